@@ -1,0 +1,130 @@
+"""Pinhole cameras and the frames of a drive."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from augment.geometry import invert_rigid
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A pinhole camera at one instant. OpenCV axes: x right, y down, z forward; pixel centres +0.5.
+
+    width, height: pixels. fx, fy, cx, cy: pixels. camera_from_world: float64 [4, 4], rigid.
+    timestamp_ns: the moment this image was taken, which poses the actors.
+    """
+
+    name: str
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    camera_from_world: Float[Tensor, "4 4"]
+    timestamp_ns: int = 0
+
+    def __post_init__(self) -> None:
+        if self.width < 1 or self.height < 1:
+            raise ValueError(
+                f"camera {self.name!r}: width and height must be >= 1 px; "
+                f"got {self.width}x{self.height}"
+            )
+        numbers = {"fx": self.fx, "fy": self.fy, "cx": self.cx, "cy": self.cy}
+        for name, value in numbers.items():
+            if not math.isfinite(value) or (name in ("fx", "fy") and value <= 0):
+                raise ValueError(
+                    f"camera {self.name!r}: {name} must be finite"
+                    f"{' and > 0' if name[0] == 'f' else ''} (pixels); got {value}"
+                )
+        pose = self.camera_from_world
+        if pose.dtype != torch.float64 or tuple(pose.shape) != (4, 4):
+            raise ValueError(
+                f"camera {self.name!r}: camera_from_world must be float64 [4, 4]; "
+                f"got {pose.dtype} {list(pose.shape)}"
+            )
+        rotation = pose[:3, :3]
+        error = (rotation @ rotation.T - torch.eye(3, dtype=torch.float64)).abs().max().item()
+        if not error < 1e-4 or torch.det(rotation) < 0:  # `not <` also catches NaN
+            raise ValueError(
+                f"camera {self.name!r}: camera_from_world must be rigid with determinant +1; "
+                f"its rotation is off orthonormal by {error:.3g}, "
+                f"determinant {torch.det(rotation).item():.3g}"
+            )
+
+    @property
+    def K(self) -> Float[Tensor, "3 3"]:
+        """Intrinsic matrix, float64."""
+        rows = [[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]]
+        return torch.tensor(rows, dtype=torch.float64)
+
+    @property
+    def world_from_camera(self) -> Float[Tensor, "4 4"]:
+        return invert_rigid(self.camera_from_world)
+
+    @property
+    def centre(self) -> Float[Tensor, "3"]:
+        """Optical centre in the world, metres, float64."""
+        return self.world_from_camera[:3, 3]
+
+    def scaled(self, scale: float) -> Camera:
+        """The same view at another resolution; both image sides are rounded, at least 1 px."""
+        if not (math.isfinite(scale) and scale > 0):
+            raise ValueError(f"scale must be a finite number > 0; got {scale}")
+        if scale == 1:
+            return self
+        width, height = max(1, round(self.width * scale)), max(1, round(self.height * scale))
+        sx, sy = width / self.width, height / self.height
+        return dataclasses.replace(
+            self,
+            width=width,
+            height=height,
+            fx=self.fx * sx,
+            fy=self.fy * sy,
+            cx=self.cx * sx,
+            cy=self.cy * sy,
+        )
+
+    def ray_directions(self, dtype: torch.dtype = torch.float32) -> Float[Tensor, "H W 3"]:
+        """World directions through the pixel centres with unit z in the camera (not unit length).
+
+        A point at depth z along pixel p is `centre + z * ray_directions()[p]`; its ray distance is
+        `z * norm(ray_directions()[p])`.
+        """
+        u = (torch.arange(self.width, dtype=torch.float64) + 0.5 - self.cx) / self.fx
+        v = (torch.arange(self.height, dtype=torch.float64) + 0.5 - self.cy) / self.fy
+        rotation = self.world_from_camera[:3, :3]
+        rays = (
+            u[None, :, None] * rotation[:, 0] + v[:, None, None] * rotation[:, 1] + rotation[:, 2]
+        )
+        return rays.to(dtype)
+
+    def ray_lengths(self, dtype: torch.dtype = torch.float32) -> Float[Tensor, "H W"]:
+        """Ray distance per unit of depth at each pixel: sqrt(1 + u^2 + v^2)."""
+        u = (torch.arange(self.width, dtype=torch.float64) + 0.5 - self.cx) / self.fx
+        v = (torch.arange(self.height, dtype=torch.float64) + 0.5 - self.cy) / self.fy
+        return torch.sqrt(1 + u[None, :] ** 2 + v[:, None] ** 2).to(dtype)
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One step of a drive: the cameras as they stood when each took its image.
+
+    index: the dataset's own frame number. timestamp_ns: the frame's reference time.
+    world_from_ego: float64 [4, 4], ego x forward, y left, z up.
+    image_paths: the recorded image of each camera where there is one (reference only).
+    """
+
+    index: int
+    timestamp_ns: int
+    world_from_ego: Float[Tensor, "4 4"]
+    cameras: Mapping[str, Camera]
+    image_paths: Mapping[str, str] = field(default_factory=dict)

@@ -1,0 +1,21 @@
+"""Errors that cross a boundary of the library; arguments raise ValueError or TypeError."""
+
+
+class ClimateGSError(Exception):
+    """Base of every error a user of the library can act on."""
+
+
+class SceneError(ClimateGSError):
+    """A scene, or a file that holds one, cannot be used as it is."""
+
+
+class AdapterError(SceneError):
+    """A dataset or scene file could not be turned into a Scene."""
+
+
+class BackendUnavailable(ClimateGSError):
+    """A rasteriser backend was named that this machine cannot run."""
+
+
+class OutputError(ClimateGSError):
+    """The output folder cannot be written, or holds something else."""

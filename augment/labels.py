@@ -1,0 +1,93 @@
+"""3D boxes and LiDAR sweeps, kept exactly as the dataset gave them.
+
+Coordinates here are the dataset's own world in float64, before the recentring that rendering
+needs: `scene = dataset - Scene.world_origin_m`. That is what lets them pass through unchanged.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+
+
+@dataclass(frozen=True, eq=False)
+class Boxes:
+    """The labelled boxes of one frame.
+
+    track_ids, labels: one string a box. centers_m: float64 [B, 3], dataset world.
+    sizes_m: float64 [B, 3] as length (box x), width (y), height (z). quats: float64 [B, 4] wxyz,
+    world_from_box. attributes: the dataset's further columns, each with B entries.
+    """
+
+    track_ids: tuple[str, ...]
+    labels: tuple[str, ...]
+    centers_m: np.ndarray
+    sizes_m: np.ndarray
+    quats: np.ndarray
+    attributes: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        count = len(self.track_ids)
+        shapes = {"centers_m": 3, "sizes_m": 3, "quats": 4}
+        for name, columns in shapes.items():
+            value = getattr(self, name)
+            if value.dtype != np.float64 or value.shape != (count, columns):
+                raise ValueError(
+                    f"{name} must be float64 [{count}, {columns}] (from {count} track_ids); "
+                    f"got {value.dtype} {list(value.shape)}"
+                )
+        for name, value in {"labels": self.labels, **self.attributes}.items():
+            if len(value) != count:
+                raise ValueError(f"{name} must have {count} entries; got {len(value)}")
+
+    def __len__(self) -> int:
+        return len(self.track_ids)
+
+    @staticmethod
+    def empty() -> Boxes:
+        return Boxes((), (), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 4)))
+
+
+@dataclass(frozen=True, eq=False)
+class LidarSweep:
+    """One frame's LiDAR returns as named columns of equal length, in the dataset's order.
+
+    Always holds x, y, z (metres, dataset world); usually intensity, timestamp_ns, sensor, semantic
+    (dataset's own class numbers) under the names its adapter documents.
+    """
+
+    columns: Mapping[str, np.ndarray]
+
+    def __post_init__(self) -> None:
+        missing = [name for name in "xyz" if name not in self.columns]
+        if missing:
+            raise ValueError(f"a LiDAR sweep needs columns x, y, z; missing {missing}")
+        lengths = {name: len(column) for name, column in self.columns.items()}
+        if len(set(lengths.values())) > 1:
+            raise ValueError(f"LiDAR columns must have equal lengths; got {lengths}")
+
+    def __len__(self) -> int:
+        return len(self.columns["x"])
+
+    @property
+    def points_m(self) -> np.ndarray:
+        """float64 [N, 3], dataset world."""
+        return np.stack([np.asarray(self.columns[c], dtype=np.float64) for c in "xyz"], axis=1)
+
+
+class LabelSource(Protocol):
+    """Reads labels and LiDAR of a frame when asked, so that a scene stays small in memory.
+
+    Implementations are picklable (they hold paths, not open files).
+    """
+
+    def boxes(self, frame_index: int) -> Boxes:
+        """Boxes of the frame; empty where the dataset has none."""
+        ...
+
+    def lidar(self, frame_index: int) -> LidarSweep | None:
+        """The sweep of the frame, or None where the dataset has no file for it."""
+        ...

@@ -1,0 +1,291 @@
+"""A driving scene: Gaussians, moving actors, sky, cameras over time, labels."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int16
+from torch import Tensor
+
+from augment.cameras import Camera, Frame
+from augment.errors import SceneError
+from augment.geometry import quat_from_rotmat, rigid, rotmat_from_quat, slerp
+from augment.labels import Boxes, LabelSource, LidarSweep
+from augment.semantics import SemanticClass
+from augment.sky import Sky
+
+SH_COUNTS = (1, 4, 9, 16)  # K = (degree + 1)^2 for degrees 0 to 3
+
+
+@dataclass(frozen=True, eq=False)
+class Gaussians:
+    """N Gaussians with activated values.
+
+    means [N, 3]: metres. quats [N, 4]: unit wxyz. scales [N, 3]: metres, > 0 along the rotated
+    axes. opacities [N]: in [0, 1]. sh [N, K, 3]: spherical harmonics, colour = 0.5 + sum sh Y.
+    semantic [N]: SemanticClass values, or None where unknown.
+    All float tensors share one dtype (float32; float64 for the reference rasteriser).
+    """
+
+    means: Float[Tensor, "N 3"]
+    quats: Float[Tensor, "N 4"]
+    scales: Float[Tensor, "N 3"]
+    opacities: Float[Tensor, "N"]
+    sh: Float[Tensor, "N K 3"]
+    semantic: Int16[Tensor, "N"] | None = None
+
+    def __post_init__(self) -> None:
+        count = self.means.shape[0]
+        expected = {
+            "means": (count, 3),
+            "quats": (count, 4),
+            "scales": (count, 3),
+            "opacities": (count,),
+        }
+        for name, shape in expected.items():
+            value = getattr(self, name)
+            if tuple(value.shape) != shape:
+                raise ValueError(
+                    f"{name} must be {list(shape)} with N={count} (from means); "
+                    f"got {list(value.shape)}"
+                )
+            if value.dtype != self.means.dtype or not value.dtype.is_floating_point:
+                raise ValueError(
+                    f"{name} must have the floating dtype of means, {self.means.dtype}; "
+                    f"got {value.dtype}"
+                )
+        shape = tuple(self.sh.shape)
+        if len(shape) != 3 or shape[0] != count or shape[1] not in SH_COUNTS or shape[2] != 3:
+            raise ValueError(
+                f"sh must be [N, K, 3] with N={count} and K in {SH_COUNTS} (degrees 0-3); "
+                f"got {list(shape)}"
+            )
+        if self.semantic is not None and tuple(self.semantic.shape) != (count,):
+            raise ValueError(f"semantic must be [{count}]; got {list(self.semantic.shape)}")
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    @property
+    def sh_degree(self) -> int:
+        return SH_COUNTS.index(self.sh.shape[1])
+
+    @property
+    def nbytes(self) -> int:
+        tensors = [self.means, self.quats, self.scales, self.opacities, self.sh]
+        if self.semantic is not None:
+            tensors.append(self.semantic)
+        return sum(t.numel() * t.element_size() for t in tensors)
+
+    def select(self, index: Tensor) -> Gaussians:
+        """The Gaussians at the given indices or mask, in that order."""
+        return Gaussians(
+            means=self.means[index],
+            quats=self.quats[index],
+            scales=self.scales[index],
+            opacities=self.opacities[index],
+            sh=self.sh[index],
+            semantic=None if self.semantic is None else self.semantic[index],
+        )
+
+    @staticmethod
+    def empty(sh_degree: int = 0) -> Gaussians:
+        k = SH_COUNTS[sh_degree]
+        return Gaussians(
+            means=torch.zeros(0, 3),
+            quats=torch.zeros(0, 4),
+            scales=torch.zeros(0, 3),
+            opacities=torch.zeros(0),
+            sh=torch.zeros(0, k, 3),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """Where an actor is over time. Linear in position, slerp in rotation, between samples.
+
+    timestamps_ns: int64 [T], strictly increasing. world_from_actor: float64 [T, 4, 4].
+    hold_ns: how long before the first and after the last sample the actor stays at that pose
+    (cameras of a frame fire at slightly different moments); beyond it the actor is absent.
+    """
+
+    timestamps_ns: Tensor
+    world_from_actor: Float[Tensor, "T 4 4"]
+    hold_ns: int = 100_000_000
+
+    def __post_init__(self) -> None:
+        count = self.timestamps_ns.shape[0]
+        if count < 1 or tuple(self.world_from_actor.shape) != (count, 4, 4):
+            raise ValueError(
+                f"a track needs T >= 1 timestamps and world_from_actor [T, 4, 4]; "
+                f"got {count} and {list(self.world_from_actor.shape)}"
+            )
+        if count > 1 and not bool((self.timestamps_ns.diff() > 0).all()):
+            raise ValueError("track timestamps must be strictly increasing")
+
+    def pose_at(self, timestamp_ns: int) -> Float[Tensor, "4 4"] | None:
+        """world_from_actor at a time, or None where the actor does not exist."""
+        times = self.timestamps_ns
+        first, last = int(times[0]), int(times[-1])
+        if not first - self.hold_ns <= timestamp_ns <= last + self.hold_ns:
+            return None
+        if timestamp_ns <= first:
+            return self.world_from_actor[0]
+        if timestamp_ns >= last:
+            return self.world_from_actor[-1]
+        after = int(torch.searchsorted(times, timestamp_ns, right=True))
+        before = after - 1
+        span = int(times[after]) - int(times[before])
+        fraction = torch.tensor((timestamp_ns - int(times[before])) / span, dtype=torch.float64)
+        a, b = self.world_from_actor[before], self.world_from_actor[after]
+        quat = slerp(quat_from_rotmat(a[:3, :3]), quat_from_rotmat(b[:3, :3]), fraction)
+        return rigid(rotmat_from_quat(quat), torch.lerp(a[:3, 3], b[:3, 3], fraction))
+
+
+@dataclass(frozen=True, eq=False)
+class Actor:
+    """A rigid moving object: its Gaussians in its own frame (x forward, y left, z up, origin at the
+    box centre), its track, and its box size (length, width, height in metres).
+    """
+
+    track_id: str
+    label: str
+    gaussians: Gaussians
+    track: Track
+    size_m: tuple[float, float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class PosedGaussians:
+    """Gaussians placed in the world: what a rasteriser takes, so that nothing is concatenated.
+
+    world_from_part: float64 [4, 4], or None for the identity. instance_id: 0 for the background,
+    1 + the actor's index otherwise.
+    """
+
+    gaussians: Gaussians
+    world_from_part: Float[Tensor, "4 4"] | None = None
+    instance_id: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Everything that is known of a drive, in one world: metres, right-handed, +z up.
+
+    world_origin_m: what was subtracted from the dataset's coordinates, float64 [3].
+    ground_z_m: height of the road under the ego path (lowest), scene world; None where unknown.
+    has_metric_scale: False where one unit is not known to be one metre.
+    frames: in order of time, each with the scene's cameras. labels: boxes and LiDAR on demand.
+    problems: what the adapter found wrong and went on without, one sentence each.
+    source: the URI the scene was opened from; open_scene(source) opens it again.
+    """
+
+    name: str
+    source: str
+    background: Gaussians
+    actors: tuple[Actor, ...]
+    sky: Sky
+    frames: tuple[Frame, ...]
+    labels: LabelSource | None = None
+    world_origin_m: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    ground_z_m: float | None = None
+    has_metric_scale: bool = True
+    problems: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if len(self.background) + sum(len(a.gaussians) for a in self.actors) == 0:
+            raise SceneError(
+                f"scene {self.name!r} ({self.source}) holds no Gaussians; nothing can be rendered"
+            )
+        ids = [a.track_id for a in self.actors]
+        if len(set(ids)) != len(ids):
+            repeated = sorted({i for i in ids if ids.count(i) > 1})
+            raise ValueError(f"scene {self.name!r}: actor track_ids repeat: {repeated}")
+
+    @property
+    def camera_names(self) -> tuple[str, ...]:
+        """Names of all cameras, in the order they first appear."""
+        return tuple(dict.fromkeys(name for frame in self.frames for name in frame.cameras))
+
+    def frame(self, index: int) -> Frame:
+        """The frame with the dataset's number `index`."""
+        for frame in self.frames:
+            if frame.index == index:
+                return frame
+        known = [f.index for f in self.frames]
+        raise SceneError(
+            f"scene {self.name!r} has no frame {index}; it has "
+            + (f"{known[0]} to {known[-1]} ({len(known)} frames)" if known else "none")
+        )
+
+    def parts_at(self, timestamp_ns: int) -> Iterator[PosedGaussians]:
+        """Background and every actor that exists at this time, posed."""
+        yield PosedGaussians(self.background)
+        for number, actor in enumerate(self.actors, start=1):
+            pose = actor.track.pose_at(timestamp_ns)
+            if pose is not None:
+                yield PosedGaussians(actor.gaussians, pose, instance_id=number)
+
+    def parts_for(self, camera: Camera) -> tuple[PosedGaussians, ...]:
+        """The parts at the moment the camera took its image."""
+        return tuple(self.parts_at(camera.timestamp_ns))
+
+    def boxes(self, frame_index: int) -> Boxes:
+        return Boxes.empty() if self.labels is None else self.labels.boxes(frame_index)
+
+    def lidar(self, frame_index: int) -> LidarSweep | None:
+        return None if self.labels is None else self.labels.lidar(frame_index)
+
+
+def check_gaussians(gaussians: Gaussians, *, where: str) -> tuple[Gaussians, tuple[str, ...]]:
+    """Gaussians without those no rasteriser can draw, and a sentence for each kind left out.
+
+    Left out: NaN or infinite values, zero quaternions, scales <= 0. Quaternions are normalised.
+
+    Raises:
+        SceneError: nothing usable remains.
+    """
+    finite = torch.ones(len(gaussians), dtype=torch.bool)
+    for tensor in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.sh):
+        finite &= torch.isfinite(tensor.reshape(len(gaussians), -1).sum(1))
+    finite &= torch.isfinite(gaussians.opacities)
+    norms = gaussians.quats.norm(dim=1)
+    # In order: each count names what the earlier checks did not already leave out.
+    bad = {
+        "with NaN or infinite values": ~finite,
+        "with a zero quaternion": finite & (norms == 0),
+        "with a scale <= 0": finite & (norms > 0) & (gaussians.scales.amin(1) <= 0),
+    }
+    problems = tuple(
+        f"{where}: left out {int(mask.sum())} of {len(gaussians)} Gaussians {what}"
+        for what, mask in bad.items()
+        if bool(mask.any())
+    )
+    if problems:
+        keep = ~torch.stack(list(bad.values())).any(0)
+        gaussians, norms = gaussians.select(keep), norms[keep]
+    if len(gaussians) == 0:
+        raise SceneError(f"{where} holds no usable Gaussians. " + " ".join(problems))
+    unit = Gaussians(
+        means=gaussians.means,
+        quats=gaussians.quats / norms[:, None],
+        scales=gaussians.scales,
+        opacities=gaussians.opacities.clamp(0, 1),
+        sh=gaussians.sh,
+        semantic=gaussians.semantic,
+    )
+    return unit, problems
+
+
+__all__ = [
+    "Actor",
+    "Gaussians",
+    "PosedGaussians",
+    "Scene",
+    "SemanticClass",
+    "Track",
+    "check_gaussians",
+]
