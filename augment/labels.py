@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -78,6 +78,7 @@ class LidarSweep:
         return np.stack([np.asarray(self.columns[c], dtype=np.float64) for c in "xyz"], axis=1)
 
 
+@runtime_checkable
 class LabelSource(Protocol):
     """Reads labels and LiDAR of a frame when asked, so that a scene stays small in memory.
 

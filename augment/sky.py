@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 
+@runtime_checkable
 class Sky(Protocol):
     """Anything that gives a display-encoded colour for a world direction."""
 
@@ -30,8 +31,8 @@ class ConstantSky:
 
 @dataclass(frozen=True, eq=False)
 class LatLongSky:
-    """An equirectangular image. image: float32 [H, W, 3]; row 0 is the zenith (+z), the last row the
-    nadir; column 0 starts at azimuth -pi, azimuth = atan2(y, x) grows with the column.
+    """An equirectangular image. image: float32 [H, W, 3]; row 0 is the zenith (+z), the last row
+    the nadir; column 0 starts at azimuth -pi, azimuth = atan2(y, x) grows with the column.
     """
 
     image: Float[Tensor, "H W 3"]

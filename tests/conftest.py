@@ -1,16 +1,45 @@
-"""Fixtures shared by all tests. Nothing of the library is imported here at the top."""
+"""Fixtures shared by all tests, and the run-time check of the library's shape annotations."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import pytest
+from jaxtyping import config, install_import_hook
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def _checked_modules() -> list[str]:
+    """Modules of the library, without those that hold numba kernels.
+
+    The hook wraps every function it sees, and a wrapped kernel can be neither compiled nor cached.
+    """
+    paths = sorted((ROOT / "augment").rglob("*.py"))
+    names = [
+        ".".join(path.relative_to(ROOT).with_suffix("").parts)
+        for path in paths
+        if path.name != "__init__.py" and "njit" not in path.read_text()
+    ]
+    assert "augment.scene" in names and "augment.render.composite_kernels" not in names
+    return names
+
+
+install_import_hook(_checked_modules(), "beartype.beartype")
 
 
 @pytest.fixture(scope="session")
 def shared_dir() -> Path:
-    """The folder with real data and reference renders beside the project; skips where it is absent."""
-    folder = Path(__file__).resolve().parents[2] / "shared"
+    """The folder of real data and reference renders beside the project; skips where absent."""
+    folder = ROOT.parent / "shared"
     if not folder.is_dir():
         pytest.skip(f"real data and reference renders are not at {folder}")
     return folder
+
+
+@pytest.fixture
+def unchecked():
+    """Turns the check of annotations off, for tests of the library's own messages."""
+    config.update("jaxtyping_disable", True)
+    yield
+    config.update("jaxtyping_disable", False)

@@ -23,9 +23,9 @@ class RenderOutput:
 
     rgb: sum of weights times colour, without background. alpha: 1 - final transmittance.
     expected_depth: sum(w z) / max(sum(w), 1e-10), metres; 0 where nothing was hit.
-    median_depth: z of the first splat that brings transmittance below 0.5, metres; 0 where none does.
-    splat_ids: index of the splat with the largest weight, counted through the parts in order; -1 where
-    nothing was hit. The first of equal weights wins.
+    median_depth: z of the first splat that brings transmittance below 0.5, metres; 0 where none
+    does. splat_ids: index of the splat with the largest weight, counted through the parts in
+    order; -1 where nothing was hit. The first of equal weights wins.
     """
 
     rgb: Float[Tensor, "H W 3"] | None = None

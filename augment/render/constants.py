@@ -19,8 +19,8 @@ DEPTH_EPS = 1e-10  # floor of the weight that expected depth is divided by
 class RasterSettings:
     """What a rasteriser may be told beyond scene and camera.
 
-    near_m: splats nearer than this along z are culled. alpha_max: 0.999 in gsplat 1.5.3, 0.99 in the
-    original 3DGS and in gsplat's main branch. antialiased: opacity times sqrt(det/det_blurred).
+    near_m: splats nearer than this along z are culled. alpha_max: 0.999 in gsplat 1.5.3, 0.99 in
+    the original 3DGS and gsplat's main branch. antialiased: opacity times sqrt(det/det_blurred).
     sh_degree: highest band evaluated; None for all a splat has.
     """
 

@@ -5,7 +5,8 @@
 The paper's smog equation has t on the smog colour; that is inverted, and this is the usual form.
 Uniform smog has tau = sigma d. With a scale height H the density is sigma0 exp(-(z - z0) / H) and
 
-    tau = sigma0 d exp(-min(a, b)) (1 - exp(-|b - a|)) / |b - a|,   a = (z_eye - z0)/H, b = (z - z0)/H
+    tau = sigma0 d exp(-min(a, b)) (1 - exp(-|b - a|)) / |b - a|,
+    a = (z_eye - z0) / H,  b = (z - z0) / H,
 
 which is symmetric in its two ends and has no large factor that another must cancel.
 """
@@ -81,10 +82,17 @@ def sky_optical_depth(
         return torch.zeros_like(slope)
     if medium.scale_height_m is None:
         return infinite
-    a = (eye_z_m - medium.base_z_m) / medium.scale_height_m
-    vertical = medium.sigma_per_m * medium.scale_height_m * math.exp(min(-a, MAX_EXPONENT))
+    vertical = vertical_optical_depth(medium, eye_z_m)
     climbing = slope > 0
     return torch.where(climbing, vertical / torch.where(climbing, slope, 1.0), infinite)
+
+
+def vertical_optical_depth(medium: SmogMedium, eye_z_m: float) -> float:
+    """tau from the eye straight up to infinity: sigma0 H exp(-(z_eye - z0) / H)."""
+    if medium.scale_height_m is None:
+        raise ValueError("uniform smog has no top: its vertical optical depth is infinite")
+    a = (eye_z_m - medium.base_z_m) / medium.scale_height_m
+    return medium.sigma_per_m * medium.scale_height_m * math.exp(min(-a, MAX_EXPONENT))
 
 
 def blend_airlight(
@@ -106,8 +114,8 @@ def fog_buffers(
 ) -> Float[Tensor, "H W 3"]:
     """Deferred smog (the paper's way) on premultiplied colour, sky not included.
 
-    ray_distance must come from depth that was divided by alpha. Exact for one surface a pixel; where
-    translucent layers mix it fogs them all at their mean distance.
+    ray_distance must come from depth that was divided by alpha. Exact for one surface a pixel;
+    where translucent layers mix it fogs them all at their mean distance.
     """
     tau = optical_depth(medium, ray_distance, eye_z_m, point_z_m)
     t = torch.exp(-tau)[..., None]

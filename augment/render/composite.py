@@ -1,0 +1,92 @@
+"""The sky behind the splats, and the step to 8 bits: the torch definition.
+
+out = rgb + (1 - alpha) sky(direction),   sky seen through the smog that lies before it
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from augment.cameras import Camera
+from augment.render import composite_kernels, threads
+from augment.sky import ConstantSky, CubemapSky, Sky
+from augment.weather.smog import (
+    SmogMedium,
+    blend_airlight,
+    sky_optical_depth,
+    vertical_optical_depth,
+)
+
+
+def sky_behind(sky: Sky, smog: SmogMedium | None) -> tuple[Sky, SmogMedium | None]:
+    """What has to be evaluated per pixel: the sky and the smog before it, or less.
+
+    Uniform smog hides the sky altogether (infinite distance), so only its colour is left; smog
+    without density changes nothing.
+    """
+    if smog is None or smog.sigma_per_m == 0:
+        return sky, None
+    if smog.scale_height_m is None:
+        return ConstantSky(torch.tensor(smog.rgb, dtype=torch.float32)), None
+    return sky, smog
+
+
+def composite_sky(
+    rgb: Float[Tensor, "H W 3"],
+    alpha: Float[Tensor, "H W"],
+    camera: Camera,
+    sky: Sky,
+    *,
+    smog: SmogMedium | None = None,
+    fast: bool = True,
+) -> Float[Tensor, "H W 3"]:
+    """The finished display-encoded image, not clamped.
+
+    smog: with it the sky is seen through the smog up to infinity. fast: cube maps in float32 go
+    through the CPU kernel, equal to this definition within float rounding.
+    """
+    sky, smog = sky_behind(sky, smog)
+    if fast and isinstance(sky, CubemapSky) and rgb.dtype == torch.float32:
+        return _composite_cubemap(rgb, alpha, camera, sky.faces, smog)
+    directions = camera.ray_directions(rgb.dtype)
+    color = sky.sample(directions)
+    if smog is not None:
+        slope = directions[..., 2] / directions.norm(dim=-1)
+        tau = sky_optical_depth(smog, slope, float(camera.centre[2]))
+        color = blend_airlight(color, tau, smog)
+    return rgb + (1 - alpha)[..., None] * color
+
+
+def _composite_cubemap(
+    rgb: Tensor, alpha: Tensor, camera: Camera, faces: Tensor, smog: SmogMedium | None
+) -> Tensor:
+    threads.prepare()
+    out = np.empty((camera.height, camera.width, 3), np.float32)
+    strength, airlight = -1.0, (0.0, 0.0, 0.0)
+    if smog is not None:
+        strength = vertical_optical_depth(smog, float(camera.centre[2]))
+        airlight = smog.rgb
+    composite_kernels.composite_cubemap(
+        rgb.detach().contiguous().numpy(),
+        alpha.detach().contiguous().numpy(),
+        faces.contiguous().numpy(),
+        camera.world_from_camera[:3, :3].numpy().astype(np.float32),
+        *(np.float32(v) for v in (1 / camera.fx, 1 / camera.fy, camera.cx, camera.cy)),
+        np.float32(min(strength, 1e30)),
+        np.asarray(airlight, np.float32),
+        out,
+    )
+    return torch.from_numpy(out)
+
+
+def quantise(rgb: Float[Tensor, "H W 3"]) -> np.ndarray:
+    """uint8 [H, W, 3]: clamped to [0, 1], times 255, rounded to the nearest."""
+    if rgb.dtype == torch.float32:
+        threads.prepare()
+        out = np.empty(tuple(rgb.shape), np.uint8)
+        composite_kernels.quantise(rgb.detach().contiguous().numpy().reshape(-1), out.reshape(-1))
+        return out
+    return (rgb.detach().clamp(0, 1) * 255 + 0.5).to(torch.uint8).numpy()

@@ -1,0 +1,72 @@
+"""Numba kernels for the sky behind the splats and for 8-bit images."""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+
+@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
+def composite_cubemap(rgb, alpha, faces, rotation, ifx, ify, cx, cy, strength, airlight, out):
+    """out = rgb + (1 - alpha) sky of a cube map [6, R, R, 3], through smog where strength >= 0.
+
+    rotation: world_from_camera. ifx, ify: 1 / focal length. strength: optical depth straight up.
+    """
+    height, width = alpha.shape
+    size = faces.shape[1]
+    half, one = np.float32(0.5), np.float32(1)
+    last = np.float32(size - 1)
+    scale = np.float32(size) * half
+    for i in numba.prange(height):
+        v = (np.float32(i) + half - cy) * ify
+        bx = rotation[0, 1] * v + rotation[0, 2]
+        by = rotation[1, 1] * v + rotation[1, 2]
+        bz = rotation[2, 1] * v + rotation[2, 2]
+        for j in range(width):
+            u = (np.float32(j) + half - cx) * ifx
+            x = rotation[0, 0] * u + bx
+            y = rotation[1, 0] * u + by
+            z = rotation[2, 0] * u + bz
+            ax, ay, az = abs(x), abs(y), abs(z)
+            if ax >= ay and ax >= az:
+                major, t = ax, -y
+                face = 0 if x >= 0 else 1
+                s = -z if x >= 0 else z
+            elif ay >= az:
+                major, s = ay, x
+                face = 2 if y >= 0 else 3
+                t = z if y >= 0 else -z
+            else:
+                major, t = az, -y
+                face = 4 if z >= 0 else 5
+                s = x if z >= 0 else -x
+            inverse = scale / major
+            column = min(max(s * inverse + scale - half, np.float32(0)), last)
+            row = min(max(t * inverse + scale - half, np.float32(0)), last)
+            c0, r0 = int(column), int(row)
+            c1, r1 = min(c0 + 1, size - 1), min(r0 + 1, size - 1)
+            fc, fr = column - np.float32(c0), row - np.float32(r0)
+            through = one - alpha[i, j]
+            visible = one
+            if strength >= 0:
+                visible = np.float32(0)
+                if z > 0:
+                    slope = z / math.sqrt(x * x + y * y + z * z)
+                    visible = math.exp(-strength / slope)
+            for c in range(3):
+                top = faces[face, r0, c0, c] * (one - fc) + faces[face, r0, c1, c] * fc
+                bottom = faces[face, r1, c0, c] * (one - fc) + faces[face, r1, c1, c] * fc
+                color = top * (one - fr) + bottom * fr
+                color = visible * color + (one - visible) * airlight[c]
+                out[i, j, c] = rgb[i, j, c] + through * color
+
+
+@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
+def quantise(values, out):
+    """uint8 of flat float32 values: clamped to [0, 1], times 255, rounded to the nearest."""
+    half, top = np.float32(0.5), np.float32(255)
+    for i in numba.prange(values.size):
+        value = values[i] * top + half
+        out[i] = np.uint8(min(max(value, np.float32(0)), top))

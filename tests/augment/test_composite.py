@@ -1,0 +1,61 @@
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from augment.cameras import Camera
+from augment.geometry import rigid, rotmat_from_quat
+from augment.render.composite import composite_sky, quantise, sky_behind
+from augment.sky import ConstantSky, CubemapSky
+from augment.weather.smog import SmogMedium
+
+
+def cameras() -> list[Camera]:
+    """Six views of a cube map, so that every face and every edge between faces is crossed."""
+    generator = torch.Generator().manual_seed(3)
+    quats = torch.randn(6, 4, generator=generator, dtype=torch.float64)
+    base = Camera("c", 61, 37, 30.0, 31.0, 29.0, 19.0, torch.eye(4, dtype=torch.float64))
+    shift = torch.tensor([1.0, 2.0, -3.0], dtype=torch.float64)
+    return [
+        dataclasses.replace(base, camera_from_world=rigid(rotmat_from_quat(q), shift))
+        for q in quats
+    ]
+
+
+@pytest.mark.parametrize("camera", cameras(), ids=range(6))
+@pytest.mark.parametrize("smog", [None, SmogMedium(0.01, (0.5, 0.6, 0.7), 30.0, -2.0)])
+def test_the_kernel_matches_the_definition(camera, smog):
+    generator = torch.Generator().manual_seed(0)
+    rgb = torch.rand(37, 61, 3, generator=generator)
+    alpha = torch.rand(37, 61, generator=generator)
+    sky = CubemapSky(torch.rand(6, 16, 16, 3, generator=generator))
+    fast = composite_sky(rgb, alpha, camera, sky, smog=smog)
+    slow = composite_sky(rgb, alpha, camera, sky, smog=smog, fast=False)
+    # Noise textures of 16 texels: float32 rounding of coordinates (1e-6) times 16 texels; a
+    # pixel whose direction lies on an edge between faces may fall to either side.
+    difference = (fast - slow).abs().amax(-1)
+    assert float(difference.quantile(0.995)) < 1e-4
+    assert int((difference > 1e-3).sum()) <= 2
+
+
+def test_opaque_pixels_keep_their_colour_to_the_bit():
+    rgb = torch.rand(37, 61, 3)
+    out = composite_sky(rgb, torch.ones(37, 61), cameras()[0], CubemapSky(torch.rand(6, 4, 4, 3)))
+    assert torch.equal(out, rgb)
+
+
+def test_uniform_smog_leaves_no_sky_to_sample():
+    sky = CubemapSky(torch.rand(6, 4, 4, 3))
+    airlight, remaining = sky_behind(sky, SmogMedium(1e-3, (0.5, 0.6, 0.7)))
+    assert isinstance(airlight, ConstantSky) and remaining is None
+    assert sky_behind(sky, SmogMedium(0.0, (0.5, 0.6, 0.7), 10.0)) == (sky, None)
+    assert sky_behind(sky, None) == (sky, None)
+
+
+def test_eight_bits_round_to_nearest_and_clamp():
+    values = torch.tensor([-0.2, 0.0, 0.4 / 255, 0.6 / 255, 127.5 / 255, 1.0, 7.0])
+    image = values[:, None, None].expand(7, 1, 3).contiguous()
+    expected = np.array([0, 0, 0, 1, 128, 255, 255], np.uint8)
+    assert np.array_equal(quantise(image)[:, 0, 0], expected)
+    assert np.array_equal(quantise(image.double())[:, 0, 0], expected)

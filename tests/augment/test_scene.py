@@ -1,0 +1,107 @@
+import dataclasses
+
+import pytest
+import torch
+
+from augment.errors import SceneError
+from augment.geometry import rigid, rotmat_from_quat
+from augment.scene import Actor, Gaussians, Scene, Track, check_gaussians
+from augment.sky import ConstantSky
+
+
+def some(count: int = 5) -> Gaussians:
+    quats = torch.zeros(count, 4)
+    quats[:, 0] = 1
+    return Gaussians(
+        means=torch.arange(count * 3, dtype=torch.float32).reshape(count, 3),
+        quats=quats,
+        scales=torch.full((count, 3), 0.1),
+        opacities=torch.full((count,), 0.5),
+        sh=torch.zeros(count, 4, 3),
+    )
+
+
+def track() -> Track:
+    turn = torch.tensor([[1.0, 0, 0, 0], [0.5**0.5, 0, 0, 0.5**0.5]], dtype=torch.float64)
+    places = torch.tensor([[0.0, 0, 0], [10.0, 0, 0]], dtype=torch.float64)
+    poses = torch.stack([rigid(rotmat_from_quat(q), p) for q, p in zip(turn, places, strict=True)])
+    return Track(torch.tensor([1_000, 2_000]), poses, hold_ns=100)
+
+
+def test_wrong_shapes_name_the_field_and_both_shapes(unchecked):
+    good = some()
+    with pytest.raises(ValueError, match=r"scales must be \[5, 3\] with N=5 .*got \[5, 1\]"):
+        dataclasses.replace(good, scales=torch.ones(5, 1))
+    with pytest.raises(ValueError, match=r"sh must be .*got \[5, 5, 3\]"):
+        dataclasses.replace(good, sh=torch.ones(5, 5, 3))
+    with pytest.raises(ValueError, match="floating dtype of means"):
+        dataclasses.replace(good, opacities=torch.ones(5, dtype=torch.float64))
+
+
+def test_unusable_gaussians_are_left_out_and_counted():
+    base = some(6)
+    means, quats, scales = base.means.clone(), base.quats.clone() * 2, base.scales.clone()
+    means[0, 1] = torch.nan
+    means[1, 0] = torch.inf
+    quats[2] = 0
+    scales[3, 2] = 0
+    hurt = dataclasses.replace(base, means=means, quats=quats, scales=scales)
+    clean, problems = check_gaussians(hurt, where="scene.ply")
+    assert torch.equal(clean.means, base.means[4:])
+    assert torch.equal(clean.quats, base.quats[4:])  # normalised
+    assert problems == (
+        "scene.ply: left out 2 of 6 Gaussians with NaN or infinite values",
+        "scene.ply: left out 1 of 6 Gaussians with a zero quaternion",
+        "scene.ply: left out 1 of 6 Gaussians with a scale <= 0",
+    )
+
+
+def test_nothing_usable_is_an_error():
+    bad = dataclasses.replace(some(2), means=torch.full((2, 3), torch.nan))
+    with pytest.raises(SceneError, match=r"scene\.ply holds no usable Gaussians"):
+        check_gaussians(bad, where="scene.ply")
+
+
+def test_a_track_interpolates_holds_and_ends():
+    t = track()
+    middle = t.pose_at(1_500)
+    assert middle is not None
+    assert middle[:3, 3].tolist() == [5.0, 0.0, 0.0]
+    eighth_turn = torch.tensor([0.5**0.5, 0.5**0.5, 0], dtype=torch.float64)
+    assert torch.allclose(middle[:3, 0], eighth_turn)
+    assert torch.equal(t.pose_at(950), t.world_from_actor[0])
+    assert torch.equal(t.pose_at(2_100), t.world_from_actor[1])
+    assert t.pose_at(899) is None and t.pose_at(2_101) is None
+
+
+def test_track_times_must_increase():
+    with pytest.raises(ValueError, match="strictly increasing"):
+        Track(torch.tensor([5, 5]), torch.eye(4, dtype=torch.float64).repeat(2, 1, 1))
+
+
+def scene(actors: tuple[Actor, ...] = (), background: Gaussians | None = None) -> Scene:
+    return Scene(
+        name="s",
+        source="test:",
+        background=some() if background is None else background,
+        actors=actors,
+        sky=ConstantSky(torch.zeros(3)),
+        frames=(),
+    )
+
+
+def test_actors_take_part_only_while_their_track_lasts():
+    actor = Actor("car", "Car", some(3), track(), (4.0, 2.0, 1.5))
+    s = scene((actor,))
+    assert [p.instance_id for p in s.parts_at(1_500)] == [0, 1]
+    assert [p.instance_id for p in s.parts_at(5_000)] == [0]
+
+
+def test_empty_scenes_repeated_tracks_and_missing_frames_are_errors():
+    with pytest.raises(SceneError, match="holds no Gaussians"):
+        scene(background=Gaussians.empty())
+    actor = Actor("car", "Car", some(3), track(), (4.0, 2.0, 1.5))
+    with pytest.raises(ValueError, match=r"track_ids repeat: \['car'\]"):
+        scene((actor, actor))
+    with pytest.raises(SceneError, match="has no frame 7; it has none"):
+        scene().frame(7)
