@@ -1,0 +1,45 @@
+# The two commands that matter: `make demo` and `make test`. Each works first on a fresh clone.
+PYTHON ?= python3.11
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test lint bench check-system clean
+
+help:
+	@echo "make demo   install, render the embedded street under three recipes, say where the pictures are"
+	@echo "make test   install, run the whole test suite"
+	@echo "make lint   formatting, style and types"
+	@echo "make bench  time the rasteriser on this machine"
+
+setup: $(STAMP)
+
+# torch comes first and alone: constraints.txt pins the version whose CPU build pip finds.
+$(STAMP): pyproject.toml constraints.txt | check-system
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet --upgrade "pip>=23.1"
+	$(BIN)/pip install --quiet torch --constraint constraints.txt
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[test]"
+	touch $(STAMP)
+
+check-system:
+	@command -v $(PYTHON) >/dev/null || { \
+	  echo "$(PYTHON) was not found: install Python 3.11, or run make PYTHON=/path/to/python3.11"; exit 1; }
+
+demo: setup
+	$(BIN)/climategs demo
+
+test: setup
+	$(BIN)/python -m pytest -q
+
+lint: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright
+
+bench: setup
+	$(BIN)/climategs bench raster
+
+clean:
+	rm -rf $(VENV) build out *.egg-info .pytest_cache .ruff_cache
