@@ -1,0 +1,405 @@
+"""Splat files: values against the formats' definitions and an independent reader, and damage."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import struct
+import tempfile
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+import plyfile
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from augment.errors import SceneError
+from augment.ply_io import iterate_rows, read_ply_header
+from augment.scene import Gaussians
+from augment.splat_io import (
+    read_ply,
+    read_splat,
+    read_splats,
+    recentring_origin,
+    write_ply,
+    write_splat,
+)
+
+BASIC = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2",
+         "rot_0", "rot_1", "rot_2", "rot_3"]  # fmt: skip
+
+
+def random_gaussians(count: int, degree: int, *, semantic: bool = False) -> Gaussians:
+    rng = torch.Generator().manual_seed(count + degree)
+    quats = torch.randn(count, 4, generator=rng)
+    return Gaussians(
+        means=torch.randn(count, 3, generator=rng) * 50,
+        quats=quats / quats.norm(dim=1, keepdim=True),
+        scales=torch.rand(count, 3, generator=rng) * 2 + 1e-3,
+        opacities=torch.rand(count, generator=rng),
+        sh=torch.randn(count, (degree + 1) ** 2, 3, generator=rng),
+        semantic=torch.arange(count).to(torch.int16) % 15 if semantic else None,
+    )
+
+
+def write_rows(
+    path: Path, names: list[str], rows: np.ndarray, *, count: int | None = None, extra: str = ""
+) -> Path:
+    """A binary float .ply with any columns, and a count that may lie."""
+    header = ["ply", "format binary_little_endian 1.0"]
+    header += [f"element vertex {len(rows) if count is None else count}"]
+    header += [f"property float {name}" for name in names]
+    header += [*filter(None, [extra]), "end_header"]
+    body = np.ascontiguousarray(rows, dtype="<f4").tobytes()
+    path.write_bytes(("\n".join(header) + "\n").encode() + body)
+    return path
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_ply_round_trip_keeps_float32_values(tmp_path: Path, degree: int) -> None:
+    written = random_gaussians(20_000, degree, semantic=True)
+    write_ply(tmp_path / "a.ply", written, notes={"unit": "metre", "up": "+z"})
+    read = read_ply(tmp_path / "a.ply")
+    got = read.gaussians
+    assert read.problems == ()
+    assert dict(read.notes) == {"unit": "metre", "up": "+z"}
+    assert torch.equal(got.means, written.means)
+    assert torch.equal(got.sh, written.sh)
+    assert got.semantic is not None and written.semantic is not None
+    assert torch.equal(got.semantic, written.semantic)
+    # log and exp, logit and sigmoid each round once: a few units in the last place of the logit
+    # (|log scale| < 7, |logit| < 12, so 12 * 2^-24 relative) and of the result.
+    torch.testing.assert_close(got.scales, written.scales, rtol=1e-6, atol=0)
+    torch.testing.assert_close(got.opacities, written.opacities, rtol=1e-6, atol=1e-7)
+    torch.testing.assert_close(got.quats, written.quats, rtol=0, atol=2e-7)
+
+
+def test_extreme_opacities_survive(tmp_path: Path) -> None:
+    written = random_gaussians(4, 0)
+    opacities = torch.tensor([0.0, 1.0, 1e-6, 1 - 2**-24])
+    write_ply(tmp_path / "a.ply", Gaussians(**{**vars(written), "opacities": opacities}))
+    raw = plyfile.PlyData.read(tmp_path / "a.ply")["vertex"]["opacity"]
+    assert np.isfinite(raw).all()
+    got = read_ply(tmp_path / "a.ply").gaussians.opacities
+    assert got[0] == 0 and got[1] == 1
+    torch.testing.assert_close(got, opacities, rtol=2e-6, atol=0)
+
+
+def test_layout_matches_an_independent_reader(tmp_path: Path) -> None:
+    """plyfile sees INRIA's columns: f_rest channel-major, log scales, logits, wxyz."""
+    written = random_gaussians(5, 2)
+    write_ply(tmp_path / "a.ply", written)
+    vertex = plyfile.PlyData.read(tmp_path / "a.ply")["vertex"]
+    names = [p.name for p in vertex.properties]
+    assert names[:9] == ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+    assert names[9:33] == [f"f_rest_{i}" for i in range(24)]
+    for channel in range(3):
+        for band in range(8):
+            expected = written.sh[:, 1 + band, channel].numpy()
+            np.testing.assert_array_equal(vertex[f"f_rest_{8 * channel + band}"], expected)
+    np.testing.assert_allclose(vertex["scale_1"], written.scales[:, 1].log().numpy(), rtol=1e-6)
+    np.testing.assert_array_equal(vertex["rot_0"], written.quats[:, 0])
+    assert vertex["nx"].sum() == 0
+
+
+@pytest.mark.parametrize("order", ["<", ">", "ascii"])
+def test_reads_what_an_independent_writer_wrote(tmp_path: Path, order: str) -> None:
+    """Any order of columns, other columns between, both byte orders and text."""
+    rng = np.random.default_rng(5)
+    names = [*BASIC[::-1], "confidence", *(f"f_rest_{i}" for i in range(9))]
+    table = np.zeros(7, dtype=[(name, "f4") for name in names])
+    for name in names:
+        table[name] = rng.normal(size=7)
+    other = np.zeros(3, dtype=[("a", "u1"), ("b", "f8")])
+    elements = [
+        plyfile.PlyElement.describe(other, "other"),
+        plyfile.PlyElement.describe(table, "vertex"),
+    ]
+    data = plyfile.PlyData(
+        elements, text=order == "ascii", byte_order="=" if order == "ascii" else order
+    )
+    data.write(str(tmp_path / "a.ply"))
+    got = read_splats(tmp_path / "a.ply").gaussians
+    # Text is parsed as float64, so float32's own rounding of exp is all that remains.
+    np.testing.assert_allclose(got.means[:, 1], table["y"], rtol=1e-6)
+    np.testing.assert_allclose(got.scales[:, 2], np.exp(table["scale_2"]), rtol=1e-6)
+    np.testing.assert_allclose(got.opacities, 1 / (1 + np.exp(-table["opacity"])), rtol=1e-6)
+    np.testing.assert_allclose(got.sh[:, 2, 1], table["f_rest_4"], rtol=1e-6)
+    norms = np.sqrt(sum(table[f"rot_{i}"] ** 2 for i in range(4)))
+    np.testing.assert_allclose(got.quats[:, 0], table["rot_0"] / norms, rtol=1e-6)
+
+
+def test_rgb_columns_serve_as_colour(tmp_path: Path) -> None:
+    names = [n for n in BASIC if not n.startswith("f_dc")]
+    types = [(n, "f4") for n in names] + [(n, "u1") for n in ("red", "green", "blue")]
+    table = np.ones(2, dtype=types)
+    table["red"], table["green"], table["blue"] = 255, 51, 0
+    element = plyfile.PlyElement.describe(table, "vertex")
+    plyfile.PlyData([element]).write(str(tmp_path / "a.ply"))
+    sh = read_ply(tmp_path / "a.ply").gaussians.sh
+    colour = 0.5 + 0.28209479177387814 * sh[:, 0]
+    torch.testing.assert_close(colour[0], torch.tensor([1.0, 0.2, 0.0]), rtol=0, atol=1e-6)
+
+
+def test_double_coordinates_are_recentred_before_float32(tmp_path: Path) -> None:
+    """UTM-sized doubles keep their millimetres; float32 alone would keep 0.5 m."""
+    table = np.ones(3, dtype=[(n, "f8" if n in "xyz" else "f4") for n in BASIC])
+    table["x"] = [500_000.001, 500_000.002, 500_001.003]
+    table["y"] = [5_300_000.004, 5_300_002.005, 5_300_003.006]
+    table["z"] = [400.0, 400.5, 401.0]
+    element = plyfile.PlyElement.describe(table, "vertex")
+    plyfile.PlyData([element]).write(str(tmp_path / "a.ply"))
+    read = read_ply(tmp_path / "a.ply")
+    assert (read.origin == np.round(read.origin)).all()
+    world = read.gaussians.means.double().numpy() + read.origin
+    expected = np.stack([table[axis] for axis in "xyz"], 1)
+    np.testing.assert_allclose(world, expected, atol=1e-6)  # float32 at a few metres: 2.4e-7
+
+
+def test_recentring_origin_ignores_floaters_and_keeps_near_scenes() -> None:
+    points = np.array([[1.0, 2, 3]] * 5 + [[1e9, 0, 0], [np.nan, 0, 0]])
+    assert (recentring_origin(points) == 0).all()
+    assert recentring_origin(points + np.array([2000.4, 0, 0])).tolist() == [2001, 2, 3]
+    assert (recentring_origin(np.full((2, 3), np.inf)) == 0).all()
+
+
+def test_unusable_gaussians_are_left_out_and_counted(tmp_path: Path) -> None:
+    rows = np.ones((6, len(BASIC)), np.float32)
+    rows[1, 0] = np.nan
+    rows[2, BASIC.index("scale_0")] = 500  # exp overflows
+    rows[3, BASIC.index("rot_0") :] = 0
+    read = read_ply(write_rows(tmp_path / "a.ply", BASIC, rows))
+    assert len(read.gaussians) == 3
+    assert [p.split(": ")[1] for p in read.problems] == [
+        "left out 2 of 6 Gaussians with NaN or infinite values",
+        "left out 1 of 6 Gaussians with a zero quaternion",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("names", "extra", "message"),
+    [
+        (["x", "y", "z", "red", "green", "blue"], "", "misses opacity, scale_0.*point cloud"),
+        (["x", "y", "z"], "element face 0", "This is a mesh"),
+        ([n for n in BASIC if n != "scale_2"], "", "misses scale_2.*2D Gaussians"),
+        (["packed_position"], "", "export it as uncompressed"),
+        ([], "", "it has no properties"),
+        ([*BASIC, *(f"f_rest_{i}" for i in range(10))], "", r"\(0, 9, 24, 45\).*got 10"),
+        ([*BASIC, *(f"f_rest_{i}" for i in range(1, 10))], "", "numbered without gaps"),
+    ],
+)
+def test_other_ply_files_are_named(
+    tmp_path: Path, names: list[str], extra: str, message: str
+) -> None:
+    path = write_rows(tmp_path / "a.ply", names, np.zeros((2, len(names))), extra=extra)
+    with pytest.raises(SceneError, match=message):
+        read_ply(path)
+
+
+def test_other_element_names_are_listed(tmp_path: Path) -> None:
+    path = tmp_path / "a.ply"
+    write_ply(path, random_gaussians(3, 0))
+    path.write_bytes(path.read_bytes().replace(b"element vertex", b"element vertex_background"))
+    with pytest.raises(SceneError, match=r"expected an element 'vertex'.*'vertex_background'"):
+        read_ply(path)
+    assert len(read_ply(path, element="vertex_background").gaussians) == 3
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_truncated_ply_says_how_much_there_is(tmp_path: Path, degree: int) -> None:
+    path = tmp_path / "a.ply"
+    write_ply(path, random_gaussians(100, degree))
+    row = 4 * (17 + 3 * ((degree + 1) ** 2 - 1))
+    path.write_bytes(path.read_bytes()[: -row - 1])
+    with pytest.raises(SceneError, match=r"announces 100 rows.*ends after 98 of them.*truncated"):
+        read_ply(path)
+
+
+@pytest.mark.parametrize("encoding", ["binary_little_endian", "ascii"])
+def test_a_lying_count_allocates_nothing(tmp_path: Path, encoding: str) -> None:
+    path = write_rows(tmp_path / "a.ply", BASIC, np.ones((2, len(BASIC))), count=10**17)
+    path.write_bytes(path.read_bytes().replace(b"binary_little_endian", encoding.encode()))
+    tracemalloc.start()
+    with pytest.raises(SceneError, match="100000000000000000 rows"):
+        read_ply(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 4_000_000  # the header buffer alone may take 1 MiB
+
+
+def test_zero_rows_and_surplus_bytes(tmp_path: Path) -> None:
+    with pytest.raises(SceneError, match="has 0 rows"):
+        read_ply(write_rows(tmp_path / "a.ply", BASIC, np.zeros((0, 14))))
+    path = write_rows(tmp_path / "b.ply", BASIC, np.ones((5, 14)), count=3)
+    read = read_ply(path)
+    assert len(read.gaussians) == 3
+    assert f"{2 * 14 * 4} bytes follow" in read.problems[0]
+
+
+def test_lists_are_refused_only_where_they_matter(tmp_path: Path) -> None:
+    table = np.ones(2, dtype=[(n, "f4") for n in BASIC])
+    faces = np.empty(1, dtype=[("idx", "O")])
+    faces["idx"][0] = np.array([0, 1, 1], dtype="i4")
+    vertex = plyfile.PlyElement.describe(table, "vertex")
+    face = plyfile.PlyElement.describe(faces, "face", len_types={"idx": "u1"})
+    plyfile.PlyData([vertex, face]).write(str(tmp_path / "after.ply"))
+    assert len(read_ply(tmp_path / "after.ply").gaussians) == 2
+    plyfile.PlyData([face, vertex]).write(str(tmp_path / "before.ply"))
+    with pytest.raises(SceneError, match="'face' has list properties"):
+        read_ply(tmp_path / "before.ply")
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "neither a .ply"),
+        (b"ply\n", "no 'end_header'"),
+        (b"ply\nend_header\n", "names no format"),
+        (b"ply\nformat text 1.0\nend_header\n", "line 2 of the .ply header"),
+        (b"ply\nformat ascii 1.0\nelement vertex -3\nend_header\n", "line 3"),
+        (b"ply\nformat ascii 1.0\nproperty float x\nend_header\n", "line 3"),
+        (b"ply\nformat ascii 1.0\nelement v 1\nproperty half x\nend_header\n", "line 4"),
+        (
+            b"ply\nformat ascii 1.0\nelement v 1\nproperty int x\nproperty int x\nend_header\n",
+            "repeats the property 'x'",
+        ),
+    ],
+)
+def test_bad_headers_name_the_line(tmp_path: Path, content: bytes, message: str) -> None:
+    (tmp_path / "a.ply").write_bytes(content)
+    with pytest.raises(SceneError, match=message):
+        read_splats(tmp_path / "a.ply")
+
+
+def test_bad_ascii_rows_name_the_row(tmp_path: Path) -> None:
+    header = ["ply", "format ascii 1.0", "element vertex 2"]
+    header += [f"property float {n}" for n in BASIC] + ["end_header"]
+    good = " ".join(["1"] * 14)
+    for row, message in [("1 2", "row 1 .* must have 14 values.*got 2"), ("x" + good[1:], "not a")]:
+        (tmp_path / "a.ply").write_text("\n".join([*header, good, row + " " * 40]) + "\n")
+        with pytest.raises(SceneError, match=message):
+            read_ply(tmp_path / "a.ply")
+
+
+WORDS = ["ply", "format", "ascii", "binary_little_endian", "binary_big_endian", "1.0", "element",
+         "vertex", "property", "list", "float", "uchar", "double", "x", "3", "0", "-1", "99999999",
+         "9" * 5000, "comment", "end_header", "\r", "é", *BASIC]  # fmt: skip
+LINES = st.lists(st.lists(st.sampled_from(WORDS), max_size=5).map(" ".join), max_size=14)
+
+
+@settings(max_examples=150, deadline=None)
+@given(lines=LINES, tail=st.binary(max_size=80), cut=st.integers(0, 400))
+def test_any_header_reads_or_raises_a_scene_error(lines: list[str], tail: bytes, cut: int) -> None:
+    content = ("ply\n" + "\n".join([*lines, "end_header\n"])).encode() + tail
+    _read_or_scene_error(content)
+    _read_or_scene_error(content[:cut])
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    flips=st.lists(st.tuples(st.integers(0, 10_000), st.integers(0, 255)), max_size=12),
+    cut=st.integers(0, 2000),
+)
+def test_any_damage_reads_or_raises_a_scene_error(flips: list[tuple[int, int]], cut: int) -> None:
+    """Flipped bytes in a good file, header and body."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "a.ply"
+        write_ply(path, random_gaussians(9, 1))
+        content = bytearray(path.read_bytes())
+    for position, value in flips:
+        content[position % len(content)] = value
+    _read_or_scene_error(bytes(content))
+    _read_or_scene_error(bytes(content[:cut]))
+
+
+def _read_or_scene_error(content: bytes) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "a.ply"
+        path.write_bytes(content)
+        with contextlib.suppress(SceneError):
+            header = read_ply_header(path)
+            for element in header.elements:
+                list(iterate_rows(header, element.name))
+        with contextlib.suppress(SceneError):
+            assert len(read_splats(path).gaussians) > 0
+
+
+def test_splat_record_definition(tmp_path: Path) -> None:
+    record = struct.pack("<6f8B", 1, 2, 3, 0.1, 0.2, 0.3, 255, 0, 51, 102, 128, 255, 128, 128)
+    (tmp_path / "a.splat").write_bytes(record)
+    got = read_splats(tmp_path / "a.splat").gaussians
+    assert got.means.tolist() == [[1, 2, 3]]
+    torch.testing.assert_close(got.scales, torch.tensor([[0.1, 0.2, 0.3]]))
+    torch.testing.assert_close(got.opacities, torch.tensor([0.4]))
+    colour = 0.5 + 0.28209479177387814 * got.sh[0, 0]
+    torch.testing.assert_close(colour, torch.tensor([1.0, 0.0, 0.2]), rtol=0, atol=1e-6)
+    assert got.quats.tolist() == [[0, 1, 0, 0]]
+
+
+def test_splat_round_trip_within_its_quantisation(tmp_path: Path) -> None:
+    written = random_gaussians(500, 0)
+    write_splat(tmp_path / "a.splat", written)
+    got = read_splat(tmp_path / "a.splat").gaussians
+    assert torch.equal(got.means, written.means)
+    assert torch.equal(got.scales, written.scales)
+    # half a step of 1/255; half a step of 1/128 in each part, a whole one where 1.0 meets 255
+    torch.testing.assert_close(got.opacities, written.opacities, rtol=0, atol=0.5 / 255 + 1e-6)
+    assert ((got.quats * written.quats).sum(1).abs() > 1 - 2 / 128).all()
+    write_splat(tmp_path / "b.splat", got)
+    assert (tmp_path / "b.splat").read_bytes()[:24] == (tmp_path / "a.splat").read_bytes()[:24]
+
+
+def test_splat_drops_view_dependence_aloud(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    write_splat(tmp_path / "a.splat", random_gaussians(3, 1))
+    assert "SH bands above 0 are dropped" in caplog.text
+
+
+def test_bad_splat_files(tmp_path: Path) -> None:
+    path = tmp_path / "a.splat"
+    path.write_bytes(b"\0" * 70)
+    with pytest.raises(SceneError, match=r"70 bytes = 2 records and 6 bytes"):
+        read_splats(path)
+    path.write_bytes(b"")
+    with pytest.raises(SceneError, match="0 bytes"):
+        read_splats(path)
+    path.write_bytes(np.random.default_rng(0).bytes(3200))
+    with pytest.raises(SceneError, match=r"probably no \.splat"):
+        read_splats(path)
+    (tmp_path / "a.spz").write_bytes(b"\x1f\x8b")
+    with pytest.raises(SceneError, match="convert other splat formats"):
+        read_splats(tmp_path / "a.spz")
+    for read in (read_splats, read_ply):
+        with pytest.raises(SceneError, match="no such file"):
+            read(tmp_path / "absent.ply")
+
+
+@pytest.mark.parametrize("write", [write_ply, write_splat])
+def test_writing_is_atomic(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, write) -> None:
+    path = tmp_path / "a.ply"
+    path.write_bytes(b"old")
+
+    def fail(_descriptor: int) -> None:
+        raise OSError("disk full")
+
+    monkeypatch.setattr(os, "fsync", fail)
+    with pytest.raises(OSError, match="disk full"):
+        write(path, random_gaussians(3, 0))
+    assert path.read_bytes() == b"old"
+    assert [p.name for p in tmp_path.iterdir()] == ["a.ply"]
+
+
+def test_notes_must_be_one_line(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="one printable line"):
+        write_ply(tmp_path / "a.ply", random_gaussians(1, 0), notes={"up": "+z\nelement x 1"})
+
+
+def test_real_tiles(shared_dir: Path) -> None:
+    for name, count in [("tile_x000_y002", 121_833), ("tile_x001_y001", 88_325)]:
+        read = read_splats(shared_dir / "data" / "splats" / f"{name}.splat")
+        assert len(read.gaussians) == count
+        assert read.problems == ()
