@@ -1,0 +1,90 @@
+import dataclasses
+
+import pytest
+import torch
+
+from augment.errors import SceneError
+from augment.plan import Plan, make_plan
+from augment.scene import Gaussians, Scene
+from augment.sky import ConstantSky
+from recipes.schema import Output, Recipe, Smog, Weather
+
+
+def scene(**changes) -> Scene:
+    gaussians = Gaussians(
+        means=torch.zeros(1, 3),
+        quats=torch.tensor([[1.0, 0, 0, 0]]),
+        scales=torch.ones(1, 3),
+        opacities=torch.ones(1),
+        sh=torch.zeros(1, 1, 3),
+    )
+    base = Scene("s", "test:", gaussians, (), ConstantSky(torch.zeros(3)), (), ground_z_m=0.25)
+    return dataclasses.replace(base, **changes)
+
+
+def plan_of(smog: Smog | None = None, **output) -> Plan:
+    output.setdefault("depth", "none")
+    return make_plan(Recipe(weather=Weather(smog=smog), output=Output(**output)), scene())
+
+
+def running(plan: Plan) -> set[str]:
+    return {step.name for step in plan.steps if step.runs}
+
+
+def test_no_weather_asks_for_colour_and_nothing_else():
+    plan = plan_of()
+    assert plan.buffers == {"rgb", "alpha"}
+    assert plan.smog is None
+    assert running(plan) == {"rasterise", "sky"}
+
+
+def test_smog_without_density_is_the_clean_plan():
+    clean, nothing = plan_of(), plan_of(Smog(extinction_per_m=0.0))
+    assert nothing.buffers == clean.buffers and nothing.smog is None
+    assert running(nothing) == running(clean)
+
+
+def test_smog_per_gaussian_needs_no_depth_and_uniform_smog_no_sky():
+    plan = plan_of(Smog(visibility_m=100))
+    assert plan.buffers == {"rgb", "alpha"}
+    assert running(plan) == {"rasterise", "smog per Gaussian"}
+    assert plan.smog_in_splats is not None
+    assert plan.smog_in_splats.sigma_per_m == pytest.approx(0.03912)
+
+
+def test_deferred_smog_needs_expected_depth():
+    plan = plan_of(Smog(visibility_m=100, model="deferred"))
+    assert plan.buffers == {"rgb", "alpha", "expected_depth"}
+    assert plan.smog_in_splats is None and plan.smog_on_buffers is not None
+
+
+def test_smog_with_a_scale_height_stands_on_the_road_and_shows_sky():
+    plan = plan_of(Smog(visibility_m=100, scale_height_m=30, base_height_m=2))
+    assert running(plan) == {"rasterise", "smog per Gaussian", "sky"}
+    assert plan.smog is not None and plan.smog.base_z_m == 2.25
+
+
+def test_outputs_ask_for_their_buffer():
+    assert plan_of(depth="median").buffers == {"rgb", "alpha", "median_depth"}
+    assert plan_of(depth="expected").buffers == {"rgb", "alpha", "expected_depth"}
+    assert plan_of(semantic=True).buffers == {"rgb", "alpha", "splat_ids"}
+    assert plan_of(instance=True).buffers == {"rgb", "alpha", "splat_ids"}
+
+
+def test_a_scale_height_over_an_unknown_road_is_an_error_that_says_what_to_do():
+    recipe = Recipe(weather=Weather(smog=Smog(visibility_m=100, scale_height_m=30)))
+    with pytest.raises(SceneError, match="ground_z=HEIGHT"):
+        make_plan(recipe, scene(ground_z_m=None))
+
+
+def test_an_unknown_unit_is_said():
+    plan = make_plan(
+        Recipe(weather=Weather(smog=Smog(visibility_m=100))), scene(has_metric_scale=False)
+    )
+    assert any("not known to be a metre" in step.why for step in plan.steps)
+
+
+def test_a_plan_is_plain_data():
+    facts = plan_of(Smog(visibility_m=100)).as_dict()
+    assert facts["buffers"] == ["alpha", "rgb"]
+    assert {"name", "runs", "why"} == set(facts["steps"][0])
