@@ -1,0 +1,191 @@
+"""The public entry to rasterisation: checks the arguments, picks a backend, calls it."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import logging
+import math
+from collections.abc import Collection, Sequence
+from types import ModuleType
+
+import torch
+
+from augment.cameras import Camera
+from augment.errors import BackendUnavailable
+from augment.render.buffers import ALPHA, BUFFERS, RGB, RenderOutput
+from augment.render.constants import RasterSettings
+from augment.render.reference import rasterize_reference
+from augment.render.sh import MAX_DEGREE
+from augment.scene import Gaussians, PosedGaussians
+from augment.weather.smog import SmogMedium
+
+logger = logging.getLogger(__name__)
+
+AUTO, REFERENCE, CPU = "auto", "reference", "cpu"
+BACKENDS = (AUTO, REFERENCE, CPU)
+
+
+def rasterize(
+    parts: Sequence[PosedGaussians],
+    camera: Camera,
+    *,
+    buffers: Collection[str] = (RGB, ALPHA),
+    settings: RasterSettings = RasterSettings(),  # noqa: B008 - frozen, so sharing it is safe
+    smog: SmogMedium | None = None,
+    backend: str = AUTO,
+) -> RenderOutput:
+    """Image buffers of the parts seen by the camera; the sky is not part of them.
+
+    buffers: names from augment.render.buffers; the others are None in the result. splat_ids counts
+    through the parts in the order given. smog: fades every splat's colour towards the airlight by
+    its own distance. backend: "cpu" (numba, float32, no gradients), "reference" (torch,
+    differentiable, float32 or float64), or "auto": cpu where it can do the job, else reference.
+
+    Raises:
+        ValueError, TypeError: an argument no backend, or not the one named, can take.
+        BackendUnavailable: the backend named cannot run on this machine.
+    """
+    _check_arguments(parts, camera, buffers, settings)
+    names = frozenset(buffers)
+    if _choose(parts, backend) == REFERENCE:
+        return rasterize_reference(parts, camera, names, settings, smog)
+    cpu = _import_cpu()
+    return cpu.rasterize_cpu([_detached(p) for p in parts], camera, names, settings, smog)
+
+
+def available_backends() -> dict[str, str | None]:
+    """Every backend but "auto", with None where it can run and else the reason why it cannot."""
+    try:
+        _import_cpu()
+    except BackendUnavailable as error:
+        return {REFERENCE: None, CPU: str(error)}
+    return {REFERENCE: None, CPU: None}
+
+
+def _choose(parts: Sequence[PosedGaussians], backend: str) -> str:
+    """The backend to use; the first time a choice is made for a reason, it is logged."""
+    if backend not in BACKENDS:
+        raise ValueError(f"backend must be one of {', '.join(BACKENDS)}; got {backend!r}")
+    if backend == REFERENCE:
+        return REFERENCE
+    dtype = parts[0].gaussians.means.dtype
+    obstacle = None
+    if dtype != torch.float32:
+        obstacle = f"the Gaussians are {dtype}, it takes torch.float32"
+    elif torch.is_grad_enabled() and any(_requires_grad(p.gaussians) for p in parts):
+        obstacle = "gradients are asked for, it has none"
+    if backend == CPU:
+        if obstacle:
+            raise ValueError(
+                f"backend 'cpu' cannot render these Gaussians: {obstacle}; convert or detach "
+                f"them, or use backend 'auto' or 'reference'"
+            )
+        return CPU
+    if obstacle is None:
+        try:
+            _import_cpu()
+        except BackendUnavailable as error:
+            obstacle = str(error)
+    if obstacle:
+        _log_choice(REFERENCE, f"not cpu: {obstacle}", logging.WARNING)
+        return REFERENCE
+    _log_choice(CPU, "float32 without gradients", logging.INFO)
+    return CPU
+
+
+@functools.cache
+def _log_choice(backend: str, reason: str, level: int) -> None:
+    logger.log(level, "backend 'auto' renders with %r (%s)", backend, reason)
+
+
+def _import_cpu() -> ModuleType:
+    try:
+        from augment.render import cpu
+    except ImportError as error:
+        raise BackendUnavailable(
+            f"backend 'cpu' is unavailable: {error}. Install the package's dependencies (numba, "
+            f"tbb), or use backend 'reference', which needs torch only and is far slower"
+        ) from error
+    return cpu
+
+
+def _check_arguments(
+    parts: Sequence[PosedGaussians],
+    camera: Camera,
+    buffers: Collection[str],
+    settings: RasterSettings,
+) -> None:
+    if isinstance(buffers, str):
+        raise TypeError(f"buffers must be a collection of names; got the string {buffers!r}")
+    unknown = sorted(set(buffers) - set(BUFFERS))
+    if unknown or not buffers:
+        what = f"unknown buffers {', '.join(map(repr, unknown))}" if unknown else "no buffers"
+        raise ValueError(f"{what} asked for; known: {', '.join(BUFFERS)}")
+    _check_settings(settings)
+    if not isinstance(parts, Sequence) or not parts:
+        raise ValueError(
+            f"parts must be a non-empty sequence of PosedGaussians; got "
+            f"{'an empty one' if isinstance(parts, Sequence) else type(parts).__name__}"
+        )
+    first = parts[0].gaussians.means
+    if first.dtype not in (torch.float32, torch.float64):
+        raise ValueError(f"Gaussians must be float32 or float64; got {first.dtype}")
+    for number, part in enumerate(parts):
+        means = part.gaussians.means
+        if means.dtype != first.dtype:
+            raise ValueError(
+                f"all parts must share one dtype; part 0 is {first.dtype}, "
+                f"part {number} is {means.dtype}"
+            )
+        if means.device.type != "cpu":
+            raise ValueError(f"part {number} is on {means.device}; move it with .cpu()")
+        _check_pose(part, number, camera)
+
+
+def _check_pose(part: PosedGaussians, number: int, camera: Camera) -> None:
+    pose = part.world_from_part
+    if pose is None:
+        return
+    if pose.dtype != torch.float64 or tuple(pose.shape) != (4, 4):
+        raise ValueError(
+            f"part {number}: world_from_part must be float64 [4, 4]; "
+            f"got {pose.dtype} {list(pose.shape)}"
+        )
+    if not bool(torch.isfinite(pose).all()):
+        raise ValueError(
+            f"part {number} (instance {part.instance_id}): world_from_part holds NaN or infinite "
+            f"values at {camera.timestamp_ns} ns; check the actor's track"
+        )
+
+
+def _check_settings(settings: RasterSettings) -> None:
+    if not (math.isfinite(settings.near_m) and settings.near_m > 0):
+        raise ValueError(f"settings.near_m must be finite and > 0 (metres); got {settings.near_m}")
+    if not 0 < settings.alpha_max < 1:
+        raise ValueError(
+            f"settings.alpha_max must lie between 0 and 1 (usual: 0.999 or 0.99), since a splat "
+            f"of alpha 1 would never be blended; got {settings.alpha_max}"
+        )
+    if settings.sh_degree is not None and not 0 <= settings.sh_degree <= MAX_DEGREE:
+        raise ValueError(
+            f"settings.sh_degree must be None or 0 to {MAX_DEGREE}; got {settings.sh_degree}"
+        )
+
+
+def _requires_grad(gaussians: Gaussians) -> bool:
+    return any(tensor.requires_grad for tensor in _floats(gaussians).values())
+
+
+def _floats(gaussians: Gaussians) -> dict[str, torch.Tensor]:
+    return {
+        name: getattr(gaussians, name) for name in ("means", "quats", "scales", "opacities", "sh")
+    }
+
+
+def _detached(part: PosedGaussians) -> PosedGaussians:
+    """The part without autograd, which numpy would refuse; the same object where it has none."""
+    if not _requires_grad(part.gaussians):
+        return part
+    tensors = {name: tensor.detach() for name, tensor in _floats(part.gaussians).items()}
+    return dataclasses.replace(part, gaussians=dataclasses.replace(part.gaussians, **tensors))

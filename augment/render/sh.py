@@ -1,0 +1,97 @@
+"""Real spherical harmonics of degrees 0 to 3 in the order and signs that splats are trained with.
+
+Band l holds 2 l + 1 functions, m = -l .. l, orthonormal over the sphere, with the Condon-Shortley
+phase: band 1 is (-y, z, -x) times sqrt(3 / 4 pi). K = (degree + 1)^2 counts all bands.
+Green 2003, "Spherical harmonic lighting: the gritty details", lists the polynomials.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+MAX_DEGREE = 3
+SH_C0 = 0.5 * math.sqrt(1 / math.pi)  # the constant function of band 0
+
+_C1 = math.sqrt(3 / (4 * math.pi))
+_C2_XY = math.sqrt(15 / (4 * math.pi))
+_C2_ZZ = math.sqrt(5 / (16 * math.pi))
+_C3_CUBIC = math.sqrt(35 / (32 * math.pi))
+_C3_XYZ = math.sqrt(105 / (4 * math.pi))
+_C3_ZZ = math.sqrt(21 / (32 * math.pi))
+_C3_ZZZ = math.sqrt(7 / (16 * math.pi))
+
+
+def sh_basis(directions: Float[Tensor, "*B 3"], degree: int) -> Float[Tensor, "*B K"]:
+    """Every basis function up to `degree` at unit directions."""
+    if not 0 <= degree <= MAX_DEGREE:
+        raise ValueError(f"degree must be 0 to {MAX_DEGREE}; got {degree}")
+    x, y, z = directions.unbind(-1)
+    xx, yy, zz = x * x, y * y, z * z
+    values = [torch.full_like(x, SH_C0)]
+    if degree >= 1:
+        values += [-_C1 * y, _C1 * z, -_C1 * x]
+    if degree >= 2:
+        values += [
+            _C2_XY * x * y,
+            -_C2_XY * y * z,
+            _C2_ZZ * (2 * zz - xx - yy),
+            -_C2_XY * x * z,
+            0.5 * _C2_XY * (xx - yy),
+        ]
+    if degree >= 3:
+        values += [
+            -_C3_CUBIC * y * (3 * xx - yy),
+            _C3_XYZ * x * y * z,
+            -_C3_ZZ * y * (4 * zz - xx - yy),
+            _C3_ZZZ * z * (2 * zz - 3 * xx - 3 * yy),
+            -_C3_ZZ * x * (4 * zz - xx - yy),
+            0.5 * _C3_XYZ * z * (xx - yy),
+            -_C3_CUBIC * x * (xx - 3 * yy),
+        ]
+    return torch.stack(values, -1)
+
+
+def evaluate_sh(
+    sh: Float[Tensor, "N K 3"], directions: Float[Tensor, "N 3"], max_degree: int | None = None
+) -> Float[Tensor, "N 3"]:
+    """Sum of sh times basis for every splat; 0.5 is not added and nothing is clamped.
+
+    directions: unit vectors from the eye to the splat. max_degree: higher bands are left out;
+    None takes all that sh holds.
+    """
+    degree = math.isqrt(sh.shape[1]) - 1
+    if max_degree is not None:
+        degree = min(degree, max_degree)
+    basis = sh_basis(directions, degree)  # [N, K']
+    return (basis[:, :, None] * sh[:, : basis.shape[1]]).sum(1)
+
+
+def rotate_sh(sh: Float[Tensor, "N K 3"], rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "N K 3"]:
+    """Coefficients of the function turned by `rotation`: f'(R d) = f(d), exact in every band.
+
+    A turn mixes the functions of one band only, so each band's matrix follows from the values at
+    more directions than it has functions: Y(d) c' = Y(R^T d) c. It is solved in float64.
+    """
+    degree = math.isqrt(sh.shape[1]) - 1
+    directions = _sphere_samples(4 * sh.shape[1])
+    turned = directions @ rotation.to(torch.float64)  # rows R^T d
+    here, there = sh_basis(directions, degree), sh_basis(turned, degree)
+    bands = []
+    for band in range(degree + 1):
+        of_band = slice(band * band, (band + 1) ** 2)
+        matrix = torch.linalg.lstsq(here[:, of_band], there[:, of_band]).solution
+        bands.append(torch.einsum("ij,njc->nic", matrix.to(sh.dtype), sh[:, of_band]))
+    return torch.cat(bands, 1)
+
+
+def _sphere_samples(count: int) -> Float[Tensor, "S 3"]:
+    """Evenly spread unit vectors on a Fibonacci spiral, float64: well conditioned for any band."""
+    step = torch.arange(count, dtype=torch.float64)
+    z = 1 - (2 * step + 1) / count
+    angle = step * (math.pi * (3 - math.sqrt(5)))
+    radius = torch.sqrt(1 - z * z)
+    return torch.stack([radius * torch.cos(angle), radius * torch.sin(angle), z], -1)
