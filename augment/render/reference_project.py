@@ -1,0 +1,179 @@
+"""Projection of the reference rasteriser: Gaussians of a scene to splats of one image.
+
+Positions are taken relative to the eye before anything else, so that float32 keeps its digits in
+scenes that are kilometres wide. Zwicker et al. 2001, "EWA volume splatting", with the clamps and
+thresholds of gsplat 1.5.3.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+from augment.cameras import Camera
+from augment.geometry import rotmat_from_quat, transform_points
+from augment.render.constants import ALPHA_MIN, COV2D_BLUR, TAN_FOV_MARGIN, RasterSettings
+from augment.render.sh import evaluate_sh
+from augment.scene import Gaussians, PosedGaussians
+from augment.weather.smog import SmogMedium, blend_airlight, optical_depth
+
+
+@dataclass(frozen=True, eq=False)
+class Splats:
+    """M Gaussians seen by one camera.
+
+    ids: index counted through all parts. depths: z, metres. means2d: pixels. covs2d: xx, xy, yy,
+    px^2, blurred. dets: their determinants. opacities: after antialiasing. colors: display-encoded
+    and >= 0, in the smog where there is any; None where no colour was asked for.
+    """
+
+    ids: Int64[Tensor, "M"]
+    depths: Float[Tensor, "M"]
+    means2d: Float[Tensor, "M 2"]
+    covs2d: Float[Tensor, "M 3"]
+    dets: Float[Tensor, "M"]
+    opacities: Float[Tensor, "M"]
+    colors: Float[Tensor, "M 3"] | None
+
+    def __len__(self) -> int:
+        return self.ids.shape[0]
+
+    def select(self, index: Tensor) -> Splats:
+        """The splats at the given indices or mask, in that order."""
+        fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        return Splats(**{k: None if v is None else v[index] for k, v in fields.items()})
+
+
+def project_parts(
+    parts: Sequence[PosedGaussians],
+    camera: Camera,
+    settings: RasterSettings,
+    smog: SmogMedium | None = None,
+    *,
+    with_color: bool = True,
+) -> Splats:
+    """Splats of all parts that are in front of the camera and opaque enough, in index order."""
+    projected: list[Splats] = []
+    first_id = 0
+    for part in parts:
+        projected.append(_project_part(part, first_id, camera, settings, smog, with_color))
+        first_id += len(part.gaussians)
+    if len(projected) == 1:
+        return projected[0]
+    joined = {}
+    for field in dataclasses.fields(Splats):
+        values = [getattr(splats, field.name) for splats in projected]
+        joined[field.name] = None if values[0] is None else torch.cat(values)
+    return Splats(**joined)
+
+
+def _project_part(
+    part: PosedGaussians,
+    first_id: int,
+    camera: Camera,
+    settings: RasterSettings,
+    smog: SmogMedium | None,
+    with_color: bool,
+) -> Splats:
+    camera_from_part = camera.camera_from_world
+    if part.world_from_part is not None:
+        camera_from_part = camera_from_part @ part.world_from_part
+    rotation = camera_from_part[:3, :3].to(part.gaussians.means.dtype)
+    offsets = _offsets_from_eye(part.gaussians.means, camera_from_part)
+    depths = offsets @ rotation[2]
+    kept = (depths >= settings.near_m) & (part.gaussians.opacities >= ALPHA_MIN)
+    index = torch.nonzero(kept).squeeze(-1)
+
+    gaussians, offsets, depths = part.gaussians.select(index), offsets[index], depths[index]
+    points = torch.cat([offsets @ rotation[:2].T, depths[:, None]], 1)  # in the camera
+    axes = rotation @ rotmat_from_quat(gaussians.quats) * gaussians.scales[:, None, :]  # [M, 3, 3]
+    covs2d, det_sharp = _project_covariances(points, axes, camera)
+    # The same product written as a sum of positive terms, so that no digits cancel.
+    dets = det_sharp + COV2D_BLUR * (covs2d[:, 0] + covs2d[:, 2]) + COV2D_BLUR**2
+    opacities = gaussians.opacities
+    if settings.antialiased:
+        tiny = torch.finfo(dets.dtype).tiny  # the slope of sqrt is infinite at 0
+        opacities = opacities * torch.sqrt((det_sharp / dets).clamp_min(tiny))
+    return Splats(
+        ids=index + first_id,
+        depths=depths,
+        means2d=_project_points(points, camera),
+        covs2d=covs2d + torch.tensor([COV2D_BLUR, 0, COV2D_BLUR], dtype=covs2d.dtype),
+        dets=dets,
+        opacities=opacities,
+        colors=_colors(gaussians, offsets, part, camera, settings, smog) if with_color else None,
+    )
+
+
+def _offsets_from_eye(
+    means: Float[Tensor, "N 3"], camera_from_part: Float[Tensor, "4 4"]
+) -> Float[Tensor, "N 3"]:
+    """Means minus the camera's centre, in the part's axes.
+
+    The centre is the point that the transform takes to the origin, also where a rotation read from
+    a file is orthonormal to seven digits only. It is subtracted in two steps, since it rarely is a
+    float32 number.
+    """
+    eye = torch.linalg.solve(camera_from_part[:3, :3], -camera_from_part[:3, 3])
+    coarse = eye.to(means.dtype)
+    return (means - coarse) - (eye - coarse).to(means.dtype)
+
+
+def _project_points(points: Float[Tensor, "M 3"], camera: Camera) -> Float[Tensor, "M 2"]:
+    x, y, z = points.unbind(-1)
+    return torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], -1)
+
+
+def _project_covariances(
+    points: Float[Tensor, "M 3"], axes: Float[Tensor, "M 3 3"], camera: Camera
+) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M"]]:
+    """Covariances (xx, xy, yy) in px^2, not blurred, and their determinants.
+
+    axes: columns are the semi-axes in the camera, metres. The projection is linearised at the
+    splat's centre, or at the nearest point within a margin around the image where it lies outside.
+    """
+    z = points[:, 2]
+    u = _clamp_to_image(points[:, 0] / z, camera.cx, camera.fx, camera.width)
+    v = _clamp_to_image(points[:, 1] / z, camera.cy, camera.fy, camera.height)
+    right = (camera.fx / z)[:, None] * (axes[:, 0] - u[:, None] * axes[:, 2])  # [M, 3]
+    down = (camera.fy / z)[:, None] * (axes[:, 1] - v[:, None] * axes[:, 2])
+    covs2d = torch.stack([(right * right).sum(1), (right * down).sum(1), (down * down).sum(1)], -1)
+    # Lagrange's identity: xx yy - xy^2 without its cancellation, which needles would suffer from.
+    return covs2d, torch.linalg.cross(right, down).square().sum(1)
+
+
+def _clamp_to_image(tangents: Tensor, centre: float, focal: float, size: int) -> Tensor:
+    margin = TAN_FOV_MARGIN * 0.5 * size / focal
+    return tangents.clamp(-(centre / focal + margin), (size - centre) / focal + margin)
+
+
+def _colors(
+    gaussians: Gaussians,
+    offsets: Float[Tensor, "M 3"],
+    part: PosedGaussians,
+    camera: Camera,
+    settings: RasterSettings,
+    smog: SmogMedium | None,
+) -> Float[Tensor, "M 3"]:
+    """max(SH + 0.5, 0), seen through the smog. offsets: from the eye, in the part's axes."""
+    directions = torch.nn.functional.normalize(offsets, dim=-1)
+    colors = (evaluate_sh(gaussians.sh, directions, settings.sh_degree) + 0.5).clamp_min(0)
+    if smog is None:
+        return colors
+    heights = None
+    if smog.scale_height_m is not None:
+        heights = gaussians.means[:, 2]
+        if part.world_from_part is not None:
+            heights = transform_points(part.world_from_part, gaussians.means)[:, 2]
+    tau = optical_depth(smog, offsets.norm(dim=-1), float(camera.centre[2]), heights)
+    return blend_airlight(colors, tau, smog)
+
+
+def order_by_depth(splats: Splats) -> Splats:
+    """Nearest first by float32 z, whatever the dtype; equal depths stay in index order."""
+    return splats.select(torch.argsort(splats.depths.detach().float(), stable=True))

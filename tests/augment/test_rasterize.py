@@ -1,0 +1,195 @@
+import dataclasses
+import logging
+import re
+
+import pytest
+import torch
+
+from augment.errors import BackendUnavailable
+from augment.render import rasterize as module
+from augment.render.buffers import BUFFERS
+from augment.render.constants import RasterSettings
+from augment.render.rasterize import available_backends, rasterize
+from augment.scene import Gaussians, PosedGaussians
+from augment.weather.smog import SmogMedium
+from tests.assertions import assert_images_close
+from tests.scenes import camera_ahead, random_gaussians, slight_pose
+
+
+@pytest.fixture
+def parts():
+    return [
+        PosedGaussians(random_gaussians(150)),
+        PosedGaussians(random_gaussians(50, seed=1), slight_pose(), 1),
+    ]
+
+
+@pytest.fixture
+def fresh_log(caplog):
+    module._log_choice.cache_clear()
+    caplog.set_level(logging.INFO, logger=module.__name__)
+    return caplog
+
+
+def without_numba(monkeypatch):
+    def missing():
+        raise BackendUnavailable("backend 'cpu' is unavailable: no numba here")
+
+    monkeypatch.setattr(module, "_import_cpu", missing)
+
+
+def tracked(part):
+    sh = part.gaussians.sh.clone().requires_grad_()
+    return dataclasses.replace(part, gaussians=dataclasses.replace(part.gaussians, sh=sh))
+
+
+def doubled(part):
+    names = ("means", "quats", "scales", "opacities", "sh")
+    tensors = {name: getattr(part.gaussians, name).double() for name in names}
+    return dataclasses.replace(part, gaussians=Gaussians(**tensors))
+
+
+# ---- what comes back --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+def test_only_the_buffers_asked_for(parts, backend):
+    for name in BUFFERS:
+        output = rasterize(parts, camera_ahead(), buffers=[name], backend=backend)
+        assert [n for n in BUFFERS if getattr(output, n) is not None] == [name]
+    output = rasterize(parts, camera_ahead(), backend=backend)
+    assert [n for n in BUFFERS if getattr(output, n) is not None] == ["rgb", "alpha"]
+
+
+def test_backends_draw_the_same_picture(parts):
+    camera, smog = camera_ahead(61, 43, 55.0), SmogMedium(0.05, (0.7, 0.7, 0.7), 20.0)
+    reference, cpu = (
+        rasterize(parts, camera, smog=smog, backend=name) for name in ("reference", "cpu")
+    )
+    # float32 in two orders of operations; flips at the 1/255 cut-off are allowed for
+    assert_images_close(cpu.rgb, reference.rgb, p999=1e-4, max_flips=3)
+    assert_images_close(cpu.alpha, reference.alpha, p999=1e-4, max_flips=3)
+
+
+# ---- choice of backend ------------------------------------------------------------------------
+
+
+def test_auto_takes_cpu_and_says_so_once(parts, fresh_log):
+    auto = rasterize(parts, camera_ahead())
+    rasterize(parts, camera_ahead())
+    assert torch.equal(auto.rgb, rasterize(parts, camera_ahead(), backend="cpu").rgb)
+    messages = [record.getMessage() for record in fresh_log.records]
+    assert messages == ["backend 'auto' renders with 'cpu' (float32 without gradients)"]
+
+
+def test_auto_takes_reference_where_gradients_are_asked_for(parts, fresh_log):
+    output = rasterize([parts[0], tracked(parts[1])], camera_ahead())
+    assert output.rgb.requires_grad
+    assert "gradients are asked for" in fresh_log.text
+
+
+def test_auto_takes_reference_for_float64(parts, fresh_log):
+    output = rasterize([doubled(part) for part in parts], camera_ahead())
+    assert output.rgb.dtype == torch.float64
+    assert "torch.float64" in fresh_log.text
+
+
+def test_gradients_that_nobody_records_do_not_slow_rendering_down(parts):
+    expected = rasterize(parts, camera_ahead(), backend="cpu")
+    with torch.no_grad():
+        output = rasterize([tracked(part) for part in parts], camera_ahead())
+    assert torch.equal(output.rgb, expected.rgb)
+
+
+def test_auto_goes_on_without_numba(parts, monkeypatch, fresh_log):
+    without_numba(monkeypatch)
+    auto = rasterize(parts, camera_ahead())
+    assert torch.equal(auto.rgb, rasterize(parts, camera_ahead(), backend="reference").rgb)
+    assert [record.levelname for record in fresh_log.records] == ["WARNING"]
+    assert "no numba here" in fresh_log.text
+
+
+def test_naming_a_backend_that_is_missing_raises(parts, monkeypatch):
+    without_numba(monkeypatch)
+    with pytest.raises(BackendUnavailable, match="no numba here"):
+        rasterize(parts, camera_ahead(), backend="cpu")
+    assert available_backends() == {
+        "reference": None,
+        "cpu": "backend 'cpu' is unavailable: no numba here",
+    }
+
+
+def test_a_failing_import_names_the_reason_and_the_way_out(monkeypatch):
+    import sys
+
+    import augment.render
+
+    monkeypatch.delattr(augment.render, "cpu", raising=False)
+    monkeypatch.setitem(sys.modules, "augment.render.cpu", None)
+    with pytest.raises(BackendUnavailable, match=r"unavailable: .*numba, tbb.*'reference'"):
+        module._import_cpu()
+
+
+# ---- refused ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        (
+            {"buffers": ["rgb", "depth"]},
+            ValueError,
+            "unknown buffers 'depth' asked for; known: ",
+        ),
+        ({"buffers": []}, ValueError, "no buffers asked for; known: rgb, alpha"),
+        ({"buffers": "rgb"}, TypeError, "collection of names; got the string 'rgb'"),
+        ({"backend": "gpu"}, ValueError, "one of auto, reference, cpu; got 'gpu'"),
+        ({"settings": RasterSettings(near_m=0.0)}, ValueError, "near_m must be finite and > 0"),
+        ({"settings": RasterSettings(alpha_max=1.0)}, ValueError, "alpha_max must lie between"),
+        ({"settings": RasterSettings(sh_degree=4)}, ValueError, "None or 0 to 3; got 4"),
+    ],
+)
+def test_arguments_that_are_refused(parts, arguments, error, message):
+    with pytest.raises(error, match=re.escape(message)):
+        rasterize(parts, camera_ahead(), **arguments)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda p: [], "non-empty sequence of PosedGaussians; got an empty one"),
+        (lambda p: [p[0], doubled(p[1])], "part 0 is torch.float32, part 1 is torch.float64"),
+        (lambda p: [dataclasses.replace(p[0], world_from_part=torch.eye(4))], "float64 [4, 4]"),
+        (
+            lambda p: [
+                p[0],
+                dataclasses.replace(p[1], world_from_part=p[1].world_from_part * 1e999),
+            ],
+            "part 1 (instance 1): world_from_part holds NaN or infinite values at 7 ns",
+        ),
+    ],
+    ids=["none", "mixed dtypes", "float32 pose", "infinite pose"],
+)
+def test_parts_that_are_refused(parts, change, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        rasterize(change(parts), camera_ahead(timestamp_ns=7))
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_a_generator_of_parts_is_refused(parts):
+    with pytest.raises(ValueError, match="sequence of PosedGaussians; got generator"):
+        rasterize((part for part in parts), camera_ahead())
+
+
+def test_cpu_refuses_what_it_cannot_do(parts):
+    with pytest.raises(ValueError, match=r"torch\.float64, it takes torch\.float32; convert"):
+        rasterize([doubled(parts[0])], camera_ahead(), backend="cpu")
+    with pytest.raises(ValueError, match="gradients are asked for, it has none; convert"):
+        rasterize([tracked(parts[0])], camera_ahead(), backend="cpu")
+
+
+def test_half_precision_is_refused(parts):
+    names = ("means", "quats", "scales", "opacities", "sh")
+    half = Gaussians(**{name: getattr(parts[0].gaussians, name).half() for name in names})
+    with pytest.raises(ValueError, match=r"float32 or float64; got torch\.float16"):
+        rasterize([PosedGaussians(half)], camera_ahead())
