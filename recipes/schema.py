@@ -1,6 +1,7 @@
 """What a recipe may say once its ranges are resolved to numbers.
 
-Every model is frozen and closed: an unknown key is an error, at every level. Units are in the names.
+Every model is frozen and closed: an unknown key is an error, at every level. Units are in the
+names. Numbers are strict: text, and true or false, never pass for a number.
 """
 
 from __future__ import annotations
@@ -10,12 +11,26 @@ import json
 import math
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, Strict, model_validator
+from pydantic.config import JsonDict
 
+VERSION = 1
 KOSCHMIEDER = 3.912  # -ln(0.02): visibility is where contrast falls to 2 %
+MAX_EXTINCTION_PER_M = 100.0  # nothing is seen through 10 cm of it
 
-Unit = Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)]
+Number = Annotated[float, Strict()]
+Whole = Annotated[int, Strict()]
+Flag = Annotated[bool, Strict()]
+Unit = Annotated[float, Strict(), Field(ge=0.0, le=1.0)]
 Colour = tuple[Unit, Unit, Unit]
+
+# In words of JSON Schema: one of the two is present and not null.
+_ONE_DENSITY: JsonDict = {
+    "oneOf": [
+        {"required": [name], "properties": {name: {"not": {"type": "null"}}}}
+        for name in ("visibility_m", "extinction_per_m")
+    ]
+}
 
 
 class _Closed(BaseModel):
@@ -25,44 +40,57 @@ class _Closed(BaseModel):
 class Smog(_Closed):
     """Fog, haze or smog: Beer-Lambert extinction towards one airlight colour."""
 
-    visibility_m: float | None = Field(
+    model_config = ConfigDict(json_schema_extra=_ONE_DENSITY)
+
+    visibility_m: Number | None = Field(
         default=None,
         gt=0,
         le=1e6,
-        description="Meteorological visibility, metres: 3.912 / extinction.",
+        description="Meteorological visibility at the base height: 3.912 / extinction.",
     )
-    extinction_per_m: float | None = Field(
+    extinction_per_m: Number | None = Field(
         default=None,
         ge=0,
-        le=100,
-        description="Extinction coefficient at the base height, 1/metre.",
+        le=MAX_EXTINCTION_PER_M,
+        description="Extinction coefficient at the base height.",
     )
     color: Colour = Field(
-        default=(0.76, 0.78, 0.80), description="Airlight colour, display-encoded sRGB in [0, 1]."
+        default=(0.76, 0.78, 0.80),
+        description="Airlight colour: red, green, blue, display-encoded sRGB.",
     )
-    scale_height_m: float | None = Field(
+    scale_height_m: Number | None = Field(
         default=None,
-        gt=0,
+        ge=0.1,
         le=1e5,
-        description="Height over which the density falls by e, metres; null for uniform smog.",
+        description="Height over which the density falls by e; null for uniform smog.",
     )
-    base_height_m: float = Field(
+    base_height_m: Number = Field(
         default=0.0,
         ge=-1e4,
         le=1e4,
-        description="Height above the road where extinction_per_m holds, metres.",
+        description="Height above the road where the density is the one given; "
+        "of no effect on uniform smog.",
     )
     model: Literal["per_gaussian", "deferred"] = Field(
         default="per_gaussian",
-        description="per_gaussian fogs every splat before blending; deferred fogs the finished buffers.",
+        description="per_gaussian fogs every splat before blending; "
+        "deferred fogs the finished buffers.",
     )
 
     @model_validator(mode="after")
     def _one_density(self) -> Smog:
-        if (self.visibility_m is None) == (self.extinction_per_m is None):
+        if self.visibility_m is not None and self.extinction_per_m is not None:
             raise ValueError(
-                "give either visibility_m or extinction_per_m, "
-                + ("not both" if self.visibility_m is not None else "one of them is needed")
+                "visibility_m and extinction_per_m both give the density: keep one of them"
+            )
+        if self.visibility_m is None and self.extinction_per_m is None:
+            raise ValueError(
+                "needs a density: give visibility_m (metres) or extinction_per_m (1/metre)"
+            )
+        if self.sigma_per_m > MAX_EXTINCTION_PER_M:
+            raise ValueError(
+                f"visibility_m = {self.visibility_m:g} means an extinction of "
+                f"{self.sigma_per_m:.3g}/metre; at most {MAX_EXTINCTION_PER_M:g}/metre is allowed"
             )
         return self
 
@@ -84,18 +112,20 @@ class Weather(_Closed):
 class Render(_Closed):
     """How the scene is drawn."""
 
-    scale: float = Field(
+    scale: Number = Field(
         default=1.0, gt=0, le=4, description="Resolution relative to the cameras'."
     )
-    near_m: float = Field(default=0.01, gt=0, le=100, description="Near plane, metres.")
-    alpha_max: float = Field(
+    near_m: Number = Field(
+        default=0.01, gt=0, le=100, description="Splats nearer to the camera's plane are dropped."
+    )
+    alpha_max: Number = Field(
         default=0.999,
         gt=0,
         le=0.9999,
-        description="Cap of one splat's alpha: 0.999, or 3DGS's 0.99.",
+        description="Cap of one splat's alpha: 0.999, or the original 3DGS's 0.99.",
     )
-    antialiased: bool = Field(default=False, description="Opacity compensated for the screen blur.")
-    sh_degree: int | None = Field(
+    antialiased: Flag = Field(default=False, description="Opacity compensated for the screen blur.")
+    sh_degree: Whole | None = Field(
         default=None, ge=0, le=3, description="Highest spherical-harmonics band; null for all."
     )
 
@@ -104,31 +134,39 @@ class Output(_Closed):
     """What is written for each image."""
 
     image: Literal["png", "jpg"] = Field(default="png", description="Image format.")
-    jpeg_quality: int = Field(default=92, ge=1, le=100, description="JPEG quality.")
+    jpeg_quality: Whole = Field(default=92, ge=1, le=100, description="Quality of jpg images.")
     depth: Literal["median", "expected", "none"] = Field(
         default="median", description="Depth estimator written as 16-bit PNG, metres x 256."
     )
-    semantic: bool = Field(default=False, description="Write the class of the heaviest splat.")
-    instance: bool = Field(
+    semantic: Flag = Field(default=False, description="Write the class of the heaviest splat.")
+    instance: Flag = Field(
         default=False, description="Write the actor number of the heaviest splat."
     )
-    lidar: bool = Field(default=True, description="Pass LiDAR sweeps through.")
-    labels: bool = Field(default=True, description="Pass 3D boxes through.")
+    lidar: Flag = Field(default=True, description="Pass LiDAR sweeps through.")
+    labels: Flag = Field(default=True, description="Pass 3D boxes through.")
 
 
 class Recipe(_Closed):
     """A recipe in numbers: together with the package version it determines every pixel."""
 
-    version: Literal[1] = 1
-    name: str = Field(default="recipe", pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")
-    seed: int = Field(default=0, ge=0, lt=2**63)
-    variant: int = Field(default=0, ge=0, description="Which draw from the ranges this is.")
+    version: Literal[1] = Field(default=VERSION, description="Version of the recipe format.")
+    name: str = Field(
+        default="recipe",
+        pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$",
+        description="Name used for folders and in the manifest; the file's name if absent.",
+    )
+    seed: Whole = Field(
+        default=0, ge=0, lt=2**63, description="What all random numbers are made from."
+    )
+    variant: Whole = Field(
+        default=0, ge=0, lt=2**31, description="Which draw from the ranges this is."
+    )
     weather: Weather = Weather()
     render: Render = Render()
     output: Output = Output()
 
     def canonical_json(self) -> str:
-        """One text per recipe: sorted keys, no spaces."""
+        """One text per recipe: sorted keys, no spaces, floats that read back to the same bits."""
         return json.dumps(self.model_dump(mode="json"), sort_keys=True, separators=(",", ":"))
 
     @property
@@ -137,11 +175,10 @@ class Recipe(_Closed):
         return hashlib.sha256(self.canonical_json().encode()).hexdigest()[:16]
 
     def weather_numbers(self) -> dict[str, float]:
-        """Flat numbers for the manifest, `smog.extinction_per_m` and so on; NaN where absent."""
+        """Flat numbers for the manifest: extinction 0 and scale height NaN where absent."""
         smog = self.weather.smog
+        height_m = None if smog is None else smog.scale_height_m
         return {
             "smog_extinction_per_m": 0.0 if smog is None else smog.sigma_per_m,
-            "smog_scale_height_m": math.nan
-            if smog is None or smog.scale_height_m is None
-            else smog.scale_height_m,
+            "smog_scale_height_m": math.nan if height_m is None else height_m,
         }

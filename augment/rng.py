@@ -1,0 +1,44 @@
+"""Random generators that depend on a key and on nothing else.
+
+Weather must come out the same whatever the number of workers, the order of the frames or the point
+at which a job was resumed, so no generator is ever shared or advanced between two uses.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import operator
+
+import numpy as np
+
+_DOMAIN = "climategs effect 1"  # a change of the scheme changes this, never silently a number
+
+
+def rng_for(
+    *,
+    seed: int,
+    scene: str,
+    effect: str,
+    frame: int | None = None,
+    camera: str | None = None,
+) -> np.random.Generator:
+    """A generator for one effect, keyed by a SHA-256 of the arguments.
+
+    seed: the recipe's, >= 0. scene: the scene's name. effect: which use this is, "snow.flakes" say;
+    two uses of the same key draw the same numbers. frame: index; camera: name. Leave out frame where
+    the result must persist over time, camera where all views must agree: None is a key of its own.
+
+    Raises:
+        ValueError: seed or frame is negative, or effect is empty.
+    """
+    seed = operator.index(seed)
+    frame = None if frame is None else operator.index(frame)
+    if seed < 0 or (frame is not None and frame < 0):
+        raise ValueError(f"seed and frame must be >= 0; got seed={seed}, frame={frame}")
+    if not effect:
+        raise ValueError("effect must name what is drawn; got an empty text")
+    key = json.dumps([_DOMAIN, seed, scene, frame, camera, effect])
+    digest = hashlib.sha256(key.encode()).digest()
+    entropy = np.random.SeedSequence(int.from_bytes(digest, "big"))
+    return np.random.Generator(np.random.PCG64(entropy))

@@ -1,0 +1,31 @@
+"""A recipe in numbers -> the YAML that reads back as the same recipe."""
+
+from __future__ import annotations
+
+import yaml
+
+from recipes.schema import Recipe
+
+
+class _Dumper(yaml.SafeDumper):
+    """Colours on one line; no anchors."""
+
+    def ignore_aliases(self, data: object) -> bool:
+        return True
+
+
+def _on_one_line(dumper: _Dumper, data: tuple[float, ...]) -> yaml.Node:
+    return dumper.represent_sequence("tag:yaml.org,2002:seq", data, flow_style=True)
+
+
+_Dumper.add_representer(tuple, _on_one_line)
+
+
+def dump_recipe(recipe: Recipe) -> str:
+    """YAML with every field written out, defaults included, and the hash in a comment.
+
+    `parse_recipe(dump_recipe(r), ...).resolve(0)` equals r: floats keep all their bits, and the
+    variant's number is kept.
+    """
+    body = yaml.dump(recipe.model_dump(), Dumper=_Dumper, sort_keys=False, allow_unicode=False)
+    return f"# A recipe in numbers, hash {recipe.hash}.\n{body}"

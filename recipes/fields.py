@@ -1,0 +1,240 @@
+"""The fields of a recipe as a table, read off the models of `schema`: nothing is stated twice.
+
+The loader, its messages, the JSON Schema and the documentation all walk `ROOT`.
+"""
+
+from __future__ import annotations
+
+import enum
+import types
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
+
+import annotated_types
+from pydantic import BaseModel, Field, TypeAdapter, ValidationError
+from pydantic.fields import FieldInfo
+
+from recipes.schema import VERSION, Colour, Number, Recipe, Unit, Whole
+from recipes.values import is_number
+
+UNITS = {"_per_m": "1/metre", "_m": "metres"}  # the end of a field's name says its unit
+
+_LIMITS = {
+    annotated_types.Gt: (">", "gt"),
+    annotated_types.Ge: (">=", "ge"),
+    annotated_types.Lt: ("<", "lt"),
+    annotated_types.Le: ("<=", "le"),
+}
+
+
+class Kind(enum.Enum):
+    """What a field holds, in the words of the messages."""
+
+    NUMBER = "a number"
+    WHOLE = "a whole number"
+    FLAG = "true or false"
+    WORD = "one of"
+    COLOUR = "a colour"
+    TEXT = "text"
+
+
+@dataclass(frozen=True)
+class FieldSpec:
+    """One field that holds a value.
+
+    limits: pairs such as (">", 0.0). words: what a WORD may be. rangeable: a range may stand here.
+    annotation: what pydantic checks a value against.
+    """
+
+    path: str
+    kind: Kind
+    description: str
+    annotation: Any
+    nullable: bool = False
+    default: Any = None
+    limits: tuple[tuple[str, float], ...] = ()
+    words: tuple[str, ...] = ()
+    rangeable: bool = True
+
+    @property
+    def name(self) -> str:
+        return self.path.rpartition(".")[2]
+
+    @property
+    def unit(self) -> str | None:
+        """The unit in words; None for a pure number."""
+        for suffix, unit in UNITS.items():
+            if self.name.endswith(suffix):
+                return unit
+        return None
+
+    @cached_property
+    def _adapter(self) -> TypeAdapter[Any]:
+        return TypeAdapter(self.annotation)
+
+    def accepts(self, value: object) -> bool:
+        """Whether the schema takes this value."""
+        if value is None:
+            return self.nullable
+        try:
+            self._adapter.validate_python(value)
+        except ValidationError:
+            return False
+        return True
+
+    def allowed(self, value: object = None) -> str:
+        """What may stand here. `value`: the one refused; what is right about it goes unsaid."""
+        if self.kind is Kind.WORD:
+            text = f"one of {', '.join(self.words)}"
+        elif self.kind is Kind.COLOUR:
+            text = "[red, green, blue], each a number >= 0 and <= 1"
+        elif self.kind is Kind.TEXT:
+            text = "up to 64 letters, digits, '.', '_' or '-', the first a letter or a digit"
+        else:
+            text = self._allowed_number(value)
+        text += f" ({self.unit})" if self.unit else ""
+        return text + (", or null" if self.nullable and not is_number(value) else "")
+
+    def _allowed_number(self, value: object) -> str:
+        limits = " and ".join(f"{sign} {plain(bound)}" for sign, bound in self.limits)
+        right_type = is_number(value) and (isinstance(value, int) or self.kind is Kind.NUMBER)
+        if limits and right_type and value == value:
+            return limits
+        return f"{self.kind.value} {limits}".strip()
+
+    @property
+    def without_null(self) -> FieldSpec:
+        return replace(self, nullable=False)
+
+
+@dataclass(frozen=True)
+class SectionSpec:
+    """A mapping of fields. effect: it may be absent, and then has a probability of being there."""
+
+    path: str
+    model: type[BaseModel]
+    description: str
+    effect: bool = False
+    fields: dict[str, FieldSpec] = field(default_factory=dict)
+    sections: dict[str, SectionSpec] = field(default_factory=dict)
+    extra: dict[str, FieldSpec] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        return self.path.rpartition(".")[2]
+
+    @property
+    def known(self) -> tuple[str, ...]:
+        """Every key that may stand here, fields of the template alone included."""
+        return (*self.fields, *self.extra, *self.sections)
+
+    def walk(self) -> Iterator[SectionSpec]:
+        """This section, then all below it."""
+        yield self
+        for section in self.sections.values():
+            yield from section.walk()
+
+
+def plain(number: float) -> str:
+    """A number without exponent or trailing zeros where it is short so."""
+    whole = isinstance(number, int) or (number.is_integer() and abs(number) < 1e15)
+    return str(int(number)) if whole else repr(number)
+
+
+def join(path: str, name: str) -> str:
+    """The dotted path of a key in a section; '' is the top."""
+    return f"{path}.{name}" if path else name
+
+
+def _section(path: str, model: type[BaseModel], *, effect: bool = False) -> SectionSpec:
+    spec = SectionSpec(path, model, (model.__doc__ or "").strip(), effect)
+    for name, info in model.model_fields.items():
+        below = join(path, name)
+        inner, nullable = _without_none(info.annotation)
+        if isinstance(inner, type) and issubclass(inner, BaseModel):
+            spec.sections[name] = _section(below, inner, effect=nullable)
+        else:
+            spec.fields[name] = _field(below, info, rangeable=bool(path))
+    if effect:
+        spec.extra["probability"] = FieldSpec(
+            path=join(path, "probability"),
+            kind=Kind.NUMBER,
+            description="Share of the variants that have this effect.",
+            annotation=Unit,
+            default=1.0,
+            limits=((">=", 0.0), ("<=", 1.0)),
+            rangeable=False,
+        )
+    return spec
+
+
+def _field(path: str, info: FieldInfo, *, rangeable: bool) -> FieldSpec:
+    inner, nullable = _without_none(info.annotation)
+    bounds = [
+        (sign, getattr(rule, attribute))
+        for rule in info.metadata
+        for kind, (sign, attribute) in _LIMITS.items()
+        if isinstance(rule, kind)
+    ]
+    return FieldSpec(
+        path=path,
+        kind=_kind(inner),
+        description=info.description or "",
+        annotation=Annotated[info.annotation, info],
+        nullable=nullable,
+        default=info.default,
+        limits=tuple(bounds),
+        words=tuple(map(str, get_args(inner))) if get_origin(inner) is Literal else (),
+        rangeable=rangeable,
+    )
+
+
+def _without_none(annotation: Any) -> tuple[Any, bool]:
+    """The annotation without `| None` and `Annotated`, and whether None was there."""
+    nullable = False
+    if get_origin(annotation) in (Union, types.UnionType):
+        members = [member for member in get_args(annotation) if member is not type(None)]
+        assert len(members) == 1, f"a field is of one type or null; got {annotation}"
+        annotation, nullable = members[0], True
+    if get_origin(annotation) is Annotated:
+        annotation = get_args(annotation)[0]
+    return annotation, nullable
+
+
+def _kind(annotation: Any) -> Kind:
+    if annotation == Colour:
+        return Kind.COLOUR
+    if get_origin(annotation) is Literal:
+        return Kind.WORD
+    return {float: Kind.NUMBER, int: Kind.WHOLE, bool: Kind.FLAG, str: Kind.TEXT}[annotation]
+
+
+CHANNEL = FieldSpec(
+    path="channel",
+    kind=Kind.NUMBER,
+    description="One channel of a colour.",
+    annotation=Unit,
+    limits=((">=", 0.0), ("<=", 1.0)),
+)
+ANY_NUMBER = FieldSpec("number", Kind.NUMBER, "", Annotated[Number, Field(allow_inf_nan=False)])
+VARIANTS = FieldSpec(
+    path="variants",
+    kind=Kind.WHOLE,
+    description="How many recipes are drawn from this one, with numbers 0, 1, 2 and so on.",
+    annotation=Annotated[Whole, Field(ge=1, le=1_000_000)],
+    default=1,
+    limits=((">=", 1), ("<=", 1_000_000)),
+    rangeable=False,
+)
+
+
+def _root() -> SectionSpec:
+    root = _section("", Recipe)
+    root.extra["variants"] = VARIANTS
+    assert root.fields["version"].words == (str(VERSION),)
+    return root
+
+
+ROOT = _root()

@@ -1,0 +1,137 @@
+"""JSON Schema of a recipe file, for editors that complete and check YAML while it is typed.
+
+It describes the file, not the recipe in numbers: every field takes a literal or a range. What JSON
+Schema cannot say (which end is the lower, rules between draws) is left to `load_recipe`.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from recipes.fields import CHANNEL, ROOT, FieldSpec, Kind, SectionSpec
+from recipes.schema import VERSION
+
+DIALECT = "https://json-schema.org/draft/2020-12/schema"
+
+_LIMITS = {">": "exclusiveMinimum", ">=": "minimum", "<": "exclusiveMaximum", "<=": "maximum"}
+_CHANNEL = "channel"
+
+Schema = dict[str, Any]
+
+
+def recipe_json_schema() -> Schema:
+    """The schema (draft 2020-12), a fresh dict made of JSON's own types."""
+    definitions = {_CHANNEL: _with_ranges(CHANNEL, _CHANNEL)}
+    schema = _section(ROOT, definitions)
+    schema["properties"]["version"] = {"const": VERSION, "description": "Version of this format."}
+    return {
+        "$schema": DIALECT,
+        "title": "ClimateGS recipe",
+        **schema,
+        "$defs": definitions,
+    }
+
+
+def write_schema(path: str | Path) -> None:
+    """Write the schema to a file, as indented UTF-8 JSON.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    text = json.dumps(recipe_json_schema(), indent=2, ensure_ascii=False)
+    Path(path).write_text(text + "\n", encoding="utf-8")
+
+
+def _section(section: SectionSpec, definitions: Schema) -> Schema:
+    properties: Schema = {}
+    for name, spec in {**section.fields, **section.extra}.items():
+        properties[name] = _field(spec, definitions)
+    for name, below in section.sections.items():
+        # 'weather:' with nothing after it is null
+        properties[name] = {"oneOf": [_section(below, definitions), {"type": "null"}]}
+    extra = section.model.model_config.get("json_schema_extra") or {}
+    assert isinstance(extra, dict), "the models state what else holds as JSON, not as functions"
+    return {
+        "type": "object",
+        "description": section.description,
+        "properties": properties,
+        "additionalProperties": False,
+        **extra,
+    }
+
+
+def _field(spec: FieldSpec, definitions: Schema) -> Schema:
+    unit = f" [{spec.unit}]" if spec.unit else ""
+    said: Schema = {"description": spec.description + unit}
+    if spec.default is not None:
+        default = spec.default
+        said["default"] = list(default) if isinstance(default, tuple) else default
+    if not spec.rangeable:
+        return {**_literal(spec), **said}
+    definitions[spec.path] = _with_ranges(spec, spec.path)
+    return {"$ref": f"#/$defs/{spec.path}", **said}
+
+
+def _literal(spec: FieldSpec) -> Schema:
+    null = ["null"] if spec.nullable else []
+    if spec.kind is Kind.WORD:
+        return {"enum": [*spec.words, *(None for _ in null)]}
+    if spec.kind is Kind.COLOUR:
+        return {
+            "type": ["array", *null],
+            "items": {"$ref": f"#/$defs/{_CHANNEL}"},
+            "minItems": 3,
+            "maxItems": 3,
+        }
+    if spec.kind is Kind.TEXT:
+        return {"type": ["string", "number", "boolean"]}  # a name is taken as it is written
+    name = {Kind.NUMBER: "number", Kind.WHOLE: "integer", Kind.FLAG: "boolean"}[spec.kind]
+    limits = {_LIMITS[sign]: bound for sign, bound in spec.limits}
+    return {"type": [name, *null] if null else name, **limits}
+
+
+def _with_ranges(spec: FieldSpec, definition: str) -> Schema:
+    literal = _literal(spec)
+    end = _literal(spec.without_null)
+    ranges = [_choice(definition)]
+    if spec.kind is Kind.COLOUR:
+        plain = {**end, "items": _literal(CHANNEL)}
+        ranges.append(_range("uniform", _pair(plain)))
+    elif spec.kind in (Kind.NUMBER, Kind.WHOLE):
+        ranges.append(_range("uniform", _pair(end)))
+        ranges.append(_range("log_uniform", _pair({"allOf": [end, {"exclusiveMinimum": 0}]})))
+        ranges.append(_range("normal", _normal(end)))
+    return {"oneOf": [literal, *ranges]}
+
+
+def _normal(end: Schema) -> Schema:
+    number = {"type": "number"}
+    spread = {**number, "exclusiveMinimum": 0}
+    return _closed({"mean": number, "std": spread, "min": end, "max": end})
+
+
+def _choice(definition: str) -> Schema:
+    weights = {"type": "array", "items": {"type": "number", "minimum": 0, "maximum": 1e9}}
+    options = {"type": "array", "items": {"$ref": f"#/$defs/{definition}"}, "minItems": 1}
+    schema = _closed({"choice": options})
+    schema["properties"]["weights"] = weights
+    return schema
+
+
+def _range(kind: str, body: Schema) -> Schema:
+    return _closed({kind: body})
+
+
+def _pair(item: Schema) -> Schema:
+    return {"type": "array", "items": item, "minItems": 2, "maxItems": 2}
+
+
+def _closed(properties: Schema) -> Schema:
+    return {
+        "type": "object",
+        "properties": properties,
+        "required": list(properties),
+        "additionalProperties": False,
+    }

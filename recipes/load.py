@@ -1,0 +1,79 @@
+"""Recipes from files and presets."""
+
+from __future__ import annotations
+
+from importlib import resources
+from importlib.resources.abc import Traversable
+from pathlib import Path
+
+from recipes.errors import RecipeError
+from recipes.parse import parse_recipe
+from recipes.suggest import nearest_word
+from recipes.template import RecipeTemplate
+
+MAX_BYTES = 65_536  # a recipe is a page of text; a bigger file is something else
+
+
+def load_recipe(path_or_preset_name: str | Path) -> RecipeTemplate:
+    """The template in a file, or the preset of that name.
+
+    A text that names a preset is the preset, even where a file is called the same (write ./NAME for
+    the file); anything else, and every Path, is a file. A file's stem is the recipe's name unless
+    the file gives one.
+
+    Raises:
+        RecipeError: there is no such file or preset, or it holds no valid recipe.
+    """
+    if isinstance(path_or_preset_name, str) and path_or_preset_name in preset_names():
+        return _load_preset(path_or_preset_name)
+    path = Path(path_or_preset_name)
+    source = str(path_or_preset_name)
+    return parse_recipe(_decode(_read(path, source), source), source=source, name=path.stem)
+
+
+def preset_names() -> tuple[str, ...]:
+    """The recipes that come with the package, in alphabetical order."""
+    stems = (Path(entry.name) for entry in _presets().iterdir())
+    return tuple(sorted(path.stem for path in stems if path.suffix == ".yaml"))
+
+
+def _presets() -> Traversable:
+    return resources.files("recipes").joinpath("presets")
+
+
+def _load_preset(name: str) -> RecipeTemplate:
+    text = _presets().joinpath(f"{name}.yaml").read_text(encoding="utf-8")
+    return parse_recipe(text, source=f"preset {name}", name=name)
+
+
+def _read(path: Path, source: str) -> bytes:
+    try:
+        with path.open("rb") as file:
+            data = file.read(MAX_BYTES + 1)
+    except (FileNotFoundError, NotADirectoryError):
+        raise RecipeError(f"{source}: {_missing(source)}") from None
+    except IsADirectoryError:
+        raise RecipeError(f"{source}: is a folder; a recipe is a YAML file") from None
+    except (OSError, ValueError) as error:  # ValueError: a null character in the path
+        raise RecipeError(f"{source!a}: cannot be read: {error}") from None
+    if len(data) > MAX_BYTES:
+        raise RecipeError(f"{source}: larger than {MAX_BYTES} bytes: this is no recipe")
+    return data
+
+
+def _missing(source: str) -> str:
+    presets = preset_names()
+    near = nearest_word(source, presets)
+    guess = f"did you mean {near}? " if near else ""
+    return f"no such file, and no such preset; {guess}presets are {', '.join(presets)}"
+
+
+def _decode(data: bytes, source: str) -> str:
+    try:
+        return data.decode("utf-8")
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        raise RecipeError(
+            f"{source}:{line}: not UTF-8 text (byte 0x{data[error.start]:02x}): "
+            "save the file as UTF-8"
+        ) from None

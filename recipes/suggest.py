@@ -1,0 +1,69 @@
+"""Guesses what a misspelt key was meant to be."""
+
+from __future__ import annotations
+
+import difflib
+import re
+
+from recipes.fields import ROOT, SectionSpec, join
+from recipes.values import RANGE_KINDS
+
+_UNIT = re.compile(
+    r"_(per_)?(k|c|m)?(m|metres?|meters?|ft|feet|mi|miles?|yards?|mps|kmh|kph|mph|deg|rad)$"
+)
+_SYNONYMS = {
+    "fog": "smog",
+    "haze": "smog",
+    "mist": "smog",
+    "beta": "extinction_per_m",
+    "density": "extinction_per_m",
+    "sigma": "extinction_per_m",
+    "airlight": "color",
+}
+
+
+def unknown_key(key: str, section: SectionSpec) -> str:
+    """Why `key` is refused and which known one is nearest."""
+    if key in RANGE_KINDS:
+        return "a range stands for one field, not for a whole section"
+    nearest = _nearest(key, section)
+    if nearest is not None:
+        spec = {**section.fields, **section.extra}.get(nearest)
+        unit = f" ({spec.unit})" if spec and spec.unit else ""
+        return f"unknown field; did you mean {nearest}{unit}?"
+    name = _SYNONYMS.get(key, key)
+    elsewhere = [other for other in ROOT.walk() if name in other.known and other is not section]
+    if elsewhere:
+        places = [join(o.path, name) if o.path else f"{name} at the top" for o in elsewhere]
+        return f"unknown field here; did you mean {' or '.join(places)}?"
+    return f"unknown field; known here: {', '.join(section.known)}"
+
+
+def nearest_word(word: str, words: tuple[str, ...]) -> str | None:
+    """The option that is most like `word`, if any is."""
+    close = difflib.get_close_matches(word.lower(), words, n=1, cutoff=0.6)
+    return close[0] if close else None
+
+
+def _nearest(key: str, section: SectionSpec) -> str | None:
+    known, low = section.known, key.lower().replace("-", "_")
+    if low in known:
+        return low
+    if _SYNONYMS.get(low) in known:
+        return _SYNONYMS[low]
+    bases = {_base(name): name for name in known}
+    if _base(low) in bases:  # visibility_km, visibility: the unit is what was wrong
+        return bases[_base(low)]
+    if any(low in other.known for other in ROOT.walk()):
+        return None  # spelt well, but in another place
+    close = nearest_word(low, known)
+    if close is None:
+        base = nearest_word(_base(low), tuple(bases))
+        close = bases[base] if base else None
+    return close
+
+
+def _base(name: str) -> str:
+    """The name without its unit."""
+    stripped = _UNIT.sub("", name)
+    return stripped or name

@@ -1,0 +1,102 @@
+"""A recipe as it is written, with its ranges, and the recipes in numbers that it stands for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from pydantic import ValidationError
+
+from recipes.errors import RecipeError
+from recipes.fields import ROOT
+from recipes.sampler import Draws
+from recipes.schema import VERSION, Recipe
+from recipes.values import Value
+
+
+@dataclass(frozen=True)
+class RecipeTemplate:
+    """A loaded recipe file.
+
+    name: for folders and the manifest. source: where it was read from, for messages. variants: how
+    many recipes it stands for; first_variant: the number of the first. values: dotted path -> how
+    the field gets its value, for the fields that the file gives. effects: dotted path -> the share
+    of variants that have it, for the effects that the file names.
+    """
+
+    name: str
+    source: str
+    seed: int = 0
+    variants: int = 1
+    first_variant: int = 0
+    values: tuple[tuple[str, Value], ...] = ()
+    effects: tuple[tuple[str, float], ...] = ()
+
+    def resolve(self, variant: int) -> Recipe:
+        """The recipe number `variant`, 0 <= variant < variants.
+
+        Its numbers depend on the seed, on first_variant + variant and on each field's own path
+        only: not on other fields, other variants, or what was resolved before.
+
+        Raises:
+            RecipeError: there is no such variant, or what was drawn breaks a rule of the schema.
+        """
+        if not 0 <= variant < self.variants:
+            known = "only 0" if self.variants == 1 else f"0 to {self.variants - 1}"
+            raise RecipeError(f"{self.source}: there is no variant {variant}: it has {known}")
+        number = self.first_variant + variant
+        draws = Draws(self.seed, number)
+        data: dict[str, Any] = {
+            "version": VERSION,
+            "name": self.name,
+            "seed": self.seed,
+            "variant": number,
+        }
+        off: list[str] = []
+        for path, probability in self.effects:
+            present = draws.unit(f"{path}.probability") < probability
+            _put(data, path, {} if present else None)
+            if not present:
+                off.append(path + ".")
+        for path, value in self.values:
+            if not path.startswith(tuple(off)):
+                _put(data, path, value.draw(draws, path))
+        try:
+            return Recipe.model_validate(data)
+        except ValidationError as error:
+            lines = [f"{self.source}: variant {number}: {text}" for text in readable(error)]
+            raise RecipeError(*lines) from None
+
+    def describe_ranges(self) -> dict[str, str]:
+        """Dotted path -> its range in words, with the unit; only what differs between variants."""
+        units = {
+            spec.path: spec.unit for section in ROOT.walk() for spec in section.fields.values()
+        }
+        said = {
+            path: f"present with probability {probability:g}"
+            for path, probability in self.effects
+            if probability < 1
+        }
+        for path, value in self.values:
+            if value.is_range:
+                unit = units.get(path)
+                said[path] = value.describe() + (f" ({unit})" if unit else "")
+        return said
+
+
+def readable(error: ValidationError) -> list[str]:
+    """pydantic's problems, one line each: the field, then what is wrong."""
+    lines = []
+    for item in error.errors(include_url=False):
+        path = ".".join(str(part) for part in item["loc"])
+        cause = item.get("ctx", {}).get("error")
+        text = str(cause) if isinstance(cause, ValueError) else item["msg"]
+        lines.append(f"{path}: {text}" if path else text)
+    return lines
+
+
+def _put(data: dict[str, Any], path: str, value: object) -> None:
+    *sections, name = path.split(".")
+    for section in sections:
+        data = data.setdefault(section, {})
+    data[name] = value

@@ -1,0 +1,230 @@
+"""YAML text -> a small tree that remembers lines; no object of YAML's choice is ever built.
+
+PyYAML scans and parses; the tree is built here from its events, without recursion, so that depth
+and size are bounded whatever the text. Scalars follow YAML 1.2's core schema (1e-3 is a number, yes
+is text); keys are always text. Duplicate keys, tags, merge keys and further documents are problems.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import yaml
+
+from recipes.errors import Problems, short
+
+MAX_DEPTH = 32
+MAX_NODES = 20_000  # counted after aliases are expanded, so nested aliases cannot multiply
+EMPTY = "the file is empty; a recipe is a mapping such as 'weather: {smog: {visibility_m: 300}}'"
+MAX_DIGITS = 400  # a longer run of digits is no number that any field takes
+
+_WHOLE = re.compile(r"[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+")
+_NUMBER = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
+_WORDS: dict[str, bool | float | None] = {
+    **dict.fromkeys(("", "~", "null", "Null", "NULL")),
+    **dict.fromkeys(("true", "True", "TRUE"), True),
+    **dict.fromkeys(("false", "False", "FALSE"), False),
+    **dict.fromkeys((".nan", ".NaN", ".NAN"), float("nan")),
+    **dict.fromkeys((".inf", ".Inf", ".INF", "+.inf", "+.Inf", "+.INF"), float("inf")),
+    **dict.fromkeys(("-.inf", "-.Inf", "-.INF"), float("-inf")),
+}
+
+ScalarValue = bool | int | float | str | None
+
+
+@dataclass(frozen=True, eq=False)
+class ScalarNode:
+    """text: as written, without quotes. value: what it means."""
+
+    line: int
+    text: str
+    value: ScalarValue
+    size: int = 1
+    height: int = 1
+
+
+@dataclass(frozen=True, eq=False)
+class ListNode:
+    """size: how many nodes it has, aliases expanded. height: how many levels."""
+
+    line: int
+    items: tuple[Node, ...]
+    size: int
+    height: int
+
+
+@dataclass(frozen=True, eq=False)
+class MapNode:
+    """entries: key -> (line of the key, value), in the order of the file."""
+
+    line: int
+    entries: dict[str, tuple[int, Node]]
+    size: int
+    height: int
+
+
+Node = ScalarNode | ListNode | MapNode
+
+
+@dataclass
+class _Open:
+    """A list or mapping whose end has not been read."""
+
+    line: int
+    is_map: bool
+    anchor: str | None
+    items: list[Node] = field(default_factory=list)
+    entries: dict[str, tuple[int, Node]] = field(default_factory=dict)
+    key: tuple[int, str] | None = None
+    size: int = 1
+    height: int = 1
+
+    def close(self) -> Node:
+        if self.is_map:
+            return MapNode(self.line, self.entries, self.size, self.height)
+        return ListNode(self.line, tuple(self.items), self.size, self.height)
+
+
+def read_tree(text: str, problems: Problems) -> Node:
+    """The tree of the one document in `text`; duplicate keys are added to `problems`.
+
+    Raises:
+        RecipeError: not YAML, or YAML that a recipe may not use.
+    """
+    return _Builder(problems).build(_events(text, problems))
+
+
+def plain_value(text: str) -> ScalarValue:
+    """What an unquoted scalar means in YAML 1.2's core schema."""
+    if text in _WORDS:
+        return _WORDS[text]
+    if len(text) <= MAX_DIGITS:
+        if _WHOLE.fullmatch(text):
+            base = {"0o": 8, "0x": 16}.get(text[:2], 10)
+            return int(text, base)
+        if _NUMBER.fullmatch(text):
+            return float(text)
+    return text
+
+
+class _Builder:
+    def __init__(self, problems: Problems) -> None:
+        self._problems = problems
+        self._open: list[_Open] = []
+        self._anchors: dict[str, Node | None] = {}  # None: named, but its end has not been read
+        self._root: Node | None = None
+
+    def build(self, events: Iterator[yaml.Event]) -> Node:
+        documents = 0
+        for event in events:
+            line = event.start_mark.line + 1
+            if isinstance(event, yaml.DocumentStartEvent):
+                documents += 1
+                if documents > 1:
+                    raise self._problems.fail(line, "one document a file: remove the second '---'")
+            elif isinstance(event, yaml.AliasEvent):
+                self._attach(line, self._look_up(line, event.anchor))
+            elif isinstance(event, yaml.CollectionEndEvent):
+                done = self._open.pop()
+                node = done.close()
+                if done.anchor is not None:
+                    self._anchors[done.anchor] = node
+                self._attach(done.line, node)
+            elif isinstance(event, yaml.ScalarEvent | yaml.CollectionStartEvent):
+                self._start(line, event)
+        if self._root is None:
+            raise self._problems.fail(1, EMPTY)
+        return self._root
+
+    def _start(self, line: int, event: yaml.ScalarEvent | yaml.CollectionStartEvent) -> None:
+        if event.tag is not None:
+            raise self._problems.fail(
+                line, f"the tag {short(str(event.tag))!r}: tags are not allowed in a recipe"
+            )
+        if isinstance(event, yaml.ScalarEvent):
+            value = plain_value(event.value) if event.style is None else event.value
+            node = ScalarNode(line, event.value, value)
+            if event.anchor is not None:
+                self._anchors[event.anchor] = node
+            self._attach(line, node)
+            return
+        if event.anchor is not None:
+            self._anchors[event.anchor] = None
+        if len(self._open) >= MAX_DEPTH:
+            raise self._problems.fail(line, f"nested more than {MAX_DEPTH} levels deep")
+        is_map = isinstance(event, yaml.MappingStartEvent)
+        self._open.append(_Open(line, is_map, event.anchor))
+
+    def _look_up(self, line: int, anchor: str) -> Node:
+        if anchor not in self._anchors:
+            raise self._problems.fail(line, f"*{short(anchor)} refers to no anchor above it")
+        node = self._anchors[anchor]
+        if node is None:
+            raise self._problems.fail(line, f"*{short(anchor)} stands inside its own anchor")
+        return node
+
+    def _attach(self, line: int, node: Node) -> None:
+        if not self._open:
+            self._root = node
+            return
+        parent = self._open[-1]
+        parent.size += node.size
+        parent.height = max(parent.height, 1 + node.height)
+        if parent.size > MAX_NODES:
+            raise self._problems.fail(line, f"more than {MAX_NODES} values, aliases expanded")
+        if parent.height > MAX_DEPTH:
+            raise self._problems.fail(line, f"nested more than {MAX_DEPTH} levels deep")
+        if not parent.is_map:
+            parent.items.append(node)
+        elif parent.key is None:
+            parent.key = (line, self._key_text(line, node))
+        else:
+            (key_line, key), parent.key = parent.key, None
+            self._insert(parent, key_line, key, node)
+
+    def _key_text(self, line: int, node: Node) -> str:
+        if not isinstance(node, ScalarNode):
+            raise self._problems.fail(line, "a key must be plain text, not a list or a mapping")
+        if node.text == "<<":
+            raise self._problems.fail(
+                line, "merge keys (<<) are not read; write the fields out, or use *alias as a value"
+            )
+        return node.text
+
+    def _insert(self, parent: _Open, line: int, key: str, node: Node) -> None:
+        if key in parent.entries:
+            first = parent.entries[key][0]
+            above = [level.key[1] for level in self._open if level.key is not None]
+            path = ".".join(short(part) for part in [*above, key])
+            self._problems.add(line, f"{path} is given twice (first on line {first})")
+        else:
+            parent.entries[key] = (line, node)
+
+
+def _events(text: str, problems: Problems) -> Iterator[yaml.Event]:
+    """PyYAML's events, its errors turned into ours."""
+    try:
+        yield from yaml.parse(text, Loader=yaml.SafeLoader)
+    except yaml.reader.ReaderError as error:
+        line = text.count("\n", 0, error.position) + 1
+        code = error.character if isinstance(error.character, int) else ord(error.character)
+        raise problems.fail(line, f"not valid YAML: it holds the character U+{code:04X}") from None
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        line = mark.line + 1 if mark else 1
+        what = " ".join(filter(None, (error.context, error.problem)))
+        hint = _tab_hint(text, line)
+        raise problems.fail(line, f"not valid YAML: {short(what, 160)}{hint}") from None
+    except (yaml.YAMLError, ValueError, OverflowError) as error:
+        # PyYAML lets chr() and int() raise on escapes and directives that are out of range.
+        raise problems.fail(1, f"not valid YAML: {short(str(error), 160)}") from None
+
+
+def _tab_hint(text: str, line: int) -> str:
+    lines = text.splitlines()
+    written = lines[line - 1] if line <= len(lines) else ""
+    if "\t" in written:
+        return "; the line holds a tab: indent and separate with spaces"
+    return ""
