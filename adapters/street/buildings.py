@@ -1,0 +1,278 @@
+"""Houses: a front of windows, doors and shops, side and back walls, a roof. Also gardens in the gaps."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from adapters.street.facades import (
+    Style,
+    door,
+    panels,
+    reveals,
+    shop_front,
+    window,
+    window_hole,
+)
+from adapters.street.forms import boxes, parallelograms, triangle, tube
+from adapters.street.layout import CROSS_STREET_M, FACADE_M, Layout, Plot, pavement_z
+from adapters.street.materials import Material
+from adapters.street.rectangles import Rectangle, cut
+from adapters.street.shapes import ALL_EDGES, U0, U1, V1, Look, Shapes, join
+from augment.semantics import SemanticClass as Class
+
+DEPTH_M = 10.5
+BASE_M = -0.25  # walls reach below the pavement
+WALLS = (
+    ((0.72, 0.66, 0.54), Material.PLASTER),
+    ((0.66, 0.50, 0.36), Material.PLASTER),
+    ((0.58, 0.57, 0.54), Material.PLASTER),
+    ((0.70, 0.56, 0.50), Material.PLASTER),
+    ((0.50, 0.58, 0.56), Material.PLASTER),
+    ((0.78, 0.76, 0.71), Material.PLASTER),
+    ((0.36, 0.16, 0.11), Material.BRICK),
+    ((0.42, 0.22, 0.14), Material.BRICK),
+    ((0.30, 0.19, 0.15), Material.BRICK),
+    ((0.55, 0.49, 0.39), Material.STONE),
+)
+ACCENTS = (
+    (0.05, 0.13, 0.10),
+    (0.24, 0.03, 0.03),
+    (0.04, 0.07, 0.18),
+    (0.10, 0.055, 0.03),
+    (0.03, 0.03, 0.035),
+    (0.30, 0.17, 0.03),
+)
+ROOFS = ((0.24, 0.10, 0.065), (0.13, 0.12, 0.125), (0.19, 0.09, 0.06))
+
+
+def build_buildings(layout: Layout) -> Shapes:
+    """Both rows of houses, those that close the street's ends, and some behind."""
+    middle = layout.path_length_m / 2
+    parts = []
+    for plot in layout.plots:
+        yaw = 0.0 if plot.side > 0 else np.pi
+        corner = (plot.x0 if plot.side > 0 else plot.x1, plot.side * FACADE_M, 0.0)
+        reach = abs((plot.x0 + plot.x1) / 2 - middle) - middle
+        built = (
+            _garden(plot) if plot.is_garden else _house(plot.seed, plot.x1 - plot.x0, reach < 32)
+        )
+        parts.append(built.moved(corner, yaw))
+    ends = (
+        (layout.x1 + CROSS_STREET_M + 4.6, -np.pi / 2),
+        (layout.x0 - CROSS_STREET_M - 4.6, np.pi / 2),
+    )
+    for number, (x, yaw) in enumerate(ends):
+        rng = np.random.default_rng([layout.parameters.seed, 20, number])
+        start = -56.0
+        while start < 56.0:
+            width = rng.uniform(9.0, 14.0)
+            house = _house(int(rng.integers(2**31)), width, False)
+            y = start + width if yaw < 0 else start
+            parts.append(house.moved((x, y, 0.0), yaw))
+            start += width
+    parts.append(_second_row(layout))
+    return join(parts)
+
+
+def draw_style(rng: np.random.Generator) -> Style:
+    """Colours and measures of one house."""
+    rgb, material = WALLS[rng.integers(len(WALLS))]
+    rgb = np.array(rgb) * rng.uniform(0.88, 1.06)
+    stone = Look((0.60, 0.57, 0.51), Class.BUILDING)
+    wall = Look(tuple(rgb), Class.BUILDING, material)
+    base = Look(tuple(rgb * 0.35 + 0.10), Class.BUILDING, Material.STONE)
+    white = rng.random() < 0.7 or material == Material.BRICK
+    return Style(
+        wall=wall,
+        base=base,
+        trim=stone.tinted((0.74, 0.72, 0.67)) if white else stone,
+        frame=stone.tinted((0.78, 0.77, 0.75) if rng.random() < 0.7 else (0.07, 0.065, 0.06)),
+        accent=Look(ACCENTS[rng.integers(len(ACCENTS))], Class.BUILDING),
+        window_m=(float(rng.uniform(1.05, 1.4)), float(rng.uniform(1.55, 1.95))),
+        floor_m=float(rng.uniform(3.0, 3.4)),
+        ground_m=float(rng.uniform(3.75, 4.1)),
+        has_surround=bool(rng.random() < 0.55),
+        has_shop=bool(rng.random() < 0.5),
+    )
+
+
+def _house(seed: int, width: float, fine: bool) -> Shapes:
+    """A house on x in [0, width], its front at y = 0."""
+    rng = np.random.default_rng(seed)
+    style = draw_style(rng)
+    floors = int(rng.integers(2, 4))
+    eaves = style.ground_m + floors * style.floor_m + 0.35
+    count = max(2, round(width / rng.uniform(2.5, 3.1)))
+    pitch = width / count
+    holes: list[Rectangle] = []
+    parts = [_ground_floor(rng, style, width, count, holes, fine)]
+
+    corners = [
+        ((i + 0.5) * pitch - style.window_m[0] / 2, style.ground_m + j * style.floor_m + 0.75)
+        for j in range(floors)
+        for i in range(count)
+    ]
+    for corner in corners:
+        holes += window_hole(corner, style)
+    places = np.array([(x, 0.0, z) for x, z in corners])
+    parts.append(window(style.window_m, style, fine).repeated(places))
+
+    ledges = [(0.0, style.ground_m + 0.12, width, style.ground_m + 0.3, 0.09)]
+    ledges.append((0.0, eaves - 0.32, width, eaves, 0.28))
+    for x0, z0, x1, z1, reach in ledges:
+        holes.append((x0, z0, x1, z1))
+        parts.append(boxes((x0, -reach, z0), (x1, 0.0, z1), style.trim, faces=_LEDGE))
+    holes.append((0.0, BASE_M, width, 0.5))
+    base, edges = cut((0.0, BASE_M, width, 0.5), [h for h in holes[:-1] if h[1] < 0.5])
+    parts.append(panels(base, -0.0, style.base, edges))
+    wall, edges = cut((0.0, 0.5, width, eaves), holes)
+    parts.append(panels(wall, 0.0, style.wall, edges))
+    parts += [_back(style, width, eaves), _roof(rng, style, width, eaves)]
+    parts.append(_rainpipe(eaves))
+    return join(parts)
+
+
+_LEDGE = ("-y", "+z", "-z", "+x", "-x")
+
+
+def _ground_floor(
+    rng: np.random.Generator,
+    style: Style,
+    width: float,
+    count: int,
+    holes: list[Rectangle],
+    fine: bool,
+) -> Shapes:
+    """Shop, or a door between windows; adds its holes to the wall's."""
+    floor = float(pavement_z(FACADE_M)) + 0.02
+    if style.has_shop:
+        opening = (0.45, floor, width - 0.45, floor + 2.75)
+        holes.append(opening)
+        holes.append((0.35, opening[3] + 0.08, width - 0.35, opening[3] + 0.70))
+        return shop_front(opening, style, bool(rng.random() < 0.45))
+    pitch = width / count
+    entry = int(rng.integers(count))
+    parts = []
+    places = []
+    for i in range(count):
+        middle = (i + 0.5) * pitch
+        if i == entry:
+            opening = (middle - 0.58, floor + 0.12, middle + 0.58, floor + 2.95)
+            holes.append(opening)
+            holes.append((opening[0] - 0.1, BASE_M, opening[2] + 0.1, opening[1]))
+            parts.append(door(opening, style))
+        else:
+            corner = (middle - style.window_m[0] / 2, 1.15)
+            holes += window_hole(corner, style)
+            places.append((corner[0], 0.0, corner[1]))
+    if places:
+        parts.append(window(style.window_m, style, fine).repeated(np.array(places)))
+    return join(parts)
+
+
+def _back(style: Style, width: float, eaves: float) -> Shapes:
+    """Side and back walls, plain."""
+    wall = Look(style.wall.rgb, Class.BUILDING, style.wall.material, spacing=1.6)
+    low, high = (0.0, 0.0, BASE_M), (width, DEPTH_M, eaves)
+    return boxes(low, high, wall, faces=("+x", "-x", "+y"), edges=0)
+
+
+def _roof(rng: np.random.Generator, style: Style, width: float, eaves: float) -> Shapes:
+    if rng.random() < 0.35:
+        return _flat_roof(style, width, eaves)
+    tiles = Look(ROOFS[rng.integers(len(ROOFS))], Class.BUILDING, Material.TILES, spacing=1.3)
+    rise, half = (DEPTH_M / 2) * float(np.tan(np.radians(rng.uniform(30, 40)))), DEPTH_M / 2
+    over = 0.35
+    drop = over * rise / half
+    front, back = (0.0, -over, eaves - drop + 0.12), (width, DEPTH_M + over, eaves - drop + 0.12)
+    slope = np.array([0.0, half + over, rise + drop])
+    parts = [
+        parallelograms(front, (width, 0, 0), slope, tiles),
+        parallelograms(back, (-width, 0, 0), slope * [1, -1, 1], tiles),
+        boxes(
+            (0.0, -over - 0.12, front[2] - 0.14),
+            (width, -over + 0.02, front[2] + 0.0),
+            style.trim.tinted((0.25, 0.24, 0.23)),
+            faces=_LEDGE,
+            edges=0,
+        ),
+        parallelograms(
+            (0, -over, front[2] - 0.02), (0, over, 0), (width, 0, 0), style.trim, edges=0
+        ),
+    ]
+    gable = Look(style.wall.rgb, Class.BUILDING, style.wall.material, spacing=0.8)
+    peak = (half, eaves + rise + 0.1)
+    for x, flip in ((0.0, True), (width, False)):
+        a, b, c = (x, 0.0, eaves), (x, DEPTH_M, eaves), (x, *peak)
+        parts.append(triangle(np.array([a, c, b] if flip else [a, b, c]), gable))
+    brick = Look((0.33, 0.16, 0.11), Class.BUILDING, Material.BRICK)
+    for x in (0.7, width - 1.5)[: int(rng.integers(1, 3))]:
+        top = eaves + rise + 0.9
+        parts.append(boxes((x, half - 0.9, eaves + rise * 0.6), (x + 0.8, half - 0.3, top), brick))
+    return join(parts)
+
+
+def _flat_roof(style: Style, width: float, eaves: float) -> Shapes:
+    """A roof behind a parapet."""
+    top = eaves + 0.75
+    gravel = Look((0.30, 0.29, 0.27), Class.BUILDING, Material.ASPHALT, spacing=1.6)
+    parapet = Look(style.wall.rgb, Class.BUILDING, style.wall.material)
+    return join(
+        [
+            parallelograms((0, 0.3, eaves), (width, 0, 0), (0, DEPTH_M - 0.3, 0), gravel, edges=0),
+            boxes((0, 0, eaves), (width, 0.3, top), parapet, faces=("-y", "+y", "+x", "-x")),
+            boxes((-0.0, -0.07, top), (width, 0.37, top + 0.1), style.trim, faces=_LEDGE),
+        ]
+    )
+
+
+def _rainpipe(eaves: float) -> Shapes:
+    zinc = Look((0.22, 0.22, 0.215), Class.BUILDING)
+    return tube((0.12, -0.09, 0.0), (0.12, -0.09, eaves - 0.2), 0.05, zinc)
+
+
+def _garden(plot: Plot) -> Shapes:
+    """A low wall with a hedge behind it, across a gap between two houses."""
+    width = plot.x1 - plot.x0
+    brick = Look((0.34, 0.17, 0.12), Class.BARRIER, Material.BRICK)
+    hedge = Look((0.075, 0.13, 0.03), Class.VEGETATION, Material.LEAVES)
+    stone = Look((0.52, 0.50, 0.46), Class.BARRIER)
+    return join(
+        [
+            boxes((0, 0.0, BASE_M), (width, 0.3, 0.95), brick, faces=("-y", "+y", "+x", "-x")),
+            boxes((0, -0.05, 0.95), (width, 0.35, 1.03), stone, faces=_LEDGE),
+            boxes((0.05, 0.5, 0.0), (width - 0.05, 1.5, 1.75), hedge, edges=0),
+        ]
+    )
+
+
+def _second_row(layout: Layout) -> Shapes:
+    """Plain houses behind the gardens, which close the view through the gaps."""
+    rng = np.random.default_rng([layout.parameters.seed, 21])
+    parts = []
+    for side in (1, -1):
+        x = layout.x0 - 4.0
+        while x < layout.x1 + 4.0:
+            width, height = rng.uniform(9, 15), rng.uniform(6.5, 9.5)
+            style = draw_style(rng)
+            y = side * rng.uniform(36, 44)
+            wall = Look(style.wall.rgb, Class.BUILDING, style.wall.material)
+            rows = [(w, z) for z in (1.2, 4.2) for w in np.arange(1.2, width - 1.6, 2.6)]
+            holes = [(w, z, w + 1.2, z + 1.5) for w, z in rows]
+            front, edges = cut((0.0, BASE_M, width, height), holes)
+            built = join(
+                [
+                    panels(front, 0.0, wall, edges & np.uint8(U0 | U1 | V1)),
+                    panels(np.array(holes), 0.1, _PANE, ALL_EDGES),
+                    *[reveals(h, 0.1, wall) for h in holes],
+                    _back(style, width, height),
+                    _roof(rng, style, width, height),
+                ]
+            )
+            corner = (x if side > 0 else x + width, y, 0.0)
+            parts.append(built.moved(corner, 0.0 if side > 0 else np.pi))
+            x += width + rng.uniform(4, 12)
+    return join(parts)
+
+
+_PANE = Look((0.10, 0.12, 0.14), Class.BUILDING)

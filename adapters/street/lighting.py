@@ -1,0 +1,186 @@
+"""Baked light: a sun with soft shadows, sky light in a street canyon, mirrors, haze, exposure.
+
+All light is a function of the place on a surface. What depends on the viewer (the sky in a window,
+the shine of paint) is worked out for one viewer, at the nearest point of the ego cameras' path.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+
+from adapters.street.materials import Material, albedo
+from adapters.street.raycast import Tree
+from adapters.street.shapes import Shapes
+
+SUN_RGB = np.array([1.0, 0.91, 0.76]) * 3.1
+SKY_RGB = np.array([0.62, 0.75, 1.0]) * 0.92
+BOUNCE_RGB = np.array([0.55, 0.50, 0.44]) * 0.42
+HAZE_RGB = np.array([0.64, 0.73, 0.83])
+SUN_SAMPLES = 8
+SUN_RADIUS_RAD = 0.018  # four times the real sun: shadow edges as soft as the splats are wide
+SHADOW_OFFSET_M = 0.004
+MIRROR_RGB = np.array([0.30, 0.29, 0.28])  # the far side of the street, as panes and paint show it
+
+
+@dataclass(frozen=True, eq=False)
+class Lighting:
+    """Light in one body's frame. to_sun [3]: unit. eye_path [2, 3]: segment the cameras move along.
+
+    canyon: y of the street's right and left walls, and z of their tops, metres. ground_z: of the
+    ground, metres. footprints [C, 4]: x, y and half sizes of parked cars, which keep sky light off
+    the ground.
+    """
+
+    to_sun: np.ndarray
+    eye_path: np.ndarray
+    canyon: tuple[float, float, float]
+    ground_z: float = 0.0
+    footprints: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 4)))
+
+    def sun_directions(self) -> np.ndarray:
+        """[SUN_SAMPLES, 3] unit vectors spread over the sun's disc (a sunflower pattern)."""
+        index = np.arange(SUN_SAMPLES)
+        radius = SUN_RADIUS_RAD * np.sqrt((index + 0.5) / SUN_SAMPLES)
+        angle = index * 2.399963
+        u = np.cross([0.0, 0.0, 1.0], self.to_sun)
+        u /= np.linalg.norm(u)
+        v = np.cross(self.to_sun, u)
+        spread = radius[:, None] * (np.cos(angle)[:, None] * u + np.sin(angle)[:, None] * v)
+        directions = self.to_sun + spread
+        return directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+    def eyes_for(self, points: np.ndarray) -> np.ndarray:
+        """The nearest place of the cameras' path to each point, [N, 3]."""
+        start, end = self.eye_path
+        along = end - start
+        length = max(float(along @ along), 1e-9)
+        fraction = np.clip((points - start) @ along / length, 0, 1)
+        return start + fraction[:, None] * along
+
+
+def shade(
+    shapes: Shapes,
+    tree: Tree,
+    lighting: Lighting,
+    shape: np.ndarray,
+    local: np.ndarray,
+    sun_directions: np.ndarray,
+) -> np.ndarray:
+    """Display-encoded colour [N, 3] of places on shapes, lit from sun_directions [K, 3]."""
+    points = shapes.points(shape, local)
+    normals = shapes.normals(shape, local)
+    smooth = shapes.shading_normals(shape, local)
+    material = shapes.material[shape]
+    base = albedo(material, shapes.rgb[shape], shapes.variation[shape], local, points)
+
+    facing = np.einsum("nk,k->n", smooth, lighting.to_sun)
+    leaf = material == Material.LEAVES  # light comes through them
+    facing = np.where(leaf, (facing + 0.5) / 1.5, facing)
+    sun = np.maximum(facing, 0) * _sun_share(
+        tree, points, normals, facing > 0, leaf, sun_directions
+    )
+    sky = _sky_share(lighting, points, smooth) * shapes.ambient[shape]
+    upward = 0.5 + 0.5 * smooth[:, 2]
+    ambient = sky[:, None] * (upward[:, None] * SKY_RGB + (1 - upward)[:, None] * BOUNCE_RGB)
+    light = sun[:, None] * SUN_RGB + ambient
+    radiance = base * light
+    glossy = (material == Material.GLASS) | (material == Material.PAINT)
+    if glossy.any():
+        radiance[glossy] += _mirrored(
+            lighting, points[glossy], smooth[glossy], material[glossy], sun[glossy], sky[glossy]
+        )
+    return encode_display(_haze(radiance, lighting, points))
+
+
+def _sun_share(
+    tree: Tree,
+    points: np.ndarray,
+    normals: np.ndarray,
+    lit: np.ndarray,
+    leaf: np.ndarray,
+    sun_directions: np.ndarray,
+) -> np.ndarray:
+    """Share of the sun's disc that is seen, [N]."""
+    share = np.zeros(len(points))
+    index = np.flatnonzero(lit)
+    # A leaf blob lights up from within, so its ray starts on the side of the sun.
+    side = np.where(np.einsum("nk,k->n", normals[index], sun_directions[0]) < 0, -1.0, 1.0)
+    offset = normals[index] * (SHADOW_OFFSET_M * np.where(leaf[index], side, 1.0))[:, None]
+    origins = points[index] + offset
+    for direction in sun_directions:
+        rays = np.broadcast_to(direction, origins.shape)
+        share[index] += ~tree.occluded(origins, rays)
+    return share / len(sun_directions)
+
+
+def _sky_share(lighting: Lighting, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Share of the sky's light that reaches a place, by closed forms rather than rays, [N]."""
+    right_wall, left_wall, top = lighting.canyon
+    below = np.maximum(top - points[:, 2], 0)
+    to_left = np.maximum(left_wall - points[:, 1], 0.05)
+    to_right = np.maximum(points[:, 1] - right_wall, 0.05)
+    left, right = to_left / np.hypot(to_left, below), to_right / np.hypot(to_right, below)
+    open_sky = (left + right) / 2  # of an endless street between equal walls
+    inside = (points[:, 1] < left_wall + 0.6) & (points[:, 1] > right_wall - 0.6)
+    share = np.where(inside, 0.42 + 0.58 * open_sky, 1.0)
+    height = points[:, 2] - lighting.ground_z
+    upright = inside & (np.abs(normals[:, 2]) < 0.5)
+    share *= 1 - 0.35 * upright * np.exp(-np.maximum(height - 0.05, 0) / 0.35)
+    ground = (normals[:, 2] > 0.7) & (height < 0.3)
+    if len(lighting.footprints) and ground.any():
+        share[ground] *= _under_cars(points[ground], lighting.footprints)
+    return share
+
+
+def _under_cars(points: np.ndarray, footprints: np.ndarray) -> np.ndarray:
+    """What is left of the sky beside and below parked cars, [N]."""
+    left = np.ones(len(points))
+    for x, y, half_length, half_width in footprints:
+        dx = np.maximum(np.abs(points[:, 0] - x) - (half_length - 0.45), 0)
+        dy = np.maximum(np.abs(points[:, 1] - y) - (half_width - 0.45), 0)
+        distance = np.hypot(dx, dy) - 0.45  # to a rounded rectangle
+        left *= 1 - 0.85 / (1 + np.exp((distance - 0.02) / 0.13))
+    return left
+
+
+def _mirrored(
+    lighting: Lighting,
+    points: np.ndarray,
+    normals: np.ndarray,
+    material: np.ndarray,
+    sun: np.ndarray,
+    sky: np.ndarray,
+) -> np.ndarray:
+    """Reflected radiance [N, 3]: sky above the roofs, the street below, a glint of the sun."""
+    view = points - lighting.eyes_for(points)
+    view /= np.linalg.norm(view, axis=1, keepdims=True)
+    cosine = np.clip(-(view * normals).sum(1), 0, 1)
+    reflected = view + 2 * cosine[:, None] * normals
+    is_glass = material == Material.GLASS
+    fresnel = 0.04 + 0.96 * (1 - cosine) ** 5
+    strength = np.where(is_glass, 0.16 + 0.84 * fresnel, fresnel)
+    roofs = 0.45 * np.abs(reflected[:, 1]) + 0.05  # how high the far side of the street stands
+    seen = 1 / (1 + np.exp(-(reflected[:, 2] - roofs) / 0.06))
+    skylight = SKY_RGB * (1.15 - 0.55 * np.clip(reflected[:, 2:], 0, 1))
+    mirrored = seen[:, None] * skylight + (1 - seen)[:, None] * MIRROR_RGB * sky[:, None]
+    mirrored *= np.where(reflected[:, 2] < 0, 0.45, 1.0)[:, None]
+    glint = np.clip(reflected @ lighting.to_sun, 0, 1) ** 180 * 2.5 * (sun > 0)
+    return strength[:, None] * mirrored + (~is_glass * glint * 0.25)[:, None] * SUN_RGB
+
+
+def _haze(radiance: np.ndarray, lighting: Lighting, points: np.ndarray) -> np.ndarray:
+    """Far things pale towards the horizon, by their distance to the cameras' path."""
+    distance = np.linalg.norm(points - lighting.eyes_for(points), axis=1)
+    veil = 1 - np.exp(-np.maximum(distance - 25, 0) / 260)
+    return radiance * (1 - veil)[:, None] + veil[:, None] * HAZE_RGB * 0.8
+
+
+def encode_display(radiance: np.ndarray) -> np.ndarray:
+    """Display-encoded sRGB in [0, 1] of linear radiance, with a soft shoulder for highlights."""
+    linear = 1 - np.exp(-1.05 * np.maximum(radiance, 0))
+    low = 12.92 * linear
+    high = 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055
+    return np.where(linear <= 0.0031308, low, high)
