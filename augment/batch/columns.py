@@ -1,0 +1,169 @@
+"""NumPy columns in Parquet files, and back with the same bits and the same dtypes.
+
+Parquet has fewer types than NumPy: `<U5` becomes a string, an object column a string or JSON. Each
+column's NumPy dtype is therefore kept in the file's metadata and restored by `unpack_column`.
+Writing fails for a column that could not be restored exactly.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from augment.errors import OutputError
+
+METADATA_KEY = b"climategs"
+
+
+@dataclass(frozen=True)
+class PackedColumn:
+    """An Arrow column of several NumPy pieces joined. encoding: `plain`, or `json` texts."""
+
+    data: pa.ChunkedArray
+    encoding: str
+
+
+def column_type(column: np.ndarray) -> str:
+    """What `unpack_column` needs to know: `<f4`, `|O`, `(3,)<f8` for a column of [n, 3]."""
+    return "".join(f"({k},)" for k in column.shape[1:]) + column.dtype.str
+
+
+def pack_column(pieces: Sequence[np.ndarray], *, where: str) -> PackedColumn:
+    """Join columns of one meaning (one per frame, say) into one Arrow column, a chunk a piece.
+
+    pieces: each [n] or [n, k]. where: names the column in errors. Pieces of different Arrow types
+    are all stored as JSON, one text an entry.
+
+    Raises:
+        ValueError: a value cannot be stored such that reading gives it back exactly.
+    """
+    plain = [_to_arrow(piece) for piece in pieces]
+    # Empty pieces have no say: a frame without boxes often has columns of another dtype.
+    filled = [array for array, piece in zip(plain, pieces, strict=True) if len(piece)]
+    types = {None if array is None else array.type for array in filled}
+    if None not in types and len(types) <= 1:
+        kind = next(iter(types), pa.null())
+        chunks = [a if a is not None and len(a) else pa.array([], kind) for a in plain]
+        return PackedColumn(pa.chunked_array(chunks, type=kind), "plain")
+    texts = [pa.array(_to_json(piece, where), pa.string()) for piece in pieces]
+    return PackedColumn(pa.chunked_array(texts, type=pa.string()), "json")
+
+
+def unpack_column(data: pa.ChunkedArray, kind: str, encoding: str) -> np.ndarray:
+    """The NumPy column that was packed. kind: its `column_type`."""
+    described = np.dtype(kind)
+    wanted, width = described.base, described.shape
+    if len(data) == 0:
+        return np.empty((0, *width), wanted)
+    if encoding == "json":
+        return _filled([json.loads(text) for text in data.to_pylist()], wanted)
+    array = pa.concat_arrays(data.chunks)
+    if pa.types.is_fixed_size_list(array.type):
+        flat = array.flatten().to_numpy(zero_copy_only=False)
+        return flat.reshape(len(array), *width).astype(wanted)
+    if wanted.kind == "O":
+        return _filled(array.to_pylist(), wanted)
+    # A copy: Arrow's own memory is read-only, which torch.from_numpy warns about.
+    return np.array(array.to_numpy(zero_copy_only=False), dtype=wanted)
+
+
+def parquet_bytes(table: pa.Table, metadata: dict[str, object]) -> bytes:
+    """The table as a Parquet file, always the same bytes for the same table."""
+    note = json.dumps(metadata, separators=(",", ":")).encode()
+    sink = pa.BufferOutputStream()
+    # An eighth smaller for coordinates, and no slower.
+    split = {f.name: "BYTE_STREAM_SPLIT" for f in table.schema if pa.types.is_floating(f.type)}
+    pq.write_table(
+        table.replace_schema_metadata({METADATA_KEY: note}),
+        sink,
+        version="2.6",
+        compression="zstd",
+        compression_level=1,
+        use_dictionary=False,  # dictionaries compare values, which would merge unlike NaNs
+        column_encoding=split,
+        write_statistics=False,
+    )
+    return sink.getvalue().to_pybytes()
+
+
+def read_parquet(path: Path) -> tuple[pa.Table, dict[str, object]]:
+    """A table and the metadata that `parquet_bytes` put beside it.
+
+    Raises:
+        OutputError: the file is missing, damaged, or without that metadata.
+    """
+    try:
+        # One thread: this runs in DataLoader workers, which bring their own parallelism.
+        table = pq.ParquetFile(path).read(use_threads=False)
+    except (OSError, pa.ArrowException) as error:
+        raise OutputError(f"{path} is missing or not a readable Parquet file: {error}") from error
+    note = (table.schema.metadata or {}).get(METADATA_KEY)
+    if note is None:
+        raise OutputError(f"{path} was not written by this project: its metadata are missing")
+    return table, json.loads(note)
+
+
+def _to_arrow(piece: np.ndarray) -> pa.Array | None:
+    """The column in a native Arrow type, or None where only JSON may hold it."""
+    if piece.dtype.kind == "O":
+        strings = piece.ndim == 1 and all(isinstance(value, str) for value in piece)
+        return pa.array(piece.tolist(), pa.string()) if strings else None
+    if piece.dtype.kind in "US" and piece.ndim == 1:
+        # From Python values: Arrow's reader of fixed-width text stops at a zero character.
+        return pa.array(piece.tolist(), pa.string() if piece.dtype.kind == "U" else pa.binary())
+    if piece.dtype.kind not in "biufMm" or piece.ndim not in (1, 2):
+        return None
+    flat = np.ascontiguousarray(piece).reshape(-1)
+    flat = flat.astype(flat.dtype.newbyteorder("="), copy=False)
+    try:
+        array = pa.array(flat, from_pandas=False)
+    except pa.ArrowException:  # times in hours and the like
+        return None
+    return array if piece.ndim == 1 else pa.FixedSizeListArray.from_arrays(array, piece.shape[1])
+
+
+def _to_json(piece: np.ndarray, where: str) -> list[str]:
+    if piece.ndim > (1 if piece.dtype.kind == "O" else 2):
+        raise ValueError(f"{where} has shape {list(piece.shape)}; columns are [n] or [n, k]")
+    # NumPy scalars inside an object column come back as the Python value they stand for.
+    values = [v.item() if isinstance(v, np.generic) else v for v in piece.tolist()]
+    texts = []
+    for value in values:
+        try:
+            text = json.dumps(value, ensure_ascii=False)
+            exact = _same(json.loads(text), value)
+        except (TypeError, ValueError):
+            text, exact = "", False
+        if not exact:
+            raise ValueError(
+                f"{where} holds {value!r} ({type(value).__name__}) in a column of dtype "
+                f"{piece.dtype}, which cannot be stored exactly; use numbers, strings, None, or "
+                f"lists of them"
+            )
+        texts.append(text)
+    return texts
+
+
+def _same(a: object, b: object) -> bool:
+    """Equal in value and type all the way down; NaN equals NaN."""
+    if type(a) is not type(b):
+        return False
+    if isinstance(a, list) and isinstance(b, list):
+        return len(a) == len(b) and all(map(_same, a, b))
+    if isinstance(a, dict) and isinstance(b, dict):
+        return list(a) == list(b) and all(_same(a[key], b[key]) for key in a)
+    return a == b or (a != a and b != b)
+
+
+def _filled(values: list, dtype: np.dtype) -> np.ndarray:
+    if dtype.kind != "O":
+        return np.array(values, dtype)
+    column = np.empty(len(values), object)  # np.array would turn lists of lists into a matrix
+    column[:] = values
+    return column

@@ -1,0 +1,254 @@
+"""Two ways to run a job's chunks: in this process, or in several worker processes.
+
+Workers are started afresh (`spawn`): nothing of the parent's threads, locks or random state leaks
+into them. Each opens the scene once and keeps it. The parent alone decides what runs where, and
+alone writes the journals.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import multiprocessing
+import os
+import signal
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from multiprocessing.connection import Connection, wait
+
+from augment.batch.lock import OutputLock
+from augment.batch.manifest import FAILED
+from augment.batch.runner import Chunk, FrameRunner, Outcome, Renderer, Setup
+from augment.batch.worker import Failure, Ready, SceneLoader, worker_main
+from augment.batch.writer import WritePump
+from augment.errors import OutputError, SceneError
+from augment.scene import Scene
+
+STOP_S = 120.0  # how long a worker may take to finish its image when the job stops
+CHUNKS_AHEAD = 2  # one being rendered and one waiting, so that no worker idles
+_log = logging.getLogger(__name__)
+
+Deliver = Callable[[Outcome], None]
+
+
+def run_serially(
+    scene: Scene,
+    setup: Setup,
+    chunks: Sequence[Chunk],
+    renderer: Renderer | None,
+    deliver: Deliver,
+) -> None:
+    """Render in this thread; two more threads encode and write. An interrupt ends cleanly."""
+    runner = FrameRunner(scene, setup, renderer, deliver, WritePump())
+    try:
+        for chunk in chunks:
+            runner.run(chunk)
+    finally:
+        runner.close()
+
+
+def run_in_processes(
+    setup: Setup,
+    chunks: Sequence[Chunk],
+    *,
+    workers: int,
+    scene_loader: SceneLoader,
+    renderer: Renderer | None,
+    deliver: Deliver,
+    lock: OutputLock,
+) -> None:
+    """Render in `workers` processes; `deliver` is called in this thread.
+
+    What a dead worker had in hand is tried once more, each image alone; if its process dies again
+    the image is recorded as failed.
+
+    Raises:
+        SceneError: a worker could not open the scene. OutputError: a worker could not write.
+    """
+    pool = _Pool(setup, scene_loader, renderer, deliver, lock, chunks)
+    pool.run(min(workers, len(chunks)))
+
+
+class _Worker:
+    """A worker process as its parent sees it."""
+
+    def __init__(self, pool: _Pool) -> None:
+        context = multiprocessing.get_context("spawn")
+        self.connection, child = context.Pipe()
+        arguments = (child, pool.setup, pool.scene_loader, pool.renderer, pool.threads)
+        self.process = context.Process(
+            target=worker_main, args=(*arguments, pool.lock.inherited()), daemon=True
+        )
+        with _thread_limits(pool.threads), _interrupts_blocked():
+            self.process.start()
+        child.close()
+        self.is_ready = False
+        self.is_stopping = False
+        self.on_trial = False  # busy with one image whose worker died before
+        self.in_hand: list[Chunk] = []
+
+    def give(self, chunk: Chunk) -> None:
+        self.in_hand.append(chunk)
+        # A worker that has just died shows itself when its connection is read.
+        with contextlib.suppress(OSError):
+            self.connection.send(chunk)
+
+    def take(self, outcome: Outcome) -> None:
+        """Strike a finished image off what the worker has in hand."""
+        for position, chunk in enumerate(self.in_hand):
+            if (chunk.variant, chunk.frame) == (outcome.variant, outcome.frame):
+                rest = tuple(name for name in chunk.cameras if name != outcome.camera)
+                if len(rest) < len(chunk.cameras):
+                    kept = [Chunk(chunk.variant, chunk.frame, rest)] if rest else []
+                    self.in_hand[position : position + 1] = kept
+                    self.on_trial = self.on_trial and bool(kept)
+                    return
+
+    def stop(self) -> None:
+        self.is_stopping = True
+        with contextlib.suppress(OSError):
+            self.connection.send(None)
+
+
+class _Pool:
+    def __init__(
+        self,
+        setup: Setup,
+        scene_loader: SceneLoader,
+        renderer: Renderer | None,
+        deliver: Deliver,
+        lock: OutputLock,
+        chunks: Sequence[Chunk],
+    ) -> None:
+        self.setup, self.scene_loader, self.renderer = setup, scene_loader, renderer
+        self.deliver, self.lock = deliver, lock
+        self.waiting = deque(chunks)
+        self.retries: deque[Chunk] = deque()
+        self.workers: list[_Worker] = []
+        self.threads = 1
+
+    def run(self, count: int) -> None:
+        self.threads = max(1, available_cores() // count)
+        try:
+            for _ in range(count):
+                self.workers.append(_Worker(self))
+            while self._feed():
+                for worker in self._readable(None):
+                    self._read(worker)
+        finally:
+            self._stop()
+
+    def _feed(self) -> bool:
+        """Hand out work; False when there is none left, in hand or waiting."""
+        for worker in self.workers:
+            while self.waiting and not worker.on_trial and len(worker.in_hand) < CHUNKS_AHEAD:
+                worker.give(self.waiting.popleft())
+            if self.retries and not worker.in_hand:
+                worker.on_trial = True
+                worker.give(self.retries.popleft())
+        return any(worker.in_hand for worker in self.workers)
+
+    def _readable(self, timeout_s: float | None) -> list[_Worker]:
+        by_connection = {worker.connection: worker for worker in self.workers}
+        ready = wait(list(by_connection), timeout_s)
+        return [by_connection[c] for c in ready if isinstance(c, Connection)]
+
+    def _read(self, worker: _Worker) -> None:
+        try:
+            message = worker.connection.recv()
+        except (EOFError, OSError):
+            self._bury(worker)
+            return
+        if isinstance(message, Ready):
+            worker.is_ready = True
+        elif isinstance(message, Failure):
+            raise (OutputError if message.is_output else SceneError)(message.text)
+        else:
+            worker.take(message)
+            self.deliver(message)
+
+    def _bury(self, worker: _Worker) -> None:
+        """Take a worker that ended out of the pool, and decide about what it had in hand."""
+        worker.process.join()
+        worker.connection.close()
+        self.workers.remove(worker)
+        if worker.is_stopping:
+            return
+        ending = _describe_exit(worker.process.exitcode)
+        if not worker.is_ready:
+            raise SceneError(
+                f"a worker process {ending} while opening {self.setup.scene_uri}; if memory ran "
+                f"out, use fewer workers"
+            )
+        _log.warning("a worker process %s; its images are tried once more", ending)
+        for chunk in worker.in_hand:
+            for name in chunk.cameras:
+                if worker.on_trial:
+                    message = (
+                        f"the worker process {ending} while rendering this image, and again when "
+                        f"it was tried alone; if memory ran out, use fewer workers"
+                    )
+                    self.deliver(Outcome(chunk.variant, chunk.frame, name, FAILED, message))
+                else:
+                    self.retries.append(Chunk(chunk.variant, chunk.frame, (name,)))
+        if self.waiting or self.retries:
+            self.workers.append(_Worker(self))
+
+    def _stop(self) -> None:
+        """Let every worker finish the image it is at, and take it in; kill what does not end."""
+        deadline = time.monotonic() + STOP_S
+        try:
+            for worker in self.workers:
+                worker.stop()
+            while self.workers and time.monotonic() < deadline:
+                for worker in self._readable(1.0):
+                    with contextlib.suppress(OutputError, SceneError):  # the first is on its way
+                        self._read(worker)
+        finally:
+            for worker in self.workers:
+                worker.process.kill()
+                worker.process.join()
+                worker.connection.close()
+            self.workers = []
+
+
+def available_cores() -> int:
+    """Cores this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _describe_exit(code: int | None) -> str:
+    if code is not None and code < 0:
+        return f"was killed by {signal.Signals(-code).name}"
+    return f"ended with exit code {code}"
+
+
+@contextlib.contextmanager
+def _thread_limits(threads: int) -> Iterator[None]:
+    """Environment that makes a child's libraries share the cores; they read it when loaded."""
+    names = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+    before = {name: os.environ.get(name) for name in names}
+    for name, value in before.items():
+        limit = min(threads, int(value)) if value and value.isdigit() else threads
+        os.environ[name] = str(max(1, limit))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+@contextlib.contextmanager
+def _interrupts_blocked() -> Iterator[None]:
+    """A child started inside never sees Ctrl-C: the parent tells it to stop instead."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

@@ -1,0 +1,109 @@
+"""Where everything lies under an output folder, and which names are safe there.
+
+Paths in the manifest are relative to the output folder, with forward slashes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from dataclasses import asdict, dataclass
+from pathlib import Path, PurePosixPath
+
+from augment.errors import OutputError
+from recipes.schema import Output, Recipe
+
+MANIFEST = "manifest.parquet"
+STATE_FOLDER = ".climategs"
+
+_SAFE = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
+_UNSAFE_CHARACTERS = re.compile(r"[^A-Za-z0-9._-]+")
+
+
+def folder_name(name: str) -> str:
+    """A name of a scene or camera as one safe path component.
+
+    Letters, digits, `.`, `_`, `-`, at most 100 of them and the first a letter or digit, stay as
+    they are. Any other name has the rest replaced by `_` and eight hex digits of its SHA-256
+    added, so that two names never share a folder and nothing leaves the output folder.
+    """
+    if _SAFE.fullmatch(name) and name != MANIFEST:
+        return name
+    digest = hashlib.sha256(name.encode()).hexdigest()[:8]
+    readable = _UNSAFE_CHARACTERS.sub("_", name).lstrip("._-")[:80]
+    return f"{readable or 'unnamed'}-{digest}"
+
+
+def variant_name(recipe: Recipe) -> str:
+    """The folder of a recipe's draw: `fog-003`."""
+    return f"{recipe.name}-{recipe.variant:03d}"
+
+
+@dataclass(frozen=True)
+class ItemPaths:
+    """Paths of one image and what belongs to it, relative to the output folder; None if unused."""
+
+    image: str
+    depth: str | None
+    semantic: str | None
+    instance: str | None
+    lidar: str | None
+    labels: str | None
+    calibration: str
+
+    def own_files(self) -> tuple[str, ...]:
+        """The files of this image alone, which nothing else rewrites."""
+        own = (self.image, self.depth, self.semantic, self.instance)
+        return tuple(path for path in own if path is not None)
+
+    def columns(self) -> dict[str, str | None]:
+        """As the manifest's columns: `image_path` and so on."""
+        return {f"{kind}_path": path for kind, path in asdict(self).items()}
+
+
+PATH_KINDS = tuple(ItemPaths.__dataclass_fields__)
+
+
+def variant_folder(scene: str, variant: str) -> str:
+    """The folder of one variant of a scene."""
+    return f"{folder_name(scene)}/{folder_name(variant)}"
+
+
+def item_paths(scene: str, variant: str, camera: str, frame: int, output: Output) -> ItemPaths:
+    """Where the image of one camera in one frame lies; `lidar` and `labels` if the recipe asks."""
+    if frame < 0:
+        raise ValueError(f"frame numbers in an output folder are >= 0; got {frame}")
+    base = variant_folder(scene, variant)
+    stem = f"{folder_name(camera)}/{frame:06d}"
+    return ItemPaths(
+        image=f"{base}/images/{stem}.{output.image}",
+        depth=None if output.depth == "none" else f"{base}/depth/{stem}.png",
+        semantic=f"{base}/semantic/{stem}.png" if output.semantic else None,
+        instance=f"{base}/instance/{stem}.png" if output.instance else None,
+        lidar=f"{base}/lidar/{frame:06d}.parquet" if output.lidar else None,
+        labels=f"{base}/labels/boxes.parquet" if output.labels else None,
+        calibration=f"{base}/calibration.json",
+    )
+
+
+def resolve_inside(root: Path, relative: str) -> Path:
+    """The file that a manifest's path names.
+
+    Raises:
+        OutputError: the path is absolute, climbs with `..`, or leaves `root` through a link.
+    """
+    parts = PurePosixPath(relative).parts
+    if not parts or parts[0] == "/" or ".." in parts or "\\" in relative or "\0" in relative:
+        raise OutputError(
+            f"{root / MANIFEST} names the file {relative!r}; paths there must be relative to "
+            f"{root}, without '..'. The manifest is damaged or not from this project: do not "
+            f"trust the folder"
+        )
+    path = root.joinpath(*parts)
+    real_root = root.resolve()
+    if not path.resolve().is_relative_to(real_root):
+        raise OutputError(
+            f"{path} leads through a link to {path.resolve()}, outside {real_root}; "
+            f"put the files themselves under the output folder"
+        )
+    return path

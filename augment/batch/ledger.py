@@ -1,0 +1,209 @@
+"""What of a job is done already, what is left, and what the manifest will say of it."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import threading
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+
+from augment.batch.atomic import flush_folder, make_folder, output_error, remove_temporaries
+from augment.batch.journal import Identity, Journal, journalled_variants
+from augment.batch.layout import (
+    MANIFEST,
+    PATH_KINDS,
+    STATE_FOLDER,
+    item_paths,
+    variant_folder,
+    variant_name,
+)
+from augment.batch.manifest import OK, merge_rows, read_manifest, rows_of, write_manifest
+from augment.batch.runner import Chunk, Outcome
+from augment.batch.selection import SceneIndex
+from augment.cameras import Frame
+from recipes.schema import Recipe
+
+Item = tuple[int, str]  # frame number and camera name
+
+
+@dataclass
+class VariantState:
+    """One variant of the job. rows: what is known of its images, from this run and earlier ones."""
+
+    recipe: Recipe
+    name: str
+    folder: str
+    identity: Identity
+    journal: Journal
+    rows: dict[Item, dict[str, Any]] = field(default_factory=dict)
+    is_journalled: bool = False
+
+    def is_finished(self, out_dir: Path, item: Item) -> bool:
+        """Whether the image's row says ok and all its files are there."""
+        row = self.rows.get(item)
+        if row is None or row["status"] != OK:
+            return False
+        paths = [
+            row[f"{kind}_path"] for kind in PATH_KINDS if kind not in ("labels", "calibration")
+        ]
+        return all((out_dir / path).is_file() for path in paths if path is not None)
+
+
+class Ledger:
+    """The state of a job in its output folder. Needs the folder's lock."""
+
+    def __init__(
+        self,
+        out_dir: Path,
+        index: SceneIndex,
+        recipes: Sequence[Recipe],
+        identities: Sequence[Identity],
+    ) -> None:
+        self.out_dir, self.index = out_dir, index
+        self._lock = threading.Lock()
+        self._table: pa.Table | None = None
+        self.variants = []
+        for recipe, identity in zip(recipes, identities, strict=True):
+            name = variant_name(recipe)
+            journal = Journal(out_dir, index.name, name)
+            folder = variant_folder(index.name, name)
+            self.variants.append(VariantState(recipe, name, folder, identity, journal))
+
+    @property
+    def keys(self) -> set[tuple[str, str]]:
+        return {(self.index.name, variant.name) for variant in self.variants}
+
+    def open(self, *, overwrite: bool) -> None:
+        """Clear away what a killed run left, and read what it finished.
+
+        Raises:
+            OutputError: a variant's folder holds images of another recipe, scene or version, and
+                `overwrite` is false; nothing was changed then.
+        """
+        if (self.out_dir / MANIFEST).is_file():
+            self._table = read_manifest(self.out_dir)
+        anew = [variant for variant in self.variants if self._load(variant, overwrite)]
+        self._clear_leftovers()
+        if anew:
+            self._begin_anew(anew)
+
+    def pending(self, selection: Sequence[tuple[Frame, tuple[str, ...]]]) -> Iterator[Chunk]:
+        """What has to be rendered, in order: variant by variant, frame by frame."""
+        for number, variant in enumerate(self.variants):
+            for frame, names in selection:
+                left = [n for n in names if not variant.is_finished(self.out_dir, (frame.index, n))]
+                if left:
+                    yield Chunk(number, frame.index, tuple(left))
+
+    def record(self, outcome: Outcome, frame: Frame) -> None:
+        """Enter what became of an image, durably. May be called from several threads."""
+        variant = self.variants[outcome.variant]
+        row = self._row(variant, outcome, frame)
+        variant.journal.append(row)
+        with self._lock:
+            variant.rows[frame.index, outcome.camera] = row
+
+    def write_manifest(self, variants: Sequence[VariantState]) -> Path:
+        """Put the rows of these variants into the manifest."""
+        keys = {(self.index.name, variant.name) for variant in variants}
+        rows = [row for variant in variants for row in variant.rows.values()]
+        return write_manifest(self.out_dir, merge_rows(self._table, rows, keys))
+
+    def close(self) -> None:
+        for variant in self.variants:
+            variant.journal.close()
+
+    def _load(self, variant: VariantState, overwrite: bool) -> bool:
+        """Read the variant's rows; true where its folder has to be begun anew."""
+        begun, journalled = variant.journal.load()
+        rows: list[dict[str, Any]] = []
+        if self._table is not None:
+            rows = rows_of(self._table, {(self.index.name, variant.name)})
+        listed = Identity.of_row(rows[0]) if rows else None
+        if overwrite and (begun or listed):
+            return True
+        found = begun or listed
+        if found is not None:
+            variant.identity.check(found, str(self.out_dir / variant.folder))
+        if begun is not None and listed not in (None, begun):
+            return True  # killed while an older content was being overwritten
+        variant.is_journalled = begun is not None
+        variant.rows = {(row["frame"], row["camera"]): row for row in [*rows, *journalled]}
+        return False
+
+    def _begin_anew(self, variants: Sequence[VariantState]) -> None:
+        """Drop the variants' rows and files, in an order that a kill cannot confuse.
+
+        The journal with the new identity comes first: while the manifest disagrees with it, the
+        next run knows that the old content has to go.
+        """
+        trash = self.out_dir / STATE_FOLDER / "trash"
+        for number, variant in enumerate(variants):
+            variant.journal.remove()
+            variant.journal.begin(variant.identity)
+            variant.is_journalled = True
+            folder = self.out_dir / variant.folder
+            if folder.is_dir():
+                try:
+                    make_folder(trash)
+                    folder.rename(trash / str(number))
+                    flush_folder(folder.parent)
+                except OSError as error:
+                    raise output_error(folder, error) from error
+        if self._table is not None:
+            keys = {(self.index.name, variant.name) for variant in variants}
+            self._table = merge_rows(self._table, [], keys)
+            write_manifest(self.out_dir, self._table)
+        _remove_tree(trash)
+
+    def _clear_leftovers(self) -> None:
+        state = self.out_dir / STATE_FOLDER
+        remove_temporaries(self.out_dir, recursive=False)
+        remove_temporaries(state)
+        _remove_tree(state / "trash")
+        mine = {variant.folder for variant in self.variants}
+        for folder in sorted(mine | set(journalled_variants(self.out_dir))):
+            remove_temporaries(self.out_dir / folder)
+
+    def _row(self, variant: VariantState, outcome: Outcome, frame: Frame) -> dict[str, Any]:
+        recipe, index = variant.recipe, self.index
+        camera = frame.cameras[outcome.camera].scaled(recipe.render.scale)
+        paths = item_paths(
+            index.name, variant.name, outcome.camera, frame.index, recipe.output
+        ).columns()
+        if not outcome.lidar:
+            paths["lidar_path"] = None
+        if frame.index not in index.labelled:
+            paths["labels_path"] = None
+        if outcome.status != OK:
+            paths = dict.fromkeys(paths)
+        return {
+            "scene": index.name,
+            "variant": variant.name,
+            "frame": frame.index,
+            "camera": outcome.camera,
+            "timestamp_ns": camera.timestamp_ns,
+            **paths,
+            "width": camera.width,
+            "height": camera.height,
+            **recipe.weather_numbers(),
+            "seed": recipe.seed,
+            "recipe": recipe.name,
+            **vars(variant.identity),
+            "checksum": outcome.checksum,
+            "status": outcome.status,
+            "message": outcome.message,
+        }
+
+
+def _remove_tree(folder: Path) -> None:
+    try:
+        with contextlib.suppress(FileNotFoundError):
+            shutil.rmtree(folder)
+    except OSError as error:
+        raise output_error(folder, error) from error

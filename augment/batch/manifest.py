@@ -1,0 +1,149 @@
+"""The table of everything that was written: one row per image, `manifest.parquet`.
+
+Rows are sorted, and nothing in them depends on when, where or by how many processes they were
+made: the same images give the same file to the bit.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from augment.batch.atomic import write_atomic
+from augment.batch.layout import MANIFEST, PATH_KINDS
+from augment.errors import OutputError
+
+OK, FAILED = "ok", "failed"
+
+# In the order of the file; the weather numbers of the recipes stand between the two groups.
+LEADING = {
+    "scene": pa.string(),
+    "source": pa.string(),
+    "variant": pa.string(),
+    "frame": pa.int64(),
+    "camera": pa.string(),
+    "timestamp_ns": pa.int64(),
+    **{f"{kind}_path": pa.string() for kind in PATH_KINDS},
+    "width": pa.int64(),
+    "height": pa.int64(),
+}
+TRAILING = {
+    "seed": pa.int64(),
+    "recipe": pa.string(),
+    "recipe_hash": pa.string(),
+    "trajectory": pa.string(),
+    "version": pa.string(),
+    "backend": pa.string(),
+    "checksum": pa.string(),
+    "status": pa.string(),
+    "message": pa.string(),
+}
+KEY = ("scene", "variant", "frame", "camera")
+
+Row = Mapping[str, Any]
+
+
+def weather_columns(table: pa.Table) -> list[str]:
+    """Names of the columns that hold weather numbers."""
+    return [n for n in table.column_names if n not in LEADING and n not in TRAILING]
+
+
+def rows_to_table(rows: Iterable[Row]) -> pa.Table:
+    """Rows as a sorted table; a weather number that a row lacks is NaN."""
+    rows = list(rows)
+    names = {name for row in rows for name in row}
+    weather = sorted(names - LEADING.keys() - TRAILING.keys())
+    columns = {name: pa.array([row[name] for row in rows], kind) for name, kind in LEADING.items()}
+    for name in weather:
+        columns[name] = pa.array([row.get(name, math.nan) for row in rows], pa.float64())
+    columns |= {
+        name: pa.array([row[name] for row in rows], kind) for name, kind in TRAILING.items()
+    }
+    return _sorted(pa.table(columns))
+
+
+def read_manifest(out_dir: Path) -> pa.Table:
+    """The manifest of an output folder.
+
+    Raises:
+        OutputError: there is none, or it is damaged, or it lacks columns.
+    """
+    path = Path(out_dir) / MANIFEST
+    if not path.is_file():
+        raise OutputError(
+            f"{path} does not exist: {out_dir} is no finished output folder. A job writes its "
+            f"manifest when it ends; run it again to let it finish"
+        )
+    try:
+        table = pq.ParquetFile(path).read(use_threads=False)
+    except (OSError, pa.ArrowException) as error:
+        raise OutputError(f"{path} is not a readable Parquet file: {error}") from error
+    wanted = {**LEADING, **TRAILING}
+    wrong = [n for n, k in wanted.items() if n not in table.column_names or table[n].type != k]
+    if wrong:
+        raise OutputError(
+            f"{path} lacks the columns {wrong} or holds them in another type; it was written by "
+            f"another program or version. Write to another output folder"
+        )
+    return table
+
+
+def merge_rows(
+    old: pa.Table | None, rows: Collection[Row], replaced: set[tuple[str, str]]
+) -> pa.Table:
+    """`old` with all rows of the (scene, variant) pairs in `replaced` exchanged for `rows`."""
+    new = rows_to_table(rows)
+    if old is None:
+        return new
+    kept = old.filter(pa.array(~_in_variants(old, replaced)))
+    weather = sorted({*weather_columns(kept), *weather_columns(new)})
+    order = [*LEADING, *weather, *TRAILING]
+    return _sorted(pa.concat_tables([_with_columns(t, weather).select(order) for t in (kept, new)]))
+
+
+def rows_of(table: pa.Table, variants: set[tuple[str, str]]) -> list[dict[str, Any]]:
+    """The rows of some (scene, variant) pairs, as dictionaries."""
+    return table.filter(pa.array(_in_variants(table, variants))).to_pylist()
+
+
+def write_manifest(out_dir: Path, table: pa.Table) -> Path:
+    """Replace the manifest in one step; untouched where it already says the same.
+
+    Raises:
+        OutputError: the system refused; the old manifest then still stands.
+    """
+    path = Path(out_dir) / MANIFEST
+    sink = pa.BufferOutputStream()
+    pq.write_table(table, sink, version="2.6", compression="zstd", row_group_size=1 << 16)
+    data = sink.getvalue().to_pybytes()
+    if not (path.is_file() and path.read_bytes() == data):
+        write_atomic(path, data)
+    return path
+
+
+def _in_variants(table: pa.Table, variants: set[tuple[str, str]]) -> np.ndarray:
+    scenes = table["scene"].to_numpy(zero_copy_only=False)
+    names = table["variant"].to_numpy(zero_copy_only=False)
+    mask = np.zeros(table.num_rows, bool)
+    for scene, variant in variants:
+        mask |= (scenes == scene) & (names == variant)
+    return mask
+
+
+def _with_columns(table: pa.Table, weather: list[str]) -> pa.Table:
+    for name in weather:
+        if name not in table.column_names:
+            absent = pa.array([math.nan] * table.num_rows, pa.float64())
+            table = table.append_column(name, absent)
+    return table
+
+
+def _sorted(table: pa.Table) -> pa.Table:
+    # Without the chunks of what was joined: they would show in the file.
+    return table.sort_by([(name, "ascending") for name in KEY]).combine_chunks()

@@ -1,0 +1,186 @@
+"""Renders the items of an opened scene, one frame of one variant at a time, and writes them.
+
+The same code runs in the job's own process and in its workers.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+from augment.batch.atomic import write_atomic
+from augment.batch.label_files import lidar_bytes
+from augment.batch.layout import item_paths, variant_name
+from augment.batch.manifest import FAILED, OK
+from augment.batch.trajectory import frames_from_json
+from augment.batch.writer import WritePump, check_view, write_view
+from augment.cameras import Camera
+from augment.scene import Scene
+from recipes.schema import Recipe
+
+MESSAGE_LENGTH = 500
+_log = logging.getLogger(__name__)
+
+
+class Renderer(Protocol):
+    """`augment.apply.render_view`, or a stand-in. Returns a `writer.View`."""
+
+    def __call__(self, scene: Scene, camera: Camera, recipe: Recipe, *, backend: str) -> Any: ...
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What rendering needs besides the scene; small, and picklable.
+
+    camera_path: JSON of `trajectory`, or None for the scene's frames. labelled: numbers of the
+    frames whose labels and LiDAR pass through.
+    """
+
+    scene_uri: str
+    out_dir: str
+    recipes: tuple[Recipe, ...]
+    backend: str
+    camera_path: str | None
+    labelled: frozenset[int]
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """Images of one frame under one recipe. variant: position in Setup.recipes."""
+
+    variant: int
+    frame: int
+    cameras: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of one image. lidar: whether the frame has a sweep. seconds: by kind of work."""
+
+    variant: int
+    frame: int
+    camera: str
+    status: str
+    message: str = ""
+    checksum: str = ""
+    lidar: bool = False
+    seconds: dict[str, float] = field(default_factory=dict)
+
+
+def describe(error: BaseException, doing: str) -> str:
+    """One line for the manifest: what was being done, the error's type and what it says."""
+    text = " ".join(f"{doing}: {type(error).__name__}: {error}".split())
+    return text if len(text) <= MESSAGE_LENGTH else text[: MESSAGE_LENGTH - 3] + "..."
+
+
+def default_renderer() -> Renderer:
+    """The library's own; imported only here, for it brings the rasteriser."""
+    from augment.apply import render_view
+
+    return render_view
+
+
+class FrameRunner:
+    """Renders chunks in this thread, writes on others, and tells `deliver` of each image.
+
+    deliver: called from the writing threads, after all files of the image are on the disk.
+    An error of the scene or the renderer concerns one image; an OutputError ends the run, since
+    the next write would fail too.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        setup: Setup,
+        renderer: Renderer | None,
+        deliver: Callable[[Outcome], None],
+        pump: WritePump,
+    ) -> None:
+        frames = scene.frames
+        if setup.camera_path is not None:
+            frames = frames_from_json(setup.camera_path)
+        self._cameras = {f.index: f.cameras for f in frames}
+        self._scene, self._setup = scene, setup
+        self._renderer = renderer or default_renderer()
+        self._deliver, self._pump = deliver, pump
+
+    def run(self, chunk: Chunk, stopped: Callable[[], bool] = lambda: False) -> None:
+        """Render the chunk's images; those not begun when `stopped()` turns true are left."""
+        recipe = self._setup.recipes[chunk.variant]
+        lidar = self._pump.submit(lambda: self._pass_lidar(chunk, recipe))
+        for name in chunk.cameras:
+            if stopped():
+                return
+            self._render(chunk, recipe, name, lidar)
+
+    def close(self) -> None:
+        """Wait for the writes; raises what stopped them."""
+        self._pump.close()
+
+    def _render(self, chunk: Chunk, recipe: Recipe, name: str, lidar: Future) -> None:
+        camera = self._cameras[chunk.frame][name]
+        started = time.perf_counter()
+        try:
+            view = self._renderer(self._scene, camera, recipe, backend=self._setup.backend)
+            check_view(view, camera.scaled(recipe.render.scale), recipe.output)
+        except Exception as error:
+            _log.debug("frame %d, camera %s", chunk.frame, name, exc_info=True)
+            message = describe(error, "rendering")
+            outcome = Outcome(chunk.variant, chunk.frame, name, FAILED, message)
+            self._pump.submit(lambda: self._deliver(outcome))
+            return
+        render_s = time.perf_counter() - started
+        self._pump.submit(lambda: self._write(chunk, recipe, name, view, lidar, render_s))
+
+    def _write(
+        self, chunk: Chunk, recipe: Recipe, name: str, view: Any, lidar: Future, render_s: float
+    ) -> None:
+        out_dir = Path(self._setup.out_dir)
+        paths = item_paths(self._scene.name, variant_name(recipe), name, chunk.frame, recipe.output)
+        passed = lidar.result()
+        if isinstance(passed, str):
+            self._deliver(Outcome(chunk.variant, chunk.frame, name, FAILED, passed))
+            return
+        try:
+            written = write_view(out_dir, paths, view, recipe.output)
+        except ValueError as error:
+            message = describe(error, "encoding")
+            self._deliver(Outcome(chunk.variant, chunk.frame, name, FAILED, message))
+            return
+        done = Outcome(
+            chunk.variant,
+            chunk.frame,
+            name,
+            OK,
+            checksum=written.checksum,
+            lidar=passed,
+            seconds={"render": render_s, "encode": written.encode_s, "write": written.write_s},
+        )
+        self._deliver(done)
+
+    def _pass_lidar(self, chunk: Chunk, recipe: Recipe) -> bool | str:
+        """Copy the frame's sweep unless it is there already.
+
+        Returns whether the frame has one, or a message where it cannot be read.
+        """
+        if not recipe.output.lidar or chunk.frame not in self._setup.labelled:
+            return False
+        paths = item_paths(self._scene.name, variant_name(recipe), "", chunk.frame, recipe.output)
+        assert paths.lidar is not None
+        target = Path(self._setup.out_dir) / paths.lidar
+        if target.exists():
+            return True
+        try:
+            sweep = self._scene.lidar(chunk.frame)
+            data = None if sweep is None else lidar_bytes(sweep)
+        except Exception as error:
+            return describe(error, "reading the LiDAR sweep")
+        if data is None:
+            return False
+        write_atomic(target, data)
+        return True

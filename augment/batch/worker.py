@@ -1,0 +1,95 @@
+"""What a worker process runs: open the scene, render the chunks it is sent, report each image."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from queue import SimpleQueue
+
+from augment.batch.lock import InheritedLock
+from augment.batch.runner import Chunk, FrameRunner, Outcome, Renderer, Setup, describe
+from augment.batch.writer import WritePump
+from augment.errors import OutputError
+from augment.scene import Scene
+
+SceneLoader = Callable[[str], Scene]
+
+
+@dataclass(frozen=True)
+class Ready:
+    """The scene is open."""
+
+
+@dataclass(frozen=True)
+class Failure:
+    """The worker cannot go on. is_output: what it could not do is write."""
+
+    is_output: bool
+    text: str
+
+
+def worker_main(
+    connection: Connection,
+    setup: Setup,
+    scene_loader: SceneLoader,
+    renderer: Renderer | None,
+    threads: int,
+    lock: InheritedLock,
+) -> None:
+    """Serve chunks until told to stop. `lock` is only held: the folder stays ours until we end."""
+    import cv2
+    import torch
+
+    torch.set_num_threads(threads)
+    cv2.setNumThreads(1)
+    inbox: SimpleQueue[Chunk | None] = SimpleQueue()
+    stopped = threading.Event()
+    threading.Thread(target=_listen, args=(connection, inbox, stopped), daemon=True).start()
+    send = _sender(connection)
+    try:
+        scene = scene_loader(setup.scene_uri)
+    except Exception as error:
+        send(Failure(False, describe(error, f"opening {setup.scene_uri} in a worker process")))
+        return
+    send(Ready())
+    # One writing thread and little waiting: the memory of a view counts once per worker.
+    runner = FrameRunner(scene, setup, renderer, send, WritePump(threads=1, waiting=2))
+    try:
+        try:
+            while (chunk := inbox.get()) is not None:
+                runner.run(chunk, stopped.is_set)
+        finally:
+            runner.close()
+    except OutputError as error:
+        send(Failure(True, str(error)))
+    except Exception as error:
+        send(Failure(False, describe(error, "in a worker process")))
+
+
+def _listen(connection: Connection, inbox: SimpleQueue, stopped: threading.Event) -> None:
+    """Receive beside the rendering, so that a stop or the parent's end is noticed at once."""
+    while True:
+        try:
+            chunk = connection.recv()
+        except (EOFError, OSError):
+            os._exit(1)  # the parent has gone: nobody is left to report to
+        if chunk is None:
+            stopped.set()
+        inbox.put(chunk)
+
+
+def _sender(connection: Connection) -> Callable[[Ready | Failure | Outcome], None]:
+    """A send that several threads may call."""
+    lock = threading.Lock()
+
+    def send(message: Ready | Failure | Outcome) -> None:
+        with lock:
+            try:
+                connection.send(message)
+            except OSError:
+                os._exit(1)
+
+    return send

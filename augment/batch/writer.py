@@ -1,0 +1,119 @@
+"""Writes one finished view: its buffers first, its image last, each file whole or absent."""
+
+from __future__ import annotations
+
+import hashlib
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from augment.batch.atomic import write_atomic
+from augment.batch.encode import encode_depth, encode_ids, encode_image
+from augment.batch.layout import ItemPaths
+from augment.cameras import Camera
+from recipes.schema import Output
+
+
+class View(Protocol):
+    """What a renderer returns; `augment.apply.WeatheredView` is one."""
+
+    rgb: np.ndarray  # uint8 [H, W, 3]
+    depth_m: np.ndarray | None  # float32 [H, W], 0 = none
+    semantic: np.ndarray | None  # uint8 [H, W]
+    instance: np.ndarray | None  # uint16 [H, W]
+
+
+@dataclass(frozen=True)
+class Written:
+    """checksum: SHA-256 of the image file, hexadecimal. Times in seconds."""
+
+    checksum: str
+    encode_s: float
+    write_s: float
+
+
+def check_view(view: Any, camera: Camera, output: Output) -> None:
+    """Raise ValueError unless the view has the camera's size and the buffers the recipe asks for.
+
+    camera: at the written resolution.
+    """
+    wanted = {
+        "rgb": True,
+        "depth_m": output.depth != "none",
+        "semantic": output.semantic,
+        "instance": output.instance,
+    }
+    for name, needed in wanted.items():
+        buffer = getattr(view, name)
+        if (buffer is not None) != needed:
+            raise ValueError(
+                f"the renderer returned {'no' if needed else 'a'} {name} buffer, which the "
+                f"recipe's output section {'asks' if needed else 'does not ask'} for"
+            )
+        if needed and buffer.shape[:2] != (camera.height, camera.width):
+            raise ValueError(
+                f"the renderer returned {name} of {list(buffer.shape)}; camera {camera.name!r} "
+                f"writes {camera.height} rows of {camera.width} pixels"
+            )
+
+
+def write_view(out_dir: Path, paths: ItemPaths, view: Any, output: Output) -> Written:
+    """Encode and write all files of a view.
+
+    Raises:
+        ValueError: a buffer has another type or shape than View says.
+        OutputError: the system refused; no partial file is left.
+    """
+    started = time.perf_counter()
+    files: dict[str, bytes] = {}
+    if paths.depth is not None:
+        files[paths.depth] = encode_depth(view.depth_m)
+    if paths.semantic is not None:
+        files[paths.semantic] = encode_ids(view.semantic, np.uint8)
+    if paths.instance is not None:
+        files[paths.instance] = encode_ids(view.instance, np.uint16)
+    files[paths.image] = encode_image(view.rgb, output)
+    checksum = hashlib.sha256(files[paths.image]).hexdigest()
+    encoded = time.perf_counter()
+    for relative, data in files.items():
+        write_atomic(out_dir / relative, data)
+    return Written(checksum, encoded - started, time.perf_counter() - encoded)
+
+
+class WritePump:
+    """Runs writes on a few threads beside the renderer, with few waiting: memory stays bounded.
+
+    OpenCV's encoders and file writes release the GIL, so they overlap with rendering. The first
+    exception of a task stops the pump: `submit` and `close` raise it.
+    """
+
+    def __init__(self, threads: int = 2, waiting: int = 4) -> None:
+        self._pool = ThreadPoolExecutor(threads, thread_name_prefix="writer")
+        self._slots = threading.BoundedSemaphore(waiting)
+        self._error: BaseException | None = None
+
+    def submit(self, task: Callable[[], Any]) -> Future:
+        """Queue a task; blocks while too many wait. Tasks start in the order they come."""
+        self._slots.acquire()
+        if self._error is not None:
+            self._slots.release()
+            raise self._error
+        future = self._pool.submit(task)
+        future.add_done_callback(self._done)
+        return future
+
+    def close(self) -> None:
+        """Wait for all tasks. Raises what one of them raised."""
+        self._pool.shutdown(wait=True)
+        if self._error is not None:
+            raise self._error
+
+    def _done(self, future: Future) -> None:
+        self._error = self._error or future.exception()
+        self._slots.release()

@@ -1,0 +1,180 @@
+"""Tiny scenes, labels and a stand-in renderer for the tests of batch jobs and datasets.
+
+Worker processes and scripts import this module by name, so it needs nothing of pytest.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import signal
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from augment.cameras import Camera, Frame
+from augment.errors import AdapterError
+from augment.labels import Boxes, LidarSweep
+from augment.scene import Gaussians, Scene
+from augment.sky import ConstantSky
+from recipes.schema import Output, Recipe, Smog, Weather
+
+ORIGIN_M = np.array([448_262.123456789, 4_421_337.987654321, 41.5])
+SIZE = (24, 16)  # width and height of the cameras, pixels
+
+
+@dataclass(frozen=True)
+class FakeLabels:
+    """Boxes and sweeps made from the frame's number. unreadable: frames whose files are broken."""
+
+    unreadable: tuple[int, ...] = ()
+
+    def boxes(self, frame_index: int) -> Boxes:
+        if frame_index in self.unreadable:
+            raise AdapterError(f"cuboids/{frame_index:02d}.pkl.gz is cut short")
+        count = frame_index % 4
+        rng = np.random.default_rng(frame_index)
+        return Boxes(
+            track_ids=tuple(f"track-{i}" for i in range(count)),
+            labels=("Car",) * count,
+            centers_m=rng.normal(size=(count, 3)) + ORIGIN_M,
+            sizes_m=rng.uniform(1, 4, (count, 3)),
+            quats=rng.normal(size=(count, 4)),
+            attributes={
+                "speed": rng.normal(size=(count, 3)).astype(np.float32),
+                "parked": np.arange(count) % 2 == 0,
+                "rider": np.array(["with", None, float("nan")][:count], object),
+            },
+        )
+
+    def lidar(self, frame_index: int) -> LidarSweep | None:
+        if frame_index == 3:
+            return None  # as a dataset with a missing sweep
+        rng = np.random.default_rng(100 + frame_index)
+        xyz = rng.normal(size=(3, 50)) + ORIGIN_M[:, None]
+        return LidarSweep({
+            "x": xyz[0], "y": xyz[1], "z": xyz[2],
+            "intensity": rng.integers(0, 255, 50).astype(np.uint8),
+            "timestamp_ns": np.arange(50, dtype=np.int64) + 2**60,
+            "sensor": np.array(["top", "front"] * 25),
+            "note": np.array(["a", "bc"] * 25, object),
+        })  # fmt: skip
+
+
+@dataclass(frozen=True)
+class FakeView:
+    rgb: np.ndarray
+    depth_m: np.ndarray | None
+    semantic: np.ndarray | None
+    instance: np.ndarray | None
+
+
+def open_fake(uri: str) -> Scene:
+    """`fake:NAME?frames=N&unreadable=K`: a scene of N frames and two cameras."""
+    name, _, query = uri.removeprefix("fake:").partition("?")
+    options = dict(part.split("=") for part in query.split("&") if part)
+    if "crash" in options:
+        os.kill(os.getpid(), signal.SIGKILL)
+    unreadable = tuple(int(options[k]) for k in ("unreadable",) if k in options)
+    frames = tuple(make_frame(index) for index in range(int(options.get("frames", 4))))
+    return Scene(
+        name=name,
+        source=f"fake:{name}",
+        background=make_gaussians(),
+        actors=(),
+        sky=ConstantSky(torch.tensor([0.5, 0.6, 0.7])),
+        frames=frames,
+        labels=None if "unlabelled" in options else FakeLabels(unreadable),
+        world_origin_m=ORIGIN_M,
+    )
+
+
+def make_gaussians(count: int = 40) -> Gaussians:
+    rng = torch.Generator().manual_seed(0)
+    means = torch.rand(count, 3, generator=rng) * torch.tensor([8.0, 4.0, 2.0])
+    return Gaussians(
+        means=means + torch.tensor([4.0, -2.0, 0.0]),
+        quats=torch.nn.functional.normalize(torch.randn(count, 4, generator=rng), dim=-1),
+        scales=torch.rand(count, 3, generator=rng) * 0.5 + 0.05,
+        opacities=torch.rand(count, generator=rng),
+        sh=torch.rand(count, 1, 3, generator=rng) - 0.5,
+        semantic=(torch.arange(count) % 14).short(),
+    )
+
+
+def make_frame(index: int) -> Frame:
+    time_ns = 10**18 + index * 100_000_000
+    world_from_ego = torch.eye(4, dtype=torch.float64)
+    world_from_ego[0, 3] = 0.1 * index
+    cameras = {
+        name: make_camera(name, time_ns + offset, 0.1 * index)
+        for offset, name in enumerate(("front", "rear/left"))
+    }
+    return Frame(index, time_ns, world_from_ego, cameras)
+
+
+def make_camera(name: str, time_ns: int, forward_m: float) -> Camera:
+    """Looks along +x from (forward_m, 0, 1)."""
+    camera_from_world = torch.tensor(
+        [[0.0, -1, 0, 0], [0, 0, -1, 1], [1, 0, 0, -forward_m], [0, 0, 0, 1]], dtype=torch.float64
+    )
+    width, height = SIZE
+    return Camera(name, width, height, 20.3, 20.1, 12.25, 8.5, camera_from_world, time_ns)
+
+
+def make_recipe(name: str = "fog", variant: int = 0, **output) -> Recipe:
+    smog = Smog(visibility_m=50.0 + variant)
+    weather = Weather(smog=smog if name == "fog" else None)
+    settings = {"semantic": True, "instance": True, **output}
+    return Recipe(
+        name=name, variant=variant, seed=7, weather=weather, output=Output(**settings)
+    )
+
+
+def fake_render(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str) -> FakeView:
+    """Noise that depends on scene, camera, time and recipe: nothing else, and on nothing less."""
+    camera = camera.scaled(recipe.render.scale)
+    key = f"{scene.name} {camera.name} {camera.timestamp_ns} {recipe.hash}"
+    seed = int.from_bytes(hashlib.sha256(key.encode()).digest()[:8], "little")
+    rng = np.random.default_rng(seed)
+    shape = (camera.height, camera.width)
+    output = recipe.output
+    depth = rng.uniform(-10, 300, shape).astype(np.float32)
+    return FakeView(
+        rgb=rng.integers(0, 256, (*shape, 3), dtype=np.uint8),
+        depth_m=None if output.depth == "none" else depth,
+        semantic=rng.integers(0, 15, shape, dtype=np.uint8) if output.semantic else None,
+        instance=rng.integers(0, 600, shape).astype(np.uint16) if output.instance else None,
+    )
+
+
+def slow_render(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str) -> FakeView:
+    time.sleep(0.02)
+    return fake_render(scene, camera, recipe, backend=backend)
+
+
+def must_not_render(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str) -> FakeView:
+    raise AssertionError(f"rendered camera {camera.name} again")
+
+
+def render_dying_at_frame_2(
+    scene: Scene, camera: Camera, recipe: Recipe, *, backend: str
+) -> FakeView:
+    """Kills its process, as the kernel does when memory runs out, at one image."""
+    if camera.name == "front" and camera.timestamp_ns == make_frame(2).timestamp_ns:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return fake_render(scene, camera, recipe, backend=backend)
+
+
+def tree_digest(folder: Path) -> dict[str, str]:
+    """SHA-256 of every file below a folder, by relative path."""
+    return {
+        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
