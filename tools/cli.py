@@ -1,0 +1,51 @@
+"""The `climategs` command: its table of subcommands, and how errors leave it."""
+
+from __future__ import annotations
+
+import logging
+import sys
+
+import tyro
+
+from tools import commands
+
+COMMANDS = {
+    "render": commands.render,
+    "inspect": commands.inspect,
+    "explain": commands.explain,
+    "recipes": commands.recipes,
+    "sheet": commands.sheet,
+    "bench": commands.bench,
+    "demo": commands.demo,
+}
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Runs one command. Returns 0, or 1 where images failed, 2 for an error, 130 when interrupted."""
+    logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
+    try:
+        return tyro.extras.subcommand_cli_from_dict(
+            COMMANDS,
+            args=arguments,
+            prog="climategs",
+            description="Weather for driving scenes made of 3D Gaussians.",
+            sort_subcommands=False,
+        )
+    except KeyboardInterrupt:
+        print("interrupted; run the same command again to go on from here", file=sys.stderr)
+        return 130
+    except Exception as error:
+        if not _is_ours(error):
+            raise
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+
+
+def _is_ours(error: Exception) -> bool:
+    """Errors a user can act on; others are defects, and their traceback is worth seeing."""
+    from recipes.errors import RecipeError
+
+    if isinstance(error, RecipeError):
+        return True
+    errors = sys.modules.get("augment.errors")  # not loaded: then none of it was raised
+    return errors is not None and isinstance(error, errors.ClimateGSError)

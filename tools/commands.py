@@ -1,0 +1,207 @@
+"""The subcommands of `climategs`: typed functions, whose docstrings are the help.
+
+Heavy imports stay inside the functions, so that `--help` answers at once.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from tyro.conf import Positional, arg
+
+if TYPE_CHECKING:
+    from augment.scene import Scene
+
+
+def render(
+    recipe: Positional[str],
+    scene: str,
+    out: Path,
+    frames: str | None = None,
+    cameras: str | None = None,
+    scale: float = 1.0,
+    variants: int | None = None,
+    workers: int = 1,
+    backend: Literal["auto", "reference", "cpu"] = "auto",
+    camera_path: Path | None = None,
+    overwrite: bool = False,
+    sheet: bool = True,
+) -> int:
+    """Render a scene under a recipe into images, depth, labels and a manifest.
+
+    Run it again to go on after an interruption: what is finished is not rendered twice.
+
+    Args:
+        recipe: A recipe file (.yaml), or the name of a preset; `climategs recipes` lists them.
+        scene: procedural:street?seed=3, pandaset:PATH/002, gaussians:PATH/point_cloud.ply, or a
+            bare path, which is recognised by what it holds.
+        out: The output folder. Further recipes and scenes may go into the same one.
+        frames: Frame numbers: 4, 0,5,9, or 0:20:2 (start:stop:step). All by default.
+        cameras: Camera names separated by commas. All by default.
+        scale: Resolution relative to the recipe's.
+        variants: How many draws from the recipe's ranges. The recipe's own number by default.
+        workers: Processes. The bits do not depend on it.
+        backend: Which rasteriser draws.
+        camera_path: A JSON file of camera poses to render instead of the scene's own.
+        overwrite: Replace what this scene and recipe wrote before.
+        sheet: Also write a contact sheet of the result.
+    """
+    from tools.render import render_recipe
+
+    return render_recipe(
+        recipe,
+        scene,
+        out,
+        frames=frames,
+        cameras=cameras,
+        scale=scale,
+        variants=variants,
+        workers=workers,
+        backend=backend,
+        camera_path=camera_path,
+        overwrite=overwrite,
+        sheet=sheet,
+    )
+
+
+def inspect(
+    uri: Positional[str], camera_path: Path | None = None, json_file: _JsonFile = None
+) -> int:
+    """Show what is in a scene: Gaussians, actors, cameras, frames, LiDAR, labels, problems.
+
+    Args:
+        uri: The scene, as for render.
+        camera_path: A JSON file of camera poses to look at instead of the scene's own.
+        json_file: Also write the facts to this file.
+    """
+    from tools.scene_report import describe_scene, scene_text
+
+    facts = describe_scene(open_with_path(uri, camera_path))
+    print(scene_text(facts))
+    _write_json(json_file, facts)
+    return 0
+
+
+def explain(
+    recipe: Positional[str], scene: str, variant: int = 0, json_file: _JsonFile = None
+) -> int:
+    """Show the plan: which passes and buffers a recipe takes on a scene, and why.
+
+    Args:
+        recipe: A recipe file or the name of a preset.
+        scene: The scene, as for render.
+        variant: Which draw from the recipe's ranges.
+        json_file: Also write the plan to this file.
+    """
+    from tools.explain import explain_recipe, explanation_text
+
+    facts = explain_recipe(recipe, scene, variant)
+    print(explanation_text(facts))
+    _write_json(json_file, facts)
+    return 0
+
+
+def recipes(name: Positional[str | None] = None, schema: Path | None = None) -> int:
+    """List the presets, print one of them, or write the JSON Schema that editors check against.
+
+    Args:
+        name: A preset to print.
+        schema: Write the JSON Schema of recipes to this file.
+    """
+    from recipes.load import preset_names, preset_text
+    from recipes.schema_json import write_schema
+
+    if schema is not None:
+        write_schema(schema)
+        print(f"wrote {schema}")
+    elif name is not None:
+        print(preset_text(name), end="")
+    else:
+        print("\n".join(preset_names()))
+    return 0
+
+
+def sheet(
+    out: Positional[Path],
+    frame: int | None = None,
+    video_camera: str | None = None,
+    fps: float = 10.0,
+) -> int:
+    """Draw pictures of an output folder: a contact sheet, and a video of one camera.
+
+    Args:
+        out: A folder that `climategs render` wrote.
+        frame: Which frame the contact sheet shows. The middle one by default.
+        video_camera: Also write an MP4 of this camera, all variants side by side.
+        fps: Frames per second of the video.
+    """
+    from tools.pictures import draw_sheet, draw_video
+
+    print(draw_sheet(out, frame))
+    if video_camera is not None:
+        print(draw_video(out, video_camera, fps))
+    return 0
+
+
+def bench(
+    what: Positional[Literal["raster"]] = "raster",
+    repeats: int = 7,
+    quick: bool = False,
+    json_file: _JsonFile = None,
+) -> int:
+    """Measure this machine: time of each stage, pairs per second, memory, against the reference.
+
+    Args:
+        what: The benchmark: raster is the rasteriser alone, on random scenes.
+        repeats: Timed frames a scene.
+        quick: Only the smaller scene.
+        json_file: Also write the figures to this file.
+    """
+    from tools.bench import bench_raster, bench_text
+
+    result = bench_raster(repeats=repeats, quick=quick)
+    print(bench_text(result))
+    _write_json(json_file, result)
+    return 0
+
+
+def demo(out: Path = Path("out/demo"), frames: int = 10) -> int:
+    """Render the embedded street under three recipes, with a contact sheet and a video.
+
+    Args:
+        out: The output folder.
+        frames: How many frames of the drive.
+    """
+    from tools.demo import run_demo
+
+    return run_demo(out, frames)
+
+
+_JsonFile = Annotated[Path | None, arg(name="json", metavar="FILE")]
+
+
+def open_with_path(uri: str, camera_path: Path | None) -> Scene:
+    """The scene of a URI, with the cameras of a path file in place of its own where one is given."""
+    from adapters.base import open_scene
+
+    scene = open_scene(uri)
+    if camera_path is None:
+        return scene
+    from adapters.camera_paths import with_camera_path
+
+    return with_camera_path(scene, camera_path)
+
+
+def _write_json(path: Path | None, facts: dict[str, Any]) -> None:
+    if path is None:
+        return
+    from augment.errors import OutputError
+
+    try:
+        path.write_text(json.dumps(facts, indent=2) + "\n")
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {error.strerror}") from error
+    print(f"wrote {path}", file=sys.stderr)

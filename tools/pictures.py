@@ -1,0 +1,87 @@
+"""Pictures of what `climategs render` wrote: read the manifest, draw."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from tools import sheet
+
+
+def read_rows(out: Path) -> list[dict[str, Any]]:
+    """The finished images of an output folder, as manifest rows.
+
+    Raises:
+        OutputError: there is no manifest, or it holds no finished image.
+    """
+    from augment.batch.manifest import read_manifest
+    from augment.errors import OutputError
+
+    rows = [row for row in read_manifest(out).to_pylist() if row["status"] == "ok"]
+    if not rows:
+        raise OutputError(f"{out} holds no finished image; run `climategs render` first")
+    return rows
+
+
+def draw_sheet(out: Path, frame: int | None = None) -> Path:
+    """Writes OUT/contact_sheet.png: a row per scene and variant, a column per camera."""
+    rows = read_rows(out)
+    frames = sorted({row["frame"] for row in rows})
+    frame = frames[len(frames) // 2] if frame is None else frame
+    cameras = list(dict.fromkeys(row["camera"] for row in rows))
+    lines = []
+    for scene, variant in _groups(rows):
+        group = {
+            row["camera"]: row
+            for row in rows
+            if (row["scene"], row["variant"], row["frame"]) == (scene, variant, frame)
+        }
+        if group:
+            title = f"{scene}, frame {frame}: {_weather(next(iter(group.values())))}"
+            images = [
+                (name, sheet.read_rgb(out / group[name]["image"])) for name in cameras if name in group
+            ]
+            lines.append((title, images))
+    if not lines:
+        from augment.errors import OutputError
+
+        raise OutputError(f"{out} holds no image of frame {frame}; it has frames {frames}")
+    path = out / "contact_sheet.png"
+    sheet.write_rgb(path, sheet.contact_sheet(lines))
+    return path
+
+
+def draw_video(out: Path, camera: str, frames_per_second: float = 10.0, width: int = 1280) -> Path:
+    """Writes OUT/video_<camera>.mp4: all scenes and variants side by side, one frame after another."""
+    rows = [row for row in read_rows(out) if row["camera"] == camera]
+    by_key = {(row["scene"], row["variant"], row["frame"]): row for row in rows}
+    groups = _groups(rows)
+    frames = [
+        frame
+        for frame in sorted({row["frame"] for row in rows})
+        if all((*group, frame) in by_key for group in groups)
+    ]
+
+    def pictures():
+        for frame in frames:
+            shown = [by_key[(*group, frame)] for group in groups]
+            images = [(_weather(row), sheet.read_rgb(out / row["image"])) for row in shown]
+            yield sheet.side_by_side(images, width)
+
+    path = out / f"video_{camera}.mp4"
+    sheet.write_video(path, pictures(), frames_per_second)
+    return path
+
+
+def _groups(rows: list[dict[str, Any]]) -> list[tuple[str, str]]:
+    return sorted({(row["scene"], row["variant"]) for row in rows})
+
+
+def _weather(row: dict[str, Any]) -> str:
+    """The variant's name and what its weather means to a person."""
+    from recipes.schema import KOSCHMIEDER
+
+    extinction = row["smog_extinction_per_m"]
+    if not extinction:
+        return f"{row['variant']} (no weather)"
+    return f"{row['variant']} (visibility {KOSCHMIEDER / extinction:.0f} m)"
