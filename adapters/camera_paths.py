@@ -1,0 +1,67 @@
+"""Other cameras for a scene: from a path file, or made for a scene that has none.
+
+The path file is a camera path (`adapters.path_json`), an INRIA cameras.json, a nerfstudio
+transforms.json or a COLMAP model. Its poses are in the scene's world before recentring: metres, +z
+up, `Scene.world_origin_m` not yet subtracted. Its times count from the scene's first frame, so that
+moving actors are where they were then. (Cameras in a splat file's own axes and unit belong
+into that scene's URI: `gaussians:FILE?cameras=…`.)
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+from adapters.base import CAMERA_PATH_KEY, add_to_uri
+from adapters.camera_files import read_views
+from adapters.camera_frames import frames_from_views
+from adapters.default_paths import NO_CAMERAS, PathKind, make_default_path
+from adapters.world import WorldChange
+from augment.cameras import Frame
+from augment.scene import Gaussians, Scene
+
+
+def frames_from_path_file(path: str | Path, scene: Scene) -> tuple[Frame, ...]:
+    """The frames of a path file, in the scene's recentred world.
+
+    Raises:
+        AdapterError: no such file, or one that cannot be used; names the field.
+    """
+    return _frames_and_problems(Path(path), scene)[0]
+
+
+def with_camera_path(scene: Scene, path: str | Path) -> Scene:
+    """The scene with the frames of a path file in place of its own, and without the labels, which
+    belong to the frames it had. Its `source` opens it again, path included.
+
+    Raises:
+        AdapterError: as for frames_from_path_file.
+    """
+    frames, problems = _frames_and_problems(Path(path), scene)
+    return dataclasses.replace(
+        scene,
+        frames=frames,
+        labels=None,
+        source=add_to_uri(scene.source, CAMERA_PATH_KEY, str(path)),
+        problems=(*(p for p in scene.problems if not p.startswith(NO_CAMERAS)), *problems),
+    )
+
+
+def default_frames(
+    gaussians: Gaussians, *, is_metric: bool = True, kind: PathKind = "auto"
+) -> tuple[tuple[Frame, ...], str]:
+    """Frames of a drive or an orbit, and a sentence that says which (adapters.default_paths)."""
+    made = make_default_path(gaussians, is_metric=is_metric, kind=kind)
+    return frames_from_views(made.views, WorldChange())[0], made.note
+
+
+def _frames_and_problems(path: Path, scene: Scene) -> tuple[tuple[Frame, ...], tuple[str, ...]]:
+    found = read_views(path)
+    frames, problems = frames_from_views(
+        found.views,
+        WorldChange(origin_m=scene.world_origin_m),
+        start_ns=scene.frames[0].timestamp_ns if scene.frames else 0,
+    )
+    if scene.labels is not None:
+        problems += (f"{path}: its frames are not the dataset's, so boxes and LiDAR are left out",)
+    return frames, (*found.problems, *problems)

@@ -1,0 +1,197 @@
+"""Camera paths for scenes that come without cameras: a drive along the street, or an orbit.
+
+A drive is made where the content is wide, flat and metric: the longest straight line over ground
+with nothing at the height of a car in its way. The camera stands CAMERA_HEIGHT_M above the ground
+and stops short of the end, so that there is something ahead in the last image. Everything else is
+orbited.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from adapters.ground_estimate import GroundGrid, ground_grid, solid_points
+from adapters.posed_views import PosedView, look_at_pose
+from augment.scene import Gaussians
+
+PathKind = Literal["auto", "drive", "orbit"]
+
+NO_CAMERAS = "no cameras came with the scene"  # how every note begins
+CAMERA_HEIGHT_M = 1.6
+WIDTH, HEIGHT = 960, 540
+DRIVE_CAMERAS_DEG = {"front": 0.0, "left": 60.0, "right": -60.0}  # yaw; 75° wide each, so they meet
+_FIELD_OF_VIEW_DEG = {"drive": 75.0, "orbit": 55.0}
+_STEP_M = 0.5  # 5 m/s at 10 Hz
+_MOST_FRAMES = 100
+_ORBIT_FRAMES = 48
+_SHORTEST_DRIVE_M = 8.0
+_WIDE_M, _FLATNESS = 20.0, 0.5
+_CAR_M = (0.5, 2.5)  # above the ground: what lies between is in the way
+_HALF_WIDTH_M = 1.25
+_AHEAD_SHARE = 0.3  # part of the line that is left ahead of the last image
+
+
+@dataclass(frozen=True, eq=False)
+class DefaultPath:
+    """views: in the scene's world. ground_z_m: lowest ground under the path. note: a sentence."""
+
+    views: tuple[PosedView, ...]
+    ground_z_m: float
+    note: str
+
+
+def make_default_path(
+    gaussians: Gaussians, *, is_metric: bool, kind: PathKind = "auto"
+) -> DefaultPath:
+    """A path for the scene; `kind` other than auto insists (a drive then takes units as metres)."""
+    points = solid_points(gaussians)
+    if kind == "orbit" or (kind == "auto" and not (is_metric and _is_wide_and_flat(points))):
+        return _orbit(points, is_metric=is_metric, asked=kind == "orbit")
+    grid = ground_grid(points, cell=1.0)
+    start, end = _longest_free_line(points, grid)
+    if np.linalg.norm(end - start) < _SHORTEST_DRIVE_M and kind == "auto":
+        return _orbit(points, is_metric=is_metric, asked=False)
+    return _drive(points, grid, start, end)
+
+
+def _is_wide_and_flat(points: np.ndarray) -> bool:
+    extent = np.subtract(*np.quantile(points, [0.95, 0.05], axis=0))
+    wide = float(np.hypot(*extent[:2]))
+    return wide >= _WIDE_M and extent[2] < _FLATNESS * wide
+
+
+def _longest_free_line(points: np.ndarray, grid: GroundGrid) -> tuple[np.ndarray, np.ndarray]:
+    """Ends [2] of the straight line with the most ground under it and the least in its way.
+
+    Every half metre of a line counts +1 over known ground, -1 elsewhere, and less by the opaque
+    Gaussians within a car's width and height; of every line the best stretch is taken.
+    """
+    worth, cell = _worth_of_cells(points, grid)
+    middle = grid.corner + 0.5 * grid.cell * np.array(grid.height.shape)
+    reach = 0.5 * grid.cell * float(np.hypot(*grid.height.shape))
+    along = np.arange(-reach, reach, _STEP_M)
+    across = np.arange(-reach, reach, 2 * _STEP_M)
+    best, ends = -math.inf, (middle, middle)
+    for angle in np.arange(0, math.pi, math.pi / 36):
+        forward = np.array([math.cos(angle), math.sin(angle)])
+        left = np.array([-forward[1], forward[0]])
+        places = middle + along[None, :, None] * forward + across[:, None, None] * left
+        index = np.floor((places - grid.corner) / cell).astype(int)
+        inside = ((index >= 0) & (index < worth.shape)).all(-1)
+        x = index[..., 0].clip(0, worth.shape[0] - 1)
+        y = index[..., 1].clip(0, worth.shape[1] - 1)
+        total = np.cumsum(np.where(inside, worth[x, y], -1.0), axis=1)
+        total = np.pad(total, ((0, 0), (1, 0)))
+        floor = np.minimum.accumulate(total, axis=1)
+        gain = total - floor
+        row, stop = np.unravel_index(gain.argmax(), gain.shape)
+        if gain[row, stop] > best:
+            best = gain[row, stop]
+            begin = int(total[row, : stop + 1].argmin())
+            ends = (places[row, begin], places[row, max(begin, int(stop) - 1)])
+    return ends
+
+
+def _worth_of_cells(points: np.ndarray, grid: GroundGrid) -> tuple[np.ndarray, float]:
+    """What a step over each fine cell counts, and the cell's side."""
+    cell = min(_STEP_M, grid.cell)
+    shape = np.ceil(np.array(grid.height.shape) * grid.cell / cell).astype(int)
+    centres = grid.corner + (np.stack(np.indices(shape), -1) + 0.5) * cell
+    known = np.isfinite(grid.at(centres))
+    above = points[:, 2] - grid.at(points)  # NaN compares false below
+    in_the_way = points[(above > _CAR_M[0]) & (above < _CAR_M[1])]
+    index = np.floor((in_the_way[:, :2] - grid.corner) / cell).astype(int)
+    count = np.zeros(shape)
+    np.add.at(count, (index[:, 0].clip(0, shape[0] - 1), index[:, 1].clip(0, shape[1] - 1)), 1.0)
+    blocked = _sum_around(count, round(_HALF_WIDTH_M / cell))
+    return np.where(known, 1.0, -1.0) - np.minimum(0.25 * blocked, 4.0), cell
+
+
+def _sum_around(values: np.ndarray, reach: int) -> np.ndarray:
+    """Sums over squares of 2 reach + 1 cells, by running totals."""
+    for axis in (0, 1):
+        padding = [(reach + 1, reach) if a == axis else (0, 0) for a in (0, 1)]
+        total = np.cumsum(np.pad(values, padding), axis=axis)
+        upper = np.take(total, range(2 * reach + 1, total.shape[axis]), axis=axis)
+        lower = np.take(total, range(0, total.shape[axis] - 2 * reach - 1), axis=axis)
+        values = upper - lower
+    return values
+
+
+def _drive(points: np.ndarray, grid: GroundGrid, start: np.ndarray, end: np.ndarray) -> DefaultPath:
+    forward = (end - start) / max(float(np.linalg.norm(end - start)), 1e-9)
+    beyond = [
+        int(((points[:, :2] - p) @ d > 0).sum()) for p, d in ((end, forward), (start, -forward))
+    ]
+    if beyond[1] > beyond[0]:  # drive towards the side where more lies ahead of the end
+        start, end, forward = end, start, -forward
+    length = float(np.linalg.norm(end - start)) * (1 - _AHEAD_SHARE)
+    count = max(2, min(_MOST_FRAMES, round(length / _STEP_M) + 1))
+    places = start + np.linspace(0, length, count)[:, None] * forward
+    ground = _smooth_profile(grid.at(places), fallback=float(np.quantile(points[:, 2], 0.1)))
+    views = []
+    for frame, (place, height) in enumerate(zip(places, ground, strict=True)):
+        eye = np.array([*place, height + CAMERA_HEIGHT_M])
+        for name, yaw_deg in DRIVE_CAMERAS_DEG.items():
+            yaw = math.radians(yaw_deg)
+            turn = np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
+            target = eye + np.array([*(turn @ forward), 0.0])
+            views.append(_view(name, frame, look_at_pose(eye, target, where="drive"), "drive"))
+    note = (
+        f"{NO_CAMERAS}: made a straight drive of {length:.0f} m in {count} frames with cameras "
+        f"{', '.join(DRIVE_CAMERAS_DEG)}, {CAMERA_HEIGHT_M} m above the estimated ground; give "
+        "camera_path=FILE for another"
+    )
+    return DefaultPath(tuple(views), float(np.quantile(ground, 0.05)), note)
+
+
+def _smooth_profile(heights: np.ndarray, *, fallback: float) -> np.ndarray:
+    """Ground along the path without gaps and jolts: interpolated, then averaged over 6 m."""
+    known = np.isfinite(heights)
+    if not known.any():
+        return np.full(len(heights), fallback)
+    where = np.arange(len(heights))
+    filled = np.interp(where, where[known], heights[known])
+    reach = 6
+    kernel = np.ones(2 * reach + 1) / (2 * reach + 1)
+    return np.convolve(np.pad(filled, reach, mode="edge"), kernel, mode="valid")
+
+
+def _orbit(points: np.ndarray, *, is_metric: bool, asked: bool) -> DefaultPath:
+    centre = np.median(points, axis=0)
+    spread = float(np.median(np.linalg.norm(points - centre, axis=1)))
+    radius = max(2.5 * spread, 1e-3)
+    views = []
+    for frame in range(_ORBIT_FRAMES):
+        angle = 2 * math.pi * frame / _ORBIT_FRAMES
+        direction = np.array([math.cos(angle), math.sin(angle), math.tan(math.radians(20))])
+        pose = look_at_pose(centre + radius * direction, centre, where="orbit")
+        views.append(_view("orbit", frame, pose, "orbit"))
+    near = np.linalg.norm(points[:, :2] - centre[:2], axis=1) < spread
+    ground = float(np.quantile(points[near, 2] if near.any() else points[:, 2], 0.05))
+    why = "" if asked or is_metric else " (give scale=METRES_PER_UNIT, 1 for metres, for a drive)"
+    note = (
+        f"{NO_CAMERAS}: made an orbit of {_ORBIT_FRAMES} frames around its "
+        f"content{why}; give camera_path=FILE for another"
+    )
+    return DefaultPath(tuple(views), ground, note)
+
+
+def _view(camera: str, frame: int, pose: np.ndarray, kind: str) -> PosedView:
+    focal = 0.5 * WIDTH / math.tan(math.radians(_FIELD_OF_VIEW_DEG[kind]) / 2)
+    return PosedView(
+        name=f"{camera}/{frame:04d}",
+        width=WIDTH,
+        height=HEIGHT,
+        fx=focal,
+        fy=focal,
+        cx=WIDTH / 2,
+        cy=HEIGHT / 2,
+        world_from_camera=pose,
+        camera=camera,
+        frame=frame,
+    )

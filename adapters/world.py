@@ -1,0 +1,102 @@
+"""From a file's world to the scene's: axes, unit of length, origin."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+
+from augment.errors import AdapterError
+from augment.geometry import multiply_quats, quat_from_rotmat
+from augment.render.sh import rotate_sh
+from augment.scene import Gaussians
+
+_AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+
+
+@dataclass(frozen=True, eq=False)
+class WorldChange:
+    """scene = scale * rotation @ source - origin_m, in float64.
+
+    rotation: [3, 3], proper. scale: metres per unit of the source. origin_m: [3], metres along the
+    scene's axes.
+    """
+
+    rotation: np.ndarray = field(default_factory=lambda: np.eye(3))
+    scale: float = 1.0
+    origin_m: np.ndarray = field(default_factory=lambda: np.zeros(3))
+
+    def points(self, points: np.ndarray) -> np.ndarray:
+        """float64 [N, 3] of the scene."""
+        return self.scale * (np.asarray(points, np.float64) @ self.rotation.T) - self.origin_m
+
+    def pose(self, world_from_camera: np.ndarray) -> np.ndarray:
+        """world_from_camera of the scene; stays rigid, the scale moves its position only."""
+        pose = np.eye(4)
+        pose[:3, :3] = self.rotation @ world_from_camera[:3, :3]
+        pose[:3, 3] = self.points(world_from_camera[None, :3, 3])[0]
+        return pose
+
+    def gaussians(self, gaussians: Gaussians, source_origin: np.ndarray) -> Gaussians:
+        """Gaussians of the scene: means, quats, scales, and SH of degree 1 and above are turned.
+
+        source_origin: [3], what was already subtracted from their means, in the source's world.
+        """
+        shift = self.points(source_origin[None])[0]
+        turned = not np.array_equal(self.rotation, np.eye(3))
+        if not turned and self.scale == 1.0 and not shift.any():
+            return gaussians
+        rotation = torch.from_numpy(np.ascontiguousarray(self.rotation))
+        means = self.scale * (gaussians.means.double() @ rotation.T) + torch.from_numpy(shift)
+        moved = dataclasses.replace(
+            gaussians, means=means.float(), scales=gaussians.scales * self.scale
+        )
+        if not turned:
+            return moved
+        quat = quat_from_rotmat(rotation).to(gaussians.quats.dtype).expand_as(gaussians.quats)
+        sh = gaussians.sh if gaussians.sh_degree == 0 else rotate_sh(gaussians.sh, rotation)
+        return dataclasses.replace(moved, quats=multiply_quats(quat, gaussians.quats), sh=sh)
+
+
+def parse_up(text: str) -> np.ndarray:
+    """Unit vector of `up`: an axis such as +z, -y or x, or three numbers such as 0.1,-0.9,0.2.
+
+    Raises:
+        AdapterError: neither.
+    """
+    name = text.strip().lower()
+    if name.lstrip("+-") in _AXES and len(name) <= 2:
+        axis = np.array(_AXES[name[-1]])
+        return -axis if name[0] == "-" else axis
+    try:
+        vector = np.array([float(number) for number in name.split(",")])
+    except ValueError:
+        vector = np.zeros(0)
+    length = np.linalg.norm(vector)
+    if vector.shape != (3,) or not (np.isfinite(length) and length > 0):
+        raise AdapterError(
+            "up must be the source's axis that points up (+x -x +y -y +z -z), three numbers "
+            f"such as 0,-1,0.1, or 'cameras'; got {text!r}"
+        )
+    return vector / length
+
+
+def rotation_to_z_up(up: np.ndarray) -> np.ndarray:
+    """The smallest rotation that takes the unit vector `up` to +z; about x where up is -z."""
+    middle = up + np.array([0.0, 0.0, 1.0])
+    if np.linalg.norm(middle) < 1e-9:
+        return np.diag([1.0, -1.0, -1.0])
+    middle /= np.linalg.norm(middle)
+    # Two mirrors make a turn that is orthonormal to rounding, however close `up` comes to -z.
+    mirrors = [np.eye(3) - 2 * np.outer(normal, normal) for normal in (middle, up)]
+    rotation = mirrors[0] @ mirrors[1]
+    # Axis names must turn exactly, so that integers stay integers.
+    return np.round(rotation) if np.abs(rotation - np.round(rotation)).max() < 1e-15 else rotation
+
+
+def nearest_axis(vector: np.ndarray) -> str:
+    """The name of the axis closest to a vector: +x, -x, … -z."""
+    index = int(np.abs(vector).argmax())
+    return f"{'-' if vector[index] < 0 else '+'}{'xyz'[index]}"
