@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import operator
+from typing import SupportsIndex
 
 import numpy as np
 
@@ -17,28 +18,29 @@ _DOMAIN = "climategs effect 1"  # a change of the scheme changes this, never sil
 
 def rng_for(
     *,
-    seed: int,
+    seed: SupportsIndex,
     scene: str,
     effect: str,
-    frame: int | None = None,
+    frame: SupportsIndex | None = None,
     camera: str | None = None,
 ) -> np.random.Generator:
     """A generator for one effect, keyed by a SHA-256 of the arguments.
 
     seed: the recipe's, >= 0. scene: the scene's name. effect: which use this is, "snow.flakes" say;
-    two uses of the same key draw the same numbers. frame: index; camera: name. Leave out frame where
-    the result must persist over time, camera where all views must agree: None is a key of its own.
+    two uses of the same key draw the same numbers. frame: index; camera: name. Leave out frame
+    where the result must persist over time, camera where all views must agree: None is a key of
+    its own.
 
     Raises:
         ValueError: seed or frame is negative, or effect is empty.
     """
-    seed = operator.index(seed)
-    frame = None if frame is None else operator.index(frame)
-    if seed < 0 or (frame is not None and frame < 0):
+    seed_number = operator.index(seed)
+    frame_number = None if frame is None else operator.index(frame)
+    if seed_number < 0 or (frame_number is not None and frame_number < 0):
         raise ValueError(f"seed and frame must be >= 0; got seed={seed}, frame={frame}")
     if not effect:
         raise ValueError("effect must name what is drawn; got an empty text")
-    key = json.dumps([_DOMAIN, seed, scene, frame, camera, effect])
+    key = json.dumps([_DOMAIN, seed_number, scene, frame_number, camera, effect])
     digest = hashlib.sha256(key.encode()).digest()
     entropy = np.random.SeedSequence(int.from_bytes(digest, "big"))
     return np.random.Generator(np.random.PCG64(entropy))

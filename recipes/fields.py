@@ -222,7 +222,7 @@ ANY_NUMBER = FieldSpec("number", Kind.NUMBER, "", Annotated[Number, Field(allow_
 VARIANTS = FieldSpec(
     path="variants",
     kind=Kind.WHOLE,
-    description="How many recipes are drawn from this one, with numbers 0, 1, 2 and so on.",
+    description="How many recipes are drawn from this file.",
     annotation=Annotated[Whole, Field(ge=1, le=1_000_000)],
     default=1,
     limits=((">=", 1), ("<=", 1_000_000)),

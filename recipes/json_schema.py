@@ -30,6 +30,7 @@ def recipe_json_schema() -> Schema:
         "$schema": DIALECT,
         "title": "ClimateGS recipe",
         **schema,
+        "description": "A recipe file: which weather a scene gets, with ranges to draw from.",
         "$defs": definitions,
     }
 

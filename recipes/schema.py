@@ -153,13 +153,16 @@ class Recipe(_Closed):
     name: str = Field(
         default="recipe",
         pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$",
-        description="Name used for folders and in the manifest; the file's name if absent.",
+        description="Used for folders and in the manifest; the file's name if absent.",
     )
     seed: Whole = Field(
         default=0, ge=0, lt=2**63, description="What all random numbers are made from."
     )
     variant: Whole = Field(
-        default=0, ge=0, lt=2**31, description="Which draw from the ranges this is."
+        default=0,
+        ge=0,
+        lt=2**31,
+        description="Which draw from the ranges this is; in a file with ranges, the first one.",
     )
     weather: Weather = Weather()
     render: Render = Render()

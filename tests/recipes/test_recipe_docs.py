@@ -1,0 +1,58 @@
+"""docs/recipes.md says what the code does."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from recipes.documentation import field_table
+from recipes.errors import RecipeError
+from recipes.fields import ROOT
+from recipes.load import preset_names
+from recipes.parse import parse_recipe
+
+PAGE = (Path(__file__).parents[2] / "docs" / "recipes.md").read_text(encoding="utf-8")
+
+
+def test_the_table_of_fields_is_the_schemas() -> None:
+    """To renew it, replace the end of the page by recipes.documentation.field_table()."""
+    assert PAGE.endswith(field_table())
+
+
+def test_every_key_has_a_row() -> None:
+    for section in ROOT.walk():
+        for spec in (*section.fields.values(), *section.extra.values()):
+            assert f"\n| `{spec.path}` |" in PAGE
+
+
+def test_every_preset_is_described() -> None:
+    for name in preset_names():
+        assert f"\n| `{name}` |" in PAGE
+
+
+def test_the_examples_load() -> None:
+    examples = re.findall(r"```yaml\n(.*?)```", PAGE, flags=re.DOTALL)
+    assert len(examples) >= 2
+    for example in examples:
+        template = parse_recipe(example, source="docs")
+        for variant in range(template.variants):
+            template.resolve(variant)
+
+
+def test_the_ranges_of_the_table_load() -> None:
+    ranges = re.findall(r"\| `(\{.*?\})` \|", PAGE)
+    assert len(ranges) == 5
+    for text in ranges:
+        parse_recipe(f"weather: {{smog: {{visibility_m: {text}}}}}", source="docs").resolve(0)
+
+
+def test_the_messages_are_those_of_the_loader() -> None:
+    text = (
+        "version: 1\nseed: 7\nvariants: 4\nweather:\n  smog:\n    visibility_km: 3\n"
+        "    color: [194, 0.5, 0.5]\n    scale_height_m: {uniform: [0, 10]}\n"
+    )
+    with pytest.raises(RecipeError) as caught:
+        parse_recipe(text, source="foggy.yaml")
+    assert f"```\n{caught.value}\n```" in PAGE

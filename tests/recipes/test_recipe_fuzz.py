@@ -1,0 +1,120 @@
+"""Whatever the text, the loader returns a template or raises RecipeError, and templates draw."""
+
+from __future__ import annotations
+
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
+
+from recipes.dump import dump_recipe
+from recipes.errors import RecipeError
+from recipes.fields import ROOT
+from recipes.parse import parse_recipe
+from recipes.template import RecipeTemplate
+
+KEYS = sorted(
+    {key for section in ROOT.walk() for key in section.known}
+    | {"uniform", "log_uniform", "normal", "choice", "weights", "mean", "std", "min", "max"}
+    | {"<<", "visibility_km", "on"}
+)
+SCALARS = st.sampled_from(
+    [
+        *("0", "1", "-5", "0.5", "1e-3", "1e400", ".nan", "-.inf", "300", "2", "010"),
+        *("null", "", "true", "yes", "png", "deferred", "x", "2024-01-01", "'1'", '"\\ud800"'),
+        *("0x" + "f" * 300, "9" * 399, "*a", "&a 1", "!!int 3"),
+        *("[0.1, 0.2, 0.3]", "{uniform: [1, 2]}"),
+    ]
+)
+FLOW = st.recursive(
+    SCALARS,
+    lambda inner: (
+        st.lists(inner, max_size=4).map(lambda items: f"[{', '.join(items)}]")
+        | st.dictionaries(st.sampled_from(KEYS), inner, max_size=4).map(
+            lambda d: "{" + ", ".join(f"{k}: {v}" for k, v in d.items()) + "}"
+        )
+    ),
+    max_leaves=12,
+)
+TOP = st.dictionaries(st.sampled_from(KEYS), FLOW, max_size=5).map(
+    lambda d: "\n".join(f"{key}: {value}" for key, value in d.items())
+)
+SMOG = st.dictionaries(st.sampled_from(ROOT.sections["weather"].sections["smog"].known), FLOW).map(
+    lambda d: "weather:\n  smog:\n" + "\n".join(f"    {key}: {value}" for key, value in d.items())
+)
+GOOD = """version: 1
+seed: 7
+variants: 2
+weather:
+  smog: &s
+    visibility_m: {log_uniform: [100, 2000]}
+    color: {choice: [[0.7, 0.7, 0.7], [0.7, {uniform: [0.6, 0.8]}, 0.7]], weights: [1, 2]}
+    scale_height_m: {normal: {mean: 60, std: 10, min: 50, max: 90}}
+output: {image: png, jpeg_quality: {uniform: [60, 95]}}
+"""
+# Without derandomize, one run in a thousand would test something that no other run repeats.
+FUZZ = settings(
+    max_examples=150,
+    deadline=None,
+    derandomize=True,
+    suppress_health_check=[HealthCheck.too_slow],
+)
+
+
+def loads_or_explains(text: str) -> RecipeTemplate | None:
+    try:
+        template = parse_recipe(text, source="fuzz.yaml")
+    except RecipeError as error:
+        assert error.problems
+        for problem in error.problems:
+            assert problem.startswith("fuzz.yaml:") and "\n" not in problem
+            problem.encode()  # can be printed, even where the text held half a surrogate pair
+            assert len(problem) < 1000
+        return None
+    recipe = template.resolve(0)
+    assert parse_recipe(dump_recipe(recipe), source="dump").resolve(0) == recipe
+    template.describe_ranges()
+    return template
+
+
+@FUZZ
+@given(st.text())
+@example("a: \ud800")
+@example("? ")
+@example("%")
+@example("- - - -")
+@example("!")
+@example("&a *a")
+def test_any_text(text: str) -> None:
+    loads_or_explains(text)
+
+
+@FUZZ
+@given(st.text(alphabet="ab:-?,[]{}&*!|>'\"%@`#~ \n\t0.1e<=", max_size=60))
+def test_text_of_yaml_signs(text: str) -> None:
+    loads_or_explains(text)
+
+
+@FUZZ
+@given(TOP)
+def test_known_keys_with_any_values(text: str) -> None:
+    loads_or_explains(text)
+
+
+@FUZZ
+@given(SMOG)
+def test_smog_with_any_values(text: str) -> None:
+    loads_or_explains(text)
+
+
+@FUZZ
+@given(st.data())
+def test_a_good_file_with_a_few_characters_changed(data: st.DataObject) -> None:
+    text = GOOD
+    for _ in range(data.draw(st.integers(0, 3))):
+        at = data.draw(st.integers(0, len(text)))
+        length = data.draw(st.integers(0, 12))
+        text = text[:at] + data.draw(st.text(max_size=4)) + text[at + length :]
+    loads_or_explains(text)
+
+
+def test_the_good_file_is_good() -> None:
+    assert loads_or_explains(GOOD) is not None
