@@ -164,6 +164,7 @@ def test_a_wrong_field_is_named_with_its_line_and_what_is_allowed(field: str, me
         ("variants: 2.5", "r.yaml:1: variants = 2.5: must be a whole number >= 1 and <= 1000000"),
         ("variant: 2147483647\nvariants: 2", "r.yaml:1: variant = 2147483647: too large with var"),
         ("fog: {}", "r.yaml:1: fog: unknown field here; did you mean weather.smog?"),
+        ("near_m: 1", "r.yaml:1: near_m: unknown field here; did you mean render.near_m?"),
         ("wether: {}", "r.yaml:1: wether: unknown field; did you mean weather?"),
         ("weather: 3", "r.yaml:1: weather = 3: must be a mapping, with smog"),
         ("weather: {smog: true}", "weather.smog = true: must be a mapping, with visibility_m, ext"),
@@ -240,6 +241,7 @@ def test_values_are_shown_shortened() -> None:
         ("model: deferred", Fixed("deferred")),
         ("color: [0, 0.5, 1]", Fixed((0.0, 0.5, 1.0))),
         ("base_height_m: {uniform: [0, 2]}", Uniform(0.0, 2.0)),
+        ("base_height_m: {uniform: [2, 2]}", Uniform(2.0, 2.0)),
         ("base_height_m: {log_uniform: [1, 2]}", LogUniform(1.0, 2.0)),
         (
             "base_height_m: {normal: {mean: 1, std: 2, min: 0, max: 3}}",

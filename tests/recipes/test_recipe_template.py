@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from recipes.dump import dump_recipe
 from recipes.errors import RecipeError
 from recipes.parse import parse_recipe
+from recipes.sampler import Draws
 from recipes.schema import Output, Recipe, Render, Smog, Weather
 from recipes.template import RecipeTemplate
 from recipes.values import Fixed
@@ -103,6 +104,18 @@ weather: {{smog: {{visibility_m: {{uniform: [50, 90]}}, probability: {probabilit
     assert abs(sum(present) / 2000 - probability) <= spread
 
 
+def test_who_has_the_effect_is_pinned() -> None:
+    text = "variants: 12\nweather: {smog: {visibility_m: 9, probability: 0.5}}"
+    present = [template(text).resolve(i).weather.smog is not None for i in range(12)]
+    assert "".join("01"[p] for p in present) == "000000010111"
+
+
+def test_probability_zero_is_never(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Draws, "unit", lambda self, path: 0.0)  # the least there is
+    never = template("weather: {smog: {visibility_m: 9, probability: 0}}")
+    assert never.resolve(0).weather.smog is None
+
+
 def test_probability_leaves_the_other_draws_alone() -> None:
     sometimes = template(TEXT.replace("  smog:\n", "  smog:\n    probability: 0.5\n"))
     pairs = [(template().resolve(i), sometimes.resolve(i)) for i in range(5)]
@@ -154,7 +167,9 @@ def test_resolved_recipes_read_back_equal() -> None:
 
 def test_a_dump_says_everything() -> None:
     text = dump_recipe(template().resolve(2))
-    assert text.startswith(f"# A recipe in numbers, hash {template().resolve(2).hash}.\n")
+    assert text.startswith(
+        f"# A recipe in numbers, hash {template().resolve(2).hash}.\nversion: 1\n"
+    )
     for line in ("name: foggy", "seed: 7", "variant: 2", "  alpha_max: 0.999", "  image: png"):
         assert f"\n{line}\n" in text
     assert "color: [0.7," in text

@@ -125,6 +125,9 @@ def test_extreme_random_numbers_stay_inside_the_ends(value: Value) -> None:
 def test_extreme_random_numbers_choose_the_outer_options() -> None:
     choice = Choice(tuple(Fixed(k) for k in "abcd"), (0.0, 1.0, 2.0, 0.0))
     assert [choice.draw(Ends(0, end), "x") for end in (0, 1)] == ["b", "c"]
+    # these weights, taken off one by one, round to a little less than their sum
+    uneven = Choice(tuple(Fixed(k) for k in "abcde"), (0.16, 0.22, 0.45, 0.71, 0.0))
+    assert uneven.draw(Ends(0, 1), "x") == "d"
 
 
 def test_a_colour_line_draws_between_its_ends_with_one_number() -> None:
