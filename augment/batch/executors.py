@@ -11,10 +11,12 @@ import contextlib
 import logging
 import multiprocessing
 import os
+import pickle
 import signal
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from multiprocessing import reduction
 from multiprocessing.connection import Connection, wait
 
 from augment.batch.lock import OutputLock
@@ -64,8 +66,17 @@ def run_in_processes(
     the image is recorded as failed.
 
     Raises:
+        ValueError: scene_loader or renderer cannot be sent to another process.
         SceneError: a worker could not open the scene. OutputError: a worker could not write.
     """
+    for name, function in {"scene_loader": scene_loader, "renderer": renderer}.items():
+        try:
+            reduction.ForkingPickler.dumps(function)
+        except (AttributeError, TypeError, pickle.PicklingError) as error:
+            raise ValueError(
+                f"{name} {function!r} cannot be sent to worker processes: {error}; use a function "
+                f"defined at the top of a module, or workers=1"
+            ) from error
     pool = _Pool(setup, scene_loader, renderer, deliver, lock, chunks)
     pool.run(min(workers, len(chunks)))
 

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from augment.batch.atomic import write_atomic
 from augment.batch.label_files import lidar_bytes
@@ -27,6 +27,7 @@ MESSAGE_LENGTH = 500
 _log = logging.getLogger(__name__)
 
 
+@runtime_checkable
 class Renderer(Protocol):
     """`augment.apply.render_view`, or a stand-in. Returns a `writer.View`."""
 

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from augment.cameras import Camera
 from recipes.schema import Output
 
 
+@runtime_checkable
 class View(Protocol):
     """What a renderer returns; `augment.apply.WeatheredView` is one."""
 
@@ -38,7 +39,7 @@ class Written:
     write_s: float
 
 
-def check_view(view: Any, camera: Camera, output: Output) -> None:
+def check_view(view: View, camera: Camera, output: Output) -> None:
     """Raise ValueError unless the view has the camera's size and the buffers the recipe asks for.
 
     camera: at the written resolution.
@@ -63,8 +64,8 @@ def check_view(view: Any, camera: Camera, output: Output) -> None:
             )
 
 
-def write_view(out_dir: Path, paths: ItemPaths, view: Any, output: Output) -> Written:
-    """Encode and write all files of a view.
+def write_view(out_dir: Path, paths: ItemPaths, view: View, output: Output) -> Written:
+    """Encode and write all files of a view that `check_view` has passed.
 
     Raises:
         ValueError: a buffer has another type or shape than View says.
@@ -73,10 +74,13 @@ def write_view(out_dir: Path, paths: ItemPaths, view: Any, output: Output) -> Wr
     started = time.perf_counter()
     files: dict[str, bytes] = {}
     if paths.depth is not None:
+        assert view.depth_m is not None
         files[paths.depth] = encode_depth(view.depth_m)
     if paths.semantic is not None:
+        assert view.semantic is not None
         files[paths.semantic] = encode_ids(view.semantic, np.uint8)
     if paths.instance is not None:
+        assert view.instance is not None
         files[paths.instance] = encode_ids(view.instance, np.uint16)
     files[paths.image] = encode_image(view.rgb, output)
     checksum = hashlib.sha256(files[paths.image]).hexdigest()

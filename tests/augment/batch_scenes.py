@@ -76,8 +76,8 @@ def open_fake(uri: str) -> Scene:
     """`fake:NAME?frames=N&unreadable=K`: a scene of N frames and two cameras."""
     name, _, query = uri.removeprefix("fake:").partition("?")
     options = dict(part.split("=") for part in query.split("&") if part)
-    if "crash" in options:
-        os.kill(os.getpid(), signal.SIGKILL)
+    if "only_parent" in options and os.environ["BATCH_SCENES_PARENT"] != str(os.getpid()):
+        raise AdapterError("no memory for a second copy")
     unreadable = tuple(int(options[k]) for k in ("unreadable",) if k in options)
     frames = tuple(make_frame(index) for index in range(int(options.get("frames", 4))))
     return Scene(
@@ -129,9 +129,7 @@ def make_recipe(name: str = "fog", variant: int = 0, **output) -> Recipe:
     smog = Smog(visibility_m=50.0 + variant)
     weather = Weather(smog=smog if name == "fog" else None)
     settings = {"semantic": True, "instance": True, **output}
-    return Recipe(
-        name=name, variant=variant, seed=7, weather=weather, output=Output(**settings)
-    )
+    return Recipe(name=name, variant=variant, seed=7, weather=weather, output=Output(**settings))
 
 
 def fake_render(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str) -> FakeView:
@@ -176,5 +174,3 @@ def tree_digest(folder: Path) -> dict[str, str]:
         for path in sorted(folder.rglob("*"))
         if path.is_file()
     }
-
-
