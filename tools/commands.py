@@ -20,8 +20,8 @@ def render(
     recipe: Positional[str],
     scene: str,
     out: Path,
-    frames: str | None = None,
-    cameras: str | None = None,
+    frames: str = "all",
+    cameras: str = "all",
     scale: float = 1.0,
     variants: int | None = None,
     workers: int = 1,
@@ -39,8 +39,8 @@ def render(
         scene: procedural:street?seed=3, pandaset:PATH/002, gaussians:PATH/point_cloud.ply, or a
             bare path, which is recognised by what it holds.
         out: The output folder. Further recipes and scenes may go into the same one.
-        frames: Frame numbers: 4, 0,5,9, or 0:20:2 (start:stop:step). All by default.
-        cameras: Camera names separated by commas. All by default.
+        frames: Frame numbers: all, 4, 0,5,9, or 0:20:2 (start:stop:step, stop excluded).
+        cameras: Camera names separated by commas, or all.
         scale: Resolution relative to the recipe's.
         variants: How many draws from the recipe's ranges. The recipe's own number by default.
         workers: Processes. The bits do not depend on it.
@@ -111,8 +111,8 @@ def recipes(name: Positional[str | None] = None, schema: Path | None = None) -> 
         name: A preset to print.
         schema: Write the JSON Schema of recipes to this file.
     """
+    from recipes.json_schema import write_schema
     from recipes.load import preset_names, preset_text
-    from recipes.schema_json import write_schema
 
     if schema is not None:
         write_schema(schema)

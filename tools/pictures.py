@@ -39,7 +39,7 @@ def draw_sheet(out: Path, frame: int | None = None) -> Path:
         if group:
             title = f"{scene}, frame {frame}: {_weather(next(iter(group.values())))}"
             images = [
-                (name, sheet.read_rgb(out / group[name]["image"])) for name in cameras if name in group
+                (name, sheet.read_rgb(out / group[name]["image_path"])) for name in cameras if name in group
             ]
             lines.append((title, images))
     if not lines:
@@ -65,7 +65,7 @@ def draw_video(out: Path, camera: str, frames_per_second: float = 10.0, width: i
     def pictures():
         for frame in frames:
             shown = [by_key[(*group, frame)] for group in groups]
-            images = [(_weather(row), sheet.read_rgb(out / row["image"])) for row in shown]
+            images = [(_weather(row), sheet.read_rgb(out / row["image_path"])) for row in shown]
             yield sheet.side_by_side(images, width)
 
     path = out / f"video_{camera}.mp4"

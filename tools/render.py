@@ -1,0 +1,139 @@
+"""`climategs render`: a recipe and a scene's URI become a job."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from adapters.base import open_scene
+from augment.batch.job import JobResult, RenderJob, run_job
+from augment.errors import ClimateGSError
+from augment.scene import Scene
+from recipes.load import load_recipe
+from recipes.schema import Recipe
+
+
+def render_recipe(
+    recipe: str,
+    scene_uri: str,
+    out: Path,
+    *,
+    frames: str = "all",
+    cameras: str = "all",
+    scale: float = 1.0,
+    variants: int | None = None,
+    workers: int = 1,
+    backend: str = "auto",
+    camera_path: Path | None = None,
+    overwrite: bool = False,
+    sheet: bool = True,
+) -> int:
+    """Runs the job and prints what became of it. Returns the exit code: 1 where images failed."""
+    from augment.render.warm_up import warm_up
+
+    recipes = resolve_variants(recipe, variants, scale)
+    seconds = warm_up()
+    if seconds > 1:
+        _say(f"compiled the kernels in {seconds:.1f} s (kept for the next run)")
+    # Opened once here; worker processes, which share no memory, open their own.
+    scene = open_scene(scene_uri)
+    for problem in scene.problems:
+        _say(f"note: {problem}")
+    job = RenderJob(
+        scene_uri=scene_uri,
+        recipes=recipes,
+        out_dir=out,
+        frames=parse_frames(frames),
+        cameras=None if cameras == "all" else tuple(cameras.split(",")),
+        camera_path=_frames_of(camera_path, scene),
+        workers=workers,
+        backend=backend,
+        overwrite=overwrite,
+    )
+    result = run_job(job, scene_loader=open_scene if workers > 1 else lambda _uri: scene)
+    _report(result)
+    if sheet and result.written + result.skipped:
+        from tools.pictures import draw_sheet
+
+        print(f"pictures: {draw_sheet(out)}")
+    return 1 if result.failed else 0
+
+
+def resolve_variants(recipe: str, variants: int | None = None, scale: float = 1.0) -> list[Recipe]:
+    """The recipe's variants in numbers, at `scale` times the recipe's resolution.
+
+    Raises:
+        RecipeError: the recipe is invalid, or scaled beyond its limits.
+    """
+    template = load_recipe(recipe)
+    count = template.variants if variants is None else variants
+    if count < 1:
+        raise ClimateGSError(f"--variants must be >= 1; got {count}")
+    resolved = [template.resolve(number) for number in range(count)]
+    return resolved if scale == 1 else [scaled_recipe(r, scale) for r in resolved]
+
+
+def scaled_recipe(recipe: Recipe, scale: float) -> Recipe:
+    """The recipe at another resolution, recorded as its render.scale."""
+    from pydantic import ValidationError
+
+    numbers = recipe.model_dump()
+    numbers["render"]["scale"] = recipe.render.scale * scale
+    try:
+        return Recipe.model_validate(numbers)
+    except ValidationError as error:
+        limits = error.errors()[0]["msg"]
+        raise ClimateGSError(
+            f"--scale {scale} times the recipe's render.scale {recipe.render.scale} is not "
+            f"possible: {limits}"
+        ) from None
+
+
+def parse_frames(text: str) -> tuple[int, ...] | None:
+    """`all`, or frame numbers and ranges: `4`, `0,5,9`, `0:20:2` (start:stop:step, stop excluded).
+
+    Raises:
+        ClimateGSError: the text is none of these.
+    """
+    if text == "all":
+        return None
+    numbers: list[int] = []
+    try:
+        for piece in text.split(","):
+            values = [int(v) for v in piece.split(":")]
+            if len(values) > 3 or (len(values) == 3 and values[2] < 1):
+                raise ValueError
+            numbers += values if len(values) == 1 else range(*values)
+    except ValueError:
+        numbers = []
+    if not numbers:
+        raise ClimateGSError(
+            f"--frames {text!r} is not understood; write all, 4, 0,5,9 or 0:20:2 "
+            f"(start:stop:step, stop excluded)"
+        )
+    return tuple(dict.fromkeys(numbers))
+
+
+def _frames_of(camera_path: Path | None, scene: Scene):
+    if camera_path is None:
+        return None
+    from adapters.camera_paths import frames_from_path_file
+
+    return frames_from_path_file(camera_path, scene)
+
+
+def _report(result: JobResult) -> None:
+    rate = result.written / result.seconds if result.seconds else 0.0
+    print(
+        f"{result.written} images written, {result.skipped} already there, {result.failed} failed; "
+        f"{result.seconds:.1f} s, {rate:.1f} images/s"
+    )
+    for failure in result.failures[:20]:
+        _say(f"failed: {failure}")
+    if len(result.failures) > 20:
+        _say(f"... and {len(result.failures) - 20} more; the manifest has them all")
+    print(f"manifest: {result.manifest}")
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr)
