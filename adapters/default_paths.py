@@ -14,7 +14,7 @@ from typing import Literal
 
 import numpy as np
 
-from adapters.ground_estimate import GroundGrid, ground_grid, solid_points
+from adapters.ground_estimate import GroundGrid, ground_grid, solid_points_and_areas
 from adapters.posed_views import PosedView, look_at_pose
 from augment.scene import Gaussians
 
@@ -32,7 +32,12 @@ _SHORTEST_DRIVE_M = 8.0
 _WIDE_M, _FLATNESS = 20.0, 0.5
 _CAR_M = (0.5, 2.5)  # above the ground: what lies between is in the way
 _HALF_WIDTH_M = 1.25
-_AHEAD_SHARE = 0.3  # part of the line that is left ahead of the last image
+_BLOCKED_COST = 4.0  # passing half a metre of wall must cost more than it gains
+_BEHIND_SHARE, _AHEAD_SHARE = (
+    0.05,
+    0.3,
+)  # parts of the line before the first and after the last image
+_ORBIT_ELEVATION_DEG = 20.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,11 +53,11 @@ def make_default_path(
     gaussians: Gaussians, *, is_metric: bool, kind: PathKind = "auto"
 ) -> DefaultPath:
     """A path for the scene; `kind` other than auto insists (a drive then takes units as metres)."""
-    points = solid_points(gaussians)
+    points, areas = solid_points_and_areas(gaussians)
     if kind == "orbit" or (kind == "auto" and not (is_metric and _is_wide_and_flat(points))):
         return _orbit(points, is_metric=is_metric, asked=kind == "orbit")
     grid = ground_grid(points, cell=1.0)
-    start, end = _longest_free_line(points, grid)
+    start, end = _longest_free_line(points, areas, grid)
     if np.linalg.norm(end - start) < _SHORTEST_DRIVE_M and kind == "auto":
         return _orbit(points, is_metric=is_metric, asked=False)
     return _drive(points, grid, start, end)
@@ -64,13 +69,15 @@ def _is_wide_and_flat(points: np.ndarray) -> bool:
     return wide >= _WIDE_M and extent[2] < _FLATNESS * wide
 
 
-def _longest_free_line(points: np.ndarray, grid: GroundGrid) -> tuple[np.ndarray, np.ndarray]:
+def _longest_free_line(
+    points: np.ndarray, areas: np.ndarray, grid: GroundGrid
+) -> tuple[np.ndarray, np.ndarray]:
     """Ends [2] of the straight line with the most ground under it and the least in its way.
 
-    Every half metre of a line counts +1 over known ground, -1 elsewhere, and less by the opaque
-    Gaussians within a car's width and height; of every line the best stretch is taken.
+    Every half metre of a line counts +1 over known ground, -1 elsewhere, and less by the share of
+    a car's front that Gaussians there hide; of every line the best stretch is taken.
     """
-    worth, cell = _worth_of_cells(points, grid)
+    worth, cell = _worth_of_cells(points, areas, grid)
     middle = grid.corner + 0.5 * grid.cell * np.array(grid.height.shape)
     reach = 0.5 * grid.cell * float(np.hypot(*grid.height.shape))
     along = np.arange(-reach, reach, _STEP_M)
@@ -96,19 +103,27 @@ def _longest_free_line(points: np.ndarray, grid: GroundGrid) -> tuple[np.ndarray
     return ends
 
 
-def _worth_of_cells(points: np.ndarray, grid: GroundGrid) -> tuple[np.ndarray, float]:
+def _worth_of_cells(
+    points: np.ndarray, areas: np.ndarray, grid: GroundGrid
+) -> tuple[np.ndarray, float]:
     """What a step over each fine cell counts, and the cell's side."""
     cell = min(_STEP_M, grid.cell)
     shape = np.ceil(np.array(grid.height.shape) * grid.cell / cell).astype(int)
     centres = grid.corner + (np.stack(np.indices(shape), -1) + 0.5) * cell
     known = np.isfinite(grid.at(centres))
     above = points[:, 2] - grid.at(points)  # NaN compares false below
-    in_the_way = points[(above > _CAR_M[0]) & (above < _CAR_M[1])]
-    index = np.floor((in_the_way[:, :2] - grid.corner) / cell).astype(int)
-    count = np.zeros(shape)
-    np.add.at(count, (index[:, 0].clip(0, shape[0] - 1), index[:, 1].clip(0, shape[1] - 1)), 1.0)
-    blocked = _sum_around(count, round(_HALF_WIDTH_M / cell))
-    return np.where(known, 1.0, -1.0) - np.minimum(0.25 * blocked, 4.0), cell
+    in_the_way = (above > _CAR_M[0]) & (above < _CAR_M[1])
+    index = np.floor((points[in_the_way, :2] - grid.corner) / cell).astype(int)
+    hidden = np.zeros(shape)
+    x, y = index[:, 0].clip(0, shape[0] - 1), index[:, 1].clip(0, shape[1] - 1)
+    np.add.at(hidden, (x, y), areas[in_the_way])
+    reach = round(_HALF_WIDTH_M / cell)
+    front = (2 * reach + 1) * cell * (_CAR_M[1] - _CAR_M[0])
+    blocked = _sum_around(hidden, reach) / front
+    # In a blurred reconstruction something hangs everywhere: there, less than usual is free.
+    usual = np.median(blocked[known]) if known.any() else 0.0
+    blocked = (blocked / max(1.0, usual)).clip(0, 1)
+    return np.where(known, 1.0, -1.0) - _BLOCKED_COST * blocked, cell
 
 
 def _sum_around(values: np.ndarray, reach: int) -> np.ndarray:
@@ -123,13 +138,17 @@ def _sum_around(values: np.ndarray, reach: int) -> np.ndarray:
 
 
 def _drive(points: np.ndarray, grid: GroundGrid, start: np.ndarray, end: np.ndarray) -> DefaultPath:
-    forward = (end - start) / max(float(np.linalg.norm(end - start)), 1e-9)
+    whole = float(np.linalg.norm(end - start))
+    forward = (end - start) / whole if whole > 1e-6 else np.array([1.0, 0.0])
     beyond = [
         int(((points[:, :2] - p) @ d > 0).sum()) for p, d in ((end, forward), (start, -forward))
     ]
     if beyond[1] > beyond[0]:  # drive towards the side where more lies ahead of the end
         start, end, forward = end, start, -forward
-    length = float(np.linalg.norm(end - start)) * (1 - _AHEAD_SHARE)
+    start, length = (
+        start + _BEHIND_SHARE * whole * forward,
+        (1 - _BEHIND_SHARE - _AHEAD_SHARE) * whole,
+    )
     count = max(2, min(_MOST_FRAMES, round(length / _STEP_M) + 1))
     places = start + np.linspace(0, length, count)[:, None] * forward
     ground = _smooth_profile(grid.at(places), fallback=float(np.quantile(points[:, 2], 0.1)))
@@ -163,13 +182,18 @@ def _smooth_profile(heights: np.ndarray, *, fallback: float) -> np.ndarray:
 
 def _orbit(points: np.ndarray, *, is_metric: bool, asked: bool) -> DefaultPath:
     centre = np.median(points, axis=0)
-    spread = float(np.median(np.linalg.norm(points - centre, axis=1)))
-    radius = max(2.5 * spread, 1e-3)
+    distances = np.linalg.norm(points - centre, axis=1)
+    spread, most = np.quantile(distances, [0.5, 0.9])
+    reach = max(min(most, 2.5 * spread), 1e-3)  # a far background must not set the distance
+    half_angle = math.atan(HEIGHT / WIDTH * math.tan(math.radians(_FIELD_OF_VIEW_DEG["orbit"]) / 2))
+    distance = 1.1 * reach / math.sin(half_angle)
+    elevation = math.radians(_ORBIT_ELEVATION_DEG)
     views = []
     for frame in range(_ORBIT_FRAMES):
         angle = 2 * math.pi * frame / _ORBIT_FRAMES
-        direction = np.array([math.cos(angle), math.sin(angle), math.tan(math.radians(20))])
-        pose = look_at_pose(centre + radius * direction, centre, where="orbit")
+        flat = math.cos(elevation)
+        direction = (flat * math.cos(angle), flat * math.sin(angle), math.sin(elevation))
+        pose = look_at_pose(centre + distance * np.array(direction), centre, where="orbit")
         views.append(_view("orbit", frame, pose, "orbit"))
     near = np.linalg.norm(points[:, :2] - centre[:2], axis=1) < spread
     ground = float(np.quantile(points[near, 2] if near.any() else points[:, 2], 0.05))

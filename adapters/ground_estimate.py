@@ -6,9 +6,12 @@ of solid Gaussians around a place; a quantile, since trained scenes hold stray o
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from augment.scene import Gaussians
 
@@ -18,6 +21,7 @@ _FEWEST_POINTS = 12
 _MOST_POINTS = 300_000
 _MOST_PLACES = 128
 _CELLS_A_SIDE = 200
+_FEWEST_KNOWN = 6  # of 25 cells: ground is not spread beyond the content's edge
 
 
 def solid_points(gaussians: Gaussians) -> np.ndarray:
@@ -25,9 +29,27 @@ def solid_points(gaussians: Gaussians) -> np.ndarray:
 
     Large scenes are thinned evenly to a few hundred thousand.
     """
-    solid = gaussians.opacities > SOLID_OPACITY
-    means = gaussians.means[solid] if int(solid.sum()) >= _FEWEST_POINTS else gaussians.means
-    return means[:: 1 + len(means) // _MOST_POINTS].double().numpy()
+    return gaussians.means[_solid(gaussians)].double().numpy()
+
+
+def solid_points_and_areas(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray]:
+    """The same centres, and the area [N] each hides: opacity times 2 pi times its two larger
+    scales, which is what it takes from a wide beam across its face. Thinned areas make up for
+    those left out.
+    """
+    index = _solid(gaussians)
+    count = int((gaussians.opacities > SOLID_OPACITY).sum())
+    scales = gaussians.scales[index].sort(dim=1).values
+    area = 2 * math.pi * gaussians.opacities[index] * scales[:, 1] * scales[:, 2]
+    thinned = max(count, len(index)) / max(len(index), 1)
+    return gaussians.means[index].double().numpy(), area.double().numpy() * thinned
+
+
+def _solid(gaussians: Gaussians) -> Tensor:
+    solid = torch.nonzero(gaussians.opacities > SOLID_OPACITY)[:, 0]
+    if len(solid) < _FEWEST_POINTS:
+        solid = torch.arange(len(gaussians))
+    return solid[:: 1 + len(solid) // _MOST_POINTS]
 
 
 def ground_under(
@@ -106,4 +128,5 @@ def _smooth(height: np.ndarray) -> np.ndarray:
     ordered = np.sort(windows, axis=-1)  # NaN last
     known = np.isfinite(ordered).sum(-1)
     pick = (0.3 * known).astype(int).clip(0, 24)
-    return np.take_along_axis(ordered, pick[..., None], -1)[..., 0]
+    smooth = np.take_along_axis(ordered, pick[..., None], -1)[..., 0]
+    return np.where(known >= _FEWEST_KNOWN, smooth, np.nan)

@@ -1,0 +1,283 @@
+"""Plain splat files as scenes: axes, unit, origin, cameras found and grouped, ground, doubts."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import plyfile
+import pytest
+import torch
+from splat_scenes import gaussians_at, street
+
+from adapters.base import open_scene
+from adapters.gaussian_files import find_splat_file, open_gaussians
+from adapters.posed_views import look_at_pose
+from augment.errors import AdapterError, SceneError
+from augment.scene import Gaussians
+from augment.splat_io import write_ply, write_splat
+
+TO_Y_DOWN = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # z-up world to COLMAP's usual y-down
+
+
+def inria_cameras(poses: dict[str, np.ndarray]) -> list[dict]:
+    return [
+        {
+            "id": number, "img_name": name, "width": 96, "height": 54, "fx": 60.0, "fy": 60.0,
+            "position": pose[:3, 3].tolist(), "rotation": pose[:3, :3].tolist(),
+        }
+        for number, (name, pose) in enumerate(poses.items())
+    ]  # fmt: skip
+
+
+def drive_poses(names: list[str], *, change: np.ndarray | None = None) -> dict[str, np.ndarray]:
+    """Cameras 2 m apart along +x at 1.6 m, looking ahead; `change` turns their world."""
+    poses = {}
+    for number, name in enumerate(names):
+        eye = (2.0 * number + 1, 0.0, 1.6)
+        pose = look_at_pose(eye, (eye[0] + 5, 0.0, 1.6), where="test")
+        turn = np.eye(4)
+        turn[:3, :3] = np.eye(3) if change is None else change
+        poses[name] = turn @ pose
+    return poses
+
+
+def turned(gaussians: Gaussians, rotation: np.ndarray) -> Gaussians:
+    """Balls only: their orientation does not matter."""
+    means = gaussians.means @ torch.from_numpy(rotation).float().T
+    return Gaussians(**{**vars(gaussians), "means": means})
+
+
+def save_model(folder: Path, gaussians: Gaussians, cameras: list | None = None) -> Path:
+    """An INRIA output folder."""
+    target = folder / "point_cloud" / "iteration_30000"
+    target.mkdir(parents=True)
+    write_ply(target / "point_cloud.ply", gaussians)
+    if cameras is not None:
+        (folder / "cameras.json").write_text(json.dumps(cameras))
+    return folder
+
+
+def problem_with(scene, words: str) -> str:
+    found = [p for p in scene.problems if words in p]
+    assert len(found) == 1, scene.problems
+    return found[0]
+
+
+def test_a_bare_file_gets_a_path_and_says_what_it_lacks(tmp_path: Path) -> None:
+    write_ply(tmp_path / "corner.ply", street())
+    scene = open_gaussians(tmp_path / "corner.ply", {})
+    assert scene.name == "corner"
+    assert not scene.has_metric_scale
+    problem_with(scene, "scale=1 if it is in metres")
+    problem_with(scene, "no cameras came with the scene")
+    assert scene.camera_names == ("orbit",)
+    metric = open_gaussians(tmp_path / "corner.ply", {"scale": "1"})
+    assert metric.has_metric_scale
+    assert metric.camera_names == ("front", "left", "right")
+    assert metric.ground_z_m == pytest.approx(0, abs=0.3)
+    assert [p[:10] for p in metric.problems] == ["no cameras"]
+
+
+def test_notes_of_the_file_are_believed(tmp_path: Path) -> None:
+    gaussians = turned(street(), TO_Y_DOWN)
+    write_ply(tmp_path / "a.ply", gaussians, notes={"unit": "metre", "up": "-y"})
+    scene = open_gaussians(tmp_path / "a.ply", {})
+    assert scene.has_metric_scale
+    torch.testing.assert_close(scene.background.means, street().means, rtol=0, atol=1e-5)
+
+
+def test_model_folder_with_cameras(tmp_path: Path) -> None:
+    """A y-down model whose cameras drive along the street: turned, scaled, grouped, grounded."""
+    source = turned(street(heading_deg=0), TO_Y_DOWN)
+    names = [f"{frame:04d}_{camera}" for frame in (3, 5) for camera in ("front", "left")]
+    poses = drive_poses(names, change=TO_Y_DOWN)
+    model = save_model(tmp_path / "trained", source, inria_cameras(poses))
+    scene = open_gaussians(model, {"up": "-y", "scale": "2"})
+    assert scene.name == "trained"
+    assert [frame.index for frame in scene.frames] == [3, 5]
+    assert scene.camera_names == ("front", "left")
+    np.testing.assert_allclose(
+        scene.frames[0].cameras["left"].centre, [2 * 3, 0, 2 * 1.6], atol=1e-12
+    )
+    np.testing.assert_allclose(
+        scene.frames[0].cameras["left"].world_from_camera[:3, 2], [1, 0, 0], atol=1e-12
+    )
+    torch.testing.assert_close(
+        scene.background.means, 2 * street(heading_deg=0).means, rtol=0, atol=2e-5
+    )
+    assert scene.ground_z_m == pytest.approx(0, abs=0.3)
+    assert scene.problems == ()
+    file = model / "point_cloud" / "iteration_30000" / "point_cloud.ply"
+    by_file = open_gaussians(file, {"up": "-y", "scale": "2"})
+    assert by_file.name == "trained" and len(by_file.frames) == 2
+
+
+def test_a_wrong_up_is_noticed(tmp_path: Path) -> None:
+    names = [f"{n:03d}" for n in range(4)]
+    source = turned(street(heading_deg=0), TO_Y_DOWN)
+    cameras = inria_cameras(drive_poses(names, change=TO_Y_DOWN))
+    model = save_model(tmp_path, source, cameras)
+    text = problem_with(open_gaussians(model, {"scale": "1"}), "mean up direction")
+    assert "90 degrees from" in text and "+z;" in text and "up=-y if" in text
+    for up in ("-y", "cameras", "0,-1,0"):
+        scene = open_gaussians(model, {"scale": "1", "up": up})
+        assert scene.problems == ()
+        np.testing.assert_allclose(
+            scene.frames[0].cameras["camera"].world_from_camera[:3, 1], [0, 0, -1], atol=1e-12
+        )
+    # One that was given is not doubted.
+    assert open_gaussians(model, {"scale": "1", "up": "+z"}).problems == ()
+
+
+def test_up_from_cameras_needs_cameras(tmp_path: Path) -> None:
+    write_ply(tmp_path / "a.ply", street(length=8))
+    with pytest.raises(AdapterError, match="up=cameras needs cameras"):
+        open_gaussians(tmp_path / "a.ply", {"up": "cameras"})
+
+
+def test_cameras_elsewhere_and_none(tmp_path: Path) -> None:
+    model = save_model(tmp_path / "m", street(), inria_cameras(drive_poses(["1", "2"])))
+    path = tmp_path / "path.json"
+    frames = [{"position": [0, 0, 2], "look_at": [1, 1, 2]}]
+    path.write_text(json.dumps({"width": 9, "height": 9, "fx": 9, "frames": frames}))
+    other = open_gaussians(model, {"cameras": str(path), "scale": "1"})
+    assert other.frames[0].cameras["camera"].width == 9
+    none = open_gaussians(model, {"cameras": "none", "scale": "1"})
+    assert none.camera_names == ("front", "left", "right")
+
+
+def test_damaged_cameras_beside_say_how_to_go_on(tmp_path: Path) -> None:
+    model = save_model(tmp_path, street(length=8))
+    (model / "cameras.json").write_text("{")
+    with pytest.raises(AdapterError, match=r"cannot be read as JSON.*cameras=none"):
+        open_gaussians(model, {})
+
+
+def test_cameras_of_another_world_are_noticed(tmp_path: Path) -> None:
+    poses = drive_poses(["1", "2"])
+    for pose in poses.values():
+        pose[:3, 3] += [0, 0, 500]
+    model = save_model(tmp_path, street(heading_deg=0), inria_cameras(poses))
+    text = problem_with(open_gaussians(model, {"scale": "1"}), "different worlds")
+    assert "see 0.00% of the Gaussians" in text
+
+
+def test_far_coordinates_are_recentred(tmp_path: Path) -> None:
+    """Doubles far away keep their precision, and their cameras come along."""
+    near = street(heading_deg=0)
+    table = np.zeros(len(near), dtype=_double_columns())
+    offset = np.array([500_000.25, 5_300_000.5, 400.0])
+    for axis, name in enumerate("xyz"):
+        table[name] = near.means[:, axis].double().numpy() + offset[axis]
+    table["rot_0"], table["opacity"] = 1, 3
+    for name in ("scale_0", "scale_1", "scale_2"):
+        table[name] = -2
+    path = tmp_path / "utm.ply"
+    plyfile.PlyData([plyfile.PlyElement.describe(table, "vertex")]).write(str(path))
+    poses = drive_poses(["1", "2"])
+    for pose in poses.values():
+        pose[:3, 3] += offset
+    (tmp_path / "cameras.json").write_text(json.dumps(inria_cameras(poses)))
+    scene = open_gaussians(path, {"scale": "1"})
+    assert scene.problems == ()
+    assert (scene.world_origin_m == np.round(scene.world_origin_m)).all()
+    world = scene.background.means.double().numpy() + scene.world_origin_m
+    # float32 keeps 2 um at 30 m
+    np.testing.assert_allclose(world, near.means.double().numpy() + offset, atol=1e-5)
+    centre = scene.frames[1].cameras["camera"].centre.numpy() + scene.world_origin_m
+    np.testing.assert_allclose(centre, offset + np.array([3, 0, 1.6]), atol=1e-6)
+    assert scene.ground_z_m == pytest.approx(offset[2] - scene.world_origin_m[2], abs=0.3)
+
+
+def test_far_float32_coordinates_are_recentred_and_lamented(tmp_path: Path) -> None:
+    near = street(heading_deg=0)
+    write_ply(tmp_path / "a.ply", Gaussians(**{**vars(near), "means": near.means + 2_000_000}))
+    scene = open_gaussians(tmp_path / "a.ply", {"scale": "1"})
+    assert scene.background.means.abs().max() < 100
+    text = problem_with(scene, "km from zero")
+    assert "steps of up to 0.12 m" in text
+
+
+def _double_columns() -> list[tuple[str, str]]:
+    names = ["f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2",
+             "rot_0", "rot_1", "rot_2", "rot_3"]  # fmt: skip
+    return [(axis, "f8") for axis in "xyz"] + [(name, "f4") for name in names]
+
+
+def test_which_file_of_a_folder(tmp_path: Path) -> None:
+    model = save_model(tmp_path / "m", street(length=8))
+    early = model / "point_cloud" / "iteration_7000"
+    early.mkdir()
+    write_ply(early / "point_cloud.ply", street(length=8))
+    assert find_splat_file(model).parent.name == "iteration_30000"
+    assert find_splat_file(model, 7000).parent.name == "iteration_7000"
+    with pytest.raises(AdapterError, match=r"no iteration 8; it has \[7000, 30000\]"):
+        find_splat_file(model, 8)
+    folder = tmp_path / "f"
+    folder.mkdir()
+    with pytest.raises(AdapterError, match=r"exactly one .* found none"):
+        find_splat_file(folder)
+    write_splat(folder / "a.splat", street(length=8))
+    assert find_splat_file(folder).name == "a.splat"
+    write_ply(folder / "b.ply", street(length=8))
+    with pytest.raises(AdapterError, match=r"found \['a\.splat', 'b\.ply'\]"):
+        open_gaussians(folder, {})
+
+
+@pytest.mark.parametrize(
+    ("query", "message"),
+    [
+        ({"upp": "z"}, r"unknown key 'upp'\. Known: up: .*; scale: metres per unit"),
+        ({"up": "north"}, "up must be"),
+        ({"scale": "big"}, "scale must be metres per unit.*got 'big'"),
+        ({"scale": "-1"}, "scale must be"),
+        ({"scale": "nan"}, "scale must be"),
+        ({"path": "walk"}, "path must be auto, drive or orbit"),
+        ({"iteration": "last"}, "iteration must be a whole number"),
+        ({"sky": "blue"}, "sky must be black, white"),
+        ({"sky": "0,0,2"}, "sky must be"),
+        ({"cameras": "absent.json"}, r"absent\.json: no such file"),
+    ],
+)
+def test_bad_queries(tmp_path: Path, query: dict[str, str], message: str) -> None:
+    write_ply(tmp_path / "a.ply", street(length=8))
+    with pytest.raises(AdapterError, match=message):
+        open_gaussians(tmp_path / "a.ply", query)
+
+
+def test_sky_is_what_was_trained_with(tmp_path: Path) -> None:
+    model = save_model(tmp_path, street(length=8))
+    up = torch.tensor([[0.0, 0, 1]])
+    assert open_gaussians(model, {}).sky.sample(up).tolist() == [[0, 0, 0]]
+    (model / "cfg_args").write_text("Namespace(sh_degree=3, white_background=True)")
+    assert open_gaussians(model, {}).sky.sample(up).tolist() == [[1, 1, 1]]
+    grey = open_gaussians(model, {"sky": "0.5,0.5,0.5"}).sky.sample(up)
+    assert grey.tolist() == [[0.5, 0.5, 0.5]]
+
+
+def test_meshes_are_scene_errors(tmp_path: Path) -> None:
+    table = np.zeros(3, dtype=[("x", "f4"), ("y", "f4"), ("z", "f4")])
+    path = tmp_path / "mesh.ply"
+    plyfile.PlyData([plyfile.PlyElement.describe(table, "vertex")]).write(str(path))
+    with pytest.raises(SceneError, match="not a Gaussian splat"):
+        open_scene(str(path))
+
+
+def test_view_dependent_colour_turns_with_the_scene(tmp_path: Path) -> None:
+    """Band 1's z coefficient: a Gaussian brighter seen along the source's +y (up) ends up +z."""
+    gaussians = gaussians_at(torch.zeros(1, 3), degree=1)
+    gaussians.sh[0, 1] = -1.0  # Y_1,-1 is -y
+    write_ply(tmp_path / "a.ply", gaussians)
+    sh = open_gaussians(tmp_path / "a.ply", {"up": "+y"}).background.sh[0, 1:]
+    expected = torch.tensor([0.0, 1.0, 0.0])[:, None].expand(3, 3)  # Y_1,0 is +z
+    torch.testing.assert_close(sh, expected, rtol=0, atol=1e-6)
+
+
+def test_real_tiles_open(shared_dir: Path) -> None:
+    tile = shared_dir / "data" / "splats" / "tile_x000_y002.splat"
+    scene = open_scene(f"{tile}?scale=1")
+    assert len(scene.background) == 121_833
+    assert scene.camera_names == ("front", "left", "right")
+    assert -4 < scene.ground_z_m < 1
