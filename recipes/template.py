@@ -19,7 +19,7 @@ class RecipeTemplate:
     """A loaded recipe file.
 
     name: for folders and the manifest. source: where it was read from, for messages. variants: how
-    many recipes it stands for; first_variant: the number of the first. values: dotted path -> how
+    many recipes a run draws from it; first_variant: the number of the first. values: dotted path -> how
     the field gets its value, for the fields that the file gives. effects: dotted path -> the share
     of variants that have it, for the effects that the file names.
     """
@@ -33,18 +33,19 @@ class RecipeTemplate:
     effects: tuple[tuple[str, float], ...] = ()
 
     def resolve(self, variant: int) -> Recipe:
-        """The recipe number `variant`, 0 <= variant < variants.
+        """The recipe number `variant`, counted from 0.
 
         Its numbers depend on the seed, on first_variant + variant and on each field's own path
-        only: not on other fields, other variants, or what was resolved before.
+        only: not on other fields, other variants, or what was resolved before. So there is no end
+        to the variants; `variants` says how many a run draws.
 
         Raises:
-            RecipeError: there is no such variant, or what was drawn breaks a rule of the schema.
+            RecipeError: variant is negative or too large, or what was drawn breaks a rule.
         """
-        if not 0 <= variant < self.variants:
-            known = "only 0" if self.variants == 1 else f"0 to {self.variants - 1}"
-            raise RecipeError(f"{self.source}: there is no variant {variant}: it has {known}")
         number = self.first_variant + variant
+        if variant < 0 or not ROOT.fields["variant"].accepts(number):
+            allowed = ROOT.fields["variant"].allowed(number)
+            raise RecipeError(f"{self.source}: variant = {variant}: must be {allowed}")
         draws = Draws(self.seed, number)
         data: dict[str, Any] = {
             "version": VERSION,
