@@ -19,9 +19,9 @@ class RecipeTemplate:
     """A loaded recipe file.
 
     name: for folders and the manifest. source: where it was read from, for messages. variants: how
-    many recipes a run draws from it; first_variant: the number of the first. values: dotted path -> how
-    the field gets its value, for the fields that the file gives. effects: dotted path -> the share
-    of variants that have it, for the effects that the file names.
+    many recipes a run draws from it; first_variant: the number of the first. values: dotted path ->
+    how the field gets its value, for the fields that the file gives. effects: dotted path -> the
+    share of variants that have it, for the effects that the file names.
     """
 
     name: str
