@@ -87,10 +87,10 @@ class Ledger:
         """
         if (self.out_dir / MANIFEST).is_file():
             self._table = read_manifest(self.out_dir)
-        anew = [variant for variant in self.variants if self._load(variant, overwrite)]
+        replaced = [variant for variant in self.variants if self._load(variant, overwrite)]
         self._clear_leftovers()
-        if anew:
-            self._begin_anew(anew)
+        if replaced:
+            self._give_up(replaced)
 
     def pending(self, selection: Sequence[tuple[Frame, tuple[str, ...]]]) -> Iterator[Chunk]:
         """What has to be rendered, in order: variant by variant, frame by frame."""
@@ -119,34 +119,28 @@ class Ledger:
             variant.journal.close()
 
     def _load(self, variant: VariantState, overwrite: bool) -> bool:
-        """Read the variant's rows; true where its folder has to be begun anew."""
+        """Read the variant's rows; true where there are any that have to be given up."""
         begun, journalled = variant.journal.load()
         rows: list[dict[str, Any]] = []
         if self._table is not None:
             rows = rows_of(self._table, {(self.index.name, variant.name)})
-        listed = Identity.of_row(rows[0]) if rows else None
-        if overwrite and (begun or listed):
+        found = begun or (Identity.of_row(rows[0]) if rows else None)
+        if overwrite and found is not None:
             return True
-        found = begun or listed
         if found is not None:
             variant.identity.check(found, str(self.out_dir / variant.folder))
-        if begun is not None and listed not in (None, begun):
-            return True  # killed while an older content was being overwritten
         variant.is_journalled = begun is not None
         variant.rows = {(row["frame"], row["camera"]): row for row in [*rows, *journalled]}
         return False
 
-    def _begin_anew(self, variants: Sequence[VariantState]) -> None:
-        """Drop the variants' rows and files, in an order that a kill cannot confuse.
+    def _give_up(self, variants: Sequence[VariantState]) -> None:
+        """Drop the variants' files and rows, in an order that a kill cannot confuse.
 
-        The journal with the new identity comes first: while the manifest disagrees with it, the
-        next run knows that the old content has to go.
+        The folder goes first, in one step: until the rows have gone too, the next run finds the
+        old images missing, which the old job can render again and another is refused.
         """
         trash = self.out_dir / STATE_FOLDER / "trash"
         for number, variant in enumerate(variants):
-            variant.journal.remove()
-            variant.journal.begin(variant.identity)
-            variant.is_journalled = True
             folder = self.out_dir / variant.folder
             if folder.is_dir():
                 try:
@@ -159,6 +153,8 @@ class Ledger:
             keys = {(self.index.name, variant.name) for variant in variants}
             self._table = merge_rows(self._table, [], keys)
             write_manifest(self.out_dir, self._table)
+        for variant in variants:
+            variant.journal.remove()
         _remove_tree(trash)
 
     def _clear_leftovers(self) -> None:

@@ -47,8 +47,7 @@ class OutputLock:
 
     def __exit__(self, *_: object) -> None:
         os.ftruncate(self._descriptor, 0)
-        fcntl.flock(self._descriptor, fcntl.LOCK_UN)
-        os.close(self._descriptor)
+        os.close(self._descriptor)  # not unlocked: a child that still lives keeps its share
 
     def inherited(self) -> InheritedLock:
         """A share of the lock for a child process started with `multiprocessing`."""

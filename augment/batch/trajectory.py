@@ -1,7 +1,6 @@
 """Camera paths as text: the frames of a novel trajectory, exact to the last bit.
 
-The same JSON carries a path to worker processes, gives it an identity for the manifest, and can be
-kept in a file.
+The text carries a path to worker processes, and its hash is the path's identity in the manifest.
 """
 
 from __future__ import annotations

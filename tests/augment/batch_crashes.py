@@ -15,12 +15,14 @@ import signal
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 from batch_scenes import fake_render, make_recipe, open_fake, slow_render, tree_digest
 
 from augment.batch.atomic import TEMPORARY_SUFFIX
 from augment.batch.job import RenderJob, run_job
+from augment.batch.journal import Journal
 from augment.batch.label_files import lidar_bytes
 from augment.batch.layout import STATE_FOLDER
 
@@ -52,8 +54,20 @@ def render(what: RenderJob, renderer=fake_render) -> Callable[[], None]:
     return lambda: run_job(what, scene_loader=open_fake, renderer=renderer, progress=False)
 
 
-def run_forked(work: Callable[[], None], kill_at: int | None = None) -> tuple[int, int]:
-    """Run `work` in a fork; returns its exit code (-9 if killed) and how many sync points it met.
+@dataclass(frozen=True)
+class Ended:
+    """How a fork ended. code: -9 if killed. points: the changes of the disk it met, if it lived.
+
+    finished: images whose entry into the journal had returned.
+    """
+
+    code: int
+    points: int
+    finished: int
+
+
+def run_forked(work: Callable[[], None], kill_at: int | None = None) -> Ended:
+    """Run `work` in a fork of this process.
 
     kill_at: the fork kills itself around that call that changes the disk: odd numbers just before
     it, even ones just after.
@@ -61,19 +75,31 @@ def run_forked(work: Callable[[], None], kill_at: int | None = None) -> tuple[in
     reader, writer = os.pipe()
     child = os.fork()
     if child == 0:
-        counter = _count_sync_points(kill_at)
+        count = _count_sync_points(kill_at)
+        _tell_of_finished(writer)
         code = 1
         try:
             work()
             code = 0
         finally:
-            os.write(writer, str(counter()).encode())
+            os.write(writer, b"%d" % count())
             os._exit(code)
     os.close(writer)
     _, status = os.waitpid(child, 0)
-    met = os.read(reader, 100)
+    told = os.read(reader, 1 << 16)
     os.close(reader)
-    return os.waitstatus_to_exitcode(status), int(met or 0)
+    points = told.lstrip(b".")
+    return Ended(os.waitstatus_to_exitcode(status), int(points or 0), told.count(b"."))
+
+
+def _tell_of_finished(pipe: int) -> None:
+    append = Journal.append
+
+    def told(journal: Journal, row: dict) -> None:
+        append(journal, row)
+        os.write(pipe, b"." if row["status"] == "ok" else b"")
+
+    Journal.append = told
 
 
 def _count_sync_points(kill_at: int | None) -> Callable[[], int]:
@@ -99,44 +125,43 @@ def _count_sync_points(kill_at: int | None) -> Callable[[], int]:
 
 def sweep_fresh(folder: Path) -> dict[str, int]:
     """Kill a first run around every few changes of the disk; check, resume, compare."""
-    code, points = run_forked(render(job(folder / "whole")))
-    require(code == 0, "the uninterrupted run failed")
+    uninterrupted = run_forked(render(job(folder / "whole")))
+    require(uninterrupted.code == 0, "the uninterrupted run failed")
     whole = tree_digest(folder / "whole")
-    kills = 0
-    for kill_at in range(1, 2 * points + 1, STRIDE):
+    kills, last = 0, 2 * uninterrupted.points
+    # The end, where journals become the manifest, is tried more closely.
+    for kill_at in [*range(1, last - 30, STRIDE), *range(last - 30, last, 3)]:
         out = folder / "killed"
-        code, _ = run_forked(render(job(out)), kill_at)
+        ended = run_forked(render(job(out)), kill_at)
         # Threads meet the points in another order each time, so the last may not be reached.
-        require(code == -signal.SIGKILL or kill_at > 2 * points - 8, f"{kill_at}: exit {code}")
-        kills += code == -signal.SIGKILL
+        require(ended.code == -signal.SIGKILL or kill_at > last - 8, f"{kill_at}: {ended}")
+        kills += ended.code == -signal.SIGKILL
         check_only_whole_files(out, whole, f"killed at {kill_at}")
-        resume_and_compare(job(out), out, whole, f"killed at {kill_at}")
+        resume_and_compare(job(out), out, whole, ended.finished, f"killed at {kill_at}")
         shutil.rmtree(out)
-    return {"points": points, "kills": kills}
+    return {"kills": kills}
 
 
 def sweep_overwrite(folder: Path) -> dict[str, int]:
-    """Kill a run that overwrites an older variant; it must end as if begun in an empty folder."""
+    """Kill a run that overwrites an older variant: the old job or the new one must go on."""
     run_forked(render(clear_job(folder / "old")))
     run_forked(render(job(folder / "whole", frames=1)))
-    whole = tree_digest(folder / "whole")
-    shutil.copytree(folder / "old", folder / "counted")
-    _, points = run_forked(render(job(folder / "counted", frames=1, overwrite=True)))
+    old, whole = tree_digest(folder / "old"), tree_digest(folder / "whole")
     kills = 0
-    for kill_at in range(1, 2 * points + 1, STRIDE):
+    # All that an overwriting run does before it renders is within its first 30 changes.
+    for kill_at in [*range(1, 60, 3), *range(61, 140, 3 * STRIDE)]:
         out = folder / "killed"
         shutil.copytree(folder / "old", out)
-        code, _ = run_forked(render(job(out, frames=1, overwrite=True)), kill_at)
-        kills += code == -signal.SIGKILL
-        code, _ = run_forked(render(job(out, frames=1)))
-        if code != 0:  # killed before the old content was given up: the old job still stands
-            code, _ = run_forked(render(clear_job(out)))
-            require(code == 0, f"killed at {kill_at}: neither job can go on")
-            require(tree_digest(out) == tree_digest(folder / "old"), f"{kill_at}: old tree differs")
-        else:
+        ended = run_forked(render(job(out, frames=1, overwrite=True)), kill_at)
+        kills += ended.code == -signal.SIGKILL
+        if run_forked(render(job(out, frames=1))).code == 0:
             require(tree_digest(out) == whole, f"killed at {kill_at}: the new tree differs")
+        else:  # killed before the old content was given up
+            again = run_forked(render(clear_job(out)))
+            require(again.code == 0, f"killed at {kill_at}: neither job can go on")
+            require(tree_digest(out) == old, f"killed at {kill_at}: the old tree differs")
         shutil.rmtree(out)
-    return {"points": points, "kills": kills}
+    return {"kills": kills}
 
 
 def kill_at_random(folder: Path) -> dict[str, int]:
@@ -173,7 +198,8 @@ def kill_parent_of_workers(folder: Path) -> dict[str, int]:
     os.kill(child, signal.SIGKILL)
     os.waitpid(child, 0)
     finished = count_finished(out)
-    resume_and_compare(job(out, frames=40), out, tree_digest(folder / "whole"), "parent killed")
+    whole = tree_digest(folder / "whole")
+    resume_and_compare(job(out, frames=40), out, whole, finished, "parent killed")
     return {"finished": finished}
 
 
@@ -184,27 +210,25 @@ def check_only_whole_files(out: Path, whole: dict[str, str], when: str) -> None:
         require(hidden or whole.get(name) == digest, f"{when}: {name} is not the whole file")
 
 
-def resume_and_compare(what: RenderJob, out: Path, whole: dict[str, str], when: str) -> None:
+def resume_and_compare(
+    what: RenderJob, out: Path, whole: dict[str, str], finished: int, when: str
+) -> None:
     """Finish the job; nothing finished is rendered again, and the files are the same."""
-    finished = count_finished(out)
 
     def work() -> None:
         result = run_job(what, scene_loader=open_fake, renderer=fake_render, progress=False)
-        require(result.skipped == finished, f"{when}: {finished} were finished, got {result}")
+        # More than was told: killed between the journal's line and the telling.
+        require(result.skipped >= finished, f"{when}: {finished} were finished, got {result}")
 
-    code, _ = run_forked(work)
-    require(code == 0, f"{when}: resuming failed with exit code {code}")
+    ended = run_forked(work)
+    require(ended.code == 0, f"{when}: resuming failed with exit code {ended.code}")
     after = tree_digest(out)
     different = {k for k in whole.keys() | after.keys() if whole.get(k) != after.get(k)}
     require(not different, f"{when}: after resuming these differ: {sorted(different)}")
 
 
 def count_finished(out: Path) -> int:
-    """Images that a journal or the manifest lists, read without the code under test."""
-    import pyarrow.parquet as pq
-
-    if (out / "manifest.parquet").exists():
-        return pq.ParquetFile(out / "manifest.parquet").metadata.num_rows
+    """Images that a journal lists, read without the code under test."""
     journals = list((out / STATE_FOLDER).rglob("*.jsonl"))
     return sum(journal.read_bytes().count(b"\n") - 1 for journal in journals)
 

@@ -6,6 +6,7 @@ import dataclasses
 import errno
 import hashlib
 import json
+import multiprocessing
 import os
 import re
 import subprocess
@@ -14,6 +15,7 @@ import threading
 from pathlib import Path
 
 import cv2
+import lock_holder
 import numpy as np
 import pytest
 from batch_scenes import (
@@ -302,6 +304,25 @@ def test_the_lock_of_a_dead_process_does_not_last(tmp_path: Path) -> None:
     with OutputLock(tmp_path):
         assert (state / "lock").read_text().isdigit()
     assert (state / "lock").read_bytes() == b""
+
+
+def test_a_worker_keeps_its_share_of_the_lock(tmp_path, monkeypatch) -> None:
+    """As after the parent was killed: the folder is free once the last worker has gone."""
+    monkeypatch.setattr("augment.batch.lock.ORPHANS_S", 0.1)
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe()
+    with OutputLock(tmp_path) as lock:
+        child = context.Process(target=lock_holder.hold, args=(lock.inherited(), theirs))
+        child.start()
+        assert ours.recv() == "holding"
+    with pytest.raises(OutputError, match="is being written by another job; wait"):
+        OutputLock(tmp_path).__enter__()
+    ours.send("end")
+    child.join()
+    with OutputLock(tmp_path):
+        pass
+    for connection in (ours, theirs):
+        connection.close()
 
 
 def test_an_output_folder_that_is_a_file(tmp_path: Path) -> None:

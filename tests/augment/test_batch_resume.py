@@ -23,6 +23,8 @@ from augment.batch.job import JobResult, RenderJob, run_job
 from augment.batch.manifest import read_manifest
 from augment.errors import OutputError
 
+IDENTITY = ("source", "recipe_hash", "trajectory", "version", "backend")
+
 
 def run(job: RenderJob, renderer=fake_render) -> JobResult:
     return run_job(job, scene_loader=open_fake, renderer=renderer, progress=False)
@@ -101,6 +103,23 @@ def test_an_interrupt_finishes_what_is_at_hand_and_can_be_resumed(tmp_path: Path
     assert tree_digest(tmp_path / "stopped") == tree_digest(tmp_path / "whole")
 
 
+def test_half_a_line_in_a_journal_is_not_believed(tmp_path: Path) -> None:
+    """As a kill in the midst of a write leaves it; whole lines before it still count."""
+    recipes = [make_recipe()]
+    run(RenderJob("fake:street", recipes, tmp_path / "whole"))
+    out = tmp_path / "torn"
+    run(RenderJob("fake:street", recipes, out, frames=[0, 1]))
+    rows = read_manifest(out).to_pylist()
+    (out / "manifest.parquet").unlink()
+    lines = [{name: rows[0][name] for name in IDENTITY}, *rows]
+    text = "".join(json.dumps(line) + "\n" for line in lines)
+    journal = out / ".climategs" / "journal" / "street" / "fog-000.jsonl"
+    journal.parent.mkdir(parents=True)
+    journal.write_text(text[:-20])
+    assert run(RenderJob("fake:street", recipes, out)).skipped == 3
+    assert tree_digest(out) == tree_digest(tmp_path / "whole")
+
+
 def test_temporary_files_of_a_killed_run_are_cleared(tmp_path: Path) -> None:
     job = RenderJob("fake:street", [make_recipe()], tmp_path)
     run(job)
@@ -129,11 +148,10 @@ def test_another_recipe_under_the_same_name_is_refused(tmp_path: Path, ended: bo
     run(RenderJob("fake:street", [make_recipe()], tmp_path, frames=[0]))
     if not ended:  # as a kill leaves it: a journal and no manifest
         identity = read_manifest(tmp_path).to_pylist()[0]
-        names = ("source", "recipe_hash", "trajectory", "version", "backend")
         (tmp_path / "manifest.parquet").unlink()
         journal = tmp_path / ".climategs" / "journal" / "street" / "fog-000.jsonl"
         journal.parent.mkdir(parents=True)
-        journal.write_text(json.dumps({name: identity[name] for name in names}) + "\n")
+        journal.write_text(json.dumps({name: identity[name] for name in IDENTITY}) + "\n")
     before = tree_digest(tmp_path)
     changed = make_recipe(depth="none")
     pattern = f"fog-000 already holds.*recipe hash there '{make_recipe().hash}'.*overwrite"
