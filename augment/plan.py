@@ -90,8 +90,8 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
         instance=recipe.output.instance,
         steps=(
             Step("rasterise", True, f"{actors}; buffers {', '.join(sorted(buffers))}"),
-            Step("smog per Gaussian", bool(smog and per_gaussian), smog_reason),
-            Step("smog on buffers", bool(smog and not per_gaussian), smog_reason),
+            _smog_step("per Gaussian", smog, per_gaussian, smog_reason),
+            _smog_step("on buffers", smog, not per_gaussian, smog_reason),
             _sky_step(smog),
             Step(
                 "depth image",
@@ -125,6 +125,12 @@ def place_smog(recipe: Recipe, scene: Scene) -> tuple[SmogMedium | None, str]:
     if not scene.has_metric_scale:
         reason += "; the scene's unit is not known to be a metre, so densities are per scene unit"
     return SmogMedium(smog.sigma_per_m, smog.color, smog.scale_height_m, base_z_m), reason
+
+
+def _smog_step(how: str, smog: SmogMedium | None, chosen: bool, reason: str) -> Step:
+    if smog is not None and not chosen:
+        reason = "weather.smog.model chooses the other way"
+    return Step(f"smog {how}", smog is not None and chosen, reason)
 
 
 def _sky_step(smog: SmogMedium | None) -> Step:

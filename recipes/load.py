@@ -37,13 +37,23 @@ def preset_names() -> tuple[str, ...]:
     return tuple(sorted(path.stem for path in stems if path.suffix == ".yaml"))
 
 
+def preset_text(name: str) -> str:
+    """The YAML of a preset, a start for one's own recipe.
+
+    Raises:
+        RecipeError: there is no preset of that name.
+    """
+    if name not in preset_names():
+        raise RecipeError(f"{name}: {_missing(name)}")
+    return _presets().joinpath(f"{name}.yaml").read_text(encoding="utf-8")
+
+
 def _presets() -> Traversable:
     return resources.files("recipes").joinpath("presets")
 
 
 def _load_preset(name: str) -> RecipeTemplate:
-    text = _presets().joinpath(f"{name}.yaml").read_text(encoding="utf-8")
-    return parse_recipe(text, source=f"preset {name}", name=name)
+    return parse_recipe(preset_text(name), source=f"preset {name}", name=name)
 
 
 def _read(path: Path, source: str) -> bytes:
