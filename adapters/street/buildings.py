@@ -174,7 +174,7 @@ def _back(style: Style, width: float, eaves: float) -> Shapes:
     """Side and back walls, plain."""
     wall = Look(style.wall.rgb, Class.BUILDING, style.wall.material, spacing=1.6)
     low, high = (0.0, 0.0, BASE_M), (width, DEPTH_M, eaves)
-    return boxes(low, high, wall, faces=("+x", "-x", "+y"), edges=0)
+    return boxes(low, high, wall, faces=("+x", "-x", "+y"))
 
 
 def _roof(rng: np.random.Generator, style: Style, width: float, eaves: float) -> Shapes:
@@ -219,7 +219,7 @@ def _flat_roof(style: Style, width: float, eaves: float) -> Shapes:
     parapet = Look(style.wall.rgb, Class.BUILDING, style.wall.material)
     return join(
         [
-            parallelograms((0, 0.3, eaves), (width, 0, 0), (0, DEPTH_M - 0.3, 0), gravel, edges=0),
+            parallelograms((0, 0.3, eaves), (width, 0, 0), (0, DEPTH_M - 0.3, 0), gravel),
             boxes((0, 0, eaves), (width, 0.3, top), parapet, faces=("-y", "+y", "+x", "-x")),
             boxes((-0.0, -0.07, top), (width, 0.37, top + 0.1), style.trim, faces=_LEDGE),
         ]

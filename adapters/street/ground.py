@@ -25,13 +25,13 @@ from adapters.street.rectangles import Rectangle, cut
 from adapters.street.shapes import V0, V1, Look, Shapes, join
 from augment.semantics import SemanticClass as Class
 
-ASPHALT = Look((0.105, 0.105, 0.11), Class.ROAD, Material.ASPHALT)
-REPAIR = Look((0.075, 0.075, 0.08), Class.ROAD, Material.ASPHALT)
+ASPHALT = Look((0.105, 0.105, 0.11), Class.ROAD, Material.ASPHALT, spacing=1.2)
+REPAIR = Look((0.075, 0.075, 0.08), Class.ROAD, Material.ASPHALT, spacing=1.2)
 IRON = Look((0.06, 0.058, 0.055), Class.ROAD)
 MARKING = Look((0.72, 0.72, 0.70), Class.LANE_MARKING, Material.MARKING)
 PAVING = Look((0.34, 0.325, 0.30), Class.SIDEWALK, Material.PAVING)
 KERB = Look((0.44, 0.43, 0.41), Class.SIDEWALK)
-GRASS = Look((0.13, 0.19, 0.05), Class.TERRAIN, Material.GRASS)
+GRASS = Look((0.13, 0.19, 0.05), Class.TERRAIN, Material.GRASS, spacing=2.5)
 
 
 def build_ground(layout: Layout) -> Shapes:

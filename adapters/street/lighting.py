@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adapters.street.materials import Material, albedo
+from adapters.street.materials import Material
 from adapters.street.raycast import Tree
 from adapters.street.shapes import Shapes
 
@@ -61,59 +61,78 @@ class Lighting:
         return start + fraction[:, None] * along
 
 
-def shade(
+def sun_share(
     shapes: Shapes,
     tree: Tree,
     lighting: Lighting,
     shape: np.ndarray,
-    local: np.ndarray,
-    sun_directions: np.ndarray,
+    places: np.ndarray,
 ) -> np.ndarray:
-    """Display-encoded colour [N, 3] of places on shapes, lit from sun_directions [K, 3]."""
+    """Share of the sun's disc that is seen from a shape's places, [N].
+
+    shape [N]; places [G, N, 3]: local coordinates, over which the share is averaged (G divides
+    SUN_SAMPLES). Half of the rays are cast first; the others only where those disagree.
+    """
+    groups, count = places.shape[:2]
+    directions = lighting.sun_directions()
+    seen = np.zeros(count)
+    index = np.flatnonzero(_facing_sun(shapes, lighting, shape, places[0]) > 0)
+    for half in range(2):
+        for number in range(half, SUN_SAMPLES, 2):
+            local = places[(number // 2) % groups, index]
+            origins = _off_surface(shapes, lighting, shape[index], local)
+            rays = np.broadcast_to(directions[number], origins.shape)
+            seen[index] += ~tree.occluded(origins, rays)
+        if half == 0:
+            doubtful = (seen[index] > 0) & (seen[index] < SUN_SAMPLES / 2)
+            seen[index[~doubtful]] *= 2
+            index = index[doubtful]
+    return seen / SUN_SAMPLES
+
+
+def _off_surface(
+    shapes: Shapes, lighting: Lighting, shape: np.ndarray, local: np.ndarray
+) -> np.ndarray:
+    """Where rays to the sun start: just outside; all of a leaf tuft starts at its sunny end."""
+    points = shapes.points(shape, local) + SHADOW_OFFSET_M * shapes.normals(shape, local)
+    leaf = shapes.material[shape] == Material.LEAF
+    size = np.linalg.norm(shapes.axes[shape[leaf]], axis=2).max(1, keepdims=True)
+    points[leaf] = shapes.origin[shape[leaf]] + 1.05 * size * lighting.to_sun
+    return points
+
+
+def _facing_sun(
+    shapes: Shapes, lighting: Lighting, shape: np.ndarray, local: np.ndarray
+) -> np.ndarray:
+    """Cosine of the sun's angle of incidence; light also comes through leaves from behind."""
+    facing = shapes.shading_normals(shape, local) @ lighting.to_sun
+    leaf = shapes.material[shape] == Material.LEAF
+    return np.where(leaf, 0.35 + 0.65 * np.abs(facing), facing)
+
+
+def shade(
+    shapes: Shapes,
+    lighting: Lighting,
+    shape: np.ndarray,
+    local: np.ndarray,
+    base: np.ndarray,
+    seen_sun: np.ndarray,
+) -> np.ndarray:
+    """Display-encoded colour [N, 3] of places on shapes with albedo base [N, 3] and sun share [N]."""
     points = shapes.points(shape, local)
-    normals = shapes.normals(shape, local)
     smooth = shapes.shading_normals(shape, local)
     material = shapes.material[shape]
-    base = albedo(material, shapes.rgb[shape], shapes.variation[shape], local, points)
-
-    facing = np.einsum("nk,k->n", smooth, lighting.to_sun)
-    leaf = material == Material.LEAVES  # light comes through them
-    facing = np.where(leaf, (facing + 0.5) / 1.5, facing)
-    sun = np.maximum(facing, 0) * _sun_share(
-        tree, points, normals, facing > 0, leaf, sun_directions
-    )
+    sun = np.maximum(_facing_sun(shapes, lighting, shape, local), 0) * seen_sun
     sky = _sky_share(lighting, points, smooth) * shapes.ambient[shape]
     upward = 0.5 + 0.5 * smooth[:, 2]
     ambient = sky[:, None] * (upward[:, None] * SKY_RGB + (1 - upward)[:, None] * BOUNCE_RGB)
-    light = sun[:, None] * SUN_RGB + ambient
-    radiance = base * light
+    radiance = base * (sun[:, None] * SUN_RGB + ambient)
     glossy = (material == Material.GLASS) | (material == Material.PAINT)
     if glossy.any():
         radiance[glossy] += _mirrored(
             lighting, points[glossy], smooth[glossy], material[glossy], sun[glossy], sky[glossy]
         )
     return encode_display(_haze(radiance, lighting, points))
-
-
-def _sun_share(
-    tree: Tree,
-    points: np.ndarray,
-    normals: np.ndarray,
-    lit: np.ndarray,
-    leaf: np.ndarray,
-    sun_directions: np.ndarray,
-) -> np.ndarray:
-    """Share of the sun's disc that is seen, [N]."""
-    share = np.zeros(len(points))
-    index = np.flatnonzero(lit)
-    # A leaf blob lights up from within, so its ray starts on the side of the sun.
-    side = np.where(np.einsum("nk,k->n", normals[index], sun_directions[0]) < 0, -1.0, 1.0)
-    offset = normals[index] * (SHADOW_OFFSET_M * np.where(leaf[index], side, 1.0))[:, None]
-    origins = points[index] + offset
-    for direction in sun_directions:
-        rays = np.broadcast_to(direction, origins.shape)
-        share[index] += ~tree.occluded(origins, rays)
-    return share / len(sun_directions)
 
 
 def _sky_share(lighting: Lighting, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
@@ -142,6 +161,7 @@ def _under_cars(points: np.ndarray, footprints: np.ndarray) -> np.ndarray:
         dx = np.maximum(np.abs(points[:, 0] - x) - (half_length - 0.45), 0)
         dy = np.maximum(np.abs(points[:, 1] - y) - (half_width - 0.45), 0)
         distance = np.hypot(dx, dy) - 0.45  # to a rounded rectangle
+        distance = np.minimum(distance, 3.0)
         left *= 1 - 0.85 / (1 + np.exp((distance - 0.02) / 0.13))
     return left
 

@@ -29,6 +29,7 @@ class Material(IntEnum):
     GLASS = 11  # window pane: shading adds what it mirrors
     PAINT = 12  # car paint: shading adds a clear coat
     RIM = 13
+    LEAF = 14  # one tuft of leaves: a single splat, one light
 
 
 def albedo(
@@ -114,6 +115,11 @@ def _leaves(rgb: np.ndarray, variation: np.ndarray, local: np.ndarray, points: n
     return rgb * tint * (1 + 0.35 * value_noise(points * 7.0, 71))[:, None]
 
 
+def _leaf(rgb: np.ndarray, variation: np.ndarray, local: np.ndarray, points: np.ndarray):
+    tone = 0.75 + 0.5 * ((variation * 13.7) % 1.0)
+    return rgb * tone[:, None] * (1 + (variation[:, None] - 0.5) * np.array([0.6, 0.25, 0.1]))
+
+
 def _bark(rgb: np.ndarray, variation: np.ndarray, local: np.ndarray, points: np.ndarray):
     return rgb * (1 + 0.3 * value_noise(points * [9.0, 9.0, 2.0], 81))[:, None]
 
@@ -145,6 +151,7 @@ _RULES: dict[Material, _Rule] = {
     Material.TILES: _tiles,
     Material.GRASS: _grass,
     Material.LEAVES: _leaves,
+    Material.LEAF: _leaf,
     Material.BARK: _bark,
     Material.GLASS: _glass,
     Material.RIM: _rim,

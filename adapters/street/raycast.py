@@ -10,6 +10,7 @@ from adapters.street.raycast_kernels import trace
 from adapters.street.shapes import Kind, Shapes
 
 LEAF_SHAPES = 4
+MEDIAN_BELOW = 64  # nodes this small are not worth a careful split
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,11 +87,10 @@ def bounds_of(shapes: Shapes) -> tuple[np.ndarray, np.ndarray]:
 
 
 def build_tree(shapes: Shapes) -> Tree:
-    """Split at the median along the longest side, down to a few shapes a leaf."""
+    """Large nodes split where the surface-area heuristic is least, small ones at the median."""
     low, high = bounds_of(shapes)
     pad = 1e-6  # flat shapes have boxes without thickness, which rounding could miss
     low, high = low - pad, high + pad
-    centres = (low + high) / 2
     order = np.arange(len(shapes))
     bounds, first, count = [], [], []
     stack = [(0, len(shapes), -1)]  # range of order, and the parent whose second child this is
@@ -105,15 +105,13 @@ def build_tree(shapes: Shapes) -> Tree:
             first.append(start)
             count.append(stop - start)
             continue
-        spread = centres[inside]
-        axis = int(np.argmax(spread.max(0) - spread.min(0)))
-        middle = (stop - start) // 2
-        ranked = np.argsort(spread[:, axis], kind="stable")
+        split = _best_split if stop - start > MEDIAN_BELOW else _median_split
+        ranked, left = split(low[inside], high[inside])
         order[start:stop] = inside[ranked]
         first.append(-1)
         count.append(0)
-        stack.append((start + middle, stop, node))
-        stack.append((start, start + middle, -1))
+        stack.append((start + left, stop, node))
+        stack.append((start, start + left, -1))
     return Tree(
         bounds=np.array(bounds),
         first=np.array(first, np.int64),
@@ -123,3 +121,32 @@ def build_tree(shapes: Shapes) -> Tree:
         origin=shapes.origin,
         inverse=np.ascontiguousarray(np.linalg.inv(shapes.axes).transpose(0, 2, 1)),
     )
+
+
+def _median_split(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, int]:
+    """An order of boxes and how many of them go left: halves along the longest side."""
+    centres = low + high
+    axis = int(np.argmax(centres.max(0) - centres.min(0)))
+    return np.argsort(centres[:, axis], kind="stable"), len(low) // 2
+
+
+def _best_split(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, int]:
+    """As _median_split, at the least sum of count times surface area over all three axes."""
+    count = len(low)
+    best_cost, best = np.inf, (np.arange(count), count // 2)
+    for axis in range(3):
+        ranked = np.argsort(low[:, axis] + high[:, axis], kind="stable")
+        a, b = low[ranked], high[ranked]
+        left = _area(np.minimum.accumulate(a), np.maximum.accumulate(b))[:-1]
+        right = _area(np.minimum.accumulate(a[::-1]), np.maximum.accumulate(b[::-1]))[::-1][1:]
+        sizes = np.arange(1, count)
+        cost = left * sizes + right * (count - sizes)
+        least = int(np.argmin(cost))
+        if cost[least] < best_cost:
+            best_cost, best = cost[least], (ranked, least + 1)
+    return best
+
+
+def _area(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    x, y, z = (high - low).T
+    return x * y + y * z + z * x

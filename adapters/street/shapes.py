@@ -57,7 +57,8 @@ class Look:
 class Shapes:
     """P shapes. origin [P, 3], axes [P, 3, 3] (rows u, v, w), metres.
 
-    shading: [P, 3, 3], flat kinds only: shading normal = shading[0] + u shading[1] + v shading[2].
+    shading: [P, 3, 3], of flat kinds and leaves: what light takes for the normal is
+    shading[0] + u shading[1] + v shading[2].
     rgb [P, 3] linear albedo; material, semantic, kind, edges [P]; ambient, spacing [P].
     variation [P]: a number in [0, 1) that tells equal shapes apart.
     """
@@ -128,7 +129,7 @@ class Shapes:
     def shading_normals(self, shape: np.ndarray, local: np.ndarray) -> np.ndarray:
         """Unit normals [N, 3] that light sees: smooth across the panels of a mesh."""
         normals = self.normals(shape, local)
-        flat = self.kind[shape] < Kind.ELLIPSOID
+        flat = (self.kind[shape] < Kind.ELLIPSOID) | (self.material[shape] == Material.LEAF)
         bent = self.shading[shape[flat]]
         q = local[flat]
         smooth = bent[:, 0] + q[:, :1] * bent[:, 1] + q[:, 1:2] * bent[:, 2]

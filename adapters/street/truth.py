@@ -125,7 +125,7 @@ class StreetTruth:
             normal[index] = body.shapes.normals(chosen, local[index]) @ turn.T
             semantic[index] = body.shapes.semantic[chosen]
             if rgb is not None:
-                rgb[index] = body.colors(chosen, local[index])
+                rgb[index] = body.colors(chosen, local[index][None])
         normal[(normal * unit).sum(1) > 0] *= -1
         if rgb is not None:
             seen = np.flatnonzero((instance == 0) & (shape >= 0))

@@ -11,8 +11,10 @@ from adapters.street.shapes import Look, Shapes, join
 from augment.semantics import SemanticClass as Class
 
 BARK = Look((0.13, 0.10, 0.075), Class.VEGETATION, Material.BARK)
-LEAVES = Look((0.105, 0.18, 0.035), Class.VEGETATION, Material.LEAVES, spacing=1.5)
-CORE = Look((0.05, 0.085, 0.02), Class.VEGETATION, Material.LEAVES, ambient=0.45, spacing=2.0)
+LEAF = Look((0.12, 0.21, 0.04), Class.VEGETATION, Material.LEAF)
+CORE = Look((0.045, 0.08, 0.02), Class.VEGETATION, Material.LEAVES, ambient=0.4, spacing=3.0)
+WOOD = Look((0.07, 0.12, 0.035), Class.VEGETATION, Material.LEAVES, spacing=2.2)
+NEAR_LEAVES, FAR_LEAVES, GARDEN_LEAVES = 1100, 300, 80
 
 
 def build_vegetation(layout: Layout) -> Shapes:
@@ -21,22 +23,18 @@ def build_vegetation(layout: Layout) -> Shapes:
     middle = layout.path_length_m / 2
     parts = []
     for x, y in layout.trees:
-        near = abs(x - middle) < middle + 26
-        parts.append(
-            _tree(rng, 1.0, 210 if near else 90).moved((x, y, float(pavement_z(y)) - 0.03))
-        )
-    for _ in range(26):
-        place = (
-            rng.uniform(layout.x0 - 8, layout.x1 + 8),
-            rng.choice([-1, 1]) * rng.uniform(24, 33),
-        )
-        parts.append(_tree(rng, rng.uniform(1.1, 1.5), 45).moved((*place, 0.0)))
+        leaves = NEAR_LEAVES if abs(x - middle) < middle + 26 else FAR_LEAVES
+        parts.append(_tree(rng, 1.0, leaves).moved((x, y, float(pavement_z(y)) - 0.03)))
+    for _ in range(24):
+        x = rng.uniform(layout.x0 - 8, layout.x1 + 8)
+        y = rng.choice([-1, 1]) * rng.uniform(24, 33)
+        parts.append(_tree(rng, rng.uniform(1.1, 1.5), GARDEN_LEAVES).moved((x, y, 0.0)))
     parts.append(_woods(rng, layout))
     return join(parts)
 
 
-def _tree(rng: np.random.Generator, size: float, blobs: int) -> Shapes:
-    """One tree at the origin; blobs says how finely its crown is broken up."""
+def _tree(rng: np.random.Generator, size: float, leaves: int) -> Shapes:
+    """One tree at the origin; leaves: how many tufts its crown has."""
     height = size * rng.uniform(3.9, 4.6)  # of the crown's middle
     radii = size * np.array([1.0, 1.0, 1.15]) * rng.uniform(1.55, 1.95)
     lean = rng.uniform(-0.12, 0.12, 2)
@@ -50,37 +48,47 @@ def _tree(rng: np.random.Generator, size: float, blobs: int) -> Shapes:
         angle = rng.uniform(0, 0.8) + k * np.pi / 2
         reach = np.array([np.cos(angle), np.sin(angle), 0.9]) * radii * 0.62
         parts.append(tube(fork * 0.98, fork + reach, 0.055 * size, BARK))
-    core = radii * 0.62
+    core = radii * 0.70
     parts.append(ellipsoids(top[None], np.diag(core)[None], CORE))
-    parts.append(_crown(rng, top, radii, blobs))
+    parts.append(_crown(rng, top, radii, leaves))
     return join(parts)
 
 
-def _crown(rng: np.random.Generator, centre: np.ndarray, radii: np.ndarray, blobs: int) -> Shapes:
-    """Flat leafy clusters in the outer shell of an ellipsoid, lighter towards the outside and top."""
-    direction = rng.normal(size=(blobs, 3))
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    direction[:, 2] = np.where(direction[:, 2] < -0.75, -direction[:, 2], direction[:, 2])
-    depth = rng.uniform(0.62, 1.04, blobs) ** 0.8
-    lumps = 1 + 0.13 * np.sin(3.1 * direction[:, 0] + 5.0 * direction[:, 2] + rng.uniform(0, 6))
-    centres = centre + direction * radii * (depth * lumps)[:, None]
-    size = 1.9 * radii.mean() / np.sqrt(blobs) * rng.uniform(0.8, 1.35, blobs)
-    normal = direction + 0.7 * rng.normal(size=(blobs, 3)) + np.array([0, 0, 0.35])
+def _crown(rng: np.random.Generator, centre: np.ndarray, radii: np.ndarray, leaves: int) -> Shapes:
+    """Tufts of leaves on boughs: round lumps around a core, lighter towards the outside and top."""
+    lumps = 34
+    lump = _directions(rng, lumps)
+    lump[:, 2] = np.where(lump[:, 2] < -0.6, -lump[:, 2], lump[:, 2])
+    lump_centre = lump * rng.uniform(0.62, 0.78, (lumps, 1))
+    lump_radius = rng.uniform(0.30, 0.42, lumps)
+    owner = rng.integers(lumps, size=leaves)
+    local = _directions(rng, leaves) + 0.75 * lump[owner]  # more of them on a lump's outside
+    local /= np.linalg.norm(local, axis=1, keepdims=True)
+    spot = lump_centre[owner] + local * (lump_radius[owner] * rng.uniform(0.7, 1.08, leaves))[:, None]
+    outward = spot / np.linalg.norm(spot, axis=1, keepdims=True)
+    normal = local + 0.5 * outward + 0.45 * rng.normal(size=(leaves, 3))
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    u = np.cross(normal, rng.normal(size=(blobs, 3)))
+    size = 2.6 * radii.mean() / np.sqrt(leaves) * rng.uniform(0.75, 1.3, leaves)
+    u = np.cross(normal, rng.normal(size=(leaves, 3)))
     u /= np.linalg.norm(u, axis=1, keepdims=True)
-    v = np.cross(normal, u)
-    axes = np.stack([u, v * 0.8, normal * 0.55], 1) * size[:, None, None]
-    shapes = ellipsoids(centres, axes, LEAVES)
-    outside = np.clip((depth - 0.62) / 0.4, 0, 1)
-    shapes.ambient[:] = 0.45 + 0.35 * outside + 0.25 * np.clip(direction[:, 2], -0.3, 1)
-    shapes.variation[:] = rng.random(blobs)
+    axes = np.stack([u, np.cross(normal, u) * 0.72, normal * 0.22], 1) * size[:, None, None]
+    shapes = ellipsoids(centre + spot * radii, axes, LEAF)
+    shapes.shading[:, 0] = normal
+    depth = np.clip((np.linalg.norm(spot, axis=1) - 0.6) / 0.45, 0, 1)
+    shapes.ambient[:] = 0.42 + 0.38 * depth + 0.22 * np.clip(outward[:, 2], -0.4, 1)
+    shapes.variation[:] = rng.random(leaves)
     return shapes
+
+
+def _directions(rng: np.random.Generator, count: int) -> np.ndarray:
+    """Unit vectors [count, 3], evenly over the sphere."""
+    out = rng.normal(size=(count, 3))
+    return out / np.linalg.norm(out, axis=1, keepdims=True)
 
 
 def _woods(rng: np.random.Generator, layout: Layout) -> Shapes:
     """Big loose crowns at the edge of the land, which hide where it ends."""
-    count = 260
+    count = 130
     angle = rng.uniform(0, 2 * np.pi, count)
     radius = rng.uniform(150, 215, count)
     middle = (layout.x0 + layout.x1) / 2
@@ -90,7 +98,6 @@ def _woods(rng: np.random.Generator, layout: Layout) -> Shapes:
         [middle + stretch * radius * np.cos(angle), radius * np.sin(angle), 0.55 * size], 1
     )
     axes = np.stack([np.diag([s * 1.5, s * 1.5, s * 0.85]) for s in size])
-    look = Look((0.07, 0.12, 0.035), Class.VEGETATION, Material.LEAVES)
-    shapes = ellipsoids(centres, axes, look)
+    shapes = ellipsoids(centres, axes, WOOD)
     shapes.variation[:] = rng.random(count)
     return shapes

@@ -20,7 +20,8 @@ from adapters.street.layout import (
     road_z,
     stream,
 )
-from adapters.street.lighting import Lighting, shade
+from adapters.street.lighting import Lighting, shade, sun_share
+from adapters.street.materials import albedo
 from adapters.street.parameters import StreetParameters
 from adapters.street.people import SIZE_M, draw_person
 from adapters.street.raycast import Tree, build_tree
@@ -47,10 +48,22 @@ class Body:
     tree: Tree
     lighting: Lighting
 
-    def colors(self, shape: np.ndarray, local: np.ndarray) -> np.ndarray:
-        """Display-encoded colour [N, 3] of places on shapes."""
-        directions = self.lighting.sun_directions()
-        return shade(self.shapes, self.tree, self.lighting, shape, local, directions)
+    def colors(self, shape: np.ndarray, places: np.ndarray) -> np.ndarray:
+        """Display-encoded colour [N, 3] on shapes [N], averaged over places [G, N, 3].
+
+        Albedo and the sun's shadows are averaged; other light is taken at the first place.
+        """
+        shapes = self.shapes
+        material, rgb, variation = (
+            shapes.material[shape],
+            shapes.rgb[shape],
+            shapes.variation[shape],
+        )
+        base = np.zeros((len(shape), 3))
+        for local in places:
+            base += albedo(material, rgb, variation, local, shapes.points(shape, local))
+        sun = sun_share(shapes, self.tree, self.lighting, shape, places)
+        return shade(shapes, self.lighting, shape, places[0], base / len(places), sun)
 
 
 @dataclass(frozen=True, eq=False)

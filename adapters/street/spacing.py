@@ -1,0 +1,140 @@
+"""How far apart the splats of each surface may stand, and how far below it they must lie.
+
+A splat's footprint should look equally large wherever the ego cameras see it from, so its spacing
+follows their nearest distance, and along a surface seen at a slant it is stretched.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from adapters.street.raycast import Tree
+from adapters.street.shapes import U0, U1, V0, V1, Kind, Shapes, join
+
+STEEPEST = 0.42  # sine of the steepest ray of a level camera, up or down
+MOST_STRETCH = 2.6
+HIDDEN_STRETCH = 3.5  # of surfaces that no camera sees
+LOOKS = 8  # places of the cameras from which sight is tried
+LEAST_M = 0.02
+# Measured on square lattices of the splats in `surfels`: blending takes nearer splats first, which
+# puts the weighted mean this many spacings too near, along the surface.
+BLEND_LEAD = 0.70
+PIXEL_BLUR_PX = 0.55  # standard deviation that the rasteriser adds to every footprint
+
+
+@dataclass(frozen=True, eq=False)
+class Spacing:
+    """Per shape: along [P, 2] spacing in metres per unit of coarseness along both axes; sink [P] how
+    far below its surface splats lie, in spacings, so that their blend is seen on it; hidden [P]
+    whether it is a panel or tube that no camera sees, whose large splats must keep clear of rims.
+    """
+
+    along: np.ndarray
+    sink: np.ndarray
+    hidden: np.ndarray
+
+
+def split_long(shapes: Shapes, eyes: np.ndarray) -> Shapes:
+    """The same surfaces, long parallelograms halved until one spacing suits all of each."""
+    done = []
+    while len(shapes):
+        distance = _sightings(shapes, eyes)[0].min(0)
+        sides = np.linalg.norm(shapes.axes[:, :2], axis=2)
+        limit = np.maximum(1.6, 0.45 * distance)
+        wanted = (sides.max(1) > limit) & (shapes.kind == Kind.PARALLELOGRAM)
+        done.append(shapes.select(np.flatnonzero(~wanted)))
+        shapes = _halved(shapes.select(np.flatnonzero(wanted)), sides[wanted].argmax(1))
+    return join(done)
+
+
+def _halved(shapes: Shapes, axis: np.ndarray) -> Shapes:
+    """Both halves of each parallelogram along its axis; only outer edges stay crisp."""
+    rows = np.arange(len(shapes))
+    first, second = shapes.select(rows), shapes.select(rows)
+    for half in (first, second):
+        half.axes[rows, axis] *= 0.5
+    second.origin[:] += second.axes[rows, axis]
+    low, high = np.array([U0, V0], np.uint8)[axis], np.array([U1, V1], np.uint8)[axis]
+    first.edges[:] &= ~high
+    second.edges[:] &= ~low
+    return join([first, second])
+
+
+def plan_spacing(shapes: Shapes, tree: Tree, eyes: np.ndarray, focal_px: float) -> Spacing:
+    """Spacings of shapes seen from eyes [E, 3], in the shapes' frame; tree: what may hide them."""
+    distance, view = _sightings(shapes, eyes)
+    unit = shapes.axes[:, :2] / np.linalg.norm(shapes.axes[:, :2], axis=2, keepdims=True)
+    cosine = np.einsum("epk,pak->epa", view, unit)
+    stretch = 1 / np.sqrt(np.maximum(1 - cosine**2, 1 / MOST_STRETCH**2))
+    along = (distance[..., None] * stretch).min(0)
+    flat = shapes.kind <= Kind.DISC
+    slant = np.abs(np.einsum("epk,pk->ep", view, shapes.axes[:, 2]))
+    facing = np.einsum("epk,pk->ep", view, shapes.axes[:, 2]) < 0
+    panel, tube = (shapes.kind == kind for kind in (Kind.PARALLELOGRAM, Kind.CYLINDER))
+    hidden = (panel | tube) & ~_in_sight(shapes, tree, eyes)
+    along[hidden & panel] *= HIDDEN_STRETCH
+    along *= shapes.spacing[:, None]
+    sink = np.where(flat, _sink(distance, slant, facing, cosine, along, focal_px), 0.25)
+    return Spacing(along, sink, hidden)
+
+
+def _in_sight(shapes: Shapes, tree: Tree, eyes: np.ndarray) -> np.ndarray:
+    """Which shapes are seen from some of the eyes, at one of five places each, bool [P]."""
+    seen = np.zeros(len(shapes), bool)
+    u, v, w = (shapes.axes[:, axis] for axis in range(3))
+    round_form = shapes.kind >= Kind.ELLIPSOID
+    centred = (shapes.kind >= Kind.DISC)[:, None]
+    radius = np.where(round_form, np.linalg.norm(shapes.axes, axis=2)[:, :2].max(1) * 1.05, 0)
+    for eye in eyes[np.linspace(0, len(eyes) - 1, min(LOOKS, len(eyes))).round().astype(int)]:
+        for a, b in ((0.5, 0.5), (0.1, 0.1), (0.8, 0.1), (0.1, 0.8), (0.8, 0.8)):
+            a, b = (np.where(centred, 1.4 * (c - 0.5), c) for c in (a, b))
+            place = np.where(round_form[:, None], b * w, a * u + b * v + 0.004 * w)
+            index = np.flatnonzero(~seen)
+            target = (shapes.origin + place)[index]
+            back = eye - target
+            length = np.linalg.norm(back, axis=1)
+            front = round_form[index] | ((back * w[index]).sum(1) > 0)
+            front &= (np.abs(back[:, 2]) < 1.2 * STEEPEST * length) & (length > radius[index])
+            index, back, target, length = index[front], back[front], target[front], length[front]
+            start = (radius[index] / length)[:, None]
+            seen[index] = ~tree.occluded(target + start * back, (1 - start) * back, 1.0)
+    return seen
+
+
+def _sightings(shapes: Shapes, eyes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distance [E, P] and unit view direction [E, P, 3] from each eye to the nearest visible place."""
+    nearest = shapes.origin[None] - eyes[:, None]  # [E, P, 3], from the eye
+    straight = shapes.kind <= Kind.TRIANGLE
+    for axis in range(2):
+        side = shapes.axes[:, axis] * straight[:, None]
+        square = np.maximum((side**2).sum(1), 1e-12)
+        share = np.clip(-np.einsum("epk,pk->ep", nearest, side) / square, 0, 1)
+        nearest = nearest + share[..., None] * side
+    length = np.maximum(np.linalg.norm(nearest, axis=2), 0.3)
+    view = nearest / length[..., None]
+    return np.maximum(length, np.abs(nearest[..., 2]) / STEEPEST), view
+
+
+def _sink(
+    distance: np.ndarray,
+    slant: np.ndarray,
+    facing: np.ndarray,
+    cosine: np.ndarray,
+    along: np.ndarray,
+    focal_px: float,
+) -> np.ndarray:
+    """Depth below the surface, per unit of spacing, that puts the blend on it in the mean.
+
+    A splat that lies h below the surface is seen h / slant further along the ray; blending brings
+    it BLEND_LEAD spacings nearer along the surface. Least squares over the eyes, each weighted by
+    the pixels it spends on the surface.
+    """
+    slant = np.maximum(slant, 0.04)
+    level = np.sqrt(1 - np.minimum(slant, 1) ** 2)
+    reach = np.maximum(np.sqrt((cosine**2 * along**2).sum(2)) / np.maximum(level, 1e-6), 1e-6)
+    lead = BLEND_LEAD * reach / along.max(1)
+    weight = facing * slant / distance**2
+    wanted = (weight * lead * level / slant).sum(0)
+    return np.minimum(wanted / np.maximum((weight / slant**2).sum(0), 1e-12), 0.5)
