@@ -1,0 +1,116 @@
+"""Depth priors: what a LiDAR sweep says of the depth at an image's pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import numpy as np
+
+from adapters.actor_motion import Motion, indices_between, inside_box
+from adapters.lidar_split import FLOOR_M, HALO_M, SKIN_M
+from augment.cameras import Camera
+from augment.errors import AdapterError
+from augment.labels import LidarSweep
+from augment.scene import Scene
+
+_NEAR_M = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class SparseDepth:
+    """Depth at M pixels of one image, at most one a pixel, in order of rows.
+
+    uv: int32 [M, 2], column and row. depth_m: float32 [M], along the optical axis.
+    timestamp_ns: int64 [M], when the LiDAR saw the point.
+    """
+
+    uv: np.ndarray
+    depth_m: np.ndarray
+    timestamp_ns: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.depth_m)
+
+
+def lidar_depth(
+    scene: Scene,
+    frame_index: int,
+    camera: Camera,
+    *,
+    without_semantic: Collection[int] = (),
+) -> SparseDepth:
+    """The frame's sweep as the camera would see it, the nearest return of each pixel.
+
+    Returns on a moving object are carried along its track from their own time to the camera's, and
+    left out if the object is not there then; the lowest FLOOR_M of its box counts as ground.
+    Without a sweep the result is empty. without_semantic: the dataset's class numbers of returns
+    that are no surface, such as mirror images. LiDAR and camera look from different places: a
+    pixel may show the depth of something that a nearer object hides from the camera.
+
+    Raises:
+        AdapterError: the sweep has no times (column timestamp_ns, or t in seconds).
+    """
+    sweep = scene.lidar(frame_index)
+    if sweep is None:
+        return SparseDepth(np.zeros((0, 2), np.int32), np.zeros(0, np.float32), np.zeros(0, int))
+    points = sweep.points_m - scene.world_origin_m
+    times = _times(sweep, frame_index)
+    keep = np.isfinite(points).all(axis=1)
+    if without_semantic and "semantic" in sweep.columns:
+        keep &= ~np.isin(sweep.columns["semantic"], list(without_semantic))
+    points, times = points[keep], times[keep]
+    present = _carry(scene, points, times, camera.timestamp_ns)
+    return _project(points[present], times[present], camera)
+
+
+def _times(sweep: LidarSweep, frame_index: int) -> np.ndarray:
+    if "timestamp_ns" in sweep.columns:
+        return sweep.columns["timestamp_ns"].astype(np.int64)
+    if "t" in sweep.columns:
+        return np.round(sweep.columns["t"].astype(np.float64) * 1e9).astype(np.int64)
+    raise AdapterError(
+        f"frame {frame_index}: the sweep must have a column timestamp_ns or t (seconds), so that "
+        f"moving objects can be followed; it has {sorted(sweep.columns)}"
+    )
+
+
+def _carry(scene: Scene, points: np.ndarray, times: np.ndarray, to_ns: int) -> np.ndarray:
+    """Move returns on actors, in place, to where they are at a time; which returns exist then."""
+    present = np.ones(len(points), dtype=bool)
+    if len(points) == 0:
+        return present
+    seen = points.copy()  # every actor is compared with what the sensor saw, not with moved points
+    for actor in scene.actors:
+        motion = Motion.of(actor.track)
+        size_m = np.array(actor.size_m)
+        low, high = motion.span(int(times.min()), int(times.max()))
+        reach = float(np.linalg.norm(size_m)) / 2 + HALO_M
+        near = indices_between(seen, low - reach, high + reach)
+        near = near[motion.exists_at(times[near])]
+        local = motion.into_actor(seen[near], times[near])
+        own = inside_box(local, size_m, SKIN_M) & (local[:, 2] > FLOOR_M - size_m[2] / 2)
+        pose = motion.pose_at(to_ns)
+        if pose is None:
+            present[near[own]] = False
+        else:
+            points[near[own]] = local[own] @ pose[:3, :3].T + pose[:3, 3]
+    return present
+
+
+def _project(points: np.ndarray, times: np.ndarray, camera: Camera) -> SparseDepth:
+    transform = camera.camera_from_world.numpy()
+    local = points @ transform[:3, :3].T + transform[:3, 3]
+    ahead = local[:, 2] > _NEAR_M
+    local, times = local[ahead], times[ahead]
+    u = np.floor(camera.fx * local[:, 0] / local[:, 2] + camera.cx)
+    v = np.floor(camera.fy * local[:, 1] / local[:, 2] + camera.cy)
+    inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    u, v = u[inside].astype(np.int32), v[inside].astype(np.int32)
+    depth, times = local[inside, 2].astype(np.float32), times[inside]
+    pixel = v.astype(np.int64) * camera.width + u
+    order = np.lexsort((depth, pixel))  # stable: of equal depths the sweep's first wins
+    first = np.ones(len(order), dtype=bool)
+    first[1:] = np.diff(pixel[order]) > 0
+    chosen = order[first]
+    return SparseDepth(np.stack([u, v], 1)[chosen], depth[chosen], times[chosen])

@@ -1,0 +1,184 @@
+"""Compiled loops over surfels and pixels: which surface a camera sees, and in what colour."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+KEPT = 12  # observations remembered of each surfel
+_NEAR_M = 0.3
+_FEATHER = 0.1  # scores fall to zero over this part of the image towards its border
+
+
+@numba.njit(cache=True, nogil=True)
+def draw_depth(
+    centres, normals, major, extent, rotation, translation, fx, fy, cx, cy, depth
+):  # pragma: no cover - compiled
+    """Draw elliptic discs into a z-buffer. extent [N, 2]: half axes, metres. depth [h, w] float32,
+    infinite where nothing is; keeps the nearest."""
+    height, width = depth.shape
+    p, n, e1, e2 = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    for i in range(len(centres)):
+        z = translation[2]
+        for b in range(3):
+            z += rotation[2, b] * centres[i, b]
+        if z < _NEAR_M:
+            continue
+        for a in range(2):
+            p[a] = translation[a]
+            for b in range(3):
+                p[a] += rotation[a, b] * centres[i, b]
+        p[2] = z
+        radius = max(extent[i, 0], extent[i, 1]) / z
+        u, v = fx * p[0] / z + cx, fy * p[1] / z + cy
+        ru, rv = fx * radius, fy * radius
+        if u + ru < 0 or u - ru > width or v + rv < 0 or v - rv > height:
+            continue
+        iu, iv = int(np.floor(u)), int(np.floor(v))
+        if 0 <= iu < width and 0 <= iv < height and z < depth[iv, iu]:
+            depth[iv, iu] = z
+        if max(ru, rv) < 0.5:
+            continue
+        for a in range(3):
+            n[a], e1[a] = 0.0, 0.0
+            for b in range(3):
+                n[a] += rotation[a, b] * normals[i, b]
+                e1[a] += rotation[a, b] * major[i, b]
+        e2[0] = n[1] * e1[2] - n[2] * e1[1]
+        e2[1] = n[2] * e1[0] - n[0] * e1[2]
+        e2[2] = n[0] * e1[1] - n[1] * e1[0]
+        offset = n[0] * p[0] + n[1] * p[1] + n[2] * p[2]
+        span = radius * z
+        for y in range(max(0, int(v - rv)), min(height, int(v + rv) + 1)):
+            dy = (y + 0.5 - cy) / fy
+            for x in range(max(0, int(u - ru)), min(width, int(u + ru) + 1)):
+                dx = (x + 0.5 - cx) / fx
+                slope = n[0] * dx + n[1] * dy + n[2]
+                if abs(slope) < 1e-3:
+                    continue
+                zt = offset / slope
+                if abs(zt - z) > span or zt >= depth[y, x]:
+                    continue
+                qx, qy, qz = dx * zt - p[0], dy * zt - p[1], zt - z
+                a = (qx * e1[0] + qy * e1[1] + qz * e1[2]) / extent[i, 0]
+                b = (qx * e2[0] + qy * e2[1] + qz * e2[2]) / extent[i, 1]
+                if a * a + b * b <= 1.0:
+                    depth[y, x] = zt
+
+
+@numba.njit(cache=True, nogil=True)
+def observe(
+    centres, normals, extent, rotation, translation, fx, fy, cx, cy,
+    depth, cover, levels, level_sizes, used_rows, camera, scores, colours, cameras,
+):  # fmt: skip  # pragma: no cover - compiled
+    """Remember the colour of every surfel that one image shows, if among the KEPT best of its own.
+
+    depth [h, w]: z-buffer of all surfaces. cover [h, w]: z of moving boxes, in front of which lies
+    nothing of them; surfels behind are hidden. levels [L, H, W, 3] uint8: the image halved again
+    and again, level_sizes [L, 2] their rows and columns. fx.. are of the z-buffer. Updated are
+    scores [N, KEPT], colours [N, KEPT, 3] and cameras [N, KEPT].
+    """
+    height, width = depth.shape
+    p, n = np.empty(3), np.empty(3)
+    for i in range(len(centres)):
+        for a in range(3):
+            p[a] = translation[a]
+            for b in range(3):
+                p[a] += rotation[a, b] * centres[i, b]
+        z = p[2]
+        if z < _NEAR_M:
+            continue
+        u, v = fx * p[0] / z + cx, fy * p[1] / z + cy
+        if not (1 <= u < width - 1 and 1 <= v < min(height - 1, used_rows * height)):
+            continue
+        x, y = int(u), int(v)
+        if cover[y, x] < z:
+            continue
+        for a in range(3):
+            n[a] = 0.0
+            for b in range(3):
+                n[a] += rotation[a, b] * normals[i, b]
+        reach = np.sqrt(p[0] * p[0] + p[1] * p[1] + z * z)
+        facing = abs(n[0] * p[0] + n[1] * p[1] + n[2] * z) / reach
+        # A surface seen at a slant spans much depth within one z-buffer pixel.
+        slant = min(z / fx / max(facing, 0.02), 1.5)
+        tolerance = 0.08 + 0.01 * z + slant
+        if z > depth[y, x] + tolerance:
+            continue
+        score = max(facing, 0.03) * fx / z
+        border = min(min(u, width - u) / width, min(v, height - v) / height)
+        score *= min(border / _FEATHER, 1.0)
+        # Beside a nearer edge the image may show that edge: calibration is good to a pixel or two.
+        for yy in range(y - 1, y + 2):
+            for xx in range(x - 1, x + 2):
+                if z > depth[yy, xx] + 2 * tolerance or cover[yy, xx] < z:
+                    score *= 0.6
+        worst = 0
+        for j in range(1, scores.shape[1]):
+            if scores[i, j] < scores[i, worst]:
+                worst = j
+        if score <= scores[i, worst]:
+            continue
+        footprint = np.sqrt(extent[i, 0] * extent[i, 1] * max(facing, 0.1)) * fx / z
+        footprint *= level_sizes[0, 1] / width  # in pixels of the sharpest level
+        level = min(max(int(np.log2(max(footprint, 1.0))), 0), len(levels) - 1)
+        _sample(levels[level], level_sizes[level], u / width, v / height, colours[i, worst])
+        scores[i, worst] = score
+        cameras[i, worst] = camera
+
+
+@numba.njit(cache=True, nogil=True)
+def _sample(image, size, u, v, out):  # pragma: no cover - compiled
+    """Bilinear colour at relative coordinates, clamped at the border."""
+    y = min(max(v * size[0] - 0.5, 0.0), size[0] - 1.0)
+    x = min(max(u * size[1] - 0.5, 0.0), size[1] - 1.0)
+    y0, x0 = int(y), int(x)
+    y1, x1 = min(y0 + 1, size[0] - 1), min(x0 + 1, size[1] - 1)
+    fy, fx = y - y0, x - x0
+    for c in range(3):
+        top = image[y0, x0, c] * (1 - fx) + image[y0, x1, c] * fx
+        bottom = image[y1, x0, c] * (1 - fx) + image[y1, x1, c] * fx
+        out[c] = np.uint8(top * (1 - fy) + bottom * fy + 0.5)
+
+
+@numba.njit(cache=True)
+def blended_colours(scores, colours, cameras, keep, power):  # pragma: no cover - compiled
+    """Per surfel and camera the median, channel by channel, of observations whose score is at least
+    `keep` of that camera's best; cameras are averaged with weights (best score)^power.
+
+    Returns float32 [N, 3] in [0, 1] and seen, bool [N].
+    """
+    count, slots = scores.shape
+    out = np.zeros((count, 3), np.float32)
+    seen = np.zeros(count, np.bool_)
+    values = np.empty(slots, np.uint8)
+    for i in range(count):
+        total = 0.0
+        for first in range(slots):
+            best = scores[i, first]
+            if best <= 0:
+                continue
+            leads = True
+            for j in range(slots):
+                if cameras[i, j] == cameras[i, first] and (
+                    scores[i, j] > best or (scores[i, j] == best and j < first)
+                ):
+                    leads = False
+            if not leads:
+                continue
+            weight = best**power
+            total += weight
+            for c in range(3):
+                n = 0
+                for j in range(slots):
+                    if cameras[i, j] == cameras[i, first] and scores[i, j] >= keep * best:
+                        values[n] = colours[i, j, c]
+                        n += 1
+                ordered = np.sort(values[:n])
+                middle = (np.float32(ordered[(n - 1) // 2]) + np.float32(ordered[n // 2])) / 2
+                out[i, c] += weight * middle / np.float32(255)
+        if total > 0:
+            seen[i] = True
+            for c in range(3):
+                out[i, c] /= total
+    return out, seen

@@ -1,0 +1,122 @@
+"""A raw PandaSet sequence as a scene: Gaussians from accumulated, image-coloured LiDAR.
+
+World: PandaSet's own, unless the drive is further than a kilometre from its origin. Ego: the LiDAR
+pose turned by a quarter about z, so that x is forward, y left, z up; its origin is the pose's. One
+actor stands for each moving object, whichever sensor's boxes it has; its track_id is the uuid of
+its first box, and the labels keep both boxes of a sibling pair.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence as Seq
+from pathlib import Path
+from urllib.parse import urlencode
+
+import torch
+
+from adapters.box_tracks import join_tracks
+from adapters.image_views import View
+from adapters.lidar_scene import DrivenPath, LidarSceneOptions, build_lidar_scene
+from adapters.pandaset_files import CameraTrack, Sequence, read_sequence
+from adapters.pandaset_labels import PandaSetLabels
+from adapters.pandaset_options import PandaSetOptions
+from adapters.pandaset_sweeps import read_drive
+from augment.cameras import Camera, Frame
+from augment.errors import AdapterError
+from augment.geometry import invert_rigid
+from augment.scene import Scene
+
+# The back camera looks over the recording car's own roof, the same in every PandaSet sequence:
+# from this part of its rows downwards.
+_ROWS_ABOVE_CAR = {"back_camera": 0.745}
+
+
+def open_pandaset(path: str, query: dict[str, str]) -> Scene:
+    """The scene of one PandaSet sequence folder, such as `pandaset/002`.
+
+    query: frames, voxel_m, max_gaussians, image_scale, sky_size, progress; see PandaSetOptions.
+    Opening is deterministic: the same files and options give the same bits.
+
+    Raises:
+        AdapterError: a wrong option, missing or damaged calibration, a damaged table, or no LiDAR.
+            Missing LiDAR or annotation files and images of single frames are Scene.problems.
+    """
+    options = PandaSetOptions.from_query(query)
+    sequence = read_sequence(Path(path))
+    numbers = [frame for frame in range(len(sequence)) if options.keeps(frame)]
+    if not numbers:
+        raise AdapterError(
+            f"pandaset: frames={query.get('frames')} selects none of the {len(sequence)} frames "
+            f"(0 to {len(sequence) - 1}) in {path}"
+        )
+    drive = read_drive(sequence, numbers, progress=options.progress)
+    if sum(len(sweep) for sweep in drive.sweeps) == 0:
+        raise AdapterError(
+            f"{Path(path) / 'lidar'} holds no returns for frames {numbers[0]} to {numbers[-1]}; "
+            f"a scene cannot be built without them, unpack the sequence again"
+        )
+    frames = tuple(_frame(sequence, number) for number in numbers)
+    built = build_lidar_scene(
+        drive.sweeps,
+        join_tracks(drive.samples),
+        _views(sequence, frames),
+        DrivenPath(sequence.world_from_ego[numbers, :3, 3], sequence.timestamps_ns[numbers]),
+        LidarSceneOptions(
+            voxel_m=options.voxel_m,
+            max_gaussians=options.max_gaussians,
+            image_scale=options.image_scale,
+            sky_size=options.sky_size,
+            progress=options.progress,
+        ),
+    )
+    return Scene(
+        name=Path(path).name,
+        source=f"pandaset:{path}" + (f"?{urlencode(query, safe=':')}" if query else ""),
+        background=built.background,
+        actors=built.actors,
+        sky=built.sky,
+        frames=frames,
+        labels=PandaSetLabels(Path(path)),
+        world_origin_m=sequence.world_origin_m,
+        ground_z_m=built.ground_z_m,
+        problems=sequence.problems + drive.problems + built.problems,
+    )
+
+
+def _frame(sequence: Sequence, number: int) -> Frame:
+    cameras = {track.name: _camera(track, number) for track in sequence.cameras}
+    paths = {track.name: track.images[number] for track in sequence.cameras}
+    return Frame(
+        index=number,
+        timestamp_ns=int(sequence.timestamps_ns[number]),
+        world_from_ego=torch.from_numpy(sequence.world_from_ego[number].copy()),
+        cameras=cameras,
+        image_paths={name: str(path) for name, path in paths.items() if path is not None},
+    )
+
+
+def _camera(track: CameraTrack, number: int) -> Camera:
+    return Camera(
+        name=track.name,
+        width=track.width,
+        height=track.height,
+        fx=track.fx,
+        fy=track.fy,
+        cx=track.cx,
+        cy=track.cy,
+        camera_from_world=invert_rigid(torch.from_numpy(track.world_from_camera[number])),
+        timestamp_ns=int(track.timestamps_ns[number]),
+    )
+
+
+def _views(sequence: Sequence, frames: Seq[Frame]) -> tuple[View, ...]:
+    return tuple(
+        View(
+            frame.cameras[name],
+            Path(path),
+            frame.index,
+            used_rows=_ROWS_ABOVE_CAR.get(name, 1.0),
+        )
+        for frame in frames
+        for name, path in frame.image_paths.items()
+    )

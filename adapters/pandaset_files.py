@@ -1,0 +1,270 @@
+"""The files of one PandaSet sequence, read and checked; nothing here builds a scene.
+
+    camera/<name>/NN.jpg            undistorted images; intrinsics.json, poses.json, timestamps.json
+    lidar/NN.pkl.gz                 returns of both sensors; poses.json, timestamps.json
+    annotations/cuboids/NN.pkl.gz   boxes
+    annotations/semseg/NN.pkl.gz    class of each return; classes.json
+
+The world is the sequence's own: metres, z up. Camera poses are world_from_camera with OpenCV axes.
+A LiDAR pose is the car's: x right, y forward, z up, so world_from_ego is that pose turned by a
+quarter about z. Times are seconds, stored here as integer nanoseconds.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pandas as pd
+import torch
+
+from adapters.safe_pickle import read_frame
+from augment.errors import AdapterError
+from augment.geometry import rigid, rotmat_from_quat
+
+LIDAR_COLUMNS = ("x", "y", "z", "i", "t", "d")
+FAR_FROM_ORIGIN_M = 1000.0  # float32 still resolves a tenth of a millimetre there
+# Columns: ego x (forward), y (left), z in the axes of the LiDAR pose (x right, y forward).
+LIDAR_POSE_FROM_EGO = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+
+
+@dataclass(frozen=True, eq=False)
+class CameraTrack:
+    """One camera over the sequence.
+
+    world_from_camera: float64 [F, 4, 4]; timestamps_ns: int64 [F]; images: one path a frame, None
+    where the image is missing or damaged.
+    """
+
+    name: str
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    world_from_camera: np.ndarray
+    timestamps_ns: np.ndarray
+    images: tuple[Path | None, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Sequence:
+    """Calibration and timing of a sequence of F frames, numbered from 0 as the files are.
+
+    world_origin_m: float64 [3], what was subtracted from the files' coordinates to give the scene's
+    world, in which all poses here are. world_from_ego: float64 [F, 4, 4], ego x forward, y left,
+    z up. timestamps_ns: int64 [F], the ends of the sweeps. problems: what was missing and gone on
+    without, one sentence each.
+    """
+
+    root: Path
+    world_origin_m: np.ndarray
+    world_from_ego: np.ndarray
+    timestamps_ns: np.ndarray
+    cameras: tuple[CameraTrack, ...]
+    problems: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.timestamps_ns)
+
+
+def read_sequence(root: Path) -> Sequence:
+    """The calibration, poses and times of the sequence in a folder.
+
+    Raises:
+        AdapterError: the folder is no PandaSet sequence, or calibration is missing or contradicts
+            itself; the message names the file.
+    """
+    if not root.is_dir():
+        raise AdapterError(f"{root} is not a folder; expected a PandaSet sequence such as .../002")
+    poses = _read_poses(root / "lidar" / "poses.json")
+    times = _read_times(root / "lidar" / "timestamps.json", expected=len(poses), what="LiDAR poses")
+    folders = sorted(p for p in _folder(root / "camera").iterdir() if p.is_dir())
+    if not folders:
+        raise AdapterError(f"{root / 'camera'} holds no camera folder; unpack the sequence again")
+    problems: list[str] = []
+    cameras = [_read_camera(folder, len(poses), problems) for folder in folders]
+    origin = _world_origin(poses[:, :3, 3])
+    poses[:, :3, 3] -= origin
+    for camera in cameras:
+        camera.world_from_camera[:, :3, 3] -= origin
+    ego = poses @ LIDAR_POSE_FROM_EGO
+    return Sequence(root, origin, ego, times, tuple(cameras), tuple(problems))
+
+
+def _world_origin(positions_m: np.ndarray) -> np.ndarray:
+    """Zero for a drive near the origin, as published ones are; else whole metres near its start."""
+    far = np.linalg.norm(positions_m, axis=1).max() > FAR_FROM_ORIGIN_M
+    return np.round(positions_m[0]) if far else np.zeros(3)
+
+
+def frame_file(root: Path, folder: str, frame: int) -> Path:
+    """The path of a frame's table: `folder` is lidar, annotations/cuboids or annotations/semseg."""
+    return root / folder / f"{frame:02d}.pkl.gz"
+
+
+def read_lidar(root: Path, frame: int) -> pd.DataFrame | None:
+    """The returns of a frame, columns x y z i t d as in the file, or None without a file.
+
+    Raises:
+        AdapterError: the file is damaged or lacks a column.
+    """
+    path = frame_file(root, "lidar", frame)
+    return _read_table(path, LIDAR_COLUMNS) if path.exists() else None
+
+
+def read_semantics(root: Path, frame: int, rows: int) -> np.ndarray | None:
+    """The class number of each return of the frame, int64 [rows], or None without a file.
+
+    Raises:
+        AdapterError: the file is damaged or does not have one row a return.
+    """
+    path = frame_file(root, "annotations/semseg", frame)
+    if not path.exists():
+        return None
+    classes = _read_table(path, ("class",))["class"].to_numpy()
+    if len(classes) != rows:
+        raise AdapterError(
+            f"{path} must have a class for each of the {rows} returns in lidar/{frame:02d}.pkl.gz; "
+            f"it has {len(classes)}"
+        )
+    return classes
+
+
+def read_cuboids(root: Path, frame: int) -> pd.DataFrame | None:
+    """The boxes of a frame with all their columns, or None without a file.
+
+    Raises:
+        AdapterError: the file is damaged or lacks a column that a box needs.
+    """
+    path = frame_file(root, "annotations/cuboids", frame)
+    needed = ("uuid", "label", "yaw", "stationary")
+    needed += tuple(f"{group}.{axis}" for group in ("position", "dimensions") for axis in "xyz")
+    return _read_table(path, needed) if path.exists() else None
+
+
+def _read_table(path: Path, needed: tuple[str, ...]) -> pd.DataFrame:
+    table = read_frame(path)
+    missing = [name for name in needed if name not in table.columns]
+    if missing:
+        raise AdapterError(f"{path} lacks the columns {missing}; it has {list(table.columns)}")
+    return table
+
+
+def _read_camera(folder: Path, frames: int, problems: list[str]) -> CameraTrack:
+    intrinsics = _read_json(folder / "intrinsics.json")
+    try:
+        fx, fy, cx, cy = (float(intrinsics[name]) for name in ("fx", "fy", "cx", "cy"))
+    except (TypeError, KeyError, ValueError) as error:
+        raise AdapterError(
+            f"{folder / 'intrinsics.json'} must hold numbers fx, fy, cx, cy ({error!r})"
+        ) from None
+    poses = _read_poses(folder / "poses.json")
+    if len(poses) != frames:
+        raise AdapterError(
+            f"{folder / 'poses.json'} has {len(poses)} poses; lidar/poses.json has {frames}"
+        )
+    times = _read_times(folder / "timestamps.json", expected=frames, what="LiDAR poses")
+    images = _find_images(folder, frames, problems)
+    height, width = _image_size(folder, images)
+    return CameraTrack(folder.name, width, height, fx, fy, cx, cy, poses, times, images)
+
+
+def _find_images(folder: Path, frames: int, problems: list[str]) -> tuple[Path | None, ...]:
+    numbers = {int(p.stem) for p in folder.glob("*.jpg") if re.fullmatch(r"\d+", p.stem)}
+    if not numbers:
+        raise AdapterError(f"{folder} holds no images NN.jpg; unpack the sequence again")
+    if max(numbers) >= frames:
+        raise AdapterError(
+            f"{folder} holds image {max(numbers):02d}.jpg, but timestamps.json ends with frame "
+            f"{frames - 1:02d}: images and timestamps are not of one sequence"
+        )
+    images: list[Path | None] = []
+    for frame in range(frames):
+        path = folder / f"{frame:02d}.jpg"
+        fault = _image_fault(path)
+        if fault:
+            problems.append(f"camera {folder.name}, frame {frame}: image {path} {fault}")
+        images.append(None if fault else path)
+    return tuple(images)
+
+
+def _image_fault(path: Path) -> str:
+    """What is wrong with a JPEG file by its ends: decoders fill what is missing with grey."""
+    if not path.exists():
+        return "does not exist"
+    with open(path, "rb") as file:
+        head = file.read(2)
+        size = file.seek(0, 2)
+        file.seek(max(0, size - 64))
+        tail = file.read()
+    if head != b"\xff\xd8":
+        return "is not a JPEG file"
+    return "" if b"\xff\xd9" in tail else "is cut short"
+
+
+def _image_size(folder: Path, images: tuple[Path | None, ...]) -> tuple[int, int]:
+    for path in images:
+        image = None if path is None else cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        if image is not None:
+            return image.shape[0], image.shape[1]
+    raise AdapterError(f"{folder} holds no image that can be decoded; unpack the sequence again")
+
+
+def _folder(path: Path) -> Path:
+    if not path.is_dir():
+        raise AdapterError(f"{path} does not exist; expected a PandaSet sequence's {path.name}/")
+    return path
+
+
+def _read_json(path: Path) -> Any:
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise AdapterError(
+            f"{path} does not exist; a PandaSet sequence cannot be read without it, "
+            f"copy it from the dataset"
+        ) from None
+    except (OSError, ValueError) as error:
+        raise AdapterError(f"{path} is not readable JSON ({error}); copy it again") from None
+
+
+def _read_times(path: Path, *, expected: int, what: str) -> np.ndarray:
+    """Nanoseconds, int64 [expected]."""
+    seconds = _read_json(path)
+    try:
+        times = np.array([float(s) for s in seconds], dtype=np.float64)
+    except (TypeError, ValueError):
+        raise AdapterError(f"{path} must be a list of seconds") from None
+    if len(times) != expected:
+        raise AdapterError(f"{path} has {len(times)} entries; there are {expected} {what}")
+    if not (np.isfinite(times).all() and (np.diff(times) > 0).all()):
+        raise AdapterError(f"{path} must be finite and increasing; copy it again")
+    return np.round(times * 1e9).astype(np.int64)
+
+
+def _read_poses(path: Path) -> np.ndarray:
+    """Rigid transforms, float64 [F, 4, 4]."""
+    entries = _read_json(path)
+    try:
+        positions = [[float(e["position"][axis]) for axis in "xyz"] for e in entries]
+        quats = [[float(e["heading"][axis]) for axis in "wxyz"] for e in entries]
+    except (TypeError, KeyError, ValueError) as error:
+        raise AdapterError(
+            f"{path} must be a list of position x y z and heading w x y z ({error!r})"
+        ) from None
+    values = np.array([p + q for p, q in zip(positions, quats, strict=True)], dtype=np.float64)
+    if len(values) == 0:
+        raise AdapterError(f"{path} holds no poses")
+    norms = np.linalg.norm(values[:, 3:], axis=1)
+    # Headings are stored to 16 digits; a norm off by a thousandth is no rotation.
+    if not (np.isfinite(values).all() and (np.abs(norms - 1) < 1e-3).all()):
+        raise AdapterError(f"{path} must hold finite positions and unit headings; copy it again")
+    rotation = rotmat_from_quat(torch.from_numpy(values[:, 3:]))
+    return rigid(rotation, torch.from_numpy(values[:, :3])).numpy()

@@ -1,0 +1,123 @@
+"""PandaSet's boxes and sweeps, passed through with every column, and what its classes mean here."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from adapters.pandaset_files import LIDAR_COLUMNS, read_cuboids, read_lidar, read_semantics
+from augment.errors import AdapterError
+from augment.labels import Boxes, LidarSweep
+from augment.semantics import SemanticClass
+
+NO_SURFACE = -1  # stands for returns that no surface made, where a SemanticClass is expected
+
+NO_SURFACE_CLASSES = (1, 2, 3, 4)  # their numbers in the published classes.json
+
+# The published classes.json, numbered from 1.
+_S = SemanticClass
+_CLASSES: tuple[tuple[str, int], ...] = (
+    ("Smoke", NO_SURFACE), ("Exhaust", NO_SURFACE), ("Spray or rain", NO_SURFACE),
+    ("Reflection", NO_SURFACE), ("Vegetation", _S.VEGETATION), ("Ground", _S.TERRAIN),
+    ("Road", _S.ROAD), ("Lane Line Marking", _S.LANE_MARKING),
+    ("Stop Line Marking", _S.LANE_MARKING), ("Other Road Marking", _S.LANE_MARKING),
+    ("Sidewalk", _S.SIDEWALK), ("Driveway", _S.SIDEWALK), ("Car", _S.VEHICLE),
+    ("Pickup Truck", _S.VEHICLE), ("Medium-sized Truck", _S.VEHICLE), ("Semi-truck", _S.VEHICLE),
+    ("Towed Object", _S.VEHICLE), ("Motorcycle", _S.TWO_WHEELER),
+    ("Other Vehicle - Construction Vehicle", _S.VEHICLE),
+    ("Other Vehicle - Uncommon", _S.VEHICLE), ("Other Vehicle - Pedicab", _S.TWO_WHEELER),
+    ("Emergency Vehicle", _S.VEHICLE), ("Bus", _S.VEHICLE),
+    ("Personal Mobility Device", _S.TWO_WHEELER), ("Motorized Scooter", _S.TWO_WHEELER),
+    ("Bicycle", _S.TWO_WHEELER), ("Train", _S.VEHICLE), ("Trolley", _S.VEHICLE),
+    ("Tram / Subway", _S.VEHICLE), ("Pedestrian", _S.PEDESTRIAN),
+    ("Pedestrian with Object", _S.PEDESTRIAN), ("Animals - Bird", _S.OTHER),
+    ("Animals - Other", _S.OTHER), ("Pylons", _S.BARRIER), ("Road Barriers", _S.BARRIER),
+    ("Signs", _S.SIGN), ("Cones", _S.OTHER), ("Construction Signs", _S.SIGN),
+    ("Temporary Construction Barriers", _S.BARRIER), ("Rolling Containers", _S.OTHER),
+    ("Building", _S.BUILDING), ("Other Static Object", _S.OTHER),
+)  # fmt: skip
+
+
+def semantic_table(root: Path) -> np.ndarray:
+    """SemanticClass (or NO_SURFACE) by the sequence's class number, int16 [256]; unknown names
+    are UNKNOWN. Numbers are those of annotations/semseg/classes.json, or of the published list.
+
+    Raises:
+        AdapterError: classes.json is there but is no table of numbers and names.
+    """
+    names = {number: name for number, (name, _) in enumerate(_CLASSES, start=1)}
+    path = root / "annotations" / "semseg" / "classes.json"
+    if path.exists():
+        try:
+            names = {
+                int(k): str(v) for k, v in json.loads(path.read_text(encoding="utf-8")).items()
+            }
+        except (OSError, ValueError, AttributeError) as error:
+            raise AdapterError(f"{path} must map class numbers to names ({error})") from None
+    meaning = dict(_CLASSES)
+    table = np.full(256, SemanticClass.UNKNOWN, dtype=np.int16)
+    for number, name in names.items():
+        if not 0 <= number < len(table):
+            raise AdapterError(f"{path}: class numbers must lie in 0 to 255; got {number}")
+        table[number] = meaning.get(name, SemanticClass.UNKNOWN)
+    return table
+
+
+@dataclass(frozen=True)
+class PandaSetLabels:
+    """Labels of one sequence, read when asked.
+
+    Boxes: track_ids are uuids, both boxes of a sibling pair are kept, and attributes hold every
+    column of the file under its own name (None where a text is missing), the yaw and sibling
+    included. Sweeps: columns x y z (metres), i (intensity 0 to 255), t (seconds), d (0: the
+    spinning sensor, 1: the forward one) exactly as in the file, and semantic (the dataset's own
+    class numbers) where the frame has them.
+    """
+
+    root: Path
+
+    def boxes(self, frame_index: int) -> Boxes:
+        table = read_cuboids(self.root, frame_index)
+        return Boxes.empty() if table is None else boxes_of_cuboids(table)
+
+    def lidar(self, frame_index: int) -> LidarSweep | None:
+        table = read_lidar(self.root, frame_index)
+        if table is None:
+            return None
+        columns = {name: table[name].to_numpy() for name in LIDAR_COLUMNS}
+        classes = read_semantics(self.root, frame_index, len(table))
+        if classes is not None:
+            columns["semantic"] = classes
+        return LidarSweep(columns)
+
+
+def boxes_of_cuboids(table: pd.DataFrame) -> Boxes:
+    """A frame's cuboids as boxes.
+
+    PandaSet's box has its length along y and its width along x, turned by yaw from world axes;
+    here x is forward, so the heading is a quarter turn more and the first two sizes swap.
+    """
+    half = (table["yaw"].to_numpy(dtype=np.float64) + np.pi / 2) / 2
+    zero = np.zeros_like(half)
+    dimensions = [table[f"dimensions.{axis}"].to_numpy(dtype=np.float64) for axis in "yxz"]
+    positions = [table[f"position.{axis}"].to_numpy(dtype=np.float64) for axis in "xyz"]
+    return Boxes(
+        track_ids=tuple(str(v) for v in table["uuid"]),
+        labels=tuple(str(v) for v in table["label"]),
+        centers_m=np.stack(positions, axis=1),
+        sizes_m=np.stack(dimensions, axis=1),
+        quats=np.stack([np.cos(half), zero, zero, np.sin(half)], axis=1),
+        attributes={str(name): _plain(table[name]) for name in table.columns},
+    )
+
+
+def _plain(column: pd.Series) -> np.ndarray:
+    """The column's values; NaN among texts, pandas' mark of a missing one, becomes None."""
+    values = column.to_numpy()
+    if values.dtype != object:
+        return values
+    return np.array([None if isinstance(v, float) and np.isnan(v) else v for v in values], object)

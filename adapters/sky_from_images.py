@@ -1,0 +1,134 @@
+"""A sky cube map from the pixels of recorded images that no surface covers.
+
+Everything uncovered is taken as infinitely far: clouds and distant towers truly are; a wall above
+the LiDAR's field of view is not, and appears in the right direction but drifts against the scene
+as the camera moves. Directions that no image shows are filled smoothly from those around them.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numba
+import numpy as np
+import torch
+
+from augment.cameras import Camera
+from augment.sky import CubemapSky, directions_of_cubemap
+
+_FEATHER = 0.12  # images fade over this part of their width, so that exposures meet softly
+_FILL_ROWS = 128  # of the lat-long image that unseen directions are filled from
+_DEFAULT_SKY = (0.7, 0.75, 0.8)  # where no image shows any sky
+
+
+class SkyGatherer:
+    """Sums of the colours seen in every direction; `finish` divides and fills."""
+
+    def __init__(self, size: int) -> None:
+        self._size = size
+        self._directions = directions_of_cubemap(size).reshape(-1, 3).numpy()
+        self._sums = np.zeros((len(self._directions), 3), np.float32)
+        self._weights = np.zeros(len(self._directions), np.float32)
+
+    def add(
+        self, camera: Camera, free: np.ndarray, levels: np.ndarray, level_sizes: np.ndarray
+    ) -> None:
+        """Add one image. free: bool [h, w] at the camera's size, True where nothing was drawn.
+        levels: uint8 [L, H, W, 3], the image halved again and again; level_sizes: int [L, 2]."""
+        # The level whose pixels are about as wide as a texel.
+        texel = 2.0 / self._size * camera.fx * level_sizes[0, 1] / camera.width
+        level = int(np.clip(round(np.log2(max(texel, 1.0))), 0, len(levels) - 1))
+        rows, columns = level_sizes[level]
+        _gather(
+            self._directions,
+            camera.camera_from_world[:3, :3].numpy().astype(np.float32),
+            np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32),
+            free,
+            levels[level, :rows, :columns],
+            np.float32(_FEATHER),
+            self._sums,
+            self._weights,
+        )
+
+    def finish(self) -> CubemapSky:
+        """The mean colour of every direction, unseen ones filled."""
+        seen = self._weights > 1e-3
+        rgb = self._sums / np.maximum(self._weights, 1e-3)[:, None] / np.float32(255)
+        if not seen.any():
+            rgb[:] = _DEFAULT_SKY
+        elif not seen.all():
+            # A wide fade between seen and filled would smear the skyline; a texel's is enough.
+            rgb[~seen] = _fill(self._directions, rgb, seen)[~seen]
+        faces = rgb.reshape(6, self._size, self._size, 3)
+        return CubemapSky(torch.from_numpy(np.ascontiguousarray(faces, np.float32)))
+
+
+def _fill(directions: np.ndarray, rgb: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """Colours [N, 3] for all directions, smooth where unseen: normalised averages over ever wider
+    areas of a lat-long image, the narrowest that holds anything counting most."""
+    rows, columns = _FILL_ROWS, 2 * _FILL_ROWS
+    azimuth = np.arctan2(directions[:, 1], directions[:, 0])
+    elevation = np.arcsin(np.clip(directions[:, 2], -1, 1))
+    x = np.clip((azimuth / (2 * np.pi) + 0.5) * columns, 0, columns - 1e-3).astype(np.int64)
+    y = np.clip((0.5 - elevation / np.pi) * rows, 0, rows - 1e-3).astype(np.int64)
+    cell = (y * columns + x)[seen]
+    total = np.bincount(cell, minlength=rows * columns).astype(np.float64)
+    image = np.stack(
+        [np.bincount(cell, rgb[seen, c].astype(np.float64), rows * columns) for c in range(3)], 1
+    )
+    # Rows shrink towards the poles: weigh by solid angle so that a pole does not outvote.
+    solid = np.cos((np.arange(rows) + 0.5) / rows * np.pi - np.pi / 2).repeat(columns)
+    present = (total > 0) * solid
+    image = image / np.maximum(total, 1)[:, None] * present[:, None]
+    filled = _widen(image.reshape(rows, columns, 3), present.reshape(rows, columns))
+    return filled.reshape(-1, 3)[y * columns + x].astype(np.float32)
+
+
+def _widen(sums: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    rows, columns = weights.shape
+    out = np.zeros_like(sums)
+    missing = np.ones_like(weights)
+    sigma = 1.0
+    while sigma <= rows:
+        wide = np.dstack([sums, weights])
+        margin = min(columns, int(4 * sigma))
+        wide = np.concatenate([wide[:, -margin:], wide, wide[:, :margin]], axis=1)
+        wide = cv2.GaussianBlur(wide, (0, 0), sigma, borderType=cv2.BORDER_REFLECT)
+        wide = wide[:, margin : margin + columns]
+        trust = np.clip(wide[..., 3] / 0.2, 0, 1) * missing
+        out += trust[..., None] * wide[..., :3] / np.maximum(wide[..., 3:], 1e-9)
+        missing -= trust
+        sigma *= 1.6
+    mean = sums.sum((0, 1)) / weights.sum()
+    return out + missing[..., None] * mean
+
+
+@numba.njit(cache=True, nogil=True)
+def _gather(
+    directions, rotation, intrinsics, free, image, feather, sums, weights
+):  # pragma: no cover - compiled
+    height, width = free.shape
+    rows, columns = image.shape[0], image.shape[1]
+    fx, fy, cx, cy = intrinsics
+    for i in range(len(directions)):
+        d = directions[i]
+        z = rotation[2, 0] * d[0] + rotation[2, 1] * d[1] + rotation[2, 2] * d[2]
+        if z < 0.1:
+            continue
+        u = fx * (rotation[0, 0] * d[0] + rotation[0, 1] * d[1] + rotation[0, 2] * d[2]) / z + cx
+        if u < 0 or u >= width:
+            continue
+        v = fy * (rotation[1, 0] * d[0] + rotation[1, 1] * d[1] + rotation[1, 2] * d[2]) / z + cy
+        if v < 0 or v >= height or not free[int(v), int(u)]:
+            continue
+        border = min(min(u, width - u) / width, min(v, height - v) / height)
+        weight = min(border / feather, np.float32(1)) + np.float32(1e-3)
+        y = min(max(v / height * rows - np.float32(0.5), np.float32(0)), np.float32(rows - 1))
+        x = min(max(u / width * columns - np.float32(0.5), np.float32(0)), np.float32(columns - 1))
+        y0, x0 = int(y), int(x)
+        y1, x1 = min(y0 + 1, rows - 1), min(x0 + 1, columns - 1)
+        wy, wx = y - y0, x - x0
+        for c in range(3):
+            top = image[y0, x0, c] * (1 - wx) + image[y0, x1, c] * wx
+            bottom = image[y1, x0, c] * (1 - wx) + image[y1, x1, c] * wx
+            sums[i, c] += weight * (top * (1 - wy) + bottom * wy)
+        weights[i] += weight
