@@ -74,7 +74,9 @@ def draw_video(out: Path, camera: str, frames_per_second: float = 10.0, width: i
 
 
 def _groups(rows: list[dict[str, Any]]) -> list[tuple[str, str]]:
-    return sorted({(row["scene"], row["variant"]) for row in rows})
+    """Scene and variant of every row, each once: the clearest weather of a scene first."""
+    density = {(row["scene"], row["variant"]): row["smog_extinction_per_m"] for row in rows}
+    return sorted(density, key=lambda group: (group[0], density[group], group[1]))
 
 
 def _weather(row: dict[str, Any]) -> str:

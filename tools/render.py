@@ -29,7 +29,7 @@ def render_recipe(
     sheet: bool = True,
 ) -> int:
     """Runs the job and prints what became of it. Returns the exit code: 1 where images failed."""
-    from augment.render.warm_up import warm_up
+    from augment.render.cpu import warm_up
 
     recipes = resolve_variants(recipe, variants, scale)
     seconds = warm_up()

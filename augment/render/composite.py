@@ -11,7 +11,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from augment.cameras import Camera
-from augment.render import composite_kernels, threads
+from augment.render import composite_kernels
+from augment.render.threads import kernel_threads
 from augment.sky import ConstantSky, CubemapSky, Sky
 from augment.weather.smog import (
     SmogMedium,
@@ -19,6 +20,8 @@ from augment.weather.smog import (
     sky_optical_depth,
     vertical_optical_depth,
 )
+
+ROWS = 32  # image rows a thread takes at a time
 
 
 def sky_behind(sky: Sky, smog: SmogMedium | None) -> tuple[Sky, SmogMedium | None]:
@@ -63,30 +66,31 @@ def composite_sky(
 def _composite_cubemap(
     rgb: Tensor, alpha: Tensor, camera: Camera, faces: Tensor, smog: SmogMedium | None
 ) -> Tensor:
-    threads.prepare()
     out = np.empty((camera.height, camera.width, 3), np.float32)
     strength, airlight = -1.0, (0.0, 0.0, 0.0)
     if smog is not None:
         strength = vertical_optical_depth(smog, float(camera.centre[2]))
         airlight = smog.rgb
-    composite_kernels.composite_cubemap(
-        rgb.detach().contiguous().numpy(),
-        alpha.detach().contiguous().numpy(),
-        faces.contiguous().numpy(),
-        camera.world_from_camera[:3, :3].numpy().astype(np.float32),
-        *(np.float32(v) for v in (1 / camera.fx, 1 / camera.fy, camera.cx, camera.cy)),
-        np.float32(min(strength, 1e30)),
-        np.asarray(airlight, np.float32),
-        out,
-    )
+    with kernel_threads(ROWS):
+        composite_kernels.composite_cubemap(
+            rgb.detach().contiguous().numpy(),
+            alpha.detach().contiguous().numpy(),
+            faces.contiguous().numpy(),
+            camera.world_from_camera[:3, :3].numpy().astype(np.float32),
+            *(np.float32(v) for v in (1 / camera.fx, 1 / camera.fy, camera.cx, camera.cy)),
+            np.float32(min(strength, 1e30)),
+            np.asarray(airlight, np.float32),
+            out,
+        )
     return torch.from_numpy(out)
 
 
 def quantise(rgb: Float[Tensor, "H W 3"]) -> np.ndarray:
     """uint8 [H, W, 3]: clamped to [0, 1], times 255, rounded to the nearest."""
     if rgb.dtype == torch.float32:
-        threads.prepare()
         out = np.empty(tuple(rgb.shape), np.uint8)
-        composite_kernels.quantise(rgb.detach().contiguous().numpy().reshape(-1), out.reshape(-1))
+        rows = rgb.detach().contiguous().numpy()
+        with kernel_threads(ROWS):
+            composite_kernels.quantise(rows.reshape(len(rows), -1), out.reshape(len(rows), -1))
         return out
     return (rgb.detach().clamp(0, 1) * 255 + 0.5).to(torch.uint8).numpy()

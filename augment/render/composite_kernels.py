@@ -65,8 +65,9 @@ def composite_cubemap(rgb, alpha, faces, rotation, ifx, ify, cx, cy, strength, a
 
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
 def quantise(values, out):
-    """uint8 of flat float32 values: clamped to [0, 1], times 255, rounded to the nearest."""
+    """uint8 of float32 rows: clamped to [0, 1], times 255, rounded to the nearest."""
     half, top = np.float32(0.5), np.float32(255)
-    for i in numba.prange(values.size):
-        value = values[i] * top + half
-        out[i] = np.uint8(min(max(value, np.float32(0)), top))
+    for i in numba.prange(values.shape[0]):
+        for j in range(values.shape[1]):
+            value = values[i, j] * top + half
+            out[i, j] = np.uint8(min(max(value, np.float32(0)), top))

@@ -1,0 +1,44 @@
+"""`climategs demo`: the embedded street under three recipes, and pictures of it."""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+
+from adapters.base import open_scene
+from augment.batch.job import RenderJob, run_job
+from augment.render.cpu import warm_up
+from recipes.load import load_recipe
+from tools.pictures import draw_sheet, draw_video
+
+RECIPES = ("clear", "brown-smog", "dense-fog")
+CAMERA = "front"  # the one that is shown as a video
+
+
+def run_demo(out: Path, frames: int) -> int:
+    """Renders, draws, prints where the pictures are. Returns the exit code."""
+    started = time.perf_counter()
+    uri = f"procedural:street?seed=3&frames={frames}"
+    print(f"building {uri} and compiling the kernels (kept for the next run)", file=sys.stderr)
+    scene = open_scene(uri)
+    warm_up()
+    ready = time.perf_counter()
+    job = RenderJob(
+        scene_uri=uri,
+        recipes=[load_recipe(name).resolve(0) for name in RECIPES],
+        out_dir=out,
+    )
+    result = run_job(job, scene_loader=lambda _uri: scene)
+    for failure in result.failures:
+        print(f"failed: {failure}", file=sys.stderr)
+    pictures = [draw_sheet(out), draw_video(out, CAMERA, frames_per_second=5)]
+    done = time.perf_counter()
+    print(
+        f"{result.written} images written, {result.skipped} already there, {result.failed} failed: "
+        f"{ready - started:.0f} s to build and compile, {done - ready:.0f} s to render and draw"
+    )
+    print(f"images, depth, labels, LiDAR: {out}")
+    print(f"contact sheet:                {pictures[0]}")
+    print(f"video, variants side by side: {pictures[1]}")
+    return 1 if result.failed else 0
