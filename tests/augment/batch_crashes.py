@@ -149,7 +149,7 @@ def sweep_overwrite(folder: Path) -> dict[str, int]:
     old, whole = tree_digest(folder / "old"), tree_digest(folder / "whole")
     kills = 0
     # All that an overwriting run does before it renders is within its first 30 changes.
-    for kill_at in [*range(1, 60, 3), *range(61, 140, 3 * STRIDE)]:
+    for kill_at in [*range(1, 60, 4), *range(61, 140, STRIDE)]:
         out = folder / "killed"
         shutil.copytree(folder / "old", out)
         ended = run_forked(render(job(out, frames=1, overwrite=True)), kill_at)

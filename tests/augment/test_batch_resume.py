@@ -159,6 +159,22 @@ def test_another_recipe_under_the_same_name_is_refused(tmp_path: Path, ended: bo
         run(RenderJob("fake:street", [changed], tmp_path), must_not_render)
     assert tree_digest(tmp_path) == before
 
+    calls = []
+
+    def stops_at_the_third(scene, camera, recipe, *, backend):
+        calls.append(camera.name)
+        if len(calls) == 3:
+            raise SystemExit("stopped without a chance to tidy up")
+        return fake_render(scene, camera, recipe, backend=backend)
+
+    with pytest.raises(SystemExit, match="stopped without"):
+        run(RenderJob("fake:street", [changed], tmp_path, overwrite=True), stops_at_the_third)
+    assert run(RenderJob("fake:street", [changed], tmp_path)).skipped == 2
+    assert {row["recipe_hash"] for row in read_manifest(tmp_path).to_pylist()} == {changed.hash}
+    digest = tree_digest(tmp_path)
+    run(RenderJob("fake:street", [changed], tmp_path / "new"))
+    assert digest == tree_digest(tmp_path / "new")
+
 
 def test_overwriting_replaces_the_variant_and_no_other(tmp_path: Path) -> None:
     run(RenderJob("fake:street", [make_recipe(), make_recipe(variant=1)], tmp_path))
