@@ -1,0 +1,349 @@
+"""Numba kernels: blend every tile's splats front to back.
+
+A tile is worked on in strips one register wide. For a batch of splats, the rows in which each
+ellipse meets the strip are found first (an interval: both are convex), then turned into a flat list
+of (row, splat) items, and one loop without branches blends the items. Strips shrink to the rows in
+which a pixel still lets light through, and a tile ends where none does.
+
+Buffers that are not asked for are None, which the compiler turns into no code at all.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+from augment.render import cpu_simd as v8
+from augment.render.cpu_jit import inner, kernel
+from augment.render.cpu_layout import (
+    BLUE,
+    BLUNT_Y,
+    DEPTH,
+    FALL_X,
+    FALL_Y,
+    GREEN,
+    LANES,
+    LEAN_X,
+    LEAN_Y,
+    LOG_OPACITY,
+    MEAN_X,
+    MEAN_Y,
+    PIXELS,
+    RADIUS_Y,
+    RECORD,
+    RED,
+    SHARP_X,
+    SPLAT_ID,
+    TILE_H,
+    TILE_W,
+    U,
+)
+from augment.render.cpu_math import exp2, fmuladd
+
+BATCH = 32  # splats between two looks at what is still open
+GROUP = 8  # tiles a thread takes at a time
+STRIPS = TILE_W // LANES
+STRIP = TILE_H * LANES  # pixels
+
+# Planes of a tile's state, PIXELS float32 each, strip after strip, row after row. The transmittance
+# is negative where blending has stopped; its size is then the final one.
+THROUGH, P_RED, P_GREEN, P_BLUE, P_DEPTH, P_MEDIAN, P_BEST, P_ID = (U(i * PIXELS) for i in range(8))
+STATE, COLOR_STATE = 8 * PIXELS, 4 * PIXELS  # all planes; those of colour and alpha alone
+
+CLOSED, OPEN, FRESH = 0, 1, 2  # a tile: finished, begun, not begun
+_ITEMS = BATCH * TILE_H + TILE_H
+
+
+@kernel()
+def blend_tiles(
+    records,
+    members,
+    starts,
+    tiles,
+    states,
+    is_last,
+    size,
+    limits,
+    rgb,
+    alpha,
+    expected,
+    median,
+    ids,
+):
+    """Blend one slice of z into every open tile; write the pixels of those that end.
+
+    records: flat float32. members, starts: lists of slots. tiles: uint8 [tiles], CLOSED, OPEN or
+    FRESH, updated. states: float32 [tiles * used part of STATE], where open tiles wait for the
+    next slice. size: image width and height. limits: float32, alpha_max, log2(ALPHA_MIN), TRANSMITTANCE_STOP.
+    """
+    columns = (size[0] + TILE_W - 1) // TILE_W
+    used = states.size // tiles.size
+    for group in numba.prange((tiles.size + GROUP - 1) // GROUP):
+        state = np.empty(STATE, np.float32)
+        staged = np.empty(RECORD * BATCH, np.float32)
+        spans = np.empty(2 * BATCH, np.int32)
+        values = np.empty(2 * _ITEMS, np.float32)
+        places = np.empty(2 * _ITEMS, np.int32)
+        rows = np.empty(2 * STRIPS, np.int64)
+        for tile in range(group * GROUP, min((group + 1) * GROUP, tiles.size)):
+            first, last = starts[tile], starts[tile + 1]
+            if tiles[tile] == CLOSED or (first == last and not is_last):
+                continue
+            left, top = tile % columns * TILE_W, tile // columns * TILE_H
+            if tiles[tile] == FRESH:
+                _clear(state, used, size[0] - left, size[1] - top)
+            else:
+                _copy(states, U(tile * used), state, U(0), U(used))
+            is_open = _blend_list(
+                records, members, first, last, np.float32(left), np.float32(top), limits,
+                state, staged, spans, values, places, rows, rgb, expected, median, ids,
+            )  # fmt: skip
+            if is_open and not is_last:
+                _copy(state, U(0), states, U(tile * used), U(used))
+                tiles[tile] = OPEN
+            else:
+                _write_pixels(state, left, top, size, rgb, alpha, expected, median, ids)
+                tiles[tile] = CLOSED
+
+
+@inner()
+def _copy(source, source_at, target, target_at, count):
+    for i in range(U(0), count, U(LANES)):
+        v8.store(target, target_at + i, v8.load(source, source_at + i))
+
+
+@inner()
+def _clear(state, used, width, height):
+    """A tile before the first splat; pixels beyond the image count as finished."""
+    nobody = np.int32(-1).view(np.float32)
+    for i in range(U(0), U(used), U(LANES)):
+        value = np.float32(1) if i < P_RED else nobody if i >= P_ID else np.float32(0)
+        v8.store(state, i, v8.splat(value))
+    if width < TILE_W or height < TILE_H:
+        for pixel in range(PIXELS):
+            x = pixel // STRIP * LANES + pixel % LANES
+            y = pixel % STRIP // LANES
+            if x >= width or y >= height:
+                state[pixel] = np.float32(-1)
+
+
+@inner()
+def _blend_list(
+    records,
+    members,
+    first,
+    last,
+    left,
+    top,
+    limits,
+    state,
+    staged,
+    spans,
+    values,
+    places,
+    rows,
+    rgb,
+    expected,
+    median,
+    ids,
+):
+    """Blend a tile's list into its state. Returns whether any pixel still lets light through."""
+    for strip in range(STRIPS):
+        rows[2 * strip], rows[2 * strip + 1] = 0, TILE_H
+        _shrink(state, strip, rows)
+    for at in range(first, last, BATCH):
+        if _is_closed(rows):
+            return False
+        count = min(BATCH, last - at)
+        for k in range(U(at + count), U(min(at + 2 * BATCH, last))):
+            v8.prefetch(records, U(members[k]) * U(RECORD))
+        _stage(records, members, U(at), U(count), left, top, rgb, expected, median, ids, staged)
+        for strip in range(STRIPS):
+            if rows[2 * strip] >= rows[2 * strip + 1]:
+                continue
+            _find_spans(staged, U(count), strip, rows, limits[1], spans)
+            items = _list_items(staged, U(count), strip, spans, values, places)
+            if items > U(0):
+                _blend_items(
+                    state, staged, values, places, items, limits, rgb, expected, median, ids
+                )
+                _shrink(state, strip, rows)
+    return not _is_closed(rows)
+
+
+@inner()
+def _is_closed(rows):
+    for strip in range(STRIPS):
+        if rows[2 * strip] < rows[2 * strip + 1]:
+            return False
+    return True
+
+
+@inner()
+def _shrink(state, strip, rows):
+    """Leave out a strip's first and last rows while no pixel of them is open."""
+    low, high = rows[2 * strip], rows[2 * strip + 1]
+    base = strip * STRIP
+    while low < high and not v8.any_not_negative(v8.load(state, U(base + low * LANES))):
+        low += 1
+    while low < high and not v8.any_not_negative(v8.load(state, U(base + (high - 1) * LANES))):
+        high -= 1
+    rows[2 * strip], rows[2 * strip + 1] = low, high
+
+
+@inner()
+def _stage(records, members, at, count, left, top, rgb, expected, median, ids, staged):
+    """Records of a batch, turned to one row a field, relative to the tile's corner."""
+    n = U(BATCH)
+    for k in range(count):
+        record = U(members[at + k]) * U(RECORD)
+        staged[U(MEAN_X) * n + k] = records[record + U(MEAN_X)] - left
+        staged[U(MEAN_Y) * n + k] = records[record + U(MEAN_Y)] - top
+        for field in range(U(LEAN_X), U(BLUNT_Y + 1)):
+            staged[field * n + k] = records[record + field]
+        if expected is not None or median is not None:
+            staged[U(DEPTH) * n + k] = records[record + U(DEPTH)]
+        if ids is not None:
+            staged[U(SPLAT_ID) * n + k] = records[record + U(SPLAT_ID)]
+        if rgb is not None:
+            staged[U(RED) * n + k] = records[record + U(RED)]
+            staged[U(GREEN) * n + k] = records[record + U(GREEN)]
+            staged[U(BLUE) * n + k] = records[record + U(BLUE)]
+
+
+@inner()
+def _find_spans(staged, count, strip, rows, log_cut, spans):
+    """Rows in which each ellipse meets the strip: first, and one past the last.
+
+    An ellipse is highest where its ridge says (LEAN_X RADIUS_Y from its mean), or, where that
+    column lies outside the strip, in the strip's nearest column.
+    """
+    zero, half = np.float32(0), np.float32(0.5)
+    n = U(BATCH)
+    west = np.float32(strip * LANES) + half
+    east = west + np.float32(LANES - 1)
+    low, high = np.float32(rows[2 * strip]), np.float32(rows[2 * strip + 1])
+    for k in range(count):
+        mean_x, mean_y = staged[k], staged[n + k]
+        budget = staged[U(LOG_OPACITY) * n + k] - log_cut
+        top = staged[U(LEAN_X) * n + k] * staged[U(RADIUS_Y) * n + k]
+        fall, lean = staged[U(FALL_X) * n + k], staged[U(LEAN_Y) * n + k]
+        blunt = staged[U(BLUNT_Y) * n + k]
+        d = min(max(top, west - mean_x), east - mean_x)
+        left_over = fmuladd(-fall * d, d, budget)
+        reach = math.sqrt(max(left_over, zero)) * blunt
+        end = fmuladd(lean, d, mean_y) + reach + half
+        end = end if left_over >= zero else zero
+        d = min(max(-top, west - mean_x), east - mean_x)
+        left_over = fmuladd(-fall * d, d, budget)
+        reach = math.sqrt(max(left_over, zero)) * blunt
+        begin = min(max(fmuladd(lean, d, mean_y) - reach + half, low), high)
+        spans[k] = np.int32(begin)
+        spans[n + k] = np.int32(max(min(end, high), begin))
+
+
+@inner()
+def _list_items(staged, count, strip, spans, values, places):
+    """One item for every (row, splat), in the order of the splats; returns how many.
+
+    An item says where its row of pixels stands in the state, which splat it is, the log2 of alpha
+    on the splat's ridge in that row, and how many (sharp) pixels the row's first one is off it.
+    A tile's height is always written and the surplus overwritten, which needs no branch.
+    """
+    n, items = U(BATCH), U(0)
+    half = np.float32(0.5)
+    first_x = np.float32(strip * LANES) + half
+    for k in range(count):
+        row, end = spans[k], spans[n + k]
+        sharp = staged[U(SHARP_X) * n + k]
+        fall = v8.splat(-staged[U(FALL_Y) * n + k])
+        peak = v8.splat(staged[U(LOG_OPACITY) * n + k])
+        start = v8.splat(sharp * (first_x - staged[k]))
+        step = v8.splat(-sharp * staged[U(LEAN_X) * n + k])
+        y = np.float32(row) + half - staged[n + k]
+        place = np.int32(strip * STRIP) + row * np.int32(LANES)
+        for j in range(0, TILE_H, LANES):
+            dy = v8.lane_numbers() + v8.splat(y + np.float32(j))
+            at = items + U(j)
+            v8.store(values, at, v8.fmuladd(fall * dy, dy, peak))
+            v8.store(values, at + U(_ITEMS), v8.fmuladd(step, dy, start))
+            v8.store_ramp(places, at, np.int32(k), np.int32(0))
+            v8.store_ramp(places, at + U(_ITEMS), np.int32(place + j * LANES), np.int32(LANES))
+        items += U(end - row)
+    return items
+
+
+@inner()
+def _blend_items(state, staged, values, places, items, limits, rgb, expected, median, ids):
+    """Blend all items in turn. The next one's alpha is begun before this one is blended."""
+    alpha_max, log_cut = v8.splat(limits[0]), v8.splat(limits[1])
+    stop, zero, half = v8.splat(limits[2]), v8.splat(np.float32(0)), v8.splat(np.float32(0.5))
+    n = U(BATCH)
+    places[items] = 0  # one item is read beyond the last
+    splat = U(places[0])
+    alpha = _alpha(staged, values, splat, U(0), alpha_max, log_cut)
+    for item in range(items):
+        following = U(places[item + U(1)])
+        next_alpha = _alpha(staged, values, following, item + U(1), alpha_max, log_cut)
+        at = U(places[item + U(_ITEMS)])
+        through = v8.load(state, at)
+        weight = alpha * through
+        after = through - weight
+        kept = v8.greater(after, stop)
+        weight = v8.select(kept, weight, zero)
+        v8.store(state, at, v8.select(kept, after, v8.minus_abs(through)))
+        if rgb is not None:
+            _add(state, at + P_RED, weight, staged[U(RED) * n + splat])
+            _add(state, at + P_GREEN, weight, staged[U(GREEN) * n + splat])
+            _add(state, at + P_BLUE, weight, staged[U(BLUE) * n + splat])
+        if expected is not None:
+            _add(state, at + P_DEPTH, weight, staged[U(DEPTH) * n + splat])
+        if median is not None:
+            crossed = v8.both(v8.at_least(through, half), v8.greater(half, after))
+            depth = v8.splat(staged[U(DEPTH) * n + splat])
+            before = v8.load(state, at + P_MEDIAN)
+            v8.store(state, at + P_MEDIAN, v8.select(v8.both(crossed, kept), depth, before))
+        if ids is not None:
+            best = v8.load(state, at + P_BEST)
+            heavier = v8.greater(weight, best)
+            v8.store(state, at + P_BEST, v8.select(heavier, weight, best))
+            number = v8.splat(staged[U(SPLAT_ID) * n + splat])
+            v8.store(state, at + P_ID, v8.select(heavier, number, v8.load(state, at + P_ID)))
+        alpha, splat = next_alpha, following
+
+
+@inner()
+def _alpha(staged, values, splat, item, alpha_max, log_cut):
+    sharp = v8.splat(staged[U(SHARP_X) * U(BATCH) + splat])
+    off = v8.fmuladd(sharp, v8.lane_numbers(), v8.splat(values[item + U(_ITEMS)]))
+    e = v8.fmuladd(v8.negate(off), off, v8.splat(values[item]))
+    alpha = v8.minimum(exp2(e), alpha_max)
+    return v8.select(v8.at_least(e, log_cut), alpha, v8.splat(np.float32(0)))
+
+
+@inner()
+def _add(state, at, weight, value):
+    v8.store(state, at, v8.fmuladd(weight, v8.splat(value), v8.load(state, at)))
+
+
+@inner()
+def _write_pixels(state, left, top, size, rgb, alpha, expected, median, ids):
+    for y in range(min(TILE_H, size[1] - top)):
+        for x in range(min(TILE_W, size[0] - left)):
+            at = U(x // LANES * STRIP + y * LANES + x % LANES)
+            row, column = top + y, left + x
+            opacity = np.float32(1) - abs(state[at])
+            if alpha is not None:
+                alpha[row, column] = opacity
+            if rgb is not None:
+                rgb[row, column, 0] = state[at + P_RED]
+                rgb[row, column, 1] = state[at + P_GREEN]
+                rgb[row, column, 2] = state[at + P_BLUE]
+            if expected is not None:
+                expected[row, column] = state[at + P_DEPTH] / max(opacity, np.float32(1e-10))
+            if median is not None:
+                median[row, column] = state[at + P_MEDIAN]
+            if ids is not None:
+                ids[row, column] = np.float32(state[at + P_ID]).view(np.int32)

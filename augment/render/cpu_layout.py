@@ -1,0 +1,47 @@
+"""How the CPU kernels lay out what they hand to each other.
+
+Arrays are flat and indices unsigned, which is what lets the compiler keep loops simple.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+U = np.uint64
+LANES = 8  # pixels or splats in one register
+
+# Gaussians are worked on in blocks: one piece of work for a thread, whose results (128 KB) stay in
+# its cache.
+BLOCK = 2048
+BIN_SHIFT = 18  # z is counted in bins of its float32 pattern without these low bits: 3 % wide
+BINS = 0x7F800000 >> BIN_SHIFT
+
+# A tile is TILE_W / LANES strips of one register's width.
+TILE_W, TILE_H = 16, 16
+PIXELS = TILE_W * TILE_H
+
+# A splat's record: RECORD float32, one cache line. With u = x - MEAN_X - LEAN_X (y - MEAN_Y),
+# pixels, the log2 of its alpha is
+#     e = LOG_OPACITY - (SHARP_X u)^2 - FALL_Y (y - MEAN_Y)^2,
+# the conic with its square completed along a row, so that no term can cancel another. FALL_X,
+# LEAN_Y and BLUNT_Y (1 / sharpness) say the same along a column.
+RECORD = 16
+MEAN_X, MEAN_Y, LEAN_X, SHARP_X, FALL_Y, LOG_OPACITY = 0, 1, 2, 3, 4, 5
+RADIUS_Y, FALL_X, LEAN_Y, BLUNT_Y, DEPTH = 6, 7, 8, 9, 10
+SPLAT_ID, RED, GREEN, BLUE = 11, 12, 13, 14
+
+# A view: VIEW float32 for every part of the scene.
+V_ROTATION = 0  # camera_from_part, 9 numbers, row by row
+V_EYE = 9  # camera centre in the part, 3, and the 3 remainders that float32 could not hold
+V_FOCAL, V_CENTRE, V_SIZE = 15, 17, 19  # pixels, x and y each
+V_LOW, V_HIGH = 21, 23  # limits of x/z and y/z in the Jacobian
+V_GAIN = 25  # most that a semi-axis of one metre can reach at z = 1, pixels, in x and y
+V_NEAR, V_BLUR, V_ALPHA_MIN, V_LOG_CUT = 27, 28, 29, 30
+V_SIGMA, V_AIRLIGHT = 31, 32  # smog: extinction, and 3 of display-encoded colour
+V_EYE_HEIGHT, V_UP = 35, 36  # camera and part axes upwards, in scale heights: 1 and 3
+VIEW = 40
+
+# How to project: int64 each.
+M_COLOR, M_FUNCTIONS, M_ANTIALIASED, M_SMOG = 0, 1, 2, 3  # M_FUNCTIONS: most SH functions
+MODES = 4
+NO_SMOG, UNIFORM_SMOG, LAYERED_SMOG = 0, 1, 2

@@ -1,0 +1,372 @@
+"""Numba kernels: Gaussians of all parts to splats of one image.
+
+Two steps, so that what nearer splats hide is never projected: `rank_splats` finds z and a generous
+box, `project_slice` does the rest for the splats of one range of z, if a tile they touch is still
+open. Both take Gaussians eight at a time.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+from augment.render import cpu_simd as v8
+from augment.render.cpu_color import COLOR_ROWS, prepare_colors, write_color
+from augment.render.cpu_jit import inner, kernel
+from augment.render.cpu_layout import (
+    BIN_SHIFT,
+    BLOCK,
+    BLUNT_Y,
+    DEPTH,
+    FALL_X,
+    FALL_Y,
+    LANES,
+    LEAN_X,
+    LEAN_Y,
+    LOG_OPACITY,
+    M_ANTIALIASED,
+    M_COLOR,
+    M_FUNCTIONS,
+    M_SMOG,
+    MEAN_X,
+    MEAN_Y,
+    RADIUS_Y,
+    RECORD,
+    SHARP_X,
+    SPLAT_ID,
+    TILE_H,
+    TILE_W,
+    V_ALPHA_MIN,
+    V_BLUR,
+    V_CENTRE,
+    V_EYE,
+    V_FOCAL,
+    V_GAIN,
+    V_HIGH,
+    V_LOG_CUT,
+    V_LOW,
+    V_NEAR,
+    V_ROTATION,
+    V_SIZE,
+    U,
+)
+from augment.render.cpu_math import LOG2_E, floats_at, log2
+
+# Rows of eight that the projection leaves for writing: a record, the pixels a splat covers, colour.
+_COLOR = 0
+_X_LO, _X_HI, _Y_LO, _Y_HI = (COLOR_ROWS + i for i in range(4))
+_FIELDS = COLOR_ROWS + 4
+_ROWS = _FIELDS + DEPTH + 1
+_HUGE = np.float32(1e37)  # px^2; beyond it float32 overflows, and no pixel could tell
+
+
+@kernel()
+def rank_splats(addresses, sizes, views, blocks, depths, histograms):
+    """z of every Gaussian that may be seen, 0 for the others, and where along z the image is paid.
+
+    addresses: uint64 [P, 5] of means, quats, scales, opacities, sh. sizes: int64 [P, 2], Gaussians
+    and SH functions. views: float32 [P, VIEW]. blocks: int64 [B, 3], part, first and last + 1.
+    depths: float32 [B BLOCK]. histograms: float64 [C, BINS], each of C runs of blocks its own:
+    opacity times area, px^2.
+    """
+    runs, total = histograms.shape[0], blocks.shape[0]
+    for run in numba.prange(runs):
+        picked = np.empty(LANES, np.int32)
+        areas = np.empty(LANES, np.float32)
+        histogram = histograms[run]
+        for z_bin in range(histogram.shape[1]):
+            histogram[0, z_bin] = histogram[1, z_bin] = 0
+        for block in range(total * run // runs, total * (run + 1) // runs):
+            part, first, last = blocks[block]
+            count = sizes[part, 0]
+            means = floats_at(addresses[part, 0], count * 3)
+            scales = floats_at(addresses[part, 2], count * 3)
+            opacities = floats_at(addresses[part, 3], count)
+            at = block * BLOCK
+            for group in range(first, last, LANES):
+                for lane in range(LANES):
+                    picked[lane] = min(group + lane, last - 1)
+                _rank_eight(means, scales, opacities, views[part], picked, depths, U(at), areas)
+                for lane in range(min(LANES, last - group)):
+                    z = depths[at + lane]
+                    if z > 0:
+                        z_bin = np.float32(z).view(np.int32) >> BIN_SHIFT
+                        histogram[0, z_bin] += areas[lane]
+                        histogram[1, z_bin] += 1
+                at += LANES
+
+
+@inner()
+def _rank_eight(means, scales, opacities, view, picked, depths, at, areas):
+    zero, two = v8.splat(np.float32(0)), v8.splat(np.float32(2))
+    d = _from_eye(means, picked, U(0), view)
+    x, y, z = _to_camera(d, view)
+    inverse = v8.splat(np.float32(1)) / z
+    x, y = _to_image(x, y, inverse, view)
+    s0, s1, s2 = _gather3(scales, picked, U(0))
+    opacity = v8.gather(opacities, picked, U(0), U(1), U(0))
+    # No direction of an ellipsoid is longer than its longest axis, and no blur wider than 2 px.
+    reach = v8.maximum(s0, v8.maximum(s1, s2)) * inverse
+    far_x = v8.fmuladd(v8.splat(view[V_GAIN]), reach, two)
+    far_y = v8.fmuladd(v8.splat(view[V_GAIN + 1]), reach, two)
+    seen = v8.both(
+        v8.at_least(z, v8.splat(view[V_NEAR])),
+        v8.at_least(opacity, v8.splat(view[V_ALPHA_MIN])),
+    )
+    seen = v8.both(seen, v8.at_least(x + far_x, zero))
+    seen = v8.both(seen, v8.at_least(v8.splat(view[V_SIZE]) - x + far_x, zero))
+    seen = v8.both(seen, v8.at_least(y + far_y, zero))
+    seen = v8.both(seen, v8.at_least(v8.splat(view[V_SIZE + 1]) - y + far_y, zero))
+    v8.store(depths, at, v8.select(seen, z, zero))
+    # Mean over all directions of the ellipse's area, 2 pi sigma^2; it only cuts z into slices.
+    squares = s0 * s1 + s1 * s2 + s0 * s2
+    focal = v8.splat(view[V_FOCAL] * view[V_FOCAL + 1] * np.float32(2 * math.pi / 3))
+    area = v8.fmuladd(focal * squares, inverse * inverse, two) * opacity
+    v8.store(areas, U(0), v8.minimum(area, v8.splat(view[V_SIZE] * view[V_SIZE + 1])))
+
+
+@inner()
+def _gather3(array, picked, at):
+    """Rows of a [N, 3] array."""
+    first = v8.gather(array, picked, at, U(3), U(0))
+    second = v8.gather(array, picked, at, U(3), U(1))
+    return first, second, v8.gather(array, picked, at, U(3), U(2))
+
+
+@inner()
+def _from_eye(means, picked, at, view):
+    """Means minus the camera's centre, in the part's axes: first of all, so that digits are kept."""
+    x, y, z = _gather3(means, picked, at)
+    x = x - v8.splat(view[V_EYE]) - v8.splat(view[V_EYE + 3])
+    y = y - v8.splat(view[V_EYE + 1]) - v8.splat(view[V_EYE + 4])
+    z = z - v8.splat(view[V_EYE + 2]) - v8.splat(view[V_EYE + 5])
+    return x, y, z
+
+
+@inner()
+def _dot(ax, ay, az, bx, by, bz):
+    return v8.fmuladd(ax, bx, v8.fmuladd(ay, by, az * bz))
+
+
+@inner()
+def _rotation_row(view, row):
+    at = U(V_ROTATION) + U(3) * row
+    return v8.splat(view[at]), v8.splat(view[at + U(1)]), v8.splat(view[at + U(2)])
+
+
+@inner()
+def _to_camera(d, view):
+    r, s, t = _rotation_row(view, U(0)), _rotation_row(view, U(1)), _rotation_row(view, U(2))
+    x = _dot(r[0], r[1], r[2], d[0], d[1], d[2])
+    y = _dot(s[0], s[1], s[2], d[0], d[1], d[2])
+    return x, y, _dot(t[0], t[1], t[2], d[0], d[1], d[2])
+
+
+@inner()
+def _to_image(x, y, inverse, view):
+    x = v8.fmuladd(v8.splat(view[V_FOCAL]) * x, inverse, v8.splat(view[V_CENTRE]))
+    return x, v8.fmuladd(v8.splat(view[V_FOCAL + 1]) * y, inverse, v8.splat(view[V_CENTRE + 1]))
+
+
+@kernel()
+def project_slice(
+    addresses,
+    sizes,
+    views,
+    blocks,
+    first_ids,
+    depths,
+    z_range,
+    open_sums,
+    modes,
+    records,
+    rects,
+    keys,
+    counts,
+):
+    """Splats of the Gaussians with z_range[0] <= z < z_range[1] that touch an open tile.
+
+    Block b owns records [b BLOCK, (b + 1) BLOCK) and writes counts[b] of them, RECORD float32 each,
+    in the order of its Gaussians, with the tiles they touch: rects, uint16 [B BLOCK, 4], column and
+    row of the first and of the last, and the bits of their z: keys, uint32 [B BLOCK]. first_ids:
+    int64 [P]. open_sums: int32 [rows + 1,
+    columns + 1], number of open tiles above and left. modes: int64 [MODES].
+    """
+    for block in numba.prange(blocks.shape[0]):
+        part, first, last = blocks[block]
+        picked = np.empty(BLOCK + LANES, np.int32)
+        rows = np.empty(_ROWS * LANES, np.float32)
+        base = block * BLOCK
+        found = _pick_range(depths, base, first, last, z_range, picked)
+        count, functions = sizes[part]
+        means = floats_at(addresses[part, 0], count * 3)
+        quats = floats_at(addresses[part, 1], count * 4)
+        scales = floats_at(addresses[part, 2], count * 3)
+        opacities = floats_at(addresses[part, 3], count)
+        sh = floats_at(addresses[part, 4], count * functions * 3)
+        used = min(modes[M_FUNCTIONS], functions)
+        slot = base
+        for at in range(0, found, LANES):
+            _project_eight(
+                means, quats, scales, opacities, views[part], picked, U(at), used, modes, rows
+            )
+            for lane in range(U(min(LANES, found - at))):
+                if not _touches_open(rows, lane, open_sums, rects, slot):
+                    continue
+                record = U(slot * RECORD)
+                for field in range(U(DEPTH + 1)):
+                    records[record + field] = rows[(U(_FIELDS) + field) * U(LANES) + lane]
+                splat = picked[U(at) + lane]
+                number = first_ids[part] + splat
+                records[record + U(SPLAT_ID)] = np.int32(number).view(np.float32)
+                if modes[M_COLOR]:
+                    coefficients = U(splat) * U(functions * 3)
+                    write_color(
+                        sh, coefficients, used, views[part], modes[M_SMOG], rows, lane, records,
+                        record,
+                    )  # fmt: skip
+                z = rows[U((_FIELDS + DEPTH) * LANES) + lane]
+                keys[slot] = np.float32(z).view(np.uint32)
+                slot += 1
+        counts[block] = slot - base
+
+
+@inner()
+def _pick_range(depths, base, first, last, z_range, picked):
+    """Numbers of a block's Gaussians in the range of z, filled up to whole groups of eight."""
+    low, high = z_range[0], z_range[1]
+    found = 0
+    for i in range(U(last - first)):
+        z = depths[U(base) + i]
+        picked[found] = np.int32(first + i)
+        found += int(z >= low and z < high)
+    for lane in range(LANES):
+        picked[found + lane] = picked[max(found - 1, 0)]
+    return found
+
+
+@inner()
+def _touches_open(rows, lane, open_sums, rects, slot):
+    """Whether a splat covers a pixel centre and one of its tiles is open; writes its tiles."""
+    x_lo, x_hi = rows[U(_X_LO * LANES) + lane], rows[U(_X_HI * LANES) + lane]
+    y_lo, y_hi = rows[U(_Y_LO * LANES) + lane], rows[U(_Y_HI * LANES) + lane]
+    if not (x_lo <= x_hi and y_lo <= y_hi):
+        return False
+    c0, c1 = np.int64(x_lo) // TILE_W, np.int64(x_hi) // TILE_W
+    r0, r1 = np.int64(y_lo) // TILE_H, np.int64(y_hi) // TILE_H
+    rects[slot, 0], rects[slot, 1], rects[slot, 2], rects[slot, 3] = c0, r0, c1, r1
+    inside = open_sums[r1 + 1, c1 + 1] - open_sums[r0, c1 + 1]
+    return inside - open_sums[r1 + 1, c0] + open_sums[r0, c0] > 0
+
+
+@inner()
+def _project_eight(means, quats, scales, opacities, view, picked, at, functions, modes, rows):
+    """Records, pixel boxes and colour rows of eight Gaussians, side by side in `rows`."""
+    d = _from_eye(means, picked, at, view)
+    if modes[M_COLOR]:
+        prepare_colors(d[0], d[1], d[2], view, functions, modes[M_SMOG], rows)
+    x, y, z = _to_camera(d, view)
+    inverse = v8.splat(np.float32(1)) / z
+    xx, xy, yy, minors = _image_covariance(quats, scales, picked, at, x, y, inverse, view)
+
+    one, half = v8.splat(np.float32(1)), v8.splat(np.float32(0.5))
+    blur, k = v8.splat(view[V_BLUR]), v8.splat(np.float32(0.5) * LOG2_E)
+    blurred_x, blurred_y = xx + blur, yy + blur
+    inverse_y, inverse_x = one / blurred_y, one / blurred_x
+    # Variance along a row, det / yy. minors = det / yy before the blur, so nothing overflows.
+    along = blur + v8.fmuladd(blur * xx, inverse_y, minors)
+    log_opacity = log2(v8.gather(opacities, picked, at, U(1), U(0)))
+    if modes[M_ANTIALIASED]:
+        log_opacity = v8.fmuladd(half, log2(minors / along), log_opacity)
+    log_cut = v8.splat(view[V_LOG_CUT])
+    budget = v8.maximum(log_opacity - log_cut, v8.splat(np.float32(0))) / k
+    radius_x, radius_y = v8.sqrt(budget * blurred_x), v8.sqrt(budget * blurred_y)
+
+    mean_x, mean_y = _to_image(x, y, inverse, view)
+    drawn = v8.both(
+        v8.at_least(log_opacity, log_cut), v8.at_least(v8.splat(_HUGE), blurred_x + blurred_y)
+    )
+    _write_box(mean_x, radius_x, v8.splat(view[V_SIZE]), drawn, U(_X_LO), U(_X_HI), rows)
+    _write_box(mean_y, radius_y, v8.splat(view[V_SIZE + 1]), drawn, U(_Y_LO), U(_Y_HI), rows)
+    _write(rows, U(MEAN_X), mean_x)
+    _write(rows, U(MEAN_Y), mean_y)
+    _write(rows, U(LEAN_X), xy * inverse_y)
+    _write(rows, U(SHARP_X), v8.sqrt(k / along))
+    _write(rows, U(FALL_Y), k * inverse_y)
+    _write(rows, U(LOG_OPACITY), log_opacity)
+    _write(rows, U(RADIUS_Y), radius_y)
+    _write(rows, U(FALL_X), k * inverse_x)
+    _write(rows, U(LEAN_Y), xy * inverse_x)
+    _write(rows, U(BLUNT_Y), v8.sqrt(along * blurred_y * inverse_x / k))
+    _write(rows, U(DEPTH), z)
+
+
+@inner()
+def _write(rows, field, value):
+    v8.store(rows, (U(_FIELDS) + field) * U(LANES), value)
+
+
+@inner()
+def _write_box(mean, radius, size, drawn, low, high, rows):
+    """First and last pixel whose centre lies within the radius; the last below where none does."""
+    zero, half = v8.splat(np.float32(0)), v8.splat(np.float32(0.5))
+    one = v8.splat(np.float32(1))
+    first = v8.maximum(mean - radius - half, zero)
+    last = v8.minimum(mean + radius - half, size - one)
+    v8.store(rows, low * U(LANES), v8.negate(v8.floor(v8.negate(first))))
+    v8.store(rows, high * U(LANES), v8.select(drawn, v8.floor(last), v8.negate(one)))
+
+
+@inner()
+def _image_covariance(quats, scales, picked, at, x, y, inverse, view):
+    """xx, xy, yy in px^2, not blurred, and det / (yy + blur), of which no digits cancel."""
+    r, s, t = _rotation_row(view, U(0)), _rotation_row(view, U(1)), _rotation_row(view, U(2))
+    u = v8.minimum(v8.maximum(x * inverse, v8.splat(view[V_LOW])), v8.splat(view[V_HIGH]))
+    v = v8.minimum(v8.maximum(y * inverse, v8.splat(view[V_LOW + 1])), v8.splat(view[V_HIGH + 1]))
+    fx, fy = v8.splat(view[V_FOCAL]) * inverse, v8.splat(view[V_FOCAL + 1]) * inverse
+    # Rows of the Jacobian times the view's rotation.
+    jx = fx * (r[0] - u * t[0]), fx * (r[1] - u * t[1]), fx * (r[2] - u * t[2])
+    jy = fy * (s[0] - v * t[0]), fy * (s[1] - v * t[1]), fy * (s[2] - v * t[2])
+    m = _rotation_from_quats(quats, picked, at)
+    s0, s1, s2 = _gather3(scales, picked, at)
+    # Semi-axes in the image: px of each axis of the ellipsoid, right and down.
+    x0 = s0 * _dot(jx[0], jx[1], jx[2], m[0], m[3], m[6])
+    x1 = s1 * _dot(jx[0], jx[1], jx[2], m[1], m[4], m[7])
+    x2 = s2 * _dot(jx[0], jx[1], jx[2], m[2], m[5], m[8])
+    y0 = s0 * _dot(jy[0], jy[1], jy[2], m[0], m[3], m[6])
+    y1 = s1 * _dot(jy[0], jy[1], jy[2], m[1], m[4], m[7])
+    y2 = s2 * _dot(jy[0], jy[1], jy[2], m[2], m[5], m[8])
+    xx, xy, yy = (
+        _dot(x0, x1, x2, x0, x1, x2),
+        _dot(x0, x1, x2, y0, y1, y2),
+        _dot(y0, y1, y2, y0, y1, y2),
+    )
+    # Lagrange's identity, det = |x cross y|^2, each term divided before it is squared.
+    scale = v8.splat(np.float32(1)) / v8.sqrt(yy + v8.splat(view[V_BLUR]))
+    c0, c1, c2 = (
+        (x1 * y2 - x2 * y1) * scale,
+        (x2 * y0 - x0 * y2) * scale,
+        (x0 * y1 - x1 * y0) * scale,
+    )
+    return xx, xy, yy, _dot(c0, c1, c2, c0, c1, c2)
+
+
+@inner()
+def _rotation_from_quats(quats, picked, at):
+    """Rotation matrices, row by row, of unit quaternions wxyz."""
+    one, two = v8.splat(np.float32(1)), v8.splat(np.float32(2))
+    w, x = v8.gather(quats, picked, at, U(4), U(0)), v8.gather(quats, picked, at, U(4), U(1))
+    y, z = v8.gather(quats, picked, at, U(4), U(2)), v8.gather(quats, picked, at, U(4), U(3))
+    return (
+        one - two * (y * y + z * z),
+        two * (x * y - w * z),
+        two * (x * z + w * y),
+        two * (x * y + w * z),
+        one - two * (x * x + z * z),
+        two * (y * z - w * x),
+        two * (x * z - w * y),
+        two * (y * z + w * x),
+        one - two * (x * x + y * y),
+    )
