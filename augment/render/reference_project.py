@@ -8,6 +8,7 @@ thresholds of gsplat 1.5.3.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -47,6 +48,17 @@ class Splats:
         """The splats at the given indices or mask, in that order."""
         fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
         return Splats(**{k: None if v is None else v[index] for k, v in fields.items()})
+
+    def split(self, sizes: list[int] | int) -> list[Splats]:
+        """Consecutive runs of the splats, of the given sizes, as views."""
+        columns = {}
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            columns[field.name] = itertools.repeat(None) if value is None else value.split(sizes)
+        return [
+            Splats(**dict(zip(columns, run, strict=True)))
+            for run in zip(*columns.values(), strict=False)
+        ]
 
 
 def project_parts(
