@@ -1,21 +1,23 @@
 """How far each smog model is from the truth: splats under smog against exact per-pixel smog.
 
-The street's surfaces are known, so the exact distance d of every pixel is. The exact picture is
-t(d) c + (1 - t(d)) airlight, with c the clean splat render, so that what is compared is the smog and
-not the splats' colour. Silhouettes, where a pixel shows two distances, are counted separately.
+The street's surfaces are known, and so is the exact distance d of every pixel. The exact picture
+is t(d) c + (1 - t(d)) airlight, with c the clean splat render, so that what is compared is the
+smog and not the splats' colour. Silhouettes, where a pixel shows two distances, count separately.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
 import numpy as np
 import torch
+from tqdm import tqdm
 
 from adapters.base import open_scene
-from adapters.street.truth import StreetTruth, open_truth
+from adapters.street.truth import StreetTruth, TrueView, open_truth
 from augment.apply import render_buffers
 from augment.cameras import Camera
 from augment.plan import make_plan
@@ -40,6 +42,16 @@ SMOOTH = 5  # px: a pixel is away from silhouettes where this square around it i
 SMOOTH_DEPTH = 0.1  # largest relative change of depth within that square
 
 
+@dataclass(frozen=True, eq=False)
+class TruthView:
+    """A camera's clean splat render and the exact picture of the same surfaces."""
+
+    camera: Camera
+    clean: torch.Tensor
+    exact: TrueView
+    regions: dict[str, np.ndarray]
+
+
 def bench_smog(
     query: dict[str, str] | None = None,
     cameras: Sequence[str] = ("front", "left", "back"),
@@ -51,9 +63,10 @@ def bench_smog(
     query = {"seed": "3"} if query is None else query
     uri = "procedural:street?" + "&".join(f"{k}={v}" for k, v in query.items())
     scene, truth = open_scene(uri), open_truth(query)
-    views = [scene.frame(f).cameras[c].scaled(scale) for f in frames for c in cameras]
+    wanted = [scene.frame(f).cameras[c].scaled(scale) for f in frames for c in cameras]
+    views = [truth_view(scene, truth, camera, backend) for camera in tqdm(wanted, unit="view")]
     results = [
-        _measure(name, model, smog, scene, truth, views, backend)
+        _measure(name, smog.model_copy(update={"model": model}), scene, views, backend)
         for name, smog in SMOGS.items()
         for model in ("per_gaussian", "deferred")
     ]
@@ -61,18 +74,12 @@ def bench_smog(
 
 
 def _measure(
-    name: str,
-    model: str,
-    smog: Smog,
-    scene: Scene,
-    truth: StreetTruth,
-    views: Sequence[Camera],
-    backend: str,
+    name: str, smog: Smog, scene: Scene, views: Sequence[TruthView], backend: str
 ) -> dict[str, Any]:
     errors: dict[str, list[np.ndarray]] = {}
-    for camera in views:
-        error, masks = smog_errors(smog.model_copy(update={"model": model}), scene, truth, camera, backend)
-        for region, mask in masks.items():
+    for view in views:
+        error = smog_error(smog, scene, view, backend)
+        for region, mask in view.regions.items():
             errors.setdefault(region, []).append(error[mask])
     regions = {}
     for region, pieces in errors.items():
@@ -84,35 +91,42 @@ def _measure(
                 "p99": float(np.quantile(values, 0.99)),
                 "share_above_4": float((values > 4).mean()),
             }
-    return {"smog": name, "model": model, "regions": regions}
+    return {"smog": name, "model": smog.model, "regions": regions}
 
 
-def smog_errors(
-    smog: Smog, scene: Scene, truth: StreetTruth, camera: Camera, backend: str = "auto"
-) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Largest channel error [H, W] in 1/255 against exact smog, and the pixels of each region.
+def truth_view(
+    scene: Scene, truth: StreetTruth, camera: Camera, backend: str = "auto"
+) -> TruthView:
+    """What `smog_error` compares with, and the pixels of each region.
 
     Regions: `smooth` is all pixels away from silhouettes, `silhouette` the other surface pixels;
     the classes are parts of `smooth`.
     """
+    recipe = Recipe(output=Output(depth="none"))
+    clean = render_buffers(scene, camera, make_plan(recipe, scene), backend=backend).rgb
+    exact = truth.render(camera)
+    surface = np.isfinite(exact.depth)
+    smooth = surface & away_from_silhouettes(exact.depth, exact.semantic, exact.instance)
+    regions = {"smooth": smooth, "silhouette": surface & ~smooth}
+    for region, classes in REGIONS.items():
+        regions[region] = smooth & np.isin(exact.semantic, [int(c) for c in classes])
+    return TruthView(camera, clean, exact, regions)
+
+
+def smog_error(smog: Smog, scene: Scene, view: TruthView, backend: str = "auto") -> np.ndarray:
+    """Largest channel error [H, W] of the fogged splats against exact smog, in 1/255."""
     recipe = Recipe(weather=Weather(smog=smog), output=Output(depth="none"))
     plan = make_plan(recipe, scene)
     assert plan.smog is not None
-    clean = render_buffers(scene, camera, make_plan(Recipe(output=Output(depth="none")), scene), backend=backend)
-    fogged = render_buffers(scene, camera, plan, backend=backend)
-    view = truth.render(camera)
-    surface = np.isfinite(view.depth)
-    exact = _exact(clean.rgb, np.where(surface, view.depth, 1.0), camera, plan.smog)
-    error = (fogged.rgb - exact).abs().amax(-1).numpy() * 255
-    assert clean.raster.alpha is not None
-    smooth = surface & away_from_silhouettes(view.depth, view.semantic, view.instance)
-    masks = {"smooth": smooth, "silhouette": surface & ~smooth}
-    for region, classes in REGIONS.items():
-        masks[region] = smooth & np.isin(view.semantic, [int(c) for c in classes])
-    return error, masks
+    fogged = render_buffers(scene, view.camera, plan, backend=backend).rgb
+    depth = np.where(np.isfinite(view.exact.depth), view.exact.depth, 1.0)
+    exact = _exact(view.clean, depth, view.camera, plan.smog)
+    return (fogged - exact).abs().amax(-1).numpy() * 255
 
 
-def _exact(rgb: torch.Tensor, depth: np.ndarray, camera: Camera, medium: SmogMedium) -> torch.Tensor:
+def _exact(
+    rgb: torch.Tensor, depth: np.ndarray, camera: Camera, medium: SmogMedium
+) -> torch.Tensor:
     z = torch.from_numpy(depth)
     rays = camera.ray_directions(torch.float64)
     eye = float(camera.centre[2])

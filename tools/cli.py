@@ -21,7 +21,7 @@ COMMANDS = {
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Runs one command. Returns 0, or 1 where images failed, 2 for an error, 130 when interrupted."""
+    """Runs one command. Returns 0; 1 where images failed, 2 for an error, 130 if interrupted."""
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
     try:
         return tyro.extras.subcommand_cli_from_dict(

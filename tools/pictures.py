@@ -39,7 +39,9 @@ def draw_sheet(out: Path, frame: int | None = None) -> Path:
         if group:
             title = f"{scene}, frame {frame}: {_weather(next(iter(group.values())))}"
             images = [
-                (name, sheet.read_rgb(out / group[name]["image_path"])) for name in cameras if name in group
+                (name, sheet.read_rgb(out / group[name]["image_path"]))
+                for name in cameras
+                if name in group
             ]
             lines.append((title, images))
     if not lines:
@@ -52,7 +54,7 @@ def draw_sheet(out: Path, frame: int | None = None) -> Path:
 
 
 def draw_video(out: Path, camera: str, frames_per_second: float = 10.0, width: int = 1280) -> Path:
-    """Writes OUT/video_<camera>.mp4: all scenes and variants side by side, one frame after another."""
+    """Writes OUT/video_<camera>.mp4: all scenes and variants side by side, frame by frame."""
     rows = [row for row in read_rows(out) if row["camera"] == camera]
     by_key = {(row["scene"], row["variant"], row["frame"]): row for row in rows}
     groups = _groups(rows)

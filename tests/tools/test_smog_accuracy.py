@@ -1,0 +1,44 @@
+"""Both smog models against exact per-pixel smog, on surfaces that are known exactly."""
+
+import numpy as np
+import pytest
+
+from adapters.base import open_scene
+from adapters.street.truth import open_truth
+from recipes.schema import Smog
+from tools.bench_smog import away_from_silhouettes, smog_error, truth_view
+
+QUERY = {"seed": "3", "frames": "2"}
+
+
+@pytest.fixture(scope="module")
+def street():
+    scene = open_scene("procedural:street?seed=3&frames=2")
+    camera = scene.frames[0].cameras["front"].scaled(0.35)
+    return scene, truth_view(scene, open_truth(QUERY), camera)
+
+
+@pytest.mark.parametrize("model", ["per_gaussian", "deferred"])
+@pytest.mark.parametrize("scale_height_m", [None, 15.0])
+def test_smog_is_within_a_grey_level_away_from_silhouettes(street, model, scale_height_m):
+    scene, view = street
+    smog = Smog(visibility_m=80, scale_height_m=scale_height_m, model=model)
+    error = smog_error(smog, scene, view)
+    smooth = error[view.regions["smooth"]]
+    assert len(smooth) > 20_000  # most of the picture is measured
+    # The bounds a viewer cannot see: one grey level at the median, four at the worst hundredth.
+    assert np.median(smooth) <= 1.0
+    assert np.quantile(smooth, 0.99) <= 4.0
+    # And it is smog that is measured: silhouettes, where two distances mix, do differ.
+    assert np.quantile(error[view.regions["silhouette"]], 0.99) > 4.0
+
+
+def test_silhouettes_are_found():
+    depth = np.full((20, 20), 10.0)
+    depth[:, 10:] = 30.0
+    same = np.zeros((20, 20), np.int64)
+    smooth = away_from_silhouettes(depth, same, same)
+    assert smooth[:, :8].all() and smooth[:, 12:].all() and not smooth[:, 8:12].any()
+    classes = np.where(np.arange(20) < 5, 1, 2)[:, None].repeat(20, 1)
+    smooth = away_from_silhouettes(np.full((20, 20), 10.0), classes, same)
+    assert not smooth[3:7].any() and smooth[8:].all()
