@@ -84,7 +84,7 @@ def random_gaussians(
     sh[:, 0] = (rng.uniform(0, 1, (count, 3)) - 0.5) / SH_C0
     fields = {
         "means": np.stack([x, *(rng.uniform(-0.7, 0.7, (2, count)) * np.abs(x))], -1),
-        "quats": rng.normal(size=(count, 4)),
+        "quats": _unit(rng.normal(size=(count, 4))),
         "scales": size * np.exp(rng.uniform(np.log(0.05), 0, (count, 3))),
         "opacities": np.clip(rng.beta(0.9, 1.2, count), 0, 1),
         "sh": sh,
@@ -102,12 +102,16 @@ def smooth_gaussians(count: int = 4, *, seed: int = 0, sh_degree: int = 1) -> Ga
     sh = rng.normal(0, 0.05, (count, (sh_degree + 1) ** 2, 3))
     fields = {
         "means": np.stack([np.arange(count) + 4.0, *rng.uniform(-0.3, 0.3, (2, count))], -1),
-        "quats": rng.normal(size=(count, 4)),
+        "quats": _unit(rng.normal(size=(count, 4))),
         "scales": rng.uniform(2.0, 3.0, (count, 3)),
         "opacities": rng.uniform(0.3, 0.7, count),
         "sh": sh,
     }
     return Gaussians(**{k: torch.from_numpy(v) for k, v in fields.items()})
+
+
+def _unit(quats: np.ndarray) -> np.ndarray:
+    return quats / np.linalg.norm(quats, axis=1, keepdims=True)
 
 
 def random_pose(seed: int = 0, translation=(0.5, -0.3, 0.2)) -> torch.Tensor:
@@ -142,6 +146,7 @@ def golden_view(
         cy=K[1, 2],
         camera_from_world=torch.from_numpy(arrays["viewmat"]).to(torch.float64),
     )
+    arrays["quats"] = _unit(arrays["quats"].astype(np.float64))  # Gaussians hold unit quaternions
     sh = torch.from_numpy(arrays["sh"]).to(dtype) if with_sh else sh_of(arrays["colors"], dtype)
     names = ("means", "quats", "scales", "opacities")
     gaussians = Gaussians(**{n: torch.from_numpy(arrays[n]).to(dtype) for n in names}, sh=sh)

@@ -34,10 +34,10 @@ from augment.scene import PosedGaussians
 from augment.weather.smog import SmogMedium
 
 TILE = 16  # pixels a side
-# Splats of a tile that are blended at once. 256 pixels x 96 splats stay in a core's cache, and torch
-# keeps so few values on one thread; handing them to others would cost more than the work, far more
-# where the cores are busy. Hence also exp2 and sums below instead of exp and matrix products, which
-# go to a library that wakes its threads for any size.
+# Splats of a tile that are blended at once. 256 pixels x 96 splats stay in a core's cache, and
+# torch keeps so few values on one thread; handing them to others would cost more than the work,
+# far more where the cores are busy. Hence also exp2 and sums below instead of exp and matrix
+# products, which go to a library that wakes its threads for any size.
 BLOCK = 96
 LOG2_E = math.log2(math.e)
 MEDIAN = 0.5  # median depth is where transmittance falls below this
