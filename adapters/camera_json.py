@@ -6,7 +6,7 @@ import json
 import math
 from collections import Counter
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
@@ -172,7 +172,7 @@ def distortion_problem(where: str, count: int, model: str) -> str:
     )
 
 
-def _pinhole(lens: _Intrinsics, where: str) -> dict[str, float]:
+def _pinhole(lens: _Intrinsics, where: str) -> dict[str, Any]:
     if lens.w is None or lens.h is None:
         raise AdapterError(f"{where}: w and h (image size, pixels) are missing; add them")
     fl_x = lens.fl_x

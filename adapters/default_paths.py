@@ -19,6 +19,7 @@ from adapters.posed_views import PosedView, look_at_pose
 from augment.scene import Gaussians
 
 PathKind = Literal["auto", "drive", "orbit"]
+PATH_KINDS: dict[str, PathKind] = {"auto": "auto", "drive": "drive", "orbit": "orbit"}
 
 NO_CAMERAS = "no cameras came with the scene"  # how every note begins
 CAMERA_HEIGHT_M = 1.6
@@ -32,6 +33,7 @@ _SHORTEST_DRIVE_M = 8.0
 _WIDE_M, _FLATNESS = 20.0, 0.5
 _CAR_M = (0.5, 2.5)  # above the ground: what lies between is in the way
 _HALF_WIDTH_M = 1.25
+_DETAIL_REACH_M, _COARSER_THAN_USUAL = 2.0, 1.7
 _BLOCKED_COST = 4.0  # passing half a metre of wall must cost more than it gains
 _BEHIND_SHARE, _AHEAD_SHARE = (
     0.05,
@@ -109,14 +111,11 @@ def _worth_of_cells(
     """What a step over each fine cell counts, and the cell's side."""
     cell = min(_STEP_M, grid.cell)
     shape = np.ceil(np.array(grid.height.shape) * grid.cell / cell).astype(int)
-    centres = grid.corner + (np.stack(np.indices(shape), -1) + 0.5) * cell
-    known = np.isfinite(grid.at(centres))
+    centres = grid.corner + (np.moveaxis(np.indices(tuple(shape)), 0, -1) + 0.5) * cell
+    known = np.isfinite(grid.at(centres)) & _is_detailed(points, areas, grid.corner, cell, shape)
     above = points[:, 2] - grid.at(points)  # NaN compares false below
     in_the_way = (above > _CAR_M[0]) & (above < _CAR_M[1])
-    index = np.floor((points[in_the_way, :2] - grid.corner) / cell).astype(int)
-    hidden = np.zeros(shape)
-    x, y = index[:, 0].clip(0, shape[0] - 1), index[:, 1].clip(0, shape[1] - 1)
-    np.add.at(hidden, (x, y), areas[in_the_way])
+    hidden = _sum_in_cells(points[in_the_way], areas[in_the_way], grid.corner, cell, shape)
     reach = round(_HALF_WIDTH_M / cell)
     front = (2 * reach + 1) * cell * (_CAR_M[1] - _CAR_M[0])
     blocked = _sum_around(hidden, reach) / front
@@ -124,6 +123,30 @@ def _worth_of_cells(
     usual = np.median(blocked[known]) if known.any() else 0.0
     blocked = (blocked / max(1.0, usual)).clip(0, 1)
     return np.where(known, 1.0, -1.0) - _BLOCKED_COST * blocked, cell
+
+
+def _is_detailed(
+    points: np.ndarray, areas: np.ndarray, corner: np.ndarray, cell: float, shape: np.ndarray
+) -> np.ndarray:
+    """Where Gaussians are not much larger than usual: scenes are sharp where their cameras drove,
+    and a path far from there would look into a blur.
+    """
+    size = np.log(np.maximum(areas, 1e-12))
+    reach = round(_DETAIL_REACH_M / cell)
+    total = _sum_around(_sum_in_cells(points, size, corner, cell, shape), reach)
+    count = _sum_around(_sum_in_cells(points, np.ones_like(size), corner, cell, shape), reach)
+    local = total / np.maximum(count, 1)
+    return local < np.median(size) + 2 * math.log(_COARSER_THAN_USUAL)
+
+
+def _sum_in_cells(
+    points: np.ndarray, values: np.ndarray, corner: np.ndarray, cell: float, shape: np.ndarray
+) -> np.ndarray:
+    index = np.floor((points[:, :2] - corner) / cell).astype(int)
+    inside = ((index >= 0) & (index < shape)).all(1)
+    total = np.zeros(shape)
+    np.add.at(total, tuple(index[inside].T), values[inside])
+    return total
 
 
 def _sum_around(values: np.ndarray, reach: int) -> np.ndarray:
@@ -182,12 +205,8 @@ def _smooth_profile(heights: np.ndarray, *, fallback: float) -> np.ndarray:
 
 def _orbit(points: np.ndarray, *, is_metric: bool, asked: bool) -> DefaultPath:
     centre = np.median(points, axis=0)
-    distances = np.linalg.norm(points - centre, axis=1)
-    spread, most = np.quantile(distances, [0.5, 0.9])
-    reach = max(min(most, 2.5 * spread), 1e-3)  # a far background must not set the distance
-    half_angle = math.atan(HEIGHT / WIDTH * math.tan(math.radians(_FIELD_OF_VIEW_DEG["orbit"]) / 2))
-    distance = 1.1 * reach / math.sin(half_angle)
     elevation = math.radians(_ORBIT_ELEVATION_DEG)
+    distance = _distance_to_see(points - centre, elevation)
     views = []
     for frame in range(_ORBIT_FRAMES):
         angle = 2 * math.pi * frame / _ORBIT_FRAMES
@@ -195,14 +214,28 @@ def _orbit(points: np.ndarray, *, is_metric: bool, asked: bool) -> DefaultPath:
         direction = (flat * math.cos(angle), flat * math.sin(angle), math.sin(elevation))
         pose = look_at_pose(centre + distance * np.array(direction), centre, where="orbit")
         views.append(_view("orbit", frame, pose, "orbit"))
-    near = np.linalg.norm(points[:, :2] - centre[:2], axis=1) < spread
-    ground = float(np.quantile(points[near, 2] if near.any() else points[:, 2], 0.05))
+    ground = float(np.quantile(points[:, 2], 0.05))
     why = "" if asked or is_metric else " (give scale=METRES_PER_UNIT, 1 for metres, for a drive)"
     note = (
         f"{NO_CAMERAS}: made an orbit of {_ORBIT_FRAMES} frames around its "
         f"content{why}; give camera_path=FILE for another"
     )
     return DefaultPath(tuple(views), ground, note)
+
+
+def _distance_to_see(offsets: np.ndarray, elevation: float) -> float:
+    """How far an orbiting camera must be for the bulk of the content to fit into its image."""
+    flat = _reach(np.linalg.norm(offsets[:, :2], axis=1))
+    upright = _reach(np.abs(offsets[:, 2])) * math.cos(elevation) + flat * math.sin(elevation)
+    half_width = math.radians(_FIELD_OF_VIEW_DEG["orbit"]) / 2
+    half_height = math.atan(HEIGHT / WIDTH * math.tan(half_width))
+    return 1.15 * max(flat / math.sin(half_width), upright / math.sin(half_height), 1e-3)
+
+
+def _reach(distances: np.ndarray) -> float:
+    """Most of the distances, unless a far background stretches them."""
+    usual, most = np.quantile(distances, [0.5, 0.9])
+    return float(min(most, 2.5 * usual)) if usual > 0 else float(most)
 
 
 def _view(camera: str, frame: int, pose: np.ndarray, kind: str) -> PosedView:

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +21,7 @@ from adapters.base import format_uri
 from adapters.camera_files import find_camera_file, read_views
 from adapters.camera_frames import frames_from_views
 from adapters.default_paths import make_default_path
+from adapters.gaussian_options import COLOURS, GaussianOptions
 from adapters.ground_estimate import lowest_ground, solid_points
 from adapters.posed_views import PosedView, ViewSet
 from adapters.world import WorldChange, nearest_axis, parse_up, rotation_to_z_up
@@ -31,35 +31,15 @@ from augment.scene import Gaussians, Scene
 from augment.sky import ConstantSky
 from augment.splat_io import SplatFile, read_splats, recentring_origin
 
-QUERY_KEYS = {
-    "up": "the file's axis that points up (+x … -z), a vector 0,-1,0.1, or 'cameras': their mean",
-    "scale": "metres per unit of the file; 1 says that it is in metres",
-    "cameras": "a camera file or COLMAP folder in the file's world, or 'none'",
-    "path": "without cameras: auto, drive or orbit",
-    "iteration": "which iteration_N of a trained model; the newest by default",
-    "sky": "colour behind the Gaussians: black (as trained), white, or three numbers 0 to 1",
-}
 _UP_TOLERANCE_DEG = 30.0
 _ITERATION = re.compile(r"iteration_(\d+)")
-_COLOURS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 _SAMPLED_VIEWS, _SAMPLED_POINTS = 16, 20_000
 _LEAST_SEEN = 0.001
 
 
-@dataclass(frozen=True)
-class _Options:
-    """The query, parsed. up: None, 'cameras', or what parse_up takes."""
-
-    up: str | None = None
-    scale: float | None = None
-    cameras: str | None = None
-    path: str = "auto"
-    iteration: int | None = None
-    sky: tuple[float, float, float] | None = None
-
-
 def open_gaussians(path: str | Path, query: dict[str, str]) -> Scene:
-    """A scene of a splat file or of a trained model's folder. The query's keys are QUERY_KEYS.
+    """A scene of a splat file or of a trained model's folder. The query's keys:
+    adapters.gaussian_options.QUERY_KEYS.
 
     has_metric_scale is True only where `scale` is given or the file's notes say `unit: metre`.
 
@@ -67,7 +47,7 @@ def open_gaussians(path: str | Path, query: dict[str, str]) -> Scene:
         AdapterError: a query key or value, or a camera file, that cannot be used.
         SceneError: the splat file is missing, damaged, or something else.
     """
-    options = _parse_query(query)
+    options = GaussianOptions.from_query(query)
     file = find_splat_file(Path(path), options.iteration)
     splats = read_splats(file)
     problems = list(splats.problems)
@@ -125,65 +105,15 @@ def find_splat_file(path: Path, iteration: int | None = None) -> Path:
     return files[0]
 
 
-def _parse_query(query: dict[str, str]) -> _Options:
-    unknown = sorted(set(query) - set(QUERY_KEYS))
-    if unknown:
-        known = "; ".join(f"{key}: {meaning}" for key, meaning in QUERY_KEYS.items())
-        raise AdapterError(
-            f"gaussians: unknown key {', '.join(map(repr, unknown))}. Known: {known}"
-        )
-    if query.get("up", "cameras") != "cameras":
-        parse_up(query["up"])  # a mistake here must not wait for a large file to load
-    if query.get("path", "auto") not in ("auto", "drive", "orbit"):
-        raise AdapterError(f"gaussians: path must be auto, drive or orbit; got {query['path']!r}")
-    return _Options(
-        up=query.get("up"),
-        scale=_positive_number(query["scale"]) if "scale" in query else None,
-        cameras=query.get("cameras"),
-        path=query.get("path", "auto"),
-        iteration=_whole_number(query["iteration"]) if "iteration" in query else None,
-        sky=_parse_colour(query["sky"]) if "sky" in query else None,
-    )
-
-
-def _positive_number(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not (math.isfinite(value) and value > 0):
-        raise AdapterError(f"gaussians: scale must be metres per unit, a number > 0; got {text!r}")
-    return value
-
-
-def _whole_number(text: str) -> int:
-    if not (text.isascii() and text.isdigit() and len(text) < 10):
-        raise AdapterError(f"gaussians: iteration must be a whole number; got {text!r}")
-    return int(text)
-
-
-def _parse_colour(text: str) -> tuple[float, float, float]:
-    try:
-        red, green, blue = _COLOURS.get(text) or [float(part) for part in text.split(",")]
-    except ValueError:
-        red = green = blue = math.nan
-    if not all(0 <= value <= 1 for value in (red, green, blue)):
-        raise AdapterError(
-            f"gaussians: sky must be black, white, or three numbers 0 to 1 such as 0.7,0.8,0.9; "
-            f"got {text!r}"
-        )
-    return red, green, blue
-
-
 def _trained_background(path: Path) -> tuple[float, float, float]:
     """What the Gaussians were trained in front of: black, unless the model's cfg_args say white."""
     arguments = path / "cfg_args"
     if arguments.is_file() and "white_background=True" in arguments.read_text(errors="replace"):
-        return _COLOURS["white"]
-    return _COLOURS["black"]
+        return COLOURS["white"]
+    return COLOURS["black"]
 
 
-def _find_views(file: Path, given: Path, options: _Options) -> ViewSet | None:
+def _find_views(file: Path, given: Path, options: GaussianOptions) -> ViewSet | None:
     if options.cameras == "none":
         return None
     if options.cameras is not None:
@@ -206,14 +136,16 @@ def _find_views(file: Path, given: Path, options: _Options) -> ViewSet | None:
 
 
 def _world_change(
-    splats: SplatFile, views: tuple[PosedView, ...], options: _Options
+    splats: SplatFile, views: tuple[PosedView, ...], options: GaussianOptions
 ) -> tuple[WorldChange, list[str]]:
     """From the file's world to the scene's, and sentences on doubts about it."""
     problems = []
     cameras_up = _mean_up(views)
     if options.up == "cameras":
         if cameras_up is None:
-            raise AdapterError("gaussians: up=cameras needs cameras, and none were found")
+            raise AdapterError(
+                "gaussians: up=cameras needs cameras that are upright on the whole; none were found"
+            )
         up = cameras_up
     else:
         up = parse_up(options.up or splats.notes.get("up") or "+z")
@@ -253,7 +185,7 @@ def _frames_and_ground(
     gaussians: Gaussians,
     views: tuple[PosedView, ...],
     change: WorldChange,
-    options: _Options,
+    options: GaussianOptions,
     *,
     is_metric: bool,
 ) -> tuple[tuple[Frame, ...], float | None, list[str]]:

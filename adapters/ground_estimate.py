@@ -92,7 +92,7 @@ class GroundGrid:
     def cells_of(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Indices along x and y, clipped to the grid, and which points lie inside it."""
         index = np.floor((points[..., :2] - self.corner) / self.cell).astype(int)
-        inside = ((index >= 0) & (index < self.height.shape)).all(-1)
+        inside = np.all((index >= 0) & (index < np.array(self.height.shape)), axis=-1)
         x = index[..., 0].clip(0, self.height.shape[0] - 1)
         y = index[..., 1].clip(0, self.height.shape[1] - 1)
         return x, y, inside

@@ -69,7 +69,9 @@ def check_pose(world_from_camera: np.ndarray, *, where: str) -> np.ndarray:
     return pose
 
 
-def look_at_pose(position: Sequence[float], target: Sequence[float], *, where: str) -> np.ndarray:
+def look_at_pose(
+    position: Sequence[float] | np.ndarray, target: Sequence[float] | np.ndarray, *, where: str
+) -> np.ndarray:
     """world_from_camera of an upright camera at `position` that looks at `target` (world +z up).
 
     Straight up or down, where upright means nothing, the top of the image points to world +y.

@@ -13,6 +13,7 @@ from augment.geometry import multiply_quats, quat_from_rotmat
 from augment.render.sh import rotate_sh
 from augment.scene import Gaussians
 
+_PIECE = 65536  # Gaussians
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
@@ -56,8 +57,20 @@ class WorldChange:
         if not turned:
             return moved
         quat = quat_from_rotmat(rotation).to(gaussians.quats.dtype).expand_as(gaussians.quats)
-        sh = gaussians.sh if gaussians.sh_degree == 0 else rotate_sh(gaussians.sh, rotation)
+        sh = (
+            gaussians.sh
+            if gaussians.sh_degree == 0
+            else _rotate_sh_in_pieces(gaussians.sh, rotation)
+        )
         return dataclasses.replace(moved, quats=multiply_quats(quat, gaussians.quats), sh=sh)
+
+
+def _rotate_sh_in_pieces(sh: torch.Tensor, rotation: torch.Tensor) -> torch.Tensor:
+    """rotate_sh without temporaries as large as the coefficients of a large scene."""
+    turned = torch.empty_like(sh)
+    for start in range(0, len(sh), _PIECE):
+        turned[start : start + _PIECE] = rotate_sh(sh[start : start + _PIECE], rotation)
+    return turned
 
 
 def parse_up(text: str) -> np.ndarray:

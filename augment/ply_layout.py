@@ -13,9 +13,9 @@ from torch import Tensor
 
 from augment.errors import SceneError
 from augment.ply_io import PlyElement, PlyHeader, iterate_rows
+from augment.render.sh import SH_C0
 from augment.scene import SH_COUNTS, Gaussians
 
-SH_C0 = 0.28209479177387814  # Y_00; colour = 0.5 + SH_C0 * dc + ...
 SEMANTIC = "semantic_class"
 _F_REST_COUNTS = tuple(3 * (k - 1) for k in SH_COUNTS)
 _GEOMETRY = ("x", "y", "z", "opacity", *(f"scale_{i}" for i in range(3)),

@@ -19,16 +19,17 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from augment.batch.atomic import flush_folder, make_folder, output_error
 from augment.errors import SceneError
 from augment.ply_io import ROWS_PER_CHUNK, count_surplus_bytes, read_ply_header
 from augment.ply_layout import (
     SEMANTIC,
-    SH_C0,
     column_types,
     has_wide_means,
     read_columns,
     rows_of_gaussians,
 )
+from augment.render.sh import SH_C0
 from augment.scene import Gaussians, check_gaussians
 
 RECENTRE_BEYOND_M = 1000.0  # float32 keeps 0.06 mm at 1 km; 0.25 m at UTM's 4000 km
@@ -144,6 +145,9 @@ def write_ply(
 
     notes: written as `comment key: value` lines and given back by `read_ply`. A `semantic_class`
     column is added where the Gaussians have classes; other readers ignore it.
+
+    Raises:
+        OutputError: the system refused (disk full, no permission ...); `path` is then as it was.
     """
     columns = column_types(gaussians)
     lines = ["ply", "format binary_little_endian 1.0"]
@@ -165,6 +169,9 @@ def write_splat(path: str | Path, gaussians: Gaussians) -> None:
     """Write a .splat file, atomically. The format keeps 8 bits of colour, opacity and rotation.
 
     SH bands above degree 0 cannot be kept; that they are dropped is logged as a warning.
+
+    Raises:
+        OutputError: as for write_ply.
     """
     if gaussians.sh_degree > 0:
         _log.warning("%s: .splat holds no view dependence; SH bands above 0 are dropped", path)
@@ -212,13 +219,18 @@ def _activate(columns: dict[str, np.ndarray], *, wide: bool) -> tuple[Gaussians,
 
 @contextlib.contextmanager
 def _atomic_file(path: Path) -> Iterator[BinaryIO]:
-    """A file that takes its name only once it is whole and on the disk."""
+    """A file that takes its name only once it is whole and on the disk; makes missing folders."""
     partial = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.partial")
     try:
-        with partial.open("wb") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
+        make_folder(path.parent)
+        try:
+            with partial.open("wb") as file:
+                yield file
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(partial, path)
+            flush_folder(path.parent)
+        finally:
+            partial.unlink(missing_ok=True)
+    except OSError as error:
+        raise output_error(path, error) from error

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import struct
 import tempfile
@@ -16,7 +17,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from augment.errors import SceneError
+from augment.errors import OutputError, SceneError
 from augment.ply_io import iterate_rows, read_ply_header
 from augment.scene import Gaussians
 from augment.splat_io import (
@@ -384,10 +385,10 @@ def test_writing_is_atomic(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, writ
     path.write_bytes(b"old")
 
     def fail(_descriptor: int) -> None:
-        raise OSError("disk full")
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(os, "fsync", fail)
-    with pytest.raises(OSError, match="disk full"):
+    with pytest.raises(OutputError, match=r"cannot write .*a\.ply: No space left"):
         write(path, random_gaussians(3, 0))
     assert path.read_bytes() == b"old"
     assert [p.name for p in tmp_path.iterdir()] == ["a.ply"]
