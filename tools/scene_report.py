@@ -52,8 +52,7 @@ def _describe_gaussians(gaussians: Gaussians) -> dict[str, Any]:
     if gaussians.semantic is not None:
         values, counts = np.unique(gaussians.semantic.numpy(), return_counts=True)
         classes = {
-            SemanticClass(int(v)).name.lower(): int(c)
-            for v, c in zip(values, counts, strict=True)
+            SemanticClass(int(v)).name.lower(): int(c) for v, c in zip(values, counts, strict=True)
         }
     return {
         "count": len(gaussians),

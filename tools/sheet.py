@@ -45,7 +45,9 @@ def side_by_side(images: Sequence[tuple[str, np.ndarray]], width: int) -> np.nda
     columns = 1 if len(images) == 1 else 2
     source_height, source_width = images[0][1].shape[:2]
     cell_width = width // columns // 2 * 2
-    cell_height = round(source_height * cell_width / source_width) // 2 * 2  # codecs want even sides
+    cell_height = (
+        round(source_height * cell_width / source_width) // 2 * 2
+    )  # codecs want even sides
     lines = -(-len(images) // columns)
     canvas = np.zeros((lines * cell_height, columns * cell_width, 3), np.uint8)
     for number, (caption, image) in enumerate(images):
@@ -121,6 +123,4 @@ def _write(
     color: tuple[int, int, int],
     thickness: int = 1,
 ) -> None:
-    cv2.putText(
-        image, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, size, color, thickness, cv2.LINE_AA
-    )
+    cv2.putText(image, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, size, color, thickness, cv2.LINE_AA)

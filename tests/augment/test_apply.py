@@ -1,0 +1,140 @@
+"""Plans carried out, on a scene small enough to know what every pixel must show."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from augment.apply import render_buffers, render_view
+from augment.cameras import Camera, Frame
+from augment.plan import make_plan
+from augment.scene import Actor, Gaussians, Scene, Track
+from augment.semantics import SemanticClass
+from augment.sky import ConstantSky, CubemapSky
+from recipes.schema import Output, Recipe, Render, Smog, Weather
+
+C0 = 0.28209479177387814  # Y_00
+SKY = (0.3, 0.5, 0.9)
+AIRLIGHT = (0.7, 0.7, 0.7)
+
+
+def wall(depth: float, left: float, right: float, rgb: tuple[float, float, float], semantic: int):
+    """Flat opaque splats side by side, facing a camera that looks along +y from the origin."""
+    x = torch.arange(left, right, 0.05)
+    z = torch.arange(-3.0, 3.0, 0.05)
+    xx, zz = torch.meshgrid(x, z, indexing="ij")
+    count = xx.numel()
+    means = torch.stack([xx.reshape(-1), torch.full((count,), depth), zz.reshape(-1)], -1)
+    return Gaussians(
+        means=means,
+        quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
+        scales=torch.tensor([[0.05, 0.001, 0.05]]).repeat(count, 1),
+        opacities=torch.full((count,), 0.999),
+        sh=((torch.tensor(rgb) - 0.5) / C0).expand(count, 1, 3).contiguous(),
+        semantic=torch.full((count,), semantic, dtype=torch.int16),
+    )
+
+
+def camera() -> Camera:
+    """World x right, y forward, z up: camera x = world x, y = -world z, z = world y."""
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64)
+    return Camera("front", 64, 48, 60.0, 60.0, 32.0, 24.0, pose, timestamp_ns=0)
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    """A building to the left at 10 m, a car (an actor) in its middle at 5 m, sky to the right."""
+    background = wall(10.0, -8.0, 0.0, (0.8, 0.2, 0.1), int(SemanticClass.BUILDING))
+    pose = torch.eye(4, dtype=torch.float64)[None].clone()
+    pose[0, :3, 3] = torch.tensor([-1.0, 5.0, 0.0], dtype=torch.float64)
+    body = wall(0.0, -0.6, 0.6, (0.1, 0.9, 0.1), int(SemanticClass.VEHICLE))
+    low = body.select(body.means[:, 2].abs() < 0.6)
+    car = Actor("car", "Car", low, Track(torch.tensor([0]), pose), (1.2, 0.1, 1.2))
+    view = camera()
+    frame = Frame(0, 0, torch.eye(4, dtype=torch.float64), {"front": view})
+    sky = ConstantSky(torch.tensor(SKY))
+    return Scene("toy", "test:toy", background, (car,), sky, (frame,), ground_z_m=-2.0)
+
+
+BUILDING, CAR, NOTHING = (10, 4), (24, 20), (24, 60)  # row, column
+
+
+def view_of(scene: Scene, smog: Smog | None = None, **output):
+    recipe = Recipe(weather=Weather(smog=smog), output=Output(**output))
+    return render_view(scene, camera(), recipe)
+
+
+def test_the_clean_view_shows_wall_car_and_sky(scene):
+    view = view_of(scene, depth="median", semantic=True, instance=True)
+    # One grey level of rounding, and up to 1 % of what lies behind shines through (0.3 % of 255).
+    assert np.abs(view.rgb[BUILDING] - np.array([204, 51, 26])).max() <= 3
+    assert np.abs(view.rgb[CAR] - np.array([26, 230, 26])).max() <= 3
+    assert view.rgb[NOTHING].tolist() == [77, 128, 230]
+    assert view.depth_m[BUILDING] == pytest.approx(10, abs=1e-3)
+    assert view.depth_m[CAR] == pytest.approx(5, abs=1e-3)
+    assert view.depth_m[NOTHING] == 0
+    assert view.semantic[BUILDING] == SemanticClass.BUILDING
+    assert view.semantic[CAR] == SemanticClass.VEHICLE
+    assert view.semantic[NOTHING] == SemanticClass.SKY
+    assert [int(view.instance[p]) for p in (BUILDING, CAR, NOTHING)] == [0, 1, 0]
+
+
+@pytest.mark.parametrize("model", ["per_gaussian", "deferred"])
+def test_smog_fades_each_surface_by_its_own_distance(scene, model):
+    view = view_of(scene, Smog(extinction_per_m=0.1, color=AIRLIGHT, model=model))
+    cam = camera()
+    for pixel, depth, rgb in ((BUILDING, 10.0, (0.8, 0.2, 0.1)), (CAR, 5.0, (0.1, 0.9, 0.1))):
+        t = np.exp(-0.1 * depth * float(cam.ray_lengths()[pixel]))
+        expected = 255 * (t * np.array(rgb) + (1 - t) * np.array(AIRLIGHT))
+        # The nearest splat centre is up to 3.5 cm of 10 m off the pixel: 0.1 grey levels.
+        assert np.abs(view.rgb[pixel] - expected).max() <= 3
+    assert view.rgb[NOTHING].tolist() == [179, 179, 179]  # no sky through uniform smog
+
+
+def test_smog_without_density_is_the_clean_view_to_the_bit(scene):
+    clean = view_of(scene)
+    for smog in (Smog(extinction_per_m=0.0), Smog(extinction_per_m=0.0, scale_height_m=10.0)):
+        assert np.array_equal(view_of(scene, smog).rgb, clean.rgb)
+
+
+def test_what_else_is_asked_for_does_not_change_the_colours(scene):
+    plain = view_of(scene, depth="none")
+    full = view_of(scene, depth="expected", semantic=True, instance=True)
+    assert plain.depth_m is None and plain.semantic is None and plain.instance is None
+    assert np.array_equal(plain.rgb, full.rgb)
+
+
+def test_smog_changes_neither_depth_nor_classes(scene):
+    clean = view_of(scene, semantic=True)
+    foggy = view_of(scene, Smog(visibility_m=10), semantic=True)
+    assert np.array_equal(clean.depth_m, foggy.depth_m)
+    assert np.array_equal(clean.semantic, foggy.semantic)
+
+
+def test_thin_haze_shows_the_zenith_and_hides_the_horizon(scene):
+    blue = CubemapSky(torch.tensor(SKY).expand(6, 4, 4, 3).contiguous())
+    empty = dataclasses.replace(scene, sky=blue)
+    haze = Smog(extinction_per_m=0.02, color=AIRLIGHT, scale_height_m=20.0)
+    rgb = view_of(empty, haze).rgb[:, 60].astype(int)  # a column of sky, from the top downwards
+    assert (np.diff(rgb[:24, 2]) <= 0).all()  # blue fades towards the horizon
+    assert rgb[0, 2] > rgb[23, 2] + 10
+    assert rgb[24:].tolist() == [[179, 179, 179]] * 24  # rays that do not climb never leave it
+
+
+def test_both_backends_show_the_same_picture(scene):
+    recipe = Recipe(weather=Weather(smog=Smog(visibility_m=30)))
+    plan = make_plan(recipe, scene)
+    fast = render_buffers(scene, camera(), plan, backend="cpu")
+    slow = render_buffers(scene, camera(), plan, backend="reference")
+    difference = (fast.rgb - slow.rgb).abs().amax(-1)
+    # Float32 sums of some hundred splats in another order; a flip at a cut-off is 1/255 at most.
+    assert float(difference.quantile(0.99)) < 1e-4
+    assert float(difference.max()) < 5e-3
+
+
+def test_the_recipe_scales_the_image(scene):
+    view = render_view(scene, camera(), Recipe(render=Render(scale=0.5)))
+    assert view.rgb.shape == (24, 32, 3)
+    assert view.camera.fx == 30.0
