@@ -54,11 +54,11 @@ def doubled(part):
 
 @pytest.mark.parametrize("backend", ["reference", "cpu"])
 def test_only_the_buffers_asked_for(parts, backend):
-    for name in BUFFERS:
-        output = rasterize(parts, camera_ahead(), buffers=[name], backend=backend)
-        assert [n for n in BUFFERS if getattr(output, n) is not None] == [name]
-    output = rasterize(parts, camera_ahead(), backend=backend)
-    assert [n for n in BUFFERS if getattr(output, n) is not None] == ["rgb", "alpha"]
+    for asked in (["rgb", "alpha"], list(BUFFERS)):
+        output = rasterize(parts, camera_ahead(), buffers=asked, backend=backend)
+        assert [name for name in BUFFERS if getattr(output, name) is not None] == asked
+    default = rasterize(parts, camera_ahead(), backend=backend)
+    assert [name for name in BUFFERS if getattr(default, name) is not None] == ["rgb", "alpha"]
 
 
 def test_backends_draw_the_same_picture(parts):

@@ -1,0 +1,72 @@
+"""Memory that rendering one frame takes on top of its scene, measured in a process of its own.
+
+A process that has rendered before holds scratch memory that would hide the need of the next frame.
+So a fresh one builds the scene, compiles, notes its resident size, resets the kernel's high-water
+mark, renders once, and reads the mark: the frame's buffers and images and all scratch are in it,
+Python, torch, compiled kernels and the scene are not.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import gc
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+from tools.bench_scene import RasterCase
+
+_STATUS, _RESET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+
+
+def peak_extra_mib(case: RasterCase, *, seed: int = 0) -> float | None:
+    """MiB above the scene at the highest moment of one clear frame; None where /proc is missing.
+
+    Raises:
+        RuntimeError: the measuring process failed; the message is what it wrote.
+    """
+    if not (_STATUS.is_file() and _RESET.is_file()):
+        return None
+    arguments = json.dumps({**dataclasses.asdict(case), "seed": seed})
+    done = subprocess.run(
+        [sys.executable, "-m", "tools.bench_memory", arguments],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=Path(__file__).resolve().parents[1],
+    )
+    if done.returncode != 0:
+        raise RuntimeError(f"measuring the memory of {case.name} failed:\n{done.stderr.strip()}")
+    return float(done.stdout.strip().splitlines()[-1])
+
+
+def _render_once(case: RasterCase, seed: int) -> float:
+    from augment.render.buffers import ALPHA, RGB
+    from augment.render.constants import RasterSettings
+    from augment.render.cpu import rasterize_cpu, warm_up
+    from augment.scene import PosedGaussians
+    from tools.bench_scene import random_scene
+
+    warm_up()
+    gaussians, camera = random_scene(case, seed=seed)
+    gc.collect()
+    before = _status_mib("VmRSS")
+    _RESET.write_text("5")
+    parts, buffers = [PosedGaussians(gaussians)], frozenset({RGB, ALPHA})
+    output = rasterize_cpu(parts, camera, buffers, RasterSettings(), None)
+    assert output.rgb is not None  # alive until the mark is read
+    return _status_mib("VmHWM") - before
+
+
+def _status_mib(field: str) -> float:
+    for line in _STATUS.read_text().splitlines():
+        if line.startswith(f"{field}:"):
+            return int(line.split()[1]) / 1024
+    raise RuntimeError(f"{_STATUS} has no {field}")
+
+
+if __name__ == "__main__":
+    numbers = json.loads(sys.argv[1])
+    seed = numbers.pop("seed")
+    print(_render_once(RasterCase(**numbers), seed))
