@@ -1,0 +1,218 @@
+"""The `climategs` command as a user runs it, on a scene small enough to be quick."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import pytest
+import torch
+
+from augment.scene import Gaussians
+from augment.splat_io import write_ply
+from tools.cli import main
+from tools.commands import open_with_path
+from tools.render import parse_frames, resolve_variants
+
+FOG = """
+version: 1
+seed: 3
+variants: 2
+weather:
+  smog:
+    visibility_m: {uniform: [5, 50]}
+"""
+
+
+@pytest.fixture
+def scene_uri(tmp_path) -> str:
+    """A floor of 400 splats, with two recorded images of it."""
+    x, y = torch.meshgrid(torch.arange(-5, 5, 0.5), torch.arange(-5, 5, 0.5), indexing="ij")
+    count = x.numel()
+    floor = Gaussians(
+        means=torch.stack([x.reshape(-1), y.reshape(-1), torch.zeros(count)], -1),
+        quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
+        scales=torch.tensor([[0.4, 0.4, 0.01]]).repeat(count, 1),
+        opacities=torch.full((count,), 0.95),
+        sh=torch.full((count, 1, 3), 0.3),
+    )
+    path = tmp_path / "floor.ply"
+    write_ply(path, floor)
+    cameras = {
+        "width": 32, "height": 24, "fx": 30, "fy": 30, "cx": 16, "cy": 12,
+        "frames": [
+            {"timestamp_s": 0.1 * i, "position": [-4 + i, 0, 1.5], "look_at": [4, 0, 0]}
+            for i in range(2)
+        ],
+    }  # fmt: skip
+    (tmp_path / "path.json").write_text(json.dumps(cameras))
+    return f"gaussians:{path}?scale=1&cameras={tmp_path / 'path.json'}"
+
+
+@pytest.fixture
+def recipe(tmp_path) -> str:
+    path = tmp_path / "fog.yaml"
+    path.write_text(FOG)
+    return str(path)
+
+
+def test_render_writes_images_manifest_and_pictures(scene_uri, recipe, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert main(["render", recipe, "--scene", scene_uri, "--out", str(out)]) == 0
+    said = capsys.readouterr().out
+    assert "4 images written, 0 already there, 0 failed" in said
+    assert (out / "manifest.parquet").is_file()
+    images = sorted(out.glob("*/fog-00[01]/images/*/*.png"))
+    assert len(images) == 4
+    assert all(cv2.imread(str(path)).shape == (24, 32, 3) for path in images)
+    assert cv2.imread(str(out / "contact_sheet.png")).shape[1] > 32
+    # The second run finds everything done, and says so.
+    assert main(["render", recipe, "--scene", scene_uri, "--out", str(out), "--no-sheet"]) == 0
+    assert "0 images written, 4 already there" in capsys.readouterr().out
+
+
+def test_render_takes_selections_and_scale(scene_uri, recipe, tmp_path):
+    out = tmp_path / "out"
+    arguments = ["render", recipe, "--scene", scene_uri, "--out", str(out), "--variants", "1"]
+    assert main([*arguments, "--frames", "1", "--scale", "0.5", "--no-sheet"]) == 0
+    (image,) = out.glob("*/*/images/*/*.png")
+    assert image.stem.endswith("1") and cv2.imread(str(image)).shape == (12, 16, 3)
+
+
+def test_a_failing_image_gives_exit_code_1(scene_uri, recipe, tmp_path, monkeypatch, capsys):
+    import augment.apply
+
+    real = augment.apply.render_view
+
+    def breaks_on_the_second_frame(scene, camera, recipe, *, backend):
+        if camera.timestamp_ns > 0:
+            raise RuntimeError("no light")
+        return real(scene, camera, recipe, backend=backend)
+
+    monkeypatch.setattr(augment.apply, "render_view", breaks_on_the_second_frame)
+    out = tmp_path / "out"
+    assert main(["render", recipe, "--scene", scene_uri, "--out", str(out), "--no-sheet"]) == 1
+    streams = capsys.readouterr()
+    assert "2 images written, 0 already there, 2 failed" in streams.out
+    assert "no light" in streams.err
+
+
+def test_video_of_one_camera(scene_uri, recipe, tmp_path):
+    out = tmp_path / "out"
+    main(["render", recipe, "--scene", scene_uri, "--out", str(out), "--no-sheet"])
+    (camera,) = {path.parent.name for path in out.glob("*/*/images/*/*.png")}
+    assert main(["sheet", str(out), "--video-camera", camera]) == 0
+    video = cv2.VideoCapture(str(out / f"video_{camera}.mp4"))
+    frames = 0
+    while video.read()[0]:
+        frames += 1
+    assert frames == 2
+
+
+def test_inspect_says_what_is_there_and_writes_json(scene_uri, tmp_path, capsys):
+    target = tmp_path / "facts.json"
+    assert main(["inspect", scene_uri, "--json", str(target)]) == 0
+    facts = json.loads(target.read_text())
+    assert facts["gaussians"] == 400
+    assert facts["frames"]["count"] == 2
+    assert "400" in capsys.readouterr().out
+
+
+def test_explain_names_every_pass(scene_uri, recipe, tmp_path, capsys):
+    target = tmp_path / "plan.json"
+    assert main(["explain", recipe, "--scene", scene_uri, "--json", str(target)]) == 0
+    text = capsys.readouterr().out
+    assert "runs   smog per Gaussian" in text and "skips  sky" in text
+    facts = json.loads(target.read_text())
+    assert facts["variants"] == 2
+    assert 5 <= facts["recipe"]["weather"]["smog"]["visibility_m"] <= 50
+
+
+def test_recipes_lists_prints_and_exports(tmp_path, capsys):
+    assert main(["recipes"]) == 0
+    assert "dense-fog" in capsys.readouterr().out.split()
+    assert main(["recipes", "dense-fog"]) == 0
+    assert "visibility_m" in capsys.readouterr().out
+    schema = tmp_path / "schema.json"
+    assert main(["recipes", "--schema", str(schema)]) == 0
+    assert "weather" in json.loads(schema.read_text())["properties"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["render", "no-such", "--scene", "SCENE", "--out", "OUT"], "no such file"),
+        (["render", "clear", "--scene", "nowhere:x", "--out", "OUT"], "nowhere"),
+        (["render", "clear", "--scene", "SCENE", "--out", "OUT", "--frames", "x"], "--frames 'x'"),
+        (["render", "clear", "--scene", "SCENE", "--out", "OUT", "--frames", "9"], "no frame 9"),
+        (["render", "clear", "--scene", "SCENE", "--out", "OUT", "--cameras", "q"], "no camera q"),
+        (["render", "clear", "--scene", "SCENE", "--out", "OUT", "--scale", "99"], "--scale 99"),
+        (["render", "clear", "--scene", "SCENE", "--out", "OUT", "--variants", "0"], "--variants"),
+        (["sheet", "OUT"], "manifest.parquet does not exist"),
+        (["inspect", "SCENE", "--json", "/nowhere/facts.json"], "cannot write /nowhere/facts.json"),
+    ],
+)
+def test_mistakes_exit_with_2_and_one_message(arguments, message, scene_uri, tmp_path, capsys):
+    words = {"SCENE": scene_uri, "OUT": str(tmp_path / "out")}
+    assert main([words.get(word, word) for word in arguments]) == 2
+    error = capsys.readouterr().err
+    assert f"error: {message}" in error or message in error
+    assert "Traceback" not in error
+
+
+def test_a_defect_keeps_its_traceback(monkeypatch):
+    from tools import cli
+
+    def broken() -> int:
+        raise ZeroDivisionError("a defect")
+
+    monkeypatch.setitem(cli.COMMANDS, "recipes", broken)
+    with pytest.raises(ZeroDivisionError):
+        main(["recipes"])
+
+
+@pytest.mark.parametrize(
+    ("text", "frames"),
+    [
+        ("all", None),
+        ("4", (4,)),
+        ("0,5,9", (0, 5, 9)),
+        ("0:6:2", (0, 2, 4)),
+        ("3:6", (3, 4, 5)),
+        ("0:3,2,7", (0, 1, 2, 7)),
+    ],
+)
+def test_frames_are_parsed(text, frames):
+    assert parse_frames(text) == frames
+
+
+def test_scale_is_recorded_in_the_recipe(recipe):
+    (half, _) = resolve_variants(recipe, scale=0.5)
+    (whole, _) = resolve_variants(recipe)
+    assert half.render.scale == 0.5 and half.hash != whole.hash
+    assert half.weather == whole.weather
+
+
+def test_another_camera_path(scene_uri, tmp_path):
+    path = tmp_path / "path.json"
+    plain = open_with_path(scene_uri.split("&cameras")[0], None)
+    scene = open_with_path(scene_uri.split("&cameras")[0], path)
+    assert len(scene.frames) == 2 and len(plain.frames) != 2
+
+
+def test_help_loads_neither_torch_nor_the_kernels():
+    """What keeps `climategs --help` instant; its time itself is measured by hand, not here."""
+    code = (
+        "import sys; from tools.cli import main\n"
+        "try: main(['--help'])\n"
+        "except SystemExit: pass\n"
+        "loaded = {'torch', 'numba', 'numpy', 'cv2', 'pyarrow', 'pydantic'} & set(sys.modules)\n"
+        "sys.exit(f'loaded {loaded}' if loaded else 0)"
+    )
+    root = Path(__file__).resolve().parents[2]
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=root, check=False
+    )
+    assert result.returncode == 0, result.stderr
+    assert "render" in result.stdout
