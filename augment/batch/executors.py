@@ -1,8 +1,8 @@
 """Two ways to run a job's chunks: in this process, or in several worker processes.
 
 Workers are started afresh (`spawn`): nothing of the parent's threads, locks or random state leaks
-into them. Each opens the scene once and keeps it. The parent alone decides what runs where, and
-alone writes the journals.
+into them. The parent hands them its open scene (`shared_scene`); it alone decides what runs where,
+and writes the journals.
 """
 
 from __future__ import annotations
@@ -22,9 +22,10 @@ from multiprocessing.connection import Connection, wait
 from augment.batch.lock import OutputLock
 from augment.batch.manifest import FAILED
 from augment.batch.runner import Chunk, FrameRunner, Outcome, Renderer, Setup
-from augment.batch.worker import Failure, Ready, SceneLoader, worker_main
+from augment.batch.shared_scene import SharedScene
+from augment.batch.worker import Failure, Ready, worker_main
 from augment.batch.writer import WritePump
-from augment.errors import OutputError, SceneError
+from augment.errors import ClimateGSError, OutputError
 from augment.scene import Scene
 
 STOP_S = 120.0  # how long a worker may take to finish its image when the job stops
@@ -55,7 +56,7 @@ def run_in_processes(
     chunks: Sequence[Chunk],
     *,
     workers: int,
-    scene_loader: SceneLoader,
+    shared: SharedScene,
     renderer: Renderer | None,
     deliver: Deliver,
     lock: OutputLock,
@@ -66,18 +67,17 @@ def run_in_processes(
     the image is recorded as failed.
 
     Raises:
-        ValueError: scene_loader or renderer cannot be sent to another process.
-        SceneError: a worker could not open the scene. OutputError: a worker could not write.
+        ValueError: the renderer cannot be sent to another process.
+        OutputError: a worker could not write. ClimateGSError: a worker could not start.
     """
-    for name, function in {"scene_loader": scene_loader, "renderer": renderer}.items():
-        try:
-            reduction.ForkingPickler.dumps(function)
-        except (AttributeError, TypeError, pickle.PicklingError) as error:
-            raise ValueError(
-                f"{name} {function!r} cannot be sent to worker processes: {error}; use a function "
-                f"defined at the top of a module, or workers=1"
-            ) from error
-    pool = _Pool(setup, scene_loader, renderer, deliver, lock, chunks)
+    try:
+        reduction.ForkingPickler.dumps(renderer)
+    except (AttributeError, TypeError, pickle.PicklingError) as error:
+        raise ValueError(
+            f"renderer {renderer!r} cannot be sent to worker processes: {error}; use a function "
+            f"defined at the top of a module, or workers=1"
+        ) from error
+    pool = _Pool(setup, shared, renderer, deliver, lock, chunks)
     pool.run(min(workers, len(chunks)))
 
 
@@ -87,7 +87,7 @@ class _Worker:
     def __init__(self, pool: _Pool) -> None:
         context = multiprocessing.get_context("spawn")
         self.connection, child = context.Pipe()
-        arguments = (child, pool.setup, pool.scene_loader, pool.renderer, pool.threads)
+        arguments = (child, pool.setup, pool.shared, pool.renderer, pool.threads)
         self.process = context.Process(
             target=worker_main, args=(*arguments, pool.lock.inherited()), daemon=True
         )
@@ -126,13 +126,13 @@ class _Pool:
     def __init__(
         self,
         setup: Setup,
-        scene_loader: SceneLoader,
+        shared: SharedScene,
         renderer: Renderer | None,
         deliver: Deliver,
         lock: OutputLock,
         chunks: Sequence[Chunk],
     ) -> None:
-        self.setup, self.scene_loader, self.renderer = setup, scene_loader, renderer
+        self.setup, self.shared, self.renderer = setup, shared, renderer
         self.deliver, self.lock = deliver, lock
         self.waiting = deque(chunks)
         self.retries: deque[Chunk] = deque()
@@ -174,7 +174,7 @@ class _Pool:
         if isinstance(message, Ready):
             worker.is_ready = True
         elif isinstance(message, Failure):
-            raise (OutputError if message.is_output else SceneError)(message.text)
+            raise (OutputError if message.is_output else ClimateGSError)(message.text)
         else:
             worker.take(message)
             self.deliver(message)
@@ -188,9 +188,10 @@ class _Pool:
             return
         ending = _describe_exit(worker.process.exitcode)
         if not worker.is_ready:
-            raise SceneError(
-                f"a worker process {ending} while opening {self.setup.scene_uri}; if memory ran "
-                f"out, use fewer workers"
+            raise ClimateGSError(
+                f"a worker process {ending} while starting; what it printed says more. A script "
+                f"that starts workers needs `if __name__ == '__main__':` around its jobs; if "
+                f"memory ran out, use fewer workers"
             )
         _log.warning("a worker process %s; its images are tried once more", ending)
         for chunk in worker.in_hand:
@@ -214,7 +215,7 @@ class _Pool:
                 worker.stop()
             while self.workers and time.monotonic() < deadline:
                 for worker in self._readable(1.0):
-                    with contextlib.suppress(OutputError, SceneError):  # the first is on its way
+                    with contextlib.suppress(ClimateGSError):  # the first is on its way
                         self._read(worker)
         finally:
             for worker in self.workers:

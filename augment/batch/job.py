@@ -9,7 +9,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter, defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -21,18 +21,20 @@ from augment.batch.backends import choose_backend
 from augment.batch.executors import run_in_processes, run_serially
 from augment.batch.finish import BoxCache, finish, needs_finish
 from augment.batch.journal import Identity
-from augment.batch.layout import MANIFEST, variant_name
+from augment.batch.layout import MANIFEST, STATE_FOLDER, variant_name
 from augment.batch.ledger import Ledger
 from augment.batch.lock import OutputLock
 from augment.batch.manifest import FAILED, OK
 from augment.batch.runner import Chunk, Outcome, Renderer, Setup
 from augment.batch.selection import SceneIndex, select_frames
+from augment.batch.shared_scene import share_scene
 from augment.batch.trajectory import frames_to_json, trajectory_id
-from augment.batch.worker import SceneLoader
 from augment.cameras import Frame
 from augment.scene import Scene
 from recipes.dump import dump_recipe
 from recipes.schema import Recipe
+
+SceneLoader = Callable[[str], Scene]
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +76,7 @@ class JobResult:
     """Counts of images of this job. skipped: finished by earlier runs. failures: one line each.
 
     manifest: its path. seconds: wall clock. timings: seconds by kind of work, summed over
-    threads and workers (render, encode, write), or of the job itself (open, labels, finish).
+    threads and workers (render, encode, write), or of the job itself (open, labels, share, finish).
     """
 
     written: int
@@ -95,8 +97,10 @@ def run_job(
 ) -> JobResult:
     """Render what is missing, then write labels, calibration and manifest.
 
-    scene_loader: opens `job.scene_uri`; renderer: `augment.apply.render_view` if None. With
-    several workers both must be importable functions, since each worker process calls them.
+    scene_loader: called once with `job.scene_uri`. renderer: `augment.apply.render_view` if None;
+    with several workers it must be an importable function, and the scene's labels and sky of
+    importable classes, since both are sent to other processes. progress: a bar on stderr.
+
     An image that fails is recorded in the manifest and the rest goes on. A KeyboardInterrupt
     finishes the images at hand, writes the manifest of what there is, and is raised again.
 
@@ -104,171 +108,148 @@ def run_job(
         SceneError: the scene cannot be opened, or lacks a wanted frame or camera.
         OutputError: the folder cannot be written, is in use, or holds something else.
     """
-    return _Run(job, scene_loader, renderer).go(progress)
+    started = time.perf_counter()
+    run = _Run(job, scene_loader(job.scene_uri), renderer)
+    run.timings["open"] = time.perf_counter() - started
+    run.go(progress)
+    return JobResult(
+        written=run.counts[OK],
+        skipped=run.skipped,
+        failed=run.counts[FAILED],
+        manifest=run.out_dir / MANIFEST,
+        seconds=time.perf_counter() - started,
+        failures=tuple(sorted(run.failures)),
+        timings=dict(run.timings),
+    )
 
 
 class _Run:
-    def __init__(
-        self, job: RenderJob, scene_loader: SceneLoader, renderer: Renderer | None
-    ) -> None:
-        self.job, self.scene_loader, self.renderer = job, scene_loader, renderer
+    """One call of run_job."""
+
+    def __init__(self, job: RenderJob, scene: Scene, renderer: Renderer | None) -> None:
+        self.job, self.renderer = job, renderer
+        self.scene: Scene | None = scene  # None once workers have it
+        # A stand-in has its own idea of backends.
+        self.backend = job.backend if renderer else choose_backend(job.backend, scene)
+        self.index = SceneIndex.of(scene, job.camera_path)
+        self.selection = select_frames(self.index, job.frames, job.cameras)
         self.out_dir = Path(job.out_dir).absolute()
+        self.trajectory = trajectory_id(job.camera_path)
+        self.ledger = Ledger(self.out_dir, self.index, job.recipes, self._identities())
+        self.boxes = BoxCache(self.index)
         self.timings: defaultdict[str, float] = defaultdict(float)
         self.counts: Counter[str] = Counter()
         self.failures: list[str] = []
         self.counting = threading.Lock()  # outcomes arrive from several threads
-        self.backend = job.backend
 
-    def go(self, progress: bool) -> JobResult:
-        started = time.perf_counter()
-        scene: Scene | None = self.scene_loader(self.job.scene_uri)
-        self.timings["open"] += time.perf_counter() - started
-        if self.renderer is None:  # a stand-in has its own idea of backends
-            self.backend = choose_backend(self.job.backend, scene)
-        index = SceneIndex.of(scene, self.job.camera_path)
-        selection = select_frames(index, self.job.frames, self.job.cameras)
-        if self.job.workers > 1:
-            scene = None  # its memory is the workers' to use
-        recipes = tuple(self.job.recipes)
-        total = len(recipes) * sum(len(names) for _, names in selection)
+    def go(self, progress: bool) -> None:
+        self.total = len(self.job.recipes) * sum(len(names) for _, names in self.selection)
         with OutputLock(self.out_dir) as lock:
-            ledger = Ledger(self.out_dir, index, recipes, self._identities(index, recipes))
-            ledger.open(overwrite=self.job.overwrite)
-            chunks = list(ledger.pending(selection))
-            left = sum(len(chunk.cameras) for chunk in chunks)
-            bar = tqdm(
-                total=total, initial=total - left, unit="image", disable=not progress, leave=True
+            self.ledger.open(overwrite=self.job.overwrite)
+            chunks = list(self.ledger.pending(self.selection))
+            self.skipped = self.total - sum(len(chunk.cameras) for chunk in chunks)
+            self.bar = tqdm(
+                total=self.total, initial=self.skipped, unit="image", disable=not progress
             )
             try:
-                with bar:
-                    self._render(scene, index, ledger, chunks, lock, bar)
+                with self.bar:
+                    self._render(chunks, lock)
+                    if self.counts or needs_finish(self.ledger):
+                        self._finish()
             except KeyboardInterrupt:
-                done = total - left + self.counts[OK]
+                self._finish()
                 raise KeyboardInterrupt(
-                    f"stopped with {done} of {total} images finished; run the same command "
-                    f"again to go on from there"
+                    f"stopped with {self.skipped + self.counts[OK]} of {self.total} images "
+                    f"finished; run the same command again to go on from there"
                 ) from None
             finally:
-                ledger.close()
-        return JobResult(
-            written=self.counts[OK],
-            skipped=total - left,
-            failed=self.counts[FAILED],
-            manifest=self.out_dir / MANIFEST,
-            seconds=time.perf_counter() - started,
-            failures=tuple(sorted(self.failures)),
-            timings=dict(self.timings),
-        )
+                self.ledger.close()
 
-    def _render(
-        self,
-        scene: Scene | None,
-        index: SceneIndex,
-        ledger: Ledger,
-        chunks: list[Chunk],
-        lock: OutputLock,
-        bar: tqdm,
-    ) -> None:
-        boxes = BoxCache(index)
-        try:
-            if chunks:
-                self._begin(ledger, chunks)
-                chunks = self._leave_unlabelled(ledger, chunks, boxes, bar)
-                self._execute(scene, index, ledger, chunks, lock, bar)
-        except KeyboardInterrupt:
-            self._finish(ledger, boxes)
-            raise
-        if self.counts or needs_finish(ledger):
-            self._finish(ledger, boxes)
-
-    def _execute(
-        self,
-        scene: Scene | None,
-        index: SceneIndex,
-        ledger: Ledger,
-        chunks: list[Chunk],
-        lock: OutputLock,
-        bar: tqdm,
-    ) -> None:
+    def _render(self, chunks: list[Chunk], lock: OutputLock) -> None:
+        if chunks:
+            self._begin(chunks)
+            chunks = self._leave_unlabelled(chunks)
         path = self.job.camera_path
         setup = Setup(
-            scene_uri=self.job.scene_uri,
             out_dir=str(self.out_dir),
             recipes=tuple(self.job.recipes),
             backend=self.backend,
             camera_path=None if path is None else frames_to_json(path),
-            labelled=index.labelled,
+            labelled=self.index.labelled,
         )
-
-        def deliver(outcome: Outcome) -> None:
-            self._deliver(ledger, outcome, bar)
-
-        if scene is not None:
-            run_serially(scene, setup, chunks, self.renderer, deliver)
-        elif chunks:
+        assert self.scene is not None
+        if not chunks:
+            return
+        if self.job.workers == 1:
+            run_serially(self.scene, setup, chunks, self.renderer, self._deliver)
+            return
+        started = time.perf_counter()
+        shared = share_scene(self.scene, self.out_dir / STATE_FOLDER)
+        self.scene = None  # this process needs no more of it than the index
+        self.timings["share"] += time.perf_counter() - started
+        try:
             run_in_processes(
                 setup,
                 chunks,
                 workers=self.job.workers,
-                scene_loader=self.scene_loader,
+                shared=shared,
                 renderer=self.renderer,
-                deliver=deliver,
+                deliver=self._deliver,
                 lock=lock,
             )
+        finally:
+            shared.remove()
 
-    def _identities(self, index: SceneIndex, recipes: Sequence[Recipe]) -> list[Identity]:
+    def _identities(self) -> list[Identity]:
         return [
             Identity(
-                source=index.source,
+                source=self.index.source,
                 recipe_hash=recipe.hash,
-                trajectory=trajectory_id(self.job.camera_path),
+                trajectory=self.trajectory,
                 version=augment.__version__,
                 backend=self.backend,
             )
-            for recipe in recipes
+            for recipe in self.job.recipes
         ]
 
-    def _begin(self, ledger: Ledger, chunks: Sequence[Chunk]) -> None:
+    def _begin(self, chunks: Sequence[Chunk]) -> None:
         """Announce the variants that will be written, before their first file."""
         for number in sorted({chunk.variant for chunk in chunks}):
-            variant = ledger.variants[number]
+            variant = self.ledger.variants[number]
             variant.journal.begin(variant.identity)
             text = dump_recipe(variant.recipe).encode()
             write_atomic(self.out_dir / variant.folder / "recipe.yaml", text)
 
-    def _leave_unlabelled(
-        self, ledger: Ledger, chunks: Sequence[Chunk], boxes: BoxCache, bar: tqdm
-    ) -> list[Chunk]:
+    def _leave_unlabelled(self, chunks: Sequence[Chunk]) -> list[Chunk]:
         """Record as failed what belongs to frames whose boxes cannot be read; return the rest."""
         started = time.perf_counter()
-        labelled = {c.frame for c in chunks if ledger.variants[c.variant].recipe.output.labels}
-        boxes.get(sorted(labelled))
+        labelled = {c.frame for c in chunks if self.job.recipes[c.variant].output.labels}
+        self.boxes.get(sorted(labelled))
         self.timings["labels"] += time.perf_counter() - started
         rest = []
         for chunk in chunks:
-            message = boxes.errors.get(chunk.frame)
-            if message is None or not ledger.variants[chunk.variant].recipe.output.labels:
+            message = self.boxes.errors.get(chunk.frame)
+            if message is None or not self.job.recipes[chunk.variant].output.labels:
                 rest.append(chunk)
                 continue
             for name in chunk.cameras:
-                outcome = Outcome(chunk.variant, chunk.frame, name, FAILED, message)
-                self._deliver(ledger, outcome, bar)
+                self._deliver(Outcome(chunk.variant, chunk.frame, name, FAILED, message))
         return rest
 
-    def _deliver(self, ledger: Ledger, outcome: Outcome, bar: tqdm) -> None:
-        ledger.record(outcome, ledger.index.frames_by_number[outcome.frame])
+    def _deliver(self, outcome: Outcome) -> None:
+        self.ledger.record(outcome, self.index.frames_by_number[outcome.frame])
         with self.counting:
             self.counts[outcome.status] += 1
             for kind, seconds in outcome.seconds.items():
                 self.timings[kind] += seconds
             if outcome.status == FAILED:
                 where = f"frame {outcome.frame}, camera {outcome.camera}"
-                folder = ledger.variants[outcome.variant].folder
+                folder = self.ledger.variants[outcome.variant].folder
                 self.failures.append(f"{folder}, {where}: {outcome.message}")
-                bar.set_postfix(failed=self.counts[FAILED], refresh=False)
-            bar.update()
+                self.bar.set_postfix(failed=self.counts[FAILED], refresh=False)
+            self.bar.update()
 
-    def _finish(self, ledger: Ledger, boxes: BoxCache) -> None:
+    def _finish(self) -> None:
         started = time.perf_counter()
-        finish(ledger, trajectory_id(self.job.camera_path), boxes)
+        finish(self.ledger, self.trajectory, self.boxes)
         self.timings["finish"] += time.perf_counter() - started

@@ -42,7 +42,6 @@ class Setup:
     frames whose labels and LiDAR pass through.
     """
 
-    scene_uri: str
     out_dir: str
     recipes: tuple[Recipe, ...]
     backend: str

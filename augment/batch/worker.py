@@ -1,4 +1,4 @@
-"""What a worker process runs: open the scene, render the chunks it is sent, report each image."""
+"""What a worker process runs: take the scene, render the chunks it is sent, report each image."""
 
 from __future__ import annotations
 
@@ -11,16 +11,14 @@ from queue import SimpleQueue
 
 from augment.batch.lock import InheritedLock
 from augment.batch.runner import Chunk, FrameRunner, Outcome, Renderer, Setup, describe
+from augment.batch.shared_scene import SharedScene
 from augment.batch.writer import WritePump
 from augment.errors import OutputError
-from augment.scene import Scene
-
-SceneLoader = Callable[[str], Scene]
 
 
 @dataclass(frozen=True)
 class Ready:
-    """The scene is open."""
+    """The scene is there; rendering can begin."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +32,7 @@ class Failure:
 def worker_main(
     connection: Connection,
     setup: Setup,
-    scene_loader: SceneLoader,
+    shared: SharedScene,
     renderer: Renderer | None,
     threads: int,
     lock: InheritedLock,
@@ -50,9 +48,9 @@ def worker_main(
     threading.Thread(target=_listen, args=(connection, inbox, stopped), daemon=True).start()
     send = _sender(connection)
     try:
-        scene = scene_loader(setup.scene_uri)
+        scene = shared.open()
     except Exception as error:
-        send(Failure(False, describe(error, f"opening {setup.scene_uri} in a worker process")))
+        send(Failure(False, describe(error, "taking over the scene in a worker process")))
         return
     send(Ready())
     # One writing thread and little waiting: the memory of a view counts once per worker.

@@ -26,7 +26,7 @@ from augment.batch.journal import Journal
 from augment.batch.label_files import lidar_bytes
 from augment.batch.layout import STATE_FOLDER
 
-STRIDE = 11  # odd, so that kills come before and after calls; 1 tries every point
+STRIDE = 17  # odd, so that kills come before and after calls; 1 tries every point
 SYNC_POINTS = ("fsync", "replace", "unlink", "rename", "rmdir")
 
 
@@ -130,7 +130,7 @@ def sweep_fresh(folder: Path) -> dict[str, int]:
     whole = tree_digest(folder / "whole")
     kills, last = 0, 2 * uninterrupted.points
     # The end, where journals become the manifest, is tried more closely.
-    for kill_at in [*range(1, last - 30, STRIDE), *range(last - 30, last, 3)]:
+    for kill_at in [*range(1, last - 30, STRIDE), *range(last - 30, last, 5)]:
         out = folder / "killed"
         ended = run_forked(render(job(out)), kill_at)
         # Threads meet the points in another order each time, so the last may not be reached.
@@ -149,7 +149,7 @@ def sweep_overwrite(folder: Path) -> dict[str, int]:
     old, whole = tree_digest(folder / "old"), tree_digest(folder / "whole")
     kills = 0
     # All that an overwriting run does before it renders is within its first 30 changes.
-    for kill_at in [*range(1, 60, 4), *range(61, 140, STRIDE)]:
+    for kill_at in [*range(1, 60, 7), *range(61, 140, STRIDE)]:
         out = folder / "killed"
         shutil.copytree(folder / "old", out)
         ended = run_forked(render(job(out, frames=1, overwrite=True)), kill_at)

@@ -76,8 +76,6 @@ def open_fake(uri: str) -> Scene:
     """`fake:NAME?frames=N&unreadable=K`: a scene of N frames and two cameras."""
     name, _, query = uri.removeprefix("fake:").partition("?")
     options = dict(part.split("=") for part in query.split("&") if part)
-    if "only_parent" in options and os.environ["BATCH_SCENES_PARENT"] != str(os.getpid()):
-        raise AdapterError("no memory for a second copy")
     unreadable = tuple(int(options[k]) for k in ("unreadable",) if k in options)
     frames = tuple(make_frame(index) for index in range(int(options.get("frames", 4))))
     return Scene(

@@ -7,8 +7,11 @@ import os
 from pathlib import Path
 
 import pytest
+import torch
 from batch_scenes import (
+    FakeLabels,
     fake_render,
+    make_gaussians,
     make_recipe,
     open_fake,
     render_dying_at_frame_2,
@@ -18,8 +21,10 @@ from batch_scenes import (
 from augment.batch.executors import _thread_limits, available_cores
 from augment.batch.job import RenderJob, run_job
 from augment.batch.manifest import read_manifest
-from augment.errors import SceneError
-from augment.scene import Scene
+from augment.batch.shared_scene import share_scene
+from augment.errors import ClimateGSError
+from augment.scene import Actor, Track
+from augment.sky import LatLongSky
 
 
 def test_a_dying_worker_costs_one_image_and_workers_change_no_file(
@@ -44,20 +49,59 @@ def test_a_dying_worker_costs_one_image_and_workers_change_no_file(
     assert tree_digest(tmp_path / "two") == tree_digest(one)
 
 
-def test_what_workers_call_must_be_importable(tmp_path: Path) -> None:
-    def local_loader(uri: str) -> Scene:
-        return open_fake(uri)
-
+def test_a_renderer_that_workers_cannot_import_is_refused(tmp_path: Path) -> None:
     job = RenderJob("fake:street", [make_recipe()], tmp_path, workers=2)
-    with pytest.raises(ValueError, match=r"scene_loader .*local_loader.* cannot be sent to"):
-        run_job(job, scene_loader=local_loader, renderer=fake_render, progress=False)
+    with pytest.raises(ValueError, match=r"renderer <function .*lambda.* cannot be sent to worker"):
+        run_job(job, scene_loader=open_fake, renderer=lambda *_, **__: None, progress=False)
     assert not list(tmp_path.rglob("*.png"))
 
 
-def test_a_worker_that_cannot_open_the_scene_says_why(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setenv("BATCH_SCENES_PARENT", str(os.getpid()))
-    job = RenderJob("fake:street?only_parent=1", [make_recipe()], tmp_path, frames=[0], workers=2)
-    with pytest.raises(SceneError, match=r"opening fake:street.* in a worker process: .*no memory"):
+def test_a_shared_scene_is_the_scene(tmp_path: Path) -> None:
+    """Every tensor to the bit, and no longer than needed on the disk."""
+    scene = open_fake("fake:street")
+    track = Track(torch.arange(2), torch.eye(4, dtype=torch.float64).expand(2, 4, 4))
+    gaussians = dataclasses.replace(make_gaussians(2000), semantic=None)
+    actor = Actor("7", "Car", gaussians, track, (4.0, 2.0, 1.5))
+    sky = LatLongSky(torch.rand(4, 8, 3))
+    scene = dataclasses.replace(scene, actors=(actor,), sky=sky)
+    shared = share_scene(scene, tmp_path)
+    assert len(list(tmp_path.iterdir())) == 1
+    assert len(shared.skeleton) < 20_000 < Path(shared.path).stat().st_size
+    again = shared.open()
+    shared.remove()
+    assert not list(tmp_path.iterdir())
+    for ours, theirs in (
+        (scene.background, again.background),
+        (actor.gaussians, again.actors[0].gaussians),
+        (track, again.actors[0].track),
+        (scene.sky, again.sky),
+        (scene.frames[1].cameras["front"], again.frames[1].cameras["front"]),
+    ):
+        for name, value in vars(ours).items():
+            other = getattr(theirs, name)
+            if isinstance(value, torch.Tensor):
+                assert other.dtype == value.dtype and torch.equal(other, value)
+            else:
+                assert other == value
+    assert again.labels == scene.labels
+    again.background.means[0] = 0  # may be written to, as any tensor
+
+
+def test_labels_that_cannot_be_sent_are_refused(tmp_path: Path) -> None:
+    class Local(FakeLabels):
+        pass
+
+    scene = dataclasses.replace(open_fake("fake:street"), labels=Local())
+    job = RenderJob("fake:street", [make_recipe()], tmp_path, workers=2)
+    with pytest.raises(ValueError, match=r"cannot be sent to worker processes.*workers=1 works"):
+        run_job(job, scene_loader=lambda _uri: scene, renderer=fake_render, progress=False)
+    assert not list(tmp_path.rglob("*.climategs-tmp"))
+
+
+def test_a_worker_that_cannot_start_ends_the_job(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr("augment.batch.executors.worker_main", os.abort)
+    job = RenderJob("fake:street", [make_recipe()], tmp_path, frames=[0], workers=2)
+    with pytest.raises(ClimateGSError, match=r"worker process ended with exit code 1 while start"):
         run_job(job, scene_loader=open_fake, renderer=fake_render, progress=False)
 
 
