@@ -2,13 +2,16 @@
 
 Schemes are in the table below; a path without one is recognised by what it holds. Special
 characters in paths and values (% ? & and, in values, = too) may be percent-encoded; a path that
-exists as written is taken as written. `+` stands for itself. `camera_path=FILE` works with every
-scheme: it replaces the scene's cameras (see adapters.camera_paths).
+exists as written is taken as written. `+` stands for itself. Two keys work with every scheme:
+`camera_path=FILE` replaces the scene's cameras (see adapters.camera_paths), and `ground_z=HEIGHT`
+says how high the road is (scene world, metres) where the scene does not know or is wrong.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -20,6 +23,7 @@ from augment.errors import AdapterError
 from augment.scene import Scene
 
 CAMERA_PATH_KEY = "camera_path"
+GROUND_KEY = "ground_z"
 _SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9_+.-]*):(?!\\)")
 
 
@@ -63,6 +67,7 @@ def open_scene(uri: str) -> Scene:
     """
     scheme, path, query = parse_uri(uri)
     camera_path = query.pop(CAMERA_PATH_KEY, None)
+    ground_z = query.pop(GROUND_KEY, None)
     if scheme is None:
         scheme = recognise(Path(path))
     entry = _SCHEMES.get(scheme)
@@ -77,11 +82,24 @@ def open_scene(uri: str) -> Scene:
             scene = _load(entry)(path, query)
         except OSError as error:
             raise AdapterError(f"{uri!r}: cannot be read: {error}") from error
+    if ground_z is not None:
+        scene = _with_ground(scene, ground_z)
     if camera_path is None:
         return scene
     from adapters.camera_paths import with_camera_path
 
     return with_camera_path(scene, Path(camera_path))
+
+
+def _with_ground(scene: Scene, text: str) -> Scene:
+    try:
+        height = float(text)
+    except ValueError:
+        height = math.nan
+    if not math.isfinite(height):
+        raise AdapterError(f"{GROUND_KEY} must be the road's height in metres; got {text!r}")
+    source = add_to_uri(scene.source, GROUND_KEY, text)
+    return dataclasses.replace(scene, ground_z_m=height, source=source)
 
 
 def parse_uri(uri: str) -> tuple[str | None, str, dict[str, str]]:

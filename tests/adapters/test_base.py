@@ -149,3 +149,13 @@ def test_unreadable_files_are_adapter_errors(tmp_path: Path, monkeypatch) -> Non
     monkeypatch.setattr(Path, "open", refuse)
     with pytest.raises(AdapterError, match=r"cannot be read: .*Permission denied"):
         open_scene(f"gaussians:{path}")
+
+
+def test_the_road_height_can_be_given_to_any_scene(tmp_path: Path) -> None:
+    write_ply(tmp_path / "a.ply", street())
+    uri = f"gaussians:{tmp_path}/a.ply?scale=1"
+    scene = open_scene(f"{uri}&ground_z=-1.5")
+    assert scene.ground_z_m == -1.5
+    assert open_scene(scene.source).ground_z_m == -1.5  # a worker opens the same scene
+    with pytest.raises(AdapterError, match="ground_z must be the road's height.*got 'low'"):
+        open_scene(f"{uri}&ground_z=low")
