@@ -12,6 +12,7 @@ Slices change no bit of the image: what they leave out lies behind closed tiles.
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
 from collections.abc import Sequence
@@ -45,13 +46,13 @@ from augment.render.threads import kernel_threads, thread_count
 from augment.scene import Gaussians, PosedGaussians
 from augment.weather.smog import SmogMedium
 
-_RANK_RUNS = 16  # pieces of work in ranking, each with its own histogram
+_RANK_RUNS = 8  # pieces of work in ranking, each with its own histogram
 # A slice ends where the splats before it would cover every pixel this many times over with opacity
 # 1: by then, and each time that doubles, most tiles of a dense scene have closed.
-_SLICE_COVER = 12.0
+_SLICE_COVER = 10.0
+_SLICE_GROWTH = 1.4
 _SMALLEST_SLICE = 20_000  # fewer splats cost less than another slice does
 _MAX_PAIRS = 1 << 24  # (splat, tile) pairs listed at once: 64 MB
-_TINY = np.float32(1e-30)  # m; z of Gaussians that cannot be seen is 0
 
 
 def rasterize_cpu(
@@ -76,20 +77,16 @@ def rasterize_cpu(
     images = _images(camera, buffers)
     with borrowed_scratch() as scratch, kernel_threads():
         tiles = _Tiles(camera, images, settings, scratch)
-        depths, ends = _rank(inputs, views, camera, scratch)
-        clock.lap("project")
-        low = np.float32(0)
-        for number, high in enumerate(ends):
-            z_range = np.array([max(low, _TINY), high], np.float32)
-            splats = _project(inputs, views, depths, z_range, tiles, modes, scratch)
+        depths, edges = _rank(inputs, views, camera, scratch)
+        for bins in itertools.pairwise(edges):
+            splats = _project(inputs, views, depths, bins, tiles, modes, scratch)
             clock.lap("project")
-            order, rects = _sort(splats, scratch)
+            slots, rects = _sort(splats, bins[0], scratch)
             clock.lap("sort")
-            clock.count("visible", len(order))
-            tiles.blend(splats.records, order, rects, is_last=number == len(ends) - 1, clock=clock)
+            clock.count("visible", len(slots))
+            tiles.blend(splats.records, slots, rects, is_last=bins[1] == edges[-1], clock=clock)
             if not tiles.open.any():
                 break
-            low = high
     return RenderOutput(**{name: torch.from_numpy(image) for name, image in images.items()})
 
 
@@ -203,30 +200,34 @@ def _images(camera: Camera, buffers: frozenset[str]) -> dict[str, np.ndarray]:
 
 def _rank(
     inputs: _Inputs, views: np.ndarray, camera: Camera, scratch: Scratch
-) -> tuple[np.ndarray, list[np.float32]]:
-    """z of all Gaussians (0: cannot be seen), and where the slices end."""
+) -> tuple[np.ndarray, list[int]]:
+    """z of all Gaussians (0: cannot be seen), and where the slices begin and end, in bins of z."""
     depths = scratch.array("depths", (inputs.slots,), np.float32)
     histograms = scratch.array("histograms", (_RANK_RUNS, 2, layout.BINS), np.float64)
     cpu_project.rank_splats(
         inputs.addresses, inputs.sizes, views, inputs.blocks, depths, histograms
     )
-    cover, counts = histograms.sum(0).cumsum(1)
-    return depths, _slice_ends(cover / (camera.width * camera.height), counts)
+    cover, counts = histograms.sum(0)
+    return depths, _slice_edges(cover / (camera.width * camera.height), counts)
 
 
-def _slice_ends(cover: np.ndarray, counts: np.ndarray) -> list[np.float32]:
-    """Upper z of every slice; the last is infinite. cover, counts: running sums over bins of z."""
-    ends: list[np.float32] = []
+def _slice_edges(cover: np.ndarray, counts: np.ndarray) -> list[int]:
+    """First bin of every slice, and the end of the last. cover, counts: of each bin of z."""
+    filled = np.flatnonzero(counts)
+    if len(filled) == 0:
+        return [0, 1]
+    edges, end = [int(filled[0])], int(filled[-1]) + 1
+    cover, counts = cover.cumsum(), counts.cumsum()
     target, taken = _SLICE_COVER, 0.0
     while target < cover[-1]:
-        last = int(np.searchsorted(cover, target))
-        if counts[-1] - counts[last] < _SMALLEST_SLICE:
+        edge = int(np.searchsorted(cover, target)) + 1
+        if counts[-1] - counts[edge - 1] < _SMALLEST_SLICE:
             break
-        if counts[last] - taken >= _SMALLEST_SLICE:
-            ends.append(np.uint32((last + 1) << layout.BIN_SHIFT).view(np.float32))
-            taken = counts[last]
-        target *= 2
-    return [*ends, np.float32(np.inf)]
+        if counts[edge - 1] - taken >= _SMALLEST_SLICE:
+            edges.append(edge)
+            taken = counts[edge - 1]
+        target *= _SLICE_GROWTH
+    return [*edges, end]
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,6 +237,7 @@ class _Splats:
     records: np.ndarray
     rects: np.ndarray
     keys: np.ndarray
+    found: np.ndarray
     counts: np.ndarray
 
 
@@ -243,16 +245,18 @@ def _project(
     inputs: _Inputs,
     views: np.ndarray,
     depths: np.ndarray,
-    z_range: np.ndarray,
+    bins: tuple[int, int],
     tiles: _Tiles,
     modes: np.ndarray,
     scratch: Scratch,
 ) -> _Splats:
+    blocks = len(inputs.blocks)
     splats = _Splats(
         scratch.array("records", (inputs.slots * layout.RECORD,), np.float32),
-        scratch.array("rects", (inputs.slots, 4), np.uint16),
-        scratch.array("record_keys", (inputs.slots,), np.uint32),
-        scratch.array("counts", (len(inputs.blocks),), np.int64),
+        scratch.array("rects", (inputs.slots,), np.uint64),
+        scratch.array("keys", (inputs.slots,), np.uint32),
+        scratch.array("found", (blocks,), np.int64),
+        scratch.array("bin_counts", (blocks, bins[1] - bins[0]), np.int32),
     )
     cpu_project.project_slice(
         inputs.addresses,
@@ -260,35 +264,30 @@ def _project(
         views,
         inputs.blocks,
         inputs.first_ids,
-        depths,
-        z_range,
+        depths.view(np.uint32),
+        np.array(bins, np.int64),
         tiles.open_sums(),
         modes,
         splats.records,
         splats.rects,
         splats.keys,
+        splats.found,
         splats.counts,
     )
     return splats
 
 
-def _sort(splats: _Splats, scratch: Scratch) -> tuple[np.ndarray, np.ndarray]:
+def _sort(splats: _Splats, first_bin: int, scratch: Scratch) -> tuple[np.ndarray, np.ndarray]:
     """Slots nearest first (ties in index order), and their tiles in that order."""
-    size = len(splats.keys)
-    keys = [scratch.array(f"keys{i}", (size,), np.uint32) for i in range(2)]
-    slots = [scratch.array(f"slots{i}", (size,), np.int32) for i in range(2)]
-    count, low, high = cpu_bin.list_splats(splats.keys, splats.counts, keys[0], slots[0])
-    keys, slots = [k[:count] for k in keys], [s[:count] for s in slots]
-    runs = 2 * thread_count()
-    for shift in range(0, int(high - low).bit_length() if count else 0, cpu_bin.RADIX_BITS):
-        cpu_bin.radix_pass(
-            keys[0], slots[0], keys[1], slots[1], np.uint32(low), np.uint32(shift), runs
-        )
-        keys.reverse()
-        slots.reverse()
-    rects = scratch.array("sorted_rects", (count, 4), np.uint16)
-    cpu_bin.sort_rects(slots[0], splats.rects, rects, runs)
-    return slots[0], rects
+    heads = scratch.array("bin_heads", splats.counts.shape, np.int64)
+    starts = scratch.array("bin_starts", (splats.counts.shape[1] + 1,), np.int64)
+    count = int(cpu_bin.place_bins(splats.counts, heads, starts))
+    keys, spare_keys = (scratch.array(f"sorted_keys{i}", (count,), np.uint32) for i in range(2))
+    slots, spare_slots = (scratch.array(f"sorted_slots{i}", (count,), np.int32) for i in range(2))
+    rects = scratch.array("sorted_rects", (count,), np.uint64)
+    cpu_bin.scatter_to_bins(splats.keys, splats.found, first_bin, heads, keys, slots)
+    cpu_bin.sort_bins(starts, keys, slots, splats.rects, spare_keys, spare_slots, rects)
+    return slots, rects
 
 
 class _Tiles:
@@ -308,7 +307,8 @@ class _Tiles:
         self._limits = np.array(
             [settings.alpha_max, math.log2(ALPHA_MIN), TRANSMITTANCE_STOP], np.float32
         )
-        self._images = [images.get(name) for name in BUFFERS]
+        flat = {name: image.reshape(-1) for name, image in images.items()}
+        self._images = [flat.get(name) for name in BUFFERS]
         used = cpu_blend.STATE if set(images) - {RGB, ALPHA} else cpu_blend.COLOR_STATE
         self._scratch = scratch
         self._states = scratch.array("states", (count * used,), np.float32)
@@ -325,17 +325,17 @@ class _Tiles:
     def blend(
         self,
         records: np.ndarray,
-        order: np.ndarray,
+        slots: np.ndarray,
         rects: np.ndarray,
         *,
         is_last: bool,
         clock: _Clock,
     ) -> None:
-        """Blend ordered splats into the open tiles; close those that end, all if this is_last."""
-        first, count = 0, len(order)
+        """Blend splats, nearest first, into the open tiles; close those that end, all if this is_last."""
+        first, count = 0, len(slots)
         while True:
             end = int(cpu_bin.next_cut(rects, first, _MAX_PAIRS))
-            members, starts = self._list(order, rects, first, end)
+            members, starts = self._list(slots, rects, first, end)
             clock.lap("bin")
             clock.count("pairs", len(members))
             cpu_blend.blend_tiles(
@@ -355,17 +355,26 @@ class _Tiles:
                 return
 
     def _list(
-        self, order: np.ndarray, rects: np.ndarray, first: int, end: int
+        self, slots: np.ndarray, rects: np.ndarray, first: int, end: int
     ) -> tuple[np.ndarray, np.ndarray]:
-        count = len(self.open)
-        heads = self._scratch.array("heads", (count,), np.int64)
-        starts = self._scratch.array("starts", (count + 1,), np.int64)
-        bands = min(self._rows, 2 * thread_count())
-        cpu_bin.count_pairs(rects, first, end, self._columns, self.open, heads, bands)
-        pairs = int(cpu_bin.place_lists(heads, starts))
+        threads = thread_count()
+        corners = self._scratch.array(
+            "corners", (threads, (self._rows + 1) * (self._columns + 1)), np.int32
+        )
+        cpu_bin.count_corners(rects, first, end, self._columns, corners)
+        heads = self._scratch.array("heads", (self._rows, self._columns), np.int64)
+        starts = self._scratch.array("starts", (len(self.open) + 1,), np.int64)
+        pairs = int(cpu_bin.place_lists(corners, self.open, heads, starts))
         members = self._scratch.array("members", (pairs,), np.int32)
         cpu_bin.fill_lists(
-            order, rects, first, end, self._columns, self.open, heads, members, bands
+            slots,
+            rects,
+            first,
+            end,
+            self._columns,
+            heads.reshape(-1),
+            members,
+            min(self._rows, 4 * threads),
         )
         return members, starts
 

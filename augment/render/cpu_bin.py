@@ -1,87 +1,107 @@
-"""Numba kernels: order splats by depth, and list them tile by tile in that order."""
+"""Numba kernels: order splats by depth, and list them tile by tile in that order.
+
+The projection has counted each block's splats by bins of z. Sorting moves them to their bins, block
+after block, then sorts every bin within the cache; both keep equal depths in index order.
+"""
 
 from __future__ import annotations
 
-import numba
 import numpy as np
+from numba import prange
 
-from augment.render.cpu_jit import kernel, serial_kernel
-from augment.render.cpu_layout import BLOCK, U
+from augment.render.cpu_jit import inner, kernel, serial_kernel
+from augment.render.cpu_layout import BIN_SHIFT, BLOCK, U
 
-RADIX_BITS = 11
-_DIGITS = 1 << RADIX_BITS
+_DIGIT_BITS = BIN_SHIFT // 2  # what z bins leave to sort, in two passes
+_DIGITS = 1 << _DIGIT_BITS
+_FEW = 32  # splats sorted faster by insertion
 
 
-@kernel()
-def list_splats(records_z, counts, keys, slots):
-    """Sort keys (bits of z) and slots of all splats that blocks hold, in index order.
+@serial_kernel()
+def place_bins(counts, heads, bin_starts):
+    """Where each block writes its splats of each bin. counts, heads: int32 and int64 [B, Z].
 
-    records_z: uint32 [B BLOCK], every record's z. Returns how many there are, and the range of keys.
+    bin_starts: int64 [Z + 1]. Returns the number of splats.
     """
-    blocks = counts.size
-    starts = np.zeros(blocks + 1, np.int64)
-    lows = np.empty(blocks, np.uint32)
-    highs = np.empty(blocks, np.uint32)
-    for b in range(blocks):
-        starts[b + 1] = starts[b] + counts[b]
-    for b in numba.prange(blocks):
-        low, high = np.uint32(0xFFFFFFFF), np.uint32(0)
-        for i in range(counts[b]):
-            key = records_z[b * BLOCK + i]
-            keys[starts[b] + i] = key
-            slots[starts[b] + i] = b * BLOCK + i
-            low, high = min(low, key), max(high, key)
-        lows[b], highs[b] = low, high
-    low, high = np.uint32(0xFFFFFFFF), np.uint32(0)
-    for b in range(blocks):
-        low, high = min(low, lows[b]), max(high, highs[b])
-    return starts[blocks], low, high
+    at = np.int64(0)
+    for z_bin in range(counts.shape[1]):
+        bin_starts[z_bin] = at
+        for block in range(counts.shape[0]):
+            heads[block, z_bin] = at
+            at += counts[block, z_bin]
+    bin_starts[counts.shape[1]] = at
+    return at
 
 
 @kernel()
-def radix_pass(keys_in, slots_in, keys_out, slots_out, low, shift, runs):
-    """One stable counting sort by RADIX_BITS bits of key - low, in `runs` pieces of work."""
-    total = keys_in.size
-    heads = np.zeros((runs, _DIGITS), np.int64)
-    for run in numba.prange(runs):
-        head = heads[run]
-        for i in range(total * run // runs, total * (run + 1) // runs):
-            head[U((keys_in[i] - low) >> shift) & U(_DIGITS - 1)] += 1
-    at = 0
+def scatter_to_bins(keys, found, first_bin, heads, binned_keys, binned_slots):
+    """Copy every block's keys, and the slots they stand for, to their bins.
+
+    keys: uint32 [B BLOCK], bits of z; found: int64 [B], how many each block has.
+    """
+    for block in prange(found.size):
+        for i in range(found[block]):
+            slot = block * BLOCK + i
+            key = keys[slot]
+            z_bin = np.int64(key >> np.uint32(BIN_SHIFT)) - first_bin
+            at = heads[block, z_bin]
+            heads[block, z_bin] = at + 1
+            binned_keys[at] = key
+            binned_slots[at] = slot
+
+
+@kernel()
+def sort_bins(bin_starts, keys, slots, rects, spare_keys, spare_slots, sorted_rects):
+    """Sort every bin by key, and gather the splats' tiles in the same order."""
+    for z_bin in prange(bin_starts.size - 1):
+        first, last = bin_starts[z_bin], bin_starts[z_bin + 1]
+        if last - first <= _FEW:
+            _sort_few(keys, slots, first, last)
+        else:
+            heads = np.empty(_DIGITS, np.int64)
+            _sort_digit(keys, slots, spare_keys, spare_slots, first, last, 0, heads)
+            _sort_digit(spare_keys, spare_slots, keys, slots, first, last, _DIGIT_BITS, heads)
+        for i in range(U(first), U(last)):
+            sorted_rects[i] = rects[U(slots[i])]
+
+
+@inner()
+def _sort_few(keys, slots, first, last):
+    for i in range(first + 1, last):
+        key, slot = keys[i], slots[i]
+        j = i
+        while j > first and keys[j - 1] > key:
+            keys[j], slots[j] = keys[j - 1], slots[j - 1]
+            j -= 1
+        keys[j], slots[j] = key, slot
+
+
+@inner()
+def _sort_digit(keys, slots, to_keys, to_slots, first, last, shift, heads):
+    """One stable counting sort by a digit of the key."""
+    mask = U(_DIGITS - 1)
     for digit in range(_DIGITS):
-        for run in range(runs):
-            count = heads[run, digit]
-            heads[run, digit] = at
-            at += count
-    for run in numba.prange(runs):
-        head = heads[run]
-        for i in range(total * run // runs, total * (run + 1) // runs):
-            digit = U((keys_in[i] - low) >> shift) & U(_DIGITS - 1)
-            to = U(head[digit])
-            head[digit] += 1
-            keys_out[to] = keys_in[i]
-            slots_out[to] = slots_in[i]
+        heads[digit] = 0
+    for i in range(U(first), U(last)):
+        heads[(U(keys[i]) >> U(shift)) & mask] += 1
+    at = first
+    for digit in range(_DIGITS):
+        count = heads[digit]
+        heads[digit] = at
+        at += count
+    for i in range(U(first), U(last)):
+        digit = (U(keys[i]) >> U(shift)) & mask
+        at = heads[digit]
+        heads[digit] = at + 1
+        to_keys[U(at)] = keys[i]
+        to_slots[U(at)] = slots[i]
 
 
-@kernel()
-def sort_rects(order, rects, sorted_rects, runs):
-    """Tiles of every splat in depth order. Returns how many (splat, tile) pairs there are."""
-    total = order.size
-    pairs = np.zeros(runs, np.int64)
-    for run in numba.prange(runs):
-        found = np.int64(0)
-        for i in range(total * run // runs, total * (run + 1) // runs):
-            slot = order[i]
-            c0, r0 = np.int64(rects[slot, 0]), np.int64(rects[slot, 1])
-            c1, r1 = np.int64(rects[slot, 2]), np.int64(rects[slot, 3])
-            sorted_rects[i, 0], sorted_rects[i, 1] = c0, r0
-            sorted_rects[i, 2], sorted_rects[i, 3] = c1, r1
-            found += (c1 - c0 + 1) * (r1 - r0 + 1)
-        pairs[run] = found
-    found = np.int64(0)
-    for run in range(runs):
-        found += pairs[run]
-    return found
+@inner()
+def _unpack(rect):
+    """First column and row, last column and row of a splat's tiles."""
+    mask = U(0xFFFF)
+    return rect & mask, (rect >> U(16)) & mask, (rect >> U(32)) & mask, rect >> U(48)
 
 
 @serial_kernel()
@@ -90,65 +110,78 @@ def next_cut(sorted_rects, first, limit):
 
     At least one splat, whatever it covers.
     """
-    pairs = np.int64(0)
-    for i in range(first, sorted_rects.shape[0]):
-        across = np.int64(sorted_rects[i, 2]) - np.int64(sorted_rects[i, 0]) + 1
-        down = np.int64(sorted_rects[i, 3]) - np.int64(sorted_rects[i, 1]) + 1
-        pairs += across * down
-        if pairs > limit and i > first:
+    pairs = U(0)
+    for i in range(first, sorted_rects.size):
+        c0, r0, c1, r1 = _unpack(sorted_rects[i])
+        pairs += (c1 - c0 + U(1)) * (r1 - r0 + U(1))
+        if pairs > U(limit) and i > first:
             return i
-    return sorted_rects.shape[0]
+    return sorted_rects.size
 
 
 @kernel()
-def count_pairs(sorted_rects, first, last, columns, open_tiles, heads, bands):
-    """Splats [first, last) of every open tile. heads: int64 [tiles]; bands of rows share the work.
+def count_corners(sorted_rects, first, last, columns, corners):
+    """Where rectangles of tiles begin and end: +1 and -1 at the corners of each.
 
-    A thread sees every splat but writes its own tiles only, so that lists stay in order and in its
-    cache.
+    corners: int32 [C, (rows + 1) (columns + 1)], each of C runs of splats its own; summed over
+    itself from the top left it says how many splats touch each tile.
     """
-    tile_rows = heads.size // columns
-    for band in numba.prange(bands):
-        top, bottom = tile_rows * band // bands, tile_rows * (band + 1) // bands - 1
-        for tile in range(top * columns, (bottom + 1) * columns):
-            heads[tile] = 0
-        for i in range(first, last):
-            r0, r1 = np.int64(sorted_rects[i, 1]), np.int64(sorted_rects[i, 3])
-            if r1 < top or r0 > bottom:
-                continue
-            c0, c1 = np.int64(sorted_rects[i, 0]), np.int64(sorted_rects[i, 2])
-            for row in range(max(r0, top), min(r1, bottom) + 1):
-                for tile in range(row * columns + c0, row * columns + c1 + 1):
-                    heads[U(tile)] += open_tiles[U(tile)] != 0
+    runs = corners.shape[0]
+    width = U(columns + 1)
+    for run in prange(runs):
+        for i in range(corners.shape[1]):
+            corners[run, i] = 0
+        own = corners[run]
+        start = first + (last - first) * run // runs
+        for i in range(U(start), U(first + (last - first) * (run + 1) // runs)):
+            c0, r0, c1, r1 = _unpack(sorted_rects[i])
+            top, bottom = r0 * width, (r1 + U(1)) * width
+            own[top + c0] += 1
+            own[top + c1 + U(1)] -= 1
+            own[bottom + c0] -= 1
+            own[bottom + c1 + U(1)] += 1
 
 
 @serial_kernel()
-def place_lists(heads, starts):
-    """Where every tile's list begins: starts int64 [tiles + 1]; heads become write positions."""
+def place_lists(corners, tiles, heads, starts):
+    """Where every tile's list begins: starts, int64 [tiles + 1]; closed tiles have none.
+
+    heads, int64 [tiles]: where to write its next splat, negative for closed tiles. Returns the
+    number of pairs.
+    """
+    runs, width = corners.shape[0], heads.shape[1] + 1
     at = np.int64(0)
-    for tile in range(heads.size):
-        starts[tile] = at
-        at += heads[tile]
-        heads[tile] = starts[tile]
+    above = np.zeros(width, np.int64)
+    for row in range(heads.shape[0]):
+        left = np.int64(0)
+        for column in range(heads.shape[1]):
+            for run in range(runs):
+                left += corners[run, row * width + column]
+            above[column] += left
+            tile = row * heads.shape[1] + column
+            starts[tile] = at
+            heads[row, column] = at if tiles[tile] else -1
+            at += above[column] if tiles[tile] else 0
     starts[heads.size] = at
     return at
 
 
 @kernel()
-def fill_lists(order, sorted_rects, first, last, columns, open_tiles, heads, members, bands):
-    """Slots of every open tile's splats, nearest first."""
-    tile_rows = heads.size // columns
-    for band in numba.prange(bands):
-        top, bottom = tile_rows * band // bands, tile_rows * (band + 1) // bands - 1
-        for i in range(first, last):
-            r0, r1 = np.int64(sorted_rects[i, 1]), np.int64(sorted_rects[i, 3])
-            if r1 < top or r0 > bottom:
-                continue
-            slot = order[i]
-            c0, c1 = np.int64(sorted_rects[i, 0]), np.int64(sorted_rects[i, 2])
-            for row in range(max(r0, top), min(r1, bottom) + 1):
-                for tile in range(row * columns + c0, row * columns + c1 + 1):
-                    if open_tiles[U(tile)]:
-                        at = heads[U(tile)]
-                        members[U(at)] = slot
-                        heads[U(tile)] = at + 1
+def fill_lists(slots, sorted_rects, first, last, columns, heads, members, bands):
+    """Slots of every open tile's splats, nearest first. heads: flat; bands of rows share the work.
+
+    A thread looks at every splat but writes its own tiles only, so lists stay in order and in its
+    cache.
+    """
+    rows = heads.size // columns
+    for band in prange(bands):
+        top, bottom = rows * band // bands, rows * (band + 1) // bands - 1
+        for i in range(U(first), U(last)):
+            c0, r0, c1, r1 = _unpack(sorted_rects[i])
+            for row in range(max(r0, U(top)), min(r1, U(bottom)) + U(1)):
+                base = row * U(columns)
+                for tile in range(base + c0, base + c1 + U(1)):
+                    at = heads[tile]
+                    if at >= 0:
+                        members[U(at)] = slots[i]
+                        heads[tile] = at + 1

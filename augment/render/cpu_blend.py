@@ -12,10 +12,11 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
+from numba import prange
 
 from augment.render import cpu_simd as v8
+from augment.render.constants import DEPTH_EPS
 from augment.render.cpu_jit import inner, kernel
 from augment.render.cpu_layout import (
     BLUE,
@@ -80,7 +81,7 @@ def blend_tiles(
     """
     columns = (size[0] + TILE_W - 1) // TILE_W
     used = states.size // tiles.size
-    for group in numba.prange((tiles.size + GROUP - 1) // GROUP):
+    for group in prange((tiles.size + GROUP - 1) // GROUP):
         state = np.empty(STATE, np.float32)
         staged = np.empty(RECORD * BATCH, np.float32)
         spans = np.empty(2 * BATCH, np.int32)
@@ -330,20 +331,25 @@ def _add(state, at, weight, value):
 
 @inner()
 def _write_pixels(state, left, top, size, rgb, alpha, expected, median, ids):
-    for y in range(min(TILE_H, size[1] - top)):
-        for x in range(min(TILE_W, size[0] - left)):
-            at = U(x // LANES * STRIP + y * LANES + x % LANES)
-            row, column = top + y, left + x
-            opacity = np.float32(1) - abs(state[at])
-            if alpha is not None:
-                alpha[row, column] = opacity
-            if rgb is not None:
-                rgb[row, column, 0] = state[at + P_RED]
-                rgb[row, column, 1] = state[at + P_GREEN]
-                rgb[row, column, 2] = state[at + P_BLUE]
-            if expected is not None:
-                expected[row, column] = state[at + P_DEPTH] / max(opacity, np.float32(1e-10))
-            if median is not None:
-                median[row, column] = state[at + P_MEDIAN]
-            if ids is not None:
-                ids[row, column] = np.float32(state[at + P_ID]).view(np.int32)
+    """Pixels of a finished tile to the images, which are flat."""
+    for y in range(U(min(TILE_H, size[1] - top))):
+        for strip in range(U(STRIPS)):
+            at = strip * U(STRIP) + y * U(LANES)
+            column = left + np.int64(strip) * LANES
+            pixel = U((top + np.int64(y)) * size[0] + column)
+            for lane in range(U(max(min(LANES, size[0] - column), 0))):
+                opacity = np.float32(1) - abs(state[at + lane])
+                if alpha is not None:
+                    alpha[pixel + lane] = opacity
+                if rgb is not None:
+                    first = U(3) * (pixel + lane)
+                    rgb[first] = state[at + lane + P_RED]
+                    rgb[first + U(1)] = state[at + lane + P_GREEN]
+                    rgb[first + U(2)] = state[at + lane + P_BLUE]
+                if expected is not None:
+                    weighted = state[at + lane + P_DEPTH]
+                    expected[pixel + lane] = weighted / max(opacity, np.float32(DEPTH_EPS))
+                if median is not None:
+                    median[pixel + lane] = state[at + lane + P_MEDIAN]
+                if ids is not None:
+                    ids[pixel + lane] = np.float32(state[at + lane + P_ID]).view(np.int32)

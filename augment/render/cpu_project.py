@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
+from numba import prange
 
 from augment.render import cpu_simd as v8
 from augment.render.cpu_color import COLOR_ROWS, prepare_colors, write_color
@@ -72,7 +72,7 @@ def rank_splats(addresses, sizes, views, blocks, depths, histograms):
     opacity times area, px^2.
     """
     runs, total = histograms.shape[0], blocks.shape[0]
-    for run in numba.prange(runs):
+    for run in prange(runs):
         picked = np.empty(LANES, np.int32)
         areas = np.empty(LANES, np.float32)
         histogram = histograms[run]
@@ -177,29 +177,30 @@ def project_slice(
     views,
     blocks,
     first_ids,
-    depths,
-    z_range,
+    depth_bits,
+    bins,
     open_sums,
     modes,
     records,
     rects,
     keys,
+    found,
     counts,
 ):
-    """Splats of the Gaussians with z_range[0] <= z < z_range[1] that touch an open tile.
+    """Splats of the Gaussians in bins[0] <= bin of z < bins[1] that touch an open tile.
 
-    Block b owns records [b BLOCK, (b + 1) BLOCK) and writes counts[b] of them, RECORD float32 each,
-    in the order of its Gaussians, with the tiles they touch: rects, uint16 [B BLOCK, 4], column and
-    row of the first and of the last, and the bits of their z: keys, uint32 [B BLOCK]. first_ids:
-    int64 [P]. open_sums: int32 [rows + 1,
+    Block b owns slots [b BLOCK, (b + 1) BLOCK) and fills found[b] of them in the order of its
+    Gaussians: records, RECORD float32 each; rects, uint64, the tiles touched as cpu_bin unpacks
+    them; keys, uint32, the bits of z. counts: int32 [B, Z], of those in each bin of the slice.
+    depth_bits: uint32, what rank_splats wrote. first_ids: int64 [P]. open_sums: int32 [rows + 1,
     columns + 1], number of open tiles above and left. modes: int64 [MODES].
     """
-    for block in numba.prange(blocks.shape[0]):
+    for block in prange(blocks.shape[0]):
         part, first, last = blocks[block]
         picked = np.empty(BLOCK + LANES, np.int32)
         rows = np.empty(_ROWS * LANES, np.float32)
         base = block * BLOCK
-        found = _pick_range(depths, base, first, last, z_range, picked)
+        taken = _pick_bins(depth_bits, base, first, last, bins, picked)
         count, functions = sizes[part]
         means = floats_at(addresses[part, 0], count * 3)
         quats = floats_at(addresses[part, 1], count * 4)
@@ -207,44 +208,43 @@ def project_slice(
         opacities = floats_at(addresses[part, 3], count)
         sh = floats_at(addresses[part, 4], count * functions * 3)
         used = min(modes[M_FUNCTIONS], functions)
-        slot = base
-        for at in range(0, found, LANES):
+        slot = U(base)
+        for at in range(U(0), U(taken), U(LANES)):
             _project_eight(
-                means, quats, scales, opacities, views[part], picked, U(at), used, modes, rows
+                means, quats, scales, opacities, views[part], picked, at, used, modes, rows
             )
-            for lane in range(U(min(LANES, found - at))):
+            for lane in range(min(U(LANES), U(taken) - at)):
                 if not _touches_open(rows, lane, open_sums, rects, slot):
                     continue
-                record = U(slot * RECORD)
-                for field in range(U(DEPTH + 1)):
-                    records[record + field] = rows[(U(_FIELDS) + field) * U(LANES) + lane]
-                splat = picked[U(at) + lane]
-                number = first_ids[part] + splat
-                records[record + U(SPLAT_ID)] = np.int32(number).view(np.float32)
+                splat = picked[at + lane]
+                record = slot * U(RECORD)
+                _write_record(rows, lane, first_ids[part] + splat, records, record)
                 if modes[M_COLOR]:
-                    coefficients = U(splat) * U(functions * 3)
+                    from_sh = U(splat) * U(functions * 3)
                     write_color(
-                        sh, coefficients, used, views[part], modes[M_SMOG], rows, lane, records,
-                        record,
-                    )  # fmt: skip
-                z = rows[U((_FIELDS + DEPTH) * LANES) + lane]
-                keys[slot] = np.float32(z).view(np.uint32)
-                slot += 1
-        counts[block] = slot - base
+                        sh, from_sh, used, views[part], modes[M_SMOG], rows, lane, records, record
+                    )
+                keys[slot] = np.float32(records[record + U(DEPTH)]).view(np.uint32)
+                slot += U(1)
+        found[block] = slot - U(base)
+        for z_bin in range(counts.shape[1]):
+            counts[block, z_bin] = 0
+        for i in range(U(base), slot):
+            counts[block, np.int64(keys[i] >> np.uint32(BIN_SHIFT)) - bins[0]] += 1
 
 
 @inner()
-def _pick_range(depths, base, first, last, z_range, picked):
-    """Numbers of a block's Gaussians in the range of z, filled up to whole groups of eight."""
-    low, high = z_range[0], z_range[1]
-    found = 0
+def _pick_bins(depth_bits, base, first, last, bins, picked):
+    """Numbers of a block's Gaussians in a range of bins, filled up to whole groups of eight."""
+    low = np.uint32(bins[0] << BIN_SHIFT)
+    span = np.uint32((bins[1] - bins[0]) << BIN_SHIFT)
+    taken = U(0)
     for i in range(U(last - first)):
-        z = depths[U(base) + i]
-        picked[found] = np.int32(first + i)
-        found += int(z >= low and z < high)
-    for lane in range(LANES):
-        picked[found + lane] = picked[max(found - 1, 0)]
-    return found
+        picked[taken] = np.int32(first + np.int64(i))
+        taken += U(np.uint32(depth_bits[U(base) + i] - low) < span)
+    for lane in range(U(LANES)):
+        picked[taken + lane] = picked[max(taken, U(1)) - U(1)]
+    return taken
 
 
 @inner()
@@ -254,11 +254,18 @@ def _touches_open(rows, lane, open_sums, rects, slot):
     y_lo, y_hi = rows[U(_Y_LO * LANES) + lane], rows[U(_Y_HI * LANES) + lane]
     if not (x_lo <= x_hi and y_lo <= y_hi):
         return False
-    c0, c1 = np.int64(x_lo) // TILE_W, np.int64(x_hi) // TILE_W
-    r0, r1 = np.int64(y_lo) // TILE_H, np.int64(y_hi) // TILE_H
-    rects[slot, 0], rects[slot, 1], rects[slot, 2], rects[slot, 3] = c0, r0, c1, r1
-    inside = open_sums[r1 + 1, c1 + 1] - open_sums[r0, c1 + 1]
-    return inside - open_sums[r1 + 1, c0] + open_sums[r0, c0] > 0
+    c0, c1 = U(x_lo) // U(TILE_W), U(x_hi) // U(TILE_W)
+    r0, r1 = U(y_lo) // U(TILE_H), U(y_hi) // U(TILE_H)
+    rects[slot] = c0 | r0 << U(16) | c1 << U(32) | r1 << U(48)
+    c1, r1 = c1 + U(1), r1 + U(1)
+    return open_sums[r1, c1] - open_sums[r0, c1] - open_sums[r1, c0] + open_sums[r0, c0] > 0
+
+
+@inner()
+def _write_record(rows, lane, number, records, record):
+    for field in range(U(DEPTH + 1)):
+        records[record + field] = rows[(U(_FIELDS) + field) * U(LANES) + lane]
+    records[record + U(SPLAT_ID)] = np.int32(number).view(np.float32)
 
 
 @inner()
