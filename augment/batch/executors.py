@@ -16,7 +16,7 @@ import signal
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from multiprocessing import reduction
+from multiprocessing import reduction, resource_tracker
 from multiprocessing.connection import Connection, wait
 
 from augment.batch.lock import OutputLock
@@ -259,6 +259,7 @@ def _thread_limits(threads: int) -> Iterator[None]:
 @contextlib.contextmanager
 def _interrupts_blocked() -> Iterator[None]:
     """A child started inside never sees Ctrl-C: the parent tells it to stop instead."""
+    resource_tracker.ensure_running()  # starting it later, with the child, would lift the block
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield

@@ -33,7 +33,7 @@ SYNC_POINTS = ("fsync", "replace", "unlink", "rename", "rmdir")
 def main(folder: Path) -> None:
     lidar_bytes(open_fake("fake:warm").labels.lidar(0))  # loads the Parquet code before the forks
     found = {}
-    for kill in (sweep_fresh, sweep_overwrite, kill_at_random, kill_parent_of_workers):
+    for kill in (sweep_fresh, sweep_overwrite, kill_at_random, stop_a_job_with_workers):
         (folder / kill.__name__).mkdir()
         found[kill.__name__] = kill(folder / kill.__name__)
     print(json.dumps(found))
@@ -185,22 +185,48 @@ def kill_at_random(folder: Path) -> dict[str, int]:
     return {"kills": kills}
 
 
-def kill_parent_of_workers(folder: Path) -> dict[str, int]:
-    """Kill a job with two workers; they must go too, and the folder be free to resume."""
-    run_forked(render(job(folder / "whole", frames=40)))
-    out = folder / "killed"
-    child = os.fork()
-    if child == 0:
-        render(job(out, frames=40, workers=2), slow_render)()
-        os._exit(0)
-    while count_finished(out) < 3:
-        time.sleep(0.01)
+def stop_a_job_with_workers(folder: Path) -> dict[str, int]:
+    """Press Ctrl-C on a job with two workers, run it again, kill its process alone, resume."""
+    run_forked(render(job(folder / "whole", frames=60)))
+    out, printed = folder / "stopped", folder / "stderr"
+    child = start_with_workers(out, printed)
+    wait_for_finished(out, 3)
+    os.killpg(child, signal.SIGINT)  # as a terminal does: to the workers too
+    _, status = os.waitpid(child, 0)
+    said = printed.read_text()
+    require(os.waitstatus_to_exitcode(status) == 130, f"interrupted: {status}, {said}")
+    require(said.startswith("stopped with") and said.count("\n") == 1, f"interrupted: {said}")
+    require((out / "manifest.parquet").exists(), "interrupted: no manifest")
+
+    child = start_with_workers(out, printed)
+    wait_for_finished(out, 3)
     os.kill(child, signal.SIGKILL)
     os.waitpid(child, 0)
     finished = count_finished(out)
     whole = tree_digest(folder / "whole")
-    resume_and_compare(job(out, frames=40), out, whole, finished, "parent killed")
+    resume_and_compare(job(out, frames=60), out, whole, finished, "parent killed")
     return {"finished": finished}
+
+
+def start_with_workers(out: Path, printed: Path) -> int:
+    """A job with two workers in a process group of its own; what it prints goes to a file."""
+    child = os.fork()
+    if child == 0:
+        os.setpgid(0, 0)
+        with printed.open("w") as file:
+            os.dup2(file.fileno(), 2)
+        try:
+            render(job(out, frames=60, workers=2), slow_render)()
+        except KeyboardInterrupt as stopped:
+            os.write(2, f"{stopped}\n".encode())
+            os._exit(130)
+        os._exit(0)
+    return child
+
+
+def wait_for_finished(out: Path, count: int) -> None:
+    while count_finished(out) < count:
+        time.sleep(0.01)
 
 
 def check_only_whole_files(out: Path, whole: dict[str, str], when: str) -> None:

@@ -49,7 +49,7 @@ def test_killed_jobs_resume_to_identical_files(quick_folder: Path) -> None:
     assert found["sweep_fresh"]["kills"] >= 8
     assert found["sweep_overwrite"]["kills"] >= 8
     assert found["kill_at_random"]["kills"] >= 1
-    assert found["kill_parent_of_workers"]["finished"] >= 3
+    assert found["stop_a_job_with_workers"]["finished"] >= 3
 
 
 def test_a_complete_job_renders_nothing_and_touches_nothing(tmp_path: Path) -> None:
