@@ -106,7 +106,9 @@ def blend(
     settings: RasterSettings,
 ) -> RenderOutput:
     """Buffers [H, W] of ordered splats; tile by tile, and so in little memory."""
-    recompute = torch.is_grad_enabled() and splats.opacities.requires_grad
+    recompute = torch.is_grad_enabled() and any(
+        value.requires_grad for value in splats.columns().values()
+    )
     sizes = lists.starts.diff().tolist()
     tiles = []
     # Gathered once: taking each tile's splats from all of them would make every backward step of a
@@ -140,8 +142,8 @@ def blend_tile(
     """Buffers [TILE, TILE] of the tile at (row, column). splats: its own, nearest first."""
     dtype = splats.depths.dtype
     step = torch.arange(TILE, dtype=dtype) + 0.5
-    rows, columns = torch.meshgrid(tile[0] * TILE + step, tile[1] * TILE + step, indexing="ij")
-    pixels = torch.stack([columns.reshape(-1), rows.reshape(-1)])  # [2, P]
+    y, x = torch.meshgrid(tile[0] * TILE + step, tile[1] * TILE + step, indexing="ij")
+    pixels = torch.stack([x.reshape(-1), y.reshape(-1)])  # [2, P]
     transmittance = torch.ones(TILE * TILE, dtype=dtype)
     rgb = torch.zeros(TILE * TILE, 3, dtype=dtype)
     alpha, depth, median = (torch.zeros(TILE * TILE, dtype=dtype) for _ in range(3))

@@ -8,7 +8,6 @@ thresholds of gsplat 1.5.3.
 from __future__ import annotations
 
 import dataclasses
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -44,21 +43,20 @@ class Splats:
     def __len__(self) -> int:
         return self.ids.shape[0]
 
+    def columns(self) -> dict[str, Tensor]:
+        """The fields that are there, by name; one row a splat."""
+        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return {name: value for name, value in values.items() if value is not None}
+
     def select(self, index: Tensor) -> Splats:
         """The splats at the given indices or mask, in that order."""
-        fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        return Splats(**{k: None if v is None else v[index] for k, v in fields.items()})
+        return dataclasses.replace(self, **{k: v[index] for k, v in self.columns().items()})
 
     def split(self, sizes: list[int] | int) -> list[Splats]:
         """Consecutive runs of the splats, of the given sizes, as views."""
-        columns = {}
-        for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            columns[field.name] = itertools.repeat(None) if value is None else value.split(sizes)
-        return [
-            Splats(**dict(zip(columns, run, strict=True)))
-            for run in zip(*columns.values(), strict=False)
-        ]
+        names = list(self.columns())
+        runs = zip(*(value.split(sizes) for value in self.columns().values()), strict=True)
+        return [dataclasses.replace(self, **dict(zip(names, run, strict=True))) for run in runs]
 
 
 def project_parts(
@@ -77,11 +75,9 @@ def project_parts(
         first_id += len(part.gaussians)
     if len(projected) == 1:
         return projected[0]
-    joined = {}
-    for field in dataclasses.fields(Splats):
-        values = [getattr(splats, field.name) for splats in projected]
-        joined[field.name] = None if values[0] is None else torch.cat(values)
-    return Splats(**joined)
+    columns = [splats.columns() for splats in projected]
+    joined = {name: torch.cat([column[name] for column in columns]) for name in columns[0]}
+    return dataclasses.replace(projected[0], **joined)
 
 
 def _project_part(
@@ -97,7 +93,10 @@ def _project_part(
         camera_from_part = camera_from_part @ part.world_from_part
     rotation = camera_from_part[:3, :3].to(part.gaussians.means.dtype)
     offsets = _offsets_from_eye(part.gaussians.means, camera_from_part)
-    depths = offsets @ rotation[2]
+    # Term by term: a matrix product may round the same mean differently at another index, and ties
+    # would no longer be ties.
+    x, y, z = offsets.unbind(1)
+    depths = x * rotation[2, 0] + y * rotation[2, 1] + z * rotation[2, 2]
     kept = (depths >= settings.near_m) & (part.gaussians.opacities >= ALPHA_MIN)
     index = torch.nonzero(kept).squeeze(-1)
 

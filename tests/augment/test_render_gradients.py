@@ -5,6 +5,7 @@ import dataclasses
 import pytest
 import torch
 
+from augment.render import reference
 from augment.render.buffers import BUFFERS
 from augment.render.constants import RasterSettings
 from augment.render.reference import rasterize_reference
@@ -70,9 +71,30 @@ def test_gradients_stay_finite_at_every_cut_off(dtype):
         assert float(tensor.grad.abs().max()) > 0, name
 
 
-def test_gradients_do_not_change_the_image():
+@pytest.mark.parametrize("field", FIELDS)
+def test_gradients_do_not_change_the_image(field):
     gaussians, camera = random_gaussians(), camera_ahead()
     plain = render(gaussians, camera)
-    tracked = dataclasses.replace(gaussians, opacities=gaussians.opacities.clone().requires_grad_())
+    value = getattr(gaussians, field).clone().requires_grad_()
+    tracked = render(dataclasses.replace(gaussians, **{field: value}), camera)
+    assert tracked.rgb.requires_grad
     for name in BUFFERS:
-        assert torch.equal(getattr(render(tracked, camera), name).detach(), getattr(plain, name))
+        assert torch.equal(getattr(tracked, name).detach(), getattr(plain, name)), name
+
+
+def test_recomputing_tiles_gives_the_gradients_of_keeping_them(monkeypatch):
+    """Backward passes blend each tile again instead of keeping every splat at every pixel."""
+    camera, weights = (
+        camera_ahead(),
+        torch.rand(21, 33, 3, generator=torch.Generator().manual_seed(0)),
+    )
+    gradients = []
+    for kept in (False, True):
+        if kept:
+            monkeypatch.setattr(reference, "checkpoint", lambda tile, *args, **_: tile(*args))
+        gaussians = random_gaussians()
+        sh = gaussians.sh.clone().requires_grad_()
+        (render(dataclasses.replace(gaussians, sh=sh), camera).rgb * weights).sum().backward()
+        gradients.append(sh.grad)
+    assert float(gradients[0].abs().max()) > 0
+    assert torch.equal(*gradients)
