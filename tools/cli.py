@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import sys
 
 import tyro
@@ -22,6 +23,8 @@ COMMANDS = {
 
 def main(arguments: list[str] | None = None) -> int:
     """Runs one command. Returns 0; 1 where images failed, 2 for an error, 130 if interrupted."""
+    if not sys.stderr.isatty():  # a log needs a progress line now and then, not ten a second
+        os.environ.setdefault("TQDM_MININTERVAL", "10")
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
     try:
         return tyro.extras.subcommand_cli_from_dict(
@@ -31,8 +34,8 @@ def main(arguments: list[str] | None = None) -> int:
             description="Weather for driving scenes made of 3D Gaussians.",
             sort_subcommands=False,
         )
-    except KeyboardInterrupt:
-        print("interrupted; run the same command again to go on from here", file=sys.stderr)
+    except KeyboardInterrupt as interruption:
+        print(str(interruption) or "interrupted", file=sys.stderr)
         return 130
     except Exception as error:
         if not _is_ours(error):

@@ -8,6 +8,7 @@ from pathlib import Path
 from adapters.base import open_scene
 from augment.batch.job import JobResult, RenderJob, run_job
 from augment.errors import ClimateGSError
+from augment.plan import make_plan
 from augment.scene import Scene
 from recipes.load import load_recipe
 from recipes.schema import Recipe
@@ -35,10 +36,11 @@ def render_recipe(
     seconds = warm_up()
     if seconds > 1:
         _say(f"compiled the kernels in {seconds:.1f} s (kept for the next run)")
-    # Opened once here; worker processes, which share no memory, open their own.
     scene = open_scene(scene_uri)
     for problem in scene.problems:
         _say(f"note: {problem}")
+    for resolved in recipes:
+        make_plan(resolved, scene)  # what the scene cannot give is said once, not for every image
     job = RenderJob(
         scene_uri=scene_uri,
         recipes=recipes,
@@ -50,7 +52,7 @@ def render_recipe(
         backend=backend,
         overwrite=overwrite,
     )
-    result = run_job(job, scene_loader=open_scene if workers > 1 else lambda _uri: scene)
+    result = run_job(job, scene_loader=lambda _uri: scene)
     _report(result)
     if sheet and result.written + result.skipped:
         from tools.pictures import draw_sheet
