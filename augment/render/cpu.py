@@ -32,16 +32,9 @@ from augment.render.buffers import (
     SPLAT_IDS,
     RenderOutput,
 )
-from augment.render.constants import (
-    ALPHA_MIN,
-    COV2D_BLUR,
-    MAX_EXTENT_SIGMAS,
-    TAN_FOV_MARGIN,
-    TRANSMITTANCE_STOP,
-    RasterSettings,
-)
+from augment.render.constants import ALPHA_MIN, TRANSMITTANCE_STOP, RasterSettings
+from augment.render.cpu_inputs import Inputs, gather_inputs
 from augment.render.cpu_scratch import Scratch, borrowed_scratch
-from augment.render.sh import MAX_DEGREE
 from augment.render.threads import kernel_threads, thread_count
 from augment.scene import Gaussians, PosedGaussians
 from augment.weather.smog import SmogMedium
@@ -71,15 +64,13 @@ def rasterize_cpu(
     nearer ones have not closed) and "pairs" (of splats and such tiles) are added to it.
     """
     clock = _Clock(stage_times)
-    inputs = _inputs([part.gaussians for part in parts])
-    views = np.stack([_view(part, camera, settings, smog) for part in parts])
-    modes = _modes(RGB in buffers, settings, smog)
+    inputs = gather_inputs(parts, camera, settings, smog, with_color=RGB in buffers)
     images = _images(camera, buffers)
     with borrowed_scratch() as scratch, kernel_threads():
         tiles = _Tiles(camera, images, settings, scratch)
-        depths, edges = _rank(inputs, views, camera, scratch)
+        depths, edges = _rank(inputs, camera, scratch)
         for bins in itertools.pairwise(edges):
-            splats = _project(inputs, views, depths, bins, tiles, modes, scratch)
+            splats = _project(inputs, depths, bins, tiles, scratch)
             clock.lap("project")
             slots, rects = _sort(splats, bins[0], scratch)
             clock.lap("sort")
@@ -108,87 +99,6 @@ class _Clock:
         self._times[name] += number
 
 
-@dataclass(frozen=True, eq=False)
-class _Inputs:
-    """The parts as kernels read them; see cpu_project.rank_splats. arrays: kept alive by this."""
-
-    arrays: list[np.ndarray]
-    addresses: np.ndarray
-    sizes: np.ndarray
-    first_ids: np.ndarray
-    blocks: np.ndarray
-
-    @property
-    def slots(self) -> int:
-        return len(self.blocks) * layout.BLOCK
-
-
-def _inputs(gaussians: list[Gaussians]) -> _Inputs:
-    arrays, addresses, sizes, blocks = [], [], [], []
-    for part, g in enumerate(gaussians):
-        tensors = (g.means, g.quats, g.scales, g.opacities, g.sh)
-        own = [t.detach().contiguous().numpy() for t in tensors]
-        arrays += own
-        addresses.append([array.ctypes.data for array in own])
-        sizes.append([len(g), g.sh.shape[1]])
-        starts = range(0, len(g), layout.BLOCK)
-        blocks += [(part, start, min(start + layout.BLOCK, len(g))) for start in starts]
-    counts = [size[0] for size in sizes]
-    return _Inputs(
-        arrays,
-        np.array(addresses, np.uint64).reshape(-1, 5),
-        np.array(sizes, np.int64).reshape(-1, 2),
-        np.cumsum([0, *counts[:-1]], dtype=np.int64),
-        np.array(blocks, np.int64).reshape(-1, 3),
-    )
-
-
-def _view(
-    part: PosedGaussians, camera: Camera, settings: RasterSettings, smog: SmogMedium | None
-) -> np.ndarray:
-    """The numbers of cpu_layout's view, formed in float64."""
-    world_from_part = np.eye(4) if part.world_from_part is None else part.world_from_part.numpy()
-    camera_from_part = camera.camera_from_world.numpy() @ world_from_part
-    rotation = camera_from_part[:3, :3]
-    eye = np.linalg.solve(rotation, -camera_from_part[:3, 3])
-    coarse_eye = eye.astype(np.float32)
-    focal = np.array([camera.fx, camera.fy])
-    centre = np.array([camera.cx, camera.cy])
-    size = np.array([camera.width, camera.height], np.float64)
-    margin = TAN_FOV_MARGIN * 0.5 * size / focal
-    low, high = -(centre / focal + margin), (size - centre) / focal + margin
-    widest = np.maximum(np.abs(low), np.abs(high))
-    view = np.zeros(layout.VIEW)
-    view[layout.V_ROTATION :][:9] = rotation.reshape(-1)
-    view[layout.V_EYE :][:6] = *coarse_eye, *(eye - coarse_eye)
-    view[layout.V_FOCAL :][:2], view[layout.V_CENTRE :][:2] = focal, centre
-    view[layout.V_SIZE :][:2] = size
-    view[layout.V_LOW :][:2], view[layout.V_HIGH :][:2] = low, high
-    view[layout.V_GAIN :][:2] = MAX_EXTENT_SIGMAS * focal * np.sqrt(1 + widest**2)
-    view[layout.V_NEAR], view[layout.V_BLUR] = settings.near_m, COV2D_BLUR
-    view[layout.V_ALPHA_MIN], view[layout.V_LOG_CUT] = ALPHA_MIN, math.log2(ALPHA_MIN)
-    if smog is not None:
-        view[layout.V_SIGMA] = smog.sigma_per_m
-        view[layout.V_AIRLIGHT :][:3] = smog.rgb
-        if smog.scale_height_m is not None:
-            above = float(camera.centre[2]) - smog.base_z_m
-            view[layout.V_EYE_HEIGHT] = above / smog.scale_height_m
-            view[layout.V_UP :][:3] = world_from_part[2, :3] / smog.scale_height_m
-    return view.astype(np.float32)
-
-
-def _modes(with_color: bool, settings: RasterSettings, smog: SmogMedium | None) -> np.ndarray:
-    degree = MAX_DEGREE if settings.sh_degree is None else settings.sh_degree
-    modes = np.zeros(layout.MODES, np.int64)
-    modes[layout.M_COLOR] = with_color
-    modes[layout.M_FUNCTIONS] = (degree + 1) ** 2
-    modes[layout.M_ANTIALIASED] = settings.antialiased
-    if smog is not None:
-        is_uniform = smog.scale_height_m is None
-        modes[layout.M_SMOG] = layout.UNIFORM_SMOG if is_uniform else layout.LAYERED_SMOG
-    return modes
-
-
 def _images(camera: Camera, buffers: frozenset[str]) -> dict[str, np.ndarray]:
     size = (camera.height, camera.width)
     shapes = {RGB: (*size, 3)}
@@ -198,14 +108,12 @@ def _images(camera: Camera, buffers: frozenset[str]) -> dict[str, np.ndarray]:
     }
 
 
-def _rank(
-    inputs: _Inputs, views: np.ndarray, camera: Camera, scratch: Scratch
-) -> tuple[np.ndarray, list[int]]:
+def _rank(inputs: Inputs, camera: Camera, scratch: Scratch) -> tuple[np.ndarray, list[int]]:
     """z of all Gaussians (0: cannot be seen), and where the slices begin and end, in bins of z."""
     depths = scratch.array("depths", (inputs.slots,), np.float32)
     histograms = scratch.array("histograms", (_RANK_RUNS, 2, layout.BINS), np.float64)
     cpu_project.rank_splats(
-        inputs.addresses, inputs.sizes, views, inputs.blocks, depths, histograms
+        inputs.addresses, inputs.sizes, inputs.views, inputs.blocks, depths, histograms
     )
     cover, counts = histograms.sum(0)
     return depths, _slice_edges(cover / (camera.width * camera.height), counts)
@@ -242,12 +150,10 @@ class _Splats:
 
 
 def _project(
-    inputs: _Inputs,
-    views: np.ndarray,
+    inputs: Inputs,
     depths: np.ndarray,
     bins: tuple[int, int],
     tiles: _Tiles,
-    modes: np.ndarray,
     scratch: Scratch,
 ) -> _Splats:
     blocks = len(inputs.blocks)
@@ -261,13 +167,13 @@ def _project(
     cpu_project.project_slice(
         inputs.addresses,
         inputs.sizes,
-        views,
+        inputs.views,
         inputs.blocks,
         inputs.first_ids,
         depths.view(np.uint32),
         np.array(bins, np.int64),
         tiles.open_sums(),
-        modes,
+        inputs.modes,
         splats.records,
         splats.rects,
         splats.keys,
@@ -331,7 +237,7 @@ class _Tiles:
         is_last: bool,
         clock: _Clock,
     ) -> None:
-        """Blend splats, nearest first, into the open tiles; close those that end, all if this is_last."""
+        """Blend splats, nearest first, into the open tiles; is_last closes them all."""
         first, count = 0, len(slots)
         while True:
             end = int(cpu_bin.next_cut(rects, first, _MAX_PAIRS))

@@ -77,7 +77,8 @@ def blend_tiles(
 
     records: flat float32. members, starts: lists of slots. tiles: uint8 [tiles], CLOSED, OPEN or
     FRESH, updated. states: float32 [tiles * used part of STATE], where open tiles wait for the
-    next slice. size: image width and height. limits: float32, alpha_max, log2(ALPHA_MIN), TRANSMITTANCE_STOP.
+    next slice. size: image width and height. limits: float32, alpha_max, log2(ALPHA_MIN),
+    TRANSMITTANCE_STOP. rgb to ids: flat images, or None.
     """
     columns = (size[0] + TILE_W - 1) // TILE_W
     used = states.size // tiles.size
@@ -176,10 +177,10 @@ def _blend_list(
 
 @inner()
 def _is_closed(rows):
+    closed = True
     for strip in range(STRIPS):
-        if rows[2 * strip] < rows[2 * strip + 1]:
-            return False
-    return True
+        closed = closed and rows[2 * strip] >= rows[2 * strip + 1]
+    return closed
 
 
 @inner()

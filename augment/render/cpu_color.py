@@ -88,7 +88,7 @@ def _layered_density(dx, dy, dz, view):
 
 @inner()
 def _write_basis(x, y, z, functions, rows):
-    """The first `functions` real spherical harmonics of unit directions, as render.sh lists them."""
+    """The first `functions` spherical harmonics of unit directions, as render.sh lists them."""
     v8.store(rows, U(0 * LANES), v8.splat(_C0))
     if functions > 1:
         v8.store(rows, U(1 * LANES), v8.splat(-_C1) * y)

@@ -137,7 +137,7 @@ def _gather3(array, picked, at):
 
 @inner()
 def _from_eye(means, picked, at, view):
-    """Means minus the camera's centre, in the part's axes: first of all, so that digits are kept."""
+    """Means minus the camera's centre, in the part's axes: first, so that digits are kept."""
     x, y, z = _gather3(means, picked, at)
     x = x - v8.splat(view[V_EYE]) - v8.splat(view[V_EYE + 3])
     y = y - v8.splat(view[V_EYE + 1]) - v8.splat(view[V_EYE + 4])

@@ -1,4 +1,4 @@
-"""Work space of the CPU rasteriser, kept between frames: fresh pages cost more than the work in them.
+"""Work space of the CPU rasteriser, kept between frames: fresh pages cost as much as the work.
 
 Every render takes a space of its own, so threads that render at once never share one.
 """

@@ -1,4 +1,4 @@
-"""The thread pool numba's kernels run on: TBB, which survives fork and serves several threads.
+"""The threads that numba's kernels run on: TBB, which survives fork and serves several callers.
 
 numba's own choice is often OpenMP, which kills DataLoader workers forked after the parent has
 rendered. pip puts TBB's library where the loader does not look, so it is loaded by its path first.
@@ -10,6 +10,8 @@ import ctypes
 import functools
 import importlib.metadata
 import logging
+import math
+import os
 import sys
 import threading
 from collections.abc import Iterator
@@ -17,39 +19,50 @@ from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 import numba
+from torch.utils.data import get_worker_info
 
 logger = logging.getLogger(__name__)
 
 TBB_LIBRARY = "libtbb.so.12"
-_FALLBACK = "workqueue"  # survives fork too, but runs one kernel at a time
-_one_at_a_time = threading.RLock()
+_ONE_CALLER = "workqueue"  # numba's own: survives fork too, but two callers end the process
+    "workqueue"  # numba's own layer: survives fork too, but ends the process on two callers
+)
+_CGROUP = Path("/sys/fs/cgroup")
+
+_one_caller_at_a_time = threading.RLock()
+_limits: dict[int, int] = {}  # process id: threads; a forked worker does not take its parent's
 
 
 @functools.cache
 def select_thread_pool() -> str:
     """Choose numba's threading layer, once, before its pool starts; returns the layer's name.
 
-    A layer the user named (NUMBA_THREADING_LAYER) or a pool that runs already is left as it is.
+    A layer the user named (NUMBA_THREADING_LAYER) and a pool that runs already are left alone.
     """
     try:
-        return numba.threading_layer()  # the pool runs
+        layer = numba.threading_layer()  # raises while no pool runs
     except ValueError:
-        pass
-    if numba.config.THREADING_LAYER != "default":
-        return numba.config.THREADING_LAYER
-    layer = "tbb" if _preload_tbb() else _FALLBACK
-    if layer == _FALLBACK:
+        layer = numba.config.THREADING_LAYER
+        if layer == "default":
+            layer = numba.config.THREADING_LAYER = "tbb" if _preload_tbb() else _ONE_CALLER
+    else:
+        if layer == "omp":
+            logger.warning(
+                "numba's threads run on OpenMP already, so worker processes forked from here "
+                "cannot render; call augment.render.threads.select_thread_pool() before anything "
+                "else that uses numba, or start workers with 'spawn'"
+            )
+    if layer == _ONE_CALLER:
         logger.warning(
-            "%s was not found, so renders run one after the other in this process; "
+            "%s was not found, so threads of this process render one after the other; "
             "install the package 'tbb'",
             TBB_LIBRARY,
         )
-    numba.config.THREADING_LAYER = layer
     return layer
 
 
 def _preload_tbb() -> bool:
-    """Load TBB with its symbols visible to numba's pool, which asks for it by name."""
+    """Load TBB with its symbols visible, so that numba's pool finds it by name."""
     for path in (*_installed_libraries(), Path(sys.prefix) / "lib" / TBB_LIBRARY, TBB_LIBRARY):
         try:
             ctypes.CDLL(str(path), mode=ctypes.RTLD_GLOBAL)
@@ -69,27 +82,62 @@ def _installed_libraries() -> list[Path]:
 
 @contextmanager
 def kernel_threads(chunk: int = 1) -> Iterator[None]:
-    """Around launches of parallel kernels: hands out work `chunk` iterations at a time.
+    """Around launches of parallel kernels: as many threads as `thread_count` says, kept busy.
 
-    Iterations differ much in cost, and a fixed share a thread, numba's default, would leave the
-    others waiting for the slowest.
+    Work is handed out `chunk` iterations at a time. Iterations differ much in cost, and with
+    numba's default, one equal share a thread, all would wait for the slowest.
     """
-    alone = nullcontext() if select_thread_pool() != _FALLBACK else _one_at_a_time
+    alone = _one_caller_at_a_time if select_thread_pool() == _ONE_CALLER else nullcontext()
+    before = numba.get_num_threads()
     with alone, numba.parallel_chunksize(chunk):
-        yield
+        numba.set_num_threads(thread_count())
+        try:
+            yield
+        finally:
+            numba.set_num_threads(before)
 
 
 def thread_count() -> int:
-    """Threads that kernels launched from this thread use."""
-    return numba.get_num_threads()
+    """Threads that kernels launched from this thread use.
 
-
-def limit_threads(count: int) -> None:
-    """Use at most `count` threads for kernels launched from this thread.
-
-    Call it in DataLoader workers, so that they do not all want every core.
+    At most numba's own setting, and `limit_threads`; where that was not called, one in a DataLoader
+    worker (whose siblings want the other cores), and else as many as this process may use cores.
     """
-    if count < 1:
-        raise ValueError(f"count must be >= 1 thread; got {count}")
     select_thread_pool()
-    numba.set_num_threads(min(count, numba.config.NUMBA_NUM_THREADS))
+    limit = _limits.get(os.getpid())
+    if limit is None:
+        limit = usable_cores() if get_worker_info() is None else 1
+    return min(limit, numba.get_num_threads())
+
+
+def limit_threads(count: int | None) -> None:
+    """Use at most `count` threads for every kernel of this process; None takes the limit back."""
+    if count is None:
+        _limits.pop(os.getpid(), None)
+    elif count >= 1:
+        _limits[os.getpid()] = count
+    else:
+        raise ValueError(f"count must be >= 1 thread, or None for no limit; got {count}")
+
+
+def usable_cores() -> int:
+    """Cores this process may keep busy: its affinity, and its container's share of time."""
+    affinity = getattr(os, "sched_getaffinity", None)
+    cores = len(affinity(0)) if affinity else os.cpu_count() or 1
+    return min(cores, _container_cores() or cores)
+
+
+@functools.cache
+def _container_cores() -> int | None:
+    """The control group's CPU quota in cores, rounded up; None where there is none."""
+    try:
+        quota, period = (_CGROUP / "cpu.max").read_text().split()
+    except (OSError, ValueError):
+        try:
+            quota = (_CGROUP / "cpu" / "cpu.cfs_quota_us").read_text().strip()
+            period = (_CGROUP / "cpu" / "cpu.cfs_period_us").read_text().strip()
+        except OSError:
+            return None
+    if not quota.isdigit() or not period.isdigit():  # "max" and -1: no quota
+        return None
+    return max(1, math.ceil(int(quota) / max(int(period), 1)))

@@ -1,0 +1,123 @@
+"""What the CPU kernels read: scene parts by address, and the numbers of a view."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from augment.cameras import Camera
+from augment.render import cpu_layout as layout
+from augment.render.constants import (
+    ALPHA_MIN,
+    COV2D_BLUR,
+    MAX_EXTENT_SIGMAS,
+    TAN_FOV_MARGIN,
+    RasterSettings,
+)
+from augment.render.sh import MAX_DEGREE
+from augment.scene import PosedGaussians
+from augment.weather.smog import SmogMedium
+
+
+@dataclass(frozen=True, eq=False)
+class Inputs:
+    """All parts for one launch: nothing is concatenated, and actors cost no launch of their own.
+
+    addresses, sizes, first_ids, views, blocks: see cpu_project. modes: see cpu_layout. arrays: what
+    the addresses point to, kept alive by this.
+    """
+
+    addresses: np.ndarray
+    sizes: np.ndarray
+    first_ids: np.ndarray
+    views: np.ndarray
+    blocks: np.ndarray
+    modes: np.ndarray
+    arrays: list[np.ndarray]
+
+    @property
+    def slots(self) -> int:
+        """Room for every Gaussian, block by block."""
+        return len(self.blocks) * layout.BLOCK
+
+
+def gather_inputs(
+    parts: Sequence[PosedGaussians],
+    camera: Camera,
+    settings: RasterSettings,
+    smog: SmogMedium | None,
+    *,
+    with_color: bool,
+) -> Inputs:
+    """Addresses and numbers of all parts; their tensors are not copied if they are contiguous."""
+    arrays, addresses, sizes, blocks = [], [], [], []
+    for number, part in enumerate(parts):
+        g, count = part.gaussians, len(part.gaussians)
+        tensors = (g.means, g.quats, g.scales, g.opacities, g.sh)
+        own = [t.detach().to(torch.float32).contiguous().numpy() for t in tensors]
+        arrays += own
+        addresses.append([array.ctypes.data for array in own])
+        sizes.append([count, g.sh.shape[1]])
+        starts = range(0, count, layout.BLOCK)
+        blocks += [(number, start, min(start + layout.BLOCK, count)) for start in starts]
+    counts = [size[0] for size in sizes]
+    return Inputs(
+        addresses=np.array(addresses, np.uint64).reshape(-1, 5),
+        sizes=np.array(sizes, np.int64).reshape(-1, 2),
+        first_ids=np.cumsum([0, *counts[:-1]], dtype=np.int64),
+        views=np.stack([_view(part, camera, settings, smog) for part in parts]),
+        blocks=np.array(blocks, np.int64).reshape(-1, 3),
+        modes=_modes(settings, smog, with_color),
+        arrays=arrays,
+    )
+
+
+def _view(
+    part: PosedGaussians, camera: Camera, settings: RasterSettings, smog: SmogMedium | None
+) -> np.ndarray:
+    """The float32 numbers of a view, formed in float64."""
+    world_from_part = np.eye(4) if part.world_from_part is None else part.world_from_part.numpy()
+    camera_from_part = camera.camera_from_world.numpy() @ world_from_part
+    rotation = camera_from_part[:3, :3]
+    # The point the transform takes to the origin, also where a rotation is not quite orthonormal.
+    eye = np.linalg.solve(rotation, -camera_from_part[:3, 3])
+    coarse_eye = eye.astype(np.float32)
+    focal = np.array([camera.fx, camera.fy])
+    centre = np.array([camera.cx, camera.cy])
+    size = np.array([camera.width, camera.height], np.float64)
+    margin = TAN_FOV_MARGIN * 0.5 * size / focal
+    low, high = -(centre / focal + margin), (size - centre) / focal + margin
+    widest = np.maximum(np.abs(low), np.abs(high))
+    view = np.zeros(layout.VIEW)
+    view[layout.V_ROTATION :][:9] = rotation.reshape(-1)
+    view[layout.V_EYE :][:6] = *coarse_eye, *(eye - coarse_eye)
+    view[layout.V_FOCAL :][:2], view[layout.V_CENTRE :][:2] = focal, centre
+    view[layout.V_SIZE :][:2] = size
+    view[layout.V_LOW :][:2], view[layout.V_HIGH :][:2] = low, high
+    view[layout.V_GAIN :][:2] = MAX_EXTENT_SIGMAS * focal * np.sqrt(1 + widest**2)
+    view[layout.V_NEAR], view[layout.V_BLUR] = settings.near_m, COV2D_BLUR
+    view[layout.V_ALPHA_MIN], view[layout.V_LOG_CUT] = ALPHA_MIN, math.log2(ALPHA_MIN)
+    if smog is not None:
+        view[layout.V_SIGMA] = smog.sigma_per_m
+        view[layout.V_AIRLIGHT :][:3] = smog.rgb
+        if smog.scale_height_m is not None:
+            above = float(camera.centre[2]) - smog.base_z_m
+            view[layout.V_EYE_HEIGHT] = above / smog.scale_height_m
+            view[layout.V_UP :][:3] = world_from_part[2, :3] / smog.scale_height_m
+    return view.astype(np.float32)
+
+
+def _modes(settings: RasterSettings, smog: SmogMedium | None, with_color: bool) -> np.ndarray:
+    degree = MAX_DEGREE if settings.sh_degree is None else settings.sh_degree
+    modes = np.zeros(layout.MODES, np.int64)
+    modes[layout.M_COLOR] = with_color
+    modes[layout.M_FUNCTIONS] = (degree + 1) ** 2
+    modes[layout.M_ANTIALIASED] = settings.antialiased
+    if smog is not None:
+        is_uniform = smog.scale_height_m is None
+        modes[layout.M_SMOG] = layout.UNIFORM_SMOG if is_uniform else layout.LAYERED_SMOG
+    return modes
