@@ -24,9 +24,7 @@ from torch.utils.data import get_worker_info
 logger = logging.getLogger(__name__)
 
 TBB_LIBRARY = "libtbb.so.12"
-_ONE_CALLER = "workqueue"  # numba's own: survives fork too, but two callers end the process
-    "workqueue"  # numba's own layer: survives fork too, but ends the process on two callers
-)
+_ONE_CALLER = "workqueue"  # numba's own layer survives fork too, but two callers end the process
 _CGROUP = Path("/sys/fs/cgroup")
 
 _one_caller_at_a_time = threading.RLock()
