@@ -15,7 +15,7 @@ import numpy as np
 
 from adapters.street.labels import StreetLabels
 from adapters.street.parameters import StreetParameters, parse_parameters
-from adapters.street.rig import CAMERA_Z_M, build_frames, ego_pose, focal_px, frame_time_ns
+from adapters.street.rig import CAMERA_Z_M, build_frames, ego_pose, frame_time_ns
 from adapters.street.shadows import contact_shadow
 from adapters.street.sky import build_sky
 from adapters.street.splats import (
@@ -49,9 +49,8 @@ def build_scene(parameters: StreetParameters) -> Scene:
     begun = time.perf_counter()
     street = build_street(parameters)
     eyes, times = _eyes(parameters)
-    focal = focal_px(parameters)
-    static = plan_splats(street.static, eyes, focal)
-    moving = [plan_splats(m.body, _eyes_from(m, eyes, times), focal) for m in street.movers]
+    static = plan_splats(street.static, eyes)
+    moving = [plan_splats(m.body, _eyes_from(m, eyes, times)) for m in street.movers]
     coarseness = coarseness_for([static, *moving], parameters.gaussians)
     actors = tuple(
         _actor(mover, plan, coarseness) for mover, plan in zip(street.movers, moving, strict=True)

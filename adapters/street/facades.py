@@ -5,7 +5,7 @@ The wall's outer face is the plane y = 0, seen from y < 0.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from adapters.street.shapes import ALL_EDGES, Look, Shapes, join
 from augment.semantics import SemanticClass as Class
 
 REVEAL_M = 0.14  # how deep windows stand in the wall
-GLASS = Look((0.022, 0.026, 0.03), Class.BUILDING, Material.GLASS)
+GLASS = Look((0.022, 0.026, 0.03), Class.BUILDING, Material.GLASS, backed=True)
 
 
 @dataclass(frozen=True)
@@ -33,6 +33,9 @@ class Style:
     ground_m: float
     has_surround: bool
     has_shop: bool
+
+
+SHOP_GLASS = replace(GLASS, material=Material.SHOP)
 
 
 def panels(rectangles: np.ndarray, depth_m: float, look: Look, edges: np.ndarray | int) -> Shapes:
@@ -58,12 +61,17 @@ def reveals(opening: Rectangle, depth_m: float, look: Look) -> Shapes:
         [into, up, along, into],
         [up, into, into, along],
         shaded,
-        edges=0,
     )
 
 
 def glazing(
-    opening: Rectangle, columns: int, rows: int, depth_m: float, frame: Look, bar_m: float = 0.07
+    opening: Rectangle,
+    columns: int,
+    rows: int,
+    depth_m: float,
+    frame: Look,
+    bar_m: float = 0.07,
+    pane: Look = GLASS,
 ) -> Shapes:
     """Panes with a frame and bars, filling an opening."""
     x0, z0, x1, z1 = opening
@@ -78,7 +86,7 @@ def glazing(
         for j in range(rows)
     ]
     bars, edges = cut(opening, panes)
-    glass = panels(np.array(panes), depth_m, GLASS, ALL_EDGES)
+    glass = panels(np.array(panes), depth_m, pane, ALL_EDGES)
     glass.variation[:] = 0.37  # one window, one curtain
     return join([panels(bars, depth_m - 0.02, frame, edges), glass])
 
@@ -91,13 +99,13 @@ def window(size_m: tuple[float, float], style: Style, fine: bool) -> Shapes:
     parts = [
         glazing(opening, columns, rows, REVEAL_M, style.frame),
         reveals(opening, REVEAL_M, style.trim if style.has_surround else style.wall),
-        boxes((-0.08, -0.09, -0.08), (width + 0.08, 0.02, 0.0), style.trim, faces=_FRONT, edges=0),
+        boxes((-0.08, -0.09, -0.08), (width + 0.08, 0.02, 0.0), style.trim, faces=_FRONT),
     ]
     if style.has_surround:
         band = SURROUND_M
         low = [(-band, -0.035, 0.0), (width, -0.035, 0.0), (-band, -0.06, height)]
         high = [(0.0, 0, height), (width + band, 0, height), (width + band, 0, height + 0.2)]
-        parts.append(boxes(low, high, style.trim, faces=_FRONT, edges=0))
+        parts.append(boxes(low, high, style.trim, faces=_FRONT))
     return join(parts)
 
 
@@ -136,7 +144,7 @@ def door(opening: Rectangle, style: Style) -> Shapes:
             panels(np.array(fields), REVEAL_M + 0.015, dark, ALL_EDGES),
             panels(light, REVEAL_M, GLASS, ALL_EDGES),
             reveals(opening, REVEAL_M, style.wall),
-            boxes((x0 - 0.1, -0.35, -0.3), (x1 + 0.1, REVEAL_M, z0), style.base, edges=0),
+            boxes((x0 - 0.1, -0.35, -0.3), (x1 + 0.1, REVEAL_M, z0), style.base),
         ]
     )
 
@@ -152,7 +160,7 @@ def shop_front(opening: Rectangle, style: Style, awning: bool) -> Shapes:
     sign_z = z1 + 0.08
     parts = [
         panels(np.array([plinth]), depth - 0.04, style.accent, ALL_EDGES),
-        glazing(show, max(1, round((door_x - x0) / 1.7)), 1, depth, style.accent, 0.09),
+        glazing(show, max(1, round((door_x - x0) / 1.7)), 1, depth, style.accent, 0.09, SHOP_GLASS),
         glazing(entry, 1, 2, depth, style.accent, 0.11),
         reveals(opening, depth, style.accent),
         boxes(

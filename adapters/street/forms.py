@@ -40,7 +40,7 @@ def boxes(
 ) -> Shapes:
     """Axis-aligned boxes between corners low and high ([3] or [P, 3]); the named faces only."""
     low, high = np.broadcast_arrays(_rows(low), _rows(high))
-    parts = []
+    corners, us, vs = [], [], []
     for face in faces:
         axis, outward = "xyz".index(face[1]), face[0] == "+"
         first, second = ((axis + 1) % 3, (axis + 2) % 3)
@@ -52,8 +52,11 @@ def boxes(
         u, v = np.zeros_like(corner), np.zeros_like(corner)
         u[:, first] = (high - low)[:, first]
         v[:, second] = (high - low)[:, second]
-        parts.append(parallelograms(corner, u, v, look, edges=edges))
-    return join(parts)
+        corners.append(corner)
+        us.append(u)
+        vs.append(v)
+    sides = (np.concatenate(part) for part in (corners, us, vs))
+    return parallelograms(*sides, look, edges=edges)
 
 
 def disc(centre: Sequence[float], normal: Sequence[float], radius_m: float, look: Look) -> Shapes:

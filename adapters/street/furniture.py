@@ -11,10 +11,10 @@ from augment.semantics import SemanticClass as Class
 
 STEEL = Look((0.16, 0.17, 0.17), Class.POLE)
 LANTERN = Look((0.72, 0.71, 0.66), Class.POLE)
-GREY = Look((0.30, 0.31, 0.32), Class.SIGN)
-WHITE = Look((0.75, 0.75, 0.74), Class.SIGN)
-BLUE = Look((0.03, 0.11, 0.36), Class.SIGN)
-RED = Look((0.48, 0.03, 0.03), Class.SIGN)
+GREY = Look((0.30, 0.31, 0.32), Class.SIGN, spacing=0.5)
+WHITE = Look((0.75, 0.75, 0.74), Class.SIGN, spacing=0.5)
+BLUE = Look((0.03, 0.11, 0.36), Class.SIGN, spacing=0.5)
+RED = Look((0.48, 0.03, 0.03), Class.SIGN, spacing=0.5)
 BIN = Look((0.05, 0.10, 0.07), Class.OTHER)
 BOLLARD = Look((0.10, 0.10, 0.105), Class.BARRIER)
 
@@ -48,8 +48,8 @@ def _lamp() -> Shapes:
             tube((0, 0, -0.05), (0, 0, 0.9), 0.085, STEEL),
             tube((0, 0, 0.9), (0, 0, 6.4), 0.055, STEEL),
             tube((0, 0, 6.35), (0, 1.5, 6.75), 0.035, STEEL),
-            boxes((-0.14, 1.35, 6.68), (0.14, 2.05, 6.82), STEEL, edges=0),
-            parallelograms((-0.11, 1.4, 6.675), (0, 0.6, 0), (0.22, 0, 0), LANTERN, edges=0),
+            boxes((-0.14, 1.35, 6.68), (0.14, 2.05, 6.82), STEEL),
+            parallelograms((-0.11, 1.4, 6.675), (0, 0.6, 0), (0.22, 0, 0), LANTERN),
             ball((0, 0, 6.38), (0.07, 0.07, 0.07), STEEL),
         ]
     )
@@ -72,7 +72,7 @@ def _rear(z: float, size: float) -> Shapes:
 
 def _crossing_sign() -> Shapes:
     figure = np.array([[0.022, -0.2, 2.3], [0.022, 0.2, 2.3], [0.022, 0.0, 2.66]])
-    dark = Look((0.02, 0.02, 0.02), Class.SIGN)
+    dark = Look((0.02, 0.02, 0.02), Class.SIGN, spacing=0.5)
     return join(
         [_pole(2.75), _rear(2.45, 0.62), _plate(2.45, 0.64, 0.64, BLUE), triangle(figure, WHITE)]
         + [_plate(2.40, 0.09, 0.18, dark, 0.032)]
@@ -82,7 +82,7 @@ def _crossing_sign() -> Shapes:
 def _limit_sign() -> Shapes:
     centre = np.array([0.0, 0.0, 2.5])
     plates = [(0.31, RED, 0.010), (0.235, WHITE, 0.018)]
-    digits = Look((0.02, 0.02, 0.02), Class.SIGN)
+    digits = Look((0.02, 0.02, 0.02), Class.SIGN, spacing=0.5)
     parts = [disc(centre + [x, 0, 0], (1, 0, 0), radius, look) for radius, look, x in plates]
     parts.append(disc(centre, (-1, 0, 0), 0.31, GREY))
     for y in (-0.1, 0.1):

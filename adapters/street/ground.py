@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 
 from adapters.street.forms import parallelograms
@@ -22,16 +24,19 @@ from adapters.street.layout import (
 )
 from adapters.street.materials import Material
 from adapters.street.rectangles import Rectangle, cut
-from adapters.street.shapes import V0, V1, Look, Shapes, join
+from adapters.street.shapes import ALL_EDGES, V0, V1, Look, Shapes, join
 from augment.semantics import SemanticClass as Class
 
-ASPHALT = Look((0.105, 0.105, 0.11), Class.ROAD, Material.ASPHALT, spacing=1.2)
-REPAIR = Look((0.075, 0.075, 0.08), Class.ROAD, Material.ASPHALT, spacing=1.2)
+ASPHALT = Look((0.105, 0.105, 0.11), Class.ROAD, Material.ASPHALT, spacing=1.3, backed=True)
+REPAIR = Look((0.075, 0.075, 0.08), Class.ROAD, Material.ASPHALT, spacing=1.3, backed=True)
 IRON = Look((0.06, 0.058, 0.055), Class.ROAD)
 MARKING = Look((0.72, 0.72, 0.70), Class.LANE_MARKING, Material.MARKING)
-PAVING = Look((0.34, 0.325, 0.30), Class.SIDEWALK, Material.PAVING)
+PAVING = Look((0.34, 0.325, 0.30), Class.SIDEWALK, Material.PAVING, spacing=1.2, backed=True)
 KERB = Look((0.44, 0.43, 0.41), Class.SIDEWALK)
 GRASS = Look((0.13, 0.19, 0.05), Class.TERRAIN, Material.GRASS, spacing=2.5)
+
+SECTION_M = 6.0
+ZEBRA_CLEAR_M = 3.6  # of a zebra crossing's middle, where no other mark may lie
 
 
 def build_ground(layout: Layout) -> Shapes:
@@ -98,23 +103,29 @@ def _apart(a: Rectangle, b: Rectangle) -> bool:
 
 
 def _carriageway(layout: Layout) -> list[Shapes]:
+    """Both halves of the road, in sections along x so that a mark cuts only the asphalt beside it."""
     marks = _markings(layout)
     repairs, covers = _patches(layout, marks)
+    crossing = (layout.zebra_x - ZEBRA_CLEAR_M, layout.zebra_x + ZEBRA_CLEAR_M)
+    bounds = np.arange(layout.x0, layout.x1 - SECTION_M / 2, SECTION_M)
+    bounds = bounds[(bounds < crossing[0] - 1) | (bounds > crossing[1] + 1)]
+    bounds = np.sort([*bounds, *crossing, layout.x1])
     parts = []
     for side in (1, -1):
         low, high = sorted((0.0, side * ROAD_HALF_M))
-        outer = (layout.x0, low, layout.x1, high)
         slope = -side * CAMBER
-        groups = ((marks, MARKING), (repairs, REPAIR), (covers, IRON))
         holes = []
-        for rectangles, look in groups:
+        for rectangles, look in ((marks, MARKING), (repairs, REPAIR), (covers, IRON)):
             here = [r for r in rectangles if low <= r[1] and r[3] <= high]
             holes += here
             if here:
-                edges = np.full(len(here), 15, np.uint8)
+                edges = np.full(len(here), ALL_EDGES, np.uint8)
                 parts.append(_sloped(np.array(here), edges, slope, 0.0, look))
-        pieces, edges = cut(outer, holes)
-        parts.append(_sloped(pieces, edges, slope, 0.0, ASPHALT))
+        kerb = V1 if side > 0 else V0
+        for start, stop in itertools.pairwise(bounds):
+            near = [h for h in holes if h[0] < stop and h[2] > start]
+            pieces, edges = cut((start, low, stop, high), near, rim=kerb)
+            parts.append(_sloped(pieces, edges, slope, 0.0, ASPHALT))
     return parts
 
 
@@ -132,7 +143,7 @@ def _pavements(layout: Layout) -> list[Shapes]:
             low, high = sorted((side * near, side * far))
             z0 = kerb_high - PAVEMENT_SLOPE * ROAD_HALF_M
             rectangle = np.array([[x0, low, layout.x1, high]])
-            edges = np.array([15], np.uint8)
+            edges = np.array([ALL_EDGES], np.uint8)
             parts.append(_sloped(rectangle, edges, side * PAVEMENT_SLOPE, z0, look))
     return parts
 
@@ -144,14 +155,14 @@ def _cross_streets(layout: Layout) -> list[Shapes]:
     for x, direction in ((layout.x0, -1), (layout.x1, 1)):
         near, far = sorted((x, x + direction * CROSS_STREET_M))
         strip = np.array([[near, -70.0, far, 70.0]])
-        parts.append(_sloped(strip, np.array([15], np.uint8), 0.0, z, ASPHALT))
+        parts.append(_sloped(strip, np.array([ALL_EDGES], np.uint8), 0.0, z, ASPHALT))
         kerb = x + direction * CROSS_STREET_M
         u, up = np.array([0, 140.0, 0]), np.array([0, 0, KERB_RISE_M])
         sides = (up, u) if direction > 0 else (u, up)
         parts.append(parallelograms([kerb, -70.0, z], *sides, KERB))
         near, far = sorted((kerb, kerb + direction * 4.6))
         strip = np.array([[near, -70.0, far, 70.0]])
-        edges = np.array([15], np.uint8)
+        edges = np.array([ALL_EDGES], np.uint8)
         parts.append(_sloped(strip, edges, 0.0, z + KERB_RISE_M, PAVING))
         for side in (1, -1):  # the near pavement's edge, left and right of our street
             u = np.array([0, 60.0, 0]) * side

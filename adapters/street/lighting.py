@@ -12,17 +12,20 @@ from dataclasses import dataclass
 import numpy as np
 
 from adapters.street.materials import Material
+from adapters.street.noise import fractal_noise, value_noise
 from adapters.street.raycast import Tree
 from adapters.street.shapes import Shapes
 
-SUN_RGB = np.array([1.0, 0.91, 0.76]) * 3.1
-SKY_RGB = np.array([0.62, 0.75, 1.0]) * 0.92
-BOUNCE_RGB = np.array([0.55, 0.50, 0.44]) * 0.42
+SUN_RGB = np.array([1.0, 0.91, 0.76]) * 2.75
+SKY_RGB = np.array([0.66, 0.77, 0.98]) * 1.0
+BOUNCE_RGB = np.array([0.55, 0.50, 0.44]) * 0.50
 HAZE_RGB = np.array([0.64, 0.73, 0.83])
 SUN_SAMPLES = 8
 SUN_RADIUS_RAD = 0.018  # four times the real sun: shadow edges as soft as the splats are wide
 SHADOW_OFFSET_M = 0.004
-MIRROR_RGB = np.array([0.30, 0.29, 0.28])  # the far side of the street, as panes and paint show it
+# What panes and paint mirror: the far side of the street, and the sky low and high.
+MIRROR_RGB = np.array([0.42, 0.38, 0.34])
+MIRROR_LOW_RGB, MIRROR_HIGH_RGB = np.array([0.75, 0.86, 1.0]), np.array([0.28, 0.45, 0.85])
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +130,7 @@ def shade(
     upward = 0.5 + 0.5 * smooth[:, 2]
     ambient = sky[:, None] * (upward[:, None] * SKY_RGB + (1 - upward)[:, None] * BOUNCE_RGB)
     radiance = base * (sun[:, None] * SUN_RGB + ambient)
-    glossy = (material == Material.GLASS) | (material == Material.PAINT)
+    glossy = np.isin(material, (Material.GLASS, Material.SHOP, Material.PAINT))
     if glossy.any():
         radiance[glossy] += _mirrored(
             lighting, points[glossy], smooth[glossy], material[glossy], sun[glossy], sky[glossy]
@@ -179,14 +182,19 @@ def _mirrored(
     view /= np.linalg.norm(view, axis=1, keepdims=True)
     cosine = np.clip(-(view * normals).sum(1), 0, 1)
     reflected = view + 2 * cosine[:, None] * normals
-    is_glass = material == Material.GLASS
+    is_glass = material != Material.PAINT
     fresnel = 0.04 + 0.96 * (1 - cosine) ** 5
-    strength = np.where(is_glass, 0.16 + 0.84 * fresnel, fresnel)
+    strength = np.where(is_glass, 0.30 + 0.70 * fresnel, fresnel)
     roofs = 0.45 * np.abs(reflected[:, 1]) + 0.05  # how high the far side of the street stands
-    seen = 1 / (1 + np.exp(-(reflected[:, 2] - roofs) / 0.06))
-    skylight = SKY_RGB * (1.15 - 0.55 * np.clip(reflected[:, 2:], 0, 1))
-    mirrored = seen[:, None] * skylight + (1 - seen)[:, None] * MIRROR_RGB * sky[:, None]
-    mirrored *= np.where(reflected[:, 2] < 0, 0.45, 1.0)[:, None]
+    roofs += 0.10 * value_noise(points[:, :2] * [0.13, 0.0], 7)
+    seen = 1 / (1 + np.exp(-(reflected[:, 2] - roofs) / 0.04))
+    clouds = 0.5 + 0.5 * fractal_noise((points[:, :2] + 6 * reflected[:, :2]) * 0.35, 3, 8)
+    high = np.clip(reflected[:, 2] * 1.4, 0, 1) * (1 - 0.8 * clouds)
+    skylight = MIRROR_LOW_RGB + high[:, None] * (MIRROR_HIGH_RGB - MIRROR_LOW_RGB)
+    street = 0.75 + 0.5 * value_noise((points + 18 * reflected)[:, [0, 2]] * [0.35, 0.6], 9)
+    mirrored = seen[:, None] * skylight
+    mirrored += ((1 - seen) * sky * street)[:, None] * MIRROR_RGB
+    mirrored *= (0.65 + 0.35 / (1 + np.exp(-reflected[:, 2] / 0.02)))[:, None]  # down: the ground
     glint = np.clip(reflected @ lighting.to_sun, 0, 1) ** 180 * 2.5 * (sun > 0)
     return strength[:, None] * mirrored + (~is_glass * glint * 0.25)[:, None] * SUN_RGB
 

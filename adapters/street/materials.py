@@ -30,6 +30,7 @@ class Material(IntEnum):
     PAINT = 12  # car paint: shading adds a clear coat
     RIM = 13
     LEAF = 14  # one tuft of leaves: a single splat, one light
+    SHOP = 15  # a shop's pane: as GLASS, with goods behind it
 
 
 def albedo(
@@ -53,7 +54,7 @@ def _asphalt(rgb: np.ndarray, variation: np.ndarray, local: np.ndarray, points: 
     flat = points[:, :2]
     tracks = value_noise(flat * [0.05, 1.1], 3)  # the long streaks that wheels leave
     grain = 0.09 * fractal_noise(flat * 1.6, 2, 1) + 0.05 * value_noise(flat * 0.3, 2)
-    return rgb * (1 + grain + 0.05 * tracks)[:, None]
+    return rgb * (1 + grain + 0.03 * tracks)[:, None]
 
 
 def _marking(rgb: np.ndarray, variation: np.ndarray, local: np.ndarray, points: np.ndarray):
@@ -132,6 +133,17 @@ def _glass(rgb: np.ndarray, variation: np.ndarray, local: np.ndarray, points: np
     return rgb + cloth * (0.35 + 0.65 * np.clip(local[:, 1:2], 0, 1))
 
 
+def _shop(rgb: np.ndarray, variation: np.ndarray, local: np.ndarray, points: np.ndarray):
+    """Goods on shelves: blocks of colour in a dim room, fewer towards the top."""
+    wall = _wall_plane(points)
+    cell = np.floor(wall / [0.45, 0.62]).astype(np.int32)
+    shown = hashed(cell, 91) < 0.75 - 0.65 * np.clip(local[:, 1], 0, 1)
+    hue = np.stack([hashed(cell, 92 + k) for k in range(3)], 1)
+    goods = 0.05 + 0.22 * hue * np.array([1.0, 0.85, 0.7])
+    lamp = 0.05 * np.clip(local[:, 1:2] - 0.7, 0, 1) * np.array([1.0, 0.85, 0.6])
+    return rgb + np.where(shown[:, None], goods, 0.0) + lamp
+
+
 def _rim(rgb: np.ndarray, variation: np.ndarray, local: np.ndarray, points: np.ndarray):
     """Five soft spokes and a hub."""
     radius = np.hypot(local[:, 0], local[:, 1])
@@ -154,5 +166,6 @@ _RULES: dict[Material, _Rule] = {
     Material.LEAF: _leaf,
     Material.BARK: _bark,
     Material.GLASS: _glass,
+    Material.SHOP: _shop,
     Material.RIM: _rim,
 }

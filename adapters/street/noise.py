@@ -5,6 +5,8 @@ Nothing here holds state, so a splat and a ray that meet a surface at one point 
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 
@@ -24,20 +26,33 @@ def hashed(integers: np.ndarray, seed: int = 0) -> np.ndarray:
 
 
 def value_noise(points: np.ndarray, seed: int = 0) -> np.ndarray:
-    """Smooth noise in [-1, 1] at points [N, D] (D 2 or 3), one lattice cell per unit."""
+    """Smooth noise in [-1, 1] at points [N, D] (D 2 or 3), one lattice cell per unit, float32.
+
+    Lattice values come from one table, so the pattern repeats after some 200 cells.
+    """
     base = np.floor(points)
-    fraction = (points - base).astype(np.float32)
-    fraction = fraction * fraction * (3 - 2 * fraction)
-    corner = base.astype(np.int32)
-    dimensions = points.shape[1]
-    total = np.zeros(len(points), np.float32)
-    for bits in range(2**dimensions):
-        offset = np.array([(bits >> d) & 1 for d in range(dimensions)], np.int32)
-        weight = np.ones(len(points), np.float32)
-        for d in range(dimensions):
-            weight *= fraction[:, d] if offset[d] else 1 - fraction[:, d]
-        total += weight * hashed(corner + offset, seed)
-    return 2 * total - 1
+    share = (points - base).astype(np.float32)
+    share = share * share * (3 - 2 * share)
+    steps = _STEPS[: points.shape[1]]
+    index = base.astype(np.int64) @ steps + seed * 7919
+
+    def blend(offset: int, axes: int) -> np.ndarray:
+        if axes == 0:
+            return _table()[(index + offset) & (TABLE_SIZE - 1)]
+        low, high = blend(offset, axes - 1), blend(offset + int(steps[axes - 1]), axes - 1)
+        return low + share[:, axes - 1] * (high - low)
+
+    return blend(0, points.shape[1])
+
+
+TABLE_SIZE = 1 << 16
+_STEPS = np.array([1, 40503, 12289])  # far apart in the table, whichever few cells are compared
+
+
+@lru_cache(maxsize=1)
+def _table() -> np.ndarray:
+    integers = np.arange(TABLE_SIZE, dtype=np.int32)[:, None]
+    return 2 * hashed(integers, 1) - 1
 
 
 def fractal_noise(points: np.ndarray, octaves: int, seed: int = 0) -> np.ndarray:

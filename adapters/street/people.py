@@ -37,7 +37,7 @@ def draw_person(seed: int) -> Shapes:
         y = side * 0.095
         knee = np.array([0.10 * phase + 0.06, y, 0.50])
         foot = np.array([0.27 * phase - (0.06 if phase < 0 else 0), y, 0.10 + 0.03 * (phase < 0)])
-        shoulder = np.array([0.0, side * 0.215, 1.41])
+        shoulder = np.array([0.0, side * 0.19, 1.41])
         elbow = np.array([-0.13 * phase, side * 0.255, 1.15])
         hand = np.array([-0.20 * phase + 0.12, side * 0.245, 0.93])
         parts += [
@@ -47,7 +47,7 @@ def draw_person(seed: int) -> Shapes:
             ball(foot + [0.055, 0, -0.04], (0.135, 0.05, 0.055), shoes),
             tube(shoulder, elbow, 0.052, coat),
             tube(elbow, hand, 0.043, coat),
-            ball(shoulder, (0.07, 0.065, 0.075), coat),
+            ball(shoulder, (0.062, 0.058, 0.068), coat),
             ball(elbow, (0.05, 0.05, 0.05), coat),
             ball(hand, (0.045, 0.03, 0.055), skin),
         ]

@@ -6,11 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adapters.street.raycast_kernels import trace
+from adapters.street.raycast_kernels import build, trace
 from adapters.street.shapes import Kind, Shapes
 
 LEAF_SHAPES = 4
-MEDIAN_BELOW = 64  # nodes this small are not worth a careful split
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,66 +86,20 @@ def bounds_of(shapes: Shapes) -> tuple[np.ndarray, np.ndarray]:
 
 
 def build_tree(shapes: Shapes) -> Tree:
-    """Large nodes split where the surface-area heuristic is least, small ones at the median."""
+    """A tree split by the surface-area heuristic, down to a few shapes a leaf."""
     low, high = bounds_of(shapes)
     pad = 1e-6  # flat shapes have boxes without thickness, which rounding could miss
-    low, high = low - pad, high + pad
-    order = np.arange(len(shapes))
-    bounds, first, count = [], [], []
-    stack = [(0, len(shapes), -1)]  # range of order, and the parent whose second child this is
-    while stack:
-        start, stop, parent = stack.pop()
-        node = len(first)
-        if parent >= 0:
-            first[parent] = node
-        inside = order[start:stop]
-        bounds.append(np.concatenate([low[inside].min(0), high[inside].max(0)]))
-        if stop - start <= LEAF_SHAPES:
-            first.append(start)
-            count.append(stop - start)
-            continue
-        split = _best_split if stop - start > MEDIAN_BELOW else _median_split
-        ranked, left = split(low[inside], high[inside])
-        order[start:stop] = inside[ranked]
-        first.append(-1)
-        count.append(0)
-        stack.append((start + left, stop, node))
-        stack.append((start, start + left, -1))
+    count = len(shapes)
+    order = np.arange(count, dtype=np.int64)
+    bounds = np.empty((2 * count, 6))
+    first, sizes = np.empty(2 * count, np.int64), np.empty(2 * count, np.int64)
+    nodes = build(low - pad, high + pad, LEAF_SHAPES, order, bounds, first, sizes)
     return Tree(
-        bounds=np.array(bounds),
-        first=np.array(first, np.int64),
-        count=np.array(count, np.int64),
-        order=order.astype(np.int64),
+        bounds=bounds[:nodes].copy(),
+        first=first[:nodes].copy(),
+        count=sizes[:nodes].copy(),
+        order=order,
         kind=shapes.kind,
         origin=shapes.origin,
         inverse=np.ascontiguousarray(np.linalg.inv(shapes.axes).transpose(0, 2, 1)),
     )
-
-
-def _median_split(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, int]:
-    """An order of boxes and how many of them go left: halves along the longest side."""
-    centres = low + high
-    axis = int(np.argmax(centres.max(0) - centres.min(0)))
-    return np.argsort(centres[:, axis], kind="stable"), len(low) // 2
-
-
-def _best_split(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, int]:
-    """As _median_split, at the least sum of count times surface area over all three axes."""
-    count = len(low)
-    best_cost, best = np.inf, (np.arange(count), count // 2)
-    for axis in range(3):
-        ranked = np.argsort(low[:, axis] + high[:, axis], kind="stable")
-        a, b = low[ranked], high[ranked]
-        left = _area(np.minimum.accumulate(a), np.maximum.accumulate(b))[:-1]
-        right = _area(np.minimum.accumulate(a[::-1]), np.maximum.accumulate(b[::-1]))[::-1][1:]
-        sizes = np.arange(1, count)
-        cost = left * sizes + right * (count - sizes)
-        least = int(np.argmin(cost))
-        if cost[least] < best_cost:
-            best_cost, best = cost[least], (ranked, least + 1)
-    return best
-
-
-def _area(low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    x, y, z = (high - low).T
-    return x * y + y * z + z * x

@@ -7,7 +7,8 @@ import math
 import numpy as np
 from numba import njit
 
-STACK = 64  # deeper than any balanced tree over 2^40 shapes
+STACK = 512  # far deeper than the trees of any street
+BINS = 16
 NEAREST_M = 1e-7  # hits nearer than this are the surface the ray starts on
 
 
@@ -140,3 +141,109 @@ def _meet(kind, a, b, c, da, db, dc, limit):
         if NEAREST_M <= t < limit and (kind == 3 or abs(c + t * dc) <= 1.0):
             return t
     return math.inf
+
+
+@njit(cache=True)
+def build(
+    low,  # [P, 3] float64: the shapes' boxes
+    high,  # [P, 3]
+    leaf_shapes,  # most shapes of a leaf
+    order,  # [P] int64 in and out: any order of the shapes; afterwards as the leaves list them
+    node_bounds,  # [2 P, 6] out
+    node_first,  # [2 P] int64 out
+    node_count,  # [2 P] int64 out
+):
+    """Fill a tree as `trace` reads it, depth first; returns how many nodes it has."""
+    todo = np.empty((STACK, 3), np.int64)  # range of order, and the parent whose second child it is
+    todo[0, 0], todo[0, 1], todo[0, 2] = 0, len(order), -1
+    top, nodes = 1, 0
+    scratch = np.empty(len(order), np.int64)
+    while top > 0:
+        top -= 1
+        start, stop, parent = todo[top, 0], todo[top, 1], todo[top, 2]
+        node = nodes
+        nodes += 1
+        if parent >= 0:
+            node_first[parent] = node
+        bounds = node_bounds[node]
+        bounds[:3], bounds[3:] = math.inf, -math.inf
+        for entry in range(start, stop):
+            _grow(bounds, low[order[entry]], high[order[entry]])
+        if stop - start <= leaf_shapes:
+            node_first[node], node_count[node] = start, stop - start
+            continue
+        node_count[node] = 0
+        middle = _split(low, high, order, start, stop, scratch)
+        todo[top, 0], todo[top, 1], todo[top, 2] = middle, stop, node
+        todo[top + 1, 0], todo[top + 1, 1], todo[top + 1, 2] = start, middle, -1
+        top += 2
+    return nodes
+
+
+@njit(cache=True)
+def _grow(bounds, low, high):
+    for axis in range(3):
+        bounds[axis] = min(bounds[axis], low[axis])
+        bounds[3 + axis] = max(bounds[3 + axis], high[axis])
+
+
+@njit(cache=True)
+def _area(bounds):
+    x, y, z = bounds[3] - bounds[0], bounds[4] - bounds[1], bounds[5] - bounds[2]
+    return x * y + y * z + z * x
+
+
+@njit(cache=True)
+def _split(low, high, order, start, stop, scratch):
+    """Reorder a range so that its halves cost least by the surface-area heuristic, over bins."""
+    best, best_axis, best_bin = math.inf, -1, 0
+    spans = np.empty((3, 2))
+    boxes, counts = np.empty((BINS, 6)), np.empty(BINS, np.int64)
+    right = np.empty((BINS, 2))
+    running = np.empty(6)
+    for axis in range(3):
+        first, last = math.inf, -math.inf
+        for entry in range(start, stop):
+            centre = low[order[entry], axis] + high[order[entry], axis]
+            first, last = min(first, centre), max(last, centre)
+        spans[axis, 0], spans[axis, 1] = first, last
+        if last <= first:
+            continue
+        boxes[:, :3], boxes[:, 3:] = math.inf, -math.inf
+        counts[:] = 0
+        for entry in range(start, stop):
+            p = order[entry]
+            b = min(BINS - 1, int((low[p, axis] + high[p, axis] - first) / (last - first) * BINS))
+            counts[b] += 1
+            _grow(boxes[b], low[p], high[p])
+        running[:3], running[3:] = math.inf, -math.inf
+        total = 0
+        for b in range(BINS - 1, 0, -1):
+            total += counts[b]
+            _grow(running, boxes[b, :3], boxes[b, 3:])
+            right[b, 0], right[b, 1] = total, _area(running) if total > 0 else 0.0
+        running[:3], running[3:] = math.inf, -math.inf
+        total = 0
+        for b in range(BINS - 1):
+            total += counts[b]
+            _grow(running, boxes[b, :3], boxes[b, 3:])
+            if total == 0 or right[b + 1, 0] == 0:
+                continue
+            cost = total * _area(running) + right[b + 1, 0] * right[b + 1, 1]
+            if cost < best:
+                best, best_axis, best_bin = cost, axis, b
+    if best_axis < 0:  # all centres in one place
+        return (start + stop) // 2
+    first, last = spans[best_axis, 0], spans[best_axis, 1]
+    left, kept = start, 0
+    for entry in range(start, stop):
+        p = order[entry]
+        centre = low[p, best_axis] + high[p, best_axis]
+        if min(BINS - 1, int((centre - first) / (last - first) * BINS)) <= best_bin:
+            order[left] = p
+            left += 1
+        else:
+            scratch[kept] = p
+            kept += 1
+    order[left:stop] = scratch[:kept]
+    return left

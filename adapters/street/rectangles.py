@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
 
-from adapters.street.shapes import U0, U1, V0, V1
+from adapters.street.shapes import ALL_EDGES, U0, U1, V0, V1
 
 Rectangle = tuple[float, float, float, float]  # x0, y0, x1, y1 with x0 < x1 and y0 < y1
 
 
-def cut(outer: Rectangle, holes: Sequence[Rectangle]) -> tuple[np.ndarray, np.ndarray]:
+def cut(
+    outer: Rectangle, holes: Sequence[Rectangle], rim: int = ALL_EDGES
+) -> tuple[np.ndarray, np.ndarray]:
     """What is left of a rectangle without holes: rectangles [R, 4] and their edge bits [R].
 
     Cuts run along x first, so long pieces lie along x. Holes may touch each other and reach beyond
-    the outer rectangle. An edge bit is set where the piece borders a hole or the outer rim.
+    the outer rectangle. An edge bit is set where the piece borders a hole, or lies on those sides
+    of the outer rectangle that `rim` names.
     """
     x0, y0, x1, y1 = outer
     clipped = [
@@ -25,7 +29,7 @@ def cut(outer: Rectangle, holes: Sequence[Rectangle]) -> tuple[np.ndarray, np.nd
     ]
     levels = sorted({y0, y1, *(h[1] for h in clipped), *(h[3] for h in clipped)})
     pieces: list[Rectangle] = []
-    for low, high in zip(levels[:-1], levels[1:], strict=True):
+    for low, high in itertools.pairwise(levels):
         here = sorted((h[0], h[2]) for h in clipped if h[1] <= low and h[3] >= high)
         start = x0
         for a, b in [*here, (x1, x1)]:
@@ -33,7 +37,7 @@ def cut(outer: Rectangle, holes: Sequence[Rectangle]) -> tuple[np.ndarray, np.nd
                 pieces.append((start, low, a, high))
             start = max(start, b)
     pieces = _merged(pieces)
-    return np.array(pieces).reshape(-1, 4), _edge_bits(pieces, outer, clipped)
+    return np.array(pieces).reshape(-1, 4), _edge_bits(pieces, outer, clipped, rim)
 
 
 def _merged(pieces: list[Rectangle]) -> list[Rectangle]:
@@ -50,14 +54,17 @@ def _merged(pieces: list[Rectangle]) -> list[Rectangle]:
 
 
 def _edge_bits(
-    pieces: Sequence[Rectangle], outer: Rectangle, holes: Sequence[Rectangle]
+    pieces: Sequence[Rectangle], outer: Rectangle, holes: Sequence[Rectangle], rim: int
 ) -> np.ndarray:
+    """Bits [R] of the sides of each piece that border a hole or a named side of the rim."""
+    p = np.array(pieces).reshape(-1, 4)[:, None]  # [R, 1, 4] against holes [1, H, 4]
+    h = np.array(holes).reshape(-1, 4)[None]
+    beside = (h[..., 1] < p[..., 3]) & (h[..., 3] > p[..., 1])
+    above = (h[..., 0] < p[..., 2]) & (h[..., 2] > p[..., 0])
     bits = np.zeros(len(pieces), np.uint8)
-    for i, (a, b, c, d) in enumerate(pieces):
-        for bit, value, rim in ((U0, a, outer[0]), (U1, c, outer[2])):
-            borders = any(value in (h[0], h[2]) and h[1] < d and h[3] > b for h in holes)
-            bits[i] |= bit if borders or value == rim else 0
-        for bit, value, rim in ((V0, b, outer[1]), (V1, d, outer[3])):
-            borders = any(value in (h[1], h[3]) and h[0] < c and h[2] > a for h in holes)
-            bits[i] |= bit if borders or value == rim else 0
+    for bit, side, across in ((U0, 0, beside), (V0, 1, above), (U1, 2, beside), (V1, 3, above)):
+        value = p[..., side]
+        touches = (value == h[..., side]) | (value == h[..., (side + 2) % 4])
+        borders = (touches & across).any(1) | ((value[:, 0] == outer[side]) & bool(rim & bit))
+        bits |= np.where(borders, bit, 0).astype(np.uint8)
     return bits

@@ -40,7 +40,8 @@ OPEN_DIAGONAL = 16
 @dataclass(frozen=True)
 class Look:
     """What a surface looks like. rgb: linear albedo. ambient: share of sky light that reaches it.
-    spacing: its splats' distance relative to other surfaces as far away.
+    spacing: its splats' distance relative to other surfaces as far away. backed: whether half a
+    metre of nothing lies behind it, where a second layer of splats may stand.
     """
 
     rgb: tuple[float, float, float]
@@ -48,6 +49,7 @@ class Look:
     material: Material = Material.PLAIN
     ambient: float = 1.0
     spacing: float = 1.0
+    backed: bool = False
 
     def tinted(self, rgb: Sequence[float]) -> Look:
         return dataclasses.replace(self, rgb=tuple(float(c) for c in rgb))
@@ -59,7 +61,8 @@ class Shapes:
 
     shading: [P, 3, 3], of flat kinds and leaves: what light takes for the normal is
     shading[0] + u shading[1] + v shading[2].
-    rgb [P, 3] linear albedo; material, semantic, kind, edges [P]; ambient, spacing [P].
+    rgb [P, 3] linear albedo; material, semantic, kind, edges [P]; ambient, spacing,
+    backed [P] as in Look.
     variation [P]: a number in [0, 1) that tells equal shapes apart.
     """
 
@@ -73,6 +76,7 @@ class Shapes:
     edges: np.ndarray
     ambient: np.ndarray
     spacing: np.ndarray
+    backed: np.ndarray
     variation: np.ndarray
 
     def __len__(self) -> int:
@@ -169,5 +173,6 @@ def make_shapes(
         edges=np.broadcast_to(np.asarray(edges, np.uint8), (count,)).copy(),
         ambient=np.full(count, look.ambient),
         spacing=np.full(count, look.spacing),
+        backed=np.full(count, look.backed),
         variation=(np.arange(count) * 0.618034 + 0.37) % 1.0,
     )

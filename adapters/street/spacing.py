@@ -10,25 +10,27 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from adapters.street.materials import Material
 from adapters.street.raycast import Tree
 from adapters.street.shapes import U0, U1, V0, V1, Kind, Shapes, join
 
 STEEPEST = 0.42  # sine of the steepest ray of a level camera, up or down
 MOST_STRETCH = 2.6
 HIDDEN_STRETCH = 3.5  # of surfaces that no camera sees
-LOOKS = 8  # places of the cameras from which sight is tried
+LOOKS = 6  # places of the cameras from which sight is tried
 LEAST_M = 0.02
-# Measured on square lattices of the splats in `surfels`: blending takes nearer splats first, which
-# puts the weighted mean this many spacings too near, along the surface.
-BLEND_LEAD = 0.70
-PIXEL_BLUR_PX = 0.55  # standard deviation that the rasteriser adds to every footprint
+# Measured on square lattices of the splats in `splats`, alone and backed by a second layer: blending
+# takes nearer splats first, which puts the weighted mean this many spacings too near, along the
+# surface.
+BLEND_LEAD = 0.62
+BACKED_BLEND_LEAD = 0.36
 
 
 @dataclass(frozen=True, eq=False)
 class Spacing:
     """Per shape: along [P, 2] spacing in metres per unit of coarseness along both axes; sink [P] how
     far below its surface splats lie, in spacings, so that their blend is seen on it; hidden [P]
-    whether it is a panel or tube that no camera sees, whose large splats must keep clear of rims.
+    whether no camera sees it, so that its splats may be few but must keep clear of rims.
     """
 
     along: np.ndarray
@@ -62,7 +64,7 @@ def _halved(shapes: Shapes, axis: np.ndarray) -> Shapes:
     return join([first, second])
 
 
-def plan_spacing(shapes: Shapes, tree: Tree, eyes: np.ndarray, focal_px: float) -> Spacing:
+def plan_spacing(shapes: Shapes, tree: Tree, eyes: np.ndarray) -> Spacing:
     """Spacings of shapes seen from eyes [E, 3], in the shapes' frame; tree: what may hide them."""
     distance, view = _sightings(shapes, eyes)
     unit = shapes.axes[:, :2] / np.linalg.norm(shapes.axes[:, :2], axis=2, keepdims=True)
@@ -72,23 +74,23 @@ def plan_spacing(shapes: Shapes, tree: Tree, eyes: np.ndarray, focal_px: float) 
     flat = shapes.kind <= Kind.DISC
     slant = np.abs(np.einsum("epk,pk->ep", view, shapes.axes[:, 2]))
     facing = np.einsum("epk,pk->ep", view, shapes.axes[:, 2]) < 0
-    panel, tube = (shapes.kind == kind for kind in (Kind.PARALLELOGRAM, Kind.CYLINDER))
-    hidden = (panel | tube) & ~_in_sight(shapes, tree, eyes)
-    along[hidden & panel] *= HIDDEN_STRETCH
+    tuft = shapes.material == Material.LEAF
+    hidden = ((shapes.kind != Kind.ELLIPSOID) | tuft) & ~_in_sight(shapes, tree, eyes)
+    along[hidden & flat] *= HIDDEN_STRETCH
     along *= shapes.spacing[:, None]
-    sink = np.where(flat, _sink(distance, slant, facing, cosine, along, focal_px), 0.25)
+    sink = np.where(flat, _sink(distance, slant, facing, cosine, along, shapes.backed), 0.25)
     return Spacing(along, sink, hidden)
 
 
 def _in_sight(shapes: Shapes, tree: Tree, eyes: np.ndarray) -> np.ndarray:
-    """Which shapes are seen from some of the eyes, at one of five places each, bool [P]."""
+    """Which shapes are seen from some of the eyes, at one of four places each, bool [P]."""
     seen = np.zeros(len(shapes), bool)
     u, v, w = (shapes.axes[:, axis] for axis in range(3))
     round_form = shapes.kind >= Kind.ELLIPSOID
     centred = (shapes.kind >= Kind.DISC)[:, None]
     radius = np.where(round_form, np.linalg.norm(shapes.axes, axis=2)[:, :2].max(1) * 1.05, 0)
     for eye in eyes[np.linspace(0, len(eyes) - 1, min(LOOKS, len(eyes))).round().astype(int)]:
-        for a, b in ((0.5, 0.5), (0.1, 0.1), (0.8, 0.1), (0.1, 0.8), (0.8, 0.8)):
+        for a, b in ((0.5, 0.5), (0.1, 0.2), (0.9, 0.2), (0.5, 0.9)):
             a, b = (np.where(centred, 1.4 * (c - 0.5), c) for c in (a, b))
             place = np.where(round_form[:, None], b * w, a * u + b * v + 0.004 * w)
             index = np.flatnonzero(~seen)
@@ -123,18 +125,22 @@ def _sink(
     facing: np.ndarray,
     cosine: np.ndarray,
     along: np.ndarray,
-    focal_px: float,
+    backed: np.ndarray,
 ) -> np.ndarray:
     """Depth below the surface, per unit of spacing, that puts the blend on it in the mean.
 
     A splat that lies h below the surface is seen h / slant further along the ray; blending brings
-    it BLEND_LEAD spacings nearer along the surface. Least squares over the eyes, each weighted by
-    the pixels it spends on the surface.
+    it some part of a spacing nearer along the surface. No depth suits all eyes: the weighted median
+    makes the error least where most pixels are spent on the surface.
     """
-    slant = np.maximum(slant, 0.04)
-    level = np.sqrt(1 - np.minimum(slant, 1) ** 2)
-    reach = np.maximum(np.sqrt((cosine**2 * along**2).sum(2)) / np.maximum(level, 1e-6), 1e-6)
-    lead = BLEND_LEAD * reach / along.max(1)
-    weight = facing * slant / distance**2
-    wanted = (weight * lead * level / slant).sum(0)
-    return np.minimum(wanted / np.maximum((weight / slant**2).sum(0), 1e-12), 0.5)
+    slant = np.clip(slant, 0.04, 1)
+    level = np.sqrt(1 - slant**2)
+    reach = np.sqrt((cosine**2 * along**2).sum(2)) / np.maximum(level, 1e-6)
+    lead = np.where(backed, BACKED_BLEND_LEAD, BLEND_LEAD)
+    wanted = lead * reach / along.max(1) * level * slant
+    weight = facing / distance**2  # pixels go with slant, what an error costs with 1 / slant
+    order = np.argsort(wanted, axis=0)
+    heard = np.cumsum(np.take_along_axis(weight, order, 0), axis=0)
+    middle = (heard < heard[-1] / 2).sum(0)
+    rows = np.take_along_axis(order, np.minimum(middle, len(order) - 1)[None], 0)
+    return np.minimum(np.take_along_axis(wanted, rows, 0)[0], 0.5)

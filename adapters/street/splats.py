@@ -9,7 +9,7 @@ import torch
 
 from adapters.street.materials import Material
 from adapters.street.shadows import ContactShadow
-from adapters.street.shapes import Kind, Shapes
+from adapters.street.shapes import U0, U1, V0, V1, Kind, Shapes
 from adapters.street.spacing import LEAST_M, Spacing, plan_spacing, split_long
 from adapters.street.surfels import Cells, cell_counts, make_cells, total_cells
 from adapters.street.world import Body
@@ -20,11 +20,17 @@ from augment.semantics import SemanticClass
 SH_C0 = 0.28209479177387814
 OPACITY = 0.99
 # Standard deviation per cell side: the least that leaves no gap (alpha > 0.99 in the mean), since
-# wider splats lead more (see `spacing`).
+# wider splats blur and lead more (see `spacing`). Over a second layer they may be narrower.
 SIGMA_PER_SIDE = 0.74
+BACKED_SIGMA_PER_SIDE = 0.62
+# The second layer, which fills what is left between the splats of the first: how many times as
+# coarse, and from how many cells a side. As deep as it is coarse it stays behind at every slant.
+BACKING = 3
+BACKED_FROM = 4
 BLOB_SIGMA_PER_SIDE = 0.62  # of round forms, whose cells overlap more as they curve
-HIDDEN_SIGMA_PER_SIDE = 0.5  # keeps large splats inside their panel
-LEAF_SIGMA = 0.72  # of the semi-axes of a tuft, which is one splat
+MESH_SIGMA_PER_SIDE = 0.66  # of the closed meshes of cars: what leaks is the car again
+NARROW_SIGMA_PER_SIDE = 0.5  # half opaque at the edge: single rows, and panels nobody sees
+LEAF_SIGMA = 0.64  # of the semi-axes of a tuft, which is one splat
 BURIED_M = 0.08
 SHADOW_SPACING_M = 0.10
 SHADOW_HEIGHT_M = 0.035
@@ -39,23 +45,31 @@ class SplatPlan:
     spacing: Spacing
 
     def counts(self, coarseness: float) -> np.ndarray:
+        """Cells of the first layer along both axes, [P, 2]."""
         along = np.maximum(self.spacing.along * coarseness, LEAST_M)
         return cell_counts(self.shapes, along, self.spacing.hidden)
 
+    def backing(self, counts: np.ndarray) -> np.ndarray:
+        """Cells of the second layer, [P, 2]; none where there is no such layer."""
+        wanted = self.shapes.backed & ~self.spacing.hidden & (counts.min(1) >= BACKED_FROM)
+        return np.where(wanted[:, None], -(-counts // BACKING), 0)
+
     def total(self, coarseness: float) -> int:
-        return total_cells(self.shapes, self.counts(coarseness), self.spacing.hidden)
+        counts = self.counts(coarseness)
+        first = total_cells(self.shapes, counts, self.spacing.hidden)
+        return first + int(self.backing(counts).prod(1).sum())
 
 
-def plan_splats(body: Body, eyes: np.ndarray, focal_px: float) -> SplatPlan:
+def plan_splats(body: Body, eyes: np.ndarray) -> SplatPlan:
     """How a body seen from eyes [E, 3] (its frame) is to be sampled."""
     shapes = split_long(body.shapes, eyes)
-    return SplatPlan(body, shapes, plan_spacing(shapes, body.tree, eyes, focal_px))
+    return SplatPlan(body, shapes, plan_spacing(shapes, body.tree, eyes))
 
 
 def coarseness_for(plans: list[SplatPlan], target: int) -> float:
     """Spacing per metre of distance at which all plans together come to the target."""
-    low, high = 1e-4, 1.0
-    for _ in range(18):
+    low, high = 1e-3, 0.2
+    for _ in range(12):
         middle = float(np.sqrt(low * high))
         if sum(plan.total(middle) for plan in plans) > target:
             low = middle
@@ -66,21 +80,41 @@ def coarseness_for(plans: list[SplatPlan], target: int) -> float:
 
 def splat(plan: SplatPlan, coarseness: float) -> Gaussians:
     """The Gaussians of a body."""
-    shapes = plan.shapes
-    cells = make_cells(shapes, plan.counts(coarseness), plan.spacing.hidden)
+    counts = plan.counts(coarseness)
+    backing = plan.backing(counts)
+    cells = make_cells(plan.shapes, counts, plan.spacing.hidden)
     cells = _uncovered(plan, cells)
-    body = Body(shapes, plan.body.tree, plan.body.lighting)
-    places = cells.places()
-    curved = shapes.kind[cells.shape] >= Kind.DISC
-    places[:, curved] = cells.local[curved]
-    rgb = body.colors(cells.shape, places)
-    return _gaussians(plan, cells, rgb, coarseness)
+    share = _sigma_per_side(plan, counts, backing)[cells.shape]
+    first = _gaussians(plan, cells, share, plan.spacing.sink[cells.shape])
+    # Under the ground the second layer may run on past an edge; behind a wall's it would be seen.
+    upright = plan.shapes.semantic == SemanticClass.BUILDING
+    below = make_cells(plan.shapes, backing, upright & (backing[:, 0] > 0))
+    if not len(below.shape):
+        return first
+    count = len(below.shape)
+    share = np.full((count, 2), SIGMA_PER_SIDE)
+    return join_gaussians([first, _gaussians(plan, below, share, np.ones(count))])
+
+
+def _sigma_per_side(plan: SplatPlan, counts: np.ndarray, backing: np.ndarray) -> np.ndarray:
+    """Standard deviation per cell side of each shape's first layer, along both axes, [P, 2]."""
+    kind, hidden = plan.shapes.kind, plan.spacing.hidden
+    share = np.where(backing[:, 0] > 0, BACKED_SIGMA_PER_SIDE, SIGMA_PER_SIDE)
+    share = np.where(kind == Kind.TRIANGLE, MESH_SIGMA_PER_SIDE, share)
+    share = np.where(kind == Kind.ELLIPSOID, BLOB_SIGMA_PER_SIDE, share)
+    share = np.where(hidden & (kind <= Kind.DISC), NARROW_SIGMA_PER_SIDE, share)
+    lone = [
+        (counts[:, i] == 1) & ((plan.shapes.edges & bits) == bits) for i, bits in enumerate(_ENDS)
+    ]
+    return np.where(np.stack(lone, 1), NARROW_SIGMA_PER_SIDE, share[:, None])
+
+
+_ENDS = (U0 | U1, V0 | V1)
 
 
 def _uncovered(plan: SplatPlan, cells: Cells) -> Cells:
-    """Cells that do not lie wholly under another surface, which would shine through it."""
-    covered = np.ones(len(cells.shape), bool)
-    covered &= plan.shapes.material[cells.shape] != Material.LEAF
+    """Cells that do not lie wholly under another surface, which they would shine through."""
+    covered = plan.shapes.material[cells.shape] != Material.LEAF
     for local in cells.places():
         index = np.flatnonzero(covered)
         shape = cells.shape[index]
@@ -90,30 +124,27 @@ def _uncovered(plan: SplatPlan, cells: Cells) -> Cells:
     return cells.select(np.flatnonzero(~covered))
 
 
-def _gaussians(plan: SplatPlan, cells: Cells, rgb: np.ndarray, coarseness: float) -> Gaussians:
+def _gaussians(plan: SplatPlan, cells: Cells, share: np.ndarray, sink: np.ndarray) -> Gaussians:
+    """Splats of cells; share [N, 2]: sigma per cell side; sink [N]: depth in longer cell sides."""
     shapes, shape = plan.shapes, cells.shape
+    body = Body(shapes, plan.body.tree, plan.body.lighting)
+    places = cells.places()
+    curved = shapes.kind[shape] >= Kind.DISC
+    places[:, curved] = cells.local[curved]
+    rgb = body.colors(shape, places)
     normals = shapes.normals(shape, cells.local)
-    rounded = shapes.kind[shape] == Kind.ELLIPSOID
-    share = np.where(rounded, BLOB_SIGMA_PER_SIDE, SIGMA_PER_SIDE)
-    flat = shapes.kind[shape] == Kind.PARALLELOGRAM
-    share = np.where(plan.spacing.hidden[shape] & flat, HIDDEN_SIGMA_PER_SIDE, share)
-    frames, sigmas = _flat_covariance(cells.edges * share[:, None, None], normals)
-    sink = plan.spacing.sink[shape] * np.linalg.norm(cells.edges, axis=2).max(1)
-    means = shapes.points(shape, cells.local) - sink[:, None] * normals
+    frames, sigmas = _flat_covariance(cells.edges * share[:, :, None], normals)
+    sides = np.linalg.norm(cells.edges, axis=2)
+    depth = sink * np.where(curved, sides.min(1), sides.max(1))
+    means = shapes.points(shape, cells.local) - depth[:, None] * normals
     thin = np.clip(0.1 * sigmas.min(1), 0.002, 0.02)
     sigmas = np.concatenate([sigmas, thin[:, None]], 1)
     leaf = np.flatnonzero(shapes.material[shape] == Material.LEAF)
     size = np.linalg.norm(shapes.axes[shape[leaf]], axis=2, keepdims=True)
     frames[leaf] = (shapes.axes[shape[leaf]] / size).transpose(0, 2, 1)
     sigmas[leaf], means[leaf] = LEAF_SIGMA * size[..., 0], shapes.origin[shape[leaf]]
-    return make_gaussians(
-        means,
-        frames,
-        sigmas,
-        np.full(len(means), OPACITY),
-        rgb,
-        shapes.semantic[shape],
-    )
+    opacities = np.full(len(means), OPACITY)
+    return make_gaussians(means, frames, sigmas, opacities, rgb, shapes.semantic[shape])
 
 
 def _flat_covariance(edges: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -21,6 +21,7 @@ LEAST_BLOB = 30  # cells on an ellipsoid
 # gets no splat at all; for tubes the girth.
 INSET = 0.5
 LEAST_HIDDEN_M = 0.4
+HIDDEN_TUFTS_DROPPED = 0.6
 FINE_FROM = 7  # cells along a side from which its crisp edges get two more rows, not one
 
 
@@ -41,7 +42,9 @@ class Cells:
     def places(self) -> np.ndarray:
         """Four places in each cell, local coordinates [4, N, 3]."""
         a, b = self.sides[:, 0] / 4, self.sides[:, 1] / 4
-        return np.stack([self.local + i * a + j * b for i, j in ((-1, -1), (1, 1), (-1, 1), (1, -1))])
+        return np.stack(
+            [self.local + i * a + j * b for i, j in ((-1, -1), (1, 1), (-1, 1), (1, -1))]
+        )
 
 
 def cell_counts(shapes: Shapes, spacing: np.ndarray, hidden: np.ndarray) -> np.ndarray:
@@ -59,9 +62,12 @@ def cell_counts(shapes: Shapes, spacing: np.ndarray, hidden: np.ndarray) -> np.n
     counts[tube, 1] = np.maximum(2, np.ceil(2 * length[:, 2] / spacing.max(1)))[tube]
     counts[blob, 0] = np.maximum(LEAST_BLOB, np.ceil(_area(length) / spacing.min(1) ** 2))[blob]
     counts[blob, 1] = 1
-    counts[shapes.material == Material.LEAF] = 1
+    tuft = shapes.material == Material.LEAF
+    counts[tuft] = 1
     counts = np.maximum(counts, 1)
-    counts[hidden & ~tube & (length[:, :2].max(1) < LEAST_HIDDEN_M)] = 0
+    panel = shapes.kind == Kind.PARALLELOGRAM
+    counts[hidden & panel & (length[:, :2].max(1) < LEAST_HIDDEN_M)] = 0
+    counts[hidden & tuft & (shapes.variation < HIDDEN_TUFTS_DROPPED)] = 0
     counts[hidden & tube & (length[:, 0] < LEAST_HIDDEN_M / 4)] = 0
     return counts.astype(np.int64)
 
@@ -86,9 +92,13 @@ def make_cells(shapes: Shapes, counts: np.ndarray, hidden: np.ndarray) -> Cells:
         ((Kind.CYLINDER,), _tube_cells),
         ((Kind.ELLIPSOID,), _blob_cells),
     ):
-        index = np.flatnonzero(np.isin(shapes.kind, kinds))
+        index = np.flatnonzero(np.isin(shapes.kind, kinds) & (counts[:, 0] > 0))
         if len(index):
             parts.append(build(shapes, index, counts[index], hidden))
+    if not parts:
+        return Cells(
+            np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 2, 3)), np.zeros((0, 2, 3))
+        )
     shape, local, sides = (np.concatenate(p) for p in zip(*parts, strict=True))
     inset = hidden[shape] & (shapes.kind[shape] == Kind.PARALLELOGRAM)
     _draw_in(shapes, counts, np.flatnonzero(inset), shape, local, sides)

@@ -14,7 +14,7 @@ BARK = Look((0.13, 0.10, 0.075), Class.VEGETATION, Material.BARK)
 LEAF = Look((0.12, 0.21, 0.04), Class.VEGETATION, Material.LEAF)
 CORE = Look((0.045, 0.08, 0.02), Class.VEGETATION, Material.LEAVES, ambient=0.4, spacing=3.0)
 WOOD = Look((0.07, 0.12, 0.035), Class.VEGETATION, Material.LEAVES, spacing=2.2)
-NEAR_LEAVES, FAR_LEAVES, GARDEN_LEAVES = 1100, 300, 80
+NEAR_LEAVES, MIDDLE_LEAVES, FAR_LEAVES, GARDEN_LEAVES = 2600, 1200, 300, 80
 
 
 def build_vegetation(layout: Layout) -> Shapes:
@@ -23,7 +23,8 @@ def build_vegetation(layout: Layout) -> Shapes:
     middle = layout.path_length_m / 2
     parts = []
     for x, y in layout.trees:
-        leaves = NEAR_LEAVES if abs(x - middle) < middle + 26 else FAR_LEAVES
+        beyond = max(abs(x - middle) - middle, 0.0)  # along the street from the drive
+        leaves = NEAR_LEAVES if beyond < 10 else (MIDDLE_LEAVES if beyond < 28 else FAR_LEAVES)
         parts.append(_tree(rng, 1.0, leaves).moved((x, y, float(pavement_z(y)) - 0.03)))
     for _ in range(24):
         x = rng.uniform(layout.x0 - 8, layout.x1 + 8)
@@ -48,7 +49,7 @@ def _tree(rng: np.random.Generator, size: float, leaves: int) -> Shapes:
         angle = rng.uniform(0, 0.8) + k * np.pi / 2
         reach = np.array([np.cos(angle), np.sin(angle), 0.9]) * radii * 0.62
         parts.append(tube(fork * 0.98, fork + reach, 0.055 * size, BARK))
-    core = radii * 0.70
+    core = radii * 0.62
     parts.append(ellipsoids(top[None], np.diag(core)[None], CORE))
     parts.append(_crown(rng, top, radii, leaves))
     return join(parts)
@@ -57,14 +58,21 @@ def _tree(rng: np.random.Generator, size: float, leaves: int) -> Shapes:
 def _crown(rng: np.random.Generator, centre: np.ndarray, radii: np.ndarray, leaves: int) -> Shapes:
     """Tufts of leaves on boughs: round lumps around a core, lighter towards the outside and top."""
     lumps = 34
-    lump = _directions(rng, lumps)
-    lump[:, 2] = np.where(lump[:, 2] < -0.6, -lump[:, 2], lump[:, 2])
-    lump_centre = lump * rng.uniform(0.62, 0.78, (lumps, 1))
-    lump_radius = rng.uniform(0.30, 0.42, lumps)
+    step = np.arange(lumps)
+    height = 1 - (2 * step + 1) / lumps * 0.93  # the underside stays open around the trunk
+    angle = step * 2.39996 + rng.uniform(0, 6)
+    flat = np.sqrt(1 - height**2)
+    lump = np.stack([flat * np.cos(angle), flat * np.sin(angle), height], 1)
+    lump += rng.normal(size=(lumps, 3)) * 0.12
+    lump /= np.linalg.norm(lump, axis=1, keepdims=True)
+    lump_centre = lump * rng.uniform(0.60, 0.80, (lumps, 1))
+    lump_radius = rng.uniform(0.32, 0.44, lumps)
     owner = rng.integers(lumps, size=leaves)
     local = _directions(rng, leaves) + 0.75 * lump[owner]  # more of them on a lump's outside
     local /= np.linalg.norm(local, axis=1, keepdims=True)
-    spot = lump_centre[owner] + local * (lump_radius[owner] * rng.uniform(0.7, 1.08, leaves))[:, None]
+    spot = (
+        lump_centre[owner] + local * (lump_radius[owner] * rng.uniform(0.7, 1.08, leaves))[:, None]
+    )
     outward = spot / np.linalg.norm(spot, axis=1, keepdims=True)
     normal = local + 0.5 * outward + 0.45 * rng.normal(size=(leaves, 3))
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)

@@ -25,14 +25,15 @@ PAINTS = (
     (0.36, 0.26, 0.06),
     (0.20, 0.29, 0.36),
 )
-GLASS = Look((0.012, 0.014, 0.016), Class.VEHICLE, Material.PAINT, ambient=0.8)
-TYRE = Look((0.022, 0.022, 0.023), Class.VEHICLE)
-ARCH = Look((0.008, 0.008, 0.008), Class.VEHICLE)
-RIM = Look((0.46, 0.46, 0.47), Class.VEHICLE, Material.RIM)
-TRIM = Look((0.03, 0.03, 0.032), Class.VEHICLE)
-HEADLIGHT = Look((0.72, 0.74, 0.78), Class.VEHICLE)
-TAILLIGHT = Look((0.42, 0.015, 0.015), Class.VEHICLE)
-PLATE = Look((0.72, 0.71, 0.62), Class.VEHICLE)
+SPACING = 0.6  # cars draw the eye
+GLASS = Look((0.012, 0.014, 0.016), Class.VEHICLE, Material.PAINT, 0.8, SPACING)
+TYRE = Look((0.022, 0.022, 0.023), Class.VEHICLE, spacing=SPACING)
+ARCH = Look((0.008, 0.008, 0.008), Class.VEHICLE, spacing=SPACING)
+RIM = Look((0.46, 0.46, 0.47), Class.VEHICLE, Material.RIM, spacing=SPACING)
+TRIM = Look((0.03, 0.03, 0.032), Class.VEHICLE, spacing=SPACING)
+HEADLIGHT = Look((0.72, 0.74, 0.78), Class.VEHICLE, spacing=SPACING)
+TAILLIGHT = Look((0.42, 0.015, 0.015), Class.VEHICLE, spacing=SPACING)
+PLATE = Look((0.72, 0.71, 0.62), Class.VEHICLE, spacing=SPACING)
 WHEEL_RADIUS_M = 0.32
 
 
@@ -70,7 +71,7 @@ def draw_car(seed: int) -> tuple[CarModel, Shapes]:
     rng = np.random.default_rng(seed)
     model = MODELS[rng.integers(len(MODELS))]
     rgb = PAINTS[rng.integers(len(PAINTS))]
-    paint = Look(rgb, Class.VEHICLE, Material.PAINT)
+    paint = Look(rgb, Class.VEHICLE, Material.PAINT, spacing=SPACING)
     return model, build_car(model, paint)
 
 
@@ -223,25 +224,25 @@ def _wheels(model: CarModel) -> list[Shapes]:
 
 def _details(model: CarModel) -> list[Shapes]:
     half, width = model.length / 2, model.width / 2
-    front_z, rear_z = model.belt - 0.27, model.belt - 0.16
+    front_z, rear_z = model.belt - 0.35, model.belt - 0.20
     parts = []
     for side in (1, -1):
         y = sorted((side * width * 0.48, side * width * 0.80))
         low, high = (half - 0.16, y[0], front_z - 0.06), (half + 0.012, y[1], front_z + 0.07)
-        parts.append(boxes(low, high, HEADLIGHT, faces=("+x", "+z", "+y", "-y", "-z"), edges=0))
+        parts.append(boxes(low, high, HEADLIGHT, faces=("+x", "+z", "+y", "-y", "-z")))
         low, high = (-half - 0.012, y[0], rear_z - 0.10), (-half + 0.16, y[1], rear_z + 0.07)
-        parts.append(boxes(low, high, TAILLIGHT, faces=("-x", "+z", "+y", "-y", "-z"), edges=0))
+        parts.append(boxes(low, high, TAILLIGHT, faces=("-x", "+z", "+y", "-y", "-z")))
         mirror = sorted((side * width * 0.93, side * (width + 0.035)))
         low, high = (model.hood - 0.42, mirror[0], model.belt + 0.0), (0.0, mirror[1], 0.0)
         high = (model.hood - 0.30, mirror[1], model.belt + 0.13)
-        parts.append(boxes(low, high, TRIM, faces=("+x", "-x", "+y", "-y", "+z", "-z"), edges=0))
+        parts.append(boxes(low, high, TRIM, faces=("+x", "-x", "+y", "-y", "+z", "-z")))
     grille = (half + 0.010, -width * 0.42, front_z - 0.07)
-    parts.append(parallelograms(grille, (0, width * 0.84, 0), (0, 0, 0.11), TRIM, edges=0))
+    parts.append(parallelograms(grille, (0, width * 0.84, 0), (0, 0, 0.11), TRIM))
     lower = (half + 0.010, -width * 0.6, 0.36)
-    parts.append(parallelograms(lower, (0, width * 1.2, 0), (0, 0, 0.12), TRIM, edges=0))
+    parts.append(parallelograms(lower, (0, width * 1.2, 0), (0, 0, 0.12), TRIM))
     parts.append(parallelograms((half + 0.016, -0.26, 0.40), (0, 0.52, 0), (0, 0, 0.11), PLATE))
     rear = (-half - 0.016, -0.26, rear_z - 0.22)
     parts.append(parallelograms(rear, (0, 0, 0.11), (0, 0.52, 0), PLATE))
     bumper = (-half - 0.010, -width * 0.7, 0.34)
-    parts.append(parallelograms(bumper, (0, 0, 0.13), (0, width * 1.4, 0), TRIM, edges=0))
+    parts.append(parallelograms(bumper, (0, 0, 0.13), (0, width * 1.4, 0), TRIM))
     return parts
