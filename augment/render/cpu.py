@@ -120,10 +120,13 @@ def _rank(inputs: Inputs, camera: Camera, scratch: Scratch) -> tuple[np.ndarray,
 
 
 def _slice_edges(cover: np.ndarray, counts: np.ndarray) -> list[int]:
-    """First bin of every slice, and the end of the last. cover, counts: of each bin of z."""
-    filled = np.flatnonzero(counts)
+    """First bin of every slice, and the end of the last. cover, counts: of each bin of z.
+
+    Bin 0 is not among them: there stand the Gaussians that cannot be seen.
+    """
+    filled = np.flatnonzero(counts[1:]) + 1
     if len(filled) == 0:
-        return [0, 1]
+        return [1, 2]
     edges, end = [int(filled[0])], int(filled[-1]) + 1
     cover, counts = cover.cumsum(), counts.cumsum()
     target, taken = _SLICE_COVER, 0.0
@@ -213,7 +216,9 @@ class _Tiles:
         self._limits = np.array(
             [settings.alpha_max, math.log2(ALPHA_MIN), TRANSMITTANCE_STOP], np.float32
         )
-        flat = {name: image.reshape(-1) for name, image in images.items()}
+        # Alpha is always written, so that kernels come in fewer variants.
+        spare = {ALPHA: scratch.array("alpha", (camera.height, camera.width), np.float32)}
+        flat = {name: image.reshape(-1) for name, image in (spare | images).items()}
         self._images = [flat.get(name) for name in BUFFERS]
         used = cpu_blend.STATE if set(images) - {RGB, ALPHA} else cpu_blend.COLOR_STATE
         self._scratch = scratch

@@ -5,7 +5,7 @@ ellipse meets the strip are found first (an interval: both are convex), then tur
 of (row, splat) items, and one loop without branches blends the items. Strips shrink to the rows in
 which a pixel still lets light through, and a tile ends where none does.
 
-Buffers that are not asked for are None, which the compiler turns into no code at all.
+Images that are not asked for are None, which the compiler turns into no code at all.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ def blend_tiles(
     records: flat float32. members, starts: lists of slots. tiles: uint8 [tiles], CLOSED, OPEN or
     FRESH, updated. states: float32 [tiles * used part of STATE], where open tiles wait for the
     next slice. size: image width and height. limits: float32, alpha_max, log2(ALPHA_MIN),
-    TRANSMITTANCE_STOP. rgb to ids: flat images, or None.
+    TRANSMITTANCE_STOP. rgb to ids: flat images; all but alpha may be None.
     """
     columns = (size[0] + TILE_W - 1) // TILE_W
     used = states.size // tiles.size
@@ -340,8 +340,7 @@ def _write_pixels(state, left, top, size, rgb, alpha, expected, median, ids):
             pixel = U((top + np.int64(y)) * size[0] + column)
             for lane in range(U(max(min(LANES, size[0] - column), 0))):
                 opacity = np.float32(1) - abs(state[at + lane])
-                if alpha is not None:
-                    alpha[pixel + lane] = opacity
+                alpha[pixel + lane] = opacity
                 if rgb is not None:
                     first = U(3) * (pixel + lane)
                     rgb[first] = state[at + lane + P_RED]

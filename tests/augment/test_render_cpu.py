@@ -1,0 +1,447 @@
+"""The CPU rasteriser against stored renders, against the definition, and against itself."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from concurrent.futures import ThreadPoolExecutor
+
+import numba
+import numpy as np
+import pytest
+import torch
+
+from augment.cameras import Camera
+from augment.geometry import multiply_quats, quat_from_rotmat, rigid, transform_points
+from augment.render import cpu, cpu_scratch
+from augment.render.buffers import (
+    ALPHA,
+    BUFFERS,
+    EXPECTED_DEPTH,
+    MEDIAN_DEPTH,
+    RGB,
+    SPLAT_IDS,
+)
+from augment.render.constants import RasterSettings
+from augment.render.cpu import rasterize_cpu, warm_up
+from augment.render.reference import rasterize_reference
+from augment.scene import Gaussians, PosedGaussians
+from augment.weather.smog import SmogMedium
+from tests.assertions import assert_images_close, assert_labels_equal
+from tests.scenes import (
+    camera_ahead,
+    golden_view,
+    one_gaussian,
+    random_gaussians,
+    random_pose,
+    slight_pose,
+    stack,
+)
+
+ALL = frozenset(BUFFERS)
+COLOR = frozenset({RGB, ALPHA})
+DEFAULT = RasterSettings()
+UNIFORM = SmogMedium(0.15, (0.8, 0.7, 0.5))
+LAYERED = SmogMedium(0.3, (0.8, 0.7, 0.5), scale_height_m=2.0, base_z_m=-1.0)
+GOLDEN_MODES = (
+    *("a999_classic", "a999_aa", "a99_classic", "a99_aa"),
+    *(f"a99_classic_sh{degree}" for degree in range(4)),
+)
+
+
+def render(parts, camera, buffers=ALL, settings=DEFAULT, smog=None):
+    parts = [PosedGaussians(parts)] if isinstance(parts, Gaussians) else parts
+    return rasterize_cpu(parts, camera, frozenset(buffers), settings, smog)
+
+
+def assert_same_bits(actual, expected, buffers=ALL):
+    for name in buffers:
+        assert torch.equal(getattr(actual, name), getattr(expected, name)), name
+
+
+def in_float64(parts):
+    """The same numbers in the precision the definition is exact in."""
+    names = ("means", "quats", "scales", "opacities", "sh")
+    return [
+        dataclasses.replace(
+            part,
+            gaussians=Gaussians(**{n: getattr(part.gaussians, n).double() for n in names}),
+        )
+        for part in parts
+    ]
+
+
+def assert_matches_definition(parts, camera, settings=DEFAULT, smog=None, *, max_flips=2):
+    actual = render(parts, camera, ALL, settings, smog)
+    expected = rasterize_reference(in_float64(parts), camera, ALL, settings, smog)
+    # 1e-5: forty float32 blends and an exp2 that is good to 3e-6. Depths are up to 9 m.
+    for name in (RGB, ALPHA):
+        assert_images_close(
+            getattr(actual, name), getattr(expected, name), p999=1e-5, max_flips=max_flips
+        )
+    assert_images_close(
+        actual.expected_depth, expected.expected_depth, p999=2e-4, flip=5e-3, max_flips=max_flips
+    )
+    # A pixel whose transmittance nears one half, or whose two heaviest splats weigh the same, may
+    # name the next splat.
+    assert_images_close(
+        actual.median_depth, expected.median_depth, p999=1e-5, max_flips=max_flips + 2
+    )
+    assert_labels_equal(actual.splat_ids, expected.splat_ids, max_flips=max_flips + 2)
+
+
+# ---- stored renders ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mode", GOLDEN_MODES)
+@pytest.mark.parametrize("name", ["edge", "garden_small", "opaque"])
+def test_stored_renders(shared_dir, name, mode):
+    with_sh = mode[-3:-1] == "sh"
+    parts, camera, arrays = golden_view(shared_dir / "golden" / f"{name}.npz", with_sh=with_sh)
+    settings = RasterSettings(
+        alpha_max=0.999 if mode.startswith("a999") else 0.99,
+        antialiased="_aa" in mode,
+        sh_degree=int(mode[-1]) if with_sh else None,
+    )
+    output = render(parts, camera, {RGB, ALPHA, EXPECTED_DEPTH}, settings)
+    stored = {"rgb": output.rgb} if with_sh else {"rgb": output.rgb, "alpha": output.alpha}
+    for key, image in stored.items():
+        # The required bound is 1e-4; exp2's 3e-6 a splat leaves less than 1e-5. Antialiasing puts
+        # one splat of garden_small on the other side of 1/255, in up to 3 of 17 010 pixels.
+        assert_images_close(image, arrays[f"{mode}_{key}"], p999=1e-5, max_flips=5)
+    if not with_sh:
+        expected = torch.from_numpy(arrays[f"{mode}_ED"]).reshape(output.alpha.shape)
+        relative = output.expected_depth / expected.clamp_min(1e-3)
+        assert_images_close(relative, expected / expected.clamp_min(1e-3), p999=1e-5, max_flips=5)
+
+
+# ---- the definition ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "size", [(97, 61), (16, 16), (17, 33), (1, 1), (8, 40), (5, 3)], ids=lambda s: f"{s[0]}x{s[1]}"
+)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_random_scenes(size, seed):
+    width, height = size
+    camera = camera_ahead(width, height, 0.9 * max(size))
+    assert_matches_definition([PosedGaussians(random_gaussians(400, seed=seed))], camera)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        RasterSettings(antialiased=True),
+        RasterSettings(alpha_max=0.99, near_m=1.5),
+        RasterSettings(sh_degree=1),
+    ],
+    ids=["antialiased", "near and alpha_max", "sh_degree"],
+)
+def test_settings(settings):
+    parts = [PosedGaussians(random_gaussians(400, size=0.1))]
+    assert_matches_definition(parts, camera_ahead(97, 61, 80.0), settings)
+
+
+@pytest.mark.parametrize("sh_degree", [0, 1, 2])
+def test_sh_degrees(sh_degree):
+    parts = [PosedGaussians(random_gaussians(300, sh_degree=sh_degree))]
+    assert_matches_definition(parts, camera_ahead(yaw=0.3))
+
+
+@pytest.mark.parametrize("smog", [UNIFORM, LAYERED], ids=["uniform", "layered"])
+def test_smog(smog):
+    parts = [
+        PosedGaussians(random_gaussians(300)),
+        PosedGaussians(random_gaussians(200, seed=1, sh_degree=1), slight_pose(), 1),
+    ]
+    assert_matches_definition(parts, camera_ahead(97, 61, 80.0), smog=smog)
+
+
+@pytest.mark.parametrize("base_z_m", [-3000.0, 0.0, 3000.0])
+@pytest.mark.parametrize("scale_height_m", [0.05, 1e6])
+def test_smog_far_below_and_above_its_layer(scale_height_m, base_z_m):
+    smog = SmogMedium(0.2, (0.8, 0.7, 0.5), scale_height_m, base_z_m)
+    assert_matches_definition(
+        [PosedGaussians(random_gaussians(200))], camera_ahead(position=(0.0, 0.0, 0.4)), smog=smog
+    )
+
+
+@pytest.mark.parametrize("smog", [UNIFORM, LAYERED], ids=["uniform", "layered"])
+def test_smog_of_no_density_changes_no_bit(smog):
+    scene, camera = random_gaussians(400), camera_ahead(97, 61, 80.0)
+    clear = dataclasses.replace(smog, sigma_per_m=0.0)
+    assert_same_bits(render(scene, camera, smog=clear), render(scene, camera))
+
+
+@pytest.mark.parametrize("smog", [UNIFORM, LAYERED], ids=["uniform", "layered"])
+def test_smog_without_end_shows_its_own_colour(smog):
+    camera = camera_ahead()
+    output = render(random_gaussians(400), camera, smog=dataclasses.replace(smog, sigma_per_m=1e30))
+    expected = output.alpha[..., None] * torch.tensor(smog.rgb)
+    # Weights sum to alpha but for the rounding of forty additions.
+    torch.testing.assert_close(output.rgb, expected, rtol=0, atol=1e-5)
+
+
+def test_poses():
+    """Actors turned and moved, SH directions in their own frames, ids through all parts."""
+    parts = [
+        PosedGaussians(random_gaussians(300)),
+        PosedGaussians(random_gaussians(150, seed=1), slight_pose(), 1),
+        PosedGaussians(random_gaussians(150, seed=2, sh_degree=1), random_pose(), 2),
+    ]
+    assert_matches_definition(parts, camera_ahead(97, 61, 80.0, yaw=0.2))
+
+
+def test_kilometres_from_the_origin():
+    """Positions lose digits where they are stored; rendering must not lose more."""
+    offset = torch.tensor([31_000.0, -17_000.0, 250.0])
+    scene = random_gaussians(300)
+    scene = dataclasses.replace(scene, means=scene.means + offset)
+    camera = camera_ahead(97, 61, 80.0, position=(31_000.1, -17_000.3, 250.2))
+    assert_matches_definition([PosedGaussians(scene)], camera)
+
+
+# ---- corners -----------------------------------------------------------------------------------
+
+
+def test_one_gaussian():
+    assert_matches_definition([PosedGaussians(one_gaussian())], camera_ahead(), max_flips=0)
+
+
+def test_nothing_to_see():
+    camera = camera_ahead(19, 7)
+    behind = one_gaussian(mean=(-4.0, 0.0, 0.0))
+    aside = one_gaussian(mean=(4.0, 90.0, 0.0))
+    thin = one_gaussian(opacity=0.0039)
+    for parts in (
+        Gaussians.empty(3),
+        stack(behind, aside, thin),
+        [PosedGaussians(Gaussians.empty()), PosedGaussians(behind, random_pose())],
+    ):
+        output = render(parts, camera)
+        for name in (RGB, ALPHA, EXPECTED_DEPTH, MEDIAN_DEPTH):
+            assert torch.count_nonzero(getattr(output, name)) == 0
+        assert (output.splat_ids == -1).all()
+
+
+def test_an_empty_part_between_others():
+    first, second = random_gaussians(100), random_gaussians(100, seed=1)
+    parts = [PosedGaussians(g) for g in (first, Gaussians.empty(3), second)]
+    camera = camera_ahead()
+    assert_same_bits(render(parts, camera), render(stack(first, second), camera))
+
+
+@pytest.mark.parametrize("scale", [1e-12, 1e-6, 1e3, 1e9, 1e15])
+def test_extreme_scales(scale):
+    """Points too small to see and balls that hold the camera: finite, and as defined."""
+    scene = random_gaussians(60, sh_degree=0)
+    scene = dataclasses.replace(scene, scales=torch.full_like(scene.scales, scale))
+    assert_matches_definition([PosedGaussians(scene)], camera_ahead())
+
+
+def test_needles():
+    scene = random_gaussians(200)
+    thin = scene.scales * torch.tensor([[30.0, 1e-4, 1e-4]])
+    assert_matches_definition(
+        [PosedGaussians(dataclasses.replace(scene, scales=thin))], camera_ahead(97, 61, 80.0)
+    )
+
+
+def test_around_the_near_plane():
+    """Some just cut, some so near that they are magnified a hundred thousand times."""
+    scene = random_gaussians(300)
+    x = torch.linspace(0.005, 0.02, 300)
+    scene = dataclasses.replace(scene, means=torch.cat([x[:, None], scene.means[:, 1:] / 20], 1))
+    output = render(scene, camera_ahead())
+    for name in (RGB, ALPHA, EXPECTED_DEPTH, MEDIAN_DEPTH):
+        assert torch.isfinite(getattr(output, name)).all()
+    assert_matches_definition(
+        [PosedGaussians(dataclasses.replace(scene, scales=scene.scales / 100))], camera_ahead()
+    )
+
+
+def test_equal_depths_keep_the_order_of_indices():
+    """Layers at one depth in several blocks: what is seen depends on their order alone."""
+    layers = [one_gaussian(opacity=0.3, rgb=(i % 7 / 7, 0.5, i / 40)) for i in range(40)]
+    scene = stack(*layers).select(torch.arange(5000) % 40)
+    assert_matches_definition([PosedGaussians(scene)], camera_ahead(), max_flips=0)
+
+
+def test_tall_and_wide_images():
+    """Tile numbers beyond one byte, in both directions."""
+    gaussian = one_gaussian(mean=(4.0, 0.0, 0.0), scale=1e4, opacity=0.5)
+    for width, height in ((5000, 3), (3, 5000)):
+        output = render(gaussian, camera_ahead(width, height, 5000.0), COLOR)
+        torch.testing.assert_close(
+            output.alpha, torch.full((height, width), 0.5), rtol=0, atol=1e-5
+        )
+
+
+# ---- the same bits -----------------------------------------------------------------------------
+
+
+@pytest.fixture
+def crowd():
+    """Several blocks of Gaussians in two parts; some tiles close soon, some late, a few never."""
+    near, far = (random_gaussians(n, seed=n, size=0.2, sh_degree=1) for n in (6000, 3000))
+    near = near.select(near.means[:, 0] > 0.5)
+    parts = [PosedGaussians(near), PosedGaussians(far.select(far.means[:, 0] > 1), slight_pose())]
+    return parts, camera_ahead(150, 111, 130.0)
+
+
+@pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="one core: nothing to compare")
+def test_bits_do_not_depend_on_the_number_of_threads(crowd):
+    before = numba.get_num_threads()
+    try:
+        outputs = []
+        for count in (1, 2):
+            numba.set_num_threads(count)
+            outputs.append(render(*crowd))
+    finally:
+        numba.set_num_threads(before)
+    assert_same_bits(*outputs)
+
+
+@pytest.mark.parametrize(
+    "buffers", [{RGB, ALPHA}, {RGB, ALPHA, MEDIAN_DEPTH}, {ALPHA}, {SPLAT_IDS}], ids=sorted
+)
+def test_bits_do_not_depend_on_the_buffers_asked_for(crowd, buffers):
+    output = render(*crowd, buffers)
+    assert_same_bits(output, render(*crowd), buffers)
+    assert all(getattr(output, name) is None for name in ALL - buffers)
+
+
+def test_bits_do_not_depend_on_slices_and_lists(crowd, monkeypatch):
+    monkeypatch.setattr(cpu, "_SMALLEST_SLICE", 1_000_000)
+    times: dict[str, float] = {}
+    whole = rasterize_cpu(*crowd, ALL, DEFAULT, None, stage_times=times)
+    monkeypatch.setattr(cpu, "_SMALLEST_SLICE", 100)
+    monkeypatch.setattr(cpu, "_SLICE_COVER", 1.0)
+    monkeypatch.setattr(cpu, "_SLICE_GROWTH", 1.5)
+    sliced_times: dict[str, float] = {}
+    sliced = rasterize_cpu(*crowd, ALL, DEFAULT, None, stage_times=sliced_times)
+    assert_same_bits(sliced, whole)
+    assert sliced_times["visible"] < times["visible"]  # slices did leave something out
+    monkeypatch.setattr(cpu, "_MAX_PAIRS", 300)
+    assert_same_bits(render(*crowd), whole)
+
+
+def test_hidden_splats_are_not_projected(crowd, monkeypatch):
+    """A wall before almost everything closes all tiles in the first slices."""
+    parts, camera = crowd
+    monkeypatch.setattr(cpu, "_SMALLEST_SLICE", 1)
+    monkeypatch.setattr(cpu, "_SLICE_COVER", 2.0)
+    wall = stack(*[one_gaussian(mean=(0.2, 0, 0), scale=5.0, opacity=0.99)] * 4)
+    open_view: dict[str, float] = {}
+    rasterize_cpu(parts, camera, COLOR, DEFAULT, None, stage_times=open_view)
+    assert open_view["visible"] > 2000
+    walled: dict[str, float] = {}
+    behind = [PosedGaussians(wall), *parts]
+    rasterize_cpu(behind, camera, COLOR, DEFAULT, None, stage_times=walled)
+    assert walled["visible"] < 100  # the wall, and what stands before it
+
+
+def test_stage_times_add_up(crowd):
+    times = {"project": 1000.0, "other": 1.0}
+    rasterize_cpu(*crowd, COLOR, DEFAULT, None, stage_times=times)
+    once = times["visible"], times["pairs"]
+    rasterize_cpu(*crowd, COLOR, DEFAULT, None, stage_times=times)
+    assert (times["visible"], times["pairs"]) == (2 * once[0], 2 * once[1])
+    assert times["pairs"] >= times["visible"] > 0
+    assert set(times) == {"project", "sort", "bin", "raster", "visible", "pairs", "other"}
+    assert times["project"] > 1000 and all(times[s] > 0 for s in ("sort", "bin", "raster"))
+
+
+def test_parts_equal_one_part():
+    pieces = [random_gaussians(n, seed=n, sh_degree=2) for n in (2049, 1, 700)]
+    camera = camera_ahead(97, 61, 80.0)
+    identity = torch.eye(4, dtype=torch.float64)
+    parts = [PosedGaussians(pieces[0]), *(PosedGaussians(p, identity, 1) for p in pieces[1:])]
+    assert_same_bits(render(parts, camera), render(stack(*pieces), camera))
+
+
+def test_a_posed_part_equals_moved_gaussians():
+    scene, pose = random_gaussians(300, sh_degree=0), slight_pose()
+    turn = quat_from_rotmat(pose[:3, :3]).float()
+    moved = dataclasses.replace(
+        scene,
+        means=transform_points(pose, scene.means),
+        quats=multiply_quats(turn.expand_as(scene.quats), scene.quats),
+    )
+    camera = camera_ahead(97, 61, 80.0)
+    posed, baked = render([PosedGaussians(scene, pose)], camera), render(moved, camera)
+    # The baked means are rounded to float32 in another frame: 1e-6 m at 8 m is 1e-5 px.
+    assert_images_close(posed.rgb, baked.rgb, p999=1e-4, max_flips=2)
+    assert_images_close(posed.alpha, baked.alpha, p999=1e-4, max_flips=2)
+
+
+def test_a_quarter_turn_of_the_world_turns_nothing():
+    """Camera and scene moved together: the same picture, its view-dependent colours included."""
+    scene, camera = random_gaussians(300), camera_ahead(97, 61, 80.0)
+    world = rigid(
+        torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64),
+        torch.tensor([3.0, 1.0, -2.0], dtype=torch.float64),
+    )
+    moved = dataclasses.replace(
+        camera, camera_from_world=camera.camera_from_world @ torch.linalg.inv(world)
+    )
+    turned = render([PosedGaussians(scene, world)], moved)
+    assert_images_close(turned.rgb, render(scene, camera).rgb, p999=1e-4, max_flips=2)
+
+
+def test_threads_that_render_at_once(crowd):
+    expected = render(*crowd)
+    with ThreadPoolExecutor(4) as pool:
+        for output in pool.map(lambda _: render(*crowd), range(8)):
+            assert_same_bits(output, expected)
+
+
+# ---- input and work space ----------------------------------------------------------------------
+
+
+def test_strided_and_float64_input():
+    scene, camera = random_gaussians(100), camera_ahead()
+    strided = dataclasses.replace(
+        scene, means=torch.cat([scene.means, scene.means], 1)[:, :3], sh=scene.sh.flip(1).flip(1)
+    )
+    assert not strided.means.is_contiguous()
+    assert_same_bits(render(strided, camera), render(scene, camera))
+    assert_same_bits(render(in_float64([PosedGaussians(scene)]), camera), render(scene, camera))
+
+
+def test_outputs_outlive_the_work_space():
+    scene, camera = random_gaussians(200), camera_ahead()
+    first = render(scene, camera)
+    copies = {name: getattr(first, name).clone() for name in ALL}
+    render(random_gaussians(200, seed=5), camera)
+    for name, copy in copies.items():
+        assert torch.equal(getattr(first, name), copy)
+
+
+def test_work_space_is_kept_and_given_back():
+    cpu_scratch.release_scratch()
+    scene, camera = random_gaussians(200), camera_ahead()
+    render(scene, camera)
+    with cpu_scratch.borrowed_scratch() as scratch:
+        kept = scratch.nbytes
+        assert kept > 0
+        aligned = scratch.array("records", (16,), np.float32)
+        assert aligned.ctypes.data % 64 == 0
+    render(scene, camera)
+    with cpu_scratch.borrowed_scratch() as scratch:
+        assert scratch.nbytes == kept
+    cpu_scratch.release_scratch()
+    with cpu_scratch.borrowed_scratch() as scratch:
+        assert scratch.nbytes == 0
+
+
+def test_warm_up_reports_its_seconds():
+    assert 0 <= warm_up() < math.inf
+    assert warm_up() < 1  # compiled by now
+
+
+def test_camera_is_not_assumed_central():
+    camera = Camera(
+        "aside", 40, 30, 35.0, 50.0, 90.0, -20.0, camera_ahead().camera_from_world
+    )  # the optical axis lies outside the image
+    assert_matches_definition([PosedGaussians(random_gaussians(400))], camera)
