@@ -12,10 +12,10 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
-from adapters.base import CAMERA_PATH_KEY, add_to_uri
 from adapters.camera_files import read_views
 from adapters.camera_frames import frames_from_views
 from adapters.default_paths import NO_CAMERAS, PathKind, make_default_path
+from adapters.uri import CAMERA_PATH_KEY, add_to_uri
 from adapters.world import WorldChange
 from augment.cameras import Frame
 from augment.scene import Gaussians, Scene

@@ -17,13 +17,13 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from adapters.base import format_uri
 from adapters.camera_files import find_camera_file, read_views
 from adapters.camera_frames import frames_from_views
 from adapters.default_paths import make_default_path
 from adapters.gaussian_options import COLOURS, GaussianOptions
 from adapters.ground_estimate import lowest_ground, solid_points
 from adapters.posed_views import PosedView, ViewSet
+from adapters.uri import format_uri
 from adapters.world import WorldChange, nearest_axis, parse_up, rotation_to_z_up
 from augment.cameras import Frame
 from augment.errors import AdapterError

@@ -11,7 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from splat_scenes import street
 
-from adapters.base import add_to_uri, format_uri, open_scene, parse_uri, recognise
+from adapters.base import open_scene, recognise
+from adapters.uri import add_to_uri, format_uri, parse_uri
 from augment.errors import AdapterError
 from augment.splat_io import write_ply, write_splat
 
@@ -157,5 +158,5 @@ def test_the_road_height_can_be_given_to_any_scene(tmp_path: Path) -> None:
     scene = open_scene(f"{uri}&ground_z=-1.5")
     assert scene.ground_z_m == -1.5
     assert open_scene(scene.source).ground_z_m == -1.5  # a worker opens the same scene
-    with pytest.raises(AdapterError, match="ground_z must be the road's height.*got 'low'"):
+    with pytest.raises(AdapterError, match=r"ground_z must be the road's height.*got 'low'"):
         open_scene(f"{uri}&ground_z=low")

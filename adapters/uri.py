@@ -1,0 +1,103 @@
+"""The text that names a scene: `scheme:path?key=value&…`, taken apart and put together.
+
+Special characters in paths and values (% ? & and, in values, = too) may be percent-encoded; a path
+that exists as written is taken as written. `+` stands for itself.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import quote, unquote
+
+from augment.errors import AdapterError
+
+CAMERA_PATH_KEY = "camera_path"
+GROUND_KEY = "ground_z"
+_SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9_+.-]*):(?!\\)")
+
+
+@dataclass(frozen=True)
+class Scheme:
+    """What opens a kind of scene. module, function: imported when used. builtin: the names that
+    the path may be where it is no file.
+    """
+
+    module: str
+    function: str
+    example: str
+    builtin: tuple[str, ...] = ()
+
+
+SCHEMES = {
+    "procedural": Scheme(
+        "adapters.procedural", "open_procedural", "procedural:street?seed=3", ("street",)
+    ),
+    "pandaset": Scheme("adapters.pandaset", "open_pandaset", "pandaset:data/pandaset/002"),
+    "gaussians": Scheme(
+        "adapters.gaussian_files", "open_gaussians", "gaussians:model/point_cloud.ply?up=-y"
+    ),
+}
+
+
+def parse_uri(uri: str) -> tuple[str | None, str, dict[str, str]]:
+    """Scheme (None where there is none), path and query of a scene's URI, decoded.
+
+    Raises:
+        AdapterError: an empty path, or a query that is not key=value&key=value.
+    """
+    if Path(uri).exists() and uri:
+        return None, uri, {}
+    match = _SCHEME.match(uri)
+    scheme = match[1].lower() if match else None
+    path, query = _split_query(uri[match.end() :] if match else uri, uri)
+    if not path:
+        raise AdapterError(
+            f"{uri!r}: no path in this scene URI; expected one of: {known_schemes()}"
+        )
+    if not Path(path).exists():
+        path = unquote(path)
+    return scheme, str(Path(path).expanduser()), query
+
+
+def format_uri(scheme: str, path: str | Path, query: Mapping[str, str]) -> str:
+    """The URI that `parse_uri` takes apart into these, with keys in the order given."""
+    encoded = "&".join(f"{key}={quote(value, safe='/+,:.~-')}" for key, value in query.items())
+    return f"{scheme}:{quote(str(path), safe='/+,:=&@ ')}" + (f"?{encoded}" if encoded else "")
+
+
+def add_to_uri(uri: str, key: str, value: str) -> str:
+    """A URI that names its scheme, with one more key, which replaces what it said before."""
+    scheme, path, query = parse_uri(uri)
+    assert scheme is not None, f"a scene's source names its scheme; got {uri!r}"
+    return format_uri(scheme, path, {**query, key: value})
+
+
+def known_schemes() -> str:
+    """Every scheme with an example, for messages."""
+    return ", ".join(f"{name} ({entry.example})" for name, entry in SCHEMES.items())
+
+
+def _split_query(text: str, uri: str) -> tuple[str, dict[str, str]]:
+    """Path and query. A path may hold '?': the shortest beginning that exists is the path, and
+    where none does, all before the first '?'.
+    """
+    marks = [i for i, character in enumerate(text) if character == "?"]
+    if not marks or Path(text).exists():
+        return text, {}
+    existing = [i for i in marks if i and Path(text[:i]).exists()]
+    mark = existing[0] if existing else marks[0]
+    query: dict[str, str] = {}
+    for item in filter(None, text[mark + 1 :].split("&")):
+        key, equals, value = item.partition("=")
+        if not equals or not key:
+            raise AdapterError(
+                f"{uri!r}: expected key=value after '?'; got {item!r} (write %3F for a '?' and %26 "
+                "for a '&' that belong to a name)"
+            )
+        if key in query:
+            raise AdapterError(f"{uri!r}: the key {key!r} is given twice")
+        query[key] = unquote(value)
+    return text[:mark], query
