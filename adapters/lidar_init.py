@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
+from adapters.lidar_split import is_flat
 from adapters.lidar_surfels import Surfels
 from augment.geometry import quat_from_rotmat
 from augment.render.sh import SH_C0
@@ -19,12 +20,14 @@ class SplatShape:
     """How a surfel becomes a Gaussian.
 
     sigma_per_spacing: standard deviation along a tangent axis over the spacing there; 0.4 leaves
-    a lattice visible, 0.6 blurs. thickness: standard deviation along the normal over the smaller
+    a lattice visible, 0.6 blurs. ground_sigma_per_spacing: the same on the ground, which must not
+    leak. thickness: standard deviation along the normal over the smaller
     tangent one, at least min_thickness_m. opacity: of every splat; high, so that a surface hides
     what lies behind it.
     """
 
     sigma_per_spacing: float = 0.5
+    ground_sigma_per_spacing: float = 0.6
     thickness: float = 0.15
     min_thickness_m: float = 0.005
     opacity: float = 0.95
@@ -42,7 +45,10 @@ def gaussians_from_surfels(
     """
     second = np.cross(surfels.normals, surfels.major)
     axes = np.stack([surfels.major, second, surfels.normals], axis=2)  # columns
-    tangent = surfels.spacing * np.float32(shape.sigma_per_spacing)
+    sigma = np.full(len(surfels), shape.sigma_per_spacing, np.float32)
+    if semantic is not None:
+        sigma[is_flat(semantic)] = shape.ground_sigma_per_spacing
+    tangent = surfels.spacing * sigma[:, None]
     thin = np.maximum(tangent.min(axis=1) * shape.thickness, shape.min_thickness_m)
     scales = np.concatenate([tangent, thin[:, None]], axis=1).astype(np.float32)
     return Gaussians(

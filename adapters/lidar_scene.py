@@ -3,26 +3,37 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from adapters.actor_motion import indices_between
 from adapters.box_tracks import ObjectTrack
+from adapters.ground_fill import fill_ground
 from adapters.image_views import Body, Seen, View, observe_views
+from adapters.lidar_bridges import bridge_gaps
 from adapters.lidar_init import borrow_colours, gaussians_from_surfels
-from adapters.lidar_split import PointSet, Sweep, split_sweeps
+from adapters.lidar_split import PointSet, Sweep, is_flat, split_sweeps
 from adapters.lidar_surfels import Surfels, surfels_from_points
 from adapters.lidar_voxels import thin_points
 from adapters.sky_from_images import SkyGatherer
+from adapters.wall_fill import fill_walls
 from augment.scene import Actor, Gaussians
 from augment.semantics import SemanticClass
 from augment.sky import CubemapSky
 
 logger = logging.getLogger(__name__)
 
-_BORROW_EDGES = 3.0  # an unseen surfel takes the colour of a seen one up to so many edges away
-_ROAD_REACH_M = 4.0
+# An unseen surfel takes the colour of a seen one up to so many edges away; ground, which goes on
+# under and behind what hides it, up to so many metres.
+_BORROW_EDGES = 6.0
+_BORROW_GROUND_M = 5.0
+_FEWEST = 8  # points that surfaces are sought in
+_TRIAL = 3.0  # voxels of the trial in units of those asked for
+_ROAD_REACHES_M = (4.0, 8.0, 16.0)
+_ROAD_RETURNS = 200  # some returns near the sensor are mislabelled: a few are not enough
 _LOW_QUANTILE = 0.02  # a low height that a single stray return does not decide
 
 
@@ -37,13 +48,15 @@ class DrivenPath:
 @dataclass(frozen=True)
 class LidarSceneOptions:
     """voxel_m: edge of a voxel near the path. max_gaussians: voxels grow until no more are needed.
-    image_scale: 1, 1/2, 1/4 or 1/8. sky_size: texels along a cube edge. progress: bars on stderr.
+    image_scale: 1, 1/2, 1/4 or 1/8. sky_size: texels along a cube edge. lidar_top_deg: highest
+    elevation that the LiDAR looks at. progress: bars on stderr.
     """
 
     voxel_m: float = 0.04
-    max_gaussians: int = 400_000
+    max_gaussians: int = 500_000
     image_scale: float = 0.5
     sky_size: int = 768
+    lidar_top_deg: float = 15.0
     progress: bool = False
 
 
@@ -72,13 +85,13 @@ def build_lidar_scene(
     """
     background, actors = split_sweeps(sweeps, tracks)
     ground_z_m = road_height(background, path.positions)
-    things = _thin_all([background, *actors], [None, *tracks], path, options)
-    thinned = [(t, e, surfels_from_points(t.points, e)) for t, e in things]
+    things = _sample_all([background, *actors], [None, *tracks], path, options)
+    thinned = [(t, e, surfels_from_points(t.points, e, semantic=t.semantic)) for t, e in things]
     bodies = [
         Body(surfels, track)
         for (_, _, surfels), track in zip(thinned, [None, *tracks], strict=True)
     ]
-    gatherer = SkyGatherer(options.sky_size)
+    gatherer = SkyGatherer(options.sky_size, math.radians(options.lidar_top_deg))
     seen, problems = observe_views(
         bodies, views, gatherer, image_scale=options.image_scale, progress=options.progress
     )
@@ -98,8 +111,9 @@ def build_lidar_scene(
 def road_height(points: PointSet, path: np.ndarray) -> float | None:
     """The lowest height of the road under the path, metres in the world of the points.
 
-    At each position of the path (float [P, 3]) the height is the median of road returns within
-    _ROAD_REACH_M, or, where no class says road, a low quantile of all returns there.
+    At each position of the path (float [P, 3]) the height is the median of the nearest road
+    returns, or, where no class says road, a low quantile of all returns there. The LiDAR sees no
+    road right below itself, so the reach widens until there are enough returns to trust.
     """
     road = np.isin(points.semantic, (SemanticClass.ROAD, SemanticClass.LANE_MARKING))
     heights = _heights(points.points[road], path, 0.5)
@@ -109,38 +123,62 @@ def road_height(points: PointSet, path: np.ndarray) -> float | None:
 
 
 def _heights(points: np.ndarray, path: np.ndarray, quantile: float) -> list[float]:
-    near = ((points[:, :2] > path[:, :2].min(0) - _ROAD_REACH_M).all(1)) & (
-        (points[:, :2] < path[:, :2].max(0) + _ROAD_REACH_M).all(1)
-    )
-    points = points[near]
+    widest = _ROAD_REACHES_M[-1]
+    low, high = path.min(axis=0) - widest, path.max(axis=0) + widest
+    points = points[indices_between(points, low, high)]
     heights = []
     for position in path:
         distance2 = ((points[:, :2] - position[:2]) ** 2).sum(1)
-        z = points[distance2 < _ROAD_REACH_M**2, 2]
-        if len(z):
-            heights.append(float(np.quantile(z, quantile)))
+        for reach in _ROAD_REACHES_M:
+            z = points[distance2 < reach**2, 2]
+            if len(z) >= _ROAD_RETURNS:
+                heights.append(float(np.quantile(z, quantile)))
+                break
     return heights
 
 
-def _thin_all(
+def _sample_all(
     things: Sequence[PointSet],
     tracks: Sequence[ObjectTrack | None],
     path: DrivenPath,
     options: LidarSceneOptions,
 ) -> list[tuple[PointSet, np.ndarray]]:
-    """Every thing thinned with one voxel size, the smallest that respects max_gaussians."""
+    """Every thing thinned and its gaps filled with one voxel size, the smallest that respects
+    max_gaussians."""
     paths = [_path_in(track, path) for track in tracks]
-    voxel_m = options.voxel_m
-    while True:
-        thinned = [
-            thin_points(thing, p, voxel_m=voxel_m) for thing, p in zip(things, paths, strict=True)
+
+    def sample(voxel_m: float) -> list[tuple[PointSet, np.ndarray]]:
+        sampled = [
+            _sample(thing, p, voxel_m, is_world=track is None)
+            for thing, p, track in zip(things, paths, tracks, strict=True)
         ]
-        count = sum(len(points) for points, _ in thinned)
-        if count <= options.max_gaussians:
-            logger.info("%d surfels at a voxel of %.3f m", count, voxel_m)
-            return thinned
-        # Surfaces: the count falls with the square of the edge, sparse parts more slowly.
-        voxel_m *= max(1.02, (count / options.max_gaussians) ** 0.5)
+        logger.info("%d surfels at a voxel of %.3f m", _count(sampled), voxel_m)
+        return sampled
+
+    # A coarse trial tells what the fine one needs: on surfaces the count goes with the square.
+    trial = _count(sample(_TRIAL * options.voxel_m))
+    needed = 1.01 * _TRIAL * (trial / options.max_gaussians) ** 0.5
+    voxel_m = options.voxel_m * max(1.0, needed)
+    while _count(sampled := sample(voxel_m)) > options.max_gaussians:
+        voxel_m *= max(1.02, (_count(sampled) / options.max_gaussians) ** 0.55)
+    return sampled
+
+
+def _count(sampled: Sequence[tuple[PointSet, np.ndarray]]) -> int:
+    return sum(len(points) for points, _ in sampled)
+
+
+def _sample(
+    thing: PointSet, path: np.ndarray, voxel_m: float, *, is_world: bool
+) -> tuple[PointSet, np.ndarray]:
+    thin, edges = thin_points(thing, path, voxel_m=voxel_m)
+    if len(thin) < _FEWEST:
+        return thin, edges
+    surfels = surfels_from_points(thin.points, edges, semantic=thin.semantic)
+    parts = [thin, bridge_gaps(thin, edges, surfels)]
+    if is_world:
+        parts += [fill_walls(thin, edges, surfels), fill_ground(thin, path, voxel_m=voxel_m)]
+    return thin_points(PointSet.join(parts), path, voxel_m=voxel_m)
 
 
 def _path_in(track: ObjectTrack | None, path: DrivenPath) -> np.ndarray:
@@ -154,9 +192,8 @@ def _path_in(track: ObjectTrack | None, path: DrivenPath) -> np.ndarray:
 
 
 def _finish(points: PointSet, edges: np.ndarray, surfels: Surfels, seen: Seen) -> Gaussians:
-    colours, known = borrow_colours(
-        points.points, seen.colours, seen.seen, edges * np.float32(_BORROW_EDGES)
-    )
+    reach = np.where(is_flat(points.semantic), np.float32(_BORROW_GROUND_M), _BORROW_EDGES * edges)
+    colours, known = borrow_colours(points.points, seen.colours, seen.seen, reach)
     keep = np.flatnonzero(known & ~surfels.isolated)
     return gaussians_from_surfels(surfels.select(keep), colours[keep], points.semantic[keep])
 

@@ -53,6 +53,12 @@ class PointSet:
     def __len__(self) -> int:
         return len(self.points)
 
+    @staticmethod
+    def join(parts: Sequence[PointSet]) -> PointSet:
+        return PointSet(
+            np.concatenate([p.points for p in parts]), np.concatenate([p.semantic for p in parts])
+        )
+
 
 def is_flat(semantic: np.ndarray) -> np.ndarray:
     """Whether each class is ground that is driven or walked on, bool [N]."""

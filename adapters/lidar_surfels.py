@@ -14,7 +14,13 @@ import numba
 import numpy as np
 from scipy.spatial import cKDTree
 
-NEIGHBOURS = 16
+from adapters.lidar_split import is_flat
+from adapters.lidar_voxels import coarse_sample
+from augment.semantics import SemanticClass
+
+NEIGHBOURS = 12  # nearest points, and as many again out of a coarser sample
+_COARSE = 4.0  # edges between points of that sample: it reaches across the gap between two rings
+_STRETCH, _STRETCH_FIRM = 2.0, 4.0  # widest gap in edges that a splat closes; on ground and walls
 _LINE = 0.02  # middle over largest variance below which neighbours lie on a line, not a plane
 
 
@@ -23,6 +29,7 @@ class Surfels:
     """N discs. centres, normals, major: float32 [N, 3]; normals and major are unit and orthogonal,
     major is the first tangent axis and normals x major the second. spacing: float32 [N, 2], metres
     to the neighbours along the tangent axes. isolated: bool [N], too few neighbours for a surface.
+    neighbours: int [N, K], see `find_neighbours`.
     """
 
     centres: np.ndarray
@@ -30,12 +37,13 @@ class Surfels:
     major: np.ndarray
     spacing: np.ndarray
     isolated: np.ndarray
+    neighbours: np.ndarray
 
     def __len__(self) -> int:
         return len(self.centres)
 
     def select(self, index: np.ndarray) -> Surfels:
-        """The surfels at the given indices."""
+        """The surfels at the given indices; neighbours still count through all."""
         return Surfels(*(getattr(self, f.name)[index] for f in dataclasses.fields(self)))
 
 
@@ -43,45 +51,70 @@ def surfels_from_points(
     points: np.ndarray,
     edge_m: np.ndarray,
     *,
+    semantic: np.ndarray | None = None,
     normals: np.ndarray | None = None,
-    max_stretch: float = 4.0,
 ) -> Surfels:
     """A surfel for every point.
 
     points: float32 [N, 3]. edge_m: float32 [N], distance that the points were thinned to there.
-    normals: float32 [N, 3] where they are known; else they come from the principal axes of the
-    nearest points. max_stretch: longest extent in units of edge_m; wider gaps stay open.
+    semantic: int16 [N], SemanticClass: says how wide a gap may be closed, that ground has no rim,
+    and which way a lone ring faces: up on the ground, sideways on a building. normals: float32
+    [N, 3] where they are known; else they come from the principal axes of the nearest points.
     """
     count = len(points)
     if count < 4:
         frame = np.broadcast_to(np.eye(3, dtype=np.float32), (count, 3, 3))
         spacing = np.repeat(edge_m[:, None], 2, 1).astype(np.float32)
-        return Surfels(points, frame[:, 2], frame[:, 0], spacing, np.ones(count, bool))
-    k = min(NEIGHBOURS, count)
-    tree = cKDTree(points)
-    distance, index = tree.query(points, k=k, workers=-1)
-    axes = _principal_axes(points, index) if normals is None else _axes_about(normals)
-    spacing = _spacing(points, index, axes[:, 0], axes[:, 2], edge_m, np.float32(max_stretch))
+        return Surfels(
+            points,
+            frame[:, 2],
+            frame[:, 0],
+            spacing,
+            np.ones(count, bool),
+            np.zeros((count, 0), int),
+        )
+    index, distance = find_neighbours(points, edge_m)
+    axes = _principal_axes(points, index, semantic) if normals is None else _axes_about(normals)
+    if semantic is None:
+        semantic = np.zeros(count, np.int16)
+    endless = is_flat(semantic)
+    firm = endless | _is_upright(semantic) | (semantic == SemanticClass.UNKNOWN)
+    stretch = np.where(firm, _STRETCH_FIRM, _STRETCH).astype(np.float32) * edge_m
+    spacing = _spacing(points, index, axes[:, 0], axes[:, 2], edge_m, stretch, endless)
     # On a surface thinned to edge_m the fourth neighbour is a little over one edge away.
-    isolated = distance[:, min(4, k - 1)] > 4 * edge_m
-    return Surfels(points, axes[:, 2], axes[:, 0], spacing, isolated)
+    isolated = distance[:, min(4, distance.shape[1] - 1)] > 4 * edge_m
+    return Surfels(points, axes[:, 2], axes[:, 0], spacing, isolated, index)
 
 
-def _principal_axes(points: np.ndarray, index: np.ndarray) -> np.ndarray:
-    """Axis of largest variance, middle one, and normal of every point, float32 [N, 3 axes, 3].
+def find_neighbours(points: np.ndarray, edge_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Neighbours of each point near and further away, int [N, K], and the distances of the near
+    ones, float [N, K / 2]. Points may come twice, and come first themselves."""
+    k = min(NEIGHBOURS, len(points))
+    distance, near = cKDTree(points).query(points, k=k, workers=-1)
+    sample = coarse_sample(points, edge_m * np.float32(_COARSE))
+    k = min(NEIGHBOURS, len(sample))
+    _, far = cKDTree(points[sample]).query(points, k=[*range(1, k + 1)], workers=-1)
+    return np.concatenate([near, sample[far]], axis=1), distance
 
-    Where neighbours lie on a line the plane is undefined; if the line is not steep the normal is
-    then the steepest direction across it, since most such lines are rings on the ground.
-    """
+
+def _principal_axes(
+    points: np.ndarray, index: np.ndarray, semantic: np.ndarray | None
+) -> np.ndarray:
+    """Axis of largest variance, middle one, and normal of every point, float32 [N, 3 axes, 3]."""
     values, vectors = np.linalg.eigh(_covariances(points, index))
     major, normal = vectors[:, :, 2], vectors[:, :, 0]
-    on_line = values[:, 1] < _LINE * values[:, 2]
-    up = np.array([0.0, 0.0, 1.0])
-    across = up - major * major[:, 2:]
-    length = np.linalg.norm(across, axis=1, keepdims=True)
-    flat_line = on_line & (length[:, 0] > 0.3)
-    normal = np.where(flat_line[:, None], across / np.maximum(length, 1e-9), normal)
+    if semantic is not None:
+        on_line = (values[:, 1] < _LINE * values[:, 2]) & (np.abs(major[:, 2]) < 0.9)
+        sideways = np.cross(major, np.array([0.0, 0.0, 1.0]))
+        hints = [(is_flat(semantic), np.cross(sideways, major)), (_is_upright(semantic), sideways)]
+        for mask, hint in hints:
+            hint = hint / np.maximum(np.linalg.norm(hint, axis=1, keepdims=True), 1e-9)
+            normal = np.where((mask & on_line)[:, None], hint, normal)
     return np.stack([major, np.cross(normal, major), normal], axis=1).astype(np.float32)
+
+
+def _is_upright(semantic: np.ndarray) -> np.ndarray:
+    return np.isin(semantic, (SemanticClass.BUILDING, SemanticClass.BARRIER))
 
 
 def _axes_about(normals: np.ndarray) -> np.ndarray:
@@ -114,10 +147,11 @@ def _covariances(points, index):  # pragma: no cover - compiled
 
 
 @numba.njit(cache=True)
-def _spacing(points, index, major, normals, edge_m, max_stretch):  # pragma: no cover - compiled
+def _spacing(points, index, major, normals, edge_m, widest, endless):  # pragma: no cover - compiled
     """Mean over both sides of the gap to the nearest neighbour on the plane within 45 degrees of
-    each tangent half axis. With a neighbour on one side only this is the surface's rim, or one of two
-    wires: it is not stretched towards that neighbour."""
+    each tangent half axis. With one side far emptier this is the surface's rim, or one of two
+    wires: it is not stretched that way. Where the surface is endless (ground) the larger gap
+    counts."""
     out = np.empty((len(points), 2), np.float32)
     gaps = np.empty(4)
     for i in range(len(points)):
@@ -144,11 +178,13 @@ def _spacing(points, index, major, normals, edge_m, max_stretch):  # pragma: no 
             a, b = gaps[2 * axis], gaps[2 * axis + 1]
             if np.isinf(a) and np.isinf(b):
                 gap = np.inf
-            elif np.isinf(a) or np.isinf(b):
+            elif endless[i] and not np.isinf(max(a, b)):
+                gap = min(max(a, b), widest[i])
+            elif max(a, b) > 3 * min(a, b):
                 gap = min(min(a, b), 1.5 * edge_m[i])
             else:
                 gap = 0.5 * (a + b)
-            if gap > max_stretch * edge_m[i]:
+            if gap > widest[i]:
                 gap = edge_m[i]
             out[i, axis] = max(gap, 0.5 * edge_m[i])
     return out

@@ -28,13 +28,37 @@ def thin_points(
     level = _levels(
         points.points, np.ascontiguousarray(path, np.float32), NEAR_M, _STEP, _MAX_LEVEL
     )
-    edges = voxel_m * 2.0 ** (_STEP * GROWTH * np.arange(_MAX_LEVEL + 1))
+    edges = _edges(voxel_m)
     keys = _keys(points.points, level, edges)
     order = np.argsort(keys, kind="stable")
     means, classes, levels = _reduce(
         points.points[order], points.semantic[order], keys[order], level[order]
     )
     return PointSet(means, classes), edges[levels].astype(np.float32)
+
+
+def edges_at(points: np.ndarray, path: np.ndarray, *, voxel_m: float) -> np.ndarray:
+    """The edge that `thin_points` uses at each position, metres, float32 [N]."""
+    level = _levels(
+        np.ascontiguousarray(points, np.float32),
+        np.ascontiguousarray(path, np.float32),
+        NEAR_M,
+        _STEP,
+        _MAX_LEVEL,
+    )
+    return _edges(voxel_m)[level].astype(np.float32)
+
+
+def coarse_sample(points: np.ndarray, cell_m: np.ndarray) -> np.ndarray:
+    """Indices of one point a cell of about the given size at it (float32 [N]); int64, ascending."""
+    level = np.clip(np.round(2 * np.log2(cell_m / cell_m.min())), 0, _MAX_LEVEL).astype(np.uint8)
+    sizes = cell_m.min() * 2.0 ** (0.5 * np.arange(_MAX_LEVEL + 1))
+    _, first = np.unique(_keys(points, level, sizes.astype(np.float64)), return_index=True)
+    return np.sort(first)
+
+
+def _edges(voxel_m: float) -> np.ndarray:
+    return voxel_m * 2.0 ** (_STEP * GROWTH * np.arange(_MAX_LEVEL + 1))
 
 
 @numba.njit(cache=True)

@@ -26,6 +26,7 @@ from augment.errors import AdapterError
 from augment.geometry import invert_rigid
 from augment.scene import Scene
 
+_LIDAR_TOP_DEG = 15.0  # the spinning sensor's uppermost channel
 # The back camera looks over the recording car's own roof, the same in every PandaSet sequence:
 # from this part of its rows downwards.
 _ROWS_ABOVE_CAR = {"back_camera": 0.745}
@@ -66,6 +67,7 @@ def open_pandaset(path: str, query: dict[str, str]) -> Scene:
             max_gaussians=options.max_gaussians,
             image_scale=options.image_scale,
             sky_size=options.sky_size,
+            lidar_top_deg=_LIDAR_TOP_DEG,
             progress=options.progress,
         ),
     )

@@ -26,7 +26,7 @@ class PandaSetOptions:
     first_frame: int = 0
     stop_frame: int | None = None
     voxel_m: float = 0.04
-    max_gaussians: int = 400_000
+    max_gaussians: int = 500_000
     image_scale: float = 0.5
     sky_size: int = 768
     progress: bool = False

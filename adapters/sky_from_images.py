@@ -2,10 +2,13 @@
 
 Everything uncovered is taken as infinitely far: clouds and distant towers truly are; a wall above
 the LiDAR's field of view is not, and appears in the right direction but drifts against the scene
-as the camera moves. Directions that no image shows are filled smoothly from those around them.
+as the camera moves. Where some image is sure to show sky in a direction, the others hardly count.
+Directions that no image shows are filled smoothly from the sky around them.
 """
 
 from __future__ import annotations
+
+import math
 
 import cv2
 import numba
@@ -16,18 +19,23 @@ from augment.cameras import Camera
 from augment.sky import CubemapSky, directions_of_cubemap
 
 _FEATHER = 0.12  # images fade over this part of their width, so that exposures meet softly
-_FILL_ROWS = 128  # of the lat-long image that unseen directions are filled from
+_UNSURE = 0.02  # weight of pixels that may be a wall above the LiDAR's view
+_TOP_MARGIN_RAD = math.radians(4.0)  # the camera is not where the LiDAR is
+_FILL_ROWS = 64  # of the lat-long image that unseen directions are filled from
 _DEFAULT_SKY = (0.7, 0.75, 0.8)  # where no image shows any sky
 
 
 class SkyGatherer:
     """Sums of the colours seen in every direction; `finish` divides and fills."""
 
-    def __init__(self, size: int) -> None:
+    def __init__(self, size: int, lidar_top_rad: float) -> None:
+        """size: texels along an edge. lidar_top_rad: highest elevation that the LiDAR looks at."""
         self._size = size
+        self._sure_below = math.sin(lidar_top_rad - _TOP_MARGIN_RAD)
         self._directions = directions_of_cubemap(size).reshape(-1, 3).numpy()
         self._sums = np.zeros((len(self._directions), 3), np.float32)
         self._weights = np.zeros(len(self._directions), np.float32)
+        self._sure = np.zeros(len(self._directions), np.bool_)
 
     def add(
         self, camera: Camera, free: np.ndarray, levels: np.ndarray, level_sizes: np.ndarray
@@ -43,21 +51,33 @@ class SkyGatherer:
             camera.camera_from_world[:3, :3].numpy().astype(np.float32),
             np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32),
             free,
+            self._sure_columns(camera, free),
             levels[level, :rows, :columns],
             np.float32(_FEATHER),
+            np.float32(_UNSURE),
             self._sums,
             self._weights,
+            self._sure,
         )
+
+    def _sure_columns(self, camera: Camera, free: np.ndarray) -> np.ndarray:
+        """Columns of the image whose free top is sky: what is drawn in them ends below the LiDAR's
+        highest channel, which therefore looked over it and met nothing."""
+        rays = camera.ray_directions().numpy()
+        rise = rays[..., 2] / np.linalg.norm(rays, axis=2)
+        drawn = ~free
+        top = np.where(drawn.any(axis=0), drawn.argmax(axis=0), len(free) - 1)
+        return rise[top, np.arange(free.shape[1])] < self._sure_below
 
     def finish(self) -> CubemapSky:
         """The mean colour of every direction, unseen ones filled."""
-        seen = self._weights > 1e-3
-        rgb = self._sums / np.maximum(self._weights, 1e-3)[:, None] / np.float32(255)
+        seen = self._weights > 0
+        rgb = self._sums / np.maximum(self._weights, 1e-9)[:, None] / np.float32(255)
         if not seen.any():
             rgb[:] = _DEFAULT_SKY
         elif not seen.all():
-            # A wide fade between seen and filled would smear the skyline; a texel's is enough.
-            rgb[~seen] = _fill(self._directions, rgb, seen)[~seen]
+            source = self._sure if self._sure.any() else seen
+            rgb[~seen] = _fill(self._directions, rgb, source)[~seen]
         faces = rgb.reshape(6, self._size, self._size, 3)
         return CubemapSky(torch.from_numpy(np.ascontiguousarray(faces, np.float32)))
 
@@ -88,8 +108,8 @@ def _widen(sums: np.ndarray, weights: np.ndarray) -> np.ndarray:
     out = np.zeros_like(sums)
     missing = np.ones_like(weights)
     sigma = 1.0
-    while sigma <= rows:
-        wide = np.dstack([sums, weights])
+    while sigma <= rows / 2:
+        wide = np.dstack([sums, weights]).astype(np.float32)
         margin = min(columns, int(4 * sigma))
         wide = np.concatenate([wide[:, -margin:], wide, wide[:, :margin]], axis=1)
         wide = cv2.GaussianBlur(wide, (0, 0), sigma, borderType=cv2.BORDER_REFLECT)
@@ -97,14 +117,14 @@ def _widen(sums: np.ndarray, weights: np.ndarray) -> np.ndarray:
         trust = np.clip(wide[..., 3] / 0.2, 0, 1) * missing
         out += trust[..., None] * wide[..., :3] / np.maximum(wide[..., 3:], 1e-9)
         missing -= trust
-        sigma *= 1.6
+        sigma *= 2.0
     mean = sums.sum((0, 1)) / weights.sum()
     return out + missing[..., None] * mean
 
 
 @numba.njit(cache=True, nogil=True)
 def _gather(
-    directions, rotation, intrinsics, free, image, feather, sums, weights
+    directions, rotation, intrinsics, free, sure, image, feather, unsure, sums, weights, sure_out
 ):  # pragma: no cover - compiled
     height, width = free.shape
     rows, columns = image.shape[0], image.shape[1]
@@ -122,6 +142,10 @@ def _gather(
             continue
         border = min(min(u, width - u) / width, min(v, height - v) / height)
         weight = min(border / feather, np.float32(1)) + np.float32(1e-3)
+        if sure[int(u)]:
+            sure_out[i] = True
+        else:
+            weight *= unsure
         y = min(max(v / height * rows - np.float32(0.5), np.float32(0)), np.float32(rows - 1))
         x = min(max(u / width * columns - np.float32(0.5), np.float32(0)), np.float32(columns - 1))
         y0, x0 = int(y), int(x)

@@ -1,0 +1,209 @@
+"""Colours and sky from images: what is seen, what is hidden, what is infinitely far."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from adapters.box_tracks import BoxSample, join_tracks
+from adapters.image_views import Body, View, observe_views, read_image
+from adapters.lidar_surfels import Surfels
+from adapters.sky_from_images import SkyGatherer
+from augment.cameras import Camera
+
+WIDTH, HEIGHT, FOCAL = 64, 48, 32.0
+# Camera axes in the world: looks along +x.
+FORWARD = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
+RED, GREEN, BLUE = (200, 30, 30), (30, 180, 40), (40, 60, 220)
+
+
+def camera(name="front", at=(0.0, 0.0, 0.0), time_ns=0, rotation=FORWARD) -> Camera:
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ np.asarray(at)
+    matrix = torch.from_numpy(pose)
+    return Camera(name, WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, matrix, time_ns)
+
+
+def view(path: Path, image, cam: Camera, **kwargs) -> View:
+    cv2.imwrite(str(path), np.asarray(image, np.uint8)[..., ::-1])
+    return View(cam, path, 0, **kwargs)
+
+
+def solid(colour) -> np.ndarray:
+    return np.tile(np.uint8(colour), (HEIGHT, WIDTH, 1))
+
+
+def wall(distance: float, half: float, spacing=0.2) -> Surfels:
+    """Facing the camera, across the optical axis."""
+    ticks = np.arange(-half, half + 1e-6, spacing)
+    y, z = np.meshgrid(ticks, ticks)
+    count = y.size
+    centres = np.stack([np.full(count, distance), y.ravel(), z.ravel()], 1).astype(np.float32)
+    axis = np.eye(3, dtype=np.float32)
+    return Surfels(
+        centres,
+        np.tile(axis[0], (count, 1)),
+        np.tile(axis[1], (count, 1)),
+        np.full((count, 2), spacing, np.float32),
+        np.zeros(count, bool),
+        np.zeros((count, 0), np.int64),
+    )
+
+
+def gatherer() -> SkyGatherer:
+    return SkyGatherer(32, math.radians(15))
+
+
+def test_surfels_take_the_colour_of_their_pixels(tmp_path):
+    image = solid(RED)
+    image[:, WIDTH // 2 :] = GREEN  # the right half: negative y
+    surfels = wall(5.0, 2.0)
+    (seen,), problems = observe_views(
+        [Body(surfels)], [view(tmp_path / "a.png", image, camera())], gatherer(), image_scale=1.0
+    )
+    assert problems == () and seen.seen.all()
+    left, right = surfels.centres[:, 1] > 0.5, surfels.centres[:, 1] < -0.5
+    np.testing.assert_allclose(
+        seen.colours[left], np.tile(np.divide(RED, 255), (left.sum(), 1)), atol=0.02
+    )
+    np.testing.assert_allclose(
+        seen.colours[right], np.tile(np.divide(GREEN, 255), (right.sum(), 1)), atol=0.02
+    )
+
+
+def test_what_is_behind_a_surface_does_not_take_its_colour(tmp_path):
+    near, far = wall(4.0, 0.8), wall(8.0, 3.0)
+    views = [view(tmp_path / "a.png", solid(RED), camera())]
+    (front, back), _ = observe_views([Body(near), Body(far)], views, gatherer(), image_scale=1.0)
+    assert front.seen.all()
+    hidden = np.abs(far.centres[:, 1:]).max(axis=1) < 1.3  # 0.8 m at 4 m hides 1.6 m at 8 m
+    free = np.abs(far.centres[:, 1:]).max(axis=1) > 2.0
+    assert not back.seen[hidden].any() and back.seen[free].all()
+
+
+def test_what_lies_outside_the_image_or_behind_it_is_unseen(tmp_path):
+    behind, aside = wall(-5.0, 1.0), wall(5.0, 1.0)
+    aside = Surfels(aside.centres + np.float32([0, 30, 0]), *list(vars(aside).values())[1:])
+    views = [view(tmp_path / "a.png", solid(RED), camera())]
+    seen, _ = observe_views([Body(behind), Body(aside)], views, gatherer(), image_scale=1.0)
+    assert not seen[0].seen.any() and not seen[1].seen.any()
+
+
+def test_the_median_leaves_one_odd_image_out(tmp_path):
+    views = [view(tmp_path / f"{i}.png", solid(RED), camera()) for i in range(4)]
+    views.append(view(tmp_path / "odd.png", solid(GREEN), camera()))
+    (seen,), _ = observe_views([Body(wall(5.0, 1.0))], views, gatherer(), image_scale=1.0)
+    np.testing.assert_allclose(seen.colours, np.tile(np.divide(RED, 255), (121, 1)), atol=0.01)
+
+
+def test_the_nearer_camera_counts_most(tmp_path):
+    views = [
+        view(tmp_path / "far.png", solid(GREEN), camera("far", at=(-15, 0, 0))),
+        view(tmp_path / "near.png", solid(RED), camera("near")),
+    ]
+    (seen,), _ = observe_views([Body(wall(5.0, 0.4))], views, gatherer(), image_scale=1.0)
+    # Scores go with 1/z, weights with their square: 16 to 1.
+    expected = (16 * np.divide(RED, 255) + np.divide(GREEN, 255)) / 17
+    np.testing.assert_allclose(seen.colours.mean(0), expected, atol=0.02)
+
+
+def moving_box() -> tuple:
+    pose = np.eye(4)
+    pose[:3, 3] = (4.0, 0, 0)
+    later = pose.copy()
+    later[1, 3] = 6.0
+    size = np.array([0.4, 1.6, 1.6])
+    samples = [
+        BoxSample("c", None, "Car", i, i * 10**8, p, size) for i, p in enumerate((pose, later))
+    ]
+    return join_tracks(samples)
+
+
+def test_a_moving_box_hides_the_world_even_where_lidar_saw_through_it(tmp_path):
+    (track,) = moving_box()
+    empty = wall(0.0, -1.0)
+    world = wall(8.0, 0.8)
+    views = [view(tmp_path / "a.png", solid(RED), camera(time_ns=0))]
+    (seen, _), _ = observe_views(
+        [Body(world), Body(empty, track)], views, gatherer(), image_scale=1.0
+    )
+    assert not seen.seen.any()
+    views.append(view(tmp_path / "b.png", solid(GREEN), camera(time_ns=10**8)))
+    (seen, _), _ = observe_views(
+        [Body(world), Body(empty, track)], views, gatherer(), image_scale=1.0
+    )
+    assert seen.seen.all()
+    np.testing.assert_allclose(seen.colours.mean(0), np.divide(GREEN, 255), atol=0.01)
+
+
+def test_actors_are_coloured_where_they_are_at_the_cameras_time(tmp_path):
+    (track,) = moving_box()
+    own = wall(-0.2, 0.6)  # its rear, in its own frame
+    image = solid(BLUE)
+    image[:, WIDTH // 2 - 8 : WIDTH // 2 + 8] = RED
+    views = [view(tmp_path / "a.png", image, camera(time_ns=0))]
+    (seen,), _ = observe_views([Body(own, track)], views, gatherer(), image_scale=1.0)
+    middle = np.abs(own.centres[:, 1]) < 0.5
+    np.testing.assert_allclose(seen.colours[middle].mean(0), np.divide(RED, 255), atol=0.02)
+    gone = [view(tmp_path / "b.png", image, camera(time_ns=10**9))]
+    (seen,), _ = observe_views([Body(own, track)], gone, gatherer(), image_scale=1.0)
+    assert not seen.seen.any()
+
+
+def test_rows_that_show_the_recording_car_are_not_used(tmp_path):
+    surfels = wall(5.0, 2.0)
+    one = view(tmp_path / "a.png", solid(RED), camera(), used_rows=0.5)
+    (seen,), _ = observe_views([Body(surfels)], [one], gatherer(), image_scale=1.0)
+    below = surfels.centres[:, 2] < -0.2
+    above = surfels.centres[:, 2] > 0.2
+    assert not seen.seen[below].any() and seen.seen[above].all()
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.5, 0.25, 0.125])
+def test_images_are_decoded_at_a_fraction(tmp_path, scale):
+    cv2.imwrite(str(tmp_path / "a.jpg"), solid(RED)[..., ::-1])
+    image = read_image(tmp_path / "a.jpg", scale)
+    assert image.shape == (HEIGHT * scale, WIDTH * scale, 3)
+    np.testing.assert_allclose(image.mean((0, 1)), RED, atol=3)  # JPEG
+    assert read_image(tmp_path / "none.jpg", scale) is None
+
+
+def test_what_nothing_covers_is_sky(tmp_path):
+    image = solid(BLUE)
+    image[HEIGHT // 2 :] = GREEN
+    floor = wall(6.0, 6.0, spacing=0.5)
+    low = Surfels(floor.centres - np.float32([0, 0, 6.5]), *list(vars(floor).values())[1:])
+    sky = gatherer()
+    observe_views([Body(low)], [view(tmp_path / "a.png", image, camera())], sky, image_scale=1.0)
+    faces = sky.finish()
+    up_ahead = torch.tensor([[1.0, 0.0, 0.3], [1.0, 0.5, 0.4]])
+    np.testing.assert_allclose(
+        faces.sample(up_ahead), np.tile(np.divide(BLUE, 255), (2, 1)), atol=0.02
+    )
+    # No image shows these: filled from the sky, not from the ground.
+    unseen = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.2]])
+    np.testing.assert_allclose(
+        faces.sample(unseen), np.tile(np.divide(BLUE, 255), (2, 1)), atol=0.05
+    )
+
+
+def test_above_a_wall_that_leaves_the_lidars_view_another_image_is_believed(tmp_path):
+    tall = wall(4.0, 1.5)  # its top is 20 degrees up: above it may be more wall
+    walled = view(tmp_path / "a.png", solid(RED), camera())
+    clear = view(tmp_path / "b.png", solid(BLUE), camera(at=(6.0, 0, 0)))  # past the wall
+    direction = torch.tensor([[1.0, 0.0, 0.55]])
+    for views, colour in (([walled], RED), ([walled, clear], BLUE), ([walled] * 5 + [clear], BLUE)):
+        sky = gatherer()
+        observe_views([Body(tall)], views, sky, image_scale=1.0)
+        got = sky.finish().sample(direction)[0]
+        np.testing.assert_allclose(got, np.divide(colour, 255), atol=0.08)
+
+
+def test_a_sky_nobody_saw_has_a_colour():
+    faces = gatherer().finish().faces
+    assert torch.isfinite(faces).all() and (faces > 0.5).all() and (faces < 1).all()

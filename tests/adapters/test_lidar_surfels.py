@@ -1,0 +1,260 @@
+"""Points to surfels to Gaussians: thinning, normals, gaps."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from adapters.ground_fill import CLOSE_M, fill_ground, ground_points
+from adapters.lidar_bridges import bridge_gaps
+from adapters.lidar_init import SplatShape, borrow_colours, gaussians_from_surfels
+from adapters.lidar_split import PointSet
+from adapters.lidar_surfels import surfels_from_points
+from adapters.lidar_voxels import GROWTH, NEAR_M, coarse_sample, edges_at, thin_points
+from adapters.wall_fill import WIDEST_M, fill_walls
+from augment.geometry import rotmat_from_quat
+from augment.semantics import SemanticClass as Class
+
+ORIGIN = np.zeros((1, 3), np.float32)
+
+
+def point_set(points, semantic=Class.OTHER) -> PointSet:
+    points = np.asarray(points, np.float32)
+    return PointSet(points, np.broadcast_to(np.int16(semantic), len(points)).copy())
+
+
+def plane(normal, spacing=(0.1, 0.1), half=1.0, centre=(0, 0, 0)) -> np.ndarray:
+    """A grid of points on a plane; the spacing along its two axes may differ."""
+    normal = np.asarray(normal, np.float64) / np.linalg.norm(normal)
+    a = np.cross(normal, [0.3, 0.1, 1.0] if abs(normal[2]) < 0.9 else [1.0, 0, 0])
+    a /= np.linalg.norm(a)
+    b = np.cross(normal, a)
+    u, v = (np.arange(-half, half + 1e-9, s) for s in spacing)
+    grid = u[:, None, None] * a + v[None, :, None] * b
+    return (grid.reshape(-1, 3) + centre).astype(np.float32)
+
+
+def test_a_voxel_keeps_its_mean_and_commonest_class():
+    points = np.array([[0.01, 0.01, 0.01], [0.03, 0.01, 0.01], [0.02, 0.04, 0.04], [0.3, 0, 0.01]])
+    classes = np.array([Class.ROAD, Class.POLE, Class.ROAD, Class.UNKNOWN], np.int16)
+    thin, edges = thin_points(PointSet(points.astype(np.float32), classes), ORIGIN, voxel_m=0.05)
+    order = np.argsort(thin.points[:, 0])
+    np.testing.assert_allclose(thin.points[order], [[0.02, 0.02, 0.02], [0.3, 0, 0.01]], atol=1e-6)
+    assert thin.semantic[order].tolist() == [Class.ROAD, Class.UNKNOWN]
+    np.testing.assert_allclose(edges, 0.05)
+
+
+def test_a_known_class_outvotes_any_number_of_unknown():
+    points = point_set(np.full((5, 3), 0.01), Class.UNKNOWN)
+    points.semantic[2] = Class.SIGN
+    thin, _ = thin_points(points, ORIGIN, voxel_m=0.1)
+    assert thin.semantic.tolist() == [Class.SIGN]
+
+
+def test_thinning_does_not_depend_on_the_order_of_points():
+    rng = np.random.default_rng(0)
+    points = point_set(rng.normal(size=(4000, 3)) * 8)
+    shuffled = rng.permutation(4000)
+    a, ea = thin_points(points, ORIGIN, voxel_m=0.4)
+    b, eb = thin_points(point_set(points.points[shuffled]), ORIGIN, voxel_m=0.4)
+    np.testing.assert_allclose(a.points, b.points, atol=1e-5)  # sums in another order
+    np.testing.assert_array_equal(ea, eb)
+
+
+def test_voxels_grow_with_distance_from_the_path():
+    far = np.array([[NEAR_M / 2, 0, 0], [2 * NEAR_M, 0, 0], [8 * NEAR_M, 0, 0]])
+    edges = edges_at(far, ORIGIN, voxel_m=0.1)
+    np.testing.assert_allclose(edges, 0.1 * np.array([1, 2, 8]) ** GROWTH, rtol=1e-6)
+    path = np.array([[0.0, 0, 0], [8 * NEAR_M, 0, 0]])
+    assert edges_at(far[2:], path, voxel_m=0.1) == pytest.approx(0.1)
+
+
+def test_no_points_thin_to_none():
+    thin, edges = thin_points(point_set(np.zeros((0, 3))), ORIGIN, voxel_m=0.1)
+    assert len(thin) == 0 and len(edges) == 0
+
+
+def test_the_coarse_sample_is_of_the_points_and_spread_out():
+    points = plane((0, 0, 1), half=2.0)
+    index = coarse_sample(points, np.full(len(points), 0.5, np.float32))
+    assert len(np.unique(index)) == len(index) and 49 <= len(index) <= 100
+
+
+@pytest.mark.parametrize("normal", [(0, 0, 1), (1, 0, 0), (1, 2, 3)])
+def test_normals_and_spacing_of_a_plane(normal):
+    points = plane(normal, spacing=(0.1, 0.1))
+    surfels = surfels_from_points(points, np.full(len(points), 0.1, np.float32))
+    expected = np.asarray(normal) / np.linalg.norm(normal)
+    np.testing.assert_allclose(np.abs(surfels.normals @ expected), 1, atol=1e-5)
+    np.testing.assert_allclose((surfels.normals * surfels.major).sum(1), 0, atol=1e-5)
+    inner = np.abs(points).max(axis=1) < 0.7
+    # Axes at an angle to the grid see the diagonal neighbour, sqrt(2) away.
+    assert (surfels.spacing[inner] > 0.099).all() and (surfels.spacing[inner] < 0.142).all()
+    assert not surfels.isolated.any()
+
+
+def test_rings_on_the_ground_are_stretched_across():
+    points = plane((0, 0, 1), spacing=(0.05, 0.18))  # dense along a ring, sparse across
+    classes = np.full(len(points), Class.ROAD, np.int16)
+    surfels = surfels_from_points(points, np.full(len(points), 0.05, np.float32), semantic=classes)
+    inner = np.abs(points).max(axis=1) < 0.6
+    along = np.abs(surfels.major[inner] @ (points[1] - points[0])) / 0.18 < 0.5
+    across = np.where(along, surfels.spacing[inner, 1], surfels.spacing[inner, 0])
+    assert np.median(across) == pytest.approx(0.18, abs=0.02)
+    assert np.abs(surfels.normals[inner, 2]).min() > 0.999
+
+
+def test_two_wires_are_not_a_sheet():
+    x = np.arange(-2, 2, 0.08)
+    wires = [np.stack([x, np.full_like(x, y), np.full_like(x, 9.0)], 1) for y in (0.0, 0.3)]
+    points = np.concatenate(wires).astype(np.float32)
+    surfels = surfels_from_points(points, np.full(len(points), 0.08, np.float32))
+    assert surfels.spacing.max() < 0.2
+    assert len(bridge_gaps(point_set(points), np.full(len(points), 0.08, np.float32), surfels)) == 0
+
+
+def test_a_lone_ring_faces_as_its_class_does():
+    x = np.arange(-1, 1, 0.05)
+    ring = np.stack([x, 0 * x, 0 * x], 1).astype(np.float32)
+    edge = np.full(len(ring), 0.05, np.float32)
+    for semantic, axis in ((Class.ROAD, 2), (Class.BUILDING, 1)):
+        classes = np.full(len(ring), semantic, np.int16)
+        surfels = surfels_from_points(ring, edge, semantic=classes)
+        np.testing.assert_allclose(np.abs(surfels.normals[:, axis]), 1, atol=1e-4)
+
+
+def test_given_normals_are_kept():
+    points = plane((0, 0, 1))
+    normals = np.tile(np.float32([0, 0.6, 0.8]), (len(points), 1))
+    surfels = surfels_from_points(points, np.full(len(points), 0.1, np.float32), normals=normals)
+    np.testing.assert_allclose(surfels.normals, normals, atol=1e-6)
+    np.testing.assert_allclose((surfels.normals * surfels.major).sum(1), 0, atol=1e-6)
+
+
+def test_a_point_far_from_all_others_is_isolated():
+    points = np.concatenate([plane((0, 0, 1)), np.float32([[0, 0, 5]])])
+    surfels = surfels_from_points(points, np.full(len(points), 0.1, np.float32))
+    assert surfels.isolated.tolist() == [False] * (len(points) - 1) + [True]
+
+
+@pytest.mark.parametrize("count", [0, 1, 3])
+def test_too_few_points_are_isolated(count):
+    points = np.arange(3 * count, dtype=np.float32).reshape(-1, 3)
+    surfels = surfels_from_points(points, np.ones(count, np.float32))
+    assert len(surfels) == count and surfels.isolated.all()
+
+
+def test_gaussians_are_flat_along_the_normal():
+    points = plane((0, 0.6, 0.8))
+    edge = np.full(len(points), 0.1, np.float32)
+    surfels = surfels_from_points(points, edge)
+    colours = np.tile(np.float32([0.2, 0.5, 0.9]), (len(points), 1))
+    g = gaussians_from_surfels(surfels, colours, np.full(len(points), Class.BUILDING, np.int16))
+    thin_axis = rotmat_from_quat(g.quats)[:, :, 2]
+    np.testing.assert_allclose(np.abs(thin_axis.numpy() @ np.float32([0, 0.6, 0.8])), 1, atol=1e-4)
+    assert (g.scales[:, 2] < 0.3 * g.scales[:, :2].amin(1)).all() and (g.scales > 0).all()
+    np.testing.assert_allclose(g.sh[:, 0] * 0.28209479 + 0.5, colours, atol=1e-6)
+    assert g.means.dtype == torch.float32 and g.semantic.dtype == torch.int16
+    shape = SplatShape(opacity=0.5, sigma_per_spacing=1.0)
+    wide = gaussians_from_surfels(surfels, colours, None, shape)
+    torch.testing.assert_close(wide.scales[:, :2], 2 * g.scales[:, :2])
+    assert (wide.opacities == 0.5).all() and wide.semantic is None
+
+
+def test_unseen_points_borrow_the_nearest_colour_within_reach():
+    points = np.float32([[0, 0, 0], [0.1, 0, 0], [3, 0, 0]])
+    colours = np.float32([[1, 0, 0], [0, 0, 0], [0, 0, 0]])
+    seen = np.array([True, False, False])
+    got, known = borrow_colours(points, colours, seen, np.full(3, 0.5, np.float32))
+    assert known.tolist() == [True, True, False]
+    np.testing.assert_array_equal(got[:2], [[1, 0, 0], [1, 0, 0]])
+    assert seen.tolist() == [True, False, False]  # the caller's arrays are left alone
+    _, known = borrow_colours(points, colours, np.zeros(3, bool), np.ones(3, np.float32))
+    assert not known.any()
+
+
+def bridges(points: np.ndarray, semantic: Class, edge: float) -> np.ndarray:
+    edges = np.full(len(points), edge, np.float32)
+    some = point_set(points, semantic)
+    return bridge_gaps(
+        some, edges, surfels_from_points(points, edges, semantic=some.semantic)
+    ).points
+
+
+def test_rings_on_one_surface_are_bridged():
+    points = plane((0, 1, 0), spacing=(0.05, 0.3))
+    new = bridges(points, Class.VEHICLE, 0.05)
+    assert len(new) > 4 * len(points) / 2
+    assert np.abs(new[:, 1]).max() < 1e-5  # on the plane
+    distance = np.abs(new[:, None] - points[None]).max(2).min(1)
+    assert distance.max() < 0.16  # within the gaps, none further
+
+
+def test_gaps_wider_than_their_class_allows_stay_open():
+    assert len(bridges(plane((0, 1, 0), spacing=(0.05, 0.6)), Class.VEHICLE, 0.05)) == 0
+
+
+def test_a_step_is_not_bridged():
+    low, high = plane((0, 0, 1)), plane((0, 0, 1), centre=(0, 0, 0.3))
+    new = bridges(np.concatenate([low, high]), Class.VEHICLE, 0.1)
+    assert not ((new[:, 2] > 0.05) & (new[:, 2] < 0.25)).any()
+
+
+def test_walls_are_filled_between_rings_and_no_further():
+    x = np.arange(0, 3, 0.1)
+    heights = (0.0, 1.0, 2.5, 2.5 + WIDEST_M + 0.5)
+    rows = [np.stack([x, np.full_like(x, 10), np.full_like(x, z)], 1) for z in heights]
+    points = np.concatenate(rows).astype(np.float32)
+    some = point_set(points, Class.BUILDING)
+    edges = np.full(len(points), 0.1, np.float32)
+    surfels = surfels_from_points(points, edges, semantic=some.semantic)
+    new = fill_walls(some, edges, surfels)
+    np.testing.assert_allclose(new.points[:, 1], 10, atol=1e-5)
+    assert (new.semantic == Class.BUILDING).all()
+    for low, high, filled in ((0.1, 0.9, True), (1.1, 2.4, True), (2.6, 5.9, False)):
+        inside = (new.points[:, 2] > low) & (new.points[:, 2] < high)
+        assert inside.any() == filled
+    # One column in 0.2 m of wall, one point in 0.16 m of height.
+    assert len(new) > 15 * 2.5 / 0.17 * 0.8
+    cars = point_set(points, Class.VEHICLE)
+    assert len(fill_walls(cars, edges, surfels)) == 0
+
+
+def sloping_ground(hole_m: float) -> PointSet:
+    x, y = np.meshgrid(np.arange(-12, 12, 0.2), np.arange(-12, 12, 0.2))
+    x, y = x.ravel(), y.ravel()
+    keep = np.hypot(x, y) > hole_m
+    points = np.stack([x, y, 0.05 * x], 1)[keep]
+    return point_set(points, Class.ROAD)
+
+
+def test_a_hole_in_the_ground_is_filled_on_its_slope():
+    ground = sloping_ground(2.0)
+    new = fill_ground(ground, np.zeros((1, 3)), voxel_m=0.2)
+    assert len(new) > np.pi * 2.0**2 / 0.4**2 * 0.8 and (new.semantic == Class.ROAD).all()
+    assert np.hypot(new.points[:, 0], new.points[:, 1]).max() < 2.3
+    # A plane is its own smoothest continuation; the rim's cells are known to their mean height.
+    np.testing.assert_allclose(new.points[:, 2], 0.05 * new.points[:, 0], atol=0.02)
+
+
+def test_ground_does_not_grow_outwards_nor_over_wide_holes():
+    wide = sloping_ground(CLOSE_M + 1.5)
+    new = fill_ground(wide, np.zeros((1, 3)), voxel_m=0.2)
+    assert len(new) == 0 or np.hypot(new.points[:, 0], new.points[:, 1]).min() > 1.0
+    assert len(new) == 0 or np.abs(new.points[:, :2]).max() < 12.3
+
+
+def test_without_ground_nothing_is_filled():
+    some = point_set(plane((0, 1, 0)), Class.BUILDING)
+    assert len(fill_ground(some, np.zeros((1, 3)), voxel_m=0.1)) == 0
+
+
+def test_without_classes_low_points_are_ground():
+    ground = sloping_ground(0.0).points
+    car = plane((0, 0, 1), half=1.0, centre=(3.0, 3.0, 1.5))
+    wall = plane((0, 1, 0), half=2.0, centre=(0, 11.0, 2.6))
+    points = point_set(np.concatenate([ground, car, wall]), Class.UNKNOWN)
+    found = ground_points(points)
+    assert found[: len(ground)].mean() > 0.9
+    assert not found[len(ground) :].any()

@@ -1,0 +1,292 @@
+"""A PandaSet sequence as a scene: a street whose answer is known, and the real one."""
+
+from __future__ import annotations
+
+import math
+import pickle
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pandaset_folder as street
+import pytest
+import torch
+
+from adapters.pandaset import open_pandaset
+from augment.errors import AdapterError
+from augment.render.rasterize import rasterize
+from augment.semantics import SemanticClass
+
+QUERY = {"voxel_m": "0.1", "image_scale": "1", "sky_size": "32"}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    return street.write_sequence(tmp_path_factory.mktemp("pandaset") / "002")
+
+
+@pytest.fixture(scope="module")
+def scene(folder):
+    return open_pandaset(str(folder), QUERY)
+
+
+@pytest.fixture
+def copy(folder, tmp_path) -> Path:
+    return Path(shutil.copytree(folder, tmp_path / "002"))
+
+
+def render(scene, camera) -> np.ndarray:
+    out = rasterize(scene.parts_for(camera), camera)
+    sky = scene.sky.sample(camera.ray_directions())
+    return (out.rgb + (1 - out.alpha)[..., None] * sky).clamp(0, 1).numpy()
+
+
+def psnr(image: np.ndarray, recorded: np.ndarray) -> float:
+    return -10 * math.log10(np.mean((image - recorded) ** 2))
+
+
+def test_the_scene_is_described(scene, folder):
+    assert scene.name == "002" and scene.problems == ()
+    assert scene.source == f"pandaset:{folder}?voxel_m=0.1&image_scale=1&sky_size=32"
+    assert scene.camera_names == ("front_camera", "left_camera")
+    assert [f.index for f in scene.frames] == [0, 1, 2]
+    assert [f.timestamp_ns for f in scene.frames] == sorted(f.timestamp_ns for f in scene.frames)
+    assert scene.ground_z_m == pytest.approx(street.GROUND_Z, abs=1e-3)
+    assert (scene.world_origin_m == 0).all()
+
+
+def test_ego_is_x_forward_y_left_z_up(scene):
+    for number, frame in enumerate(scene.frames):
+        # The street's car drives along the world's x, left is y.
+        np.testing.assert_allclose(frame.world_from_ego[:3, :3], np.eye(3), atol=1e-12)
+        np.testing.assert_allclose(frame.world_from_ego[:3, 3], street.ego_position(number))
+
+
+def test_cameras_have_their_own_pose_and_time(scene):
+    left = scene.frame(2).cameras["left_camera"]
+    assert (left.width, left.height, left.fx) == (street.WIDTH, street.HEIGHT, street.FOCAL_PX)
+    assert abs(left.timestamp_ns - street.START_NS - 200_000_000) < 1000  # float64 seconds
+    np.testing.assert_allclose(left.ray_directions()[48, 80], [0, 1, 0], atol=0.02)
+    np.testing.assert_allclose(
+        left.centre, street.ego_position(2) + np.array([0, 0, 1.1]), atol=1e-9
+    )
+
+
+@pytest.mark.parametrize("camera", ["front_camera", "left_camera"])
+def test_the_scene_looks_like_the_recorded_image(scene, camera):
+    frame = scene.frame(1)
+    recorded = cv2.imread(frame.image_paths[camera])[..., ::-1] / 255
+    # 26 dB when written; edges are as blurred as the voxels of 10 cm are wide.
+    assert psnr(render(scene, frame.cameras[camera]), recorded) > 24.5
+
+
+def test_the_ground_is_closed_under_the_car_too(scene):
+    camera = scene.frame(0).cameras["front_camera"]
+    out = rasterize([next(iter(scene.parts_at(camera.timestamp_ns)))], camera)
+    # Up to 20 m ahead and 5 m to the sides, also where the car hides it in every image.
+    ground = out.alpha[street.HEIGHT // 2 + 6 :, 60:100]
+    assert ground.min() > 0.8
+
+
+def test_background_has_no_trace_of_the_moving_car(scene):
+    means, half = scene.background.means.numpy(), street.CAR_SIZE_M / 2
+    for frame in range(street.FRAMES):
+        offset = np.abs(means - street.car_centre(street.FRAME_S * frame))
+        above = means[:, 2] > street.GROUND_Z + 0.2
+        assert not ((offset < half).all(axis=1) & above).any()
+
+
+def test_the_two_boxes_of_the_car_are_one_actor(scene):
+    (actor,) = scene.actors
+    assert actor.track_id == street.CAR_IDS[0] and actor.label == "Car"
+    assert actor.size_m == pytest.approx(tuple(street.CAR_SIZE_M))
+    inside = np.abs(actor.gaussians.means.numpy()) <= street.CAR_SIZE_M / 2 + 0.1
+    assert inside.all()
+    reds = actor.gaussians.sh[:, 0] * 0.2820948 + 0.5
+    np.testing.assert_allclose(reds.median(0).values, street.CAR / 255, atol=0.03)
+
+
+def test_the_actor_is_where_the_car_is(scene):
+    (actor,) = scene.actors
+    for time in (0.0, 0.05, 0.13):
+        pose = actor.track.pose_at(street.START_NS + round(time * 1e9))
+        # The boxes' own times are known to within the sweep's half width of 10 ms: 6 cm.
+        np.testing.assert_allclose(pose[:3, 3], street.car_centre(time), atol=0.07)
+        np.testing.assert_allclose(pose[:3, :3], np.eye(3), atol=1e-9)
+
+
+def test_points_take_their_class(scene):
+    semantic = scene.background.semantic.numpy()
+    means = scene.background.means.numpy()
+    ground = np.abs(means[:, 2] - street.GROUND_Z) < 0.05
+    away = np.abs(means[:, 1] - street.WALL_Y) > 1
+    assert (semantic[ground & away] == SemanticClass.ROAD).all()
+    assert (semantic[means[:, 2] > 1] == SemanticClass.BUILDING).all()
+
+
+def test_the_sky_is_what_the_images_show_above(scene):
+    up_ahead = torch.tensor([[1.0, -0.3, 0.3], [0.1, 1.0, 0.55], [0.0, 0.0, 1.0]])
+    # The zenith is in no image: it is filled from the whole sky, wall tops at its rim included.
+    for sampled, tolerance in zip(scene.sky.sample(up_ahead), (0.02, 0.02, 0.1), strict=True):
+        np.testing.assert_allclose(sampled, street.SKY / 255, atol=tolerance)
+
+
+def test_opening_twice_gives_the_same_bits(scene, folder):
+    again = open_pandaset(str(folder), QUERY)
+    pairs = [(scene.background, again.background)]
+    pairs += [(a.gaussians, b.gaussians) for a, b in zip(scene.actors, again.actors, strict=True)]
+    for a, b in pairs:
+        for name in ("means", "quats", "scales", "opacities", "sh", "semantic"):
+            assert torch.equal(getattr(a, name), getattr(b, name)), name
+    assert torch.equal(scene.sky.faces, again.sky.faces)
+
+
+def test_labels_survive_pickling(scene):
+    labels = pickle.loads(pickle.dumps(scene.labels))
+    assert len(labels.boxes(0)) == 3 and len(labels.lidar(1)) == len(scene.lidar(1))
+
+
+def test_a_world_far_from_its_origin_is_recentred(scene, tmp_path):
+    offset = np.array([545_000.25, 4_183_000.5, 12.0])
+    moved = open_pandaset(str(street.write_sequence(tmp_path / "utm", offset_m=offset)), QUERY)
+    np.testing.assert_array_equal(moved.world_origin_m, np.round(offset))
+    shift = offset - np.round(offset)
+    ego = moved.frame(2).world_from_ego[:3, 3].numpy()
+    np.testing.assert_allclose(ego, street.ego_position(2) + shift, atol=1e-6)
+    here, there = scene.background.means.numpy(), moved.background.means.numpy()
+    # The voxel grid sits elsewhere on the points, by less than a voxel.
+    np.testing.assert_allclose(there.min(0), here.min(0) + shift, atol=0.15)
+    np.testing.assert_allclose(there.max(0), here.max(0) + shift, atol=0.15)
+    assert moved.ground_z_m == pytest.approx(street.GROUND_Z, abs=1e-3)
+    # Labels stay in the dataset's world.
+    box = moved.boxes(0).centers_m[0]
+    np.testing.assert_allclose(box, street.car_centre(0) + offset, atol=1e-6)
+
+
+def test_without_classes_the_ground_is_still_found(tmp_path):
+    folder = street.write_sequence(tmp_path / "002", semantic=False)
+    scene = open_pandaset(str(folder), QUERY)
+    assert len(scene.problems) == street.FRAMES
+    assert "semseg/00.pkl.gz is missing; its points have no class" in scene.problems[0]
+    assert scene.ground_z_m == pytest.approx(street.GROUND_Z, abs=0.02)
+    assert (scene.background.semantic == SemanticClass.UNKNOWN).all()
+    assert len(scene.actors) == 1
+
+
+def test_frames_are_limited_and_max_gaussians_respected(folder):
+    scene = open_pandaset(str(folder), {**QUERY, "frames": "1:2", "max_gaussians": "3000"})
+    assert [f.index for f in scene.frames] == [1]
+    total = len(scene.background) + sum(len(a.gaussians) for a in scene.actors)
+    assert 1500 < total <= 3000
+
+
+def test_missing_files_of_single_frames_are_problems(copy):
+    (copy / "lidar/01.pkl.gz").unlink()
+    (copy / "annotations/cuboids/02.pkl.gz").unlink()
+    (copy / "camera/front_camera/00.jpg").unlink()
+    left = copy / "camera/left_camera/01.jpg"
+    left.write_bytes(left.read_bytes()[:-200])
+    scene = open_pandaset(str(copy), QUERY)
+    text = " ".join(scene.problems)
+    assert len(scene.problems) == 4
+    assert "frame 1: lidar/01.pkl.gz is missing" in text
+    assert "frame 2: annotations/cuboids/02.pkl.gz is missing" in text
+    assert "camera front_camera, frame 0" in text and "00.jpg does not exist" in text
+    assert "camera left_camera, frame 1" in text and "01.jpg is cut short" in text
+    assert scene.lidar(1) is None and len(scene.boxes(2)) == 0
+    assert set(scene.frame(1).image_paths) == {"front_camera"}
+    assert set(scene.frame(1).cameras) == {"front_camera", "left_camera"}
+
+
+def test_an_image_that_does_not_decode_is_a_problem(copy):
+    path = copy / "camera/left_camera/02.jpg"
+    path.write_bytes(b"\xff\xd8 nothing of a picture \xff\xd9")
+    scene = open_pandaset(str(copy), QUERY)
+    assert any("left_camera, frame 2" in p and "cannot be decoded" in p for p in scene.problems)
+
+
+def test_an_image_of_another_size_is_a_problem(copy):
+    cv2.imwrite(str(copy / "camera/left_camera/02.jpg"), np.zeros((48, 80, 3), np.uint8))
+    scene = open_pandaset(str(copy), QUERY)
+    assert any("is 80 px wide, not 160" in p for p in scene.problems)
+
+
+@pytest.mark.parametrize(
+    ("remove", "message"),
+    [
+        ("camera/front_camera/intrinsics.json", r"intrinsics\.json does not exist.*copy it"),
+        ("camera/front_camera/poses.json", r"poses\.json does not exist"),
+        ("camera/left_camera/timestamps.json", r"timestamps\.json does not exist"),
+        ("lidar/poses.json", r"lidar/poses\.json does not exist"),
+        ("lidar/timestamps.json", r"lidar/timestamps\.json does not exist"),
+    ],
+)
+def test_missing_calibration_is_an_error(copy, remove, message):
+    (copy / remove).unlink()
+    with pytest.raises(AdapterError, match=message):
+        open_pandaset(str(copy), QUERY)
+
+
+def test_a_damaged_table_is_an_error_that_names_it(copy):
+    path = copy / "lidar/02.pkl.gz"
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(AdapterError, match=r"02\.pkl\.gz is not a whole gzip file"):
+        open_pandaset(str(copy), QUERY)
+
+
+def test_no_lidar_at_all_is_an_error(copy):
+    for path in (copy / "lidar").glob("*.pkl.gz"):
+        path.unlink()
+    with pytest.raises(AdapterError, match="holds no returns for frames 0 to 2"):
+        open_pandaset(str(copy), QUERY)
+
+
+def test_frames_beyond_the_sequence_are_an_error(folder):
+    with pytest.raises(AdapterError, match=r"frames=7:9 selects none of the 3 frames"):
+        open_pandaset(str(folder), {**QUERY, "frames": "7:9"})
+
+
+def test_a_folder_that_is_none_is_an_error(tmp_path):
+    with pytest.raises(AdapterError, match="is not a folder"):
+        open_pandaset(str(tmp_path / "003"), {})
+
+
+@pytest.fixture(scope="module")
+def real(shared_dir):
+    root = shared_dir / "data" / "pandaset_mini" / "002"
+    if not root.is_dir():
+        pytest.skip(f"no PandaSet sequence at {root}")
+    query = {"frames": "10:12", "voxel_m": "0.15", "image_scale": "0.25", "sky_size": "128"}
+    return open_pandaset(str(root), query)
+
+
+def test_the_real_sequence_opens(real):
+    assert real.problems == () and len(real.frames) == 2 and len(real.camera_names) == 6
+    assert len(real.background) > 20_000 and len(real.actors) > 15
+    # The road lies about 0.3 m below the LiDAR pose's origin.
+    assert -0.5 < real.ground_z_m < -0.1
+    forward = real.frame(11).world_from_ego[:3, 3] - real.frame(10).world_from_ego[:3, 3]
+    ahead = real.frame(10).world_from_ego[:3, 0]
+    assert torch.dot(forward / forward.norm(), ahead) > 0.99
+
+
+def test_the_real_sequence_looks_like_its_images(real):
+    values = {}
+    for name, full in real.frame(11).cameras.items():
+        camera = full.scaled(0.125)
+        recorded = cv2.imread(real.frame(11).image_paths[name], cv2.IMREAD_REDUCED_COLOR_8)
+        rows = round(0.745 * camera.height) if name == "back_camera" else camera.height
+        image = render(real, camera)[:rows]
+        values[name] = psnr(image, recorded[:rows, :, ::-1] / 255)
+    # 22.0 on average when written, from two sweeps at voxels of 15 cm.
+    assert np.mean(list(values.values())) > 20.5, values
+
+
+def test_every_real_box_and_return_passes_through(real):
+    boxes, sweep = real.boxes(10), real.lidar(10)
+    assert 90 < len(boxes) < 130
+    siblings = boxes.attributes["cuboids.sibling_id"]
+    assert sum(s != "-" for s in siblings) > 20
+    assert set(sweep.columns) == {"x", "y", "z", "i", "t", "d", "semantic"}
+    assert len(sweep) > 150_000 and sweep.columns["x"].dtype == np.float64

@@ -1,0 +1,197 @@
+"""Calibration files, options, labels: what is refused, and that nothing is lost."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pandaset_folder as street
+import pytest
+import torch
+
+from adapters.pandaset_files import read_lidar, read_semantics, read_sequence
+from adapters.pandaset_labels import NO_SURFACE, PandaSetLabels, semantic_table
+from adapters.pandaset_options import PandaSetOptions
+from adapters.pandaset_sweeps import read_drive
+from augment.errors import AdapterError
+from augment.geometry import rotmat_from_quat
+from augment.semantics import SemanticClass
+
+
+@pytest.fixture
+def folder(tmp_path) -> Path:
+    return street.write_sequence(tmp_path / "002")
+
+
+def edit(path: Path, change) -> None:
+    value = json.loads(path.read_text())
+    path.write_text(json.dumps(change(value)))
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "message"),
+    [
+        ("camera/left_camera/intrinsics.json", lambda v: {"fx": 1.0}, "must hold numbers fx, fy"),
+        ("camera/left_camera/intrinsics.json", lambda v: [1, 2], "must hold numbers fx, fy"),
+        ("camera/left_camera/poses.json", lambda v: v[:-1], "has 2 poses; lidar/poses.json has 3"),
+        ("camera/left_camera/timestamps.json", lambda v: v[:-1], "has 2 entries; there are 3"),
+        ("camera/left_camera/timestamps.json", lambda v: v[::-1], "finite and increasing"),
+        ("camera/left_camera/timestamps.json", lambda v: ["now"] * 3, "must be a list of seconds"),
+        ("lidar/timestamps.json", lambda v: [*v, v[-1] + 1], "has 4 entries; there are 3"),
+        ("lidar/poses.json", lambda v: [], "holds no poses"),
+        ("lidar/poses.json", lambda v: [{"position": v[0]["position"]}] * 3, "heading w x y z"),
+        (
+            "lidar/poses.json",
+            lambda v: [{**p, "heading": {"w": 2, "x": 0, "y": 0, "z": 0}} for p in v],
+            "unit headings",
+        ),
+    ],
+)
+def test_calibration_that_contradicts_itself_is_refused(folder, name, change, message):
+    edit(folder / name, change)
+    with pytest.raises(AdapterError, match=message) as caught:
+        read_sequence(folder)
+    assert Path(name).name in str(caught.value)
+
+
+def test_json_that_is_none_is_refused(folder):
+    (folder / "lidar" / "poses.json").write_text("{")
+    with pytest.raises(AdapterError, match=r"poses\.json is not readable JSON"):
+        read_sequence(folder)
+
+
+def test_a_camera_folder_without_images_is_refused(folder):
+    for path in (folder / "camera/left_camera").glob("*.jpg"):
+        path.unlink()
+    with pytest.raises(AdapterError, match="left_camera holds no images"):
+        read_sequence(folder)
+
+
+def test_more_images_than_timestamps_are_refused(folder):
+    left = folder / "camera/left_camera"
+    (left / "03.jpg").write_bytes((left / "00.jpg").read_bytes())
+    with pytest.raises(
+        AdapterError, match=r"image 03\.jpg, but timestamps\.json ends with frame 02"
+    ):
+        read_sequence(folder)
+
+
+def test_a_folder_without_cameras_is_refused(tmp_path):
+    with pytest.raises(AdapterError, match=r"poses\.json does not exist"):
+        read_sequence(tmp_path)
+    root = street.write_sequence(tmp_path / "002")
+    (root / "camera").rename(root / "cam")
+    with pytest.raises(AdapterError, match="camera does not exist"):
+        read_sequence(root)
+
+
+def test_tables_without_their_columns_are_refused(folder):
+    street.write_table(folder / "lidar/00.pkl.gz", {"x": np.zeros(2), "y": np.zeros(2)})
+    with pytest.raises(AdapterError, match=r"00\.pkl\.gz lacks the columns \['z', 'i', 't', 'd'\]"):
+        read_lidar(folder, 0)
+    street.write_table(folder / "annotations/semseg/01.pkl.gz", {"class": np.zeros(3, int)})
+    rows = len(read_lidar(folder, 1))
+    with pytest.raises(AdapterError, match=f"each of the {rows} returns .* it has 3"):
+        read_semantics(folder, 1, rows)
+
+
+def test_boxes_turn_to_x_forward_and_keep_every_column(folder):
+    boxes = PandaSetLabels(folder).boxes(1)
+    assert boxes.track_ids == (*street.CAR_IDS, "parked") and boxes.labels == ("Car",) * 3
+    np.testing.assert_allclose(boxes.sizes_m[0], street.CAR_SIZE_M)
+    np.testing.assert_allclose(boxes.centers_m[0], street.car_centre(0.1))
+    forward = rotmat_from_quat(torch.from_numpy(boxes.quats))[0, :, 0]
+    np.testing.assert_allclose(forward, [1, 0, 0], atol=1e-12)
+    columns = boxes.attributes
+    assert list(columns["cuboids.sibling_id"]) == [street.CAR_IDS[1], street.CAR_IDS[0], "-"]
+    assert list(columns["cuboids.sensor_id"]) == [0, 1, -1]
+    np.testing.assert_allclose(columns["yaw"], -np.pi / 2)
+    np.testing.assert_allclose(columns["dimensions.y"], street.CAR_SIZE_M[0])
+    assert list(columns["attributes.object_motion"]) == ["Moving", "Moving", "Parked"]
+    assert len(columns) == 15
+
+
+def test_missing_texts_are_none(folder):
+    path = folder / "annotations/cuboids/00.pkl.gz"
+    table = street._cuboids(0, np.zeros(3)) | {
+        "attributes.rider_status": ["With Rider", np.nan, None]
+    }
+    street.write_table(path, table)
+    status = PandaSetLabels(folder).boxes(0).attributes["attributes.rider_status"]
+    assert list(status) == ["With Rider", None, None]
+
+
+def test_sweeps_pass_through_bit_for_bit(folder):
+    table = read_lidar(folder, 1)
+    sweep = PandaSetLabels(folder).lidar(1)
+    assert list(sweep.columns) == ["x", "y", "z", "i", "t", "d", "semantic"]
+    for name in "xyzitd":
+        assert sweep.columns[name].dtype == table[name].dtype
+        assert (sweep.columns[name] == table[name].to_numpy()).all()
+
+
+def test_classes_are_known_by_name(folder):
+    table = semantic_table(folder)  # the published numbers
+    assert table[7] == SemanticClass.ROAD and table[4] == NO_SURFACE and table[99] == 0
+    names = {"3": "Road", "9": "Reflection", "5": "Hovercraft"}
+    (folder / "annotations/semseg/classes.json").write_text(json.dumps(names))
+    table = semantic_table(folder)
+    assert table[3] == SemanticClass.ROAD and table[9] == NO_SURFACE and table[5] == 0
+    (folder / "annotations/semseg/classes.json").write_text("[1, 2]")
+    with pytest.raises(AdapterError, match=r"classes\.json must map class numbers to names"):
+        semantic_table(folder)
+
+
+def test_own_car_and_mirror_images_are_left_out(folder):
+    table = read_lidar(folder, 0)
+    points = np.array([[0.5, 0.2, 0.8], [2.0, -0.6, 1.2], [4.0, 0.0, 0.3], [5.0, 0.0, 0.3]])
+    columns = {c: points[:, i] for i, c in enumerate("xyz")}
+    columns |= {"i": np.zeros(4), "t": np.full(4, table["t"].iloc[0]), "d": np.zeros(4, int)}
+    street.write_table(folder / "lidar/00.pkl.gz", columns)
+    street.write_table(
+        folder / "annotations/semseg/00.pkl.gz", {"class": np.array([13, 13, 4, 13])}
+    )
+    (sweep,) = read_drive(read_sequence(folder), [0]).sweeps
+    np.testing.assert_allclose(sweep.points, points[3:])  # two on the car itself, one reflection
+
+
+def test_a_box_called_stationary_that_travels_is_an_actor(folder):
+    for frame in range(street.FRAMES):
+        table = street._cuboids(frame, np.zeros(3)) | {"stationary": np.array([True] * 3)}
+        table["position.x"] = table["position.x"] + [2.0 * frame, 2.0 * frame, 0]
+        street.write_table(folder / f"annotations/cuboids/{frame:02d}.pkl.gz", table)
+    samples = read_drive(read_sequence(folder), range(street.FRAMES)).samples
+    assert {s.object_id for s in samples} == set(street.CAR_IDS)
+
+
+def test_options_are_typed():
+    query = {"frames": "2:9", "voxel_m": "0.08", "max_gaussians": "5000", "image_scale": "0.25"}
+    options = PandaSetOptions.from_query(query | {"sky_size": "16", "progress": "true"})
+    assert options == PandaSetOptions(2, 9, 0.08, 5000, 0.25, 16, True)
+    assert PandaSetOptions.from_query({"frames": "4:"}) == PandaSetOptions(first_frame=4)
+    assert PandaSetOptions.from_query({}) == PandaSetOptions()
+
+
+@pytest.mark.parametrize(
+    ("query", "message"),
+    [
+        (
+            {"voxels": "1"},
+            r"unknown option 'voxels'; allowed are frames: .*; progress: true or false",
+        ),
+        ({"frames": "3"}, "frames must be first:stop.*got '3'"),
+        ({"frames": "5:5"}, "frames must be first:stop"),
+        ({"frames": "-1:5"}, "frames must be first:stop"),
+        ({"frames": "a:b"}, "frames must be first:stop"),
+        ({"voxel_m": "nan"}, "voxel_m must be a number of metres from 0.01 to 2; got 'nan'"),
+        ({"voxel_m": "0"}, "voxel_m must be"),
+        ({"max_gaussians": "1e6"}, "max_gaussians must be an integer from 1000"),
+        ({"image_scale": "0.3"}, "image_scale must be one of 1, 0.5, 0.25, 0.125; got '0.3'"),
+        ({"sky_size": "4"}, "sky_size must be an integer from 8"),
+        ({"progress": "maybe"}, "progress must be true or false"),
+    ],
+)
+def test_wrong_options_say_what_is_allowed(query, message):
+    with pytest.raises(AdapterError, match=message):
+        PandaSetOptions.from_query(query)
