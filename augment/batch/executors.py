@@ -17,7 +17,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from multiprocessing import reduction, resource_tracker
-from multiprocessing.connection import Connection, wait
+from multiprocessing.connection import wait
 
 from augment.batch.lock import OutputLock
 from augment.batch.manifest import FAILED
@@ -161,9 +161,8 @@ class _Pool:
         return any(worker.in_hand for worker in self.workers)
 
     def _readable(self, timeout_s: float | None) -> list[_Worker]:
-        by_connection = {worker.connection: worker for worker in self.workers}
-        ready = wait(list(by_connection), timeout_s)
-        return [by_connection[c] for c in ready if isinstance(c, Connection)]
+        ready = wait([worker.connection for worker in self.workers], timeout_s)
+        return [worker for worker in self.workers if worker.connection in ready]
 
     def _read(self, worker: _Worker) -> None:
         try:

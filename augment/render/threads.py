@@ -4,6 +4,9 @@ numba's own choice is often OpenMP, which kills DataLoader workers forked after 
 rendered. pip puts TBB's library where the loader does not look, so it is loaded by its path first.
 """
 
+# pyright: reportPrivateImportUsage=false, reportAttributeAccessIssue=false
+# (numba has no types: its settings are attributes made at run time)
+
 from __future__ import annotations
 
 import ctypes
