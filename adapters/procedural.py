@@ -15,7 +15,7 @@ import numpy as np
 
 from adapters.street.labels import StreetLabels
 from adapters.street.parameters import StreetParameters, parse_parameters
-from adapters.street.rig import CAMERA_Z_M, build_frames, ego_pose, frame_time_ns
+from adapters.street.rig import build_frames, camera_path, ego_pose, frame_time_ns
 from adapters.street.shadows import contact_shadow
 from adapters.street.sky import build_sky
 from adapters.street.splats import (
@@ -88,7 +88,7 @@ def _eyes(parameters: StreetParameters) -> tuple[np.ndarray, np.ndarray]:
     length = parameters.speed_mps * (last - first) * 1e-9
     count = int(np.clip(np.ceil(length / EYE_STEP_M) + 1, 1, MOST_EYES))
     times = np.linspace(0, last - first, count).round().astype(np.int64) + first
-    return ego_pose(parameters, times).positions + np.array([0, 0, CAMERA_Z_M]), times
+    return camera_path(parameters, times), times
 
 
 def _eyes_from(mover: MovingBody, eyes: np.ndarray, times: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Houses: a front of windows, doors and shops, side and back walls, a roof. Also gardens in the gaps."""
+"""Houses: fronts of windows, doors and shops, plain other walls, roofs; gardens in the gaps."""
 
 from __future__ import annotations
 

@@ -74,17 +74,21 @@ def _crossing_sign() -> Shapes:
     figure = np.array([[0.022, -0.2, 2.3], [0.022, 0.2, 2.3], [0.022, 0.0, 2.66]])
     dark = Look((0.02, 0.02, 0.02), Class.SIGN, spacing=0.5)
     return join(
-        [_pole(2.75), _rear(2.45, 0.62), _plate(2.45, 0.64, 0.64, BLUE), triangle(figure, WHITE)]
-        + [_plate(2.40, 0.09, 0.18, dark, 0.032)]
+        [
+            _pole(2.75),
+            _rear(2.45, 0.62),
+            _plate(2.45, 0.64, 0.64, BLUE),
+            triangle(figure, WHITE),
+            _plate(2.40, 0.09, 0.18, dark, 0.032),
+        ]
     )
 
 
 def _limit_sign() -> Shapes:
-    centre = np.array([0.0, 0.0, 2.5])
     plates = [(0.31, RED, 0.010), (0.235, WHITE, 0.018)]
     digits = Look((0.02, 0.02, 0.02), Class.SIGN, spacing=0.5)
-    parts = [disc(centre + [x, 0, 0], (1, 0, 0), radius, look) for radius, look, x in plates]
-    parts.append(disc(centre, (-1, 0, 0), 0.31, GREY))
+    parts = [disc((x, 0, 2.5), (1, 0, 0), radius, look) for radius, look, x in plates]
+    parts.append(disc((0, 0, 2.5), (-1, 0, 0), 0.31, GREY))
     for y in (-0.1, 0.1):
         parts.append(_plate(2.5, 0.13, 0.24, digits, 0.024).moved((0, y, 0)))
         parts.append(_plate(2.5, 0.045, 0.14, WHITE, 0.030).moved((0, y, 0)))

@@ -1,4 +1,4 @@
-"""Carriageway with its markings, kerbs, pavements, the cross streets that end it, and the land around."""
+"""Carriageway and markings, kerbs, pavements, the cross streets at both ends, the land around."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def _apart(a: Rectangle, b: Rectangle) -> bool:
 
 
 def _carriageway(layout: Layout) -> list[Shapes]:
-    """Both halves of the road, in sections along x so that a mark cuts only the asphalt beside it."""
+    """Both halves of the road, in sections along x: a mark cuts only the asphalt beside it."""
     marks = _markings(layout)
     repairs, covers = _patches(layout, marks)
     crossing = (layout.zebra_x - ZEBRA_CLEAR_M, layout.zebra_x + ZEBRA_CLEAR_M)

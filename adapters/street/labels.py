@@ -3,22 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 
 from adapters.street.lidar import sweep
 from adapters.street.parameters import StreetParameters
 from adapters.street.rig import frame_time_ns
-from adapters.street.truth import StreetTruth, truth_of
+from adapters.street.truth import StreetTruth
 from adapters.street.world import build_street
 from augment.errors import SceneError
 from augment.labels import Boxes, LidarSweep
-
-
-@lru_cache(maxsize=2)
-def _truth(parameters: StreetParameters) -> StreetTruth:
-    return truth_of(build_street(parameters))
 
 
 @dataclass(frozen=True)
@@ -58,7 +52,7 @@ class StreetLabels:
 
     def lidar(self, frame_index: int) -> LidarSweep:
         self._time_ns(frame_index)
-        return sweep(_truth(self.parameters), frame_index)
+        return sweep(StreetTruth(build_street(self.parameters)), frame_index)
 
     def _time_ns(self, frame_index: int) -> int:
         if not 0 <= frame_index < self.parameters.frames:

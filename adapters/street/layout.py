@@ -1,4 +1,4 @@
-"""Where things stand: the street's plan, drawn from the seed. x runs along the street, y to the left.
+"""Where things stand: the street's plan, drawn from the seed. x runs along it, y to the left.
 
 Each kind of thing draws from its own stream, so that one more car moves no tree.
 """

@@ -33,14 +33,15 @@ class Lighting:
     """Light in one body's frame. to_sun [3]: unit. eye_path [2, 3]: segment the cameras move along.
 
     canyon: y of the street's right and left walls, and z of their tops, metres. ground_z: of the
-    ground, metres. footprints [C, 4]: x, y and half sizes of parked cars, which keep sky light off
-    the ground.
+    ground, metres. sunlit: share of its way that the body spends in the sun. footprints [C, 4]:
+    x, y and half sizes of parked cars, which keep sky light off the ground.
     """
 
     to_sun: np.ndarray
     eye_path: np.ndarray
     canyon: tuple[float, float, float]
     ground_z: float = 0.0
+    sunlit: float = 1.0
     footprints: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 4)))
 
     def sun_directions(self) -> np.ndarray:
@@ -121,11 +122,11 @@ def shade(
     base: np.ndarray,
     seen_sun: np.ndarray,
 ) -> np.ndarray:
-    """Display-encoded colour [N, 3] of places on shapes with albedo base [N, 3] and sun share [N]."""
+    """Display-encoded colour [N, 3] of places; base [N, 3]: albedo, seen_sun [N]: its share."""
     points = shapes.points(shape, local)
     smooth = shapes.shading_normals(shape, local)
     material = shapes.material[shape]
-    sun = np.maximum(_facing_sun(shapes, lighting, shape, local), 0) * seen_sun
+    sun = np.maximum(_facing_sun(shapes, lighting, shape, local), 0) * seen_sun * lighting.sunlit
     sky = _sky_share(lighting, points, smooth) * shapes.ambient[shape]
     upward = 0.5 + 0.5 * smooth[:, 2]
     ambient = sky[:, None] * (upward[:, None] * SKY_RGB + (1 - upward)[:, None] * BOUNCE_RGB)

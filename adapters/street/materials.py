@@ -1,7 +1,7 @@
 """Surface colour before light: a base albedo with each material's own grain.
 
-Every rule is a function of place alone (and of a shape's variation), in linear albedo. Grain is kept
-as coarse as the splats can carry: finer detail would only be lost between them.
+Every rule is a function of place alone (and of a shape's variation), in linear albedo. Grain is
+kept as coarse as the splats can carry: finer detail would only be lost between them.
 """
 
 from __future__ import annotations

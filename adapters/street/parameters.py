@@ -40,7 +40,7 @@ class StreetParameters:
     width: int = 960
     height: int = 540
     speed_mps: float = 8.0
-    gaussians: int = 300_000
+    gaussians: int = 290_000
     parked: int = 12
     moving: int = 3
     pedestrians: int = 2

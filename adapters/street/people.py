@@ -44,7 +44,7 @@ def draw_person(seed: int) -> Shapes:
             tube((0, y, 0.93), knee, 0.085, legs),
             tube(knee, foot, 0.062, legs),
             ball(knee, (0.072, 0.07, 0.075), legs),
-            ball(foot + [0.055, 0, -0.04], (0.135, 0.05, 0.055), shoes),
+            ball(foot + np.array([0.055, 0, -0.04]), (0.135, 0.05, 0.055), shoes),
             tube(shoulder, elbow, 0.052, coat),
             tube(elbow, hand, 0.043, coat),
             ball(shoulder, (0.062, 0.058, 0.068), coat),

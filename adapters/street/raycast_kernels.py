@@ -111,7 +111,7 @@ def _enter(bounds, node, ox, oy, oz, dx, dy, dz, ix, iy, iz, limit):
 
 @njit(cache=True)
 def _meet(kind, a, b, c, da, db, dc, limit):
-    """Distance at which a ray, given in a shape's own frame, meets it; infinite where it does not."""
+    """Distance at which a ray, in a shape's own frame, meets it; infinite where it does not."""
     if kind <= 2:  # flat
         if dc == 0.0:
             return math.inf

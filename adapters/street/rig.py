@@ -46,6 +46,11 @@ def ego_pose(parameters: StreetParameters, timestamps_ns: np.ndarray) -> EgoPose
     return EgoPose(np.stack([x, y, road_z(y)], -1), yaw)
 
 
+def camera_path(parameters: StreetParameters, timestamps_ns: np.ndarray) -> np.ndarray:
+    """Where the cameras are at times [N], taken together: above the ego car's middle, [N, 3]."""
+    return ego_pose(parameters, timestamps_ns).positions + np.array([0.0, 0.0, CAMERA_Z_M])
+
+
 def world_from_ego(parameters: StreetParameters, timestamp_ns: int) -> np.ndarray:
     """float64 [4, 4]: ego x forward, y left, z up, origin on the road."""
     pose = ego_pose(parameters, np.array([timestamp_ns]))
@@ -105,7 +110,7 @@ def _camera(parameters: StreetParameters, name: str, frame_ns: int) -> Camera:
 class Motion:
     """A mover's box centre over time; its heading never changes.
 
-    times_ns: int64 [T], samples one frame beyond the drive on both sides, as far as the street goes.
+    times_ns: int64 [T], one frame beyond the drive on both sides, as far as the street goes.
     centres: float64 [T, 3].
     """
 

@@ -60,12 +60,13 @@ def contact_shadow(mover: MovingBody) -> ContactShadow:
     for direction in directions:
         rays = np.broadcast_to(direction, points.shape)
         shaded += mover.body.tree.occluded(points, rays)
-    sun = (1 - shaded / len(directions)) * lighting.to_sun[2] * SUN_RGB.mean()
+    full_sun = lighting.sunlit * lighting.to_sun[2] * SUN_RGB.mean()
+    sun = (1 - shaded / len(directions)) * full_sun
     rounding = 0.8 * half.min()
     outside = np.linalg.norm(np.maximum(np.abs(grid) - half + rounding, 0), axis=1) - rounding
     hidden = 0.8 / (1 + np.exp((outside - 0.02) / (0.11 * half.min() / 0.9)))
     sky = (1 - hidden) * SKY_RGB.mean() * 0.75
-    lit = lighting.to_sun[2] * SUN_RGB.mean() + SKY_RGB.mean() * 0.75
+    lit = full_sun + SKY_RGB.mean() * 0.75
     cover = 1 - ((sun + sky) / lit) ** 0.45  # the display's encoding of that ratio, nearly
     rim = np.min(np.minimum(grid - origin, -origin - grid), axis=1)  # fade out before the grid ends
     cover = np.minimum(cover, MOST_COVER) * np.clip(rim / 0.3, 0, 1)

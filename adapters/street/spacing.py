@@ -13,22 +13,23 @@ import numpy as np
 from adapters.street.materials import Material
 from adapters.street.raycast import Tree
 from adapters.street.shapes import U0, U1, V0, V1, Kind, Shapes, join
+from augment.semantics import SemanticClass
 
+SPLIT_M = (1.6, 4.0)  # panels are never cut shorter than half the first; walls not left longer
 STEEPEST = 0.42  # sine of the steepest ray of a level camera, up or down
 MOST_STRETCH = 2.6
 HIDDEN_STRETCH = 3.5  # of surfaces that no camera sees
-LOOKS = 6  # places of the cameras from which sight is tried
+LOOKS, PLACES = 6, 4  # eyes from which sight is tried, and places per eye
 LEAST_M = 0.02
-# Measured on square lattices of the splats in `splats`, alone and backed by a second layer: blending
-# takes nearer splats first, which puts the weighted mean this many spacings too near, along the
-# surface.
+# Blending takes nearer splats first, which puts the weighted mean this many spacings too near,
+# along the surface: measured against the truth, for one layer of splats and for two (see `splats`).
 BLEND_LEAD = 0.62
 BACKED_BLEND_LEAD = 0.36
 
 
 @dataclass(frozen=True, eq=False)
 class Spacing:
-    """Per shape: along [P, 2] spacing in metres per unit of coarseness along both axes; sink [P] how
+    """Per shape: along [P, 2] spacing in metres per unit of coarseness on both axes; sink [P] how
     far below its surface splats lie, in spacings, so that their blend is seen on it; hidden [P]
     whether no camera sees it, so that its splats may be few but must keep clear of rims.
     """
@@ -44,7 +45,9 @@ def split_long(shapes: Shapes, eyes: np.ndarray) -> Shapes:
     while len(shapes):
         distance = _sightings(shapes, eyes)[0].min(0)
         sides = np.linalg.norm(shapes.axes[:, :2], axis=2)
-        limit = np.maximum(1.6, 0.45 * distance)
+        limit = np.maximum(SPLIT_M[0], 0.45 * distance)
+        built = shapes.semantic != SemanticClass.TERRAIN
+        limit[built] = np.minimum(limit, SPLIT_M[1])[built]
         wanted = (sides.max(1) > limit) & (shapes.kind == Kind.PARALLELOGRAM)
         done.append(shapes.select(np.flatnonzero(~wanted)))
         shapes = _halved(shapes.select(np.flatnonzero(wanted)), sides[wanted].argmax(1))
@@ -83,30 +86,38 @@ def plan_spacing(shapes: Shapes, tree: Tree, eyes: np.ndarray) -> Spacing:
 
 
 def _in_sight(shapes: Shapes, tree: Tree, eyes: np.ndarray) -> np.ndarray:
-    """Which shapes are seen from some of the eyes, at one of four places each, bool [P]."""
+    """Which shapes some of the eyes can see, bool [P]: a few places are tried, each time others."""
     seen = np.zeros(len(shapes), bool)
-    u, v, w = (shapes.axes[:, axis] for axis in range(3))
     round_form = shapes.kind >= Kind.ELLIPSOID
-    centred = (shapes.kind >= Kind.DISC)[:, None]
     radius = np.where(round_form, np.linalg.norm(shapes.axes, axis=2)[:, :2].max(1) * 1.05, 0)
-    for eye in eyes[np.linspace(0, len(eyes) - 1, min(LOOKS, len(eyes))).round().astype(int)]:
-        for a, b in ((0.5, 0.5), (0.1, 0.2), (0.9, 0.2), (0.5, 0.9)):
-            a, b = (np.where(centred, 1.4 * (c - 0.5), c) for c in (a, b))
-            place = np.where(round_form[:, None], b * w, a * u + b * v + 0.004 * w)
-            index = np.flatnonzero(~seen)
-            target = (shapes.origin + place)[index]
-            back = eye - target
-            length = np.linalg.norm(back, axis=1)
-            front = round_form[index] | ((back * w[index]).sum(1) > 0)
-            front &= (np.abs(back[:, 2]) < 1.2 * STEEPEST * length) & (length > radius[index])
-            index, back, target, length = index[front], back[front], target[front], length[front]
-            start = (radius[index] / length)[:, None]
-            seen[index] = ~tree.occluded(target + start * back, (1 - start) * back, 1.0)
+    chosen = np.linspace(0, len(eyes) - 1, min(LOOKS, len(eyes))).round().astype(int)
+    for number, eye in enumerate(np.repeat(eyes[chosen], PLACES, axis=0)):
+        index = np.flatnonzero(~seen)
+        target = _place(shapes, index, number)
+        back = eye - target
+        length = np.linalg.norm(back, axis=1)
+        front = round_form[index] | ((back * shapes.axes[index, 2]).sum(1) > 0)
+        front &= (np.abs(back[:, 2]) < 1.2 * STEEPEST * length) & (length > radius[index])
+        index, back, target, length = index[front], back[front], target[front], length[front]
+        start = (radius[index] / length)[:, None]
+        seen[index] = ~tree.occluded(target + start * back, (1 - start) * back, 1.0)
     return seen
 
 
+def _place(shapes: Shapes, index: np.ndarray, number: int) -> np.ndarray:
+    """A place on each shape at index (on the axis of round forms), [I, 3]; numbers spread out."""
+    kind, (u, v, w) = shapes.kind[index], shapes.axes[index].transpose(1, 0, 2)
+    a, b = (0.06 + 0.88 * ((0.5 + number * step) % 1.0) for step in (0.7549, 0.5698))
+    folded = (kind == Kind.TRIANGLE) & (a + b > 1)
+    a, b = np.where(folded, 1 - a, a), np.where(folded, 1 - b, b)
+    centred = kind >= Kind.DISC
+    a, b = (np.where(centred, 1.4 * (c - 0.5), c)[:, None] for c in (a, b))
+    on_axis = (kind >= Kind.ELLIPSOID)[:, None]
+    return shapes.origin[index] + np.where(on_axis, b * w, a * u + b * v + 0.004 * w)
+
+
 def _sightings(shapes: Shapes, eyes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distance [E, P] and unit view direction [E, P, 3] from each eye to the nearest visible place."""
+    """Distance [E, P] and unit direction [E, P, 3] from each eye to the nearest visible place."""
     nearest = shapes.origin[None] - eyes[:, None]  # [E, P, 3], from the eye
     straight = shapes.kind <= Kind.TRIANGLE
     for axis in range(2):

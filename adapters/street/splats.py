@@ -27,7 +27,7 @@ BACKED_SIGMA_PER_SIDE = 0.62
 # coarse, and from how many cells a side. As deep as it is coarse it stays behind at every slant.
 BACKING = 3
 BACKED_FROM = 4
-BLOB_SIGMA_PER_SIDE = 0.62  # of round forms, whose cells overlap more as they curve
+BLOB_SIGMA_PER_SIDE = 0.66  # of round forms, whose cells overlap more as they curve
 MESH_SIGMA_PER_SIDE = 0.66  # of the closed meshes of cars: what leaks is the car again
 NARROW_SIGMA_PER_SIDE = 0.5  # half opaque at the edge: single rows, and panels nobody sees
 LEAF_SIGMA = 0.64  # of the semi-axes of a tuft, which is one splat
@@ -148,7 +148,7 @@ def _gaussians(plan: SplatPlan, cells: Cells, share: np.ndarray, sink: np.ndarra
 
 
 def _flat_covariance(edges: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Principal axes of a a' + b b' for edges a, b [N, 2, 3]: rotations [N, 3, 3] and sigmas [N, 2]."""
+    """Principal axes of a a' + b b', edges a, b [N, 2, 3]: rotations [N, 3, 3], sigmas [N, 2]."""
     a, b = edges[:, 0], edges[:, 1]
     length = np.linalg.norm(a, axis=1)
     first = a / length[:, None]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -51,8 +52,15 @@ class StreetTruth:
     """Exact answers about a street, by ray casting."""
 
     street: Street
-    sky: Sky
-    shadows: tuple[ContactShadow, ...]
+
+    @cached_property
+    def sky(self) -> Sky:
+        """As the scene's."""
+        return build_sky(self.street.parameters.seed, self.street.to_sun)
+
+    @cached_property
+    def _shadows(self) -> tuple[ContactShadow, ...]:
+        return tuple(contact_shadow(mover) for mover in self.street.movers)
 
     def cast(
         self,
@@ -130,7 +138,7 @@ class StreetTruth:
         if rgb is not None:
             seen = np.flatnonzero((instance == 0) & (shape >= 0))
             points = origins[seen] + distance[seen, None] * unit[seen]
-            for mover, shadow in zip(self.street.movers, self.shadows, strict=True):
+            for mover, shadow in zip(self.street.movers, self._shadows, strict=True):
                 centres, present = mover.motion.at(times[seen])
                 relative = (points - centres) @ _turn(mover.motion.yaw)
                 cover = shadow.cover(relative) * present
@@ -150,16 +158,10 @@ def _turn(yaw: float) -> np.ndarray:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def truth_of(street: Street) -> StreetTruth:
-    """Truth of a street that was built already."""
-    sky = build_sky(street.parameters.seed, street.to_sun)
-    return StreetTruth(street, sky, tuple(contact_shadow(m) for m in street.movers))
-
-
 def open_truth(query: Mapping[str, str]) -> StreetTruth:
     """Truth of the street that `open_procedural` opens for the same query.
 
     Raises:
         AdapterError: as open_procedural.
     """
-    return truth_of(build_street(parse_parameters(query)))
+    return StreetTruth(build_street(parse_parameters(query)))

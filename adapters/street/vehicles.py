@@ -39,7 +39,7 @@ WHEEL_RADIUS_M = 0.32
 
 @dataclass(frozen=True)
 class CarModel:
-    """Measures in metres. hood, tail: where the windscreen and rear window start, from the middle."""
+    """Measures in metres. hood, tail: where windscreen and rear window start, from the middle."""
 
     length: float
     width: float
@@ -126,7 +126,7 @@ def _body(model: CarModel, paint: Look) -> Shapes:
 
 
 def _loft(rings: np.ndarray, look: Look) -> Shapes:
-    """A smooth surface through rings [X, M, 3], facing outwards for rings that run right to left."""
+    """A smooth surface through rings [X, M, 3], facing outwards if rings run right to left."""
     along = np.gradient(rings, axis=0)
     around = np.gradient(rings, axis=1)
     normals = np.cross(along, around)

@@ -26,9 +26,8 @@ from adapters.street.parameters import StreetParameters
 from adapters.street.people import SIZE_M, draw_person
 from adapters.street.raycast import Tree, build_tree
 from adapters.street.rig import (
-    CAMERA_Z_M,
     Motion,
-    ego_pose,
+    camera_path,
     frame_time_ns,
     motion_of,
 )
@@ -107,7 +106,7 @@ def build_street(parameters: StreetParameters) -> Street:
     layout = draw_layout(parameters)
     to_sun = _sun(parameters)
     ends = np.array([frame_time_ns(0), frame_time_ns(parameters.frames - 1)])
-    eye_path = ego_pose(parameters, ends).positions + [0, 0, CAMERA_Z_M]
+    eye_path = camera_path(parameters, ends)
     parked, cars = _park(layout)
     shapes = join(
         [
@@ -125,8 +124,8 @@ def build_street(parameters: StreetParameters) -> Street:
         canyon=(-FACADE_M, FACADE_M, ROOF_Z_M),
         footprints=np.array(footprints).reshape(-1, 4),
     )
-    movers = tuple(_moving_body(mover, layout, to_sun, ends) for mover in layout.movers)
     static = Body(shapes, build_tree(shapes), lighting)
+    movers = tuple(_moving_body(mover, layout, static, ends) for mover in layout.movers)
     return Street(parameters, layout, to_sun, static, movers, parked, eye_path)
 
 
@@ -153,7 +152,7 @@ def _park(layout: Layout) -> tuple[tuple[ParkedCar, ...], list[Shapes]]:
     return tuple(parked), shapes
 
 
-def _moving_body(mover: Mover, layout: Layout, to_sun: np.ndarray, ends: np.ndarray) -> MovingBody:
+def _moving_body(mover: Mover, layout: Layout, static: Body, ends: np.ndarray) -> MovingBody:
     if mover.kind == "car":
         model, shapes = draw_car(mover.seed)
         size, ground, label = model.size_m, float(road_z(mover.y_m)) - SINK_M, "Car"
@@ -164,14 +163,23 @@ def _moving_body(mover: Mover, layout: Layout, to_sun: np.ndarray, ends: np.ndar
     motion = motion_of(mover, layout, size[2], ground)
     turn = 1.0 if motion.yaw == 0 else -1.0  # the heading is along +x or -x
     flip = np.array([turn, turn, 1.0])
-    eyes = ego_pose(layout.parameters, ends).positions + [0, 0, CAMERA_Z_M]
+    eyes = camera_path(layout.parameters, ends)
     centre = motion.centres[0]
     walls = sorted(turn * (side * FACADE_M - centre[1]) for side in (-1, 1))
     lighting = Lighting(
-        to_sun=to_sun * flip,
+        to_sun=static.lighting.to_sun * flip,
         eye_path=(eyes - motion.at(ends)[0]) * flip,
         canyon=(walls[0], walls[1], ROOF_Z_M - centre[2]),
         ground_z=-size[2] / 2,
+        sunlit=_sunlit(static, motion.centres),
     )
     body = Body(shapes, build_tree(shapes), lighting)
     return MovingBody(mover.name, label, size, body, motion, -size[2] / 2)
+
+
+def _sunlit(static: Body, centres: np.ndarray) -> float:
+    """Share of places [N, 3] that the static scene leaves in the sun."""
+    directions = static.lighting.sun_directions()
+    origins = np.repeat(centres, len(directions), axis=0)
+    rays = np.tile(directions, (len(centres), 1))
+    return 1 - float(static.tree.occluded(origins, rays).mean())
