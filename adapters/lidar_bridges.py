@@ -17,6 +17,7 @@ from augment.semantics import SemanticClass as Class
 _WIDEST_M = {
     Class.BUILDING: 1.0,
     Class.BARRIER: 0.6,
+    Class.SIGN: 0.6,
     Class.VEHICLE: 0.4,
     Class.UNKNOWN: 0.4,
 }

@@ -21,6 +21,7 @@ from augment.semantics import SemanticClass
 NEIGHBOURS = 12  # nearest points, and as many again out of a coarser sample
 _COARSE = 4.0  # edges between points of that sample: it reaches across the gap between two rings
 _STRETCH, _STRETCH_FIRM = 2.0, 4.0  # widest gap in edges that a splat closes; on ground and walls
+_UPRIGHT = (SemanticClass.BUILDING, SemanticClass.BARRIER, SemanticClass.SIGN)
 _LINE = 0.02  # middle over largest variance below which neighbours lie on a line, not a plane
 
 
@@ -114,7 +115,7 @@ def _principal_axes(
 
 
 def _is_upright(semantic: np.ndarray) -> np.ndarray:
-    return np.isin(semantic, (SemanticClass.BUILDING, SemanticClass.BARRIER))
+    return np.isin(semantic, _UPRIGHT)
 
 
 def _axes_about(normals: np.ndarray) -> np.ndarray:

@@ -171,12 +171,14 @@ def _read_camera(folder: Path, frames: int, problems: list[str]) -> CameraTrack:
             f"{folder / 'poses.json'} has {len(poses)} poses; lidar/poses.json has {frames}"
         )
     times = _read_times(folder / "timestamps.json", expected=frames, what="LiDAR poses")
-    images = _find_images(folder, frames, problems)
-    height, width = _image_size(folder, images)
+    images, (height, width) = _find_images(folder, frames, problems)
     return CameraTrack(folder.name, width, height, fx, fy, cx, cy, poses, times, images)
 
 
-def _find_images(folder: Path, frames: int, problems: list[str]) -> tuple[Path | None, ...]:
+def _find_images(
+    folder: Path, frames: int, problems: list[str]
+) -> tuple[tuple[Path | None, ...], tuple[int, int]]:
+    """The usable image of every frame, and the rows and columns of all."""
     numbers = {int(p.stem) for p in folder.glob("*.jpg") if re.fullmatch(r"\d+", p.stem)}
     if not numbers:
         raise AdapterError(f"{folder} holds no images NN.jpg; unpack the sequence again")
@@ -185,17 +187,19 @@ def _find_images(folder: Path, frames: int, problems: list[str]) -> tuple[Path |
             f"{folder} holds image {max(numbers):02d}.jpg, but timestamps.json ends with frame "
             f"{frames - 1:02d}: images and timestamps are not of one sequence"
         )
+    paths = [folder / f"{frame:02d}.jpg" for frame in range(frames)]
+    faults = [_file_fault(path) for path in paths]
+    size = _image_size(folder, [p for p, fault in zip(paths, faults, strict=True) if not fault])
     images: list[Path | None] = []
-    for frame in range(frames):
-        path = folder / f"{frame:02d}.jpg"
-        fault = _image_fault(path)
+    for frame, (path, fault) in enumerate(zip(paths, faults, strict=True)):
+        fault = fault or _picture_fault(path, size)
         if fault:
             problems.append(f"camera {folder.name}, frame {frame}: image {path} {fault}")
         images.append(None if fault else path)
-    return tuple(images)
+    return tuple(images), size
 
 
-def _image_fault(path: Path) -> str:
+def _file_fault(path: Path) -> str:
     """What is wrong with a JPEG file by its ends: decoders fill what is missing with grey."""
     if not path.exists():
         return "does not exist"
@@ -209,9 +213,20 @@ def _image_fault(path: Path) -> str:
     return "" if b"\xff\xd9" in tail else "is cut short"
 
 
-def _image_size(folder: Path, images: tuple[Path | None, ...]) -> tuple[int, int]:
-    for path in images:
-        image = None if path is None else cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+def _picture_fault(path: Path, size: tuple[int, int]) -> str:
+    """What is wrong with the picture in a JPEG file, decoded at an eighth of its size."""
+    image = cv2.imread(str(path), cv2.IMREAD_REDUCED_GRAYSCALE_8)
+    if image is None:
+        return "cannot be decoded"
+    if image.shape != tuple(-(-side // 8) for side in size):
+        return f"is not of {size[1]}x{size[0]} pixels as the camera's first image"
+    return ""
+
+
+def _image_size(folder: Path, paths: list[Path]) -> tuple[int, int]:
+    """Rows and columns of the first image that can be decoded."""
+    for path in paths:
+        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         if image is not None:
             return image.shape[0], image.shape[1]
     raise AdapterError(f"{folder} holds no image that can be decoded; unpack the sequence again")

@@ -18,11 +18,11 @@ _UPRIGHT = 0.4  # largest upward part of an upright surface's unit normal
 
 
 def fill_walls(points: PointSet, edge_m: np.ndarray, surfels: Surfels) -> PointSet:
-    """The new points only, on walls and fences, or without classes on any upright surface.
+    """The new points only, on walls, fences and boards, or without classes on any upright surface.
 
     edge_m: float32 [N], distance that the points were thinned to. surfels: of the points.
     """
-    wall = np.isin(points.semantic, (Class.BUILDING, Class.BARRIER, Class.UNKNOWN))
+    wall = np.isin(points.semantic, (Class.BUILDING, Class.BARRIER, Class.SIGN, Class.UNKNOWN))
     wall &= np.abs(surfels.normals[:, 2]) < _UPRIGHT
     some, edges, classes = points.points[wall], edge_m[wall], points.semantic[wall]
     if len(some) < 2:

@@ -173,6 +173,16 @@ def test_images_are_decoded_at_a_fraction(tmp_path, scale):
     assert read_image(tmp_path / "none.jpg", scale) is None
 
 
+def test_images_that_cannot_be_used_are_problems(tmp_path):
+    small = view(tmp_path / "small.png", solid(RED)[::2, ::2], camera())
+    (tmp_path / "bad.png").write_bytes(b"no image")
+    bad = View(camera(), tmp_path / "bad.png", 3)
+    (seen,), problems = observe_views([Body(wall(5, 1))], [small, bad], gatherer(), image_scale=1.0)
+    assert not seen.seen.any()
+    assert "small.png is 32 px wide, not 64; left out" in problems[0]
+    assert "frame 3: image" in problems[1] and "bad.png cannot be decoded" in problems[1]
+
+
 def test_what_nothing_covers_is_sky(tmp_path):
     image = solid(BLUE)
     image[HEIGHT // 2 :] = GREEN

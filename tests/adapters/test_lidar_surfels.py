@@ -253,7 +253,7 @@ def test_without_ground_nothing_is_filled():
 def test_without_classes_low_points_are_ground():
     ground = sloping_ground(0.0).points
     car = plane((0, 0, 1), half=1.0, centre=(3.0, 3.0, 1.5))
-    wall = plane((0, 1, 0), half=2.0, centre=(0, 11.0, 2.6))
+    wall = plane((0, 1, 0), half=2.0, centre=(0, 11.0, 3.6))
     points = point_set(np.concatenate([ground, car, wall]), Class.UNKNOWN)
     found = ground_points(points)
     assert found[: len(ground)].mean() > 0.9

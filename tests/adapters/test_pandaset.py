@@ -204,12 +204,13 @@ def test_an_image_that_does_not_decode_is_a_problem(copy):
     path.write_bytes(b"\xff\xd8 nothing of a picture \xff\xd9")
     scene = open_pandaset(str(copy), QUERY)
     assert any("left_camera, frame 2" in p and "cannot be decoded" in p for p in scene.problems)
+    assert set(scene.frame(2).image_paths) == {"front_camera"}
 
 
 def test_an_image_of_another_size_is_a_problem(copy):
     cv2.imwrite(str(copy / "camera/left_camera/02.jpg"), np.zeros((48, 80, 3), np.uint8))
     scene = open_pandaset(str(copy), QUERY)
-    assert any("is 80 px wide, not 160" in p for p in scene.problems)
+    assert any("02.jpg is not of 160x96 pixels" in p for p in scene.problems)
 
 
 @pytest.mark.parametrize(
