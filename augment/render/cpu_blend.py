@@ -167,12 +167,38 @@ def _blend_list(
                 continue
             _find_spans(staged, U(count), strip, rows, limits[1], spans)
             items = _list_items(staged, U(count), strip, spans, values, places)
-            if items > U(0):
+            if items == U(0):
+                continue
+            if (median is not None or ids is not None) and _can_change(
+                state, strip, rows, median, ids
+            ):
                 _blend_items(
                     state, staged, values, places, items, limits, rgb, expected, median, ids
                 )
-                _shrink(state, strip, rows)
+            else:
+                _blend_items(
+                    state, staged, values, places, items, limits, rgb, expected, None, None
+                )
+            _shrink(state, strip, rows)
     return not _is_closed(rows)
+
+
+@inner()
+def _can_change(state, strip, rows, median, ids):
+    """Whether a pixel of the strip may still find its median depth or a heavier splat.
+
+    It finds neither once its transmittance has fallen below one half and the best weight so far,
+    which most pixels reach early: the rest of the list costs them no more than colour does.
+    """
+    most = v8.splat(np.float32(-1))
+    for row in range(rows[2 * strip], rows[2 * strip + 1]):
+        at = U(strip * STRIP + row * LANES)
+        through = v8.load(state, at)
+        if median is not None:
+            most = v8.maximum(most, through - v8.splat(np.float32(0.5)))
+        if ids is not None:
+            most = v8.maximum(most, through - v8.load(state, at + P_BEST))
+    return v8.any_not_negative(most)
 
 
 @inner()
