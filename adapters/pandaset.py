@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence as Seq
 from pathlib import Path
-from urllib.parse import urlencode
 
 import torch
 
@@ -21,6 +20,7 @@ from adapters.pandaset_files import CameraTrack, Sequence, read_sequence
 from adapters.pandaset_labels import PandaSetLabels
 from adapters.pandaset_options import PandaSetOptions
 from adapters.pandaset_sweeps import read_drive
+from adapters.uri import format_uri
 from augment.cameras import Camera, Frame
 from augment.errors import AdapterError
 from augment.geometry import invert_rigid
@@ -73,7 +73,7 @@ def open_pandaset(path: str, query: dict[str, str]) -> Scene:
     )
     return Scene(
         name=Path(path).name,
-        source=f"pandaset:{path}" + (f"?{urlencode(query, safe=':')}" if query else ""),
+        source=format_uri("pandaset", path, query),
         background=built.background,
         actors=built.actors,
         sky=built.sky,

@@ -14,6 +14,7 @@ import pytest
 import torch
 
 from adapters.pandaset import open_pandaset
+from adapters.uri import format_uri
 from augment.errors import AdapterError
 from augment.render.rasterize import rasterize
 from augment.semantics import SemanticClass
@@ -48,7 +49,7 @@ def psnr(image: np.ndarray, recorded: np.ndarray) -> float:
 
 def test_the_scene_is_described(scene, folder):
     assert scene.name == "002" and scene.problems == ()
-    assert scene.source == f"pandaset:{folder}?voxel_m=0.1&image_scale=1&sky_size=32"
+    assert scene.source == format_uri("pandaset", str(folder), QUERY)
     assert scene.camera_names == ("front_camera", "left_camera")
     assert [f.index for f in scene.frames] == [0, 1, 2]
     assert [f.timestamp_ns for f in scene.frames] == sorted(f.timestamp_ns for f in scene.frames)
