@@ -24,7 +24,6 @@ DEPTH_M = 10.5
 BASE_M = -0.25  # walls reach below the pavement
 # Nobody sees it: it stops what little shines through the front's splats from showing the back wall.
 INNER_WALL_M = 0.45
-INNER_WALL = Look((0.05, 0.05, 0.05), Class.BUILDING)
 WALLS = (
     ((0.72, 0.66, 0.54), Material.PLASTER),
     ((0.66, 0.50, 0.36), Material.PLASTER),
@@ -131,9 +130,8 @@ def _house(seed: int, width: float, fine: bool) -> Shapes:
     wall, edges = cut((0.0, 0.5, width, eaves), holes)
     parts.append(panels(wall, 0.0, style.wall, edges))
     parts += [_back(style, width, eaves), _roof(rng, style, width, eaves)]
-    parts.append(
-        panels(np.array([(0.0, BASE_M, width, eaves)]), INNER_WALL_M, INNER_WALL, ALL_EDGES)
-    )
+    inner = Look(style.wall.rgb, Class.BUILDING)
+    parts.append(panels(np.array([(0.0, BASE_M, width, eaves)]), INNER_WALL_M, inner, ALL_EDGES))
     parts.append(_rainpipe(eaves))
     return join(parts)
 

@@ -19,12 +19,13 @@ SPLIT_M = (1.6, 4.0)  # panels are never cut shorter than half the first; walls 
 STEEPEST = 0.42  # sine of the steepest ray of a level camera, up or down
 MOST_STRETCH = 2.6
 HIDDEN_STRETCH = 3.5  # of surfaces that no camera sees
-LOOKS, PLACES = 6, 4  # eyes from which sight is tried, and places per eye
+# From which eyes sight is tried, by how near they are, and at how many places from each.
+LOOKS, PLACES = (0, 1, 2, 3, 5, 8, 13, 21, 34), 3
 LEAST_M = 0.02
 # Blending takes nearer splats first, which puts the weighted mean this many spacings too near,
 # along the surface: measured against the truth, for one layer of splats and for two (see `splats`).
 BLEND_LEAD = 0.62
-BACKED_BLEND_LEAD = 0.36
+BACKED_BLEND_LEAD = 0.41
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,11 +91,13 @@ def _in_sight(shapes: Shapes, tree: Tree, eyes: np.ndarray) -> np.ndarray:
     seen = np.zeros(len(shapes), bool)
     round_form = shapes.kind >= Kind.ELLIPSOID
     radius = np.where(round_form, np.linalg.norm(shapes.axes, axis=2)[:, :2].max(1) * 1.05, 0)
-    chosen = np.linspace(0, len(eyes) - 1, min(LOOKS, len(eyes))).round().astype(int)
-    for number, eye in enumerate(np.repeat(eyes[chosen], PLACES, axis=0)):
+    distance = np.linalg.norm(shapes.origin[None] - eyes[:, None], axis=2)
+    nearest = np.argsort(distance, axis=0, kind="stable")  # [E, P]: eyes by distance
+    ranks = [rank for rank in LOOKS if rank < len(eyes)]
+    for number in range(len(ranks) * PLACES):
         index = np.flatnonzero(~seen)
         target = _place(shapes, index, number)
-        back = eye - target
+        back = eyes[nearest[ranks[number // PLACES], index]] - target
         length = np.linalg.norm(back, axis=1)
         front = round_form[index] | ((back * shapes.axes[index, 2]).sum(1) > 0)
         front &= (np.abs(back[:, 2]) < 1.2 * STEEPEST * length) & (length > radius[index])

@@ -22,13 +22,13 @@ OPACITY = 0.99
 # Standard deviation per cell side: the least that leaves no gap (alpha > 0.99 in the mean), since
 # wider splats blur and lead more (see `spacing`). Over a second layer they may be narrower.
 SIGMA_PER_SIDE = 0.74
-BACKED_SIGMA_PER_SIDE = 0.62
+BACKED_SIGMA_PER_SIDE = 0.64
 # The second layer, which fills what is left between the splats of the first: how many times as
 # coarse, and from how many cells a side. As deep as it is coarse it stays behind at every slant.
 BACKING = 3
 BACKED_FROM = 4
 BLOB_SIGMA_PER_SIDE = 0.66  # of round forms, whose cells overlap more as they curve
-MESH_SIGMA_PER_SIDE = 0.66  # of the closed meshes of cars: what leaks is the car again
+MESH_SIGMA_PER_SIDE = 0.71  # of the closed meshes of cars: what leaks is the car again
 NARROW_SIGMA_PER_SIDE = 0.5  # half opaque at the edge: single rows, and panels nobody sees
 LEAF_SIGMA = 0.64  # of the semi-axes of a tuft, which is one splat
 BURIED_M = 0.08
@@ -102,7 +102,7 @@ def _sigma_per_side(plan: SplatPlan, counts: np.ndarray, backing: np.ndarray) ->
     share = np.where(backing[:, 0] > 0, BACKED_SIGMA_PER_SIDE, SIGMA_PER_SIDE)
     share = np.where(kind == Kind.TRIANGLE, MESH_SIGMA_PER_SIDE, share)
     share = np.where(kind == Kind.ELLIPSOID, BLOB_SIGMA_PER_SIDE, share)
-    share = np.where(hidden & (kind <= Kind.DISC), NARROW_SIGMA_PER_SIDE, share)
+    share = np.where(hidden & (kind == Kind.PARALLELOGRAM), NARROW_SIGMA_PER_SIDE, share)
     lone = [
         (counts[:, i] == 1) & ((plan.shapes.edges & bits) == bits) for i, bits in enumerate(_ENDS)
     ]
@@ -115,7 +115,10 @@ _ENDS = (U0 | U1, V0 | V1)
 def _uncovered(plan: SplatPlan, cells: Cells) -> Cells:
     """Cells that do not lie wholly under another surface, which they would shine through."""
     covered = plan.shapes.material[cells.shape] != Material.LEAF
-    for local in cells.places():
+    places = cells.places()
+    mesh = plan.shapes.kind[cells.shape] == Kind.TRIANGLE
+    places[:, mesh] = cells.local[mesh]  # its overlays, wheels and lamps, spill over their rims
+    for local in places:
         index = np.flatnonzero(covered)
         shape = cells.shape[index]
         normals = plan.shapes.normals(shape, local[index])

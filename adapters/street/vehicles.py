@@ -214,10 +214,10 @@ def _wheels(model: CarModel) -> list[Shapes]:
             y, out = side * (reach - 0.005), (0.0, float(side), 0.0)
             inner = (x, side * (reach - 0.24), radius)
             parts += [
-                disc((x, side * (reach + 0.004), radius + 0.03), out, radius + 0.065, ARCH),
-                tube(inner, (x, y + side * 0.02, radius), radius, TYRE),
-                disc((x, y + side * 0.02, radius), out, radius, TYRE),
-                disc((x, y + side * 0.028, radius), out, radius * 0.68, RIM),
+                disc((x, side * (reach + 0.012), radius + 0.03), out, radius + 0.065, ARCH),
+                tube(inner, (x, y + side * 0.028, radius), radius, TYRE),
+                disc((x, y + side * 0.028, radius), out, radius, TYRE),
+                disc((x, y + side * 0.036, radius), out, radius * 0.68, RIM),
             ]
     return parts
 
