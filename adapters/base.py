@@ -2,7 +2,7 @@
 
 Schemes and syntax are those of adapters.uri; a path without a scheme is recognised by what it
 holds. Two keys work with every scheme:
-`camera_path=FILE` replaces the scene's cameras (see adapters.camera_paths), and `ground_z=HEIGHT`
+`camera_path=FILE` replaces the scene's cameras (see adapters.cameras.paths), and `ground_z=HEIGHT`
 says how high the road is (scene world, metres) where the scene does not know or is wrong.
 """
 
@@ -14,7 +14,7 @@ import math
 from pathlib import Path
 from typing import Protocol
 
-from adapters.camera_paths import with_camera_path
+from adapters.cameras.paths import with_camera_path
 from adapters.uri import (
     CAMERA_PATH_KEY,
     GROUND_KEY,

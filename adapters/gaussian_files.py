@@ -3,9 +3,10 @@
     gaussians:PATH?up=-y&scale=1&cameras=FILE
 
 Cameras are looked for beside the file (cameras.json, transforms.json, a COLMAP model in sparse/0)
-and above it in a model's folder; `adapters.camera_frames` says how images become frames. Without
-any, `adapters.default_paths` makes a path. Coordinates and cameras of the file are turned so that
-`up` points to +z, scaled to metres, and recentred where they lie beyond a kilometre from zero.
+and above it in a model's folder; `adapters.cameras.frames` says how images become frames. Without
+any, `adapters.cameras.default_paths` makes a path. Coordinates and cameras of the file are turned
+so that `up` points to +z, scaled to metres, and recentred where they lie beyond a kilometre from
+zero.
 """
 
 from __future__ import annotations
@@ -17,12 +18,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from adapters.camera_files import find_camera_file, read_views
-from adapters.camera_frames import frames_from_views
-from adapters.default_paths import make_default_path
+from adapters.cameras.default_paths import make_default_path
+from adapters.cameras.files import find_camera_file, read_views
+from adapters.cameras.frames import frames_from_views
+from adapters.cameras.ground_estimate import lowest_ground, solid_points
+from adapters.cameras.posed_views import PosedView, ViewSet
 from adapters.gaussian_options import COLOURS, GaussianOptions
-from adapters.ground_estimate import lowest_ground, solid_points
-from adapters.posed_views import PosedView, ViewSet
 from adapters.uri import format_uri
 from adapters.world import WorldChange, nearest_axis, parse_up, rotation_to_z_up
 from augment.cameras import Frame

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from adapters.default_paths import PATH_KINDS, PathKind
+from adapters.cameras.default_paths import PATH_KINDS, PathKind
 from adapters.world import parse_up
 from augment.errors import AdapterError
 

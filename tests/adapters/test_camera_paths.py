@@ -13,8 +13,8 @@ import torch
 from splat_scenes import street
 
 from adapters.base import open_scene
-from adapters.camera_files import read_views
-from adapters.camera_paths import frames_from_path_file, with_camera_path
+from adapters.cameras.files import read_views
+from adapters.cameras.paths import frames_from_path_file, with_camera_path
 from augment.errors import AdapterError
 from augment.scene import Scene
 from augment.sky import ConstantSky

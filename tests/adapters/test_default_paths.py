@@ -10,9 +10,9 @@ import pytest
 import torch
 from splat_scenes import gaussians_at, street
 
-from adapters.camera_paths import default_frames
-from adapters.default_paths import CAMERA_HEIGHT_M, NO_CAMERAS, make_default_path
-from adapters.ground_estimate import ground_grid, ground_under, lowest_ground, solid_points
+from adapters.cameras.default_paths import CAMERA_HEIGHT_M, NO_CAMERAS, make_default_path
+from adapters.cameras.ground_estimate import ground_grid, ground_under, lowest_ground, solid_points
+from adapters.cameras.paths import default_frames
 from augment.scene import Gaussians
 from augment.splat_io import read_splats
 

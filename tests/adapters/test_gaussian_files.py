@@ -12,8 +12,8 @@ import torch
 from splat_scenes import gaussians_at, street
 
 from adapters.base import open_scene
+from adapters.cameras.posed_views import look_at_pose
 from adapters.gaussian_files import find_splat_file, open_gaussians
-from adapters.posed_views import look_at_pose
 from augment.errors import AdapterError, SceneError
 from augment.scene import Gaussians
 from augment.splat_io import write_ply, write_splat

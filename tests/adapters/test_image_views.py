@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import torch
 
-from adapters.box_tracks import BoxSample, join_tracks
-from adapters.image_views import Body, View, observe_views, read_image
-from adapters.lidar_surfels import Surfels
-from adapters.sky_from_images import SkyGatherer
+from adapters.lidar.box_tracks import BoxSample, join_tracks
+from adapters.lidar.image_views import Body, View, observe_views, read_image
+from adapters.lidar.sky import SkyGatherer
+from adapters.lidar.surfels import Surfels
 from augment.cameras import Camera
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 32.0

@@ -10,10 +10,10 @@ import pandaset_folder as street
 import pytest
 import torch
 
-from adapters.pandaset_files import read_lidar, read_semantics, read_sequence
-from adapters.pandaset_labels import NO_SURFACE, PandaSetLabels, semantic_table
-from adapters.pandaset_options import PandaSetOptions
-from adapters.pandaset_sweeps import read_drive
+from adapters.pandaset.files import read_lidar, read_semantics, read_sequence
+from adapters.pandaset.labels import NO_SURFACE, PandaSetLabels, semantic_table
+from adapters.pandaset.options import PandaSetOptions
+from adapters.pandaset.sweeps import read_drive
 from augment.errors import AdapterError
 from augment.geometry import rotmat_from_quat
 from augment.semantics import SemanticClass
@@ -167,8 +167,8 @@ def test_a_box_called_stationary_that_travels_is_an_actor(folder):
 
 def test_options_are_typed():
     query = {"frames": "2:9", "voxel_m": "0.08", "max_gaussians": "5000", "image_scale": "0.25"}
-    options = PandaSetOptions.from_query(query | {"sky_size": "16", "progress": "true"})
-    assert options == PandaSetOptions(2, 9, 0.08, 5000, 0.25, 16, True)
+    options = PandaSetOptions.from_query(query | {"sky_size": "16"})
+    assert options == PandaSetOptions(2, 9, 0.08, 5000, 0.25, 16)
     assert PandaSetOptions.from_query({"frames": "4:"}) == PandaSetOptions(first_frame=4)
     assert PandaSetOptions.from_query({}) == PandaSetOptions()
 
@@ -178,7 +178,7 @@ def test_options_are_typed():
     [
         (
             {"voxels": "1"},
-            r"unknown option 'voxels'; allowed are frames: .*; progress: true or false",
+            r"unknown option 'voxels'; allowed are frames: .*; sky_size: ",
         ),
         ({"frames": "3"}, "frames must be first:stop.*got '3'"),
         ({"frames": "5:5"}, "frames must be first:stop"),
@@ -189,7 +189,6 @@ def test_options_are_typed():
         ({"max_gaussians": "1e6"}, "max_gaussians must be an integer from 1000"),
         ({"image_scale": "0.3"}, "image_scale must be one of 1, 0.5, 0.25, 0.125; got '0.3'"),
         ({"sky_size": "4"}, "sky_size must be an integer from 8"),
-        ({"progress": "maybe"}, "progress must be true or false"),
     ],
 )
 def test_wrong_options_say_what_is_allowed(query, message):

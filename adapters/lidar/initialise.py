@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from adapters.lidar_split import is_flat
-from adapters.lidar_surfels import Surfels
+from adapters.lidar.split import is_flat
+from adapters.lidar.surfels import Surfels
 from augment.geometry import quat_from_rotmat
 from augment.render.sh import SH_C0
 from augment.scene import Gaussians

@@ -7,8 +7,8 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from adapters.lidar_split import PointSet
-from adapters.lidar_surfels import Surfels
+from adapters.lidar.split import PointSet
+from adapters.lidar.surfels import Surfels
 from augment.semantics import SemanticClass as Class
 
 WIDEST_M = 3.0  # gaps higher than this stay open

@@ -14,8 +14,8 @@ import numba
 import numpy as np
 from scipy.spatial import cKDTree
 
-from adapters.lidar_split import is_flat
-from adapters.lidar_voxels import coarse_sample
+from adapters.lidar.split import is_flat
+from adapters.lidar.voxels import coarse_sample
 from augment.semantics import SemanticClass
 
 NEIGHBOURS = 12  # nearest points, and as many again out of a coarser sample

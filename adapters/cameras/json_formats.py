@@ -11,7 +11,7 @@ from typing import Annotated, Any, TypeVar
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 
-from adapters.posed_views import PosedView, ViewSet, check_pose
+from adapters.cameras.posed_views import PosedView, ViewSet, check_pose
 from augment.errors import AdapterError
 
 Model = TypeVar("Model", bound=BaseModel)

@@ -13,13 +13,13 @@ from pathlib import Path
 
 import torch
 
-from adapters.box_tracks import join_tracks
-from adapters.image_views import View
-from adapters.lidar_scene import DrivenPath, LidarSceneOptions, build_lidar_scene
-from adapters.pandaset_files import CameraTrack, Sequence, read_sequence
-from adapters.pandaset_labels import PandaSetLabels
-from adapters.pandaset_options import PandaSetOptions
-from adapters.pandaset_sweeps import read_drive
+from adapters.lidar.box_tracks import join_tracks
+from adapters.lidar.image_views import View
+from adapters.lidar.scene import DrivenPath, LidarSceneOptions, build_lidar_scene
+from adapters.pandaset.files import CameraTrack, Sequence, read_sequence
+from adapters.pandaset.labels import PandaSetLabels
+from adapters.pandaset.options import PandaSetOptions
+from adapters.pandaset.sweeps import read_drive
 from adapters.uri import format_uri
 from augment.cameras import Camera, Frame
 from augment.errors import AdapterError
@@ -35,7 +35,7 @@ _ROWS_ABOVE_CAR = {"back_camera": 0.745}
 def open_pandaset(path: str, query: dict[str, str]) -> Scene:
     """The scene of one PandaSet sequence folder, such as `pandaset/002`.
 
-    query: frames, voxel_m, max_gaussians, image_scale, sky_size, progress; see PandaSetOptions.
+    query: frames, voxel_m, max_gaussians, image_scale, sky_size; see PandaSetOptions.
     Opening is deterministic: the same files and options give the same bits.
 
     Raises:
@@ -50,7 +50,7 @@ def open_pandaset(path: str, query: dict[str, str]) -> Scene:
             f"pandaset: frames={query.get('frames')} selects none of the {len(sequence)} frames "
             f"(0 to {len(sequence) - 1}) in {path}"
         )
-    drive = read_drive(sequence, numbers, progress=options.progress)
+    drive = read_drive(sequence, numbers)
     if sum(len(sweep) for sweep in drive.sweeps) == 0:
         raise AdapterError(
             f"{Path(path) / 'lidar'} holds no returns for frames {numbers[0]} to {numbers[-1]}; "
@@ -68,7 +68,6 @@ def open_pandaset(path: str, query: dict[str, str]) -> Scene:
             image_scale=options.image_scale,
             sky_size=options.sky_size,
             lidar_top_deg=_LIDAR_TOP_DEG,
-            progress=options.progress,
         ),
     )
     return Scene(

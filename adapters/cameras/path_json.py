@@ -21,8 +21,8 @@ from typing import Annotated
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
-from adapters.camera_json import Focal, Pixels, Pose, Vector, validate
-from adapters.posed_views import PosedView, ViewSet, check_pose, look_at_pose
+from adapters.cameras.json_formats import Focal, Pixels, Pose, Vector, validate
+from adapters.cameras.posed_views import PosedView, ViewSet, check_pose, look_at_pose
 
 Seconds = Annotated[FiniteFloat, Field(ge=-9e9, le=9e9)]  # int64 nanoseconds reach 9.2e9 s
 

@@ -1,6 +1,6 @@
 """Other cameras for a scene: from a path file, or made for a scene that has none.
 
-The path file is a camera path (`adapters.path_json`), an INRIA cameras.json, a nerfstudio
+The path file is a camera path (`adapters.cameras.path_json`), an INRIA cameras.json, a nerfstudio
 transforms.json or a COLMAP model. Its poses are in the scene's world before recentring: metres, +z
 up, `Scene.world_origin_m` not yet subtracted. Its times count from the scene's first frame, so that
 moving actors are where they were then. (Cameras in a splat file's own axes and unit belong
@@ -12,9 +12,9 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
-from adapters.camera_files import read_views
-from adapters.camera_frames import frames_from_views
-from adapters.default_paths import NO_CAMERAS, PathKind, make_default_path
+from adapters.cameras.default_paths import NO_CAMERAS, PathKind, make_default_path
+from adapters.cameras.files import read_views
+from adapters.cameras.frames import frames_from_views
 from adapters.uri import CAMERA_PATH_KEY, add_to_uri
 from adapters.world import WorldChange
 from augment.cameras import Frame
@@ -50,7 +50,7 @@ def with_camera_path(scene: Scene, path: str | Path) -> Scene:
 def default_frames(
     gaussians: Gaussians, *, is_metric: bool = True, kind: PathKind = "auto"
 ) -> tuple[tuple[Frame, ...], str]:
-    """Frames of a drive or an orbit, and a sentence that says which (adapters.default_paths)."""
+    """Frames of a drive or an orbit, and a sentence that says which."""
     made = make_default_path(gaussians, is_metric=is_metric, kind=kind)
     return frames_from_views(made.views, WorldChange())[0], made.note
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from adapters.lidar_split import PointSet
+from adapters.lidar.split import PointSet
 
 NEAR_M = 6.0  # voxels have their given size up to this distance from the path
 # Edges grow with this power of the distance: slower than a LiDAR's spacing, because a narrow camera

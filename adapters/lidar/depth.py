@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adapters.actor_motion import Motion, indices_between, inside_box
-from adapters.lidar_split import FLOOR_M, HALO_M, SKIN_M
+from adapters.lidar.actor_motion import Motion, indices_between, inside_box
+from adapters.lidar.split import FLOOR_M, HALO_M, SKIN_M
 from augment.cameras import Camera
 from augment.errors import AdapterError
 from augment.labels import LidarSweep

@@ -24,7 +24,7 @@ from pathlib import PurePosixPath
 import numpy as np
 import torch
 
-from adapters.posed_views import PosedView
+from adapters.cameras.posed_views import PosedView
 from adapters.world import WorldChange
 from augment.cameras import Camera, Frame
 from augment.errors import AdapterError

@@ -10,8 +10,8 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from adapters.lidar_split import PointSet
-from adapters.lidar_surfels import Surfels
+from adapters.lidar.split import PointSet
+from adapters.lidar.surfels import Surfels
 from augment.semantics import SemanticClass as Class
 
 _WIDEST_M = {

@@ -11,10 +11,10 @@ import cv2
 import numpy as np
 from tqdm import tqdm
 
-from adapters import lidar_kernels as kernels
-from adapters.box_tracks import ObjectTrack
-from adapters.lidar_surfels import Surfels
-from adapters.sky_from_images import SkyGatherer
+from adapters.lidar import kernels
+from adapters.lidar.box_tracks import ObjectTrack
+from adapters.lidar.sky import SkyGatherer
+from adapters.lidar.surfels import Surfels
 from augment.cameras import Camera
 
 logger = logging.getLogger(__name__)
@@ -66,7 +66,6 @@ def observe_views(
     sky: SkyGatherer,
     *,
     image_scale: float = 0.5,
-    progress: bool = False,
 ) -> tuple[tuple[Seen, ...], tuple[str, ...]]:
     """The colour of every body's surfels, and a sentence for each image that cannot be decoded.
 
@@ -78,7 +77,7 @@ def observe_views(
     names = list(dict.fromkeys(view.camera.name for view in views))
     stores = [_Store.empty(len(body.surfels)) for body in bodies]
     problems: list[str] = []
-    for view in tqdm(views, desc="colours from images", unit="image", disable=not progress):
+    for view in tqdm(views, desc="colours from images", unit="image", disable=None):
         image = read_image(view.path, image_scale)
         if image is None:
             problems.append(

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adapters.actor_motion import indices_between, inside_box
-from adapters.box_tracks import ObjectTrack
+from adapters.lidar.actor_motion import indices_between, inside_box
+from adapters.lidar.box_tracks import ObjectTrack
 from augment.semantics import SemanticClass
 
 # A moving object's returns stray from its box by timing and labelling: within this of the box a

@@ -20,7 +20,7 @@ class PandaSetOptions:
     voxel_m: edge of a voxel near the ego path, metres; it grows with the distance from it.
     max_gaussians: voxels are enlarged until the scene holds no more than about this many.
     image_scale: resolution that images are decoded at for colours and sky. sky_size: texels along
-    an edge of the sky's cube map. progress: show progress bars on stderr.
+    an edge of the sky's cube map.
     """
 
     first_frame: int = 0
@@ -29,7 +29,6 @@ class PandaSetOptions:
     max_gaussians: int = 500_000
     image_scale: float = 0.5
     sky_size: int = 768
-    progress: bool = False
 
     @staticmethod
     def from_query(query: dict[str, str]) -> PandaSetOptions:
@@ -87,18 +86,10 @@ def _scale(key: str, text: str) -> dict[str, Any]:
     return {key: float(text)}
 
 
-def _flag(key: str, text: str) -> dict[str, Any]:
-    values = {"1": True, "true": True, "0": False, "false": False}
-    if text.lower() not in values:
-        raise ValueError(text)
-    return {key: values[text.lower()]}
-
-
 _KEYS: dict[str, tuple[Callable[[str, str], dict[str, Any]], str]] = {
     "frames": (_frames, "first:stop, frame numbers with stop excluded, either side may be empty"),
     "voxel_m": (_voxel, "a number of metres from 0.01 to 2"),
     "max_gaussians": (_integer(1_000, 20_000_000), "an integer from 1000 to 20000000"),
     "image_scale": (_scale, "one of 1, 0.5, 0.25, 0.125"),
     "sky_size": (_integer(8, 4096), "an integer from 8 to 4096"),
-    "progress": (_flag, "true or false"),
 }

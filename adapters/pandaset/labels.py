@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from adapters.pandaset_files import LIDAR_COLUMNS, read_cuboids, read_lidar, read_semantics
+from adapters.pandaset.files import LIDAR_COLUMNS, read_cuboids, read_lidar, read_semantics
 from augment.errors import AdapterError
 from augment.labels import Boxes, LidarSweep
 from augment.semantics import SemanticClass

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from adapters.actor_motion import Motion
+from adapters.lidar.actor_motion import Motion
 from augment.geometry import quat_from_rotmat, rigid, rotmat_from_quat
 from augment.scene import Track
 

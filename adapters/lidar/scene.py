@@ -9,17 +9,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adapters.actor_motion import indices_between
-from adapters.box_tracks import ObjectTrack
-from adapters.ground_fill import fill_ground
-from adapters.image_views import Body, Seen, View, observe_views
-from adapters.lidar_bridges import bridge_gaps
-from adapters.lidar_init import borrow_colours, gaussians_from_surfels
-from adapters.lidar_split import PointSet, Sweep, is_flat, split_sweeps
-from adapters.lidar_surfels import Surfels, surfels_from_points
-from adapters.lidar_voxels import thin_points
-from adapters.sky_from_images import SkyGatherer
-from adapters.wall_fill import fill_walls
+from adapters.lidar.actor_motion import indices_between
+from adapters.lidar.box_tracks import ObjectTrack
+from adapters.lidar.bridges import bridge_gaps
+from adapters.lidar.ground_fill import fill_ground
+from adapters.lidar.image_views import Body, Seen, View, observe_views
+from adapters.lidar.initialise import borrow_colours, gaussians_from_surfels
+from adapters.lidar.sky import SkyGatherer
+from adapters.lidar.split import PointSet, Sweep, is_flat, split_sweeps
+from adapters.lidar.surfels import Surfels, surfels_from_points
+from adapters.lidar.voxels import thin_points
+from adapters.lidar.wall_fill import fill_walls
 from augment.scene import Actor, Gaussians
 from augment.semantics import SemanticClass
 from augment.sky import CubemapSky
@@ -49,7 +49,7 @@ class DrivenPath:
 class LidarSceneOptions:
     """voxel_m: edge of a voxel near the path. max_gaussians: voxels grow until no more are needed.
     image_scale: 1, 1/2, 1/4 or 1/8. sky_size: texels along a cube edge. lidar_top_deg: highest
-    elevation that the LiDAR looks at. progress: bars on stderr.
+    elevation that the LiDAR looks at.
     """
 
     voxel_m: float = 0.04
@@ -57,7 +57,6 @@ class LidarSceneOptions:
     image_scale: float = 0.5
     sky_size: int = 768
     lidar_top_deg: float = 15.0
-    progress: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,9 +91,7 @@ def build_lidar_scene(
         for (_, _, surfels), track in zip(thinned, [None, *tracks], strict=True)
     ]
     gatherer = SkyGatherer(options.sky_size, math.radians(options.lidar_top_deg))
-    seen, problems = observe_views(
-        bodies, views, gatherer, image_scale=options.image_scale, progress=options.progress
-    )
+    seen, problems = observe_views(bodies, views, gatherer, image_scale=options.image_scale)
     gaussians = [
         _finish(points, edges, surfels, colours)
         for (points, edges, surfels), colours in zip(thinned, seen, strict=True)

@@ -9,8 +9,8 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
-from adapters.lidar_split import PointSet, is_flat
-from adapters.lidar_voxels import edges_at
+from adapters.lidar.split import PointSet, is_flat
+from adapters.lidar.voxels import edges_at
 from augment.semantics import SemanticClass
 
 CELL_M = 0.25

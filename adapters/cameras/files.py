@@ -1,17 +1,17 @@
 """Camera files: which there are, which lies beside a scene, and their views.
 
 Read are INRIA's cameras.json, nerfstudio's transforms.json, this project's camera paths
-(`adapters.path_json`) and COLMAP sparse models, all told apart by their contents.
+(`adapters.cameras.path_json`) and COLMAP sparse models, all told apart by their contents.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from adapters.camera_json import inria_views, load_json, nerfstudio_views
-from adapters.colmap_cameras import find_colmap_model, read_colmap_views
-from adapters.path_json import path_views
-from adapters.posed_views import ViewSet
+from adapters.cameras.colmap import find_colmap_model, read_colmap_views
+from adapters.cameras.json_formats import inria_views, load_json, nerfstudio_views
+from adapters.cameras.path_json import path_views
+from adapters.cameras.posed_views import ViewSet
 from augment.errors import AdapterError
 
 _JSON_NAMES = ("cameras.json", "transforms.json")

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from adapters.camera_json import distortion_problem
-from adapters.posed_views import PosedView, ViewSet, check_pose
+from adapters.cameras.json_formats import distortion_problem
+from adapters.cameras.posed_views import PosedView, ViewSet, check_pose
 from augment.errors import AdapterError
 
 _MODEL_FOLDERS = (".", "sparse/0", "sparse", "colmap/sparse/0")

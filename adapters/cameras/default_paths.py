@@ -14,8 +14,8 @@ from typing import Literal
 
 import numpy as np
 
-from adapters.ground_estimate import GroundGrid, ground_grid, solid_points_and_areas
-from adapters.posed_views import PosedView, look_at_pose
+from adapters.cameras.ground_estimate import GroundGrid, ground_grid, solid_points_and_areas
+from adapters.cameras.posed_views import PosedView, look_at_pose
 from augment.scene import Gaussians
 
 PathKind = Literal["auto", "drive", "orbit"]

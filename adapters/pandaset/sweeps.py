@@ -10,11 +10,11 @@ import pandas as pd
 import torch
 from tqdm import tqdm
 
-from adapters.actor_motion import indices_between, inside_box
-from adapters.box_tracks import BoxSample
-from adapters.lidar_split import Sweep
-from adapters.pandaset_files import Sequence, read_cuboids, read_lidar, read_semantics
-from adapters.pandaset_labels import NO_SURFACE, boxes_of_cuboids, semantic_table
+from adapters.lidar.actor_motion import indices_between, inside_box
+from adapters.lidar.box_tracks import BoxSample
+from adapters.lidar.split import Sweep
+from adapters.pandaset.files import Sequence, read_cuboids, read_lidar, read_semantics
+from adapters.pandaset.labels import NO_SURFACE, boxes_of_cuboids, semantic_table
 from augment.geometry import rotmat_from_quat
 from augment.semantics import SemanticClass
 
@@ -37,7 +37,7 @@ class Drive:
     problems: tuple[str, ...]
 
 
-def read_drive(sequence: Sequence, frames: Seq[int], *, progress: bool = False) -> Drive:
+def read_drive(sequence: Sequence, frames: Seq[int]) -> Drive:
     """Sweeps and moving boxes of the given frames.
 
     Left out: returns of smoke, exhaust, spray and mirror images, and of the recording car itself.
@@ -47,7 +47,7 @@ def read_drive(sequence: Sequence, frames: Seq[int], *, progress: bool = False) 
     sweeps, samples, problems = [], [], []
     cuboids = {frame: read_cuboids(sequence.root, frame) for frame in frames}
     moving = _moving_ids([c for c in cuboids.values() if c is not None])
-    for frame in tqdm(frames, desc="LiDAR", unit="frame", disable=not progress):
+    for frame in tqdm(frames, desc="LiDAR", unit="frame", disable=None):
         lidar = read_lidar(sequence.root, frame)
         if lidar is None:
             problems.append(f"frame {frame}: lidar/{frame:02d}.pkl.gz is missing, its points too")
