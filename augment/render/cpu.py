@@ -188,9 +188,10 @@ def _project(
 
 def _sort(splats: _Splats, first_bin: int, scratch: Scratch) -> tuple[np.ndarray, np.ndarray]:
     """Slots nearest first (ties in index order), and their tiles in that order."""
-    heads = scratch.array("bin_heads", splats.counts.shape, np.int64)
-    starts = scratch.array("bin_starts", (splats.counts.shape[1] + 1,), np.int64)
-    count = int(cpu_bin.place_bins(splats.counts, heads, starts))
+    # Bin after bin, and in each of them block after block.
+    starts = np.append(0, splats.counts.sum(0, dtype=np.int64).cumsum())
+    heads = starts[:-1] + splats.counts.cumsum(0, dtype=np.int64) - splats.counts
+    count = int(starts[-1])
     keys, spare_keys = (scratch.array(f"sorted_keys{i}", (count,), np.uint32) for i in range(2))
     slots, spare_slots = (scratch.array(f"sorted_slots{i}", (count,), np.int32) for i in range(2))
     rects = scratch.array("sorted_rects", (count,), np.uint64)
@@ -245,8 +246,7 @@ class _Tiles:
         """Blend splats, nearest first, into the open tiles; is_last closes them all."""
         first, count = 0, len(slots)
         while True:
-            end = int(cpu_bin.next_cut(rects, first, _MAX_PAIRS))
-            members, starts = self._list(slots, rects, first, end)
+            end, members, starts = self._list(slots, rects, first)
             clock.lap("bin")
             clock.count("pairs", len(members))
             cpu_blend.blend_tiles(
@@ -266,28 +266,39 @@ class _Tiles:
                 return
 
     def _list(
-        self, slots: np.ndarray, rects: np.ndarray, first: int, end: int
-    ) -> tuple[np.ndarray, np.ndarray]:
-        threads = thread_count()
-        corners = self._scratch.array(
-            "corners", (threads, (self._rows + 1) * (self._columns + 1)), np.int32
-        )
+        self, slots: np.ndarray, rects: np.ndarray, first: int
+    ) -> tuple[int, np.ndarray, np.ndarray]:
+        """Lists of every open tile's splats, nearest first, from the splat `first` on.
+
+        Returns where they stop, which is before the end where they would be too long, the lists
+        one after the other, and where each begins.
+        """
+        end = len(slots)
+        counts = self._count(rects, first, end)
+        if counts.sum() > _MAX_PAIRS:
+            end = first + _splats_in(rects[first:], _MAX_PAIRS)
+            counts = self._count(rects, first, end)
+        starts = np.append(0, np.cumsum(counts))
+        heads = np.where(self.open != cpu_blend.CLOSED, starts[:-1], -1)
+        members = self._scratch.array("members", (int(starts[-1]),), np.int32)
+        bands = min(self._rows, 2 * thread_count())
+        cpu_bin.fill_lists(slots, rects, first, end, self._columns, heads, members, bands)
+        return end, members, starts
+
+    def _count(self, rects: np.ndarray, first: int, end: int) -> np.ndarray:
+        """int64 [tiles]: splats [first, end) in each; none in closed tiles."""
+        shape = (self._rows + 1, self._columns + 1)
+        corners = self._scratch.array("corners", (thread_count(), shape[0] * shape[1]), np.int32)
         cpu_bin.count_corners(rects, first, end, self._columns, corners)
-        heads = self._scratch.array("heads", (self._rows, self._columns), np.int64)
-        starts = self._scratch.array("starts", (len(self.open) + 1,), np.int64)
-        pairs = int(cpu_bin.place_lists(corners, self.open, heads, starts))
-        members = self._scratch.array("members", (pairs,), np.int32)
-        cpu_bin.fill_lists(
-            slots,
-            rects,
-            first,
-            end,
-            self._columns,
-            heads.reshape(-1),
-            members,
-            min(self._rows, 4 * threads),
-        )
-        return members, starts
+        totals = corners.sum(0, dtype=np.int64).reshape(shape).cumsum(0).cumsum(1)
+        return np.where(self.open != cpu_blend.CLOSED, totals[:-1, :-1].reshape(-1), 0)
+
+
+def _splats_in(rects: np.ndarray, limit: int) -> int:
+    """How many splats in turn touch no more than `limit` tiles; at least one."""
+    corners = rects.view(np.uint16).reshape(-1, 4).astype(np.int64)  # as cpu_bin unpacks them
+    tiles = (corners[:, 2] - corners[:, 0] + 1) * (corners[:, 3] - corners[:, 1] + 1)
+    return max(1, int(np.searchsorted(tiles.cumsum(), limit, side="right")))
 
 
 def warm_up() -> float:

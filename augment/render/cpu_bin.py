@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numba import prange
 
-from augment.render.cpu_jit import inner, kernel, serial_kernel
+from augment.render.cpu_jit import inner, kernel
 from augment.render.cpu_layout import BIN_SHIFT, BLOCK, U
 
 _DIGIT_BITS = BIN_SHIFT // 2  # what z bins leave to sort, in two passes
@@ -17,27 +17,12 @@ _DIGITS = 1 << _DIGIT_BITS
 _FEW = 32  # splats sorted faster by insertion
 
 
-@serial_kernel()
-def place_bins(counts, heads, bin_starts):
-    """Where each block writes its splats of each bin. counts, heads: int32 and int64 [B, Z].
-
-    bin_starts: int64 [Z + 1]. Returns the number of splats.
-    """
-    at = np.int64(0)
-    for z_bin in range(counts.shape[1]):
-        bin_starts[z_bin] = at
-        for block in range(counts.shape[0]):
-            heads[block, z_bin] = at
-            at += counts[block, z_bin]
-    bin_starts[counts.shape[1]] = at
-    return at
-
-
 @kernel()
 def scatter_to_bins(keys, found, first_bin, heads, binned_keys, binned_slots):
     """Copy every block's keys, and the slots they stand for, to their bins.
 
-    keys: uint32 [B BLOCK], bits of z; found: int64 [B], how many each block has.
+    keys: uint32 [B BLOCK], bits of z. found: int64 [B], how many each block has. heads: int64
+    [B, Z], where each block writes its splats of each bin; used up.
     """
     for block in prange(found.size):
         for i in range(found[block]):
@@ -52,7 +37,7 @@ def scatter_to_bins(keys, found, first_bin, heads, binned_keys, binned_slots):
 
 @kernel()
 def sort_bins(bin_starts, keys, slots, rects, spare_keys, spare_slots, sorted_rects):
-    """Sort every bin by key, and gather the splats' tiles in the same order."""
+    """Sort every bin [bin_starts[z], bin_starts[z + 1]) by key; gather the splats' tiles alike."""
     for z_bin in prange(bin_starts.size - 1):
         first, last = bin_starts[z_bin], bin_starts[z_bin + 1]
         if last - first <= _FEW:
@@ -104,21 +89,6 @@ def _unpack(rect):
     return rect & mask, (rect >> U(16)) & mask, (rect >> U(32)) & mask, rect >> U(48)
 
 
-@serial_kernel()
-def next_cut(sorted_rects, first, limit):
-    """Past the last splat for which those from `first` on make no more than `limit` pairs.
-
-    At least one splat, whatever it covers.
-    """
-    pairs = U(0)
-    for i in range(first, sorted_rects.size):
-        c0, r0, c1, r1 = _unpack(sorted_rects[i])
-        pairs += (c1 - c0 + U(1)) * (r1 - r0 + U(1))
-        if pairs > U(limit) and i > first:
-            return i
-    return sorted_rects.size
-
-
 @kernel()
 def count_corners(sorted_rects, first, last, columns, corners):
     """Where rectangles of tiles begin and end: +1 and -1 at the corners of each.
@@ -142,34 +112,11 @@ def count_corners(sorted_rects, first, last, columns, corners):
             own[bottom + c1 + U(1)] += 1
 
 
-@serial_kernel()
-def place_lists(corners, tiles, heads, starts):
-    """Where every tile's list begins: starts, int64 [tiles + 1]; closed tiles have none.
-
-    heads, int64 [tiles]: where to write its next splat, negative for closed tiles. Returns the
-    number of pairs.
-    """
-    runs, width = corners.shape[0], heads.shape[1] + 1
-    at = np.int64(0)
-    above = np.zeros(width, np.int64)
-    for row in range(heads.shape[0]):
-        left = np.int64(0)
-        for column in range(heads.shape[1]):
-            for run in range(runs):
-                left += corners[run, row * width + column]
-            above[column] += left
-            tile = row * heads.shape[1] + column
-            starts[tile] = at
-            heads[row, column] = at if tiles[tile] else -1
-            at += above[column] if tiles[tile] else 0
-    starts[heads.size] = at
-    return at
-
-
 @kernel()
 def fill_lists(slots, sorted_rects, first, last, columns, heads, members, bands):
-    """Slots of every open tile's splats, nearest first. heads: flat; bands of rows share the work.
+    """Slots of every open tile's splats, nearest first. Bands of rows share the work.
 
+    heads: int64 [tiles], where each tile's list begins; negative where it has none; used up.
     A thread looks at every splat but writes its own tiles only, so lists stay in order and in its
     cache.
     """

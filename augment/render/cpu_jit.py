@@ -13,6 +13,5 @@ import numba
 _COMMON = {"nogil": True, "error_model": "numpy"}
 
 kernel = functools.partial(numba.njit, parallel=True, cache=True, **_COMMON)  # launched from Python
-serial_kernel = functools.partial(numba.njit, cache=True, **_COMMON)
 # Called by kernels only, which keep its code in their own cache files.
 inner = functools.partial(numba.njit, no_cpython_wrapper=True, no_cfunc_wrapper=True, **_COMMON)
