@@ -201,7 +201,7 @@ def open_with_path(uri: str, camera_path: Path | None) -> Scene:
     scene = open_scene(uri)
     if camera_path is None:
         return scene
-    from adapters.camera_paths import with_camera_path
+    from adapters.cameras.paths import with_camera_path
 
     return with_camera_path(scene, camera_path)
 

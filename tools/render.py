@@ -119,7 +119,7 @@ def parse_frames(text: str) -> tuple[int, ...] | None:
 def _frames_of(camera_path: Path | None, scene: Scene):
     if camera_path is None:
         return None
-    from adapters.camera_paths import frames_from_path_file
+    from adapters.cameras.paths import frames_from_path_file
 
     return frames_from_path_file(camera_path, scene)
 
