@@ -53,7 +53,7 @@ def draw_sheet(out: Path, frame: int | None = None) -> Path:
     return path
 
 
-def draw_video(out: Path, camera: str, frames_per_second: float = 10.0, width: int = 1280) -> Path:
+def draw_video(out: Path, camera: str, frames_per_second: float = 10.0, width: int = 1440) -> Path:
     """Writes OUT/video_<camera>.mp4: all scenes and variants side by side, frame by frame."""
     rows = [row for row in read_rows(out) if row["camera"] == camera]
     by_key = {(row["scene"], row["variant"], row["frame"]): row for row in rows}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -41,8 +42,8 @@ def contact_sheet(rows: Sequence[tuple[str, Sequence[tuple[str, np.ndarray]]]]) 
 
 
 def side_by_side(images: Sequence[tuple[str, np.ndarray]], width: int) -> np.ndarray:
-    """Images of equal size in a grid of at most two columns, each named in its corner."""
-    columns = 1 if len(images) == 1 else 2
+    """Images of equal size in a row of up to three, else in a square grid, each named."""
+    columns = len(images) if len(images) <= 3 else math.ceil(math.sqrt(len(images)))
     source_height, source_width = images[0][1].shape[:2]
     cell_width = width // columns // 2 * 2
     cell_height = (
@@ -54,8 +55,8 @@ def side_by_side(images: Sequence[tuple[str, np.ndarray]], width: int) -> np.nda
         top, left = number // columns * cell_height, number % columns * cell_width
         small = cv2.resize(image, (cell_width, cell_height), interpolation=cv2.INTER_AREA)
         canvas[top : top + cell_height, left : left + cell_width] = small
-        _write(canvas, caption, left + 9, top + 23, 0.6, (0, 0, 0), 3)
-        _write(canvas, caption, left + 8, top + 22, 0.6, (255, 255, 255))
+        _write(canvas, caption, left + 9, top + 23, 0.55, (0, 0, 0))
+        _write(canvas, caption, left + 8, top + 22, 0.55, (255, 255, 255))
     return canvas
 
 
@@ -121,6 +122,5 @@ def _write(
     y: int,
     size: float,
     color: tuple[int, int, int],
-    thickness: int = 1,
 ) -> None:
-    cv2.putText(image, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, size, color, thickness, cv2.LINE_AA)
+    cv2.putText(image, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, size, color, 1, cv2.LINE_AA)
