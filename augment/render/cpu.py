@@ -262,7 +262,7 @@ class _Tiles:
             )
             clock.lap("raster")
             first = end
-            if first == count:
+            if first == count or not self.open.any():
                 return
 
     def _list(

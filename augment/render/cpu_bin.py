@@ -17,7 +17,7 @@ _DIGITS = 1 << _DIGIT_BITS
 _FEW = 32  # splats sorted faster by insertion
 
 
-@kernel()
+@kernel
 def scatter_to_bins(keys, found, first_bin, heads, binned_keys, binned_slots):
     """Copy every block's keys, and the slots they stand for, to their bins.
 
@@ -35,7 +35,7 @@ def scatter_to_bins(keys, found, first_bin, heads, binned_keys, binned_slots):
             binned_slots[at] = slot
 
 
-@kernel()
+@kernel
 def sort_bins(bin_starts, keys, slots, rects, spare_keys, spare_slots, sorted_rects):
     """Sort every bin [bin_starts[z], bin_starts[z + 1]) by key; gather the splats' tiles alike."""
     for z_bin in prange(bin_starts.size - 1):
@@ -89,7 +89,7 @@ def _unpack(rect):
     return rect & mask, (rect >> U(16)) & mask, (rect >> U(32)) & mask, rect >> U(48)
 
 
-@kernel()
+@kernel
 def count_corners(sorted_rects, first, last, columns, corners):
     """Where rectangles of tiles begin and end: +1 and -1 at the corners of each.
 
@@ -112,7 +112,7 @@ def count_corners(sorted_rects, first, last, columns, corners):
             own[bottom + c1 + U(1)] += 1
 
 
-@kernel()
+@kernel
 def fill_lists(slots, sorted_rects, first, last, columns, heads, members, bands):
     """Slots of every open tile's splats, nearest first. Bands of rows share the work.
 

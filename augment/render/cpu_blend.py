@@ -1,52 +1,39 @@
 """Numba kernels: blend every tile's splats front to back.
 
-A tile is worked on in strips one register wide. For a batch of splats, the rows in which each
-ellipse meets the strip are found first (an interval: both are convex), then turned into a flat list
-of (row, splat) items, and one loop without branches blends the items. Strips shrink to the rows in
-which a pixel still lets light through, and a tile ends where none does.
+Batch by batch of a tile's list, strip by strip, the items of cpu_items are blended in turn. Strips
+shrink to the rows in which a pixel still lets light through, and a tile ends where none does.
 
 Images that are not asked for are None, which the compiler turns into no code at all.
 """
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numba import prange
 
 from augment.render import cpu_simd as v8
 from augment.render.constants import DEPTH_EPS
+from augment.render.cpu_items import BATCH, ITEMS, find_spans, list_items, stage
 from augment.render.cpu_jit import inner, kernel
 from augment.render.cpu_layout import (
     BLUE,
-    BLUNT_Y,
     DEPTH,
-    FALL_X,
-    FALL_Y,
     GREEN,
     LANES,
-    LEAN_X,
-    LEAN_Y,
-    LOG_OPACITY,
-    MEAN_X,
-    MEAN_Y,
     PIXELS,
-    RADIUS_Y,
     RECORD,
     RED,
     SHARP_X,
     SPLAT_ID,
+    STRIP,
+    STRIPS,
     TILE_H,
     TILE_W,
     U,
 )
-from augment.render.cpu_math import exp2, fmuladd
+from augment.render.cpu_math import exp2
 
-BATCH = 32  # splats between two looks at what is still open
 GROUP = 8  # tiles a thread takes at a time
-STRIPS = TILE_W // LANES
-STRIP = TILE_H * LANES  # pixels
 
 # Planes of a tile's state, PIXELS float32 each, strip after strip, row after row. The transmittance
 # is negative where blending has stopped; its size is then the final one.
@@ -54,10 +41,9 @@ THROUGH, P_RED, P_GREEN, P_BLUE, P_DEPTH, P_MEDIAN, P_BEST, P_ID = (U(i * PIXELS
 STATE, COLOR_STATE = 8 * PIXELS, 4 * PIXELS  # all planes; those of colour and alpha alone
 
 CLOSED, OPEN, FRESH = 0, 1, 2  # a tile: finished, begun, not begun
-_ITEMS = BATCH * TILE_H + TILE_H
 
 
-@kernel()
+@kernel
 def blend_tiles(
     records,
     members,
@@ -86,8 +72,8 @@ def blend_tiles(
         state = np.empty(STATE, np.float32)
         staged = np.empty(RECORD * BATCH, np.float32)
         spans = np.empty(2 * BATCH, np.int32)
-        values = np.empty(2 * _ITEMS, np.float32)
-        places = np.empty(2 * _ITEMS, np.int32)
+        values = np.empty(2 * ITEMS, np.float32)
+        places = np.empty(2 * ITEMS, np.int32)
         rows = np.empty(2 * STRIPS, np.int64)
         for tile in range(group * GROUP, min((group + 1) * GROUP, tiles.size)):
             first, last = starts[tile], starts[tile + 1]
@@ -161,12 +147,12 @@ def _blend_list(
         count = min(BATCH, last - at)
         for k in range(U(at + count), U(min(at + 2 * BATCH, last))):
             v8.prefetch(records, U(members[k]) * U(RECORD))
-        _stage(records, members, U(at), U(count), left, top, rgb, expected, median, ids, staged)
+        stage(records, members, U(at), U(count), left, top, rgb, expected, median, ids, staged)
         for strip in range(STRIPS):
             if rows[2 * strip] >= rows[2 * strip + 1]:
                 continue
-            _find_spans(staged, U(count), strip, rows, limits[1], spans)
-            items = _list_items(staged, U(count), strip, spans, values, places)
+            find_spans(staged, U(count), strip, rows, limits[1], spans)
+            items = list_items(staged, U(count), strip, spans, values, places)
             if items == U(0):
                 continue
             if (median is not None or ids is not None) and _can_change(
@@ -222,88 +208,6 @@ def _shrink(state, strip, rows):
 
 
 @inner()
-def _stage(records, members, at, count, left, top, rgb, expected, median, ids, staged):
-    """Records of a batch, turned to one row a field, relative to the tile's corner."""
-    n = U(BATCH)
-    for k in range(count):
-        record = U(members[at + k]) * U(RECORD)
-        staged[U(MEAN_X) * n + k] = records[record + U(MEAN_X)] - left
-        staged[U(MEAN_Y) * n + k] = records[record + U(MEAN_Y)] - top
-        for field in range(U(LEAN_X), U(BLUNT_Y + 1)):
-            staged[field * n + k] = records[record + field]
-        if expected is not None or median is not None:
-            staged[U(DEPTH) * n + k] = records[record + U(DEPTH)]
-        if ids is not None:
-            staged[U(SPLAT_ID) * n + k] = records[record + U(SPLAT_ID)]
-        if rgb is not None:
-            staged[U(RED) * n + k] = records[record + U(RED)]
-            staged[U(GREEN) * n + k] = records[record + U(GREEN)]
-            staged[U(BLUE) * n + k] = records[record + U(BLUE)]
-
-
-@inner()
-def _find_spans(staged, count, strip, rows, log_cut, spans):
-    """Rows in which each ellipse meets the strip: first, and one past the last.
-
-    An ellipse is highest where its ridge says (LEAN_X RADIUS_Y from its mean), or, where that
-    column lies outside the strip, in the strip's nearest column.
-    """
-    zero, half = np.float32(0), np.float32(0.5)
-    n = U(BATCH)
-    west = np.float32(strip * LANES) + half
-    east = west + np.float32(LANES - 1)
-    low, high = np.float32(rows[2 * strip]), np.float32(rows[2 * strip + 1])
-    for k in range(count):
-        mean_x, mean_y = staged[k], staged[n + k]
-        budget = staged[U(LOG_OPACITY) * n + k] - log_cut
-        top = staged[U(LEAN_X) * n + k] * staged[U(RADIUS_Y) * n + k]
-        fall, lean = staged[U(FALL_X) * n + k], staged[U(LEAN_Y) * n + k]
-        blunt = staged[U(BLUNT_Y) * n + k]
-        d = min(max(top, west - mean_x), east - mean_x)
-        left_over = fmuladd(-fall * d, d, budget)
-        reach = math.sqrt(max(left_over, zero)) * blunt
-        end = fmuladd(lean, d, mean_y) + reach + half
-        end = end if left_over >= zero else zero
-        d = min(max(-top, west - mean_x), east - mean_x)
-        left_over = fmuladd(-fall * d, d, budget)
-        reach = math.sqrt(max(left_over, zero)) * blunt
-        begin = min(max(fmuladd(lean, d, mean_y) - reach + half, low), high)
-        spans[k] = np.int32(begin)
-        spans[n + k] = np.int32(max(min(end, high), begin))
-
-
-@inner()
-def _list_items(staged, count, strip, spans, values, places):
-    """One item for every (row, splat), in the order of the splats; returns how many.
-
-    An item says where its row of pixels stands in the state, which splat it is, the log2 of alpha
-    on the splat's ridge in that row, and how many (sharp) pixels the row's first one is off it.
-    A tile's height is always written and the surplus overwritten, which needs no branch.
-    """
-    n, items = U(BATCH), U(0)
-    half = np.float32(0.5)
-    first_x = np.float32(strip * LANES) + half
-    for k in range(count):
-        row, end = spans[k], spans[n + k]
-        sharp = staged[U(SHARP_X) * n + k]
-        fall = v8.splat(-staged[U(FALL_Y) * n + k])
-        peak = v8.splat(staged[U(LOG_OPACITY) * n + k])
-        start = v8.splat(sharp * (first_x - staged[k]))
-        step = v8.splat(-sharp * staged[U(LEAN_X) * n + k])
-        y = np.float32(row) + half - staged[n + k]
-        place = np.int32(strip * STRIP) + row * np.int32(LANES)
-        for j in range(0, TILE_H, LANES):
-            dy = v8.lane_numbers() + v8.splat(y + np.float32(j))
-            at = items + U(j)
-            v8.store(values, at, v8.fmuladd(fall * dy, dy, peak))
-            v8.store(values, at + U(_ITEMS), v8.fmuladd(step, dy, start))
-            v8.store_ramp(places, at, np.int32(k), np.int32(0))
-            v8.store_ramp(places, at + U(_ITEMS), np.int32(place + j * LANES), np.int32(LANES))
-        items += U(end - row)
-    return items
-
-
-@inner()
 def _blend_items(state, staged, values, places, items, limits, rgb, expected, median, ids):
     """Blend all items in turn. The next one's alpha is begun before this one is blended."""
     alpha_max, log_cut = v8.splat(limits[0]), v8.splat(limits[1])
@@ -315,7 +219,7 @@ def _blend_items(state, staged, values, places, items, limits, rgb, expected, me
     for item in range(items):
         following = U(places[item + U(1)])
         next_alpha = _alpha(staged, values, following, item + U(1), alpha_max, log_cut)
-        at = U(places[item + U(_ITEMS)])
+        at = U(places[item + U(ITEMS)])
         through = v8.load(state, at)
         weight = alpha * through
         after = through - weight
@@ -345,7 +249,7 @@ def _blend_items(state, staged, values, places, items, limits, rgb, expected, me
 @inner()
 def _alpha(staged, values, splat, item, alpha_max, log_cut):
     sharp = v8.splat(staged[U(SHARP_X) * U(BATCH) + splat])
-    off = v8.fmuladd(sharp, v8.lane_numbers(), v8.splat(values[item + U(_ITEMS)]))
+    off = v8.fmuladd(sharp, v8.lane_numbers(), v8.splat(values[item + U(ITEMS)]))
     e = v8.fmuladd(v8.negate(off), off, v8.splat(values[item]))
     alpha = v8.minimum(exp2(e), alpha_max)
     return v8.select(v8.at_least(e, log_cut), alpha, v8.splat(np.float32(0)))

@@ -16,9 +16,10 @@ BLOCK = 2048
 BIN_SHIFT = 18  # z is counted in bins of its float32 pattern without these low bits: 3 % wide
 BINS = 0x7F800000 >> BIN_SHIFT
 
-# A tile is TILE_W / LANES strips of one register's width.
 TILE_W, TILE_H = 16, 16
 PIXELS = TILE_W * TILE_H
+STRIPS = TILE_W // LANES  # of a tile, each one register wide
+STRIP = TILE_H * LANES  # pixels of a strip
 
 # A splat's record: RECORD float32, one cache line. With u = x - MEAN_X - LEAN_X (y - MEAN_Y),
 # pixels, the log2 of its alpha is

@@ -14,6 +14,7 @@ from numba import prange
 
 from augment.render import cpu_simd as v8
 from augment.render.cpu_color import COLOR_ROWS, prepare_colors, write_color
+from augment.render.cpu_geometry import from_eye, gather3, image_covariance, to_camera, to_image
 from augment.render.cpu_jit import inner, kernel
 from augment.render.cpu_layout import (
     BIN_SHIFT,
@@ -40,15 +41,10 @@ from augment.render.cpu_layout import (
     TILE_W,
     V_ALPHA_MIN,
     V_BLUR,
-    V_CENTRE,
-    V_EYE,
     V_FOCAL,
     V_GAIN,
-    V_HIGH,
     V_LOG_CUT,
-    V_LOW,
     V_NEAR,
-    V_ROTATION,
     V_SIZE,
     U,
 )
@@ -62,7 +58,7 @@ _ROWS = _FIELDS + DEPTH + 1
 _HUGE = np.float32(1e37)  # px^2; beyond it float32 overflows, and no pixel could tell
 
 
-@kernel()
+@kernel
 def rank_splats(addresses, sizes, views, blocks, depths, histograms):
     """z of every Gaussian that may be seen, 0 for the others, and where along z the image is paid.
 
@@ -101,11 +97,11 @@ def rank_splats(addresses, sizes, views, blocks, depths, histograms):
 @inner()
 def _rank_eight(means, scales, opacities, view, picked, depths, at, areas):
     zero, two = v8.splat(np.float32(0)), v8.splat(np.float32(2))
-    d = _from_eye(means, picked, U(0), view)
-    x, y, z = _to_camera(d, view)
+    d = from_eye(means, picked, U(0), view)
+    x, y, z = to_camera(d, view)
     inverse = v8.splat(np.float32(1)) / z
-    x, y = _to_image(x, y, inverse, view)
-    s0, s1, s2 = _gather3(scales, picked, U(0))
+    x, y = to_image(x, y, inverse, view)
+    s0, s1, s2 = gather3(scales, picked, U(0))
     opacity = v8.gather(opacities, picked, U(0), U(1), U(0))
     # No direction of an ellipsoid is longer than its longest axis, and no blur wider than 2 px.
     reach = v8.maximum(s0, v8.maximum(s1, s2)) * inverse
@@ -127,50 +123,7 @@ def _rank_eight(means, scales, opacities, view, picked, depths, at, areas):
     v8.store(areas, U(0), v8.minimum(area, v8.splat(view[V_SIZE] * view[V_SIZE + 1])))
 
 
-@inner()
-def _gather3(array, picked, at):
-    """Rows of a [N, 3] array."""
-    first = v8.gather(array, picked, at, U(3), U(0))
-    second = v8.gather(array, picked, at, U(3), U(1))
-    return first, second, v8.gather(array, picked, at, U(3), U(2))
-
-
-@inner()
-def _from_eye(means, picked, at, view):
-    """Means minus the camera's centre, in the part's axes: first, so that digits are kept."""
-    x, y, z = _gather3(means, picked, at)
-    x = x - v8.splat(view[V_EYE]) - v8.splat(view[V_EYE + 3])
-    y = y - v8.splat(view[V_EYE + 1]) - v8.splat(view[V_EYE + 4])
-    z = z - v8.splat(view[V_EYE + 2]) - v8.splat(view[V_EYE + 5])
-    return x, y, z
-
-
-@inner()
-def _dot(ax, ay, az, bx, by, bz):
-    return v8.fmuladd(ax, bx, v8.fmuladd(ay, by, az * bz))
-
-
-@inner()
-def _rotation_row(view, row):
-    at = U(V_ROTATION) + U(3) * row
-    return v8.splat(view[at]), v8.splat(view[at + U(1)]), v8.splat(view[at + U(2)])
-
-
-@inner()
-def _to_camera(d, view):
-    r, s, t = _rotation_row(view, U(0)), _rotation_row(view, U(1)), _rotation_row(view, U(2))
-    x = _dot(r[0], r[1], r[2], d[0], d[1], d[2])
-    y = _dot(s[0], s[1], s[2], d[0], d[1], d[2])
-    return x, y, _dot(t[0], t[1], t[2], d[0], d[1], d[2])
-
-
-@inner()
-def _to_image(x, y, inverse, view):
-    x = v8.fmuladd(v8.splat(view[V_FOCAL]) * x, inverse, v8.splat(view[V_CENTRE]))
-    return x, v8.fmuladd(v8.splat(view[V_FOCAL + 1]) * y, inverse, v8.splat(view[V_CENTRE + 1]))
-
-
-@kernel()
+@kernel
 def project_slice(
     addresses,
     sizes,
@@ -271,12 +224,12 @@ def _write_record(rows, lane, number, records, record):
 @inner()
 def _project_eight(means, quats, scales, opacities, view, picked, at, functions, modes, rows):
     """Records, pixel boxes and colour rows of eight Gaussians, side by side in `rows`."""
-    d = _from_eye(means, picked, at, view)
+    d = from_eye(means, picked, at, view)
     if modes[M_COLOR]:
         prepare_colors(d[0], d[1], d[2], view, functions, modes[M_SMOG], rows)
-    x, y, z = _to_camera(d, view)
+    x, y, z = to_camera(d, view)
     inverse = v8.splat(np.float32(1)) / z
-    xx, xy, yy, minors = _image_covariance(quats, scales, picked, at, x, y, inverse, view)
+    xx, xy, yy, minors = image_covariance(quats, scales, picked, at, x, y, inverse, view)
 
     one, half = v8.splat(np.float32(1)), v8.splat(np.float32(0.5))
     blur, k = v8.splat(view[V_BLUR]), v8.splat(np.float32(0.5) * LOG2_E)
@@ -291,7 +244,7 @@ def _project_eight(means, quats, scales, opacities, view, picked, at, functions,
     budget = v8.maximum(log_opacity - log_cut, v8.splat(np.float32(0))) / k
     radius_x, radius_y = v8.sqrt(budget * blurred_x), v8.sqrt(budget * blurred_y)
 
-    mean_x, mean_y = _to_image(x, y, inverse, view)
+    mean_x, mean_y = to_image(x, y, inverse, view)
     drawn = v8.both(
         v8.at_least(log_opacity, log_cut), v8.at_least(v8.splat(_HUGE), blurred_x + blurred_y)
     )
@@ -324,56 +277,3 @@ def _write_box(mean, radius, size, drawn, low, high, rows):
     last = v8.minimum(mean + radius - half, size - one)
     v8.store(rows, low * U(LANES), v8.negate(v8.floor(v8.negate(first))))
     v8.store(rows, high * U(LANES), v8.select(drawn, v8.floor(last), v8.negate(one)))
-
-
-@inner()
-def _image_covariance(quats, scales, picked, at, x, y, inverse, view):
-    """xx, xy, yy in px^2, not blurred, and det / (yy + blur), of which no digits cancel."""
-    r, s, t = _rotation_row(view, U(0)), _rotation_row(view, U(1)), _rotation_row(view, U(2))
-    u = v8.minimum(v8.maximum(x * inverse, v8.splat(view[V_LOW])), v8.splat(view[V_HIGH]))
-    v = v8.minimum(v8.maximum(y * inverse, v8.splat(view[V_LOW + 1])), v8.splat(view[V_HIGH + 1]))
-    fx, fy = v8.splat(view[V_FOCAL]) * inverse, v8.splat(view[V_FOCAL + 1]) * inverse
-    # Rows of the Jacobian times the view's rotation.
-    jx = fx * (r[0] - u * t[0]), fx * (r[1] - u * t[1]), fx * (r[2] - u * t[2])
-    jy = fy * (s[0] - v * t[0]), fy * (s[1] - v * t[1]), fy * (s[2] - v * t[2])
-    m = _rotation_from_quats(quats, picked, at)
-    s0, s1, s2 = _gather3(scales, picked, at)
-    # Semi-axes in the image: px of each axis of the ellipsoid, right and down.
-    x0 = s0 * _dot(jx[0], jx[1], jx[2], m[0], m[3], m[6])
-    x1 = s1 * _dot(jx[0], jx[1], jx[2], m[1], m[4], m[7])
-    x2 = s2 * _dot(jx[0], jx[1], jx[2], m[2], m[5], m[8])
-    y0 = s0 * _dot(jy[0], jy[1], jy[2], m[0], m[3], m[6])
-    y1 = s1 * _dot(jy[0], jy[1], jy[2], m[1], m[4], m[7])
-    y2 = s2 * _dot(jy[0], jy[1], jy[2], m[2], m[5], m[8])
-    xx, xy, yy = (
-        _dot(x0, x1, x2, x0, x1, x2),
-        _dot(x0, x1, x2, y0, y1, y2),
-        _dot(y0, y1, y2, y0, y1, y2),
-    )
-    # Lagrange's identity, det = |x cross y|^2, each term divided before it is squared.
-    scale = v8.splat(np.float32(1)) / v8.sqrt(yy + v8.splat(view[V_BLUR]))
-    c0, c1, c2 = (
-        (x1 * y2 - x2 * y1) * scale,
-        (x2 * y0 - x0 * y2) * scale,
-        (x0 * y1 - x1 * y0) * scale,
-    )
-    return xx, xy, yy, _dot(c0, c1, c2, c0, c1, c2)
-
-
-@inner()
-def _rotation_from_quats(quats, picked, at):
-    """Rotation matrices, row by row, of unit quaternions wxyz."""
-    one, two = v8.splat(np.float32(1)), v8.splat(np.float32(2))
-    w, x = v8.gather(quats, picked, at, U(4), U(0)), v8.gather(quats, picked, at, U(4), U(1))
-    y, z = v8.gather(quats, picked, at, U(4), U(2)), v8.gather(quats, picked, at, U(4), U(3))
-    return (
-        one - two * (y * y + z * z),
-        two * (x * y - w * z),
-        two * (x * z + w * y),
-        two * (x * y + w * z),
-        one - two * (x * x + z * z),
-        two * (y * z - w * x),
-        two * (x * z - w * y),
-        two * (y * z + w * x),
-        one - two * (x * x + y * y),
-    )
