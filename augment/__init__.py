@@ -1,3 +1,41 @@
-"""ClimateGS: weather for driving scenes made of 3D Gaussians."""
+"""ClimateGS: weather for driving scenes made of 3D Gaussians.
+
+The names below are the library's public face, loaded when first used; other modules can be imported
+but promise nothing between versions.
+"""
+
+from importlib import import_module
 
 __version__ = "0.1.0"
+
+_PUBLIC = {
+    "augment.apply": ("WeatheredView", "render_buffers", "render_view"),
+    "augment.batch.job": ("JobResult", "RenderJob", "run_job"),
+    "augment.batch.manifest": ("read_manifest",),
+    "augment.cameras": ("Camera", "Frame"),
+    "augment.dataset": ("SceneDataset", "WeatherDataset", "collate_frames"),
+    "augment.errors": ("ClimateGSError",),
+    "augment.labels": ("Boxes", "LidarSweep"),
+    "augment.plan": ("make_plan",),
+    "augment.render.buffers": ("RenderOutput",),
+    "augment.render.constants": ("RasterSettings",),
+    "augment.render.rasterize": ("rasterize",),
+    "augment.scene": ("Actor", "Gaussians", "PosedGaussians", "Scene", "Track"),
+    "augment.semantics": ("SemanticClass",),
+    "augment.sky": ("ConstantSky", "CubemapSky", "LatLongSky"),
+    "augment.splat_io": ("read_splats", "write_ply", "write_splat"),
+    "augment.weather.smog": ("SmogMedium",),
+}
+_HOMES = {name: module for module, names in _PUBLIC.items() for name in names}
+
+__all__ = sorted(_HOMES)  # pyright: ignore[reportUnsupportedDunderAll]
+
+
+def __getattr__(name: str) -> object:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'augment' has no attribute {name!r}")
+    return getattr(import_module(_HOMES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -73,3 +73,13 @@ def test_all_packages_are_installed():
     for package in LAYERS:
         for path in modules(package):
             assert (path.parent / "__init__.py").exists(), f"{path.parent} has no __init__.py"
+
+
+def test_every_public_name_resolves():
+    import augment
+
+    for name in augment.__all__:
+        assert getattr(augment, name).__name__ == name
+    assert set(augment.__all__) <= set(dir(augment))
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = augment.nothing
