@@ -130,6 +130,10 @@ def _report(result: JobResult) -> None:
         f"{result.written} images written, {result.skipped} already there, {result.failed} failed; "
         f"{result.seconds:.1f} s, {rate:.1f} images/s"
     )
+    if result.written:
+        kinds = ("render", "encode", "write")
+        each = [f"{1000 * result.timings.get(k, 0.0) / result.written:.0f} ms {k}" for k in kinds]
+        print(f"per image: {', '.join(each)} (on threads that overlap)")
     for failure in result.failures[:20]:
         _say(f"failed: {failure}")
     if len(result.failures) > 20:
