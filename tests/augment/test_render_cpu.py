@@ -341,6 +341,18 @@ def test_hidden_splats_are_not_projected(crowd, monkeypatch):
     assert walled["visible"] < 100  # the wall, and what stands before it
 
 
+def test_pixels_beyond_the_image_keep_no_tile_open(monkeypatch):
+    """The screen covers the image of 3x3 pixels and not its one tile; what is behind is hidden."""
+    monkeypatch.setattr(cpu, "_SMALLEST_SLICE", 1)
+    monkeypatch.setattr(cpu, "_SLICE_COVER", 20.0)
+    screen = stack(*[one_gaussian(mean=(1.0, 0, 0), scale=2 / 30, opacity=0.99)] * 20)
+    behind = stack(*[one_gaussian(mean=(5.0, 0, 0), scale=1.0)] * 50)
+    times: dict[str, float] = {}
+    parts = [PosedGaussians(screen), PosedGaussians(behind)]
+    rasterize_cpu(parts, camera_ahead(3, 3, 30.0), COLOR, DEFAULT, None, stage_times=times)
+    assert times["visible"] == 20
+
+
 def test_stage_times_add_up(crowd):
     times = {"project": 1000.0, "other": 1.0}
     rasterize_cpu(*crowd, COLOR, DEFAULT, None, stage_times=times)
