@@ -7,6 +7,8 @@ from typing import Any
 
 from tools import sheet
 
+MOST_SHOWN = 12  # scenes and variants in one picture
+
 
 def read_rows(out: Path) -> list[dict[str, Any]]:
     """The finished images of an output folder, as manifest rows.
@@ -24,13 +26,16 @@ def read_rows(out: Path) -> list[dict[str, Any]]:
 
 
 def draw_sheet(out: Path, frame: int | None = None) -> Path:
-    """Writes OUT/contact_sheet.png: a row per scene and variant, a column per camera."""
+    """Writes OUT/contact_sheet.png: a row per scene and variant, a column per camera.
+
+    Of more than MOST_SHOWN variants, as many are shown, evenly spread.
+    """
     rows = read_rows(out)
     frames = sorted({row["frame"] for row in rows})
     frame = frames[len(frames) // 2] if frame is None else frame
     cameras = list(dict.fromkeys(row["camera"] for row in rows))
     lines = []
-    for scene, variant in _groups(rows):
+    for scene, variant in _shown(_groups(rows)):
         group = {
             row["camera"]: row
             for row in rows
@@ -54,10 +59,10 @@ def draw_sheet(out: Path, frame: int | None = None) -> Path:
 
 
 def draw_video(out: Path, camera: str, frames_per_second: float = 10.0, width: int = 1440) -> Path:
-    """Writes OUT/video_<camera>.mp4: all scenes and variants side by side, frame by frame."""
+    """Writes OUT/video_<camera>.mp4: scenes and variants side by side, frame by frame."""
     rows = [row for row in read_rows(out) if row["camera"] == camera]
     by_key = {(row["scene"], row["variant"], row["frame"]): row for row in rows}
-    groups = _groups(rows)
+    groups = _shown(_groups(rows))
     frames = [
         frame
         for frame in sorted({row["frame"] for row in rows})
@@ -73,6 +78,11 @@ def draw_video(out: Path, camera: str, frames_per_second: float = 10.0, width: i
     path = out / f"video_{camera}.mp4"
     sheet.write_video(path, pictures(), frames_per_second)
     return path
+
+
+def _shown(groups: list[tuple[str, str]]) -> list[tuple[str, str]]:
+    step = -(-len(groups) // MOST_SHOWN)
+    return groups[::step]
 
 
 def _groups(rows: list[dict[str, Any]]) -> list[tuple[str, str]]:
