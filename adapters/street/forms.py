@@ -8,8 +8,6 @@ import numpy as np
 
 from adapters.street.shapes import ALL_EDGES, OPEN_DIAGONAL, Kind, Look, Shapes, join, make_shapes
 
-FACES = ("+x", "-x", "+y", "-y", "+z", "-z")
-
 
 def _rows(values: Sequence[float] | np.ndarray) -> np.ndarray:
     return np.atleast_2d(np.asarray(values, np.float64))

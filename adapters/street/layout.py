@@ -70,10 +70,6 @@ class Layout:
     def path_length_m(self) -> float:
         return path_length(self.parameters)
 
-    @property
-    def duration_s(self) -> float:
-        return (self.parameters.frames - 1) * FRAME_NS * 1e-9
-
 
 def path_length(parameters: StreetParameters) -> float:
     """How far the ego car drives, metres."""

@@ -96,15 +96,6 @@ class Shapes:
             shading=self.shading @ turn,
         )
 
-    def mapped(self, frame: np.ndarray, origin: Sequence[float]) -> Shapes:
-        """The shapes in another right-handed orthonormal frame (rows: images of x, y, z)."""
-        return dataclasses.replace(
-            self,
-            origin=self.origin @ frame + np.asarray(origin, np.float64),
-            axes=self.axes @ frame,
-            shading=self.shading @ frame,
-        )
-
     def repeated(self, translations: np.ndarray) -> Shapes:
         """A copy at each translation [M, 3]."""
         count, copies = len(self), len(translations)

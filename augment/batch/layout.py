@@ -51,11 +51,6 @@ class ItemPaths:
     labels: str | None
     calibration: str
 
-    def own_files(self) -> tuple[str, ...]:
-        """The files of this image alone, which nothing else rewrites."""
-        own = (self.image, self.depth, self.semantic, self.instance)
-        return tuple(path for path in own if path is not None)
-
     def columns(self) -> dict[str, str | None]:
         """As the manifest's columns: `image_path` and so on."""
         return {f"{kind}_path": path for kind, path in asdict(self).items()}

@@ -49,10 +49,14 @@ def composite_sky(
     """The finished display-encoded image, not clamped.
 
     smog: with it the sky is seen through the smog up to infinity. fast: cube maps in float32 go
-    through the CPU kernel, equal to this definition within float rounding.
+    through the CPU kernel, equal to this definition within float rounding, unless gradients are
+    recorded, which the kernel has none of.
     """
     sky, smog = sky_behind(sky, smog)
-    if fast and isinstance(sky, CubemapSky) and rgb.dtype == torch.float32:
+    if isinstance(sky, ConstantSky) and smog is None:  # no direction matters
+        return rgb + (1 - alpha)[..., None] * sky.rgb.to(rgb.dtype)
+    tracked = torch.is_grad_enabled() and (rgb.requires_grad or alpha.requires_grad)
+    if fast and not tracked and isinstance(sky, CubemapSky) and rgb.dtype == torch.float32:
         return _composite_cubemap(rgb, alpha, camera, sky.faces, smog)
     directions = camera.ray_directions(rgb.dtype)
     color = sky.sample(directions)

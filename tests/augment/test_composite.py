@@ -45,6 +45,30 @@ def test_opaque_pixels_keep_their_colour_to_the_bit():
     assert torch.equal(out, rgb)
 
 
+def test_a_constant_sky_needs_no_directions(monkeypatch):
+    def asked(self, dtype=torch.float32):
+        raise AssertionError("ray directions were computed for a sky of one colour")
+
+    monkeypatch.setattr(Camera, "ray_directions", asked)
+    rgb, alpha = torch.rand(37, 61, 3), torch.rand(37, 61)
+    grey = torch.tensor([0.5, 0.6, 0.7])
+    expected = rgb + (1 - alpha)[..., None] * grey
+    camera, textured = cameras()[0], CubemapSky(torch.rand(6, 4, 4, 3))
+    assert torch.equal(composite_sky(rgb, alpha, camera, ConstantSky(grey)), expected)
+    fog = SmogMedium(1e-3, (0.5, 0.6, 0.7))
+    assert torch.equal(composite_sky(rgb, alpha, camera, textured, smog=fog), expected)
+
+
+def test_gradients_pass_through_the_sky():
+    rgb = torch.rand(37, 61, 3, requires_grad=True)
+    alpha = torch.rand(37, 61, requires_grad=True)
+    sky = CubemapSky(torch.rand(6, 4, 4, 3))
+    composite_sky(rgb, alpha, cameras()[0], sky).sum().backward()
+    assert torch.equal(rgb.grad, torch.ones_like(rgb))
+    behind = sky.sample(cameras()[0].ray_directions()).sum(-1)
+    assert torch.allclose(alpha.grad, -behind, atol=1e-5)  # float32 sums of three numbers
+
+
 def test_uniform_smog_leaves_no_sky_to_sample():
     sky = CubemapSky(torch.rand(6, 4, 4, 3))
     airlight, remaining = sky_behind(sky, SmogMedium(1e-3, (0.5, 0.6, 0.7)))
