@@ -1,0 +1,74 @@
+"""Every number that steers a reconstruction, in one place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True)
+class LossWeights:
+    """Loss of one view = (1 - d_ssim) L1 + d_ssim (1 - SSIM) / 2 (mean over weighted pixels)
+    + depth * mean |1/ED - 1/z| over the pixels with a depth prior (1/m)
+    + sky * mean alpha over all pixels marked as sky (relative to the image's pixel count).
+
+    depth 0 switches depth regularisation off.
+    """
+
+    d_ssim: float = 0.2
+    depth: float = 1.0
+    sky: float = 0.05
+
+
+@dataclass(frozen=True)
+class LearningRates:
+    """Adam's step sizes. Means: metres per step relative to the splat's distance scale, decaying
+    exponentially from means to means_end over the run; scales: of their logarithm; opacities: of
+    their logit; sh_rest: of the bands above degree 0.
+    """
+
+    means: float = 1.6e-3
+    means_end: float = 1.6e-5
+    quats: float = 1e-3
+    scales: float = 5e-3
+    opacities: float = 3e-2
+    sh_dc: float = 5e-3
+    sh_rest: float = 2.5e-4
+    sky: float = 5e-3
+    color_map: float = 5e-4
+    poses: float = 1e-4
+
+
+@dataclass(frozen=True)
+class DensifyConfig:
+    """How the number of splats grows. method: "absgrad" clones and splits where image gradients
+    are large; "mcmc" moves dead splats onto living ones and adds more in proportion to opacity.
+
+    max_splats: none are added beyond. every: steps between two rounds. start, stop: parts of the
+    run. prune_opacity: fainter splats are removed (absgrad) or moved (mcmc).
+    """
+
+    method: str = "absgrad"
+    max_splats: int = 400_000
+    every: int = 200
+    start: float = 0.05
+    stop: float = 0.6
+    prune_opacity: float = 0.02
+    grow_fraction: float = 0.05
+    noise: float = 0.0
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """One reconstruction. steps: optimiser updates, one view each. sh_degree: highest band that is
+    learnt; one more every sh_every steps. pose_refinement: whether actors' boxes may move a little.
+    """
+
+    steps: int = 5000
+    seed: int = 0
+    sh_degree: int = 1
+    sh_every: int = 500
+    pose_refinement: bool = True
+    exposure: bool = True
+    loss: LossWeights = field(default_factory=LossWeights)
+    rates: LearningRates = field(default_factory=LearningRates)
+    densify: DensifyConfig = field(default_factory=DensifyConfig)
