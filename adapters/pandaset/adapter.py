@@ -15,10 +15,10 @@ import torch
 
 from adapters.lidar.box_tracks import join_tracks
 from adapters.lidar.image_views import View
-from adapters.lidar.scene import DrivenPath, LidarSceneOptions, build_lidar_scene
+from adapters.lidar.options import DriveOptions
+from adapters.lidar.scene import DrivenPath, build_lidar_scene
 from adapters.pandaset.files import CameraTrack, Sequence, read_sequence
 from adapters.pandaset.labels import PandaSetLabels
-from adapters.pandaset.options import PandaSetOptions
 from adapters.pandaset.sweeps import read_drive
 from adapters.uri import format_uri
 from augment.cameras import Camera, Frame
@@ -35,40 +35,30 @@ _ROWS_ABOVE_CAR = {"back_camera": 0.745}
 def open_pandaset(path: str, query: dict[str, str]) -> Scene:
     """The scene of one PandaSet sequence folder, such as `pandaset/002`.
 
-    query: frames, voxel_m, max_gaussians, image_scale, sky_size; see PandaSetOptions.
+    query: frames, voxel_m, max_gaussians, image_scale, sky_size, held_out; see DriveOptions.
     Opening is deterministic: the same files and options give the same bits.
 
     Raises:
         AdapterError: a wrong option, missing or damaged calibration, a damaged table, or no LiDAR.
             Missing LiDAR or annotation files and images of single frames are Scene.problems.
     """
-    options = PandaSetOptions.from_query(query)
+    options = DriveOptions.from_query("pandaset", query)
     sequence = read_sequence(Path(path))
-    numbers = [frame for frame in range(len(sequence)) if options.keeps(frame)]
-    if not numbers:
-        raise AdapterError(
-            f"pandaset: frames={query.get('frames')} selects none of the {len(sequence)} frames "
-            f"(0 to {len(sequence) - 1}) in {path}"
-        )
-    drive = read_drive(sequence, numbers)
+    chosen = options.select(range(len(sequence)), where=f"pandaset:{path}")
+    drive = read_drive(sequence, chosen.numbers, held_out=chosen.held_out)
     if sum(len(sweep) for sweep in drive.sweeps) == 0:
         raise AdapterError(
-            f"{Path(path) / 'lidar'} holds no returns for frames {numbers[0]} to {numbers[-1]}; "
-            f"a scene cannot be built without them, unpack the sequence again"
+            f"{Path(path) / 'lidar'} holds no returns for frames {chosen.used[0]} to "
+            f"{chosen.used[-1]}; a scene cannot be built without them, unpack the sequence again"
         )
+    numbers = list(chosen.numbers)
     frames = tuple(_frame(sequence, number) for number in numbers)
     built = build_lidar_scene(
         drive.sweeps,
         join_tracks(drive.samples),
-        _views(sequence, frames),
+        _views([frame for frame in frames if frame.index not in chosen.held_out]),
         DrivenPath(sequence.world_from_ego[numbers, :3, 3], sequence.timestamps_ns[numbers]),
-        LidarSceneOptions(
-            voxel_m=options.voxel_m,
-            max_gaussians=options.max_gaussians,
-            image_scale=options.image_scale,
-            sky_size=options.sky_size,
-            lidar_top_deg=_LIDAR_TOP_DEG,
-        ),
+        options.scene_options(lidar_top_deg=_LIDAR_TOP_DEG),
     )
     return Scene(
         name=Path(path).name,
@@ -80,7 +70,7 @@ def open_pandaset(path: str, query: dict[str, str]) -> Scene:
         labels=PandaSetLabels(Path(path)),
         world_origin_m=sequence.world_origin_m,
         ground_z_m=built.ground_z_m,
-        problems=sequence.problems + drive.problems + built.problems,
+        problems=sequence.problems + chosen.problems + drive.problems + built.problems,
     )
 
 
@@ -110,7 +100,7 @@ def _camera(track: CameraTrack, number: int) -> Camera:
     )
 
 
-def _views(sequence: Sequence, frames: Seq[Frame]) -> tuple[View, ...]:
+def _views(frames: Seq[Frame]) -> tuple[View, ...]:
     return tuple(
         View(
             frame.cameras[name],

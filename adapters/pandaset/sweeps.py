@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from collections.abc import Sequence as Seq
 from dataclasses import dataclass
 
@@ -29,7 +30,8 @@ _MOVED_M = 1.0  # a box labelled stationary that travels further than this is no
 class Drive:
     """What the sensors and annotators saw, in the scene's world.
 
-    sweeps: one a frame that has a file. samples: the boxes of moving objects, in order of frames.
+    sweeps: one a frame that has a file and is not held out. samples: the boxes of moving objects,
+    in order of frames.
     """
 
     sweeps: tuple[Sweep, ...]
@@ -37,9 +39,13 @@ class Drive:
     problems: tuple[str, ...]
 
 
-def read_drive(sequence: Sequence, frames: Seq[int]) -> Drive:
+def read_drive(
+    sequence: Sequence, frames: Seq[int], *, held_out: Collection[int] = frozenset()
+) -> Drive:
     """Sweeps and moving boxes of the given frames.
 
+    held_out: frames whose sweeps only tell at what moment their boxes were seen, so that the tracks
+    are those of the whole drive.
     Left out: returns of smoke, exhaust, spray and mirror images, and of the recording car itself.
     Missing files of single frames are problems, not errors.
     """
@@ -58,7 +64,8 @@ def read_drive(sequence: Sequence, frames: Seq[int]) -> Drive:
                     f"frame {frame}: annotations/semseg/{frame:02d}.pkl.gz is missing; "
                     f"its points have no class"
                 )
-            sweeps.append(raw.usable())
+            if frame not in held_out:
+                sweeps.append(raw.usable())
         boxes = cuboids[frame]
         if boxes is None:
             problems.append(

@@ -10,9 +10,9 @@ import pandaset_folder as street
 import pytest
 import torch
 
+from adapters.lidar.options import DriveOptions, HeldOut
 from adapters.pandaset.files import read_lidar, read_semantics, read_sequence
 from adapters.pandaset.labels import NO_SURFACE, PandaSetLabels, semantic_table
-from adapters.pandaset.options import PandaSetOptions
 from adapters.pandaset.sweeps import read_drive
 from augment.errors import AdapterError
 from augment.geometry import rotmat_from_quat
@@ -167,10 +167,10 @@ def test_a_box_called_stationary_that_travels_is_an_actor(folder):
 
 def test_options_are_typed():
     query = {"frames": "2:9", "voxel_m": "0.08", "max_gaussians": "5000", "image_scale": "0.25"}
-    options = PandaSetOptions.from_query(query | {"sky_size": "16"})
-    assert options == PandaSetOptions(2, 9, 0.08, 5000, 0.25, 16)
-    assert PandaSetOptions.from_query({"frames": "4:"}) == PandaSetOptions(first_frame=4)
-    assert PandaSetOptions.from_query({}) == PandaSetOptions()
+    options = DriveOptions.from_query("pandaset", query | {"sky_size": "16"})
+    assert options == DriveOptions(2, 9, 0.08, 5000, 0.25, 16)
+    assert DriveOptions.from_query("pandaset", {"frames": "4:"}) == DriveOptions(first_frame=4)
+    assert DriveOptions.from_query("pandaset", {}) == DriveOptions()
 
 
 @pytest.mark.parametrize(
@@ -189,8 +189,38 @@ def test_options_are_typed():
         ({"max_gaussians": "1e6"}, "max_gaussians must be an integer from 1000"),
         ({"image_scale": "0.3"}, "image_scale must be one of 1, 0.5, 0.25, 0.125; got '0.3'"),
         ({"sky_size": "4"}, "sky_size must be an integer from 8"),
+        ({"held_out": "3"}, "held_out must be first:stop:step.*such as 1::2.*got '3'"),
+        ({"held_out": "1::0"}, "held_out must be first:stop:step"),
+        ({"held_out": "5:2:1"}, "held_out must be first:stop:step"),
+        ({"held_out": "-1::2"}, "held_out must be first:stop:step"),
+        ({"held_out": "1:2:3:4"}, "held_out must be first:stop:step"),
     ],
 )
 def test_wrong_options_say_what_is_allowed(query, message):
     with pytest.raises(AdapterError, match=message):
-        PandaSetOptions.from_query(query)
+        DriveOptions.from_query("pandaset", query)
+
+
+@pytest.mark.parametrize(
+    ("text", "held"),
+    [("1::2", [3, 5, 7]), ("::", [2, 3, 4, 5, 6, 7, 8]), ("4:6", [4, 5]), ("0:7:3", [3, 6])],
+)
+def test_held_out_counts_frame_numbers(text, held):
+    options = DriveOptions.from_query("pandaset", {"frames": "2:9", "held_out": text})
+    everything = held == list(range(2, 9))
+    if everything:
+        with pytest.raises(
+            AdapterError, match=r"here: held_out=0::1 holds out all 7 frames \(2 to"
+        ):
+            options.select(range(20), where="here")
+        return
+    chosen = options.select(range(20), where="here")
+    assert sorted(chosen.held_out) == held and chosen.numbers == tuple(range(2, 9))
+    assert set(chosen.used) == set(range(2, 9)) - set(held)
+    assert chosen.problems == ()
+
+
+def test_holding_out_nothing_is_said():
+    options = DriveOptions(held_out=HeldOut(30))
+    problems = options.select(range(20), where="here").problems
+    assert problems == ("held_out=30::1 holds out none of frames 0 to 19",)
