@@ -12,7 +12,7 @@ from torch import Tensor
 from augment.cameras import Camera
 from augment.plan import Plan, make_plan
 from augment.render.buffers import RenderOutput
-from augment.render.composite import composite_sky, quantise
+from augment.render.composite import composite_sky, map_colors, quantise
 from augment.render.rasterize import rasterize
 from augment.scene import PosedGaussians, Scene
 from augment.semantics import SemanticClass
@@ -93,6 +93,9 @@ def render_buffers(
     rgb = composite_sky(
         rgb, raster.alpha, camera, scene.sky, smog=plan.smog, fast=backend != "reference"
     )
+    color_map = scene.color_map(camera.name) if plan.recorded_exposure else None
+    if color_map is not None:  # a camera exposes what the weather has left, so this comes last
+        rgb = map_colors(rgb, color_map, fast=backend != "reference")
     depth = None
     if plan.depth_buffer is not None:
         z = getattr(raster, plan.depth_buffer)

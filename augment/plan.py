@@ -32,6 +32,7 @@ class Plan:
 
     buffers: what the rasteriser is asked for. smog_in_splats: smog blended per Gaussian inside the
     rasteriser; smog_on_buffers: smog applied to finished buffers; at most one of them is set.
+    recorded_exposure: whether cameras' colour maps apply to the finished picture.
     depth_buffer: which buffer is written as depth, or None. steps: every pass considered, in order.
     """
 
@@ -43,6 +44,7 @@ class Plan:
     semantic: bool
     instance: bool
     steps: tuple[Step, ...]
+    recorded_exposure: bool = False
 
     @property
     def smog(self) -> SmogMedium | None:
@@ -79,6 +81,7 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
         antialiased=recipe.render.antialiased,
         sh_degree=recipe.render.sh_degree,
     )
+    exposure = _exposure_step(recipe, scene)
     actors = f"background and {len(scene.actors)} actors posed at the camera's timestamp"
     return Plan(
         settings=settings,
@@ -88,11 +91,13 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
         depth_buffer=depth_buffer,
         semantic=recipe.output.semantic,
         instance=recipe.output.instance,
+        recorded_exposure=exposure.runs,
         steps=(
             Step("rasterise", True, f"{actors}; buffers {', '.join(sorted(buffers))}"),
             _smog_step("per Gaussian", smog, per_gaussian, smog_reason),
             _smog_step("on buffers", smog, not per_gaussian, smog_reason),
             _sky_step(smog),
+            exposure,
             Step(
                 "depth image",
                 depth_buffer is not None,
@@ -139,6 +144,17 @@ def _sky_step(smog: SmogMedium | None) -> Step:
     if smog.scale_height_m is None:
         return Step("sky", False, "uniform smog hides it: the airlight colour stands for it")
     return Step("sky", True, "sampled, then faded through the smog up to infinity")
+
+
+def _exposure_step(recipe: Recipe, scene: Scene) -> Step:
+    name = "camera colour map"
+    mapped = sum(scene.color_map(camera) is not None for camera in scene.camera_names)
+    if mapped == 0:
+        return Step(name, False, "the scene's cameras record the scene's own colours")
+    if recipe.render.exposure == "neutral":
+        return Step(name, False, "render.exposure is 'neutral'")
+    why = f"{mapped} of {len(scene.camera_names)} cameras have one, applied after the weather"
+    return Step(name, True, why)
 
 
 def _asked(name: str, recipe: Recipe) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -181,6 +181,9 @@ class Scene:
     frames: in order of time, each with the scene's cameras. labels: boxes and LiDAR on demand.
     problems: what the adapter found wrong and went on without, one sentence each.
     source: the URI the scene was opened from; open_scene(source) opens it again.
+    color_maps: how a camera's recorded colours differ from the scene's, by camera name: float32
+    [3, 4], recorded = M[:, :3] @ rgb + M[:, 3], display-encoded. A camera without one records the
+    scene's own colours.
     """
 
     name: str
@@ -194,8 +197,11 @@ class Scene:
     ground_z_m: float | None = None
     has_metric_scale: bool = True
     problems: tuple[str, ...] = ()
+    color_maps: Mapping[str, Float[Tensor, "3 4"]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        for name, color_map in self.color_maps.items():
+            _check_color_map(self.name, name, color_map)
         if len(self.background) + sum(len(a.gaussians) for a in self.actors) == 0:
             raise SceneError(
                 f"scene {self.name!r} ({self.source}) holds no Gaussians; nothing can be rendered"
@@ -233,11 +239,31 @@ class Scene:
         """The parts at the moment the camera took its image."""
         return tuple(self.parts_at(camera.timestamp_ns))
 
+    def color_map(self, camera_name: str) -> Float[Tensor, "3 4"] | None:
+        """The camera's colour map; None where it has none, or one that changes nothing."""
+        color_map = self.color_maps.get(camera_name)
+        if color_map is None or torch.equal(color_map, torch.eye(3, 4)):
+            return None
+        return color_map
+
     def boxes(self, frame_index: int) -> Boxes:
         return Boxes.empty() if self.labels is None else self.labels.boxes(frame_index)
 
     def lidar(self, frame_index: int) -> LidarSweep | None:
         return None if self.labels is None else self.labels.lidar(frame_index)
+
+
+def _check_color_map(scene: str, camera: str, color_map: Tensor) -> None:
+    if color_map.dtype != torch.float32 or tuple(color_map.shape) != (3, 4):
+        raise ValueError(
+            f"scene {scene!r}: the colour map of camera {camera!r} must be float32 [3, 4]; "
+            f"got {color_map.dtype} {list(color_map.shape)}"
+        )
+    if not bool(torch.isfinite(color_map).all()):
+        raise ValueError(
+            f"scene {scene!r}: the colour map of camera {camera!r} must be finite; "
+            f"got {color_map.tolist()}"
+        )
 
 
 def check_gaussians(gaussians: Gaussians, *, where: str) -> tuple[Gaussians, tuple[str, ...]]:

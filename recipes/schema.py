@@ -16,6 +16,7 @@ from pydantic.config import JsonDict
 
 VERSION = 1
 KOSCHMIEDER = 3.912  # -ln(0.02): visibility is where contrast falls to 2 %
+_LATER_FIELDS = (("render", "exposure"),)
 MAX_EXTINCTION_PER_M = 100.0  # nothing is seen through 10 cm of it
 
 Number = Annotated[float, Strict()]
@@ -128,6 +129,11 @@ class Render(_Closed):
     sh_degree: Whole | None = Field(
         default=None, ge=0, le=3, description="Highest spherical-harmonics band; null for all."
     )
+    exposure: Literal["recorded", "neutral"] = Field(
+        default="recorded",
+        description="recorded gives each camera's picture the colours of its recording, where the "
+        "scene knows them; neutral leaves the scene's own.",
+    )
 
 
 class Output(_Closed):
@@ -169,8 +175,17 @@ class Recipe(_Closed):
     output: Output = Output()
 
     def canonical_json(self) -> str:
-        """One text per recipe: sorted keys, no spaces, floats that read back to the same bits."""
-        return json.dumps(self.model_dump(mode="json"), sort_keys=True, separators=(",", ":"))
+        """One text per recipe: sorted keys, no spaces, floats that read back to the same bits.
+
+        Fields younger than the first release are left out at their defaults, which mean what
+        recipes without them meant: their hashes stay, and with them the folders they resume.
+        """
+        data = self.model_dump(mode="json")
+        for section, name in _LATER_FIELDS:
+            model = type(getattr(self, section))
+            if data[section][name] == model.model_fields[name].default:
+                del data[section][name]
+        return json.dumps(data, sort_keys=True, separators=(",", ":"))
 
     @property
     def hash(self) -> str:

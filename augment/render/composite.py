@@ -1,4 +1,4 @@
-"""The sky behind the splats, and the step to 8 bits: the torch definition.
+"""The sky behind the splats, a camera's colour map, and the step to 8 bits: the torch definition.
 
 out = rgb + (1 - alpha) sky(direction),   sky seen through the smog that lies before it
 """
@@ -90,6 +90,23 @@ def _composite_cubemap(
             out,
         )
     return torch.from_numpy(out)
+
+
+def map_colors(
+    rgb: Float[Tensor, "H W 3"], color_map: Float[Tensor, "3 4"], *, fast: bool = True
+) -> Float[Tensor, "H W 3"]:
+    """M[:, :3] @ rgb + M[:, 3] at every pixel, not clamped.
+
+    fast: float32 without gradients goes through the CPU kernel, equal to this definition within
+    float rounding, which overwrites `rgb`: fresh memory would take as long as the arithmetic.
+    """
+    tracked = torch.is_grad_enabled() and (rgb.requires_grad or color_map.requires_grad)
+    if not fast or tracked or rgb.dtype != torch.float32 or not rgb.is_contiguous():
+        color_map = color_map.to(rgb.dtype)
+        return rgb @ color_map[:, :3].T + color_map[:, 3]
+    with kernel_threads(ROWS):
+        composite_kernels.map_colors(rgb.detach().numpy(), color_map.detach().contiguous().numpy())
+    return rgb
 
 
 def quantise(rgb: Float[Tensor, "H W 3"]) -> np.ndarray:

@@ -71,3 +71,17 @@ def quantise(values, out):
         for j in range(values.shape[1]):
             value = values[i, j] * top + half
             out[i, j] = np.uint8(min(max(value, np.float32(0)), top))
+
+
+@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
+def map_colors(rgb, matrix):
+    """Every colour of float32 [H, W, 3] becomes matrix[:, :3] @ colour + matrix[:, 3], in place."""
+    m00, m01, m02, m03 = matrix[0, 0], matrix[0, 1], matrix[0, 2], matrix[0, 3]
+    m10, m11, m12, m13 = matrix[1, 0], matrix[1, 1], matrix[1, 2], matrix[1, 3]
+    m20, m21, m22, m23 = matrix[2, 0], matrix[2, 1], matrix[2, 2], matrix[2, 3]
+    for i in numba.prange(rgb.shape[0]):
+        for j in range(rgb.shape[1]):
+            r, g, b = rgb[i, j, 0], rgb[i, j, 1], rgb[i, j, 2]
+            rgb[i, j, 0] = m00 * r + m01 * g + m02 * b + m03
+            rgb[i, j, 1] = m10 * r + m11 * g + m12 * b + m13
+            rgb[i, j, 2] = m20 * r + m21 * g + m22 * b + m23

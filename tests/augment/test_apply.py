@@ -138,3 +138,32 @@ def test_the_recipe_scales_the_image(scene):
     view = render_view(scene, camera(), Recipe(render=Render(scale=0.5)))
     assert view.rgb.shape == (24, 32, 3)
     assert view.camera.fx == 30.0
+
+
+def test_a_camera_exposes_what_the_weather_left(scene):
+    """Weather first, colour map last: smog, sky and surfaces alike go through the map."""
+    matrix = torch.tensor([[0.5, 0.0, 0.0, 0.1], [0.0, 0.8, 0.1, 0.0], [0.0, 0.0, 0.6, 0.2]])
+    mapped = dataclasses.replace(scene, color_maps={"front": matrix})
+    for smog in (None, Smog(visibility_m=30)):
+        recipe = Recipe(weather=Weather(smog=smog))
+        plain = render_buffers(scene, camera(), make_plan(recipe, scene))
+        expected = plain.rgb @ matrix[:, :3].T + matrix[:, 3]
+        plan = make_plan(recipe, mapped)
+        for backend in ("cpu", "reference"):
+            got = render_buffers(mapped, camera(), plan, backend=backend)
+            # Backends differ in the order of sums, as in the test of both backends above.
+            assert float((got.rgb - expected).abs().quantile(0.99)) < 1e-4
+        fast = render_buffers(mapped, camera(), plan)
+        assert torch.equal(fast.raster.rgb, plain.raster.rgb)
+        assert torch.equal(fast.depth_m, plain.depth_m)
+
+
+def test_without_a_map_of_its_own_a_camera_keeps_every_bit(scene):
+    clean = view_of(scene)
+    dark = torch.eye(3, 4) * 0.5
+    others = dataclasses.replace(scene, color_maps={"rear": dark, "front": torch.eye(3, 4)})
+    assert np.array_equal(view_of(others).rgb, clean.rgb)
+    neutral = Recipe(render=Render(exposure="neutral"))
+    mapped = dataclasses.replace(scene, color_maps={"front": dark})
+    assert np.array_equal(render_view(mapped, camera(), neutral).rgb, clean.rgb)
+    assert not np.array_equal(view_of(mapped).rgb, clean.rgb)

@@ -63,7 +63,8 @@ def test_a_shared_scene_is_the_scene(tmp_path: Path) -> None:
     gaussians = dataclasses.replace(make_gaussians(2000), semantic=None)
     actor = Actor("7", "Car", gaussians, track, (4.0, 2.0, 1.5))
     sky = LatLongSky(torch.rand(4, 8, 3))
-    scene = dataclasses.replace(scene, actors=(actor,), sky=sky)
+    maps = {"front": torch.rand(3, 4)}
+    scene = dataclasses.replace(scene, actors=(actor,), sky=sky, color_maps=maps)
     shared = share_scene(scene, tmp_path)
     assert len(list(tmp_path.iterdir())) == 1
     assert len(shared.skeleton) < 20_000 < Path(shared.path).stat().st_size
@@ -83,6 +84,7 @@ def test_a_shared_scene_is_the_scene(tmp_path: Path) -> None:
                 assert other.dtype == value.dtype and torch.equal(other, value)
             else:
                 assert other == value
+    assert torch.equal(again.color_maps["front"], maps["front"])
     assert again.labels == scene.labels
     again.background.means[0] = 0  # may be written to, as any tensor
 

@@ -6,7 +6,7 @@ import torch
 
 from augment.cameras import Camera
 from augment.geometry import rigid, rotmat_from_quat
-from augment.render.composite import composite_sky, quantise, sky_behind
+from augment.render.composite import composite_sky, map_colors, quantise, sky_behind
 from augment.sky import ConstantSky, CubemapSky
 from augment.weather.smog import SmogMedium
 
@@ -83,3 +83,24 @@ def test_eight_bits_round_to_nearest_and_clamp():
     expected = np.array([0, 0, 0, 1, 128, 255, 255], np.uint8)
     assert np.array_equal(quantise(image)[:, 0, 0], expected)
     assert np.array_equal(quantise(image.double())[:, 0, 0], expected)
+
+
+COLOR_MAP = torch.tensor([[1.1, 0.05, 0.0, 0.02], [-0.1, 0.9, 0.1, 0.0], [0.0, 0.2, 1.2, -0.05]])
+
+
+@pytest.mark.parametrize("size", [(37, 61), (1, 1), (33, 1)])
+def test_colour_maps_match_their_definition(size):
+    rgb = torch.rand(*size, 3) * 1.5 - 0.2  # pictures are not clamped before
+    expected = rgb.double() @ COLOR_MAP[:, :3].double().T + COLOR_MAP[:, 3].double()
+    slow = map_colors(rgb, COLOR_MAP, fast=False)
+    fast = map_colors(rgb.clone(), COLOR_MAP)
+    # Sums of four float32 products below 2.
+    torch.testing.assert_close(slow.double(), expected, atol=1e-6, rtol=0)
+    torch.testing.assert_close(fast.double(), expected, atol=1e-6, rtol=0)
+    assert torch.equal(map_colors(rgb.double(), COLOR_MAP), expected)
+
+
+def test_gradients_pass_through_colour_maps():
+    rgb = torch.rand(5, 4, 3, requires_grad=True)
+    map_colors(rgb, COLOR_MAP).sum().backward()
+    torch.testing.assert_close(rgb.grad, COLOR_MAP[:, :3].sum(0).expand(5, 4, 3))

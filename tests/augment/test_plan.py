@@ -3,11 +3,12 @@ import dataclasses
 import pytest
 import torch
 
+from augment.cameras import Camera, Frame
 from augment.errors import SceneError
 from augment.plan import Plan, make_plan
 from augment.scene import Gaussians, Scene
 from augment.sky import ConstantSky
-from recipes.schema import Output, Recipe, Smog, Weather
+from recipes.schema import Output, Recipe, Render, Smog, Weather
 
 
 def scene(**changes) -> Scene:
@@ -88,3 +89,23 @@ def test_a_plan_is_plain_data():
     facts = plan_of(Smog(visibility_m=100)).as_dict()
     assert facts["buffers"] == ["alpha", "rgb"]
     assert {"name", "runs", "why"} == set(facts["steps"][0])
+
+
+def test_colour_maps_apply_where_cameras_have_them_and_the_recipe_lets_them():
+    pose = torch.eye(4, dtype=torch.float64)
+    cameras = {name: Camera(name, 4, 3, 5.0, 5.0, 2.0, 1.5, pose) for name in ("front", "back")}
+    frames = (Frame(0, 0, pose, cameras),)
+
+    def step(recipe: Recipe, **color_maps):
+        plan = make_plan(recipe, scene(frames=frames, color_maps=color_maps))
+        [found] = [s for s in plan.steps if s.name == "camera colour map"]
+        assert found.runs == plan.recorded_exposure
+        return found
+
+    dark = torch.eye(3, 4) * 0.5
+    assert not step(Recipe()).runs
+    assert not step(Recipe(), front=torch.eye(3, 4), elsewhere=dark).runs
+    used = step(Recipe(), front=dark, back=torch.eye(3, 4))
+    assert used.runs and used.why.startswith("1 of 2 cameras")
+    neutral = step(Recipe(render=Render(exposure="neutral")), front=dark)
+    assert not neutral.runs and "neutral" in neutral.why

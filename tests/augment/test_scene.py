@@ -105,3 +105,14 @@ def test_empty_scenes_repeated_tracks_and_missing_frames_are_errors():
         scene((actor, actor))
     with pytest.raises(SceneError, match="has no frame 7; it has none"):
         scene().frame(7)
+
+
+def test_colour_maps_are_checked_and_none_where_they_change_nothing(unchecked):
+    with pytest.raises(ValueError, match=r"'front' must be float32 \[3, 4\]; got .*\[3, 3\]"):
+        dataclasses.replace(scene(), color_maps={"front": torch.eye(3)})
+    with pytest.raises(ValueError, match="'front' must be finite"):
+        dataclasses.replace(scene(), color_maps={"front": torch.full((3, 4), torch.nan)})
+    maps = {"front": torch.eye(3, 4) * 0.5, "rear": torch.eye(3, 4)}
+    s = dataclasses.replace(scene(), color_maps=maps)
+    assert s.color_map("front") is maps["front"]
+    assert s.color_map("rear") is None and s.color_map("left") is None

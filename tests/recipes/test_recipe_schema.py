@@ -111,6 +111,7 @@ OTHER = {
     "render.alpha_max": 0.99,
     "render.antialiased": True,
     "render.sh_degree": 0,
+    "render.exposure": "neutral",
     "output.image": "jpg",
     "output.jpeg_quality": 91,
     "output.depth": "none",
