@@ -63,16 +63,16 @@ def rasterize_cpu(
     "project", "sort", "bin" and "raster" and the counts "visible" (splats that touch a tile which
     nearer ones have not closed) and "pairs" (of splats and such tiles) are added to it.
     """
-    clock = _Clock(stage_times)
+    clock = Clock(stage_times)
     inputs = gather_inputs(parts, camera, settings, smog, with_color=RGB in buffers)
-    images = _images(camera, buffers)
+    images = image_arrays(camera, buffers)
     with borrowed_scratch() as scratch, kernel_threads():
-        tiles = _Tiles(camera, images, settings, scratch)
-        depths, edges = _rank(inputs, camera, scratch)
+        tiles = Tiles(camera, images, settings, scratch)
+        depths, edges = rank(inputs, camera, scratch)
         for bins in itertools.pairwise(edges):
-            splats = _project(inputs, depths, bins, tiles, scratch)
+            splats = project(inputs, depths, bins, tiles, scratch)
             clock.lap("project")
-            slots, rects = _sort(splats, bins[0], scratch)
+            slots, rects = sort(splats, bins[0], scratch)
             clock.lap("sort")
             clock.count("visible", len(slots))
             tiles.blend(splats.records, slots, rects, is_last=bins[1] == edges[-1], clock=clock)
@@ -81,7 +81,7 @@ def rasterize_cpu(
     return RenderOutput(**{name: torch.from_numpy(image) for name, image in images.items()})
 
 
-class _Clock:
+class Clock:
     """Adds the time between laps, and counts, to the caller's dictionary."""
 
     def __init__(self, times: dict[str, float] | None) -> None:
@@ -92,14 +92,14 @@ class _Clock:
 
     def lap(self, name: str) -> None:
         now = time.perf_counter()
-        self._times[name] += now - self._last
+        self._times[name] = self._times.get(name, 0.0) + now - self._last
         self._last = now
 
     def count(self, name: str, number: int) -> None:
         self._times[name] += number
 
 
-def _images(camera: Camera, buffers: frozenset[str]) -> dict[str, np.ndarray]:
+def image_arrays(camera: Camera, buffers: frozenset[str]) -> dict[str, np.ndarray]:
     size = (camera.height, camera.width)
     shapes = {RGB: (*size, 3)}
     dtypes = {SPLAT_IDS: np.int32}
@@ -108,7 +108,7 @@ def _images(camera: Camera, buffers: frozenset[str]) -> dict[str, np.ndarray]:
     }
 
 
-def _rank(inputs: Inputs, camera: Camera, scratch: Scratch) -> tuple[np.ndarray, list[int]]:
+def rank(inputs: Inputs, camera: Camera, scratch: Scratch) -> tuple[np.ndarray, list[int]]:
     """z of all Gaussians (0: cannot be seen), and where the slices begin and end, in bins of z."""
     depths = scratch.array("depths", (inputs.slots,), np.float32)
     histograms = scratch.array("histograms", (_RANK_RUNS, 2, layout.BINS), np.float64)
@@ -142,7 +142,7 @@ def _slice_edges(cover: np.ndarray, counts: np.ndarray) -> list[int]:
 
 
 @dataclass(frozen=True, eq=False)
-class _Splats:
+class Splats:
     """What project_slice wrote."""
 
     records: np.ndarray
@@ -152,15 +152,15 @@ class _Splats:
     counts: np.ndarray
 
 
-def _project(
+def project(
     inputs: Inputs,
     depths: np.ndarray,
     bins: tuple[int, int],
-    tiles: _Tiles,
+    tiles: Tiles,
     scratch: Scratch,
-) -> _Splats:
+) -> Splats:
     blocks = len(inputs.blocks)
-    splats = _Splats(
+    splats = Splats(
         scratch.array("records", (inputs.slots * layout.RECORD,), np.float32),
         scratch.array("rects", (inputs.slots,), np.uint64),
         scratch.array("keys", (inputs.slots,), np.uint32),
@@ -186,7 +186,7 @@ def _project(
     return splats
 
 
-def _sort(splats: _Splats, first_bin: int, scratch: Scratch) -> tuple[np.ndarray, np.ndarray]:
+def sort(splats: Splats, first_bin: int, scratch: Scratch) -> tuple[np.ndarray, np.ndarray]:
     """Slots nearest first (ties in index order), and their tiles in that order."""
     # Bin after bin, and in each of them block after block.
     starts = np.append(0, splats.counts.sum(0, dtype=np.int64).cumsum())
@@ -200,7 +200,7 @@ def _sort(splats: _Splats, first_bin: int, scratch: Scratch) -> tuple[np.ndarray
     return slots, rects
 
 
-class _Tiles:
+class Tiles:
     """The image's tiles while it is rendered: which are open, and what they hold."""
 
     def __init__(
@@ -213,8 +213,8 @@ class _Tiles:
         self._columns = -(-camera.width // layout.TILE_W)
         self._rows = -(-camera.height // layout.TILE_H)
         count = self._columns * self._rows
-        self._size = np.array([camera.width, camera.height], np.int64)
-        self._limits = np.array(
+        self.size = np.array([camera.width, camera.height], np.int64)
+        self.limits = np.array(
             [settings.alpha_max, math.log2(ALPHA_MIN), TRANSMITTANCE_STOP], np.float32
         )
         # Alpha is always written, so that kernels come in fewer variants.
@@ -241,32 +241,47 @@ class _Tiles:
         rects: np.ndarray,
         *,
         is_last: bool,
-        clock: _Clock,
+        clock: Clock,
     ) -> None:
         """Blend splats, nearest first, into the open tiles; is_last closes them all."""
         first, count = 0, len(slots)
         while True:
-            end, members, starts = self._list(slots, rects, first)
+            end, members, starts = self.list_members(slots, rects, first)
             clock.lap("bin")
             clock.count("pairs", len(members))
-            cpu_blend.blend_tiles(
-                records,
-                members,
-                starts,
-                self.open,
-                self._states,
-                is_last and end == count,
-                self._size,
-                self._limits,
-                *self._images,
-            )
+            self.blend_members(records, members, starts, is_last=is_last and end == count)
             clock.lap("raster")
             first = end
             if first == count or not self.open.any():
                 return
 
-    def _list(
-        self, slots: np.ndarray, rects: np.ndarray, first: int
+    def blend_members(
+        self, records: np.ndarray, members: np.ndarray, starts: np.ndarray, *, is_last: bool
+    ) -> None:
+        """Blend every open tile's list; is_last closes them all."""
+        cpu_blend.blend_tiles(
+            records,
+            members,
+            starts,
+            self.open,
+            self._states,
+            is_last,
+            self.size,
+            self.limits,
+            *self._images,
+        )
+
+    def list_all(self, slots: np.ndarray, rects: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The lists of all splats and where each begins, however long they are."""
+        _, members, starts = self.list_members(slots, rects, 0, limit=None)
+        return members, starts
+
+    def list_members(
+        self,
+        slots: np.ndarray,
+        rects: np.ndarray,
+        first: int,
+        limit: int | None = _MAX_PAIRS,
     ) -> tuple[int, np.ndarray, np.ndarray]:
         """Lists of every open tile's splats, nearest first, from the splat `first` on.
 
@@ -275,8 +290,8 @@ class _Tiles:
         """
         end = len(slots)
         counts = self._count(rects, first, end)
-        if counts.sum() > _MAX_PAIRS:
-            end = first + _splats_in(rects[first:], _MAX_PAIRS)
+        if limit is not None and counts.sum() > limit:
+            end = first + _splats_in(rects[first:], limit)
             counts = self._count(rects, first, end)
         starts = np.append(0, np.cumsum(counts))
         heads = np.where(self.open != cpu_blend.CLOSED, starts[:-1], -1)

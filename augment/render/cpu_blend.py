@@ -140,9 +140,9 @@ def _blend_list(
     """Blend a tile's list into its state. Returns whether any pixel still lets light through."""
     for strip in range(STRIPS):
         rows[2 * strip], rows[2 * strip + 1] = 0, TILE_H
-        _shrink(state, strip, rows)
+        shrink(state, strip, rows)
     for at in range(first, last, BATCH):
-        if _is_closed(rows):
+        if is_closed(rows):
             return False
         count = min(BATCH, last - at)
         for k in range(U(at + count), U(min(at + 2 * BATCH, last))):
@@ -165,8 +165,8 @@ def _blend_list(
                 _blend_items(
                     state, staged, values, places, items, limits, rgb, expected, None, None
                 )
-            _shrink(state, strip, rows)
-    return not _is_closed(rows)
+            shrink(state, strip, rows)
+    return not is_closed(rows)
 
 
 @inner()
@@ -188,7 +188,7 @@ def _can_change(state, strip, rows, median, ids):
 
 
 @inner()
-def _is_closed(rows):
+def is_closed(rows):
     closed = True
     for strip in range(STRIPS):
         closed = closed and rows[2 * strip] >= rows[2 * strip + 1]
@@ -196,7 +196,7 @@ def _is_closed(rows):
 
 
 @inner()
-def _shrink(state, strip, rows):
+def shrink(state, strip, rows):
     """Leave out a strip's first and last rows while no pixel of them is open."""
     low, high = rows[2 * strip], rows[2 * strip + 1]
     base = strip * STRIP
@@ -215,10 +215,10 @@ def _blend_items(state, staged, values, places, items, limits, rgb, expected, me
     n = U(BATCH)
     places[items] = 0  # one item is read beyond the last
     splat = U(places[0])
-    alpha = _alpha(staged, values, splat, U(0), alpha_max, log_cut)
+    alpha = alpha_of(staged, values, splat, U(0), alpha_max, log_cut)
     for item in range(items):
         following = U(places[item + U(1)])
-        next_alpha = _alpha(staged, values, following, item + U(1), alpha_max, log_cut)
+        next_alpha = alpha_of(staged, values, following, item + U(1), alpha_max, log_cut)
         at = U(places[item + U(ITEMS)])
         through = v8.load(state, at)
         weight = alpha * through
@@ -247,7 +247,7 @@ def _blend_items(state, staged, values, places, items, limits, rgb, expected, me
 
 
 @inner()
-def _alpha(staged, values, splat, item, alpha_max, log_cut):
+def alpha_of(staged, values, splat, item, alpha_max, log_cut):
     sharp = v8.splat(staged[U(SHARP_X) * U(BATCH) + splat])
     off = v8.fmuladd(sharp, v8.lane_numbers(), v8.splat(values[item + U(ITEMS)]))
     e = v8.fmuladd(v8.negate(off), off, v8.splat(values[item]))

@@ -137,3 +137,43 @@ def write_color(sh, at, functions, view, smog, rows, lane, records, slot):
     records[slot + U(RED)] = r
     records[slot + U(GREEN)] = g
     records[slot + U(BLUE)] = b
+
+
+@inner()
+def add_direction_slopes(x, y, z, functions, rows):
+    """Sum over SH functions k >= 1 of a row's weight times the slope of the function, by x, y, z.
+
+    rows: flat; the weights of function k for eight splats start at k LANES. Slopes are those of
+    the polynomials in `_write_basis`; only their part across the direction has a meaning.
+    """
+    two, three = v8.splat(np.float32(2)), v8.splat(np.float32(3))
+    c1 = v8.splat(_C1)
+    gx = v8.negate(c1 * v8.load(rows, U(3 * LANES)))
+    gy = v8.negate(c1 * v8.load(rows, U(1 * LANES)))
+    gz = c1 * v8.load(rows, U(2 * LANES))
+    if functions > U(4):
+        xy, zz = v8.splat(_C2_XY), v8.splat(_C2_ZZ)
+        a4, a5 = xy * v8.load(rows, U(4 * LANES)), xy * v8.load(rows, U(5 * LANES))
+        a6, a7 = two * zz * v8.load(rows, U(6 * LANES)), xy * v8.load(rows, U(7 * LANES))
+        a8 = two * v8.splat(_C2_XX) * v8.load(rows, U(8 * LANES))
+        gx = gx + a4 * y - a6 * x - a7 * z + a8 * x
+        gy = gy + a4 * x - a5 * z - a6 * y - a8 * y
+        gz = gz - a5 * y + two * a6 * z - a7 * x
+    if functions > U(9):
+        four = v8.splat(np.float32(4))
+        xx, yy, zz = x * x, y * y, z * z
+        cubic, high = v8.splat(_C3_CUBIC), v8.splat(_C3_ZZ)
+        a9, a15 = cubic * v8.load(rows, U(9 * LANES)), cubic * v8.load(rows, U(15 * LANES))
+        a10 = v8.splat(_C3_XYZ) * v8.load(rows, U(10 * LANES))
+        a11, a13 = high * v8.load(rows, U(11 * LANES)), high * v8.load(rows, U(13 * LANES))
+        a12 = three * v8.splat(_C3_ZZZ) * v8.load(rows, U(12 * LANES))
+        a14 = v8.splat(_C3_ZXX) * v8.load(rows, U(14 * LANES))
+        three_diff = three * (xx - yy)
+        two_xy = two * x * y
+        gx = gx - three * a9 * two_xy + a10 * y * z + a11 * two_xy - two * a12 * x * z
+        gx = gx - a13 * (four * zz - three * xx - yy) + two * a14 * x * z - a15 * three_diff
+        gy = gy - a9 * three_diff + a10 * x * z - a11 * (four * zz - xx - three * yy)
+        gy = gy - two * a12 * y * z + a13 * two_xy - two * a14 * y * z + three * a15 * two_xy
+        gz = gz + a10 * x * y - two * four * a11 * y * z + a12 * (two * zz - xx - yy)
+        gz = gz - two * four * a13 * x * z + a14 * (xx - yy)
+    return gx, gy, gz

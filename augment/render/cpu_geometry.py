@@ -37,22 +37,22 @@ def from_eye(means, picked, at, view):
 
 
 @inner()
-def _dot(ax, ay, az, bx, by, bz):
+def dot(ax, ay, az, bx, by, bz):
     return v8.fmuladd(ax, bx, v8.fmuladd(ay, by, az * bz))
 
 
 @inner()
-def _rotation_row(view, row):
+def rotation_row(view, row):
     at = U(V_ROTATION) + U(3) * row
     return v8.splat(view[at]), v8.splat(view[at + U(1)]), v8.splat(view[at + U(2)])
 
 
 @inner()
 def to_camera(d, view):
-    r, s, t = _rotation_row(view, U(0)), _rotation_row(view, U(1)), _rotation_row(view, U(2))
-    x = _dot(r[0], r[1], r[2], d[0], d[1], d[2])
-    y = _dot(s[0], s[1], s[2], d[0], d[1], d[2])
-    return x, y, _dot(t[0], t[1], t[2], d[0], d[1], d[2])
+    r, s, t = rotation_row(view, U(0)), rotation_row(view, U(1)), rotation_row(view, U(2))
+    x = dot(r[0], r[1], r[2], d[0], d[1], d[2])
+    y = dot(s[0], s[1], s[2], d[0], d[1], d[2])
+    return x, y, dot(t[0], t[1], t[2], d[0], d[1], d[2])
 
 
 @inner()
@@ -64,26 +64,26 @@ def to_image(x, y, inverse, view):
 @inner()
 def image_covariance(quats, scales, picked, at, x, y, inverse, view):
     """xx, xy, yy in px^2, not blurred, and det / (yy + blur), of which no digits cancel."""
-    r, s, t = _rotation_row(view, U(0)), _rotation_row(view, U(1)), _rotation_row(view, U(2))
+    r, s, t = rotation_row(view, U(0)), rotation_row(view, U(1)), rotation_row(view, U(2))
     u = v8.minimum(v8.maximum(x * inverse, v8.splat(view[V_LOW])), v8.splat(view[V_HIGH]))
     v = v8.minimum(v8.maximum(y * inverse, v8.splat(view[V_LOW + 1])), v8.splat(view[V_HIGH + 1]))
     fx, fy = v8.splat(view[V_FOCAL]) * inverse, v8.splat(view[V_FOCAL + 1]) * inverse
     # Rows of the Jacobian times the view's rotation.
     jx = fx * (r[0] - u * t[0]), fx * (r[1] - u * t[1]), fx * (r[2] - u * t[2])
     jy = fy * (s[0] - v * t[0]), fy * (s[1] - v * t[1]), fy * (s[2] - v * t[2])
-    m = _rotation_from_quats(quats, picked, at)
+    m = rotation_from_quats(quats, picked, at)
     s0, s1, s2 = gather3(scales, picked, at)
     # Semi-axes in the image: px of each axis of the ellipsoid, right and down.
-    x0 = s0 * _dot(jx[0], jx[1], jx[2], m[0], m[3], m[6])
-    x1 = s1 * _dot(jx[0], jx[1], jx[2], m[1], m[4], m[7])
-    x2 = s2 * _dot(jx[0], jx[1], jx[2], m[2], m[5], m[8])
-    y0 = s0 * _dot(jy[0], jy[1], jy[2], m[0], m[3], m[6])
-    y1 = s1 * _dot(jy[0], jy[1], jy[2], m[1], m[4], m[7])
-    y2 = s2 * _dot(jy[0], jy[1], jy[2], m[2], m[5], m[8])
+    x0 = s0 * dot(jx[0], jx[1], jx[2], m[0], m[3], m[6])
+    x1 = s1 * dot(jx[0], jx[1], jx[2], m[1], m[4], m[7])
+    x2 = s2 * dot(jx[0], jx[1], jx[2], m[2], m[5], m[8])
+    y0 = s0 * dot(jy[0], jy[1], jy[2], m[0], m[3], m[6])
+    y1 = s1 * dot(jy[0], jy[1], jy[2], m[1], m[4], m[7])
+    y2 = s2 * dot(jy[0], jy[1], jy[2], m[2], m[5], m[8])
     xx, xy, yy = (
-        _dot(x0, x1, x2, x0, x1, x2),
-        _dot(x0, x1, x2, y0, y1, y2),
-        _dot(y0, y1, y2, y0, y1, y2),
+        dot(x0, x1, x2, x0, x1, x2),
+        dot(x0, x1, x2, y0, y1, y2),
+        dot(y0, y1, y2, y0, y1, y2),
     )
     # Lagrange's identity, det = |x cross y|^2, each term divided before it is squared.
     scale = v8.splat(np.float32(1)) / v8.sqrt(yy + v8.splat(view[V_BLUR]))
@@ -92,11 +92,11 @@ def image_covariance(quats, scales, picked, at, x, y, inverse, view):
         (x2 * y0 - x0 * y2) * scale,
         (x0 * y1 - x1 * y0) * scale,
     )
-    return xx, xy, yy, _dot(c0, c1, c2, c0, c1, c2)
+    return xx, xy, yy, dot(c0, c1, c2, c0, c1, c2)
 
 
 @inner()
-def _rotation_from_quats(quats, picked, at):
+def rotation_from_quats(quats, picked, at):
     """Rotation matrices, row by row, of unit quaternions wxyz."""
     one, two = v8.splat(np.float32(1)), v8.splat(np.float32(2))
     w, x = v8.gather(quats, picked, at, U(4), U(0)), v8.gather(quats, picked, at, U(4), U(1))

@@ -213,6 +213,34 @@ def minus_abs(typingctx, a):
 
 
 @intrinsic
+def absolute(typingctx, a):
+    """|a|: a with its sign bit clear."""
+
+    def codegen(context, builder, sig, args):
+        bits = builder.and_(builder.bitcast(args[0], _I8), _all(2**31 - 1))
+        return builder.bitcast(bits, _F8)
+
+    return float8(float8), codegen
+
+
+@intrinsic
+def total(typingctx, a):
+    """The sum of the eight lanes, always in the same order: halves, quarters, the last two."""
+
+    def codegen(context, builder, sig, args):
+        value = args[0]
+        for width in (4, 2, 1):
+            lanes = ir.Constant(
+                ir.VectorType(_INT, LANES),
+                [lane + width if lane < width else lane for lane in range(LANES)],
+            )
+            value = builder.fadd(value, builder.shuffle_vector(value, value, lanes))
+        return builder.extract_element(value, _INT(0))
+
+    return types.float32(float8), codegen
+
+
+@intrinsic
 def minimum(typingctx, a, b):
     """a where a < b, else b (so b where a is NaN)."""
 

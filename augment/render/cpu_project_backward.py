@@ -1,0 +1,302 @@
+"""Numba kernel: from gradients of a splat's ellipse, depth and colour to those of its Gaussian.
+
+Eight splats at a time the projection of cpu_geometry is repeated and its chain rule followed
+backwards. Names: g_a is dL/da.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import prange
+
+from augment.render import cpu_simd as v8
+from augment.render.cpu_blend_backward import (
+    S_0,
+    S_ABS_X,
+    S_ABS_Y,
+    S_BLUE,
+    S_DEPTH,
+    S_GREEN,
+    S_RED,
+    S_X,
+    S_XX,
+    S_XY,
+    S_Y,
+    S_YY,
+    SHARE,
+)
+from augment.render.cpu_color import add_direction_slopes
+from augment.render.cpu_geometry import (
+    dot,
+    from_eye,
+    gather3,
+    rotation_from_quats,
+    rotation_row,
+    to_camera,
+)
+from augment.render.cpu_jit import inner, kernel
+from augment.render.cpu_layout import (
+    BLOCK,
+    BLUE,
+    GREEN,
+    LANES,
+    LEAN_X,
+    M_ANTIALIASED,
+    M_FUNCTIONS,
+    RECORD,
+    RED,
+    SHARP_X,
+    SPLAT_ID,
+    V_BLUR,
+    V_FOCAL,
+    V_HIGH,
+    V_LOW,
+    U,
+)
+from augment.render.cpu_math import LOG2_E, floats_at
+
+# A row of gradients, one cache line: by mean (3, metres, in the part's axes), unit quaternion (4,
+# tangential), logarithms of scales (3) and opacity, colour before its clamp at 0 (3); then what
+# densification looks at: the sum of |dL/d mean| over pixels (1/px), and the largest sigma, px.
+GRAD = 16
+G_MEAN, G_QUAT, G_SCALE, G_OPACITY, G_COLOR, G_ABS, G_RADIUS = 0, 3, 7, 10, 11, 14, 15
+
+_INVERSE_LN2 = np.float32(1 / math.log(2))
+_SLOPES = 16  # rows of eight: gradients of the SH functions, weighted
+
+
+@kernel
+def project_backward(
+    addresses,
+    sizes,
+    views,
+    blocks,
+    first_ids,
+    found,
+    touched,
+    modes,
+    records,
+    sums,
+    grads,
+    ids,
+    counts,
+):
+    """A row of `grads` for every touched splat, block by block in the order of its Gaussians.
+
+    addresses to first_ids, found, modes, records: as in cpu_project. touched, sums: what
+    cpu_blend_backward.sum_shares wrote. Block b fills rows b BLOCK to b BLOCK + counts[b] of grads
+    (float32 [B BLOCK * GRAD]) and of ids (int32, index of the Gaussian in its part).
+    """
+    for block in prange(blocks.shape[0]):
+        part = blocks[block, 0]
+        slots = np.empty(BLOCK + LANES, np.int32)
+        picked = np.empty(BLOCK + LANES, np.int32)
+        rows = np.empty((_SLOPES + GRAD) * LANES, np.float32)
+        base = block * BLOCK
+        taken = U(0)
+        for slot in range(base, base + found[block]):
+            if touched[slot] != 0:
+                number = np.float32(records[slot * RECORD + SPLAT_ID]).view(np.int32)
+                slots[taken] = np.int32(slot)
+                picked[taken] = number - np.int32(first_ids[part])
+                ids[U(base) + taken] = picked[taken]
+                taken += U(1)
+        counts[block] = taken
+        if taken == U(0):
+            continue
+        for lane in range(U(LANES)):
+            slots[taken + lane] = slots[taken - U(1)]
+            picked[taken + lane] = picked[taken - U(1)]
+        count, functions = sizes[part]
+        means = floats_at(addresses[part, 0], count * 3)
+        quats = floats_at(addresses[part, 1], count * 4)
+        scales = floats_at(addresses[part, 2], count * 3)
+        sh = floats_at(addresses[part, 4], count * functions * 3)
+        used = min(modes[M_FUNCTIONS], functions)
+        for at in range(U(0), taken, U(LANES)):
+            _color_backward(
+                sh, U(functions), U(used), means, views[part], slots, picked, at, records, sums,
+                rows,
+            )  # fmt: skip
+            _geometry_backward(
+                means, quats, scales, views[part], slots, picked, at, modes, records, sums, rows
+            )
+            for lane in range(min(U(LANES), taken - at)):
+                row = (U(base) + at + lane) * U(GRAD)
+                for field in range(U(GRAD)):
+                    grads[row + field] = rows[(U(_SLOPES) + field) * U(LANES) + lane]
+
+
+@inner()
+def _write(rows, field, value):
+    v8.store(rows, U(_SLOPES + field) * U(LANES), value)
+
+
+@inner()
+def _color_backward(
+    sh, functions, used, means, view, slots, picked, at, records, sums, rows
+):  # fmt: skip
+    """Rows of colour, and of the mean as far as the viewing direction changes the colour."""
+    for lane in range(U(LANES)):
+        slot, splat = U(slots[at + lane]), U(picked[at + lane])
+        share, record = slot * U(SHARE), slot * U(RECORD)
+        zero = np.float32(0)
+        red = sums[share + U(S_RED)] if records[record + U(RED)] > zero else zero
+        green = sums[share + U(S_GREEN)] if records[record + U(GREEN)] > zero else zero
+        blue = sums[share + U(S_BLUE)] if records[record + U(BLUE)] > zero else zero
+        rows[U(_SLOPES + G_COLOR) * U(LANES) + lane] = red
+        rows[U(_SLOPES + G_COLOR + 1) * U(LANES) + lane] = green
+        rows[U(_SLOPES + G_COLOR + 2) * U(LANES) + lane] = blue
+        first = splat * functions * U(3)
+        for k in range(U(1), used):
+            c = first + k * U(3)
+            rows[k * U(LANES) + lane] = red * sh[c] + green * sh[c + U(1)] + blue * sh[c + U(2)]
+    zero = v8.splat(np.float32(0))
+    if used == U(1):
+        for axis in range(3):
+            _write(rows, G_MEAN + axis, zero)
+        return
+    dx, dy, dz = from_eye(means, picked, at, view)
+    inverse = v8.splat(np.float32(1)) / v8.sqrt(dot(dx, dy, dz, dx, dy, dz))
+    x, y, z = dx * inverse, dy * inverse, dz * inverse
+    gx, gy, gz = add_direction_slopes(x, y, z, used, rows)
+    radial = dot(gx, gy, gz, x, y, z)
+    _write(rows, G_MEAN, (gx - radial * x) * inverse)
+    _write(rows, G_MEAN + 1, (gy - radial * y) * inverse)
+    _write(rows, G_MEAN + 2, (gz - radial * z) * inverse)
+
+
+@inner()
+def _share(sums, slots, at, field):
+    return v8.gather(sums, slots, at, U(SHARE), U(field))
+
+
+@inner()
+def _geometry_backward(
+    means, quats, scales, view, slots, picked, at, modes, records, sums, rows
+):  # fmt: skip
+    one, two = v8.splat(np.float32(1)), v8.splat(np.float32(2))
+    k = v8.splat(np.float32(0.5) * LOG2_E)
+    x, y, z = to_camera(from_eye(means, picked, at, view), view)
+    inverse = one / z
+    # Semi-axes in the image, as in cpu_geometry.image_covariance.
+    r, s, t = rotation_row(view, U(0)), rotation_row(view, U(1)), rotation_row(view, U(2))
+    u_low, u_high = v8.splat(view[V_LOW]), v8.splat(view[V_HIGH])
+    v_low, v_high = v8.splat(view[V_LOW + 1]), v8.splat(view[V_HIGH + 1])
+    u = v8.minimum(v8.maximum(x * inverse, u_low), u_high)
+    v = v8.minimum(v8.maximum(y * inverse, v_low), v_high)
+    fx, fy = v8.splat(view[V_FOCAL]) * inverse, v8.splat(view[V_FOCAL + 1]) * inverse
+    jx = fx * (r[0] - u * t[0]), fx * (r[1] - u * t[1]), fx * (r[2] - u * t[2])
+    jy = fy * (s[0] - v * t[0]), fy * (s[1] - v * t[1]), fy * (s[2] - v * t[2])
+    m = rotation_from_quats(quats, picked, at)
+    s0, s1, s2 = gather3(scales, picked, at)
+    x0 = s0 * dot(jx[0], jx[1], jx[2], m[0], m[3], m[6])
+    x1 = s1 * dot(jx[0], jx[1], jx[2], m[1], m[4], m[7])
+    x2 = s2 * dot(jx[0], jx[1], jx[2], m[2], m[5], m[8])
+    y0 = s0 * dot(jy[0], jy[1], jy[2], m[0], m[3], m[6])
+    y1 = s1 * dot(jy[0], jy[1], jy[2], m[1], m[4], m[7])
+    y2 = s2 * dot(jy[0], jy[1], jy[2], m[2], m[5], m[8])
+    blur = v8.splat(view[V_BLUR])
+    xx, yy = dot(x0, x1, x2, x0, x1, x2), dot(y0, y1, y2, y0, y1, y2)
+    cxx, cyy = xx + blur, yy + blur
+    sharp = v8.gather(records, slots, at, U(RECORD), U(SHARP_X))
+    lean = v8.gather(records, slots, at, U(RECORD), U(LEAN_X))
+    along = k / (sharp * sharp)
+
+    # The conic: e = ... - sharp^2 (dx - lean dy)^2 - k / cyy dy^2, sharp^2 = k / along.
+    sum_0, sum_x = _share(sums, slots, at, S_0), _share(sums, slots, at, S_X)
+    inverse_cyy = one / cyy
+    g_along = _share(sums, slots, at, S_XX) / along
+    g_lean = two * sharp * _share(sums, slots, at, S_XY) * inverse_cyy
+    g_fall = k * inverse_cyy * inverse_cyy * _share(sums, slots, at, S_YY)
+    g_xx = g_along
+    g_xy = g_lean - two * lean * g_along
+    g_yy = lean * lean * g_along - lean * g_lean + g_fall
+    if modes[M_ANTIALIASED]:
+        # log2 of opacity holds half of log2(det / det_blurred), det = |x cross y|^2.
+        half = v8.splat(np.float32(0.5) * _INVERSE_LN2) * sum_0
+        c0, c1, c2 = x1 * y2 - x2 * y1, x2 * y0 - x0 * y2, x0 * y1 - x1 * y0
+        tiny = v8.splat(np.float32(1e-30))
+        inverse_det = half / v8.maximum(dot(c0, c1, c2, c0, c1, c2), tiny)
+        inverse_blurred = half / v8.maximum(along * cyy, tiny)
+        xy = lean * cyy
+        g_xx = g_xx + yy * inverse_det - cyy * inverse_blurred
+        g_yy = g_yy + xx * inverse_det - cxx * inverse_blurred
+        g_xy = g_xy + two * xy * (inverse_blurred - inverse_det)
+
+    g_px = two * sharp * sum_x
+    fall = k * inverse_cyy
+    g_py = two * (fall * _share(sums, slots, at, S_Y) - sharp * lean * sum_x)
+    abs_x = two * sharp * _share(sums, slots, at, S_ABS_X)
+    abs_y = two * _share(sums, slots, at, S_ABS_Y)
+    _write(rows, G_ABS, v8.sqrt(v8.fmuladd(abs_x, abs_x, abs_y * abs_y)))
+    _write(rows, G_RADIUS, v8.sqrt(v8.maximum(cxx, cyy)))
+    _write(rows, G_OPACITY, v8.splat(_INVERSE_LN2) * sum_0)
+
+    # Semi-axes: xx = sum x_j^2, xy = sum x_j y_j, yy = sum y_j^2.
+    two_xx, two_yy = two * g_xx, two * g_yy
+    a0, b0 = two_xx * x0 + g_xy * y0, g_xy * x0 + two_yy * y0
+    a1, b1 = two_xx * x1 + g_xy * y1, g_xy * x1 + two_yy * y1
+    a2, b2 = two_xx * x2 + g_xy * y2, g_xy * x2 + two_yy * y2
+    _write(rows, G_SCALE, a0 * x0 + b0 * y0)
+    _write(rows, G_SCALE + 1, a1 * x1 + b1 * y1)
+    _write(rows, G_SCALE + 2, a2 * x2 + b2 * y2)
+    a0, a1, a2, b0, b1, b2 = s0 * a0, s1 * a1, s2 * a2, s0 * b0, s1 * b1, s2 * b2
+    _write_quats(
+        quats, picked, at, rows,
+        (a0 * jx[0] + b0 * jy[0], a1 * jx[0] + b1 * jy[0], a2 * jx[0] + b2 * jy[0],
+         a0 * jx[1] + b0 * jy[1], a1 * jx[1] + b1 * jy[1], a2 * jx[1] + b2 * jy[1],
+         a0 * jx[2] + b0 * jy[2], a1 * jx[2] + b1 * jy[2], a2 * jx[2] + b2 * jy[2]),
+    )  # fmt: skip
+
+    # The Jacobian's rows jx = fx (r - u t) / z, jy = fy (s - v t) / z.
+    p0, p1, p2 = (
+        dot(a0, a1, a2, m[0], m[1], m[2]),
+        dot(a0, a1, a2, m[3], m[4], m[5]),
+        dot(a0, a1, a2, m[6], m[7], m[8]),
+    )
+    q0, q1, q2 = (
+        dot(b0, b1, b2, m[0], m[1], m[2]),
+        dot(b0, b1, b2, m[3], m[4], m[5]),
+        dot(b0, b1, b2, m[6], m[7], m[8]),
+    )
+    zero = v8.splat(np.float32(0))
+    raw_u, raw_v = x * inverse, y * inverse
+    free_u = v8.both(v8.at_least(raw_u, u_low), v8.at_least(u_high, raw_u))
+    free_v = v8.both(v8.at_least(raw_v, v_low), v8.at_least(v_high, raw_v))
+    g_u = v8.select(free_u, zero - fx * dot(p0, p1, p2, t[0], t[1], t[2]), zero)
+    g_v = v8.select(free_v, zero - fy * dot(q0, q1, q2, t[0], t[1], t[2]), zero)
+    g_x = (g_u + g_px * v8.splat(view[V_FOCAL])) * inverse
+    g_y = (g_v + g_py * v8.splat(view[V_FOCAL + 1])) * inverse
+    g_z = dot(p0, p1, p2, jx[0], jx[1], jx[2]) + dot(q0, q1, q2, jy[0], jy[1], jy[2])
+    g_z = _share(sums, slots, at, S_DEPTH) - g_z * inverse - g_x * raw_u - g_y * raw_v
+    for axis in range(3):
+        at_axis = U(_SLOPES + G_MEAN + axis) * U(LANES)
+        from_color = v8.load(rows, at_axis)
+        g = g_x * v8.splat(view[axis]) + g_y * v8.splat(view[3 + axis])
+        v8.store(rows, at_axis, from_color + v8.fmuladd(g_z, v8.splat(view[6 + axis]), g))
+
+
+@inner()
+def _write_quats(quats, picked, at, rows, g):
+    """dL by the unit quaternion from dL by its rotation matrix, row by row; radial part removed."""
+    two = v8.splat(np.float32(2))
+    w, x = v8.gather(quats, picked, at, U(4), U(0)), v8.gather(quats, picked, at, U(4), U(1))
+    y, z = v8.gather(quats, picked, at, U(4), U(2)), v8.gather(quats, picked, at, U(4), U(3))
+    g_w = two * (x * (g[7] - g[5]) + y * (g[2] - g[6]) + z * (g[3] - g[1]))
+    g_x = two * (
+        w * (g[7] - g[5]) + y * (g[1] + g[3]) + z * (g[2] + g[6]) - two * x * (g[4] + g[8])
+    )
+    g_y = two * (
+        w * (g[2] - g[6]) + x * (g[1] + g[3]) + z * (g[5] + g[7]) - two * y * (g[0] + g[8])
+    )
+    g_z = two * (
+        w * (g[3] - g[1]) + x * (g[2] + g[6]) + y * (g[5] + g[7]) - two * z * (g[0] + g[4])
+    )
+    radial = v8.fmuladd(g_w, w, dot(g_x, g_y, g_z, x, y, z))
+    _write(rows, G_QUAT, g_w - radial * w)
+    _write(rows, G_QUAT + 1, g_x - radial * x)
+    _write(rows, G_QUAT + 2, g_y - radial * y)
+    _write(rows, G_QUAT + 3, g_z - radial * z)
