@@ -1,0 +1,355 @@
+"""The loss of one view, from the rasteriser's buffers to their gradients.
+
+    picture = color_map(rgb + (1 - alpha) sky(direction))
+    total = (1 - d_ssim) L1 + d_ssim (1 - SSIM) / 2 + depth |1/ED - 1/z| + sky alpha
+
+each a weighted mean as `LossWeights` says. `loss_reference` is the torch definition of the same.
+SSIM is that of 3D Gaussian splatting (Kerbl et al. 2023): windows of 11 x 11 pixels, a Gaussian of
+sigma 1.5, zeros beyond the image, per channel, of pictures in [0, 1] that are not clamped.
+
+Departures, all shared by the reference:
+- Where a pixel's weight is 0, both pictures hold the prediction there, as a constant: it neither
+  disturbs the windows of its neighbours nor gets a gradient from them. (Depth and sky have masks
+  of their own and do not ask for the weight.)
+- The sky is not looked up where 1 - alpha < LEAST_SKY; it counts as black, and has no gradient.
+- A depth prior counts only where alpha > LEAST_ALPHA, for the expected depth of next to nothing is
+  noise; it gives no gradient elsewhere, but the mean is always over all of the view's priors, so
+  that uncovered pixels do not make the others count more.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from augment.cameras import Camera
+from augment.reconstruct import loss_kernels, sky_kernels
+from augment.reconstruct.config import LossWeights
+from augment.reconstruct.view import RecordedView
+from augment.render.threads import kernel_threads
+
+LEAST_SKY = np.float32(1e-3)  # less of the sky shows 1/4 of an 8-bit step
+LEAST_ALPHA = np.float32(0.05)
+ROWS = 8  # image rows a thread takes at a time
+IDENTITY_MAP = np.eye(3, 4, dtype=np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class SkyGradient:
+    """Gradient of the texels that were seen. texels: int32 [T], increasing indices into
+    faces.reshape(-1, 3); grads: float32 [T, 3].
+    """
+
+    texels: np.ndarray
+    grads: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class ViewLoss:
+    """A view's loss and its gradient.
+
+    total: the weighted sum, what d_* are the derivatives of. l1: mean |picture - recorded| over
+    weighted pixels; ssim: mean SSIM over them, 1 where there are none; depth: mean |1/ED - 1/z| in
+    1/m; sky: mean over the image of alpha in the sky. d_rgb [H, W, 3], d_alpha, d_expected_depth
+    [H, W]: float32. d_color_map: float64 [3, 4]. d_sky: None where no texel was seen.
+
+    A view whose weights are all 0 has l1 0, ssim 1, and gradients only from depth and sky.
+    """
+
+    total: float
+    l1: float
+    ssim: float
+    depth: float
+    sky: float
+    d_rgb: np.ndarray
+    d_alpha: np.ndarray
+    d_expected_depth: np.ndarray
+    d_color_map: np.ndarray
+    d_sky: SkyGradient | None
+
+
+@dataclass(eq=False)
+class LossScratch:
+    """Buffers that calls of `view_loss` share, to allocate nothing. Gradients returned by a call
+    with it lie in it: they hold until the next call. Not for two threads at once.
+    """
+
+    _images: dict[tuple[int, int], _ImageBuffers] = field(default_factory=dict)
+    _skies: dict[int, _SkyBuffers] = field(default_factory=dict)
+
+    def image(self, height: int, width: int) -> _ImageBuffers:
+        key = (height, width)
+        if key not in self._images:
+            self._images[key] = _ImageBuffers(height, width)
+        return self._images[key]
+
+    def sky(self, size: int) -> _SkyBuffers:
+        """Sums that are zero, whatever became of the call before."""
+        if size not in self._skies:
+            self._skies[size] = _SkyBuffers(size)
+        return self._skies[size]
+
+
+class _ImageBuffers:
+    """What depends on the image's size; see the kernels for each buffer's meaning."""
+
+    def __init__(self, height: int, width: int) -> None:
+        lanes, pad = loss_kernels.LANES, loss_kernels.PAD
+        stride = -(-width // lanes) * lanes
+        padded = (height + 2 * pad) * stride
+        self.size = (height, width, stride)
+        self.sky_colors = np.zeros((3, height, stride), np.float32)
+        self.texels = np.empty((height, width), np.int32)
+        self.fractions = np.empty((2, height, width), np.float32)
+        self.pairs = np.zeros(6 * padded, np.float32)  # their margins stay zero
+        self.slopes = np.zeros(9 * padded, np.float32)
+        self.weights = np.empty(height * stride, np.float32)
+        self.sums = np.empty((height, 3))
+        self.ssim_sums = np.empty(height)
+        self.map_sums = np.empty((height, 12))
+        self.d_rgb = np.empty((height, width, 3), np.float32)
+        self.d_alpha = np.empty((height, width), np.float32)
+        self.d_expected_depth = np.empty((height, width), np.float32)
+
+
+class _SkyBuffers:
+    """Sums over a cube map of faces `size` wide, zero between two calls."""
+
+    def __init__(self, size: int) -> None:
+        self.size = size
+        texels = 6 * size * size
+        slots = -(-texels // 8) * 8
+        self.parts = np.zeros((sky_kernels.PARTS, texels, 3), np.float32)
+        self.touched = np.zeros((sky_kernels.PARTS, slots), np.uint8)
+        self.texels = np.empty(texels, np.int32)
+        self.grads = np.empty((texels, 3), np.float32)
+        self.is_clean = True
+
+    def gradient(
+        self, d_rgb: np.ndarray, alpha: np.ndarray, image: _ImageBuffers
+    ) -> SkyGradient | None:
+        if not self.is_clean:  # a call was interrupted between the two kernels
+            self.parts.fill(0)
+            self.touched.fill(0)
+        self.is_clean = False
+        with kernel_threads():
+            sky_kernels.scatter_sky(
+                d_rgb, alpha, image.texels, image.fractions, self.size, self.parts, self.touched
+            )
+        words = self.touched.view(np.uint64)
+        count = sky_kernels.gather_sky(self.parts, self.touched, words, self.texels, self.grads)
+        self.is_clean = True
+        return SkyGradient(self.texels[:count], self.grads[:count]) if count else None
+
+
+def picture(
+    rgb: np.ndarray,
+    alpha: np.ndarray,
+    camera: Camera,
+    sky_faces: np.ndarray,
+    color_map: np.ndarray = IDENTITY_MAP,
+) -> np.ndarray:
+    """float32 [H, W, 3], not clamped: the sky [6, R, R, 3] behind, then the colour map [3, 4].
+
+    rgb [H, W, 3] without background and alpha [H, W] as rasterised, float32. Every pixel's sky is
+    looked up.
+    """
+    rgb, alpha, sky_faces, color_map = _checked(rgb, alpha, camera, sky_faces, color_map)
+    buffers = _ImageBuffers(camera.height, camera.width)
+    out = np.empty_like(rgb)
+    with kernel_threads(ROWS):
+        _sample_sky(alpha, camera, sky_faces, np.float32(0), buffers)
+        loss_kernels.finish_picture(
+            rgb.reshape(-1),
+            alpha.reshape(-1),
+            buffers.sky_colors.reshape(-1),
+            color_map.reshape(-1),
+            buffers.size,
+            out.reshape(-1),
+        )
+    return out
+
+
+def view_loss(
+    rgb: np.ndarray,
+    alpha: np.ndarray,
+    expected_depth: np.ndarray,
+    view: RecordedView,
+    sky_faces: np.ndarray,
+    color_map: np.ndarray,
+    weights: LossWeights,
+    *,
+    scratch: LossScratch | None = None,
+) -> ViewLoss:
+    """The loss of a render of `view.camera` against the view, and its gradient.
+
+    rgb [H, W, 3] without background, alpha [H, W], expected_depth [H, W] (m): as rasterised,
+    float32. sky_faces: float32 [6, R, R, 3]. color_map: float32 [3, 4]. scratch: buffers to reuse;
+    the gradients then hold until the next call. The same inputs give the same bits for any number
+    of threads.
+
+    Raises:
+        ValueError: an array's shape or type is wrong, or depth_pixels are not increasing indices.
+    """
+    camera = view.camera
+    rgb, alpha, sky_faces, color_map = _checked(rgb, alpha, camera, sky_faces, color_map)
+    expected_depth = _plain(
+        "expected_depth", expected_depth, np.float32, (camera.height, camera.width), camera
+    )
+    scratch = scratch or LossScratch()
+    buffers = scratch.image(camera.height, camera.width)
+    with kernel_threads(ROWS):
+        _sample_sky(alpha, camera, sky_faces, LEAST_SKY, buffers)
+        l1, ssim, sky, d_color_map = _compare(rgb, alpha, view, color_map, weights, buffers)
+    depth = _compare_depth(expected_depth, alpha, view, weights, buffers)
+    d_sky = scratch.sky(sky_faces.shape[1]).gradient(buffers.d_rgb, alpha, buffers)
+    total = (1 - weights.d_ssim) * l1 + weights.d_ssim * (1 - ssim) / 2
+    total += weights.depth * depth + weights.sky * sky
+    return ViewLoss(
+        total=total,
+        l1=l1,
+        ssim=ssim,
+        depth=depth,
+        sky=sky,
+        d_rgb=buffers.d_rgb,
+        d_alpha=buffers.d_alpha,
+        d_expected_depth=buffers.d_expected_depth,
+        d_color_map=d_color_map,
+        d_sky=d_sky,
+    )
+
+
+def _sample_sky(
+    alpha: np.ndarray,
+    camera: Camera,
+    sky_faces: np.ndarray,
+    least: np.float32,
+    buffers: _ImageBuffers,
+) -> None:
+    rotation = camera.camera_from_world[:3, :3].numpy().T.astype(np.float32, order="C")
+    intrinsics = np.array([1 / camera.fx, 1 / camera.fy, camera.cx, camera.cy], np.float32)
+    sky_kernels.sample_sky(
+        alpha,
+        sky_faces,
+        rotation,
+        intrinsics,
+        least,
+        buffers.sky_colors,
+        buffers.texels,
+        buffers.fractions,
+    )
+
+
+def _compare(
+    rgb: np.ndarray,
+    alpha: np.ndarray,
+    view: RecordedView,
+    color_map: np.ndarray,
+    weights: LossWeights,
+    buffers: _ImageBuffers,
+) -> tuple[float, float, float, np.ndarray]:
+    """L1, SSIM, alpha in the sky, and the colour map's gradient; the others go to the buffers."""
+    size = buffers.size
+    pixels = size[0] * size[1]
+    rendered = (
+        rgb.reshape(-1),
+        alpha.reshape(-1),
+        buffers.sky_colors.reshape(-1),
+        color_map.reshape(-1),
+    )
+    recorded = _writeable(view.rgb).reshape(-1)
+    weight, is_sky = _writeable(view.weight).reshape(-1), _writeable(view.sky).reshape(-1)
+    pairs, slopes, kept = buffers.pairs, buffers.slopes, buffers.weights
+    loss_kernels.compare(*rendered, recorded, weight, is_sky, size, pairs, kept, buffers.sums)
+    error_sum, weight_sum, covered = buffers.sums.sum(axis=0).tolist()
+    count = 3 * weight_sum
+    ssim, ssim_factor = 1.0, 0.0
+    if count > 0 and weights.d_ssim != 0:
+        loss_kernels.compare_windows(pairs, kept, size, slopes, buffers.ssim_sums)
+        ssim, ssim_factor = float(buffers.ssim_sums.sum()) / count, -weights.d_ssim / 2 / count
+    per_weight = 1 / count if count > 0 else 0.0
+    factors = ((1 - weights.d_ssim) * per_weight, ssim_factor, weights.sky / pixels)
+    loss_kernels.differentiate(
+        *rendered,
+        is_sky,
+        pairs,
+        slopes,
+        kept,
+        size,
+        np.array(factors, np.float32),
+        buffers.d_rgb.reshape(-1),
+        buffers.d_alpha.reshape(-1),
+        buffers.map_sums,
+    )
+    d_color_map = buffers.map_sums.sum(axis=0).reshape(3, 4)
+    return error_sum * per_weight, ssim, covered / pixels, d_color_map
+
+
+def _compare_depth(
+    expected_depth: np.ndarray,
+    alpha: np.ndarray,
+    view: RecordedView,
+    weights: LossWeights,
+    buffers: _ImageBuffers,
+) -> float:
+    """Mean |1/ED - 1/z| in 1/m; its gradient goes to the buffers."""
+    buffers.d_expected_depth.fill(0)
+    weight_sum = float(view.depth_weight.sum(dtype=np.float64))
+    if weight_sum <= 0 or weights.depth == 0:
+        return 0.0
+    sums = np.empty(-(-len(view.depth_pixels) // loss_kernels.CHUNK))
+    with kernel_threads():
+        loss_kernels.compare_depth(
+            expected_depth.reshape(-1),
+            alpha.reshape(-1),
+            _writeable(view.depth_pixels),
+            _writeable(view.depth_m),
+            _writeable(view.depth_weight),
+            np.float32(weights.depth / weight_sum),
+            LEAST_ALPHA,
+            buffers.d_expected_depth.reshape(-1),
+            sums,
+        )
+    if sums.min() < 0:
+        raise ValueError(
+            f"view of camera {view.camera.name!r}: depth_pixels must be increasing indices from 0 "
+            f"to {expected_depth.size - 1}, and depth_weight >= 0; got pixels from "
+            f"{view.depth_pixels.min()} to {view.depth_pixels.max()}, weights from "
+            f"{view.depth_weight.min()}"
+        )
+    return float(sums.sum()) / weight_sum
+
+
+def _checked(
+    rgb: np.ndarray,
+    alpha: np.ndarray,
+    camera: Camera,
+    sky_faces: np.ndarray,
+    color_map: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    size = (camera.height, camera.width)
+    faces = sky_faces.shape[1] if sky_faces.ndim == 4 and sky_faces.shape[1] else 1
+    return (
+        _plain("rgb", rgb, np.float32, (*size, 3), camera),
+        _plain("alpha", alpha, np.float32, size, camera),
+        _plain("sky_faces", sky_faces, np.float32, (6, faces, faces, 3), camera),
+        _plain("color_map", color_map, np.float32, (3, 4), camera),
+    )
+
+
+def _plain(
+    name: str, value: np.ndarray, dtype: type, shape: tuple[int, ...], camera: Camera
+) -> np.ndarray:
+    if value.shape != shape or value.dtype != dtype:
+        raise ValueError(
+            f"{name} of camera {camera.name!r} must be {np.dtype(dtype)} {list(shape)}; "
+            f"got {value.dtype} {list(value.shape)}"
+        )
+    return _writeable(value)
+
+
+def _writeable(value: np.ndarray) -> np.ndarray:
+    """The array, or a copy where it is read-only, which numba would compile everything anew for."""
+    value = np.ascontiguousarray(value)
+    return value if value.flags.writeable else value.copy()

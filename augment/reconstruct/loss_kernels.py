@@ -1,0 +1,359 @@
+"""Numba kernels of the image loss: L1 and SSIM against a recorded picture, and their gradients.
+
+With x the picture, y the recorded one, G the window's blur, P = G(x + y) and N = G(x - y):
+
+    A1 = (P^2 - N^2)/2 + C1 = 2 mu_x mu_y + C1        A2 = 2 sigma_xy + C2, from G((x + y)^2)
+    B1 = (P^2 + N^2)/2 + C1 = mu_x^2 + mu_y^2 + C1    B2 = sigma_x^2 + sigma_y^2 + C2, G((x - y)^2)
+    SSIM = A1 A2 / (B1 B2)
+
+so that four blurs do instead of five, and the gradient takes three: with a, b, c the derivatives
+by P plus N, by G((x + y)^2) and by G((x - y)^2), each times the pixel's weight,
+
+    d/dx = G(a) + (x + y) G(2 b) + (x - y) G(2 c)
+
+Planes are rows of `stride` float32, a multiple of LANES; those that are blurred have PAD rows of
+zeros above and below, and zeros from the image's width to the stride.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import prange
+
+from augment.render import cpu_simd as v8
+from augment.render.cpu_jit import inner, kernel
+
+U = np.uint64
+LANES = v8.LANES
+PAD = 5  # the window's radius
+MARGIN = 8  # zeros on either side of a row that is blurred, >= PAD
+SIGMA = 1.5
+C1, C2 = np.float32(0.01**2), np.float32(0.03**2)
+
+_BELL = [math.exp(-(k**2) / (2 * SIGMA**2)) for k in range(PAD + 1)]
+_AREA = _BELL[0] + 2 * sum(_BELL[1:])
+W0, W1, W2, W3, W4, W5 = (np.float32(value / _AREA) for value in _BELL)
+
+CHUNK = 4096  # depth priors summed at a time
+
+
+@inner()
+def _blur_row(row, at):
+    """Eight blurred values of a row with margins; at: index of the first in the row."""
+    value = v8.load(row, at) * v8.splat(W0)
+    pair = v8.load(row, at - U(1)) + v8.load(row, at + U(1))
+    value = v8.fmuladd(pair, v8.splat(W1), value)
+    pair = v8.load(row, at - U(2)) + v8.load(row, at + U(2))
+    value = v8.fmuladd(pair, v8.splat(W2), value)
+    pair = v8.load(row, at - U(3)) + v8.load(row, at + U(3))
+    value = v8.fmuladd(pair, v8.splat(W3), value)
+    pair = v8.load(row, at - U(4)) + v8.load(row, at + U(4))
+    value = v8.fmuladd(pair, v8.splat(W4), value)
+    pair = v8.load(row, at - U(5)) + v8.load(row, at + U(5))
+    return v8.fmuladd(pair, v8.splat(W5), value)
+
+
+@inner()
+def _blur_column(plane, at, stride):
+    """Eight values blurred over the rows; at: index of the first, PAD rows above the centre."""
+    value = v8.load(plane, at + U(5) * stride) * v8.splat(W0)
+    pair = v8.load(plane, at + U(4) * stride) + v8.load(plane, at + U(6) * stride)
+    value = v8.fmuladd(pair, v8.splat(W1), value)
+    pair = v8.load(plane, at + U(3) * stride) + v8.load(plane, at + U(7) * stride)
+    value = v8.fmuladd(pair, v8.splat(W2), value)
+    pair = v8.load(plane, at + U(2) * stride) + v8.load(plane, at + U(8) * stride)
+    value = v8.fmuladd(pair, v8.splat(W3), value)
+    pair = v8.load(plane, at + stride) + v8.load(plane, at + U(9) * stride)
+    value = v8.fmuladd(pair, v8.splat(W4), value)
+    pair = v8.load(plane, at) + v8.load(plane, at + U(10) * stride)
+    return v8.fmuladd(pair, v8.splat(W5), value)
+
+
+@inner()
+def _pair_of_moments(plane, upper, lower, weight, first, second):
+    """first + weight (a + b) and second + weight (a^2 + b^2), a and b from two rows."""
+    a, b = v8.load(plane, upper), v8.load(plane, lower)
+    first = v8.fmuladd(a + b, weight, first)
+    return first, v8.fmuladd(v8.fmuladd(a, a, b * b), weight, second)
+
+
+@inner()
+def _column_moments(plane, at, stride, rows, first_at, second_at):
+    """As `_blur_column`, of the values and of their squares, into two rows."""
+    a = v8.load(plane, at + U(5) * stride)
+    first = a * v8.splat(W0)
+    second = a * first
+    first, second = _pair_of_moments(
+        plane, at + U(4) * stride, at + U(6) * stride, v8.splat(W1), first, second
+    )
+    first, second = _pair_of_moments(
+        plane, at + U(3) * stride, at + U(7) * stride, v8.splat(W2), first, second
+    )
+    first, second = _pair_of_moments(
+        plane, at + U(2) * stride, at + U(8) * stride, v8.splat(W3), first, second
+    )
+    first, second = _pair_of_moments(
+        plane, at + stride, at + U(9) * stride, v8.splat(W4), first, second
+    )
+    first, second = _pair_of_moments(plane, at, at + U(10) * stride, v8.splat(W5), first, second)
+    v8.store(rows, first_at, first)
+    v8.store(rows, second_at, second)
+
+
+@inner()
+def _mapped(rows, at, stride, color_map, channel):
+    """One channel of the colour map, of three rows of composited colour."""
+    entry = U(4 * channel)
+    value = v8.fmuladd(
+        v8.load(rows, at), v8.splat(color_map[entry]), v8.splat(color_map[entry + U(3)])
+    )
+    value = v8.fmuladd(v8.load(rows, at + stride), v8.splat(color_map[entry + U(1)]), value)
+    return v8.fmuladd(v8.load(rows, at + stride + stride), v8.splat(color_map[entry + U(2)]), value)
+
+
+@inner()
+def _composite_row(rgb, alpha, sky, row, size, rows):
+    """rgb + (1 - alpha) sky of one image row, into the first three of `rows`."""
+    height, width, stride = U(size[0]), U(size[1]), U(size[2])
+    one = np.float32(1)
+    for j in range(U(0), width):
+        through = one - alpha[row * width + j]
+        for c in range(U(0), U(3)):
+            behind = sky[(c * height + row) * stride + j]
+            rows[c * stride + j] = rgb[(row * width + j) * U(3) + c] + through * behind
+
+
+@kernel
+def finish_picture(rgb, alpha, sky, color_map, size, out):
+    """The picture as the camera shows it: the sky behind, then the camera's colours.
+
+    rgb, out: flat [H, W, 3]. alpha: flat [H, W]. sky: flat planes [3, H, stride]. color_map: flat
+    [3, 4]. size: height, width, stride.
+    """
+    width, stride = U(size[1]), U(size[2])
+    for i in prange(size[0]):
+        rows = np.zeros(6 * size[2], np.float32)
+        _composite_row(rgb, alpha, sky, U(i), size, rows)
+        for j in range(U(0), stride, U(LANES)):
+            for c in range(3):
+                v8.store(rows, U(3 + c) * stride + j, _mapped(rows, j, stride, color_map, c))
+        for j in range(U(0), width):
+            for c in range(U(0), U(3)):
+                out[(U(i) * width + j) * U(3) + c] = rows[(U(3) + c) * stride + j]
+
+
+@kernel
+def compare(rgb, alpha, sky, color_map, recorded, weight, is_sky, size, pairs, weights, sums):
+    """x + y and x - y of the finished and the recorded picture, and the sums of the L1 loss.
+
+    recorded: flat uint8 [H, W, 3]. weight, is_sky: flat [H, W]; the rest as `finish_picture`.
+    Written: pairs, six flat planes [H + 2 PAD, stride], red, green, blue of x + y, then of x - y;
+    weights, a flat plane [H, stride]; sums, float64 [H, 3]: of weight |x - y|, of weight, and of
+    alpha in the sky. Where the weight is 0, y is x.
+    """
+    width, stride = U(size[1]), U(size[2])
+    plane = U(size[0] + 2 * PAD) * stride
+    to_unit = np.float32(1 / 255)
+    for i in prange(size[0]):
+        row = U(i)
+        rows = np.zeros(6 * size[2], np.float32)
+        _composite_row(rgb, alpha, sky, row, size, rows)
+        covered = 0.0
+        for j in range(U(0), width):
+            at = row * width + j
+            weights[row * stride + j] = weight[at]
+            if is_sky[at]:
+                covered += alpha[at]
+            for c in range(U(0), U(3)):
+                rows[(U(3) + c) * stride + j] = np.float32(recorded[at * U(3) + c]) * to_unit
+        for j in range(width, stride):
+            weights[row * stride + j] = np.float32(0)
+        zero = v8.splat(np.float32(0))
+        error, weight_sum = zero, zero
+        first = (row + U(PAD)) * stride
+        for j in range(U(0), stride, U(LANES)):
+            w = v8.load(weights, row * stride + j)
+            is_used = v8.greater(w, zero)
+            weight_sum = weight_sum + w
+            for c in range(3):
+                x = _mapped(rows, j, stride, color_map, c)
+                y = v8.select(is_used, v8.load(rows, U(3 + c) * stride + j), x)
+                v8.store(pairs, U(c) * plane + first + j, x + y)
+                v8.store(pairs, U(3 + c) * plane + first + j, x - y)
+                error = v8.fmuladd(v8.absolute(x - y), w, error)
+        for c in range(U(0), U(6)):  # beyond the image both are zero, as the window's padding is
+            for j in range(width, stride):
+                pairs[c * plane + first + j] = np.float32(0)
+        sums[i, 0] = v8.total(error)
+        sums[i, 1] = v8.total(weight_sum)
+        sums[i, 2] = covered
+
+
+@kernel
+def compare_windows(pairs, weights, size, slopes, sums):
+    """SSIM's sum with the weights, and the three planes that its gradient is blurred from.
+
+    pairs, weights: from `compare`. Written: slopes, nine flat planes [H + 2 PAD, stride], a, 2 b,
+    2 c (see above) for red, then green, then blue; sums, float64 [H].
+    """
+    stride = U(size[2])
+    plane = U(size[0] + 2 * PAD) * stride
+    length = stride + U(2 * MARGIN)
+    for i in prange(size[0]):
+        row = U(i)
+        rows = np.zeros(U(4) * length, np.float32)
+        half, one = v8.splat(np.float32(0.5)), v8.splat(np.float32(1))
+        ssim_sum = v8.splat(np.float32(0))
+        for c in range(U(0), U(3)):
+            for j in range(U(0), stride, U(LANES)):
+                top, at = c * plane + row * stride + j, j + U(MARGIN)
+                _column_moments(pairs, top, stride, rows, at, at + U(2) * length)
+                _column_moments(
+                    pairs, top + U(3) * plane, stride, rows, at + length, at + U(3) * length
+                )
+            centre = U(3) * c * plane + (row + U(PAD)) * stride
+            for j in range(U(0), stride, U(LANES)):
+                at = j + U(MARGIN)
+                p, n = _blur_row(rows, at), _blur_row(rows, at + length)
+                pp, nn = p * p, n * n
+                over_p = _blur_row(rows, at + U(2) * length) - pp
+                over_n = _blur_row(rows, at + U(3) * length) - nn
+                a1 = v8.fmuladd(pp - nn, half, v8.splat(C1))
+                b1 = v8.fmuladd(pp + nn, half, v8.splat(C1))
+                a2 = v8.fmuladd(over_p - over_n, half, v8.splat(C2))
+                b2 = v8.fmuladd(over_p + over_n, half, v8.splat(C2))
+                b2 = v8.maximum(b2, v8.splat(C2))  # a variance; rounding may make it negative
+                w = v8.load(weights, row * stride + j)
+                inverse = one / (b1 * b2)
+                ssim = a1 * a2 * inverse
+                ssim_sum = v8.fmuladd(ssim, w, ssim_sum)
+                w = w * inverse  # the derivatives by A1, A2, B1 and B2, times the weight
+                by_a1, by_a2 = a2 * w, a1 * w
+                by_b1, by_b2 = v8.negate(ssim * b2 * w), v8.negate(ssim * b1 * w)
+                along = by_a1 - by_a2
+                across = by_b1 - by_b2
+                a = v8.fmuladd(p, along + across, n * (across - along))
+                v8.store(slopes, centre + j, a)
+                v8.store(slopes, centre + plane + j, by_b2 + by_a2)
+                v8.store(slopes, centre + plane + plane + j, by_b2 - by_a2)
+        sums[i] = v8.total(ssim_sum)
+
+
+@inner()
+def _picture_slopes(pairs, slopes, weights, row, size, factors, work, rows):
+    """The loss's derivatives by the finished picture, one image row, into rows 3 to 5 of `rows`."""
+    stride = U(size[2])
+    plane = U(size[0] + 2 * PAD) * stride
+    length = stride + U(2 * MARGIN)
+    zero, one = v8.splat(np.float32(0)), v8.splat(np.float32(1))
+    for c in range(U(0), U(3)):
+        top = U(3) * c * plane + row * stride
+        for k in range(U(0), U(3)):
+            for j in range(U(0), stride, U(LANES)):
+                value = _blur_column(slopes, top + k * plane + j, stride)
+                v8.store(work, k * length + U(MARGIN) + j, value)
+        centre = c * plane + (row + U(PAD)) * stride
+        for j in range(U(0), stride, U(LANES)):
+            at = j + U(MARGIN)
+            w = v8.load(weights, row * stride + j)
+            plus, minus = v8.load(pairs, centre + j), v8.load(pairs, centre + U(3) * plane + j)
+            slope = v8.fmuladd(_blur_row(work, at + length), plus, _blur_row(work, at))
+            slope = v8.fmuladd(_blur_row(work, at + length + length), minus, slope)
+            sign = v8.select(v8.greater(minus, zero), one, zero)
+            sign = v8.select(v8.greater(zero, minus), v8.negate(one), sign)
+            slope = v8.fmuladd(slope, v8.splat(factors[1]), sign * w * v8.splat(factors[0]))
+            v8.store(rows, (U(3) + c) * stride + j, v8.select(v8.greater(w, zero), slope, zero))
+
+
+@inner()
+def _times_transposed(rows, at, stride, color_map, k):
+    """Derivative by one channel of the composited colour: rows 3 to 5 times the map's column k."""
+    value = v8.load(rows, at + U(3) * stride) * v8.splat(color_map[U(k)])
+    value = v8.fmuladd(v8.load(rows, at + U(4) * stride), v8.splat(color_map[U(4 + k)]), value)
+    return v8.fmuladd(v8.load(rows, at + U(5) * stride), v8.splat(color_map[U(8 + k)]), value)
+
+
+@inner()
+def _sum_products(rows, first, second, stride):
+    """Sum over a row of the product of two of `rows`."""
+    value = v8.splat(np.float32(0))
+    for j in range(U(0), stride, U(LANES)):
+        value = v8.fmuladd(
+            v8.load(rows, first * stride + j), v8.load(rows, second * stride + j), value
+        )
+    return v8.total(value)
+
+
+@inner()
+def _sum_row(rows, first, stride):
+    value = v8.splat(np.float32(0))
+    for j in range(U(0), stride, U(LANES)):
+        value = value + v8.load(rows, first * stride + j)
+    return v8.total(value)
+
+
+@kernel
+def differentiate(
+    rgb, alpha, sky, color_map, is_sky, pairs, slopes, weights, size, factors, d_rgb, d_alpha, sums
+):
+    """The loss's derivatives by rgb, alpha and the colour map.
+
+    factors: float32, of the L1 loss and of SSIM per unit of weight, and of alpha in the sky; the
+    rest as in the kernels above. Written: d_rgb flat [H, W, 3], d_alpha flat [H, W]; sums, float64
+    [H, 12]: the row's part of the map's derivative.
+    """
+    height, width, stride = U(size[0]), U(size[1]), U(size[2])
+    length = stride + U(2 * MARGIN)
+    for i in prange(size[0]):
+        row = U(i)
+        rows = np.zeros(U(6) * stride, np.float32)  # composited colour, derivatives by picture
+        work = np.zeros(U(3) * length, np.float32)
+        _composite_row(rgb, alpha, sky, row, size, rows)
+        _picture_slopes(pairs, slopes, weights, row, size, factors, work, rows)
+        for c in range(U(0), U(3)):
+            for k in range(U(0), U(3)):
+                sums[i, U(4) * c + k] = _sum_products(rows, U(3) + c, k, stride)
+            sums[i, U(4) * c + U(3)] = _sum_row(rows, U(3) + c, stride)
+        for j in range(U(0), stride, U(LANES)):
+            for k in range(3):
+                v8.store(rows, U(k) * stride + j, _times_transposed(rows, j, stride, color_map, k))
+        for j in range(U(0), width):
+            at = row * width + j
+            slope = factors[2] if is_sky[at] else np.float32(0)
+            for c in range(U(0), U(3)):
+                value = rows[c * stride + j]
+                d_rgb[at * U(3) + c] = value
+                slope -= value * sky[(c * height + row) * stride + j]
+            d_alpha[at] = slope
+
+
+@kernel
+def compare_depth(expected, alpha, pixels, depth, weight, factor, least_alpha, d_expected, sums):
+    """Sum of weight |1/expected - 1/depth| over the priors, and its derivative.
+
+    expected, alpha, d_expected: flat [H, W]; d_expected must be 0 and gets factor times the
+    derivative. pixels, depth, weight: the priors. Pixels with alpha <= least_alpha count nothing.
+    sums: float64, one per CHUNK of priors; -1 where a pixel lies outside of the image or the order
+    does not increase.
+    """
+    one, zero = np.float32(1), np.float32(0)
+    for chunk in prange(sums.size):
+        total = 0.0
+        before = pixels[chunk * CHUNK - 1] if chunk else np.int32(-1)
+        for k in range(chunk * CHUNK, min((chunk + 1) * CHUNK, pixels.size)):
+            pixel = pixels[k]
+            if pixel <= before or pixel >= expected.size:
+                total = -1.0
+                break
+            before = pixel
+            value = expected[pixel]
+            if not (alpha[pixel] > least_alpha and value > zero and depth[k] > zero):
+                continue
+            inverse = one / value
+            error = inverse - one / depth[k]
+            total += weight[k] * abs(error)
+            slope = factor * weight[k] * inverse * inverse
+            d_expected[pixel] = -slope if error > zero else slope if error < zero else zero
+        sums[chunk] = total
