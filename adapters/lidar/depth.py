@@ -33,6 +33,23 @@ class SparseDepth:
         return len(self.depth_m)
 
 
+@dataclass(frozen=True, eq=False)
+class FrameReturns:
+    """A frame's sweep, ready to be seen by any camera of the frame.
+
+    points: float64 [N, 3], scene world, as the LiDAR saw them. timestamps_ns: int64 [N].
+    carried: for each actor that has any, its motion, the indices of its returns, and their places
+    in its own frame.
+    """
+
+    points: np.ndarray
+    timestamps_ns: np.ndarray
+    carried: tuple[tuple[Motion, np.ndarray, np.ndarray], ...]
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
 def lidar_depth(
     scene: Scene,
     frame_index: int,
@@ -51,17 +68,39 @@ def lidar_depth(
     Raises:
         AdapterError: the sweep has no times (column timestamp_ns, or t in seconds).
     """
+    returns = read_returns(scene, frame_index, without_semantic=without_semantic)
+    if returns is None:
+        return SparseDepth(np.zeros((0, 2), np.int32), np.zeros(0, np.float32), np.zeros(0, int))
+    return depth_seen(returns, camera)
+
+
+def read_returns(
+    scene: Scene, frame_index: int, *, without_semantic: Collection[int] = ()
+) -> FrameReturns | None:
+    """The part of `lidar_depth` that all cameras of a frame share; None without a sweep."""
     sweep = scene.lidar(frame_index)
     if sweep is None:
-        return SparseDepth(np.zeros((0, 2), np.int32), np.zeros(0, np.float32), np.zeros(0, int))
+        return None
     points = sweep.points_m - scene.world_origin_m
     times = _times(sweep, frame_index)
     keep = np.isfinite(points).all(axis=1)
     if without_semantic and "semantic" in sweep.columns:
         keep &= ~np.isin(sweep.columns["semantic"], list(without_semantic))
     points, times = points[keep], times[keep]
-    present = _carry(scene, points, times, camera.timestamp_ns)
-    return _project(points[present], times[present], camera)
+    return FrameReturns(points, times, _on_actors(scene, points, times))
+
+
+def depth_seen(returns: FrameReturns, camera: Camera) -> SparseDepth:
+    """The part of `lidar_depth` that is the camera's own."""
+    points = returns.points.copy()
+    present = np.ones(len(points), dtype=bool)
+    for motion, own, local in returns.carried:
+        pose = motion.pose_at(camera.timestamp_ns)
+        if pose is None:
+            present[own] = False
+        else:
+            points[own] = local @ pose[:3, :3].T + pose[:3, 3]
+    return _project(points[present], returns.timestamps_ns[present], camera)
 
 
 def _times(sweep: LidarSweep, frame_index: int) -> np.ndarray:
@@ -75,27 +114,23 @@ def _times(sweep: LidarSweep, frame_index: int) -> np.ndarray:
     )
 
 
-def _carry(scene: Scene, points: np.ndarray, times: np.ndarray, to_ns: int) -> np.ndarray:
-    """Move returns on actors, in place, to where they are at a time; which returns exist then."""
-    present = np.ones(len(points), dtype=bool)
-    if len(points) == 0:
-        return present
-    seen = points.copy()  # every actor is compared with what the sensor saw, not with moved points
-    for actor in scene.actors:
+def _on_actors(
+    scene: Scene, points: np.ndarray, times: np.ndarray
+) -> tuple[tuple[Motion, np.ndarray, np.ndarray], ...]:
+    """For each actor with returns: its motion, their indices, and where they are on it."""
+    found = []
+    for actor in scene.actors if len(points) else ():
         motion = Motion.of(actor.track)
         size_m = np.array(actor.size_m)
         low, high = motion.span(int(times.min()), int(times.max()))
         reach = float(np.linalg.norm(size_m)) / 2 + HALO_M
-        near = indices_between(seen, low - reach, high + reach)
+        near = indices_between(points, low - reach, high + reach)
         near = near[motion.exists_at(times[near])]
-        local = motion.into_actor(seen[near], times[near])
+        local = motion.into_actor(points[near], times[near])
         own = inside_box(local, size_m, SKIN_M) & (local[:, 2] > FLOOR_M - size_m[2] / 2)
-        pose = motion.pose_at(to_ns)
-        if pose is None:
-            present[near[own]] = False
-        else:
-            points[near[own]] = local[own] @ pose[:3, :3].T + pose[:3, 3]
-    return present
+        if own.any():
+            found.append((motion, near[own], local[own]))
+    return tuple(found)
 
 
 def _project(points: np.ndarray, times: np.ndarray, camera: Camera) -> SparseDepth:

@@ -84,6 +84,11 @@ class PandaSetLabels:
         table = read_cuboids(self.root, frame_index)
         return Boxes.empty() if table is None else boxes_of_cuboids(table)
 
+    @property
+    def no_surface_classes(self) -> tuple[int, ...]:
+        """The sweeps' class numbers of returns that no surface made: smoke, spray, reflections."""
+        return tuple(int(n) for n in np.flatnonzero(semantic_table(self.root) == NO_SURFACE))
+
     def lidar(self, frame_index: int) -> LidarSweep | None:
         table = read_lidar(self.root, frame_index)
         if table is None:

@@ -1,0 +1,240 @@
+"""The recorded images of a scene's frames as views to learn from."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from adapters.recorded.depth_priors import DepthPriors, DepthSource
+from adapters.recorded.holdout import holdout_step, is_held_out
+from adapters.recorded.images import ImageFault, Images
+from adapters.recorded.sky_masks import lidar_top_rad, sky_mask
+from augment.cameras import Camera
+from augment.errors import AdapterError
+from augment.reconstruct.view import RecordedView, ViewKey
+from augment.scene import Scene
+
+logger = logging.getLogger(__name__)
+
+CACHE_BYTES = 1 << 30
+_TOP_FRAMES = 5  # frames that the LiDAR's highest view is measured in
+
+
+def recorded_views(
+    scene: Scene,
+    *,
+    scale: float,
+    cameras: Sequence[str] | None = None,
+    holdout: str = "none",
+    cache_bytes: int = CACHE_BYTES,
+    depth: DepthPriors = DepthPriors(),  # noqa: B008 - frozen, so sharing it is safe
+    masks_dir: Path | None = None,
+    mask_ego: bool = False,
+) -> RecordedViews:
+    """The views of a scene that was opened from recordings.
+
+    scene: as initialised, before any optimisation; its Gaussians tell where sky must be. scale:
+    training resolution over recorded resolution, in (0, 1]. cameras: names, all by default.
+    holdout: "none" or "every-Nth": of the scene's frames the last of every N is held out.
+    cache_bytes: memory for decoded images, and half as much for depth priors; what does not fit is
+    read again. masks_dir: DIR/<camera>.png, white where the image shows the recording car.
+    mask_ego: do not learn from pixels that show the recording car.
+
+    Every image is decoded once here. Unusable ones are left out and named in `problems`.
+
+    Raises:
+        AdapterError: an unknown camera or holdout, or no usable image.
+    """
+    if not 0 < scale <= 1:
+        raise ValueError(f"scale must be > 0 and <= 1; got {scale}")
+    return RecordedViews(
+        scene,
+        scale=scale,
+        names=_camera_names(scene, cameras),
+        holdout=holdout,
+        cache_bytes=cache_bytes,
+        depth=depth,
+        masks_dir=masks_dir,
+        mask_ego=mask_ego,
+    )
+
+
+class RecordedViews:
+    """A `ViewSource`; made by `recorded_views`. `load` may be called from several threads."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        *,
+        scale: float,
+        names: Sequence[str],
+        holdout: str,
+        cache_bytes: int,
+        depth: DepthPriors,
+        masks_dir: Path | None,
+        mask_ego: bool,
+    ) -> None:
+        step = holdout_step(holdout)
+        self._scene = scene
+        self._images = Images(cache_bytes)
+        self._problems: list[str] = []
+        self._cameras = self._read_all(scene, names, scale)
+        positions = {frame.index: i for i, frame in enumerate(scene.frames)}
+        is_test = [is_held_out(positions[key.frame], step) for key in self._cameras]
+        self._train = tuple(k for k, t in zip(self._cameras, is_test, strict=True) if not t)
+        self._test = tuple(k for k, t in zip(self._cameras, is_test, strict=True) if t)
+        self._check_split(holdout)
+        self._depth = DepthSource(scene, self._cameras, depth, cache_bytes=cache_bytes // 2)
+        self._lidar_top_rad = self._measure_lidar_top()
+        self._skies: dict[ViewKey, np.ndarray] = {}  # one bit a pixel
+        self._weights: dict[str, np.ndarray] = {}
+        self.ego_masks: dict[str, np.ndarray] = {}
+        self._lock = threading.Lock()
+
+    @property
+    def train(self) -> tuple[ViewKey, ...]:
+        return self._train
+
+    @property
+    def test(self) -> tuple[ViewKey, ...]:
+        return self._test
+
+    @property
+    def problems(self) -> tuple[str, ...]:
+        """What was found wrong and gone on without, one sentence each; loading may add some."""
+        return (*self._problems, *self._depth.problems)
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What there is, for reports: JSON-able."""
+        sizes = {k.camera: [c.width, c.height] for k, c in self._cameras.items()}
+        top = self._lidar_top_rad
+        return {
+            "images": dict(Counter(key.camera for key in self._cameras)),
+            "sizes_px": sizes,
+            "train_images": len(self._train),
+            "test_images": len(self._test),
+            "depth_priors": list(self._depth.kinds),
+            "lidar_top_deg": None if top is None else float(np.degrees(top)),
+            "ego_mask_parts": {n: float(mask.mean()) for n, mask in self.ego_masks.items()},
+        }
+
+    def camera(self, key: ViewKey) -> Camera:
+        try:
+            return self._cameras[key]
+        except KeyError:
+            raise AdapterError(
+                f"scene {self._scene.name!r} has no usable image of camera {key.camera!r} in "
+                f"frame {key.frame}"
+            ) from None
+
+    def load(self, key: ViewKey) -> RecordedView:
+        camera = self.camera(key)
+        with self._lock:
+            rgb = self._images.load(key)
+            prior = self._depth.load(key)
+            return RecordedView(
+                camera=camera,
+                rgb=rgb,
+                weight=self._weight(camera),
+                sky=self._sky(key, camera, rgb),
+                depth_pixels=prior.pixels,
+                depth_m=prior.depth_m,
+                depth_weight=prior.weight,
+            )
+
+    def _weight(self, camera: Camera) -> np.ndarray:
+        weight = self._weights.get(camera.name)
+        if weight is None or weight.shape != (camera.height, camera.width):
+            weight = np.ones((camera.height, camera.width), np.float32)
+            self._weights[camera.name] = weight
+        return weight
+
+    def _sky(self, key: ViewKey, camera: Camera, rgb: np.ndarray) -> np.ndarray:
+        packed = self._skies.get(key)
+        if packed is None:
+            mask = sky_mask(self._scene, camera, rgb, self._lidar_top_rad)
+            self._skies[key] = np.packbits(mask)
+            return mask
+        count = camera.height * camera.width
+        bits = np.unpackbits(packed, count=count).view(np.bool_)
+        return bits.reshape(camera.height, camera.width)
+
+    def _read_all(self, scene: Scene, names: Sequence[str], scale: float) -> dict[ViewKey, Camera]:
+        """The training camera of every view with a usable image, in order of frame and camera."""
+        wanted = [
+            (ViewKey(frame.index, name), frame.cameras[name], frame.image_paths.get(name))
+            for frame in scene.frames
+            for name in names
+            if name in frame.cameras
+        ]
+        cameras: dict[ViewKey, Camera] = {}
+        for key, full, path in tqdm(wanted, desc="images", unit="image", disable=None):
+            if path is None:
+                continue  # the adapter that left it out has said so
+            scaled = full.scaled(scale)
+            try:
+                self._images.add(key, Path(path), full, scaled)
+            except ImageFault as fault:
+                self._problems.append(
+                    f"camera {key.camera}, frame {key.frame}: image {path} {fault}; left out"
+                )
+                continue
+            cameras[key] = scaled
+        if not cameras:
+            raise AdapterError(_no_images(scene, names, len(wanted), self._problems))
+        return cameras
+
+    def _check_split(self, holdout: str) -> None:
+        if not self._train:
+            raise AdapterError(
+                f"scene {self._scene.name!r}: holdout {holdout!r} leaves no image to learn from; "
+                f"choose a larger step or 'none'"
+            )
+        if holdout != "none" and not self._test:
+            frames = len({key.frame for key in self._cameras})
+            self._problems.append(
+                f"nothing is held out: {holdout} selects none of the {frames} "
+                f"frame{'s' if frames > 1 else ''} with images, so quality is known on training "
+                f"views only"
+            )
+
+    def _measure_lidar_top(self) -> float | None:
+        frames = list(dict.fromkeys(key.frame for key in self._cameras))
+        spread = frames[:: max(1, -(-len(frames) // _TOP_FRAMES))]
+        top = lidar_top_rad(self._scene, spread)
+        if top is None:
+            self._problems.append(
+                "no sky masks: without LiDAR sweeps nothing tells sky from tall buildings"
+            )
+        return top
+
+
+def _camera_names(scene: Scene, cameras: Sequence[str] | None) -> tuple[str, ...]:
+    known = scene.camera_names
+    if cameras is None:
+        return known
+    unknown = sorted(set(cameras) - set(known))
+    if unknown or not cameras:
+        raise AdapterError(
+            f"scene {scene.name!r} has no camera {', '.join(map(repr, unknown)) or 'named'}; "
+            f"it has {', '.join(known) or 'none'}"
+        )
+    return tuple(name for name in known if name in cameras)
+
+
+def _no_images(scene: Scene, names: Sequence[str], wanted: int, problems: Sequence[str]) -> str:
+    first = f" First: {problems[0]}." if problems else ""
+    return (
+        f"scene {scene.name!r} ({scene.source}) has no usable recorded image for "
+        f"{len(scene.frames)} frames of {', '.join(names) or 'no camera'} ({wanted} expected). "
+        f"A reconstruction needs recordings: open the raw drive, such as pandaset:PATH or "
+        f"recording:PATH, and see that its images are in place.{first}"
+    )
