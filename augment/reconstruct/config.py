@@ -11,23 +11,27 @@ class LossWeights:
     + depth * mean |1/ED - 1/z| over the pixels with a depth prior (1/m)
     + sky * mean alpha over all pixels marked as sky (relative to the image's pixel count).
 
-    depth 0 switches depth regularisation off.
+    depth 0 switches depth regularisation off. opacity_decay and scale_decay pull the opacity and
+    the size (1/m) of every splat that a view touches towards 0.
     """
 
     d_ssim: float = 0.2
     depth: float = 1.0
     sky: float = 0.05
+    opacity_decay: float = 0.0
+    scale_decay: float = 0.0
 
 
 @dataclass(frozen=True)
 class LearningRates:
-    """Adam's step sizes. Means: metres per step relative to the splat's distance scale, decaying
-    exponentially from means to means_end over the run; scales: of their logarithm; opacities: of
-    their logit; sh_rest: of the bands above degree 0.
+    """Adam's step sizes. means: pixels of the view at hand, so that a distant splat moves further,
+    decaying exponentially to means_end over the run; scales: of their logarithm; opacities: of
+    their logit; sh_rest: of the bands above degree 0. The others of a splat fall to `late` of their
+    value over the run.
     """
 
-    means: float = 1.6e-3
-    means_end: float = 1.6e-5
+    means: float = 0.1
+    means_end: float = 0.002
     quats: float = 1e-3
     scales: float = 5e-3
     opacities: float = 3e-2
@@ -36,6 +40,7 @@ class LearningRates:
     sky: float = 5e-3
     color_map: float = 5e-4
     poses: float = 1e-4
+    late: float = 0.2
 
 
 @dataclass(frozen=True)
@@ -44,7 +49,8 @@ class DensifyConfig:
     are large; "mcmc" moves dead splats onto living ones and adds more in proportion to opacity.
 
     max_splats: none are added beyond. every: steps between two rounds. start, stop: parts of the
-    run. prune_opacity: fainter splats are removed (absgrad) or moved (mcmc).
+    run. prune_opacity: fainter splats are removed (absgrad) or moved (mcmc). split: where absgrad's
+    children of large splats go, "sampled" within the parent or side by side on its "long_axis".
     """
 
     method: str = "absgrad"
@@ -55,12 +61,14 @@ class DensifyConfig:
     prune_opacity: float = 0.02
     grow_fraction: float = 0.05
     noise: float = 0.0
+    split: str = "sampled"
 
 
 @dataclass(frozen=True)
 class FitConfig:
     """One reconstruction. steps: optimiser updates, one view each. sh_degree: highest band that is
     learnt; one more every sh_every steps. pose_refinement: whether actors' boxes may move a little.
+    exposure: whether every camera gets a colour map; exposure_pull draws it to the identity.
     """
 
     steps: int = 5000
@@ -69,6 +77,7 @@ class FitConfig:
     sh_every: int = 500
     pose_refinement: bool = True
     exposure: bool = True
+    exposure_pull: float = 0.01
     loss: LossWeights = field(default_factory=LossWeights)
     rates: LearningRates = field(default_factory=LearningRates)
     densify: DensifyConfig = field(default_factory=DensifyConfig)

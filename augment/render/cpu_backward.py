@@ -1,7 +1,7 @@
 """Gradients on the CPU: a render that remembers how it was made, and the way back.
 
-    tape = record(inputs, camera, settings, scratch, with_depth=…)     tape.rgb, alpha, expected_depth
-    grads = tape.backward(d_rgb, d_alpha, d_expected_depth)            one row a touched Gaussian
+    tape = record(inputs, camera, settings, scratch, with_depth=…)   rgb, alpha, expected_depth
+    grads = tape.backward(d_rgb, d_alpha, d_expected_depth)          a row a touched Gaussian
 
 The forward pass is `cpu.rasterize_cpu` in a single slice of z, so that every list entry is still
 there when the way back needs it. Bits do not depend on the number of threads.
@@ -14,8 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from augment.cameras import Camera
-from augment.render import cpu_blend, cpu_blend_backward, cpu_project_backward
-from augment.render import cpu_layout as layout
+from augment.render import cpu_blend_backward, cpu_project_backward
 from augment.render.buffers import ALPHA, EXPECTED_DEPTH, RGB
 from augment.render.constants import DEPTH_EPS, RasterSettings
 from augment.render.cpu import Clock, Tiles, image_arrays, project, rank, sort

@@ -52,7 +52,7 @@ def prepare_colors(dx, dy, dz, view, functions, smog, rows):
     """
     distance = v8.sqrt(v8.fmuladd(dx, dx, v8.fmuladd(dy, dy, dz * dz)))
     inverse = v8.splat(np.float32(1)) / distance
-    _write_basis(dx * inverse, dy * inverse, dz * inverse, functions, rows)
+    write_basis(dx * inverse, dy * inverse, dz * inverse, functions, rows)
     if smog != NO_SMOG:
         tau = v8.splat(view[V_SIGMA]) * distance
         if smog == LAYERED_SMOG:
@@ -87,7 +87,7 @@ def _layered_density(dx, dy, dz, view):
 
 
 @inner()
-def _write_basis(x, y, z, functions, rows):
+def write_basis(x, y, z, functions, rows):
     """The first `functions` spherical harmonics of unit directions, as render.sh lists them."""
     v8.store(rows, U(0 * LANES), v8.splat(_C0))
     if functions > 1:
@@ -144,7 +144,7 @@ def add_direction_slopes(x, y, z, functions, rows):
     """Sum over SH functions k >= 1 of a row's weight times the slope of the function, by x, y, z.
 
     rows: flat; the weights of function k for eight splats start at k LANES. Slopes are those of
-    the polynomials in `_write_basis`; only their part across the direction has a meaning.
+    the polynomials in `write_basis`; only their part across the direction has a meaning.
     """
     two, three = v8.splat(np.float32(2)), v8.splat(np.float32(3))
     c1 = v8.splat(_C1)

@@ -69,18 +69,21 @@ def gather_inputs(
         addresses=np.array(addresses, np.uint64).reshape(-1, 5),
         sizes=np.array(sizes, np.int64).reshape(-1, 2),
         first_ids=np.cumsum([0, *counts[:-1]], dtype=np.int64),
-        views=np.stack([_view(part, camera, settings, smog) for part in parts]),
+        views=np.stack([part_view(p.world_from_part, camera, settings, smog) for p in parts]),
         blocks=np.array(blocks, np.int64).reshape(-1, 3),
-        modes=_modes(settings, smog, with_color),
+        modes=raster_modes(settings, smog, with_color=with_color),
         arrays=arrays,
     )
 
 
-def _view(
-    part: PosedGaussians, camera: Camera, settings: RasterSettings, smog: SmogMedium | None
+def part_view(
+    pose: torch.Tensor | None,
+    camera: Camera,
+    settings: RasterSettings,
+    smog: SmogMedium | None,
 ) -> np.ndarray:
-    """The float32 numbers of a view, formed in float64."""
-    world_from_part = np.eye(4) if part.world_from_part is None else part.world_from_part.numpy()
+    """The float32 numbers of a view, formed in float64. pose: world_from_part; None: identity."""
+    world_from_part = np.eye(4) if pose is None else pose.numpy()
     camera_from_part = camera.camera_from_world.numpy() @ world_from_part
     rotation = camera_from_part[:3, :3]
     # The point the transform takes to the origin, also where a rotation is not quite orthonormal.
@@ -111,7 +114,10 @@ def _view(
     return view.astype(np.float32)
 
 
-def _modes(settings: RasterSettings, smog: SmogMedium | None, with_color: bool) -> np.ndarray:
+def raster_modes(
+    settings: RasterSettings, smog: SmogMedium | None, *, with_color: bool
+) -> np.ndarray:
+    """The kernels' modes, int64."""
     degree = MAX_DEGREE if settings.sh_degree is None else settings.sh_degree
     modes = np.zeros(layout.MODES, np.int64)
     modes[layout.M_COLOR] = with_color

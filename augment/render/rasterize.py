@@ -13,7 +13,7 @@ import torch
 
 from augment.cameras import Camera
 from augment.errors import BackendUnavailable
-from augment.render.buffers import ALPHA, BUFFERS, RGB, RenderOutput
+from augment.render.buffers import ALPHA, BUFFERS, DIFFERENTIABLE, RGB, RenderOutput
 from augment.render.constants import RasterSettings
 from augment.render.reference import rasterize_reference
 from augment.render.sh import MAX_DEGREE
@@ -39,8 +39,9 @@ def rasterize(
 
     buffers: names from augment.render.buffers; the others are None in the result. splat_ids counts
     through the parts in the order given. smog: fades every splat's colour towards the airlight by
-    its own distance. backend: "cpu" (numba, float32, no gradients), "reference" (torch,
-    differentiable, float32 or float64), or "auto": cpu where it can do the job, else reference.
+    its own distance. backend: "cpu" (numba, float32; gradients of rgb, alpha and
+    expected depth, without smog), "reference" (torch, float32 or float64, gradients of all), or
+    "auto": cpu where it can do the job, else reference.
 
     Raises:
         ValueError, TypeError: an argument no backend, or not the one named, can take.
@@ -48,9 +49,13 @@ def rasterize(
     """
     _check_arguments(parts, camera, buffers, settings)
     names = frozenset(buffers)
-    if _choose(parts, backend) == REFERENCE:
+    if _choose(parts, backend, names, smog) == REFERENCE:
         return rasterize_reference(parts, camera, names, settings, smog)
     cpu = _import_cpu()
+    if _tracked(parts):
+        from augment.render.autograd import rasterize_with_gradients
+
+        return rasterize_with_gradients(parts, camera, names, settings)
     return cpu.rasterize_cpu([_detached(p) for p in parts], camera, names, settings, smog)
 
 
@@ -63,7 +68,12 @@ def available_backends() -> dict[str, str | None]:
     return {REFERENCE: None, CPU: None}
 
 
-def _choose(parts: Sequence[PosedGaussians], backend: str) -> str:
+def _choose(
+    parts: Sequence[PosedGaussians],
+    backend: str,
+    buffers: frozenset[str],
+    smog: SmogMedium | None,
+) -> str:
     """The backend to use; the first time a choice is made for a reason, it is logged."""
     if backend not in BACKENDS:
         raise ValueError(f"backend must be one of {', '.join(BACKENDS)}; got {backend!r}")
@@ -73,8 +83,9 @@ def _choose(parts: Sequence[PosedGaussians], backend: str) -> str:
     obstacle = None
     if dtype != torch.float32:
         obstacle = f"the Gaussians are {dtype}, it takes torch.float32"
-    elif torch.is_grad_enabled() and any(_requires_grad(p.gaussians) for p in parts):
-        obstacle = "gradients are asked for, it has none"
+    elif _tracked(parts) and (smog is not None or buffers - DIFFERENTIABLE):
+        what = "through smog" if smog is not None else "of " + ", ".join(buffers - DIFFERENTIABLE)
+        obstacle = f"gradients {what} are asked for, it has none"
     if backend == CPU:
         if obstacle:
             raise ValueError(
@@ -90,7 +101,7 @@ def _choose(parts: Sequence[PosedGaussians], backend: str) -> str:
     if obstacle:
         _log_choice(REFERENCE, f"not cpu: {obstacle}", logging.WARNING)
         return REFERENCE
-    _log_choice(CPU, "float32 without gradients", logging.INFO)
+    _log_choice(CPU, "float32", logging.INFO)
     return CPU
 
 
@@ -171,6 +182,10 @@ def _check_settings(settings: RasterSettings) -> None:
         raise ValueError(
             f"settings.sh_degree must be None or 0 to {MAX_DEGREE}; got {settings.sh_degree}"
         )
+
+
+def _tracked(parts: Sequence[PosedGaussians]) -> bool:
+    return torch.is_grad_enabled() and any(_requires_grad(p.gaussians) for p in parts)
 
 
 def _requires_grad(gaussians: Gaussians) -> bool:

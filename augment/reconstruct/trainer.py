@@ -1,0 +1,281 @@
+"""The optimisation itself: one recorded view a step, all splats of the scene.
+
+    load → forward (record) → loss → backward → Adam on what the view touched → now and then densify
+
+Everything a step needs stays in arrays that the kernels read directly. A run is a function of
+(scene, views, config): bits do not depend on threads, and a state saved between two steps continues
+to the same bits.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from augment.cameras import Camera
+from augment.reconstruct.adam_kernels import update_splats
+from augment.reconstruct.config import FitConfig
+from augment.reconstruct.dense_adam import DenseAdam, SparseAdam
+from augment.reconstruct.densify import densify, densify_due
+from augment.reconstruct.inputs import splat_inputs
+from augment.reconstruct.loss import ViewLoss, view_loss
+from augment.reconstruct.rates import CORRECTIONS, splat_rates
+from augment.reconstruct.splats import Splats
+from augment.reconstruct.view import RecordedView, ViewKey, ViewSource
+from augment.render import cpu_backward
+from augment.render.constants import RasterSettings
+from augment.render.cpu_inputs import Inputs
+from augment.render.cpu_layout import M_FUNCTIONS
+from augment.render.cpu_scratch import Scratch
+from augment.render.threads import kernel_threads
+from augment.rng import rng_for
+from augment.scene import Scene
+from augment.sky import CubemapSky, directions_of_cubemap
+
+_SKY_SIZE = 512  # texels along a cube edge where the starting sky is no cube map
+_IDENTITY = np.eye(3, 4, dtype=np.float32)
+
+
+@dataclass(frozen=True)
+class StepRecord:
+    """What one step did. stage_s: seconds of load, forward, loss, backward, optimise, densify."""
+
+    step: int
+    key: ViewKey
+    loss: float
+    l1: float
+    ssim: float
+    depth: float
+    sky: float
+    splats: int
+    stage_s: dict[str, float]
+
+
+class Trainer:
+    """A scene while it is fitted to its recorded views."""
+
+    def __init__(self, scene: Scene, source: ViewSource, config: FitConfig) -> None:
+        """scene: what is started from; it is not changed. source: at least one training view."""
+        if not source.train:
+            raise ValueError("the view source has no training views; nothing can be learnt")
+        self.config = config
+        self.step = 0
+        parts = [scene.background, *(actor.gaussians for actor in scene.actors)]
+        self.splats = Splats.of(parts, config.sh_degree)
+        self.sky_faces = _sky_faces(scene)
+        self._sky_adam = SparseAdam(self.sky_faces.reshape(-1, 3))
+        names = sorted({key.camera for key in (*source.train, *source.test)})
+        self.color_maps = {name: _IDENTITY.copy() for name in names}
+        self._map_adams = {name: DenseAdam(m) for name, m in self.color_maps.items()}
+        self._scene = scene
+        self._source = source
+        self._settings = RasterSettings()
+        self._scratch = Scratch()
+        self._inputs: dict[ViewKey, Inputs] = {}
+        self._extent_m = _extent(source)
+        self._order: tuple[int, np.ndarray] = (-1, np.zeros(0, np.int64))
+
+    def run_step(self) -> StepRecord:
+        """One update of everything that one view shows."""
+        stages: dict[str, float] = {}
+        key = self._next_key()
+        with _timed(stages, "load"):
+            view = self._source.load(key)
+        with _timed(stages, "forward"):
+            tape = self._render(key, view.camera)
+        with _timed(stages, "loss"):
+            loss = self._loss(tape, view, key)
+        with _timed(stages, "backward"):
+            with_depth = tape.expected_depth is not None
+            grads = tape.backward(
+                loss.d_rgb, loss.d_alpha, loss.d_expected_depth if with_depth else None
+            )
+        with _timed(stages, "optimise"):
+            self._update(tape.inputs, grads, view, key, loss)
+        self.step += 1
+        with _timed(stages, "densify"):
+            self._densify()
+        return StepRecord(
+            step=self.step,
+            key=key,
+            loss=loss.total,
+            l1=loss.l1,
+            ssim=loss.ssim,
+            depth=loss.depth,
+            sky=loss.sky,
+            splats=len(self.splats),
+            stage_s=stages,
+        )
+
+    def scene(self) -> Scene:
+        """The scene as fitted so far; it shares nothing with the trainer."""
+        actors = tuple(
+            dataclasses.replace(actor, gaussians=self.splats.gaussians(number))
+            for number, actor in enumerate(self._scene.actors, start=1)
+        )
+        maps = {name: torch.from_numpy(m.copy()) for name, m in self.color_maps.items()}
+        return dataclasses.replace(
+            self._scene,
+            background=self.splats.gaussians(0),
+            actors=actors,
+            sky=CubemapSky(torch.from_numpy(self.sky_faces.copy())),
+            color_maps=maps if self.config.exposure else {},
+        )
+
+    def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """All that continuing to the same bits needs: arrays, and facts for JSON."""
+        arrays = {f"splats.{name}": array for name, array in self.splats.arrays().items()}
+        arrays["sky"] = self.sky_faces
+        arrays |= {f"sky_adam.{name}": a for name, a in self._sky_adam.arrays().items()}
+        for name, adam in self._map_adams.items():
+            arrays[f"color_map.{name}"] = self.color_maps[name]
+            arrays |= {f"color_map_adam.{name}.{k}": a for k, a in adam.arrays().items()}
+        return {name: array.copy() for name, array in arrays.items()}, {"step": self.step}
+
+    def load_state(self, arrays: dict[str, np.ndarray], facts: dict[str, Any]) -> None:
+        """Continue from a state of a trainer with the same scene, views and config."""
+        names = Splats.__dataclass_fields__
+        self.splats = Splats(**{name: arrays[f"splats.{name}"].copy() for name in names})
+        self.sky_faces[:] = arrays["sky"]
+        self._sky_adam.load({k: arrays[f"sky_adam.{k}"] for k in self._sky_adam.arrays()})
+        for name, adam in self._map_adams.items():
+            self.color_maps[name][:] = arrays[f"color_map.{name}"]
+            adam.load({k: arrays[f"color_map_adam.{name}.{k}"] for k in adam.arrays()})
+        self.step = int(facts["step"])
+        self._inputs.clear()
+
+    def _next_key(self) -> ViewKey:
+        """Every view once an epoch, in an order of its own."""
+        train = self._source.train
+        epoch, place = divmod(self.step, len(train))
+        if self._order[0] != epoch:
+            rng = rng_for(
+                seed=self.config.seed, scene=self._scene.name, effect="fit.order", frame=epoch
+            )
+            self._order = (epoch, rng.permutation(len(train)))
+        return train[int(self._order[1][place])]
+
+    def _render(self, key: ViewKey, camera: Camera) -> cpu_backward.Tape:
+        inputs = self._inputs.get(key)
+        if inputs is None:
+            present = [
+                (part.instance_id, part.world_from_part)
+                for part in self._scene.parts_for(camera)
+                if self.splats.starts[part.instance_id] < self.splats.starts[part.instance_id + 1]
+            ]
+            inputs = splat_inputs(self.splats, present, camera, self._settings)
+            self._inputs[key] = inputs
+        inputs.modes[M_FUNCTIONS] = self._functions
+        return cpu_backward.record(
+            inputs,
+            camera,
+            self._settings,
+            self._scratch,
+            with_depth=self.config.loss.depth > 0,
+        )
+
+    @property
+    def _functions(self) -> int:
+        """SH functions that are learnt by now."""
+        degree = min(self.config.sh_degree, self.step // max(self.config.sh_every, 1))
+        return (degree + 1) ** 2
+
+    def _loss(self, tape: cpu_backward.Tape, view: RecordedView, key: ViewKey) -> ViewLoss:
+        return view_loss(
+            tape.rgb,
+            tape.alpha,
+            tape.expected_depth if tape.expected_depth is not None else np.zeros_like(tape.alpha),
+            view,
+            self.sky_faces,
+            self.color_maps[key.camera],
+            self.config.loss,
+        )
+
+    def _update(
+        self,
+        inputs: Inputs,
+        grads: cpu_backward.SplatGradients,
+        view: RecordedView,
+        key: ViewKey,
+        loss: ViewLoss,
+    ) -> None:
+        splats, rates = self.splats, self.config.rates
+        with kernel_threads():
+            update_splats(
+                inputs.addresses,
+                inputs.sizes,
+                inputs.views,
+                inputs.blocks,
+                inputs.first_ids,
+                grads.rows.reshape(-1),
+                grads.ids,
+                grads.counts,
+                self._functions,
+                splat_rates(self.config, self.step, view.camera, self._extent_m),
+                CORRECTIONS.reshape(-1),
+                splats.geometry_m.reshape(-1),
+                splats.geometry_v.reshape(-1),
+                splats.sh_m.reshape(-1),
+                splats.sh_v.reshape(-1),
+                splats.age,
+                splats.grads.reshape(-1),
+            )
+        if loss.d_sky is not None:
+            self._sky_adam.update(loss.d_sky.texels, loss.d_sky.grads, rates.sky)
+            touched = loss.d_sky.texels
+            flat = self.sky_faces.reshape(-1, 3)
+            flat[touched] = flat[touched].clip(0, 1)
+        if self.config.exposure:
+            color_map = self.color_maps[key.camera]
+            pull = self.config.exposure_pull * (color_map - _IDENTITY)
+            self._map_adams[key.camera].update(loss.d_color_map + pull, rates.color_map)
+
+    def _densify(self) -> None:
+        config = self.config
+        if not densify_due(config.densify, self.step, config.steps):
+            return
+        rng = rng_for(
+            seed=config.seed, scene=self._scene.name, effect="fit.densify", frame=self.step
+        )
+        self.splats, _ = densify(
+            self.splats,
+            config.densify,
+            rng=rng,
+            step=self.step,
+            total_steps=config.steps,
+            extent_m=self._extent_m,
+        )
+        self._inputs.clear()
+
+
+@contextmanager
+def _timed(stages: dict[str, float], name: str) -> Iterator[None]:
+    start = time.perf_counter()
+    yield
+    stages[name] = time.perf_counter() - start
+
+
+def _sky_faces(scene: Scene) -> np.ndarray:
+    """float32 [6, R, R, 3], the trainer's own copy."""
+    if isinstance(scene.sky, CubemapSky):
+        return scene.sky.faces.float().numpy().copy()
+    directions = directions_of_cubemap(_SKY_SIZE).float()
+    return np.ascontiguousarray(scene.sky.sample(directions).float().numpy())
+
+
+def _extent(source: ViewSource) -> float:
+    """How far the cameras move, and at least 10 m: what splats' sizes are bounded against."""
+    centres = np.stack([source.camera(key).centre.numpy() for key in source.train])
+    return max(10.0, float(np.linalg.norm(centres.max(0) - centres.min(0))))
+
+
+def mean_or_nan(values: list[float]) -> float:
+    return math.fsum(values) / len(values) if values else math.nan
