@@ -95,21 +95,34 @@ def recognise(path: Path) -> str:
     else:
         if (path / "camera").is_dir() and (path / "lidar").is_dir():
             return "pandaset"
+        if _is_recording(path):
+            return "recording"
         if _holds_splats(path):
             return "gaussians"
         looked_for = (
-            "a PandaSet sequence (camera/ and lidar/), a trained 3DGS model "
-            "(point_cloud/iteration_N/point_cloud.ply), or a single .ply or .splat file in it"
+            "a PandaSet sequence (camera/ and lidar/), a recording (calibration.json and images/), "
+            "a trained 3DGS model (point_cloud/iteration_N/point_cloud.ply), or a single .ply or "
+            ".splat file in it"
         )
-        below = sorted(
-            p.parent.name for p in path.glob("*/lidar") if (p.parent / "camera").is_dir()
-        )
-        if below:
-            looked_for += f". It holds PandaSet sequences: give one, such as {path / below[0]}"
+        looked_for += _hint_below(path)
     raise AdapterError(
         f"{path}: not recognised as a scene; looked for {looked_for}. "
         f"Or name the scheme: {known_schemes()}"
     )
+
+
+def _hint_below(folder: Path) -> str:
+    """Which folders inside are scenes, where one above them was given."""
+    below = sorted(p.parent for p in folder.glob("*/lidar") if (p.parent / "camera").is_dir())
+    if below:
+        return f". It holds PandaSet sequences: give one, such as {below[0]}"
+    inside = [*folder.glob("*/calibration.json"), *folder.glob("*/*/calibration.json")]
+    recordings = sorted(p.parent for p in inside if _is_recording(p.parent))
+    return f". It holds recordings: give one, such as {recordings[0]}" if recordings else ""
+
+
+def _is_recording(folder: Path) -> bool:
+    return (folder / "calibration.json").is_file() and (folder / "images").is_dir()
 
 
 def _holds_splats(folder: Path) -> bool:

@@ -13,6 +13,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from adapters.join import join_gaussians
 from adapters.street.labels import StreetLabels
 from adapters.street.parameters import StreetParameters, parse_parameters
 from adapters.street.rig import build_frames, camera_path, ego_pose, frame_time_ns
@@ -21,7 +22,6 @@ from adapters.street.sky import build_sky
 from adapters.street.splats import (
     SplatPlan,
     coarseness_for,
-    join_gaussians,
     plan_splats,
     shadow_gaussians,
     splat,

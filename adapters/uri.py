@@ -36,6 +36,9 @@ SCHEMES = {
         "adapters.procedural", "open_procedural", "procedural:street?seed=3", ("street",)
     ),
     "pandaset": Scheme("adapters.pandaset", "open_pandaset", "pandaset:data/pandaset/002"),
+    "recording": Scheme(
+        "adapters.recording", "open_recording", "recording:out/street-seed3/clear-000"
+    ),
     "gaussians": Scheme(
         "adapters.gaussian_files", "open_gaussians", "gaussians:model/point_cloud.ply?up=-y"
     ),

@@ -23,12 +23,12 @@ import numpy as np
 import pandas as pd
 import torch
 
+from adapters.lidar.origin import drive_origin
 from adapters.safe_pickle import read_frame
 from augment.errors import AdapterError
 from augment.geometry import rigid, rotmat_from_quat
 
 LIDAR_COLUMNS = ("x", "y", "z", "i", "t", "d")
-FAR_FROM_ORIGIN_M = 1000.0  # float32 still resolves a tenth of a millimetre there
 # Columns: ego x (forward), y (left), z in the axes of the LiDAR pose (x right, y forward).
 LIDAR_POSE_FROM_EGO = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
 
@@ -90,18 +90,12 @@ def read_sequence(root: Path) -> Sequence:
         raise AdapterError(f"{root / 'camera'} holds no camera folder; unpack the sequence again")
     problems: list[str] = []
     cameras = [_read_camera(folder, len(poses), problems) for folder in folders]
-    origin = _world_origin(poses[:, :3, 3])
+    origin = drive_origin(poses[:, :3, 3])
     poses[:, :3, 3] -= origin
     for camera in cameras:
         camera.world_from_camera[:, :3, 3] -= origin
     ego = poses @ LIDAR_POSE_FROM_EGO
     return Sequence(root, origin, ego, times, tuple(cameras), tuple(problems))
-
-
-def _world_origin(positions_m: np.ndarray) -> np.ndarray:
-    """Zero for a drive near the origin, as published ones are; else whole metres near its start."""
-    far = np.linalg.norm(positions_m, axis=1).max() > FAR_FROM_ORIGIN_M
-    return np.round(positions_m[0]) if far else np.zeros(3)
 
 
 def frame_file(root: Path, folder: str, frame: int) -> Path:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from adapters.join import join_gaussians
 from adapters.street.materials import Material
 from adapters.street.shadows import ContactShadow
 from adapters.street.shapes import U0, U1, V0, V1, Kind, Shapes
@@ -205,11 +206,3 @@ def make_gaussians(
         sh=torch.from_numpy((rgb - 0.5) / SH_C0).float()[:, None],
         semantic=torch.from_numpy(semantic.astype(np.int16)),
     )
-
-
-def join_gaussians(parts: list[Gaussians]) -> Gaussians:
-    """All parts in one."""
-    names = ("means", "quats", "scales", "opacities", "sh")
-    joined = {name: torch.cat([getattr(p, name) for p in parts]) for name in names}
-    semantic = torch.cat([p.semantic for p in parts if p.semantic is not None])
-    return Gaussians(**joined, semantic=semantic)

@@ -1,0 +1,175 @@
+"""A folder of raw data in this project's own layout as a scene: one's own recording, or what
+`climategs render` wrote.
+
+    images/<camera>/<frame>.png|jpg    required, with calibration.json
+    lidar/<frame>.parquet              columns x y z (metres, world); timestamp_ns or t, semantic
+    depth/<camera>/<frame>.png         where there is no LiDAR: 16 bits, metres x 256, 0 = none
+    labels/boxes.parquet               boxes; those that move become actors
+
+Everything is in one world, as calibration.json has it: metres, z up. docs/scenes.md has examples.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from adapters.join import join_gaussians
+from adapters.lidar.box_tracks import ObjectTrack, join_tracks
+from adapters.lidar.image_views import View
+from adapters.lidar.options import DriveOptions
+from adapters.lidar.scene import DrivenPath, LidarScene, build_lidar_scene
+from adapters.lidar.split import Sweep
+from adapters.recording.calibration import Calibration, read_calibration
+from adapters.recording.depth_images import depth_sweeps
+from adapters.recording.files import find_images, unlisted_images
+from adapters.recording.guesses import (
+    MOST_GAUSSIANS,
+    SHELL_SHARE,
+    VOXEL_M,
+    ground_heights,
+    guess_shells,
+    guess_surfaces,
+)
+from adapters.recording.labels import RecordingLabels, all_boxes
+from adapters.recording.sweeps import read_lidar_drive
+from adapters.recording.tracks import RecordedObjects, read_objects
+from adapters.uri import format_uri
+from augment.cameras import Frame
+from augment.errors import AdapterError
+from augment.scene import Scene
+
+_SKY_ABOVE_DEG = 15.0  # with nothing but a flat ground drawn, every column's top is sky
+
+
+def open_recording(path: str, query: dict[str, str]) -> Scene:
+    """The scene of a recording's folder, such as `out/street-seed3/clear-000`.
+
+    query: frames, voxel_m, max_gaussians, image_scale, sky_size, held_out; see DriveOptions.
+    Opening is deterministic: the same files and options give the same bits. Without LiDAR the
+    scene starts from depth images, or else from guesses; Scene.problems says which.
+
+    Raises:
+        AdapterError: a wrong option; calibration that is missing, damaged or not finite; no usable
+            image; a damaged LiDAR file or table of boxes; a file outside the folder.
+    """
+    options = DriveOptions.from_query("recording", query)
+    root = Path(path)
+    if not root.is_dir():
+        raise AdapterError(f"{root} is not a folder; expected one with calibration.json in it")
+    calibration = read_calibration(root)
+    numbers = [frame.index for frame in calibration.frames]
+    chosen = options.select(numbers, where=f"recording:{path}")
+    listed = [frame for frame in calibration.frames if frame.index in set(chosen.numbers)]
+    frames, image_problems = find_images(root, listed)
+    used = [frame for frame in frames if frame.index not in chosen.held_out]
+    objects = read_objects(frames, all_boxes(root), calibration.world_origin_m)
+    start = _Start(root, calibration, options, frames, used, objects)
+    built, problems = start.build()
+    return Scene(
+        name=calibration.name,
+        source=format_uri("recording", path, query),
+        background=built.background,
+        actors=built.actors,
+        sky=built.sky,
+        frames=frames,
+        labels=RecordingLabels(root),
+        world_origin_m=calibration.world_origin_m,
+        ground_z_m=built.ground_z_m,
+        has_metric_scale=calibration.has_metric_scale,
+        problems=(
+            *unlisted_images(root, calibration.frames),
+            *image_problems,
+            *chosen.problems,
+            *objects.problems,
+            *problems,
+            *built.problems,
+        ),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Start:
+    """What a scene is built from. frames: all; used: those that are not held out."""
+
+    root: Path
+    calibration: Calibration
+    options: DriveOptions
+    frames: Sequence[Frame]
+    used: Sequence[Frame]
+    objects: RecordedObjects
+
+    def build(self) -> tuple[LidarScene, tuple[str, ...]]:
+        """The scene from the best there is, and what was missing, one sentence each."""
+        lidar = read_lidar_drive(self.root, self.calibration, self.used)
+        if len(lidar):
+            return self._surfaces(lidar.sweeps, lidar.top_deg), lidar.problems
+        sweeps, top_deg, problems = depth_sweeps(self.root, self.used)
+        problems = lidar.problems + problems
+        if any(len(sweep) for sweep in sweeps):
+            said = (
+                f"{self.root / 'lidar'} holds no returns: the scene starts from the points of "
+                f"{len(sweeps)} depth images"
+            )
+            return self._surfaces(sweeps, top_deg), (*problems, said)
+        said = (
+            f"{self.root / 'lidar'} holds no returns and {self.root / 'depth'} no depth: the scene "
+            f"starts from a flat ground {self.calibration.ego_above_ground_m:g} m below the ego "
+            f"origin, the labelled boxes, and splats guessed along the cameras' rays; reconstruct "
+            f"it before rendering it"
+        )
+        return self._guess(), (*problems, said)
+
+    def _surfaces(self, sweeps: Sequence[Sweep], top_deg: float) -> LidarScene:
+        tracks = join_tracks(self.objects.moving)
+        options = self.options.scene_options(lidar_top_deg=top_deg)
+        built = build_lidar_scene(sweeps, tracks, self._views(), self._path(), options)
+        return dataclasses.replace(built, problems=(*built.problems, *_pointless(tracks, built)))
+
+    def _guess(self) -> LidarScene:
+        road = ground_heights(self.frames, self.calibration.ego_above_ground_m)
+        most = min(MOST_GAUSSIANS, self.options.max_gaussians)
+        shells = guess_shells(self._views(), road, round(most * SHELL_SHARE))
+        coarse = dataclasses.replace(
+            self.options.scene_options(lidar_top_deg=_SKY_ABOVE_DEG),
+            voxel_m=max(VOXEL_M, self.options.voxel_m),
+            max_gaussians=most - len(shells),
+        )
+        sweeps = guess_surfaces(road, self.objects.moving, self.objects.still)
+        tracks = join_tracks(self.objects.moving)
+        built = build_lidar_scene(sweeps, tracks, self._views(), self._path(), coarse)
+        return dataclasses.replace(
+            built,
+            background=join_gaussians([built.background, shells]),
+            ground_z_m=float(road[:, 2].min()),
+            problems=(*built.problems, *_pointless(tracks, built)),
+        )
+
+    def _views(self) -> tuple[View, ...]:
+        return tuple(
+            View(frame.cameras[name], Path(path), frame.index)
+            for frame in self.used
+            for name, path in frame.image_paths.items()
+        )
+
+    def _path(self) -> DrivenPath:
+        return DrivenPath(
+            np.stack([frame.world_from_ego[:3, 3].numpy() for frame in self.frames]),
+            np.array([frame.timestamp_ns for frame in self.frames], np.int64),
+        )
+
+
+def _pointless(tracks: Sequence[ObjectTrack], built: LidarScene) -> list[str]:
+    """A sentence for the moving objects of which nothing was measured, or that no image shows."""
+    there = {actor.track_id for actor in built.actors}
+    missing = [track.track_id for track in tracks if track.track_id not in there]
+    if not missing:
+        return []
+    return [
+        f"{len(missing)} moving objects, such as {missing[0]!r}, have too few points in their "
+        f"boxes or are in no image: they are not in the scene, their boxes stay in the labels"
+    ]

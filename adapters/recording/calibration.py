@@ -1,0 +1,239 @@
+"""`calibration.json` of a recording: frames and cameras, checked one by one.
+
+It is the file that a render job writes (augment.batch.calibration). Only `frames` is required, and
+in each frame `frame`, `timestamp_ns`, `world_from_ego` and `cameras`; a camera's timestamp_ns is
+the frame's where it has none. Further keys that only a recording has, all optional:
+
+    ego_above_ground_m   height of the ego origin above the road, 0 by default
+    ego_box_m            [[x, y, z], [x, y, z]], lowest and highest corner of the recording car in
+                         ego axes: LiDAR returns in it are left out
+    lidar_classes        the LiDAR's class numbers by name of SemanticClass: {"7": "road"}; "none"
+                         for returns that no surface made
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from adapters.lidar.origin import drive_origin
+from augment.batch.calibration import read_camera
+from augment.cameras import Camera, Frame
+from augment.errors import AdapterError
+from augment.geometry import invert_rigid
+from augment.semantics import SemanticClass
+
+CALIBRATION = "calibration.json"
+NO_SURFACE = -1  # stands for returns that no surface made, where a SemanticClass is expected
+# Rotations written with six digits are off by a few millionths.
+_RIGID = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """A recording's cameras over time, in the scene's world: the file's minus world_origin_m.
+
+    frames: in order of number and time, without image paths. lidar_classes: SemanticClass, or
+    NO_SURFACE, by the LiDAR's own number; None where numbers are those of SemanticClass. ego_box_m:
+    float64 [2, 3] or None.
+    """
+
+    name: str
+    frames: tuple[Frame, ...]
+    world_origin_m: np.ndarray
+    has_metric_scale: bool
+    ego_above_ground_m: float
+    ego_box_m: np.ndarray | None
+    lidar_classes: Mapping[int, int] | None
+
+
+def read_calibration(root: Path) -> Calibration:
+    """The calibration of the recording in a folder.
+
+    Raises:
+        AdapterError: missing, damaged, or a pose that is not finite and rigid; the message names
+            the file, the frame and the camera.
+    """
+    path = root / CALIBRATION
+    content = _read_json(path)
+    entries = content.get("frames")
+    if not isinstance(entries, list) or not entries:
+        raise AdapterError(f"{path} must hold a list 'frames' with at least one entry")
+    frames = sorted((_frame(path, entry) for entry in entries), key=lambda f: f.index)
+    for before, after in itertools.pairwise(frames):
+        if after.index == before.index:
+            raise AdapterError(f"{path} lists frame {after.index} twice")
+        if after.timestamp_ns <= before.timestamp_ns:
+            raise AdapterError(
+                f"{path}: timestamp_ns must increase with the frame's number; frame "
+                f"{before.index} has {before.timestamp_ns}, frame {after.index} "
+                f"{after.timestamp_ns}"
+            )
+    origin = drive_origin(np.stack([f.world_from_ego[:3, 3].numpy() for f in frames]))
+    return Calibration(
+        name=_name(content, root),
+        frames=tuple(_recentred(frame, origin) for frame in frames),
+        world_origin_m=origin,
+        has_metric_scale=content.get("has_metric_scale") is not False,
+        ego_above_ground_m=_number(path, content, "ego_above_ground_m", 0.0),
+        ego_box_m=_ego_box(path, content.get("ego_box_m")),
+        lidar_classes=_lidar_classes(path, content.get("lidar_classes")),
+    )
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise AdapterError(
+            f"{path} does not exist; a recording needs it, docs/scenes.md shows what is in it"
+        ) from None
+    except (OSError, ValueError, RecursionError) as error:
+        raise AdapterError(f"{path} is not readable JSON ({error}); write it again") from None
+    if not isinstance(content, dict):
+        raise AdapterError(f"{path} must hold a JSON object; it holds a {type(content).__name__}")
+    return content
+
+
+def _frame(path: Path, entry: Any) -> Frame:
+    number = entry.get("frame") if isinstance(entry, dict) else None
+    if type(number) is not int or number < 0:
+        raise AdapterError(
+            f"{path}: every entry of 'frames' needs a number 'frame', 0 or greater; got {number!r}"
+        )
+    where = f"{path}, frame {number}"
+    timestamp_ns = _time(where, entry.get("timestamp_ns"))
+    world_from_ego = _rigid(where, "world_from_ego", entry.get("world_from_ego"))
+    cameras = entry.get("cameras")
+    if not isinstance(cameras, dict):
+        raise AdapterError(f"{where}: 'cameras' must map names to cameras; got {cameras!r}")
+    return Frame(
+        index=number,
+        timestamp_ns=timestamp_ns,
+        world_from_ego=world_from_ego,
+        cameras={
+            name: _camera(f"{where}, camera {name!r}", name, camera, timestamp_ns)
+            for name, camera in cameras.items()
+        },
+    )
+
+
+def _camera(where: str, name: str, camera: Any, frame_ns: int) -> Camera:
+    if not isinstance(camera, dict):
+        raise AdapterError(f"{where}: must be an object with width, height, fx ...; got {camera!r}")
+    pose = _rigid(where, "world_from_camera", camera.get("world_from_camera"))
+    try:
+        record = read_camera({"cameras": {name: {"timestamp_ns": frame_ns} | camera}}, name)
+        if type(record.width) is not int or type(record.height) is not int:
+            raise ValueError(f"width and height must be whole pixels; got {record.width!r}")
+        k = record.K
+        return Camera(
+            name=name,
+            width=record.width,
+            height=record.height,
+            fx=float(k[0, 0]),
+            fy=float(k[1, 1]),
+            cx=float(k[0, 2]),
+            cy=float(k[1, 2]),
+            camera_from_world=invert_rigid(pose),
+            timestamp_ns=_time(where, record.timestamp_ns),
+        )
+    except KeyError as error:
+        raise AdapterError(f"{where}: {error} is missing") from None
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+        raise AdapterError(f"{where}: {error}") from None
+
+
+def _rigid(where: str, name: str, value: Any) -> torch.Tensor:
+    """A rigid transform, float64 [4, 4]."""
+    try:
+        matrix = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        matrix = np.zeros(0)
+    if matrix.shape != (4, 4):
+        raise AdapterError(f"{where}: {name} must be 4 rows of 4 numbers; got {value!r:.200}")
+    if not np.isfinite(matrix).all():
+        raise AdapterError(
+            f"{where}: {name} must be finite; got {matrix.tolist()}. Leave the camera or the frame "
+            f"out where its pose is not known"
+        )
+    rotation = matrix[:3, :3].clip(-2, 2)  # larger entries are wrong anyway, and would overflow
+    error = max(
+        np.abs(rotation @ rotation.T - np.eye(3)).max(),
+        np.abs(matrix[3] - np.array([0.0, 0, 0, 1])).max(),
+    )
+    if error > _RIGID or np.linalg.det(rotation) < 0:
+        raise AdapterError(
+            f"{where}: {name} must be a rotation and a translation, last row 0 0 0 1, determinant "
+            f"+1; it is off by {error:.3g}, determinant {np.linalg.det(rotation):.3g}"
+        )
+    return torch.from_numpy(matrix)
+
+
+def _time(where: str, value: Any) -> int:
+    if type(value) is not int or abs(value) > 2**62:
+        raise AdapterError(f"{where}: timestamp_ns must be whole nanoseconds; got {value!r}")
+    return value
+
+
+def _recentred(frame: Frame, origin: np.ndarray) -> Frame:
+    world_from_ego = frame.world_from_ego.clone()
+    world_from_ego[:3, 3] -= torch.from_numpy(origin)
+    cameras = {}
+    for name, camera in frame.cameras.items():
+        moved = camera.camera_from_world.clone()
+        moved[:3, 3] += moved[:3, :3] @ torch.from_numpy(origin)
+        cameras[name] = dataclasses.replace(camera, camera_from_world=moved)
+    return dataclasses.replace(frame, world_from_ego=world_from_ego, cameras=cameras)
+
+
+def _name(content: Mapping[str, Any], root: Path) -> str:
+    """What a job named its scene and variant, else the folder's name."""
+    parts = [content.get("scene"), content.get("variant")]
+    given = [part for part in parts if isinstance(part, str) and part]
+    return "-".join(given) if given else root.resolve().name
+
+
+def _number(path: Path, content: Mapping[str, Any], key: str, otherwise: float) -> float:
+    value = content.get(key, otherwise)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise AdapterError(f"{path}: {key} must be a number of metres; got {value!r}")
+    return float(value)
+
+
+def _ego_box(path: Path, value: Any) -> np.ndarray | None:
+    if value is None:
+        return None
+    try:
+        box = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        box = np.zeros(0)
+    if box.shape != (2, 3) or not np.isfinite(box).all() or not (box[0] < box[1]).all():
+        raise AdapterError(
+            f"{path}: ego_box_m must be [[x, y, z], [x, y, z]], the lowest and the highest corner "
+            f"in ego axes; got {value!r:.200}"
+        )
+    return box
+
+
+def _lidar_classes(path: Path, value: Any) -> Mapping[int, int] | None:
+    if value is None:
+        return None
+    meanings = {member.name.lower(): int(member) for member in SemanticClass}
+    meanings["none"] = NO_SURFACE
+    try:
+        return {int(number): meanings[str(name).lower()] for number, name in value.items()}
+    except (AttributeError, ValueError, KeyError) as error:
+        raise AdapterError(
+            f"{path}: lidar_classes must map class numbers to {', '.join(meanings)}; got "
+            f"{value!r:.200} ({error!r})"
+        ) from None

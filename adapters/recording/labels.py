@@ -1,0 +1,42 @@
+"""Boxes and sweeps of a recording, passed through with every column."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from adapters.recording.files import inside, numbered_files
+from adapters.recording.tables import TimedBoxes, read_frame_boxes, read_sweep
+from augment.labels import Boxes, LidarSweep
+
+
+def boxes_file(root: Path) -> Path | None:
+    """labels/boxes.parquet where there is one."""
+    path = root / "labels" / "boxes.parquet"
+    return inside(root, path) if path.exists() else None
+
+
+def lidar_files(root: Path) -> dict[int, Path]:
+    """The sweeps' files by frame number."""
+    return numbered_files(root, "lidar", (".parquet",))
+
+
+def all_boxes(root: Path) -> dict[int, TimedBoxes]:
+    """The boxes of every frame that has any; none without the file."""
+    path = boxes_file(root)
+    return {} if path is None else read_frame_boxes(path)
+
+
+@dataclass(frozen=True)
+class RecordingLabels:
+    """Labels of one recording, read when asked, in the recording's own world."""
+
+    root: Path
+
+    def boxes(self, frame_index: int) -> Boxes:
+        timed = all_boxes(self.root).get(frame_index)
+        return Boxes.empty() if timed is None else timed.boxes
+
+    def lidar(self, frame_index: int) -> LidarSweep | None:
+        path = lidar_files(self.root).get(frame_index)
+        return None if path is None else read_sweep(path)

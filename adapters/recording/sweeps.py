@@ -1,0 +1,186 @@
+"""A recording's LiDAR files into sweeps of usable returns."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from adapters.lidar.split import Sweep
+from adapters.recording.calibration import NO_SURFACE, Calibration
+from adapters.recording.labels import lidar_files
+from adapters.recording.tables import read_sweep, whole_numbers
+from augment.cameras import Frame
+from augment.errors import AdapterError
+from augment.labels import LidarSweep
+from augment.semantics import SemanticClass
+
+_FAR_M = 1000.0  # no LiDAR on the ground sees this far
+_SAME_DRIVE_NS = 10_000_000_000  # times further from the frame's count from some other start
+_TOP_QUANTILE = 0.999
+_TOP_BEYOND_M = 5.0  # nearer, a camera's height says little of the sensor's
+_TOP_DEG = (2.0, 60.0)
+
+
+@dataclass(frozen=True, eq=False)
+class LidarDrive:
+    """sweeps: one a frame that has a file, scene world. top_deg: about the highest elevation that
+    the LiDAR looks at. problems: one sentence each."""
+
+    sweeps: tuple[Sweep, ...]
+    top_deg: float
+    problems: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return sum(len(sweep) for sweep in self.sweeps)
+
+
+def read_lidar_drive(root: Path, calibration: Calibration, frames: Sequence[Frame]) -> LidarDrive:
+    """The sweeps of the given frames.
+
+    Left out: returns that are not finite, of no surface, or of the recording car (ego_box_m).
+
+    Raises:
+        AdapterError: a damaged file, or returns that cannot be in the calibration's world.
+    """
+    files = lidar_files(root)
+    problems = []
+    if files:
+        missing = [f.index for f in frames if f.index not in files]
+        problems += [
+            f"frame {n}: lidar/{n:06d}.parquet is missing, its points too" for n in missing
+        ]
+    known = [(frame, files[frame.index]) for frame in frames if frame.index in files]
+    raws = [
+        _Raw.of(path, frame, calibration)
+        for frame, path in tqdm(known, desc="LiDAR", unit="frame", disable=None)
+    ]
+    timeless = [raw.frame for raw in raws if raw.timeless]
+    if timeless:
+        problems.append(
+            f"lidar/: no column timestamp_ns, or t in seconds, near the frame's time in "
+            f"{len(timeless)} sweeps (the first of frame {timeless[0]}); their frames' times are "
+            f"used, fast objects are smeared"
+        )
+    table, more = _class_table(root, raws, calibration)
+    sweeps = tuple(raw.usable(table) for raw in raws)
+    return LidarDrive(sweeps, _top_deg(sweeps, known), (*problems, *more))
+
+
+@dataclass(frozen=True, eq=False)
+class _Raw:
+    frame: int
+    points: np.ndarray  # float32 [N, 3], scene world, finite
+    timestamps_ns: np.ndarray  # int64 [N]
+    classes: np.ndarray | None  # int64 [N], the file's own numbers
+    timeless: bool
+
+    @staticmethod
+    def of(path: Path, frame: Frame, calibration: Calibration) -> _Raw:
+        sweep = read_sweep(path)
+        world = sweep.points_m - calibration.world_origin_m
+        pose = frame.world_from_ego.numpy()
+        keep = np.isfinite(world).all(axis=1)
+        ego = (np.where(keep[:, None], world, 0) - pose[:3, 3]) @ pose[:3, :3]
+        if keep.any() and np.median(np.abs(ego[keep]).max(axis=1)) > _FAR_M:
+            raise AdapterError(
+                f"{path}: most returns lie more than {_FAR_M:.0f} m from the car as "
+                f"calibration.json has it in frame {frame.index}; x, y, z must be metres in the "
+                f"world of its poses, not in the sensor's"
+            )
+        if calibration.ego_box_m is not None:
+            low, high = calibration.ego_box_m
+            keep &= ~((ego > low) & (ego < high)).all(axis=1)
+        times = _times(path, sweep, frame.timestamp_ns)
+        classes = sweep.columns.get("semantic")
+        if classes is not None:
+            classes = _classes(path, classes)[keep]
+        return _Raw(
+            frame.index,
+            world[keep].astype(np.float32),
+            np.full(int(keep.sum()), frame.timestamp_ns) if times is None else times[keep],
+            classes,
+            timeless=times is None,
+        )
+
+    def usable(self, table: np.ndarray | None) -> Sweep:
+        if self.classes is None or table is None:
+            unknown = np.full(len(self.points), SemanticClass.UNKNOWN, np.int16)
+            return Sweep(self.points, self.timestamps_ns, unknown)
+        semantic = table[np.clip(self.classes, 0, len(table) - 1)]
+        keep = semantic != NO_SURFACE
+        return Sweep(self.points[keep], self.timestamps_ns[keep], semantic[keep])
+
+
+def _times(path: Path, sweep: LidarSweep, frame_ns: int) -> np.ndarray | None:
+    """The returns' times, int64 [N], or None where the file has none of this drive."""
+    times = sweep.columns.get("timestamp_ns")
+    if times is None:
+        seconds = sweep.columns.get("t")
+        if seconds is None or seconds.dtype.kind not in "fiu" or not np.isfinite(seconds).all():
+            return None
+        # Beyond 9e9 s int64 has no nanoseconds; such times are no times of this drive either.
+        times = np.round(seconds.astype(np.float64).clip(-9e9, 9e9) * 1e9)
+    try:
+        times = whole_numbers(times, "timestamp_ns")
+    except ValueError as error:
+        raise AdapterError(f"{path}: {error}") from None
+    near = len(times) == 0 or abs(int(np.median(times)) - frame_ns) <= _SAME_DRIVE_NS
+    return times if near else None
+
+
+def _classes(path: Path, column: np.ndarray) -> np.ndarray:
+    try:
+        return whole_numbers(column, "semantic")
+    except ValueError as error:
+        raise AdapterError(f"{path}: {error}") from None
+
+
+def _class_table(
+    root: Path, raws: Sequence[_Raw], calibration: Calibration
+) -> tuple[np.ndarray | None, tuple[str, ...]]:
+    """SemanticClass by the files' class number, int16; None where their meaning is not known."""
+    present = [np.unique(raw.classes) for raw in raws if raw.classes is not None]
+    if not present:
+        return None, ()
+    numbers = np.unique(np.concatenate(present))
+    if calibration.lidar_classes is None:
+        known = (numbers >= 0) & (numbers < SemanticClass.SKY)
+        if not known.all():
+            return None, (
+                f"lidar/: the column semantic holds {int(numbers[~known][0])}, which is no "
+                f"SemanticClass (0 to {SemanticClass.SKY - 1}): classes are ignored. Say what the "
+                f'numbers mean in calibration.json: "lidar_classes": {{"7": "road", ...}}',
+            )
+        return np.arange(SemanticClass.SKY, dtype=np.int16), ()
+    size = max(0, int(numbers.max()), *calibration.lidar_classes) + 1
+    if numbers.min() < 0 or min(calibration.lidar_classes, default=0) < 0 or size > 2**16:
+        raise AdapterError(
+            f"{root / 'lidar'}: class numbers must lie in 0 to 65535; the files hold "
+            f"{int(numbers.min())} to {int(numbers.max())}, lidar_classes names "
+            f"{sorted(calibration.lidar_classes)}"
+        )
+    table = np.full(size, SemanticClass.UNKNOWN, np.int16)
+    for number, meaning in calibration.lidar_classes.items():
+        table[number] = meaning
+    return table, ()
+
+
+def _top_deg(sweeps: Sequence[Sweep], known: Sequence[tuple[Frame, Path]]) -> float:
+    """About the elevation of the highest channel: that of nearly the steepest return, as seen from
+    the height of the cameras, for want of the sensor's own."""
+    rises = []
+    for sweep, (frame, _) in zip(sweeps, known, strict=True):
+        if not frame.cameras or not len(sweep):
+            continue
+        eyes = np.stack([camera.centre.numpy() for camera in frame.cameras.values()])
+        offset = sweep.points - eyes.mean(axis=0)
+        reach = np.hypot(offset[:, 0], offset[:, 1])
+        far = reach > _TOP_BEYOND_M
+        rises.append(np.degrees(np.arctan2(offset[far, 2], reach[far])))
+    joined = np.concatenate(rises) if rises else np.zeros(0)
+    top = float(np.quantile(joined, _TOP_QUANTILE)) if len(joined) else 0.0
+    return float(np.clip(top, *_TOP_DEG))
