@@ -1,0 +1,197 @@
+"""How far a picture is from the one it should be: PSNR, SSIM, FLIP; and errors of depth.
+
+Pictures are display-encoded RGB [H, W, 3]: uint8, or floats in [0, 1]; both arguments may differ in
+that. `weight` [H, W], bool or >= 0, says how much a pixel counts; where it is 0 the picture is
+taken to be right, so that what is left out does not disturb its neighbours either.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+WINDOW = 11  # SSIM's, pixels
+SIGMA = 1.5
+C1, C2 = 0.01**2, 0.03**2
+PIXELS_PER_DEGREE = 67.0206  # FLIP's own default: a 0.7 m wide 3840 px screen at 0.7 m
+CLOSE_M = 0.05
+
+
+def psnr(picture: np.ndarray, reference: np.ndarray, weight: np.ndarray | None = None) -> float:
+    """Peak signal-to-noise ratio, dB: 10 log10(1 / mean squared error); infinite where equal.
+
+    Raises:
+        ValueError: shapes, types or values are not as this module says, or no pixel counts.
+    """
+    a, b, w = _pair(picture, reference, weight)
+    error = ((a - b) ** 2).mean(axis=2)
+    mean = float(np.average(error, weights=w))
+    return math.inf if mean == 0 else -10 * math.log10(mean)
+
+
+def ssim(picture: np.ndarray, reference: np.ndarray, weight: np.ndarray | None = None) -> float:
+    """Structural similarity (Wang et al. 2004), averaged over the picture and its channels.
+
+    An 11x11 Gaussian window of sigma 1.5 on each colour channel, C1 = 0.01^2, C2 = 0.03^2, range 1.
+    As in 3D Gaussian Splatting (Kerbl et al. 2023) every pixel counts, and outside the picture all
+    is 0. That lifts the score of pixels near the border slightly against Wang's valid windows.
+
+    Raises:
+        ValueError: as psnr.
+    """
+    a, b, w = _pair(picture, reference, weight)
+    return float(np.average(_ssim_map(a, b), weights=w))
+
+
+def flip(picture: np.ndarray, reference: np.ndarray, weight: np.ndarray | None = None) -> float:
+    """Mean of `flip_map`: 0 is the same picture, 1 as different as can be.
+
+    Raises:
+        ValueError: as psnr.
+    """
+    w = None if weight is None else _checked_weight(weight, np.shape(reference)[:2])
+    error = flip_map(picture, reference, weight).astype(np.float64)
+    return float(np.average(error, weights=w))
+
+
+def flip_map(
+    picture: np.ndarray, reference: np.ndarray, weight: np.ndarray | None = None
+) -> np.ndarray:
+    """float32 [H, W]: the difference a person sees when the two alternate (Andersson et al. 2020).
+
+    LDR-FLIP of the authors' own package, seen at PIXELS_PER_DEGREE.
+
+    Raises:
+        ValueError: as psnr.
+    """
+    from flip_evaluator import evaluate
+
+    a, b, _ = _pair(picture, reference, weight)
+    error, _, _ = evaluate(
+        np.ascontiguousarray(b, np.float32),
+        np.ascontiguousarray(a, np.float32),
+        "LDR",
+        applyMagma=False,
+        computeMeanError=False,
+        parameters={"ppd": PIXELS_PER_DEGREE},
+    )
+    return error[..., 0]
+
+
+@dataclass(frozen=True)
+class DepthErrors:
+    """Errors of depth over a number of pixels; NaN where there are none.
+
+    median_m, p90_m: quantiles of |depth - true|, metres: the smallest error that at least this part
+    of the weight does not exceed. abs_rel: mean of |depth - true| / true. within_5cm: part of the
+    weight whose error is at most CLOSE_M, in [0, 1].
+    """
+
+    pixels: int
+    median_m: float
+    p90_m: float
+    abs_rel: float
+    within_5cm: float
+
+
+def depth_errors(
+    depth_m: np.ndarray, true_m: np.ndarray, weight: np.ndarray | None = None
+) -> DepthErrors:
+    """Errors of depths against true ones, metres, arrays of one shape; weight >= 0 of that shape.
+
+    Pixels of weight 0 are left out, whatever they hold.
+
+    Raises:
+        ValueError: shapes differ, or a pixel that counts has no finite depth or no true depth > 0.
+    """
+    depth, true = np.asarray(depth_m, np.float64), np.asarray(true_m, np.float64)
+    if depth.shape != true.shape:
+        raise ValueError(f"depths must have one shape; got {depth.shape} and {true.shape}")
+    w = np.ones(depth.shape) if weight is None else _checked_weight(weight, depth.shape)
+    counts = w > 0
+    depth, true, w = depth[counts], true[counts], w[counts]
+    if not (np.isfinite(depth).all() and np.isfinite(true).all() and (true > 0).all()):
+        raise ValueError(
+            "depths must be finite and true depths > 0 (metres) wherever the weight is > 0; "
+            f"{int((~np.isfinite(depth)).sum())} of {depth.size} depths and "
+            f"{int((~(true > 0) | np.isinf(true)).sum())} true depths are not"
+        )
+    if depth.size == 0:
+        return DepthErrors(0, math.nan, math.nan, math.nan, math.nan)
+    error = np.abs(depth - true)
+    return DepthErrors(
+        pixels=int(depth.size),
+        median_m=_quantile(error, w, 0.5),
+        p90_m=_quantile(error, w, 0.9),
+        abs_rel=float(np.average(error / true, weights=w)),
+        within_5cm=float(np.average(error <= CLOSE_M, weights=w)),
+    )
+
+
+def _quantile(values: np.ndarray, weight: np.ndarray, part: float) -> float:
+    order = np.argsort(values, kind="stable")
+    reached = np.cumsum(weight[order])
+    # Sums of weights round: an exact half must count as reached.
+    first = int(np.searchsorted(reached, part * reached[-1] * (1 - 1e-12)))
+    return float(values[order[min(first, len(order) - 1)]])
+
+
+def _ssim_map(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """float64 [H, W]: mean over the channels of [H, W, 3]."""
+    offsets = np.arange(WINDOW) - WINDOW // 2
+    window = np.exp(-(offsets**2) / (2 * SIGMA**2))
+    window /= window.sum()
+
+    def blurred(image: np.ndarray) -> np.ndarray:
+        return cv2.sepFilter2D(image, cv2.CV_64F, window, window, borderType=cv2.BORDER_CONSTANT)
+
+    mean_a, mean_b = blurred(a), blurred(b)
+    var_a, var_b = blurred(a * a) - mean_a**2, blurred(b * b) - mean_b**2
+    covariance = blurred(a * b) - mean_a * mean_b
+    similarity = (
+        (2 * mean_a * mean_b + C1)
+        * (2 * covariance + C2)
+        / ((mean_a**2 + mean_b**2 + C1) * (var_a + var_b + C2))
+    )
+    return similarity.mean(axis=2)
+
+
+def _pair(
+    picture: np.ndarray, reference: np.ndarray, weight: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """Both as float64 in [0, 1], the picture made right where nothing counts; and the weight."""
+    a, b = _unit("picture", picture), _unit("reference", reference)
+    if a.shape != b.shape:
+        raise ValueError(f"pictures must have one size; got {a.shape} and {b.shape}")
+    if weight is None:
+        return a, b, None
+    w = _checked_weight(weight, b.shape[:2])
+    if not w.any():
+        raise ValueError("the weight is 0 everywhere, so no pixel counts")
+    return np.where((w > 0)[..., None], a, b), b, w
+
+
+def _unit(name: str, image: np.ndarray) -> np.ndarray:
+    image = np.asarray(image)
+    if image.ndim != 3 or image.shape[2] != 3 or image.size == 0:
+        raise ValueError(f"{name} must be [H, W, 3] with H, W >= 1; got {list(image.shape)}")
+    if image.dtype == np.uint8:
+        return image / 255.0
+    if not np.issubdtype(image.dtype, np.floating):
+        raise ValueError(f"{name} must be uint8, or floats in [0, 1]; got {image.dtype}")
+    low, high = float(image.min()), float(image.max())
+    if not (low >= 0 and high <= 1):  # `not` also catches NaN
+        raise ValueError(f"{name} must lie in [0, 1] (clamp it first); got {low:g} to {high:g}")
+    return image.astype(np.float64)
+
+
+def _checked_weight(weight: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    w = np.asarray(weight, np.float64)
+    if w.shape != tuple(shape):
+        raise ValueError(f"weight must be {list(shape)}, as the image; got {list(w.shape)}")
+    if not (np.isfinite(w).all() and (w >= 0).all()):
+        raise ValueError("weight must be finite and >= 0 everywhere")
+    return w
