@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import torch
@@ -184,6 +185,9 @@ class Scene:
     color_maps: how a camera's recorded colours differ from the scene's, by camera name: float32
     [3, 4], recorded = M[:, :3] @ rgb + M[:, 3], display-encoded. A camera without one records the
     scene's own colours.
+    recorded_source: the URI of the recording that a fitted scene was made from, for its labels;
+    None where `source` itself is the recording. made_by: how the Gaussians came about, facts for
+    people and reports in JSON's own types.
     """
 
     name: str
@@ -198,6 +202,8 @@ class Scene:
     has_metric_scale: bool = True
     problems: tuple[str, ...] = ()
     color_maps: Mapping[str, Float[Tensor, "3 4"]] = field(default_factory=dict)
+    recorded_source: str | None = None
+    made_by: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for name, color_map in self.color_maps.items():

@@ -1,0 +1,396 @@
+"""Scene folders: to the bit and back, whole or not at all, and what is said of damaged ones."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from fitted_scenes import assert_same, fitted_scene
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from safetensors.numpy import load_file, save_file
+from scenes import camera_ahead, random_gaussians
+
+from augment import atomic_folder
+from augment.errors import OutputError, SceneError
+from augment.render.rasterize import rasterize
+from augment.scene import Gaussians
+from augment.scene_files import FILES, is_scene_folder, load_scene_parts, save_scene
+from augment.sky import ConstantSky, LatLongSky
+
+DIFFERENT = ("source", "labels")  # a loaded scene is opened from its folder
+
+
+@pytest.fixture
+def saved(tmp_path: Path) -> Path:
+    save_scene(fitted_scene(), tmp_path / "fit")
+    return tmp_path / "fit"
+
+
+def hidden(folder: Path) -> list[str]:
+    return [entry.name for entry in folder.iterdir() if entry.name.startswith(".")]
+
+
+@pytest.mark.parametrize("sky", [None, ConstantSky(torch.rand(3)), LatLongSky(torch.rand(4, 7, 3))])
+def test_a_scene_comes_back_to_the_bit(tmp_path, sky):
+    scene = fitted_scene() if sky is None else fitted_scene(sky=sky)
+    save_scene(scene, tmp_path / "a" / "fit")
+    again = load_scene_parts(tmp_path / "a" / "fit")
+    assert_same(scene, again, but=DIFFERENT)
+    assert again.source == f"scene:{tmp_path / 'a' / 'fit'}"
+    assert is_scene_folder(tmp_path / "a" / "fit")
+    assert sorted(p.name for p in (tmp_path / "a" / "fit").iterdir()) == sorted(FILES)
+    ours, theirs = (
+        rasterize(s.parts_for(s.frames[0].cameras["ahead"]), camera_ahead()).rgb
+        for s in (scene, again)
+    )
+    assert torch.equal(ours, theirs)
+
+
+def test_equal_scenes_make_equal_files(tmp_path, saved):
+    save_scene(load_scene_parts(saved), tmp_path / "again")
+    for name in FILES:
+        assert (saved / name).read_bytes() == (tmp_path / "again" / name).read_bytes()
+
+
+def test_what_else_a_scene_may_be(tmp_path):
+    """No frames, no actors, unknown ground, an empty background, no recording but its source."""
+    empty = fitted_scene(background=Gaussians.empty(2), frames=(), color_maps={}, made_by={})
+    empty = dataclasses.replace(empty, ground_z_m=None, problems=(), recorded_source=None)
+    save_scene(empty, tmp_path / "fit")
+    again = load_scene_parts(tmp_path / "fit")
+    assert_same(empty, again, but=(*DIFFERENT, "recorded_source"))
+    assert again.recorded_source == empty.source
+    save_scene(fitted_scene(actors=()), tmp_path / "fit")
+    assert load_scene_parts(tmp_path / "fit").actors == ()
+
+
+def test_arrays_are_mapped_and_writes_to_them_stay_in_memory(saved):
+    before = (saved / FILES[1]).read_bytes()
+    load_scene_parts(saved).background.means[:] = 0
+    assert (saved / FILES[1]).read_bytes() == before
+
+
+def test_image_paths_become_absolute(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    first = dataclasses.replace(fitted_scene().frames[0], image_paths={"ahead": "data/4.jpg"})
+    save_scene(fitted_scene(frames=(first,)), "fit")
+    paths = load_scene_parts("fit").frames[0].image_paths
+    assert paths == {"ahead": str(tmp_path / "data" / "4.jpg")}
+
+
+def test_a_million_gaussians_open_at_once(tmp_path):
+    scene = fitted_scene(background=random_gaussians(1_000_000, sh_degree=1))
+    save_scene(scene, tmp_path / "fit")
+    seconds = []
+    for _ in range(3):
+        begun = time.perf_counter()
+        load_scene_parts(tmp_path / "fit")
+        seconds.append(time.perf_counter() - begun)
+    assert min(seconds) < 0.5  # 0.03 s on a quiet machine with two cores
+
+
+def test_what_cannot_be_kept_is_refused(tmp_path):
+    class OwnSky(ConstantSky):
+        pass
+
+    scene = fitted_scene()
+    wide = random_gaussians(3, dtype=torch.float64)
+    ego = torch.diag(torch.tensor([2.0, 1, 1, 1], dtype=torch.float64))
+    stretched = dataclasses.replace(scene.frames[0], world_from_ego=ego)
+    for changes, message in (
+        ({"sky": OwnSky(torch.zeros(3))}, "a sky of class OwnSky cannot be saved"),
+        ({"background": wide}, "float32 Gaussians; got torch.float64"),
+        ({"made_by": {"loss": float("nan")}}, "made_by must hold JSON's own types"),
+        ({"made_by": {"config": object()}}, "made_by must hold JSON's own types"),
+        ({"frames": (stretched,)}, "frame 4: a pose must be a rotation and a translation"),
+        ({"name": "a\0b"}, "name: .*NUL"),
+    ):
+        with pytest.raises(SceneError, match=message):
+            save_scene(dataclasses.replace(scene, **changes), tmp_path / "fit")
+    assert not list(tmp_path.iterdir())
+
+
+# Replacing
+
+
+def test_a_folder_that_is_no_scene_is_not_replaced(tmp_path):
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "holiday.jpg").touch()
+    with pytest.raises(OutputError, match="holds other files and no scene"):
+        save_scene(fitted_scene(), tmp_path / "photos")
+    assert [p.name for p in (tmp_path / "photos").iterdir()] == ["holiday.jpg"]
+    (tmp_path / "file").touch()
+    with pytest.raises(OutputError, match="file"):
+        save_scene(fitted_scene(), tmp_path / "file")
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "scene.json").write_text('{"format": "of another program"}')
+    with pytest.raises(OutputError, match="holds other files and no scene"):
+        save_scene(fitted_scene(), tmp_path / "other")
+    (tmp_path / "empty").mkdir()
+    save_scene(fitted_scene(), tmp_path / "empty")
+    assert not hidden(tmp_path)
+
+
+@pytest.mark.parametrize("exchanges", [True, False])
+def test_replacing_keeps_what_else_is_there(tmp_path, saved, monkeypatch, exchanges):
+    if not exchanges:
+        monkeypatch.setattr(atomic_folder, "_exchange", lambda one, other: False)
+    (saved / "report").mkdir()
+    (saved / "report" / "curves.png").write_bytes(b"png")
+    (tmp_path / "link").symlink_to(saved)
+    save_scene(fitted_scene(name="new"), tmp_path / "link")
+    assert load_scene_parts(saved).name == "new"
+    assert (saved / "report" / "curves.png").read_bytes() == b"png"
+    assert (tmp_path / "link").is_symlink() and not hidden(tmp_path)
+
+
+@pytest.mark.parametrize("exchanges", [True, False])
+@pytest.mark.parametrize("stop_at", range(6))
+def test_an_error_at_any_moment_leaves_one_of_the_two(
+    tmp_path, saved, monkeypatch, exchanges, stop_at
+):
+    """The calls that change names or flush fail, one after the other."""
+    calls = iter(range(1000))
+    if not exchanges:
+        monkeypatch.setattr(atomic_folder, "_exchange", lambda one, other: False)
+
+    def failing(do):
+        def call(*args):
+            if next(calls) == stop_at:
+                raise OSError(28, os.strerror(28))
+            return do(*args)
+
+        return call
+
+    (saved / "notes.txt").write_text("keep")
+    for name in ("_flush_file", "flush_folder", "_exchange"):
+        monkeypatch.setattr(atomic_folder, name, failing(getattr(atomic_folder, name)))
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "rename", failing(os.rename))
+        try:
+            save_scene(fitted_scene(name="new"), saved)
+            failed = False
+        except OutputError as error:
+            assert "the disk is full" in str(error)
+            failed = True
+    assert load_scene_parts(saved).name in (("drive 2", "new") if failed else ("new",))
+    monkeypatch.undo()
+    save_scene(fitted_scene(name="newest"), saved)
+    assert load_scene_parts(saved).name == "newest"
+    assert (saved / "notes.txt").read_text() == "keep"
+    assert not hidden(tmp_path)
+
+
+def test_a_killed_save_is_cleared_by_the_next(tmp_path, saved):
+    code = f"""
+import os, sys
+sys.path.insert(0, {str(Path(__file__).parents[1])!r})
+from augment import atomic_folder, scene_files
+from fitted_scenes import fitted_scene
+atomic_folder._put_in_place = lambda *_: os.kill(os.getpid(), 9)
+scene_files.save_scene(fitted_scene(name="killed"), {str(saved)!r})
+"""
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == -9
+    assert len(hidden(tmp_path)) == 1
+    assert load_scene_parts(saved).name == "drive 2"
+    save_scene(fitted_scene(name="new"), saved)
+    assert load_scene_parts(saved).name == "new" and not hidden(tmp_path)
+
+
+def test_a_full_disk_is_said(tmp_path, monkeypatch):
+    from augment import scene_files
+
+    def full(tensors, path):
+        raise scene_files.SafetensorError(
+            f"Error while serializing: I/O error: No space left on device (os error 28) at {path}"
+        )
+
+    monkeypatch.setattr(scene_files, "save_file", full)
+    with pytest.raises(OutputError, match="the disk is full"):
+        save_scene(fitted_scene(), tmp_path / "fit")
+    assert not list(tmp_path.iterdir())
+
+
+# Damaged and hostile folders
+
+
+def test_missing_and_damaged_files_are_named(saved, tmp_path):
+    for name in FILES:
+        hurt = tmp_path / f"without {name}"
+        shutil.copytree(saved, hurt)
+        (hurt / name).unlink()
+        with pytest.raises(SceneError, match=f"no scene folder: it has no {name}"):
+            load_scene_parts(hurt)
+    for name in FILES:
+        data = (saved / name).read_bytes()
+        for damaged in (b"", data[:5], data[: len(data) // 2], data[:-1], data + b"\0"):
+            if name == FILES[0] and damaged.strip(b"\n") == data.strip(b"\n"):
+                continue
+            hurt = tmp_path / "hurt"
+            shutil.copytree(saved, hurt, dirs_exist_ok=True)
+            (hurt / name).write_bytes(damaged)
+            with pytest.raises(SceneError, match=name):
+                load_scene_parts(hurt)
+
+
+def change_document(folder: Path, change) -> None:
+    raw = json.loads((folder / "scene.json").read_text())
+    change(raw)
+    (folder / "scene.json").write_text(json.dumps(raw))
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "message"),
+    [
+        (("format",), "other", r'"format" must be \'climategs-scene\'; got \'other\''),
+        (("version",), 2, "reads scene folders of version 1; got 2"),
+        (("colour_maps",), {}, "colour_maps: Extra inputs are not permitted"),
+        (("background_gaussians",), 51, "means must have 51 rows.*do not belong together"),
+        (("actors", 0, "gaussians"), "7", r"actors\.0\.gaussians: .*valid integer; got '7'"),
+        (("actors", 0, "track_id"), "é", "track_ids repeat"),
+        (("actors", 0, "track", "timestamps_ns"), [1, 1, 2], "'car/1': track timestamps"),
+        (("actors", 0, "track", "timestamps_ns"), [1, 2], "'car/1': a track needs"),
+        (("actors", 0, "track", "timestamps_ns"), [2**63], "less than"),
+        (("actors", 0, "track", "world_from_actor", 1, 0, 0), 9.0, "'car/1': a pose must be"),
+        (("frames", 0, "cameras", "left", "fx"), -1.0, "camera 'left': fx must be finite and > 0"),
+        (("frames", 0, "cameras", "left", "fx"), 1e999, "no number of JSON"),
+        (("frames", 0, "cameras", "left", "width"), 10**9, "less than or equal to 100000"),
+        (("frames", 0, "cameras", "left", "camera_from_world", 3, 3), 2.0, "a pose must be"),
+        (("frames", 0, "world_from_ego", 0), [1.0, 2.0], "at least 4 items"),
+        (("frames", 0, "index"), 5, "1 frame numbers are given twice"),
+        (("frames", 0, "image_paths", "ahead"), "a\0b", "NUL"),
+        (("frames", 0, "image_paths", "ahead"), "\ud800", "surrogates"),
+        (("color_maps", "ahead"), [[1.0] * 4] * 2, "at least 3 items"),
+        (("sky",), "latlong", "a latlong sky is one array 'image'; got"),
+        (("sky",), "void", "'constant', 'latlong' or 'cubemap'; got 'void'"),
+    ],
+)
+def test_wrong_documents_are_refused(saved, path, value, message):
+    def change(raw):
+        inner = raw
+        for key in path[:-1]:
+            inner = inner[key]
+        inner[path[-1]] = value
+
+    change_document(saved, change)
+    with pytest.raises(SceneError, match=message) as caught:
+        load_scene_parts(saved)
+    assert str(saved) in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ["[]", "null", "[" * 100_000, '{"format": NaN}', "1" * 10_000])
+def test_what_is_no_document_is_refused(saved, text):
+    (saved / "scene.json").write_text(text)
+    with pytest.raises(SceneError, match=r"scene\.json"):
+        load_scene_parts(saved)
+
+
+def paths_of(value, path=()):
+    yield path
+    items = value.items() if isinstance(value, dict) else enumerate(value)
+    for key, inner in items if isinstance(value, dict | list) else ():
+        yield from (
+            paths_of(inner, (*path, key)) if isinstance(inner, dict | list) else [(*path, key)]
+        )
+
+
+VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5)
+    | st.sampled_from([2**63, -(2**63) - 1, 10**400, 1e308, "\ud800", -0.0]),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=3), inner),
+    max_leaves=6,
+)  # fmt: skip
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(data=st.data())
+def test_any_document_is_a_scene_or_a_scene_error(tmp_path_factory, data):
+    folder = tmp_path_factory.getbasetemp() / "fuzzed"
+    if not folder.exists():
+        save_scene(fitted_scene(), folder)
+        shutil.copy(folder / "scene.json", folder / "whole.json")
+    raw = copy.deepcopy(json.loads((folder / "whole.json").read_text()))
+    path = data.draw(st.sampled_from([p for p in paths_of(raw) if p]))
+    inner = raw
+    for key in path[:-1]:
+        inner = inner[key]
+    if data.draw(st.booleans()):
+        inner[path[-1]] = data.draw(VALUES)
+    elif isinstance(inner, dict):
+        del inner[path[-1]]
+    (folder / "scene.json").write_text(json.dumps(raw))
+    try:
+        scene = load_scene_parts(folder)
+    except SceneError:
+        return
+    assert len(scene.background) == 50
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda t: t.pop("actors.0.sh"), r"lacks actors\.0\.sh"),
+        (lambda t: t.update({"extra": t["background.sh"]}), r"does not know: \['extra'\]"),
+        (lambda t: t.update({"background.means": t["background.means"][:9]}), "belong together"),
+        (lambda t: t.update({"background.sh": t["background.sh"][:, :3]}), r"K in \(1, 4, 9, 16\)"),
+        (
+            lambda t: t.update({"background.quats": t["background.quats"][:, :3]}),
+            r"quats must be \[50, 4\]; got \[50, 3\]",
+        ),
+        (lambda t: t.update({"background.sh": t["background.sh"].astype("f8")}), "be float32"),
+        (lambda t: t.update({"actors.1.semantic": np.full(3, 15, np.int16)}), "from 0 to 14"),
+        (lambda t: t.update({"actors.1.semantic": np.zeros(3, np.int64)}), r"must be int16 \[3\]"),
+        (lambda t: t.update({"background.semantic": np.zeros(9, np.int16)}), r"be int16 \[50\]"),
+        (lambda t: t.update({"background.opacities": np.array(1, "f4")}), "must have 50 rows"),
+        (lambda t: t["actors.0.opacities"].fill(np.nan), "holds no usable Gaussians"),
+    ],
+)
+def test_wrong_arrays_are_refused(saved, change, message):
+    tensors = load_file(saved / FILES[1])
+    change(tensors)
+    save_file({k: np.ascontiguousarray(v) for k, v in tensors.items()}, saved / FILES[1])
+    with pytest.raises(SceneError, match=message):
+        load_scene_parts(saved)
+
+
+def test_undrawable_gaussians_are_left_out_and_counted(saved):
+    tensors = load_file(saved / FILES[1])
+    tensors["background.means"][3] = np.nan
+    tensors["background.scales"][5] = 0
+    tensors["background.quats"][7] *= 3
+    save_file(tensors, saved / FILES[1])
+    scene = load_scene_parts(saved)
+    assert len(scene.background) == 48
+    assert [p.split(", ")[-1] for p in scene.problems[2:]] == [
+        "background: left out 1 of 50 Gaussians with NaN or infinite values",
+        "background: left out 1 of 50 Gaussians with a scale <= 0",
+    ]
+    lengths = scene.background.quats.norm(dim=1)
+    assert torch.allclose(lengths, torch.ones(48))
+
+
+@pytest.mark.parametrize(
+    "faces",
+    [
+        np.zeros((6, 4, 5, 3), "f4"),
+        np.zeros((5, 4, 4, 3), "f4"),
+        np.zeros((6, 0, 0, 3), "f4"),
+        np.zeros((6, 4, 4, 3), "f8"),
+        np.full((6, 4, 4, 3), np.inf, "f4"),
+    ],
+)
+def test_wrong_skies_are_refused(saved, faces):
+    save_file({"faces": faces}, saved / "sky.safetensors")
+    with pytest.raises(SceneError, match=r"sky\.safetensors: faces"):
+        load_scene_parts(saved)
