@@ -115,6 +115,47 @@ def read_frame(path: Path, *, max_bytes: int = MAX_BYTES) -> pd.DataFrame:
     return frame
 
 
+def read_array_dict(path: Path, *, max_bytes: int = MAX_BYTES) -> dict[str, np.ndarray]:
+    """The arrays by name that `np.save` wrote as one dictionary into a .npy file.
+
+    Raises:
+        AdapterError: the file is missing, truncated, too large, asks for anything but arrays, or
+            holds something else.
+    """
+    stream = io.BytesIO(_read_bounded(path, max_bytes))
+    try:
+        version = np.lib.format.read_magic(stream)
+        read_header = {
+            (1, 0): np.lib.format.read_array_header_1_0,
+            (2, 0): np.lib.format.read_array_header_2_0,
+        }[version]
+        shape, _, dtype = read_header(stream)
+        if shape != () or not dtype.hasobject:
+            raise AdapterError(
+                f"{path} must hold one dictionary of arrays; it holds {dtype} {list(shape)}"
+            )
+        held = _TableUnpickler(stream).load()
+        found = held.item() if type(held) is np.ndarray and held.shape == () else held
+    except AdapterError:
+        raise
+    except pickle.UnpicklingError as error:
+        raise AdapterError(
+            f"{path} was not read: {error}. Only a dictionary of arrays is accepted"
+        ) from None
+    except Exception as error:  # a hostile or damaged file can raise anything at all
+        raise AdapterError(
+            f"{path} is no .npy file of a dictionary, or a damaged one "
+            f"({type(error).__name__}: {error})"
+        ) from error
+    is_plain = type(found) is dict and all(
+        type(name) is str and type(value) is np.ndarray and not value.dtype.hasobject
+        for name, value in found.items()
+    )
+    if not is_plain:
+        raise AdapterError(f"{path} must hold a dictionary of arrays; it holds something else")
+    return found
+
+
 def _read_bounded(path: Path, max_bytes: int) -> bytes:
     """The file's bytes, unpacked if gzipped, never more than max_bytes of them."""
     try:

@@ -29,13 +29,11 @@ class LidarPriors:
         scene: Scene,
         cameras: Mapping[ViewKey, Camera],
         *,
-        weight: float,
         without_semantic: Collection[int],
         cache_bytes: int,
     ) -> None:
         """cameras: every view that may be asked for, at the training resolution."""
         self._scene = scene
-        self._weight = weight
         self._without = tuple(without_semantic)
         self._frames: dict[int, dict[ViewKey, Camera]] = {}
         for key, camera in cameras.items():
@@ -53,7 +51,7 @@ class LidarPriors:
             prior = PriorPixels.empty()
             if returns is not None:
                 seen = depth_seen(returns, camera)
-                prior = _as_prior(seen, visible(seen, camera), camera, self._weight)
+                prior = _as_prior(seen, visible(seen, camera), camera)
             self._cache.put(other, prior, prior.nbytes)
             if other == key:
                 wanted = prior
@@ -80,7 +78,6 @@ def visible(seen: SparseDepth, camera: Camera) -> np.ndarray:
     return ~hidden
 
 
-def _as_prior(seen: SparseDepth, keep: np.ndarray, camera: Camera, weight: float) -> PriorPixels:
+def _as_prior(seen: SparseDepth, keep: np.ndarray, camera: Camera) -> PriorPixels:
     pixels = seen.uv[keep, 1] * np.int32(camera.width) + seen.uv[keep, 0]
-    count = len(pixels)
-    return PriorPixels(pixels, seen.depth_m[keep], np.full(count, weight, np.float32))
+    return PriorPixels(pixels, seen.depth_m[keep], np.ones(len(pixels), np.float32))

@@ -30,8 +30,9 @@ class PriorPixels:
         return PriorPixels(np.zeros(0, np.int32), np.zeros(0, np.float32), np.zeros(0, np.float32))
 
     @staticmethod
-    def of(pixels: np.ndarray, depth_m: np.ndarray, weight: float) -> PriorPixels:
-        """Pixels in any order, some of them several times: the nearest depth of each remains."""
+    def of(pixels: np.ndarray, depth_m: np.ndarray) -> PriorPixels:
+        """Of weight 1. Pixels come in any order, some of them several times: the nearest depth of
+        each remains."""
         order = np.lexsort((depth_m, pixels))
         first = np.ones(len(order), np.bool_)
         first[1:] = np.diff(pixels[order]) > 0
@@ -39,11 +40,15 @@ class PriorPixels:
         return PriorPixels(
             pixels[chosen].astype(np.int32),
             depth_m[chosen].astype(np.float32),
-            np.full(len(chosen), weight, np.float32),
+            np.ones(len(chosen), np.float32),
         )
 
     def select(self, keep: np.ndarray) -> PriorPixels:
         return PriorPixels(self.pixels[keep], self.depth_m[keep], self.weight[keep])
+
+    def weighing(self, weight: float) -> PriorPixels:
+        """The same with another weight."""
+        return PriorPixels(self.pixels, self.depth_m, np.full(len(self), weight, np.float32))
 
     def image(self, camera: Camera) -> np.ndarray:
         """float32 [H, W], 0 where nothing is known."""

@@ -54,19 +54,26 @@ def lidar_top_rad(scene: Scene, frames: Sequence[int]) -> float | None:
 
 
 def sky_mask(
-    scene: Scene, camera: Camera, rgb: np.ndarray, lidar_top_rad: float | None
+    scene: Scene,
+    camera: Camera,
+    rgb: np.ndarray,
+    returns: np.ndarray,
+    lidar_top_rad: float | None,
 ) -> np.ndarray:
     """Pixels of the view that surely show sky, bool [H, W]; none where nothing can be known.
 
-    scene: as initialised from LiDAR. rgb: uint8 [H, W, 3], the recorded image. lidar_top_rad: see
-    the function of that name.
+    scene: as initialised from LiDAR. rgb: uint8 [H, W, 3], the recorded image. returns:
+    int [M], flat indices of pixels with a LiDAR return. lidar_top_rad: see the function of that
+    name.
     """
     none = np.zeros((camera.height, camera.width), np.bool_)
     if lidar_top_rad is None:
         return none
     alpha = rasterize(scene.parts_for(camera), camera, buffers=(ALPHA,)).alpha
     assert alpha is not None
-    free = _above_surfaces(camera, alpha.numpy() > _DRAWN_ALPHA, lidar_top_rad)
+    drawn = alpha.numpy() > _DRAWN_ALPHA
+    drawn.reshape(-1)[returns] = True  # thin things that are not in the scene: wires, twigs
+    free = _above_surfaces(camera, drawn, lidar_top_rad)
     return free & looks_like_sky(rgb, free)
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from adapters.recorded.depth_priors import DepthPriors, DepthSource
+from adapters.recorded.depth_priors import DepthPriors, DepthSource, ReferenceDepth
 from adapters.recorded.holdout import holdout_step, is_held_out
 from adapters.recorded.images import ImageFault, Images
 from adapters.recorded.sky_masks import lidar_top_rad, sky_mask
@@ -35,6 +35,7 @@ def recorded_views(
     holdout: str = "none",
     cache_bytes: int = CACHE_BYTES,
     depth: DepthPriors = DepthPriors(),  # noqa: B008 - frozen, so sharing it is safe
+    reference_depth: ReferenceDepth | None = None,
     masks_dir: Path | None = None,
     mask_ego: bool = False,
 ) -> RecordedViews:
@@ -44,7 +45,8 @@ def recorded_views(
     training resolution over recorded resolution, in (0, 1]. cameras: names, all by default.
     holdout: "none" or "every-Nth": of the scene's frames the last of every N is held out.
     cache_bytes: memory for decoded images, and half as much for depth priors; what does not fit is
-    read again. masks_dir: DIR/<camera>.png, white where the image shows the recording car.
+    read again. reference_depth: what relative depth maps are brought to metres by where there is no
+    LiDAR. masks_dir: DIR/<camera>.png, white where the image shows the recording car.
     mask_ego: do not learn from pixels that show the recording car.
 
     Every image is decoded once here. Unusable ones are left out and named in `problems`.
@@ -61,6 +63,7 @@ def recorded_views(
         holdout=holdout,
         cache_bytes=cache_bytes,
         depth=depth,
+        reference_depth=reference_depth,
         masks_dir=masks_dir,
         mask_ego=mask_ego,
     )
@@ -78,6 +81,7 @@ class RecordedViews:
         holdout: str,
         cache_bytes: int,
         depth: DepthPriors,
+        reference_depth: ReferenceDepth | None,
         masks_dir: Path | None,
         mask_ego: bool,
     ) -> None:
@@ -91,7 +95,13 @@ class RecordedViews:
         self._train = tuple(k for k, t in zip(self._cameras, is_test, strict=True) if not t)
         self._test = tuple(k for k, t in zip(self._cameras, is_test, strict=True) if t)
         self._check_split(holdout)
-        self._depth = DepthSource(scene, self._cameras, depth, cache_bytes=cache_bytes // 2)
+        self._depth = DepthSource(
+            scene,
+            self._cameras,
+            depth,
+            cache_bytes=cache_bytes // 2,
+            reference=reference_depth,
+        )
         self._lidar_top_rad = self._measure_lidar_top()
         self._skies: dict[ViewKey, np.ndarray] = {}  # one bit a pixel
         self._weights: dict[str, np.ndarray] = {}
@@ -139,12 +149,13 @@ class RecordedViews:
         camera = self.camera(key)
         with self._lock:
             rgb = self._images.load(key)
-            prior = self._depth.load(key)
+            sky = self._sky(key, camera, rgb)
+            prior = self._depth.load(key, sky)
             return RecordedView(
                 camera=camera,
                 rgb=rgb,
                 weight=self._weight(camera),
-                sky=self._sky(key, camera, rgb),
+                sky=sky,
                 depth_pixels=prior.pixels,
                 depth_m=prior.depth_m,
                 depth_weight=prior.weight,
@@ -160,7 +171,8 @@ class RecordedViews:
     def _sky(self, key: ViewKey, camera: Camera, rgb: np.ndarray) -> np.ndarray:
         packed = self._skies.get(key)
         if packed is None:
-            mask = sky_mask(self._scene, camera, rgb, self._lidar_top_rad)
+            returns = self._depth.lidar(key).pixels
+            mask = sky_mask(self._scene, camera, rgb, returns, self._lidar_top_rad)
             self._skies[key] = np.packbits(mask)
             return mask
         count = camera.height * camera.width

@@ -132,9 +132,7 @@ def test_no_usable_image_says_what_to_do(scene):
     for frame in scene.frames:
         for path in frame.image_paths.values():
             os.truncate(path, 10)
-    with pytest.raises(
-        AdapterError, match=r"no usable recorded image.*First: camera front"
-    ):
+    with pytest.raises(AdapterError, match=r"no usable recorded image.*First: camera front"):
         recorded_views(scene, scale=0.5)
 
 
