@@ -18,20 +18,31 @@ from augment.render.cpu_color import write_basis
 from augment.render.cpu_geometry import from_eye
 from augment.render.cpu_jit import inner, kernel
 from augment.render.cpu_layout import BLOCK, LANES, V_FOCAL, V_ROTATION, U
-from augment.render.cpu_math import floats_at
-from augment.render.cpu_project_backward import G_ABS, G_COLOR, G_RADIUS, GRAD
+from augment.render.cpu_math import LOG2_E, exp2_fine, floats_at
+from augment.render.cpu_project_backward import (
+    G_ABS,
+    G_COLOR,
+    G_OPACITY,
+    G_QUAT,
+    G_RADIUS,
+    G_SCALE,
+    GRAD,
+)
 
-# Step sizes and other numbers of an update, float32 each.
-R_MEANS, R_QUATS, R_SCALES, R_OPACITIES, R_SH_DC, R_SH_REST = range(6)
-R_BETA1, R_BETA2, R_OPACITY_DECAY, R_SCALE_DECAY, R_SMALLEST, R_LARGEST = range(6, 12)
-R_ABS_UNIT, R_RADIUS_UNIT = 12, 13  # what turns 1/px and px into the units of Splats.grads
-RATES = 14
+# Numbers of an update, float32: step sizes of a row's first 16 columns as GRAD lists them (negative
+# for opacity, whose odds are divided), of the SH, and the rest.
+R_ROW, R_SH_DC, R_SH_REST, R_BETA1, R_BETA2 = 0, 16, 17, 18, 19
+R_OPACITY_DECAY, R_SCALE_DECAY, R_SMALLEST, R_LARGEST = 20, 21, 22, 23
+R_ABS_UNIT, R_RADIUS_UNIT = 24, 25  # what turns 1/px and px into the units of Splats.grads
+RATES = 26
 
 CORRECTED = 10_000  # updates after which Adam's bias is taken as gone
 
 _EPS = np.float32(1e-15)
 _FAINTEST, _FULLEST = np.float32(1e-4), np.float32(0.9995)
 _FUNCTIONS = 16
+_ROWS = 1024
+_WORK = 48  # room for a splat's SH: gradients, moments, steps
 
 
 def bias_corrections(beta1: float, beta2: float) -> np.ndarray:
@@ -66,8 +77,8 @@ def update_splats(
     addresses, sizes, views, blocks: as in cpu_project; the splats are changed in place. firsts:
     int64 [P], index of each part's first splat in the arrays of moments. rows, ids, counts: what
     cpu_project_backward wrote. functions: SH functions that are learnt by now. rates: float32
-    [RATES]. corrections: as `bias_corrections` gives them, flat. geometry_m to grads: flat arrays of
-    `Splats`.
+    [RATES]. corrections: as `bias_corrections` gives them, flat. geometry_m to grads: flat arrays
+    of `Splats`.
     """
     for block in prange(blocks.shape[0]):
         part = blocks[block, 0]
@@ -79,8 +90,7 @@ def update_splats(
         sh = floats_at(addresses[part, 4], count * total * 3)
         view = views[part]
         basis = np.empty((_FUNCTIONS + 2) * LANES, np.float32)
-        g = np.empty(_FUNCTIONS * 3, np.float32)
-        step = np.empty(_FUNCTIONS * 3, np.float32)
+        work = np.zeros(4 * _WORK, np.float32)
         base = U(block * BLOCK)
         for at in range(U(0), U(counts[block]), U(LANES)):
             _write_bases(means, ids, base + at, U(counts[block]) - at, view, functions, basis)
@@ -93,22 +103,25 @@ def update_splats(
                 grads[U(3) * one + U(1)] += np.float32(1)
                 radius = rows[row + U(G_RADIUS)] * rates[R_RADIUS_UNIT]
                 grads[U(3) * one + U(2)] = max(grads[U(3) * one + U(2)], radius)
-                if math.isfinite(_row_sum(rows, row)):
-                    _update_geometry(
-                        means, quats, scales, opacities, splat, rows, row,
-                        basis[U(_FUNCTIONS * LANES) + lane], rates, corrections, age[one],
-                        geometry_m, geometry_v, one * U(GEOMETRY), g, step,
-                    )  # fmt: skip
-                    _update_sh(
-                        sh, U(total), splat, rows, row, basis, lane, U(functions), rates,
-                        corrections, age[one], sh_m, sh_v, one * U(total) * U(3), g, step,
-                    )  # fmt: skip
+                if not math.isfinite(_row_sum(rows, row)):
+                    continue
+                n = U(min(age[one], CORRECTED))
+                first, second = corrections[U(2) * n], corrections[U(2) * n + U(1)]
+                _update_geometry(
+                    means, quats, scales, opacities, splat, rows, row,
+                    basis[U(_FUNCTIONS * LANES) + lane], rates, first, second,
+                    geometry_m, geometry_v, one * U(GEOMETRY), work,
+                )  # fmt: skip
+                _update_sh(
+                    sh, U(total), splat, rows, row, basis, lane, U(functions), rates, first,
+                    second, sh_m, sh_v, one * U(total) * U(3), work,
+                )  # fmt: skip
 
 
 @inner()
 def _row_sum(rows, row):
     total = np.float32(0)
-    for i in range(U(G_ABS)):
+    for i in range(U(GRAD)):
         total += rows[row + i]
     return total
 
@@ -129,78 +142,100 @@ def _write_bases(means, ids, at, left, view, functions, basis):
 
 
 @inner()
-def _adam(g, count, rates, corrections, age, m, v, at, step):
-    """Moments brought up to date; step: what Adam takes a learning rate's multiple of."""
+def _adam8(g, rates, first, second, m, m_at, v, v_at):
+    """Eight moments brought up to date; returns what a step size is multiplied with."""
+    one = np.float32(1)
     beta1, beta2 = rates[R_BETA1], rates[R_BETA2]
-    rest1, rest2 = np.float32(1) - beta1, np.float32(1) - beta2
-    n = U(min(age, CORRECTED))
-    correct1, correct2 = corrections[U(2) * n], corrections[U(2) * n + U(1)]
-    for i in range(count):
-        first = beta1 * m[at + i] + rest1 * g[i]
-        second = beta2 * v[at + i] + rest2 * g[i] * g[i]
-        m[at + i] = first
-        v[at + i] = second
-        step[i] = first * correct1 / (np.float32(math.sqrt(second * correct2)) + _EPS)
+    new_m = v8.fmuladd(v8.splat(beta1), v8.load(m, m_at), v8.splat(one - beta1) * g)
+    new_v = v8.fmuladd(v8.splat(beta2), v8.load(v, v_at), v8.splat(one - beta2) * g * g)
+    v8.store(m, m_at, new_m)
+    v8.store(v, v_at, new_v)
+    root = v8.sqrt(new_v * v8.splat(second)) + v8.splat(_EPS)
+    return new_m * v8.splat(first) / root
 
 
 @inner()
 def _update_geometry(
-    means,
-    quats,
-    scales,
-    opacities,
-    splat,
-    rows,
-    row,
-    pixel_m,
-    rates,
-    corrections,
-    age,
-    m,
-    v,
-    at,
-    g,
-    step,
-):
-    o = min(max(opacities[splat], _FAINTEST), _FULLEST)
+    means, quats, scales, opacities, splat, rows, row, pixel_m, rates, first, second, m, v, at,
+    work,
+):  # fmt: skip
     one = np.float32(1)
-    for i in range(U(GEOMETRY)):
-        g[i] = rows[row + i]
+    o = min(max(opacities[splat], _FAINTEST), _FULLEST)
     for i in range(U(3)):
-        g[U(7) + i] += rates[R_SCALE_DECAY] * scales[U(3) * splat + i]
-    g[U(10)] = g[U(10)] * (one - o) + rates[R_OPACITY_DECAY] * o * (one - o)
-    _adam(g, U(GEOMETRY), rates, corrections, age, m, v, at, step)
+        rows[row + U(G_SCALE) + i] += rates[R_SCALE_DECAY] * scales[U(3) * splat + i]
+    slope = rows[row + U(G_OPACITY)] + rates[R_OPACITY_DECAY] * o
+    rows[row + U(G_OPACITY)] = slope * (one - o)
+    low = _adam8(v8.load(rows, row), rates, first, second, m, at, v, at)
+    v8.store(work, U(0), low * v8.load(rates, U(R_ROW)))
+    high = _adam8(v8.load(rows, row + U(8)), rates, first, second, m, at + U(8), v, at + U(8))
+    factors = exp2_fine(v8.splat(-LOG2_E) * high * v8.load(rates, U(R_ROW + 8)))
+    v8.store(work, U(8), factors)
     for i in range(U(3)):
-        means[U(3) * splat + i] -= rates[R_MEANS] * pixel_m * step[i]
+        means[U(3) * splat + i] -= pixel_m * work[i]
     norm = np.float32(0)
     for i in range(U(4)):
-        q = quats[U(4) * splat + i] - rates[R_QUATS] * step[U(3) + i]
+        q = quats[U(4) * splat + i] - work[U(G_QUAT) + i]
         quats[U(4) * splat + i] = q
         norm += q * q
     norm = one / np.float32(math.sqrt(norm))
     for i in range(U(4)):
         quats[U(4) * splat + i] *= norm
     for i in range(U(3)):
-        factor = np.float32(math.exp(-rates[R_SCALES] * step[U(7) + i]))
-        s = scales[U(3) * splat + i] * factor
+        s = scales[U(3) * splat + i] * work[U(G_SCALE) + i]
         scales[U(3) * splat + i] = min(max(s, rates[R_SMALLEST]), rates[R_LARGEST])
-    odds = (one - o) / o * np.float32(math.exp(rates[R_OPACITIES] * step[U(10)]))
+    odds = (one - o) / o * work[U(G_OPACITY)]
     opacities[splat] = min(max(one / (one + odds), _FAINTEST), _FULLEST)
 
 
 @inner()
 def _update_sh(
-    sh, total, splat, rows, row, basis, lane, functions, rates, corrections, age, m, v, at, g, step
-):  # fmt: skip
+    sh, total, splat, rows, row, basis, lane, functions, rates, first, second, m, v, at, work
+):
     red, green = rows[row + U(G_COLOR)], rows[row + U(G_COLOR + 1)]
     blue = rows[row + U(G_COLOR + 2)]
+    count = U(3) * functions
+    # A copy of its own, since eight at a time would reach into the next splat's moments.
     for k in range(functions):
         value = basis[k * U(LANES) + lane]
-        g[U(3) * k] = value * red
-        g[U(3) * k + U(1)] = value * green
-        g[U(3) * k + U(2)] = value * blue
-    _adam(g, functions * U(3), rates, corrections, age, m, v, at, step)
-    first = splat * total * U(3)
-    for i in range(functions * U(3)):
-        rate = rates[R_SH_DC] if i < U(3) else rates[R_SH_REST]
-        sh[first + i] -= rate * step[i]
+        work[U(3) * k] = value * red
+        work[U(3) * k + U(1)] = value * green
+        work[U(3) * k + U(2)] = value * blue
+    for i in range(count):
+        work[U(_WORK) + i] = m[at + i]
+        work[U(2 * _WORK) + i] = v[at + i]
+    for i in range(U(0), count, U(LANES)):
+        steps = _adam8(
+            v8.load(work, i), rates, first, second, work, U(_WORK) + i, work, U(2 * _WORK) + i
+        )
+        v8.store(work, U(3 * _WORK) + i, steps)
+    for i in range(count):
+        m[at + i] = work[U(_WORK) + i]
+        v[at + i] = work[U(2 * _WORK) + i]
+    start = splat * total * U(3)
+    for i in range(U(3)):
+        sh[start + i] -= rates[R_SH_DC] * work[U(3 * _WORK) + i]
+    for i in range(U(3), count):
+        sh[start + i] -= rates[R_SH_REST] * work[U(3 * _WORK) + i]
+
+
+@kernel
+def update_rows(values, m, v, age, rows, grads, rate, betas, corrections):
+    """One step of Adam for rows of three numbers, each row once; values stay within [0, 1].
+
+    values, m, v: float32 [N * 3]. age: int32 [N]. rows: int32 [T]. grads: float32 [T, 3]. betas:
+    float32 [2]. corrections: as for `update_splats`.
+    """
+    for run in prange((rows.size + _ROWS - 1) // _ROWS):
+        one = np.float32(1)
+        for i in range(U(run * _ROWS), U(min((run + 1) * _ROWS, rows.size))):
+            row = U(rows[i])
+            age[row] += 1
+            n = U(min(age[row], CORRECTED))
+            first, second = corrections[U(2) * n], corrections[U(2) * n + U(1)]
+            for channel in range(U(3)):
+                at = U(3) * row + channel
+                g = grads[i, channel]
+                m[at] = betas[0] * m[at] + (one - betas[0]) * g
+                v[at] = betas[1] * v[at] + (one - betas[1]) * g * g
+                root = np.float32(math.sqrt(v[at] * second)) + _EPS
+                values[at] = min(max(values[at] - rate * first * m[at] / root, np.float32(0)), one)

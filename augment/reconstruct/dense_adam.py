@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-_BETA1, _BETA2, _EPS = 0.9, 0.999, 1e-15
+from augment.reconstruct.adam_kernels import update_rows
+from augment.reconstruct.rates import BETA1, BETA2, CORRECTIONS
+from augment.render.threads import kernel_threads
+
+_EPS = 1e-15
 
 
 class DenseAdam:
@@ -18,11 +22,11 @@ class DenseAdam:
 
     def update(self, gradient: np.ndarray, rate: float) -> None:
         self._count += 1
-        self._m += (1 - _BETA1) * (gradient - self._m)
-        self._v += (1 - _BETA2) * (gradient * gradient - self._v)
+        self._m += (1 - BETA1) * (gradient - self._m)
+        self._v += (1 - BETA2) * (gradient * gradient - self._v)
         n = int(self._count[0])
-        first = self._m / (1 - _BETA1**n)
-        second = self._v / (1 - _BETA2**n)
+        first = self._m / (1 - BETA1**n)
+        second = self._v / (1 - BETA2**n)
         self._values -= (rate * first / (np.sqrt(second) + _EPS)).astype(np.float32)
 
     def arrays(self) -> dict[str, np.ndarray]:
@@ -33,8 +37,8 @@ class DenseAdam:
             array[:] = arrays[name]
 
 
-class SparseAdam:
-    """Adam on rows of a float32 array [N, C] in place, counting the updates of each row."""
+class ColorAdam:
+    """Adam on rows of a float32 array [N, 3] of colours in place, counting each row's updates."""
 
     def __init__(self, values: np.ndarray) -> None:
         self._values = values
@@ -43,15 +47,19 @@ class SparseAdam:
         self._count = np.zeros(len(values), np.int32)
 
     def update(self, rows: np.ndarray, gradient: np.ndarray, rate: float) -> None:
-        """rows: indices, each once. gradient: float32 [len(rows), C]."""
-        self._count[rows] += 1
-        n = self._count[rows].astype(np.float32)[:, None]
-        m = self._m[rows] + np.float32(1 - _BETA1) * (gradient - self._m[rows])
-        v = self._v[rows] + np.float32(1 - _BETA2) * (gradient * gradient - self._v[rows])
-        self._m[rows], self._v[rows] = m, v
-        first = m / (1 - np.float32(_BETA1) ** n)
-        second = v / (1 - np.float32(_BETA2) ** n)
-        self._values[rows] -= np.float32(rate) * first / (np.sqrt(second) + np.float32(_EPS))
+        """rows: int32 [T], each once. gradient: float32 [T, 3]. Colours stay within [0, 1]."""
+        with kernel_threads():
+            update_rows(
+                self._values.reshape(-1),
+                self._m.reshape(-1),
+                self._v.reshape(-1),
+                self._count,
+                rows,
+                gradient,
+                np.float32(rate),
+                np.array([BETA1, BETA2], np.float32),
+                CORRECTIONS.reshape(-1),
+            )
 
     def arrays(self) -> dict[str, np.ndarray]:
         return {"m": self._m, "v": self._v, "count": self._count}

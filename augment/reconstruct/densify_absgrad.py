@@ -17,7 +17,7 @@ from augment.reconstruct.densify_report import DensifyReport
 from augment.reconstruct.splat_rows import check_some_usable, rebuild, rest, rotate, usable
 from augment.reconstruct.splats import Splats
 
-GRADIENT_FLOOR = 2e-4  # a quarter of gsplat's threshold for the same measure: the budget decides
+GRADIENT_FLOOR = 1e-4  # an eighth of gsplat's threshold for the same measure: the budget decides
 SPLIT_RADIUS = 0.004  # one sigma, of the image's larger side: two pixels of 480
 SPLIT_SCALE = 0.01  # of the scene's extent, where no image has shown the splat
 SHRINK = 1.6

@@ -19,30 +19,20 @@ Departures, all shared by the reference:
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from augment.cameras import Camera
-from augment.reconstruct import loss_kernels, sky_kernels
+from augment.reconstruct import depth_kernels, loss_kernels, sky_kernels
 from augment.reconstruct.config import LossWeights
+from augment.reconstruct.loss_buffers import ImageBuffers, LossScratch, SkyGradient
+from augment.reconstruct.loss_reference import LEAST_ALPHA, LEAST_SKY
 from augment.reconstruct.view import RecordedView
 from augment.render.threads import kernel_threads
 
-LEAST_SKY = np.float32(1e-3)  # less of the sky shows 1/4 of an 8-bit step
-LEAST_ALPHA = np.float32(0.05)
 ROWS = 8  # image rows a thread takes at a time
 IDENTITY_MAP = np.eye(3, 4, dtype=np.float32)
-
-
-@dataclass(frozen=True, eq=False)
-class SkyGradient:
-    """Gradient of the texels that were seen. texels: int32 [T], increasing indices into
-    faces.reshape(-1, 3); grads: float32 [T, 3].
-    """
-
-    texels: np.ndarray
-    grads: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,80 +59,6 @@ class ViewLoss:
     d_sky: SkyGradient | None
 
 
-@dataclass(eq=False)
-class LossScratch:
-    """Buffers that calls of `view_loss` share, to allocate nothing. Gradients returned by a call
-    with it lie in it: they hold until the next call. Not for two threads at once.
-    """
-
-    _images: dict[tuple[int, int], _ImageBuffers] = field(default_factory=dict)
-    _skies: dict[int, _SkyBuffers] = field(default_factory=dict)
-
-    def image(self, height: int, width: int) -> _ImageBuffers:
-        key = (height, width)
-        if key not in self._images:
-            self._images[key] = _ImageBuffers(height, width)
-        return self._images[key]
-
-    def sky(self, size: int) -> _SkyBuffers:
-        """Sums that are zero, whatever became of the call before."""
-        if size not in self._skies:
-            self._skies[size] = _SkyBuffers(size)
-        return self._skies[size]
-
-
-class _ImageBuffers:
-    """What depends on the image's size; see the kernels for each buffer's meaning."""
-
-    def __init__(self, height: int, width: int) -> None:
-        lanes, pad = loss_kernels.LANES, loss_kernels.PAD
-        stride = -(-width // lanes) * lanes
-        padded = (height + 2 * pad) * stride
-        self.size = (height, width, stride)
-        self.sky_colors = np.zeros((3, height, stride), np.float32)
-        self.texels = np.empty((height, width), np.int32)
-        self.fractions = np.empty((2, height, width), np.float32)
-        self.pairs = np.zeros(6 * padded, np.float32)  # their margins stay zero
-        self.slopes = np.zeros(9 * padded, np.float32)
-        self.weights = np.empty(height * stride, np.float32)
-        self.sums = np.empty((height, 3))
-        self.ssim_sums = np.empty(height)
-        self.map_sums = np.empty((height, 12))
-        self.d_rgb = np.empty((height, width, 3), np.float32)
-        self.d_alpha = np.empty((height, width), np.float32)
-        self.d_expected_depth = np.empty((height, width), np.float32)
-
-
-class _SkyBuffers:
-    """Sums over a cube map of faces `size` wide, zero between two calls."""
-
-    def __init__(self, size: int) -> None:
-        self.size = size
-        texels = 6 * size * size
-        slots = -(-texels // 8) * 8
-        self.parts = np.zeros((sky_kernels.PARTS, texels, 3), np.float32)
-        self.touched = np.zeros((sky_kernels.PARTS, slots), np.uint8)
-        self.texels = np.empty(texels, np.int32)
-        self.grads = np.empty((texels, 3), np.float32)
-        self.is_clean = True
-
-    def gradient(
-        self, d_rgb: np.ndarray, alpha: np.ndarray, image: _ImageBuffers
-    ) -> SkyGradient | None:
-        if not self.is_clean:  # a call was interrupted between the two kernels
-            self.parts.fill(0)
-            self.touched.fill(0)
-        self.is_clean = False
-        with kernel_threads():
-            sky_kernels.scatter_sky(
-                d_rgb, alpha, image.texels, image.fractions, self.size, self.parts, self.touched
-            )
-        words = self.touched.view(np.uint64)
-        count = sky_kernels.gather_sky(self.parts, self.touched, words, self.texels, self.grads)
-        self.is_clean = True
-        return SkyGradient(self.texels[:count], self.grads[:count]) if count else None
-
-
 def picture(
     rgb: np.ndarray,
     alpha: np.ndarray,
@@ -156,7 +72,7 @@ def picture(
     looked up.
     """
     rgb, alpha, sky_faces, color_map = _checked(rgb, alpha, camera, sky_faces, color_map)
-    buffers = _ImageBuffers(camera.height, camera.width)
+    buffers = ImageBuffers(camera.height, camera.width)
     out = np.empty_like(rgb)
     with kernel_threads(ROWS):
         _sample_sky(alpha, camera, sky_faces, np.float32(0), buffers)
@@ -200,7 +116,7 @@ def view_loss(
     scratch = scratch or LossScratch()
     buffers = scratch.image(camera.height, camera.width)
     with kernel_threads(ROWS):
-        _sample_sky(alpha, camera, sky_faces, LEAST_SKY, buffers)
+        _sample_sky(alpha, camera, sky_faces, np.float32(LEAST_SKY), buffers)
         l1, ssim, sky, d_color_map = _compare(rgb, alpha, view, color_map, weights, buffers)
     depth = _compare_depth(expected_depth, alpha, view, weights, buffers)
     d_sky = scratch.sky(sky_faces.shape[1]).gradient(buffers.d_rgb, alpha, buffers)
@@ -225,7 +141,7 @@ def _sample_sky(
     camera: Camera,
     sky_faces: np.ndarray,
     least: np.float32,
-    buffers: _ImageBuffers,
+    buffers: ImageBuffers,
 ) -> None:
     rotation = camera.camera_from_world[:3, :3].numpy().T.astype(np.float32, order="C")
     intrinsics = np.array([1 / camera.fx, 1 / camera.fy, camera.cx, camera.cy], np.float32)
@@ -247,21 +163,29 @@ def _compare(
     view: RecordedView,
     color_map: np.ndarray,
     weights: LossWeights,
-    buffers: _ImageBuffers,
+    buffers: ImageBuffers,
 ) -> tuple[float, float, float, np.ndarray]:
     """L1, SSIM, alpha in the sky, and the colour map's gradient; the others go to the buffers."""
     size = buffers.size
     pixels = size[0] * size[1]
-    rendered = (
-        rgb.reshape(-1),
-        alpha.reshape(-1),
-        buffers.sky_colors.reshape(-1),
-        color_map.reshape(-1),
-    )
+    sky, mapping = buffers.sky_colors.reshape(-1), color_map.reshape(-1)
     recorded = _writeable(view.rgb).reshape(-1)
     weight, is_sky = _writeable(view.weight).reshape(-1), _writeable(view.sky).reshape(-1)
     pairs, slopes, kept = buffers.pairs, buffers.slopes, buffers.weights
-    loss_kernels.compare(*rendered, recorded, weight, is_sky, size, pairs, kept, buffers.sums)
+    loss_kernels.compare(
+        rgb.reshape(-1),
+        alpha.reshape(-1),
+        sky,
+        mapping,
+        recorded,
+        weight,
+        is_sky,
+        size,
+        buffers.behind,
+        pairs,
+        kept,
+        buffers.sums,
+    )
     error_sum, weight_sum, covered = buffers.sums.sum(axis=0).tolist()
     count = 3 * weight_sum
     ssim, ssim_factor = 1.0, 0.0
@@ -271,8 +195,10 @@ def _compare(
     per_weight = 1 / count if count > 0 else 0.0
     factors = ((1 - weights.d_ssim) * per_weight, ssim_factor, weights.sky / pixels)
     loss_kernels.differentiate(
-        *rendered,
+        sky,
+        mapping,
         is_sky,
+        buffers.behind,
         pairs,
         slopes,
         kept,
@@ -282,7 +208,7 @@ def _compare(
         buffers.d_alpha.reshape(-1),
         buffers.map_sums,
     )
-    d_color_map = buffers.map_sums.sum(axis=0).reshape(3, 4)
+    d_color_map = buffers.map_sums.sum(axis=0)
     return error_sum * per_weight, ssim, covered / pixels, d_color_map
 
 
@@ -291,23 +217,23 @@ def _compare_depth(
     alpha: np.ndarray,
     view: RecordedView,
     weights: LossWeights,
-    buffers: _ImageBuffers,
+    buffers: ImageBuffers,
 ) -> float:
     """Mean |1/ED - 1/z| in 1/m; its gradient goes to the buffers."""
     buffers.d_expected_depth.fill(0)
     weight_sum = float(view.depth_weight.sum(dtype=np.float64))
     if weight_sum <= 0 or weights.depth == 0:
         return 0.0
-    sums = np.empty(-(-len(view.depth_pixels) // loss_kernels.CHUNK))
+    sums = np.empty(-(-len(view.depth_pixels) // depth_kernels.CHUNK))
     with kernel_threads():
-        loss_kernels.compare_depth(
+        depth_kernels.compare_depth(
             expected_depth.reshape(-1),
             alpha.reshape(-1),
             _writeable(view.depth_pixels),
             _writeable(view.depth_m),
             _writeable(view.depth_weight),
             np.float32(weights.depth / weight_sum),
-            LEAST_ALPHA,
+            np.float32(LEAST_ALPHA),
             buffers.d_expected_depth.reshape(-1),
             sums,
         )

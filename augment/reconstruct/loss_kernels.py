@@ -36,8 +36,6 @@ _BELL = [math.exp(-(k**2) / (2 * SIGMA**2)) for k in range(PAD + 1)]
 _AREA = _BELL[0] + 2 * sum(_BELL[1:])
 W0, W1, W2, W3, W4, W5 = (np.float32(value / _AREA) for value in _BELL)
 
-CHUNK = 4096  # depth priors summed at a time
-
 
 @inner()
 def _blur_row(row, at):
@@ -103,26 +101,36 @@ def _column_moments(plane, at, stride, rows, first_at, second_at):
 
 
 @inner()
-def _mapped(rows, at, stride, color_map, channel):
-    """One channel of the colour map, of three rows of composited colour."""
-    entry = U(4 * channel)
-    value = v8.fmuladd(
-        v8.load(rows, at), v8.splat(color_map[entry]), v8.splat(color_map[entry + U(3)])
-    )
-    value = v8.fmuladd(v8.load(rows, at + stride), v8.splat(color_map[entry + U(1)]), value)
-    return v8.fmuladd(v8.load(rows, at + stride + stride), v8.splat(color_map[entry + U(2)]), value)
+def _composite_row(rgb, alpha, sky, row, size, rows, out, first, plane):
+    """rgb + (1 - alpha) sky of one image row, into three planes of `out` from `first` on.
+
+    rows: work space of four rows, zero beyond the image's width.
+    """
+    height, width, stride = U(size[0]), U(size[1]), U(size[2])
+    for j in range(U(0), width):
+        at = row * width + j
+        rows[j] = rgb[at * U(3)]
+        rows[stride + j] = rgb[at * U(3) + U(1)]
+        rows[U(2) * stride + j] = rgb[at * U(3) + U(2)]
+        rows[U(3) * stride + j] = alpha[at]
+    one = v8.splat(np.float32(1))
+    for j in range(U(0), stride, U(LANES)):
+        through = one - v8.load(rows, U(3) * stride + j)
+        for c in range(U(0), U(3)):
+            behind = v8.load(sky, (c * height + row) * stride + j)
+            value = v8.fmuladd(through, behind, v8.load(rows, c * stride + j))
+            v8.store(out, first + c * plane + j, value)
 
 
 @inner()
-def _composite_row(rgb, alpha, sky, row, size, rows):
-    """rgb + (1 - alpha) sky of one image row, into the first three of `rows`."""
-    height, width, stride = U(size[0]), U(size[1]), U(size[2])
-    one = np.float32(1)
-    for j in range(U(0), width):
-        through = one - alpha[row * width + j]
-        for c in range(U(0), U(3)):
-            behind = sky[(c * height + row) * stride + j]
-            rows[c * stride + j] = rgb[(row * width + j) * U(3) + c] + through * behind
+def _mapped(planes, at, plane, color_map, channel):
+    """One channel of the colour map, of three planes of composited colour."""
+    entry = U(4) * channel
+    value = v8.fmuladd(
+        v8.load(planes, at), v8.splat(color_map[entry]), v8.splat(color_map[entry + U(3)])
+    )
+    value = v8.fmuladd(v8.load(planes, at + plane), v8.splat(color_map[entry + U(1)]), value)
+    return v8.fmuladd(v8.load(planes, at + plane + plane), v8.splat(color_map[entry + U(2)]), value)
 
 
 @kernel
@@ -134,54 +142,60 @@ def finish_picture(rgb, alpha, sky, color_map, size, out):
     """
     width, stride = U(size[1]), U(size[2])
     for i in prange(size[0]):
-        rows = np.zeros(6 * size[2], np.float32)
-        _composite_row(rgb, alpha, sky, U(i), size, rows)
+        rows = np.zeros(7 * size[2], np.float32)
+        _composite_row(rgb, alpha, sky, U(i), size, rows, rows, U(4) * stride, stride)
         for j in range(U(0), stride, U(LANES)):
-            for c in range(3):
-                v8.store(rows, U(3 + c) * stride + j, _mapped(rows, j, stride, color_map, c))
+            for c in range(U(0), U(3)):
+                value = _mapped(rows, U(4) * stride + j, stride, color_map, c)
+                v8.store(rows, c * stride + j, value)
         for j in range(U(0), width):
             for c in range(U(0), U(3)):
-                out[(U(i) * width + j) * U(3) + c] = rows[(U(3) + c) * stride + j]
+                out[(U(i) * width + j) * U(3) + c] = rows[c * stride + j]
 
 
 @kernel
-def compare(rgb, alpha, sky, color_map, recorded, weight, is_sky, size, pairs, weights, sums):
+def compare(
+    rgb, alpha, sky, color_map, recorded, weight, is_sky, size, behind, pairs, weights, sums
+):
     """x + y and x - y of the finished and the recorded picture, and the sums of the L1 loss.
 
     recorded: flat uint8 [H, W, 3]. weight, is_sky: flat [H, W]; the rest as `finish_picture`.
-    Written: pairs, six flat planes [H + 2 PAD, stride], red, green, blue of x + y, then of x - y;
-    weights, a flat plane [H, stride]; sums, float64 [H, 3]: of weight |x - y|, of weight, and of
-    alpha in the sky. Where the weight is 0, y is x.
+    Written: behind, the composited colour, flat planes [3, H, stride]; pairs, six flat planes
+    [H + 2 PAD, stride], red, green, blue of x + y, then of x - y; weights, a flat plane [H,
+    stride]; sums, float64 [H, 3]: of weight |x - y|, of weight, and of alpha in the sky. Where the
+    weight is 0, y is x.
     """
-    width, stride = U(size[1]), U(size[2])
+    height, width, stride = U(size[0]), U(size[1]), U(size[2])
     plane = U(size[0] + 2 * PAD) * stride
-    to_unit = np.float32(1 / 255)
+    to_unit = v8.splat(np.float32(1 / 255))
     for i in prange(size[0]):
         row = U(i)
-        rows = np.zeros(6 * size[2], np.float32)
-        _composite_row(rgb, alpha, sky, row, size, rows)
+        own = row * stride
+        rows = np.zeros(U(4) * stride, np.float32)
+        _composite_row(rgb, alpha, sky, row, size, rows, behind, own, height * stride)
         covered = 0.0
         for j in range(U(0), width):
             at = row * width + j
-            weights[row * stride + j] = weight[at]
+            weights[own + j] = weight[at]
             if is_sky[at]:
                 covered += alpha[at]
-            for c in range(U(0), U(3)):
-                rows[(U(3) + c) * stride + j] = np.float32(recorded[at * U(3) + c]) * to_unit
+            rows[j] = np.float32(recorded[at * U(3)])
+            rows[stride + j] = np.float32(recorded[at * U(3) + U(1)])
+            rows[U(2) * stride + j] = np.float32(recorded[at * U(3) + U(2)])
         for j in range(width, stride):
-            weights[row * stride + j] = np.float32(0)
+            weights[own + j] = np.float32(0)
         zero = v8.splat(np.float32(0))
         error, weight_sum = zero, zero
         first = (row + U(PAD)) * stride
         for j in range(U(0), stride, U(LANES)):
-            w = v8.load(weights, row * stride + j)
+            w = v8.load(weights, own + j)
             is_used = v8.greater(w, zero)
             weight_sum = weight_sum + w
-            for c in range(3):
-                x = _mapped(rows, j, stride, color_map, c)
-                y = v8.select(is_used, v8.load(rows, U(3 + c) * stride + j), x)
-                v8.store(pairs, U(c) * plane + first + j, x + y)
-                v8.store(pairs, U(3 + c) * plane + first + j, x - y)
+            for c in range(U(0), U(3)):
+                x = _mapped(behind, own + j, height * stride, color_map, c)
+                y = v8.select(is_used, v8.load(rows, c * stride + j) * to_unit, x)
+                v8.store(pairs, c * plane + first + j, x + y)
+                v8.store(pairs, (U(3) + c) * plane + first + j, x - y)
                 error = v8.fmuladd(v8.absolute(x - y), w, error)
         for c in range(U(0), U(6)):  # beyond the image both are zero, as the window's padding is
             for j in range(width, stride):
@@ -243,7 +257,7 @@ def compare_windows(pairs, weights, size, slopes, sums):
 
 @inner()
 def _picture_slopes(pairs, slopes, weights, row, size, factors, work, rows):
-    """The loss's derivatives by the finished picture, one image row, into rows 3 to 5 of `rows`."""
+    """The loss's derivatives by the finished picture, one image row, into three rows."""
     stride = U(size[2])
     plane = U(size[0] + 2 * PAD) * stride
     length = stride + U(2 * MARGIN)
@@ -264,96 +278,69 @@ def _picture_slopes(pairs, slopes, weights, row, size, factors, work, rows):
             sign = v8.select(v8.greater(minus, zero), one, zero)
             sign = v8.select(v8.greater(zero, minus), v8.negate(one), sign)
             slope = v8.fmuladd(slope, v8.splat(factors[1]), sign * w * v8.splat(factors[0]))
-            v8.store(rows, (U(3) + c) * stride + j, v8.select(v8.greater(w, zero), slope, zero))
+            v8.store(rows, c * stride + j, v8.select(v8.greater(w, zero), slope, zero))
+
+
+@inner()
+def _map_slopes(rows, channel, behind, own, plane, stride, out):
+    """The row's part of the derivative by one channel of the colour map, into out[0 to 3]."""
+    zero = v8.splat(np.float32(0))
+    red, green, blue, offset = zero, zero, zero, zero
+    for j in range(U(0), stride, U(LANES)):
+        slope = v8.load(rows, channel * stride + j)
+        at = own + j
+        red = v8.fmuladd(slope, v8.load(behind, at), red)
+        green = v8.fmuladd(slope, v8.load(behind, at + plane), green)
+        blue = v8.fmuladd(slope, v8.load(behind, at + plane + plane), blue)
+        offset = offset + slope
+    out[0], out[1], out[2], out[3] = (
+        v8.total(red),
+        v8.total(green),
+        v8.total(blue),
+        v8.total(offset),
+    )
 
 
 @inner()
 def _times_transposed(rows, at, stride, color_map, k):
-    """Derivative by one channel of the composited colour: rows 3 to 5 times the map's column k."""
-    value = v8.load(rows, at + U(3) * stride) * v8.splat(color_map[U(k)])
-    value = v8.fmuladd(v8.load(rows, at + U(4) * stride), v8.splat(color_map[U(4 + k)]), value)
-    return v8.fmuladd(v8.load(rows, at + U(5) * stride), v8.splat(color_map[U(8 + k)]), value)
-
-
-@inner()
-def _sum_products(rows, first, second, stride):
-    """Sum over a row of the product of two of `rows`."""
-    value = v8.splat(np.float32(0))
-    for j in range(U(0), stride, U(LANES)):
-        value = v8.fmuladd(
-            v8.load(rows, first * stride + j), v8.load(rows, second * stride + j), value
-        )
-    return v8.total(value)
-
-
-@inner()
-def _sum_row(rows, first, stride):
-    value = v8.splat(np.float32(0))
-    for j in range(U(0), stride, U(LANES)):
-        value = value + v8.load(rows, first * stride + j)
-    return v8.total(value)
+    """Derivative by channel k of the composited colour, from three rows of those by the picture."""
+    value = v8.load(rows, at) * v8.splat(color_map[k])
+    value = v8.fmuladd(v8.load(rows, at + stride), v8.splat(color_map[U(4) + k]), value)
+    return v8.fmuladd(v8.load(rows, at + stride + stride), v8.splat(color_map[U(8) + k]), value)
 
 
 @kernel
 def differentiate(
-    rgb, alpha, sky, color_map, is_sky, pairs, slopes, weights, size, factors, d_rgb, d_alpha, sums
+    sky, color_map, is_sky, behind, pairs, slopes, weights, size, factors, d_rgb, d_alpha, sums
 ):
     """The loss's derivatives by rgb, alpha and the colour map.
 
     factors: float32, of the L1 loss and of SSIM per unit of weight, and of alpha in the sky; the
     rest as in the kernels above. Written: d_rgb flat [H, W, 3], d_alpha flat [H, W]; sums, float64
-    [H, 12]: the row's part of the map's derivative.
+    [H, 3, 4]: the row's part of the map's derivative.
     """
     height, width, stride = U(size[0]), U(size[1]), U(size[2])
     length = stride + U(2 * MARGIN)
+    plane = height * stride
     for i in prange(size[0]):
         row = U(i)
-        rows = np.zeros(U(6) * stride, np.float32)  # composited colour, derivatives by picture
+        own = row * stride
+        rows = np.zeros(U(7) * stride, np.float32)
         work = np.zeros(U(3) * length, np.float32)
-        _composite_row(rgb, alpha, sky, row, size, rows)
         _picture_slopes(pairs, slopes, weights, row, size, factors, work, rows)
         for c in range(U(0), U(3)):
-            for k in range(U(0), U(3)):
-                sums[i, U(4) * c + k] = _sum_products(rows, U(3) + c, k, stride)
-            sums[i, U(4) * c + U(3)] = _sum_row(rows, U(3) + c, stride)
+            _map_slopes(rows, c, behind, own, plane, stride, sums[i, c])
         for j in range(U(0), stride, U(LANES)):
-            for k in range(3):
-                v8.store(rows, U(k) * stride + j, _times_transposed(rows, j, stride, color_map, k))
+            toward_sky = v8.splat(np.float32(0))
+            for k in range(U(0), U(3)):
+                slope = _times_transposed(rows, j, stride, color_map, k)
+                v8.store(rows, (U(3) + k) * stride + j, slope)
+                toward_sky = v8.fmuladd(slope, v8.load(sky, k * plane + own + j), toward_sky)
+            v8.store(rows, U(6) * stride + j, v8.negate(toward_sky))
         for j in range(U(0), width):
             at = row * width + j
-            slope = factors[2] if is_sky[at] else np.float32(0)
-            for c in range(U(0), U(3)):
-                value = rows[c * stride + j]
-                d_rgb[at * U(3) + c] = value
-                slope -= value * sky[(c * height + row) * stride + j]
-            d_alpha[at] = slope
-
-
-@kernel
-def compare_depth(expected, alpha, pixels, depth, weight, factor, least_alpha, d_expected, sums):
-    """Sum of weight |1/expected - 1/depth| over the priors, and its derivative.
-
-    expected, alpha, d_expected: flat [H, W]; d_expected must be 0 and gets factor times the
-    derivative. pixels, depth, weight: the priors. Pixels with alpha <= least_alpha count nothing.
-    sums: float64, one per CHUNK of priors; -1 where a pixel lies outside of the image or the order
-    does not increase.
-    """
-    one, zero = np.float32(1), np.float32(0)
-    for chunk in prange(sums.size):
-        total = 0.0
-        before = pixels[chunk * CHUNK - 1] if chunk else np.int32(-1)
-        for k in range(chunk * CHUNK, min((chunk + 1) * CHUNK, pixels.size)):
-            pixel = pixels[k]
-            if pixel <= before or pixel >= expected.size:
-                total = -1.0
-                break
-            before = pixel
-            value = expected[pixel]
-            if not (alpha[pixel] > least_alpha and value > zero and depth[k] > zero):
-                continue
-            inverse = one / value
-            error = inverse - one / depth[k]
-            total += weight[k] * abs(error)
-            slope = factor * weight[k] * inverse * inverse
-            d_expected[pixel] = -slope if error > zero else slope if error < zero else zero
-        sums[chunk] = total
+            d_rgb[at * U(3)] = rows[U(3) * stride + j]
+            d_rgb[at * U(3) + U(1)] = rows[U(4) * stride + j]
+            d_rgb[at * U(3) + U(2)] = rows[U(5) * stride + j]
+            slope = rows[U(6) * stride + j]
+            d_alpha[at] = slope + factors[2] if is_sky[at] else slope

@@ -16,7 +16,7 @@ from augment.sky import CubemapSky
 
 RADIUS, SIGMA = 5, 1.5
 C1, C2 = 0.01**2, 0.03**2
-LEAST_SKY = 1e-3
+LEAST_SKY = 1e-3  # less of the sky shows at most a quarter of an 8-bit step
 LEAST_ALPHA = 0.05
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from augment.cameras import Camera
 from augment.reconstruct import adam_kernels as kernels
 from augment.reconstruct.config import FitConfig
+from augment.render.cpu_project_backward import G_MEAN, G_OPACITY, G_QUAT, G_SCALE
 
 BETA1, BETA2 = 0.9, 0.999
 CORRECTIONS = kernels.bias_corrections(BETA1, BETA2)
@@ -22,10 +23,10 @@ def splat_rates(config: FitConfig, step: int, camera: Camera, extent_m: float) -
     done = min(1.0, step / max(config.steps, 1))
     late = rates.late**done
     values = np.zeros(kernels.RATES, np.float32)
-    values[kernels.R_MEANS] = rates.means * (rates.means_end / rates.means) ** done
-    values[kernels.R_QUATS] = rates.quats * late
-    values[kernels.R_SCALES] = rates.scales * late
-    values[kernels.R_OPACITIES] = rates.opacities * late
+    values[G_MEAN : G_MEAN + 3] = rates.means * (rates.means_end / rates.means) ** done
+    values[G_QUAT : G_QUAT + 4] = rates.quats * late
+    values[G_SCALE : G_SCALE + 3] = rates.scales * late
+    values[G_OPACITY] = -rates.opacities * late
     values[kernels.R_SH_DC] = rates.sh_dc * late
     values[kernels.R_SH_REST] = rates.sh_rest * late
     values[kernels.R_BETA1], values[kernels.R_BETA2] = BETA1, BETA2

@@ -10,7 +10,9 @@ import torch
 
 from augment.scene import SH_COUNTS, Gaussians
 
-GEOMETRY = 11  # columns of the geometry's moments: means 3, quats 4, log scales 3, opacity logit 1
+# Columns of the geometry's moments, two registers: means 3, quats 4, one unused, logarithms of
+# scales 3, logit of opacity 1, four unused.
+GEOMETRY = 16
 
 
 @dataclass(eq=False)

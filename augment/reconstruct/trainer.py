@@ -23,7 +23,7 @@ import torch
 from augment.cameras import Camera
 from augment.reconstruct.adam_kernels import update_splats
 from augment.reconstruct.config import FitConfig
-from augment.reconstruct.dense_adam import DenseAdam, SparseAdam
+from augment.reconstruct.dense_adam import ColorAdam, DenseAdam
 from augment.reconstruct.densify import densify, densify_due
 from augment.reconstruct.inputs import splat_inputs
 from augment.reconstruct.loss import ViewLoss, view_loss
@@ -71,7 +71,7 @@ class Trainer:
         parts = [scene.background, *(actor.gaussians for actor in scene.actors)]
         self.splats = Splats.of(parts, config.sh_degree)
         self.sky_faces = _sky_faces(scene)
-        self._sky_adam = SparseAdam(self.sky_faces.reshape(-1, 3))
+        self._sky_adam = ColorAdam(self.sky_faces.reshape(-1, 3))
         names = sorted({key.camera for key in (*source.train, *source.test)})
         self.color_maps = {name: _IDENTITY.copy() for name in names}
         self._map_adams = {name: DenseAdam(m) for name, m in self.color_maps.items()}
@@ -230,9 +230,6 @@ class Trainer:
             )
         if loss.d_sky is not None:
             self._sky_adam.update(loss.d_sky.texels, loss.d_sky.grads, rates.sky)
-            touched = loss.d_sky.texels
-            flat = self.sky_faces.reshape(-1, 3)
-            flat[touched] = flat[touched].clip(0, 1)
         if self.config.exposure:
             color_map = self.color_maps[key.camera]
             pull = self.config.exposure_pull * (color_map - _IDENTITY)

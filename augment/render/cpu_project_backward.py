@@ -58,10 +58,10 @@ from augment.render.cpu_layout import (
 from augment.render.cpu_math import LOG2_E, floats_at
 
 # A row of gradients, one cache line: by mean (3, metres, in the part's axes), unit quaternion (4,
-# tangential), logarithms of scales (3) and opacity, colour before its clamp at 0 (3); then what
-# densification looks at: the sum of |dL/d mean| over pixels (1/px), and the largest sigma, px.
+# tangential), logarithms of scales (3) and opacity, colour before its clamp at 0 (3). Between them
+# what densification looks at: the sum of |dL/d mean| over pixels (1/px), and the largest sigma, px.
 GRAD = 16
-G_MEAN, G_QUAT, G_SCALE, G_OPACITY, G_COLOR, G_ABS, G_RADIUS = 0, 3, 7, 10, 11, 14, 15
+G_MEAN, G_QUAT, G_ABS, G_SCALE, G_OPACITY, G_COLOR, G_RADIUS = 0, 3, 7, 8, 11, 12, 15
 
 _INVERSE_LN2 = np.float32(1 / math.log(2))
 _SLOPES = 16  # rows of eight: gradients of the SH functions, weighted
