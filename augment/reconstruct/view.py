@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -62,6 +62,7 @@ class RecordedView:
         return sum(a.nbytes for a in arrays) + self.depth_weight.nbytes
 
 
+@runtime_checkable
 class ViewSource(Protocol):
     """The recorded views of a drive. Loading is deterministic; memory is the source's own care."""
 
