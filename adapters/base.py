@@ -26,6 +26,7 @@ from adapters.uri import (
 )
 from augment.errors import AdapterError
 from augment.scene import Scene
+from augment.scene_files import is_scene_folder
 
 
 class Adapter(Protocol):
@@ -93,6 +94,8 @@ def recognise(path: Path) -> str:
             return "gaussians"
         looked_for = "a .ply or .splat file"
     else:
+        if is_scene_folder(path):
+            return "scene"
         if (path / "camera").is_dir() and (path / "lidar").is_dir():
             return "pandaset"
         if _is_recording(path):
@@ -101,8 +104,8 @@ def recognise(path: Path) -> str:
             return "gaussians"
         looked_for = (
             "a PandaSet sequence (camera/ and lidar/), a recording (calibration.json and images/), "
-            "a trained 3DGS model (point_cloud/iteration_N/point_cloud.ply), or a single .ply or "
-            ".splat file in it"
+            "a fitted scene (scene.json), a trained 3DGS model "
+            "(point_cloud/iteration_N/point_cloud.ply), or a single .ply or .splat file in it"
         )
         looked_for += _hint_below(path)
     raise AdapterError(

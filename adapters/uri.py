@@ -42,6 +42,7 @@ SCHEMES = {
     "gaussians": Scheme(
         "adapters.gaussian_files", "open_gaussians", "gaussians:model/point_cloud.ply?up=-y"
     ),
+    "scene": Scheme("adapters.scene_folder", "open_scene_folder", "scene:out/fitted"),
 }
 
 

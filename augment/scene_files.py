@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import os
 import re
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -71,8 +72,23 @@ def save_scene(scene: Scene, folder: str | Path) -> None:
             (new / name).chmod(mode)  # safetensors keeps its files to their owner
 
 
+@dataclass(frozen=True, eq=False)
+class SceneFolder:
+    """What a scene folder held. scene: without labels. working_folder: where relative paths in
+    scene.recorded_source start from.
+    """
+
+    scene: Scene
+    working_folder: Path
+
+
 def load_scene_parts(folder: str | Path) -> Scene:
-    """The scene of a folder without labels. Its arrays are mapped: writes to them stay in memory.
+    """The scene of `read_scene_folder` alone."""
+    return read_scene_folder(folder).scene
+
+
+def read_scene_folder(folder: str | Path) -> SceneFolder:
+    """Open a scene folder. Its arrays are mapped: writes to them stay in memory.
 
     Gaussians that no rasteriser can draw are left out with a sentence in `problems`.
 
@@ -90,7 +106,8 @@ def load_scene_parts(folder: str | Path) -> Scene:
     if problems:
         found = [*document.problems, *problems]
         document = document.model_copy(update={"problems": found})
-    return scene_of(document, parts, sky, source=f"scene:{folder}", where=str(folder / DOCUMENT))
+    scene = scene_of(document, parts, sky, source=f"scene:{folder}", where=str(folder / DOCUMENT))
+    return SceneFolder(scene, Path(document.working_folder))
 
 
 def _arrays_of(scene: Scene) -> dict[str, np.ndarray]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
 import numpy as np
@@ -39,6 +40,9 @@ def describe_scene(scene: Scene) -> dict[str, Any]:
         "ground_z_m": scene.ground_z_m,
         "has_metric_scale": scene.has_metric_scale,
         "world_origin_m": [float(v) for v in scene.world_origin_m],
+        "recorded_source": scene.recorded_source,
+        "color_maps": {name: matrix.tolist() for name, matrix in scene.color_maps.items()},
+        "made_by": dict(scene.made_by),
         "problems": list(scene.problems),
     }
 
@@ -126,9 +130,13 @@ def scene_text(facts: dict[str, Any]) -> str:
         f"  sky         {facts['sky']}",
         f"  frames      {_frames(frames)}",
     ]
+    if facts["recorded_source"] is not None:
+        lines.insert(1, f"  made from   {facts['recorded_source']}")
+    lines += [f"  made by     {name}: {_short(value)}" for name, value in facts["made_by"].items()]
     lines += [
         f"  camera      {c['name']}: {c['width']}x{c['height']} px, "
         f"{c['horizontal_fov_deg']:.0f} deg wide, {c['images']} images"
+        + _gains(facts["color_maps"].get(c["name"]))
         for c in facts["cameras"]
     ]
     lines += [
@@ -154,6 +162,19 @@ def scene_text(facts: dict[str, Any]) -> str:
         lines.append("  classes     " + ", ".join(f"{name} {count:,}" for name, count in known))
     lines += [f"  problem     {p}" for p in facts["problems"]] or ["  problems    none found"]
     return "\n".join(lines)
+
+
+def _gains(color_map: list[list[float]] | None) -> str:
+    """How much a camera's colour map changes mid grey, by channel."""
+    if color_map is None:
+        return ""
+    gains = (sum(row[:3]) + row[3] / 0.5 for row in color_map)
+    return f", records mid grey x {' '.join(f'{gain:.2f}' for gain in gains)}"
+
+
+def _short(value: Any) -> str:
+    text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+    return text if len(text) <= 100 else text[:97] + "..."
 
 
 def _height(ground_z_m: float | None) -> str:

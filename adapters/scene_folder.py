@@ -1,0 +1,145 @@
+"""Scene folders of our own (`climategs fit` writes them), with the labels of their recording.
+
+    scene:PATH?data=pandaset:PATH/002
+
+A scene folder holds no labels: boxes and LiDAR are read, when asked for, from the recording that
+the scene was fitted to. `data` says where that is now, if it has moved.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+from adapters.uri import CAMERA_PATH_KEY, GROUND_KEY, SCHEMES, format_uri, parse_uri
+from augment.cameras import Frame
+from augment.errors import AdapterError
+from augment.labels import LabelSource
+from augment.scene import Scene
+from augment.scene_files import read_scene_folder
+
+_DATA_KEY = "data"
+
+
+@dataclasses.dataclass(frozen=True)
+class Recording:
+    """Where raw data lie. path: absolute, or a builtin scene's name."""
+
+    scheme: str
+    path: str
+    query: Mapping[str, str]
+
+    @property
+    def uri(self) -> str:
+        return format_uri(self.scheme, self.path, self.query)
+
+    @property
+    def is_there(self) -> bool:
+        return self.path in SCHEMES[self.scheme].builtin or Path(self.path).exists()
+
+
+def open_scene_folder(path: str, query: dict[str, str]) -> Scene:
+    """The scene of a scene folder.
+
+    query: data, the URI or path of the recording, where it has moved.
+
+    Raises:
+        AdapterError: an unknown key, or nothing where `data` says. SceneError: a file is missing or
+            damaged. A recording that is gone is a sentence in Scene.problems.
+    """
+    unknown = sorted(set(query) - {_DATA_KEY})
+    if unknown:
+        raise AdapterError(
+            f"scene:{path} does not know {', '.join(map(repr, unknown))}; it takes {_DATA_KEY}"
+        )
+    folder = read_scene_folder(path)
+    scene = dataclasses.replace(folder.scene, source=format_uri("scene", path, query))
+    assert scene.recorded_source is not None
+    recorded = _recording(scene.recorded_source, folder.working_folder)
+    if _DATA_KEY in query:
+        found = _given(query[_DATA_KEY])
+        if recorded is not None:
+            frames = tuple(_moved(frame, recorded.path, found.path) for frame in scene.frames)
+            scene = dataclasses.replace(scene, frames=frames)
+        recorded = found
+    try:
+        if recorded is None or not recorded.is_there:
+            name = scene.recorded_source if recorded is None else recorded.uri
+            raise AdapterError(f"{name}, which the scene was made from, is not there")
+        labels = recorded_labels(recorded)
+    except AdapterError as error:
+        missing = (
+            f"{error}; so boxes and LiDAR are left out. Where it has moved, add {_DATA_KEY}=URI to "
+            f"the scene's URI"
+        )
+        return dataclasses.replace(scene, problems=(*scene.problems, missing))
+    return dataclasses.replace(scene, labels=labels, recorded_source=recorded.uri)
+
+
+def recorded_labels(recording: Recording) -> LabelSource | None:
+    """The labels of a recording without its Gaussians, which take long to build; None where a scene
+    of this URI has none.
+
+    Raises:
+        AdapterError: the query of a procedural street that cannot be used.
+    """
+    if CAMERA_PATH_KEY in recording.query:  # the frames are not the recorded ones
+        return None
+    if recording.scheme == "pandaset":
+        from adapters.pandaset.labels import PandaSetLabels
+
+        return PandaSetLabels(Path(recording.path))
+    if recording.scheme == "recording":
+        from adapters.recording.labels import RecordingLabels
+
+        return RecordingLabels(Path(recording.path))
+    if recording.scheme == "procedural":
+        from adapters.street.labels import StreetLabels
+        from adapters.street.parameters import parse_parameters
+
+        query = {key: value for key, value in recording.query.items() if key != GROUND_KEY}
+        return StreetLabels(parse_parameters(query))
+    return None
+
+
+def _given(uri: str) -> Recording:
+    """The recording of the `data` key.
+
+    Raises:
+        AdapterError: nothing there, or nothing that is known.
+    """
+    from adapters.base import recognise
+
+    recording = _recording(uri, Path.cwd())
+    if recording is None:
+        scheme, path, query = parse_uri(uri)
+        if scheme is not None:
+            raise AdapterError(f"{_DATA_KEY}={uri}: no recording is named so")
+        return Recording(recognise(Path(path)), os.path.abspath(path), query)
+    if not recording.is_there:
+        raise AdapterError(f"{_DATA_KEY}={uri}: no such file or folder: {recording.path}")
+    return recording
+
+
+def _recording(uri: str, working_folder: Path) -> Recording | None:
+    """A URI with its path made absolute; None for what names no recording."""
+    try:
+        scheme, path, query = parse_uri(uri)
+    except AdapterError:
+        return None
+    if scheme is None or scheme not in SCHEMES or scheme == "scene":
+        return None
+    if path in SCHEMES[scheme].builtin:
+        return Recording(scheme, path, query)
+    return Recording(scheme, os.path.normpath(working_folder / path), query)
+
+
+def _moved(frame: Frame, old: str, new: str) -> Frame:
+    """The frame with the image paths that lay in one folder in another."""
+    paths = {
+        name: os.path.join(new, os.path.relpath(path, old)) if path.startswith(old + "/") else path
+        for name, path in frame.image_paths.items()
+    }
+    return dataclasses.replace(frame, image_paths=paths)

@@ -1,0 +1,128 @@
+"""`scene:` URIs: recognised, opened, and the labels of the recording they were made from."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from fitted_scenes import assert_same, fitted_scene
+from pandaset_folder import write_sequence
+
+from adapters.base import open_scene, recognise
+from adapters.pandaset.labels import PandaSetLabels
+from augment.batch.shared_scene import share_scene
+from augment.errors import AdapterError, SceneError
+from augment.scene import Scene
+from augment.scene_files import save_scene
+from tools.scene_report import describe_scene, scene_text
+
+STREET = "procedural:street?seed=5&frames=6&lidar_columns=16"
+
+
+def save(tmp_path: Path, **changes) -> Path:
+    save_scene(fitted_scene(**changes), tmp_path / "fit")
+    return tmp_path / "fit"
+
+
+def test_a_scene_folder_is_recognised_and_opened(tmp_path):
+    folder = save(tmp_path)
+    assert recognise(folder) == "scene"
+    for uri in (f"scene:{folder}", str(folder)):
+        scene = open_scene(uri)
+        assert scene.source == f"scene:{folder}"
+        assert_same(scene, fitted_scene(), but=("source", "problems"))
+        assert scene.labels is None
+        assert "test:recording, which the scene was made from, is not there" in scene.problems[-1]
+    again = open_scene(open_scene(f"scene:{folder}?ground_z=-3").source)
+    assert again.ground_z_m == -3
+
+
+def test_bad_uris_and_folders(tmp_path):
+    folder = save(tmp_path)
+    with pytest.raises(AdapterError, match=r"does not know 'frames'; it takes data"):
+        open_scene(f"scene:{folder}?frames=2")
+    with pytest.raises(AdapterError, match="no such file or folder"):
+        open_scene(f"scene:{folder}?data={tmp_path}/nowhere")
+    with pytest.raises(AdapterError, match="no such file or folder"):
+        open_scene(f"scene:{folder}?data=pandaset:{tmp_path}/nowhere")
+    with pytest.raises(AdapterError, match="no recording is named so"):
+        open_scene(f"scene:{folder}?data=scene:{folder}")
+    with pytest.raises(SceneError, match=r"no scene folder: it has no scene\.json"):
+        open_scene(f"scene:{tmp_path}")
+    (folder / "sky.safetensors").unlink()
+    assert recognise(folder) == "scene"  # so that what is wrong with it is said
+    with pytest.raises(SceneError, match=r"it has no sky\.safetensors"):
+        open_scene(str(folder))
+
+
+def test_labels_come_from_the_recording(tmp_path):
+    folder = save(tmp_path, recorded_source=STREET)
+    scene, street = open_scene(f"scene:{folder}"), open_scene(STREET)
+    assert scene.problems == fitted_scene().problems
+    ours, theirs = scene.boxes(1), street.boxes(1)
+    assert ours.track_ids == theirs.track_ids and len(ours) > 0
+    assert np.array_equal(ours.centers_m, theirs.centers_m)
+    assert np.array_equal(scene.lidar(0).points_m, street.lidar(0).points_m)
+    save(tmp_path, recorded_source=f"{STREET}&ground_z=1")
+    assert len(open_scene(f"scene:{folder}").boxes(1)) == len(theirs)
+    save(tmp_path, recorded_source="procedural:street?seed=x")
+    broken = open_scene(f"scene:{folder}")
+    assert broken.labels is None and "boxes and LiDAR are left out" in broken.problems[-1]
+
+
+def test_a_recording_is_found_from_anywhere_and_after_it_moved(tmp_path, monkeypatch):
+    """Its URI and its images are given relative to where the scene was saved."""
+    (tmp_path / "raw").mkdir()
+    write_sequence(tmp_path / "raw" / "002")
+    monkeypatch.chdir(tmp_path)
+    image = {"ahead": "raw/002/camera/front_camera/00.jpg"}
+    frames = (dataclasses.replace(fitted_scene().frames[0], image_paths=image),)
+    save(tmp_path, source="pandaset:raw/002?frames=0:2", recorded_source=None, frames=frames)
+    monkeypatch.chdir("/")
+    scene = open_scene(f"scene:{tmp_path}/fit")
+    assert scene.labels == PandaSetLabels(tmp_path / "raw" / "002")
+    assert scene.recorded_source == f"pandaset:{tmp_path}/raw/002?frames=0:2"
+    assert scene.frames[0].image_paths == {"ahead": f"{tmp_path}/{image['ahead']}"}
+
+    shutil.move(tmp_path / "raw", tmp_path / "moved")
+    gone = open_scene(f"scene:{tmp_path}/fit")
+    assert gone.labels is None and "is not there" in gone.problems[-1]
+    for uri in (f"pandaset:{tmp_path}/moved/002", f"{tmp_path}/moved/002"):
+        found = open_scene(f"scene:{tmp_path}/fit?data={uri}")
+        assert found.labels == PandaSetLabels(tmp_path / "moved" / "002")
+        assert found.problems == fitted_scene().problems
+        paths = found.frames[0].image_paths
+        assert paths == {"ahead": f"{tmp_path}/moved/002/camera/front_camera/00.jpg"}
+        assert open_scene(found.source).labels == found.labels
+
+
+def test_a_scene_made_from_a_fitted_scene_keeps_its_recording(tmp_path):
+    first = open_scene(f"scene:{save(tmp_path, recorded_source=STREET)}")
+    save_scene(first, tmp_path / "fit")  # in its own place
+    again = open_scene(f"scene:{tmp_path}/fit")
+    assert again.recorded_source == first.recorded_source
+    assert again.labels == first.labels
+
+
+def test_workers_share_a_scene_folders_scene(tmp_path):
+    scene = open_scene(f"scene:{save(tmp_path, recorded_source=STREET)}")
+    shared = share_scene(scene, tmp_path)
+    again: Scene = shared.open()
+    shared.remove()
+    assert_same(scene, again, but=("labels",))
+    assert again.labels == scene.labels
+
+
+def test_inspect_says_what_it_was_made_from_and_by(tmp_path):
+    maps = {"ahead": torch.tensor([[1.1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, -0.1]])}
+    folder = save(tmp_path, recorded_source=STREET, color_maps=maps)
+    facts = describe_scene(open_scene(str(folder)))
+    assert facts["recorded_source"] == STREET and facts["made_by"]["steps"] == 30
+    text = scene_text(facts)
+    assert f"made from   {STREET}" in text
+    assert "made by     steps: 30" in text
+    assert "records mid grey x 1.10 1.00 0.80" in text
