@@ -131,10 +131,16 @@ def _camera(where: str, name: str, camera: Any, frame_ns: int) -> Camera:
     if not isinstance(camera, dict):
         raise AdapterError(f"{where}: must be an object with width, height, fx ...; got {camera!r}")
     pose = _rigid(where, "world_from_camera", camera.get("world_from_camera"))
+    camera = {"timestamp_ns": frame_ns} | camera
+    _time(where, camera["timestamp_ns"])
+    size = [camera.get(side) for side in ("width", "height")]
+    if any(type(side) is not int for side in size):
+        raise AdapterError(f"{where}: width and height must be whole pixels; got {size}")
+    for key in ("fx", "fy", "cx", "cy"):
+        if isinstance(camera.get(key, 0), bool) or not isinstance(camera.get(key, 0), int | float):
+            raise AdapterError(f"{where}: {key} must be a number of pixels; got {camera[key]!r}")
     try:
-        record = read_camera({"cameras": {name: {"timestamp_ns": frame_ns} | camera}}, name)
-        if type(record.width) is not int or type(record.height) is not int:
-            raise ValueError(f"width and height must be whole pixels; got {record.width!r}")
+        record = read_camera({"cameras": {name: camera}}, name)
         k = record.K
         return Camera(
             name=name,
@@ -145,7 +151,7 @@ def _camera(where: str, name: str, camera: Any, frame_ns: int) -> Camera:
             cx=float(k[0, 2]),
             cy=float(k[1, 2]),
             camera_from_world=invert_rigid(pose),
-            timestamp_ns=_time(where, record.timestamp_ns),
+            timestamp_ns=record.timestamp_ns,
         )
     except KeyError as error:
         raise AdapterError(f"{where}: {error} is missing") from None

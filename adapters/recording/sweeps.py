@@ -10,16 +10,16 @@ import numpy as np
 from tqdm import tqdm
 
 from adapters.lidar.split import Sweep
+from adapters.lidar.sweep_times import sweep_times, whole_numbers
 from adapters.recording.calibration import NO_SURFACE, Calibration
 from adapters.recording.labels import lidar_files
-from adapters.recording.tables import read_sweep, whole_numbers
+from adapters.recording.tables import read_sweep
 from augment.cameras import Frame
 from augment.errors import AdapterError
 from augment.labels import LidarSweep
 from augment.semantics import SemanticClass
 
 _FAR_M = 1000.0  # no LiDAR on the ground sees this far
-_SAME_DRIVE_NS = 10_000_000_000  # times further from the frame's count from some other start
 _TOP_QUANTILE = 0.999
 _TOP_BEYOND_M = 5.0  # nearer, a camera's height says little of the sensor's
 _TOP_DEG = (2.0, 60.0)
@@ -116,20 +116,10 @@ class _Raw:
 
 
 def _times(path: Path, sweep: LidarSweep, frame_ns: int) -> np.ndarray | None:
-    """The returns' times, int64 [N], or None where the file has none of this drive."""
-    times = sweep.columns.get("timestamp_ns")
-    if times is None:
-        seconds = sweep.columns.get("t")
-        if seconds is None or seconds.dtype.kind not in "fiu" or not np.isfinite(seconds).all():
-            return None
-        # Beyond 9e9 s int64 has no nanoseconds; such times are no times of this drive either.
-        times = np.round(seconds.astype(np.float64).clip(-9e9, 9e9) * 1e9)
     try:
-        times = whole_numbers(times, "timestamp_ns")
+        return sweep_times(sweep, frame_ns)
     except ValueError as error:
         raise AdapterError(f"{path}: {error}") from None
-    near = len(times) == 0 or abs(int(np.median(times)) - frame_ns) <= _SAME_DRIVE_NS
-    return times if near else None
 
 
 def _classes(path: Path, column: np.ndarray) -> np.ndarray:

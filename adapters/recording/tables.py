@@ -16,6 +16,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from adapters.lidar.sweep_times import whole_numbers
 from augment.batch.columns import METADATA_KEY
 from augment.batch.label_files import ATTRIBUTE_PREFIX, read_boxes, read_lidar
 from augment.errors import AdapterError, OutputError
@@ -112,23 +113,6 @@ def _boxes_at(columns: dict[str, np.ndarray], rows: np.ndarray) -> TimedBoxes:
         ),
         None if times is None else whole_numbers(times[rows], "timestamp_ns"),
     )
-
-
-def whole_numbers(column: np.ndarray, name: str) -> np.ndarray:
-    """A column of whole numbers, or of times (nanoseconds since 1970), as int64.
-
-    Raises:
-        ValueError: it holds anything else, or gaps.
-    """
-    if column.dtype.kind == "M" and not np.isnat(column).any():
-        return column.astype("datetime64[ns]").astype(np.int64)
-    if column.dtype.kind == "f" and np.isfinite(column).all() and (column % 1 == 0).all():
-        return column.astype(np.int64)
-    if column.dtype.kind not in "iu":
-        raise ValueError(
-            f"column {name} must hold whole numbers without gaps; it is {column.dtype}"
-        )
-    return column.astype(np.int64)
 
 
 def _column(table: pa.Table, name: str) -> np.ndarray:
