@@ -18,7 +18,7 @@ from pathlib import Path
 
 from tools.bench_scene import RasterCase
 
-_STATUS, _RESET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+_STATUS, RESET_PEAK = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
 
 def peak_extra_mib(case: RasterCase, *, seed: int = 0) -> float | None:
@@ -27,7 +27,7 @@ def peak_extra_mib(case: RasterCase, *, seed: int = 0) -> float | None:
     Raises:
         RuntimeError: the measuring process failed; the message is what it wrote.
     """
-    if not (_STATUS.is_file() and _RESET.is_file()):
+    if not (_STATUS.is_file() and RESET_PEAK.is_file()):
         return None
     arguments = json.dumps({**dataclasses.asdict(case), "seed": seed})
     done = subprocess.run(
@@ -52,16 +52,16 @@ def _render_once(case: RasterCase, seed: int) -> float:
     warm_up()
     gaussians, camera = random_scene(case, seed=seed)
     gc.collect()
-    _return_free_memory()
-    before = _status_mib("VmRSS")
-    _RESET.write_text("5")
+    return_free_memory()
+    before = status_mib("VmRSS")
+    RESET_PEAK.write_text("5")
     parts, buffers = [PosedGaussians(gaussians)], frozenset({RGB, ALPHA})
     output = rasterize_cpu(parts, camera, buffers, RasterSettings(), None)
     assert output.rgb is not None  # alive until the mark is read
-    return _status_mib("VmHWM") - before
+    return status_mib("VmHWM") - before
 
 
-def _return_free_memory() -> None:
+def return_free_memory() -> None:
     """Give freed heap back to the system, or what building the scene left would hide the frame's.
 
     glibc keeps up to 64 MiB; elsewhere nothing is done.
@@ -71,7 +71,7 @@ def _return_free_memory() -> None:
         trim(0)
 
 
-def _status_mib(field: str) -> float:
+def status_mib(field: str) -> float:
     for line in _STATUS.read_text().splitlines():
         if line.startswith(f"{field}:"):
             return int(line.split()[1]) / 1024

@@ -12,6 +12,7 @@ from tools import commands
 
 COMMANDS = {
     "render": commands.render,
+    "fit": commands.fit,
     "inspect": commands.inspect,
     "explain": commands.explain,
     "recipes": commands.recipes,

@@ -67,6 +67,76 @@ def render(
     )
 
 
+def fit(
+    scene: Positional[str],
+    out: Path,
+    minutes: float | None = None,
+    steps: int | None = None,
+    scale: float = 0.25,
+    cameras: str = "all",
+    holdout: str = "every-2nd",
+    seed: int = 0,
+    depth_weight: float = 1.0,
+    sh_degree: int | None = None,
+    max_splats: int | None = None,
+    densify: Literal["absgrad", "mcmc", "none"] = "absgrad",
+    image_cache_mb: int = 1024,
+    depth: str = "lidar",
+    ego_masks: Path | None = None,
+    overwrite: bool = False,
+    json_file: _JsonFile = None,
+) -> int:
+    """Reconstruct a scene of Gaussians from recorded images, LiDAR and boxes.
+
+    Run it again to go on after an interruption; the result is the same to the bit. Ctrl-C stops
+    after the current step, and the scene as far as it is fitted is written.
+
+    Args:
+        scene: Raw data: pandaset:PATH/002, recording:PATH, or a path that is recognised.
+        out: The scene's folder; OUT.fit beside it holds the checkpoint and the report.
+        minutes: How long to optimise, 10 by default. Opening and the report come on top.
+        steps: How many steps instead. The same steps and seed give the same bytes.
+        scale: Resolution of the images that are learnt from, relative to the recorded.
+        cameras: Camera names separated by commas, or all.
+        holdout: Which frames are kept for the report: every-2nd, every-8th, ..., or none.
+        seed: Of everything random.
+        depth_weight: How much depth priors count. 0 switches them off.
+        sh_degree: Highest band of spherical harmonics, 0 to 3.
+        max_splats: Splats are not added beyond this number.
+        densify: How splats are added.
+        image_cache_mb: Memory for decoded images. The result does not depend on it.
+        depth: Depth priors: none, or kinds separated by commas: lidar, metric:DIR (depth maps as
+            render writes them), relative:DIR (monocular networks), sparse:DIR (lidar_depth).
+        ego_masks: A folder of CAMERA.png, white where the image shows the recording car.
+        overwrite: Begin anew and replace what is there.
+        json_file: Also write the report to this file.
+    """
+    from tools.fit import fit_scene
+    from tools.fit_options import FitOptions
+
+    options = FitOptions(
+        scene=scene,
+        out=out,
+        minutes=minutes,
+        steps=steps,
+        scale=scale,
+        cameras=None if cameras == "all" else tuple(cameras.split(",")),
+        holdout=holdout,
+        seed=seed,
+        depth_weight=depth_weight,
+        sh_degree=sh_degree,
+        max_splats=max_splats,
+        densify=densify,
+        image_cache_mb=image_cache_mb,
+        depth=depth,
+        ego_masks=ego_masks,
+        overwrite=overwrite,
+    )
+    outcome = fit_scene(options)
+    _write_json(json_file, outcome.report)
+    return outcome.code
+
+
 def inspect(
     uri: Positional[str], camera_path: Path | None = None, json_file: _JsonFile = None
 ) -> int:
@@ -147,21 +217,23 @@ def sheet(
 
 
 def bench(
-    what: Positional[Literal["raster", "smog"]] = "raster",
+    what: Positional[Literal["raster", "smog", "fit"]] = "raster",
     repeats: int = 7,
     quick: bool = False,
+    scene: str | None = None,
     json_file: _JsonFile = None,
 ) -> int:
     """Measure speed and error on this machine.
 
     raster: the rasteriser on random scenes: time of each stage, pairs per second, memory, and the
     torch reference beside it. smog: the error of both smog models against exact per-pixel smog on
-    the procedural street.
+    the procedural street. fit: time of each stage of a reconstruction's step, and memory.
 
     Args:
         what: Which benchmark.
         repeats: Timed frames a scene (raster).
-        quick: The smaller scene, or one view, only.
+        quick: The smaller scene, one view, or fewer steps, only.
+        scene: Raw data to fit (fit); by default a drive down the procedural street is recorded.
         json_file: Also write the figures to this file.
     """
     if what == "smog":
@@ -169,6 +241,11 @@ def bench(
 
         result = bench_smog(cameras=("front",), frames=(5,)) if quick else bench_smog()
         text = smog_text(result)
+    elif what == "fit":
+        from tools.bench_fit import bench_fit, fit_text
+
+        result = bench_fit(scene, quick=quick)
+        text = fit_text(result)
     else:
         from tools.bench import bench_raster, bench_text
 

@@ -1,0 +1,574 @@
+"""The driver of reconstruction, on stand-ins for what it drives."""
+
+import dataclasses
+import importlib
+import json
+import os
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fake_fit import Fakes, FakeTrainer
+
+from adapters.base import open_scene
+from adapters.recorded.depth_priors import DepthPriors
+from augment.batch.lock import OutputLock
+from augment.errors import ClimateGSError, OutputError
+from augment.reconstruct.view import ViewKey
+from augment.scene_schema import FORMAT
+from tools.cli import main
+from tools.fit import fit_scene, state_folder
+from tools.fit_checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from tools.fit_data import held_out_range, open_to_fit
+from tools.fit_loop import evaluation_steps, sample_keys
+from tools.fit_options import FitOptions, parse_depth
+from tools.fit_parts import real_parts
+from tools.fit_time import GROWTH, RESERVE, estimate_steps
+
+
+@pytest.fixture
+def drive(tmp_path):
+    """A folder that a URI can name; the stand-ins never look into it."""
+    (tmp_path / "drive").mkdir()
+    return f"recording:{tmp_path / 'drive'}"
+
+
+@pytest.fixture
+def options(drive, tmp_path) -> FitOptions:
+    return FitOptions(scene=drive, out=tmp_path / "scene", steps=120)
+
+
+def run(options, fakes, **more):
+    return fit_scene(options, parts=fakes.parts(), progress=False, **more)
+
+
+def written(out) -> dict[str, bytes]:
+    return {p.name: p.read_bytes() for p in sorted(out.iterdir())}
+
+
+def learnt(rows) -> list:
+    """A history without what the clock decides."""
+    return [{k: v for k, v in row.items() if k != "seconds"} for row in rows]
+
+
+# ---- a run ------------------------------------------------------------------------------------
+
+
+def test_a_run_writes_scene_checkpoint_and_report(options, capsys):
+    fakes = Fakes()
+    outcome = run(options, fakes)
+    assert outcome.code == 0 and outcome.report["complete"] and outcome.report["step"] == 120
+    assert set(written(options.out)) == {"scene.json", "gaussians.bin"}
+    saved = load_checkpoint(state_folder(options.out))
+    assert saved.finished and saved.step == saved.steps == 120 and saved.data["train views"] == 6
+    streams = capsys.readouterr()
+    assert "| 6 | 20.0 |" in streams.out and f"scene:{options.out}" in streams.out
+    assert streams.err.count("a view lacks its mask") == 1  # said by scene and views alike
+    assert outcome.report["problems"] == ["frame 3 has no sweep", "a view lacks its mask"]
+
+
+def test_history_has_averages_and_evaluations(options):
+    rows = run(options, Fakes()).report["history"]
+    averages = [row for row in rows if "loss" in row]
+    assert [row["step"] for row in averages] == [50, 100]
+    assert averages[0]["stage_s"] == pytest.approx({"load": 0.001, "forward": 0.002})
+    assert averages[0]["ssim"] == 0.5 and averages[0]["splats"] == 400
+    tests = [row for row in rows if row.get("split") == "test"]
+    assert [row["step"] for row in tests] == list(range(0, 121, 12))
+    assert tests[-1]["psnr"] > tests[0]["psnr"]
+    assert len(tests) == sum(row.get("split") == "train" for row in rows)
+
+
+def test_the_same_command_gives_the_same_bytes(options, tmp_path):
+    run(options, Fakes())
+    again = dataclasses.replace(options, out=tmp_path / "again")
+    run(again, Fakes())
+    assert written(options.out) == written(again.out)
+    other = dataclasses.replace(options, out=tmp_path / "other", seed=1)
+    run(other, Fakes())
+    assert written(options.out) != written(other.out)
+
+
+def test_without_held_out_views_the_others_are_looked_at(options):
+    whole = dataclasses.replace(options, holdout="none")
+    fakes = Fakes()
+    rows = run(whole, fakes).report["history"]
+    assert {row["split"] for row in rows if "psnr" in row} == {"train"}
+    assert "held_out=" not in fakes.opened[0]
+
+
+def test_a_loss_that_is_no_number_ends_the_run(options, monkeypatch):
+    real = FakeTrainer.run_step
+
+    def breaks(self):
+        record = real(self)
+        return dataclasses.replace(record, loss=float("nan")) if self.step == 30 else record
+
+    monkeypatch.setattr(FakeTrainer, "run_step", breaks)
+    with pytest.raises(ClimateGSError, match=r"nan in step 30 \(frame \d, camera '(front|left)'"):
+        run(options, Fakes())
+    assert not options.out.exists()
+
+
+# ---- going on ---------------------------------------------------------------------------------
+
+
+class Killed(BaseException):
+    pass
+
+
+def killer(at):
+    def kill(step):
+        if step == at:
+            raise Killed
+
+    return kill
+
+
+def interrupter(at, number):
+    def interrupt(step):
+        if step == at:
+            os.kill(os.getpid(), number)
+
+    return interrupt
+
+
+@pytest.mark.parametrize("at", [0, 49, 50, 77])
+def test_a_killed_run_goes_on_to_the_same_bits(options, tmp_path, at):
+    with pytest.raises(Killed):
+        run(options, Fakes(before_step=killer(at)), checkpoint_s=0)
+    assert not options.out.exists()
+    resumed = run(options, Fakes())
+    plain = dataclasses.replace(options, out=tmp_path / "plain")
+    whole = run(plain, Fakes())
+    assert written(options.out) == written(plain.out)
+    assert learnt(resumed.report["history"]) == learnt(whole.report["history"])
+
+
+def test_a_run_killed_between_checkpoints_repeats_what_was_lost(options, tmp_path):
+    with pytest.raises(Killed):
+        run(options, Fakes(before_step=killer(60)), checkpoint_s=3600)
+    assert load_checkpoint(state_folder(options.out)).step == 0
+    run(options, Fakes())
+    plain = dataclasses.replace(options, out=tmp_path / "plain")
+    run(plain, Fakes())
+    assert written(options.out) == written(plain.out)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_run_leaves_a_scene_and_goes_on(options, tmp_path, number, capfd):
+    before = signal.getsignal(number)
+    outcome = run(options, Fakes(before_step=interrupter(70, number)))
+    assert outcome.code == 130 and outcome.report["step"] == 71  # the step it was in is finished
+    assert not outcome.report["complete"] and (options.out / "scene.json").is_file()
+    assert signal.getsignal(number) is before
+    assert "interrupt again to stop at once" in capfd.readouterr().err
+    resumed = run(options, Fakes())
+    assert resumed.code == 0
+    plain = dataclasses.replace(options, out=tmp_path / "plain")
+    whole = run(plain, Fakes())
+    assert written(options.out) == written(plain.out)
+    assert learnt(resumed.report["history"]) == learnt(whole.report["history"])
+    assert resumed.report["seconds"] > resumed.report["seconds_of_this_run"] > 0
+
+
+def test_a_second_interruption_stops_at_once(options):
+    def twice(step):
+        if step in (70, 71):
+            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), signal.SIGINT)
+
+    with pytest.raises(KeyboardInterrupt, match="last checkpoint"):
+        run(options, Fakes(before_step=twice))
+    assert load_checkpoint(state_folder(options.out)).step == 0
+
+
+def test_a_finished_run_does_nothing_and_says_so(options, capsys):
+    first = run(options, Fakes())
+    before = {p: p.stat().st_mtime_ns for p in options.out.iterdir()}
+    capsys.readouterr()
+    fakes = Fakes()
+    again = run(options, fakes)
+    assert again.code == 0 and again.report == json.loads(json.dumps(first.report))
+    assert fakes.opened == [] and fakes.trainers == []
+    assert {p: p.stat().st_mtime_ns for p in options.out.iterdir()} == before
+    assert "finished already (120 steps); nothing was done" in capsys.readouterr().out
+
+
+def test_a_scene_that_was_deleted_is_written_again_from_the_checkpoint(options):
+    run(options, Fakes())
+    before = written(options.out)
+    for path in options.out.iterdir():
+        path.unlink()
+    fakes = Fakes(before_step=killer(0))  # no step is needed
+    run(options, fakes)
+    assert written(options.out) == before
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"scale": 0.5}, "scale was 0.25, now 0.5"),
+        ({"seed": 3}, "seed was 0, now 3"),
+        ({"cameras": ("front",)}, "cameras was all, now front"),
+        ({"depth_weight": 0.0}, r"loss.depth was 1.0, now 0.0"),
+        ({"densify": "mcmc"}, r"densify.method was absgrad, now mcmc"),
+        ({"steps": 200}, r"its length was --steps 120 \(120 steps\), now --steps 200"),
+        ({"steps": None}, r"now --minutes 10"),
+    ],
+)
+def test_other_settings_are_refused_by_name(options, change, message):
+    run(options, Fakes())
+    before = written(options.out)
+    changed = dataclasses.replace(options, **change)
+    with pytest.raises(OutputError, match=message):
+        run(changed, Fakes())
+    assert written(options.out) == before
+
+
+def test_what_does_not_change_the_result_may_change(options):
+    run(options, Fakes(before_step=interrupter(5, signal.SIGINT)))
+    assert run(dataclasses.replace(options, image_cache_mb=7), Fakes()).code == 0
+
+
+def test_overwrite_begins_anew(options, tmp_path):
+    run(options, Fakes())
+    other = dataclasses.replace(options, seed=5, overwrite=True)
+    assert run(other, Fakes()).code == 0
+    plain = dataclasses.replace(other, out=tmp_path / "plain")
+    run(plain, Fakes())
+    assert written(options.out) == written(plain.out)
+    assert len(list(state_folder(options.out).glob("*.safetensors"))) == 1
+
+
+def test_data_that_changed_is_refused(options):
+    run(options, Fakes(before_step=interrupter(5, signal.SIGINT)))
+    with pytest.raises(OutputError, match="frames was 6, now 4; train views was 6, now 4"):
+        run(options, Fakes(numbers=range(4)))
+
+
+# ---- time ------------------------------------------------------------------------------------
+
+
+def test_minutes_become_steps_once(drive, tmp_path, capsys):
+    options = FitOptions(scene=drive, out=tmp_path / "scene", minutes=1e-6)
+    fakes = Fakes()
+    outcome = run(options, fakes)
+    steps = outcome.report["steps"]
+    assert len(fakes.trainers) == 2  # the first was thrown away
+    assert f"--steps {steps} gives the same scene again" in capsys.readouterr().err
+    by_steps = FitOptions(scene=drive, out=tmp_path / "by-steps", steps=steps)
+    run(by_steps, Fakes())
+    assert written(options.out) == written(by_steps.out)
+    # naming the number of steps it became is the same request
+    asked = dataclasses.replace(options, minutes=None, steps=steps)
+    assert run(asked, Fakes()).code == 0
+
+
+def test_the_number_of_steps_survives_a_kill(drive, tmp_path):
+    options = FitOptions(scene=drive, out=tmp_path / "scene", minutes=0.001)
+    calls = []
+
+    def kill(step):
+        calls.append(step)
+        if step == 0 and calls.count(0) == 2:  # the first step that counts
+            raise Killed
+
+    with pytest.raises(Killed):
+        run(options, Fakes(before_step=kill))
+    planned = load_checkpoint(state_folder(options.out)).steps
+    fakes = Fakes(before_step=interrupter(3, signal.SIGINT))
+    assert run(options, fakes).report["steps"] == planned
+    assert len(fakes.trainers) == 1  # not timed again
+
+
+def test_estimate():
+    class Timed:
+        now = 0.0
+
+        def run_step(self):
+            self.now += 0.1
+
+    trainer = Timed()
+    estimate = estimate_steps(lambda _: trainer, 600, grows=False, clock=lambda: trainer.now)
+    assert estimate.step_s == pytest.approx(0.1)
+    assert estimate.steps % 50 == 0
+    assert estimate.steps == pytest.approx(600 * (1 - RESERVE) / 0.1, abs=51)  # rounded down to 50
+    slower = estimate_steps(lambda _: trainer, 600, grows=True, clock=lambda: trainer.now)
+    assert slower.steps == pytest.approx(estimate.steps / GROWTH, abs=51)
+    short = estimate_steps(lambda _: trainer, 0.01, grows=True, clock=lambda: trainer.now)
+    assert short.steps == 1
+
+
+@pytest.mark.parametrize("steps", [1, 3, 10, 11, 5000])
+def test_evaluations_are_about_ten_and_end_the_run(steps):
+    marks = evaluation_steps(steps)
+    assert max(marks) == steps and min(marks) >= 1 and len(marks) == min(steps, 10)
+
+
+def test_sampled_views_take_turns_between_cameras():
+    keys = [ViewKey(f, c) for f in range(0, 26, 2) for c in ("a", "b", "c")]
+    chosen = sample_keys(keys, 6)
+    assert len(chosen) == 6 and [k.camera for k in chosen] == ["a", "b", "c"] * 2
+    assert len({k.frame for k in chosen}) == 6
+    assert sample_keys(keys[:2], 6) == (keys[0], keys[1])
+    assert sample_keys([], 6) == ()
+
+
+# ---- what is held out ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("numbers", "step", "expected"),
+    [
+        (range(6), 2, "1::2"),
+        (range(26), 8, "7::8"),
+        (range(5, 12), 2, "6::2"),
+        (range(0, 20, 2), 2, "2::4"),
+        (range(1), 2, None),
+        (range(3), 3, "2::1"),
+        ((0, 1, 2, 5, 6, 9), 2, None),  # 1, 5, 9 would take no other; 1::4 holds them alone
+    ],
+)
+def test_held_out_frames_as_a_range(numbers, step, expected):
+    if numbers == (0, 1, 2, 5, 6, 9):
+        expected = "1::4"
+    assert held_out_range(list(numbers), step) == expected
+
+
+def test_no_range_holds_uneven_frames_alone():
+    assert held_out_range([0, 1, 2, 3, 10, 11], 2) is not None
+    assert held_out_range([0, 1, 2, 4, 5, 6], 2) is None
+
+
+@pytest.mark.parametrize(
+    ("numbers", "query", "last"),
+    [
+        (range(6), "", "held_out=1::2"),
+        (range(4, 9), "?frames=4:9", "held_out=5::2"),
+        (range(0, 12, 2), "", "held_out=2::4"),
+    ],
+)
+def test_scenes_are_opened_without_the_held_out_frames(drive, tmp_path, numbers, query, last):
+    fakes = Fakes(numbers=list(numbers))
+    options = FitOptions(scene=drive + query, out=tmp_path / "scene", steps=1)
+    _, warnings = open_to_fit(options, fakes.parts().open_scene)
+    assert fakes.opened[-1].endswith(last) and warnings == ()
+    assert len(fakes.opened) == (2 if last == "held_out=2::4" else 1)
+
+
+def test_a_scheme_that_cannot_hold_out_is_a_problem(tmp_path):
+    (tmp_path / "a.ply").touch()
+    options = FitOptions(scene=f"gaussians:{tmp_path / 'a.ply'}", out=tmp_path / "o", steps=1)
+    fakes = Fakes()
+    _, warnings = open_to_fit(options, fakes.parts().open_scene)
+    assert "held_out=" not in fakes.opened[0] and "may be too good" in warnings[0]
+
+
+def test_a_scene_without_images_is_refused_with_the_way_out(tmp_path):
+    options = FitOptions(scene="procedural:street?seed=3", out=tmp_path / "scene", steps=1)
+    with pytest.raises(ClimateGSError) as caught:
+        run(options, Fakes(recorded=False))
+    assert "climategs render clear --scene 'procedural:street?seed=3' --out raw" in str(
+        caught.value
+    )
+    assert "climategs fit recording:raw/street/clear-000" in str(caught.value)
+
+
+# ---- refusals --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--steps", "5", "--minutes", "1"], "--minutes or --steps, not both"),
+        (["--steps", "0"], "--steps must be a number of steps >= 1; got 0"),
+        (["--minutes", "nan"], "--minutes must be a number of minutes > 0; got nan"),
+        (["--minutes", "inf"], "got inf"),
+        (["--scale", "0"], "--scale must be above 0 and at most 1; got 0.0"),
+        (["--scale", "2"], "got 2.0"),
+        (["--holdout", "every-1st"], "every-2nd or every-8th"),
+        (["--holdout", "half"], "got 'half'"),
+        (["--seed", "-1"], "--seed must be >= 0"),
+        (["--sh-degree", "4"], "--sh-degree must be 0, 1, 2 or 3"),
+        (["--max-splats", "0"], "--max-splats"),
+        (["--depth-weight", "-1"], "--depth-weight must be >= 0"),
+        (["--image-cache-mb", "-1"], "--image-cache-mb"),
+        (["--depth", "/nowhere/depth"], "there is no folder '/nowhere/depth'"),
+        (["--depth", "relative:"], "--depth is lidar, none, or lidar and folders"),
+        (["--depth", "lidar,lidar"], "lidar is given twice"),
+        (["--ego-masks", "/nowhere/masks"], "--ego-masks: there is no folder /nowhere/masks"),
+        (["--cameras", "a,,b"], "--cameras is names separated by commas"),
+    ],
+)
+def test_mistakes_exit_with_2_before_anything_is_opened(arguments, message, tmp_path, capsys):
+    out = tmp_path / "scene"
+    assert main(["fit", "procedural:street", "--out", str(out), *arguments]) == 2
+    error = capsys.readouterr().err
+    assert message in error and "Traceback" not in error
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_held_out_in_the_uri_is_refused(drive, tmp_path):
+    options = FitOptions(scene=f"{drive}?held_out=1::2", out=tmp_path / "scene", steps=1)
+    with pytest.raises(ClimateGSError, match="--holdout says which frames"):
+        run(options, Fakes())
+
+
+def test_other_contents_of_the_output_folder_are_kept(options):
+    options.out.mkdir()
+    (options.out / "diary.txt").write_text("mine")
+    for overwrite in (False, True):
+        with pytest.raises(OutputError, match="holds something else than a scene"):
+            run(dataclasses.replace(options, overwrite=overwrite), Fakes())
+    assert (options.out / "diary.txt").read_text() == "mine"
+
+
+def test_a_scene_of_unknown_origin_is_replaced_only_when_asked(options):
+    options.out.mkdir()
+    (options.out / "scene.json").write_text(json.dumps({"format": FORMAT}))
+    with pytest.raises(OutputError, match=r"there is no .*scene\.fit to go on from"):
+        run(options, Fakes())
+    assert run(dataclasses.replace(options, overwrite=True), Fakes()).code == 0
+
+
+def test_two_runs_at_once_are_refused(options):
+    refused = pytest.raises(OutputError, match="being written by another job")
+    with OutputLock(state_folder(options.out)), refused:
+        run(options, Fakes())
+
+
+@pytest.mark.parametrize(
+    ("text", "priors"),
+    [
+        ("none", {"lidar": False}),
+        ("lidar", {}),
+        ("relative:DIR", {"lidar": False, "relative_dir": "DIR"}),
+        ("DIR", {"lidar": False, "metric_dir": "DIR"}),
+        ("metric:DIR,lidar", {"metric_dir": "DIR"}),
+    ],
+)
+def test_depth_priors(text, priors, tmp_path):
+    expected = {k: tmp_path if v == "DIR" else v for k, v in priors.items()}
+    assert parse_depth(text.replace("DIR", str(tmp_path))) == DepthPriors(**expected)
+
+
+# ---- checkpoints -----------------------------------------------------------------------------
+
+
+def checkpoint(**more) -> Checkpoint:
+    values = {"settings": {"scale": 0.25}, "length": {"steps": 9}, "steps": 9, "data": {}}
+    return Checkpoint(**{**values, **more})
+
+
+def test_checkpoints_keep_every_type_to_the_bit(tmp_path):
+    rng = np.random.default_rng(0)
+    arrays = {
+        "f4": rng.normal(size=(3, 2)).astype(np.float32),
+        "f8": np.array([np.nan, np.inf, -0.0, 5e-324]),
+        "i8": np.arange(4),
+        "i2": np.array([-3], np.int16),
+        "u1": np.array([[7]], np.uint8),
+        "flag": np.array([True, False]),
+        "none": np.zeros((0, 4), np.float32),
+        "scalar": np.array(2.5),
+        "turned": rng.normal(size=(4, 3)).T,
+    }
+    facts = {"rng": rng.bit_generator.state, "rate": 0.1 + 0.2, "names": ["a", "ß"]}
+    save_checkpoint(tmp_path, checkpoint(step=4, arrays=arrays, facts=facts))
+    loaded = load_checkpoint(tmp_path)
+    assert loaded.facts == facts and loaded.step == 4
+    assert loaded.arrays.keys() == arrays.keys()
+    for name, array in arrays.items():
+        back = loaded.arrays[name]
+        assert back.dtype == array.dtype and back.shape == array.shape and back.flags.writeable
+        assert back.tobytes() == array.tobytes()
+
+
+def test_a_new_checkpoint_replaces_the_old_and_failing_keeps_it(tmp_path, monkeypatch):
+    save_checkpoint(tmp_path, checkpoint(step=1, arrays={"a": np.ones(3)}))
+    save_checkpoint(tmp_path, checkpoint(step=2, arrays={"a": np.full(3, 2.0)}))
+    assert [p.name for p in tmp_path.glob("state-*")] == ["state-0000002.safetensors"]
+    real = os.replace
+
+    def full(source, target):
+        if str(target).endswith("fit.json"):
+            raise OSError(28, "No space left on device")
+        real(source, target)
+
+    monkeypatch.setattr(os, "replace", full)
+    with pytest.raises(OutputError, match="disk is full"):
+        save_checkpoint(tmp_path, checkpoint(step=3, arrays={"a": np.full(3, 3.0)}))
+    assert load_checkpoint(tmp_path).arrays["a"][0] == 2.0
+
+
+@pytest.mark.parametrize("name", ["fit.json", "state-0000001.safetensors"])
+@pytest.mark.parametrize("damage", ["cut", "garbage", "gone"])
+def test_a_damaged_checkpoint_is_named(tmp_path, name, damage):
+    save_checkpoint(tmp_path, checkpoint(step=1, arrays={"a": np.ones(100)}))
+    path = tmp_path / name
+    if damage == "gone":
+        path.unlink()
+    else:
+        path.write_bytes(path.read_bytes()[:40] if damage == "cut" else b"\x00garbage")
+    if (name, damage) == ("fit.json", "gone"):
+        assert load_checkpoint(tmp_path) is None
+        return
+    with pytest.raises(OutputError, match=rf"{name} is damaged.*--overwrite"):
+        load_checkpoint(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "change", [{"version": 99}, {"unknown": 1}, {"state": {"file": "x"}}, {"step": "no"}]
+)
+def test_a_checkpoint_of_another_making_is_refused(tmp_path, change):
+    save_checkpoint(tmp_path, checkpoint(step=1, arrays={"a": np.ones(1)}))
+    plan = json.loads((tmp_path / "fit.json").read_text())
+    (tmp_path / "fit.json").write_text(json.dumps({**plan, **change}))
+    with pytest.raises(OutputError, match=r"fit.json is (damaged|of version 99)"):
+        load_checkpoint(tmp_path)
+
+
+# ---- the whole, with the real parts ----------------------------------------------------------
+
+
+@pytest.fixture
+def recording(tmp_path, monkeypatch) -> str:
+    """A street of 3 m with a moving car, recorded by small cameras."""
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "adapters"))
+    write_recording = importlib.import_module("recording_folder").write_recording
+    folder = write_recording(tmp_path / "drive")
+    return f"recording:{folder}?voxel_m=0.1&image_scale=1&sky_size=32"
+
+
+def real_fit(recording, out, before_step=None):
+    parts = real_parts()
+
+    def trainer(scene, source, config):
+        made = parts.trainer(scene, source, config)
+        step = made.run_step
+
+        def run_step():
+            before_step(made.step)
+            return step()
+
+        if before_step is not None:
+            made.run_step = run_step
+        return made
+
+    options = FitOptions(scene=recording, out=out, steps=12, scale=1.0, max_splats=20_000)
+    return fit_scene(options, parts=dataclasses.replace(parts, trainer=trainer), progress=False)
+
+
+def test_a_recording_is_fitted_and_interruptions_change_no_bit(recording, tmp_path):
+    whole = real_fit(recording, tmp_path / "whole")
+    assert whole.code == 0
+    stopped = real_fit(recording, tmp_path / "parts", interrupter(4, signal.SIGINT))
+    assert stopped.code == 130
+    so_far = open_scene(f"scene:{tmp_path / 'parts'}")
+    assert so_far.actors and so_far.frames
+    assert real_fit(recording, tmp_path / "parts").code == 0
+    assert written(tmp_path / "whole") == written(tmp_path / "parts")
+    scored = [row["psnr"] for row in whole.report["history"] if row.get("split") == "train"]
+    assert scored[-1] > scored[0]

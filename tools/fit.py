@@ -1,0 +1,272 @@
+"""`climategs fit`: recorded images, LiDAR and boxes become a scene of Gaussians.
+
+OUT is the scene; OUT.fit beside it holds the checkpoint and the report. The scene's bytes depend on
+the data, the settings and the number of steps alone; times are in OUT.fit only.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from augment.batch.lock import OutputLock
+from augment.errors import OutputError
+from augment.scene import Scene
+from augment.scene_files import is_scene_folder
+from tools.fit_checkpoint import (
+    Checkpoint,
+    clear_checkpoint,
+    load_checkpoint,
+    mark_finished,
+    save_checkpoint,
+)
+from tools.fit_data import data_facts, open_to_fit
+from tools.fit_loop import CHECKPOINT_S, History, Loop, StopRequest, sample_keys
+from tools.fit_options import FitOptions, differences
+from tools.fit_parts import FitParts, Fitter, Views, real_parts
+from tools.fit_time import estimate_steps
+
+EVALUATED = {"test": 6, "train": 3}  # views looked at during the run; all of them at its end
+REPORT_FILE = "report.json"
+
+
+@dataclass(frozen=True)
+class FitOutcome:
+    """code: the command's exit code, 130 where it was interrupted. report: as in report.json."""
+
+    code: int
+    report: dict[str, Any]
+
+
+def fit_scene(
+    options: FitOptions,
+    *,
+    parts: FitParts | None = None,
+    checkpoint_s: float = CHECKPOINT_S,
+    progress: bool = True,
+) -> FitOutcome:
+    """Fits, or goes on fitting, `options.scene` into `options.out`.
+
+    Raises:
+        ClimateGSError: options, data or the output folder cannot be used as they are.
+    """
+    folder = state_folder(options.out)
+    _check_out(options, folder)
+    with OutputLock(folder):
+        if options.overwrite:
+            clear_checkpoint(folder)
+        before = load_checkpoint(folder, arrays=False)
+        if before is not None:
+            _check_same(options, before)
+            if before.finished and (done := _finished(options, folder, before)) is not None:
+                return done
+        run = _prepare(options, parts or real_parts(), folder, before)
+        return _run(run, checkpoint_s, progress)
+
+
+def state_folder(out: Path) -> Path:
+    """Where the checkpoint and the report of a scene folder lie: beside it."""
+    out = out.absolute()
+    return out.with_name(f"{out.name}.fit")
+
+
+@dataclass(frozen=True, eq=False)
+class _Run:
+    """All that fitting needs, opened and at the step to go on from."""
+
+    options: FitOptions
+    parts: FitParts
+    folder: Path
+    scene: Scene
+    source: Views
+    leaks: tuple[str, ...]
+    trainer: Fitter
+    plan: Checkpoint
+    history: History
+
+
+def _prepare(options: FitOptions, parts: FitParts, folder: Path, before: Checkpoint | None) -> _Run:
+    scene, leaks = open_to_fit(options, parts.open_scene)
+    source = parts.views(scene, options)
+    for problem in _problems(scene, source, leaks):
+        _say(f"note: {problem}")
+    facts = data_facts(scene, source)
+    _say(
+        f"{len(source.train)} images to learn from, {len(source.test)} held out; "
+        f"{facts['Gaussians to start from']} Gaussians and {len(scene.actors)} actors to start from"
+    )
+    if before is None:
+        plan = Checkpoint(options.settings(), options.length(), options.steps or 0, facts)
+        if options.budget_s is not None:
+            steps = _estimate(options, parts, scene, source)
+            plan = dataclasses.replace(plan, steps=steps)
+        save_checkpoint(folder, plan)
+    else:
+        plan = load_checkpoint(folder)
+        assert plan is not None
+        if changed := differences(plan.data, facts):
+            raise OutputError(
+                f"{options.scene} is not what {options.out} was fitted to so far: "
+                f"{'; '.join(changed)}. Begin anew with --overwrite, or fit to another --out"
+            )
+    trainer = parts.trainer(scene, source, options.config(plan.steps))
+    if plan.arrays:
+        trainer.load_state(plan.arrays, plan.facts)
+        _say(f"going on after step {plan.step} of {plan.steps}")
+    history = History(plan.history, plan.sums, plan.seconds)
+    plan = dataclasses.replace(plan, arrays={}, facts={})  # the trainer has them: free the memory
+    return _Run(options, parts, folder, scene, source, leaks, trainer, plan, history)
+
+
+def _estimate(options: FitOptions, parts: FitParts, scene: Scene, source: Views) -> int:
+    assert options.budget_s is not None
+
+    def throw_away(steps: int) -> Fitter:
+        return parts.trainer(scene, source, options.config(steps))
+
+    _say("timing a few steps (kernels are compiled first where they are not yet) ...")
+    estimate = estimate_steps(throw_away, options.budget_s, grows=options.densify != "none")
+    _say(
+        f"{1e3 * estimate.step_s:.0f} ms a step at the start: {estimate.steps} steps make about "
+        f"{options.budget_s / 60:g} minutes. --steps {estimate.steps} gives the same scene again"
+    )
+    return estimate.steps
+
+
+def _run(run: _Run, checkpoint_s: float, progress: bool) -> FitOutcome:
+    begun = time.perf_counter()
+    keys = {
+        split: sample_keys(getattr(run.source, split), count) for split, count in EVALUATED.items()
+    }
+
+    def evaluate() -> dict[str, dict[str, float]]:
+        scene = run.trainer.scene()
+        return {s: run.parts.score(scene, run.source, k) for s, k in keys.items() if k}
+
+    with StopRequest() as stop:
+        loop = Loop(
+            trainer=run.trainer,
+            steps=run.plan.steps,
+            history=run.history,
+            evaluate=evaluate,
+            save=lambda: save_checkpoint(run.folder, _checkpoint(run)),
+            stop=stop,
+            checkpoint_s=checkpoint_s,
+            progress=progress,
+        )
+        complete = loop.run()
+        _say(f"writing {run.options.out} and evaluating all views")
+        report = _write(run, complete, time.perf_counter() - begun)
+    if complete:
+        mark_finished(run.folder)
+        return FitOutcome(0, report)
+    _say(
+        f"stopped after step {run.trainer.step} of {run.plan.steps}; the same command goes on "
+        f"from there, and what is fitted so far can be rendered"
+    )
+    return FitOutcome(130, report)
+
+
+def _checkpoint(run: _Run) -> Checkpoint:
+    arrays, facts = run.trainer.state()
+    return dataclasses.replace(
+        run.plan,
+        step=run.trainer.step,
+        seconds=run.history.spent_s(),
+        history=run.history.rows,
+        sums=run.history.sums,
+        facts=facts,
+        arrays=arrays,
+    )
+
+
+def _write(run: _Run, complete: bool, seconds: float) -> dict[str, Any]:
+    options = run.options
+    made_by = {"command": "fit", "step": run.trainer.step, "steps": run.plan.steps}
+    made_by |= {"settings": run.plan.settings, "data": run.plan.data}
+    scene = dataclasses.replace(run.trainer.scene(), made_by=made_by)
+    run.parts.save(scene, options.out.absolute())
+    facts = {
+        "scene": options.scene,
+        "complete": complete,
+        "step": run.trainer.step,
+        "steps": run.plan.steps,
+        "seconds": run.history.spent_s(),
+        "seconds_of_this_run": seconds,
+        "data": run.plan.data,
+        "settings": run.plan.settings,
+        "problems": list(_problems(run.scene, run.source, run.leaks)),
+    }
+    folder = report_folder(run.folder)
+    report = run.parts.report(folder, scene, run.source, run.history.rows, facts)
+    _show_end(options.out, folder)
+    return report
+
+
+def _problems(scene: Scene, source: Views, leaks: tuple[str, ...]) -> tuple[str, ...]:
+    """Every sentence once; loading views may have added some since they were opened."""
+    return tuple(dict.fromkeys((*scene.problems, *source.problems, *leaks)))
+
+
+def report_folder(folder: Path) -> Path:
+    return folder / "report"
+
+
+def _check_out(options: FitOptions, folder: Path) -> None:
+    """What is at --out is a scene, or nothing; known before hours are spent."""
+    out = options.out
+    if not out.exists() or (out.is_dir() and not any(out.iterdir())):
+        return
+    if not is_scene_folder(out):
+        raise OutputError(f"{out} holds something else than a scene: choose another --out")
+    if not options.overwrite and load_checkpoint(folder, arrays=False) is None:
+        raise OutputError(
+            f"{out} holds a scene, and there is no {folder} to go on from: choose another --out, "
+            f"or replace it with --overwrite"
+        )
+
+
+def _check_same(options: FitOptions, before: Checkpoint) -> None:
+    changed = differences(before.settings, options.settings())
+    asked = options.length()
+    if asked != before.length and asked.get("steps") != before.steps:
+        was, now = (" ".join(f"--{n} {v:g}" for n, v in a.items()) for a in (before.length, asked))
+        changed.append(f"its length was {was} ({before.steps} steps), now {now}")
+    if changed:
+        raise OutputError(
+            f"{options.out} was begun with other settings: {'; '.join(changed)}. Choose another "
+            f"--out, or begin anew with --overwrite"
+        )
+
+
+def _finished(options: FitOptions, folder: Path, before: Checkpoint) -> FitOutcome | None:
+    """The outcome where scene and report stand; None where one of them was lost since."""
+    report = report_folder(folder) / REPORT_FILE
+    try:
+        facts = json.loads(report.read_bytes())
+    except (OSError, ValueError):
+        return None
+    if not is_scene_folder(options.out):
+        return None
+    print(f"{options.out} is finished already ({before.steps} steps); nothing was done")
+    _show_end(options.out, report.parent)
+    return FitOutcome(0, facts)
+
+
+def _show_end(out: Path, folder: Path) -> None:
+    table = folder / "report.md"
+    if table.is_file():
+        print("\n".join(line for line in table.read_text().splitlines() if line.startswith("|")))
+    for path in sorted((*folder.glob("*.jpg"), *folder.glob("*.png"), *folder.glob("*.md"))):
+        print(f"{path.stem.replace('_', ' ')}: {path}")
+    print(f"scene: {out}")
+    print(f"render it: climategs render dense-fog --scene 'scene:{out}' --out out/fog")
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr)

@@ -1,0 +1,155 @@
+"""The state of an unfinished reconstruction on disk, from which it goes on to the same bits.
+
+`fit.json` says all there is to say and names the arrays' file with its checksum; it is written last
+and replaced in one step, so a kill at any moment leaves a whole checkpoint: this one or the one
+before.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import safetensors.numpy
+from safetensors import SafetensorError
+
+from augment.batch.atomic import output_error, remove_temporaries, write_atomic
+from augment.errors import OutputError
+
+VERSION = 1
+PLAN_FILE = "fit.json"
+_STATES = "state-*.safetensors"
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A reconstruction after `step` of `steps` steps.
+
+    settings, length: what was asked for. data: what was found in the recorded data. history: rows
+    so far; sums: of the steps since the last row; seconds: spent so far. facts, arrays: the
+    Trainer's state; no arrays before the first step. finished: the scene and its report stand.
+    """
+
+    settings: dict[str, Any]
+    length: dict[str, float]
+    steps: int
+    data: dict[str, Any]
+    step: int = 0
+    finished: bool = False
+    seconds: float = 0.0
+    history: list[dict[str, Any]] = field(default_factory=list)
+    sums: dict[str, float] = field(default_factory=dict)
+    facts: dict[str, Any] = field(default_factory=dict)
+    arrays: dict[str, np.ndarray] = field(default_factory=dict)
+
+
+def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
+    """Replace the folder's checkpoint.
+
+    Raises:
+        OutputError: the system refused; the checkpoint before is then as it was.
+    """
+    plan = {**facts_of(checkpoint), "version": VERSION, "state": None}
+    name = None
+    if checkpoint.arrays:
+        name = f"state-{checkpoint.step:07d}.safetensors"
+        arrays = {key: np.asarray(a, order="C") for key, a in checkpoint.arrays.items()}
+        data = safetensors.numpy.save(arrays)
+        plan["state"] = {"file": name, "sha256": hashlib.sha256(data).hexdigest()}
+        write_atomic(folder / name, data)
+    write_atomic(folder / PLAN_FILE, (json.dumps(plan, indent=1) + "\n").encode())
+    for path in folder.glob(_STATES):
+        if path.name != name:
+            _remove(path)
+
+
+def mark_finished(folder: Path) -> None:
+    """Note that the scene and the report of the folder's checkpoint are written."""
+    plan = _read_plan(folder)
+    plan["finished"] = True
+    write_atomic(folder / PLAN_FILE, (json.dumps(plan, indent=1) + "\n").encode())
+
+
+def load_checkpoint(folder: Path, *, arrays: bool = True) -> Checkpoint | None:
+    """The folder's checkpoint; None where there is none. arrays: False leaves them on disk.
+
+    Raises:
+        OutputError: a file of it is missing, damaged, or of another version.
+    """
+    if not (folder / PLAN_FILE).is_file():
+        return None
+    plan = _read_plan(folder)
+    state = plan.pop("state")
+    del plan["version"]
+    return Checkpoint(**plan, arrays=_read_state(folder, state) if state and arrays else {})
+
+
+def clear_checkpoint(folder: Path) -> None:
+    """Forget what was fitted here, and what a killed run left."""
+    for path in (folder / PLAN_FILE, *folder.glob(_STATES)):  # the plan first: it names a state
+        _remove(path)
+    if folder.is_dir():
+        remove_temporaries(folder, recursive=False)
+
+
+def facts_of(checkpoint: Checkpoint) -> dict[str, Any]:
+    """The checkpoint's facts for JSON."""
+    names = (name for name in Checkpoint.__dataclass_fields__ if name != "arrays")
+    return {name: getattr(checkpoint, name) for name in names}
+
+
+def _read_plan(folder: Path) -> dict[str, Any]:
+    path = folder / PLAN_FILE
+    try:
+        plan = json.loads(path.read_bytes())
+    except OSError as error:
+        raise OutputError(f"{path} cannot be read: {error.strerror}") from error
+    except ValueError as error:
+        raise _damaged(path, str(error)) from error
+    version = plan.get("version") if isinstance(plan, dict) else None
+    if version != VERSION:
+        raise OutputError(
+            f"{path} is of version {version}, this program writes {VERSION}: fit to another --out, "
+            f"or begin anew with --overwrite"
+        )
+    names = {*Checkpoint.__dataclass_fields__, "version", "state"} - {"arrays"}
+    if wrong := names ^ plan.keys():
+        raise _damaged(path, f"it lacks, or should not have, {', '.join(sorted(wrong))}")
+    step, steps = plan["step"], plan["steps"]
+    if not (isinstance(step, int) and isinstance(steps, int) and 0 <= step <= steps):
+        raise _damaged(path, f"it is at step {step!r} of {steps!r}")
+    return plan
+
+
+def _read_state(folder: Path, state: dict[str, str]) -> dict[str, np.ndarray]:
+    try:
+        path = folder / Path(state["file"]).name  # a name: nothing outside the folder is read
+        checksum = state["sha256"]
+    except (KeyError, TypeError) as error:
+        raise _damaged(folder / PLAN_FILE, "it does not name its state's file") from error
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise _damaged(path, f"it cannot be read ({error.strerror})") from error
+    if hashlib.sha256(data).hexdigest() != checksum:
+        raise _damaged(path, f"its SHA-256 is not the one in {PLAN_FILE}")
+    try:
+        arrays = safetensors.numpy.load(data)
+    except SafetensorError as error:
+        raise _damaged(path, str(error)) from error
+    return {name: np.array(array) for name, array in arrays.items()}  # the loader's are read-only
+
+
+def _damaged(path: Path, what: str) -> OutputError:
+    return OutputError(f"{path} is damaged: {what}. Begin anew with --overwrite")
+
+
+def _remove(path: Path) -> None:
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise output_error(path, error) from error
