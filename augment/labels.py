@@ -12,6 +12,10 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
+# The label of an actor that is the recording car itself, as one camera sees it: no dataset labels
+# it, no box stands for it, and no LiDAR return is its own.
+EGO_VEHICLE = "ego_vehicle"
+
 
 @dataclass(frozen=True, eq=False)
 class Boxes:

@@ -9,9 +9,10 @@ import numpy as np
 
 from adapters.lidar.actor_motion import Motion, indices_between, inside_box
 from adapters.lidar.split import FLOOR_M, HALO_M, SKIN_M
+from adapters.lidar.sweep_times import sweep_times
 from augment.cameras import Camera
 from augment.errors import AdapterError
-from augment.labels import LidarSweep
+from augment.labels import EGO_VEHICLE, LidarSweep
 from augment.scene import Scene
 
 _NEAR_M = 0.1
@@ -66,7 +67,8 @@ def lidar_depth(
     pixel may show the depth of something that a nearer object hides from the camera.
 
     Raises:
-        AdapterError: the sweep has no times (column timestamp_ns, or t in seconds).
+        AdapterError: the sweep has no times (column timestamp_ns, or t in seconds) and its frame
+            is none of the scene's, whose time would be taken.
     """
     returns = read_returns(scene, frame_index, without_semantic=without_semantic)
     if returns is None:
@@ -82,7 +84,7 @@ def read_returns(
     if sweep is None:
         return None
     points = sweep.points_m - scene.world_origin_m
-    times = _times(sweep, frame_index)
+    times = _times(scene, sweep, frame_index)
     keep = np.isfinite(points).all(axis=1)
     if without_semantic and "semantic" in sweep.columns:
         keep &= ~np.isin(sweep.columns["semantic"], list(without_semantic))
@@ -103,7 +105,11 @@ def depth_seen(returns: FrameReturns, camera: Camera) -> SparseDepth:
     return _project(points[present], returns.timestamps_ns[present], camera)
 
 
-def _times(sweep: LidarSweep, frame_index: int) -> np.ndarray:
+def _times(scene: Scene, sweep: LidarSweep, frame_index: int) -> np.ndarray:
+    frame_ns = next((f.timestamp_ns for f in scene.frames if f.index == frame_index), None)
+    if frame_ns is not None:
+        times = sweep_times(sweep, frame_ns)
+        return np.full(len(sweep), frame_ns, np.int64) if times is None else times
     if "timestamp_ns" in sweep.columns:
         return sweep.columns["timestamp_ns"].astype(np.int64)
     if "t" in sweep.columns:
@@ -120,6 +126,8 @@ def _on_actors(
     """For each actor with returns: its motion, their indices, and where they are on it."""
     found = []
     for actor in scene.actors if len(points) else ():
+        if actor.label == EGO_VEHICLE:
+            continue
         motion = Motion.of(actor.track)
         size_m = np.array(actor.size_m)
         low, high = motion.span(int(times.min()), int(times.max()))
