@@ -67,6 +67,11 @@ def open_recording(path: str, query: dict[str, str]) -> Scene:
     listed = [frame for frame in calibration.frames if frame.index in set(chosen.numbers)]
     frames, image_problems = find_images(root, listed)
     used = [frame for frame in frames if frame.index not in chosen.held_out]
+    if not any(frame.image_paths for frame in used):
+        raise AdapterError(
+            f"{root / 'images'} holds no usable image of the frames that are not held out "
+            f"({used[0].index} to {used[-1].index}); colours cannot be had without them"
+        )
     objects = read_objects(frames, all_boxes(root), calibration.world_origin_m)
     start = _Start(root, calibration, options, frames, used, objects)
     built, problems = start.build()

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from augment.batch.encode import decode_image
+from adapters.lidar.image_views import read_image
 from augment.batch.layout import folder_name
 from augment.cameras import Camera, Frame
 from augment.errors import AdapterError
@@ -127,11 +127,12 @@ def _fault(path: Path | None, camera: Camera) -> str:
         data = path.read_bytes()
         if not _is_whole(data):
             return f"image {path} is cut short, or neither PNG nor JPEG"
-        height, width, _ = decode_image(data).shape
     except OSError as error:
         return f"image {path} cannot be read ({error.strerror})"
-    except ValueError as error:
-        return f"image {path} is damaged: {error}"
+    image = read_image(path, 1.0)
+    if image is None:
+        return f"image {path} cannot be decoded"
+    height, width, _ = image.shape
     if (width, height) != (camera.width, camera.height):
         return (
             f"image {path} is {width}x{height} pixels, calibration.json says "

@@ -17,7 +17,9 @@ import torch
 from recording_folder import QUERY, write_recording
 
 from adapters.base import open_scene, recognise
+from adapters.lidar.depth import lidar_depth
 from adapters.recording import open_recording
+from adapters.recording.calibration import read_calibration
 from adapters.uri import format_uri
 from augment.batch.job import RenderJob, run_job
 from augment.errors import AdapterError
@@ -250,6 +252,17 @@ def test_a_box_without_points_is_said(copy):
     assert problem.startswith("1 moving objects, such as 'car', have too few points")
 
 
+def test_sweeps_without_times_are_depth_priors_too(copy):
+    for frame in range(3):
+        columns = recording.sweep_columns(frame)
+        del columns["t"]
+        recording.write_lidar(copy, frame, columns)
+    scene = open_recording(str(copy), QUERY)
+    assert "frames' times are used" in scene.problems[0]
+    depth = lidar_depth(scene, 1, scene.frame(1).cameras["front_camera"])
+    assert len(depth) > 1000 and (depth.timestamp_ns == recording.time_ns(1)).all()
+
+
 def test_without_boxes_or_classes_it_is_one_static_world(tmp_path):
     folder = write_recording(tmp_path / "drive", boxes=False)
     for frame in range(3):
@@ -260,3 +273,20 @@ def test_without_boxes_or_classes_it_is_one_static_world(tmp_path):
     assert scene.problems == () and scene.actors == ()
     assert (scene.background.semantic == SemanticClass.UNKNOWN).all()
     assert scene.ground_z_m == pytest.approx(street.GROUND_Z, abs=0.02)
+
+
+def test_the_example_in_the_docs_is_a_recording(tmp_path, monkeypatch):
+    text = (Path(__file__).parents[2] / "docs" / "scenes.md").read_text()
+    section = text.split("## `recording:PATH`")[1].split("\n## ")[0]
+    calibration, program = (
+        section.split(f"```{kind}\n")[1].split("```")[0] for kind in ("json", "python")
+    )
+    monkeypatch.chdir(tmp_path)
+    exec(compile(program, "docs/scenes.md", "exec"), {})
+    scene = open_scene("my-drive?image_scale=1&sky_size=16&voxel_m=0.2")
+    assert scene.problems == () and scene.name == "my-drive" and len(scene.boxes(0)) == 1
+    assert len(scene.background) > 1000 and scene.ground_z_m == pytest.approx(0, abs=1e-6)
+    Path("my-drive/calibration.json").write_text(calibration)
+    front = read_calibration(Path("my-drive")).frames[0].cameras["front"]
+    assert (front.width, front.timestamp_ns) == (1920, 1700000000412000000)
+    np.testing.assert_allclose(front.ray_directions()[540, 960], [1, 0, 0], atol=1e-3)

@@ -153,7 +153,7 @@ def test_missing_and_damaged_images_are_problems(folder):
     frames, problems = images_of(folder)
     assert [len(frame.image_paths) for frame in frames] == [1, 1, 1]
     assert problems[0] == "camera left_camera, frame 0: its image is missing"
-    assert "000001.png is cut short" in problems[1] and "000002.png is damaged" in problems[2]
+    assert "000001.png is cut short" in problems[1] and "000002.png cannot be decoded" in problems[2]
     more = unlisted_images(folder, frames)
     assert "front_camera: 1 images, such as of frame 77, have no entry" in more[0]
     assert "images/roof belongs to no camera of calibration.json" in more[1]
