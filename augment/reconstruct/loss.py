@@ -31,7 +31,6 @@ from augment.reconstruct.loss_reference import LEAST_ALPHA, LEAST_SKY
 from augment.reconstruct.view import RecordedView
 from augment.render.threads import kernel_threads
 
-ROWS = 8  # image rows a thread takes at a time
 IDENTITY_MAP = np.eye(3, 4, dtype=np.float32)
 
 
@@ -74,7 +73,7 @@ def picture(
     rgb, alpha, sky_faces, color_map = _checked(rgb, alpha, camera, sky_faces, color_map)
     buffers = ImageBuffers(camera.height, camera.width)
     out = np.empty_like(rgb)
-    with kernel_threads(ROWS):
+    with kernel_threads():
         _sample_sky(alpha, camera, sky_faces, np.float32(0), buffers)
         loss_kernels.finish_picture(
             rgb.reshape(-1),
@@ -115,11 +114,11 @@ def view_loss(
     )
     scratch = scratch or LossScratch()
     buffers = scratch.image(camera.height, camera.width)
-    with kernel_threads(ROWS):
+    with kernel_threads():
         _sample_sky(alpha, camera, sky_faces, np.float32(LEAST_SKY), buffers)
         l1, ssim, sky, d_color_map = _compare(rgb, alpha, view, color_map, weights, buffers)
-    depth = _compare_depth(expected_depth, alpha, view, weights, buffers)
-    d_sky = scratch.sky(sky_faces.shape[1]).gradient(buffers.d_rgb, alpha, buffers)
+        depth = _compare_depth(expected_depth, alpha, view, weights, buffers)
+        d_sky = scratch.sky(sky_faces.shape[1]).gradient(buffers.d_rgb, alpha, buffers)
     total = (1 - weights.d_ssim) * l1 + weights.d_ssim * (1 - ssim) / 2
     total += weights.depth * depth + weights.sky * sky
     return ViewLoss(
@@ -184,14 +183,17 @@ def _compare(
         buffers.behind,
         pairs,
         kept,
-        buffers.sums,
+        buffers.sums.reshape(-1),
+        buffers.covered,
     )
-    error_sum, weight_sum, covered = buffers.sums.sum(axis=0).tolist()
+    error_sum, weight_sum = buffers.sums.sum(axis=(0, 2), dtype=np.float64).tolist()
+    covered = float(buffers.covered.sum())
     count = 3 * weight_sum
     ssim, ssim_factor = 1.0, 0.0
     if count > 0 and weights.d_ssim != 0:
-        loss_kernels.compare_windows(pairs, kept, size, slopes, buffers.ssim_sums)
-        ssim, ssim_factor = float(buffers.ssim_sums.sum()) / count, -weights.d_ssim / 2 / count
+        loss_kernels.compare_windows(pairs, kept, size, slopes, buffers.ssim_sums.reshape(-1))
+        ssim = float(buffers.ssim_sums.sum(dtype=np.float64)) / count
+        ssim_factor = -weights.d_ssim / 2 / count
     per_weight = 1 / count if count > 0 else 0.0
     factors = ((1 - weights.d_ssim) * per_weight, ssim_factor, weights.sky / pixels)
     loss_kernels.differentiate(
@@ -206,9 +208,9 @@ def _compare(
         np.array(factors, np.float32),
         buffers.d_rgb.reshape(-1),
         buffers.d_alpha.reshape(-1),
-        buffers.map_sums,
+        buffers.map_sums.reshape(-1),
     )
-    d_color_map = buffers.map_sums.sum(axis=0)
+    d_color_map = buffers.map_sums.sum(axis=(0, 3), dtype=np.float64)
     return error_sum * per_weight, ssim, covered / pixels, d_color_map
 
 
@@ -225,18 +227,17 @@ def _compare_depth(
     if weight_sum <= 0 or weights.depth == 0:
         return 0.0
     sums = np.empty(-(-len(view.depth_pixels) // depth_kernels.CHUNK))
-    with kernel_threads():
-        depth_kernels.compare_depth(
-            expected_depth.reshape(-1),
-            alpha.reshape(-1),
-            _writeable(view.depth_pixels),
-            _writeable(view.depth_m),
-            _writeable(view.depth_weight),
-            np.float32(weights.depth / weight_sum),
-            np.float32(LEAST_ALPHA),
-            buffers.d_expected_depth.reshape(-1),
-            sums,
-        )
+    depth_kernels.compare_depth(
+        expected_depth.reshape(-1),
+        alpha.reshape(-1),
+        _writeable(view.depth_pixels),
+        _writeable(view.depth_m),
+        _writeable(view.depth_weight),
+        np.float32(weights.depth / weight_sum),
+        np.float32(LEAST_ALPHA),
+        buffers.d_expected_depth.reshape(-1),
+        sums,
+    )
     if sums.min() < 0:
         raise ValueError(
             f"view of camera {view.camera.name!r}: depth_pixels must be increasing indices from 0 "

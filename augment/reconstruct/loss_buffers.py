@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from augment.reconstruct import loss_kernels, sky_kernels
-from augment.render.threads import kernel_threads
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,9 +33,10 @@ class ImageBuffers:
         self.pairs = np.zeros(6 * padded, np.float32)  # their margins stay zero
         self.slopes = np.zeros(9 * padded, np.float32)
         self.weights = np.empty(height * stride, np.float32)
-        self.sums = np.empty((height, 3))
-        self.ssim_sums = np.empty(height)
-        self.map_sums = np.empty((height, 3, 4))
+        self.sums = np.empty((height, 2, lanes), np.float32)
+        self.covered = np.empty(height)
+        self.ssim_sums = np.empty((height, lanes), np.float32)
+        self.map_sums = np.empty((height, 3, 4, lanes), np.float32)
         self.behind = np.empty(3 * height * stride, np.float32)
         self.d_rgb = np.empty((height, width, 3), np.float32)
         self.d_alpha = np.empty((height, width), np.float32)
@@ -63,10 +63,9 @@ class SkyBuffers:
             self.parts.fill(0)
             self.touched.fill(0)
         self.is_clean = False
-        with kernel_threads():
-            sky_kernels.scatter_sky(
-                d_rgb, alpha, image.texels, image.fractions, self.size, self.parts, self.touched
-            )
+        sky_kernels.scatter_sky(
+            d_rgb, alpha, image.texels, image.fractions, self.size, self.parts, self.touched
+        )
         words = self.touched.view(np.uint64)
         count = sky_kernels.gather_sky(self.parts, self.touched, words, self.texels, self.grads)
         self.is_clean = True

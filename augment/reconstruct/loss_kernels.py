@@ -12,7 +12,8 @@ by P plus N, by G((x + y)^2) and by G((x - y)^2), each times the pixel's weight,
     d/dx = G(a) + (x + y) G(2 b) + (x - y) G(2 c)
 
 Planes are rows of `stride` float32, a multiple of LANES; those that are blurred have PAD rows of
-zeros above and below, and zeros from the image's width to the stride.
+zeros above and below, and zeros from the image's width to the stride. Sums are left as LANES sums
+of every row, to be added up in float64.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ LANES = v8.LANES
 PAD = 5  # the window's radius
 MARGIN = 8  # zeros on either side of a row that is blurred, >= PAD
 SIGMA = 1.5
+BAND = 8  # image rows that a thread takes at a time
 C1, C2 = np.float32(0.01**2), np.float32(0.03**2)
 
 _BELL = [math.exp(-(k**2) / (2 * SIGMA**2)) for k in range(PAD + 1)]
@@ -141,68 +143,83 @@ def finish_picture(rgb, alpha, sky, color_map, size, out):
     [3, 4]. size: height, width, stride.
     """
     width, stride = U(size[1]), U(size[2])
-    for i in prange(size[0]):
+    for band in prange((size[0] + BAND - 1) // BAND):
         rows = np.zeros(7 * size[2], np.float32)
-        _composite_row(rgb, alpha, sky, U(i), size, rows, rows, U(4) * stride, stride)
-        for j in range(U(0), stride, U(LANES)):
-            for c in range(U(0), U(3)):
-                value = _mapped(rows, U(4) * stride + j, stride, color_map, c)
-                v8.store(rows, c * stride + j, value)
-        for j in range(U(0), width):
-            for c in range(U(0), U(3)):
-                out[(U(i) * width + j) * U(3) + c] = rows[c * stride + j]
+        for i in range(band * BAND, min((band + 1) * BAND, size[0])):
+            _composite_row(rgb, alpha, sky, U(i), size, rows, rows, U(4) * stride, stride)
+            for j in range(U(0), stride, U(LANES)):
+                for c in range(U(0), U(3)):
+                    value = _mapped(rows, U(4) * stride + j, stride, color_map, c)
+                    v8.store(rows, c * stride + j, value)
+            for j in range(U(0), width):
+                for c in range(U(0), U(3)):
+                    out[(U(i) * width + j) * U(3) + c] = rows[c * stride + j]
 
 
 @kernel
 def compare(
-    rgb, alpha, sky, color_map, recorded, weight, is_sky, size, behind, pairs, weights, sums
+    rgb,
+    alpha,
+    sky,
+    color_map,
+    recorded,
+    weight,
+    is_sky,
+    size,
+    behind,
+    pairs,
+    weights,
+    sums,
+    covered,
 ):
     """x + y and x - y of the finished and the recorded picture, and the sums of the L1 loss.
 
     recorded: flat uint8 [H, W, 3]. weight, is_sky: flat [H, W]; the rest as `finish_picture`.
     Written: behind, the composited colour, flat planes [3, H, stride]; pairs, six flat planes
     [H + 2 PAD, stride], red, green, blue of x + y, then of x - y; weights, a flat plane [H,
-    stride]; sums, float64 [H, 3]: of weight |x - y|, of weight, and of alpha in the sky. Where the
-    weight is 0, y is x.
+    stride]; sums, flat [H, 2, LANES]: of weight |x - y| and of weight; covered, float64 [H]: of
+    alpha in the sky. Where the weight is 0, y is x.
     """
     height, width, stride = U(size[0]), U(size[1]), U(size[2])
     plane = U(size[0] + 2 * PAD) * stride
     to_unit = v8.splat(np.float32(1 / 255))
-    for i in prange(size[0]):
-        row = U(i)
-        own = row * stride
+    for band in prange((size[0] + BAND - 1) // BAND):
         rows = np.zeros(U(4) * stride, np.float32)
-        _composite_row(rgb, alpha, sky, row, size, rows, behind, own, height * stride)
-        covered = 0.0
-        for j in range(U(0), width):
-            at = row * width + j
-            weights[own + j] = weight[at]
-            if is_sky[at]:
-                covered += alpha[at]
-            rows[j] = np.float32(recorded[at * U(3)])
-            rows[stride + j] = np.float32(recorded[at * U(3) + U(1)])
-            rows[U(2) * stride + j] = np.float32(recorded[at * U(3) + U(2)])
-        for j in range(width, stride):
-            weights[own + j] = np.float32(0)
-        zero = v8.splat(np.float32(0))
-        error, weight_sum = zero, zero
-        first = (row + U(PAD)) * stride
-        for j in range(U(0), stride, U(LANES)):
-            w = v8.load(weights, own + j)
-            is_used = v8.greater(w, zero)
-            weight_sum = weight_sum + w
-            for c in range(U(0), U(3)):
-                x = _mapped(behind, own + j, height * stride, color_map, c)
-                y = v8.select(is_used, v8.load(rows, c * stride + j) * to_unit, x)
-                v8.store(pairs, c * plane + first + j, x + y)
-                v8.store(pairs, (U(3) + c) * plane + first + j, x - y)
-                error = v8.fmuladd(v8.absolute(x - y), w, error)
-        for c in range(U(0), U(6)):  # beyond the image both are zero, as the window's padding is
+        for i in range(band * BAND, min((band + 1) * BAND, size[0])):
+            row = U(i)
+            own = row * stride
+            _composite_row(rgb, alpha, sky, row, size, rows, behind, own, height * stride)
+            opacity = 0.0
+            for j in range(U(0), width):
+                at = row * width + j
+                weights[own + j] = weight[at]
+                if is_sky[at]:
+                    opacity += alpha[at]
+                rows[j] = np.float32(recorded[at * U(3)])
+                rows[stride + j] = np.float32(recorded[at * U(3) + U(1)])
+                rows[U(2) * stride + j] = np.float32(recorded[at * U(3) + U(2)])
             for j in range(width, stride):
-                pairs[c * plane + first + j] = np.float32(0)
-        sums[i, 0] = v8.total(error)
-        sums[i, 1] = v8.total(weight_sum)
-        sums[i, 2] = covered
+                weights[own + j] = np.float32(0)
+            zero = v8.splat(np.float32(0))
+            error, weight_sum = zero, zero
+            first = (row + U(PAD)) * stride
+            for j in range(U(0), stride, U(LANES)):
+                w = v8.load(weights, own + j)
+                is_used = v8.greater(w, zero)
+                weight_sum = weight_sum + w
+                for c in range(U(0), U(3)):
+                    x = _mapped(behind, own + j, height * stride, color_map, c)
+                    y = v8.select(is_used, v8.load(rows, c * stride + j) * to_unit, x)
+                    v8.store(pairs, c * plane + first + j, x + y)
+                    v8.store(pairs, (U(3) + c) * plane + first + j, x - y)
+                    error = v8.fmuladd(v8.absolute(x - y), w, error)
+            # Beyond the image both are zero, as the window's padding is.
+            for c in range(U(0), U(6)):
+                for j in range(width, stride):
+                    pairs[c * plane + first + j] = np.float32(0)
+            v8.store(sums, row * U(2 * LANES), error)
+            v8.store(sums, row * U(2 * LANES) + U(LANES), weight_sum)
+            covered[i] = opacity
 
 
 @kernel
@@ -210,49 +227,50 @@ def compare_windows(pairs, weights, size, slopes, sums):
     """SSIM's sum with the weights, and the three planes that its gradient is blurred from.
 
     pairs, weights: from `compare`. Written: slopes, nine flat planes [H + 2 PAD, stride], a, 2 b,
-    2 c (see above) for red, then green, then blue; sums, float64 [H].
+    2 c (see above) for red, then green, then blue; sums, flat [H, LANES].
     """
     stride = U(size[2])
     plane = U(size[0] + 2 * PAD) * stride
     length = stride + U(2 * MARGIN)
-    for i in prange(size[0]):
-        row = U(i)
+    for band in prange((size[0] + BAND - 1) // BAND):
         rows = np.zeros(U(4) * length, np.float32)
-        half, one = v8.splat(np.float32(0.5)), v8.splat(np.float32(1))
-        ssim_sum = v8.splat(np.float32(0))
-        for c in range(U(0), U(3)):
-            for j in range(U(0), stride, U(LANES)):
-                top, at = c * plane + row * stride + j, j + U(MARGIN)
-                _column_moments(pairs, top, stride, rows, at, at + U(2) * length)
-                _column_moments(
-                    pairs, top + U(3) * plane, stride, rows, at + length, at + U(3) * length
-                )
-            centre = U(3) * c * plane + (row + U(PAD)) * stride
-            for j in range(U(0), stride, U(LANES)):
-                at = j + U(MARGIN)
-                p, n = _blur_row(rows, at), _blur_row(rows, at + length)
-                pp, nn = p * p, n * n
-                over_p = _blur_row(rows, at + U(2) * length) - pp
-                over_n = _blur_row(rows, at + U(3) * length) - nn
-                a1 = v8.fmuladd(pp - nn, half, v8.splat(C1))
-                b1 = v8.fmuladd(pp + nn, half, v8.splat(C1))
-                a2 = v8.fmuladd(over_p - over_n, half, v8.splat(C2))
-                b2 = v8.fmuladd(over_p + over_n, half, v8.splat(C2))
-                b2 = v8.maximum(b2, v8.splat(C2))  # a variance; rounding may make it negative
-                w = v8.load(weights, row * stride + j)
-                inverse = one / (b1 * b2)
-                ssim = a1 * a2 * inverse
-                ssim_sum = v8.fmuladd(ssim, w, ssim_sum)
-                w = w * inverse  # the derivatives by A1, A2, B1 and B2, times the weight
-                by_a1, by_a2 = a2 * w, a1 * w
-                by_b1, by_b2 = v8.negate(ssim * b2 * w), v8.negate(ssim * b1 * w)
-                along = by_a1 - by_a2
-                across = by_b1 - by_b2
-                a = v8.fmuladd(p, along + across, n * (across - along))
-                v8.store(slopes, centre + j, a)
-                v8.store(slopes, centre + plane + j, by_b2 + by_a2)
-                v8.store(slopes, centre + plane + plane + j, by_b2 - by_a2)
-        sums[i] = v8.total(ssim_sum)
+        for i in range(band * BAND, min((band + 1) * BAND, size[0])):
+            row = U(i)
+            half, one = v8.splat(np.float32(0.5)), v8.splat(np.float32(1))
+            ssim_sum = v8.splat(np.float32(0))
+            for c in range(U(0), U(3)):
+                for j in range(U(0), stride, U(LANES)):
+                    top, at = c * plane + row * stride + j, j + U(MARGIN)
+                    _column_moments(pairs, top, stride, rows, at, at + U(2) * length)
+                    _column_moments(
+                        pairs, top + U(3) * plane, stride, rows, at + length, at + U(3) * length
+                    )
+                centre = U(3) * c * plane + (row + U(PAD)) * stride
+                for j in range(U(0), stride, U(LANES)):
+                    at = j + U(MARGIN)
+                    p, n = _blur_row(rows, at), _blur_row(rows, at + length)
+                    pp, nn = p * p, n * n
+                    over_p = _blur_row(rows, at + U(2) * length) - pp
+                    over_n = _blur_row(rows, at + U(3) * length) - nn
+                    a1 = v8.fmuladd(pp - nn, half, v8.splat(C1))
+                    b1 = v8.fmuladd(pp + nn, half, v8.splat(C1))
+                    a2 = v8.fmuladd(over_p - over_n, half, v8.splat(C2))
+                    b2 = v8.fmuladd(over_p + over_n, half, v8.splat(C2))
+                    b2 = v8.maximum(b2, v8.splat(C2))  # a variance; rounding may make it negative
+                    w = v8.load(weights, row * stride + j)
+                    inverse = one / (b1 * b2)
+                    ssim = a1 * a2 * inverse
+                    ssim_sum = v8.fmuladd(ssim, w, ssim_sum)
+                    w = w * inverse  # the derivatives by A1, A2, B1 and B2, times the weight
+                    by_a1, by_a2 = a2 * w, a1 * w
+                    by_b1, by_b2 = v8.negate(ssim * b2 * w), v8.negate(ssim * b1 * w)
+                    along = by_a1 - by_a2
+                    across = by_b1 - by_b2
+                    a = v8.fmuladd(p, along + across, n * (across - along))
+                    v8.store(slopes, centre + j, a)
+                    v8.store(slopes, centre + plane + j, by_b2 + by_a2)
+                    v8.store(slopes, centre + plane + plane + j, by_b2 - by_a2)
+            v8.store(sums, row * U(LANES), ssim_sum)
 
 
 @inner()
@@ -282,8 +300,8 @@ def _picture_slopes(pairs, slopes, weights, row, size, factors, work, rows):
 
 
 @inner()
-def _map_slopes(rows, channel, behind, own, plane, stride, out):
-    """The row's part of the derivative by one channel of the colour map, into out[0 to 3]."""
+def _map_slopes(rows, channel, behind, own, plane, stride, sums, first):
+    """The row's part of the derivative by one channel of the colour map, LANES sums an entry."""
     zero = v8.splat(np.float32(0))
     red, green, blue, offset = zero, zero, zero, zero
     for j in range(U(0), stride, U(LANES)):
@@ -293,12 +311,10 @@ def _map_slopes(rows, channel, behind, own, plane, stride, out):
         green = v8.fmuladd(slope, v8.load(behind, at + plane), green)
         blue = v8.fmuladd(slope, v8.load(behind, at + plane + plane), blue)
         offset = offset + slope
-    out[0], out[1], out[2], out[3] = (
-        v8.total(red),
-        v8.total(green),
-        v8.total(blue),
-        v8.total(offset),
-    )
+    v8.store(sums, first, red)
+    v8.store(sums, first + U(LANES), green)
+    v8.store(sums, first + U(2 * LANES), blue)
+    v8.store(sums, first + U(3 * LANES), offset)
 
 
 @inner()
@@ -316,31 +332,33 @@ def differentiate(
     """The loss's derivatives by rgb, alpha and the colour map.
 
     factors: float32, of the L1 loss and of SSIM per unit of weight, and of alpha in the sky; the
-    rest as in the kernels above. Written: d_rgb flat [H, W, 3], d_alpha flat [H, W]; sums, float64
-    [H, 3, 4]: the row's part of the map's derivative.
+    rest as in the kernels above. Written: d_rgb flat [H, W, 3], d_alpha flat [H, W]; sums, flat
+    [H, 3, 4, LANES]: the row's part of the map's derivative.
     """
     height, width, stride = U(size[0]), U(size[1]), U(size[2])
     length = stride + U(2 * MARGIN)
     plane = height * stride
-    for i in prange(size[0]):
-        row = U(i)
-        own = row * stride
+    for band in prange((size[0] + BAND - 1) // BAND):
         rows = np.zeros(U(7) * stride, np.float32)
         work = np.zeros(U(3) * length, np.float32)
-        _picture_slopes(pairs, slopes, weights, row, size, factors, work, rows)
-        for c in range(U(0), U(3)):
-            _map_slopes(rows, c, behind, own, plane, stride, sums[i, c])
-        for j in range(U(0), stride, U(LANES)):
-            toward_sky = v8.splat(np.float32(0))
-            for k in range(U(0), U(3)):
-                slope = _times_transposed(rows, j, stride, color_map, k)
-                v8.store(rows, (U(3) + k) * stride + j, slope)
-                toward_sky = v8.fmuladd(slope, v8.load(sky, k * plane + own + j), toward_sky)
-            v8.store(rows, U(6) * stride + j, v8.negate(toward_sky))
-        for j in range(U(0), width):
-            at = row * width + j
-            d_rgb[at * U(3)] = rows[U(3) * stride + j]
-            d_rgb[at * U(3) + U(1)] = rows[U(4) * stride + j]
-            d_rgb[at * U(3) + U(2)] = rows[U(5) * stride + j]
-            slope = rows[U(6) * stride + j]
-            d_alpha[at] = slope + factors[2] if is_sky[at] else slope
+        for i in range(band * BAND, min((band + 1) * BAND, size[0])):
+            row = U(i)
+            own = row * stride
+            _picture_slopes(pairs, slopes, weights, row, size, factors, work, rows)
+            for c in range(U(0), U(3)):
+                first = (row * U(3) + c) * U(4 * LANES)
+                _map_slopes(rows, c, behind, own, plane, stride, sums, first)
+            for j in range(U(0), stride, U(LANES)):
+                toward_sky = v8.splat(np.float32(0))
+                for k in range(U(0), U(3)):
+                    slope = _times_transposed(rows, j, stride, color_map, k)
+                    v8.store(rows, (U(3) + k) * stride + j, slope)
+                    toward_sky = v8.fmuladd(slope, v8.load(sky, k * plane + own + j), toward_sky)
+                v8.store(rows, U(6) * stride + j, v8.negate(toward_sky))
+            for j in range(U(0), width):
+                at = row * width + j
+                d_rgb[at * U(3)] = rows[U(3) * stride + j]
+                d_rgb[at * U(3) + U(1)] = rows[U(4) * stride + j]
+                d_rgb[at * U(3) + U(2)] = rows[U(5) * stride + j]
+                slope = rows[U(6) * stride + j]
+                d_alpha[at] = slope + factors[2] if is_sky[at] else slope

@@ -10,7 +10,7 @@ import numba
 import numpy as np
 
 PARTS = 4  # gradients are summed in as many copies of the cube map, whatever the threads
-BAND = 8  # image rows; part p sums the bands p, p + PARTS, ... so that all see as much sky
+BAND = 8  # image rows at a time; part p sums bands p, p + PARTS, ... so that all see as much sky
 UNSEEN = -1  # texel of a pixel whose sky was not looked up
 
 
@@ -28,47 +28,48 @@ def sample_sky(alpha, faces, rotation, intrinsics, least, colors, texels, fracti
     last = np.float32(size - 1)
     scale = np.float32(size) * half
     ifx, ify, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
-    for i in numba.prange(height):
-        v = (np.float32(i) + half - cy) * ify
-        bx = rotation[0, 1] * v + rotation[0, 2]
-        by = rotation[1, 1] * v + rotation[1, 2]
-        bz = rotation[2, 1] * v + rotation[2, 2]
-        for j in range(width):
-            if one - alpha[i, j] < least:
-                texels[i, j] = UNSEEN
+    for band in numba.prange((height + BAND - 1) // BAND):
+        for i in range(band * BAND, min((band + 1) * BAND, height)):
+            v = (np.float32(i) + half - cy) * ify
+            bx = rotation[0, 1] * v + rotation[0, 2]
+            by = rotation[1, 1] * v + rotation[1, 2]
+            bz = rotation[2, 1] * v + rotation[2, 2]
+            for j in range(width):
+                if one - alpha[i, j] < least:
+                    texels[i, j] = UNSEEN
+                    for c in range(3):
+                        colors[c, i, j] = zero
+                    continue
+                u = (np.float32(j) + half - cx) * ifx
+                x = rotation[0, 0] * u + bx
+                y = rotation[1, 0] * u + by
+                z = rotation[2, 0] * u + bz
+                ax, ay, az = abs(x), abs(y), abs(z)
+                if ax >= ay and ax >= az:
+                    major, t = ax, -y
+                    face = 0 if x >= 0 else 1
+                    s = -z if x >= 0 else z
+                elif ay >= az:
+                    major, s = ay, x
+                    face = 2 if y >= 0 else 3
+                    t = z if y >= 0 else -z
+                else:
+                    major, t = az, -y
+                    face = 4 if z >= 0 else 5
+                    s = x if z >= 0 else -x
+                inverse = scale / major
+                column = min(max(s * inverse + scale - half, zero), last)
+                row = min(max(t * inverse + scale - half, zero), last)
+                c0, r0 = int(column), int(row)
+                c1, r1 = min(c0 + 1, size - 1), min(r0 + 1, size - 1)
+                fc, fr = column - np.float32(c0), row - np.float32(r0)
+                texels[i, j] = (face * size + r0) * size + c0
+                fractions[0, i, j] = fc
+                fractions[1, i, j] = fr
                 for c in range(3):
-                    colors[c, i, j] = zero
-                continue
-            u = (np.float32(j) + half - cx) * ifx
-            x = rotation[0, 0] * u + bx
-            y = rotation[1, 0] * u + by
-            z = rotation[2, 0] * u + bz
-            ax, ay, az = abs(x), abs(y), abs(z)
-            if ax >= ay and ax >= az:
-                major, t = ax, -y
-                face = 0 if x >= 0 else 1
-                s = -z if x >= 0 else z
-            elif ay >= az:
-                major, s = ay, x
-                face = 2 if y >= 0 else 3
-                t = z if y >= 0 else -z
-            else:
-                major, t = az, -y
-                face = 4 if z >= 0 else 5
-                s = x if z >= 0 else -x
-            inverse = scale / major
-            column = min(max(s * inverse + scale - half, zero), last)
-            row = min(max(t * inverse + scale - half, zero), last)
-            c0, r0 = int(column), int(row)
-            c1, r1 = min(c0 + 1, size - 1), min(r0 + 1, size - 1)
-            fc, fr = column - np.float32(c0), row - np.float32(r0)
-            texels[i, j] = (face * size + r0) * size + c0
-            fractions[0, i, j] = fc
-            fractions[1, i, j] = fr
-            for c in range(3):
-                top = faces[face, r0, c0, c] * (one - fc) + faces[face, r0, c1, c] * fc
-                bottom = faces[face, r1, c0, c] * (one - fc) + faces[face, r1, c1, c] * fc
-                colors[c, i, j] = top * (one - fr) + bottom * fr
+                    top = faces[face, r0, c0, c] * (one - fc) + faces[face, r0, c1, c] * fc
+                    bottom = faces[face, r1, c0, c] * (one - fc) + faces[face, r1, c1, c] * fc
+                    colors[c, i, j] = top * (one - fr) + bottom * fr
 
 
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
