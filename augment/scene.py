@@ -13,10 +13,10 @@ from torch import Tensor
 
 from augment.cameras import Camera, Frame
 from augment.errors import SceneError
-from augment.geometry import quat_from_rotmat, rigid, rotmat_from_quat, slerp
 from augment.labels import Boxes, LabelSource, LidarSweep
 from augment.semantics import SemanticClass
 from augment.sky import Sky
+from augment.track import Track
 
 SH_COUNTS = (1, 4, 9, 16)  # K = (degree + 1)^2 for degrees 0 to 3
 
@@ -102,48 +102,6 @@ class Gaussians:
             opacities=torch.zeros(0),
             sh=torch.zeros(0, k, 3),
         )
-
-
-@dataclass(frozen=True, eq=False)
-class Track:
-    """Where an actor is over time. Linear in position, slerp in rotation, between samples.
-
-    timestamps_ns: int64 [T], strictly increasing. world_from_actor: float64 [T, 4, 4].
-    hold_ns: how long before the first and after the last sample the actor stays at that pose
-    (cameras of a frame fire at slightly different moments); beyond it the actor is absent.
-    """
-
-    timestamps_ns: Tensor
-    world_from_actor: Float[Tensor, "T 4 4"]
-    hold_ns: int = 100_000_000
-
-    def __post_init__(self) -> None:
-        count = self.timestamps_ns.shape[0]
-        if count < 1 or tuple(self.world_from_actor.shape) != (count, 4, 4):
-            raise ValueError(
-                f"a track needs T >= 1 timestamps and world_from_actor [T, 4, 4]; "
-                f"got {count} and {list(self.world_from_actor.shape)}"
-            )
-        if count > 1 and not bool((self.timestamps_ns.diff() > 0).all()):
-            raise ValueError("track timestamps must be strictly increasing")
-
-    def pose_at(self, timestamp_ns: int) -> Float[Tensor, "4 4"] | None:
-        """world_from_actor at a time, or None where the actor does not exist."""
-        times = self.timestamps_ns
-        first, last = int(times[0]), int(times[-1])
-        if not first - self.hold_ns <= timestamp_ns <= last + self.hold_ns:
-            return None
-        if timestamp_ns <= first:
-            return self.world_from_actor[0]
-        if timestamp_ns >= last:
-            return self.world_from_actor[-1]
-        after = int(torch.searchsorted(times, timestamp_ns, right=True))
-        before = after - 1
-        span = int(times[after]) - int(times[before])
-        fraction = torch.tensor((timestamp_ns - int(times[before])) / span, dtype=torch.float64)
-        a, b = self.world_from_actor[before], self.world_from_actor[after]
-        quat = slerp(quat_from_rotmat(a[:3, :3]), quat_from_rotmat(b[:3, :3]), fraction)
-        return rigid(rotmat_from_quat(quat), torch.lerp(a[:3, 3], b[:3, 3], fraction))
 
 
 @dataclass(frozen=True, eq=False)

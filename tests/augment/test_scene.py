@@ -1,10 +1,11 @@
 import dataclasses
+import pickle
 
 import pytest
 import torch
 
 from augment.errors import SceneError
-from augment.geometry import rigid, rotmat_from_quat
+from augment.geometry import quat_from_rotmat, rigid, rotmat_from_quat, slerp
 from augment.scene import Actor, Gaussians, Scene, Track, check_gaussians
 from augment.sky import ConstantSky
 
@@ -72,6 +73,50 @@ def test_a_track_interpolates_holds_and_ends():
     assert torch.equal(t.pose_at(950), t.world_from_actor[0])
     assert torch.equal(t.pose_at(2_100), t.world_from_actor[1])
     assert t.pose_at(899) is None and t.pose_at(2_101) is None
+
+
+def pose_by_tensors(track: Track, time: int) -> torch.Tensor:
+    """Between two samples, by the functions of augment.geometry."""
+    times, poses = track.timestamps_ns, track.world_from_actor
+    after = int(torch.searchsorted(times, time, right=True))
+    a, b = poses[after - 1], poses[after]
+    fraction = torch.tensor(
+        (time - int(times[after - 1])) / int(times[after] - times[after - 1]), dtype=torch.float64
+    )
+    quat = slerp(quat_from_rotmat(a[:3, :3]), quat_from_rotmat(b[:3, :3]), fraction)
+    return rigid(rotmat_from_quat(quat), torch.lerp(a[:3, 3], b[:3, 3], fraction))
+
+
+@pytest.mark.parametrize("turn_rad", [None, 0.0, 1e-9, 2e-6, 3.1])
+def test_poses_are_those_of_the_geometry(turn_rad):
+    """Random turns, none, tiny and nearly half ones; and times that a float64 does not hold."""
+    generator = torch.Generator().manual_seed(1)
+    quats = torch.randn(6, 4, generator=generator, dtype=torch.float64)
+    if turn_rad is not None:
+        half = torch.arange(6, dtype=torch.float64) * turn_rad / 2
+        quats = torch.stack([half.cos(), 0 * half, 0.6 * half.sin(), 0.8 * half.sin()], -1)
+    places = torch.randn(6, 3, generator=generator, dtype=torch.float64) * 1000
+    start = 1_557_540_079_200_123_457
+    times = start + torch.tensor([0, 7, 100_000_001, 200_000_000, 300_000_000, 300_000_001])
+    moving = Track(times, rigid(rotmat_from_quat(quats), places))
+    for time in [*times[:-1].tolist(), *range(start + 1, start + 300_000_000, 9_999_991)]:
+        got = moving.pose_at(time)
+        if time == start:  # the sample itself
+            assert torch.equal(got, moving.world_from_actor[0])
+            continue
+        assert got.dtype == torch.float64
+        # Float64 rounding of positions below 10 km, and of rotations.
+        torch.testing.assert_close(got, pose_by_tensors(moving, time), atol=1e-11, rtol=0)
+
+
+def test_a_track_sends_only_its_samples_to_other_processes():
+    t = track()
+    size = len(pickle.dumps(t))
+    t.pose_at(1_500)
+    assert len(pickle.dumps(t)) == size
+    again = pickle.loads(pickle.dumps(t))
+    assert torch.equal(again.pose_at(1_500), t.pose_at(1_500))
+    assert dataclasses.replace(t, hold_ns=7).hold_ns == 7
 
 
 def test_track_times_must_increase():
