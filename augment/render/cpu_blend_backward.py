@@ -44,10 +44,10 @@ from augment.render.cpu_layout import (
     U,
 )
 
-# Of a list entry: sums of g, g off, g off^2, g dy, g off dy, g dy^2; dL/d colour (3) and z; sums of
-# |dL/d mean| along x (over 2 sharp) and y (over 2).
-SHARE = 12
-S_0, S_X, S_XX, S_Y, S_XY, S_YY, S_RED, S_GREEN, S_BLUE, S_DEPTH, S_ABS_X, S_ABS_Y = range(SHARE)
+# Of a list entry, one cache line: sums of g, g off, g off^2, g dy, g off dy, g dy^2, and of
+# |dL/d mean| along x (over 2 sharp) and y (over 2); then dL/d colour (3) and z.
+SHARE = 16
+S_0, S_X, S_XX, S_Y, S_XY, S_YY, S_ABS_X, S_ABS_Y, S_RED, S_GREEN, S_BLUE, S_DEPTH = range(12)
 
 # Planes of a tile: transmittance as in cpu_blend, what lies behind, and the pixel's gradients.
 THROUGH, REST, G_RED, G_GREEN, G_BLUE, G_ALPHA, G_DEPTH = (U(i * PIXELS) for i in range(7))
@@ -233,18 +233,10 @@ def _add_share(state, staged, values, places, k, item, end, limits, d_depth, sha
         syy = v8.fmuladd(g * dy, dy, syy)
         ax = ax + v8.absolute(g_off)
         ay = ay + v8.absolute(v8.fmuladd(tilt, g_off, fall * (g * dy)))
-    shares[share + U(S_0)] += v8.total(s0)
-    shares[share + U(S_X)] += v8.total(sx)
-    shares[share + U(S_XX)] += v8.total(sxx)
-    shares[share + U(S_Y)] += v8.total(sy)
-    shares[share + U(S_XY)] += v8.total(sxy)
-    shares[share + U(S_YY)] += v8.total(syy)
-    shares[share + U(S_RED)] += v8.total(sr)
-    shares[share + U(S_GREEN)] += v8.total(sg)
-    shares[share + U(S_BLUE)] += v8.total(sb)
-    shares[share + U(S_DEPTH)] += v8.total(sz)
-    shares[share + U(S_ABS_X)] += v8.total(ax)
-    shares[share + U(S_ABS_Y)] += v8.total(ay)
+    shape = v8.totals(s0, sx, sxx, sy, sxy, syy, ax, ay)
+    v8.store(shares, share, v8.load(shares, share) + shape)
+    color = v8.totals(sr, sg, sb, sz, zero, zero, zero, zero)
+    v8.store(shares, share + U(8), v8.load(shares, share + U(8)) + color)
 
 
 @kernel
@@ -268,8 +260,9 @@ def sum_shares(members, starts, reached, shares, ranges, sums, touched):
                 at, share = slot * U(SHARE), entry * U(SHARE)
                 if touched[slot] == 0:
                     touched[slot] = 1
-                    for i in range(U(SHARE)):
-                        sums[at + i] = shares[share + i]
+                    for i in range(U(0), U(SHARE), U(LANES)):
+                        v8.store(sums, at + i, v8.load(shares, share + i))
                 else:
-                    for i in range(U(SHARE)):
-                        sums[at + i] += shares[share + i]
+                    for i in range(U(0), U(SHARE), U(LANES)):
+                        total = v8.load(sums, at + i) + v8.load(shares, share + i)
+                        v8.store(sums, at + i, total)

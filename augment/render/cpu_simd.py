@@ -230,14 +230,37 @@ def total(typingctx, a):
     def codegen(context, builder, sig, args):
         value = args[0]
         for width in (4, 2, 1):
-            lanes = ir.Constant(
-                ir.VectorType(_INT, LANES),
-                [lane + width if lane < width else lane for lane in range(LANES)],
-            )
-            value = builder.fadd(value, builder.shuffle_vector(value, value, lanes))
+            lanes = [lane + width if lane < width else lane for lane in range(LANES)]
+            other = builder.shuffle_vector(value, value, ir.Constant(_I8, lanes))
+            value = builder.fadd(value, other)
         return builder.extract_element(value, _INT(0))
 
     return types.float32(float8), codegen
+
+
+@intrinsic
+def totals(typingctx, a, b, c, d, e, f, g, h):
+    """The sums of the eight lanes of a to h, as lanes 0 to 7; always added in the same order."""
+
+    def codegen(context, builder, sig, args):
+        def fold(left, right, low, high):
+            low, high = (
+                builder.shuffle_vector(left, right, ir.Constant(_I8, picked))
+                for picked in (low, high)
+            )
+            return builder.fadd(low, high)
+
+        pairs = [
+            fold(args[i], args[i + 1], [0, 8, 2, 10, 4, 12, 6, 14], [1, 9, 3, 11, 5, 13, 7, 15])
+            for i in range(0, LANES, 2)
+        ]
+        fours = [
+            fold(*pairs[i : i + 2], [0, 1, 8, 9, 4, 5, 12, 13], [2, 3, 10, 11, 6, 7, 14, 15])
+            for i in (0, 2)
+        ]
+        return fold(*fours, [0, 1, 2, 3, 8, 9, 10, 11], [4, 5, 6, 7, 12, 13, 14, 15])
+
+    return float8(*[float8] * LANES), codegen
 
 
 @intrinsic
