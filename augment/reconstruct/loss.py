@@ -89,7 +89,7 @@ def picture(
 def view_loss(
     rgb: np.ndarray,
     alpha: np.ndarray,
-    expected_depth: np.ndarray,
+    expected_depth: np.ndarray | None,
     view: RecordedView,
     sky_faces: np.ndarray,
     color_map: np.ndarray,
@@ -100,7 +100,8 @@ def view_loss(
     """The loss of a render of `view.camera` against the view, and its gradient.
 
     rgb [H, W, 3] without background, alpha [H, W], expected_depth [H, W] (m): as rasterised,
-    float32. sky_faces: float32 [6, R, R, 3]. color_map: float32 [3, 4]. scratch: buffers to reuse;
+    float32; without expected_depth no depth prior counts. sky_faces: float32 [6, R, R, 3].
+    color_map: float32 [3, 4]. scratch: buffers to reuse, which saves page faults by the megabyte;
     the gradients then hold until the next call. The same inputs give the same bits for any number
     of threads.
 
@@ -109,9 +110,9 @@ def view_loss(
     """
     camera = view.camera
     rgb, alpha, sky_faces, color_map = _checked(rgb, alpha, camera, sky_faces, color_map)
-    expected_depth = _plain(
-        "expected_depth", expected_depth, np.float32, (camera.height, camera.width), camera
-    )
+    if expected_depth is not None:
+        size = (camera.height, camera.width)
+        expected_depth = _plain("expected_depth", expected_depth, np.float32, size, camera)
     scratch = scratch or LossScratch()
     buffers = scratch.image(camera.height, camera.width)
     with kernel_threads():
@@ -215,7 +216,7 @@ def _compare(
 
 
 def _compare_depth(
-    expected_depth: np.ndarray,
+    expected_depth: np.ndarray | None,
     alpha: np.ndarray,
     view: RecordedView,
     weights: LossWeights,
@@ -224,7 +225,7 @@ def _compare_depth(
     """Mean |1/ED - 1/z| in 1/m; its gradient goes to the buffers."""
     buffers.d_expected_depth.fill(0)
     weight_sum = float(view.depth_weight.sum(dtype=np.float64))
-    if weight_sum <= 0 or weights.depth == 0:
+    if expected_depth is None or weight_sum <= 0 or weights.depth == 0:
         return 0.0
     sums = np.empty(-(-len(view.depth_pixels) // depth_kernels.CHUNK))
     depth_kernels.compare_depth(

@@ -271,6 +271,8 @@ def test_l1_alone_and_ssim_alone(weights):
 def test_weights_of_zero_switch_depth_and_sky_off():
     loss = assert_matches_reference({**case(13, 17), "weights": LossWeights(depth=0.0, sky=0.0)})
     assert loss.depth == 0 and (loss.d_expected_depth == 0).all()
+    unasked = view_loss(**{**case(13, 17), "expected_depth": None, "weights": LossWeights(sky=0.0)})
+    assert unasked.total == loss.total and (unasked.d_expected_depth == 0).all()
 
 
 @pytest.mark.parametrize("texels", [1, 2, 7])
