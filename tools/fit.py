@@ -16,6 +16,7 @@ from typing import Any
 
 from augment.batch.lock import OutputLock
 from augment.errors import OutputError
+from augment.reconstruct.view import ViewSource
 from augment.scene import Scene
 from augment.scene_files import is_scene_folder
 from tools.fit_checkpoint import (
@@ -25,13 +26,14 @@ from tools.fit_checkpoint import (
     mark_finished,
     save_checkpoint,
 )
-from tools.fit_data import data_facts, open_to_fit
+from tools.fit_data import FewerTestViews, data_facts, open_to_fit
 from tools.fit_loop import CHECKPOINT_S, History, Loop, StopRequest, sample_keys
 from tools.fit_options import FitOptions, differences
 from tools.fit_parts import FitParts, Fitter, Views, real_parts
 from tools.fit_time import estimate_steps
 
 EVALUATED = {"test": 6, "train": 3}  # views looked at during the run; all of them at its end
+EVALUATED_WHEN_STOPPED = 12
 REPORT_FILE = "report.json"
 
 
@@ -71,7 +73,9 @@ def fit_scene(
 
 def state_folder(out: Path) -> Path:
     """Where the checkpoint and the report of a scene folder lie: beside it."""
-    out = out.absolute()
+    out = out.resolve()
+    if not out.name:
+        raise OutputError(f"--out {out} is the file system's root: name a folder below it")
     return out.with_name(f"{out.name}.fit")
 
 
@@ -167,7 +171,7 @@ def _run(run: _Run, checkpoint_s: float, progress: bool) -> FitOutcome:
         return FitOutcome(0, report)
     _say(
         f"stopped after step {run.trainer.step} of {run.plan.steps}; the same command goes on "
-        f"from there, and what is fitted so far can be rendered"
+        f"from there"
     )
     return FitOutcome(130, report)
 
@@ -191,7 +195,7 @@ def _write(run: _Run, complete: bool, seconds: float) -> dict[str, Any]:
     made_by |= {"settings": run.plan.settings, "data": run.plan.data}
     scene = dataclasses.replace(run.trainer.scene(), made_by=made_by)
     run.parts.save(scene, options.out.absolute())
-    facts = {
+    facts: dict[str, Any] = {
         "scene": options.scene,
         "complete": complete,
         "step": run.trainer.step,
@@ -202,8 +206,15 @@ def _write(run: _Run, complete: bool, seconds: float) -> dict[str, Any]:
         "settings": run.plan.settings,
         "problems": list(_problems(run.scene, run.source, run.leaks)),
     }
+    source: ViewSource = run.source
+    if not complete and len(source.test) > EVALUATED_WHEN_STOPPED:  # someone waits for the end
+        source = FewerTestViews(source, sample_keys(source.test, EVALUATED_WHEN_STOPPED))
+        facts["problems"].append(
+            f"the run was stopped: figures are of {len(source.test)} of the "
+            f"{len(run.source.test)} held-out views"
+        )
     folder = report_folder(run.folder)
-    report = run.parts.report(folder, scene, run.source, run.history.rows, facts)
+    report = run.parts.report(folder, scene, source, run.history.rows, facts)
     _show_end(options.out, folder)
     return report
 

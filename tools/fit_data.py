@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from adapters.recorded.holdout import holdout_step
 from adapters.uri import format_uri
+from augment.cameras import Camera
 from augment.errors import AdapterError, ClimateGSError
-from augment.reconstruct.view import ViewSource
+from augment.reconstruct.view import RecordedView, ViewKey, ViewSource
 from augment.scene import Scene
 from tools.fit_options import FitOptions, resolved_uri
 
@@ -108,6 +110,24 @@ def data_facts(scene: Scene, source: ViewSource) -> dict[str, Any]:
         "actors": len(scene.actors),
         "cameras' poses (SHA-256)": digest.hexdigest(),
     }
+
+
+@dataclass(frozen=True)
+class FewerTestViews:
+    """A ViewSource of which only some views are held out, to be evaluated sooner."""
+
+    source: ViewSource
+    test: tuple[ViewKey, ...]
+
+    @property
+    def train(self) -> tuple[ViewKey, ...]:
+        return self.source.train
+
+    def camera(self, key: ViewKey) -> Camera:
+        return self.source.camera(key)
+
+    def load(self, key: ViewKey) -> RecordedView:
+        return self.source.load(key)
 
 
 def splat_count(scene: Scene) -> int:

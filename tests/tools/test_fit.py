@@ -17,6 +17,7 @@ from augment.batch.lock import OutputLock
 from augment.errors import ClimateGSError, OutputError
 from augment.reconstruct.view import ViewKey
 from augment.scene_schema import FORMAT
+from tools import fit
 from tools.cli import main
 from tools.fit import fit_scene, state_folder
 from tools.fit_checkpoint import Checkpoint, load_checkpoint, save_checkpoint
@@ -171,6 +172,22 @@ def test_an_interrupted_run_leaves_a_scene_and_goes_on(options, tmp_path, number
     assert written(options.out) == written(plain.out)
     assert learnt(resumed.report["history"]) == learnt(whole.report["history"])
     assert resumed.report["seconds"] > resumed.report["seconds_of_this_run"] > 0
+
+
+def test_a_stopped_run_evaluates_some_views_only(options, monkeypatch):
+    seen = []
+    monkeypatch.setattr(fit, "EVALUATED_WHEN_STOPPED", 2)
+    fakes = Fakes(before_step=interrupter(3, signal.SIGINT))
+    parts, report = fakes.parts(), fakes.parts().report
+
+    def noting(folder, scene, source, history, facts):
+        seen.append((source.test, source.load(source.test[0]).camera.name, len(source.train)))
+        return report(folder, scene, source, history, facts)
+
+    outcome = fit_scene(options, parts=dataclasses.replace(parts, report=noting), progress=False)
+    ((keys, camera, training),) = seen
+    assert len(keys) == 2 and camera == keys[0].camera and training == 6
+    assert "figures are of 2 of the 6 held-out views" in outcome.report["problems"][-1]
 
 
 def test_a_second_interruption_stops_at_once(options):
