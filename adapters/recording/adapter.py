@@ -24,13 +24,14 @@ from adapters.lidar.image_views import View
 from adapters.lidar.options import DriveOptions
 from adapters.lidar.scene import DrivenPath, LidarScene, build_lidar_scene
 from adapters.lidar.split import Sweep
-from adapters.recording.calibration import Calibration, read_calibration
+from adapters.recording.calibration import CALIBRATION, Calibration, read_calibration
 from adapters.recording.depth_images import depth_sweeps
 from adapters.recording.files import find_images, unlisted_images
 from adapters.recording.guesses import (
     MOST_GAUSSIANS,
     SHELL_SHARE,
     VOXEL_M,
+    check_cameras_above,
     ground_heights,
     guess_shells,
     guess_surfaces,
@@ -43,6 +44,7 @@ from augment.cameras import Frame
 from augment.errors import AdapterError
 from augment.scene import Scene
 
+_FEWEST_RETURNS = 100  # no surface is found among fewer
 _SKY_ABOVE_DEG = 15.0  # with nothing but a flat ground drawn, every column's top is sky
 
 
@@ -75,6 +77,12 @@ def open_recording(path: str, query: dict[str, str]) -> Scene:
     objects = read_objects(frames, all_boxes(root), calibration.world_origin_m)
     start = _Start(root, calibration, options, frames, used, objects)
     built, problems = start.build()
+    if len(built.background) + len(built.actors) == 0:
+        raise AdapterError(
+            f"{root}: none of the points that were measured is in any image; check in "
+            f"calibration.json that camera axes are x right, y down, z forward, and that LiDAR "
+            f"and poses are in one world with z up"
+        )
     return Scene(
         name=calibration.name,
         source=format_uri("recording", path, query),
@@ -111,21 +119,21 @@ class _Start:
     def build(self) -> tuple[LidarScene, tuple[str, ...]]:
         """The scene from the best there is, and what was missing, one sentence each."""
         lidar = read_lidar_drive(self.root, self.calibration, self.used)
-        if len(lidar):
+        if len(lidar) >= _FEWEST_RETURNS:
             return self._surfaces(lidar.sweeps, lidar.top_deg), lidar.problems
         sweeps, top_deg, problems = depth_sweeps(self.root, self.used)
         problems = lidar.problems + problems
         if any(len(sweep) for sweep in sweeps):
             said = (
-                f"{self.root / 'lidar'} holds no returns: the scene starts from the points of "
-                f"{len(sweeps)} depth images"
+                f"{self.root / 'lidar'} holds {len(lidar) or 'no'} returns: the scene starts from "
+                f"the points of {len(sweeps)} depth images"
             )
             return self._surfaces(sweeps, top_deg), (*problems, said)
         said = (
-            f"{self.root / 'lidar'} holds no returns and {self.root / 'depth'} no depth: the scene "
-            f"starts from a flat ground {self.calibration.ego_above_ground_m:g} m below the ego "
-            f"origin, the labelled boxes, and splats guessed along the cameras' rays; reconstruct "
-            f"it before rendering it"
+            f"{self.root / 'lidar'} holds {len(lidar) or 'no'} returns and {self.root / 'depth'} "
+            f"no depth: the scene starts from a flat ground "
+            f"{self.calibration.ego_above_ground_m:g} m below the ego origin, the labelled boxes, "
+            f"and splats guessed along the cameras' rays; reconstruct it before rendering it"
         )
         return self._guess(), (*problems, said)
 
@@ -137,6 +145,7 @@ class _Start:
 
     def _guess(self) -> LidarScene:
         road = ground_heights(self.frames, self.calibration.ego_above_ground_m)
+        check_cameras_above(self.root / CALIBRATION, self.frames, road)
         most = min(MOST_GAUSSIANS, self.options.max_gaussians)
         shells = guess_shells(self._views(), road, round(most * SHELL_SHARE))
         coarse = dataclasses.replace(

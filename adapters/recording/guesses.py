@@ -8,6 +8,7 @@ among which optimisation chooses.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -19,6 +20,7 @@ from adapters.lidar.initialise import SplatShape, gaussians_from_surfels
 from adapters.lidar.split import Sweep
 from adapters.lidar.surfels import Surfels
 from augment.cameras import Camera, Frame
+from augment.errors import AdapterError
 from augment.scene import Gaussians
 from augment.semantics import SemanticClass
 
@@ -31,9 +33,10 @@ _GROUND_STEP_M = 0.5
 _BOX_STEP_M = 0.15
 _MOST_VIEWS = 48
 _DRIVEN_M = 1.6  # the car went through here: nothing stands there
+_LOWEST_CAMERA_M = 0.1
 _ABOVE_GROUND_M = 0.2  # a ray that is lower at a shell has met the ground before
 _SHAPE = SplatShape(sigma_per_spacing=0.5, opacity=0.1)
-_IMAGE_SCALE = 0.125
+_IMAGE_SCALE, _SMALL_PX = 0.125, 64  # smaller images are read as they are
 _NEVER_NS = -(2**62)  # a time at which no object exists: these points belong to the static world
 
 
@@ -41,6 +44,19 @@ def ground_heights(frames: Sequence[Frame], ego_above_ground_m: float) -> np.nda
     """Points of the road under the ego origins, float64 [F, 3]."""
     poses = np.stack([frame.world_from_ego.numpy() for frame in frames])
     return poses[:, :3, 3] - ego_above_ground_m * poses[:, :3, 2]
+
+
+def check_cameras_above(path: Path, frames: Sequence[Frame], road: np.ndarray) -> None:
+    """Raises AdapterError where a camera is not above the ground. path: of the calibration."""
+    for frame, ground in zip(frames, road, strict=True):
+        for name, camera in frame.cameras.items():
+            height_m = float(camera.centre[2]) - ground[2]
+            if height_m < _LOWEST_CAMERA_M:
+                raise AdapterError(
+                    f"{path}, frame {frame.index}, camera {name!r}: it is {height_m:.2f} m above "
+                    f"the ground that is taken to lie under the ego origin; without LiDAR or depth "
+                    f"the ground must be known: give ego_above_ground_m, the ego origin's height"
+                )
 
 
 def guess_surfaces(
@@ -68,7 +84,8 @@ def guess_shells(views: Sequence[View], road: np.ndarray, count: int) -> Gaussia
     tree = cKDTree(road[:, :2])
     parts = []
     for number, view in enumerate(chosen):
-        image = read_image(view.path, _IMAGE_SCALE)
+        small = min(view.camera.width, view.camera.height) < _SMALL_PX
+        image = read_image(view.path, 1.0 if small else _IMAGE_SCALE)
         if image is not None:
             parts.append(_shell_points(view.camera, image, number, count // len(chosen)))
     if not parts:

@@ -137,6 +137,8 @@ def _class_table(
     if not present:
         return None, ()
     numbers = np.unique(np.concatenate(present))
+    if len(numbers) == 0:
+        return None, ()
     if calibration.lidar_classes is None:
         known = (numbers >= 0) & (numbers < SemanticClass.SKY)
         if not known.all():

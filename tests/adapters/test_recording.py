@@ -219,6 +219,43 @@ def test_guesses_respect_max_gaussians_and_held_out_images(tmp_path):
     assert_same_bits(held, open_recording(str(folder), query))
 
 
+def test_ground_above_the_cameras_is_an_error(tmp_path):
+    folder = write_recording(tmp_path / "drive", lidar=False)
+    recording.edit_calibration(folder, lambda c: c.update(ego_above_ground_m=-1.5))
+    message = r"frame 0, camera 'front_camera': it is -0.40 m above .* give ego_above_ground_m"
+    with pytest.raises(AdapterError, match=message):
+        open_recording(str(folder), QUERY)
+
+
+@pytest.mark.parametrize("count", [0, 1, 30])
+def test_a_handful_of_returns_is_no_lidar(copy, count):
+    for frame in range(3):
+        few = {k: v[:count] for k, v in recording.sweep_columns(frame).items()}
+        recording.write_lidar(copy, frame, few)
+    (problem,) = open_recording(str(copy), QUERY).problems
+    assert f"lidar holds {3 * count or 'no'} returns and" in problem
+
+
+def test_points_that_no_image_shows_are_an_error(copy):
+    def turn_up(content):
+        for frame in content["frames"]:
+            for camera in frame["cameras"].values():
+                pose = np.array(camera["world_from_camera"])
+                pose[:3, :3] = np.eye(3)  # the camera's forward is the world's up
+                camera["world_from_camera"] = pose.tolist()
+
+    recording.edit_calibration(copy, turn_up)
+    with pytest.raises(AdapterError, match="none of the points that were measured is in any image"):
+        open_recording(str(copy), QUERY)
+
+
+def test_images_of_held_out_frames_alone_are_not_enough(copy):
+    for path in copy.glob("images/*/00000[02].png"):
+        path.unlink()
+    with pytest.raises(AdapterError, match="no usable image of the frames that are not held out"):
+        open_recording(str(copy), QUERY | {"held_out": "1:2"})
+
+
 @pytest.mark.parametrize("lidar", [True, False])
 def test_one_camera_and_one_frame_are_enough(tmp_path, lidar):
     folder = write_recording(
