@@ -5,17 +5,24 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import torch
 
-from adapters.street.truth import StreetTruth
+from adapters.street.truth import TrueView
 from augment.cameras import Camera
 from augment.geometry import rigid
 from augment.metrics.image import DepthErrors, depth_errors
 from augment.scene import Scene
 from augment.semantics import SemanticClass
 from tools.fit_scores import RenderedView, render_recorded
+
+
+class Truth(Protocol):
+    """What is asked of a `StreetTruth`."""
+
+    def render(self, camera: Camera) -> TrueView: ...
 
 
 @dataclass(frozen=True)
@@ -37,7 +44,7 @@ class TruthErrors:
     sky_alpha: float
 
 
-def true_depth_errors(scene: Scene, truth: StreetTruth, cameras: Sequence[Camera]) -> TruthErrors:
+def true_depth_errors(scene: Scene, truth: Truth, cameras: Sequence[Camera]) -> TruthErrors:
     """Compare a scene's depth with the street's, through cameras of the scene's own world.
 
     The scene may have moved the origin (`world_origin_m`), as an adapter of recordings does.
@@ -79,7 +86,7 @@ class _Pixels:
     expected_m: np.ndarray
 
 
-def _pixels(scene: Scene, truth: StreetTruth, camera: Camera) -> _Pixels:
+def _pixels(scene: Scene, truth: Truth, camera: Camera) -> _Pixels:
     seen: RenderedView = render_recorded(scene, camera)
     true = truth.render(_in_dataset_world(camera, scene.world_origin_m))
     return _Pixels(
