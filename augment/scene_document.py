@@ -193,16 +193,14 @@ def _rigid_rows(transforms: Tensor, where: str) -> list:
 
 def _check_rigid(transforms: Tensor, where: str) -> None:
     """ValueError unless [.., 4, 4] are rotations and translations."""
-    rotation = transforms[..., :3, :3]
-    identity = torch.eye(3, dtype=torch.float64)
-    error = (rotation @ rotation.transpose(-1, -2) - identity).abs()
-    last = (transforms[..., 3, :] == torch.eye(4, dtype=torch.float64)[3]).all()
-    # `not <` also catches NaN
-    if transforms.numel() and (
-        not float(error.max()) < _ROTATION_TOLERANCE
-        or bool((torch.linalg.det(rotation) < 0).any())
-        or not bool(last)
-    ):
+    poses = transforms.detach().numpy()  # torch would wake its threads for a few numbers
+    rotation = poses[..., :3, :3]
+    with np.errstate(all="ignore"):  # of numbers so large that their products overflow
+        error = np.abs(rotation @ np.swapaxes(rotation, -1, -2) - np.eye(3))
+        determinant = np.linalg.det(rotation)
+    is_rotation = (error < _ROTATION_TOLERANCE).all() and (determinant > 0).all()
+    has_last_row = (poses[..., 3, :] == np.eye(4)[3]).all()
+    if not (np.isfinite(poses).all() and is_rotation and has_last_row):
         raise ValueError(
             f"{where}: a pose must be a rotation and a translation with 0 0 0 1 in its last row"
         )

@@ -97,7 +97,7 @@ def test_a_million_gaussians_open_at_once(tmp_path):
         begun = time.perf_counter()
         load_scene_parts(tmp_path / "fit")
         seconds.append(time.perf_counter() - begun)
-    assert min(seconds) < 0.5  # 0.03 s on a quiet machine with two cores
+    assert min(seconds) < 0.5  # 0.05 s on a busy machine with two cores
 
 
 def test_what_cannot_be_kept_is_refused(tmp_path):
@@ -263,6 +263,8 @@ def change_document(folder: Path, change) -> None:
         (("actors", 0, "track", "timestamps_ns"), [1, 2], "'car/1': a track needs"),
         (("actors", 0, "track", "timestamps_ns"), [2**63], "less than"),
         (("actors", 0, "track", "world_from_actor", 1, 0, 0), 9.0, "'car/1': a pose must be"),
+        (("actors", 0, "track", "world_from_actor", 1, 0, 0), 1e300, "'car/1': a pose must be"),
+        (("frames", 0, "world_from_ego", 0, 0), -1e308, "frame 4: a pose must be"),
         (("frames", 0, "cameras", "left", "fx"), -1.0, "camera 'left': fx must be finite and > 0"),
         (("frames", 0, "cameras", "left", "fx"), 1e999, "no number of JSON"),
         (("frames", 0, "cameras", "left", "width"), 10**9, "less than or equal to 100000"),
@@ -369,15 +371,17 @@ def test_undrawable_gaussians_are_left_out_and_counted(saved):
     tensors["background.means"][3] = np.nan
     tensors["background.scales"][5] = 0
     tensors["background.quats"][7] *= 3
+    tensors["background.quats"][9] = 0
     save_file(tensors, saved / FILES[1])
     scene = load_scene_parts(saved)
-    assert len(scene.background) == 48
+    assert len(scene.background) == 47
     assert [p.split(", ")[-1] for p in scene.problems[2:]] == [
         "background: left out 1 of 50 Gaussians with NaN or infinite values",
+        "background: left out 1 of 50 Gaussians with a zero quaternion",
         "background: left out 1 of 50 Gaussians with a scale <= 0",
     ]
     lengths = scene.background.quats.norm(dim=1)
-    assert torch.allclose(lengths, torch.ones(48))
+    assert torch.allclose(lengths, torch.ones(47))
 
 
 @pytest.mark.parametrize(
