@@ -14,6 +14,7 @@ from augment.metrics.image import (
     psnr,
     ssim,
 )
+from augment.reconstruct.loss_reference import ssim_map
 
 
 def pictures(height=23, width=31, *, noise=0.1, seed=0):
@@ -213,3 +214,9 @@ def test_bad_depths_are_refused():
         depth_errors(np.array([1, np.nan]), np.ones(2))
     with pytest.raises(ValueError, match="2 true depths"):
         depth_errors(np.ones(3), np.array([0, 1, np.inf]))
+
+
+def test_ssim_is_the_one_that_reconstruction_learns_with():
+    a, b = pictures(17, 40)
+    learnt = ssim_map(torch.from_numpy(a), torch.from_numpy(b))
+    assert ssim(a, b) == pytest.approx(float(learnt.mean()), abs=1e-11)  # both float64
