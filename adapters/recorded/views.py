@@ -13,6 +13,7 @@ import numpy as np
 from tqdm import tqdm
 
 from adapters.recorded.depth_priors import DepthPriors, DepthSource, ReferenceDepth
+from adapters.recorded.ego_masks import find_ego_mask, moving_frames, read_ego_mask
 from adapters.recorded.holdout import holdout_step, is_held_out
 from adapters.recorded.images import ImageFault, Images
 from adapters.recorded.sky_masks import lidar_top_rad, sky_mask
@@ -46,8 +47,9 @@ def recorded_views(
     holdout: "none" or "every-Nth": of the scene's frames the last of every N is held out.
     cache_bytes: memory for decoded images, and half as much for depth priors; what does not fit is
     read again. reference_depth: what relative depth maps are brought to metres by where there is no
-    LiDAR. masks_dir: DIR/<camera>.png, white where the image shows the recording car.
-    mask_ego: do not learn from pixels that show the recording car.
+    LiDAR. masks_dir: DIR/<camera>.png, white where the image shows the recording car; a camera
+    without a file does not see it. By default such pixels are found by their standing still.
+    mask_ego: do not learn from them.
 
     Every image is decoded once here. Unusable ones are left out and named in `problems`.
 
@@ -70,7 +72,11 @@ def recorded_views(
 
 
 class RecordedViews:
-    """A `ViewSource`; made by `recorded_views`. `load` may be called from several threads."""
+    """A `ViewSource`; made by `recorded_views`. `load` may be called from several threads.
+
+    ego_masks: for each camera that sees the recording car, where, bool [H, W] at the training
+    resolution. No depth priors are given there: the LiDAR looks past the car at the road behind.
+    """
 
     def __init__(
         self,
@@ -105,7 +111,8 @@ class RecordedViews:
         self._lidar_top_rad = self._measure_lidar_top()
         self._skies: dict[ViewKey, np.ndarray] = {}  # one bit a pixel
         self._weights: dict[str, np.ndarray] = {}
-        self.ego_masks: dict[str, np.ndarray] = {}
+        self.ego_masks = self._find_ego(names, masks_dir)
+        self._mask_ego = mask_ego
         self._lock = threading.Lock()
 
     @property
@@ -151,6 +158,9 @@ class RecordedViews:
             rgb = self._images.load(key)
             sky = self._sky(key, camera, rgb)
             prior = self._depth.load(key, sky)
+            ego = self._ego(camera)
+            if ego is not None:
+                prior = prior.select(~ego.reshape(-1)[prior.pixels])
             return RecordedView(
                 camera=camera,
                 rgb=rgb,
@@ -161,10 +171,18 @@ class RecordedViews:
                 depth_weight=prior.weight,
             )
 
+    def _ego(self, camera: Camera) -> np.ndarray | None:
+        """Where the camera sees the recording car; None if it does not."""
+        mask = self.ego_masks.get(camera.name)
+        return mask if mask is not None and mask.shape == (camera.height, camera.width) else None
+
     def _weight(self, camera: Camera) -> np.ndarray:
         weight = self._weights.get(camera.name)
         if weight is None or weight.shape != (camera.height, camera.width):
             weight = np.ones((camera.height, camera.width), np.float32)
+            ego = self._ego(camera)
+            if ego is not None and self._mask_ego:
+                weight[ego] = 0
             self._weights[camera.name] = weight
         return weight
 
@@ -173,6 +191,9 @@ class RecordedViews:
         if packed is None:
             returns = self._depth.lidar(key).pixels
             mask = sky_mask(self._scene, camera, rgb, returns, self._lidar_top_rad)
+            ego = self._ego(camera)
+            if ego is not None:
+                mask &= ~ego
             self._skies[key] = np.packbits(mask)
             return mask
         count = camera.height * camera.width
@@ -218,6 +239,30 @@ class RecordedViews:
                 f"views only"
             )
 
+    def _find_ego(self, names: Sequence[str], masks_dir: Path | None) -> dict[str, np.ndarray]:
+        """The masks that are there, from files or else from the images; empty ones left out."""
+        found: dict[str, np.ndarray] = {}
+        for name in names:
+            views = [(k, c) for k, c in self._cameras.items() if k.camera == name]
+            # Should a camera's size change, masks are for the size it has at first.
+            views = [(k, c) for k, c in views if (c.width, c.height) == _size(views[0][1])]
+            if not views:
+                continue
+            if masks_dir is not None:
+                path = masks_dir / f"{name}.png"
+                if path.exists():
+                    found[name] = read_ego_mask(path, views[0][1])
+                continue
+            moving = [views[i] for i in moving_frames([camera for _, camera in views])]
+            images = [self._images.load(key) for key, _ in moving]
+            found[name] = find_ego_mask([camera for _, camera in moving], images)
+        if masks_dir is not None and not found:
+            raise AdapterError(
+                f"{masks_dir} holds no mask {names[0]}.png or of another camera; expected images "
+                f"named like the cameras ({', '.join(names)}), white on the recording car"
+            )
+        return {name: mask for name, mask in found.items() if mask.any()}
+
     def _measure_lidar_top(self) -> float | None:
         frames = list(dict.fromkeys(key.frame for key in self._cameras))
         spread = frames[:: max(1, -(-len(frames) // _TOP_FRAMES))]
@@ -227,6 +272,10 @@ class RecordedViews:
                 "no sky masks: without LiDAR sweeps nothing tells sky from tall buildings"
             )
         return top
+
+
+def _size(camera: Camera) -> tuple[int, int]:
+    return camera.width, camera.height
 
 
 def _camera_names(scene: Scene, cameras: Sequence[str] | None) -> tuple[str, ...]:

@@ -1,0 +1,227 @@
+"""Which pixels show sky, and which the recording car itself."""
+
+from __future__ import annotations
+
+import cv2
+import drives
+import numpy as np
+import pytest
+
+from adapters.recorded.ego_masks import find_ego_mask, moving_frames, read_ego_mask
+from adapters.recorded.sky_masks import lidar_top_rad, looks_like_sky, sky_mask
+from adapters.recorded.views import recorded_views
+from augment.errors import AdapterError
+from augment.reconstruct.view import ViewKey
+
+NO_RETURNS = np.zeros(0, np.int32)
+SIZE = (160, 120)
+
+
+def wall_scene(tmp_path, top_m: float, *, sweeps=None):
+    """A wall 20 m ahead, left of the middle up to top_m, right of it up to 2 m."""
+    y, z = np.meshgrid(np.arange(-20, 20, 0.25), np.arange(0, 20, 0.25))
+    wall = np.stack([np.full(y.size, 20.0), y.ravel(), z.ravel()], 1)
+    height = np.where(wall[:, 1] > 0, top_m, 2.0)
+    wall = wall[wall[:, 2] < height]
+    return drives.drive(
+        tmp_path,
+        1,
+        cameras=lambda f: {"front": drives.camera(size=SIZE, focal_px=100.0)},
+        background=drives.flat_splats(wall, 0.15),
+        sweeps=sweeps,
+    )
+
+
+def sky_picture(sky: int = 200, wall: int = 60) -> np.ndarray:
+    """Bright above the wall of 2 m (row 58), textured below."""
+    rgb = np.full((120, 160, 3), sky, np.uint8)
+    rgb[58:] = wall
+    rgb[58::4] = wall + 40
+    return rgb
+
+
+def test_sky_lies_above_walls_that_end_below_the_lidars_view(tmp_path):
+    scene = wall_scene(tmp_path, top_m=8.0)
+    camera = scene.frame(0).cameras["front"]
+    # The low wall ends at 1.4 degrees, the high one at 18: the LiDAR looks up to 15.
+    mask = sky_mask(scene, camera, sky_picture(), NO_RETURNS, np.radians(15))
+    assert mask[:50, 90:].all()  # over the low wall, right of the middle
+    assert not mask[54:].any() and not mask[:, :80].any()
+    # A LiDAR that looks up to 40 degrees would have seen the high wall's end too.
+    mask = sky_mask(scene, camera, sky_picture(), NO_RETURNS, np.radians(40))
+    assert mask[:20, :70].all() and mask[:50, 90:].all()
+    assert not mask[30:, :80].any()  # the wall itself is as bright here, but it is drawn
+
+
+def test_without_a_lidar_no_sky_is_sure(tmp_path):
+    scene = wall_scene(tmp_path, top_m=8.0)
+    assert lidar_top_rad(scene, [0]) is None
+    view = recorded_views(scene, scale=1.0).load(ViewKey(0, "front"))
+    assert not view.sky.any()
+
+
+def test_a_return_above_the_scene_is_no_sky(tmp_path):
+    scene = wall_scene(tmp_path, top_m=2.0)
+    camera = scene.frame(0).cameras["front"]
+    wire = np.array([20 * 160 + x for x in range(160)])
+    mask = sky_mask(scene, camera, sky_picture(), wire, np.radians(15))
+    assert not mask[18:23].any() and mask[:15, 10:150].all()
+    assert not mask[23:].any()  # what hangs from a wire is not known
+
+
+def test_the_picture_has_to_agree():
+    rgb = sky_picture()
+    rgb[10:30, 20:60] = 90  # a dark tower that no splat shows
+    rgb[30:50:3, 100:140] = 120  # a billboard
+    rgb[5, :] = 100  # a wire
+    found = looks_like_sky(rgb, np.arange(120)[:, None] < np.full((1, 160), 58))
+    assert not found[10:30, 20:60].any() and not found[30:48, 100:140].any()
+    assert not found[5].any() and found[35:55, 20:60].all()
+    assert not looks_like_sky(rgb, np.zeros((120, 160), bool)).any()
+    night = sky_picture(sky=30, wall=10)
+    assert not looks_like_sky(night, np.ones((120, 160), bool)).any()
+
+
+def test_the_lidars_highest_view_is_measured(tmp_path):
+    azimuth, elevation = np.meshgrid(
+        np.radians(np.arange(-180, 180, 2.0)), np.radians(np.linspace(-20, 15, 64))
+    )
+    ray = np.stack(
+        [np.cos(azimuth), np.sin(azimuth), np.tan(elevation)], -1
+    ).reshape(-1, 3)  # fmt: skip
+    points = np.array([0, 0, 1.5]) + 30 * ray
+    stray = np.array([[12.0, 0, 30]])
+    scene = wall_scene(tmp_path, 8.0, sweeps={0: np.concatenate([points, stray])})
+    assert np.degrees(lidar_top_rad(scene, [0])) == pytest.approx(15, abs=0.6)  # a channel
+    near = wall_scene(tmp_path, 8.0, sweeps={0: points[:100]})
+    assert lidar_top_rad(near, [0]) is None
+
+
+def road_texture() -> np.ndarray:
+    """Grey values of a rough road, 5 cm a cell, for 60 m x 40 m; with a kerb along the drive."""
+    rng = np.random.default_rng(1)
+    rough = cv2.GaussianBlur(rng.uniform(0, 255, (1200, 800)).astype(np.float32), (0, 0), 2)
+    rough = np.clip((rough - 127) * 1.5 + 90, 0, 255)  # deviates by 15 levels, as asphalt does
+    rough[:, 300:303] = 250
+    return rough
+
+
+ROAD = road_texture()
+
+
+def road_picture(camera, car_rows: np.ndarray | None, *, lead_car: bool = False) -> np.ndarray:
+    """The road at z = 0 and a bright sky; below car_rows [W] a smooth bonnet."""
+    if camera.width == SIZE[0]:  # several rays a pixel, as a lens takes them
+        rows = None if car_rows is None else np.repeat(4 * np.asarray(car_rows), 4)
+        fine = road_picture(camera.scaled(4.0), rows, lead_car=lead_car)
+        return cv2.resize(fine, SIZE, interpolation=cv2.INTER_AREA)
+    rays = camera.ray_directions().double().numpy()
+    grey = np.full(rays.shape[:2], 220.0)
+    down = rays[..., 2] < -1e-3
+    along = camera.centre[2].item() / -rays[down][:, 2]
+    points = camera.centre.numpy() + along[:, None] * rays[down]
+    x = np.clip((points[:, 0] * 20).astype(int), 0, len(ROAD) - 1)
+    y = np.clip(((points[:, 1] + 20) * 20).astype(int), 0, ROAD.shape[1] - 1)
+    grey[down] = ROAD[x, y]
+    if lead_car:  # always twelve metres ahead
+        grey[248:288, 240:400] = 30
+    rows = np.arange(camera.height)[:, None]
+    if car_rows is not None:
+        body = 180 - 0.1 * rows + 0.02 * np.arange(camera.width)
+        grey = np.where(rows >= car_rows, body, grey)
+    return np.repeat(grey[..., None], 3, 2).clip(0, 255).astype(np.uint8)
+
+
+def drive_pictures(*, rotation=drives.AHEAD, frames=20, step_m=0.6, **what):
+    cameras = [
+        drives.camera(
+            "a", f, size=SIZE, focal_px=80.0, position=(step_m * f, 0, 1.6), rotation=rotation
+        )
+        for f in range(frames)
+    ]
+    return cameras, [road_picture(camera, **what) for camera in cameras]
+
+
+def test_a_bonnet_is_found_where_it_is():
+    rows = 95 - 8 * np.sin(np.linspace(0, np.pi, 160))
+    cameras, pictures = drive_pictures(car_rows=rows)
+    mask = find_ego_mask(cameras, pictures)
+    top = np.where(mask.any(axis=0), mask.argmax(axis=0), 120)
+    # The window that evidence is averaged in reaches four pixels over the edge, less two.
+    assert np.abs(top - rows).max() < 4 and np.abs(np.median(top - rows)) < 2.5
+
+
+@pytest.mark.parametrize("rotation", [drives.AHEAD, drives.LEFT])
+def test_nothing_is_found_where_the_car_is_not_seen(rotation):
+    cameras, pictures = drive_pictures(car_rows=None, rotation=rotation)
+    assert not find_ego_mask(cameras, pictures).any()
+
+
+def test_a_smooth_road_and_a_car_ahead_are_not_the_own_car(monkeypatch):
+    monkeypatch.setitem(globals(), "ROAD", np.full_like(ROAD, 100))
+    cameras, pictures = drive_pictures(car_rows=None, lead_car=True)
+    assert not find_ego_mask(cameras, pictures).any()
+
+
+def test_a_standing_car_tells_nothing():
+    cameras, pictures = drive_pictures(car_rows=np.full(160, 90), step_m=0.0)
+    assert moving_frames(cameras) == [0]
+    assert not find_ego_mask(cameras[:1], pictures[:1]).any()
+    assert find_ego_mask([], []).shape == (0, 0)
+
+
+def test_frames_are_taken_where_the_car_moved():
+    cameras, _ = drive_pictures(car_rows=None, frames=100, step_m=0.2)
+    chosen = moving_frames(cameras)
+    assert len(chosen) == 24 and chosen == sorted(set(chosen))
+
+
+@pytest.fixture
+def bonnet_drive(tmp_path):
+    rows = np.full(160, 96)
+
+    def cameras(frame):
+        position = (0.6 * frame, 0, 1.6)
+        return {"front": drives.camera("front", frame, size=SIZE, focal_px=80.0, position=position)}
+
+    x, y = np.meshgrid(np.arange(2, 30, 0.3), np.arange(-8, 8, 0.3))
+    floor = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], 1)
+    return drives.drive(
+        tmp_path / "images", 12, cameras=cameras, speed_mps=6.0,
+        picture=lambda camera, number: road_picture(camera, rows),
+        sweeps={frame: floor + np.array([0.6 * frame, 0, 0]) for frame in range(12)},
+    )  # fmt: skip
+
+
+def test_views_know_the_own_car(bonnet_drive):
+    views = recorded_views(bonnet_drive, scale=1.0)
+    mask = views.ego_masks["front"]
+    assert mask[100:].all() and not mask[:92].any()
+    assert 0.15 < views.facts["ego_mask_parts"]["front"] < 0.25
+    view = views.load(views.train[0])
+    assert (view.weight == 1).all() and len(view.depth_pixels) > 100
+    # The floor behind the bonnet is not seen.
+    assert not mask.reshape(-1)[view.depth_pixels].any()
+    masked = recorded_views(bonnet_drive, scale=0.5, mask_ego=True)
+    weight = masked.load(views.train[0]).weight
+    assert (weight[52:] == 0).all() and (weight[:44] == 1).all()
+
+
+def test_masks_from_files(bonnet_drive, tmp_path):
+    folder = tmp_path / "masks"
+    folder.mkdir()
+    with pytest.raises(AdapterError, match=r"no mask front\.png"):
+        recorded_views(bonnet_drive, scale=0.5, masks_dir=folder)
+    mask = np.zeros((240, 320), np.uint8)
+    mask[200:, :160] = 255
+    cv2.imwrite(str(folder / "front.png"), mask)
+    views = recorded_views(bonnet_drive, scale=0.5, masks_dir=folder)
+    wanted = np.zeros((60, 80), bool)
+    wanted[50:, :40] = True
+    np.testing.assert_array_equal(views.ego_masks["front"], wanted)
+    cv2.imwrite(str(folder / "front.png"), mask[:, :200])
+    with pytest.raises(AdapterError, match="proportions"):
+        read_ego_mask(folder / "front.png", bonnet_drive.frame(0).cameras["front"])
+    (folder / "front.png").write_bytes(b"?")
+    with pytest.raises(AdapterError, match="cannot be decoded"):
+        recorded_views(bonnet_drive, scale=0.5, masks_dir=folder)
