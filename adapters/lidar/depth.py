@@ -108,7 +108,10 @@ def depth_seen(returns: FrameReturns, camera: Camera) -> SparseDepth:
 def _times(scene: Scene, sweep: LidarSweep, frame_index: int) -> np.ndarray:
     frame_ns = next((f.timestamp_ns for f in scene.frames if f.index == frame_index), None)
     if frame_ns is not None:
-        times = sweep_times(sweep, frame_ns)
+        try:
+            times = sweep_times(sweep, frame_ns)
+        except ValueError as error:
+            raise AdapterError(f"frame {frame_index}: its sweep's {error}") from None
         return np.full(len(sweep), frame_ns, np.int64) if times is None else times
     if "timestamp_ns" in sweep.columns:
         return sweep.columns["timestamp_ns"].astype(np.int64)

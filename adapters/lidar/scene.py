@@ -110,23 +110,26 @@ def road_height(points: PointSet, path: np.ndarray) -> float | None:
 
     At each position of the path (float [P, 3]) the height is the median of the nearest road
     returns, or, where no class says road, a low quantile of all returns there. The LiDAR sees no
-    road right below itself, so the reach widens until there are enough returns to trust.
+    road right below itself, so the reach widens until there are enough returns to trust; without
+    classes it begins wider, because what is nearest is the recording car and spray.
     """
     road = np.isin(points.semantic, (SemanticClass.ROAD, SemanticClass.LANE_MARKING))
-    heights = _heights(points.points[road], path, 0.5)
+    heights = _heights(points.points[road], path, 0.5, _ROAD_REACHES_M)
     if not heights:
-        heights = _heights(points.points, path, _LOW_QUANTILE)
+        heights = _heights(points.points, path, _LOW_QUANTILE, _ROAD_REACHES_M[1:])
     return min(heights) if heights else None
 
 
-def _heights(points: np.ndarray, path: np.ndarray, quantile: float) -> list[float]:
-    widest = _ROAD_REACHES_M[-1]
+def _heights(
+    points: np.ndarray, path: np.ndarray, quantile: float, reaches_m: Sequence[float]
+) -> list[float]:
+    widest = reaches_m[-1]
     low, high = path.min(axis=0) - widest, path.max(axis=0) + widest
     points = points[indices_between(points, low, high)]
     heights = []
     for position in path:
         distance2 = ((points[:, :2] - position[:2]) ** 2).sum(1)
-        for reach in _ROAD_REACHES_M:
+        for reach in reaches_m:
             z = points[distance2 < reach**2, 2]
             if len(z) >= _ROAD_RETURNS:
                 heights.append(float(np.quantile(z, quantile)))
