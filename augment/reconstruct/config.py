@@ -38,8 +38,8 @@ class LearningRates:
     sh_dc: float = 5e-3
     sh_rest: float = 2.5e-4
     sky: float = 5e-3
-    color_map: float = 5e-4
-    poses: float = 1e-4
+    color_map: float = 2e-3
+    poses: float = 1e-3
     late: float = 0.2
 
 
@@ -68,7 +68,8 @@ class DensifyConfig:
 class FitConfig:
     """One reconstruction. steps: optimiser updates, one view each. sh_degree: highest band that is
     learnt; one more every sh_every steps. pose_refinement: whether actors' boxes may move a little.
-    exposure: whether every camera gets a colour map; exposure_pull draws it to the identity.
+    exposure: whether every camera gets a colour map; exposure_pull draws it to the identity,
+    pose_pull (1/m^2) the boxes to where they were labelled.
     """
 
     steps: int = 5000
@@ -77,7 +78,8 @@ class FitConfig:
     sh_every: int = 500
     pose_refinement: bool = True
     exposure: bool = True
-    exposure_pull: float = 0.01
+    exposure_pull: float = 0.001
+    pose_pull: float = 1e-4
     loss: LossWeights = field(default_factory=LossWeights)
     rates: LearningRates = field(default_factory=LearningRates)
     densify: DensifyConfig = field(default_factory=DensifyConfig)

@@ -5,31 +5,30 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import torch
 
 from augment.cameras import Camera
 from augment.reconstruct.splats import Splats
 from augment.render import cpu_layout as layout
 from augment.render.constants import RasterSettings
-from augment.render.cpu_inputs import Inputs, part_view, raster_modes
+from augment.render.cpu_inputs import Inputs, part_views, raster_modes
 
 _FIELDS = ("means", "quats", "scales", "opacities", "sh")
 
 
 def splat_inputs(
     splats: Splats,
-    present: Sequence[tuple[int, torch.Tensor | None]],
+    parts: Sequence[int],
+    poses: np.ndarray,
     camera: Camera,
     settings: RasterSettings,
 ) -> Inputs:
-    """Inputs of the parts that exist now. present: part numbers and world_from_part, float64
-    [4, 4], None for the world itself. Nothing is copied: kernels read, and Adam writes, the arrays
-    of `splats`, which must outlive the inputs.
+    """Inputs of the parts that exist now. parts: their numbers. poses: world_from_part, float64
+    [P, 4, 4]. Nothing is copied: kernels read, and Adam writes, the arrays of `splats`, which must
+    outlive the inputs.
 
     first_ids are positions in the arrays of `splats`.
     """
-    parts = [part for part, _ in present]
-    starts = splats.starts[parts]
+    starts = splats.starts[list(parts)]
     counts = splats.starts[np.asarray(parts) + 1] - starts
     functions = splats.sh.shape[1]
     strides = [getattr(splats, name)[:1].nbytes for name in _FIELDS]
@@ -41,7 +40,7 @@ def splat_inputs(
         addresses=np.ascontiguousarray(addresses),
         sizes=np.stack([counts, np.full_like(counts, functions)], 1),
         first_ids=starts.copy(),
-        views=np.stack([part_view(pose, camera, settings, None) for _, pose in present]),
+        views=part_views(poses, camera, settings, None),
         blocks=_blocks(counts),
         modes=raster_modes(settings, None, with_color=True),
         arrays=[getattr(splats, name) for name in _FIELDS],

@@ -27,12 +27,14 @@ from augment.reconstruct.dense_adam import ColorAdam, DenseAdam
 from augment.reconstruct.densify import densify, densify_due
 from augment.reconstruct.inputs import splat_inputs
 from augment.reconstruct.loss import ViewLoss, view_loss
+from augment.reconstruct.loss_buffers import LossScratch
+from augment.reconstruct.poses import PoseCorrections
 from augment.reconstruct.rates import CORRECTIONS, splat_rates
 from augment.reconstruct.splats import Splats
 from augment.reconstruct.view import RecordedView, ViewKey, ViewSource
 from augment.render import cpu_backward
 from augment.render.constants import RasterSettings
-from augment.render.cpu_inputs import Inputs
+from augment.render.cpu_inputs import Inputs, part_poses, part_views
 from augment.render.cpu_layout import M_FUNCTIONS
 from augment.render.cpu_scratch import Scratch
 from augment.render.threads import kernel_threads
@@ -79,7 +81,10 @@ class Trainer:
         self._source = source
         self._settings = RasterSettings()
         self._scratch = Scratch()
-        self._inputs: dict[ViewKey, Inputs] = {}
+        self._loss_scratch = LossScratch()
+        self.poses = PoseCorrections(scene.actors)
+        self._moves_actors = config.pose_refinement and len(self.poses.values) > 0
+        self._inputs: dict[ViewKey, _ViewInputs] = {}
         self._extent_m = _extent(source)
         self._order: tuple[int, np.ndarray] = (-1, np.zeros(0, np.int64))
 
@@ -118,7 +123,11 @@ class Trainer:
     def scene(self) -> Scene:
         """The scene as fitted so far; it shares nothing with the trainer."""
         actors = tuple(
-            dataclasses.replace(actor, gaussians=self.splats.gaussians(number))
+            dataclasses.replace(
+                actor,
+                gaussians=self.splats.gaussians(number),
+                track=self.poses.track(number - 1, actor.track),
+            )
             for number, actor in enumerate(self._scene.actors, start=1)
         )
         maps = {name: torch.from_numpy(m.copy()) for name, m in self.color_maps.items()}
@@ -138,6 +147,7 @@ class Trainer:
         for name, adam in self._map_adams.items():
             arrays[f"color_map.{name}"] = self.color_maps[name]
             arrays |= {f"color_map_adam.{name}.{k}": a for k, a in adam.arrays().items()}
+        arrays |= {f"poses.{name}": a for name, a in self.poses.arrays().items()}
         return {name: array.copy() for name, array in arrays.items()}, {"step": self.step}
 
     def load_state(self, arrays: dict[str, np.ndarray], facts: dict[str, Any]) -> None:
@@ -149,6 +159,7 @@ class Trainer:
         for name, adam in self._map_adams.items():
             self.color_maps[name][:] = arrays[f"color_map.{name}"]
             adam.load({k: arrays[f"color_map_adam.{name}.{k}"] for k in adam.arrays()})
+        self.poses.load({k: arrays[f"poses.{k}"] for k in self.poses.arrays()})
         self.step = int(facts["step"])
         self._inputs.clear()
 
@@ -164,23 +175,44 @@ class Trainer:
         return train[int(self._order[1][place])]
 
     def _render(self, key: ViewKey, camera: Camera) -> cpu_backward.Tape:
-        inputs = self._inputs.get(key)
-        if inputs is None:
-            present = [
-                (part.instance_id, part.world_from_part)
-                for part in self._scene.parts_for(camera)
-                if self.splats.starts[part.instance_id] < self.splats.starts[part.instance_id + 1]
-            ]
-            inputs = splat_inputs(self.splats, present, camera, self._settings)
-            self._inputs[key] = inputs
-        inputs.modes[M_FUNCTIONS] = self._functions
+        cached = self._inputs.get(key)
+        if cached is None:
+            cached = self._inputs[key] = self._gather(camera)
+        elif self._moves_actors:
+            poses = self._corrected(cached.parts, cached.labelled, camera)
+            cached.poses[:] = poses
+            cached.inputs.views[:] = part_views(poses, camera, self._settings, None)
+        cached.inputs.modes[M_FUNCTIONS] = self._functions
         return cpu_backward.record(
-            inputs,
+            cached.inputs,
             camera,
             self._settings,
             self._scratch,
             with_depth=self.config.loss.depth > 0,
         )
+
+    def _gather(self, camera: Camera) -> _ViewInputs:
+        """The parts that hold splats and exist when the view was taken."""
+        starts = self.splats.starts
+        posed = [
+            part
+            for part in self._scene.parts_for(camera)
+            if starts[part.instance_id] < starts[part.instance_id + 1]
+        ]
+        parts = [part.instance_id for part in posed]
+        labelled = part_poses([part.world_from_part for part in posed])
+        poses = self._corrected(parts, labelled, camera)
+        inputs = splat_inputs(self.splats, parts, poses, camera, self._settings)
+        return _ViewInputs(inputs, parts, labelled, poses)
+
+    def _corrected(self, parts: list[int], labelled: np.ndarray, camera: Camera) -> np.ndarray:
+        """Poses of the parts with what has been learnt of them."""
+        if not self._moves_actors:
+            return labelled
+        return np.stack([
+            self.poses.corrected(part - 1, pose, camera.timestamp_ns) if part else pose
+            for part, pose in zip(parts, labelled, strict=True)
+        ])  # fmt: skip
 
     @property
     def _functions(self) -> int:
@@ -192,11 +224,12 @@ class Trainer:
         return view_loss(
             tape.rgb,
             tape.alpha,
-            tape.expected_depth if tape.expected_depth is not None else np.zeros_like(tape.alpha),
+            tape.expected_depth,
             view,
             self.sky_faces,
             self.color_maps[key.camera],
             self.config.loss,
+            scratch=self._loss_scratch,
         )
 
     def _update(
@@ -233,7 +266,19 @@ class Trainer:
         if self.config.exposure:
             color_map = self.color_maps[key.camera]
             pull = self.config.exposure_pull * (color_map - _IDENTITY)
-            self._map_adams[key.camera].update(loss.d_color_map + pull, rates.color_map)
+            rate = rates.color_map * rates.late ** (self.step / max(self.config.steps, 1))
+            self._map_adams[key.camera].update(loss.d_color_map + pull, rate)
+        if self._moves_actors:
+            cached = self._inputs[key]
+            self.poses.update(
+                splats,
+                cached.parts,
+                cached.poses,
+                grads,
+                view.camera.timestamp_ns,
+                rate=rates.poses * rates.late ** (self.step / max(self.config.steps, 1)),
+                pull=self.config.pose_pull,
+            )
 
     def _densify(self) -> None:
         config = self.config
@@ -251,6 +296,17 @@ class Trainer:
             extent_m=self._extent_m,
         )
         self._inputs.clear()
+
+
+@dataclass(frozen=True, eq=False)
+class _ViewInputs:
+    """What stays the same of a view between densifications. labelled, poses: float64 [P, 4, 4],
+    world_from_part as recorded and as corrected."""
+
+    inputs: Inputs
+    parts: list[int]
+    labelled: np.ndarray
+    poses: np.ndarray
 
 
 @contextmanager

@@ -69,49 +69,53 @@ def gather_inputs(
         addresses=np.array(addresses, np.uint64).reshape(-1, 5),
         sizes=np.array(sizes, np.int64).reshape(-1, 2),
         first_ids=np.cumsum([0, *counts[:-1]], dtype=np.int64),
-        views=np.stack([part_view(p.world_from_part, camera, settings, smog) for p in parts]),
+        views=part_views(part_poses([p.world_from_part for p in parts]), camera, settings, smog),
         blocks=np.array(blocks, np.int64).reshape(-1, 3),
         modes=raster_modes(settings, smog, with_color=with_color),
         arrays=arrays,
     )
 
 
-def part_view(
-    pose: torch.Tensor | None,
-    camera: Camera,
-    settings: RasterSettings,
-    smog: SmogMedium | None,
+def part_views(
+    poses: np.ndarray, camera: Camera, settings: RasterSettings, smog: SmogMedium | None
 ) -> np.ndarray:
-    """The float32 numbers of a view, formed in float64. pose: world_from_part; None: identity."""
-    world_from_part = np.eye(4) if pose is None else pose.numpy()
-    camera_from_part = camera.camera_from_world.numpy() @ world_from_part
-    rotation = camera_from_part[:3, :3]
+    """The float32 numbers of every part's view, [P, VIEW], formed in float64.
+
+    poses: world_from_part, float64 [P, 4, 4].
+    """
+    camera_from_part = camera.camera_from_world.numpy() @ poses
+    rotations = camera_from_part[:, :3, :3]
     # The point the transform takes to the origin, also where a rotation is not quite orthonormal.
-    eye = np.linalg.solve(rotation, -camera_from_part[:3, 3])
-    coarse_eye = eye.astype(np.float32)
+    eyes = np.linalg.solve(rotations, -camera_from_part[:, :3, 3:])[..., 0]
+    coarse_eyes = eyes.astype(np.float32)
     focal = np.array([camera.fx, camera.fy])
     centre = np.array([camera.cx, camera.cy])
     size = np.array([camera.width, camera.height], np.float64)
     margin = TAN_FOV_MARGIN * 0.5 * size / focal
     low, high = -(centre / focal + margin), (size - centre) / focal + margin
     widest = np.maximum(np.abs(low), np.abs(high))
-    view = np.zeros(layout.VIEW)
-    view[layout.V_ROTATION :][:9] = rotation.reshape(-1)
-    view[layout.V_EYE :][:6] = *coarse_eye, *(eye - coarse_eye)
-    view[layout.V_FOCAL :][:2], view[layout.V_CENTRE :][:2] = focal, centre
-    view[layout.V_SIZE :][:2] = size
-    view[layout.V_LOW :][:2], view[layout.V_HIGH :][:2] = low, high
-    view[layout.V_GAIN :][:2] = MAX_EXTENT_SIGMAS * focal * np.sqrt(1 + widest**2)
-    view[layout.V_NEAR], view[layout.V_BLUR] = settings.near_m, COV2D_BLUR
-    view[layout.V_ALPHA_MIN], view[layout.V_LOG_CUT] = ALPHA_MIN, math.log2(ALPHA_MIN)
+    views = np.zeros((len(poses), layout.VIEW))
+    views[:, layout.V_ROTATION :][:, :9] = rotations.reshape(-1, 9)
+    views[:, layout.V_EYE :][:, :6] = np.concatenate([coarse_eyes, eyes - coarse_eyes], 1)
+    views[:, layout.V_FOCAL :][:, :2], views[:, layout.V_CENTRE :][:, :2] = focal, centre
+    views[:, layout.V_SIZE :][:, :2] = size
+    views[:, layout.V_LOW :][:, :2], views[:, layout.V_HIGH :][:, :2] = low, high
+    views[:, layout.V_GAIN :][:, :2] = MAX_EXTENT_SIGMAS * focal * np.sqrt(1 + widest**2)
+    views[:, layout.V_NEAR], views[:, layout.V_BLUR] = settings.near_m, COV2D_BLUR
+    views[:, layout.V_ALPHA_MIN], views[:, layout.V_LOG_CUT] = ALPHA_MIN, math.log2(ALPHA_MIN)
     if smog is not None:
-        view[layout.V_SIGMA] = smog.sigma_per_m
-        view[layout.V_AIRLIGHT :][:3] = smog.rgb
+        views[:, layout.V_SIGMA] = smog.sigma_per_m
+        views[:, layout.V_AIRLIGHT :][:, :3] = smog.rgb
         if smog.scale_height_m is not None:
             above = float(camera.centre[2]) - smog.base_z_m
-            view[layout.V_EYE_HEIGHT] = above / smog.scale_height_m
-            view[layout.V_UP :][:3] = world_from_part[2, :3] / smog.scale_height_m
-    return view.astype(np.float32)
+            views[:, layout.V_EYE_HEIGHT] = above / smog.scale_height_m
+            views[:, layout.V_UP :][:, :3] = poses[:, 2, :3] / smog.scale_height_m
+    return views.astype(np.float32)
+
+
+def part_poses(poses: Sequence[torch.Tensor | None]) -> np.ndarray:
+    """float64 [P, 4, 4] of parts' poses, None standing for the identity."""
+    return np.stack([np.eye(4) if pose is None else pose.numpy() for pose in poses])
 
 
 def raster_modes(
