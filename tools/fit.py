@@ -134,7 +134,9 @@ def _estimate(options: FitOptions, parts: FitParts, scene: Scene, source: Views)
         return parts.trainer(scene, source, options.config(steps))
 
     _say("timing a few steps (kernels are compiled first where they are not yet) ...")
-    estimate = estimate_steps(throw_away, options.budget_s, grows=options.densify != "none")
+    estimate = estimate_steps(
+        throw_away, options.budget_s, views=len(source.train), grows=options.densify != "none"
+    )
     _say(
         f"{1e3 * estimate.step_s:.0f} ms a step at the start: {estimate.steps} steps make about "
         f"{options.budget_s / 60:g} minutes. --steps {estimate.steps} gives the same scene again"

@@ -9,15 +9,23 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import safetensors.numpy
 from safetensors import SafetensorError
+from safetensors.numpy import load_file, save_file
 
-from augment.batch.atomic import output_error, remove_temporaries, write_atomic
+from augment.batch.atomic import (
+    TEMPORARY_SUFFIX,
+    flush_folder,
+    make_folder,
+    output_error,
+    remove_temporaries,
+    write_atomic,
+)
 from augment.errors import OutputError
 
 VERSION = 1
@@ -57,14 +65,12 @@ def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
     name = None
     if checkpoint.arrays:
         name = f"state-{checkpoint.step:07d}.safetensors"
-        arrays = {key: np.asarray(a, order="C") for key, a in checkpoint.arrays.items()}
-        data = safetensors.numpy.save(arrays)
-        plan["state"] = {"file": name, "sha256": hashlib.sha256(data).hexdigest()}
-        write_atomic(folder / name, data)
+        plan["state"] = {"file": name, "sha256": _write_state(folder / name, checkpoint.arrays)}
     write_atomic(folder / PLAN_FILE, (json.dumps(plan, indent=1) + "\n").encode())
     for path in folder.glob(_STATES):
         if path.name != name:
             _remove(path)
+    _remove_leftovers(folder)
 
 
 def mark_finished(folder: Path) -> None:
@@ -93,7 +99,7 @@ def clear_checkpoint(folder: Path) -> None:
     for path in (folder / PLAN_FILE, *folder.glob(_STATES)):  # the plan first: it names a state
         _remove(path)
     if folder.is_dir():
-        remove_temporaries(folder, recursive=False)
+        _remove_leftovers(folder)
 
 
 def facts_of(checkpoint: Checkpoint) -> dict[str, Any]:
@@ -132,16 +138,43 @@ def _read_state(folder: Path, state: dict[str, str]) -> dict[str, np.ndarray]:
     except (KeyError, TypeError) as error:
         raise _damaged(folder / PLAN_FILE, "it does not name its state's file") from error
     try:
-        data = path.read_bytes()
+        with path.open("rb") as file:
+            if hashlib.file_digest(file, "sha256").hexdigest() != checksum:
+                raise _damaged(path, f"its SHA-256 is not the one in {PLAN_FILE}")
+        return {name: np.array(array) for name, array in load_file(path).items()}  # ours to change
     except OSError as error:
         raise _damaged(path, f"it cannot be read ({error.strerror})") from error
-    if hashlib.sha256(data).hexdigest() != checksum:
-        raise _damaged(path, f"its SHA-256 is not the one in {PLAN_FILE}")
-    try:
-        arrays = safetensors.numpy.load(data)
     except SafetensorError as error:
         raise _damaged(path, str(error)) from error
-    return {name: np.array(array) for name, array in arrays.items()}  # the loader's are read-only
+
+
+def _write_state(path: Path, arrays: dict[str, np.ndarray]) -> str:
+    """Write arrays under their final name in one step, without a copy in memory. Returns SHA-256.
+
+    Raises:
+        OutputError: the system refused.
+    """
+    temporary = path.with_name(f".{path.name}{TEMPORARY_SUFFIX}")
+    try:
+        make_folder(path.parent)
+        save_file({name: np.asarray(a, order="C") for name, a in arrays.items()}, temporary)
+        with temporary.open("rb") as file:
+            checksum = hashlib.file_digest(file, "sha256").hexdigest()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+        flush_folder(path.parent)
+    except OSError as error:
+        raise output_error(path, error) from error
+    except SafetensorError as error:  # how it reports a full disk
+        raise OutputError(f"cannot write {path}: {error}; see whether the disk is full") from error
+    return checksum
+
+
+def _remove_leftovers(folder: Path) -> None:
+    """What killed runs left half-written; safetensors has temporary names of its own."""
+    remove_temporaries(folder, recursive=False)
+    for path in folder.glob(".tmp*"):
+        _remove(path)
 
 
 def _damaged(path: Path, what: str) -> OutputError:

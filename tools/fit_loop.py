@@ -96,11 +96,9 @@ class History:
         self.rows.append({"step": step, "seconds": self.spent_s(), "split": split, **scores})
 
     def last_psnr(self) -> tuple[str, float] | None:
-        """Split and PSNR of the latest evaluation."""
-        for row in reversed(self.rows):
-            if "psnr" in row:
-                return row["split"], row["psnr"]
-        return None
+        """Split and PSNR of the latest evaluation, of held-out views where there are any."""
+        latest = {row["split"]: row["psnr"] for row in self.rows if "psnr" in row}
+        return next(((s, latest[s]) for s in ("test", "train") if s in latest), None)
 
 
 @dataclass(frozen=True)

@@ -166,7 +166,7 @@ def resolved_uri(uri: str) -> tuple[str, str, dict[str, str]]:
     if scheme is None:
         scheme = recognise(Path(path))
     if Path(path).exists():
-        path = str(Path(path).absolute())
+        path = str(_absolute(Path(path)))
     return scheme, path, query
 
 
@@ -177,6 +177,13 @@ def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
         for name in dict.fromkeys([*before, *now])
         if before.get(name) != now.get(name)
     ]
+
+
+def _absolute(path: Path) -> Path:
+    """Without `..`, but with the last name as given, even of a link: it names the scene."""
+    if path.name in ("", ".."):
+        return path.resolve()
+    return path.parent.resolve() / path.name
 
 
 def _or(value: int | None, default: int) -> int:

@@ -6,10 +6,12 @@ import json
 import os
 import signal
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from fake_fit import Fakes, FakeTrainer
+from safetensors import SafetensorError
 
 from adapters.base import open_scene
 from adapters.recorded.depth_priors import DepthPriors
@@ -17,7 +19,7 @@ from augment.batch.lock import OutputLock
 from augment.errors import ClimateGSError, OutputError
 from augment.reconstruct.view import ViewKey
 from augment.scene_schema import FORMAT
-from tools import fit
+from tools import fit, fit_checkpoint
 from tools.cli import main
 from tools.fit import fit_scene, state_folder
 from tools.fit_checkpoint import Checkpoint, load_checkpoint, save_checkpoint
@@ -305,17 +307,27 @@ def test_estimate():
         now = 0.0
 
         def run_step(self):
-            self.now += 0.1
+            self.now += 0.1 + load_s
+            return SimpleNamespace(stage_s={"load": load_s})
 
-    trainer = Timed()
-    estimate = estimate_steps(lambda _: trainer, 600, grows=False, clock=lambda: trainer.now)
+    def estimated(budget_s, grows, views=100):
+        trainer = Timed()
+        clock = lambda: trainer.now  # noqa: E731
+        return estimate_steps(lambda _: trainer, budget_s, views=views, grows=grows, clock=clock)
+
+    load_s = 0.0
+    estimate = estimated(600, grows=False)
     assert estimate.step_s == pytest.approx(0.1)
     assert estimate.steps % 50 == 0
     assert estimate.steps == pytest.approx(600 * (1 - RESERVE) / 0.1, abs=51)  # rounded down to 50
-    slower = estimate_steps(lambda _: trainer, 600, grows=True, clock=lambda: trainer.now)
+    slower = estimated(600, grows=True)
     assert slower.steps == pytest.approx(estimate.steps / GROWTH, abs=51)
-    short = estimate_steps(lambda _: trainer, 0.01, grows=True, clock=lambda: trainer.now)
-    assert short.steps == 1
+    assert estimated(0.01, grows=True).steps == 1
+    load_s = 0.9  # reading 100 views once takes 90 s, and is done once
+    reading = estimated(600, grows=False)
+    assert reading.step_s == pytest.approx(0.1)
+    assert reading.steps == pytest.approx((600 * (1 - RESERVE) - 90) / 0.1, abs=51)
+    assert estimated(600, grows=False, views=10**6).steps > 1000  # some time is left for steps
 
 
 @pytest.mark.parametrize("steps", [1, 3, 10, 11, 5000])
@@ -518,6 +530,22 @@ def test_a_new_checkpoint_replaces_the_old_and_failing_keeps_it(tmp_path, monkey
     with pytest.raises(OutputError, match="disk is full"):
         save_checkpoint(tmp_path, checkpoint(step=3, arrays={"a": np.full(3, 3.0)}))
     assert load_checkpoint(tmp_path).arrays["a"][0] == 2.0
+
+
+def test_a_disk_that_is_full_keeps_the_old_checkpoint(tmp_path, monkeypatch):
+    save_checkpoint(tmp_path, checkpoint(step=1, arrays={"a": np.ones(3)}))
+
+    def full(arrays, path):
+        path.with_name(".tmpAbC").write_bytes(b"half")
+        raise SafetensorError("Error while serializing: No space left on device (os error 28)")
+
+    monkeypatch.setattr(fit_checkpoint, "save_file", full)
+    with pytest.raises(OutputError, match=r"state-0000002.safetensors: .*No space left"):
+        save_checkpoint(tmp_path, checkpoint(step=2, arrays={"a": np.zeros(3)}))
+    monkeypatch.undo()
+    assert load_checkpoint(tmp_path).step == 1
+    save_checkpoint(tmp_path, checkpoint(step=2, arrays={"a": np.zeros(3)}))
+    assert {p.name for p in tmp_path.iterdir()} == {"fit.json", "state-0000002.safetensors"}
 
 
 @pytest.mark.parametrize("name", ["fit.json", "state-0000001.safetensors"])
