@@ -39,9 +39,9 @@ def rasterize(
 
     buffers: names from augment.render.buffers; the others are None in the result. splat_ids counts
     through the parts in the order given. smog: fades every splat's colour towards the airlight by
-    its own distance. backend: "cpu" (numba, float32; gradients of rgb, alpha and
-    expected depth, without smog), "reference" (torch, float32 or float64, gradients of all), or
-    "auto": cpu where it can do the job, else reference.
+    its own distance. backend: "cpu" (numba, float32; gradients of rgb, alpha and expected_depth,
+    without smog and where no other buffer is asked for), "reference" (torch, float32 or float64,
+    gradients of all), or "auto": cpu where it can do the job, else reference.
 
     Raises:
         ValueError, TypeError: an argument no backend, or not the one named, can take.
@@ -84,7 +84,8 @@ def _choose(
     if dtype != torch.float32:
         obstacle = f"the Gaussians are {dtype}, it takes torch.float32"
     elif _tracked(parts) and (smog is not None or buffers - DIFFERENTIABLE):
-        what = "through smog" if smog is not None else "of " + ", ".join(buffers - DIFFERENTIABLE)
+        others = ", ".join(sorted(buffers - DIFFERENTIABLE))
+        what = "through smog" if smog is not None else f"of {others}"
         obstacle = f"gradients {what} are asked for, it has none"
     if backend == CPU:
         if obstacle:

@@ -79,13 +79,20 @@ def test_auto_takes_cpu_and_says_so_once(parts, fresh_log):
     rasterize(parts, camera_ahead())
     assert torch.equal(auto.rgb, rasterize(parts, camera_ahead(), backend="cpu").rgb)
     messages = [record.getMessage() for record in fresh_log.records]
-    assert messages == ["backend 'auto' renders with 'cpu' (float32 without gradients)"]
+    assert messages == ["backend 'auto' renders with 'cpu' (float32)"]
 
 
-def test_auto_takes_reference_where_gradients_are_asked_for(parts, fresh_log):
+def test_auto_takes_cpu_for_gradients_too(parts, fresh_log):
     output = rasterize([parts[0], tracked(parts[1])], camera_ahead())
     assert output.rgb.requires_grad
-    assert "gradients are asked for" in fresh_log.text
+    assert "renders with 'cpu'" in fresh_log.text
+
+
+def test_auto_takes_reference_for_gradients_that_cpu_has_not(parts, fresh_log):
+    arguments = {"buffers": ["rgb", "median_depth"]}
+    output = rasterize([parts[0], tracked(parts[1])], camera_ahead(), **arguments)
+    assert output.rgb.requires_grad
+    assert "gradients of median_depth are asked for" in fresh_log.text
 
 
 def test_auto_takes_reference_for_float64(parts, fresh_log):
@@ -184,8 +191,10 @@ def test_a_generator_of_parts_is_refused(parts):
 def test_cpu_refuses_what_it_cannot_do(parts):
     with pytest.raises(ValueError, match=r"torch\.float64, it takes torch\.float32; convert"):
         rasterize([doubled(parts[0])], camera_ahead(), backend="cpu")
-    with pytest.raises(ValueError, match="gradients are asked for, it has none; convert"):
-        rasterize([tracked(parts[0])], camera_ahead(), backend="cpu")
+    asked = {"buffers": ["rgb", "splat_ids", "median_depth"], "backend": "cpu"}
+    message = "gradients of median_depth, splat_ids are asked for, it has none; convert"
+    with pytest.raises(ValueError, match=message):
+        rasterize([tracked(parts[0])], camera_ahead(), **asked)
 
 
 def test_half_precision_is_refused(parts):

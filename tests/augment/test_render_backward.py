@@ -1,0 +1,572 @@
+"""Gradients of the CPU backend against those of the definition in float64, and against itself."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+
+import numpy as np
+import pytest
+import torch
+
+from augment.apply import render_buffers
+from augment.cameras import Frame
+from augment.plan import make_plan
+from augment.render.buffers import ALPHA, DIFFERENTIABLE, EXPECTED_DEPTH, RGB
+from augment.render.composite import composite_sky, map_colors
+from augment.render.constants import ALPHA_MIN, RasterSettings
+from augment.render.rasterize import rasterize
+from augment.render.threads import limit_threads
+from augment.scene import Gaussians, PosedGaussians, Scene
+from augment.sky import CubemapSky
+from augment.weather.smog import SmogMedium
+from recipes.schema import Output, Recipe
+from tests.scenes import (
+    camera_ahead,
+    one_gaussian,
+    random_gaussians,
+    sh_of,
+    slight_pose,
+    stack,
+)
+
+FIELDS = ("means", "quats", "scales", "opacities", "sh")
+DEFAULT = RasterSettings()
+# Alpha is 1 - T, good to 6e-8 of one, and the expected depth divides by it. Where a single splat
+# covers a pixel by 1/255 that is 1.5e-5 of its depth; and its slope by that splat's opacity, in
+# truth 0, is 255 times the error. (Losses leave out depths of pixels that are hardly covered.)
+HARDLY_COVERED = 3e-3
+
+
+@pytest.fixture
+def any_threads():
+    yield
+    limit_threads(None)
+
+
+# ---- comparing -------------------------------------------------------------------------------
+
+
+def leaves(parts, dtype=torch.float32):
+    """The parts with fresh float tensors that record gradients."""
+    out = []
+    for part in parts:
+        tensors = {
+            name: getattr(part.gaussians, name).detach().to(dtype).clone().requires_grad_()
+            for name in FIELDS
+        }
+        out.append(dataclasses.replace(part, gaussians=Gaussians(**tensors)))
+    return out
+
+
+def weighting(camera, buffers=DIFFERENTIABLE, seed=0) -> dict[str, torch.Tensor]:
+    """A random derivative of some loss by every pixel, of both signs."""
+    rng = np.random.default_rng(seed)
+    shapes = {RGB: (camera.height, camera.width, 3)}
+    return {
+        name: torch.from_numpy(
+            rng.normal(size=shapes.get(name, (camera.height, camera.width))).astype(np.float32)
+        )
+        for name in sorted(buffers)
+    }
+
+
+def gradients(parts, camera, weights, settings=DEFAULT, backend="cpu"):
+    """Gradients of the weighted sum of buffers: one dictionary a part, in float64."""
+    tracked = leaves(parts, torch.float64 if backend == "reference" else torch.float32)
+    out = rasterize(tracked, camera, buffers=list(weights), settings=settings, backend=backend)
+    total = sum((getattr(out, name) * weight).sum() for name, weight in weights.items())
+    if total.requires_grad or backend == "cpu":  # the definition of an empty image has no leaves
+        total.backward()
+    found = []
+    for part in tracked:
+        tensors = {name: getattr(part.gaussians, name) for name in FIELDS}
+        if backend == "cpu":
+            for name, tensor in tensors.items():
+                assert tensor.grad is not None and tensor.grad.shape == tensor.shape, name
+        found.append({
+            name: np.zeros(tensor.shape) if tensor.grad is None else tensor.grad.double().numpy()
+            for name, tensor in tensors.items()
+        })  # fmt: skip
+    return found
+
+
+def row_norms(array: np.ndarray) -> np.ndarray:
+    return np.sqrt(np.square(array).sum(axis=tuple(range(1, array.ndim))))
+
+
+def sizes_and_errors(parts, actual, expected, name) -> tuple[np.ndarray, np.ndarray]:
+    """Of every Gaussian of all parts: the size of its gradient by a field, and the error's.
+
+    A turn moves what a scale stretches, and of a ball nothing: a quaternion's gradient is a
+    difference of numbers as large as the one by the logarithm of scales, which counts as its size.
+    """
+    sizes, errors = [], []
+    for part, got, want in zip(parts, actual, expected, strict=True):
+        assert np.isfinite(got[name]).all() and np.isfinite(want[name]).all(), name
+        size = row_norms(want[name])
+        if name == "quats":
+            size += row_norms(want["scales"] * part.gaussians.scales.double().numpy())
+        sizes.append(size)
+        errors.append(row_norms(got[name] - want[name]))
+    return np.concatenate(sizes), np.concatenate(errors)
+
+
+def assert_gradients_match(
+    parts, camera, settings=DEFAULT, *, buffers=DIFFERENTIABLE, tolerance=2e-5, max_flips=0
+):
+    """Every Gaussian's gradient agrees with the definition's in float64, field by field.
+
+    A Gaussian's error is taken relative to its own gradient, or to a thousandth of the root mean
+    square where its own is smaller than that: sums of pixels that cancel keep the rounding errors
+    of their terms. `tolerance` bounds a field's relative l2 error: the kernel's exp2 is good to
+    3e-6 of alpha, and what lies behind a splat is a difference of float32 sums, which is 1e-6 to
+    1e-5 together. The 95th percentile of single Gaussians, small ones too, may be 100 times that.
+
+    max_flips: Gaussians that may be off by more than 1 %. The cut-offs (alpha at 1/255,
+    transmittance at 1e-4, order of z) are crossed in float32 elsewhere than in float64 in about
+    one of 1e5 pairs, and a Gaussian that shows in few pixels then gains or loses one of them.
+    """
+    weights = weighting(camera, buffers)
+    actual = gradients(parts, camera, weights, settings)
+    expected = gradients(parts, camera, weights, settings, backend="reference")
+    flipped: set[int] = set()
+    for name in FIELDS:
+        size, error = sizes_and_errors(parts, actual, expected, name)
+        shown = size > 0
+        assert not error[~shown].any(), f"{name} of splats that show nothing"
+        if not shown.any():
+            continue
+        floor = 1e-3 * np.sqrt(np.mean(size[shown] ** 2))
+        relative = error / np.maximum(size, floor)
+        flipped |= set(np.flatnonzero(relative > 1e-2).tolist())
+        good = shown & (relative <= 1e-2)
+        l2 = np.linalg.norm(error[good]) / np.linalg.norm(size[good])
+        p95 = np.quantile(relative[good], 0.95)
+        message = f"{name}: relative l2 error {l2:.2g}, 95th percentile {p95:.2g}"
+        assert l2 <= tolerance and p95 <= 100 * tolerance, message
+    assert len(flipped) <= max_flips, f"{len(flipped)} off by more than 1 %: {sorted(flipped)}"
+    return actual
+
+
+def posed(*gaussians):
+    return [PosedGaussians(g) for g in gaussians]
+
+
+def drawn_nowhere(gaussians: Gaussians) -> Gaussians:
+    """The Gaussians behind the camera."""
+    return dataclasses.replace(gaussians, means=-gaussians.means.abs() - 1)
+
+
+# ---- the definition --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("size", [(37, 21), (17, 33), (16, 16)], ids=str)
+def test_random_gaussians(size, antialiased):
+    settings = RasterSettings(antialiased=antialiased)
+    camera = camera_ahead(*size, 28.0, position=(0.02, -0.1, 0.07), yaw=0.1)
+    assert_gradients_match(
+        [PosedGaussians(random_gaussians(300, seed=size[0]), slight_pose())],
+        camera,
+        settings,
+        max_flips=2,
+    )
+
+
+def test_an_image_of_one_pixel():
+    assert_gradients_match(posed(random_gaussians(200, size=0.6)), camera_ahead(1, 1, 2.0))
+
+
+@pytest.mark.parametrize("limit", [None, 0, 1, 2, 3])
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_every_sh_degree(degree, limit):
+    gaussians = random_gaussians(60, seed=degree, sh_degree=degree, size=0.5)
+    settings = RasterSettings(sh_degree=limit)
+    found = assert_gradients_match(posed(gaussians), camera_ahead(19, 13, 18.0), settings)
+    used = (min(degree, 3 if limit is None else limit) + 1) ** 2
+    assert np.abs(found[0]["sh"][:, :used]).max(axis=(0, 2)).all()
+    assert not found[0]["sh"][:, used:].any()  # bands that were not evaluated
+
+
+@pytest.mark.parametrize("buffers", [{RGB}, {ALPHA}, {EXPECTED_DEPTH}, {RGB, ALPHA}], ids=str)
+def test_every_buffer_alone(buffers):
+    found = assert_gradients_match(
+        posed(random_gaussians(150, size=0.4)), camera_ahead(21, 17, 20.0), buffers=buffers
+    )
+    assert found[0]["opacities"].any()
+    assert bool(found[0]["sh"].any()) == (RGB in buffers)
+
+
+def test_parts_in_their_own_frames():
+    parts = [
+        PosedGaussians(random_gaussians(120, seed=1)),
+        PosedGaussians(drawn_nowhere(random_gaussians(40, seed=2)), slight_pose(), 1),
+        PosedGaussians(Gaussians.empty(sh_degree=3), slight_pose(), 2),
+        PosedGaussians(random_gaussians(90, seed=3, sh_degree=1), slight_pose((0.3, 0, 0.2)), 3),
+        PosedGaussians(one_gaussian(), None, 4),
+    ]
+    found = assert_gradients_match(parts, camera_ahead(33, 25), max_flips=1)
+    assert not any(found[1][name].any() for name in FIELDS)
+    assert all(found[part][name].any() for part in (0, 3) for name in FIELDS)
+
+
+def test_more_gaussians_than_a_block_holds():
+    """Blocks of 2048, of two parts, each with its own rows of gradients."""
+    small = random_gaussians(5000, seed=4, sh_degree=0, size=0.03)
+    parts = [PosedGaussians(small), PosedGaussians(random_gaussians(2100, seed=5, size=0.05))]
+    # 7000 Gaussians, most of a few pixels: a dozen of their pixels lie within 1e-6 of a cut-off.
+    assert_gradients_match(parts, camera_ahead(49, 35, 45.0), max_flips=12)
+
+
+def test_one_gaussian_has_the_gradients_of_its_formula():
+    """By opacity and colour they are sums that can be written down."""
+    camera = camera_ahead(33, 21)
+    weights = weighting(camera, {RGB})
+    found = gradients(posed(one_gaussian(opacity=0.6)), camera, weights)[0]
+    alpha = rasterize(posed(one_gaussian(opacity=0.6)), camera, backend="cpu").alpha.double()
+    shade = (weights[RGB] * torch.tensor([0.9, 0.5, 0.1])).sum(-1)
+    # 1e-5: rgb = opacity shape colour in float32, exp2 good to 3e-6
+    assert found["opacities"][0] == pytest.approx(float((shade * alpha).sum()) / 0.6, rel=1e-5)
+    by_color = (weights[RGB] * alpha[..., None]).sum((0, 1)).numpy() * 0.28209479177387814
+    np.testing.assert_allclose(found["sh"][0, 0], by_color, rtol=1e-5)
+    thin = posed(one_gaussian(scale=(0.3, 0.2, 0.5)))
+    assert_gradients_match(thin, camera, buffers={RGB, ALPHA})
+    assert_gradients_match(thin, camera, tolerance=HARDLY_COVERED)
+
+
+@pytest.mark.parametrize("count", [0, 30])
+def test_nothing_to_be_seen(count):
+    gaussians = drawn_nowhere(random_gaussians(30)) if count else Gaussians.empty()
+    camera = camera_ahead(17, 9)
+    found = gradients(posed(gaussians), camera, weighting(camera))
+    assert not any(found[0][name].any() for name in FIELDS)
+
+
+# ---- cut-offs --------------------------------------------------------------------------------
+
+
+def crowd(count: int, *, opacity: float, seed: int = 0) -> Gaussians:
+    """Splats all over the image, two pixels wide, one behind the other."""
+    rng = np.random.default_rng(seed)
+    base = random_gaussians(count, seed=seed, sh_degree=1)
+    x = rng.uniform(3.0, 6.0, count)
+    means = np.stack([x, *(rng.uniform(-0.6, 0.6, (2, count)) * x)], -1)
+    return dataclasses.replace(
+        base,
+        means=torch.from_numpy(means.astype(np.float32)),
+        scales=torch.from_numpy(rng.uniform(0.15, 0.4, (count, 3)).astype(np.float32)),
+        opacities=torch.full((count,), opacity),
+    )
+
+
+@pytest.mark.parametrize("opacity", [0.999, 0.7])
+def test_tiles_that_close_long_before_their_list_ends(opacity):
+    camera = camera_ahead(37, 21)
+    gaussians = crowd(3000, opacity=opacity)
+    assert float(rasterize(posed(gaussians), camera).alpha.min()) > 0.97
+    # What lies behind a splat is known to a few 1e-7 of the pixel, and transmittance falls to 1e-4:
+    # the last splats of a pixel, whose gradients are that small, keep two or three digits of them.
+    found = assert_gradients_match(posed(gaussians), camera, tolerance=1e-4, max_flips=8)
+    hidden = ~np.abs(found[0]["sh"]).reshape(3000, -1).any(1)
+    assert hidden.sum() > 1000  # what closed tiles hide gets exactly nothing
+
+
+@pytest.mark.parametrize("count", [31, 32, 33, 64, 65, 200])
+def test_lists_about_as_long_as_a_batch(count):
+    """Faint splats that all cover both tiles: no pixel closes before the end of the list."""
+    gaussians = dataclasses.replace(
+        crowd(count, opacity=0.03),
+        means=torch.stack([torch.linspace(3, 6, count), torch.zeros(count), torch.zeros(count)], 1),
+        scales=torch.linspace(2.0, 3.0, 3 * count).reshape(count, 3).contiguous(),
+    )
+    found = assert_gradients_match(posed(gaussians), camera_ahead(24, 16))
+    assert np.abs(found[0]["opacities"]).all()
+
+
+def test_tiles_without_any_splat():
+    near_corner = one_gaussian(mean=(4.0, 1.6, 1.0), scale=0.1)
+    camera = camera_ahead(65, 49, 40.0)
+    assert int((rasterize(posed(near_corner), camera).alpha > 0).sum()) < 100
+    assert_gradients_match(posed(near_corner), camera, buffers={RGB, ALPHA})
+    assert_gradients_match(posed(near_corner), camera, tolerance=HARDLY_COVERED)
+
+
+def degenerate() -> dict[str, Gaussians]:
+    """Gaussians at the edges of what can be drawn, by name; sixty of each."""
+    base = random_gaussians(60, seed=7, sh_degree=2, size=0.4)
+    ahead = torch.cat([base.means[:, :1].abs() + 2, base.means[:, 1:] * 0.5], 1)
+    base = dataclasses.replace(base, means=ahead)
+    ones = torch.ones(60)
+
+    def but(**changes):
+        return dataclasses.replace(base, **changes)
+
+    dark = base.sh.clone()
+    dark[:30, 0] = -4.0  # all channels below 0 in every direction
+    dark[30:, 0, 1] = -4.0
+    outside = torch.stack([base.means[:, 0], 1.8 * base.means[:, 0], base.means[:, 2]], 1)
+    near = torch.cat([torch.linspace(0.011, 0.3, 60)[:, None], 0.02 * base.means[:, 1:]], 1)
+    return {
+        "needles": but(scales=base.scales * torch.tensor([1.0, 1e-6, 1e-6])),
+        "needles in depth": but(scales=base.scales * torch.tensor([1e-6, 1e-6, 3.0])),
+        "flat": but(scales=base.scales * torch.tensor([1.0, 1.0, 1e-7])),
+        "huge": but(scales=base.scales * 200, opacities=0.1 * ones),
+        "specks": but(scales=base.scales * 1e-5),
+        "opaque": but(opacities=ones),
+        "faintest": but(opacities=ones * ALPHA_MIN),
+        "just drawn": but(opacities=ones * ALPHA_MIN * 1.02),
+        "invisible": but(opacities=ones * 0),
+        "dark": but(sh=dark),
+        "outside": but(means=outside, scales=base.scales * 4),
+        "near": but(means=near, scales=base.scales * 0.01),
+    }
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("kind", degenerate())
+def test_degenerate_gaussians(kind, antialiased):
+    camera = camera_ahead(37, 21)
+    settings = RasterSettings(antialiased=antialiased)
+    parts = posed(degenerate()[kind])
+    assert_gradients_match(parts, camera, settings, buffers={RGB, ALPHA}, max_flips=2)
+    assert_gradients_match(parts, camera, settings, tolerance=HARDLY_COVERED, max_flips=2)
+
+
+@pytest.mark.parametrize("alpha_max", [0.99, 0.5])
+def test_alphas_that_are_clamped_do_not_move(alpha_max):
+    """One splat wide enough that every pixel is clamped: only its colour has a gradient."""
+    camera = camera_ahead(17, 9)
+    wall = one_gaussian(scale=(1.0, 300.0, 300.0), opacity=0.9999)
+    settings = RasterSettings(alpha_max=alpha_max)
+    found = gradients(posed(wall), camera, weighting(camera, {RGB, ALPHA}), settings)[0]
+    assert found["sh"].any()
+    assert not any(found[name].any() for name in ("quats", "scales", "opacities", "means"))
+    assert_gradients_match(posed(random_gaussians(100, size=0.5)), camera, settings, max_flips=1)
+
+
+def test_colours_clamped_at_zero_get_no_gradient():
+    camera = camera_ahead(17, 9)
+    found = gradients(posed(one_gaussian(rgb=(0.5, -0.2, 0.3))), camera, weighting(camera))[0]
+    assert found["sh"][0, 0, 0] != 0 and found["sh"][0, 0, 1] == 0 and found["sh"][0, 0, 2] != 0
+
+
+def test_gaussians_about_the_near_plane():
+    """Those nearer than near_m are culled and get nothing; z is x here, to the bit."""
+    x = torch.tensor([0.5, np.nextafter(np.float32(2), np.float32(0)).item(), 2.0, 2.5])
+    base = stack(*(one_gaussian(opacity=0.5, scale=0.2) for _ in range(4)))
+    means = torch.stack([x, torch.linspace(-0.1, 0.1, 4), torch.zeros(4)], 1)
+    parts = posed(dataclasses.replace(base, means=means))
+    settings = RasterSettings(near_m=2.0)
+    found = assert_gradients_match(parts, camera_ahead(17, 9), settings)
+    assert (np.abs(found[0]["opacities"]) > 0).tolist() == [False, False, True, True]
+
+
+def test_equal_depths_keep_the_order_of_their_index():
+    """Forty splats at one z, alternately of two colours, in two parts."""
+    rng = np.random.default_rng(3)
+    spread = torch.from_numpy(rng.uniform(-0.3, 0.3, (40, 2)).astype(np.float32))
+    base = crowd(40, opacity=0.6)
+    colors = np.tile([[0.9, 0.1, 0.2], [0.1, 0.8, 0.7]], (20, 1))
+    flat = dataclasses.replace(
+        base, means=torch.cat([torch.full((40, 1), 4.0), spread], 1), sh=sh_of(colors)
+    )
+    parts = [PosedGaussians(flat), PosedGaussians(flat, None, 1)]
+    found = assert_gradients_match(parts, camera_ahead(25, 17))
+    front, back = (np.linalg.norm(g["sh"]) for g in found)
+    assert front > 3 * back  # the same splats, but the second part's stand behind
+
+
+# ---- as a torch operation --------------------------------------------------------------------
+
+
+def test_recording_gradients_changes_no_bit_of_the_image():
+    parts = [
+        PosedGaussians(random_gaussians(400)),
+        PosedGaussians(crowd(3000, opacity=0.9), slight_pose(), 1),
+    ]
+    camera = camera_ahead(61, 43, 50.0)
+    plain = rasterize(parts, camera, buffers=DIFFERENTIABLE, backend="cpu")
+    tracked = rasterize(leaves(parts), camera, buffers=DIFFERENTIABLE, backend="cpu")
+    for name in DIFFERENTIABLE:
+        assert getattr(tracked, name).requires_grad
+        assert torch.equal(getattr(tracked, name).detach(), getattr(plain, name)), name
+
+
+@pytest.mark.usefixtures("any_threads")
+def test_same_bits_for_any_number_of_threads_and_every_time():
+    parts = [
+        PosedGaussians(random_gaussians(3000, size=0.1)),
+        PosedGaussians(crowd(2500, opacity=0.8), slight_pose(), 1),
+    ]
+    camera = camera_ahead(97, 65, 80.0)
+    weights = weighting(camera)
+    runs = []
+    for threads in (1, 2, 2, 1):
+        limit_threads(threads)
+        runs.append(gradients(parts, camera, weights))
+    for run in runs[1:]:
+        for actual, expected in zip(run, runs[0], strict=True):
+            for name in FIELDS:
+                assert np.array_equal(actual[name], expected[name]), name
+
+
+def test_auto_takes_the_kernels():
+    camera = camera_ahead()
+    parts, weights = posed(random_gaussians(100)), weighting(camera)
+    auto, cpu = (gradients(parts, camera, weights, backend=name)[0] for name in ("auto", "cpu"))
+    assert all(np.array_equal(auto[name], cpu[name]) for name in FIELDS)
+
+
+@pytest.mark.parametrize("field", FIELDS)
+def test_one_tracked_tensor_of_one_part_is_enough(field):
+    camera = camera_ahead(21, 15)
+    parts = posed(random_gaussians(80), random_gaussians(60, seed=1))
+    weights = weighting(camera)
+    expected = gradients(parts, camera, weights)[1][field]
+    tensor = getattr(parts[1].gaussians, field).clone().requires_grad_()
+    parts[1] = PosedGaussians(dataclasses.replace(parts[1].gaussians, **{field: tensor}))
+    out = rasterize(parts, camera, buffers=DIFFERENTIABLE, backend="cpu")
+    sum((getattr(out, name) * weight).sum() for name, weight in weights.items()).backward()
+    assert np.array_equal(tensor.grad.double().numpy(), expected)
+
+
+def test_tensors_that_are_views_of_others():
+    """Slices and transposes: the kernels read copies, gradients find their way back."""
+    camera = camera_ahead(21, 15)
+    gaussians = random_gaussians(80, sh_degree=1)
+    weights = weighting(camera)
+    expected = gradients(posed(gaussians), camera, weights)[0]
+    columns = torch.cat([gaussians.means, gaussians.scales], 1).T.contiguous().requires_grad_()
+    every = gaussians.sh.repeat_interleave(2, 0).requires_grad_()
+    changed = dataclasses.replace(
+        gaussians, means=columns[:3].T, scales=columns[3:].T, sh=every[::2]
+    )
+    out = rasterize(posed(changed), camera, buffers=DIFFERENTIABLE, backend="cpu")
+    sum((getattr(out, name) * weight).sum() for name, weight in weights.items()).backward()
+    assert np.array_equal(columns.grad[:3].T.double().numpy(), expected["means"])
+    assert np.array_equal(columns.grad[3:].T.double().numpy(), expected["scales"])
+    assert np.array_equal(every.grad[::2].double().numpy(), expected["sh"])
+    assert not every.grad[1::2].any()
+
+
+def test_two_renders_in_one_loss_keep_apart():
+    """Each keeps its own record of what it drew, whatever is rendered before its gradients."""
+    cameras = [camera_ahead(21, 15), camera_ahead(33, 9, yaw=0.2)]
+    parts = posed(random_gaussians(100))
+    separate = [gradients(parts, c, weighting(c, {RGB}))[0] for c in cameras]
+    tracked = leaves(parts)
+    images = [rasterize(tracked, c, backend="cpu").rgb for c in cameras]
+    rasterize(parts, camera_ahead(50, 50), backend="cpu")
+    pairs = zip(images, cameras, strict=True)
+    total = sum((image * weighting(c, {RGB})[RGB]).sum() for image, c in pairs)
+    total.backward(retain_graph=True)
+    for name in FIELDS:
+        together = getattr(tracked[0].gaussians, name).grad.double().numpy()
+        summed = separate[0][name] + separate[1][name]
+        # two float32 gradients added in float32 rather than in float64
+        np.testing.assert_allclose(together, summed, rtol=1e-6, atol=1e-6 * np.abs(summed).max())
+    first = tracked[0].gaussians.means.grad.clone()
+    total.backward()
+    assert torch.equal(tracked[0].gaussians.means.grad, 2 * first)  # the record can be used again
+
+
+def test_images_may_be_changed_in_place_before_the_gradients():
+    camera = camera_ahead(21, 15)
+    parts, weights = posed(random_gaussians(100)), weighting(camera, {RGB, ALPHA})
+    expected = gradients(parts, camera, weights)[0]
+    tracked = leaves(parts)
+    out = rasterize(tracked, camera, backend="cpu")
+    rgb = out.rgb.mul_(2.0)
+    ((rgb * weights[RGB]).sum() / 2 + (out.alpha * weights[ALPHA]).sum()).backward()
+    for name in FIELDS:
+        actual = getattr(tracked[0].gaussians, name).grad.double().numpy()
+        assert np.array_equal(actual, expected[name]), name  # by 2 and 1/2: exact
+
+
+@pytest.mark.parametrize("field", FIELDS)
+def test_changing_a_tensor_before_its_gradients_raises(field):
+    tracked = leaves(posed(random_gaussians(50)))
+    total = rasterize(tracked, camera_ahead(), backend="cpu").rgb.sum()
+    with torch.no_grad():
+        getattr(tracked[0].gaussians, field).mul_(1.5)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        total.backward()
+
+
+def test_second_derivatives_are_refused():
+    tracked = leaves(posed(random_gaussians(50)))
+    total = rasterize(tracked, camera_ahead(), backend="cpu").rgb.square().sum()
+    means = tracked[0].gaussians.means
+    (first,) = torch.autograd.grad(total, means, create_graph=True)
+    with pytest.raises(RuntimeError, match="once_differentiable"):
+        first.sum().backward()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "what"),
+    [
+        ({"smog": SmogMedium(0.05, (0.5, 0.6, 0.7))}, "gradients through smog are asked for"),
+        ({"buffers": [RGB, "median_depth"]}, "gradients of median_depth are asked for"),
+        (
+            {"buffers": [RGB, "median_depth", "splat_ids"]},
+            "gradients of median_depth, splat_ids are asked for",
+        ),
+    ],
+    ids=["smog", "median depth", "splat ids too"],
+)
+def test_what_the_kernels_have_no_gradients_of(arguments, what):
+    """Naming the backend raises; auto takes the definition, to the bit."""
+    camera, parts = camera_ahead(17, 9), posed(random_gaussians(60))
+    with pytest.raises(ValueError, match=re.escape(what)):
+        rasterize(leaves(parts), camera, backend="cpu", **arguments)
+    found = []
+    for backend in ("auto", "reference"):
+        tracked = leaves(parts)
+        out = rasterize(tracked, camera, backend=backend, **arguments)
+        total = out.rgb.square().sum()
+        if out.median_depth is not None:
+            total = total + out.median_depth.sum()
+        total.backward()
+        found.append([getattr(tracked[0].gaussians, name).grad for name in FIELDS])
+    for actual, expected in zip(*found, strict=True):
+        assert actual.any() and torch.equal(actual, expected)
+    with torch.no_grad():  # nothing is recorded, so nothing stands in the way
+        rasterize(leaves(parts), camera, backend="cpu", **arguments)
+
+
+# ---- through the rest of the picture ---------------------------------------------------------
+
+
+def sky() -> CubemapSky:
+    return CubemapSky(torch.rand(6, 8, 8, 3, generator=torch.Generator().manual_seed(1)))
+
+
+def test_gradients_through_sky_and_colour_map():
+    """The fast paths of both know no gradients, and must not be taken where they are recorded."""
+    camera = camera_ahead(33, 21)
+    weights = weighting(camera, {RGB})[RGB]
+    color_map = torch.eye(3, 4) + 0.05
+    found = []
+    for backend in ("cpu", "reference"):
+        dtype = torch.float32 if backend == "cpu" else torch.float64
+        tracked = leaves(posed(random_gaussians(150, seed=2)), dtype)
+        out = rasterize(tracked, camera, backend=backend)
+        rgb = map_colors(composite_sky(out.rgb, out.alpha, camera, sky()), color_map)
+        (rgb * weights).sum().backward()
+        found.append({n: getattr(tracked[0].gaussians, n).grad.double() for n in FIELDS})
+    for name in FIELDS:
+        difference = (found[0][name] - found[1][name]).norm() / found[1][name].norm()
+        assert float(difference) < 1e-4, name  # as in assert_gradients_match: a flip is smaller
+
+
+def test_gradients_through_a_planned_picture():
+    gaussians = leaves(posed(random_gaussians(100)))[0].gaussians
+    camera = camera_ahead(33, 21)
+    frame = Frame(0, 0, torch.eye(4, dtype=torch.float64), {"ahead": camera})
+    maps = {"ahead": torch.eye(3, 4) * 0.9}
+    scene = Scene("s", "test:s", gaussians, (), sky(), (frame,), color_maps=maps)
+    plan = make_plan(Recipe(output=Output(depth="expected", semantic=False, instance=False)), scene)
+    view = render_buffers(scene, camera, plan, backend="cpu")
+    view.rgb.sum().backward()
+    assert bool(gaussians.means.grad.any())
