@@ -45,6 +45,7 @@ from augment.errors import AdapterError
 from augment.scene import Scene
 
 _FEWEST_RETURNS = 100  # no surface is found among fewer
+_DEPTH_TOP_DEG = 90.0  # what a depth image leaves open has no surface, however high it is
 _SKY_ABOVE_DEG = 15.0  # with nothing but a flat ground drawn, every column's top is sky
 
 
@@ -121,14 +122,14 @@ class _Start:
         lidar = read_lidar_drive(self.root, self.calibration, self.used)
         if len(lidar) >= _FEWEST_RETURNS:
             return self._surfaces(lidar.sweeps, lidar.top_deg), lidar.problems
-        sweeps, top_deg, problems = depth_sweeps(self.root, self.used)
+        sweeps, problems = depth_sweeps(self.root, self.used)
         problems = lidar.problems + problems
         if any(len(sweep) for sweep in sweeps):
             said = (
                 f"{self.root / 'lidar'} holds {len(lidar) or 'no'} returns: the scene starts from "
                 f"the points of {len(sweeps)} depth images"
             )
-            return self._surfaces(sweeps, top_deg), (*problems, said)
+            return self._surfaces(sweeps, _DEPTH_TOP_DEG), (*problems, said)
         said = (
             f"{self.root / 'lidar'} holds {len(lidar) or 'no'} returns and {self.root / 'depth'} "
             f"no depth: the scene starts from a flat ground "

@@ -25,13 +25,9 @@ _FARTHEST_M = 200.0  # beyond, one step of the file's may be less than the depth
 _BENT = 0.05
 
 
-def depth_sweeps(
-    root: Path, frames: Sequence[Frame]
-) -> tuple[tuple[Sweep, ...], float, tuple[str, ...]]:
-    """One sweep for each depth image, the highest elevation above the horizon that all images
-    together look at (degrees), and a sentence for each image that cannot be used.
-
-    Each point has its camera's time. Only frames' cameras of the calibration count.
+def depth_sweeps(root: Path, frames: Sequence[Frame]) -> tuple[tuple[Sweep, ...], tuple[str, ...]]:
+    """One sweep for each depth image of the frames' cameras, and a sentence for each image that
+    cannot be used. Each point has its camera's time.
 
     Raises:
         AdapterError: a file lies outside the folder.
@@ -55,8 +51,7 @@ def depth_sweeps(
                 problems.append(f"camera {name}, frame {frame.index}: depth {path}: {error}")
                 continue
             sweeps.append(back_project(depth_m, camera))
-    # What a depth image leaves open has no surface: there the sky is sure at any elevation.
-    return tuple(sweeps), 90.0, tuple(problems)
+    return tuple(sweeps), tuple(problems)
 
 
 def back_project(depth_m: np.ndarray, camera: Camera) -> Sweep:

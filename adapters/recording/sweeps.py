@@ -20,6 +20,7 @@ from augment.labels import LidarSweep
 from augment.semantics import SemanticClass
 
 _FAR_M = 1000.0  # no LiDAR on the ground sees this far
+_OWN_M, _OWN_PART = 1.5, 1e-3  # a car's own returns are some hundreds a sweep
 _TOP_QUANTILE = 0.999
 _TOP_BEYOND_M = 5.0  # nearer, a camera's height says little of the sensor's
 _TOP_DEG = (2.0, 60.0)
@@ -67,6 +68,8 @@ def read_lidar_drive(root: Path, calibration: Calibration, frames: Sequence[Fram
         )
     table, more = _class_table(root, raws, calibration)
     sweeps = tuple(raw.usable(table) for raw in raws)
+    if calibration.ego_box_m is None:
+        problems += _own_returns(sweeps, known)
     return LidarDrive(sweeps, _top_deg(sweeps, known), (*problems, *more))
 
 
@@ -161,6 +164,28 @@ def _class_table(
     return table, ()
 
 
+def _own_returns(sweeps: Sequence[Sweep], known: Sequence[tuple[Frame, Path]]) -> list[str]:
+    """A sentence where the LiDAR seems to see its own car."""
+    near = total = 0
+    for sweep, (frame, _) in zip(sweeps, known, strict=True):
+        if frame.cameras:
+            total += len(sweep)
+            distance = np.linalg.norm(sweep.points - _middle(frame), axis=1)
+            near += int((distance < _OWN_M).sum())
+    if near <= _OWN_PART * total:
+        return []
+    return [
+        f"lidar/: {near} of {total} returns lie within {_OWN_M} m of the cameras' middle, likely "
+        f"on the recording car, which they smear along the road; give ego_box_m in "
+        f"calibration.json to leave them out"
+    ]
+
+
+def _middle(frame: Frame) -> np.ndarray:
+    """The middle of a frame's cameras, float64 [3]."""
+    return np.mean([camera.centre.numpy() for camera in frame.cameras.values()], axis=0)
+
+
 def _top_deg(sweeps: Sequence[Sweep], known: Sequence[tuple[Frame, Path]]) -> float:
     """About the elevation of the highest channel: that of nearly the steepest return, as seen from
     the height of the cameras, for want of the sensor's own."""
@@ -168,8 +193,7 @@ def _top_deg(sweeps: Sequence[Sweep], known: Sequence[tuple[Frame, Path]]) -> fl
     for sweep, (frame, _) in zip(sweeps, known, strict=True):
         if not frame.cameras or not len(sweep):
             continue
-        eyes = np.stack([camera.centre.numpy() for camera in frame.cameras.values()])
-        offset = sweep.points - eyes.mean(axis=0)
+        offset = sweep.points - _middle(frame)
         reach = np.hypot(offset[:, 0], offset[:, 1])
         far = reach > _TOP_BEYOND_M
         rises.append(np.degrees(np.arctan2(offset[far, 2], reach[far])))

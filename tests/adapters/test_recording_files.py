@@ -153,7 +153,9 @@ def test_missing_and_damaged_images_are_problems(folder):
     frames, problems = images_of(folder)
     assert [len(frame.image_paths) for frame in frames] == [1, 1, 1]
     assert problems[0] == "camera left_camera, frame 0: its image is missing"
-    assert "000001.png is cut short" in problems[1] and "000002.png cannot be decoded" in problems[2]
+    assert (
+        "000001.png is cut short" in problems[1] and "000002.png cannot be decoded" in problems[2]
+    )
     more = unlisted_images(folder, frames)
     assert "front_camera: 1 images, such as of frame 77, have no entry" in more[0]
     assert "images/roof belongs to no camera of calibration.json" in more[1]
@@ -282,6 +284,17 @@ def test_returns_on_the_own_car_and_not_finite_ones_are_left_out(folder):
     # Returns on the box's very edge may be counted either way.
     assert not ((np.abs(local[:, :2]) < [1.99, 0.99]).all(axis=1) & (local[:, 2] > -1)).any()
     assert len(drive.sweeps[1]) < len(columns["x"]) - 5
+
+
+def test_returns_on_the_own_car_are_noticed(folder):
+    columns = recording.sweep_columns(1)
+    body = {k: v[:200].copy() for k, v in columns.items()}
+    body["x"][:], body["y"][:], body["z"][:] = street.ego_position(1)[0] + 0.6, 0.5, 0.7
+    recording.write_lidar(folder, 1, {k: np.append(v, body[k]) for k, v in columns.items()})
+    (problem,) = lidar_of(folder).problems
+    assert "lidar/: 200 of " in problem and "give ego_box_m" in problem
+    edit_calibration(folder, lambda c: c.update(ego_box_m=[[-2, -1, -0.3], [2, 1, 2]]))
+    assert lidar_of(folder).problems == ()
 
 
 def test_classes_are_those_of_the_calibration(folder):
