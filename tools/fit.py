@@ -6,22 +6,25 @@ the data, the settings and the number of steps alone; times are in OUT.fit only.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
+import shutil
 import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from augment.batch.layout import STATE_FOLDER
 from augment.batch.lock import OutputLock
 from augment.errors import OutputError
 from augment.reconstruct.view import ViewSource
 from augment.scene import Scene
 from augment.scene_files import is_scene_folder
 from tools.fit_checkpoint import (
+    PLAN_FILE,
     Checkpoint,
-    clear_checkpoint,
     load_checkpoint,
     mark_finished,
     save_checkpoint,
@@ -60,14 +63,16 @@ def fit_scene(
     folder = state_folder(options.out)
     _check_out(options, folder)
     with OutputLock(folder):
-        if options.overwrite:
-            clear_checkpoint(folder)
-        before = load_checkpoint(folder, arrays=False)
+        before = None if options.overwrite else load_checkpoint(folder, arrays=False)
         if before is not None:
             _check_same(options, before)
             if before.finished and (done := _finished(options, folder, before)) is not None:
                 return done
-        run = _prepare(options, parts or real_parts(), folder, before)
+        try:
+            run = _prepare(options, parts or real_parts(), folder, before)
+        except BaseException:
+            _remove_unused(folder)
+            raise
         return _run(run, checkpoint_s, progress)
 
 
@@ -109,7 +114,7 @@ def _prepare(options: FitOptions, parts: FitParts, folder: Path, before: Checkpo
         if options.budget_s is not None:
             steps = _estimate(options, parts, scene, source)
             plan = dataclasses.replace(plan, steps=steps)
-        save_checkpoint(folder, plan)
+        save_checkpoint(folder, plan)  # in place of what --overwrite gives up
     else:
         plan = load_checkpoint(folder)
         assert plan is not None
@@ -171,10 +176,8 @@ def _run(run: _Run, checkpoint_s: float, progress: bool) -> FitOutcome:
     if complete:
         mark_finished(run.folder)
         return FitOutcome(0, report)
-    _say(
-        f"stopped after step {run.trainer.step} of {run.plan.steps}; the same command goes on "
-        f"from there"
-    )
+    again = "the same command without --overwrite" if run.options.overwrite else "the same command"
+    _say(f"stopped after step {run.trainer.step} of {run.plan.steps}; {again} goes on from there")
     return FitOutcome(130, report)
 
 
@@ -228,6 +231,14 @@ def _problems(scene: Scene, source: Views, leaks: tuple[str, ...]) -> tuple[str,
 
 def report_folder(folder: Path) -> Path:
     return folder / "report"
+
+
+def _remove_unused(folder: Path) -> None:
+    """Leave no trace of a run that never began: its lock, and the folder if that was all."""
+    if not (folder / PLAN_FILE).exists():
+        shutil.rmtree(folder / STATE_FOLDER, ignore_errors=True)
+        with contextlib.suppress(OSError):  # not empty
+            folder.rmdir()
 
 
 def _check_out(options: FitOptions, folder: Path) -> None:

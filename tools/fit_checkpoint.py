@@ -94,14 +94,6 @@ def load_checkpoint(folder: Path, *, arrays: bool = True) -> Checkpoint | None:
     return Checkpoint(**plan, arrays=_read_state(folder, state) if state and arrays else {})
 
 
-def clear_checkpoint(folder: Path) -> None:
-    """Forget what was fitted here, and what a killed run left."""
-    for path in (folder / PLAN_FILE, *folder.glob(_STATES)):  # the plan first: it names a state
-        _remove(path)
-    if folder.is_dir():
-        _remove_leftovers(folder)
-
-
 def facts_of(checkpoint: Checkpoint) -> dict[str, Any]:
     """The checkpoint's facts for JSON."""
     names = (name for name in Checkpoint.__dataclass_fields__ if name != "arrays")

@@ -176,6 +176,14 @@ def test_an_interrupted_run_leaves_a_scene_and_goes_on(options, tmp_path, number
     assert resumed.report["seconds"] > resumed.report["seconds_of_this_run"] > 0
 
 
+def test_an_ignored_signal_stays_ignored(options):
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        assert run(options, Fakes(before_step=interrupter(5, signal.SIGINT))).code == 0
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 def test_a_stopped_run_evaluates_some_views_only(options, monkeypatch):
     seen = []
     monkeypatch.setattr(fit, "EVALUATED_WHEN_STOPPED", 2)
@@ -437,6 +445,21 @@ def test_mistakes_exit_with_2_before_anything_is_opened(arguments, message, tmp_
     error = capsys.readouterr().err
     assert message in error and "Traceback" not in error
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_run_that_never_began_leaves_nothing(drive, tmp_path):
+    options = FitOptions(scene=drive, out=tmp_path / "scene", steps=1)
+    with pytest.raises(ClimateGSError, match="no recorded images"):
+        run(options, Fakes(recorded=False))
+    assert [p.name for p in tmp_path.iterdir()] == ["drive"]
+
+
+def test_overwriting_with_data_that_cannot_be_opened_keeps_what_is_there(options):
+    run(options, Fakes())
+    with pytest.raises(ClimateGSError, match="no recorded images"):
+        run(dataclasses.replace(options, overwrite=True), Fakes(recorded=False))
+    fakes = Fakes()
+    assert run(options, fakes).code == 0 and fakes.opened == []  # finished as before
 
 
 def test_held_out_in_the_uri_is_refused(drive, tmp_path):
