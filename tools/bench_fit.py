@@ -32,7 +32,7 @@ from recipes.load import load_recipe
 from tools.bench import Spread
 from tools.bench_memory import RESET_PEAK, return_free_memory, status_mib
 from tools.fit_data import HELD_OUT_SCHEMES, check_recorded, splat_count
-from tools.fit_options import resolved_uri
+from tools.fit_options import resolved_uri, without_growth
 from tools.machine import MachineFacts, load_average, machine_facts
 
 SPLATS = 200_000
@@ -99,7 +99,7 @@ def _measure(
     before = _mark_memory()
     begun = time.perf_counter()
     warm_up()
-    config = FitConfig(sh_every=1, densify=DensifyConfig(method="none"))
+    config = FitConfig(sh_every=1, densify=without_growth(DensifyConfig()))
     trainer = Trainer(scene, source, config)
     for _ in range(UNTIMED):
         trainer.run_step()

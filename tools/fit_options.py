@@ -16,7 +16,7 @@ from adapters.recorded.depth_priors import DepthPriors
 from adapters.recorded.holdout import holdout_step
 from adapters.uri import format_uri, parse_uri
 from augment.errors import ClimateGSError
-from augment.reconstruct.config import FitConfig
+from augment.reconstruct.config import DensifyConfig, FitConfig
 
 DEFAULT_MINUTES = 10.0
 DENSIFY = ("absgrad", "mcmc", "none")
@@ -92,10 +92,12 @@ class FitOptions:
         """The optimiser's configuration for this many steps."""
         default = FitConfig()
         growth = dataclasses.replace(
-            default.densify,
-            method=self.densify,
-            max_splats=_or(self.max_splats, default.densify.max_splats),
+            default.densify, max_splats=_or(self.max_splats, default.densify.max_splats)
         )
+        if self.densify == "none":
+            growth = without_growth(growth)
+        else:
+            growth = dataclasses.replace(growth, method=self.densify)
         return dataclasses.replace(
             default,
             steps=steps,
@@ -114,6 +116,7 @@ class FitOptions:
             "cameras": "all" if self.cameras is None else ",".join(self.cameras),
             "scale": self.scale,
             "holdout": self.holdout,
+            "densify": self.densify,
             "depth": _depth_text(parse_depth(self.depth)),
             "ego_masks": None if self.ego_masks is None else str(self.ego_masks.absolute()),
             **_flat(config),
@@ -124,6 +127,11 @@ class FitOptions:
         if self.steps is not None:
             return {"steps": self.steps}
         return {"minutes": DEFAULT_MINUTES if self.minutes is None else self.minutes}
+
+
+def without_growth(config: DensifyConfig) -> DensifyConfig:
+    """No splats are added or removed: the part of the run for it ends before it starts."""
+    return dataclasses.replace(config, start=1.0, stop=0.0)
 
 
 def parse_depth(text: str) -> DepthPriors:

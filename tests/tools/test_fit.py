@@ -17,6 +17,8 @@ from adapters.base import open_scene
 from adapters.recorded.depth_priors import DepthPriors
 from augment.batch.lock import OutputLock
 from augment.errors import ClimateGSError, OutputError
+from augment.reconstruct.config import FitConfig
+from augment.reconstruct.densify import densify_due
 from augment.reconstruct.view import ViewKey
 from augment.scene_schema import FORMAT
 from tools import fit, fit_checkpoint
@@ -240,7 +242,7 @@ def test_a_scene_that_was_deleted_is_written_again_from_the_checkpoint(options):
         ({"seed": 3}, "seed was 0, now 3"),
         ({"cameras": ("front",)}, "cameras was all, now front"),
         ({"depth_weight": 0.0}, r"loss.depth was 1.0, now 0.0"),
-        ({"densify": "mcmc"}, r"densify.method was absgrad, now mcmc"),
+        ({"densify": "mcmc"}, "densify was absgrad, now mcmc"),
         ({"steps": 200}, r"its length was --steps 120 \(120 steps\), now --steps 200"),
         ({"steps": None}, r"now --minutes 10"),
     ],
@@ -489,6 +491,19 @@ def test_two_runs_at_once_are_refused(options):
     refused = pytest.raises(OutputError, match="being written by another job")
     with OutputLock(state_folder(options.out)), refused:
         run(options, Fakes())
+
+
+def test_options_become_a_configuration(options):
+    chosen = dataclasses.replace(
+        options, densify="mcmc", max_splats=9, sh_degree=3, depth_weight=0.5, seed=4
+    ).config(700)
+    assert (chosen.steps, chosen.seed, chosen.sh_degree, chosen.loss.depth) == (700, 4, 3, 0.5)
+    assert (chosen.densify.method, chosen.densify.max_splats) == ("mcmc", 9)
+    default = options.config(120)
+    assert default == dataclasses.replace(FitConfig(), steps=120)
+    assert any(densify_due(default.densify, step, 1000) for step in range(1001))
+    fixed = dataclasses.replace(options, densify="none").config(1000)
+    assert not any(densify_due(fixed.densify, step, 1000) for step in range(1001))
 
 
 @pytest.mark.parametrize(
