@@ -72,7 +72,7 @@ def update_splats(
     age,
     grads,
 ):
-    """One step of Adam for every row of gradients.
+    """One step of Adam for every row of gradients; a splat whose row is not finite stays as it is.
 
     addresses, sizes, views, blocks: as in cpu_project; the splats are changed in place. firsts:
     int64 [P], index of each part's first splat in the arrays of moments. rows, ids, counts: what
@@ -98,13 +98,13 @@ def update_splats(
                 row = (base + at + lane) * U(GRAD)
                 splat = U(ids[base + at + lane])
                 one = U(firsts[part]) + splat
+                if not math.isfinite(_row_power(rows, row)):
+                    continue
                 age[one] += 1
                 grads[U(3) * one] += rows[row + U(G_ABS)] * rates[R_ABS_UNIT]
                 grads[U(3) * one + U(1)] += np.float32(1)
                 radius = rows[row + U(G_RADIUS)] * rates[R_RADIUS_UNIT]
                 grads[U(3) * one + U(2)] = max(grads[U(3) * one + U(2)], radius)
-                if not math.isfinite(_row_sum(rows, row)):
-                    continue
                 n = U(min(age[one], CORRECTED))
                 first, second = corrections[U(2) * n], corrections[U(2) * n + U(1)]
                 _update_geometry(
@@ -119,10 +119,11 @@ def update_splats(
 
 
 @inner()
-def _row_sum(rows, row):
+def _row_power(rows, row):
+    """Sum of squares: not finite where a number is not, or its second moment would not be."""
     total = np.float32(0)
     for i in range(U(GRAD)):
-        total += rows[row + i]
+        total += rows[row + i] * rows[row + i]
     return total
 
 

@@ -23,7 +23,7 @@ def splat_rates(config: FitConfig, step: int, camera: Camera, extent_m: float) -
     done = min(1.0, step / max(config.steps, 1))
     late = rates.late**done
     values = np.zeros(kernels.RATES, np.float32)
-    values[G_MEAN : G_MEAN + 3] = rates.means * (rates.means_end / rates.means) ** done
+    values[G_MEAN : G_MEAN + 3] = rates.means ** (1 - done) * rates.means_end**done
     values[G_QUAT : G_QUAT + 4] = rates.quats * late
     values[G_SCALE : G_SCALE + 3] = rates.scales * late
     values[G_OPACITY] = -rates.opacities * late

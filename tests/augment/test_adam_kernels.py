@@ -1,0 +1,579 @@
+"""Updates of splats, sky and colour maps against plain Adam in float64."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from augment.geometry import rigid, rotmat_from_quat
+from augment.reconstruct import adam_kernels as kernels
+from augment.reconstruct.config import FitConfig, LearningRates, LossWeights
+from augment.reconstruct.dense_adam import ColorAdam, DenseAdam
+from augment.reconstruct.inputs import splat_inputs
+from augment.reconstruct.rates import BETA1, BETA2, CORRECTIONS, splat_rates
+from augment.reconstruct.splats import Splats
+from augment.render.constants import RasterSettings
+from augment.render.cpu_inputs import part_poses
+from augment.render.cpu_layout import BLOCK
+from augment.render.cpu_project_backward import (
+    G_ABS,
+    G_COLOR,
+    G_MEAN,
+    G_OPACITY,
+    G_QUAT,
+    G_RADIUS,
+    G_SCALE,
+    GRAD,
+)
+from augment.render.sh import sh_basis
+from augment.render.threads import kernel_threads, limit_threads
+from augment.scene import Gaussians
+from tests.scenes import camera_ahead, random_gaussians, slight_pose
+
+EPS = 1e-15
+EXTENT_M = 50.0
+FASTER = LearningRates(means=0.5, quats=1e-2, scales=2e-2, opacities=0.2, sh_rest=1e-3)
+CONFIG = FitConfig(
+    steps=100, rates=FASTER, loss=LossWeights(opacity_decay=0.02, scale_decay=0.03), sh_degree=3
+)
+BOTH = ((0, None), (1, slight_pose()))
+COUNTS = (2500, 37)  # of both parts; the first fills one block and begins a second
+
+
+@pytest.fixture
+def any_threads():
+    yield
+    limit_threads(None)
+
+
+def ahead(count: int, seed: int) -> Gaussians:
+    """Gaussians at z > 0 for `camera_ahead`, of opacities that no clamp touches."""
+    gaussians = random_gaussians(count, seed=seed, sh_degree=3)
+    means = torch.cat([gaussians.means[:, :1].abs() + 1, gaussians.means[:, 1:]], 1)
+    opacities = gaussians.opacities.clamp(0.05, 0.95)
+    return dataclasses.replace(gaussians, means=means, opacities=opacities)
+
+
+def some_splats() -> Splats:
+    return Splats.of([ahead(n, seed) for seed, n in enumerate(COUNTS)], CONFIG.sh_degree)
+
+
+def copied(splats: Splats) -> dict[str, np.ndarray]:
+    return {name: array.copy() for name, array in splats.arrays().items()}
+
+
+@dataclasses.dataclass
+class Update:
+    """What a view says: its camera and parts, which splats it touches, and their gradients."""
+
+    camera: object
+    present: list
+    touched: dict[int, np.ndarray]  # part: increasing indices in the part
+    gradients: dict[int, np.ndarray]  # part: float32 [touched, GRAD]
+    functions: int = 16
+    step: int = 0
+
+
+def random_update(splats: Splats, seed: int, *, present=BOTH) -> Update:
+    """Two thirds of the splats with gradients of all magnitudes from 1e-6 to 1e2."""
+    rng = np.random.default_rng(seed)
+    touched, gradients = {}, {}
+    for part, _ in present:
+        count = int(np.diff(splats.starts)[part])
+        touched[part] = np.flatnonzero(rng.random(count) < 0.67)
+        size = (len(touched[part]), GRAD)
+        signs = rng.choice([-1.0, 1.0], size)
+        gradients[part] = (signs * 10 ** rng.uniform(-6, 2, size)).astype(np.float32)
+        gradients[part][:, [G_ABS, G_RADIUS]] = np.abs(gradients[part][:, [G_ABS, G_RADIUS]])
+    camera = camera_ahead(64, 48, 40.0 + seed, yaw=0.05 * seed, position=(0.1 * seed, 0.0, 0.0))
+    return Update(camera, list(present), touched, gradients, step=seed)
+
+
+def apply_update(splats: Splats, update: Update, config: FitConfig = CONFIG) -> None:
+    """The update as the trainer makes it: rows block by block, in the order of the splats."""
+    parts = [part for part, _ in update.present]
+    poses = part_poses([pose for _, pose in update.present])
+    inputs = splat_inputs(splats, parts, poses, update.camera, RasterSettings())
+    rows = np.full((inputs.slots, GRAD), np.nan, np.float32)  # what is not counted is not read
+    ids = np.full(inputs.slots, -1, np.int32)
+    counts = np.zeros(len(inputs.blocks), np.int64)
+    for block, (number, first, last) in enumerate(inputs.blocks):
+        part = parts[number]
+        inside = (update.touched[part] >= first) & (update.touched[part] < last)
+        counts[block] = inside.sum()
+        own = slice(block * BLOCK, block * BLOCK + int(counts[block]))
+        rows[own], ids[own] = update.gradients[part][inside], update.touched[part][inside]
+    with kernel_threads():
+        kernels.update_splats(
+            inputs.addresses,
+            inputs.sizes,
+            inputs.views,
+            inputs.blocks,
+            inputs.first_ids,
+            rows.reshape(-1),
+            ids,
+            counts,
+            update.functions,
+            splat_rates(config, update.step, update.camera, EXTENT_M),
+            CORRECTIONS.reshape(-1),
+            splats.geometry_m.reshape(-1),
+            splats.geometry_v.reshape(-1),
+            splats.sh_m.reshape(-1),
+            splats.sh_v.reshape(-1),
+            splats.age,
+            splats.grads.reshape(-1),
+        )
+
+
+class PlainAdam:
+    """Adam on logarithms of scales, logits, quaternions, means and SH, in float64, splat by splat
+    with its own count of updates.
+    """
+
+    def __init__(self, splats: Splats) -> None:
+        n = len(splats)
+        opacities = splats.opacities.astype(np.float64)
+        self.starts = splats.starts
+        self.values = {
+            "means": splats.means.astype(np.float64),
+            "quats": splats.quats.astype(np.float64),
+            "scales": np.log(splats.scales.astype(np.float64)),
+            "opacities": np.log(opacities / (1 - opacities))[:, None],
+            "sh": splats.sh.astype(np.float64),
+        }
+        self.m = {name: np.zeros_like(v) for name, v in self.values.items()}
+        self.v = {name: np.zeros_like(v) for name, v in self.values.items()}
+        self.age = np.zeros(n, np.int64)
+        self.grads = np.zeros((n, 3))
+
+    def update(self, update: Update, config: FitConfig = CONFIG) -> None:
+        done, rates = update.step / config.steps, config.rates
+        late = rates.late**done
+        for part, pose in update.present:
+            local, g = update.touched[part], update.gradients[part].astype(np.float64)
+            at = self.starts[part] + local
+            self.age[at] += 1
+            side = max(update.camera.width, update.camera.height)
+            self.grads[at, 0] += g[:, G_ABS] * side / 2
+            self.grads[at, 1] += 1
+            self.grads[at, 2] = np.maximum(self.grads[at, 2], g[:, G_RADIUS] / side)
+
+            camera_from_part = update.camera.camera_from_world.numpy()
+            if pose is not None:
+                camera_from_part = camera_from_part @ pose.numpy()
+            means = self.values["means"][at]
+            z = means @ camera_from_part[2, :3] + camera_from_part[2, 3]
+            eye = -camera_from_part[:3, :3].T @ camera_from_part[:3, 3]
+            towards = torch.nn.functional.normalize(torch.from_numpy(means - eye), dim=1)
+            basis = sh_basis(towards, 3).numpy()[:, : update.functions]
+            opacity = 1 / (1 + np.exp(-self.values["opacities"][at]))
+            # rows hold slopes by the logarithm of opacity: dlog(o) / dlogit = 1 - o
+            by_opacity = g[:, [G_OPACITY]] + config.loss.opacity_decay * opacity
+            scales = np.exp(self.values["scales"][at])
+            by_color = g[:, G_COLOR : G_COLOR + 3]
+            slopes = {
+                "means": g[:, G_MEAN : G_MEAN + 3],
+                "quats": g[:, G_QUAT : G_QUAT + 4],
+                "scales": g[:, G_SCALE : G_SCALE + 3] + config.loss.scale_decay * scales,
+                "opacities": by_opacity * (1 - opacity),
+                "sh": basis[:, :, None] * by_color[:, None, :],
+            }
+            pixels = rates.means * (rates.means_end / rates.means) ** done
+            sh_rates = np.full((update.functions, 1), rates.sh_rest * late)
+            sh_rates[0] = rates.sh_dc * late
+            steps = {
+                "means": pixels * (z / update.camera.fx)[:, None],
+                "quats": rates.quats * late,
+                "scales": rates.scales * late,
+                "opacities": rates.opacities * late,
+                "sh": sh_rates,
+            }
+            for name, slope in slopes.items():
+                self._step(name, at, slope, steps[name])
+            quats = self.values["quats"]
+            quats[at] /= np.linalg.norm(quats[at], axis=1, keepdims=True)
+
+    def _step(self, name, at, slope, size) -> None:
+        used = (at, slice(0, slope.shape[1]))
+        m = self.m[name][used] = BETA1 * self.m[name][used] + (1 - BETA1) * slope
+        v = self.v[name][used] = BETA2 * self.v[name][used] + (1 - BETA2) * slope**2
+        n = self.age[at].reshape(-1, *[1] * (slope.ndim - 1))
+        hat = m / (1 - BETA1**n), v / (1 - BETA2**n)
+        self.values[name][used] -= size * hat[0] / (np.sqrt(hat[1]) + EPS)
+
+    def activated(self) -> dict[str, np.ndarray]:
+        logits = self.values["opacities"][:, 0]
+        return self.values | {
+            "scales": np.exp(self.values["scales"]),
+            "opacities": 1 / (1 + np.exp(-logits)),
+        }
+
+
+def assert_close_to(splats: Splats, plain: PlainAdam) -> None:
+    """Values after a dozen steps. A step is good to some 1e-6 of itself (moments, root and exp2 in
+    float32); values are rounded at every step to 6e-8 of themselves, means of up to 10 m to 1e-6.
+    """
+    expected = plain.activated()
+    np.testing.assert_allclose(splats.means, expected["means"], rtol=1e-6, atol=5e-6)
+    np.testing.assert_allclose(splats.quats, expected["quats"], rtol=0, atol=3e-6)
+    np.testing.assert_allclose(splats.scales, expected["scales"], rtol=5e-6)
+    np.testing.assert_allclose(splats.opacities, expected["opacities"], rtol=0, atol=5e-6)
+    np.testing.assert_allclose(splats.sh, expected["sh"], rtol=1e-6, atol=1e-6)
+    assert np.array_equal(splats.age, plain.age)
+    np.testing.assert_allclose(splats.grads, plain.grads, rtol=1e-5)
+    # gradients of up to 1e2 times SH functions, which are good to 1e-6 where they cross 0
+    np.testing.assert_allclose(splats.sh_m, plain.m["sh"], rtol=1e-4, atol=1e-4)
+    columns = slice(G_SCALE, G_SCALE + 3)
+    np.testing.assert_allclose(splats.geometry_v[:, columns], plain.v["scales"], rtol=1e-4)
+
+
+# ---- splats ----------------------------------------------------------------------------------
+
+
+def test_many_updates_follow_plain_adam():
+    """Splats of two parts, each with its own count of updates; SH bands join as they do in a fit,
+    a part is absent from some views, and rates fall with the step.
+    """
+    splats = some_splats()
+    plain = PlainAdam(splats)
+    before = copied(splats)
+    for seed in range(12):
+        present = BOTH if seed % 3 else BOTH[1:]
+        update = random_update(splats, seed, present=present)
+        update.functions = (1, 4, 9, 16)[min(seed // 2, 3)]
+        apply_update(splats, update)
+        plain.update(update)
+    assert len(set(splats.age.tolist())) > 4
+    assert_close_to(splats, plain)
+    for name in ("means", "quats", "scales", "opacities", "sh"):
+        moved = np.abs(getattr(splats, name) - before[name]).reshape(len(splats), -1).max(1)
+        assert np.median(moved) > 1e-3, name  # far more than the tolerances above
+
+
+def test_the_first_step_is_the_step_size_whatever_the_gradient():
+    """Bias correction: m / sqrt(v) is the sign at first. Means move by pixels, so by z / fx."""
+    splats = some_splats()
+    before = copied(splats)
+    update = random_update(splats, 0, present=BOTH[:1])
+    config = dataclasses.replace(CONFIG, loss=LossWeights())
+    apply_update(splats, update, config)
+    at = update.touched[0]
+    g = update.gradients[0]
+    pixel_m = before["means"][at, :1] / update.camera.fx  # z is x for a camera at the origin
+    moved = splats.means[at] - before["means"][at]
+    # float32 rounds means of up to 10 m to 5e-7 m
+    expected = -np.sign(g[:, G_MEAN : G_MEAN + 3]) * FASTER.means * pixel_m
+    np.testing.assert_allclose(moved, expected, rtol=1e-5, atol=2e-6)
+    grown = np.log(splats.scales[at].astype(np.float64) / before["scales"][at])
+    expected = -np.sign(g[:, G_SCALE : G_SCALE + 3]) * FASTER.scales
+    np.testing.assert_allclose(grown, expected, rtol=1e-5)  # exp2 and roots in float32
+    changed = splats.sh[at, 0] - before["sh"][at, 0]
+    expected = -np.sign(g[:, G_COLOR : G_COLOR + 3]) * FASTER.sh_dc
+    np.testing.assert_allclose(changed, expected, rtol=1e-4)  # values up to 2 round to 1e-7
+
+
+def test_splats_that_are_not_touched_keep_their_bits():
+    splats = some_splats()
+    for seed in range(3):
+        apply_update(splats, random_update(splats, seed))
+    before = copied(splats)
+    update = random_update(splats, 5, present=BOTH[1:])
+    apply_update(splats, update)
+    others = np.ones(len(splats), bool)
+    others[splats.starts[1] + update.touched[1]] = False
+    for name, array in splats.arrays().items():
+        if name == "starts":
+            assert np.array_equal(array, before[name])
+            continue
+        assert np.array_equal(array[others], before[name][others]), name
+        if name != "semantic":
+            assert not np.array_equal(array, before[name]), name
+
+
+def test_bands_that_are_not_learnt_yet_keep_their_bits():
+    splats = some_splats()
+    before = copied(splats)
+    update = random_update(splats, 1)
+    update.functions = 4
+    apply_update(splats, update)
+    for name in ("sh", "sh_m", "sh_v"):
+        assert np.array_equal(getattr(splats, name)[:, 4:], before[name][:, 4:]), name
+        assert not np.array_equal(getattr(splats, name)[:, :4], before[name][:, :4]), name
+
+
+@pytest.mark.parametrize("number", [np.nan, np.inf, -np.inf, 1e30])
+@pytest.mark.parametrize("column", [G_MEAN, G_QUAT + 2, G_ABS, G_SCALE, G_OPACITY, G_COLOR + 2])
+def test_a_gradient_that_is_not_finite_leaves_its_splat_as_it_was(column, number):
+    """Also one whose square is not: a second moment of infinity would hold the splat for ever."""
+    splats, clean = some_splats(), some_splats()
+    before = copied(splats)
+    update = random_update(splats, 3)
+    apply_update(clean, update)
+    bad = [0, 7, 8, 1000]
+    for row in bad:
+        update.gradients[0][row, column] = number
+    apply_update(splats, update)
+    at = update.touched[0][bad]
+    for name, array in splats.arrays().items():
+        if name == "starts":
+            continue
+        expected = getattr(clean, name).copy()
+        expected[at] = before[name][at]
+        assert np.array_equal(array, expected), name
+
+
+def test_gradients_of_zero_move_nothing_but_momentum():
+    splats = some_splats()
+    config = dataclasses.replace(CONFIG, loss=LossWeights())
+    update = random_update(splats, 0)
+    for gradients in update.gradients.values():
+        gradients[:] = 0
+    before = copied(splats)
+    apply_update(splats, update, config)
+    for name in ("means", "scales", "sh"):
+        assert np.array_equal(getattr(splats, name), before[name]), name
+    # normalised anew, and through the odds and back: a rounding each
+    np.testing.assert_allclose(splats.quats, before["quats"], rtol=0, atol=2e-7)
+    np.testing.assert_allclose(splats.opacities, before["opacities"], rtol=0, atol=2e-7)
+    assert splats.age.max() == 1
+
+
+def test_quaternions_stay_unit_and_turn_along_the_sphere():
+    splats = some_splats()
+    for seed in range(30):
+        update = random_update(splats, seed % 7)
+        for part, gradients in update.gradients.items():
+            quats = splats.quats[splats.starts[part] + update.touched[part]]
+            own = gradients[:, G_QUAT : G_QUAT + 4]
+            own -= (own * quats).sum(1, keepdims=True) * quats  # as the rasteriser's: tangential
+        apply_update(splats, update)
+    norms = np.linalg.norm(splats.quats.astype(np.float64), axis=1)
+    assert np.abs(norms - 1).max() < 3e-7  # normalised at every step, four products and a root
+
+
+def test_values_are_clamped():
+    """Scales between a millimetre and the scene's extent, opacities short of 0 and 1."""
+    splats = some_splats()
+    config = dataclasses.replace(
+        CONFIG, rates=dataclasses.replace(FASTER, scales=5.0, opacities=8.0), loss=LossWeights()
+    )
+    update = random_update(splats, 0, present=BOTH[:1])
+    at, g = update.touched[0], update.gradients[0]
+    for _ in range(4):
+        apply_update(splats, update, config)
+    grows, shrinks = g[:, G_SCALE : G_SCALE + 3] < 0, g[:, G_SCALE : G_SCALE + 3] > 0
+    assert (splats.scales[at][grows] == np.float32(EXTENT_M)).all()
+    assert (splats.scales[at][shrinks] == np.float32(1e-3)).all()
+    rises = g[:, G_OPACITY] < 0
+    assert (splats.opacities[at][rises] == np.float32(0.9995)).all()
+    assert (splats.opacities[at][~rises] == np.float32(1e-4)).all()
+    for array in splats.arrays().values():
+        assert np.isfinite(array).all()
+
+
+@pytest.mark.parametrize("opacity", [0.0, 1.0, 1e-9])
+def test_opacities_of_zero_and_one_can_be_learnt_from(opacity):
+    """They have no logit: they count as the clamped value."""
+    splats = some_splats()
+    splats.opacities[:] = opacity
+    update = random_update(splats, 0)
+    towards = 1.0 if opacity == 1.0 else -1.0
+    for gradients in update.gradients.values():
+        gradients[:, G_OPACITY] = towards
+    apply_update(splats, update)
+    at = update.touched[0]
+    assert np.isfinite(splats.opacities).all()
+    moved = splats.opacities[at]
+    assert (moved < 0.9995).all() if opacity == 1.0 else (moved > 1e-4).all()
+
+
+@pytest.mark.usefixtures("any_threads")
+def test_same_bits_for_any_number_of_threads():
+    results = []
+    for threads in (1, 2, 2):
+        limit_threads(threads)
+        splats = some_splats()
+        for seed in range(4):
+            apply_update(splats, random_update(splats, seed))
+        results.append(splats)
+    for other in results[1:]:
+        for name, array in other.arrays().items():
+            assert np.array_equal(array, getattr(results[0], name)), name
+
+
+def test_a_splat_that_was_updated_very_often_counts_as_unbiased():
+    splats = some_splats()
+    splats.age[:] = 3 * kernels.CORRECTED
+    before = copied(splats)
+    update = random_update(splats, 0, present=BOTH[1:])
+    apply_update(splats, update)
+    at = splats.starts[1] + update.touched[1]
+    assert (splats.age[at] == 3 * kernels.CORRECTED + 1).all()
+    # 0.1 g / sqrt(0.001 g^2): no correction
+    grown = np.log(splats.scales[at].astype(np.float64) / before["scales"][at])
+    late = FASTER.late ** (update.step / CONFIG.steps)
+    expected = 0.1 / np.sqrt(0.001) * FASTER.scales * late
+    # 5 %: scale_decay adds up to 0.03 m times the scale to slopes of 1 and more
+    g = update.gradients[1][:, G_SCALE : G_SCALE + 3]
+    large = np.abs(g) > 1
+    np.testing.assert_allclose(np.abs(grown)[large], expected, rtol=0.05)
+
+
+# ---- step sizes ------------------------------------------------------------------------------
+
+
+def test_bias_corrections():
+    table = kernels.bias_corrections(BETA1, BETA2)
+    assert table.shape == (kernels.CORRECTED + 1, 2) and np.isfinite(table).all()
+    np.testing.assert_allclose(table[1], [10, 1000], rtol=1e-6)
+    n = 17
+    np.testing.assert_allclose(table[n], [1 / (1 - 0.9**n), 1 / (1 - 0.999**n)], rtol=1e-6)
+    assert 1 <= table[-1, 1] < 1 + 1e-4 and table[-1, 0] == 1
+
+
+def test_step_sizes_fall_over_the_run_and_no_further():
+    camera, rates = camera_ahead(64, 48), CONFIG.rates
+    first, last, after = (
+        splat_rates(CONFIG, step, camera, EXTENT_M) for step in (0, CONFIG.steps, 5 * CONFIG.steps)
+    )
+    assert np.array_equal(last, after)
+    assert first[G_MEAN] == pytest.approx(rates.means) and last[G_MEAN] == pytest.approx(
+        rates.means_end
+    )
+    for column, rate in (
+        (G_QUAT, rates.quats),
+        (G_SCALE, rates.scales),
+        (G_OPACITY, -rates.opacities),
+        (kernels.R_SH_DC, rates.sh_dc),
+        (kernels.R_SH_REST, rates.sh_rest),
+    ):
+        assert first[column] == pytest.approx(rate)
+        assert last[column] == pytest.approx(rate * rates.late)
+    assert first.dtype == np.float32 and len(first) == kernels.RATES
+
+
+@pytest.mark.parametrize("steps", [0, 1])
+def test_step_sizes_of_the_shortest_runs(steps):
+    config = dataclasses.replace(CONFIG, steps=steps)
+    assert np.isfinite(splat_rates(config, 0, camera_ahead(), EXTENT_M)).all()
+
+
+def test_a_rate_of_zero_freezes_the_means():
+    rates = dataclasses.replace(FASTER, means=0.0)
+    values = splat_rates(dataclasses.replace(CONFIG, rates=rates), 10, camera_ahead(), EXTENT_M)
+    assert np.isfinite(values).all() and values[G_MEAN] == 0
+
+
+# ---- sky and colour maps ---------------------------------------------------------------------
+
+
+def torch_adam(values: np.ndarray, rate: float) -> tuple[torch.Tensor, torch.optim.Adam]:
+    parameter = torch.from_numpy(values.astype(np.float64)).requires_grad_()
+    return parameter, torch.optim.Adam([parameter], lr=rate, betas=(BETA1, BETA2), eps=EPS)
+
+
+def test_dense_adam_follows_torch():
+    rng = np.random.default_rng(0)
+    values = rng.normal(size=(3, 4)).astype(np.float32)
+    parameter, expected = torch_adam(values, 0.01)
+    adam = DenseAdam(values)
+    for step in range(20):
+        gradient = rng.normal(size=(3, 4)) * 10.0 ** (step % 5 - 3)
+        adam.update(gradient, 0.01)
+        parameter.grad = torch.from_numpy(gradient)
+        expected.step()
+    # moments are float64; values are rounded to float32 at each of twenty steps
+    np.testing.assert_allclose(values, parameter.detach().numpy(), rtol=0, atol=2e-6)
+
+
+def test_color_adam_follows_torch_where_all_rows_are_seen():
+    rng = np.random.default_rng(1)
+    values = rng.uniform(0.3, 0.7, (3000, 3)).astype(np.float32)  # three runs of rows
+    parameter, expected = torch_adam(values, 0.005)
+    adam = ColorAdam(values)
+    for _ in range(15):
+        gradient = (rng.normal(size=(3000, 3)) * 1e-3).astype(np.float32)
+        adam.update(np.arange(3000, dtype=np.int32), gradient, 0.005)
+        parameter.grad = torch.from_numpy(gradient).double()
+        expected.step()
+    # moments in float32: some 1e-6 of each step of 0.005, and rounding of the values
+    np.testing.assert_allclose(values, parameter.detach().numpy(), rtol=0, atol=1e-6)
+
+
+def test_color_adam_counts_every_row_for_itself():
+    rng = np.random.default_rng(2)
+    values = rng.uniform(0, 1, (20, 3)).astype(np.float32)
+    rows = [torch_adam(row[None], 0.02) for row in values]
+    adam = ColorAdam(values)
+    for step in range(30):
+        seen = np.flatnonzero(rng.random(20) < 0.4).astype(np.int32)
+        seen = seen[seen != 13]
+        before = values[13].copy()
+        gradient = rng.normal(size=(len(seen), 3)).astype(np.float32)
+        if step > 20:
+            gradient = np.abs(gradient)  # towards 0, and no further
+        adam.update(seen, gradient, 0.02)
+        for row, g in zip(seen, gradient, strict=True):
+            parameter, expected = rows[row]
+            parameter.grad = torch.from_numpy(g[None]).double()
+            expected.step()
+            with torch.no_grad():
+                parameter.clamp_(0, 1)
+        assert np.array_equal(values[13], before)
+    got = np.concatenate([parameter.detach().numpy() for parameter, _ in rows])
+    np.testing.assert_allclose(values, got, rtol=0, atol=2e-6)  # float32 moments and values
+    assert values.min() == 0 and values.max() <= 1
+    assert adam.arrays()["count"][13] == 0
+
+
+def test_color_adam_takes_no_rows_at_all():
+    values = np.full((5, 3), 0.5, np.float32)
+    ColorAdam(values).update(np.zeros(0, np.int32), np.zeros((0, 3), np.float32), 0.1)
+    assert (values == 0.5).all()
+
+
+@pytest.mark.parametrize("kind", [DenseAdam, ColorAdam])
+def test_moments_that_were_saved_continue_to_the_same_bits(kind):
+    rng = np.random.default_rng(3)
+    start = rng.uniform(0.2, 0.8, (9, 3)).astype(np.float32)
+    gradients = rng.normal(size=(6, 9, 3)).astype(np.float32)
+
+    def update(adam, gradient):
+        rows = (np.arange(9, dtype=np.int32),) if kind is ColorAdam else ()
+        adam.update(*rows, gradient, 0.01)
+
+    values, adam = start.copy(), None
+    adam = kind(values)
+    for gradient in gradients[:3]:
+        update(adam, gradient)
+    saved = {name: array.copy() for name, array in adam.arrays().items()}
+    resumed_values = values.copy()
+    resumed = kind(resumed_values)
+    resumed.load(saved)
+    for gradient in gradients[3:]:
+        update(adam, gradient)
+        update(resumed, gradient)
+    assert np.array_equal(values, resumed_values)
+
+
+# ---- inputs ----------------------------------------------------------------------------------
+
+
+def test_kernels_read_the_arrays_themselves():
+    """Addresses of the parts that are present, in their order, without a copy."""
+    splats = some_splats()
+    pose = rigid(
+        rotmat_from_quat(torch.tensor([1.0, 0.1, 0, 0], dtype=torch.float64)),
+        torch.zeros(3, dtype=torch.float64),
+    )
+    alone, both = (part_poses(poses) for poses in ([pose], [None, pose]))
+    inputs = splat_inputs(splats, [1], alone, camera_ahead(), RasterSettings())
+    start = int(splats.starts[1])
+    assert inputs.addresses[0, 0] == splats.means[start:].ctypes.data
+    assert inputs.addresses[0, 4] == splats.sh[start:].ctypes.data
+    assert inputs.sizes.tolist() == [[COUNTS[1], 16]] and inputs.first_ids.tolist() == [start]
+    inputs = splat_inputs(splats, [0, 1], both, camera_ahead(), RasterSettings())
+    assert inputs.blocks.tolist() == [[0, 0, BLOCK], [0, BLOCK, COUNTS[0]], [1, 0, COUNTS[1]]]
