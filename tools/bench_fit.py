@@ -117,7 +117,7 @@ def _measure(
     return FitFigures(
         machine=machine,
         scene=uri,
-        splats=record.splats,
+        splats=len(trainer.splats),
         actors=len(scene.actors),
         views=len(source.train),
         sizes_px={name: (camera.width, camera.height) for name, camera in cameras.items()},

@@ -102,6 +102,7 @@ class _Run:
 def _prepare(options: FitOptions, parts: FitParts, folder: Path, before: Checkpoint | None) -> _Run:
     scene, leaks = open_to_fit(options, parts.open_scene)
     source = parts.views(scene, options)
+    scene = parts.start(scene, source)
     for problem in _problems(scene, source, leaks):
         _say(f"note: {problem}")
     facts = data_facts(scene, source)

@@ -60,13 +60,15 @@ class Views(ViewSource, Protocol):
 
 @dataclass(frozen=True)
 class FitParts:
-    """open_scene(uri); views(scene, options); trainer(scene, source, config);
+    """open_scene(uri); views(scene, options); start(scene, source): with what no sensor gave;
+    trainer(scene, source, config);
     score(scene, source, keys): means over the views, {"psnr", "ssim", ...};
     save(scene, folder); report(folder, scene, source, history, facts): report.json's content.
     """
 
     open_scene: Callable[[str], Scene]
     views: Callable[[Scene, FitOptions], Views]
+    start: Callable[[Scene, Any], Scene]
     trainer: Callable[[Scene, ViewSource, FitConfig], Fitter]
     score: Callable[[Scene, ViewSource, Sequence[ViewKey]], dict[str, float]]
     save: Callable[[Scene, Path], None]
@@ -76,12 +78,14 @@ class FitParts:
 def real_parts() -> FitParts:
     """The library's own."""
     from adapters.base import open_scene
+    from adapters.recorded.starting_scene import starting_scene
     from augment.reconstruct.trainer import Trainer
     from augment.scene_files import save_scene
 
     return FitParts(
         open_scene=open_scene,
         views=_recorded_views,
+        start=starting_scene,
         trainer=Trainer,
         score=_mean_scores,
         save=save_scene,
@@ -100,7 +104,6 @@ def _recorded_views(scene: Scene, options: FitOptions) -> Views:
         cache_bytes=options.image_cache_mb * 2**20,
         depth=parse_depth(options.depth),
         masks_dir=options.ego_masks,
-        mask_ego=options.ego_masks is not None,
     )
 
 

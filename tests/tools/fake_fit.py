@@ -147,6 +147,7 @@ class Fakes:
         return FitParts(
             open_scene=self._open,
             views=lambda scene, options: FakeViews(scene, options.holdout),
+            start=lambda scene, source: scene,
             trainer=self._trainer,
             score=self._score,
             save=_save,
