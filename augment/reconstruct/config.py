@@ -26,8 +26,8 @@ class LossWeights:
 class LearningRates:
     """Adam's step sizes. means: pixels of the view at hand, so that a distant splat moves further,
     decaying exponentially to means_end over the run; scales: of their logarithm; opacities: of
-    their logit; sh_rest: of the bands above degree 0. The others of a splat fall to `late` of their
-    value over the run.
+    their logit; sh_rest: of the bands above degree 0. actors: metres of a box's position; cameras:
+    pixels of what a camera sees 10 m away. All but means fall to `late` of their value in the run.
     """
 
     means: float = 0.1
@@ -39,7 +39,8 @@ class LearningRates:
     sh_rest: float = 2.5e-4
     sky: float = 5e-3
     color_map: float = 2e-3
-    poses: float = 1e-3
+    actors: float = 1e-3
+    cameras: float = 0.01
     late: float = 0.2
 
 
@@ -67,9 +68,10 @@ class DensifyConfig:
 @dataclass(frozen=True)
 class FitConfig:
     """One reconstruction. steps: optimiser updates, one view each. sh_degree: highest band that is
-    learnt; one more every sh_every steps. pose_refinement: whether actors' boxes may move a little.
+    learnt; one more every sh_every steps. pose_refinement: whether actors' boxes and
+    cameras may move a little.
     exposure: whether every camera gets a colour map; exposure_pull draws it to the identity,
-    pose_pull (1/m^2) the boxes to where they were labelled.
+    pose_pull (1/m^2) boxes and cameras to where they were recorded.
     """
 
     steps: int = 5000

@@ -20,15 +20,16 @@ from typing import Any
 import numpy as np
 import torch
 
-from augment.cameras import Camera
+from augment.cameras import Camera, Frame
 from augment.reconstruct.adam_kernels import update_splats
 from augment.reconstruct.config import FitConfig
 from augment.reconstruct.dense_adam import ColorAdam, DenseAdam
 from augment.reconstruct.densify import densify, densify_due
+from augment.reconstruct.forces import part_forces
 from augment.reconstruct.inputs import splat_inputs
 from augment.reconstruct.loss import ViewLoss, view_loss
 from augment.reconstruct.loss_buffers import LossScratch
-from augment.reconstruct.poses import PoseCorrections
+from augment.reconstruct.poses import ActorPoses, CameraPoses
 from augment.reconstruct.rates import CORRECTIONS, splat_rates
 from augment.reconstruct.splats import Splats
 from augment.reconstruct.view import RecordedView, ViewKey, ViewSource
@@ -82,8 +83,8 @@ class Trainer:
         self._settings = RasterSettings()
         self._scratch = Scratch()
         self._loss_scratch = LossScratch()
-        self.poses = PoseCorrections(scene.actors)
-        self._moves_actors = config.pose_refinement and len(self.poses.values) > 0
+        self.actor_poses = ActorPoses(scene.actors)
+        self.camera_poses = CameraPoses(source)
         self._inputs: dict[ViewKey, _ViewInputs] = {}
         self._extent_m = _extent(source)
         self._order: tuple[int, np.ndarray] = (-1, np.zeros(0, np.int64))
@@ -94,6 +95,7 @@ class Trainer:
         key = self._next_key()
         with _timed(stages, "load"):
             view = self._source.load(key)
+            view = dataclasses.replace(view, camera=self.camera_poses.corrected(view.camera))
         with _timed(stages, "forward"):
             tape = self._render(key, view.camera)
         with _timed(stages, "loss"):
@@ -126,7 +128,7 @@ class Trainer:
             dataclasses.replace(
                 actor,
                 gaussians=self.splats.gaussians(number),
-                track=self.poses.track(number - 1, actor.track),
+                track=self.actor_poses.track(number - 1, actor.track),
             )
             for number, actor in enumerate(self._scene.actors, start=1)
         )
@@ -135,9 +137,14 @@ class Trainer:
             self._scene,
             background=self.splats.gaussians(0),
             actors=actors,
+            frames=tuple(self._frame(frame) for frame in self._scene.frames),
             sky=CubemapSky(torch.from_numpy(self.sky_faces.copy())),
             color_maps=maps if self.config.exposure else {},
         )
+
+    def _frame(self, frame: Frame) -> Frame:
+        cameras = {n: self.camera_poses.corrected(c) for n, c in frame.cameras.items()}
+        return dataclasses.replace(frame, cameras=cameras)
 
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """All that continuing to the same bits needs: arrays, and facts for JSON."""
@@ -147,7 +154,8 @@ class Trainer:
         for name, adam in self._map_adams.items():
             arrays[f"color_map.{name}"] = self.color_maps[name]
             arrays |= {f"color_map_adam.{name}.{k}": a for k, a in adam.arrays().items()}
-        arrays |= {f"poses.{name}": a for name, a in self.poses.arrays().items()}
+        arrays |= {f"actors.{name}": a for name, a in self.actor_poses.knots.arrays().items()}
+        arrays |= {f"cameras.{name}": a for name, a in self.camera_poses.knots.arrays().items()}
         return {name: array.copy() for name, array in arrays.items()}, {"step": self.step}
 
     def load_state(self, arrays: dict[str, np.ndarray], facts: dict[str, Any]) -> None:
@@ -159,7 +167,11 @@ class Trainer:
         for name, adam in self._map_adams.items():
             self.color_maps[name][:] = arrays[f"color_map.{name}"]
             adam.load({k: arrays[f"color_map_adam.{name}.{k}"] for k in adam.arrays()})
-        self.poses.load({k: arrays[f"poses.{k}"] for k in self.poses.arrays()})
+        for prefix, knots in (
+            ("actors", self.actor_poses.knots),
+            ("cameras", self.camera_poses.knots),
+        ):
+            knots.load({k: arrays[f"{prefix}.{k}"] for k in knots.arrays()})
         self.step = int(facts["step"])
         self._inputs.clear()
 
@@ -178,10 +190,9 @@ class Trainer:
         cached = self._inputs.get(key)
         if cached is None:
             cached = self._inputs[key] = self._gather(camera)
-        elif self._moves_actors:
-            poses = self._corrected(cached.parts, cached.labelled, camera)
-            cached.poses[:] = poses
-            cached.inputs.views[:] = part_views(poses, camera, self._settings, None)
+        elif self.config.pose_refinement:
+            cached.poses[:] = self._corrected(cached.parts, cached.labelled, camera)
+            cached.inputs.views[:] = part_views(cached.poses, camera, self._settings, None)
         cached.inputs.modes[M_FUNCTIONS] = self._functions
         return cpu_backward.record(
             cached.inputs,
@@ -207,10 +218,8 @@ class Trainer:
 
     def _corrected(self, parts: list[int], labelled: np.ndarray, camera: Camera) -> np.ndarray:
         """Poses of the parts with what has been learnt of them."""
-        if not self._moves_actors:
-            return labelled
         return np.stack([
-            self.poses.corrected(part - 1, pose, camera.timestamp_ns) if part else pose
+            self.actor_poses.corrected(part - 1, pose, camera.timestamp_ns) if part else pose
             for part, pose in zip(parts, labelled, strict=True)
         ])  # fmt: skip
 
@@ -268,15 +277,23 @@ class Trainer:
             pull = self.config.exposure_pull * (color_map - _IDENTITY)
             rate = rates.color_map * rates.late ** (self.step / max(self.config.steps, 1))
             self._map_adams[key.camera].update(loss.d_color_map + pull, rate)
-        if self._moves_actors:
+        if self.config.pose_refinement:
             cached = self._inputs[key]
-            self.poses.update(
-                splats,
+            forces = part_forces(inputs, grads)
+            late = rates.late ** (self.step / max(self.config.steps, 1))
+            self.actor_poses.update(
                 cached.parts,
                 cached.poses,
-                grads,
+                forces,
                 view.camera.timestamp_ns,
-                rate=rates.poses * rates.late ** (self.step / max(self.config.steps, 1)),
+                rate_m=rates.actors * late,
+                pull=self.config.pose_pull,
+            )
+            self.camera_poses.update(
+                view.camera,
+                cached.poses,
+                forces,
+                rate_px=rates.cameras * late,
                 pull=self.config.pose_pull,
             )
 
