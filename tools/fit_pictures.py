@@ -12,7 +12,7 @@ from augment.metrics.image import flip_map
 from augment.reconstruct.view import ViewKey, ViewSource
 from augment.scene import Scene
 from tools.drawing import Color, color_bar, color_mapped, log_ticks, short_number, write
-from tools.fit_scores import ViewScore, render_recorded
+from tools.fit_scores import ViewScore, found_camera, render_recorded
 
 MOST_ROWS = 12
 MOST_OF_A_CAMERA = 3
@@ -80,7 +80,7 @@ def draw_views(scene: Scene, source: ViewSource, scores: Sequence[ViewScore]) ->
 
 def _row(scene: Scene, source: ViewSource, score: ViewScore) -> _Row:
     view = source.load(score.key)
-    rendered = render_recorded(scene, view.camera)
+    rendered = render_recorded(scene, found_camera(scene, score.key, view.camera))
     counts = view.weight > 0
     if counts.any():
         error = flip_map(rendered.rgb, view.rgb, counts)

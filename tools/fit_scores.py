@@ -134,13 +134,19 @@ def render_recorded(scene: Scene, camera: Camera) -> RenderedView:
     )
 
 
+def found_camera(scene: Scene, key: ViewKey, camera: Camera) -> Camera:
+    """`camera` where the fitted scene says that it stood: a fit refines recorded poses."""
+    pose = scene.frame(key.frame).cameras[key.camera].camera_from_world
+    return dataclasses.replace(camera, camera_from_world=pose)
+
+
 @cache
 def _clear() -> Recipe:
     return load_recipe("clear").resolve(0)
 
 
 def _score(key: ViewKey, scene: Scene, view: RecordedView, with_flip: bool) -> ViewScore:
-    rendered = render_recorded(scene, view.camera)
+    rendered = render_recorded(scene, found_camera(scene, key, view.camera))
     counts = view.weight > 0
     scored = float(counts.mean())
     numbers = {"psnr": math.nan, "ssim": math.nan, "flip": math.nan}
