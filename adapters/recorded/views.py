@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import threading
 from collections import Counter
 from collections.abc import Sequence
@@ -25,6 +26,8 @@ from augment.scene import Scene
 logger = logging.getLogger(__name__)
 
 CACHE_BYTES = 1 << 30
+_FARTHEST_M = 1e6  # float32 has a resolution of 6 cm there
+_LEAST_FOCAL, _MOST_FOCAL = 0.05, 50.0  # focal length over width: a view of 169 or of 1.1 degrees
 _TOP_FRAMES = 5  # frames that the LiDAR's highest view is measured in
 
 
@@ -152,6 +155,12 @@ class RecordedViews:
                 f"frame {key.frame}"
             ) from None
 
+    def image(self, key: ViewKey) -> np.ndarray:
+        """The view's image alone, uint8 [H, W, 3]; callers do not write into it."""
+        self.camera(key)
+        with self._lock:
+            return self._images.load(key)
+
     def load(self, key: ViewKey) -> RecordedView:
         camera = self.camera(key)
         with self._lock:
@@ -212,6 +221,7 @@ class RecordedViews:
         for key, full, path in tqdm(wanted, desc="images", unit="image", disable=None):
             if path is None:
                 continue  # the adapter that left it out has said so
+            _check_camera(key, full)
             scaled = full.scaled(scale)
             try:
                 self._images.add(key, Path(path), full, scaled)
@@ -272,6 +282,22 @@ class RecordedViews:
                 "no sky masks: without LiDAR sweeps nothing tells sky from tall buildings"
             )
         return top
+
+
+def _check_camera(key: ViewKey, camera: Camera) -> None:
+    """Refuse what a Camera may be but a recording cannot."""
+    where = f"camera {key.camera}, frame {key.frame}"
+    position = camera.centre.tolist()
+    if not all(math.isfinite(x) and abs(x) < _FARTHEST_M for x in position):
+        raise AdapterError(
+            f"{where}: its position in the scene must be finite and within {_FARTHEST_M:.0f} m of "
+            f"the origin; got {position}. Check the pose in the dataset"
+        )
+    if not _LEAST_FOCAL < camera.fx / camera.width < _MOST_FOCAL:
+        raise AdapterError(
+            f"{where}: a focal length of {camera.fx:g} px is impossible for an image of "
+            f"{camera.width} columns; check the intrinsics and their unit (pixels)"
+        )
 
 
 def _size(camera: Camera) -> tuple[int, int]:

@@ -25,7 +25,8 @@ LEFT = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 
 @dataclass(frozen=True)
 class Sweeps:
-    """Labels without boxes; `by_frame` holds each frame's returns, float64 [N, 3] in the world."""
+    """Labels without boxes; `by_frame` holds each frame's returns, float64 [N, 3] in the world or
+    [N, 4] with their intensity."""
 
     by_frame: Mapping[int, np.ndarray]
 
@@ -36,7 +37,8 @@ class Sweeps:
         points = self.by_frame.get(frame_index)
         if points is None:
             return None
-        columns = {axis: points[:, i] for i, axis in enumerate("xyz")}
+        names = ("x", "y", "z", "intensity")[: points.shape[1]]
+        columns = {name: points[:, i] for i, name in enumerate(names)}
         times = np.full(len(points), frame_index * FRAME_NS, np.int64)
         return LidarSweep(columns | {"timestamp_ns": times})
 
