@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numba import prange
 
@@ -18,7 +20,7 @@ def sum_forces(addresses, sizes, blocks, rows, ids, counts, moments):
     """moments: float64 [B, MOMENTS], filled: g is dL/d mean and p the mean, in the part's axes.
 
     addresses, sizes, blocks: as in cpu_project; rows (flat), ids, counts: as project_backward
-    wrote them.
+    wrote them. Splats whose gradient is not finite are left out, as they are of the update.
     """
     for block in prange(blocks.shape[0]):
         part = blocks[block, 0]
@@ -28,6 +30,8 @@ def sum_forces(addresses, sizes, blocks, rows, ids, counts, moments):
         for at in range(U(block * BLOCK), U(block * BLOCK + counts[block])):
             row = at * U(GRAD) + U(G_MEAN)
             splat = U(3) * U(ids[at])
+            if not math.isfinite(rows[row] + rows[row + U(1)] + rows[row + U(2)]):
+                continue
             for j in range(U(3)):
                 g = np.float64(rows[row + j])
                 moments[block, j] += g
