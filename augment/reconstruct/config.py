@@ -39,8 +39,8 @@ class LearningRates:
     sh_rest: float = 2.5e-4
     sky: float = 5e-3
     color_map: float = 2e-3
-    actors: float = 1e-3
-    cameras: float = 0.01
+    actors: float = 3e-3
+    cameras: float = 0.12
     late: float = 0.2
 
 
@@ -55,14 +55,14 @@ class DensifyConfig:
     """
 
     method: str = "absgrad"
-    max_splats: int = 400_000
+    max_splats: int = 600_000
     every: int = 200
     start: float = 0.05
     stop: float = 0.6
     prune_opacity: float = 0.02
     grow_fraction: float = 0.05
     noise: float = 0.0
-    split: str = "sampled"
+    split: str = "long_axis"
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,6 @@ to the same bits.
 from __future__ import annotations
 
 import dataclasses
-import math
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -35,7 +34,7 @@ from augment.reconstruct.splats import Splats
 from augment.reconstruct.view import RecordedView, ViewKey, ViewSource
 from augment.render import cpu_backward
 from augment.render.constants import RasterSettings
-from augment.render.cpu_inputs import Inputs, part_poses, part_views
+from augment.render.cpu_inputs import Inputs, part_poses
 from augment.render.cpu_layout import M_FUNCTIONS
 from augment.render.cpu_scratch import Scratch
 from augment.render.threads import kernel_threads
@@ -85,7 +84,6 @@ class Trainer:
         self._loss_scratch = LossScratch()
         self.actor_poses = ActorPoses(scene.actors)
         self.camera_poses = CameraPoses(source)
-        self._inputs: dict[ViewKey, _ViewInputs] = {}
         self._extent_m = _extent(source)
         self._order: tuple[int, np.ndarray] = (-1, np.zeros(0, np.int64))
 
@@ -97,7 +95,8 @@ class Trainer:
             view = self._source.load(key)
             view = dataclasses.replace(view, camera=self.camera_poses.corrected(view.camera))
         with _timed(stages, "forward"):
-            tape = self._render(key, view.camera)
+            parts = self._posed(view.camera)
+            tape = self._render(parts, view.camera)
         with _timed(stages, "loss"):
             loss = self._loss(tape, view, key)
         with _timed(stages, "backward"):
@@ -106,7 +105,7 @@ class Trainer:
                 loss.d_rgb, loss.d_alpha, loss.d_expected_depth if with_depth else None
             )
         with _timed(stages, "optimise"):
-            self._update(tape.inputs, grads, view, key, loss)
+            self._update(parts, tape.inputs, grads, view.camera, loss)
         self.step += 1
         with _timed(stages, "densify"):
             self._densify()
@@ -173,7 +172,6 @@ class Trainer:
         ):
             knots.load({k: arrays[f"{prefix}.{k}"] for k in knots.arrays()})
         self.step = int(facts["step"])
-        self._inputs.clear()
 
     def _next_key(self) -> ViewKey:
         """Every view once an epoch, in an order of its own."""
@@ -186,42 +184,35 @@ class Trainer:
             self._order = (epoch, rng.permutation(len(train)))
         return train[int(self._order[1][place])]
 
-    def _render(self, key: ViewKey, camera: Camera) -> cpu_backward.Tape:
-        cached = self._inputs.get(key)
-        if cached is None:
-            cached = self._inputs[key] = self._gather(camera)
-        elif self.config.pose_refinement:
-            cached.poses[:] = self._corrected(cached.parts, cached.labelled, camera)
-            cached.inputs.views[:] = part_views(cached.poses, camera, self._settings, None)
-        cached.inputs.modes[M_FUNCTIONS] = self._functions
+    def _posed(self, camera: Camera) -> _PosedParts:
+        """The world, and the actors that hold splats and exist when the view was taken, where they
+        are now taken to be."""
+        starts = self.splats.starts
+        posed = [
+            part
+            for part in self._scene.parts_for(camera)
+            if part.instance_id == 0 or starts[part.instance_id] < starts[part.instance_id + 1]
+        ]
+        numbers = [part.instance_id for part in posed]
+        poses = part_poses([part.world_from_part for part in posed])
+        if self.config.pose_refinement:
+            for place, number in enumerate(numbers):
+                if number > 0:
+                    poses[place] = self.actor_poses.corrected(
+                        number - 1, poses[place], camera.timestamp_ns
+                    )
+        return _PosedParts(numbers, poses)
+
+    def _render(self, parts: _PosedParts, camera: Camera) -> cpu_backward.Tape:
+        inputs = splat_inputs(self.splats, parts.numbers, parts.poses, camera, self._settings)
+        inputs.modes[M_FUNCTIONS] = self._functions
         return cpu_backward.record(
-            cached.inputs,
+            inputs,
             camera,
             self._settings,
             self._scratch,
             with_depth=self.config.loss.depth > 0,
         )
-
-    def _gather(self, camera: Camera) -> _ViewInputs:
-        """The parts that hold splats and exist when the view was taken."""
-        starts = self.splats.starts
-        posed = [
-            part
-            for part in self._scene.parts_for(camera)
-            if starts[part.instance_id] < starts[part.instance_id + 1]
-        ]
-        parts = [part.instance_id for part in posed]
-        labelled = part_poses([part.world_from_part for part in posed])
-        poses = self._corrected(parts, labelled, camera)
-        inputs = splat_inputs(self.splats, parts, poses, camera, self._settings)
-        return _ViewInputs(inputs, parts, labelled, poses)
-
-    def _corrected(self, parts: list[int], labelled: np.ndarray, camera: Camera) -> np.ndarray:
-        """Poses of the parts with what has been learnt of them."""
-        return np.stack([
-            self.actor_poses.corrected(part - 1, pose, camera.timestamp_ns) if part else pose
-            for part, pose in zip(parts, labelled, strict=True)
-        ])  # fmt: skip
 
     @property
     def _functions(self) -> int:
@@ -243,13 +234,14 @@ class Trainer:
 
     def _update(
         self,
+        parts: _PosedParts,
         inputs: Inputs,
         grads: cpu_backward.SplatGradients,
-        view: RecordedView,
-        key: ViewKey,
+        camera: Camera,
         loss: ViewLoss,
     ) -> None:
         splats, rates = self.splats, self.config.rates
+        forces = part_forces(inputs, grads) if self.config.pose_refinement else None
         with kernel_threads():
             update_splats(
                 inputs.addresses,
@@ -261,7 +253,7 @@ class Trainer:
                 grads.ids,
                 grads.counts,
                 self._functions,
-                splat_rates(self.config, self.step, view.camera, self._extent_m),
+                splat_rates(self.config, self.step, camera, self._extent_m),
                 CORRECTIONS.reshape(-1),
                 splats.geometry_m.reshape(-1),
                 splats.geometry_v.reshape(-1),
@@ -273,25 +265,23 @@ class Trainer:
         if loss.d_sky is not None:
             self._sky_adam.update(loss.d_sky.texels, loss.d_sky.grads, rates.sky)
         if self.config.exposure:
-            color_map = self.color_maps[key.camera]
+            color_map = self.color_maps[camera.name]
             pull = self.config.exposure_pull * (color_map - _IDENTITY)
             rate = rates.color_map * rates.late ** (self.step / max(self.config.steps, 1))
-            self._map_adams[key.camera].update(loss.d_color_map + pull, rate)
-        if self.config.pose_refinement:
-            cached = self._inputs[key]
-            forces = part_forces(inputs, grads)
+            self._map_adams[camera.name].update(loss.d_color_map + pull, rate)
+        if forces is not None:
             late = rates.late ** (self.step / max(self.config.steps, 1))
             self.actor_poses.update(
-                cached.parts,
-                cached.poses,
+                parts.numbers,
+                parts.poses,
                 forces,
-                view.camera.timestamp_ns,
+                camera.timestamp_ns,
                 rate_m=rates.actors * late,
                 pull=self.config.pose_pull,
             )
             self.camera_poses.update(
-                view.camera,
-                cached.poses,
+                camera,
+                parts.poses,
                 forces,
                 rate_px=rates.cameras * late,
                 pull=self.config.pose_pull,
@@ -312,17 +302,13 @@ class Trainer:
             total_steps=config.steps,
             extent_m=self._extent_m,
         )
-        self._inputs.clear()
 
 
 @dataclass(frozen=True, eq=False)
-class _ViewInputs:
-    """What stays the same of a view between densifications. labelled, poses: float64 [P, 4, 4],
-    world_from_part as recorded and as corrected."""
+class _PosedParts:
+    """What a view may show. numbers: of the parts. poses: world_from_part, float64 [P, 4, 4]."""
 
-    inputs: Inputs
-    parts: list[int]
-    labelled: np.ndarray
+    numbers: list[int]
     poses: np.ndarray
 
 
@@ -345,7 +331,3 @@ def _extent(source: ViewSource) -> float:
     """How far the cameras move, and at least 10 m: what splats' sizes are bounded against."""
     centres = np.stack([source.camera(key).centre.numpy() for key in source.train])
     return max(10.0, float(np.linalg.norm(centres.max(0) - centres.min(0))))
-
-
-def mean_or_nan(values: list[float]) -> float:
-    return math.fsum(values) / len(values) if values else math.nan
