@@ -85,25 +85,28 @@ def camera_at(path: Sequence[Camera], camera: Camera, offset_s: float) -> Camera
 def measure_time_offset(
     scene: Scene, views: RecordedViews, keys: Mapping[str, Sequence[ViewKey]]
 ) -> float | None:
-    """Seconds after its stamp at which images fit the LiDAR best, the median over the cameras.
+    """Seconds after their stamps at which images fit the LiDAR best, one number for all cameras.
 
-    keys: views by camera, in order of time. None where the car hardly moves, sweeps have no
-    intensity, or no camera shows a clear best time within 50 ms.
+    keys: views by camera, in order of time. Cameras count by how clearly they show a time: those
+    that look sideways do. None where the car hardly moves, sweeps have no intensity, or no time
+    within 50 ms stands out.
     """
-    best: list[float] = []
+    total = np.zeros(len(_STEPS_S))
+    cameras = 0
     for name, own in keys.items():
         path = _path(scene, name)
         moving = [key for key in own if _speed_mps(path, scene, key) > _LEAST_SPEED_MPS]
         scores = [_fit(scene, views, path, moving, float(offset)) for offset in _STEPS_S]
-        known = np.array([s for s in scores if s is not None])
-        if len(known) < len(_STEPS_S):
-            continue
-        i = int(known.argmax())
-        if 0 < i < len(known) - 1 and known[i] > (1 + _CONTRAST) * known.mean():
-            bend = known[i - 1] - 2 * known[i] + known[i + 1]
-            step = 0.0 if bend == 0 else 0.5 * (known[i - 1] - known[i + 1]) / bend
-            best.append(float(_STEPS_S[i] + step * (_STEPS_S[1] - _STEPS_S[0])))
-    return float(np.median(best)) if best else None
+        known = np.array([score for score in scores if score is not None])
+        if len(known) == len(_STEPS_S) and known.mean() > 0:
+            total += known / known.mean()
+            cameras += 1
+    i = int(total.argmax())
+    if cameras == 0 or not 0 < i < len(total) - 1 or total[i] < (1 + _CONTRAST) * total.mean():
+        return None
+    bend = total[i - 1] - 2 * total[i] + total[i + 1]
+    step = 0.0 if bend == 0 else 0.5 * (total[i - 1] - total[i + 1]) / bend
+    return float(_STEPS_S[i] + step * (_STEPS_S[1] - _STEPS_S[0]))
 
 
 def _fit(

@@ -1,0 +1,67 @@
+"""Masks and checks on a real drive, without building its Gaussians."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import drives
+import pytest
+import torch
+
+from adapters.pandaset.adapter import _frame
+from adapters.pandaset.files import read_sequence
+from adapters.pandaset.labels import PandaSetLabels
+from adapters.recorded.checks import check_views
+from adapters.recorded.views import recorded_views
+from augment.scene import Scene
+from augment.sky import ConstantSky
+
+
+@pytest.fixture(scope="module")
+def scene(shared_dir) -> Scene:
+    root = shared_dir / "data/pandaset_mini/002"
+    sequence = read_sequence(root)
+    frames = tuple(_frame(sequence, number) for number in range(0, len(sequence), 2))
+    return Scene(
+        "002", "pandaset:002", drives.one_splat(), (), ConstantSky(torch.ones(3)), frames,
+        PandaSetLabels(root), sequence.world_origin_m,
+    )  # fmt: skip
+
+
+def test_only_the_back_camera_sees_the_own_car(scene):
+    views = recorded_views(scene, scale=0.25)
+    assert list(views.ego_masks) == ["back_camera"]
+    mask = views.ego_masks["back_camera"]
+    # The roof's highest point was read off the images: 0.745 of the height.
+    assert mask.any(axis=1).argmax() / len(mask) == pytest.approx(0.745, abs=0.01)
+    assert mask[-1].all() and (mask[1:] >= mask[:-1]).all()
+    assert views.problems == ()
+
+
+def test_its_calibration_is_right_and_a_turned_camera_is_noticed(scene):
+    few = dataclasses.replace(scene, frames=scene.frames[::2])
+    cameras = ["front_camera", "right_camera", "left_camera"]
+    checks = check_views(few, recorded_views(few, scale=0.25, cameras=cameras))
+    assert checks.problems == () and len(checks.offsets) == 3
+    # Images show the world some 20 ms before their stamps: half a rolling shutter, it seems.
+    assert -0.03 < checks.time_offset_s < -0.01
+
+    def turned(camera):
+        a = math.radians(0.5)
+        yaw = torch.eye(4, dtype=torch.float64)
+        yaw[[0, 0, 2, 2], [0, 2, 0, 2]] = torch.tensor(
+            [math.cos(a), math.sin(a), -math.sin(a), math.cos(a)], dtype=torch.float64
+        )
+        return dataclasses.replace(camera, camera_from_world=yaw @ camera.camera_from_world)
+
+    frames = tuple(
+        dataclasses.replace(
+            frame, cameras={**frame.cameras, "front_camera": turned(frame.cameras["front_camera"])}
+        )
+        for frame in few.frames
+    )
+    wrong = dataclasses.replace(few, frames=frames)
+    said = check_views(wrong, recorded_views(wrong, scale=0.25, cameras=cameras)).problems
+    assert len(said) == 1, said
+    assert said[0].startswith("camera front_camera: its images lie 0.")
