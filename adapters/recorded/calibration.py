@@ -8,7 +8,7 @@ where they lie on each other (Pandey et al. 2012, here with shifts for rotations
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -50,6 +50,14 @@ class CameraOffset:
 
 
 @dataclass(frozen=True, eq=False)
+class Returns:
+    """A sweep's returns with intensity. points: float64 [N, 3], scene world. intensity: [N]."""
+
+    points: np.ndarray
+    intensity: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
 class Points:
     """Returns in one image: columns, rows int64 [M], intensity [M]; grey uint8 [H, W]."""
 
@@ -60,17 +68,20 @@ class Points:
 
 
 def measure_offset(
-    scene: Scene, views: RecordedViews, cameras: Mapping[ViewKey, Camera]
+    returns: Mapping[int, Returns], views: RecordedViews, cameras: Mapping[ViewKey, Camera]
 ) -> CameraOffset | None:
-    """The shift of one camera's images; None if sweeps have no intensity or fewer than 3000 returns
-    are seen. cameras: the views to compare, at any resolution."""
-    seen: list[Points] = []
-    for key, camera in cameras.items():
-        points = project_returns(
-            scene, views, key, camera, reach=_reach_px(_compared(camera)), near_m=_NEAR_M
+    """The shift of one camera's images; None if fewer than 3000 returns are seen.
+
+    returns: by frame. cameras: the views to compare, at any resolution.
+    """
+    seen = [
+        project_returns(
+            returns[key.frame], views, key, camera,
+            reach=_reach_px(_compared(camera)), near_m=_NEAR_M,
         )
-        if points is not None:
-            seen.append(points)
+        for key, camera in cameras.items()
+        if key.frame in returns
+    ]  # fmt: skip
     if sum(len(points.rows) for points in seen) < _FEWEST_POINTS:
         return None
     camera = _compared(next(iter(cameras.values())))
@@ -105,34 +116,43 @@ def _column(sweep: LidarSweep, names: Sequence[str]) -> np.ndarray | None:
     return np.asarray(sweep.columns[found[0]]) if found else None
 
 
+def read_intensities(scene: Scene, frames: Iterable[int]) -> dict[int, Returns]:
+    """The returns of each frame's sweep, of the sensor that has most; frames without intensity
+    left out."""
+    out: dict[int, Returns] = {}
+    for frame in dict.fromkeys(frames):
+        sweep = scene.lidar(frame)
+        intensity = None if sweep is None else _column(sweep, _INTENSITY)
+        if sweep is None or intensity is None:
+            continue
+        points = sweep.points_m - scene.world_origin_m
+        use = np.isfinite(points).all(axis=1) & np.isfinite(intensity.astype(np.float64))
+        sensor = _column(sweep, _SENSOR)
+        if sensor is not None and len(sensor):
+            names, counts = np.unique(sensor, return_counts=True)
+            use &= sensor == names[counts.argmax()]  # each sensor has its own scale of intensity
+        out[frame] = Returns(points[use], intensity[use])
+    return out
+
+
 def project_returns(
-    scene: Scene,
+    returns: Returns,
     views: RecordedViews,
     key: ViewKey,
     camera: Camera,
     *,
     reach: int,
     near_m: float,
-) -> Points | None:
-    """The returns beyond near_m that `camera` sees, of the sensor that has most, with the image of
-    `key`; None without intensities. reach: pixels from the image's border that are left out."""
-    sweep = scene.lidar(key.frame)
-    intensity = None if sweep is None else _column(sweep, _INTENSITY)
-    if sweep is None or intensity is None:
-        return None
+) -> Points:
+    """The returns beyond near_m that `camera` sees, with the image of `key`. reach: pixels from the
+    image's border that are left out."""
     camera = _compared(camera)
     grey = cv2.cvtColor(views.image(key), cv2.COLOR_RGB2GRAY)
     grey = cv2.resize(grey, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-    points = sweep.points_m - scene.world_origin_m
-    use = np.isfinite(points).all(axis=1) & np.isfinite(intensity.astype(np.float64))
-    sensor = _column(sweep, _SENSOR)
-    if sensor is not None and len(sensor):
-        names, counts = np.unique(sensor, return_counts=True)
-        use &= sensor == names[counts.argmax()]  # each sensor has its own scale of intensity
     pose = camera.camera_from_world.numpy()
-    local = points[use] @ pose[:3, :3].T + pose[:3, 3]
+    local = returns.points @ pose[:3, :3].T + pose[:3, 3]
     ahead = local[:, 2] > near_m
-    local, intensity = local[ahead], intensity[use][ahead]
+    local, intensity = local[ahead], returns.intensity[ahead]
     u = np.floor(camera.fx * local[:, 0] / local[:, 2] + camera.cx).astype(np.int64)
     v = np.floor(camera.fy * local[:, 1] / local[:, 2] + camera.cy).astype(np.int64)
     inside = (u >= reach) & (u < camera.width - reach) & (v >= reach) & (v < camera.height - reach)

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import torch
 
-from adapters.recorded.calibration import Points, project_returns, shared_information
+from adapters.recorded.calibration import Points, Returns, project_returns, shared_information
 from adapters.recorded.views import RecordedViews
 from augment.cameras import Camera
 from augment.geometry import (
@@ -29,6 +29,7 @@ from augment.scene import Scene
 _STEPS_S = np.arange(-5, 6) * 0.010
 _NEAR_M = 3.0  # near returns shift most with time
 _LEAST_SPEED_MPS = 1.0
+_EVERY = 3  # return is enough
 _CONTRAST = 0.02  # how much the best time must stand out from the range's mean
 
 
@@ -83,20 +84,28 @@ def camera_at(path: Sequence[Camera], camera: Camera, offset_s: float) -> Camera
 
 
 def measure_time_offset(
-    scene: Scene, views: RecordedViews, keys: Mapping[str, Sequence[ViewKey]]
+    scene: Scene,
+    returns: Mapping[int, Returns],
+    views: RecordedViews,
+    keys: Mapping[str, Sequence[ViewKey]],
 ) -> float | None:
     """Seconds after their stamps at which images fit the LiDAR best, one number for all cameras.
 
-    keys: views by camera, in order of time. Cameras count by how clearly they show a time: those
-    that look sideways do. None where the car hardly moves, sweeps have no intensity, or no time
-    within 50 ms stands out.
+    returns: by frame. keys: views by camera, in order of time. Cameras count by how clearly they
+    show a time: those that look sideways do. None where the car hardly moves, sweeps have no
+    intensity, or no time within 50 ms stands out.
     """
+    returns = {
+        frame: Returns(found.points[::_EVERY], found.intensity[::_EVERY])
+        for frame, found in returns.items()
+    }
     total = np.zeros(len(_STEPS_S))
     cameras = 0
     for name, own in keys.items():
         path = _path(scene, name)
+        own = [key for key in own if key.frame in returns]
         moving = [key for key in own if _speed_mps(path, scene, key) > _LEAST_SPEED_MPS]
-        scores = [_fit(scene, views, path, moving, float(offset)) for offset in _STEPS_S]
+        scores = [_fit(scene, returns, views, path, moving, float(offset)) for offset in _STEPS_S]
         known = np.array([score for score in scores if score is not None])
         if len(known) == len(_STEPS_S) and known.mean() > 0:
             total += known / known.mean()
@@ -111,6 +120,7 @@ def measure_time_offset(
 
 def _fit(
     scene: Scene,
+    returns: Mapping[int, Returns],
     views: RecordedViews,
     path: Sequence[Camera],
     keys: Sequence[ViewKey],
@@ -120,9 +130,9 @@ def _fit(
     seen: list[Points] = []
     for key in keys:
         camera = camera_at(path, scene.frame(key.frame).cameras[key.camera], offset_s)
-        points = project_returns(scene, views, key, camera, reach=0, near_m=_NEAR_M)
-        if points is not None:
-            seen.append(points)
+        seen.append(
+            project_returns(returns[key.frame], views, key, camera, reach=0, near_m=_NEAR_M)
+        )
     return float(shared_information(seen, 0)[0, 0]) if seen else None
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-import functools
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,10 +10,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from adapters.recorded.calibration import CameraOffset, measure_offset
+from adapters.recorded.calibration import CameraOffset, measure_offset, read_intensities
 from adapters.recorded.camera_timing import measure_time_offset, with_camera_times
 from adapters.recorded.views import RecordedViews
-from augment.labels import Boxes, LabelSource
 from augment.reconstruct.view import ViewKey
 from augment.scene import Scene
 
@@ -69,11 +66,9 @@ def check_views(scene: Scene, views: RecordedViews) -> Checks:
     problems: list[str] = []
     for found in own.values():
         problems += exposure_jumps(views, found)
-    if scene.labels is None:
-        return Checks(tuple(problems), None, ())
     own = {name: _spread(found, _FRAMES) for name, found in own.items()}
-    scene = dataclasses.replace(scene, labels=_Remembered(scene.labels))
-    late = measure_time_offset(scene, views, own)
+    returns = read_intensities(scene, (key.frame for found in own.values() for key in found))
+    late = measure_time_offset(scene, returns, views, own)
     if late is not None and abs(late) > _WORST_TIME_S:
         problems.append(
             f"images fit the LiDAR best if they were taken {abs(late) * 1e3:.0f} ms "
@@ -83,22 +78,11 @@ def check_views(scene: Scene, views: RecordedViews) -> Checks:
     offsets = []
     for found in own.values():
         cameras = {k: timed.frame(k.frame).cameras[k.camera] for k in found}
-        offset = measure_offset(scene, views, cameras)
+        offset = measure_offset(returns, views, cameras)
         if offset is not None:
             offsets.append(offset)
             problems += _offset_problem(offset)
     return Checks(tuple(problems), late, tuple(offsets))
-
-
-class _Remembered:
-    """Labels whose last sweeps stay in memory, since every camera asks for the same ones."""
-
-    def __init__(self, labels: LabelSource) -> None:
-        self._labels = labels
-        self.lidar = functools.lru_cache(maxsize=_FRAMES)(labels.lidar)
-
-    def boxes(self, frame_index: int) -> Boxes:
-        return self._labels.boxes(frame_index)
 
 
 def _spread(keys: Sequence[ViewKey], count: int) -> list[ViewKey]:
