@@ -16,8 +16,8 @@ from augment.render.threads import kernel_threads
 class Forces:
     """Of P parts, in each part's own axes, float64. seen: bool [P], whether the view shows it.
 
-    shift [P, 3]: dL by a shift of the part. turn [P, 3]: dL by a turn about its origin (rad). What
-    a turn does to the shape of single splats is left out.
+    shift [P, 3]: dL by a shift of the part. turn [P, 3]: dL by a turn about its origin (rad), of
+    means and ellipsoids; that view-dependent colours turn along is left out.
     """
 
     seen: np.ndarray
@@ -53,6 +53,4 @@ def part_forces(inputs: Inputs, grads: SplatGradients) -> Forces:
     totals = np.zeros((parts, MOMENTS))
     np.add.at(totals, inputs.blocks[:, 0], moments)
     seen = np.bincount(inputs.blocks[:, 0], grads.counts, minlength=parts) > 0
-    m = totals[:, 3:].reshape(parts, 3, 3)
-    turn = np.stack([m[:, 1, 2] - m[:, 2, 1], m[:, 2, 0] - m[:, 0, 2], m[:, 0, 1] - m[:, 1, 0]], 1)
-    return Forces(seen, totals[:, :3], turn)
+    return Forces(seen, totals[:, :3], totals[:, 3:])

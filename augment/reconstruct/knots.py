@@ -6,7 +6,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-_BETA1, _BETA2, _EPS = 0.9, 0.999, 1e-15
+# Forces are some 1e-4 a metre: what is smaller than this is rounding, and must not be a direction.
+_BETA1, _BETA2, _EPS = 0.9, 0.999, 1e-10
 
 
 class Knots:
