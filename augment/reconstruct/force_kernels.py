@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numba import prange
 
@@ -20,7 +22,7 @@ def sum_forces(addresses, sizes, blocks, rows, ids, counts, moments):
     """moments: float64 [B, MOMENTS], filled, in each part's axes.
 
     addresses, sizes, blocks: as in cpu_project; rows (flat), ids, counts: as project_backward
-    wrote them.
+    wrote them. Splats whose gradient is not finite are left out, as they are of the update.
     """
     for block in prange(blocks.shape[0]):
         part = blocks[block, 0]
@@ -39,6 +41,8 @@ def sum_forces(addresses, sizes, blocks, rows, ids, counts, moments):
             hx, hy, hz = _three(rows, row + U(G_QUAT + 1))
             w = np.float64(quats[q])
             x, y, z = _three(quats, q + U(1))
+            if not math.isfinite(gx + gy + gz + hw + hx + hy + hz):
+                continue
             moments[block, 0] += gx
             moments[block, 1] += gy
             moments[block, 2] += gz

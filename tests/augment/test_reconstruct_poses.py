@@ -110,19 +110,22 @@ def test_forces_are_the_slopes_of_the_loss():
     tape = render(poses, camera)
     forces = part_forces(tape.inputs, tape.backward(weights, np.zeros_like(tape.alpha)))
     on_camera = forces.on_camera(camera.camera_from_world.numpy() @ poses)
-    step = 3e-4
+    step = 1e-3
+    slopes = np.zeros((2, 6))
     for axis in range(6):
         change = np.zeros(6)
         change[axis] = step
         there, back = (moved(sign * change) for sign in (1, -1))
         part = [np.stack([poses[0], poses[1] @ m]) for m in (there, back)]
-        slope = (loss(part[0], camera) - loss(part[1], camera)) / (2 * step)
-        found = np.append(forces.turn[1], forces.shift[1])
+        slopes[0, axis] = (loss(part[0], camera) - loss(part[1], camera)) / (2 * step)
         cameras = [camera_moved(camera, m) for m in (there, back)]
-        camera_slope = (loss(poses, cameras[0]) - loss(poses, cameras[1])) / (2 * step)
-        # Cut-offs of single splats at single pixels make the differences rough by a few per cent.
-        assert found[axis] == pytest.approx(slope, abs=0.04 * np.abs(found).max())
-        assert on_camera[axis] == pytest.approx(camera_slope, abs=0.04 * np.abs(on_camera).max())
+        slopes[1, axis] = (loss(poses, cameras[0]) - loss(poses, cameras[1])) / (2 * step)
+    found = np.stack([np.append(forces.turn[1], forces.shift[1]), on_camera])
+    # Cut-offs of splats at single pixels make differences rough; a splat that did not turn with
+    # its part would be off by more than half.
+    for kind in (slice(0, 3), slice(3, 6)):
+        scale = np.abs(slopes[:, kind]).max(1, keepdims=True)
+        assert (np.abs(found[:, kind] - slopes[:, kind]) < 0.15 * scale).all()
 
 
 def test_a_camera_is_found_again():

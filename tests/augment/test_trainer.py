@@ -22,9 +22,8 @@ from augment.reconstruct.view import RecordedView, ViewKey, ViewSource
 from augment.render.composite import quantise
 from augment.render.cpu_backward import Tape
 from augment.render.cpu_layout import BLOCK
-from augment.render.rasterize import rasterize
 from augment.render.threads import limit_threads
-from augment.scene import Actor, Gaussians, PosedGaussians, Scene, Track
+from augment.scene import Actor, Gaussians, Scene, Track
 from augment.sky import ConstantSky, CubemapSky
 from recipes.schema import Output, Recipe
 from tests.scenes import camera_ahead, random_gaussians
@@ -549,45 +548,6 @@ def gradients_of(trainer: Trainer, key: ViewKey, weights: np.ndarray):
     """Inputs of a view, and gradients of the weighted sum of its colours."""
     tape = rendered(trainer, camera_of(trainer.scene(), key))
     return tape.inputs, tape.backward(weights, np.zeros((HEIGHT, WIDTH), np.float32))
-
-
-def test_forces_are_the_slopes_of_the_picture(recorded):
-    """By a shift and a turn of the car about its origin, and of all that the camera sees about the
-    camera, which carry the means along and leave the shape of single splats as it is.
-    """
-    scene = truth(color_maps={})
-    trainer = Trainer(scene, recorded, QUICK)
-    trainer.step = 1000  # all SH bands
-    key = ViewKey(1, "left")
-    camera = scene.frames[1].cameras["left"]
-    weights = np.random.default_rng(0).normal(size=(HEIGHT, WIDTH, 3)).astype(np.float32)
-    forces = part_forces(*gradients_of(trainer, key, weights))
-    assert forces.seen.all()
-
-    car_moves, view_moves = (torch.zeros(2, 3, dtype=torch.float64).requires_grad_() for _ in "ab")
-    parts, camera_from_parts = [], []
-    for part in scene.parts_for(camera):
-        pose = torch.eye(4, dtype=torch.float64)
-        pose = pose if part.world_from_part is None else part.world_from_part
-        camera_from_part = camera.camera_from_world @ pose
-        camera_from_parts.append(camera_from_part.numpy())
-        rotation = camera_from_part[:3, :3]
-        tensors = {name: getattr(part.gaussians, name).double() for name in ARRAYS}
-        means = tensors["means"]
-        if part.instance_id:
-            means = means + car_moves[0] + torch.linalg.cross(car_moves[1].expand_as(means), means)
-        seen = means @ rotation.T + camera_from_part[:3, 3]
-        step = view_moves[0] + torch.linalg.cross(view_moves[1].expand_as(seen), seen)
-        tensors["means"] = means + step @ rotation
-        parts.append(PosedGaussians(Gaussians(**tensors), pose, part.instance_id))
-    out = rasterize(parts, camera, backend="reference")
-    (out.rgb * torch.from_numpy(weights)).sum().backward()
-    # float32 kernels against float64, as everywhere; forces are sums of some hundred splats
-    on_car = np.stack([forces.shift[1], forces.turn[1]])
-    on_camera = forces.on_camera(np.stack(camera_from_parts)).reshape(2, 3)[::-1]
-    for got, want in ((on_car, car_moves.grad.numpy()), (on_camera, view_moves.grad.numpy())):
-        assert np.abs(want).min() > 1e-2
-        np.testing.assert_allclose(got, want, rtol=0, atol=1e-4 * np.abs(want).max())
 
 
 def test_a_gradient_that_is_not_finite_pulls_at_nothing(recorded):
