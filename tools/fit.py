@@ -12,6 +12,7 @@ import json
 import shutil
 import sys
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -93,17 +94,19 @@ class _Run:
     folder: Path
     scene: Scene
     source: Views
-    leaks: tuple[str, ...]
+    notes: tuple[str, ...]
+    checks: Mapping[str, Any]
     trainer: Fitter
     plan: Checkpoint
     history: History
 
 
 def _prepare(options: FitOptions, parts: FitParts, folder: Path, before: Checkpoint | None) -> _Run:
-    scene, leaks = open_to_fit(options, parts.open_scene)
-    source = parts.views(scene, options)
-    scene = parts.start(scene, source)
-    for problem in _problems(scene, source, leaks):
+    scene, notes = open_to_fit(options, parts.open_scene)
+    checked = parts.check(scene, parts.views(scene, options), options)
+    source, notes = checked.source, (*notes, *checked.problems)
+    scene = parts.start(checked.scene, source)
+    for problem in _problems(scene, source, notes):
         _say(f"note: {problem}")
     facts = data_facts(scene, source)
     _say(
@@ -130,7 +133,7 @@ def _prepare(options: FitOptions, parts: FitParts, folder: Path, before: Checkpo
         _say(f"going on after step {plan.step} of {plan.steps}")
     history = History(plan.history, plan.sums, plan.seconds)
     plan = dataclasses.replace(plan, arrays={}, facts={})  # the trainer has them: free the memory
-    return _Run(options, parts, folder, scene, source, leaks, trainer, plan, history)
+    return _Run(options, parts, folder, scene, source, notes, checked.facts, trainer, plan, history)
 
 
 def _estimate(options: FitOptions, parts: FitParts, scene: Scene, source: Views) -> int:
@@ -210,7 +213,8 @@ def _write(run: _Run, complete: bool, seconds: float) -> dict[str, Any]:
         "seconds_of_this_run": seconds,
         "data": run.plan.data,
         "settings": run.plan.settings,
-        "problems": list(_problems(run.scene, run.source, run.leaks)),
+        "problems": list(_problems(run.scene, run.source, run.notes)),
+        "checks": dict(run.checks),
     }
     source: ViewSource = run.source
     if not complete and len(source.test) > EVALUATED_WHEN_STOPPED:  # someone waits for the end
@@ -225,9 +229,9 @@ def _write(run: _Run, complete: bool, seconds: float) -> dict[str, Any]:
     return report
 
 
-def _problems(scene: Scene, source: Views, leaks: tuple[str, ...]) -> tuple[str, ...]:
+def _problems(scene: Scene, source: Views, notes: tuple[str, ...]) -> tuple[str, ...]:
     """Every sentence once; loading views may have added some since they were opened."""
-    return tuple(dict.fromkeys((*scene.problems, *source.problems, *leaks)))
+    return tuple(dict.fromkeys((*scene.problems, *source.problems, *notes)))
 
 
 def report_folder(folder: Path) -> Path:

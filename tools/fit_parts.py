@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -14,6 +14,7 @@ from augment.reconstruct.view import ViewKey, ViewSource
 from augment.scene import Scene
 from tools.fit_options import FitOptions, parse_depth
 
+LEAST_OFFSET_S = 0.005  # of clocks: less moves a camera by centimetres at most, if it is real
 SCORES = ("psnr", "ssim", "depth_median_m")  # of a row of the history
 
 
@@ -60,7 +61,8 @@ class Views(ViewSource, Protocol):
 
 @dataclass(frozen=True)
 class FitParts:
-    """open_scene(uri); views(scene, options); start(scene, source): with what no sensor gave;
+    """open_scene(uri); views(scene, options); check(scene, source, options): both again, timed
+    anew where the clocks disagree, and sentences; start(scene, source): with what no sensor gave;
     trainer(scene, source, config);
     score(scene, source, keys): means over the views, {"psnr", "ssim", ...};
     save(scene, folder); report(folder, scene, source, history, facts): report.json's content.
@@ -73,6 +75,19 @@ class FitParts:
     score: Callable[[Scene, ViewSource, Sequence[ViewKey]], dict[str, float]]
     save: Callable[[Scene, Path], None]
     report: Callable[..., dict[str, Any]]
+    check: Callable[[Scene, Any, FitOptions], Checked] = lambda scene, source, _: Checked(
+        scene, source
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Checked:
+    """Scene and views after images and LiDAR were compared, what was found, and facts of it."""
+
+    scene: Scene
+    source: Views
+    problems: tuple[str, ...] = ()
+    facts: Mapping[str, Any] = field(default_factory=dict)
 
 
 def real_parts() -> FitParts:
@@ -90,6 +105,26 @@ def real_parts() -> FitParts:
         score=_mean_scores,
         save=save_scene,
         report=_report,
+        check=_checked,
+    )
+
+
+def _checked(scene: Scene, source: Any, options: FitOptions) -> Checked:
+    from adapters.recorded.camera_timing import with_camera_times
+    from adapters.recorded.checks import check_views
+
+    checks = check_views(scene, source)
+    late_s = checks.time_offset_s
+    if late_s is None or abs(late_s) < LEAST_OFFSET_S:
+        return Checked(scene, source, checks.problems, checks.facts)
+    timed = with_camera_times(scene, late_s)
+    sentence = (
+        f"images fit the LiDAR best {abs(late_s) * 1e3:.0f} ms "
+        f"{'after' if late_s > 0 else 'before'} their time stamps: every camera is taken to be "
+        f"where it was then"
+    )
+    return Checked(
+        timed, _recorded_views(timed, options), (*checks.problems, sentence), checks.facts
     )
 
 

@@ -66,7 +66,9 @@ def check_views(scene: Scene, views: RecordedViews) -> Checks:
     problems: list[str] = []
     for found in own.values():
         problems += exposure_jumps(views, found)
-    own = {name: _spread(found, _FRAMES) for name, found in own.items()}
+    # What is measured changes the cameras, so held-out images have no part in it.
+    learnt = {name: [k for k in found if k in set(views.train)] for name, found in own.items()}
+    own = {name: _spread(found, _FRAMES) for name, found in learnt.items() if found}
     returns = read_intensities(scene, (key.frame for found in own.values() for key in found))
     late = measure_time_offset(scene, returns, views, own)
     if late is not None and abs(late) > _WORST_TIME_S:

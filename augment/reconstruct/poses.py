@@ -53,7 +53,7 @@ class ActorPoses:
     ) -> None:
         """One step for every actor that a view shows. parts, poses: those of its inputs."""
         rates = np.full(4, rate_m)
-        for place in np.flatnonzero(forces.seen):
+        for place in np.flatnonzero(forces.seen).tolist():
             if parts[place] == 0:
                 continue
             rotation = poses[place, :3, :3]
