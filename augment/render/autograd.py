@@ -88,7 +88,9 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, d_rgb: Tensor, d_alpha: Tensor, d_depth: Tensor) -> tuple[Any, ...]:
+    def backward(  # pyright: ignore[reportIncompatibleMethodOverride] - torch's own way
+        ctx: Any, d_rgb: Tensor, d_alpha: Tensor, d_depth: Tensor
+    ) -> tuple[Any, ...]:
         tape: cpu_backward.Tape = ctx.tape
         grads = tape.backward(
             d_rgb.contiguous().numpy(),
