@@ -76,7 +76,7 @@ def fit(
     cameras: str = "all",
     holdout: str = "every-2nd",
     seed: int = 0,
-    depth_weight: float = 1.0,
+    depth_weight: float | None = None,
     sh_degree: int | None = None,
     max_splats: int | None = None,
     densify: Literal["absgrad", "mcmc", "none"] = "absgrad",

@@ -9,7 +9,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from adapters.base import recognise
 from adapters.recorded.depth_priors import DepthPriors
@@ -22,13 +22,15 @@ DEFAULT_MINUTES = 10.0
 DENSIFY = ("absgrad", "mcmc", "none")
 DEPTH_KINDS = ("sparse", "metric", "relative")
 
+_Number = TypeVar("_Number", int, float)
+
 
 @dataclass(frozen=True)
 class FitOptions:
     """The options of one reconstruction; see `climategs fit --help`.
 
     scene: URI of the raw data. minutes, steps: one of them or neither (10 minutes). cameras: names,
-    None for all. sh_degree, max_splats: None for FitConfig's. depth: see parse_depth.
+    None for all. depth_weight, sh_degree, max_splats: None for FitConfig's. depth: see parse_depth.
 
     Raises:
         ClimateGSError: a value outside its range, or two that exclude each other.
@@ -42,7 +44,7 @@ class FitOptions:
     cameras: tuple[str, ...] | None = None
     holdout: str = "every-2nd"
     seed: int = 0
-    depth_weight: float = 1.0
+    depth_weight: float | None = None
     sh_degree: int | None = None
     max_splats: int | None = None
     densify: str = "absgrad"
@@ -103,7 +105,9 @@ class FitOptions:
             steps=steps,
             seed=self.seed,
             sh_degree=_or(self.sh_degree, default.sh_degree),
-            loss=dataclasses.replace(default.loss, depth=self.depth_weight),
+            loss=dataclasses.replace(
+                default.loss, depth=_or(self.depth_weight, default.loss.depth)
+            ),
             densify=growth,
         )
 
@@ -194,7 +198,7 @@ def _absolute(path: Path) -> Path:
     return path.parent.resolve() / path.name
 
 
-def _or(value: int | None, default: int) -> int:
+def _or(value: _Number | None, default: _Number) -> _Number:
     return default if value is None else value
 
 

@@ -16,7 +16,7 @@ class LossWeights:
     """
 
     d_ssim: float = 0.2
-    depth: float = 1.0
+    depth: float = 2.0
     sky: float = 0.05
     opacity_decay: float = 0.0
     scale_decay: float = 0.0
@@ -24,20 +24,22 @@ class LossWeights:
 
 @dataclass(frozen=True)
 class LearningRates:
-    """Adam's step sizes. means: pixels of the view at hand, so that a distant splat moves further,
-    decaying exponentially to means_end over the run; scales: of their logarithm; opacities: of
-    their logit; sh_rest: of the bands above degree 0. actors: metres of a box's position; cameras:
-    pixels of what a camera sees 10 m away. All but means fall to `late` of their value in the run.
+    """Adam's step sizes. means: pixels of the view at hand, so that a distant splat moves further;
+    scales: of their logarithm; opacities: of their logit; sh_rest: of the bands above degree 0;
+    actors: metres of a box's position; cameras: pixels of what a camera sees 10 m away. Means and
+    the sky's texels decay exponentially to means_end and sky_end over the run, the others to `late`
+    of their value.
     """
 
-    means: float = 0.1
-    means_end: float = 0.002
-    quats: float = 1e-3
-    scales: float = 5e-3
-    opacities: float = 3e-2
-    sh_dc: float = 5e-3
+    means: float = 0.3
+    means_end: float = 0.003
+    quats: float = 6e-3
+    scales: float = 0.02
+    opacities: float = 0.1
+    sh_dc: float = 0.02
     sh_rest: float = 2.5e-4
-    sky: float = 5e-3
+    sky: float = 0.03
+    sky_end: float = 1e-3
     color_map: float = 2e-3
     actors: float = 3e-3
     cameras: float = 0.12

@@ -241,6 +241,7 @@ class Trainer:
         loss: ViewLoss,
     ) -> None:
         splats, rates = self.splats, self.config.rates
+        done = min(1.0, self.step / max(self.config.steps, 1))
         forces = part_forces(inputs, grads) if self.config.pose_refinement else None
         with kernel_threads():
             update_splats(
@@ -263,14 +264,16 @@ class Trainer:
                 splats.grads.reshape(-1),
             )
         if loss.d_sky is not None:
-            self._sky_adam.update(loss.d_sky.texels, loss.d_sky.grads, rates.sky)
+            rate = rates.sky * (rates.sky_end / rates.sky) ** done if rates.sky else 0.0
+            self._sky_adam.update(loss.d_sky.texels, loss.d_sky.grads, rate)
         if self.config.exposure:
             color_map = self.color_maps[camera.name]
             pull = self.config.exposure_pull * (color_map - _IDENTITY)
-            rate = rates.color_map * rates.late ** (self.step / max(self.config.steps, 1))
-            self._map_adams[camera.name].update(loss.d_color_map + pull, rate)
+            self._map_adams[camera.name].update(
+                loss.d_color_map + pull, rates.color_map * rates.late**done
+            )
         if forces is not None:
-            late = rates.late ** (self.step / max(self.config.steps, 1))
+            late = rates.late**done
             self.actor_poses.update(
                 parts.numbers,
                 parts.poses,
