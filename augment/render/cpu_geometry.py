@@ -62,24 +62,37 @@ def to_image(x, y, inverse, view):
 
 
 @inner()
-def image_covariance(quats, scales, picked, at, x, y, inverse, view):
-    """xx, xy, yy in px^2, not blurred, and det / (yy + blur), of which no digits cancel."""
+def semi_axes(quats, scales, picked, at, x, y, inverse, view):
+    """Ellipsoids' axes in the image, px right (3) and down (3), and what they were made of: the
+    scales (3), the Jacobian's rows times the view's rotation (3 and 3), the rotations (9).
+    """
     r, s, t = rotation_row(view, U(0)), rotation_row(view, U(1)), rotation_row(view, U(2))
     u = v8.minimum(v8.maximum(x * inverse, v8.splat(view[V_LOW])), v8.splat(view[V_HIGH]))
     v = v8.minimum(v8.maximum(y * inverse, v8.splat(view[V_LOW + 1])), v8.splat(view[V_HIGH + 1]))
     fx, fy = v8.splat(view[V_FOCAL]) * inverse, v8.splat(view[V_FOCAL + 1]) * inverse
-    # Rows of the Jacobian times the view's rotation.
     jx = fx * (r[0] - u * t[0]), fx * (r[1] - u * t[1]), fx * (r[2] - u * t[2])
     jy = fy * (s[0] - v * t[0]), fy * (s[1] - v * t[1]), fy * (s[2] - v * t[2])
     m = rotation_from_quats(quats, picked, at)
-    s0, s1, s2 = gather3(scales, picked, at)
-    # Semi-axes in the image: px of each axis of the ellipsoid, right and down.
-    x0 = s0 * dot(jx[0], jx[1], jx[2], m[0], m[3], m[6])
-    x1 = s1 * dot(jx[0], jx[1], jx[2], m[1], m[4], m[7])
-    x2 = s2 * dot(jx[0], jx[1], jx[2], m[2], m[5], m[8])
-    y0 = s0 * dot(jy[0], jy[1], jy[2], m[0], m[3], m[6])
-    y1 = s1 * dot(jy[0], jy[1], jy[2], m[1], m[4], m[7])
-    y2 = s2 * dot(jy[0], jy[1], jy[2], m[2], m[5], m[8])
+    sizes = gather3(scales, picked, at)
+    right = (
+        sizes[0] * dot(jx[0], jx[1], jx[2], m[0], m[3], m[6]),
+        sizes[1] * dot(jx[0], jx[1], jx[2], m[1], m[4], m[7]),
+        sizes[2] * dot(jx[0], jx[1], jx[2], m[2], m[5], m[8]),
+    )
+    down = (
+        sizes[0] * dot(jy[0], jy[1], jy[2], m[0], m[3], m[6]),
+        sizes[1] * dot(jy[0], jy[1], jy[2], m[1], m[4], m[7]),
+        sizes[2] * dot(jy[0], jy[1], jy[2], m[2], m[5], m[8]),
+    )
+    return right, down, sizes, jx, jy, m
+
+
+@inner()
+def image_covariance(quats, scales, picked, at, x, y, inverse, view):
+    """xx, xy, yy in px^2, not blurred, and det / (yy + blur), of which no digits cancel."""
+    right, down, _, _, _, _ = semi_axes(quats, scales, picked, at, x, y, inverse, view)
+    x0, x1, x2 = right
+    y0, y1, y2 = down
     xx, xy, yy = (
         dot(x0, x1, x2, x0, x1, x2),
         dot(x0, x1, x2, y0, y1, y2),

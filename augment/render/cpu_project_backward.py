@@ -31,8 +31,6 @@ from augment.render.cpu_color import add_direction_slopes
 from augment.render.cpu_geometry import (
     dot,
     from_eye,
-    gather3,
-    rotation_from_quats,
     rotation_row,
     to_camera,
 )
@@ -181,23 +179,10 @@ def _geometry_backward(
     k = v8.splat(np.float32(0.5) * LOG2_E)
     x, y, z = to_camera(from_eye(means, picked, at, view), view)
     inverse = one / z
-    # Semi-axes in the image, as in cpu_geometry.image_covariance.
-    r, s, t = rotation_row(view, U(0)), rotation_row(view, U(1)), rotation_row(view, U(2))
-    u_low, u_high = v8.splat(view[V_LOW]), v8.splat(view[V_HIGH])
-    v_low, v_high = v8.splat(view[V_LOW + 1]), v8.splat(view[V_HIGH + 1])
-    u = v8.minimum(v8.maximum(x * inverse, u_low), u_high)
-    v = v8.minimum(v8.maximum(y * inverse, v_low), v_high)
-    fx, fy = v8.splat(view[V_FOCAL]) * inverse, v8.splat(view[V_FOCAL + 1]) * inverse
-    jx = fx * (r[0] - u * t[0]), fx * (r[1] - u * t[1]), fx * (r[2] - u * t[2])
-    jy = fy * (s[0] - v * t[0]), fy * (s[1] - v * t[1]), fy * (s[2] - v * t[2])
-    m = rotation_from_quats(quats, picked, at)
-    s0, s1, s2 = gather3(scales, picked, at)
-    x0 = s0 * dot(jx[0], jx[1], jx[2], m[0], m[3], m[6])
-    x1 = s1 * dot(jx[0], jx[1], jx[2], m[1], m[4], m[7])
-    x2 = s2 * dot(jx[0], jx[1], jx[2], m[2], m[5], m[8])
-    y0 = s0 * dot(jy[0], jy[1], jy[2], m[0], m[3], m[6])
-    y1 = s1 * dot(jy[0], jy[1], jy[2], m[1], m[4], m[7])
-    y2 = s2 * dot(jy[0], jy[1], jy[2], m[2], m[5], m[8])
+    right, down, sizes, jx, jy, m = semi_axes(quats, scales, picked, at, x, y, inverse, view)
+    x0, x1, x2 = right
+    y0, y1, y2 = down
+    s0, s1, s2 = sizes
     blur = v8.splat(view[V_BLUR])
     xx, yy = dot(x0, x1, x2, x0, x1, x2), dot(y0, y1, y2, y0, y1, y2)
     cxx, cyy = xx + blur, yy + blur
@@ -262,7 +247,10 @@ def _geometry_backward(
         dot(b0, b1, b2, m[3], m[4], m[5]),
         dot(b0, b1, b2, m[6], m[7], m[8]),
     )
-    zero = v8.splat(np.float32(0))
+    zero, t = v8.splat(np.float32(0)), rotation_row(view, U(2))
+    fx, fy = v8.splat(view[V_FOCAL]) * inverse, v8.splat(view[V_FOCAL + 1]) * inverse
+    u_low, u_high = v8.splat(view[V_LOW]), v8.splat(view[V_HIGH])
+    v_low, v_high = v8.splat(view[V_LOW + 1]), v8.splat(view[V_HIGH + 1])
     raw_u, raw_v = x * inverse, y * inverse
     free_u = v8.both(v8.at_least(raw_u, u_low), v8.at_least(u_high, raw_u))
     free_v = v8.both(v8.at_least(raw_v, v_low), v8.at_least(v_high, raw_v))
