@@ -32,6 +32,7 @@ from augment.render.cpu_geometry import (
     dot,
     from_eye,
     rotation_row,
+    semi_axes,
     to_camera,
 )
 from augment.render.cpu_jit import inner, kernel
