@@ -83,6 +83,7 @@ def fit(
     image_cache_mb: int = 1024,
     depth: str = "lidar",
     ego_masks: Path | None = None,
+    truth: str | None = None,
     overwrite: bool = False,
     json_file: _JsonFile = None,
 ) -> int:
@@ -108,6 +109,8 @@ def fit(
         depth: Depth priors: none, or kinds separated by commas: lidar, metric:DIR (depth maps as
             render writes them), relative:DIR (monocular networks), sparse:DIR (lidar_depth).
         ego_masks: A folder of CAMERA.png, white where the image shows the recording car.
+        truth: The procedural street that a recording was rendered from: the report then holds
+            the error against its exact depth.
         overwrite: Begin anew and replace what is there.
         json_file: Also write the report to this file.
     """
@@ -130,6 +133,7 @@ def fit(
         image_cache_mb=image_cache_mb,
         depth=depth,
         ego_masks=ego_masks,
+        truth=truth,
         overwrite=overwrite,
     )
     outcome = fit_scene(options)

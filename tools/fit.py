@@ -35,6 +35,7 @@ from tools.fit_loop import CHECKPOINT_S, History, Loop, StopRequest, sample_keys
 from tools.fit_options import FitOptions, differences
 from tools.fit_parts import FitParts, Fitter, Views, real_parts
 from tools.fit_time import estimate_steps
+from tools.fit_truth import truth_facts
 
 EVALUATED = {"test": 6, "train": 3}  # views looked at during the run; all of them at its end
 EVALUATED_WHEN_STOPPED = 12
@@ -223,10 +224,22 @@ def _write(run: _Run, complete: bool, seconds: float) -> dict[str, Any]:
             f"the run was stopped: figures are of {len(source.test)} of the "
             f"{len(run.source.test)} held-out views"
         )
+    if options.truth is not None:
+        facts["truth"] = truth_facts(options.truth, scene, run.source)
+        _say(_truth_line(facts["truth"]))
     folder = report_folder(run.folder)
     report = run.parts.report(folder, scene, source, run.history.rows, facts)
     _show_end(options.out, folder)
     return report
+
+
+def _truth_line(truth: Mapping[str, Any]) -> str:
+    depth = truth["median"]
+    return (
+        f"depth against the street's own: median {100 * depth['median_m']:.1f} cm, 90 % within "
+        f"{100 * depth['p90_m']:.1f} cm; {100 * truth['no_surface']:.2f} % of surfaces missing, "
+        f"{100 * truth['sky_covered']:.2f} % of the sky covered"
+    )
 
 
 def _problems(scene: Scene, source: Views, notes: tuple[str, ...]) -> tuple[str, ...]:

@@ -17,6 +17,7 @@ from adapters.recorded.holdout import holdout_step
 from adapters.uri import format_uri, parse_uri
 from augment.errors import ClimateGSError
 from augment.reconstruct.config import DensifyConfig, FitConfig
+from tools.fit_truth import open_street
 
 DEFAULT_MINUTES = 10.0
 DENSIFY = ("absgrad", "mcmc", "none")
@@ -31,6 +32,7 @@ class FitOptions:
 
     scene: URI of the raw data. minutes, steps: one of them or neither (10 minutes). cameras: names,
     None for all. depth_weight, sh_degree, max_splats: None for FitConfig's. depth: see parse_depth.
+    truth: URI of the street a recording shows, for the report alone.
 
     Raises:
         ClimateGSError: a value outside its range, or two that exclude each other.
@@ -51,6 +53,7 @@ class FitOptions:
     image_cache_mb: int = 1024
     depth: str = "lidar"
     ego_masks: Path | None = None
+    truth: str | None = None
     overwrite: bool = False
 
     def __post_init__(self) -> None:
@@ -70,6 +73,8 @@ class FitOptions:
         if self.cameras is not None and not all(self.cameras):
             raise ClimateGSError("--cameras is names separated by commas, or all")
         parse_depth(self.depth)
+        if self.truth is not None:
+            open_street(self.truth)
         if self.ego_masks is not None and not self.ego_masks.is_dir():
             raise ClimateGSError(f"--ego-masks: there is no folder {self.ego_masks}")
 

@@ -5,18 +5,23 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
 
-from adapters.street.truth import TrueView
+from adapters.street.truth import StreetTruth, TrueView, open_truth
+from adapters.uri import parse_uri
 from augment.cameras import Camera
+from augment.errors import AdapterError
 from augment.geometry import rigid
 from augment.metrics.image import DepthErrors, depth_errors
+from augment.reconstruct.view import ViewSource
 from augment.scene import Scene
 from augment.semantics import SemanticClass
 from tools.fit_scores import RenderedView, render_recorded
+
+MOST_VIEWS = 24
 
 
 class Truth(Protocol):
@@ -72,6 +77,38 @@ def true_depth_errors(scene: Scene, truth: Truth, cameras: Sequence[Camera]) -> 
         sky_covered=_part(surface[is_sky]),
         sky_alpha=_part(alpha[is_sky]),
     )
+
+
+def truth_facts(uri: str, scene: Scene, source: ViewSource) -> dict[str, Any]:
+    """For reports: a fitted scene's depth against the street it was recorded from, JSON-able.
+
+    uri: that street, procedural:street?...; at most MOST_VIEWS held-out views (training views
+    where none is held out) at their recorded cameras.
+
+    Raises:
+        AdapterError: the URI is no procedural street.
+    """
+    truth = open_street(uri)
+    keys = source.test or source.train
+    chosen = keys[:: max(1, -(-len(keys) // MOST_VIEWS))]
+    errors = true_depth_errors(scene, truth, [source.camera(key) for key in chosen])
+    facts = dataclasses.asdict(errors)
+    return {"street": uri, **facts}
+
+
+def open_street(uri: str) -> StreetTruth:
+    """The exact street of a URI.
+
+    Raises:
+        AdapterError: the URI names something else, or an option that streets do not have.
+    """
+    scheme, path, query = parse_uri(uri)
+    if scheme != "procedural" or path != "street":
+        raise AdapterError(
+            f"--truth {uri!r}: exact depth is known of procedural streets alone, such as "
+            f"procedural:street?seed=3, with the options that the recording was rendered with"
+        )
+    return open_truth(query)
 
 
 @dataclass(frozen=True, eq=False)
