@@ -54,6 +54,7 @@ class DensifyConfig:
     max_splats: none are added beyond. every: steps between two rounds. start, stop: parts of the
     run. prune_opacity: fainter splats are removed (absgrad) or moved (mcmc). split: where absgrad's
     children of large splats go, "sampled" within the parent or side by side on its "long_axis".
+    noise: 1/m, how far mcmc shakes faint splats at every step, decaying as the steps of means do.
     """
 
     method: str = "absgrad"
@@ -63,7 +64,7 @@ class DensifyConfig:
     stop: float = 0.6
     prune_opacity: float = 0.02
     grow_fraction: float = 0.05
-    noise: float = 0.0
+    noise: float = 50.0
     split: str = "long_axis"
 
 

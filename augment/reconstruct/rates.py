@@ -23,7 +23,7 @@ def splat_rates(config: FitConfig, step: int, camera: Camera, extent_m: float) -
     done = min(1.0, step / max(config.steps, 1))
     late = rates.late**done
     values = np.zeros(kernels.RATES, np.float32)
-    values[G_MEAN : G_MEAN + 3] = rates.means ** (1 - done) * rates.means_end**done
+    values[G_MEAN : G_MEAN + 3] = decayed(rates.means, rates.means_end, done)
     values[G_QUAT : G_QUAT + 4] = rates.quats * late
     values[G_SCALE : G_SCALE + 3] = rates.scales * late
     values[G_OPACITY] = -rates.opacities * late
@@ -36,3 +36,8 @@ def splat_rates(config: FitConfig, step: int, camera: Camera, extent_m: float) -
     side = max(camera.width, camera.height)
     values[kernels.R_ABS_UNIT], values[kernels.R_RADIUS_UNIT] = 0.5 * side, 1 / side
     return values
+
+
+def decayed(start: float, end: float, done: float) -> float:
+    """From start to end exponentially, done being the part of the run; 0 where either is 0."""
+    return start ** (1 - done) * end**done if start and end else 0.0

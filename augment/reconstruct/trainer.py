@@ -23,19 +23,19 @@ from augment.cameras import Camera, Frame
 from augment.reconstruct.adam_kernels import update_splats
 from augment.reconstruct.config import FitConfig
 from augment.reconstruct.dense_adam import ColorAdam, DenseAdam
-from augment.reconstruct.densify import densify, densify_due
+from augment.reconstruct.densify import add_noise, densify, densify_due
 from augment.reconstruct.forces import part_forces
 from augment.reconstruct.inputs import splat_inputs
 from augment.reconstruct.loss import ViewLoss, view_loss
 from augment.reconstruct.loss_buffers import LossScratch
 from augment.reconstruct.poses import ActorPoses, CameraPoses
-from augment.reconstruct.rates import CORRECTIONS, splat_rates
+from augment.reconstruct.rates import CORRECTIONS, decayed, splat_rates
 from augment.reconstruct.splats import Splats
 from augment.reconstruct.view import RecordedView, ViewKey, ViewSource
 from augment.render import cpu_backward
 from augment.render.constants import RasterSettings
 from augment.render.cpu_inputs import Inputs, part_poses
-from augment.render.cpu_layout import M_FUNCTIONS
+from augment.render.cpu_layout import BLOCK, M_FUNCTIONS
 from augment.render.cpu_scratch import Scratch
 from augment.render.threads import kernel_threads
 from augment.rng import rng_for
@@ -108,6 +108,8 @@ class Trainer:
             self._update(parts, tape.inputs, grads, view.camera, loss)
         self.step += 1
         with _timed(stages, "densify"):
+            if self.config.densify.method == "mcmc" and self.config.densify.noise > 0:
+                self._shake(tape.inputs, grads)
             self._densify()
         return StepRecord(
             step=self.step,
@@ -215,6 +217,11 @@ class Trainer:
         )
 
     @property
+    def _done(self) -> float:
+        """The part of the run that lies behind."""
+        return min(1.0, self.step / max(self.config.steps, 1))
+
+    @property
     def _functions(self) -> int:
         """SH functions that are learnt by now."""
         degree = min(self.config.sh_degree, self.step // max(self.config.sh_every, 1))
@@ -241,7 +248,7 @@ class Trainer:
         loss: ViewLoss,
     ) -> None:
         splats, rates = self.splats, self.config.rates
-        done = min(1.0, self.step / max(self.config.steps, 1))
+        done = self._done
         forces = part_forces(inputs, grads) if self.config.pose_refinement else None
         with kernel_threads():
             update_splats(
@@ -264,7 +271,7 @@ class Trainer:
                 splats.grads.reshape(-1),
             )
         if loss.d_sky is not None:
-            rate = rates.sky * (rates.sky_end / rates.sky) ** done if rates.sky else 0.0
+            rate = decayed(rates.sky, rates.sky_end, done)
             self._sky_adam.update(loss.d_sky.texels, loss.d_sky.grads, rate)
         if self.config.exposure:
             color_map = self.color_maps[camera.name]
@@ -289,6 +296,23 @@ class Trainer:
                 rate_px=rates.cameras * late,
                 pull=self.config.pose_pull,
             )
+
+    def _shake(self, inputs: Inputs, grads: cpu_backward.SplatGradients) -> None:
+        """Noise on the means of faint splats that the view shows."""
+        config = self.config
+        firsts = inputs.first_ids[inputs.blocks[:, 0]]
+        rows = [
+            first + grads.ids[block * BLOCK : block * BLOCK + count].astype(np.int64)
+            for block, (first, count) in enumerate(zip(firsts, grads.counts, strict=True))
+            if count > 0
+        ]
+        if not rows:
+            return
+        rng = rng_for(seed=config.seed, scene=self._scene.name, effect="fit.noise", frame=self.step)
+        rates = config.rates
+        decay = decayed(rates.means, rates.means_end, self._done) / (rates.means or 1.0)
+        noise = config.densify.noise * decay
+        add_noise(self.splats, np.concatenate(rows), noise, rng)
 
     def _densify(self) -> None:
         config = self.config

@@ -354,6 +354,28 @@ def test_a_saved_state_continues_to_the_same_bits(recorded, stop):
         assert np.array_equal(array, kept[name]), f"{name} is shared with the trainer"
 
 
+def test_moved_and_shaken_splats_learn_and_continue_to_the_same_bits(recorded):
+    """Relocation instead of splitting, with its noise on faint splats."""
+    growth = dataclasses.replace(QUICK.densify, method="mcmc", prune_opacity=0.05)
+    config = dataclasses.replace(QUICK, densify=growth)
+    whole = Trainer(start(), recorded, config)
+    first = run(whole, 45)
+    last = run(whole, QUICK.steps - 45)
+    epoch = len(recorded.train)
+    assert np.mean([r.loss for r in last[-epoch:]]) < 0.5 * np.mean([r.loss for r in first[:epoch]])
+    assert len(whole.splats) > first[0].splats
+    still = dataclasses.replace(config, densify=dataclasses.replace(growth, noise=0.0))
+    calm = Trainer(start(), recorded, still)
+    run(calm, 45)
+    shaken, resumed = (Trainer(start(), recorded, config) for _ in range(2))
+    run(shaken, 30)
+    resumed.load_state(*shaken.state())
+    for trainer in (shaken, resumed):
+        run(trainer, 15)
+    assert_same_state(resumed, shaken)
+    assert not np.array_equal(calm.splats.means, shaken.splats.means)
+
+
 def test_a_state_replaces_what_a_trainer_did_before(recorded):
     one, other = (Trainer(start(), recorded, QUICK) for _ in range(2))
     run(one, 25)
