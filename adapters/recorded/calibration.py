@@ -30,6 +30,7 @@ _MOST_POINTS = 60_000
 _FEWEST_POINTS = 3000
 _CONTRAST = 0.1  # how much the best shift must stand out
 _AGREE_PX = 0.75  # between the measurement in every other frame and the rest
+_ALONE_PX = 2.0  # a single frame says less, and less exactly
 _INTENSITY, _SENSOR = ("intensity", "i"), ("sensor", "d")
 
 
@@ -90,6 +91,9 @@ def measure_offset(
     right, down = _peak(score)
     halves = [_peak(shared_information(half, reach)) for half in (seen[::2], seen[1::2]) if half]
     apart = max(math.hypot(right - h[0], down - h[1]) for h in halves)
+    # Repeated shapes can look shifted to all frames together, but not to most of them one by one.
+    single = [_peak(shared_information([points], reach)) for points in seen]
+    near = [math.hypot(right - p[0], down - p[1]) < _ALONE_PX for p in single]
     contrast = float(score.max() / max(float(np.median(score)), 1e-12) - 1)
     inside = max(abs(right), abs(down)) < reach - 0.5
     return CameraOffset(
@@ -99,7 +103,10 @@ def measure_offset(
         width_px=camera.width,
         angle_deg=math.degrees(math.hypot(right / camera.fx, down / camera.fy)),
         # At the border of the range the shift is at least as large as that.
-        is_sure=contrast > _CONTRAST and len(halves) == 2 and (apart < _AGREE_PX or not inside),
+        is_sure=contrast > _CONTRAST
+        and len(halves) == 2
+        and (apart < _AGREE_PX or not inside)
+        and 2 * sum(near) >= len(near),
     )
 
 

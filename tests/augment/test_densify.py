@@ -200,7 +200,7 @@ def test_all_others_stay_as_they_are() -> None:
 
 def test_large_ones_are_split_within_their_own_shape() -> None:
     splats = pulled(splats_of(*PARTS), [7], radius=0.2)
-    grown, report = round_of(splats, grow_fraction=1.0)
+    grown, report = round_of(splats, grow_fraction=1.0, split="sampled")
     assert_sound(grown, report, splats)
     assert (report.cloned, report.split) == (0, 1)
     pair = grown.means[7:9]
@@ -219,7 +219,7 @@ def test_splits_keep_the_parents_covariance_on_average() -> None:
     splats.scales[:] = (0.5, 0.1, 0.02)
     splats.means[:] = 0
     splats.grads[:] = (1, 1, 0.1)
-    grown, report = round_of(splats, grow_fraction=1.0)
+    grown, report = round_of(splats, grow_fraction=1.0, split="sampled")
     assert report.split == count
     axes = rotate(np.repeat(splats.quats[:1], 3, 0), np.eye(3, dtype=np.float32))
     spread = ((grown.means @ axes.T) ** 2).mean(0) + grown.scales[0] ** 2
@@ -533,7 +533,7 @@ def test_the_same_seed_gives_the_same_bits(method: str, expected: list[float]) -
     def grown(seed: int) -> Splats:
         splats = pulled(splats_of(*PARTS), [3, 35, 44], radius=0.2)
         splats.opacities[10:20] = 0.01
-        return round_of(splats, seed=seed, method=method, grow_fraction=0.1)[0]
+        return round_of(splats, seed=seed, method=method, grow_fraction=0.1, split="sampled")[0]
 
     one, two, other = grown(1), grown(1), grown(2)
     assert same(one, two)

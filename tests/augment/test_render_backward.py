@@ -189,7 +189,11 @@ def test_every_sh_degree(degree, limit):
     assert not found[0]["sh"][:, used:].any()  # bands that were not evaluated
 
 
-@pytest.mark.parametrize("buffers", [{RGB}, {ALPHA}, {EXPECTED_DEPTH}, {RGB, ALPHA}], ids=str)
+@pytest.mark.parametrize(
+    "buffers",
+    [{RGB}, {ALPHA}, {EXPECTED_DEPTH}, {RGB, ALPHA}],
+    ids=lambda names: "+".join(sorted(names)),
+)
 def test_every_buffer_alone(buffers):
     found = assert_gradients_match(
         posed(random_gaussians(150, size=0.4)), camera_ahead(21, 17, 20.0), buffers=buffers

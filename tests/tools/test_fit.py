@@ -241,7 +241,7 @@ def test_a_scene_that_was_deleted_is_written_again_from_the_checkpoint(options):
         ({"scale": 0.5}, "scale was 0.25, now 0.5"),
         ({"seed": 3}, "seed was 0, now 3"),
         ({"cameras": ("front",)}, "cameras was all, now front"),
-        ({"depth_weight": 0.0}, r"loss.depth was 1.0, now 0.0"),
+        ({"depth_weight": 0.0}, r"loss.depth was 2.0, now 0.0"),
         ({"densify": "mcmc"}, "densify was absgrad, now mcmc"),
         ({"steps": 200}, r"its length was --steps 120 \(120 steps\), now --steps 200"),
         ({"steps": None}, r"now --minutes 10"),
