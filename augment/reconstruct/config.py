@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 class LossWeights:
     """Loss of one view = (1 - d_ssim) L1 + d_ssim (1 - SSIM) / 2 (mean over weighted pixels)
     + depth * mean |1/ED - 1/z| over the pixels with a depth prior (1/m)
+    + surface * mean (1 - alpha) over the same pixels, so that ground and walls have no holes
     + sky * mean alpha over all pixels marked as sky (relative to the image's pixel count).
 
     depth 0 switches depth regularisation off. opacity_decay and scale_decay pull the opacity and
@@ -17,6 +18,7 @@ class LossWeights:
 
     d_ssim: float = 0.2
     depth: float = 2.0
+    surface: float = 0.05
     sky: float = 0.05
     opacity_decay: float = 0.0
     scale_decay: float = 0.0

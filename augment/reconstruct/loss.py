@@ -1,7 +1,8 @@
 """The loss of one view, from the rasteriser's buffers to their gradients.
 
     picture = color_map(rgb + (1 - alpha) sky(direction))
-    total = (1 - d_ssim) L1 + d_ssim (1 - SSIM) / 2 + depth |1/ED - 1/z| + sky alpha
+    total = (1 - d_ssim) L1 + d_ssim (1 - SSIM) / 2 + depth |1/ED - 1/z| + surface (1 - alpha)
+            + sky alpha
 
 each a weighted mean as `LossWeights` says. `loss_reference` is the torch definition of the same.
 SSIM is that of 3D Gaussian splatting (Kerbl et al. 2023): windows of 11 x 11 pixels, a Gaussian of
@@ -40,7 +41,8 @@ class ViewLoss:
 
     total: the weighted sum, what d_* are the derivatives of. l1: mean |picture - recorded| over
     weighted pixels; ssim: mean SSIM over them, 1 where there are none; depth: mean |1/ED - 1/z| in
-    1/m; sky: mean over the image of alpha in the sky. d_rgb [H, W, 3], d_alpha, d_expected_depth
+    1/m; sky: mean over the image of alpha in the sky; surface: mean of 1 - alpha where there is a
+    depth prior. d_rgb [H, W, 3], d_alpha, d_expected_depth
     [H, W]: float32. d_color_map: float64 [3, 4]. d_sky: None where no texel was seen.
 
     A view whose weights are all 0 has l1 0, ssim 1, and gradients only from depth and sky.
@@ -56,6 +58,7 @@ class ViewLoss:
     d_expected_depth: np.ndarray
     d_color_map: np.ndarray
     d_sky: SkyGradient | None
+    surface: float = 0.0
 
 
 def picture(
@@ -119,9 +122,10 @@ def view_loss(
         _sample_sky(alpha, camera, sky_faces, np.float32(LEAST_SKY), buffers)
         l1, ssim, sky, d_color_map = _compare(rgb, alpha, view, color_map, weights, buffers)
         depth = _compare_depth(expected_depth, alpha, view, weights, buffers)
+        surface = _compare_surface(alpha, view, weights, buffers)
         d_sky = scratch.sky(sky_faces.shape[1]).gradient(buffers.d_rgb, alpha, buffers)
     total = (1 - weights.d_ssim) * l1 + weights.d_ssim * (1 - ssim) / 2
-    total += weights.depth * depth + weights.sky * sky
+    total += weights.depth * depth + weights.surface * surface + weights.sky * sky
     return ViewLoss(
         total=total,
         l1=l1,
@@ -133,6 +137,7 @@ def view_loss(
         d_expected_depth=buffers.d_expected_depth,
         d_color_map=d_color_map,
         d_sky=d_sky,
+        surface=surface,
     )
 
 
@@ -213,6 +218,20 @@ def _compare(
     )
     d_color_map = buffers.map_sums.sum(axis=(0, 3), dtype=np.float64)
     return error_sum * per_weight, ssim, covered / pixels, d_color_map
+
+
+def _compare_surface(
+    alpha: np.ndarray, view: RecordedView, weights: LossWeights, buffers: ImageBuffers
+) -> float:
+    """Mean 1 - alpha where a depth prior says that something is; its gradient to the buffers."""
+    weight_sum = float(view.depth_weight.sum(dtype=np.float64))
+    if weight_sum <= 0 or weights.surface == 0:
+        return 0.0
+    pixels = view.depth_pixels  # each once
+    share = view.depth_weight * np.float32(weights.surface / weight_sum)
+    buffers.d_alpha.reshape(-1)[pixels] -= share
+    through = (1 - alpha.reshape(-1)[pixels]) * view.depth_weight
+    return float(through.sum(dtype=np.float64)) / weight_sum
 
 
 def _compare_depth(

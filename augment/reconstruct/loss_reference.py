@@ -90,7 +90,17 @@ def reference_loss(
     sky = (alpha * torch.from_numpy(view.sky)).sum() / alpha.numel()
     total = (1 - weights.d_ssim) * l1 + weights.d_ssim * (1 - ssim) / 2
     total = total + weights.depth * depth + weights.sky * sky
+    total = total + weights.surface * _transparency(alpha, view)
     return ReferenceLoss(total=total, l1=l1, ssim=ssim, depth=depth, sky=sky)
+
+
+def _transparency(alpha: Tensor, view: RecordedView) -> Tensor:
+    """Weighted mean of 1 - alpha over the depth priors; 0 without any."""
+    weight = torch.from_numpy(view.depth_weight).to(alpha.dtype)
+    if not bool(weight.sum() > 0):
+        return alpha.new_zeros(())
+    seen = alpha.reshape(-1)[torch.from_numpy(view.depth_pixels).long()]
+    return ((1 - seen) * weight).sum() / weight.sum()
 
 
 def _depth_error(expected_depth: Tensor, alpha: Tensor, view: RecordedView) -> Tensor:

@@ -44,6 +44,8 @@ from augment.sky import CubemapSky, directions_of_cubemap
 
 _SKY_SIZE = 512  # texels along a cube edge where the starting sky is no cube map
 _IDENTITY = np.eye(3, 4, dtype=np.float32)
+# Sines of elevations: what lies lower is no sky, also where the road falls; the horizon's colour.
+_BELOW, _HAZE = -0.05, 0.15
 
 
 @dataclass(frozen=True)
@@ -73,6 +75,7 @@ class Trainer:
         parts = [scene.background, *(actor.gaussians for actor in scene.actors)]
         self.splats = Splats.of(parts, config.sh_degree)
         self.sky_faces = _sky_faces(scene)
+        self._is_sky = _paint_below(self.sky_faces)
         self._sky_adam = ColorAdam(self.sky_faces.reshape(-1, 3))
         names = sorted({key.camera for key in (*source.train, *source.test)})
         self.color_maps = {name: _IDENTITY.copy() for name in names}
@@ -272,7 +275,8 @@ class Trainer:
             )
         if loss.d_sky is not None:
             rate = decayed(rates.sky, rates.sky_end, done)
-            self._sky_adam.update(loss.d_sky.texels, loss.d_sky.grads, rate)
+            above = self._is_sky[loss.d_sky.texels]
+            self._sky_adam.update(loss.d_sky.texels[above], loss.d_sky.grads[above], rate)
         if self.config.exposure:
             color_map = self.color_maps[camera.name]
             pull = self.config.exposure_pull * (color_map - _IDENTITY)
@@ -352,6 +356,20 @@ def _sky_faces(scene: Scene) -> np.ndarray:
         return scene.sky.faces.float().numpy().copy()
     directions = directions_of_cubemap(_SKY_SIZE).float()
     return np.ascontiguousarray(scene.sky.sample(directions).float().numpy())
+
+
+def _paint_below(faces: np.ndarray) -> np.ndarray:
+    """Which texels are sky, bool [6 R R]; the others, below the horizon, get its mean colour.
+
+    They are not learnt: a hole in the road must look wrong, not like road infinitely far away,
+    which weather would uncover.
+    """
+    flat = faces.reshape(-1, 3)
+    z = directions_of_cubemap(faces.shape[1]).reshape(-1, 3)
+    z = torch.nn.functional.normalize(z, dim=1)[:, 2].numpy()
+    horizon = (z >= 0) & (z < _HAZE)
+    flat[z < _BELOW] = flat[horizon if horizon.any() else z >= 0].mean(0, dtype=np.float64)
+    return z >= _BELOW
 
 
 def _extent(source: ViewSource) -> float:

@@ -174,6 +174,23 @@ def test_a_perfect_picture_has_ssim_1_and_no_gradient():
     assert np.abs(loss.d_rgb).max() <= 1.01 * (1 / (3 * view.weight.sum()))
 
 
+def test_surfaces_are_pulled_to_be_opaque():
+    arguments = case(24, 33, seed=6)
+    view = arguments["view"]
+    with_it, without = (
+        view_loss(**{**arguments, "weights": LossWeights(surface=weight)}) for weight in (0.3, 0.0)
+    )
+    total = view.depth_weight.sum()
+    through = (1 - arguments["alpha"].reshape(-1)[view.depth_pixels]) * view.depth_weight
+    assert with_it.surface == pytest.approx(through.sum() / total)
+    assert with_it.total - without.total == pytest.approx(0.3 * with_it.surface)
+    change = (with_it.d_alpha - without.d_alpha).reshape(-1)
+    expected = np.zeros_like(change)
+    expected[view.depth_pixels] = -0.3 * view.depth_weight / total
+    # differences of float32 sums of about 1e-3
+    np.testing.assert_allclose(change, expected, atol=1e-8)
+
+
 def test_pixels_without_weight_neither_count_nor_disturb_nor_learn():
     arguments = case(24, 33, seed=6)
     view = arguments["view"]
@@ -183,7 +200,10 @@ def test_pixels_without_weight_neither_count_nor_disturb_nor_learn():
     assert before.total == after.total
     np.testing.assert_array_equal(before.d_rgb, after.d_rgb)
     assert (before.d_rgb[view.weight == 0] == 0).all()
-    assert (before.d_alpha[(view.weight == 0) & ~view.sky] == 0).all()
+    has_prior = np.zeros(view.weight.size, np.bool_)
+    has_prior[view.depth_pixels] = True
+    blank = (view.weight == 0) & ~view.sky & ~has_prior.reshape(view.weight.shape)
+    assert (before.d_alpha[blank] == 0).all()
 
     # A picture that is right wherever it counts is perfect, however wrong it is elsewhere.
     rgb = np.where((view.weight > 0)[..., None], view.rgb / np.float32(255), np.float32(0.5))
