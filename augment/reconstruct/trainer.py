@@ -30,6 +30,7 @@ from augment.reconstruct.loss import ViewLoss, view_loss
 from augment.reconstruct.loss_buffers import LossScratch
 from augment.reconstruct.poses import ActorPoses, CameraPoses
 from augment.reconstruct.rates import CORRECTIONS, decayed, splat_rates
+from augment.reconstruct.sky import paint_below_horizon, starting_sky
 from augment.reconstruct.splats import Splats
 from augment.reconstruct.view import RecordedView, ViewKey, ViewSource
 from augment.render import cpu_backward
@@ -40,12 +41,9 @@ from augment.render.cpu_scratch import Scratch
 from augment.render.threads import kernel_threads
 from augment.rng import rng_for
 from augment.scene import Scene
-from augment.sky import CubemapSky, directions_of_cubemap
+from augment.sky import CubemapSky
 
-_SKY_SIZE = 512  # texels along a cube edge where the starting sky is no cube map
 _IDENTITY = np.eye(3, 4, dtype=np.float32)
-# Sines of elevations: what lies lower is no sky, also where the road falls; the horizon's colour.
-_BELOW, _HAZE = -0.05, 0.15
 
 
 @dataclass(frozen=True)
@@ -74,8 +72,8 @@ class Trainer:
         self.step = 0
         parts = [scene.background, *(actor.gaussians for actor in scene.actors)]
         self.splats = Splats.of(parts, config.sh_degree)
-        self.sky_faces = _sky_faces(scene)
-        self._is_sky = _paint_below(self.sky_faces)
+        self.sky_faces = starting_sky(scene.sky)
+        self._is_sky = paint_below_horizon(self.sky_faces)
         self._sky_adam = ColorAdam(self.sky_faces.reshape(-1, 3))
         names = sorted({key.camera for key in (*source.train, *source.test)})
         self.color_maps = {name: _IDENTITY.copy() for name in names}
@@ -348,28 +346,6 @@ def _timed(stages: dict[str, float], name: str) -> Iterator[None]:
     start = time.perf_counter()
     yield
     stages[name] = time.perf_counter() - start
-
-
-def _sky_faces(scene: Scene) -> np.ndarray:
-    """float32 [6, R, R, 3], the trainer's own copy."""
-    if isinstance(scene.sky, CubemapSky):
-        return scene.sky.faces.float().numpy().copy()
-    directions = directions_of_cubemap(_SKY_SIZE).float()
-    return np.ascontiguousarray(scene.sky.sample(directions).float().numpy())
-
-
-def _paint_below(faces: np.ndarray) -> np.ndarray:
-    """Which texels are sky, bool [6 R R]; the others, below the horizon, get its mean colour.
-
-    They are not learnt: a hole in the road must look wrong, not like road infinitely far away,
-    which weather would uncover.
-    """
-    flat = faces.reshape(-1, 3)
-    z = directions_of_cubemap(faces.shape[1]).reshape(-1, 3)
-    z = torch.nn.functional.normalize(z, dim=1)[:, 2].numpy()
-    horizon = (z >= 0) & (z < _HAZE)
-    flat[z < _BELOW] = flat[horizon if horizon.any() else z >= 0].mean(0, dtype=np.float64)
-    return z >= _BELOW
 
 
 def _extent(source: ViewSource) -> float:
