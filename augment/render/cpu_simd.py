@@ -224,21 +224,6 @@ def absolute(typingctx, a):
 
 
 @intrinsic
-def total(typingctx, a):
-    """The sum of the eight lanes, always in the same order: halves, quarters, the last two."""
-
-    def codegen(context, builder, sig, args):
-        value = args[0]
-        for width in (4, 2, 1):
-            lanes = [lane + width if lane < width else lane for lane in range(LANES)]
-            other = builder.shuffle_vector(value, value, ir.Constant(_I8, lanes))
-            value = builder.fadd(value, other)
-        return builder.extract_element(value, _INT(0))
-
-    return types.float32(float8), codegen
-
-
-@intrinsic
 def totals(typingctx, a, b, c, d, e, f, g, h):
     """The sums of the eight lanes of a to h, as lanes 0 to 7; always added in the same order."""
 
