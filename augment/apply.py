@@ -37,11 +37,25 @@ class WeatheredBuffers:
 
 
 @dataclass(frozen=True, eq=False)
+class FloodedView:
+    """What a view's labels under water are measured from.
+
+    level_z_m: the water's surface, scene world. scene_depth_m: float32 [H, W], z of the scene's own
+    surface, seen through the water where there is some; 0 = none.
+    """
+
+    level_z_m: float
+    scene_depth_m: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
 class WeatheredView:
     """One finished view as it is written to files.
 
     rgb: uint8 [H, W, 3]. depth_m: float32 [H, W], 0 = none. semantic: uint8 [H, W], SemanticClass.
     instance: uint16 [H, W], 0 = background or sky, else 1 + the actor's index in the scene.
+    water: uint8 [H, W], 255 where a ray meets water first, else 0; None where the recipe has no
+    flood. flood: None where no water is in view.
     """
 
     camera: Camera
@@ -49,6 +63,8 @@ class WeatheredView:
     depth_m: np.ndarray | None
     semantic: np.ndarray | None
     instance: np.ndarray | None
+    water: np.ndarray | None = None
+    flood: FloodedView | None = None
 
 
 def render_view(

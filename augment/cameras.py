@@ -93,6 +93,14 @@ class Camera:
             cy=self.cy * sy,
         )
 
+    def cropped(self, left: int, top: int, width: int, height: int) -> Camera:
+        """The view through a window of the image, which may reach beyond its borders; pixels keep
+        their rays.
+        """
+        return dataclasses.replace(
+            self, width=width, height=height, cx=self.cx - left, cy=self.cy - top
+        )
+
     def ray_directions(self, dtype: torch.dtype = torch.float32) -> Float[Tensor, "H W 3"]:
         """World directions through the pixel centres with unit z in the camera (not unit length).
 

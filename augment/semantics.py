@@ -21,3 +21,4 @@ class SemanticClass(IntEnum):
     PEDESTRIAN = 12
     OTHER = 13
     SKY = 14
+    WATER = 15

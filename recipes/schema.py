@@ -14,9 +14,11 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, Strict, model_validator
 from pydantic.config import JsonDict
 
+from recipes.flood import Flood
+
 VERSION = 1
 KOSCHMIEDER = 3.912  # -ln(0.02): visibility is where contrast falls to 2 %
-_LATER_FIELDS = (("render", "exposure"),)
+_LATER_FIELDS = (("render", "exposure"), ("weather", "flood"), ("output", "surface"))
 MAX_EXTINCTION_PER_M = 100.0  # nothing is seen through 10 cm of it
 
 Number = Annotated[float, Strict()]
@@ -108,6 +110,7 @@ class Weather(_Closed):
     """The effects of a recipe; null where one is absent."""
 
     smog: Smog | None = None
+    flood: Flood | None = None
 
 
 class Render(_Closed):
@@ -143,6 +146,11 @@ class Output(_Closed):
     jpeg_quality: Whole = Field(default=92, ge=1, le=100, description="Quality of jpg images.")
     depth: Literal["median", "expected", "none"] = Field(
         default="median", description="Depth estimator written as 16-bit PNG, metres x 256."
+    )
+    surface: Literal["scene", "first"] = Field(
+        default="scene",
+        description="What depth, semantic and instance images show where there is water: the "
+        "scene's surface under it, or the water itself, the first surface a ray meets.",
     )
     semantic: Flag = Field(default=False, description="Write the class of the heaviest splat.")
     instance: Flag = Field(
