@@ -27,6 +27,29 @@ $(STAMP): pyproject.toml constraints.txt | check-system
 check-system:
 	@command -v $(PYTHON) >/dev/null || { \
 	  echo "$(PYTHON) was not found: install Python 3.11, or run make PYTHON=/path/to/python3.11"; exit 1; }
+	@$(PYTHON) -c "$$MISSING_LIBRARIES"
+
+# open3d, which finds the road where nothing else says where it is, is loaded only then. Without
+# these libraries the rest works, so they are asked for and not insisted on.
+define MISSING_LIBRARIES
+import ctypes, sys
+needed = {
+    "libusb-1.0.so.0": "libusb-1.0-0", "libGL.so.1": "libgl1",
+    "libX11.so.6": "libx11-6", "libgomp.so.1": "libgomp1",
+}
+missing = []
+for name, package in needed.items() if sys.platform == "linux" else ():
+    try:
+        ctypes.CDLL(name)
+    except OSError:
+        missing.append(package)
+if missing:
+    print(
+        "open3d cannot be loaded without", ", ".join(missing), "(Debian's names), so that the road "
+        "is looked for without it. Install with: apt-get install", *missing, file=sys.stderr,
+    )
+endef
+export MISSING_LIBRARIES
 
 demo: setup
 	$(BIN)/climategs demo
