@@ -10,11 +10,13 @@ _HEADER = "| Field | Allowed | Default | Meaning |\n| --- | --- | --- | --- |\n"
 
 def field_table() -> str:
     """A Markdown table of every key of a recipe file, one row each, sections in their order."""
-    rows = [
-        _row(spec)
-        for section in ROOT.walk()
-        for spec in (*section.fields.values(), *section.extra.values())
-    ]
+    rows = []
+    for section in ROOT.walk():
+        if section.items is not None:
+            path = section.path.removesuffix("[]")
+            allowed = f"a list of up to {section.items.most} mappings, or null"
+            rows.append(f"| `{path}` | {allowed} | `null` | {section.items.description} |\n")
+        rows += [_row(spec) for spec in (*section.fields.values(), *section.extra.values())]
     return _HEADER + "".join(rows)
 
 
@@ -25,10 +27,12 @@ def _row(spec: FieldSpec) -> str:
     default = "" if spec.default is None else f"`{words(spec.default)}`"
     if spec.nullable:
         default = "`null`"
+    if spec.required:
+        default = "required"
     return f"| `{spec.path}` | {allowed} | {default} | {spec.description} |\n"
 
 
 def _ranges(spec: FieldSpec) -> str:
     if spec.kind in (Kind.NUMBER, Kind.WHOLE):
         return f"ranges: {', '.join(RANGE_KINDS)}"
-    return "ranges: uniform, choice" if spec.kind is Kind.COLOUR else "ranges: choice"
+    return "ranges: choice" if spec.channel is None else "ranges: uniform, choice"

@@ -5,20 +5,22 @@ from __future__ import annotations
 import yaml
 
 from recipes.schema import Recipe
+from recipes.values import is_number
 
 
 class _Dumper(yaml.SafeDumper):
-    """Colours on one line; no anchors."""
+    """Colours and rates on one line; no anchors."""
 
     def ignore_aliases(self, data: object) -> bool:
         return True
 
 
-def _on_one_line(dumper: _Dumper, data: tuple[float, ...]) -> yaml.Node:
-    return dumper.represent_sequence("tag:yaml.org,2002:seq", data, flow_style=True)
+def _sequence(dumper: _Dumper, data: tuple[object, ...]) -> yaml.Node:
+    flat = all(map(is_number, data))
+    return dumper.represent_sequence("tag:yaml.org,2002:seq", data, flow_style=flat)
 
 
-_Dumper.add_representer(tuple, _on_one_line)
+_Dumper.add_representer(tuple, _sequence)
 
 
 def dump_recipe(recipe: Recipe) -> str:

@@ -16,10 +16,17 @@ import annotated_types
 from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 from pydantic.fields import FieldInfo
 
-from recipes.schema import VERSION, Colour, Number, Recipe, Unit, Whole
+from recipes.schema import VERSION, Recipe
+from recipes.types import MOST_PER_M, Colour, Number, PerMetre, Rates, Unit, Whole
 from recipes.values import is_number
 
-UNITS = {"_per_m": "1/metre", "_m": "metres"}  # the end of a field's name says its unit
+# the end of a field's name says its unit
+UNITS = {
+    "_per_m": "1/metre",
+    "_m": "metres",
+    "_deg": "degrees",
+    "_ntu": "nephelometric turbidity units",
+}
 
 _LIMITS = {
     annotated_types.Gt: (">", "gt"),
@@ -37,6 +44,7 @@ class Kind(enum.Enum):
     FLAG = "true or false"
     WORD = "one of"
     COLOUR = "a colour"
+    RATES = "three rates"
     TEXT = "text"
 
 
@@ -44,8 +52,10 @@ class Kind(enum.Enum):
 class FieldSpec:
     """One field that holds a value.
 
-    limits: pairs such as (">", 0.0). words: what a WORD may be. rangeable: a range may stand here.
-    annotation: what pydantic checks a value against.
+    path: as in a file, with [] for the items of a list. limits: pairs such as (">", 0.0). words:
+    what a WORD may be. rangeable: a range may stand here. required: there is no default.
+    annotation: what pydantic checks a value against. channel: what each of a COLOUR's or RATES'
+    three numbers is; None for other kinds.
     """
 
     path: str
@@ -57,6 +67,8 @@ class FieldSpec:
     limits: tuple[tuple[str, float], ...] = ()
     words: tuple[str, ...] = ()
     rangeable: bool = True
+    required: bool = False
+    channel: FieldSpec | None = None
 
     @property
     def name(self) -> str:
@@ -88,13 +100,14 @@ class FieldSpec:
         """What may stand here. `value`: the one refused; what is right about it goes unsaid."""
         if self.kind is Kind.WORD:
             text = f"one of {', '.join(self.words)}"
-        elif self.kind is Kind.COLOUR:
-            text = "[red, green, blue], each a number >= 0 and <= 1"
+        elif self.channel is not None:
+            text = f"[red, green, blue], each {self.channel.allowed()}"
         elif self.kind is Kind.TEXT:
             text = "up to 64 letters, digits, '.', '_' or '-', the first a letter or a digit"
         else:
             text = self._allowed_number(value)
-        text += f" ({self.unit})" if self.unit else ""
+        if self.unit and self.channel is None:
+            text += f" ({self.unit})"
         return text + (", or null" if self.nullable and not is_number(value) else "")
 
     def _allowed_number(self, value: object) -> str:
@@ -110,20 +123,28 @@ class FieldSpec:
 
 
 @dataclass(frozen=True)
+class ListSpec:
+    """A list of mappings, which may be absent. most: how many. description: of all of them."""
+
+    most: int
+    description: str
+
+
+@dataclass(frozen=True)
 class SectionSpec:
-    """A mapping of fields. effect: it may be absent, and then has a probability of being there."""
+    """A mapping of fields. effect: it may be absent, and then has a probability of being there.
+
+    items: set where not one such mapping stands but a list of them; the path then ends in [].
+    """
 
     path: str
     model: type[BaseModel]
     description: str
     effect: bool = False
+    items: ListSpec | None = None
     fields: dict[str, FieldSpec] = field(default_factory=dict)
     sections: dict[str, SectionSpec] = field(default_factory=dict)
     extra: dict[str, FieldSpec] = field(default_factory=dict)
-
-    @property
-    def name(self) -> str:
-        return self.path.rpartition(".")[2]
 
     @property
     def known(self) -> tuple[str, ...]:
@@ -148,12 +169,18 @@ def join(path: str, name: str) -> str:
     return f"{path}.{name}" if path else name
 
 
-def _section(path: str, model: type[BaseModel], *, effect: bool = False) -> SectionSpec:
-    spec = SectionSpec(path, model, (model.__doc__ or "").strip(), effect)
+def _section(
+    path: str, model: type[BaseModel], *, effect: bool = False, items: ListSpec | None = None
+) -> SectionSpec:
+    spec = SectionSpec(path, model, (model.__doc__ or "").strip(), effect, items)
     for name, info in model.model_fields.items():
         below = join(path, name)
         inner, nullable = _without_none(info.annotation)
-        if isinstance(inner, type) and issubclass(inner, BaseModel):
+        item = _item(inner)
+        if item is not None:
+            items = ListSpec(_most(info), info.description or "")
+            spec.sections[name] = _section(f"{below}[]", item, items=items)
+        elif isinstance(inner, type) and issubclass(inner, BaseModel):
             spec.sections[name] = _section(below, inner, effect=nullable)
         else:
             spec.fields[name] = _field(below, info, rangeable=bool(path))
@@ -178,17 +205,34 @@ def _field(path: str, info: FieldInfo, *, rangeable: bool) -> FieldSpec:
         for kind, (sign, attribute) in _LIMITS.items()
         if isinstance(rule, kind)
     ]
+    required = info.is_required()
     return FieldSpec(
         path=path,
         kind=_kind(inner),
         description=info.description or "",
         annotation=Annotated[info.annotation, info],
         nullable=nullable,
-        default=info.default,
+        default=None if required else info.default,
         limits=tuple(bounds),
         words=tuple(map(str, get_args(inner))) if get_origin(inner) is Literal else (),
         rangeable=rangeable,
+        required=required,
+        channel={Kind.COLOUR: CHANNEL, Kind.RATES: RATE}.get(_kind(inner)),
     )
+
+
+def _item(annotation: Any) -> type[BaseModel] | None:
+    """The model of a list's items; None for what is no list of models."""
+    arguments = get_args(annotation)
+    if get_origin(annotation) is not tuple or arguments[1:] != (...,):
+        return None
+    item: type[BaseModel] = arguments[0]
+    return item
+
+
+def _most(info: FieldInfo) -> int:
+    (most,) = (r.max_length for r in info.metadata if isinstance(r, annotated_types.MaxLen))
+    return most
 
 
 def _without_none(annotation: Any) -> tuple[Any, bool]:
@@ -206,6 +250,8 @@ def _without_none(annotation: Any) -> tuple[Any, bool]:
 def _kind(annotation: Any) -> Kind:
     if annotation == Colour:
         return Kind.COLOUR
+    if annotation == Rates:
+        return Kind.RATES
     if get_origin(annotation) is Literal:
         return Kind.WORD
     return {float: Kind.NUMBER, int: Kind.WHOLE, bool: Kind.FLAG, str: Kind.TEXT}[annotation]
@@ -217,6 +263,13 @@ CHANNEL = FieldSpec(
     description="One channel of a colour.",
     annotation=Unit,
     limits=((">=", 0.0), ("<=", 1.0)),
+)
+RATE = FieldSpec(
+    path="rate_per_m",
+    kind=Kind.NUMBER,
+    description="One channel of three rates.",
+    annotation=PerMetre,
+    limits=((">=", 0.0), ("<=", MOST_PER_M)),
 )
 ANY_NUMBER = FieldSpec("number", Kind.NUMBER, "", Annotated[Number, Field(allow_inf_nan=False)])
 VARIANTS = FieldSpec(

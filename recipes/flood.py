@@ -1,43 +1,74 @@
-"""What a recipe may say of a flood."""
+"""What a recipe may say of a flood, and how clear its water is."""
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+import math
+from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, Strict, model_validator
+from pydantic import ConfigDict, Field, model_validator
+from pydantic.config import JsonDict
 
-Number = Annotated[float, Strict()]
-Whole = Annotated[int, Strict()]
-Unit = Annotated[float, Strict(), Field(ge=0.0, le=1.0)]
-Colour = tuple[Unit, Unit, Unit]
-Rate = Annotated[float, Strict(), Field(ge=0.0, le=1e6)]
-Rates = tuple[Rate, Rate, Rate]
+from recipes.types import Closed, Colour, Number, Rates, Whole
 
 MOST_WAVES = 64
 
+# Absorption of pure water at 650, 550 and 450 nm, 1/metre (Pope and Fry 1997).
+PURE_WATER_PER_M = (0.340, 0.0565, 0.00922)
 
-class _Closed(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+# Extinction that one nephelometric turbidity unit of particles adds, 1/metre. A black disc is seen
+# as far as 4.8 / extinction (Davies-Colley and Smith 2001), in rivers about 0.2 m at 50 NTU. The
+# ratio follows the grain size: clear rivers have up to twice as much, muddy ones down to half.
+EXTINCTION_PER_M_PER_NTU = 0.5
+
+DEFAULT_TURBIDITY_NTU = 50.0  # moderately turbid, as a street's run-off is
+
+# In words of JSON Schema: the two are not both present and not null.
+_ONE_CLARITY: JsonDict = {
+    "not": {
+        "required": ["turbidity_ntu", "absorption_per_m"],
+        "properties": {
+            name: {"not": {"type": "null"}} for name in ("turbidity_ntu", "absorption_per_m")
+        },
+    }
+}
 
 
-class Wave(_Closed):
+class Wave(Closed):
     """One Gerstner wave."""
 
     direction_deg: Number = Field(
         default=0.0, ge=-360, le=360, description="Where it runs to: 0 is world +x, 90 is +y."
     )
-    amplitude_m: Number = Field(ge=0, le=100, description="Half its height.")
-    wavelength_m: Number = Field(ge=1e-3, le=1e4, description="Crest to crest.")
+    amplitude_m: Number = Field(
+        ge=0,
+        le=100,
+        description="Half its height from trough to crest; at most its wavelength / 2 pi.",
+    )
+    wavelength_m: Number = Field(ge=1e-3, le=1e4, description="From crest to crest.")
     steepness: Number = Field(
         default=0.0,
         ge=0,
         le=1,
-        description="0 is a sine, 1 the sharpest crest it can have without looping.",
+        description="0 is a sine, 1 the sharpest crest it can have without looping; "
+        "at most 1 over all waves together.",
     )
-    phase_deg: Number = Field(default=0.0, ge=-360, le=360, description="At the origin at time 0.")
+    phase_deg: Number = Field(
+        default=0.0, ge=-360, le=360, description="At the world's origin at time 0."
+    )
+
+    @model_validator(mode="after")
+    def _not_breaking(self) -> Wave:
+        highest_m = self.wavelength_m / (2 * math.pi)
+        if self.amplitude_m > highest_m:
+            raise ValueError(
+                f"amplitude_m = {self.amplitude_m:g} is too high for "
+                f"wavelength_m = {self.wavelength_m:g}: the wave would break; "
+                f"at most {_rounded_down(highest_m)} (wavelength / 2 pi)"
+            )
+        return self
 
 
-class Waves(_Closed):
+class Waves(Closed):
     """The water's surface: a preset's spectrum, drawn from a seed, or waves one by one."""
 
     preset: Literal["still", "calm", "breeze", "wind"] = Field(
@@ -47,24 +78,45 @@ class Waves(_Closed):
         default=24, ge=1, le=MOST_WAVES, description="How many waves are drawn from the spectrum."
     )
     direction_deg: Number = Field(
-        default=30.0, ge=-360, le=360, description="Where the wind blows to: 0 is world +x."
+        default=30.0,
+        ge=-360,
+        le=360,
+        description="Where the preset's wind blows to: 0 is world +x, 90 is +y.",
     )
     height: Number = Field(
         default=1.0, ge=0, le=10, description="Factor on the amplitudes of the preset's waves."
     )
     seed: Whole | None = Field(
-        default=None, ge=0, lt=2**63, description="Of the waves; the recipe's seed if null."
+        default=None,
+        ge=0,
+        lt=2**63,
+        description="What the preset's waves are drawn from; null for the recipe's seed.",
     )
     components: tuple[Wave, ...] | None = Field(
-        default=None, max_length=MOST_WAVES, description="Waves one by one, instead of a preset."
+        default=None,
+        max_length=MOST_WAVES,
+        description="Waves one by one, in place of a preset's; an empty list is still water.",
     )
 
+    @model_validator(mode="after")
+    def _no_loops(self) -> Waves:
+        waves = self.components or ()
+        steepness = math.fsum(wave.steepness for wave in waves)
+        if steepness > 1:
+            raise ValueError(
+                f"the steepness of its {len(waves)} components adds up to {steepness:.6g}; "
+                "above 1 the surface would loop"
+            )
+        return self
 
-class Flood(_Closed):
+
+class Flood(Closed):
     """Standing water with a horizontal surface: waves, reflection, refraction, absorption."""
 
+    model_config = ConfigDict(json_schema_extra=_ONE_CLARITY)
+
     level_m: Number = Field(
-        ge=-1e4, le=1e4, description="Height of the surface above the reference."
+        ge=-1e4, le=1e4, description="Height of the water's surface above the reference."
     )
     reference: Literal["lowest", "median", "absolute"] = Field(
         default="lowest",
@@ -75,16 +127,17 @@ class Flood(_Closed):
         default=None,
         ge=0,
         le=1e6,
-        description="How cloudy the water is; 0 is pure water. 50 where neither it nor "
-        "absorption_per_m is given.",
+        description="How cloudy the water is; 0 is pure water. "
+        f"{DEFAULT_TURBIDITY_NTU:g} where neither it nor absorption_per_m is given.",
     )
     absorption_per_m: Rates | None = Field(
         default=None,
-        description="Extinction along the way through the water, for red, green and blue.",
+        description="Extinction along the way through the water, in place of turbidity_ntu.",
     )
     color: Colour = Field(
         default=(0.42, 0.38, 0.30),
-        description="Colour of deep water seen from above, display-encoded sRGB.",
+        description="Colour of deep water seen from above, without reflections, "
+        "display-encoded sRGB.",
     )
     refraction_index: Number = Field(
         default=1.333, ge=1, le=3, description="Of the water; 1 neither reflects nor bends."
@@ -100,9 +153,36 @@ class Flood(_Closed):
     )
 
     @model_validator(mode="after")
-    def _one_extinction(self) -> Flood:
+    def _one_clarity(self) -> Flood:
         if self.turbidity_ntu is not None and self.absorption_per_m is not None:
             raise ValueError(
-                "turbidity_ntu and absorption_per_m both say how clear the water is: keep one"
+                "turbidity_ntu and absorption_per_m both say how clear the water is: "
+                "keep one of them"
             )
         return self
+
+    @property
+    def effective_turbidity_ntu(self) -> float | None:
+        """The turbidity that the water is drawn with; None where its extinction is given."""
+        if self.absorption_per_m is not None:
+            return None
+        return DEFAULT_TURBIDITY_NTU if self.turbidity_ntu is None else self.turbidity_ntu
+
+    @property
+    def extinction_per_m_rgb(self) -> tuple[float, float, float]:
+        """Extinction of red, green and blue along the way through the water, 1/metre.
+
+        From a turbidity: the absorption of pure water, and grey particles in proportion.
+        """
+        if self.absorption_per_m is not None:
+            return self.absorption_per_m
+        assert self.effective_turbidity_ntu is not None
+        particles = EXTINCTION_PER_M_PER_NTU * self.effective_turbidity_ntu
+        red, green, blue = PURE_WATER_PER_M
+        return (red + particles, green + particles, blue + particles)
+
+
+def _rounded_down(number: float) -> str:
+    """Four digits that are at most the number: what a message allows must be allowed."""
+    step = 10.0 ** (math.floor(math.log10(number)) - 3)
+    return f"{math.floor(number / step) * step:.4g}"

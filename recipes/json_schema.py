@@ -10,20 +10,19 @@ import json
 from pathlib import Path
 from typing import Any
 
-from recipes.fields import CHANNEL, ROOT, FieldSpec, Kind, SectionSpec
+from recipes.fields import CHANNEL, RATE, ROOT, FieldSpec, Kind, SectionSpec
 from recipes.schema import VERSION
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
 _LIMITS = {">": "exclusiveMinimum", ">=": "minimum", "<": "exclusiveMaximum", "<=": "maximum"}
-_CHANNEL = "channel"
 
 Schema = dict[str, Any]
 
 
 def recipe_json_schema() -> Schema:
     """The schema (draft 2020-12), a fresh dict made of JSON's own types."""
-    definitions = {_CHANNEL: _with_ranges(CHANNEL, _CHANNEL)}
+    definitions = {spec.path: _with_ranges(spec, spec.path) for spec in (CHANNEL, RATE)}
     schema = _section(ROOT, definitions)
     schema["properties"]["version"] = {"const": VERSION, "description": "Version of this format."}
     return {
@@ -50,14 +49,20 @@ def _section(section: SectionSpec, definitions: Schema) -> Schema:
     for name, spec in {**section.fields, **section.extra}.items():
         properties[name] = _field(spec, definitions)
     for name, below in section.sections.items():
+        schema = _section(below, definitions)
+        if below.items is not None:
+            said = {"description": below.items.description, "maxItems": below.items.most}
+            schema = {"type": "array", "items": schema, **said}
         # 'weather:' with nothing after it is null
-        properties[name] = {"oneOf": [_section(below, definitions), {"type": "null"}]}
+        properties[name] = {"oneOf": [schema, {"type": "null"}]}
+    required = [name for name, spec in section.fields.items() if spec.required]
     extra = section.model.model_config.get("json_schema_extra") or {}
     assert isinstance(extra, dict), "the models state what else holds as JSON, not as functions"
     return {
         "type": "object",
         "description": section.description,
         "properties": properties,
+        **({"required": required} if required else {}),
         "additionalProperties": False,
         **extra,
     }
@@ -79,10 +84,10 @@ def _literal(spec: FieldSpec) -> Schema:
     null = ["null"] if spec.nullable else []
     if spec.kind is Kind.WORD:
         return {"enum": [*spec.words, *(None for _ in null)]}
-    if spec.kind is Kind.COLOUR:
+    if spec.channel is not None:
         return {
             "type": ["array", *null],
-            "items": {"$ref": f"#/$defs/{_CHANNEL}"},
+            "items": {"$ref": f"#/$defs/{spec.channel.path}"},
             "minItems": 3,
             "maxItems": 3,
         }
@@ -97,8 +102,8 @@ def _with_ranges(spec: FieldSpec, definition: str) -> Schema:
     literal = _literal(spec)
     end = _literal(spec.without_null)
     ranges = [_choice(definition)]
-    if spec.kind is Kind.COLOUR:
-        plain = {**end, "items": _literal(CHANNEL)}
+    if spec.channel is not None:
+        plain = {**end, "items": _literal(spec.channel)}
         ranges.append(_range("uniform", _pair(plain)))
     elif spec.kind in (Kind.NUMBER, Kind.WHOLE):
         ranges.append(_range("uniform", _pair(end)))

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import itertools
 import logging
 from typing import Any
 
-from pydantic import ValidationError
-
 from recipes.errors import Problems, short
-from recipes.fields import ROOT, SectionSpec, join
+from recipes.fields import ROOT, ListSpec, SectionSpec, join
 from recipes.hints import show
 from recipes.parse_value import ValueParser
+from recipes.rules import Items, broken_rules
 from recipes.schema import VERSION
 from recipes.suggest import unknown_key
-from recipes.template import RecipeTemplate, readable
-from recipes.values import Fixed, Plain, Value, as_number, is_number, words
-from recipes.yaml_tree import EMPTY, MapNode, Node, ScalarNode, read_tree
+from recipes.template import RecipeTemplate
+from recipes.values import Fixed, Value, as_number
+from recipes.yaml_tree import EMPTY, ListNode, MapNode, Node, ScalarNode, read_tree
 
 _LOG = logging.getLogger(__name__)
 
@@ -58,10 +56,11 @@ class _Compiler:
         self._parser = ValueParser(problems)
         self._values: dict[str, Value] = {}
         self._effects: dict[str, float] = {}
+        self._lists: dict[str, int] = {}
 
     def template(self, tree: MapNode, source: str, file_name: str | None) -> RecipeTemplate:
         """The template of a whole file; raises all that was found wrong."""
-        self._section(tree, ROOT, line=1)
+        self._section(tree, ROOT, "", line=1)
         name = self._take("name", file_name)
         if "name" not in tree.entries and not ROOT.fields["name"].accepts(name):
             allowed = ROOT.fields["name"].allowed()
@@ -83,8 +82,16 @@ class _Compiler:
                 source,
                 variants,
             )
-        values, effects = tuple(self._values.items()), tuple(self._effects.items())
-        return RecipeTemplate(str(name), source, seed, variants, first, values, effects)
+        return RecipeTemplate(
+            name=str(name),
+            source=source,
+            seed=seed,
+            variants=variants,
+            first_variant=first,
+            values=tuple(self._values.items()),
+            effects=tuple(self._effects.items()),
+            lists=tuple(self._lists.items()),
+        )
 
     def _take(self, key: str, absent: str | None = None) -> Any:
         """The value of a top field, which is no part of what is drawn."""
@@ -97,35 +104,75 @@ class _Compiler:
         drawn = any(value.is_range for value in self._values.values())
         return drawn or any(0 < probability < 1 for probability in self._effects.values())
 
-    def _section(self, node: Node, spec: SectionSpec, line: int) -> None:
-        if isinstance(node, ScalarNode) and node.value is None:
-            return  # 'weather:' with nothing below it: the section is empty, the effect absent
+    def _section(
+        self, node: Node, spec: SectionSpec, path: str, line: int
+    ) -> dict[str, Value | Items]:
+        """Read a mapping; its fields' values, for the rules of the section that holds it.
+
+        path: the section's, with numbers in place of the [] of lists. line: the one of its key.
+        """
+        given: dict[str, Value | Items] = {}
+        if isinstance(node, ScalarNode) and node.value is None and spec.items is None:
+            return (
+                given  # 'weather:' with nothing below it: the section is empty, the effect absent
+            )
         if not isinstance(node, MapNode):
             known = ", ".join(spec.known)
-            text = f"{spec.path} = {show(node)}: must be a mapping, with {known}"
+            text = f"{path} = {show(node)}: must be a mapping, with {known}"
             self._problems.add(node.line, text)
-            return
+            return given
         found_before = len(self._problems)
         if spec.effect:
-            self._effects[spec.path] = 1.0
-        given: dict[str, Value] = {}
+            self._effects[path] = 1.0
         for key, (key_line, child) in node.entries.items():
-            path = join(spec.path, key)
-            if key in spec.sections:
-                self._section(child, spec.sections[key], key_line)
-            elif key in spec.fields:
-                field = spec.fields[key]
-                read = self._parser.parse if field.rangeable else self._parser.literal
-                value = read(child, field, path)
-                if value is not None:
-                    given[key] = self._values[path] = value
-            elif key in spec.extra:
-                self._extra(child, spec, key, path)
-            else:
-                shown = join(spec.path, short(key))
-                self._problems.add(key_line, f"{shown}: {unknown_key(key, spec)}")
-        if spec.path and len(self._problems) == found_before:
-            self._check_together(spec, given, line)
+            value = self._entry(child, spec, key, join(path, key), key_line)
+            if value is not None:
+                given[key] = value
+        for name, field in spec.fields.items():
+            if field.required and name not in node.entries:
+                self._problems.add(line, f"{join(path, name)}: must be given, {field.allowed()}")
+        if path and len(self._problems) == found_before:
+            for text in broken_rules(spec.model, given):
+                self._problems.add(line, f"{path}: {text}")
+        return given
+
+    def _entry(
+        self, node: Node, spec: SectionSpec, key: str, path: str, line: int
+    ) -> Value | Items | None:
+        """Read what stands under a key; None where the section's rules do not ask for it."""
+        below = spec.sections.get(key)
+        if below is not None and below.items is not None:
+            return self._list(node, below, below.items, path)
+        if below is not None:
+            self._section(node, below, path, line)
+        elif key in spec.fields:
+            field = spec.fields[key]
+            read = self._parser.parse if field.rangeable else self._parser.literal
+            value = read(node, field, path)
+            if value is not None:
+                self._values[path] = value
+            return value
+        elif key in spec.extra:
+            self._extra(node, spec, key, path)
+        else:
+            shown = path.removesuffix(key) + short(key)
+            self._problems.add(line, f"{shown}: {unknown_key(key, spec)}")
+        return None
+
+    def _list(self, node: Node, spec: SectionSpec, items: ListSpec, path: str) -> Items | None:
+        if isinstance(node, ScalarNode) and node.value is None:
+            return None
+        if not isinstance(node, ListNode) or len(node.items) > items.most:
+            known = ", ".join(spec.known)
+            allowed = f"a list of up to {items.most} mappings, each with {known}; or null"
+            self._problems.add(node.line, f"{path} = {show(node)}: must be {allowed}")
+            return None
+        self._lists[path] = len(node.items)
+        mappings = [
+            self._section(item, spec, f"{path}[{index}]", item.line)
+            for index, item in enumerate(node.items)
+        ]
+        return Items(tuple(mappings))
 
     def _extra(self, node: Node, spec: SectionSpec, key: str, path: str) -> None:
         value = self._parser.literal(node, spec.extra[key], path)
@@ -135,34 +182,3 @@ class _Compiler:
             self._effects[spec.path] = as_number(value.value)
         else:
             self._values[path] = value
-
-    def _check_together(self, spec: SectionSpec, given: dict[str, Value], line: int) -> None:
-        """The section's own rules, at every combination of its ranges' ends."""
-        said: set[str] = set()
-        corners = {name: _ends(value) for name, value in given.items()}
-        for combination in itertools.product(*corners.values()):
-            corner = dict(zip(corners, combination, strict=True))
-            try:
-                spec.model.model_validate(corner)
-            except ValidationError as error:
-                ranged = [name for name, value in given.items() if value.is_range]
-                drawn = [f"{name} = {words(corner[name])}" for name in ranged]
-                where = f" (in a draw with {', '.join(drawn)})" if drawn else ""
-                fresh = [text for text in readable(error) if text not in said]
-                said.update(fresh)
-                for text in fresh:
-                    self._problems.add(line, f"{spec.path}: {text}{where}")
-
-
-def _ends(value: Value) -> list[Plain]:
-    """What a rule between fields can depend on: the extreme numbers, null, and every word.
-
-    A handful, so that the product over a section's fields stays in the hundreds. No rule compares
-    colours, so one stands for all.
-    """
-    probes = value.probes()
-    numbers = [p for p in probes if is_number(p)]
-    colours = [p for p in probes if isinstance(p, tuple)]
-    others = [p for p in probes if p is None or isinstance(p, str | bool)]
-    ends = [min(numbers), max(numbers)] if numbers else []
-    return list(dict.fromkeys([*ends, *colours[:1], *others]))

@@ -7,20 +7,20 @@ A range is a mapping: {uniform: [a, b]}, {log_uniform: [a, b]}, {normal: {mean, 
 from __future__ import annotations
 
 from recipes.errors import Problems, short
-from recipes.fields import ANY_NUMBER, CHANNEL, FieldSpec, Kind
+from recipes.fields import ANY_NUMBER, FieldSpec, Kind
 from recipes.hints import hint, show, which_range
 from recipes.values import (
     RANGE_KINDS,
     Channels,
     Choice,
-    ColourLine,
     Fixed,
     LogUniform,
     Normal,
+    TripleLine,
     Uniform,
     Value,
-    as_colour,
     as_number,
+    as_triple,
 )
 from recipes.yaml_tree import ListNode, MapNode, Node, ScalarNode
 
@@ -41,8 +41,8 @@ class ValueParser:
         """The value of a field that may have a range."""
         if isinstance(node, MapNode):
             return self._range(node, spec, path)
-        if isinstance(node, ListNode) and spec.kind is Kind.COLOUR and len(node.items) == 3:
-            return self._colour(node, path)
+        if isinstance(node, ListNode) and spec.channel is not None and len(node.items) == 3:
+            return self._triple(node, spec.channel, path)
         return self.literal(node, spec, path)
 
     def literal(self, node: Node, spec: FieldSpec, path: str) -> Fixed | None:
@@ -67,15 +67,15 @@ class ValueParser:
         fixed = self.literal(node, spec.without_null, path)
         return None if fixed is None else as_number(fixed.value)
 
-    def _colour(self, node: ListNode, path: str) -> Value | None:
+    def _triple(self, node: ListNode, spec: FieldSpec, path: str) -> Value | None:
         channels = [
-            self.parse(item, CHANNEL, f"{path}[{index}]") for index, item in enumerate(node.items)
+            self.parse(item, spec, f"{path}[{index}]") for index, item in enumerate(node.items)
         ]
         red, green, blue = channels
         if red is None or green is None or blue is None:
             return None
         fixed = [channel.value for channel in channels if isinstance(channel, Fixed)]
-        return Fixed(as_colour(fixed)) if len(fixed) == 3 else Channels((red, green, blue))
+        return Fixed(as_triple(fixed)) if len(fixed) == 3 else Channels((red, green, blue))
 
     def _range(self, node: MapNode, spec: FieldSpec, path: str) -> Value | None:
         kinds = [key for key in node.entries if key in RANGE_KINDS]
@@ -90,10 +90,10 @@ class ValueParser:
         body, below = node.entries[kind][1], f"{path}.{kind}"
         if kind == "choice":
             return self._choice(node, spec, path)
-        if spec.kind is Kind.COLOUR and kind == "uniform":
-            return self._colour_line(body, spec, below)
+        if spec.channel is not None and kind == "uniform":
+            return self._line(body, spec, below)
         if spec.kind not in (Kind.NUMBER, Kind.WHOLE):
-            possible = "uniform or choice" if spec.kind is Kind.COLOUR else "choice"
+            possible = "choice" if spec.channel is None else "uniform or choice"
             return self._bad(node, path, f"{kind} is for numbers; a range here is {possible}")
         if kind == "normal":
             return self._normal(body, spec, below)
@@ -161,15 +161,16 @@ class ValueParser:
             return self._bad(node, path, "each is 0 or from 1e-9 to 1e9, and one is above 0")
         return weights
 
-    def _colour_line(self, body: Node, spec: FieldSpec, path: str) -> Value | None:
+    def _line(self, body: Node, spec: FieldSpec, path: str) -> Value | None:
+        ends = "colours" if spec.kind is Kind.COLOUR else "triples of rates"
         if not isinstance(body, ListNode) or len(body.items) != 2:
-            return self._bad(body, path, "must be [from, to], two colours")
+            return self._bad(body, path, f"must be [from, to], two {ends}")
         start, end = (
             self.parse(item, spec, f"{path}[{index}]") for index, item in enumerate(body.items)
         )
         if start is None or end is None:
             return None
         if not (isinstance(start, Fixed) and isinstance(end, Fixed)):
-            return self._bad(body, path, "the two colours must be written out, without ranges")
+            return self._bad(body, path, f"the two {ends} must be written out, without ranges")
         assert isinstance(start.value, tuple) and isinstance(end.value, tuple)
-        return ColourLine(start.value, end.value)
+        return TripleLine(start.value, end.value)

@@ -9,23 +9,18 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from typing import Annotated, Literal
+from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, Strict, model_validator
+from pydantic import ConfigDict, Field, model_validator
 from pydantic.config import JsonDict
 
 from recipes.flood import Flood
+from recipes.types import Closed, Colour, Flag, Number, Whole
 
 VERSION = 1
 KOSCHMIEDER = 3.912  # -ln(0.02): visibility is where contrast falls to 2 %
 _LATER_FIELDS = (("render", "exposure"), ("weather", "flood"), ("output", "surface"))
 MAX_EXTINCTION_PER_M = 100.0  # nothing is seen through 10 cm of it
-
-Number = Annotated[float, Strict()]
-Whole = Annotated[int, Strict()]
-Flag = Annotated[bool, Strict()]
-Unit = Annotated[float, Strict(), Field(ge=0.0, le=1.0)]
-Colour = tuple[Unit, Unit, Unit]
 
 # In words of JSON Schema: one of the two is present and not null.
 _ONE_DENSITY: JsonDict = {
@@ -36,11 +31,7 @@ _ONE_DENSITY: JsonDict = {
 }
 
 
-class _Closed(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class Smog(_Closed):
+class Smog(Closed):
     """Fog, haze or smog: Beer-Lambert extinction towards one airlight colour."""
 
     model_config = ConfigDict(json_schema_extra=_ONE_DENSITY)
@@ -106,14 +97,14 @@ class Smog(_Closed):
         return KOSCHMIEDER / self.visibility_m
 
 
-class Weather(_Closed):
+class Weather(Closed):
     """The effects of a recipe; null where one is absent."""
 
     smog: Smog | None = None
     flood: Flood | None = None
 
 
-class Render(_Closed):
+class Render(Closed):
     """How the scene is drawn."""
 
     scale: Number = Field(
@@ -139,7 +130,7 @@ class Render(_Closed):
     )
 
 
-class Output(_Closed):
+class Output(Closed):
     """What is written for each image."""
 
     image: Literal["png", "jpg"] = Field(default="png", description="Image format.")
@@ -160,7 +151,7 @@ class Output(_Closed):
     labels: Flag = Field(default=True, description="Pass 3D boxes through.")
 
 
-class Recipe(_Closed):
+class Recipe(Closed):
     """A recipe in numbers: together with the package version it determines every pixel."""
 
     version: Literal[1] = Field(default=VERSION, description="Version of the recipe format.")
@@ -201,10 +192,19 @@ class Recipe(_Closed):
         return hashlib.sha256(self.canonical_json().encode()).hexdigest()[:16]
 
     def weather_numbers(self) -> dict[str, float]:
-        """Flat numbers for the manifest: extinction 0 and scale height NaN where absent."""
-        smog = self.weather.smog
+        """Flat numbers for the manifest: without smog its extinction is 0, all else absent is NaN.
+
+        flood_turbidity_ntu is the default's where the recipe gives none, and NaN where it gives an
+        absorption. flood_wave_height is a factor on a preset's waves, NaN where they are listed.
+        """
+        smog, flood = self.weather.smog, self.weather.flood
         height_m = None if smog is None else smog.scale_height_m
+        turbidity = None if flood is None else flood.effective_turbidity_ntu
+        waves = None if flood is None or flood.waves.components is not None else flood.waves
         return {
             "smog_extinction_per_m": 0.0 if smog is None else smog.sigma_per_m,
             "smog_scale_height_m": math.nan if height_m is None else height_m,
+            "flood_level_m": math.nan if flood is None else flood.level_m,
+            "flood_turbidity_ntu": math.nan if turbidity is None else turbidity,
+            "flood_wave_height": math.nan if waves is None else waves.height,
         }

@@ -9,7 +9,7 @@ from recipes.fields import ROOT, SectionSpec, join
 from recipes.values import RANGE_KINDS
 
 _UNIT = re.compile(
-    r"_(per_)?(k|c|m)?(m|metres?|meters?|ft|feet|mi|miles?|yards?|mps|kmh|kph|mph|deg|rad)$"
+    r"_(per_)?(k|c|m)?(m|metres?|meters?|ft|feet|mi|miles?|yards?|mps|kmh|kph|mph|deg|rad|ntu|fnu)$"
 )
 _SYNONYMS = {
     "fog": "smog",
@@ -19,6 +19,14 @@ _SYNONYMS = {
     "density": "extinction_per_m",
     "sigma": "extinction_per_m",
     "airlight": "color",
+    "water": "flood",
+    "puddle": "flood",
+    "puddles": "flood",
+    "depth_m": "level_m",
+    "clarity": "turbidity_ntu",
+    "ior": "refraction_index",
+    "wind": "waves",
+    "ripples": "waves",
 }
 
 

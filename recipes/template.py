@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,6 +14,8 @@ from recipes.sampler import Draws
 from recipes.schema import VERSION, Recipe
 from recipes.values import Value
 
+_INDEX = re.compile(r"\[[0-9]+\]")
+
 
 @dataclass(frozen=True)
 class RecipeTemplate:
@@ -21,7 +24,8 @@ class RecipeTemplate:
     name: for folders and the manifest. source: where it was read from, for messages. variants: how
     many recipes a run draws from it; first_variant: the number of the first. values: dotted path ->
     how the field gets its value, for the fields that the file gives. effects: dotted path -> the
-    share of variants that have it, for the effects that the file names.
+    share of variants that have it, for the effects that the file names. lists: dotted path -> how
+    many items, for the lists that the file gives.
     """
 
     name: str
@@ -31,6 +35,7 @@ class RecipeTemplate:
     first_variant: int = 0
     values: tuple[tuple[str, Value], ...] = ()
     effects: tuple[tuple[str, float], ...] = ()
+    lists: tuple[tuple[str, int], ...] = ()
 
     def resolve(self, variant: int) -> Recipe:
         """The recipe number `variant`, counted from 0.
@@ -59,6 +64,9 @@ class RecipeTemplate:
             _put(data, path, {} if present else None)
             if not present:
                 off.append(path + ".")
+        for path, count in self.lists:
+            if not path.startswith(tuple(off)):
+                _put(data, path, [{} for _ in range(count)])
         for path, value in self.values:
             if not path.startswith(tuple(off)):
                 _put(data, path, value.draw(draws, path))
@@ -80,7 +88,7 @@ class RecipeTemplate:
         }
         for path, value in self.values:
             if value.is_range:
-                unit = units.get(path)
+                unit = units.get(_INDEX.sub("[]", path))
                 said[path] = value.describe() + (f" ({unit})" if unit else "")
         return said
 
@@ -89,7 +97,8 @@ def readable(error: ValidationError) -> list[str]:
     """pydantic's problems, one line each: the field, then what is wrong."""
     lines = []
     for item in error.errors(include_url=False):
-        path = ".".join(str(part) for part in item["loc"])
+        parts = (f"[{part}]" if isinstance(part, int) else f".{part}" for part in item["loc"])
+        path = "".join(parts).removeprefix(".")
         cause = item.get("ctx", {}).get("error")
         text = str(cause) if isinstance(cause, ValueError) else item["msg"]
         lines.append(f"{path}: {text}" if path else text)
@@ -99,5 +108,7 @@ def readable(error: ValidationError) -> list[str]:
 def _put(data: dict[str, Any], path: str, value: object) -> None:
     *sections, name = path.split(".")
     for section in sections:
-        data = data.setdefault(section, {})
+        key, _, index = section.removesuffix("]").partition("[")
+        # a list is put before its items' fields, with a mapping for each
+        data = data[key][int(index)] if index else data.setdefault(key, {})
     data[name] = value

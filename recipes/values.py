@@ -14,9 +14,9 @@ from typing import Protocol, TypeGuard
 
 from recipes.sampler import Draws
 
-Colour = tuple[float, float, float]
+Triple = tuple[float, float, float]  # a colour, or three rates
 RANGE_KINDS = ("uniform", "log_uniform", "normal", "choice")
-Plain = bool | int | float | str | Colour | None
+Plain = bool | int | float | str | Triple | None
 
 
 class Value(Protocol):
@@ -168,19 +168,19 @@ class Choice:
 
 
 @dataclass(frozen=True)
-class ColourLine:
-    """A colour on the straight line from one to another: one random number, so no odd mixtures."""
+class TripleLine:
+    """On the straight line from one to another: one random number, so no odd mixtures."""
 
-    start: Colour
-    end: Colour
+    start: Triple
+    end: Triple
     is_range = True
 
-    def draw(self, draws: Draws, path: str) -> Colour:
+    def draw(self, draws: Draws, path: str) -> Triple:
         unit = draws.unit(path)
         ends = zip(self.start, self.end, strict=True)
-        return as_colour(_rounded(a + unit * (b - a), min(a, b), max(a, b)) for a, b in ends)
+        return as_triple(_rounded(a + unit * (b - a), min(a, b), max(a, b)) for a, b in ends)
 
-    def probes(self) -> tuple[Colour, ...]:
+    def probes(self) -> tuple[Triple, ...]:
         return (self.start, self.end)
 
     def describe(self) -> str:
@@ -189,17 +189,17 @@ class ColourLine:
 
 @dataclass(frozen=True)
 class Channels:
-    """A colour whose channels are drawn one by one."""
+    """Three channels that are drawn one by one."""
 
     channels: tuple[Value, Value, Value]
     is_range = True
 
-    def draw(self, draws: Draws, path: str) -> Colour:
-        return as_colour(c.draw(draws, f"{path}[{i}]") for i, c in enumerate(self.channels))
+    def draw(self, draws: Draws, path: str) -> Triple:
+        return as_triple(c.draw(draws, f"{path}[{i}]") for i, c in enumerate(self.channels))
 
-    def probes(self) -> tuple[Colour, ...]:
+    def probes(self) -> tuple[Triple, ...]:
         probes = [[as_number(probe) for probe in channel.probes()] for channel in self.channels]
-        return (as_colour(map(min, probes)), as_colour(map(max, probes)))
+        return (as_triple(map(min, probes)), as_triple(map(max, probes)))
 
     def describe(self) -> str:
         return f"[{', '.join(channel.describe() for channel in self.channels)}]"
@@ -220,8 +220,8 @@ def as_number(value: Plain) -> float:
     return value
 
 
-def as_colour(values: Iterable[Plain]) -> Colour:
-    """The three channels of a field that was checked to hold a colour."""
+def as_triple(values: Iterable[Plain]) -> Triple:
+    """The three channels of a field that was checked to hold a colour or rates."""
     red, green, blue = map(as_number, values)
     return (red, green, blue)
 

@@ -6,7 +6,7 @@ import pytest
 
 from recipes.errors import MAX_SHOWN, RecipeError
 from recipes.parse import parse_recipe
-from recipes.values import Channels, Choice, ColourLine, Fixed, LogUniform, Normal, Uniform
+from recipes.values import Channels, Choice, Fixed, LogUniform, Normal, TripleLine, Uniform
 
 
 def problems(text: str) -> tuple[str, ...]:
@@ -249,7 +249,7 @@ def test_values_are_shown_shortened() -> None:
         ),
         ("scale_height_m: {choice: [null, 5]}", Choice((Fixed(None), Fixed(5.0)), (1.0, 1.0))),
         ("model: {choice: [deferred], weights: [2]}", Choice((Fixed("deferred"),), (2.0,))),
-        ("color: {uniform: [[0, 0, 0], [1, 1, 1]]}", ColourLine((0.0,) * 3, (1.0,) * 3)),
+        ("color: {uniform: [[0, 0, 0], [1, 1, 1]]}", TripleLine((0.0,) * 3, (1.0,) * 3)),
         (
             "color: [0, {uniform: [0, 1]}, 1]",
             Channels((Fixed(0.0), Uniform(0.0, 1.0), Fixed(1.0))),

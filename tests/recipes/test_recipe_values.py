@@ -13,10 +13,10 @@ from recipes.sampler import Draws
 from recipes.values import (
     Channels,
     Choice,
-    ColourLine,
     Fixed,
     LogUniform,
     Normal,
+    TripleLine,
     Uniform,
     Value,
 )
@@ -132,7 +132,7 @@ def test_extreme_random_numbers_choose_the_outer_options() -> None:
 
 def test_a_colour_line_draws_between_its_ends_with_one_number() -> None:
     start, end = (0.2, 0.9, 0.5), (0.6, 0.1, 0.5)
-    for red, green, blue in many(ColourLine(start, end), 5, 200):
+    for red, green, blue in many(TripleLine(start, end), 5, 200):
         share = (red - 0.2) / 0.4
         assert 0 <= share <= 1 and blue == 0.5
         assert green == pytest.approx(0.9 - 0.8 * share, abs=1e-9)  # ten digits of each channel
@@ -178,7 +178,7 @@ def test_random_numbers_are_pinned() -> None:
         (Normal(80.0, 10.0, 50.0, 120.0), 85.45044491),
         (Uniform(1, 100, True), 71),
         (Choice((Fixed("a"), Fixed("b"), Fixed("c")), (1.0, 1.0, 1.0)), "c"),
-        (ColourLine((0.0, 0.2, 0.4), (1.0, 0.4, 0.2)), (0.7067650877, 0.3413530175, 0.2586469825)),
+        (TripleLine((0.0, 0.2, 0.4), (1.0, 0.4, 0.2)), (0.7067650877, 0.3413530175, 0.2586469825)),
     ],
 )
 def test_first_draws_are_pinned(value: Value, drawn: object) -> None:
@@ -195,6 +195,6 @@ def test_descriptions() -> None:
     assert even.describe() == "one of null, uniform from 1 to 2"
     weighted = Choice((Fixed("png"), Fixed(True)), (1.0, 3.0))
     assert weighted.describe() == "one of png (25 %), true (75 %)"
-    assert ColourLine((0, 0.5, 1), (1, 1, 1)).describe() == "uniform from [0, 0.5, 1] to [1, 1, 1]"
+    assert TripleLine((0, 0.5, 1), (1, 1, 1)).describe() == "uniform from [0, 0.5, 1] to [1, 1, 1]"
     channels = Channels((Fixed(0.5), Uniform(0.0, 1.0), Fixed(1.0)))
     assert channels.describe() == "[0.5, uniform from 0 to 1, 1]"
