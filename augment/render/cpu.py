@@ -22,7 +22,7 @@ import numpy as np
 import torch
 
 from augment.cameras import Camera
-from augment.render import cpu_bin, cpu_blend, cpu_project
+from augment.render import cpu_bin, cpu_blend, cpu_clip, cpu_project
 from augment.render import cpu_layout as layout
 from augment.render.buffers import (
     ALPHA,
@@ -32,6 +32,7 @@ from augment.render.buffers import (
     SPLAT_IDS,
     RenderOutput,
 )
+from augment.render.clip import HeightClip
 from augment.render.constants import ALPHA_MIN, TRANSMITTANCE_STOP, RasterSettings
 from augment.render.cpu_inputs import Inputs, gather_inputs
 from augment.render.cpu_scratch import Scratch, borrowed_scratch
@@ -54,6 +55,7 @@ def rasterize_cpu(
     buffers: frozenset[str],
     settings: RasterSettings,
     smog: SmogMedium | None,
+    clip: HeightClip | None = None,
     *,
     stage_times: dict[str, float] | None = None,
 ) -> RenderOutput:
@@ -64,7 +66,7 @@ def rasterize_cpu(
     nearer ones have not closed) and "pairs" (of splats and such tiles) are added to it.
     """
     clock = Clock(stage_times)
-    inputs = gather_inputs(parts, camera, settings, smog, with_color=RGB in buffers)
+    inputs = gather_inputs(parts, camera, settings, smog, clip, with_color=RGB in buffers)
     images = image_arrays(camera, buffers)
     with borrowed_scratch() as scratch, kernel_threads():
         tiles = Tiles(camera, images, settings, scratch)
@@ -75,7 +77,7 @@ def rasterize_cpu(
             slots, rects = sort(splats, bins[0], scratch)
             clock.lap("sort")
             clock.count("visible", len(slots))
-            tiles.blend(splats.records, slots, rects, is_last=bins[1] == edges[-1], clock=clock)
+            tiles.blend(splats, slots, rects, is_last=bins[1] == edges[-1], clock=clock)
             if not tiles.open.any():
                 break
     return RenderOutput(**{name: torch.from_numpy(image) for name, image in images.items()})
@@ -150,6 +152,7 @@ class Splats:
     keys: np.ndarray
     found: np.ndarray
     counts: np.ndarray
+    cuts: np.ndarray | None
 
 
 def project(
@@ -160,12 +163,15 @@ def project(
     scratch: Scratch,
 ) -> Splats:
     blocks = len(inputs.blocks)
+    is_cut = bool(inputs.modes[layout.M_CLIP])
+    cuts = scratch.array("cuts", (cpu_clip.CUT * (inputs.slots if is_cut else 1),), np.float32)
     splats = Splats(
         scratch.array("records", (inputs.slots * layout.RECORD,), np.float32),
         scratch.array("rects", (inputs.slots,), np.uint64),
         scratch.array("keys", (inputs.slots,), np.uint32),
         scratch.array("found", (blocks,), np.int64),
         scratch.array("bin_counts", (blocks, bins[1] - bins[0]), np.int32),
+        cuts if is_cut else None,
     )
     cpu_project.project_slice(
         inputs.addresses,
@@ -182,6 +188,7 @@ def project(
         splats.keys,
         splats.found,
         splats.counts,
+        cuts,
     )
     return splats
 
@@ -236,7 +243,7 @@ class Tiles:
 
     def blend(
         self,
-        records: np.ndarray,
+        splats: Splats,
         slots: np.ndarray,
         rects: np.ndarray,
         *,
@@ -249,18 +256,18 @@ class Tiles:
             end, members, starts = self.list_members(slots, rects, first)
             clock.lap("bin")
             clock.count("pairs", len(members))
-            self.blend_members(records, members, starts, is_last=is_last and end == count)
+            self.blend_members(splats, members, starts, is_last=is_last and end == count)
             clock.lap("raster")
             first = end
             if first == count or not self.open.any():
                 return
 
     def blend_members(
-        self, records: np.ndarray, members: np.ndarray, starts: np.ndarray, *, is_last: bool
+        self, splats: Splats, members: np.ndarray, starts: np.ndarray, *, is_last: bool
     ) -> None:
         """Blend every open tile's list; is_last closes them all."""
         cpu_blend.blend_tiles(
-            records,
+            splats.records,
             members,
             starts,
             self.open,
@@ -269,6 +276,7 @@ class Tiles:
             self.size,
             self.limits,
             *self._images,
+            splats.cuts,
         )
 
     def list_all(self, slots: np.ndarray, rects: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

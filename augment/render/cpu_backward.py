@@ -152,7 +152,7 @@ def record(
         clock.lap("bin")
         clock.count("visible", len(slots))
         clock.count("pairs", len(members))
-        tiles.blend_members(splats.records, members, starts, is_last=True)
+        tiles.blend_members(splats, members, starts, is_last=True)
         clock.lap("raster")
     return Tape(
         inputs=inputs,

@@ -13,6 +13,7 @@ from numba import prange
 
 from augment.render import cpu_simd as v8
 from augment.render.constants import DEPTH_EPS
+from augment.render.cpu_clip import kept_share, list_edges, stage_cuts
 from augment.render.cpu_items import BATCH, ITEMS, find_spans, list_items, stage
 from augment.render.cpu_jit import inner, kernel
 from augment.render.cpu_layout import (
@@ -58,13 +59,15 @@ def blend_tiles(
     expected,
     median,
     ids,
+    cuts,
 ):
     """Blend one slice of z into every open tile; write the pixels of those that end.
 
     records: flat float32. members, starts: lists of slots. tiles: uint8 [tiles], CLOSED, OPEN or
     FRESH, updated. states: float32 [tiles * used part of STATE], where open tiles wait for the
     next slice. size: image width and height. limits: float32, alpha_max, log2(ALPHA_MIN),
-    TRANSMITTANCE_STOP. rgb to ids: flat images; all but alpha may be None.
+    TRANSMITTANCE_STOP. rgb to ids: flat images; all but alpha may be None. cuts: flat, of each slot
+    as cpu_clip has them, or None.
     """
     columns = (size[0] + TILE_W - 1) // TILE_W
     used = states.size // tiles.size
@@ -74,6 +77,8 @@ def blend_tiles(
         spans = np.empty(2 * BATCH, np.int32)
         values = np.empty(2 * ITEMS, np.float32)
         places = np.empty(2 * ITEMS, np.int32)
+        lines = np.empty(3 * BATCH, np.float32)
+        edges = np.empty(ITEMS, np.float32)
         rows = np.empty(2 * STRIPS, np.int64)
         for tile in range(group * GROUP, min((group + 1) * GROUP, tiles.size)):
             first, last = starts[tile], starts[tile + 1]
@@ -87,6 +92,7 @@ def blend_tiles(
             is_open = _blend_list(
                 records, members, first, last, np.float32(left), np.float32(top), limits,
                 state, staged, spans, values, places, rows, rgb, expected, median, ids,
+                cuts, lines, edges,
             )  # fmt: skip
             if is_open and not is_last:
                 _copy(state, U(0), states, U(tile * used), U(used))
@@ -136,6 +142,9 @@ def _blend_list(
     expected,
     median,
     ids,
+    cuts,
+    lines,
+    edges,
 ):
     """Blend a tile's list into its state. Returns whether any pixel still lets light through."""
     for strip in range(STRIPS):
@@ -148,6 +157,8 @@ def _blend_list(
         for k in range(U(at + count), U(min(at + 2 * BATCH, last))):
             v8.prefetch(records, U(members[k]) * U(RECORD))
         stage(records, members, U(at), U(count), left, top, rgb, expected, median, ids, staged)
+        if cuts is not None:
+            stage_cuts(cuts, members, U(at), U(count), staged, lines)
         for strip in range(STRIPS):
             if rows[2 * strip] >= rows[2 * strip + 1]:
                 continue
@@ -155,16 +166,20 @@ def _blend_list(
             items = list_items(staged, U(count), strip, spans, values, places)
             if items == U(0):
                 continue
+            if cuts is not None:
+                list_edges(lines, U(count), strip, spans, edges)
             if (median is not None or ids is not None) and _can_change(
                 state, strip, rows, median, ids
             ):
                 _blend_items(
-                    state, staged, values, places, items, limits, rgb, expected, median, ids
-                )
+                    state, staged, values, places, items, limits, rgb, expected, median, ids,
+                    cuts, lines, edges,
+                )  # fmt: skip
             else:
                 _blend_items(
-                    state, staged, values, places, items, limits, rgb, expected, None, None
-                )
+                    state, staged, values, places, items, limits, rgb, expected, None, None,
+                    cuts, lines, edges,
+                )  # fmt: skip
             shrink(state, strip, rows)
     return not is_closed(rows)
 
@@ -208,7 +223,9 @@ def shrink(state, strip, rows):
 
 
 @inner()
-def _blend_items(state, staged, values, places, items, limits, rgb, expected, median, ids):
+def _blend_items(
+    state, staged, values, places, items, limits, rgb, expected, median, ids, cuts, lines, edges
+):
     """Blend all items in turn. The next one's alpha is begun before this one is blended."""
     alpha_max, log_cut = v8.splat(limits[0]), v8.splat(limits[1])
     stop, zero, half = v8.splat(limits[2]), v8.splat(np.float32(0)), v8.splat(np.float32(0.5))
@@ -216,9 +233,13 @@ def _blend_items(state, staged, values, places, items, limits, rgb, expected, me
     places[items] = 0  # one item is read beyond the last
     splat = U(places[0])
     alpha = alpha_of(staged, values, splat, U(0), alpha_max, log_cut)
+    if cuts is not None:
+        alpha = alpha * kept_share(lines, edges, splat, U(0))
     for item in range(items):
         following = U(places[item + U(1)])
         next_alpha = alpha_of(staged, values, following, item + U(1), alpha_max, log_cut)
+        if cuts is not None:
+            next_alpha = next_alpha * kept_share(lines, edges, following, item + U(1))
         at = U(places[item + U(ITEMS)])
         through = v8.load(state, at)
         weight = alpha * through

@@ -11,6 +11,7 @@ import torch
 
 from augment.cameras import Camera
 from augment.render import cpu_layout as layout
+from augment.render.clip import HeightClip
 from augment.render.constants import (
     ALPHA_MIN,
     COV2D_BLUR,
@@ -21,6 +22,8 @@ from augment.render.constants import (
 from augment.render.sh import MAX_DEGREE
 from augment.scene import PosedGaussians
 from augment.weather.smog import SmogMedium
+
+_NO_CLIP = 1e30  # a height at which everything is on the kept side
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +53,7 @@ def gather_inputs(
     camera: Camera,
     settings: RasterSettings,
     smog: SmogMedium | None,
+    clip: HeightClip | None = None,
     *,
     with_color: bool,
 ) -> Inputs:
@@ -69,15 +73,21 @@ def gather_inputs(
         addresses=np.array(addresses, np.uint64).reshape(-1, 5),
         sizes=np.array(sizes, np.int64).reshape(-1, 2),
         first_ids=np.cumsum([0, *counts[:-1]], dtype=np.int64),
-        views=part_views(part_poses([p.world_from_part for p in parts]), camera, settings, smog),
+        views=part_views(
+            part_poses([p.world_from_part for p in parts]), camera, settings, smog, clip
+        ),
         blocks=np.array(blocks, np.int64).reshape(-1, 3),
-        modes=raster_modes(settings, smog, with_color=with_color),
+        modes=raster_modes(settings, smog, clip, with_color=with_color),
         arrays=arrays,
     )
 
 
 def part_views(
-    poses: np.ndarray, camera: Camera, settings: RasterSettings, smog: SmogMedium | None
+    poses: np.ndarray,
+    camera: Camera,
+    settings: RasterSettings,
+    smog: SmogMedium | None,
+    clip: HeightClip | None = None,
 ) -> np.ndarray:
     """The float32 numbers of every part's view, [P, VIEW], formed in float64.
 
@@ -110,6 +120,14 @@ def part_views(
             above = float(camera.centre[2]) - smog.base_z_m
             views[:, layout.V_EYE_HEIGHT] = above / smog.scale_height_m
             views[:, layout.V_UP :][:, :3] = poses[:, 2, :3] / smog.scale_height_m
+    views[:, layout.V_EXTENT] = MAX_EXTENT_SIGMAS
+    views[:, layout.V_CLIP_EYE] = _NO_CLIP
+    if clip is not None:
+        views[:, layout.V_CLIP_EYE] = clip.sign * (float(camera.centre[2]) - clip.z_m)
+        views[:, layout.V_CLIP_PART :][:, :3] = clip.sign * poses[:, 2, :3]
+        upwards = camera.camera_from_world.numpy()[:3, 2]
+        views[:, layout.V_CLIP_CAMERA :][:, :3] = clip.sign * upwards
+        views[:, layout.V_CLIP_EDGE] = clip.edge_px
     return views.astype(np.float32)
 
 
@@ -119,7 +137,11 @@ def part_poses(poses: Sequence[torch.Tensor | None]) -> np.ndarray:
 
 
 def raster_modes(
-    settings: RasterSettings, smog: SmogMedium | None, *, with_color: bool
+    settings: RasterSettings,
+    smog: SmogMedium | None,
+    clip: HeightClip | None = None,
+    *,
+    with_color: bool,
 ) -> np.ndarray:
     """The kernels' modes, int64."""
     degree = MAX_DEGREE if settings.sh_degree is None else settings.sh_degree
@@ -127,6 +149,7 @@ def raster_modes(
     modes[layout.M_COLOR] = with_color
     modes[layout.M_FUNCTIONS] = (degree + 1) ** 2
     modes[layout.M_ANTIALIASED] = settings.antialiased
+    modes[layout.M_CLIP] = clip is not None
     if smog is not None:
         is_uniform = smog.scale_height_m is None
         modes[layout.M_SMOG] = layout.UNIFORM_SMOG if is_uniform else layout.LAYERED_SMOG

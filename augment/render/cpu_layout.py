@@ -40,9 +40,13 @@ V_GAIN = 25  # most that a semi-axis of one metre can reach at z = 1, pixels, in
 V_NEAR, V_BLUR, V_ALPHA_MIN, V_LOG_CUT = 27, 28, 29, 30
 V_SIGMA, V_AIRLIGHT = 31, 32  # smog: extinction, and 3 of display-encoded colour
 V_EYE_HEIGHT, V_UP = 35, 36  # camera and part axes upwards, in scale heights: 1 and 3
-VIEW = 40
+V_CLIP_EYE = 39  # height of the camera on the kept side of the clip's plane, metres
+V_CLIP_PART, V_CLIP_CAMERA = 40, 43  # towards that side, in the part's axes and the camera's
+V_CLIP_EDGE, V_EXTENT = 46, 47  # pixels; sigmas that a splat reaches at most
+VIEW = 48
 
 # How to project: int64 each.
 M_COLOR, M_FUNCTIONS, M_ANTIALIASED, M_SMOG = 0, 1, 2, 3  # M_FUNCTIONS: most SH functions
-MODES = 4
+M_CLIP = 4
+MODES = 5
 NO_SMOG, UNIFORM_SMOG, LAYERED_SMOG = 0, 1, 2

@@ -13,6 +13,7 @@ import numpy as np
 from numba import prange
 
 from augment.render import cpu_simd as v8
+from augment.render.cpu_clip import C_AT, C_X, C_Y, CUT, cut_eight, height_of
 from augment.render.cpu_color import COLOR_ROWS, prepare_colors, write_color
 from augment.render.cpu_geometry import from_eye, gather3, image_covariance, to_camera, to_image
 from augment.render.cpu_jit import inner, kernel
@@ -28,6 +29,7 @@ from augment.render.cpu_layout import (
     LEAN_Y,
     LOG_OPACITY,
     M_ANTIALIASED,
+    M_CLIP,
     M_COLOR,
     M_FUNCTIONS,
     M_SMOG,
@@ -41,6 +43,7 @@ from augment.render.cpu_layout import (
     TILE_W,
     V_ALPHA_MIN,
     V_BLUR,
+    V_EXTENT,
     V_FOCAL,
     V_GAIN,
     V_LOG_CUT,
@@ -54,7 +57,8 @@ from augment.render.cpu_math import LOG2_E, floats_at, log2
 _COLOR = 0
 _X_LO, _X_HI, _Y_LO, _Y_HI = (COLOR_ROWS + i for i in range(4))
 _FIELDS = COLOR_ROWS + 4
-_ROWS = _FIELDS + DEPTH + 1
+_CUTS = _FIELDS + DEPTH + 1
+_ROWS = _CUTS + CUT
 _HUGE = np.float32(1e37)  # px^2; beyond it float32 overflows, and no pixel could tell
 
 
@@ -104,7 +108,8 @@ def _rank_eight(means, scales, opacities, view, picked, depths, at, areas):
     s0, s1, s2 = gather3(scales, picked, U(0))
     opacity = v8.gather(opacities, picked, U(0), U(1), U(0))
     # No direction of an ellipsoid is longer than its longest axis, and no blur wider than 2 px.
-    reach = v8.maximum(s0, v8.maximum(s1, s2)) * inverse
+    longest = v8.maximum(s0, v8.maximum(s1, s2))
+    reach = longest * inverse
     far_x = v8.fmuladd(v8.splat(view[V_GAIN]), reach, two)
     far_y = v8.fmuladd(v8.splat(view[V_GAIN + 1]), reach, two)
     seen = v8.both(
@@ -115,6 +120,8 @@ def _rank_eight(means, scales, opacities, view, picked, depths, at, areas):
     seen = v8.both(seen, v8.at_least(v8.splat(view[V_SIZE]) - x + far_x, zero))
     seen = v8.both(seen, v8.at_least(y + far_y, zero))
     seen = v8.both(seen, v8.at_least(v8.splat(view[V_SIZE + 1]) - y + far_y, zero))
+    kept = v8.fmuladd(v8.splat(view[V_EXTENT]), longest, height_of(d, view))
+    seen = v8.both(seen, v8.at_least(kept, zero))
     v8.store(depths, at, v8.select(seen, z, zero))
     # Mean over all directions of the ellipse's area, 2 pi sigma^2; it only cuts z into slices.
     squares = s0 * s1 + s1 * s2 + s0 * s2
@@ -139,6 +146,7 @@ def project_slice(
     keys,
     found,
     counts,
+    cuts,
 ):
     """Splats of the Gaussians in bins[0] <= bin of z < bins[1] that touch an open tile.
 
@@ -146,7 +154,8 @@ def project_slice(
     Gaussians: records, RECORD float32 each; rects, uint64, the tiles touched as cpu_bin unpacks
     them; keys, uint32, the bits of z. counts: int32 [B, Z], of those in each bin of the slice.
     depth_bits: uint32, what rank_splats wrote. first_ids: int64 [P]. open_sums: int32 [rows + 1,
-    columns + 1], number of open tiles above and left. modes: int64 [MODES].
+    columns + 1], number of open tiles above and left. modes: int64 [MODES]. cuts: CUT float32 each,
+    written where modes ask for a clip.
     """
     for block in prange(blocks.shape[0]):
         part, first, last = blocks[block]
@@ -177,6 +186,9 @@ def project_slice(
                     write_color(
                         sh, from_sh, used, views[part], modes[M_SMOG], rows, lane, records, record
                     )
+                if modes[M_CLIP]:
+                    for field in range(U(C_Y + 1)):
+                        cuts[slot * U(CUT) + field] = rows[(U(_CUTS) + field) * U(LANES) + lane]
                 keys[slot] = np.float32(records[record + U(DEPTH)]).view(np.uint32)
                 slot += U(1)
         found[block] = slot - U(base)
@@ -248,6 +260,12 @@ def _project_eight(means, quats, scales, opacities, view, picked, at, functions,
     drawn = v8.both(
         v8.at_least(log_opacity, log_cut), v8.at_least(v8.splat(_HUGE), blurred_x + blurred_y)
     )
+    if modes[M_CLIP]:
+        partly, offset, lx, ly = cut_eight(quats, scales, picked, at, d, x, y, inverse, view)
+        drawn = v8.both(drawn, partly)
+        v8.store(rows, U((_CUTS + C_AT) * LANES), offset)
+        v8.store(rows, U((_CUTS + C_X) * LANES), lx)
+        v8.store(rows, U((_CUTS + C_Y) * LANES), ly)
     _write_box(mean_x, radius_x, v8.splat(view[V_SIZE]), drawn, U(_X_LO), U(_X_HI), rows)
     _write_box(mean_y, radius_y, v8.splat(view[V_SIZE + 1]), drawn, U(_Y_LO), U(_Y_HI), rows)
     _write(rows, U(MEAN_X), mean_x)

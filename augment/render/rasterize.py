@@ -14,6 +14,7 @@ import torch
 from augment.cameras import Camera
 from augment.errors import BackendUnavailable
 from augment.render.buffers import ALPHA, BUFFERS, DIFFERENTIABLE, RGB, RenderOutput
+from augment.render.clip import HeightClip
 from augment.render.constants import RasterSettings
 from augment.render.reference import rasterize_reference
 from augment.render.sh import MAX_DEGREE
@@ -33,14 +34,16 @@ def rasterize(
     buffers: Collection[str] = (RGB, ALPHA),
     settings: RasterSettings = RasterSettings(),  # noqa: B008 - frozen, so sharing it is safe
     smog: SmogMedium | None = None,
+    clip: HeightClip | None = None,
     backend: str = AUTO,
 ) -> RenderOutput:
     """Image buffers of the parts seen by the camera; the sky is not part of them.
 
     buffers: names from augment.render.buffers; the others are None in the result. splat_ids counts
     through the parts in the order given. smog: fades every splat's colour towards the airlight by
-    its own distance. backend: "cpu" (numba, float32; gradients of rgb, alpha and expected_depth,
-    without smog and where no other buffer is asked for), "reference" (torch, float32 or float64,
+    its own distance. clip: only what lies above, or below, a height is drawn (augment.render.clip).
+    backend: "cpu" (numba, float32; gradients of rgb, alpha and expected_depth, without smog or clip
+    and where no other buffer is asked for), "reference" (torch, float32 or float64,
     gradients of all), or "auto": cpu where it can do the job, else reference.
 
     Raises:
@@ -49,14 +52,14 @@ def rasterize(
     """
     _check_arguments(parts, camera, buffers, settings)
     names = frozenset(buffers)
-    if _choose(parts, backend, names, smog) == REFERENCE:
-        return rasterize_reference(parts, camera, names, settings, smog)
+    if _choose(parts, backend, names, smog, clip) == REFERENCE:
+        return rasterize_reference(parts, camera, names, settings, smog, clip)
     cpu = _import_cpu()
     if _tracked(parts):
         from augment.render.autograd import rasterize_with_gradients
 
         return rasterize_with_gradients(parts, camera, names, settings)
-    return cpu.rasterize_cpu([_detached(p) for p in parts], camera, names, settings, smog)
+    return cpu.rasterize_cpu([_detached(p) for p in parts], camera, names, settings, smog, clip)
 
 
 def available_backends() -> dict[str, str | None]:
@@ -73,6 +76,7 @@ def _choose(
     backend: str,
     buffers: frozenset[str],
     smog: SmogMedium | None,
+    clip: HeightClip | None,
 ) -> str:
     """The backend to use; the first time a choice is made for a reason, it is logged."""
     if backend not in BACKENDS:
@@ -83,9 +87,9 @@ def _choose(
     obstacle = None
     if dtype != torch.float32:
         obstacle = f"the Gaussians are {dtype}, it takes torch.float32"
-    elif _tracked(parts) and (smog is not None or buffers - DIFFERENTIABLE):
+    elif _tracked(parts) and (smog is not None or clip is not None or buffers - DIFFERENTIABLE):
         others = ", ".join(sorted(buffers - DIFFERENTIABLE))
-        what = "through smog" if smog is not None else f"of {others}"
+        what = "through smog" if smog is not None else "of a clip" if clip else f"of {others}"
         obstacle = f"gradients {what} are asked for, it has none"
     if backend == CPU:
         if obstacle:

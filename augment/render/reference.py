@@ -22,6 +22,7 @@ from torch.utils.checkpoint import checkpoint
 
 from augment.cameras import Camera
 from augment.render.buffers import ALPHA, EXPECTED_DEPTH, MEDIAN_DEPTH, RGB, SPLAT_IDS, RenderOutput
+from augment.render.clip import HeightClip
 from augment.render.constants import (
     ALPHA_MIN,
     DEPTH_EPS,
@@ -61,13 +62,16 @@ def rasterize_reference(
     buffers: frozenset[str],
     settings: RasterSettings,
     smog: SmogMedium | None,
+    clip: HeightClip | None = None,
 ) -> RenderOutput:
     """The image of the parts: project, order, blend. Arguments are checked by `rasterize`.
 
     Differentiable with respect to all float tensors of the Gaussians; the cut-offs (order, alpha
     threshold, transmittance stop) are taken as constant.
     """
-    splats = order_by_depth(project_parts(parts, camera, settings, smog, with_color=RGB in buffers))
+    with_color = RGB in buffers
+    splats = project_parts(parts, camera, settings, smog, clip, with_color=with_color)
+    splats = order_by_depth(splats)
     return blend(splats, bin_to_tiles(splats, camera), camera, buffers, settings)
 
 
@@ -198,6 +202,9 @@ def blend_weights(
     sigma = 0.5 * (along * along * (yy / splats.dets[:, None]) + dy * dy / yy)
     alphas = (splats.opacities[:, None] * torch.exp2(-LOG2_E * sigma)).clamp_max(settings.alpha_max)
     alphas = torch.where(alphas >= ALPHA_MIN, alphas, torch.zeros_like(alphas))
+    if splats.cuts is not None:
+        at, slope_x, slope_y = splats.cuts.T[:, :, None]
+        alphas = alphas * (at + slope_x * dx + slope_y * dy).clamp(0, 1)
     after = transmittance * torch.cumprod(1 - alphas, 0)
     before = torch.cat([transmittance[None], after[:-1]])
     weights = torch.where(after > TRANSMITTANCE_STOP, alphas * before, torch.zeros_like(alphas))

@@ -17,7 +17,14 @@ from torch import Tensor
 
 from augment.cameras import Camera
 from augment.geometry import rotmat_from_quat, transform_points
-from augment.render.constants import ALPHA_MIN, COV2D_BLUR, TAN_FOV_MARGIN, RasterSettings
+from augment.render.clip import FAR_PX, HeightClip
+from augment.render.constants import (
+    ALPHA_MIN,
+    COV2D_BLUR,
+    MAX_EXTENT_SIGMAS,
+    TAN_FOV_MARGIN,
+    RasterSettings,
+)
 from augment.render.sh import evaluate_sh
 from augment.scene import Gaussians, PosedGaussians
 from augment.weather.smog import SmogMedium, blend_airlight, optical_depth
@@ -29,7 +36,9 @@ class Splats:
 
     ids: index counted through all parts. depths: z, metres. means2d: pixels. covs2d: xx, xy, yy,
     px^2, blurred. dets: their determinants. opacities: after antialiasing. colors: display-encoded
-    and >= 0, in the smog where there is any; None where no colour was asked for.
+    and >= 0, in the smog where there is any; None where no colour was asked for. cuts: of splats
+    clipped at a height, value at means2d and slope in x and y: clamp(value, 0, 1) is the share of
+    alpha that is kept at a pixel; None without a clip.
     """
 
     ids: Int64[Tensor, "M"]
@@ -39,6 +48,7 @@ class Splats:
     dets: Float[Tensor, "M"]
     opacities: Float[Tensor, "M"]
     colors: Float[Tensor, "M 3"] | None
+    cuts: Float[Tensor, "M 3"] | None = None
 
     def __len__(self) -> int:
         return self.ids.shape[0]
@@ -64,6 +74,7 @@ def project_parts(
     camera: Camera,
     settings: RasterSettings,
     smog: SmogMedium | None = None,
+    clip: HeightClip | None = None,
     *,
     with_color: bool = True,
 ) -> Splats:
@@ -71,7 +82,7 @@ def project_parts(
     projected: list[Splats] = []
     first_id = 0
     for part in parts:
-        projected.append(_project_part(part, first_id, camera, settings, smog, with_color))
+        projected.append(_project_part(part, first_id, camera, settings, smog, clip, with_color))
         first_id += len(part.gaussians)
     if len(projected) == 1:
         return projected[0]
@@ -86,6 +97,7 @@ def _project_part(
     camera: Camera,
     settings: RasterSettings,
     smog: SmogMedium | None,
+    clip: HeightClip | None,
     with_color: bool,
 ) -> Splats:
     camera_from_part = camera.camera_from_world
@@ -110,7 +122,7 @@ def _project_part(
     if settings.antialiased:
         tiny = torch.finfo(dets.dtype).tiny  # the slope of sqrt is infinite at 0
         opacities = opacities * torch.sqrt((det_sharp / dets).clamp_min(tiny))
-    return Splats(
+    splats = Splats(
         ids=index + first_id,
         depths=depths,
         means2d=_project_points(points, camera),
@@ -119,6 +131,48 @@ def _project_part(
         opacities=opacities,
         colors=_colors(gaussians, offsets, part, camera, settings, smog) if with_color else None,
     )
+    if clip is None:
+        return splats
+    heights = clip.sign * _heights(gaussians, offsets, part, camera, clip)
+    cuts, partly = _cut(splats, heights, axes, points, camera, clip)
+    return dataclasses.replace(splats, cuts=cuts).select(partly)
+
+
+def _heights(
+    gaussians: Gaussians, offsets: Tensor, part: PosedGaussians, camera: Camera, clip: HeightClip
+) -> Float[Tensor, "M"]:
+    """Heights of the means above the plane, by way of the eye, so that float32 keeps its digits."""
+    rise = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    if part.world_from_part is not None:
+        rise = part.world_from_part[2, :3]
+    return offsets @ rise.to(offsets.dtype) + (float(camera.centre[2]) - clip.z_m)
+
+
+def _cut(
+    splats: Splats,
+    heights: Float[Tensor, "M"],
+    axes: Float[Tensor, "M 3 3"],
+    points: Float[Tensor, "M 3"],
+    camera: Camera,
+    clip: HeightClip,
+) -> tuple[Float[Tensor, "M 3"], Tensor]:
+    """Cuts, and which splats have a part on the kept side. heights: positive there."""
+    up = (clip.sign * camera.camera_from_world[:3, 2]).to(axes.dtype)
+    reach = MAX_EXTENT_SIGMAS * (up @ axes).norm(dim=-1)
+    xx, xy, yy = splats.covs2d.unbind(1)
+    right, down = _image_axes(points, axes, camera)
+    cx, cy = (right * axes[:, 2]).sum(1), (down * axes[:, 2]).sum(1)
+    gx = (cx - xy / yy * cy) / (xx - xy / yy * xy).clamp_min(COV2D_BLUR)
+    gy = (cy - xy * gx) / yy
+    z = points[:, 2]
+    fall = clip.sign * (float(camera.centre[2]) - clip.z_m) / z**2
+    slope = torch.stack([up[0] / camera.fx - fall * gx, up[1] / camera.fy - fall * gy], -1)
+    length = slope.norm(dim=-1).clamp_min(1e-20)
+    offset = (heights / z / length).clamp(-FAR_PX, FAR_PX)
+    whole = heights >= reach
+    offset = torch.where(whole, torch.full_like(offset, FAR_PX), offset) + clip.edge_px
+    slope = torch.where(whole[:, None], torch.zeros_like(slope), slope / length[:, None])
+    return torch.cat([offset[:, None], slope], 1), heights >= -reach
 
 
 def _offsets_from_eye(
@@ -148,14 +202,22 @@ def _project_covariances(
     axes: columns are the semi-axes in the camera, metres. The projection is linearised at the
     splat's centre, or at the nearest point within a margin around the image where it lies outside.
     """
-    z = points[:, 2]
-    u = _clamp_to_image(points[:, 0] / z, camera.cx, camera.fx, camera.width)
-    v = _clamp_to_image(points[:, 1] / z, camera.cy, camera.fy, camera.height)
-    right = (camera.fx / z)[:, None] * (axes[:, 0] - u[:, None] * axes[:, 2])  # [M, 3]
-    down = (camera.fy / z)[:, None] * (axes[:, 1] - v[:, None] * axes[:, 2])
+    right, down = _image_axes(points, axes, camera)
     covs2d = torch.stack([(right * right).sum(1), (right * down).sum(1), (down * down).sum(1)], -1)
     # Lagrange's identity: xx yy - xy^2 without its cancellation, which needles would suffer from.
     return covs2d, torch.linalg.cross(right, down).square().sum(1)
+
+
+def _image_axes(
+    points: Float[Tensor, "M 3"], axes: Float[Tensor, "M 3 3"], camera: Camera
+) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M 3"]]:
+    """The semi-axes in the image, px right and px down."""
+    z = points[:, 2]
+    u = _clamp_to_image(points[:, 0] / z, camera.cx, camera.fx, camera.width)
+    v = _clamp_to_image(points[:, 1] / z, camera.cy, camera.fy, camera.height)
+    right = (camera.fx / z)[:, None] * (axes[:, 0] - u[:, None] * axes[:, 2])
+    down = (camera.fy / z)[:, None] * (axes[:, 1] - v[:, None] * axes[:, 2])
+    return right, down
 
 
 def _clamp_to_image(tangents: Tensor, centre: float, focal: float, size: int) -> Tensor:

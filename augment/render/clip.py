@@ -1,0 +1,51 @@
+"""Splats cut at a height: what lies above a level plane, or below it, and nothing of the rest.
+
+A splat is taken for the surface on which its density is highest along each ray: with covariance S2
+of its image position (blurred) and c, that of image position and depth, the depth there is
+
+    z(p) = z + g . (p - mean2d),    g = S2^-1 c
+
+(the conditional mean of a Gaussian, linear in the pixel). Seen from an eye at height h_eye over the
+plane, a point at inverse depth i on the ray through p is at height z (h_eye i + s(p)), s being the
+vertical part of the ray's direction. With i(p) = 1/z - g . (p - mean2d) / z^2, exact for a plane,
+
+    L(p) = h_eye i(p) + s(p)
+
+is linear in p and has the sign of the height: the cut is a straight line in the image. Divided by
+its slope L is a distance from that line in pixels, and clamp(L + 0.5, 0, 1) a smooth edge. Of what
+lies below, one pixel more is kept, so that nothing shows between the two sides of a cut.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+ABOVE, BELOW = "above", "below"
+EDGE_PX = {ABOVE: 0.5, BELOW: 1.5}  # added to the distance before it is clamped to [0, 1]
+FAR_PX = 1e6  # distances are clamped to this: where the slope vanishes they have no end
+
+
+@dataclass(frozen=True)
+class HeightClip:
+    """The side of the plane z = z_m (world, metres) that is kept."""
+
+    z_m: float
+    keep: Literal["above", "below"]
+
+    def __post_init__(self) -> None:
+        if self.keep not in EDGE_PX or not math.isfinite(self.z_m):
+            raise ValueError(
+                f"a clip keeps 'above' or 'below' a finite height; "
+                f"got {self.keep!r}, z_m = {self.z_m}"
+            )
+
+    @property
+    def sign(self) -> float:
+        """1 where heights above the plane are kept, -1 where those below are."""
+        return 1.0 if self.keep == ABOVE else -1.0
+
+    @property
+    def edge_px(self) -> float:
+        return EDGE_PX[self.keep]

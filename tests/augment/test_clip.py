@@ -1,0 +1,188 @@
+"""Splats cut at a height: where the cut runs, and that nothing is lost or shown twice."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from augment.render.buffers import ALPHA, BUFFERS, RGB
+from augment.render.clip import HeightClip
+from augment.render.rasterize import rasterize
+from augment.render.threads import limit_threads
+from augment.scene import Gaussians, PosedGaussians
+from augment.weather.water_plane import mirrored_camera
+from tests.assertions import assert_images_close
+from tests.scenes import camera_ahead, one_gaussian, random_gaussians, random_pose, sh_of, stack
+
+ALL = frozenset(BUFFERS)
+BACKENDS = ("cpu", "reference")
+
+
+def render(parts, camera, clip=None, backend="cpu", buffers=ALL):
+    parts = [PosedGaussians(parts)] if isinstance(parts, Gaussians) else parts
+    return rasterize(parts, camera, buffers=buffers, clip=clip, backend=backend)
+
+
+def in_float64(gaussians: Gaussians) -> Gaussians:
+    names = ("means", "quats", "scales", "opacities", "sh")
+    return Gaussians(**{n: getattr(gaussians, n).double() for n in names})
+
+
+def sheet(points, flat_axis: int, size: float, thickness=0.002) -> Gaussians:
+    """Opaque discs that are thin along one axis of the world. points [N, 3]."""
+    points = np.asarray(points, np.float32)
+    scales = np.full((len(points), 3), size, np.float32)
+    scales[:, flat_axis] = thickness
+    quats = np.tile(np.array([1, 0, 0, 0], np.float32), (len(points), 1))
+    return Gaussians(
+        means=torch.from_numpy(points),
+        quats=torch.from_numpy(quats),
+        scales=torch.from_numpy(scales),
+        opacities=torch.full((len(points),), 0.99),
+        sh=sh_of(np.full((len(points), 3), 0.6)),
+    )
+
+
+def wall(distance=5.0) -> Gaussians:
+    grid = np.mgrid[-3:3.01:0.4, -3:3.01:0.4].reshape(2, -1).T
+    return sheet(np.c_[np.full(len(grid), distance), grid], 0, 0.35)
+
+
+def floor(z: float) -> Gaussians:
+    grid = np.mgrid[1:20:0.4, -8:8.01:0.4].reshape(2, -1).T
+    return sheet(np.c_[grid, np.full(len(grid), z)], 2, 0.4)
+
+
+@pytest.mark.parametrize("keep", ["above", "below"])
+@pytest.mark.parametrize("z_m", [-0.6, 0.0, 0.21])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_kernels_match_the_definition(seed, z_m, keep):
+    gaussians = random_gaussians(300, seed=seed)
+    clip, camera = HeightClip(z_m, keep), camera_ahead()
+    actual = render(gaussians, camera, clip)
+    expected = render(in_float64(gaussians), camera, clip, "reference")
+    # A cut that runs nearly parallel to its splat moves by pixels with the last bit of float32.
+    for name in (RGB, ALPHA):
+        assert_images_close(getattr(actual, name), getattr(expected, name), p999=2e-3, max_flips=4)
+        error = (getattr(actual, name) - getattr(expected, name)).abs()
+        assert float(error.flatten().quantile(0.98)) < 2e-5
+    assert float((actual.expected_depth - expected.expected_depth).abs().median()) < 1e-5
+
+
+@pytest.mark.parametrize("pose", [None, random_pose(3)])
+def test_posed_parts_and_the_mirrored_eye(pose):
+    parts = [PosedGaussians(random_gaussians(200, seed=4), pose)]
+    double = [dataclasses.replace(parts[0], gaussians=in_float64(parts[0].gaussians))]
+    camera = mirrored_camera(camera_ahead(), -0.3)  # stands below the plane and looks up at it
+    clip = HeightClip(-0.3, "above")
+    actual, expected = render(parts, camera, clip), render(double, camera, clip, "reference")
+    assert_images_close(actual.rgb, expected.rgb, p999=2e-3, max_flips=4)
+
+
+@pytest.mark.parametrize("keep", ["above", "below"])
+def test_a_clip_that_cuts_nothing_changes_no_bit(keep):
+    gaussians, camera = random_gaussians(300), camera_ahead()
+    z_m = -50.0 if keep == "above" else 50.0
+    clipped, plain = render(gaussians, camera, HeightClip(z_m, keep)), render(gaussians, camera)
+    for name in ALL:
+        assert torch.equal(getattr(clipped, name), getattr(plain, name)), name
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_clip_that_leaves_nothing(backend):
+    image = render(random_gaussians(50), camera_ahead(), HeightClip(50.0, "above"), backend)
+    assert not image.alpha.any() and bool((image.splat_ids == -1).all())
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("z_m", [-0.52, 0.0, 0.33])
+def test_a_wall_is_cut_along_its_waterline(z_m, backend):
+    """The wall stands 5 m ahead, so the cut is the row that looks at height z_m there."""
+    camera = camera_ahead(40, 60, 60.0)
+    row = camera.cy - camera.fy * z_m / 5.0
+    above = render(wall(), camera, HeightClip(z_m, "above"), backend).alpha
+    below = render(wall(), camera, HeightClip(z_m, "below"), backend).alpha
+    centres = torch.arange(60) + 0.5
+    # Row by row the kept share is clamp(pixels above the line + 0.5, 0, 1) of an opaque wall's
+    # alpha; the wall's discs overlap, and each is cut, so what is left lies between one cut layer
+    # and an opaque one. A pixel and a half from the line there is all or nothing.
+    assert float(above[centres < row - 1.5].min()) > 0.98
+    assert float(above[centres > row + 1.5].max()) < 1e-3
+    assert float(below[centres > row + 0.5].min()) > 0.98  # one pixel more, behind the other's edge
+    assert float(below[centres < row - 2.5].max()) < 1e-3
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("depth_m", [0.01, 0.2])
+def test_a_flat_road_is_on_one_side_however_shallow_the_water(depth_m, backend):
+    """Discs of 0.4 m seen at a grazing angle: told apart by their surface, not by their centre."""
+    camera = camera_ahead(40, 60, 60.0)
+    road = floor(-1.5)
+    plain = render(road, camera, None, backend, frozenset({RGB, ALPHA}))
+    above = render(road, camera, HeightClip(-1.5 + depth_m, "above"), backend)
+    below = render(road, camera, HeightClip(-1.5 + depth_m, "below"), backend)
+    near = torch.arange(60) > camera.cy + 60 * 1.5 / 12  # nearer than 12 m
+    assert float(above.alpha[near].max()) < 0.02
+    assert float((below.alpha - plain.alpha)[near].abs().max()) < 0.02
+
+
+def test_both_sides_together_are_the_whole():
+    """Blended one behind the other, the sides of a cut give the picture without one."""
+    camera = camera_ahead(40, 60, 60.0)
+    gaussians = stack(wall(9.0), floor(-1.5), one_gaussian((4.0, 0.3, -0.9), 0.4, 0.999))
+    plain = render(gaussians, camera)
+    above = render(gaussians, camera, HeightClip(-0.9, "above"))
+    below = render(gaussians, camera, HeightClip(-0.9, "below"))
+    both = above.rgb + (1 - above.alpha)[..., None] * below.rgb
+    error = (both - plain.rgb).abs().amax(-1)
+    # At the edge of the cut a splat's two sides are blended as two splats, which covers a little
+    # more than it does as one: a few pixels of the line show it, most where the ball is translucent.
+    assert float(error.median()) < 1e-3 and float(error.max()) < 0.15
+    assert float((error > 0.02).float().mean()) < 0.03
+
+
+def test_the_sign_follows_the_height_not_the_distance():
+    """A road seen from under it, as by the mirrored eye: above, though it lies beyond the cut."""
+    camera = camera_ahead(40, 60, 60.0, position=(0.0, 0.0, -3.0))
+    ceiling = floor(-1.5)
+    assert float(render(ceiling, camera, HeightClip(-2.0, "above")).alpha.max()) > 0.9
+    assert float(render(ceiling, camera, HeightClip(-2.0, "below")).alpha.max()) < 0.02
+
+
+def test_bits_do_not_depend_on_the_number_of_threads():
+    gaussians, camera = random_gaussians(2000, seed=5), camera_ahead(200, 150, 180.0)
+    images = []
+    for count in (1, 2):
+        limit_threads(count)
+        images.append(render(gaussians, camera, HeightClip(-0.2, "above")))
+    limit_threads(None)
+    for name in ALL:
+        assert torch.equal(getattr(images[0], name), getattr(images[1], name)), name
+
+
+def test_gradients_take_the_definition():
+    gaussians = random_gaussians(20, seed=1)
+    means = gaussians.means.clone().requires_grad_()
+    part = PosedGaussians(dataclasses.replace(gaussians, means=means))
+    image = rasterize([part], camera_ahead(), clip=HeightClip(0.0, "above"))
+    image.rgb.sum().backward()
+    assert bool(torch.isfinite(means.grad).all()) and float(means.grad.abs().max()) > 0
+    with pytest.raises(ValueError, match="gradients of a clip are asked for"):
+        rasterize([part], camera_ahead(), clip=HeightClip(0.0, "above"), backend="cpu")
+
+
+@pytest.mark.parametrize(("z_m", "keep"), [(math.nan, "above"), (math.inf, "below"), (0.0, "left")])
+def test_what_no_clip_can_be(z_m, keep):
+    with pytest.raises(ValueError, match="a clip keeps"):
+        HeightClip(z_m, keep)
+
+
+def test_expected_depth_of_what_is_left():
+    camera = camera_ahead(40, 60, 60.0)
+    image = render(stack(wall(5.0), floor(-1.5)), camera, HeightClip(-0.5, "above"))
+    covered = image.alpha > 0.9
+    assert float((image.expected_depth[covered] - 5.0).abs().max()) < 0.05
