@@ -21,6 +21,7 @@ from augment.batch.encode import decode_image, decode_png
 from augment.batch.label_files import read_boxes
 from augment.batch.layout import PATH_KINDS, resolve_inside
 from augment.batch.manifest import OK, read_manifest, weather_columns
+from augment.batch.water_labels import BoxWater, Item, read_water
 from augment.dataset_samples import ImageType, Pixels, collate_frames, make_sample
 from augment.dataset_scene import SceneDataset
 from augment.errors import OutputError
@@ -28,6 +29,7 @@ from augment.labels import Boxes
 
 __all__ = ["SceneDataset", "WeatherDataset", "collate_frames"]
 
+_BUFFERS = {"depth": np.uint16, "semantic": np.uint8, "instance": np.uint16, "water": np.uint8}
 CACHED_VARIANTS = 8  # whose boxes and calibration are kept: neighbours in the order of the rows
 Value = TypeVar("Value")
 
@@ -73,6 +75,7 @@ class WeatherDataset(Dataset):
         table = _keep_only(table, wanted, self.out_dir)
         self._table = table if where is None else table.filter(where)
         self._boxes: _Cache[dict[int, Boxes]] = _Cache(_read_all_boxes)
+        self._box_water: _Cache[dict[Item, BoxWater]] = _Cache(read_water)
         self._calibration: _Cache[dict[int, dict[str, Any]]] = _Cache(read_entries)
 
     @property
@@ -94,12 +97,14 @@ class WeatherDataset(Dataset):
             else resolve_inside(self.out_dir, row[f"{kind}_path"])
             for kind in PATH_KINDS
         }
-        names = ("scene", "variant", "frame", "recipe_hash")
+        names = ("scene", "variant", "frame", "recipe_hash", "surface")
+        boxes = self._read_boxes(row, paths)
         return make_sample(
             pixels=self._read_pixels(row, paths),
             image_type=self.image_type,
             camera=self._read_camera(row, paths),
-            boxes=self._read_boxes(row, paths),
+            boxes=boxes,
+            box_water=None if boxes is None else self._read_box_water(row, paths, len(boxes)),
             weather={name: row[name] for name in self._weather},
             paths={kind: None if path is None else str(path) for kind, path in paths.items()},
             names={name: row[name] for name in names},
@@ -113,7 +118,7 @@ class WeatherDataset(Dataset):
         if self.verify and hashlib.sha256(data).hexdigest() != row["checksum"]:
             raise _damaged(path, f"its SHA-256 is not the manifest's {row['checksum']}")
         images = {"rgb": _decoded(path, lambda: decode_image(data))}
-        for kind, dtype in (("depth", np.uint16), ("semantic", np.uint8), ("instance", np.uint16)):
+        for kind, dtype in _BUFFERS.items():
             if (buffer := paths[kind]) is not None:
                 images[kind] = _read_png(buffer, dtype)
         for kind, image in images.items():
@@ -144,6 +149,20 @@ class WeatherDataset(Dataset):
             return self._boxes.get(path)[row["frame"]]
         except KeyError as error:
             raise _damaged(path, f"it lacks frame {row['frame']}") from error
+
+    def _read_box_water(
+        self, row: dict[str, Any], paths: dict[str, Path | None], count: int
+    ) -> BoxWater | None:
+        path = paths["box_water"]
+        if path is None:
+            return None
+        where = f"frame {row['frame']}, camera {row['camera']!r}"
+        water = self._box_water.get(path).get((row["frame"], row["camera"]))
+        if water is None:
+            raise _damaged(path, f"it lacks {where}")
+        if len(water) != count:
+            raise _damaged(path, f"{where}: it has {len(water)} boxes, the labels have {count}")
+        return water
 
 
 class _Cache(Generic[Value]):

@@ -6,12 +6,15 @@ A sample is a dictionary:
     depth             float32 [H, W], metres along the optical axis, 0 = none; or None
     semantic          uint8 [H, W], augment.semantics.SemanticClass; or None
     instance          int32 [H, W], 0 = none, else 1 + the actor's index; or None
+    water             bool [H, W], where a ray meets water first; None where there is no flood
     boxes             all boxes of the frame, see `box_tensors`; None where the dataset has none
     camera            name, width, height, timestamp_ns, K float64 [3, 3] in pixels of the image,
                       world_from_camera float64 [4, 4] in the dataset's world
     weather           the recipe's numbers by name, floats; NaN where absent
     paths             the files by kind (image, depth, ...), None where there is none
     scene, variant    names;  frame: the dataset's number;  recipe_hash: 16 hexadecimal digits
+    surface           what depth, semantic and instance show where there is water: `scene`, what
+                      lies under it, or `first`, the water
 """
 
 from __future__ import annotations
@@ -25,6 +28,7 @@ import torch
 
 from augment.batch.calibration import CameraRecord
 from augment.batch.encode import depth_in_metres
+from augment.batch.water_labels import BoxWater
 from augment.labels import Boxes
 
 ImageType = Literal["float32", "uint8"]
@@ -34,13 +38,14 @@ ImageType = Literal["float32", "uint8"]
 class Pixels:
     """Decoded images of one view. rgb: uint8 [H, W, 3]. depth: uint16 [H, W], steps of 1/256 m.
 
-    semantic: uint8 [H, W]. instance: uint16 [H, W].
+    semantic: uint8 [H, W]. instance: uint16 [H, W]. water: uint8 [H, W], 0 or 255.
     """
 
     rgb: np.ndarray
     depth: np.ndarray | None = None
     semantic: np.ndarray | None = None
     instance: np.ndarray | None = None
+    water: np.ndarray | None = None
 
 
 def make_sample(
@@ -49,21 +54,24 @@ def make_sample(
     image_type: ImageType,
     camera: CameraRecord,
     boxes: Boxes | None,
+    box_water: BoxWater | None,
     weather: Mapping[str, float],
     paths: Mapping[str, str | None],
     names: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """One sample as the module describes it. names: scene, variant, frame, recipe_hash."""
+    """One sample as the module describes it. names: scene, variant, frame, recipe_hash, surface."""
     image = torch.from_numpy(np.ascontiguousarray(pixels.rgb.transpose(2, 0, 1)))
     if image_type == "float32":
         image = image.float() / 255
     depth, semantic, instance = pixels.depth, pixels.semantic, pixels.instance
+    water = pixels.water
     return {
         "image": image,
         "depth": None if depth is None else torch.from_numpy(depth_in_metres(depth)),
         "semantic": None if semantic is None else torch.from_numpy(semantic),
         "instance": None if instance is None else torch.from_numpy(instance.astype(np.int32)),
-        "boxes": None if boxes is None else box_tensors(boxes),
+        "water": None if water is None else torch.from_numpy(water == 255),
+        "boxes": None if boxes is None else box_tensors(boxes, box_water),
         "camera": {
             "name": camera.name,
             "width": camera.width,
@@ -78,11 +86,18 @@ def make_sample(
     }
 
 
-def box_tensors(boxes: Boxes) -> dict[str, Any]:
+def box_tensors(boxes: Boxes, water: BoxWater | None) -> dict[str, Any]:
     """centers_m [B, 3], sizes_m [B, 3] (length, width, height), quats [B, 4] (wxyz,
     world_from_box): float64 tensors in the dataset's world. labels, track_ids: lists of strings.
     attributes: the dataset's further columns, NumPy arrays by name.
+
+    submerged_fraction, hidden_fraction: float64 [B], how much of a box's height is under water,
+    and of its pixels behind water (NaN where the image shows none); None where there is no flood.
     """
+    submerged = hidden = None
+    if water is not None:
+        submerged = torch.from_numpy(water.submerged_fraction)
+        hidden = torch.from_numpy(water.hidden_fraction)
     return {
         "centers_m": torch.from_numpy(boxes.centers_m.copy()),
         "sizes_m": torch.from_numpy(boxes.sizes_m.copy()),
@@ -90,6 +105,8 @@ def box_tensors(boxes: Boxes) -> dict[str, Any]:
         "labels": list(boxes.labels),
         "track_ids": list(boxes.track_ids),
         "attributes": dict(boxes.attributes),
+        "submerged_fraction": submerged,
+        "hidden_fraction": hidden,
     }
 
 
@@ -103,7 +120,7 @@ def collate_frames(samples: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """
     first = samples[0]
     batch: dict[str, Any] = {key: [sample[key] for sample in samples] for key in first}
-    for key in ("image", "depth", "semantic", "instance"):
+    for key in ("image", "depth", "semantic", "instance", "water"):
         batch[key] = _stacked(batch[key])
     cameras = batch["camera"]
     batch["camera"] = {

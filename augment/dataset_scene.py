@@ -13,6 +13,7 @@ from augment.batch.encode import decode_image, encode_image, quantise_depth
 from augment.batch.layout import PATH_KINDS, variant_name
 from augment.batch.runner import Renderer, default_renderer
 from augment.batch.selection import SceneIndex, select_frames
+from augment.batch.water_labels import measure_boxes
 from augment.batch.writer import check_view
 from augment.dataset_samples import ImageType, Pixels, make_sample
 from augment.scene import Scene
@@ -63,21 +64,27 @@ class SceneDataset(Dataset):
         camera, recipe = frame.cameras[name], self.recipe
         view = self._renderer(self.scene, camera, recipe, backend=self._backend)
         written = camera.scaled(recipe.render.scale)
-        check_view(view, written, recipe.output)
+        check_view(view, written, recipe)
         rgb = view.rgb
         if recipe.output.image != "png":
             rgb = decode_image(encode_image(rgb, recipe.output))
         has_labels = recipe.output.labels and frame.index in self._index.labelled
+        boxes = self.scene.boxes(frame.index) if has_labels else None
+        origin_m, box_water = self._index.world_origin_m, None
+        if boxes is not None and view.flood is not None:
+            box_water = measure_boxes(boxes, origin_m, written, view.water, view.flood)
         return make_sample(
             pixels=Pixels(
                 rgb,
                 None if view.depth_m is None else quantise_depth(view.depth_m),
                 view.semantic,
                 view.instance,
+                view.water,
             ),
             image_type=self.image_type,
-            camera=camera_record(written, self._index.world_origin_m),
-            boxes=self.scene.boxes(frame.index) if has_labels else None,
+            camera=camera_record(written, origin_m),
+            boxes=boxes,
+            box_water=box_water,
             weather=recipe.weather_numbers(),
             paths=dict.fromkeys(PATH_KINDS),
             names={
@@ -85,5 +92,6 @@ class SceneDataset(Dataset):
                 "variant": variant_name(recipe),
                 "frame": frame.index,
                 "recipe_hash": recipe.hash,
+                "surface": recipe.output.surface,
             },
         )

@@ -69,6 +69,14 @@ def encode_ids(ids: np.ndarray, dtype: type) -> bytes:
     return _encode(".png", ids, _png_settings("UP"))
 
 
+def encode_mask(mask: np.ndarray) -> bytes:
+    """uint8 [H, W] of 0 and 255 as a PNG of 8 bits."""
+    _require(mask, np.uint8, 2, "mask")
+    if not ((mask == 0) | (mask == 255)).all():
+        raise ValueError(f"mask must hold 0 and 255 only; got {np.unique(mask)[:8].tolist()}")
+    return _encode(".png", mask, _png_settings("UP"))
+
+
 def decode_png(data: bytes, dtype: type) -> np.ndarray:
     """[H, W] of `dtype`. Raises ValueError for anything but a complete PNG of that kind."""
     # libpng hands over what it has of a cut file, so the end mark is looked for.

@@ -9,10 +9,11 @@ from pathlib import Path
 from augment.batch.atomic import write_atomic
 from augment.batch.calibration import calibration_bytes, frame_entry, read_entries
 from augment.batch.label_files import FrameBoxes, boxes_bytes, read_boxes
-from augment.batch.layout import MANIFEST
+from augment.batch.layout import MANIFEST, WATER_LABELS
 from augment.batch.ledger import Ledger, VariantState
 from augment.batch.runner import describe
 from augment.batch.selection import SceneIndex
+from augment.batch.water_labels import water_bytes
 from augment.errors import OutputError
 
 
@@ -57,6 +58,8 @@ def finish(ledger: Ledger, trajectory: str, boxes: BoxCache) -> None:
     for variant in variants:
         if variant.recipe.output.labels and ledger.index.labels is not None:
             _write_boxes(ledger, variant, boxes)
+            if variant.recipe.weather.flood is not None:
+                _write_box_water(ledger, variant)
         _write_calibration(ledger, variant, trajectory)
     if variants:
         ledger.write_manifest(variants)
@@ -81,6 +84,8 @@ def _companions(ledger: Ledger, variant: VariantState) -> dict[str, Path]:
     paths = {"calibration": folder / "calibration.json"}
     if variant.recipe.output.labels and ledger.index.labels is not None:
         paths["labels"] = folder / "labels" / "boxes.parquet"
+        if variant.recipe.weather.flood is not None:
+            paths["box_water"] = folder / WATER_LABELS
     return paths
 
 
@@ -92,6 +97,15 @@ def _write_boxes(ledger: Ledger, variant: VariantState, cache: BoxCache) -> None
         known = {n: b for n, b in _read_or_drop(path).items() if n in set(frames)}
     new = cache.get([number for number in frames if number not in known])
     write_atomic(path, boxes_bytes({**known, **new}))
+
+
+def _write_box_water(ledger: Ledger, variant: VariantState) -> None:
+    path = _companions(ledger, variant)["box_water"]
+    # Not of an image that was measured once and has failed since.
+    listed = {item for item, row in variant.rows.items() if row["box_water_path"] is not None}
+    write_atomic(
+        path, water_bytes({i: water for i, water in variant.box_water.items() if i in listed})
+    )
 
 
 def _read_or_drop(path: Path) -> dict[int, FrameBoxes]:

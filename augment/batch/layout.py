@@ -11,10 +11,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path, PurePosixPath
 
 from augment.errors import OutputError
-from recipes.schema import Output, Recipe
+from recipes.schema import Recipe
 
 MANIFEST = "manifest.parquet"
 STATE_FOLDER = ".climategs"
+WATER_LABELS = "labels/water.parquet"  # inside a variant's folder
 
 _SAFE = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 _UNSAFE_CHARACTERS = re.compile(r"[^A-Za-z0-9._-]+")
@@ -47,8 +48,10 @@ class ItemPaths:
     depth: str | None
     semantic: str | None
     instance: str | None
+    water: str | None
     lidar: str | None
     labels: str | None
+    box_water: str | None
     calibration: str
 
     def columns(self) -> dict[str, str | None]:
@@ -64,19 +67,22 @@ def variant_folder(scene: str, variant: str) -> str:
     return f"{folder_name(scene)}/{folder_name(variant)}"
 
 
-def item_paths(scene: str, variant: str, camera: str, frame: int, output: Output) -> ItemPaths:
-    """Where the image of one camera in one frame lies; `lidar` and `labels` if the recipe asks."""
+def item_paths(scene: str, recipe: Recipe, camera: str, frame: int) -> ItemPaths:
+    """Where the image of one camera in one frame lies, and what else the recipe asks for."""
     if frame < 0:
         raise ValueError(f"frame numbers in an output folder are >= 0; got {frame}")
-    base = variant_folder(scene, variant)
+    output, has_flood = recipe.output, recipe.weather.flood is not None
+    base = variant_folder(scene, variant_name(recipe))
     stem = f"{folder_name(camera)}/{frame:06d}"
     return ItemPaths(
         image=f"{base}/images/{stem}.{output.image}",
         depth=None if output.depth == "none" else f"{base}/depth/{stem}.png",
         semantic=f"{base}/semantic/{stem}.png" if output.semantic else None,
         instance=f"{base}/instance/{stem}.png" if output.instance else None,
+        water=f"{base}/water/{stem}.png" if has_flood else None,
         lidar=f"{base}/lidar/{frame:06d}.parquet" if output.lidar else None,
         labels=f"{base}/labels/boxes.parquet" if output.labels else None,
+        box_water=f"{base}/{WATER_LABELS}" if has_flood and output.labels else None,
         calibration=f"{base}/calibration.json",
     )
 

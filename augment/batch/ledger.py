@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import shutil
 import threading
 from collections.abc import Iterator, Sequence
@@ -18,22 +19,38 @@ from augment.batch.layout import (
     MANIFEST,
     PATH_KINDS,
     STATE_FOLDER,
+    WATER_LABELS,
     item_paths,
     variant_folder,
     variant_name,
 )
-from augment.batch.manifest import OK, merge_rows, read_manifest, rows_of, write_manifest
+from augment.batch.manifest import (
+    LATER,
+    OK,
+    merge_rows,
+    read_manifest,
+    rows_of,
+    write_manifest,
+)
 from augment.batch.runner import Chunk, Outcome
 from augment.batch.selection import SceneIndex
+from augment.batch.water_labels import BoxWater, Item, read_water
 from augment.cameras import Frame
+from augment.errors import OutputError
 from recipes.schema import Recipe
 
-Item = tuple[int, str]  # frame number and camera name
+# What belongs to a whole variant is written when the job ends.
+_OF_VARIANT = ("labels", "box_water", "calibration")
+_IN_JOURNAL = "box_water"  # what a journal's line has beyond the manifest's row
+_log = logging.getLogger(__name__)
 
 
 @dataclass
 class VariantState:
-    """One variant of the job. rows: what is known of its images, from this run and earlier ones."""
+    """One variant of the job. rows: what is known of its images, from this run and earlier ones.
+
+    box_water: what its flood does to the boxes of those images.
+    """
 
     recipe: Recipe
     name: str
@@ -41,16 +58,17 @@ class VariantState:
     identity: Identity
     journal: Journal
     rows: dict[Item, dict[str, Any]] = field(default_factory=dict)
+    box_water: dict[Item, BoxWater] = field(default_factory=dict)
     is_journalled: bool = False
 
     def is_finished(self, out_dir: Path, item: Item) -> bool:
-        """Whether the image's row says ok and all its files are there."""
+        """Whether the image's row says ok, and all its files and its boxes' numbers are there."""
         row = self.rows.get(item)
         if row is None or row["status"] != OK:
             return False
-        paths = [
-            row[f"{kind}_path"] for kind in PATH_KINDS if kind not in ("labels", "calibration")
-        ]
+        if row["box_water_path"] is not None and item not in self.box_water:
+            return False
+        paths = [row[f"{kind}_path"] for kind in PATH_KINDS if kind not in _OF_VARIANT]
         return all((out_dir / path).is_file() for path in paths if path is not None)
 
 
@@ -104,9 +122,12 @@ class Ledger:
         """Enter what became of an image, durably. May be called from several threads."""
         variant = self.variants[outcome.variant]
         row = self._row(variant, outcome, frame)
-        variant.journal.append(row)
+        water = outcome.box_water
+        variant.journal.append(row if water is None else {**row, _IN_JOURNAL: water.to_json()})
         with self._lock:
             variant.rows[frame.index, outcome.camera] = row
+            if water is not None:
+                variant.box_water[frame.index, outcome.camera] = water
 
     def write_manifest(self, variants: Sequence[VariantState]) -> Path:
         """Put the rows of these variants into the manifest."""
@@ -130,7 +151,13 @@ class Ledger:
         if found is not None:
             variant.identity.check(found, str(self.out_dir / variant.folder))
         variant.is_journalled = begun is not None
-        variant.rows = {(row["frame"], row["camera"]): row for row in [*rows, *journalled]}
+        if any(row.get("box_water_path") for row in rows):
+            variant.box_water = _read_water(self.out_dir / variant.folder / WATER_LABELS)
+        for row in journalled:
+            if (water := row.pop(_IN_JOURNAL, None)) is not None:
+                variant.box_water[row["frame"], row["camera"]] = BoxWater.from_json(water)
+        known = [{**LATER, **row} for row in [*rows, *journalled]]
+        variant.rows = {(row["frame"], row["camera"]): row for row in known}
         return False
 
     def _give_up(self, variants: Sequence[VariantState]) -> None:
@@ -169,13 +196,13 @@ class Ledger:
     def _row(self, variant: VariantState, outcome: Outcome, frame: Frame) -> dict[str, Any]:
         recipe, index = variant.recipe, self.index
         camera = frame.cameras[outcome.camera].scaled(recipe.render.scale)
-        paths = item_paths(
-            index.name, variant.name, outcome.camera, frame.index, recipe.output
-        ).columns()
+        paths = item_paths(index.name, recipe, outcome.camera, frame.index).columns()
         if not outcome.lidar:
             paths["lidar_path"] = None
         if frame.index not in index.labelled:
             paths["labels_path"] = None
+        if outcome.box_water is None:
+            paths["box_water_path"] = None
         if outcome.status != OK:
             paths = dict.fromkeys(paths)
         return {
@@ -187,6 +214,7 @@ class Ledger:
             **paths,
             "width": camera.width,
             "height": camera.height,
+            "surface": recipe.output.surface,
             **recipe.weather_numbers(),
             "seed": recipe.seed,
             "recipe": recipe.name,
@@ -195,6 +223,15 @@ class Ledger:
             "status": outcome.status,
             "message": outcome.message,
         }
+
+
+def _read_water(path: Path) -> dict[Item, BoxWater]:
+    """A lost or damaged file counts as empty: only rendering again tells what was in it."""
+    try:
+        return read_water(path)
+    except OutputError as error:
+        _log.warning("%s; the images it belongs to are rendered again", error)
+        return {}
 
 
 def _remove_tree(folder: Path) -> None:

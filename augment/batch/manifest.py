@@ -32,6 +32,7 @@ LEADING = {
     **{f"{kind}_path": pa.string() for kind in PATH_KINDS},
     "width": pa.int64(),
     "height": pa.int64(),
+    "surface": pa.string(),
 }
 TRAILING = {
     "seed": pa.int64(),
@@ -44,6 +45,8 @@ TRAILING = {
     "status": pa.string(),
     "message": pa.string(),
 }
+# Columns younger than the first release, and what a row without them means.
+LATER: dict[str, str | None] = {"water_path": None, "box_water_path": None, "surface": "scene"}
 KEY = ("scene", "variant", "frame", "camera")
 
 Row = Mapping[str, Any]
@@ -69,7 +72,7 @@ def rows_to_table(rows: Iterable[Row]) -> pa.Table:
 
 
 def read_manifest(out_dir: Path) -> pa.Table:
-    """The manifest of an output folder.
+    """The manifest of an output folder; one of an older version gains the columns it lacks.
 
     Raises:
         OutputError: there is none, or it is damaged, or it lacks columns.
@@ -84,6 +87,7 @@ def read_manifest(out_dir: Path) -> pa.Table:
         table = pq.ParquetFile(path).read(use_threads=False)
     except (OSError, pa.ArrowException) as error:
         raise OutputError(f"{path} is not a readable Parquet file: {error}") from error
+    table = _with_later_columns(table)
     wanted = {**LEADING, **TRAILING}
     wrong = [n for n, k in wanted.items() if n not in table.column_names or table[n].type != k]
     if wrong:
@@ -141,6 +145,15 @@ def _with_columns(table: pa.Table, weather: list[str]) -> pa.Table:
         if name not in table.column_names:
             absent = pa.array([math.nan] * table.num_rows, pa.float64())
             table = table.append_column(name, absent)
+    return table
+
+
+def _with_later_columns(table: pa.Table) -> pa.Table:
+    for name, meaning in LATER.items():
+        if name not in table.column_names:
+            column = pa.array([meaning] * table.num_rows, pa.string())
+            place = [n for n in LEADING if n in table.column_names or n == name].index(name)
+            table = table.add_column(place, name, column)
     return table
 
 

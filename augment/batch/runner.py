@@ -9,17 +9,21 @@ import logging
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
+import numpy as np
+
 from augment.batch.atomic import write_atomic
 from augment.batch.label_files import lidar_bytes
-from augment.batch.layout import item_paths, variant_name
+from augment.batch.layout import item_paths
 from augment.batch.manifest import FAILED, OK
 from augment.batch.trajectory import frames_from_json
-from augment.batch.writer import WritePump, check_view, write_view
+from augment.batch.water_labels import BoxWater, measure_boxes
+from augment.batch.writer import View, WritePump, check_view, write_view
 from augment.cameras import Camera
+from augment.labels import Boxes
 from augment.scene import Scene
 from recipes.schema import Recipe
 
@@ -60,7 +64,11 @@ class Chunk:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one image. lidar: whether the frame has a sweep. seconds: by kind of work."""
+    """What became of one image.
+
+    lidar: whether the frame has a sweep. box_water: what the recipe's flood does to its boxes,
+    where there are labels. seconds: by kind of work.
+    """
 
     variant: int
     frame: int
@@ -69,6 +77,7 @@ class Outcome:
     message: str = ""
     checksum: str = ""
     lidar: bool = False
+    box_water: BoxWater | None = None
     seconds: dict[str, float] = field(default_factory=dict)
 
 
@@ -108,6 +117,7 @@ class FrameRunner:
         self._scene, self._setup = scene, setup
         self._renderer = renderer or default_renderer()
         self._deliver, self._pump = deliver, pump
+        self._boxes: dict[int, Boxes] = {}  # of the frames so far
 
     def run(self, chunk: Chunk, stopped: Callable[[], bool] = lambda: False) -> None:
         """Render the chunk's images; those not begun when `stopped()` turns true are left."""
@@ -125,43 +135,57 @@ class FrameRunner:
     def _render(self, chunk: Chunk, recipe: Recipe, name: str, lidar: Future) -> None:
         camera = self._cameras[chunk.frame][name]
         started = time.perf_counter()
+        doing = "rendering"
         try:
             view = self._renderer(self._scene, camera, recipe, backend=self._setup.backend)
-            check_view(view, camera.scaled(recipe.render.scale), recipe.output)
+            written = camera.scaled(recipe.render.scale)
+            check_view(view, written, recipe)
+            doing = "measuring the boxes under water"
+            box_water = self._measure(chunk.frame, recipe, written, view)
         except Exception as error:
             _log.debug("frame %d, camera %s", chunk.frame, name, exc_info=True)
-            message = describe(error, "rendering")
+            message = describe(error, doing)
             outcome = Outcome(chunk.variant, chunk.frame, name, FAILED, message)
             self._pump.submit(lambda: self._deliver(outcome))
             return
         render_s = time.perf_counter() - started
-        self._pump.submit(lambda: self._write(chunk, recipe, name, view, lidar, render_s))
-
-    def _write(
-        self, chunk: Chunk, recipe: Recipe, name: str, view: Any, lidar: Future, render_s: float
-    ) -> None:
-        out_dir = Path(self._setup.out_dir)
-        paths = item_paths(self._scene.name, variant_name(recipe), name, chunk.frame, recipe.output)
-        passed = lidar.result()
-        if isinstance(passed, str):
-            self._deliver(Outcome(chunk.variant, chunk.frame, name, FAILED, passed))
-            return
-        try:
-            written = write_view(out_dir, paths, view, recipe.output)
-        except ValueError as error:
-            message = describe(error, "encoding")
-            self._deliver(Outcome(chunk.variant, chunk.frame, name, FAILED, message))
-            return
         done = Outcome(
             chunk.variant,
             chunk.frame,
             name,
             OK,
-            checksum=written.checksum,
-            lidar=passed,
-            seconds={"render": render_s, "encode": written.encode_s, "write": written.write_s},
+            box_water=box_water,
+            seconds={"render": render_s},
         )
-        self._deliver(done)
+        self._pump.submit(lambda: self._write(done, recipe, view, lidar))
+
+    def _measure(self, frame: int, recipe: Recipe, camera: Camera, view: View) -> BoxWater | None:
+        """What the flood does to the frame's boxes; None without a flood or labels."""
+        has_labels = recipe.output.labels and frame in self._setup.labelled
+        if view.flood is None or not has_labels:
+            return None
+        assert view.water is not None  # check_view has seen to it
+        if frame not in self._boxes:
+            self._boxes[frame] = self._scene.boxes(frame)
+        origin = np.asarray(self._scene.world_origin_m, np.float64)
+        return measure_boxes(self._boxes[frame], origin, camera, view.water, view.flood)
+
+    def _write(self, done: Outcome, recipe: Recipe, view: View, lidar: Future) -> None:
+        """Write the files of a view and deliver `done`, completed, or a failure in its place."""
+        out_dir = Path(self._setup.out_dir)
+        paths = item_paths(self._scene.name, recipe, done.camera, done.frame)
+        passed = lidar.result()
+        if isinstance(passed, str):
+            self._deliver(Outcome(done.variant, done.frame, done.camera, FAILED, passed))
+            return
+        try:
+            written = write_view(out_dir, paths, view, recipe)
+        except ValueError as error:
+            message = describe(error, "encoding")
+            self._deliver(Outcome(done.variant, done.frame, done.camera, FAILED, message))
+            return
+        seconds = {**done.seconds, "encode": written.encode_s, "write": written.write_s}
+        self._deliver(replace(done, checksum=written.checksum, lidar=passed, seconds=seconds))
 
     def _pass_lidar(self, chunk: Chunk, recipe: Recipe) -> bool | str:
         """Copy the frame's sweep unless it is there already.
@@ -170,7 +194,7 @@ class FrameRunner:
         """
         if not recipe.output.lidar or chunk.frame not in self._setup.labelled:
             return False
-        paths = item_paths(self._scene.name, variant_name(recipe), "", chunk.frame, recipe.output)
+        paths = item_paths(self._scene.name, recipe, "", chunk.frame)
         assert paths.lidar is not None
         target = Path(self._setup.out_dir) / paths.lidar
         if target.exists():

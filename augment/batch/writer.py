@@ -14,10 +14,11 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from augment.batch.atomic import write_atomic
-from augment.batch.encode import encode_depth, encode_ids, encode_image
+from augment.batch.encode import encode_depth, encode_ids, encode_image, encode_mask
 from augment.batch.layout import ItemPaths
+from augment.batch.water_labels import Flooded
 from augment.cameras import Camera
-from recipes.schema import Output
+from recipes.schema import Recipe
 
 
 @runtime_checkable
@@ -28,6 +29,8 @@ class View(Protocol):
     depth_m: np.ndarray | None  # float32 [H, W], 0 = none
     semantic: np.ndarray | None  # uint8 [H, W]
     instance: np.ndarray | None  # uint16 [H, W]
+    water: np.ndarray | None  # uint8 [H, W], 0 or 255
+    flood: Flooded | None
 
 
 @dataclass(frozen=True)
@@ -39,23 +42,30 @@ class Written:
     write_s: float
 
 
-def check_view(view: View, camera: Camera, output: Output) -> None:
+def check_view(view: View, camera: Camera, recipe: Recipe) -> None:
     """Raise ValueError unless the view has the camera's size and the buffers the recipe asks for.
 
     camera: at the written resolution.
     """
+    output, has_flood = recipe.output, recipe.weather.flood is not None
+    if (view.flood is not None) != has_flood:
+        raise ValueError(
+            f"the renderer returned {'no' if has_flood else 'a'} water level for a recipe "
+            f"{'with' if has_flood else 'without'} a flood"
+        )
     wanted = {
         "rgb": True,
         "depth_m": output.depth != "none",
         "semantic": output.semantic,
         "instance": output.instance,
+        "water": has_flood,
     }
     for name, needed in wanted.items():
         buffer = getattr(view, name)
         if (buffer is not None) != needed:
             raise ValueError(
                 f"the renderer returned {'no' if needed else 'a'} {name} buffer, which the "
-                f"recipe's output section {'asks' if needed else 'does not ask'} for"
+                f"recipe {'asks' if needed else 'does not ask'} for"
             )
         if needed and buffer.shape[:2] != (camera.height, camera.width):
             raise ValueError(
@@ -64,7 +74,7 @@ def check_view(view: View, camera: Camera, output: Output) -> None:
             )
 
 
-def write_view(out_dir: Path, paths: ItemPaths, view: View, output: Output) -> Written:
+def write_view(out_dir: Path, paths: ItemPaths, view: View, recipe: Recipe) -> Written:
     """Encode and write all files of a view that `check_view` has passed.
 
     Raises:
@@ -82,7 +92,10 @@ def write_view(out_dir: Path, paths: ItemPaths, view: View, output: Output) -> W
     if paths.instance is not None:
         assert view.instance is not None
         files[paths.instance] = encode_ids(view.instance, np.uint16)
-    files[paths.image] = encode_image(view.rgb, output)
+    if paths.water is not None:
+        assert view.water is not None
+        files[paths.water] = encode_mask(view.water)
+    files[paths.image] = encode_image(view.rgb, recipe.output)
     checksum = hashlib.sha256(files[paths.image]).hexdigest()
     encoded = time.perf_counter()
     for relative, data in files.items():

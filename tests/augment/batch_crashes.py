@@ -25,6 +25,7 @@ from augment.batch.job import RenderJob, run_job
 from augment.batch.journal import Journal
 from augment.batch.label_files import lidar_bytes
 from augment.batch.layout import STATE_FOLDER
+from recipes.flood import Flood
 
 STRIDE = 17  # odd, so that kills come before and after calls; 1 tries every point
 SYNC_POINTS = ("fsync", "replace", "unlink", "rename", "rmdir")
@@ -40,7 +41,7 @@ def main(folder: Path) -> None:
 
 
 def job(folder: Path, frames: int = 2, **options) -> RenderJob:
-    recipe = make_recipe(instance=False, semantic=False)
+    recipe = make_recipe(instance=False, semantic=False, flood=Flood(level_m=0.3))
     return RenderJob(f"fake:street?frames={frames}", [recipe], folder, **options)
 
 

@@ -20,9 +20,12 @@ from augment.errors import AdapterError
 from augment.labels import Boxes, LidarSweep
 from augment.scene import Gaussians, Scene
 from augment.sky import ConstantSky
+from recipes.flood import Flood
 from recipes.schema import Output, Recipe, Smog, Weather
 
 ORIGIN_M = np.array([448_262.123456789, 4_421_337.987654321, 41.5])
+LEVEL_Z_M = 0.2
+DRY_NS = 10**18 + 300_000_001  # frame 3, rear/left
 SIZE = (24, 16)  # width and height of the cameras, pixels
 
 
@@ -65,11 +68,19 @@ class FakeLabels:
 
 
 @dataclass(frozen=True)
+class FakeFlood:
+    level_z_m: float
+    scene_depth_m: np.ndarray | None
+
+
+@dataclass(frozen=True)
 class FakeView:
     rgb: np.ndarray
     depth_m: np.ndarray | None
     semantic: np.ndarray | None
     instance: np.ndarray | None
+    water: np.ndarray | None = None
+    flood: FakeFlood | None = None
 
 
 def open_fake(uri: str) -> Scene:
@@ -123,9 +134,11 @@ def make_camera(name: str, time_ns: int, forward_m: float) -> Camera:
     return Camera(name, width, height, 20.3, 20.1, 12.25, 8.5, camera_from_world, time_ns)
 
 
-def make_recipe(name: str = "fog", variant: int = 0, **output) -> Recipe:
+def make_recipe(
+    name: str = "fog", variant: int = 0, flood: Flood | None = None, **output
+) -> Recipe:
     smog = Smog(visibility_m=50.0 + variant)
-    weather = Weather(smog=smog if name == "fog" else None)
+    weather = Weather(smog=smog if name == "fog" else None, flood=flood)
     settings = {"semantic": True, "instance": True, **output}
     return Recipe(name=name, variant=variant, seed=7, weather=weather, output=Output(**settings))
 
@@ -139,12 +152,25 @@ def fake_render(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str) -
     shape = (camera.height, camera.width)
     output = recipe.output
     depth = rng.uniform(-10, 300, shape).astype(np.float32)
+    has_flood = recipe.weather.flood is not None
     return FakeView(
         rgb=rng.integers(0, 256, (*shape, 3), dtype=np.uint8),
         depth_m=None if output.depth == "none" else depth,
         semantic=rng.integers(0, 15, shape, dtype=np.uint8) if output.semantic else None,
         instance=rng.integers(0, 600, shape).astype(np.uint16) if output.instance else None,
+        **(fake_flood(camera, rng) if has_flood else {}),
     )
+
+
+def fake_flood(camera: Camera, rng: np.random.Generator) -> dict:
+    """Water on a third of the pixels, none in view of one image; surfaces where the boxes are."""
+    shape = (camera.height, camera.width)
+    if camera.timestamp_ns == DRY_NS:
+        return {"water": np.zeros(shape, np.uint8), "flood": FakeFlood(LEVEL_Z_M, None)}
+    return {
+        "water": np.where(rng.random(shape) < 1 / 3, 255, 0).astype(np.uint8),
+        "flood": FakeFlood(LEVEL_Z_M, rng.uniform(0, 4, shape).astype(np.float32)),
+    }
 
 
 def slow_render(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str) -> FakeView:

@@ -62,7 +62,7 @@ def test_files_hold_what_was_rendered(tmp_path: Path) -> None:
     scene = open_fake("fake:street")
     for frame in scene.frames:
         for name, camera in frame.cameras.items():
-            paths = item_paths("street", "fog-000", name, frame.index, recipe.output)
+            paths = item_paths("street", recipe, name, frame.index)
             view = fake_render(scene, camera, recipe, backend="auto")
             image = cv2.imread(str(tmp_path / paths.image), cv2.IMREAD_COLOR_RGB)
             np.testing.assert_array_equal(image, view.rgb)
@@ -101,6 +101,9 @@ def test_manifest_has_a_row_for_every_image(tmp_path: Path) -> None:
         "calibration_path": "street/fog-000/calibration.json",
         "width": SIZE[0],
         "height": SIZE[1],
+        "surface": "scene",
+        "water_path": None,
+        "box_water_path": None,
         "seed": 7,
         "recipe": "fog",
         "recipe_hash": recipe.hash,
@@ -112,11 +115,12 @@ def test_manifest_has_a_row_for_every_image(tmp_path: Path) -> None:
         "message": "",
     }
     assert {name: row[name] for name in expected} == expected
-    numbers = {name: row[name] for name in row if name.startswith("smog_")}
+    numbers = {name: row[name] for name in row if name.startswith(("smog_", "flood_"))}
     assert numbers.keys() == recipe.weather_numbers().keys()
     assert numbers["smog_extinction_per_m"] == recipe.weather_numbers()["smog_extinction_per_m"]
     assert rows[1]["lidar_path"] is None  # the dataset has no sweep there
-    assert all((tmp_path / row[name]).is_file() for name in row if name.endswith("_path"))
+    files = [row[name] for name in row if name.endswith("_path") and row[name] is not None]
+    assert len(files) == 7 and all((tmp_path / file).is_file() for file in files)
 
 
 def test_labels_and_lidar_pass_through_to_the_bit(tmp_path: Path) -> None:
