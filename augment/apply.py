@@ -6,17 +6,18 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from augment.cameras import Camera
 from augment.plan import Plan, make_plan
-from augment.render.buffers import RenderOutput
+from augment.render.buffers import EXPECTED_DEPTH, RenderOutput
 from augment.render.composite import composite_sky, map_colors, quantise
 from augment.render.rasterize import rasterize
 from augment.scene import PosedGaussians, Scene
 from augment.semantics import SemanticClass
-from augment.weather.smog import fog_buffers
+from augment.weather.flood_view import Painter, render_flooded
+from augment.weather.smog import fog_raster
 from recipes.schema import Recipe
 
 SURFACE_ALPHA = 0.5  # a pixel less covered than this shows more sky than surface: it has no depth
@@ -26,7 +27,10 @@ SURFACE_ALPHA = 0.5  # a pixel less covered than this shows more sky than surfac
 class WeatheredBuffers:
     """One finished view in floats. rgb [H, W, 3]: display-encoded, not clamped, sky included.
 
-    depth_m [H, W]: z along the optical axis, 0 where there is no surface; None unless planned.
+    raster: the buffers of the scene's surfaces; under water too, then without colours.
+    depth_m [H, W]: z along the optical axis of the scene's surface, 0 where there is none; None
+    unless planned. water [H, W]: where a ray meets water first; None where no water is in view.
+    water_depth_m [H, W]: z of its surface there, else 0.
     """
 
     camera: Camera
@@ -34,6 +38,8 @@ class WeatheredBuffers:
     raster: RenderOutput
     depth_m: Float[Tensor, "H W"] | None
     parts: tuple[PosedGaussians, ...]
+    water: Bool[Tensor, "H W"] | None = None
+    water_depth_m: Float[Tensor, "H W"] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,11 +47,11 @@ class FloodedView:
     """What a view's labels under water are measured from.
 
     level_z_m: the water's surface, scene world. scene_depth_m: float32 [H, W], z of the scene's own
-    surface, seen through the water where there is some; 0 = none.
+    surface, seen through the water where there is some; 0 = none. None where no label needs it.
     """
 
     level_z_m: float
-    scene_depth_m: np.ndarray
+    scene_depth_m: np.ndarray | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +61,7 @@ class WeatheredView:
     rgb: uint8 [H, W, 3]. depth_m: float32 [H, W], 0 = none. semantic: uint8 [H, W], SemanticClass.
     instance: uint16 [H, W], 0 = background or sky, else 1 + the actor's index in the scene.
     water: uint8 [H, W], 255 where a ray meets water first, else 0; None where the recipe has no
-    flood. flood: None where no water is in view.
+    flood. flood: None where the recipe has no flood.
     """
 
     camera: Camera
@@ -73,19 +79,29 @@ def render_view(
     """The view of `camera` (before recipe.render.scale) under the recipe's weather, in 8 bits."""
     plan = make_plan(recipe, scene)
     buffers = render_buffers(scene, camera.scaled(recipe.render.scale), plan, backend=backend)
-    semantic = instance = None
+    first = buffers.water if plan.shows_water else None  # pixels that show the water itself
+    semantic = instance = depth = None
     if plan.semantic:
-        semantic = _look_up(
-            buffers.raster, semantic_table(buffers.parts), int(SemanticClass.SKY), np.uint8
-        )
+        table = semantic_table(buffers.parts)
+        semantic = _look_up(buffers.raster, table, int(SemanticClass.SKY), np.uint8)
+        if first is not None:
+            semantic[first.numpy()] = int(SemanticClass.WATER)
     if plan.instance:
         instance = _look_up(buffers.raster, instance_table(buffers.parts), 0, np.uint16)
+        if first is not None:
+            instance[first.numpy()] = 0
+    if plan.depth_buffer is not None and buffers.depth_m is not None:
+        depth = buffers.depth_m
+        if first is not None and buffers.water_depth_m is not None:
+            depth = torch.where(first, buffers.water_depth_m, depth)
     return WeatheredView(
         camera=buffers.camera,
         rgb=quantise(buffers.rgb),
-        depth_m=None if buffers.depth_m is None else buffers.depth_m.float().numpy(),
+        depth_m=None if depth is None else depth.float().numpy(),
         semantic=semantic,
         instance=instance,
+        water=_water_mask(buffers) if recipe.weather.flood is not None else None,
+        flood=_flooded(buffers, plan),
     )
 
 
@@ -94,6 +110,38 @@ def render_buffers(
 ) -> WeatheredBuffers:
     """The view of `camera` at its own resolution, as floats."""
     parts = scene.parts_for(camera)
+    flooded = None
+    if plan.flood is not None:
+        painter = Painter(
+            parts, scene.sky, plan.settings, plan.smog_in_splats, plan.smog_on_buffers, backend
+        )
+        flooded = render_flooded(painter, camera, plan.flood, plan.buffers)
+    if flooded is not None:
+        rgb, raster = flooded.rgb, flooded.scene
+    else:
+        rgb, raster = _without_water(scene, parts, camera, plan, backend)
+    color_map = scene.color_map(camera.name) if plan.recorded_exposure else None
+    if color_map is not None:  # a camera exposes what the weather has left, so this comes last
+        rgb = map_colors(rgb, color_map, fast=backend != "reference")
+    depth = None
+    if plan.depth_buffer is not None or plan.measures_flood:
+        z = getattr(raster, plan.depth_buffer or EXPECTED_DEPTH)
+        assert raster.alpha is not None
+        depth = torch.where(raster.alpha >= SURFACE_ALPHA, z, torch.zeros_like(z))
+    return WeatheredBuffers(
+        camera,
+        rgb,
+        raster,
+        depth,
+        parts,
+        water=None if flooded is None else flooded.water,
+        water_depth_m=None if flooded is None else flooded.water_depth_m,
+    )
+
+
+def _without_water(
+    scene: Scene, parts: tuple[PosedGaussians, ...], camera: Camera, plan: Plan, backend: str
+) -> tuple[Tensor, RenderOutput]:
     raster = rasterize(
         parts,
         camera,
@@ -105,31 +153,25 @@ def render_buffers(
     assert raster.rgb is not None and raster.alpha is not None
     rgb = raster.rgb
     if plan.smog_on_buffers is not None:
-        rgb = _fog_on_buffers(raster, camera, plan)
+        rgb = fog_raster(raster, camera, plan.smog_on_buffers)
     rgb = composite_sky(
         rgb, raster.alpha, camera, scene.sky, smog=plan.smog, fast=backend != "reference"
     )
-    color_map = scene.color_map(camera.name) if plan.recorded_exposure else None
-    if color_map is not None:  # a camera exposes what the weather has left, so this comes last
-        rgb = map_colors(rgb, color_map, fast=backend != "reference")
-    depth = None
-    if plan.depth_buffer is not None:
-        z = getattr(raster, plan.depth_buffer)
-        depth = torch.where(raster.alpha >= SURFACE_ALPHA, z, torch.zeros_like(z))
-    return WeatheredBuffers(camera, rgb, raster, depth, parts)
+    return rgb, raster
 
 
-def _fog_on_buffers(raster: RenderOutput, camera: Camera, plan: Plan) -> Tensor:
-    smog = plan.smog_on_buffers
-    assert smog is not None and raster.rgb is not None
-    assert raster.alpha is not None and raster.expected_depth is not None
-    depth = raster.expected_depth
-    ray_distance = depth * camera.ray_lengths(depth.dtype)
-    eye_z_m = float(camera.centre[2])
-    point_z_m = None
-    if smog.scale_height_m is not None:
-        point_z_m = eye_z_m + depth * camera.ray_directions(depth.dtype)[..., 2]
-    return fog_buffers(raster.rgb, raster.alpha, ray_distance, smog, eye_z_m, point_z_m)
+def _water_mask(buffers: WeatheredBuffers) -> np.ndarray:
+    """uint8 [H, W]: 255 where a ray meets water first, else 0."""
+    if buffers.water is None:
+        return np.zeros((buffers.camera.height, buffers.camera.width), np.uint8)
+    return buffers.water.numpy().astype(np.uint8) * np.uint8(255)
+
+
+def _flooded(buffers: WeatheredBuffers, plan: Plan) -> FloodedView | None:
+    if plan.flood_level_z_m is None:
+        return None
+    depth = buffers.depth_m if plan.measures_flood else None
+    return FloodedView(plan.flood_level_z_m, None if depth is None else depth.float().numpy())
 
 
 def semantic_table(parts: tuple[PosedGaussians, ...]) -> np.ndarray:

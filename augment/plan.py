@@ -7,10 +7,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from augment.errors import SceneError
+from augment.place import gaussians_below, place_flood, place_smog
 from augment.render.buffers import ALPHA, EXPECTED_DEPTH, MEDIAN_DEPTH, RGB, SPLAT_IDS
 from augment.render.constants import RasterSettings
 from augment.scene import Scene
+from augment.weather.flood import FloodMedium
 from augment.weather.smog import SmogMedium
 from recipes.schema import Recipe
 
@@ -34,6 +35,9 @@ class Plan:
     rasteriser; smog_on_buffers: smog applied to finished buffers; at most one of them is set.
     recorded_exposure: whether cameras' colour maps apply to the finished picture.
     depth_buffer: which buffer is written as depth, or None. steps: every pass considered, in order.
+    flood: the water, None where there is none. shows_water: whether depth, semantic and instance
+    images show the water's surface or the scene's under it. measures_flood: whether the depth of
+    the scene's surfaces is needed for what labels say of the flood.
     """
 
     settings: RasterSettings
@@ -45,6 +49,10 @@ class Plan:
     instance: bool
     steps: tuple[Step, ...]
     recorded_exposure: bool = False
+    flood: FloodMedium | None = None
+    flood_level_z_m: float | None = None
+    shows_water: bool = False
+    measures_flood: bool = False
 
     @property
     def smog(self) -> SmogMedium | None:
@@ -65,6 +73,10 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
     Raises:
         SceneError: the recipe needs a fact that the scene does not know (the road's height).
     """
+    flood, flood_reason = place_flood(recipe, scene)
+    level_z_m = None if flood is None else flood.level_z_m
+    if flood is not None and not gaussians_below(scene, flood.level_z_m):
+        flood, flood_reason = None, f"no splat reaches below the level, z = {flood.level_z_m:.2f} m"
     smog, smog_reason = place_smog(recipe, scene)
     per_gaussian = recipe.weather.smog is not None and recipe.weather.smog.model == "per_gaussian"
     depth_buffer = DEPTH_BUFFERS.get(recipe.output.depth)
@@ -72,6 +84,9 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
     if depth_buffer:
         buffers.add(depth_buffer)
     if smog and not per_gaussian:
+        buffers.add(EXPECTED_DEPTH)
+    measures_flood = flood is not None and recipe.output.labels and scene.labels is not None
+    if measures_flood and not depth_buffer:
         buffers.add(EXPECTED_DEPTH)
     if recipe.output.semantic or recipe.output.instance:
         buffers.add(SPLAT_IDS)
@@ -92,11 +107,16 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
         semantic=recipe.output.semantic,
         instance=recipe.output.instance,
         recorded_exposure=exposure.runs,
+        flood=flood,
+        flood_level_z_m=level_z_m,
+        shows_water=flood is not None and recipe.output.surface == "first",
+        measures_flood=measures_flood,
         steps=(
             Step("rasterise", True, f"{actors}; buffers {', '.join(sorted(buffers))}"),
             _smog_step("per Gaussian", smog, per_gaussian, smog_reason),
             _smog_step("on buffers", smog, not per_gaussian, smog_reason),
             _sky_step(smog),
+            *_flood_steps(flood, flood_reason),
             exposure,
             Step(
                 "depth image",
@@ -107,29 +127,6 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
             Step("instance image", recipe.output.instance, _asked("instance", recipe)),
         ),
     )
-
-
-def place_smog(recipe: Recipe, scene: Scene) -> tuple[SmogMedium | None, str]:
-    """The recipe's smog in the scene's heights, or None where it would change nothing; and why."""
-    smog = recipe.weather.smog
-    if smog is None:
-        return None, "the recipe has no smog"
-    if smog.sigma_per_m == 0:
-        return None, "the smog has no density, so it changes nothing"
-    base_z_m = 0.0
-    reason = f"extinction {smog.sigma_per_m:.6g}/m, model {smog.model}"
-    if smog.scale_height_m is not None:
-        if scene.ground_z_m is None:
-            raise SceneError(
-                f"weather.smog.scale_height_m = {smog.scale_height_m} needs the road's height, "
-                f"which scene {scene.name!r} ({scene.source}) does not know; remove "
-                f"scale_height_m, or add ground_z=HEIGHT to the scene's URI"
-            )
-        base_z_m = scene.ground_z_m + smog.base_height_m
-        reason += f", scale height {smog.scale_height_m:g} m above z = {base_z_m:.2f} m"
-    if not scene.has_metric_scale:
-        reason += "; the scene's unit is not known to be a metre, so densities are per scene unit"
-    return SmogMedium(smog.sigma_per_m, smog.color, smog.scale_height_m, base_z_m), reason
 
 
 def _smog_step(how: str, smog: SmogMedium | None, chosen: bool, reason: str) -> Step:
@@ -144,6 +141,25 @@ def _sky_step(smog: SmogMedium | None) -> Step:
     if smog.scale_height_m is None:
         return Step("sky", False, "uniform smog hides it: the airlight colour stands for it")
     return Step("sky", True, "sampled, then faded through the smog up to infinity")
+
+
+def _flood_steps(flood: FloodMedium | None, reason: str) -> tuple[Step, ...]:
+    """What runs does so in views that the water's plane reaches; the others are drawn as ever."""
+    if flood is None:
+        names = ("flood: waves", "flood: bed", "flood: mirrored view", "flood: screen march")
+        return tuple(Step(name, False, reason) for name in names)
+    waves, tier = len(flood.waves.amplitudes_m), flood.reflection
+    mirrored = {
+        "sky": "reflection 'sky' shows no scene",
+        "screen_space": "at a quarter of the resolution, for what the screen does not show",
+        "mirrored": "at full resolution",
+    }
+    return (
+        Step("flood: waves", waves > 0, reason if waves else "the surface is still"),
+        Step("flood: bed", True, f"{reason}; splats are cut at the surface"),
+        Step("flood: mirrored view", tier != "sky", mirrored[tier]),
+        Step("flood: screen march", tier == "screen_space", f"reflection is {tier!r}"),
+    )
 
 
 def _exposure_step(recipe: Recipe, scene: Scene) -> Step:

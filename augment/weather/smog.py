@@ -20,6 +20,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from augment.cameras import Camera
+from augment.render.buffers import RenderOutput
+
 MAX_EXPONENT = 80.0  # exp(80) is still finite in float32; smog that dense has t = 0 at any distance
 
 
@@ -121,3 +124,16 @@ def fog_buffers(
     t = torch.exp(-tau)[..., None]
     airlight = torch.tensor(medium.rgb, dtype=rgb.dtype)
     return t * rgb + (1 - t) * alpha[..., None] * airlight
+
+
+def fog_raster(raster: RenderOutput, camera: Camera, medium: SmogMedium) -> Float[Tensor, "H W 3"]:
+    """Deferred smog on a render with colour, alpha and expected depth."""
+    assert raster.rgb is not None
+    assert raster.alpha is not None and raster.expected_depth is not None
+    depth = raster.expected_depth
+    ray_distance = depth * camera.ray_lengths(depth.dtype)
+    eye_z_m = float(camera.centre[2])
+    point_z_m = None
+    if medium.scale_height_m is not None:
+        point_z_m = eye_z_m + depth * camera.ray_directions(depth.dtype)[..., 2]
+    return fog_buffers(raster.rgb, raster.alpha, ray_distance, medium, eye_z_m, point_z_m)

@@ -1,0 +1,116 @@
+"""Where a camera sees a level plane, and the camera mirrored in it."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from augment.cameras import Camera
+from augment.geometry import rigid
+
+
+@dataclass(frozen=True)
+class Window:
+    """Columns left to right - 1 and rows top to bottom - 1 of an image; may reach beyond it."""
+
+    left: int
+    top: int
+    right: int
+    bottom: int
+
+    def of(self, camera: Camera) -> Camera:
+        """The camera's view through this window."""
+        return camera.cropped(self.left, self.top, self.right - self.left, self.bottom - self.top)
+
+    def grown(self, left: int, top: int, right: int, bottom: int) -> Window:
+        """The window with this many pixels more on each side."""
+        return Window(self.left - left, self.top - top, self.right + right, self.bottom + bottom)
+
+    def paste(self, into: Tensor, values: Tensor) -> None:
+        """Write those of the window's pixels [h, w, ...] that lie in the image [H, W, ...]."""
+        height, width = into.shape[:2]
+        rows = slice(max(self.top, 0), min(self.bottom, height))
+        columns = slice(max(self.left, 0), min(self.right, width))
+        into[rows, columns] = values[
+            rows.start - self.top : rows.stop - self.top,
+            columns.start - self.left : columns.stop - self.left,
+        ]
+
+    def cut(self, image: Tensor) -> Tensor:
+        """The window's pixels of an image [H, W, ...] that contains it."""
+        return image[self.top : self.bottom, self.left : self.right]
+
+
+def plane_window(camera: Camera, level_z_m: float) -> Window | None:
+    """The least window with all pixels whose rays meet the plane; None where no ray does.
+
+    A ray meets the plane where it falls, from an eye above it, or rises, from an eye below it. From
+    an eye in the plane rays are taken to meet it where they rise.
+    """
+    side = -1.0 if float(camera.centre[2]) > level_z_m else 1.0
+    # World z along the camera's axes: of a ray it is linear in column and row.
+    right, down, ahead = (side * v for v in camera.camera_from_world[:3, 2].tolist())
+    from_columns = _most(right / camera.fx, camera.width, camera.cx)
+    from_rows = _most(down / camera.fy, camera.height, camera.cy)
+    columns = _span(right / camera.fx, from_rows + ahead, camera.width, camera.cx)
+    rows = _span(down / camera.fy, from_columns + ahead, camera.height, camera.cy)
+    if columns is None or rows is None:
+        return None
+    return Window(columns[0], rows[0], columns[1], rows[1])
+
+
+def _most(slope: float, size: int, centre: float) -> float:
+    """The largest slope (i + 0.5 - centre) over the pixels i."""
+    return max(slope * (0.5 - centre), slope * (size - 0.5 - centre))
+
+
+def _span(slope: float, best: float, size: int, centre: float) -> tuple[int, int] | None:
+    """First and one past the last i with slope (i + 0.5 - centre) + best > 0 in [0, size)."""
+    first, last = 0, size
+    if slope == 0:
+        return (0, size) if best > 0 else None
+    edge = centre - 0.5 - best / slope  # where the sum is zero
+    if slope > 0:
+        first = max(first, math.floor(max(min(edge, size), -1.0)) + 1)
+    else:
+        last = min(last, math.ceil(max(min(edge, size), -1.0)))
+    return (first, last) if first < last else None
+
+
+def plane_depth(camera: Camera, level_z_m: float) -> Float[Tensor, "H W"]:
+    """z in metres, float64, at which pixels' rays meet the plane before the eye; else infinite."""
+    height = float(camera.centre[2]) - level_z_m
+    fall = -camera.ray_directions(torch.float64)[..., 2]
+    meets = fall > 0 if height > 0 else fall < 0
+    depth = height / torch.where(meets, fall, torch.ones_like(fall))
+    return torch.where(meets, depth, torch.full_like(depth, math.inf))
+
+
+def mirrored_camera(camera: Camera, level_z_m: float) -> Camera:
+    """The camera whose pictures are the reflections that `camera` sees in the plane.
+
+    It stands at the eye's mirror image. Mirroring turns left and right hands round, so the image
+    is turned upside down too, which makes it an ordinary camera again: its pixel (column, row) is
+    the reflection in the pixel (column, height - 1 - row).
+    """
+    mirror = torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64)
+    flip = torch.tensor([1.0, -1.0, 1.0], dtype=torch.float64)
+    rotation = flip[:, None] * camera.camera_from_world[:3, :3] * mirror
+    eye = camera.centre * mirror
+    eye[2] += 2 * level_z_m
+    return dataclasses.replace(
+        camera,
+        camera_from_world=rigid(rotation, -rotation @ eye),
+        cy=camera.height - camera.cy,
+    )
+
+
+def mirrored_window(window: Window, camera: Camera) -> Window:
+    """Where the reflections of a window's pixels stand in the mirrored camera's image."""
+    top, bottom = camera.height - window.bottom, camera.height - window.top
+    return Window(window.left, top, window.right, bottom)
