@@ -113,9 +113,7 @@ class _Compiler:
         """
         given: dict[str, Value | Items] = {}
         if isinstance(node, ScalarNode) and node.value is None and spec.items is None:
-            return (
-                given  # 'weather:' with nothing below it: the section is empty, the effect absent
-            )
+            return given  # 'weather:' with nothing below it: it is empty, an effect absent
         if not isinstance(node, MapNode):
             known = ", ".join(spec.known)
             text = f"{path} = {show(node)}: must be a mapping, with {known}"

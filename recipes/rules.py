@@ -58,9 +58,8 @@ def broken_rules(model: type[BaseModel], given: Mapping[str, Value | Items]) -> 
 
 def _drawn(name: str, value: Value | Items, end: Any) -> str:
     if isinstance(value, Items):
-        return (
-            f"all {name} at the {'low' if end == value.ends()[0] else 'high'} ends of their ranges"
-        )
+        which = "low" if end == value.ends()[0] else "high"
+        return f"all {name} at the {which} ends of their ranges"
     return f"{name} = {words(end)}"
 
 

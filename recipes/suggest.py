@@ -25,6 +25,7 @@ _SYNONYMS = {
     "depth_m": "level_m",
     "clarity": "turbidity_ntu",
     "ior": "refraction_index",
+    "refraction": "refraction_index",
     "wind": "waves",
     "ripples": "waves",
 }

@@ -40,6 +40,26 @@ TOP = st.dictionaries(st.sampled_from(KEYS), FLOW, max_size=5).map(
 SMOG = st.dictionaries(st.sampled_from(ROOT.sections["weather"].sections["smog"].known), FLOW).map(
     lambda d: "weather:\n  smog:\n" + "\n".join(f"    {key}: {value}" for key, value in d.items())
 )
+FLOODS = ROOT.sections["weather"].sections["flood"]
+WAVE_KEYS = FLOODS.sections["waves"].sections["components"].known
+WAVES = st.lists(
+    st.dictionaries(st.sampled_from(WAVE_KEYS), SCALARS).map(
+        lambda d: "{" + ", ".join(f"{key}: {value}" for key, value in d.items()) + "}"
+    ),
+    max_size=3,
+).map(lambda items: "{components: [" + ", ".join(items) + "]}")
+FLOOD = st.dictionaries(st.sampled_from(FLOODS.known), FLOW).flatmap(
+    lambda d: WAVES.map(
+        lambda waves: (
+            "weather:\n  flood:\n    level_m: 1\n"
+            + "".join(
+                f"    {key}: {waves if key == 'waves' else value}\n"
+                for key, value in d.items()
+                if key != "level_m"
+            )
+        )
+    )
+)
 GOOD = """version: 1
 seed: 7
 variants: 2
@@ -48,6 +68,13 @@ weather:
     visibility_m: {log_uniform: [100, 2000]}
     color: {choice: [[0.7, 0.7, 0.7], [0.7, {uniform: [0.6, 0.8]}, 0.7]], weights: [1, 2]}
     scale_height_m: {normal: {mean: 60, std: 10, min: 50, max: 90}}
+  flood:
+    level_m: {uniform: [0.1, 0.5]}
+    absorption_per_m: {uniform: [[1, 2, 3], [2, 3, 4]]}
+    waves:
+      components:
+        - {amplitude_m: 0.01, wavelength_m: {uniform: [1, 2]}, steepness: 0.06}
+        - {amplitude_m: 0.002, wavelength_m: 0.3}
 output: {image: png, jpeg_quality: {uniform: [60, 95]}}
 """
 # Without derandomize, one run in a thousand would test something that no other run repeats.
@@ -102,6 +129,12 @@ def test_known_keys_with_any_values(text: str) -> None:
 @FUZZ
 @given(SMOG)
 def test_smog_with_any_values(text: str) -> None:
+    loads_or_explains(text)
+
+
+@FUZZ
+@given(FLOOD)
+def test_flood_with_any_values(text: str) -> None:
     loads_or_explains(text)
 
 

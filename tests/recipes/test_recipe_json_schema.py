@@ -31,9 +31,14 @@ def test_every_field_is_in_the_schema_with_its_description() -> None:
     for section in ROOT.walk():
         node = schema
         for name in filter(None, section.path.split(".")):
-            node = node["properties"][name]["oneOf"][0]
+            node = node["properties"][name.removesuffix("[]")]["oneOf"][0]
+            if name.endswith("[]"):
+                assert node["description"].endswith("."), name
+                node = node["items"]
         assert node["additionalProperties"] is False
         assert set(node["properties"]) == set(section.known)
+        required = [name for name, spec in section.fields.items() if spec.required]
+        assert node.get("required", []) == required
         for name, spec in section.fields.items():
             if name != "version":
                 assert spec.description in node["properties"][name]["description"]
@@ -61,6 +66,17 @@ def with_smog(**fields: Any) -> dict:
     return {"weather": {"smog": {**SMOG, **fields}}}
 
 
+def with_flood(**fields: Any) -> dict:
+    return {"weather": {"flood": {"level_m": 0.2, **fields}}}
+
+
+def with_waves(*components: Any) -> dict:
+    return with_flood(waves={"components": list(components)})
+
+
+WAVE = {"amplitude_m": 0.02, "wavelength_m": 2.0}
+
+
 @pytest.mark.parametrize(
     "data",
     [
@@ -77,6 +93,18 @@ def with_smog(**fields: Any) -> dict:
         with_smog(color={"uniform": [[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]}),
         with_smog(model={"choice": ["deferred"], "weights": [2.0]}),
         {"output": {"jpeg_quality": {"uniform": [1, 2]}, "lidar": {"choice": [True, False]}}},
+        with_flood(),
+        with_flood(probability=0.5, reference={"choice": ["lowest", "median"]}),
+        with_flood(turbidity_ntu=3, absorption_per_m=None),
+        with_flood(turbidity_ntu=None, absorption_per_m=[0.0, 1e6, {"log_uniform": [1.0, 2.0]}]),
+        with_flood(absorption_per_m={"uniform": [[0.0, 0.0, 0.0], [9.0, 9.0, 9.0]]}),
+        with_flood(absorption_per_m={"choice": [None, [9.0, 9.0, 9.0]]}),
+        with_flood(waves=None),
+        with_flood(waves={"components": None, "seed": None}),
+        with_flood(waves={"preset": "wind", "direction_deg": {"uniform": [0.0, 360.0]}}),
+        with_waves(),
+        with_waves(WAVE, {**WAVE, "steepness": {"uniform": [0.0, 0.5]}}),
+        {"output": {"surface": {"choice": ["first", "scene"]}}},
     ],
 )
 def test_both_accept(data: dict, validator: Any) -> None:
@@ -117,6 +145,22 @@ def test_both_accept(data: dict, validator: Any) -> None:
         with_smog(probability={"uniform": [0.0, 1.0]}),
         {"render": {"sh_degree": 1.5}},
         {"output": {"lidar": "yes"}},
+        {"weather": {"flood": {}}},
+        {"weather": {"flood": {"level_m": None}}},
+        with_flood(turbidity_ntu=3, absorption_per_m=[1.0, 1.0, 1.0]),
+        with_flood(absorption_per_m=1.0),
+        with_flood(absorption_per_m=[1.0, 1.0]),
+        with_flood(absorption_per_m=[1.0, 1.0, -1.0]),
+        with_flood(absorption_per_m={"normal": {"mean": 1, "std": 1, "min": 0, "max": 2}}),
+        with_flood(waves="calm"),
+        with_flood(waves={"components": WAVE}),
+        with_flood(waves={"components": {"choice": [[WAVE]]}}),
+        with_waves(None),
+        with_waves({}),
+        with_waves({"amplitude_m": 0.1}),
+        with_waves({**WAVE, "steepness": 2}),
+        with_waves({**WAVE, "speed_mps": 2}),
+        with_waves(*[WAVE] * 65),
     ],
 )
 def test_both_refuse(data: dict, validator: Any) -> None:

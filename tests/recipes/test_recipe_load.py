@@ -96,7 +96,10 @@ def test_a_preset_comes_before_a_file_of_its_name(
 
 
 def test_the_presets_are_there() -> None:
-    assert preset_names() == ("brown-smog", "clear", "dense-fog", "light-haze")
+    assert preset_names() == (
+        *("brown-smog", "clear", "deep-flood", "dense-fog", "light-haze"),
+        *("puddled", "street-flood"),
+    )
     for name in preset_names():
         template = load_recipe(name)
         assert template.name == name

@@ -58,7 +58,10 @@ S = "r.yaml:4: weather.smog."
         ("colour: [0, 0, 0]", "colour: unknown field; did you mean color?"),
         ("probabilty: 1", "probabilty: unknown field; did you mean probability?"),
         ("scale: 1", "scale: unknown field here; did you mean render.scale?"),
-        ("seed: 1", "seed: unknown field here; did you mean seed at the top?"),
+        (
+            "seed: 1",
+            "seed: unknown field here; did you mean seed at the top or weather.flood.waves.seed?",
+        ),
         ("qqq: 1", "qqq: unknown field; known here: visibility_m, extinction_per_m, color, scale_"),
         ('"a\\nb": 1', "a\\nb: unknown field"),
         (

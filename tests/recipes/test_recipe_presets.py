@@ -6,8 +6,9 @@ import math
 
 import pytest
 
+from recipes.flood import Flood
 from recipes.load import load_recipe
-from recipes.schema import KOSCHMIEDER
+from recipes.schema import KOSCHMIEDER, Weather
 from recipes.values import as_number
 
 
@@ -31,7 +32,7 @@ def zenith(name: str) -> tuple[float, float]:
 def test_clear_is_without_weather() -> None:
     template = load_recipe("clear")
     assert template.describe_ranges() == {}
-    assert template.resolve(0).weather.smog is None
+    assert template.resolve(0).weather == Weather()
 
 
 @pytest.mark.parametrize(
@@ -64,3 +65,51 @@ def test_drawn_presets_differ_between_variants_and_are_pinned(name: str) -> None
 
 
 PINNED = {"light-haze": 1295.869842, "dense-fog": 86.84725686, "brown-smog": 434.2362843}
+
+
+FLOODS = {"puddled": -0.008174129998, "street-flood": 0.30912935, "deep-flood": 0.9182587}
+CROWN_M, GUTTER_M, KERB_M = 0.05, -0.062, 0.068  # over the lane of a road that falls 2 % sideways
+HUB_M, WINDOW_M = 0.3, 0.9
+
+
+def ends(name: str, field: str) -> tuple[float, float]:
+    low, high = dict(load_recipe(name).values)[f"weather.flood.{field}"].probes()
+    return as_number(low), as_number(high)
+
+
+def test_how_high_the_water_stands() -> None:
+    low, high = ends("puddled", "level_m")
+    assert GUTTER_M < low < high < CROWN_M < KERB_M, "gutters wet, crown and kerbs dry"
+    assert (low - GUTTER_M, high - GUTTER_M) == pytest.approx((0.05, 0.09), abs=0.005)
+    # the water's edge on a road that falls 2 % to either side
+    dry_m = [2 * (CROWN_M - level) / 0.02 for level in (high, low)]
+    assert dry_m == pytest.approx((2, 6), abs=0.01)
+    assert max(KERB_M, HUB_M) <= ends("street-flood", "level_m")[0]
+    assert ends("street-flood", "level_m")[1] < WINDOW_M <= ends("deep-flood", "level_m")[0]
+
+
+def test_how_deep_one_sees() -> None:
+    turbidities = ends("puddled", "turbidity_ntu")
+    through_4_cm = [
+        math.exp(-0.04 * extinction)
+        for turbidity in turbidities
+        for extinction in Flood(level_m=0, turbidity_ntu=turbidity).extinction_per_m_rgb
+    ]
+    assert (min(through_4_cm), max(through_4_cm)) == pytest.approx((0.66, 0.96), abs=0.005)
+    for name, shallow_cm, deep_cm in (("street-flood", 1, 3), ("deep-flood", 0.3, 1.3)):
+        depths_cm = [
+            100 / Flood(level_m=0, turbidity_ntu=turbidity).extinction_per_m_rgb[1]
+            for turbidity in ends(name, "turbidity_ntu")
+        ]
+        # as the comments round them
+        assert depths_cm[::-1] == pytest.approx((shallow_cm, deep_cm), rel=0.12)
+
+
+@pytest.mark.parametrize("name", FLOODS)
+def test_drawn_floods_are_pinned_and_brown(name: str) -> None:
+    variants = [load_recipe(name).resolve(i).weather for i in range(20)]
+    floods = [weather.flood for weather in variants if weather.flood is not None]
+    assert len(floods) == 20 and all(weather.smog is None for weather in variants)
+    assert floods[0].level_m == FLOODS[name]
+    assert len({flood.level_m for flood in floods}) == 20
+    assert all(red >= green >= blue for red, green, blue in (flood.color for flood in floods))

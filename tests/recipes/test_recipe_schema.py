@@ -11,10 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from recipes.fields import ROOT, FieldSpec, Kind
+from recipes.fields import CHANNEL, RATE, ROOT, FieldSpec, Kind
+from recipes.flood import Flood, Wave, Waves
+from recipes.load import load_recipe
+from recipes.parse import parse_recipe
 from recipes.schema import KOSCHMIEDER, Output, Recipe, Render, Smog, Weather
 
 FIELDS = [spec for section in ROOT.walk() for spec in section.fields.values()]
+NUMBERS = [spec for spec in FIELDS if spec.kind in (Kind.NUMBER, Kind.WHOLE)] + [CHANNEL, RATE]
 
 
 def smoggy(**smog: Any) -> Recipe:
@@ -89,6 +93,30 @@ def test_the_hash_is_pinned() -> None:
     """Output folders are resumed by it: it changes only with the format."""
     assert smoggy(visibility_m=300).hash == "272920d93c3e113c"
     assert Recipe().hash == "8553a2737c7b8e42"
+    assert Recipe(weather=Weather(flood=Flood(level_m=0.2))).hash == "efb12819c12b5307"
+
+
+def test_recipes_from_before_floods_keep_their_hashes() -> None:
+    """Every hash here is of the version before `weather.flood` and `output.surface`."""
+    text = """
+name: old
+seed: 5
+weather:
+  smog:
+    visibility_m: {uniform: [100, 500]}
+    color: {uniform: [[0.6, 0.5, 0.4], [0.7, 0.6, 0.5]]}
+    scale_height_m: 80
+render: {scale: 0.5, exposure: neutral}
+output: {semantic: true, image: jpg}
+"""
+    assert parse_recipe(text, source="old").resolve(3).hash == "031828409378fcb4"
+    before = {
+        "brown-smog": "74e961af5b7d3fe0",
+        "clear": "205ce53115366998",
+        "dense-fog": "d7f20162c99b23fc",
+        "light-haze": "2f5fabf9fcad2c3e",
+    }
+    assert {name: load_recipe(name).resolve(0).hash for name in before} == before
 
 
 def test_the_hash_does_not_depend_on_how_a_number_was_written() -> None:
@@ -106,6 +134,24 @@ OTHER = {
     "weather.smog.scale_height_m": 100,
     "weather.smog.base_height_m": 1,
     "weather.smog.model": "deferred",
+    "weather.flood.level_m": 0.3,
+    "weather.flood.reference": "median",
+    "weather.flood.turbidity_ntu": 51,
+    "weather.flood.absorption_per_m": None,  # in place of turbidity: below
+    "weather.flood.color": (0.42, 0.38, 0.31),
+    "weather.flood.refraction_index": 1,
+    "weather.flood.fresnel": "schlick",
+    "weather.flood.reflection": "sky",
+    "weather.flood.waves.preset": "still",
+    "weather.flood.waves.count": 25,
+    "weather.flood.waves.direction_deg": 31,
+    "weather.flood.waves.height": 1.5,
+    "weather.flood.waves.seed": 0,
+    "weather.flood.waves.components[].direction_deg": 1,
+    "weather.flood.waves.components[].amplitude_m": 0.02,
+    "weather.flood.waves.components[].wavelength_m": 1.1,
+    "weather.flood.waves.components[].steepness": 0.1,
+    "weather.flood.waves.components[].phase_deg": 90,
     "render.scale": 0.5,
     "render.near_m": 0.02,
     "render.alpha_max": 0.99,
@@ -115,6 +161,7 @@ OTHER = {
     "output.image": "jpg",
     "output.jpeg_quality": 91,
     "output.depth": "none",
+    "output.surface": "first",
     "output.semantic": True,
     "output.instance": True,
     "output.lidar": False,
@@ -124,25 +171,45 @@ OTHER = {
 
 def test_every_field_changes_the_hash() -> None:
     assert OTHER.keys() == {spec.path for spec in FIELDS}, "a new field needs a value here"
-    base = smoggy(visibility_m=300).model_dump()
-    hashes = {Recipe.model_validate(base).hash, smoggy(extinction_per_m=0.01).hash}
+    wave = Wave(amplitude_m=0.01, wavelength_m=1.0)
+    flood = Flood(level_m=0.2, waves=Waves(components=(wave,)))
+    base = Recipe(weather=Weather(smog=Smog(visibility_m=300), flood=flood))
+    cleared = flood.model_copy(update={"absorption_per_m": (1.0, 1.0, 1.0)})
+    hashes = {base.hash, smoggy(extinction_per_m=0.01).hash}
+    hashes.add(Recipe(weather=Weather(smog=base.weather.smog, flood=cleared)).hash)
     changes = {path: value for path, value in OTHER.items() if value is not None}
     for path, value in changes.items():
-        data = smoggy(visibility_m=300).model_dump()
+        data = base.model_dump()
         *sections, name = path.split(".")
         inner = data
         for section in sections:
-            inner = inner[section]
+            key = section.removesuffix("[]")
+            inner = inner[key] if key == section else inner[key][0]
         inner[name] = value
         hashes.add(Recipe.model_validate(data).hash)
-    assert len(hashes) == len(changes) + 2
+    assert len(hashes) == len(changes) + 3
 
 
 def test_numbers_for_the_manifest() -> None:
     clear = Recipe().weather_numbers()
     assert clear["smog_extinction_per_m"] == 0 and math.isnan(clear["smog_scale_height_m"])
     thick = smoggy(extinction_per_m=0.02, scale_height_m=50).weather_numbers()
-    assert thick == {"smog_extinction_per_m": 0.02, "smog_scale_height_m": 50.0}
+    assert (thick["smog_extinction_per_m"], thick["smog_scale_height_m"]) == (0.02, 50.0)
+    flooded = Recipe(weather=Weather(flood=Flood(level_m=0.2))).weather_numbers()
+    assert clear.keys() == thick.keys() == flooded.keys()
+    names = ("flood_level_m", "flood_turbidity_ntu", "flood_wave_height")
+    assert all(math.isnan(clear[name]) and math.isnan(thick[name]) for name in names)
+    assert [flooded[name] for name in names] == [0.2, 50.0, 1.0]
+
+
+def test_numbers_of_a_flood_that_says_more() -> None:
+    listed = Waves(components=(Wave(amplitude_m=0.1, wavelength_m=2),), height=2)
+    one = Recipe(weather=Weather(flood=Flood(level_m=0, absorption_per_m=(1, 2, 3), waves=listed)))
+    assert math.isnan(one.weather_numbers()["flood_turbidity_ntu"])
+    assert math.isnan(one.weather_numbers()["flood_wave_height"]), "no factor applies"
+    two = Recipe(weather=Weather(flood=Flood(level_m=0, turbidity_ntu=0, waves=Waves(height=0.5))))
+    assert two.weather_numbers()["flood_turbidity_ntu"] == 0
+    assert two.weather_numbers()["flood_wave_height"] == 0.5
 
 
 def test_every_field_is_described() -> None:
@@ -152,7 +219,7 @@ def test_every_field_is_described() -> None:
 
 @settings(max_examples=200, deadline=None, derandomize=True)
 @given(
-    spec=st.sampled_from([spec for spec in FIELDS if spec.kind in (Kind.NUMBER, Kind.WHOLE)]),
+    spec=st.sampled_from(NUMBERS),
     value=st.one_of(st.floats(), st.integers(), st.sampled_from([0, 1, 100, 4, 0.9999, 2**63])),
 )
 def test_the_limits_in_messages_are_those_of_the_schema(spec: FieldSpec, value: float) -> None:

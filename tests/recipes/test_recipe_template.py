@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from recipes.dump import dump_recipe
 from recipes.errors import RecipeError
+from recipes.flood import Flood, Wave, Waves
 from recipes.parse import parse_recipe
 from recipes.sampler import Draws
 from recipes.schema import Output, Recipe, Render, Smog, Weather
@@ -146,6 +147,12 @@ def test_a_rule_broken_by_a_draw_is_a_recipe_error() -> None:
     made = RecipeTemplate("x", "code", values=values, effects=(("weather.smog", 1.0),))
     with pytest.raises(RecipeError, match=r"^code: variant 0: weather.smog.color: Input should"):
         made.resolve(0)
+    values = (("weather.flood.waves.components[1].steepness", Fixed(2.0)),)
+    lists = (("weather.flood.waves.components", 2),)
+    made = RecipeTemplate("x", "code", values=values, lists=lists)
+    where = r"variant 0: weather\.flood\.waves\.components\[1\]\.steepness: Input should be less"
+    with pytest.raises(RecipeError, match=where):
+        made.resolve(0)
 
 
 def test_templates_and_errors_survive_pickling() -> None:
@@ -178,7 +185,100 @@ def test_a_dump_says_everything() -> None:
     assert "color: [0.7," in text
 
 
+FLOODED = """
+seed: 3
+weather:
+  flood:
+    level_m: {uniform: [0.1, 0.5]}
+    absorption_per_m: {uniform: [[1, 2, 3], [3, 6, 9]]}
+    waves:
+      components:
+        - {amplitude_m: {uniform: [0.01, 0.02]}, wavelength_m: 1, steepness: {choice: [0.1, 0.2]}}
+        - {amplitude_m: {uniform: [0.01, 0.02]}, wavelength_m: 2}
+"""
+PINNED_FLOOD = (0.1369834527, (1.79031723, 3.580634461, 5.370951691))
+PINNED_WAVES = (0.01428204438, 0.1, 0.01068017609)
+
+
+def flood_of(recipe: Recipe) -> Flood:
+    assert recipe.weather.flood is not None
+    return recipe.weather.flood
+
+
+def test_the_numbers_of_a_list_are_drawn_each_by_itself_and_pinned() -> None:
+    flood = flood_of(template(FLOODED).resolve(0))
+    assert flood.waves.components is not None
+    first, second = flood.waves.components
+    assert (flood.level_m, flood.absorption_per_m) == PINNED_FLOOD
+    assert (first.amplitude_m, first.steepness, second.amplitude_m) == PINNED_WAVES
+    assert (second.wavelength_m, second.steepness) == (2.0, 0.0)
+    for red, green, blue in (
+        flood_of(template(FLOODED).resolve(i)).extinction_per_m_rgb for i in range(5)
+    ):
+        # ten digits of each channel
+        assert (green, blue) == pytest.approx((2 * red, 3 * red), rel=1e-9)
+
+
+def test_another_wave_changes_no_draw() -> None:
+    more = template(FLOODED + "        - {amplitude_m: {uniform: [0, 0.1]}, wavelength_m: 3}\n")
+    for i in range(3):
+        here = flood_of(template(FLOODED).resolve(i)).waves.components
+        there = flood_of(more.resolve(i)).waves.components
+        assert here is not None and there is not None and there[:2] == here and len(there) == 3
+
+
+def test_ranges_of_a_list_in_words() -> None:
+    said = template(FLOODED).describe_ranges()
+    waves = "weather.flood.waves.components"
+    assert said["weather.flood.absorption_per_m"] == "uniform from [1, 2, 3] to [3, 6, 9] (1/metre)"
+    assert said[f"{waves}[0].steepness"] == "one of 0.1, 0.2"
+    assert said[f"{waves}[1].amplitude_m"] == "uniform from 0.01 to 0.02 (metres)"
+
+
+def test_a_flood_that_is_absent_takes_its_waves_along() -> None:
+    text = FLOODED.replace("  flood:\n", "  flood:\n    probability: 0.5\n")
+    pairs = [(template(FLOODED).resolve(i), template(text).resolve(i)) for i in range(12)]
+    kept = [(a, b) for a, b in pairs if b.weather.flood is not None]
+    assert 0 < len(kept) < 12
+    assert all(a == b for a, b in kept)
+
+
+def test_an_empty_list_is_a_list() -> None:
+    text = "weather: {flood: {level_m: 1, waves: {components: []}}}"
+    assert flood_of(template(text).resolve(0)).waves.components == ()
+    assert flood_of(read_back(template(text).resolve(0))).waves.components == ()
+    for absent in ("null", ""):
+        none = template(text.replace("[]", absent)).resolve(0)
+        assert flood_of(none).waves.components is None
+
+
+def test_flooded_recipes_read_back_equal() -> None:
+    for i in range(5):
+        recipe = template(FLOODED).resolve(i)
+        assert read_back(recipe) == recipe and read_back(recipe).hash == recipe.hash
+    text = dump_recipe(template(FLOODED).resolve(0))
+    assert "      - direction_deg: 0.0\n        amplitude_m: " in text, "a wave a paragraph"
+    assert "    absorption_per_m: [" in text, "rates on one line"
+
+
 finite = {"allow_nan": False, "allow_infinity": False}
+wave_models = st.builds(
+    Wave,
+    direction_deg=st.floats(-360, 360, **finite),
+    amplitude_m=st.floats(0, 1.5, **finite),  # 10 m / 2 pi is 1.59
+    wavelength_m=st.floats(10, 1e4, **finite),
+    steepness=st.floats(0, 0.2, **finite),  # five of them are 1
+)
+floods = st.builds(
+    Flood,
+    level_m=st.floats(-1e4, 1e4, **finite),
+    absorption_per_m=st.none() | st.tuples(*[st.floats(0, 1e6, **finite)] * 3),
+    waves=st.builds(
+        Waves,
+        seed=st.none() | st.integers(0, 2**63 - 1),
+        components=st.none() | st.lists(wave_models, max_size=5).map(tuple),
+    ),
+)
 smogs = st.builds(
     Smog,
     extinction_per_m=st.floats(0, 100, **finite),
@@ -192,7 +292,7 @@ recipes = st.builds(
     name=st.from_regex(r"\A[A-Za-z0-9][A-Za-z0-9._-]{0,63}\Z"),
     seed=st.integers(0, 2**63 - 1),
     variant=st.integers(0, 2**31 - 1),
-    weather=st.builds(Weather, smog=st.none() | smogs),
+    weather=st.builds(Weather, smog=st.none() | smogs, flood=st.none() | floods),
     render=st.builds(
         Render,
         scale=st.floats(0, 4, exclude_min=True, **finite),
