@@ -13,6 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 from batch_scenes import (
+    LEVEL_Z_M,
     ORIGIN_M,
     FakeLabels,
     fake_render,
@@ -24,16 +25,25 @@ from batch_scenes import (
 from torch.utils.data import DataLoader
 
 from augment.batch.job import RenderJob, run_job
+from augment.batch.water_labels import BoxWater, water_bytes
 from augment.dataset import SceneDataset, WeatherDataset, collate_frames
 from augment.errors import OutputError, SceneError
+from augment.weather.flood_labels import hidden_pixels, submerged_fraction
+from recipes.flood import Flood
 from recipes.schema import Recipe
 
-RECIPES = [make_recipe(), make_recipe(variant=1, image="jpg"), make_recipe("clear", depth="none")]
+FLOODED = make_recipe("clear", variant=9, flood=Flood(level_m=0.3), surface="first")
+RECIPES = [
+    make_recipe(),
+    make_recipe(variant=1, image="jpg"),
+    make_recipe("clear", depth="none"),
+    FLOODED,
+]
 
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Three variants of one scene; shared, so tests that damage files copy it."""
+    """Four variants of one scene; shared, so tests that damage files copy it."""
     out = tmp_path_factory.mktemp("dataset") / "out"
     job = RenderJob("fake:street", RECIPES, out)
     run_job(job, scene_loader=open_fake, renderer=fake_render, progress=False)
@@ -55,7 +65,8 @@ def assert_same_sample(a, b, *, but: tuple[str, ...] = ()) -> None:
         for key in a.keys() - set(but):
             assert_same_sample(a[key], b[key])
     elif isinstance(a, torch.Tensor):
-        assert a.dtype == b.dtype and torch.equal(a, b)
+        same = np.array_equal(a.numpy(), b.numpy(), equal_nan=a.is_floating_point())
+        assert a.dtype == b.dtype and same
     elif isinstance(a, np.ndarray):
         assert a.dtype == b.dtype and [repr(v) for v in a.ravel()] == [repr(v) for v in b.ravel()]
     elif isinstance(a, float):
@@ -64,7 +75,7 @@ def assert_same_sample(a, b, *, but: tuple[str, ...] = ()) -> None:
         assert a == b
 
 
-@pytest.mark.parametrize("recipe", RECIPES, ids=["png", "jpg", "no depth"])
+@pytest.mark.parametrize("recipe", RECIPES, ids=["png", "jpg", "no depth", "flood"])
 def test_live_samples_equal_written_ones(written: Path, recipe: Recipe) -> None:
     scene = open_fake("fake:street")
     live = SceneDataset(scene, recipe, renderer=fake_render)
@@ -110,11 +121,42 @@ def test_a_sample_holds_what_it_says(written: Path) -> None:
     assert (sample["scene"], sample["variant"], sample["frame"]) == ("street", "fog-000", 3)
 
 
+def test_a_flooded_sample_holds_what_it_says(written: Path) -> None:
+    files = WeatherDataset(written, variants=["clear-009"], cameras=["front"], frames=[3])
+    sample = files[0]
+    camera, boxes = make_frame(3).cameras["front"], FakeLabels().boxes(3)
+    view = fake_render(open_fake("fake:street"), camera, FLOODED, backend="")
+    assert sample["water"].dtype == torch.bool
+    np.testing.assert_array_equal(sample["water"].numpy(), view.water > 0)
+    assert sample["surface"] == "first"
+    submerged = submerged_fraction(boxes, ORIGIN_M, LEVEL_Z_M)
+    np.testing.assert_array_equal(sample["boxes"]["submerged_fraction"].numpy(), submerged)
+    counted = hidden_pixels(boxes, ORIGIN_M, camera, view.flood.scene_depth_m, view.water)
+    assert counted.hidden.sum() > 0
+    hidden = [h / p if p else np.nan for p, h in zip(counted.pixels, counted.hidden, strict=True)]
+    np.testing.assert_array_equal(sample["boxes"]["hidden_fraction"].numpy(), hidden)
+    assert sample["paths"]["water"].endswith("water/front/000003.png")
+    assert sample["paths"]["box_water"].endswith("labels/water.parquet")
+
+
+def test_batches_of_flooded_samples(written: Path) -> None:
+    flooded = WeatherDataset(written, variants=["clear-009"], frames=[2])
+    batch = collate_frames([flooded[0], flooded[1]])
+    assert batch["water"].shape == (2, 16, 24) and batch["water"].dtype == torch.bool
+    assert [boxes["hidden_fraction"].shape for boxes in batch["boxes"]] == [(2,), (2,)]
+    dry = WeatherDataset(written, variants=["fog-000"], frames=[2])
+    mixed = collate_frames([flooded[0], dry[0]])
+    assert mixed["water"][1] is None and mixed["surface"] == ["first", "scene"]
+    assert mixed["boxes"][1]["submerged_fraction"] is None
+
+
 def test_filters(written: Path) -> None:
-    assert len(WeatherDataset(written)) == 24
+    assert len(WeatherDataset(written)) == 32
+    flooded = WeatherDataset(written, where=pc.field("water_path").is_valid())
+    assert set(flooded.table["variant"].to_pylist()) == {"clear-009"}
     foggy = WeatherDataset(written, where=pc.field("smog_extinction_per_m") > 0)
     assert set(foggy.table["variant"].to_pylist()) == {"fog-000", "fog-001"}
-    assert len(WeatherDataset(written, cameras=["front"], frames=[0, 2])) == 6
+    assert len(WeatherDataset(written, cameras=["front"], frames=[0, 2])) == 8
     assert len(WeatherDataset(written, scenes=[])) == 0
     with pytest.raises(ValueError, match=r"no camera \['back'\]; finished are: front, rear/left"):
         WeatherDataset(written, cameras=["back"])
@@ -203,6 +245,50 @@ def test_images_of_another_kind_are_named(one_image: Path) -> None:
     )
     with pytest.raises(OutputError, match=r"depth/front/000001.png is damaged: expected.*uint16"):
         WeatherDataset(one_image)[0]
+
+
+@pytest.fixture
+def one_flooded_image(tmp_path: Path) -> Path:
+    job = RenderJob("fake:street", [FLOODED], tmp_path, frames=[1], cameras=["front"])
+    run_job(job, scene_loader=open_fake, renderer=fake_render, progress=False)
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("name", "damage", "message"),
+    [
+        ("water/front/000001.png", None, "water/front/000001.png cannot be read"),
+        ("water/front/000001.png", 40, "water/front/000001.png is damaged: not a complete PNG"),
+        ("labels/water.parquet", None, "water.parquet is missing or not a readable"),
+        ("labels/water.parquet", 50, "water.parquet is missing or not a readable"),
+    ],
+)
+def test_damaged_files_of_a_flood_are_named(one_flooded_image, name, damage, message) -> None:
+    path = one_flooded_image / "street" / "clear-009" / name
+    data = path.read_bytes()
+    path.unlink()
+    if damage is not None:
+        path.write_bytes(data[:damage])
+    with pytest.raises(OutputError, match=message):
+        WeatherDataset(one_flooded_image)[0]
+
+
+@pytest.mark.parametrize(
+    ("item", "message"),
+    [
+        ((2, "front"), "water.parquet is damaged: it lacks frame 1, camera 'front'"),
+        ((1, "front"), "water.parquet is damaged: frame 1, camera 'front': it has 0 boxes"),
+    ],
+)
+def test_numbers_of_other_boxes_are_refused(one_flooded_image: Path, item, message) -> None:
+    none = BoxWater((), np.zeros(0), np.zeros(0, np.int64), np.zeros(0, np.int64))
+    path = one_flooded_image / "street" / "clear-009" / "labels" / "water.parquet"
+    path.write_bytes(water_bytes({item: none}))
+    with pytest.raises(OutputError, match=message):
+        WeatherDataset(one_flooded_image)[0]
+    path.write_bytes((path.parent / "boxes.parquet").read_bytes())
+    with pytest.raises(OutputError, match="holds 'boxes' data; expected 'box water'"):
+        WeatherDataset(one_flooded_image)[0]
 
 
 def test_entries_missing_from_companions_are_named(one_image: Path) -> None:
