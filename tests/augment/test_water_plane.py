@@ -1,0 +1,115 @@
+"""Where a camera sees a level plane, and the mirrored camera."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from augment.cameras import Camera
+from augment.geometry import rigid, rotmat_from_quat
+from augment.weather.water_plane import (
+    Window,
+    mirrored_camera,
+    mirrored_window,
+    plane_depth,
+    plane_window,
+)
+from tests.scenes import camera_ahead
+
+
+def turned_camera(seed: int, width=31, height=19, position=(0.0, 0.0, 0.0)) -> Camera:
+    quat = torch.from_numpy(np.random.default_rng(seed).normal(size=4))
+    rotation = rotmat_from_quat(quat / quat.norm())
+    centre = torch.tensor(position, dtype=torch.float64)
+    return Camera(
+        "turned", width, height, 25.0, 27.0, 14.2, 9.7, rigid(rotation, -rotation @ centre)
+    )
+
+
+def looking(forward, down) -> Camera:
+    forward, down = (torch.tensor(v, dtype=torch.float64) for v in (forward, down))
+    rotation = torch.stack([torch.linalg.cross(down, forward), down, forward])
+    return Camera("c", 8, 6, 10.0, 10.0, 4.0, 3.0, rigid(rotation, torch.zeros(3).double()))
+
+
+@pytest.mark.parametrize("level_z_m", [-1.5, 1.5, 0.0])
+@pytest.mark.parametrize("seed", range(20))
+def test_the_window_is_the_least_that_holds_all_rays_that_meet_the_plane(seed, level_z_m):
+    camera = turned_camera(seed)
+    meets = plane_depth(camera, level_z_m).isfinite()
+    if level_z_m == 0.0:  # an eye in the plane: rays that rise
+        meets = camera.ray_directions(torch.float64)[..., 2] > 0
+    window = plane_window(camera, level_z_m)
+    if not bool(meets.any()):
+        assert window is None
+        return
+    rows, columns = meets.any(1).nonzero(), meets.any(0).nonzero()
+    assert window == Window(
+        int(columns.min()), int(rows.min()), int(columns.max()) + 1, int(rows.max()) + 1
+    )
+
+
+def test_straight_down_up_and_along():
+    down = looking((0.0, 0.0, -1.0), (-1.0, 0.0, 0.0))
+    up = looking((0.0, 0.0, 1.0), (1.0, 0.0, 0.0))
+    assert plane_window(down, -1.0) == Window(0, 0, 8, 6)
+    assert plane_window(up, -1.0) is None
+    assert plane_window(up, 1.0) == Window(0, 0, 8, 6)
+    along = looking((1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
+    assert plane_window(along, -1.0) == Window(0, 3, 8, 6)  # the rows below the horizon
+    assert plane_window(along.cropped(0, 0, 8, 3), -1.0) is None
+
+
+def test_depths_reach_the_plane():
+    camera = turned_camera(1, position=(3.0, -2.0, 5.0))
+    depth = plane_depth(camera, 2.0)
+    points = camera.centre + depth[..., None] * camera.ray_directions(torch.float64)
+    met = depth.isfinite()
+    assert bool(met.any()) and float((points[met][:, 2] - 2.0).abs().max()) < 1e-12
+    assert bool((depth[met] > 0).all())
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_pixel_of_the_mirrored_camera_looks_along_the_reflected_ray(seed):
+    camera, level = turned_camera(seed, position=(0.4, 0.3, 1.7)), -0.2
+    mirrored = mirrored_camera(camera, level)
+    rays = camera.ray_directions(torch.float64)
+    expected = rays * torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64)
+    assert torch.allclose(mirrored.ray_directions(torch.float64).flip(0), expected, atol=1e-12)
+    assert mirrored.centre.tolist() == pytest.approx([0.4, 0.3, 2 * level - 1.7])
+    # Twice mirrored is where it was.
+    back = mirrored_camera(mirrored, level)
+    assert torch.allclose(back.camera_from_world, camera.camera_from_world, atol=1e-12)
+
+
+def test_the_window_of_the_reflections():
+    camera = camera_ahead(33, 21)
+    window = Window(2, 12, 30, 21)
+    place = mirrored_window(window, camera)
+    assert place == Window(2, 0, 30, 9)
+    crop = place.of(mirrored_camera(camera, -1.0))
+    rays = window.of(camera).ray_directions(torch.float64)
+    expected = rays * torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64)
+    assert torch.allclose(crop.ray_directions(torch.float64).flip(0), expected, atol=1e-12)
+
+
+def test_cut_and_paste():
+    image = torch.arange(20.0).reshape(4, 5)
+    window = Window(1, 2, 4, 4)
+    assert torch.equal(window.cut(image), image[2:4, 1:4])
+    into = torch.zeros(4, 5)
+    beyond = Window(-1, 3, 2, 6)
+    beyond.paste(into, torch.arange(1.0, 10.0).reshape(3, 3))
+    expected = torch.zeros(4, 5)
+    expected[3, :2] = torch.tensor([2.0, 3.0])
+    assert torch.equal(into, expected)
+    assert window.grown(1, 2, 3, 4) == Window(0, 0, 7, 8)
+
+
+def test_pixels_of_a_window_keep_their_rays():
+    camera = turned_camera(7)
+    part = camera.cropped(-3, 5, 12, 40)
+    whole = camera.ray_directions(torch.float64)
+    inside = part.ray_directions(torch.float64)[: 19 - 5, 3:]
+    assert torch.allclose(inside, whole[5:, :9], atol=1e-13)
