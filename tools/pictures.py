@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -86,16 +87,27 @@ def _shown(groups: list[tuple[str, str]]) -> list[tuple[str, str]]:
 
 
 def _groups(rows: list[dict[str, Any]]) -> list[tuple[str, str]]:
-    """Scene and variant of every row, each once: the clearest weather of a scene first."""
-    density = {(row["scene"], row["variant"]): row["smog_extinction_per_m"] for row in rows}
-    return sorted(density, key=lambda group: (group[0], density[group], group[1]))
+    """Scene and variant of every row, each once: the clearest and driest of a scene first."""
+    weather = {
+        (row["scene"], row["variant"]): (row["smog_extinction_per_m"], _water_level(row))
+        for row in rows
+    }
+    return sorted(weather, key=lambda group: (group[0], *weather[group], group[1]))
+
+
+def _water_level(row: dict[str, Any]) -> float:
+    """Of the recipe's flood, metres; -infinity where it has none."""
+    level = row.get("flood_level_m", math.nan)  # no column in folders older than floods
+    return -math.inf if math.isnan(level) else level
 
 
 def _weather(row: dict[str, Any]) -> str:
     """The variant's name and what its weather means to a person."""
     from recipes.schema import KOSCHMIEDER
 
-    extinction = row["smog_extinction_per_m"]
-    if not extinction:
-        return f"{row['variant']} (no weather)"
-    return f"{row['variant']} (visibility {KOSCHMIEDER / extinction:.0f} m)"
+    said = []
+    if extinction := row["smog_extinction_per_m"]:
+        said.append(f"visibility {KOSCHMIEDER / extinction:.0f} m")
+    if math.isfinite(level := _water_level(row)):
+        said.append(f"water at {level:.2f} m")
+    return f"{row['variant']} ({', '.join(said) or 'no weather'})"
