@@ -5,9 +5,10 @@ The parameter point x of the still plane goes, with phase theta = k D.x - omega 
     x + sum (S / k) D cos(theta),   level + sum A sin(theta)
 
 k = 2 pi / wavelength, omega^2 = g k tanh(k h) for water of depth h, A the amplitude and S = Q k A
-the steepness (Q is the steepness of Tessendorf 2001 and of Finch in GPU Gems 1, chapter 1). The
-surface folds over itself where sum S exceeds 1. The normal is the cross product of the tangents
-d/dx and d/dy of all waves together, which no sum over single waves replaces.
+the steepness (Q as in Finch, GPU Gems 1, chapter 1). The surface folds over itself where sum S
+exceeds 1. The normal is the cross product of the tangents d/dx and d/dy of the whole sum. The usual
+closed form (-sum k A D cos(theta), 1 - sum S sin(theta)) is exact for one wave only, and right for
+many to first order.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, Float64
+from jaxtyping import Float32, Float64
 from torch import Tensor
 
 GRAVITY_MPS2 = 9.80665
@@ -180,9 +181,3 @@ def normals_from_tangents(tangents: Float64[Tensor, "*B 5"]) -> Float64[Tensor, 
     length = normals.norm(dim=-1, keepdim=True)
     level = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     return torch.where(length > 0, normals / length.clamp_min(1e-300), level)
-
-
-def total_slope_variance(waves: WaveSet, direction: Float[Tensor, "*B 2"]) -> Float[Tensor, "*B"]:
-    """Mean square of the sines' slope along a unit horizontal direction: sum (k A D.v)^2 / 2."""
-    slopes = torch.from_numpy(waves.directions * (waves.wavenumbers * waves.amplitudes_m)[:, None])
-    return 0.5 * (direction @ slopes.to(direction.dtype).T).square().sum(-1)

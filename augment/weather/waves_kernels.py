@@ -13,7 +13,8 @@ and one pixel right and one pixel down move it by
 So float64 is needed once per wave and chunk of a row; float32 counts turns from the anchor.
 """
 
-# pyright: basic
+# pyright: reportCallIssue=false
+# (of numba's intrinsics it sees the compiler's first argument as well)
 
 from __future__ import annotations
 
@@ -25,7 +26,7 @@ from augment.render.cpu_jit import inner, kernel
 
 CHUNK = 64  # columns that share an anchor; few enough for float32 turns good to 1e-6
 KEPT, FADING = 7, 10  # float32 numbers that are laid out per wave
-_ZERO, _HALF, _ONE, _TWO, _THREE, _TINY = (np.float32(x) for x in (0, 0.5, 1, 2, 3, 1e-30))
+_ZERO, _HALF, _ONE, _THREE, _TINY = (np.float32(x) for x in (0, 0.5, 1, 3, 1e-30))
 # sin(pi r) / r and cos(pi r) in powers of r^2 for |r| <= 1/2, least maximal error (3e-9, 5e-8).
 _S0, _S1, _S2, _S3, _S4 = (
     np.float32(c) for c in (3.14159258, -5.16770688, 2.55003138, -0.598045173, 0.0772201257)
@@ -86,9 +87,10 @@ def _sort_waves(waves, terms, place, step, z, drop, bend, columns, spacing, kept
     """Sort the waves of one chunk by whether all, some or none of its pixels resolve them.
 
     place: p0. step: A. z: of the anchor's ray. drop, bend: the constant and the linear part of the
-    step down. columns: the chunk's first and last, from the anchor. spacing: the least and greatest
-    of (s / d_z)^2. kept, fading: filled with what `_add_kept` and `_add_fading` want of a wave;
-    how many there are is returned. faded [3]: slope variance of the others, xx, xy, yy.
+    step down. columns: the chunk's first and last, from the anchor. spacing: the least of
+    (s / d_z)^2 times the square of the length in pixels at which a wave is gone, and the greatest
+    times that of its full height. kept, fading: filled with what `_add_kept` and `_add_fading` want
+    of a wave; how many there are is returned. faded [3]: slope variance of the rest, xx, xy, yy.
     """
     many = some = np.uint64(0)
     faded[:] = _ZERO
@@ -100,7 +102,7 @@ def _sort_waves(waves, terms, place, step, z, drop, bend, columns, spacing, kept
         down_more = kx * bend[0] + ky * bend[1]
         left, right = down + columns[0] * down_more, down + columns[1] * down_more
         nearest = 0.0 if left * right < 0.0 else min(left * left, right * right)
-        if spacing[0] * (side + nearest) >= 0.25:  # two pixels a wave, and fewer
+        if spacing[0] * (side + nearest) >= 1.0:
             gx, gy = terms[i, 3], terms[i, 4]
             faded[0] += _HALF * gx * gx
             faded[1] += _HALF * gx * gy
@@ -108,7 +110,7 @@ def _sort_waves(waves, terms, place, step, z, drop, bend, columns, spacing, kept
             continue
         turns = kx * place[0] + ky * place[1] + waves[i, 2]
         turns -= np.floor(turns)
-        if spacing[1] * (side + max(left * left, right * right)) <= 0.0625:  # four, and more
+        if spacing[1] * (side + max(left * left, right * right)) <= 1.0:
             at = many * np.uint64(KEPT)
             _put(kept, at, turns, along, terms, i)
             many += np.uint64(1)
@@ -151,13 +153,14 @@ def _add_kept(kept, count, way):
 
 
 @inner()
-def _add_fading(fading, count, way, n, spacing, vx, vy, lost, xx, xy, yy, gx, gy):
+def _add_fading(fading, count, way, n, spacing, limits, vx, vy, lost, xx, xy, yy, gx, gy):
     """As `_add_kept` with weights; what they leave out goes to the variance `lost`."""
+    gone, rise = limits[1], _ONE / (limits[2] - limits[1])
     for i in range(count):
         at = i * np.uint64(FADING)
         down = v8.fmuladd(_term(fading, at, 9), n, _term(fading, at, 8))
         per_pixel = spacing * v8.sqrt(v8.fmuladd(down, down, _term(fading, at, 7)))
-        t = (v8.splat(_ONE) / per_pixel - v8.splat(_TWO)) * v8.splat(_HALF)
+        t = (v8.splat(_ONE) / per_pixel - v8.splat(gone)) * v8.splat(rise)
         t = v8.minimum(v8.maximum(t, v8.splat(_ZERO)), v8.splat(_ONE))
         weight = t * t * (v8.splat(_THREE) - t - t)
         sine, cosine = _sin_cos(v8.fmuladd(_term(fading, at, 1), way, _term(fading, at, 0)))
@@ -175,10 +178,10 @@ def _add_fading(fading, count, way, n, spacing, vx, vy, lost, xx, xy, yy, gx, gy
 
 
 @inner()
-def _shade_chunk(kept, many, fading, some, faded, ray, height, upright, begin, end, out):
+def _shade_chunk(kept, many, fading, some, faded, ray, height, limits, begin, end, out):
     """out [3 * CHUNK]: normal x, normal y and variance of columns begin to end from the anchor.
 
-    ray: d0 and a, their x, y and z. upright: a ray whose horizontal part is shorter is vertical.
+    ray: d0 and a, their x, y and z. limits [3]: of `fill_field`.
     """
     zero, one = v8.splat(_ZERO), v8.splat(_ONE)
     x0, y0, z0, ax, ay, az = ray
@@ -190,7 +193,7 @@ def _shade_chunk(kept, many, fading, some, faded, ray, height, upright, begin, e
         dx = v8.fmuladd(v8.splat(ax), n, v8.splat(x0))
         dy = v8.fmuladd(v8.splat(ay), n, v8.splat(y0))
         length = v8.sqrt(v8.fmuladd(dx, dx, dy * dy))
-        slanted = v8.at_least(length, v8.splat(upright))
+        slanted = v8.at_least(length, v8.splat(limits[0]))
         vx, vy = v8.select(slanted, dx / length, one), v8.select(slanted, dy / length, zero)
         lost = v8.splat(faded[0]) * vx * vx
         lost = v8.fmuladd(v8.splat(faded[1] + faded[1]) * vx, vy, lost)
@@ -198,7 +201,7 @@ def _shade_chunk(kept, many, fading, some, faded, ray, height, upright, begin, e
         way = away * n
         xx, xy, yy, gx, gy = _add_kept(kept, many, way)
         lost, xx, xy, yy, gx, gy = _add_fading(
-            fading, some, way, n, spacing, vx, vy, lost, xx, xy, yy, gx, gy
+            fading, some, way, n, spacing, limits, vx, vy, lost, xx, xy, yy, gx, gy
         )
         wide, deep = one - xx, one - yy
         nx = v8.negate(v8.fmuladd(xy, gy, deep * gx))
@@ -229,15 +232,16 @@ def _anchor(begin, end, row_z, rotation, lens):
 
 @kernel
 def fill_field(
-    rotation, eye, height, lens, limits, waves, terms, normal_x, normal_y, slope_variance
+    rotation, eye, height, lens, farthest, limits, waves, terms, normal_x, normal_y, slope_variance
 ):
     """Normals and slope variance where a pixel's ray meets the plane; other pixels are left alone.
 
     rotation [3, 3]: world_from_camera. eye [2]: its x and y. height: of the eye over the plane.
-    lens: fx, fy, cx, cy. limits: the farthest depth at which the plane is met, and the least
-    horizontal part of a ray that is not vertical. waves [N, 3]: turns per metre of x and of y,
-    turns at the origin. All float64. terms [N, 5], float32: S Dx Dx, S Dx Dy, S Dy Dy, k A Dx,
-    k A Dy. Outputs float32 [H, W].
+    lens: fx, fy, cx, cy. farthest: depth at which the plane is still met. waves [N, 3]: turns per
+    metre of x and of y, turns at the origin. All float64. limits [3]: horizontal part of a ray, at
+    unit z, below which it is vertical; lengths in pixels at which a wave is gone, and at full
+    height. terms [N, 5]: S Dx Dx, S Dx Dy, S Dy Dy, k A Dx, k A Dy. Both float32, as the outputs
+    [H, W].
     """
     rows, width = normal_x.shape
     ax, ay, az = rotation[0, 0] / lens[0], rotation[1, 0] / lens[0], rotation[2, 0] / lens[0]
@@ -245,7 +249,7 @@ def fill_field(
     for i in numba.prange(rows):
         v = (i + 0.5 - lens[3]) / lens[1]
         row_z = v * rotation[2, 1]
-        first, end = _columns_that_meet(width, row_z, rotation, lens, height, limits[0])
+        first, end = _columns_that_meet(width, row_z, rotation, lens, height, farthest)
         if first == end:
             continue
         kept = np.empty(len(waves) * KEPT, np.float32)
@@ -267,31 +271,18 @@ def fill_field(
             drop = bx * z - bz * x, by * z - bz * y
             bend = bx * az - bz * ax, by * az - bz * ay
             near, far = max(abs(z_begin), abs(z_last)), min(abs(z_begin), abs(z_last))
-            spacing = (height / (near * near)) ** 2, (height / (far * far)) ** 2
+            sparse = (limits[1] * height / (near * near)) ** 2
+            dense = (limits[2] * height / (far * far)) ** 2
             columns = float(begin - at), float(stop - 1 - at)
+            spacing = sparse, dense
             many, some = _sort_waves(
                 waves, terms, place, step, z, drop, bend, columns, spacing, kept, fading, faded
             )
-            ray = (
-                np.float32(x),
-                np.float32(y),
-                np.float32(z),
-                np.float32(ax),
-                np.float32(ay),
-                np.float32(az),
-            )
+            start = np.float32(x), np.float32(y), np.float32(z)
+            ray = (*start, np.float32(ax), np.float32(ay), np.float32(az))
+            chunk = begin - at, stop - at
             _shade_chunk(
-                kept,
-                many,
-                fading,
-                some,
-                faded,
-                ray,
-                np.float32(height),
-                np.float32(limits[1]),
-                begin - at,
-                stop - at,
-                out,
+                kept, many, fading, some, faded, ray, np.float32(height), limits, *chunk, out
             )
             for j in range(stop - begin):
                 normal_x[i, begin + j] = out[j]

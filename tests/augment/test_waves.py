@@ -1,0 +1,479 @@
+import dataclasses
+import math
+from decimal import Decimal, localcontext
+
+import numpy as np
+import pytest
+import torch
+
+from augment.cameras import Camera
+from augment.geometry import rigid
+from augment.render.threads import limit_threads
+from augment.weather import waves_kernels
+from augment.weather.wave_field import FARTHEST_M, wave_field
+from augment.weather.wave_spectrum import MOST_STEEPNESS, make_waves
+from augment.weather.waves import (
+    GRAVITY_MPS2,
+    WaveSet,
+    displaced_surface,
+    turns_at,
+    wave_normals,
+)
+from recipes.flood import Wave, Waves
+
+NOW = 1_700_000_000_123_456_789  # a timestamp of today's recordings
+RMS_SLOPES = {"calm": 0.012, "breeze": 0.04, "wind": 0.09}
+
+
+def waves_of(count: int = 5, *, steepness: float = 0.5, low=0.4, high=6.0, slope=0.3) -> WaveSet:
+    """Waves of all directions, a total steepness and a total slope (sum of k A)."""
+    rng = np.random.default_rng(count)
+    angles = rng.uniform(0, 2 * math.pi, count)
+    share = rng.uniform(0.5, 1.5, count)
+    share /= share.sum()
+    wavelengths = np.geomspace(low, high, count)
+    return WaveSet(
+        directions=np.stack([np.cos(angles), np.sin(angles)], axis=1),
+        amplitudes_m=slope * share * wavelengths / (2 * math.pi),
+        wavelengths_m=wavelengths,
+        steepness=steepness * share,
+        phases_rad=rng.uniform(0, 2 * math.pi, count),
+        depth_m=0.4,
+    )
+
+
+def camera_at(
+    eye, *, down_deg=6.0, yaw_deg=40.0, roll_deg=0.0, size=(97, 61), focal=90.0, time=NOW
+) -> Camera:
+    """A camera that looks down_deg below the horizon; yaw 0 is world +x."""
+    yaw, down, roll = (math.radians(a) for a in (yaw_deg, down_deg, roll_deg))
+    forward = [
+        math.cos(yaw) * math.cos(down),
+        math.sin(yaw) * math.cos(down),
+        -math.sin(down),
+    ]
+    forward = torch.tensor(forward, dtype=torch.float64)
+    right = torch.tensor([math.sin(yaw), -math.cos(yaw), 0.0], dtype=torch.float64)
+    below = torch.linalg.cross(forward, right)
+    right, below = (
+        math.cos(roll) * right + math.sin(roll) * below,
+        math.cos(roll) * below - math.sin(roll) * right,
+    )
+    rotation = torch.stack([right, below, forward])
+    pose = rigid(rotation, -rotation @ torch.tensor(eye, dtype=torch.float64))
+    width, height = size
+    return Camera("c", width, height, focal, 1.1 * focal, width / 2, height / 2, pose, time)
+
+
+def random_points(count: int, extent_m: float = 50.0) -> torch.Tensor:
+    return torch.from_numpy(np.random.default_rng(0).uniform(-extent_m, extent_m, (count, 2)))
+
+
+# The records
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("directions", np.ones((5, 2)), "unit length"),
+        ("directions", np.ones((5, 3)), r"float64 \[5, 2\].*got float64 \[5, 3\]"),
+        ("amplitudes_m", np.full(5, -0.1), "amplitudes_m must be >= 0"),
+        ("amplitudes_m", np.zeros(4), r"amplitudes_m must be float64 \[5\]"),
+        ("amplitudes_m", np.zeros(5, np.float32), "float32"),
+        ("wavelengths_m", np.zeros(5), "wavelengths_m must be > 0"),
+        ("steepness", np.full(5, 0.21), "sum to at most 1.*got 1.05 from 5 waves"),
+        ("steepness", np.full(5, -0.1), "steepness must be >= 0"),
+        ("phases_rad", np.full(5, np.nan), "phases_rad must be finite"),
+        ("depth_m", 0.0, "depth_m must be > 0"),
+        ("depth_m", math.nan, "depth_m must be > 0"),
+    ],
+)
+def test_a_wave_set_refuses_what_makes_no_surface(field, value, message):
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(waves_of(), **{field: value})
+
+
+def test_a_steepness_of_one_may_be_a_sum_of_decimal_fractions():
+    tenths = np.full(5, 0.1) + 0.1
+    assert tenths.sum() == 1.0
+    assert dataclasses.replace(waves_of(), steepness=tenths + 1e-12).steepness.sum() > 1
+
+
+# What a recipe draws
+
+
+def test_the_same_seed_draws_the_same_bits():
+    first, again = (make_waves(Waves(preset="wind"), seed=5, depth_m=0.5) for _ in range(2))
+    for field in dataclasses.fields(WaveSet):
+        assert np.array_equal(getattr(first, field.name), getattr(again, field.name))
+    other = make_waves(Waves(preset="wind"), seed=6, depth_m=0.5)
+    assert not np.array_equal(first.wavelengths_m, other.wavelengths_m)
+    own = make_waves(Waves(preset="wind", seed=6), seed=5, depth_m=0.5)
+    assert np.array_equal(own.phases_rad, other.phases_rad)
+
+
+def test_the_first_numbers_of_a_seed_are_pinned():
+    waves = make_waves(Waves(preset="breeze", count=3), seed=1, depth_m=0.5)
+    # Twelve digits: cosines and powers may differ in the last bits between machines.
+    wavelengths = [0.0804594348773729, 0.3843134351955985, 2.0991211404386902]
+    phases = [2.751173005872406, 1.4414570607582793, 5.628359912392606]
+    assert waves.wavelengths_m.tolist() == pytest.approx(wavelengths, rel=1e-12)
+    assert waves.phases_rad.tolist() == pytest.approx(phases, rel=1e-12)
+
+
+def test_still_water_has_no_waves():
+    assert len(make_waves(Waves(preset="still"), seed=0, depth_m=1.0).wavelengths_m) == 0
+    assert make_waves(Waves(components=()), seed=0, depth_m=1.0).is_flat
+    assert make_waves(Waves(preset="wind", height=0.0), seed=0, depth_m=1.0).is_flat
+
+
+@pytest.mark.parametrize("preset", RMS_SLOPES)
+@pytest.mark.parametrize("count", [1, 24, 64])
+def test_a_preset_has_its_rms_slope_whatever_the_count(preset, count):
+    waves = make_waves(Waves(preset=preset, count=count), seed=3, depth_m=0.5)
+    assert len(waves.wavelengths_m) == count
+    waves = dataclasses.replace(waves, steepness=np.zeros(count))  # sines, whose slopes add
+    # Over kilometres: two waves of nearly one length still beat within fifty metres.
+    normals = wave_normals(waves, random_points(8000, 5000.0), NOW)
+    slopes = (normals[:, :2] / normals[:, 2:]).square().sum(-1)
+    # 8000 samples of a square that varies as much as its mean: 1.1 %, halved by the root.
+    assert float(slopes.mean().sqrt()) == pytest.approx(RMS_SLOPES[preset], rel=0.02)
+
+
+def test_presets_are_as_high_as_water_in_a_street():
+    def rms_height(preset: str) -> float:
+        waves = make_waves(Waves(preset=preset), seed=3, depth_m=0.5)
+        return float(displaced_surface(waves, random_points(5000), NOW)[:, 2].std())
+
+    assert 1e-4 < rms_height("calm") < 2e-3
+    assert 1e-3 < rms_height("breeze") < 1e-2
+    assert 1e-2 < rms_height("wind") < 5e-2
+
+
+@pytest.mark.parametrize("preset", RMS_SLOPES)
+@pytest.mark.parametrize("count", [1, 24, 64])
+@pytest.mark.parametrize("height", [0.5, 1.0, 10.0])
+def test_height_scales_amplitudes_and_keeps_the_surface_from_folding(preset, count, height):
+    low = make_waves(Waves(preset=preset, count=count), seed=3, depth_m=0.5)
+    high = make_waves(Waves(preset=preset, count=count, height=height), seed=3, depth_m=0.5)
+    assert np.allclose(high.amplitudes_m, height * low.amplitudes_m, rtol=1e-14, atol=0)
+    assert high.steepness.sum() <= MOST_STEEPNESS + 1e-12
+    natural = high.wavenumbers * high.amplitudes_m  # circular orbits, Q = 1
+    capped = min(1.0, MOST_STEEPNESS / natural.sum())
+    assert np.allclose(high.steepness, capped * natural, rtol=1e-12, atol=0)
+
+
+def test_waves_run_with_the_wind():
+    waves = make_waves(Waves(preset="wind", direction_deg=120.0, count=64), seed=0, depth_m=0.5)
+    wind = np.array([math.cos(math.radians(120)), math.sin(math.radians(120))])
+    along = waves.directions @ wind
+    assert along.min() > 0 and along.mean() > 0.8  # the mean of cos over 28 degrees is 0.89
+    assert np.all(np.diff(waves.wavelengths_m) > 0)  # one in each part of the octaves
+    assert waves.wavelengths_m[0] >= 0.12 and waves.wavelengths_m[-1] <= 6.0
+
+
+def test_components_are_taken_as_they_are():
+    wave = Wave(direction_deg=90, amplitude_m=0.1, wavelength_m=3, steepness=0.2, phase_deg=45)
+    waves = make_waves(Waves(preset="wind", height=5, components=(wave,)), seed=0, depth_m=2.0)
+    assert np.allclose(waves.directions, [[0, 1]], atol=1e-16)
+    assert waves.amplitudes_m == [0.1] and waves.wavelengths_m == [3] and waves.steepness == [0.2]
+    assert waves.phases_rad == [math.pi / 4] and waves.depth_m == 2
+
+
+# Time
+
+
+def test_waves_travel_as_fast_as_their_depth_allows():
+    waves = waves_of(2, low=0.01, high=1000.0)
+    deep = dataclasses.replace(waves, depth_m=math.inf)
+    speed = deep.frequencies_hz * deep.wavelengths_m
+    assert np.allclose(speed, np.sqrt(GRAVITY_MPS2 / deep.wavenumbers), rtol=1e-14)
+    shallow = dataclasses.replace(waves, depth_m=1e-4)
+    # k h is at most 0.06 here: tanh(x) / x is 1 - x^2 / 3.
+    speed = shallow.frequencies_hz * shallow.wavelengths_m
+    assert np.allclose(speed, math.sqrt(GRAVITY_MPS2 * 1e-4), rtol=1e-3)
+
+
+@pytest.mark.parametrize("time", [0, 1, -5, 10**18, NOW, -NOW])
+def test_phases_keep_their_precision_at_any_time(time):
+    waves = waves_of(64, low=1e-3, high=1e3)
+    turns = turns_at(waves, time)
+    with localcontext() as context:
+        context.prec = 80
+        for frequency, phase, turn in zip(
+            waves.frequencies_hz, waves.phases_rad, turns, strict=True
+        ):
+            passed = Decimal(float(frequency)) * time / 10**9
+            exact = Decimal(float(phase) / (2 * math.pi)) - passed - Decimal(float(turn))
+            # Whole turns, and two roundings of numbers below 1.
+            assert abs(exact - exact.to_integral_value()) < 4e-16
+
+
+def test_float64_seconds_would_not_keep_it():
+    waves = waves_of(8, low=0.01, high=1.0)
+    naive = waves.phases_rad / (2 * math.pi) - waves.frequencies_hz * (NOW * 1e-9)
+    off = turns_at(waves, NOW) - naive
+    assert np.abs(off - np.round(off)).max() > 1e-7
+
+
+def test_a_wave_has_run_one_length_after_one_period():
+    waves = waves_of(1, steepness=0.3)
+    direction = torch.from_numpy(waves.directions[0])
+    points = random_points(50, 3.0)
+    lapse_ns = 137_000_000
+    way_m = float(waves.frequencies_hz[0] * waves.wavelengths_m[0]) * lapse_ns * 1e-9
+    before = displaced_surface(waves, points, NOW)[:, 2]
+    after = displaced_surface(waves, points + way_m * direction, NOW + lapse_ns)[:, 2]
+    assert torch.allclose(before, after, atol=1e-14)  # metres, of waves 2 cm high
+
+
+# The surface
+
+
+def test_a_wave_lifts_and_gathers_the_surface_at_its_crest():
+    wave = Wave(direction_deg=0, amplitude_m=0.2, wavelength_m=4, steepness=0.5)
+    waves = make_waves(Waves(components=(wave,)), seed=0, depth_m=1.0)
+    points = torch.tensor([[0.0, 0], [1, 0], [2, 0], [3, 7]], dtype=torch.float64)
+    reach = 0.5 * 4 / (2 * math.pi)
+    expected = [[reach, 0, 0], [1, 0, 0.2], [2 - reach, 0, 0], [3, 7, -0.2]]
+    found = displaced_surface(waves, points, 0)
+    assert torch.allclose(found, torch.tensor(expected, dtype=torch.float64), atol=1e-15)
+
+
+@pytest.mark.parametrize("steepness", [0.0, 0.5, 0.98])
+def test_normals_are_those_of_the_displaced_surface(steepness):
+    waves = waves_of(64, steepness=steepness, slope=0.9)
+    points = random_points(500)
+    step = 1e-5
+    tangents = []
+    for axis in range(2):
+        shift = torch.zeros(2, dtype=torch.float64)
+        shift[axis] = step
+        ahead = displaced_surface(waves, points + shift, NOW)
+        tangents.append((ahead - displaced_surface(waves, points - shift, NOW)) / (2 * step))
+    expected = torch.linalg.cross(*tangents)
+    expected = expected / expected.norm(dim=-1, keepdim=True)
+    normals = wave_normals(waves, points, NOW)
+    assert float(normals[:, 2].min()) > 0
+    # Central differences: (k step)^2 / 6 = 4e-9 of the slope for the shortest wave, and 1e-14 m /
+    # 1e-5 m from rounding 50 m; ten times that where the crests are steep.
+    assert torch.allclose(normals, expected, atol=5e-8)
+    assert torch.allclose(normals.norm(dim=-1), torch.ones(500, dtype=torch.float64), atol=1e-14)
+
+
+def closed_form(waves: WaveSet, points: torch.Tensor) -> torch.Tensor:
+    """The normals often quoted for sums: (-sum D k A cos, 1 - sum S sin)."""
+    d, k = torch.from_numpy(waves.directions), torch.from_numpy(waves.wavenumbers)
+    theta = k * (points @ d.T) + 2 * math.pi * torch.from_numpy(turns_at(waves, NOW))
+    slopes = k * torch.from_numpy(waves.amplitudes_m) * theta.cos()
+    up = 1 - (torch.from_numpy(waves.steepness) * theta.sin()).sum(-1, keepdim=True)
+    normals = torch.cat([-slopes @ d, up], dim=-1)
+    return normals / normals.norm(dim=-1, keepdim=True)
+
+
+def error_of_closed_form_deg(waves: WaveSet) -> torch.Tensor:
+    points = random_points(5000)
+    cosine = (closed_form(waves, points) * wave_normals(waves, points, NOW)).sum(-1)
+    return torch.rad2deg(torch.acos(cosine.clamp(-1, 1)))
+
+
+def test_the_closed_form_is_exact_for_one_wave_and_wrong_for_sums():
+    one = error_of_closed_form_deg(waves_of(1, steepness=0.9, slope=0.9))
+    assert float(one.max()) < 1e-5  # acos next to 1 loses half the digits
+    aligned = waves_of(4, steepness=0.8, slope=0.8)
+    same = np.tile(aligned.directions[:1], (4, 1))
+    aligned = error_of_closed_form_deg(dataclasses.replace(aligned, directions=same))
+    assert float(aligned.max()) < 1e-5
+    crossing = error_of_closed_form_deg(waves_of(4, steepness=0.8, slope=0.8))
+    assert float(crossing.max()) > 3 and float(crossing.mean()) > 0.5
+
+
+def test_a_cusp_counts_as_level():
+    wave = Wave(amplitude_m=0.5, wavelength_m=4, steepness=1.0)
+    waves = make_waves(Waves(components=(wave,)), seed=0, depth_m=1.0)
+    # A quarter of a wavelength from the origin sin is 1 to the bit, so both tangents are vertical.
+    points = torch.tensor([[1.0, 0.0]], dtype=torch.float64)
+    found = wave_normals(waves, points, 0)
+    assert torch.isfinite(found).all() and float(found[0, 2]) >= 0
+    assert torch.isfinite(wave_field(waves, camera_at([0, 0, 1.5]), 0.0).normal_x).all()
+
+
+# What a camera sees
+
+CAMERAS = {
+    "driving": camera_at([0.0, 0, 1.5]),
+    "rolled": camera_at([3.0, 1, 1.5], roll_deg=25),
+    "on its side": camera_at([3.0, 1, 1.5], roll_deg=90),
+    "along the surface": camera_at([0.0, 0, 0.02], down_deg=0),
+    "down": camera_at([1.0, 2, 3.0], down_deg=90),
+    "up": camera_at([1.0, 2, 3.0], down_deg=-90),
+    "under water": camera_at([1.0, 2, -0.3], down_deg=-20, roll_deg=5),
+    "far from the origin": camera_at([5000.0, -5000, 1.5]),
+    "at 1e9 s": camera_at([0.0, 0, 1.5], time=10**18),
+    "one pixel": camera_at([0.0, 0, 1.5], size=(1, 1)),
+    "a row": camera_at([0.0, 0, 1.5], size=(301, 1), roll_deg=10),
+    "a column": camera_at([0.0, 0, 1.5], size=(1, 77)),
+    "tele": camera_at([0.0, 0, 1.5], down_deg=3, focal=4000.0),
+}
+
+SETS = {
+    "one": waves_of(1),
+    "24": waves_of(24, steepness=0.8, slope=0.8),
+    "64": waves_of(64, steepness=0.5, slope=2.0, low=0.05),
+    "1 mm and 1 km": waves_of(2, low=1e-3, high=1e3),
+}
+
+
+def fields_of(waves: WaveSet, camera: Camera, *, fast: bool, level_z_m: float = 0.0):
+    field = wave_field(waves, camera, level_z_m, fast=fast)
+    return torch.stack([field.normal_x, field.normal_y, field.slope_variance])
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+@pytest.mark.parametrize("waves", SETS)
+def test_the_kernel_matches_the_definition(camera, waves):
+    fast = fields_of(SETS[waves], CAMERAS[camera], fast=True)
+    slow = fields_of(SETS[waves], CAMERAS[camera], fast=False)
+    assert fast.shape == slow.shape and fast.dtype == slow.dtype == torch.float32
+    # Turns from an anchor at most 64 pixels away, at 4 pixels a turn: 16 * 6e-8 * 2 pi = 6e-6
+    # radians at worst, times a slope of at most 1, over the 0.2 that the steepest crest leaves
+    # of a unit area.
+    assert float((fast - slow).abs().max()) < 1e-5
+    assert bool((slow != 0).any()) == (camera != "up")
+
+
+def footprint_by_differences(camera: Camera, row: int, column: int) -> tuple[np.ndarray, ...]:
+    """The plane point of a pixel, its change per pixel [2, 2], and the ray, by moving the image."""
+
+    def point(dx: float, dy: float) -> np.ndarray:
+        moved = dataclasses.replace(camera, cx=camera.cx - dx, cy=camera.cy - dy)
+        ray = moved.ray_directions(torch.float64)[row, column].numpy()
+        eye = camera.centre.numpy()
+        return eye[:2] - eye[2] / ray[2] * ray[:2]
+
+    step = 1e-5
+    columns = (point(step, 0) - point(-step, 0)) / (2 * step)
+    rows = (point(0, step) - point(0, -step)) / (2 * step)
+    ray = camera.ray_directions(torch.float64)[row, column].numpy()
+    return point(0, 0), np.stack([columns, rows], axis=1), ray
+
+
+@pytest.mark.parametrize("camera", ["driving", "rolled", "down", "tele"])
+def test_the_field_is_what_its_definition_says_pixel_by_pixel(camera):
+    camera, waves = CAMERAS[camera], waves_of(12, steepness=0.6, slope=1.0, low=0.05, high=3.0)
+    field = fields_of(waves, camera, fast=False)
+    rays = camera.ray_directions(torch.float64)
+    seen = torch.nonzero(rays[..., 2] < -0.02)[::37].tolist()
+    assert len(seen) > 20
+    partly = 0
+    for row, column in seen:
+        place, footprint, ray = footprint_by_differences(camera, row, column)
+        view = ray[:2] / np.hypot(*ray[:2])
+        heights, variance, xx, xy, yy = np.zeros(2), 0.0, 0.0, 0.0, 0.0
+        for i, turn in enumerate(turns_at(waves, camera.timestamp_ns)):
+            d, k = waves.directions[i], waves.wavenumbers[i]
+            pixels = 2 * math.pi / (k * np.hypot(*(footprint.T @ d)))
+            x = min(max((pixels - 2) / 2, 0), 1)
+            weight = 3 * x**2 - 2 * x**3
+            partly += 0 < weight < 1
+            theta = k * (d @ place) + 2 * math.pi * turn
+            heights += weight * k * waves.amplitudes_m[i] * math.cos(theta) * d
+            squeeze = weight * waves.steepness[i] * math.sin(theta)
+            xx, xy, yy = (
+                xx + squeeze * d[0] ** 2,
+                xy + squeeze * d[0] * d[1],
+                yy + squeeze * d[1] ** 2,
+            )
+            slope = k * waves.amplitudes_m[i] * (d @ view)
+            variance += 0.5 * slope**2 * (1 - weight**2)
+        normal = np.cross([1 - xx, -xy, heights[0]], [-xy, 1 - yy, heights[1]])
+        normal /= np.linalg.norm(normal)
+        expected = [normal[0], normal[1], variance]
+        # Differences of 1e-5 px leave 1e-9 of the footprint; the field is stored in float32.
+        assert field[:, row, column].tolist() == pytest.approx(expected, abs=3e-7)
+    assert partly > 10
+
+
+def test_pixels_above_the_horizon_and_eyes_in_the_plane_see_no_water():
+    camera, waves = CAMERAS["rolled"], SETS["24"]
+    rays = camera.ray_directions(torch.float64)
+    meets = (rays[..., 2] < 0) & (-1.5 / rays[..., 2] <= FARTHEST_M)
+    assert 0.2 < float(meets.double().mean()) < 0.9
+    for fast in (True, False):
+        field = fields_of(waves, camera, fast=fast)
+        assert bool((field[:, ~meets] == 0).all()) and bool((field[2, meets] > 0).any())
+        assert bool((fields_of(waves, camera, fast=fast, level_z_m=1.5) == 0).all())
+    with pytest.raises(ValueError, match="level_z_m must be finite"):
+        wave_field(waves, camera, math.inf)
+
+
+def test_still_water_runs_no_kernel(monkeypatch):
+    def ran(*_):
+        raise AssertionError("the kernel ran for still water")
+
+    monkeypatch.setattr(waves_kernels, "fill_field", ran)
+    for recipe in (Waves(preset="still"), Waves(preset="wind", height=0.0)):
+        waves = make_waves(recipe, seed=0, depth_m=1.0)
+        assert bool((fields_of(waves, CAMERAS["driving"], fast=True) == 0).all())
+    with pytest.raises(AssertionError, match="the kernel ran"):
+        wave_field(SETS["one"], CAMERAS["driving"], 0.0)
+
+
+def test_two_cameras_see_one_surface():
+    waves = SETS["24"]  # 0.4 m and longer
+    first = camera_at([0.0, 0, 2.0], down_deg=30, focal=400.0)
+    row, column = 40, 33
+    ray = first.ray_directions(torch.float64)[row, column]
+    point = first.centre - first.centre[2] / ray[2] * ray
+    second = camera_at([7.0, -1, 3.0], down_deg=25, yaw_deg=140, roll_deg=8, focal=500.0)
+    x, y, z = (second.camera_from_world @ torch.cat([point, torch.ones(1)]))[:3].tolist()
+    assert z > 0
+    # The principal point is moved until the centre of pixel (20, 50) is where the point appears.
+    second = dataclasses.replace(second, cx=50.5 - second.fx * x / z, cy=20.5 - second.fy * y / z)
+    expected = wave_normals(waves, point[:2], NOW)[:2].tolist()
+    for fast in (True, False):
+        a, b = (fields_of(waves, camera, fast=fast) for camera in (first, second))
+        assert a[2, row, column] == b[2, 20, 50] == 0  # nothing is faded
+        assert a[:2, row, column].tolist() == pytest.approx(expected, abs=1e-5)  # the contract
+        assert b[:2, 20, 50].tolist() == pytest.approx(expected, abs=1e-5)
+
+
+def test_the_distance_does_not_glitter():
+    waves = make_waves(Waves(preset="wind"), seed=0, depth_m=0.5)
+    camera = camera_at([0.0, 0, 1.5], down_deg=1.0, size=(9, 400), focal=900.0)
+    field = fields_of(waves, camera, fast=True)
+    rays = camera.ray_directions(torch.float64)
+    seen = rays[:, 4, 2] < 0
+    tilt, variance = field[:2, seen, 4].norm(dim=0), field[2, seen, 4]
+    view = rays[-1, 4, :2] / rays[-1, 4, :2].norm()  # a column without roll: one direction
+    slopes = waves.directions @ view.numpy() * waves.wavenumbers * waves.amplitudes_m
+    total = float(0.5 * (slopes**2).sum())
+    assert bool((tilt[:3] == 0).all())  # at the horizon nothing is left to flicker,
+    assert variance[:3].tolist() == pytest.approx([total] * 3, rel=1e-6)  # it is roughness now
+    assert bool((variance.diff() <= 1e-9).all())  # and ever less of it towards the eye
+    assert float(tilt[-50:].max()) > 0.1 and float(variance[-1]) < 0.8 * total
+    rays, eye = rays[seen, 4], camera.centre
+    points = eye[:2] - eye[2] / rays[:, 2:] * rays[:, :2]
+    unfaded = wave_normals(waves, points, NOW)[:, :2].T
+    flicker, calm = (n[:, 1:21].sub(n[:, :20]).norm() for n in (unfaded, field[:2, seen, 4]))
+    assert float(calm) < 0.1 * float(flicker)  # of neighbours in the farthest 20 rows
+
+
+def test_bits_do_not_depend_on_threads():
+    camera = camera_at([0.0, 0, 1.5], roll_deg=3, size=(333, 211), focal=300.0)
+    alone = []
+    for count in (1, 2):
+        limit_threads(count)
+        try:
+            alone.append(fields_of(SETS["64"], camera, fast=True))
+        finally:
+            limit_threads(None)
+    assert torch.equal(*alone)
+
+
+def test_a_window_of_the_image_sees_the_same_waves():
+    camera, waves = CAMERAS["rolled"], SETS["24"]
+    whole = fields_of(waves, camera, fast=True)
+    window = fields_of(waves, camera.cropped(11, 20, 40, 30), fast=True)
+    # Other anchors: the kernel's error twice.
+    assert torch.allclose(window, whole[:, 20:50, 11:51], atol=2e-5)
