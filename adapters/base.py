@@ -25,6 +25,7 @@ from adapters.uri import (
     parse_uri,
 )
 from augment.errors import AdapterError
+from augment.ground import Ground
 from augment.scene import Scene
 from augment.scene_files import is_scene_folder
 
@@ -78,7 +79,8 @@ def _with_ground(scene: Scene, text: str) -> Scene:
     if not math.isfinite(height):
         raise AdapterError(f"{GROUND_KEY} must be the road's height in metres; got {text!r}")
     source = add_to_uri(scene.source, GROUND_KEY, text)
-    return dataclasses.replace(scene, ground_z_m=height, source=source)
+    ground = Ground(height, height, "stated")
+    return dataclasses.replace(scene, ground_z_m=height, ground=ground, source=source)
 
 
 def recognise(path: Path) -> str:

@@ -33,6 +33,7 @@ from augment.sky import ConstantSky
 from augment.splat_io import SplatFile, read_splats, recentring_origin
 
 _UP_TOLERANCE_DEG = 30.0
+_LEVEL_TOLERANCE_DEG = 15.0  # cameras on a car lean less; this vouches for an axis, not for degrees
 _ITERATION = re.compile(r"iteration_(\d+)")
 _SAMPLED_VIEWS, _SAMPLED_POINTS = 16, 20_000
 _LEAST_SEEN = 0.001
@@ -42,7 +43,8 @@ def open_gaussians(path: str | Path, query: dict[str, str]) -> Scene:
     """A scene of a splat file or of a trained model's folder. The query's keys:
     adapters.gaussian_options.QUERY_KEYS.
 
-    has_metric_scale is True only where `scale` is given or the file's notes say `unit: metre`.
+    has_metric_scale is True only where `scale` is given or the file's notes say `unit: metre`;
+    has_known_gravity only where `up` is given or in the notes, or the cameras are upright.
 
     Raises:
         AdapterError: a query key or value, or a camera file, that cannot be used.
@@ -76,6 +78,7 @@ def open_gaussians(path: str | Path, query: dict[str, str]) -> Scene:
         world_origin_m=change.origin_m,
         ground_z_m=ground_z_m,
         has_metric_scale=is_metric,
+        has_known_gravity=_knows_gravity(splats, views, options, change),
         problems=(*problems, *about_world, *about_frames),
     )
 
@@ -171,6 +174,17 @@ def _world_change(
             "before is lost"
         )
     return WorldChange(turned.rotation, scale, origin), problems
+
+
+def _knows_gravity(
+    splats: SplatFile, views: tuple[PosedView, ...], options: GaussianOptions, change: WorldChange
+) -> bool:
+    if options.up is not None or splats.notes.get("up"):
+        return True
+    cameras_up = _mean_up(views)
+    if cameras_up is None:
+        return False
+    return float((change.rotation @ cameras_up)[2]) > math.cos(math.radians(_LEVEL_TOLERANCE_DEG))
 
 
 def _mean_up(views: tuple[PosedView, ...]) -> np.ndarray | None:

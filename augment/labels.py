@@ -96,3 +96,14 @@ class LabelSource(Protocol):
     def lidar(self, frame_index: int) -> LidarSweep | None:
         """The sweep of the frame, or None where the dataset has no file for it."""
         ...
+
+
+@runtime_checkable
+class ClassifiesLidar(Protocol):
+    """A LabelSource that also knows what the class numbers of its sweeps mean."""
+
+    def lidar_classes(self, sweep: LidarSweep) -> np.ndarray | None:
+        """The SemanticClass of each of the sweep's returns, int16 [N], negative where no surface
+        made it; None where the sweep has no classes, or they are not known to mean anything.
+        """
+        ...

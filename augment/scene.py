@@ -13,6 +13,7 @@ from torch import Tensor
 
 from augment.cameras import Camera, Frame
 from augment.errors import SceneError
+from augment.ground_heights import Ground
 from augment.labels import Boxes, LabelSource, LidarSweep
 from augment.semantics import SemanticClass
 from augment.sky import Sky
@@ -137,6 +138,10 @@ class Scene:
     world_origin_m: what was subtracted from the dataset's coordinates, float64 [3].
     ground_z_m: height of the road under the ego path (lowest), scene world; None where unknown.
     has_metric_scale: False where one unit is not known to be one metre.
+    ground: the road's heights under the path and how they are known, where the adapter has measured
+    them or was told; None where `augment.ground.ground_of` has to measure. Where it is set,
+    ground_z_m is its lowest.
+    has_known_gravity: False where +z is not known to point up.
     frames: in order of time, each with the scene's cameras. labels: boxes and LiDAR on demand.
     problems: what the adapter found wrong and went on without, one sentence each.
     source: the URI the scene was opened from; open_scene(source) opens it again.
@@ -162,6 +167,8 @@ class Scene:
     color_maps: Mapping[str, Float[Tensor, "3 4"]] = field(default_factory=dict)
     recorded_source: str | None = None
     made_by: Mapping[str, Any] = field(default_factory=dict)
+    ground: Ground | None = None
+    has_known_gravity: bool = True
 
     def __post_init__(self) -> None:
         for name, color_map in self.color_maps.items():

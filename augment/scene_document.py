@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 from typing import Any
@@ -12,6 +13,7 @@ from torch import Tensor
 
 from augment.cameras import Camera, Frame
 from augment.errors import SceneError
+from augment.ground_heights import Ground
 from augment.scene import Actor, Gaussians, Scene, Track
 from augment.scene_schema import (
     FORMAT,
@@ -48,6 +50,8 @@ def scene_document(scene: Scene) -> dict[str, Any]:
         "world_origin_m": np.asarray(scene.world_origin_m, np.float64).tolist(),
         "ground_z_m": None if scene.ground_z_m is None else float(scene.ground_z_m),
         "has_metric_scale": bool(scene.has_metric_scale),
+        "ground": None if scene.ground is None else dataclasses.asdict(scene.ground),
+        "has_known_gravity": bool(scene.has_known_gravity),
         "sky": kind,
         "background_gaussians": len(scene.background),
         "color_maps": {name: matrix.tolist() for name, matrix in scene.color_maps.items()},
@@ -103,6 +107,8 @@ def scene_of(
             world_origin_m=np.array(document.world_origin_m, np.float64),
             ground_z_m=document.ground_z_m,
             has_metric_scale=document.has_metric_scale,
+            ground=None if document.ground is None else Ground(**document.ground.model_dump()),
+            has_known_gravity=document.has_known_gravity,
             problems=tuple(document.problems),
             color_maps={
                 name: torch.tensor(rows, dtype=torch.float32)

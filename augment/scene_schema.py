@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from augment.errors import SceneError
+from augment.ground_heights import GroundSource
 
 FORMAT = "climategs-scene"
 VERSION = 1
@@ -83,8 +84,21 @@ class ActorEntry(_Closed):
     track: TrackEntry
 
 
+class GroundEntry(_Closed):
+    """The record augment.ground.Ground."""
+
+    lowest_z_m: float
+    median_z_m: float
+    source: GroundSource
+    residual_m: float | None
+    points: Count
+    tilt_deg: float | None
+
+
 class SceneDocument(_Closed):
-    """The whole file. working_folder: what relative paths in recorded_source start from."""
+    """The whole file. working_folder: what relative paths in recorded_source start from. The keys
+    with a default are not in older files.
+    """
 
     format: Literal["climategs-scene"]
     version: Literal[1]
@@ -94,6 +108,8 @@ class SceneDocument(_Closed):
     world_origin_m: Row3
     ground_z_m: float | None
     has_metric_scale: bool
+    ground: GroundEntry | None = None
+    has_known_gravity: bool = True
     sky: Literal["constant", "latlong", "cubemap"]
     background_gaussians: Count
     color_maps: dict[Text, Matrix3x4]

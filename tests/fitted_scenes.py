@@ -9,6 +9,7 @@ import torch
 from scenes import camera_ahead, random_gaussians, random_pose
 
 from augment.cameras import Frame
+from augment.ground_heights import Ground
 from augment.scene import Actor, Gaussians, Scene, Track
 from augment.sky import CubemapSky
 
@@ -42,6 +43,8 @@ def fitted_scene(**changes) -> Scene:
         color_maps={"ahead": torch.from_numpy(rng.normal(size=(3, 4)).astype(np.float32))},
         recorded_source="test:recording",
         made_by={"steps": 30, "loss": [0.1, None], "config": {"seed": 0, "name": "ß"}},
+        ground=Ground(-1.2345678901234567, -1.1, "lidar labels", 1 / 70, 41_233, None),
+        has_known_gravity=False,
     )
     return dataclasses.replace(scene, **changes)
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from typing import Any
 
 import numpy as np
 import torch
 
+from augment.errors import SceneError
+from augment.ground import ground_of, ground_sentence
 from augment.scene import Gaussians, Scene
 from augment.semantics import SemanticClass
 
@@ -38,7 +41,9 @@ def describe_scene(scene: Scene) -> dict[str, Any]:
         "frames": _describe_frames(scene),
         "labels": _describe_labels(scene),
         "ground_z_m": scene.ground_z_m,
+        "ground": _describe_ground(scene),
         "has_metric_scale": scene.has_metric_scale,
+        "has_known_gravity": scene.has_known_gravity,
         "world_origin_m": [float(v) for v in scene.world_origin_m],
         "recorded_source": scene.recorded_source,
         "color_maps": {name: matrix.tolist() for name, matrix in scene.color_maps.items()},
@@ -99,6 +104,15 @@ def _describe_frames(scene: Scene) -> dict[str, Any]:
     }
 
 
+def _describe_ground(scene: Scene) -> dict[str, Any]:
+    """The ground's record, or without it the sentence that says what is lacking."""
+    try:
+        ground = ground_of(scene)
+    except SceneError as error:
+        return {"sentence": f"not known: {error}"}
+    return {**dataclasses.asdict(ground), "sentence": ground_sentence(ground)}
+
+
 def _describe_labels(scene: Scene) -> dict[str, Any]:
     """From the first frame only: reading every sweep of a long drive would take minutes."""
     if scene.labels is None or not scene.frames:
@@ -125,8 +139,9 @@ def scene_text(facts: dict[str, Any]) -> str:
         f"  extent      {size} m (middle 98 % of the background)",
         f"  splats      median scale {background['median_scale_m'] * 100:.1f} cm, "
         f"median opacity {background['median_opacity']:.2f}",
-        f"  ground      {_height(facts['ground_z_m'])}",
+        f"  ground      {facts['ground']['sentence']}",
         f"  scale       {'metres' if facts['has_metric_scale'] else 'unknown unit'}",
+        f"  up          {'+z' if facts['has_known_gravity'] else 'taken as +z, not known'}",
         f"  sky         {facts['sky']}",
         f"  frames      {_frames(frames)}",
     ]
@@ -175,10 +190,6 @@ def _gains(color_map: list[list[float]] | None) -> str:
 def _short(value: Any) -> str:
     text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
     return text if len(text) <= 100 else text[:97] + "..."
-
-
-def _height(ground_z_m: float | None) -> str:
-    return "height unknown" if ground_z_m is None else f"z = {ground_z_m:.2f} m under the path"
 
 
 def _frames(frames: dict[str, Any]) -> str:

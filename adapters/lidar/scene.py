@@ -20,8 +20,8 @@ from adapters.lidar.split import PointSet, Sweep, is_flat, split_sweeps
 from adapters.lidar.surfels import Surfels, surfels_from_points
 from adapters.lidar.voxels import thin_points
 from adapters.lidar.wall_fill import fill_walls
+from augment.ground import Ground, measure_from_classes
 from augment.scene import Actor, Gaussians
-from augment.semantics import SemanticClass
 from augment.sky import CubemapSky
 
 logger = logging.getLogger(__name__)
@@ -32,8 +32,8 @@ _BORROW_EDGES = 6.0
 _BORROW_GROUND_M = 5.0
 _FEWEST = 8  # points that surfaces are sought in
 _TRIAL = 3.0  # voxels of the trial in units of those asked for
-_ROAD_REACHES_M = (4.0, 8.0, 16.0)
-_ROAD_RETURNS = 200  # some returns near the sensor are mislabelled: a few are not enough
+_REACHES_M = (8.0, 16.0)
+_FEWEST_RETURNS = 200
 _LOW_QUANTILE = 0.02  # a low height that a single stray return does not decide
 
 
@@ -61,12 +61,16 @@ class LidarSceneOptions:
 
 @dataclass(frozen=True, eq=False)
 class LidarScene:
-    """What the recordings give before any optimisation; problems one sentence each."""
+    """What the recordings give before any optimisation; problems one sentence each.
+
+    ground_z_m: the lowest of the ground where that was found, else a low height.
+    """
 
     background: Gaussians
     actors: tuple[Actor, ...]
     sky: CubemapSky
     ground_z_m: float | None
+    ground: Ground | None
     problems: tuple[str, ...]
 
 
@@ -83,7 +87,7 @@ def build_lidar_scene(
     without neighbours, and actors of which nothing is left.
     """
     background, actors = split_sweeps(sweeps, tracks)
-    ground_z_m = road_height(background, path.positions)
+    ground = measure_from_classes(background.points, background.semantic, path.positions)
     things = _sample_all([background, *actors], [None, *tracks], path, options)
     thinned = [(t, e, surfels_from_points(t.points, e, semantic=t.semantic)) for t, e in things]
     bodies = [
@@ -100,41 +104,30 @@ def build_lidar_scene(
         background=gaussians[0],
         actors=_actors(tracks, gaussians[1:]),
         sky=gatherer.finish(),
-        ground_z_m=ground_z_m,
+        ground_z_m=low_height(background, path.positions) if ground is None else ground.lowest_z_m,
+        ground=ground,
         problems=problems,
     )
 
 
-def road_height(points: PointSet, path: np.ndarray) -> float | None:
-    """The lowest height of the road under the path, metres in the world of the points.
+def low_height(points: PointSet, path: np.ndarray) -> float | None:
+    """The lowest height under the path where no road was found, metres in the world of the points.
 
-    At each position of the path (float [P, 3]) the height is the median of the nearest road
-    returns, or, where no class says road, a low quantile of all returns there. The LiDAR sees no
-    road right below itself, so the reach widens until there are enough returns to trust; without
-    classes it begins wider, because what is nearest is the recording car and spray.
+    At each position of the path (float [P, 3]) it is a low quantile of the returns there. The reach
+    widens until there are enough to trust: what is nearest is the recording car and spray.
     """
-    road = np.isin(points.semantic, (SemanticClass.ROAD, SemanticClass.LANE_MARKING))
-    heights = _heights(points.points[road], path, 0.5, _ROAD_REACHES_M)
-    if not heights:
-        heights = _heights(points.points, path, _LOW_QUANTILE, _ROAD_REACHES_M[1:])
-    return min(heights) if heights else None
-
-
-def _heights(
-    points: np.ndarray, path: np.ndarray, quantile: float, reaches_m: Sequence[float]
-) -> list[float]:
-    widest = reaches_m[-1]
+    widest = _REACHES_M[-1]
     low, high = path.min(axis=0) - widest, path.max(axis=0) + widest
-    points = points[indices_between(points, low, high)]
+    near = points.points[indices_between(points.points, low, high)]
     heights = []
     for position in path:
-        distance2 = ((points[:, :2] - position[:2]) ** 2).sum(1)
-        for reach in reaches_m:
-            z = points[distance2 < reach**2, 2]
-            if len(z) >= _ROAD_RETURNS:
-                heights.append(float(np.quantile(z, quantile)))
+        distance2 = ((near[:, :2] - position[:2]) ** 2).sum(1)
+        for reach in _REACHES_M:
+            z = near[distance2 < reach**2, 2]
+            if len(z) >= _FEWEST_RETURNS:
+                heights.append(float(np.quantile(z, _LOW_QUANTILE)))
                 break
-    return heights
+    return min(heights) if heights else None
 
 
 def _sample_all(

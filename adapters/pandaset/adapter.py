@@ -70,6 +70,7 @@ def open_pandaset(path: str, query: dict[str, str]) -> Scene:
         labels=PandaSetLabels(Path(path)),
         world_origin_m=sequence.world_origin_m,
         ground_z_m=built.ground_z_m,
+        ground=built.ground,
         problems=sequence.problems + chosen.problems + drive.problems + built.problems,
     )
 

@@ -89,6 +89,14 @@ class PandaSetLabels:
         """The sweeps' class numbers of returns that no surface made: smoke, spray, reflections."""
         return tuple(int(n) for n in np.flatnonzero(semantic_table(self.root) == NO_SURFACE))
 
+    def lidar_classes(self, sweep: LidarSweep) -> np.ndarray | None:
+        """The SemanticClass of each return, or NO_SURFACE; None for a sweep without classes."""
+        classes = sweep.columns.get("semantic")
+        if classes is None:
+            return None
+        table = semantic_table(self.root)
+        return table[np.clip(classes, 0, len(table) - 1)]
+
     def lidar(self, frame_index: int) -> LidarSweep | None:
         table = read_lidar(self.root, frame_index)
         if table is None:

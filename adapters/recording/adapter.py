@@ -42,6 +42,7 @@ from adapters.recording.tracks import RecordedObjects, read_objects
 from adapters.uri import format_uri
 from augment.cameras import Frame
 from augment.errors import AdapterError
+from augment.ground import Ground
 from augment.scene import Scene
 
 _FEWEST_RETURNS = 100  # no surface is found among fewer
@@ -94,6 +95,7 @@ def open_recording(path: str, query: dict[str, str]) -> Scene:
         labels=RecordingLabels(root),
         world_origin_m=calibration.world_origin_m,
         ground_z_m=built.ground_z_m,
+        ground=built.ground,
         has_metric_scale=calibration.has_metric_scale,
         problems=(
             *unlisted_images(root, calibration.frames),
@@ -157,10 +159,13 @@ class _Start:
         sweeps = guess_surfaces(road, self.objects.moving, self.objects.still)
         tracks = join_tracks(self.objects.moving)
         built = build_lidar_scene(sweeps, tracks, self._views(), self._path(), coarse)
+        # Whatever was found in the guessed surfaces is the height they were given.
+        assumed = Ground(float(road[:, 2].min()), float(np.median(road[:, 2])), "ego path")
         return dataclasses.replace(
             built,
             background=join_gaussians([built.background, shells]),
-            ground_z_m=float(road[:, 2].min()),
+            ground_z_m=assumed.lowest_z_m,
+            ground=assumed,
             problems=(*built.problems, *_pointless(tracks, built)),
         )
 

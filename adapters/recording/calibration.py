@@ -90,6 +90,16 @@ def read_calibration(root: Path) -> Calibration:
     )
 
 
+def read_lidar_classes(root: Path) -> Mapping[int, int] | None:
+    """The calibration's lidar_classes alone.
+
+    Raises:
+        AdapterError: the file is missing or damaged, or names no classes.
+    """
+    path = root / CALIBRATION
+    return _lidar_classes(path, _read_json(path).get("lidar_classes"))
+
+
 def _read_json(path: Path) -> dict[str, Any]:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))

@@ -5,6 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
+from adapters.recording.calibration import read_lidar_classes
+from adapters.recording.classes import class_numbers, class_table
 from adapters.recording.files import inside, numbered_files
 from adapters.recording.tables import TimedBoxes, read_frame_boxes, read_sweep
 from augment.labels import Boxes, LidarSweep
@@ -40,3 +44,15 @@ class RecordingLabels:
     def lidar(self, frame_index: int) -> LidarSweep | None:
         path = lidar_files(self.root).get(frame_index)
         return None if path is None else read_sweep(path)
+
+    def lidar_classes(self, sweep: LidarSweep) -> np.ndarray | None:
+        """The SemanticClass of each return, or NO_SURFACE; None where the numbers are not known to
+        mean anything.
+        """
+        column = sweep.columns.get("semantic")
+        if column is None:
+            return None
+        numbers = class_numbers(self.root / "lidar", column)
+        meanings = read_lidar_classes(self.root)
+        table, _ = class_table(self.root, np.unique(numbers), meanings)
+        return None if table is None else table[numbers]

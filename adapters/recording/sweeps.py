@@ -10,8 +10,9 @@ import numpy as np
 from tqdm import tqdm
 
 from adapters.lidar.split import Sweep
-from adapters.lidar.sweep_times import sweep_times, whole_numbers
+from adapters.lidar.sweep_times import sweep_times
 from adapters.recording.calibration import NO_SURFACE, Calibration
+from adapters.recording.classes import class_numbers, class_table
 from adapters.recording.labels import lidar_files
 from adapters.recording.tables import read_sweep
 from augment.cameras import Frame
@@ -100,7 +101,7 @@ class _Raw:
         times = _times(path, sweep, frame.timestamp_ns)
         classes = sweep.columns.get("semantic")
         if classes is not None:
-            classes = _classes(path, classes)[keep]
+            classes = class_numbers(path, classes)[keep]
         return _Raw(
             frame.index,
             world[keep].astype(np.float32),
@@ -125,43 +126,14 @@ def _times(path: Path, sweep: LidarSweep, frame_ns: int) -> np.ndarray | None:
         raise AdapterError(f"{path}: {error}") from None
 
 
-def _classes(path: Path, column: np.ndarray) -> np.ndarray:
-    try:
-        return whole_numbers(column, "semantic")
-    except ValueError as error:
-        raise AdapterError(f"{path}: {error}") from None
-
-
 def _class_table(
     root: Path, raws: Sequence[_Raw], calibration: Calibration
 ) -> tuple[np.ndarray | None, tuple[str, ...]]:
-    """SemanticClass by the files' class number, int16; None where their meaning is not known."""
+    """As `class_table`, for the classes of all sweeps."""
     present = [np.unique(raw.classes) for raw in raws if raw.classes is not None]
     if not present:
         return None, ()
-    numbers = np.unique(np.concatenate(present))
-    if len(numbers) == 0:
-        return None, ()
-    if calibration.lidar_classes is None:
-        known = (numbers >= 0) & (numbers < SemanticClass.SKY)
-        if not known.all():
-            return None, (
-                f"lidar/: the column semantic holds {int(numbers[~known][0])}, which is no "
-                f"SemanticClass (0 to {SemanticClass.SKY - 1}): classes are ignored. Say what the "
-                f'numbers mean in calibration.json: "lidar_classes": {{"7": "road", ...}}',
-            )
-        return np.arange(SemanticClass.SKY, dtype=np.int16), ()
-    size = max(0, int(numbers.max()), *calibration.lidar_classes) + 1
-    if numbers.min() < 0 or min(calibration.lidar_classes, default=0) < 0 or size > 2**16:
-        raise AdapterError(
-            f"{root / 'lidar'}: class numbers must lie in 0 to 65535; the files hold "
-            f"{int(numbers.min())} to {int(numbers.max())}, lidar_classes names "
-            f"{sorted(calibration.lidar_classes)}"
-        )
-    table = np.full(size, SemanticClass.UNKNOWN, np.int16)
-    for number, meaning in calibration.lidar_classes.items():
-        table[number] = meaning
-    return table, ()
+    return class_table(root, np.unique(np.concatenate(present)), calibration.lidar_classes)
 
 
 def _own_returns(sweeps: Sequence[Sweep], known: Sequence[tuple[Frame, Path]]) -> list[str]:

@@ -54,6 +54,10 @@ class StreetLabels:
         self._time_ns(frame_index)
         return sweep(StreetTruth(build_street(self.parameters)), frame_index)
 
+    def lidar_classes(self, sweep: LidarSweep) -> np.ndarray:
+        """The SemanticClass of each return: the sweeps' own numbers."""
+        return np.asarray(sweep.columns["semantic"], np.int16)
+
     def _time_ns(self, frame_index: int) -> int:
         if not 0 <= frame_index < self.parameters.frames:
             raise SceneError(
