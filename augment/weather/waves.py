@@ -23,6 +23,7 @@ from torch import Tensor
 
 GRAVITY_MPS2 = 9.80665
 UNIT_ERROR = 1e-6  # of a direction's length, which scales a wavelength no more than this
+CUSP = 1e-12  # area that is left of a unit of the plane where the surface counts as a point
 STEEPNESS_ROUNDING = 1e-9  # sums of decimal fractions that make 1 on paper
 
 
@@ -173,11 +174,11 @@ def tangent_terms(
 
 
 def normals_from_tangents(tangents: Float64[Tensor, "*B 5"]) -> Float64[Tensor, "*B 3"]:
-    """The unit cross product of the two tangents; straight up where they are parallel."""
+    """The unit cross product of the two tangents; straight up where both vanish."""
     xx, xy, yy, gx, gy = tangents.unbind(-1)
     # Rounding must not turn the normal over where the surface is about to fold.
     up = ((1 - xx) * (1 - yy) - xy * xy).clamp_min(0)
     normals = torch.stack([-xy * gy - (1 - yy) * gx, -xy * gx - (1 - xx) * gy, up], dim=-1)
     length = normals.norm(dim=-1, keepdim=True)
     level = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-    return torch.where(length > 0, normals / length.clamp_min(1e-300), level)
+    return torch.where(length > CUSP, normals / length.clamp_min(CUSP), level)

@@ -26,7 +26,7 @@ from augment.render.cpu_jit import inner, kernel
 
 CHUNK = 64  # columns that share an anchor; few enough for float32 turns good to 1e-6
 KEPT, FADING = 7, 10  # float32 numbers that are laid out per wave
-_ZERO, _HALF, _ONE, _THREE, _TINY = (np.float32(x) for x in (0, 0.5, 1, 3, 1e-30))
+_ZERO, _HALF, _ONE, _THREE, _TINY = (np.float32(x) for x in (0, 0.5, 1, 3, 1e-24))
 # sin(pi r) / r and cos(pi r) in powers of r^2 for |r| <= 1/2, least maximal error (3e-9, 5e-8).
 _S0, _S1, _S2, _S3, _S4 = (
     np.float32(c) for c in (3.14159258, -5.16770688, 2.55003138, -0.598045173, 0.0772201257)
