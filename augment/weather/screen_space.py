@@ -29,15 +29,13 @@ from augment.cameras import Camera
 from augment.render.threads import kernel_threads
 from augment.weather import screen_space_kernels as kernels
 from augment.weather.flood import Layer
-from augment.weather.screen_space_kernels import (
-    AGREEING,
-    COVERED,
-    EDGE,
-    HIDDEN_PX,
-    NEAR_M,
-    THICKNESS,
-    THICKNESS_M,
+
+# The kernels' thresholds, as numbers that torch takes.
+COVERED, THICKNESS_M, THICKNESS = map(
+    float, (kernels.COVERED, kernels.THICKNESS_M, kernels.THICKNESS)
 )
+HIDDEN_PX, NEAR_M = float(kernels.HIDDEN_PX), float(kernels.NEAR_M)
+AGREEING, EDGE = float(kernels.AGREEING), float(kernels.EDGE)
 
 STEP_PX = 0.25  # of the definition's march
 STRIDES = (1, 2, 4)
@@ -120,23 +118,19 @@ def _trace_fast(
     whole = front.camera
     up, image, eye_height_m = _vertical(whole, level_z_m)
     alpha = front.alpha.detach().contiguous().numpy()
-    sizes = [(whole.height, whole.width)]
-    while sizes[-1] != (1, 1):
-        sizes.append(((sizes[-1][0] + 1) // 2, (sizes[-1][1] + 1) // 2))
-    starts = np.cumsum([0, *(rows * columns for rows, columns in sizes)])
-    pyramid = np.empty(starts[-1], np.float32)
-    shape = np.array([(*size, start) for size, start in zip(sizes, starts, strict=False)])
+    block = kernels.BLOCK
+    high, wide = (-(-size // block) * block for size in (whole.height, whole.width))
+    pyramid = np.empty((high, wide + wide // 4), np.float32)
     numbers = (*up, *image, whole.fx, whole.fy, whole.cx, whole.cy, eye_height_m)
+    numbers += (whole.width, whole.height)
     view = np.array(numbers, np.float32)
     rows, columns = -(-camera.height // stride), -(-camera.width // stride)
     ways, trust = np.empty((2, rows, columns), np.float32)
     distance, weight = np.empty((2, camera.height, camera.width), np.float32)
     with kernel_threads(ROWS):
-        kernels.build_pyramid(alpha, front.depth.detach().contiguous().numpy(), shape, pyramid)
-        kernels.trace(pyramid, shape, view, alpha, left, top, stride, ways, trust)
-        kernels.spread(
-            pyramid, shape, view, alpha, left, top, stride, ways, trust, distance, weight
-        )
+        kernels.build_pyramid(alpha, front.depth.detach().contiguous().numpy(), pyramid)
+        kernels.trace(pyramid, view, alpha, left, top, stride, ways, trust)
+        kernels.spread(pyramid, view, alpha, left, top, stride, ways, trust, distance, weight)
     return torch.from_numpy(distance), torch.from_numpy(weight)
 
 

@@ -1,13 +1,17 @@
-"""Numba kernels that march mirrored rays through a pyramid of the nearest depth.
+"""Numba kernels that march mirrored rays, eight at a time, through a pyramid of the nearest depth.
 
 The letters are those of `screen_space`, which defines the result. The pyramid holds inverse depths,
-which are linear along a ray's image: a cell of level l is the largest of 2^l x 2^l pixels, 0 where
+which are linear along a ray's image: a cell of level l is the largest of 4^l x 4^l pixels, 0 where
 nothing stands. A ray whose own inverse depth stays above a cell's, all the way across it, is in
 front of everything there and passes the cell at once.
 
-shape [levels, 3]: rows, columns, and the index at which the level starts. view: the vertical in
-the camera (3), its image N (3), fx, fy, cx, cy, and the eye's height over the water.
+The levels lie in one array: level 0, padded to whole cells of the highest level, [R, C]; to the
+right of it the others, level l from row R (1 - 4 / 4^l) on. view: the vertical in the camera (3),
+its image N (3), fx, fy, cx, cy, the eye's height over the water, and the image's width and height.
 """
+
+# pyright: reportCallIssue=false
+# (of numba's intrinsics it sees the compiler's first argument as well)
 
 from __future__ import annotations
 
@@ -15,7 +19,11 @@ import math
 
 import numba
 import numpy as np
+from llvmlite import ir
+from numba.core import cgutils
+from numba.extending import intrinsic
 
+from augment.render import cpu_simd as v8
 from augment.render.cpu_jit import inner, kernel
 
 COVERED = np.float32(1 - 1 / 512)  # an alpha through which the water does not show
@@ -26,61 +34,90 @@ NEAR_M = np.float32(0.05)  # rays coming back end so far from the camera's plane
 AGREEING = np.float32(0.05)  # neighbours of one surface: relative difference of inverse depths
 EDGE = np.float32(0.04)  # share of the image over which the weight falls to 0
 
-_MAX_STEPS = 1024  # cells a ray may look at; streets need 30 on average
+LEVELS = 3  # above the pixels
+BLOCK = 4**LEVELS  # pixels along a cell of the highest one
+
+_MAX_STEPS = 1024  # cells a ray may look at; streets need 20 on average
 _NUDGE = np.float32(1e-3)  # pixels past a cell's border, against rounding
 _ZERO, _HALF, _ONE = np.float32(0), np.float32(0.5), np.float32(1)
 _INFINITE = np.float32(math.inf)
-# Ways (fractions of |x|) that one bilinear patch may hold: those of one surface.
-_SMOOTH, _SMOOTH_M = np.float32(0.1), np.float32(0.25)
+_FARTHEST = np.float32(1e-9)  # inverse depth; nothing is seen beyond
+# Ways (in |x|) that one bilinear patch may hold: those of one surface.
+_SMOOTH, _SMOOTH_WAY = np.float32(0.2), np.float32(0.05)
 
 
 @kernel
-def build_pyramid(alpha, depth, shape, pyramid):
-    """Largest inverse depths, from the pixels down to a single cell."""
+def build_pyramid(alpha, depth, pyramid):
+    """Largest inverse depths of the front's solid pixels, in pyramid [R, C + C / 4]."""
     height, width = alpha.shape
-    for i in numba.prange(height):
-        row = i * width
-        for j in range(width):
-            solid = alpha[i, j] >= _HALF
-            pyramid[row + j] = _ONE / depth[i, j] if solid else _ZERO
-    for level in range(1, len(shape)):
-        rows, columns, start = shape[level]
-        fine_rows, fine_columns, fine = shape[level - 1]
-        for i in numba.prange(rows):
-            above = fine + 2 * i * fine_columns
-            below = above + fine_columns if 2 * i + 1 < fine_rows else above
-            whole = fine_columns // 2
-            for j in range(whole):
-                pyramid[start + i * columns + j] = max(
-                    max(pyramid[above + 2 * j], pyramid[above + 2 * j + 1]),
-                    max(pyramid[below + 2 * j], pyramid[below + 2 * j + 1]),
-                )
-            if whole < columns:  # an odd column stands alone
-                last = fine_columns - 1
-                value = max(pyramid[above + last], pyramid[below + last])
-                pyramid[start + i * columns + whole] = value
+    rows = pyramid.shape[0]
+    columns = pyramid.shape[1] // 5 * 4
+    for block in numba.prange(rows // BLOCK):
+        for i in range(block * BLOCK, (block + 1) * BLOCK):
+            out = pyramid[i]
+            if i < height:
+                seen, z = alpha[i], depth[i]
+                for j in range(width):
+                    out[j] = _ONE / z[j] if seen[j] >= _HALF else _ZERO
+                out[width:columns] = _ZERO
+            else:
+                out[:columns] = _ZERO
+        fine, size = pyramid[block * BLOCK : (block + 1) * BLOCK, :columns], 4
+        for _ in range(LEVELS):
+            first = rows - rows * 4 // size + block * (BLOCK // size)
+            coarse = pyramid[first : first + BLOCK // size, columns : columns + columns // size]
+            for i in range(coarse.shape[0]):
+                a, b, c, d = fine[4 * i], fine[4 * i + 1], fine[4 * i + 2], fine[4 * i + 3]
+                for j in range(coarse.shape[1]):
+                    largest = _ZERO
+                    for k in range(4 * j, 4 * j + 4):
+                        largest = max(largest, max(max(a[k], b[k]), max(c[k], d[k])))
+                    coarse[i, j] = largest
+            fine, size = coarse, size * 4
+
+
+@intrinsic
+def _fetch(typingctx, array, row, column):
+    """array[row, column] for eight pairs of whole numbers >= -1, of a contiguous 2-D array."""
+
+    def codegen(context, builder, sig, args):
+        whole, wide = ir.VectorType(ir.IntType(32), v8.LANES), ir.IntType(64)
+        held = context.make_array(sig.args[0])(context, builder, args[0])
+        rows, columns = (
+            builder.trunc(n, ir.IntType(32)) for n in cgutils.unpack_tuple(builder, held.shape)
+        )
+        undefined = ir.Constant(whole, ir.Undefined)
+        pitch, last = undefined, undefined
+        size = builder.sub(builder.mul(rows, columns), ir.IntType(32)(1))
+        for lane in range(v8.LANES):
+            pitch = builder.insert_element(pitch, columns, ir.IntType(32)(lane))
+            last = builder.insert_element(last, size, ir.IntType(32)(lane))
+        index = builder.mul(builder.fptosi(args[1], whole), pitch)
+        index = builder.add(index, builder.fptosi(args[2], whole))
+        zero = ir.Constant(whole, [0] * v8.LANES)
+        index = builder.select(builder.icmp_signed("<", index, zero), zero, index)
+        index = builder.select(builder.icmp_signed(">", index, last), last, index)
+        value = ir.Constant(ir.VectorType(ir.FloatType(), v8.LANES), ir.Undefined)
+        for lane in range(v8.LANES):
+            number = ir.IntType(32)(lane)
+            at = builder.zext(builder.extract_element(index, number), wide)
+            element = builder.load(builder.gep(held.data, [at]))
+            value = builder.insert_element(value, element, number)
+        return value
+
+    return v8.float8(array, v8.float8, v8.float8), codegen
 
 
 @inner()
-def _back_side(surface):
-    depth = _ONE / surface
-    return _ONE / (depth + max(THICKNESS * depth, THICKNESS_M))
-
-
-@inner()
-def _difference(pyramid, here, before, has_before, after, has_after):
+def _difference(before, here, after, has_before, has_after):
     """Change of the inverse depth per pixel, from those neighbours that belong to the surface."""
     total, count = _ZERO, _ZERO
-    if has_after:
-        change = pyramid[after] - here
-        if abs(change) < AGREEING * here:
-            total += change
-            count += _ONE
-    if has_before:
-        change = here - pyramid[before]
-        if abs(change) < AGREEING * here:
-            total += change
-            count += _ONE
+    if has_after and abs(after - here) < AGREEING * here:
+        total += after - here
+        count += _ONE
+    if has_before and abs(here - before) < AGREEING * here:
+        total += here - before
+        count += _ONE
     return total / max(count, _ONE)
 
 
@@ -93,91 +130,182 @@ def _edge_weight(x, y, width, height):
 
 
 @inner()
-def _march(pyramid, shape, view, column, row):
-    """(way / |x|, weight) of the ray mirrored at a pixel of the image that sees the water."""
-    height, width = shape[0, 0], shape[0, 1]
-    if row < 0 or row >= height or column < 0 or column >= width:
-        return _INFINITE, _ZERO
-    x0, y0 = np.float32(column) + _HALF, np.float32(row) + _HALF
-    u, v = (x0 - view[8]) / view[6], (y0 - view[9]) / view[7]
-    slope = u * view[0] + v * view[1] + view[2]
-    gx, gy = view[3] - x0 * view[5], view[4] - y0 * view[5]
-    g = max(max(abs(gx), abs(gy)), np.float32(1e-9))
-    rise = np.float32(-2) * slope
+def _set_up(view, xs, ys, first):
+    """Numbers of eight mirrored rays, those of the definition's record, and where they begin."""
+    width, height = view[11], view[12]
+    x0, y0 = v8.load(xs, first), v8.load(ys, first)
+    one, zero = v8.splat(_ONE), v8.splat(_ZERO)
+    nx, ny, nz = v8.splat(view[0]), v8.splat(view[1]), v8.splat(view[2])
+    u = (x0 - v8.splat(view[8])) / v8.splat(view[6])
+    v = (y0 - v8.splat(view[9])) / v8.splat(view[7])
+    slope = u * nx + v * ny + nz
+    gx, gy = v8.splat(view[3]) - x0 * nz, v8.splat(view[4]) - y0 * nz
+    g = v8.maximum(v8.maximum(v8.absolute(gx), v8.absolute(gy)), v8.splat(np.float32(1e-9)))
+    rise = slope * v8.splat(np.float32(-2))
     scale = rise * g
-    bend = (_ONE + rise * view[2]) / scale
-    near = -slope / view[10]
+    bend = (one + rise * nz) / scale
+    near = v8.negate(slope) / v8.splat(view[10])
     dx, dy = gx / g, gy / g
     # A ray along an axis never gets to the other axis's next border.
-    inverse_x = _ONE / dx if dx != _ZERO else np.float32(1e30)
-    inverse_y = _ONE / dy if dy != _ZERO else np.float32(1e30)
-    ahead_x, ahead_y = 1 if dx >= _ZERO else 0, 1 if dy >= _ZERO else 0
-    w, h = np.float32(width), np.float32(height)
-    end = min((w - x0 if ahead_x else -x0) * inverse_x, (h - y0 if ahead_y else -y0) * inverse_y)
-    to_sky = False
-    if bend < _ZERO:
-        end = min(end, (_ONE - _ONE / (near * NEAR_M)) / bend)
-    elif bend * end >= _ONE:
-        end, to_sky = _ONE / bend, True
-    # Nothing is met in the pixel that the ray starts from.
-    t = _NUDGE + min(
-        (np.float32(column + ahead_x) - x0) * inverse_x, (np.float32(row + ahead_y) - y0) * inverse_y
+    tiny = v8.splat(np.float32(1e-30))
+    inverse_x = one / v8.select(v8.greater(v8.absolute(dx), tiny), dx, tiny)
+    inverse_y = one / v8.select(v8.greater(v8.absolute(dy), tiny), dy, tiny)
+    ahead_x = v8.select(v8.at_least(inverse_x, zero), one, zero)
+    ahead_y = v8.select(v8.at_least(inverse_y, zero), one, zero)
+    end = v8.minimum(
+        (ahead_x * v8.splat(width) - x0) * inverse_x, (ahead_y * v8.splat(height) - y0) * inverse_y
     )
-    top = len(shape) - 1
-    level = min(1, top)
-    hidden, clean = _ZERO, True
-    for _ in range(_MAX_STEPS):
-        if t >= end:
-            if to_sky and clean:
-                return _INFINITE, _edge_weight(x0 + end * dx, y0 + end * dy, w, h)
-            return _INFINITE, _ZERO
-        cx = min(max(int(x0 + t * dx), 0), width - 1) >> level
-        cy = min(max(int(y0 + t * dy), 0), height - 1) >> level
-        border_x = np.float32((cx + ahead_x) << level)
-        border_y = np.float32((cy + ahead_y) << level)
-        leave = min(min((border_x - x0) * inverse_x, (border_y - y0) * inverse_y), end)
-        leave = max(leave, t)
-        k0, k1 = (_ONE - bend * t) * near, (_ONE - bend * leave) * near
-        surface = pyramid[shape[level, 2] + cy * shape[level, 1] + cx]
-        if surface == _ZERO or min(k0, k1) > surface:
-            hidden = _ZERO
-        elif level > 0:
-            level -= 1
-            continue
-        elif max(k0, k1) >= _back_side(surface):
-            way, at = _meet(pyramid, width, height, cx, cy, x0, y0, dx, dy, bend, near, end)
-            weight = _edge_weight(x0 + at * dx, y0 + at * dy, w, h)
-            return way / scale, weight
-        else:
-            clean = False
-            hidden += leave - t
-            if hidden > HIDDEN_PX:
-                return _INFINITE, _ZERO
-        t = leave + _NUDGE
-        # Up only out of the parent: it has been looked into already.
-        parent_x, parent_y = int(x0 + t * dx) >> (level + 1), int(y0 + t * dy) >> (level + 1)
-        if level < top and (parent_x != cx >> 1 or parent_y != cy >> 1):
-            level += 1
-    return _INFINITE, _ZERO
+    back = (one - one / (near * v8.splat(NEAR_M))) / bend
+    returns = v8.greater(zero, bend)
+    end = v8.select(returns, v8.minimum(end, back), end)
+    far = v8.at_least(bend * end, one)
+    end = v8.select(far, one / bend, end)
+    to_sky = v8.select(far, one, zero)
+    ray = (x0, y0, dx, dy, inverse_x, inverse_y, ahead_x, ahead_y, near, bend * near, end)
+    # Nothing is met in the pixel that the ray starts from.
+    t = v8.splat(_HALF) * v8.minimum(v8.absolute(inverse_x), v8.absolute(inverse_y))
+    size = v8.splat(np.float32(4))
+    state = (t + v8.splat(_NUDGE), end, size, one / size, zero, one, zero)
+    return ray, state, to_sky, scale
 
 
 @inner()
-def _meet(pyramid, width, height, cx, cy, x0, y0, dx, dy, bend, near, end):
-    """t / (1 - c t) and t where the ray meets the plane through the pixel, at most 1 px off it."""
-    at = cy * width + cx
-    here = pyramid[at]
-    across = _difference(pyramid, here, at - 1, cx > 0, at + 1, cx + 1 < width)
-    down = _difference(pyramid, here, at - width, cy > 0, at + width, cy + 1 < height)
+def _step(pyramid, ray, state):
+    """Eight rays look into one cell each, and pass it or go into its parts.
+
+    state: t, the t to stop at, the cell's size and its inverse, pixels spent behind something
+    without a break, 1 if there were none ever, 1 where something is met.
+    """
+    x0, y0, dx, dy, inverse_x, inverse_y, ahead_x, ahead_y, near, change, end = ray
+    t, stop, size, inverse, hidden, clean, met = state
+    zero, half, one = v8.splat(_ZERO), v8.splat(_HALF), v8.splat(_ONE)
+    four, quarter = v8.splat(np.float32(4)), v8.splat(np.float32(0.25))
+    rows = v8.splat(np.float32(pyramid.shape[0]))
+    columns = v8.splat(np.float32(pyramid.shape[1] // 5 * 4))
+    going = v8.greater(stop, t)
+    cell_x = v8.floor(v8.fmuladd(t, dx, x0) * inverse)
+    cell_y = v8.floor(v8.fmuladd(t, dy, y0) * inverse)
+    level_row = v8.maximum(rows - rows * four * inverse, zero)
+    level_column = v8.select(v8.greater(size, one), columns, zero)
+    surface = _fetch(pyramid, cell_y + level_row, cell_x + level_column)
+    leave_x = ((cell_x + ahead_x) * size - x0) * inverse_x
+    leave_y = ((cell_y + ahead_y) * size - y0) * inverse_y
+    leave = v8.maximum(v8.minimum(v8.minimum(leave_x, leave_y), end), t)
+    beyond = leave + v8.splat(_NUDGE)
+    # Up only out of the parent, which has been looked into already.
+    above = inverse * quarter
+    other_x = v8.floor(v8.fmuladd(beyond, dx, x0) * above) - v8.floor(cell_x * quarter)
+    other_y = v8.floor(v8.fmuladd(beyond, dy, y0) * above) - v8.floor(cell_y * quarter)
+    climbs = v8.both(
+        v8.greater(v8.splat(np.float32(BLOCK)), size),
+        v8.greater(v8.absolute(other_x) + v8.absolute(other_y), half),
+    )
+    k0, k1 = near - change * t, near - change * leave
+    nearest = v8.maximum(v8.minimum(k0, k1), v8.splat(_FARTHEST))
+    reached = v8.both(going, v8.at_least(surface, nearest))
+    thick = v8.maximum(v8.splat(THICKNESS), v8.splat(THICKNESS_M) * surface)
+    entered = v8.at_least(v8.maximum(k0, k1) * (one + thick), surface)
+    pixel = v8.both(reached, v8.at_least(one, size))
+    hit = v8.both(pixel, entered)
+    met = v8.select(hit, one, met)
+    clean = v8.select(pixel, v8.select(entered, clean, zero), clean)
+    hidden = v8.select(pixel, hidden + (leave - t), v8.select(reached, hidden, zero))
+    stop = v8.select(hit, v8.negate(one), stop)
+    stop = v8.select(v8.greater(hidden, v8.splat(HIDDEN_PX)), v8.negate(one), stop)
+    moved = v8.select(pixel, beyond, v8.select(reached, t, beyond))
+    t = v8.select(hit, t, v8.select(going, moved, t))
+    up = v8.select(climbs, four, one)
+    size = v8.select(reached, v8.maximum(size * quarter, one), size * up)
+    up = v8.select(climbs, above, inverse)
+    inverse = v8.select(reached, v8.minimum(inverse * four, one), up)
+    return t, stop, size, inverse, hidden, clean, met
+
+
+@inner()
+def _march(pyramid, view, lanes, xs, ys, first, ways, trusts):
+    """(way / |x|, weight) of eight mirrored rays of pixels of the image that see the water.
+
+    xs, ys: pixel centres, read from `first` on; the results go to the same places. lanes: scratch.
+    """
+    ray, state, to_sky, scale = _set_up(view, xs, ys, first)
+    for _ in range(_MAX_STEPS):
+        # The sign is clear where a ray goes on; one that has ended just here does no harm.
+        if not v8.any_not_negative(state[1] - state[0]):
+            break
+        state = _step(pyramid, ray, state)
+    _finish(pyramid, view, lanes, ray, state, to_sky, scale, first, ways, trusts)
+
+
+@inner()
+def _finish(pyramid, view, lanes, ray, state, to_sky, scale, first, ways, trusts):
+    """Results of eight rays that have ended."""
+    x0, y0, dx, dy, _, _, _, _, near, change, end = ray
+    t, stop, _, _, _, clean, met = state
+    half, zero = v8.splat(_HALF), v8.splat(_ZERO)
+    sky = v8.select(v8.at_least(t, stop), clean * to_sky, zero)
+    t = v8.select(v8.greater(met, half), t, end)
+    v8.store(lanes, np.uint64(0), met)
+    v8.store(lanes, np.uint64(8), sky)
+    v8.store(lanes, np.uint64(16), t)
+    v8.store(lanes, np.uint64(24), dx)
+    v8.store(lanes, np.uint64(32), dy)
+    v8.store(lanes, np.uint64(40), change)
+    v8.store(lanes, np.uint64(48), near)
+    v8.store(lanes, np.uint64(56), end)
+    v8.store(lanes, np.uint64(64), scale)
+    v8.store(lanes, np.uint64(72), x0)
+    v8.store(lanes, np.uint64(80), y0)
+    width, height = view[11], view[12]
+    for lane in range(8):
+        way, trust, t_last = _INFINITE, _ZERO, lanes[16 + lane]
+        x, y = lanes[72 + lane], lanes[80 + lane]
+        step_x, step_y = lanes[24 + lane], lanes[32 + lane]
+        if lanes[lane] > _HALF:
+            change_, near_ = lanes[40 + lane], lanes[48 + lane]
+            way, t_last = _meet(
+                pyramid, width, height, x, y, step_x, step_y, t_last, change_, near_
+            )
+            t_last = min(t_last, lanes[56 + lane])
+            way = way * near_ / lanes[64 + lane]
+        if lanes[lane] > _HALF or lanes[8 + lane] > _HALF:
+            trust = _edge_weight(x + t_last * step_x, y + t_last * step_y, width, height)
+        ways[first + np.uint64(lane)] = way
+        trusts[first + np.uint64(lane)] = trust
+
+
+@inner()
+def _meet(pyramid, width, height, x0, y0, dx, dy, t, change, near):
+    """t / k and t where the ray, of inverse depth k, meets the plane through the pixel found at t.
+
+    At most 1 px off that pixel.
+    """
+    cx = min(max(int(x0 + t * dx), 0), int(width) - 1)
+    cy = min(max(int(y0 + t * dy), 0), int(height) - 1)
+    here = pyramid[cy, cx]
+    left, above = max(cx - 1, 0), max(cy - 1, 0)  # a pixel is its own neighbour at the border
+    right, below = min(cx + 1, int(width) - 1), min(cy + 1, int(height) - 1)
+    across = _difference(pyramid[cy, left], here, pyramid[cy, right], cx > left, right > cx)
+    down = _difference(pyramid[above, cx], here, pyramid[below, cx], cy > above, below > cy)
     off_x, off_y = np.float32(cx) + _HALF - x0, np.float32(cy) + _HALF - y0
-    closing = -bend * near - across * dx - down * dy
+    closing = -change - across * dx - down * dy
     middle = off_x * dx if abs(dx) >= abs(dy) else off_y * dy
-    t = middle
+    meet = middle
     if closing != _ZERO:
-        t = (here - across * off_x - down * off_y - near) / closing
+        meet = (here - across * off_x - down * off_y - near) / closing
     reach = np.float32(1.5)
-    t = min(max(min(max(t, middle - reach), middle + reach), _ZERO), end)
+    meet = max(min(max(meet, middle - reach), middle + reach), _ZERO)
     # Not farther than what was met, however the ray grazes it.
-    return t / (max((_ONE - bend * t) * near, _back_side(here)) / near), t
+    back = here / (_ONE + max(THICKNESS, THICKNESS_M * here))
+    return meet / max(near - change * meet, back), meet
+
+
+@inner()
+def _run(pyramid, view, lanes, xs, ys, count, ways, trusts):
+    """`_march` of the first `count` pixels of a list, which has room for eight more."""
+    for first in range(0, count, 8):
+        for spare in range(count, first + 8):
+            xs[spare], ys[spare] = xs[count - 1], ys[count - 1]
+        _march(pyramid, view, lanes, xs, ys, np.uint64(first), ways, trusts)
 
 
 @inner()
@@ -191,30 +319,53 @@ def _sees_water(view, alpha, column, row):
 
 
 @inner()
-def _surface_range(view, column, row):
-    """|x|, metres from the eye to the water."""
-    u = (np.float32(column) + _HALF - view[8]) / view[6]
-    v = (np.float32(row) + _HALF - view[9]) / view[7]
-    slope = u * view[0] + v * view[1] + view[2]
-    return math.sqrt(_ONE + u * u + v * v) * view[10] / -slope
+def _inside(alpha, column, row):
+    return 0 <= row < alpha.shape[0] and 0 <= column < alpha.shape[1]
 
 
 @kernel
-def trace(pyramid, shape, view, alpha, left, top, stride, ways, weights):
+def trace(pyramid, view, alpha, left, top, stride, ways, weights):
     """Ways (in |x|) and weights of every `stride`-th pixel; weight -1 where no water shows."""
+    columns = ways.shape[1]
     for i in numba.prange(ways.shape[0]):
-        row = top + i * stride
-        for j in range(ways.shape[1]):
+        lanes = np.empty(88, np.float32)
+        lists = np.empty((4, columns + 8), np.float32)
+        row, count = top + i * stride, 0
+        for j in range(columns):
             column = left + j * stride
-            way, weight = _INFINITE, np.float32(-1)
-            if _sees_water(view, alpha, column, row):
-                way, weight = _march(pyramid, shape, view, column, row)
-            ways[i, j] = way
-            weights[i, j] = weight
+            ways[i, j] = _INFINITE
+            weights[i, j] = _ZERO
+            if not _sees_water(view, alpha, column, row):
+                weights[i, j] = -_ONE
+            elif _inside(alpha, column, row):
+                lists[0, count] = np.float32(column) + _HALF
+                lists[1, count] = np.float32(row) + _HALF
+                count += 1
+        _run(pyramid, view, lanes, lists[0], lists[1], count, lists[2], lists[3])
+        for n in range(count):
+            j = (int(lists[0, n]) - left) // stride
+            ways[i, j] = lists[2, n]
+            weights[i, j] = lists[3, n]
+
+
+@inner()
+def _to_metres(view, alpha, column, row, distance, weight):
+    """A row of ways (in |x|) becomes metres; pixels that show no water get no weight."""
+    v = (np.float32(row) + _HALF - view[9]) / view[7]
+    vv, slope_v = _ONE + v * v, v * view[1] + view[2]
+    inside = 0 <= row < alpha.shape[0]
+    for j in range(distance.shape[0]):
+        u = (np.float32(column + j) + _HALF - view[8]) / view[6]
+        slope = u * view[0] + slope_v
+        covered = inside and 0 <= column + j < alpha.shape[1] and alpha[row, column + j] >= COVERED
+        hidden = slope >= _ZERO or covered
+        r = math.sqrt(vv + u * u) * view[10] / -slope
+        distance[j] = _INFINITE if hidden else distance[j] * r
+        weight[j] = _ZERO if hidden else weight[j]
 
 
 @kernel
-def spread(pyramid, shape, view, alpha, left, top, stride, ways, weights, distance, weight):
+def spread(pyramid, view, alpha, left, top, stride, ways, weights, distance, weight):
     """Metres and weights of all pixels; the four traced around a pixel speak for it if they agree.
 
     Where they do not, at silhouettes and beside covered pixels, the pixel is traced itself.
@@ -223,36 +374,50 @@ def spread(pyramid, shape, view, alpha, left, top, stride, ways, weights, distan
     rows, columns = ways.shape
     part = _ONE / np.float32(stride)
     for i in numba.prange(rows):
-        below = min(i + 1, rows - 1)
+        lanes = np.empty(88, np.float32)
+        lists = np.empty((4, stride * (width + stride) + 8), np.float32)
+        count = 0
+        below, deep = min(i + 1, rows - 1), min(stride, height - i * stride)
+        y0 = i * stride
         for j in range(columns):
-            right = min(j + 1, columns - 1)
+            right, wide = min(j + 1, columns - 1), min(stride, width - j * stride)
+            x0 = j * stride
             w00, w01, w10, w11 = ways[i, j], ways[i, right], ways[below, j], ways[below, right]
             t00, t01 = weights[i, j], weights[i, right]
             t10, t11 = weights[below, j], weights[below, right]
             least, most = min(min(w00, w01), min(w10, w11)), max(max(w00, w01), max(w10, w11))
             sure = min(min(t00, t01), min(t10, t11))
             doubt = max(max(t00, t01), max(t10, t11))
-            same = sure >= _ZERO and (sure > _ZERO or doubt == _ZERO)
-            infinite = least == _INFINITE
-            if same and not infinite:
-                r = _surface_range(view, left + j * stride, top + i * stride)
-                same = most - least <= _SMOOTH * least + _SMOOTH_M / r
-            for di in range(min(stride, height - i * stride)):
-                fy = np.float32(di) * part
-                y = i * stride + di
-                for dj in range(min(stride, width - j * stride)):
-                    fx = np.float32(dj) * part
-                    x = j * stride + dj
+            same = sure > _ZERO or (sure == _ZERO and doubt == _ZERO)
+            if same and least < _INFINITE:
+                same = most - least <= _SMOOTH * least + _SMOOTH_WAY
+            if same or doubt < _ZERO:
+                for di in range(deep):
+                    fy = np.float32(di) * part
+                    w0, w1 = w00 + (w10 - w00) * fy, w01 + (w11 - w01) * fy
+                    t0, t1 = t00 + (t10 - t00) * fy, t01 + (t11 - t01) * fy
+                    for dj in range(wide):
+                        fx = np.float32(dj) * part
+                        way = w0 + (w1 - w0) * fx if least < _INFINITE else _INFINITE
+                        distance[y0 + di, x0 + dj] = way
+                        weight[y0 + di, x0 + dj] = t0 + (t1 - t0) * fx
+                continue
+            for di in range(deep):
+                for dj in range(wide):
                     way, trust = w00, t00
-                    if not _sees_water(view, alpha, left + x, top + y):
+                    column, row = left + x0 + dj, top + y0 + di
+                    if di > 0 or dj > 0:
                         way, trust = _INFINITE, _ZERO
-                    elif same:
-                        upper, lower = t00 + (t01 - t00) * fx, t10 + (t11 - t10) * fx
-                        trust = upper + (lower - upper) * fy
-                        if not infinite:
-                            upper, lower = w00 + (w01 - w00) * fx, w10 + (w11 - w10) * fx
-                            way = upper + (lower - upper) * fy
-                    elif di > 0 or dj > 0:
-                        way, trust = _march(pyramid, shape, view, left + x, top + y)
-                    distance[y, x] = way * _surface_range(view, left + x, top + y)
-                    weight[y, x] = trust
+                        if _inside(alpha, column, row) and _sees_water(view, alpha, column, row):
+                            lists[0, count] = np.float32(column) + _HALF
+                            lists[1, count] = np.float32(row) + _HALF
+                            count += 1
+                    distance[y0 + di, x0 + dj] = way
+                    weight[y0 + di, x0 + dj] = trust
+        _run(pyramid, view, lanes, lists[0], lists[1], count, lists[2], lists[3])
+        for n in range(count):
+            x, y = int(lists[0, n]) - left, int(lists[1, n]) - top
+            distance[y, x] = lists[2, n]
+            weight[y, x] = lists[3, n]
+        for y in range(y0, y0 + deep):
+            _to_metres(view, alpha, left, top + y, distance[y], weight[y])
