@@ -1,0 +1,143 @@
+"""A water surface's picture: what it reflects, and what is seen through it. The torch definition.
+
+water = sum_i w_i F_i R_i + (1 - sum_i w_i F_i) T
+
+i runs over the slopes of the surface inside a pixel, F is the reflected share of the light, R what
+comes from the mirrored direction and T what comes up through the surface.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from augment.cameras import Camera
+from augment.sky import Sky
+from augment.weather import water_launch
+from augment.weather.flood import FloodMedium, Layer
+from augment.weather.fresnel import reflectance
+from augment.weather.reflection_lookup import (
+    mirrored_eye_is,
+    reflect_mirror,
+    reflect_screen,
+    reflect_sky,
+)
+from augment.weather.refraction import through_the_surface, window_offset
+from augment.weather.screen_space import ScreenReflection
+from augment.weather.smog import SmogMedium
+from augment.weather.water_surface import (
+    LEAST_COSINE,
+    Surface,
+    meet_plane,
+    mirrored,
+    tilted_normals,
+)
+from augment.weather.waves import WaveField
+
+HIDDEN_COVER = 1 - 1 / 512  # what is covered more than this adds less than half an 8-bit step
+
+
+def shade_water(
+    camera: Camera,
+    cover: Float[Tensor, "h w"],
+    medium: FloodMedium,
+    field: WaveField,
+    bed: Layer,
+    *,
+    mirror: Layer | None = None,
+    screen: ScreenReflection | None = None,
+    sky: Sky,
+    smog: SmogMedium | None = None,
+    fast: bool = True,
+) -> Float[Tensor, "h w 3"]:
+    """Colour of the water where the camera's rays meet it, not clamped; 0 where they do not.
+
+    camera: above the water. cover: alpha of what stands before the water; where it hides the water
+    the result is 0. field: of this camera. bed: from a window of the same image, best a larger one.
+    mirror: from the eye mirrored in the plane. screen: its layer is of the same eye. Layers are
+    fogged already; smog here dims the sky and the water's own colour. fast: float32 goes through
+    the CPU kernel, equal to this definition within float rounding, unless gradients are recorded.
+
+    Raises:
+        ValueError: the eye is not above the water, or cameras, images and fields do not fit.
+    """
+    _check(camera, cover, medium, field, bed, mirror, screen)
+    if smog is not None and smog.sigma_per_m == 0:
+        smog = None
+    images = [bed.rgb, bed.alpha, cover]
+    tracked = torch.is_grad_enabled() and any(image.requires_grad for image in images)
+    if fast and not tracked and bed.rgb.dtype == torch.float32:
+        return water_launch.shade(
+            camera, cover, HIDDEN_COVER, medium, field, bed, mirror, screen, sky, smog
+        )
+    surface = meet_plane(camera, medium.level_z_m, bed.rgb.dtype)
+    taps = tilted_normals(surface, field)
+    below = through_the_surface(surface, taps[0][1], camera, medium, bed, smog)
+    out = below
+    if medium.refraction_index != 1:
+        rays = [mirrored(surface.to_eye, normal) for _, normal in taps]
+        above = reflect_sky(surface, rays, camera, medium.level_z_m, sky, smog)
+        colors = above
+        if mirror is not None:
+            colors = reflect_mirror(surface, rays, mirror, above)
+        if screen is not None:
+            colors = reflect_screen(surface, rays, screen, above, colors)
+        for (weight, normal), color in zip(taps, colors, strict=True):
+            share = weight * reflected_share(surface, normal, medium)
+            out = out + share[..., None] * (color - below)
+    shown = surface.meets & (cover <= HIDDEN_COVER)
+    return torch.where(shown[..., None], out, 0)
+
+
+def reflected_share(
+    surface: Surface, normal: Float[Tensor, "h w 3"], medium: FloodMedium
+) -> Float[Tensor, "h w"]:
+    """F at a normal; facets that look away from the eye count as seen edge-on."""
+    cosine = (normal * surface.to_eye).sum(-1).clamp(LEAST_COSINE, 1)
+    return reflectance(cosine, medium.refraction_index, medium.fresnel)
+
+
+def _check(
+    camera: Camera,
+    cover: Tensor,
+    medium: FloodMedium,
+    field: WaveField,
+    bed: Layer,
+    mirror: Layer | None,
+    screen: ScreenReflection | None,
+) -> None:
+    eye_z = float(camera.centre[2])
+    if not eye_z > medium.level_z_m:
+        raise ValueError(
+            f"camera {camera.name!r} must be above the water at z = {medium.level_z_m} m; "
+            f"its eye is at z = {eye_z} m"
+        )
+    window_offset(bed.camera, camera)
+    parts = {"cover": cover, "field": field.normal_x}
+    if screen is not None:
+        parts |= {"screen.distance": screen.distance}
+    for name, part in parts.items():
+        _fits(name, part, camera)
+    layers = {
+        "bed": bed,
+        "mirror": mirror,
+        "screen.layer": None if screen is None else screen.layer,
+    }
+    for name, layer in layers.items():
+        if layer is not None:
+            _fits(name, layer.alpha, layer.camera)
+    if mirror is not None and not mirrored_eye_is(mirror.camera, medium.level_z_m, camera.centre):
+        expected = [*camera.centre.tolist()[:2], 2 * medium.level_z_m - eye_z]
+        raise ValueError(
+            f"the mirror's camera must stand at the mirrored eye {expected}; "
+            f"it stands at {mirror.camera.centre.tolist()}"
+        )
+
+
+def _fits(name: str, part: Tensor, camera: Camera) -> None:
+    if tuple(part.shape) != (camera.height, camera.width):
+        raise ValueError(
+            f"{name} must be [{camera.height}, {camera.width}] as its camera {camera.name!r} is; "
+            f"got {list(part.shape)}"
+        )

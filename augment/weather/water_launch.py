@@ -1,0 +1,149 @@
+"""Arrays for the kernels that shade water, and their launch."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from augment.cameras import Camera
+from augment.render.composite import sky_behind
+from augment.render.threads import kernel_threads
+from augment.sky import ConstantSky, CubemapSky, Sky, directions_of_cubemap
+from augment.weather import layer_lookup, reflection_lookup, refraction, water_surface
+from augment.weather import water_kernels as kernels
+from augment.weather.flood import FloodMedium, Layer
+from augment.weather.screen_space import ScreenReflection
+from augment.weather.smog import SmogMedium, optical_depth, vertical_optical_depth
+from augment.weather.waves import WaveField
+
+ROWS = 8  # image rows a thread takes at a time: rows without water cost nothing
+MIP_ROWS = 32
+SKY_SIZE = 256  # texels along a face where a sky that is no cube map is sampled onto one
+LARGEST = 1e30  # stands for infinity: its products with 0 are 0
+
+
+def shade(
+    camera: Camera,
+    cover: Tensor,
+    hidden_cover: float,
+    medium: FloodMedium,
+    field: WaveField,
+    bed: Layer,
+    mirror: Layer | None,
+    screen: ScreenReflection | None,
+    sky: Sky,
+    smog: SmogMedium | None,
+) -> Tensor:
+    """As `water.shade_water`; smog is None where it has no density."""
+    faces, layered = _faces(sky, smog)
+    rough = bool((field.slope_variance >= water_surface.SMOOTH_VARIANCE).any())
+    out = np.empty((camera.height, camera.width, 3), np.float32)
+    front, distance, weight = None, cover, cover
+    if screen is not None:
+        front, distance, weight = screen.layer, screen.distance, screen.weight
+    arguments = (
+        (np.arange(camera.width, dtype=np.float64) + 0.5 - camera.cx) / camera.fx,
+        (np.arange(camera.height, dtype=np.float64) + 0.5 - camera.cy) / camera.fy,
+        np.ascontiguousarray(camera.world_from_camera[:3, :3].numpy()),
+        _array(cover),
+        _array(field.normal_x),
+        _array(field.normal_y),
+        _array(field.slope_variance),
+        *_layer(bed),
+        refraction.window_offset(bed.camera, camera),
+        *_layer(mirror),
+        *_averages(mirror, rough),
+        mirror is not None,
+        *_layer(front),
+        *_averages(front, rough),
+        screen is not None,
+        _array(distance),
+        _array(weight),
+        faces.reshape(-1),
+        np.uint64(faces.shape[1]),
+        _medium(camera, medium, smog, layered),
+        _limits(hidden_cover),
+        out,
+    )
+    with kernel_threads(ROWS):
+        kernels.shade(*arguments)
+    return torch.from_numpy(out)
+
+
+def _array(part: Tensor) -> np.ndarray:
+    return part.detach().float().contiguous().numpy()
+
+
+def _faces(sky: Sky, smog: SmogMedium | None) -> tuple[np.ndarray, SmogMedium | None]:
+    seen, layered = sky_behind(sky, smog)
+    if isinstance(seen, CubemapSky):
+        faces = seen.faces
+    elif isinstance(seen, ConstantSky):
+        faces = seen.rgb.expand(6, 1, 1, 3)
+    else:
+        faces = seen.sample(directions_of_cubemap(SKY_SIZE))
+    return _array(faces), layered
+
+
+def _layer(layer: Layer | None) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """`kernels.View` and images of a layer; of None what nothing will be looked up in."""
+    if layer is None:
+        return np.zeros(22, np.float32), *[np.zeros(1, np.float32)] * 3
+    camera = layer.camera
+    rotation = camera.camera_from_world[:3, :3].numpy()
+    fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
+    project = rotation * [[fx], [fy], [1.0]]
+    rays = rotation.T @ [[1 / fx, 0.0, -cx / fx], [0.0, 1 / fy, -cy / fy], [0.0, 0.0, 1.0]]
+    numbers = [*project.reshape(-1), *rays.reshape(-1), cx, cy, camera.width, camera.height]
+    images = (_array(image).reshape(-1) for image in (layer.rgb, layer.alpha, layer.depth))
+    return np.asarray(numbers, np.float32), *images
+
+
+def _averages(layer: Layer | None, rough: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Mip levels from 1 on in one array, and (first pixel, width, height) of every level."""
+    if layer is None or not rough:
+        return np.zeros(1, np.float32), np.zeros((1, 3), np.uint64)
+    rgb, alpha = _array(layer.rgb), _array(layer.alpha)
+    height, width = alpha.shape
+    shapes, first = [(0, width, height)], 0
+    while len(shapes) < layer_lookup.MIP_LEVELS and max(height, width) > 1:
+        height, width = (height + 1) // 2, (width + 1) // 2
+        shapes.append((first, width, height))
+        first += height * width
+    mips = np.empty((max(first, 1), 4), np.float32)
+    last = None
+    with kernel_threads(MIP_ROWS):
+        for start, width, height in shapes[1:]:
+            image = mips[start : start + width * height].reshape(height, width, 4)
+            if last is None:
+                kernels.halve_image(rgb, alpha, image)
+            else:
+                kernels.halve_mip(last, image)
+            last = image
+    return mips.reshape(-1), np.asarray(shapes, np.uint64)
+
+
+def _medium(
+    camera: Camera, medium: FloodMedium, smog: SmogMedium | None, layered: SmogMedium | None
+) -> np.ndarray:
+    """`kernels.Medium`."""
+    eye_z, level = float(camera.centre[2]), medium.level_z_m
+    per_m, above, airlight = 0.0, -1.0, (0.0, 0.0, 0.0)
+    if smog is not None:
+        metre, height = torch.tensor([1.0, level], dtype=torch.float64)
+        per_m, airlight = float(optical_depth(smog, metre, eye_z, height)), smog.rgb
+    if layered is not None:
+        above = vertical_optical_depth(layered, level)
+    numbers = [eye_z - level, medium.refraction_index, medium.fresnel == "schlick"]
+    numbers += [*medium.extinction_per_m, *medium.rgb, per_m, above, *airlight]
+    return np.minimum(numbers, LARGEST).astype(np.float32)
+
+
+def _limits(hidden_cover: float) -> np.ndarray:
+    """`kernels.Limits`."""
+    surface, lookup, reflection = water_surface, layer_lookup, reflection_lookup
+    numbers = [hidden_cover, surface.FARTHEST, surface.LEAST_COSINE, surface.SMOOTH_VARIANCE]
+    numbers += [surface.STEEPEST, lookup.LEAST_DEPTH, lookup.SOLID_ALPHA, refraction.BED_STEPS]
+    numbers += [reflection.EDGE, reflection.MATCH_M, reflection.MATCH_SHARE]
+    return np.asarray(numbers, np.float32)

@@ -1,0 +1,456 @@
+"""The water's picture against hand-made cases, and its kernel against its definition."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from augment.cameras import Camera
+from augment.geometry import invert_rigid
+from augment.sky import ConstantSky, CubemapSky, LatLongSky
+from augment.weather.flood import FloodMedium, Layer
+from augment.weather.fresnel import reflectance
+from augment.weather.screen_space import ScreenReflection
+from augment.weather.smog import SmogMedium, blend_airlight, optical_depth
+from augment.weather.water import shade_water
+from augment.weather.waves import WaveField, WaveSet
+
+NONE = np.zeros(0)
+STILL = WaveSet(np.zeros((0, 2)), NONE, NONE, NONE, NONE, 1.0)
+LEVEL = 10.0
+MUD = (0.42, 0.38, 0.30)
+GREY = (0.5, 0.6, 0.7)
+
+
+def medium(**changes) -> FloodMedium:
+    return dataclasses.replace(FloodMedium(LEVEL, (2.0, 1.5, 1.0), MUD, STILL), **changes)
+
+
+def camera(
+    width: int = 61, height: int = 43, *, above: float = 1.5, pitch_deg: float = -20.0, roll=0.03
+) -> Camera:
+    """An eye above the water, looking north-east and down, a few kilometres from the origin."""
+    yaw, pitch = 0.7, math.radians(pitch_deg)
+    forward = np.array(
+        [math.cos(yaw) * math.cos(pitch), math.sin(yaw) * math.cos(pitch), math.sin(pitch)]
+    )
+    right = np.array([math.sin(yaw), -math.cos(yaw), 0.0])
+    down = np.cross(forward, right)
+    c, s = math.cos(roll), math.sin(roll)
+    pose = np.eye(4)
+    pose[:3, :3] = [c * right + s * down, c * down - s * right, forward]
+    pose[:3, 3] = -pose[:3, :3] @ [3000.0, -2000.0, LEVEL + above]
+    f = 0.8 * max(width, 40)
+    return Camera("c", width, height, f, f * 1.03, width / 2 + 0.3, height / 2, torch.tensor(pose))
+
+
+def mirrored(eye: Camera) -> Camera:
+    """The camera below the water, its image upside down, which keeps its axes right-handed."""
+    world = eye.world_from_camera.clone()
+    world[2] = -world[2]
+    world[:3, 1] = -world[:3, 1]
+    world[2, 3] += 2 * LEVEL
+    world[3] = torch.tensor([0.0, 0.0, 0.0, 1.0])
+    pose = invert_rigid(world)
+    return dataclasses.replace(eye, cy=eye.height - eye.cy, camera_from_world=pose)
+
+
+def flat_field(eye: Camera) -> WaveField:
+    zero = torch.zeros(eye.height, eye.width)
+    return WaveField(zero, zero, zero)
+
+
+def wavy_field(eye: Camera, *, slope: float = 0.04, variance: float = 0.0) -> WaveField:
+    """Slopes that vary over a few pixels; the variance jumps to 0 in the middle of the image."""
+    rows = torch.arange(eye.height)[:, None] / 7
+    columns = torch.arange(eye.width)[None, :] / 9
+    rough = torch.full((eye.height, eye.width), variance)
+    rough[:, eye.width // 2 :] = 0
+    return WaveField(
+        slope * torch.sin(rows + 2 * columns), slope * torch.cos(2 * rows - columns), rough
+    )
+
+
+def pattern(points: torch.Tensor) -> torch.Tensor:
+    """A smooth colour of every point of the world."""
+    x, y, z = points.double().unbind(-1)
+    waves = [torch.sin(0.9 * x + 0.3 * z), torch.sin(1.1 * y + x / 2), torch.cos(0.8 * (x - y) + z)]
+    return 0.5 + 0.4 * torch.stack(waves, -1)
+
+
+def plane_layer(
+    eye: Camera, z_m: float, dtype: torch.dtype = torch.float32, *, reach: float = 200.0
+) -> Layer:
+    """The pattern on a level plane, as far as `reach` metres of depth."""
+    rays = eye.ray_directions(torch.float64)
+    depth = (z_m - float(eye.centre[2])) / rays[..., 2]
+    hit = (depth > 0) & (depth < reach)
+    depth = torch.where(hit, depth, 0)
+    rgb = pattern(eye.centre + depth[..., None] * rays) * hit[..., None]
+    return Layer(eye, rgb.to(dtype), hit.to(dtype), depth.to(dtype))
+
+
+def constant_layer(eye: Camera, rgb: tuple, depth: float, seed: int) -> Layer:
+    """One colour behind alphas of every size, some of them holes."""
+    alpha = torch.rand(eye.height, eye.width, generator=torch.Generator().manual_seed(seed))
+    alpha = (1.6 * alpha - 0.2).clamp(0, 1)
+    flat = torch.tensor(rgb) * alpha[..., None]
+    return Layer(eye, flat, alpha, torch.full_like(alpha, depth))
+
+
+def doubled(layer: Layer) -> Layer:
+    parts = {name: getattr(layer, name).double() for name in ("rgb", "alpha", "depth")}
+    return dataclasses.replace(layer, **parts)
+
+
+def noise_sky(size: int = 16) -> CubemapSky:
+    return CubemapSky(torch.rand(6, size, size, 3, generator=torch.Generator().manual_seed(5)))
+
+
+def uncovered(eye: Camera) -> torch.Tensor:
+    return torch.zeros(eye.height, eye.width)
+
+
+def margin(eye: Camera, pixels: int = 12) -> Camera:
+    return eye.cropped(-pixels, -pixels, eye.width + 2 * pixels, eye.height + 2 * pixels)
+
+
+BOTH = pytest.mark.parametrize("fast", [False, True], ids=["definition", "kernel"])
+SMOGS = {
+    "clear": None,
+    "uniform": SmogMedium(0.02, GREY),
+    "layered": SmogMedium(0.02, GREY, 8.0, LEVEL - 3),
+}
+
+
+@pytest.mark.parametrize("smog", SMOGS.values(), ids=SMOGS)
+@pytest.mark.parametrize("tier", ["sky", "mirrored", "screen_space"])
+@pytest.mark.parametrize(
+    ("size", "variance", "fresnel"),
+    [
+        ((61, 43), 0.0, "exact"),
+        ((61, 43), 2e-3, "schlick"),
+        ((1, 1), 2e-3, "exact"),
+        ((17, 90), 2e-3, "exact"),
+    ],
+)
+def test_the_kernel_matches_the_definition(smog, tier, size, variance, fresnel):
+    eye = camera(*size)
+    field = wavy_field(eye, variance=variance)
+    bed = plane_layer(margin(eye), LEVEL - 0.4)
+    sky = CubemapSky(noise_sky(2).faces)  # smooth: coordinates' rounding is not magnified
+    layers, exact = {}, {}
+    if tier != "sky":
+        layers["mirror"] = plane_layer(margin(mirrored(eye), 3), LEVEL + 2, reach=12.0)
+        exact["mirror"] = doubled(layers["mirror"])
+    if tier == "screen_space":
+        front = plane_layer(margin(eye, 40), LEVEL + 2, reach=12.0)
+        distance = torch.full((eye.height, eye.width), 4.0)
+        distance[::3] = torch.inf
+        weight = torch.linspace(0, 1, eye.width).expand(eye.height, eye.width).contiguous()
+        layers["screen"] = ScreenReflection(front, distance, weight)
+        exact["screen"] = ScreenReflection(doubled(front), distance, weight)
+    water = medium(fresnel=fresnel)
+    cover = uncovered(eye)
+    fast = shade_water(eye, cover, water, field, bed, sky=sky, smog=smog, **layers)
+    slow = shade_water(eye, cover, water, field, doubled(bed), sky=sky, smog=smog, **exact)
+    assert slow.dtype == torch.float64 and bool((slow != 0).any())
+    difference = (fast - slow).abs().amax(-1)
+    # Float32 knows image coordinates to about 1e-5 pixels here, and colours change by up to 0.1 a
+    # pixel; distances and depths that follow from them have the same relative error.
+    assert float(difference.median()) < 1e-6
+    # Where a coordinate lies that close to a pixel's border, the nearest pixel and the depth read
+    # from it are another: visible where the layer ends there, or a ray just meets it or misses.
+    assert int((difference > 5e-5).sum()) <= 0.002 * difference.numel()
+
+
+@BOTH
+@pytest.mark.parametrize("tier", ["sky", "mirrored", "screen_space"])
+@pytest.mark.parametrize("index", [1.0, 1.333, 3.0])
+@pytest.mark.parametrize("extinction", [0.0, 1.0, math.inf])
+def test_a_world_of_one_colour_keeps_it(fast, tier, index, extinction):
+    eye = camera()
+    layers = {}
+    if tier != "sky":
+        layers["mirror"] = constant_layer(mirrored(eye), GREY, 5.0, 2)
+    if tier == "screen_space":
+        distance = torch.full((43, 61), 3.0)
+        distance[:, ::2] = torch.inf
+        front = constant_layer(margin(eye), GREY, 5.0, 3)
+        layers["screen"] = ScreenReflection(front, distance, torch.full((43, 61), 0.7))
+    water = medium(rgb=GREY, refraction_index=index, extinction_per_m=(extinction,) * 3)
+    bed = constant_layer(margin(eye), GREY, 8.0, 1)
+    field = wavy_field(eye, slope=0.3, variance=0.01)
+    sky = ConstantSky(torch.tensor(GREY))
+    for smog in (None, *[SmogMedium(0.05, GREY, height) for height in (None, 5.0)]):
+        out = shade_water(
+            eye, uncovered(eye), water, field, bed, sky=sky, smog=smog, fast=fast, **layers
+        )
+        met = eye.ray_directions(torch.float64)[..., 2] < 0
+        # Mixtures of one colour by weights that sum to 1: some twenty float32 roundings.
+        torch.testing.assert_close(
+            out[met], torch.tensor(GREY).expand_as(out[met]), atol=3e-6, rtol=0
+        )
+
+
+@BOTH
+def test_without_refraction_and_absorption_the_bed_is_seen_as_it_is(fast):
+    eye = camera(pitch_deg=-40)
+    bed = plane_layer(margin(eye, 5), LEVEL - 0.5)
+    water = medium(refraction_index=1.0, extinction_per_m=(0.0, 0.0, 0.0))
+    field = wavy_field(eye)
+    out = shade_water(eye, uncovered(eye), water, field, bed, sky=noise_sky(), fast=fast)
+    own = bed.rgb[5:-5, 5:-5]
+    mud = torch.tensor(MUD)
+    expected = torch.where(bed.alpha[5:-5, 5:-5, None] > 0, own, mud)
+    met = eye.ray_directions(torch.float64)[..., 2] < 0
+    assert bool(met.all()) and torch.equal(out, expected)
+
+
+def refract_exactly(eye: Camera, depth: float, index: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """World points [H, W, 3] of a flat bed seen through flat water, and the way to them there."""
+    d = torch.nn.functional.normalize(eye.ray_directions(torch.float64), dim=-1)
+    height = float(eye.centre[2]) - LEVEL
+    surface = eye.centre + d * (height / -d[..., 2:])
+    level_part = d[..., :2] / index  # Snell: n sin(inside) = sin(outside), in the same plane
+    fall = torch.sqrt(1 - level_part.square().sum(-1))
+    way = depth / fall
+    ends = torch.cat((surface[..., :2] + level_part * way[..., None], surface[..., 2:] - depth), -1)
+    return ends, way
+
+
+@BOTH
+@pytest.mark.parametrize("index", [1.333, 2.5])
+def test_refracted_rays_meet_the_bed_where_snell_says(fast, index):
+    eye, depth = camera(pitch_deg=-40), 0.6
+    bed = plane_layer(margin(eye, 40), LEVEL - depth)
+    water = medium(extinction_per_m=(0.0, 0.4, 1.5), refraction_index=index)
+    black = ConstantSky(torch.zeros(3))
+    out = shade_water(eye, uncovered(eye), water, flat_field(eye), bed, sky=black, fast=fast)
+    ends, way = refract_exactly(eye, depth, index)
+    a = torch.exp(-torch.tensor([0.0, 0.4, 1.5], dtype=torch.float64) * way[..., None])
+    seen = a * pattern(ends) + (1 - a) * torch.tensor(MUD, dtype=torch.float64)
+    d = torch.nn.functional.normalize(eye.ray_directions(torch.float64), dim=-1)
+    share = reflectance(-d[..., 2], index, "exact")[..., None]
+    # The bed's image is interpolated between pixels up to 0.3 m apart, of a pattern whose second
+    # derivative is about 0.6 / m2: 0.6 / 8 * 0.3^2; misplacing the end by that much would show
+    # as 0.1.
+    assert float((out - (1 - share) * seen).abs().max()) < 7e-3
+    straight = pattern(
+        eye.centre
+        + plane_layer(eye, LEVEL - depth).depth[..., None].double()
+        * eye.ray_directions(torch.float64)
+    )
+    assert float((seen - straight)[..., 0].abs().mean()) > 0.05  # it does bend
+
+
+@BOTH
+@pytest.mark.parametrize("slope", [(0.0, 0.0), (0.03, -0.02)])
+def test_the_mirrored_wall_is_where_the_mirrored_ray_meets_it(fast, slope):
+    eye = camera(pitch_deg=-8)
+    below = mirrored(eye).cropped(-20, -20, 101, 83)
+    normal = torch.tensor([40.0, 30.0, 0.0], dtype=torch.float64) / 50  # a wall 25 m ahead
+
+    def on_wall(origin: torch.Tensor, rays: torch.Tensor) -> torch.Tensor:
+        return 25.0 - ((origin - eye.centre) @ normal), rays @ normal
+
+    offset, speed = on_wall(below.centre, below.ray_directions(torch.float64))
+    depth = offset / speed
+    points = below.centre + depth[..., None] * below.ray_directions(torch.float64)
+    small = 0.25 * points  # a coarser pattern than on the bed: the wall is far
+    mirror = Layer(below, pattern(small).float(), torch.ones(83, 101), depth.float())
+    bed = plane_layer(margin(eye), LEVEL - 0.3)
+    water = medium(rgb=(0.0, 0.0, 0.0), extinction_per_m=(math.inf,) * 3)
+    up = torch.tensor([*slope, 1.0], dtype=torch.float64)
+    up = up / up.norm()
+    field = WaveField(*(torch.full((43, 61), float(part)) for part in (up[0], up[1], 0.0)))
+    out = shade_water(
+        eye, uncovered(eye), water, field, bed, mirror=mirror, sky=noise_sky(), fast=fast
+    )
+    d = torch.nn.functional.normalize(eye.ray_directions(torch.float64), dim=-1)
+    surface = eye.centre + d * ((float(eye.centre[2]) - LEVEL) / -d[..., 2:])
+    ray = d - 2 * (d @ up)[..., None] * up
+    far, speed = on_wall(surface, ray)
+    met = (d[..., 2] < -0.02) & (ray[..., 2] > 0.01)
+    seen = pattern(0.25 * (surface + (far / speed)[..., None] * ray))
+    share = reflectance((-(d @ up)).clamp(1e-3, 1), 1.333, "exact")[..., None]
+    error = (out - share * seen).abs().amax(-1)[met]
+    assert int(met.sum()) > 1500
+    # Bilinear between pixels 0.5 m apart on the wall, 0.13 on the pattern; a tilted ray's end
+    # is corrected once, which leaves some centimetres where the surface is seen edge-on.
+    assert float(error.quantile(0.99)) < 4e-3
+
+
+@BOTH
+def test_the_sky_tier_shows_the_sky_of_the_mirrored_direction(fast):
+    eye = camera(pitch_deg=0)
+    bed = plane_layer(eye, LEVEL - 0.3)
+    opaque = medium(rgb=(0.0, 0.0, 0.0), extinction_per_m=(math.inf,) * 3)
+    sky = noise_sky(8)
+    out = shade_water(eye, uncovered(eye), opaque, flat_field(eye), bed, sky=sky, fast=fast)
+    rays = eye.ray_directions(torch.float64)
+    up = rays * torch.tensor([1.0, 1.0, -1.0])
+    cosine = up[..., 2] / up.norm(dim=-1)
+    expected = reflectance(cosine.clamp(1e-3, 1), 1.333, "exact")[..., None] * sky.sample(up)
+    met = cosine > 2e-3  # closer to the horizon rays are raised
+    assert 500 < int(met.sum()) < 61 * 43
+    # Texture coordinates of float32 (1e-6) times differences between texels of up to 1.
+    assert float((out - expected).abs()[met].max()) < 1e-5
+    assert torch.equal(out[rays[..., 2] >= 0], torch.zeros_like(out[rays[..., 2] >= 0]))
+
+
+@BOTH
+@pytest.mark.parametrize("smog", list(SMOGS.values())[1:], ids=list(SMOGS)[1:])
+def test_smog_fogs_the_water_as_a_surface_of_its_colour(fast, smog):
+    eye = camera(pitch_deg=-40)
+    bed = constant_layer(margin(eye), MUD, 9.0, 1)
+    water = medium(refraction_index=1.0, extinction_per_m=(math.inf,) * 3)
+    out = shade_water(
+        eye, uncovered(eye), water, flat_field(eye), bed, sky=noise_sky(), smog=smog, fast=fast
+    )
+    rays = eye.ray_directions(torch.float64)
+    height = float(eye.centre[2]) - LEVEL
+    distance = height / -rays[..., 2] * rays.norm(dim=-1)
+    tau = optical_depth(smog, distance, LEVEL + height, torch.full_like(distance, LEVEL))
+    mud = torch.tensor(MUD, dtype=torch.float64).expand(43, 61, 3)
+    expected = blend_airlight(mud, tau, smog)
+    torch.testing.assert_close(out.double(), expected, atol=2e-6, rtol=0)  # a few float32 roundings
+
+
+@BOTH
+def test_uniform_smog_leaves_its_own_colour_of_the_sky(fast):
+    eye = camera(pitch_deg=-40)
+    bed = plane_layer(eye, LEVEL - 0.3)
+    black = medium(rgb=(0.0, 0.0, 0.0), extinction_per_m=(math.inf,) * 3)
+    thin = SmogMedium(1e-6, GREY)
+    out = shade_water(
+        eye, uncovered(eye), black, flat_field(eye), bed, sky=noise_sky(), smog=thin, fast=fast
+    )
+    rays = torch.nn.functional.normalize(eye.ray_directions(torch.float64), dim=-1)
+    share = reflectance(-rays[..., 2], 1.333, "exact")[..., None]
+    # The smog before the water hides less than a 1e-4th of it.
+    assert float((out - share * torch.tensor(GREY)).abs().max()) < 1e-4
+
+
+@BOTH
+@pytest.mark.parametrize("above", [1e-6, 0.01, 5e3])
+@pytest.mark.parametrize("pitch_deg", [-90.0, 0.0, 35.0])
+def test_extreme_views_stay_finite(fast, above, pitch_deg):
+    eye = camera(above=above, pitch_deg=pitch_deg, roll=0.0)
+    bed = constant_layer(eye, MUD, 3.0, 1)
+    steep = wavy_field(eye, slope=0.69, variance=0.05)
+    mirror = constant_layer(mirrored(eye), GREY, 4.0, 2)
+    screen = ScreenReflection(
+        constant_layer(eye, GREY, 4.0, 3), torch.full((43, 61), 2.0), torch.ones(43, 61)
+    )
+    for extinction in (0.0, math.inf):
+        out = shade_water(
+            eye, uncovered(eye), medium(extinction_per_m=(extinction,) * 3), steep, bed,
+            mirror=mirror, screen=screen, sky=noise_sky(), smog=SMOGS["layered"], fast=fast,
+        )  # fmt: skip
+        assert bool(torch.isfinite(out).all()) and float(out.min()) >= -1e-5
+        assert float(out.max()) <= 1 + 1e-5  # no more light than the brightest colour
+
+
+@BOTH
+def test_a_dry_bed_is_not_dimmed_by_any_water(fast):
+    eye = camera()
+    bed = dataclasses.replace(plane_layer(eye, LEVEL), alpha=torch.ones(43, 61))
+    water = medium(extinction_per_m=(math.inf,) * 3, refraction_index=1.0)
+    # On the plane itself, or above it by the rounding of its depth: no water over it.
+    bed = dataclasses.replace(bed, depth=bed.depth * (1 - 1e-6))
+    out = shade_water(eye, uncovered(eye), water, flat_field(eye), bed, sky=noise_sky(), fast=fast)
+    assert torch.equal(out, bed.rgb)
+
+
+@BOTH
+def test_covered_pixels_are_left_black(fast):
+    eye = camera()
+    cover = uncovered(eye)
+    cover[10:20, 5:30] = 1 - 1 / 1024
+    cover[30:, :] = 1 - 1 / 256
+    bed = plane_layer(eye, LEVEL - 0.3)
+    out = shade_water(eye, cover, medium(), flat_field(eye), bed, sky=noise_sky(), fast=fast)
+    assert bool((out[10:20, 5:30] == 0).all()) and bool((out[30:] > 0).all())
+
+
+@BOTH
+def test_several_slopes_show_one_blurred_picture(fast):
+    """A bright line reflected in rough water spreads evenly instead of showing three times."""
+    eye = camera(pitch_deg=-8)
+    below = mirrored(eye)
+    rgb = torch.zeros(43, 61, 3)
+    rgb[20:24] = 1
+    mirror = Layer(below, rgb, torch.ones(43, 61), torch.full((43, 61), 1e3))
+    water = medium(rgb=(0.0, 0.0, 0.0), extinction_per_m=(math.inf,) * 3)
+    bed = plane_layer(eye, LEVEL - 0.3)
+    zero = torch.zeros(43, 61)
+    rough = WaveField(zero, zero, torch.full((43, 61), 0.004))
+    out = shade_water(
+        eye, uncovered(eye), water, rough, bed, mirror=mirror, sky=noise_sky(), fast=fast
+    )
+    column = out[:, 30, 0]
+    top = int(column.argmax())
+    rises = column[1:] - column[:-1]
+    assert float(column[top]) > 0.01
+    # One hill, but for the small steps of mip levels' pixels.
+    assert float(rises[:top].min()) > -0.15 * float(column[top])
+    assert float(rises[top:].max()) < 0.15 * float(column[top])
+
+
+def test_other_skies_go_through_a_cube_map():
+    eye = camera()
+    image = torch.rand(4, 8, 3, generator=torch.Generator().manual_seed(2))
+    bed = plane_layer(eye, LEVEL - 0.3)
+    fast, slow = (
+        shade_water(
+            eye, uncovered(eye), medium(), wavy_field(eye), bed, sky=LatLongSky(image), fast=choice
+        )
+        for choice in (True, False)
+    )
+    # A texel of the cube map is 1/80 of the image's: a kink between its pixels is cut that much.
+    assert float((fast - slow).abs().max()) < 5e-3
+
+
+def test_gradients_pass_through_the_definition():
+    eye = camera(20, 14)
+    layer = plane_layer(eye, LEVEL - 0.3)
+    rgb = layer.rgb.clone().requires_grad_(True)
+    out = shade_water(
+        eye, uncovered(eye), medium(), wavy_field(eye),
+        dataclasses.replace(layer, rgb=rgb), sky=noise_sky(),
+    )  # fmt: skip
+    out.sum().backward()
+    assert bool(torch.isfinite(rgb.grad).all()) and float(rgb.grad.sum()) > 1
+
+
+def test_results_do_not_depend_on_the_number_of_threads():
+    from augment.render.threads import limit_threads
+
+    eye = camera()
+    bed, mirror = plane_layer(eye, LEVEL - 0.3), plane_layer(mirrored(eye), LEVEL + 2)
+    field = wavy_field(eye, variance=1e-3)
+    images = []
+    for count in (1, 2, None):
+        limit_threads(count)
+        images.append(
+            shade_water(eye, uncovered(eye), medium(), field, bed, mirror=mirror, sky=noise_sky())
+        )
+    assert torch.equal(images[0], images[1]) and torch.equal(images[0], images[2])
+
+
+def test_what_does_not_fit_is_refused():
+    eye = camera()
+    bed, field, cover = plane_layer(eye, LEVEL - 0.3), flat_field(eye), uncovered(eye)
+    sky = ConstantSky(torch.zeros(3))
+    with pytest.raises(ValueError, match="above the water"):
+        shade_water(eye, cover, medium(level_z_m=20.0), field, bed, sky=sky)
+    turned = dataclasses.replace(bed, camera=camera(pitch_deg=-21))
+    with pytest.raises(ValueError, match="window of the image"):
+        shade_water(eye, cover, medium(), field, turned, sky=sky)
+    with pytest.raises(ValueError, match="mirrored eye"):
+        shade_water(eye, cover, medium(), field, bed, mirror=bed, sky=sky)
+    with pytest.raises(ValueError, match="cover must be"):
+        shade_water(eye, cover[1:], medium(), field, bed, sky=sky)
