@@ -75,6 +75,14 @@ def test_what_else_a_scene_may_be(tmp_path):
     assert load_scene_parts(tmp_path / "fit").actors == ()
 
 
+def test_folders_from_before_grounds_were_kept_still_open(saved):
+    document = json.loads((saved / "scene.json").read_text())
+    del document["ground"], document["has_known_gravity"]
+    (saved / "scene.json").write_text(json.dumps(document))
+    scene = load_scene_parts(saved)
+    assert scene.ground is None and scene.has_known_gravity
+
+
 def test_arrays_are_mapped_and_writes_to_them_stay_in_memory(saved):
     before = (saved / FILES[1]).read_bytes()
     load_scene_parts(saved).background.means[:] = 0
