@@ -273,11 +273,11 @@ def test_the_mirrored_wall_is_where_the_mirrored_ray_meets_it(fast, slope):
     surface = eye.centre + d * ((float(eye.centre[2]) - LEVEL) / -d[..., 2:])
     ray = d - 2 * (d @ up)[..., None] * up
     far, speed = on_wall(surface, ray)
-    met = (d[..., 2] < -0.02) & (ray[..., 2] > 0.01)
+    met = (ray[..., 2] > 0.01) & (far > 1)  # the surface lies before the wall
     seen = pattern(0.25 * (surface + (far / speed)[..., None] * ray))
     share = reflectance((-(d @ up)).clamp(1e-3, 1), 1.333, "exact")[..., None]
     error = (out - share * seen).abs().amax(-1)[met]
-    assert int(met.sum()) > 1500
+    assert int(met.sum()) > 1000
     # Bilinear between pixels 0.5 m apart on the wall, 0.13 on the pattern; a tilted ray's end
     # is corrected once, which leaves some centimetres where the surface is seen edge-on.
     assert float(error.quantile(0.99)) < 4e-3
