@@ -221,7 +221,7 @@ def sheet(
 
 
 def bench(
-    what: Positional[Literal["raster", "smog", "fit"]] = "raster",
+    what: Positional[Literal["raster", "smog", "flood", "fit"]] = "raster",
     repeats: int = 7,
     quick: bool = False,
     scene: str | None = None,
@@ -231,13 +231,17 @@ def bench(
 
     raster: the rasteriser on random scenes: time of each stage, pairs per second, memory, and the
     torch reference beside it. smog: the error of both smog models against exact per-pixel smog on
-    the procedural street. fit: time of each stage of a reconstruction's step, and memory.
+    the procedural street. flood: what flooded frames cost beside clean ones, how far each kind of
+    reflection is from the exact one, and whether cameras agree on where the water is. fit: time of
+    each stage of a reconstruction's step, and memory.
 
     Args:
         what: Which benchmark.
-        repeats: Timed frames a scene (raster).
+        repeats: Timed frames a scene (raster) or a kind of flood (flood).
         quick: The smaller scene, one view, or fewer steps, only.
         scene: Raw data to fit (fit); by default a drive down the procedural street is recorded.
+            Or the scene whose frames are timed (flood), as for render; by default the procedural
+            street with a million Gaussians.
         json_file: Also write the figures to this file.
     """
     if what == "smog":
@@ -245,6 +249,11 @@ def bench(
 
         result = bench_smog(cameras=("front",), frames=(5,)) if quick else bench_smog()
         text = smog_text(result)
+    elif what == "flood":
+        from tools.bench_flood import QUICK, WHOLE, bench_flood, flood_text
+
+        result = bench_flood(QUICK if quick else WHOLE, scene_uri=scene, repeats=repeats)
+        text = flood_text(result)
     elif what == "fit":
         from tools.bench_fit import bench_fit, fit_text
 

@@ -1,0 +1,66 @@
+"""Memory that one flooded frame takes on top of its scene, in a process of its own.
+
+See tools.bench_memory for why, and for what is counted. The frame is drawn once small before the
+mark is set, so that kernels are loaded and the sky is at hand.
+"""
+
+from __future__ import annotations
+
+import gc
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from tools.bench_memory import RESET_PEAK, return_free_memory, status_mib
+
+SMALL = 0.125
+
+
+def flood_peak_mib(uri: str, width: int, height: int, tier: str | None) -> float | None:
+    """MiB above the scene at the highest moment of one frame; tier None is the clean frame; the
+    answer is None where the system cannot tell.
+
+    Raises:
+        RuntimeError: the measuring process failed; the message is what it wrote.
+    """
+    if not RESET_PEAK.is_file():
+        return None
+    arguments = json.dumps({"uri": uri, "width": width, "height": height, "tier": tier})
+    done = subprocess.run(
+        [sys.executable, "-m", "tools.bench_flood_memory", arguments],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=Path(__file__).resolve().parents[1],
+    )
+    if done.returncode != 0:
+        raise RuntimeError(f"measuring the memory of a flood failed:\n{done.stderr.strip()}")
+    return float(done.stdout.strip().splitlines()[-1])
+
+
+def _render_once(uri: str, width: int, height: int, tier: Any) -> float:
+    from adapters.base import open_scene
+    from augment.apply import render_buffers
+    from augment.plan import make_plan
+    from recipes.schema import Output, Recipe
+    from tools.bench_flood_cost import bench_camera
+    from tools.bench_flood_error import flood_recipe
+
+    scene = open_scene(uri)
+    camera = bench_camera(scene, width, height)
+    recipe = Recipe(output=Output(depth="none")) if tier is None else flood_recipe(tier, "calm")
+    plan = make_plan(recipe, scene)
+    render_buffers(scene, camera.scaled(SMALL), plan)
+    gc.collect()
+    return_free_memory()
+    before = status_mib("VmRSS")
+    RESET_PEAK.write_text("5")
+    view = render_buffers(scene, camera, plan)
+    assert view.rgb is not None  # alive until the mark is read
+    return status_mib("VmHWM") - before
+
+
+if __name__ == "__main__":
+    print(_render_once(**json.loads(sys.argv[1])))
