@@ -1,5 +1,8 @@
-"""Numba kernels for a water surface: what `water.shade_water` defines, a pixel at a time.
+"""Numba kernels for a water surface: what `water.shade_water` defines.
 
+The pixels of a row that show water are worked on in strips, stage by stage: loops that compute, and
+that a compiler can vectorise, take turns with loops that look pixels up, whose waits overlap. What
+a stage leaves for the next stands in scratch memory, one line of `STRIP` numbers for each quantity.
 Everything is float32 but the rays' directions, whose sign decides where there is water and whose
 small downward part the distance to it is divided by. Indices are unsigned, so that nothing wraps.
 """
@@ -12,12 +15,37 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
+from augment.render import cpu_simd as v8
 from augment.render.cpu_jit import inner, kernel
+from augment.render.cpu_math import LOG2_E, exp2_fine
 
 F = np.float32
 U = np.uint64
 ZERO, HALF, ONE, TWO = F(0), F(0.5), F(1), F(2)
-INFINITE = F(np.inf)
+NOTHING = F(-1)  # a distance at which nothing is met
+STRIP = 128
+N = U(STRIP)
+
+
+def _lines(first, count):
+    return tuple(U(STRIP * line) for line in range(first, first + count))
+
+
+# Lines of the scratch memory. Points where the rays meet the water, rays to the eye, slopes and
+# normals of the surface, cosines in air and water, smog before the water.
+PX, PY, VX, VY, VZ, DX, DY, DZ, ALONG, SX, SY, SPREAD, ROUGH, NX, NY, NZ, COS, IN, NEAR = _lines(
+    0, 19
+)
+# The water's own colour; the bed: refracted ray per metre of depth and its length, depths, colour.
+WR, WG, WB, TX, TY, STEEP, DEPTH, OWN_DEPTH, FOUND, BR, BG, BB, BA = _lines(19, 13)
+# Place and find of a look-up.
+COLUMN, ROW, ALPHA, FAR, VALUE_R, VALUE_G, VALUE_B, VALUE_A = _lines(32, 8)
+# Reflection: the flat mirror's distance, the ray and its share, the levels of averages, the result.
+FIRST, LEVEL, FRONT_LEVEL, DISTANCE, WEIGHT, SUM_R, SUM_G, SUM_B = _lines(40, 8)
+SKY_R, SKY_G, SKY_B, REFLECTED_R, REFLECTED_G, REFLECTED_B, EXP = _lines(48, 7)
+# Three of each, for three slopes: mirrored ray, share, place in the mirror and in the image.
+RX, RY, RZ, SHARE, MIRROR_C, MIRROR_R, FRONT_C, FRONT_R, FRONT_W = _lines(55, 27)[::3]
+SCRATCH = 82 * STRIP
 
 
 class View(NamedTuple):
@@ -130,14 +158,6 @@ def _whole(x):
 
 
 @inner()
-def _nearest(view, column, row):
-    """Flat index of the nearest pixel, and its column and row."""
-    c = _whole(_clamp(column, ZERO, view.columns - ONE))
-    r = _whole(_clamp(row, ZERO, view.rows - ONE))
-    return r * view.width + c, _real(c) + HALF, _real(r) + HALF
-
-
-@inner()
 def _height_of_ray(view, column, row):
     return view.rays[6] * column + view.rays[7] * row + view.rays[8]
 
@@ -219,10 +239,25 @@ def _fetch(rgb, alpha, view, mips, sizes, column, row, level):
 
 
 @inner()
-def _level(sizes, spacing):
-    if not spacing > ONE:
-        return ZERO
-    return min(F(math.log2(spacing)), _real(sizes.shape[0] - 1))
+def _reflectance(c, inside, medium):
+    """Share of reflected light. c, inside: cosines in the air and in the water."""
+    n = medium.index
+    if medium.schlick:
+        base = (n - ONE) / (n + ONE)
+        base = base * base
+        x = ONE - c
+        return base + (ONE - base) * ((x * x) * (x * x) * x)
+    a, b = c - n * inside, c + n * inside
+    d, e = n * c - inside, n * c + inside
+    quotient = ONE / (b * e)
+    rs, rp = a * e * quotient, d * b * quotient
+    return HALF * (rs * rs + rp * rp)
+
+
+@inner()
+def _cosine_inside(c, medium):
+    inverse = ONE / medium.index
+    return math.sqrt(max(ONE - (ONE - c * c) * inverse * inverse, ZERO))
 
 
 @inner()
@@ -257,157 +292,318 @@ def _sky(v, size, x, y, z):
 
 
 @inner()
-def _reflectance(c, inside, medium):
-    """Share of reflected light. c, inside: cosines in the air and in the water."""
-    n = medium.index
-    if medium.schlick:
-        base = (n - ONE) / (n + ONE)
-        base = base * base
-        x = ONE - c
-        return base + (ONE - base) * ((x * x) * (x * x) * x)
-    a, b = c - n * inside, c + n * inside
-    d, e = n * c - inside, n * c + inside
-    quotient = ONE / (b * e)
-    rs, rp = a * e * quotient, d * b * quotient
-    return HALF * (rs * rs + rp * rp)
+def _surface(s, n, medium, limits):
+    """Points, views and slopes from rays, distances and normals; smog before the water."""
+    for k in range(n):
+        dx, dy, dz = s[DX + k], s[DY + k], s[DZ + k]
+        along = s[ALONG + k]
+        s[PX + k], s[PY + k] = along * dx, along * dy
+        length = math.sqrt(dx * dx + dy * dy + dz * dz)
+        inverse = ONE / length
+        vx, vy = -dx * inverse, -dy * inverse
+        s[VX + k], s[VY + k], s[VZ + k] = vx, vy, -dz * inverse
+        s[NEAR + k] = medium.smog_per_m * along * length
+        nx, ny = s[NX + k], s[NY + k]
+        upright = ONE / math.sqrt(max(ONE - nx * nx - ny * ny, limits.steepest))
+        s[SX + k], s[SY + k] = nx * upright, ny * upright
+        flat = max(math.sqrt(vx * vx + vy * vy), F(1e-12))
+        s[SPREAD + k] = math.sqrt(F(3) * max(s[ROUGH + k], ZERO)) / flat
 
 
 @inner()
-def _cosine_inside(c, medium):
-    inverse = ONE / medium.index
-    return math.sqrt(max(ONE - (ONE - c * c) * inverse * inverse, ZERO))
+def _tap(s, n, t, sign, weight, alone, medium, limits):
+    """Mirrored rays and their shares of a pixel's light for one of its slopes.
 
-
-@inner()
-def _bed_along(bed_rgb, bed_alpha, bed_depth, bed, px, py, tx, ty, depth, medium, limits):
-    """(found, depth below the plane, colour, alpha) along a refracted ray.
-
-    px, py: where it enters the water. tx, ty: its way per metre of depth.
+    weight, alone: of this slope where the surface is rough and where it is not.
     """
+    for k in range(n):
+        vx, vy, vz = s[VX + k], s[VY + k], s[VZ + k]
+        rough = s[ROUGH + k] > ZERO
+        spread = sign * s[SPREAD + k] if rough else ZERO
+        sx, sy = s[SX + k] + spread * vx, s[SY + k] + spread * vy
+        inverse = ONE / math.sqrt(sx * sx + sy * sy + ONE)
+        nx, ny, nz = sx * inverse, sy * inverse, inverse
+        cosine = nx * vx + ny * vy + nz * vz
+        c = _clamp(cosine, limits.least_cosine, ONE)
+        inside = _cosine_inside(c, medium)
+        s[NX + k], s[NY + k], s[NZ + k], s[COS + k], s[IN + k] = nx, ny, nz, c, inside
+        twice = TWO * cosine
+        x, y = twice * nx - vx, twice * ny - vy
+        z = max(twice * nz - vz, limits.least_cosine)
+        inverse = ONE / math.sqrt(x * x + y * y + z * z)
+        s[RX + t + k], s[RY + t + k], s[RZ + t + k] = x * inverse, y * inverse, z * inverse
+        share = weight if rough else alone
+        s[SHARE + t + k] = share * _reflectance(c, inside, medium)
+
+
+@inner()
+def _exponential(s, n):
+    """The line EXP becomes its exponentials; of numbers <= 0."""
+    least, scale = v8.splat(F(-126)), v8.splat(LOG2_E)
+    for k in range(U(0), n, U(8)):
+        v8.store(s, EXP + k, exp2_fine(v8.maximum(v8.load(s, EXP + k) * scale, least)))
+
+
+@inner()
+def _water_color(s, n, medium):
+    for k in range(n):
+        s[EXP + k] = -s[NEAR + k]
+    _exponential(s, n)
+    fog, rgb = medium.airlight, medium.rgb
+    for k in range(n):
+        t = s[EXP + k]
+        rest = ONE - t
+        s[WR + k], s[WG + k] = t * rgb[0] + rest * fog[0], t * rgb[1] + rest * fog[1]
+        s[WB + k] = t * rgb[2] + rest * fog[2]
+
+
+@inner()
+def _refract(s, n, medium, limits):
+    """Refracted rays per metre of depth, and their length per metre."""
+    ratio, bends = ONE / medium.index, medium.index != ONE
+    for k in range(n):
+        vx, vy, vz = s[VX + k], s[VY + k], s[VZ + k]
+        bend = s[COS + k] * ratio - s[IN + k]
+        x, y = bend * s[NX + k] - vx * ratio, bend * s[NY + k] - vy * ratio
+        z = max(vz * ratio - bend * s[NZ + k], limits.least_cosine)
+        steep = ONE / z
+        s[TX + k], s[TY + k] = x * steep, y * steep
+        length = math.sqrt(x * x + y * y + z * z) * steep
+        s[STEEP + k] = length if bends else ONE / vz
+
+
+@inner()
+def _place_on_bed(s, n, bed, medium, limits):
+    for k in range(n):
+        depth = s[DEPTH + k]
+        x, y = s[PX + k] + depth * s[TX + k], s[PY + k] + depth * s[TY + k]
+        column, row = _project(bed, x, y, -medium.height - depth, limits.least_depth)
+        s[FOUND + k] = s[FOUND + k] if _is_inside(bed, column, row) else ZERO
+        s[COLUMN + k], s[ROW + k] = column, row
+
+
+@inner()
+def _look(s, n, alpha, depth, view):
+    """Alpha and depth of the pixels nearest to COLUMN and ROW, which become their centres."""
+    last_column, last_row = view.columns - ONE, view.rows - ONE
+    for k in range(n):
+        c = _whole(_clamp(s[COLUMN + k], ZERO, last_column))
+        r = _whole(_clamp(s[ROW + k], ZERO, last_row))
+        pixel = r * view.width + c
+        s[ALPHA + k], s[FAR + k] = alpha[pixel], depth[pixel]
+        s[COLUMN + k], s[ROW + k] = _real(c) + HALF, _real(r) + HALF
+
+
+@inner()
+def _search_bed(s, n, alpha, depth, bed, medium, limits):
+    """Corrects the bed's depth along the refracted rays; COLUMN, ROW: where they meet it."""
     for _ in range(limits.bed_steps):
-        z = -medium.height - depth
-        column, row = _project(bed, px + depth * tx, py + depth * ty, z, limits.least_depth)
-        if not _is_inside(bed, column, row):
-            return False, ZERO, ZERO, ZERO, ZERO, ZERO
-        pixel, column, row = _nearest(bed, column, row)
-        if bed_alpha[pixel] < limits.solid_alpha:
-            return False, ZERO, ZERO, ZERO, ZERO, ZERO
-        z = bed_depth[pixel] * _height_of_ray(bed, column, row)
-        depth = max(-medium.height - z, ZERO)
-    z = -medium.height - depth
-    column, row = _project(bed, px + depth * tx, py + depth * ty, z, limits.least_depth)
-    if not _is_inside(bed, column, row):
-        return False, ZERO, ZERO, ZERO, ZERO, ZERO
-    r, g, b, a = _bilinear(bed_rgb, bed_alpha, bed, column, row)
-    return a >= limits.solid_alpha, depth, r, g, b, a
+        _place_on_bed(s, n, bed, medium, limits)
+        _look(s, n, alpha, depth, bed)
+        for k in range(n):
+            found = s[FOUND + k] if s[ALPHA + k] >= limits.solid_alpha else ZERO
+            s[FOUND + k] = found
+            z = s[FAR + k] * _height_of_ray(bed, s[COLUMN + k], s[ROW + k])
+            s[DEPTH + k] = max(-medium.height - z, ZERO) if found > ZERO else s[DEPTH + k]
+    _place_on_bed(s, n, bed, medium, limits)
 
 
 @inner()
-def _absorbed(seen, water, extinction, length):
-    if length <= ZERO:
-        return seen
-    a = math.exp(-extinction * length)
-    return a * seen + (ONE - a) * water
+def _fetch_bed(s, n, own, rgb, alpha, bed, limits):
+    """The bed's colour where it was found, straight behind the pixel elsewhere."""
+    for k in range(n):
+        r = g = b = a = ZERO
+        if s[FOUND + k] > ZERO:
+            r, g, b, a = _bilinear(rgb, alpha, bed, s[COLUMN + k], s[ROW + k])
+        if a < limits.solid_alpha:
+            r = g = b = a = ZERO
+            s[DEPTH + k] = s[OWN_DEPTH + k]
+            if own[k] >= 0:
+                pixel = U(own[k])
+                a = alpha[pixel]
+                pixel = U(3) * pixel
+                r, g, b = rgb[pixel], rgb[pixel + U(1)], rgb[pixel + U(2)]
+        s[BR + k], s[BG + k], s[BB + k], s[BA + k] = r, g, b, a
 
 
 @inner()
-def _distance_at(alpha, depth, mirror, column, row, px, py, medium, limits):
-    """From a point of the surface to what a pixel of the mirrored layer shows."""
-    pixel, column, row = _nearest(mirror, column, row)
-    if alpha[pixel] < limits.solid_alpha:
-        return INFINITE
-    x, y, z = _point(mirror, depth[pixel], column, row)
-    x, y, z = x - px, y - py, z - medium.height
-    return math.sqrt(x * x + y * y + z * z)
+def _absorb(s, n, value, water, extinction):
+    for k in range(n):
+        s[EXP + k] = -extinction * (s[DEPTH + k] * s[STEEP + k])
+    _exponential(s, n)
+    for k in range(n):
+        seen, own = s[value + k] + (ONE - s[BA + k]) * s[water + k], s[water + k]
+        t = s[EXP + k]
+        s[value + k] = t * seen + (ONE - t) * own
 
 
 @inner()
-def _end_in_mirror(mirror, px, py, rx, ry, rz, distance, medium, limits):
-    """Coordinates of the end of a reflected ray in the mirrored layer, kept inside it."""
-    x, y, z = rx, ry, rz
-    if distance < INFINITE:
-        x, y, z = px + distance * rx, py + distance * ry, medium.height + distance * rz
-    column, row = _project(mirror, x, y, z, limits.least_depth)
-    return _clamp_to(mirror, column, row)
+def _measure_mirror(s, n, into, mirror, medium, limits):
+    """From the surface to what was looked up in the mirrored layer, or NOTHING."""
+    for k in range(n):
+        x, y, z = _point(mirror, s[FAR + k], s[COLUMN + k], s[ROW + k])
+        x, y, z = x - s[PX + k], y - s[PY + k], z - medium.height
+        distance = math.sqrt(x * x + y * y + z * z)
+        s[into + k] = distance if s[ALPHA + k] >= limits.solid_alpha else NOTHING
 
 
 @inner()
-def _end_in_image(alpha, depth, front, px, py, rx, ry, rz, distance, medium, limits):
-    """(weight, column, row) of the end of a reflected ray in the image, 0 where it is not seen."""
-    x, y, z = rx, ry, rz
-    far = not distance < INFINITE
-    m = front.project
-    gap = reach = solid = INFINITE
-    for i in range(2):
-        if not far:
-            x, y, z = px + distance * rx, py + distance * ry, distance * rz - medium.height
+def _place_in_mirror(s, n, t, distances, columns, rows, mirror, medium, limits):
+    """Where reflected rays of these lengths end in the mirrored layer, kept inside it."""
+    for k in range(n):
+        rx, ry, rz = s[RX + t + k], s[RY + t + k], s[RZ + t + k]
+        d = s[distances + k]
+        met = d >= ZERO
+        x, y = s[PX + k] + d * rx if met else rx, s[PY + k] + d * ry if met else ry
+        z = medium.height + d * rz if met else rz
+        column, row = _project(mirror, x, y, z, limits.least_depth)
+        s[columns + k], s[rows + k] = _clamp_to(mirror, column, row)
+
+
+@inner()
+def _find_in_mirror(s, n, count, alpha, depth, mirror, medium, limits):
+    """MIRROR_C, MIRROR_R: where the reflected rays end in the mirrored layer."""
+    for k in range(n):
+        column, row = _project(mirror, s[DX + k], s[DY + k], -s[DZ + k], limits.least_depth)
+        s[COLUMN + k], s[ROW + k] = _clamp_to(mirror, column, row)
+    _look(s, n, alpha, depth, mirror)
+    _measure_mirror(s, n, FIRST, mirror, medium, limits)
+    for tap in range(count):
+        t = tap * N
+        _place_in_mirror(s, n, t, FIRST, COLUMN, ROW, mirror, medium, limits)
+        _look(s, n, alpha, depth, mirror)
+        _measure_mirror(s, n, DISTANCE, mirror, medium, limits)
+        _place_in_mirror(s, n, t, DISTANCE, MIRROR_C + t, MIRROR_R + t, mirror, medium, limits)
+
+
+@inner()
+def _place_in_image(s, n, t, front, medium, limits):
+    for k in range(n):
+        rx, ry, rz = s[RX + t + k], s[RY + t + k], s[RZ + t + k]
+        d = s[DISTANCE + k]
+        met = d >= ZERO
+        x, y = s[PX + k] + d * rx if met else rx, s[PY + k] + d * ry if met else ry
+        z = d * rz - medium.height if met else rz
         column, row = _project(front, x, y, z, limits.least_depth)
-        pixel, c, r = _nearest(front, column, row)
-        solid = ONE if alpha[pixel] >= limits.solid_alpha else ZERO
-        if far:
-            break
-        reach = m[6] * x + m[7] * y + m[8] * z
-        gap = INFINITE
-        if solid > ZERO:
-            gap = abs(depth[pixel] - reach)
-            if i == 0:
-                x, y, z = _point(front, depth[pixel], c, r)
-                x, y, z = x - px, y - py, z + medium.height
-                distance = math.sqrt(x * x + y * y + z * z)
-    weight = ONE
-    if far:
-        weight = ONE - solid
-    elif not gap < max(limits.match_share * reach, limits.match_m):
-        weight = ZERO
-    if not _is_inside(front, column, row):
-        weight = ZERO
-    width, height = front.columns, front.rows
-    across = min(column, width - column) / width
-    border = min(across, min(row, height - row) / height)
-    fade = _clamp(border / limits.edge, ZERO, ONE)
-    column, row = _clamp_to(front, column, row)
-    return weight * fade * fade * (F(3) - TWO * fade), column, row
+        s[COLUMN + k], s[ROW + k] = column, row
+        s[FRONT_C + t + k], s[FRONT_R + t + k] = column, row
 
 
 @inner()
-def _spacing(taps, column, row):
-    """Mean distance of the outer coordinates from the first."""
-    total = ZERO
-    for k in range(U(1), U(3)):
-        x = taps[k, column] - taps[U(0), column]
-        y = taps[k, row] - taps[U(0), row]
-        total += math.sqrt(x * x + y * y)
-    return HALF * total
-
-
-# Columns of the scratch memory that holds a pixel's normals: the mirrored ray, its share of the
-# pixel's light, and where it ends in the mirrored layer and in the image.
-RX, RY, RZ, SHARE, MIRROR_C, MIRROR_R, FRONT_W, FRONT_C, FRONT_R = map(U, range(9))
+def _find_in_image(s, n, count, alpha, depth, front, medium, limits):
+    """FRONT_C, FRONT_R: where the reflected rays end in the image; FRONT_W: is it seen there."""
+    m = front.project
+    for tap in range(count):
+        t = tap * N
+        for k in range(n):
+            s[DISTANCE + k] = s[FIRST + k]
+        _place_in_image(s, n, t, front, medium, limits)
+        _look(s, n, alpha, depth, front)
+        for k in range(n):
+            x, y, z = _point(front, s[FAR + k], s[COLUMN + k], s[ROW + k])
+            x, y, z = x - s[PX + k], y - s[PY + k], z + medium.height
+            better = math.sqrt(x * x + y * y + z * z)
+            d = s[DISTANCE + k]
+            s[DISTANCE + k] = better if d >= ZERO and s[ALPHA + k] >= limits.solid_alpha else d
+        _place_in_image(s, n, t, front, medium, limits)
+        _look(s, n, alpha, depth, front)
+        for k in range(n):
+            column, row, d = s[FRONT_C + t + k], s[FRONT_R + t + k], s[DISTANCE + k]
+            x, y = s[PX + k] + d * s[RX + t + k], s[PY + k] + d * s[RY + t + k]
+            z = d * s[RZ + t + k] - medium.height
+            ahead = m[6] * x + m[7] * y + m[8] * z
+            near = abs(s[FAR + k] - ahead) < max(limits.match_share * ahead, limits.match_m)
+            solid = s[ALPHA + k] >= limits.solid_alpha
+            seen = (solid and near) if d >= ZERO else not solid
+            across = min(column, front.columns - column) / front.columns
+            border = min(across, min(row, front.rows - row) / front.rows)
+            fade = _clamp(border / limits.edge, ZERO, ONE)
+            weight = s[WEIGHT + k] * (fade * fade * (F(3) - TWO * fade))
+            s[FRONT_W + t + k] = weight if seen else ZERO
+            s[FRONT_C + t + k], s[FRONT_R + t + k] = _clamp_to(front, column, row)
 
 
 @inner()
-def _tap(out, k, weight, sx, sy, vx, vy, vz, medium, limits):
-    """The mirrored ray of a surface of slopes sx, sy, and its share of the pixel's light.
+def _set_levels(s, n, count, into, columns, rows, sizes):
+    """Level of averages whose pixels are as wide as a pixel's three places lie apart."""
+    top = _real(sizes.shape[0] - 1)
+    for k in range(n):
+        level = ZERO
+        if count > U(1) and s[ROUGH + k] > ZERO:
+            c, r = s[columns + k], s[rows + k]
+            x1, y1 = s[columns + N + k] - c, s[rows + N + k] - r
+            x2, y2 = s[columns + N + N + k] - c, s[rows + N + N + k] - r
+            spacing = HALF * (math.sqrt(x1 * x1 + y1 * y1) + math.sqrt(x2 * x2 + y2 * y2))
+            if spacing > ONE:
+                level = min(F(math.log2(spacing)), top)
+        s[into + k] = level
 
-    Returns the normal and its cosines in air and water too.
-    """
-    inverse = ONE / math.sqrt(sx * sx + sy * sy + ONE)
-    nx, ny, nz = sx * inverse, sy * inverse, inverse
-    cosine = nx * vx + ny * vy + nz * vz
-    c = _clamp(cosine, limits.least_cosine, ONE)
-    inside = _cosine_inside(c, medium)
-    twice = TWO * cosine
-    x, y = twice * nx - vx, twice * ny - vy
-    z = max(twice * nz - vz, limits.least_cosine)
-    inverse = ONE / math.sqrt(x * x + y * y + z * z)
-    out[k, RX], out[k, RY], out[k, RZ] = x * inverse, y * inverse, z * inverse
-    out[k, SHARE] = weight * _reflectance(c, inside, medium)
-    return nx, ny, nz, c, inside
+
+@inner()
+def _fetch_layer(s, n, columns, rows, levels, rgb, alpha, view, mips, sizes):
+    """VALUE: the layer's colour and the sky behind it."""
+    for k in range(n):
+        r, g, b, a = _fetch(
+            rgb, alpha, view, mips, sizes, s[columns + k], s[rows + k], s[levels + k]
+        )
+        s[VALUE_R + k], s[VALUE_G + k], s[VALUE_B + k], s[VALUE_A + k] = r, g, b, a
+    for k in range(n):
+        through = ONE - s[VALUE_A + k]
+        s[VALUE_R + k] += through * s[SKY_R + k]
+        s[VALUE_G + k] += through * s[SKY_G + k]
+        s[VALUE_B + k] += through * s[SKY_B + k]
+
+
+@inner()
+def _fetch_sky(s, n, t, faces, size, medium):
+    for k in range(n):
+        r, g, b = _sky(faces, size, s[RX + t + k], s[RY + t + k], s[RZ + t + k])
+        s[SKY_R + k], s[SKY_G + k], s[SKY_B + k] = r, g, b
+    if medium.smog_above < ZERO:
+        return
+    for k in range(n):
+        s[EXP + k] = -(s[NEAR + k] + medium.smog_above / s[RZ + t + k])
+    _exponential(s, n)
+    fog = medium.airlight
+    for k in range(n):
+        x = s[EXP + k]
+        s[SKY_R + k] = x * s[SKY_R + k] + (ONE - x) * fog[0]
+        s[SKY_G + k] = x * s[SKY_G + k] + (ONE - x) * fog[1]
+        s[SKY_B + k] = x * s[SKY_B + k] + (ONE - x) * fog[2]
+
+
+@inner()
+def _add_reflection(s, n, t):
+    """One slope's share of the pixels' light comes from above instead of below."""
+    for k in range(n):
+        share = s[SHARE + t + k]
+        s[SUM_R + k] += share * (s[REFLECTED_R + k] - s[BR + k])
+        s[SUM_G + k] += share * (s[REFLECTED_G + k] - s[BG + k])
+        s[SUM_B + k] += share * (s[REFLECTED_B + k] - s[BB + k])
+
+
+@inner()
+def _reflect(s, n, value_r, value_g, value_b):
+    """REFLECTED becomes one of the colours in the scratch memory."""
+    for k in range(n):
+        s[REFLECTED_R + k], s[REFLECTED_G + k] = s[value_r + k], s[value_g + k]
+        s[REFLECTED_B + k] = s[value_b + k]
+
+
+@inner()
+def _cover_with_image(s, n, t):
+    for k in range(n):
+        w = s[FRONT_W + t + k]
+        s[REFLECTED_R + k] += w * (s[VALUE_R + k] - s[REFLECTED_R + k])
+        s[REFLECTED_G + k] += w * (s[VALUE_G + k] - s[REFLECTED_G + k])
+        s[REFLECTED_B + k] += w * (s[VALUE_B + k] - s[REFLECTED_B + k])
 
 
 @kernel
 def shade(
-    u, v, axes, cover, normal_x, normal_y, variance, bed_view, bed_rgb, bed_alpha, bed_depth, offset, mirror_view, mirror_rgb, mirror_alpha, mirror_depth, mirror_mips, mirror_sizes, has_mirror, front_view, front_rgb, front_alpha, front_depth, front_mips, front_sizes,
+    u, v, axes, cover, normal_x, normal_y, variance, bed_view, bed_rgb, bed_alpha, bed_depth,
+    offset, mirror_view, mirror_rgb, mirror_alpha, mirror_depth, mirror_mips, mirror_sizes,
+    has_mirror, front_view, front_rgb, front_alpha, front_depth, front_mips, front_sizes,
     has_front, front_distance, front_weight, faces, size, medium_numbers, limit_numbers, out,
 ):  # fmt: skip
     """Water of the pixels of a camera into out [H, W, 3].
@@ -422,181 +618,99 @@ def shade(
         bed, mirror, front = _view(bed_view), _view(mirror_view), _view(front_view)
         medium, limits = _medium(medium_numbers), _limits(limit_numbers)
         bends = medium.index != ONE
-        layered = medium.smog_above >= ZERO
-        foggy = medium.smog_per_m > ZERO
-        taps = np.zeros((3, 9), np.float32)
+        s = np.zeros(SCRATCH, np.float32)
+        pixels, own = np.empty(STRIP, np.int64), np.empty(STRIP, np.int64)
         bx, by, bz = v[i] * axes[0, 1], v[i] * axes[1, 1], v[i] * axes[2, 1]
         own_row = i + top
         row_inside = own_row >= 0 and own_row < np.int64(bed.height)
-        for j in range(width):
-            # The order of these sums is that of Camera.ray_directions: the sign has to agree.
-            fall = (u[j] * axes[2, 0] + bz) + axes[2, 2]
-            if not (fall < 0.0 and cover[i, j] <= limits.cover):
-                out[i, j, 0] = out[i, j, 1] = out[i, j, 2] = ZERO
+        j = 0
+        while j < width:
+            n, rough = U(0), False
+            while j < width and n < N:
+                # The order of these sums is that of Camera.ray_directions: the sign has to agree.
+                fall = (u[j] * axes[2, 0] + bz) + axes[2, 2]
+                if not (fall < 0.0 and cover[i, j] <= limits.cover):
+                    out[i, j, 0] = out[i, j, 1] = out[i, j, 2] = ZERO
+                    j += 1
+                    continue
+                s[DX + n] = F((u[j] * axes[0, 0] + bx) + axes[0, 2])
+                s[DY + n] = F((u[j] * axes[1, 0] + by) + axes[1, 2])
+                s[DZ + n] = F(fall)
+                far = np.float64(limits.farthest)
+                s[ALONG + n] = F(min(np.float64(medium.height) / -fall, far))
+                s[NX + n], s[NY + n] = normal_x[i, j], normal_y[i, j]
+                spread = variance[i, j] if variance[i, j] >= limits.smooth_variance else ZERO
+                rough = rough or spread > ZERO
+                s[ROUGH + n] = spread
+                own[n] = -1
+                s[FOUND + n] = s[DEPTH + n] = ZERO
+                column = j + left
+                if row_inside and column >= 0 and column < np.int64(bed.width):
+                    pixel = U(own_row) * bed.width + U(column)
+                    if bed_alpha[pixel] >= limits.solid_alpha:
+                        own[n], s[FOUND + n] = np.int64(pixel), ONE
+                        s[DEPTH + n] = max(-bed_depth[pixel] * F(fall) - medium.height, ZERO)
+                s[OWN_DEPTH + n] = s[DEPTH + n]
+                if has_front:
+                    s[FIRST + n] = front_distance[i, j]
+                    s[WEIGHT + n] = front_weight[i, j]
+                pixels[n] = j
+                n += U(1)
+                j += 1
+            if n == U(0):
                 continue
-            dx = F((u[j] * axes[0, 0] + bx) + axes[0, 2])
-            dy = F((u[j] * axes[1, 0] + by) + axes[1, 2])
-            dz = F(fall)
-            along = F(min(np.float64(medium.height) / -fall, np.float64(limits.farthest)))
-            px, py = along * dx, along * dy
-            length = math.sqrt(dx * dx + dy * dy + dz * dz)
-            inverse = ONE / length
-            vx, vy, vz = -dx * inverse, -dy * inverse, -dz * inverse
-
-            nx, ny = normal_x[i, j], normal_y[i, j]
-            upright = ONE / math.sqrt(max(ONE - nx * nx - ny * ny, limits.steepest))
-            sx, sy = nx * upright, ny * upright
-            rough = variance[i, j] >= limits.smooth_variance
-            weight = F(2 / 3) if rough else ONE
-            nx, ny, nz, c, inside = _tap(taps, U(0), weight, sx, sy, vx, vy, vz, medium, limits)
-            count = U(1)
-            if rough and bends:
-                count = U(3)
-                flat = max(math.sqrt(vx * vx + vy * vy), F(1e-12))
-                spread = math.sqrt(F(3) * variance[i, j]) / flat
-                hx, hy = spread * vx, spread * vy
-                weight = F(1 / 6)
-                _tap(taps, U(1), weight, sx + hx, sy + hy, vx, vy, vz, medium, limits)
-                _tap(taps, U(2), weight, sx - hx, sy - hy, vx, vy, vz, medium, limits)
-
-            near = medium.smog_per_m * along * length
-            wr, wg, wb = medium.rgb[0], medium.rgb[1], medium.rgb[2]
-            if foggy:
-                t = math.exp(-near)
-                wr = t * wr + (ONE - t) * medium.airlight[0]
-                wg = t * wg + (ONE - t) * medium.airlight[1]
-                wb = t * wb + (ONE - t) * medium.airlight[2]
-
-            red, green, blue = wr, wg, wb
-            own_column = j + left
-            if row_inside and own_column >= 0 and own_column < np.int64(bed.width):
-                pixel = U(own_row) * bed.width + U(own_column)
-                alpha = bed_alpha[pixel]
-                if alpha >= limits.solid_alpha:
-                    depth = max(-bed_depth[pixel] * dz - medium.height, ZERO)
-                    tx, ty, tz = -vx, -vy, vz
-                    found = False
-                    if bends:
-                        ratio = ONE / medium.index
-                        bend = c * ratio - inside
-                        tx, ty = bend * nx - vx * ratio, bend * ny - vy * ratio
-                        tz = max(vz * ratio - bend * nz, limits.least_cosine)
-                        inverse = ONE / math.sqrt(tx * tx + ty * ty + tz * tz)
-                        tx, ty, tz = tx * inverse, ty * inverse, tz * inverse
-                    steep = ONE / tz
-                    if bends:
-                        found, deep, r, g, b, a = _bed_along(
-                            bed_rgb,
-                            bed_alpha,
-                            bed_depth,
-                            bed,
-                            px,
-                            py,
-                            tx * steep,
-                            ty * steep,
-                            depth,
-                            medium,
-                            limits,
-                        )
-                    if found:
-                        depth = deep
-                    else:
-                        r, g, b = (
-                            bed_rgb[U(3) * pixel],
-                            bed_rgb[U(3) * pixel + U(1)],
-                            bed_rgb[U(3) * pixel + U(2)],
-                        )
-                        a = alpha
-                    way = depth * steep
-                    red = _absorbed(r + (ONE - a) * wr, wr, medium.extinction[0], way)
-                    green = _absorbed(g + (ONE - a) * wg, wg, medium.extinction[1], way)
-                    blue = _absorbed(b + (ONE - a) * wb, wb, medium.extinction[2], way)
-            if not bends:
-                out[i, j, 0], out[i, j, 1], out[i, j, 2] = red, green, blue
-                continue
-
-            mirror_level = front_level = ZERO
-            if has_mirror:
-                column, row = _project(mirror, dx, dy, -dz, limits.least_depth)
-                column, row = _clamp_to(mirror, column, row)
-                first = _distance_at(
-                    mirror_alpha, mirror_depth, mirror, column, row, px, py, medium, limits
-                )
-                for k in range(count):
-                    rx, ry, rz = taps[k, RX], taps[k, RY], taps[k, RZ]
-                    column, row = _end_in_mirror(mirror, px, py, rx, ry, rz, first, medium, limits)
-                    distance = _distance_at(
-                        mirror_alpha, mirror_depth, mirror, column, row, px, py, medium, limits
-                    )
-                    column, row = _end_in_mirror(
-                        mirror, px, py, rx, ry, rz, distance, medium, limits
-                    )
-                    taps[k, MIRROR_C], taps[k, MIRROR_R] = column, row
-                if count > U(1):
-                    mirror_level = _level(mirror_sizes, _spacing(taps, MIRROR_C, MIRROR_R))
-            if has_front:
-                for k in range(count):
-                    rx, ry, rz = taps[k, RX], taps[k, RY], taps[k, RZ]
-                    fade, column, row = _end_in_image(
-                        front_alpha,
-                        front_depth,
-                        front,
-                        px,
-                        py,
-                        rx,
-                        ry,
-                        rz,
-                        front_distance[i, j],
-                        medium,
-                        limits,
-                    )
-                    taps[k, FRONT_W] = fade * front_weight[i, j]
-                    taps[k, FRONT_C], taps[k, FRONT_R] = column, row
-                if count > U(1):
-                    front_level = _level(front_sizes, _spacing(taps, FRONT_C, FRONT_R))
-
-            below_r, below_g, below_b = red, green, blue
-            for k in range(count):
-                rx, ry, rz = taps[k, RX], taps[k, RY], taps[k, RZ]
-                sr, sg, sb = _sky(faces, size, rx, ry, rz)
-                if layered:
-                    t = math.exp(-(near + medium.smog_above / rz))
-                    sr = t * sr + (ONE - t) * medium.airlight[0]
-                    sg = t * sg + (ONE - t) * medium.airlight[1]
-                    sb = t * sb + (ONE - t) * medium.airlight[2]
-                r, g, b = sr, sg, sb
+            _surface(s, n, medium, limits)
+            _tap(s, n, U(0), ZERO, F(2 / 3), ONE, medium, limits)
+            _water_color(s, n, medium)
+            _refract(s, n, medium, limits)
+            if bends:
+                _search_bed(s, n, bed_alpha, bed_depth, bed, medium, limits)
+            else:
+                for k in range(n):
+                    s[FOUND + k] = ZERO
+            _fetch_bed(s, n, own, bed_rgb, bed_alpha, bed, limits)
+            _absorb(s, n, BR, WR, medium.extinction[0])
+            _absorb(s, n, BG, WG, medium.extinction[1])
+            _absorb(s, n, BB, WB, medium.extinction[2])
+            for k in range(n):
+                s[SUM_R + k], s[SUM_G + k], s[SUM_B + k] = s[BR + k], s[BG + k], s[BB + k]
+            if bends:
+                count = U(1)
+                if rough:
+                    count = U(3)
+                    _tap(s, n, N, ONE, F(1 / 6), ZERO, medium, limits)
+                    _tap(s, n, N + N, -ONE, F(1 / 6), ZERO, medium, limits)
+                if has_front:
+                    for k in range(n):
+                        d = s[FIRST + k]
+                        s[FIRST + k] = d if d < F(np.inf) else NOTHING
+                    _find_in_image(s, n, count, front_alpha, front_depth, front, medium, limits)
+                    _set_levels(s, n, count, FRONT_LEVEL, FRONT_C, FRONT_R, front_sizes)
                 if has_mirror:
-                    r, g, b, a = _fetch(
-                        mirror_rgb,
-                        mirror_alpha,
-                        mirror,
-                        mirror_mips,
-                        mirror_sizes,
-                        taps[k, MIRROR_C],
-                        taps[k, MIRROR_R],
-                        mirror_level,
-                    )
-                    r, g, b = r + (ONE - a) * sr, g + (ONE - a) * sg, b + (ONE - a) * sb
-                if has_front and taps[k, FRONT_W] > ZERO:
-                    fr, fg, fb, a = _fetch(
-                        front_rgb,
-                        front_alpha,
-                        front,
-                        front_mips,
-                        front_sizes,
-                        taps[k, FRONT_C],
-                        taps[k, FRONT_R],
-                        front_level,
-                    )
-                    w = taps[k, FRONT_W]
-                    r += w * (fr + (ONE - a) * sr - r)
-                    g += w * (fg + (ONE - a) * sg - g)
-                    b += w * (fb + (ONE - a) * sb - b)
-                share = taps[k, SHARE]
-                red += share * (r - below_r)
-                green += share * (g - below_g)
-                blue += share * (b - below_b)
-            out[i, j, 0], out[i, j, 1], out[i, j, 2] = red, green, blue
+                    _find_in_mirror(s, n, count, mirror_alpha, mirror_depth, mirror, medium, limits)
+                    _set_levels(s, n, count, LEVEL, MIRROR_C, MIRROR_R, mirror_sizes)
+                for tap in range(count):
+                    t = tap * N
+                    _fetch_sky(s, n, t, faces, size, medium)
+                    if has_mirror:
+                        _fetch_layer(
+                            s, n, MIRROR_C + t, MIRROR_R + t, LEVEL, mirror_rgb, mirror_alpha,
+                            mirror, mirror_mips, mirror_sizes,
+                        )  # fmt: skip
+                        _reflect(s, n, VALUE_R, VALUE_G, VALUE_B)
+                    else:
+                        _reflect(s, n, SKY_R, SKY_G, SKY_B)
+                    if has_front:
+                        _fetch_layer(
+                            s, n, FRONT_C + t, FRONT_R + t, FRONT_LEVEL, front_rgb, front_alpha,
+                            front, front_mips, front_sizes,
+                        )  # fmt: skip
+                        _cover_with_image(s, n, t)
+                    _add_reflection(s, n, t)
+            for k in range(n):
+                at = pixels[k]
+                out[i, at, 0], out[i, at, 1] = s[SUM_R + k], s[SUM_G + k]
+                out[i, at, 2] = s[SUM_B + k]
 
 
 @kernel
