@@ -10,8 +10,8 @@ right of it the others, level l from row R (1 - 4 / 4^l) on. view: the vertical 
 its image N (3), fx, fy, cx, cy, the eye's height over the water, and the image's width and height.
 """
 
-# pyright: reportCallIssue=false
-# (of numba's intrinsics it sees the compiler's first argument as well)
+# pyright: reportCallIssue=false, reportGeneralTypeIssues=false
+# (of numba's intrinsics it sees the compiler's first argument as well, and no result)
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ from augment.render import cpu_simd as v8
 from augment.render.cpu_jit import inner, kernel
 
 COVERED = np.float32(1 - 1 / 512)  # an alpha through which the water does not show
-THICKNESS_M = np.float32(0.5)  # how thick anything is taken to be, at least,
-THICKNESS = np.float32(0.05)  # and as a share of its depth
+THICKNESS_M = np.float32(0.25)  # how thick anything is taken to be, at least,
+THICKNESS = np.float32(0.02)  # and as a share of its depth
 HIDDEN_PX = np.float32(64)  # a ray may run behind something for so long
 NEAR_M = np.float32(0.05)  # rays coming back end so far from the camera's plane
 AGREEING = np.float32(0.05)  # neighbours of one surface: relative difference of inverse depths

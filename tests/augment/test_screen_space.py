@@ -15,6 +15,15 @@ LEVEL_M = 0.3
 WALL_M = 12.0
 
 
+@pytest.fixture(autouse=True, scope="module")
+def one_torch_thread():
+    """The definition is hundreds of steps on few rays, where threads only wait for each other."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
 def looking(
     pitch_deg: float = 0, roll_deg: float = 0, width: int = 97, height: int = 75, fx: float = 60.0
 ) -> Camera:
