@@ -149,7 +149,8 @@ def _fetch(layer: Layer, places: list[tuple[Tensor, Tensor]]) -> list[Tensor]:
     if len(places) == 1:
         return [bilinear(image, *places[0])]
     (column, row), *sides = places
-    spacing = sum(torch.hypot(c - column, r - row) for c, r in sides) / len(sides)
+    apart = [torch.hypot(c - column, r - row) for c, r in sides]
+    spacing = torch.stack(apart).mean(0)
     levels = mip_chain(image)
     return [blurred(levels, c, r, spacing) for c, r in places]
 

@@ -34,7 +34,7 @@ def window_offset(outer: Camera, inner: Camera) -> tuple[int, int]:
     off_grid = max(abs(left - round(left)), abs(top - round(top)))
     if focal > 1e-9 or apart > 1e-6 or off_grid > 1e-3:
         raise ValueError(
-            f"the bed must be seen by a window of the image of camera {inner.name!r}, not {outer.name!r}; "
+            f"the bed must be seen through a window of the image of camera {inner.name!r}; the "
             f"focal lengths differ by a factor of {1 + focal:.6g}, poses by {apart:.3g}, "
             f"offsets are ({left:.6g}, {top:.6g}) pixels"
         )

@@ -65,7 +65,12 @@ def shade_water(
     _check(camera, cover, medium, field, bed, mirror, screen)
     if smog is not None and smog.sigma_per_m == 0:
         smog = None
-    images = [bed.rgb, bed.alpha, cover]
+    layers = [
+        bed,
+        *([] if mirror is None else [mirror]),
+        *([] if screen is None else [screen.layer]),
+    ]
+    images = [cover, *(part for layer in layers for part in (layer.rgb, layer.alpha, layer.depth))]
     tracked = torch.is_grad_enabled() and any(image.requires_grad for image in images)
     if fast and not tracked and bed.rgb.dtype == torch.float32:
         return water_launch.shade(

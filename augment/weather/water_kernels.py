@@ -383,23 +383,25 @@ def _place_on_bed(s, n, bed, medium, limits):
 
 
 @inner()
-def _look(s, n, alpha, depth, view):
+def _look(s, n, index, alpha, depth, view):
     """Alpha and depth of the pixels nearest to COLUMN and ROW, which become their centres."""
-    last_column, last_row = view.columns - ONE, view.rows - ONE
+    last_column, last_row, width = view.columns - ONE, view.rows - ONE, np.int32(view.width)
     for k in range(n):
-        c = _whole(_clamp(s[COLUMN + k], ZERO, last_column))
-        r = _whole(_clamp(s[ROW + k], ZERO, last_row))
-        pixel = r * view.width + c
+        c = np.int32(_clamp(s[COLUMN + k], ZERO, last_column))
+        r = np.int32(_clamp(s[ROW + k], ZERO, last_row))
+        index[k] = np.int32(r * width + c)
+        s[COLUMN + k], s[ROW + k] = F(c) + HALF, F(r) + HALF
+    for k in range(n):
+        pixel = U(index[k])
         s[ALPHA + k], s[FAR + k] = alpha[pixel], depth[pixel]
-        s[COLUMN + k], s[ROW + k] = _real(c) + HALF, _real(r) + HALF
 
 
 @inner()
-def _search_bed(s, n, alpha, depth, bed, medium, limits):
+def _search_bed(s, n, index, alpha, depth, bed, medium, limits):
     """Corrects the bed's depth along the refracted rays; COLUMN, ROW: where they meet it."""
     for _ in range(limits.bed_steps):
         _place_on_bed(s, n, bed, medium, limits)
-        _look(s, n, alpha, depth, bed)
+        _look(s, n, index, alpha, depth, bed)
         for k in range(n):
             found = s[FOUND + k] if s[ALPHA + k] >= limits.solid_alpha else ZERO
             s[FOUND + k] = found
@@ -461,17 +463,17 @@ def _place_in_mirror(s, n, t, distances, columns, rows, mirror, medium, limits):
 
 
 @inner()
-def _find_in_mirror(s, n, count, alpha, depth, mirror, medium, limits):
+def _find_in_mirror(s, n, index, count, alpha, depth, mirror, medium, limits):
     """MIRROR_C, MIRROR_R: where the reflected rays end in the mirrored layer."""
     for k in range(n):
         column, row = _project(mirror, s[DX + k], s[DY + k], -s[DZ + k], limits.least_depth)
         s[COLUMN + k], s[ROW + k] = _clamp_to(mirror, column, row)
-    _look(s, n, alpha, depth, mirror)
+    _look(s, n, index, alpha, depth, mirror)
     _measure_mirror(s, n, FIRST, mirror, medium, limits)
     for tap in range(count):
         t = tap * N
         _place_in_mirror(s, n, t, FIRST, COLUMN, ROW, mirror, medium, limits)
-        _look(s, n, alpha, depth, mirror)
+        _look(s, n, index, alpha, depth, mirror)
         _measure_mirror(s, n, DISTANCE, mirror, medium, limits)
         _place_in_mirror(s, n, t, DISTANCE, MIRROR_C + t, MIRROR_R + t, mirror, medium, limits)
 
@@ -490,7 +492,7 @@ def _place_in_image(s, n, t, front, medium, limits):
 
 
 @inner()
-def _find_in_image(s, n, count, alpha, depth, front, medium, limits):
+def _find_in_image(s, n, index, count, alpha, depth, front, medium, limits):
     """FRONT_C, FRONT_R: where the reflected rays end in the image; FRONT_W: is it seen there."""
     m = front.project
     for tap in range(count):
@@ -498,7 +500,7 @@ def _find_in_image(s, n, count, alpha, depth, front, medium, limits):
         for k in range(n):
             s[DISTANCE + k] = s[FIRST + k]
         _place_in_image(s, n, t, front, medium, limits)
-        _look(s, n, alpha, depth, front)
+        _look(s, n, index, alpha, depth, front)
         for k in range(n):
             x, y, z = _point(front, s[FAR + k], s[COLUMN + k], s[ROW + k])
             x, y, z = x - s[PX + k], y - s[PY + k], z + medium.height
@@ -506,7 +508,7 @@ def _find_in_image(s, n, count, alpha, depth, front, medium, limits):
             d = s[DISTANCE + k]
             s[DISTANCE + k] = better if d >= ZERO and s[ALPHA + k] >= limits.solid_alpha else d
         _place_in_image(s, n, t, front, medium, limits)
-        _look(s, n, alpha, depth, front)
+        _look(s, n, index, alpha, depth, front)
         for k in range(n):
             column, row, d = s[FRONT_C + t + k], s[FRONT_R + t + k], s[DISTANCE + k]
             x, y = s[PX + k] + d * s[RX + t + k], s[PY + k] + d * s[RY + t + k]
@@ -620,6 +622,7 @@ def shade(
         bends = medium.index != ONE
         s = np.zeros(SCRATCH, np.float32)
         pixels, own = np.empty(STRIP, np.int64), np.empty(STRIP, np.int64)
+        index = np.empty(STRIP, np.int32)
         bx, by, bz = v[i] * axes[0, 1], v[i] * axes[1, 1], v[i] * axes[2, 1]
         own_row = i + top
         row_inside = own_row >= 0 and own_row < np.int64(bed.height)
@@ -664,7 +667,7 @@ def shade(
             _water_color(s, n, medium)
             _refract(s, n, medium, limits)
             if bends:
-                _search_bed(s, n, bed_alpha, bed_depth, bed, medium, limits)
+                _search_bed(s, n, index, bed_alpha, bed_depth, bed, medium, limits)
             else:
                 for k in range(n):
                     s[FOUND + k] = ZERO
@@ -684,10 +687,14 @@ def shade(
                     for k in range(n):
                         d = s[FIRST + k]
                         s[FIRST + k] = d if d < F(np.inf) else NOTHING
-                    _find_in_image(s, n, count, front_alpha, front_depth, front, medium, limits)
+                    _find_in_image(
+                        s, n, index, count, front_alpha, front_depth, front, medium, limits
+                    )
                     _set_levels(s, n, count, FRONT_LEVEL, FRONT_C, FRONT_R, front_sizes)
                 if has_mirror:
-                    _find_in_mirror(s, n, count, mirror_alpha, mirror_depth, mirror, medium, limits)
+                    _find_in_mirror(
+                        s, n, index, count, mirror_alpha, mirror_depth, mirror, medium, limits
+                    )
                     _set_levels(s, n, count, LEVEL, MIRROR_C, MIRROR_R, mirror_sizes)
                 for tap in range(count):
                     t = tap * N
@@ -711,39 +718,3 @@ def shade(
                 at = pixels[k]
                 out[i, at, 0], out[i, at, 1] = s[SUM_R + k], s[SUM_G + k]
                 out[i, at, 2] = s[SUM_B + k]
-
-
-@kernel
-def halve_image(rgb, alpha, out):
-    """Averages over 2 x 2 pixels of rgb [H, W, 3] and alpha [H, W] into out [h, w, 4]."""
-    height, width = alpha.shape
-    quarter = F(0.25)
-    for i in numba.prange(out.shape[0]):
-        top, bottom = U(2 * i), U(min(2 * i + 1, height - 1))
-        for j in range(U(out.shape[1])):
-            c0 = U(2) * j
-            c1 = min(c0 + U(1), U(width - 1))
-            for c in range(U(3)):
-                total = (rgb[top, c0, c] + rgb[bottom, c0, c]) + (
-                    rgb[top, c1, c] + rgb[bottom, c1, c]
-                )
-                out[i, j, c] = quarter * total
-            total = (alpha[top, c0] + alpha[bottom, c0]) + (alpha[top, c1] + alpha[bottom, c1])
-            out[i, j, 3] = quarter * total
-
-
-@kernel
-def halve_mip(image, out):
-    """Averages over 2 x 2 pixels of image [H, W, 4] into out [h, w, 4]."""
-    height, width, _ = image.shape
-    quarter = F(0.25)
-    for i in numba.prange(out.shape[0]):
-        top, bottom = U(2 * i), U(min(2 * i + 1, height - 1))
-        for j in range(U(out.shape[1])):
-            c0 = U(2) * j
-            c1 = min(c0 + U(1), U(width - 1))
-            for c in range(U(4)):
-                total = (image[top, c0, c] + image[bottom, c0, c]) + (
-                    image[top, c1, c] + image[bottom, c1, c]
-                )
-                out[i, j, c] = quarter * total

@@ -10,7 +10,7 @@ from augment.cameras import Camera
 from augment.render.composite import sky_behind
 from augment.render.threads import kernel_threads
 from augment.sky import ConstantSky, CubemapSky, Sky, directions_of_cubemap
-from augment.weather import layer_lookup, reflection_lookup, refraction, water_surface
+from augment.weather import layer_lookup, mip_kernels, reflection_lookup, refraction, water_surface
 from augment.weather import water_kernels as kernels
 from augment.weather.flood import FloodMedium, Layer
 from augment.weather.screen_space import ScreenReflection
@@ -89,15 +89,16 @@ def _faces(sky: Sky, smog: SmogMedium | None) -> tuple[np.ndarray, SmogMedium | 
 def _layer(layer: Layer | None) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """`kernels.View` and images of a layer; of None what nothing will be looked up in."""
     if layer is None:
-        return np.zeros(22, np.float32), *[np.zeros(1, np.float32)] * 3
+        nothing = np.zeros(1, np.float32)
+        return np.zeros(22, np.float32), nothing, nothing, nothing
     camera = layer.camera
     rotation = camera.camera_from_world[:3, :3].numpy()
     fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
     project = rotation * [[fx], [fy], [1.0]]
     rays = rotation.T @ [[1 / fx, 0.0, -cx / fx], [0.0, 1 / fy, -cy / fy], [0.0, 0.0, 1.0]]
     numbers = [*project.reshape(-1), *rays.reshape(-1), cx, cy, camera.width, camera.height]
-    images = (_array(image).reshape(-1) for image in (layer.rgb, layer.alpha, layer.depth))
-    return np.asarray(numbers, np.float32), *images
+    rgb, alpha, depth = (_array(part).reshape(-1) for part in (layer.rgb, layer.alpha, layer.depth))
+    return np.asarray(numbers, np.float32), rgb, alpha, depth
 
 
 def _averages(layer: Layer | None, rough: bool) -> tuple[np.ndarray, np.ndarray]:
@@ -117,9 +118,9 @@ def _averages(layer: Layer | None, rough: bool) -> tuple[np.ndarray, np.ndarray]
         for start, width, height in shapes[1:]:
             image = mips[start : start + width * height].reshape(height, width, 4)
             if last is None:
-                kernels.halve_image(rgb, alpha, image)
+                mip_kernels.halve_image(rgb, alpha, image)
             else:
-                kernels.halve_mip(last, image)
+                mip_kernels.halve_mip(last, image)
             last = image
     return mips.reshape(-1), np.asarray(shapes, np.uint64)
 
