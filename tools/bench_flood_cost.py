@@ -25,7 +25,7 @@ from augment.weather import flood_view
 from augment.weather.flood import FresnelModel, ReflectionTier
 from recipes.schema import Output, Recipe
 from tools.bench import Spread
-from tools.bench_flood_error import draw, flood_recipe
+from tools.bench_flood_error import PICTURE_ONLY, draw, flood_recipe
 from tools.bench_flood_masks import FAR_BELOW_M, looking_up
 
 TIERS: tuple[ReflectionTier, ...] = ("sky", "screen_space", "mirrored")
@@ -54,10 +54,10 @@ class CostCase:
 
 
 def cost_cases(camera: Camera) -> list[CostCase]:
-    """Every tier still and with waves; with the default depth image; Schlick's formula; and views
-    that no water is in.
+    """Every tier still and with waves, pictures alone; with Schlick's formula; with depth and labels
+    as by default; and views that no water is in.
     """
-    none, default = Output(depth="none"), Output()
+    none, default = PICTURE_ONLY, Output()
     cases = [
         CostCase(f"{tier}, {waves}", camera, flood_recipe(tier, waves), Recipe(output=none))
         for tier in TIERS
@@ -67,7 +67,9 @@ def cost_cases(camera: Camera) -> list[CostCase]:
     cases.append(CostCase("mirrored, calm, schlick", camera, schlick, Recipe(output=none)))
     for tier in TIERS:
         recipe = flood_recipe(tier, "calm", output=default)
-        cases.append(CostCase(f"{tier}, calm, with depth", camera, recipe, Recipe(output=default)))
+        cases.append(
+            CostCase(f"{tier}, calm, depth and labels", camera, recipe, Recipe(output=default))
+        )
     up, low = flood_recipe(waves="calm"), flood_recipe(level_m=FAR_BELOW_M)
     cases.append(CostCase("looking up", looking_up(camera), up, Recipe(output=none)))
     cases.append(CostCase("level below everything", camera, low, Recipe(output=none)))
@@ -158,7 +160,7 @@ def _time_frame(scene: Scene, camera: Camera, plan: Plan) -> float:
 
 def _stage_case(scene: Scene, camera: Camera, tier: ReflectionTier, repeats: int) -> dict[str, Any]:
     """Milliseconds of each stage with waves, and over those of the clean frame before it."""
-    clean = make_plan(Recipe(output=Output(depth="none")), scene)
+    clean = make_plan(Recipe(output=PICTURE_ONLY), scene)
     flooded = make_plan(flood_recipe(tier, "calm"), scene)
     times: dict[str, list[float]] = defaultdict(list)
     for _ in range(repeats):

@@ -26,6 +26,7 @@ from recipes.schema import Output, Recipe, Weather
 from tools.bench_flood_mirror import mirrored_picture
 
 WAVES = ("still", "calm")
+PICTURE_ONLY = Output(depth="none", labels=False)
 OPAQUE = (1e6, 1e6, 1e6)
 EDGE_PX = 3  # pixels this close to the water's border are left out: they show two surfaces
 DARK, LIT = 2 / 255, 8 / 255  # a black pixel, and what it is compared with when it should not be
@@ -60,7 +61,7 @@ def flood_recipe(
         fresnel=fresnel,
         reflection=reflection,
     )
-    return Recipe(weather=Weather(flood=flood), output=output or Output(depth="none"))
+    return Recipe(weather=Weather(flood=flood), output=output or PICTURE_ONLY)
 
 
 def draw(scene: Scene, camera: Camera, recipe: Recipe) -> Picture:

@@ -24,8 +24,8 @@ from augment.geometry import rigid
 from augment.plan import make_plan
 from augment.scene import Scene
 from augment.weather.water_plane import plane_depth
-from recipes.schema import Output, Recipe
-from tools.bench_flood_error import draw, flood_recipe, inside
+from recipes.schema import Recipe
+from tools.bench_flood_error import PICTURE_ONLY, draw, flood_recipe, inside
 
 SILHOUETTE_PX = 3  # splats stand up to this far out beyond the true surface
 REACH_M = 80.0  # farther out a pixel is metres long and shows many things at once
@@ -162,7 +162,7 @@ def dry_views(scene: Scene, camera: Camera) -> dict[str, bool]:
         "looking up": (looking_up(camera), flood_recipe(waves="calm")),
         "level below everything": (camera, flood_recipe(level_m=FAR_BELOW_M)),
     }
-    clean = make_plan(Recipe(output=Output(depth="none")), scene)
+    clean = make_plan(Recipe(output=PICTURE_ONLY), scene)
     return {
         name: torch.equal(
             render_buffers(scene, view, make_plan(recipe, scene)).rgb,

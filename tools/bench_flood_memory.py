@@ -44,13 +44,13 @@ def _render_once(uri: str, width: int, height: int, tier: Any) -> float:
     from adapters.base import open_scene
     from augment.apply import render_buffers
     from augment.plan import make_plan
-    from recipes.schema import Output, Recipe
+    from recipes.schema import Recipe
     from tools.bench_flood_cost import bench_camera
-    from tools.bench_flood_error import flood_recipe
+    from tools.bench_flood_error import PICTURE_ONLY, flood_recipe
 
     scene = open_scene(uri)
     camera = bench_camera(scene, width, height)
-    recipe = Recipe(output=Output(depth="none")) if tier is None else flood_recipe(tier, "calm")
+    recipe = Recipe(output=PICTURE_ONLY) if tier is None else flood_recipe(tier, "calm")
     plan = make_plan(recipe, scene)
     render_buffers(scene, camera.scaled(SMALL), plan)
     gc.collect()
