@@ -23,7 +23,8 @@ class RenderOutput:
     """Image buffers of one camera; None where not asked for.
 
     rgb: sum of weights times colour, without background. alpha: 1 - final transmittance.
-    expected_depth: sum(w z) / max(sum(w), 1e-10), metres; 0 where nothing was hit.
+    expected_depth: sum(w z) / max(sum(w), 1e-10), metres; 0 where nothing was hit; z is that of a
+    splat's centre, or, with a clip, of its surface at the pixel (see augment.render.clip).
     median_depth: z of the first splat that brings transmittance below 0.5, metres; 0 where none
     does. splat_ids: index of the splat with the largest weight, counted through the parts in
     order; -1 where nothing was hit. The first of equal weights wins.

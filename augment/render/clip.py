@@ -1,19 +1,23 @@
 """Splats cut at a height: what lies above a level plane, or below it, and nothing of the rest.
 
 A splat is taken for the surface on which its density is highest along each ray: with covariance S2
-of its image position (blurred) and c, that of image position and depth, the depth there is
+of its image position and c, that of image position and depth, the depth there is
 
     z(p) = z + g . (p - mean2d),    g = S2^-1 c
 
-(the conditional mean of a Gaussian, linear in the pixel). Seen from an eye at height h_eye over the
-plane, a point at inverse depth i on the ray through p is at height z (h_eye i + s(p)), s being the
-vertical part of the ray's direction. With i(p) = 1/z - g . (p - mean2d) / z^2, exact for a plane,
+to first order (the conditional mean of a Gaussian). Of a plane it is 1/z that is linear in the
+image, so i(p) = 1/z - g . (p - mean2d) / z^2 is used, which has the same slope. Seen from an eye at
+height h_eye over the plane, a point at inverse depth i on the ray through p is at height
+z (h_eye i + s(p)), s being the vertical part of the ray's direction. So
 
     L(p) = h_eye i(p) + s(p)
 
 is linear in p and has the sign of the height: the cut is a straight line in the image. Divided by
-its slope L is a distance from that line in pixels, and clamp(L + 0.5, 0, 1) a smooth edge. Of what
+its slope, L is a distance from that line in pixels, and clamp(L + 0.5, 0, 1) a smooth edge. Of what
 lies below, one pixel more is kept, so that nothing shows between the two sides of a cut.
+Where there is a clip, expected depth, too, is taken over these surfaces, 1/i(p), no farther from
+the centre than the splat reaches: the centres of large splats stand nearer or farther than what a
+pixel shows of them, by more than shallow water is deep.
 """
 
 from __future__ import annotations
@@ -25,6 +29,8 @@ from typing import Literal
 ABOVE, BELOW = "above", "below"
 EDGE_PX = {ABOVE: 0.5, BELOW: 1.5}  # added to the distance before it is clamped to [0, 1]
 FAR_PX = 1e6  # distances are clamped to this: where the slope vanishes they have no end
+SHARP_PX2 = 0.003  # added to S2's diagonal, so that splats seen edge-on have a slope
+LONGEST = 2 / 3  # of its depth, that a splat may reach: z(p) is at most 3 z
 
 
 @dataclass(frozen=True)

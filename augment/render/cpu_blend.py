@@ -13,7 +13,15 @@ from numba import prange
 
 from augment.render import cpu_simd as v8
 from augment.render.constants import DEPTH_EPS
-from augment.render.cpu_clip import kept_share, list_edges, stage_cuts
+from augment.render.cpu_clip import (
+    LINES,
+    SHARE,
+    SURFACE,
+    kept_share,
+    list_lines,
+    stage_cuts,
+    surface_depth,
+)
 from augment.render.cpu_items import BATCH, ITEMS, find_spans, list_items, stage
 from augment.render.cpu_jit import inner, kernel
 from augment.render.cpu_layout import (
@@ -77,8 +85,9 @@ def blend_tiles(
         spans = np.empty(2 * BATCH, np.int32)
         values = np.empty(2 * ITEMS, np.float32)
         places = np.empty(2 * ITEMS, np.int32)
-        lines = np.empty(3 * BATCH, np.float32)
+        lines = np.empty(LINES, np.float32)
         edges = np.empty(ITEMS, np.float32)
+        surfaces = np.empty(ITEMS, np.float32)
         rows = np.empty(2 * STRIPS, np.int64)
         for tile in range(group * GROUP, min((group + 1) * GROUP, tiles.size)):
             first, last = starts[tile], starts[tile + 1]
@@ -92,7 +101,7 @@ def blend_tiles(
             is_open = _blend_list(
                 records, members, first, last, np.float32(left), np.float32(top), limits,
                 state, staged, spans, values, places, rows, rgb, expected, median, ids,
-                cuts, lines, edges,
+                cuts, lines, edges, surfaces,
             )  # fmt: skip
             if is_open and not is_last:
                 _copy(state, U(0), states, U(tile * used), U(used))
@@ -145,6 +154,7 @@ def _blend_list(
     cuts,
     lines,
     edges,
+    surfaces,
 ):
     """Blend a tile's list into its state. Returns whether any pixel still lets light through."""
     for strip in range(STRIPS):
@@ -158,7 +168,7 @@ def _blend_list(
             v8.prefetch(records, U(members[k]) * U(RECORD))
         stage(records, members, U(at), U(count), left, top, rgb, expected, median, ids, staged)
         if cuts is not None:
-            stage_cuts(cuts, members, U(at), U(count), staged, lines)
+            stage_cuts(cuts, members, U(at), U(count), staged, expected, lines)
         for strip in range(STRIPS):
             if rows[2 * strip] >= rows[2 * strip + 1]:
                 continue
@@ -167,18 +177,20 @@ def _blend_list(
             if items == U(0):
                 continue
             if cuts is not None:
-                list_edges(lines, U(count), strip, spans, edges)
+                list_lines(lines, SHARE, U(count), strip, spans, edges)
+                if expected is not None:
+                    list_lines(lines, SURFACE, U(count), strip, spans, surfaces)
             if (median is not None or ids is not None) and _can_change(
                 state, strip, rows, median, ids
             ):
                 _blend_items(
                     state, staged, values, places, items, limits, rgb, expected, median, ids,
-                    cuts, lines, edges,
+                    cuts, lines, edges, surfaces,
                 )  # fmt: skip
             else:
                 _blend_items(
                     state, staged, values, places, items, limits, rgb, expected, None, None,
-                    cuts, lines, edges,
+                    cuts, lines, edges, surfaces,
                 )  # fmt: skip
             shrink(state, strip, rows)
     return not is_closed(rows)
@@ -224,7 +236,20 @@ def shrink(state, strip, rows):
 
 @inner()
 def _blend_items(
-    state, staged, values, places, items, limits, rgb, expected, median, ids, cuts, lines, edges
+    state,
+    staged,
+    values,
+    places,
+    items,
+    limits,
+    rgb,
+    expected,
+    median,
+    ids,
+    cuts,
+    lines,
+    edges,
+    surfaces,
 ):
     """Blend all items in turn. The next one's alpha is begun before this one is blended."""
     alpha_max, log_cut = v8.splat(limits[0]), v8.splat(limits[1])
@@ -251,8 +276,12 @@ def _blend_items(
             _add(state, at + P_RED, weight, staged[U(RED) * n + splat])
             _add(state, at + P_GREEN, weight, staged[U(GREEN) * n + splat])
             _add(state, at + P_BLUE, weight, staged[U(BLUE) * n + splat])
-        if expected is not None:
+        if expected is not None and cuts is None:
             _add(state, at + P_DEPTH, weight, staged[U(DEPTH) * n + splat])
+        if expected is not None and cuts is not None:
+            centre = staged[U(DEPTH) * n + splat]
+            depth = surface_depth(lines, surfaces, splat, item, centre)
+            v8.store(state, at + P_DEPTH, v8.fmuladd(weight, depth, v8.load(state, at + P_DEPTH)))
         if median is not None:
             crossed = v8.both(v8.at_least(through, half), v8.greater(half, after))
             depth = v8.splat(staged[U(DEPTH) * n + splat])

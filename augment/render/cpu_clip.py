@@ -1,7 +1,8 @@
 """Numba functions: splats cut at a height (see augment.render.clip for the geometry).
 
-A splat's cut is CUT float32: the kept share of its alpha at pixel p is
-clamp(C_AT + C_X (x - mean_x) + C_Y (y - mean_y), 0, 1).
+A splat's cut is CUT float32. With x and y from its mean, in pixels, the kept share of its alpha is
+clamp(C_AT + C_X x + C_Y y, 0, 1), and its surface's depth is its centre's over
+1 - clamp(C_RIGHT x + C_DOWN y, -C_REACH, C_REACH).
 """
 
 from __future__ import annotations
@@ -17,7 +18,6 @@ from augment.render.cpu_layout import (
     MEAN_X,
     MEAN_Y,
     TILE_H,
-    V_BLUR,
     V_CLIP_CAMERA,
     V_CLIP_EDGE,
     V_CLIP_EYE,
@@ -27,10 +27,15 @@ from augment.render.cpu_layout import (
     U,
 )
 
-CUT = 4
-C_AT, C_X, C_Y = 0, 1, 2
+CUT = 8
+C_AT, C_X, C_Y, C_RIGHT, C_DOWN, C_REACH = 0, 1, 2, 3, 4, 5
+SHARE, SURFACE = 0, 3 * BATCH  # where a batch's lines of each kind begin: value, slope in x and y
+REACHES = 6 * BATCH
+LINES = 7 * BATCH
 _FAR = np.float32(1e6)  # augment.render.clip.FAR_PX
 _TINY = np.float32(1e-20)
+_SHARP = np.float32(0.003)  # augment.render.clip.SHARP_PX2
+_LONGEST = np.float32(2 / 3)  # augment.render.clip.LONGEST
 
 
 @inner()
@@ -43,7 +48,7 @@ def height_of(d, view):
 
 @inner()
 def cut_eight(quats, scales, picked, at, d, x, y, inverse, view):
-    """Of eight Gaussians: which have a part on the kept side, and C_AT, C_X, C_Y of their cuts."""
+    """Of eight Gaussians: which have a part on the kept side, and their cuts' six numbers."""
     zero, one = v8.splat(np.float32(0)), v8.splat(np.float32(1))
     right, down, sizes, _, _, m = semi_axes(quats, scales, picked, at, x, y, inverse, view)
     up0, up1, up2 = (
@@ -62,8 +67,8 @@ def cut_eight(quats, scales, picked, at, d, x, y, inverse, view):
     sigma = v8.sqrt(dot(rise0, rise1, rise2, rise0, rise1, rise2))
     reach = v8.splat(view[V_EXTENT]) * sigma
 
-    # Slope of depth: the blurred covariance, inverted, times that of position and depth.
-    blur = v8.splat(view[V_BLUR])
+    # Slope of depth: the image's covariance, inverted, times that of position and depth.
+    blur = v8.splat(_SHARP)
     xx = blur + dot(right[0], right[1], right[2], right[0], right[1], right[2])
     yy = blur + dot(down[0], down[1], down[2], down[0], down[1], down[2])
     xy = dot(right[0], right[1], right[2], down[0], down[1], down[2])
@@ -84,42 +89,68 @@ def cut_eight(quats, scales, picked, at, d, x, y, inverse, view):
     offset = v8.select(whole, far, offset)
     lx = v8.select(whole, zero, lx * scale)
     ly = v8.select(whole, zero, ly * scale)
+    deep = v8.sqrt(dot(away0, away1, away2, away0, away1, away2)) * inverse
+    deep = v8.minimum(v8.splat(view[V_EXTENT]) * deep, v8.splat(_LONGEST))
     partly = v8.at_least(height + reach, zero)
-    return partly, offset + v8.splat(view[V_CLIP_EDGE]), lx, ly
+    return partly, offset + v8.splat(view[V_CLIP_EDGE]), lx, ly, gx * inverse, gy * inverse, deep
 
 
 @inner()
-def stage_cuts(cuts, members, at, count, staged, lines):
-    """Cuts of a batch, turned to one row a number, about the tile's corner. staged: cpu_items'."""
+def stage_cuts(cuts, members, at, count, staged, depths, lines):
+    """Cuts of a batch, turned to one row a number, about the tile's corner. staged: cpu_items'.
+
+    depths: whether the lines of the surfaces are wanted.
+    """
     n = U(BATCH)
     for k in range(count):
         cut = U(members[at + k]) * U(CUT)
+        x, y = staged[U(MEAN_X) * n + k], staged[U(MEAN_Y) * n + k]
         lx, ly = cuts[cut + U(C_X)], cuts[cut + U(C_Y)]
-        start = cuts[cut + U(C_AT)] - lx * staged[U(MEAN_X) * n + k]
-        lines[k] = start - ly * staged[U(MEAN_Y) * n + k]
+        lines[k] = cuts[cut + U(C_AT)] - lx * x - ly * y
         lines[n + k] = lx
         lines[U(2) * n + k] = ly
+        if depths is not None:
+            gx, gy = cuts[cut + U(C_RIGHT)], cuts[cut + U(C_DOWN)]
+            lines[U(3) * n + k] = -gx * x - gy * y
+            lines[U(4) * n + k] = gx
+            lines[U(5) * n + k] = gy
+            lines[U(6) * n + k] = cuts[cut + U(C_REACH)]
 
 
 @inner()
-def list_edges(lines, count, strip, spans, edges):
-    """The cut's value at the first pixel of every item of cpu_items.list_items, in its order."""
+def list_lines(lines, kind, count, strip, spans, values):
+    """A line's value at the first pixel of every item of cpu_items.list_items, in its order."""
     n, items = U(BATCH), U(0)
     half = np.float32(0.5)
     first_x = np.float32(strip * LANES) + half
     for k in range(count):
         row, end = spans[k], spans[n + k]
-        ly = lines[U(2) * n + k]
-        start = lines[k] + lines[n + k] * first_x + ly * (np.float32(row) + half)
+        down = lines[U(kind) + U(2) * n + k]
+        start = lines[U(kind) + k] + lines[U(kind) + n + k] * first_x
+        start = start + down * (np.float32(row) + half)
         for j in range(0, TILE_H, LANES):
-            first = v8.splat(start + ly * np.float32(j))
-            v8.store(edges, items + U(j), v8.fmuladd(v8.splat(ly), v8.lane_numbers(), first))
+            first = v8.splat(start + down * np.float32(j))
+            v8.store(values, items + U(j), v8.fmuladd(v8.splat(down), v8.lane_numbers(), first))
         items += U(end - row)
 
 
 @inner()
-def kept_share(lines, edges, splat, item):
-    lx = v8.splat(lines[U(BATCH) + splat])
-    value = v8.fmuladd(lx, v8.lane_numbers(), v8.splat(edges[item]))
+def line_at(lines, kind, values, splat, item):
+    """A line's values at the eight pixels of an item."""
+    slope = v8.splat(lines[U(kind) + U(BATCH) + splat])
+    return v8.fmuladd(slope, v8.lane_numbers(), v8.splat(values[item]))
+
+
+@inner()
+def surface_depth(lines, values, splat, item, depth):
+    reach = v8.splat(lines[U(REACHES) + splat])
+    farther = v8.minimum(line_at(lines, SURFACE, values, splat, item), reach)
+    farther = v8.maximum(farther, v8.negate(reach))
+    return v8.splat(depth) / (v8.splat(np.float32(1)) - farther)
+
+
+@inner()
+def kept_share(lines, values, splat, item):
+    value = line_at(lines, SHARE, values, splat, item)
     zero, one = v8.splat(np.float32(0)), v8.splat(np.float32(1))
     return v8.maximum(v8.minimum(value, one), zero)

@@ -13,7 +13,17 @@ import numpy as np
 from numba import prange
 
 from augment.render import cpu_simd as v8
-from augment.render.cpu_clip import C_AT, C_X, C_Y, CUT, cut_eight, height_of
+from augment.render.cpu_clip import (
+    C_AT,
+    C_DOWN,
+    C_REACH,
+    C_RIGHT,
+    C_X,
+    C_Y,
+    CUT,
+    cut_eight,
+    height_of,
+)
 from augment.render.cpu_color import COLOR_ROWS, prepare_colors, write_color
 from augment.render.cpu_geometry import from_eye, gather3, image_covariance, to_camera, to_image
 from augment.render.cpu_jit import inner, kernel
@@ -187,7 +197,7 @@ def project_slice(
                         sh, from_sh, used, views[part], modes[M_SMOG], rows, lane, records, record
                     )
                 if modes[M_CLIP]:
-                    for field in range(U(C_Y + 1)):
+                    for field in range(U(C_REACH + 1)):
                         cuts[slot * U(CUT) + field] = rows[(U(_CUTS) + field) * U(LANES) + lane]
                 keys[slot] = np.float32(records[record + U(DEPTH)]).view(np.uint32)
                 slot += U(1)
@@ -261,11 +271,16 @@ def _project_eight(means, quats, scales, opacities, view, picked, at, functions,
         v8.at_least(log_opacity, log_cut), v8.at_least(v8.splat(_HUGE), blurred_x + blurred_y)
     )
     if modes[M_CLIP]:
-        partly, offset, lx, ly = cut_eight(quats, scales, picked, at, d, x, y, inverse, view)
+        partly, offset, lx, ly, gx, gy, deep = cut_eight(
+            quats, scales, picked, at, d, x, y, inverse, view
+        )
         drawn = v8.both(drawn, partly)
         v8.store(rows, U((_CUTS + C_AT) * LANES), offset)
         v8.store(rows, U((_CUTS + C_X) * LANES), lx)
         v8.store(rows, U((_CUTS + C_Y) * LANES), ly)
+        v8.store(rows, U((_CUTS + C_RIGHT) * LANES), gx)
+        v8.store(rows, U((_CUTS + C_DOWN) * LANES), gy)
+        v8.store(rows, U((_CUTS + C_REACH) * LANES), deep)
     _write_box(mean_x, radius_x, v8.splat(view[V_SIZE]), drawn, U(_X_LO), U(_X_HI), rows)
     _write_box(mean_y, radius_y, v8.splat(view[V_SIZE + 1]), drawn, U(_Y_LO), U(_Y_HI), rows)
     _write(rows, U(MEAN_X), mean_x)

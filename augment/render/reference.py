@@ -159,7 +159,7 @@ def blend_tile(
         if near.colors is not None:
             rgb = rgb + _weighted_sums(weights, near.colors)
         if EXPECTED_DEPTH in buffers:
-            depth = depth + (weights * near.depths[:, None]).sum(0)
+            depth = depth + (weights * _surface_depths(near, pixels)).sum(0)
         if MEDIAN_DEPTH in buffers:
             median = median + _median_here(near.depths, weights, after, transmittance)
         if SPLAT_IDS in buffers:
@@ -203,12 +203,23 @@ def blend_weights(
     alphas = (splats.opacities[:, None] * torch.exp2(-LOG2_E * sigma)).clamp_max(settings.alpha_max)
     alphas = torch.where(alphas >= ALPHA_MIN, alphas, torch.zeros_like(alphas))
     if splats.cuts is not None:
-        at, slope_x, slope_y = splats.cuts.T[:, :, None]
+        at, slope_x, slope_y = splats.cuts.T[:3, :, None]
         alphas = alphas * (at + slope_x * dx + slope_y * dy).clamp(0, 1)
     after = transmittance * torch.cumprod(1 - alphas, 0)
     before = torch.cat([transmittance[None], after[:-1]])
     weights = torch.where(after > TRANSMITTANCE_STOP, alphas * before, torch.zeros_like(alphas))
     return weights, after
+
+
+def _surface_depths(splats: Splats, pixels: Float[Tensor, "2 P"]) -> Float[Tensor, "S P"]:
+    """z of every splat at every pixel: its centre's, or with a clip that of its surface."""
+    depths = splats.depths[:, None].expand(-1, pixels.shape[1])
+    if splats.cuts is None:
+        return depths
+    right, down, most = splats.cuts.T[3:, :, None]
+    dx, dy = pixels[0] - splats.means2d[:, :1], pixels[1] - splats.means2d[:, 1:]
+    growth = (right * dx + down * dy).clamp(-most, most)
+    return depths / (1 - growth)
 
 
 def _weighted_sums(

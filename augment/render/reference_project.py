@@ -17,7 +17,7 @@ from torch import Tensor
 
 from augment.cameras import Camera
 from augment.geometry import rotmat_from_quat, transform_points
-from augment.render.clip import FAR_PX, HeightClip
+from augment.render.clip import FAR_PX, LONGEST, SHARP_PX2, HeightClip
 from augment.render.constants import (
     ALPHA_MIN,
     COV2D_BLUR,
@@ -37,8 +37,9 @@ class Splats:
     ids: index counted through all parts. depths: z, metres. means2d: pixels. covs2d: xx, xy, yy,
     px^2, blurred. dets: their determinants. opacities: after antialiasing. colors: display-encoded
     and >= 0, in the smog where there is any; None where no colour was asked for. cuts: of splats
-    clipped at a height, value at means2d and slope in x and y: clamp(value, 0, 1) is the share of
-    alpha that is kept at a pixel; None without a clip.
+    clipped at a height, value at means2d and slope in x and y, per px: clamp(value, 0, 1) is the
+    share of alpha that is kept at a pixel; then the growth of the surface's depth in x and y, its
+    share per px, and the most that it may grow or shrink. None without a clip.
     """
 
     ids: Int64[Tensor, "M"]
@@ -48,7 +49,7 @@ class Splats:
     dets: Float[Tensor, "M"]
     opacities: Float[Tensor, "M"]
     colors: Float[Tensor, "M 3"] | None
-    cuts: Float[Tensor, "M 3"] | None = None
+    cuts: Float[Tensor, "M 6"] | None = None
 
     def __len__(self) -> int:
         return self.ids.shape[0]
@@ -134,7 +135,7 @@ def _project_part(
     if clip is None:
         return splats
     heights = clip.sign * _heights(gaussians, offsets, part, camera, clip)
-    cuts, partly = _cut(splats, heights, axes, points, camera, clip)
+    cuts, partly = _cut(heights, axes, points, camera, clip)
     return dataclasses.replace(splats, cuts=cuts).select(partly)
 
 
@@ -149,30 +150,32 @@ def _heights(
 
 
 def _cut(
-    splats: Splats,
     heights: Float[Tensor, "M"],
     axes: Float[Tensor, "M 3 3"],
     points: Float[Tensor, "M 3"],
     camera: Camera,
     clip: HeightClip,
-) -> tuple[Float[Tensor, "M 3"], Tensor]:
+) -> tuple[Float[Tensor, "M 6"], Tensor]:
     """Cuts, and which splats have a part on the kept side. heights: positive there."""
     up = (clip.sign * camera.camera_from_world[:3, 2]).to(axes.dtype)
     reach = MAX_EXTENT_SIGMAS * (up @ axes).norm(dim=-1)
-    xx, xy, yy = splats.covs2d.unbind(1)
     right, down = _image_axes(points, axes, camera)
+    xx, yy = right.square().sum(1) + SHARP_PX2, down.square().sum(1) + SHARP_PX2
+    xy = (right * down).sum(1)
     cx, cy = (right * axes[:, 2]).sum(1), (down * axes[:, 2]).sum(1)
-    gx = (cx - xy / yy * cy) / (xx - xy / yy * xy).clamp_min(COV2D_BLUR)
+    gx = (cx - xy / yy * cy) / (xx - xy / yy * xy).clamp_min(SHARP_PX2)
     gy = (cy - xy * gx) / yy
     z = points[:, 2]
     fall = clip.sign * (float(camera.centre[2]) - clip.z_m) / z**2
     slope = torch.stack([up[0] / camera.fx - fall * gx, up[1] / camera.fy - fall * gy], -1)
     length = slope.norm(dim=-1).clamp_min(1e-20)
     offset = (heights / z / length).clamp(-FAR_PX, FAR_PX)
+    deep = (MAX_EXTENT_SIGMAS * axes[:, 2].norm(dim=-1) / z).clamp_max(LONGEST)
     whole = heights >= reach
     offset = torch.where(whole, torch.full_like(offset, FAR_PX), offset) + clip.edge_px
     slope = torch.where(whole[:, None], torch.zeros_like(slope), slope / length[:, None])
-    return torch.cat([offset[:, None], slope], 1), heights >= -reach
+    cuts = torch.cat([offset[:, None], slope, torch.stack([gx / z, gy / z, deep], -1)], 1)
+    return cuts, heights >= -reach
 
 
 def _offsets_from_eye(

@@ -46,7 +46,9 @@ from augment.weather.water_plane import (
 from augment.weather.wave_field import wave_field
 from augment.weather.waves import WaveField
 
-VISIBLE = 1 / 512  # water that less of a pixel shows cannot change its 8 bits
+# No water is in view where no pixel shows more of it. Opaque surfaces let up to 4 % through: a splat
+# that would bring transmittance to 1e-4 is not blended, whatever is left before it.
+VISIBLE = 0.05
 COARSE = 0.25  # resolution of the mirrored view that fills what the screen does not show
 REACH_SIGMAS = 3.0  # slopes of the waves that the margins allow for
 MOST_MARGIN = 0.25  # of the image's longer side

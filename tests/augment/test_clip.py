@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from augment.render.buffers import ALPHA, BUFFERS, RGB
+from augment.render.buffers import ALPHA, BUFFERS, EXPECTED_DEPTH, RGB
 from augment.render.clip import HeightClip
 from augment.render.rasterize import rasterize
 from augment.render.threads import limit_threads
@@ -70,7 +70,7 @@ def test_kernels_match_the_definition(seed, z_m, keep):
         assert_images_close(getattr(actual, name), getattr(expected, name), p999=2e-3, max_flips=4)
         error = (getattr(actual, name) - getattr(expected, name)).abs()
         assert float(error.flatten().quantile(0.98)) < 2e-5
-    assert float((actual.expected_depth - expected.expected_depth).abs().median()) < 1e-5
+    assert float((actual.expected_depth - expected.expected_depth).abs().median()) < 2e-5
 
 
 @pytest.mark.parametrize("pose", [None, random_pose(3)])
@@ -88,7 +88,7 @@ def test_a_clip_that_cuts_nothing_changes_no_bit(keep):
     gaussians, camera = random_gaussians(300), camera_ahead()
     z_m = -50.0 if keep == "above" else 50.0
     clipped, plain = render(gaussians, camera, HeightClip(z_m, keep)), render(gaussians, camera)
-    for name in ALL:
+    for name in ALL - {EXPECTED_DEPTH}:  # which clips define more finely
         assert torch.equal(getattr(clipped, name), getattr(plain, name)), name
 
 
@@ -140,7 +140,7 @@ def test_both_sides_together_are_the_whole():
     both = above.rgb + (1 - above.alpha)[..., None] * below.rgb
     error = (both - plain.rgb).abs().amax(-1)
     # At the edge of the cut a splat's two sides are blended as two splats, which covers a little
-    # more than it does as one: a few pixels of the line show it, most where the ball is translucent.
+    # more than it does as one: a few pixels show it, most where the ball is translucent.
     assert float(error.median()) < 1e-3 and float(error.max()) < 0.15
     assert float((error > 0.02).float().mean()) < 0.03
 
@@ -186,3 +186,19 @@ def test_expected_depth_of_what_is_left():
     image = render(stack(wall(5.0), floor(-1.5)), camera, HeightClip(-0.5, "above"))
     covered = image.alpha > 0.9
     assert float((image.expected_depth[covered] - 5.0).abs().max()) < 0.05
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_expected_depth_follows_the_surface_of_large_splats(backend):
+    """A road of discs 0.4 m wide, 1.5 m below the eye: z = 1.5 f / rows below the horizon."""
+    camera = camera_ahead(40, 60, 60.0)
+    image = render(floor(-1.5), camera, HeightClip(-1.4, "below"), backend)
+    rows = torch.arange(60)[:, None] + 0.5 - camera.cy
+    exact = camera.fy * 1.5 / rows
+    near = ((rows > 0) & (exact > 2) & (exact < 10)).expand(60, 40) & (image.alpha > 0.95)
+    error = (image.expected_depth / exact - 1).abs()[near]
+    # Discs are flat to 2 mm, so what is left is the linearised projection; their centres, as the
+    # plain buffer takes them, are several times as far off.
+    assert int(near.sum()) > 400 and float(error.quantile(0.9)) < 0.02
+    plain = render(floor(-1.5), camera, None, backend)
+    assert float((plain.expected_depth / exact - 1).abs()[near].quantile(0.1)) > 0.1

@@ -1,0 +1,430 @@
+"""Flooded views of a small scene: what the picture must show, and every extreme of a flood."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from augment.apply import render_buffers, render_view
+from augment.cameras import Camera, Frame
+from augment.geometry import rigid
+from augment.ground_heights import Ground
+from augment.plan import make_plan
+from augment.render.composite import quantise
+from augment.scene import Actor, Gaussians, Scene, Track
+from augment.semantics import SemanticClass
+from augment.sky import ConstantSky, CubemapSky, Sky
+from augment.weather.flood_view import Painter, render_flooded
+from recipes.flood import Flood, Wave, Waves
+from recipes.schema import Output, Recipe, Smog, Weather
+from tests.scenes import sh_of
+
+ROAD_Z = -1.5
+ROAD, WALL, CAR, SKY = (0.45, 0.45, 0.47), (0.8, 0.2, 0.1), (0.1, 0.8, 0.1), (0.3, 0.5, 0.9)
+STILL = Waves(preset="still")
+
+
+def sheet(points, flat_axis: int, rgb, semantic: SemanticClass, size=0.25) -> Gaussians:
+    """Opaque discs that are thin along one axis of the world. points [N, 3]."""
+    points = np.asarray(points, np.float32)
+    scales = np.full((len(points), 3), size, np.float32)
+    scales[:, flat_axis] = 0.002
+    return Gaussians(
+        means=torch.from_numpy(points),
+        quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(len(points), 1),
+        scales=torch.from_numpy(scales),
+        opacities=torch.full((len(points),), 0.999),
+        sh=sh_of(np.tile(np.asarray(rgb), (len(points), 1))),
+        semantic=torch.full((len(points),), int(semantic), dtype=torch.int16),
+    )
+
+
+def grid(*ranges) -> np.ndarray:
+    axes = [np.arange(a, b, 0.25) for a, b in ranges]
+    return np.stack([m.ravel() for m in np.meshgrid(*axes, indexing="ij")], -1)
+
+
+def camera(width=80, height=60, *, position=(0.0, 0.0, 0.0), pitch=0.0, focal=60.0) -> Camera:
+    """Looks along +x, down by pitch (radians)."""
+    c, s = np.cos(pitch), np.sin(pitch)
+    rows = torch.tensor([[0.0, -1, 0], [-s, 0, -c], [c, 0, -s]], dtype=torch.float64)
+    centre = torch.tensor(position, dtype=torch.float64)
+    return Camera(
+        "front", width, height, focal, focal, width / 2, height / 2, rigid(rows, -rows @ centre), 0
+    )
+
+
+def make_scene(*, with_road=True, sky: Sky | None = None) -> Scene:
+    """A road at z = -1.5 m, a red wall across it 12 m ahead, a green car (an actor) at 6 m."""
+    flat = grid((0.0, 14.0), (-9.0, 9.0))
+    road = sheet(np.c_[flat, np.full(len(flat), ROAD_Z)], 2, ROAD, SemanticClass.ROAD)
+    upright = grid((-9.0, 9.0), (-4.0 if with_road else 0.5, 5.0))
+    wall = sheet(np.c_[np.full(len(upright), 12.0), upright], 0, WALL, SemanticClass.BUILDING)
+    names = ("means", "quats", "scales", "opacities", "sh", "semantic")
+    both = [road, wall] if with_road else [wall]
+    background = Gaussians(**{n: torch.cat([getattr(g, n) for g in both]) for n in names})
+    body = grid((-0.7, 0.8), (-0.7, 0.8))
+    rear = np.c_[np.full(len(body), 0.0), body]
+    pose = torch.eye(4, dtype=torch.float64)[None].clone()
+    pose[0, :3, 3] = torch.tensor([6.0, -1.5, ROAD_Z + 0.8], dtype=torch.float64)
+    car = Actor(
+        "car",
+        "Car",
+        sheet(rear, 0, CAR, SemanticClass.VEHICLE, 0.12),
+        Track(torch.tensor([0]), pose),
+        (1.6, 1.6, 1.6),
+    )
+    frame = Frame(0, 0, torch.eye(4, dtype=torch.float64), {"front": camera()})
+    return Scene(
+        "toy",
+        "test:toy",
+        background,
+        (car,) if with_road else (),
+        ConstantSky(torch.tensor(SKY)) if sky is None else sky,
+        (frame,),
+        ground_z_m=ROAD_Z,
+        ground=Ground(ROAD_Z, ROAD_Z, "stated", None, 0, None),
+    )
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return make_scene()
+
+
+def recipe_of(flood: Flood | None, smog: Smog | None = None, **output) -> Recipe:
+    return Recipe(weather=Weather(flood=flood, smog=smog), output=Output(**output))
+
+
+def view_of(scene, flood, view=None, *, smog=None, backend="auto", **output):
+    output = {"depth": "expected", **output}
+    recipe = recipe_of(flood, smog, **output)
+    return render_view(scene, camera() if view is None else view, recipe, backend=backend)
+
+
+def flood(level_m=0.4, **fields) -> Flood:
+    fields = {"waves": STILL, **fields}
+    return Flood(level_m=level_m, **fields)
+
+
+# ---- what the picture shows --------------------------------------------------------------------
+
+
+def row_at(z: float, distance: float, view: Camera) -> float:
+    """The image row that looks at height z at a distance ahead (level cameras)."""
+    return view.cy - view.fy * z / distance
+
+
+@pytest.mark.parametrize("reflection", ["sky", "screen_space", "mirrored"])
+def test_water_stands_at_its_level_and_hides_nothing_in_front_of_it(scene, reflection):
+    view = camera()
+    dry, wet = view_of(scene, None), view_of(scene, flood(reflection=reflection))
+    edge = row_at(ROAD_Z + 0.4, 12.0, view)  # where the water meets the wall
+    left = slice(0, 20)  # no car there
+    assert not wet.water[: int(edge) - 1, left].any()
+    assert (wet.water[int(edge) + 2 :, left] == 255).all()
+    # Through the wall, opaque to 0.1 %, shines what lies below the water's level or does not.
+    above = (slice(None, int(edge) - 2), left)
+    assert np.abs(wet.rgb[above].astype(int) - dry.rgb[above]).max() <= 1
+    # The car, an actor 6 m ahead, is dry down to the water and gone below it.
+    line = row_at(ROAD_Z + 0.4, 6.0, view)
+    column = int(view.cx + view.fx * 1.5 / 6.0)
+    assert np.abs(wet.rgb[int(line) - 3, column].astype(int) - np.array([26, 204, 26])).max() <= 12
+    assert wet.water[int(line) - 2, column] == 0 and wet.water[int(line) + 2, column] == 255
+
+
+def test_the_mirrored_view_shows_wall_car_and_sky_upside_down(scene):
+    """At the height h above the water, the reflection of a point at height z over it 12 m away
+    stands in the row that looks at -z there (mirror image), above the horizon's own row.
+    """
+    view = camera(position=(0.0, 0.0, 0.0))
+    wet = view_of(scene, flood(turbidity_ntu=1e6, color=(0.0, 0.0, 0.0)), view)
+    level = ROAD_Z + 0.4
+    column = 8
+    row = int(row_at(2 * level - 0.0, 12.0, view))  # the mirror image of the wall at z = 0
+    red = wet.rgb[row, column].astype(float)
+    assert red[0] > 2.5 * red[1] and red[0] > 2.5 * red[2]
+    column = int(view.cx + view.fx * 1.5 / 6.0)
+    row = int(row_at(2 * level - (ROAD_Z + 1.0), 6.0, view))  # of the car 1 m above the road
+    green = wet.rgb[row, column].astype(float)
+    assert green[1] > 2.5 * green[0]
+
+
+def test_the_sky_tier_reflects_the_sky_alone(scene):
+    wet = view_of(scene, flood(turbidity_ntu=1e6, color=(0.0, 0.0, 0.0), reflection="sky"))
+    # Below the wall's waterline, beside the car.
+    water = wet.rgb[38:, :20].reshape(-1, 3).astype(float)
+    water = water[water[:, 2] > 20]  # where enough is reflected to tell a colour
+    assert len(water) > 150
+    assert np.abs(water / water[:, 2:] - np.array(SKY) / SKY[2]).max() < 0.06  # 8-bit rounding
+
+
+def test_muddy_water_hides_the_bed_and_clear_water_shows_it(scene):
+    down = camera(pitch=0.5)
+    index_1 = {"refraction_index": 1.0}
+    clear = view_of(scene, flood(turbidity_ntu=None, absorption_per_m=(0, 0, 0), **index_1), down)
+    dry = view_of(scene, None, down)
+    bottom = (slice(45, 60), slice(5, 75))
+    # Nothing reflects, bends or absorbs: what remains is the scene, cut in two and put together.
+    assert np.abs(clear.rgb[bottom].astype(int) - dry.rgb[bottom]).max() <= 2
+    muddy = view_of(scene, flood(turbidity_ntu=1e6, color=(0.2, 0.3, 0.1), **index_1), down)
+    assert np.abs(muddy.rgb[bottom].astype(int) - np.array([51, 77, 26])).max() <= 1
+
+
+def test_one_colour_everywhere_stays_that_colour():
+    """Whatever is reflected, refracted, absorbed or fogged: light is neither lost nor made."""
+    grey = make_scene(sky=ConstantSky(torch.full((3,), 0.5)))
+    sh = torch.zeros_like(grey.background.sh)
+    actor = grey.actors[0]
+    plain = dataclasses.replace(
+        grey,
+        background=dataclasses.replace(grey.background, sh=sh),
+        actors=(
+            dataclasses.replace(
+                actor,
+                gaussians=dataclasses.replace(
+                    actor.gaussians, sh=torch.zeros_like(actor.gaussians.sh)
+                ),
+            ),
+        ),
+    )
+    smog = Smog(extinction_per_m=0.05, color=(0.5, 0.5, 0.5))
+    for reflection in ("sky", "screen_space", "mirrored"):
+        for waves in (STILL, Waves(preset="wind")):
+            water = flood(color=(0.5, 0.5, 0.5), reflection=reflection, waves=waves)
+            view = view_of(plain, water, smog=smog)
+            assert view.water.any()
+            assert np.abs(view.rgb.astype(int) - 128).max() <= 1, (reflection, waves.preset)
+
+
+@pytest.mark.parametrize("reflection", ["sky", "screen_space", "mirrored"])
+@pytest.mark.parametrize("waves", [STILL, Waves(preset="breeze")])
+def test_kernels_match_the_definition(scene, reflection, waves):
+    water = flood(reflection=reflection, waves=waves, turbidity_ntu=5)
+    smog = Smog(extinction_per_m=0.02, scale_height_m=20)
+    plan = make_plan(recipe_of(water, smog, depth="expected"), scene)
+    fast, slow = (
+        render_buffers(scene, camera(), plan, backend=name) for name in ("cpu", "reference")
+    )
+    error = (fast.rgb - slow.rgb).abs().amax(-1)
+    # A pixel at a silhouette may fetch its neighbour's distance, and the screen's march is defined
+    # by small steps where the kernel takes large ones; away from silhouettes both agree.
+    assert float(error.median()) < 1e-5
+    assert float((error > 2 / 255).float().mean()) < (
+        0.05 if reflection == "screen_space" else 0.01
+    )
+    assert bool((fast.water == slow.water).float().mean() > 0.999)
+
+
+def test_deferred_smog_reaches_every_layer(scene):
+    """In dense deferred smog the water far away is smog, as with smog per Gaussian."""
+    pictures = [
+        view_of(scene, flood(), smog=Smog(extinction_per_m=0.3, model=model)).rgb.astype(int)
+        for model in ("deferred", "per_gaussian")
+    ]
+    # The models differ where a pixel shows several distances (the bed's far end).
+    assert np.quantile(np.abs(pictures[0] - pictures[1]), 0.95) <= 4
+
+
+# ---- no water in view --------------------------------------------------------------------------
+
+
+def test_no_water_in_view_is_the_clean_frame_to_the_bit(scene):
+    up = camera(pitch=-1.0)
+    for water, view in ((flood(), up), (flood(-3.5), camera())):
+        dry, wet = view_of(scene, None, view), view_of(scene, water, view)
+        assert np.array_equal(dry.rgb, wet.rgb) and np.array_equal(dry.depth_m, wet.depth_m)
+        assert not wet.water.any()
+
+
+def test_nothing_is_rasterised_twice_without_water_in_view(scene, monkeypatch):
+    import augment.apply as apply
+    import augment.weather.flood_view as flood_view
+
+    calls = []
+    for module in (apply, flood_view):
+        original = module.rasterize
+        monkeypatch.setattr(
+            module, "rasterize", lambda *a, _f=original, **k: calls.append(1) or _f(*a, **k)
+        )
+    view_of(scene, flood(), camera(pitch=-1.0))
+    view_of(scene, flood(-3.5))
+    assert len(calls) == 2
+    calls.clear()
+    view_of(scene, flood())
+    assert len(calls) == 3  # front, bed, mirror
+    calls.clear()
+    view_of(scene, flood(reflection="sky"))
+    assert len(calls) == 2
+
+
+def test_water_behind_a_covering_front_is_not_shaded(scene, monkeypatch):
+    """The wall fills the picture: the plane is in view, the water is not."""
+    import augment.weather.flood_view as flood_view
+
+    monkeypatch.setattr(flood_view, "shade_water", lambda *a, **k: pytest.fail("shaded"))
+    near = camera(position=(9.0, 0.0, 1.0), focal=400.0)
+    dry, wet = view_of(scene, None, near), view_of(scene, flood(), near)
+    assert np.abs(dry.rgb.astype(int) - wet.rgb).max() <= 1 and not wet.water.any()
+
+
+# ---- what is written beside the picture --------------------------------------------------------
+
+
+def test_depth_and_classes_of_the_scene_or_of_the_first_surface(scene):
+    view = camera()
+    images = {"semantic": True, "instance": True}
+    dry = view_of(scene, None, view, **images)
+    under = view_of(scene, flood(), view, **images)
+    first = view_of(scene, flood(), view, surface="first", **images)
+    mask = under.water == 255
+    assert mask.sum() > 1000 and np.array_equal(under.water, first.water)
+    road = view.fy * 1.5 / (np.arange(60) + 0.5 - view.cy)  # 1.5 m below the camera
+    assert np.abs(under.depth_m[40:, :20] / road[40:, None] - 1).max() < 0.03
+    assert (under.semantic == dry.semantic).mean() > 0.99
+    assert (under.instance == dry.instance).mean() > 0.99
+    assert (first.semantic[mask] == SemanticClass.WATER).all() and not first.instance[mask].any()
+    rows = np.nonzero(mask)[0]
+    expected = view.fy * 1.1 / (rows + 0.5 - view.cy)  # the plane lies 1.1 m below the camera
+    assert np.abs(first.depth_m[mask] / expected - 1).max() < 1e-5
+    assert np.array_equal(first.depth_m[~mask], under.depth_m[~mask])
+
+
+def test_masks_of_two_cameras_agree(scene):
+    """Water points of one camera are water in another too, unless the car hides them."""
+    one, two = camera(), camera(position=(0.3, 0.8, 0.4))
+    first = view_of(scene, flood(), one, surface="first")
+    second = view_of(scene, flood(), two, surface="first")
+    points = one.centre + torch.from_numpy(first.depth_m).double()[..., None] * one.ray_directions(
+        torch.float64
+    )
+    points = points[torch.from_numpy(first.water == 255)]
+    local = (points - two.centre) @ two.camera_from_world[:3, :3].T
+    column = (two.fx * local[:, 0] / local[:, 2] + two.cx).floor().long()
+    row = (two.fy * local[:, 1] / local[:, 2] + two.cy).floor().long()
+    seen = (column >= 0) & (column < 80) & (row >= 0) & (row < 60) & (local[:, 2] > 0)
+    seen &= (points[:, 1] + 1.5).abs() > 1.5  # clear of the car
+    water = second.water[row[seen], column[seen]] == 255
+    assert int(seen.sum()) > 500 and water.mean() > 0.98
+
+
+# ---- extremes ----------------------------------------------------------------------------------
+
+DOWN, UP = camera(pitch=np.pi / 2), camera(pitch=-np.pi / 2)
+SURFACE = ROAD_Z + 0.4
+EXTREMES = {
+    "level below everything": (flood(-50.0), camera()),
+    "level above the camera": (flood(3.0), camera()),
+    "level far above the camera": (flood(9999.0), camera()),
+    "level at the camera": (flood(0.4), camera(position=(0.0, 0.0, SURFACE))),
+    "a hair above the water": (flood(0.4), camera(position=(0.0, 0.0, SURFACE + 1e-9))),
+    "a hair below the water": (flood(0.4), camera(position=(0.0, 0.0, SURFACE - 1e-9))),
+    "straight down": (flood(), DOWN),
+    "straight up": (flood(), UP),
+    "straight up from below": (flood(3.0), UP),
+    "along the surface": (flood(0.4), camera(position=(0.0, 0.0, SURFACE + 1e-3))),
+    "amplitude 0": (flood(waves=Waves(height=0.0)), camera()),
+    "one wave": (flood(waves=Waves(preset="wind", count=1)), camera()),
+    "64 waves": (flood(waves=Waves(preset="wind", count=64)), camera()),
+    "a wavelength of 1 mm": (
+        flood(waves=Waves(components=(Wave(amplitude_m=1e-5, wavelength_m=1e-3),))),
+        camera(),
+    ),
+    "a wavelength of 1 km": (
+        flood(waves=Waves(components=(Wave(amplitude_m=5.0, wavelength_m=1e3),))),
+        camera(),
+    ),
+    "the steepest wave": (
+        flood(waves=Waves(components=(Wave(amplitude_m=0.15, wavelength_m=1.0, steepness=1.0),))),
+        camera(),
+    ),
+    "t = 1e9 s": (
+        flood(waves=Waves(preset="wind")),
+        dataclasses.replace(camera(), timestamp_ns=10**18),
+    ),
+    "turbidity 0": (flood(turbidity_ntu=0), camera()),
+    "turbidity without end": (flood(turbidity_ntu=1e6), camera()),
+    "refraction index 1": (flood(refraction_index=1.0), camera()),
+    "refraction index 3": (flood(refraction_index=3.0), camera()),
+    "1x1 pixel": (flood(), camera(1, 1, pitch=0.5)),
+    "1x1 pixel of sky": (flood(), camera(1, 1, pitch=-0.5)),
+    "odd sizes": (flood(waves=Waves(preset="breeze")), camera(37, 23)),
+}
+
+
+@pytest.mark.parametrize("reflection", ["sky", "screen_space", "mirrored"])
+@pytest.mark.parametrize("name", EXTREMES)
+def test_extremes_give_finite_pictures(scene, name, reflection):
+    water, view = EXTREMES[name]
+    water = water.model_copy(update={"reflection": reflection})
+    scene = dataclasses.replace(
+        scene,
+        actors=tuple(
+            dataclasses.replace(a, track=dataclasses.replace(a.track, hold_ns=2 * 10**18))
+            for a in scene.actors
+        ),
+    )
+    plan = make_plan(recipe_of(water, depth="expected"), scene)
+    got = render_buffers(scene, view, plan)
+    assert bool(torch.isfinite(got.rgb).all())
+    assert float(got.rgb.min()) > -0.01 and float(got.rgb.max()) < 1.05
+
+
+@pytest.mark.parametrize("level_m", [0.4, 5.0])
+def test_infinite_extinction_shows_water_alone(scene, level_m):
+    """No recipe can say it, a medium can: the bed is gone, and 0 times infinity is no NaN."""
+    plan = make_plan(recipe_of(flood(level_m, refraction_index=1.0)), scene)
+    medium = dataclasses.replace(plan.flood, extinction_per_m=(np.inf, np.inf, np.inf))
+    view = camera()
+    painter = Painter(scene.parts_for(view), scene.sky, plan.settings, None, None, "auto")
+    got = render_flooded(painter, view, medium, plan.buffers)
+    assert got is not None and bool(torch.isfinite(got.rgb).all())
+    rgb = quantise(got.rgb)[got.water.numpy()]
+    share = (np.abs(rgb - 255 * np.array(medium.rgb)).max(-1) < 1.5).mean()
+    assert share > 0.9  # all but the waterline's pixels
+
+
+def test_snells_window(scene):
+    """Straight up from below: the sky through a cone of 48.6 degrees, and water outside it."""
+    view = camera(101, 101, position=(-6.0, 0.0, ROAD_Z + 0.2), pitch=-np.pi / 2, focal=30.0)
+    clear = flood(1.0, absorption_per_m=(0.0, 0.0, 0.0), color=(0.0, 0.0, 0.0))
+    picture = view_of(scene, clear, view).rgb.astype(float)
+    radius = 30.0 * np.tan(np.arcsin(1 / 1.333))
+    y, x = np.mgrid[0:101, 0:101] + 0.5 - 50.5
+    r = np.hypot(x, y)
+    assert np.abs(picture[r < 5] / 255 - np.array(SKY)).max() < 0.05  # 2 % is reflected there
+    assert picture[r > radius + 1].max() < 3
+    assert picture[r < radius - 3][:, 2].min() > 60
+
+
+def test_a_scene_without_ground_shows_deep_water():
+    bare = make_scene(with_road=False)
+    water = flood(2.5, color=(0.2, 0.3, 0.1), refraction_index=1.0)  # reaches the wall's lower end
+    high = camera(position=(0.0, 0.0, 3.0))
+    view = view_of(bare, water, high)
+    # Before the wall nothing is under the surface.
+    assert np.abs(view.rgb[58, 40].astype(int) - np.array([51, 77, 26])).max() <= 1
+
+
+def test_a_scene_without_a_sky(scene):
+    black = dataclasses.replace(scene, sky=ConstantSky(torch.zeros(3)))
+    view = view_of(black, flood(reflection="sky", color=(0.0, 0.0, 0.0), turbidity_ntu=1e6))
+    assert view.rgb[38:, :20].max() <= 2  # water from side to side, below the wall's waterline
+
+
+def test_cube_maps_and_constant_skies_reflect_alike(scene):
+    faces = torch.tensor(SKY).expand(6, 4, 4, 3).contiguous()
+    mapped = dataclasses.replace(scene, sky=CubemapSky(faces))
+    views = [view_of(s, flood(waves=Waves())).rgb.astype(int) for s in (scene, mapped)]
+    assert np.abs(views[0] - views[1]).max() <= 1
+
+
+def test_time_moves_the_waves_and_nothing_else_does(scene):
+    view = camera()
+    water = flood(waves=Waves(preset="breeze"), reflection="sky")
+    later = dataclasses.replace(view, timestamp_ns=50_000_000)
+    first, again, moved = (view_of(scene, water, v).rgb for v in (view, view, later))
+    assert np.array_equal(first, again) and not np.array_equal(first, moved)
