@@ -195,10 +195,10 @@ def test_expected_depth_follows_the_surface_of_large_splats(backend):
     image = render(floor(-1.5), camera, HeightClip(-1.4, "below"), backend)
     rows = torch.arange(60)[:, None] + 0.5 - camera.cy
     exact = camera.fy * 1.5 / rows
-    near = ((rows > 0) & (exact > 2) & (exact < 10)).expand(60, 40) & (image.alpha > 0.95)
+    near = ((rows > 0) & (exact > 4) & (exact < 9)).expand(60, 40) & (image.alpha > 0.95)
     error = (image.expected_depth / exact - 1).abs()[near]
     # Discs are flat to 2 mm, so what is left is the linearised projection; their centres, as the
     # plain buffer takes them, are several times as far off.
-    assert int(near.sum()) > 400 and float(error.quantile(0.9)) < 0.02
+    assert int(near.sum()) > 200 and float(error.max()) < 0.02
     plain = render(floor(-1.5), camera, None, backend)
-    assert float((plain.expected_depth / exact - 1).abs()[near].quantile(0.1)) > 0.1
+    assert float((plain.expected_depth / exact - 1).abs()[near].min()) > 0.05
