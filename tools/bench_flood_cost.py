@@ -54,8 +54,8 @@ class CostCase:
 
 
 def cost_cases(camera: Camera) -> list[CostCase]:
-    """Every tier still and with waves, pictures alone; with Schlick's formula; with depth and labels
-    as by default; and views that no water is in.
+    """Every tier still and with waves, as pictures only; Schlick's formula; depth and labels as by
+    default; and views that no water is in.
     """
     none, default = PICTURE_ONLY, Output()
     cases = [

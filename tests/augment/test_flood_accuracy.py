@@ -56,11 +56,11 @@ def view_of(scene, frame, name):
 def test_mirrored_tier_shows_mirrored_splats(street, frame, name):
     error = analytic_error(street, view_of(street, frame, name))
     assert error["water_share"] > 0.2  # enough is compared
-    # 60 dB is a quarter of a grey level: both are the same splats by other arithmetic. Measured: 68
-    # to 94 dB at 960x540, where what is off are single pixels at the foot of walls.
-    assert error["psnr_db"] >= 60
-    # The edges are cut half a pixel earlier or later in the two pictures.
-    assert error["psnr_with_edges_db"] >= 40
+    # The same splats by other arithmetic. Measured: 83 to 98 dB; what is off are single pixels at
+    # the foot of walls, by up to two grey levels. 70 dB leaves room for another few such pixels.
+    assert error["psnr_db"] >= 70
+    # At the water's edges the pictures are cut a pixel apart: measured 59 to 69 dB.
+    assert error["psnr_with_edges_db"] >= 50
     # And above the water both show the same layer, so no error hides in the comparison itself.
     assert error["outside_psnr_db"] >= 60
 
@@ -77,14 +77,13 @@ def test_the_comparison_would_see_another_level_or_formula(street):
 @pytest.mark.parametrize(("frame", "name"), VIEWS)
 def test_screen_space_is_close_to_mirrored(street, frame, name, waves):
     error = tier_error(street, view_of(street, frame, name), "screen_space", waves)
-    # What was asked of flat water. Flat water measures 36 to 42 dB at 960x540; waves the same,
-    # since only the way along the ray is that of the flat surface.
-    assert error["psnr_db"] >= 25
+    # Measured: 34 to 40 dB still, 37 to 41 dB with waves, whose rays are found along the flat
+    # surface's. At 25 dB reflections of whole objects would be missing.
+    assert error["psnr_db"] >= 30
     assert error["black_share"] == 0  # a miss falls back on the coarse mirrored view
-    # A smeared or missing object would be a block whose every pixel is off by tens of grey levels:
-    # the sky tier, which lacks all objects, has such blocks at 60 to 90. At 240x135 a block is as
-    # wide as a car, and its silhouettes alone come to about 10.
-    assert error["worst_block"] < 25
+    # A smeared or missing object would be a block whose every pixel is off by tens of grey levels,
+    # as under the sky tier. Measured: 2.5 to 3.7, all of it at silhouettes.
+    assert error["worst_block"] < 8
 
 
 def test_sky_alone_is_not_enough(street):
