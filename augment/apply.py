@@ -18,6 +18,7 @@ from augment.scene import PosedGaussians, Scene
 from augment.semantics import SemanticClass
 from augment.weather.flood_view import Painter, render_flooded
 from augment.weather.smog import fog_raster
+from augment.weather.water_plane import plane_depth
 from recipes.schema import Recipe
 
 SURFACE_ALPHA = 0.5  # a pixel less covered than this shows more sky than surface: it has no depth
@@ -27,10 +28,10 @@ SURFACE_ALPHA = 0.5  # a pixel less covered than this shows more sky than surfac
 class WeatheredBuffers:
     """One finished view in floats. rgb [H, W, 3]: display-encoded, not clamped, sky included.
 
-    raster: the buffers of the scene's surfaces; under water too, then without colours.
-    depth_m [H, W]: z along the optical axis of the scene's surface, 0 where there is none; None
-    unless planned. water [H, W]: where a ray meets water first; None where no water is in view.
-    water_depth_m [H, W]: z of its surface there, else 0.
+    raster: the buffers of the scene's surfaces; with water in view, of those under it too, without
+    colours. depth_m [H, W]: z along the optical axis of the scene's surface, 0 where there is none;
+    None unless planned. water [H, W]: where a ray meets water first; None where no water is in
+    view.
     """
 
     camera: Camera
@@ -39,7 +40,6 @@ class WeatheredBuffers:
     depth_m: Float[Tensor, "H W"] | None
     parts: tuple[PosedGaussians, ...]
     water: Bool[Tensor, "H W"] | None = None
-    water_depth_m: Float[Tensor, "H W"] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,8 +92,11 @@ def render_view(
             instance[first.numpy()] = 0
     if plan.depth_buffer is not None and buffers.depth_m is not None:
         depth = buffers.depth_m
-        if first is not None and buffers.water_depth_m is not None:
-            depth = torch.where(first, buffers.water_depth_m, depth)
+        if first is not None:
+            assert plan.flood is not None
+            surface = plane_depth(buffers.camera, plan.flood.level_z_m).to(depth.dtype)
+            in_air = float(buffers.camera.centre[2]) > plan.flood.level_z_m
+            depth = torch.where(first, surface if in_air else torch.zeros_like(depth), depth)
     return WeatheredView(
         camera=buffers.camera,
         rgb=quantise(buffers.rgb),
@@ -135,7 +138,6 @@ def render_buffers(
         depth,
         parts,
         water=None if flooded is None else flooded.water,
-        water_depth_m=None if flooded is None else flooded.water_depth_m,
     )
 
 

@@ -35,10 +35,15 @@ LONGEST = 2 / 3  # of its depth, that a splat may reach: z(p) is at most 3 z
 
 @dataclass(frozen=True)
 class HeightClip:
-    """The side of the plane z = z_m (world, metres) that is kept."""
+    """The side of the plane z = z_m (world, metres) that is kept.
+
+    reach_m: splats that lie farther from the plane than this with all they are may be left out,
+    where whoever asks could not see them.
+    """
 
     z_m: float
     keep: Literal["above", "below"]
+    reach_m: float = math.inf
 
     def __post_init__(self) -> None:
         if self.keep not in EDGE_PX or not math.isfinite(self.z_m):
@@ -46,6 +51,8 @@ class HeightClip:
                 f"a clip keeps 'above' or 'below' a finite height; "
                 f"got {self.keep!r}, z_m = {self.z_m}"
             )
+        if not self.reach_m >= 0:
+            raise ValueError(f"a clip's reach_m must be >= 0 metres; got {self.reach_m}")
 
     @property
     def sign(self) -> float:

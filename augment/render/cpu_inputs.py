@@ -121,13 +121,14 @@ def part_views(
             views[:, layout.V_EYE_HEIGHT] = above / smog.scale_height_m
             views[:, layout.V_UP :][:, :3] = poses[:, 2, :3] / smog.scale_height_m
     views[:, layout.V_EXTENT] = MAX_EXTENT_SIGMAS
-    views[:, layout.V_CLIP_EYE] = _NO_CLIP
+    views[:, layout.V_CLIP_EYE] = views[:, layout.V_CLIP_REACH] = _NO_CLIP
     if clip is not None:
         views[:, layout.V_CLIP_EYE] = clip.sign * (float(camera.centre[2]) - clip.z_m)
         views[:, layout.V_CLIP_PART :][:, :3] = clip.sign * poses[:, 2, :3]
         upwards = camera.camera_from_world.numpy()[:3, 2]
         views[:, layout.V_CLIP_CAMERA :][:, :3] = clip.sign * upwards
         views[:, layout.V_CLIP_EDGE] = clip.edge_px
+        views[:, layout.V_CLIP_REACH] = min(clip.reach_m, _NO_CLIP)
     return views.astype(np.float32)
 
 

@@ -43,7 +43,8 @@ V_EYE_HEIGHT, V_UP = 35, 36  # camera and part axes upwards, in scale heights: 1
 V_CLIP_EYE = 39  # height of the camera on the kept side of the clip's plane, metres
 V_CLIP_PART, V_CLIP_CAMERA = 40, 43  # towards that side, in the part's axes and the camera's
 V_CLIP_EDGE, V_EXTENT = 46, 47  # pixels; sigmas that a splat reaches at most
-VIEW = 48
+V_CLIP_REACH = 48  # metres from the clip's plane beyond which nothing need be drawn
+VIEW = 56
 
 # How to project: int64 each.
 M_COLOR, M_FUNCTIONS, M_ANTIALIASED, M_SMOG = 0, 1, 2, 3  # M_FUNCTIONS: most SH functions

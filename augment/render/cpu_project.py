@@ -53,6 +53,7 @@ from augment.render.cpu_layout import (
     TILE_W,
     V_ALPHA_MIN,
     V_BLUR,
+    V_CLIP_REACH,
     V_EXTENT,
     V_FOCAL,
     V_GAIN,
@@ -130,8 +131,9 @@ def _rank_eight(means, scales, opacities, view, picked, depths, at, areas):
     seen = v8.both(seen, v8.at_least(v8.splat(view[V_SIZE]) - x + far_x, zero))
     seen = v8.both(seen, v8.at_least(y + far_y, zero))
     seen = v8.both(seen, v8.at_least(v8.splat(view[V_SIZE + 1]) - y + far_y, zero))
-    kept = v8.fmuladd(v8.splat(view[V_EXTENT]), longest, height_of(d, view))
-    seen = v8.both(seen, v8.at_least(kept, zero))
+    height, size = height_of(d, view), v8.splat(view[V_EXTENT]) * longest
+    seen = v8.both(seen, v8.at_least(height + size, zero))
+    seen = v8.both(seen, v8.at_least(v8.splat(view[V_CLIP_REACH]), height - size))
     v8.store(depths, at, v8.select(seen, z, zero))
     # Mean over all directions of the ellipse's area, 2 pi sigma^2; it only cuts z into slices.
     squares = s0 * s1 + s1 * s2 + s0 * s2

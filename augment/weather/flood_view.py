@@ -16,6 +16,7 @@ and nothing in front of the water can leak into refraction or reflection.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -24,14 +25,15 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from augment.cameras import Camera
-from augment.render.buffers import ALPHA, EXPECTED_DEPTH, RGB, SPLAT_IDS, RenderOutput
+from augment.render.buffers import ALPHA, EXPECTED_DEPTH, RGB, RenderOutput
 from augment.render.clip import ABOVE, BELOW, HeightClip
 from augment.render.composite import composite_sky
-from augment.render.constants import DEPTH_EPS, RasterSettings
+from augment.render.constants import RasterSettings
 from augment.render.rasterize import REFERENCE, rasterize
 from augment.scene import PosedGaussians
 from augment.sky import Sky
 from augment.weather.flood import FloodMedium, Layer
+from augment.weather.pour import both_sides, find_water, pour
 from augment.weather.screen_space import ScreenReflection, trace_screen
 from augment.weather.smog import SmogMedium, fog_raster
 from augment.weather.submerged import view_from_below
@@ -40,14 +42,13 @@ from augment.weather.water_plane import (
     Window,
     mirrored_camera,
     mirrored_window,
-    plane_depth,
     plane_window,
 )
 from augment.weather.wave_field import wave_field
 from augment.weather.waves import WaveField
 
-# No water is in view where no pixel shows more of it. Opaque surfaces let up to 4 % through: a splat
-# that would bring transmittance to 1e-4 is not blended, whatever is left before it.
+# No water is in view where no pixel shows more of it. Opaque surfaces let up to 4 % through: a
+# splat that would bring transmittance to 1e-4 is not blended, whatever is left before it.
 VISIBLE = 0.05
 COARSE = 0.25  # resolution of the mirrored view that fills what the screen does not show
 REACH_SIGMAS = 3.0  # slopes of the waves that the margins allow for
@@ -99,15 +100,14 @@ class Painter:
 
 @dataclass(frozen=True, eq=False)
 class FloodedImage:
-    """rgb [H, W, 3]: with sky and water, not clamped. scene: the buffers of the scene's own
-    surfaces, through the water where there is some. water [H, W]: where a ray meets water first.
-    water_depth_m [H, W]: z of the water's surface there, 0 elsewhere.
+    """rgb [H, W, 3]: with sky and water, not clamped. scene: buffers of the scene's own surfaces,
+    through the water where there is some: those asked for, with alpha, if any besides colour and
+    alpha are. water [H, W]: where a ray meets water first.
     """
 
     rgb: Float[Tensor, "H W 3"]
     scene: RenderOutput
     water: Bool[Tensor, "H W"]
-    water_depth_m: Float[Tensor, "H W"]
 
 
 def as_layer(camera: Camera, raster: RenderOutput) -> Layer:
@@ -144,22 +144,21 @@ def _from_above(
         wanted = wanted | {EXPECTED_DEPTH}
     front = painter.draw(camera, above, wanted)
     assert front.rgb is not None and front.alpha is not None
-    surface = plane_depth(camera, medium.level_z_m).to(front.rgb.dtype)
-    shown = torch.where(surface.isfinite(), 1 - front.alpha, torch.zeros_like(front.alpha))
-    image = composite_sky(
-        front.rgb, front.alpha, camera, painter.sky, smog=painter.medium, fast=painter.fast
-    )
-    water = shown > 0.5
-    depth = torch.where(water, surface, torch.zeros_like(surface))
-    if bool((shown <= VISIBLE).all()):
-        return FloodedImage(image, front, water, depth)
+    sky, smog, fast = painter.sky, painter.medium, painter.fast
+    water, most_shown = find_water(front.alpha, camera, fast=fast)
+    if most_shown <= VISIBLE:
+        image = composite_sky(front.rgb, front.alpha, camera, sky, smog=smog, fast=fast)
+        return FloodedImage(image, front, water)
 
     crop = window.of(camera)
-    field = wave_field(medium.waves, crop, medium.level_z_m, fast=painter.fast)
-    bed_window = window.grown(*_bed_margins(camera, medium, window))
+    field = wave_field(medium.waves, crop, medium.level_z_m, fast=fast)
+    bed_window = window.grown(*_bed_margins(camera, medium))
     bed_camera = bed_window.of(camera)
-    below = HeightClip(medium.level_z_m, BELOW)
-    bed = painter.draw(bed_camera, below, buffers | {RGB, ALPHA, EXPECTED_DEPTH})
+    scene_buffers = buffers - {RGB, ALPHA}
+    # Only a picture is needed: then what the water hides is not.
+    reach = math.inf if scene_buffers else visible_depth_m(medium)
+    below = HeightClip(medium.level_z_m, BELOW, reach)
+    bed = painter.draw(bed_camera, below, scene_buffers | {RGB, ALPHA, EXPECTED_DEPTH})
     color = shade_water(
         crop,
         window.cut(front.alpha),
@@ -168,15 +167,18 @@ def _from_above(
         as_layer(bed_camera, bed),
         mirror=_mirror_layer(painter, camera, medium, window, field),
         screen=_screen_reflection(painter, camera, medium, crop, front),
-        sky=painter.sky,
-        smog=painter.medium,
-        fast=painter.fast,
+        sky=sky,
+        smog=smog,
+        fast=fast,
     )
-    alpha = window.cut(front.alpha)[..., None]
-    mixed = window.cut(front.rgb) + (1 - alpha) * color
-    meets = window.cut(surface).isfinite()[..., None]
-    window.paste(image, torch.where(meets, mixed, window.cut(image)))
-    return FloodedImage(image, _both_sides(front, bed, bed_window), water, depth)
+    image = pour(front, camera, window, color, sky, smog, fast=fast)
+    return FloodedImage(image, both_sides(front, bed, bed_window, buffers, fast=fast), water)
+
+
+def visible_depth_m(medium: FloodMedium) -> float:
+    """Depth below the surface from which less than 1/512 of any colour comes up."""
+    least = min(medium.extinction_per_m)
+    return math.log(512) / least if least > 0 else math.inf
 
 
 def _mirror_layer(
@@ -215,7 +217,7 @@ def _mirror_margins(camera: Camera, field: WaveField) -> tuple[int, int, int, in
     return sideways, upwards, sideways, 4
 
 
-def _bed_margins(camera: Camera, medium: FloodMedium, window: Window) -> tuple[int, int, int, int]:
+def _bed_margins(camera: Camera, medium: FloodMedium) -> tuple[int, int, int, int]:
     """Pixels left, above, right and below by which refraction may move the bed.
 
     A bent ray meets a bed of depth D nearer to the eye, at height h, than a straight one, by less
@@ -241,32 +243,5 @@ def _from_below(
     )
     water = torch.ones(camera.height, camera.width, dtype=torch.bool)
     whole = Window(0, 0, camera.width, camera.height)
-    nothing = torch.zeros(camera.height, camera.width, dtype=image.dtype)
-    return FloodedImage(image, _both_sides(front, air, whole), water, nothing)
-
-
-def _both_sides(front: RenderOutput, behind: RenderOutput, window: Window) -> RenderOutput:
-    """Buffers of both layers as one scene's, without what the water does to them.
-
-    Alpha and expected depth are what one render would give. Median depth and the heaviest splat
-    are those of the layer that covers more of the pixel.
-    """
-    assert front.alpha is not None and behind.alpha is not None
-    covered = torch.zeros_like(front.alpha)
-    window.paste(covered, behind.alpha)
-    share = (1 - front.alpha) * covered
-    alpha = front.alpha + share
-    hidden = share > front.alpha
-    values: dict[str, Tensor] = {ALPHA: alpha}
-    for field in dataclasses.fields(RenderOutput):
-        nearer, farther = getattr(front, field.name), getattr(behind, field.name)
-        if field.name in (RGB, ALPHA) or nearer is None or farther is None:
-            continue
-        other = torch.full_like(nearer, -1) if field.name == SPLAT_IDS else torch.zeros_like(nearer)
-        window.paste(other, farther)
-        if field.name == EXPECTED_DEPTH:
-            total = front.alpha * nearer + share * other
-            values[field.name] = total / alpha.clamp_min(DEPTH_EPS)
-        else:
-            values[field.name] = torch.where(hidden, other, nearer)
-    return RenderOutput(**values)
+    scene = both_sides(front, air, whole, buffers, fast=painter.fast)
+    return FloodedImage(image, scene, water)

@@ -7,7 +7,7 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from augment.cameras import Camera
@@ -80,6 +80,11 @@ def _span(slope: float, best: float, size: int, centre: float) -> tuple[int, int
     else:
         last = min(last, math.ceil(max(min(edge, size), -1.0)))
     return (first, last) if first < last else None
+
+
+def falling(camera: Camera) -> Bool[Tensor, "H W"]:
+    """Whose rays meet a level plane somewhere below the eye."""
+    return camera.ray_directions(torch.float64)[..., 2] < 0
 
 
 def plane_depth(camera: Camera, level_z_m: float) -> Float[Tensor, "H W"]:
