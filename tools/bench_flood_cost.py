@@ -34,12 +34,13 @@ NEAR_SHARE = 0.05  # as much off is about a third, too
 ZOOMS = (1.0, 0.8, 1.25, 1.6, 2.0, 2.5)  # the first that is near is taken
 LOOK = 0.125  # resolution at which a zoom's share of water is looked up
 STAGES = {
-    "plane_depth": "depth of the plane",
-    "composite_sky": "sky behind all",
+    "find_water": "where water is",
     "wave_field": "waves",
     "trace_screen": "march through the screen",
     "shade_water": "shading",
-    "_both_sides": "buffers of both sides",
+    "pour": "water and sky behind the front",
+    "composite_sky": "sky alone",
+    "both_sides": "buffers of both sides",
 }
 FRONT, BED, MIRROR, REST = "front layer", "bed layer", "mirror layer", "the rest"
 
