@@ -79,7 +79,7 @@ def mirrored_picture(scene: Scene, camera: Camera, plan: Plan) -> Float[Tensor, 
     parts = scene.parts_for(camera)
     front_rgb, cover = _layer(parts, camera, plan, HeightClip(medium.level_z_m, ABOVE))
     below = mirror_parts(parts, medium.level_z_m)
-    rgb, alpha = _layer(below, camera, plan, HeightClip(medium.level_z_m, BELOW))
+    rgb, alpha = _layer(below, camera, plan, HeightClip(medium.level_z_m, BELOW, overlaps=True))
     rays = camera.ray_directions(torch.float64)
     falls = rays[..., 2] < 0
     upward = (rays * MIRROR.diagonal()[:3]).float()

@@ -13,8 +13,7 @@ z (h_eye i + s(p)), s being the vertical part of the ray's direction. So
     L(p) = h_eye i(p) + s(p)
 
 is linear in p and has the sign of the height: the cut is a straight line in the image. Divided by
-its slope, L is a distance from that line in pixels, and clamp(L + 0.5, 0, 1) a smooth edge. Of what
-lies below, one pixel more is kept, so that nothing shows between the two sides of a cut.
+its slope, L is a distance from that line in pixels, and clamp(L + 0.5, 0, 1) a smooth edge.
 Where there is a clip, expected depth, too, is taken over these surfaces, 1/i(p), no farther from
 the centre than the splat reaches: the centres of large splats stand nearer or farther than what a
 pixel shows of them, by more than shallow water is deep.
@@ -27,7 +26,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 ABOVE, BELOW = "above", "below"
-EDGE_PX = {ABOVE: 0.5, BELOW: 1.5}  # added to the distance before it is clamped to [0, 1]
+SIGNS = {ABOVE: 1.0, BELOW: -1.0}
+EDGE_PX, OVERLAP_PX = 0.5, 1.0  # added to the distance before it is clamped to [0, 1]
 FAR_PX = 1e6  # distances are clamped to this: where the slope vanishes they have no end
 SHARP_PX2 = 0.003  # added to S2's diagonal, so that splats seen edge-on have a slope
 LONGEST = 2 / 3  # of its depth, that a splat may reach: z(p) is at most 3 z
@@ -38,15 +38,17 @@ class HeightClip:
     """The side of the plane z = z_m (world, metres) that is kept.
 
     reach_m: splats that lie farther from the plane than this with all they are may be left out,
-    where whoever asks could not see them.
+    where whoever asks could not see them. overlaps: keep one pixel more than half of the edge, for
+    a layer that is seen behind the edge of another: nothing shows between them then.
     """
 
     z_m: float
     keep: Literal["above", "below"]
     reach_m: float = math.inf
+    overlaps: bool = False
 
     def __post_init__(self) -> None:
-        if self.keep not in EDGE_PX or not math.isfinite(self.z_m):
+        if self.keep not in SIGNS or not math.isfinite(self.z_m):
             raise ValueError(
                 f"a clip keeps 'above' or 'below' a finite height; "
                 f"got {self.keep!r}, z_m = {self.z_m}"
@@ -57,8 +59,9 @@ class HeightClip:
     @property
     def sign(self) -> float:
         """1 where heights above the plane are kept, -1 where those below are."""
-        return 1.0 if self.keep == ABOVE else -1.0
+        return SIGNS[self.keep]
 
     @property
     def edge_px(self) -> float:
-        return EDGE_PX[self.keep]
+        """What is added to the distance from the cut, pixels."""
+        return EDGE_PX + OVERLAP_PX * self.overlaps

@@ -56,10 +56,13 @@ def rasterize_cpu(
     settings: RasterSettings,
     smog: SmogMedium | None,
     clip: HeightClip | None = None,
+    wanted: np.ndarray | None = None,
     *,
     stage_times: dict[str, float] | None = None,
 ) -> RenderOutput:
     """The image of the parts in float32, without gradients. Arguments are checked by `rasterize`.
+
+    wanted: bool [H, W]; tiles without a wanted pixel are left out and hold zeros.
 
     The same bits on any number of threads, whichever buffers are asked for. stage_times: seconds of
     "project", "sort", "bin" and "raster" and the counts "visible" (splats that touch a tile which
@@ -70,6 +73,8 @@ def rasterize_cpu(
     images = image_arrays(camera, buffers)
     with borrowed_scratch() as scratch, kernel_threads():
         tiles = Tiles(camera, images, settings, scratch)
+        if wanted is not None:
+            tiles.leave_out(wanted)
         depths, edges = rank(inputs, camera, scratch)
         for bins in itertools.pairwise(edges):
             splats = project(inputs, depths, bins, tiles, scratch)
@@ -233,6 +238,16 @@ class Tiles:
         self._states = scratch.array("states", (count * used,), np.float32)
         self.open = scratch.array("open", (count,), np.uint8)
         self.open[:] = cpu_blend.FRESH
+
+    def leave_out(self, wanted: np.ndarray) -> None:
+        """Close the tiles without a wanted pixel [H, W]; their part of the images becomes 0."""
+        rows, columns = (np.arange(n) for n in (self._rows, self._columns))
+        strips = np.logical_or.reduceat(wanted, rows * layout.TILE_H, axis=0)
+        drawn = np.logical_or.reduceat(strips, columns * layout.TILE_W, axis=1)
+        self.open[~drawn.reshape(-1)] = cpu_blend.CLOSED
+        for image in self._images:
+            if image is not None:
+                image.fill(0)
 
     def open_sums(self) -> np.ndarray:
         """int32 [rows + 1, columns + 1]: open tiles above and to the left."""

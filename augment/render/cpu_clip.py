@@ -22,6 +22,7 @@ from augment.render.cpu_layout import (
     V_CLIP_EDGE,
     V_CLIP_EYE,
     V_CLIP_PART,
+    V_CLIP_REACH,
     V_EXTENT,
     V_FOCAL,
     U,
@@ -91,7 +92,10 @@ def cut_eight(quats, scales, picked, at, d, x, y, inverse, view):
     ly = v8.select(whole, zero, ly * scale)
     deep = v8.sqrt(dot(away0, away1, away2, away0, away1, away2)) * inverse
     deep = v8.minimum(v8.splat(view[V_EXTENT]) * deep, v8.splat(_LONGEST))
-    partly = v8.at_least(height + reach, zero)
+    partly = v8.both(
+        v8.at_least(height + reach, zero),
+        v8.at_least(v8.splat(view[V_CLIP_REACH]), height - reach),
+    )
     return partly, offset + v8.splat(view[V_CLIP_EDGE]), lx, ly, gx * inverse, gy * inverse, deep
 
 

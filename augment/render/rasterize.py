@@ -35,6 +35,7 @@ def rasterize(
     settings: RasterSettings = RasterSettings(),  # noqa: B008 - frozen, so sharing it is safe
     smog: SmogMedium | None = None,
     clip: HeightClip | None = None,
+    wanted: torch.Tensor | None = None,
     backend: str = AUTO,
 ) -> RenderOutput:
     """Image buffers of the parts seen by the camera; the sky is not part of them.
@@ -42,6 +43,7 @@ def rasterize(
     buffers: names from augment.render.buffers; the others are None in the result. splat_ids counts
     through the parts in the order given. smog: fades every splat's colour towards the airlight by
     its own distance. clip: only what lies above, or below, a height is drawn (augment.render.clip).
+    wanted: bool [H, W], the pixels that will be looked at; a backend may leave the others 0.
     backend: "cpu" (numba, float32; gradients of rgb, alpha and expected_depth, without smog or clip
     and where no other buffer is asked for), "reference" (torch, float32 or float64,
     gradients of all), or "auto": cpu where it can do the job, else reference.
@@ -51,6 +53,13 @@ def rasterize(
         BackendUnavailable: the backend named cannot run on this machine.
     """
     _check_arguments(parts, camera, buffers, settings)
+    if wanted is not None and (
+        wanted.dtype != torch.bool or tuple(wanted.shape) != (camera.height, camera.width)
+    ):
+        raise ValueError(
+            f"wanted must be bool [{camera.height}, {camera.width}] (the camera's size); got "
+            f"{wanted.dtype} {list(wanted.shape)}"
+        )
     names = frozenset(buffers)
     if _choose(parts, backend, names, smog, clip) == REFERENCE:
         return rasterize_reference(parts, camera, names, settings, smog, clip)
@@ -59,7 +68,15 @@ def rasterize(
         from augment.render.autograd import rasterize_with_gradients
 
         return rasterize_with_gradients(parts, camera, names, settings)
-    return cpu.rasterize_cpu([_detached(p) for p in parts], camera, names, settings, smog, clip)
+    return cpu.rasterize_cpu(
+        [_detached(p) for p in parts],
+        camera,
+        names,
+        settings,
+        smog,
+        clip,
+        None if wanted is None else wanted.numpy(),
+    )
 
 
 def available_backends() -> dict[str, str | None]:

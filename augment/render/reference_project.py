@@ -175,8 +175,7 @@ def _cut(
     offset = torch.where(whole, torch.full_like(offset, FAR_PX), offset) + clip.edge_px
     slope = torch.where(whole[:, None], torch.zeros_like(slope), slope / length[:, None])
     cuts = torch.cat([offset[:, None], slope, torch.stack([gx / z, gy / z, deep], -1)], 1)
-    longest = MAX_EXTENT_SIGMAS * axes.norm(dim=1).amax(1)
-    return cuts, (heights >= -reach) & (heights - longest <= clip.reach_m)
+    return cuts, (heights >= -reach) & (heights - reach <= clip.reach_m)
 
 
 def _offsets_from_eye(

@@ -37,15 +37,16 @@ from augment.weather.pour import both_sides, find_water, pour
 from augment.weather.screen_space import ScreenReflection, trace_screen
 from augment.weather.smog import SmogMedium, fog_raster
 from augment.weather.submerged import view_from_below
-from augment.weather.water import shade_water
+from augment.weather.water import HIDDEN_COVER, shade_water
 from augment.weather.water_plane import (
+    Margins,
     Window,
     mirrored_camera,
     mirrored_window,
     plane_window,
+    resized,
 )
 from augment.weather.wave_field import wave_field
-from augment.weather.waves import WaveField
 
 # No water is in view where no pixel shows more of it. Opaque surfaces let up to 4 % through: a
 # splat that would bring transmittance to 1e-4 is not blended, whatever is left before it.
@@ -77,8 +78,14 @@ class Painter:
     def medium(self) -> SmogMedium | None:
         return self.smog or self.smog_on_buffers
 
-    def draw(self, camera: Camera, clip: HeightClip, buffers: frozenset[str]) -> RenderOutput:
-        """The layer's buffers; its colours are seen through the smog."""
+    def draw(
+        self,
+        camera: Camera,
+        clip: HeightClip,
+        buffers: frozenset[str],
+        wanted: Bool[Tensor, "H W"] | None = None,
+    ) -> RenderOutput:
+        """The layer's buffers; its colours are seen through the smog. wanted: as for rasterize."""
         if self.smog_on_buffers is not None:
             buffers = buffers | {EXPECTED_DEPTH}
         raster = rasterize(
@@ -88,14 +95,18 @@ class Painter:
             settings=self.settings,
             smog=self.smog,
             clip=clip,
+            wanted=wanted,
             backend=self.backend,
         )
         if self.smog_on_buffers is None:
             return raster
         return dataclasses.replace(raster, rgb=fog_raster(raster, camera, self.smog_on_buffers))
 
-    def layer(self, camera: Camera, clip: HeightClip) -> Layer:
-        return as_layer(camera, self.draw(camera, clip, frozenset({RGB, ALPHA, EXPECTED_DEPTH})))
+    def layer(
+        self, camera: Camera, clip: HeightClip, wanted: Bool[Tensor, "H W"] | None = None
+    ) -> Layer:
+        buffers = frozenset({RGB, ALPHA, EXPECTED_DEPTH})
+        return as_layer(camera, self.draw(camera, clip, buffers, wanted))
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,21 +162,19 @@ def _from_above(
         return FloodedImage(image, front, water)
 
     crop = window.of(camera)
+    seen = _seen(window.cut(front.alpha))
     field = wave_field(medium.waves, crop, medium.level_z_m, fast=fast)
-    bed_window = window.grown(*_bed_margins(camera, medium))
+    margins = _bed_margins(camera, medium)
+    bed_window = window.grown(margins)
     bed_camera = bed_window.of(camera)
-    scene_buffers = buffers - {RGB, ALPHA}
-    # Only a picture is needed: then what the water hides is not.
-    reach = math.inf if scene_buffers else visible_depth_m(medium)
-    below = HeightClip(medium.level_z_m, BELOW, reach)
-    bed = painter.draw(bed_camera, below, scene_buffers | {RGB, ALPHA, EXPECTED_DEPTH})
+    bed = _draw_bed(painter, bed_camera, medium, buffers - {RGB, ALPHA}, margins, seen)
     color = shade_water(
         crop,
         window.cut(front.alpha),
         medium,
         field,
         as_layer(bed_camera, bed),
-        mirror=_mirror_layer(painter, camera, medium, window, field),
+        mirror=_mirror_layer(painter, camera, medium, window, seen),
         screen=_screen_reflection(painter, camera, medium, crop, front),
         sky=sky,
         smog=smog,
@@ -175,6 +184,29 @@ def _from_above(
     return FloodedImage(image, both_sides(front, bed, bed_window, buffers, fast=fast), water)
 
 
+def _seen(alpha: Float[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
+    """Which of the water's pixels are shaded, for what stands before them."""
+    return alpha <= HIDDEN_COVER
+
+
+def _draw_bed(
+    painter: Painter,
+    camera: Camera,
+    medium: FloodMedium,
+    scene_buffers: frozenset[str],
+    margins: Margins,
+    seen: Bool[Tensor, "h w"],
+) -> RenderOutput:
+    """What lies below the surface. Where only a picture is needed, what the front hides and what
+    the water does is not drawn.
+    """
+    wanted, reach = None, math.inf
+    if not scene_buffers:
+        wanted, reach = margins.around(seen), visible_depth_m(medium)
+    below = HeightClip(medium.level_z_m, BELOW, reach, overlaps=True)
+    return painter.draw(camera, below, scene_buffers | {RGB, ALPHA, EXPECTED_DEPTH}, wanted)
+
+
 def visible_depth_m(medium: FloodMedium) -> float:
     """Depth below the surface from which less than 1/512 of any colour comes up."""
     least = min(medium.extinction_per_m)
@@ -182,16 +214,23 @@ def visible_depth_m(medium: FloodMedium) -> float:
 
 
 def _mirror_layer(
-    painter: Painter, camera: Camera, medium: FloodMedium, window: Window, field: WaveField
+    painter: Painter,
+    camera: Camera,
+    medium: FloodMedium,
+    window: Window,
+    seen: Bool[Tensor, "h w"],
 ) -> Layer | None:
     if medium.reflection == "sky":
         return None
-    mirrored = mirrored_camera(camera, medium.level_z_m)
-    place = mirrored_window(window, camera).grown(*_mirror_margins(camera, field))
-    view = place.of(mirrored)
+    margins = _mirror_margins(camera, medium)
+    place = mirrored_window(window, camera).grown(margins)
+    view = place.of(mirrored_camera(camera, medium.level_z_m))
+    wanted = margins.around(seen.flip(0))
     if medium.reflection == "screen_space":
         view = view.scaled(COARSE)
-    return painter.layer(view, HeightClip(medium.level_z_m, ABOVE))
+        wanted = resized(wanted, view)
+    above = HeightClip(medium.level_z_m, ABOVE, overlaps=True)
+    return painter.layer(view, above, wanted)
 
 
 def _screen_reflection(
@@ -203,31 +242,31 @@ def _screen_reflection(
     return trace_screen(layer, crop, medium.level_z_m, fast=painter.fast)
 
 
-def _mirror_margins(camera: Camera, field: WaveField) -> tuple[int, int, int, int]:
-    """Pixels left, above, right and below that tilted waves look beyond the flat reflection.
+def _mirror_margins(camera: Camera, medium: FloodMedium) -> Margins:
+    """What tilted waves look at beyond the flat reflection.
 
     A slope turns the reflected ray by twice its angle, mostly up or down, where the reflections are
     drawn out. The side below the reflections is the horizon, beyond which no reflection looks.
     """
-    slopes = field.normal_x.square() + field.normal_y.square() + field.slope_variance
-    tilt = 2 * REACH_SIGMAS * float((slopes.mean() / 2).sqrt()) if slopes.numel() else 0.0
+    waves = medium.waves
+    slopes = waves.wavenumbers * waves.amplitudes_m
+    tilt = 2 * REACH_SIGMAS * math.sqrt(float((slopes**2).sum()) / 2)
     most = MOST_MARGIN * max(camera.width, camera.height)
     upwards = int(min(camera.fy * tilt, most)) + 4
     sideways = int(min(0.5 * camera.fx * tilt, most)) + 4
-    return sideways, upwards, sideways, 4
+    return Margins(sideways, upwards, sideways, 4)
 
 
-def _bed_margins(camera: Camera, medium: FloodMedium) -> tuple[int, int, int, int]:
-    """Pixels left, above, right and below by which refraction may move the bed.
+def _bed_margins(camera: Camera, medium: FloodMedium) -> Margins:
+    """By how much refraction may move the bed in the image.
 
     A bent ray meets a bed of depth D nearer to the eye, at height h, than a straight one, by less
-    than D / (h + D) in tangents. Only where the plane lies below the image's lower border does it
-    leave the image.
+    than D / (h + D) in tangents, which is downwards in the image of an upright camera.
     """
     height = float(camera.centre[2]) - medium.level_z_m
     depth = medium.waves.depth_m
     reach = min(camera.fy * depth / (height + depth) * 0.5, 0.12 * camera.height)
-    return 8, 8, 8, int(reach) + 8
+    return Margins(8, 8, 8, int(reach) + 8)
 
 
 def _from_below(
@@ -237,7 +276,8 @@ def _from_below(
     wanted = buffers | {RGB, ALPHA, EXPECTED_DEPTH}
     in_air = dataclasses.replace(painter, smog=None, smog_on_buffers=None)
     front = in_air.draw(camera, HeightClip(medium.level_z_m, BELOW), wanted)
-    air = painter.draw(camera, HeightClip(medium.level_z_m, ABOVE), wanted)
+    above = HeightClip(medium.level_z_m, ABOVE, overlaps=True)
+    air = painter.draw(camera, above, wanted)
     image = view_from_below(
         as_layer(camera, front), as_layer(camera, air), medium, painter.sky, painter.medium
     )

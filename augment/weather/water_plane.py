@@ -6,12 +6,44 @@ import dataclasses
 import math
 from dataclasses import dataclass
 
+import cv2
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from augment.cameras import Camera
 from augment.geometry import rigid
+
+GRAIN = 16  # pixels a side of the squares that masks are grown in
+
+
+@dataclass(frozen=True)
+class Margins:
+    """Pixels on each side."""
+
+    left: int
+    top: int
+    right: int
+    bottom: int
+
+    def around(self, mask: Bool[Tensor, "h w"]) -> Bool[Tensor, "H W"]:
+        """A window's mask as one of the grown window, grown as far: in whole squares, so that
+        nothing is missed.
+        """
+        height, width = mask.shape
+        inside = np.zeros((height + self.top + self.bottom, width + self.left + self.right), bool)
+        inside[self.top : self.top + height, self.left : self.left + width] = mask.numpy()
+        steps = [np.arange(0, n, GRAIN) for n in inside.shape]
+        coarse = np.logical_or.reduceat(np.logical_or.reduceat(inside, steps[0], 0), steps[1], 1)
+        left, up, right, down = (
+            math.ceil(n / GRAIN) for n in (self.left, self.top, self.right, self.bottom)
+        )
+        square = np.ones((up + down + 1, left + right + 1), np.uint8)
+        # OpenCV grows towards what lies before the anchor in the kernel's own direction.
+        grown = cv2.dilate(coarse.astype(np.uint8), square, anchor=(right, down))
+        fine = grown.repeat(GRAIN, 0).repeat(GRAIN, 1)[: inside.shape[0], : inside.shape[1]]
+        return torch.from_numpy(np.ascontiguousarray(fine)).view(torch.bool)
 
 
 @dataclass(frozen=True)
@@ -27,9 +59,14 @@ class Window:
         """The camera's view through this window."""
         return camera.cropped(self.left, self.top, self.right - self.left, self.bottom - self.top)
 
-    def grown(self, left: int, top: int, right: int, bottom: int) -> Window:
-        """The window with this many pixels more on each side."""
-        return Window(self.left - left, self.top - top, self.right + right, self.bottom + bottom)
+    def grown(self, margins: Margins) -> Window:
+        """The window with margins around it."""
+        return Window(
+            self.left - margins.left,
+            self.top - margins.top,
+            self.right + margins.right,
+            self.bottom + margins.bottom,
+        )
 
     def paste(self, into: Tensor, values: Tensor) -> None:
         """Write those of the window's pixels [h, w, ...] that lie in the image [H, W, ...]."""
@@ -113,6 +150,13 @@ def mirrored_camera(camera: Camera, level_z_m: float) -> Camera:
         camera_from_world=rigid(rotation, -rotation @ eye),
         cy=camera.height - camera.cy,
     )
+
+
+def resized(mask: Bool[Tensor, "H W"], camera: Camera) -> Bool[Tensor, "h w"]:
+    """The mask at a camera's smaller size: true where any of a pixel is."""
+    size = (camera.width, camera.height)
+    share = cv2.resize(mask.float().numpy(), size, interpolation=cv2.INTER_AREA)
+    return torch.from_numpy(share > 0).reshape(camera.height, camera.width)
 
 
 def mirrored_window(window: Window, camera: Camera) -> Window:

@@ -105,7 +105,8 @@ def test_a_wall_is_cut_along_its_waterline(z_m, backend):
     camera = camera_ahead(40, 60, 60.0)
     row = camera.cy - camera.fy * z_m / 5.0
     above = render(wall(), camera, HeightClip(z_m, "above"), backend).alpha
-    below = render(wall(), camera, HeightClip(z_m, "below"), backend).alpha
+    behind = HeightClip(z_m, "below", overlaps=True)
+    below = render(wall(), camera, behind, backend).alpha
     centres = torch.arange(60) + 0.5
     # Row by row the kept share is clamp(pixels above the line + 0.5, 0, 1) of an opaque wall's
     # alpha; the wall's discs overlap, and each is cut, so what is left lies between one cut layer
@@ -136,7 +137,7 @@ def test_both_sides_together_are_the_whole():
     gaussians = stack(wall(9.0), floor(-1.5), one_gaussian((4.0, 0.3, -0.9), 0.4, 0.999))
     plain = render(gaussians, camera)
     above = render(gaussians, camera, HeightClip(-0.9, "above"))
-    below = render(gaussians, camera, HeightClip(-0.9, "below"))
+    below = render(gaussians, camera, HeightClip(-0.9, "below", overlaps=True))
     both = above.rgb + (1 - above.alpha)[..., None] * below.rgb
     error = (both - plain.rgb).abs().amax(-1)
     # At the edge of the cut a splat's two sides are blended as two splats, which covers a little
@@ -202,3 +203,30 @@ def test_expected_depth_follows_the_surface_of_large_splats(backend):
     assert int(near.sum()) > 200 and float(error.max()) < 0.02
     plain = render(floor(-1.5), camera, None, backend)
     assert float((plain.expected_depth / exact - 1).abs()[near].min()) > 0.05
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_reach_leaves_out_what_lies_deeper(backend):
+    camera = camera_ahead(40, 60, 60.0)
+    road = floor(-1.5)
+    shallow = render(road, camera, HeightClip(-1.2, "below", reach_m=0.1), backend)
+    whole = render(road, camera, HeightClip(-1.2, "below"), backend)
+    assert not shallow.alpha.any() and float(whole.alpha[-10:].min()) > 0.9
+    enough = render(road, camera, HeightClip(-1.2, "below", reach_m=0.4), backend)
+    for name in (RGB, ALPHA):
+        assert torch.equal(getattr(enough, name), getattr(whole, name))
+
+
+def test_unwanted_tiles_are_left_out():
+    gaussians, camera = random_gaussians(2000, seed=5), camera_ahead(100, 70, 90.0)
+    wanted = torch.zeros(70, 100, dtype=torch.bool)
+    wanted[20, 40] = wanted[65, 99] = True  # in two tiles, one at the image's corner
+    part = rasterize([PosedGaussians(gaussians)], camera, buffers=ALL, wanted=wanted)
+    plain = render(gaussians, camera)
+    for rows, columns in ((slice(16, 32), slice(32, 48)), (slice(64, 70), slice(96, 100))):
+        for name in ALL:
+            piece = getattr(part, name)[rows, columns]
+            assert torch.equal(piece, getattr(plain, name)[rows, columns]), name
+    assert int((part.alpha > 0).sum()) <= 16 * 16 + 6 * 4 and bool((part.splat_ids[:16] == 0).all())
+    with pytest.raises(ValueError, match="wanted must be bool"):
+        rasterize([PosedGaussians(gaussians)], camera, wanted=wanted[1:])

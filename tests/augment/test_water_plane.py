@@ -9,6 +9,7 @@ import torch
 from augment.cameras import Camera
 from augment.geometry import rigid, rotmat_from_quat
 from augment.weather.water_plane import (
+    Margins,
     Window,
     mirrored_camera,
     mirrored_window,
@@ -104,7 +105,7 @@ def test_cut_and_paste():
     expected = torch.zeros(4, 5)
     expected[3, :2] = torch.tensor([2.0, 3.0])
     assert torch.equal(into, expected)
-    assert window.grown(1, 2, 3, 4) == Window(0, 0, 7, 8)
+    assert window.grown(Margins(1, 2, 3, 4)) == Window(0, 0, 7, 8)
 
 
 def test_pixels_of_a_window_keep_their_rays():
@@ -113,3 +114,18 @@ def test_pixels_of_a_window_keep_their_rays():
     whole = camera.ray_directions(torch.float64)
     inside = part.ray_directions(torch.float64)[: 19 - 5, 3:]
     assert torch.allclose(inside, whole[5:, :9], atol=1e-13)
+
+
+def test_masks_grow_at_least_by_their_margins():
+    margins = Margins(5, 40, 20, 0)
+    mask = torch.zeros(100, 120, dtype=torch.bool)
+    mask[50, 60] = True
+    grown = margins.around(mask)
+    assert grown.shape == (140, 145)
+    row, column = 50 + 40, 60 + 5  # where that pixel stands in the grown window
+    assert bool(grown[row - 40 : row + 1, column - 5 : column + 21].all())
+    rows, columns = grown.any(1).nonzero(), grown.any(0).nonzero()
+    # No farther than the squares of 16 pixels that hold the margins.
+    assert row - int(rows.min()) < 40 + 32 and int(rows.max()) - row < 32
+    assert column - int(columns.min()) < 5 + 32 and int(columns.max()) - column < 20 + 32
+    assert not Margins(3, 3, 3, 3).around(torch.zeros(10, 10, dtype=torch.bool)).any()
