@@ -8,11 +8,11 @@ from pathlib import Path
 
 from adapters.base import open_scene
 from augment.batch.job import RenderJob, run_job
-from augment.render.cpu import warm_up
 from recipes.load import load_recipe
 from tools.pictures import draw_sheet, draw_video
+from tools.warm_up import warm_up
 
-RECIPES = ("clear", "brown-smog", "dense-fog")
+RECIPES = ("clear", "dense-fog", "street-flood")
 CAMERA = "front"  # the one that is shown as a video
 
 
@@ -22,13 +22,10 @@ def run_demo(out: Path, frames: int) -> int:
     uri = f"procedural:street?seed=3&frames={frames}"
     print(f"building {uri} and compiling the kernels (kept for the next run)", file=sys.stderr)
     scene = open_scene(uri)
-    warm_up()
+    recipes = [load_recipe(name).resolve(0) for name in RECIPES]
+    warm_up(recipes)
     ready = time.perf_counter()
-    job = RenderJob(
-        scene_uri=uri,
-        recipes=[load_recipe(name).resolve(0) for name in RECIPES],
-        out_dir=out,
-    )
+    job = RenderJob(scene_uri=uri, recipes=recipes, out_dir=out)
     result = run_job(job, scene_loader=lambda _uri: scene)
     for failure in result.failures:
         print(f"failed: {failure}", file=sys.stderr)

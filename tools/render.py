@@ -30,10 +30,10 @@ def render_recipe(
     sheet: bool = True,
 ) -> int:
     """Runs the job and prints what became of it. Returns the exit code: 1 where images failed."""
-    from augment.render.cpu import warm_up
+    from tools.warm_up import warm_up
 
     recipes = resolve_variants(recipe, variants, scale)
-    seconds = warm_up()
+    seconds = warm_up(recipes)
     if seconds > 1:
         _say(f"compiled the kernels in {seconds:.1f} s (kept for the next run)")
     scene = open_scene(scene_uri)

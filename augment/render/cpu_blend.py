@@ -167,8 +167,9 @@ def _blend_list(
         for k in range(U(at + count), U(min(at + 2 * BATCH, last))):
             v8.prefetch(records, U(members[k]) * U(RECORD))
         stage(records, members, U(at), U(count), left, top, rgb, expected, median, ids, staged)
+        any_cut = False
         if cuts is not None:
-            stage_cuts(cuts, members, U(at), U(count), staged, expected, lines)
+            any_cut = stage_cuts(cuts, members, U(at), U(count), staged, expected, lines)
         for strip in range(STRIPS):
             if rows[2 * strip] >= rows[2 * strip + 1]:
                 continue
@@ -176,21 +177,25 @@ def _blend_list(
             items = list_items(staged, U(count), strip, spans, values, places)
             if items == U(0):
                 continue
-            if cuts is not None:
+            if cuts is not None and expected is not None:
+                list_lines(lines, SURFACE, U(count), strip, spans, surfaces)
+            if cuts is not None and any_cut:
                 list_lines(lines, SHARE, U(count), strip, spans, edges)
-                if expected is not None:
-                    list_lines(lines, SURFACE, U(count), strip, spans, surfaces)
-            if (median is not None or ids is not None) and _can_change(
-                state, strip, rows, median, ids
-            ):
                 _blend_items(
                     state, staged, values, places, items, limits, rgb, expected, median, ids,
                     cuts, lines, edges, surfaces,
                 )  # fmt: skip
+            elif (median is not None or ids is not None) and _can_change(
+                state, strip, rows, median, ids
+            ):
+                _blend_items(
+                    state, staged, values, places, items, limits, rgb, expected, median, ids,
+                    cuts, lines, None, surfaces,
+                )  # fmt: skip
             else:
                 _blend_items(
                     state, staged, values, places, items, limits, rgb, expected, None, None,
-                    cuts, lines, edges, surfaces,
+                    cuts, lines, None, surfaces,
                 )  # fmt: skip
             shrink(state, strip, rows)
     return not is_closed(rows)
@@ -251,19 +256,22 @@ def _blend_items(
     edges,
     surfaces,
 ):
-    """Blend all items in turn. The next one's alpha is begun before this one is blended."""
+    """Blend all items in turn. The next one's alpha is begun before this one is blended.
+
+    edges: None where no splat is cut.
+    """
     alpha_max, log_cut = v8.splat(limits[0]), v8.splat(limits[1])
     stop, zero, half = v8.splat(limits[2]), v8.splat(np.float32(0)), v8.splat(np.float32(0.5))
     n = U(BATCH)
     places[items] = 0  # one item is read beyond the last
     splat = U(places[0])
     alpha = alpha_of(staged, values, splat, U(0), alpha_max, log_cut)
-    if cuts is not None:
+    if edges is not None:
         alpha = alpha * kept_share(lines, edges, splat, U(0))
     for item in range(items):
         following = U(places[item + U(1)])
         next_alpha = alpha_of(staged, values, following, item + U(1), alpha_max, log_cut)
-        if cuts is not None:
+        if edges is not None:
             next_alpha = next_alpha * kept_share(lines, edges, following, item + U(1))
         at = U(places[item + U(ITEMS)])
         through = v8.load(state, at)

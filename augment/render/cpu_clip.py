@@ -103,9 +103,10 @@ def cut_eight(quats, scales, picked, at, d, x, y, inverse, view):
 def stage_cuts(cuts, members, at, count, staged, depths, lines):
     """Cuts of a batch, turned to one row a number, about the tile's corner. staged: cpu_items'.
 
-    depths: whether the lines of the surfaces are wanted.
+    depths: whether the lines of the surfaces are wanted. Returns whether any splat is cut: the
+    others lie wholly on the kept side.
     """
-    n = U(BATCH)
+    n, any_cut = U(BATCH), False
     for k in range(count):
         cut = U(members[at + k]) * U(CUT)
         x, y = staged[U(MEAN_X) * n + k], staged[U(MEAN_Y) * n + k]
@@ -113,12 +114,14 @@ def stage_cuts(cuts, members, at, count, staged, depths, lines):
         lines[k] = cuts[cut + U(C_AT)] - lx * x - ly * y
         lines[n + k] = lx
         lines[U(2) * n + k] = ly
+        any_cut = any_cut or lx != np.float32(0) or ly != np.float32(0)
         if depths is not None:
             gx, gy = cuts[cut + U(C_RIGHT)], cuts[cut + U(C_DOWN)]
             lines[U(3) * n + k] = -gx * x - gy * y
             lines[U(4) * n + k] = gx
             lines[U(5) * n + k] = gy
             lines[U(6) * n + k] = cuts[cut + U(C_REACH)]
+    return any_cut
 
 
 @inner()
