@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 from adapters.base import open_scene
 from augment.batch.job import JobResult, RenderJob, run_job
 from augment.errors import ClimateGSError
+from augment.ground import ground_of
 from augment.plan import make_plan
 from augment.scene import Scene
 from recipes.load import load_recipe
@@ -39,6 +41,8 @@ def render_recipe(
     scene = open_scene(scene_uri)
     for problem in scene.problems:
         _say(f"note: {problem}")
+    if any(resolved.weather.flood is not None for resolved in recipes):
+        scene = replace(scene, ground=ground_of(scene))  # looked for once, not by every worker
     for resolved in recipes:
         make_plan(resolved, scene)  # what the scene cannot give is said once, not for every image
     job = RenderJob(

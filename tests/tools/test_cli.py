@@ -9,6 +9,7 @@ import cv2
 import pytest
 import torch
 
+from augment.dataset import WeatherDataset
 from augment.scene import Gaussians
 from augment.splat_io import write_ply
 from tools.cli import main
@@ -70,6 +71,34 @@ def test_render_writes_images_manifest_and_pictures(scene_uri, recipe, tmp_path,
     # The second run finds everything done, and says so.
     assert main(["render", recipe, "--scene", scene_uri, "--out", str(out), "--no-sheet"]) == 0
     assert "0 images written, 4 already there" in capsys.readouterr().out
+
+
+def test_render_a_flood_and_read_it_back(scene_uri, tmp_path, capsys):
+    recipe, out = tmp_path / "flood.yaml", tmp_path / "out"
+    recipe.write_text(
+        "weather: {flood: {level_m: 0.3, reflection: sky}}\noutput: {surface: first}\n"
+    )
+    uri = scene_uri + "&up=%2Bz&ground_z=0"
+    assert main(["render", str(recipe), "--scene", uri, "--out", str(out)]) == 0
+    samples = WeatherDataset(out)
+    assert len(samples) == 2
+    for sample in samples:
+        assert sample["surface"] == "first" and sample["weather"]["flood_level_m"] == 0.3
+        water = sample["water"]
+        assert 0.3 < float(water.float().mean()) < 0.9  # what lies below the horizon
+        # The camera looks down at the floor's middle, so the water is nearer than the floor.
+        assert float(sample["depth"][water].min()) > 0.5
+    assert "2 images written" in capsys.readouterr().out
+    assert main(["explain", str(recipe), "--scene", uri]) == 0
+    assert "flood: bed" in capsys.readouterr().out
+
+
+def test_a_flood_asks_for_metres_and_gravity(scene_uri, tmp_path, capsys):
+    bare = scene_uri.split("?")[0] + "?cameras=none"
+    out = tmp_path / "out"
+    assert main(["render", "street-flood", "--scene", bare, "--out", str(out)]) == 2
+    message = capsys.readouterr().err
+    assert "up=" in message and "scale=" in message and not out.exists()
 
 
 def test_render_takes_selections_and_scale(scene_uri, recipe, tmp_path):
