@@ -136,12 +136,14 @@ def test_water_stands_at_its_level_and_hides_nothing_in_front_of_it(scene, refle
     assert wet.water[int(line) - 2, column] == 0 and wet.water[int(line) + 2, column] == 255
 
 
-def test_the_mirrored_view_shows_wall_car_and_sky_upside_down(scene):
+@pytest.mark.parametrize("reflection", ["screen_space", "mirrored"])
+def test_wall_and_car_are_reflected_upside_down(scene, reflection):
     """At the height h above the water, the reflection of a point at height z over it 12 m away
     stands in the row that looks at -z there (mirror image), above the horizon's own row.
     """
     view = camera(position=(0.0, 0.0, 0.0))
-    wet = view_of(scene, flood(turbidity_ntu=1e6, color=(0.0, 0.0, 0.0)), view)
+    black = {"turbidity_ntu": 1e6, "color": (0.0, 0.0, 0.0)}
+    wet = view_of(scene, flood(reflection=reflection, **black), view)
     level = ROAD_Z + 0.4
     column = 8
     row = int(row_at(2 * level - 0.0, 12.0, view))  # the mirror image of the wall at z = 0
