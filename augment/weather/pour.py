@@ -116,16 +116,16 @@ def both_sides(
         return RenderOutput()
     values = {name: getattr(front, name) for name in (*wanted, ALPHA)}
     if fast and front.alpha.dtype == torch.float32:
-        corner = (window.top, window.left)
-        alphas = (front.alpha.numpy(), behind.alpha.numpy())
+        here, there = window.overlap(front.alpha)
+        alphas = (front.alpha.numpy()[here], behind.alpha.numpy()[there])
         with kernel_threads(ROWS):
             for name in sorted(wanted):
-                pair = (values[name].numpy(), getattr(behind, name).numpy())
+                pair = (values[name].numpy()[here], getattr(behind, name).numpy()[there])
                 if name == EXPECTED_DEPTH:
-                    pour_kernels.join_depth(*corner, *alphas, *pair, np.float32(DEPTH_EPS))
+                    pour_kernels.join_depth(*alphas, *pair, np.float32(DEPTH_EPS))
                 else:
-                    pour_kernels.join_heavier(*corner, *alphas, *pair)
-            pour_kernels.join_alpha(*corner, *alphas)
+                    pour_kernels.join_heavier(*alphas, *pair)
+            pour_kernels.join_alpha(*alphas)
         return RenderOutput(**values)
     covered = torch.zeros_like(front.alpha)
     window.paste(covered, behind.alpha)

@@ -49,47 +49,30 @@ def pour(u, v, rise, top, left, alpha, color, rgb):
 
 
 @kernel
-def join_depth(top, left, alpha, behind_alpha, depth, behind_depth, least):
-    """Expected depth of two layers as one: means by weight. The window [h, w] into [H, W]."""
-    for i in prange(behind_alpha.shape[0]):
-        row = top + i
-        if row < 0 or row >= alpha.shape[0]:
-            continue
-        for j in range(behind_alpha.shape[1]):
-            column = left + j
-            if column < 0 or column >= alpha.shape[1]:
-                continue
-            a = alpha[row, column]
+def join_depth(alpha, behind_alpha, depth, behind_depth, least):
+    """Expected depth of two layers as one: means by weight, into depth [h, w]."""
+    for i in prange(alpha.shape[0]):
+        for j in range(alpha.shape[1]):
+            a = alpha[i, j]
             share = (np.float32(1) - a) * behind_alpha[i, j]
-            total = a * depth[row, column] + share * behind_depth[i, j]
-            depth[row, column] = total / max(a + share, least)
+            total = a * depth[i, j] + share * behind_depth[i, j]
+            depth[i, j] = total / max(a + share, least)
 
 
 @kernel
-def join_heavier(top, left, alpha, behind_alpha, values, behind):
-    """Values of the layer that covers more of a pixel. The window [h, w] into [H, W]."""
-    for i in prange(behind_alpha.shape[0]):
-        row = top + i
-        if row < 0 or row >= alpha.shape[0]:
-            continue
-        for j in range(behind_alpha.shape[1]):
-            column = left + j
-            if column < 0 or column >= alpha.shape[1]:
-                continue
-            a = alpha[row, column]
+def join_heavier(alpha, behind_alpha, values, behind):
+    """Values of the layer that covers more of a pixel, into values [h, w]."""
+    for i in prange(alpha.shape[0]):
+        for j in range(alpha.shape[1]):
+            a = alpha[i, j]
             if (np.float32(1) - a) * behind_alpha[i, j] > a:
-                values[row, column] = behind[i, j]
+                values[i, j] = behind[i, j]
 
 
 @kernel
-def join_alpha(top, left, alpha, behind_alpha):
-    """alpha += (1 - alpha) of the layer behind. The window [h, w] into [H, W]."""
-    for i in prange(behind_alpha.shape[0]):
-        row = top + i
-        if row < 0 or row >= alpha.shape[0]:
-            continue
-        for j in range(behind_alpha.shape[1]):
-            column = left + j
-            if column >= 0 and column < alpha.shape[1]:
-                a = alpha[row, column]
-                alpha[row, column] = a + (np.float32(1) - a) * behind_alpha[i, j]
+def join_alpha(alpha, behind_alpha):
+    """alpha [h, w] += (1 - alpha) of the layer behind."""
+    for i in prange(alpha.shape[0]):
+        for j in range(alpha.shape[1]):
+            a = alpha[i, j]
+            alpha[i, j] = a + (np.float32(1) - a) * behind_alpha[i, j]

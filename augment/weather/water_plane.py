@@ -68,15 +68,19 @@ class Window:
             self.bottom + margins.bottom,
         )
 
-    def paste(self, into: Tensor, values: Tensor) -> None:
-        """Write those of the window's pixels [h, w, ...] that lie in the image [H, W, ...]."""
-        height, width = into.shape[:2]
+    def overlap(self, image: Tensor) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
+        """(rows, columns) of what the window shares with an image [H, W, ...]: in it, in itself."""
+        height, width = image.shape[:2]
         rows = slice(max(self.top, 0), min(self.bottom, height))
         columns = slice(max(self.left, 0), min(self.right, width))
-        into[rows, columns] = values[
-            rows.start - self.top : rows.stop - self.top,
-            columns.start - self.left : columns.stop - self.left,
-        ]
+        own_rows = slice(rows.start - self.top, rows.stop - self.top)
+        own_columns = slice(columns.start - self.left, columns.stop - self.left)
+        return (rows, columns), (own_rows, own_columns)
+
+    def paste(self, into: Tensor, values: Tensor) -> None:
+        """Write those of the window's pixels [h, w, ...] that lie in the image [H, W, ...]."""
+        here, there = self.overlap(into)
+        into[here] = values[there]
 
     def cut(self, image: Tensor) -> Tensor:
         """The window's pixels of an image [H, W, ...] that contains it."""
