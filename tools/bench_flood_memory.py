@@ -8,12 +8,10 @@ from __future__ import annotations
 
 import gc
 import json
-import subprocess
 import sys
-from pathlib import Path
 from typing import Any
 
-from tools.bench_memory import RESET_PEAK, return_free_memory, status_mib
+from tools.bench_memory import RESET_PEAK, measured_apart, return_free_memory, status_mib
 
 SMALL = 0.125
 
@@ -27,17 +25,8 @@ def flood_peak_mib(uri: str, width: int, height: int, tier: str | None) -> float
     """
     if not RESET_PEAK.is_file():
         return None
-    arguments = json.dumps({"uri": uri, "width": width, "height": height, "tier": tier})
-    done = subprocess.run(
-        [sys.executable, "-m", "tools.bench_flood_memory", arguments],
-        capture_output=True,
-        text=True,
-        check=False,
-        cwd=Path(__file__).resolve().parents[1],
-    )
-    if done.returncode != 0:
-        raise RuntimeError(f"measuring the memory of a flood failed:\n{done.stderr.strip()}")
-    return float(done.stdout.strip().splitlines()[-1])
+    arguments = {"uri": uri, "width": width, "height": height, "tier": tier}
+    return measured_apart("tools.bench_flood_memory", arguments, "a flood")
 
 
 def _render_once(uri: str, width: int, height: int, tier: Any) -> float:

@@ -15,6 +15,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 from tools.bench_scene import RasterCase
 
@@ -29,16 +30,25 @@ def peak_extra_mib(case: RasterCase, *, seed: int = 0) -> float | None:
     """
     if not (_STATUS.is_file() and RESET_PEAK.is_file()):
         return None
-    arguments = json.dumps({**dataclasses.asdict(case), "seed": seed})
+    arguments = {**dataclasses.asdict(case), "seed": seed}
+    return measured_apart("tools.bench_memory", arguments, case.name)
+
+
+def measured_apart(module: str, arguments: dict[str, Any], what: str) -> float:
+    """The number that `python -m module JSON` prints last.
+
+    Raises:
+        RuntimeError: the process failed; the message is what it wrote.
+    """
     done = subprocess.run(
-        [sys.executable, "-m", "tools.bench_memory", arguments],
+        [sys.executable, "-m", module, json.dumps(arguments)],
         capture_output=True,
         text=True,
         check=False,
         cwd=Path(__file__).resolve().parents[1],
     )
     if done.returncode != 0:
-        raise RuntimeError(f"measuring the memory of {case.name} failed:\n{done.stderr.strip()}")
+        raise RuntimeError(f"measuring the memory of {what} failed:\n{done.stderr.strip()}")
     return float(done.stdout.strip().splitlines()[-1])
 
 
