@@ -197,14 +197,13 @@ def _draw_bed(
     margins: Margins,
     seen: Bool[Tensor, "h w"],
 ) -> RenderOutput:
-    """What lies below the surface. Where only a picture is needed, what the front hides and what
-    the water does is not drawn.
+    """What lies below the surface, but for what the front hides, and, where only a picture is
+    needed, what the water does.
     """
-    wanted, reach = None, math.inf
-    if not scene_buffers:
-        wanted, reach = margins.around(seen), visible_depth_m(medium)
+    reach = math.inf if scene_buffers else visible_depth_m(medium)
     below = HeightClip(medium.level_z_m, BELOW, reach, overlaps=True)
-    return painter.draw(camera, below, scene_buffers | {RGB, ALPHA, EXPECTED_DEPTH}, wanted)
+    wanted = scene_buffers | {RGB, ALPHA, EXPECTED_DEPTH}
+    return painter.draw(camera, below, wanted, margins.around(seen))
 
 
 def visible_depth_m(medium: FloodMedium) -> float:
