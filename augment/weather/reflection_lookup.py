@@ -8,7 +8,7 @@ off the flat mirror's direction is looked up there at the distance at which it m
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from augment.cameras import Camera
@@ -33,7 +33,9 @@ from augment.weather.water_surface import Surface
 EDGE = 0.04  # share of the image's sides over which what the image shows fades out
 MATCH_M, MATCH_SHARE = 0.3, 0.05  # how far beside a surface a ray may end and still show it
 
-Colours = list[Tensor]  # one [H, W, 3] for each of a pixel's normals
+FAINT = 1 / 256  # a share of the sky that does not change what it shows through
+
+Colours = list[Tensor]  # one [H, W, 3], or 4 with alpha, for each of a pixel's normals
 
 
 def mirrored_eye_is(mirror: Camera, level_z_m: float, eye: Float[Tensor, "3"]) -> bool:
@@ -63,11 +65,14 @@ def reflect_sky(
     return [t * color + (1 - t) * airlight for t, color in zip(through, colors, strict=True)]
 
 
-def reflect_mirror(surface: Surface, rays: list[Tensor], mirror: Layer, sky: Colours) -> Colours:
-    """The mirrored layer, and the sky behind it.
+def reflect_mirror(
+    surface: Surface, rays: list[Tensor], mirror: Layer, smooth: Bool[Tensor, "H W"]
+) -> Colours:
+    """The mirrored layer's colours and alphas.
 
-    The ray's length is first that of the flat mirror's ray, then what the layer shows where the
-    tilted ray of that length ends.
+    A ray's length is first that of the flat mirror's ray, then what the layer shows where the
+    tilted ray of that length ends. In rough pixels all rays take the length of the first: what they
+    show is blurred over more than they would differ.
     """
     to_mirror = torch.tensor([0.0, 0.0, -2 * surface.height_m], dtype=surface.points.dtype)
     flat = surface.directions * torch.tensor([1.0, 1.0, -1.0], dtype=surface.points.dtype)
@@ -84,25 +89,35 @@ def reflect_mirror(surface: Surface, rays: list[Tensor], mirror: Layer, sky: Col
         return torch.where(solid, distance, torch.inf)
 
     first = distance_at(*clamp_to(mirror.camera, *project(mirror.camera, flat)))
-    places = [end_of(ray, distance_at(*end_of(ray, first))) for ray in rays]
-    return _behind(_fetch(mirror, places), sky)
+    distance = distance_at(*end_of(rays[0], first))
+    return _fetch(mirror, [end_of(ray, distance) for ray in rays], smooth)
 
 
 def reflect_screen(
-    surface: Surface, rays: list[Tensor], screen: ScreenReflection, sky: Colours, rest: Colours
-) -> Colours:
-    """What the image itself shows where the ray ends, as far as it does; the rest elsewhere."""
+    surface: Surface,
+    ray: Float[Tensor, "H W 3"],
+    screen: ScreenReflection,
+    smooth: Bool[Tensor, "H W"],
+    rest: Tensor,
+) -> Float[Tensor, "H W 4"]:
+    """What the image itself shows where the ray of smooth pixels ends, as far as it does.
+
+    The rest elsewhere, and in rough pixels: they are blurred too much for the image to add to it.
+    """
     camera = screen.layer.camera
-    places, weights = [], []
-    for ray in rays:
-        column, row, matches = _end_in_image(surface, ray, screen)
-        matches = matches & is_inside(camera, column, row)
-        fade = _smoothstep(_to_border(camera, column, row) / EDGE)
-        weights.append(torch.where(matches, screen.weight * fade, 0)[..., None])
-        places.append(clamp_to(camera, column, row))
-    seen = _behind(_fetch(screen.layer, places), sky)
-    parts = zip(weights, seen, rest, strict=True)
-    return [weight * color + (1 - weight) * other for weight, color, other in parts]
+    column, row, matches = _end_in_image(surface, ray, screen)
+    matches = matches & is_inside(camera, column, row) & smooth
+    fade = _smoothstep(_to_border(camera, column, row) / EDGE)
+    weight = torch.where(matches, screen.weight * fade, 0)[..., None]
+    seen = bilinear(stacked(screen.layer), *clamp_to(camera, column, row))
+    return weight * seen + (1 - weight) * rest
+
+
+def before_sky(seen: Float[Tensor, "H W 4"], sky: Float[Tensor, "H W 3"]) -> Tensor:
+    """Premultiplied colours and alphas before a sky, which is left out where it hardly shows."""
+    color, alpha = seen[..., :3], seen[..., 3:]
+    opaque = 1 - alpha <= FAINT
+    return torch.where(opaque, color / alpha.clamp_min(0.5), color + (1 - alpha) * sky)
 
 
 def _end_in_image(
@@ -139,22 +154,19 @@ def _smoothstep(x: Tensor) -> Tensor:
     return x * x * (3 - 2 * x)
 
 
-def _fetch(layer: Layer, places: list[tuple[Tensor, Tensor]]) -> list[Tensor]:
+def _fetch(
+    layer: Layer, places: list[tuple[Tensor, Tensor]], smooth: Bool[Tensor, "H W"]
+) -> Colours:
     """Colour and alpha at every normal's coordinates.
 
     Where a pixel has several normals, each sees an average as wide as they lie apart: single
     points would show as so many ghosts.
     """
     image = stacked(layer)
-    if len(places) == 1:
-        return [bilinear(image, *places[0])]
     (column, row), *sides = places
+    if not sides:
+        return [bilinear(image, column, row)]
     apart = [torch.hypot(c - column, r - row) for c, r in sides]
-    spacing = torch.stack(apart).mean(0)
+    spacing = torch.where(smooth, 1, torch.stack(apart).mean(0))
     levels = mip_chain(image)
     return [blurred(levels, c, r, spacing) for c, r in places]
-
-
-def _behind(seen: list[Tensor], sky: Colours) -> Colours:
-    parts = zip(seen, sky, strict=True)
-    return [color[..., :3] + (1 - color[..., 3:]) * behind for color, behind in parts]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -19,7 +21,11 @@ from augment.weather.layer_lookup import (
 from augment.weather.smog import SmogMedium, optical_depth
 from augment.weather.water_surface import Surface, refracted
 
-BED_STEPS = 2  # corrections of the bed's depth where a refracted ray meets it
+BED_STEPS = 2  # corrections of the bed's depth where a refracted ray meets it,
+SETTLED_M = 0.01  # unless the last one was smaller
+# Where less of any colour comes up from the depth of the bed straight behind a pixel, no bed is
+# looked for: a quarter of an 8-bit step at most, but for beds that rise before the pixel's own.
+LEAST_TRANSMITTANCE = 1 / 1024
 
 
 def window_offset(outer: Camera, inner: Camera) -> tuple[int, int]:
@@ -54,7 +60,8 @@ def through_the_surface(
     The bed's depth where the ray meets it is unknown; it starts as that of the bed straight behind
     the pixel, and is corrected by the depth at the pixel found with it. Where that search leaves
     the bed's image or meets a hole, the bed straight behind the pixel is taken, and the water's own
-    colour where there is none either. The bed's holes show the water's own colour.
+    colour where there is none either, or it lies too deep to be seen. The bed's holes show the
+    water's own colour.
     """
     water = water_color(surface, camera, medium, smog)
     own_column, own_row = _own_pixel(bed.camera, camera, normal.dtype)
@@ -62,20 +69,23 @@ def through_the_surface(
     own_solid, own_point = point_at(bed, own_column, own_row)
     own_solid = own_solid & own_inside
     own_depth = _depth_below(surface, own_point)
+    extinction = torch.tensor(medium.extinction_per_m, dtype=normal.dtype)
+    bends = medium.refraction_index != 1
+    ray = -surface.to_eye  # nothing bends, whatever the waves
+    if bends:
+        ray = refracted(surface.to_eye, normal, medium.refraction_index)
+    opaque = _optical_depth(own_depth / -ray[..., 2], extinction.min())
+    own_solid = own_solid & (opaque < -math.log(LEAST_TRANSMITTANCE))
     image = stacked(bed)
     own_colors = bilinear(image, own_column, own_row)
-    if medium.refraction_index == 1:  # nothing bends, whatever the waves
-        found, depth, colors, ray = own_solid, own_depth, own_colors, -surface.to_eye
-    else:
-        ray = refracted(surface.to_eye, normal, medium.refraction_index)
+    found, depth, colors = own_solid, own_depth, own_colors
+    if bends:
         found, depth, colors = _search(surface, ray, bed, image, own_solid, own_depth)
     depth = torch.where(found, depth, own_depth)
     colors = torch.where(found[..., None], colors, own_colors)
     colors = torch.where(own_solid[..., None], colors, 0)
     length = torch.where(own_solid, depth / -ray[..., 2], 0)[..., None]
-    extinction = torch.tensor(medium.extinction_per_m, dtype=normal.dtype)
-    tau = torch.where(length > 0, extinction * length, 0)  # infinity times no way is none
-    a = torch.exp(-tau)
+    a = torch.exp(-_optical_depth(length, extinction))
     return a * (colors[..., :3] + (1 - colors[..., 3:]) * water) + (1 - a) * water
 
 
@@ -84,15 +94,22 @@ def _search(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """(found, depth below the plane, colour and alpha) of the bed along refracted rays."""
     per_depth = ray / -ray[..., 2:]
+    going = found
     for _ in range(BED_STEPS):
         column, row = project(bed.camera, surface.points + depth[..., None] * per_depth)
         solid, point = point_at(bed, column, row)
-        found = found & is_inside(bed.camera, column, row) & solid
-        depth = torch.where(found, _depth_below(surface, point), depth)
+        found = found & (~going | (is_inside(bed.camera, column, row) & solid))
+        going = going & found
+        last, depth = depth, torch.where(going, _depth_below(surface, point), depth)
+        going = going & ((depth - last).abs() > SETTLED_M)
     column, row = project(bed.camera, surface.points + depth[..., None] * per_depth)
     colors = bilinear(image, column, row)
     found = found & is_inside(bed.camera, column, row) & (colors[..., 3] >= SOLID_ALPHA)
     return found, depth, colors
+
+
+def _optical_depth(length: Tensor, extinction_per_m: Tensor) -> Tensor:
+    return torch.where(length > 0, extinction_per_m * length, 0)  # infinity times no way is none
 
 
 def _own_pixel(outer: Camera, inner: Camera, dtype: torch.dtype) -> tuple[Tensor, Tensor]:

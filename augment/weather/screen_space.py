@@ -58,15 +58,22 @@ class ScreenReflection:
 
 
 def trace_screen(
-    front: Layer, camera: Camera, level_z_m: float, *, stride: int = 2, fast: bool = True
+    front: Layer,
+    camera: Camera,
+    level_z_m: float,
+    *,
+    needed: Bool[Tensor, "h w"] | None = None,
+    stride: int = 2,
+    fast: bool = True,
 ) -> ScreenReflection:
     """What the mirrored rays of the flat surface z = level_z_m meet, for the pixels of `camera`.
 
     front: what stands above the water, over the whole image. camera: a window of that image (same
-    eye, same pixels), which may reach beyond it. Pixels that the front covers, or whose own ray
-    does not meet the water, have weight 0. So have rays that leave the image, come back to the
-    camera's plane, or are lost behind something that is thinner than the way behind it. The weight
-    falls to 0 over the outer 4 % of the image.
+    eye, same pixels), which may reach beyond it. needed: the pixels to trace, best those that
+    `water_surface.is_smooth` names; None for all. The others, those that the front covers, and
+    those whose own ray does not meet the water have weight 0. So have rays that leave the image,
+    come back to the camera's plane, or are lost behind something that is thinner than the way
+    behind it. The weight falls to 0 over the outer 4 % of the image.
 
     fast: through the CPU kernels, equal to this definition but for rays that pass a silhouette's
     pixel by its corner. They trace every `stride`-th pixel of rows and columns (1, 2 or 4),
@@ -81,8 +88,15 @@ def trace_screen(
     if float(camera.centre[2]) <= level_z_m:
         distance = torch.full((camera.height, camera.width), math.inf)
         return ScreenReflection(front, distance, torch.zeros_like(distance))
+    if needed is None:
+        needed = torch.ones(camera.height, camera.width, dtype=torch.bool)
+    elif tuple(needed.shape) != (camera.height, camera.width):
+        raise ValueError(
+            f"needed must be [{camera.height}, {camera.width}] as camera {camera.name!r} is; "
+            f"got {list(needed.shape)}"
+        )
     run = _trace_fast if fast else _trace
-    distance, weight = run(front, camera, level_z_m, left, top, stride)
+    distance, weight = run(front, camera, level_z_m, left, top, stride, needed)
     return ScreenReflection(front, distance, weight)
 
 
@@ -113,11 +127,18 @@ def _vertical(camera: Camera, level_z_m: float) -> tuple[list[float], list[float
 
 
 def _trace_fast(
-    front: Layer, camera: Camera, level_z_m: float, left: int, top: int, stride: int
+    front: Layer,
+    camera: Camera,
+    level_z_m: float,
+    left: int,
+    top: int,
+    stride: int,
+    needed: Bool[Tensor, "h w"],
 ) -> tuple[Tensor, Tensor]:
     whole = front.camera
     up, image, eye_height_m = _vertical(whole, level_z_m)
     alpha = front.alpha.detach().contiguous().numpy()
+    asked = needed.contiguous().numpy()
     block = kernels.BLOCK
     high, wide = (-(-size // block) * block for size in (whole.height, whole.width))
     pyramid = np.empty((high, wide + wide // 4), np.float32)
@@ -129,8 +150,10 @@ def _trace_fast(
     distance, weight = np.empty((2, camera.height, camera.width), np.float32)
     with kernel_threads(ROWS):
         kernels.build_pyramid(alpha, front.depth.detach().contiguous().numpy(), pyramid)
-        kernels.trace(pyramid, view, alpha, left, top, stride, ways, trust)
-        kernels.spread(pyramid, view, alpha, left, top, stride, ways, trust, distance, weight)
+        kernels.trace(pyramid, view, alpha, asked, left, top, stride, ways, trust)
+        kernels.spread(
+            pyramid, view, alpha, asked, left, top, stride, ways, trust, distance, weight
+        )
     return torch.from_numpy(distance), torch.from_numpy(weight)
 
 
@@ -183,7 +206,13 @@ def _mirrored_rays(camera: Camera, level_z_m: float, x: Tensor, y: Tensor) -> _R
 
 
 def _trace(
-    front: Layer, camera: Camera, level_z_m: float, left: int, top: int, stride: int
+    front: Layer,
+    camera: Camera,
+    level_z_m: float,
+    left: int,
+    top: int,
+    stride: int,
+    needed: Bool[Tensor, "h w"],
 ) -> tuple[Tensor, Tensor]:
     """The definition: every pixel, in small steps. `stride` is the kernel's affair."""
     whole = front.camera
@@ -193,7 +222,7 @@ def _trace(
     inside = (row >= 0) & (row < whole.height) & (column >= 0) & (column < whole.width)
     cover = torch.ones(row.shape, dtype=front.alpha.dtype)
     cover[inside] = front.alpha.detach()[row[inside], column[inside]]
-    asked = (cover < COVERED) & (camera.ray_directions(torch.float64)[..., 2] < 0)
+    asked = needed & (cover < COVERED) & (camera.ray_directions(torch.float64)[..., 2] < 0)
     x, y = column[asked].double() + 0.5, row[asked].double() + 0.5
     rays = _mirrored_rays(whole, level_z_m, x, y)
     solid = torch.where(front.alpha.detach() >= 0.5, 1 / front.depth.detach().double(), 0.0)

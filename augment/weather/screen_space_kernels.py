@@ -324,8 +324,8 @@ def _inside(alpha, column, row):
 
 
 @kernel
-def trace(pyramid, view, alpha, left, top, stride, ways, weights):
-    """Ways (in |x|) and weights of every `stride`-th pixel; weight -1 where no water shows."""
+def trace(pyramid, view, alpha, needed, left, top, stride, ways, weights):
+    """Ways (in |x|) and weights of every `stride`-th pixel; weight -1 where none is needed."""
     columns = ways.shape[1]
     for i in numba.prange(ways.shape[0]):
         lanes = np.empty(88, np.float32)
@@ -335,7 +335,7 @@ def trace(pyramid, view, alpha, left, top, stride, ways, weights):
             column = left + j * stride
             ways[i, j] = _INFINITE
             weights[i, j] = _ZERO
-            if not _sees_water(view, alpha, column, row):
+            if not (needed[i * stride, j * stride] and _sees_water(view, alpha, column, row)):
                 weights[i, j] = -_ONE
             elif _inside(alpha, column, row):
                 lists[0, count] = np.float32(column) + _HALF
@@ -349,8 +349,8 @@ def trace(pyramid, view, alpha, left, top, stride, ways, weights):
 
 
 @inner()
-def _to_metres(view, alpha, column, row, distance, weight):
-    """A row of ways (in |x|) becomes metres; pixels that show no water get no weight."""
+def _to_metres(view, alpha, needed, column, row, distance, weight):
+    """A row of ways (in |x|) becomes metres; only needed pixels that show water get a weight."""
     v = (np.float32(row) + _HALF - view[9]) / view[7]
     vv, slope_v = _ONE + v * v, v * view[1] + view[2]
     inside = 0 <= row < alpha.shape[0]
@@ -358,14 +358,14 @@ def _to_metres(view, alpha, column, row, distance, weight):
         u = (np.float32(column + j) + _HALF - view[8]) / view[6]
         slope = u * view[0] + slope_v
         covered = inside and 0 <= column + j < alpha.shape[1] and alpha[row, column + j] >= COVERED
-        hidden = slope >= _ZERO or covered
+        hidden = slope >= _ZERO or covered or not needed[j] or weight[j] < _ZERO
         r = math.sqrt(vv + u * u) * view[10] / -slope
         distance[j] = _INFINITE if hidden else distance[j] * r
         weight[j] = _ZERO if hidden else weight[j]
 
 
 @kernel
-def spread(pyramid, view, alpha, left, top, stride, ways, weights, distance, weight):
+def spread(pyramid, view, alpha, needed, left, top, stride, ways, weights, distance, weight):
     """Metres and weights of all pixels; the four traced around a pixel speak for it if they agree.
 
     Where they do not, at silhouettes and beside covered pixels, the pixel is traced itself.
@@ -408,7 +408,8 @@ def spread(pyramid, view, alpha, left, top, stride, ways, weights, distance, wei
                     column, row = left + x0 + dj, top + y0 + di
                     if di > 0 or dj > 0:
                         way, trust = _INFINITE, _ZERO
-                        if _inside(alpha, column, row) and _sees_water(view, alpha, column, row):
+                        asked = needed[y0 + di, x0 + dj] and _inside(alpha, column, row)
+                        if asked and _sees_water(view, alpha, column, row):
                             lists[0, count] = np.float32(column) + _HALF
                             lists[1, count] = np.float32(row) + _HALF
                             count += 1
@@ -420,4 +421,4 @@ def spread(pyramid, view, alpha, left, top, stride, ways, weights, distance, wei
             distance[y, x] = lists[2, n]
             weight[y, x] = lists[3, n]
         for y in range(y0, y0 + deep):
-            _to_metres(view, alpha, left, top + y, distance[y], weight[y])
+            _to_metres(view, alpha, needed[y], left, top + y, distance[y], weight[y])

@@ -18,6 +18,7 @@ from augment.weather import water_launch
 from augment.weather.flood import FloodMedium, Layer
 from augment.weather.fresnel import reflectance
 from augment.weather.reflection_lookup import (
+    before_sky,
     mirrored_eye_is,
     reflect_mirror,
     reflect_screen,
@@ -29,6 +30,7 @@ from augment.weather.smog import SmogMedium
 from augment.weather.water_surface import (
     LEAST_COSINE,
     Surface,
+    is_smooth,
     meet_plane,
     mirrored,
     tilted_normals,
@@ -55,9 +57,11 @@ def shade_water(
 
     camera: above the water. cover: alpha of what stands before the water; where it hides the water
     the result is 0. field: of this camera. bed: from a window of the same image, best a larger one.
-    mirror: from the eye mirrored in the plane. screen: its layer is of the same eye. Layers are
-    fogged already; smog here dims the sky and the water's own colour. fast: float32 goes through
-    the CPU kernel, equal to this definition within float rounding, unless gradients are recorded.
+    mirror: from the eye mirrored in the plane. screen: its layer is of the same eye; it serves the
+    pixels that are smooth (`water_surface.is_smooth`), in the others' blur a coarse mirror is as
+    sharp. Layers are fogged already; smog here dims the sky and the water's own colour. fast:
+    float32 goes through the CPU kernel, equal to this definition within float rounding, unless
+    gradients are recorded.
 
     Raises:
         ValueError: the eye is not above the water, or cameras, images and fields do not fit.
@@ -77,20 +81,21 @@ def shade_water(
             camera, cover, HIDDEN_COVER, medium, field, bed, mirror, screen, sky, smog
         )
     surface = meet_plane(camera, medium.level_z_m, bed.rgb.dtype)
-    taps = tilted_normals(surface, field)
+    smooth = is_smooth(field, camera)
+    taps = tilted_normals(surface, field, smooth)
     below = through_the_surface(surface, taps[0][1], camera, medium, bed, smog)
     out = below
     if medium.refraction_index != 1:
         rays = [mirrored(surface.to_eye, normal) for _, normal in taps]
         above = reflect_sky(surface, rays, camera, medium.level_z_m, sky, smog)
-        colors = above
+        seen = [torch.zeros_like(below[..., :1]).expand(*cover.shape, 4)] * len(taps)
         if mirror is not None:
-            colors = reflect_mirror(surface, rays, mirror, above)
+            seen = reflect_mirror(surface, rays, mirror, smooth)
         if screen is not None:
-            colors = reflect_screen(surface, rays, screen, above, colors)
-        for (weight, normal), color in zip(taps, colors, strict=True):
+            seen = [reflect_screen(surface, rays[0], screen, smooth, seen[0]), *seen[1:]]
+        for (weight, normal), color, behind in zip(taps, seen, above, strict=True):
             share = weight * reflected_share(surface, normal, medium)
-            out = out + share[..., None] * (color - below)
+            out = out + share[..., None] * (before_sky(color, behind) - below)
     shown = surface.meets & (cover <= HIDDEN_COVER)
     return torch.where(shown[..., None], out, 0)
 

@@ -1,51 +1,50 @@
 """Numba kernels for a water surface: what `water.shade_water` defines.
 
-The pixels of a row that show water are worked on in strips, stage by stage: loops that compute, and
-that a compiler can vectorise, take turns with loops that look pixels up, whose waits overlap. What
-a stage leaves for the next stands in scratch memory, one line of `STRIP` numbers for each quantity.
-Everything is float32 but the rays' directions, whose sign decides where there is water and whose
-small downward part the distance to it is divided by. Indices are unsigned, so that nothing wraps.
+The pixels of a row that show water are collected in two lists, smooth and rough ones, and worked on
+eight at a time: what a list's pixels need differs (rough ones: three slopes and averages over
+squares of pixels; smooth ones: the image itself), and what none of the eight needs is left out.
+Coordinates and colours are vectors of eight; looking pixels up is done one by one, through scratch
+memory, which holds lines of eight numbers. All is float32 but the rays' directions, whose sign
+decides where there is water and whose small downward part the distance to it is divided by.
+Indices are unsigned, so that nothing wraps.
 """
+
+# pyright: reportCallIssue=false, reportGeneralTypeIssues=false, reportAttributeAccessIssue=false
+# (of numba's intrinsics it sees the compiler's first argument as well, and no result)
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numba
 import numpy as np
+from llvmlite import ir
+from numba.core import types
+from numba.extending import intrinsic
 
 from augment.render import cpu_simd as v8
 from augment.render.cpu_jit import inner, kernel
-from augment.render.cpu_math import LOG2_E, exp2_fine
+from augment.render.cpu_math import LOG2_E, exp2_fine, log2
 
 F = np.float32
 U = np.uint64
-ZERO, HALF, ONE, TWO = F(0), F(0.5), F(1), F(2)
-NOTHING = F(-1)  # a distance at which nothing is met
-STRIP = 128
-N = U(STRIP)
+ZERO, HALF, ONE = F(0), F(0.5), F(1)
+TINY = F(1e-7)
+STRIP = 64  # pixels of a list that are worked on at a time
+LANES = U(8)
+EIGHTS = ~U(7)  # a number's multiple of eight
 
+# Lines of a list, one number a pixel: the ray and how far the water is along it, the surface's
+# normal and slope variance, the depth of the bed straight behind (-1: none), the screen-space ray's
+# length and weight.
+DX, DY, DZ, ALONG, NX, NY, ROUGH, OWN_DEPTH, DISTANCE, TRUST = (U(STRIP * k) for k in range(10))
+LIST = U(STRIP * 10)
 
-def _lines(first, count):
-    return tuple(U(STRIP * line) for line in range(first, first + count))
-
-
-# Lines of the scratch memory. Points where the rays meet the water, rays to the eye, slopes and
-# normals of the surface, cosines in air and water, smog before the water.
-PX, PY, VX, VY, VZ, DX, DY, DZ, ALONG, SX, SY, SPREAD, ROUGH, NX, NY, NZ, COS, IN, NEAR = _lines(
-    0, 19
-)
-# The water's own colour; the bed: refracted ray per metre of depth and its length, depths, colour.
-WR, WG, WB, TX, TY, STEEP, DEPTH, OWN_DEPTH, FOUND, BR, BG, BB, BA = _lines(19, 13)
-# Place and find of a look-up.
-COLUMN, ROW, ALPHA, FAR, VALUE_R, VALUE_G, VALUE_B, VALUE_A = _lines(32, 8)
-# Reflection: the flat mirror's distance, the ray and its share, the levels of averages, the result.
-FIRST, LEVEL, FRONT_LEVEL, DISTANCE, WEIGHT, SUM_R, SUM_G, SUM_B = _lines(40, 8)
-SKY_R, SKY_G, SKY_B, REFLECTED_R, REFLECTED_G, REFLECTED_B, EXP = _lines(48, 7)
-# Three of each, for three slopes: mirrored ray, share, place in the mirror and in the image.
-RX, RY, RZ, SHARE, MIRROR_C, MIRROR_R, FRONT_C, FRONT_R, FRONT_W = _lines(55, 27)[::3]
-SCRATCH = 82 * STRIP
+# Lines of the scratch memory. Look-ups: place, level, colour; for each of three slopes the mirrored
+# ray, its share of the light and its place in the mirror.
+COLUMN, ROW, LEVEL, FOUND, R, G, B, A = (U(8 * k) for k in range(8))
+RX, RY, RZ, SHARE, MIRROR_C, MIRROR_R = (U(64 + 24 * k) for k in range(6))
+SCRATCH = 64 + 24 * 6
 
 
 class View(NamedTuple):
@@ -72,7 +71,7 @@ class Medium(NamedTuple):
 
     height: of the eye over the water. smog_per_m: optical depth between eye and water per metre of
     the ray, 0 without smog. smog_above: from the water straight up, < 0 where the sky is seen
-    clearly (or replaced by the airlight already).
+    clearly (or replaced by the airlight already). least_extinction: of the three.
     """
 
     height: np.float32
@@ -83,6 +82,7 @@ class Medium(NamedTuple):
     smog_per_m: np.float32
     smog_above: np.float32
     airlight: tuple[np.float32, ...]
+    least_extinction: np.float32
 
 
 class Limits(NamedTuple):
@@ -99,6 +99,9 @@ class Limits(NamedTuple):
     edge: np.float32
     match_m: np.float32
     match_share: np.float32
+    settled_m: np.float32
+    opaque: np.float32
+    faint: np.float32
 
 
 @inner()
@@ -112,32 +115,99 @@ def _view(n):
 @inner()
 def _medium(n):
     extinction, rgb, airlight = (n[3], n[4], n[5]), (n[6], n[7], n[8]), (n[11], n[12], n[13])
-    return Medium(n[0], n[1], n[2] > ZERO, extinction, rgb, n[9], n[10], airlight)
+    least = min(n[3], min(n[4], n[5]))
+    return Medium(n[0], n[1], n[2] > ZERO, extinction, rgb, n[9], n[10], airlight, least)
 
 
 @inner()
 def _limits(n):
-    return Limits(n[0], n[1], n[2], n[3], n[4], n[5], n[6], np.int64(n[7]), n[8], n[9], n[10])
+    return Limits(
+        n[0], n[1], n[2], n[3], n[4], n[5], n[6], np.int64(n[7]), n[8], n[9], n[10], n[11], n[12],
+        n[13],
+    )  # fmt: skip
 
 
-@inner()
-def _real(count):
-    return F(np.int32(count))  # from 64 unsigned bits it takes several instructions
+def _mixture(channels: int):
+    """A function: sum of four pixels of a flat image times four weights, channel by channel."""
+
+    @intrinsic
+    def mix(typingctx, image, a, b, c, d, wa, wb, wc, wd):
+        def codegen(context, builder, sig, args):
+            data = context.make_array(sig.args[0])(context, builder, args[0]).data
+            number, real, wide = ir.IntType(32), ir.FloatType(), ir.IntType(64)
+            two, four = ir.VectorType(real, 2), ir.VectorType(real, 4)
+            spread = ir.Constant(ir.VectorType(number, 4), [0, 0, 0, 0])
+            nothing = ir.Constant(four, ir.Undefined)
+            parts = []
+            for index, weight in zip(args[1:5], args[5:], strict=True):
+                at = builder.gep(data, [builder.mul(index, wide(channels))])
+                if channels == 4:
+                    pixel = builder.load(builder.bitcast(at, four.as_pointer()), align=4)
+                else:  # a fourth number would lie beyond the last pixel
+                    pair = builder.load(builder.bitcast(at, two.as_pointer()), align=4)
+                    order = ir.Constant(ir.VectorType(number, 4), [0, 1, 0, 1])
+                    pixel = builder.shuffle_vector(pair, pair, order)
+                    third = builder.load(builder.gep(at, [wide(2)]))
+                    pixel = builder.insert_element(pixel, third, number(2))
+                weights = builder.insert_element(nothing, weight, number(0))
+                weights = builder.shuffle_vector(weights, nothing, spread)
+                parts.append(builder.fmul(pixel, weights))
+            top, bottom = builder.fadd(*parts[:2]), builder.fadd(*parts[2:])
+            total = builder.fadd(top, bottom)
+            values = [builder.extract_element(total, number(k)) for k in range(channels)]
+            return context.make_tuple(builder, sig.return_type, values)
+
+        result = types.UniTuple(types.float32, channels)
+        return result(image, *[types.uint64] * 4, *[types.float32] * 4), codegen
+
+    return mix
 
 
-@inner()
-def _project(view, x, y, z, least_depth):
-    m = view.project
-    depth = max(m[6] * x + m[7] * y + m[8] * z, least_depth)
-    inverse = ONE / depth
-    column = (m[0] * x + m[1] * y + m[2] * z) * inverse + view.cx
-    row = (m[3] * x + m[4] * y + m[5] * z) * inverse + view.cy
-    return column, row
+_mix3, _mix4 = _mixture(3), _mixture(4)
+
+
+@intrinsic
+def _pixels(typingctx, alpha, depth, row, column, width):
+    """Two flat images at eight whole rows and columns inside them."""
+
+    def codegen(context, builder, sig, args):
+        number, wide = ir.IntType(32), ir.IntType(64)
+        whole = ir.VectorType(number, v8.LANES)
+        rows, columns = (builder.fptosi(arg, whole) for arg in args[2:4])
+        found = [ir.Constant(ir.VectorType(ir.FloatType(), v8.LANES), ir.Undefined)] * 2
+        arrays = [
+            context.make_array(kind)(context, builder, array).data
+            for kind, array in zip(sig.args[:2], args[:2], strict=True)
+        ]
+        for lane in range(v8.LANES):
+            r, c = (builder.extract_element(part, number(lane)) for part in (rows, columns))
+            at = builder.add(builder.mul(builder.zext(r, wide), args[4]), builder.zext(c, wide))
+            for k, array in enumerate(arrays):
+                value = builder.load(builder.gep(array, [at]))
+                found[k] = builder.insert_element(found[k], value, number(lane))
+        return context.make_tuple(builder, sig.return_type, found)
+
+    result = types.UniTuple(v8.float8, 2)
+    return result(alpha, depth, v8.float8, v8.float8, types.uint64), codegen
 
 
 @inner()
 def _clamp(x, low, high):
-    return min(max(x, low), high)
+    return v8.minimum(v8.maximum(x, v8.splat(low)), v8.splat(high))
+
+
+@inner()
+def _dot(m, first, x, y, z):
+    return v8.splat(m[first]) * x + v8.splat(m[first + 1]) * y + v8.splat(m[first + 2]) * z
+
+
+@inner()
+def _project(view, x, y, z, limits):
+    m = view.project
+    depth = v8.maximum(_dot(m, 6, x, y, z), v8.splat(limits.least_depth))
+    inverse = v8.splat(ONE) / depth
+    column = _dot(m, 0, x, y, z) * inverse + v8.splat(view.cx)
+    return column, _dot(m, 3, x, y, z) * inverse + v8.splat(view.cy)
 
 
 @inner()
@@ -148,90 +218,103 @@ def _clamp_to(view, column, row):
 
 @inner()
 def _is_inside(view, column, row):
-    across = column >= ZERO and column < view.columns
-    return across and row >= ZERO and row < view.rows
+    zero = v8.splat(ZERO)
+    across = v8.both(v8.at_least(column, zero), v8.greater(v8.splat(view.columns), column))
+    down = v8.both(v8.at_least(row, zero), v8.greater(v8.splat(view.rows), row))
+    return v8.both(across, down)
 
 
 @inner()
-def _whole(x):
-    return U(np.int32(x))
+def _look(alpha, depth, view, column, row):
+    """Alpha and depth of the nearest pixels inside, and their centres."""
+    column = v8.floor(_clamp(column, ZERO, view.columns - ONE))
+    row = v8.floor(_clamp(row, ZERO, view.rows - ONE))
+    a, z = _pixels(alpha, depth, row, column, view.width)
+    half = v8.splat(HALF)
+    return a, z, column + half, row + half
 
 
 @inner()
-def _height_of_ray(view, column, row):
-    return view.rays[6] * column + view.rays[7] * row + view.rays[8]
-
-
-@inner()
-def _point(view, z, column, row):
-    """The point that a pixel shows, relative to the layer's eye."""
+def _ray_part(view, first, column, row):
     m = view.rays
-    x = m[0] * column + m[1] * row + m[2]
-    y = m[3] * column + m[4] * row + m[5]
-    return z * x, z * y, z * _height_of_ray(view, column, row)
+    return v8.splat(m[first]) * column + v8.splat(m[first + 1]) * row + v8.splat(m[first + 2])
+
+
+@inner()
+def _way(view, z, column, row, x0, y0, z0):
+    """How far the points that pixels show (relative to the layer's eye) are from others."""
+    x = z * _ray_part(view, 0, column, row) - x0
+    y = z * _ray_part(view, 3, column, row) - y0
+    z = z * _ray_part(view, 6, column, row) - z0
+    return v8.sqrt(x * x + y * y + z * z)
+
+
+@inner()
+def _end(px, py, pz, distance, rx, ry, rz):
+    """Where rays end, and their directions where that is nowhere (a distance < 0)."""
+    met = v8.at_least(distance, v8.splat(ZERO))
+    x, y = v8.select(met, px + distance * rx, rx), v8.select(met, py + distance * ry, ry)
+    return x, y, v8.select(met, pz + distance * rz, rz)
+
+
+@inner()
+def _any(mask):
+    return v8.any_not_negative(v8.select(mask, v8.splat(ONE), v8.splat(-ONE)))
+
+
+@inner()
+def _exponential(x):
+    """exp(-x) for x >= 0."""
+    return exp2_fine(v8.maximum(x * v8.splat(-LOG2_E), v8.splat(F(-126))))
+
+
+@inner()
+def _real(count):
+    return F(np.int32(count))  # from 64 unsigned bits it takes several instructions
 
 
 @inner()
 def _corners(column, row, width, height):
-    """Indices of the four pixels round a coordinate, and how far it lies between them."""
-    x = _clamp(column - HALF, ZERO, _real(width) - ONE)
-    y = _clamp(row - HALF, ZERO, _real(height) - ONE)
-    c0, r0 = _whole(x), _whole(y)
+    """Indices of the four pixels round a coordinate, and their weights."""
+    x = min(max(column - HALF, ZERO), _real(width) - ONE)
+    y = min(max(row - HALF, ZERO), _real(height) - ONE)
+    c0, r0 = U(np.int32(x)), U(np.int32(y))
     c1, r1 = min(c0 + U(1), width - U(1)), min(r0 + U(1), height - U(1))
     top, bottom = r0 * width, r1 * width
     fc, fr = x - _real(c0), y - _real(r0)
-    return top + c0, top + c1, bottom + c0, bottom + c1, fc, fr
-
-
-@inner()
-def _mix(a, b, c, d, wa, wb, wc, wd):
-    return (a * wa + b * wb) + (c * wc + d * wd)
-
-
-@inner()
-def _bilinear(v, alphas, view, column, row):
-    a, b, c, d, fc, fr = _corners(column, row, view.width, view.height)
     gc, gr = ONE - fc, ONE - fr
-    wa, wb, wc, wd = gc * gr, fc * gr, gc * fr, fc * fr
-    alpha = _mix(alphas[a], alphas[b], alphas[c], alphas[d], wa, wb, wc, wd)
-    a, b, c, d = U(3) * a, U(3) * b, U(3) * c, U(3) * d
-    red = _mix(v[a], v[b], v[c], v[d], wa, wb, wc, wd)
-    one, two = U(1), U(2)
-    green = _mix(v[a + one], v[b + one], v[c + one], v[d + one], wa, wb, wc, wd)
-    blue = _mix(v[a + two], v[b + two], v[c + two], v[d + two], wa, wb, wc, wd)
-    return red, green, blue, alpha
+    return (
+        top + c0, top + c1, bottom + c0, bottom + c1, gc * gr, fc * gr, gc * fr, fc * fr,
+    )  # fmt: skip
+
+
+@inner()
+def _bilinear(rgb, alpha, view, column, row):
+    a, b, c, d, wa, wb, wc, wd = _corners(column, row, view.width, view.height)
+    red, green, blue = _mix3(rgb, a, b, c, d, wa, wb, wc, wd)
+    opaque = (alpha[a] * wa + alpha[b] * wb) + (alpha[c] * wc + alpha[d] * wd)
+    return red, green, blue, opaque
 
 
 @inner()
 def _mip(v, sizes, level, column, row):
     first, width, height = sizes[level, U(0)], sizes[level, U(1)], sizes[level, U(2)]
     scale = ONE / _real(U(1) << level)
-    a, b, c, d, fc, fr = _corners(column * scale, row * scale, width, height)
-    a, b, c, d = U(4) * (first + a), U(4) * (first + b), U(4) * (first + c), U(4) * (first + d)
-    gc, gr = ONE - fc, ONE - fr
-    wa, wb, wc, wd = gc * gr, fc * gr, gc * fr, fc * fr
-    one, two, three = U(1), U(2), U(3)
-    return (
-        _mix(v[a], v[b], v[c], v[d], wa, wb, wc, wd),
-        _mix(v[a + one], v[b + one], v[c + one], v[d + one], wa, wb, wc, wd),
-        _mix(v[a + two], v[b + two], v[c + two], v[d + two], wa, wb, wc, wd),
-        _mix(v[a + three], v[b + three], v[c + three], v[d + three], wa, wb, wc, wd),
-    )
+    a, b, c, d, wa, wb, wc, wd = _corners(column * scale, row * scale, width, height)
+    return _mix4(v, first + a, first + b, first + c, first + d, wa, wb, wc, wd)
 
 
 @inner()
-def _fetch(rgb, alpha, view, mips, sizes, column, row, level):
+def _blurred(rgb, alpha, view, mips, sizes, column, row, level):
     """Colour and alpha at a coordinate; level: of the averages, 0 for the image itself."""
-    if not level > ZERO:
-        return _bilinear(rgb, alpha, view, column, row)
-    low = _whole(level)
+    low = U(np.int32(level))
     share = level - _real(low)
-    keep = ONE - share
     if low == U(0):
         r, g, b, a = _bilinear(rgb, alpha, view, column, row)
     else:
         r, g, b, a = _mip(mips, sizes, low, column, row)
     if share > ZERO:
+        keep = ONE - share
         r1, g1, b1, a1 = _mip(mips, sizes, low + U(1), column, row)
         r, g, b = keep * r + share * r1, keep * g + share * g1, keep * b + share * b1
         a = keep * a + share * a1
@@ -239,482 +322,454 @@ def _fetch(rgb, alpha, view, mips, sizes, column, row, level):
 
 
 @inner()
+def _fetched(s):
+    return v8.load(s, R), v8.load(s, G), v8.load(s, B), v8.load(s, A)
+
+
+@inner()
+def _fetch(s, column, row, rgb, alpha, view):
+    v8.store(s, COLUMN, column)
+    v8.store(s, ROW, row)
+    for k in range(LANES):
+        r, g, b, a = _bilinear(rgb, alpha, view, s[COLUMN + k], s[ROW + k])
+        s[R + k], s[G + k], s[B + k], s[A + k] = r, g, b, a
+    return _fetched(s)
+
+
+@inner()
+def _fetch_blurred(s, t, rgb, alpha, view, mips, sizes):
+    for k in range(LANES):
+        column, row = s[MIRROR_C + t + k], s[MIRROR_R + t + k]
+        r, g, b, a = _blurred(rgb, alpha, view, mips, sizes, column, row, s[LEVEL + k])
+        s[R + k], s[G + k], s[B + k], s[A + k] = r, g, b, a
+    return _fetched(s)
+
+
+@inner()
+def _sky(s, faces, size, x, y, z, near, medium):
+    """Colours of a cube map, flat [6, size, size, 4], in directions that climb, behind smog."""
+    zero = v8.splat(ZERO)
+    ax, ay = v8.absolute(x), v8.absolute(y)
+    by_x = v8.both(v8.at_least(ax, ay), v8.at_least(ax, z))
+    by_y = v8.at_least(ay, z)
+    major = v8.select(by_x, ax, v8.select(by_y, ay, z))
+    right, ahead = v8.at_least(x, zero), v8.at_least(y, zero)
+    across = v8.select(by_x, v8.select(right, v8.negate(z), z), x)
+    turned = v8.select(v8.both(by_y, ahead), z, v8.select(by_y, v8.negate(z), v8.negate(y)))
+    down = v8.select(by_x, v8.negate(y), turned)
+    face = v8.select(by_y, v8.select(ahead, v8.splat(F(2)), v8.splat(F(3))), v8.splat(F(4)))
+    face = v8.select(by_x, v8.select(right, zero, v8.splat(ONE)), face)
+    scale = v8.splat(HALF * _real(size))
+    inverse = scale / major
+    v8.store(s, COLUMN, across * inverse + scale)
+    v8.store(s, ROW, down * inverse + scale)
+    v8.store(s, FOUND, face)
+    for k in range(LANES):
+        a, b, c, d, wa, wb, wc, wd = _corners(s[COLUMN + k], s[ROW + k], size, size)
+        first = U(np.int32(s[FOUND + k])) * size * size
+        r, g, b, a = _mix4(faces, first + a, first + b, first + c, first + d, wa, wb, wc, wd)
+        s[R + k], s[G + k], s[B + k] = r, g, b
+    r, g, b = v8.load(s, R), v8.load(s, G), v8.load(s, B)
+    if medium.smog_above >= ZERO:
+        t = _exponential(near + v8.splat(medium.smog_above) / z)
+        rest, fog = v8.splat(ONE) - t, medium.airlight
+        r = t * r + rest * v8.splat(fog[0])
+        g = t * g + rest * v8.splat(fog[1])
+        b = t * b + rest * v8.splat(fog[2])
+    return r, g, b
+
+
+@inner()
 def _reflectance(c, inside, medium):
     """Share of reflected light. c, inside: cosines in the air and in the water."""
-    n = medium.index
+    one, n = v8.splat(ONE), v8.splat(medium.index)
     if medium.schlick:
-        base = (n - ONE) / (n + ONE)
+        base = (n - one) / (n + one)
         base = base * base
-        x = ONE - c
-        return base + (ONE - base) * ((x * x) * (x * x) * x)
+        x = one - c
+        return base + (one - base) * ((x * x) * (x * x) * x)
     a, b = c - n * inside, c + n * inside
     d, e = n * c - inside, n * c + inside
-    quotient = ONE / (b * e)
+    quotient = one / (b * e)
     rs, rp = a * e * quotient, d * b * quotient
-    return HALF * (rs * rs + rp * rp)
+    return v8.splat(HALF) * (rs * rs + rp * rp)
 
 
 @inner()
-def _cosine_inside(c, medium):
-    inverse = ONE / medium.index
-    return math.sqrt(max(ONE - (ONE - c * c) * inverse * inverse, ZERO))
+def _facet(sx, sy, vx, vy, vz, medium, limits):
+    """Of facets with these slopes: normals, cosines in air and water, reflected share, rays."""
+    one, least = v8.splat(ONE), v8.splat(limits.least_cosine)
+    nz = one / v8.sqrt(sx * sx + sy * sy + one)
+    nx, ny = sx * nz, sy * nz
+    cosine = nx * vx + ny * vy + nz * vz
+    c = v8.minimum(v8.maximum(cosine, least), one)
+    inverse = v8.splat(ONE / medium.index)
+    inside = v8.sqrt(v8.maximum(one - (one - c * c) * inverse * inverse, v8.splat(ZERO)))
+    twice = cosine + cosine
+    x, y = twice * nx - vx, twice * ny - vy
+    z = v8.maximum(twice * nz - vz, least)
+    unit = one / v8.sqrt(x * x + y * y + z * z)
+    share = _reflectance(c, inside, medium)
+    return nx, ny, nz, c, inside, share, x * unit, y * unit, z * unit
 
 
 @inner()
-def _sky(v, size, x, y, z):
-    """Bilinear from a cube map, flat [6, size, size, 3]."""
-    ax, ay, az = abs(x), abs(y), abs(z)
-    if ax >= ay and ax >= az:
-        major, t = ax, -y
-        face = U(0) if x >= ZERO else U(1)
-        s = -z if x >= ZERO else z
-    elif ay >= az:
-        major, s = ay, x
-        face = U(2) if y >= ZERO else U(3)
-        t = z if y >= ZERO else -z
-    else:
-        major, t = az, -y
-        face = U(4) if z >= ZERO else U(5)
-        s = x if z >= ZERO else -x
-    scale = HALF * _real(size)
-    inverse = scale / major
-    a, b, c, d, fc, fr = _corners(s * inverse + scale, t * inverse + scale, size, size)
-    first = face * size * size
-    a, b, c, d = U(3) * (first + a), U(3) * (first + b), U(3) * (first + c), U(3) * (first + d)
-    gc, gr = ONE - fc, ONE - fr
-    wa, wb, wc, wd = gc * gr, fc * gr, gc * fr, fc * fr
-    one, two = U(1), U(2)
-    return (
-        _mix(v[a], v[b], v[c], v[d], wa, wb, wc, wd),
-        _mix(v[a + one], v[b + one], v[c + one], v[d + one], wa, wb, wc, wd),
-        _mix(v[a + two], v[b + two], v[c + two], v[d + two], wa, wb, wc, wd),
-    )
-
-
-@inner()
-def _surface(s, n, medium, limits):
-    """Points, views and slopes from rays, distances and normals; smog before the water."""
-    for k in range(n):
-        dx, dy, dz = s[DX + k], s[DY + k], s[DZ + k]
-        along = s[ALONG + k]
-        s[PX + k], s[PY + k] = along * dx, along * dy
-        length = math.sqrt(dx * dx + dy * dy + dz * dz)
-        inverse = ONE / length
-        vx, vy = -dx * inverse, -dy * inverse
-        s[VX + k], s[VY + k], s[VZ + k] = vx, vy, -dz * inverse
-        s[NEAR + k] = medium.smog_per_m * along * length
-        nx, ny = s[NX + k], s[NY + k]
-        upright = ONE / math.sqrt(max(ONE - nx * nx - ny * ny, limits.steepest))
-        s[SX + k], s[SY + k] = nx * upright, ny * upright
-        flat = max(math.sqrt(vx * vx + vy * vy), F(1e-12))
-        s[SPREAD + k] = math.sqrt(F(3) * max(s[ROUGH + k], ZERO)) / flat
-
-
-@inner()
-def _tap(s, n, t, sign, weight, alone, medium, limits):
-    """Mirrored rays and their shares of a pixel's light for one of its slopes.
-
-    weight, alone: of this slope where the surface is rough and where it is not.
-    """
-    for k in range(n):
-        vx, vy, vz = s[VX + k], s[VY + k], s[VZ + k]
-        rough = s[ROUGH + k] > ZERO
-        spread = sign * s[SPREAD + k] if rough else ZERO
-        sx, sy = s[SX + k] + spread * vx, s[SY + k] + spread * vy
-        inverse = ONE / math.sqrt(sx * sx + sy * sy + ONE)
-        nx, ny, nz = sx * inverse, sy * inverse, inverse
-        cosine = nx * vx + ny * vy + nz * vz
-        c = _clamp(cosine, limits.least_cosine, ONE)
-        inside = _cosine_inside(c, medium)
-        s[NX + k], s[NY + k], s[NZ + k], s[COS + k], s[IN + k] = nx, ny, nz, c, inside
-        twice = TWO * cosine
-        x, y = twice * nx - vx, twice * ny - vy
-        z = max(twice * nz - vz, limits.least_cosine)
-        inverse = ONE / math.sqrt(x * x + y * y + z * z)
-        s[RX + t + k], s[RY + t + k], s[RZ + t + k] = x * inverse, y * inverse, z * inverse
-        share = weight if rough else alone
-        s[SHARE + t + k] = share * _reflectance(c, inside, medium)
-
-
-@inner()
-def _exponential(s, n):
-    """The line EXP becomes its exponentials; of numbers <= 0."""
-    least, scale = v8.splat(F(-126)), v8.splat(LOG2_E)
-    for k in range(U(0), n, U(8)):
-        v8.store(s, EXP + k, exp2_fine(v8.maximum(v8.load(s, EXP + k) * scale, least)))
-
-
-@inner()
-def _water_color(s, n, medium):
-    for k in range(n):
-        s[EXP + k] = -s[NEAR + k]
-    _exponential(s, n)
-    fog, rgb = medium.airlight, medium.rgb
-    for k in range(n):
-        t = s[EXP + k]
-        rest = ONE - t
-        s[WR + k], s[WG + k] = t * rgb[0] + rest * fog[0], t * rgb[1] + rest * fog[1]
-        s[WB + k] = t * rgb[2] + rest * fog[2]
-
-
-@inner()
-def _refract(s, n, medium, limits):
+def _refract(nx, ny, nz, c, inside, vx, vy, vz, medium, limits):
     """Refracted rays per metre of depth, and their length per metre."""
-    ratio, bends = ONE / medium.index, medium.index != ONE
-    for k in range(n):
-        vx, vy, vz = s[VX + k], s[VY + k], s[VZ + k]
-        bend = s[COS + k] * ratio - s[IN + k]
-        x, y = bend * s[NX + k] - vx * ratio, bend * s[NY + k] - vy * ratio
-        z = max(vz * ratio - bend * s[NZ + k], limits.least_cosine)
-        steep = ONE / z
-        s[TX + k], s[TY + k] = x * steep, y * steep
-        length = math.sqrt(x * x + y * y + z * z) * steep
-        s[STEEP + k] = length if bends else ONE / vz
+    one, ratio = v8.splat(ONE), v8.splat(ONE / medium.index)
+    bend = c * ratio - inside
+    x, y = bend * nx - vx * ratio, bend * ny - vy * ratio
+    z = v8.maximum(vz * ratio - bend * nz, v8.splat(limits.least_cosine))
+    steep = one / z
+    return x * steep, y * steep, v8.sqrt(x * x + y * y + z * z) * steep
 
 
 @inner()
-def _place_on_bed(s, n, bed, medium, limits):
-    for k in range(n):
-        depth = s[DEPTH + k]
-        x, y = s[PX + k] + depth * s[TX + k], s[PY + k] + depth * s[TY + k]
-        column, row = _project(bed, x, y, -medium.height - depth, limits.least_depth)
-        s[FOUND + k] = s[FOUND + k] if _is_inside(bed, column, row) else ZERO
-        s[COLUMN + k], s[ROW + k] = column, row
+def _place_on_bed(px, py, tx, ty, depth, bed, medium, limits):
+    x, y = px + depth * tx, py + depth * ty
+    column, row = _project(bed, x, y, v8.splat(-medium.height) - depth, limits)
+    return column, row, _is_inside(bed, column, row)
 
 
 @inner()
-def _look(s, n, index, alpha, depth, view):
-    """Alpha and depth of the pixels nearest to COLUMN and ROW, which become their centres."""
-    last_column, last_row, width = view.columns - ONE, view.rows - ONE, np.int32(view.width)
-    for k in range(n):
-        c = np.int32(_clamp(s[COLUMN + k], ZERO, last_column))
-        r = np.int32(_clamp(s[ROW + k], ZERO, last_row))
-        index[k] = np.int32(r * width + c)
-        s[COLUMN + k], s[ROW + k] = F(c) + HALF, F(r) + HALF
-    for k in range(n):
-        pixel = U(index[k])
-        s[ALPHA + k], s[FAR + k] = alpha[pixel], depth[pixel]
-
-
-@inner()
-def _search_bed(s, n, index, alpha, depth, bed, medium, limits):
-    """Corrects the bed's depth along the refracted rays; COLUMN, ROW: where they meet it."""
+def _search_bed(s, found, depth, px, py, tx, ty, alpha, depths, bed, medium, limits):
+    """The bed's depth along the refracted rays; COLUMN, ROW, FOUND (1 or 0): where they meet it."""
+    zero, one = v8.splat(ZERO), v8.splat(ONE)
+    solid = v8.splat(limits.solid_alpha)
+    going = found
     for _ in range(limits.bed_steps):
-        _place_on_bed(s, n, bed, medium, limits)
-        _look(s, n, index, alpha, depth, bed)
-        for k in range(n):
-            found = s[FOUND + k] if s[ALPHA + k] >= limits.solid_alpha else ZERO
-            s[FOUND + k] = found
-            z = s[FAR + k] * _height_of_ray(bed, s[COLUMN + k], s[ROW + k])
-            s[DEPTH + k] = max(-medium.height - z, ZERO) if found > ZERO else s[DEPTH + k]
-    _place_on_bed(s, n, bed, medium, limits)
+        goes = v8.greater(going, zero)
+        if not _any(goes):
+            break
+        column, row, inside = _place_on_bed(px, py, tx, ty, depth, bed, medium, limits)
+        a, z, column, row = _look(alpha, depths, bed, column, row)
+        met = v8.select(v8.both(inside, v8.at_least(a, solid)), one, zero)
+        found = v8.select(goes, v8.minimum(found, met), found)
+        going = v8.minimum(going, met)
+        better = v8.splat(-medium.height) - z * _ray_part(bed, 6, column, row)
+        better = v8.select(v8.greater(going, zero), v8.maximum(better, zero), depth)
+        moved = v8.greater(v8.absolute(better - depth), v8.splat(limits.settled_m))
+        going = v8.select(moved, going, zero)
+        depth = better
+    column, row, inside = _place_on_bed(px, py, tx, ty, depth, bed, medium, limits)
+    v8.store(s, COLUMN, column)
+    v8.store(s, ROW, row)
+    v8.store(s, FOUND, v8.select(inside, found, zero))
+    return depth
 
 
 @inner()
-def _fetch_bed(s, n, own, rgb, alpha, bed, limits):
-    """The bed's colour where it was found, straight behind the pixel elsewhere."""
-    for k in range(n):
+def _fetch_bed(s, q, own, place, at, depth, rgb, alpha, bed, limits):
+    """The bed's colour where it was found, straight behind the pixel elsewhere; its depth."""
+    v8.store(s, LEVEL, depth)
+    for k in range(LANES):
         r = g = b = a = ZERO
         if s[FOUND + k] > ZERO:
             r, g, b, a = _bilinear(rgb, alpha, bed, s[COLUMN + k], s[ROW + k])
         if a < limits.solid_alpha:
-            r = g = b = a = ZERO
-            s[DEPTH + k] = s[OWN_DEPTH + k]
-            if own[k] >= 0:
-                pixel = U(own[k])
-                a = alpha[pixel]
-                pixel = U(3) * pixel
-                r, g, b = rgb[pixel], rgb[pixel + U(1)], rgb[pixel + U(2)]
-        s[BR + k], s[BG + k], s[BB + k], s[BA + k] = r, g, b, a
+            pixel = U(own[place + k])
+            r, g, b = rgb[U(3) * pixel], rgb[U(3) * pixel + U(1)], rgb[U(3) * pixel + U(2)]
+            a, s[LEVEL + k] = alpha[pixel], q[OWN_DEPTH + at + k]
+        s[R + k], s[G + k], s[B + k], s[A + k] = r, g, b, a
+    return v8.load(s, LEVEL)
 
 
 @inner()
-def _absorb(s, n, value, water, extinction):
-    for k in range(n):
-        s[EXP + k] = -extinction * (s[DEPTH + k] * s[STEEP + k])
-    _exponential(s, n)
-    for k in range(n):
-        seen, own = s[value + k] + (ONE - s[BA + k]) * s[water + k], s[water + k]
-        t = s[EXP + k]
-        s[value + k] = t * seen + (ONE - t) * own
+def _absorb(seen, alpha, water, length, extinction):
+    one = v8.splat(ONE)
+    t = _exponential(length * v8.splat(extinction))
+    return t * (seen + (one - alpha) * water) + (one - t) * water
 
 
 @inner()
-def _measure_mirror(s, n, into, mirror, medium, limits):
-    """From the surface to what was looked up in the mirrored layer, or NOTHING."""
-    for k in range(n):
-        x, y, z = _point(mirror, s[FAR + k], s[COLUMN + k], s[ROW + k])
-        x, y, z = x - s[PX + k], y - s[PY + k], z - medium.height
-        distance = math.sqrt(x * x + y * y + z * z)
-        s[into + k] = distance if s[ALPHA + k] >= limits.solid_alpha else NOTHING
+def _mirror_distance(alpha, depth, mirror, column, row, px, py, medium, limits):
+    """From the surface to what the mirrored layer shows, -1 where that is nothing."""
+    a, z, column, row = _look(alpha, depth, mirror, column, row)
+    way = _way(mirror, z, column, row, px, py, v8.splat(medium.height))
+    return v8.select(v8.at_least(a, v8.splat(limits.solid_alpha)), way, v8.splat(-ONE))
 
 
 @inner()
-def _place_in_mirror(s, n, t, distances, columns, rows, mirror, medium, limits):
-    """Where reflected rays of these lengths end in the mirrored layer, kept inside it."""
-    for k in range(n):
-        rx, ry, rz = s[RX + t + k], s[RY + t + k], s[RZ + t + k]
-        d = s[distances + k]
-        met = d >= ZERO
-        x, y = s[PX + k] + d * rx if met else rx, s[PY + k] + d * ry if met else ry
-        z = medium.height + d * rz if met else rz
-        column, row = _project(mirror, x, y, z, limits.least_depth)
-        s[columns + k], s[rows + k] = _clamp_to(mirror, column, row)
-
-
-@inner()
-def _find_in_mirror(s, n, index, count, alpha, depth, mirror, medium, limits):
+def _find_in_mirror(s, count, dx, dy, dz, px, py, alpha, depth, mirror, medium, limits):
     """MIRROR_C, MIRROR_R: where the reflected rays end in the mirrored layer."""
-    for k in range(n):
-        column, row = _project(mirror, s[DX + k], s[DY + k], -s[DZ + k], limits.least_depth)
-        s[COLUMN + k], s[ROW + k] = _clamp_to(mirror, column, row)
-    _look(s, n, index, alpha, depth, mirror)
-    _measure_mirror(s, n, FIRST, mirror, medium, limits)
+    pz = v8.splat(medium.height)
+    column, row = _project(mirror, dx, dy, v8.negate(dz), limits)
+    column, row = _clamp_to(mirror, column, row)
+    d = _mirror_distance(alpha, depth, mirror, column, row, px, py, medium, limits)
+    rx, ry, rz = v8.load(s, RX), v8.load(s, RY), v8.load(s, RZ)
+    x, y, z = _end(px, py, pz, d, rx, ry, rz)
+    column, row = _project(mirror, x, y, z, limits)
+    column, row = _clamp_to(mirror, column, row)
+    d = _mirror_distance(alpha, depth, mirror, column, row, px, py, medium, limits)
     for tap in range(count):
-        t = tap * N
-        _place_in_mirror(s, n, t, FIRST, COLUMN, ROW, mirror, medium, limits)
-        _look(s, n, index, alpha, depth, mirror)
-        _measure_mirror(s, n, DISTANCE, mirror, medium, limits)
-        _place_in_mirror(s, n, t, DISTANCE, MIRROR_C + t, MIRROR_R + t, mirror, medium, limits)
+        t = tap * LANES
+        rx, ry, rz = v8.load(s, RX + t), v8.load(s, RY + t), v8.load(s, RZ + t)
+        x, y, z = _end(px, py, pz, d, rx, ry, rz)
+        column, row = _project(mirror, x, y, z, limits)
+        column, row = _clamp_to(mirror, column, row)
+        v8.store(s, MIRROR_C + t, column)
+        v8.store(s, MIRROR_R + t, row)
 
 
 @inner()
-def _place_in_image(s, n, t, front, medium, limits):
-    for k in range(n):
-        rx, ry, rz = s[RX + t + k], s[RY + t + k], s[RZ + t + k]
-        d = s[DISTANCE + k]
-        met = d >= ZERO
-        x, y = s[PX + k] + d * rx if met else rx, s[PY + k] + d * ry if met else ry
-        z = d * rz - medium.height if met else rz
-        column, row = _project(front, x, y, z, limits.least_depth)
-        s[COLUMN + k], s[ROW + k] = column, row
-        s[FRONT_C + t + k], s[FRONT_R + t + k] = column, row
-
-
-@inner()
-def _find_in_image(s, n, index, count, alpha, depth, front, medium, limits):
-    """FRONT_C, FRONT_R: where the reflected rays end in the image; FRONT_W: is it seen there."""
-    m = front.project
-    for tap in range(count):
-        t = tap * N
-        for k in range(n):
-            s[DISTANCE + k] = s[FIRST + k]
-        _place_in_image(s, n, t, front, medium, limits)
-        _look(s, n, index, alpha, depth, front)
-        for k in range(n):
-            x, y, z = _point(front, s[FAR + k], s[COLUMN + k], s[ROW + k])
-            x, y, z = x - s[PX + k], y - s[PY + k], z + medium.height
-            better = math.sqrt(x * x + y * y + z * z)
-            d = s[DISTANCE + k]
-            s[DISTANCE + k] = better if d >= ZERO and s[ALPHA + k] >= limits.solid_alpha else d
-        _place_in_image(s, n, t, front, medium, limits)
-        _look(s, n, index, alpha, depth, front)
-        for k in range(n):
-            column, row, d = s[FRONT_C + t + k], s[FRONT_R + t + k], s[DISTANCE + k]
-            x, y = s[PX + k] + d * s[RX + t + k], s[PY + k] + d * s[RY + t + k]
-            z = d * s[RZ + t + k] - medium.height
-            ahead = m[6] * x + m[7] * y + m[8] * z
-            near = abs(s[FAR + k] - ahead) < max(limits.match_share * ahead, limits.match_m)
-            solid = s[ALPHA + k] >= limits.solid_alpha
-            seen = (solid and near) if d >= ZERO else not solid
-            across = min(column, front.columns - column) / front.columns
-            border = min(across, min(row, front.rows - row) / front.rows)
-            fade = _clamp(border / limits.edge, ZERO, ONE)
-            weight = s[WEIGHT + k] * (fade * fade * (F(3) - TWO * fade))
-            s[FRONT_W + t + k] = weight if seen else ZERO
-            s[FRONT_C + t + k], s[FRONT_R + t + k] = _clamp_to(front, column, row)
-
-
-@inner()
-def _set_levels(s, n, count, into, columns, rows, sizes):
+def _set_level(s, sizes):
     """Level of averages whose pixels are as wide as a pixel's three places lie apart."""
+    c, r = v8.load(s, MIRROR_C), v8.load(s, MIRROR_R)
+    x1, y1 = v8.load(s, MIRROR_C + U(8)) - c, v8.load(s, MIRROR_R + U(8)) - r
+    x2, y2 = v8.load(s, MIRROR_C + U(16)) - c, v8.load(s, MIRROR_R + U(16)) - r
+    apart = v8.sqrt(x1 * x1 + y1 * y1) + v8.sqrt(x2 * x2 + y2 * y2)
+    spacing = v8.maximum(v8.splat(HALF) * apart, v8.splat(ONE))
     top = _real(sizes.shape[0] - 1)
-    for k in range(n):
-        level = ZERO
-        if count > U(1) and s[ROUGH + k] > ZERO:
-            c, r = s[columns + k], s[rows + k]
-            x1, y1 = s[columns + N + k] - c, s[rows + N + k] - r
-            x2, y2 = s[columns + N + N + k] - c, s[rows + N + N + k] - r
-            spacing = HALF * (math.sqrt(x1 * x1 + y1 * y1) + math.sqrt(x2 * x2 + y2 * y2))
-            if spacing > ONE:
-                level = min(F(math.log2(spacing)), top)
-        s[into + k] = level
+    v8.store(s, LEVEL, v8.maximum(v8.minimum(log2(spacing), v8.splat(top)), v8.splat(ZERO)))
 
 
 @inner()
-def _fetch_layer(s, n, columns, rows, levels, rgb, alpha, view, mips, sizes):
-    """VALUE: the layer's colour and the sky behind it."""
-    for k in range(n):
-        r, g, b, a = _fetch(
-            rgb, alpha, view, mips, sizes, s[columns + k], s[rows + k], s[levels + k]
-        )
-        s[VALUE_R + k], s[VALUE_G + k], s[VALUE_B + k], s[VALUE_A + k] = r, g, b, a
-    for k in range(n):
-        through = ONE - s[VALUE_A + k]
-        s[VALUE_R + k] += through * s[SKY_R + k]
-        s[VALUE_G + k] += through * s[SKY_G + k]
-        s[VALUE_B + k] += through * s[SKY_B + k]
+def _match_in_image(px, py, pz, d, rx, ry, rz, alpha, depth, front, limits):
+    """(column, row, alpha, depth, distance along the optical axis of the ray's end)."""
+    x, y, z = _end(px, py, pz, d, rx, ry, rz)
+    column, row = _project(front, x, y, z, limits)
+    a, z_seen, c, r = _look(alpha, depth, front, column, row)
+    return column, row, a, z_seen, c, r, _dot(front.project, 6, x, y, z)
 
 
 @inner()
-def _fetch_sky(s, n, t, faces, size, medium):
-    for k in range(n):
-        r, g, b = _sky(faces, size, s[RX + t + k], s[RY + t + k], s[RZ + t + k])
-        s[SKY_R + k], s[SKY_G + k], s[SKY_B + k] = r, g, b
-    if medium.smog_above < ZERO:
-        return
-    for k in range(n):
-        s[EXP + k] = -(s[NEAR + k] + medium.smog_above / s[RZ + t + k])
-    _exponential(s, n)
-    fog = medium.airlight
-    for k in range(n):
-        x = s[EXP + k]
-        s[SKY_R + k] = x * s[SKY_R + k] + (ONE - x) * fog[0]
-        s[SKY_G + k] = x * s[SKY_G + k] + (ONE - x) * fog[1]
-        s[SKY_B + k] = x * s[SKY_B + k] + (ONE - x) * fog[2]
-
-
-@inner()
-def _add_reflection(s, n, t):
-    """One slope's share of the pixels' light comes from above instead of below."""
-    for k in range(n):
-        share = s[SHARE + t + k]
-        s[SUM_R + k] += share * (s[REFLECTED_R + k] - s[BR + k])
-        s[SUM_G + k] += share * (s[REFLECTED_G + k] - s[BG + k])
-        s[SUM_B + k] += share * (s[REFLECTED_B + k] - s[BB + k])
-
-
-@inner()
-def _reflect(s, n, value_r, value_g, value_b):
-    """REFLECTED becomes one of the colours in the scratch memory."""
-    for k in range(n):
-        s[REFLECTED_R + k], s[REFLECTED_G + k] = s[value_r + k], s[value_g + k]
-        s[REFLECTED_B + k] = s[value_b + k]
-
-
-@inner()
-def _cover_with_image(s, n, t):
-    for k in range(n):
-        w = s[FRONT_W + t + k]
-        s[REFLECTED_R + k] += w * (s[VALUE_R + k] - s[REFLECTED_R + k])
-        s[REFLECTED_G + k] += w * (s[VALUE_G + k] - s[REFLECTED_G + k])
-        s[REFLECTED_B + k] += w * (s[VALUE_B + k] - s[REFLECTED_B + k])
+def _find_in_image(s, d, trust, px, py, alpha, depth, front, medium, limits):
+    """(column, row, weight) of the image's pixels in which the first ray ends."""
+    zero, one = v8.splat(ZERO), v8.splat(ONE)
+    pz, solid = v8.splat(-medium.height), v8.splat(limits.solid_alpha)
+    rx, ry, rz = v8.load(s, RX), v8.load(s, RY), v8.load(s, RZ)
+    _, _, a, z, c, r, _ = _match_in_image(px, py, pz, d, rx, ry, rz, alpha, depth, front, limits)
+    better = v8.select(v8.at_least(a, solid), _way(front, z, c, r, px, py, pz), d)
+    finite = v8.at_least(d, zero)
+    d = v8.select(finite, better, d)
+    column, row, a, z, _, _, ahead = _match_in_image(
+        px, py, pz, d, rx, ry, rz, alpha, depth, front, limits
+    )
+    allowed = v8.maximum(v8.splat(limits.match_share) * ahead, v8.splat(limits.match_m))
+    near = v8.both(v8.at_least(a, solid), v8.greater(allowed, v8.absolute(z - ahead)))
+    on_sky = v8.select(v8.at_least(a, solid), zero, one)
+    seen = v8.select(finite, v8.select(near, one, zero), on_sky)
+    columns, rows = v8.splat(front.columns), v8.splat(front.rows)
+    across = v8.minimum(column, columns - column) / columns
+    border = v8.minimum(across, v8.minimum(row, rows - row) / rows)
+    fade = _clamp(border / v8.splat(limits.edge), ZERO, ONE)
+    weight = trust * (fade * fade * (v8.splat(F(3)) - (fade + fade)))
+    column, row = _clamp_to(front, column, row)
+    return column, row, seen * weight
 
 
 @kernel
 def shade(
     u, v, axes, cover, normal_x, normal_y, variance, bed_view, bed_rgb, bed_alpha, bed_depth,
     offset, mirror_view, mirror_rgb, mirror_alpha, mirror_depth, mirror_mips, mirror_sizes,
-    has_mirror, front_view, front_rgb, front_alpha, front_depth, front_mips, front_sizes,
-    has_front, front_distance, front_weight, faces, size, medium_numbers, limit_numbers, out,
+    has_mirror, front_view, front_rgb, front_alpha, front_depth, has_front, front_distance,
+    front_weight, faces, size, medium_numbers, limit_numbers, out,
 ):  # fmt: skip
     """Water of the pixels of a camera into out [H, W, 3].
 
     u [W], v [H]: image coordinates at unit depth. axes [3, 3]: world_from_camera, float64. offset:
     (left, top) of the camera's window in the bed's. front: the layer of the screen-space reflection
-    whose rays run front_distance. faces: flat cube map of `size` squared texels a face.
+    whose rays run front_distance. faces: flat cube map of `size` squared texels a face, each four
+    numbers. mirror_mips, mirror_sizes: see `water_launch.averages`.
     """
     height, width = cover.shape
     left, top = offset
     for i in numba.prange(height):
         bed, mirror, front = _view(bed_view), _view(mirror_view), _view(front_view)
         medium, limits = _medium(medium_numbers), _limits(limit_numbers)
-        bends = medium.index != ONE
-        s = np.zeros(SCRATCH, np.float32)
-        pixels, own = np.empty(STRIP, np.int64), np.empty(STRIP, np.int64)
-        index = np.empty(STRIP, np.int32)
+        q, s = np.zeros(2 * STRIP * 10, np.float32), np.zeros(SCRATCH, np.float32)
+        pixels, own = np.zeros(2 * STRIP, np.int64), np.zeros(2 * STRIP, np.int64)
+        smooth_count, rough_count, j = U(0), U(0), 0
         bx, by, bz = v[i] * axes[0, 1], v[i] * axes[1, 1], v[i] * axes[2, 1]
         own_row = i + top
         row_inside = own_row >= 0 and own_row < np.int64(bed.height)
-        j = 0
-        while j < width:
-            n, rough = U(0), False
-            while j < width and n < N:
+        far = np.float64(limits.farthest)
+        while True:
+            while j < width and smooth_count < U(STRIP) and rough_count < U(STRIP):
                 # The order of these sums is that of Camera.ray_directions: the sign has to agree.
                 fall = (u[j] * axes[2, 0] + bz) + axes[2, 2]
                 if not (fall < 0.0 and cover[i, j] <= limits.cover):
                     out[i, j, 0] = out[i, j, 1] = out[i, j, 2] = ZERO
                     j += 1
                     continue
-                s[DX + n] = F((u[j] * axes[0, 0] + bx) + axes[0, 2])
-                s[DY + n] = F((u[j] * axes[1, 0] + by) + axes[1, 2])
-                s[DZ + n] = F(fall)
-                far = np.float64(limits.farthest)
-                s[ALONG + n] = F(min(np.float64(medium.height) / -fall, far))
-                s[NX + n], s[NY + n] = normal_x[i, j], normal_y[i, j]
-                spread = variance[i, j] if variance[i, j] >= limits.smooth_variance else ZERO
-                rough = rough or spread > ZERO
-                s[ROUGH + n] = spread
-                own[n] = -1
-                s[FOUND + n] = s[DEPTH + n] = ZERO
+                spread = variance[i, j]
+                if spread >= limits.smooth_variance:
+                    n, p = LIST + rough_count, U(STRIP) + rough_count
+                    rough_count += U(1)
+                else:
+                    n = p = smooth_count
+                    smooth_count += U(1)
+                q[DX + n] = F((u[j] * axes[0, 0] + bx) + axes[0, 2])
+                q[DY + n] = F((u[j] * axes[1, 0] + by) + axes[1, 2])
+                q[DZ + n] = F(fall)
+                q[ALONG + n] = F(min(np.float64(medium.height) / -fall, far))
+                q[NX + n], q[NY + n], q[ROUGH + n] = normal_x[i, j], normal_y[i, j], spread
+                q[OWN_DEPTH + n] = -ONE
+                own[p] = 0
                 column = j + left
                 if row_inside and column >= 0 and column < np.int64(bed.width):
                     pixel = U(own_row) * bed.width + U(column)
                     if bed_alpha[pixel] >= limits.solid_alpha:
-                        own[n], s[FOUND + n] = np.int64(pixel), ONE
-                        s[DEPTH + n] = max(-bed_depth[pixel] * F(fall) - medium.height, ZERO)
-                s[OWN_DEPTH + n] = s[DEPTH + n]
+                        own[p] = np.int64(pixel)
+                        q[OWN_DEPTH + n] = max(-bed_depth[pixel] * F(fall) - medium.height, ZERO)
                 if has_front:
-                    s[FIRST + n] = front_distance[i, j]
-                    s[WEIGHT + n] = front_weight[i, j]
-                pixels[n] = j
-                n += U(1)
+                    d = front_distance[i, j]
+                    q[DISTANCE + n] = d if d < F(np.inf) else -ONE
+                    q[TRUST + n] = front_weight[i, j]
+                pixels[p] = j
                 j += 1
+            # The fuller list first, so that lists are short at a row's end only.
+            rough = rough_count > smooth_count
+            n = rough_count if rough else smooth_count
             if n == U(0):
-                continue
-            _surface(s, n, medium, limits)
-            _tap(s, n, U(0), ZERO, F(2 / 3), ONE, medium, limits)
-            _water_color(s, n, medium)
-            _refract(s, n, medium, limits)
-            if bends:
-                _search_bed(s, n, index, bed_alpha, bed_depth, bed, medium, limits)
+                break
+            base, start, taps = U(0), U(0), U(1)
+            if rough:
+                base, start, taps = LIST, U(STRIP), U(3)
+                rough_count = U(0)
             else:
-                for k in range(n):
-                    s[FOUND + k] = ZERO
-            _fetch_bed(s, n, own, bed_rgb, bed_alpha, bed, limits)
-            _absorb(s, n, BR, WR, medium.extinction[0])
-            _absorb(s, n, BG, WG, medium.extinction[1])
-            _absorb(s, n, BB, WB, medium.extinction[2])
-            for k in range(n):
-                s[SUM_R + k], s[SUM_G + k], s[SUM_B + k] = s[BR + k], s[BG + k], s[BB + k]
-            if bends:
-                count = U(1)
-                if rough:
-                    count = U(3)
-                    _tap(s, n, N, ONE, F(1 / 6), ZERO, medium, limits)
-                    _tap(s, n, N + N, -ONE, F(1 / 6), ZERO, medium, limits)
-                if has_front:
-                    for k in range(n):
-                        d = s[FIRST + k]
-                        s[FIRST + k] = d if d < F(np.inf) else NOTHING
-                    _find_in_image(
-                        s, n, index, count, front_alpha, front_depth, front, medium, limits
-                    )
-                    _set_levels(s, n, count, FRONT_LEVEL, FRONT_C, FRONT_R, front_sizes)
-                if has_mirror:
-                    _find_in_mirror(
-                        s, n, index, count, mirror_alpha, mirror_depth, mirror, medium, limits
-                    )
-                    _set_levels(s, n, count, LEVEL, MIRROR_C, MIRROR_R, mirror_sizes)
-                for tap in range(count):
-                    t = tap * N
-                    _fetch_sky(s, n, t, faces, size, medium)
-                    if has_mirror:
-                        _fetch_layer(
-                            s, n, MIRROR_C + t, MIRROR_R + t, LEVEL, mirror_rgb, mirror_alpha,
-                            mirror, mirror_mips, mirror_sizes,
+                smooth_count = U(0)
+            for last in range(n, (n + U(7)) & EIGHTS):  # the last pixel again in lanes left over
+                own[start + last] = own[start + n - U(1)]
+                for line in range(U(10)):
+                    at = base + line * U(STRIP)
+                    q[at + last] = q[at + n - U(1)]
+            for first in range(U(0), n, LANES):
+                at = base + first
+                one, zero = v8.splat(ONE), v8.splat(ZERO)
+                dx, dy, dz = v8.load(q, DX + at), v8.load(q, DY + at), v8.load(q, DZ + at)
+                along = v8.load(q, ALONG + at)
+                px, py = along * dx, along * dy
+                length = v8.sqrt(dx * dx + dy * dy + dz * dz)
+                inverse = one / length
+                vx, vy, vz = (
+                    v8.negate(dx) * inverse,
+                    v8.negate(dy) * inverse,
+                    v8.negate(dz) * inverse,
+                )
+                near = v8.splat(medium.smog_per_m) * along * length
+                nx, ny = v8.load(q, NX + at), v8.load(q, NY + at)
+                upright = v8.maximum(one - nx * nx - ny * ny, v8.splat(limits.steepest))
+                upright = one / v8.sqrt(upright)
+                sx, sy = nx * upright, ny * upright
+                nx, ny, nz, c, inside, share, rx, ry, rz = _facet(
+                    sx, sy, vx, vy, vz, medium, limits
+                )
+                # Through the surface.
+                wr, wg, wb = (
+                    v8.splat(medium.rgb[0]), v8.splat(medium.rgb[1]), v8.splat(medium.rgb[2])
+                )  # fmt: skip
+                if medium.smog_per_m > ZERO:
+                    t = _exponential(near)
+                    rest, fog = one - t, medium.airlight
+                    wr, wg = t * wr + rest * v8.splat(fog[0]), t * wg + rest * v8.splat(fog[1])
+                    wb = t * wb + rest * v8.splat(fog[2])
+                below_r, below_g, below_b = wr, wg, wb
+                own_depth = v8.load(q, OWN_DEPTH + at)
+                bends = medium.index != ONE
+                tx, ty, steep = zero, zero, one / vz
+                if bends:
+                    tx, ty, steep = _refract(nx, ny, nz, c, inside, vx, vy, vz, medium, limits)
+                thick = own_depth * steep * v8.splat(medium.least_extinction)
+                clear = v8.both(
+                    v8.at_least(own_depth, zero), v8.greater(v8.splat(limits.opaque), thick)
+                )
+                if _any(clear):
+                    found = v8.select(clear, one, zero)
+                    v8.store(s, FOUND, zero)
+                    depth = own_depth
+                    if bends:
+                        depth = _search_bed(
+                            s, found, own_depth, px, py, tx, ty, bed_alpha, bed_depth, bed, medium,
+                            limits,
                         )  # fmt: skip
-                        _reflect(s, n, VALUE_R, VALUE_G, VALUE_B)
-                    else:
-                        _reflect(s, n, SKY_R, SKY_G, SKY_B)
-                    if has_front:
-                        _fetch_layer(
-                            s, n, FRONT_C + t, FRONT_R + t, FRONT_LEVEL, front_rgb, front_alpha,
-                            front, front_mips, front_sizes,
+                    depth = _fetch_bed(
+                        s, q, own, start + first, at, depth, bed_rgb, bed_alpha, bed, limits
+                    )  # fmt: skip
+                    r, g, b, a = _fetched(s)
+                    way = depth * steep
+                    r = _absorb(r, a, wr, way, medium.extinction[0])
+                    g = _absorb(g, a, wg, way, medium.extinction[1])
+                    b = _absorb(b, a, wb, way, medium.extinction[2])
+                    below_r = v8.select(clear, r, wr)
+                    below_g = v8.select(clear, g, wg)
+                    below_b = v8.select(clear, b, wb)
+                sum_r, sum_g, sum_b = below_r, below_g, below_b
+                if bends:
+                    # Mirrored rays and shares of the slopes.
+                    if rough:
+                        share = v8.splat(F(2 / 3)) * share
+                    v8.store(s, RX, rx)
+                    v8.store(s, RY, ry)
+                    v8.store(s, RZ, rz)
+                    v8.store(s, SHARE, share)
+                    if rough:
+                        flat = v8.maximum(v8.sqrt(vx * vx + vy * vy), v8.splat(F(1e-12)))
+                        spread8 = v8.sqrt(v8.splat(F(3)) * v8.load(q, ROUGH + at)) / flat
+                        for tap in range(U(1), U(3)):
+                            t8 = tap * LANES
+                            sign = ONE if tap == U(1) else -ONE
+                            offset8 = v8.splat(sign) * spread8
+                            _, _, _, _, _, share, rx, ry, rz = _facet(
+                                sx + offset8 * vx, sy + offset8 * vy, vx, vy, vz, medium, limits
+                            )
+                            v8.store(s, RX + t8, rx)
+                            v8.store(s, RY + t8, ry)
+                            v8.store(s, RZ + t8, rz)
+                            v8.store(s, SHARE + t8, v8.splat(F(1 / 6)) * share)
+                    # What stands above the water, where the image shows it.
+                    image_r, image_g, image_b, image_a, weight = zero, zero, zero, zero, zero
+                    needs_mirror = has_mirror
+                    if has_front and not rough:
+                        column, row, weight = _find_in_image(
+                            s, v8.load(q, DISTANCE + at), v8.load(q, TRUST + at), px, py,
+                            front_alpha, front_depth, front, medium, limits,
                         )  # fmt: skip
-                        _cover_with_image(s, n, t)
-                    _add_reflection(s, n, t)
-            for k in range(n):
-                at = pixels[k]
-                out[i, at, 0], out[i, at, 1] = s[SUM_R + k], s[SUM_G + k]
-                out[i, at, 2] = s[SUM_B + k]
+                        if _any(v8.greater(weight, zero)):
+                            image_r, image_g, image_b, image_a = _fetch(
+                                s, column, row, front_rgb, front_alpha, front
+                            )
+                        rest = _any(v8.greater(one - weight, v8.splat(TINY)))
+                        needs_mirror = has_mirror and rest
+                    if needs_mirror:
+                        _find_in_mirror(
+                            s, taps, dx, dy, dz, px, py, mirror_alpha, mirror_depth, mirror,
+                            medium, limits,
+                        )  # fmt: skip
+                        v8.store(s, LEVEL, zero)
+                    for tap in range(taps):
+                        t8 = tap * LANES
+                        r, g, b, a = zero, zero, zero, zero
+                        if needs_mirror:
+                            if rough:
+                                _set_level(s, mirror_sizes)
+                            r, g, b, a = _fetch_blurred(
+                                s, t8, mirror_rgb, mirror_alpha, mirror, mirror_mips, mirror_sizes
+                            )
+                        if has_front:
+                            rest = one - weight
+                            r, g = weight * image_r + rest * r, weight * image_g + rest * g
+                            b, a = weight * image_b + rest * b, weight * image_a + rest * a
+                        through = one - a
+                        shines = v8.greater(through, v8.splat(limits.faint))
+                        whole = one / v8.maximum(a, v8.splat(HALF))
+                        own_r, own_g, own_b = r * whole, g * whole, b * whole
+                        if _any(shines):
+                            rx, ry, rz = (
+                                v8.load(s, RX + t8), v8.load(s, RY + t8), v8.load(s, RZ + t8)
+                            )  # fmt: skip
+                            sky_r, sky_g, sky_b = _sky(s, faces, size, rx, ry, rz, near, medium)
+                            own_r = v8.select(shines, r + through * sky_r, own_r)
+                            own_g = v8.select(shines, g + through * sky_g, own_g)
+                            own_b = v8.select(shines, b + through * sky_b, own_b)
+                        share = v8.load(s, SHARE + t8)
+                        sum_r = sum_r + share * (own_r - below_r)
+                        sum_g = sum_g + share * (own_g - below_g)
+                        sum_b = sum_b + share * (own_b - below_b)
+                v8.store(s, R, sum_r)
+                v8.store(s, G, sum_g)
+                v8.store(s, B, sum_b)
+                for k in range(min(LANES, n - first)):
+                    pixel = pixels[start + first + k]
+                    out[i, pixel, 0], out[i, pixel, 1] = s[R + k], s[G + k]
+                    out[i, pixel, 2] = s[B + k]

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from weakref import WeakKeyDictionary
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -9,7 +12,7 @@ from torch import Tensor
 from augment.cameras import Camera
 from augment.render.composite import sky_behind
 from augment.render.threads import kernel_threads
-from augment.sky import ConstantSky, CubemapSky, Sky, directions_of_cubemap
+from augment.sky import ConstantSky, CubemapSky, LatLongSky, Sky, directions_of_cubemap
 from augment.weather import layer_lookup, mip_kernels, reflection_lookup, refraction, water_surface
 from augment.weather import water_kernels as kernels
 from augment.weather.flood import FloodMedium, Layer
@@ -20,6 +23,7 @@ from augment.weather.waves import WaveField
 ROWS = 8  # image rows a thread takes at a time: rows without water cost nothing
 MIP_ROWS = 32
 SKY_SIZE = 256  # texels along a face where a sky that is no cube map is sampled onto one
+_known_faces: WeakKeyDictionary[Sky, tuple[int, np.ndarray]] = WeakKeyDictionary()
 LARGEST = 1e30  # stands for infinity: its products with 0 are 0
 
 
@@ -37,7 +41,8 @@ def shade(
 ) -> Tensor:
     """As `water.shade_water`; smog is None where it has no density."""
     faces, layered = _faces(sky, smog)
-    rough = bool((field.slope_variance >= water_surface.SMOOTH_VARIANCE).any())
+    limit = water_surface.smooth_variance(camera)
+    rough = bool((field.slope_variance >= limit).any())
     out = np.empty((camera.height, camera.width, 3), np.float32)
     front, distance, weight = None, cover, cover
     if screen is not None:
@@ -56,14 +61,13 @@ def shade(
         *_averages(mirror, rough),
         mirror is not None,
         *_layer(front),
-        *_averages(front, rough),
         screen is not None,
         _array(distance),
         _array(weight),
         faces.reshape(-1),
         np.uint64(faces.shape[1]),
         _medium(camera, medium, smog, layered),
-        _limits(hidden_cover),
+        _limits(hidden_cover, limit),
         out,
     )
     with kernel_threads(ROWS):
@@ -76,14 +80,26 @@ def _array(part: Tensor) -> np.ndarray:
 
 
 def _faces(sky: Sky, smog: SmogMedium | None) -> tuple[np.ndarray, SmogMedium | None]:
+    """A cube map's faces with four numbers a texel, [6, size, size, 4]; the smog before them."""
     seen, layered = sky_behind(sky, smog)
-    if isinstance(seen, CubemapSky):
-        faces = seen.faces
-    elif isinstance(seen, ConstantSky):
-        faces = seen.rgb.expand(6, 1, 1, 3)
-    else:
-        faces = seen.sample(directions_of_cubemap(SKY_SIZE))
-    return _array(faces), layered
+    if isinstance(seen, ConstantSky):
+        return _padded(seen.rgb.expand(6, 1, 1, 3)), layered
+    if not isinstance(seen, CubemapSky | LatLongSky):
+        return _padded(_sampled(seen)), layered
+    image = seen.faces if isinstance(seen, CubemapSky) else seen.image
+    known = _known_faces.get(seen)
+    if known is None or known[0] != image._version:
+        faces = seen.faces if isinstance(seen, CubemapSky) else _sampled(seen)
+        known = _known_faces[seen] = (image._version, _padded(faces))
+    return known[1], layered
+
+
+def _sampled(sky: Sky) -> Tensor:
+    return sky.sample(directions_of_cubemap(SKY_SIZE))
+
+
+def _padded(faces: Tensor) -> np.ndarray:
+    return _array(torch.nn.functional.pad(faces.detach(), (0, 1)))
 
 
 def _layer(layer: Layer | None) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -141,10 +157,11 @@ def _medium(
     return np.minimum(numbers, LARGEST).astype(np.float32)
 
 
-def _limits(hidden_cover: float) -> np.ndarray:
+def _limits(hidden_cover: float, smooth_variance: float) -> np.ndarray:
     """`kernels.Limits`."""
     surface, lookup, reflection = water_surface, layer_lookup, reflection_lookup
-    numbers = [hidden_cover, surface.FARTHEST, surface.LEAST_COSINE, surface.SMOOTH_VARIANCE]
+    numbers = [hidden_cover, surface.FARTHEST, surface.LEAST_COSINE, smooth_variance]
     numbers += [surface.STEEPEST, lookup.LEAST_DEPTH, lookup.SOLID_ALPHA, refraction.BED_STEPS]
-    numbers += [reflection.EDGE, reflection.MATCH_M, reflection.MATCH_SHARE]
+    numbers += [reflection.EDGE, reflection.MATCH_M, reflection.MATCH_SHARE, refraction.SETTLED_M]
+    numbers += [-math.log(refraction.LEAST_TRANSMITTANCE), reflection.FAINT]
     return np.asarray(numbers, np.float32)

@@ -17,7 +17,7 @@ from augment.weather.waves import WaveField
 
 FARTHEST = 1e12  # times the eye's distance from the image plane: rays along the water end here
 LEAST_COSINE = 1e-3  # of rays against the surface, and of reflected ones against the horizon
-SMOOTH_VARIANCE = 1e-8  # slopes that vary less than this (rms 1e-4) blur by less than a pixel
+SMOOTH_PX = 2.0  # reflections that a pixel's slopes spread over less are as good as sharp
 STEEPEST = 1e-6  # least square of a normal's z
 
 
@@ -59,12 +59,27 @@ def meet_plane(camera: Camera, level_z_m: float, dtype: torch.dtype) -> Surface:
     )
 
 
-def tilted_normals(surface: Surface, field: WaveField) -> list[tuple[Tensor, Tensor]]:
+def is_smooth(field: WaveField, camera: Camera) -> Bool[Tensor, "H W"]:
+    """Where the slopes inside a pixel of `camera` hardly blur what it mirrors."""
+    return field.slope_variance < smooth_variance(camera)
+
+
+def smooth_variance(camera: Camera) -> float:
+    """The slope variance V that spreads a reflection by 2 sqrt(3 V) fy = SMOOTH_PX pixels.
+
+    A slope turns the mirrored ray by twice its angle; sqrt(3 V) is what `tilted_normals` takes.
+    """
+    return (SMOOTH_PX / (2 * camera.fy)) ** 2 / 3
+
+
+def tilted_normals(
+    surface: Surface, field: WaveField, smooth: Bool[Tensor, "H W"]
+) -> list[tuple[Tensor, Tensor]]:
     """(weight [H, W], unit normal [H, W, 3]) of slopes that stand for all slopes in a pixel.
 
     Gauss-Hermite quadrature over the slope along the view's horizontal direction, whose variance is
     V: the pixel's own normal has weight 2/3, slopes sqrt(3 V) to either side have 1/6 each. The
-    first is the pixel's own, and the only one where nothing is rough.
+    first is the pixel's own, and the only one that counts where the pixel is smooth.
     """
     dtype = surface.points.dtype
     nx, ny = field.normal_x.to(dtype), field.normal_y.to(dtype)
@@ -73,7 +88,7 @@ def tilted_normals(surface: Surface, field: WaveField) -> list[tuple[Tensor, Ten
     horizontal = surface.to_eye[..., :2]
     # Seen straight from above the view has no horizontal direction: nothing is tilted then.
     horizontal = horizontal / horizontal.norm(dim=-1, keepdim=True).clamp_min(1e-12)
-    rough = variance >= SMOOTH_VARIANCE
+    rough = ~smooth
     spread = torch.where(rough, torch.sqrt(3 * variance), 0)
 
     def normal(offset: Tensor) -> Tensor:
