@@ -1,4 +1,4 @@
-"""Numba kernels that halve images, for averages over ever larger squares of pixels."""
+"""Numba kernels for averages over ever larger squares of pixels: images are halved."""
 
 from __future__ import annotations
 
@@ -9,22 +9,13 @@ from augment.render.cpu_jit import kernel
 
 
 @kernel
-def halve_image(rgb, alpha, out):
-    """Averages over 2 x 2 pixels of rgb [H, W, 3] and alpha [H, W] into out [h, w, 4]."""
-    height, width = alpha.shape
-    quarter = np.float32(0.25)
+def pack(rgb, alpha, out):
+    """rgb [H, W, 3] and alpha [H, W] side by side in out [H, W, 4]."""
     for i in numba.prange(out.shape[0]):
-        top, bottom = np.uint64(2 * i), np.uint64(min(2 * i + 1, height - 1))
         for j in range(np.uint64(out.shape[1])):
-            c0 = np.uint64(2) * j
-            c1 = min(c0 + np.uint64(1), np.uint64(width - 1))
             for c in range(np.uint64(3)):
-                total = (rgb[top, c0, c] + rgb[bottom, c0, c]) + (
-                    rgb[top, c1, c] + rgb[bottom, c1, c]
-                )
-                out[i, j, c] = quarter * total
-            total = (alpha[top, c0] + alpha[bottom, c0]) + (alpha[top, c1] + alpha[bottom, c1])
-            out[i, j, 3] = quarter * total
+                out[i, j, c] = rgb[i, j, c]
+            out[i, j, 3] = alpha[i, j]
 
 
 @kernel

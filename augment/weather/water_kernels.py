@@ -40,11 +40,12 @@ EIGHTS = ~U(7)  # a number's multiple of eight
 DX, DY, DZ, ALONG, NX, NY, ROUGH, OWN_DEPTH, DISTANCE, TRUST = (U(STRIP * k) for k in range(10))
 LIST = U(STRIP * 10)
 
-# Lines of the scratch memory. Look-ups: place, level, colour; for each of three slopes the mirrored
-# ray, its share of the light and its place in the mirror.
-COLUMN, ROW, LEVEL, FOUND, R, G, B, A = (U(8 * k) for k in range(8))
-RX, RY, RZ, SHARE, MIRROR_C, MIRROR_R = (U(64 + 24 * k) for k in range(6))
-SCRATCH = 64 + 24 * 6
+# Lines of the scratch memory. Look-ups: pixel, way from it, level and its size, colour; was the bed
+# found and how deep; for each of three slopes the mirrored ray, its share of the light and its
+# place in the mirror.
+C0, R0, FC, FR, LOW, WIDE, HIGH, R, G, B, A, FOUND, DEPTH = (U(8 * k) for k in range(13))
+RX, RY, RZ, SHARE, MIRROR_C, MIRROR_R = (U(8 * 13 + 24 * k) for k in range(6))
+SCRATCH = 8 * 13 + 24 * 6
 
 
 class View(NamedTuple):
@@ -127,43 +128,71 @@ def _limits(n):
     )  # fmt: skip
 
 
-def _mixture(channels: int):
-    """A function: sum of four pixels of a flat image times four weights, channel by channel."""
+@intrinsic
+def _mix(typingctx, image, a, b, c, d, wa, wb, wc, wd):
+    """Sums of four pixels of a flat image of three channels times four weights."""
 
-    @intrinsic
-    def mix(typingctx, image, a, b, c, d, wa, wb, wc, wd):
-        def codegen(context, builder, sig, args):
-            data = context.make_array(sig.args[0])(context, builder, args[0]).data
-            number, real, wide = ir.IntType(32), ir.FloatType(), ir.IntType(64)
-            two, four = ir.VectorType(real, 2), ir.VectorType(real, 4)
-            spread = ir.Constant(ir.VectorType(number, 4), [0, 0, 0, 0])
-            nothing = ir.Constant(four, ir.Undefined)
-            parts = []
-            for index, weight in zip(args[1:5], args[5:], strict=True):
-                at = builder.gep(data, [builder.mul(index, wide(channels))])
-                if channels == 4:
-                    pixel = builder.load(builder.bitcast(at, four.as_pointer()), align=4)
-                else:  # a fourth number would lie beyond the last pixel
-                    pair = builder.load(builder.bitcast(at, two.as_pointer()), align=4)
-                    order = ir.Constant(ir.VectorType(number, 4), [0, 1, 0, 1])
-                    pixel = builder.shuffle_vector(pair, pair, order)
-                    third = builder.load(builder.gep(at, [wide(2)]))
-                    pixel = builder.insert_element(pixel, third, number(2))
-                weights = builder.insert_element(nothing, weight, number(0))
-                weights = builder.shuffle_vector(weights, nothing, spread)
-                parts.append(builder.fmul(pixel, weights))
-            top, bottom = builder.fadd(*parts[:2]), builder.fadd(*parts[2:])
-            total = builder.fadd(top, bottom)
-            values = [builder.extract_element(total, number(k)) for k in range(channels)]
-            return context.make_tuple(builder, sig.return_type, values)
+    def codegen(context, builder, sig, args):
+        data = context.make_array(sig.args[0])(context, builder, args[0]).data
+        number, real, wide = ir.IntType(32), ir.FloatType(), ir.IntType(64)
+        two, four = ir.VectorType(real, 2), ir.VectorType(real, 4)
+        order = ir.Constant(ir.VectorType(number, 4), [0, 1, 0, 1])
+        spread = ir.Constant(ir.VectorType(number, 4), [0, 0, 0, 0])
+        nothing = ir.Constant(four, ir.Undefined)
+        parts = []
+        for index, weight in zip(args[1:5], args[5:], strict=True):
+            at = builder.gep(data, [builder.mul(index, wide(3))])
+            # Not four numbers at once: the fourth may lie beyond the last pixel.
+            pair = builder.load(builder.bitcast(at, two.as_pointer()), align=4)
+            pixel = builder.shuffle_vector(pair, pair, order)
+            third = builder.load(builder.gep(at, [wide(2)]))
+            pixel = builder.insert_element(pixel, third, number(2))
+            weights = builder.insert_element(nothing, weight, number(0))
+            weights = builder.shuffle_vector(weights, nothing, spread)
+            parts.append(builder.fmul(pixel, weights))
+        total = builder.fadd(builder.fadd(*parts[:2]), builder.fadd(*parts[2:]))
+        values = [builder.extract_element(total, number(k)) for k in range(3)]
+        return context.make_tuple(builder, sig.return_type, values)
 
-        result = types.UniTuple(types.float32, channels)
-        return result(image, *[types.uint64] * 4, *[types.float32] * 4), codegen
-
-    return mix
+    result = types.UniTuple(types.float32, 3)
+    return result(image, *[types.uint64] * 4, *[types.float32] * 4), codegen
 
 
-_mix3, _mix4 = _mixture(3), _mixture(4)
+@intrinsic
+def _between(typingctx, image, a, b, fc, fr):
+    """Bilinear from a flat image of four channels: pixels a, a + 1 and below them b, b + 1."""
+
+    def codegen(context, builder, sig, args):
+        number, real, wide = ir.IntType(32), ir.FloatType(), ir.IntType(64)
+        eight, one = ir.VectorType(real, 8), real(1)
+        nothing = ir.Constant(eight, ir.Undefined)
+        data = context.make_array(sig.args[0])(context, builder, args[0]).data
+
+        def splat(*values):
+            vector = nothing
+            for k, value in enumerate(values):
+                vector = builder.insert_element(vector, value, number(k))
+            count = 8 // len(values)
+            order = [k for k in range(len(values)) for _ in range(count)]
+            order = ir.Constant(ir.VectorType(number, 8), order)
+            return builder.shuffle_vector(vector, nothing, order)
+
+        def pair(index):
+            at = builder.gep(data, [builder.mul(index, wide(4))])
+            return builder.load(builder.bitcast(at, eight.as_pointer()), align=4)
+
+        top = builder.fmul(pair(args[1]), splat(builder.fsub(one, args[4])))
+        bottom = builder.fmul(pair(args[2]), splat(args[4]))
+        across = splat(builder.fsub(one, args[3]), args[3])
+        both = builder.fmul(builder.fadd(top, bottom), across)
+        values = [
+            builder.fadd(*(builder.extract_element(both, number(k + side)) for side in (0, 4)))
+            for k in range(4)
+        ]
+        return context.make_tuple(builder, sig.return_type, values)
+
+    result = types.UniTuple(types.float32, 4)
+    return result(image, types.uint64, types.uint64, types.float32, types.float32), codegen
 
 
 @intrinsic
@@ -269,56 +298,20 @@ def _exponential(x):
 
 
 @inner()
-def _real(count):
-    return F(np.int32(count))  # from 64 unsigned bits it takes several instructions
+def _place(s, column, row, columns, rows):
+    """The first of the four pixels round coordinates (C0, R0), and the way from it (FC, FR).
 
-
-@inner()
-def _corners(column, row, width, height):
-    """Indices of the four pixels round a coordinate, and their weights."""
-    x = min(max(column - HALF, ZERO), _real(width) - ONE)
-    y = min(max(row - HALF, ZERO), _real(height) - ONE)
-    c0, r0 = U(np.int32(x)), U(np.int32(y))
-    c1, r1 = min(c0 + U(1), width - U(1)), min(r0 + U(1), height - U(1))
-    top, bottom = r0 * width, r1 * width
-    fc, fr = x - _real(c0), y - _real(r0)
-    gc, gr = ONE - fc, ONE - fr
-    return (
-        top + c0, top + c1, bottom + c0, bottom + c1, gc * gr, fc * gr, gc * fr, fc * fr,
-    )  # fmt: skip
-
-
-@inner()
-def _bilinear(rgb, alpha, view, column, row):
-    a, b, c, d, wa, wb, wc, wd = _corners(column, row, view.width, view.height)
-    red, green, blue = _mix3(rgb, a, b, c, d, wa, wb, wc, wd)
-    opaque = (alpha[a] * wa + alpha[b] * wb) + (alpha[c] * wc + alpha[d] * wd)
-    return red, green, blue, opaque
-
-
-@inner()
-def _mip(v, sizes, level, column, row):
-    first, width, height = sizes[level, U(0)], sizes[level, U(1)], sizes[level, U(2)]
-    scale = ONE / _real(U(1) << level)
-    a, b, c, d, wa, wb, wc, wd = _corners(column * scale, row * scale, width, height)
-    return _mix4(v, first + a, first + b, first + c, first + d, wa, wb, wc, wd)
-
-
-@inner()
-def _blurred(rgb, alpha, view, mips, sizes, column, row, level):
-    """Colour and alpha at a coordinate; level: of the averages, 0 for the image itself."""
-    low = U(np.int32(level))
-    share = level - _real(low)
-    if low == U(0):
-        r, g, b, a = _bilinear(rgb, alpha, view, column, row)
-    else:
-        r, g, b, a = _mip(mips, sizes, low, column, row)
-    if share > ZERO:
-        keep = ONE - share
-        r1, g1, b1, a1 = _mip(mips, sizes, low + U(1), column, row)
-        r, g, b = keep * r + share * r1, keep * g + share * g1, keep * b + share * b1
-        a = keep * a + share * a1
-    return r, g, b, a
+    columns, rows: the image's sides, vectors. On the last pixels the way is 1, from those before.
+    """
+    half, one, two, zero = v8.splat(HALF), v8.splat(ONE), v8.splat(F(2)), v8.splat(ZERO)
+    x = v8.minimum(v8.maximum(column - half, zero), columns - one)
+    y = v8.minimum(v8.maximum(row - half, zero), rows - one)
+    c0 = v8.maximum(v8.minimum(v8.floor(x), columns - two), zero)
+    r0 = v8.maximum(v8.minimum(v8.floor(y), rows - two), zero)
+    v8.store(s, C0, c0)
+    v8.store(s, R0, r0)
+    v8.store(s, FC, x - c0)
+    v8.store(s, FR, y - r0)
 
 
 @inner()
@@ -327,27 +320,71 @@ def _fetched(s):
 
 
 @inner()
+def _pixel(x):
+    return U(np.int32(x))
+
+
+@inner()
+def _bilinear(s, k, rgb, alpha, width, right, below):
+    """Colour and alpha at the place of a lane."""
+    a = _pixel(s[R0 + k]) * width + _pixel(s[C0 + k])
+    b, c, d = a + right, a + below, a + right + below
+    fc, fr = s[FC + k], s[FR + k]
+    gc, gr = ONE - fc, ONE - fr
+    wa, wb, wc, wd = gc * gr, fc * gr, gc * fr, fc * fr
+    opaque = (alpha[a] * wa + alpha[b] * wb) + (alpha[c] * wc + alpha[d] * wd)
+    red, green, blue = _mix(rgb, a, b, c, d, wa, wb, wc, wd)
+    return red, green, blue, opaque
+
+
+@inner()
 def _fetch(s, column, row, rgb, alpha, view):
-    v8.store(s, COLUMN, column)
-    v8.store(s, ROW, row)
+    _place(s, column, row, v8.splat(view.columns), v8.splat(view.rows))
+    right = min(view.width - U(1), U(1))
+    below = min(view.height - U(1), U(1)) * view.width
     for k in range(LANES):
-        r, g, b, a = _bilinear(rgb, alpha, view, s[COLUMN + k], s[ROW + k])
+        r, g, b, a = _bilinear(s, k, rgb, alpha, view.width, right, below)
         s[R + k], s[G + k], s[B + k], s[A + k] = r, g, b, a
     return _fetched(s)
 
 
 @inner()
-def _fetch_blurred(s, t, rgb, alpha, view, mips, sizes):
+def _fetch_level(s, column, row, level, mips, sizes):
+    """Colours and alphas from whole levels of averages."""
+    v8.store(s, LOW, level)
     for k in range(LANES):
-        column, row = s[MIRROR_C + t + k], s[MIRROR_R + t + k]
-        r, g, b, a = _blurred(rgb, alpha, view, mips, sizes, column, row, s[LEVEL + k])
+        low = _pixel(s[LOW + k])
+        s[WIDE + k], s[HIGH + k] = F(np.int32(sizes[low, 1])), F(np.int32(sizes[low, 2]))
+        s[LOW + k] = ONE / F(np.int32(1) << np.int32(low))
+    scale = v8.load(s, LOW)
+    _place(s, column * scale, row * scale, v8.load(s, WIDE), v8.load(s, HIGH))
+    v8.store(s, LOW, level)
+    for k in range(LANES):
+        width = _pixel(s[WIDE + k])
+        first = U(sizes[_pixel(s[LOW + k]), 0])
+        at = first + _pixel(s[R0 + k]) * width + _pixel(s[C0 + k])
+        r, g, b, a = _between(mips, at, at + width, s[FC + k], s[FR + k])
         s[R + k], s[G + k], s[B + k], s[A + k] = r, g, b, a
     return _fetched(s)
+
+
+@inner()
+def _fetch_blurred(s, column, row, level, mips, sizes):
+    """Colours and alphas between two levels of averages."""
+    low = v8.floor(level)
+    share = level - low
+    r, g, b, a = _fetch_level(s, column, row, low, mips, sizes)
+    top = v8.splat(F(np.int32(sizes.shape[0] - 1)))
+    low = v8.minimum(low + v8.splat(ONE), top)
+    r1, g1, b1, a1 = _fetch_level(s, column, row, low, mips, sizes)
+    keep = v8.splat(ONE) - share
+    r, g, b = keep * r + share * r1, keep * g + share * g1, keep * b + share * b1
+    return r, g, b, keep * a + share * a1
 
 
 @inner()
 def _sky(s, faces, size, x, y, z, near, medium):
-    """Colours of a cube map, flat [6, size, size, 4], in directions that climb, behind smog."""
+    """Colours of a cube map, flat, in directions that climb, behind smog."""
     zero = v8.splat(ZERO)
     ax, ay = v8.absolute(x), v8.absolute(y)
     by_x = v8.both(v8.at_least(ax, ay), v8.at_least(ax, z))
@@ -359,15 +396,14 @@ def _sky(s, faces, size, x, y, z, near, medium):
     down = v8.select(by_x, v8.negate(y), turned)
     face = v8.select(by_y, v8.select(ahead, v8.splat(F(2)), v8.splat(F(3))), v8.splat(F(4)))
     face = v8.select(by_x, v8.select(right, zero, v8.splat(ONE)), face)
-    scale = v8.splat(HALF * _real(size))
+    side = v8.splat(F(np.int32(size)))
+    scale = v8.splat(HALF) * side
     inverse = scale / major
-    v8.store(s, COLUMN, across * inverse + scale)
-    v8.store(s, ROW, down * inverse + scale)
-    v8.store(s, FOUND, face)
+    _place(s, across * inverse + scale, down * inverse + scale, side, side)
+    v8.store(s, R0, v8.load(s, R0) + face * side)
     for k in range(LANES):
-        a, b, c, d, wa, wb, wc, wd = _corners(s[COLUMN + k], s[ROW + k], size, size)
-        first = U(np.int32(s[FOUND + k])) * size * size
-        r, g, b, a = _mix4(faces, first + a, first + b, first + c, first + d, wa, wb, wc, wd)
+        at = _pixel(s[R0 + k]) * size + _pixel(s[C0 + k])
+        r, g, b, _ = _between(faces, at, at + size, s[FC + k], s[FR + k])
         s[R + k], s[G + k], s[B + k] = r, g, b
     r, g, b = v8.load(s, R), v8.load(s, G), v8.load(s, B)
     if medium.smog_above >= ZERO:
@@ -433,7 +469,7 @@ def _place_on_bed(px, py, tx, ty, depth, bed, medium, limits):
 
 @inner()
 def _search_bed(s, found, depth, px, py, tx, ty, alpha, depths, bed, medium, limits):
-    """The bed's depth along the refracted rays; COLUMN, ROW, FOUND (1 or 0): where they meet it."""
+    """The bed's depth along the refracted rays; C0 to FR, FOUND (1 or 0): where they meet it."""
     zero, one = v8.splat(ZERO), v8.splat(ONE)
     solid = v8.splat(limits.solid_alpha)
     going = found
@@ -452,8 +488,7 @@ def _search_bed(s, found, depth, px, py, tx, ty, alpha, depths, bed, medium, lim
         going = v8.select(moved, going, zero)
         depth = better
     column, row, inside = _place_on_bed(px, py, tx, ty, depth, bed, medium, limits)
-    v8.store(s, COLUMN, column)
-    v8.store(s, ROW, row)
+    _place(s, column, row, v8.splat(bed.columns), v8.splat(bed.rows))
     v8.store(s, FOUND, v8.select(inside, found, zero))
     return depth
 
@@ -461,17 +496,19 @@ def _search_bed(s, found, depth, px, py, tx, ty, alpha, depths, bed, medium, lim
 @inner()
 def _fetch_bed(s, q, own, place, at, depth, rgb, alpha, bed, limits):
     """The bed's colour where it was found, straight behind the pixel elsewhere; its depth."""
-    v8.store(s, LEVEL, depth)
+    v8.store(s, DEPTH, depth)
+    right = min(bed.width - U(1), U(1))
+    below = min(bed.height - U(1), U(1)) * bed.width
     for k in range(LANES):
         r = g = b = a = ZERO
         if s[FOUND + k] > ZERO:
-            r, g, b, a = _bilinear(rgb, alpha, bed, s[COLUMN + k], s[ROW + k])
+            r, g, b, a = _bilinear(s, k, rgb, alpha, bed.width, right, below)
         if a < limits.solid_alpha:
             pixel = U(own[place + k])
             r, g, b = rgb[U(3) * pixel], rgb[U(3) * pixel + U(1)], rgb[U(3) * pixel + U(2)]
-            a, s[LEVEL + k] = alpha[pixel], q[OWN_DEPTH + at + k]
+            a, s[DEPTH + k] = alpha[pixel], q[OWN_DEPTH + at + k]
         s[R + k], s[G + k], s[B + k], s[A + k] = r, g, b, a
-    return v8.load(s, LEVEL)
+    return v8.load(s, DEPTH)
 
 
 @inner()
@@ -512,15 +549,15 @@ def _find_in_mirror(s, count, dx, dy, dz, px, py, alpha, depth, mirror, medium, 
 
 
 @inner()
-def _set_level(s, sizes):
+def _level(s, sizes):
     """Level of averages whose pixels are as wide as a pixel's three places lie apart."""
     c, r = v8.load(s, MIRROR_C), v8.load(s, MIRROR_R)
     x1, y1 = v8.load(s, MIRROR_C + U(8)) - c, v8.load(s, MIRROR_R + U(8)) - r
     x2, y2 = v8.load(s, MIRROR_C + U(16)) - c, v8.load(s, MIRROR_R + U(16)) - r
     apart = v8.sqrt(x1 * x1 + y1 * y1) + v8.sqrt(x2 * x2 + y2 * y2)
     spacing = v8.maximum(v8.splat(HALF) * apart, v8.splat(ONE))
-    top = _real(sizes.shape[0] - 1)
-    v8.store(s, LEVEL, v8.maximum(v8.minimum(log2(spacing), v8.splat(top)), v8.splat(ZERO)))
+    top = F(np.int32(sizes.shape[0] - 1))
+    return v8.maximum(v8.minimum(log2(spacing), v8.splat(top)), v8.splat(ZERO))
 
 
 @inner()
@@ -570,7 +607,8 @@ def shade(
     u [W], v [H]: image coordinates at unit depth. axes [3, 3]: world_from_camera, float64. offset:
     (left, top) of the camera's window in the bed's. front: the layer of the screen-space reflection
     whose rays run front_distance. faces: flat cube map of `size` squared texels a face, each four
-    numbers. mirror_mips, mirror_sizes: see `water_launch.averages`.
+    numbers. mirror_mips: the mirrored layer and its averages, four numbers a pixel. mirror_sizes
+    [levels, 3]: their first pixels, widths, heights. Both arrays go on a row and a pixel beyond.
     """
     height, width = cover.shape
     left, top = offset
@@ -736,16 +774,22 @@ def shade(
                             s, taps, dx, dy, dz, px, py, mirror_alpha, mirror_depth, mirror,
                             medium, limits,
                         )  # fmt: skip
-                        v8.store(s, LEVEL, zero)
+                    level = zero
+                    if needs_mirror and rough:
+                        level = _level(s, mirror_sizes)
                     for tap in range(taps):
                         t8 = tap * LANES
                         r, g, b, a = zero, zero, zero, zero
                         if needs_mirror:
+                            column, row = v8.load(s, MIRROR_C + t8), v8.load(s, MIRROR_R + t8)
                             if rough:
-                                _set_level(s, mirror_sizes)
-                            r, g, b, a = _fetch_blurred(
-                                s, t8, mirror_rgb, mirror_alpha, mirror, mirror_mips, mirror_sizes
-                            )
+                                r, g, b, a = _fetch_blurred(
+                                    s, column, row, level, mirror_mips, mirror_sizes
+                                )
+                            else:
+                                r, g, b, a = _fetch(
+                                    s, column, row, mirror_rgb, mirror_alpha, mirror
+                                )
                         if has_front:
                             rest = one - weight
                             r, g = weight * image_r + rest * r, weight * image_g + rest * g

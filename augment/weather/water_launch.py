@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -40,7 +41,7 @@ def shade(
     smog: SmogMedium | None,
 ) -> Tensor:
     """As `water.shade_water`; smog is None where it has no density."""
-    faces, layered = _faces(sky, smog)
+    faces, size, layered = _faces(sky, smog)
     limit = water_surface.smooth_variance(camera)
     rough = bool((field.slope_variance >= limit).any())
     out = np.empty((camera.height, camera.width, 3), np.float32)
@@ -64,8 +65,8 @@ def shade(
         screen is not None,
         _array(distance),
         _array(weight),
-        faces.reshape(-1),
-        np.uint64(faces.shape[1]),
+        faces,
+        np.uint64(size),
         _medium(camera, medium, smog, layered),
         _limits(hidden_cover, limit),
         out,
@@ -79,19 +80,20 @@ def _array(part: Tensor) -> np.ndarray:
     return part.detach().float().contiguous().numpy()
 
 
-def _faces(sky: Sky, smog: SmogMedium | None) -> tuple[np.ndarray, SmogMedium | None]:
-    """A cube map's faces with four numbers a texel, [6, size, size, 4]; the smog before them."""
+def _faces(sky: Sky, smog: SmogMedium | None) -> tuple[np.ndarray, int, SmogMedium | None]:
+    """A flat cube map for the kernel, the size of its faces, the smog before them."""
     seen, layered = sky_behind(sky, smog)
     if isinstance(seen, ConstantSky):
-        return _padded(seen.rgb.expand(6, 1, 1, 3)), layered
+        return _padded(seen.rgb.expand(6, 1, 1, 3)), 1, layered
     if not isinstance(seen, CubemapSky | LatLongSky):
-        return _padded(_sampled(seen)), layered
+        return _padded(_sampled(seen)), SKY_SIZE, layered
     image = seen.faces if isinstance(seen, CubemapSky) else seen.image
     known = _known_faces.get(seen)
     if known is None or known[0] != image._version:
         faces = seen.faces if isinstance(seen, CubemapSky) else _sampled(seen)
         known = _known_faces[seen] = (image._version, _padded(faces))
-    return known[1], layered
+    size = seen.faces.shape[1] if isinstance(seen, CubemapSky) else SKY_SIZE
+    return known[1], size, layered
 
 
 def _sampled(sky: Sky) -> Tensor:
@@ -99,7 +101,11 @@ def _sampled(sky: Sky) -> Tensor:
 
 
 def _padded(faces: Tensor) -> np.ndarray:
-    return _array(torch.nn.functional.pad(faces.detach(), (0, 1)))
+    """Four numbers a texel, and a row and a texel beyond them."""
+    size = faces.shape[1]
+    out = np.zeros((6 * size * size + size + 1, 4), np.float32)
+    out[: 6 * size * size, :3] = _array(faces).reshape(-1, 3)
+    return out.reshape(-1)
 
 
 def _layer(layer: Layer | None) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -118,27 +124,24 @@ def _layer(layer: Layer | None) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.
 
 
 def _averages(layer: Layer | None, rough: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Mip levels from 1 on in one array, and (first pixel, width, height) of every level."""
+    """Mip levels in one array, a row and a pixel longer; (first pixel, width, height) of each."""
     if layer is None or not rough:
-        return np.zeros(1, np.float32), np.zeros((1, 3), np.uint64)
+        return np.zeros(1, np.float32), np.zeros((1, 3), np.int64)
     rgb, alpha = _array(layer.rgb), _array(layer.alpha)
     height, width = alpha.shape
-    shapes, first = [(0, width, height)], 0
+    spare, shapes, first = width + 1, [(0, width, height)], height * width
     while len(shapes) < layer_lookup.MIP_LEVELS and max(height, width) > 1:
         height, width = (height + 1) // 2, (width + 1) // 2
         shapes.append((first, width, height))
         first += height * width
-    mips = np.empty((max(first, 1), 4), np.float32)
-    last = None
+    mips = np.empty((first + spare, 4), np.float32)
+    mips[first:] = 0
+    images = [mips[start : start + w * h].reshape(h, w, 4) for start, w, h in shapes]
     with kernel_threads(MIP_ROWS):
-        for start, width, height in shapes[1:]:
-            image = mips[start : start + width * height].reshape(height, width, 4)
-            if last is None:
-                mip_kernels.halve_image(rgb, alpha, image)
-            else:
-                mip_kernels.halve_mip(last, image)
-            last = image
-    return mips.reshape(-1), np.asarray(shapes, np.uint64)
+        mip_kernels.pack(rgb, alpha, images[0])
+        for fine, coarse in pairwise(images):
+            mip_kernels.halve_mip(fine, coarse)
+    return mips.reshape(-1), np.asarray(shapes, np.int64)
 
 
 def _medium(
