@@ -63,7 +63,7 @@ def trace_screen(
     level_z_m: float,
     *,
     needed: Bool[Tensor, "h w"] | None = None,
-    stride: int = 2,
+    stride: int = 4,
     fast: bool = True,
 ) -> ScreenReflection:
     """What the mirrored rays of the flat surface z = level_z_m meet, for the pixels of `camera`.

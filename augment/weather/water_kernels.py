@@ -40,12 +40,13 @@ EIGHTS = ~U(7)  # a number's multiple of eight
 DX, DY, DZ, ALONG, NX, NY, ROUGH, OWN_DEPTH, DISTANCE, TRUST = (U(STRIP * k) for k in range(10))
 LIST = U(STRIP * 10)
 
-# Lines of the scratch memory. Look-ups: pixel, way from it, level and its size, colour; was the bed
-# found and how deep; for each of three slopes the mirrored ray, its share of the light and its
-# place in the mirror.
-C0, R0, FC, FR, LOW, WIDE, HIGH, R, G, B, A, FOUND, DEPTH = (U(8 * k) for k in range(13))
-RX, RY, RZ, SHARE, MIRROR_C, MIRROR_R = (U(8 * 13 + 24 * k) for k in range(6))
-SCRATCH = 8 * 13 + 24 * 6
+# Lines of the scratch memory. Look-ups: pixel, way from it, colour; was the bed found and how deep;
+# two levels of averages; for each of three slopes the mirrored ray, its share of the light
+# and its place in the mirror.
+C0, R0, FC, FR, R, G, B, A, FOUND, DEPTH, SHARE_ABOVE = (U(8 * k) for k in range(11))
+LOW, WIDE, HIGH, SCALE = (U(88 + 16 * k) for k in range(4))
+RX, RY, RZ, SHARE, MIRROR_C, MIRROR_R = (U(152 + 24 * k) for k in range(6))
+SCRATCH = 152 + 24 * 6
 
 
 class View(NamedTuple):
@@ -349,34 +350,39 @@ def _fetch(s, column, row, rgb, alpha, view):
 
 
 @inner()
-def _fetch_level(s, column, row, level, mips, sizes):
-    """Colours and alphas from whole levels of averages."""
-    v8.store(s, LOW, level)
+def _choose_levels(s, starts, level, sizes):
+    """The two levels of averages round real ones: first pixels, sizes, scales of coordinates."""
+    low, top = v8.floor(level), v8.splat(F(np.int32(sizes.shape[0] - 1)))
+    v8.store(s, SHARE_ABOVE, level - low)
+    v8.store(s, LOW, low)
+    v8.store(s, LOW + LANES, v8.minimum(low + v8.splat(ONE), top))
+    for k in range(U(2) * LANES):
+        n = _pixel(s[LOW + k])
+        starts[k] = sizes[n, 0]
+        s[WIDE + k], s[HIGH + k] = F(np.int32(sizes[n, 1])), F(np.int32(sizes[n, 2]))
+        s[SCALE + k] = ONE / F(np.int32(1) << np.int32(n))
+
+
+@inner()
+def _fetch_level(s, starts, second, column, row, mips):
+    """Colours and alphas from one of the levels chosen; second: LANES for the upper one."""
+    scale = v8.load(s, SCALE + second)
+    wide, high = v8.load(s, WIDE + second), v8.load(s, HIGH + second)
+    _place(s, column * scale, row * scale, wide, high)
     for k in range(LANES):
-        low = _pixel(s[LOW + k])
-        s[WIDE + k], s[HIGH + k] = F(np.int32(sizes[low, 1])), F(np.int32(sizes[low, 2]))
-        s[LOW + k] = ONE / F(np.int32(1) << np.int32(low))
-    scale = v8.load(s, LOW)
-    _place(s, column * scale, row * scale, v8.load(s, WIDE), v8.load(s, HIGH))
-    v8.store(s, LOW, level)
-    for k in range(LANES):
-        width = _pixel(s[WIDE + k])
-        first = U(sizes[_pixel(s[LOW + k]), 0])
-        at = first + _pixel(s[R0 + k]) * width + _pixel(s[C0 + k])
+        width = _pixel(s[WIDE + second + k])
+        at = U(starts[second + k]) + _pixel(s[R0 + k]) * width + _pixel(s[C0 + k])
         r, g, b, a = _between(mips, at, at + width, s[FC + k], s[FR + k])
         s[R + k], s[G + k], s[B + k], s[A + k] = r, g, b, a
     return _fetched(s)
 
 
 @inner()
-def _fetch_blurred(s, column, row, level, mips, sizes):
-    """Colours and alphas between two levels of averages."""
-    low = v8.floor(level)
-    share = level - low
-    r, g, b, a = _fetch_level(s, column, row, low, mips, sizes)
-    top = v8.splat(F(np.int32(sizes.shape[0] - 1)))
-    low = v8.minimum(low + v8.splat(ONE), top)
-    r1, g1, b1, a1 = _fetch_level(s, column, row, low, mips, sizes)
+def _fetch_blurred(s, starts, column, row, mips):
+    """Colours and alphas between the two levels chosen."""
+    r, g, b, a = _fetch_level(s, starts, U(0), column, row, mips)
+    r1, g1, b1, a1 = _fetch_level(s, starts, LANES, column, row, mips)
+    share = v8.load(s, SHARE_ABOVE)
     keep = v8.splat(ONE) - share
     r, g, b = keep * r + share * r1, keep * g + share * g1, keep * b + share * b1
     return r, g, b, keep * a + share * a1
@@ -617,6 +623,7 @@ def shade(
         medium, limits = _medium(medium_numbers), _limits(limit_numbers)
         q, s = np.zeros(2 * STRIP * 10, np.float32), np.zeros(SCRATCH, np.float32)
         pixels, own = np.zeros(2 * STRIP, np.int64), np.zeros(2 * STRIP, np.int64)
+        starts = np.zeros(16, np.int64)
         smooth_count, rough_count, j = U(0), U(0), 0
         bx, by, bz = v[i] * axes[0, 1], v[i] * axes[1, 1], v[i] * axes[2, 1]
         own_row = i + top
@@ -774,18 +781,15 @@ def shade(
                             s, taps, dx, dy, dz, px, py, mirror_alpha, mirror_depth, mirror,
                             medium, limits,
                         )  # fmt: skip
-                    level = zero
                     if needs_mirror and rough:
-                        level = _level(s, mirror_sizes)
+                        _choose_levels(s, starts, _level(s, mirror_sizes), mirror_sizes)
                     for tap in range(taps):
                         t8 = tap * LANES
                         r, g, b, a = zero, zero, zero, zero
                         if needs_mirror:
                             column, row = v8.load(s, MIRROR_C + t8), v8.load(s, MIRROR_R + t8)
                             if rough:
-                                r, g, b, a = _fetch_blurred(
-                                    s, column, row, level, mirror_mips, mirror_sizes
-                                )
+                                r, g, b, a = _fetch_blurred(s, starts, column, row, mirror_mips)
                             else:
                                 r, g, b, a = _fetch(
                                     s, column, row, mirror_rgb, mirror_alpha, mirror

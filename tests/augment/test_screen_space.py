@@ -246,6 +246,33 @@ def test_the_kernel_matches_the_definition(pitch, roll):
     assert int((~close).sum()) <= 0.005 * close.numel()
 
 
+@pytest.mark.parametrize("fast", [False, True])
+@pytest.mark.parametrize("stride", [1, 2, 4])
+def test_only_needed_pixels_are_traced(stride, fast):
+    camera = looking(6, 10)
+    front = see(camera, CAR, WALL)
+    whole = trace_screen(front, camera, LEVEL_M, stride=1, fast=fast)
+    needed = torch.zeros(camera.height, camera.width, dtype=torch.bool)
+    needed[40:60, 5:70] = True
+    needed[65::3, 1::3] = True  # alone between pixels that are not
+    part = trace_screen(front, camera, LEVEL_M, needed=needed, stride=stride, fast=fast)
+    assert (part.weight[~needed] == 0).all() and part.distance[~needed].isinf().all()
+    assert (part.weight >= 0).all() and int((part.weight[needed] > 0).sum()) > 500
+    if stride == 1:
+        assert torch.equal(part.distance[needed], whole.distance[needed])
+        assert torch.equal(part.weight[needed], whole.weight[needed])
+
+
+def test_gaps_narrower_than_the_stride_have_no_negative_weight():
+    camera = looking(10)
+    front = see(camera)
+    alpha = torch.ones_like(front.alpha)
+    alpha[41::4, 41::4] = 0  # rays of no other pixel are traced first
+    covered = dataclasses.replace(front, alpha=alpha, depth=torch.full_like(front.depth, 2.0))
+    found = trace_screen(covered, camera, LEVEL_M, stride=4)
+    assert (found.weight >= 0).all()
+
+
 def test_the_number_of_threads_changes_nothing():
     camera = looking(6, 10, 131, 90)
     front = see(camera, SIGN, CAR, WALL)
@@ -264,5 +291,8 @@ def test_a_camera_that_is_no_window_is_named():
     camera = looking()
     with pytest.raises(ValueError, match="must be a window of the front's"):
         trace_screen(see(camera), camera.scaled(0.5), LEVEL_M)
+    with pytest.raises(ValueError, match="needed must be"):
+        needed = torch.ones(3, 4, dtype=torch.bool)
+        trace_screen(see(camera), camera, LEVEL_M, needed=needed)
     with pytest.raises(ValueError, match="stride must be one of"):
         trace_screen(see(camera), camera, LEVEL_M, stride=3)

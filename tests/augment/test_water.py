@@ -15,6 +15,7 @@ from augment.weather.fresnel import reflectance
 from augment.weather.screen_space import ScreenReflection
 from augment.weather.smog import SmogMedium, blend_airlight, optical_depth
 from augment.weather.water import shade_water
+from augment.weather.water_surface import is_smooth, smooth_variance
 from augment.weather.waves import WaveField, WaveSet
 
 NONE = np.zeros(0)
@@ -366,6 +367,60 @@ def test_a_dry_bed_is_not_dimmed_by_any_water(fast):
 
 
 @BOTH
+def test_the_bed_is_not_looked_for_where_it_cannot_be_seen(fast):
+    eye = camera(pitch_deg=-40)
+    field, black = flat_field(eye), ConstantSky(torch.zeros(3))
+    bed = plane_layer(margin(eye), LEVEL - 0.4)
+    for per_m, seen in ((10.0, True), (40.0, False)):
+        clear, opaque = medium(extinction_per_m=(per_m,) * 3), medium(extinction_per_m=(1e9,) * 3)
+        out, water = (
+            shade_water(eye, uncovered(eye), each, field, bed, sky=black, fast=fast)
+            for each in (clear, opaque)
+        )
+        difference = float((out - water).abs().max())
+        # Through 0.4 m, exp(-4 / 0.8) comes up at least, or exp(-16) at most.
+        assert difference > 1e-3 if seen else difference == 0
+
+
+@BOTH
+def test_rough_pixels_take_the_mirror_and_smooth_ones_the_image(fast):
+    eye = camera(pitch_deg=-8)
+    white, grey = (
+        Layer(view, torch.full((43, 61, 3), shade), torch.ones(43, 61), torch.full((43, 61), 50.0))
+        for view, shade in ((eye, 1.0), (mirrored(eye), 0.5))
+    )
+    screen = ScreenReflection(white, torch.full((43, 61), 40.0), torch.ones(43, 61))
+    water = medium(rgb=(0.0, 0.0, 0.0), extinction_per_m=(math.inf,) * 3)
+    limit = smooth_variance(eye)
+    bed, sky, zero = plane_layer(eye, LEVEL - 0.3), noise_sky(), torch.zeros(43, 61)
+    both = []
+    for variance in (0.99 * limit, 1.01 * limit):
+        field = WaveField(zero, zero, torch.full((43, 61), variance))
+        assert bool(is_smooth(field, eye).all()) == (variance < limit)
+        views = [
+            shade_water(
+                eye,
+                uncovered(eye),
+                water,
+                field,
+                bed,
+                mirror=grey,
+                screen=shown,
+                sky=sky,
+                fast=fast,
+            )
+            for shown in (None, screen)
+        ]
+        both.append(views)
+    (mirror, image), (rough_mirror, rough_image) = both
+    assert torch.equal(rough_mirror, rough_image)
+    met = mirror > 0
+    ratio = image[met] / mirror[met]
+    # White instead of grey where the ray ends before the white wall; float32 roundings.
+    assert float(ratio.max()) < 2 + 1e-5 and int((ratio > 2 - 1e-5).sum()) > 500
+
+
+@BOTH
 def test_covered_pixels_are_left_black(fast):
     eye = camera()
     cover = uncovered(eye)
@@ -412,6 +467,16 @@ def test_other_skies_go_through_a_cube_map():
     )
     # A texel of the cube map is 1/80 of the image's: a kink between its pixels is cut that much.
     assert float((fast - slow).abs().max()) < 5e-3
+
+
+def test_a_sky_that_is_painted_over_is_seen_anew():
+    eye = camera()
+    bed, field, sky = plane_layer(eye, LEVEL - 0.3), flat_field(eye), noise_sky()
+    before = shade_water(eye, uncovered(eye), medium(), field, bed, sky=sky)
+    sky.faces.mul_(0.5)
+    after = shade_water(eye, uncovered(eye), medium(), field, bed, sky=sky)
+    fresh = shade_water(eye, uncovered(eye), medium(), field, bed, sky=CubemapSky(sky.faces))
+    assert torch.equal(after, fresh) and float((before - after).abs().max()) > 0.01
 
 
 def test_gradients_pass_through_the_definition():
