@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 
@@ -43,14 +44,24 @@ def explanation_text(facts: dict[str, Any]) -> str:
     ]
     effects = {name: numbers for name, numbers in recipe["weather"].items() if numbers}
     lines += [
-        f"  {effect}.{field} = {value}"
-        for effect, numbers in effects.items()
-        for field, value in numbers.items()
-        if value is not None
+        f"  {path} = {value}" for name in effects for path, value in _flat(name, effects[name])
     ] or ["  none: this is the clean render"]
     lines += ["", "passes, in order:"]
+    width = max(len(step["name"]) for step in plan["steps"])
     lines += [
-        f"  {'runs ' if step['runs'] else 'skips'}  {step['name']:<20} {step['why']}"
+        f"  {'runs ' if step['runs'] else 'skips'}  {step['name']:<{width}}  {step['why']}"
         for step in plan["steps"]
     ]
     return "\n".join(lines)
+
+
+def _flat(path: str, value: Any) -> Iterator[tuple[str, Any]]:
+    """Every number below a field with its dotted path; what is not given is left out."""
+    if isinstance(value, dict):
+        for name, inner in value.items():
+            yield from _flat(f"{path}.{name}", inner)
+    elif isinstance(value, (list, tuple)) and any(isinstance(v, dict) for v in value):
+        for number, inner in enumerate(value):
+            yield from _flat(f"{path}[{number}]", inner)
+    elif value is not None:
+        yield path, value
