@@ -46,7 +46,9 @@ from augment.weather.water_plane import (
     plane_window,
     resized,
 )
+from augment.weather.water_surface import is_smooth
 from augment.weather.wave_field import wave_field
+from augment.weather.waves import WaveField
 
 # No water is in view where no pixel shows more of it. Opaque surfaces let up to 4 % through: a
 # splat that would bring transmittance to 1e-4 is not blended, whatever is left before it.
@@ -175,7 +177,7 @@ def _from_above(
         field,
         as_layer(bed_camera, bed),
         mirror=_mirror_layer(painter, camera, medium, window, seen),
-        screen=_screen_reflection(painter, camera, medium, crop, front),
+        screen=_screen_reflection(painter, camera, medium, crop, field, front),
         sky=sky,
         smog=smog,
         fast=fast,
@@ -233,12 +235,18 @@ def _mirror_layer(
 
 
 def _screen_reflection(
-    painter: Painter, camera: Camera, medium: FloodMedium, crop: Camera, front: RenderOutput
+    painter: Painter,
+    camera: Camera,
+    medium: FloodMedium,
+    crop: Camera,
+    field: WaveField,
+    front: RenderOutput,
 ) -> ScreenReflection | None:
     if medium.reflection != "screen_space":
         return None
+    needed = is_smooth(field, crop)  # rough water takes the mirrored view alone
     layer = as_layer(camera, front)
-    return trace_screen(layer, crop, medium.level_z_m, fast=painter.fast)
+    return trace_screen(layer, crop, medium.level_z_m, needed=needed, fast=painter.fast)
 
 
 def _mirror_margins(camera: Camera, medium: FloodMedium) -> Margins:
