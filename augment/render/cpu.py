@@ -38,6 +38,7 @@ from augment.render.cpu_inputs import Inputs, gather_inputs
 from augment.render.cpu_scratch import Scratch, borrowed_scratch
 from augment.render.threads import kernel_threads, thread_count
 from augment.scene import Gaussians, PosedGaussians
+from augment.squares import any_in_squares
 from augment.weather.smog import SmogMedium
 
 _RANK_RUNS = 8  # pieces of work in ranking, each with its own histogram
@@ -241,9 +242,7 @@ class Tiles:
 
     def leave_out(self, wanted: np.ndarray) -> None:
         """Close the tiles without a wanted pixel [H, W]; their part of the images becomes 0."""
-        rows, columns = (np.arange(n) for n in (self._rows, self._columns))
-        strips = np.logical_or.reduceat(wanted, rows * layout.TILE_H, axis=0)
-        drawn = np.logical_or.reduceat(strips, columns * layout.TILE_W, axis=1)
+        drawn = any_in_squares(wanted, layout.TILE_W)
         self.open[~drawn.reshape(-1)] = cpu_blend.CLOSED
         for image in self._images:
             if image is not None:

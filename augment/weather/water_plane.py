@@ -14,6 +14,7 @@ from torch import Tensor
 
 from augment.cameras import Camera
 from augment.geometry import rigid
+from augment.squares import any_in_squares
 
 GRAIN = 16  # pixels a side of the squares that masks are grown in
 
@@ -34,8 +35,7 @@ class Margins:
         height, width = mask.shape
         inside = np.zeros((height + self.top + self.bottom, width + self.left + self.right), bool)
         inside[self.top : self.top + height, self.left : self.left + width] = mask.numpy()
-        steps = [np.arange(0, n, GRAIN) for n in inside.shape]
-        coarse = np.logical_or.reduceat(np.logical_or.reduceat(inside, steps[0], 0), steps[1], 1)
+        coarse = any_in_squares(inside, GRAIN)
         left, up, right, down = (
             math.ceil(n / GRAIN) for n in (self.left, self.top, self.right, self.bottom)
         )
