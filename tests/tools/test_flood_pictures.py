@@ -1,0 +1,29 @@
+"""The documentation's pictures of floods, on a street small enough to be quick."""
+
+import cv2
+
+from tools import flood_pictures
+
+
+def test_three_pictures_of_three_panels(tmp_path, monkeypatch):
+    small = "procedural:street?seed=3&frames=1&gaussians=20000&lidar_columns=128"
+    monkeypatch.setattr(flood_pictures, "STREET", small)
+    monkeypatch.setattr(flood_pictures, "FRAME", 0)
+    monkeypatch.setattr(flood_pictures, "SCALE", 0.25)
+    monkeypatch.setattr(flood_pictures, "REPEATS", 1)
+    paths = flood_pictures.draw_flood_pictures(tmp_path / "images")
+    assert [path.name for path in paths] == [
+        "flood-levels.jpg",
+        "flood-waves.jpg",
+        "flood-tiers.jpg",
+    ]
+    for path in paths:
+        image = cv2.imread(str(path))
+        height, width = round(540 * 0.25), round(960 * 0.25)
+        assert image.shape[1] == 3 * width + 2 * flood_pictures.GAP_PX
+        assert image.shape[0] == height + flood_pictures.CAPTION_PX
+        caption = image[height:]
+        assert (caption < 128).any() and (caption > 250).mean() > 0.7  # dark text on white
+    tiers = cv2.imread(str(paths[2]))[:135].astype(int)
+    sky, mirrored = tiers[90:, :240], tiers[90:, -240:]
+    assert abs(sky - mirrored).mean() > 3  # water with and without facades in it
