@@ -225,6 +225,7 @@ def bench(
     repeats: int = 7,
     quick: bool = False,
     scene: str | None = None,
+    pictures: Path | None = None,
     json_file: _JsonFile = None,
 ) -> int:
     """Measure speed and error on this machine.
@@ -242,6 +243,7 @@ def bench(
         scene: Raw data to fit (fit); by default a drive down the procedural street is recorded.
             Or the scene whose frames are timed (flood), as for render; by default the procedural
             street with a million Gaussians.
+        pictures: Also draw levels, waves and reflections with their time and error here (flood).
         json_file: Also write the figures to this file.
     """
     if what == "smog":
@@ -254,6 +256,10 @@ def bench(
 
         result = bench_flood(QUICK if quick else WHOLE, scene_uri=scene, repeats=repeats)
         text = flood_text(result)
+        if pictures is not None:
+            from tools.flood_pictures import draw_flood_pictures
+
+            text += "".join(f"\nwrote {path}" for path in draw_flood_pictures(pictures))
     elif what == "fit":
         from tools.bench_fit import bench_fit, fit_text
 

@@ -6,7 +6,7 @@ from tools import flood_pictures
 
 
 def test_three_pictures_of_three_panels(tmp_path, monkeypatch):
-    small = "procedural:street?seed=3&frames=1&gaussians=20000&lidar_columns=128"
+    small = "procedural:street?seed=3&frames=1&gaussians=60000"
     monkeypatch.setattr(flood_pictures, "STREET", small)
     monkeypatch.setattr(flood_pictures, "FRAME", 0)
     monkeypatch.setattr(flood_pictures, "SCALE", 0.25)
