@@ -50,12 +50,11 @@ from augment.weather.water_surface import is_smooth
 from augment.weather.wave_field import wave_field
 from augment.weather.waves import WaveField
 
-# No water is in view where no pixel shows more of it. Opaque surfaces let up to 4 % through: a
-# splat that would bring transmittance to 1e-4 is not blended, whatever is left before it.
-VISIBLE = 0.05
 COARSE = 0.25  # resolution of the mirrored view that fills what the screen does not show
 REACH_SIGMAS = 3.0  # slopes of the waves that the margins allow for
 MOST_MARGIN = 0.25  # of the image's longer side
+STEEPEST = 0.65  # fall of the ray whose bed refraction moves the most in the image
+MOST_SHIFT = 0.12  # of the image's height
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +158,7 @@ def _from_above(
     assert front.rgb is not None and front.alpha is not None
     sky, smog, fast = painter.sky, painter.medium, painter.fast
     water, most_shown = find_water(front.alpha, camera, fast=fast)
-    if most_shown <= VISIBLE:
+    if most_shown < 1 - HIDDEN_COVER:
         image = composite_sky(front.rgb, front.alpha, camera, sky, smog=smog, fast=fast)
         return FloodedImage(image, front, water)
 
@@ -267,13 +266,17 @@ def _mirror_margins(camera: Camera, medium: FloodMedium) -> Margins:
 def _bed_margins(camera: Camera, medium: FloodMedium) -> Margins:
     """By how much refraction may move the bed in the image.
 
-    A bent ray meets a bed of depth D nearer to the eye, at height h, than a straight one, by less
-    than D / (h + D) in tangents, which is downwards in the image of an upright camera.
+    Seen from a height h, a ray that falls by c per metre meets a bed of depth D, bent to fall by 1
+    per t metres, where a straight ray falls by c (h + D) / (h + c D t). So the image moves, down in
+    an upright camera's, by c D (1 - c t) / (h + c D t) in tangents, most for c near STEEPEST.
     """
     height = float(camera.centre[2]) - medium.level_z_m
-    depth = medium.waves.depth_m
-    reach = min(camera.fy * depth / (height + depth) * 0.5, 0.12 * camera.height)
-    return Margins(8, 8, 8, int(reach) + 8)
+    depth = min(medium.waves.depth_m, visible_depth_m(medium))
+    fall = min(max((camera.height - camera.cy) / camera.fy, 0.1), STEEPEST)
+    sine = 1 / (medium.refraction_index * math.hypot(1, fall))
+    bent = sine / math.sqrt(1 - sine**2)
+    shift = fall * depth * (1 - fall * bent) / (height + fall * depth * bent)
+    return Margins(8, 8, 8, int(min(camera.fy * shift, MOST_SHIFT * camera.height)) + 8)
 
 
 def _from_below(

@@ -37,7 +37,10 @@ from augment.weather.water_surface import (
 )
 from augment.weather.waves import WaveField
 
-HIDDEN_COVER = 1 - 1 / 512  # what is covered more than this adds less than half an 8-bit step
+# Water that is covered more than this is one colour. Opaque surfaces let up to 4 % through (a splat
+# that would bring transmittance to 1e-4 is not blended, whatever is left before it), and what
+# shines through them is worth no reflections.
+HIDDEN_COVER = 0.95
 
 
 def shade_water(
@@ -55,9 +58,9 @@ def shade_water(
 ) -> Float[Tensor, "h w 3"]:
     """Colour of the water where the camera's rays meet it, not clamped; 0 where they do not.
 
-    camera: above the water. cover: alpha of what stands before the water; where it hides the water
-    the result is 0. field: of this camera. bed: from a window of the same image, best a larger one.
-    mirror: from the eye mirrored in the plane. screen: its layer is of the same eye; it serves the
+    camera: above the water. cover: alpha of what stands before the water; where it is more than
+    HIDDEN_COVER the result is the water's own colour, or the smog's. field: of this camera.
+    bed: from a window of the same image, best a larger one. mirror: from the eye mirrored in the plane. screen: its layer is of the same eye; it serves the
     pixels that are smooth (`water_surface.is_smooth`), in the others' blur a coarse mirror is as
     sharp. Layers are fogged already; smog here dims the sky and the water's own colour. fast:
     float32 goes through the CPU kernel, equal to this definition within float rounding, unless
@@ -96,8 +99,9 @@ def shade_water(
         for (weight, normal), color, behind in zip(taps, seen, above, strict=True):
             share = weight * reflected_share(surface, normal, medium)
             out = out + share[..., None] * (before_sky(color, behind) - below)
-    shown = surface.meets & (cover <= HIDDEN_COVER)
-    return torch.where(shown[..., None], out, 0)
+    plain = torch.tensor(medium.rgb if smog is None else smog.rgb, dtype=out.dtype)
+    out = torch.where((cover <= HIDDEN_COVER)[..., None], out, plain)
+    return torch.where(surface.meets[..., None], out, 0)
 
 
 def reflected_share(

@@ -634,7 +634,10 @@ def shade(
                 # The order of these sums is that of Camera.ray_directions: the sign has to agree.
                 fall = (u[j] * axes[2, 0] + bz) + axes[2, 2]
                 if not (fall < 0.0 and cover[i, j] <= limits.cover):
-                    out[i, j, 0] = out[i, j, 1] = out[i, j, 2] = ZERO
+                    plain = medium.airlight if medium.smog_per_m > ZERO else medium.rgb
+                    met = ONE if fall < 0.0 else ZERO
+                    for c in range(3):
+                        out[i, j, c] = met * plain[c]
                     j += 1
                     continue
                 spread = variance[i, j]

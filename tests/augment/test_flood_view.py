@@ -126,7 +126,7 @@ def test_water_stands_at_its_level_and_hides_nothing_in_front_of_it(scene, refle
     left = slice(0, 20)  # no car there
     assert not wet.water[: int(edge) - 1, left].any()
     assert (wet.water[int(edge) + 2 :, left] == 255).all()
-    # Through the wall, opaque to some per cent (see VISIBLE), shines sky or water.
+    # Through the wall, opaque to some per cent (see HIDDEN_COVER), shines sky or water.
     above = (slice(None, int(edge) - 2), left)
     assert np.abs(wet.rgb[above].astype(int) - dry.rgb[above]).max() <= 4
     # The car, an actor 6 m ahead, is dry down to the water and gone below it.

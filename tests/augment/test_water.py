@@ -421,14 +421,19 @@ def test_rough_pixels_take_the_mirror_and_smooth_ones_the_image(fast):
 
 
 @BOTH
-def test_covered_pixels_are_left_black(fast):
+def test_covered_pixels_are_one_colour(fast):
     eye = camera()
     cover = uncovered(eye)
-    cover[10:20, 5:30] = 1 - 1 / 1024
-    cover[30:, :] = 1 - 1 / 256
-    bed = plane_layer(eye, LEVEL - 0.3)
-    out = shade_water(eye, cover, medium(), flat_field(eye), bed, sky=noise_sky(), fast=fast)
-    assert bool((out[10:20, 5:30] == 0).all()) and bool((out[30:] > 0).all())
+    cover[30:, :] = 0.96
+    cover[40:, :] = 0.94
+    bed, water, sky = plane_layer(eye, LEVEL - 0.3), medium(), noise_sky()
+    out = shade_water(eye, cover, water, flat_field(eye), bed, sky=sky, fast=fast)
+    bare = shade_water(eye, uncovered(eye), water, flat_field(eye), bed, sky=sky, fast=fast)
+    covered = torch.tensor(water.rgb).expand_as(out[30:40])
+    assert torch.equal(out[30:40], covered) and torch.equal(out[40:], bare[40:])
+    smog = SmogMedium(0.05, (0.5, 0.6, 0.7))
+    out = shade_water(eye, cover, water, flat_field(eye), bed, sky=sky, smog=smog, fast=fast)
+    assert torch.equal(out[30:40], torch.tensor(smog.rgb).expand_as(out[30:40]))
 
 
 @BOTH
