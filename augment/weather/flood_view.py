@@ -15,10 +15,9 @@ and nothing in front of the water can leak into refraction or reflection.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -101,7 +100,7 @@ class Painter:
         )
         if self.smog_on_buffers is None:
             return raster
-        return dataclasses.replace(raster, rgb=fog_raster(raster, camera, self.smog_on_buffers))
+        return replace(raster, rgb=fog_raster(raster, camera, self.smog_on_buffers))
 
     def layer(
         self, camera: Camera, clip: HeightClip, wanted: Bool[Tensor, "H W"] | None = None
@@ -204,7 +203,7 @@ def _draw_bed(
     reach = math.inf if scene_buffers else visible_depth_m(medium)
     below = HeightClip(medium.level_z_m, BELOW, reach, overlaps=True)
     wanted = scene_buffers | {RGB, ALPHA, EXPECTED_DEPTH}
-    return painter.draw(camera, below, wanted, margins.around(seen))
+    return painter.draw(camera, below, wanted, margins.around(seen, margins))
 
 
 def visible_depth_m(medium: FloodMedium) -> float:
@@ -225,7 +224,8 @@ def _mirror_layer(
     margins = _mirror_margins(camera, medium)
     place = mirrored_window(window, camera).grown(margins)
     view = place.of(mirrored_camera(camera, medium.level_z_m))
-    wanted = margins.around(seen.flip(0))
+    # Within the window tilted waves look as far down as up.
+    wanted = margins.around(seen.flip(0), replace(margins, bottom=margins.top))
     if medium.reflection == "screen_space":
         view = view.scaled(COARSE)
         wanted = resized(wanted, view)
@@ -284,7 +284,7 @@ def _from_below(
 ) -> FloodedImage:
     """From under the water, or exactly at its surface."""
     wanted = buffers | {RGB, ALPHA, EXPECTED_DEPTH}
-    in_air = dataclasses.replace(painter, smog=None, smog_on_buffers=None)
+    in_air = replace(painter, smog=None, smog_on_buffers=None)
     front = in_air.draw(camera, HeightClip(medium.level_z_m, BELOW), wanted)
     above = HeightClip(medium.level_z_m, ABOVE, overlaps=True)
     air = painter.draw(camera, above, wanted)

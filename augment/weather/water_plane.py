@@ -28,8 +28,8 @@ class Margins:
     right: int
     bottom: int
 
-    def around(self, mask: Bool[Tensor, "h w"]) -> Bool[Tensor, "H W"]:
-        """A window's mask as one of the grown window, grown as far: in whole squares, so that
+    def around(self, mask: Bool[Tensor, "h w"], reach: Margins) -> Bool[Tensor, "H W"]:
+        """A window's mask as one of the grown window, grown by the reach: in whole squares, so that
         nothing is missed.
         """
         height, width = mask.shape
@@ -37,7 +37,7 @@ class Margins:
         inside[self.top : self.top + height, self.left : self.left + width] = mask.numpy()
         coarse = any_in_squares(inside, GRAIN)
         left, up, right, down = (
-            math.ceil(n / GRAIN) for n in (self.left, self.top, self.right, self.bottom)
+            math.ceil(n / GRAIN) for n in (reach.left, reach.top, reach.right, reach.bottom)
         )
         square = np.ones((up + down + 1, left + right + 1), np.uint8)
         # OpenCV grows towards what lies before the anchor in the kernel's own direction.

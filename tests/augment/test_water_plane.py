@@ -120,7 +120,7 @@ def test_masks_grow_at_least_by_their_margins():
     margins = Margins(5, 40, 20, 0)
     mask = torch.zeros(100, 120, dtype=torch.bool)
     mask[50, 60] = True
-    grown = margins.around(mask)
+    grown = margins.around(mask, margins)
     assert grown.shape == (140, 145)
     row, column = 50 + 40, 60 + 5  # where that pixel stands in the grown window
     assert bool(grown[row - 40 : row + 1, column - 5 : column + 21].all())
@@ -128,4 +128,7 @@ def test_masks_grow_at_least_by_their_margins():
     # No farther than the squares of 16 pixels that hold the margins.
     assert row - int(rows.min()) < 40 + 32 and int(rows.max()) - row < 32
     assert column - int(columns.min()) < 5 + 32 and int(columns.max()) - column < 20 + 32
-    assert not Margins(3, 3, 3, 3).around(torch.zeros(10, 10, dtype=torch.bool)).any()
+    none = torch.zeros(10, 10, dtype=torch.bool)
+    assert not margins.around(none, margins).any()
+    further = margins.around(mask, Margins(5, 40, 20, 33))
+    assert bool(further[row : row + 34, column].all())
