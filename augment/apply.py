@@ -47,7 +47,8 @@ class FloodedView:
     """What a view's labels under water are measured from.
 
     level_z_m: the water's surface, scene world. scene_depth_m: float32 [H, W], z of the scene's own
-    surface, seen through the water where there is some; 0 = none. None where no label needs it.
+    surface, seen through the water where there is some; 0 = none. None where no water is in
+    view, or no label needs it.
     """
 
     level_z_m: float
@@ -118,7 +119,10 @@ def render_buffers(
         painter = Painter(
             parts, scene.sky, plan.settings, plan.smog_in_splats, plan.smog_on_buffers, backend
         )
-        flooded = render_flooded(painter, camera, plan.flood, plan.buffers)
+        buffers = plan.buffers
+        if plan.measures_flood and plan.depth_buffer is None:
+            buffers = buffers | {EXPECTED_DEPTH}
+        flooded = render_flooded(painter, camera, plan.flood, buffers)
     if flooded is not None:
         rgb, raster = flooded.rgb, flooded.scene
     else:
@@ -127,7 +131,7 @@ def render_buffers(
     if color_map is not None:  # a camera exposes what the weather has left, so this comes last
         rgb = map_colors(rgb, color_map, fast=backend != "reference")
     depth = None
-    if plan.depth_buffer is not None or plan.measures_flood:
+    if plan.depth_buffer is not None or (plan.measures_flood and flooded is not None):
         z = getattr(raster, plan.depth_buffer or EXPECTED_DEPTH)
         assert raster.alpha is not None
         depth = torch.where(raster.alpha >= SURFACE_ALPHA, z, torch.zeros_like(z))
@@ -172,7 +176,7 @@ def _water_mask(buffers: WeatheredBuffers) -> np.ndarray:
 def _flooded(buffers: WeatheredBuffers, plan: Plan) -> FloodedView | None:
     if plan.flood_level_z_m is None:
         return None
-    depth = buffers.depth_m if plan.measures_flood else None
+    depth = buffers.depth_m if plan.measures_flood and buffers.water is not None else None
     return FloodedView(plan.flood_level_z_m, None if depth is None else depth.float().numpy())
 
 

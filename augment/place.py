@@ -103,6 +103,3 @@ def _lowest_of_actor(actor: Actor) -> float:
 def gaussians_below(scene: Scene, level_z_m: float) -> bool:
     """Whether any splat of the scene reaches below a height: else no water stands anywhere."""
     return lowest_z_m(scene) < level_z_m
-
-
-__all__ = ["gaussians_below", "lowest_z_m", "place_flood", "place_smog"]

@@ -36,8 +36,8 @@ class Plan:
     recorded_exposure: whether cameras' colour maps apply to the finished picture.
     depth_buffer: which buffer is written as depth, or None. steps: every pass considered, in order.
     flood: the water, None where there is none. shows_water: whether depth, semantic and instance
-    images show the water's surface or the scene's under it. measures_flood: whether the depth of
-    the scene's surfaces is needed for what labels say of the flood.
+    images show the water's surface or the scene's under it. measures_flood: whether views with
+    water need the depth of the scene's surfaces, for what labels say of the flood.
     """
 
     settings: RasterSettings
@@ -86,8 +86,6 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
     if smog and not per_gaussian:
         buffers.add(EXPECTED_DEPTH)
     measures_flood = flood is not None and recipe.output.labels and scene.labels is not None
-    if measures_flood and not depth_buffer:
-        buffers.add(EXPECTED_DEPTH)
     if recipe.output.semantic or recipe.output.instance:
         buffers.add(SPLAT_IDS)
     settings = RasterSettings(

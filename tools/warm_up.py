@@ -28,7 +28,8 @@ def warm_up(recipes: Sequence[Recipe]) -> float:
         flood = recipe.weather.flood
         if flood is None:
             continue
-        kernels = (flood.reflection, recipe.output.depth, recipe.output.semantic)
+        ids = recipe.output.semantic or recipe.output.instance
+        kernels = (flood.reflection, recipe.output.depth, ids)
         if kernels not in seen:
             seen.add(kernels)
             render_view(_pool(flood.level_m), _camera(flood.level_m + 0.5), recipe)

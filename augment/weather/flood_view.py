@@ -162,7 +162,8 @@ def _from_above(
         return FloodedImage(image, front, water)
 
     crop = window.of(camera)
-    seen = _seen(window.cut(front.alpha))
+    cover = window.cut(front.alpha)
+    seen = cover <= HIDDEN_COVER
     field = wave_field(medium.waves, crop, medium.level_z_m, fast=fast)
     margins = _bed_margins(camera, medium)
     bed_window = window.grown(margins)
@@ -170,7 +171,7 @@ def _from_above(
     bed = _draw_bed(painter, bed_camera, medium, buffers - {RGB, ALPHA}, margins, seen)
     color = shade_water(
         crop,
-        window.cut(front.alpha),
+        cover,
         medium,
         field,
         as_layer(bed_camera, bed),
@@ -182,11 +183,6 @@ def _from_above(
     )
     image = pour(front, camera, window, color, sky, smog, fast=fast)
     return FloodedImage(image, both_sides(front, bed, bed_window, buffers, fast=fast), water)
-
-
-def _seen(alpha: Float[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
-    """Which of the water's pixels are shaded, for what stands before them."""
-    return alpha <= HIDDEN_COVER
 
 
 def _draw_bed(

@@ -12,6 +12,7 @@ from augment.apply import render_buffers, render_view
 from augment.cameras import Camera, Frame
 from augment.geometry import rigid
 from augment.ground_heights import Ground
+from augment.labels import Boxes
 from augment.plan import make_plan
 from augment.render.composite import quantise
 from augment.scene import Actor, Gaussians, Scene, Track
@@ -293,6 +294,37 @@ def test_depth_and_classes_of_the_scene_or_of_the_first_surface(scene):
     expected = view.fy * 1.1 / (rows + 0.5 - view.cy)  # the plane lies 1.1 m below the camera
     assert np.abs(first.depth_m[mask] / expected - 1).max() < 1e-5
     assert np.array_equal(first.depth_m[~mask], under.depth_m[~mask])
+
+
+class NoBoxes:
+    """Labels, so that a flood is measured for them."""
+
+    def boxes(self, frame_index):
+        return Boxes.empty()
+
+    def lidar(self, frame_index):
+        return None
+
+
+def test_labels_take_the_depth_under_water_and_only_where_there_is_water(scene, monkeypatch):
+    import augment.apply as apply
+
+    asked = []
+    original = apply.rasterize
+    monkeypatch.setattr(
+        apply, "rasterize", lambda *a, **k: asked.append(k["buffers"]) or original(*a, **k)
+    )
+    labelled = dataclasses.replace(scene, labels=NoBoxes())
+    view = camera()
+    wet = view_of(labelled, flood(), view, depth="none")
+    assert wet.depth_m is None and wet.flood.level_z_m == pytest.approx(ROAD_Z + 0.4)
+    road = view.fy * 1.5 / (np.arange(60) + 0.5 - view.cy)  # 1.5 m below the camera
+    assert np.abs(wet.flood.scene_depth_m[40:, :20] / road[40:, None] - 1).max() < 0.03
+    up = view_of(labelled, flood(), camera(pitch=-1.0), depth="none")
+    assert up.flood.level_z_m == wet.flood.level_z_m and up.flood.scene_depth_m is None
+    assert asked == [{"rgb", "alpha"}]  # of the clean frame alone
+    unlabelled = view_of(scene, flood(), view, depth="none")
+    assert unlabelled.flood.scene_depth_m is None
 
 
 def test_masks_of_two_cameras_agree(scene):
