@@ -119,16 +119,33 @@ class Actor:
 
 
 @dataclass(frozen=True, eq=False)
+class SplatShading:
+    """Light that falls on every pixel of a splat by its own normal (see augment.render.shading).
+
+    A splat's colour at a pixel is that of its SH plus slopes [N, 3] times the wrapped share of the
+    light, clamp((n . sun + wrap) / (1 + wrap), 0, 1). sun: unit, towards the light, in the part's
+    frame.
+    """
+
+    slopes: Float[Tensor, "N 3"]
+    sun: tuple[float, float, float]
+    wrap: float
+
+
+@dataclass(frozen=True, eq=False)
 class PosedGaussians:
     """Gaussians placed in the world: what a rasteriser takes, so that nothing is concatenated.
 
     world_from_part: float64 [4, 4], or None for the identity. instance_id: 0 for the background,
-    1 + the actor's index otherwise.
+    1 + the actor's index otherwise. is_snow: whether they are snow, which the buffer "snow" counts.
+    shading: None for splats of one colour each.
     """
 
     gaussians: Gaussians
     world_from_part: Float[Tensor, "4 4"] | None = None
     instance_id: int = 0
+    is_snow: bool = False
+    shading: SplatShading | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,3 +22,4 @@ class SemanticClass(IntEnum):
     OTHER = 13
     SKY = 14
     WATER = 15
+    SNOW = 16
