@@ -15,11 +15,17 @@ from pydantic import ConfigDict, Field, model_validator
 from pydantic.config import JsonDict
 
 from recipes.flood import Flood
+from recipes.snow import Snow
 from recipes.types import Closed, Colour, Flag, Number, Whole
 
 VERSION = 1
 KOSCHMIEDER = 3.912  # -ln(0.02): visibility is where contrast falls to 2 %
-_LATER_FIELDS = (("render", "exposure"), ("weather", "flood"), ("output", "surface"))
+_LATER_FIELDS = (
+    ("render", "exposure"),
+    ("weather", "flood"),
+    ("weather", "snow"),
+    ("output", "surface"),
+)
 MAX_EXTINCTION_PER_M = 100.0  # nothing is seen through 10 cm of it
 
 # In words of JSON Schema: one of the two is present and not null.
@@ -102,6 +108,7 @@ class Weather(Closed):
 
     smog: Smog | None = None
     flood: Flood | None = None
+    snow: Snow | None = None
 
 
 class Render(Closed):
@@ -138,10 +145,11 @@ class Output(Closed):
     depth: Literal["median", "expected", "none"] = Field(
         default="median", description="Depth estimator written as 16-bit PNG, metres x 256."
     )
-    surface: Literal["scene", "first"] = Field(
-        default="scene",
-        description="What depth, semantic and instance images show where there is water: the "
-        "scene's surface under it, or the water itself, the first surface a ray meets.",
+    surface: Literal["solid", "scene", "first"] = Field(
+        default="solid",
+        description="What depth, semantic and instance images show of the weather: solid counts "
+        "snow as a surface and water not; scene shows the scene without either; first shows "
+        "whatever a ray meets first, water too.",
     )
     semantic: Flag = Field(default=False, description="Write the class of the heaviest splat.")
     instance: Flag = Field(
@@ -197,7 +205,7 @@ class Recipe(Closed):
         flood_turbidity_ntu is the default's where the recipe gives none, and NaN where it gives an
         absorption. flood_wave_height is a factor on a preset's waves, NaN where they are listed.
         """
-        smog, flood = self.weather.smog, self.weather.flood
+        smog, flood, snow = self.weather.smog, self.weather.flood, self.weather.snow
         height_m = None if smog is None else smog.scale_height_m
         turbidity = None if flood is None else flood.effective_turbidity_ntu
         waves = None if flood is None or flood.waves.components is not None else flood.waves
@@ -207,4 +215,6 @@ class Recipe(Closed):
             "flood_level_m": math.nan if flood is None else flood.level_m,
             "flood_turbidity_ntu": math.nan if turbidity is None else turbidity,
             "flood_wave_height": math.nan if waves is None else waves.height,
+            "snow_depth_m": math.nan if snow is None else snow.depth_m,
+            "snow_coverage": math.nan if snow is None else snow.coverage,
         }

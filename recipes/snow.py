@@ -10,7 +10,7 @@ from recipes.types import Closed, Number, Unit, Whole
 
 
 class SnowLight(Closed):
-    """The light on the snow; null means: as the scene's sky and ground show it."""
+    """The light on the snow; null leaves a field to what the scene's sky and ground show."""
 
     sun_azimuth_deg: Number | None = Field(
         default=None,
@@ -25,8 +25,10 @@ class SnowLight(Closed):
         le=90,
         description="The sun's height above the horizon; null for the brightest part of the sky.",
     )
-    sun: Unit | None = Field(
+    sun: Number | None = Field(
         default=None,
+        ge=0,
+        le=1,
         description="How much of the light comes from the sun: 0 overcast, 1 a clear day; null "
         "for what the sky's contrast suggests.",
     )
@@ -34,8 +36,8 @@ class SnowLight(Closed):
         default=None,
         ge=0,
         le=1,
-        description="Display-encoded brightness of fresh snow that faces the light; null for what "
-        "the scene's ground suggests.",
+        description="Display-encoded brightness of snow of albedo 0.85 that faces the light; null "
+        "for what the scene's ground suggests.",
     )
 
 

@@ -60,6 +60,13 @@ FLOOD = st.dictionaries(st.sampled_from(FLOODS.known), FLOW).flatmap(
         )
     )
 )
+SNOWS = ROOT.sections["weather"].sections["snow"]
+SNOW = st.dictionaries(st.sampled_from(SNOWS.known), FLOW).map(
+    lambda d: (
+        "weather:\n  snow:\n    depth_m: 0.1\n"
+        + "".join(f"    {key}: {value}\n" for key, value in d.items() if key != "depth_m")
+    )
+)
 GOOD = """version: 1
 seed: 7
 variants: 2
@@ -75,6 +82,9 @@ weather:
       components:
         - {amplitude_m: 0.01, wavelength_m: {uniform: [1, 2]}, steepness: 0.06}
         - {amplitude_m: 0.002, wavelength_m: 0.3}
+  snow:
+    depth_m: {uniform: [0.02, 0.2]}
+    light: {sun: {choice: [null, 0.5]}}
 output: {image: png, jpeg_quality: {uniform: [60, 95]}}
 """
 # Without derandomize, one run in a thousand would test something that no other run repeats.
@@ -135,6 +145,12 @@ def test_smog_with_any_values(text: str) -> None:
 @FUZZ
 @given(FLOOD)
 def test_flood_with_any_values(text: str) -> None:
+    loads_or_explains(text)
+
+
+@FUZZ
+@given(SNOW)
+def test_snow_with_any_values(text: str) -> None:
     loads_or_explains(text)
 
 

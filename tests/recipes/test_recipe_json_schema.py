@@ -74,6 +74,10 @@ def with_waves(*components: Any) -> dict:
     return with_flood(waves={"components": list(components)})
 
 
+def with_snow(**fields: Any) -> dict:
+    return {"weather": {"snow": {"depth_m": 0.1, **fields}}}
+
+
 WAVE = {"amplitude_m": 0.02, "wavelength_m": 2.0}
 
 
@@ -104,7 +108,13 @@ WAVE = {"amplitude_m": 0.02, "wavelength_m": 2.0}
         with_flood(waves={"preset": "wind", "direction_deg": {"uniform": [0.0, 360.0]}}),
         with_waves(),
         with_waves(WAVE, {**WAVE, "steepness": {"uniform": [0.0, 0.5]}}),
-        {"output": {"surface": {"choice": ["first", "scene"]}}},
+        {"output": {"surface": {"choice": ["first", "scene", "solid"]}}},
+        with_snow(),
+        with_snow(probability=0.5, depth_m={"log_uniform": [0.01, 1.0]}, seed=None),
+        with_snow(light=None, wind=None),
+        with_snow(light={"sun": {"choice": [None, {"uniform": [0.0, 1.0]}]}, "brightness": None}),
+        with_snow(wind={"direction_deg": {"uniform": [-180.0, 180.0]}, "drift": 1}),
+        with_snow(tracks={"choice": ["auto", "never"]}, shading="per_pixel", cell_m=0.001),
     ],
 )
 def test_both_accept(data: dict, validator: Any) -> None:
@@ -161,6 +171,19 @@ def test_both_accept(data: dict, validator: Any) -> None:
         with_waves({**WAVE, "steepness": 2}),
         with_waves({**WAVE, "speed_mps": 2}),
         with_waves(*[WAVE] * 65),
+        {"output": {"surface": "water"}},
+        {"weather": {"snow": {}}},
+        with_snow(depth_m=None),
+        with_snow(depth_m=-0.1),
+        with_snow(depth_m=10.1),
+        with_snow(cell_m=0),
+        with_snow(coverage={"uniform": [0.5, 1.5]}),
+        with_snow(tracks=True),
+        with_snow(light={"sun_elevation_deg": -1}),
+        with_snow(light={"azimuth_deg": 1}),
+        with_snow(wind={"drift": None}),
+        with_snow(wind=3),
+        with_snow(seed=1.5),
     ],
 )
 def test_both_refuse(data: dict, validator: Any) -> None:

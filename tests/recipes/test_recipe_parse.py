@@ -60,7 +60,8 @@ S = "r.yaml:4: weather.smog."
         ("scale: 1", "scale: unknown field here; did you mean render.scale?"),
         (
             "seed: 1",
-            "seed: unknown field here; did you mean seed at the top or weather.flood.waves.seed?",
+            "seed: unknown field here; did you mean seed at the top or weather.flood.waves.seed or "
+            "weather.snow.seed?",
         ),
         ("qqq: 1", "qqq: unknown field; known here: visibility_m, extinction_per_m, color, scale_"),
         ('"a\\nb": 1', "a\\nb: unknown field"),

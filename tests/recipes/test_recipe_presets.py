@@ -9,7 +9,7 @@ import pytest
 from recipes.flood import Flood
 from recipes.load import load_recipe
 from recipes.schema import KOSCHMIEDER, Weather
-from recipes.values import as_number
+from recipes.values import Uniform, as_number
 
 
 def arriving(name: str, distance_m: float) -> tuple[float, float]:
@@ -113,3 +113,37 @@ def test_drawn_floods_are_pinned_and_brown(name: str) -> None:
     assert floods[0].level_m == FLOODS[name]
     assert len({flood.level_m for flood in floods}) == 20
     assert all(red >= green >= blue for red, green, blue in (flood.color for flood in floods))
+    assert all(weather.snow is None for weather in variants)
+
+
+# of draw 0; least and greatest depth, m
+SNOWS = {
+    "dusting": (0.01805341217, 0.005, 0.02),
+    "fresh-snow": (0.1148090991, 0.08, 0.12),
+    "deep-snow": (0.476640946, 0.32, 0.5),
+    "winter-fog": (0.1096181982, 0.04, 0.12),
+}
+TRACKS_TO_M = 0.3  # "auto" draws no tracks in deeper snow
+
+
+@pytest.mark.parametrize("name", SNOWS)
+def test_drawn_snow_is_pinned_and_as_deep_as_documented(name: str) -> None:
+    first_m, low_m, high_m = SNOWS[name]
+    assert dict(load_recipe(name).values)["weather.snow.depth_m"] == Uniform(low_m, high_m)
+    variants = [load_recipe(name).resolve(i).weather for i in range(20)]
+    snows = [weather.snow for weather in variants if weather.snow is not None]
+    assert len(snows) == 20 and all(weather.flood is None for weather in variants)
+    assert snows[0].depth_m == first_m
+    assert len({snow.depth_m for snow in snows}) == 20
+    assert (low_m > TRACKS_TO_M) == (name == "deep-snow") and snows[0].tracks == "auto"
+    assert (max(s.coverage for s in snows) < 1) == (name == "dusting")
+    said = [s.light.sun for s in snows if s.light.sun is not None]
+    soft = {"deep-snow": 0.3, "winter-fog": 0.1}
+    assert max(said) <= soft[name] if name in soft else not said
+
+
+def test_fog_over_snow() -> None:
+    assert arriving("winter-fog", 200) == pytest.approx((0.02, 0.14), abs=0.005)
+    fogs = [load_recipe(name).resolve(0).weather.smog for name in SNOWS]
+    assert [fog is not None for fog in fogs] == [name == "winter-fog" for name in SNOWS]
+    assert fogs[-1] is not None and fogs[-1].scale_height_m is None, "the sky is hidden"

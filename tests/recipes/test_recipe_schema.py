@@ -16,6 +16,7 @@ from recipes.flood import Flood, Wave, Waves
 from recipes.load import load_recipe
 from recipes.parse import parse_recipe
 from recipes.schema import KOSCHMIEDER, Output, Recipe, Render, Smog, Weather
+from recipes.snow import Snow
 
 FIELDS = [spec for section in ROOT.walk() for spec in section.fields.values()]
 NUMBERS = [spec for spec in FIELDS if spec.kind in (Kind.NUMBER, Kind.WHOLE)] + [CHANNEL, RATE]
@@ -43,6 +44,7 @@ def smoggy(**smog: Any) -> Recipe:
         (Render, {"antialiased": 1}),
         (Output, {"jpeg_quality": True}),
         (Output, {"image": "gif"}),
+        (Output, {"surface": "water"}),
         (Recipe, {"seed": -1}),
         (Recipe, {"seed": 2**63}),
         (Recipe, {"name": "../escape"}),
@@ -94,6 +96,7 @@ def test_the_hash_is_pinned() -> None:
     assert smoggy(visibility_m=300).hash == "272920d93c3e113c"
     assert Recipe().hash == "8553a2737c7b8e42"
     assert Recipe(weather=Weather(flood=Flood(level_m=0.2))).hash == "efb12819c12b5307"
+    assert Recipe(weather=Weather(snow=Snow(depth_m=0.1))).hash == "0b005b8e06d7eedd"
 
 
 def test_recipes_from_before_floods_keep_their_hashes() -> None:
@@ -117,6 +120,18 @@ output: {semantic: true, image: jpg}
         "light-haze": "2f5fabf9fcad2c3e",
     }
     assert {name: load_recipe(name).resolve(0).hash for name in before} == before
+
+
+def test_recipes_from_before_snow_keep_their_hashes() -> None:
+    """Floods were resumed by these when `output.surface` was `scene` where nothing was said."""
+    before = {
+        "deep-flood": "172bb044982a1589",
+        "puddled": "602327c5f75e697a",
+        "street-flood": "8e0fcd6fb1df7b39",
+    }
+    assert {name: load_recipe(name).resolve(0).hash for name in before} == before
+    first = Recipe(weather=Weather(flood=Flood(level_m=0.2)), output=Output(surface="first"))
+    assert first.hash == "cac7905aab0116ca"
 
 
 def test_the_hash_does_not_depend_on_how_a_number_was_written() -> None:
@@ -152,6 +167,22 @@ OTHER = {
     "weather.flood.waves.components[].wavelength_m": 1.1,
     "weather.flood.waves.components[].steepness": 0.1,
     "weather.flood.waves.components[].phase_deg": 90,
+    "weather.snow.depth_m": 0.11,
+    "weather.snow.coverage": 0.9,
+    "weather.snow.max_slope_deg": 49,
+    "weather.snow.albedo": 0.84,
+    "weather.snow.grain": 0.4,
+    "weather.snow.sparkle": 0.1,
+    "weather.snow.tracks": "never",
+    "weather.snow.shading": "per_pixel",
+    "weather.snow.cell_m": 0.06,
+    "weather.snow.seed": 0,
+    "weather.snow.light.sun_azimuth_deg": 0,
+    "weather.snow.light.sun_elevation_deg": 0,
+    "weather.snow.light.sun": 0,
+    "weather.snow.light.brightness": 1,
+    "weather.snow.wind.direction_deg": 1,
+    "weather.snow.wind.drift": 0.2,
     "render.scale": 0.5,
     "render.near_m": 0.02,
     "render.alpha_max": 0.99,
@@ -173,10 +204,11 @@ def test_every_field_changes_the_hash() -> None:
     assert OTHER.keys() == {spec.path for spec in FIELDS}, "a new field needs a value here"
     wave = Wave(amplitude_m=0.01, wavelength_m=1.0)
     flood = Flood(level_m=0.2, waves=Waves(components=(wave,)))
-    base = Recipe(weather=Weather(smog=Smog(visibility_m=300), flood=flood))
+    smog, snow = Smog(visibility_m=300), Snow(depth_m=0.1)
+    base = Recipe(weather=Weather(smog=smog, flood=flood, snow=snow))
     cleared = flood.model_copy(update={"absorption_per_m": (1.0, 1.0, 1.0)})
     hashes = {base.hash, smoggy(extinction_per_m=0.01).hash}
-    hashes.add(Recipe(weather=Weather(smog=base.weather.smog, flood=cleared)).hash)
+    hashes.add(Recipe(weather=Weather(smog=smog, flood=cleared, snow=snow)).hash)
     changes = {path: value for path, value in OTHER.items() if value is not None}
     for path, value in changes.items():
         data = base.model_dump()
@@ -188,6 +220,8 @@ def test_every_field_changes_the_hash() -> None:
         inner[name] = value
         hashes.add(Recipe.model_validate(data).hash)
     assert len(hashes) == len(changes) + 3
+    scene = Recipe(output=Output(surface="scene"))
+    assert len({scene.hash, Recipe().hash, Recipe(output=Output(surface="first")).hash}) == 3
 
 
 def test_numbers_for_the_manifest() -> None:
@@ -200,6 +234,13 @@ def test_numbers_for_the_manifest() -> None:
     names = ("flood_level_m", "flood_turbidity_ntu", "flood_wave_height")
     assert all(math.isnan(clear[name]) and math.isnan(thick[name]) for name in names)
     assert [flooded[name] for name in names] == [0.2, 50.0, 1.0]
+    snowy = Recipe(weather=Weather(snow=Snow(depth_m=0.1, coverage=0.7))).weather_numbers()
+    assert snowy.keys() == clear.keys() and all(math.isnan(snowy[name]) for name in names)
+    assert (snowy["snow_depth_m"], snowy["snow_coverage"]) == (0.1, 0.7)
+    absent = [
+        n[name] for n in (clear, thick, flooded) for name in ("snow_depth_m", "snow_coverage")
+    ]
+    assert all(map(math.isnan, absent))
 
 
 def test_numbers_of_a_flood_that_says_more() -> None:

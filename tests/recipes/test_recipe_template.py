@@ -15,6 +15,7 @@ from recipes.flood import Flood, Wave, Waves
 from recipes.parse import parse_recipe
 from recipes.sampler import Draws
 from recipes.schema import Output, Recipe, Render, Smog, Weather
+from recipes.snow import Snow, SnowLight, SnowWind
 from recipes.template import RecipeTemplate
 from recipes.values import Fixed
 
@@ -279,6 +280,20 @@ floods = st.builds(
         components=st.none() | st.lists(wave_models, max_size=5).map(tuple),
     ),
 )
+snows = st.builds(
+    Snow,
+    depth_m=st.floats(0, 10, **finite),
+    coverage=st.floats(0, 1, **finite),
+    tracks=st.sampled_from(["auto", "always", "never"]),
+    cell_m=st.floats(0.001, 10, **finite),
+    light=st.builds(
+        SnowLight,
+        sun_azimuth_deg=st.none() | st.floats(-360, 360, **finite),
+        sun=st.none() | st.floats(0, 1, **finite),
+    ),
+    wind=st.builds(SnowWind, drift=st.floats(0, 1, **finite)),
+    seed=st.none() | st.integers(0, 2**63 - 1),
+)
 smogs = st.builds(
     Smog,
     extinction_per_m=st.floats(0, 100, **finite),
@@ -292,7 +307,9 @@ recipes = st.builds(
     name=st.from_regex(r"\A[A-Za-z0-9][A-Za-z0-9._-]{0,63}\Z"),
     seed=st.integers(0, 2**63 - 1),
     variant=st.integers(0, 2**31 - 1),
-    weather=st.builds(Weather, smog=st.none() | smogs, flood=st.none() | floods),
+    weather=st.builds(
+        Weather, smog=st.none() | smogs, flood=st.none() | floods, snow=st.none() | snows
+    ),
     render=st.builds(
         Render,
         scale=st.floats(0, 4, exclude_min=True, **finite),
