@@ -1,4 +1,4 @@
-"""Pinhole cameras and the frames of a drive."""
+"""Pinhole and orthographic cameras, and the frames of a drive."""
 
 from __future__ import annotations
 
@@ -16,10 +16,14 @@ from augment.geometry import invert_rigid
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A pinhole camera at one instant. OpenCV axes: x right, y down, z forward; pixel centres +0.5.
+    """A camera at one instant. OpenCV axes: x right, y down, z forward; pixel centres +0.5.
 
-    width, height: pixels. fx, fy, cx, cy: pixels. camera_from_world: float64 [4, 4], rigid.
-    timestamp_ns: the moment this image was taken, which poses the actors.
+    A pinhole camera shows the point (x, y, z) at pixel (fx x / z + cx, fy y / z + cy), an
+    orthographic one, whose rays are parallel, at (fx x + cx, fy y + cy); for both, depth is z.
+    width, height: pixels. fx, fy: pixels, or, of an orthographic camera, pixels per metre. cx, cy:
+    pixels. camera_from_world: float64 [4, 4], rigid. timestamp_ns: the moment this image was taken,
+    which poses the actors. is_orthographic: for maps seen from above; weather, labels and training
+    know pinhole cameras only.
     """
 
     name: str
@@ -31,6 +35,7 @@ class Camera:
     cy: float
     camera_from_world: Float[Tensor, "4 4"]
     timestamp_ns: int = 0
+    is_orthographic: bool = False
 
     def __post_init__(self) -> None:
         if self.width < 1 or self.height < 1:
@@ -43,7 +48,7 @@ class Camera:
             if not math.isfinite(value) or (name in ("fx", "fy") and value <= 0):
                 raise ValueError(
                     f"camera {self.name!r}: {name} must be finite"
-                    f"{' and > 0' if name[0] == 'f' else ''} (pixels); got {value}"
+                    f"{' and > 0' if name[0] == 'f' else ''} ({self._unit(name)}); got {value}"
                 )
         pose = self.camera_from_world
         if pose.dtype != torch.float64 or tuple(pose.shape) != (4, 4):
@@ -62,7 +67,8 @@ class Camera:
 
     @property
     def K(self) -> Float[Tensor, "3 3"]:
-        """Intrinsic matrix, float64."""
+        """Intrinsic matrix, float64, of a pinhole camera."""
+        self._check_pinhole("an intrinsic matrix")
         rows = [[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]]
         return torch.tensor(rows, dtype=torch.float64)
 
@@ -72,7 +78,9 @@ class Camera:
 
     @property
     def centre(self) -> Float[Tensor, "3"]:
-        """Optical centre in the world, metres, float64."""
+        """Optical centre in the world, metres, float64; where depth is 0 and, of an orthographic
+        camera, the ray through (cx, cy) begins.
+        """
         return self.world_from_camera[:3, 3]
 
     def scaled(self, scale: float) -> Camera:
@@ -106,7 +114,11 @@ class Camera:
 
         A point at depth z along pixel p is `centre + z * ray_directions()[p]`; its ray distance is
         `z * norm(ray_directions()[p])`.
+
+        Raises:
+            ValueError: the camera is orthographic.
         """
+        self._check_pinhole("rays of its own at every pixel")
         u = (torch.arange(self.width, dtype=torch.float64) + 0.5 - self.cx) / self.fx
         v = (torch.arange(self.height, dtype=torch.float64) + 0.5 - self.cy) / self.fy
         rotation = self.world_from_camera[:3, :3]
@@ -116,10 +128,25 @@ class Camera:
         return rays.to(dtype)
 
     def ray_lengths(self, dtype: torch.dtype = torch.float32) -> Float[Tensor, "H W"]:
-        """Ray distance per unit of depth at each pixel: sqrt(1 + u^2 + v^2)."""
+        """Ray distance per unit of depth at each pixel: sqrt(1 + u^2 + v^2).
+
+        Raises:
+            ValueError: the camera is orthographic.
+        """
+        self._check_pinhole("ray lengths that differ")
         u = (torch.arange(self.width, dtype=torch.float64) + 0.5 - self.cx) / self.fx
         v = (torch.arange(self.height, dtype=torch.float64) + 0.5 - self.cy) / self.fy
         return torch.sqrt(1 + u[None, :] ** 2 + v[:, None] ** 2).to(dtype)
+
+    def _unit(self, name: str) -> str:
+        return "pixels per metre" if self.is_orthographic and name[0] == "f" else "pixels"
+
+    def _check_pinhole(self, what: str) -> None:
+        if self.is_orthographic:
+            raise ValueError(
+                f"camera {self.name!r} is orthographic and has not {what}: its rays are parallel, "
+                f"along world_from_camera[:3, 2]; use a pinhole camera here"
+            )
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,9 +14,10 @@ z (h_eye i + s(p)), s being the vertical part of the ray's direction. So
 
 is linear in p and has the sign of the height: the cut is a straight line in the image. Divided by
 its slope, L is a distance from that line in pixels, and clamp(L + 0.5, 0, 1) a smooth edge.
+Parallel rays need no such detour: there z(p) is exact for a plane, and the height linear in p.
 Where there is a clip, expected depth, too, is taken over these surfaces, 1/i(p), no farther from
 the centre than the splat reaches: the centres of large splats stand nearer or farther than what a
-pixel shows of them, by more than shallow water is deep.
+pixel shows of them, by more than shallow water is deep. `UNCUT` asks for that and cuts nothing.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ SIGNS = {ABOVE: 1.0, BELOW: -1.0}
 EDGE_PX, OVERLAP_PX = 0.5, 1.0  # added to the distance before it is clamped to [0, 1]
 FAR_PX = 1e6  # distances are clamped to this: where the slope vanishes they have no end
 SHARP_PX2 = 0.003  # added to S2's diagonal, so that splats seen edge-on have a slope
-LONGEST = 2 / 3  # of its depth, that a splat may reach: z(p) is at most 3 z
+LONGEST = 2 / 3  # of its depth, that a splat may reach: z(p) is at most 3 z (no matter if parallel)
 
 
 @dataclass(frozen=True)
@@ -65,3 +66,7 @@ class HeightClip:
     def edge_px(self) -> float:
         """What is added to the distance from the cut, pixels."""
         return EDGE_PX + OVERLAP_PX * self.overlaps
+
+
+# Nothing is cut: images have the bits of those without a clip, but for depths, which are surfaces'.
+UNCUT = HeightClip(z_m=-1e9, keep="above")

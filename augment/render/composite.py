@@ -55,6 +55,11 @@ def composite_sky(
     sky, smog = sky_behind(sky, smog)
     if isinstance(sky, ConstantSky) and smog is None:  # no direction matters
         return rgb + (1 - alpha)[..., None] * sky.rgb.to(rgb.dtype)
+    if camera.is_orthographic:
+        raise ValueError(
+            f"camera {camera.name!r} is orthographic: its rays are parallel and see the sky in one "
+            f"direction only; composite a ConstantSky, without layered smog"
+        )
     tracked = torch.is_grad_enabled() and (rgb.requires_grad or alpha.requires_grad)
     if fast and not tracked and isinstance(sky, CubemapSky) and rgb.dtype == torch.float32:
         return _composite_cubemap(rgb, alpha, camera, sky.faces, smog)

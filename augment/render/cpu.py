@@ -228,7 +228,13 @@ class Tiles:
         count = self._columns * self._rows
         self.size = np.array([camera.width, camera.height], np.int64)
         self.limits = np.array(
-            [settings.alpha_max, math.log2(ALPHA_MIN), TRANSMITTANCE_STOP], np.float32
+            [
+                settings.alpha_max,
+                math.log2(ALPHA_MIN),
+                TRANSMITTANCE_STOP,
+                camera.is_orthographic,
+            ],
+            np.float32,
         )
         # Alpha is always written, so that kernels come in fewer variants.
         spare = {ALPHA: scratch.array("alpha", (camera.height, camera.width), np.float32)}

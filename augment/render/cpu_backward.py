@@ -136,7 +136,16 @@ def record(
     with_depth: bool,
     clock: Clock | None = None,
 ) -> Tape:
-    """Render colour, alpha and, if asked for, expected depth, and keep what `backward` needs."""
+    """Render colour, alpha and, if asked for, expected depth, and keep what `backward` needs.
+
+    Raises:
+        ValueError: the camera is orthographic; the way back knows pinhole cameras only.
+    """
+    if camera.is_orthographic:
+        raise ValueError(
+            f"camera {camera.name!r} is orthographic; the kernels' gradients are of pinhole "
+            f"cameras only: use `rasterize` with backend 'auto' or 'reference'"
+        )
     clock = Clock(None) if clock is None else clock
     buffers = frozenset({RGB, ALPHA, EXPECTED_DEPTH} if with_depth else {RGB, ALPHA})
     images = image_arrays(camera, buffers)

@@ -74,8 +74,8 @@ def blend_tiles(
     records: flat float32. members, starts: lists of slots. tiles: uint8 [tiles], CLOSED, OPEN or
     FRESH, updated. states: float32 [tiles * used part of STATE], where open tiles wait for the
     next slice. size: image width and height. limits: float32, alpha_max, log2(ALPHA_MIN),
-    TRANSMITTANCE_STOP. rgb to ids: flat images; all but alpha may be None. cuts: flat, of each slot
-    as cpu_clip has them, or None.
+    TRANSMITTANCE_STOP, 1 where rays are parallel. rgb to ids: flat images; all but alpha may be
+    None. cuts: flat, of each slot as cpu_clip has them, or None.
     """
     columns = (size[0] + TILE_W - 1) // TILE_W
     used = states.size // tiles.size
@@ -288,7 +288,7 @@ def _blend_items(
             _add(state, at + P_DEPTH, weight, staged[U(DEPTH) * n + splat])
         if expected is not None and cuts is not None:
             centre = staged[U(DEPTH) * n + splat]
-            depth = surface_depth(lines, surfaces, splat, item, centre)
+            depth = surface_depth(lines, surfaces, splat, item, centre, limits[3])
             v8.store(state, at + P_DEPTH, v8.fmuladd(weight, depth, v8.load(state, at + P_DEPTH)))
         if median is not None:
             crossed = v8.both(v8.at_least(through, half), v8.greater(half, after))

@@ -2,7 +2,8 @@
 
 A splat's cut is CUT float32. With x and y from its mean, in pixels, the kept share of its alpha is
 clamp(C_AT + C_X x + C_Y y, 0, 1), and its surface's depth is its centre's over
-1 - clamp(C_RIGHT x + C_DOWN y, -C_REACH, C_REACH).
+1 - clamp(C_RIGHT x + C_DOWN y, -C_REACH, C_REACH), or, seen by an orthographic camera, its centre's
+plus that clamped line.
 """
 
 from __future__ import annotations
@@ -21,6 +22,8 @@ from augment.render.cpu_layout import (
     V_CLIP_CAMERA,
     V_CLIP_EDGE,
     V_CLIP_EYE,
+    V_CLIP_FALL,
+    V_CLIP_LONGEST,
     V_CLIP_PART,
     V_CLIP_REACH,
     V_EXTENT,
@@ -36,7 +39,6 @@ LINES = 7 * BATCH
 _FAR = np.float32(1e6)  # augment.render.clip.FAR_PX
 _TINY = np.float32(1e-20)
 _SHARP = np.float32(0.003)  # augment.render.clip.SHARP_PX2
-_LONGEST = np.float32(2 / 3)  # augment.render.clip.LONGEST
 
 
 @inner()
@@ -79,7 +81,7 @@ def cut_eight(quats, scales, picked, at, d, x, y, inverse, view):
     gx = (cx - lean * cy) / v8.maximum(xx - lean * xy, blur)
     gy = (cy - xy * gx) / yy
 
-    fall = v8.splat(view[V_CLIP_EYE]) * inverse * inverse
+    fall = v8.splat(view[V_CLIP_FALL]) * inverse * inverse
     lx = v8.splat(view[V_CLIP_CAMERA] / view[V_FOCAL]) - fall * gx
     ly = v8.splat(view[V_CLIP_CAMERA + 1] / view[V_FOCAL + 1]) - fall * gy
     slope = v8.sqrt(v8.fmuladd(lx, lx, ly * ly))
@@ -91,7 +93,7 @@ def cut_eight(quats, scales, picked, at, d, x, y, inverse, view):
     lx = v8.select(whole, zero, lx * scale)
     ly = v8.select(whole, zero, ly * scale)
     deep = v8.sqrt(dot(away0, away1, away2, away0, away1, away2)) * inverse
-    deep = v8.minimum(v8.splat(view[V_EXTENT]) * deep, v8.splat(_LONGEST))
+    deep = v8.minimum(v8.splat(view[V_EXTENT]) * deep, v8.splat(view[V_CLIP_LONGEST]))
     partly = v8.both(
         v8.at_least(height + reach, zero),
         v8.at_least(v8.splat(view[V_CLIP_REACH]), height - reach),
@@ -149,11 +151,14 @@ def line_at(lines, kind, values, splat, item):
 
 
 @inner()
-def surface_depth(lines, values, splat, item, depth):
+def surface_depth(lines, values, splat, item, depth, parallel):
+    """Depths of a splat's surface at an item's pixels. parallel: 1 where rays are, else 0."""
+    one = np.float32(1)
     reach = v8.splat(lines[U(REACHES) + splat])
     farther = v8.minimum(line_at(lines, SURFACE, values, splat, item), reach)
     farther = v8.maximum(farther, v8.negate(reach))
-    return v8.splat(depth) / (v8.splat(np.float32(1)) - farther)
+    depths = v8.fmuladd(v8.splat(parallel), farther, v8.splat(depth))
+    return depths / (v8.splat(one) - v8.splat(one - parallel) * farther)
 
 
 @inner()

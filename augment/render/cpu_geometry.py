@@ -13,6 +13,7 @@ from augment.render.cpu_layout import (
     V_FOCAL,
     V_HIGH,
     V_LOW,
+    V_PARALLEL,
     V_ROTATION,
     U,
 )
@@ -53,6 +54,14 @@ def to_camera(d, view):
     x = dot(r[0], r[1], r[2], d[0], d[1], d[2])
     y = dot(s[0], s[1], s[2], d[0], d[1], d[2])
     return x, y, dot(t[0], t[1], t[2], d[0], d[1], d[2])
+
+
+@inner()
+def inverse_divisor(z, view):
+    """1 over what x and y are divided by in the projection: z, or 1 where rays are parallel."""
+    one = np.float32(1)
+    parallel = view[V_PARALLEL]
+    return v8.splat(one) / v8.fmuladd(v8.splat(one - parallel), z, v8.splat(parallel))
 
 
 @inner()

@@ -11,7 +11,7 @@ import torch
 
 from augment.cameras import Camera
 from augment.render import cpu_layout as layout
-from augment.render.clip import HeightClip
+from augment.render.clip import LONGEST, HeightClip
 from augment.render.constants import (
     ALPHA_MIN,
     COV2D_BLUR,
@@ -103,6 +103,8 @@ def part_views(
     size = np.array([camera.width, camera.height], np.float64)
     margin = TAN_FOV_MARGIN * 0.5 * size / focal
     low, high = -(centre / focal + margin), (size - centre) / focal + margin
+    if camera.is_orthographic:
+        low, high = np.zeros(2), np.zeros(2)  # the Jacobian has no terms of x/z and y/z
     widest = np.maximum(np.abs(low), np.abs(high))
     views = np.zeros((len(poses), layout.VIEW))
     views[:, layout.V_ROTATION :][:, :9] = rotations.reshape(-1, 9)
@@ -120,6 +122,7 @@ def part_views(
             above = float(camera.centre[2]) - smog.base_z_m
             views[:, layout.V_EYE_HEIGHT] = above / smog.scale_height_m
             views[:, layout.V_UP :][:, :3] = poses[:, 2, :3] / smog.scale_height_m
+    views[:, layout.V_PARALLEL] = camera.is_orthographic
     views[:, layout.V_EXTENT] = MAX_EXTENT_SIGMAS
     views[:, layout.V_CLIP_EYE] = views[:, layout.V_CLIP_REACH] = _NO_CLIP
     if clip is not None:
@@ -127,6 +130,11 @@ def part_views(
         views[:, layout.V_CLIP_PART :][:, :3] = clip.sign * poses[:, 2, :3]
         upwards = camera.camera_from_world.numpy()[:3, 2]
         views[:, layout.V_CLIP_CAMERA :][:, :3] = clip.sign * upwards
+        views[:, layout.V_CLIP_FALL] = clip.sign * (float(camera.centre[2]) - clip.z_m)
+        views[:, layout.V_CLIP_LONGEST] = LONGEST
+        if camera.is_orthographic:
+            views[:, layout.V_CLIP_FALL] = -clip.sign * upwards[2]
+            views[:, layout.V_CLIP_LONGEST] = _NO_CLIP
         views[:, layout.V_CLIP_EDGE] = clip.edge_px
         views[:, layout.V_CLIP_REACH] = min(clip.reach_m, _NO_CLIP)
     return views.astype(np.float32)

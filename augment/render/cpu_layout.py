@@ -44,6 +44,9 @@ V_CLIP_EYE = 39  # height of the camera on the kept side of the clip's plane, me
 V_CLIP_PART, V_CLIP_CAMERA = 40, 43  # towards that side, in the part's axes and the camera's
 V_CLIP_EDGE, V_EXTENT = 46, 47  # pixels; sigmas that a splat reaches at most
 V_CLIP_REACH = 48  # metres from the clip's plane beyond which nothing need be drawn
+V_CLIP_FALL = 49  # times inverse^2: how the cut's slope follows the surface's
+V_CLIP_LONGEST = 50  # most that a surface's depth may grow or shrink
+V_PARALLEL = 51  # 1 where rays are parallel, else 0
 VIEW = 56
 
 # How to project: int64 each.

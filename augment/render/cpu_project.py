@@ -25,7 +25,15 @@ from augment.render.cpu_clip import (
     height_of,
 )
 from augment.render.cpu_color import COLOR_ROWS, prepare_colors, write_color
-from augment.render.cpu_geometry import from_eye, gather3, image_covariance, to_camera, to_image
+from augment.render.cpu_geometry import (
+    from_eye,
+    gather3,
+    image_covariance,
+    inverse_divisor,
+    rotation_row,
+    to_camera,
+    to_image,
+)
 from augment.render.cpu_jit import inner, kernel
 from augment.render.cpu_layout import (
     BIN_SHIFT,
@@ -59,6 +67,7 @@ from augment.render.cpu_layout import (
     V_GAIN,
     V_LOG_CUT,
     V_NEAR,
+    V_PARALLEL,
     V_SIZE,
     U,
 )
@@ -114,7 +123,7 @@ def _rank_eight(means, scales, opacities, view, picked, depths, at, areas):
     zero, two = v8.splat(np.float32(0)), v8.splat(np.float32(2))
     d = from_eye(means, picked, U(0), view)
     x, y, z = to_camera(d, view)
-    inverse = v8.splat(np.float32(1)) / z
+    inverse = inverse_divisor(z, view)
     x, y = to_image(x, y, inverse, view)
     s0, s1, s2 = gather3(scales, picked, U(0))
     opacity = v8.gather(opacities, picked, U(0), U(1), U(0))
@@ -250,9 +259,10 @@ def _project_eight(means, quats, scales, opacities, view, picked, at, functions,
     """Records, pixel boxes and colour rows of eight Gaussians, side by side in `rows`."""
     d = from_eye(means, picked, at, view)
     if modes[M_COLOR]:
-        prepare_colors(d[0], d[1], d[2], view, functions, modes[M_SMOG], rows)
+        towards = rotation_row(view, U(2)) if view[V_PARALLEL] > 0 else d
+        prepare_colors(towards[0], towards[1], towards[2], view, functions, modes[M_SMOG], rows)
     x, y, z = to_camera(d, view)
-    inverse = v8.splat(np.float32(1)) / z
+    inverse = inverse_divisor(z, view)
     xx, xy, yy, minors = image_covariance(quats, scales, picked, at, x, y, inverse, view)
 
     one, half = v8.splat(np.float32(1)), v8.splat(np.float32(0.5))

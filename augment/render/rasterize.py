@@ -44,15 +44,20 @@ def rasterize(
     through the parts in the order given. smog: fades every splat's colour towards the airlight by
     its own distance. clip: only what lies above, or below, a height is drawn (augment.render.clip).
     wanted: bool [H, W], the pixels that will be looked at; a backend may leave the others 0.
-    backend: "cpu" (numba, float32; gradients of rgb, alpha and expected_depth, without smog or clip
-    and where no other buffer is asked for), "reference" (torch, float32 or float64,
-    gradients of all), or "auto": cpu where it can do the job, else reference.
+    backend: "cpu" (numba, float32; gradients of rgb, alpha and expected_depth, of pinhole cameras,
+    without smog or clip and where no other buffer is asked for), "reference" (torch, float32 or
+    float64, gradients of all), or "auto": cpu where it can do the job, else reference.
 
     Raises:
         ValueError, TypeError: an argument no backend, or not the one named, can take.
         BackendUnavailable: the backend named cannot run on this machine.
     """
     _check_arguments(parts, camera, buffers, settings)
+    if smog is not None and camera.is_orthographic:
+        raise ValueError(
+            f"camera {camera.name!r} is orthographic: there is no eye from which to measure how "
+            f"far the smog is looked through; render it without smog, or with a pinhole camera"
+        )
     if wanted is not None and (
         wanted.dtype != torch.bool or tuple(wanted.shape) != (camera.height, camera.width)
     ):
@@ -61,7 +66,7 @@ def rasterize(
             f"{wanted.dtype} {list(wanted.shape)}"
         )
     names = frozenset(buffers)
-    if _choose(parts, backend, names, smog, clip) == REFERENCE:
+    if _choose(parts, camera, backend, names, smog, clip) == REFERENCE:
         return rasterize_reference(parts, camera, names, settings, smog, clip)
     cpu = _import_cpu()
     if _tracked(parts):
@@ -90,6 +95,7 @@ def available_backends() -> dict[str, str | None]:
 
 def _choose(
     parts: Sequence[PosedGaussians],
+    camera: Camera,
     backend: str,
     buffers: frozenset[str],
     smog: SmogMedium | None,
@@ -104,10 +110,9 @@ def _choose(
     obstacle = None
     if dtype != torch.float32:
         obstacle = f"the Gaussians are {dtype}, it takes torch.float32"
-    elif _tracked(parts) and (smog is not None or clip is not None or buffers - DIFFERENTIABLE):
-        others = ", ".join(sorted(buffers - DIFFERENTIABLE))
-        what = "through smog" if smog is not None else "of a clip" if clip else f"of {others}"
-        obstacle = f"gradients {what} are asked for, it has none"
+    elif _tracked(parts):
+        what = _beyond_its_gradients(camera, buffers, smog, clip)
+        obstacle = what and f"gradients {what} are asked for, it has none"
     if backend == CPU:
         if obstacle:
             raise ValueError(
@@ -125,6 +130,20 @@ def _choose(
         return REFERENCE
     _log_choice(CPU, "float32", logging.INFO)
     return CPU
+
+
+def _beyond_its_gradients(
+    camera: Camera, buffers: frozenset[str], smog: SmogMedium | None, clip: HeightClip | None
+) -> str | None:
+    """What the cpu backend would need gradients of and has none; None where it has all."""
+    if smog is not None:
+        return "through smog"
+    if clip is not None:
+        return "of a clip"
+    if camera.is_orthographic:
+        return "of an orthographic camera"
+    others = buffers - DIFFERENTIABLE
+    return f"of {', '.join(sorted(others))}" if others else None
 
 
 @functools.cache

@@ -118,7 +118,7 @@ def blend(
     # Gathered once: taking each tile's splats from all of them would make every backward step of a
     # tile as long as the scene.
     for tile, members in enumerate(splats.select(lists.members).split(sizes)):
-        args = (members, divmod(tile, lists.columns), buffers, settings)
+        args = (members, divmod(tile, lists.columns), buffers, settings, camera.is_orthographic)
         if recompute and len(members):  # a backward pass would else keep every splat x pixel
             tiles.append(
                 checkpoint(blend_tile, *args, use_reentrant=False, preserve_rng_state=False)
@@ -142,6 +142,7 @@ def blend_tile(
     tile: tuple[int, int],
     buffers: frozenset[str],
     settings: RasterSettings,
+    is_orthographic: bool,
 ) -> RenderOutput:
     """Buffers [TILE, TILE] of the tile at (row, column). splats: its own, nearest first."""
     dtype = splats.depths.dtype
@@ -159,7 +160,7 @@ def blend_tile(
         if near.colors is not None:
             rgb = rgb + _weighted_sums(weights, near.colors)
         if EXPECTED_DEPTH in buffers:
-            depth = depth + (weights * _surface_depths(near, pixels)).sum(0)
+            depth = depth + (weights * _surface_depths(near, pixels, is_orthographic)).sum(0)
         if MEDIAN_DEPTH in buffers:
             median = median + _median_here(near.depths, weights, after, transmittance)
         if SPLAT_IDS in buffers:
@@ -211,7 +212,9 @@ def blend_weights(
     return weights, after
 
 
-def _surface_depths(splats: Splats, pixels: Float[Tensor, "2 P"]) -> Float[Tensor, "S P"]:
+def _surface_depths(
+    splats: Splats, pixels: Float[Tensor, "2 P"], is_orthographic: bool
+) -> Float[Tensor, "S P"]:
     """z of every splat at every pixel: its centre's, or with a clip that of its surface."""
     depths = splats.depths[:, None].expand(-1, pixels.shape[1])
     if splats.cuts is None:
@@ -219,7 +222,7 @@ def _surface_depths(splats: Splats, pixels: Float[Tensor, "2 P"]) -> Float[Tenso
     right, down, most = splats.cuts.T[3:, :, None]
     dx, dy = pixels[0] - splats.means2d[:, :1], pixels[1] - splats.means2d[:, 1:]
     growth = (right * dx + down * dy).clamp(-most, most)
-    return depths / (1 - growth)
+    return depths + growth if is_orthographic else depths / (1 - growth)
 
 
 def _weighted_sums(

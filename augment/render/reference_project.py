@@ -8,6 +8,7 @@ thresholds of gsplat 1.5.3.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -39,7 +40,8 @@ class Splats:
     and >= 0, in the smog where there is any; None where no colour was asked for. cuts: of splats
     clipped at a height, value at means2d and slope in x and y, per px: clamp(value, 0, 1) is the
     share of alpha that is kept at a pixel; then the growth of the surface's depth in x and y, its
-    share per px, and the most that it may grow or shrink. None without a clip.
+    share per px (seen by an orthographic camera: metres per px), and the most that it may grow or
+    shrink. None without a clip.
     """
 
     ids: Int64[Tensor, "M"]
@@ -123,6 +125,10 @@ def _project_part(
     if settings.antialiased:
         tiny = torch.finfo(dets.dtype).tiny  # the slope of sqrt is infinite at 0
         opacities = opacities * torch.sqrt((det_sharp / dets).clamp_min(tiny))
+    colors = None
+    if with_color:
+        towards = rotation[2].expand_as(offsets) if camera.is_orthographic else offsets
+        colors = _colors(gaussians, towards, part, camera, settings, smog)
     splats = Splats(
         ids=index + first_id,
         depths=depths,
@@ -130,7 +136,7 @@ def _project_part(
         covs2d=covs2d + torch.tensor([COV2D_BLUR, 0, COV2D_BLUR], dtype=covs2d.dtype),
         dets=dets,
         opacities=opacities,
-        colors=_colors(gaussians, offsets, part, camera, settings, smog) if with_color else None,
+        colors=colors,
     )
     if clip is None:
         return splats
@@ -165,16 +171,19 @@ def _cut(
     cx, cy = (right * axes[:, 2]).sum(1), (down * axes[:, 2]).sum(1)
     gx = (cx - xy / yy * cy) / (xx - xy / yy * xy).clamp_min(SHARP_PX2)
     gy = (cy - xy * gx) / yy
-    z = points[:, 2]
-    fall = clip.sign * (float(camera.centre[2]) - clip.z_m) / z**2
+    by = _divisors(points, camera)
+    fall = clip.sign * (float(camera.centre[2]) - clip.z_m) / by**2
+    most = LONGEST
+    if camera.is_orthographic:
+        fall, most = -up[2], math.inf
     slope = torch.stack([up[0] / camera.fx - fall * gx, up[1] / camera.fy - fall * gy], -1)
     length = slope.norm(dim=-1).clamp_min(1e-20)
-    offset = (heights / z / length).clamp(-FAR_PX, FAR_PX)
-    deep = (MAX_EXTENT_SIGMAS * axes[:, 2].norm(dim=-1) / z).clamp_max(LONGEST)
+    offset = (heights / by / length).clamp(-FAR_PX, FAR_PX)
+    deep = (MAX_EXTENT_SIGMAS * axes[:, 2].norm(dim=-1) / by).clamp_max(most)
     whole = heights >= reach
     offset = torch.where(whole, torch.full_like(offset, FAR_PX), offset) + clip.edge_px
     slope = torch.where(whole[:, None], torch.zeros_like(slope), slope / length[:, None])
-    cuts = torch.cat([offset[:, None], slope, torch.stack([gx / z, gy / z, deep], -1)], 1)
+    cuts = torch.cat([offset[:, None], slope, torch.stack([gx / by, gy / by, deep], -1)], 1)
     return cuts, (heights >= -reach) & (heights - reach <= clip.reach_m)
 
 
@@ -193,8 +202,14 @@ def _offsets_from_eye(
 
 
 def _project_points(points: Float[Tensor, "M 3"], camera: Camera) -> Float[Tensor, "M 2"]:
-    x, y, z = points.unbind(-1)
-    return torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], -1)
+    x, y, by = points[:, 0], points[:, 1], _divisors(points, camera)
+    return torch.stack([camera.fx * x / by + camera.cx, camera.fy * y / by + camera.cy], -1)
+
+
+def _divisors(points: Float[Tensor, "M 3"], camera: Camera) -> Float[Tensor, "M"]:
+    """What x and y are divided by in the projection: z, or 1 where rays are parallel."""
+    z = points[:, 2]
+    return torch.ones_like(z) if camera.is_orthographic else z
 
 
 def _project_covariances(
@@ -215,6 +230,8 @@ def _image_axes(
     points: Float[Tensor, "M 3"], axes: Float[Tensor, "M 3 3"], camera: Camera
 ) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M 3"]]:
     """The semi-axes in the image, px right and px down."""
+    if camera.is_orthographic:
+        return camera.fx * axes[:, 0], camera.fy * axes[:, 1]
     z = points[:, 2]
     u = _clamp_to_image(points[:, 0] / z, camera.cx, camera.fx, camera.width)
     v = _clamp_to_image(points[:, 1] / z, camera.cy, camera.fy, camera.height)
@@ -236,7 +253,9 @@ def _colors(
     settings: RasterSettings,
     smog: SmogMedium | None,
 ) -> Float[Tensor, "M 3"]:
-    """max(SH + 0.5, 0), seen through the smog. offsets: from the eye, in the part's axes."""
+    """max(SH + 0.5, 0), seen through the smog. offsets: from the eye, in the part's axes; without
+    smog their lengths do not matter.
+    """
     directions = torch.nn.functional.normalize(offsets, dim=-1)
     colors = (evaluate_sh(gaussians.sh, directions, settings.sh_degree) + 0.5).clamp_min(0)
     if smog is None:
