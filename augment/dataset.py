@@ -16,12 +16,13 @@ import pyarrow as pa
 from pyarrow.compute import Expression
 from torch.utils.data import Dataset
 
+from augment.batch.box_tables import BoxNumbers, Item
+from augment.batch.box_weather import TABLES
 from augment.batch.calibration import CameraRecord, read_camera, read_entries
 from augment.batch.encode import decode_image, decode_png
 from augment.batch.label_files import read_boxes
 from augment.batch.layout import PATH_KINDS, resolve_inside
 from augment.batch.manifest import OK, read_manifest, weather_columns
-from augment.batch.water_labels import BoxWater, Item, read_water
 from augment.dataset_samples import ImageType, Pixels, collate_frames, make_sample
 from augment.dataset_scene import SceneDataset
 from augment.errors import OutputError
@@ -29,7 +30,13 @@ from augment.labels import Boxes
 
 __all__ = ["SceneDataset", "WeatherDataset", "collate_frames"]
 
-_BUFFERS = {"depth": np.uint16, "semantic": np.uint8, "instance": np.uint16, "water": np.uint8}
+_BUFFERS = {
+    "depth": np.uint16,
+    "semantic": np.uint8,
+    "instance": np.uint16,
+    "water": np.uint8,
+    "snow": np.uint8,
+}
 CACHED_VARIANTS = 8  # whose boxes and calibration are kept: neighbours in the order of the rows
 Value = TypeVar("Value")
 
@@ -75,7 +82,9 @@ class WeatherDataset(Dataset):
         table = _keep_only(table, wanted, self.out_dir)
         self._table = table if where is None else table.filter(where)
         self._boxes: _Cache[dict[int, Boxes]] = _Cache(_read_all_boxes)
-        self._box_water: _Cache[dict[Item, BoxWater]] = _Cache(read_water)
+        self._box_weather: dict[str, _Cache[dict[Item, BoxNumbers]]] = {
+            kind: _Cache(table.read) for kind, table in TABLES.items()
+        }
         self._calibration: _Cache[dict[int, dict[str, Any]]] = _Cache(read_entries)
 
     @property
@@ -104,7 +113,7 @@ class WeatherDataset(Dataset):
             image_type=self.image_type,
             camera=self._read_camera(row, paths),
             boxes=boxes,
-            box_water=None if boxes is None else self._read_box_water(row, paths, len(boxes)),
+            box_weather={} if boxes is None else self._read_box_weather(row, paths, len(boxes)),
             weather={name: row[name] for name in self._weather},
             paths={kind: None if path is None else str(path) for kind, path in paths.items()},
             names={name: row[name] for name in names},
@@ -150,19 +159,23 @@ class WeatherDataset(Dataset):
         except KeyError as error:
             raise _damaged(path, f"it lacks frame {row['frame']}") from error
 
-    def _read_box_water(
+    def _read_box_weather(
         self, row: dict[str, Any], paths: dict[str, Path | None], count: int
-    ) -> BoxWater | None:
-        path = paths["box_water"]
-        if path is None:
-            return None
+    ) -> dict[str, BoxNumbers]:
+        found = {}
         where = f"frame {row['frame']}, camera {row['camera']!r}"
-        water = self._box_water.get(path).get((row["frame"], row["camera"]))
-        if water is None:
-            raise _damaged(path, f"it lacks {where}")
-        if len(water) != count:
-            raise _damaged(path, f"{where}: it has {len(water)} boxes, the labels have {count}")
-        return water
+        for kind, tables in self._box_weather.items():
+            path = paths[kind]
+            if path is None:
+                continue
+            numbers = tables.get(path).get((row["frame"], row["camera"]))
+            if numbers is None:
+                raise _damaged(path, f"it lacks {where}")
+            boxes = len(numbers.track_ids)
+            if boxes != count:
+                raise _damaged(path, f"{where}: it has {boxes} boxes, the labels have {count}")
+            found[kind] = numbers
+        return found
 
 
 class _Cache(Generic[Value]):

@@ -7,14 +7,15 @@ A sample is a dictionary:
     semantic          uint8 [H, W], augment.semantics.SemanticClass; or None
     instance          int32 [H, W], 0 = none, else 1 + the actor's index; or None
     water             bool [H, W], where a ray meets water first; None where there is no flood
+    snow              bool [H, W], where the pixel shows snow; None where there is no snow
     boxes             all boxes of the frame, see `box_tensors`; None where the dataset has none
     camera            name, width, height, timestamp_ns, K float64 [3, 3] in pixels of the image,
                       world_from_camera float64 [4, 4] in the dataset's world
     weather           the recipe's numbers by name, floats; NaN where absent
     paths             the files by kind (image, depth, ...), None where there is none
     scene, variant    names;  frame: the dataset's number;  recipe_hash: 16 hexadecimal digits
-    surface           what depth, semantic and instance show where there is water: `scene`, what
-                      lies under it, or `first`, the water
+    surface           what depth, semantic and instance show of the weather: `solid`, snow but not
+                      water, `scene`, neither, or `first`, both
 """
 
 from __future__ import annotations
@@ -26,9 +27,9 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
+from augment.batch.box_weather import TABLES, BoxWeather
 from augment.batch.calibration import CameraRecord
 from augment.batch.encode import depth_in_metres
-from augment.batch.water_labels import BoxWater
 from augment.labels import Boxes
 
 ImageType = Literal["float32", "uint8"]
@@ -38,7 +39,7 @@ ImageType = Literal["float32", "uint8"]
 class Pixels:
     """Decoded images of one view. rgb: uint8 [H, W, 3]. depth: uint16 [H, W], steps of 1/256 m.
 
-    semantic: uint8 [H, W]. instance: uint16 [H, W]. water: uint8 [H, W], 0 or 255.
+    semantic: uint8 [H, W]. instance: uint16 [H, W]. water, snow: uint8 [H, W], 0 or 255.
     """
 
     rgb: np.ndarray
@@ -46,6 +47,7 @@ class Pixels:
     semantic: np.ndarray | None = None
     instance: np.ndarray | None = None
     water: np.ndarray | None = None
+    snow: np.ndarray | None = None
 
 
 def make_sample(
@@ -54,7 +56,7 @@ def make_sample(
     image_type: ImageType,
     camera: CameraRecord,
     boxes: Boxes | None,
-    box_water: BoxWater | None,
+    box_weather: BoxWeather,
     weather: Mapping[str, float],
     paths: Mapping[str, str | None],
     names: Mapping[str, Any],
@@ -64,14 +66,15 @@ def make_sample(
     if image_type == "float32":
         image = image.float() / 255
     depth, semantic, instance = pixels.depth, pixels.semantic, pixels.instance
-    water = pixels.water
+    water, snow = pixels.water, pixels.snow
     return {
         "image": image,
         "depth": None if depth is None else torch.from_numpy(depth_in_metres(depth)),
         "semantic": None if semantic is None else torch.from_numpy(semantic),
         "instance": None if instance is None else torch.from_numpy(instance.astype(np.int32)),
         "water": None if water is None else torch.from_numpy(water == 255),
-        "boxes": None if boxes is None else box_tensors(boxes, box_water),
+        "snow": None if snow is None else torch.from_numpy(snow == 255),
+        "boxes": None if boxes is None else box_tensors(boxes, box_weather),
         "camera": {
             "name": camera.name,
             "width": camera.width,
@@ -86,18 +89,20 @@ def make_sample(
     }
 
 
-def box_tensors(boxes: Boxes, water: BoxWater | None) -> dict[str, Any]:
+def box_tensors(boxes: Boxes, weather: BoxWeather) -> dict[str, Any]:
     """centers_m [B, 3], sizes_m [B, 3] (length, width, height), quats [B, 4] (wxyz,
     world_from_box): float64 tensors in the dataset's world. labels, track_ids: lists of strings.
     attributes: the dataset's further columns, NumPy arrays by name.
 
     submerged_fraction, hidden_fraction: float64 [B], how much of a box's height is under water,
     and of its pixels behind water (NaN where the image shows none); None where there is no flood.
+    snow_fraction: float64 [B], how much of its pixels is snow (as above); None without snow.
     """
-    submerged = hidden = None
-    if water is not None:
-        submerged = torch.from_numpy(water.submerged_fraction)
-        hidden = torch.from_numpy(water.hidden_fraction)
+    fractions = {
+        name: torch.from_numpy(getattr(weather[kind], name)) if kind in weather else None
+        for kind, table in TABLES.items()
+        for name in table.sampled
+    }
     return {
         "centers_m": torch.from_numpy(boxes.centers_m.copy()),
         "sizes_m": torch.from_numpy(boxes.sizes_m.copy()),
@@ -105,8 +110,7 @@ def box_tensors(boxes: Boxes, water: BoxWater | None) -> dict[str, Any]:
         "labels": list(boxes.labels),
         "track_ids": list(boxes.track_ids),
         "attributes": dict(boxes.attributes),
-        "submerged_fraction": submerged,
-        "hidden_fraction": hidden,
+        **fractions,
     }
 
 
@@ -120,7 +124,7 @@ def collate_frames(samples: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """
     first = samples[0]
     batch: dict[str, Any] = {key: [sample[key] for sample in samples] for key in first}
-    for key in ("image", "depth", "semantic", "instance", "water"):
+    for key in ("image", "depth", "semantic", "instance", "water", "snow"):
         batch[key] = _stacked(batch[key])
     cameras = batch["camera"]
     batch["camera"] = {

@@ -8,12 +8,12 @@ from typing import Any
 from torch.utils.data import Dataset
 
 from augment.batch.backends import choose_backend
+from augment.batch.box_weather import measure_boxes
 from augment.batch.calibration import camera_record
 from augment.batch.encode import decode_image, encode_image, quantise_depth
 from augment.batch.layout import PATH_KINDS, variant_name
 from augment.batch.runner import Renderer, default_renderer
 from augment.batch.selection import SceneIndex, select_frames
-from augment.batch.water_labels import measure_boxes
 from augment.batch.writer import check_view
 from augment.dataset_samples import ImageType, Pixels, make_sample
 from augment.scene import Scene
@@ -70,9 +70,7 @@ class SceneDataset(Dataset):
             rgb = decode_image(encode_image(rgb, recipe.output))
         has_labels = recipe.output.labels and frame.index in self._index.labelled
         boxes = self.scene.boxes(frame.index) if has_labels else None
-        origin_m, box_water = self._index.world_origin_m, None
-        if boxes is not None and view.flood is not None:
-            box_water = measure_boxes(boxes, origin_m, written, view.water, view.flood)
+        origin_m = self._index.world_origin_m
         return make_sample(
             pixels=Pixels(
                 rgb,
@@ -80,11 +78,12 @@ class SceneDataset(Dataset):
                 view.semantic,
                 view.instance,
                 view.water,
+                view.snow,
             ),
             image_type=self.image_type,
             camera=camera_record(written, origin_m),
             boxes=boxes,
-            box_water=box_water,
+            box_weather={} if boxes is None else measure_boxes(boxes, origin_m, written, view),
             weather=recipe.weather_numbers(),
             paths=dict.fromkeys(PATH_KINDS),
             names={

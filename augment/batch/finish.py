@@ -7,13 +7,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from augment.batch.atomic import write_atomic
+from augment.batch.box_weather import TABLES
 from augment.batch.calibration import calibration_bytes, frame_entry, read_entries
 from augment.batch.label_files import FrameBoxes, boxes_bytes, read_boxes
-from augment.batch.layout import MANIFEST, WATER_LABELS
+from augment.batch.layout import MANIFEST, box_weather_files
 from augment.batch.ledger import Ledger, VariantState
 from augment.batch.runner import describe
 from augment.batch.selection import SceneIndex
-from augment.batch.water_labels import water_bytes
 from augment.errors import OutputError
 
 
@@ -58,8 +58,8 @@ def finish(ledger: Ledger, trajectory: str, boxes: BoxCache) -> None:
     for variant in variants:
         if variant.recipe.output.labels and ledger.index.labels is not None:
             _write_boxes(ledger, variant, boxes)
-            if variant.recipe.weather.flood is not None:
-                _write_box_water(ledger, variant)
+            for kind in box_weather_files(variant.recipe):
+                _write_box_weather(ledger, variant, kind)
         _write_calibration(ledger, variant, trajectory)
     if variants:
         ledger.write_manifest(variants)
@@ -84,8 +84,8 @@ def _companions(ledger: Ledger, variant: VariantState) -> dict[str, Path]:
     paths = {"calibration": folder / "calibration.json"}
     if variant.recipe.output.labels and ledger.index.labels is not None:
         paths["labels"] = folder / "labels" / "boxes.parquet"
-        if variant.recipe.weather.flood is not None:
-            paths["box_water"] = folder / WATER_LABELS
+        tables = box_weather_files(variant.recipe)
+        paths |= {kind: folder / file for kind, file in tables.items()}
     return paths
 
 
@@ -99,13 +99,12 @@ def _write_boxes(ledger: Ledger, variant: VariantState, cache: BoxCache) -> None
     write_atomic(path, boxes_bytes({**known, **new}))
 
 
-def _write_box_water(ledger: Ledger, variant: VariantState) -> None:
-    path = _companions(ledger, variant)["box_water"]
+def _write_box_weather(ledger: Ledger, variant: VariantState, kind: str) -> None:
+    path = _companions(ledger, variant)[kind]
     # Not of an image that was measured once and has failed since.
-    listed = {item for item, row in variant.rows.items() if row["box_water_path"] is not None}
-    write_atomic(
-        path, water_bytes({i: water for i, water in variant.box_water.items() if i in listed})
-    )
+    listed = {item for item, row in variant.rows.items() if row[f"{kind}_path"] is not None}
+    known = variant.box_weather[kind]
+    write_atomic(path, TABLES[kind].to_bytes({i: known[i] for i in known if i in listed}))
 
 
 def _read_or_drop(path: Path) -> dict[int, FrameBoxes]:

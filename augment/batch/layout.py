@@ -15,7 +15,8 @@ from recipes.schema import Recipe
 
 MANIFEST = "manifest.parquet"
 STATE_FOLDER = ".climategs"
-WATER_LABELS = "labels/water.parquet"  # inside a variant's folder
+# What weather does to the boxes, inside a variant's folder.
+_BOX_WEATHER = {"box_water": "labels/water.parquet", "box_snow": "labels/snow.parquet"}
 
 _SAFE = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 _UNSAFE_CHARACTERS = re.compile(r"[^A-Za-z0-9._-]+")
@@ -49,9 +50,11 @@ class ItemPaths:
     semantic: str | None
     instance: str | None
     water: str | None
+    snow: str | None
     lidar: str | None
     labels: str | None
     box_water: str | None
+    box_snow: str | None
     calibration: str
 
     def columns(self) -> dict[str, str | None]:
@@ -67,11 +70,21 @@ def variant_folder(scene: str, variant: str) -> str:
     return f"{folder_name(scene)}/{folder_name(variant)}"
 
 
+def box_weather_files(recipe: Recipe) -> dict[str, str]:
+    """Files inside the variant's folder that say what its weather does to the boxes, by kind."""
+    present = {
+        "box_water": recipe.weather.flood is not None,
+        "box_snow": recipe.weather.snow is not None,
+    }
+    return {k: _BOX_WEATHER[k] for k, there in present.items() if there and recipe.output.labels}
+
+
 def item_paths(scene: str, recipe: Recipe, camera: str, frame: int) -> ItemPaths:
     """Where the image of one camera in one frame lies, and what else the recipe asks for."""
     if frame < 0:
         raise ValueError(f"frame numbers in an output folder are >= 0; got {frame}")
-    output, has_flood = recipe.output, recipe.weather.flood is not None
+    output, weather = recipe.output, recipe.weather
+    tables = box_weather_files(recipe)
     base = variant_folder(scene, variant_name(recipe))
     stem = f"{folder_name(camera)}/{frame:06d}"
     return ItemPaths(
@@ -79,10 +92,12 @@ def item_paths(scene: str, recipe: Recipe, camera: str, frame: int) -> ItemPaths
         depth=None if output.depth == "none" else f"{base}/depth/{stem}.png",
         semantic=f"{base}/semantic/{stem}.png" if output.semantic else None,
         instance=f"{base}/instance/{stem}.png" if output.instance else None,
-        water=f"{base}/water/{stem}.png" if has_flood else None,
+        water=None if weather.flood is None else f"{base}/water/{stem}.png",
+        snow=None if weather.snow is None else f"{base}/snow/{stem}.png",
         lidar=f"{base}/lidar/{frame:06d}.parquet" if output.lidar else None,
         labels=f"{base}/labels/boxes.parquet" if output.labels else None,
-        box_water=f"{base}/{WATER_LABELS}" if has_flood and output.labels else None,
+        box_water=f"{base}/{tables['box_water']}" if "box_water" in tables else None,
+        box_snow=f"{base}/{tables['box_snow']}" if "box_snow" in tables else None,
         calibration=f"{base}/calibration.json",
     )
 

@@ -14,12 +14,14 @@ from typing import Any
 import pyarrow as pa
 
 from augment.batch.atomic import flush_folder, make_folder, output_error, remove_temporaries
+from augment.batch.box_tables import BoxNumbers, Item
+from augment.batch.box_weather import TABLES
 from augment.batch.journal import Identity, Journal, journalled_variants
 from augment.batch.layout import (
     MANIFEST,
     PATH_KINDS,
     STATE_FOLDER,
-    WATER_LABELS,
+    box_weather_files,
     item_paths,
     variant_folder,
     variant_name,
@@ -34,14 +36,12 @@ from augment.batch.manifest import (
 )
 from augment.batch.runner import Chunk, Outcome
 from augment.batch.selection import SceneIndex
-from augment.batch.water_labels import BoxWater, Item, read_water
 from augment.cameras import Frame
 from augment.errors import OutputError
 from recipes.schema import Recipe
 
 # What belongs to a whole variant is written when the job ends.
-_OF_VARIANT = ("labels", "box_water", "calibration")
-_IN_JOURNAL = "box_water"  # what a journal's line has beyond the manifest's row
+_OF_VARIANT = ("labels", *TABLES, "calibration")
 _log = logging.getLogger(__name__)
 
 
@@ -49,7 +49,7 @@ _log = logging.getLogger(__name__)
 class VariantState:
     """One variant of the job. rows: what is known of its images, from this run and earlier ones.
 
-    box_water: what its flood does to the boxes of those images.
+    box_weather: what its weather does to the boxes of those images, by effect (see TABLES).
     """
 
     recipe: Recipe
@@ -58,7 +58,9 @@ class VariantState:
     identity: Identity
     journal: Journal
     rows: dict[Item, dict[str, Any]] = field(default_factory=dict)
-    box_water: dict[Item, BoxWater] = field(default_factory=dict)
+    box_weather: dict[str, dict[Item, BoxNumbers]] = field(
+        default_factory=lambda: {kind: {} for kind in TABLES}
+    )
     is_journalled: bool = False
 
     def is_finished(self, out_dir: Path, item: Item) -> bool:
@@ -66,7 +68,8 @@ class VariantState:
         row = self.rows.get(item)
         if row is None or row["status"] != OK:
             return False
-        if row["box_water_path"] is not None and item not in self.box_water:
+        measured = [kind for kind in TABLES if row[f"{kind}_path"] is not None]
+        if any(item not in self.box_weather[kind] for kind in measured):
             return False
         paths = [row[f"{kind}_path"] for kind in PATH_KINDS if kind not in _OF_VARIANT]
         return all((out_dir / path).is_file() for path in paths if path is not None)
@@ -122,12 +125,12 @@ class Ledger:
         """Enter what became of an image, durably. May be called from several threads."""
         variant = self.variants[outcome.variant]
         row = self._row(variant, outcome, frame)
-        water = outcome.box_water
-        variant.journal.append(row if water is None else {**row, _IN_JOURNAL: water.to_json()})
+        measured = {k: TABLES[k].to_json(numbers) for k, numbers in outcome.box_weather.items()}
+        variant.journal.append({**row, **measured})
         with self._lock:
             variant.rows[frame.index, outcome.camera] = row
-            if water is not None:
-                variant.box_water[frame.index, outcome.camera] = water
+            for kind, numbers in outcome.box_weather.items():
+                variant.box_weather[kind][frame.index, outcome.camera] = numbers
 
     def write_manifest(self, variants: Sequence[VariantState]) -> Path:
         """Put the rows of these variants into the manifest."""
@@ -151,12 +154,17 @@ class Ledger:
         if found is not None:
             variant.identity.check(found, str(self.out_dir / variant.folder))
         variant.is_journalled = begun is not None
-        if any(row.get("box_water_path") for row in rows):
-            variant.box_water = _read_water(self.out_dir / variant.folder / WATER_LABELS)
-        for row in journalled:
-            if (water := row.pop(_IN_JOURNAL, None)) is not None:
-                variant.box_water[row["frame"], row["camera"]] = BoxWater.from_json(water)
-        known = [{**LATER, **row} for row in [*rows, *journalled]]
+        for kind, file in box_weather_files(variant.recipe).items():
+            if any(row.get(f"{kind}_path") for row in rows):
+                variant.box_weather[kind] = _read_table(kind, self.out_dir / variant.folder / file)
+        for row in journalled:  # which have the boxes' numbers beyond the manifest's columns
+            for kind, table in TABLES.items():
+                if (numbers := row.pop(kind, None)) is not None:
+                    item = row["frame"], row["camera"]
+                    variant.box_weather[kind][item] = table.from_json(numbers)
+        # The recipe's hash agrees, so the rows show what it says, whatever their version called it.
+        shown = {"surface": variant.recipe.output.surface}
+        known = [{**LATER, **row, **shown} for row in [*rows, *journalled]]
         variant.rows = {(row["frame"], row["camera"]): row for row in known}
         return False
 
@@ -201,8 +209,8 @@ class Ledger:
             paths["lidar_path"] = None
         if frame.index not in index.labelled:
             paths["labels_path"] = None
-        if outcome.box_water is None:
-            paths["box_water_path"] = None
+        for kind in TABLES.keys() - outcome.box_weather.keys():
+            paths[f"{kind}_path"] = None
         if outcome.status != OK:
             paths = dict.fromkeys(paths)
         return {
@@ -225,10 +233,10 @@ class Ledger:
         }
 
 
-def _read_water(path: Path) -> dict[Item, BoxWater]:
+def _read_table(kind: str, path: Path) -> dict[Item, BoxNumbers]:
     """A lost or damaged file counts as empty: only rendering again tells what was in it."""
     try:
-        return read_water(path)
+        return TABLES[kind].read(path)
     except OutputError as error:
         _log.warning("%s; the images it belongs to are rendered again", error)
         return {}

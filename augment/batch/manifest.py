@@ -46,7 +46,14 @@ TRAILING = {
     "message": pa.string(),
 }
 # Columns younger than the first release, and what a row without them means.
-LATER: dict[str, str | None] = {"water_path": None, "box_water_path": None, "surface": "scene"}
+# Without water and snow all surfaces are the same; new rows of such a variant say the default.
+LATER: dict[str, str | None] = {
+    "water_path": None,
+    "snow_path": None,
+    "box_water_path": None,
+    "box_snow_path": None,
+    "surface": "solid",
+}
 KEY = ("scene", "variant", "frame", "camera")
 
 Row = Mapping[str, Any]

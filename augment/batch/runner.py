@@ -16,11 +16,11 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from augment.batch.atomic import write_atomic
+from augment.batch.box_weather import BoxWeather, has_box_weather, measure_boxes
 from augment.batch.label_files import lidar_bytes
 from augment.batch.layout import item_paths
 from augment.batch.manifest import FAILED, OK
 from augment.batch.trajectory import frames_from_json
-from augment.batch.water_labels import BoxWater, measure_boxes
 from augment.batch.writer import View, WritePump, check_view, write_view
 from augment.cameras import Camera
 from augment.labels import Boxes
@@ -66,8 +66,8 @@ class Chunk:
 class Outcome:
     """What became of one image.
 
-    lidar: whether the frame has a sweep. box_water: what the recipe's flood does to its boxes,
-    where there are labels. seconds: by kind of work.
+    lidar: whether the frame has a sweep. box_weather: what each effect of the recipe does to its
+    boxes, where there are labels. seconds: by kind of work.
     """
 
     variant: int
@@ -77,7 +77,7 @@ class Outcome:
     message: str = ""
     checksum: str = ""
     lidar: bool = False
-    box_water: BoxWater | None = None
+    box_weather: BoxWeather = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
 
 
@@ -140,8 +140,8 @@ class FrameRunner:
             view = self._renderer(self._scene, camera, recipe, backend=self._setup.backend)
             written = camera.scaled(recipe.render.scale)
             check_view(view, written, recipe)
-            doing = "measuring the boxes under water"
-            box_water = self._measure(chunk.frame, recipe, written, view)
+            doing = "measuring the boxes in the weather"
+            box_weather = self._measure(chunk.frame, recipe, written, view)
         except Exception as error:
             _log.debug("frame %d, camera %s", chunk.frame, name, exc_info=True)
             message = describe(error, doing)
@@ -154,21 +154,20 @@ class FrameRunner:
             chunk.frame,
             name,
             OK,
-            box_water=box_water,
+            box_weather=box_weather,
             seconds={"render": render_s},
         )
         self._pump.submit(lambda: self._write(done, recipe, view, lidar))
 
-    def _measure(self, frame: int, recipe: Recipe, camera: Camera, view: View) -> BoxWater | None:
-        """What the flood does to the frame's boxes; None without a flood or labels."""
+    def _measure(self, frame: int, recipe: Recipe, camera: Camera, view: View) -> BoxWeather:
+        """What the weather does to the frame's boxes; nothing without labels."""
         has_labels = recipe.output.labels and frame in self._setup.labelled
-        if view.flood is None or not has_labels:
-            return None
-        assert view.water is not None  # check_view has seen to it
+        if not has_labels or not has_box_weather(view):
+            return {}
         if frame not in self._boxes:
             self._boxes[frame] = self._scene.boxes(frame)
         origin = np.asarray(self._scene.world_origin_m, np.float64)
-        return measure_boxes(self._boxes[frame], origin, camera, view.water, view.flood)
+        return measure_boxes(self._boxes[frame], origin, camera, view)
 
     def _write(self, done: Outcome, recipe: Recipe, view: View, lidar: Future) -> None:
         """Write the files of a view and deliver `done`, completed, or a failure in its place."""

@@ -16,6 +16,7 @@ import numpy as np
 from augment.batch.atomic import write_atomic
 from augment.batch.encode import encode_depth, encode_ids, encode_image, encode_mask
 from augment.batch.layout import ItemPaths
+from augment.batch.snow_labels import Snowy
 from augment.batch.water_labels import Flooded
 from augment.cameras import Camera
 from recipes.schema import Recipe
@@ -31,6 +32,8 @@ class View(Protocol):
     instance: np.ndarray | None  # uint16 [H, W]
     water: np.ndarray | None  # uint8 [H, W], 0 or 255
     flood: Flooded | None
+    snow: np.ndarray | None  # uint8 [H, W], 0 or 255
+    snowy: Snowy | None
 
 
 @dataclass(frozen=True)
@@ -47,18 +50,17 @@ def check_view(view: View, camera: Camera, recipe: Recipe) -> None:
 
     camera: at the written resolution.
     """
-    output, has_flood = recipe.output, recipe.weather.flood is not None
-    if (view.flood is not None) != has_flood:
-        raise ValueError(
-            f"the renderer returned {'no' if has_flood else 'a'} water level for a recipe "
-            f"{'with' if has_flood else 'without'} a flood"
-        )
+    output, weather = recipe.output, recipe.weather
+    has_flood, has_snow = weather.flood is not None, weather.snow is not None
+    _check_fact("water level", view.flood is not None, "a flood", has_flood)
+    _check_fact("snow depth", view.snowy is not None, "snow", has_snow)
     wanted = {
         "rgb": True,
         "depth_m": output.depth != "none",
         "semantic": output.semantic,
         "instance": output.instance,
         "water": has_flood,
+        "snow": has_snow,
     }
     for name, needed in wanted.items():
         buffer = getattr(view, name)
@@ -72,6 +74,14 @@ def check_view(view: View, camera: Camera, recipe: Recipe) -> None:
                 f"the renderer returned {name} of {list(buffer.shape)}; camera {camera.name!r} "
                 f"writes {camera.height} rows of {camera.width} pixels"
             )
+
+
+def _check_fact(fact: str, is_given: bool, effect: str, is_wanted: bool) -> None:
+    if is_given != is_wanted:
+        raise ValueError(
+            f"the renderer returned {'a' if is_given else 'no'} {fact} for a recipe "
+            f"{'with' if is_wanted else 'without'} {effect}"
+        )
 
 
 def write_view(out_dir: Path, paths: ItemPaths, view: View, recipe: Recipe) -> Written:
@@ -95,6 +105,9 @@ def write_view(out_dir: Path, paths: ItemPaths, view: View, recipe: Recipe) -> W
     if paths.water is not None:
         assert view.water is not None
         files[paths.water] = encode_mask(view.water)
+    if paths.snow is not None:
+        assert view.snow is not None
+        files[paths.snow] = encode_mask(view.snow)
     files[paths.image] = encode_image(view.rgb, recipe.output)
     checksum = hashlib.sha256(files[paths.image]).hexdigest()
     encoded = time.perf_counter()

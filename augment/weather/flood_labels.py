@@ -1,47 +1,17 @@
 """What a flood does to labelled boxes: how deep each stands in the water, and what of it is hidden.
 
 Boxes come in the dataset's world (`augment.labels`), water and cameras in the scene's, which is the
-dataset's less `world_origin_m`. A box's own axes: x along its length, y its width, z its height.
+dataset's less `world_origin_m`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
-import torch
-from jaxtyping import Float32, Float64, Int64, UInt8
+from jaxtyping import Float32, Float64, UInt8
 
+from augment.box_pixels import BoxPixels, PlacedBoxes, count_pixels
 from augment.cameras import Camera
-from augment.geometry import rotmat_from_quat
 from augment.labels import Boxes
-
-NOT_COUNTED = -1  # in place of a number of pixels
-
-# Which surfaces a box owns. Its lowest 8 cm are left out, for the road under a car is inside the
-# box as often as not: labels, ground and depth agree to some 5 cm. Of the pixels in the boxes of a
-# recorded drive that makes 1.2 % road, where all of the box has 6.1 % and 4 cm less have 3.5 %, and
-# costs 0.3 % of the vehicles'. A low box keeps three quarters.
-BOTTOM_M = 0.08
-MOST_OF_HEIGHT = 0.25
-# On the other five sides boxes are drawn tight (mirrors and bumpers reach beyond them), and splats
-# blur a surface by a few centimetres.
-SIDES_M = 0.10
-NEAR_M = 0.01  # what of a box is nearer to the camera's plane, or behind it, is not projected
-
-_CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
-# Corners that differ in one axis are joined by an edge.
-_EDGES = np.array([
-    (a, b) for a in range(8) for b in range(a) if (_CORNERS[a] != _CORNERS[b]).sum() == 1
-])  # fmt: skip
-
-
-@dataclass(frozen=True, eq=False)
-class HiddenPixels:
-    """pixels: of the image, that show a box's surface. hidden: those of them behind water."""
-
-    pixels: Int64[np.ndarray, " B"]
-    hidden: Int64[np.ndarray, " B"]
 
 
 def submerged_fraction(
@@ -52,7 +22,7 @@ def submerged_fraction(
     level_z_m: scene world. A box without height is wholly in or out; one whose numbers are not
     finite has NaN.
     """
-    placed = _Placed.of(boxes, world_origin_m)
+    placed = PlacedBoxes.of(boxes, world_origin_m)
     z = placed.corners_m[..., 2]  # [B, 8]
     low, high = z.min(axis=1), z.max(axis=1)
     height = high - low
@@ -69,128 +39,10 @@ def hidden_pixels(
     camera: Camera,
     scene_depth_m: Float32[np.ndarray, "H W"],
     water: UInt8[np.ndarray, "H W"],
-) -> HiddenPixels:
-    """How many pixels show each box, and how many of them do so through water.
+) -> BoxPixels:
+    """How many pixels show each box, and how many of them (`marked`) do so through water.
 
     scene_depth_m: z of the scene's own surface, seen through the water where there is some; 0 =
-    none. water: 255 where water is the first surface. A pixel belongs to a box if the surface there
-    lies inside it, its lowest centimetres left out and its other sides drawn wider (see BOTTOM_M
-    and SIDES_M), so what hides a box otherwise, or stands beside it, does not count. Where boxes
-    overlap, a pixel belongs to each.
+    none. water: 255 where water is the first surface.
     """
-    placed = _Placed.of(boxes, world_origin_m)
-    pixels = np.zeros(len(boxes), np.int64)
-    hidden = np.zeros(len(boxes), np.int64)
-    windows = _windows(placed, camera)
-    world_from_camera = camera.world_from_camera.numpy()
-    across = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx  # x / z of the pixels' rays
-    down = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy  # y / z
-    for number, (left, top, right, bottom) in enumerate(windows):
-        if left >= right or top >= bottom:
-            continue
-        window = np.s_[top:bottom, left:right]
-        rays = across[left:right], down[top:bottom]
-        inside = _inside(placed, number, world_from_camera, rays, scene_depth_m[window])
-        pixels[number] = len(inside)
-        hidden[number] = np.count_nonzero(water[window].ravel()[inside] == 255)
-    return HiddenPixels(pixels, hidden)
-
-
-@dataclass(frozen=True, eq=False)
-class _Placed:
-    """Boxes in the scene's world, float64. rotations [B, 3, 3]: world_from_box.
-
-    low_m, high_m [B, 3]: the part of each box, along its own axes from its centre, that owns
-    surfaces. corners_m [B, 8, 3]: of the labelled box. Boxes that are not finite hold zeros.
-    """
-
-    is_finite: np.ndarray
-    centres_m: np.ndarray
-    rotations: np.ndarray
-    low_m: np.ndarray
-    high_m: np.ndarray
-    corners_m: np.ndarray
-
-    @staticmethod
-    def of(boxes: Boxes, world_origin_m: np.ndarray) -> _Placed:
-        numbers = np.concatenate([boxes.centers_m, boxes.sizes_m, boxes.quats], axis=1)
-        turned = np.linalg.norm(boxes.quats, axis=1) > 0
-        finite = np.isfinite(numbers).all(axis=1) & turned
-        quats = np.where(finite[:, None], boxes.quats, np.array([1.0, 0, 0, 0]))
-        rotations = rotmat_from_quat(torch.from_numpy(quats)).numpy()
-        centres = np.where(finite[:, None], boxes.centers_m - world_origin_m, 0.0)
-        sizes = np.where(finite[:, None], boxes.sizes_m, 0.0)
-        low, high = -sizes / 2 - SIDES_M, sizes / 2 + SIDES_M
-        low[:, 2] = -sizes[:, 2] / 2 + np.minimum(BOTTOM_M, MOST_OF_HEIGHT * sizes[:, 2])
-        corners = _to_world(centres, rotations, _CORNERS * sizes[:, None, :])
-        return _Placed(finite, centres, rotations, low, high, corners)
-
-
-def _to_world(centres_m: np.ndarray, rotations: np.ndarray, points_m: np.ndarray) -> np.ndarray:
-    """Points [B, K, 3] from their boxes' axes to the world."""
-    return centres_m[:, None, :] + points_m @ rotations.transpose(0, 2, 1)
-
-
-def _windows(placed: _Placed, camera: Camera) -> np.ndarray:
-    """int64 [B, 4]: left, top, right, bottom of the pixels that can show the box; right and bottom
-    are excluded, and nothing is left of a box out of view.
-    """
-    middle = (placed.low_m + placed.high_m)[:, None, :] / 2
-    extent = (placed.high_m - placed.low_m)[:, None, :]
-    corners = _to_world(placed.centres_m, placed.rotations, middle + _CORNERS * extent)
-    camera_from_world = camera.camera_from_world.numpy()
-    corners = corners @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
-    a, b = corners[:, _EDGES[:, 0]], corners[:, _EDGES[:, 1]]  # [B, 12, 3]
-    ends = np.concatenate([_cut(a, b), _cut(b, a)], axis=1)
-    seen = (np.maximum(a[..., 2], b[..., 2]) > NEAR_M) & placed.is_finite[:, None]
-    seen = np.concatenate([seen, seen], axis=1)
-    z = np.where(seen, ends[..., 2], 1.0)
-    windows = np.zeros((len(corners), 4), np.int64)
-    sides = ((camera.fx, camera.cx, camera.width), (camera.fy, camera.cy, camera.height))
-    for axis, (focal, centre, size) in enumerate(sides):
-        at = focal * ends[..., axis] / z + centre - 0.5  # of pixel centres, counted from 0
-        first = np.where(seen, at, np.inf).min(axis=1, initial=np.inf)
-        last = np.where(seen, at, -np.inf).max(axis=1, initial=-np.inf)
-        windows[:, axis] = np.clip(np.ceil(first), 0, size)
-        windows[:, axis + 2] = np.clip(np.floor(last) + 1, 0, size)
-    return windows
-
-
-def _cut(end: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """`end` of each edge [..., 3], moved along the edge to z = NEAR_M where it lies nearer."""
-    length = other[..., 2] - end[..., 2]
-    behind = (end[..., 2] < NEAR_M) & (length > 0)
-    t = np.where(behind, (NEAR_M - end[..., 2]) / np.where(behind, length, 1.0), 0.0)
-    return end + t[..., None] * (other - end)
-
-
-def _inside(
-    placed: _Placed,
-    number: int,
-    world_from_camera: np.ndarray,
-    rays: tuple[np.ndarray, np.ndarray],
-    depth_m: np.ndarray,
-) -> np.ndarray:
-    """Flat indices of those pixels of a window whose surface lies inside one box.
-
-    rays: x / z of the window's columns [w], y / z of its rows [h]. depth_m: [h, w].
-    """
-    box_from_world = placed.rotations[number].T
-    axes = box_from_world @ world_from_camera[:3, :3]  # columns: the camera's axes in the box
-    eye = box_from_world @ (world_from_camera[:3, 3] - placed.centres_m[number])
-    low, high = placed.low_m[number], placed.high_m[number]
-    # The depths of the box bound what is looked at closely: a few pixels of many, mostly.
-    depth_of_centre = -(eye @ axes[:, 2])
-    reach = np.maximum(-low, high) @ np.abs(axes[:, 2])
-    nearest = max(depth_of_centre - reach, 0.0)
-    flat = np.ascontiguousarray(depth_m).ravel()
-    near = np.flatnonzero((flat > nearest) & (flat <= depth_of_centre + reach))
-    rows, columns = np.divmod(near, depth_m.shape[1])
-    z = flat[near].astype(np.float64)
-    x = rays[0][columns] * z
-    y = rays[1][rows] * z
-    kept = np.ones(len(near), bool)
-    for axis in range(3):
-        along = eye[axis] + axes[axis, 0] * x + axes[axis, 1] * y + axes[axis, 2] * z
-        kept &= (along >= low[axis]) & (along <= high[axis])
-    return near[kept]
+    return count_pixels(PlacedBoxes.of(boxes, world_origin_m), camera, scene_depth_m, water)

@@ -22,10 +22,12 @@ from augment.scene import Gaussians, Scene
 from augment.sky import ConstantSky
 from recipes.flood import Flood
 from recipes.schema import Output, Recipe, Smog, Weather
+from recipes.snow import Snow
 
 ORIGIN_M = np.array([448_262.123456789, 4_421_337.987654321, 41.5])
 LEVEL_Z_M = 0.2
-DRY_NS = 10**18 + 300_000_001  # frame 3, rear/left
+THICKNESS_M = 0.15
+DRY_NS = 10**18 + 300_000_001  # frame 3, rear/left: neither water nor snow is in view
 SIZE = (24, 16)  # width and height of the cameras, pixels
 
 
@@ -74,6 +76,12 @@ class FakeFlood:
 
 
 @dataclass(frozen=True)
+class FakeSnowy:
+    surface_depth_m: np.ndarray | None
+    thickness_m: float
+
+
+@dataclass(frozen=True)
 class FakeView:
     rgb: np.ndarray
     depth_m: np.ndarray | None
@@ -81,6 +89,8 @@ class FakeView:
     instance: np.ndarray | None
     water: np.ndarray | None = None
     flood: FakeFlood | None = None
+    snow: np.ndarray | None = None
+    snowy: FakeSnowy | None = None
 
 
 def open_fake(uri: str) -> Scene:
@@ -135,10 +145,14 @@ def make_camera(name: str, time_ns: int, forward_m: float) -> Camera:
 
 
 def make_recipe(
-    name: str = "fog", variant: int = 0, flood: Flood | None = None, **output
+    name: str = "fog",
+    variant: int = 0,
+    flood: Flood | None = None,
+    snow: Snow | None = None,
+    **output,
 ) -> Recipe:
     smog = Smog(visibility_m=50.0 + variant)
-    weather = Weather(smog=smog if name == "fog" else None, flood=flood)
+    weather = Weather(smog=smog if name == "fog" else None, flood=flood, snow=snow)
     settings = {"semantic": True, "instance": True, **output}
     return Recipe(name=name, variant=variant, seed=7, weather=weather, output=Output(**settings))
 
@@ -152,13 +166,14 @@ def fake_render(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str) -
     shape = (camera.height, camera.width)
     output = recipe.output
     depth = rng.uniform(-10, 300, shape).astype(np.float32)
-    has_flood = recipe.weather.flood is not None
+    weather = recipe.weather
     return FakeView(
         rgb=rng.integers(0, 256, (*shape, 3), dtype=np.uint8),
         depth_m=None if output.depth == "none" else depth,
         semantic=rng.integers(0, 15, shape, dtype=np.uint8) if output.semantic else None,
         instance=rng.integers(0, 600, shape).astype(np.uint16) if output.instance else None,
-        **(fake_flood(camera, rng) if has_flood else {}),
+        **(fake_flood(camera, rng) if weather.flood is not None else {}),
+        **(fake_snow(camera, rng) if weather.snow is not None else {}),
     )
 
 
@@ -170,6 +185,17 @@ def fake_flood(camera: Camera, rng: np.random.Generator) -> dict:
     return {
         "water": np.where(rng.random(shape) < 1 / 3, 255, 0).astype(np.uint8),
         "flood": FakeFlood(LEVEL_Z_M, rng.uniform(0, 4, shape).astype(np.float32)),
+    }
+
+
+def fake_snow(camera: Camera, rng: np.random.Generator) -> dict:
+    """Snow on half of the pixels, as `fake_flood` has water."""
+    shape = (camera.height, camera.width)
+    if camera.timestamp_ns == DRY_NS:
+        return {"snow": np.zeros(shape, np.uint8), "snowy": FakeSnowy(None, THICKNESS_M)}
+    return {
+        "snow": np.where(rng.random(shape) < 1 / 2, 255, 0).astype(np.uint8),
+        "snowy": FakeSnowy(rng.uniform(0, 4, shape).astype(np.float32), THICKNESS_M),
     }
 
 

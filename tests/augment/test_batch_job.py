@@ -101,9 +101,11 @@ def test_manifest_has_a_row_for_every_image(tmp_path: Path) -> None:
         "calibration_path": "street/fog-000/calibration.json",
         "width": SIZE[0],
         "height": SIZE[1],
-        "surface": "scene",
+        "surface": "solid",
         "water_path": None,
+        "snow_path": None,
         "box_water_path": None,
+        "box_snow_path": None,
         "seed": 7,
         "recipe": "fog",
         "recipe_hash": recipe.hash,
@@ -115,7 +117,9 @@ def test_manifest_has_a_row_for_every_image(tmp_path: Path) -> None:
         "message": "",
     }
     assert {name: row[name] for name in expected} == expected
-    numbers = {name: row[name] for name in row if name.startswith(("smog_", "flood_"))}
+    numbers = {
+        name: row[name] for name in row if name.startswith(("smog_", "flood_", "snow_d", "snow_c"))
+    }
     assert numbers.keys() == recipe.weather_numbers().keys()
     assert numbers["smog_extinction_per_m"] == recipe.weather_numbers()["smog_extinction_per_m"]
     assert rows[1]["lidar_path"] is None  # the dataset has no sweep there

@@ -28,7 +28,7 @@ from batch_scenes import (
 
 from augment.batch.job import JobResult, RenderJob, run_job
 from augment.batch.manifest import LATER, read_manifest
-from augment.batch.water_labels import BoxWater, read_water, water_bytes
+from augment.batch.water_labels import WATER_TABLE, BoxWater, read_water
 from augment.cameras import Frame
 from augment.dataset import WeatherDataset
 from augment.weather.flood_labels import hidden_pixels, submerged_fraction
@@ -71,7 +71,7 @@ def test_masks_hold_what_was_rendered(whole: Path, recipe: Recipe) -> None:
         mask = cv2.imread(str(whole / row["water_path"]), cv2.IMREAD_UNCHANGED)
         assert mask.dtype == np.uint8
         np.testing.assert_array_equal(mask, view.water)
-    assert {row["surface"] for row in rows} == {"scene"}
+    assert {row["surface"] for row in rows} == {"solid"}
 
 
 def test_boxes_have_their_numbers_beside_the_labels(whole: Path, recipe: Recipe) -> None:
@@ -99,7 +99,7 @@ def test_boxes_have_their_numbers_beside_the_labels(whole: Path, recipe: Recipe)
             assert numbers == [None, 0, 0.0]
             continue
         counted = hidden_pixels(boxes, ORIGIN_M, camera, view.flood.scene_depth_m, view.water)
-        assert (row["pixels"], row["hidden_pixels"]) == (counted.pixels[k], counted.hidden[k])
+        assert (row["pixels"], row["hidden_pixels"]) == (counted.pixels[k], counted.marked[k])
         seen, hidden = seen + row["pixels"], hidden + row["hidden_pixels"]
         if row["pixels"]:
             assert row["hidden_fraction"] == row["hidden_pixels"] / row["pixels"]
@@ -122,14 +122,14 @@ def test_the_numbers_survive_the_file_to_the_bit() -> None:
         np.array([7, 0, -1]),
         np.array([3, 0, 0]),
     )
-    again = BoxWater.from_json(json.loads(json.dumps(numbers.to_json())))
-    assert water_bytes({(2, "x"): again}) == water_bytes({(2, "x"): numbers})
+    again = WATER_TABLE.from_json(json.loads(json.dumps(WATER_TABLE.to_json(numbers))))
+    assert WATER_TABLE.to_bytes({(2, "x"): again}) == WATER_TABLE.to_bytes({(2, "x"): numbers})
     np.testing.assert_array_equal(again.hidden_fraction, [3 / 7, np.nan, 0.0])
 
 
 def test_images_without_boxes_are_listed(whole: Path) -> None:
     water = read_water(whole / FOLDER / "labels" / "water.parquet")
-    assert {(f, len(numbers)) for (f, _), numbers in water.items()} == {
+    assert {(f, len(numbers.track_ids)) for (f, _), numbers in water.items()} == {
         (0, 0),
         (1, 1),
         (2, 2),
@@ -282,26 +282,29 @@ def test_labels_that_cannot_be_measured_fail_their_image(recipe, tmp_path: Path)
     job = RenderJob("fake:street", [recipe], tmp_path, frames=[2], cameras=["front"])
     result = run(job, scene_loader=open_scene)
     assert result.failures[0].endswith(
-        "measuring the boxes under water: EOFError: compressed file ended early"
+        "measuring the boxes in the weather: EOFError: compressed file ended early"
     )
 
 
 def test_manifests_of_older_versions_are_read_and_gone_on_with(tmp_path: Path) -> None:
-    """Without the columns that came later: no water, and what is shown is the scene."""
+    """Without the columns that came later: no water and no snow, so all surfaces are the same."""
     whole, old = tmp_path / "whole", tmp_path / "old"
     run(RenderJob("fake:street", [make_recipe()], whole))
     run(RenderJob("fake:street", [make_recipe()], old, frames=[0, 1]))
     manifest = old / "manifest.parquet"
     table = pq.read_table(manifest)
-    later = [name for name in table.column_names if name in LATER or name.startswith("flood_")]
-    assert len(later) == len(LATER) + 3
+    numbers = [
+        n for n in table.column_names if n.startswith(("flood_", "snow_")) and n not in LATER
+    ]
+    later = [*numbers, *LATER]
+    assert len(numbers) == 5
     pq.write_table(table.drop_columns(later), manifest)
     assert read_manifest(old).column_names == [
-        name for name in table.column_names if not name.startswith("flood_")
+        name for name in table.column_names if name not in numbers
     ]
-    assert read_manifest(old)["surface"].to_pylist() == ["scene"] * 4
+    assert read_manifest(old)["surface"].to_pylist() == ["solid"] * 4
     sample = WeatherDataset(old)[0]
-    assert sample["surface"] == "scene" and sample["water"] is None
+    assert sample["surface"] == "solid" and sample["water"] is sample["snow"] is None
     assert sample["boxes"]["submerged_fraction"] is None
     assert run(RenderJob("fake:street", [make_recipe()], old)).skipped == 4
     assert tree_digest(old / "street") == tree_digest(whole / "street")

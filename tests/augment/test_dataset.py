@@ -25,7 +25,7 @@ from batch_scenes import (
 from torch.utils.data import DataLoader
 
 from augment.batch.job import RenderJob, run_job
-from augment.batch.water_labels import BoxWater, water_bytes
+from augment.batch.water_labels import WATER_TABLE, BoxWater
 from augment.dataset import SceneDataset, WeatherDataset, collate_frames
 from augment.errors import OutputError, SceneError
 from augment.weather.flood_labels import hidden_pixels, submerged_fraction
@@ -132,8 +132,8 @@ def test_a_flooded_sample_holds_what_it_says(written: Path) -> None:
     submerged = submerged_fraction(boxes, ORIGIN_M, LEVEL_Z_M)
     np.testing.assert_array_equal(sample["boxes"]["submerged_fraction"].numpy(), submerged)
     counted = hidden_pixels(boxes, ORIGIN_M, camera, view.flood.scene_depth_m, view.water)
-    assert counted.hidden.sum() > 0
-    hidden = [h / p if p else np.nan for p, h in zip(counted.pixels, counted.hidden, strict=True)]
+    assert counted.marked.sum() > 0
+    hidden = [h / p if p else np.nan for p, h in zip(counted.pixels, counted.marked, strict=True)]
     np.testing.assert_array_equal(sample["boxes"]["hidden_fraction"].numpy(), hidden)
     assert sample["paths"]["water"].endswith("water/front/000001.png")
     assert sample["paths"]["box_water"].endswith("labels/water.parquet")
@@ -146,7 +146,7 @@ def test_batches_of_flooded_samples(written: Path) -> None:
     assert [boxes["hidden_fraction"].shape for boxes in batch["boxes"]] == [(2,), (2,)]
     dry = WeatherDataset(written, variants=["fog-000"], frames=[2])
     mixed = collate_frames([flooded[0], dry[0]])
-    assert mixed["water"][1] is None and mixed["surface"] == ["first", "scene"]
+    assert mixed["water"][1] is None and mixed["surface"] == ["first", "solid"]
     assert mixed["boxes"][1]["submerged_fraction"] is None
 
 
@@ -283,7 +283,7 @@ def test_damaged_files_of_a_flood_are_named(one_flooded_image, name, damage, mes
 def test_numbers_of_other_boxes_are_refused(one_flooded_image: Path, item, message) -> None:
     none = BoxWater((), np.zeros(0), np.zeros(0, np.int64), np.zeros(0, np.int64))
     path = one_flooded_image / "street" / "clear-009" / "labels" / "water.parquet"
-    path.write_bytes(water_bytes({item: none}))
+    path.write_bytes(WATER_TABLE.to_bytes({item: none}))
     with pytest.raises(OutputError, match=message):
         WeatherDataset(one_flooded_image)[0]
     path.write_bytes((path.parent / "boxes.parquet").read_bytes())

@@ -8,57 +8,19 @@ import numpy as np
 import pytest
 import torch
 from batch_scenes import ORIGIN_M
+from box_views import (
+    CAR_M,
+    UPRIGHT,
+    boxes_at_random,
+    count_by_hand,
+    make_boxes,
+    make_camera,
+    plane_depth,
+)
 
-from augment.cameras import Camera
-from augment.geometry import rotmat_from_quat
+from augment.box_pixels import BOTTOM_M, SIDES_M
 from augment.labels import Boxes
-from augment.weather.flood_labels import BOTTOM_M, SIDES_M, hidden_pixels, submerged_fraction
-
-UPRIGHT = (1.0, 0.0, 0.0, 0.0)
-CAR_M = (4.0, 2.0, 1.5)
-
-
-def make_boxes(*boxes: tuple, origin: np.ndarray = ORIGIN_M) -> Boxes:
-    """Boxes from (centre in the scene, size, quaternion)."""
-    centres, sizes, quats = (np.array(column, np.float64) for column in zip(*boxes, strict=True))
-    names = tuple(f"track-{i}" for i in range(len(boxes)))
-    return Boxes(names, ("Car",) * len(boxes), centres + origin, sizes, quats)
-
-
-def make_camera(width: int = 160, height: int = 106, pitch: float = 0.0) -> Camera:
-    """At (0, 0, 1.6), looking along +x; pitch in radians, downwards."""
-    level = torch.tensor([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]], dtype=torch.float64)
-    c, s = np.cos(pitch), np.sin(pitch)
-    down = torch.tensor([[1, 0, 0], [0, c, -s], [0, s, c]], dtype=torch.float64)
-    rotation = down.T @ level
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, :3] = rotation
-    pose[:3, 3] = -rotation @ torch.tensor([0, 0, 1.6], dtype=torch.float64)
-    return Camera("front", width, height, 101.3, 99.7, 79.2, 55.1, pose)
-
-
-def plane_depth(camera: Camera, z_m: float) -> np.ndarray:
-    """float32 [H, W]: depth of the plane at that height, 0 where no ray meets it."""
-    rays = camera.ray_directions(torch.float64).numpy()
-    with np.errstate(divide="ignore"):
-        depth = (z_m - camera.centre[2].item()) / rays[..., 2]
-    return np.where((depth > 0) & (depth < 1000), depth, 0).astype(np.float32)
-
-
-def count_by_hand(boxes: Boxes, camera: Camera, depth_m: np.ndarray, water: np.ndarray):
-    """Every pixel of the image against every box, in the box's own axes."""
-    rays = camera.ray_directions(torch.float64).numpy()
-    points = camera.centre.numpy() + depth_m[..., None].astype(np.float64) * rays
-    pixels, hidden = [], []
-    for centre, size, quat in zip(boxes.centers_m, boxes.sizes_m, boxes.quats, strict=True):
-        rotation = rotmat_from_quat(torch.from_numpy(quat)).numpy()
-        along = (points - (centre - ORIGIN_M)) @ rotation  # [H, W, 3]
-        low, high = -size / 2 - SIDES_M, size / 2 + SIDES_M
-        low[2] = -size[2] / 2 + min(BOTTOM_M, size[2] / 4)
-        inside = ((along >= low) & (along <= high)).all(axis=-1) & (depth_m > 0)
-        pixels.append(inside.sum())
-        hidden.append((inside & (water == 255)).sum())
-    return pixels, hidden
+from augment.weather.flood_labels import hidden_pixels, submerged_fraction
 
 
 def test_an_upright_box_is_submerged_by_its_height() -> None:
@@ -97,24 +59,23 @@ def test_boxes_of_no_height_and_of_no_number() -> None:
 
 
 def test_pixels_are_those_counted_one_by_one() -> None:
-    """Boxes at random: near and far, tilted, cut by the borders, around and behind the camera."""
     rng = np.random.default_rng(4)
-    listed = [
-        (rng.uniform((-6, -8, -0.5), (25, 8, 2)), rng.uniform(0.3, 5, 3), rng.normal(size=4))
-        for _ in range(60)
-    ]
-    listed += [((0.0, 0, 1.6), (3, 3, 3), UPRIGHT), ((10, 0, 0.05), (3, 3, 0.1), UPRIGHT)]
-    boxes = make_boxes(*listed)
+    boxes = boxes_at_random(rng)
     camera = make_camera(pitch=0.15)
     # Surfaces everywhere in the boxes' space, with holes.
     depth = rng.uniform(-1, 25, (106, 160)).clip(0).astype(np.float32)
     water = np.where(rng.random((106, 160)) < 0.4, 255, 0).astype(np.uint8)
     got = hidden_pixels(boxes, ORIGIN_M, camera, depth, water)
-    pixels, hidden = count_by_hand(boxes, camera, depth, water)
+    extents = []
+    for size in boxes.sizes_m:
+        low, high = -size / 2 - SIDES_M, size / 2 + SIDES_M
+        low[2] = -size[2] / 2 + min(BOTTOM_M, size[2] / 4)
+        extents.append((low, high))
+    pixels, hidden = count_by_hand(boxes, extents, camera, depth, water)
     assert sum(p > 0 for p in pixels) > 30 and sum(p == 0 for p in pixels) > 5
     assert pixels[-2] > 0  # the camera stands inside that one
     np.testing.assert_array_equal(got.pixels, pixels)
-    np.testing.assert_array_equal(got.hidden, hidden)
+    np.testing.assert_array_equal(got.marked, hidden)
 
 
 def test_the_road_under_a_car_is_not_the_car() -> None:
@@ -135,14 +96,14 @@ def test_what_stands_in_front_is_not_the_box() -> None:
     wall = np.full((106, 160), 7.8, np.float32)
     assert hidden_pixels(boxes, ORIGIN_M, camera, wall, water).pixels[0] == 0
     seen = hidden_pixels(boxes, ORIGIN_M, camera, wall + np.float32(0.3), water)
-    assert seen.pixels[0] == seen.hidden[0] > 0
+    assert seen.pixels[0] == seen.marked[0] > 0
 
 
 def test_a_windows_boxes_may_be_none() -> None:
     camera = make_camera()
     image = np.zeros((106, 160), np.uint8)
     counted = hidden_pixels(Boxes.empty(), ORIGIN_M, camera, image.astype(np.float32), image)
-    assert counted.pixels.shape == counted.hidden.shape == (0,)
+    assert counted.pixels.shape == counted.marked.shape == (0,)
     assert submerged_fraction(Boxes.empty(), ORIGIN_M, 0.0).shape == (0,)
 
 
@@ -160,4 +121,4 @@ def test_the_hidden_part_is_that_under_the_water_line(resolution: float) -> None
     # Below, 1 - BOTTOM_M of the metre counts, above 1 + SIDES_M; the water line and
     # each edge are off by half a pixel, of the 21 that the face has at resolution 1.
     expected = (1 - BOTTOM_M) / (2 - BOTTOM_M + SIDES_M)
-    assert counted.hidden[0] / counted.pixels[0] == pytest.approx(expected, abs=1 / 21 / resolution)
+    assert counted.marked[0] / counted.pixels[0] == pytest.approx(expected, abs=1 / 21 / resolution)

@@ -1,0 +1,44 @@
+"""What snow does to labelled boxes: how much of what an image shows of each is snow.
+
+Boxes come in the dataset's world (`augment.labels`), depth and cameras in the scene's, which is the
+dataset's less `world_origin_m`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float32, Float64, UInt8
+
+from augment.box_pixels import SIDES_M, BoxPixels, PlacedBoxes, count_pixels
+from augment.cameras import Camera
+from augment.labels import Boxes
+
+MARGIN_M = 0.05  # by which splats blur the layer's surface
+DRIFTED = 1.5  # how deep drifts make the layer, relative to its depth on level ground
+KEPT_OF_HEIGHT = 0.25  # of a low box in deep snow, from its top down
+
+
+def snow_pixels(
+    boxes: Boxes,
+    world_origin_m: Float64[np.ndarray, "3"],
+    camera: Camera,
+    surface_depth_m: Float32[np.ndarray, "H W"],
+    snow: UInt8[np.ndarray, "H W"],
+    thickness_m: float,
+) -> BoxPixels:
+    """How many pixels show each box or the snow on it, and how many of them (`marked`) show snow.
+
+    surface_depth_m: z of the first solid surface, snow included; 0 = none. snow: 255 where the
+    pixel shows snow. thickness_m: of the layer on level ground. The top of a box is raised, for the
+    snow on it counts as the box; so is its bottom, for the snow around its wheels does not.
+    """
+    placed = PlacedBoxes.of(boxes, world_origin_m)
+    height = placed.sizes_m[:, 2]
+    low, high = placed.low_m.copy(), placed.high_m.copy()
+    above_ground = np.minimum(thickness_m + MARGIN_M, (1 - KEPT_OF_HEIGHT) * height)
+    low[:, 2] = np.maximum(low[:, 2], above_ground - height / 2)
+    high[:, 2] = height / 2 + max(SIDES_M, DRIFTED * thickness_m + MARGIN_M)
+    placed = dataclasses.replace(placed, low_m=low, high_m=high)
+    return count_pixels(placed, camera, surface_depth_m, snow)
