@@ -11,7 +11,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from augment.cameras import Camera
+from augment.render.sh import SH_C0
 from augment.scene import Gaussians, PosedGaussians, Scene, SplatShading
+from augment.snow.sparkle import Crystals
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,13 +21,17 @@ class Layer:
     """The snow on one part of a scene.
 
     gaussians [S]: the snow, in the part's frame, semantic SNOW. opacities [N]: of the part's own
-    Gaussians, 0 for those that the snow buries. slopes [S, 3]: see SplatShading; None where the
-    light is in the Gaussians' colours already.
+    Gaussians, 0 for those that the snow buries. slopes [S, 3]: what the light's share is
+    multiplied by, see SplatShading; None where the light is in the Gaussians' colours already.
+    normals [S, 3]: unit, where that share is one for a splat but changes as the part turns, as that
+    of a vehicle's snow; None where it is one for a pixel. crystals: what may glint, or None.
     """
 
     gaussians: Gaussians
     opacities: Float[Tensor, "N"]
     slopes: Float[Tensor, "S 3"] | None = None
+    normals: Float[Tensor, "S 3"] | None = None
+    crystals: Crystals | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,16 +65,38 @@ class SnowCover:
             kept = dataclasses.replace(part.gaussians, opacities=layer.opacities)
             parts.append(dataclasses.replace(part, gaussians=kept))
             if len(layer.gaussians):
-                snow.append(self._posed(layer, part))
+                snow.extend(self._posed(layer, part, camera))
         return (*parts, *snow)
 
-    def _posed(self, layer: Layer, part: PosedGaussians) -> PosedGaussians:
-        shading = None
-        if layer.slopes is not None:
-            sun = torch.tensor(self.sun, dtype=torch.float64)
-            if part.world_from_part is not None:
-                sun = part.world_from_part[:3, :3].T @ sun
+    def _posed(
+        self, layer: Layer, part: PosedGaussians, camera: Camera
+    ) -> tuple[PosedGaussians, ...]:
+        """The layer where its part stands, and what glints on it."""
+        pose, number = part.world_from_part, part.instance_id
+        sun, eye_m = torch.tensor(self.sun, dtype=torch.float64), camera.centre
+        if pose is not None:
+            sun, eye_m = pose[:3, :3].T @ sun, pose[:3, :3].T @ (eye_m - pose[:3, 3])
+        gaussians, shading = layer.gaussians, None
+        if layer.normals is not None:
+            assert layer.slopes is not None
+            gaussians = _lit(gaussians, layer.slopes, layer.normals, sun, self.wrap)
+        elif layer.slopes is not None:
             shading = SplatShading(layer.slopes, tuple(sun.tolist()), self.wrap)
-        return PosedGaussians(
-            layer.gaussians, part.world_from_part, part.instance_id, is_snow=True, shading=shading
-        )
+        snow = PosedGaussians(gaussians, pose, number, is_snow=True, shading=shading)
+        glints = None if layer.crystals is None else layer.crystals.glints(sun, eye_m)
+        if glints is None:
+            return (snow,)
+        return snow, PosedGaussians(glints, pose, number, is_snow=True)
+
+
+def _lit(
+    gaussians: Gaussians,
+    slopes: Float[Tensor, "S 3"],
+    normals: Float[Tensor, "S 3"],
+    sun: Float[Tensor, "3"],
+    wrap: float,
+) -> Gaussians:
+    """The Gaussians in the light that their own normals catch. sun: unit, in the part's frame."""
+    share = ((normals @ sun.to(normals.dtype) + wrap) / (1 + wrap)).clamp(0, 1)
+    lit = gaussians.sh + (slopes * (share / SH_C0)[:, None])[:, None, :]
+    return dataclasses.replace(gaussians, sh=lit)

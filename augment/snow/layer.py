@@ -1,0 +1,236 @@
+"""Snow of a recipe's depth laid on a bed: Gaussians in the colours of its light.
+
+Everything is a function of the bed, the recipe and the seed; a bed is laid anew in a fraction of a
+second when only the recipe changes.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from augment.render.threads import kernel_threads
+from augment.rng import rng_for
+from augment.scene import Gaussians, Scene
+from augment.semantics import SemanticClass
+from augment.snow import noise_kernels, splat_kernels
+from augment.snow.cells import SnowBed, SnowCells
+from augment.snow.cover import Layer, SnowCover
+from augment.snow.light import Illumination
+from augment.snow.noise import Octaves
+from augment.snow.profile import Profile, profile_of
+from augment.snow.sparkle import crystals_of
+from recipes.snow import Snow
+
+CELLS = 2048  # that a thread takes at a time
+OPACITY = 1.0
+LEAST_STEPS, MOST_STEPS = 3, 8  # of evening out the surface beneath and the light
+
+
+class Look(NamedTuple):
+    """What colours are made from besides the cells; a tuple, as kernels take it.
+
+    wrap: see augment.snow.light. grain: the recipe's. packed: 1 where tracks show, else 0.
+    is_baked: the light by the splats' normals is in `sh`.
+    """
+
+    wrap: float
+    grain: float
+    packed: float
+    is_baked: bool
+
+
+def lay_snow(
+    bed: SnowBed,
+    scene: Scene,
+    snow: Snow,
+    light: Illumination,
+    *,
+    seed: int,
+    water_level_z_m: float | None = None,
+) -> SnowCover:
+    """The recipe's snow on a bed of the scene.
+
+    seed: of drifts, patches and grain. water_level_z_m: height of standing water, which melts what
+    it reaches, in the scene's world; snow on actors is not asked.
+
+    What a tensor of the scene holds is never written to: `Layer.opacities` is the part's own tensor
+    where nothing is buried, and a copy else.
+    """
+
+    def layer_of(cells: SnowCells, own: Gaussians, track_id: str | None) -> Layer:
+        part = "ground" if track_id is None else f"actor {track_id}"
+        rng = rng_for(seed=seed, scene=scene.name, effect=f"snow.layer of {part}")
+        profile = profile_of(snow, rng, on_ground=track_id is None, water_level_z_m=water_level_z_m)
+        return _lay(cells, own, snow, light, profile, rng, moves=track_id is not None)
+
+    actors = {actor.track_id: actor.gaussians for actor in scene.actors}
+    return SnowCover(
+        ground=layer_of(bed.ground, scene.background, None),
+        actors={
+            track_id: layer_of(cells, actors[track_id], track_id)
+            for track_id, cells in bed.actors.items()
+        },
+        sun=light.sun,
+        wrap=light.wrap,
+        thickness_m=snow.depth_m,
+    )
+
+
+def _lay(
+    cells: SnowCells,
+    own: Gaussians,
+    snow: Snow,
+    light: Illumination,
+    profile: Profile,
+    rng: np.random.Generator,
+    *,
+    moves: bool,
+) -> Layer:
+    """The snow on one part. own: the part's Gaussians."""
+    per_pixel = snow.shading == "per_pixel"
+    look = Look(
+        wrap=float(light.wrap),
+        grain=float(snow.grain),
+        packed=1.0 if profile.numbers.pressed > 0 else 0.0,
+        is_baked=not per_pixel and not moves,
+    )
+    lights = np.array([light.sun, light.lit_rgb, light.shadow_rgb], np.float64)
+    seed = rng.integers(0, 2**64, dtype=np.uint64)
+    heights, gaussians, normals, slopes = _splats(
+        cells,
+        profile,
+        lights,
+        look,
+        seed,
+        keep_normals=snow.sparkle > 0 or (moves and not per_pixel),
+        keep_slopes=per_pixel or moves,
+    )
+    crystals = None
+    if snow.sparkle > 0:
+        assert normals is not None
+        rises = float(lights[1].mean() - lights[2].mean())
+        crystals = crystals_of(gaussians, normals, rises, snow.sparkle, rng)
+    return Layer(
+        gaussians=gaussians,
+        opacities=_left_visible(cells, own, heights),
+        slopes=slopes,
+        normals=normals if moves and not per_pixel else None,
+        crystals=crystals,
+    )
+
+
+def _splats(
+    cells: SnowCells,
+    profile: Profile,
+    lights: np.ndarray,
+    look: Look,
+    seed: np.uint64,
+    *,
+    keep_normals: bool,
+    keep_slopes: bool,
+) -> tuple[np.ndarray, Gaussians, Tensor | None, Tensor | None]:
+    """Depth on every cell, and the Gaussians with their normals and slopes where asked for."""
+    count = len(cells)
+    centers, bed_normals, sizes, neighbours = (
+        t.contiguous().numpy()
+        for t in (cells.centers_m, cells.normals, cells.sizes_m, cells.neighbours)
+    )
+    tracks = cells.tracks.contiguous().numpy()
+    heights, mottle = np.empty((2, count), np.float32)
+    draws = np.empty(count, np.uint64)
+    with kernel_threads(CELLS):
+        noise_kernels.lay(
+            centers,
+            sizes,
+            cells.edge_m.contiguous().numpy(),
+            tracks,
+            cells.banks.contiguous().numpy(),
+            profile.numbers,
+            _arrays(profile.drifts),
+            _arrays(profile.patches),
+            _arrays(profile.mottle),
+            seed,
+            heights,
+            mottle,
+            draws,
+        )
+        settled_z, light = _settled(cells, heights, profile.numbers.depth_m)
+        tops = np.empty(count, np.float64)
+        splat_kernels.find_tops(centers, heights, settled_z, tops)
+        counts = np.empty(count, np.int64)
+        splat_kernels.count_splats(neighbours, sizes, centers, heights, tops, counts)
+        lasts = np.cumsum(counts)
+        total = int(lasts[-1]) if count else 0
+        means, scales = torch.empty(2, total, 3).unbind()
+        quats, sh = torch.empty(total, 4), torch.empty(total, 1, 3)
+        normals, slopes = (
+            torch.empty(total if keep else 0, 3) for keep in (keep_normals, keep_slopes)
+        )
+        splat_kernels.fill(
+            centers,
+            bed_normals,
+            sizes,
+            neighbours,
+            tracks,
+            light,
+            heights,
+            mottle,
+            draws,
+            tops,
+            lasts - counts,
+            lights,
+            look,
+            *(t.numpy() for t in (means, quats, scales, sh, normals, slopes)),
+        )
+    gaussians = Gaussians(
+        means=means,
+        quats=quats,
+        scales=scales,
+        opacities=torch.full((total,), OPACITY),
+        sh=sh,
+        semantic=torch.full((total,), int(SemanticClass.SNOW), dtype=torch.int16),
+    )
+    return heights, gaussians, normals if keep_normals else None, slopes if keep_slopes else None
+
+
+def _settled(
+    cells: SnowCells, heights: np.ndarray, depth_m: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Height of what lies beneath the snow and the light on it, evened out: deep snow shows less
+    of the ground's relief, and no snow shows a recording's finest spots.
+    """
+    sizes, neighbours = cells.sizes_m.contiguous().numpy(), cells.neighbours.contiguous().numpy()
+    z, light = cells.centers_m[:, 2].contiguous().numpy(), cells.light.contiguous().numpy()
+    finest = float(sizes.min()) if len(sizes) else 1.0
+    steps = min(max(math.ceil(2 * depth_m / finest), LEAST_STEPS), MOST_STEPS)
+    for _ in range(steps):
+        next_z, next_light = np.empty((2, len(z)), np.float32)
+        splat_kernels.settle(
+            neighbours, heights, sizes, float(depth_m), z, light, next_z, next_light
+        )
+        z, light = next_z, next_light
+    return z, light
+
+
+def _left_visible(cells: SnowCells, own: Gaussians, heights: np.ndarray) -> Tensor:
+    """Opacities of a part's own Gaussians, 0 for those that the snow buries."""
+    if len(cells.buried) == 0 or not heights.any():
+        return own.opacities
+    opacities = own.opacities.detach().clone()
+    with kernel_threads(CELLS):
+        splat_kernels.bury(
+            cells.buried.contiguous().numpy(),
+            cells.buried_by.contiguous().numpy(),
+            heights,
+            opacities.numpy(),
+        )
+    return opacities
+
+
+def _arrays(octaves: Octaves) -> tuple[np.ndarray, ...]:
+    return octaves.turns, octaves.amplitudes, octaves.lengths_m, octaves.seeds
