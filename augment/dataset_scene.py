@@ -14,9 +14,11 @@ from augment.batch.encode import decode_image, encode_image, quantise_depth
 from augment.batch.layout import PATH_KINDS, variant_name
 from augment.batch.runner import Renderer, default_renderer
 from augment.batch.selection import SceneIndex, select_frames
+from augment.batch.snow_beds import BedNeed
 from augment.batch.writer import check_view
 from augment.dataset_samples import ImageType, Pixels, make_sample
 from augment.scene import Scene
+from augment.snow.cells import SnowBed
 from recipes.schema import Recipe
 
 
@@ -26,11 +28,14 @@ class SceneDataset(Dataset):
     The pixels are those of the files: depth is in steps of 1/256 m, and where the recipe writes
     JPEG the image passes through JPEG in memory. `paths` holds only None.
 
+    Where the recipe's snow can lie is found here, once for all samples and worker processes.
+
     scene: an open scene. frames, cameras: what to keep, None for all. backend: as in `rasterize`.
     renderer: `augment.apply.render_view` if None.
 
     Raises:
-        SceneError: an unknown frame or camera. BackendUnavailable, ValueError: the backend.
+        SceneError: an unknown frame or camera, or the scene cannot have the recipe's snow.
+        BackendUnavailable, ValueError: the backend.
     """
 
     def __init__(
@@ -53,6 +58,21 @@ class SceneDataset(Dataset):
         self._index = SceneIndex.of(scene)
         selection = select_frames(self._index, frames, cameras)
         self._items = [(frame, name) for frame, names in selection for name in names]
+
+        self._bed: SnowBed | None = None
+        if (need := BedNeed.of(recipe)) is not None:
+            from augment.snow.beds import bed_of
+
+            self._bed = bed_of(scene, need.settings())
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """In another process the scene is another object, which knows of no bed yet."""
+        self.__dict__.update(state)
+        need = BedNeed.of(self.recipe)
+        if need is not None and self._bed is not None:
+            from augment.snow.beds import remember_bed
+
+            remember_bed(self.scene, need.settings(), self._bed)
 
     def __len__(self) -> int:
         return len(self._items)

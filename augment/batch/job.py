@@ -6,10 +6,11 @@ leaves do not depend on how often that happened, nor on the number of workers.
 
 from __future__ import annotations
 
+import copy
 import threading
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -28,6 +29,7 @@ from augment.batch.manifest import FAILED, OK
 from augment.batch.runner import Chunk, Outcome, Renderer, Setup
 from augment.batch.selection import SceneIndex, select_frames
 from augment.batch.shared_scene import share_scene
+from augment.batch.snow_beds import BedNeed, StoredBed, find_beds
 from augment.batch.trajectory import frames_to_json, trajectory_id
 from augment.cameras import Frame
 from augment.scene import Scene
@@ -76,7 +78,8 @@ class JobResult:
     """Counts of images of this job. skipped: finished by earlier runs. failures: one line each.
 
     manifest: its path. seconds: wall clock. timings: seconds by kind of work, summed over
-    threads and workers (render, encode, write), or of the job itself (open, labels, share, finish).
+    threads and workers (render, encode, write), or of the job itself (open, place, labels, share,
+    finish).
     """
 
     written: int
@@ -105,7 +108,8 @@ def run_job(
     finishes the images at hand, writes the manifest of what there is, and is raised again.
 
     Raises:
-        SceneError: the scene cannot be opened, or lacks a wanted frame or camera.
+        SceneError: the scene cannot be opened, lacks a wanted frame or camera, or cannot have the
+            snow of a recipe; no file of a variant has been written or replaced then.
         OutputError: the folder cannot be written, is in use, or holds something else.
     """
     started = time.perf_counter()
@@ -137,6 +141,7 @@ class _Run:
         self.trajectory = trajectory_id(job.camera_path)
         self.ledger = Ledger(self.out_dir, self.index, job.recipes, self._identities())
         self.boxes = BoxCache(self.index)
+        self.beds: tuple[StoredBed, ...] = ()
         self.timings: defaultdict[str, float] = defaultdict(float)
         self.counts: Counter[str] = Counter()
         self.failures: list[str] = []
@@ -145,13 +150,18 @@ class _Run:
     def go(self, progress: bool) -> None:
         self.total = len(self.job.recipes) * sum(len(names) for _, names in self.selection)
         with OutputLock(self.out_dir) as lock:
+            if self.job.overwrite:  # this may fail, so it comes before anything is given up
+                self._find_beds(self.job.recipes, progress)
             self.ledger.open(overwrite=self.job.overwrite)
             chunks = list(self.ledger.pending(self.selection))
             self.skipped = self.total - sum(len(chunk.cameras) for chunk in chunks)
-            self.bar = tqdm(
-                total=self.total, initial=self.skipped, unit="image", disable=not progress
-            )
             try:
+                if not self.job.overwrite:
+                    pending = sorted({chunk.variant for chunk in chunks})
+                    self._find_beds([self.job.recipes[number] for number in pending], progress)
+                self.bar = tqdm(
+                    total=self.total, initial=self.skipped, unit="image", disable=not progress
+                )
                 with self.bar:
                     self._render(chunks, lock)
                     if self.counts or needs_finish(self.ledger):
@@ -176,6 +186,7 @@ class _Run:
             backend=self.backend,
             camera_path=None if path is None else frames_to_json(path),
             labelled=self.index.labelled,
+            beds=self.beds,
         )
         assert self.scene is not None
         if not chunks:
@@ -211,6 +222,22 @@ class _Run:
             )
             for recipe in self.job.recipes
         ]
+
+    def _find_beds(self, recipes: Iterable[Recipe], progress: bool) -> None:
+        """Find where the recipes' snow can lie, for all cameras of the scene or the path."""
+        snowy = [recipe for recipe in recipes if BedNeed.of(recipe) is not None]
+        if not snowy:
+            return
+        started = time.perf_counter()
+        assert self.scene is not None
+        cameras, path = None, self.job.camera_path
+        if path is not None:
+            # An object of its own, or the caller's would remember the bed of this path.
+            self.scene = copy.copy(self.scene)
+            cameras = [camera for frame in path for camera in frame.cameras.values()]
+        folder = self.out_dir / STATE_FOLDER
+        self.beds = find_beds(self.scene, snowy, folder, cameras=cameras, progress=progress)
+        self.timings["place"] += time.perf_counter() - started
 
     def _begin(self, chunks: Sequence[Chunk]) -> None:
         """Announce the variants that will be written, before their first file."""

@@ -20,6 +20,7 @@ from augment.batch.box_weather import BoxWeather, has_box_weather, measure_boxes
 from augment.batch.label_files import lidar_bytes
 from augment.batch.layout import item_paths
 from augment.batch.manifest import FAILED, OK
+from augment.batch.snow_beds import StoredBed
 from augment.batch.trajectory import frames_from_json
 from augment.batch.writer import View, WritePump, check_view, write_view
 from augment.cameras import Camera
@@ -43,7 +44,8 @@ class Setup:
     """What rendering needs besides the scene; small, and picklable.
 
     camera_path: JSON of `trajectory`, or None for the scene's frames. labelled: numbers of the
-    frames whose labels and LiDAR pass through.
+    frames whose labels and LiDAR pass through. beds: where the recipes' snow can lie; the scene to
+    render remembers them.
     """
 
     out_dir: str
@@ -51,6 +53,7 @@ class Setup:
     backend: str
     camera_path: str | None
     labelled: frozenset[int]
+    beds: tuple[StoredBed, ...] = ()
 
 
 @dataclass(frozen=True)

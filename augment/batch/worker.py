@@ -49,6 +49,8 @@ def worker_main(
     send = _sender(connection)
     try:
         scene = shared.open()
+        for bed in setup.beds:
+            bed.take_over(scene)
     except Exception as error:
         send(Failure(False, describe(error, "taking over the scene in a worker process")))
         return

@@ -26,6 +26,7 @@ from augment.batch.journal import Journal
 from augment.batch.label_files import lidar_bytes
 from augment.batch.layout import STATE_FOLDER
 from recipes.flood import Flood
+from recipes.snow import Snow
 
 STRIDE = 17  # odd, so that kills come before and after calls; 1 tries every point
 SYNC_POINTS = ("fsync", "replace", "unlink", "rename", "rmdir")
@@ -41,7 +42,9 @@ def main(folder: Path) -> None:
 
 
 def job(folder: Path, frames: int = 2, **options) -> RenderJob:
-    recipe = make_recipe(instance=False, semantic=False, flood=Flood(level_m=0.3))
+    # Snow of no depth is not laid; the stand-in draws some all the same.
+    weather = {"flood": Flood(level_m=0.3), "snow": Snow(depth_m=0)}
+    recipe = make_recipe(instance=False, semantic=False, **weather)
     return RenderJob(f"fake:street?frames={frames}", [recipe], folder, **options)
 
 

@@ -26,13 +26,14 @@ from augment.errors import ClimateGSError
 from augment.scene import Actor, Track
 from augment.sky import LatLongSky
 from recipes.flood import Flood
+from recipes.snow import Snow
 
 
 def test_a_dying_worker_costs_one_image_and_workers_change_no_file(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Two promises in one test, for every start of a worker imports torch anew."""
-    recipes = [make_recipe(flood=Flood(level_m=0.3))]
+    recipes = [make_recipe(flood=Flood(level_m=0.3), snow=Snow(depth_m=0))]
     one = tmp_path / "one"
     run_job(RenderJob("fake:street", recipes, one), scene_loader=open_fake, renderer=fake_render,
             progress=False)  # fmt: skip

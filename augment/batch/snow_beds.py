@@ -1,0 +1,104 @@
+"""Where snow can lie, found once for all images and processes of a job.
+
+The beds lie beside the lock and the journals, named by their content: a later job of the same
+scene, with snow of another depth, finds them there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from augment.batch.atomic import make_folder, output_error
+from augment.cameras import Camera
+from augment.scene import Scene
+from recipes.schema import Recipe
+
+if TYPE_CHECKING:  # imported where it is used, for it brings the rasteriser
+    from augment.snow.placement import PlacementSettings
+
+
+@dataclass(frozen=True)
+class BedNeed:
+    """What of a recipe's snow its bed depends on; its depth does not matter."""
+
+    cell_m: float
+    max_slope_deg: float
+
+    @staticmethod
+    def of(recipe: Recipe) -> BedNeed | None:
+        """None where no snow is to be laid."""
+        snow = recipe.weather.snow
+        if snow is None or snow.depth_m == 0 or snow.coverage == 0:
+            return None
+        return BedNeed(snow.cell_m, snow.max_slope_deg)
+
+    def settings(self) -> PlacementSettings:
+        from augment.snow.placement import PlacementSettings
+
+        return PlacementSettings(cell_m=self.cell_m, max_slope_deg=self.max_slope_deg)
+
+
+@dataclass(frozen=True)
+class StoredBed:
+    """A bed in its file; small, and picklable."""
+
+    need: BedNeed
+    path: str
+    key: str
+
+    def take_over(self, scene: Scene) -> None:
+        """Read the bed into this process, for whoever renders the scene here.
+
+        Raises:
+            SceneError: the file is lost or damaged.
+        """
+        from augment.snow.bed_files import load_bed
+        from augment.snow.beds import remember_bed
+
+        remember_bed(scene, self.need.settings(), load_bed(Path(self.path), self.key))
+
+
+def find_beds(
+    scene: Scene,
+    recipes: Iterable[Recipe],
+    folder: Path,
+    *,
+    cameras: Sequence[Camera] | None = None,
+    progress: bool = False,
+) -> tuple[StoredBed, ...]:
+    """The beds of all snow in the recipes, in `folder` and remembered for this scene object.
+
+    cameras: all that a camera path has, or None for the scene's: never a selection, so that no
+    image depends on what else is rendered. progress: a bar on stderr for each bed that is placed.
+
+    Raises:
+        SceneError, ValueError: a bed cannot be placed. OutputError: it cannot be written.
+    """
+    needs = dict.fromkeys(need for recipe in recipes if (need := BedNeed.of(recipe)) is not None)
+    return tuple(_find_bed(scene, need, folder, cameras, progress) for need in needs)
+
+
+def _find_bed(
+    scene: Scene,
+    need: BedNeed,
+    folder: Path,
+    cameras: Sequence[Camera] | None,
+    progress: bool,
+) -> StoredBed:
+    from augment.snow.bed_files import bed_key, bed_path, save_bed
+    from augment.snow.beds import bed_of
+
+    settings = need.settings()
+    key = bed_key(scene, cameras, settings)
+    path = bed_path(folder, key)
+    try:
+        make_folder(folder)
+        bed = bed_of(scene, settings, cameras=cameras, folder=folder, progress=progress)
+        if not path.is_file():  # this process knew the bed from another folder's job
+            save_bed(path, bed, key)
+    except OSError as error:
+        raise output_error(path, error) from error
+    return StoredBed(need, str(path), key)
