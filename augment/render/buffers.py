@@ -7,14 +7,16 @@ from dataclasses import dataclass
 from jaxtyping import Float, Int32
 from torch import Tensor
 
-RGB, ALPHA, EXPECTED_DEPTH, MEDIAN_DEPTH, SPLAT_IDS = (
+RGB, ALPHA, EXPECTED_DEPTH, MEDIAN_DEPTH, SPLAT_IDS, MODE_DEPTH, SNOW = (
     "rgb",
     "alpha",
     "expected_depth",
     "median_depth",
     "splat_ids",
+    "mode_depth",
+    "snow",
 )
-BUFFERS = (RGB, ALPHA, EXPECTED_DEPTH, MEDIAN_DEPTH, SPLAT_IDS)
+BUFFERS = (RGB, ALPHA, EXPECTED_DEPTH, MEDIAN_DEPTH, SPLAT_IDS, MODE_DEPTH, SNOW)
 DIFFERENTIABLE = frozenset({RGB, ALPHA, EXPECTED_DEPTH})  # by every backend that has gradients
 
 
@@ -27,7 +29,10 @@ class RenderOutput:
     splat's centre, or, with a clip, of its surface at the pixel (see augment.render.clip).
     median_depth: z of the first splat that brings transmittance below 0.5, metres; 0 where none
     does. splat_ids: index of the splat with the largest weight, counted through the parts in
-    order; -1 where nothing was hit. The first of equal weights wins.
+    order; -1 where nothing was hit. The first of equal weights wins. mode_depth: mode of the
+    heaviest cluster of depths along the ray (augment.render.mode_depth), metres; 0 where nothing
+    was hit; z is that of expected_depth. snow: sum of weights of the splats that are snow, in
+    [0, alpha].
     """
 
     rgb: Float[Tensor, "H W 3"] | None = None
@@ -35,3 +40,5 @@ class RenderOutput:
     expected_depth: Float[Tensor, "H W"] | None = None
     median_depth: Float[Tensor, "H W"] | None = None
     splat_ids: Int32[Tensor, "H W"] | None = None
+    mode_depth: Float[Tensor, "H W"] | None = None
+    snow: Float[Tensor, "H W"] | None = None

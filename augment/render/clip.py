@@ -15,9 +15,10 @@ z (h_eye i + s(p)), s being the vertical part of the ray's direction. So
 is linear in p and has the sign of the height: the cut is a straight line in the image. Divided by
 its slope, L is a distance from that line in pixels, and clamp(L + 0.5, 0, 1) a smooth edge.
 Parallel rays need no such detour: there z(p) is exact for a plane, and the height linear in p.
-Where there is a clip, expected depth, too, is taken over these surfaces, 1/i(p), no farther from
-the centre than the splat reaches: the centres of large splats stand nearer or farther than what a
-pixel shows of them, by more than shallow water is deep. `UNCUT` asks for that and cuts nothing.
+Where there is a clip, expected and mode depth, too, are taken over these surfaces, 1/i(p), no
+farther from the centre than the splat reaches: the centres of large splats stand nearer or farther
+than what a pixel shows of them, by more than shallow water is deep. `UNCUT` asks for that and cuts
+nothing.
 """
 
 from __future__ import annotations

@@ -21,10 +21,13 @@ class RasterSettings:
 
     near_m: splats nearer than this along z are culled. alpha_max: 0.999 in gsplat 1.5.3, 0.99 in
     the original 3DGS and gsplat's main branch. antialiased: opacity times sqrt(det/det_blurred).
-    sh_degree: highest band evaluated; None for all a splat has.
+    sh_degree: highest band evaluated; None for all a splat has. mode_depth_floor_m: spread below
+    which depths are one cluster whatever they are, as the Gumbel distribution's beta: those up to
+    0.88 times as far behind a surface, and 1.56 times as far before it, belong to it.
     """
 
     near_m: float = 0.01
     alpha_max: float = 0.999
     antialiased: bool = False
     sh_degree: int | None = None
+    mode_depth_floor_m: float = 0.2

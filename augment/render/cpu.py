@@ -28,7 +28,9 @@ from augment.render.buffers import (
     ALPHA,
     BUFFERS,
     MEDIAN_DEPTH,
+    MODE_DEPTH,
     RGB,
+    SNOW,
     SPLAT_IDS,
     RenderOutput,
 )
@@ -233,6 +235,7 @@ class Tiles:
                 math.log2(ALPHA_MIN),
                 TRANSMITTANCE_STOP,
                 camera.is_orthographic,
+                settings.mode_depth_floor_m,
             ],
             np.float32,
         )
@@ -240,7 +243,7 @@ class Tiles:
         spare = {ALPHA: scratch.array("alpha", (camera.height, camera.width), np.float32)}
         flat = {name: image.reshape(-1) for name, image in (spare | images).items()}
         self._images = [flat.get(name) for name in BUFFERS]
-        used = cpu_blend.STATE if set(images) - {RGB, ALPHA} else cpu_blend.COLOR_STATE
+        used = _state_size(images)
         self._scratch = scratch
         self._states = scratch.array("states", (count * used,), np.float32)
         self.open = scratch.array("open", (count,), np.uint8)
@@ -335,6 +338,16 @@ class Tiles:
         cpu_bin.count_corners(rects, first, end, self._columns, corners)
         totals = corners.sum(0, dtype=np.int64).reshape(shape).cumsum(0).cumsum(1)
         return np.where(self.open != cpu_blend.CLOSED, totals[:-1, :-1].reshape(-1), 0)
+
+
+def _state_size(images: dict[str, np.ndarray]) -> int:
+    """float32 numbers that a tile keeps between slices for these images."""
+    names = set(images) - {RGB, ALPHA}
+    if MODE_DEPTH in names:
+        return cpu_blend.STATE
+    if names - {SNOW}:
+        return cpu_blend.MODELESS_STATE
+    return cpu_blend.SNOW_STATE if names else cpu_blend.COLOR_STATE
 
 
 def _splats_in(rects: np.ndarray, limit: int) -> int:

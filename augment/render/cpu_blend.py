@@ -28,6 +28,7 @@ from augment.render.cpu_layout import (
     BLUE,
     DEPTH,
     GREEN,
+    IS_SNOW,
     LANES,
     PIXELS,
     RECORD,
@@ -41,13 +42,17 @@ from augment.render.cpu_layout import (
     U,
 )
 from augment.render.cpu_math import exp2
+from augment.render.cpu_mode import MODE, MODE_PLANES, add_sample, can_grow, close_clusters
 
 GROUP = 8  # tiles a thread takes at a time
 
 # Planes of a tile's state, PIXELS float32 each, strip after strip, row after row. The transmittance
-# is negative where blending has stopped; its size is then the final one.
-THROUGH, P_RED, P_GREEN, P_BLUE, P_DEPTH, P_MEDIAN, P_BEST, P_ID = (U(i * PIXELS) for i in range(8))
-STATE, COLOR_STATE = 8 * PIXELS, 4 * PIXELS  # all planes; those of colour and alpha alone
+# is negative where blending has stopped; its size is then the final one. An image needs its plane
+# and all before, so those that cost most come last.
+THROUGH, P_RED, P_GREEN, P_BLUE, P_SNOW = (U(i * PIXELS) for i in range(5))
+P_DEPTH, P_MEDIAN, P_BEST, P_ID, P_MODE = (U(i * PIXELS) for i in range(5, 10))
+COLOR_STATE, SNOW_STATE, MODELESS_STATE = 4 * PIXELS, 5 * PIXELS, 9 * PIXELS
+STATE = MODELESS_STATE + MODE_PLANES * PIXELS
 
 CLOSED, OPEN, FRESH = 0, 1, 2  # a tile: finished, begun, not begun
 
@@ -67,6 +72,8 @@ def blend_tiles(
     expected,
     median,
     ids,
+    mode,
+    snow,
     cuts,
 ):
     """Blend one slice of z into every open tile; write the pixels of those that end.
@@ -74,8 +81,8 @@ def blend_tiles(
     records: flat float32. members, starts: lists of slots. tiles: uint8 [tiles], CLOSED, OPEN or
     FRESH, updated. states: float32 [tiles * used part of STATE], where open tiles wait for the
     next slice. size: image width and height. limits: float32, alpha_max, log2(ALPHA_MIN),
-    TRANSMITTANCE_STOP, 1 where rays are parallel. rgb to ids: flat images; all but alpha may be
-    None. cuts: flat, of each slot as cpu_clip has them, or None.
+    TRANSMITTANCE_STOP, 1 where rays are parallel, mode depth's floor. rgb to snow: flat images; all
+    but alpha may be None. cuts: flat, of each slot as cpu_clip has them, or None.
     """
     columns = (size[0] + TILE_W - 1) // TILE_W
     used = states.size // tiles.size
@@ -100,14 +107,16 @@ def blend_tiles(
                 _copy(states, U(tile * used), state, U(0), U(used))
             is_open = _blend_list(
                 records, members, first, last, np.float32(left), np.float32(top), limits,
-                state, staged, spans, values, places, rows, rgb, expected, median, ids,
+                state, staged, spans, values, places, rows, rgb, expected, median, ids, mode, snow,
                 cuts, lines, edges, surfaces,
             )  # fmt: skip
             if is_open and not is_last:
                 _copy(state, U(0), states, U(tile * used), U(used))
                 tiles[tile] = OPEN
             else:
-                _write_pixels(state, left, top, size, rgb, alpha, expected, median, ids)
+                if mode is not None:
+                    close_clusters(state, P_MODE)
+                _write_pixels(state, left, top, size, rgb, alpha, expected, median, ids, mode, snow)
                 tiles[tile] = CLOSED
 
 
@@ -122,7 +131,8 @@ def _clear(state, used, width, height):
     """A tile before the first splat; pixels beyond the image count as finished."""
     nobody = np.int32(-1).view(np.float32)
     for i in range(U(0), U(used), U(LANES)):
-        value = np.float32(1) if i < P_RED else nobody if i >= P_ID else np.float32(0)
+        value = np.float32(1) if i < P_RED else np.float32(0)
+        value = nobody if P_ID <= i < P_MODE else value
         v8.store(state, i, v8.splat(value))
     if width < TILE_W or height < TILE_H:
         for pixel in range(PIXELS):
@@ -151,6 +161,8 @@ def _blend_list(
     expected,
     median,
     ids,
+    mode,
+    snow,
     cuts,
     lines,
     edges,
@@ -166,10 +178,13 @@ def _blend_list(
         count = min(BATCH, last - at)
         for k in range(U(at + count), U(min(at + 2 * BATCH, last))):
             v8.prefetch(records, U(members[k]) * U(RECORD))
-        stage(records, members, U(at), U(count), left, top, rgb, expected, median, ids, staged)
+        stage(
+            records, members, U(at), U(count), left, top, rgb, expected, median, ids, mode, snow,
+            staged,
+        )  # fmt: skip
         any_cut = False
         if cuts is not None:
-            any_cut = stage_cuts(cuts, members, U(at), U(count), staged, expected, lines)
+            any_cut = stage_cuts(cuts, members, U(at), U(count), staged, expected, mode, lines)
         for strip in range(STRIPS):
             if rows[2 * strip] >= rows[2 * strip + 1]:
                 continue
@@ -177,35 +192,35 @@ def _blend_list(
             items = list_items(staged, U(count), strip, spans, values, places)
             if items == U(0):
                 continue
-            if cuts is not None and expected is not None:
+            if cuts is not None and (expected is not None or mode is not None):
                 list_lines(lines, SURFACE, U(count), strip, spans, surfaces)
             if cuts is not None and any_cut:
                 list_lines(lines, SHARE, U(count), strip, spans, edges)
                 _blend_items(
-                    state, staged, values, places, items, limits, rgb, expected, median, ids,
-                    cuts, lines, edges, surfaces,
+                    state, staged, values, places, items, limits, rgb, expected, median, ids, mode,
+                    snow, cuts, lines, edges, surfaces,
                 )  # fmt: skip
-            elif (median is not None or ids is not None) and _can_change(
-                state, strip, rows, median, ids
+            elif (median is not None or ids is not None or mode is not None) and _can_change(
+                state, strip, rows, median, ids, mode
             ):
                 _blend_items(
-                    state, staged, values, places, items, limits, rgb, expected, median, ids,
-                    cuts, lines, None, surfaces,
+                    state, staged, values, places, items, limits, rgb, expected, median, ids, mode,
+                    snow, cuts, lines, None, surfaces,
                 )  # fmt: skip
             else:
                 _blend_items(
-                    state, staged, values, places, items, limits, rgb, expected, None, None,
-                    cuts, lines, None, surfaces,
+                    state, staged, values, places, items, limits, rgb, expected, None, None, None,
+                    snow, cuts, lines, None, surfaces,
                 )  # fmt: skip
             shrink(state, strip, rows)
     return not is_closed(rows)
 
 
 @inner()
-def _can_change(state, strip, rows, median, ids):
-    """Whether a pixel of the strip may still find its median depth or a heavier splat.
+def _can_change(state, strip, rows, median, ids, mode):
+    """Whether a pixel of the strip may still find its median depth or a heavier splat or cluster.
 
-    It finds neither once its transmittance has fallen below one half and the best weight so far,
+    It finds none once its transmittance has fallen below one half and the best weight so far,
     which most pixels reach early: the rest of the list costs them no more than colour does.
     """
     most = v8.splat(np.float32(-1))
@@ -216,6 +231,8 @@ def _can_change(state, strip, rows, median, ids):
             most = v8.maximum(most, through - v8.splat(np.float32(0.5)))
         if ids is not None:
             most = v8.maximum(most, through - v8.load(state, at + P_BEST))
+        if mode is not None:
+            most = v8.maximum(most, can_grow(state, at + P_MODE, through))
     return v8.any_not_negative(most)
 
 
@@ -251,6 +268,8 @@ def _blend_items(
     expected,
     median,
     ids,
+    mode,
+    snow,
     cuts,
     lines,
     edges,
@@ -284,12 +303,18 @@ def _blend_items(
             _add(state, at + P_RED, weight, staged[U(RED) * n + splat])
             _add(state, at + P_GREEN, weight, staged[U(GREEN) * n + splat])
             _add(state, at + P_BLUE, weight, staged[U(BLUE) * n + splat])
-        if expected is not None and cuts is None:
-            _add(state, at + P_DEPTH, weight, staged[U(DEPTH) * n + splat])
-        if expected is not None and cuts is not None:
+        if snow is not None:
+            _add(state, at + P_SNOW, weight, staged[U(IS_SNOW) * n + splat])
+        if expected is not None or mode is not None:
             centre = staged[U(DEPTH) * n + splat]
-            depth = surface_depth(lines, surfaces, splat, item, centre, limits[3])
-            v8.store(state, at + P_DEPTH, v8.fmuladd(weight, depth, v8.load(state, at + P_DEPTH)))
+            depth = v8.splat(centre)
+            if cuts is not None:
+                depth = surface_depth(lines, surfaces, splat, item, centre, limits[3])
+            if expected is not None:
+                sums = v8.fmuladd(weight, depth, v8.load(state, at + P_DEPTH))
+                v8.store(state, at + P_DEPTH, sums)
+            if mode is not None:
+                add_sample(state, at + P_MODE, depth, weight, limits[4])
         if median is not None:
             crossed = v8.both(v8.at_least(through, half), v8.greater(half, after))
             depth = v8.splat(staged[U(DEPTH) * n + splat])
@@ -319,7 +344,7 @@ def _add(state, at, weight, value):
 
 
 @inner()
-def _write_pixels(state, left, top, size, rgb, alpha, expected, median, ids):
+def _write_pixels(state, left, top, size, rgb, alpha, expected, median, ids, mode, snow):
     """Pixels of a finished tile to the images, which are flat."""
     for y in range(U(min(TILE_H, size[1] - top))):
         for strip in range(U(STRIPS)):
@@ -341,3 +366,7 @@ def _write_pixels(state, left, top, size, rgb, alpha, expected, median, ids):
                     median[pixel + lane] = state[at + lane + P_MEDIAN]
                 if ids is not None:
                     ids[pixel + lane] = np.float32(state[at + lane + P_ID]).view(np.int32)
+                if mode is not None:
+                    mode[pixel + lane] = state[at + lane + P_MODE + MODE]
+                if snow is not None:
+                    snow[pixel + lane] = state[at + lane + P_SNOW]

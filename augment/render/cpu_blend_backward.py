@@ -153,7 +153,21 @@ def _replay_list(
         count = min(BATCH, last - at)
         for k in range(U(at + count), U(min(at + 2 * BATCH, last))):
             v8.prefetch(records, U(members[k]) * U(RECORD))
-        stage(records, members, U(at), U(count), left, top, shares, d_depth, None, None, staged)
+        stage(
+            records,
+            members,
+            U(at),
+            U(count),
+            left,
+            top,
+            shares,
+            d_depth,
+            None,
+            None,
+            None,
+            None,
+            staged,
+        )
         for i in range(U(at) * U(SHARE), U(at + count) * U(SHARE)):
             shares[i] = np.float32(0)
         for strip in range(STRIPS):

@@ -102,11 +102,11 @@ def cut_eight(quats, scales, picked, at, d, x, y, inverse, view):
 
 
 @inner()
-def stage_cuts(cuts, members, at, count, staged, depths, lines):
+def stage_cuts(cuts, members, at, count, staged, expected, mode, lines):
     """Cuts of a batch, turned to one row a number, about the tile's corner. staged: cpu_items'.
 
-    depths: whether the lines of the surfaces are wanted. Returns whether any splat is cut: the
-    others lie wholly on the kept side.
+    expected, mode: None where the lines of the surfaces are not wanted. Returns whether any splat
+    is cut: the others lie wholly on the kept side.
     """
     n, any_cut = U(BATCH), False
     for k in range(count):
@@ -117,7 +117,7 @@ def stage_cuts(cuts, members, at, count, staged, depths, lines):
         lines[n + k] = lx
         lines[U(2) * n + k] = ly
         any_cut = any_cut or lx != np.float32(0) or ly != np.float32(0)
-        if depths is not None:
+        if expected is not None or mode is not None:
             gx, gy = cuts[cut + U(C_RIGHT)], cuts[cut + U(C_DOWN)]
             lines[U(3) * n + k] = -gx * x - gy * y
             lines[U(4) * n + k] = gx

@@ -69,13 +69,14 @@ def gather_inputs(
         starts = range(0, count, layout.BLOCK)
         blocks += [(number, start, min(start + layout.BLOCK, count)) for start in starts]
     counts = [size[0] for size in sizes]
+    poses = part_poses([part.world_from_part for part in parts])
+    views = part_views(poses, camera, settings, smog, clip)
+    views[:, layout.V_SNOW] = [part.is_snow for part in parts]
     return Inputs(
         addresses=np.array(addresses, np.uint64).reshape(-1, 5),
         sizes=np.array(sizes, np.int64).reshape(-1, 2),
         first_ids=np.cumsum([0, *counts[:-1]], dtype=np.int64),
-        views=part_views(
-            part_poses([p.world_from_part for p in parts]), camera, settings, smog, clip
-        ),
+        views=views,
         blocks=np.array(blocks, np.int64).reshape(-1, 3),
         modes=raster_modes(settings, smog, clip, with_color=with_color),
         arrays=arrays,
@@ -89,7 +90,7 @@ def part_views(
     smog: SmogMedium | None,
     clip: HeightClip | None = None,
 ) -> np.ndarray:
-    """The float32 numbers of every part's view, [P, VIEW], formed in float64.
+    """The float32 numbers of every part's view, [P, VIEW], formed in float64; none is snow.
 
     poses: world_from_part, float64 [P, 4, 4].
     """

@@ -20,6 +20,7 @@ from augment.render.cpu_layout import (
     FALL_X,
     FALL_Y,
     GREEN,
+    IS_SNOW,
     LANES,
     LEAN_X,
     LEAN_Y,
@@ -42,7 +43,7 @@ ITEMS = BATCH * TILE_H + TILE_H  # a batch's items at most, and room for the sur
 
 
 @inner()
-def stage(records, members, at, count, left, top, rgb, expected, median, ids, staged):
+def stage(records, members, at, count, left, top, rgb, expected, median, ids, mode, snow, staged):
     """Records of a batch, turned to one row a field, relative to the tile's corner."""
     n = U(BATCH)
     for k in range(count):
@@ -51,10 +52,12 @@ def stage(records, members, at, count, left, top, rgb, expected, median, ids, st
         staged[U(MEAN_Y) * n + k] = records[record + U(MEAN_Y)] - top
         for field in range(U(LEAN_X), U(BLUNT_Y + 1)):
             staged[field * n + k] = records[record + field]
-        if expected is not None or median is not None:
+        if expected is not None or median is not None or mode is not None:
             staged[U(DEPTH) * n + k] = records[record + U(DEPTH)]
         if ids is not None:
             staged[U(SPLAT_ID) * n + k] = records[record + U(SPLAT_ID)]
+        if snow is not None:
+            staged[U(IS_SNOW) * n + k] = records[record + U(IS_SNOW)]
         if rgb is not None:
             staged[U(RED) * n + k] = records[record + U(RED)]
             staged[U(GREEN) * n + k] = records[record + U(GREEN)]

@@ -29,7 +29,7 @@ STRIP = TILE_H * LANES  # pixels of a strip
 RECORD = 16
 MEAN_X, MEAN_Y, LEAN_X, SHARP_X, FALL_Y, LOG_OPACITY = 0, 1, 2, 3, 4, 5
 RADIUS_Y, FALL_X, LEAN_Y, BLUNT_Y, DEPTH = 6, 7, 8, 9, 10
-SPLAT_ID, RED, GREEN, BLUE = 11, 12, 13, 14
+SPLAT_ID, RED, GREEN, BLUE, IS_SNOW = 11, 12, 13, 14, 15
 
 # A view: VIEW float32 for every part of the scene.
 V_ROTATION = 0  # camera_from_part, 9 numbers, row by row
@@ -47,6 +47,7 @@ V_CLIP_REACH = 48  # metres from the clip's plane beyond which nothing need be d
 V_CLIP_FALL = 49  # times inverse^2: how the cut's slope follows the surface's
 V_CLIP_LONGEST = 50  # most that a surface's depth may grow or shrink
 V_PARALLEL = 51  # 1 where rays are parallel, else 0
+V_SNOW = 52  # 1 where the part is snow, else 0
 VIEW = 56
 
 # How to project: int64 each.

@@ -42,6 +42,7 @@ from augment.render.cpu_layout import (
     DEPTH,
     FALL_X,
     FALL_Y,
+    IS_SNOW,
     LANES,
     LEAN_X,
     LEAN_Y,
@@ -69,6 +70,7 @@ from augment.render.cpu_layout import (
     V_NEAR,
     V_PARALLEL,
     V_SIZE,
+    V_SNOW,
     U,
 )
 from augment.render.cpu_math import LOG2_E, floats_at, log2
@@ -202,6 +204,7 @@ def project_slice(
                 splat = picked[at + lane]
                 record = slot * U(RECORD)
                 _write_record(rows, lane, first_ids[part] + splat, records, record)
+                records[record + U(IS_SNOW)] = views[part, V_SNOW]
                 if modes[M_COLOR]:
                     from_sh = U(splat) * U(functions * 3)
                     write_color(

@@ -219,6 +219,11 @@ def _check_settings(settings: RasterSettings) -> None:
             f"settings.alpha_max must lie between 0 and 1 (usual: 0.999 or 0.99), since a splat "
             f"of alpha 1 would never be blended; got {settings.alpha_max}"
         )
+    if not (math.isfinite(settings.mode_depth_floor_m) and settings.mode_depth_floor_m > 0):
+        raise ValueError(
+            f"settings.mode_depth_floor_m must be finite and > 0 (metres); "
+            f"got {settings.mode_depth_floor_m}"
+        )
     if settings.sh_degree is not None and not 0 <= settings.sh_degree <= MAX_DEGREE:
         raise ValueError(
             f"settings.sh_degree must be None or 0 to {MAX_DEGREE}; got {settings.sh_degree}"

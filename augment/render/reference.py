@@ -21,7 +21,16 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from augment.cameras import Camera
-from augment.render.buffers import ALPHA, EXPECTED_DEPTH, MEDIAN_DEPTH, RGB, SPLAT_IDS, RenderOutput
+from augment.render.buffers import (
+    ALPHA,
+    EXPECTED_DEPTH,
+    MEDIAN_DEPTH,
+    MODE_DEPTH,
+    RGB,
+    SNOW,
+    SPLAT_IDS,
+    RenderOutput,
+)
 from augment.render.clip import HeightClip
 from augment.render.constants import (
     ALPHA_MIN,
@@ -30,6 +39,7 @@ from augment.render.constants import (
     TRANSMITTANCE_STOP,
     RasterSettings,
 )
+from augment.render.mode_depth import Clusters
 from augment.render.reference_project import Splats, order_by_depth, project_parts
 from augment.scene import PosedGaussians
 from augment.weather.smog import SmogMedium
@@ -151,7 +161,8 @@ def blend_tile(
     pixels = torch.stack([x.reshape(-1), y.reshape(-1)])  # [2, P]
     transmittance = torch.ones(TILE * TILE, dtype=dtype)
     rgb = torch.zeros(TILE * TILE, 3, dtype=dtype)
-    alpha, depth, median = (torch.zeros(TILE * TILE, dtype=dtype) for _ in range(3))
+    alpha, depth, median, snow = (torch.zeros(TILE * TILE, dtype=dtype) for _ in range(4))
+    clusters = Clusters.empty(TILE * TILE, dtype)
     heaviest = torch.zeros(TILE * TILE, dtype=dtype)
     ids = torch.full((TILE * TILE,), -1, dtype=torch.int64)
     for near in splats.split(BLOCK) if len(splats) else ():
@@ -159,8 +170,16 @@ def blend_tile(
         alpha = alpha + weights.sum(0)
         if near.colors is not None:
             rgb = rgb + _weighted_sums(weights, near.colors)
-        if EXPECTED_DEPTH in buffers:
-            depth = depth + (weights * _surface_depths(near, pixels, is_orthographic)).sum(0)
+        if SNOW in buffers:
+            snow = snow + (weights * near.snow[:, None]).sum(0)
+        if buffers & {EXPECTED_DEPTH, MODE_DEPTH}:
+            surfaces = _surface_depths(near, pixels, is_orthographic)
+            depth = depth + (weights * surfaces).sum(0)
+            if MODE_DEPTH in buffers:
+                for row in torch.nonzero(weights.detach().any(1))[:, 0].tolist():
+                    clusters = clusters.add(
+                        surfaces[row], weights[row], settings.mode_depth_floor_m
+                    )
         if MEDIAN_DEPTH in buffers:
             median = median + _median_here(near.depths, weights, after, transmittance)
         if SPLAT_IDS in buffers:
@@ -178,6 +197,8 @@ def blend_tile(
         EXPECTED_DEPTH: depth / alpha.clamp_min(DEPTH_EPS),
         MEDIAN_DEPTH: median,
         SPLAT_IDS: ids.int(),
+        MODE_DEPTH: clusters.heaviest_mode(),
+        SNOW: snow,
     }
     shaped = {name: values[name].reshape(TILE, TILE, *values[name].shape[1:]) for name in buffers}
     return RenderOutput(**shaped)

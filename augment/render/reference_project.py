@@ -37,7 +37,8 @@ class Splats:
 
     ids: index counted through all parts. depths: z, metres. means2d: pixels. covs2d: xx, xy, yy,
     px^2, blurred. dets: their determinants. opacities: after antialiasing. colors: display-encoded
-    and >= 0, in the smog where there is any; None where no colour was asked for. cuts: of splats
+    and >= 0, in the smog where there is any; None where no colour was asked for. snow: 1 of those
+    that are snow, else 0. cuts: of splats
     clipped at a height, value at means2d and slope in x and y, per px: clamp(value, 0, 1) is the
     share of alpha that is kept at a pixel; then the growth of the surface's depth in x and y, its
     share per px (seen by an orthographic camera: metres per px), and the most that it may grow or
@@ -51,6 +52,7 @@ class Splats:
     dets: Float[Tensor, "M"]
     opacities: Float[Tensor, "M"]
     colors: Float[Tensor, "M 3"] | None
+    snow: Float[Tensor, "M"]
     cuts: Float[Tensor, "M 6"] | None = None
 
     def __len__(self) -> int:
@@ -137,6 +139,7 @@ def _project_part(
         dets=dets,
         opacities=opacities,
         colors=colors,
+        snow=torch.full_like(depths, float(part.is_snow)),
     )
     if clip is None:
         return splats

@@ -1,0 +1,97 @@
+"""The buffer "snow": how much of a pixel is covered by parts that are snow."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+
+from augment.render.buffers import ALPHA, BUFFERS, RGB, SNOW
+from augment.render.rasterize import rasterize
+from augment.scene import Gaussians, PosedGaussians
+from tests.assertions import assert_images_close
+from tests.scenes import camera_ahead, one_gaussian, random_gaussians, slight_pose
+
+BACKENDS = ("cpu", "reference")
+CAMERA = camera_ahead(97, 61, 80.0)
+
+
+def crowd(*snowy: bool) -> list[PosedGaussians]:
+    """Parts that stand among each other, not too near the eye."""
+    scenes = [random_gaussians(900, seed=i, sh_degree=0) for i in range(len(snowy))]
+    scenes = [s.select(s.means[:, 0] > 2) for s in scenes]
+    pose = slight_pose()
+    return [
+        PosedGaussians(scene, pose if i else None, i, is_snow=is_snow)
+        for i, (scene, is_snow) in enumerate(zip(scenes, snowy, strict=True))
+    ]
+
+
+def render(parts, backend="cpu", buffers=(ALPHA, SNOW), camera=CAMERA):
+    return rasterize(parts, camera, buffers=buffers, backend=backend)
+
+
+def test_kernels_match_the_definition():
+    parts = crowd(False, True, False)
+    names = ("means", "quats", "scales", "opacities", "sh")
+    doubled = [
+        dataclasses.replace(
+            part, gaussians=Gaussians(**{n: getattr(part.gaussians, n).double() for n in names})
+        )
+        for part in parts
+    ]
+    actual, expected = render(parts), render(doubled, "reference")
+    assert_images_close(actual.snow, expected.snow, p999=1e-5, max_flips=2)
+    assert 0.2 < float(actual.snow.mean()) < 0.8 * float(actual.alpha.mean())
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_all_of_it_is_alpha_and_none_of_it_is_nothing(backend):
+    image = render(crowd(True, True), backend)
+    # One is a sum of weights, the other 1 - transmittance: forty roundings.
+    torch.testing.assert_close(image.snow, image.alpha, rtol=0, atol=1e-5)
+    assert not render(crowd(False, False), backend).snow.any()
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_shares_add_up_to_alpha(backend):
+    first, second = render(crowd(True, False), backend), render(crowd(False, True), backend)
+    torch.testing.assert_close(first.snow + second.snow, first.alpha, rtol=0, atol=1e-5)
+    assert torch.equal(first.alpha, second.alpha)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_what_hides_snow_counts_against_it(backend):
+    snow = PosedGaussians(one_gaussian((6.0, 0, 0), 30.0, 0.9), is_snow=True)
+    glass = PosedGaussians(one_gaussian((3.0, 0, 0), 30.0, 0.75))
+    middle = render([glass, snow], backend).snow[20:40, 40:60]
+    torch.testing.assert_close(middle, torch.full_like(middle, 0.25 * 0.9), rtol=0, atol=1e-4)
+
+
+def test_bits_do_not_depend_on_the_buffers_asked_for():
+    parts = crowd(False, True)
+    whole = render(parts, buffers=BUFFERS)
+    for others in ({RGB, ALPHA}, {ALPHA}, set(BUFFERS) - {SNOW, "mode_depth"}):
+        image, without = render(parts, buffers=others | {SNOW}), render(parts, buffers=others)
+        assert torch.equal(image.snow, whole.snow) and without.snow is None
+        for name in others:
+            assert torch.equal(getattr(image, name), getattr(without, name)), name
+            assert torch.equal(getattr(image, name), getattr(whole, name)), name
+
+
+def test_what_is_called_snow_changes_nothing_else():
+    colder, warmer = (render(crowd(False, is_snow), buffers=BUFFERS) for is_snow in (True, False))
+    for name in set(BUFFERS) - {SNOW}:
+        assert torch.equal(getattr(colder, name), getattr(warmer, name)), name
+
+
+def test_gradients_take_the_definition():
+    part = PosedGaussians(random_gaussians(30, seed=2), is_snow=True)
+    opacities = part.gaussians.opacities.clone().requires_grad_()
+    gaussians = dataclasses.replace(part.gaussians, opacities=opacities)
+    image = render([dataclasses.replace(part, gaussians=gaussians)], "auto", camera=camera_ahead())
+    (slope,) = torch.autograd.grad(image.snow.sum(), opacities, retain_graph=True)
+    (expected,) = torch.autograd.grad(image.alpha.sum(), opacities)
+    torch.testing.assert_close(slope, expected)
+    assert float(slope.abs().max()) > 0
