@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from augment.batch.atomic import make_folder, output_error
 from augment.cameras import Camera
 from augment.scene import Scene
 from recipes.schema import Recipe
@@ -77,28 +76,23 @@ def find_beds(
     Raises:
         SceneError, ValueError: a bed cannot be placed. OutputError: it cannot be written.
     """
+    seeing = cameras
+    if seeing is None:
+        seeing = [camera for frame in scene.frames for camera in frame.cameras.values()]
     needs = dict.fromkeys(need for recipe in recipes if (need := BedNeed.of(recipe)) is not None)
-    return tuple(_find_bed(scene, need, folder, cameras, progress) for need in needs)
+    return tuple(_find_bed(scene, need, folder, seeing, progress) for need in needs)
 
 
 def _find_bed(
-    scene: Scene,
-    need: BedNeed,
-    folder: Path,
-    cameras: Sequence[Camera] | None,
-    progress: bool,
+    scene: Scene, need: BedNeed, folder: Path, cameras: Sequence[Camera], progress: bool
 ) -> StoredBed:
-    from augment.snow.bed_files import bed_key, bed_path, save_bed
-    from augment.snow.beds import bed_of
+    from augment.snow.bed_files import bed_key, save_bed
+    from augment.snow.beds import bed_of, bed_path
 
     settings = need.settings()
+    bed = bed_of(scene, settings, cameras=cameras, folder=folder, progress=progress)
     key = bed_key(scene, cameras, settings)
     path = bed_path(folder, key)
-    try:
-        make_folder(folder)
-        bed = bed_of(scene, settings, cameras=cameras, folder=folder, progress=progress)
-        if not path.is_file():  # this process knew the bed from another folder's job
-            save_bed(path, bed, key)
-    except OSError as error:
-        raise output_error(path, error) from error
+    if not path.is_file():  # this process knew the bed from a job in another folder
+        save_bed(path, bed, key)
     return StoredBed(need, str(path), key)

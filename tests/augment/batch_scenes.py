@@ -20,6 +20,7 @@ from augment.errors import AdapterError
 from augment.labels import Boxes, LidarSweep
 from augment.scene import Gaussians, Scene
 from augment.sky import ConstantSky
+from augment.snow.cells import OPEN_EDGE, SnowBed, SnowCells
 from recipes.flood import Flood
 from recipes.schema import Output, Recipe, Smog, Weather
 from recipes.snow import Snow
@@ -197,6 +198,37 @@ def fake_snow(camera: Camera, rng: np.random.Generator) -> dict:
         "snow": np.where(rng.random(shape) < 1 / 2, 255, 0).astype(np.uint8),
         "snowy": FakeSnowy(rng.uniform(0, 4, shape).astype(np.float32), THICKNESS_M),
     }
+
+
+def make_bed(x_m: float) -> SnowBed:
+    """One cell at x_m, without anything under it."""
+    cells = SnowCells(
+        centers_m=torch.tensor([[x_m, 0.0, 0.0]]),
+        normals=torch.tensor([[0.0, 0.0, 1.0]]),
+        sizes_m=torch.ones(1),
+        edge_m=torch.ones(1),
+        neighbours=torch.full((1, 4), OPEN_EDGE, dtype=torch.int32),
+        light=torch.ones(1),
+        tracks=torch.zeros(1),
+        banks=torch.zeros(1, 2),
+        semantic=torch.zeros(1, dtype=torch.int16),
+        buried=torch.zeros(0, dtype=torch.int32),
+        buried_by=torch.zeros(0, 5, dtype=torch.int32),
+    )
+    return SnowBed(cells, {})
+
+
+def bed_render(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str) -> FakeView:
+    """As `fake_render`, with the number that `make_bed` was given in the first pixel's red."""
+    from augment.snow.beds import bed_of
+    from augment.snow.placement import PlacementSettings
+
+    snow = recipe.weather.snow
+    assert snow is not None
+    bed = bed_of(scene, PlacementSettings(cell_m=snow.cell_m, max_slope_deg=snow.max_slope_deg))
+    view = fake_render(scene, camera, recipe, backend=backend)
+    view.rgb[0, 0, 0] = round(bed.ground.centers_m[0, 0].item() * 20)
+    return view
 
 
 def slow_render(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str) -> FakeView:

@@ -1,0 +1,218 @@
+"""Where snow can lie is found once a job, for all of its images, and used again by later jobs."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from batch_scenes import (
+    bed_render,
+    fake_render,
+    make_bed,
+    make_camera,
+    make_frame,
+    make_recipe,
+    open_fake,
+    tree_digest,
+)
+
+from augment.batch.job import JobResult, RenderJob, run_job
+from augment.batch.snow_beds import BedNeed, find_beds
+from augment.cameras import Frame
+from augment.dataset import SceneDataset
+from augment.errors import OutputError, SceneError
+from augment.snow import beds
+from augment.snow.placement import PlacementSettings
+from recipes.schema import Recipe
+from recipes.snow import Snow
+
+FILES = ("*.png", "*.jsonl", "*.yaml", "*.json", "*.parquet")
+
+
+class Placements(list):
+    """Stands in for finding a bed: lists (settings, cameras) of every call.
+
+    before: what to do at each call.
+    """
+
+    before: Callable[[], None] = staticmethod(lambda: None)
+
+    def __call__(self, scene, cameras, settings, *, progress=False):
+        self.before()
+        self.append((settings, list(cameras)))
+        return make_bed(len(self[-1][1]) + settings.cell_m)
+
+
+@pytest.fixture
+def placements(monkeypatch: pytest.MonkeyPatch) -> Placements:
+    found = Placements()
+    monkeypatch.setattr(beds, "place_snow_bed", found)
+    return found
+
+
+def snowy(depth_m: float = 0.1, variant: int = 0, **snow) -> Recipe:
+    return make_recipe(variant=variant, snow=Snow(depth_m=depth_m, **snow))
+
+
+def run(job: RenderJob, renderer=fake_render, **options) -> JobResult:
+    options = {"scene_loader": open_fake, "progress": False, **options}
+    return run_job(job, renderer=renderer, **options)
+
+
+def files_of(out: Path) -> list[Path]:
+    return [path for pattern in FILES for path in out.rglob(pattern)]
+
+
+def test_a_bed_is_found_for_all_cameras_before_any_file(placements, tmp_path: Path) -> None:
+    placements.before = lambda: placements.append(files_of(tmp_path))
+    job = RenderJob("fake:street", [snowy()], tmp_path, frames=[1], cameras=["front"])
+    result = run(job)
+    assert result.written == 1 and result.timings["place"] > 0
+    before, (settings, cameras) = placements
+    assert before == []
+    assert settings == PlacementSettings(cell_m=0.05, max_slope_deg=50.0)
+    expected = [camera for k in range(4) for camera in make_frame(k).cameras.values()]
+    assert [(c.name, c.timestamp_ns) for c in cameras] == [
+        (c.name, c.timestamp_ns) for c in expected
+    ]
+    # The other images need no second search.
+    assert run(dataclasses.replace(job, frames=None, cameras=None)).written == 7
+    assert len(placements) == 2
+
+
+def test_snow_of_one_kind_shares_a_bed(placements, tmp_path: Path) -> None:
+    recipes = [
+        snowy(0.1, 0), snowy(0.4, 1, coverage=0.5), snowy(0.1, 2, cell_m=0.1),
+        snowy(0.1, 3, max_slope_deg=30),
+    ]  # fmt: skip
+    run(RenderJob("fake:street", recipes, tmp_path, frames=[0]))
+    assert [(s.cell_m, s.max_slope_deg) for s, _ in placements] == [
+        (0.05, 50),
+        (0.1, 50),
+        (0.05, 30),
+    ]
+    assert len(list((tmp_path / ".climategs").glob("snow-*"))) == 3
+
+
+def test_another_depth_finds_the_bed_in_its_file(placements, tmp_path: Path) -> None:
+    run(RenderJob("fake:street", [snowy(0.1)], tmp_path))
+    placements.before = pytest.fail
+    result = run(RenderJob("fake:street", [snowy(0.3, 1)], tmp_path), bed_render)
+    assert (result.written, result.failures) == (8, ())
+
+
+@pytest.mark.parametrize("snow", [None, Snow(depth_m=0), Snow(depth_m=0.2, coverage=0)])
+def test_without_snow_there_is_no_search(placements, tmp_path: Path, snow) -> None:
+    placements.before = pytest.fail
+    result = run(RenderJob("fake:street", [make_recipe(snow=snow)], tmp_path))
+    assert result.written == 8 and "place" not in result.timings
+    assert BedNeed.of(make_recipe(snow=snow)) is None
+
+
+def test_a_finished_job_searches_for_nothing(placements, tmp_path: Path) -> None:
+    job = RenderJob("fake:street", [snowy()], tmp_path)
+    run(job)
+    (bed,) = (tmp_path / ".climategs").glob("snow-*")
+    bed.unlink()
+    placements.before = pytest.fail
+    assert run(job).skipped == 8
+
+
+def test_where_there_can_be_no_snow_nothing_is_written_or_replaced(
+    placements, tmp_path: Path
+) -> None:
+    def fails() -> None:
+        raise SceneError("scene 'street' does not know its metres")
+
+    run(RenderJob("fake:street", [make_recipe()], tmp_path, frames=[0]))
+    before = tree_digest(tmp_path)
+    placements.before = fails
+    for overwrite, variant in ((False, 1), (True, 0)):
+        job = RenderJob("fake:street", [snowy(0.1, variant)], tmp_path, overwrite=overwrite)
+        with pytest.raises(SceneError, match="does not know its metres"):
+            run(job)
+        assert tree_digest(tmp_path) == before
+
+
+def test_a_job_stopped_while_it_searches_goes_on(placements, tmp_path: Path) -> None:
+    def stops() -> None:
+        raise KeyboardInterrupt
+
+    job = RenderJob("fake:street", [snowy()], tmp_path)
+    placements.before = stops
+    with pytest.raises(KeyboardInterrupt, match="0 of 8 images"):
+        run(job)
+    assert not files_of(tmp_path) and not list((tmp_path / ".climategs").glob("snow-*"))
+    placements.before = lambda: None
+    assert run(job).written == 8
+
+
+def test_a_camera_path_has_a_bed_of_its_own(placements, tmp_path: Path) -> None:
+    """And the caller's scene goes on with its own cameras' bed."""
+    scene = open_fake("fake:street")
+    recorded = make_frame(1)
+    cameras = {"front": make_camera("front", recorded.timestamp_ns, 0.5)}
+    path = [Frame(1, recorded.timestamp_ns, recorded.world_from_ego, cameras)]
+    settings, found = PlacementSettings(), []
+
+    def render(scene, camera, recipe, *, backend):
+        found.append(beds.bed_of(scene, settings))
+        return fake_render(scene, camera, recipe, backend=backend)
+
+    load = {"scene_loader": lambda _uri: scene}
+    run(RenderJob("fake:street", [snowy()], tmp_path / "path", camera_path=path), render, **load)
+    run(RenderJob("fake:street", [snowy()], tmp_path / "own", frames=[0]), render, **load)
+    assert [len(cameras) for _, cameras in placements] == [1, 8]
+    assert [bed.ground.centers_m[0, 0].item() for bed in found] == pytest.approx([1.05, 8.05, 8.05])
+    # A path's job after it neither takes the scene's bed nor leaves its own.
+    run(RenderJob("fake:street", [snowy()], tmp_path / "path2", camera_path=path), render, **load)
+    assert found[-1].ground.centers_m[0, 0].item() == pytest.approx(1.05)
+    assert beds.bed_of(scene, settings).ground.centers_m[0, 0].item() == pytest.approx(8.05)
+
+
+def test_beds_that_are_remembered_get_their_file_too(placements, tmp_path: Path) -> None:
+    """One scene object, two output folders: workers of the second job need a file there."""
+    scene = open_fake("fake:street")
+    for name in "ab":
+        (bed,) = find_beds(scene, [snowy()], tmp_path / name)
+        assert Path(bed.path).parent == tmp_path / name and Path(bed.path).is_file()
+    assert len(placements) == 1
+    other = open_fake("fake:street")
+    bed.take_over(other)
+    placements.before = pytest.fail
+    same, again = beds.bed_of(scene, PlacementSettings()), beds.bed_of(other, PlacementSettings())
+    assert torch.equal(same.ground.centers_m, again.ground.centers_m)
+
+
+def test_a_folder_that_cannot_be_written_is_named(placements, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="file"):
+        find_beds(open_fake("fake:street"), [snowy()], tmp_path / "file" / "state")
+
+
+def test_workers_take_the_bed_over(placements, tmp_path: Path) -> None:
+    """Workers that found one for themselves would not find the stand-in's."""
+    outs = [tmp_path / "1", tmp_path / "2"]
+    for workers, out in enumerate(outs, start=1):
+        result = run(RenderJob("fake:street", [snowy()], out, workers=workers), bed_render)
+        assert (result.written, result.failures) == (8, ())
+    one, two = (tree_digest(out / "street") for out in outs)
+    assert one == two
+    manifests = [(out / "manifest.parquet").read_bytes() for out in outs]
+    assert manifests[0] == manifests[1]
+
+
+def test_live_samples_share_one_search(placements) -> None:
+    scene = open_fake("fake:street")
+    live = SceneDataset(scene, snowy(), renderer=bed_render, frames=[0])
+    assert len(placements) == 1 and len(placements[0][1]) == 8
+    images = [live[k]["image"] for k in range(2)]
+    assert len(placements) == 1
+    state = {name: value for name, value in vars(live).items() if name != "scene"}
+    again = SceneDataset.__new__(SceneDataset)
+    again.__setstate__({**state, "scene": open_fake("fake:street")})  # as a worker receives it
+    placements.before = pytest.fail
+    assert all(torch.equal(again[k]["image"], images[k]) for k in range(2))
