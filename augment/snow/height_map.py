@@ -1,0 +1,156 @@
+"""A part of a scene as seen from straight above: heights, colours, classes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+
+from augment.cameras import Camera
+from augment.render.buffers import ALPHA, EXPECTED_DEPTH, MEDIAN_DEPTH, RGB, SPLAT_IDS
+from augment.render.clip import UNCUT
+from augment.render.constants import ALPHA_MIN, MAX_EXTENT_SIGMAS, RasterSettings
+from augment.render.rasterize import rasterize
+from augment.scene import Gaussians, PosedGaussians
+from augment.semantics import SemanticClass
+
+Estimator = Literal["mode", "expected", "median"]
+
+_DEPTHS = {"mode": "mode_depth", "expected": EXPECTED_DEPTH, "median": MEDIAN_DEPTH}
+COVERED = 0.5  # of a pixel must be opaque, for something to lie there
+_EYE_ABOVE_M = 100.0
+
+
+@dataclass(frozen=True, eq=False)
+class HeightMap:
+    """What is highest at each cell of a grid. Arrays [H, W, ...], rows towards +y.
+
+    left_m, bottom_m: the grid's corner; cell_m: its step. alpha: float32. height_m: float32, z of
+    the surface; 0 where not covered. rgb: float32 [H, W, 3], of what is there, light from all sides
+    alike. ids: int32, heaviest Gaussian, counted through the parts, -1 where none.
+    """
+
+    left_m: float
+    bottom_m: float
+    cell_m: float
+    alpha: np.ndarray
+    height_m: np.ndarray
+    rgb: np.ndarray
+    ids: np.ndarray
+
+    @property
+    def covered(self) -> np.ndarray:
+        """bool [H, W]: something lies there that can carry snow."""
+        return self.alpha >= COVERED
+
+    def centers(self) -> tuple[np.ndarray, np.ndarray]:
+        """x [W] and y [H] of the cells' middles, float64."""
+        rows, columns = self.alpha.shape
+        return (
+            self.left_m + (np.arange(columns) + 0.5) * self.cell_m,
+            self.bottom_m + (np.arange(rows) + 0.5) * self.cell_m,
+        )
+
+
+def plain_gaussians(gaussians: Gaussians) -> Gaussians:
+    """float32, with the colour that all directions share, without gradients."""
+    return Gaussians(
+        means=_plain(gaussians.means),
+        quats=_plain(gaussians.quats),
+        scales=_plain(gaussians.scales),
+        opacities=_plain(gaussians.opacities),
+        sh=_plain(gaussians.sh[:, :1]),
+        semantic=gaussians.semantic,
+    )
+
+
+def classes_of(gaussians: Gaussians) -> np.ndarray:
+    """int16 [N]: UNKNOWN throughout where classes are not known."""
+    if gaussians.semantic is None:
+        return np.full(len(gaussians), SemanticClass.UNKNOWN, np.int16)
+    return gaussians.semantic.numpy()
+
+
+def in_box(gaussians: Gaussians, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """int64: numbers of the Gaussians that may be seen, from above, between two corners (x, y)."""
+    means, reach = gaussians.means.numpy(), gaussians.scales.numpy().max(1, initial=0)
+    reach = reach * np.float32(MAX_EXTENT_SIGMAS)
+    inside = gaussians.opacities.numpy() >= np.float32(ALPHA_MIN)
+    for axis in range(2):
+        inside &= means[:, axis] + reach >= low[axis]
+        inside &= means[:, axis] - reach <= high[axis]
+    return np.flatnonzero(inside)
+
+
+def draw_from_above(
+    parts: Sequence[PosedGaussians],
+    *,
+    corner_m: tuple[float, float],
+    cell_m: float,
+    shape: tuple[int, int],
+    estimator: Estimator,
+    wanted: np.ndarray | None = None,
+) -> HeightMap:
+    """Draw parts of plain Gaussians from above. corner_m: least x and y. shape: rows and columns of
+    cells. wanted: bool of that shape; the others may be left empty.
+    """
+    rows, columns = shape
+    top = max((_top_m(part) for part in parts if len(part.gaussians)), default=0.0)
+    middle = (corner_m[0] + columns * cell_m / 2, corner_m[1] + rows * cell_m / 2)
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[1, 1] = pose[2, 2] = -1.0  # x to +x, rows towards -y, depth downwards
+    eye = torch.tensor([*middle, top + _EYE_ABOVE_M], dtype=torch.float64)
+    pose[:3, 3] = -pose[:3, :3] @ eye
+    camera = Camera(
+        "from above",
+        columns,
+        rows,
+        1 / cell_m,
+        1 / cell_m,
+        columns / 2,
+        rows / 2,
+        pose,
+        is_orthographic=True,
+    )
+    depth = _DEPTHS[estimator]
+    out = rasterize(
+        parts,
+        camera,
+        buffers=(ALPHA, depth, RGB, SPLAT_IDS),
+        settings=RasterSettings(sh_degree=0),
+        clip=UNCUT,
+        wanted=None if wanted is None else torch.from_numpy(np.ascontiguousarray(wanted[::-1])),
+    )
+    images = {name: getattr(out, name) for name in (ALPHA, depth, RGB, SPLAT_IDS)}
+    alpha, depths, rgb, ids = (
+        np.ascontiguousarray(images[name].numpy()[::-1]) for name in (ALPHA, depth, RGB, SPLAT_IDS)
+    )
+    covered = (alpha >= COVERED) & (depths > 0) & np.isfinite(depths)
+    height = np.where(covered, float(eye[2]) - depths.astype(np.float64), 0.0)
+    alpha = np.where(covered, alpha, np.minimum(alpha, np.float32(COVERED / 2)))
+    return HeightMap(
+        left_m=corner_m[0],
+        bottom_m=corner_m[1],
+        cell_m=cell_m,
+        alpha=alpha,
+        height_m=height.astype(np.float32),
+        rgb=rgb / np.maximum(alpha, np.float32(COVERED / 2))[..., None],
+        ids=np.where(alpha > 0, ids, -1),
+    )
+
+
+def _plain(tensor: torch.Tensor) -> torch.Tensor:
+    return tensor.detach().to(torch.float32).contiguous()
+
+
+def _top_m(part: PosedGaussians) -> float:
+    """A height that no centre of the part exceeds, world."""
+    means = part.gaussians.means
+    if part.world_from_part is None:
+        return float(means[:, 2].max())
+    pose = part.world_from_part
+    return float(pose[2, 3]) + math.sqrt(float((means * means).sum(1).max()))

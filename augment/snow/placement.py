@@ -1,0 +1,328 @@
+"""Where snow can lie in a scene: cells of the surfaces that are open to the sky and seen.
+
+plan      square tiles about the cameras' path, finer near it             (tiles)
+views     what each of some cameras along the drive sees                  (visibility)
+then for squares of tiles, each with a margin of its surroundings:
+  above   heights, colours and classes from straight above                (height_map)
+  surface where snow stays, and where its edges are                       (surface)
+  ground  light, wheel tracks, banks                                      (ground_light, ...)
+actors    the same in each vehicle's own frame                            (actor_cells)
+join      neighbours across squares, and what the cells bury              (cell_lists, buried)
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from augment.cameras import Camera
+from augment.errors import SceneError
+from augment.ground import check_metric_and_level
+from augment.labels import EGO_VEHICLE
+from augment.scene import Gaussians, PosedGaussians, Scene
+from augment.semantics import SemanticClass
+from augment.snow.actor_cells import find_actor_cells, is_vehicle, moves
+from augment.snow.cell_lists import CellList, cells_at, make_cells
+from augment.snow.cells import EDGE_CAP_M, FLUSH, SnowBed, SnowCells
+from augment.snow.ground_light import ground_luminance, relative_light
+from augment.snow.height_map import (
+    Estimator,
+    HeightMap,
+    classes_of,
+    draw_from_above,
+    in_box,
+    plain_gaussians,
+)
+from augment.snow.surface import Surface, banks_of, find_surface, normals_of
+from augment.snow.surface_kernels import LINK, RISES
+from augment.snow.tiles import RINGS_M, CellNumbers, TilePlan, Window, plan_tiles, views_along
+from augment.snow.visibility import Views, draw_views
+from augment.snow.wheel_tracks import WheelPath, draw_tracks, wheel_paths
+
+_SQUARE_CELLS = 1024  # on a side of what is drawn at once, about
+_MARGIN_M, _MARGIN_CELLS = EDGE_CAP_M + 0.2, 4  # drawn about it
+_SEEN_GROWS_CELLS = 2
+
+
+@dataclass(frozen=True)
+class PlacementSettings:
+    """How a bed is found. cell_m: side of the cells near the path, metres; they double with the
+    distance from it. max_slope_deg: nothing steeper carries snow. estimator: the depth buffer that
+    heights from above are taken from.
+    """
+
+    cell_m: float = 0.05
+    max_slope_deg: float = 50.0
+    estimator: Estimator = "mode"
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.cell_m) and self.cell_m > 0):
+            raise ValueError(f"cell_m must be finite and > 0 (metres); got {self.cell_m}")
+        if not 0 <= self.max_slope_deg < 90:
+            raise ValueError(f"max_slope_deg must be 0 to below 90; got {self.max_slope_deg}")
+        if self.estimator not in ("mode", "expected", "median"):
+            raise ValueError(
+                f"estimator must be 'mode', 'expected' or 'median'; got {self.estimator!r}"
+            )
+
+
+def place_snow_bed(
+    scene: Scene,
+    cameras: Sequence[Camera],
+    settings: PlacementSettings = PlacementSettings(),
+    *,
+    progress: bool = False,
+) -> SnowBed:
+    """The cells of a scene that snow can lie on and that some of the cameras can see.
+
+    The same bits on any number of threads. Without cameras, or where nothing open is seen, the bed
+    is empty. progress: shows a bar.
+
+    Raises:
+        SceneError: metres or gravity are not known, or the cells would take too much memory.
+    """
+    check_metric_and_level(scene)
+    clock = _Clock()
+    views = views_along(cameras)
+    background = plain_gaussians(scene.background)
+    plan = plan_tiles(views, settings.cell_m, _heights(scene))
+    plan.check_size()
+    clock.lap("plan")
+    vehicles = [actor for actor in scene.actors if is_vehicle(actor)]
+    squares = [
+        (level, window)
+        for level in range(len(RINGS_M))
+        for window in plan.squares(level, _SQUARE_CELLS)
+    ]
+    if not squares:
+        return SnowBed(_no_cells(), {}, clock.seconds)
+    parked = tuple(_parked(scene))
+    with tqdm(
+        total=len(views) + len(squares) + len(vehicles),
+        desc="placing snow",
+        disable=not progress,
+        unit="step",
+    ) as bar:
+        seen_from = draw_views(
+            views, [PosedGaussians(background), *parked], after_each=lambda: bar.update()
+        )
+        clock.lap("views")
+        work = _Ground(background, parked, plan, seen_from, wheel_paths(scene), settings, clock)
+        for level, window in squares:
+            work.add_square(level, window)
+            bar.update()
+        actors = {}
+        for actor in vehicles:
+            cells = find_actor_cells(
+                actor,
+                cell_m=settings.cell_m,
+                max_slope_deg=settings.max_slope_deg,
+                estimator=settings.estimator,
+            )
+            if cells is not None:
+                actors[actor.track_id] = cells
+            bar.update()
+        clock.lap("actors")
+    ground = work.joined()
+    return SnowBed(ground, actors, clock.seconds)
+
+
+class _Clock:
+    """Adds up the seconds between laps by name."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._last = time.perf_counter()
+
+    def lap(self, name: str) -> None:
+        now = time.perf_counter()
+        self.seconds[name] = self.seconds.get(name, 0.0) + now - self._last
+        self._last = now
+
+
+@dataclass(frozen=True, eq=False)
+class _Square:
+    """A level's window with its margin. window: with it. inner: bool, cells of the window itself in
+    tiles of the level. own: bool, cells of the level's tiles, margin included.
+    """
+
+    level: int
+    window: Window
+    inner: np.ndarray
+    own: np.ndarray
+
+
+class _Ground:
+    """The background's cells, collected square by square."""
+
+    def __init__(
+        self,
+        background: Gaussians,
+        parked: tuple[PosedGaussians, ...],
+        plan: TilePlan,
+        views: Views,
+        paths: tuple[WheelPath, ...],
+        settings: PlacementSettings,
+        clock: _Clock,
+    ) -> None:
+        self._background, self._parked, self._plan = background, parked, plan
+        self._views, self._paths, self._settings = views, paths, settings
+        self._clock = clock
+        self._classes = classes_of(background)
+        self._numbers = CellNumbers(plan)
+        self._lists: list[CellList] = []
+        self._count = 0
+
+    def add_square(self, level: int, window: Window) -> None:
+        """Find the cells of one window of a level."""
+        square = _with_margin(self._plan, level, window)
+        view, classes, is_ground = self._draw(square)
+        self._clock.lap("above")
+        surface = find_surface(view, is_ground, max_slope_deg=self._settings.max_slope_deg)
+        self._clock.lap("surface")
+        seen = self._seen(surface, square)
+        self._clock.lap("seen")
+        rows, columns = np.nonzero(surface.can_carry & seen & square.inner)
+        if len(rows) == 0:
+            return
+        cells = cells_at(
+            surface,
+            rows,
+            columns,
+            sides=_sides(surface, seen & square.own),
+            luminance=ground_luminance(view, classes, surface.can_carry),
+            tracks=draw_tracks(self._paths, surface, classes),
+            banks=banks_of(surface),
+            classes=classes,
+        )
+        numbers = self._count + np.arange(len(rows), dtype=np.int32)
+        corner = square.window
+        self._numbers.put(
+            level,
+            columns.astype(np.int64) + corner.left,
+            rows.astype(np.int64) + corner.bottom,
+            numbers,
+        )
+        self._lists.append(cells)
+        self._count += len(rows)
+        self._clock.lap("ground")
+
+    def joined(self) -> SnowCells:
+        """All cells found so far, linked across squares."""
+        if not self._lists:
+            return _no_cells()
+        cells = CellList.joined(self._lists)
+        light = relative_light(cells.luminance, cells.semantic)
+        made = make_cells(cells, light, self._numbers, self._background)
+        self._clock.lap("join")
+        return made
+
+    def _draw(self, square: _Square) -> tuple[HeightMap, np.ndarray, np.ndarray]:
+        """The square from above, its classes, and where the background is what is seen."""
+        plan, window = self._plan, square.window
+        cell = plan.size_m(square.level)
+        corner = (
+            plan.origin_m[0] + window.left * cell,
+            plan.origin_m[1] + window.bottom * cell,
+        )
+        shape = (window.height, window.width)
+        far = (corner[0] + window.width * cell, corner[1] + window.height * cell)
+        chosen = in_box(self._background, np.array(corner), np.array(far))
+        near = self._background.select(torch.from_numpy(chosen))
+        margin = _margin(cell)
+        around = np.ones((2 * margin + 1, 2 * margin + 1), np.uint8)
+        wanted = cv2.dilate(square.inner.astype(np.uint8), around).astype(bool)
+        view = draw_from_above(
+            [PosedGaussians(near), *self._parked],
+            corner_m=corner,
+            cell_m=cell,
+            shape=shape,
+            estimator=self._settings.estimator,
+            wanted=wanted,
+        )
+        is_ground = (view.ids >= 0) & (view.ids < len(chosen))
+        classes = np.full(shape, SemanticClass.UNKNOWN, np.int16)
+        classes[is_ground] = self._classes[chosen[view.ids[is_ground]]]
+        return view, classes, is_ground
+
+    def _seen(self, surface: Surface, square: _Square) -> np.ndarray:
+        """bool [H, W]: cells that can carry snow which some camera sees, and those next to them."""
+        rows, columns = np.nonzero(surface.can_carry)
+        x, y = surface.map.centers()
+        points = np.stack([x[columns], y[rows], surface.height_m[rows, columns]], 1)
+        normals = normals_of(surface.slopes[rows, columns])
+        low, high = np.array([x[0], y[0]]), np.array([x[-1], y[-1]])
+        views = self._views.near(low, high, RINGS_M[-1])
+        seen = np.zeros(surface.can_carry.shape, np.uint8)
+        seen[rows, columns] = views.see(points, normals)
+        side = 2 * _SEEN_GROWS_CELLS + 1
+        return cv2.dilate(seen, np.ones((side, side), np.uint8)).astype(bool)
+
+
+def _with_margin(plan: TilePlan, level: int, window: Window) -> _Square:
+    margin = _margin(plan.size_m(level))
+    wide = Window(
+        window.left - margin,
+        window.bottom - margin,
+        window.width + 2 * margin,
+        window.height + 2 * margin,
+    )
+    own = plan.is_level(level, wide)
+    inner = np.zeros_like(own)
+    inner[margin:-margin, margin:-margin] = own[margin:-margin, margin:-margin]
+    return _Square(level, wide, inner, own)
+
+
+def _margin(cell_m: float) -> int:
+    return max(_MARGIN_CELLS, math.ceil(_MARGIN_M / cell_m))
+
+
+def _sides(surface: Surface, has_cells: np.ndarray) -> np.ndarray:
+    """int8 [H, W, 4]: as SnowCells.neighbours, with LINK where a cell follows. The same surface
+    that has no cells there, for want of a camera that sees it or because others cover it, is FLUSH.
+    """
+    sides = np.where(surface.sides == RISES, np.int8(FLUSH), surface.sides)
+    has = np.pad(has_cells & surface.can_carry, 1)
+    following = np.stack([has[1:-1, :-2], has[1:-1, 2:], has[:-2, 1:-1], has[2:, 1:-1]], -1)
+    return np.where((sides == LINK) & ~following, np.int8(FLUSH), sides)
+
+
+def _parked(scene: Scene) -> list[PosedGaussians]:
+    """Actors that stand still, where they stand halfway through their track; the background's
+    snow lies beside them.
+    """
+    parts = []
+    for number, actor in enumerate(scene.actors, start=1):
+        if actor.label == EGO_VEHICLE or moves(actor) or len(actor.gaussians) == 0:
+            continue
+        poses = actor.track.world_from_actor
+        parts.append(
+            PosedGaussians(plain_gaussians(actor.gaussians), poses[len(poses) // 2], number)
+        )
+    return parts
+
+
+def _heights(scene: Scene) -> tuple[float, float]:
+    """Lowest and highest z of anything in the background."""
+    z = scene.background.means[:, 2]
+    if len(z) == 0:
+        return 0.0, 0.0
+    return float(z.min()), float(z.max())
+
+
+def _no_cells() -> SnowCells:
+    return make_cells(
+        CellList.empty(), np.zeros(0, np.float32), CellNumbers(plan_tiles([], 1.0, (0, 0))), _NOBODY
+    )
+
+
+_NOBODY = Gaussians.empty()
+
+__all__ = ["PlacementSettings", "SceneError", "place_snow_bed"]

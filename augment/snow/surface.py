@@ -1,0 +1,150 @@
+"""Where on a height map snow can lie: slopes, what hangs together, edges, obstacles beside."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from augment.render.threads import kernel_threads
+from augment.snow import surface_kernels
+from augment.snow.cells import EDGE_CAP_M
+from augment.snow.height_map import HeightMap
+from augment.snow.surface_kernels import LINK
+
+STEP_M = 0.1  # higher steps than this between cells are edges
+LEAST_AREA_M2, LEAST_CELLS = 0.05, 4  # smaller patches are specks
+OBSTACLE_M, _BANK_REACH_M, _BANK_SPREAD_M = 0.4, 1.0, 0.35
+_MEDIAN_M, _SMOOTH_M = 0.1, 0.15  # scales of smoothing; one cell at least
+_SLACK_M, _SMOOTHED_BY_M = 0.05, 0.02
+_STEEPER_RAD, _STEEPEST_RAD = math.radians(20), math.radians(80)
+_ROWS = 8  # grid rows a thread takes at a time
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """What lies highest, on the grid of a height map [H, W].
+
+    height_m: float32, without the noise of single cells. slopes: float32 [H, W, 2], dz/dx, dz/dy.
+    can_carry: bool, snow stays there. sides: int8 [H, W, 4], see surface_kernels.compare_sides.
+    edge_m: float32, see SnowCells.
+    """
+
+    map: HeightMap
+    height_m: np.ndarray
+    slopes: np.ndarray
+    can_carry: np.ndarray
+    sides: np.ndarray
+    edge_m: np.ndarray
+
+
+def find_surface(
+    height_map: HeightMap,
+    may_carry: np.ndarray,
+    *,
+    max_slope_deg: float,
+    least_area_m2: float = LEAST_AREA_M2,
+) -> Surface:
+    """The surface of a map, and where snow stays on it.
+
+    may_carry: bool [H, W]; where it is false nothing is put, whatever lies there. Patches that end
+    within the map and are smaller than least_area_m2 or LEAST_CELLS carry nothing.
+    """
+    cell, covered = height_map.cell_m, np.ascontiguousarray(height_map.covered)
+    shape = covered.shape
+    smooth, fitted = np.empty(shape, np.float32), np.empty(shape, np.float32)
+    slopes, good = np.empty((*shape, 2), np.float32), np.empty(shape, bool)
+    limit = math.radians(max_slope_deg)
+    with kernel_threads(_ROWS):
+        surface_kernels.median_heights(
+            height_map.height_m, covered, int(np.clip(round(_MEDIAN_M / cell), 1, 3)), smooth
+        )
+        surface_kernels.fit_planes(
+            smooth,
+            covered,
+            int(np.clip(round(_SMOOTH_M / cell), 1, 5)),
+            cell,
+            _SLACK_M,
+            math.tan(min(limit + _STEEPER_RAD, _STEEPEST_RAD)),
+            _SMOOTHED_BY_M,
+            fitted,
+            slopes,
+            good,
+        )
+    can_carry = good & may_carry
+    can_carry &= np.hypot(slopes[..., 0], slopes[..., 1]) <= math.tan(limit)
+    step = max(STEP_M, math.tan(limit) * cell)
+    sides = _compare(fitted, covered, can_carry, step)
+    least = max(LEAST_CELLS, math.ceil(least_area_m2 / cell**2))
+    can_carry &= ~_specks(can_carry, sides, least)
+    sides = _compare(fitted, covered, can_carry, step)
+    edges = np.empty(shape, np.float32)
+    surface_kernels.edge_distances(can_carry, sides, max(EDGE_CAP_M / cell, 0.5), edges)
+    return Surface(height_map, fitted, slopes, can_carry, sides, edges * np.float32(cell))
+
+
+def banks_of(surface: Surface) -> np.ndarray:
+    """float32 [H, W, 2]: see SnowCells.banks. 0 on what is itself an obstacle."""
+    cell, covered = surface.map.cell_m, surface.map.covered
+    low = np.where(covered, surface.height_m, np.float32(np.inf))
+    reach = max(1, round(_BANK_REACH_M / cell))
+    lowest = cv2.erode(low, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8))
+    obstacle = covered & (surface.height_m - lowest > OBSTACLE_M)
+    if not obstacle.any():
+        return np.zeros((*covered.shape, 2), np.float32)
+    sigma = max(_BANK_SPREAD_M / cell, 0.5)
+    blurred = cv2.GaussianBlur(
+        obstacle.astype(np.float32), (0, 0), sigma, borderType=cv2.BORDER_REPLICATE
+    )
+    banks = np.stack(_gradient(blurred), -1) * np.float32(sigma * math.sqrt(2 * math.pi))
+    length = np.hypot(banks[..., 0], banks[..., 1])
+    banks /= np.maximum(length, 1)[..., None]
+    banks[obstacle | ~surface.can_carry] = 0
+    return banks
+
+
+def normals_of(slopes: np.ndarray) -> np.ndarray:
+    """Upward unit normals [..., 3] of slopes [..., 2]."""
+    normals = np.concatenate([-slopes, np.ones_like(slopes[..., :1])], -1)
+    return normals / np.sqrt((normals * normals).sum(-1, keepdims=True))
+
+
+def _compare(
+    height: np.ndarray, covered: np.ndarray, can_carry: np.ndarray, step: float
+) -> np.ndarray:
+    sides = np.empty((*height.shape, 4), np.int8)
+    with kernel_threads(_ROWS):
+        surface_kernels.compare_sides(height, covered, can_carry, step, sides)
+    return sides
+
+
+def _specks(can_carry: np.ndarray, sides: np.ndarray, least: int) -> np.ndarray:
+    """bool [H, W]: cells in patches of fewer than `least` linked cells that end within the grid.
+
+    cv2 finds patches of pixels; links become pixels between those of the cells.
+    """
+    rows, columns = can_carry.shape
+    pixels = np.zeros((2 * rows - 1, 2 * columns - 1), np.uint8)
+    pixels[::2, ::2] = can_carry
+    right, up = sides[..., 1] == LINK, sides[..., 3] == LINK
+    pixels[::2, 1::2] = can_carry[:, :-1] & right[:, :-1] & can_carry[:, 1:]
+    pixels[1::2, ::2] = can_carry[:-1] & up[:-1] & can_carry[1:]
+    count, labels = cv2.connectedComponents(pixels, connectivity=4)
+    labels = labels[::2, ::2]
+    labels = labels.astype(np.int64)
+    sizes = np.bincount(labels.ravel(), minlength=count)
+    for border in (labels[0], labels[-1], labels[:, 0], labels[:, -1]):
+        sizes[border] = least  # it may go on outside
+    return sizes[labels] < least
+
+
+def _gradient(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Differences to +x and +y, a cell; 0 beyond the borders."""
+    padded = np.pad(values, 1, mode="edge")
+    half = np.float32(0.5)
+    return (
+        (padded[1:-1, 2:] - padded[1:-1, :-2]) * half,
+        (padded[2:, 1:-1] - padded[:-2, 1:-1]) * half,
+    )

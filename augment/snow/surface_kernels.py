@@ -1,0 +1,187 @@
+"""Numba kernels on grids of heights: smoothing, planes, which cells hang together, edges.
+
+Grids are [H, W], rows towards +y. Each row's result depends on its inputs alone, so that bits do
+not depend on threads. Sides are in the order -x, +x, -y, +y.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+from numba import prange
+
+LINK, OPEN, RISES = 0, -1, -2  # what is on a cell's side; the last two are those of SnowCells
+
+
+@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
+def median_heights(height, covered, radius, out):
+    """Median of the covered heights in squares of 2 radius + 1 cells, into out [H, W] float32."""
+    rows, columns = height.shape
+    for row in prange(rows):
+        i = np.int64(row)  # unsigned, it would turn sums with signed numbers into floats
+        found = np.empty((2 * radius + 1) ** 2, np.float32)
+        for j in range(columns):
+            out[i, j] = height[i, j]
+            if not covered[i, j]:
+                continue
+            count = 0
+            for k in range(max(0, i - radius), min(rows, i + radius + 1)):
+                for m in range(max(0, j - radius), min(columns, j + radius + 1)):
+                    if covered[k, m]:
+                        value, at = height[k, m], count
+                        while at > 0 and found[at - 1] > value:
+                            found[at] = found[at - 1]
+                            at -= 1
+                        found[at] = value
+                        count += 1
+            upper = count // 2
+            out[i, j] = found[upper]
+            if count % 2 == 0:
+                out[i, j] = np.float32(0.5) * (found[upper - 1] + found[upper])
+
+
+@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
+def fit_planes(height, covered, radius, cell, slack, steepest, height_slack, fitted, slopes, good):
+    """A plane through each covered cell's surroundings: its height there and its slopes.
+
+    Taken in are covered cells within radius whose height differs by at most slack + steepest times
+    the distance; good [H, W] is false where they are too few or lie in a line. fitted: the plane's
+    height, at most height_slack from the cell's own. slopes [H, W, 2]: dz/dx, dz/dy.
+    """
+    rows, columns = height.shape
+    for row in prange(rows):
+        i = np.int64(row)
+        for j in range(columns):
+            fitted[i, j] = height[i, j]
+            slopes[i, j, 0] = slopes[i, j, 1] = 0.0
+            good[i, j] = False
+            if not covered[i, j]:
+                continue
+            n = sx = sy = sz = sxx = sxy = syy = sxz = syz = 0.0
+            middle = float(height[i, j])
+            for k in range(max(0, i - radius), min(rows, i + radius + 1)):
+                for m in range(max(0, j - radius), min(columns, j + radius + 1)):
+                    if not covered[k, m]:
+                        continue
+                    x, y, z = float(m - j), float(k - i), float(height[k, m]) - middle
+                    if abs(z) > slack + steepest * cell * math.sqrt(x * x + y * y):
+                        continue
+                    n += 1.0
+                    sx, sy, sz = sx + x, sy + y, sz + z
+                    sxx, sxy, syy = sxx + x * x, sxy + x * y, syy + y * y
+                    sxz, syz = sxz + x * z, syz + y * z
+            if 2.5 * n < (2 * radius + 1) ** 2:
+                continue
+            vxx, vxy, vyy = sxx - sx * sx / n, sxy - sx * sy / n, syy - sy * sy / n
+            vxz, vyz = sxz - sx * sz / n, syz - sy * sz / n
+            determinant = vxx * vyy - vxy * vxy
+            if determinant < 0.02 * (vxx + vyy) ** 2 or vxx + vyy <= 0.0:
+                continue
+            gx = (vyy * vxz - vxy * vyz) / determinant
+            gy = (vxx * vyz - vxy * vxz) / determinant
+            level = (sz - gx * sx - gy * sy) / n
+            fitted[i, j] = middle + min(max(level, -height_slack), height_slack)
+            slopes[i, j, 0], slopes[i, j, 1] = gx / cell, gy / cell
+            good[i, j] = True
+
+
+@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
+def compare_sides(height, covered, can_carry, step, sides):
+    """sides int8 [H, W, 4]: what follows on each side of the cells that can carry snow.
+
+    OPEN: nothing, or what lies lower by more than step, or as high but carries none. RISES: what
+    stands higher by more than step. LINK: the same surface; beyond the grid, too. Others hold LINK.
+    """
+    rows, columns = height.shape
+    for row in prange(rows):
+        i = np.int64(row)
+        for j in range(columns):
+            for side in range(4):
+                sides[i, j, side] = LINK
+                if not can_carry[i, j]:
+                    continue
+                k, m = i, j
+                if side < 2:
+                    m += 2 * side - 1
+                else:
+                    k += 2 * side - 5
+                if k < 0 or m < 0 or k >= rows or m >= columns:
+                    continue
+                if not covered[k, m]:
+                    sides[i, j, side] = OPEN
+                elif height[k, m] - height[i, j] > step:
+                    sides[i, j, side] = RISES
+                elif height[k, m] - height[i, j] < -step or not can_carry[k, m]:
+                    sides[i, j, side] = OPEN
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _nearer(offsets, i, j, k, m, dx, dy):
+    """Let cell (i, j) take the nearest edge of its neighbour (k, m), which is dx, dy away."""
+    x, y = offsets[k, m, 0] + dx, offsets[k, m, 1] + dy
+    if x * x + y * y < offsets[i, j, 0] ** 2 + offsets[i, j, 1] ** 2:
+        offsets[i, j, 0], offsets[i, j, 1] = x, y
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _take_diagonal(offsets, can_carry, sides, i, j, k, m):
+    """As _nearer, from a diagonal neighbour that is linked by way of one of the two between."""
+    rows, columns = can_carry.shape
+    if k < 0 or m < 0 or k >= rows or m >= columns or not can_carry[k, m]:
+        return
+    across, along = (0 if m < j else 1), (2 if k < i else 3)
+    if (sides[i, j, across] == LINK and can_carry[i, m] and sides[i, m, along] == LINK) or (
+        sides[i, j, along] == LINK and can_carry[k, j] and sides[k, j, across] == LINK
+    ):
+        _nearer(offsets, i, j, k, m, float(m - j), float(k - i))
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def edge_distances(can_carry, sides, far, out):
+    """Distance in cells from the middle of each cell to the nearest open edge of its own surface,
+    into out [H, W] float32; at most far.
+
+    Offsets to edges are handed from cell to cell (Danielsson 1980), along links only, in two
+    sweeps there and back.
+    """
+    rows, columns = can_carry.shape
+    offsets = np.full((rows, columns, 2), 1e9)
+    for i in range(rows):
+        for j in range(columns):
+            if can_carry[i, j]:
+                for side in range(4):
+                    if sides[i, j, side] == OPEN:
+                        sign = 0.5 if side % 2 else -0.5
+                        offsets[i, j, 0] = sign if side < 2 else 0.0
+                        offsets[i, j, 1] = 0.0 if side < 2 else sign
+    for _ in range(2):
+        for i in range(rows):
+            for j in range(columns):
+                if can_carry[i, j]:
+                    if i > 0 and sides[i, j, 2] == LINK and can_carry[i - 1, j]:
+                        _nearer(offsets, i, j, i - 1, j, 0.0, -1.0)
+                    if j > 0 and sides[i, j, 0] == LINK and can_carry[i, j - 1]:
+                        _nearer(offsets, i, j, i, j - 1, -1.0, 0.0)
+                    _take_diagonal(offsets, can_carry, sides, i, j, i - 1, j - 1)
+                    _take_diagonal(offsets, can_carry, sides, i, j, i - 1, j + 1)
+            for j in range(columns - 2, -1, -1):
+                if can_carry[i, j] and sides[i, j, 1] == LINK and can_carry[i, j + 1]:
+                    _nearer(offsets, i, j, i, j + 1, 1.0, 0.0)
+        for i in range(rows - 1, -1, -1):
+            for j in range(columns - 1, -1, -1):
+                if can_carry[i, j]:
+                    if i < rows - 1 and sides[i, j, 3] == LINK and can_carry[i + 1, j]:
+                        _nearer(offsets, i, j, i + 1, j, 0.0, 1.0)
+                    if j < columns - 1 and sides[i, j, 1] == LINK and can_carry[i, j + 1]:
+                        _nearer(offsets, i, j, i, j + 1, 1.0, 0.0)
+                    _take_diagonal(offsets, can_carry, sides, i, j, i + 1, j - 1)
+                    _take_diagonal(offsets, can_carry, sides, i, j, i + 1, j + 1)
+            for j in range(1, columns):
+                if can_carry[i, j] and sides[i, j, 0] == LINK and can_carry[i, j - 1]:
+                    _nearer(offsets, i, j, i, j - 1, -1.0, 0.0)
+    for i in range(rows):
+        for j in range(columns):
+            x, y = offsets[i, j, 0], offsets[i, j, 1]
+            out[i, j] = min(math.sqrt(x * x + y * y), far)

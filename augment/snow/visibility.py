@@ -1,0 +1,93 @@
+"""What the cameras of a drive can see of what lies on the ground."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from augment.cameras import Camera
+from augment.render.buffers import ALPHA, EXPECTED_DEPTH
+from augment.render.clip import UNCUT
+from augment.render.rasterize import rasterize
+from augment.render.threads import kernel_threads
+from augment.scene import PosedGaussians
+from augment.snow import visibility_kernels
+from augment.snow.height_map import COVERED
+
+WIDTH_PX = 200  # of the depth images: they tell houses apart, not posts
+LIFTS_M = (0.0, 0.3, 1.0)  # depths of snow at which a cell may be seen
+_FAR_SHARE, _FAR_M = 1.05, 0.5  # of the depth there, and beyond it: what blurred images hide
+_BELOW_SHARE = 1.02  # of the depth there: snow on top of what shows its underside
+_GRAZING = math.sin(math.radians(3))  # how far normals may be off
+_MARGIN_PX = 3.0
+_ROWS = 256  # points a thread takes at a time
+
+
+@dataclass(frozen=True, eq=False)
+class Views:
+    """Cameras with the depth that they see. See visibility_kernels.find_seen."""
+
+    views: np.ndarray
+    sizes: np.ndarray
+    depths: np.ndarray
+
+    def near(self, low: np.ndarray, high: np.ndarray, reach_m: float) -> Views:
+        """Those whose centre is within reach_m of the rectangle between two corners (x, y)."""
+        centres = self.views[:, 12:14]
+        gap = np.maximum(np.maximum(low - centres, centres - high), 0)
+        chosen = (np.hypot(gap[:, 0], gap[:, 1]) <= reach_m) | (self.views[:, 15] == 1)
+        return Views(self.views[chosen], self.sizes[chosen], self.depths)
+
+    def see(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        """bool [C]: points float64 [C, 3], of surfaces with unit normals [C, 3], that one sees."""
+        seen = np.empty(len(points), bool)
+        tolerances = np.array([_FAR_SHARE, _FAR_M, _BELOW_SHARE, _GRAZING, _MARGIN_PX])
+        with kernel_threads(_ROWS):
+            visibility_kernels.find_seen(
+                np.ascontiguousarray(points, np.float64),
+                np.ascontiguousarray(normals, np.float64),
+                self.views,
+                self.sizes,
+                self.depths,
+                np.array(LIFTS_M),
+                tolerances,
+                seen,
+            )
+        return seen
+
+
+def draw_views(
+    cameras: Sequence[Camera],
+    parts: Sequence[PosedGaussians],
+    *,
+    after_each: Callable[[], object] = lambda: None,
+) -> Views:
+    """The depth that each camera sees of the parts, in small images."""
+    views, sizes, depths, start = [], [], [], 0
+    for camera in cameras:
+        small = camera.scaled(min(1.0, WIDTH_PX / max(camera.width, camera.height)))
+        out = rasterize(parts, small, buffers=(ALPHA, EXPECTED_DEPTH), clip=UNCUT)
+        assert out.alpha is not None and out.expected_depth is not None
+        alpha, depth = out.alpha.numpy(), out.expected_depth.numpy()
+        depths.append(np.where(alpha >= COVERED, depth, np.float32(np.inf)).ravel())
+        views.append(_numbers(small))
+        sizes.append((small.width, small.height, start))
+        start += small.width * small.height
+        after_each()
+    return Views(
+        np.array(views, np.float64).reshape(-1, 17),
+        np.array(sizes, np.int64).reshape(-1, 3),
+        np.concatenate(depths) if depths else np.zeros(0, np.float32),
+    )
+
+
+def _numbers(camera: Camera) -> np.ndarray:
+    out = np.empty(17)
+    out[:9] = camera.camera_from_world[:3, :3].numpy().ravel()
+    out[9:12] = camera.fx, camera.cx, camera.fy
+    out[12:15] = camera.centre.numpy()
+    out[15:] = float(camera.is_orthographic), camera.cy
+    return out
