@@ -7,6 +7,7 @@ albedo is roughly known, for what a surface of a given albedo looks like at this
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 from weakref import WeakKeyDictionary
@@ -25,12 +26,13 @@ from recipes.snow import Snow
 FRESH_ALBEDO = 0.85  # `light.brightness` is of this snow; fresh snow has 0.8 to 0.95 (Oke 1987)
 
 # Class, albedo, and whether it is grey, so that its tint is the light's; the best witness first.
-# Oke 1987 lists asphalt 0.05 to 0.20, concrete 0.10 to 0.35, grass 0.16 to 0.26. None: any class.
+# Oke 1987 lists asphalt 0.05 to 0.20, concrete 0.10 to 0.35, grass 0.16 to 0.26; with the road's a
+# little below the middle, snow comes out about as bright as white cars do. None: any class.
 _WITNESSES: tuple[tuple[SemanticClass | None, float, bool], ...] = (
-    (SemanticClass.ROAD, 0.12, True),
-    (SemanticClass.SIDEWALK, 0.25, True),
-    (SemanticClass.TERRAIN, 0.20, False),
-    (None, 0.15, False),
+    (SemanticClass.ROAD, 0.10, True),
+    (SemanticClass.SIDEWALK, 0.22, True),
+    (SemanticClass.TERRAIN, 0.18, False),
+    (None, 0.12, False),
 )
 _FEWEST_SPLATS = 20
 _SOLID_OPACITY = 0.5
@@ -50,6 +52,7 @@ _UNIFORM_CONTRAST = 1.2
 _GREY_CONTRASTS, _BLUE_CONTRASTS = (1.5, 3.0), (1.2, 1.9)  # overcast below, clear above
 _GREY_BLUENESS, _CLEAR_BLUENESS = 1.15, 1.8
 _OVERCAST_SHARE, _CLEAR_SHARE = 0.1, 0.9
+_LOW_SUN_SHARE, _HIGH_SUN_DEG = 0.5, 30.0  # of that share; the air takes its part of a low sun
 _UNKNOWN_SUN_DEG = (135.0, 45.0)  # azimuth, elevation, where the sky shows none
 
 # Light on snow in shadow over light on snow that faces the sun, at no sun and at nothing but sun.
@@ -120,11 +123,11 @@ def illumination_of(scene: Scene, snow: Snow) -> Illumination:
     else:
         given = float(linear_from_display(np.array(light.brightness)))
         lit = min(1.0, given * snow.albedo / FRESH_ALBEDO)
-    # The wider the light comes from, the more of the sky's colour falls on lit snow too.
-    cast = _tint(found.ground_rgb_linear, 0.5) if found.ground_is_grey else np.ones(3)
+    # A grey road shows the light's colour, but its own and its shadows' as well: a part is taken.
+    cast = _tint(found.ground_rgb_linear, 0.25) if found.ground_is_grey else np.ones(3)
     lit_linear = lit * _even(cast * np.asarray(_SUN_TINT) ** share)
-    shadow_tint = _even(cast * _tint(found.sky_rgb_linear, 0.2 + 0.4 * share))
-    shadow_linear = np.minimum(lit * shade * shadow_tint, lit_linear)
+    sky_linear = lit * _even(cast * _tint(found.sky_rgb_linear, 0.2 + 0.4 * share))
+    shadow_linear = _shadow(lit_linear, sky_linear, shade)
     return Illumination(sun, _display(lit_linear), _display(shadow_linear), wrap)
 
 
@@ -151,10 +154,19 @@ def display_from_linear(linear: np.ndarray) -> np.ndarray:
 
 def _facing_light(found: SceneLight, shade: float, facing_level: float) -> float:
     """Luminance of a white surface that faces the sun."""
-    ground = float(_luminance(np.asarray(found.ground_rgb_linear)))
+    ground = _luminance(np.asarray(found.ground_rgb_linear))
     if found.ground_albedo is None:
         return ground / shade  # it is the sky's, which is all that shadows get
     return ground / found.ground_albedo / _mix(shade, 1.0, facing_level)
+
+
+def _shadow(lit: np.ndarray, tinted: np.ndarray, shade: float) -> np.ndarray:
+    """Linear colour [3] of shadow, `shade` times as bright as lit and of the tint of `tinted`,
+    which is as bright as lit; of less tint where a channel would come out above lit's.
+    """
+    excess = np.maximum(tinted - lit, 1e-12)
+    strength = np.minimum(1.0, lit * (1 / shade - 1) / excess).min()
+    return np.minimum(shade * (lit + strength * (tinted - lit)), lit)
 
 
 def _look(scene: Scene) -> SceneLight:
@@ -168,6 +180,7 @@ def _look(scene: Scene) -> SceneLight:
     clear = _ramp(contrast, overcast_at, clear_at)
     rgb, albedo, is_grey = _look_at_ground(scene) or (sky_rgb, None, False)
     azimuth_deg, elevation_deg = sun_deg
+    clear *= _mix(_LOW_SUN_SHARE, 1.0, _ramp(elevation_deg, 0.0, _HIGH_SUN_DEG))
     return SceneLight(
         azimuth_deg=azimuth_deg,
         elevation_deg=elevation_deg,
@@ -182,12 +195,11 @@ def _look(scene: Scene) -> SceneLight:
 
 def _look_at_sky(sky: Sky) -> tuple[tuple[float, float], float, np.ndarray]:
     """The sun's azimuth and elevation in degrees, the contrast, and the mean linear colour [3]."""
-    directions = _upper_directions()
+    directions, near = _sky_samples()
     rgb = sky.sample(torch.from_numpy(directions.astype(np.float32))).double().numpy()
     linear = linear_from_display(np.clip(np.nan_to_num(rgb), 0, 1))
     mean_rgb = linear.mean(0)
-    _, near = KDTree(directions).query(directions, _SMOOTH_OVER)
-    smooth = _luminance(linear)[near].mean(1)
+    smooth = (linear * np.asarray(_LUMINANCE)).sum(1)[near].mean(1)
     peak, mean = float(smooth.max()), float(smooth.mean())
     contrast = peak / mean if mean > 1e-6 else 1.0
     if contrast < _UNIFORM_CONTRAST:
@@ -202,13 +214,17 @@ def _look_at_sky(sky: Sky) -> tuple[tuple[float, float], float, np.ndarray]:
     return (math.degrees(azimuth_deg), math.degrees(elevation_deg)), contrast, mean_rgb
 
 
-def _upper_directions() -> np.ndarray:
-    """Unit vectors above the skyline, float64 [_SKY_SAMPLES, 3], evenly spread: a golden spiral."""
+@functools.cache
+def _sky_samples() -> tuple[np.ndarray, np.ndarray]:
+    """Unit vectors above the skyline, evenly spread on a golden spiral, float64 [_SKY_SAMPLES, 3],
+    and the numbers of those around each, [_SKY_SAMPLES, _SMOOTH_OVER].
+    """
     index = np.arange(_SKY_SAMPLES)
     z = _LOWEST_SINE + (1 - _LOWEST_SINE) * (index + 0.5) / _SKY_SAMPLES
     angle = index * (math.pi * (3 - math.sqrt(5)))
     flat = np.sqrt(1 - z * z)
-    return np.stack([flat * np.cos(angle), flat * np.sin(angle), z], 1)
+    directions = np.stack([flat * np.cos(angle), flat * np.sin(angle), z], 1)
+    return directions, np.asarray(KDTree(directions).query(directions, _SMOOTH_OVER)[1])
 
 
 def _look_at_ground(scene: Scene) -> tuple[np.ndarray, float, bool] | None:
@@ -289,8 +305,8 @@ def _even(rgb: np.ndarray) -> np.ndarray:
     return rgb / _luminance(rgb)
 
 
-def _luminance(rgb_linear: np.ndarray) -> np.ndarray:
-    return (rgb_linear * np.asarray(_LUMINANCE)).sum(-1)
+def _luminance(rgb_linear: np.ndarray) -> float:
+    return float((rgb_linear * np.asarray(_LUMINANCE)).sum())
 
 
 def _display(linear: np.ndarray) -> tuple[float, float, float]:
