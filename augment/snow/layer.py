@@ -27,7 +27,9 @@ from augment.snow.sparkle import crystals_of
 from recipes.snow import Snow
 
 CELLS = 2048  # that a thread takes at a time
-OPACITY = 1.0
+# A rasteriser stops before the splat that would leave 1e-4 of the light behind it. With opaque discs
+# that is while up to a tenth still shines through; with these, no more than a two-hundredth.
+OPACITY = 0.98
 LEAST_STEPS, MOST_STEPS = 3, 8  # of evening out the surface beneath and the light
 
 
@@ -101,12 +103,13 @@ def _lay(
     )
     lights = np.array([light.sun, light.lit_rgb, light.shadow_rgb], np.float64)
     seed = rng.integers(0, 2**64, dtype=np.uint64)
-    heights, gaussians, normals, slopes = _splats(
+    depths = find_depths(cells, profile, seed)
+    gaussians, normals, slopes = _splats(
         cells,
-        profile,
+        depths,
+        profile.numbers.depth_m,
         lights,
         look,
-        seed,
         keep_normals=snow.sparkle > 0 or (moves and not per_pixel),
         keep_slopes=per_pixel or moves,
     )
@@ -117,57 +120,68 @@ def _lay(
         crystals = crystals_of(gaussians, normals, rises, snow.sparkle, rng)
     return Layer(
         gaussians=gaussians,
-        opacities=_left_visible(cells, own, heights),
+        opacities=_left_visible(cells, own, depths.heights),
         slopes=slopes,
         normals=normals if moves and not per_pixel else None,
         crystals=crystals,
     )
 
 
-def _splats(
-    cells: SnowCells,
-    profile: Profile,
-    lights: np.ndarray,
-    look: Look,
-    seed: np.uint64,
-    *,
-    keep_normals: bool,
-    keep_slopes: bool,
-) -> tuple[np.ndarray, Gaussians, Tensor | None, Tensor | None]:
-    """Depth on every cell, and the Gaussians with their normals and slopes where asked for."""
+class Depths(NamedTuple):
+    """Of the snow on C cells: its depth in metres, 0 where there is none; noise that its colour
+    follows; uint64 to draw grain from.
+    """
+
+    heights: np.ndarray
+    mottle: np.ndarray
+    draws: np.ndarray
+
+
+def find_depths(cells: SnowCells, profile: Profile, seed: np.uint64) -> Depths:
+    """Depth of the snow on every cell, as `profile.heights_of` defines it."""
     count = len(cells)
-    centers, bed_normals, sizes, neighbours = (
-        t.contiguous().numpy()
-        for t in (cells.centers_m, cells.normals, cells.sizes_m, cells.neighbours)
-    )
-    tracks = cells.tracks.contiguous().numpy()
     heights, mottle = np.empty((2, count), np.float32)
     draws = np.empty(count, np.uint64)
     with kernel_threads(CELLS):
         noise_kernels.lay(
-            centers,
-            sizes,
-            cells.edge_m.contiguous().numpy(),
-            tracks,
-            cells.banks.contiguous().numpy(),
+            *_arrays(cells.centers_m, cells.sizes_m, cells.edge_m, cells.tracks, cells.banks),
             profile.numbers,
-            _arrays(profile.drifts),
-            _arrays(profile.patches),
-            _arrays(profile.mottle),
+            _columns(profile.drifts),
+            _columns(profile.patches),
+            _columns(profile.mottle),
             seed,
             heights,
             mottle,
             draws,
         )
-        settled_z, light = _settled(cells, heights, profile.numbers.depth_m)
-        tops = np.empty(count, np.float64)
+    return Depths(heights, mottle, draws)
+
+
+def _splats(
+    cells: SnowCells,
+    depths: Depths,
+    depth_m: float,
+    lights: np.ndarray,
+    look: Look,
+    *,
+    keep_normals: bool,
+    keep_slopes: bool,
+) -> tuple[Gaussians, Tensor | None, Tensor | None]:
+    """The Gaussians of the snow, with their normals and slopes where asked for."""
+    centers, bed_normals, sizes, neighbours, tracks = _arrays(
+        cells.centers_m, cells.normals, cells.sizes_m, cells.neighbours, cells.tracks
+    )
+    heights = depths.heights
+    settled_z, light = _settled(cells, heights, depth_m)
+    tops, counts = np.empty(len(cells), np.float64), np.empty(len(cells), np.int64)
+    with kernel_threads(CELLS):
         splat_kernels.find_tops(centers, heights, settled_z, tops)
-        counts = np.empty(count, np.int64)
         splat_kernels.count_splats(neighbours, sizes, centers, heights, tops, counts)
         lasts = np.cumsum(counts)
-        total = int(lasts[-1]) if count else 0
-        means, scales = torch.empty(2, total, 3).unbind()
-        quats, sh = torch.empty(total, 4), torch.empty(total, 1, 3)
+        total = int(lasts[-1]) if len(cells) else 0
+        means, scales, quats, sh = (
+            torch.empty(total, *shape) for shape in ((3,), (3,), (4,), (1, 3))
+        )
         normals, slopes = (
             torch.empty(total if keep else 0, 3) for keep in (keep_normals, keep_slopes)
         )
@@ -179,8 +193,8 @@ def _splats(
             tracks,
             light,
             heights,
-            mottle,
-            draws,
+            depths.mottle,
+            depths.draws,
             tops,
             lasts - counts,
             lights,
@@ -195,7 +209,7 @@ def _splats(
         sh=sh,
         semantic=torch.full((total,), int(SemanticClass.SNOW), dtype=torch.int16),
     )
-    return heights, gaussians, normals if keep_normals else None, slopes if keep_slopes else None
+    return gaussians, normals if keep_normals else None, slopes if keep_slopes else None
 
 
 def _settled(
@@ -204,16 +218,18 @@ def _settled(
     """Height of what lies beneath the snow and the light on it, evened out: deep snow shows less
     of the ground's relief, and no snow shows a recording's finest spots.
     """
-    sizes, neighbours = cells.sizes_m.contiguous().numpy(), cells.neighbours.contiguous().numpy()
-    z, light = cells.centers_m[:, 2].contiguous().numpy(), cells.light.contiguous().numpy()
+    sizes, neighbours, z, light = _arrays(
+        cells.sizes_m, cells.neighbours, cells.centers_m[:, 2], cells.light
+    )
     finest = float(sizes.min()) if len(sizes) else 1.0
     steps = min(max(math.ceil(2 * depth_m / finest), LEAST_STEPS), MOST_STEPS)
-    for _ in range(steps):
-        next_z, next_light = np.empty((2, len(z)), np.float32)
-        splat_kernels.settle(
-            neighbours, heights, sizes, float(depth_m), z, light, next_z, next_light
-        )
-        z, light = next_z, next_light
+    with kernel_threads(CELLS):
+        for _ in range(steps):
+            next_z, next_light = np.empty((2, len(z)), np.float32)
+            splat_kernels.settle(
+                neighbours, heights, sizes, float(depth_m), z, light, next_z, next_light
+            )
+            z, light = next_z, next_light
     return z, light
 
 
@@ -223,14 +239,13 @@ def _left_visible(cells: SnowCells, own: Gaussians, heights: np.ndarray) -> Tens
         return own.opacities
     opacities = own.opacities.detach().clone()
     with kernel_threads(CELLS):
-        splat_kernels.bury(
-            cells.buried.contiguous().numpy(),
-            cells.buried_by.contiguous().numpy(),
-            heights,
-            opacities.numpy(),
-        )
+        splat_kernels.bury(*_arrays(cells.buried, cells.buried_by), heights, opacities.numpy())
     return opacities
 
 
-def _arrays(octaves: Octaves) -> tuple[np.ndarray, ...]:
+def _arrays(*tensors: Tensor) -> tuple[np.ndarray, ...]:
+    return tuple(t.contiguous().numpy() for t in tensors)
+
+
+def _columns(octaves: Octaves) -> tuple[np.ndarray, ...]:
     return octaves.turns, octaves.amplitudes, octaves.lengths_m, octaves.seeds

@@ -11,6 +11,7 @@ from augment.render.cpu_jit import inner, kernel
 from augment.snow.noise import DEVIATION, MIX_A, MIX_B, STEP_X, STEP_Y
 from augment.snow.profile import (
     BARE_M,
+    CRUMBLED,
     FILM_M,
     PILED,
     SCOURED,
@@ -103,10 +104,12 @@ def lay(
         drift = _field(x, y, size, drifts[0], drifts[1], drifts[2], drifts[3])
         drift = math.exp(min(max(drift, -STEEPEST), STEEPEST)) * piled
         full = numbers.depth_m * drift * _pillow(edges[i] / numbers.radius_m)
-        h = BARE_M + max(full - BARE_M, 0.0) * _pillow(above / numbers.rim)
-        h = max(h * (1.0 - numbers.pressed * tracks[i]), min(h, FILM_M))
+        h = BARE_M + max(full - BARE_M, 0.0) * min(above / numbers.rim, 1.0)
+        mottled = _field(x, y, size, mottling[0], mottling[1], mottling[2], mottling[3])
+        track = np.float64(tracks[i])
+        track += CRUMBLED * mottled * track * (1.0 - track)
+        track = min(max(track, 0.0), 1.0)
+        h = max(h * (1.0 - numbers.pressed * track), min(h, FILM_M))
         h = BARE_M + (h - BARE_M) * min(room / WATER_RIM_M, 1.0)
         heights[i] = np.float32(h)
-        mottle[i] = np.float32(
-            _field(x, y, size, mottling[0], mottling[1], mottling[2], mottling[3])
-        )
+        mottle[i] = np.float32(mottled)

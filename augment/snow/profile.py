@@ -26,6 +26,7 @@ COVERING_M = 0.004  # depth that covers all but 1/e of the surface
 FULL = 1 - 1e-6  # shares above this are the whole
 FILM_M = 0.004  # what wheels leave at least
 PRESSED = 0.8  # share of the depth that wheels take
+CRUMBLED = 0.8  # of the mottling noise, by which a track's sides are uneven
 AUTO_TRACKS_M = 0.3  # deepest snow that shows tracks by itself
 WATER_MARGIN_M, WATER_RIM_M = 0.005, 0.02  # bare above the water, and thinner above that
 SHELTER = 0.4  # what the foot of an obstacle adds to the noise of the patches, which it keeps
@@ -34,14 +35,15 @@ STEEPEST = 1.4  # of the logarithm of the drift: within four times the depth, or
 
 # Octaves: (lattice step in metres, standard deviation). Of drifts, with wind.drift 0 and 1:
 _CALM = ((6.0, 0.015), (2.6, 0.02), (1.1, 0.02))
-_WINDY = ((6.0, 0.22), (2.6, 0.28), (1.1, 0.19))
+_WINDY = ((6.0, 0.25), (2.6, 0.25), (1.1, 0.14))
+_CALM_RISE, _WINDY_RISE = 0.008, 0.035  # their most height in metres per metre of lattice step
 # Of the surface's own relief, in metres of height and at most this share of the depth:
 _RELIEF_M = ((0.52, 0.0045), (0.21, 0.0018))
 _RELIEF_SHARE = 0.08
 # Of patches, and of what mottles the snow's colour:
 _PATCHES = ((2.6, 1.0), (1.1, 0.55), (0.45, 0.3), (0.19, 0.16))
 _MOTTLE = ((0.9, 0.75), (0.31, 0.65))
-RIM_M = 0.15  # over which patches thin out
+RIM_M = 0.2  # over which patches thin out
 RIM_SLOPE = 1.8  # rise of the patches' noise over a metre, at a patch's rim: the usual one
 
 
@@ -93,8 +95,9 @@ def profile_of(
     depth_m = snow.depth_m / max(-math.expm1(-snow.depth_m / COVERING_M), 1e-12)
     drift = snow.wind.drift if on_ground else snow.wind.drift / 2
     along = math.radians(snow.wind.direction_deg) if on_ground else 0.0
+    rise = _CALM_RISE + drift * (_WINDY_RISE - _CALM_RISE)
     rows = [
-        (step, calm + drift * (windy - calm))
+        (step, min(calm + drift * (windy - calm), rise * step / depth_m))
         for (step, calm), (_, windy) in zip(_CALM, _WINDY, strict=True)
     ]
     relief = [
@@ -148,9 +151,10 @@ def heights_of(cells: SnowCells, profile: Profile) -> np.ndarray:
 
     shelter = SHELTER * np.hypot(banks[:, 0], banks[:, 1])
     above = field_of(profile.patches, x_m, y_m) + shelter - n.threshold
-    h = BARE_M + np.maximum(full - BARE_M, 0) * _pillow(above / n.rim)
+    h = BARE_M + np.maximum(full - BARE_M, 0) * np.clip(above / n.rim, 0, 1)
 
-    h = np.maximum(h * (1 - n.pressed * tracks), np.minimum(h, FILM_M))
+    tracks = tracks + CRUMBLED * mottle_of(cells, profile) * tracks * (1 - tracks)
+    h = np.maximum(h * (1 - n.pressed * np.clip(tracks, 0, 1)), np.minimum(h, FILM_M))
     room = z_m - n.floor_z_m
     h = BARE_M + (h - BARE_M) * np.clip(room / WATER_RIM_M, 0, 1)
     return np.where((above > 0) & (room > 0), h, 0.0)

@@ -18,12 +18,14 @@ from augment.snow.cells import OPEN_EDGE
 MOST_WALLS = 8  # discs one above the other that close a wall
 LEAN = 1.5  # steepest slope that a cell's own disc follows
 SETTLED = 0.5  # of the depth: by this much at most does snow even out what lies beneath it
-SPREAD = 0.70  # standard deviation of a disc, in cells
-RIM_SPREAD = 0.56  # of one beside what is bare, so that the snow's edge is sharp
+SPREAD = 0.78  # standard deviation of a disc, in cells
+STEEP_SPREAD = 0.64  # of one on a slope of 45 degrees, which is stretched as well
+RIM_SPREAD = 0.58  # of one beside what is bare, so that the snow's edge is sharp
 RIM_STRETCH = 1.2  # most that such a disc is stretched down a slope
-SHIFT = 0.22  # farthest that a disc is moved from its cell's middle, in cells
+DRAWN_IN = 0.2  # by how much of a cell it keeps away from what is bare
+SHIFT = 0.2  # farthest that a disc is moved from its cell's middle, in cells
 THICK = 0.2  # most that a disc's thickness measures, in cells
-WALL_SPREAD = 0.55  # of a wall's discs upwards, in heights of one
+WALL_SPREAD = 0.62  # of a wall's discs upwards, in heights of one
 INSET = 0.12  # by which a wall stands behind the cell's border, in cells
 SUNK = 0.5  # by which a disc's middle lies below the surface, in its thickness
 ROUGH, ROUGH_GRAIN = 0.03, 0.10  # tilt of a disc's normal for its light, and more with grain
@@ -77,12 +79,29 @@ def find_tops(centers, heights, settled_z, tops):
 
 
 @inner()
+def _beyond(i, side, neighbours, size, centers, tops):
+    """Height of the surface on one side of a covered cell, and the level distance to there.
+
+    Half a cell where the layer ends: at an open edge, and above what even the neighbour's snow does
+    not reach up from. 0 where it ends against something higher.
+    """
+    n, z = neighbours[i, side], np.float64(centers[i, 2])
+    if n < 0:
+        return z, (0.5 * size if n == OPEN_EDGE else 0.0)
+    if tops[n] < z - LEAN * size:
+        return z, 0.5 * size
+    if centers[n, 2] > tops[i] + LEAN * size:
+        return z, 0.0
+    return tops[n], size
+
+
+@inner()
 def _walls(i, side, neighbours, sizes, centers, tops):
     """Discs that close the wall on one side of a covered cell, and how far down it reaches."""
-    n = neighbours[i, side]
-    low = tops[n] if n >= 0 else (np.float64(centers[i, 2]) if n == OPEN_EDGE else tops[i])
-    drop, most = tops[i] - low, LEAN * np.float64(sizes[i])
-    if drop <= most:
+    size = np.float64(sizes[i])
+    low, run = _beyond(i, side, neighbours, size, centers, tops)
+    drop, most = tops[i] - low, LEAN * size
+    if run == 0.0 or drop <= most:
         return 0, drop
     return min(math.ceil(drop / most), MOST_WALLS), drop
 
@@ -100,13 +119,14 @@ def count_splats(neighbours, sizes, centers, heights, tops, counts):
 
 
 @inner()
-def _slope(i, axis, neighbours, size, bed_slope, bed_z, tops):
+def _slope(i, axis, neighbours, size, bed_slope, centers, tops):
     """Rise of the surface per metre along x (axis 0) or y (1)."""
-    a, b = neighbours[i, 2 * axis], neighbours[i, 2 * axis + 1]
-    before = tops[a] if a >= 0 else bed_z - 0.5 * size * bed_slope
-    after = tops[b] if b >= 0 else bed_z + 0.5 * size * bed_slope
-    run_before = size if a >= 0 else (0.5 * size if a == OPEN_EDGE else 0.0)
-    run_after = size if b >= 0 else (0.5 * size if b == OPEN_EDGE else 0.0)
+    before, run_before = _beyond(i, 2 * axis, neighbours, size, centers, tops)
+    after, run_after = _beyond(i, 2 * axis + 1, neighbours, size, centers, tops)
+    if run_before < size:  # the bed's own height where the layer ends, not its middle's
+        before -= run_before * bed_slope
+    if run_after < size:
+        after += run_after * bed_slope
     if run_before == 0.0 and run_after == 0.0:
         return bed_slope
     if run_before == 0.0:
@@ -129,12 +149,14 @@ def _hollow(i, neighbours, size, tops):
 
 
 @inner()
-def _beside_bare(i, neighbours, heights):
-    bare = False
-    for side in range(4):
-        n = neighbours[i, side]
-        bare |= n == OPEN_EDGE or (n >= 0 and heights[n] == 0)
-    return bare
+def _inwards(i, axis, neighbours, heights):
+    """-1, 0 or 1 along x (axis 0) or y (1), away from what is bare; 2 if both sides are."""
+    a, b = neighbours[i, 2 * axis], neighbours[i, 2 * axis + 1]
+    before = a == OPEN_EDGE or (a >= 0 and heights[a] == 0)
+    after = b == OPEN_EDGE or (b >= 0 and heights[b] == 0)
+    if before and after:
+        return 2
+    return 1 if before else (-1 if after else 0)
 
 
 @inner()
@@ -198,29 +220,34 @@ def fill(
         if heights[i] == 0:
             continue
         size, draw, h = np.float64(sizes[i]), draws[i], np.float64(heights[i])
-        x, y, z = np.float64(centers[i, 0]), np.float64(centers[i, 1]), np.float64(centers[i, 2])
+        x, y = np.float64(centers[i, 0]), np.float64(centers[i, 1])
         up = np.float64(bed_normals[i, 2])
-        gx = _slope(i, 0, neighbours, size, -bed_normals[i, 0] / up, z, tops)
-        gy = _slope(i, 1, neighbours, size, -bed_normals[i, 1] / up, z, tops)
+        gx = _slope(i, 0, neighbours, size, -bed_normals[i, 0] / up, centers, tops)
+        gy = _slope(i, 1, neighbours, size, -bed_normals[i, 1] / up, centers, tops)
         steep = math.sqrt(gx * gx + gy * gy)
         if steep > LEAN:
             gx, gy, steep = gx * LEAN / steep, gy * LEAN / steep, LEAN
         stretch = math.sqrt(1.0 + steep * steep)
         normal = (-gx / stretch, -gy / stretch, 1.0 / stretch)
 
-        at_rim = _beside_bare(i, neighbours, heights)
-        spread = (RIM_SPREAD if at_rim else SPREAD) * size
+        in_x, in_y = _inwards(i, 0, neighbours, heights), _inwards(i, 1, neighbours, heights)
+        at_rim = in_x != 0 or in_y != 0
+        spread = RIM_SPREAD if at_rim else SPREAD + (STEEP_SPREAD - SPREAD) * min(steep, 1.0)
+        spread *= size
         spread *= 1.0 + 0.2 * look.grain * abs(_uniform(draw, 0))
-        shift = (0.5 if at_rim else 1.0) * SHIFT * size
+        # On steep sides discs are long, and scattered ones would look like fur.
+        shift = (0.5 if at_rim else max(1.0 - 1.2 * steep, 0.1)) * SHIFT * size
         dx, dy = shift * _uniform(draw, 1), shift * _uniform(draw, 2)
+        dx += DRAWN_IN * size * in_x if in_x < 2 else 0.0
+        dy += DRAWN_IN * size * in_y if in_y < 2 else 0.0
         thick = min(THICK * size, 0.006 + 0.25 * h)
         s = firsts[i]
         means[s, 0] = np.float32(x + dx)
         means[s, 1] = np.float32(y + dy)
         means[s, 2] = np.float32(tops[i] + gx * dx + gy * dy - SUNK * thick)
         _turn(normal[0], normal[1], normal[2], s, quats)
-        stretch = min(stretch, RIM_STRETCH) if at_rim else stretch
-        scales[s, 0], scales[s, 1], scales[s, 2] = spread * stretch, spread, thick
+        longer = min(stretch, RIM_STRETCH) if at_rim else stretch
+        scales[s, 0], scales[s, 1], scales[s, 2] = spread * longer, spread, thick
 
         bend = min(max(_hollow(i, neighbours, size, tops), -LARGEST_BEND), LARGEST_BEND)
         pale = 1.0 + (PALE + PALE_GRAIN * look.grain) * _uniform(draw, 3) + MOTTLED * mottle[i]
@@ -228,10 +255,10 @@ def fill(
         loss = SHADED_HOLLOW * bend
         tints = (pale * (1.0 - loss), pale * (1.0 - 0.8 * loss), pale * (1.0 - 0.55 * loss))
         dirt = min(max(0.8 + 0.2 * mottle[i] + 0.15 * _uniform(draw, 4), 0.3), 1.0)
-        packed = look.packed * tracks[i] * dirt
+        packed = look.packed * tracks[i] * tracks[i] * dirt
         seen = min(max((light[i] - DARKEST) / (BRIGHTEST - DARKEST), 0.0), 1.0)
         seen = seen * seen * (3.0 - 2.0 * seen)
-        rough = ROUGH + ROUGH_GRAIN * look.grain
+        rough = (ROUGH + ROUGH_GRAIN * look.grain) / stretch
         facing = _rough(normal, rough, draw, 5)
         _shade(s, facing, tints, packed, seen, lights, look, sh, normals, slopes)
 
