@@ -18,13 +18,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from batch_scenes import fake_render, make_recipe, open_fake, slow_render, tree_digest
+from batch_scenes import fake_render, make_bed, make_recipe, open_fake, slow_render, tree_digest
 
 from augment.batch.atomic import TEMPORARY_SUFFIX
 from augment.batch.job import RenderJob, run_job
 from augment.batch.journal import Journal
 from augment.batch.label_files import lidar_bytes
 from augment.batch.layout import STATE_FOLDER
+from augment.snow import beds
 from recipes.flood import Flood
 from recipes.snow import Snow
 
@@ -35,7 +36,7 @@ SYNC_POINTS = ("fsync", "replace", "unlink", "rename", "rmdir")
 def main(folder: Path) -> None:
     lidar_bytes(open_fake("fake:warm").labels.lidar(0))  # loads the Parquet code before the forks
     found = {}
-    for kill in (sweep_fresh, sweep_overwrite, kill_at_random, stop_a_job_with_workers):
+    for kill in (sweep_fresh, sweep_snow, sweep_overwrite, kill_at_random, stop_a_job_with_workers):
         (folder / kill.__name__).mkdir()
         found[kill.__name__] = kill(folder / kill.__name__)
     print(json.dumps(found))
@@ -142,6 +143,31 @@ def sweep_fresh(folder: Path) -> dict[str, int]:
         kills += ended.code == -signal.SIGKILL
         check_only_whole_files(out, whole, f"killed at {kill_at}")
         resume_and_compare(job(out), out, whole, ended.finished, f"killed at {kill_at}")
+        shutil.rmtree(out)
+    return {"kills": kills}
+
+
+def sweep_snow(folder: Path) -> dict[str, int]:
+    """Kill a run while it stores where snow can lie, and while it writes the first files."""
+    beds.place_snow_bed = lambda *_, **__: make_bed(1.0)
+    recipe = make_recipe(instance=False, semantic=False, snow=Snow(depth_m=0.1))
+
+    def snowy_job(out: Path) -> RenderJob:
+        return RenderJob("fake:street?frames=1", [recipe], out)
+
+    require(run_forked(render(snowy_job(folder / "whole"))).code == 0, "the snowy run failed")
+    # The state's own files go by what they hold, and a job's do not tell of it.
+    whole = tree_digest(folder / "whole" / "street")
+    kills = 0
+    for kill_at in range(1, 25):
+        out = folder / "killed"
+        kills += run_forked(render(snowy_job(out)), kill_at).code == -signal.SIGKILL
+        check_only_whole_files(out / "street", whole, f"killed at {kill_at}")
+        again = run_forked(render(snowy_job(out)))
+        require(again.code == 0, f"killed at {kill_at}: the snowy job cannot go on")
+        require(tree_digest(out / "street") == whole, f"killed at {kill_at}: the tree differs")
+        left = sorted(path.name[:5] for path in (out / STATE_FOLDER).iterdir())
+        require(left == ["lock", "snow-"], f"killed at {kill_at}: left behind are {left}")
         shutil.rmtree(out)
     return {"kills": kills}
 
