@@ -334,9 +334,8 @@ def test_gradients_are_finite_where_nothing_varies():
 def test_gradients_of_a_crowd_are_finite():
     scene = open_scene(200)
     means = scene.means.clone().requires_grad_()
-    image = render(
-        [PosedGaussians(dataclasses.replace(scene, means=means))], camera_ahead(), "auto"
-    )
+    tracked = dataclasses.replace(scene, means=means)
+    image = render(tracked, camera_ahead(), "auto")
     image.mode_depth.sum().backward()
     assert bool(torch.isfinite(means.grad).all()) and float(means.grad.abs().max()) > 0
     with pytest.raises(ValueError, match="gradients of mode_depth are asked for"):
