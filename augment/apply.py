@@ -16,6 +16,7 @@ from augment.render.composite import composite_sky, map_colors, quantise
 from augment.render.rasterize import rasterize
 from augment.scene import PosedGaussians, Scene
 from augment.semantics import SemanticClass
+from augment.snow.covers import cover_of
 from augment.weather.flood_view import Painter, render_flooded
 from augment.weather.smog import fog_raster
 from augment.weather.water_plane import plane_depth
@@ -25,13 +26,23 @@ SURFACE_ALPHA = 0.5  # a pixel less covered than this shows more sky than surfac
 
 
 @dataclass(frozen=True, eq=False)
+class BareBuffers:
+    """What images show of a scene without its snow: see the same fields of WeatheredBuffers."""
+
+    raster: RenderOutput
+    depth_m: Float[Tensor, "H W"] | None
+    parts: tuple[PosedGaussians, ...]
+
+
+@dataclass(frozen=True, eq=False)
 class WeatheredBuffers:
     """One finished view in floats. rgb [H, W, 3]: display-encoded, not clamped, sky included.
 
     raster: the buffers of the scene's surfaces; with water in view, of those under it too, without
     colours. depth_m [H, W]: z along the optical axis of the scene's surface, 0 where there is none;
     None unless planned. water [H, W]: where a ray meets water first; None where no water is in
-    view.
+    view. snow [H, W]: where snow is what the pixel shows; None where none is planned; it is a
+    surface of the scene for raster, depth_m and parts. bare: the scene without it, if planned.
     """
 
     camera: Camera
@@ -40,6 +51,8 @@ class WeatheredBuffers:
     depth_m: Float[Tensor, "H W"] | None
     parts: tuple[PosedGaussians, ...]
     water: Bool[Tensor, "H W"] | None = None
+    snow: Bool[Tensor, "H W"] | None = None
+    bare: BareBuffers | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,13 +69,26 @@ class FloodedView:
 
 
 @dataclass(frozen=True, eq=False)
+class SnowyView:
+    """What a view's labels in the snow are measured from.
+
+    surface_depth_m: float32 [H, W], z of the first solid surface, snow included; 0 = none. None
+    where no snow is in view, or no label needs it. thickness_m: the layer's depth.
+    """
+
+    surface_depth_m: np.ndarray | None
+    thickness_m: float
+
+
+@dataclass(frozen=True, eq=False)
 class WeatheredView:
     """One finished view as it is written to files.
 
     rgb: uint8 [H, W, 3]. depth_m: float32 [H, W], 0 = none. semantic: uint8 [H, W], SemanticClass.
     instance: uint16 [H, W], 0 = background or sky, else 1 + the actor's index in the scene.
     water: uint8 [H, W], 255 where a ray meets water first, else 0; None where the recipe has no
-    flood. flood: None where the recipe has no flood.
+    flood. flood: None where the recipe has no flood. snow: uint8 [H, W], 255 where snow is what the
+    pixel shows, else 0. snow, snowy: None where the recipe has no snow.
     """
 
     camera: Camera
@@ -72,6 +98,8 @@ class WeatheredView:
     instance: np.ndarray | None
     water: np.ndarray | None = None
     flood: FloodedView | None = None
+    snow: np.ndarray | None = None
+    snowy: SnowyView | None = None
 
 
 def render_view(
@@ -81,18 +109,19 @@ def render_view(
     plan = make_plan(recipe, scene)
     buffers = render_buffers(scene, camera.scaled(recipe.render.scale), plan, backend=backend)
     first = buffers.water if plan.shows_water else None  # pixels that show the water itself
+    shown = buffers.bare or buffers  # the scene's surfaces that the other images show
     semantic = instance = depth = None
     if plan.semantic:
-        table = semantic_table(buffers.parts)
-        semantic = _look_up(buffers.raster, table, int(SemanticClass.SKY), np.uint8)
+        table = semantic_table(shown.parts)
+        semantic = _look_up(shown.raster, table, int(SemanticClass.SKY), np.uint8)
         if first is not None:
             semantic[first.numpy()] = int(SemanticClass.WATER)
     if plan.instance:
-        instance = _look_up(buffers.raster, instance_table(buffers.parts), 0, np.uint16)
+        instance = _look_up(shown.raster, instance_table(shown.parts), 0, np.uint16)
         if first is not None:
             instance[first.numpy()] = 0
-    if plan.depth_buffer is not None and buffers.depth_m is not None:
-        depth = buffers.depth_m
+    if plan.depth_buffer is not None and shown.depth_m is not None:
+        depth = shown.depth_m
         if first is not None:
             assert plan.flood is not None
             surface = plane_depth(buffers.camera, plan.flood.level_z_m).to(depth.dtype)
@@ -104,8 +133,10 @@ def render_view(
         depth_m=None if depth is None else depth.float().numpy(),
         semantic=semantic,
         instance=instance,
-        water=_water_mask(buffers) if recipe.weather.flood is not None else None,
+        water=_mask(buffers.water, camera=buffers.camera) if recipe.weather.flood else None,
         flood=_flooded(buffers, plan),
+        snow=_mask(buffers.snow, camera=buffers.camera) if recipe.weather.snow else None,
+        snowy=_snowy(buffers, plan, recipe),
     )
 
 
@@ -113,14 +144,16 @@ def render_buffers(
     scene: Scene, camera: Camera, plan: Plan, *, backend: str = "auto"
 ) -> WeatheredBuffers:
     """The view of `camera` at its own resolution, as floats."""
-    parts = scene.parts_for(camera)
+    parts = bare_parts = scene.parts_for(camera)
+    if plan.snow is not None:
+        parts = cover_of(scene, plan.snow).parts_for(scene, camera)
     flooded = None
     if plan.flood is not None:
         painter = Painter(
             parts, scene.sky, plan.settings, plan.smog_in_splats, plan.smog_on_buffers, backend
         )
         buffers = plan.buffers
-        if plan.measures_flood and plan.depth_buffer is None:
+        if plan.measures_flood and plan.depth_buffer not in buffers:
             buffers = buffers | {EXPECTED_DEPTH}
         flooded = render_flooded(painter, camera, plan.flood, buffers)
     if flooded is not None:
@@ -130,19 +163,46 @@ def render_buffers(
     color_map = scene.color_map(camera.name) if plan.recorded_exposure else None
     if color_map is not None:  # a camera exposes what the weather has left, so this comes last
         rgb = map_colors(rgb, color_map, fast=backend != "reference")
-    depth = None
-    if plan.depth_buffer is not None or (plan.measures_flood and flooded is not None):
-        z = getattr(raster, plan.depth_buffer or EXPECTED_DEPTH)
-        assert raster.alpha is not None
-        depth = torch.where(raster.alpha >= SURFACE_ALPHA, z, torch.zeros_like(z))
+    water = None if flooded is None else flooded.water
     return WeatheredBuffers(
         camera,
         rgb,
         raster,
-        depth,
+        _surface_depth(raster, plan),
         parts,
-        water=None if flooded is None else flooded.water,
+        water=water,
+        snow=_snow_mask(raster, water),
+        bare=_bare(bare_parts, camera, plan, backend),
     )
+
+
+def _surface_depth(raster: RenderOutput, plan: Plan) -> Tensor | None:
+    """z of the surfaces by the planned estimator, else by the one that labels need."""
+    z = getattr(raster, plan.depth_buffer or EXPECTED_DEPTH)
+    if z is None:
+        z = raster.expected_depth
+    if z is None or raster.alpha is None:
+        return None
+    return torch.where(raster.alpha >= SURFACE_ALPHA, z, torch.zeros_like(z))
+
+
+def _snow_mask(raster: RenderOutput, water: Tensor | None) -> Tensor | None:
+    """Where snow makes up half of the pixel or more; what a ray meets behind water is none."""
+    if raster.snow is None:
+        return None
+    shows = raster.snow >= SURFACE_ALPHA
+    return shows if water is None else shows & ~water
+
+
+def _bare(
+    parts: tuple[PosedGaussians, ...], camera: Camera, plan: Plan, backend: str
+) -> BareBuffers | None:
+    if not plan.bare_buffers:
+        return None
+    raster = rasterize(
+        parts, camera, buffers=plan.bare_buffers, settings=plan.settings, backend=backend
+    )
+    return BareBuffers(raster, _surface_depth(raster, plan), parts)
 
 
 def _without_water(
@@ -166,11 +226,11 @@ def _without_water(
     return rgb, raster
 
 
-def _water_mask(buffers: WeatheredBuffers) -> np.ndarray:
-    """uint8 [H, W]: 255 where a ray meets water first, else 0."""
-    if buffers.water is None:
-        return np.zeros((buffers.camera.height, buffers.camera.width), np.uint8)
-    return buffers.water.numpy().astype(np.uint8) * np.uint8(255)
+def _mask(shown: Tensor | None, *, camera: Camera) -> np.ndarray:
+    """uint8 [H, W]: 255 where `shown`, else 0; all 0 where it is None."""
+    if shown is None:
+        return np.zeros((camera.height, camera.width), np.uint8)
+    return shown.numpy().astype(np.uint8) * np.uint8(255)
 
 
 def _flooded(buffers: WeatheredBuffers, plan: Plan) -> FloodedView | None:
@@ -178,6 +238,14 @@ def _flooded(buffers: WeatheredBuffers, plan: Plan) -> FloodedView | None:
         return None
     depth = buffers.depth_m if plan.measures_flood and buffers.water is not None else None
     return FloodedView(plan.flood_level_z_m, None if depth is None else depth.float().numpy())
+
+
+def _snowy(buffers: WeatheredBuffers, plan: Plan, recipe: Recipe) -> SnowyView | None:
+    if recipe.weather.snow is None:
+        return None
+    in_view = buffers.snow is not None and bool(buffers.snow.any())
+    depth = buffers.depth_m if plan.measures_snow and in_view else None
+    return SnowyView(None if depth is None else depth.float().numpy(), recipe.weather.snow.depth_m)
 
 
 def semantic_table(parts: tuple[PosedGaussians, ...]) -> np.ndarray:

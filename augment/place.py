@@ -7,9 +7,10 @@ from weakref import WeakKeyDictionary
 
 from augment.errors import SceneError
 from augment.geometry import rotmat_from_quat
-from augment.ground import ground_of
+from augment.ground import check_metric_and_level, ground_of
 from augment.render.constants import MAX_EXTENT_SIGMAS
 from augment.scene import Actor, Gaussians, Scene
+from augment.snow.placed import PlacedSnow
 from augment.weather.flood import FloodMedium
 from augment.weather.smog import SmogMedium
 from augment.weather.wave_spectrum import make_waves
@@ -70,6 +71,34 @@ def place_flood(recipe: Recipe, scene: Scene) -> tuple[FloodMedium | None, str]:
         f"{len(medium.waves.amplitudes_m)} waves"
     )
     return medium, reason
+
+
+def place_snow(
+    recipe: Recipe, scene: Scene, water_level_z_m: float | None
+) -> tuple[PlacedSnow | None, str]:
+    """The recipe's snow in the scene, or None where it would change nothing; and why.
+
+    water_level_z_m: of the recipe's flood, scene world.
+
+    Raises:
+        SceneError: the scene's scale or gravity is not known.
+    """
+    snow = recipe.weather.snow
+    if snow is None:
+        return None, "the recipe has no snow"
+    if snow.depth_m == 0 or snow.coverage == 0:
+        nothing = "depth" if snow.depth_m == 0 else "coverage"
+        return None, f"the snow has no {nothing}, so it changes nothing"
+    check_metric_and_level(scene)
+    seed = recipe.seed if snow.seed is None else snow.seed
+    reason = (
+        f"{snow.depth_m:g} m deep on {100 * snow.coverage:.3g} % of what is open to the sky, no "
+        f"steeper than {snow.max_slope_deg:g} deg and seen by a camera; cells of "
+        f"{100 * snow.cell_m:g} cm near the path"
+    )
+    if water_level_z_m is not None:
+        reason += f"; none below the water's level, z = {water_level_z_m:.2f} m"
+    return PlacedSnow(snow, seed, water_level_z_m), reason
 
 
 def lowest_z_m(scene: Scene) -> float:

@@ -7,15 +7,24 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from augment.place import gaussians_below, place_flood, place_smog
-from augment.render.buffers import ALPHA, EXPECTED_DEPTH, MEDIAN_DEPTH, RGB, SPLAT_IDS
+from augment.place import gaussians_below, place_flood, place_smog, place_snow
+from augment.render.buffers import (
+    ALPHA,
+    EXPECTED_DEPTH,
+    MEDIAN_DEPTH,
+    MODE_DEPTH,
+    RGB,
+    SNOW,
+    SPLAT_IDS,
+)
 from augment.render.constants import RasterSettings
 from augment.scene import Scene
+from augment.snow.placed import PlacedSnow
 from augment.weather.flood import FloodMedium
 from augment.weather.smog import SmogMedium
 from recipes.schema import Recipe
 
-DEPTH_BUFFERS = {"median": MEDIAN_DEPTH, "expected": EXPECTED_DEPTH}
+DEPTH_BUFFERS = {"median": MEDIAN_DEPTH, "expected": EXPECTED_DEPTH, "mode": MODE_DEPTH}
 
 
 @dataclass(frozen=True)
@@ -38,6 +47,9 @@ class Plan:
     flood: the water, None where there is none. shows_water: whether depth, semantic and instance
     images show the water's surface or the scene's under it. measures_flood: whether views with
     water need the depth of the scene's surfaces, for what labels say of the flood.
+    snow: None where there is none. measures_snow: whether labels need the depth of its surface.
+    bare_buffers: what depth, semantic and instance images take from a render of the scene without
+    its snow; empty where they show the snow.
     """
 
     settings: RasterSettings
@@ -53,6 +65,9 @@ class Plan:
     flood_level_z_m: float | None = None
     shows_water: bool = False
     measures_flood: bool = False
+    snow: PlacedSnow | None = None
+    measures_snow: bool = False
+    bare_buffers: frozenset[str] = frozenset()
 
     @property
     def smog(self) -> SmogMedium | None:
@@ -63,6 +78,7 @@ class Plan:
         """For machines: buffers sorted, one entry a step."""
         return {
             "buffers": sorted(self.buffers),
+            "bare_buffers": sorted(self.bare_buffers),
             "steps": [{"name": s.name, "runs": s.runs, "why": s.why} for s in self.steps],
         }
 
@@ -77,17 +93,24 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
     level_z_m = None if flood is None else flood.level_z_m
     if flood is not None and not gaussians_below(scene, flood.level_z_m):
         flood, flood_reason = None, f"no splat reaches below the level, z = {flood.level_z_m:.2f} m"
+    snow, snow_reason = place_snow(recipe, scene, level_z_m)
     smog, smog_reason = place_smog(recipe, scene)
     per_gaussian = recipe.weather.smog is not None and recipe.weather.smog.model == "per_gaussian"
     depth_buffer = DEPTH_BUFFERS.get(recipe.output.depth)
-    buffers = {RGB, ALPHA}
-    if depth_buffer:
-        buffers.add(depth_buffer)
+    labelled = recipe.output.labels and scene.labels is not None
+    measures_flood, measures_snow = flood is not None and labelled, snow is not None and labelled
+    for_images = {ALPHA, depth_buffer} if depth_buffer else set[str]()
+    if recipe.output.semantic or recipe.output.instance:
+        for_images |= {ALPHA, SPLAT_IDS}
+    buffers, bare_buffers = {RGB, ALPHA} | for_images, set[str]()
+    if snow is not None:
+        buffers.add(SNOW)
+        if recipe.output.surface == "scene":
+            buffers, bare_buffers = {RGB, ALPHA, SNOW}, for_images
+        if measures_snow and depth_buffer not in buffers:
+            buffers.add(EXPECTED_DEPTH)
     if smog and not per_gaussian:
         buffers.add(EXPECTED_DEPTH)
-    measures_flood = flood is not None and recipe.output.labels and scene.labels is not None
-    if recipe.output.semantic or recipe.output.instance:
-        buffers.add(SPLAT_IDS)
     settings = RasterSettings(
         near_m=recipe.render.near_m,
         alpha_max=recipe.render.alpha_max,
@@ -109,7 +132,11 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
         flood_level_z_m=level_z_m,
         shows_water=flood is not None and recipe.output.surface == "first",
         measures_flood=measures_flood,
+        snow=snow,
+        measures_snow=measures_snow,
+        bare_buffers=frozenset(bare_buffers),
         steps=(
+            *_snow_steps(snow, snow_reason, bare_buffers),
             Step("rasterise", True, f"{actors}; buffers {', '.join(sorted(buffers))}"),
             _smog_step("per Gaussian", smog, per_gaussian, smog_reason),
             _smog_step("on buffers", smog, not per_gaussian, smog_reason),
@@ -157,6 +184,24 @@ def _flood_steps(flood: FloodMedium | None, reason: str) -> tuple[Step, ...]:
         Step("flood: bed", True, f"{reason}; splats are cut at the surface"),
         Step("flood: mirrored view", tier != "sky", mirrored[tier]),
         Step("flood: screen march", tier == "screen_space", f"reflection is {tier!r}"),
+    )
+
+
+def _snow_steps(snow: PlacedSnow | None, reason: str, bare_buffers: set[str]) -> tuple[Step, ...]:
+    """Placement runs once for all views of a scene, and the layer is laid once for each recipe."""
+    if snow is None:
+        names = ("snow: placement and layer", "snow: light per pixel", "snow: bare surface")
+        return tuple(Step(name, False, reason) for name in names)
+    per_pixel = snow.snow.shading == "per_pixel"
+    bare = f"output.surface is 'scene': {', '.join(sorted(bare_buffers))} of the bare scene"
+    return (
+        Step("snow: placement and layer", True, reason),
+        Step("snow: light per pixel", per_pixel, f"shading is {snow.snow.shading!r}"),
+        Step(
+            "snow: bare surface",
+            bool(bare_buffers),
+            bare if bare_buffers else "no image shows the surface under the snow",
+        ),
     )
 
 

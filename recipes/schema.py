@@ -142,7 +142,7 @@ class Output(Closed):
 
     image: Literal["png", "jpg"] = Field(default="png", description="Image format.")
     jpeg_quality: Whole = Field(default=92, ge=1, le=100, description="Quality of jpg images.")
-    depth: Literal["median", "expected", "none"] = Field(
+    depth: Literal["median", "expected", "mode", "none"] = Field(
         default="median", description="Depth estimator written as 16-bit PNG, metres x 256."
     )
     surface: Literal["solid", "scene", "first"] = Field(

@@ -1,0 +1,50 @@
+"""The Gaussians that a recipe's snow becomes when a picture needs them."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from weakref import WeakKeyDictionary
+
+from augment.scene import Scene
+from augment.snow.beds import bed_of
+from augment.snow.cover import SnowCover
+from augment.snow.layer import lay_snow
+from augment.snow.light import illumination_of
+from augment.snow.placed import PlacedSnow
+from augment.snow.placement import PlacementSettings
+from recipes.snow import Snow
+
+_MOST_COVERS = 2  # of a scene, that are kept: a job goes through its variants frame by frame
+
+
+def placement_settings(snow: Snow) -> PlacementSettings:
+    """What of a recipe's snow decides where it can lie."""
+    return PlacementSettings(cell_m=snow.cell_m, max_slope_deg=snow.max_slope_deg)
+
+
+def cover_of(scene: Scene, placed: PlacedSnow) -> SnowCover:
+    """The snow in the scene; remembered for as long as the scene lives and no third is asked for.
+
+    The first call finds where snow can lie, unless a bed is remembered (augment.snow.beds).
+
+    Raises:
+        SceneError: snow cannot be placed in this scene, or not with cells this small.
+    """
+    covers = _covers.setdefault(scene, OrderedDict())
+    if placed not in covers:
+        bed = bed_of(scene, placement_settings(placed.snow))
+        covers[placed] = lay_snow(
+            bed,
+            scene,
+            placed.snow,
+            illumination_of(scene, placed.snow),
+            seed=placed.seed,
+            water_level_z_m=placed.water_level_z_m,
+        )
+    covers.move_to_end(placed)
+    while len(covers) > _MOST_COVERS:
+        covers.popitem(last=False)
+    return covers[placed]
+
+
+_covers: WeakKeyDictionary[Scene, OrderedDict[PlacedSnow, SnowCover]] = WeakKeyDictionary()
