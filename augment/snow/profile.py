@@ -23,7 +23,7 @@ from recipes.snow import Snow
 
 BARE_M = 0.002  # less snow than this is none
 COVERING_M = 0.004  # depth that covers all but 1/e of the surface
-FULL = 1 - 1e-6  # shares above this are the whole
+FULL = 0.9999  # shares above this are the whole
 FILM_M = 0.004  # what wheels leave at least
 PRESSED = 0.8  # share of the depth that wheels take
 CRUMBLED = 0.8  # of the mottling noise, by which a track's sides are uneven
@@ -92,7 +92,9 @@ def profile_of(
     """The profile of the recipe's snow. on_ground: of what does not move, so that wind, tracks and
     water count; what moves has met many winds.
     """
-    depth_m = snow.depth_m / max(-math.expm1(-snow.depth_m / COVERING_M), 1e-12)
+    # What fell lies on the covered share; the less fell, the nearer this comes to COVERING_M.
+    settled = -math.expm1(-snow.depth_m / COVERING_M)
+    depth_m = snow.depth_m / settled if settled > 0 else COVERING_M
     drift = snow.wind.drift if on_ground else snow.wind.drift / 2
     along = math.radians(snow.wind.direction_deg) if on_ground else 0.0
     rise = _CALM_RISE + drift * (_WINDY_RISE - _CALM_RISE)

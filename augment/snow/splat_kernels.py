@@ -25,7 +25,8 @@ RIM_STRETCH = 1.2  # most that such a disc is stretched down a slope
 DRAWN_IN = 0.2  # by how much of a cell it keeps away from what is bare
 SHIFT = 0.2  # farthest that a disc is moved from its cell's middle, in cells
 THICK = 0.2  # most that a disc's thickness measures, in cells
-WALL_SPREAD = 0.62  # of a wall's discs upwards, in heights of one
+WALL_SPREAD = 0.7  # of a wall's discs upwards, in heights of one
+WALL_LIFT = 0.25  # by which its lowest keeps clear of the wall's foot, in heights of one
 INSET = 0.12  # by which a wall stands behind the cell's border, in cells
 SUNK = 0.5  # by which a disc's middle lies below the surface, in its thickness
 ROUGH, ROUGH_GRAIN = 0.03, 0.10  # tilt of a disc's normal for its light, and more with grain
@@ -100,10 +101,10 @@ def _walls(i, side, neighbours, sizes, centers, tops):
     """Discs that close the wall on one side of a covered cell, and how far down it reaches."""
     size = np.float64(sizes[i])
     low, run = _beyond(i, side, neighbours, size, centers, tops)
-    drop, most = tops[i] - low, LEAN * size
-    if run == 0.0 or drop <= most:
+    drop = tops[i] - low
+    if run == 0.0 or drop <= LEAN * size:
         return 0, drop
-    return min(math.ceil(drop / most), MOST_WALLS), drop
+    return min(math.ceil(drop / size), MOST_WALLS), drop
 
 
 @kernel
@@ -270,11 +271,13 @@ def fill(
                 s += 1
                 means[s, 0] = np.float32(x + (0.5 - INSET) * size * out_x)
                 means[s, 1] = np.float32(y + (0.5 - INSET) * size * out_y)
-                means[s, 2] = np.float32(tops[i] - drop * (k + 0.5) / count)
+                step = drop / (count + WALL_LIFT)
+                means[s, 2] = np.float32(tops[i] - step * (k + 0.5))
                 normal = (0.96 * out_x, 0.96 * out_y, 0.28)
                 _turn(normal[0], normal[1], normal[2], s, quats)
-                scales[s, 0], scales[s, 1] = WALL_SPREAD * drop / count, SPREAD * size
+                scales[s, 0], scales[s, 1] = WALL_SPREAD * step, SPREAD * size
                 scales[s, 2] = thick
+                normal = (0.8 * out_x, 0.8 * out_y, 0.6)  # of a rounded side, for its light
                 facing = _rough(normal, rough, draw, 8 + 12 * side + 3 * (k % 4))
                 _shade(s, facing, tints, packed, seen, lights, look, sh, normals, slopes)
 

@@ -1,0 +1,479 @@
+"""Snow laid on beds made by hand: how deep, where, how closed, what colour, and what it buries."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from augment.geometry import rigid
+from augment.render.buffers import ALPHA, RGB
+from augment.render.rasterize import rasterize
+from augment.render.sh import SH_C0
+from augment.render.threads import limit_threads
+from augment.scene import Actor
+from augment.semantics import SemanticClass
+from augment.snow.cells import FLUSH, OPEN_EDGE
+from augment.snow.cover import SnowCover
+from augment.snow.layer import OPACITY, find_depths, lay_snow
+from augment.snow.light import Illumination
+from augment.snow.profile import BARE_M, FILM_M, PRESSED, profile_of, share_covered
+from augment.track import Track
+from recipes.snow import Snow
+from tests.snow_beds import bed_of_cells, cells_on_grid, grid_surface, level_bed, looking, scene_of
+
+CELL_M = 0.05
+SUN = (0.8, 0.0, 0.6)
+LIGHT = Illumination(SUN, (0.95, 0.94, 0.92), (0.62, 0.68, 0.78), 0.3)
+CALM = {"wind": {"drift": 0}, "grain": 0, "tracks": "never"}
+FAR_AWAY = scene_of(grid_surface(np.zeros((1, 1)), CELL_M, corner_m=(-90.0, -90.0)))
+
+
+def _lay(bed, scene=FAR_AWAY, *, seed=3, water=None, light=LIGHT, **options) -> SnowCover:
+    return lay_snow(bed, scene, Snow(**options), light, seed=seed, water_level_z_m=water)
+
+
+def _depths(cells, *, seed=3, water=None, **options) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    profile = profile_of(Snow(**options), rng, on_ground=True, water_level_z_m=water)
+    return find_depths(cells, profile, np.uint64(seed)).heights
+
+
+def _alpha(cover, camera) -> torch.Tensor:
+    out = rasterize(cover.parts_for(FAR_AWAY, camera), camera, buffers=(RGB, ALPHA))
+    assert out.alpha is not None
+    return out.alpha
+
+
+def _colors(gaussians) -> torch.Tensor:
+    return gaussians.sh[:, 0] * SH_C0 + 0.5
+
+
+# --- depth ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("depth_m", [0.05, 0.3, 2.0])
+@pytest.mark.parametrize("drift", [0.0, 0.3, 1.0])
+def test_median_depth_on_open_ground_is_the_recipes(depth_m, drift):
+    """Over 60 m, some hundreds of the widest drifts: the median may be a few per cent off."""
+    bed = level_bed(60.0, 0.2)
+    heights = _depths(bed.ground, depth_m=depth_m, wind={"drift": drift}, tracks="never")
+    assert abs(np.median(heights) / depth_m - 1) < (0.03 if drift < 1 else 0.06)
+    assert heights.min() >= depth_m / 4.1 and heights.max() <= depth_m * 4.1
+
+
+def test_drifts_grow_with_the_wind_and_stay_gentle_in_deep_snow():
+    ground = level_bed(30.0, 0.1).ground
+    calm, breezy, stormy = (
+        _depths(ground, depth_m=0.2, wind={"drift": d}, grain=0) for d in (0, 0.3, 1)
+    )
+    assert calm.std() < 0.5 * breezy.std() < 0.4 * stormy.std()
+    deep = _depths(ground, depth_m=3.0, wind={"drift": 0.3}).reshape(300, 300)
+    assert np.abs(np.diff(deep, axis=0) / 0.1).mean() < 0.15  # a rise of 15 % would be choppy
+
+
+def test_wind_piles_snow_up_before_obstacles_and_takes_it_from_their_lee():
+    options = {"depth_m": 0.1, "wind": {"drift": 0.5, "direction_deg": 90}}
+    before, beside, behind = (
+        np.median(_depths(level_bed(10.0, 0.1, banks=banks).ground, **options))
+        for banks in ((0.0, 0.8), (0.8, 0.0), (0.0, -0.8))
+    )
+    assert before > 1.2 * beside and behind < 0.95 * beside
+
+
+def test_layer_is_rounded_at_open_edges_and_nowhere_else():
+    """A quarter of a circle: sqrt(1 - (1 - t)^2) of the depth, t depths from the edge."""
+    depth_m = 0.4
+    z = np.zeros((80, 80))
+    z[38:42, 38:42] = np.nan
+    cells = cells_on_grid(z, CELL_M)
+    heights = _depths(cells, depth_m=depth_m, **CALM)
+    t = np.minimum(cells.edge_m.numpy() / depth_m, 1)
+    ratio = heights / (depth_m * np.sqrt(1 - (1 - t) ** 2))
+    assert abs(np.median(ratio) - 1) < 0.03 and ratio.std() < 0.05
+    flush = _depths(cells_on_grid(z, CELL_M, holes=FLUSH), depth_m=depth_m, **CALM)
+    assert flush.min() > 0.85 * depth_m
+
+
+# --- patches --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("depth_m", "coverage"), [(0.1, 0.5), (0.1, 0.1), (0.004, 1), (0.002, 0.6), (0.01, 0.9)]
+)
+def test_share_of_level_ground_that_carries_snow(depth_m, coverage):
+    snow = Snow(depth_m=depth_m, coverage=coverage)
+    expected = coverage * (1 - math.exp(-depth_m / 0.004))
+    assert math.isclose(share_covered(snow), expected, rel_tol=1e-9)
+    heights = _depths(level_bed(100.0, 0.2).ground, depth_m=depth_m, coverage=coverage)
+    assert abs((heights > 0).mean() - expected) < 0.02
+    assert (heights[heights > 0] >= BARE_M).all()
+
+
+def test_patches_are_metres_wide_and_thin_out_at_their_rims():
+    heights = _depths(level_bed(40.0, CELL_M).ground, depth_m=0.1, coverage=0.5, **CALM)
+    covered = heights.reshape(800, 800) > 0
+    ends = np.diff(covered.astype(np.int8), axis=0) != 0
+    mean_run_m = 40.0 * 800 / (ends.sum() + 800)
+    assert 0.3 < mean_run_m < 3
+    beside_bare = np.zeros_like(covered)
+    beside_bare[:-1] |= ends
+    beside_bare[1:] |= ends
+    rims = heights.reshape(800, 800)[beside_bare & covered]
+    assert np.median(rims) < 0.03 < 0.08 < np.median(heights[heights > 0])
+
+
+def test_more_coverage_never_bares_what_was_covered():
+    ground = level_bed(20.0, 0.1).ground
+    some, more = (_depths(ground, depth_m=0.1, coverage=c, **CALM) for c in (0.3, 0.7))
+    assert (more >= some).all() and (more > some).any()
+
+
+# --- tracks and water -----------------------------------------------------------------------------
+
+
+def _rutted():
+    tracks = np.zeros((100, 60))
+    tracks[:, 20:26] = 1.0
+    return cells_on_grid(np.zeros((100, 60)), CELL_M, tracks=tracks)
+
+
+@pytest.mark.parametrize(
+    ("depth_m", "tracks", "shown"),
+    [
+        (0.1, "auto", True),
+        (0.3, "auto", True),
+        (0.31, "auto", False),
+        (0.31, "always", True),
+        (0.1, "never", False),
+    ],
+)
+def test_tracks_are_pressed_where_the_recipe_says(depth_m, tracks, shown):
+    cells = _rutted()
+    heights = _depths(cells, depth_m=depth_m, tracks=tracks)
+    rut = cells.tracks.numpy() == 1
+    ratio = np.median(heights[rut]) / np.median(heights[~rut])
+    assert abs(ratio - (1 - PRESSED if shown else 1)) < 0.1
+
+
+def test_tracks_keep_a_film_and_are_grey():
+    cells = _rutted()
+    cover = _lay(bed_of_cells(cells), depth_m=0.02, coverage=1.0)
+    heights = _depths(cells, depth_m=0.02)
+    rut = cells.tracks.numpy() == 1
+    assert np.quantile(heights[rut & (heights > 0)], 0.2) >= 0.9 * FILM_M
+    means = cover.ground.gaussians.means
+    colors = _colors(cover.ground.gaussians)
+    inside = (means[:, 1] > 1.07) & (means[:, 1] < 1.23)
+    dark, bright = colors[inside].mean(0), colors[~inside].mean(0)
+    assert 0.5 < dark.mean() / bright.mean() < 0.85
+    assert (dark.max() - dark.min()) < 0.6 * (bright.max() - bright.min())
+
+
+def test_no_snow_below_the_waters_edge():
+    """Ground that rises by 2 m over 10 m, in water 1 m deep at its foot."""
+    z = np.broadcast_to(np.linspace(0, 2, 200)[:, None], (200, 40)).copy()
+    cells = cells_on_grid(z, CELL_M)
+    cover = _lay(bed_of_cells(cells), depth_m=0.1, water=1.0, tracks="never")
+    bed_z = cover.ground.gaussians.means[:, 0] * 0.2
+    assert bed_z.min() > 1.0 and bed_z.min() < 1.03
+    heights = _depths(cells, depth_m=0.1, water=1.0, tracks="never")
+    low = cells.centers_m[:, 2].numpy() < 1.005
+    assert not heights[low].any()
+    assert (heights[~low] > 0).mean() > 0.99
+    assert not len(_lay(bed_of_cells(cells), depth_m=0.1, water=5.0).ground.gaussians)
+
+
+# --- closed surfaces ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("grain", [0.0, 1.0])
+@pytest.mark.parametrize("depth_m", [0.05, 0.4])
+def test_level_layer_lets_no_light_through(depth_m, grain):
+    """At most 2 %, from above and from a car's height; half a metre of the bed's border is left."""
+    cover = _lay(level_bed(6.0), depth_m=depth_m, grain=grain)
+    for eye in ((3, 3, 5), (3, 3, 1.5), (-2.0, 3, 1.6)):
+        camera = looking(eye, (3, 3, 0), 240, 160, 260.0)
+        rays = camera.ray_directions(torch.float64)
+        reach = -(eye[2] - depth_m) / rays[..., 2]
+        hit = camera.centre + reach[..., None] * rays
+        inside = (reach > 0) & ((hit[..., :2] - 3).abs() < 2.5).all(-1)
+        assert inside.sum() > 2000
+        assert _alpha(cover, camera)[inside].min() > 0.98
+
+
+def test_edge_is_as_sharp_as_a_cell():
+    cover = _lay(level_bed(4.0, border=OPEN_EDGE), depth_m=0.02, grain=0.5, tracks="never", seed=1)
+    camera = looking((2, 4, 3), (2, 4, 0), 120, 400, 2000.0)
+    alpha = _alpha(cover, camera).numpy()  # rows run towards -y
+    pixel_m = 2.98 / 2000
+    widths, middles = [], []
+    for column in alpha.T:
+        if column[-1] < 0.9:
+            continue  # a bare patch
+        low, middle, high = ((column > share).argmax() for share in (0.1, 0.5, 0.9))
+        widths.append((high - low) * pixel_m)
+        middles.append((200 - middle) * pixel_m)
+    assert len(widths) > 60
+    assert np.median(widths) < 1.2 * CELL_M and max(widths) < 1.6 * CELL_M
+    assert abs(np.median(middles)) < 0.4 * CELL_M  # from the bed's border
+
+
+@pytest.mark.parametrize("depth_m", [0.2, 0.5, 2.0])
+def test_sides_of_a_deep_layer_are_closed(depth_m):
+    cover = _lay(level_bed(3.0, border=OPEN_EDGE), depth_m=depth_m)
+    height = 0.3 * depth_m
+    camera = looking((1.5, -4 - 3 * depth_m, height), (1.5, 1.5, height), 300, 200, 300.0)
+    rays = camera.ray_directions(torch.float64)
+    hit = camera.centre - camera.centre[1] / rays[..., 1:2] * rays
+    margin = 0.3 + 0.3 * min(depth_m, 1.0)
+    inside = (hit[..., 0] > margin) & (hit[..., 0] < 3 - margin)
+    inside &= (hit[..., 2] > 0.03) & (hit[..., 2] < 0.45 * depth_m)
+    assert inside.sum() > 50
+    assert _alpha(cover, camera)[inside].min() > 0.97
+
+
+def test_thin_snow_hangs_no_curtain_over_a_step_of_the_ground():
+    z = np.zeros((40, 40))
+    z[20:] = 0.5
+    gaussians = _lay(bed_of_cells(cells_on_grid(z, CELL_M)), depth_m=0.05).ground.gaussians
+    assert len(gaussians) == 1600
+    assert ((gaussians.means[:, 2] < 0.15) | (gaussians.means[:, 2] > 0.5)).all()
+
+
+def test_deep_snow_evens_out_the_grounds_relief():
+    rough = np.random.default_rng(1).normal(0, 0.02, (100, 100))
+    bed = bed_of_cells(cells_on_grid(rough, CELL_M))
+    steps = []
+    for depth_m in (0.05, 0.4):
+        z = _lay(bed, depth_m=depth_m, **CALM).ground.gaussians.means[:, 2].reshape(100, 100)
+        steps.append(z.diff(dim=0)[10:-10, 10:-10].std())
+    assert steps[1] < 0.35 * steps[0] and steps[0] < 0.03
+
+
+def test_discs_lie_in_the_surface_of_a_slope():
+    """A plane of 30 degrees: discs' middles above it by the depth, their thin axes along it."""
+    slope = math.tan(math.radians(30))
+    z = np.broadcast_to(slope * np.arange(80)[:, None] * CELL_M, (80, 80)).copy()
+    cells = cells_on_grid(z, CELL_M)
+    gaussians = _lay(bed_of_cells(cells), depth_m=0.1, **CALM).ground.gaussians
+    w, x, y, v = gaussians.quats.T
+    thin = torch.stack([2 * (x * v + w * y), 2 * (y * v - w * x), 1 - 2 * (x * x + y * y)], 1)
+    expected = torch.tensor([-slope, 0.0, 1.0]) / math.hypot(slope, 1)
+    angles = torch.rad2deg(torch.acos((thin @ expected).clamp(-1, 1)))
+    assert angles.median() < 4 and angles.max() < 20
+    assert (gaussians.quats.norm(dim=1) - 1).abs().max() < 1e-5
+    above = gaussians.means[:, 2] - slope * (gaussians.means[:, 0] - CELL_M / 2)
+    assert abs(above.median() - 0.1) < 0.01
+    assert (gaussians.scales[:, 0] >= gaussians.scales[:, 1]).all()
+
+
+# --- colour ---------------------------------------------------------------------------------------
+
+
+def _slope_facing(sign: float):
+    z = np.broadcast_to(-sign * 0.4 * np.arange(40)[:, None] * CELL_M, (40, 40)).copy()
+    return bed_of_cells(cells_on_grid(z, CELL_M))
+
+
+def test_colours_follow_the_sun_and_stay_between_shade_and_light():
+    facing, away = (
+        _colors(_lay(_slope_facing(s), depth_m=0.1).ground.gaussians).mean(0) for s in (1, -1)
+    )
+    assert (facing > away + 0.05).all()
+    assert facing.max() < 1.0 and away.min() > 0.55
+    assert away[2] - away[0] > facing[2] - facing[0] + 0.03  # bluish where the sun is low
+
+
+def test_shadows_of_the_recording_are_bluish_snow_not_dirt():
+    light = np.ones((40, 40))
+    light[:20] = 0.3
+    bed = bed_of_cells(cells_on_grid(np.zeros((40, 40)), CELL_M, light=light))
+    gaussians = _lay(bed, depth_m=0.1).ground.gaussians
+    shaded = _colors(gaussians)[gaussians.means[:, 0] < 0.7].mean(0)
+    lit = _colors(gaussians)[gaussians.means[:, 0] > 1.3].mean(0)
+    assert (shaded - torch.tensor(LIGHT.shadow_rgb)).abs().max() < 0.03
+    assert lit[0] - shaded[0] > lit[2] - shaded[2] + 0.05
+
+
+def test_grain_shows_in_sizes_and_colours():
+    smooth, coarse = (
+        _lay(level_bed(4.0), depth_m=0.1, grain=g, tracks="never").ground.gaussians for g in (0, 1)
+    )
+    assert coarse.scales[:, 1].std() > smooth.scales[:, 1].std() + 0.02 * CELL_M
+    assert 0.005 < _colors(smooth).std(0).mean() < 0.5 * _colors(coarse).std(0).mean()
+
+
+def test_two_shadings_agree_where_normals_do():
+    bed = level_bed(4.0)
+    baked = _lay(bed, depth_m=0.1).ground
+    per_pixel = _lay(bed, depth_m=0.1, shading="per_pixel").ground
+    assert baked.slopes is None and per_pixel.slopes is not None and per_pixel.normals is None
+    share = (SUN[2] + LIGHT.wrap) / (1 + LIGHT.wrap)  # of a level surface
+    lit = _colors(per_pixel.gaussians) + share * per_pixel.slopes
+    assert torch.equal(baked.gaussians.means, per_pixel.gaussians.means)
+    assert (lit.mean(0) - _colors(baked.gaussians).mean(0)).abs().max() < 0.01
+    assert (per_pixel.slopes >= 0).all()
+    part = _lay(bed, depth_m=0.1, shading="per_pixel").parts_for(
+        FAR_AWAY, looking((2, 2, 3), (2, 2, 0))
+    )[-1]
+    assert part.is_snow and part.shading is not None and part.shading.sun == SUN
+
+
+# --- what it buries -------------------------------------------------------------------------------
+
+
+def test_gaussians_are_buried_where_all_their_cells_carry_snow():
+    scene = scene_of(grid_surface(np.zeros((10, 10)), 0.5))
+    before = scene.background.opacities.clone()
+    cells = level_bed(10.0, 0.1).ground
+    heights_scene = {"depth_m": 0.1, "coverage": 0.5}
+    rng = np.random.default_rng(0)
+    buried_by = torch.from_numpy(rng.integers(0, len(cells), (60, 5), np.int32))
+    buried_by[:40, 1:] = buried_by[:40, :1]
+    buried_by[::7, 4] = -1
+    cells = dataclasses.replace(
+        cells, buried=torch.arange(20, 80, dtype=torch.int32), buried_by=buried_by
+    )
+    cover = _lay(bed_of_cells(cells), scene, **heights_scene)
+    snowy = set()
+    for x, y in cover.ground.gaussians.means[:, :2].tolist():  # no disc leaves its cell
+        snowy.add((math.floor(x / 0.1), math.floor(y / 0.1)))
+    places = [tuple(np.floor(c / 0.1).astype(int)) for c in cells.centers_m[:, :2].numpy()]
+    expected = before.clone()
+    for number, row in enumerate(buried_by.tolist()):
+        if all(c >= 0 and places[c] in snowy for c in row):
+            expected[20 + number] = 0
+    assert 5 < (expected == 0).sum() < 55
+    assert torch.equal(cover.ground.opacities, expected)
+    assert torch.equal(scene.background.opacities, before)
+
+
+# --- actors ---------------------------------------------------------------------------------------
+
+
+def _driving_scene(yaw: float, bed_cells):
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    turn = torch.tensor([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]], dtype=torch.float64)
+    pose = rigid(turn, torch.tensor([5.0, 2.0, 1.0], dtype=torch.float64))
+    track = Track(torch.tensor([0, 10]), torch.stack([pose, pose]))
+    roof = grid_surface(np.zeros((4, 4)), 0.5, corner_m=(-1.0, -1.0))
+    actor = Actor("car", "car", roof, track, (2.0, 2.0, 1.0))
+    scene = scene_of(FAR_AWAY.background, (actor,))
+    return scene, bed_of_cells(level_bed(0.1).ground, car=bed_cells)
+
+
+@pytest.mark.parametrize("shading", ["per_splat", "per_pixel"])
+def test_snow_on_a_vehicle_is_carried_along_and_lit_where_it_stands(shading):
+    """A slope of the vehicle that faces the sun is bright, and dull once it has turned round."""
+    cells = _slope_facing(1).ground
+    brightness = []
+    for yaw in (0.0, math.pi):
+        scene, bed = _driving_scene(yaw, cells)
+        cover = _lay(bed, scene, depth_m=0.1, shading=shading)
+        snow = cover.parts_for(scene, looking((5, 2, 9), (5, 2, 0)))[-1]
+        assert snow.is_snow and snow.instance_id == 1 and snow.world_from_part is not None
+        if shading == "per_splat":
+            assert snow.shading is None
+            brightness.append(float(_colors(snow.gaussians).mean()))
+        else:
+            assert snow.shading is not None
+            assert abs(snow.shading.sun[0] - math.cos(yaw) * SUN[0]) < 1e-9
+    if shading == "per_splat":
+        assert brightness[0] > brightness[1] + 0.1
+
+
+def test_snow_on_vehicles_has_no_ruts_and_is_each_ones_own():
+    tracks = np.ones((60, 60))
+    cells = cells_on_grid(np.zeros((60, 60)), CELL_M, tracks=tracks)
+    scene, bed = _driving_scene(0.0, cells)
+    cover = _lay(bed, scene, depth_m=0.1, water=100.0)
+    car = cover.actors["car"]
+    assert not len(cover.ground.gaussians)  # under water, which the vehicle's is not asked about
+    assert abs(car.gaussians.means[:, 2].median() - 0.1) < 0.02
+    ground = _lay(bed_of_cells(cells), depth_m=0.1, tracks="never").ground
+    assert not torch.equal(ground.gaussians.means, car.gaussians.means)
+
+
+# --- glints ---------------------------------------------------------------------------------------
+
+
+def test_sparkle_adds_a_few_glints_that_change_with_the_view():
+    bed = level_bed(8.0)
+    camera = looking((2.0, 4.0, 1.5), (6.0, 4.0, 0.0))
+    counts = []
+    for sparkle in (0.0, 0.3, 1.0):
+        cover = _lay(bed, depth_m=0.1, sparkle=sparkle)
+        parts = cover.parts_for(FAR_AWAY, camera)
+        counts.append(len(parts[-1].gaussians) if len(parts) > 2 else 0)
+    assert counts[0] == 0 < 2 * counts[1] < counts[2] < 0.05 * 160 * 160
+    glints = cover.parts_for(FAR_AWAY, camera)[-1]
+    assert glints.is_snow and glints.gaussians.scales.max() < 0.005
+    moved = cover.parts_for(FAR_AWAY, looking((2.6, 4.3, 1.5), (6.0, 4.0, 0.0)))[-1]
+    here, there = (set(map(tuple, p.gaussians.means.tolist())) for p in (glints, moved))
+    assert len(here & there) < 0.6 * len(here)
+    overcast = Illumination(SUN, LIGHT.lit_rgb, LIGHT.lit_rgb, 0.3)
+    assert _lay(bed, depth_m=0.1, sparkle=1.0, light=overcast).ground.crystals is None
+
+
+# --- extremes -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("shading", ["per_splat", "per_pixel"])
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"depth_m": 1e-4},
+        {"depth_m": 10.0, "wind": {"drift": 1.0}, "sparkle": 1.0},
+        {"depth_m": 0.1, "coverage": 0.001},
+        {"depth_m": 1e-12},
+    ],
+)
+@pytest.mark.parametrize(
+    "bed",
+    [
+        level_bed(8.0, 0.1, border=OPEN_EDGE),
+        level_bed(CELL_M, border=OPEN_EDGE),
+        level_bed(CELL_M),
+        level_bed(60.0, 10.0),
+        level_bed(0.01, 0.001),
+        level_bed(2.0, corner_m=(1e6, -1e6)),
+        bed_of_cells(cells_on_grid(np.full((3, 3), np.nan))),
+    ],
+    ids=["edges", "one open", "one", "10 m", "1 mm", "far", "none"],
+)
+def test_extremes_stay_finite(bed, options, shading):
+    cover = _lay(bed, shading=shading, **options)
+    snow = cover.ground.gaussians
+    for values in (snow.means, snow.quats, snow.scales, snow.opacities, snow.sh):
+        assert torch.isfinite(values).all()
+    assert (snow.scales > 0).all() and (snow.opacities == OPACITY).all()
+    assert snow.semantic is not None and (snow.semantic == int(SemanticClass.SNOW)).all()
+    assert cover.thickness_m == options["depth_m"]
+    if options["depth_m"] == 10.0:
+        assert (len(snow) > 0) == (len(bed.ground) > 0)
+
+
+@pytest.mark.parametrize("options", [{"depth_m": 0.0}, {"depth_m": 0.1, "coverage": 0.0}])
+def test_no_snow_leaves_the_parts_own_tensors(options):
+    cover = _lay(level_bed(2.0), **options)
+    assert not len(cover.ground.gaussians)
+    assert cover.ground.opacities is FAR_AWAY.background.opacities
+
+
+def test_same_bits_for_any_number_of_threads_and_another_seed_is_another_snow():
+    bed = level_bed(8.0, 0.1, border=OPEN_EDGE)
+    layers = []
+    for count in (1, 2):
+        limit_threads(count)
+        try:
+            layers.append(_lay(bed, depth_m=0.3, coverage=0.7).ground.gaussians)
+        finally:
+            limit_threads(None)
+    for name in ("means", "quats", "scales", "sh"):
+        assert torch.equal(getattr(layers[0], name), getattr(layers[1], name))
+    other = _lay(bed, depth_m=0.3, coverage=0.7, seed=4).ground.gaussians
+    assert len(other) != len(layers[0]) or not torch.equal(other.means, layers[0].means)
