@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -19,6 +19,7 @@ _INLAND_M = 0.15  # but not near an open edge, where it may be a wall's top
 _SIGMAS = 1.5
 
 
+@runtime_checkable
 class NumbersCells(Protocol):
     """Tells which cell is under a point."""
 
