@@ -64,7 +64,7 @@ def test_gradients_stay_finite_at_every_cut_off(dtype):
     settings = RasterSettings(antialiased=True)
     output = render(Gaussians(**tensors), camera_ahead(), settings, smog)
     total = output.rgb.sum() + output.alpha.sum() + output.expected_depth.sum()
-    (total + output.median_depth.sum()).backward()
+    (total + output.median_depth.sum() + output.mode_depth.sum()).backward()
     for name, tensor in tensors.items():
         assert tensor.grad is not None
         assert bool(torch.isfinite(tensor.grad).all()), name
