@@ -9,42 +9,21 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from augment.cameras import Camera
 from augment.scene import Scene
+from augment.snow.bed_files import bed_key, load_bed, save_bed
+from augment.snow.beds import bed_of, bed_path, remember_bed
+from augment.snow.covers import placement_settings
+from augment.snow.placement import PlacementSettings
 from recipes.schema import Recipe
-
-if TYPE_CHECKING:  # imported where it is used, for it brings the rasteriser
-    from augment.snow.placement import PlacementSettings
-
-
-@dataclass(frozen=True)
-class BedNeed:
-    """What of a recipe's snow its bed depends on; its depth does not matter."""
-
-    cell_m: float
-    max_slope_deg: float
-
-    @staticmethod
-    def of(recipe: Recipe) -> BedNeed | None:
-        """None where no snow is to be laid."""
-        snow = recipe.weather.snow
-        if snow is None or snow.depth_m == 0 or snow.coverage == 0:
-            return None
-        return BedNeed(snow.cell_m, snow.max_slope_deg)
-
-    def settings(self) -> PlacementSettings:
-        from augment.snow.placement import PlacementSettings
-
-        return PlacementSettings(cell_m=self.cell_m, max_slope_deg=self.max_slope_deg)
 
 
 @dataclass(frozen=True)
 class StoredBed:
     """A bed in its file; small, and picklable."""
 
-    need: BedNeed
+    settings: PlacementSettings
     path: str
     key: str
 
@@ -54,10 +33,15 @@ class StoredBed:
         Raises:
             SceneError: the file is lost or damaged.
         """
-        from augment.snow.bed_files import load_bed
-        from augment.snow.beds import remember_bed
+        remember_bed(scene, self.settings, load_bed(Path(self.path), self.key))
 
-        remember_bed(scene, self.need.settings(), load_bed(Path(self.path), self.key))
+
+def bed_settings(recipe: Recipe) -> PlacementSettings | None:
+    """How the bed of the recipe's snow is found; None where no snow is to be laid."""
+    snow = recipe.weather.snow
+    if snow is None or snow.depth_m == 0 or snow.coverage == 0:
+        return None
+    return placement_settings(snow)
 
 
 def find_beds(
@@ -79,20 +63,20 @@ def find_beds(
     seeing = cameras
     if seeing is None:
         seeing = [camera for frame in scene.frames for camera in frame.cameras.values()]
-    needs = dict.fromkeys(need for recipe in recipes if (need := BedNeed.of(recipe)) is not None)
-    return tuple(_find_bed(scene, need, folder, seeing, progress) for need in needs)
+    wanted = dict.fromkeys(s for recipe in recipes if (s := bed_settings(recipe)) is not None)
+    return tuple(_find_bed(scene, settings, folder, seeing, progress) for settings in wanted)
 
 
 def _find_bed(
-    scene: Scene, need: BedNeed, folder: Path, cameras: Sequence[Camera], progress: bool
+    scene: Scene,
+    settings: PlacementSettings,
+    folder: Path,
+    cameras: Sequence[Camera],
+    progress: bool,
 ) -> StoredBed:
-    from augment.snow.bed_files import bed_key, save_bed
-    from augment.snow.beds import bed_of, bed_path
-
-    settings = need.settings()
     bed = bed_of(scene, settings, cameras=cameras, folder=folder, progress=progress)
     key = bed_key(scene, cameras, settings)
     path = bed_path(folder, key)
     if not path.is_file():  # this process knew the bed from a job in another folder
         save_bed(path, bed, key)
-    return StoredBed(need, str(path), key)
+    return StoredBed(settings, str(path), key)

@@ -20,7 +20,9 @@ from augment.errors import AdapterError
 from augment.labels import Boxes, LidarSweep
 from augment.scene import Gaussians, Scene
 from augment.sky import ConstantSky
+from augment.snow.beds import bed_of
 from augment.snow.cells import OPEN_EDGE, SnowBed, SnowCells
+from augment.snow.placement import PlacementSettings
 from recipes.flood import Flood
 from recipes.schema import Output, Recipe, Smog, Weather
 from recipes.snow import Snow
@@ -220,9 +222,6 @@ def make_bed(x_m: float) -> SnowBed:
 
 def bed_render(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str) -> FakeView:
     """As `fake_render`, with the number that `make_bed` was given in the first pixel's red."""
-    from augment.snow.beds import bed_of
-    from augment.snow.placement import PlacementSettings
-
     snow = recipe.weather.snow
     assert snow is not None
     bed = bed_of(scene, PlacementSettings(cell_m=snow.cell_m, max_slope_deg=snow.max_slope_deg))

@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import pytest
 import torch
 from batch_scenes import (
@@ -20,7 +21,7 @@ from batch_scenes import (
 )
 
 from augment.batch.job import JobResult, RenderJob, run_job
-from augment.batch.snow_beds import BedNeed, find_beds
+from augment.batch.snow_beds import bed_settings, find_beds
 from augment.cameras import Frame
 from augment.dataset import SceneDataset
 from augment.errors import OutputError, SceneError
@@ -109,7 +110,7 @@ def test_without_snow_there_is_no_search(placements, tmp_path: Path, snow) -> No
     placements.before = pytest.fail
     result = run(RenderJob("fake:street", [make_recipe(snow=snow)], tmp_path))
     assert result.written == 8 and "place" not in result.timings
-    assert BedNeed.of(make_recipe(snow=snow)) is None
+    assert bed_settings(make_recipe(snow=snow)) is None
 
 
 def test_a_finished_job_searches_for_nothing(placements, tmp_path: Path) -> None:
@@ -216,3 +217,21 @@ def test_live_samples_share_one_search(placements) -> None:
     again.__setstate__({**state, "scene": open_fake("fake:street")})  # as a worker receives it
     placements.before = pytest.fail
     assert all(torch.equal(again[k]["image"], images[k]) for k in range(2))
+
+
+def test_the_librarys_own_snow_does_not_depend_on_how_a_job_went(tmp_path: Path) -> None:
+    """Real beds and real pictures: whole, by two workers, and in parts that search anew."""
+    recipe = snowy(0.15, cell_m=0.2)
+    whole, shared, parts = (tmp_path / name for name in ("whole", "shared", "parts"))
+    result = run(RenderJob("fake:street", [recipe], whole), None)
+    assert (result.written, result.failures) == (8, ())
+    assert run(RenderJob("fake:street", [recipe], shared, workers=2), None).failures == ()
+    run(RenderJob("fake:street", [recipe], parts, frames=[2], cameras=["front"]), None)
+    for bed in (parts / ".climategs").glob("snow-*"):
+        bed.unlink()
+    assert run(RenderJob("fake:street", [recipe], parts), None).skipped == 1
+    for out in (shared, parts):
+        assert tree_digest(out / "street") == tree_digest(whole / "street")
+        assert (out / "manifest.parquet").read_bytes() == (whole / "manifest.parquet").read_bytes()
+    masks = [cv2.imread(str(path), cv2.IMREAD_UNCHANGED) for path in whole.rglob("snow/*/*.png")]
+    assert len(masks) == 8 and max(mask.mean() for mask in masks) > 0
