@@ -36,8 +36,9 @@ def splat_inputs(
     addresses = np.array(bases, np.uint64) + starts[:, None].astype(np.uint64) * np.array(
         strides, np.uint64
     )
+    unlit = np.zeros((len(starts), 1), np.uint64)  # no part has slopes of light
     return Inputs(
-        addresses=np.ascontiguousarray(addresses),
+        addresses=np.concatenate([addresses, unlit], 1),
         sizes=np.stack([counts, np.full_like(counts, functions)], 1),
         first_ids=starts.copy(),
         views=part_views(poses, camera, settings, None),

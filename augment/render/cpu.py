@@ -22,7 +22,7 @@ import numpy as np
 import torch
 
 from augment.cameras import Camera
-from augment.render import cpu_bin, cpu_blend, cpu_clip, cpu_project
+from augment.render import cpu_bin, cpu_blend, cpu_clip, cpu_project, cpu_shading
 from augment.render import cpu_layout as layout
 from augment.render.buffers import (
     ALPHA,
@@ -161,6 +161,7 @@ class Splats:
     found: np.ndarray
     counts: np.ndarray
     cuts: np.ndarray | None
+    lights: np.ndarray | None
 
 
 def project(
@@ -173,6 +174,9 @@ def project(
     blocks = len(inputs.blocks)
     is_cut = bool(inputs.modes[layout.M_CLIP])
     cuts = scratch.array("cuts", (cpu_clip.CUT * (inputs.slots if is_cut else 1),), np.float32)
+    is_lit = bool(inputs.modes[layout.M_LIGHT])
+    lights = (cpu_shading.LINES * (inputs.slots if is_lit else 1),)
+    lights = scratch.array("lights", lights, np.float32)
     splats = Splats(
         scratch.array("records", (inputs.slots * layout.RECORD,), np.float32),
         scratch.array("rects", (inputs.slots,), np.uint64),
@@ -180,6 +184,7 @@ def project(
         scratch.array("found", (blocks,), np.int64),
         scratch.array("bin_counts", (blocks, bins[1] - bins[0]), np.int32),
         cuts if is_cut else None,
+        lights if is_lit else None,
     )
     cpu_project.project_slice(
         inputs.addresses,
@@ -197,6 +202,7 @@ def project(
         splats.found,
         splats.counts,
         cuts,
+        lights,
     )
     return splats
 
@@ -236,6 +242,8 @@ class Tiles:
                 TRANSMITTANCE_STOP,
                 camera.is_orthographic,
                 settings.mode_depth_floor_m,
+                camera.fx**-2,
+                camera.fy**-2,
             ],
             np.float32,
         )
@@ -300,6 +308,7 @@ class Tiles:
             self.limits,
             *self._images,
             splats.cuts,
+            splats.lights,
         )
 
     def list_all(self, slots: np.ndarray, rects: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

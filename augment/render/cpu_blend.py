@@ -43,6 +43,15 @@ from augment.render.cpu_layout import (
 )
 from augment.render.cpu_math import exp2
 from augment.render.cpu_mode import MODE, MODE_PLANES, add_sample, can_grow, close_clusters
+from augment.render.cpu_shading import (
+    L_BLUE,
+    L_GREEN,
+    L_RED,
+    LIT,
+    is_lit,
+    light_share,
+    stage_lights,
+)
 
 GROUP = 8  # tiles a thread takes at a time
 
@@ -75,14 +84,16 @@ def blend_tiles(
     mode,
     snow,
     cuts,
+    lights,
 ):
     """Blend one slice of z into every open tile; write the pixels of those that end.
 
     records: flat float32. members, starts: lists of slots. tiles: uint8 [tiles], CLOSED, OPEN or
     FRESH, updated. states: float32 [tiles * used part of STATE], where open tiles wait for the
     next slice. size: image width and height. limits: float32, alpha_max, log2(ALPHA_MIN),
-    TRANSMITTANCE_STOP, 1 where rays are parallel, mode depth's floor. rgb to snow: flat images; all
-    but alpha may be None. cuts: flat, of each slot as cpu_clip has them, or None.
+    TRANSMITTANCE_STOP, 1 where rays are parallel, mode depth's floor, 1/fx^2, 1/fy^2. rgb to snow:
+    flat images; all but alpha may be None. cuts, lights: flat, of each slot as cpu_clip and
+    cpu_shading have them, or None.
     """
     columns = (size[0] + TILE_W - 1) // TILE_W
     used = states.size // tiles.size
@@ -95,6 +106,7 @@ def blend_tiles(
         lines = np.empty(LINES, np.float32)
         edges = np.empty(ITEMS, np.float32)
         surfaces = np.empty(ITEMS, np.float32)
+        lit = np.empty(LIT, np.float32)
         rows = np.empty(2 * STRIPS, np.int64)
         for tile in range(group * GROUP, min((group + 1) * GROUP, tiles.size)):
             first, last = starts[tile], starts[tile + 1]
@@ -108,7 +120,7 @@ def blend_tiles(
             is_open = _blend_list(
                 records, members, first, last, np.float32(left), np.float32(top), limits,
                 state, staged, spans, values, places, rows, rgb, expected, median, ids, mode, snow,
-                cuts, lines, edges, surfaces,
+                cuts, lines, edges, surfaces, lights, lit,
             )  # fmt: skip
             if is_open and not is_last:
                 _copy(state, U(0), states, U(tile * used), U(used))
@@ -167,6 +179,8 @@ def _blend_list(
     lines,
     edges,
     surfaces,
+    lights,
+    lit,
 ):
     """Blend a tile's list into its state. Returns whether any pixel still lets light through."""
     for strip in range(STRIPS):
@@ -182,6 +196,8 @@ def _blend_list(
             records, members, U(at), U(count), left, top, rgb, expected, median, ids, mode, snow,
             staged,
         )  # fmt: skip
+        if lights is not None and rgb is not None:
+            stage_lights(lights, members, U(at), U(count), lit)
         any_cut = False
         if cuts is not None:
             any_cut = stage_cuts(cuts, members, U(at), U(count), staged, expected, mode, lines)
@@ -198,19 +214,19 @@ def _blend_list(
                 list_lines(lines, SHARE, U(count), strip, spans, edges)
                 _blend_items(
                     state, staged, values, places, items, limits, rgb, expected, median, ids, mode,
-                    snow, cuts, lines, edges, surfaces,
+                    snow, cuts, lines, edges, surfaces, lights, lit,
                 )  # fmt: skip
             elif (median is not None or ids is not None or mode is not None) and _can_change(
                 state, strip, rows, median, ids, mode
             ):
                 _blend_items(
                     state, staged, values, places, items, limits, rgb, expected, median, ids, mode,
-                    snow, cuts, lines, None, surfaces,
+                    snow, cuts, lines, None, surfaces, lights, lit,
                 )  # fmt: skip
             else:
                 _blend_items(
                     state, staged, values, places, items, limits, rgb, expected, None, None, None,
-                    snow, cuts, lines, None, surfaces,
+                    snow, cuts, lines, None, surfaces, lights, lit,
                 )  # fmt: skip
             shrink(state, strip, rows)
     return not is_closed(rows)
@@ -274,6 +290,8 @@ def _blend_items(
     lines,
     edges,
     surfaces,
+    lights,
+    lit,
 ):
     """Blend all items in turn. The next one's alpha is begun before this one is blended.
 
@@ -303,6 +321,11 @@ def _blend_items(
             _add(state, at + P_RED, weight, staged[U(RED) * n + splat])
             _add(state, at + P_GREEN, weight, staged[U(GREEN) * n + splat])
             _add(state, at + P_BLUE, weight, staged[U(BLUE) * n + splat])
+        if rgb is not None and lights is not None and is_lit(lit, splat):
+            share = weight * light_share(lit, staged, values, splat, item, at, limits)
+            _add(state, at + P_RED, share, lit[U(L_RED) * n + splat])
+            _add(state, at + P_GREEN, share, lit[U(L_GREEN) * n + splat])
+            _add(state, at + P_BLUE, share, lit[U(L_BLUE) * n + splat])
         if snow is not None:
             _add(state, at + P_SNOW, weight, staged[U(IS_SNOW) * n + splat])
         if expected is not None or mode is not None:

@@ -63,6 +63,7 @@ def gather_inputs(
         g, count = part.gaussians, len(part.gaussians)
         tensors = (g.means, g.quats, g.scales, g.opacities, g.sh)
         own = [t.detach().to(torch.float32).contiguous().numpy() for t in tensors]
+        own.append(_slopes(part))
         arrays += own
         addresses.append([array.ctypes.data for array in own])
         sizes.append([count, g.sh.shape[1]])
@@ -72,15 +73,29 @@ def gather_inputs(
     poses = part_poses([part.world_from_part for part in parts])
     views = part_views(poses, camera, settings, smog, clip)
     views[:, layout.V_SNOW] = [part.is_snow for part in parts]
+    for view, part, pose in zip(views, parts, poses, strict=True):
+        if part.shading is not None:
+            sun = camera.camera_from_world.numpy()[:3, :3] @ pose[:3, :3] @ part.shading.sun
+            view[layout.V_SUN :][:3], view[layout.V_WRAP] = sun, part.shading.wrap
+            view[layout.V_LIT] = 1
+    modes = raster_modes(settings, smog, clip, with_color=with_color)
+    modes[layout.M_LIGHT] = with_color and any(part.shading is not None for part in parts)
     return Inputs(
-        addresses=np.array(addresses, np.uint64).reshape(-1, 5),
+        addresses=np.array(addresses, np.uint64).reshape(-1, 6),
         sizes=np.array(sizes, np.int64).reshape(-1, 2),
         first_ids=np.cumsum([0, *counts[:-1]], dtype=np.int64),
         views=views,
         blocks=np.array(blocks, np.int64).reshape(-1, 3),
-        modes=raster_modes(settings, smog, clip, with_color=with_color),
+        modes=modes,
         arrays=arrays,
     )
+
+
+def _slopes(part: PosedGaussians) -> np.ndarray:
+    """float32 [N, 3], or [1] for parts of splats of one colour."""
+    if part.shading is None:
+        return np.zeros(1, np.float32)
+    return part.shading.slopes.detach().to(torch.float32).contiguous().numpy()
 
 
 def part_views(

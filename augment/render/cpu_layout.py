@@ -48,10 +48,12 @@ V_CLIP_FALL = 49  # times inverse^2: how the cut's slope follows the surface's
 V_CLIP_LONGEST = 50  # most that a surface's depth may grow or shrink
 V_PARALLEL = 51  # 1 where rays are parallel, else 0
 V_SNOW = 52  # 1 where the part is snow, else 0
-VIEW = 56
+V_SUN, V_WRAP = 53, 56  # towards the light, in the camera's axes; how far it is wrapped
+V_LIT = 57  # 1 where the part is lit pixel by pixel, else 0
+VIEW = 64
 
 # How to project: int64 each.
 M_COLOR, M_FUNCTIONS, M_ANTIALIASED, M_SMOG = 0, 1, 2, 3  # M_FUNCTIONS: most SH functions
-M_CLIP = 4
-MODES = 5
+M_CLIP, M_LIGHT = 4, 5
+MODES = 6
 NO_SMOG, UNIFORM_SMOG, LAYERED_SMOG = 0, 1, 2

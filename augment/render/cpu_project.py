@@ -24,12 +24,13 @@ from augment.render.cpu_clip import (
     cut_eight,
     height_of,
 )
-from augment.render.cpu_color import COLOR_ROWS, prepare_colors, write_color
+from augment.render.cpu_color import COLOR_ROWS, THROUGH, prepare_colors, write_color
 from augment.render.cpu_geometry import (
     from_eye,
     gather3,
     image_covariance,
     inverse_divisor,
+    rotation_from_quats,
     rotation_row,
     to_camera,
     to_image,
@@ -51,9 +52,11 @@ from augment.render.cpu_layout import (
     M_CLIP,
     M_COLOR,
     M_FUNCTIONS,
+    M_LIGHT,
     M_SMOG,
     MEAN_X,
     MEAN_Y,
+    NO_SMOG,
     RADIUS_Y,
     RECORD,
     SHARP_X,
@@ -66,6 +69,7 @@ from augment.render.cpu_layout import (
     V_EXTENT,
     V_FOCAL,
     V_GAIN,
+    V_LIT,
     V_LOG_CUT,
     V_NEAR,
     V_PARALLEL,
@@ -74,13 +78,25 @@ from augment.render.cpu_layout import (
     U,
 )
 from augment.render.cpu_math import LOG2_E, floats_at, log2
+from augment.render.cpu_shading import (
+    L_FACING,
+    L_LEAN_X,
+    L_LEAN_Y,
+    L_RED,
+    L_WRAP,
+    L_X,
+    L_Y,
+    LINES,
+    light_eight,
+)
 
 # Rows of eight that the projection leaves for writing: a record, the pixels a splat covers, colour.
 _COLOR = 0
 _X_LO, _X_HI, _Y_LO, _Y_HI = (COLOR_ROWS + i for i in range(4))
 _FIELDS = COLOR_ROWS + 4
 _CUTS = _FIELDS + DEPTH + 1
-_ROWS = _CUTS + CUT
+_LIGHTS = _CUTS + CUT
+_ROWS = _LIGHTS + LINES
 _HUGE = np.float32(1e37)  # px^2; beyond it float32 overflows, and no pixel could tell
 
 
@@ -88,10 +104,10 @@ _HUGE = np.float32(1e37)  # px^2; beyond it float32 overflows, and no pixel coul
 def rank_splats(addresses, sizes, views, blocks, depths, histograms):
     """z of every Gaussian that may be seen, 0 for the others, and where along z the image is paid.
 
-    addresses: uint64 [P, 5] of means, quats, scales, opacities, sh. sizes: int64 [P, 2], Gaussians
-    and SH functions. views: float32 [P, VIEW]. blocks: int64 [B, 3], part, first and last + 1.
-    depths: float32 [B BLOCK]. histograms: float64 [C, BINS], each of C runs of blocks its own:
-    opacity times area, px^2.
+    addresses: uint64 [P, 6] of means, quats, scales, opacities, sh, and the light's slopes, which
+    are read of lit parts only. sizes: int64 [P, 2], Gaussians and SH functions. views: float32 [P,
+    VIEW]. blocks: int64 [B, 3], part, first and last + 1. depths: float32 [B BLOCK]. histograms:
+    float64 [C, BINS], each of C runs of blocks its own: opacity times area, px^2.
     """
     runs, total = histograms.shape[0], blocks.shape[0]
     for run in prange(runs):
@@ -170,6 +186,7 @@ def project_slice(
     found,
     counts,
     cuts,
+    lights,
 ):
     """Splats of the Gaussians in bins[0] <= bin of z < bins[1] that touch an open tile.
 
@@ -178,7 +195,7 @@ def project_slice(
     them; keys, uint32, the bits of z. counts: int32 [B, Z], of those in each bin of the slice.
     depth_bits: uint32, what rank_splats wrote. first_ids: int64 [P]. open_sums: int32 [rows + 1,
     columns + 1], number of open tiles above and left. modes: int64 [MODES]. cuts: CUT float32 each,
-    written where modes ask for a clip.
+    written where modes ask for a clip. lights: LINES each, where they ask for light.
     """
     for block in prange(blocks.shape[0]):
         part, first, last = blocks[block]
@@ -192,6 +209,7 @@ def project_slice(
         scales = floats_at(addresses[part, 2], count * 3)
         opacities = floats_at(addresses[part, 3], count)
         sh = floats_at(addresses[part, 4], count * functions * 3)
+        slopes = floats_at(addresses[part, 5], count * 3 if views[part, V_LIT] > 0 else 1)
         used = min(modes[M_FUNCTIONS], functions)
         slot = U(base)
         for at in range(U(0), U(taken), U(LANES)):
@@ -213,6 +231,10 @@ def project_slice(
                 if modes[M_CLIP]:
                     for field in range(U(C_REACH + 1)):
                         cuts[slot * U(CUT) + field] = rows[(U(_CUTS) + field) * U(LANES) + lane]
+                if modes[M_LIGHT]:
+                    _write_lights(
+                        slopes, splat, modes[M_SMOG], views[part], rows, lane, lights, slot
+                    )
                 keys[slot] = np.float32(records[record + U(DEPTH)]).view(np.uint32)
                 slot += U(1)
         found[block] = slot - U(base)
@@ -258,6 +280,23 @@ def _write_record(rows, lane, number, records, record):
 
 
 @inner()
+def _write_lights(slopes, splat, smog, view, rows, lane, lights, slot):
+    first = slot * U(LINES)
+    if not view[V_LIT] > np.float32(0):
+        for line in range(U(LINES)):
+            lights[first + line] = np.float32(0)
+        return
+    for line in range(U(L_RED)):
+        lights[first + line] = rows[(U(_LIGHTS) + line) * U(LANES) + lane]
+    through = np.float32(1)
+    if smog != NO_SMOG:
+        through = rows[U(THROUGH * LANES) + lane]
+    for channel in range(U(3)):
+        slope = slopes[U(splat) * U(3) + channel]
+        lights[first + U(L_RED) + channel] = through * slope
+
+
+@inner()
 def _project_eight(means, quats, scales, opacities, view, picked, at, functions, modes, rows):
     """Records, pixel boxes and colour rows of eight Gaussians, side by side in `rows`."""
     d = from_eye(means, picked, at, view)
@@ -296,6 +335,16 @@ def _project_eight(means, quats, scales, opacities, view, picked, at, functions,
         v8.store(rows, U((_CUTS + C_RIGHT) * LANES), gx)
         v8.store(rows, U((_CUTS + C_DOWN) * LANES), gy)
         v8.store(rows, U((_CUTS + C_REACH) * LANES), deep)
+    if modes[M_LIGHT] and view[V_LIT] > np.float32(0):
+        zero = v8.splat(np.float32(0))
+        ray = (zero, zero, one) if view[V_PARALLEL] > 0 else (x, y, z)
+        lines = light_eight(rotation_from_quats(quats, picked, at), ray, view)
+        v8.store(rows, U((_LIGHTS + L_FACING) * LANES), lines[0])
+        v8.store(rows, U((_LIGHTS + L_X) * LANES), lines[1])
+        v8.store(rows, U((_LIGHTS + L_Y) * LANES), lines[2])
+        v8.store(rows, U((_LIGHTS + L_WRAP) * LANES), lines[3])
+        v8.store(rows, U((_LIGHTS + L_LEAN_X) * LANES), lines[4])
+        v8.store(rows, U((_LIGHTS + L_LEAN_Y) * LANES), lines[5])
     _write_box(mean_x, radius_x, v8.splat(view[V_SIZE]), drawn, U(_X_LO), U(_X_HI), rows)
     _write_box(mean_y, radius_y, v8.splat(view[V_SIZE + 1]), drawn, U(_Y_LO), U(_Y_HI), rows)
     _write(rows, U(MEAN_X), mean_x)

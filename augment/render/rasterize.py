@@ -45,8 +45,9 @@ def rasterize(
     its own distance. clip: only what lies above, or below, a height is drawn (augment.render.clip).
     wanted: bool [H, W], the pixels that will be looked at; a backend may leave the others 0.
     backend: "cpu" (numba, float32; gradients of rgb, alpha and expected_depth, of pinhole cameras,
-    without smog or clip and where no other buffer is asked for), "reference" (torch, float32 or
-    float64, gradients of all), or "auto": cpu where it can do the job, else reference.
+    without smog, clip or light per pixel and where no other buffer is asked for), "reference"
+    (torch, float32 or float64, gradients of all), or "auto": cpu where it can do the job, else
+    reference.
 
     Raises:
         ValueError, TypeError: an argument no backend, or not the one named, can take.
@@ -111,7 +112,7 @@ def _choose(
     if dtype != torch.float32:
         obstacle = f"the Gaussians are {dtype}, it takes torch.float32"
     elif _tracked(parts):
-        what = _beyond_its_gradients(camera, buffers, smog, clip)
+        what = _beyond_its_gradients(parts, camera, buffers, smog, clip)
         obstacle = what and f"gradients {what} are asked for, it has none"
     if backend == CPU:
         if obstacle:
@@ -133,9 +134,15 @@ def _choose(
 
 
 def _beyond_its_gradients(
-    camera: Camera, buffers: frozenset[str], smog: SmogMedium | None, clip: HeightClip | None
+    parts: Sequence[PosedGaussians],
+    camera: Camera,
+    buffers: frozenset[str],
+    smog: SmogMedium | None,
+    clip: HeightClip | None,
 ) -> str | None:
     """What the cpu backend would need gradients of and has none; None where it has all."""
+    if any(part.shading is not None for part in parts):
+        return "of light per pixel"
     if smog is not None:
         return "through smog"
     if clip is not None:
@@ -193,6 +200,25 @@ def _check_arguments(
         if means.device.type != "cpu":
             raise ValueError(f"part {number} is on {means.device}; move it with .cpu()")
         _check_pose(part, number, camera)
+        _check_shading(part, number)
+
+
+def _check_shading(part: PosedGaussians, number: int) -> None:
+    if part.shading is None:
+        return
+    expected, slopes = (len(part.gaussians), 3), part.shading.slopes
+    if tuple(slopes.shape) != expected or not slopes.dtype.is_floating_point:
+        raise ValueError(
+            f"part {number}: shading.slopes must be floats {list(expected)} (from its Gaussians); "
+            f"got {slopes.dtype} {list(slopes.shape)}"
+        )
+    length = math.hypot(*part.shading.sun)
+    if not abs(length - 1) < 1e-3:  # `not <` also catches NaN
+        raise ValueError(f"part {number}: shading.sun must be of length 1; got {part.shading.sun}")
+    if not (math.isfinite(part.shading.wrap) and part.shading.wrap >= 0):
+        raise ValueError(
+            f"part {number}: shading.wrap must be finite and >= 0; got {part.shading.wrap}"
+        )
 
 
 def _check_pose(part: PosedGaussians, number: int, camera: Camera) -> None:

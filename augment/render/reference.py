@@ -41,6 +41,7 @@ from augment.render.constants import (
 )
 from augment.render.mode_depth import Clusters
 from augment.render.reference_project import Splats, order_by_depth, project_parts
+from augment.render.shading import TINY, light_share
 from augment.scene import PosedGaussians
 from augment.weather.smog import SmogMedium
 
@@ -128,7 +129,7 @@ def blend(
     # Gathered once: taking each tile's splats from all of them would make every backward step of a
     # tile as long as the scene.
     for tile, members in enumerate(splats.select(lists.members).split(sizes)):
-        args = (members, divmod(tile, lists.columns), buffers, settings, camera.is_orthographic)
+        args = (members, divmod(tile, lists.columns), buffers, settings, camera)
         if recompute and len(members):  # a backward pass would else keep every splat x pixel
             tiles.append(
                 checkpoint(blend_tile, *args, use_reentrant=False, preserve_rng_state=False)
@@ -152,7 +153,7 @@ def blend_tile(
     tile: tuple[int, int],
     buffers: frozenset[str],
     settings: RasterSettings,
-    is_orthographic: bool,
+    camera: Camera,
 ) -> RenderOutput:
     """Buffers [TILE, TILE] of the tile at (row, column). splats: its own, nearest first."""
     dtype = splats.depths.dtype
@@ -170,10 +171,12 @@ def blend_tile(
         alpha = alpha + weights.sum(0)
         if near.colors is not None:
             rgb = rgb + _weighted_sums(weights, near.colors)
+            if near.lights is not None:
+                rgb = rgb + _shaded(near, pixels, weights, camera)
         if SNOW in buffers:
             snow = snow + (weights * near.snow[:, None]).sum(0)
         if buffers & {EXPECTED_DEPTH, MODE_DEPTH}:
-            surfaces = _surface_depths(near, pixels, is_orthographic)
+            surfaces = _surface_depths(near, pixels, camera.is_orthographic)
             depth = depth + (weights * surfaces).sum(0)
             if MODE_DEPTH in buffers:
                 for row in torch.nonzero(weights.detach().any(1))[:, 0].tolist():
@@ -216,12 +219,9 @@ def blend_weights(
     grows, so the splat that would bring it to the stop and all behind it are those with
     `after <= stop`; they get no weight.
     """
-    xy, yy = splats.covs2d[:, 1:2], splats.covs2d[:, 2:3]  # [S, 1]
     dx = pixels[0] - splats.means2d[:, :1]  # [S, P]
     dy = pixels[1] - splats.means2d[:, 1:]
-    # d^T cov^-1 d with the square completed: never negative, in whatever precision.
-    along = dx - (xy / yy) * dy
-    sigma = 0.5 * (along * along * (yy / splats.dets[:, None]) + dy * dy / yy)
+    sigma = _sigmas(splats, dx, dy)
     alphas = (splats.opacities[:, None] * torch.exp2(-LOG2_E * sigma)).clamp_max(settings.alpha_max)
     alphas = torch.where(alphas >= ALPHA_MIN, alphas, torch.zeros_like(alphas))
     if splats.cuts is not None:
@@ -231,6 +231,31 @@ def blend_weights(
     before = torch.cat([transmittance[None], after[:-1]])
     weights = torch.where(after > TRANSMITTANCE_STOP, alphas * before, torch.zeros_like(alphas))
     return weights, after
+
+
+def _shaded(
+    splats: Splats,
+    pixels: Float[Tensor, "2 P"],
+    weights: Float[Tensor, "S P"],
+    camera: Camera,
+) -> Float[Tensor, "P 3"]:
+    """What the light adds to the colours of splats that are lit pixel by pixel."""
+    assert splats.lights is not None
+    dx, dy = pixels[0] - splats.means2d[:, :1], pixels[1] - splats.means2d[:, 1:]
+    reach = torch.log(splats.opacities / ALPHA_MIN).clamp_min(TINY)[:, None]
+    rim = (_sigmas(splats, dx, dy) / reach).clamp(0, 1)
+    share = light_share(splats.lights, dx, dy, rim, camera)
+    return _weighted_sums(weights * share, splats.lights[:, 6:])
+
+
+def _sigmas(
+    splats: Splats, dx: Float[Tensor, "S P"], dy: Float[Tensor, "S P"]
+) -> Float[Tensor, "S P"]:
+    """Half the squared Mahalanobis distance of pixels dx, dy away from the means."""
+    xy, yy = splats.covs2d[:, 1:2], splats.covs2d[:, 2:3]  # [S, 1]
+    # d^T cov^-1 d with the square completed: never negative, in whatever precision.
+    along = dx - (xy / yy) * dy
+    return 0.5 * (along * along * (yy / splats.dets[:, None]) + dy * dy / yy)
 
 
 def _surface_depths(

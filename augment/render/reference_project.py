@@ -27,6 +27,7 @@ from augment.render.constants import (
     RasterSettings,
 )
 from augment.render.sh import evaluate_sh
+from augment.render.shading import LINES, shading_lines
 from augment.scene import Gaussians, PosedGaussians
 from augment.weather.smog import SmogMedium, blend_airlight, optical_depth
 
@@ -54,6 +55,7 @@ class Splats:
     colors: Float[Tensor, "M 3"] | None
     snow: Float[Tensor, "M"]
     cuts: Float[Tensor, "M 6"] | None = None
+    lights: Float[Tensor, "M 9"] | None = None
 
     def __len__(self) -> int:
         return self.ids.shape[0]
@@ -85,9 +87,12 @@ def project_parts(
 ) -> Splats:
     """Splats of all parts that are in front of the camera and opaque enough, in index order."""
     projected: list[Splats] = []
+    any_light = with_color and any(part.shading is not None for part in parts)
     first_id = 0
     for part in parts:
-        projected.append(_project_part(part, first_id, camera, settings, smog, clip, with_color))
+        projected.append(
+            _project_part(part, first_id, camera, settings, smog, clip, with_color, any_light)
+        )
         first_id += len(part.gaussians)
     if len(projected) == 1:
         return projected[0]
@@ -104,6 +109,7 @@ def _project_part(
     smog: SmogMedium | None,
     clip: HeightClip | None,
     with_color: bool,
+    any_light: bool,
 ) -> Splats:
     camera_from_part = camera.camera_from_world
     if part.world_from_part is not None:
@@ -141,6 +147,14 @@ def _project_part(
         colors=colors,
         snow=torch.full_like(depths, float(part.is_snow)),
     )
+    if any_light:
+        lights = splats.depths.new_zeros(len(splats), LINES)
+        if part.shading is not None:
+            lights = _lights(part, index, rotation, points, camera)
+            if smog is not None:
+                tau = _optical_depths(gaussians, offsets, part, camera, smog)
+                lights[:, 6:] *= torch.exp(-tau)[:, None]
+        splats = dataclasses.replace(splats, lights=lights)
     if clip is None:
         return splats
     heights = clip.sign * _heights(gaussians, offsets, part, camera, clip)
@@ -263,13 +277,40 @@ def _colors(
     colors = (evaluate_sh(gaussians.sh, directions, settings.sh_degree) + 0.5).clamp_min(0)
     if smog is None:
         return colors
+    return blend_airlight(colors, _optical_depths(gaussians, offsets, part, camera, smog), smog)
+
+
+def _optical_depths(
+    gaussians: Gaussians,
+    offsets: Float[Tensor, "M 3"],
+    part: PosedGaussians,
+    camera: Camera,
+    smog: SmogMedium,
+) -> Float[Tensor, "M"]:
+    """Of the smog before every splat."""
     heights = None
     if smog.scale_height_m is not None:
         heights = gaussians.means[:, 2]
         if part.world_from_part is not None:
             heights = transform_points(part.world_from_part, gaussians.means)[:, 2]
-    tau = optical_depth(smog, offsets.norm(dim=-1), float(camera.centre[2]), heights)
-    return blend_airlight(colors, tau, smog)
+    return optical_depth(smog, offsets.norm(dim=-1), float(camera.centre[2]), heights)
+
+
+def _lights(
+    part: PosedGaussians,
+    index: Int64[Tensor, "M"],
+    rotation: Float[Tensor, "3 3"],
+    points: Float[Tensor, "M 3"],
+    camera: Camera,
+) -> Float[Tensor, "M 9"]:
+    """The lines of a shaded part's splats (augment.render.shading). points: in the camera."""
+    assert part.shading is not None
+    normals = rotmat_from_quat(part.gaussians.quats[index])[:, :, 2] @ rotation.T
+    sun = rotation @ torch.tensor(part.shading.sun, dtype=rotation.dtype)
+    towards = torch.tensor([0.0, 0, 1]).to(points).expand_as(points)
+    towards = towards if camera.is_orthographic else points
+    slopes = part.shading.slopes[index].to(rotation.dtype)
+    return shading_lines(normals, towards, slopes, sun, part.shading.wrap, camera)
 
 
 def order_by_depth(splats: Splats) -> Splats:
