@@ -10,6 +10,7 @@ from augment.snow.height_map import HeightMap
 
 DARKEST, BRIGHTEST = 0.25, 1.5
 _SPREAD_M = 0.2  # standard deviation of the blur: shadows have soft edges, gravel is not one
+_PAINT_M = 0.1  # so far beyond its own splats a marking may show
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)  # linear sRGB
 _SHARP_CELLS = 0.3  # a narrower blur leaves cells as they are
 _LEAST_WEIGHT = 0.02
@@ -32,11 +33,13 @@ def ground_luminance(
     luminance = (linear.astype(np.float32) * _LUMINANCE).sum(-1)
     out = np.full(luminance.shape, np.nan, np.float32)
     marking = classes == _MARKING
+    around = 2 * max(1, round(_PAINT_M / height_map.cell_m)) + 1
+    painted = cv2.dilate(marking.astype(np.uint8), np.ones((around, around), np.uint8)).astype(bool)
     surfaces = np.where(marking, np.int16(_ROAD), classes)
     sigma = _SPREAD_M / height_map.cell_m
     for surface in np.unique(surfaces[can_carry]):
         here = can_carry & (surfaces == surface)
-        told = here & ~marking
+        told = here & ~painted
         weights = told.astype(np.float32)
         sums = luminance * weights
         for spread in (sigma, 4 * sigma):

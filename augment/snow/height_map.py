@@ -23,6 +23,8 @@ Estimator = Literal["mode", "expected", "median"]
 _DEPTHS = {"mode": "mode_depth", "expected": EXPECTED_DEPTH, "median": MEDIAN_DEPTH}
 COVERED = 0.5  # of a pixel must be opaque, for something to lie there
 _EYE_ABOVE_M = 100.0
+_FLAT = 0.5  # one axis over the next, of what is flat or long
+_UPRIGHT_RAD = math.radians(15)  # off the vertical
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +75,19 @@ def classes_of(gaussians: Gaussians) -> np.ndarray:
     if gaussians.semantic is None:
         return np.full(len(gaussians), SemanticClass.UNKNOWN, np.int16)
     return gaussians.semantic.numpy()
+
+
+def find_upright(gaussians: Gaussians) -> np.ndarray:
+    """bool [N]: walls and posts: flat Gaussians on edge, and long ones on end."""
+    w, x, y, z = (column.numpy() for column in gaussians.quats.unbind(1))
+    # The world's z along each of the Gaussian's axes.
+    rise = np.abs(np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], 1))
+    scales = gaussians.scales.numpy()
+    order = np.argsort(scales, axis=1, kind="stable")
+    short, middle, long = np.take_along_axis(scales, order, 1).T
+    rise_short, _, rise_long = np.take_along_axis(rise, order, 1).T
+    on_edge = (short <= _FLAT * middle) & (rise_short < math.sin(_UPRIGHT_RAD))
+    return on_edge | ((middle <= _FLAT * long) & (rise_long > math.cos(_UPRIGHT_RAD)))
 
 
 def in_box(gaussians: Gaussians, low: np.ndarray, high: np.ndarray) -> np.ndarray:

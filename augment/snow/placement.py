@@ -37,6 +37,7 @@ from augment.snow.height_map import (
     HeightMap,
     classes_of,
     draw_from_above,
+    find_upright,
     in_box,
     plain_gaussians,
 )
@@ -98,7 +99,7 @@ def place_snow_bed(
     vehicles = [actor for actor in scene.actors if is_vehicle(actor)]
     squares = [
         (level, window)
-        for level in range(len(RINGS_M))
+        for level in range(int(plan.levels.max()) + 1)
         for window in plan.squares(level, _SQUARE_CELLS)
     ]
     if not squares:
@@ -176,6 +177,7 @@ class _Ground:
         self._views, self._paths, self._settings = views, paths, settings
         self._clock = clock
         self._classes = classes_of(background)
+        self._upright = find_upright(background)
         self._numbers = CellNumbers(plan)
         self._lists: list[CellList] = []
         self._count = 0
@@ -183,9 +185,9 @@ class _Ground:
     def add_square(self, level: int, window: Window) -> None:
         """Find the cells of one window of a level."""
         square = _with_margin(self._plan, level, window)
-        view, classes, is_ground = self._draw(square)
+        view, classes, lies = self._draw(square)
         self._clock.lap("above")
-        surface = find_surface(view, is_ground, max_slope_deg=self._settings.max_slope_deg)
+        surface = find_surface(view, lies, max_slope_deg=self._settings.max_slope_deg)
         self._clock.lap("surface")
         seen = self._seen(surface, square)
         self._clock.lap("seen")
@@ -225,7 +227,9 @@ class _Ground:
         return made
 
     def _draw(self, square: _Square) -> tuple[HeightMap, np.ndarray, np.ndarray]:
-        """The square from above, its classes, and where the background is what is seen."""
+        """The square from above, its classes, and where what is seen is of the background and no
+        top of a wall.
+        """
         plan, window = self._plan, square.window
         cell = plan.size_m(square.level)
         corner = (
@@ -249,8 +253,11 @@ class _Ground:
         )
         is_ground = (view.ids >= 0) & (view.ids < len(chosen))
         classes = np.full(shape, SemanticClass.UNKNOWN, np.int16)
-        classes[is_ground] = self._classes[chosen[view.ids[is_ground]]]
-        return view, classes, is_ground
+        ids = chosen[view.ids[is_ground]]
+        classes[is_ground] = self._classes[ids]
+        upright = np.zeros(shape, np.float32)
+        upright[is_ground] = self._upright[ids]
+        return view, classes, is_ground & (cv2.blur(upright, (3, 3)) <= 0.5)
 
     def _seen(self, surface: Surface, square: _Square) -> np.ndarray:
         """bool [H, W]: cells that can carry snow which some camera sees, and those next to them."""
@@ -319,7 +326,10 @@ def _heights(scene: Scene) -> tuple[float, float]:
 
 def _no_cells() -> SnowCells:
     return make_cells(
-        CellList.empty(), np.zeros(0, np.float32), CellNumbers(plan_tiles([], 1.0, (0, 0))), _NOBODY
+        CellList.empty(),
+        np.zeros(0, np.float32),
+        CellNumbers(plan_tiles([], 1.0, (0.0, 0.0))),
+        _NOBODY,
     )
 
 

@@ -19,7 +19,7 @@ from augment.snow.height_map import COVERED
 
 WIDTH_PX = 200  # of the depth images: they tell houses apart, not posts
 LIFTS_M = (0.0, 0.3, 1.0)  # depths of snow at which a cell may be seen
-_FAR_SHARE, _FAR_M = 1.05, 0.5  # of the depth there, and beyond it: what blurred images hide
+_FAR_SHARE, _FAR_M = 1.05, 0.3  # of the depth there, and beyond it: what blurred images hide
 _BELOW_SHARE = 1.02  # of the depth there: snow on top of what shows its underside
 _GRAZING = math.sin(math.radians(3))  # how far normals may be off
 _MARGIN_PX = 3.0

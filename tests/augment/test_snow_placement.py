@@ -1,0 +1,562 @@
+"""Where snow can lie: cells over scenes whose surfaces are known."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+
+import numpy as np
+import pytest
+import torch
+
+from augment.errors import SceneError
+from augment.geometry import quat_from_rotmat, rotmat_from_quat
+from augment.labels import EGO_VEHICLE
+from augment.render.threads import limit_threads
+from augment.scene import Gaussians, Scene
+from augment.semantics import SemanticClass
+from augment.snow import placement, surface_kernels
+from augment.snow.actor_cells import DRIVEN_MAX_SLOPE_DEG, is_vehicle
+from augment.snow.cells import EDGE_CAP_M, FLUSH, OPEN_EDGE, SnowBed, SnowCells
+from augment.snow.placement import PlacementSettings, place_snow_bed
+from augment.snow.surface_kernels import LINK, OPEN
+from augment.snow.tiles import RINGS_M, CellNumbers, plan_tiles, views_along
+from augment.snow.wheel_tracks import EGO_WIDTH_M, WHEEL_SHARE
+from tests.scenes import camera_ahead, one_gaussian
+from tests.snow_scenes import box_car, cameras_of, drive, sheet, side_wall, wall
+
+COARSE = PlacementSettings(cell_m=0.1)
+GROUND = sheet((-6, 20), (-8, 8))
+LEFT, RIGHT, BACK, FRONT = range(4)
+
+
+def place(scene: Scene, settings: PlacementSettings = COARSE) -> SnowBed:
+    bed = place_snow_bed(scene, cameras_of(scene), settings)
+    check_cells(bed.ground, len(scene.background))
+    for actor in scene.actors:
+        if actor.track_id in bed.actors:
+            check_cells(bed.actors[actor.track_id], len(actor.gaussians))
+    return bed
+
+
+def check_cells(cells: SnowCells, gaussians: int) -> None:
+    """What holds for the cells of any scene."""
+    count = len(cells)
+    for field in dataclasses.fields(SnowCells):
+        values = getattr(cells, field.name)
+        assert bool(torch.isfinite(values.double()).all()), field.name
+        if not field.name.startswith("buried"):
+            assert len(values) == count, field.name
+    np.testing.assert_allclose(cells.normals.norm(dim=1), 1, atol=1e-5)
+    assert bool((cells.normals[:, 2] > 0).all())
+    assert bool((cells.edge_m >= 0.499 * cells.sizes_m).all())
+    assert bool((cells.edge_m <= torch.clamp(cells.sizes_m / 2, min=EDGE_CAP_M) + 1e-5).all())
+    assert bool(((cells.light >= 0.25) & (cells.light <= 1.5)).all())
+    assert bool(((cells.tracks >= 0) & (cells.tracks <= 1)).all())
+    assert bool((cells.banks.norm(dim=1) <= 1 + 1e-5).all())
+    check_neighbours(cells)
+    assert tuple(cells.buried_by.shape) == (len(cells.buried), 5)
+    if len(cells.buried):
+        assert 0 <= int(cells.buried.min()) <= int(cells.buried.max()) < gaussians
+        assert 0 <= int(cells.buried_by.min()) <= int(cells.buried_by.max()) < count
+        assert len(cells.buried.unique()) == len(cells.buried)
+
+
+def check_neighbours(cells: SnowCells) -> None:
+    """Every link leads one cell aside, to a cell of the same size that links back."""
+    steps = torch.tensor([[-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]])
+    for side, step in enumerate(steps):
+        to = cells.neighbours[:, side].long()
+        assert bool((to >= FLUSH).all())
+        here = torch.nonzero(to >= 0)[:, 0]
+        there = to[here]
+        assert bool((cells.neighbours[there, side ^ 1].long() == here).all())
+        assert bool((cells.sizes_m[there] == cells.sizes_m[here]).all())
+        moved = cells.centers_m[there, :2] - cells.centers_m[here, :2]
+        expected = step * cells.sizes_m[here, None]
+        rounding = 1e-4 + 1.3e-7 * float(cells.centers_m.abs().amax()) if len(here) else 0.0
+        np.testing.assert_allclose(moved, expected, atol=rounding)
+
+
+def under(cells: SnowCells, x: float, y: float) -> int:
+    """The number of the cell under a point, -1 where there is none."""
+    gap = (cells.centers_m[:, :2] - torch.tensor([x, y])).abs().amax(1)
+    found = torch.nonzero(gap <= cells.sizes_m / 2 + 1e-6)[:, 0]
+    return int(found[0]) if len(found) else -1
+
+
+def within(cells: SnowCells, x: tuple[float, float], y: tuple[float, float]) -> torch.Tensor:
+    px, py = cells.centers_m[:, 0], cells.centers_m[:, 1]
+    return (px > x[0]) & (px < x[1]) & (py > y[0]) & (py < y[1])
+
+
+@pytest.fixture(scope="module")
+def flat_ground() -> tuple[Scene, SnowBed]:
+    scene = drive(GROUND)
+    return scene, place(scene)
+
+
+def test_level_ground_ahead_is_covered_once(flat_ground) -> None:
+    cells = flat_ground[1].ground
+    chosen = within(cells, (4, 12), (-2, 2))
+    area = float((cells.sizes_m[chosen] ** 2).sum())
+    assert area == pytest.approx(32, rel=0.03)  # up to a row of cells at its border
+    lowest = float(cells.centers_m[chosen, 2].abs().max())
+    assert lowest < 0.005
+    assert float(cells.normals[chosen, 2].min()) > 0.999
+    np.testing.assert_allclose(cells.light[chosen], 1, atol=0.02)
+    assert float(cells.edge_m[chosen].min()) == EDGE_CAP_M
+
+
+def test_cells_are_squares_of_the_plan_that_do_not_overlap(flat_ground) -> None:
+    cells = flat_ground[1].ground
+    corners = (cells.centers_m[:, :2] - cells.sizes_m[:, None] / 2).double()
+    fine = torch.round(corners / 0.1).long()
+    np.testing.assert_allclose(corners, fine * 0.1, atol=1e-4)
+    covered = set()
+    for (x, y), size in zip(fine.tolist(), torch.round(cells.sizes_m / 0.1).tolist(), strict=True):
+        square = {(x + i, y + j) for i in range(int(size)) for j in range(int(size))}
+        assert not covered & square
+        covered |= square
+
+
+def test_cells_grow_with_the_distance_from_the_path(flat_ground) -> None:
+    cells = flat_ground[1].ground
+    x, y = cells.centers_m[:, 0].double(), cells.centers_m[:, 1].double()
+    path = torch.hypot((x - x.clamp(0, 1)).abs(), y)
+    for distance, size in zip(path.tolist(), cells.sizes_m.tolist(), strict=True):
+        ring = sum(distance >= limit + 3.2 * math.sqrt(2) for limit in RINGS_M)  # a tile's diagonal
+        ring_at_most = sum(distance >= limit for limit in RINGS_M)
+        assert 0.1 * 2 ** min(ring, 3) <= size * 1.001
+        assert size <= 0.1 * 2 ** min(ring_at_most, 3) * 1.001
+    assert len(cells.sizes_m.unique()) >= 2
+
+
+def test_only_what_a_camera_sees_has_cells(flat_ground) -> None:
+    scene, bed = flat_ground
+    camera, last = cameras_of(scene)
+    points = bed.ground.centers_m.double()
+    seen = torch.zeros(len(points), dtype=torch.bool)
+    for view in (camera, last):
+        ahead = points @ view.camera_from_world[:3, :3].T + view.camera_from_world[:3, 3]
+        u = ahead[:, 0] / ahead[:, 2] * view.fx + view.cx
+        v = (ahead[:, 1] - 1.0) / ahead[:, 2] * view.fy + view.cy  # a metre of snow on it
+        near = 10 + 3 * 0.2 * view.fx / ahead[:, 2].clamp(min=0.2)  # grown by two cells
+        inside = (u > -near) & (u < view.width + near) & (v < view.height + near)
+        seen |= (ahead[:, 2] > 0) & inside
+    assert bool(seen.all())
+    assert float(points[:, 0].min()) > 0.5
+
+
+def test_without_cameras_the_bed_is_empty(flat_ground) -> None:
+    bed = place_snow_bed(flat_ground[0], [], COARSE)
+    check_cells(bed.ground, 0)
+    assert len(bed.ground) == 0 and bed.actors == {}
+
+
+def test_bits_do_not_depend_on_threads(flat_ground) -> None:
+    scene, bed = flat_ground
+    limit_threads(1)
+    try:
+        alone = place_snow_bed(scene, cameras_of(scene), COARSE)
+    finally:
+        limit_threads(None)
+    assert_equal_cells(alone.ground, bed.ground)
+
+
+def test_squares_drawn_at_once_make_no_difference(monkeypatch) -> None:
+    platform = sheet((8, 10), (-2, 0), 0.6)
+    scene = drive(GROUND, platform, wall(8, (-2, 0), (0, 0.6)))
+    whole = place(scene).ground
+    monkeypatch.setattr(placement, "_SQUARE_CELLS", 64)
+    parts = place(scene).ground
+    assert len(whole) == len(parts)
+    orders = [np.lexsort(cells.centers_m[:, :2].numpy().T) for cells in (whole, parts)]
+    for name in ("centers_m", "normals", "sizes_m", "edge_m", "tracks", "banks", "light"):
+        a, b = (
+            getattr(cells, name)[order] for cells, order in zip((whole, parts), orders, strict=True)
+        )
+        # Splats are projected from another eye, so heights and colours differ by roundings.
+        np.testing.assert_allclose(a, b, atol=2e-3, err_msg=name)
+    codes = [
+        cells.neighbours[order].clamp(max=0)
+        for cells, order in zip((whole, parts), orders, strict=True)
+    ]
+    assert torch.equal(*codes)
+
+
+def test_a_platform_has_open_edges_and_the_ground_beside_it_none() -> None:
+    platform = sheet((6, 8), (-1, 1), 0.6)
+    sides = [side_wall(y, (6, 8), (0, 0.6)) for y in (-1, 1)]
+    scene = drive(GROUND, platform, wall(6, (-1, 1), (0, 0.6)), *sides)
+    cells = place(scene).ground
+    top, foot = under(cells, 7.0, 0.05), under(cells, 5.65, 0.05)
+    assert float(cells.centers_m[top, 2]) == pytest.approx(0.6, abs=0.01)
+    # Splats reach half their size beyond the edge that their centres end at.
+    assert float(cells.edge_m[top]) == pytest.approx(1.0, abs=0.25)
+    assert float(cells.edge_m[foot]) > 1.5
+    raised = torch.nonzero(cells.centers_m[:, 2] > 0.5)[:, 0]
+    borders = (cells.neighbours[raised] == OPEN_EDGE).any(1)
+    assert bool(borders.any())
+    assert float(cells.edge_m[raised][borders].max()) <= 0.5 * 0.1 + 1e-5
+    assert bool((cells.banks[raised] == 0).all())
+    bank = cells.banks[foot]
+    assert float(bank[0]) > 0.3 and abs(float(bank[1])) < 0.1  # towards +x, where it stands
+    assert float(cells.banks[under(cells, 3.5, 0.05)].norm()) < 0.01
+    low = torch.nonzero(within(cells, (5.2, 6.2), (-0.7, 0.7)) & (cells.centers_m[:, 2] < 0.1))
+    assert not bool((cells.neighbours[low[:, 0], RIGHT] == OPEN_EDGE).any())
+
+
+@pytest.mark.parametrize(
+    ("slope", "limit", "expected"), [(30.0, 50.0, 1), (60.0, 50.0, 0), (30.0, 20.0, 0)]
+)
+@pytest.mark.parametrize("cell_m", [0.05, 0.4])
+def test_the_slope_decides(slope: float, limit: float, expected: int, cell_m: float) -> None:
+    ramp = sheet((5, 10), (-3, 3), slope_deg=slope)
+    settings = PlacementSettings(cell_m=cell_m, max_slope_deg=limit)
+    cells = place(drive(ramp), settings).ground
+    inside = within(cells, (6, 9), (-2, 2))
+    assert bool(inside.any()) == bool(expected)
+    if expected:
+        tilt = torch.rad2deg(torch.atan2(-cells.normals[inside, 0], cells.normals[inside, 2]))
+        np.testing.assert_allclose(tilt.median(), slope, atol=2)
+        rise = math.tan(math.radians(slope)) * (cells.centers_m[inside, 0] - 5)
+        np.testing.assert_allclose(cells.centers_m[inside, 2], rise, atol=0.06)
+
+
+def test_nothing_lies_under_a_canopy() -> None:
+    canopy = sheet((6, 9), (-3, 3), 4.0)
+    cells = place(drive(GROUND, canopy)).ground
+    below = within(cells, (6.2, 8.8), (-2.8, 2.8)) & (cells.centers_m[:, 2] < 3.9)
+    assert not bool(below.any())
+    assert bool(within(cells, (3, 5.5), (-1, 1)).any())
+    assert bool(within(cells, (10, 13), (-1, 1)).any())
+
+
+def test_a_tunnel_has_no_snow() -> None:
+    parts = [
+        sheet((-7, 21), (-4.5, 4.5)),
+        sheet((-8, 22), (-5, 5), 4.5),
+        wall(21, (-5, 5), (0, 4.5)),
+    ]
+    parts += [side_wall(y, (-8, 22), (0, 4.5)) for y in (-4.5, 4.5)]
+    bed = place(drive(*parts, wall(-7, (-5, 5), (0, 4.5))))
+    assert len(bed.ground) == 0
+
+
+def test_walls_alone_have_no_snow() -> None:
+    bed = place(drive(wall(8, (-5, 5), (-2, 6)), side_wall(4, (2, 8), (-2, 6))))
+    assert len(bed.ground) == 0
+
+
+def test_what_a_wall_hides_has_no_cells() -> None:
+    cells = place(drive(GROUND, wall(8, (-7.9, 7.9), (0, 5)))).ground
+    assert bool(within(cells, (5, 7), (-2, 2)).any())
+    assert not bool(within(cells, (11, 19), (-5, 5)).any())
+
+
+def test_a_single_gaussian_and_faint_ones() -> None:
+    place(drive(one_gaussian(mean=(6.0, 0.0, 0.0))))
+    faint = sheet((-6, 20), (-8, 8), opacity=0.01)
+    assert len(place(drive(faint)).ground) == 0
+    alone = place(drive(one_gaussian(mean=(6, 0, 0), scale=(0.5, 0.5, 0.01), opacity=0.99)))
+    assert len(alone.ground) > 10 and float(alone.ground.centers_m[:, 2].abs().max()) < 0.05
+
+
+def test_coarse_cells() -> None:
+    bed = place(drive(sheet((-30, 60), (-30, 30))), PlacementSettings(cell_m=10.0))
+    assert bed.ground.sizes_m.unique().tolist() == [10.0]
+    assert float(bed.ground.centers_m[:, 2].abs().max()) < 0.05
+
+
+def test_cells_that_would_take_too_much_memory_are_refused_at_once() -> None:
+    scene = drive(GROUND)
+    start = time.perf_counter()
+    with pytest.raises(SceneError, match=r"0\.001 m would take [\d,]+ million cells.* GB.*cell_m"):
+        place_snow_bed(scene, cameras_of(scene), PlacementSettings(cell_m=0.001))
+    assert time.perf_counter() - start < 1.0
+
+
+def test_far_from_the_origin_nothing_breaks() -> None:
+    shift = torch.tensor([1e6, -1e6, 50.0])
+    ground = dataclasses.replace(GROUND, means=GROUND.means + shift)
+    start = tuple(shift.tolist())
+    places = [(start[0] + x, start[1], start[2] + 1.5) for x in (0.0, 1.0)]
+    cells = place(drive(ground, places=places), PlacementSettings(cell_m=0.2)).ground
+    assert len(cells) > 100
+    np.testing.assert_allclose(cells.centers_m[:, 2], 50, atol=0.02)
+
+
+@pytest.mark.parametrize("unknown", ["has_metric_scale", "has_known_gravity"])
+def test_metres_and_gravity_are_needed(unknown: str) -> None:
+    scene = drive(GROUND, **{unknown: False})
+    with pytest.raises(SceneError, match="not known"):
+        place_snow_bed(scene, cameras_of(scene), COARSE)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"cell_m": 0.0}, {"cell_m": math.nan}, {"max_slope_deg": 90.0}, {"estimator": "mean"}],
+)
+def test_settings_are_checked(wrong: dict, unchecked) -> None:
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        PlacementSettings(**wrong)
+
+
+@pytest.mark.parametrize("estimator", ["mode", "expected", "median"])
+def test_every_estimator_finds_level_ground(estimator) -> None:
+    settings = PlacementSettings(cell_m=0.2, estimator=estimator)
+    cells = place(drive(GROUND), settings).ground
+    np.testing.assert_allclose(cells.centers_m[:, 2], 0, atol=0.01)
+
+
+def test_a_faint_floater_does_not_lift_the_bed() -> None:
+    floater = one_gaussian(mean=(7.0, 0.0, 4.0), scale=(1.0, 1.0, 0.3), opacity=0.3)
+    cells = place(drive(GROUND, floater)).ground
+    chosen = within(cells, (6, 8), (-1, 1))
+    assert int(chosen.sum()) > 300
+    assert float(cells.centers_m[chosen, 2].abs().max()) < 0.02
+
+
+def test_the_ground_is_buried_and_walls_are_not() -> None:
+    platform, front = sheet((6, 8), (-1, 1), 0.6), wall(6, (-1, 1), (0, 0.6))
+    scene = drive(GROUND, platform, front)
+    cells = place(scene).ground
+    hidden = torch.zeros(len(scene.background), dtype=torch.bool)
+    hidden[cells.buried.long()] = True
+    first_wall = len(GROUND) + len(platform)
+    assert not bool(hidden[first_wall:].any())
+    means = scene.background.means
+    ahead = (means[:, 0] > 3) & (means[:, 0] < 5) & (means[:, 1].abs() < 1)
+    assert bool(hidden[ahead].all())
+    behind = means[:, 0] < 0
+    assert not bool(hidden[behind].any())
+    inner = (means[:, 0] > 6.4) & (means[:, 0] < 7.6) & (means[:, 1].abs() < 0.5)
+    on_top = inner & (means[:, 2] > 0.5)
+    assert bool(hidden[on_top].all())
+    assert not bool(hidden[inner & (means[:, 2] < 0.05)].any())  # the ground below is deeper
+
+
+def test_what_reaches_beyond_the_cells_is_not_buried() -> None:
+    far = sheet((2, 12), (-0.2, 0.2), -0.01)
+    wide = dataclasses.replace(far, scales=far.scales * torch.tensor([1.0, 60.0, 1.0]))
+    cells = place(drive(sheet((2, 12), (-2, 2)), wide)).ground
+    assert len(cells.buried) > 0
+    assert int(cells.buried.max()) < len(sheet((2, 12), (-2, 2)))
+
+
+def test_cells_over_a_buried_gaussian_are_those_it_lies_under() -> None:
+    ground = sheet((-6, 20), (-8, 8))
+    turn = rotmat_from_quat(torch.tensor([[math.cos(0.3), 0.0, 0.0, math.sin(0.3)]]))
+    ground = dataclasses.replace(
+        ground,
+        scales=ground.scales * torch.tensor([3.0, 1.0, 1.0]),
+        quats=quat_from_rotmat(turn).expand(len(ground), 4).contiguous(),
+    )
+    cells = place(drive(ground)).ground
+    offsets = torch.tensor([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]]).float() * 1.5
+    axes = turn[0, :2, :2]  # columns: the long axis, then the short one
+    ends = (offsets * ground.scales[0, :2]) @ axes.T
+    points = ground.means[cells.buried.long(), None, :2] + ends
+    gap = (cells.centers_m[cells.buried_by.long(), :2] - points).abs().amax(-1)
+    assert bool((gap <= cells.sizes_m[cells.buried_by.long()] / 2 + 1e-4).all())
+
+
+def test_wheels_leave_tracks_beside_the_path() -> None:
+    scene = drive(sheet((-6, 30), (-8, 8)), places=[(x, 0.0, 1.5) for x in (0.0, 2.0, 4.0)])
+    cells = place(scene, PlacementSettings(cell_m=0.05)).ground
+    wheels = WHEEL_SHARE * EGO_WIDTH_M
+    for x in (6.0, 12.0):
+        for y in (wheels, -wheels):
+            assert float(cells.tracks[under(cells, x, y)]) > 0.6
+        for y in (0.0, 0.4, 1.3, -1.3):
+            assert float(cells.tracks[under(cells, x, y)]) < 0.05
+    assert float(cells.tracks.max()) > 0.95
+
+
+def test_tracks_stay_on_the_road() -> None:
+    road = sheet((-6, 8), (-8, 8), semantic=SemanticClass.ROAD)
+    grass = sheet((8, 20), (-8, 8), semantic=SemanticClass.TERRAIN)
+    cells = place(drive(road, grass)).ground
+    assert float(cells.tracks[within(cells, (3, 7.5), (-2, 2))].max()) > 0.5
+    assert float(cells.tracks[within(cells, (8.5, 16), (-2, 2))].max()) == 0
+    assert set(cells.semantic.unique().tolist()) == {SemanticClass.ROAD, SemanticClass.TERRAIN}
+
+
+def test_shade_on_the_ground_is_kept_and_markings_are_no_light() -> None:
+    road = SemanticClass.ROAD
+    parts = [
+        sheet((-6, 9), (-8, 8), rgb=(0.5, 0.5, 0.5), semantic=road),
+        sheet((9, 14), (-8, 8), rgb=(0.3, 0.3, 0.3), semantic=road),
+        sheet((3, 7), (-0.2, 0.2), 0.004, rgb=(1, 1, 1), semantic=SemanticClass.LANE_MARKING),
+    ]
+    cells = place(drive(*parts), PlacementSettings(cell_m=0.05)).ground
+    marked = cells.semantic == SemanticClass.LANE_MARKING
+    assert int(marked.sum()) > 50
+    lit = within(cells, (2.5, 8), (-2, 2)) & ~marked
+    shade = within(cells, (10, 13), (-2, 2))
+    expected = ((0.3 + 0.055) / 1.055) ** 2.4 / ((0.5 + 0.055) / 1.055) ** 2.4
+    ratio = float(cells.light[shade].median() / cells.light[lit].median())
+    assert ratio == pytest.approx(expected, rel=0.05)
+    assert float(cells.light[marked].median()) == pytest.approx(
+        float(cells.light[lit].median()), rel=0.25
+    )
+
+
+def test_vehicles_carry_their_own_cells() -> None:
+    car = box_car(size=(4.0, 1.8, 1.5))
+    bed = place(drive(GROUND, actors=[car]))
+    cells = bed.actors["car"]
+    area = float((cells.sizes_m**2).sum())
+    assert area == pytest.approx(4.0 * 1.8, rel=0.2)
+    np.testing.assert_allclose(cells.centers_m[:, 2], 0.75, atol=0.02)
+    assert not bool((cells.neighbours == FLUSH).any())
+    assert float(cells.edge_m.max()) == pytest.approx(0.9, abs=0.2)
+    roof = len(sheet((-2, 2), (-0.9, 0.9), 0.75))
+    assert len(cells.buried) > roof / 2 and int(cells.buried.max()) < roof
+    assert bool(within(bed.ground, (4, 8), (2.5, 3.5)).any())  # it drives on: ground is ground
+
+
+def test_windscreens_of_those_that_drive_stay_clear() -> None:
+    slope = DRIVEN_MAX_SLOPE_DEG + 10
+    found = []
+    for moved_m in (5.0, 0.0):
+        car = box_car(moved_m=moved_m)
+        tilted = sheet((-2, -0.5), (-0.9, 0.9), 0.0, slope_deg=slope)
+        car = dataclasses.replace(car, gaussians=tilted)
+        found.append("car" in place(drive(GROUND, actors=[car])).actors)
+    assert found == [False, True]
+
+
+def test_parked_cars_keep_the_ground_below_them_bare() -> None:
+    parked = box_car(start=(7.0, 0.0), moved_m=0.0, with_shadow=False)
+    bed = place(drive(GROUND, actors=[parked]))
+    assert not bool(within(bed.ground, (5.3, 8.7), (-0.7, 0.7)).any())
+    assert "car" in bed.actors
+    assert float(bed.ground.tracks[within(bed.ground, (3, 4.7), (-2, 2))].max()) > 0.5  # the ego's
+
+
+@pytest.mark.parametrize(
+    ("label", "semantic", "expected"),
+    [
+        ("Car", None, True),
+        ("Medium-sized Truck", None, True),
+        ("Pedestrian", None, False),
+        ("Scarecrow", None, False),
+        (EGO_VEHICLE, SemanticClass.VEHICLE, False),
+        ("thing", SemanticClass.VEHICLE, True),
+        ("Car", SemanticClass.PEDESTRIAN, False),
+    ],
+)
+def test_which_actors_are_vehicles(label: str, semantic: int | None, expected: bool) -> None:
+    actor = box_car(label=label, semantic=semantic)
+    assert is_vehicle(actor) is expected
+    bed = place(drive(GROUND, actors=[actor]), PlacementSettings(cell_m=0.2))
+    assert ("car" in bed.actors) is expected
+
+
+def test_an_empty_actor_is_no_obstacle() -> None:
+    empty = dataclasses.replace(box_car(moved_m=0.0), gaussians=Gaussians.empty())
+    assert place(drive(GROUND, actors=[empty]), PlacementSettings(cell_m=0.2)).actors == {}
+
+
+def test_views_along_a_drive_are_spread_and_hold_both_ends() -> None:
+    cameras = [camera_ahead(position=(0.5 * i, 0, 1.5), timestamp_ns=i) for i in range(20)]
+    times = [camera.timestamp_ns for camera in views_along(cameras[::-1])]
+    assert times == [0, 4, 8, 12, 16, 19]
+    turning = [camera_ahead(yaw=0.1 * i, timestamp_ns=i) for i in range(5)]
+    assert [camera.timestamp_ns for camera in views_along(turning)] == [0, 2, 4]
+
+
+def test_numbers_of_cells_are_found_by_place() -> None:
+    plan = plan_tiles([camera_ahead(position=(3.0, 5.0, 1.5))], 0.1, (-1.0, 2.0))
+    numbers = CellNumbers(plan)
+    rng = np.random.default_rng(0)
+    expected, points = [], []
+    for level in range(4):
+        tiles = np.argwhere(plan.levels == level)
+        side = plan.cells_per_side(level)
+        picked = tiles[rng.integers(len(tiles), size=50)]
+        cells = np.unique(picked[:, ::-1] * side + rng.integers(side, size=(50, 2)), axis=0)
+        put = np.arange(len(cells), dtype=np.int32) + 1000 * level
+        numbers.put(level, cells[:, 0], cells[:, 1], put)
+        points.append(
+            plan.origin_m + (cells + rng.uniform(0.1, 0.9, cells.shape)) * plan.size_m(level)
+        )
+        expected.append(put)
+    assert numbers.at(np.concatenate(points)).tolist() == np.concatenate(expected).tolist()
+    outside = np.array([[1e9, 0.0], [-1e9, 5.0], [np.nan, 0.0], [3.0, 1e4]])
+    assert (numbers.at(outside) == -1).all()
+
+
+def test_medians_of_heights() -> None:
+    rng = np.random.default_rng(1)
+    height = rng.normal(size=(9, 11)).astype(np.float32)
+    covered = rng.random((9, 11)) < 0.7
+    out = np.empty_like(height)
+    surface_kernels.median_heights(height, covered, 2, out)
+    for i, j in np.argwhere(covered):
+        window = slice(max(0, i - 2), i + 3), slice(max(0, j - 2), j + 3)
+        assert out[i, j] == pytest.approx(np.median(height[window][covered[window]]), abs=1e-6)
+    assert (out[~covered] == height[~covered]).all()
+
+
+def test_planes_are_found_exactly_and_lines_are_none() -> None:
+    i, j = np.mgrid[:9, :9]
+    height = (0.3 * 0.1 * j - 0.2 * 0.1 * i).astype(np.float32)
+    fitted, slopes = np.empty((9, 9), np.float32), np.empty((9, 9, 2), np.float32)
+    good = np.empty((9, 9), bool)
+    numbers = (2, 0.1, 0.05, 2.0, 0.02)
+    everywhere = np.ones((9, 9), bool)
+    surface_kernels.fit_planes(height, everywhere, *numbers, fitted, slopes, good)
+    assert good[1:-1, 1:-1].all()
+    np.testing.assert_allclose(
+        slopes[good], np.broadcast_to([0.3, -0.2], slopes[good].shape), atol=1e-4
+    )
+    np.testing.assert_allclose(fitted, height, atol=1e-5)
+    ridge = np.zeros((9, 9), bool)
+    ridge[:, 4] = True
+    surface_kernels.fit_planes(height, ridge, *numbers, fitted, slopes, good)
+    assert not good.any()
+
+
+def test_edge_distances_are_those_to_the_nearest_edge() -> None:
+    can_carry = np.zeros((14, 17), bool)
+    can_carry[2:12, 3:15] = True
+    can_carry[5:7, 8] = False  # a hole
+    height = np.zeros(can_carry.shape, np.float32)
+    sides = np.empty((*can_carry.shape, 4), np.int8)
+    surface_kernels.compare_sides(height, can_carry, can_carry, 0.1, sides)
+    out = np.empty(can_carry.shape, np.float32)
+    surface_kernels.edge_distances(can_carry, sides, 50.0, out)
+    edges = []
+    for i, j in np.argwhere(can_carry):
+        for side, step in enumerate(((0, -0.5), (0, 0.5), (-0.5, 0), (0.5, 0))):
+            if sides[i, j, side] == OPEN:
+                edges.append((i + step[0], j + step[1]))
+    for i, j in np.argwhere(can_carry):
+        nearest = min(math.hypot(i - a, j - b) for a, b in edges)
+        assert out[i, j] == pytest.approx(nearest, abs=0.1)  # a sweep may miss the very nearest
+
+
+def test_steps_part_surfaces_but_not_their_low_sides() -> None:
+    height = np.zeros((5, 8), np.float32)
+    height[:, 4:] = 0.15
+    everywhere = np.ones(height.shape, bool)
+    sides = np.empty((*height.shape, 4), np.int8)
+    surface_kernels.compare_sides(height, everywhere, everywhere, 0.1, sides)
+    assert (sides[:, 4, LEFT] == OPEN).all()
+    assert (sides[:, 3, RIGHT] == surface_kernels.RISES).all()
+    out = np.empty(height.shape, np.float32)
+    surface_kernels.edge_distances(everywhere, sides, 40.0, out)
+    np.testing.assert_allclose(out[:, 4:], np.tile([0.5, 1.5, 2.5, 3.5], (5, 1)))
+    assert (out[:, :4] == 40).all()
+    sides[:] = LINK
+    surface_kernels.edge_distances(everywhere, sides, 40.0, out)
+    assert (out == 40).all()
+
+
+def assert_equal_cells(a: SnowCells, b: SnowCells) -> None:
+    for field in dataclasses.fields(SnowCells):
+        assert torch.equal(getattr(a, field.name), getattr(b, field.name)), field.name
