@@ -14,12 +14,10 @@ from augment.batch.encode import decode_image, encode_image, quantise_depth
 from augment.batch.layout import PATH_KINDS, variant_name
 from augment.batch.runner import Renderer, default_renderer
 from augment.batch.selection import SceneIndex, select_frames
-from augment.batch.snow_beds import bed_settings
+from augment.batch.snow_beds import find_bed, remember, snow_to_lay
 from augment.batch.writer import check_view
 from augment.dataset_samples import ImageType, Pixels, make_sample
 from augment.scene import Scene
-from augment.snow.beds import bed_of, remember_bed
-from augment.snow.cells import SnowBed
 from recipes.schema import Recipe
 
 
@@ -60,16 +58,15 @@ class SceneDataset(Dataset):
         selection = select_frames(self._index, frames, cameras)
         self._items = [(frame, name) for frame, names in selection for name in names]
 
-        self._bed: SnowBed | None = None
-        if (settings := bed_settings(recipe)) is not None:
-            self._bed = bed_of(scene, settings)
+        snow = snow_to_lay(recipe)
+        self._bed = None if snow is None else find_bed(scene, snow)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """In another process the scene is another object, which knows of no bed yet."""
         self.__dict__.update(state)
-        settings = bed_settings(self.recipe)
-        if settings is not None and self._bed is not None:
-            remember_bed(self.scene, settings, self._bed)
+        snow = snow_to_lay(self.recipe)
+        if snow is not None and self._bed is not None:
+            remember(self.scene, snow, self._bed)
 
     def __len__(self) -> int:
         return len(self._items)

@@ -29,7 +29,7 @@ from augment.batch.manifest import FAILED, OK
 from augment.batch.runner import Chunk, Outcome, Renderer, Setup
 from augment.batch.selection import SceneIndex, select_frames
 from augment.batch.shared_scene import share_scene
-from augment.batch.snow_beds import StoredBed, bed_settings, find_beds
+from augment.batch.snow_beds import StoredBed, snow_to_lay, store_beds
 from augment.batch.trajectory import frames_to_json, trajectory_id
 from augment.cameras import Frame
 from augment.scene import Scene
@@ -225,7 +225,7 @@ class _Run:
 
     def _find_beds(self, recipes: Iterable[Recipe], progress: bool) -> None:
         """Find where the recipes' snow can lie, for all cameras of the scene or the path."""
-        snowy = [recipe for recipe in recipes if bed_settings(recipe) is not None]
+        snowy = [recipe for recipe in recipes if snow_to_lay(recipe) is not None]
         if not snowy:
             return
         started = time.perf_counter()
@@ -236,7 +236,7 @@ class _Run:
             self.scene = copy.copy(self.scene)
             cameras = [camera for frame in path for camera in frame.cameras.values()]
         folder = self.out_dir / STATE_FOLDER
-        self.beds = find_beds(self.scene, snowy, folder, cameras=cameras, progress=progress)
+        self.beds = store_beds(self.scene, snowy, folder, cameras=cameras, progress=progress)
         self.timings["place"] += time.perf_counter() - started
 
     def _begin(self, chunks: Sequence[Chunk]) -> None:

@@ -1,7 +1,8 @@
 """Where snow can lie, found once for all images and processes of a job.
 
 The beds lie beside the lock and the journals, named by their content: a later job of the same
-scene, with snow of another depth, finds them there.
+scene, with snow of another depth, finds them there. What finds them is imported only where it is
+needed, for it brings the rasteriser.
 """
 
 from __future__ import annotations
@@ -12,18 +13,16 @@ from pathlib import Path
 
 from augment.cameras import Camera
 from augment.scene import Scene
-from augment.snow.bed_files import bed_key, load_bed, save_bed
-from augment.snow.beds import bed_of, bed_path, remember_bed
-from augment.snow.covers import placement_settings
-from augment.snow.placement import PlacementSettings
+from augment.snow.cells import SnowBed
 from recipes.schema import Recipe
+from recipes.snow import Snow
 
 
 @dataclass(frozen=True)
 class StoredBed:
-    """A bed in its file; small, and picklable."""
+    """A bed in its file, for this snow and any that can lie in the same places; picklable."""
 
-    settings: PlacementSettings
+    snow: Snow
     path: str
     key: str
 
@@ -33,18 +32,38 @@ class StoredBed:
         Raises:
             SceneError: the file is lost or damaged.
         """
-        remember_bed(scene, self.settings, load_bed(Path(self.path), self.key))
+        from augment.snow.bed_files import load_bed
+
+        remember(scene, self.snow, load_bed(Path(self.path), self.key))
 
 
-def bed_settings(recipe: Recipe) -> PlacementSettings | None:
-    """How the bed of the recipe's snow is found; None where no snow is to be laid."""
+def snow_to_lay(recipe: Recipe) -> Snow | None:
+    """The recipe's snow; None where there is none to be laid."""
     snow = recipe.weather.snow
-    if snow is None or snow.depth_m == 0 or snow.coverage == 0:
-        return None
-    return placement_settings(snow)
+    return None if snow is None or snow.depth_m == 0 or snow.coverage == 0 else snow
 
 
-def find_beds(
+def remember(scene: Scene, snow: Snow, bed: SnowBed) -> None:
+    """Make it the bed that pictures of the scene in such snow use in this process."""
+    from augment.snow.beds import remember_bed
+    from augment.snow.covers import placement_settings
+
+    remember_bed(scene, placement_settings(snow), bed)
+
+
+def find_bed(scene: Scene, snow: Snow) -> SnowBed:
+    """The bed of a snow for all of the scene's cameras, remembered for this scene object.
+
+    Raises:
+        SceneError: it cannot be placed.
+    """
+    from augment.snow.beds import bed_of
+    from augment.snow.covers import placement_settings
+
+    return bed_of(scene, placement_settings(snow))
+
+
+def store_beds(
     scene: Scene,
     recipes: Iterable[Recipe],
     folder: Path,
@@ -58,25 +77,21 @@ def find_beds(
     image depends on what else is rendered. progress: a bar on stderr for each bed that is placed.
 
     Raises:
-        SceneError, ValueError: a bed cannot be placed. OutputError: it cannot be written.
+        SceneError: a bed cannot be placed. OutputError: it cannot be written.
     """
-    seeing = cameras
-    if seeing is None:
-        seeing = [camera for frame in scene.frames for camera in frame.cameras.values()]
-    wanted = dict.fromkeys(s for recipe in recipes if (s := bed_settings(recipe)) is not None)
-    return tuple(_find_bed(scene, settings, folder, seeing, progress) for settings in wanted)
+    from augment.snow.bed_files import bed_key, save_bed
+    from augment.snow.beds import bed_of, bed_path
+    from augment.snow.covers import placement_settings
 
-
-def _find_bed(
-    scene: Scene,
-    settings: PlacementSettings,
-    folder: Path,
-    cameras: Sequence[Camera],
-    progress: bool,
-) -> StoredBed:
-    bed = bed_of(scene, settings, cameras=cameras, folder=folder, progress=progress)
-    key = bed_key(scene, cameras, settings)
-    path = bed_path(folder, key)
-    if not path.is_file():  # this process knew the bed from a job in another folder
-        save_bed(path, bed, key)
-    return StoredBed(settings, str(path), key)
+    if cameras is None:
+        cameras = [camera for frame in scene.frames for camera in frame.cameras.values()]
+    wanted = {placement_settings(s): s for r in recipes if (s := snow_to_lay(r)) is not None}
+    stored = []
+    for settings, snow in wanted.items():
+        bed = bed_of(scene, settings, cameras=cameras, folder=folder, progress=progress)
+        key = bed_key(scene, cameras, settings)
+        path = bed_path(folder, key)
+        if not path.is_file():  # this process knew the bed from a job in another folder
+            save_bed(path, bed, key)
+        stored.append(StoredBed(snow, str(path), key))
+    return tuple(stored)

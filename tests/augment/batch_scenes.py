@@ -245,7 +245,7 @@ def render_dying_at_frame_2(
     """Kills its process, as the kernel does when memory runs out, at one image."""
     if camera.name == "front" and camera.timestamp_ns == make_frame(2).timestamp_ns:
         os.kill(os.getpid(), signal.SIGKILL)
-    return fake_render(scene, camera, recipe, backend=backend)
+    return bed_render(scene, camera, recipe, backend=backend)
 
 
 def tree_digest(folder: Path) -> dict[str, str]:

@@ -21,7 +21,7 @@ from batch_scenes import (
 )
 
 from augment.batch.job import JobResult, RenderJob, run_job
-from augment.batch.snow_beds import bed_settings, find_beds
+from augment.batch.snow_beds import snow_to_lay, store_beds
 from augment.cameras import Frame
 from augment.dataset import SceneDataset
 from augment.errors import OutputError, SceneError
@@ -110,7 +110,7 @@ def test_without_snow_there_is_no_search(placements, tmp_path: Path, snow) -> No
     placements.before = pytest.fail
     result = run(RenderJob("fake:street", [make_recipe(snow=snow)], tmp_path))
     assert result.written == 8 and "place" not in result.timings
-    assert bed_settings(make_recipe(snow=snow)) is None
+    assert snow_to_lay(make_recipe(snow=snow)) is None
 
 
 def test_a_finished_job_searches_for_nothing(placements, tmp_path: Path) -> None:
@@ -178,7 +178,7 @@ def test_beds_that_are_remembered_get_their_file_too(placements, tmp_path: Path)
     """One scene object, two output folders: workers of the second job need a file there."""
     scene = open_fake("fake:street")
     for name in "ab":
-        (bed,) = find_beds(scene, [snowy()], tmp_path / name)
+        (bed,) = store_beds(scene, [snowy()], tmp_path / name)
         assert Path(bed.path).parent == tmp_path / name and Path(bed.path).is_file()
     assert len(placements) == 1
     other = open_fake("fake:street")
@@ -191,19 +191,7 @@ def test_beds_that_are_remembered_get_their_file_too(placements, tmp_path: Path)
 def test_a_folder_that_cannot_be_written_is_named(placements, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="file"):
-        find_beds(open_fake("fake:street"), [snowy()], tmp_path / "file" / "state")
-
-
-def test_workers_take_the_bed_over(placements, tmp_path: Path) -> None:
-    """Workers that found one for themselves would not find the stand-in's."""
-    outs = [tmp_path / "1", tmp_path / "2"]
-    for workers, out in enumerate(outs, start=1):
-        result = run(RenderJob("fake:street", [snowy()], out, workers=workers), bed_render)
-        assert (result.written, result.failures) == (8, ())
-    one, two = (tree_digest(out / "street") for out in outs)
-    assert one == two
-    manifests = [(out / "manifest.parquet").read_bytes() for out in outs]
-    assert manifests[0] == manifests[1]
+        store_beds(open_fake("fake:street"), [snowy()], tmp_path / "file" / "state")
 
 
 def test_live_samples_share_one_search(placements) -> None:
@@ -221,17 +209,17 @@ def test_live_samples_share_one_search(placements) -> None:
 
 def test_the_librarys_own_snow_does_not_depend_on_how_a_job_went(tmp_path: Path) -> None:
     """Real beds and real pictures: whole, by two workers, and in parts that search anew."""
-    recipe = snowy(0.15, cell_m=0.2)
+    recipe, uri = snowy(0.15, cell_m=0.2), "fake:street?frames=2"
     whole, shared, parts = (tmp_path / name for name in ("whole", "shared", "parts"))
-    result = run(RenderJob("fake:street", [recipe], whole), None)
-    assert (result.written, result.failures) == (8, ())
-    assert run(RenderJob("fake:street", [recipe], shared, workers=2), None).failures == ()
-    run(RenderJob("fake:street", [recipe], parts, frames=[2], cameras=["front"]), None)
+    result = run(RenderJob(uri, [recipe], whole), None)
+    assert (result.written, result.failures) == (4, ())
+    assert run(RenderJob(uri, [recipe], shared, workers=2), None).failures == ()
+    run(RenderJob(uri, [recipe], parts, frames=[1], cameras=["front"]), None)
     for bed in (parts / ".climategs").glob("snow-*"):
         bed.unlink()
-    assert run(RenderJob("fake:street", [recipe], parts), None).skipped == 1
+    assert run(RenderJob(uri, [recipe], parts), None).skipped == 1
     for out in (shared, parts):
         assert tree_digest(out / "street") == tree_digest(whole / "street")
         assert (out / "manifest.parquet").read_bytes() == (whole / "manifest.parquet").read_bytes()
     masks = [cv2.imread(str(path), cv2.IMREAD_UNCHANGED) for path in whole.rglob("snow/*/*.png")]
-    assert len(masks) == 8 and max(mask.mean() for mask in masks) > 0
+    assert len(masks) == 4 and max(mask.mean() for mask in masks) > 0

@@ -10,7 +10,9 @@ import pytest
 import torch
 from batch_scenes import (
     FakeLabels,
+    bed_render,
     fake_render,
+    make_bed,
     make_gaussians,
     make_recipe,
     open_fake,
@@ -30,12 +32,16 @@ from recipes.snow import Snow
 
 
 def test_a_dying_worker_costs_one_image_and_workers_change_no_file(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Two promises in one test, for every start of a worker imports torch anew."""
-    recipes = [make_recipe(flood=Flood(level_m=0.3), snow=Snow(depth_m=0))]
+    """Three promises in one test, for every start of a worker imports torch anew.
+
+    The third: workers take the job's bed over. One that they found themselves would show.
+    """
+    monkeypatch.setattr("augment.snow.beds.place_snow_bed", lambda *_, **__: make_bed(3.0))
+    recipes = [make_recipe(flood=Flood(level_m=0.3), snow=Snow(depth_m=0.1))]
     one = tmp_path / "one"
-    run_job(RenderJob("fake:street", recipes, one), scene_loader=open_fake, renderer=fake_render,
+    run_job(RenderJob("fake:street", recipes, one), scene_loader=open_fake, renderer=bed_render,
             progress=False)  # fmt: skip
     job = RenderJob("fake:street", recipes, tmp_path / "two", workers=2)
     result = run_job(job, scene_loader=open_fake, renderer=render_dying_at_frame_2, progress=False)
@@ -46,9 +52,11 @@ def test_a_dying_worker_costs_one_image_and_workers_change_no_file(
     assert [(row["frame"], row["camera"]) for row in failed] == [(2, "front")]
 
     alone = dataclasses.replace(job, workers=1)
-    result = run_job(alone, scene_loader=open_fake, renderer=fake_render, progress=False)
+    result = run_job(alone, scene_loader=open_fake, renderer=bed_render, progress=False)
     assert (result.written, result.skipped, result.failed) == (1, 7, 0)
-    assert tree_digest(tmp_path / "two") == tree_digest(one)
+    assert tree_digest(tmp_path / "two" / "street") == tree_digest(one / "street")
+    manifest = (tmp_path / "two" / "manifest.parquet").read_bytes()
+    assert manifest == (one / "manifest.parquet").read_bytes()
 
 
 def test_a_renderer_that_workers_cannot_import_is_refused(tmp_path: Path) -> None:
