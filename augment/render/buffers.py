@@ -27,12 +27,12 @@ class RenderOutput:
     rgb: sum of weights times colour, without background. alpha: 1 - final transmittance.
     expected_depth: sum(w z) / max(sum(w), 1e-10), metres; 0 where nothing was hit; z is that of a
     splat's centre, or, with a clip, of its surface at the pixel (see augment.render.clip).
-    median_depth: z of the first splat that brings transmittance below 0.5, metres; 0 where none
-    does. splat_ids: index of the splat with the largest weight, counted through the parts in
-    order; -1 where nothing was hit. The first of equal weights wins. mode_depth: mode of the
-    heaviest cluster of depths along the ray (augment.render.mode_depth), metres; 0 where nothing
-    was hit; z is that of expected_depth. snow: sum of weights of the splats that are snow, in
-    [0, alpha].
+    median_depth: z of the centre of the first splat that brings transmittance below 0.5, metres; 0
+    where none does. splat_ids: index of the splat with the largest weight, counted through the
+    parts in order; -1 where nothing was hit. The first of equal weights wins. mode_depth: mode of
+    the heaviest cluster of depths along the ray (augment.render.mode_depth), metres; 0 where
+    nothing was hit; z is that of expected_depth. snow: sum of weights of the splats that are snow,
+    in [0, alpha].
     """
 
     rgb: Float[Tensor, "H W 3"] | None = None

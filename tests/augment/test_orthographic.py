@@ -11,10 +11,13 @@ import torch
 
 from augment.cameras import Camera
 from augment.geometry import quat_from_rotmat, rigid, rotmat_from_quat
+from augment.render import cpu_backward
 from augment.render.buffers import ALPHA, BUFFERS, EXPECTED_DEPTH, MEDIAN_DEPTH, RGB
 from augment.render.clip import UNCUT, HeightClip
 from augment.render.composite import composite_sky
 from augment.render.constants import COV2D_BLUR, RasterSettings
+from augment.render.cpu_inputs import gather_inputs
+from augment.render.cpu_scratch import Scratch
 from augment.render.rasterize import rasterize
 from augment.render.reference_project import project_parts
 from augment.scene import Gaussians, PosedGaussians
@@ -301,6 +304,13 @@ def test_gradients_take_the_definition():
     image = rasterize([part], map_camera(), buffers=[ALPHA, EXPECTED_DEPTH], clip=UNCUT)
     (image.alpha.sum() + image.expected_depth.sum()).backward()
     assert bool(torch.isfinite(means.grad).all()) and float(means.grad.abs().max()) > 0
+
+
+def test_training_refuses_it():
+    camera, parts = map_camera(), [PosedGaussians(one_gaussian())]
+    inputs = gather_inputs(parts, camera, RasterSettings(), None, with_color=True)
+    with pytest.raises(ValueError, match="gradients are of pinhole cameras only"):
+        cpu_backward.record(inputs, camera, RasterSettings(), Scratch(), with_depth=False)
 
 
 def test_median_depth_is_along_the_axis():
