@@ -27,10 +27,10 @@ from augment.snow.sparkle import crystals_of
 from recipes.snow import Snow
 
 CELLS = 2048  # that a thread takes at a time
-# A rasteriser stops before the splat that would leave 1e-4 of the light behind it. With opaque discs
-# that is while up to a tenth still shines through; with these, no more than a two-hundredth.
+# A rasteriser stops before the splat that would leave 1e-4 of the light behind it. With opaque
+# discs up to a tenth may still shine through then; with these, no more than a two-hundredth.
 OPACITY = 0.98
-LEAST_STEPS, MOST_STEPS = 3, 8  # of evening out the surface beneath and the light
+LEAST_STEPS, MOST_STEPS = 6, 10  # of evening out the surface beneath and the light
 
 
 class Look(NamedTuple):

@@ -35,8 +35,8 @@ def _mix(bits):
 @inner()
 def _corner(across, down, seed, x, y):
     bits = _mix((across + down) ^ seed)
-    gx = np.float64(bits >> _S32) * 2.0**-31 - 1.0
-    gy = np.float64(bits & _LOW) * 2.0**-31 - 1.0
+    gx = np.float64(np.int64(bits >> _S32)) * 2.0**-31 - 1.0
+    gy = np.float64(np.int64(bits & _LOW)) * 2.0**-31 - 1.0
     return gx * x + gy * y
 
 

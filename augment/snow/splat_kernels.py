@@ -29,8 +29,8 @@ WALL_SPREAD = 0.7  # of a wall's discs upwards, in heights of one
 WALL_LIFT = 0.25  # by which its lowest keeps clear of the wall's foot, in heights of one
 INSET = 0.12  # by which a wall stands behind the cell's border, in cells
 SUNK = 0.5  # by which a disc's middle lies below the surface, in its thickness
-ROUGH, ROUGH_GRAIN = 0.03, 0.10  # tilt of a disc's normal for its light, and more with grain
-PALE, PALE_GRAIN = 0.008, 0.022  # of its brightness
+ROUGH, ROUGH_GRAIN = 0.03, 0.15  # tilt of a disc's normal for its light, and more with grain
+PALE, PALE_GRAIN = 0.01, 0.035  # of its brightness
 MOTTLED = 0.010  # of the brightness per deviation of the mottling noise
 SHADED_HOLLOW, LARGEST_BEND = 0.9, 0.12  # a hollow's loss of brightness per bend, and most bend
 THIN_M, THIN_LOSS = 0.005, 0.42  # depth through which the ground darkens snow, and how much
@@ -49,7 +49,7 @@ def _uniform(bits, number):
     bits = (bits ^ (bits >> _S30)) * _A
     bits = (bits ^ (bits >> _S27)) * _B
     bits = bits ^ (bits >> _S31)
-    return np.float64(bits >> _S11) * _UNIT * 2.0 - 1.0
+    return np.float64(np.int64(bits >> _S11)) * _UNIT * 2.0 - 1.0
 
 
 @kernel
