@@ -12,7 +12,7 @@ from recipes.load import load_recipe
 from tools.pictures import draw_sheet, draw_video
 from tools.warm_up import warm_up
 
-RECIPES = ("clear", "dense-fog", "street-flood")
+RECIPES = ("clear", "dense-fog", "street-flood", "fresh-snow")
 CAMERA = "front"  # the one that is shown as a video
 
 

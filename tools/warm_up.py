@@ -8,15 +8,17 @@ from collections.abc import Sequence
 import torch
 
 from augment.apply import render_view
-from augment.cameras import Camera
+from augment.cameras import Camera, Frame
 from augment.geometry import rigid
 from augment.ground_heights import Ground
+from augment.labels import Boxes, LidarSweep
 from augment.render import cpu
 from augment.scene import Gaussians, Scene
 from augment.sky import CubemapSky
 from recipes.schema import Recipe
 
 SIZE = 32  # pixels a side
+ACROSS, SPACING_M = 10, 0.1  # splats of the road to each side, and between them
 
 
 def warm_up(recipes: Sequence[Recipe]) -> float:
@@ -25,29 +27,56 @@ def warm_up(recipes: Sequence[Recipe]) -> float:
     started = time.perf_counter()
     seen = set()
     for recipe in recipes:
-        flood = recipe.weather.flood
-        if flood is None:
+        flood, snow, output = recipe.weather.flood, recipe.weather.snow, recipe.output
+        if flood is None and snow is None:
             continue
-        ids = recipe.output.semantic or recipe.output.instance
-        kernels = (flood.reflection, recipe.output.depth, ids)
+        ids = output.semantic or output.instance
+        water, light = flood and flood.reflection, snow and snow.shading
+        kernels = (water, light, output.depth, ids, output.surface)
         if kernels not in seen:
             seen.add(kernels)
-            render_view(_pool(flood.level_m), _camera(flood.level_m + 0.5), recipe)
+            level_z_m = 0.0 if flood is None else flood.level_m
+            scene = _yard(level_z_m, with_labels=output.labels)
+            render_view(scene, scene.frames[0].cameras["warm-up"], recipe)
     return seconds + time.perf_counter() - started
 
 
-def _pool(level_z_m: float) -> Scene:
-    """A splat above the water and one below it; the level counts from z = 0."""
-    means = torch.tensor([[4.0, 0.0, level_z_m + 0.1], [4.0, 0.0, level_z_m - 0.1]])
+def _yard(level_z_m: float, *, with_labels: bool) -> Scene:
+    """A level road above a flood's surface, and a splat below it; the level counts from z = 0."""
+    across = torch.arange(-ACROSS, ACROSS + 1) * SPACING_M
+    x, y = torch.meshgrid(across + 4, across, indexing="ij")
+    road = torch.stack([x.flatten(), y.flatten(), torch.full((x.numel(),), level_z_m + 0.1)], 1)
+    means = torch.cat([road, torch.tensor([[4.0, 0.0, level_z_m - 0.1]])])
     gaussians = Gaussians(
         means=means,
-        quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(2, 1),
-        scales=torch.full((2, 3), 0.1),
-        opacities=torch.full((2,), 0.9),
-        sh=torch.zeros(2, 1, 3),
+        quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(len(means), 1),
+        scales=torch.tensor([[SPACING_M, SPACING_M, 0.02]]).repeat(len(means), 1),
+        opacities=torch.full((len(means),), 0.9),
+        sh=torch.zeros(len(means), 1, 3),
     )
     sky = CubemapSky(torch.zeros(6, 2, 2, 3))
-    return Scene("warm-up", "warm-up", gaussians, (), sky, (), ground=Ground(0.0, 0.0, "stated"))
+    camera = _camera(level_z_m + 1.0)
+    frame = Frame(0, 0, torch.eye(4, dtype=torch.float64), {camera.name: camera})
+    return Scene(
+        "warm-up",
+        "warm-up",
+        gaussians,
+        (),
+        sky,
+        (frame,),
+        labels=_NoLabels() if with_labels else None,
+        ground=Ground(0.0, 0.0, "stated"),
+    )
+
+
+class _NoLabels:
+    """Labels of which there are none: what is drawn for labels' sake is drawn."""
+
+    def boxes(self, frame_index: int) -> Boxes:
+        return Boxes.empty()
+
+    def lidar(self, frame_index: int) -> LidarSweep | None:
+        return None
 
 
 def _camera(z_m: float) -> Camera:
