@@ -7,6 +7,7 @@ from weakref import WeakKeyDictionary
 
 from augment.scene import Scene
 from augment.snow.beds import bed_of
+from augment.snow.cells import SnowBed
 from augment.snow.cover import SnowCover
 from augment.snow.layer import lay_snow
 from augment.snow.light import illumination_of
@@ -31,9 +32,10 @@ def cover_of(scene: Scene, placed: PlacedSnow) -> SnowCover:
         SceneError: snow cannot be placed in this scene, or not with cells this small.
     """
     covers = _covers.setdefault(scene, OrderedDict())
-    if placed not in covers:
-        bed = bed_of(scene, placement_settings(placed.snow))
-        covers[placed] = lay_snow(
+    bed = bed_of(scene, placement_settings(placed.snow))
+    laid_on, cover = covers.get(placed, (None, None))
+    if cover is None or laid_on is not bed:
+        cover = lay_snow(
             bed,
             scene,
             placed.snow,
@@ -41,10 +43,12 @@ def cover_of(scene: Scene, placed: PlacedSnow) -> SnowCover:
             seed=placed.seed,
             water_level_z_m=placed.water_level_z_m,
         )
+        covers[placed] = (bed, cover)
     covers.move_to_end(placed)
     while len(covers) > _MOST_COVERS:
         covers.popitem(last=False)
-    return covers[placed]
+    return cover
 
 
-_covers: WeakKeyDictionary[Scene, OrderedDict[PlacedSnow, SnowCover]] = WeakKeyDictionary()
+_Covers = OrderedDict[PlacedSnow, tuple[SnowBed, SnowCover]]
+_covers: WeakKeyDictionary[Scene, _Covers] = WeakKeyDictionary()

@@ -31,6 +31,8 @@ class _View:
     flood: _Water | None
     semantic: None = None
     instance: None = None
+    snow: None = None
+    snowy: None = None
 
 
 def _render(scene, camera, recipe, *, backend) -> _View:
