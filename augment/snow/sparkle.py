@@ -15,9 +15,10 @@ from augment.scene import Gaussians
 from augment.semantics import SemanticClass
 
 FARTHEST_M = 15.0  # from the camera: glints fade until there
-LOBE_DEG = 14.0  # how far a mirror may be off what throws the sun at the camera
+LOBE_DEG = 9.0  # how far a mirror may be off what throws the sun at the camera
 SIZE_M = 0.002  # standard deviation of a glint
 LIFTED = 4.0  # height over a disc's middle, in its thickness
+PER_DISC = 2  # crystals at most
 WIDEST_M = 0.15  # discs larger than this are too far for any glint
 DULL, STRONG = 0.02, 0.25  # by how much lit snow outshines shaded snow where glints begin, are full
 CLEAN = 0.9  # of the usual brightness: packed and shaded snow below it shows none
@@ -71,7 +72,7 @@ def crystals_of(
     sparkle: float,
     rng: np.random.Generator,
 ) -> Crystals | None:
-    """Crystals on `sparkle` of the discs; None where the light makes no glints.
+    """As many of all possible crystals as `sparkle` says; None where the light makes no glints.
 
     Their mirrors face every direction above the snow alike. normals: of the discs. rises: by how
     much snow in the sun is brighter than in shade.
@@ -79,14 +80,16 @@ def crystals_of(
     strength = min((rises - DULL) / (STRONG - DULL), 1.0)
     if strength <= 0 or len(gaussians) == 0:
         return None
-    draws = torch.from_numpy(rng.random((5, len(gaussians)), np.float32))
     brightness = gaussians.sh[:, 0].mean(1) * SH_C0 + 0.5
-    kept = (draws[0] < sparkle) & (gaussians.scales[:, :2].amax(1) < WIDEST_M)
-    kept &= brightness > CLEAN * brightness.median()
-    draws, normals = draws[:, kept], normals[kept]
+    bearing = gaussians.scales[:, :2].amax(1) < WIDEST_M
+    bearing &= brightness > CLEAN * brightness.median()
+    draws = torch.from_numpy(rng.random((5, PER_DISC * len(gaussians)), np.float32))
+    kept = ((draws[0] < sparkle) & bearing.repeat(PER_DISC)).nonzero()[:, 0]
+    draws, discs = draws[:, kept], kept % len(gaussians)
     up, around = draws[1], 2 * math.pi * draws[2]
     flat = (1 - up * up).sqrt()
     mirrors = torch.stack([flat * around.cos(), flat * around.sin(), up], 1)
-    side, thick = gaussians.scales[kept, 1:2], gaussians.scales[kept, 2:3]
+    side, thick = gaussians.scales[discs, 1:2], gaussians.scales[discs, 2:3]
     beside = torch.stack([draws[3] - 0.5, draws[4] - 0.5, torch.zeros_like(up)], 1) * side
-    return Crystals(gaussians.means[kept] + LIFTED * thick * normals + beside, mirrors, strength)
+    places = gaussians.means[discs] + LIFTED * thick * normals[discs] + beside
+    return Crystals(places, mirrors, strength)

@@ -330,7 +330,6 @@ def test_gaussians_are_buried_where_all_their_cells_carry_snow():
     scene = scene_of(grid_surface(np.zeros((10, 10)), 0.5))
     before = scene.background.opacities.clone()
     cells = level_bed(10.0, 0.1).ground
-    heights_scene = {"depth_m": 0.1, "coverage": 0.5}
     rng = np.random.default_rng(0)
     buried_by = torch.from_numpy(rng.integers(0, len(cells), (60, 5), np.int32))
     buried_by[:40, 1:] = buried_by[:40, :1]
@@ -338,7 +337,7 @@ def test_gaussians_are_buried_where_all_their_cells_carry_snow():
     cells = dataclasses.replace(
         cells, buried=torch.arange(20, 80, dtype=torch.int32), buried_by=buried_by
     )
-    cover = _lay(bed_of_cells(cells), scene, **heights_scene)
+    cover = _lay(bed_of_cells(cells), scene, depth_m=0.1, coverage=0.5)
     snowy = set()
     for x, y in cover.ground.gaussians.means[:, :2].tolist():  # no disc leaves its cell
         snowy.add((math.floor(x / 0.1), math.floor(y / 0.1)))
