@@ -55,8 +55,8 @@ def find_buried(
     if len(index) == 0:
         return none
     rows = torch.from_numpy(index)
-    axes = rotmat_from_quat(gaussians.quats[rows].double()).numpy()  # columns: the axes
-    scales = gaussians.scales[rows].numpy().astype(np.float64)
+    axes = rotmat_from_quat(gaussians.quats[rows]).numpy()  # columns: the axes
+    scales = gaussians.scales[rows].numpy()
     order = np.argsort(scales, axis=1, kind="stable")
     axes = np.take_along_axis(axes, order[:, None, :], 2)
     scales = np.take_along_axis(scales, order, 1)

@@ -16,6 +16,7 @@ from augment.snow.surface_kernels import LINK
 
 STEP_M = 0.1  # higher steps than this between cells are edges
 LEAST_AREA_M2, LEAST_CELLS = 0.05, 4  # smaller patches are specks
+POCKET_M2, _POCKET_STEP_M, _POCKET_CELLS = 0.1, 0.3, 1.5  # gaps that are closed
 OBSTACLE_M, _BANK_REACH_M, _BANK_SPREAD_M = 0.4, 1.0, 0.35
 _MEDIAN_M, _SMOOTH_M = 0.1, 0.15  # scales of smoothing; one cell at least
 _SLACK_M, _SMOOTHED_BY_M = 0.05, 0.02
@@ -52,7 +53,7 @@ def find_surface(
     may_carry: bool [H, W]; where it is false nothing is put, whatever lies there. Patches that end
     within the map and are smaller than least_area_m2 or LEAST_CELLS carry nothing.
     """
-    cell, covered = height_map.cell_m, np.ascontiguousarray(height_map.covered)
+    cell, covered = height_map.cell_m, height_map.covered.copy()
     shape = covered.shape
     smooth, fitted = np.empty(shape, np.float32), np.empty(shape, np.float32)
     slopes, good = np.empty((*shape, 2), np.float32), np.empty(shape, bool)
@@ -79,6 +80,9 @@ def find_surface(
     sides = _compare(fitted, covered, can_carry, step)
     least = max(LEAST_CELLS, math.ceil(least_area_m2 / cell**2))
     can_carry &= ~_specks(can_carry, sides, least)
+    filled = _fill_pockets(fitted, slopes, can_carry, covered, cell)
+    can_carry |= filled
+    covered |= filled
     sides = _compare(fitted, covered, can_carry, step)
     edges = np.empty(shape, np.float32)
     surface_kernels.edge_distances(can_carry, sides, max(EDGE_CAP_M / cell, 0.5), edges)
@@ -138,6 +142,37 @@ def _specks(can_carry: np.ndarray, sides: np.ndarray, least: int) -> np.ndarray:
     for border in (labels[0], labels[-1], labels[:, 0], labels[:, -1]):
         sizes[border] = least  # it may go on outside
     return sizes[labels] < least
+
+
+def _fill_pockets(
+    height: np.ndarray, slopes: np.ndarray, can_carry: np.ndarray, covered: np.ndarray, cell: float
+) -> np.ndarray:
+    """bool [H, W]: small gaps in a surface, which snow bridges; their heights and slopes are put
+    in as those around. What stands out of the surface, or lies between two levels, is no gap.
+    """
+    count, labels = cv2.connectedComponents((~can_carry).astype(np.uint8), connectivity=4)
+    labels = labels.astype(np.int64)
+    is_pocket = np.bincount(labels.ravel(), minlength=count) <= max(1, POCKET_M2 / cell**2)
+    for border in (labels[0], labels[-1], labels[:, 0], labels[:, -1]):
+        is_pocket[border] = False  # it may go on outside
+    is_pocket[labels[can_carry]] = False
+    around = np.ones((7, 7), np.uint8)
+    highest = cv2.dilate(np.where(can_carry, height, np.float32(-np.inf)), around)
+    lowest = cv2.erode(np.where(can_carry, height, np.float32(np.inf)), around)
+    inside = is_pocket[labels]
+    with np.errstate(invalid="ignore", over="ignore"):  # far from any surface both are infinite
+        broken = inside & ~(highest - lowest < _POCKET_STEP_M)
+    broken |= inside & covered & (height - highest > STEP_M)
+    is_pocket[labels[broken]] = False
+    filled = is_pocket[labels]
+    if not filled.any():
+        return filled
+    weights = can_carry.astype(np.float32)
+    total = cv2.GaussianBlur(weights, (0, 0), _POCKET_CELLS)
+    for values in (height, slopes[..., 0], slopes[..., 1]):
+        mean = cv2.GaussianBlur(values * weights, (0, 0), _POCKET_CELLS)
+        values[filled] = mean[filled] / total[filled]
+    return filled
 
 
 def _gradient(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

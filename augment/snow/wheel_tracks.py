@@ -140,7 +140,7 @@ def _wheel_lines(path: WheelPath) -> tuple[np.ndarray, np.ndarray]:
 
 def _within(line: np.ndarray, low: np.ndarray, high: np.ndarray) -> Sequence[np.ndarray]:
     """Stretches of two points and more between two corners."""
-    inside = ((line[:, :2] >= low) & (line[:, :2] <= high)).all(1)
+    inside = np.all((line[:, :2] >= low) & (line[:, :2] <= high), axis=1).reshape(-1)
     breaks = np.flatnonzero(np.diff(inside.astype(np.int8))) + 1
     parts = np.split(np.arange(len(line)), breaks)
     return [line[part] for part in parts if len(part) > 1 and inside[part].all()]

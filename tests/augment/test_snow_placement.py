@@ -319,6 +319,25 @@ def test_a_faint_floater_does_not_lift_the_bed() -> None:
     assert float(cells.centers_m[chosen, 2].abs().max()) < 0.02
 
 
+def test_small_gaps_are_bridged_and_posts_stand_out() -> None:
+    ground = sheet((-6, 20), (-8, 8))
+    gap = (ground.means[:, :2] - torch.tensor([5.1, 0.1])).abs().amax(1) < 0.11
+    post = one_gaussian(mean=(7.0, 0.0, 0.7), scale=(0.05, 0.05, 0.3), opacity=0.99)
+    pit = ground.means - torch.tensor([9.1, 0.1, 0.0])
+    means = ground.means.clone()
+    means[(pit[:, :2].abs() < 0.11).all(1), 2] = -1.0
+    broken = dataclasses.replace(ground, means=means).select(~gap)
+    cells = place(drive(broken, post), PlacementSettings(cell_m=0.1)).ground
+    for x in (5.1, 9.1):
+        bridged = within(cells, (x - 0.3, x + 0.3), (-0.2, 0.4))
+        area = float((cells.sizes_m[bridged] ** 2).sum())
+        assert area == pytest.approx(0.36, rel=0.01)
+        assert float(cells.centers_m[bridged, 2].abs().max()) < 0.03
+        assert not bool((cells.neighbours[bridged] == OPEN_EDGE).any())
+    foot = within(cells, (6.95, 7.05), (-0.05, 0.05))
+    assert not bool((foot & (cells.centers_m[:, 2] < 0.3)).any())
+
+
 def test_the_ground_is_buried_and_walls_are_not() -> None:
     platform, front = sheet((6, 8), (-1, 1), 0.6), wall(6, (-1, 1), (0, 0.6))
     scene = drive(GROUND, platform, front)
