@@ -121,7 +121,7 @@ def threshold_of(octaves: Octaves, share: float) -> float:
     if share >= 1:
         return -math.inf
     values = _ordered_values(tuple(octaves.lengths_m), tuple(octaves.amplitudes))
-    return float(np.quantile(values, 1 - share))
+    return float(values[min(int((1 - share) * len(values)), len(values) - 1)])
 
 
 @functools.lru_cache(maxsize=8)

@@ -411,7 +411,7 @@ def test_sparkle_adds_a_few_glints_that_change_with_the_view():
     assert counts[0] == 0 < 2 * counts[1] < counts[2] < 0.05 * 160 * 160
     glints = cover.parts_for(FAR_AWAY, camera)[-1]
     assert glints.is_snow and glints.gaussians.scales.max() < 0.005
-    moved = cover.parts_for(FAR_AWAY, looking((2.6, 4.3, 1.5), (6.0, 4.0, 0.0)))[-1]
+    moved = cover.parts_for(FAR_AWAY, looking((3.5, 5.0, 1.5), (6.0, 4.0, 0.0)))[-1]
     here, there = (set(map(tuple, p.gaussians.means.tolist())) for p in (glints, moved))
     assert len(here & there) < 0.6 * len(here)
     overcast = Illumination(SUN, LIGHT.lit_rgb, LIGHT.lit_rgb, 0.3)
