@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from augment.cameras import Camera
 from augment.errors import SceneError
 from augment.geometry import quat_from_rotmat, rotmat_from_quat
 from augment.labels import EGO_VEHICLE
@@ -579,3 +580,20 @@ def test_steps_part_surfaces_but_not_their_low_sides() -> None:
 def assert_equal_cells(a: SnowCells, b: SnowCells) -> None:
     for field in dataclasses.fields(SnowCells):
         assert torch.equal(getattr(a, field.name), getattr(b, field.name)), field.name
+
+
+def test_a_scene_of_actors_alone() -> None:
+    bed = place(drive(Gaussians.empty(), actors=[box_car()]), PlacementSettings(cell_m=0.2))
+    assert len(bed.ground) == 0 and "car" in bed.actors
+
+
+def test_a_map_camera_sees_what_is_below_it() -> None:
+    scene = drive(sheet((-6, 20), (-8, 8)))
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[1, 1] = pose[2, 2] = -1.0
+    pose[2, 3] = 30.0
+    above = Camera("map", 60, 40, 10.0, 10.0, 30.0, 20.0, pose, is_orthographic=True)
+    cells = place_snow_bed(scene, [above], PlacementSettings(cell_m=0.2)).ground
+    check_cells(cells, len(scene.background))
+    area = float((cells.sizes_m**2).sum())
+    assert area == pytest.approx(7.4 * 5.4, rel=0.15)  # 6 m x 4 m, and what is grown at its border
