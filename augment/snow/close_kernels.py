@@ -1,0 +1,132 @@
+"""Numba kernels that split near discs of snow into finer ones; `augment.snow.close` launches."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import prange
+
+from augment.render.cpu_jit import inner, kernel
+from augment.render.sh import SH_C0
+from augment.snow.splat_kernels import SPREAD
+
+FARTHEST_M = 10.0  # from the camera: discs farther away stay whole
+MOST_SPLITS = 4  # of a disc, along each of its sides
+MARGIN = 0.15  # of the image's half width or height: discs so far outside are split as well
+CRUMB_M, CLOD_M = 0.025, 0.07  # lengths of the noise that the grain follows
+CRUMB, CLOD = 0.6, 0.4  # and their shares of it
+_A, _B = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
+_X, _Y, _Z = (
+    np.uint64(step) for step in (0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0xD6E8FEB86659FD93)
+)
+_S11, _S27, _S30, _S31 = (np.uint64(s) for s in (11, 27, 30, 31))
+
+
+@kernel
+def count_splits(means, scales, pose, limits, finest, splits):
+    """Into how many discs along each side every disc is split, uint8 [S]; 0 where it stays whole.
+
+    pose: camera_from_part, float64 [3, 4]. limits: lowest and highest x / z, then y / z. finest:
+    standard deviation of a disc over its distance, that splitting stops at.
+    """
+    for i in prange(len(splits)):
+        x, y, z = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
+        right = pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3]
+        down = pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3]
+        away = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
+        distance = math.sqrt(right * right + down * down + away * away)
+        splits[i] = 0
+        if away <= 0.0 or distance >= FARTHEST_M:
+            continue
+        if not (limits[0] * away <= right <= limits[1] * away):
+            continue
+        if not (limits[2] * away <= down <= limits[3] * away):
+            continue
+        side = np.float64(max(scales[i, 0], scales[i, 1]))
+        count = min(math.ceil(side / (finest * distance)), MOST_SPLITS)
+        splits[i] = count if count > 1 else 0
+
+
+@inner()
+def _corner(bits):
+    bits = (bits ^ (bits >> _S30)) * _A
+    bits = (bits ^ (bits >> _S27)) * _B
+    bits = bits ^ (bits >> _S31)
+    return np.float64(np.int64(bits >> _S11)) * 2.0**-52 - 1.0
+
+
+@inner()
+def _noise(x, y, z, seed):
+    """Value noise over space in [-1, 1]: random numbers on a lattice of step 1, blended."""
+    fx, fy, fz = math.floor(x), math.floor(y), math.floor(z)
+    a, b, c = x - fx, y - fy, z - fz
+    a, b, c = a * a * (3.0 - 2.0 * a), b * b * (3.0 - 2.0 * b), c * c * (3.0 - 2.0 * c)
+    total = 0.0
+    for k in range(2):
+        wz = c if k else 1.0 - c
+        at_z = (np.uint64(np.int64(fz)) + np.uint64(k)) * _Z + seed
+        for j in range(2):
+            wy = b if j else 1.0 - b
+            at_y = (np.uint64(np.int64(fy)) + np.uint64(j)) * _Y + at_z
+            for i in range(2):
+                wx = a if i else 1.0 - a
+                at_x = (np.uint64(np.int64(fx)) + np.uint64(i)) * _X + at_y
+                total += wx * wy * wz * _corner(at_x)
+    return total
+
+
+@inner()
+def grain_at(x, y, z, seed):
+    """The noise that crumbs and clods of snow follow, at a place in metres."""
+    crumb = _noise(x / CRUMB_M, y / CRUMB_M, z / CRUMB_M, seed)
+    clod = _noise(x / CLOD_M, y / CLOD_M, z / CLOD_M, seed + _X)
+    return CRUMB * crumb + CLOD * clod
+
+
+@kernel
+def split(
+    chosen, splits, firsts, eye, sun, seed, relief, mottle, finest,
+    means, quats, scales, sh, slopes, fine_means, fine_quats, fine_scales, fine_sh, fine_slopes,
+):  # fmt: skip
+    """The finer discs of the chosen ones, splits[c]^2 of each from index firsts[c] on.
+
+    eye: the camera's centre; sun: its level direction times a step in metres, both [3], in the
+    part's frame. relief: brightness per fall of the noise towards the sun; mottle: per noise.
+    finest: as for count_splits. slopes, fine_slopes: [., 3] or empty. The arrays are a part's
+    Gaussians, sh [S, 1, 3].
+    """
+    for c in prange(len(chosen)):
+        i, n = chosen[c], np.int64(splits[c])
+        w, x = np.float64(quats[i, 0]), np.float64(quats[i, 1])
+        y, z = np.float64(quats[i, 2]), np.float64(quats[i, 3])
+        ux, uy, uz = 1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)
+        vx, vy, vz = 2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x)
+        mx, my, mz = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
+        far = math.sqrt((mx - eye[0]) ** 2 + (my - eye[1]) ** 2 + (mz - eye[2]) ** 2)
+        fade = min(max(2.0 * (1.0 - far / FARTHEST_M), 0.0), 1.0)
+        side = np.float64(max(scales[i, 0], scales[i, 1]))
+        fade *= min(max(side / (finest * far) - 1.0, 0.0), 1.0)  # 0 where discs grow whole again
+        along, across = np.float64(scales[i, 0]) / SPREAD, np.float64(scales[i, 1]) / SPREAD
+        s = firsts[c]
+        for j in range(n):
+            p = ((j + 0.5) / n - 0.5) * along
+            for k in range(n):
+                q = ((k + 0.5) / n - 0.5) * across
+                px, py, pz = mx + p * ux + q * vx, my + p * uy + q * vy, mz + p * uz + q * vz
+                fine_means[s, 0], fine_means[s, 1] = np.float32(px), np.float32(py)
+                fine_means[s, 2] = np.float32(pz)
+                for axis in range(4):
+                    fine_quats[s, axis] = quats[i, axis]
+                fine_scales[s, 0] = scales[i, 0] / np.float32(n)
+                fine_scales[s, 1] = scales[i, 1] / np.float32(n)
+                fine_scales[s, 2] = scales[i, 2]
+                here = grain_at(px, py, pz, seed)
+                sunward = grain_at(px + sun[0], py + sun[1], pz + sun[2], seed)
+                factor = 1.0 + fade * (relief * (here - sunward) + mottle * here)
+                for channel in range(3):
+                    color = 0.5 + SH_C0 * np.float64(sh[i, 0, channel])
+                    fine_sh[s, 0, channel] = np.float32((factor * color - 0.5) / SH_C0)
+                    if len(slopes) > 0:
+                        fine_slopes[s, channel] = np.float32(factor * slopes[i, channel])
+                s += 1
