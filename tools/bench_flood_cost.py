@@ -16,7 +16,6 @@ from typing import Any
 
 from tqdm import tqdm
 
-from augment.apply import render_buffers
 from augment.cameras import Camera
 from augment.plan import Plan, make_plan
 from augment.render.clip import BELOW, HeightClip
@@ -24,9 +23,9 @@ from augment.scene import Scene
 from augment.weather import flood_view
 from augment.weather.flood import FresnelModel, ReflectionTier
 from recipes.schema import Output, Recipe
-from tools.bench import Spread
 from tools.bench_flood_error import PICTURE_ONLY, draw, flood_recipe
 from tools.bench_flood_masks import FAR_BELOW_M, looking_up
+from tools.bench_pairs import spread_ms, spread_ratio, time_frame, time_in_turns
 
 TIERS: tuple[ReflectionTier, ...] = ("sky", "screen_space", "mirrored")
 WANTED_SHARE = 1 / 3  # of the image under water
@@ -140,27 +139,13 @@ def _time_case(scene: Scene, case: CostCase, repeats: int) -> dict[str, Any]:
         "clean": make_plan(case.clean, scene),
         "flooded": make_plan(case.recipe, scene),
     }
-    seconds: dict[str, list[float]] = {name: [] for name in plans}
-    for repeat in range(repeats + 1):
-        for name in plans if repeat % 2 else reversed(plans):
-            seconds[name].append(_time_frame(scene, case.camera, plans[name]))
-    clean, flooded = seconds["clean"][1:], seconds["flooded"][1:]  # the first compiled or loaded
+    seconds = time_in_turns(scene, case.camera, plans, repeats)
     return {
         "case": case.name,
-        "clean_ms": _spread([1e3 * s for s in clean]),
-        "flooded_ms": _spread([1e3 * s for s in flooded]),
-        "ratio": _spread([f / c for f, c in zip(flooded, clean, strict=True)]),
+        "clean_ms": spread_ms(seconds["clean"]),
+        "flooded_ms": spread_ms(seconds["flooded"]),
+        "ratio": spread_ratio(seconds["flooded"], seconds["clean"]),
     }
-
-
-def _spread(values: list[float]) -> dict[str, float]:
-    return dataclasses.asdict(Spread.of(values))
-
-
-def _time_frame(scene: Scene, camera: Camera, plan: Plan) -> float:
-    start = time.perf_counter()
-    render_buffers(scene, camera, plan)
-    return time.perf_counter() - start
 
 
 def _stage_case(scene: Scene, camera: Camera, tier: ReflectionTier, repeats: int) -> dict[str, Any]:
@@ -169,7 +154,7 @@ def _stage_case(scene: Scene, camera: Camera, tier: ReflectionTier, repeats: int
     flooded = make_plan(flood_recipe(tier, "calm"), scene)
     times: dict[str, list[float]] = defaultdict(list)
     for _ in range(repeats):
-        times["clean"].append(_time_frame(scene, camera, clean))
+        times["clean"].append(time_frame(scene, camera, clean))
         for name, seconds in _stage_times(scene, camera, flooded).items():
             times[name].append(seconds)
     before = times.pop("clean")
@@ -178,8 +163,8 @@ def _stage_case(scene: Scene, camera: Camera, tier: ReflectionTier, repeats: int
         "stages": [
             {
                 "stage": name,
-                "ms": _spread([1e3 * s for s in seconds]),
-                "over_clean": _spread([s / c for s, c in zip(seconds, before, strict=True)]),
+                "ms": spread_ms(seconds),
+                "over_clean": spread_ratio(seconds, before),
             }
             for name, seconds in times.items()
         ],
@@ -188,7 +173,7 @@ def _stage_case(scene: Scene, camera: Camera, tier: ReflectionTier, repeats: int
 
 def _stage_times(scene: Scene, camera: Camera, plan: Plan) -> dict[str, float]:
     with _timed_stages() as times:
-        whole = _time_frame(scene, camera, plan)
+        whole = time_frame(scene, camera, plan)
     return {**times, REST: whole - math.fsum(times.values())}
 
 
@@ -238,8 +223,8 @@ def _fresnel_cost(scene: Scene, camera: Camera, repeats: int) -> dict[str, Any]:
         for model in models if repeat % 2 else reversed(models):
             times = _stage_times(scene, camera, plans[model])
             seconds[model].append(times.get(STAGES["shade_water"], math.nan))
-    ratios = [e / s for e, s in zip(seconds["exact"][1:], seconds["schlick"][1:], strict=True)]
+    counted = {model: each[1:] for model, each in seconds.items()}
     return {
-        "exact_over_schlick": _spread(ratios),
-        **{f"{m}_ms": _spread([1e3 * s for s in seconds[m][1:]]) for m in models},
+        "exact_over_schlick": spread_ratio(counted["exact"], counted["schlick"]),
+        **{f"{model}_ms": spread_ms(each) for model, each in counted.items()},
     }

@@ -6,12 +6,11 @@ mark is set, so that kernels are loaded and the sky is at hand.
 
 from __future__ import annotations
 
-import gc
 import json
 import sys
 from typing import Any
 
-from tools.bench_memory import RESET_PEAK, measured_apart, return_free_memory, status_mib
+from tools.bench_memory import RESET_PEAK, extra_mib, measured_apart
 
 SMALL = 0.125
 
@@ -42,13 +41,7 @@ def _render_once(uri: str, width: int, height: int, tier: Any) -> float:
     recipe = Recipe(output=PICTURE_ONLY) if tier is None else flood_recipe(tier, "calm")
     plan = make_plan(recipe, scene)
     render_buffers(scene, camera.scaled(SMALL), plan)
-    gc.collect()
-    return_free_memory()
-    before = status_mib("VmRSS")
-    RESET_PEAK.write_text("5")
-    view = render_buffers(scene, camera, plan)
-    assert view.rgb is not None  # alive until the mark is read
-    return status_mib("VmHWM") - before
+    return extra_mib(lambda: render_buffers(scene, camera, plan))
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ import gc
 import json
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -61,14 +62,22 @@ def _render_once(case: RasterCase, seed: int) -> float:
 
     warm_up()
     gaussians, camera = random_scene(case, seed=seed)
+    parts, buffers = [PosedGaussians(gaussians)], frozenset({RGB, ALPHA})
+    return extra_mib(lambda: rasterize_cpu(parts, camera, buffers, RasterSettings(), None))
+
+
+def extra_mib(action: Callable[[], object]) -> float:
+    """MiB that this process takes at the highest moment of an action, above what it holds before;
+    what the action returns counts.
+    """
     gc.collect()
     return_free_memory()
     before = status_mib("VmRSS")
     RESET_PEAK.write_text("5")
-    parts, buffers = [PosedGaussians(gaussians)], frozenset({RGB, ALPHA})
-    output = rasterize_cpu(parts, camera, buffers, RasterSettings(), None)
-    assert output.rgb is not None  # alive until the mark is read
-    return status_mib("VmHWM") - before
+    kept = action()
+    highest = status_mib("VmHWM")
+    del kept  # alive until the mark was read
+    return highest - before
 
 
 def return_free_memory() -> None:

@@ -221,7 +221,7 @@ def sheet(
 
 
 def bench(
-    what: Positional[Literal["raster", "smog", "flood", "fit"]] = "raster",
+    what: Positional[Literal["raster", "smog", "flood", "snow", "fit"]] = "raster",
     repeats: int = 7,
     quick: bool = False,
     scene: str | None = None,
@@ -233,17 +233,19 @@ def bench(
     raster: the rasteriser on random scenes: time of each stage, pairs per second, memory, and the
     torch reference beside it. smog: the error of both smog models against exact per-pixel smog on
     the procedural street. flood: what flooded frames cost beside clean ones, how far each kind of
-    reflection is from the exact one, and whether cameras agree on where the water is. fit: time of
-    each stage of a reconstruction's step, and memory.
+    reflection is from the exact one, and whether cameras agree on where the water is. snow: how
+    much of the open ground it covers and how high, what placing and drawing it costs, and whether
+    cameras agree on it. fit: time of each stage of a reconstruction's step, and memory.
 
     Args:
         what: Which benchmark.
-        repeats: Timed frames a scene (raster) or a kind of flood (flood).
+        repeats: Timed frames a scene (raster) or a kind of flood or snow (flood, snow).
         quick: The smaller scene, one view, or fewer steps, only.
         scene: Raw data to fit (fit); by default a drive down the procedural street is recorded.
             Or the scene whose frames are timed (flood), as for render; by default the procedural
-            street with a million Gaussians.
-        pictures: Also draw levels, waves and reflections with their time and error here (flood).
+            street with a million Gaussians. Or a scene that is measured beside it (snow).
+        pictures: Also draw levels, waves and reflections with their time and error here (flood), or
+            depths, shadings, estimators and masks (snow).
         json_file: Also write the figures to this file.
     """
     if what == "smog":
@@ -260,6 +262,17 @@ def bench(
             from tools.flood_pictures import draw_flood_pictures
 
             text += "".join(f"\nwrote {path}" for path in draw_flood_pictures(pictures))
+    elif what == "snow":
+        from tools import bench_snow
+        from tools.bench_snow_text import snow_text
+
+        case = bench_snow.QUICK if quick else bench_snow.WHOLE
+        result = bench_snow.bench_snow(case, scene_uri=scene, repeats=repeats)
+        text = snow_text(result)
+        if pictures is not None:
+            from tools.snow_pictures import draw_snow_pictures
+
+            text += "".join(f"\nwrote {path}" for path in draw_snow_pictures(pictures))
     elif what == "fit":
         from tools.bench_fit import bench_fit, fit_text
 
