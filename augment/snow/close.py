@@ -25,8 +25,8 @@ from augment.snow.close_kernels import CRUMB_M, MARGIN
 # Splitting stops at a standard deviation of so many pixels, and of so much of the distance.
 FINEST_PX, FINEST = 4.0, 0.003
 ROWS = 2048  # discs that a thread takes at a time
-RELIEF = 2.2  # brightness per fall of the noise towards the sun, of a clear day's contrast
-MOTTLE = 0.12  # brightness per noise, in any light
+RELIEF = 5.0  # brightness per fall of the noise towards the sun, of a clear day's contrast
+MOTTLE = 0.22  # brightness per noise, in any light
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ def split_near(
     )
     fine_slopes = torch.empty(0 if slopes is None else total, 3)
     level = sun.numpy() * np.array([1.0, 1.0, 0.0])
-    step = 0.5 * CRUMB_M * level / max(float(np.linalg.norm(level)), 1e-9)
+    step = 0.25 * CRUMB_M * level / max(float(np.linalg.norm(level)), 1e-9)
     with kernel_threads(ROWS):
         close_kernels.split(
             chosen,

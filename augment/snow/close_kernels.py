@@ -11,6 +11,7 @@ from augment.render.cpu_jit import inner, kernel
 from augment.render.sh import SH_C0
 from augment.snow.splat_kernels import SPREAD
 
+REACH = 1.4  # cells that a disc's parts cover: discs lie scattered, up to so far apart
 FARTHEST_M = 10.0  # from the camera: discs farther away stay whole
 MOST_SPLITS = 4  # of a disc, along each of its sides
 MARGIN = 0.15  # of the image's half width or height: discs so far outside are split as well
@@ -43,7 +44,7 @@ def count_splits(means, scales, pose, limits, finest, splits):
             continue
         if not (limits[2] * away <= down <= limits[3] * away):
             continue
-        side = np.float64(max(scales[i, 0], scales[i, 1]))
+        side = REACH * np.float64(max(scales[i, 0], scales[i, 1]))
         count = min(math.ceil(side / (finest * distance)), MOST_SPLITS)
         splits[i] = count if count > 1 else 0
 
@@ -91,7 +92,7 @@ def split(
 ):  # fmt: skip
     """The finer discs of the chosen ones, splits[c]^2 of each from index firsts[c] on.
 
-    eye: the camera's centre; sun: its level direction times a step in metres, both [3], in the
+    eye: the camera's centre; sun: its level direction times half a step in metres, both [3], in the
     part's frame. relief: brightness per fall of the noise towards the sun; mottle: per noise.
     finest: as for count_splits. slopes, fine_slopes: [., 3] or empty. The arrays are a part's
     Gaussians, sh [S, 1, 3].
@@ -105,9 +106,10 @@ def split(
         mx, my, mz = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
         far = math.sqrt((mx - eye[0]) ** 2 + (my - eye[1]) ** 2 + (mz - eye[2]) ** 2)
         fade = min(max(2.0 * (1.0 - far / FARTHEST_M), 0.0), 1.0)
-        side = np.float64(max(scales[i, 0], scales[i, 1]))
+        side = REACH * np.float64(max(scales[i, 0], scales[i, 1]))
         fade *= min(max(side / (finest * far) - 1.0, 0.0), 1.0)  # 0 where discs grow whole again
-        along, across = np.float64(scales[i, 0]) / SPREAD, np.float64(scales[i, 1]) / SPREAD
+        wide, deep = REACH * np.float64(scales[i, 0]), REACH * np.float64(scales[i, 1])
+        along, across = wide / SPREAD, deep / SPREAD
         s = firsts[c]
         for j in range(n):
             p = ((j + 0.5) / n - 0.5) * along
@@ -118,12 +120,12 @@ def split(
                 fine_means[s, 2] = np.float32(pz)
                 for axis in range(4):
                     fine_quats[s, axis] = quats[i, axis]
-                fine_scales[s, 0] = scales[i, 0] / np.float32(n)
-                fine_scales[s, 1] = scales[i, 1] / np.float32(n)
+                fine_scales[s, 0], fine_scales[s, 1] = np.float32(wide / n), np.float32(deep / n)
                 fine_scales[s, 2] = scales[i, 2]
-                here = grain_at(px, py, pz, seed)
+                behind = grain_at(px - sun[0], py - sun[1], pz - sun[2], seed)
                 sunward = grain_at(px + sun[0], py + sun[1], pz + sun[2], seed)
-                factor = 1.0 + fade * (relief * (here - sunward) + mottle * here)
+                bright = relief * (behind - sunward) + 0.5 * mottle * (behind + sunward)
+                factor = 1.0 + fade * bright
                 for channel in range(3):
                     color = 0.5 + SH_C0 * np.float64(sh[i, 0, channel])
                     fine_sh[s, 0, channel] = np.float32((factor * color - 0.5) / SH_C0)

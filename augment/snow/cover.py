@@ -13,6 +13,7 @@ from torch import Tensor
 from augment.cameras import Camera
 from augment.render.sh import SH_C0
 from augment.scene import Gaussians, PosedGaussians, Scene, SplatShading
+from augment.snow.close import Grain, split_near
 from augment.snow.sparkle import Crystals
 
 
@@ -37,7 +38,8 @@ class Layer:
 @dataclass(frozen=True, eq=False)
 class SnowCover:
     """The snow in a scene. actors: layers by track_id. sun, wrap: of the light, for layers with
-    slopes (world; see SplatShading). thickness_m: the layer's depth on level ground.
+    slopes (world; see SplatShading). thickness_m: the layer's depth on level ground. grain: how the
+    ground's snow looks from close by.
     """
 
     ground: Layer
@@ -45,6 +47,7 @@ class SnowCover:
     sun: tuple[float, float, float]
     wrap: float
     thickness_m: float
+    grain: Grain
 
     def parts_for(self, scene: Scene, camera: Camera) -> tuple[PosedGaussians, ...]:
         """The scene's parts and the snow on them at the moment the camera took its image.
@@ -71,22 +74,36 @@ class SnowCover:
     def _posed(
         self, layer: Layer, part: PosedGaussians, camera: Camera
     ) -> tuple[PosedGaussians, ...]:
-        """The layer where its part stands, and what glints on it."""
+        """The layer where its part stands, the ground's finer where it is near, and its glints."""
         pose, number = part.world_from_part, part.instance_id
         sun, eye_m = torch.tensor(self.sun, dtype=torch.float64), camera.centre
         if pose is not None:
             sun, eye_m = pose[:3, :3].T @ sun, pose[:3, :3].T @ (eye_m - pose[:3, 3])
-        gaussians, shading = layer.gaussians, None
+        gaussians, slopes = layer.gaussians, layer.slopes
         if layer.normals is not None:
-            assert layer.slopes is not None
-            gaussians = _lit(gaussians, layer.slopes, layer.normals, sun, self.wrap)
-        elif layer.slopes is not None:
-            shading = SplatShading(layer.slopes, tuple(sun.tolist()), self.wrap)
-        snow = PosedGaussians(gaussians, pose, number, is_snow=True, shading=shading)
+            assert slopes is not None
+            gaussians = _lit(gaussians, slopes, layer.normals, sun, self.wrap)
+            slopes = None
+        drawn = [(gaussians, slopes)]
+        near = (
+            split_near(gaussians, slopes, camera, sun, self.grain) if layer is self.ground else None
+        )
+        if near is not None:
+            drawn = [(near.whole, slopes), (near.fine, near.fine_slopes)]
         glints = None if layer.crystals is None else layer.crystals.glints(sun, eye_m)
-        if glints is None:
-            return (snow,)
-        return snow, PosedGaussians(glints, pose, number, is_snow=True)
+        if glints is not None:
+            drawn.append((glints, None))
+        light = tuple(sun.tolist())
+        return tuple(
+            PosedGaussians(
+                splats,
+                pose,
+                number,
+                is_snow=True,
+                shading=None if added is None else SplatShading(added, light, self.wrap),
+            )
+            for splats, added in drawn
+        )
 
 
 def _lit(

@@ -19,6 +19,7 @@ from augment.scene import Gaussians, Scene
 from augment.semantics import SemanticClass
 from augment.snow import noise_kernels, splat_kernels
 from augment.snow.cells import SnowBed, SnowCells
+from augment.snow.close import Grain
 from augment.snow.cover import Layer, SnowCover
 from augment.snow.light import Illumination
 from augment.snow.noise import Octaves
@@ -80,7 +81,15 @@ def lay_snow(
         sun=light.sun,
         wrap=light.wrap,
         thickness_m=snow.depth_m,
+        grain=_grain(snow, scene, light, seed),
     )
+
+
+def _grain(snow: Snow, scene: Scene, light: Illumination, seed: int) -> Grain:
+    rng = rng_for(seed=seed, scene=scene.name, effect="snow.grain")
+    lit, shadow = math.fsum(light.lit_rgb), math.fsum(light.shadow_rgb)
+    contrast = min(max(1 - shadow / lit, 0.0), 1.0) if lit > 0 else 0.0
+    return Grain(snow.grain, contrast, int(rng.integers(0, 2**63)))
 
 
 def _lay(
