@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 from augment.apply import render_buffers
 from augment.cameras import Camera
@@ -35,6 +35,12 @@ def time_frame(scene: Scene, camera: Camera, plan: Plan) -> float:
     return time.perf_counter() - start
 
 
+def turns(names: Iterable[str], repeat: int) -> list[str]:
+    """The names in order, and every other time in the opposite one."""
+    order = list(names)
+    return order if repeat % 2 else order[::-1]
+
+
 def time_in_turns(
     scene: Scene, camera: Camera, plans: Mapping[str, Plan], repeats: int
 ) -> dict[str, list[float]]:
@@ -43,6 +49,6 @@ def time_in_turns(
     """
     seconds: dict[str, list[float]] = {name: [] for name in plans}
     for repeat in range(repeats + 1):
-        for name in plans if repeat % 2 else reversed(plans):
+        for name in turns(plans, repeat):
             seconds[name].append(time_frame(scene, camera, plans[name]))
     return {name: each[1:] for name, each in seconds.items()}

@@ -84,7 +84,7 @@ def bench_snow(
         "street": case.street,
         "accuracy": bench_accuracy(street, truth, cell_m=case.cell_m, case=case.accuracy),
         "depths": street_depths(street, truth, views),
-        "masks": bench_masks(street, case.frames, scale=case.scale / 2),
+        "masks": bench_masks(street, case.frames, scale=case.scale / 2, cell_m=case.cell_m),
         "load_after": load_average(),
     }
 
@@ -102,7 +102,7 @@ def _scene_figures(
             **placement,
             "peak_mib": placement_peak_mib(uri, case.cell_m) if memory else None,
         },
-        "cost": bench_cost(scene, camera, repeats=repeats, progress=progress),
+        "cost": bench_cost(scene, camera, cell_m=case.cell_m, repeats=repeats, progress=progress),
         "lidar_depths": None if uri == case.scene else _against_lidar(scene),
     }
 

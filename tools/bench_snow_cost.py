@@ -17,7 +17,7 @@ from recipes.flood import Flood
 from recipes.schema import Output, Recipe, Smog, Weather
 from recipes.snow import Snow
 from tools.bench_flood_error import PICTURE_ONLY
-from tools.bench_pairs import spread_ms, spread_ratio, time_frame, time_in_turns
+from tools.bench_pairs import spread_ms, spread_ratio, time_frame, time_in_turns, turns
 
 SHADINGS = ("per_splat", "per_pixel")
 DEPTH_M = 0.1
@@ -25,42 +25,53 @@ STAGES = ("project", "sort", "bin", "raster")
 PARTS, REST = "snow put in place", "the rest"
 
 
-def snow_recipe(shading: str = "per_splat", *, output: Output | None = None, **weather) -> Recipe:
+def snow_recipe(
+    shading: str = "per_splat",
+    *,
+    cell_m: float = 0.05,
+    output: Output | None = None,
+    **weather: Any,
+) -> Recipe:
     """Snow as the cost is measured of; weather: what else the recipe has."""
-    snow = Snow.model_validate({"depth_m": DEPTH_M, "shading": shading})
+    snow = Snow.model_validate({"depth_m": DEPTH_M, "shading": shading, "cell_m": cell_m})
     return Recipe(weather=Weather(snow=snow, **weather), output=output or PICTURE_ONLY)
 
 
-def cost_cases() -> dict[str, tuple[Recipe, Recipe]]:
+def cost_cases(cell_m: float = 0.05) -> dict[str, tuple[Recipe, Recipe]]:
     """The recipe with snow and that without, of every case."""
     smog = Smog(visibility_m=200)
     flood = Flood(level_m=0.15, reference="median")
     default = Output()
     cases = {}
     for shading in SHADINGS:
-        cases[shading] = snow_recipe(shading), Recipe(output=PICTURE_ONLY)
+        cases[shading] = snow_recipe(shading, cell_m=cell_m), Recipe(output=PICTURE_ONLY)
     for shading in SHADINGS:
         cases[f"{shading}, depth and labels"] = (
-            snow_recipe(shading, output=default),
+            snow_recipe(shading, cell_m=cell_m, output=default),
             Recipe(output=default),
         )
     for shading in SHADINGS:
         cases[f"{shading}, smog"] = (
-            snow_recipe(shading, smog=smog),
+            snow_recipe(shading, cell_m=cell_m, smog=smog),
             Recipe(weather=Weather(smog=smog), output=PICTURE_ONLY),
         )
     cases["per_splat, flood"] = (
-        snow_recipe(flood=flood),
+        snow_recipe(cell_m=cell_m, flood=flood),
         Recipe(weather=Weather(flood=flood), output=PICTURE_ONLY),
     )
     return cases
 
 
 def bench_cost(
-    scene: Scene, camera: Camera, *, repeats: int, progress: bool = True
+    scene: Scene,
+    camera: Camera,
+    *,
+    cell_m: float = 0.05,
+    repeats: int,
+    progress: bool = True,
 ) -> dict[str, Any]:
     """Times of all cases and of their stages. repeats: pairs of frames that count."""
-    cases, results, stages = cost_cases(), [], []
+    cases, results, stages = cost_cases(cell_m), [], []
     with tqdm(total=len(cases) + len(SHADINGS), disable=not progress) as bar:
         for name, (snowy, clean) in cases.items():
             bar.set_description(name)
@@ -77,7 +88,7 @@ def bench_cost(
             bar.update()
         for shading in SHADINGS:
             bar.set_description(f"stages, {shading}")
-            stages.append({"shading": shading, **_stages(scene, camera, shading, repeats)})
+            stages.append({"shading": shading, **_stages(scene, camera, shading, cell_m, repeats)})
             bar.update()
     return {
         "camera": f"{camera.name} {camera.width}x{camera.height}, focal length {camera.fx:.0f} px",
@@ -88,15 +99,17 @@ def bench_cost(
     }
 
 
-def _stages(scene: Scene, camera: Camera, shading: str, repeats: int) -> dict[str, Any]:
+def _stages(
+    scene: Scene, camera: Camera, shading: str, cell_m: float, repeats: int
+) -> dict[str, Any]:
     """Milliseconds of each stage of a clean and of a snowy picture, and what they draw."""
     plans = {
         "clean": make_plan(Recipe(output=PICTURE_ONLY), scene),
-        "snowy": make_plan(snow_recipe(shading), scene),
+        "snowy": make_plan(snow_recipe(shading, cell_m=cell_m), scene),
     }
     times: dict[str, dict[str, list[float]]] = {name: defaultdict(list) for name in plans}
     for repeat in range(repeats + 1):
-        for name in plans if repeat % 2 else reversed(plans):
+        for name in turns(plans, repeat):
             for stage, value in _stage_times(scene, camera, plans[name]).items():
                 times[name][stage].append(value)
     rows = []

@@ -77,13 +77,15 @@ def pair_agreement(here: SnowView, there: SnowView) -> dict[str, Any]:
     }
 
 
-def bench_masks(scene: Scene, frames: Sequence[int], *, scale: float) -> dict[str, Any]:
+def bench_masks(
+    scene: Scene, frames: Sequence[int], *, scale: float, cell_m: float = 0.05
+) -> dict[str, Any]:
     """Pairs of neighbouring cameras, and of each camera with itself a frame later, taken at the
     first one's time; figures of both shadings, and of all pairs together.
     """
     figures = {}
     for shading in SHADINGS:
-        recipe = snow_recipe(shading, output=DEPTH_ONLY)
+        recipe = snow_recipe(shading, cell_m=cell_m, output=DEPTH_ONLY)
         cameras, ahead = [], []
         for index in frames:
             frame = scene.frame(index)

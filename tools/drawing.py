@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from pathlib import Path
 
 import cv2
 import numpy as np
 
 FONT = cv2.FONT_HERSHEY_SIMPLEX
+CAPTION_PX, GAP_PX = 42, 8
 Color = tuple[int, int, int]
 
 
@@ -26,6 +29,25 @@ def write(
     shift = {"left": 0.0, "centre": 0.5, "right": 1.0}[align] * text_width(text, size, thickness)
     at = (round(x - shift), round(y))
     cv2.putText(image, text, at, FONT, size, color, thickness, cv2.LINE_AA)
+
+
+def captioned(image: np.ndarray, title: str, text: str) -> np.ndarray:
+    """A picture uint8 [H, W, 3] with two lines under it."""
+    caption = np.full((CAPTION_PX, image.shape[1], 3), 255, np.uint8)
+    write(caption, title, 4, 17, size=0.48)
+    write(caption, text, 4, 36, size=0.42, color=(110, 110, 110))
+    return np.concatenate([image, caption])
+
+
+def strip(panels: Sequence[np.ndarray]) -> np.ndarray:
+    """Pictures of one height side by side on white."""
+    gap = np.full((panels[0].shape[0], GAP_PX, 3), 255, np.uint8)
+    return np.concatenate([part for panel in panels for part in (gap, panel)][1:], 1)
+
+
+def write_jpeg(path: Path, image: np.ndarray) -> None:
+    """uint8 [H, W, 3] RGB, at a quality for documents."""
+    cv2.imwrite(str(path), image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 88])
 
 
 def text_width(text: str, size: float, thickness: int = 1) -> int:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
-import cv2
 import numpy as np
 from tqdm import tqdm
 
@@ -18,11 +17,10 @@ from augment.scene import Scene
 from recipes.flood import Flood, Waves
 from recipes.schema import Output, Recipe, Weather
 from tools.bench_flood_error import inside
-from tools.drawing import write
+from tools.drawing import captioned, strip, write_jpeg
 
 STREET = "procedural:street?seed=3"
 CAMERA, FRAME, SCALE = "front", 5, 0.6
-CAPTION_PX, GAP_PX = 42, 8
 REPEATS = 5
 LEVELS = {"kerb": 0.08, "knee": 0.4, "waist": 1.1}
 TIERS = ("sky", "screen_space", "mirrored")
@@ -50,10 +48,8 @@ def draw_flood_pictures(folder: Path) -> list[Path]:
     paths = []
     for name, floods in tqdm(rows.items(), unit="row"):
         panels = [_panel(scene, camera, title, flood) for title, flood in floods.items()]
-        gap = np.full((panels[0].shape[0], GAP_PX, 3), 255, np.uint8)
-        strip = np.concatenate([panels[0], gap, panels[1], gap, panels[2]], 1)
         paths.append(folder / f"{name}.jpg")
-        cv2.imwrite(str(paths[-1]), strip[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 88])
+        write_jpeg(paths[-1], strip(panels))
     return paths
 
 
@@ -67,10 +63,7 @@ def _panel(scene: Scene, camera: Camera, title: str, flood: Flood) -> np.ndarray
         text += f"; {_psnr(wet, truth):.1f} dB to mirrored"
     else:
         text += "; the reference"
-    caption = np.full((CAPTION_PX, camera.width, 3), 255, np.uint8)
-    write(caption, title, 4, 17, size=0.48)
-    write(caption, text, 4, 36, size=0.42, color=(110, 110, 110))
-    return np.concatenate([quantise(wet.rgb), caption])
+    return captioned(quantise(wet.rgb), title, text)
 
 
 def _timed(scene: Scene, camera: Camera, flood: Flood | None) -> tuple[float, WeatheredBuffers]:

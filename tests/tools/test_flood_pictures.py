@@ -3,6 +3,7 @@
 import cv2
 
 from tools import flood_pictures
+from tools.drawing import CAPTION_PX, GAP_PX
 
 
 def test_three_pictures_of_three_panels(tmp_path, monkeypatch):
@@ -20,8 +21,8 @@ def test_three_pictures_of_three_panels(tmp_path, monkeypatch):
     for path in paths:
         image = cv2.imread(str(path))
         height, width = round(540 * 0.25), round(960 * 0.25)
-        assert image.shape[1] == 3 * width + 2 * flood_pictures.GAP_PX
-        assert image.shape[0] == height + flood_pictures.CAPTION_PX
+        assert image.shape[1] == 3 * width + 2 * GAP_PX
+        assert image.shape[0] == height + CAPTION_PX
         caption = image[height:]
         assert (caption < 128).any() and (caption > 250).mean() > 0.7  # dark text on white
     tiers = cv2.imread(str(paths[2]))[:135].astype(int)
