@@ -1,0 +1,231 @@
+"""Snow in finished views: what images and masks show, alone and with other weather."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from augment.apply import render_buffers, render_view
+from augment.errors import SceneError
+from augment.labels import Boxes
+from augment.plan import make_plan
+from augment.render.buffers import EXPECTED_DEPTH, MODE_DEPTH, SNOW, SPLAT_IDS
+from augment.scene import Scene
+from augment.semantics import SemanticClass
+from augment.snow.covers import cover_of
+from recipes.flood import Flood, Waves
+from recipes.schema import Output, Recipe, Smog, Weather
+from recipes.snow import Snow
+from tests.snow_scenes import box_car, drive, sheet, side_wall
+
+ROAD, BUILDING, CAR = (int(SemanticClass[name]) for name in ("ROAD", "BUILDING", "VEHICLE"))
+DEPTH_M, CELL_M = 0.1, 0.1
+
+
+class NoBoxes:
+    """Labels of a drive on which nothing was labelled."""
+
+    def boxes(self, frame_index: int) -> Boxes:
+        return Boxes.empty()
+
+    def lidar(self, frame_index: int) -> None:
+        return None
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    """A road, a wall beside it with a flat roof on it, and a car that drives away."""
+    ground = sheet((-2.0, 24.0), (-4.0, 4.0), semantic=ROAD)
+    wall = side_wall(4.0, (2.0, 24.0), (0.0, 1.0))
+    wall = dataclasses.replace(wall, semantic=torch.full((len(wall),), BUILDING, dtype=torch.int16))
+    roof = sheet((2.0, 24.0), (4.0, 8.0), 1.0, semantic=BUILDING)
+    car = box_car(start=(8.0, -2.0), moved_m=3.0, size=(3.0, 1.8, 1.0), semantic=CAR)
+    return drive(ground, wall, roof, actors=[car], labels=NoBoxes())
+
+
+def snow(**options) -> Snow:
+    return Snow(**({"depth_m": DEPTH_M, "cell_m": CELL_M, "tracks": "never"} | options))
+
+
+def recipe_of(weather_snow: Snow | None = None, *, smog=None, flood=None, **output) -> Recipe:
+    weather = Weather(snow=weather_snow, smog=smog, flood=flood)
+    return Recipe(weather=weather, output=Output(**({"semantic": True} | output)))
+
+
+def view_of(scene: Scene, weather_snow: Snow | None = None, frame=0, backend="auto", **options):
+    camera = scene.frames[frame].cameras["ahead"]
+    return render_view(scene, camera, recipe_of(weather_snow, **options), backend=backend)
+
+
+def heights_of(view) -> np.ndarray:
+    """World z of every pixel's surface, NaN where there is none."""
+    rays = view.camera.ray_directions(torch.float64)[..., 2].numpy()
+    z = float(view.camera.centre[2]) + view.depth_m * rays
+    return np.where(view.depth_m > 0, z, np.nan)
+
+
+def test_snow_lies_on_the_road_the_roof_and_the_car(scene):
+    clean, white = view_of(scene, instance=True), view_of(scene, snow(), instance=True)
+    lies = white.snow == 255
+    assert set(np.unique(white.snow)) == {0, 255}
+    for kind in (ROAD, CAR):
+        seen = clean.semantic == kind
+        assert seen.sum() > 50
+    assert lies[clean.semantic == ROAD].mean() > 0.9
+    assert (white.semantic[lies] == SemanticClass.SNOW).mean() > 0.98
+    assert not lies[clean.semantic == SemanticClass.SKY][:200].any()
+    on_car = lies & (white.instance == 1)
+    assert on_car.sum() > 10  # the roof's, which is part of the car
+    ground = lies & (white.instance == 0)
+    brighter = white.rgb[ground].mean() - clean.rgb[ground].mean()
+    assert brighter > 40
+
+
+def test_depth_is_that_of_the_snow(scene):
+    bare, white = view_of(scene), view_of(scene, snow())
+    near = (bare.semantic == ROAD) & (white.snow == 255) & (bare.depth_m < 12)
+    assert near.sum() > 1000
+    rise = (heights_of(white) - heights_of(bare))[near]
+    assert np.median(rise) == pytest.approx(DEPTH_M, abs=0.02)
+
+
+def test_the_cars_snow_drives_with_it(scene):
+    for frame in (0, 1):
+        view = view_of(scene, snow(), frame=frame, instance=True, surface="solid")
+        on_car = (view.snow == 255) & (view.instance == 1)
+        x = float(view.camera.centre[0]) + view.depth_m[on_car]
+        rear = 8.0 - 1.5 + 3.0 * frame
+        assert on_car.sum() > 10
+        low, high = np.percentile(x, [10, 90])  # the rest are pixels at its edges
+        assert rear - 0.1 < low and high < rear + 3.1
+        assert np.median(heights_of(view)[on_car]) > 1.0
+
+
+@pytest.mark.parametrize("nothing", [{"depth_m": 0.0}, {"coverage": 0.0}])
+def test_snow_of_no_depth_is_the_clean_view_to_the_bit(scene, nothing):
+    clean, white = view_of(scene, instance=True), view_of(scene, snow(**nothing), instance=True)
+    for name in ("rgb", "depth_m", "semantic", "instance"):
+        assert np.array_equal(getattr(clean, name), getattr(white, name))
+    assert white.snow is not None and not white.snow.any()
+    assert white.snowy is not None and white.snowy.surface_depth_m is None
+    assert clean.snow is None and clean.snowy is None
+
+
+def test_images_of_the_bare_surface_are_those_of_the_clean_scene(scene):
+    clean = view_of(scene, instance=True)
+    white = view_of(scene, snow(), instance=True, surface="scene")
+    for name in ("depth_m", "semantic", "instance"):
+        assert np.array_equal(getattr(clean, name), getattr(white, name))
+    assert white.snow.any() and not np.array_equal(clean.rgb, white.rgb)
+    solid = view_of(scene, snow(), instance=True)
+    assert np.array_equal(solid.rgb, white.rgb) and np.array_equal(solid.snow, white.snow)
+    lies = white.snow == 255
+    off = np.abs(white.snowy.surface_depth_m - solid.depth_m)[lies] / solid.depth_m[lies]
+    assert np.quantile(off, 0.9) < 0.05  # expected depth for the labels, median in the image
+
+
+def test_what_else_is_asked_for_does_not_change_the_picture(scene):
+    rich = view_of(scene, snow(), instance=True, depth="mode")
+    poor = view_of(scene, snow(), semantic=False, depth="none", labels=False)
+    assert np.array_equal(rich.rgb, poor.rgb) and np.array_equal(rich.snow, poor.snow)
+    assert poor.depth_m is None and poor.semantic is None
+    assert poor.snowy.surface_depth_m is None and rich.snowy.surface_depth_m is not None
+
+
+@pytest.mark.parametrize("shading", ["per_splat", "per_pixel"])
+def test_both_backends_show_the_same_snow(scene, shading):
+    plan = make_plan(recipe_of(snow(shading=shading, cell_m=0.2), depth="expected"), scene)
+    camera = scene.frames[0].cameras["ahead"].scaled(0.5)
+    fast, slow = (
+        render_buffers(scene, camera, plan, backend=name) for name in ("cpu", "reference")
+    )
+    difference = (fast.rgb - slow.rgb).abs().amax(-1)
+    # The sums of some hundred splats in another order; a flip at a cut-off is 1/255 at most.
+    assert float(difference.quantile(0.99)) < 1e-3 and float(difference.max()) < 2e-2
+    assert float((fast.snow != slow.snow).float().mean()) < 1e-3
+
+
+def test_the_two_shadings_agree_on_how_bright_snow_is(scene):
+    """One is a detail of the other: means agree, pixels differ."""
+    splat = view_of(scene, snow()).rgb.astype(int)
+    pixel = view_of(scene, snow(shading="per_pixel")).rgb.astype(int)
+    lies = view_of(scene, snow()).snow == 255
+    assert abs(splat[lies].mean() - pixel[lies].mean()) < 10
+    assert not np.array_equal(splat, pixel)
+
+
+def test_the_same_bits_every_time(scene):
+    once = view_of(scene, snow())
+    again = view_of(dataclasses.replace(scene), snow())
+    other = view_of(scene, snow(seed=7))
+    assert np.array_equal(once.rgb, again.rgb)
+    assert not np.array_equal(once.rgb, other.rgb)
+
+
+@pytest.mark.parametrize("model", ["per_gaussian", "deferred"])
+def test_fog_lies_over_the_snow(scene, model):
+    fog = Smog(extinction_per_m=0.2, color=(0.5, 0.5, 0.5), model=model)
+    clear, foggy = view_of(scene, snow()), view_of(scene, snow(), smog=fog)
+    assert np.array_equal(clear.snow, foggy.snow)
+    lies = (clear.snow == 255) & (clear.depth_m > 3)
+    t = np.exp(-0.2 * clear.depth_m * view_lengths(clear))[..., None]
+    expected = t * clear.rgb + (1 - t) * 0.5 * 255
+    assert np.median(np.abs(foggy.rgb - expected)[lies]) < 3
+
+
+def view_lengths(view) -> np.ndarray:
+    return view.camera.ray_lengths().numpy()
+
+
+def test_water_melts_the_snow_it_reaches_and_mirrors_the_rest(scene):
+    flood = Flood(level_m=0.3, reference="absolute", waves=Waves(preset="still"))
+    wet = view_of(scene, snow(), flood=flood, surface="first")
+    water, lies = wet.water == 255, wet.snow == 255
+    assert water.any() and lies.any()
+    assert not (water & lies).any()
+    assert (wet.semantic[water] == SemanticClass.WATER).all()
+    heights = heights_of(wet)[lies]
+    assert np.nanmin(heights) > 0.3  # of the road's snow nothing is left
+    dry = view_of(scene, snow(), flood=flood.model_copy(update={"level_m": -0.5}), surface="first")
+    plain = view_of(scene, snow(), surface="first")
+    covered = plain.semantic != SemanticClass.SKY  # beyond the sheets the water shows
+    assert np.median(np.abs(dry.rgb.astype(int) - plain.rgb)[covered]) == 0
+    assert (dry.snow != plain.snow).mean() < 0.005
+
+
+def test_the_plan_names_what_runs_and_what_does_not(scene):
+    def steps(recipe):
+        return {step.name: step.runs for step in make_plan(recipe, scene).steps}
+
+    plain = steps(recipe_of())
+    assert not any(runs for name, runs in plain.items() if name.startswith("snow"))
+    assert SNOW not in make_plan(recipe_of(), scene).buffers
+    white = steps(recipe_of(snow()))
+    assert white["snow: placement and layer"] and not white["snow: light per pixel"]
+    assert not white["snow: bare surface"]
+    assert steps(recipe_of(snow(shading="per_pixel")))["snow: light per pixel"]
+    bare = make_plan(recipe_of(snow(), surface="scene", depth="mode"), scene)
+    assert {MODE_DEPTH, SPLAT_IDS} < bare.bare_buffers
+    assert not bare.buffers & {MODE_DEPTH, SPLAT_IDS}
+    unlabelled = dataclasses.replace(scene, labels=None)
+    poor = recipe_of(snow(), depth="none")
+    assert EXPECTED_DEPTH in make_plan(poor, scene).buffers  # what labels are measured from
+    assert EXPECTED_DEPTH not in make_plan(poor, unlabelled).buffers
+
+
+def test_a_recipes_snow_is_laid_once_and_a_third_drives_out_the_first(scene):
+    placed = [make_plan(recipe_of(snow(depth_m=d)), scene).snow for d in (0.05, 0.1, 0.2)]
+    first = cover_of(scene, placed[0])
+    assert cover_of(scene, placed[0]) is first
+    cover_of(scene, placed[1])
+    assert cover_of(scene, placed[0]) is first
+    cover_of(scene, placed[1]), cover_of(scene, placed[2])
+    assert cover_of(scene, placed[0]) is not first
+
+
+def test_scenes_without_metres_or_gravity_are_refused_before_anything_is_rendered(scene):
+    for lacks in ({"has_metric_scale": False}, {"has_known_gravity": False}):
+        with pytest.raises(SceneError, match="metres and gravity"):
+            make_plan(recipe_of(snow()), dataclasses.replace(scene, **lacks))
+    make_plan(recipe_of(snow(depth_m=0.0)), dataclasses.replace(scene, has_metric_scale=False))
