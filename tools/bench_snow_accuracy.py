@@ -76,6 +76,7 @@ def bench_accuracy(
     points = true_points(truth, cameras, xy, reach_m=case.reach_m)
     flat = points.chosen(points.is_seen & (points.slope < math.radians(settings.max_slope_deg)))
     edges, figures = at_edges(truth, flat), []
+    scene_bias = scene_bias_m(scene, truth, flat, above)
     for estimator in estimators:
         settings = PlacementSettings(cell_m=cell_m, estimator=estimator)
         bed = place_snow_bed(scene, cameras, settings)
@@ -87,7 +88,8 @@ def bench_accuracy(
                 **sheltered_share(bed.ground, truth, points),
                 "bed_error_m": _error(bed_heights(bed.ground, flat) - flat.z),
                 "depths": [
-                    drawn_figures(scene, bed, truth, flat, above, depth) for depth in depths_m
+                    drawn_figures(scene, bed, truth, flat, above, depth, scene_bias)
+                    for depth in depths_m
                 ],
             }
         )
@@ -96,7 +98,7 @@ def bench_accuracy(
         "exposed_flat_seen": len(flat),
         "at_edges": float(edges.mean()),
         "reach_m": case.reach_m,
-        "scene_bias_m": scene_bias_m(scene, truth, flat, above),
+        "scene_bias_m": scene_bias,
         "estimators": figures,
     }
 
@@ -223,9 +225,11 @@ def drawn_figures(
     flat: TruePoints,
     above: Camera,
     depth_m: float,
+    scene_bias: float,
 ) -> dict[str, Any]:
     """The snow as it is drawn from above: the points it covers; where it is drawn beneath what is
-    open to the sky; and how far its surface is from the true one raised by its depth.
+    open to the sky; and how far its surface is from the true one raised by its depth, and from that
+    with the scene's own offset.
     """
     snow = Snow(depth_m=depth_m)
     cover = lay_snow(bed, scene, snow, illumination_of(scene, snow), seed=0)
@@ -233,7 +237,7 @@ def drawn_figures(
     rows, columns = _pixels(above, flat.xy)
     z, there = height[rows, columns], shown[rows, columns]
     on_it = there & (np.abs(z - depth_m - flat.z) <= OVER_M + 0.5 * depth_m)
-    error = _error(np.where(on_it, z - flat.z - depth_m, np.nan))
+    off = np.where(on_it, z - flat.z - depth_m, np.nan)
     allowed = ALLOWED_SHARE * depth_m + ALLOWED_M
     drawn_rows, drawn_columns = np.nonzero(shown)
     step = max(1, len(drawn_rows) // 400_000)
@@ -245,7 +249,8 @@ def drawn_figures(
         "gaussians": len(cover.ground.gaussians),
         "covered": _shares(on_it, flat)["covered"],
         "sheltered": float(sunk.mean()) if len(sunk) else 0.0,
-        "error_m": error,
+        "error_m": _error(off),
+        "error_on_scene_m": _error(off - scene_bias),
         "allowed_m": allowed,
     }
 

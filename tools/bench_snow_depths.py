@@ -1,8 +1,9 @@
 """How far the three depth buffers of a camera are from the surface that it sees.
 
 The truth is the procedural street's own, or a scene's LiDAR: its frame's sweep as the camera would
-see it. LiDAR and camera look from different places, so that some returns are hidden from the
-camera; they count as errors of every estimator alike, and at silhouettes above all.
+see it. LiDAR and camera look from different places: returns that most of those about them lie in
+front of are taken for hidden from the camera and left out. Some are missed, and count as errors of
+every estimator alike, at silhouettes above all.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ ZONES = ("overall", "smooth", "silhouettes")
 JUMP_M = 0.5
 NEAR_PX, FAR_PX = 2, 4  # from a jump: a silhouette is that near, a smooth surface farther away
 LIDAR_GAP_PX = 7  # between a sweep's points in an image, about, at full resolution
+HIDDEN_SHARE = 0.6  # of the returns about one; beside a straight silhouette half are nearer
 REACH_M = 80.0
 OFF_M = 0.1
 COVERED = 0.5
@@ -71,14 +73,32 @@ def lidar_zones(depth: np.ndarray, gap_px: int) -> dict[str, np.ndarray]:
     """The same of a sweep's depth [H, W], 0 where it has no point: where neighbouring points are
     JUMP_M apart.
     """
-    known = depth > 0
+    known = (depth > 0) & ~hidden_returns(depth, 2 * gap_px)
     square = np.ones((2 * gap_px + 1, 2 * gap_px + 1), np.uint8)
     far = cv2.dilate(np.where(known, depth, -np.inf), square)
     near = cv2.erode(np.where(known, depth, np.inf), square)
-    with np.errstate(invalid="ignore"):  # inf - inf far from any point
+    with np.errstate(invalid="ignore", over="ignore"):  # far from any point both are infinite
         jumps = known & (far - near > JUMP_M)
     inside = known & (depth <= REACH_M)
     return {"overall": inside, "smooth": inside & ~jumps, "silhouettes": inside & jumps}
+
+
+def hidden_returns(depth: np.ndarray, reach_px: int) -> np.ndarray:
+    """bool [H, W]: returns of a sweep's depth [H, W], 0 where it has none, that are JUMP_M or more
+    behind HIDDEN_SHARE of those within reach_px.
+    """
+    rows, columns = np.nonzero(depth)
+    padded = np.pad(depth, reach_px)
+    own = depth[rows, columns]
+    there, nearer = np.zeros(len(rows), np.int64), np.zeros(len(rows), np.int64)
+    for down in range(2 * reach_px + 1):
+        for right in range(2 * reach_px + 1):
+            beside = padded[rows + down, columns + right]
+            there += beside > 0
+            nearer += (beside > 0) & (beside < own - JUMP_M)
+    out = np.zeros(depth.shape, bool)
+    out[rows, columns] = nearer > HIDDEN_SHARE * there
+    return out
 
 
 def _zones(

@@ -48,13 +48,14 @@ def _accuracy_lines(street: str, accuracy: dict[str, Any]) -> list[str]:
         f"  as drawn from above; the scene's own surface is off by "
         f"{100 * accuracy['scene_bias_m']:+.1f} cm",
         f"  {'heights from':<14}{'depth cm':>9}{'covered':>10}{'sheltered':>11}"
-        f"{'error median, p95, bias, cm':>34}{'allowed':>9}",
+        f"{'error median, p95, bias, cm':>34}{'allowed':>9}{'without that':>14}",
     ]
     for each in accuracy["estimators"]:
         lines += [
             f"  {each['estimator']:<14}{100 * drawn['depth_m']:>9.0f}"
             f"{_percent(drawn['covered']):>10}{_percent(drawn['sheltered']):>11}"
             f"{_error_cm(drawn['error_m']):>34}{100 * drawn['allowed_m']:>9.1f}"
+            f"{_cm(drawn['error_on_scene_m']['median']):>14}"
             for drawn in each["depths"]
         ]
     best = accuracy["estimators"][0]
@@ -154,6 +155,10 @@ def _mask_lines(masks: dict[str, Any]) -> list[str]:
 
 def _percent(share: float | None) -> str:
     return "-" if share is None else f"{100 * share:.2f} %"
+
+
+def _cm(length_m: float | None) -> str:
+    return "-" if length_m is None else f"{100 * length_m:.2f}"
 
 
 def _error_cm(error: dict[str, float | None]) -> str:

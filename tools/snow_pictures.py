@@ -138,9 +138,8 @@ def draw_estimators(scene: Scene, truth: StreetTruth) -> np.ndarray:
         picture = quantise(_frame(with_bed, view, snow).rgb)
         width = map_rgb.shape[1]
         part = cv2.resize(picture, (width, round(width * view.height / view.width)))
-        columns.append(
-            np.concatenate([captioned(map_rgb, f"heights from {estimator} depth", text), part])
-        )
+        title = f"heights from {estimator} depth: blue too low, red too high"
+        columns.append(np.concatenate([captioned(map_rgb, title, text), part]))
     return strip(columns)
 
 
