@@ -9,24 +9,28 @@ see the same grain; it fades out with the distance before the discs grow whole a
 from __future__ import annotations
 
 import dataclasses
+import functools
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from jaxtyping import Float
+from scipy import ndimage
 from torch import Tensor
 
 from augment.cameras import Camera
 from augment.render.threads import kernel_threads
 from augment.scene import Gaussians
 from augment.snow import close_kernels
-from augment.snow.close_kernels import CRUMB_M, MARGIN
+from augment.snow.close_kernels import MARGIN, TEXEL_M
 
 # Splitting stops at a standard deviation of so many pixels, and of so much of the distance.
-FINEST_PX, FINEST = 4.0, 0.003
+FINEST_PX, FINEST = 4.0, 0.0035
 ROWS = 2048  # discs that a thread takes at a time
-RELIEF = 5.0  # brightness per fall of the noise towards the sun, of a clear day's contrast
-MOTTLE = 0.22  # brightness per noise, in any light
+RELIEF = 1.8  # brightness per fall of the noise towards the sun, of a clear day's contrast
+CRUMB_M = 0.025  # what one crumb of snow measures
+TABLE = 512  # texels a side of the noise that grain follows: 5 m, repeated
+MOTTLE = 0.09  # brightness per noise, in any light
 
 
 @dataclass(frozen=True)
@@ -88,7 +92,8 @@ def split_near(
             lasts - splits.astype(np.int64) ** 2,
             camera.centre.numpy(),
             step,
-            np.uint64(grain.seed),
+            _shift_m(grain.seed),
+            _noise(),
             grain.amount * grain.contrast * RELIEF,
             grain.amount * MOTTLE,
             finest,
@@ -102,6 +107,19 @@ def split_near(
         fine,
         None if slopes is None else fine_slopes,
     )
+
+
+@functools.cache
+def _noise() -> np.ndarray:
+    """float32 [TABLE, TABLE] of unit deviation, smooth over a crumb, whose borders meet."""
+    white = np.random.Generator(np.random.PCG64(0)).standard_normal((TABLE, TABLE))
+    smooth = ndimage.gaussian_filter(white, 0.5 * CRUMB_M / TEXEL_M, mode="wrap")
+    return (smooth / smooth.std()).astype(np.float32)
+
+
+def _shift_m(seed: int) -> np.ndarray:
+    """Where a recipe's grain begins in the table, float64 [2]."""
+    return np.random.Generator(np.random.PCG64(seed)).uniform(0, TABLE * TEXEL_M, 2)
 
 
 def _count_splits(gaussians: Gaussians, camera: Camera, finest: float) -> np.ndarray:

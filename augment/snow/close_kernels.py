@@ -15,13 +15,9 @@ REACH = 1.4  # cells that a disc's parts cover: discs lie scattered, up to so fa
 FARTHEST_M = 10.0  # from the camera: discs farther away stay whole
 MOST_SPLITS = 4  # of a disc, along each of its sides
 MARGIN = 0.15  # of the image's half width or height: discs so far outside are split as well
-CRUMB_M, CLOD_M = 0.025, 0.07  # lengths of the noise that the grain follows
-CRUMB, CLOD = 0.6, 0.4  # and their shares of it
-_A, _B = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
-_X, _Y, _Z = (
-    np.uint64(step) for step in (0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0xD6E8FEB86659FD93)
-)
-_S11, _S27, _S30, _S31 = (np.uint64(s) for s in (11, 27, 30, 31))
+TEXEL_M = 0.01  # of the table of noise that the grain follows
+COARSER = 0.37  # how fast the table is read a second time, turned: for clods
+CRUMB, CLOD = 0.6, 0.4  # shares of the two
 
 
 @kernel
@@ -50,52 +46,27 @@ def count_splits(means, scales, pose, limits, finest, splits):
 
 
 @inner()
-def _corner(bits):
-    bits = (bits ^ (bits >> _S30)) * _A
-    bits = (bits ^ (bits >> _S27)) * _B
-    bits = bits ^ (bits >> _S31)
-    return np.float64(np.int64(bits >> _S11)) * 2.0**-52 - 1.0
-
-
-@inner()
-def _noise(x, y, z, seed):
-    """Value noise over space in [-1, 1]: random numbers on a lattice of step 1, blended."""
-    fx, fy, fz = math.floor(x), math.floor(y), math.floor(z)
-    a, b, c = x - fx, y - fy, z - fz
-    a, b, c = a * a * (3.0 - 2.0 * a), b * b * (3.0 - 2.0 * b), c * c * (3.0 - 2.0 * c)
-    total = 0.0
-    for k in range(2):
-        wz = c if k else 1.0 - c
-        at_z = (np.uint64(np.int64(fz)) + np.uint64(k)) * _Z + seed
-        for j in range(2):
-            wy = b if j else 1.0 - b
-            at_y = (np.uint64(np.int64(fy)) + np.uint64(j)) * _Y + at_z
-            for i in range(2):
-                wx = a if i else 1.0 - a
-                at_x = (np.uint64(np.int64(fx)) + np.uint64(i)) * _X + at_y
-                total += wx * wy * wz * _corner(at_x)
-    return total
-
-
-@inner()
-def grain_at(x, y, z, seed):
-    """The noise that crumbs and clods of snow follow, at a place in metres."""
-    crumb = _noise(x / CRUMB_M, y / CRUMB_M, z / CRUMB_M, seed)
-    clod = _noise(x / CLOD_M, y / CLOD_M, z / CLOD_M, seed + _X)
+def _grain(x, y, z, shift, noise):
+    """The noise that the grain follows, at a place in metres: two scales of one table."""
+    mask, texel = noise.shape[0] - 1, 1.0 / TEXEL_M
+    u, v = x + 0.7 * z + shift[0], y + 0.7 * z + shift[1]
+    crumb = noise[np.int64(math.floor(u * texel)) & mask, np.int64(math.floor(v * texel)) & mask]
+    u, v = (0.8 * u - 0.6 * v) * COARSER * texel, (0.6 * u + 0.8 * v) * COARSER * texel
+    clod = noise[np.int64(math.floor(u)) & mask, np.int64(math.floor(v)) & mask]
     return CRUMB * crumb + CLOD * clod
 
 
 @kernel
 def split(
-    chosen, splits, firsts, eye, sun, seed, relief, mottle, finest,
+    chosen, splits, firsts, eye, sun, shift, noise, relief, mottle, finest,
     means, quats, scales, sh, slopes, fine_means, fine_quats, fine_scales, fine_sh, fine_slopes,
 ):  # fmt: skip
     """The finer discs of the chosen ones, splits[c]^2 of each from index firsts[c] on.
 
-    eye: the camera's centre; sun: its level direction times half a step in metres, both [3], in the
-    part's frame. relief: brightness per fall of the noise towards the sun; mottle: per noise.
-    finest: as for count_splits. slopes, fine_slopes: [., 3] or empty. The arrays are a part's
-    Gaussians, sh [S, 1, 3].
+    eye: the camera's centre; sun: its level direction times half a step in metres, in the part's
+    frame. shift, noise: see `_grain`. relief: brightness per fall of the noise towards the sun;
+    mottle: per noise. finest: as for count_splits. slopes, fine_slopes: [., 3] or empty. The arrays
+    are a part's Gaussians, sh [S, 1, 3].
     """
     for c in prange(len(chosen)):
         i, n = chosen[c], np.int64(splits[c])
@@ -122,8 +93,8 @@ def split(
                     fine_quats[s, axis] = quats[i, axis]
                 fine_scales[s, 0], fine_scales[s, 1] = np.float32(wide / n), np.float32(deep / n)
                 fine_scales[s, 2] = scales[i, 2]
-                behind = grain_at(px - sun[0], py - sun[1], pz - sun[2], seed)
-                sunward = grain_at(px + sun[0], py + sun[1], pz + sun[2], seed)
+                behind = _grain(px - sun[0], py - sun[1], pz, shift, noise)
+                sunward = _grain(px + sun[0], py + sun[1], pz, shift, noise)
                 bright = relief * (behind - sunward) + 0.5 * mottle * (behind + sunward)
                 factor = 1.0 + fade * bright
                 for channel in range(3):

@@ -55,7 +55,7 @@ class SnowCover:
         The scene's own come first and in their order, so that what is neither buried nor covered
         keeps its number.
         """
-        bare = scene.parts_for(camera)
+        bare, eye_m = scene.parts_for(camera), camera.centre
         parts, snow = [], []
         for part in bare:
             layer = self.ground
@@ -68,15 +68,19 @@ class SnowCover:
             kept = dataclasses.replace(part.gaussians, opacities=layer.opacities)
             parts.append(dataclasses.replace(part, gaussians=kept))
             if len(layer.gaussians):
-                snow.extend(self._posed(layer, part, camera))
+                snow.extend(self._posed(layer, part, camera, eye_m))
         return (*parts, *snow)
 
     def _posed(
-        self, layer: Layer, part: PosedGaussians, camera: Camera
+        self,
+        layer: Layer,
+        part: PosedGaussians,
+        camera: Camera,
+        eye_m: Float[Tensor, "3"],
     ) -> tuple[PosedGaussians, ...]:
         """The layer where its part stands, the ground's finer where it is near, and its glints."""
         pose, number = part.world_from_part, part.instance_id
-        sun, eye_m = torch.tensor(self.sun, dtype=torch.float64), camera.centre
+        sun = torch.tensor(self.sun, dtype=torch.float64)
         if pose is not None:
             sun, eye_m = pose[:3, :3].T @ sun, pose[:3, :3].T @ (eye_m - pose[:3, 3])
         gaussians, slopes = layer.gaussians, layer.slopes
