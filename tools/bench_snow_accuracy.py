@@ -20,14 +20,23 @@ from augment.render.clip import UNCUT
 from augment.render.constants import RasterSettings
 from augment.render.rasterize import rasterize
 from augment.scene import PosedGaussians, Scene
-from augment.semantics import SemanticClass
-from augment.snow.cells import SnowBed, SnowCells
+from augment.snow.cells import SnowBed
 from augment.snow.cover import SnowCover
 from augment.snow.height_map import Estimator
 from augment.snow.layer import lay_snow
 from augment.snow.light import illumination_of
 from augment.snow.placement import PlacementSettings, place_snow_bed
 from recipes.snow import Snow
+from tools.bench_snow_cells import (
+    OVER_M,
+    at_edges,
+    bed_heights,
+    class_shares,
+    covered_shares,
+    height_error,
+    sheltered_share,
+    vehicle_shares,
+)
 from tools.bench_snow_truth import (
     TruePoints,
     camera_from_above,
@@ -40,11 +49,8 @@ from tools.bench_snow_truth import (
 ESTIMATORS: tuple[Estimator, ...] = get_args(Estimator)
 DEPTHS_M = (0.02, 0.1, 0.4)
 DRAWN_DEPTH_M = 0.1  # of the snow whose drawn area is measured
-OVER_M = 0.2  # a cell farther above or below the true surface does not lie on it
 COVERED = 0.5  # of a pixel
 ALLOWED_SHARE, ALLOWED_M = 0.2, 0.01  # of the depth, and beside it: median height error
-RINGS_M = (8.0, 16.0, 32.0)
-EDGE_M, STEP_M = 0.2, 0.1  # a point is at an edge if this near to it the surface is that far off
 
 
 @dataclass(frozen=True)
@@ -69,7 +75,7 @@ def bench_accuracy(
 ) -> dict[str, Any]:
     """Figures of every estimator that placement can use."""
     cameras = [camera for frame in scene.frames for camera in frame.cameras.values()]
-    truth, settings = still(truth), PlacementSettings(cell_m=cell_m)
+    moving, truth, settings = truth, still(truth), PlacementSettings(cell_m=cell_m)
     above = camera_from_above(cameras, reach_m=case.reach_m, pixel_m=case.pixel_m)
     pick = np.s_[case.every // 2 :: case.every, case.every // 2 :: case.every]
     xy = pixel_places(above)[pick].reshape(-1, 2)
@@ -86,7 +92,8 @@ def bench_accuracy(
                 "cells": len(bed.ground),
                 **covered_shares(bed.ground, flat, edges),
                 **sheltered_share(bed.ground, truth, points),
-                "bed_error_m": _error(bed_heights(bed.ground, flat) - flat.z),
+                "vehicles": vehicle_shares(bed, scene, moving),
+                "bed_error_m": height_error(bed_heights(bed.ground, flat) - flat.z),
                 "depths": [
                     drawn_figures(scene, bed, truth, flat, above, depth, scene_bias)
                     for depth in depths_m
@@ -103,61 +110,6 @@ def bench_accuracy(
     }
 
 
-def cells_over(cells: SnowCells, points: TruePoints) -> np.ndarray:
-    """int64 [P]: the cell over each point and close to its surface, -1 where there is none."""
-    centers, sizes = cells.centers_m.numpy().astype(np.float64), cells.sizes_m.numpy()
-    normals = cells.normals.numpy().astype(np.float64)
-    out = np.full(len(points), -1, np.int64)
-    for size in np.unique(sizes):
-        own = np.flatnonzero(sizes == size)
-        low = centers[own, :2] - size / 2
-        offset = low[0] % size  # cells of one size share a grid
-        key = _keys(np.round((low - offset) / size).astype(np.int64))
-        place = _keys(np.floor((points.xy - offset) / size).astype(np.int64))
-        order = np.argsort(key)
-        at = np.minimum(np.searchsorted(key[order], place), len(own) - 1)
-        found = own[order[at]]
-        met = key[order[at]] == place
-        z = _plane_z(centers[found], normals[found], points.xy)
-        met &= np.abs(z - points.z) <= OVER_M
-        out[met] = found[met]
-    return out
-
-
-def _keys(columns_rows: np.ndarray) -> np.ndarray:
-    return (columns_rows[:, 0] << 32) + columns_rows[:, 1]
-
-
-def _plane_z(centers: np.ndarray, normals: np.ndarray, xy: np.ndarray) -> np.ndarray:
-    slopes = -normals[:, :2] / normals[:, 2:]
-    return centers[:, 2] + (slopes * (xy - centers[:, :2])).sum(1)
-
-
-def bed_heights(cells: SnowCells, points: TruePoints) -> np.ndarray:
-    """z [P] of the bed under each point, NaN where it has none."""
-    over = cells_over(cells, points)
-    z = np.full(len(points), np.nan)
-    met = over >= 0
-    found = over[met]
-    z[met] = _plane_z(
-        cells.centers_m.numpy()[found].astype(np.float64),
-        cells.normals.numpy()[found].astype(np.float64),
-        points.xy[met],
-    )
-    return z
-
-
-def at_edges(truth: StreetTruth, points: TruePoints) -> np.ndarray:
-    """bool [P]: within EDGE_M the true surface leaves the point's own plane by STEP_M or more."""
-    off = np.zeros(len(points), bool)
-    steep = np.tan(points.slope)
-    for angle in np.arange(8) * (math.pi / 4):
-        shift = EDGE_M * np.array([math.cos(angle), math.sin(angle)])
-        beside = surface_below(truth, points.xy + shift)
-        off |= np.abs(beside - points.z) > STEP_M + EDGE_M * steep
-    return off
-
-
 def scene_bias_m(scene: Scene, truth: StreetTruth, points: TruePoints, above: Camera) -> float:
     """How far the scene's own Gaussians are above the true surface where the points are: median of
     the centres of those that are heaviest there. A fitted or sampled surface has such an offset,
@@ -169,53 +121,6 @@ def scene_bias_m(scene: Scene, truth: StreetTruth, points: TruePoints, above: Ca
     means = scene.background.means.numpy()[ids[ids >= 0]].astype(np.float64)
     off = means[:, 2] - surface_below(truth, means[:, :2])
     return float(np.median(off[np.abs(off) < OVER_M]))
-
-
-def covered_shares(cells: SnowCells, flat: TruePoints, edges: np.ndarray) -> dict[str, Any]:
-    """Shares of the points that have a cell; of all, of those at no edge, of each class and ring
-    about the path.
-    """
-    covered = cells_over(cells, flat) >= 0
-    inner = ~edges & (flat.semantic != SemanticClass.VEGETATION)
-    return {**_shares(covered, flat), "covered_off_edges": float(covered[inner].mean())}
-
-
-def _shares(covered: np.ndarray, flat: TruePoints) -> dict[str, Any]:
-    classes = {}
-    for number in np.unique(flat.semantic):
-        own = flat.semantic == number
-        classes[SemanticClass(int(number)).name.lower()] = {
-            "points": int(own.sum()),
-            "covered": float(covered[own].mean()),
-        }
-    rings, low = {}, 0.0
-    for high in RINGS_M:
-        own = (flat.from_path_m >= low) & (flat.from_path_m < high)
-        rings[f"{low:g}-{high:g} m"] = float(covered[own].mean()) if own.any() else None
-        low = high
-    crown = flat.semantic == SemanticClass.VEGETATION
-    return {
-        "covered": float(covered[~crown].mean()),
-        "covered_with_crowns": float(covered.mean()),
-        "classes": classes,
-        "rings": rings,
-    }
-
-
-def sheltered_share(cells: SnowCells, truth: StreetTruth, points: TruePoints) -> dict[str, float]:
-    """Shares by area of the cells that lie OVER_M or more beneath the true surface which is open to
-    the sky there, and of those that lie as much above it, on nothing.
-    """
-    centers, sizes = cells.centers_m.numpy().astype(np.float64), cells.sizes_m.numpy()
-    low, high = points.xy.min(0), points.xy.max(0)
-    inside = ((centers[:, :2] >= low) & (centers[:, :2] <= high)).all(1)
-    centers, area = centers[inside], sizes[inside].astype(np.float64) ** 2
-    off = centers[:, 2] - surface_below(truth, centers[:, :2])
-    whole = max(float(area.sum()), 1e-9)
-    return {
-        "sheltered": float(area[off < -OVER_M].sum()) / whole,
-        "in_the_air": float(area[off > OVER_M].sum()) / whole,
-    }
 
 
 def drawn_figures(
@@ -247,10 +152,10 @@ def drawn_figures(
     return {
         "depth_m": depth_m,
         "gaussians": len(cover.ground.gaussians),
-        "covered": _shares(on_it, flat)["covered"],
+        "covered": class_shares(on_it, flat)["covered"],
         "sheltered": float(sunk.mean()) if len(sunk) else 0.0,
-        "error_m": _error(off),
-        "error_on_scene_m": _error(off - scene_bias),
+        "error_m": height_error(off),
+        "error_on_scene_m": height_error(off - scene_bias),
         "allowed_m": allowed,
     }
 
@@ -279,16 +184,3 @@ def _pixels(above: Camera, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     columns = np.floor((xy[:, 0] - centre[0]) * above.fx + above.cx).astype(np.int64)
     rows = np.floor((centre[1] - xy[:, 1]) * above.fy + above.cy).astype(np.int64)
     return rows, columns
-
-
-def _error(off: np.ndarray) -> dict[str, float | None]:
-    """Of height differences [P], NaN left out."""
-    off = off[np.isfinite(off)]
-    if len(off) == 0:
-        return {"median": None, "p95": None, "bias": None}
-    size = np.abs(off)
-    return {
-        "median": float(np.median(size)),
-        "p95": float(np.quantile(size, 0.95)),
-        "bias": float(np.median(off)),
-    }

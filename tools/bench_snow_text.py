@@ -63,6 +63,12 @@ def _accuracy_lines(street: str, accuracy: dict[str, Any]) -> list[str]:
         f"{name} {_percent(found['covered'])} of {found['points']}"
         for name, found in best["classes"].items()
     )
+    lines += [
+        f"  {each['estimator']}, {each['vehicles']['points']} points on driving cars: "
+        f"covered {_percent(each['vehicles']['covered'])}, bed error "
+        f"{_error_cm(each['vehicles']['bed_error_m'])} cm"
+        for each in accuracy["estimators"]
+    ]
     rings = ", ".join(f"{name} {_percent(share)}" for name, share in best["rings"].items())
     return [*lines, f"  {best['estimator']}, covered: {classes}", f"  {rings}"]
 

@@ -14,7 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from adapters.street.truth import StreetTruth
+from adapters.street.truth import RayHits, StreetTruth
+from adapters.street.world import Body
 from augment.cameras import Camera
 from augment.geometry import rigid
 
@@ -87,6 +88,22 @@ def surface_below(truth: StreetTruth, xy: np.ndarray) -> np.ndarray:
     return SKY_Z_M - _drop(truth, xy).distance
 
 
+def body_tops(body: Body, xy: np.ndarray) -> TruePoints:
+    """What is highest of a body at xy [P, 2], its frame; is_seen and from_path_m say nothing."""
+    origins = np.concatenate([xy, np.full((len(xy), 1), SKY_Z_M)], 1)
+    hits = body.tree.cast(origins, np.broadcast_to([0.0, 0.0, -1.0], origins.shape))
+    met = hits.shape >= 0
+    normals = body.shapes.normals(hits.shape[met], hits.local[met])
+    return TruePoints(
+        xy=xy[met],
+        z=SKY_Z_M - hits.distance[met],
+        slope=np.arccos(np.clip(np.abs(normals[:, 2]), 0, 1)),
+        semantic=body.shapes.semantic[hits.shape[met]],
+        from_path_m=np.zeros(int(met.sum())),
+        is_seen=np.ones(int(met.sum()), bool),
+    )
+
+
 def true_points(
     truth: StreetTruth, cameras: Sequence[Camera], xy: np.ndarray, *, reach_m: float
 ) -> TruePoints:
@@ -111,7 +128,7 @@ def true_points(
     return dataclasses.replace(points, is_seen=seen)
 
 
-def _drop(truth: StreetTruth, xy: np.ndarray):
+def _drop(truth: StreetTruth, xy: np.ndarray) -> RayHits:
     origins = np.concatenate([xy, np.full((len(xy), 1), SKY_Z_M)], 1)
     down = np.broadcast_to([0.0, 0.0, -1.0], origins.shape)
     return truth.cast(origins, down, 0, with_rgb=False)

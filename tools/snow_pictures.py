@@ -32,6 +32,7 @@ from tools.drawing import captioned, color_mapped, strip, write_jpeg
 STREET = "procedural:street?seed=3"
 CAMERA, FRAME, SCALE = "front", 5, 0.6
 REPEATS = 5
+CELL_M = 0.05
 DEPTHS_M = (0.02, 0.1, 0.4)
 ESTIMATORS: tuple[Estimator, ...] = ("mode", "median", "expected")
 CLOSE = 3.0  # of the close view's resolution over the picture's
@@ -66,7 +67,7 @@ def draw_depths(scene: Scene) -> np.ndarray:
     clean_s, _ = _timed(scene, camera, None)
     panels = []
     for depth_m in DEPTHS_M:
-        seconds, frame = _timed(scene, camera, Snow(depth_m=depth_m))
+        seconds, frame = _timed(scene, camera, Snow(depth_m=depth_m, cell_m=CELL_M))
         text = f"{1e3 * seconds:.0f} ms, {seconds / clean_s:.2f} x the clean frame"
         panels.append(captioned(quantise(frame.rgb), f"{100 * depth_m:g} cm of snow", text))
     return strip(panels)
@@ -79,7 +80,7 @@ def draw_shadings(scene: Scene) -> np.ndarray:
     clean_s, _ = _timed(scene, camera, None)
     columns = []
     for shading in ("per_splat", "per_pixel"):
-        snow = Snow(depth_m=0.1, shading=shading)
+        snow = Snow(depth_m=0.1, shading=shading, cell_m=CELL_M)
         seconds, frame = _timed(scene, camera, snow)
         larger = _frame(scene, close, snow)
         text = (
@@ -99,7 +100,7 @@ def draw_masks(scene: Scene) -> np.ndarray:
     panels = []
     for name in ("front_left", "front", "front_right"):
         camera = scene.frame(FRAME).cameras[name].scaled(SCALE)
-        frame = _frame(scene, camera, Snow(depth_m=0.1))
+        frame = _frame(scene, camera, Snow(depth_m=0.1, cell_m=CELL_M))
         assert frame.snow is not None
         mask = frame.snow.numpy()
         rgb = quantise(frame.rgb).astype(np.float32)
@@ -114,7 +115,7 @@ def draw_estimators(scene: Scene, truth: StreetTruth) -> np.ndarray:
     and a part of a picture with silhouettes; for each depth buffer that placement can use.
     """
     cameras = [camera for frame in scene.frames for camera in frame.cameras.values()]
-    snow, truth = Snow(depth_m=0.1), still(truth)
+    snow, truth = Snow(depth_m=0.1, cell_m=CELL_M), still(truth)
     near = scene.frame(FRAME).cameras.values()
     above = camera_from_above(list(near), reach_m=ABOVE_REACH_M, pixel_m=ABOVE_PIXEL_M)
     top = surface_below(truth, pixel_places(above).reshape(-1, 2)).reshape(above.height, -1)
@@ -122,7 +123,7 @@ def draw_estimators(scene: Scene, truth: StreetTruth) -> np.ndarray:
     view = _window(view, EDGES_AT, EDGES_ZOOM)
     columns = []
     for estimator in ESTIMATORS:
-        bed = place_snow_bed(scene, cameras, PlacementSettings(estimator=estimator))
+        bed = place_snow_bed(scene, cameras, PlacementSettings(cell_m=CELL_M, estimator=estimator))
         cover = lay_snow(bed, scene, snow, illumination_of(scene, snow), seed=0)
         height, shown = draw_snow(scene, cover, above)
         error = height - top - snow.depth_m
