@@ -110,4 +110,6 @@ def _weather(row: dict[str, Any]) -> str:
         said.append(f"visibility {KOSCHMIEDER / extinction:.0f} m")
     if math.isfinite(level := _water_level(row)):
         said.append(f"water at {level:.2f} m")
+    if (depth := row.get("snow_depth_m", math.nan)) > 0:  # no column in folders older than snow
+        said.append(f"snow {100 * depth:.3g} cm")
     return f"{row['variant']} ({', '.join(said) or 'no weather'})"
