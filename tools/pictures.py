@@ -87,9 +87,13 @@ def _shown(groups: list[tuple[str, str]]) -> list[tuple[str, str]]:
 
 
 def _groups(rows: list[dict[str, Any]]) -> list[tuple[str, str]]:
-    """Scene and variant of every row, each once: the clearest and driest of a scene first."""
+    """Scene and variant of every row, each once: a scene's clearest, driest and barest first."""
     weather = {
-        (row["scene"], row["variant"]): (row["smog_extinction_per_m"], _water_level(row))
+        (row["scene"], row["variant"]): (
+            row["smog_extinction_per_m"],
+            _water_level(row),
+            _snow_depth(row),
+        )
         for row in rows
     }
     return sorted(weather, key=lambda group: (group[0], *weather[group], group[1]))
@@ -101,6 +105,12 @@ def _water_level(row: dict[str, Any]) -> float:
     return -math.inf if math.isnan(level) else level
 
 
+def _snow_depth(row: dict[str, Any]) -> float:
+    """Of the recipe's snow, metres; 0 where it has none."""
+    depth = row.get("snow_depth_m", math.nan)  # no column in folders older than snow
+    return 0.0 if math.isnan(depth) else depth
+
+
 def _weather(row: dict[str, Any]) -> str:
     """The variant's name and what its weather means to a person."""
     from recipes.schema import KOSCHMIEDER
@@ -110,6 +120,6 @@ def _weather(row: dict[str, Any]) -> str:
         said.append(f"visibility {KOSCHMIEDER / extinction:.0f} m")
     if math.isfinite(level := _water_level(row)):
         said.append(f"water at {level:.2f} m")
-    if (depth := row.get("snow_depth_m", math.nan)) > 0:  # no column in folders older than snow
+    if (depth := _snow_depth(row)) > 0:
         said.append(f"snow {100 * depth:.3g} cm")
     return f"{row['variant']} ({', '.join(said) or 'no weather'})"

@@ -16,22 +16,25 @@ from augment.batch.manifest import LATER, rows_to_table, write_manifest
 from tools import pictures, sheet
 
 DRY, THIN, DEEP = ("clear-000", 0.0, math.nan), ("wet-000", 0.0, -0.05), ("wet-001", 0.0, 0.5)
-MURKY = ("fog-000", 0.0978, 0.3)
+MURKY, WHITE = ("fog-000", 0.0978, 0.3), ("white-000", 0.0, math.nan, 0.125)
 
 
-def make_row(variant: str, extinction_per_m: float, level_m: float) -> dict[str, Any]:
+def make_row(
+    variant: str, extinction_per_m: float, level_m: float, snow_m: float = math.nan
+) -> dict[str, Any]:
     paths: dict[str, Any] = {f"{kind}_path": None for kind in PATH_KINDS}
     paths |= {"image_path": f"{variant}.png", "water_path": f"{variant}-water.png"}
     row = {"scene": "street", "source": "s", "variant": variant, "frame": 4, "camera": "front"}
     row |= {"timestamp_ns": 5, "width": 40, "height": 20, "surface": "scene", **paths}
     row |= {"smog_extinction_per_m": extinction_per_m, "flood_level_m": level_m}
+    row |= {"snow_depth_m": snow_m}
     row |= {"seed": 0, "recipe": "r", "recipe_hash": "0", "trajectory": "recorded"}
     return row | {"version": "1", "backend": "cpu", "checksum": "", "status": "ok", "message": ""}
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    rows = [make_row(*variant) for variant in (MURKY, DEEP, DRY, THIN)]
+    rows = [make_row(*variant) for variant in (MURKY, DEEP, WHITE, DRY, THIN)]
     for row in rows:
         cv2.imwrite(str(tmp_path / row["image_path"]), np.full((20, 40, 3), 200, np.uint8))
     write_manifest(tmp_path, rows_to_table(rows))
@@ -54,6 +57,7 @@ def titles(folder: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
 def test_a_row_says_its_weather_and_the_driest_comes_first(folder, monkeypatch) -> None:
     assert titles(folder, monkeypatch) == [
         "street, frame 4: clear-000 (no weather)",
+        "street, frame 4: white-000 (snow 12.5 cm)",
         "street, frame 4: wet-000 (water at -0.05 m)",
         "street, frame 4: wet-001 (water at 0.50 m)",
         "street, frame 4: fog-000 (visibility 40 m, water at 0.30 m)",
@@ -62,8 +66,9 @@ def test_a_row_says_its_weather_and_the_driest_comes_first(folder, monkeypatch) 
 
 def test_a_folder_older_than_floods_is_drawn(folder, monkeypatch) -> None:
     table = pq.read_table(folder / MANIFEST)
-    pq.write_table(table.drop_columns([*LATER, "flood_level_m"]), folder / MANIFEST)
+    pq.write_table(table.drop_columns([*LATER, "flood_level_m", "snow_depth_m"]), folder / MANIFEST)
     assert [title.rpartition(" (")[2] for title in titles(folder, monkeypatch)] == [
+        "no weather)",
         "no weather)",
         "no weather)",
         "no weather)",
