@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 
 import numpy as np
@@ -88,12 +89,16 @@ def find_actor_cells(
         cell_m=cell,
         shape=shape,
         estimator=estimator,
+        with_thin=False,
     )
     bottom = np.float32(_BOTTOM_M - actor.size_m[2] / 2)
     limit = min(max_slope_deg, DRIVEN_MAX_SLOPE_DEG) if moves(actor) else max_slope_deg
     body_only = view.height_m > bottom
     body_only[[0, -1]] = body_only[:, [0, -1]] = False  # an edge all round, even of what is cut off
-    surface = find_surface(view, body_only, max_slope_deg=limit, least_area_m2=_PATCH_M2)
+    view = dataclasses.replace(view, alpha=np.where(body_only, view.alpha, np.float32(0)))
+    surface = find_surface(
+        view, body_only, max_slope_deg=limit, least_area_m2=_PATCH_M2, floor_m=float(bottom)
+    )
     rows, columns = np.nonzero(surface.can_carry)
     if len(rows) * cell**2 < LEAST_AREA_M2:
         return None

@@ -7,6 +7,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,7 +23,8 @@ from augment.snow.cells import FLUSH, SnowBed, SnowCells
 from augment.snow.placement import PlacementSettings
 
 # Raised whenever the same scene would give another bed, or a file hold it otherwise.
-FORMAT = "climategs-snow-bed-1"
+FORMAT = "climategs-snow-bed-2"
+_ABOUT = "snow_bed"
 _DTYPES = {
     "neighbours": torch.int32,
     "semantic": torch.int16,
@@ -55,7 +57,8 @@ def bed_key(scene: Scene, cameras: Sequence[Camera], settings: PlacementSettings
 
 
 def save_bed(path: Path, bed: SnowBed, key: str) -> None:
-    """Write a bed, as a whole or not at all.
+    """Write a bed, as a whole or not at all; its bytes are those of its content. Seconds are not
+    kept.
 
     Raises:
         OutputError: the system refused (disk full, no permission ...); `path` is then as it was.
@@ -63,13 +66,9 @@ def save_bed(path: Path, bed: SnowBed, key: str) -> None:
     tensors = _named("ground", bed.ground)
     for number, cells in enumerate(bed.actors.values()):
         tensors |= _named(f"actors.{number}", cells)
-    about = {
-        "format": FORMAT,
-        "key": key,
-        "track_ids": json.dumps(list(bed.actors)),
-        "seconds": json.dumps(dict(bed.seconds)),
-    }
-    write_atomic(path, save(tensors, metadata=about))
+    about = {"format": FORMAT, "key": key, "track_ids": list(bed.actors)}
+    # A single entry: several are written in any order.
+    write_atomic(path, save(tensors, metadata={_ABOUT: json.dumps(about, sort_keys=True)}))
 
 
 def load_bed(path: Path, key: str) -> SnowBed:
@@ -81,15 +80,15 @@ def load_bed(path: Path, key: str) -> SnowBed:
     """
     try:
         with safe_open(path, framework="pt") as file:
-            about = file.metadata() or {}
+            about = json.loads((file.metadata() or {}).get(_ABOUT, "{}"))
             _check_about(path, about, key)
-            track_ids, seconds = json.loads(about["track_ids"]), json.loads(about["seconds"])
+            track_ids = about["track_ids"]
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         actors = {
             track_id: _cells(path, tensors, f"actors.{number}")
             for number, track_id in enumerate(track_ids)
         }
-        return SnowBed(_cells(path, tensors, "ground"), actors, seconds)
+        return SnowBed(_cells(path, tensors, "ground"), actors)
     except FileNotFoundError as error:
         raise SceneError(f"{path}: no such file, so no snow bed to read") from error
     except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
@@ -99,7 +98,9 @@ def load_bed(path: Path, key: str) -> SnowBed:
         ) from error
 
 
-def _check_about(path: Path, about: Mapping[str, str], key: str) -> None:
+def _check_about(path: Path, about: Any, key: str) -> None:
+    if not isinstance(about, dict):
+        about = {}
     if about.get("format") != FORMAT:
         raise SceneError(
             f"{path} is no snow bed of this version: its format is {about.get('format')!r}, "
@@ -114,7 +115,7 @@ def _check_about(path: Path, about: Mapping[str, str], key: str) -> None:
 
 def _named(part: str, cells: SnowCells) -> dict[str, Tensor]:
     return {
-        f"{part}.{field.name}": getattr(cells, field.name).contiguous()
+        f"{part}.{field.name}": getattr(cells, field.name).contiguous().clone()
         for field in fields(SnowCells)
     }
 

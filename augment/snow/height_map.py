@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+import cv2
 import numpy as np
 import torch
 
@@ -23,8 +24,10 @@ Estimator = Literal["mode", "expected", "median"]
 _DEPTHS = {"mode": "mode_depth", "expected": EXPECTED_DEPTH, "median": MEDIAN_DEPTH}
 COVERED = 0.5  # of a pixel must be opaque, for something to lie there
 _EYE_ABOVE_M = 100.0
-_FLAT = 0.5  # one axis over the next, of what is flat or long
-_UPRIGHT_RAD = math.radians(15)  # off the vertical
+_SHELTER_M = 1.0  # what stands less far above a cell hides no sky from it
+_SHELTER_CELLS = 2  # narrower things hide too little of it
+_TRUE_M = 1.0  # in coarser cells, splats that together cover one are too faint one by one
+_FINE_M = 0.15  # in coarser cells, what is blurred to their width is no measure
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +36,9 @@ class HeightMap:
 
     left_m, bottom_m: the grid's corner; cell_m: its step. alpha: float32. height_m: float32, z of
     the surface; 0 where not covered. rgb: float32 [H, W, 3], of what is there, light from all sides
-    alike. ids: int32, heaviest Gaussian, counted through the parts, -1 where none.
+    alike. ids: int32, heaviest Gaussian, counted through the parts, -1 where none. is_thin: bool,
+    what is there is narrower than a cell (a wall on edge, a fence, twigs): it keeps snow off what
+    is below and carries none itself.
     """
 
     left_m: float
@@ -43,6 +48,7 @@ class HeightMap:
     height_m: np.ndarray
     rgb: np.ndarray
     ids: np.ndarray
+    is_thin: np.ndarray
 
     @property
     def covered(self) -> np.ndarray:
@@ -77,19 +83,6 @@ def classes_of(gaussians: Gaussians) -> np.ndarray:
     return gaussians.semantic.numpy()
 
 
-def find_upright(gaussians: Gaussians) -> np.ndarray:
-    """bool [N]: walls and posts: flat Gaussians on edge, and long ones on end."""
-    w, x, y, z = (column.numpy() for column in gaussians.quats.unbind(1))
-    # The world's z along each of the Gaussian's axes.
-    rise = np.abs(np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], 1))
-    scales = gaussians.scales.numpy()
-    order = np.argsort(scales, axis=1, kind="stable")
-    short, middle, long = np.take_along_axis(scales, order, 1).T
-    rise_short, _, rise_long = np.take_along_axis(rise, order, 1).T
-    on_edge = (short <= _FLAT * middle) & (rise_short < math.sin(_UPRIGHT_RAD))
-    return on_edge | ((middle <= _FLAT * long) & (rise_long > math.cos(_UPRIGHT_RAD)))
-
-
 def in_box(gaussians: Gaussians, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     """int64: numbers of the Gaussians that may be seen, from above, between two corners (x, y)."""
     means, reach = gaussians.means.numpy(), gaussians.scales.numpy().max(1, initial=0)
@@ -109,9 +102,14 @@ def draw_from_above(
     shape: tuple[int, int],
     estimator: Estimator,
     wanted: np.ndarray | None = None,
+    with_thin: bool = True,
 ) -> HeightMap:
     """Draw parts of plain Gaussians from above. corner_m: least x and y. shape: rows and columns of
-    cells. wanted: bool of that shape; the others may be left empty.
+    cells. wanted: bool of that shape; the others may be left empty. with_thin: what is thin is
+    looked for.
+
+    A pixel of the drawing is opaque for the share that is truly covered; a second drawing, in which
+    whatever is thin is blurred to a pixel's width, shows what is thin.
     """
     rows, columns = shape
     top = max((_top_m(part) for part in parts if len(part.gaussians)), default=0.0)
@@ -131,31 +129,57 @@ def draw_from_above(
         pose,
         is_orthographic=True,
     )
-    depth = _DEPTHS[estimator]
-    out = rasterize(
-        parts,
-        camera,
-        buffers=(ALPHA, depth, RGB, SPLAT_IDS),
-        settings=RasterSettings(sh_degree=0),
-        clip=UNCUT,
-        wanted=None if wanted is None else torch.from_numpy(np.ascontiguousarray(wanted[::-1])),
-    )
-    images = {name: getattr(out, name) for name in (ALPHA, depth, RGB, SPLAT_IDS)}
-    alpha, depths, rgb, ids = (
-        np.ascontiguousarray(images[name].numpy()[::-1]) for name in (ALPHA, depth, RGB, SPLAT_IDS)
-    )
-    covered = (alpha >= COVERED) & (depths > 0) & np.isfinite(depths)
-    height = np.where(covered, float(eye[2]) - depths.astype(np.float64), 0.0)
+    shown = None if wanted is None else torch.from_numpy(np.ascontiguousarray(wanted[::-1]))
+    names = (ALPHA, _DEPTHS[estimator], RGB, SPLAT_IDS)
+    alpha, depths, rgb, ids = _draw(parts, camera, names, shown, antialiased=cell_m <= _TRUE_M)
+    covered, height = _heights(alpha, depths, float(eye[2]))
     alpha = np.where(covered, alpha, np.minimum(alpha, np.float32(COVERED / 2)))
+    is_thin = np.zeros(shape, bool)
+    if with_thin and cell_m <= _FINE_M:
+        alpha_wide, depths = _draw(parts, camera, names[:2], shown, antialiased=False)
+        covered_wide, height_wide = _heights(alpha_wide, depths, float(eye[2]))
+        shelters = covered & covered_wide & (height_wide - height > _SHELTER_M)
+        wide = np.ones((_SHELTER_CELLS, _SHELTER_CELLS), np.uint8)
+        shelters = cv2.morphologyEx(shelters.astype(np.uint8), cv2.MORPH_OPEN, wide) > 0
+        is_thin = shelters | (covered_wide & ~covered)
+        height[is_thin], alpha[is_thin] = height_wide[is_thin], alpha_wide[is_thin]
     return HeightMap(
         left_m=corner_m[0],
         bottom_m=corner_m[1],
         cell_m=cell_m,
         alpha=alpha,
-        height_m=height.astype(np.float32),
+        height_m=height,
         rgb=rgb / np.maximum(alpha, np.float32(COVERED / 2))[..., None],
         ids=np.where(alpha > 0, ids, -1),
+        is_thin=is_thin,
     )
+
+
+def _draw(
+    parts: Sequence[PosedGaussians],
+    camera: Camera,
+    names: tuple[str, ...],
+    wanted: torch.Tensor | None,
+    *,
+    antialiased: bool,
+) -> list[np.ndarray]:
+    """Buffers of a view from above, rows towards +y."""
+    out = rasterize(
+        parts,
+        camera,
+        buffers=names,
+        settings=RasterSettings(sh_degree=0, antialiased=antialiased),
+        clip=UNCUT,
+        wanted=wanted,
+    )
+    return [np.ascontiguousarray(getattr(out, name).numpy()[::-1]) for name in names]
+
+
+def _heights(alpha: np.ndarray, depths: np.ndarray, eye_z_m: float) -> tuple[np.ndarray, ...]:
+    """Where something lies, bool [H, W], and its z, float32, 0 elsewhere."""
+    covered = (alpha >= COVERED) & (depths > 0) & np.isfinite(depths)
+    height = np.where(covered, eye_z_m - depths.astype(np.float64), 0.0)
+    return covered, height.astype(np.float32)
 
 
 def _plain(tensor: torch.Tensor) -> torch.Tensor:

@@ -37,7 +37,6 @@ from augment.snow.height_map import (
     HeightMap,
     classes_of,
     draw_from_above,
-    find_upright,
     in_box,
     plain_gaussians,
 )
@@ -177,7 +176,6 @@ class _Ground:
         self._views, self._paths, self._settings = views, paths, settings
         self._clock = clock
         self._classes = classes_of(background)
-        self._upright = find_upright(background)
         self._numbers = CellNumbers(plan)
         self._lists: list[CellList] = []
         self._count = 0
@@ -228,7 +226,7 @@ class _Ground:
 
     def _draw(self, square: _Square) -> tuple[HeightMap, np.ndarray, np.ndarray]:
         """The square from above, its classes, and where what is seen is of the background and no
-        top of a wall.
+        wall on edge.
         """
         plan, window = self._plan, square.window
         cell = plan.size_m(square.level)
@@ -253,11 +251,8 @@ class _Ground:
         )
         is_ground = (view.ids >= 0) & (view.ids < len(chosen))
         classes = np.full(shape, SemanticClass.UNKNOWN, np.int16)
-        ids = chosen[view.ids[is_ground]]
-        classes[is_ground] = self._classes[ids]
-        upright = np.zeros(shape, np.float32)
-        upright[is_ground] = self._upright[ids]
-        return view, classes, is_ground & (cv2.blur(upright, (3, 3)) <= 0.5)
+        classes[is_ground] = self._classes[chosen[view.ids[is_ground]]]
+        return view, classes, is_ground & ~view.is_thin
 
     def _seen(self, surface: Surface, square: _Square) -> np.ndarray:
         """bool [H, W]: cells that can carry snow which some camera sees, and those next to them."""
@@ -268,7 +263,7 @@ class _Ground:
         low, high = np.array([x[0], y[0]]), np.array([x[-1], y[-1]])
         views = self._views.near(low, high, RINGS_M[-1])
         seen = np.zeros(surface.can_carry.shape, np.uint8)
-        seen[rows, columns] = views.see(points, normals)
+        seen[rows, columns] = views.see(points, normals, np.zeros(len(points), bool))
         side = 2 * _SEEN_GROWS_CELLS + 1
         return cv2.dilate(seen, np.ones((side, side), np.uint8)).astype(bool)
 

@@ -14,7 +14,11 @@ from augment.snow.cells import EDGE_CAP_M
 from augment.snow.height_map import HeightMap
 from augment.snow.surface_kernels import LINK
 
-STEP_M = 0.1  # higher steps than this between cells are edges
+STEP_M = 0.25  # lower steps do not break a layer: kerbs
+_AROUND_M = 0.4  # of a cell: steps are told by the heights within
+_NARROW_M, _HIGH_M = 0.4, 1.5  # what is so narrow and so high carries nothing: wires, arms of lamps
+_GAP_M = 0.6  # wider gaps may be deep
+_STANDS_OUT_M = 0.1  # of a surface, so that it is not bridged
 LEAST_AREA_M2, LEAST_CELLS = 0.05, 4  # smaller patches are specks
 POCKET_M2, _POCKET_STEP_M, _POCKET_CELLS = 0.1, 0.3, 1.5  # gaps that are closed
 OBSTACLE_M, _BANK_REACH_M, _BANK_SPREAD_M = 0.4, 1.0, 0.35
@@ -47,11 +51,14 @@ def find_surface(
     *,
     max_slope_deg: float,
     least_area_m2: float = LEAST_AREA_M2,
+    floor_m: float | None = None,
 ) -> Surface:
     """The surface of a map, and where snow stays on it.
 
     may_carry: bool [H, W]; where it is false nothing is put, whatever lies there. Patches that end
-    within the map and are smaller than least_area_m2 or LEAST_CELLS carry nothing.
+    within the map and are smaller than least_area_m2 or LEAST_CELLS carry nothing. floor_m: how high
+    that lies which the map does not show; None for deep but
+    in small gaps.
     """
     cell, covered = height_map.cell_m, height_map.covered.copy()
     shape = covered.shape
@@ -74,16 +81,19 @@ def find_surface(
             slopes,
             good,
         )
-    can_carry = good & may_carry
-    can_carry &= np.hypot(slopes[..., 0], slopes[..., 1]) <= math.tan(limit)
+    floor = _floor(fitted, covered & may_carry, cell) if floor_m is None else np.float32(floor_m)
+    lowest, rises = _rises(fitted, covered, floor, cell)
+    steep = np.hypot(slopes[..., 0], slopes[..., 1]) > math.tan(limit)
+    can_carry = good & may_carry & ~_is_narrow(fitted, covered & may_carry, floor, cell)
+    can_carry &= ~(steep & (rises > _highest_step(limit, cell)))
     step = max(STEP_M, math.tan(limit) * cell)
-    sides = _compare(fitted, covered, can_carry, step)
+    sides = _compare(fitted, lowest, covered, can_carry, step)
     least = max(LEAST_CELLS, math.ceil(least_area_m2 / cell**2))
     can_carry &= ~_specks(can_carry, sides, least)
     filled = _fill_pockets(fitted, slopes, can_carry, covered, cell)
     can_carry |= filled
     covered |= filled
-    sides = _compare(fitted, covered, can_carry, step)
+    sides = _compare(fitted, lowest, covered, can_carry, step)
     edges = np.empty(shape, np.float32)
     surface_kernels.edge_distances(can_carry, sides, max(EDGE_CAP_M / cell, 0.5), edges)
     return Surface(height_map, fitted, slopes, can_carry, sides, edges * np.float32(cell))
@@ -115,12 +125,63 @@ def normals_of(slopes: np.ndarray) -> np.ndarray:
     return normals / np.sqrt((normals * normals).sum(-1, keepdims=True))
 
 
+def _floor(height: np.ndarray, solid: np.ndarray, cell: float) -> np.ndarray:
+    """How high what is not known may lie, [H, W]: in gaps up to _GAP_M wide as high as the lowest
+    about them, else deep.
+    """
+    size = 2 * max(1, round(_GAP_M / 2 / cell)) + 1
+    around = np.ones((size, size), np.uint8)
+    gaps = cv2.morphologyEx(solid.astype(np.uint8), cv2.MORPH_CLOSE, around) > 0
+    lowest = cv2.erode(np.where(solid, height, np.float32(1e6)), around)
+    return np.where(gaps & (lowest < 1e6), lowest, np.float32(-1e6))
+
+
+def _rises(
+    height: np.ndarray, covered: np.ndarray, floor: np.ndarray | np.float32, cell: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Least height within _AROUND_M of each cell, and range of the heights that are known, [H, W];
+    the latter means nothing where none is.
+    """
+    reach = max(1, round(_AROUND_M / cell))
+    around = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
+    lowest_known = cv2.erode(np.where(covered, height, np.float32(1e6)), around)
+    highest_known = cv2.dilate(np.where(covered, height, np.float32(-1e6)), around)
+    lowest = cv2.erode(np.where(covered, height, floor), around)
+    return lowest, highest_known - lowest_known
+
+
+def _is_narrow(
+    height: np.ndarray, solid: np.ndarray, floor: np.ndarray | np.float32, cell: float
+) -> np.ndarray:
+    """bool [H, W]: what stands higher than _HIGH_M above what is on both sides of it, _NARROW_M or
+    three cells apart.
+    """
+    size = max(3, round(_NARROW_M / cell))  # a wall between two cells shows in both
+    around = np.ones((size, size), np.uint8)
+    before, after = (size - 1) // 2, size - 1 - (size - 1) // 2  # an even square has no middle
+    known = np.where(solid, height, floor)
+    lowest = cv2.erode(known, around, anchor=(before, before), borderType=cv2.BORDER_REPLICATE)
+    opened = cv2.dilate(lowest, around, anchor=(after, after), borderType=cv2.BORDER_REPLICATE)
+    return solid & (height - opened > _HIGH_M)
+
+
+def _highest_step(limit: float, cell: float) -> float:
+    """What is steeper than the limit is a low step, not a slope, where heights around it differ by
+    no more than this, metres. A slope as steep as the limit may differ by less.
+    """
+    return min(STEP_M, 2 * max(_AROUND_M, cell) * math.tan(limit))
+
+
 def _compare(
-    height: np.ndarray, covered: np.ndarray, can_carry: np.ndarray, step: float
+    height: np.ndarray,
+    lowest: np.ndarray,
+    covered: np.ndarray,
+    can_carry: np.ndarray,
+    step: float,
 ) -> np.ndarray:
     sides = np.empty((*height.shape, 4), np.int8)
     with kernel_threads(_ROWS):
-        surface_kernels.compare_sides(height, covered, can_carry, step, sides)
+        surface_kernels.compare_sides(height, lowest, covered, can_carry, step, sides)
     return sides
 
 
@@ -162,7 +223,7 @@ def _fill_pockets(
     inside = is_pocket[labels]
     with np.errstate(invalid="ignore", over="ignore"):  # far from any surface both are infinite
         broken = inside & ~(highest - lowest < _POCKET_STEP_M)
-    broken |= inside & covered & (height - highest > STEP_M)
+    broken |= inside & covered & (height - highest > _STANDS_OUT_M)
     is_pocket[labels[broken]] = False
     filled = is_pocket[labels]
     if not filled.any():

@@ -88,11 +88,13 @@ def fit_planes(height, covered, radius, cell, slack, steepest, height_slack, fit
 
 
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
-def compare_sides(height, covered, can_carry, step, sides):
+def compare_sides(height, lowest, covered, can_carry, step, sides):
     """sides int8 [H, W, 4]: what follows on each side of the cells that can carry snow.
 
-    OPEN: nothing, or what lies lower by more than step, or as high but carries none. RISES: what
-    stands higher by more than step. LINK: the same surface; beyond the grid, too. Others hold LINK.
+    lowest: float32 [H, W], least height around each cell. OPEN: nothing follows, or what lies
+    lower by more than step, or carries none and leads down so far. RISES: what stands higher by
+    more than step, or carries none and does not lead down. LINK: the same surface; beyond the grid,
+    too. Others hold LINK.
     """
     rows, columns = height.shape
     for row in prange(rows):
@@ -113,8 +115,11 @@ def compare_sides(height, covered, can_carry, step, sides):
                     sides[i, j, side] = OPEN
                 elif height[k, m] - height[i, j] > step:
                     sides[i, j, side] = RISES
-                elif height[k, m] - height[i, j] < -step or not can_carry[k, m]:
+                elif height[k, m] - height[i, j] < -step:
                     sides[i, j, side] = OPEN
+                elif not can_carry[k, m]:
+                    falls = lowest[k, m] - height[i, j] < -step
+                    sides[i, j, side] = OPEN if falls else RISES
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

@@ -41,14 +41,19 @@ class Views:
         chosen = (np.hypot(gap[:, 0], gap[:, 1]) <= reach_m) | (self.views[:, 15] == 1)
         return Views(self.views[chosen], self.sizes[chosen], self.depths)
 
-    def see(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """bool [C]: points float64 [C, 3], of surfaces with unit normals [C, 3], that one sees."""
+    def see(self, points: np.ndarray, normals: np.ndarray, is_sure: np.ndarray) -> np.ndarray:
+        """bool [C]: points float64 [C, 3], of surfaces with unit normals [C, 3], that one sees.
+
+        What most views look through, where they should show it, is not there for any of them, but
+        where is_sure, bool [C].
+        """
         seen = np.empty(len(points), bool)
         tolerances = np.array([_FAR_SHARE, _FAR_M, _BELOW_SHARE, _GRAZING, _MARGIN_PX])
         with kernel_threads(_ROWS):
             visibility_kernels.find_seen(
                 np.ascontiguousarray(points, np.float64),
                 np.ascontiguousarray(normals, np.float64),
+                np.ascontiguousarray(is_sure),
                 self.views,
                 self.sizes,
                 self.depths,

@@ -33,6 +33,21 @@ def _farthest(depths, start, width, height, column, row):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
+def _is_there(view, depths, start, width, height, x, y, z, tolerances):
+    """1 where the view shows something solid at the point, -1 where it looks through it, else 0."""
+    u, v, depth = _project(view, x, y, z)
+    if depth == 0.0 or u < 0 or v < 0 or u >= width or v >= height:
+        return 0
+    column, row = math.floor(u), math.floor(v)
+    slack = depth * (tolerances[0] - 1.0) + tolerances[1]
+    for k in range(max(0, row - 1), min(height, row + 2)):
+        for m in range(max(0, column - 1), min(width, column + 2)):
+            if abs(depths[start + k * width + m] - depth) <= slack:
+                return 1
+    return -1 if depths[start + row * width + column] > depth else 0
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _is_seen(view, depths, start, width, height, x, y, z, nx, ny, nz, lifts, tolerances):
     far_share, far_m, below_share, grazing, margin = tolerances
     for lift in lifts:
@@ -59,8 +74,9 @@ def _is_seen(view, depths, start, width, height, x, y, z, nx, ny, nz, lifts, tol
 
 
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
-def find_seen(points, normals, views, sizes, depths, lifts, tolerances, seen):
-    """seen [C] bool: points [C, 3] that some view sees, at one of the lifts over them.
+def find_seen(points, normals, is_sure, views, sizes, depths, lifts, tolerances, seen):
+    """seen [C] bool: points [C, 3] that some view sees, at one of the lifts over them, and where no
+    more views look through the point itself than show something there; is_sure [C]: this is known.
 
     views: float64 [V, 17]: rotation camera_from_world by rows, fx, cx, fy, centre, 1 where
     orthographic, cy. sizes: int64 [V, 3]: width, height, where its depths begin. depths: float32 of
@@ -72,10 +88,12 @@ def find_seen(points, normals, views, sizes, depths, lifts, tolerances, seen):
     for i in prange(points.shape[0]):
         x, y, z = points[i]
         nx, ny, nz = normals[i]
-        seen[i] = False
+        found, there = False, 0
         for view in range(views.shape[0]):
             width, height, start = sizes[view]
-            if _is_seen(
+            if not is_sure[i]:
+                there += _is_there(views[view], depths, start, width, height, x, y, z, tolerances)
+            if not found and _is_seen(
                 views[view],
                 depths,
                 start,
@@ -90,5 +108,7 @@ def find_seen(points, normals, views, sizes, depths, lifts, tolerances, seen):
                 lifts,
                 tolerances,
             ):
-                seen[i] = True
+                found = True
+            if found and is_sure[i]:
                 break
+        seen[i] = found and there >= 0

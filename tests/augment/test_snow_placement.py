@@ -547,7 +547,7 @@ def test_edge_distances_are_those_to_the_nearest_edge() -> None:
     can_carry[5:7, 8] = False  # a hole
     height = np.zeros(can_carry.shape, np.float32)
     sides = np.empty((*can_carry.shape, 4), np.int8)
-    surface_kernels.compare_sides(height, can_carry, can_carry, 0.1, sides)
+    surface_kernels.compare_sides(height, height, can_carry, can_carry, 0.1, sides)
     out = np.empty(can_carry.shape, np.float32)
     surface_kernels.edge_distances(can_carry, sides, 50.0, out)
     edges = []
@@ -565,7 +565,7 @@ def test_steps_part_surfaces_but_not_their_low_sides() -> None:
     height[:, 4:] = 0.15
     everywhere = np.ones(height.shape, bool)
     sides = np.empty((*height.shape, 4), np.int8)
-    surface_kernels.compare_sides(height, everywhere, everywhere, 0.1, sides)
+    surface_kernels.compare_sides(height, height, everywhere, everywhere, 0.1, sides)
     assert (sides[:, 4, LEFT] == OPEN).all()
     assert (sides[:, 3, RIGHT] == surface_kernels.RISES).all()
     out = np.empty(height.shape, np.float32)
