@@ -3,7 +3,7 @@
 plan      square tiles about the cameras' path, finer near it             (tiles)
 views     what each of some cameras along the drive sees                  (visibility)
 then for squares of tiles, each with a margin of its surroundings:
-  above   heights, colours and classes from straight above                (height_map)
+  above   heights, colours and classes from straight above                (height_map, holes)
   surface where snow stays, and where its edges are                       (surface)
   ground  light, wheel tracks, banks                                      (ground_light, ...)
 actors    the same in each vehicle's own frame                            (actor_cells)
@@ -40,9 +40,18 @@ from augment.snow.height_map import (
     in_box,
     plain_gaussians,
 )
+from augment.snow.holes import fill_holes
 from augment.snow.surface import Surface, banks_of, find_surface, normals_of
 from augment.snow.surface_kernels import LINK, RISES
-from augment.snow.tiles import RINGS_M, CellNumbers, TilePlan, Window, plan_tiles, views_along
+from augment.snow.tiles import (
+    RINGS_M,
+    CellNumbers,
+    TilePlan,
+    Window,
+    path_points,
+    plan_tiles,
+    views_along,
+)
 from augment.snow.visibility import Views, draw_views
 from augment.snow.wheel_tracks import WheelPath, draw_tracks, wheel_paths
 
@@ -114,7 +123,9 @@ def place_snow_bed(
             views, [PosedGaussians(background), *parked], after_each=lambda: bar.update()
         )
         clock.lap("views")
-        work = _Ground(background, parked, plan, seen_from, wheel_paths(scene), settings, clock)
+        work = _Ground(
+            background, parked, plan, views, seen_from, wheel_paths(scene), settings, clock
+        )
         for level, window in squares:
             work.add_square(level, window)
             bar.update()
@@ -167,6 +178,7 @@ class _Ground:
         background: Gaussians,
         parked: tuple[PosedGaussians, ...],
         plan: TilePlan,
+        cameras: Sequence[Camera],
         views: Views,
         paths: tuple[WheelPath, ...],
         settings: PlacementSettings,
@@ -176,6 +188,7 @@ class _Ground:
         self._views, self._paths, self._settings = views, paths, settings
         self._clock = clock
         self._classes = classes_of(background)
+        self._path = path_points(cameras)
         self._numbers = CellNumbers(plan)
         self._lists: list[CellList] = []
         self._count = 0
@@ -183,11 +196,11 @@ class _Ground:
     def add_square(self, level: int, window: Window) -> None:
         """Find the cells of one window of a level."""
         square = _with_margin(self._plan, level, window)
-        view, classes, lies = self._draw(square)
+        view, classes, lies, filled = self._draw(square)
         self._clock.lap("above")
         surface = find_surface(view, lies, max_slope_deg=self._settings.max_slope_deg)
         self._clock.lap("surface")
-        seen = self._seen(surface, square)
+        seen = self._seen(surface, square, filled)
         self._clock.lap("seen")
         rows, columns = np.nonzero(surface.can_carry & seen & square.inner)
         if len(rows) == 0:
@@ -224,9 +237,9 @@ class _Ground:
         self._clock.lap("join")
         return made
 
-    def _draw(self, square: _Square) -> tuple[HeightMap, np.ndarray, np.ndarray]:
-        """The square from above, its classes, and where what is seen is of the background and no
-        wall on edge.
+    def _draw(self, square: _Square) -> tuple[HeightMap, np.ndarray, np.ndarray, np.ndarray]:
+        """The square from above, its classes, where what is seen is of the background and no
+        wall on edge, and where it closes a hole.
         """
         plan, window = self._plan, square.window
         cell = plan.size_m(square.level)
@@ -252,10 +265,15 @@ class _Ground:
         is_ground = (view.ids >= 0) & (view.ids < len(chosen))
         classes = np.full(shape, SemanticClass.UNKNOWN, np.int16)
         classes[is_ground] = self._classes[chosen[view.ids[is_ground]]]
-        return view, classes, is_ground & ~view.is_thin
+        lies = is_ground & ~view.is_thin
+        view, filled = fill_holes(view, classes, lies, wanted, self._path[:, :2])
+        return view, classes, lies | filled, filled
 
-    def _seen(self, surface: Surface, square: _Square) -> np.ndarray:
-        """bool [H, W]: cells that can carry snow which some camera sees, and those next to them."""
+    def _seen(self, surface: Surface, square: _Square, filled: np.ndarray) -> np.ndarray:
+        """bool [H, W]: cells that can carry snow which some camera sees, and those next to them.
+
+        filled: bool [H, W], cells of closed holes, which no camera can show.
+        """
         rows, columns = np.nonzero(surface.can_carry)
         x, y = surface.map.centers()
         points = np.stack([x[columns], y[rows], surface.height_m[rows, columns]], 1)
@@ -263,7 +281,7 @@ class _Ground:
         low, high = np.array([x[0], y[0]]), np.array([x[-1], y[-1]])
         views = self._views.near(low, high, RINGS_M[-1])
         seen = np.zeros(surface.can_carry.shape, np.uint8)
-        seen[rows, columns] = views.see(points, normals, np.zeros(len(points), bool))
+        seen[rows, columns] = views.see(points, normals, filled[rows, columns])
         side = 2 * _SEEN_GROWS_CELLS + 1
         return cv2.dilate(seen, np.ones((side, side), np.uint8)).astype(bool)
 

@@ -17,6 +17,7 @@ from augment.snow.surface_kernels import LINK
 STEP_M = 0.25  # lower steps do not break a layer: kerbs
 _AROUND_M = 0.4  # of a cell: steps are told by the heights within
 _NARROW_M, _HIGH_M = 0.4, 1.5  # what is so narrow and so high carries nothing: wires, arms of lamps
+_HIGH_M2 = 0.6  # smaller patches so high up are ledges, and what floats before walls
 _GAP_M = 0.6  # wider gaps may be deep
 _STANDS_OUT_M = 0.1  # of a surface, so that it is not bridged
 LEAST_AREA_M2, LEAST_CELLS = 0.05, 4  # smaller patches are specks
@@ -56,9 +57,8 @@ def find_surface(
     """The surface of a map, and where snow stays on it.
 
     may_carry: bool [H, W]; where it is false nothing is put, whatever lies there. Patches that end
-    within the map and are smaller than least_area_m2 or LEAST_CELLS carry nothing. floor_m: how high
-    that lies which the map does not show; None for deep but
-    in small gaps.
+    within the map and are smaller than least_area_m2 or LEAST_CELLS carry nothing. floor_m: how
+    high that lies which the map does not show; None for deep but in small gaps.
     """
     cell, covered = height_map.cell_m, height_map.covered.copy()
     shape = covered.shape
@@ -89,7 +89,8 @@ def find_surface(
     step = max(STEP_M, math.tan(limit) * cell)
     sides = _compare(fitted, lowest, covered, can_carry, step)
     least = max(LEAST_CELLS, math.ceil(least_area_m2 / cell**2))
-    can_carry &= ~_specks(can_carry, sides, least)
+    is_high = fitted - lowest > _HIGH_M
+    can_carry &= ~_specks(can_carry, sides, is_high, least, max(least, round(_HIGH_M2 / cell**2)))
     filled = _fill_pockets(fitted, slopes, can_carry, covered, cell)
     can_carry |= filled
     covered |= filled
@@ -185,8 +186,11 @@ def _compare(
     return sides
 
 
-def _specks(can_carry: np.ndarray, sides: np.ndarray, least: int) -> np.ndarray:
-    """bool [H, W]: cells in patches of fewer than `least` linked cells that end within the grid.
+def _specks(
+    can_carry: np.ndarray, sides: np.ndarray, is_high: np.ndarray, least: int, least_high: int
+) -> np.ndarray:
+    """bool [H, W]: cells in patches of fewer than `least` linked cells that end within the grid;
+    of fewer than `least_high` where all of them are high above something beside.
 
     cv2 finds patches of pixels; links become pixels between those of the cells.
     """
@@ -200,9 +204,10 @@ def _specks(can_carry: np.ndarray, sides: np.ndarray, least: int) -> np.ndarray:
     labels = labels[::2, ::2]
     labels = labels.astype(np.int64)
     sizes = np.bincount(labels.ravel(), minlength=count)
+    low = np.bincount(labels[can_carry & ~is_high], minlength=count)
     for border in (labels[0], labels[-1], labels[:, 0], labels[:, -1]):
-        sizes[border] = least  # it may go on outside
-    return sizes[labels] < least
+        sizes[border] = least_high  # it may go on outside
+    return sizes[labels] < np.where(low > 0, least, least_high)[labels]
 
 
 def _fill_pockets(

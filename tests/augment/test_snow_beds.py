@@ -101,7 +101,7 @@ def changed(scene: Scene) -> dict[str, Scene]:
         "opacities": with_ground(opacities=ground.opacities * 0.9),
         "colours": with_ground(sh=ground.sh * 0.9),
         "no classes": with_ground(semantic=None),
-        "a class": with_ground(semantic=torch.full_like(ground.semantic, 3)),
+        "a class": with_ground(semantic=torch.full((len(ground),), 3).short()),
         "a label": with_actor(label="Pedestrian"),
         "a size": with_actor(size_m=(4.0, 1.8, 1.6)),
         "a track": with_actor(track=track),

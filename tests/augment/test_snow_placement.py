@@ -24,8 +24,8 @@ from augment.snow.placement import PlacementSettings, place_snow_bed
 from augment.snow.surface_kernels import LINK, OPEN
 from augment.snow.tiles import RINGS_M, CellNumbers, plan_tiles, views_along
 from augment.snow.wheel_tracks import EGO_WIDTH_M, WHEEL_SHARE
-from tests.scenes import camera_ahead, one_gaussian
-from tests.snow_scenes import box_car, cameras_of, drive, sheet, side_wall, wall
+from tests.scenes import camera_ahead, one_gaussian, stack
+from tests.snow_scenes import box_car, cameras_of, drive, sheet, side_wall, stack_all, wall
 
 COARSE = PlacementSettings(cell_m=0.1)
 GROUND = sheet((-6, 20), (-8, 8))
@@ -337,6 +337,72 @@ def test_small_gaps_are_bridged_and_posts_stand_out() -> None:
         assert not bool((cells.neighbours[bridged] == OPEN_EDGE).any())
     foot = within(cells, (6.95, 7.05), (-0.05, 0.05))
     assert not bool((foot & (cells.centers_m[:, 2] < 0.3)).any())
+
+
+def hole_at(ground: Gaussians, x: float, y: float, radius: float) -> Gaussians:
+    """The ground without its splats about a place."""
+    return ground.select((ground.means[:, :2] - torch.tensor([x, y])).norm(dim=1) > radius)
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "radius", "expected"),
+    [(2.0, 0.0, 2.5, True), (9.0, 5.0, 1.2, True), (9.0, 0.0, 2.5, False)],
+)
+def test_holes_under_the_path_and_small_ones_are_closed(
+    x: float, y: float, radius: float, expected: bool
+) -> None:
+    ground = hole_at(sheet((-6, 20), (-9, 9), slope_deg=3.0), x, y, radius)
+    cells = place(drive(ground, places=[(0.0, 0.0, 2.0), (3.0, 0.0, 2.0)])).ground
+    size = radius / 2
+    inside = within(cells, (max(x - size, 2.5), x + size), (y - size, y + size))
+    assert bool(inside.any()) == expected
+    if expected:
+        rise = math.tan(math.radians(3)) * (cells.centers_m[inside, 0] + 6)
+        np.testing.assert_allclose(cells.centers_m[inside, 2], rise, atol=0.03)
+        area = float((cells.sizes_m[inside] ** 2).sum())
+        assert area == pytest.approx((x + size - max(x - size, 2.5)) * 2 * size, rel=0.15)
+        np.testing.assert_allclose(cells.light[inside], 1, atol=0.1)
+
+
+def test_a_hole_between_two_levels_stays_open() -> None:
+    levels = [sheet((-6, 6), (-8, 8)), sheet((6, 20), (-8, 8), 0.7)]
+    cells = place(drive(hole_at(stack_all(levels), 6.0, 0.0, 1.2))).ground
+    assert not bool(within(cells, (5.3, 6.7), (-0.7, 0.7)).any())
+
+
+@pytest.mark.parametrize(("height_m", "expected"), [(0.15, False), (0.6, True)])
+def test_kerbs_do_not_break_the_layer(height_m: float, expected: bool) -> None:
+    pavement = [sheet((-6, 20), (1.5, 8), height_m), side_wall(1.5, (-6, 20), (0, height_m))]
+    cells = place(drive(sheet((-6, 20), (-8, 1.5)), *pavement)).ground
+    beside = within(cells, (5, 8), (1.6, 2.2))
+    assert bool((cells.edge_m[beside] < 1).any()) == expected
+    area = float((cells.sizes_m[within(cells, (5, 8), (1, 2))] ** 2).sum())
+    assert expected or area > 2.9
+
+
+@pytest.mark.parametrize("cell_m", [0.05, 0.2, 0.4])
+def test_wires_and_boards_on_edge_carry_nothing(cell_m: float) -> None:
+    x = torch.linspace(6, 9, 40)
+    wire = one_gaussian(mean=(0.0, 0.0, 5.0), scale=(0.08, 0.01, 0.01), opacity=0.99)
+    wire = stack(*(dataclasses.replace(wire, means=torch.tensor([[v, 0.5, 5.0]])) for v in x))
+    board = [wall(10 + 0.02 * i, (-3, -1), (1.0, 3.0)) for i in range(3)]
+    cells = place(drive(GROUND, wire, *board), PlacementSettings(cell_m=cell_m)).ground
+    assert float(cells.centers_m[:, 2].max()) < 0.1
+    assert bool(within(cells, (6.5, 8.5), (-0.2, 1.2)).any())
+
+
+def test_bins_carry_snow_and_blobs_before_walls_do_not() -> None:
+    bin_top = sheet((5, 5.5), (1.0, 1.5), 0.9)
+    sides = [side_wall(y, (5, 5.5), (0, 0.9)) for y in (1.0, 1.5)]
+    fronts = [wall(v, (1.0, 1.5), (0, 0.9)) for v in (5, 5.5)]
+    blob = one_gaussian(mean=(7.0, -1.0, 2.5), scale=(0.15, 0.25, 0.05), opacity=0.99)
+    scene = drive(
+        GROUND, bin_top, *sides, *fronts, blob, places=[(x, 0.0, 3.5) for x in (0.0, 1.0)]
+    )
+    cells = place(scene, PlacementSettings(cell_m=0.05)).ground
+    top = within(cells, (5, 5.5), (1.0, 1.5)) & (cells.centers_m[:, 2] > 0.8)
+    assert float((cells.sizes_m[top] ** 2).sum()) > 0.15
+    assert float(cells.centers_m[:, 2].max()) < 1.0
 
 
 def test_the_ground_is_buried_and_walls_are_not() -> None:
