@@ -115,7 +115,7 @@ def draw_estimators(scene: Scene, truth: StreetTruth) -> np.ndarray:
     and a part of a picture with silhouettes; for each depth buffer that placement can use.
     """
     cameras = [camera for frame in scene.frames for camera in frame.cameras.values()]
-    snow, truth = Snow(depth_m=0.1, cell_m=CELL_M), still(truth)
+    snow, truth = Snow(depth_m=0.1, cell_m=CELL_M, tracks="never"), still(truth)
     near = scene.frame(FRAME).cameras.values()
     above = camera_from_above(list(near), reach_m=ABOVE_REACH_M, pixel_m=ABOVE_PIXEL_M)
     top = surface_below(truth, pixel_places(above).reshape(-1, 2)).reshape(above.height, -1)
