@@ -27,7 +27,7 @@ _EYE_ABOVE_M = 100.0
 _SHELTER_M = 1.0  # what stands less far above a cell hides no sky from it
 _SHELTER_CELLS = 2  # narrower things hide too little of it
 _TRUE_M = 1.0  # in coarser cells, splats that together cover one are too faint one by one
-_FINE_M = 0.15  # in coarser cells, what is blurred to their width is no measure
+_FINE_M = 0.3  # in coarser cells, what is blurred to their width is no measure
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,16 +30,18 @@ def fill_holes(
     height_map: HeightMap,
     classes: np.ndarray,
     lies: np.ndarray,
+    narrow: np.ndarray,
     wanted: np.ndarray,
     path_xy: np.ndarray,
 ) -> tuple[HeightMap, np.ndarray]:
     """The map with the holes closed that one smooth surface surrounds, and where, bool [H, W].
 
-    classes int16 [H, W] get those of what is around. lies: bool, where the map shows something that
-    may carry snow. wanted: bool, what was drawn. path_xy [P, 2]: places of the cameras.
+    classes: int16 [H, W], which get those of what is around. lies: bool, where the map shows
+    something that may carry snow. narrow: bool, what stands high and hides nothing below it.
+    wanted: bool, what was drawn. path_xy [P, 2]: places of the cameras.
     """
     filled = np.zeros(lies.shape, bool)
-    empty = wanted & (~height_map.covered | height_map.is_thin)
+    empty = wanted & (~height_map.covered | height_map.is_thin | narrow)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(
         empty.astype(np.uint8), connectivity=4
     )
@@ -64,7 +66,7 @@ def fill_holes(
         rim = (cv2.dilate(inside.astype(np.uint8), around) > 0) & ~inside
         if not on_path[hole] and bool((rim & ~wanted[window]).any()):
             continue  # it goes on where nothing was drawn
-        known = rim & height_map.covered[window] & ~height_map.is_thin[window]
+        known = rim & height_map.covered[window] & ~height_map.is_thin[window] & ~narrow[window]
         plane, alike = _plane_around(
             known, lies[window], height_map.height_m[window], height_map.cell_m
         )

@@ -41,7 +41,7 @@ from augment.snow.height_map import (
     plain_gaussians,
 )
 from augment.snow.holes import fill_holes
-from augment.snow.surface import Surface, banks_of, find_surface, normals_of
+from augment.snow.surface import Surface, banks_of, find_surface, narrow_things, normals_of
 from augment.snow.surface_kernels import LINK, RISES
 from augment.snow.tiles import (
     RINGS_M,
@@ -58,6 +58,7 @@ from augment.snow.wheel_tracks import WheelPath, draw_tracks, wheel_paths
 _SQUARE_CELLS = 1024  # on a side of what is drawn at once, about
 _MARGIN_M, _MARGIN_CELLS = EDGE_CAP_M + 0.2, 4  # drawn about it
 _SEEN_GROWS_CELLS = 2
+_SURELY_BELOW_M = 0.5  # the cameras: there is ground behind what lies there, not sky
 
 
 @dataclass(frozen=True)
@@ -250,7 +251,11 @@ class _Ground:
         shape = (window.height, window.width)
         far = (corner[0] + window.width * cell, corner[1] + window.height * cell)
         chosen = in_box(self._background, np.array(corner), np.array(far))
-        near = self._background.select(torch.from_numpy(chosen))
+        near = self._background
+        if 2 * len(chosen) < len(near):
+            near = near.select(torch.from_numpy(chosen))
+        else:  # a copy would take longer than what lies outside
+            chosen = np.arange(len(near))
         margin = _margin(cell)
         around = np.ones((2 * margin + 1, 2 * margin + 1), np.uint8)
         wanted = cv2.dilate(square.inner.astype(np.uint8), around).astype(bool)
@@ -266,7 +271,8 @@ class _Ground:
         classes = np.full(shape, SemanticClass.UNKNOWN, np.int16)
         classes[is_ground] = self._classes[chosen[view.ids[is_ground]]]
         lies = is_ground & ~view.is_thin
-        view, filled = fill_holes(view, classes, lies, wanted, self._path[:, :2])
+        narrow = narrow_things(view, lies)
+        view, filled = fill_holes(view, classes, lies, narrow, wanted, self._path[:, :2])
         return view, classes, lies | filled, filled
 
     def _seen(self, surface: Surface, square: _Square, filled: np.ndarray) -> np.ndarray:
@@ -281,7 +287,8 @@ class _Ground:
         low, high = np.array([x[0], y[0]]), np.array([x[-1], y[-1]])
         views = self._views.near(low, high, RINGS_M[-1])
         seen = np.zeros(surface.can_carry.shape, np.uint8)
-        seen[rows, columns] = views.see(points, normals, filled[rows, columns])
+        is_low = points[:, 2] < views.lowest_m - _SURELY_BELOW_M
+        seen[rows, columns] = views.see(points, normals, filled[rows, columns] | is_low)
         side = 2 * _SEEN_GROWS_CELLS + 1
         return cv2.dilate(seen, np.ones((side, side), np.uint8)).astype(bool)
 

@@ -100,6 +100,13 @@ def find_surface(
     return Surface(height_map, fitted, slopes, can_carry, sides, edges * np.float32(cell))
 
 
+def narrow_things(height_map: HeightMap, may_carry: np.ndarray) -> np.ndarray:
+    """bool [H, W]: what stands high and is so narrow that snow falls past it: lamps, wires."""
+    solid = height_map.covered & may_carry
+    floor = _floor(height_map.height_m, solid, height_map.cell_m)
+    return _is_narrow(height_map.height_m, solid, floor, height_map.cell_m)
+
+
 def banks_of(surface: Surface) -> np.ndarray:
     """float32 [H, W, 2]: see SnowCells.banks. 0 on what is itself an obstacle."""
     cell, covered = surface.map.cell_m, surface.map.covered

@@ -34,6 +34,11 @@ class Views:
     sizes: np.ndarray
     depths: np.ndarray
 
+    @property
+    def lowest_m(self) -> float:
+        """z of the lowest of them; infinite where there are none."""
+        return float(self.views[:, 14].min(initial=np.inf))
+
     def near(self, low: np.ndarray, high: np.ndarray, reach_m: float) -> Views:
         """Those whose centre is within reach_m of the rectangle between two corners (x, y)."""
         centres = self.views[:, 12:14]

@@ -391,6 +391,14 @@ def test_wires_and_boards_on_edge_carry_nothing(cell_m: float) -> None:
     assert bool(within(cells, (6.5, 8.5), (-0.2, 1.2)).any())
 
 
+def test_snow_falls_past_lamps() -> None:
+    lamp = one_gaussian(mean=(6.5, 0.1, 6.0), scale=(0.4, 0.1, 0.02), opacity=0.99)
+    cells = place(drive(GROUND, lamp), PlacementSettings(cell_m=0.05)).ground
+    below = within(cells, (5.8, 7.2), (-0.1, 0.3))
+    assert float((cells.sizes_m[below] ** 2).sum()) == pytest.approx(1.4 * 0.4, rel=0.1)
+    assert float(cells.centers_m[:, 2].max()) < 0.1
+
+
 def test_bins_carry_snow_and_blobs_before_walls_do_not() -> None:
     bin_top = sheet((5, 5.5), (1.0, 1.5), 0.9)
     sides = [side_wall(y, (5, 5.5), (0, 0.9)) for y in (1.0, 1.5)]
