@@ -16,6 +16,7 @@ import numpy as np
 from augment.snow.height_map import HeightMap
 
 LEAST_M2, MOST_M2 = 0.1, 7.0  # what is smaller is left to `surface`
+MOST_OVER_M2 = 0.6  # of that, under narrow things: lamps, not eaves
 MOST_ON_PATH_M2 = 80.0  # where the path of the cameras leads over it
 _PATH_M = 1.0  # on both sides of it
 _RIM_CELLS = 3
@@ -51,8 +52,10 @@ def fill_holes(
     possible = possible[possible > 0]
     if count <= 1 or len(possible) == 0:
         return height_map, filled
-    on_path = np.zeros(count, bool)
-    on_path[np.unique(labels[_near_path(height_map, path_xy)])] = True
+    near = labels[_near_path(height_map, path_xy)].astype(np.int64)
+    on_path = np.bincount(near, minlength=count) > 0
+    over = np.bincount(labels[narrow].astype(np.int64), minlength=count) * cell_m2
+    possible = possible[over[possible] <= MOST_OVER_M2]
     new = {name: getattr(height_map, name).copy() for name in ("height_m", "rgb", "alpha")}
     is_thin = height_map.is_thin.copy()
     for hole in possible[(sizes[possible] <= MOST_M2) | on_path[possible]]:
