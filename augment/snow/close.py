@@ -25,12 +25,12 @@ from augment.snow import close_kernels
 from augment.snow.close_kernels import MARGIN, TEXEL_M
 
 # Splitting stops at a standard deviation of so many pixels, and of so much of the distance.
-FINEST_PX, FINEST = 4.0, 0.0035
+FINEST_PX, FINEST = 5.0, 0.0038
 ROWS = 2048  # discs that a thread takes at a time
-RELIEF = 1.8  # brightness per fall of the noise towards the sun, of a clear day's contrast
+RELIEF = 3.4  # brightness per fall of the noise towards the sun, of a clear day's contrast
 CRUMB_M = 0.025  # what one crumb of snow measures
 TABLE = 512  # texels a side of the noise that grain follows: 5 m, repeated
-MOTTLE = 0.09  # brightness per noise, in any light
+MOTTLE = 0.16  # brightness per noise, in any light
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ def split_near(
         means=torch.empty(total, 3),
         quats=torch.empty(total, 4),
         scales=torch.empty(total, 3),
-        opacities=gaussians.opacities[:1].expand(total).contiguous(),
+        opacities=torch.from_numpy(np.full(total, gaussians.opacities.numpy()[0])),
         sh=torch.empty(total, 1, 3),
         semantic=None if gaussians.semantic is None else gaussians.semantic[:1].expand(total),
     )
@@ -100,10 +100,10 @@ def split_near(
             *_arrays(gaussians, slopes),
             *_arrays(fine, fine_slopes),
         )
-    opacities = gaussians.opacities.clone()
-    opacities[torch.from_numpy(chosen)] = 0
+    opacities = gaussians.opacities.numpy().copy()  # numpy: torch would wake threads for so little
+    opacities[chosen] = 0
     return CloseSnow(
-        dataclasses.replace(gaussians, opacities=opacities),
+        dataclasses.replace(gaussians, opacities=torch.from_numpy(opacities)),
         fine,
         None if slopes is None else fine_slopes,
     )

@@ -13,7 +13,7 @@ from augment.snow.splat_kernels import SPREAD
 
 REACH = 1.4  # cells that a disc's parts cover: discs lie scattered, up to so far apart
 FARTHEST_M = 10.0  # from the camera: discs farther away stay whole
-MOST_SPLITS = 4  # of a disc, along each of its sides
+MOST_SPLITS = 3  # of a disc, along each of its sides
 MARGIN = 0.15  # of the image's half width or height: discs so far outside are split as well
 TEXEL_M = 0.01  # of the table of noise that the grain follows
 COARSER = 0.37  # how fast the table is read a second time, turned: for clods
@@ -41,7 +41,7 @@ def count_splits(means, scales, pose, limits, finest, splits):
         if not (limits[2] * away <= down <= limits[3] * away):
             continue
         side = REACH * np.float64(max(scales[i, 0], scales[i, 1]))
-        count = min(math.ceil(side / (finest * distance)), MOST_SPLITS)
+        count = min(math.floor(side / (finest * distance) + 0.5), MOST_SPLITS)
         splits[i] = count if count > 1 else 0
 
 
@@ -78,7 +78,7 @@ def split(
         far = math.sqrt((mx - eye[0]) ** 2 + (my - eye[1]) ** 2 + (mz - eye[2]) ** 2)
         fade = min(max(2.0 * (1.0 - far / FARTHEST_M), 0.0), 1.0)
         side = REACH * np.float64(max(scales[i, 0], scales[i, 1]))
-        fade *= min(max(side / (finest * far) - 1.0, 0.0), 1.0)  # 0 where discs grow whole again
+        fade *= min(max(2.0 * side / (finest * far) - 3.0, 0.0), 1.0)  # 0 where discs grow whole again
         wide, deep = REACH * np.float64(scales[i, 0]), REACH * np.float64(scales[i, 1])
         along, across = wide / SPREAD, deep / SPREAD
         s = firsts[c]

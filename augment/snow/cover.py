@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -118,6 +119,9 @@ def _lit(
     wrap: float,
 ) -> Gaussians:
     """The Gaussians in the light that their own normals catch. sun: unit, in the part's frame."""
-    share = ((normals @ sun.to(normals.dtype) + wrap) / (1 + wrap)).clamp(0, 1)
-    lit = gaussians.sh + (slopes * (share / SH_C0)[:, None])[:, None, :]
-    return dataclasses.replace(gaussians, sh=lit)
+    # numpy, since starting threads would take longer than the arithmetic on one part's snow
+    n, light = normals.numpy(), sun.numpy().astype(np.float32)
+    facing = n[:, 0] * light[0] + n[:, 1] * light[1] + n[:, 2] * light[2]
+    share = np.clip((facing + wrap) / (1 + wrap), 0, 1) / SH_C0
+    lit = gaussians.sh.numpy() + (slopes.numpy() * share[:, None])[:, None, :]
+    return dataclasses.replace(gaussians, sh=torch.from_numpy(lit.astype(np.float32)))
