@@ -11,7 +11,7 @@ import torch
 from augment.geometry import rotmat_from_quat
 from augment.scene import Gaussians
 
-BELOW_M, ABOVE_M = 0.5, 0.04  # of the bed; above, half a cell at least
+BELOW_M, ABOVE_M = 0.5, 0.08  # of the bed; above, half a cell at least
 FACING_RAD = math.radians(40)  # between a flat Gaussian's normal and the bed's
 _FLAT = 0.5  # shortest axis over the next, of a flat Gaussian
 _SMALL_M, _SMALL_BELOW_M = 0.06, 0.15  # what is small and just beneath goes whichever way it faces
