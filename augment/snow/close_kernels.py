@@ -78,7 +78,9 @@ def split(
         far = math.sqrt((mx - eye[0]) ** 2 + (my - eye[1]) ** 2 + (mz - eye[2]) ** 2)
         fade = min(max(2.0 * (1.0 - far / FARTHEST_M), 0.0), 1.0)
         side = REACH * np.float64(max(scales[i, 0], scales[i, 1]))
-        fade *= min(max(2.0 * side / (finest * far) - 3.0, 0.0), 1.0)  # 0 where discs grow whole again
+        fade *= min(
+            max(2.0 * side / (finest * far) - 3.0, 0.0), 1.0
+        )  # 0 where discs grow whole again
         wide, deep = REACH * np.float64(scales[i, 0]), REACH * np.float64(scales[i, 1])
         along, across = wide / SPREAD, deep / SPREAD
         s = firsts[c]
