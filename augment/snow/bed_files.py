@@ -23,7 +23,7 @@ from augment.snow.cells import FLUSH, SnowBed, SnowCells
 from augment.snow.placement import PlacementSettings
 
 # Raised whenever the same scene would give another bed, or a file hold it otherwise.
-FORMAT = "climategs-snow-bed-4"
+FORMAT = "climategs-snow-bed-5"
 _ABOUT = "snow_bed"
 _DTYPES = {
     "neighbours": torch.int32,

@@ -24,6 +24,7 @@ Estimator = Literal["mode", "expected", "median"]
 _DEPTHS = {"mode": "mode_depth", "expected": EXPECTED_DEPTH, "median": MEDIAN_DEPTH}
 COVERED = 0.5  # of a pixel must be opaque, for something to lie there
 _EYE_ABOVE_M = 100.0
+_HANGS_M = 1.0  # over a surface: where half of what falls lands so high up, it is sheltered
 _SHELTER_M = 1.0  # what stands less far above a cell hides no sky from it
 _SHELTER_CELLS = 2  # narrower things hide too little of it
 _TRUE_M = 1.0  # in coarser cells, splats that together cover one are too faint one by one
@@ -130,8 +131,10 @@ def draw_from_above(
         is_orthographic=True,
     )
     shown = None if wanted is None else torch.from_numpy(np.ascontiguousarray(wanted[::-1]))
-    names = (ALPHA, _DEPTHS[estimator], RGB, SPLAT_IDS)
-    alpha, depths, rgb, ids = _draw(parts, camera, names, shown, antialiased=cell_m <= _TRUE_M)
+    names = (ALPHA, _DEPTHS[estimator], MEDIAN_DEPTH, RGB, SPLAT_IDS)
+    alpha, depths, medians, rgb, ids = _draw(
+        parts, camera, names, shown, antialiased=cell_m <= _TRUE_M
+    )
     covered, height = _heights(alpha, depths, float(eye[2]))
     alpha = np.where(covered, alpha, np.minimum(alpha, np.float32(COVERED / 2)))
     is_thin = np.zeros(shape, bool)
@@ -143,6 +146,9 @@ def draw_from_above(
         shelters = cv2.morphologyEx(shelters.astype(np.uint8), cv2.MORPH_OPEN, wide) > 0
         is_thin = shelters | (covered_wide & ~covered)
         height[is_thin], alpha[is_thin] = height_wide[is_thin], alpha_wide[is_thin]
+    above = np.where(medians > 0, eye[2].item() - medians.astype(np.float64), 0).astype(np.float32)
+    hangs = (alpha >= COVERED) & (medians > 0) & (above - height > _HANGS_M)
+    height[hangs], is_thin = above[hangs], is_thin | hangs
     return HeightMap(
         left_m=corner_m[0],
         bottom_m=corner_m[1],

@@ -25,7 +25,7 @@ POCKET_M2, _POCKET_STEP_M, _POCKET_CELLS = 0.1, 0.3, 1.5  # gaps that are closed
 OBSTACLE_M, _BANK_REACH_M, _BANK_SPREAD_M = 0.4, 1.0, 0.35
 _MEDIAN_M, _SMOOTH_M = 0.1, 0.15  # scales of smoothing; one cell at least
 _SLACK_M, _SMOOTHED_BY_M = 0.05, 0.02
-_STEEPER_RAD, _STEEPEST_RAD = math.radians(20), math.radians(80)
+_STEEPER_RAD, _STEEPEST_RAD = math.radians(8), math.radians(80)
 _ROWS = 8  # grid rows a thread takes at a time
 
 

@@ -14,7 +14,7 @@ from augment.errors import SceneError
 
 # Cells double in size at each of these level distances from the cameras' path, metres; beyond the
 # last there are none.
-RINGS_M = (8.0, 16.0, 32.0, 64.0, 120.0)
+RINGS_M = (8.0, 32.0, 48.0, 80.0, 120.0)
 COARSEST_M = 1.0  # cells double up to about this size; a coarser cell_m does not double at all
 BYTES_PER_CELL = 70  # of a bed
 MOST_BYTES = 4 << 30
