@@ -48,7 +48,6 @@ from tools.bench_snow_truth import (
 
 ESTIMATORS: tuple[Estimator, ...] = get_args(Estimator)
 DEPTHS_M = (0.02, 0.1, 0.4)
-DRAWN_DEPTH_M = 0.1  # of the snow whose drawn area is measured
 COVERED = 0.5  # of a pixel
 ALLOWED_SHARE, ALLOWED_M = 0.2, 0.01  # of the depth, and beside it: median height error
 
