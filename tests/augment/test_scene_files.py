@@ -359,7 +359,7 @@ def test_any_document_is_a_scene_or_a_scene_error(tmp_path_factory, data):
             r"quats must be \[50, 4\]; got \[50, 3\]",
         ),
         (lambda t: t.update({"background.sh": t["background.sh"].astype("f8")}), "be float32"),
-        (lambda t: t.update({"actors.1.semantic": np.full(3, 16, np.int16)}), "from 0 to 15"),
+        (lambda t: t.update({"actors.1.semantic": np.full(3, 17, np.int16)}), "from 0 to 16"),
         (lambda t: t.update({"actors.1.semantic": np.zeros(3, np.int64)}), r"must be int16 \[3\]"),
         (lambda t: t.update({"background.semantic": np.zeros(9, np.int16)}), r"be int16 \[50\]"),
         (lambda t: t.update({"background.opacities": np.array(1, "f4")}), "must have 50 rows"),
