@@ -86,7 +86,7 @@ def place_snow(
     snow = recipe.weather.snow
     if snow is None:
         return None, "the recipe has no snow"
-    if snow.depth_m == 0 or snow.coverage == 0:
+    if not snow.lies:
         nothing = "depth" if snow.depth_m == 0 else "coverage"
         return None, f"the snow has no {nothing}, so it changes nothing"
     check_metric_and_level(scene)

@@ -10,9 +10,8 @@ from dataclasses import dataclass
 from augment.place import gaussians_below, place_flood, place_smog, place_snow
 from augment.render.buffers import (
     ALPHA,
+    DEPTH_ESTIMATORS,
     EXPECTED_DEPTH,
-    MEDIAN_DEPTH,
-    MODE_DEPTH,
     RGB,
     SNOW,
     SPLAT_IDS,
@@ -23,8 +22,6 @@ from augment.snow.placed import PlacedSnow
 from augment.weather.flood import FloodMedium
 from augment.weather.smog import SmogMedium
 from recipes.schema import Recipe
-
-DEPTH_BUFFERS = {"median": MEDIAN_DEPTH, "expected": EXPECTED_DEPTH, "mode": MODE_DEPTH}
 
 
 @dataclass(frozen=True)
@@ -96,7 +93,7 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
     snow, snow_reason = place_snow(recipe, scene, level_z_m)
     smog, smog_reason = place_smog(recipe, scene)
     per_gaussian = recipe.weather.smog is not None and recipe.weather.smog.model == "per_gaussian"
-    depth_buffer = DEPTH_BUFFERS.get(recipe.output.depth)
+    depth_buffer = DEPTH_ESTIMATORS.get(recipe.output.depth)
     labelled = recipe.output.labels and scene.labels is not None
     measures_flood, measures_snow = flood is not None and labelled, snow is not None and labelled
     for_images = {ALPHA, depth_buffer} if depth_buffer else set[str]()

@@ -92,3 +92,8 @@ class Snow(Closed):
         lt=2**63,
         description="What drifts, patches and grain are drawn from; null for the recipe's seed.",
     )
+
+    @property
+    def lies(self) -> bool:
+        """Whether there is any: snow without depth or coverage changes nothing."""
+        return self.depth_m > 0 and self.coverage > 0

@@ -40,7 +40,7 @@ class StoredBed:
 def snow_to_lay(recipe: Recipe) -> Snow | None:
     """The recipe's snow; None where there is none to be laid."""
     snow = recipe.weather.snow
-    return None if snow is None or snow.depth_m == 0 or snow.coverage == 0 else snow
+    return snow if snow is not None and snow.lies else None
 
 
 def remember(scene: Scene, snow: Snow, bed: SnowBed) -> None:

@@ -17,6 +17,8 @@ RGB, ALPHA, EXPECTED_DEPTH, MEDIAN_DEPTH, SPLAT_IDS, MODE_DEPTH, SNOW = (
     "snow",
 )
 BUFFERS = (RGB, ALPHA, EXPECTED_DEPTH, MEDIAN_DEPTH, SPLAT_IDS, MODE_DEPTH, SNOW)
+# Depth estimators by the names that recipes and placement give them.
+DEPTH_ESTIMATORS = {"median": MEDIAN_DEPTH, "expected": EXPECTED_DEPTH, "mode": MODE_DEPTH}
 DIFFERENTIABLE = frozenset({RGB, ALPHA, EXPECTED_DEPTH})  # by every backend that has gradients
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from augment.cameras import Camera
-from augment.render.buffers import ALPHA, EXPECTED_DEPTH, MEDIAN_DEPTH, RGB, SPLAT_IDS
+from augment.render.buffers import ALPHA, DEPTH_ESTIMATORS, MEDIAN_DEPTH, RGB, SPLAT_IDS
 from augment.render.clip import UNCUT
 from augment.render.constants import ALPHA_MIN, MAX_EXTENT_SIGMAS, RasterSettings
 from augment.render.rasterize import rasterize
@@ -21,7 +21,6 @@ from augment.semantics import SemanticClass
 
 Estimator = Literal["mode", "expected", "median"]
 
-_DEPTHS = {"mode": "mode_depth", "expected": EXPECTED_DEPTH, "median": MEDIAN_DEPTH}
 COVERED = 0.5  # of a pixel must be opaque, for something to lie there
 _EYE_ABOVE_M = 100.0
 _HANGS_M = 1.0  # over a surface: where half of what falls lands so high up, it is sheltered
@@ -131,7 +130,7 @@ def draw_from_above(
         is_orthographic=True,
     )
     shown = None if wanted is None else torch.from_numpy(np.ascontiguousarray(wanted[::-1]))
-    names = (ALPHA, _DEPTHS[estimator], MEDIAN_DEPTH, RGB, SPLAT_IDS)
+    names = (ALPHA, DEPTH_ESTIMATORS[estimator], MEDIAN_DEPTH, RGB, SPLAT_IDS)
     alpha, depths, medians, rgb, ids = _draw(
         parts, camera, names, shown, antialiased=cell_m <= _TRUE_M
     )
