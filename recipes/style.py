@@ -1,0 +1,84 @@
+"""What a recipe may say of style: the colour mood of a photograph, or of a preset."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import ConfigDict, Field, Strict, model_validator
+from pydantic.config import JsonDict
+
+from recipes.types import Closed, Flag, Number
+
+# In words of JSON Schema: one of the two is present and not null.
+_ONE_SOURCE: JsonDict = {
+    "oneOf": [
+        {"required": [name], "properties": {name: {"not": {"type": "null"}}}}
+        for name in ("image", "preset")
+    ]
+}
+Path = Annotated[str, Strict(), Field(min_length=1, max_length=1024)]
+
+
+class Style(Closed):
+    """The colours of the scene, turned into those of an image or of a preset."""
+
+    model_config = ConfigDict(json_schema_extra=_ONE_SOURCE)
+
+    image: Path | None = Field(
+        default=None, description="The style image, a file in the recipe's folder or below it."
+    )
+    preset: Annotated[str, Strict()] | None = Field(
+        default=None, description="A style that comes with the package, in place of an image."
+    )
+    mask: Path | None = Field(
+        default=None,
+        description="An image of the style image's shape, white where that shows sky; null to "
+        "look for the sky at its top.",
+    )
+    method: Literal["mkl", "reinhard", "gscm"] = Field(
+        default="mkl",
+        description="mkl maps mean and covariance of the colours (Monge-Kantorovich), reinhard "
+        "mean and spread of each channel; gscm is the network.",
+    )
+    strength: Number = Field(
+        default=1.0, ge=0, le=2, description="0 leaves the scene's colours, 1 takes on the style's."
+    )
+    per_region: Flag = Field(
+        default=False,
+        description="Maps of their own for road, vegetation and the rest, where the scene knows "
+        "its classes.",
+    )
+    applied_to: Literal["scene", "picture"] = Field(
+        default="scene",
+        description="scene styles what stands in the weather, picture also the weather itself.",
+    )
+    checkpoint: Path | None = Field(
+        default=None,
+        description="A trained network for gscm, in the recipe's folder or below it; null for the "
+        "one that comes with the package.",
+    )
+    digest: Annotated[str, Strict(), Field(pattern=r"^[0-9a-f]{64}$")] | None = Field(
+        default=None,
+        description="SHA-256 over what the files above hold; checked where given, worked out "
+        "where null.",
+    )
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Style:
+        if (self.image is None) == (self.preset is None):
+            both = "both give" if self.image is not None else "neither gives"
+            raise ValueError(f"image and preset {both} the style: give one of them")
+        if self.image is None and self.mask is not None:
+            raise ValueError("mask belongs to an image, and there is none")
+        if self.image is None and self.method == "gscm":
+            raise ValueError("method gscm looks at an image: give image instead of preset")
+        if self.checkpoint is not None and self.method != "gscm":
+            raise ValueError(f"checkpoint belongs to method gscm; method is {self.method}")
+        if self.method == "gscm" and self.per_region:
+            raise ValueError("per_region is for mkl and reinhard: gscm gives one map for all")
+        return self
+
+    @property
+    def changes(self) -> bool:
+        """Whether there is any: a style of no strength changes nothing."""
+        return self.strength > 0
