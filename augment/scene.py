@@ -138,7 +138,9 @@ class PosedGaussians:
 
     world_from_part: float64 [4, 4], or None for the identity. instance_id: 0 for the background,
     1 + the actor's index otherwise. is_snow: whether they are snow, which the buffer "snow" counts.
-    shading: None for splats of one colour each.
+    shading: None for splats of one colour each. color_maps [C, 3, 4]: of what every splat shows,
+    c' = max(M[:, :3] @ c + M[:, 3], 0): the map of its class, the first where it has none; None
+    leaves the colours. A part has either shading or maps.
     """
 
     gaussians: Gaussians
@@ -146,6 +148,7 @@ class PosedGaussians:
     instance_id: int = 0
     is_snow: bool = False
     shading: SplatShading | None = None
+    color_maps: Float[Tensor, "C 3 4"] | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -36,9 +36,10 @@ def splat_inputs(
     addresses = np.array(bases, np.uint64) + starts[:, None].astype(np.uint64) * np.array(
         strides, np.uint64
     )
-    unlit = np.zeros((len(starts), 1), np.uint64)  # no part has slopes of light
+    # no part has slopes of light, or colour maps
+    absent = np.zeros((len(starts), layout.ADDRESSES - len(_FIELDS)), np.uint64)
     return Inputs(
-        addresses=np.concatenate([addresses, unlit], 1),
+        addresses=np.concatenate([addresses, absent], 1),
         sizes=np.stack([counts, np.full_like(counts, functions)], 1),
         first_ids=starts.copy(),
         views=part_views(poses, camera, settings, None),

@@ -114,10 +114,11 @@ def write_basis(x, y, z, functions, rows):
 
 
 @inner()
-def write_color(sh, at, functions, view, smog, rows, lane, records, slot):
-    """max(0.5 + sum sh Y, 0), in the smog where there is any, to the record that starts at `slot`.
+def write_color(sh, at, functions, maps, at_map, view, smog, rows, lane, records, slot):
+    """max(0.5 + sum sh Y, 0), mapped and in the smog, to the record that starts at `slot`.
 
-    sh: flat; the splat's coefficients start at `at`.
+    sh, maps: flat; the splat's coefficients start at `at`, its colour map at `at_map`, which is
+    negative where it has none.
     """
     r = g = b = np.float32(0.5)
     for k in range(U(functions)):
@@ -128,6 +129,11 @@ def write_color(sh, at, functions, view, smog, rows, lane, records, slot):
         at += U(3)
     zero = np.float32(0)
     r, g, b = max(r, zero), max(g, zero), max(b, zero)
+    if at_map >= 0:
+        mapped_r = _map_channel(maps, U(at_map), r, g, b)
+        mapped_g = _map_channel(maps, U(at_map) + U(4), r, g, b)
+        b = _map_channel(maps, U(at_map) + U(8), r, g, b)
+        r, g = mapped_r, mapped_g
     if smog != NO_SMOG:
         t = rows[U(THROUGH * LANES) + lane]
         hidden = np.float32(1) - t
@@ -137,6 +143,14 @@ def write_color(sh, at, functions, view, smog, rows, lane, records, slot):
     records[slot + U(RED)] = r
     records[slot + U(GREEN)] = g
     records[slot + U(BLUE)] = b
+
+
+@inner()
+def _map_channel(maps, at, r, g, b):
+    """One row of a colour map, at four numbers from `at`, applied to a colour; not below 0."""
+    value = fmuladd(maps[at], r, maps[at + U(3)])
+    value = fmuladd(maps[at + U(1)], g, value)
+    return max(fmuladd(maps[at + U(2)], b, value), np.float32(0))
 
 
 @inner()

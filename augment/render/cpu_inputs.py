@@ -63,7 +63,7 @@ def gather_inputs(
         g, count = part.gaussians, len(part.gaussians)
         tensors = (g.means, g.quats, g.scales, g.opacities, g.sh)
         own = [t.detach().to(torch.float32).contiguous().numpy() for t in tensors]
-        own.append(_slopes(part))
+        own += [_slopes(part), *_color_maps(part)]
         arrays += own
         addresses.append([array.ctypes.data for array in own])
         sizes.append([count, g.sh.shape[1]])
@@ -73,6 +73,7 @@ def gather_inputs(
     poses = part_poses([part.world_from_part for part in parts])
     views = part_views(poses, camera, settings, smog, clip)
     views[:, layout.V_SNOW] = [part.is_snow for part in parts]
+    views[:, layout.V_MAPS] = [_map_count(part) for part in parts]
     for view, part, pose in zip(views, parts, poses, strict=True):
         if part.shading is not None:
             sun = camera.camera_from_world.numpy()[:3, :3] @ pose[:3, :3] @ part.shading.sun
@@ -81,7 +82,7 @@ def gather_inputs(
     modes = raster_modes(settings, smog, clip, with_color=with_color)
     modes[layout.M_LIGHT] = with_color and any(part.shading is not None for part in parts)
     return Inputs(
-        addresses=np.array(addresses, np.uint64).reshape(-1, 6),
+        addresses=np.array(addresses, np.uint64).reshape(-1, layout.ADDRESSES),
         sizes=np.array(sizes, np.int64).reshape(-1, 2),
         first_ids=np.cumsum([0, *counts[:-1]], dtype=np.int64),
         views=views,
@@ -96,6 +97,24 @@ def _slopes(part: PosedGaussians) -> np.ndarray:
     if part.shading is None:
         return np.zeros(1, np.float32)
     return part.shading.slopes.detach().to(torch.float32).contiguous().numpy()
+
+
+def _map_count(part: PosedGaussians) -> int:
+    """One for all of a part without classes, since they have none to choose by."""
+    if part.color_maps is None:
+        return 0
+    return 1 if part.gaussians.semantic is None else len(part.color_maps)
+
+
+def _color_maps(part: PosedGaussians) -> tuple[np.ndarray, np.ndarray]:
+    """Float32 [C, 3, 4] and int16 [N], or [1] of what is not read."""
+    maps, classes = np.zeros(1, np.float32), np.zeros(1, np.int16)
+    if part.color_maps is not None:
+        maps = part.color_maps.detach().to(torch.float32).contiguous().numpy()
+        if _map_count(part) > 1:
+            assert part.gaussians.semantic is not None
+            classes = part.gaussians.semantic.contiguous().numpy()
+    return maps, classes
 
 
 def part_views(

@@ -50,7 +50,15 @@ V_PARALLEL = 51  # 1 where rays are parallel, else 0
 V_SNOW = 52  # 1 where the part is snow, else 0
 V_SUN, V_WRAP = 53, 56  # towards the light, in the camera's axes; how far it is wrapped
 V_LIT = 57  # 1 where the part is lit pixel by pixel, else 0
+V_MAPS = 58  # how many colour maps the part has
 VIEW = 64
+
+# What a part is read from: arrays of these by address.
+A_MEANS, A_QUATS, A_SCALES, A_OPACITIES, A_SH = 0, 1, 2, 3, 4
+A_SLOPES = 5  # of the light; read of lit parts only
+A_MAPS, A_CLASSES = 6, 7  # colour maps, read where V_MAPS > 0; int16 classes, where it is > 1
+ADDRESSES = 8
+MAP = 12  # numbers of a colour map
 
 # How to project: int64 each.
 M_COLOR, M_FUNCTIONS, M_ANTIALIASED, M_SMOG = 0, 1, 2, 3  # M_FUNCTIONS: most SH functions

@@ -87,6 +87,20 @@ def _float_pointer(typingctx, address):
     return types.CPointer(types.float32)(types.uint64), codegen
 
 
+@intrinsic
+def _short_pointer(typingctx, address):
+    def codegen(context, builder, sig, args):
+        return builder.inttoptr(args[0], ir.IntType(16).as_pointer())
+
+    return types.CPointer(types.int16)(types.uint64), codegen
+
+
+@inner()
+def shorts_at(address, count):
+    """The int16 array of `count` numbers at a memory address; the caller keeps it alive."""
+    return numba.carray(_short_pointer(address), (count,))
+
+
 @inner()
 def floats_at(address, count):
     """The float32 array of `count` numbers at a memory address; the caller keeps it alive.

@@ -37,6 +37,14 @@ from augment.render.cpu_geometry import (
 )
 from augment.render.cpu_jit import inner, kernel
 from augment.render.cpu_layout import (
+    A_CLASSES,
+    A_MAPS,
+    A_MEANS,
+    A_OPACITIES,
+    A_QUATS,
+    A_SCALES,
+    A_SH,
+    A_SLOPES,
     BIN_SHIFT,
     BLOCK,
     BLUNT_Y,
@@ -54,6 +62,7 @@ from augment.render.cpu_layout import (
     M_FUNCTIONS,
     M_LIGHT,
     M_SMOG,
+    MAP,
     MEAN_X,
     MEAN_Y,
     NO_SMOG,
@@ -71,13 +80,14 @@ from augment.render.cpu_layout import (
     V_GAIN,
     V_LIT,
     V_LOG_CUT,
+    V_MAPS,
     V_NEAR,
     V_PARALLEL,
     V_SIZE,
     V_SNOW,
     U,
 )
-from augment.render.cpu_math import LOG2_E, floats_at, log2
+from augment.render.cpu_math import LOG2_E, floats_at, log2, shorts_at
 from augment.render.cpu_shading import (
     L_FACING,
     L_LEAN_X,
@@ -104,10 +114,10 @@ _HUGE = np.float32(1e37)  # px^2; beyond it float32 overflows, and no pixel coul
 def rank_splats(addresses, sizes, views, blocks, depths, histograms):
     """z of every Gaussian that may be seen, 0 for the others, and where along z the image is paid.
 
-    addresses: uint64 [P, 6] of means, quats, scales, opacities, sh, and the light's slopes, which
-    are read of lit parts only. sizes: int64 [P, 2], Gaussians and SH functions. views: float32 [P,
-    VIEW]. blocks: int64 [B, 3], part, first and last + 1. depths: float32 [B BLOCK]. histograms:
-    float64 [C, BINS], each of C runs of blocks its own: opacity times area, px^2.
+    addresses: uint64 [P, ADDRESSES], see cpu_layout. sizes: int64 [P, 2], Gaussians and SH
+    functions. views: float32 [P, VIEW]. blocks: int64 [B, 3], part, first and last + 1. depths:
+    float32 [B BLOCK]. histograms: float64 [C, BINS], each of C runs of blocks its own: opacity
+    times area, px^2.
     """
     runs, total = histograms.shape[0], blocks.shape[0]
     for run in prange(runs):
@@ -119,9 +129,9 @@ def rank_splats(addresses, sizes, views, blocks, depths, histograms):
         for block in range(total * run // runs, total * (run + 1) // runs):
             part, first, last = blocks[block]
             count = sizes[part, 0]
-            means = floats_at(addresses[part, 0], count * 3)
-            scales = floats_at(addresses[part, 2], count * 3)
-            opacities = floats_at(addresses[part, 3], count)
+            means = floats_at(addresses[part, A_MEANS], count * 3)
+            scales = floats_at(addresses[part, A_SCALES], count * 3)
+            opacities = floats_at(addresses[part, A_OPACITIES], count)
             at = block * BLOCK
             for group in range(first, last, LANES):
                 for lane in range(LANES):
@@ -204,12 +214,15 @@ def project_slice(
         base = block * BLOCK
         taken = _pick_bins(depth_bits, base, first, last, bins, picked)
         count, functions = sizes[part]
-        means = floats_at(addresses[part, 0], count * 3)
-        quats = floats_at(addresses[part, 1], count * 4)
-        scales = floats_at(addresses[part, 2], count * 3)
-        opacities = floats_at(addresses[part, 3], count)
-        sh = floats_at(addresses[part, 4], count * functions * 3)
-        slopes = floats_at(addresses[part, 5], count * 3 if views[part, V_LIT] > 0 else 1)
+        means = floats_at(addresses[part, A_MEANS], count * 3)
+        quats = floats_at(addresses[part, A_QUATS], count * 4)
+        scales = floats_at(addresses[part, A_SCALES], count * 3)
+        opacities = floats_at(addresses[part, A_OPACITIES], count)
+        sh = floats_at(addresses[part, A_SH], count * functions * 3)
+        slopes = floats_at(addresses[part, A_SLOPES], count * 3 if views[part, V_LIT] > 0 else 1)
+        map_count = np.int64(views[part, V_MAPS])
+        maps = floats_at(addresses[part, A_MAPS], max(map_count, 1) * MAP)
+        classes = shorts_at(addresses[part, A_CLASSES], count if map_count > 1 else 1)
         used = min(modes[M_FUNCTIONS], functions)
         slot = U(base)
         for at in range(U(0), U(taken), U(LANES)):
@@ -225,9 +238,11 @@ def project_slice(
                 records[record + U(IS_SNOW)] = views[part, V_SNOW]
                 if modes[M_COLOR]:
                     from_sh = U(splat) * U(functions * 3)
+                    at_map = _map_of(classes, splat, map_count)
                     write_color(
-                        sh, from_sh, used, views[part], modes[M_SMOG], rows, lane, records, record
-                    )
+                        sh, from_sh, used, maps, at_map, views[part], modes[M_SMOG], rows, lane,
+                        records, record,
+                    )  # fmt: skip
                 if modes[M_CLIP]:
                     for field in range(U(C_REACH + 1)):
                         cuts[slot * U(CUT) + field] = rows[(U(_CUTS) + field) * U(LANES) + lane]
@@ -256,6 +271,19 @@ def _pick_bins(depth_bits, base, first, last, bins, picked):
     for lane in range(U(LANES)):
         picked[taken + lane] = picked[max(taken, U(1)) - U(1)]
     return taken
+
+
+@inner()
+def _map_of(classes, splat, map_count):
+    """Where a splat's colour map starts, -1 without one; classes that have none take the first."""
+    if map_count == 0:
+        return np.int64(-1)
+    group = np.int64(0)
+    if map_count > 1:
+        group = np.int64(classes[splat])
+        if group < 0 or group >= map_count:
+            group = np.int64(0)
+    return group * np.int64(MAP)
 
 
 @inner()

@@ -45,9 +45,9 @@ def rasterize(
     its own distance. clip: only what lies above, or below, a height is drawn (augment.render.clip).
     wanted: bool [H, W], the pixels that will be looked at; a backend may leave the others 0.
     backend: "cpu" (numba, float32; gradients of rgb, alpha and expected_depth, of pinhole cameras,
-    without smog, clip or light per pixel and where no other buffer is asked for), "reference"
-    (torch, float32 or float64, gradients of all), or "auto": cpu where it can do the job, else
-    reference.
+    without smog, clip, light per pixel or colour maps and where no other buffer is asked for),
+    "reference" (torch, float32 or float64, gradients of all), or "auto": cpu where it can do the
+    job, else reference.
 
     Raises:
         ValueError, TypeError: an argument no backend, or not the one named, can take.
@@ -143,6 +143,8 @@ def _beyond_its_gradients(
     """What the cpu backend would need gradients of and has none; None where it has all."""
     if any(part.shading is not None for part in parts):
         return "of light per pixel"
+    if any(part.color_maps is not None for part in parts):
+        return "through colour maps"
     if smog is not None:
         return "through smog"
     if clip is not None:
@@ -201,6 +203,7 @@ def _check_arguments(
             raise ValueError(f"part {number} is on {means.device}; move it with .cpu()")
         _check_pose(part, number, camera)
         _check_shading(part, number)
+        _check_color_maps(part, number)
 
 
 def _check_shading(part: PosedGaussians, number: int) -> None:
@@ -219,6 +222,23 @@ def _check_shading(part: PosedGaussians, number: int) -> None:
         raise ValueError(
             f"part {number}: shading.wrap must be finite and >= 0; got {part.shading.wrap}"
         )
+
+
+def _check_color_maps(part: PosedGaussians, number: int) -> None:
+    maps = part.color_maps
+    if maps is None:
+        return
+    if part.shading is not None:
+        raise ValueError(
+            f"part {number} has colour maps and light per pixel, which maps do not reach; map the "
+            f"colours and slopes of its shading instead"
+        )
+    if maps.ndim != 3 or len(maps) == 0 or tuple(maps.shape[1:]) != (3, 4):
+        raise ValueError(
+            f"part {number}: color_maps must be [C, 3, 4] with C >= 1; got {list(maps.shape)}"
+        )
+    if not maps.dtype.is_floating_point or not bool(torch.isfinite(maps).all()):
+        raise ValueError(f"part {number}: color_maps must be finite floats; got {maps}")
 
 
 def _check_pose(part: PosedGaussians, number: int, camera: Camera) -> None:

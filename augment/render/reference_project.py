@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float, Int16, Int64
 from torch import Tensor
 
 from augment.cameras import Camera
@@ -270,14 +270,29 @@ def _colors(
     settings: RasterSettings,
     smog: SmogMedium | None,
 ) -> Float[Tensor, "M 3"]:
-    """max(SH + 0.5, 0), seen through the smog. offsets: from the eye, in the part's axes; without
-    smog their lengths do not matter.
+    """max(SH + 0.5, 0), mapped, and seen through the smog. offsets: from the eye, in the part's
+    axes; without smog their lengths do not matter.
     """
     directions = torch.nn.functional.normalize(offsets, dim=-1)
     colors = (evaluate_sh(gaussians.sh, directions, settings.sh_degree) + 0.5).clamp_min(0)
+    if part.color_maps is not None:
+        colors = _mapped(colors, part.color_maps.to(colors.dtype), gaussians.semantic)
     if smog is None:
         return colors
     return blend_airlight(colors, _optical_depths(gaussians, offsets, part, camera, smog), smog)
+
+
+def _mapped(
+    colors: Float[Tensor, "M 3"],
+    maps: Float[Tensor, "C 3 4"],
+    classes: Int16[Tensor, "M"] | None,
+) -> Float[Tensor, "M 3"]:
+    """Every colour under its class's map, under the first where that has none; not below 0."""
+    if classes is None or len(maps) == 1:
+        return (colors @ maps[0, :, :3].T + maps[0, :, 3]).clamp_min(0)
+    index = torch.where((classes >= 0) & (classes < len(maps)), classes, 0).long()
+    own = maps[index]
+    return (torch.einsum("mij,mj->mi", own[..., :3], colors) + own[..., 3]).clamp_min(0)
 
 
 def _optical_depths(
