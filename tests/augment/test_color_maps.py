@@ -4,6 +4,7 @@ import dataclasses
 
 import pytest
 import torch
+
 from augment.render.rasterize import rasterize
 from augment.scene import Gaussians, PosedGaussians, SplatShading
 from augment.weather.smog import SmogMedium
