@@ -19,3 +19,7 @@ class BackendUnavailable(ClimateGSError):
 
 class OutputError(ClimateGSError):
     """The output folder cannot be written, or holds something else."""
+
+
+class StyleError(ClimateGSError):
+    """A style image, mask, preset or network cannot be used as it is."""

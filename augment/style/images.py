@@ -1,0 +1,197 @@
+"""Style images: read from a file into a small picture with weights and a sky."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from augment.errors import StyleError
+from augment.style.image_header import FORMATS, ImageHeader, image_header
+from augment.style.image_regions import find_sky, region_masks
+from augment.style.statistics import LAND, SKY, WHOLE, ColorStatistics, Statistics, statistics_of
+
+SIDE_PX = 512  # colours need no more, and everything after the reading costs the same for any file
+MAX_BYTES = 256 * 1024**2
+MAX_PIXELS = 64_000_000  # about 1 GiB while an image of this size with alpha is averaged
+_SHAPE_TOLERANCE = 0.02  # by which a mask's aspect ratio may miss: a pixel's rounding when small
+
+_REDUCED = {  # libjpeg averages while it decodes, for less than the whole costs
+    8: cv2.IMREAD_REDUCED_COLOR_8,
+    4: cv2.IMREAD_REDUCED_COLOR_4,
+    2: cv2.IMREAD_REDUCED_COLOR_2,
+}
+
+
+@dataclass(frozen=True, eq=False)
+class StyleImage:
+    """A style image as the transfer sees it, upright and at most SIDE_PX on its longer side.
+
+    rgb: float32 [H, W, 3] in [0, 1], display-encoded. weights: float32 [H, W] in [0, 1], how much a
+    pixel counts (its alpha). sky: bool [H, W].
+    """
+
+    rgb: np.ndarray
+    weights: np.ndarray
+    sky: np.ndarray
+
+    def __post_init__(self) -> None:
+        shape = self.rgb.shape[:2]
+        for name, dtype, expected in (
+            ("rgb", np.float32, (*shape, 3)),
+            ("weights", np.float32, shape),
+            ("sky", np.bool_, shape),
+        ):
+            value = getattr(self, name)
+            if value.shape != expected or value.dtype != dtype:
+                raise ValueError(
+                    f"{name} must be {np.dtype(dtype)} {list(expected)}; "
+                    f"got {value.dtype} {list(value.shape)}"
+                )
+
+
+def read_style_image(path: Path, mask: Path | None = None) -> StyleImage:
+    """The picture in a file: 8 or 16 bits, grey, colour, palette, CMYK (JPEG) or with alpha.
+
+    EXIF's orientation is followed. mask: a picture of the same shape, white where the style image
+    shows sky (more than half white counts); where None the sky is looked for. CMYK is read as
+    inverted, as Photoshop writes it and browsers read it, and without its colour profile.
+
+    Raises:
+        StyleError: a file cannot be read, is no image of these kinds, is too large or fully
+            transparent, or the mask's shape is not the image's.
+    """
+    bgr, alpha = _read(Path(path), "style image")
+    if alpha is not None and not alpha.any():
+        raise StyleError(f"style image {path}: is fully transparent; it shows no colour to take on")
+    rgb, weights = _shrunk(bgr[..., ::-1], alpha)
+    sky = find_sky(rgb, weights) if mask is None else _mask(Path(mask), bgr.shape, rgb.shape, path)
+    return StyleImage(rgb, weights, sky)
+
+
+def image_statistics(image: StyleImage) -> Statistics:
+    """The colour statistics of the image's regions.
+
+    WHOLE always; SKY and LAND where it shows both; VEGETATION, ROAD and REST where found.
+    """
+    total = float(image.weights.sum(dtype=np.float64))
+    masks = region_masks(image.rgb, image.weights, image.sky)
+    found: dict[str, ColorStatistics] = {}
+    for region, inside in {WHOLE: np.ones_like(image.sky), **masks}.items():
+        statistics = statistics_of(image.rgb[inside], image.weights[inside], total=total)
+        if statistics is not None:
+            found[region] = statistics
+    if SKY not in found or LAND not in found:
+        found = {region: found[region] for region in found if region not in (SKY, LAND)}
+    return found
+
+
+def _read(path: Path, what: str) -> tuple[np.ndarray, np.ndarray | None]:
+    """Upright BGR [H, W, 3] and alpha [H, W] or None, of the file's own depth."""
+    data = _bytes(path, what)
+    header = image_header(data)
+    if header is None:
+        raise StyleError(f"{what} {path}: is no {FORMATS} image, or ends within its header")
+    if header.width * header.height > MAX_PIXELS:
+        raise StyleError(
+            f"{what} {path}: has {header.width} x {header.height} pixels, more than "
+            f"{MAX_PIXELS:,}; make it smaller, {SIDE_PX} pixels across are all that is used"
+        )
+    try:
+        bgr, alpha = _decoded(np.frombuffer(data, np.uint8), header)
+    except cv2.error as error:
+        raise StyleError(f"{what} {path}: cannot be decoded as {header.format}: {error}") from None
+    if bgr is None:
+        raise StyleError(
+            f"{what} {path}: cannot be decoded as {header.format}; it may be cut short or damaged"
+        )
+    if bgr.dtype not in (np.uint8, np.uint16):
+        raise StyleError(
+            f"{what} {path}: has {bgr.dtype} pixels; expected 8 or 16 bits a channel, display-"
+            "encoded. Save it as PNG or JPEG"
+        )
+    return bgr, alpha
+
+
+def _bytes(path: Path, what: str) -> bytes:
+    try:
+        with path.open("rb") as file:
+            data = file.read(MAX_BYTES + 1)
+    except (FileNotFoundError, NotADirectoryError):
+        raise StyleError(f"{what} {path}: there is no such file") from None
+    except IsADirectoryError:
+        raise StyleError(f"{what} {path}: is a folder; give one image file") from None
+    except (OSError, ValueError) as error:  # ValueError: a null character in the path
+        raise StyleError(f"{what} {str(path)!a}: cannot be read: {error}") from None
+    if not data:
+        raise StyleError(f"{what} {path}: is empty")
+    if len(data) > MAX_BYTES:
+        raise StyleError(f"{what} {path}: is larger than {MAX_BYTES:,} bytes; make it smaller")
+    return data
+
+
+def _decoded(data: np.ndarray, header: ImageHeader) -> tuple[np.ndarray | None, np.ndarray | None]:
+    if header.format == "JPEG":
+        side = max(header.width, header.height)
+        flag = next((_REDUCED[n] for n in _REDUCED if side // n >= SIDE_PX), cv2.IMREAD_COLOR)
+        return cv2.imdecode(data, flag), None
+    stored = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
+    if stored is None:
+        return None, None
+    upright = cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
+    if upright is None or stored.ndim != 3 or stored.shape[2] != 4:
+        return upright, None
+    return upright, _upright_alpha(stored, upright)
+
+
+def _upright_alpha(stored: np.ndarray, upright: np.ndarray) -> np.ndarray:
+    """The fourth channel turned as EXIF turned the others: OpenCV turns colours alone."""
+    for quarter in range(4):
+        for flipped in (stored, stored[:, ::-1]):
+            turned = np.rot90(flipped, quarter)
+            if np.array_equal(turned[..., :3], upright):
+                return turned[..., 3]
+    return stored[..., 3]
+
+
+def _shrunk(rgb: np.ndarray, alpha: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    """Averaged to at most SIDE_PX: float32 colours [H, W, 3] and weights [H, W]."""
+    most = np.float32(np.iinfo(rgb.dtype).max)
+    size = _small_size(rgb.shape)
+    if alpha is None:
+        small = cv2.resize(np.ascontiguousarray(rgb), size, interpolation=cv2.INTER_AREA)
+        small = small.reshape(size[1], size[0], 3)
+        return small.astype(np.float32) / most, np.ones((size[1], size[0]), np.float32)
+    weights = alpha.astype(np.float32) / most
+    weighted = rgb.astype(np.float32) * (weights / most)[..., None]
+    weights = cv2.resize(weights, size, interpolation=cv2.INTER_AREA)
+    weighted = cv2.resize(weighted, size, interpolation=cv2.INTER_AREA)
+    colors = weighted / np.maximum(weights, 1e-6)[..., None]
+    return np.clip(colors, 0, 1), np.clip(weights, 0, 1)
+
+
+def _small_size(shape: tuple[int, ...]) -> tuple[int, int]:
+    """(width, height) as OpenCV takes it."""
+    height, width = shape[:2]
+    scale = min(1.0, SIDE_PX / max(height, width))
+    return max(1, round(width * scale)), max(1, round(height * scale))
+
+
+def _mask(mask: Path, full: tuple[int, ...], small: tuple[int, ...], image: Path) -> np.ndarray:
+    bgr, alpha = _read(mask, "sky mask")
+    if alpha is not None:
+        bgr = bgr * (alpha[..., None] > np.iinfo(alpha.dtype).max // 2)  # transparent: no sky
+    height, width = bgr.shape[:2]
+    fits = abs(width * full[0] - height * full[1]) <= _SHAPE_TOLERANCE * height * full[1] + max(
+        full[:2]
+    )
+    if not fits:
+        raise StyleError(
+            f"sky mask {mask}: is {width} x {height}, and style image {image} is of another "
+            f"shape, {full[1]} x {full[0]}; a mask has the image's aspect ratio"
+        )
+    white = bgr.max(2).astype(np.float32) / np.iinfo(bgr.dtype).max
+    shrunk = cv2.resize(white, (small[1], small[0]), interpolation=cv2.INTER_AREA)
+    return shrunk.reshape(small[:2]) > 0.5
