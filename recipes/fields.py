@@ -17,7 +17,19 @@ from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 from pydantic.fields import FieldInfo
 
 from recipes.schema import VERSION, Recipe
-from recipes.types import MOST_PER_M, Colour, Number, PerMetre, Rates, Unit, Whole
+from recipes.style import StyleName
+from recipes.style_presets import style_preset_names
+from recipes.types import (
+    MOST_PER_M,
+    Colour,
+    Digest,
+    FilePath,
+    Number,
+    PerMetre,
+    Rates,
+    Unit,
+    Whole,
+)
 from recipes.values import is_number
 
 # the end of a field's name says its unit
@@ -46,6 +58,16 @@ class Kind(enum.Enum):
     COLOUR = "a colour"
     RATES = "three rates"
     TEXT = "text"
+    PATH = "a file in the recipe's folder or below it"
+    DIGEST = "64 hexadecimal digits, small letters"
+
+    @property
+    def is_text(self) -> bool:
+        """Whether it is taken as it is written, though it may look like a number."""
+        return self in (Kind.TEXT, Kind.PATH, Kind.DIGEST)
+
+
+_TEXTS = ((StyleName, Kind.WORD), (FilePath, Kind.PATH), (Digest, Kind.DIGEST))
 
 
 @dataclass(frozen=True)
@@ -104,6 +126,8 @@ class FieldSpec:
             text = f"[red, green, blue], each {self.channel.allowed()}"
         elif self.kind is Kind.TEXT:
             text = "up to 64 letters, digits, '.', '_' or '-', the first a letter or a digit"
+        elif self.kind.is_text:
+            text = self.kind.value
         else:
             text = self._allowed_number(value)
         if self.unit and self.channel is None:
@@ -205,19 +229,19 @@ def _field(path: str, info: FieldInfo, *, rangeable: bool) -> FieldSpec:
         for kind, (sign, attribute) in _LIMITS.items()
         if isinstance(rule, kind)
     ]
-    required = info.is_required()
+    required, kind = info.is_required(), _kind(inner)
     return FieldSpec(
         path=path,
-        kind=_kind(inner),
+        kind=kind,
         description=info.description or "",
         annotation=Annotated[info.annotation, info],
         nullable=nullable,
         default=None if required else info.default,
         limits=tuple(bounds),
-        words=tuple(map(str, get_args(inner))) if get_origin(inner) is Literal else (),
-        rangeable=rangeable,
+        words=_words(inner),
+        rangeable=rangeable and kind is not Kind.DIGEST,
         required=required,
-        channel={Kind.COLOUR: CHANNEL, Kind.RATES: RATE}.get(_kind(inner)),
+        channel={Kind.COLOUR: CHANNEL, Kind.RATES: RATE}.get(kind),
     )
 
 
@@ -236,18 +260,30 @@ def _most(info: FieldInfo) -> int:
 
 
 def _without_none(annotation: Any) -> tuple[Any, bool]:
-    """The annotation without `| None` and `Annotated`, and whether None was there."""
+    """The annotation without `| None` and `Annotated`, and whether None was there.
+
+    The kinds of text stay as they are annotated: nothing else tells them apart.
+    """
     nullable = False
     if get_origin(annotation) in (Union, types.UnionType):
         members = [member for member in get_args(annotation) if member is not type(None)]
         assert len(members) == 1, f"a field is of one type or null; got {annotation}"
         annotation, nullable = members[0], True
-    if get_origin(annotation) is Annotated:
+    if get_origin(annotation) is Annotated and all(annotation != text for text, _ in _TEXTS):
         annotation = get_args(annotation)[0]
     return annotation, nullable
 
 
+def _words(annotation: Any) -> tuple[str, ...]:
+    if annotation == StyleName:
+        return style_preset_names()
+    return tuple(map(str, get_args(annotation))) if get_origin(annotation) is Literal else ()
+
+
 def _kind(annotation: Any) -> Kind:
+    for text, kind in _TEXTS:
+        if annotation == text:
+            return kind
     if annotation == Colour:
         return Kind.COLOUR
     if annotation == Rates:

@@ -6,7 +6,7 @@ import re
 
 from recipes.errors import short
 from recipes.fields import FieldSpec, Kind
-from recipes.suggest import nearest_word
+from recipes.nearest import nearest_word
 from recipes.values import RANGE_KINDS, is_number
 from recipes.yaml_tree import ListNode, MapNode, Node, ScalarNode
 

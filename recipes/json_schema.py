@@ -17,6 +17,11 @@ DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
 _LIMITS = {">": "exclusiveMinimum", ">=": "minimum", "<": "exclusiveMaximum", "<=": "maximum"}
 
+_PATTERNS = {
+    Kind.PATH: {"pattern": r"^[^/\\][^\\]*$"},
+    Kind.DIGEST: {"pattern": "^[0-9a-f]{64}$"},
+}
+
 Schema = dict[str, Any]
 
 
@@ -91,8 +96,8 @@ def _literal(spec: FieldSpec) -> Schema:
             "minItems": 3,
             "maxItems": 3,
         }
-    if spec.kind is Kind.TEXT:
-        return {"type": ["string", "number", "boolean"]}  # a name is taken as it is written
+    if spec.kind.is_text:  # taken as it is written
+        return {"type": ["string", "number", "boolean", *null], **_PATTERNS.get(spec.kind, {})}
     name = {Kind.NUMBER: "number", Kind.WHOLE: "integer", Kind.FLAG: "boolean"}[spec.kind]
     limits = {_LIMITS[sign]: bound for sign, bound in spec.limits}
     return {"type": [name, *null] if null else name, **limits}

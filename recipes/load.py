@@ -7,8 +7,8 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 
 from recipes.errors import RecipeError
+from recipes.nearest import nearest_word
 from recipes.parse import parse_recipe
-from recipes.suggest import nearest_word
 from recipes.template import RecipeTemplate
 
 MAX_BYTES = 65_536  # a recipe is a page of text; a bigger file is something else

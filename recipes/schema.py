@@ -16,6 +16,7 @@ from pydantic.config import JsonDict
 
 from recipes.flood import Flood
 from recipes.snow import Snow
+from recipes.style import FILES, Style
 from recipes.types import Closed, Colour, Flag, Number, Whole
 
 VERSION = 1
@@ -25,6 +26,7 @@ _LATER_FIELDS = (
     ("weather", "flood"),
     ("weather", "snow"),
     ("output", "surface"),
+    ("", "style"),
 )
 MAX_EXTINCTION_PER_M = 100.0  # nothing is seen through 10 cm of it
 
@@ -178,6 +180,7 @@ class Recipe(Closed):
         description="Which draw from the ranges this is; in a file with ranges, the first one.",
     )
     weather: Weather = Weather()
+    style: Style | None = None
     render: Render = Render()
     output: Output = Output()
 
@@ -186,12 +189,17 @@ class Recipe(Closed):
 
         Fields younger than the first release are left out at their defaults, which mean what
         recipes without them meant: their hashes stay, and with them the folders they resume.
+
+        Where files lie is left out, too: what they hold is in their digest, which
+        `recipes.files.with_digest` fills in where a recipe lacks it.
         """
         data = self.model_dump(mode="json")
         for section, name in _LATER_FIELDS:
-            model = type(getattr(self, section))
-            if data[section][name] == model.model_fields[name].default:
-                del data[section][name]
+            model, holder = (getattr(self, section), data[section]) if section else (self, data)
+            if holder[name] == type(model).model_fields[name].default:
+                del holder[name]
+        for name in FILES if self.style is not None else ():
+            del data["style"][name]
         return json.dumps(data, sort_keys=True, separators=(",", ":"))
 
     @property
@@ -200,7 +208,9 @@ class Recipe(Closed):
         return hashlib.sha256(self.canonical_json().encode()).hexdigest()[:16]
 
     def weather_numbers(self) -> dict[str, float]:
-        """Flat numbers for the manifest: without smog its extinction is 0, all else absent is NaN.
+        """Flat numbers for the manifest: NaN where absent.
+
+        Without smog its extinction is 0, and without a style its strength.
 
         flood_turbidity_ntu is the default's where the recipe gives none, and NaN where it gives an
         absorption. flood_wave_height is a factor on a preset's waves, NaN where they are listed.
@@ -217,4 +227,12 @@ class Recipe(Closed):
             "flood_wave_height": math.nan if waves is None else waves.height,
             "snow_depth_m": math.nan if snow is None else snow.depth_m,
             "snow_coverage": math.nan if snow is None else snow.coverage,
+            "style_strength": 0.0 if self.style is None else self.style.strength,
         }
+
+    def style_words(self) -> dict[str, str | None]:
+        """For the manifest: the name of the style's preset or image, and the method; or null."""
+        style = self.style
+        if style is None:
+            return {"style": None, "style_method": None}
+        return {"style": style.name, "style_method": style.method}

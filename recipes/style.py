@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import PurePath
 from typing import Annotated, Literal
 
-from pydantic import ConfigDict, Field, Strict, model_validator
+from pydantic import AfterValidator, ConfigDict, Field, Strict, model_validator
 from pydantic.config import JsonDict
 
-from recipes.types import Closed, Flag, Number
+from recipes.style_presets import no_such_style, style_preset_names
+from recipes.types import Closed, Digest, FilePath, Flag, Number
 
 # In words of JSON Schema: one of the two is present and not null.
 _ONE_SOURCE: JsonDict = {
@@ -16,7 +18,16 @@ _ONE_SOURCE: JsonDict = {
         for name in ("image", "preset")
     ]
 }
-Path = Annotated[str, Strict(), Field(min_length=1, max_length=1024)]
+FILES = ("image", "mask", "checkpoint")  # the fields that name one
+
+
+def _known(name: str) -> str:
+    if name not in style_preset_names():
+        raise ValueError(no_such_style(name))
+    return name
+
+
+StyleName = Annotated[str, Strict(), AfterValidator(_known)]
 
 
 class Style(Closed):
@@ -24,13 +35,13 @@ class Style(Closed):
 
     model_config = ConfigDict(json_schema_extra=_ONE_SOURCE)
 
-    image: Path | None = Field(
-        default=None, description="The style image, a file in the recipe's folder or below it."
+    image: FilePath | None = Field(
+        default=None, description="The picture whose colours the scene takes on."
     )
-    preset: Annotated[str, Strict()] | None = Field(
+    preset: StyleName | None = Field(
         default=None, description="A style that comes with the package, in place of an image."
     )
-    mask: Path | None = Field(
+    mask: FilePath | None = Field(
         default=None,
         description="An image of the style image's shape, white where that shows sky; null to "
         "look for the sky at its top.",
@@ -52,12 +63,11 @@ class Style(Closed):
         default="scene",
         description="scene styles what stands in the weather, picture also the weather itself.",
     )
-    checkpoint: Path | None = Field(
+    checkpoint: FilePath | None = Field(
         default=None,
-        description="A trained network for gscm, in the recipe's folder or below it; null for the "
-        "one that comes with the package.",
+        description="A trained network for gscm; null for the one that comes with the package.",
     )
-    digest: Annotated[str, Strict(), Field(pattern=r"^[0-9a-f]{64}$")] | None = Field(
+    digest: Digest | None = Field(
         default=None,
         description="SHA-256 over what the files above hold; checked where given, worked out "
         "where null.",
@@ -72,6 +82,8 @@ class Style(Closed):
             raise ValueError("mask belongs to an image, and there is none")
         if self.image is None and self.method == "gscm":
             raise ValueError("method gscm looks at an image: give image instead of preset")
+        if self.image is None and self.digest is not None:
+            raise ValueError("digest belongs to an image, and there is none")
         if self.checkpoint is not None and self.method != "gscm":
             raise ValueError(f"checkpoint belongs to method gscm; method is {self.method}")
         if self.method == "gscm" and self.per_region:
@@ -82,3 +94,14 @@ class Style(Closed):
     def changes(self) -> bool:
         """Whether there is any: a style of no strength changes nothing."""
         return self.strength > 0
+
+    @property
+    def name(self) -> str:
+        """Of the preset, or of the image's file without its folders."""
+        return self.preset or PurePath(self.image or "").name
+
+    @property
+    def files(self) -> dict[str, str]:
+        """The files that it names, by field."""
+        named = {name: getattr(self, name) for name in FILES}
+        return {name: path for name, path in named.items() if path is not None}

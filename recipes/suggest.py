@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 
 from recipes.fields import ROOT, SectionSpec, join
+from recipes.nearest import nearest_word
 from recipes.values import RANGE_KINDS
 
 _UNIT = re.compile(
@@ -45,6 +45,21 @@ _SYNONYMS: dict[str, tuple[str, ...]] = {
     "elevation": ("sun_elevation_deg",),
     "elevation_deg": ("sun_elevation_deg",),
     "drifts": ("drift",),
+    "mood": ("style",),
+    "look": ("style",),
+    "photo": ("image",),
+    "picture": ("image",),
+    "file": ("image",),
+    "path": ("image",),
+    "sky_mask": ("mask",),
+    "algorithm": ("method",),
+    "weight": ("strength",),
+    "amount": ("strength",),
+    "intensity": ("strength",),
+    "regions": ("per_region",),
+    "network": ("checkpoint",),
+    "weights": ("checkpoint",),
+    "sha256": ("digest",),
 }
 
 
@@ -63,16 +78,12 @@ def unknown_key(key: str, section: SectionSpec) -> str:
         for other in ROOT.walk()
         if name in other.known and other is not section
     ]
+    below = [place for place in elsewhere if place[0].path.startswith(f"{section.path}.")]
+    elsewhere = below or elsewhere
     if elsewhere:
         places = [join(o.path, name) if o.path else f"{name} at the top" for o, name in elsewhere]
         return f"unknown field here; did you mean {' or '.join(places)}?"
     return f"unknown field; known here: {', '.join(section.known)}"
-
-
-def nearest_word(word: str, words: tuple[str, ...]) -> str | None:
-    """The option that is most like `word`, if any is."""
-    close = difflib.get_close_matches(word.lower(), words, n=1, cutoff=0.6)
-    return close[0] if close else None
 
 
 def _nearest(key: str, section: SectionSpec) -> str | None:

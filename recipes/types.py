@@ -15,6 +15,9 @@ Unit = Annotated[float, Strict(), Field(ge=0.0, le=1.0)]
 Colour = tuple[Unit, Unit, Unit]
 PerMetre = Annotated[float, Strict(), Field(ge=0.0, le=MOST_PER_M)]
 Rates = tuple[PerMetre, PerMetre, PerMetre]
+# In a recipe file a path below its folder; in a recipe in numbers any path.
+FilePath = Annotated[str, Strict(), Field(min_length=1, max_length=4096)]
+Digest = Annotated[str, Strict(), Field(pattern=r"^[0-9a-f]{64}$")]
 
 
 class Closed(BaseModel):
