@@ -1,0 +1,173 @@
+"""A style put on a scene: its colour maps folded into every Gaussian's SH, and into the sky.
+
+A Gaussian's colour is c = 0.5 + sum sh_lm Y_lm(direction), and Y_00 = C0 is constant. So
+c' = M c + b holds in every direction where
+    sh_00' = (M (C0 sh_00 + 0.5) + b - 0.5) / C0 = M sh_00 + (0.5 M 1 + b - 0.5) / C0,
+    sh_lm' = M sh_lm  otherwise.
+Renderers clamp c to >= 0 before they blend, which a map does not commute with: where a colour was
+clamped, or is after it, the picture is not the map of the picture.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from augment.render.sh import SH_C0
+from augment.render.threads import kernel_threads
+from augment.scene import Gaussians, Scene
+from augment.sky import ConstantSky, CubemapSky, LatLongSky, Sky
+from augment.style import sh_kernels
+from augment.style.maps import StyleMaps
+
+BLOCKS = 4  # pieces of work that a thread takes at a time
+
+
+def style_gaussians(
+    gaussians: Gaussians, maps: StyleMaps, *, out: Tensor | None = None, fast: bool = True
+) -> Gaussians:
+    """The same Gaussians with mapped SH; every other tensor is shared, and all of them where no
+    map changes anything.
+
+    out: where the SH are written, contiguous and of their shape and dtype; may be `gaussians.sh`
+    itself. New memory by default, whose first touch takes longer than the arithmetic. fast: float32
+    without gradients goes through the CPU kernel, equal to `map_sh` within float rounding.
+
+    Raises:
+        ValueError: maps by class, and a class that has none; or out does not fit.
+    """
+    sh = gaussians.sh
+    if out is not None:
+        _check_out(out, sh)
+    classes = _rows_of(gaussians, len(maps.splats))
+    folded = fold_maps(maps.splats)
+    if out is None and not bool(_changes(maps.splats).any()):
+        return gaussians
+    tracked = torch.is_grad_enabled() and sh.requires_grad
+    if not fast or tracked or sh.dtype != torch.float32:
+        mapped = map_sh(sh, maps.splats, classes)
+        if out is not None:
+            mapped = out.copy_(mapped)
+        return dataclasses.replace(gaussians, sh=mapped)
+    target = torch.empty(tuple(sh.shape)) if out is None else out
+    # Kernels stream into aligned memory, as torch's own is; a view may begin anywhere.
+    aligned = target.data_ptr() % sh_kernels.ALIGNMENT == 0
+    written = target if aligned else torch.empty(tuple(sh.shape))
+    with kernel_threads(BLOCKS):
+        sh_kernels.map_sh(
+            sh.detach().contiguous().numpy().reshape(-1),
+            written.detach().numpy().reshape(-1),
+            sh.shape[1],
+            np.empty(0, np.int16) if classes is None else classes.contiguous().numpy(),
+            folded.numpy(),
+        )
+    if not aligned:
+        target.copy_(written)
+    return dataclasses.replace(gaussians, sh=target)
+
+
+def map_sh(
+    sh: Float[Tensor, "N K 3"], maps: Float[Tensor, "C 3 4"], classes: Tensor | None = None
+) -> Float[Tensor, "N K 3"]:
+    """The torch definition: SH of the mapped colours. classes [N]: rows of maps; None: the first.
+
+    A map that changes nothing leaves every bit of its splats.
+    """
+    folded = fold_maps(maps, sh.dtype)
+    rows = folded[torch.zeros(len(sh), dtype=torch.long) if classes is None else classes.long()]
+    mapped = torch.einsum("nij,nkj->nki", rows[:, :9].reshape(-1, 3, 3), sh)
+    first = mapped[:, :1] + rows[:, None, 9:12]
+    mapped = torch.cat([first, mapped[:, 1:]], 1)
+    return torch.where(rows[:, 12, None, None] != 0, mapped, sh)
+
+
+def fold_maps(
+    maps: Float[Tensor, "C 3 4"], dtype: torch.dtype = torch.float32
+) -> Float[Tensor, "C 13"]:
+    """Maps of colours as maps of SH: M row by row, what sh_00 gets besides, and 0 where the map
+    changes nothing, else 1. Worked out in float64.
+    """
+    wide = maps.detach().double()
+    matrix, offset = wide[:, :, :3], wide[:, :, 3]
+    first = (0.5 * matrix.sum(2) + offset - 0.5) / SH_C0
+    changes = _changes(maps).double()[:, None]
+    return torch.cat([matrix.reshape(-1, 9), first, changes], 1).to(dtype)
+
+
+def style_sky(sky: Sky, color_map: Float[Tensor, "3 4"]) -> Sky:
+    """The sky with mapped colours, clamped to [0, 1]; the same sky where the map changes nothing.
+
+    Skies made of texels are mapped texel by texel: a map is affine and so is interpolation, so they
+    commute but where the clamp acts.
+    """
+    if not bool(_changes(color_map[None])):
+        return sky
+    if isinstance(sky, ConstantSky):
+        return ConstantSky(_mapped(sky.rgb, color_map))
+    if isinstance(sky, LatLongSky):
+        return LatLongSky(_mapped(sky.image, color_map))
+    if isinstance(sky, CubemapSky):
+        return CubemapSky(_mapped(sky.faces, color_map))
+    return MappedSky(sky, color_map)
+
+
+@dataclass(frozen=True, eq=False)
+class MappedSky:
+    """Any other sky, mapped where it is looked at."""
+
+    sky: Sky
+    color_map: Float[Tensor, "3 4"]
+
+    def sample(self, directions: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3"]:
+        return _mapped(self.sky.sample(directions), self.color_map)
+
+
+def styled_scene(scene: Scene, maps: StyleMaps) -> Scene:
+    """Background, actors and sky mapped; all else is the scene's own."""
+    return dataclasses.replace(
+        scene,
+        background=style_gaussians(scene.background, maps),
+        actors=tuple(
+            dataclasses.replace(actor, gaussians=style_gaussians(actor.gaussians, maps))
+            for actor in scene.actors
+        ),
+        sky=style_sky(scene.sky, maps.sky),
+    )
+
+
+def _mapped(rgb: Tensor, color_map: Tensor) -> Tensor:
+    color_map = color_map.to(rgb.dtype)
+    return (rgb @ color_map[:, :3].T + color_map[:, 3]).clamp(0, 1)
+
+
+def _changes(maps: Tensor) -> Tensor:
+    """bool [C]: whether each map is anything else than the identity."""
+    return (maps != torch.eye(3, 4, dtype=maps.dtype)).flatten(1).any(1)
+
+
+def _rows_of(gaussians: Gaussians, count: int) -> Tensor | None:
+    """Every Gaussian's row among the maps; None where all take the first."""
+    classes = gaussians.semantic
+    if count == 1 or classes is None or not len(classes):
+        return None
+    values = classes.numpy()
+    low, high = int(values.min()), int(values.max())
+    if low < 0 or high >= count:
+        raise ValueError(
+            f"the style has maps for classes 0 to {count - 1}; the Gaussians' classes are "
+            f"{low} to {high}"
+        )
+    return classes
+
+
+def _check_out(out: Tensor, sh: Tensor) -> None:
+    if tuple(out.shape) != tuple(sh.shape) or out.dtype != sh.dtype or not out.is_contiguous():
+        raise ValueError(
+            f"out must be contiguous {sh.dtype} {list(sh.shape)}, as the SH; got "
+            f"{'' if out.is_contiguous() else 'strided '}{out.dtype} {list(out.shape)}"
+        )

@@ -1,0 +1,134 @@
+"""From a recipe's style to the maps of a scene: the one place that knows all the methods."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from weakref import WeakKeyDictionary
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from augment.cameras import Camera
+from augment.errors import StyleError
+from augment.scene import Scene
+from augment.style.closed_form import LAND_LIMITS, closed_maps
+from augment.style.content import content_key, content_pictures, content_statistics
+from augment.style.images import StyleImage, image_statistics, read_style_image
+from augment.style.maps import StyleMaps, identity_map, with_strength
+from augment.style.statistics import Statistics
+from recipes.style import Style
+
+MOST_REMEMBERED = 8  # styles of a scene
+
+_remembered: WeakKeyDictionary[Scene, dict[tuple, StyleMaps]] = WeakKeyDictionary()
+_given: WeakKeyDictionary[Scene, dict[Style, StyleMaps]] = WeakKeyDictionary()
+
+
+def style_maps(scene: Scene, style: Style, *, cameras: Sequence[Camera] | None = None) -> StyleMaps:
+    """The maps that give the scene the style's colours, float32; identities at strength 0.
+
+    style: image, mask and checkpoint are paths that can be opened as they are. Its applied_to says
+    which of the maps are wanted, and changes none. cameras: those that the scene will be seen by;
+    None for all of its own. The last few are remembered for as long as the scene lives, with what
+    their files held when they were first read. `remember_maps` overrides all of this.
+
+    Raises:
+        StyleError: an image, a preset or a checkpoint cannot be used.
+    """
+    if not style.changes:
+        return identity_maps()
+    given = _given.get(scene, {}).get(style)
+    if given is not None:
+        return given
+    key = (style, content_key(scene, cameras))
+    known = _remembered.setdefault(scene, {})
+    if key not in known:
+        maps = _find_maps(scene, style, cameras)
+        while len(known) >= MOST_REMEMBERED:
+            del known[next(iter(known))]
+        known[key] = maps
+    return known[key]
+
+
+def remember_maps(scene: Scene, style: Style, maps: StyleMaps) -> None:
+    """Make `style_maps` give these maps for the scene and the style from now on, whatever the
+    cameras.
+    """
+    given = _given.setdefault(scene, {})
+    while len(given) >= MOST_REMEMBERED:
+        del given[next(iter(given))]
+    given[style] = maps
+
+
+def identity_maps() -> StyleMaps:
+    """One map for all, which changes nothing."""
+    return StyleMaps(identity_map()[None], identity_map(), identity_map())
+
+
+def _find_maps(scene: Scene, style: Style, cameras: Sequence[Camera] | None) -> StyleMaps:
+    if style.method == "gscm":
+        found = _network_map(scene, style, cameras)
+        return StyleMaps(found[None], found, found)
+    return closed_maps(
+        content_statistics(scene, cameras, per_region=style.per_region),
+        _style_statistics(style),
+        method=style.method,
+        strength=style.strength,
+        per_region=style.per_region,
+    )
+
+
+def _style_statistics(style: Style) -> Statistics:
+    if style.preset is not None:
+        from augment.style.presets import preset_statistics
+
+        return preset_statistics(style.preset)
+    return image_statistics(_style_image(style))
+
+
+def _style_image(style: Style) -> StyleImage:
+    assert style.image is not None
+    mask = None if style.mask is None else Path(style.mask)
+    return read_style_image(Path(style.image), mask)
+
+
+def _network_map(
+    scene: Scene, style: Style, cameras: Sequence[Camera] | None
+) -> Float[Tensor, "3 4"]:
+    from augment.style.checkpoint import load_network
+    from augment.style.network import gscm_map
+
+    picture = _style_picture(_style_image(style))
+    net = load_network(None if style.checkpoint is None else Path(style.checkpoint))
+    content = content_pictures(scene, cameras)
+    found = gscm_map(net, content, picture).double()
+    if not bool(torch.isfinite(found).all()):
+        raise StyleError(
+            f"the network gives no finite map for style image {style.image}: {found.tolist()}; "
+            f"use another checkpoint, or method mkl"
+        )
+    stronger = with_strength(found, style.strength)
+    return _limited(stronger, content.double().mean((0, 2, 3))).float()
+
+
+def _style_picture(image: StyleImage) -> Float[Tensor, "1 3 256 256"]:
+    """The style image squeezed to a square; what does not count has the others' mean colour."""
+    rgb, weights = torch.from_numpy(image.rgb), torch.from_numpy(image.weights)[..., None]
+    mean = (rgb * weights).sum((0, 1), dtype=torch.float64) / weights.sum(dtype=torch.float64)
+    filled = rgb * weights + mean.float() * (1 - weights)
+    square = torch.nn.functional.interpolate(
+        filled.permute(2, 0, 1)[None], size=(256, 256), mode="bilinear", antialias=True
+    )
+    return square.clamp(0, 1)
+
+
+def _limited(color_map: Float[Tensor, "3 4"], mean: Float[Tensor, "3"]) -> Float[Tensor, "3 4"]:
+    """The map with no gain above that of the closed forms; the mean colour goes where it went."""
+    matrix, offset = color_map[:, :3], color_map[:, 3]
+    u, gains, v = torch.linalg.svd(matrix)
+    if float(gains.max()) <= LAND_LIMITS.most_gain:
+        return color_map
+    tamed = u @ torch.diag(gains.clamp(max=LAND_LIMITS.most_gain)) @ v
+    return torch.cat([tamed, (offset + (matrix - tamed) @ mean)[:, None]], 1)
