@@ -27,7 +27,8 @@ def dump_recipe(recipe: Recipe) -> str:
     """YAML with every field written out, defaults included, and the hash in a comment.
 
     `parse_recipe(dump_recipe(r), ...).resolve(0)` equals r: floats keep all their bits, and the
-    variant's number is kept.
+    variant's number is kept. Paths of files are written as they are, and a recipe file names files
+    from its own folder only: give them such names first, as a job does.
     """
     body = yaml.dump(recipe.model_dump(), Dumper=_Dumper, sort_keys=False, allow_unicode=False)
     return f"# A recipe in numbers, hash {recipe.hash}.\n{body}"

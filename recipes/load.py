@@ -19,16 +19,18 @@ def load_recipe(path_or_preset_name: str | Path) -> RecipeTemplate:
 
     A text that names a preset is the preset, even where a file is called the same (write ./NAME for
     the file); anything else, and every Path, is a file. A file's stem is the recipe's name unless
-    the file gives one.
+    the file gives one. Files that it names lie in its folder or below it.
 
     Raises:
-        RecipeError: there is no such file or preset, or it holds no valid recipe.
+        RecipeError: there is no such file or preset, it holds no valid recipe, or it names a
+            file that cannot be read.
     """
     if isinstance(path_or_preset_name, str) and path_or_preset_name in preset_names():
         return _load_preset(path_or_preset_name)
     path = Path(path_or_preset_name)
     source = str(path_or_preset_name)
-    return parse_recipe(_decode(_read(path, source), source), source=source, name=path.stem)
+    text = _decode(_read(path, source), source)
+    return parse_recipe(text, source=source, name=path.stem, folder=path.parent)
 
 
 def preset_names() -> tuple[str, ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from pathlib import Path
 from typing import Any
 
 from recipes.errors import Problems, short
@@ -19,11 +20,14 @@ from recipes.yaml_tree import EMPTY, ListNode, MapNode, Node, ScalarNode, read_t
 _LOG = logging.getLogger(__name__)
 
 
-def parse_recipe(text: str, *, source: str, name: str | None = None) -> RecipeTemplate:
+def parse_recipe(
+    text: str, *, source: str, name: str | None = None, folder: Path | None = None
+) -> RecipeTemplate:
     """The template in YAML `text`.
 
     source: stands before the line number in messages. name: the recipe's name where the text gives
-    none; the schema's default without it.
+    none; the schema's default without it. folder: where the files that the text names lie; without
+    it, it can name none.
 
     Raises:
         RecipeError: anything is wrong with the text; one line for each problem.
@@ -35,7 +39,7 @@ def parse_recipe(text: str, *, source: str, name: str | None = None) -> RecipeTe
     if not isinstance(tree, MapNode):
         raise problems.fail(tree.line, f"a recipe is a mapping of fields; got {show(tree)}")
     _check_version(tree, problems)
-    return _Compiler(problems).template(tree, source, name)
+    return _Compiler(problems, folder).template(tree, source, name)
 
 
 def _check_version(tree: MapNode, problems: Problems) -> None:
@@ -51,9 +55,9 @@ def _check_version(tree: MapNode, problems: Problems) -> None:
 
 
 class _Compiler:
-    def __init__(self, problems: Problems) -> None:
-        self._problems = problems
-        self._parser = ValueParser(problems)
+    def __init__(self, problems: Problems, folder: Path | None) -> None:
+        self._problems, self._folder = problems, folder
+        self._parser = ValueParser(problems, folder)
         self._values: dict[str, Value] = {}
         self._effects: dict[str, float] = {}
         self._lists: dict[str, int] = {}
@@ -91,6 +95,7 @@ class _Compiler:
             values=tuple(self._values.items()),
             effects=tuple(self._effects.items()),
             lists=tuple(self._lists.items()),
+            folder=self._folder,
         )
 
     def _take(self, key: str, absent: str | None = None) -> Any:
@@ -130,7 +135,7 @@ class _Compiler:
             if field.required and name not in node.entries:
                 self._problems.add(line, f"{join(path, name)}: must be given, {field.allowed()}")
         if path and len(self._problems) == found_before:
-            for text in broken_rules(spec.model, given):
+            for text in broken_rules(spec, given):
                 self._problems.add(line, f"{path}: {text}")
         return given
 

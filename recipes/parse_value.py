@@ -6,8 +6,11 @@ A range is a mapping: {uniform: [a, b]}, {log_uniform: [a, b]}, {normal: {mean, 
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from recipes.errors import Problems, short
 from recipes.fields import ANY_NUMBER, FieldSpec, Kind
+from recipes.files import file_below
 from recipes.hints import hint, show, which_range
 from recipes.values import (
     RANGE_KINDS,
@@ -31,11 +34,12 @@ MAX_STD_PER_WIDTH = 1000  # a wider normal is uniform for all purposes, and lose
 class ValueParser:
     """Turns the node of a field into its Value.
 
-    Every method returns None where something is wrong, which it has added to the problems.
+    Every method returns None where something is wrong, which it has added to the problems. folder:
+    where the files that the recipe names lie; None for a text that comes from no file.
     """
 
-    def __init__(self, problems: Problems) -> None:
-        self._problems = problems
+    def __init__(self, problems: Problems, folder: Path | None = None) -> None:
+        self._problems, self._folder = problems, folder
 
     def parse(self, node: Node, spec: FieldSpec, path: str) -> Value | None:
         """The value of a field that may have a range."""
@@ -52,13 +56,26 @@ class ValueParser:
         if not isinstance(node, ScalarNode):
             return self._bad(node, path, f"must be {spec.allowed()}")
         value = node.value
-        if spec.kind is Kind.TEXT and value is not None:
+        if spec.kind.is_text and value is not None:
             value = node.text  # a name may look like a number
         if not spec.accepts(value):
             return self._bad(node, path, f"must be {spec.allowed(value)}{hint(node, spec)}")
+        if spec.kind is Kind.PATH and value is not None:
+            return self._file(node, path)
         if spec.kind is Kind.NUMBER and value is not None:
             return Fixed(float(as_number(value)))
         return Fixed(value)
+
+    def _file(self, node: ScalarNode, path: str) -> Fixed | None:
+        """The name of a file as it is written, where that file can be read."""
+        if self._folder is None:
+            text = "this text is in no file, so there is no folder to look in; save it as one"
+            return self._bad(node, path, text)
+        try:
+            file_below(self._folder, node.text)
+        except ValueError as error:
+            return self._bad(node, path, str(error))
+        return Fixed(node.text)
 
     def _bad(self, node: Node, path: str, text: str) -> None:
         self._problems.add(node.line, f"{path} = {show(node)}: {text}")

@@ -7,8 +7,9 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from pydantic import BaseModel, ValidationError
+from pydantic import ValidationError
 
+from recipes.fields import SectionSpec
 from recipes.template import readable
 from recipes.values import Plain, Value, is_number, words
 
@@ -38,14 +39,15 @@ class Items:
         return (low, high)
 
 
-def broken_rules(model: type[BaseModel], given: Mapping[str, Value | Items]) -> Iterator[str]:
-    """What the model says against any combination of the ranges' ends, each text once."""
+def broken_rules(spec: SectionSpec, given: Mapping[str, Value | Items]) -> Iterator[str]:
+    """What the section's model says against any combination of the ranges' ends, each text once."""
     said: set[str] = set()
-    corners = {name: _ends(value) for name, value in given.items()}
+    free = {name for name, field in spec.fields.items() if field.kind.is_text}
+    corners = {name: _ends(value, name in free) for name, value in given.items()}
     for combination in itertools.product(*corners.values()):
         corner = dict(zip(corners, combination, strict=True))
         try:
-            model.model_validate(corner)
+            spec.model.model_validate(corner)
         except ValidationError as error:
             ranged = [name for name, value in given.items() if value.is_range]
             drawn = [_drawn(name, given[name], corner[name]) for name in ranged]
@@ -63,11 +65,11 @@ def _drawn(name: str, value: Value | Items, end: Any) -> str:
     return f"{name} = {words(end)}"
 
 
-def _ends(value: Value | Items) -> list[Any]:
+def _ends(value: Value | Items, is_free_text: bool) -> list[Any]:
     """What a rule between fields can depend on: the extreme numbers, null, and every word.
 
     A handful, so that the product over a section's fields stays in the hundreds. No rule compares
-    colours or rates, so one stands for all.
+    colours, rates or names of files, so one stands for all.
     """
     if isinstance(value, Items):
         return list(value.ends())
@@ -75,6 +77,8 @@ def _ends(value: Value | Items) -> list[Any]:
     numbers = [p for p in probes if is_number(p)]
     triples = [p for p in probes if isinstance(p, tuple)]
     others = [p for p in probes if p is None or isinstance(p, str | bool)]
+    if is_free_text:
+        others = [p for p in others if p is None] + [p for p in others if p is not None][:1]
     ends: list[Plain] = [min(numbers), max(numbers)] if numbers else []
     return list(dict.fromkeys([*ends, *triples[:1], *others]))
 

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
 
 from recipes.errors import RecipeError
 from recipes.fields import ROOT
+from recipes.files import file_below, with_digest
 from recipes.sampler import Draws
 from recipes.schema import VERSION, Recipe
+from recipes.style import FILES
 from recipes.values import Value
 
 _INDEX = re.compile(r"\[[0-9]+\]")
@@ -25,7 +28,7 @@ class RecipeTemplate:
     many recipes a run draws from it; first_variant: the number of the first. values: dotted path ->
     how the field gets its value, for the fields that the file gives. effects: dotted path -> the
     share of variants that have it, for the effects that the file names. lists: dotted path -> how
-    many items, for the lists that the file gives.
+    many items, for the lists that the file gives. folder: where the files lie that values name.
     """
 
     name: str
@@ -36,16 +39,19 @@ class RecipeTemplate:
     values: tuple[tuple[str, Value], ...] = ()
     effects: tuple[tuple[str, float], ...] = ()
     lists: tuple[tuple[str, int], ...] = ()
+    folder: Path | None = None
 
     def resolve(self, variant: int) -> Recipe:
         """The recipe number `variant`, counted from 0.
 
         Its numbers depend on the seed, on first_variant + variant and on each field's own path
         only: not on other fields, other variants, or what was resolved before. So there is no end
-        to the variants; `variants` says how many a run draws.
+        to the variants; `variants` says how many a run draws. Files that it names are found and
+        read: the recipe has their absolute paths, and a digest of what they hold.
 
         Raises:
-            RecipeError: variant is negative or too large, or what was drawn breaks a rule.
+            RecipeError: variant is negative or too large, what was drawn breaks a rule, or a file
+                cannot be read or is not the one of which the recipe gives the digest.
         """
         number = self.first_variant + variant
         if variant < 0 or not ROOT.fields["variant"].accepts(number):
@@ -70,11 +76,27 @@ class RecipeTemplate:
         for path, value in self.values:
             if not path.startswith(tuple(off)):
                 _put(data, path, value.draw(draws, path))
+        where = f"{self.source}: variant {number}"
+        self._find_files(data.get("style"), where)
         try:
-            return Recipe.model_validate(data)
+            return with_digest(Recipe.model_validate(data))
         except ValidationError as error:
-            lines = [f"{self.source}: variant {number}: {text}" for text in readable(error)]
-            raise RecipeError(*lines) from None
+            raise RecipeError(*(f"{where}: {text}" for text in readable(error))) from None
+        except RecipeError as error:
+            raise RecipeError(f"{self.source}: {error}") from None
+
+    def _find_files(self, style: dict[str, Any] | None, where: str) -> None:
+        """Replace the names of files by absolute paths."""
+        for name in FILES:
+            written = (style or {}).get(name)
+            if style is None or written is None:
+                continue
+            try:
+                if self.folder is None:
+                    raise ValueError("the recipe is in no folder to look in")
+                style[name] = str(file_below(self.folder, written))
+            except ValueError as error:
+                raise RecipeError(f"{where}: style.{name} = {written!r}: {error}") from None
 
     def describe_ranges(self) -> dict[str, str]:
         """Dotted path -> its range in words, with the unit; only what differs between variants."""

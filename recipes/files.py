@@ -1,0 +1,163 @@
+"""The files that a recipe's style names: where they may lie, and the digest of what they hold.
+
+A recipe file names them from its own folder, and none outside of it: a recipe from elsewhere reads
+no other files. A recipe in numbers holds their paths and, in `style.digest`, what stands for their
+contents; the paths are no part of its hash.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import stat
+from collections.abc import Mapping
+from io import BufferedReader
+from pathlib import Path, PurePosixPath, PureWindowsPath
+
+from recipes.errors import RecipeError, short
+from recipes.nearest import nearest_word
+from recipes.schema import Recipe
+from recipes.style import FILES, Style
+
+MAX_MIB = 512  # of one file
+MOST_NAMES = 1000  # of files in a folder, to guess a misspelt one from
+
+
+def with_digest(recipe: Recipe) -> Recipe:
+    """The recipe with the digest of its style's files; the same object where there is none.
+
+    Raises:
+        RecipeError: a file is missing, unreadable or too large, or the recipe has a digest already
+            and the files have changed since.
+    """
+    style = recipe.style
+    if style is None or not style.files:
+        return recipe
+    try:
+        digest = _checked(style, {name: _hash(name, path) for name, path in style.files.items()})
+    except ValueError as error:
+        raise RecipeError(f"recipe {recipe.name}, variant {recipe.variant}: {error}") from None
+    return recipe.model_copy(update={"style": style.model_copy(update={"digest": digest})})
+
+
+def read_files(style: Style) -> dict[str, bytes]:
+    """What the style's files hold, by field: that of which it has the digest, where it has one.
+
+    Raises:
+        RecipeError: a file is missing, unreadable or too large, or they have changed.
+    """
+    contents = {}
+    try:
+        for name, path in style.files.items():
+            with _open(name, path) as file:
+                contents[name] = file.read()
+        _checked(style, {name: hashlib.sha256(data).hexdigest() for name, data in contents.items()})
+    except (ValueError, OSError) as error:
+        raise RecipeError(str(error)) from None
+    return contents
+
+
+def digest_of(hashes: Mapping[str, str]) -> str:
+    """One digest for all files. hashes: the SHA-256 of each, in hexadecimal, by field.
+
+    The SHA-256 of a line `FIELD HASH` for each file, in the order image, mask, checkpoint.
+    """
+    lines = [f"{name} {hashes[name]}\n" for name in FILES if name in hashes]
+    return hashlib.sha256("".join(lines).encode()).hexdigest()
+
+
+def file_below(folder: Path, written: str) -> Path:
+    """The file that a recipe in `folder` names, as an absolute path.
+
+    Raises:
+        ValueError: it leads out of the folder, or is no file that can be read.
+    """
+    where = short(str(folder.absolute()), 200)
+    aside = f"put the file beside the recipe, in {where} or below it"
+    if PureWindowsPath(written).anchor:
+        raise ValueError(f"must be a path from the recipe's folder; {aside}")
+    if "\\" in written:
+        raise ValueError("must have / between folders, on every system")
+    depth = 0
+    for part in PurePosixPath(written).parts:
+        depth += -1 if part == ".." else 1
+        if depth < 0:
+            raise ValueError(f"leads out of the recipe's folder; {aside}")
+    path = folder.absolute() / written
+    try:
+        real = path.resolve()
+        is_inside = real.is_relative_to(folder.resolve())
+    except (OSError, RuntimeError, ValueError) as error:  # a circle of links; no possible name
+        raise ValueError(f"cannot be found: {short(str(error), 200)}") from None
+    if not is_inside:
+        target = short(str(real), 200)
+        raise ValueError(f"leads through a link to {target}, out of the recipe's folder; {aside}")
+    try:
+        check_file(path)
+    except FileNotFoundError:
+        raise ValueError(f"there is no such file in {where}{_near(path)}") from None
+    return path
+
+
+def check_file(path: Path) -> None:
+    """Raise ValueError unless the file can be read and is not too large.
+
+    Raises:
+        FileNotFoundError: there is none. ValueError: it cannot be read; says why.
+    """
+    try:
+        status = path.stat()
+        if stat.S_ISDIR(status.st_mode):
+            raise ValueError("is a folder, not a file")
+        if not stat.S_ISREG(status.st_mode):  # to open a pipe might wait for ever
+            raise ValueError("is no regular file")
+        path.open("rb").close()
+    except (FileNotFoundError, NotADirectoryError):
+        raise FileNotFoundError(str(path)) from None
+    except OSError as error:
+        raise ValueError(f"cannot be read: {error.strerror}") from None
+    if status.st_size > MAX_MIB * 2**20:
+        mib = status.st_size / 2**20
+        raise ValueError(f"holds {mib:.0f} MiB, more than the {MAX_MIB} MiB that are read")
+
+
+def _open(name: str, path: str) -> BufferedReader:
+    shown = f"style.{name} = {path!r}"
+    try:
+        check_file(Path(path))
+        return Path(path).open("rb")
+    except FileNotFoundError:
+        raise ValueError(f"{shown}: there is no such file") from None
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{shown}: {error}") from None
+
+
+def _hash(name: str, path: str) -> str:
+    with _open(name, path) as file:
+        try:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+        except OSError as error:
+            raise ValueError(f"style.{name} = {path!r}: cannot be read: {error}") from None
+
+
+def _checked(style: Style, hashes: Mapping[str, str]) -> str:
+    digest = digest_of(hashes)
+    if style.digest not in (None, digest):
+        paths = ", ".join(style.files.values())
+        which = "the file has" if len(hashes) == 1 else "one of the files has"
+        raise ValueError(
+            f"style.digest = '{style.digest}': {which} changed since: {paths} now "
+            f"gives {digest}; bring back what was there, or remove the digest to take what is"
+        )
+    return digest
+
+
+def _near(path: Path) -> str:
+    """What of the folder may have been meant."""
+    try:
+        with os.scandir(path.parent) as entries:
+            names = [entry.name for entry, _ in zip(entries, range(MOST_NAMES), strict=False)]
+    except OSError:
+        return ""
+    near = nearest_word(path.name, tuple(sorted(names)))
+    return f"; did you mean {short(near)}?" if near else ""
