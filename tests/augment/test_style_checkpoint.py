@@ -1,0 +1,140 @@
+"""Style networks in files: what goes in comes out, and nothing else is taken for a network."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from augment.errors import StyleError
+from augment.style.checkpoint import METADATA_KEY, load_network, network_facts, save_network
+from augment.style.network import Gscm
+
+
+def different(**options) -> Gscm:
+    net = Gscm(**options)
+    generator = torch.Generator().manual_seed(3)
+    with torch.no_grad():
+        for value in net.parameters():
+            value.add_(torch.randn(value.shape, generator=generator) * 0.05)
+    return net
+
+
+@pytest.mark.parametrize("options", [{}, {"offset": False, "k": 5}, {"moments": False}])
+def test_round_trip(options, tmp_path):
+    path, net = tmp_path / "deep" / "net.safetensors", different(**options)
+    save_network(path, net, {"steps": 12, "licences": ["CC0"]})
+    found = load_network(path)
+    assert not found.training
+    assert (found.k, found.offset, found.moments) == (net.k, net.offset, net.moments)
+    own, read = net.state_dict(), found.state_dict()
+    assert own.keys() == read.keys() and all(torch.equal(own[name], read[name]) for name in own)
+    assert network_facts(path)["about"] == {"steps": 12, "licences": ["CC0"]}
+
+
+def test_half_precision_is_half_the_size_and_read_as_float32(tmp_path):
+    full, half, net = tmp_path / "full.safetensors", tmp_path / "half.safetensors", different()
+    save_network(full, net, {})
+    save_network(half, net, {}, half_precision=True)
+    assert half.stat().st_size < 0.55 * full.stat().st_size
+    found = load_network(half).state_dict()
+    for name, value in net.state_dict().items():
+        assert found[name].dtype == value.dtype
+        torch.testing.assert_close(found[name], value, atol=1e-4, rtol=1e-3)
+
+
+def test_no_weight_that_is_not_finite_is_written(tmp_path):
+    net = Gscm()
+    with torch.no_grad():
+        net.head.bias[0] = float("nan")
+    with pytest.raises(StyleError, match=r"'head.bias' is not finite"):
+        save_network(tmp_path / "net.safetensors", net, {})
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    path = tmp_path_factory.mktemp("net") / "net.safetensors"
+    save_network(path, Gscm(), {})
+    return path
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"format": 2}, "format must be 1; got 2"),
+        ({"encoder": "vgg"}, "encoder must be one of"),
+        ({"encoder": 3}, "'encoder' must be of type str; got 3"),
+        ({"k": True}, "'k' must be of type int; got True"),
+        ({"k": 100000}, "k must be 4 to 256"),
+        ({"k": 8}, "must be .*; got"),
+        ({"offset": False}, "must be .*; got"),
+        ({"offset": None}, "'offset' must be of type bool; got None"),
+        ({"size": 128}, "size 256; got 16 and 128"),
+    ],
+)
+def test_a_header_that_lies(written, change, message, tmp_path):
+    header = network_facts(written) | change
+    path = tmp_path / "net.safetensors"
+    save_file(load_file(written), path, {METADATA_KEY: json.dumps(header)})
+    with pytest.raises(StyleError, match=message) as caught:
+        load_network(path)
+    assert str(path) in str(caught.value)
+
+
+def without_one(tensors):
+    del tensors["head.bias"]
+
+
+def with_one_more(tensors):
+    tensors["more"] = torch.zeros(1)
+
+
+def with_nan(tensors):
+    tensors["head.bias"] = torch.full_like(tensors["head.bias"], float("nan"))
+
+
+def with_whole_numbers(tensors):
+    tensors["head.bias"] = tensors["head.bias"].int()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (without_one, r"missing \['head.bias'\]"),
+        (with_one_more, r"unknown \['more'\]"),
+        (with_nan, "not finite"),
+        (with_whole_numbers, "torch.int32"),
+    ],
+)
+def test_tensors_of_another_network(written, change, message, tmp_path):
+    tensors, path = load_file(written), tmp_path / "net.safetensors"
+    change(tensors)
+    save_file(tensors, path, {METADATA_KEY: json.dumps(network_facts(written))})
+    with pytest.raises(StyleError, match=message):
+        load_network(path)
+
+
+@pytest.mark.parametrize("text", ["[]", "{", "3"])
+def test_metadata_that_is_no_object(text, tmp_path):
+    path = tmp_path / "net.safetensors"
+    save_file({"a": torch.zeros(1)}, path, {METADATA_KEY: text})
+    with pytest.raises(StyleError, match=r"JSON|object"):
+        load_network(path)
+
+
+def test_other_files(tmp_path, written):
+    path = tmp_path / "net.safetensors"
+    with pytest.raises(StyleError, match="cannot be read"):
+        load_network(path)
+    for content in (b"", b"no tensors at all", written.read_bytes()[:-100]):
+        path.write_bytes(content)
+        with pytest.raises(StyleError, match="cannot be read"):
+            load_network(path)
+    save_file({"a": torch.zeros(1)}, path)
+    with pytest.raises(StyleError, match=r"no 'climategs.gscm'"):
+        load_network(path)
+    with pytest.raises(StyleError, match="climategs style train"):
+        load_network(tmp_path)

@@ -1,0 +1,232 @@
+"""GSCM: two linear stages that fold, start at the transport of colour moments, and train."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from augment.errors import StyleError
+from augment.style.encoder import B0Encoder, load_imagenet_weights
+from augment.style.moments import FLOOR_STD, image_moments
+from augment.style.network import Gscm, apply_map, compose, gscm_map
+
+
+def pictures(count: int, seed: int = 0, px: int = 256) -> torch.Tensor:
+    """Smooth pictures of different colour moments."""
+    generator = torch.Generator().manual_seed(seed)
+    rough = torch.rand((count, 3, 5, 5), generator=generator)
+    scale = 0.3 + 0.7 * torch.rand((count, 3, 1, 1), generator=generator)
+    smooth = torch.nn.functional.interpolate(rough, (px, px), mode="bilinear")
+    return (smooth * scale).clamp(0, 1)
+
+
+def trained(encoder: str = "small", **options) -> Gscm:
+    """A network whose every weight is away from its start."""
+    net = Gscm(encoder, **options)
+    generator = torch.Generator().manual_seed(1)
+    with torch.no_grad():
+        for value in (*net.head.parameters(), net.content_p, net.content_q, net.style_p):
+            value.add_(0.05 * torch.randn(value.shape, generator=generator))
+    return net.eval()
+
+
+@pytest.mark.parametrize("offset", [True, False])
+@pytest.mark.parametrize("moments", [True, False])
+def test_folded_is_factor_by_factor(offset, moments):
+    net = trained(offset=offset, moments=moments)
+    f_c, f_s = net.encode(pictures(2))
+    colors = torch.rand(2, 40, 3, generator=torch.Generator().manual_seed(2))
+    folded = apply_map(compose(net.style_map(f_s), net.content_map(f_c)), colors)
+    # 1e-5: the sums of float32 products of values near 1, in two orders.
+    torch.testing.assert_close(folded, net.apply_factors(f_c, f_s, colors), atol=1e-5, rtol=1e-5)
+
+
+def test_without_offset_every_map_is_3x3():
+    net = trained(offset=False)
+    f_c, f_s = net.encode(pictures(2))
+    for maps in (net.content_map(f_c), net.style_map(f_s)):
+        assert maps.shape == (2, 3, 4)
+        assert (maps[..., 3] == 0).all()
+    assert net.content_p.shape == (3, 16) and net.content_q.shape == (16, 3)
+    assert Gscm(offset=True).content_p.shape == (4, 16)
+
+
+@pytest.mark.parametrize("offset", [True, False])
+@pytest.mark.parametrize("moments", [True, False])
+def test_untrained_leaves_a_picture_in_its_own_style(offset, moments):
+    image = pictures(1)
+    found = gscm_map(Gscm(offset=offset, moments=moments), image, image)
+    torch.testing.assert_close(found, torch.eye(3, 4), atol=1e-4, rtol=0)
+
+
+def test_untrained_carries_moments_from_content_to_style():
+    content, style = pictures(2, seed=4).split(1)
+    mapped = apply_map(gscm_map(Gscm(), content, style)[None], content.permute(0, 2, 3, 1))
+    got, wanted = (image.reshape(-1, 3).T for image in (mapped, style.permute(0, 2, 3, 1)))
+    torch.testing.assert_close(got.mean(1), wanted.mean(1), atol=1e-3, rtol=0)
+    # Up to the floor of the covariances.
+    torch.testing.assert_close(torch.cov(got), torch.cov(wanted), atol=4 * FLOOR_STD**2, rtol=0.03)
+
+
+@pytest.mark.parametrize(
+    "image",
+    [
+        torch.zeros(1, 3, 256, 256),
+        torch.ones(1, 3, 256, 256),
+        torch.tensor([1.0, 0.0, 0.0])[None, :, None, None].expand(1, 3, 256, 256),
+        pictures(1)[:, :1].expand(1, 3, 256, 256),
+    ],
+    ids=["black", "white", "red", "grey"],
+)
+def test_plain_pictures_give_finite_maps_of_bounded_gain(image):
+    net = trained()
+    for content, style in ((image, pictures(1)), (pictures(1), image), (image, image)):
+        found = gscm_map(net, content, style)
+        assert torch.isfinite(found).all()
+        assert torch.linalg.matrix_norm(found[:, :3], 2) < 0.6 / FLOOR_STD
+
+
+def test_a_map_of_maps():
+    first, second = torch.rand(2, 5, 3, 4).unbind(0)
+    colors = torch.rand(5, 2, 3, 3)
+    torch.testing.assert_close(
+        apply_map(compose(second, first), colors), apply_map(second, apply_map(first, colors))
+    )
+
+
+def test_bits_do_not_depend_on_threads_and_threads_come_back():
+    net, content, style = trained(), pictures(3, seed=5), pictures(1, seed=6)
+    before = torch.get_num_threads()
+    net.train()
+    found = []
+    try:
+        for threads in (1, 2):
+            torch.set_num_threads(threads)
+            found.append(gscm_map(net, content, style))
+            assert torch.get_num_threads() == threads
+    finally:
+        torch.set_num_threads(before)
+    assert torch.equal(*found)
+    assert net.training
+
+
+def test_every_weight_is_trained():
+    net = trained()
+    content, style = pictures(2, seed=7, px=64), pictures(2, seed=8, px=64)
+    f_c, _ = net.encode(content)
+    _, f_s = net.encode(style)
+    maps = compose(net.style_map(f_s), net.content_map(f_c))
+    maps.square().sum().backward()
+    for name, value in net.named_parameters():
+        assert value.grad is not None and value.grad.abs().sum() > 0, name
+
+
+def test_moments_maps_are_inverses_and_symmetric():
+    for offset in (True, False):
+        found = image_moments(pictures(3), offset=offset)
+        size = 4 if offset else 3
+        both = found.restore @ found.normalise
+        torch.testing.assert_close(both, torch.eye(size).expand(3, -1, -1), atol=1e-4, rtol=0)
+        matrix = found.normalise[:, :3, :3]
+        torch.testing.assert_close(matrix, matrix.transpose(1, 2), atol=1e-4, rtol=1e-4)
+
+
+def test_small_encoder_is_small():
+    assert sum(value.numel() for value in Gscm().parameters()) < 500_000
+
+
+def test_bad_arguments():
+    with pytest.raises(ValueError, match="k must be at least 4"):
+        Gscm(k=3)
+    with pytest.raises(ValueError, match="small, b0; got 'vgg'"):
+        Gscm("vgg")
+
+
+def test_without_monai_the_extra_is_named(monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "monai.networks.nets.efficientnet", None)
+    with pytest.raises(StyleError, match=r"climategs\[efficientnet\]"):
+        Gscm("b0")
+
+
+@pytest.fixture(scope="module")
+def b0() -> B0Encoder:
+    pytest.importorskip("monai")
+    return B0Encoder().eval()
+
+
+def torchvision_names(state):
+    """MONAI's state under torchvision's names, built by order: both list layers as they run."""
+    stages = [1, 2, 2, 3, 3, 4, 1]
+    values = [(n.rsplit(".", 1)[1], v) for n, v in state.items()]
+    ends = iter(values)
+    norm = ["weight", "bias", "running_mean", "running_var", "num_batches_tracked"]
+    names: dict[str, torch.Tensor] = {}
+
+    def take(prefix, parts):
+        for part in parts:
+            end, value = next(ends)
+            assert end == part
+            names[f"{prefix}.{part}"] = value
+
+    take("features.0.0", ["weight"])
+    take("features.0.1", norm)
+    for stage, blocks in enumerate(stages, 1):
+        for block in range(blocks):
+            inner = f"features.{stage}.{block}.block"
+            layers = ["conv"] * (stage > 1) + ["conv", "squeeze", "conv"]
+            for index, layer in enumerate(layers):
+                if layer == "squeeze":
+                    take(f"{inner}.{index}.fc1", ["weight", "bias"])
+                    take(f"{inner}.{index}.fc2", ["weight", "bias"])
+                else:
+                    take(f"{inner}.{index}.0", ["weight"])
+                    take(f"{inner}.{index}.1", norm)
+    take("features.8.0", ["weight"])
+    take("features.8.1", norm)
+    assert next(ends, None) is None
+    return names | {"classifier.1.weight": torch.zeros(1000, 1280)}
+
+
+@pytest.mark.parametrize("scheme", ["torchvision", "lukemelas", "safetensors"])
+def test_imagenet_weights_by_path(b0, scheme, tmp_path):
+    own = b0.net.state_dict()
+    given = {n: v + 0.5 if v.is_floating_point() else torch.tensor(7) for n, v in own.items()}
+    path = tmp_path / "weights.pth"
+    if scheme == "torchvision":
+        torch.save(torchvision_names(given), path)
+    elif scheme == "lukemelas":
+        parts = {n: n.split(".") for n in given}
+        luke = {
+            ".".join([p[0], *p[2:]] if p[0] == "_blocks" else p): given[n] for n, p in parts.items()
+        }
+        torch.save(luke | {"_fc.weight": torch.zeros(1000, 1280)}, path)
+    else:
+        from safetensors.torch import save_file
+
+        path = tmp_path / "weights.safetensors"
+        save_file(torchvision_names(given), path)
+    fresh = B0Encoder()
+    load_imagenet_weights(fresh, path)
+    found = fresh.net.state_dict()
+    assert [name for name, value in given.items() if not torch.equal(found[name], value)] == []
+
+
+def test_weights_of_another_network(b0, tmp_path):
+    path = tmp_path / "weights.pth"
+    torch.save({"features.0.0.weight": torch.zeros(8, 3, 3, 3)}, path)
+    with pytest.raises(StyleError, match=r"'features.0.0.weight' as a tensor \[32, 3, 3, 3\]"):
+        load_imagenet_weights(b0, path)
+    path.write_bytes(b"no weights")
+    with pytest.raises(StyleError, match="no weights could be read"):
+        load_imagenet_weights(b0, path)
+    torch.save([1, 2], path)
+    with pytest.raises(StyleError, match="expected a state dict"):
+        load_imagenet_weights(b0, path)
+    with pytest.raises(StyleError, match=r"missing\.pth"):
+        load_imagenet_weights(b0, tmp_path / "missing.pth")
+
+
+def test_b0_maps(b0):
+    image = pictures(1)
+    net = Gscm("b0")
+    torch.testing.assert_close(gscm_map(net, image, image), torch.eye(3, 4), atol=1e-4, rtol=0)
