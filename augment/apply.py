@@ -16,7 +16,9 @@ from augment.render.composite import composite_sky, map_colors, quantise
 from augment.render.rasterize import rasterize
 from augment.scene import PosedGaussians, Scene
 from augment.semantics import SemanticClass
+from augment.sky import Sky
 from augment.snow.covers import cover_of
+from augment.style.looks import look_of
 from augment.weather.flood_view import Painter, render_flooded
 from augment.weather.smog import fog_raster
 from augment.weather.water_plane import plane_depth
@@ -145,12 +147,17 @@ def render_buffers(
 ) -> WeatheredBuffers:
     """The view of `camera` at its own resolution, as floats."""
     parts = bare_parts = scene.parts_for(camera)
+    look = None if plan.style is None else look_of(scene, plan.style)
+    worn = None if plan.styles_picture else look
     if plan.snow is not None:
-        parts = cover_of(scene, plan.snow).parts_for(scene, camera)
+        parts = cover_of(scene, plan.snow, worn).parts_for(scene, camera)
+    sky = scene.sky
+    if worn is not None:
+        parts, sky = worn.on(parts), worn.sky
     flooded = None
     if plan.flood is not None:
         painter = Painter(
-            parts, scene.sky, plan.settings, plan.smog_in_splats, plan.smog_on_buffers, backend
+            parts, sky, plan.settings, plan.smog_in_splats, plan.smog_on_buffers, backend
         )
         buffers = plan.buffers
         if plan.measures_flood and plan.depth_buffer not in buffers:
@@ -159,7 +166,9 @@ def render_buffers(
     if flooded is not None:
         rgb, raster = flooded.rgb, flooded.scene
     else:
-        rgb, raster = _without_water(scene, parts, camera, plan, backend)
+        rgb, raster = _without_water(sky, parts, camera, plan, backend)
+    if look is not None and plan.styles_picture:
+        rgb = map_colors(rgb, look.maps.picture, fast=backend != "reference")
     color_map = scene.color_map(camera.name) if plan.recorded_exposure else None
     if color_map is not None:  # a camera exposes what the weather has left, so this comes last
         rgb = map_colors(rgb, color_map, fast=backend != "reference")
@@ -206,7 +215,7 @@ def _bare(
 
 
 def _without_water(
-    scene: Scene, parts: tuple[PosedGaussians, ...], camera: Camera, plan: Plan, backend: str
+    sky: Sky, parts: tuple[PosedGaussians, ...], camera: Camera, plan: Plan, backend: str
 ) -> tuple[Tensor, RenderOutput]:
     raster = rasterize(
         parts,
@@ -220,9 +229,7 @@ def _without_water(
     rgb = raster.rgb
     if plan.smog_on_buffers is not None:
         rgb = fog_raster(raster, camera, plan.smog_on_buffers)
-    rgb = composite_sky(
-        rgb, raster.alpha, camera, scene.sky, smog=plan.smog, fast=backend != "reference"
-    )
+    rgb = composite_sky(rgb, raster.alpha, camera, sky, smog=plan.smog, fast=backend != "reference")
     return rgb, raster
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from weakref import WeakKeyDictionary
 
 from augment.errors import SceneError
@@ -15,8 +16,20 @@ from augment.weather.flood import FloodMedium
 from augment.weather.smog import SmogMedium
 from augment.weather.wave_spectrum import make_waves
 from recipes.schema import Recipe
+from recipes.style import Style
 
 LEAST_DEPTH_M = 0.05  # waves run in at least this much water
+
+
+def place_style(recipe: Recipe) -> tuple[Style | None, str]:
+    """The recipe's style, or None where it would change nothing; and why."""
+    style = recipe.style
+    if style is None:
+        return None, "the recipe has no style"
+    if not style.changes:
+        return None, "the style has no strength, so it changes nothing"
+    source = f"preset {style.preset!r}" if style.preset else f"image {Path(style.image or '').name}"
+    return style, f"{style.method} from {source} at strength {style.strength:g}"
 
 
 def place_smog(recipe: Recipe, scene: Scene) -> tuple[SmogMedium | None, str]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from augment.place import gaussians_below, place_flood, place_smog, place_snow
+from augment.place import gaussians_below, place_flood, place_smog, place_snow, place_style
 from augment.render.buffers import (
     ALPHA,
     DEPTH_ESTIMATORS,
@@ -22,6 +22,7 @@ from augment.snow.placed import PlacedSnow
 from augment.weather.flood import FloodMedium
 from augment.weather.smog import SmogMedium
 from recipes.schema import Recipe
+from recipes.style import Style
 
 
 @dataclass(frozen=True)
@@ -47,6 +48,8 @@ class Plan:
     snow: None where there is none. measures_snow: whether labels need the depth of its surface.
     bare_buffers: what depth, semantic and instance images take from a render of the scene without
     its snow; empty where they show the snow.
+    style: what the colours of the scene are turned into; None leaves them. styles_picture: whether
+    it is put on the finished picture, weather and all, and not on the scene in it.
     """
 
     settings: RasterSettings
@@ -65,6 +68,8 @@ class Plan:
     snow: PlacedSnow | None = None
     measures_snow: bool = False
     bare_buffers: frozenset[str] = frozenset()
+    style: Style | None = None
+    styles_picture: bool = False
 
     @property
     def smog(self) -> SmogMedium | None:
@@ -92,6 +97,8 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
         flood, flood_reason = None, f"no splat reaches below the level, z = {flood.level_z_m:.2f} m"
     snow, snow_reason = place_snow(recipe, scene, level_z_m)
     smog, smog_reason = place_smog(recipe, scene)
+    style, style_reason = place_style(recipe)
+    styles_picture = style is not None and style.applied_to == "picture"
     per_gaussian = recipe.weather.smog is not None and recipe.weather.smog.model == "per_gaussian"
     depth_buffer = DEPTH_ESTIMATORS.get(recipe.output.depth)
     labelled = recipe.output.labels and scene.labels is not None
@@ -132,13 +139,17 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
         snow=snow,
         measures_snow=measures_snow,
         bare_buffers=frozenset(bare_buffers),
+        style=style,
+        styles_picture=styles_picture,
         steps=(
+            _style_step("on the scene", style, not styles_picture, style_reason),
             *_snow_steps(snow, snow_reason, bare_buffers),
             Step("rasterise", True, f"{actors}; buffers {', '.join(sorted(buffers))}"),
             _smog_step("per Gaussian", smog, per_gaussian, smog_reason),
             _smog_step("on buffers", smog, not per_gaussian, smog_reason),
             _sky_step(smog),
             *_flood_steps(flood, flood_reason),
+            _style_step("on the picture", style, styles_picture, style_reason),
             exposure,
             Step(
                 "depth image",
@@ -149,6 +160,16 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
             Step("instance image", recipe.output.instance, _asked("instance", recipe)),
         ),
     )
+
+
+def _style_step(how: str, style: Style | None, chosen: bool, reason: str) -> Step:
+    """On the scene it takes no pass of its own: splats are mapped as they are projected."""
+    if style is not None and not chosen:
+        reason = f"style.applied_to is {style.applied_to!r}"
+    elif style is not None and how == "on the scene":
+        maps = "a map for every region" if style.per_region else "one map for all splats"
+        reason += f", {maps}, applied as they are projected; snow and water keep their colours"
+    return Step(f"style {how}", style is not None and chosen, reason)
 
 
 def _smog_step(how: str, smog: SmogMedium | None, chosen: bool, reason: str) -> Step:

@@ -13,6 +13,7 @@ from augment.snow.layer import lay_snow
 from augment.snow.light import illumination_of
 from augment.snow.placed import PlacedSnow
 from augment.snow.placement import PlacementSettings
+from augment.style.looks import Look
 from recipes.snow import Snow
 
 _MOST_COVERS = 2  # of a scene, that are kept: a job goes through its variants frame by frame
@@ -23,8 +24,10 @@ def placement_settings(snow: Snow) -> PlacementSettings:
     return PlacementSettings(cell_m=snow.cell_m, max_slope_deg=snow.max_slope_deg)
 
 
-def cover_of(scene: Scene, placed: PlacedSnow) -> SnowCover:
+def cover_of(scene: Scene, placed: PlacedSnow, look: Look | None = None) -> SnowCover:
     """The snow in the scene; remembered for as long as the scene lives and no third is asked for.
+
+    look: the style that the scene wears; the snow lies in the light that it shows.
 
     The first call finds where snow can lie, unless a bed is remembered (augment.snow.beds).
 
@@ -33,22 +36,22 @@ def cover_of(scene: Scene, placed: PlacedSnow) -> SnowCover:
     """
     covers = _covers.setdefault(scene, OrderedDict())
     bed = bed_of(scene, placement_settings(placed.snow))
-    laid_on, cover = covers.get(placed, (None, None))
+    laid_on, cover = covers.get((placed, look), (None, None))
     if cover is None or laid_on is not bed:
         cover = lay_snow(
             bed,
             scene,
             placed.snow,
-            illumination_of(scene, placed.snow),
+            illumination_of(scene if look is None else look.witness, placed.snow),
             seed=placed.seed,
             water_level_z_m=placed.water_level_z_m,
         )
-        covers[placed] = (bed, cover)
-    covers.move_to_end(placed)
+        covers[placed, look] = (bed, cover)
+    covers.move_to_end((placed, look))
     while len(covers) > _MOST_COVERS:
         covers.popitem(last=False)
     return cover
 
 
-_Covers = OrderedDict[PlacedSnow, tuple[SnowBed, SnowCover]]
+_Covers = OrderedDict[tuple[PlacedSnow, Look | None], tuple[SnowBed, SnowCover]]
 _covers: WeakKeyDictionary[Scene, _Covers] = WeakKeyDictionary()

@@ -1,0 +1,211 @@
+"""Styles in finished views: what is mapped, what is not, and in which order."""
+
+import dataclasses
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from augment.apply import render_buffers, render_view
+from augment.plan import make_plan
+from augment.render.rasterize import rasterize
+from augment.scene import Scene
+from augment.semantics import SemanticClass
+from augment.snow.covers import cover_of
+from augment.style.looks import look_of
+from augment.style.maps import CLASSES, StyleMaps
+from augment.style.scene_maps import remember_maps, style_maps
+from recipes.flood import Flood, Waves
+from recipes.schema import Output, Recipe, Smog, Weather
+from recipes.snow import Snow
+from recipes.style import Style
+from tests.snow_scenes import box_car, drive, sheet, side_wall
+
+ROAD, BUILDING, CAR = (int(SemanticClass[name]) for name in ("ROAD", "BUILDING", "VEHICLE"))
+STYLE = Style(preset="dusk")
+STILL = Waves(preset="still")
+
+
+@pytest.fixture
+def scene() -> Scene:
+    """A road, a wall beside it, and a car."""
+    ground = sheet((-2.0, 24.0), (-4.0, 4.0), semantic=ROAD)
+    wall = side_wall(4.0, (2.0, 24.0), (0.0, 1.0))
+    wall = dataclasses.replace(wall, semantic=torch.full((len(wall),), BUILDING, dtype=torch.int16))
+    car = box_car(start=(8.0, -2.0), moved_m=3.0, size=(3.0, 1.8, 1.0), semantic=CAR)
+    return drive(ground, wall, actors=[car])
+
+
+def gentle(seed: int, spread: float = 0.3) -> torch.Tensor:
+    """A map that takes no colour of the scene out of [0, 1]."""
+    rng = torch.Generator().manual_seed(seed)
+    return (
+        torch.eye(3, 4) * 0.6 + 0.1 * torch.eye(3, 4) + spread * torch.rand(3, 4, generator=rng) / 4
+    )
+
+
+def known_maps(scene: Scene, style: Style = STYLE) -> StyleMaps:
+    """Maps that the scene takes for its style's from now on."""
+    maps = StyleMaps(gentle(1)[None], gentle(2), gentle(3))
+    remember_maps(scene, style, maps)
+    return maps
+
+
+def camera_of(scene: Scene, frame: int = 0):
+    return scene.frames[frame].cameras["ahead"]
+
+
+def recipe_of(style: Style | None = STYLE, **weather) -> Recipe:
+    output = Output(semantic=True, instance=True)
+    return Recipe(style=style, weather=Weather(**weather), output=output)
+
+
+def buffers_of(scene: Scene, recipe: Recipe, backend: str = "auto"):
+    return render_buffers(scene, camera_of(scene), make_plan(recipe, scene), backend=backend)
+
+
+def mapped(rgb: torch.Tensor, color_map: torch.Tensor) -> torch.Tensor:
+    return rgb @ color_map[:, :3].T + color_map[:, 3]
+
+
+def ran(scene: Scene, recipe: Recipe) -> dict[str, bool]:
+    return {step.name: step.runs for step in make_plan(recipe, scene).steps}
+
+
+@pytest.mark.parametrize("backend", ["cpu", "reference"])
+def test_splats_and_sky_are_mapped_each_by_its_own(scene, backend):
+    maps = known_maps(scene)
+    clean = buffers_of(scene, recipe_of(None), backend)
+    styled = buffers_of(scene, recipe_of(), backend)
+    alpha = clean.raster.alpha[..., None]
+    splats, sky = clean.raster.rgb, scene.sky.rgb
+    expected = splats @ maps.splats[0, :, :3].T + alpha * maps.splats[0, :, 3]
+    expected = expected + (1 - alpha) * mapped(sky, maps.sky)
+    torch.testing.assert_close(styled.rgb, expected, rtol=0, atol=2e-5)
+    assert (styled.rgb - clean.rgb).abs().max() > 0.1
+
+
+def test_every_class_takes_its_map(scene):
+    splats = torch.eye(3, 4).repeat(CLASSES, 1, 1)
+    splats[CAR] = gentle(5)
+    remember_maps(scene, STYLE, StyleMaps(splats, torch.eye(3, 4), gentle(3)))
+    clean = render_view(scene, camera_of(scene), recipe_of(None))
+    styled = render_view(scene, camera_of(scene), recipe_of())
+    changed = (styled.rgb.astype(int) != clean.rgb).any(-1)
+    sure = clean.semantic == CAR
+    assert changed[sure].mean() > 0.95
+    reach = cv2.dilate(sure.astype(np.uint8), np.ones((25, 25), np.uint8)) > 0
+    assert not changed[~reach].any()
+
+
+def test_only_colours_change(scene):
+    known_maps(scene)
+    clean, styled = (render_view(scene, camera_of(scene), recipe_of(s)) for s in (None, STYLE))
+    for name in ("depth_m", "semantic", "instance"):
+        assert np.array_equal(getattr(clean, name), getattr(styled, name))
+
+
+@pytest.mark.parametrize("weather", [{}, {"snow": Snow(depth_m=0.1, cell_m=0.1)}])
+def test_no_strength_is_no_style_to_the_bit(scene, weather):
+    none = Style(preset="dusk", strength=0)
+    plan = make_plan(recipe_of(none, **weather), scene)
+    assert plan.style is None
+    assert not any(runs for name, runs in ran(scene, recipe_of(none)).items() if "style" in name)
+    clean, same = (render_view(scene, camera_of(scene), recipe_of(s, **weather))
+                   for s in (None, none))  # fmt: skip
+    assert np.array_equal(clean.rgb, same.rgb)
+
+
+def test_a_picture_is_mapped_with_its_weather(scene):
+    style = Style(preset="dusk", applied_to="picture")
+    maps = known_maps(scene, style)
+    weather = {"smog": Smog(visibility_m=50)}
+    clean = buffers_of(scene, recipe_of(None, **weather))
+    styled = buffers_of(scene, recipe_of(style, **weather))
+    torch.testing.assert_close(styled.rgb, mapped(clean.rgb, maps.picture), rtol=0, atol=1e-5)
+    steps = ran(scene, recipe_of(style))
+    assert steps["style on the picture"] and not steps["style on the scene"]
+
+
+def test_smog_keeps_its_colour(scene):
+    known_maps(scene)
+    dense = {"smog": Smog(extinction_per_m=50, color=(0.3, 0.5, 0.7))}
+    view = render_view(scene, camera_of(scene), recipe_of(**dense))
+    assert (np.abs(view.rgb.astype(int) - np.array([77, 128, 179])) <= 1).all()
+
+
+def test_snow_keeps_its_colour_and_takes_the_styles_light(scene):
+    maps = known_maps(scene)
+    recipe = recipe_of(snow=Snow(depth_m=0.1, cell_m=0.1, tracks="never"))
+    plan = make_plan(recipe, scene)
+    look = look_of(scene, STYLE)
+    styled, plain = cover_of(scene, plan.snow, look), cover_of(scene, plan.snow)
+    parts = look.on(styled.parts_for(scene, camera_of(scene)))
+    assert any(part.is_snow for part in parts)
+    assert all((part.color_maps is None) == part.is_snow for part in parts)
+    # Its light is read from the mapped ground and sky, and differs from the bare scene's.
+    mean = {name: cover.ground.gaussians.sh.mean((0, 1))
+            for name, cover in (("styled", styled), ("plain", plain))}  # fmt: skip
+    assert (mean["styled"] - mean["plain"]).abs().max() > 0.02
+    ground = scene.background.sh[0, 0] * 0.28209479 + 0.5
+    seen = look.witness.background.sh[0, 0] * 0.28209479 + 0.5
+    torch.testing.assert_close(seen, mapped(ground, maps.splats[0]), rtol=0, atol=1e-5)
+    assert torch.equal(styled.ground.gaussians.means, plain.ground.gaussians.means)
+    drawn = rasterize([p for p in parts if p.is_snow], camera_of(scene))
+    view = render_buffers(scene, camera_of(scene), plan)
+    covered = view.raster.snow > 0.995
+    assert covered.sum() > 500
+    torch.testing.assert_close(view.rgb[covered], drawn.rgb[covered], rtol=0, atol=0.02)
+
+
+def test_covers_of_two_styles_are_kept_beside_each_other(scene):
+    other = Style(preset="dusk", strength=0.5)
+    for style in (STYLE, other):
+        known_maps(scene, style)
+    placed = make_plan(recipe_of(snow=Snow(depth_m=0.1, cell_m=0.1)), scene).snow
+    first = cover_of(scene, placed, look_of(scene, STYLE))
+    second = cover_of(scene, placed, look_of(scene, other))
+    assert first is not second
+    assert cover_of(scene, placed, look_of(scene, STYLE)) is first
+    assert cover_of(scene, placed, look_of(scene, other)) is second
+
+
+def test_water_mirrors_the_styled_sky(scene):
+    unchanged = torch.eye(3, 4)[None]
+    maps = StyleMaps(
+        unchanged, torch.tensor([[0, 0, 0, 1.0], [0, 0, 0, 0], [0, 0, 0, 0]]), gentle(3)
+    )
+    remember_maps(scene, STYLE, maps)
+    deep = {"flood": Flood(level_m=0.5, reference="absolute", waves=STILL, reflection="sky",
+                           turbidity_ntu=1000)}  # fmt: skip
+    clean, styled = (
+        render_view(scene, camera_of(scene), recipe_of(s, **deep)) for s in (None, STYLE)
+    )
+    far = (clean.water == 255) & (np.arange(90)[:, None] < 55)
+    assert far.sum() > 100
+    redder = styled.rgb[far].astype(float).mean(0) - clean.rgb[far].astype(float).mean(0)
+    assert redder[0] > 5 and redder[2] < -5
+
+
+def test_maps_are_made_once(scene):
+    assert style_maps(scene, STYLE) is style_maps(scene, STYLE)
+    assert look_of(scene, STYLE) is look_of(scene, STYLE)
+    other = StyleMaps(gentle(1)[None], gentle(2), gentle(3))
+    remember_maps(scene, STYLE, other)
+    assert look_of(scene, STYLE).maps is other
+
+
+def test_a_preset_darkens_the_day(scene):
+    bright = dataclasses.replace(scene)
+    clean = render_view(bright, camera_of(bright), recipe_of(None)).rgb.mean()
+    night = render_view(bright, camera_of(bright), recipe_of(Style(preset="night"))).rgb.mean()
+    assert night < 0.75 * clean
+
+
+def test_a_plan_says_what_a_style_takes(scene):
+    plan = make_plan(recipe_of(Style(preset="dusk", strength=0.5, per_region=True)), scene)
+    [step] = [s for s in plan.steps if s.name == "style on the scene"]
+    assert step.runs and "dusk" in step.why and "0.5" in step.why and "region" in step.why
+    bare = make_plan(recipe_of(None), scene)
+    assert plan.buffers == bare.buffers  # no pass of its own
