@@ -19,7 +19,19 @@ KEYS = sorted(
 SCALARS = st.sampled_from(
     [
         *("0", "1", "-5", "0.5", "1e-3", "1e400", ".nan", "-.inf", "300", "2", "010"),
-        *("null", "", "true", "yes", "png", "deferred", "x", "2024-01-01", "'1'", '"\\ud800"'),
+        *(
+            "null",
+            "",
+            "true",
+            "yes",
+            "png",
+            "dusk",
+            "deferred",
+            "x",
+            "2024-01-01",
+            "'1'",
+            '"\\ud800"',
+        ),
         *("0x" + "f" * 300, "9" * 399, "*a", "&a 1", "!!int 3"),
         *("[0.1, 0.2, 0.3]", "{uniform: [1, 2]}"),
     ]
@@ -85,6 +97,7 @@ weather:
   snow:
     depth_m: {uniform: [0.02, 0.2]}
     light: {sun: {choice: [null, 0.5]}}
+style: {preset: dusk, strength: {uniform: [0.5, 1]}, method: {choice: [mkl, reinhard]}}
 output: {image: png, jpeg_quality: {uniform: [60, 95]}}
 """
 # Without derandomize, one run in a thousand would test something that no other run repeats.

@@ -52,6 +52,14 @@ def test_the_file_is_the_schema(tmp_path: Path) -> None:
     assert json.loads(text) == recipe_json_schema() and text.endswith("}\n")
 
 
+def test_files_are_named_as_text(validator: Any) -> None:
+    for style in (
+        {"image": "a.jpg", "mask": "looks/sky.png", "digest": "0" * 64},
+        {"image": {"choice": ["a.jpg", "b.jpg"]}, "method": "gscm", "checkpoint": None},
+    ):
+        validator.validate({"style": style})
+
+
 @pytest.mark.parametrize("name", preset_names())
 def test_presets_and_what_is_drawn_from_them_are_valid(name: str, validator: Any) -> None:
     preset = Path(__file__).parents[2] / "recipes" / "presets" / f"{name}.yaml"
@@ -72,6 +80,10 @@ def with_flood(**fields: Any) -> dict:
 
 def with_waves(*components: Any) -> dict:
     return with_flood(waves={"components": list(components)})
+
+
+def with_style(**fields: Any) -> dict:
+    return {"style": {"preset": "dusk", **fields}}
 
 
 def with_snow(**fields: Any) -> dict:
@@ -115,6 +127,11 @@ WAVE = {"amplitude_m": 0.02, "wavelength_m": 2.0}
         with_snow(light={"sun": {"choice": [None, {"uniform": [0.0, 1.0]}]}, "brightness": None}),
         with_snow(wind={"direction_deg": {"uniform": [-180.0, 180.0]}, "drift": 1}),
         with_snow(tracks={"choice": ["auto", "never"]}, shading="per_pixel", cell_m=0.001),
+        {"style": None},
+        with_style(),
+        with_style(preset={"choice": ["dusk", "dusk"]}, probability=0.5, image=None, digest=None),
+        with_style(strength={"uniform": [0.0, 2.0]}, per_region={"choice": [True, False]}),
+        with_style(method={"choice": ["mkl", "reinhard"]}, applied_to="picture"),
     ],
 )
 def test_both_accept(data: dict, validator: Any) -> None:
@@ -184,6 +201,21 @@ def test_both_accept(data: dict, validator: Any) -> None:
         with_snow(wind={"drift": None}),
         with_snow(wind=3),
         with_snow(seed=1.5),
+        {"style": {}},
+        {"style": "dusk"},
+        {"style": {"image": None}},
+        {"style": {"image": "/a.jpg"}},
+        {"style": {"image": "a\\b.jpg"}},
+        {"style": {"image": ["a.jpg"]}},
+        {"weather": with_style()},
+        with_style(image="a.jpg"),
+        with_style(preset="no such style"),
+        with_style(strength=2.5),
+        with_style(strength=None),
+        with_style(per_region="yes"),
+        with_style(method="magic"),
+        with_style(digest="0"),
+        with_style(digest={"choice": [None]}),
     ],
 )
 def test_both_refuse(data: dict, validator: Any) -> None:

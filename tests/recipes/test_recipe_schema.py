@@ -17,6 +17,7 @@ from recipes.load import load_recipe
 from recipes.parse import parse_recipe
 from recipes.schema import KOSCHMIEDER, Output, Recipe, Render, Smog, Weather
 from recipes.snow import Snow
+from recipes.style import Style
 
 FIELDS = [spec for section in ROOT.walk() for spec in section.fields.values()]
 NUMBERS = [spec for spec in FIELDS if spec.kind in (Kind.NUMBER, Kind.WHOLE)] + [CHANNEL, RATE]
@@ -97,6 +98,7 @@ def test_the_hash_is_pinned() -> None:
     assert Recipe().hash == "8553a2737c7b8e42"
     assert Recipe(weather=Weather(flood=Flood(level_m=0.2))).hash == "efb12819c12b5307"
     assert Recipe(weather=Weather(snow=Snow(depth_m=0.1))).hash == "0b005b8e06d7eedd"
+    assert Recipe(style=Style(preset="dusk")).hash == "535470ef48aaa9f4"
 
 
 def test_recipes_from_before_floods_keep_their_hashes() -> None:
@@ -183,6 +185,15 @@ OTHER = {
     "weather.snow.light.brightness": 1,
     "weather.snow.wind.direction_deg": 1,
     "weather.snow.wind.drift": 0.2,
+    "style.image": None,  # a path does not count, but what it holds: test_recipe_files.py
+    "style.preset": None,  # in place of an image: below
+    "style.mask": None,
+    "style.method": "reinhard",
+    "style.strength": 0.5,
+    "style.per_region": True,
+    "style.applied_to": "picture",
+    "style.checkpoint": None,
+    "style.digest": "1" * 64,
     "render.scale": 0.5,
     "render.near_m": 0.02,
     "render.alpha_max": 0.99,
@@ -205,10 +216,12 @@ def test_every_field_changes_the_hash() -> None:
     wave = Wave(amplitude_m=0.01, wavelength_m=1.0)
     flood = Flood(level_m=0.2, waves=Waves(components=(wave,)))
     smog, snow = Smog(visibility_m=300), Snow(depth_m=0.1)
-    base = Recipe(weather=Weather(smog=smog, flood=flood, snow=snow))
+    weather = Weather(smog=smog, flood=flood, snow=snow)
+    base = Recipe(weather=weather, style=Style(image="a.png", digest="0" * 64))
     cleared = flood.model_copy(update={"absorption_per_m": (1.0, 1.0, 1.0)})
     hashes = {base.hash, smoggy(extinction_per_m=0.01).hash}
     hashes.add(Recipe(weather=Weather(smog=smog, flood=cleared, snow=snow)).hash)
+    hashes |= {Recipe(weather=weather, style=style).hash for style in (None, Style(preset="dusk"))}
     changes = {path: value for path, value in OTHER.items() if value is not None}
     for path, value in changes.items():
         data = base.model_dump()
@@ -219,7 +232,7 @@ def test_every_field_changes_the_hash() -> None:
             inner = inner[key] if key == section else inner[key][0]
         inner[name] = value
         hashes.add(Recipe.model_validate(data).hash)
-    assert len(hashes) == len(changes) + 3
+    assert len(hashes) == len(changes) + 5
     scene = Recipe(output=Output(surface="scene"))
     assert len({scene.hash, Recipe().hash, Recipe(output=Output(surface="first")).hash}) == 3
 
@@ -241,6 +254,16 @@ def test_numbers_for_the_manifest() -> None:
         n[name] for n in (clear, thick, flooded) for name in ("snow_depth_m", "snow_coverage")
     ]
     assert all(map(math.isnan, absent))
+
+
+def test_a_style_for_the_manifest() -> None:
+    assert Recipe().weather_numbers()["style_strength"] == 0
+    assert Recipe().style_words() == {"style": None, "style_method": None}
+    dusk = Recipe(style=Style(preset="dusk", strength=0.5))
+    assert dusk.weather_numbers()["style_strength"] == 0.5
+    assert dusk.style_words() == {"style": "dusk", "style_method": "mkl"}
+    photo = Recipe(style=Style(image="/photos/sunset 3.jpg", method="reinhard"))
+    assert photo.style_words() == {"style": "sunset 3.jpg", "style_method": "reinhard"}
 
 
 def test_numbers_of_a_flood_that_says_more() -> None:
