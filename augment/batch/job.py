@@ -10,7 +10,7 @@ import copy
 import threading
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -30,10 +30,13 @@ from augment.batch.runner import Chunk, Outcome, Renderer, Setup
 from augment.batch.selection import SceneIndex, select_frames
 from augment.batch.shared_scene import share_scene
 from augment.batch.snow_beds import StoredBed, snow_to_lay, store_beds
+from augment.batch.style_files import check_kept, copy_style_files, portable_recipe
+from augment.batch.style_maps import StoredMaps, store_maps, style_to_apply
 from augment.batch.trajectory import frames_to_json, trajectory_id
 from augment.cameras import Frame
 from augment.scene import Scene
 from recipes.dump import dump_recipe
+from recipes.files import with_digest
 from recipes.schema import Recipe
 
 SceneLoader = Callable[[str], Scene]
@@ -44,6 +47,7 @@ class RenderJob:
     """What to render, and where to.
 
     recipes: resolved recipes, one a variant; their `name` and `variant` number make the folder.
+    Where a style names files without a digest, the job fills it in.
     frames: the dataset's frame numbers, or None for all. cameras: names, or None for all.
     camera_path: frames to render in place of the scene's own, poses in the scene's world; labels
     and LiDAR pass through where a frame of the scene has the same number and timestamp.
@@ -78,8 +82,8 @@ class JobResult:
     """Counts of images of this job. skipped: finished by earlier runs. failures: one line each.
 
     manifest: its path. seconds: wall clock. timings: seconds by kind of work, summed over
-    threads and workers (render, encode, write), or of the job itself (open, place, labels, share,
-    finish).
+    threads and workers (render, encode, write), or of the job itself (open, place, style, labels,
+    share, finish).
     """
 
     written: int
@@ -109,7 +113,8 @@ def run_job(
 
     Raises:
         SceneError: the scene cannot be opened, lacks a wanted frame or camera, or cannot have the
-            snow of a recipe; no file of a variant has been written or replaced then.
+            snow of a recipe. StyleError, RecipeError: a style or one of its files cannot be used.
+            No file of a variant has been written or replaced then.
         OutputError: the folder cannot be written, is in use, or holds something else.
     """
     started = time.perf_counter()
@@ -133,32 +138,35 @@ class _Run:
     def __init__(self, job: RenderJob, scene: Scene, renderer: Renderer | None) -> None:
         self.job, self.renderer = job, renderer
         self.scene: Scene | None = scene  # None once workers have it
+        self.recipes = tuple(map(with_digest, job.recipes))
         # A stand-in has its own idea of backends.
         self.backend = job.backend if renderer else choose_backend(job.backend, scene)
         self.index = SceneIndex.of(scene, job.camera_path)
         self.selection = select_frames(self.index, job.frames, job.cameras)
         self.out_dir = Path(job.out_dir).absolute()
         self.trajectory = trajectory_id(job.camera_path)
-        self.ledger = Ledger(self.out_dir, self.index, job.recipes, self._identities())
+        self.ledger = Ledger(self.out_dir, self.index, self.recipes, self._identities())
         self.boxes = BoxCache(self.index)
         self.beds: tuple[StoredBed, ...] = ()
+        self.maps: tuple[StoredMaps, ...] = ()
         self.timings: defaultdict[str, float] = defaultdict(float)
         self.counts: Counter[str] = Counter()
         self.failures: list[str] = []
         self.counting = threading.Lock()  # outcomes arrive from several threads
 
     def go(self, progress: bool) -> None:
-        self.total = len(self.job.recipes) * sum(len(names) for _, names in self.selection)
+        self.total = len(self.recipes) * sum(len(names) for _, names in self.selection)
         with OutputLock(self.out_dir) as lock:
             if self.job.overwrite:  # this may fail, so it comes before anything is given up
-                self._find_beds(self.job.recipes, progress)
+                self._check_kept()
+                self._prepare(self.recipes, progress)
             self.ledger.open(overwrite=self.job.overwrite)
             chunks = list(self.ledger.pending(self.selection))
             self.skipped = self.total - sum(len(chunk.cameras) for chunk in chunks)
             try:
                 if not self.job.overwrite:
                     pending = sorted({chunk.variant for chunk in chunks})
-                    self._find_beds([self.job.recipes[number] for number in pending], progress)
+                    self._prepare([self.recipes[number] for number in pending], progress)
                 self.bar = tqdm(
                     total=self.total, initial=self.skipped, unit="image", disable=not progress
                 )
@@ -182,11 +190,12 @@ class _Run:
         path = self.job.camera_path
         setup = Setup(
             out_dir=str(self.out_dir),
-            recipes=tuple(self.job.recipes),
+            recipes=self.recipes,
             backend=self.backend,
             camera_path=None if path is None else frames_to_json(path),
             labelled=self.index.labelled,
             beds=self.beds,
+            maps=self.maps,
         )
         assert self.scene is not None
         if not chunks:
@@ -220,43 +229,57 @@ class _Run:
                 version=augment.__version__,
                 backend=self.backend,
             )
-            for recipe in self.job.recipes
+            for recipe in self.recipes
         ]
 
-    def _find_beds(self, recipes: Iterable[Recipe], progress: bool) -> None:
-        """Find where the recipes' snow can lie, for all cameras of the scene or the path."""
+    def _check_kept(self) -> None:
+        folders = [self.out_dir / variant.folder for variant in self.ledger.variants]
+        for recipe in self.recipes:
+            check_kept(recipe, folders)
+
+    def _prepare(self, recipes: Collection[Recipe], progress: bool) -> None:
+        """Find what images of these recipes share, for all cameras of the scene or the path.
+
+        Where their snow can lie, and the colour maps of their styles.
+        """
         snowy = [recipe for recipe in recipes if snow_to_lay(recipe) is not None]
-        if not snowy:
-            return
-        started = time.perf_counter()
+        styled = [recipe for recipe in recipes if style_to_apply(recipe) is not None]
         assert self.scene is not None
         cameras, path = None, self.job.camera_path
-        if path is not None:
-            # An object of its own, or the caller's would remember the bed of this path.
+        if path is not None and (snowy or styled):
+            # An object of its own, or the caller's would remember what was found for this path.
             self.scene = copy.copy(self.scene)
             cameras = [camera for frame in path for camera in frame.cameras.values()]
-        folder = self.out_dir / STATE_FOLDER
-        self.beds = store_beds(self.scene, snowy, folder, cameras=cameras, progress=progress)
-        self.timings["place"] += time.perf_counter() - started
+        if styled:
+            started = time.perf_counter()
+            self.maps = store_maps(self.scene, styled, cameras=cameras)
+            self.timings["style"] += time.perf_counter() - started
+        if snowy:
+            started = time.perf_counter()
+            folder = self.out_dir / STATE_FOLDER
+            self.beds = store_beds(self.scene, snowy, folder, cameras=cameras, progress=progress)
+            self.timings["place"] += time.perf_counter() - started
 
     def _begin(self, chunks: Sequence[Chunk]) -> None:
         """Announce the variants that will be written, before their first file."""
         for number in sorted({chunk.variant for chunk in chunks}):
             variant = self.ledger.variants[number]
             variant.journal.begin(variant.identity)
-            text = dump_recipe(variant.recipe).encode()
-            write_atomic(self.out_dir / variant.folder / "recipe.yaml", text)
+            folder = self.out_dir / variant.folder
+            copy_style_files(variant.recipe, folder)
+            text = dump_recipe(portable_recipe(variant.recipe)).encode()
+            write_atomic(folder / "recipe.yaml", text)
 
     def _leave_unlabelled(self, chunks: Sequence[Chunk]) -> list[Chunk]:
         """Record as failed what belongs to frames whose boxes cannot be read; return the rest."""
         started = time.perf_counter()
-        labelled = {c.frame for c in chunks if self.job.recipes[c.variant].output.labels}
+        labelled = {c.frame for c in chunks if self.recipes[c.variant].output.labels}
         self.boxes.get(sorted(labelled))
         self.timings["labels"] += time.perf_counter() - started
         rest = []
         for chunk in chunks:
             message = self.boxes.errors.get(chunk.frame)
-            if message is None or not self.job.recipes[chunk.variant].output.labels:
+            if message is None or not self.recipes[chunk.variant].output.labels:
                 rest.append(chunk)
                 continue
             for name in chunk.cameras:

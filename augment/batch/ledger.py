@@ -163,7 +163,7 @@ class Ledger:
                     item = row["frame"], row["camera"]
                     variant.box_weather[kind][item] = table.from_json(numbers)
         # The recipe's hash agrees, so the rows show what it says, whatever their version called it.
-        shown = {"surface": variant.recipe.output.surface}
+        shown = {"surface": variant.recipe.output.surface, **variant.recipe.style_words()}
         known = [{**LATER, **row, **shown} for row in [*rows, *journalled]]
         variant.rows = {(row["frame"], row["camera"]): row for row in known}
         return False
@@ -223,6 +223,7 @@ class Ledger:
             "width": camera.width,
             "height": camera.height,
             "surface": recipe.output.surface,
+            **recipe.style_words(),
             **recipe.weather_numbers(),
             "seed": recipe.seed,
             "recipe": recipe.name,

@@ -33,6 +33,8 @@ LEADING = {
     "width": pa.int64(),
     "height": pa.int64(),
     "surface": pa.string(),
+    "style": pa.string(),
+    "style_method": pa.string(),
 }
 TRAILING = {
     "seed": pa.int64(),
@@ -53,7 +55,11 @@ LATER: dict[str, str | None] = {
     "box_water_path": None,
     "box_snow_path": None,
     "surface": "solid",
+    "style": None,
+    "style_method": None,
 }
+# What a row without them means by weather numbers that others have; NaN for all else.
+LATER_NUMBERS = {"style_strength": 0.0}
 KEY = ("scene", "variant", "frame", "camera")
 
 Row = Mapping[str, Any]
@@ -65,13 +71,14 @@ def weather_columns(table: pa.Table) -> list[str]:
 
 
 def rows_to_table(rows: Iterable[Row]) -> pa.Table:
-    """Rows as a sorted table; a weather number that a row lacks is NaN."""
+    """Rows as a sorted table; a weather number that a row lacks is what LATER_NUMBERS says."""
     rows = list(rows)
     names = {name for row in rows for name in row}
     weather = sorted(names - LEADING.keys() - TRAILING.keys())
     columns = {name: pa.array([row[name] for row in rows], kind) for name, kind in LEADING.items()}
     for name in weather:
-        columns[name] = pa.array([row.get(name, math.nan) for row in rows], pa.float64())
+        absent = LATER_NUMBERS.get(name, math.nan)
+        columns[name] = pa.array([row.get(name, absent) for row in rows], pa.float64())
     columns |= {
         name: pa.array([row[name] for row in rows], kind) for name, kind in TRAILING.items()
     }
@@ -150,7 +157,8 @@ def _in_variants(table: pa.Table, variants: set[tuple[str, str]]) -> np.ndarray:
 def _with_columns(table: pa.Table, weather: list[str]) -> pa.Table:
     for name in weather:
         if name not in table.column_names:
-            absent = pa.array([math.nan] * table.num_rows, pa.float64())
+            meaning = LATER_NUMBERS.get(name, math.nan)
+            absent = pa.array([meaning] * table.num_rows, pa.float64())
             table = table.append_column(name, absent)
     return table
 

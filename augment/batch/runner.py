@@ -21,6 +21,7 @@ from augment.batch.label_files import lidar_bytes
 from augment.batch.layout import item_paths
 from augment.batch.manifest import FAILED, OK
 from augment.batch.snow_beds import StoredBed
+from augment.batch.style_maps import StoredMaps
 from augment.batch.trajectory import frames_from_json
 from augment.batch.writer import View, WritePump, check_view, write_view
 from augment.cameras import Camera
@@ -45,7 +46,7 @@ class Setup:
 
     camera_path: JSON of `trajectory`, or None for the scene's frames. labelled: numbers of the
     frames whose labels and LiDAR pass through. beds: where the recipes' snow can lie; the scene to
-    render remembers them.
+    render remembers them. maps: those of the recipes' styles.
     """
 
     out_dir: str
@@ -54,6 +55,7 @@ class Setup:
     camera_path: str | None
     labelled: frozenset[int]
     beds: tuple[StoredBed, ...] = ()
+    maps: tuple[StoredMaps, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -120,11 +122,14 @@ class FrameRunner:
         self._scene, self._setup = scene, setup
         self._renderer = renderer or default_renderer()
         self._deliver, self._pump = deliver, pump
+        self._maps = {stored.style: stored for stored in setup.maps}
         self._boxes: dict[int, Boxes] = {}  # of the frames so far
 
     def run(self, chunk: Chunk, stopped: Callable[[], bool] = lambda: False) -> None:
         """Render the chunk's images; those not begun when `stopped()` turns true are left."""
         recipe = self._setup.recipes[chunk.variant]
+        if recipe.style in self._maps:  # one at a time: a scene remembers few
+            self._maps[recipe.style].take_over(self._scene)
         lidar = self._pump.submit(lambda: self._pass_lidar(chunk, recipe))
         for name in chunk.cameras:
             if stopped():

@@ -102,6 +102,8 @@ def test_manifest_has_a_row_for_every_image(tmp_path: Path) -> None:
         "width": SIZE[0],
         "height": SIZE[1],
         "surface": "solid",
+        "style": None,
+        "style_method": None,
         "water_path": None,
         "snow_path": None,
         "box_water_path": None,
