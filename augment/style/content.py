@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass
 from typing import TypeVar
 from weakref import WeakKeyDictionary
 
@@ -145,34 +146,55 @@ def gaussian_statistics(scene: Scene, *, per_region: bool) -> Statistics:
 def _statistics(scene: Scene, views: Sequence[Camera], per_region: bool) -> Statistics:
     per_region = per_region and knows_regions(scene)
     marked = _marked_scene(scene) if per_region else None
-    pictures, lands, skies, covered, shares = [], [], [], [], []
-    for camera in views:
-        view = _small(camera)
-        rgb, alpha = _render(scene, view)
-        empty = torch.zeros_like(rgb)
-        sky = composite_sky(empty, torch.zeros_like(alpha), view, scene.sky)
-        picture = rgb + (1 - alpha)[..., None] * sky
-        # Colours of the splats alone: alpha is taken back out.
-        land = rgb / alpha[..., None].clamp_min(1e-6)
-        for kept, image in ((pictures, picture), (lands, land), (skies, sky)):
-            kept.append(image.clamp(0, 1).reshape(-1, 3).numpy())
-        covered.append(alpha.reshape(-1).numpy())
-        if marked is not None:
-            shares.append(_render(marked, view)[0].reshape(-1, 3).numpy())
-    if not covered or not max(float(alpha.max()) for alpha in covered) > 0:
+    seen = [_see(scene, marked, _small(camera)) for camera in views]
+    if not any((view.alpha > 0).any() for view in seen):
         return gaussian_statistics(scene, per_region=per_region)
-    alpha = np.concatenate(covered).astype(np.float64)
+    alpha = np.concatenate([view.alpha for view in seen])
+    land = np.concatenate([view.land for view in seen])
     total = float(alpha.size)
     found: dict[str, ColorStatistics] = {}
-    _add(found, WHOLE, np.concatenate(pictures), np.ones_like(alpha), total)
-    _add(found, LAND, np.concatenate(lands), alpha, total)
-    if (1 - alpha).sum() >= LEAST_SKY * total:
-        _add(found, SKY, np.concatenate(skies), np.clip(1 - alpha, 0, 1), total)
-    if shares:
-        marks = np.clip(np.concatenate(shares), 0, 1)
+    _add(found, WHOLE, np.concatenate([view.picture for view in seen]), np.ones_like(alpha), total)
+    _add(found, LAND, land, alpha, total)
+    open_share = np.clip(1 - alpha, 0, 1)
+    if open_share.sum(dtype=np.float64) >= LEAST_SKY * total:
+        _add(found, SKY, np.concatenate([view.sky for view in seen]), open_share, total)
+    if per_region:
+        marks = np.concatenate([view.marks for view in seen])
         for number, region in enumerate(_CHANNELS):
-            _add(found, region, np.concatenate(lands), marks[:, number], total)
+            _add(found, region, land, marks[:, number], total)
     return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """Of a view's P pixels, float32 in [0, 1]: picture, land (the splats alone) and sky (alone)
+    [P, 3]; alpha [P]; marks [P, 3], weights of _CHANNELS, or [0, 3].
+    """
+
+    picture: np.ndarray
+    land: np.ndarray
+    sky: np.ndarray
+    alpha: np.ndarray
+    marks: np.ndarray
+
+
+def _see(scene: Scene, marked: Scene | None, camera: Camera) -> _Seen:
+    rgb_image, alpha_image = _render(scene, camera)
+    nothing = torch.from_numpy(np.zeros((camera.height, camera.width, 3), np.float32))
+    sky_image = composite_sky(nothing, nothing[..., 0].contiguous(), camera, scene.sky)
+    # By NumPy from here: on arrays this small torch's threads cost more than they give.
+    rgb, sky = (image.numpy().reshape(-1, 3) for image in (rgb_image, sky_image))
+    alpha = np.clip(alpha_image.numpy().reshape(-1), 0, 1)
+    marks = np.empty((0, 3), np.float32)
+    if marked is not None:
+        marks = np.clip(_render(marked, camera)[0].numpy().reshape(-1, 3), 0, 1)
+    return _Seen(
+        picture=np.clip(rgb + (1 - alpha)[:, None] * sky, 0, 1),
+        land=np.clip(rgb / np.maximum(alpha, np.float32(1e-6))[:, None], 0, 1),
+        sky=np.clip(sky, 0, 1),
+        alpha=alpha,
+        marks=marks,
+    )
 
 
 def _add(
@@ -182,8 +204,7 @@ def _add(
     weights: np.ndarray,
     total: float,
 ) -> None:
-    seen = weights > 0
-    one = statistics_of(rgb[seen], weights[seen], total=total)
+    one = statistics_of(rgb, weights, total=total)
     # Float rounding of the marks leaves traces of regions that are nowhere.
     if one is not None and one.share > 1e-6:
         found[region] = one
