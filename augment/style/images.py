@@ -11,11 +11,12 @@ import numpy as np
 from augment.errors import StyleError
 from augment.style.image_header import FORMATS, ImageHeader, image_header
 from augment.style.image_regions import find_sky, region_masks
-from augment.style.statistics import LAND, SKY, WHOLE, ColorStatistics, Statistics, statistics_of
+from augment.style.statistics import LAND, SKY, WHOLE, ColorStatistics, Statistics
 
 SIDE_PX = 512  # colours need no more, and everything after the reading costs the same for any file
 MAX_BYTES = 256 * 1024**2
 MAX_PIXELS = 64_000_000  # about 1 GiB while an image of this size with alpha is averaged
+_ENOUGH_PIXELS = 65_536  # for statistics; of more, every second row and column says the same
 _SHAPE_TOLERANCE = 0.02  # by which a mask's aspect ratio may miss: a pixel's rounding when small
 
 _REDUCED = {  # libjpeg averages while it decodes, for less than the whole costs
@@ -76,16 +77,46 @@ def image_statistics(image: StyleImage) -> Statistics:
 
     WHOLE always; SKY and LAND where it shows both; VEGETATION, ROAD and REST where found.
     """
-    total = float(image.weights.sum(dtype=np.float64))
+    step = 1 if image.sky.size <= _ENOUGH_PIXELS else 2
+    image = StyleImage(*(part[::step, ::step] for part in (image.rgb, image.weights, image.sky)))
     masks = region_masks(image.rgb, image.weights, image.sky)
-    found: dict[str, ColorStatistics] = {}
-    for region, inside in {WHOLE: np.ones_like(image.sky), **masks}.items():
-        statistics = statistics_of(image.rgb[inside], image.weights[inside], total=total)
-        if statistics is not None:
-            found[region] = statistics
-    if SKY not in found or LAND not in found:
-        found = {region: found[region] for region in found if region not in (SKY, LAND)}
-    return found
+    parts = np.zeros(image.sky.shape, np.int64)  # each pixel in one part, so that each counts once
+    inside = {WHOLE: {0}}
+    for number, (region, mask) in enumerate(masks.items(), start=1):
+        if region != LAND:
+            parts[mask] = number
+            inside[WHOLE].add(number)
+            inside[region] = {number}
+    if SKY in inside:
+        inside[LAND] = inside[WHOLE] - inside[SKY]
+    sums = _sums(image, parts, len(masks) + 1)
+    return {region: _statistics(sums, sorted(of)) for region, of in inside.items()}
+
+
+def _sums(image: StyleImage, parts: np.ndarray, count: int) -> np.ndarray:
+    """Weighted sums of products of (1, r, g, b) in each part, float64 [count, 4, 4]."""
+    labels = parts.ravel()
+    weights = image.weights.ravel().astype(np.float64)
+    channels = [np.ones_like(weights), *image.rgb.reshape(-1, 3).T.astype(np.float64)]
+    sums = np.empty((count, 4, 4))
+    for i in range(4):
+        weighted = weights * channels[i]
+        for j in range(i, 4):
+            sums[:, i, j] = np.bincount(labels, weighted * channels[j], minlength=count)
+            sums[:, j, i] = sums[:, i, j]
+    return sums
+
+
+def _statistics(sums: np.ndarray, parts: list[int]) -> ColorStatistics:
+    total, own = sums[:, 0, 0].sum(), sums[parts].sum(0)
+    mean = own[0, 1:] / own[0, 0]
+    covariance = own[1:, 1:] / own[0, 0] - np.outer(mean, mean)
+    # A constant colour's variance is zero less rounding.
+    values, vectors = np.linalg.eigh(covariance)
+    if values[0] < 0:
+        covariance = (vectors * np.maximum(values, 0)) @ vectors.T
+        covariance = (covariance + covariance.T) / 2
+    return ColorStatistics(mean, covariance, float(own[0, 0] / total))
 
 
 def _read(path: Path, what: str) -> tuple[np.ndarray, np.ndarray | None]:
