@@ -109,8 +109,9 @@ def _network_map(
             f"the network gives no finite map for style image {style.image}: {found.tolist()}; "
             f"use another checkpoint, or method mkl"
         )
-    stronger = with_strength(found, style.strength)
-    return _limited(stronger, content.double().mean((0, 2, 3))).float()
+    mean = content.double().mean((0, 2, 3))
+    full = _limited(found, mean)
+    return _limited(with_strength(full, style.strength), mean).float()
 
 
 def _style_picture(image: StyleImage) -> Float[Tensor, "1 3 256 256"]:
