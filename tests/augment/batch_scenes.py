@@ -23,9 +23,11 @@ from augment.sky import ConstantSky
 from augment.snow.beds import bed_of
 from augment.snow.cells import OPEN_EDGE, SnowBed, SnowCells
 from augment.snow.placement import PlacementSettings
+from augment.style.maps import StyleMaps
 from recipes.flood import Flood
 from recipes.schema import Output, Recipe, Smog, Weather
 from recipes.snow import Snow
+from recipes.style import Style
 
 ORIGIN_M = np.array([448_262.123456789, 4_421_337.987654321, 41.5])
 LEVEL_Z_M = 0.2
@@ -152,12 +154,14 @@ def make_recipe(
     variant: int = 0,
     flood: Flood | None = None,
     snow: Snow | None = None,
+    style: Style | None = None,
     **output,
 ) -> Recipe:
     smog = Smog(visibility_m=50.0 + variant)
     weather = Weather(smog=smog if name == "fog" else None, flood=flood, snow=snow)
     settings = {"semantic": True, "instance": True, **output}
-    return Recipe(name=name, variant=variant, seed=7, weather=weather, output=Output(**settings))
+    numbers = {"name": name, "variant": variant, "seed": 7}
+    return Recipe(**numbers, weather=weather, style=style, output=Output(**settings))
 
 
 def fake_render(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str) -> FakeView:
@@ -221,12 +225,31 @@ def make_bed(x_m: float) -> SnowBed:
 
 
 def bed_render(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str) -> FakeView:
-    """As `fake_render`, with the number that `make_bed` was given in the first pixel's red."""
+    """As `style_render`, with the number that `make_bed` was given in the first pixel's red."""
     snow = recipe.weather.snow
     assert snow is not None
     bed = bed_of(scene, PlacementSettings(cell_m=snow.cell_m, max_slope_deg=snow.max_slope_deg))
-    view = fake_render(scene, camera, recipe, backend=backend)
+    view = style_render(scene, camera, recipe, backend=backend)
     view.rgb[0, 0, 0] = round(bed.ground.centers_m[0, 0].item() * 20)
+    return view
+
+
+def make_maps(red: float) -> StyleMaps:
+    """Maps that give everything this much red."""
+    one = torch.tensor([[0.0, 0, 0, red], [0, 1, 0, 0], [0, 0, 1, 0]])
+    return StyleMaps(one[None], one, one)
+
+
+def style_render(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str) -> FakeView:
+    """As `fake_render`, with the number that `make_maps` was given, times 100, in the second
+    pixel's red.
+    """
+    from augment.style.scene_maps import style_maps  # brings the rasteriser
+
+    view = fake_render(scene, camera, recipe, backend=backend)
+    if recipe.style is not None:
+        maps = style_maps(scene, recipe.style)
+        view.rgb[0, 1, 0] = round(100 * maps.picture[0, 3].item())
     return view
 
 

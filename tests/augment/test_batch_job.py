@@ -120,7 +120,9 @@ def test_manifest_has_a_row_for_every_image(tmp_path: Path) -> None:
     }
     assert {name: row[name] for name in expected} == expected
     numbers = {
-        name: row[name] for name in row if name.startswith(("smog_", "flood_", "snow_d", "snow_c"))
+        name: row[name]
+        for name in row
+        if name.startswith(("smog_", "flood_", "snow_d", "snow_c", "style_s"))
     }
     assert numbers.keys() == recipe.weather_numbers().keys()
     assert numbers["smog_extinction_per_m"] == recipe.weather_numbers()["smog_extinction_per_m"]

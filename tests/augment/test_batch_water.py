@@ -287,17 +287,19 @@ def test_labels_that_cannot_be_measured_fail_their_image(recipe, tmp_path: Path)
 
 
 def test_manifests_of_older_versions_are_read_and_gone_on_with(tmp_path: Path) -> None:
-    """Without the columns that came later: no water and no snow, so all surfaces are the same."""
+    """Without the columns that came later: no style, no water, no snow: all surfaces are the same."""
     whole, old = tmp_path / "whole", tmp_path / "old"
     run(RenderJob("fake:street", [make_recipe()], whole))
     run(RenderJob("fake:street", [make_recipe()], old, frames=[0, 1]))
     manifest = old / "manifest.parquet"
     table = pq.read_table(manifest)
     numbers = [
-        n for n in table.column_names if n.startswith(("flood_", "snow_")) and n not in LATER
+        n
+        for n in table.column_names
+        if n.startswith(("flood_", "snow_", "style_")) and n not in LATER
     ]
     later = [*numbers, *LATER]
-    assert len(numbers) == 5
+    assert len(numbers) == 6
     pq.write_table(table.drop_columns(later), manifest)
     assert read_manifest(old).column_names == [
         name for name in table.column_names if name not in numbers

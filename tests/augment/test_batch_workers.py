@@ -14,6 +14,7 @@ from batch_scenes import (
     fake_render,
     make_bed,
     make_gaussians,
+    make_maps,
     make_recipe,
     open_fake,
     render_dying_at_frame_2,
@@ -29,6 +30,7 @@ from augment.scene import Actor, Track
 from augment.sky import LatLongSky
 from recipes.flood import Flood
 from recipes.snow import Snow
+from recipes.style import Style
 
 
 def test_a_dying_worker_costs_one_image_and_workers_change_no_file(
@@ -36,10 +38,12 @@ def test_a_dying_worker_costs_one_image_and_workers_change_no_file(
 ) -> None:
     """Three promises in one test, for every start of a worker imports torch anew.
 
-    The third: workers take the job's bed over. One that they found themselves would show.
+    The third: workers take over the job's bed and maps. What they found themselves would show.
     """
     monkeypatch.setattr("augment.snow.beds.place_snow_bed", lambda *_, **__: make_bed(3.0))
-    recipes = [make_recipe(flood=Flood(level_m=0.3), snow=Snow(depth_m=0.1))]
+    monkeypatch.setattr("augment.style.scene_maps._find_maps", lambda *_: make_maps(0.4))
+    style = Style(preset="dusk")
+    recipes = [make_recipe(flood=Flood(level_m=0.3), snow=Snow(depth_m=0.1), style=style)]
     one = tmp_path / "one"
     run_job(RenderJob("fake:street", recipes, one), scene_loader=open_fake, renderer=bed_render,
             progress=False)  # fmt: skip

@@ -38,8 +38,8 @@ def template(text: str, folder: Path | None = None) -> RecipeTemplate:
 
 def test_a_preset_is_enough() -> None:
     recipe = template("style: {preset: dusk}").resolve(0)
-    assert recipe.style == Style(preset="dusk") and recipe.style.changes
-    assert (recipe.style.name, recipe.style.files) == ("dusk", {})
+    style = Style(preset="dusk")
+    assert recipe.style == style and style.changes and (style.name, style.files) == ("dusk", {})
     assert not Style(preset="dusk", strength=0).changes
 
 
