@@ -8,7 +8,7 @@ import sys
 
 import tyro
 
-from tools import commands
+from tools import commands, style_commands
 
 COMMANDS = {
     "render": commands.render,
@@ -19,6 +19,15 @@ COMMANDS = {
     "sheet": commands.sheet,
     "bench": commands.bench,
     "demo": commands.demo,
+    "style": commands.style,
+}
+# Commands of commands, which take over where the first word names one.
+GROUPS = {
+    "style": {
+        "apply": style_commands.apply,
+        "train": style_commands.train,
+        "presets": style_commands.presets,
+    },
 }
 
 
@@ -26,13 +35,19 @@ def main(arguments: list[str] | None = None) -> int:
     """Runs one command. Returns 0; 1 where images failed, 2 for an error, 130 if interrupted."""
     if not sys.stderr.isatty():  # a log needs a progress line now and then, not ten a second
         os.environ.setdefault("TQDM_MININTERVAL", "10")
+    arguments = sys.argv[1:] if arguments is None else arguments
+    table, prog = COMMANDS, "climategs"
+    description = "Weather for driving scenes made of 3D Gaussians."
+    if arguments and arguments[0] in GROUPS:
+        group, *arguments = arguments
+        table, prog, description = GROUPS[group], f"climategs {group}", COMMANDS[group].__doc__
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
     try:
         return tyro.extras.subcommand_cli_from_dict(
-            COMMANDS,
+            table,
             args=arguments,
-            prog="climategs",
-            description="Weather for driving scenes made of 3D Gaussians.",
+            prog=prog,
+            description=description,
             sort_subcommands=False,
         )
     except KeyboardInterrupt as interruption:

@@ -5,12 +5,12 @@ Heavy imports stay inside the functions, so that `--help` answers at once.
 
 from __future__ import annotations
 
-import json
-import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
+
+from tools.json_files import JsonFile, write_json
 
 if TYPE_CHECKING:
     from augment.scene import Scene
@@ -85,7 +85,7 @@ def fit(
     ego_masks: Path | None = None,
     truth: str | None = None,
     overwrite: bool = False,
-    json_file: _JsonFile = None,
+    json_file: JsonFile = None,
 ) -> int:
     """Reconstruct a scene of Gaussians from recorded images, LiDAR and boxes.
 
@@ -137,12 +137,12 @@ def fit(
         overwrite=overwrite,
     )
     outcome = fit_scene(options)
-    _write_json(json_file, outcome.report)
+    write_json(json_file, outcome.report)
     return outcome.code
 
 
 def inspect(
-    uri: Positional[str], camera_path: Path | None = None, json_file: _JsonFile = None
+    uri: Positional[str], camera_path: Path | None = None, json_file: JsonFile = None
 ) -> int:
     """Show what is in a scene: Gaussians, actors, cameras, frames, LiDAR, labels, problems.
 
@@ -155,12 +155,12 @@ def inspect(
 
     facts = describe_scene(open_with_path(uri, camera_path))
     print(scene_text(facts))
-    _write_json(json_file, facts)
+    write_json(json_file, facts)
     return 0
 
 
 def explain(
-    recipe: Positional[str], scene: str, variant: int = 0, json_file: _JsonFile = None
+    recipe: Positional[str], scene: str, variant: int = 0, json_file: JsonFile = None
 ) -> int:
     """Show the plan: which passes and buffers a recipe takes on a scene, and why.
 
@@ -174,7 +174,7 @@ def explain(
 
     facts = explain_recipe(recipe, scene, variant)
     print(explanation_text(facts))
-    _write_json(json_file, facts)
+    write_json(json_file, facts)
     return 0
 
 
@@ -226,7 +226,7 @@ def bench(
     quick: bool = False,
     scene: str | None = None,
     pictures: Path | None = None,
-    json_file: _JsonFile = None,
+    json_file: JsonFile = None,
 ) -> int:
     """Measure speed and error on this machine.
 
@@ -284,7 +284,7 @@ def bench(
         result = bench_raster(repeats=repeats, quick=quick)
         text = bench_text(result)
     print(text)
-    _write_json(json_file, result)
+    write_json(json_file, result)
     return 0
 
 
@@ -300,7 +300,10 @@ def demo(out: Path = Path("out/demo"), frames: int = 10) -> int:
     return run_demo(out, frames)
 
 
-_JsonFile = Annotated[Path | None, arg(name="json", metavar="FILE")]
+def style() -> int:
+    """Colour moods: apply one to a scene, train the network behind them, list the presets."""
+    print("climategs style apply | train | presets; climategs style --help says more")
+    return 0
 
 
 def open_with_path(uri: str, camera_path: Path | None) -> Scene:
@@ -313,15 +316,3 @@ def open_with_path(uri: str, camera_path: Path | None) -> Scene:
     from adapters.cameras.paths import with_camera_path
 
     return with_camera_path(scene, camera_path)
-
-
-def _write_json(path: Path | None, facts: dict[str, Any]) -> None:
-    if path is None:
-        return
-    from augment.errors import OutputError
-
-    try:
-        path.write_text(json.dumps(facts, indent=2) + "\n")
-    except OSError as error:
-        raise OutputError(f"cannot write {path}: {error.strerror}") from error
-    print(f"wrote {path}", file=sys.stderr)

@@ -28,11 +28,13 @@ def warm_up(recipes: Sequence[Recipe]) -> float:
     seen = set()
     for recipe in recipes:
         flood, snow, output = recipe.weather.flood, recipe.weather.snow, recipe.output
-        if flood is None and snow is None:
+        style = recipe.style if recipe.style and recipe.style.changes else None
+        if flood is None and snow is None and style is None:
             continue
         ids = output.semantic or output.instance
         water, light = flood and flood.reflection, snow and snow.shading
-        kernels = (water, light, output.depth, ids, output.surface)
+        worn = style and (style.applied_to, style.method)
+        kernels = (water, light, output.depth, ids, output.surface, worn)
         if kernels not in seen:
             seen.add(kernels)
             level_z_m = 0.0 if flood is None else flood.level_m
