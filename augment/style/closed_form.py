@@ -63,9 +63,8 @@ LAND_LIMITS = Limits()
 # A sky is smooth: gains show its steps of 8 bits; and a plain sky (overcast) is a wish.
 SKY_LIMITS = Limits(most_gain=2.0, least_contrast=0.2)
 
-_UNLIMITED_STRENGTH = 1.0  # up to here a map lies between the identity and one within its limits
 _SMALL_SHARE, _LARGE_SHARE = 0.02, 0.15  # of a picture: where a region's own map begins and is full
-_ROOM = 1.5  # standard deviations that a limited map keeps between its mean and black or white
+_ROOM = 2.0  # standard deviations that a limited map keeps between its mean and black or white
 
 
 def mkl_map(
@@ -78,7 +77,7 @@ def mkl_map(
     b = target - M mean_c, the target being the style's mean as far as the limits let it
     (see `_target_mean`).
     """
-    return _mapped(content, style, limits, 1.0, _mkl_gain)
+    return _mapped(content, style, limits, 1.0, _MKL)
 
 
 def reinhard_map(
@@ -87,7 +86,7 @@ def reinhard_map(
     """Mean and standard deviation of each channel of RGB (Reinhard et al. 2001, eq. 10-11, without
     their change of colour space), float64, diagonal, within the limits.
     """
-    return _mapped(content, style, limits, 1.0, _reinhard_gain)
+    return _mapped(content, style, limits, 1.0, _REINHARD)
 
 
 def closed_maps(
@@ -112,10 +111,10 @@ def closed_maps(
         raise ValueError(f"method must be mkl or reinhard; got {method!r}")
     if not 0 <= strength <= 2:
         raise ValueError(f"strength must be in [0, 2]; got {strength}")
-    gain = _mkl_gain if method == "mkl" else _reinhard_gain
+    form = _MKL if method == "mkl" else _REINHARD
 
     def between(region: str, limits: Limits = LAND_LIMITS) -> Tensor:
-        return _mapped(content[region], style[region], limits, strength, gain)
+        return _mapped(content[region], style[region], limits, strength, form)
 
     picture = between(WHOLE)
     own_sky = _both(content, style, SKY)
@@ -152,7 +151,12 @@ def _of_class(value: int, regions: dict[str, Tensor], land: Tensor, sky: Tensor)
     return regions.get(REGION_OF_CLASS.get(kind, REST), land)
 
 
-Gain = Callable[[np.ndarray, np.ndarray, Limits], np.ndarray]  # of two covariances
+@dataclass(frozen=True)
+class _Form:
+    """gain: the 3 x 3 between two floored covariances. limited: one like it within limits."""
+
+    gain: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    limited: Callable[[np.ndarray, Limits], np.ndarray]
 
 
 def _mapped(
@@ -160,15 +164,15 @@ def _mapped(
     style: ColorStatistics,
     limits: Limits,
     strength: float,
-    gain: Gain,
+    form: _Form,
 ) -> Tensor:
     floor = limits.floor**2 * np.eye(3)
-    full = _limited(gain(content.covariance + floor, style.covariance + floor, limits), limits)
+    full = form.limited(form.gain(content.covariance + floor, style.covariance + floor), limits)
     target = _target_mean(content, style, full, floor)
     matrix = np.eye(3) + strength * (full - np.eye(3))
     mean = content.mean + strength * (target - content.mean)
-    if strength > _UNLIMITED_STRENGTH:
-        matrix = _limited(matrix, limits)
+    if strength > 1:  # up to 1 it lies between the identity and a map within the limits
+        matrix = form.limited(matrix, limits)
         room = np.minimum(np.sqrt(np.diag(matrix @ (content.covariance + floor) @ matrix.T)), 0.5)
         lowest = np.minimum(room, np.minimum(content.mean, target))
         highest = np.maximum(1 - room, np.maximum(content.mean, target))
@@ -177,9 +181,9 @@ def _mapped(
     return torch.from_numpy(np.concatenate([matrix, offset[:, None]], axis=1))
 
 
-def _mkl_gain(content: np.ndarray, style: np.ndarray, limits: Limits) -> np.ndarray:
+def _mkl_gain(content: np.ndarray, style: np.ndarray) -> np.ndarray:
     values, vectors = np.linalg.eigh(content)
-    values = np.maximum(values, limits.floor**2)  # the least there is, but for rounding
+    values = np.maximum(values, 1e-12)  # with a floor only rounding comes below it
     root = (vectors * np.sqrt(values)) @ vectors.T
     inverse = (vectors / np.sqrt(values)) @ vectors.T
     middle, axes = np.linalg.eigh(root @ style @ root)
@@ -188,10 +192,13 @@ def _mkl_gain(content: np.ndarray, style: np.ndarray, limits: Limits) -> np.ndar
     return (matrix + matrix.T) / 2
 
 
-def _reinhard_gain(content: np.ndarray, style: np.ndarray, limits: Limits) -> np.ndarray:
-    # Each channel carries contrast, so each keeps the least that contrast has.
-    ratio = np.sqrt(np.diag(style) / np.diag(content))
-    return np.diag(np.clip(ratio, limits.least_contrast, limits.most_gain))
+def _reinhard_gain(content: np.ndarray, style: np.ndarray) -> np.ndarray:
+    return np.diag(np.sqrt(np.diag(style) / np.diag(content)))
+
+
+def _limited_channels(matrix: np.ndarray, limits: Limits) -> np.ndarray:
+    """The diagonal matrix within the limits; each channel carries contrast, and keeps some."""
+    return np.diag(np.clip(np.diag(matrix), limits.least_contrast, limits.most_gain))
 
 
 def _limited(matrix: np.ndarray, limits: Limits) -> np.ndarray:
@@ -203,6 +210,10 @@ def _limited(matrix: np.ndarray, limits: Limits) -> np.ndarray:
         matrix = (matrix + matrix.T) / 2
     missing = limits.least_contrast - _GREY @ matrix @ _GREY
     return matrix + max(missing, 0.0) * np.outer(_GREY, _GREY)
+
+
+_MKL = _Form(_mkl_gain, _limited)
+_REINHARD = _Form(_reinhard_gain, _limited_channels)
 
 
 def _target_mean(

@@ -12,7 +12,7 @@ import numpy as np
 from augment.style.statistics import LAND, REST, ROAD, SKY, VEGETATION
 
 _SIDE_PX = 128  # the longer side of the picture in which regions are found
-_STEPS = np.geomspace(0.015, 0.3, 24)  # of colour, that may end a sky; the best of them is taken
+_STEPS = np.geomspace(0.015, 0.2, 20)  # of colour, that may end a sky; the best of them is taken
 _LEAST_SHARE = 0.04  # of the picture, or the statistics are of a handful of pixels
 _LEAST_COLUMNS = 0.6  # of the picture's columns that begin with sky
 _LEAST_SIDE_PX = 16  # of a picture that shows anything
@@ -128,18 +128,18 @@ def _is_sky(small: np.ndarray, sky: np.ndarray, steps: np.ndarray) -> bool:
 
     Numbers chosen by eye on photographs of skies and of walls, water, leaves and rooms.
     """
-    share, columns = sky.mean(), sky[: max(1, len(sky) // 25)].all(0).mean()
+    share, columns = sky.mean(), (sky.sum(0) > len(sky) // 25).mean()
     if not _LEAST_SHARE <= share <= 1 - _LEAST_SHARE or columns < _LEAST_COLUMNS:
         return False
-    red, green, blue = small[sky].mean(0)
-    land = small[~sky].mean(0)
-    brighter = float(small[sky].mean() - land.mean())
+    red, green, blue = small[sky].mean(0).tolist()
+    land = small[~sky].mean(0).tolist()
+    brighter = (red + green + blue - sum(land)) / 3
     rougher = float(steps[sky].mean() / max(float(steps[~sky].mean()), 1e-6))
     if rougher > 0.55 or max(red, green, blue) < 0.15 or green > max(red, blue) + 0.07:
         return False  # texture; black; leaves out of focus
     if blue < red - 0.1:
         return brighter > 0.2 and rougher < 0.5  # dusk; else a wall in warm light
-    bluer = float((blue - red) - (land[2] - land[0]))
+    bluer = (blue - red) - (land[2] - land[0])
     return brighter > 0.08 or (brighter > -0.2 and blue - red > 0.12 and bluer > 0.1)
 
 
