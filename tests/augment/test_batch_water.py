@@ -287,7 +287,7 @@ def test_labels_that_cannot_be_measured_fail_their_image(recipe, tmp_path: Path)
 
 
 def test_manifests_of_older_versions_are_read_and_gone_on_with(tmp_path: Path) -> None:
-    """Without the columns that came later: no style; no water or snow, so all surfaces are alike."""
+    """Without the columns that came later: no style; no water or snow, so surfaces are alike."""
     whole, old = tmp_path / "whole", tmp_path / "old"
     run(RenderJob("fake:street", [make_recipe()], whole))
     run(RenderJob("fake:street", [make_recipe()], old, frames=[0, 1]))
