@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,6 +17,9 @@ from augment.cameras import Camera
 from augment.scene import Scene
 from recipes.schema import Recipe
 from recipes.style import Style
+
+if TYPE_CHECKING:
+    from augment.style.maps import StyleMaps
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,14 +36,19 @@ class StoredMaps:
 
         A scene remembers the last few styles only, so this comes right before their pictures.
         """
+        from augment.style.scene_maps import remember_maps
+
+        remember_maps(scene, self.style, self._maps)
+
+    @cached_property
+    def _maps(self) -> StyleMaps:
+        """Always the same object: what pictures make of it is kept as long as it is."""
         import torch
 
         from augment.style.maps import StyleMaps
-        from augment.style.scene_maps import remember_maps
 
         arrays = (self.splats, self.sky, self.picture)
-        maps = StyleMaps(*(torch.from_numpy(array.copy()) for array in arrays))
-        remember_maps(scene, self.style, maps)
+        return StyleMaps(*(torch.from_numpy(array.copy()) for array in arrays))
 
 
 def style_to_apply(recipe: Recipe) -> Style | None:

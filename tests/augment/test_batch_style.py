@@ -145,6 +145,8 @@ def test_maps_travel_with_all_their_bits(searches, tmp_path: Path) -> None:
     expected = make_maps(1 / 3)
     for name in ("splats", "sky", "picture"):
         assert torch.equal(getattr(again, name), getattr(expected, name))
+    stored.take_over(other)
+    assert scene_maps.style_maps(other, stored.style) is again, "what is made of it can be kept"
 
 
 def test_a_style_that_cannot_be_used_leaves_all_as_it_was(searches, tmp_path: Path) -> None:

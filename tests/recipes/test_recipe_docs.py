@@ -32,11 +32,14 @@ def test_every_preset_is_described() -> None:
         assert f"\n| `{name}` |" in PAGE
 
 
-def test_the_examples_load() -> None:
+def test_the_examples_load(tmp_path: Path) -> None:
+    (tmp_path / "looks").mkdir()
+    for name in ("sunset.jpg", "looks/harbour.png"):
+        (tmp_path / name).write_bytes(b"")
     examples = re.findall(r"```yaml\n(.*?)```", PAGE, flags=re.DOTALL)
     assert len(examples) >= 2
     for example in examples:
-        template = parse_recipe(example, source="docs")
+        template = parse_recipe(example, source="docs", folder=tmp_path)
         for variant in range(template.variants):
             template.resolve(variant)
 
