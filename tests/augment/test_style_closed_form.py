@@ -1,0 +1,353 @@
+"""Closed-form colour maps: what they match, that none moves colours less, and where they stop."""
+
+import itertools
+
+import numpy as np
+import pytest
+import torch
+
+from augment.semantics import SemanticClass
+from augment.style.closed_form import (
+    LAND_LIMITS,
+    SKY_LIMITS,
+    Limits,
+    closed_maps,
+    mkl_map,
+    reinhard_map,
+)
+from augment.style.maps import CLASSES, with_strength
+from augment.style.statistics import (
+    LAND,
+    REST,
+    ROAD,
+    SKY,
+    VEGETATION,
+    WHOLE,
+    ColorStatistics,
+    statistics_of,
+)
+
+# Nothing of the limits acts on ordinary statistics with these; the floor is far below any spread.
+FREE = Limits(floor=1e-9, most_gain=1e6, least_gain=1e-6, least_contrast=1e-6)
+METHODS = {"mkl": mkl_map, "reinhard": reinhard_map}
+
+
+def spread(values, seed):
+    """A covariance with these standard deviations along random axes."""
+    axes, _ = np.linalg.qr(np.random.default_rng(seed).standard_normal((3, 3)))
+    return axes @ np.diag(np.square(values)) @ axes.T
+
+
+def photo_like(seed, mean=None, scale=1.0):
+    """Mostly grey variation, as photographs have."""
+    rng = np.random.default_rng(seed)
+    mean = rng.uniform(0.3, 0.6, 3) if mean is None else np.array(mean, float)
+    grey = np.full((3, 3), rng.uniform(0.02, 0.04))
+    covariance = scale**2 * (grey + spread(rng.uniform(0.03, 0.06, 3), seed))
+    return ColorStatistics(mean, covariance)
+
+
+def constant(*color):
+    return ColorStatistics(np.array(color, float), np.zeros((3, 3)))
+
+
+def parts(color_map):
+    values = color_map.numpy()
+    return values[:, :3], values[:, 3]
+
+
+def mapped(color_map, statistics):
+    """Mean and covariance after the map."""
+    matrix, offset = parts(color_map)
+    return matrix @ statistics.mean + offset, matrix @ statistics.covariance @ matrix.T
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_mkl_matches_mean_and_covariance(seed):
+    content, style = photo_like(seed), photo_like(seed + 10)
+    mean, covariance = mapped(mkl_map(content, style, FREE), content)
+    assert mean == pytest.approx(style.mean, abs=1e-12)
+    assert covariance == pytest.approx(style.covariance, abs=1e-11)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_reinhard_matches_mean_and_spread_of_each_channel(seed):
+    content, style = photo_like(seed), photo_like(seed + 10)
+    color_map = reinhard_map(content, style, FREE)
+    mean, covariance = mapped(color_map, content)
+    assert mean == pytest.approx(style.mean, abs=1e-12)
+    assert np.diag(covariance) == pytest.approx(np.diag(style.covariance), abs=1e-11)
+    assert np.count_nonzero(parts(color_map)[0] - np.diag(np.diag(parts(color_map)[0]))) == 0
+
+
+def test_the_floor_changes_ordinary_maps_by_less_than_a_step_of_eight_bits():
+    content, style = photo_like(0), photo_like(10, scale=0.8)
+    mean, covariance = mapped(mkl_map(content, style), content)
+    assert mean == pytest.approx(style.mean, abs=1e-12)
+    assert covariance == pytest.approx(style.covariance, abs=LAND_LIMITS.floor**2)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_mkl_is_symmetric_positive_definite_and_moves_colours_least(seed):
+    content, style = photo_like(seed), photo_like(seed + 10)
+    matrix, _ = parts(mkl_map(content, style, FREE))
+    assert np.array_equal(matrix, matrix.T) and np.linalg.eigvalsh(matrix)[0] > 0
+
+    def cost(linear):  # the mean squared move, but for the means' part, the same for all
+        moved = linear - np.eye(3)
+        return np.trace(moved @ content.covariance @ moved.T)
+
+    def root(covariance):
+        values, vectors = np.linalg.eigh(covariance)
+        return (vectors * np.sqrt(values)) @ vectors.T
+
+    # Every linear map with the style's covariance is S^1/2 R C^-1/2, R orthogonal.
+    inverse = np.linalg.inv(root(content.covariance))
+    rng = np.random.default_rng(seed)
+    for _ in range(200):
+        rotation, _ = np.linalg.qr(rng.standard_normal((3, 3)))
+        other = root(style.covariance) @ rotation @ inverse
+        assert other @ content.covariance @ other.T == pytest.approx(style.covariance)
+        assert cost(other) >= cost(matrix) - 1e-12
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("order", list(itertools.permutations(range(3))))
+def test_channels_have_no_order(method, order):
+    content, style = photo_like(3), photo_like(4)
+    p = np.eye(3)[list(order)]
+
+    def swapped(statistics):
+        return ColorStatistics(p @ statistics.mean, p @ statistics.covariance @ p.T)
+
+    matrix, offset = parts(METHODS[method](content, style))
+    other, other_offset = parts(METHODS[method](swapped(content), swapped(style)))
+    assert other == pytest.approx(p @ matrix @ p.T, abs=1e-10)
+    assert other_offset == pytest.approx(p @ offset, abs=1e-10)
+
+
+def test_brightness_and_contrast_of_both_change_nothing_of_the_matrix():
+    content, style = photo_like(5), photo_like(6)
+
+    def scaled(statistics):
+        return ColorStatistics(0.5 * statistics.mean + 0.1, 0.25 * statistics.covariance)
+
+    matrix, offset = parts(mkl_map(content, style, FREE))
+    other, other_offset = parts(mkl_map(scaled(content), scaled(style), FREE))
+    assert other == pytest.approx(matrix, abs=1e-9)
+    assert other_offset == pytest.approx(0.5 * offset + 0.1 - matrix @ np.full(3, 0.1), abs=1e-9)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(
+    "statistics",
+    [photo_like(0), photo_like(1, mean=(0.99, 0.01, 1.2)), constant(0, 0, 0), constant(1, 0, 0)],
+)
+def test_the_scene_itself_as_style_changes_nothing(method, statistics):
+    color_map = METHODS[method](statistics, statistics)
+    assert color_map == pytest.approx(np.eye(3, 4), abs=1e-6)
+
+
+def test_mapped_pixels_have_the_style_s_statistics():
+    rng = np.random.default_rng(0)
+    pixels = rng.multivariate_normal((0.4, 0.4, 0.5), photo_like(0).covariance, 500)
+    style = photo_like(11)
+    content = statistics_of(pixels)
+    assert content is not None
+    matrix, offset = parts(mkl_map(content, style, FREE))
+    after = statistics_of(pixels @ matrix.T + offset)
+    assert after is not None
+    assert after.mean == pytest.approx(style.mean) and after.share == 1
+    assert after.covariance == pytest.approx(style.covariance, abs=1e-10)
+
+
+EXTREMES = {
+    "black": constant(0, 0, 0),
+    "white": constant(1, 1, 1),
+    "grey": constant(0.5, 0.5, 0.5),
+    "red": constant(1, 0, 0),
+    "greys only": ColorStatistics(np.full(3, 0.4), np.full((3, 3), 0.04)),
+    "one channel": ColorStatistics(np.array([0.5, 0, 0]), np.diag([0.08, 0.0, 0.0])),
+    "noise": ColorStatistics(np.full(3, 0.5), np.eye(3) / 12),
+    "black and white": ColorStatistics(np.full(3, 0.5), np.full((3, 3), 0.25)),
+    "night": ColorStatistics(np.full(3, 0.03), np.full((3, 3), 1e-3) + 1e-4 * np.eye(3)),
+    "street": photo_like(0),
+}
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("limits", [LAND_LIMITS, SKY_LIMITS])
+def test_any_pair_of_extremes_stays_within_the_limits(method, limits):
+    for content, style in itertools.product(EXTREMES.values(), repeat=2):
+        matrix, offset = parts(METHODS[method](content, style, limits))
+        gains = np.linalg.eigvalsh(matrix)
+        assert np.isfinite(matrix).all() and np.isfinite(offset).all()
+        assert gains[0] >= limits.least_gain - 1e-9
+        # The contrast that is given back may lie along no axis of the rest: at most their sum.
+        assert gains[-1] <= limits.most_gain + limits.least_contrast + 1e-9
+        assert matrix.sum() / 3 >= limits.least_contrast - 1e-9, "contrast along grey"
+        mean = matrix @ content.mean + offset
+        assert (mean > -1e-12).all() and (mean < 1 + 1e-12).all()
+
+
+def test_a_constant_style_tints_and_leaves_the_shapes():
+    content = photo_like(0)
+    for color in ((1, 0, 0), (0, 0, 0), (1, 1, 1), (0.8, 0.5, 0.2)):
+        matrix, offset = parts(mkl_map(content, constant(*color)))
+        mean = matrix @ content.mean + offset
+        assert np.abs(mean - color).max() < 0.2
+        assert matrix.sum() / 3 == pytest.approx(LAND_LIMITS.least_contrast)
+        # Two standard deviations on either side are still colours that a screen can show.
+        deviations = np.sqrt(np.diag(matrix @ content.covariance @ matrix.T))
+        assert (mean - 2 * deviations > -0.02).all() and (mean + 2 * deviations < 1.02).all()
+
+
+def test_a_grey_style_takes_the_colour_out_and_keeps_the_contrast():
+    content, grey = photo_like(0), EXTREMES["greys only"]
+    _, covariance = mapped(mkl_map(content, grey), content)
+    across = np.eye(3) - 1 / 3
+    before = np.trace(across @ content.covariance @ across)
+    assert np.trace(across @ covariance @ across) < 0.05 * before
+    assert covariance.sum() == pytest.approx(grey.covariance.sum(), rel=0.02)
+
+
+def test_black_content_takes_the_mean_and_no_noise():
+    matrix, offset = parts(mkl_map(EXTREMES["black"], EXTREMES["street"]))
+    assert offset == pytest.approx(EXTREMES["street"].mean)
+    assert np.linalg.eigvalsh(matrix)[-1] == pytest.approx(LAND_LIMITS.most_gain)
+
+
+def test_limits_are_checked():
+    for wrong in ({"floor": 0.0}, {"most_gain": 0.5}, {"least_gain": 0.6}, {"least_contrast": 2.0}):
+        with pytest.raises(ValueError, match="limits need"):
+            Limits(**wrong)
+
+
+def shared(seed, share, **keywords):
+    statistics = photo_like(seed, **keywords)
+    return ColorStatistics(statistics.mean, statistics.covariance, share)
+
+
+def scene(seed, *regions, share=0.25):
+    """Statistics of WHOLE and the regions."""
+    return {WHOLE: shared(seed, 1.0)} | {
+        region: shared(seed + 1 + at, share) for at, region in enumerate(regions)
+    }
+
+
+def maps(content, style, *, method="mkl", strength=1.0, per_region=False):
+    return closed_maps(content, style, method=method, strength=strength, per_region=per_region)
+
+
+def test_sky_and_land_have_their_own_maps_where_both_sides_show_them():
+    content, style = scene(0, SKY, LAND), scene(20, SKY, LAND)
+    found = maps(content, style)
+    assert found.splats.shape == (1, 3, 4) and found.splats.dtype == torch.float32
+    assert torch.equal(found.sky, mkl_map(content[SKY], style[SKY], SKY_LIMITS).float())
+    assert torch.equal(found.splats[0], mkl_map(content[LAND], style[LAND]).float())
+    assert torch.equal(found.picture, mkl_map(content[WHOLE], style[WHOLE]).float())
+
+
+@pytest.mark.parametrize("one_sided", [(), (SKY, LAND)])
+def test_one_map_for_all_where_a_side_shows_no_sky(one_sided):
+    for content, style in (
+        (scene(0), scene(20, *one_sided)),
+        (scene(0, *one_sided), scene(20)),
+    ):
+        found = maps(content, style)
+        assert torch.equal(found.sky, found.picture) and torch.equal(found.splats[0], found.picture)
+
+
+def test_regions_have_maps_of_their_own_by_class():
+    regions = (SKY, LAND, ROAD, VEGETATION, REST)
+    content, style = scene(0, *regions), scene(20, *regions)
+    found = maps(content, style, per_region=True)
+    assert found.splats.shape == (CLASSES, 3, 4)
+
+    def own(region):
+        return mkl_map(content[region], style[region]).float()
+
+    for kind, expected in (
+        (SemanticClass.ROAD, own(ROAD)),
+        (SemanticClass.LANE_MARKING, own(ROAD)),
+        (SemanticClass.VEGETATION, own(VEGETATION)),
+        (SemanticClass.VEHICLE, own(REST)),
+        (SemanticClass.SKY, found.sky),
+        (SemanticClass.UNKNOWN, own(LAND)),
+        (SemanticClass.SNOW, own(LAND)),
+    ):
+        assert torch.equal(found.splats[kind], expected), kind
+
+
+def test_a_small_region_fades_into_the_land_without_a_step():
+    regions = (SKY, LAND, ROAD)
+    style = scene(20, *regions)
+
+    def road(share):
+        content = scene(0, *regions)
+        content[ROAD] = ColorStatistics(content[ROAD].mean, content[ROAD].covariance, share)
+        return maps(content, style, per_region=True).splats[SemanticClass.ROAD]
+
+    land = maps(scene(0, *regions), style).splats[0]
+    shares = np.linspace(0.005, 0.2, 40)
+    distances = [float((road(share) - land).abs().max()) for share in shares]
+    assert distances[0] == 0 and distances[-1] == distances[-5] > 0.05
+    assert distances == sorted(distances)
+    assert max(np.diff(distances)) < 0.08 * distances[-1]
+
+
+def test_regions_without_a_partner_take_the_land_s_map():
+    content, style = scene(0, SKY, LAND, ROAD), scene(20, SKY, LAND, VEGETATION)
+    found = maps(content, style, per_region=True)
+    others = [kind for kind in SemanticClass if kind is not SemanticClass.SKY]
+    assert all(torch.equal(found.splats[kind], found.splats[0]) for kind in others)
+    assert torch.equal(found.splats[0], mkl_map(content[LAND], style[LAND]).float())
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("per_region", [False, True])
+def test_strength_zero_is_the_identity_to_the_bit_and_half_lies_between(method, per_region):
+    regions = (SKY, LAND, ROAD)
+    content, style = scene(0, *regions), scene(20, *regions)
+    full = maps(content, style, method=method, per_region=per_region)
+    none = maps(content, style, method=method, strength=0.0, per_region=per_region)
+    half = maps(content, style, method=method, strength=0.5, per_region=per_region)
+    for name in ("splats", "sky", "picture"):
+        value = getattr(full, name)
+        assert torch.equal(getattr(none, name), torch.eye(3, 4).expand_as(value))
+        assert torch.allclose(getattr(half, name), with_strength(value, 0.5), atol=1e-6)
+
+
+def test_strength_two_goes_on_straight_where_no_limit_acts():
+    content = photo_like(0, mean=(0.45, 0.45, 0.45), scale=0.5)
+    style = ColorStatistics(np.array([0.5, 0.48, 0.44]), 1.21 * content.covariance)
+    full, double = (
+        maps({WHOLE: content}, {WHOLE: style}, strength=strength).picture for strength in (1.0, 2.0)
+    )
+    assert torch.allclose(double, with_strength(full, 2.0), atol=1e-5)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_strength_two_of_extremes_turns_no_colour_round(method):
+    for content, style in itertools.product(EXTREMES.values(), repeat=2):
+        color_map = maps({WHOLE: content}, {WHOLE: style}, method=method, strength=2.0).picture
+        matrix, offset = parts(color_map.double())
+        gains = np.linalg.eigvalsh(matrix)
+        assert gains[0] > 0.04 and gains[-1] < 3.5
+        mean = matrix @ content.mean + offset
+        assert (mean > -1e-6).all() and (mean < 1 + 1e-6).all()
+
+
+def test_strength_goes_through_one_without_a_step():
+    content, style = {WHOLE: photo_like(0)}, {WHOLE: EXTREMES["red"]}
+    before, after = (maps(content, style, strength=s).picture for s in (1.0, 1.0 + 1e-6))
+    assert torch.allclose(before, after, atol=1e-4)
+
+
+def test_wrong_method_and_strength_are_refused(unchecked):
+    content = {WHOLE: photo_like(0)}
+    with pytest.raises(ValueError, match="mkl or reinhard; got 'gscm'"):
+        maps(content, content, method="gscm")
+    for strength in (-0.1, 2.1, float("nan")):
+        with pytest.raises(ValueError, match="strength must be in"):
+            maps(content, content, strength=strength)
