@@ -95,7 +95,9 @@ def file_below(folder: Path, written: str) -> Path:
     try:
         check_file(path)
     except FileNotFoundError:
-        raise ValueError(f"there is no such file in {where}{_near(path)}") from None
+        near = _near(path)
+        hint = f"did you mean {near}?" if near else "put the file beside the recipe or below it"
+        raise ValueError(f"there is no such file in {where}; {hint}") from None
     return path
 
 
@@ -152,12 +154,12 @@ def _checked(style: Style, hashes: Mapping[str, str]) -> str:
     return digest
 
 
-def _near(path: Path) -> str:
+def _near(path: Path) -> str | None:
     """What of the folder may have been meant."""
     try:
         with os.scandir(path.parent) as entries:
             names = [entry.name for entry, _ in zip(entries, range(MOST_NAMES), strict=False)]
     except OSError:
-        return ""
+        return None
     near = nearest_word(path.name, tuple(sorted(names)))
-    return f"; did you mean {short(near)}?" if near else ""
+    return short(near) if near else None

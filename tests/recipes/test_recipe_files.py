@@ -75,7 +75,7 @@ def test_a_file_is_found_from_the_recipes_folder(
         ("../recipes/sunset.jpg", "leads out of the recipe's folder"),
         ("sunst.jpg", "; did you mean sunset.jpg?"),
         ("sunset.jpg/x", "there is no such file in "),
-        ("nowhere/sunset.jpg", "there is no such file in "),
+        ("nowhere/sunset.jpg", "; put the file beside the recipe or below it"),
         ("looks", "is a folder, not a file"),
         (".", "is a folder, not a file"),
         ('"a\\0b"', "cannot be found: "),
@@ -209,3 +209,4 @@ def test_what_is_written_from_the_folder_reads_back(folder: Path) -> None:
         dump_recipe(recipe.model_copy(update={"style": named})), encoding="utf-8"
     )
     assert load_recipe(folder / "numbers.yaml").resolve(0) == recipe
+    assert Recipe.model_validate(recipe.model_dump()) == recipe

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import pytest
 
@@ -10,6 +11,8 @@ from recipes.flood import Flood
 from recipes.load import load_recipe
 from recipes.schema import KOSCHMIEDER, Weather
 from recipes.values import Uniform, as_number
+
+PAGE = (Path(__file__).parents[2] / "docs" / "recipes.md").read_text(encoding="utf-8")
 
 
 def arriving(name: str, distance_m: float) -> tuple[float, float]:
@@ -147,3 +150,34 @@ def test_fog_over_snow() -> None:
     fogs = [load_recipe(name).resolve(0).weather.smog for name in SNOWS]
     assert [fog is not None for fog in fogs] == [name == "winter-fog" for name in SNOWS]
     assert fogs[-1] is not None and fogs[-1].scale_height_m is None, "the sky is hidden"
+
+
+STYLES = {
+    "overcast": {"overcast"},
+    "evening": {"golden-hour", "dusk", "blue-hour"},
+    "rainy-day": {"rain"},
+    "winter-day": {"snow-light"},
+}
+
+
+@pytest.mark.parametrize("name", STYLES)
+def test_styled_presets_are_of_the_styles_documented(name: str) -> None:
+    template = load_recipe(name)
+    low, high = dict(template.values)["style.strength"].probes()
+    (row,) = [line for line in PAGE.splitlines() if line.startswith(f"| `{name}` |")]
+    assert f", {low:g} to {high:g} |" in row and all(f"`{style}`" in row for style in STYLES[name])
+    recipes = [template.resolve(i) for i in range(20)]
+    drawn = [recipe.style for recipe in recipes if recipe.style is not None]
+    assert len(drawn) == 20 and {style.preset for style in drawn} == STYLES[name]
+    has_weather = {"rainy-day", "winter-day"}
+    assert all((recipe.weather != Weather()) == (name in has_weather) for recipe in recipes)
+
+
+def test_weather_of_styled_days() -> None:
+    assert dict(load_recipe("winter-day").values)["weather.snow.depth_m"] == Uniform(0.05, 0.15)
+    low, high = dict(load_recipe("rainy-day").values)["weather.smog.visibility_m"].probes()
+    assert (low, high) == (600, 1500)
+    levels = dict(load_recipe("rainy-day").values)["weather.flood.level_m"]
+    assert levels == Uniform(-0.02, 0.02)
+    flood = load_recipe("rainy-day").resolve(0).weather.flood
+    assert flood is not None and flood.reference == "median"
