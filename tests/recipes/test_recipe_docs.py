@@ -12,6 +12,7 @@ from recipes.errors import RecipeError
 from recipes.fields import ROOT
 from recipes.load import preset_names
 from recipes.parse import parse_recipe
+from recipes.style_presets import style_preset_names
 
 PAGE = (Path(__file__).parents[2] / "docs" / "recipes.md").read_text(encoding="utf-8")
 
@@ -30,6 +31,11 @@ def test_every_key_has_a_row() -> None:
 def test_every_preset_is_described() -> None:
     for name in preset_names():
         assert f"\n| `{name}` |" in PAGE
+
+
+def test_every_style_is_described() -> None:
+    section = PAGE.partition("\n## Style\n")[2].partition("\n## ")[0]
+    assert re.findall(r"\n\| `(.*?)` \| [a-z]", section) == list(style_preset_names())
 
 
 def test_the_examples_load(tmp_path: Path) -> None:
