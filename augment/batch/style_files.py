@@ -78,8 +78,7 @@ def copy_style_files(recipe: Recipe, folder: Path) -> None:
 
 def _safe_name(path: str) -> str:
     """The file's name as `folder_name` has it, with its suffix still at the end."""
-    name = PurePath(path).name
-    if folder_name(name) == name:
-        return name
-    suffix = PurePath(name).suffix
-    return folder_name(name) + (suffix if _SUFFIX.fullmatch(suffix) else "")
+    name = PurePath(path)
+    if _SUFFIX.fullmatch(name.suffix):
+        return folder_name(name.stem) + name.suffix
+    return folder_name(name.name)

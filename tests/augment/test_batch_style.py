@@ -248,13 +248,16 @@ def test_files_keep_their_names_but_for_collisions(files: dict, names: list[str]
     assert list(stored_names(style).values()) == [f"style/{name}" for name in names]
 
 
-@pytest.mark.parametrize("name", ["été 3.JPG", "..png", "-x.png", "manifest.parquet", "a" * 200])
+@pytest.mark.parametrize(
+    "name", ["été 3.JPG", "..png", "-x.png", "a.b c", "a" * 200, "b" * 200 + ".png"]
+)
 def test_unsafe_names_become_safe_ones_and_then_stay(name: str) -> None:
     first = stored_names(Style(image=f"/photos/{name}"))["image"]
     assert first != f"style/{name}" and first.isascii() and " " not in first
-    assert Path(first).suffix == Path(name).suffix and len(first) < 140
+    assert first.endswith((".JPG", ".png")) == name.endswith((".JPG", ".png"))
+    assert len(first) < 140
     assert stored_names(Style(image=f"/out/{first}"))["image"] == first
-    other = stored_names(Style(image=f"/photos/{name}x"))["image"]
+    other = stored_names(Style(image=f"/photos/x{name}"))["image"]
     assert other != first
 
 
