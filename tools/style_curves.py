@@ -38,7 +38,7 @@ def draw_style_curves(history: Sequence[Mapping[str, Any]]) -> np.ndarray | None
         return Line(label, points, color, marked) if points else None
 
     terms = [line(name, name, color) for name, color in zip(TERMS, _COLORS, strict=True)]
-    panels = [Panel("losses before their weights (log scale)", _known(terms), log=True)]
+    panels = [Panel("losses (log scale)", _known(terms), log=True)]
     for name, (title, log) in _PANELS.items():
         own = line(name, "", _COLORS[0], marked=name not in ("loss", "pairs"))
         panels.append(Panel(title, _known([own]), log=log))

@@ -41,7 +41,7 @@ from tools.style_curves import draw_style_curves
 from tools.style_train_options import StyleTrainOptions, uri_text
 
 NETWORK_FILE, REPORT_FILE, CURVES_FILE = "network.safetensors", "report.json", "curves.png"
-ROW_STEPS = 50  # averaged into one row of the history
+ROWS, ROW_STEPS = 40, 50  # of the history; steps averaged into one, at most
 SCORED = 16  # contents with a style each, by which a network is scored
 TIMED, UNTIMED = 8, 2  # steps from which the number of them is estimated
 RESERVE = 0.05  # of the time, for scores and checkpoints
@@ -294,7 +294,8 @@ def _add(run: _Run, record: StepRecord) -> None:
     for name, value in record.terms.items():  # of a part of the steps, where the warm-up ends
         run.sums[f"sum.{name}"] = run.sums.get(f"sum.{name}", 0.0) + value
         run.sums[f"count.{name}"] = run.sums.get(f"count.{name}", 0.0) + 1
-    if record.step % ROW_STEPS and record.step != run.plan.steps:
+    length = min(max(run.plan.steps // ROWS, 1), ROW_STEPS)
+    if record.step % length and record.step != run.plan.steps:
         return
     sums, run.sums = run.sums, {}
     names = [name.removeprefix("sum.") for name in sums if name.startswith("sum.")]

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 import torch.nn.functional as F
@@ -24,6 +24,7 @@ from augment.errors import StyleError
 Features = tuple[Tensor, ...]  # [B, C, h, w] of every layer
 
 
+@runtime_checkable
 class FeatureExtractor(Protocol):
     """Pictures [B, 3, H, W], display-encoded RGB about [0, 1], become layers of features.
 

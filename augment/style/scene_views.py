@@ -97,9 +97,9 @@ def spread_cameras(scene: Scene, count: int) -> list[Camera]:
             f"scene {scene.name!r} ({scene.source}) has no cameras to look through; name some with "
             f"camera_path=FILE in its URI"
         )
-    total = sum(map(len, groups))
+    count = min(count, sum(map(len, groups)))
     chosen: dict[int, Camera] = {}
-    for number in range(min(count, total)):
+    for number in range(count):
         group = groups[number % len(groups)]
         camera = group[int((number + 0.5) / count * len(group))]
         chosen.setdefault(id(camera), camera)

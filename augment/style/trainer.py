@@ -12,7 +12,7 @@ import contextlib
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -36,6 +36,7 @@ THREADS = 1
 CYCLE, CONSISTENCY, STYLE, PAIRS = "cycle", "consistency", "style", "pairs"
 
 
+@runtime_checkable
 class PairLoss(Protocol):
     """The loss of a batch of self-supervised pairs of pictures, drawn with the generator."""
 
@@ -100,7 +101,13 @@ class StyleTrainer:
         config, step = self.config, self.step
         self._train_mode()
         with fixed_threads(), _own_generator(config.seed, step):
-            terms = self._terms(step)
+            try:
+                terms = self._terms(step)
+            except torch.linalg.LinAlgError as error:  # of a picture under a map that is not finite
+                raise StyleError(
+                    f"the pictures are no longer numbers in step {step + 1} ({error}): train with "
+                    f"a smaller learning rate"
+                ) from error
             loss = weighted_sum(terms, self._weights(step))
             value = float(loss.detach())
             if not math.isfinite(value):
