@@ -11,6 +11,7 @@ clamped, or is after it, the picture is not the map of the picture.
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,7 +36,7 @@ def style_gaussians(
     map changes anything.
 
     out: where the SH are written, contiguous and of their shape and dtype; may be `gaussians.sh`
-    itself. New memory by default, whose first touch takes longer than the arithmetic. fast: float32
+    itself. New memory by default, whose first touch takes as long as the mapping. fast: float32
     without gradients goes through the CPU kernel, equal to `map_sh` within float rounding.
 
     Raises:
@@ -54,10 +55,9 @@ def style_gaussians(
         if out is not None:
             mapped = out.copy_(mapped)
         return dataclasses.replace(gaussians, sh=mapped)
-    target = torch.empty(tuple(sh.shape)) if out is None else out
-    # Kernels stream into aligned memory, as torch's own is; a view may begin anywhere.
-    aligned = target.data_ptr() % sh_kernels.ALIGNMENT == 0
-    written = target if aligned else torch.empty(tuple(sh.shape))
+    target = _new_memory(sh.shape) if out is None else out
+    aligned = target.data_ptr() % sh_kernels.ALIGNMENT == 0  # a view may begin anywhere
+    written = target if aligned else _new_memory(sh.shape)
     with kernel_threads(BLOCKS):
         sh_kernels.map_sh(
             sh.detach().contiguous().numpy().reshape(-1),
@@ -138,6 +138,17 @@ def styled_scene(scene: Scene, maps: StyleMaps) -> Scene:
         ),
         sky=style_sky(scene.sky, maps.sky),
     )
+
+
+def _new_memory(shape: tuple[int, ...]) -> Tensor:
+    """Float32 of any values, aligned for the kernel. From NumPy, which asks the system for huge
+    pages: the first touch of memory from torch takes several times as long as the mapping.
+    """
+    count = math.prod(shape)
+    spare = sh_kernels.ALIGNMENT // 4
+    memory = np.empty(count + spare, np.float32)
+    first = -memory.ctypes.data % sh_kernels.ALIGNMENT // 4
+    return torch.from_numpy(memory[first : first + count]).view(tuple(shape))
 
 
 def _mapped(rgb: Tensor, color_map: Tensor) -> Tensor:
