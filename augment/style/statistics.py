@@ -65,8 +65,14 @@ def statistics_of(
     weight = float(w.sum())
     if weight <= 0:
         return None
-    mean = (w[:, None] * rgb).sum(0) / weight
-    centred = rgb - mean
-    covariance = (w[:, None] * centred).T @ centred / weight
+    # einsum sums in one order, whatever the threads of a BLAS
+    mean = np.einsum("n,nc->c", w, rgb) / weight
+    channels = np.ascontiguousarray((rgb - mean).T)
+    covariance = np.empty((3, 3))
+    for i, channel in enumerate(channels):
+        weighted = w * channel
+        for j in range(i + 1):
+            product = np.einsum("n,n->", weighted, channels[j]) / weight
+            covariance[i, j] = covariance[j, i] = product
     whole = weight if total is None else total
-    return ColorStatistics(mean, (covariance + covariance.T) / 2, weight / whole)
+    return ColorStatistics(mean, covariance, weight / whole)
