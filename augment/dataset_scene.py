@@ -15,9 +15,11 @@ from augment.batch.layout import PATH_KINDS, variant_name
 from augment.batch.runner import Renderer, default_renderer
 from augment.batch.selection import SceneIndex, select_frames
 from augment.batch.snow_beds import find_bed, remember, snow_to_lay
+from augment.batch.style_maps import store_maps
 from augment.batch.writer import check_view
 from augment.dataset_samples import ImageType, Pixels, make_sample
 from augment.scene import Scene
+from recipes.files import with_digest
 from recipes.schema import Recipe
 
 
@@ -27,13 +29,15 @@ class SceneDataset(Dataset):
     The pixels are those of the files: depth is in steps of 1/256 m, and where the recipe writes
     JPEG the image passes through JPEG in memory. `paths` holds only None.
 
-    Where the recipe's snow can lie is found here, once for all samples and worker processes.
+    Where the recipe's snow can lie and which maps its style takes are found here, once for all
+    samples and worker processes.
 
     scene: an open scene. frames, cameras: what to keep, None for all. backend: as in `rasterize`.
     renderer: `augment.apply.render_view` if None.
 
     Raises:
         SceneError: an unknown frame or camera, or the scene cannot have the recipe's snow.
+        RecipeError, StyleError: a file of the recipe's style cannot be used.
         BackendUnavailable, ValueError: the backend.
     """
 
@@ -50,7 +54,7 @@ class SceneDataset(Dataset):
     ) -> None:
         if image_type not in ("float32", "uint8"):
             raise ValueError(f"image_type must be 'float32' or 'uint8'; got {image_type!r}")
-        self.scene, self.recipe = scene, recipe
+        self.scene, self.recipe = scene, with_digest(recipe)
         self.image_type: ImageType = image_type
         self._backend = choose_backend(backend, scene) if renderer is None else backend
         self._renderer = renderer or default_renderer()
@@ -60,13 +64,16 @@ class SceneDataset(Dataset):
 
         snow = snow_to_lay(recipe)
         self._bed = None if snow is None else find_bed(scene, snow)
+        self._maps = store_maps(scene, [self.recipe])
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """In another process the scene is another object, which knows of no bed yet."""
+        """In another process the scene is another object, which knows of no bed and no maps yet."""
         self.__dict__.update(state)
         snow = snow_to_lay(self.recipe)
         if snow is not None and self._bed is not None:
             remember(self.scene, snow, self._bed)
+        for maps in self._maps:
+            maps.take_over(self.scene)
 
     def __len__(self) -> int:
         return len(self._items)

@@ -40,9 +40,10 @@ def explanation_text(facts: dict[str, Any]) -> str:
         f"scene  {scene['name']} ({scene['source']}): {len(scene['cameras'])} cameras x "
         f"{scene['frames']} frames, {images} images in all variants",
         "",
-        "weather in numbers:",
+        "effects in numbers:",
     ]
-    effects = {name: numbers for name, numbers in recipe["weather"].items() if numbers}
+    effects = {"style": recipe["style"], **recipe["weather"]}
+    effects = {name: numbers for name, numbers in effects.items() if numbers}
     lines += [
         f"  {path} = {value}" for name in effects for path, value in _flat(name, effects[name])
     ] or ["  none: this is the clean render"]

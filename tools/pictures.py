@@ -116,6 +116,8 @@ def _weather(row: dict[str, Any]) -> str:
     from recipes.schema import KOSCHMIEDER
 
     said = []
+    if style := row.get("style"):
+        said.append(f"{style} x {row['style_strength']:.2g}")
     if extinction := row["smog_extinction_per_m"]:
         said.append(f"visibility {KOSCHMIEDER / extinction:.0f} m")
     if math.isfinite(level := _water_level(row)):

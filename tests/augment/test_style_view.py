@@ -1,6 +1,7 @@
 """Styles in finished views: what is mapped, what is not, and in which order."""
 
 import dataclasses
+import pickle
 
 import cv2
 import numpy as np
@@ -8,11 +9,13 @@ import pytest
 import torch
 
 from augment.apply import render_buffers, render_view
+from augment.dataset_scene import SceneDataset
 from augment.plan import make_plan
 from augment.render.rasterize import rasterize
 from augment.scene import Scene
 from augment.semantics import SemanticClass
 from augment.snow.covers import cover_of
+from augment.style import scene_maps
 from augment.style.looks import look_of
 from augment.style.maps import CLASSES, StyleMaps
 from augment.style.scene_maps import remember_maps, style_maps
@@ -209,3 +212,15 @@ def test_a_plan_says_what_a_style_takes(scene):
     assert step.runs and "dusk" in step.why and "0.5" in step.why and "region" in step.why
     bare = make_plan(recipe_of(None), scene)
     assert plan.buffers == bare.buffers  # no pass of its own
+
+
+def test_samples_take_their_maps_along_to_other_processes(scene, monkeypatch):
+    live = SceneDataset(scene, recipe_of())
+    expected = live[0]["image"]
+    found = style_maps(scene, STYLE)
+    copy = pickle.dumps(live)
+    monkeypatch.setattr(scene_maps, "_find_maps", lambda *_: pytest.fail("looked for again"))
+    other = pickle.loads(copy)
+    assert other.scene is not scene
+    assert torch.equal(style_maps(other.scene, STYLE).splats, found.splats)
+    assert torch.equal(other[0]["image"], expected)

@@ -8,6 +8,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
@@ -75,3 +76,13 @@ def test_a_folder_older_than_floods_is_drawn(folder, monkeypatch) -> None:
         "no weather)",
         "visibility 40 m)",
     ]
+
+
+def test_a_row_says_its_style(folder, monkeypatch) -> None:
+    table = pq.read_table(folder / MANIFEST)
+    for name, value in (("style", "dusk"), ("style_strength", 0.75)):
+        at = table.schema.get_field_index(name)
+        values = pa.array([value] * len(table), table.schema.field(at).type)
+        table = table.set_column(at, table.schema.field(at), values)
+    pq.write_table(table, folder / MANIFEST)
+    assert titles(folder, monkeypatch)[0] == "street, frame 4: clear-000 (dusk x 0.75)"
