@@ -80,9 +80,7 @@ def test_a_folder_older_than_floods_is_drawn(folder, monkeypatch) -> None:
 
 def test_a_row_says_its_style(folder, monkeypatch) -> None:
     table = pq.read_table(folder / MANIFEST)
-    for name, value in (("style", "dusk"), ("style_strength", 0.75)):
-        at = table.schema.get_field_index(name)
-        values = pa.array([value] * len(table), table.schema.field(at).type)
-        table = table.set_column(at, table.schema.field(at), values)
+    table = table.drop_columns("style").append_column("style", pa.array(["dusk"] * len(table)))
+    table = table.append_column("style_strength", pa.array([0.75] * len(table)))
     pq.write_table(table, folder / MANIFEST)
     assert titles(folder, monkeypatch)[0] == "street, frame 4: clear-000 (dusk x 0.75)"
