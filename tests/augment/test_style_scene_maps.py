@@ -13,6 +13,7 @@ from augment.errors import StyleError
 from augment.style import checkpoint, content, scene_maps
 from augment.style.apply import styled_scene
 from augment.style.content import content_pictures, content_statistics
+from augment.style.images import StyleImage
 from augment.style.maps import CLASSES, StyleMaps, identity_map
 from augment.style.network import Gscm
 from augment.style.scene_maps import identity_maps, remember_maps, style_maps
@@ -166,3 +167,19 @@ def test_few_styles_are_remembered(photo):
     assert len(scene_maps._remembered[scene]) == scene_maps.MOST_REMEMBERED
     assert len(scene_maps._given[scene]) == scene_maps.MOST_REMEMBERED
     assert len(content._remembered[scene]) == 1
+
+
+def test_the_network_sees_what_counts_of_the_image():
+    """A square of any shape; what is transparent takes the mean of the rest."""
+    rgb = np.zeros((4, 6, 3), np.float32)
+    rgb[:, :3], rgb[:, 3:] = (0.2, 0.4, 0.6), (0.9, 0.0, 0.0)
+    weights = np.ones((4, 6), np.float32)
+    square = scene_maps._style_picture(StyleImage(rgb, weights, weights > 2))
+    assert square.shape == (1, 3, 256, 256) and square.dtype == torch.float32
+    assert torch.allclose(square[0, :, 100, 0], torch.tensor([0.2, 0.4, 0.6]), atol=1e-6)
+    weights[:, 3:] = 0
+    plain = scene_maps._style_picture(StyleImage(rgb, weights, weights > 2))
+    expected = torch.tensor([0.2, 0.4, 0.6])[:, None, None].expand(3, 256, 256)
+    assert torch.allclose(plain[0], expected, atol=1e-6)
+    one = StyleImage(rgb[:1, :1].copy(), weights[:1, :1].copy(), np.zeros((1, 1), bool))
+    assert torch.allclose(scene_maps._style_picture(one)[0], expected, atol=1e-6)
