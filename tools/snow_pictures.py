@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -132,7 +133,7 @@ def draw_estimators(scene: Scene, truth: StreetTruth) -> np.ndarray:
             f"median error {100 * np.median(size):.1f} cm, {100 * (size > 0.1).mean():.1f} % off "
             f"by more than 10 cm"
         )
-        with_bed = open_scene(STREET)  # beds and covers are remembered by scene
+        with_bed = dataclasses.replace(scene)  # beds and covers are remembered by scene
         remember_bed(with_bed, placement_settings(snow), bed)
         picture = quantise(_frame(with_bed, view, snow).rgb)
         width = map_rgb.shape[1]

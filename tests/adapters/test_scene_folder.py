@@ -20,7 +20,7 @@ from augment.scene import Scene
 from augment.scene_files import save_scene
 from tools.scene_report import describe_scene, scene_text
 
-STREET = "procedural:street?seed=5&frames=6&lidar_columns=16"
+STREET = "procedural:street?seed=5&frames=6&gaussians=60000&lidar_columns=16"
 
 
 def save(tmp_path: Path, **changes) -> Path:

@@ -3,22 +3,29 @@ import math
 
 import pytest
 
-from adapters.base import open_scene
 from augment.weather import flood_view
+from tests.streets import SMALL_STREET, open_street
 from tools import bench_flood, commands
 from tools.bench_flood import FloodCase, flood_text
 from tools.bench_flood_cost import FRONT, MIRROR, STAGES, TIERS, bench_camera, cost_cases
 from tools.bench_flood_masks import neighbours
 
-STREET = "procedural:street?seed=3&frames=2&gaussians=60000&parked=4&moving=1&pedestrians=0"
 TINY = FloodCase(
-    scene=STREET, width=120, height=80, street=STREET, frames=(0, 1), cameras=("front",), scale=0.2
+    scene=SMALL_STREET,
+    width=120,
+    height=80,
+    street=SMALL_STREET,
+    frames=(0, 1),
+    cameras=("front",),
+    scale=0.2,
 )
 
 
 @pytest.fixture(scope="module")
 def figures():
-    return bench_flood.bench_flood(TINY, repeats=2, memory=False, progress=False)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(bench_flood, "open_scene", open_street)
+        return bench_flood.bench_flood(TINY, repeats=2, memory=False, progress=False)
 
 
 def test_figures_are_json_and_hang_together(figures):
@@ -71,7 +78,7 @@ def test_a_view_that_is_not_clean_is_said_loudly(figures):
 
 
 def test_the_camera_sees_a_third_of_water():
-    scene = open_scene(STREET)
+    scene = open_street()
     camera = bench_camera(scene, 120, 80)
     assert (camera.name, camera.width, camera.height) == ("front", 120, 80)
     assert camera.centre.tolist() == scene.frames[1].cameras["front"].centre.tolist()
@@ -80,7 +87,7 @@ def test_the_camera_sees_a_third_of_water():
 
 
 def test_neighbours_go_once_around():
-    cameras = open_scene(STREET).frames[0].cameras
+    cameras = open_street().frames[0].cameras
     ring = ["front", "front_right", "right", "back", "left", "front_left"]
     assert neighbours(cameras) == list(zip(ring, [*ring[1:], ring[0]], strict=True))
 

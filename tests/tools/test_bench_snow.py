@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from adapters.base import open_scene, parse_uri
+from adapters.base import parse_uri
 from adapters.street.truth import open_truth
 from augment.semantics import SemanticClass
 from augment.snow.cells import FLUSH, SnowCells
+from tests.streets import SMALL_STREET, open_street
 from tools import bench_snow, commands
 from tools.bench_snow import SnowCase
 from tools.bench_snow_accuracy import AccuracyCase
@@ -26,12 +27,11 @@ from tools.bench_snow_truth import (
     true_points,
 )
 
-STREET = "procedural:street?seed=3&frames=2&gaussians=60000&parked=4&moving=1&pedestrians=0"
 TINY = SnowCase(
-    scene=STREET,
+    scene=SMALL_STREET,
     width=120,
     height=80,
-    street=STREET,
+    street=SMALL_STREET,
     accuracy=AccuracyCase(reach_m=6.0, pixel_m=0.2, every=2),
     frames=(0,),
     cameras=("front",),
@@ -42,17 +42,19 @@ TINY = SnowCase(
 
 @pytest.fixture(scope="module")
 def figures():
-    return bench_snow.bench_snow(TINY, repeats=2, memory=False, progress=False)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(bench_snow, "open_scene", open_street)
+        return bench_snow.bench_snow(TINY, repeats=2, memory=False, progress=False)
 
 
 @pytest.fixture(scope="module")
 def truth():
-    return still(open_truth(parse_uri(STREET)[2]))
+    return still(open_truth(parse_uri(SMALL_STREET)[2]))
 
 
 @pytest.fixture(scope="module")
 def cameras():
-    scene = open_scene(STREET)
+    scene = open_street()
     return [camera for frame in scene.frames for camera in frame.cameras.values()]
 
 
@@ -186,7 +188,7 @@ def test_returns_behind_most_of_those_about_them_are_hidden():
 
 
 def test_a_street_is_measured_against_its_own_lidar():
-    scene = open_scene(STREET)
+    scene = open_street()
     found = lidar_depths(scene, [0], ["front"], 0.5)
     assert found is not None and set(found) == set(BUFFERS)
     for zones in found.values():

@@ -2,13 +2,13 @@
 
 import cv2
 
+from tests.streets import open_street
 from tools import flood_pictures
 from tools.drawing import CAPTION_PX, GAP_PX
 
 
 def test_three_pictures_of_three_panels(tmp_path, monkeypatch):
-    small = "procedural:street?seed=3&frames=1&gaussians=60000"
-    monkeypatch.setattr(flood_pictures, "STREET", small)
+    monkeypatch.setattr(flood_pictures, "open_scene", lambda _: open_street())
     monkeypatch.setattr(flood_pictures, "FRAME", 0)
     monkeypatch.setattr(flood_pictures, "SCALE", 0.25)
     monkeypatch.setattr(flood_pictures, "REPEATS", 1)

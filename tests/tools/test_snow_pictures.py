@@ -3,13 +3,14 @@
 import cv2
 import numpy as np
 
+from tests.streets import SMALL_STREET, open_street
 from tools import snow_pictures
 from tools.drawing import CAPTION_PX, GAP_PX
 
 
 def test_four_pictures(tmp_path, monkeypatch):
-    small = "procedural:street?seed=3&frames=1&gaussians=60000"
-    monkeypatch.setattr(snow_pictures, "STREET", small)
+    monkeypatch.setattr(snow_pictures, "STREET", SMALL_STREET)
+    monkeypatch.setattr(snow_pictures, "open_scene", open_street)
     monkeypatch.setattr(snow_pictures, "FRAME", 0)
     monkeypatch.setattr(snow_pictures, "SCALE", 0.25)
     monkeypatch.setattr(snow_pictures, "REPEATS", 1)

@@ -1,0 +1,21 @@
+"""Procedural streets for tests: each is built once a process, which takes seconds."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+from adapters import base
+from augment.scene import Scene
+
+# The cheapest street there is: as few Gaussians as it can have, and few things in it.
+SMALL_STREET = "procedural:street?seed=3&frames=2&gaussians=60000&parked=4&moving=1&pedestrians=0"
+
+_built = functools.lru_cache(maxsize=4)(base.open_scene)
+
+
+def open_street(uri: str = SMALL_STREET) -> Scene:
+    """The street of a URI as `open_scene` gives it: a new scene, of which nothing is remembered yet
+    (beds of snow, covers, light), with the arrays of the earlier ones. They must not be changed.
+    """
+    return dataclasses.replace(_built(uri))
