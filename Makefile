@@ -8,7 +8,7 @@ STAMP := $(VENV)/.installed
 .PHONY: help setup demo test lint bench check-system clean
 
 help:
-	@echo "make demo   install, render the embedded street under three recipes, say where the pictures are"
+	@echo "make demo   install, render the embedded street under five recipes, say where the pictures are"
 	@echo "make test   install, run the whole test suite"
 	@echo "make lint   formatting, style and types"
 	@echo "make bench  time the rasteriser on this machine"

@@ -289,7 +289,7 @@ def bench(
 
 
 def demo(out: Path = Path("out/demo"), frames: int = 10) -> int:
-    """Render the embedded street under three recipes, with a contact sheet and a video.
+    """Render the embedded street under five recipes, with a contact sheet and a video.
 
     Args:
         out: The output folder.

@@ -1,4 +1,4 @@
-"""`climategs demo`: the embedded street under three recipes, and pictures of it."""
+"""`climategs demo`: the embedded street under five recipes, and pictures of it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from recipes.load import load_recipe
 from tools.pictures import draw_sheet, draw_video
 from tools.warm_up import warm_up
 
-RECIPES = ("clear", "dense-fog", "street-flood", "fresh-snow")
+RECIPES = ("clear", "dense-fog", "street-flood", "fresh-snow", "evening")
 CAMERA = "front"  # the one that is shown as a video
 
 
