@@ -103,7 +103,7 @@ class StyleTrainer:
         with fixed_threads(), _own_generator(config.seed, step):
             try:
                 terms = self._terms(step)
-            except torch.linalg.LinAlgError as error:  # of a picture under a map that is not finite
+            except torch.linalg.LinAlgError as error:  # pyright: ignore[reportPrivateImportUsage]
                 raise StyleError(
                     f"the pictures are no longer numbers in step {step + 1} ({error}): train with "
                     f"a smaller learning rate"
