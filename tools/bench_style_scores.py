@@ -1,0 +1,75 @@
+"""How well methods do on photographs that no network was trained on (augment.style.scores)."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from augment.style.scores import (
+    Method,
+    closed_method,
+    identity_method,
+    least_squares_limit,
+    network_method,
+    score_harm,
+    score_pairs,
+)
+from augment.style.train_photos import read_photos
+from tools.bench_style_network import BenchNetwork
+
+HOLDOUT = 8  # as `climategs style train` holds photos out by default
+LEAST_PHOTOS = 2
+
+
+@dataclass(frozen=True)
+class ScoreCase:
+    """size_px: of the square photos. repeats: recolourings a photo. pairs: of different photos."""
+
+    size_px: int = 256
+    repeats: int = 2
+    pairs: int = 200
+
+
+def bench_scores(
+    network: BenchNetwork,
+    photos: Sequence[Path],
+    case: ScoreCase,
+    *,
+    holdout: int = HOLDOUT,
+    progress: bool = True,
+) -> dict[str, Any]:
+    """Scores by method, or the reason why there are none."""
+    if not photos:
+        return {"skipped": "no photos were given"}
+    held_out = read_photos(photos, case.size_px, holdout=holdout).held_out
+    if len(held_out) < LEAST_PHOTOS:
+        return {"skipped": f"{len(held_out)} photos are held out; {LEAST_PHOTOS} are needed"}
+    pictures = held_out.float() / 255
+    methods: dict[str, Method] = {
+        "none": identity_method,
+        "reinhard": closed_method("reinhard"),
+        "mkl": closed_method("mkl"),
+        "mkl, half": closed_method("mkl", 0.5),
+    }
+    if network.is_trained:
+        methods[f"gscm ({network.facts['name']})"] = network_method(network.net)
+    rows = []
+    for name, method in tqdm(methods.items(), "scores", disable=not progress):
+        good = score_pairs(method, pictures, repeats=case.repeats)
+        harm = score_harm(method, pictures, pairs=case.pairs)
+        rows.append({"method": name, **dataclasses.asdict(good), **dataclasses.asdict(harm)})
+    return {
+        "photos": len(pictures),
+        "size_px": case.size_px,
+        "methods": rows,
+        "limits_db": {
+            name: least_squares_limit(pictures, offset=offset, repeats=case.repeats)
+            for name, offset in (("3x3", False), ("3x4", True))
+        },
+        "skipped": None if network.is_trained else "the network: no checkpoint is there",
+    }
