@@ -15,7 +15,7 @@ import torch
 
 from adapters.street.truth import StreetTruth
 from augment.cameras import Camera
-from augment.render.buffers import MODE_DEPTH, SNOW, SPLAT_IDS
+from augment.render.buffers import BUFFERS
 from augment.render.clip import UNCUT
 from augment.render.constants import RasterSettings
 from augment.render.rasterize import rasterize
@@ -114,7 +114,7 @@ def scene_bias_m(scene: Scene, truth: StreetTruth, points: TruePoints, above: Ca
     the centres of those that are heaviest there. A fitted or sampled surface has such an offset,
     which no placement can know.
     """
-    out = rasterize([PosedGaussians(scene.background)], above, buffers=(SPLAT_IDS,), clip=UNCUT)
+    out = rasterize([PosedGaussians(scene.background)], above, buffers=BUFFERS, clip=UNCUT)
     assert out.splat_ids is not None
     ids = np.unique(out.splat_ids.numpy()[_pixels(above, points.xy)])
     means = scene.background.means.numpy()[ids[ids >= 0]].astype(np.float64)
@@ -168,7 +168,7 @@ def draw_snow(scene: Scene, cover: SnowCover, above: Camera) -> tuple[np.ndarray
     out = rasterize(
         [kept, PosedGaussians(layer.gaussians, is_snow=True)],
         above,
-        buffers=(MODE_DEPTH, SNOW),
+        buffers=BUFFERS,
         settings=RasterSettings(sh_degree=0),
         clip=UNCUT,
     )

@@ -17,7 +17,8 @@ import numpy as np
 from adapters.lidar.depth import lidar_depth
 from adapters.street.truth import StreetTruth
 from augment.cameras import Camera
-from augment.render.buffers import ALPHA, EXPECTED_DEPTH, MEDIAN_DEPTH, MODE_DEPTH
+from augment.render.buffers import BUFFERS as EVERY_BUFFER
+from augment.render.buffers import EXPECTED_DEPTH, MEDIAN_DEPTH, MODE_DEPTH
 from augment.render.clip import UNCUT
 from augment.render.rasterize import rasterize
 from augment.scene import Scene
@@ -44,10 +45,10 @@ COVERED = 0.5
 def depth_buffers(scene: Scene, camera: Camera) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """float32 [H, W] of every estimator, and bool [H, W]: where the scene has a surface."""
     parts = scene.parts_for(camera)
-    names = (EXPECTED_DEPTH, MEDIAN_DEPTH, MODE_DEPTH)
+    # With all buffers, because kernels for these alone would be compiled first.
     outputs = {
-        False: rasterize(parts, camera, buffers=(ALPHA, *names)),
-        True: rasterize(parts, camera, buffers=(EXPECTED_DEPTH, MODE_DEPTH), clip=UNCUT),
+        False: rasterize(parts, camera, buffers=EVERY_BUFFER),
+        True: rasterize(parts, camera, buffers=EVERY_BUFFER, clip=UNCUT),
     }
     found = {
         name: getattr(outputs[of_surfaces], buffer).numpy()

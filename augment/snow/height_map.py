@@ -12,7 +12,15 @@ import numpy as np
 import torch
 
 from augment.cameras import Camera
-from augment.render.buffers import ALPHA, DEPTH_ESTIMATORS, MEDIAN_DEPTH, RGB, SPLAT_IDS
+from augment.render.buffers import (
+    ALPHA,
+    BUFFERS,
+    DEPTH_ESTIMATORS,
+    MEDIAN_DEPTH,
+    MODE_DEPTH,
+    RGB,
+    SPLAT_IDS,
+)
 from augment.render.clip import UNCUT
 from augment.render.constants import ALPHA_MIN, MAX_EXTENT_SIGMAS, RasterSettings
 from augment.render.rasterize import rasterize
@@ -169,10 +177,12 @@ def _draw(
     antialiased: bool,
 ) -> list[np.ndarray]:
     """Buffers of a view from above, rows towards +y."""
+    # Other depths than the mode's are for comparing them: rather slower with all buffers, which
+    # takes a kernel that there is, than at once after one has been compiled for each.
     out = rasterize(
         parts,
         camera,
-        buffers=names,
+        buffers=names if MODE_DEPTH in names else BUFFERS,
         settings=RasterSettings(sh_degree=0, antialiased=antialiased),
         clip=UNCUT,
         wanted=wanted,
