@@ -261,10 +261,10 @@ def _clamp_facts(scene: Scene, styled: Scene, maps: StyleMaps) -> dict[str, Any]
         [torch.cat([p.reshape(-1, 3) for p, _ in group]) for group in (before, after)]
     )
     if len(maps.splats) == 1:
-        errors = [
-            (_mapped_picture(camera, scene, maps, *old) - new[0]).abs().amax(-1).flatten()
-            for camera, old, new in zip(_views(scene), before, after, strict=True)
-        ]
+        errors = []
+        for camera, old, new in zip(_views(scene), before, after, strict=True):
+            expected = _mapped_picture(camera, scene, maps, *old)
+            errors.append((expected.clamp(0, 1) - new[0].clamp(0, 1)).abs().amax(-1).flatten())
         off = torch.cat(errors) > VISIBLE
         facts["pixels off the mapped picture"] = float(off.float().mean())
     return facts
