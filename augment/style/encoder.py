@@ -1,6 +1,6 @@
 """Encoders: a picture to a vector of features, from which GSCM's matrices T are predicted.
 
-Every encoder takes display-encoded pictures [B, 3, S, S] and small copies of them [B, 3, 64, 64]
+Every encoder takes display-encoded pictures [B, 3, S, S] and small copies of them [B, 3, R, R]
 whose colour moments were carried to a mean photo's, and returns [B, .width].
 """
 
@@ -18,6 +18,7 @@ from torch.nn import functional
 from augment.errors import StyleError
 
 ENCODERS = ("small", "b0")
+LOOKED_AT_PX = 32  # by the small encoder: the arrangement of colours, not the detail
 SMALL_CHANNELS = (32, 64, 96, 128, 128)
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 B0_WIDTH = 1280
@@ -54,8 +55,8 @@ class SmallEncoder(nn.Module):
     def forward(
         self, images: Float[Tensor, "B 3 S S"], normal: Float[Tensor, "B 3 R R"]
     ) -> Float[Tensor, "B W"]:
-        small = functional.adaptive_avg_pool2d(images, normal.shape[-1])
-        features = self.layers(4 * (torch.cat([small, normal], dim=1) - 0.43))
+        pictures = (functional.adaptive_avg_pool2d(p, LOOKED_AT_PX) for p in (images, normal))
+        features = self.layers(4 * (torch.cat(tuple(pictures), dim=1) - 0.43))
         deviations = (features.var((2, 3), correction=0) + 1e-6).sqrt()
         return torch.cat([features.mean((2, 3)), deviations], dim=1)
 

@@ -18,7 +18,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from augment.style.encoder import build_encoder
-from augment.style.moments import MOMENT_FEATURES, SHAPE_PX, Moments, image_moments
+from augment.style.moments import MOMENT_FEATURES, Moments, image_moments
 
 SIZE_PX = 256  # of the pictures that the encoder is given
 LATENT = 16  # the paper's k
@@ -40,8 +40,9 @@ class Gscm(nn.Module):
         self.encoder = build_encoder(encoder)
         self.hidden = nn.Linear(self.encoder.width + MOMENT_FEATURES, HIDDEN)
         self.head = nn.Linear(HIDDEN, 2 * k * k)
-        nn.init.zeros_(self.head.weight)
-        nn.init.zeros_(self.head.bias)
+        self.direct = nn.Linear(MOMENT_FEATURES, 2 * k * k, bias=False)
+        for value in (self.head.weight, self.head.bias, self.direct.weight):
+            nn.init.zeros_(value)
         basis = _basis(rows, k)
         self.basis = nn.Buffer(basis)  # [rows, k], orthonormal: how T holds a map of colours
         self.content_p, self.style_p = nn.Parameter(basis.clone()), nn.Parameter(basis.clone())
@@ -53,10 +54,9 @@ class Gscm(nn.Module):
     ) -> tuple[Float[Tensor, "B k k"], Float[Tensor, "B k k"]]:
         """f_c and f_s: the content stage's T and the style stage's. images: in [0, 1]."""
         found = image_moments(images, offset=self.offset)
-        small = nn.functional.adaptive_avg_pool2d(images, SHAPE_PX)
-        normal = _mapped(found.normalise, small)
-        features = torch.cat([self.encoder(images, normal), found.features], dim=1)
+        features = torch.cat([self.encoder(images, found.normal), found.features], dim=1)
         predicted = self.head(nn.functional.silu(self.hidden(features)))
+        predicted = predicted + self.direct(found.features)
         content, style = predicted.unflatten(1, (2, self.k, self.k)).unbind(1)
         eye = torch.eye(self.k, device=images.device)
         if not self.moments:
@@ -139,13 +139,6 @@ def gscm_map(
     finally:
         torch.set_num_threads(threads)
         net.train(training)
-
-
-def _mapped(
-    maps: Float[Tensor, "B N N"], images: Float[Tensor, "B 3 S S"]
-) -> Float[Tensor, "B 3 S S"]:
-    mapped = torch.einsum("bij,bjhw->bihw", maps[:, :3, :3], images)
-    return mapped if maps.shape[1] == 3 else mapped + maps[:, :3, 3, None, None]
 
 
 def _basis(rows: int, k: int) -> Float[Tensor, "rows k"]:

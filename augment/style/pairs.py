@@ -1,0 +1,167 @@
+"""Pairs to train a style network on, made of photographs: a photo and a recoloured copy of it.
+
+A recolouring is a change of colours that a camera, a light or a weather makes: exposure, white
+balance, contrast, saturation, hue, tint, gamma, a curve, an arbitrary linear part; some reach grey
+and night. Put on a photo it gives a style whose perfect result is known; put on two photos, a look
+that both share.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional
+
+GREY = (0.2126, 0.7152, 0.0722)  # luma of sRGB's primaries (ITU-R BT.709)
+
+
+@dataclass(frozen=True)
+class RecolorSettings:
+    """How far recolourings go: standard deviations, but for the shares.
+
+    exposure, balance: log2 of the gains of all channels, of each. contrast, gamma: log. lift: of
+    each channel. saturation: log. hue_rad: about the grey axis. mix: of the entries of a matrix.
+    curve: of a tone curve's strength. grey_share, night_share: of the recolourings that take nearly
+    all colour, or light, away.
+    """
+
+    exposure: float = 0.22
+    balance: float = 0.20
+    contrast: float = 0.18
+    gamma: float = 0.42
+    lift: float = 0.07
+    saturation: float = 0.38
+    hue_rad: float = 0.30
+    mix: float = 0.17
+    curve: float = 0.90
+    grey_share: float = 0.05
+    night_share: float = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class Recoloring:
+    """B recolourings: clamp(curve(M c^gamma + b)) with curve(c) = c + s (3 c^2 - 2 c^3 - c).
+
+    maps: float32 [B, 3, 4], (M, b). gamma: float32 [B, 3], above 0. curve: float32 [B], s in
+    (-1, 1).
+    """
+
+    maps: Float[Tensor, "B 3 4"]
+    gamma: Float[Tensor, "B 3"]
+    curve: Float[Tensor, "B"]
+
+    def __call__(self, images: Float[Tensor, "B 3 H W"]) -> Float[Tensor, "B 3 H W"]:
+        """Pictures in [0, 1], each under its recolouring."""
+        bent = images.clamp_min(1e-6) ** self.gamma[:, :, None, None]
+        mapped = torch.einsum("bij,bjhw->bihw", self.maps[:, :, :3], bent)
+        mapped = (mapped + self.maps[:, :, 3, None, None]).clamp(0, 1)
+        smooth = mapped * mapped * (3 - 2 * mapped)
+        return torch.lerp(mapped, smooth, self.curve[:, None, None, None])
+
+
+@dataclass(frozen=True, eq=False)
+class PairBatch:
+    """B photos, B others, and both under the same recolourings; float32 [B, 3, S, S] in [0, 1]."""
+
+    photos: Float[Tensor, "B 3 S S"]
+    recolored: Float[Tensor, "B 3 S S"]
+    others: Float[Tensor, "B 3 S S"]
+    others_recolored: Float[Tensor, "B 3 S S"]
+
+
+def sample_recolorings(
+    count: int, generator: torch.Generator, settings: RecolorSettings | None = None
+) -> Recoloring:
+    """The same for the same state of the generator."""
+    s = RecolorSettings() if settings is None else settings
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn((count, *shape), generator=generator).clamp(-2.5, 2.5)
+
+    def uniform(low: float, high: float) -> Tensor:
+        return low + (high - low) * torch.rand(count, generator=generator)
+
+    exposure = s.exposure * normal()
+    saturation = (s.saturation * normal()).exp()
+    kind = torch.rand(count, generator=generator)
+    grey = kind < s.grey_share
+    night = (kind >= s.grey_share) & (kind < s.grey_share + s.night_share)
+    saturation = torch.where(grey, uniform(0.0, 0.3), saturation)
+    exposure = torch.where(night, uniform(-3.0, -1.5), exposure)
+    gains = 2 ** (exposure[:, None] + s.balance * normal(3))
+    gains = gains * torch.where(night[:, None], torch.tensor([0.8, 0.95, 1.25]), torch.ones(3))
+    contrast = (s.contrast * normal()).exp()[:, None]
+    # Contrast about the middle grey that the exposure makes, so that night stays night.
+    middle = 0.43 * gains
+    maps = torch.eye(3) + s.mix * normal(3, 3)
+    maps = _about_grey(saturation, s.hue_rad * normal()) @ maps
+    maps = (contrast * gains)[:, :, None] * maps
+    lift = torch.where(night, 0.2, 1.0)[:, None] * s.lift * normal(3)
+    offset = middle * (1 - contrast) + lift
+    return Recoloring(
+        torch.cat([maps, offset[..., None]], dim=2),
+        (s.gamma * normal())[:, None].exp() * (0.3 * s.gamma * normal(3)).exp(),
+        (s.curve * normal()).clamp(-0.9, 0.9),
+    )
+
+
+def recolor(
+    images: Float[Tensor, "B 3 H W"], generator: torch.Generator
+) -> Float[Tensor, "B 3 H W"]:
+    """Every picture under a recolouring of its own."""
+    return sample_recolorings(len(images), generator)(images)
+
+
+def sample_pairs(
+    photos: Float[Tensor, "P 3 H W"],
+    generator: torch.Generator,
+    batch: int,
+    *,
+    size_px: int = 128,
+    settings: RecolorSettings | None = None,
+) -> PairBatch:
+    """A batch from photos in [0, 1]; the same for the same state of the generator.
+
+    Photos are cut (half to all of each side), mirrored at random, and squeezed to size_px squares.
+
+    Raises:
+        ValueError: fewer than two photos, of which one could not be the other.
+    """
+    count = len(photos)
+    if count < 2:
+        raise ValueError(f"pairs need at least 2 photos; got {count}")
+    first = torch.randint(count, (batch,), generator=generator)
+    second = (first + torch.randint(1, count, (batch,), generator=generator)) % count
+    recoloring = sample_recolorings(batch, generator, settings)
+    one = _cut(photos[first], generator, size_px)
+    two = _cut(photos[second], generator, size_px)
+    return PairBatch(one, recoloring(one), two, recoloring(two))
+
+
+def _about_grey(
+    saturation: Float[Tensor, "B"], hue_rad: Float[Tensor, "B"]
+) -> Float[Tensor, "B 3 3"]:
+    """Turn colours about the grey axis, and scale their distance from it; grey stays as it is."""
+    third = torch.full((3, 3), 1 / 3)
+    cross = torch.tensor([[0.0, -1.0, 1.0], [1.0, 0.0, -1.0], [-1.0, 1.0, 0.0]]) / 3**0.5
+    cos, sin = hue_rad.cos()[:, None, None], hue_rad.sin()[:, None, None]
+    turned = third + cos * (torch.eye(3) - third) + sin * cross  # Rodrigues' formula
+    luma = torch.tensor(GREY).expand(3, 3)
+    return torch.lerp(luma.expand(len(saturation), 3, 3), turned, saturation[:, None, None])
+
+
+def _cut(
+    photos: Float[Tensor, "B 3 H W"], generator: torch.Generator, size_px: int
+) -> Float[Tensor, "B 3 S S"]:
+    count = len(photos)
+    sides = 0.5 + 0.5 * torch.rand((count, 2), generator=generator)
+    centres = (1 - sides) * (2 * torch.rand((count, 2), generator=generator) - 1)
+    mirrored = torch.where(torch.rand(count, generator=generator) < 0.5, -1.0, 1.0)
+    theta = torch.zeros(count, 2, 3)
+    theta[:, 0, 0], theta[:, 1, 1] = sides[:, 0] * mirrored, sides[:, 1]
+    theta[:, :, 2] = centres
+    grid = functional.affine_grid(theta, [count, 3, size_px, size_px], align_corners=False)
+    return functional.grid_sample(photos, grid, padding_mode="border", align_corners=False)

@@ -1,0 +1,142 @@
+"""Recolourings, pairs, and the losses on them: drawn from a seed, in range, and learnable."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from augment.style.network import Gscm
+from augment.style.pair_losses import PairWeights, pair_losses, weighted
+from augment.style.pairs import (
+    GREY,
+    PairBatch,
+    Recoloring,
+    RecolorSettings,
+    recolor,
+    sample_pairs,
+    sample_recolorings,
+)
+
+STILL = RecolorSettings(*[0.0] * 11)
+
+
+def photos(count: int = 3, px: int = 24) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(count)
+    rough = torch.rand((count, 3, 4, 4), generator=generator)
+    return torch.nn.functional.interpolate(rough, (px, px), mode="bilinear")
+
+
+def seeded(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def test_settings_of_nothing_change_nothing():
+    assert set(vars(STILL).values()) == {0.0}
+    images = photos()
+    torch.testing.assert_close(sample_recolorings(3, seeded(), STILL)(images), images)
+
+
+def test_a_seed_is_a_recolouring():
+    images = photos()
+    first, again, other = (recolor(images, seeded(seed)) for seed in (1, 1, 2))
+    assert torch.equal(first, again)
+    assert not torch.equal(first, other)
+    assert first.min() >= 0 and first.max() <= 1
+    assert not torch.equal(first, images)
+
+
+def test_the_global_generator_is_left_alone():
+    before = torch.random.get_rng_state()
+    sample_pairs(photos(), seeded(), 2, size_px=8)
+    assert torch.equal(torch.random.get_rng_state(), before)
+
+
+def test_grey_and_night_are_reached():
+    images = photos(1).expand(64, -1, -1, -1)
+    grey = sample_recolorings(64, seeded(), replace(STILL, grey_share=1.0))(images)
+    spread = images.std(1).mean()
+    assert (grey.std(1).mean((1, 2)) < 0.31 * spread).all()
+    luma = torch.tensor(GREY)
+    torch.testing.assert_close(  # what is taken away is colour alone
+        torch.einsum("c,bchw->bhw", luma, grey), torch.einsum("c,bchw->bhw", luma, images)
+    )
+    night = sample_recolorings(64, seeded(), replace(STILL, night_share=1.0))(images)
+    assert (night.mean((1, 2, 3)) < 0.4 * images.mean((1, 2, 3))).all()
+    assert (night.mean((2, 3))[:, 2] / night.mean((2, 3))[:, 0]).mean() > 1.3 * (
+        images.mean((2, 3))[:, 2] / images.mean((2, 3))[:, 0]
+    ).mean()
+
+
+@pytest.mark.parametrize(
+    "name", ["exposure", "balance", "contrast", "gamma", "lift", "saturation", "hue_rad", "curve"]
+)
+def test_every_setting_does_something(name):
+    settings = replace(STILL, **{name: 0.3})
+    changed = sample_recolorings(3, seeded(), settings)(photos())
+    assert (changed - photos()).abs().amax((1, 2, 3)).min() > 1e-3
+
+
+def test_hue_and_saturation_leave_grey():
+    grey = photos()[:, :1].expand(-1, 3, -1, -1)
+    settings = replace(STILL, hue_rad=0.5, saturation=0.5)
+    torch.testing.assert_close(sample_recolorings(3, seeded(), settings)(grey), grey)
+
+
+def test_a_recolouring_is_of_its_own_picture():
+    images, both = photos(2), sample_recolorings(2, seeded())
+    second = Recoloring(both.maps[1:], both.gamma[1:], both.curve[1:])
+    torch.testing.assert_close(both(images)[1:], second(images[1:]))
+
+
+def test_pairs_share_a_recolouring():
+    batch = sample_pairs(photos(4), seeded(), 5, size_px=16, settings=STILL)
+    assert batch.photos.shape == (5, 3, 16, 16)
+    torch.testing.assert_close(batch.photos, batch.recolored)
+    torch.testing.assert_close(batch.others, batch.others_recolored)
+    assert (batch.photos - batch.others).abs().mean((1, 2, 3)).min() > 0.01
+    again = sample_pairs(photos(4), seeded(), 5, size_px=16)
+    same = sample_pairs(photos(4), seeded(), 5, size_px=16)
+    for name in ("photos", "recolored", "others", "others_recolored"):
+        assert torch.equal(getattr(again, name), getattr(same, name))
+
+
+def test_one_photo_is_no_pair():
+    with pytest.raises(ValueError, match="at least 2 photos; got 1"):
+        sample_pairs(photos(1), seeded(), 2)
+
+
+def test_nothing_to_change_is_nothing_to_lose():
+    """Photo, copy and both others the same: the untrained network is right, to the floor."""
+    images = photos(2)
+    losses = pair_losses(Gscm(), PairBatch(images, images, images, images))
+    for name in ("consistency", "cycle", "range"):
+        assert losses[name] < 1e-5
+    floor = torch.tensor(1e-4).log()
+    for name in ("same", "look"):
+        torch.testing.assert_close(losses[name], floor, atol=1e-3, rtol=0)
+    assert losses["half"] > floor + 1
+
+
+def test_losses_fall_by_training():
+    torch.manual_seed(0)
+    net = Gscm()
+    batch = sample_pairs(photos(6), seeded(), 6, size_px=32)
+    optimizer = torch.optim.Adam(net.parameters(), 2e-3)
+    totals = []
+    for _ in range(8):
+        losses = pair_losses(net, batch)
+        total = weighted(losses, PairWeights())
+        optimizer.zero_grad()
+        total.backward()
+        optimizer.step()
+        totals.append(total.item())
+    assert totals[-1] < totals[0] - 0.3
+    assert losses.keys() == vars(PairWeights()).keys()
+
+
+def test_weights_weigh():
+    losses = {name: torch.tensor(1.0) for name in vars(PairWeights())}
+    only = PairWeights(2.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    assert float(weighted(losses, only)) == 2.0
