@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import re
 import signal
 from pathlib import Path
+
+# Before torch is loaded. Processes that share the cores wait for each other's threads at the end of
+# every operation, ten times as long as these small ones take. (numba's threads are others.)
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest
 from jaxtyping import config, install_import_hook
