@@ -6,10 +6,12 @@ from. The network's bytes depend on the data, the settings and the number of ste
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
 import json
 import math
+import shutil
 import sys
 import time
 from collections.abc import Iterable
@@ -22,6 +24,7 @@ from tqdm import tqdm
 
 from adapters.base import open_scene
 from augment.batch.atomic import write_atomic
+from augment.batch.layout import STATE_FOLDER
 from augment.batch.lock import OutputLock
 from augment.errors import OutputError
 from augment.style.checkpoint import save_network
@@ -81,7 +84,11 @@ def train_style(
             _check_same(options, before)
             if before.finished and (done := _finished(options, before)) is not None:
                 return done
-        run = _prepare(options, folder, before)
+        try:
+            run = _prepare(options, folder, before)
+        except BaseException:
+            _remove_unused(options.out)
+            raise
         return _train(run, progress, checkpoint_s)
 
 
@@ -336,7 +343,7 @@ def _write(run: _Run, complete: bool) -> dict[str, Any]:
         "settings": run.plan.settings,
         "data": run.plan.data,
     }
-    save_network(options.out / NETWORK_FILE, net, about)
+    save_network(options.out / NETWORK_FILE, net, about, half_precision=options.half_precision)
     scores = score_training(net, run.scored, run.features) | score_photos(net, run.held_out)
     report = {
         **about,
@@ -355,6 +362,14 @@ def _write(run: _Run, complete: bool) -> dict[str, Any]:
     if curves is not None:
         write_rgb(options.out / CURVES_FILE, curves)
     return report
+
+
+def _remove_unused(out: Path) -> None:
+    """Leave no trace of a training that never began: its lock, and the folder if that was all."""
+    if not checkpoint_folder(out).exists():
+        shutil.rmtree(out / STATE_FOLDER, ignore_errors=True)
+        with contextlib.suppress(OSError):  # not empty
+            out.rmdir()
 
 
 def _check_same(options: StyleTrainOptions, before: Checkpoint) -> None:

@@ -27,10 +27,10 @@ class StyleTrainOptions:
     minutes, steps: one of them or neither (10 minutes). matrix: 3x4, or 3x3 as in the paper.
     encoder_weights: of B0, trained on ImageNet. vgg: weights of VGG-19 for L_s; None for the bank
     of filters. size_px: of the square pictures; None for the encoder's usual one. views: most of a
-    scene. learning_rate: None for the encoder's usual one. pair_weights: of the
-    losses of pairs, as same=1,look=2; what is not named keeps its weight. holdout: every so many
-    photos are kept for scores; 0 for none. ablations: train without each loss, and 3x3, too.
-    The rest is as augment.style.train_config.StyleTrainConfig has it.
+    scene. learning_rate: None for the encoder's usual one. pair_weights: of the losses of pairs, as
+    same=1,look=2; what is not named keeps its weight. holdout: every so many photos are kept for
+    scores; 0 for none. half_precision: of the file, not of the training. ablations: train without
+    each loss, and 3x3, too. The rest is as augment.style.train_config.StyleTrainConfig has it.
 
     Raises:
         ClimateGSError: a value outside its range, or two that exclude each other.
@@ -62,6 +62,7 @@ class StyleTrainOptions:
     through: Literal["picture", "renderer"] = "picture"
     holdout: int = 8
     device: str = "cpu"
+    half_precision: bool = False
     ablations: bool = False
     overwrite: bool = False
 
@@ -151,6 +152,7 @@ class StyleTrainOptions:
             "views": self.views,
             "holdout": self.holdout,
             "device": self.device,
+            "half_precision": self.half_precision,
             **config,
         }
 

@@ -215,7 +215,7 @@ def test_no_images_leave_no_training_behind(tmp_path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(StyleError, match="holds no images"):
         run(options_of(tmp_path / "out", tmp_path / "empty"))
-    assert not checkpoint_folder(tmp_path / "out").exists()
+    assert not (tmp_path / "out").exists()
 
 
 def test_pair_weights_keep_what_is_not_named():
