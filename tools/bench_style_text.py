@@ -135,11 +135,15 @@ def _view_lines(scene: str, rows: list[dict[str, Any]]) -> list[str]:
                 cells.append("-")
                 continue
             cells.append(
-                f"{255 * each['rmse']:.2f} ({each['rmse_ratio']:.2f})  "
-                f"{each['relative']:.3f} ({each['relative_ratio']:.2f})"
+                f"{255 * each['rmse']:.2f} ({_number(each['rmse_ratio'], 2)})  "
+                f"{_number(each['relative'], 3)} ({_number(each['relative_ratio'], 2)})"
             )
         lines.append(f"  {row['style']:<26}" + "".join(f"{cell:>30}" for cell in cells))
     return lines
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
 
 
 def _percent(share: float) -> str:

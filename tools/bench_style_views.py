@@ -30,7 +30,8 @@ def bench_views(
 ) -> list[dict[str, Any]]:
     """A row a style, the clean scene first. Of each kind of pairs: rmse and relative (to the
     picture's own spread), pooled over pairs by how many pixels count, share (of the pixels that
-    count), and the ratios of both errors to the clean scene's; None where no pair overlaps.
+    count), and the ratios of both errors to the clean scene's; None where no pair overlaps, and
+    for ratios to nothing.
     """
     styles: dict[str, Style | None] = {"clean": None}
     for preset in presets:
@@ -45,8 +46,8 @@ def bench_views(
         for kind, each in found.items():
             clean = rows[0][kind] if rows else each
             if each is not None and clean is not None:
-                each["rmse_ratio"] = each["rmse"] / clean["rmse"]
-                each["relative_ratio"] = each["relative"] / clean["relative"]
+                for error in ("rmse", "relative"):
+                    each[f"{error}_ratio"] = _ratio(each[error], clean[error])
         rows.append({"style": name, **found})
     return rows
 
@@ -59,7 +60,7 @@ def _pairs(
     for index in frames:
         cameras = scene.frame(index).cameras
         if kind == KINDS[2]:
-            chosen = [(cameras[a], cameras[b]) for a, b in neighbours(cameras)]
+            chosen = [(cameras[a], cameras[b]) for a, b in neighbours(cameras) if a != b]
         else:
             numbers = [frame.index for frame in scene.frames]
             at = numbers.index(index) + (NEAR if kind == KINDS[0] else FAR)
@@ -78,7 +79,7 @@ def _small(camera: Camera, width: int) -> Camera:
 
 def _pooled(
     scene: Scene, plan: Plan, pairs: Sequence[tuple[Camera, Camera]]
-) -> dict[str, float] | None:
+) -> dict[str, float | None] | None:
     seen: list[Consistency] = []
     for one, other in pairs:
         each = warped_consistency(_view(scene, one, plan), _view(scene, other, plan))
@@ -89,7 +90,16 @@ def _pooled(
         return None
     rmse = math.sqrt(sum(each.share * each.rmse**2 for each in seen) / total)
     spread = math.sqrt(sum(each.share * each.spread**2 for each in seen) / total)
-    return {"rmse": rmse, "relative": rmse / spread, "share": total / len(seen), "pairs": len(seen)}
+    return {
+        "rmse": rmse,
+        "relative": _ratio(rmse, spread),
+        "share": total / len(seen),
+        "pairs": len(seen),
+    }
+
+
+def _ratio(over: float | None, under: float | None) -> float | None:
+    return over / under if over is not None and under else None
 
 
 def _view(scene: Scene, camera: Camera, plan: Plan) -> DepthView:
