@@ -19,7 +19,7 @@ from augment.errors import StyleError
 
 ENCODERS = ("small", "b0")
 LOOKED_AT_PX = 32  # by the small encoder: the arrangement of colours, not the detail
-SMALL_CHANNELS = (32, 64, 96, 128, 128)
+SMALL_CHANNELS = (16, 32, 64, 96, 96)
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 B0_WIDTH = 1280
 

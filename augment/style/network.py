@@ -22,7 +22,8 @@ from augment.style.moments import MOMENT_FEATURES, Moments, image_moments
 
 SIZE_PX = 256  # of the pictures that the encoder is given
 LATENT = 16  # the paper's k
-HIDDEN = 192  # of the layer between features and T
+HIDDEN = 96  # of the layer between features and T
+HEAD_SCALE = 0.1  # of T, so that a step of the optimiser is a small step of the map
 
 
 class Gscm(nn.Module):
@@ -56,7 +57,7 @@ class Gscm(nn.Module):
         found = image_moments(images, offset=self.offset)
         features = torch.cat([self.encoder(images, found.normal), found.features], dim=1)
         predicted = self.head(nn.functional.silu(self.hidden(features)))
-        predicted = predicted + self.direct(found.features)
+        predicted = HEAD_SCALE * (predicted + self.direct(found.features))
         content, style = predicted.unflatten(1, (2, self.k, self.k)).unbind(1)
         eye = torch.eye(self.k, device=images.device)
         if not self.moments:

@@ -17,6 +17,9 @@ from torch.nn import functional
 
 GREY = (0.2126, 0.7152, 0.0722)  # luma of sRGB's primaries (ITU-R BT.709)
 
+MIXED_SHARE = 0.5  # of a batch's photos that share their square with another
+VARIED = 0.3  # of a recolouring's settings: by how much photos are recoloured before all else
+
 
 @dataclass(frozen=True)
 class RecolorSettings:
@@ -125,7 +128,9 @@ def sample_pairs(
 ) -> PairBatch:
     """A batch from photos in [0, 1]; the same for the same state of the generator.
 
-    Photos are cut (half to all of each side), mirrored at random, and squeezed to size_px squares.
+    Photos are cut (half to all of each side), mirrored at random, and squeezed to size_px squares;
+    every second one shares its square with another, and each is recoloured a little before all
+    else. A hundred photos would be learnt by heart otherwise.
 
     Raises:
         ValueError: fewer than two photos, of which one could not be the other.
@@ -136,9 +141,27 @@ def sample_pairs(
     first = torch.randint(count, (batch,), generator=generator)
     second = (first + torch.randint(1, count, (batch,), generator=generator)) % count
     recoloring = sample_recolorings(batch, generator, settings)
-    one = _cut(photos[first], generator, size_px)
-    two = _cut(photos[second], generator, size_px)
+    one = _varied(_cut(photos[first], generator, size_px), generator, settings)
+    two = _varied(_cut(photos[second], generator, size_px), generator, settings)
     return PairBatch(one, recoloring(one), two, recoloring(two))
+
+
+def _varied(
+    photos: Float[Tensor, "B 3 S S"], generator: torch.Generator, settings: RecolorSettings | None
+) -> Float[Tensor, "B 3 S S"]:
+    """Half of the photos take a part, on the right or below, from the one before in the batch;
+    then each is recoloured a little."""
+    count, _, _, size = photos.shape
+    place = torch.arange(size) + 0.5
+    start = size * (0.3 + 0.4 * torch.rand((count, 1), generator=generator))
+    beyond = (place > start)[:, None]  # [B, 1, S]
+    below = (torch.rand((count, 1, 1), generator=generator) < 0.5).expand(-1, size, size)
+    foreign = torch.where(below, beyond.transpose(1, 2), beyond)
+    foreign = foreign & (torch.rand((count, 1, 1), generator=generator) < MIXED_SHARE)
+    mixed = torch.where(foreign[:, None], photos.roll(1, 0), photos)
+    own = settings or RecolorSettings()
+    little = RecolorSettings(*(0.0 if "share" in n else VARIED * v for n, v in vars(own).items()))
+    return sample_recolorings(count, generator, little)(mixed)
 
 
 def _about_grey(

@@ -122,8 +122,8 @@ def test_nothing_to_change_is_nothing_to_lose():
 def test_losses_fall_by_training():
     torch.manual_seed(0)
     net = Gscm()
-    batch = sample_pairs(photos(6), seeded(), 6, size_px=32)
-    optimizer = torch.optim.Adam(net.parameters(), 2e-3)
+    batch = sample_pairs(photos(6), seeded(), 3, size_px=32)
+    optimizer = torch.optim.Adam(net.parameters(), 3e-4)
     totals = []
     for _ in range(8):
         losses = pair_losses(net, batch)
@@ -132,7 +132,7 @@ def test_losses_fall_by_training():
         total.backward()
         optimizer.step()
         totals.append(total.item())
-    assert totals[-1] < totals[0] - 0.3
+    assert totals[-1] < totals[0] - 0.1
     assert losses.keys() == vars(PairWeights()).keys()
 
 
