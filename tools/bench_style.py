@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from adapters.base import open_scene
+from recipes.style_presets import style_preset_names
 from tools.bench_scene import RasterCase
 from tools.bench_style_cost import bench_apply, bench_frames, front_camera
 from tools.bench_style_exact import bench_exact, bench_folding
@@ -34,7 +35,7 @@ class StyleCase:
     street: str = "procedural:street?seed=0&frames=10"
     frames: tuple[int, ...] = (0, 1, 2)
     views_width: int = 480
-    presets: tuple[str, ...] = ("overcast", "golden-hour", "night", "dawn-mist")
+    presets: tuple[str, ...] = style_preset_names()
     scores: ScoreCase = field(default_factory=ScoreCase)
     b0: bool = True
 
