@@ -139,8 +139,9 @@ class PosedGaussians:
     world_from_part: float64 [4, 4], or None for the identity. instance_id: 0 for the background,
     1 + the actor's index otherwise. is_snow: whether they are snow, which the buffer "snow" counts.
     shading: None for splats of one colour each. color_maps [C, 3, 4]: of what every splat shows,
-    c' = max(M[:, :3] @ c + M[:, 3], 0): the map of its class, the first where it has none; None
-    leaves the colours. A part has either shading or maps.
+    c' = max(M[:, :3] @ c + M[:, 3], 0): the map in the row of color_rows int16 [N], without them of
+    its class, the first where there is none such; None leaves the colours. A part has either
+    shading or maps.
     """
 
     gaussians: Gaussians
@@ -149,6 +150,14 @@ class PosedGaussians:
     is_snow: bool = False
     shading: SplatShading | None = None
     color_maps: Float[Tensor, "C 3 4"] | None = None
+    color_rows: Int16[Tensor, "N"] | None = None
+
+    @property
+    def map_rows(self) -> Int16[Tensor, "N"] | None:
+        """Of every splat among the colour maps; None where all take the first."""
+        if self.color_maps is None or len(self.color_maps) == 1:
+            return None
+        return self.gaussians.semantic if self.color_rows is None else self.color_rows
 
 
 @dataclass(frozen=True, eq=False)

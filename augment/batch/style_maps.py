@@ -30,6 +30,7 @@ class StoredMaps:
     splats: np.ndarray  # [C, 3, 4]
     sky: np.ndarray  # [3, 4]
     picture: np.ndarray  # [3, 4]
+    seen_sky: np.ndarray | None  # [3, 4]
 
     def take_over(self, scene: Scene) -> None:
         """Make them the maps that pictures of the scene in this style use in this process.
@@ -47,8 +48,11 @@ class StoredMaps:
 
         from augment.style.maps import StyleMaps
 
-        arrays = (self.splats, self.sky, self.picture)
-        return StyleMaps(*(torch.from_numpy(array.copy()) for array in arrays))
+        splats, sky, picture = (
+            torch.from_numpy(array.copy()) for array in (self.splats, self.sky, self.picture)
+        )
+        seen = None if self.seen_sky is None else torch.from_numpy(self.seen_sky.copy())
+        return StyleMaps(splats, sky, picture, seen)
 
 
 def style_to_apply(recipe: Recipe) -> Style | None:
@@ -74,6 +78,7 @@ def store_maps(
     stored = []
     for style in wanted:
         maps = style_maps(scene, style, cameras=cameras)
-        arrays = (m.detach().cpu().numpy() for m in (maps.splats, maps.sky, maps.picture))
-        stored.append(StoredMaps(style, *arrays))
+        splats, sky, picture = (m.numpy() for m in (maps.splats, maps.sky, maps.picture))
+        seen = None if maps.seen_sky is None else maps.seen_sky.numpy()
+        stored.append(StoredMaps(style, splats, sky, picture, seen))
     return tuple(stored)

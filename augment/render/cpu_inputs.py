@@ -100,21 +100,20 @@ def _slopes(part: PosedGaussians) -> np.ndarray:
 
 
 def _map_count(part: PosedGaussians) -> int:
-    """One for all of a part without classes, since they have none to choose by."""
+    """One for all of a part whose splats have nothing to choose by."""
     if part.color_maps is None:
         return 0
-    return 1 if part.gaussians.semantic is None else len(part.color_maps)
+    return 1 if part.map_rows is None else len(part.color_maps)
 
 
 def _color_maps(part: PosedGaussians) -> tuple[np.ndarray, np.ndarray]:
     """Float32 [C, 3, 4] and int16 [N], or [1] of what is not read."""
-    maps, classes = np.zeros(1, np.float32), np.zeros(1, np.int16)
+    maps, rows = np.zeros(1, np.float32), np.zeros(1, np.int16)
     if part.color_maps is not None:
         maps = part.color_maps.detach().to(torch.float32).contiguous().numpy()
-        if _map_count(part) > 1:
-            assert part.gaussians.semantic is not None
-            classes = part.gaussians.semantic.contiguous().numpy()
-    return maps, classes
+    if part.map_rows is not None:
+        rows = part.map_rows.contiguous().numpy()
+    return maps, rows
 
 
 def part_views(

@@ -56,7 +56,7 @@ VIEW = 64
 # What a part is read from: arrays of these by address.
 A_MEANS, A_QUATS, A_SCALES, A_OPACITIES, A_SH = 0, 1, 2, 3, 4
 A_SLOPES = 5  # of the light; read of lit parts only
-A_MAPS, A_CLASSES = 6, 7  # colour maps, read where V_MAPS > 0; int16 classes, where it is > 1
+A_MAPS, A_ROWS = 6, 7  # colour maps, read where V_MAPS > 0; int16 rows of them, where it is > 1
 ADDRESSES = 8
 MAP = 12  # numbers of a colour map
 

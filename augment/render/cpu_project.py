@@ -37,11 +37,11 @@ from augment.render.cpu_geometry import (
 )
 from augment.render.cpu_jit import inner, kernel
 from augment.render.cpu_layout import (
-    A_CLASSES,
     A_MAPS,
     A_MEANS,
     A_OPACITIES,
     A_QUATS,
+    A_ROWS,
     A_SCALES,
     A_SH,
     A_SLOPES,
@@ -222,7 +222,7 @@ def project_slice(
         slopes = floats_at(addresses[part, A_SLOPES], count * 3 if views[part, V_LIT] > 0 else 1)
         map_count = np.int64(views[part, V_MAPS])
         maps = floats_at(addresses[part, A_MAPS], max(map_count, 1) * MAP)
-        classes = shorts_at(addresses[part, A_CLASSES], count if map_count > 1 else 1)
+        map_rows = shorts_at(addresses[part, A_ROWS], count if map_count > 1 else 1)
         used = min(modes[M_FUNCTIONS], functions)
         slot = U(base)
         for at in range(U(0), U(taken), U(LANES)):
@@ -238,7 +238,7 @@ def project_slice(
                 records[record + U(IS_SNOW)] = views[part, V_SNOW]
                 if modes[M_COLOR]:
                     from_sh = U(splat) * U(functions * 3)
-                    at_map = _map_of(classes, splat, map_count)
+                    at_map = _map_of(map_rows, splat, map_count)
                     write_color(
                         sh, from_sh, used, maps, at_map, views[part], modes[M_SMOG], rows, lane,
                         records, record,
@@ -274,16 +274,16 @@ def _pick_bins(depth_bits, base, first, last, bins, picked):
 
 
 @inner()
-def _map_of(classes, splat, map_count):
-    """Where a splat's colour map starts, -1 without one; classes that have none take the first."""
+def _map_of(map_rows, splat, map_count):
+    """Where a splat's colour map starts, -1 without one; rows that are none mean the first."""
     if map_count == 0:
         return np.int64(-1)
-    group = np.int64(0)
+    row = np.int64(0)
     if map_count > 1:
-        group = np.int64(classes[splat])
-        if group < 0 or group >= map_count:
-            group = np.int64(0)
-    return group * np.int64(MAP)
+        row = np.int64(map_rows[splat])
+        if row < 0 or row >= map_count:
+            row = np.int64(0)
+    return row * np.int64(MAP)
 
 
 @inner()

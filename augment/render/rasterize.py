@@ -237,6 +237,12 @@ def _check_color_maps(part: PosedGaussians, number: int) -> None:
         raise ValueError(
             f"part {number}: color_maps must be [C, 3, 4] with C >= 1; got {list(maps.shape)}"
         )
+    rows = part.color_rows
+    if rows is not None and (rows.dtype != torch.int16 or len(rows) != len(part.gaussians)):
+        raise ValueError(
+            f"part {number}: color_rows must be int16 [{len(part.gaussians)}] (from its "
+            f"Gaussians); got {rows.dtype} {list(rows.shape)}"
+        )
     if not maps.dtype.is_floating_point or not bool(torch.isfinite(maps).all()):
         raise ValueError(f"part {number}: color_maps must be finite floats; got {maps}")
 

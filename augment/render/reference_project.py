@@ -136,7 +136,8 @@ def _project_part(
     colors = None
     if with_color:
         towards = rotation[2].expand_as(offsets) if camera.is_orthographic else offsets
-        colors = _colors(gaussians, towards, part, camera, settings, smog)
+        rows = None if part.map_rows is None else part.map_rows[index]
+        colors = _colors(gaussians, rows, towards, part, camera, settings, smog)
     splats = Splats(
         ids=index + first_id,
         depths=depths,
@@ -264,19 +265,20 @@ def _clamp_to_image(tangents: Tensor, centre: float, focal: float, size: int) ->
 
 def _colors(
     gaussians: Gaussians,
+    rows: Int16[Tensor, "M"] | None,
     offsets: Float[Tensor, "M 3"],
     part: PosedGaussians,
     camera: Camera,
     settings: RasterSettings,
     smog: SmogMedium | None,
 ) -> Float[Tensor, "M 3"]:
-    """max(SH + 0.5, 0), mapped, and seen through the smog. offsets: from the eye, in the part's
-    axes; without smog their lengths do not matter.
+    """max(SH + 0.5, 0), mapped, and seen through the smog. rows: of the colour maps. offsets: from
+    the eye, in the part's axes; without smog their lengths do not matter.
     """
     directions = torch.nn.functional.normalize(offsets, dim=-1)
     colors = (evaluate_sh(gaussians.sh, directions, settings.sh_degree) + 0.5).clamp_min(0)
     if part.color_maps is not None:
-        colors = _mapped(colors, part.color_maps.to(colors.dtype), gaussians.semantic)
+        colors = _mapped(colors, part.color_maps.to(colors.dtype), rows)
     if smog is None:
         return colors
     return blend_airlight(colors, _optical_depths(gaussians, offsets, part, camera, smog), smog)
@@ -285,12 +287,12 @@ def _colors(
 def _mapped(
     colors: Float[Tensor, "M 3"],
     maps: Float[Tensor, "C 3 4"],
-    classes: Int16[Tensor, "M"] | None,
+    rows: Int16[Tensor, "M"] | None,
 ) -> Float[Tensor, "M 3"]:
-    """Every colour under its class's map, under the first where that has none; not below 0."""
-    if classes is None or len(maps) == 1:
+    """Every colour under its map, the first where there is no such row; not below 0."""
+    if rows is None:
         return (colors @ maps[0, :, :3].T + maps[0, :, 3]).clamp_min(0)
-    index = torch.where((classes >= 0) & (classes < len(maps)), classes, 0).long()
+    index = torch.where((rows >= 0) & (rows < len(maps)), rows, 0).long()
     own = maps[index]
     return (torch.einsum("mij,mj->mi", own[..., :3], colors) + own[..., 3]).clamp_min(0)
 

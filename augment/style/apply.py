@@ -25,19 +25,26 @@ from augment.scene import Gaussians, Scene
 from augment.sky import ConstantSky, CubemapSky, LatLongSky, Sky
 from augment.style import sh_kernels
 from augment.style.maps import StyleMaps
+from augment.style.sky_splats import level_maps, map_rows, sky_levels
 
 BLOCKS = 4  # pieces of work that a thread takes at a time
 
 
 def style_gaussians(
-    gaussians: Gaussians, maps: StyleMaps, *, out: Tensor | None = None, fast: bool = True
+    gaussians: Gaussians,
+    maps: StyleMaps,
+    *,
+    levels: Tensor | None = None,
+    out: Tensor | None = None,
+    fast: bool = True,
 ) -> Gaussians:
     """The same Gaussians with mapped SH; every other tensor is shared, and all of them where no
     map changes anything.
 
-    out: where the SH are written, contiguous and of their shape and dtype; may be `gaussians.sh`
-    itself. New memory by default, whose first touch takes as long as the mapping. fast: float32
-    without gradients goes through the CPU kernel, equal to `map_sh` within float rounding.
+    levels [N]: how much of each is sky (see sky_levels). out: where the SH are written, contiguous
+    and of their shape and dtype; may be `gaussians.sh` itself. New memory by default, whose first
+    touch takes as long as the mapping. fast: float32 without gradients goes through the CPU kernel,
+    equal to `map_sh` within float rounding.
 
     Raises:
         ValueError: maps by class, and a class that has none; or out does not fit.
@@ -45,13 +52,15 @@ def style_gaussians(
     sh = gaussians.sh
     if out is not None:
         _check_out(out, sh)
-    classes = _rows_of(gaussians, len(maps.splats))
-    folded = fold_maps(maps.splats)
-    if out is None and not bool(_changes(maps.splats).any()):
+    splats, classes = maps.splats, _rows_of(gaussians, len(maps.splats))
+    if levels is not None:
+        splats, classes = level_maps(maps), map_rows(levels, gaussians.semantic, len(splats))
+    folded = fold_maps(splats)
+    if out is None and not bool(_changes(splats).any()):
         return gaussians
     tracked = torch.is_grad_enabled() and sh.requires_grad
     if not fast or tracked or sh.dtype != torch.float32:
-        mapped = map_sh(sh, maps.splats, classes)
+        mapped = map_sh(sh, splats, classes)
         if out is not None:
             mapped = out.copy_(mapped)
         return dataclasses.replace(gaussians, sh=mapped)
@@ -128,10 +137,12 @@ class MappedSky:
 
 
 def styled_scene(scene: Scene, maps: StyleMaps) -> Scene:
-    """Background, actors and sky mapped; all else is the scene's own."""
+    """Background, actors and sky mapped; all else is the scene's own. What of the background paints
+    sky changes with it.
+    """
     return dataclasses.replace(
         scene,
-        background=style_gaussians(scene.background, maps),
+        background=style_gaussians(scene.background, maps, levels=sky_levels(scene, maps)),
         actors=tuple(
             dataclasses.replace(actor, gaussians=style_gaussians(actor.gaussians, maps))
             for actor in scene.actors

@@ -128,7 +128,9 @@ def closed_maps(
             if _both(content, style, region)
         }
         splats = torch.stack([_of_class(value, regions, land, sky) for value in range(CLASSES)])
-    return StyleMaps(splats.float(), sky.float(), picture.float())
+    seen = content[SKY] if own_sky else None
+    about = seen and torch.from_numpy(np.column_stack([seen.covariance, seen.mean])).float()
+    return StyleMaps(splats.float(), sky.float(), picture.float(), about)
 
 
 def _both(content: Statistics, style: Statistics, region: str) -> bool:

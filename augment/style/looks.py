@@ -9,11 +9,15 @@ from dataclasses import dataclass
 from functools import cached_property
 from weakref import WeakKeyDictionary
 
+from jaxtyping import Float, Int16
+from torch import Tensor
+
 from augment.scene import PosedGaussians, Scene
 from augment.sky import Sky
 from augment.style.apply import style_gaussians, style_sky
 from augment.style.maps import StyleMaps
 from augment.style.scene_maps import style_maps
+from augment.style.sky_splats import level_maps, map_rows, sky_levels
 from recipes.style import Style
 
 _MOST_LOOKS = 4  # of a scene, that are kept: a job goes through its variants frame by frame
@@ -21,26 +25,39 @@ _MOST_LOOKS = 4  # of a scene, that are kept: a job goes through its variants fr
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """The maps of a style in a scene, and the scene's sky under them."""
+    """The maps of a style in a scene, and the scene's sky under them. levels [N]: how much of each
+    background splat is sky; None where none is any.
+    """
 
     maps: StyleMaps
     sky: Sky
     bare: Scene
+    levels: Int16[Tensor, "N"] | None = None
 
     def on(self, parts: Sequence[PosedGaussians]) -> tuple[PosedGaussians, ...]:
         """The parts under the maps; snow among them keeps its colours."""
-        return tuple(
-            part if part.is_snow else dataclasses.replace(part, color_maps=self.maps.splats)
-            for part in parts
-        )
+        return tuple(part if part.is_snow else self._mapped(part) for part in parts)
 
     @cached_property
     def witness(self) -> Scene:
         """A scene of the styled background's mean colours and sky, to read the light from."""
         flat = dataclasses.replace(self.bare.background, sh=self.bare.background.sh[:, :1])
-        return dataclasses.replace(
-            self.bare, background=style_gaussians(flat, self.maps), sky=self.sky
-        )
+        flat = style_gaussians(flat, self.maps, levels=self.levels)
+        return dataclasses.replace(self.bare, background=flat, sky=self.sky)
+
+    def _mapped(self, part: PosedGaussians) -> PosedGaussians:
+        if self.levels is None or part.instance_id > 0:
+            return dataclasses.replace(part, color_maps=self.maps.splats)
+        return dataclasses.replace(part, color_maps=self._level_maps, color_rows=self._rows)
+
+    @cached_property
+    def _level_maps(self) -> Float[Tensor, "R 3 4"]:
+        return level_maps(self.maps)
+
+    @cached_property
+    def _rows(self) -> Int16[Tensor, "N"]:
+        assert self.levels is not None
+        return map_rows(self.levels, self.bare.background.semantic, len(self.maps.splats))
 
 
 def look_of(scene: Scene, style: Style) -> Look:
@@ -56,7 +73,8 @@ def look_of(scene: Scene, style: Style) -> Look:
     if look is None or look.maps is not maps:
         # The scene itself would be kept alive by what is remembered for as long as it lives.
         bare = dataclasses.replace(scene)
-        look = looks[style] = Look(maps, style_sky(scene.sky, maps.sky), bare)
+        sky, levels = style_sky(scene.sky, maps.sky), sky_levels(scene, maps)
+        look = looks[style] = Look(maps, sky, bare, levels)
     looks.move_to_end(style)
     while len(looks) > _MOST_LOOKS:
         looks.popitem(last=False)

@@ -112,6 +112,19 @@ def test_classes_without_a_map_take_the_first(backend):
     assert torch.equal(images[0], images[1]) and torch.equal(images[0], images[2])
 
 
+@pytest.mark.parametrize("backend", ["cpu", "reference"])
+def test_rows_come_before_classes(backend):
+    gaussians = labelled(10)
+    rows = torch.arange(len(gaussians), dtype=torch.int16) % CLASSES
+    maps = some_maps(CLASSES, 11)
+    chosen = PosedGaussians(gaussians, color_maps=maps, color_rows=rows)
+    instead = PosedGaussians(dataclasses.replace(gaussians, semantic=rows), color_maps=maps)
+    images = [rasterize([p], camera_ahead(), backend=backend).rgb for p in (chosen, instead)]
+    assert torch.equal(*images)
+    with pytest.raises(ValueError, match=r"color_rows must be int16 \[300\]"):
+        rasterize([dataclasses.replace(chosen, color_rows=rows[1:])], camera_ahead())
+
+
 def test_gradients_pass_through_the_maps():
     gaussians = random_gaussians(20, seed=12, sh_degree=1)
     sh = gaussians.sh.clone().requires_grad_(True)
