@@ -213,9 +213,14 @@ def transfer_maps(
         return Transfer(content, content, content, cycled), None
     styled = compose(other, content)
     rendered = _pictures(draw, styled, through)
-    # An encoder sees pictures, which end at 0 and 1.
-    back, _ = net.encode(rendered.clamp(0, 1))
-    return Transfer(content, styled, compose(net.content_map(back), styled), cycled), rendered
+    seen, transferred = rendered.clamp(0, 1), styled  # an encoder's pictures end at 0 and 1
+    if net.moments:
+        # No gradient passes a picture's moments, so a map that Z_s follows would not be seen to do
+        # so, and L_con would bend Y_s instead (by 2 dB of `same`): it teaches the way back alone.
+        seen, transferred = seen.detach(), styled.detach()
+    back, _ = net.encode(seen)
+    returned = compose(net.content_map(back), transferred)
+    return Transfer(content, styled, returned, cycled), rendered
 
 
 def paper_terms(

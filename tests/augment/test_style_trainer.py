@@ -14,7 +14,7 @@ from augment.scene import Scene
 from augment.sky import ConstantSky
 from augment.style.features import FilterBank
 from augment.style.losses import GaussianColors
-from augment.style.network import apply_map
+from augment.style.network import Gscm, apply_map
 from augment.style.pair_losses import PairWeights
 from augment.style.pairs import recolor
 from augment.style.train_config import StyleTrainConfig
@@ -198,6 +198,15 @@ def test_through_the_renderer_is_through_the_picture():
     assert values[0]["style"] == pytest.approx(values[1]["style"], rel=0.1)
     assert values[0]["consistency"] == pytest.approx(values[1]["consistency"], rel=0.2)
     assert (gradients[0] - gradients[1]).abs().max() < 1e-2 * gradients[0].abs().max()
+
+
+@pytest.mark.parametrize("moments", [True, False])
+def test_l_con_bends_no_style_where_it_cannot_see_the_moments(moments):
+    net = Gscm("small", moments=moments)
+    torch.nn.init.normal_(net.head.weight, std=0.01, generator=torch.Generator().manual_seed(1))
+    paper_terms(net, draw(pool_of()), FilterBank())["consistency"].backward()
+    assert (net.content_q.grad != 0).any()
+    assert (net.style_q.grad is None) == moments
 
 
 def test_the_loss_falls():
