@@ -9,6 +9,8 @@ the clouds beside it may still differ from the sky behind it.
 
 from __future__ import annotations
 
+from weakref import WeakKeyDictionary
+
 import numpy as np
 import torch
 from jaxtyping import Float, Int16
@@ -30,24 +32,39 @@ _MOST_PLACES = 64  # that the sky is looked at from
 def sky_levels(scene: Scene, maps: StyleMaps) -> Int16[Tensor, "N"] | None:
     """How much of every background splat is sky, 0 to LEVELS; None where none is any.
 
-    Each is looked at from the nearest of the scene's cameras.
+    Each is looked at from the nearest of the scene's cameras. Remembered for as long as the scene
+    lives, since it is the same for every style.
     """
-    seen, g = maps.seen_sky, scene.background
-    places = _places(scene)
-    if seen is None or len(places) == 0 or len(g) == 0:
+    seen = maps.seen_sky
+    if seen is None:
         return None
-    means = g.means.double().numpy()
+    known, key = _remembered.setdefault(scene, {}), seen.numpy().tobytes()
+    if key not in known:
+        known[key] = _find(scene, seen)
+    return known[key]
+
+
+_remembered: WeakKeyDictionary[Scene, dict[bytes, Tensor | None]] = WeakKeyDictionary()
+
+
+def _find(scene: Scene, seen: Float[Tensor, "3 4"]) -> Int16[Tensor, "N"] | None:
+    g, places = scene.background, _places(scene)
+    if len(places) == 0 or len(g) == 0:
+        return None
+    rgb = np.clip(0.5 + SH_C0 * g.sh[:, 0].double().numpy(), 0, 1)
+    likely = _ramp(_distance(rgb, seen), _UNLIKELY, _LIKELY)
+    found = np.flatnonzero((likely > 0) & (g.means[:, 2].numpy() > places[:, 2].min()))
+    if len(found) == 0:
+        return None
+    means = g.means[found].double().numpy()
     away = means - places[KDTree(places).query(means)[1]]
     length = np.maximum(np.linalg.norm(away, axis=1), 1e-9)
     elevation_deg = np.degrees(np.arcsin(np.clip(away[:, 2] / length, -1, 1)))
-    found = np.flatnonzero(_ramp(elevation_deg, _LOW_DEG, _HIGH_DEG) > 0)
-    own = np.clip(0.5 + SH_C0 * g.sh[found, 0].double().numpy(), 0, 1)
-    towards = torch.from_numpy(away[found].astype(np.float32))
-    behind = scene.sky.sample(towards).double().numpy() if len(found) else own
+    behind = scene.sky.sample(torch.from_numpy(away.astype(np.float32))).double().numpy()
     share = (
-        _ramp(elevation_deg[found], _LOW_DEG, _HIGH_DEG)
-        * _ramp(np.abs(own - behind).max(1), _FAR, _NEAR)
-        * _ramp(_distance(own, seen), _UNLIKELY, _LIKELY)
+        likely[found]
+        * _ramp(elevation_deg, _LOW_DEG, _HIGH_DEG)
+        * _ramp(np.abs(rgb[found] - behind).max(1), _FAR, _NEAR)
         * _ramp(_distance(behind, seen), _UNLIKELY, _LIKELY)
     )
     levels = np.zeros(len(g), np.int16)
