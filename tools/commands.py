@@ -300,10 +300,9 @@ def demo(out: Path = Path("out/demo"), frames: int = 10) -> int:
     return run_demo(out, frames)
 
 
-def style() -> int:
+def style() -> None:
     """Colour moods: apply one to a scene, train the network behind them, list the presets."""
-    print("climategs style apply | train | presets; climategs style --help says more")
-    return 0
+    # A line in the list of commands; the words after it go to a table of their own (tools.cli).
 
 
 def open_with_path(uri: str, camera_path: Path | None) -> Scene:

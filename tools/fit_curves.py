@@ -58,7 +58,7 @@ def draw_curves(history: Sequence[Row]) -> np.ndarray | None:
     sheet = np.full((rows * HEIGHT, columns * WIDTH, 3), 255, np.uint8)
     for i, panel in enumerate(panels):
         y, x = i // columns * HEIGHT, i % columns * WIDTH
-        _draw(sheet[y : y + HEIGHT, x : x + WIDTH], panel, max(last_step, 1.0), clock)
+        draw_panel(sheet[y : y + HEIGHT, x : x + WIDTH], panel, max(last_step, 1.0), clock)
     return sheet
 
 
@@ -93,7 +93,7 @@ def _known(value: Any) -> bool:
     return isinstance(value, int | float) and math.isfinite(value)
 
 
-def _draw(
+def draw_panel(
     panel_image: np.ndarray,
     panel: Panel,
     last_step: float,

@@ -71,8 +71,18 @@ def train(
     views: int = 24,
     seed: int = 0,
     learning_rate: float | None = None,
+    decay: float = 0.1,
+    warm_up: float = 0.1,
+    style: float = 1.0,
+    consistency: float = 10.0,
+    cycle: float = 10.0,
+    pairs: float = 1.0,
     pair_weights: str = "",
+    batch: int = 2,
+    pair_batch: int = 4,
+    scene_share: float = 0.5,
     holdout: int = 8,
+    half_precision: bool = False,
     through: Literal["picture", "renderer"] = "picture",
     device: str = "cpu",
     ablations: bool = False,
@@ -98,8 +108,18 @@ def train(
         views: Most views of a scene.
         seed: Of everything random.
         learning_rate: Adam's; the encoder's usual one by default.
+        decay: What the learning rate is multiplied by after each third of the steps.
+        warm_up: Share of the steps that learn the cycle alone.
+        style: Weight of the style loss.
+        consistency: Weight of the loss in content space.
+        cycle: Weight of the cycle's loss.
+        pairs: Weight of recoloured pairs of photos, whose perfect result is known.
         pair_weights: Of the losses of pairs, as same=1,look=2; the others keep theirs.
+        batch: Transfers a step.
+        pair_batch: Pairs a step.
+        scene_share: Share of the transfers whose content is a view of a scene.
         holdout: Every so many photos are kept for scores; 0 for none.
+        half_precision: Write the network's numbers in 16 bits.
         through: Render mapped Gaussians for every step, or map pictures rendered once.
         device: Where torch trains.
         ablations: Train without each loss, and 3x3 maps, too, and write a table.
@@ -123,8 +143,18 @@ def train(
         views=views,
         seed=seed,
         learning_rate=learning_rate,
+        decay=decay,
+        warm_up=warm_up,
+        style=style,
+        consistency=consistency,
+        cycle=cycle,
+        pairs=pairs,
         pair_weights=pair_weights,
+        batch=batch,
+        pair_batch=pair_batch,
+        scene_share=scene_share,
         holdout=holdout,
+        half_precision=half_precision,
         through=through,
         device=device,
         ablations=ablations,

@@ -51,7 +51,9 @@ def draw_style_curves(history: Sequence[Mapping[str, Any]]) -> np.ndarray | None
     sheet = np.full((rows * HEIGHT, 2 * WIDTH, 3), 255, np.uint8)
     for i, panel in enumerate(panels):
         y, x = i // 2 * HEIGHT, i % 2 * WIDTH
-        fit_curves._draw(sheet[y : y + HEIGHT, x : x + WIDTH], panel, max(last_step, 1.0), clock)
+        fit_curves.draw_panel(
+            sheet[y : y + HEIGHT, x : x + WIDTH], panel, max(last_step, 1.0), clock
+        )
     return sheet
 
 
