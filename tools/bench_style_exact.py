@@ -31,7 +31,7 @@ from tools.bench_style_network import random_network
 
 VISIBLE = 1 / 255
 _COLORS = 4096
-_SH3 = 16
+_SH3 = 16  # coefficients
 _BAND_SPREAD = 0.06  # standard deviation of the coefficients that give a scene directions
 
 
@@ -64,7 +64,7 @@ def folding_error(net: Gscm) -> float:
 def bench_exact(scene: Scene, camera: Camera, presets: Sequence[str]) -> list[dict[str, Any]]:
     """Of the scene as it is and, where its colours depend on no direction, with some that do."""
     kinds = {f"SH {_degree(scene)}": scene}
-    if _degree(scene) < 3:
+    if _degree(scene) == 0:
         kinds["SH 3"] = with_directions(scene)
     found = []
     for kind, each in kinds.items():

@@ -1,6 +1,7 @@
 """Whether views of a styled scene agree as well as those of the clean one.
 
 The protocol is augment.metrics.consistency's: a view is warped into another by the scene's depth.
+Cameras show the scene's own colours, or what is measured would be how their exposures differ.
 """
 
 from __future__ import annotations
@@ -15,13 +16,14 @@ from augment.cameras import Camera
 from augment.metrics.consistency import Consistency, DepthView, warped_consistency
 from augment.plan import Plan, make_plan
 from augment.scene import Scene
-from recipes.schema import Output, Recipe
+from recipes.schema import Output, Recipe, Render
 from recipes.style import Style
 from tools.bench_flood_masks import neighbours
 
 NEAR, FAR = 1, 7  # frames apart, as Lai et al. 2018 and its successors take them
 KINDS = (f"{NEAR} frame apart", f"{FAR} frames apart", "neighbouring cameras")
 _DEPTH = Output(depth="expected", labels=False)
+_NEUTRAL = Render(exposure="neutral")
 _LEAST_SHARE = 0.01  # of a view that another shows; of less there is nothing to say
 
 
@@ -41,7 +43,7 @@ def bench_views(
     pairs = {kind: _pairs(scene, frames, kind, width) for kind in KINDS}
     rows: list[dict[str, Any]] = []
     for name, style in styles.items():
-        plan = make_plan(Recipe(style=style, output=_DEPTH), scene)
+        plan = make_plan(Recipe(style=style, output=_DEPTH, render=_NEUTRAL), scene)
         found = {kind: _pooled(scene, plan, pairs[kind]) for kind in KINDS}
         for kind, each in found.items():
             clean = rows[0][kind] if rows else each
