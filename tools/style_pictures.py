@@ -39,7 +39,7 @@ PHOTOS = ("21.jpg", "06.jpg", "22.jpg")  # Kodak's, shown where the folder has t
 REGION_PHOTOS = ("16.jpg", "11.jpg")
 # What goes wrong: Kodak's photos, and presets.
 FAILING_PHOTOS = {
-    "02.jpg": "a door: all is red, though dusk was not meant",
+    "02.jpg": "a red door: the whole street is red",
     "13.jpg": "a forest: walls and road turn green",
     "03.jpg": "caps in the sun: leaves turn acid",
 }
@@ -168,7 +168,11 @@ def draw_strengths(stage: Stage) -> np.ndarray:
     sources = ["golden-hour", "overcast", *stage.chosen(PHOTOS[2:3], 1)]
     return _grid([
         [
-            stage.panel(f"strength {value:g}", name, style=stage.style(name, strength=value))
+            stage.panel(
+                f"strength {value:g}",
+                "a photograph" if name in stage.photos else name,
+                style=stage.style(name, strength=value),
+            )
             for value in STRENGTHS
         ]
         for name in sources
