@@ -9,7 +9,13 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from augment.errors import StyleError
-from augment.style.checkpoint import METADATA_KEY, load_network, network_facts, save_network
+from augment.style.checkpoint import (
+    METADATA_KEY,
+    SHIPPED,
+    load_network,
+    network_facts,
+    save_network,
+)
 from augment.style.network import Gscm
 
 
@@ -138,3 +144,13 @@ def test_other_files(tmp_path, written):
         load_network(path)
     with pytest.raises(StyleError, match="climategs style train"):
         load_network(tmp_path)
+
+
+def test_the_shipped_network():
+    net, facts = load_network(), network_facts()
+    assert facts["encoder"] == "small" and net.offset
+    assert facts["about"]["licences"] and facts["about"]["data"]["held_out"]
+    assert not set(facts["about"]["data"]["train"]) & set(facts["about"]["data"]["held_out"])
+    figures = facts["about"]["figures"]
+    assert figures["network"]["look"] > figures["mkl"]["look"] > 0
+    assert SHIPPED.stat().st_size < 10 * 2**20
