@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 from weakref import WeakKeyDictionary
 
 import cv2
@@ -26,6 +28,9 @@ from augment.style.images import StyleImage, image_statistics, read_style_image
 from augment.style.maps import StyleMaps, identity_map, with_strength
 from augment.style.statistics import Statistics
 from recipes.style import Style
+
+if TYPE_CHECKING:
+    from augment.style.network import Gscm
 
 MOST_REMEMBERED = 8  # styles of a scene
 
@@ -104,11 +109,10 @@ def _style_image(style: Style) -> StyleImage:
 def _network_map(
     scene: Scene, style: Style, cameras: Sequence[Camera] | None
 ) -> Float[Tensor, "3 4"]:
-    from augment.style.checkpoint import load_network
     from augment.style.network import gscm_map
 
     picture = _style_picture(_style_image(style))
-    net = load_network(None if style.checkpoint is None else Path(style.checkpoint))
+    net = _network(style.checkpoint, _stamp(style.checkpoint))
     content = content_pictures(scene, cameras)
     found = gscm_map(net, content, picture).double()
     if not bool(torch.isfinite(found).all()):
@@ -119,6 +123,22 @@ def _network_map(
     mean = content.double().mean((0, 2, 3))
     full = _limited(found, mean)
     return _limited(with_strength(full, style.strength), mean).float()
+
+
+@functools.lru_cache(maxsize=2)
+def _network(path: str | None, _stamp: tuple[int, int]) -> Gscm:
+    """The network of a file, read once for all styles for as long as the file stays as it is."""
+    from augment.style.checkpoint import load_network
+
+    return load_network(None if path is None else Path(path))
+
+
+def _stamp(path: str | None) -> tuple[int, int]:
+    """What changes with a file; of one that is not there, nothing: reading it says so."""
+    if path is None or not Path(path).is_file():
+        return (0, 0)
+    found = Path(path).stat()
+    return (found.st_mtime_ns, found.st_size)
 
 
 def _style_picture(image: StyleImage) -> Float[Tensor, "1 3 256 256"]:
