@@ -221,10 +221,11 @@ def sheet(
 
 
 def bench(
-    what: Positional[Literal["raster", "smog", "flood", "snow", "fit"]] = "raster",
+    what: Positional[Literal["raster", "smog", "flood", "snow", "style", "fit"]] = "raster",
     repeats: int = 7,
     quick: bool = False,
     scene: str | None = None,
+    photos: Path | None = None,
     pictures: Path | None = None,
     json_file: JsonFile = None,
 ) -> int:
@@ -235,17 +236,21 @@ def bench(
     the procedural street. flood: what flooded frames cost beside clean ones, how far each kind of
     reflection is from the exact one, and whether cameras agree on where the water is. snow: how
     much of the open ground it covers and how high, what placing and drawing it costs, and whether
-    cameras agree on it. fit: time of each stage of a reconstruction's step, and memory.
+    cameras agree on it. style: what a style costs, how exact its maps are, whether views of a
+    styled scene agree, and how the methods do on photos. fit: time of each stage of a
+    reconstruction's step, and memory.
 
     Args:
         what: Which benchmark.
-        repeats: Timed frames a scene (raster) or a kind of flood or snow (flood, snow).
+        repeats: Timed frames a scene (raster) or a kind of flood, snow or style.
         quick: The smaller scene, one view, or fewer steps, only.
         scene: Raw data to fit (fit); by default a drive down the procedural street is recorded.
             Or the scene whose frames are timed (flood), as for render; by default the procedural
-            street with a million Gaussians. Or a scene that is measured beside it (snow).
-        pictures: Also draw levels, waves and reflections with their time and error here (flood), or
-            depths, shadings, estimators and masks (snow).
+            street with a million Gaussians. Or a scene that is measured beside it (snow, style).
+        photos: A folder of photographs to score styles on (style).
+        pictures: Also draw levels, waves and reflections with their time and error here (flood),
+            depths, shadings, estimators and masks (snow), or methods, presets, strengths, regions,
+            orders and failures (style).
         json_file: Also write the figures to this file.
     """
     if what == "smog":
@@ -273,6 +278,18 @@ def bench(
             from tools.snow_pictures import draw_snow_pictures
 
             text += "".join(f"\nwrote {path}" for path in draw_snow_pictures(pictures))
+    elif what == "style":
+        from tools import bench_style
+        from tools.bench_style_text import style_text
+
+        case = bench_style.QUICK if quick else bench_style.WHOLE
+        result = bench_style.bench_style(case, scene_uri=scene, photos=photos, repeats=repeats)
+        text = style_text(result)
+        if pictures is not None:
+            from tools.style_pictures import draw_style_pictures
+
+            drawn = draw_style_pictures(pictures, photos=photos)
+            text += "".join(f"\nwrote {path}" for path in drawn)
     elif what == "fit":
         from tools.bench_fit import bench_fit, fit_text
 
