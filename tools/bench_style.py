@@ -67,8 +67,9 @@ def bench_style(
     """All figures as plain numbers for JSON.
 
     scene_uri: a scene that exactness, frames, memory and views are measured on, too. photos: files
-    and folders, of which every eighth is scored on, as training holds them out. checkpoint: the
-    network; None for the one that comes with the package, or where there is none a random one.
+    and folders, of which those are scored on that the network was not trained on: as its file
+    says, else every eighth. checkpoint: the network; None for the one that comes with the
+    package, or where there is none a random one.
     repeats: timed turns a case, after one that is not counted. memory: also start processes that
     measure the peak memory of a frame.
     """
@@ -109,5 +110,5 @@ def _scene_figures(
         "scene": uri,
         "exact": bench_exact(scene, camera, case.presets),
         "frames": bench_frames(scene, camera, case.presets[0], repeats, progress=progress),
-        "memory": bench_memory(uri, case.width, case.presets[0]) if memory else None,
+        "memory": bench_memory(scene, uri, case.width, case.presets[0]) if memory else None,
     }

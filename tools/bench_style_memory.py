@@ -7,31 +7,49 @@ is the scene's from then on, and counts for both.
 
 from __future__ import annotations
 
+import dataclasses
 import json
+import statistics
 import sys
 from typing import Any
 
+from augment.scene import Scene
 from tools.bench_memory import RESET_PEAK, extra_mib, measured_apart
 
 SMALL = 0.125
+RUNS = 3  # of each, in turns: threads that meet otherwise take some MiB more or less
 
 
-def bench_memory(uri: str, width: int, preset: str) -> dict[str, float] | None:
-    """MiB above the scene at the highest moment of a clean and of a styled frame, and their ratio;
-    None where the system cannot tell.
+def bench_memory(scene: Scene, uri: str, width: int, preset: str) -> dict[str, float] | None:
+    """MiB above the scene at the highest moment of a clean and of a styled frame, medians, and
+    their ratio; the scene's own, and the ratio with it in both. None where the system cannot tell.
 
     Raises:
         RuntimeError: a measuring process failed; the message is what it wrote.
     """
     if not RESET_PEAK.is_file():
         return None
-    clean, styled = (
-        measured_apart(
-            "tools.bench_style_memory", {"uri": uri, "width": width, "preset": name}, "a style"
-        )
-        for name in (None, preset)
-    )
-    return {"clean_mib": clean, "styled_mib": styled, "ratio": styled / clean}
+    found: dict[str | None, list[float]] = {None: [], preset: []}
+    for _ in range(RUNS):
+        for name, each in found.items():
+            arguments = {"uri": uri, "width": width, "preset": name}
+            each.append(measured_apart("tools.bench_style_memory", arguments, "a style"))
+    clean, styled = (statistics.median(each) for each in found.values())
+    own = scene_mib(scene)
+    return {
+        "scene_mib": own,
+        "clean_mib": clean,
+        "styled_mib": styled,
+        "ratio": styled / clean,
+        "whole_ratio": (own + styled) / (own + clean),
+    }
+
+
+def scene_mib(scene: Scene) -> float:
+    """Of the Gaussians alone."""
+    parts = [scene.background, *(actor.gaussians for actor in scene.actors)]
+    tensors = [getattr(part, field.name) for part in parts for field in dataclasses.fields(part)]
+    return sum(t.numel() * t.element_size() for t in tensors if t is not None) / 2**20
 
 
 def _render_once(uri: str, width: int, preset: Any) -> float:

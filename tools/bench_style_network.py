@@ -18,11 +18,14 @@ _HEAD = 0.02  # standard deviation of a random head's weights; a new one's are 0
 
 @dataclass(frozen=True, eq=False)
 class BenchNetwork:
-    """is_trained: whether it is a checkpoint. facts: what to say of it."""
+    """is_trained: whether it is a checkpoint. facts: what to say of it. held_out: names of photos
+    with their folder's, such as kodak/01.jpg, that it was not trained on, where its file says so.
+    """
 
     net: Gscm
     is_trained: bool
     facts: dict[str, Any]
+    held_out: tuple[str, ...] = ()
 
 
 def bench_network(checkpoint: Path | None) -> BenchNetwork:
@@ -37,7 +40,10 @@ def bench_network(checkpoint: Path | None) -> BenchNetwork:
     name = (checkpoint or SHIPPED).name
     weights = sum(value.numel() for value in net.state_dict().values())
     facts = {"name": name, "weights": weights, **{k: found[k] for k in ("encoder", "k", "offset")}}
-    return BenchNetwork(net, True, facts)
+    data = found["about"].get("data", {}) if isinstance(found.get("about"), dict) else {}
+    held_out = data.get("held_out", ()) if isinstance(data, dict) else ()
+    names = tuple(map(str, held_out)) if isinstance(held_out, list) else ()
+    return BenchNetwork(net, True, facts, names)
 
 
 def random_network(encoder: str = "small", *, offset: bool = True) -> Gscm:

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from jaxtyping import UInt8
+from torch import Tensor
 from tqdm import tqdm
 
 from augment.style.scores import (
@@ -43,10 +45,12 @@ def bench_scores(
     holdout: int = HOLDOUT,
     progress: bool = True,
 ) -> dict[str, Any]:
-    """Scores by method, or the reason why there are none."""
+    """Scores by method, or the reason why there are none. holdout: every so many photos are
+    scored on where the network's file does not say which it was not trained on.
+    """
     if not photos:
         return {"skipped": "no photos were given"}
-    held_out = read_photos(photos, case.size_px, holdout=holdout).held_out
+    held_out = held_out_photos(photos, network.held_out, case.size_px, holdout)
     if len(held_out) < LEAST_PHOTOS:
         return {"skipped": f"{len(held_out)} photos are held out; {LEAST_PHOTOS} are needed"}
     pictures = held_out.float() / 255
@@ -73,3 +77,16 @@ def bench_scores(
         },
         "skipped": None if network.is_trained else "the network: no checkpoint is there",
     }
+
+
+def held_out_photos(
+    photos: Sequence[Path], names: Sequence[str], size_px: int, holdout: int
+) -> UInt8[Tensor, "P 3 S S"]:
+    """Squares of the photos of these names, with the folder's before them; of every `holdout`th
+    photo where there are no names.
+    """
+    if not names:
+        return read_photos(photos, size_px, holdout=holdout).held_out
+    files = [f for path in photos for f in (sorted(path.rglob("*")) if path.is_dir() else [path])]
+    chosen = [file for file in files if file.as_posix().endswith(tuple(f"/{n}" for n in names))]
+    return read_photos(chosen, size_px, holdout=0).train

@@ -75,7 +75,8 @@ def _frame_lines(scene: str, frames: dict[str, Any], memory: dict[str, float] | 
     if memory is not None:
         lines.append(
             f"  memory above the scene: clean {memory['clean_mib']:.0f} MiB, styled "
-            f"{memory['styled_mib']:.0f} MiB, ratio {memory['ratio']:.3f}"
+            f"{memory['styled_mib']:.0f} MiB, ratio {memory['ratio']:.3f}; with the scene's "
+            f"{memory['scene_mib']:.0f} MiB {memory['whole_ratio']:.3f}"
         )
     return lines
 

@@ -16,8 +16,8 @@ from tools.bench_scene import RasterCase
 from tools.bench_style import StyleCase
 from tools.bench_style_cost import bench_apply, front_camera
 from tools.bench_style_exact import bench_exact, clamped_pixels, folding_error, with_directions
-from tools.bench_style_network import random_network
-from tools.bench_style_scores import ScoreCase, bench_scores
+from tools.bench_style_network import BenchNetwork, bench_network, random_network
+from tools.bench_style_scores import ScoreCase, bench_scores, held_out_photos
 from tools.bench_style_text import style_text
 from tools.bench_style_views import KINDS, bench_views
 
@@ -54,6 +54,8 @@ def figures(tmp_path_factory):
         write_photo(photos / f"{number:02}.png", rng)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(bench_style, "open_scene", lambda _: sheets())
+        found = BenchNetwork(random_network(), True, {"name": "random", "encoder": "small"})
+        patch.setattr(bench_style, "bench_network", lambda _: found)
         return bench_style.bench_style(TINY, photos=photos, repeats=1, memory=False, progress=False)
 
 
@@ -105,12 +107,24 @@ def test_text_has_a_row_for_everything(figures):
 
 
 def test_without_photos_scores_say_so(figures):
-    from tools.bench_style_network import bench_network
-
     found = bench_scores(bench_network(None), [], TINY.scores, progress=False)
     assert found == {"skipped": "no photos were given"}
     text = style_text({**figures, "scores": found})
     assert "SCORES  left out: no photos were given" in text
+
+
+def test_photos_that_the_network_was_not_trained_on_are_scored_on(tmp_path):
+    rng = np.random.default_rng(0)
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        for number in range(8):
+            write_photo(tmp_path / name / f"{number}.png", rng)
+    every = held_out_photos([tmp_path], (), 16, 8)
+    assert len(every) == 2
+    named = held_out_photos([tmp_path], ("a/7.png", "b/7.png", "c/7.png"), 16, 8)
+    assert torch.equal(named, every)
+    one = held_out_photos([tmp_path / "b" / "7.png", tmp_path / "a"], ("b/7.png",), 16, 8)
+    assert torch.equal(one, every[1:])
 
 
 def test_views_of_a_styled_scene_agree_as_those_of_the_clean_one_do():
