@@ -33,8 +33,8 @@ class ScoreCase:
     """size_px: of the square photos. repeats: recolourings a photo. pairs: of different photos."""
 
     size_px: int = 256
-    repeats: int = 2
-    pairs: int = 200
+    repeats: int = 1
+    pairs: int = 60
 
 
 def bench_scores(
