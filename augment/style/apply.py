@@ -4,8 +4,8 @@ A Gaussian's colour is c = 0.5 + sum sh_lm Y_lm(direction), and Y_00 = C0 is con
 c' = M c + b holds in every direction where
     sh_00' = (M (C0 sh_00 + 0.5) + b - 0.5) / C0 = M sh_00 + (0.5 M 1 + b - 0.5) / C0,
     sh_lm' = M sh_lm  otherwise.
-Renderers clamp c to >= 0 before they blend, which a map does not commute with: where a colour was
-clamped, or is after it, the picture is not the map of the picture.
+Renderers clamp c to >= 0 before they blend, which a map does not commute with: where a colour that
+changes with the direction was clamped, or is after it, the picture is not the map of the picture.
 """
 
 from __future__ import annotations
@@ -85,11 +85,13 @@ def map_sh(
 ) -> Float[Tensor, "N K 3"]:
     """The torch definition: SH of the mapped colours. classes [N]: rows of maps; None: the first.
 
-    A map that changes nothing leaves every bit of its splats.
+    A map that changes nothing leaves every bit of its splats. Of degree 0, a colour below 0 is
+    mapped as the black that it shows.
     """
     folded = fold_maps(maps, sh.dtype)
     rows = folded[torch.zeros(len(sh), dtype=torch.long) if classes is None else classes.long()]
-    mapped = torch.einsum("nij,nkj->nki", rows[:, :9].reshape(-1, 3, 3), sh)
+    shown = sh.clamp_min(float(sh_kernels.BLACK)) if sh.shape[1] == 1 else sh
+    mapped = torch.einsum("nij,nkj->nki", rows[:, :9].reshape(-1, 3, 3), shown)
     first = mapped[:, :1] + rows[:, None, 9:12]
     mapped = torch.cat([first, mapped[:, 1:]], 1)
     return torch.where(rows[:, 12, None, None] != 0, mapped, sh)

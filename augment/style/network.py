@@ -13,6 +13,9 @@ identity).
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -123,20 +126,33 @@ def apply_map(
 def gscm_map(
     net: Gscm, content: Float[Tensor, "B 3 S S"], style: Float[Tensor, "1 3 S S"]
 ) -> Float[Tensor, "3 4"]:
-    """The one map of a scene and a style picture; f_c is the mean over the scene's pictures.
+    """The one map of a scene and a style picture."""
+    return compose(style_side(net, style), content_side(net, content))
 
-    Computed in one thread, so that its bits do not depend on how many there are.
-    """
-    threads = torch.get_num_threads()
-    training = net.training
+
+def content_side(net: Gscm, content: Float[Tensor, "B 3 S S"]) -> Float[Tensor, "3 4"]:
+    """nGSCM of a scene, the same for every style; f_c is the mean over the scene's pictures."""
+    with _one_thread(net):
+        f_c, _ = net.encode(content)
+        return net.content_map(f_c.mean(0, keepdim=True))[0]
+
+
+def style_side(net: Gscm, style: Float[Tensor, "1 3 S S"]) -> Float[Tensor, "3 4"]:
+    """sGSCM of a style picture, the same for every scene."""
+    with _one_thread(net):
+        _, f_s = net.encode(style)
+        return net.style_map(f_s)[0]
+
+
+@contextmanager
+def _one_thread(net: Gscm) -> Iterator[None]:
+    """Without gradients, and so that bits do not depend on how many threads there are."""
+    threads, training = torch.get_num_threads(), net.training
     try:
         torch.set_num_threads(1)
         net.eval()
         with torch.no_grad():
-            f_c, _ = net.encode(content)
-            _, f_s = net.encode(style)
-            first = net.content_map(f_c.mean(0, keepdim=True))
-            return compose(net.style_map(f_s), first)[0]
+            yield
     finally:
         torch.set_num_threads(threads)
         net.train(training)

@@ -109,12 +109,12 @@ def _style_image(style: Style) -> StyleImage:
 def _network_map(
     scene: Scene, style: Style, cameras: Sequence[Camera] | None
 ) -> Float[Tensor, "3 4"]:
-    from augment.style.network import gscm_map
+    from augment.style.network import compose, style_side
 
     picture = _style_picture(_style_image(style))
     net = _network(style.checkpoint, _stamp(style.checkpoint))
     content = content_pictures(scene, cameras)
-    found = gscm_map(net, content, picture).double()
+    found = compose(style_side(net, picture), _content_side(scene, net, content)).double()
     if not bool(torch.isfinite(found).all()):
         raise StyleError(
             f"the network gives no finite map for style image {style.image}: {found.tolist()}; "
@@ -123,6 +123,21 @@ def _network_map(
     mean = content.double().mean((0, 2, 3))
     full = _limited(found, mean)
     return _limited(with_strength(full, style.strength), mean).float()
+
+
+def _content_side(
+    scene: Scene, net: Gscm, content: Float[Tensor, "B 3 256 256"]
+) -> Float[Tensor, "3 4"]:
+    """The scene's half of its maps, remembered with the pictures and the network it is of."""
+    from augment.style.network import content_side
+
+    known = _content_sides.get(scene)
+    if known is None or known[0] is not net or known[1] is not content:
+        known = _content_sides[scene] = (net, content, content_side(net, content))
+    return known[2]
+
+
+_content_sides: WeakKeyDictionary[Scene, tuple[Gscm, Tensor, Tensor]] = WeakKeyDictionary()
 
 
 @functools.lru_cache(maxsize=2)

@@ -13,11 +13,13 @@ from numba.extending import intrinsic
 
 from augment.render.cpu_jit import inner, kernel
 from augment.render.cpu_layout import LANES, U
+from augment.render.sh import SH_C0
 
 SPLATS = 2048  # of a piece of work
 RUN = 128  # splats mapped at a time, whose results (24 KB at degree 3) stay in the first cache
 FOLDED = 13  # numbers of a folded map: 9 of M row by row, 3 that the first function gets, changes
 ALIGNMENT = 4 * LANES  # bytes, of the target
+BLACK = np.float32(-0.5 / SH_C0)  # sh_00 of a colour of 0
 
 
 @intrinsic
@@ -53,13 +55,15 @@ def _fence(typingctx):
 
 @inner()
 def _map_splats(source, at, work, to, count, functions, folded):
-    """`count` splats, from source[at:] to work[to:], by one map."""
+    """`count` splats, from source[at:] to work[to:], by one map; see apply.map_sh for `least`."""
+    least = BLACK if functions == U(1) else np.float32(-np.inf)
     a0, a1, a2 = folded[0], folded[1], folded[2]
     b0, b1, b2 = folded[3], folded[4], folded[5]
     c0, c1, c2 = folded[6], folded[7], folded[8]
     for i in range(count * functions):
         j, k = at + U(3) * i, to + U(3) * i
-        red, green, blue = source[j], source[j + U(1)], source[j + U(2)]
+        red, green = max(source[j], least), max(source[j + U(1)], least)
+        blue = max(source[j + U(2)], least)
         work[k] = a0 * red + a1 * green + a2 * blue
         work[k + U(1)] = b0 * red + b1 * green + b2 * blue
         work[k + U(2)] = c0 * red + c1 * green + c2 * blue

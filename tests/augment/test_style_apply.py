@@ -9,7 +9,7 @@ from scenes import camera_ahead, random_gaussians
 
 from augment.render.composite import composite_sky, map_colors
 from augment.render.rasterize import rasterize
-from augment.render.sh import evaluate_sh
+from augment.render.sh import SH_C0, evaluate_sh
 from augment.render.threads import limit_threads
 from augment.scene import PosedGaussians
 from augment.sky import ConstantSky, CubemapSky, LatLongSky
@@ -235,3 +235,12 @@ def test_a_styled_scene_keeps_everything_else():
 
 
 changed = {"background", "actors", "sky"}
+
+
+@pytest.mark.parametrize("fast", [True, False])
+def test_without_directions_a_colour_below_0_is_mapped_as_the_black_that_it_shows(fast):
+    dark = dataclasses.replace(random_gaussians(3, sh_degree=0), sh=torch.full((3, 1, 3), -9.0))
+    lift = torch.cat([0.5 * torch.eye(3), torch.tensor([[0.2], [0.1], [0.3]])], 1)
+    maps = StyleMaps(lift[None], lift, lift)
+    colors = 0.5 + SH_C0 * style_gaussians(dark, maps, fast=fast).sh[:, 0]
+    torch.testing.assert_close(colors, lift[:, 3].expand(3, 3), rtol=0, atol=1e-6)

@@ -132,11 +132,29 @@ def test_the_network_gives_one_map_for_all(photo, network):
     )
 
 
+def test_a_scene_is_looked_at_once_for_all_styles(photo, network, monkeypatch):
+    from augment.style import network as net
+
+    looked = []
+    original = net.content_side
+    monkeypatch.setattr(net, "content_side", lambda *args: looked.append(args) or original(*args))
+    scene = colourful()
+    for strength in (1.0, 0.5):
+        style_maps(
+            scene,
+            Style(image=str(photo), method="gscm", checkpoint=str(network), strength=strength),
+        )
+    assert len(looked) == 1
+    style_maps(colourful(), Style(image=str(photo), method="gscm", checkpoint=str(network)))
+    assert len(looked) == 2
+
+
 @pytest.mark.parametrize("gain", [0.5, 8.0])
 def test_the_networks_gains_are_limited(photo, network, monkeypatch, gain):
     """A map that is too steep is flattened about the content's mean."""
     color_map = torch.cat([gain * torch.eye(3), torch.full((3, 1), 0.1)], 1)
-    monkeypatch.setattr("augment.style.network.gscm_map", lambda *_: color_map)
+    monkeypatch.setattr("augment.style.network.content_side", lambda *_: identity_map())
+    monkeypatch.setattr("augment.style.network.style_side", lambda *_: color_map)
     scene = colourful()
     style = Style(image=str(photo), method="gscm", checkpoint=str(network))
     found = style_maps(scene, style).sky
@@ -151,7 +169,7 @@ def test_the_networks_gains_are_limited(photo, network, monkeypatch, gain):
 
 def test_a_network_without_a_finite_map_says_so(photo, network, monkeypatch):
     monkeypatch.setattr(
-        "augment.style.network.gscm_map", lambda *_: torch.full((3, 4), float("nan"))
+        "augment.style.network.style_side", lambda *_: torch.full((3, 4), float("nan"))
     )
     style = Style(image=str(photo), method="gscm", checkpoint=str(network))
     with pytest.raises(StyleError, match=r"no finite map.*use another checkpoint"):
