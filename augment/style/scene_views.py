@@ -154,14 +154,6 @@ def map_sh(sh: Float[Tensor, "N K 3"], color_map: Float[Tensor, "3 4"]) -> Float
     return torch.cat([mapped[:, :1] + shift, mapped[:, 1:]], 1)
 
 
-def clamped_share(view: SceneView, color_map: Tensor, *, above: float = 1e-4) -> float:
-    """Share of pixels where the clamps at 0 make the two ways differ by more than `above`."""
-    with torch.no_grad():
-        rendered = rendered_pictures([view], color_map[None])
-        folded = folded_pictures(view.picture[None], color_map[None])
-    return float(((rendered - folded).abs().amax(1) > above).float().mean())
-
-
 def colors_of(scene: Scene, *, count: int = KEPT_COLORS, seed: int = 0) -> GaussianColors:
     """Colours of the scene's Gaussians, actors among them: of `count` drawn evenly, or of all.
 
