@@ -49,8 +49,8 @@ def open_features(weights: Path | None) -> FeatureExtractor:
 
 # ---- VGG-19 -----------------------------------------------------------------------------------
 
-# Channels of the convolutions up to relu4_1, blocks parted by pooling; and the relus, by the numbers
-# that torchvision gives them, whose outputs are taken.
+# Channels of the convolutions up to relu4_1, blocks parted by pooling; and the relus whose outputs
+# are taken, by the numbers that torchvision gives them.
 _BLOCKS = ((64, 64), (128, 128), (256, 256, 256, 256), (512,))
 _TAKEN = {1: "relu1_1", 6: "relu2_1", 11: "relu3_1", 20: "relu4_1"}
 _MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet, in training
