@@ -88,6 +88,8 @@ class Style(Closed):
             raise ValueError(f"checkpoint belongs to method gscm; method is {self.method}")
         if self.method == "gscm" and self.per_region:
             raise ValueError("per_region is for mkl and reinhard: gscm gives one map for all")
+        if self.applied_to == "picture" and self.per_region:
+            raise ValueError("per_region is for applied_to scene: a picture has one map for all")
         return self
 
     @property

@@ -133,6 +133,7 @@ def test_rules_are_tried_at_every_word_of_a_choice(folder: Path) -> None:
         {"preset": "dusk", "strength": 2.01},
         {"preset": "dusk", "per_region": 1},
         {"preset": "dusk", "applied_to": "sky"},
+        {"preset": "dusk", "applied_to": "picture", "per_region": True},
         {"preset": "dusk", "colour": 1},
         {"preset": "dawn of nothing"},
         {"image": 3},
@@ -158,7 +159,6 @@ style:
   method: {choice: [mkl, reinhard]}
   strength: {uniform: [0.25, 1]}
   per_region: {choice: [true, false]}
-  applied_to: {choice: [scene, picture]}
 """
 
 
@@ -179,6 +179,10 @@ def test_every_field_takes_ranges(folder: Path) -> None:
     assert {style.mask for style in drawn} == {None, str(folder / "sky.png")}
     assert {style.method for style in drawn} == {"mkl", "reinhard"}
     assert {style.per_region for style in drawn} == {True, False}
+    order = RANGED.replace(
+        "per_region: {choice: [true, false]}", "applied_to: {choice: [scene, picture]}"
+    )
+    drawn = [style for style in styles(order, folder, 30) if style is not None]
     assert {style.applied_to for style in drawn} == {"scene", "picture"}
     assert len({style.digest for style in drawn}) == 4, "one for each pair of image and mask"
 
