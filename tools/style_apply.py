@@ -23,16 +23,18 @@ from pydantic import ValidationError
 from augment.batch.atomic import write_atomic
 from augment.cameras import Camera
 from augment.errors import ClimateGSError, OutputError, StyleError
-from augment.render.composite import composite_sky, map_colors, quantise
+from augment.render.composite import composite_sky, quantise
 from augment.render.rasterize import rasterize
 from augment.render.sh import SH_C0
 from augment.scene import Gaussians, Scene
 from augment.scene_files import is_scene_folder, read_scene_folder, save_scene
 from augment.semantics import SemanticClass
-from augment.style.apply import style_gaussians, style_sky, styled_scene
+from augment.style.apply import style_gaussians, styled_scene
 from augment.style.content import content_pictures, content_statistics, select_views
+from augment.style.looks import Look
 from augment.style.maps import StyleMaps
 from augment.style.scene_maps import style_maps
+from augment.style.sky_splats import sky_levels
 from recipes.style import Style
 from recipes.style_presets import no_such_style, style_preset_names
 from tools.drawing import captioned, strip
@@ -145,8 +147,11 @@ def style_text(facts: Mapping[str, Any]) -> str:
             lines.append(
                 f"{what:9} with a colour below 0: {_percent(below)}; above 1: {_percent(above)}"
             )
-    if (off := clamped.get("pixels off the mapped picture")) is not None:
-        lines.append(f"pixels off the mapped picture by more than 1/255: {100 * off:.2f} %")
+    if (off := clamped.get("pixels off a render under the style")) is not None:
+        lines.append(
+            f"pixels where that makes more than 1/255 of difference to rendering the scene under "
+            f"the style: {100 * off:.2f} %"
+        )
     seconds, applied = facts["seconds"], facts["apply"]
     lines.append(
         f"scene colours {1e3 * seconds['content']:.0f} ms, image to map "
@@ -258,15 +263,15 @@ def _clamp_facts(scene: Scene, styled: Scene, maps: StyleMaps) -> dict[str, Any]
     half = len(pictures) // 2
     before, after = pictures[:half], pictures[half:]
     facts["pixels"] = _outside(
-        [torch.cat([p.reshape(-1, 3) for p, _ in group]) for group in (before, after)]
+        [torch.cat([p.reshape(-1, 3) for p in group]) for group in (before, after)]
     )
-    if len(maps.splats) == 1:
-        errors = []
-        for camera, old, new in zip(_views(scene), before, after, strict=True):
-            expected = _mapped_picture(camera, scene, maps, *old)
-            errors.append((expected.clamp(0, 1) - new[0].clamp(0, 1)).abs().amax(-1).flatten())
-        off = torch.cat(errors) > VISIBLE
-        facts["pixels off the mapped picture"] = float(off.float().mean())
+    worn = Look(maps, styled.sky, scene, sky_levels(scene, maps))
+    errors = [
+        (_render(scene, camera, worn) - new).abs().amax(-1).flatten()
+        for camera, new in zip(_views(scene), after, strict=True)
+    ]
+    off = torch.cat(errors) > VISIBLE
+    facts["pixels off a render under the style"] = float(off.float().mean())
     return facts
 
 
@@ -291,23 +296,14 @@ def _views(scene: Scene) -> list[Camera]:
     return [camera.scaled(min(1.0, VIEW_WIDTH / camera.width)) for camera in cameras]
 
 
-def _render(scene: Scene, camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
-    """The picture with its sky, not clamped, and alpha."""
-    seen = rasterize(scene.parts_for(camera), camera)
+def _render(scene: Scene, camera: Camera, worn: Look | None = None) -> torch.Tensor:
+    """The picture with its sky, not clamped. worn: a style to render it under."""
+    parts, sky = scene.parts_for(camera), scene.sky
+    if worn is not None:
+        parts, sky = worn.on(parts), worn.sky
+    seen = rasterize(parts, camera)
     assert seen.rgb is not None and seen.alpha is not None
-    return composite_sky(seen.rgb, seen.alpha, camera, scene.sky), seen.alpha
-
-
-def _mapped_picture(
-    camera: Camera, scene: Scene, maps: StyleMaps, picture: torch.Tensor, alpha: torch.Tensor
-) -> torch.Tensor:
-    """The styled scene's picture if no colour were clamped: M rgb + alpha b, before its sky."""
-    through = (1 - alpha)[..., None]
-    black = torch.zeros_like(picture), torch.zeros_like(alpha)
-    own = picture - through * composite_sky(*black, camera, scene.sky)
-    color_map = maps.splats[0]
-    mapped = map_colors(own, color_map, fast=False) - through * color_map[:, 3]
-    return mapped + through * composite_sky(*black, camera, style_sky(scene.sky, maps.sky))
+    return composite_sky(seen.rgb, seen.alpha, camera, sky)
 
 
 def _apply_facts(scene: Scene, maps: StyleMaps) -> dict[str, Any]:
@@ -339,7 +335,7 @@ def _picture(scene: Scene, styled: Scene) -> bytes | None:
     rows = []
     for camera in _views(scene):
         panels = [
-            captioned(quantise(_render(shown, camera)[0]), title, camera.name)
+            captioned(quantise(_render(shown, camera)), title, camera.name)
             for shown, title in ((scene, "before"), (styled, "after"))
         ]
         rows.append(strip(panels))
