@@ -30,7 +30,8 @@ _MOST_PLACES = 64  # that the sky is looked at from
 
 
 def sky_levels(scene: Scene, maps: StyleMaps) -> Int16[Tensor, "N"] | None:
-    """How much of every background splat is sky, 0 to LEVELS; None where none is any.
+    """How much of every background splat is sky, 0 to LEVELS; None where none is any, or where it
+    cannot be told: without cameras, or without knowing where up is.
 
     Each is looked at from the nearest of the scene's cameras. Remembered for as long as the scene
     lives, since it is the same for every style.
@@ -49,7 +50,7 @@ _remembered: WeakKeyDictionary[Scene, dict[bytes, Tensor | None]] = WeakKeyDicti
 
 def _find(scene: Scene, seen: Float[Tensor, "3 4"]) -> Int16[Tensor, "N"] | None:
     g, places = scene.background, _places(scene)
-    if len(places) == 0 or len(g) == 0:
+    if len(places) == 0 or len(g) == 0 or not scene.has_known_gravity:
         return None
     rgb = np.clip(0.5 + SH_C0 * g.sh[:, 0].double().numpy(), 0, 1)
     likely = _ramp(_distance(rgb, seen), _UNLIKELY, _LIKELY)

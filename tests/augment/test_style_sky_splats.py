@@ -71,7 +71,9 @@ def test_a_wall_in_front_of_what_the_sky_holds_of_it_is_no_sky():
 def test_without_a_map_of_its_own_no_sky_is_looked_for():
     scene = scene_of(ball((30.0, 0.0, 12.0)))
     assert sky_levels(scene, maps(seen=None)) is None
+    assert sky_levels(scene, maps()) is not None
     assert sky_levels(dataclasses.replace(scene, frames=()), maps()) is None
+    assert sky_levels(dataclasses.replace(scene, has_known_gravity=False), maps()) is None
     assert sky_levels(scene_of(ball((30.0, 0.0, 12.0), (0.1, 0.1, 0.1))), maps()) is None
 
 
