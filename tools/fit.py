@@ -26,6 +26,7 @@ from augment.scene_files import is_scene_folder
 from tools.fit_checkpoint import (
     PLAN_FILE,
     Checkpoint,
+    check_same,
     load_checkpoint,
     mark_finished,
     save_checkpoint,
@@ -67,7 +68,7 @@ def fit_scene(
     with OutputLock(folder):
         before = None if options.overwrite else load_checkpoint(folder, arrays=False)
         if before is not None:
-            _check_same(options, before)
+            check_same(options.out, options.settings(), options.length(), before)
             if before.finished and (done := _finished(options, folder, before)) is not None:
                 return done
         try:
@@ -270,19 +271,6 @@ def _check_out(options: FitOptions, folder: Path) -> None:
         raise OutputError(
             f"{out} holds a scene, and there is no {folder} to go on from: choose another --out, "
             f"or replace it with --overwrite"
-        )
-
-
-def _check_same(options: FitOptions, before: Checkpoint) -> None:
-    changed = differences(before.settings, options.settings())
-    asked = options.length()
-    if asked != before.length and asked.get("steps") != before.steps:
-        was, now = (" ".join(f"--{n} {v:g}" for n, v in a.items()) for a in (before.length, asked))
-        changed.append(f"its length was {was} ({before.steps} steps), now {now}")
-    if changed:
-        raise OutputError(
-            f"{options.out} was begun with other settings: {'; '.join(changed)}. Choose another "
-            f"--out, or begin anew with --overwrite"
         )
 
 

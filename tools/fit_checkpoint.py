@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ from augment.batch.atomic import (
     write_atomic,
 )
 from augment.errors import OutputError
+from tools.fit_options import differences
 
 VERSION = 1
 PLAN_FILE = "fit.json"
@@ -78,6 +80,25 @@ def mark_finished(folder: Path) -> None:
     plan = _read_plan(folder)
     plan["finished"] = True
     write_atomic(folder / PLAN_FILE, (json.dumps(plan, indent=1) + "\n").encode())
+
+
+def check_same(
+    out: Path, settings: Mapping[str, Any], length: Mapping[str, float], before: Checkpoint
+) -> None:
+    """Refuse to go on with what was begun with other settings or another length.
+
+    Raises:
+        OutputError: it was; every difference is named.
+    """
+    changed = differences(before.settings, settings)
+    if length != before.length and length.get("steps") != before.steps:
+        was, now = (" ".join(f"--{n} {v:g}" for n, v in a.items()) for a in (before.length, length))
+        changed.append(f"its length was {was} ({before.steps} steps), now {now}")
+    if changed:
+        raise OutputError(
+            f"{out} was begun with other settings: {'; '.join(changed)}. Choose another --out, or "
+            f"begin anew with --overwrite"
+        )
 
 
 def load_checkpoint(folder: Path, *, arrays: bool = True) -> Checkpoint | None:

@@ -36,7 +36,13 @@ from augment.style.train_photos import Photos, read_photos
 from augment.style.train_pool import Content, Draw, TrainingPool, generator_for, scene_contents
 from augment.style.train_scores import DEFINITIONS, score_photos, score_training
 from augment.style.trainer import StepRecord, StyleTrainer, fixed_threads, new_network
-from tools.fit_checkpoint import Checkpoint, load_checkpoint, mark_finished, save_checkpoint
+from tools.fit_checkpoint import (
+    Checkpoint,
+    check_same,
+    load_checkpoint,
+    mark_finished,
+    save_checkpoint,
+)
 from tools.fit_loop import CHECKPOINT_S, StopRequest, evaluation_steps
 from tools.fit_options import differences
 from tools.sheet import write_rgb
@@ -81,7 +87,7 @@ def train_style(
                 f"--out, or replace it with --overwrite"
             )
         if before is not None:
-            _check_same(options, before)
+            check_same(options.out, options.settings(), options.length(), before)
             if before.finished and (done := _finished(options, before)) is not None:
                 return done
         try:
@@ -370,19 +376,6 @@ def _remove_unused(out: Path) -> None:
         shutil.rmtree(out / STATE_FOLDER, ignore_errors=True)
         with contextlib.suppress(OSError):  # not empty
             out.rmdir()
-
-
-def _check_same(options: StyleTrainOptions, before: Checkpoint) -> None:
-    changed = differences(before.settings, options.settings())
-    asked = options.length()
-    if asked != before.length and asked.get("steps") != before.steps:
-        was, now = (" ".join(f"--{n} {v:g}" for n, v in a.items()) for a in (before.length, asked))
-        changed.append(f"its length was {was} ({before.steps} steps), now {now}")
-    if changed:
-        raise OutputError(
-            f"{options.out} was begun with other settings: {'; '.join(changed)}. Choose another "
-            f"--out, or begin anew with --overwrite"
-        )
 
 
 def _finished(options: StyleTrainOptions, before: Checkpoint) -> StyleTrainOutcome | None:
