@@ -179,16 +179,15 @@ def _turn(nx, ny, nz, s, quats):
 def _shade(s, normal, tints, packed, seen, lights, look, sh, normals, slopes):
     """Colour of Gaussian s: by its normal, or what the light's share is added to.
 
-    tints: of red, green and blue. packed: 0 to 1, grey and darker. seen: share of the sun.
+    tints: of red, green and blue. packed: 0 to 1, darker. seen: share of the sun.
     """
     share = normal[0] * lights[0, 0] + normal[1] * lights[0, 1] + normal[2] * lights[0, 2]
     share = min(max((share + look.wrap) / (1.0 + look.wrap), 0.0), 1.0)
-    gray_shadow = PACKED_SHARE * (lights[2, 0] + lights[2, 1] + lights[2, 2]) / 3.0
-    gray_rise = PACKED_SHARE * (lights[1, 0] + lights[1, 1] + lights[1, 2]) / 3.0 - gray_shadow
+    # Packed snow gives back less of every colour alike: what is grey has the tint of the light.
+    left = 1.0 - packed * (1.0 - PACKED_SHARE)
     for c in range(3):
-        shadow, rise = lights[2, c], lights[1, c] - lights[2, c]
-        shadow = tints[c] * (shadow + packed * (gray_shadow - shadow))
-        rise = tints[c] * (rise + packed * (gray_rise - rise)) * seen
+        shadow = tints[c] * left * lights[2, c]
+        rise = tints[c] * left * (lights[1, c] - lights[2, c]) * seen
         baked = share if look.is_baked else 0.0
         sh[s, 0, c] = np.float32((shadow + rise * baked - 0.5) / SH_C0)
         if len(slopes) > 0:
