@@ -89,7 +89,10 @@ class Camera:
             raise ValueError(f"scale must be a finite number > 0; got {scale}")
         if scale == 1:
             return self
-        width, height = max(1, round(self.width * scale)), max(1, round(self.height * scale))
+        return self.resized(max(1, round(self.width * scale)), max(1, round(self.height * scale)))
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The same view in an image of another size, squeezed where its shape is another."""
         sx, sy = width / self.width, height / self.height
         return dataclasses.replace(
             self,

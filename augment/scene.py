@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -215,6 +215,19 @@ class Scene:
     def camera_names(self) -> tuple[str, ...]:
         """Names of all cameras, in the order they first appear."""
         return tuple(dict.fromkeys(name for frame in self.frames for name in frame.cameras))
+
+    @property
+    def all_gaussians(self) -> tuple[Gaussians, ...]:
+        """The background's, then each actor's in its own frame."""
+        return (self.background, *(actor.gaussians for actor in self.actors))
+
+    def with_gaussians(self, change: Callable[[Gaussians], Gaussians]) -> Scene:
+        """The scene with every part's Gaussians changed."""
+        return replace(
+            self,
+            background=change(self.background),
+            actors=tuple(replace(a, gaussians=change(a.gaussians)) for a in self.actors),
+        )
 
     def frame(self, index: int) -> Frame:
         """The frame with the dataset's number `index`."""

@@ -112,7 +112,7 @@ def read_scene_folder(folder: str | Path) -> SceneFolder:
 
 def _arrays_of(scene: Scene) -> dict[str, np.ndarray]:
     arrays = {}
-    for number, gaussians in enumerate((scene.background, *(a.gaussians for a in scene.actors))):
+    for number, gaussians in enumerate(scene.all_gaussians):
         if gaussians.means.dtype != torch.float32:
             raise SceneError(
                 f"scene {scene.name!r}: scene folders hold float32 Gaussians; got "

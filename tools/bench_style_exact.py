@@ -128,15 +128,9 @@ def with_directions(scene: Scene) -> Scene:
         sh[:, : own.shape[1]] = own.numpy()
         return dataclasses.replace(gaussians, sh=torch.from_numpy(sh))
 
-    return dataclasses.replace(
-        scene,
-        background=widened(scene.background),
-        actors=tuple(
-            dataclasses.replace(actor, gaussians=widened(actor.gaussians)) for actor in scene.actors
-        ),
-    )
+    return scene.with_gaussians(widened)
 
 
 def _degree(scene: Scene) -> int:
-    parts = [scene.background, *(actor.gaussians for actor in scene.actors)]
+    parts = scene.all_gaussians
     return max(round(part.sh.shape[1] ** 0.5) - 1 for part in parts)

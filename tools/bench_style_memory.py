@@ -47,7 +47,7 @@ def bench_memory(scene: Scene, uri: str, width: int, preset: str) -> dict[str, f
 
 def scene_mib(scene: Scene) -> float:
     """Of the Gaussians alone."""
-    parts = [scene.background, *(actor.gaussians for actor in scene.actors)]
+    parts = scene.all_gaussians
     tensors = [getattr(part, field.name) for part in parts for field in dataclasses.fields(part)]
     return sum(t.numel() * t.element_size() for t in tensors if t is not None) / 2**20
 

@@ -28,7 +28,7 @@ def describe_scene(scene: Scene) -> dict[str, Any]:
         }
         for a in scene.actors
     ]
-    all_gaussians = [scene.background, *(a.gaussians for a in scene.actors)]
+    all_gaussians = scene.all_gaussians
     return {
         "name": scene.name,
         "source": scene.source,

@@ -284,11 +284,7 @@ def _outside(pair: list[torch.Tensor]) -> dict[str, list[float]]:
 
 
 def _constant_colors(scene: Scene) -> torch.Tensor:
-    return torch.cat([0.5 + SH_C0 * part.sh[:, 0] for part in _parts(scene)])
-
-
-def _parts(scene: Scene) -> list[Gaussians]:
-    return [scene.background, *(actor.gaussians for actor in scene.actors)]
+    return torch.cat([0.5 + SH_C0 * part.sh[:, 0] for part in scene.all_gaussians])
 
 
 def _views(scene: Scene) -> list[Camera]:
@@ -308,7 +304,7 @@ def _render(scene: Scene, camera: Camera, worn: Look | None = None) -> torch.Ten
 
 def _apply_facts(scene: Scene, maps: StyleMaps) -> dict[str, Any]:
     """Time of the mapping alone, over all Gaussians, least of three."""
-    parts = [dataclasses.replace(part, sh=part.sh.clone()) for part in _parts(scene)]
+    parts = [dataclasses.replace(part, sh=part.sh.clone()) for part in scene.all_gaussians]
     traffic = 2 * sum(part.sh.numel() * part.sh.element_size() for part in parts)
     in_place, fresh = [], []
     for _ in range(3):

@@ -70,7 +70,7 @@ class Trainer:
             raise ValueError("the view source has no training views; nothing can be learnt")
         self.config = config
         self.step = 0
-        parts = [scene.background, *(actor.gaussians for actor in scene.actors)]
+        parts = scene.all_gaussians
         self.splats = Splats.of(parts, config.sh_degree)
         self.sky_faces = starting_sky(scene.sky)
         self._is_sky = paint_below_horizon(self.sky_faces)

@@ -118,7 +118,7 @@ def knows_regions(scene: Scene) -> bool:
     regions = [REGION_OF_CLASS.get(cls) in (ROAD, VEGETATION) for cls in SemanticClass]
     table = np.zeros(CLASSES, bool)
     table[list(SemanticClass)] = regions
-    classes = [part.semantic for part in _all_gaussians(scene)]
+    classes = [part.semantic for part in scene.all_gaussians]
     return any(c is not None and bool(table[c.numpy()].any()) for c in classes)
 
 
@@ -127,7 +127,7 @@ def gaussian_statistics(scene: Scene, *, per_region: bool) -> Statistics:
 
     They stand for the whole picture: how much sky would be seen is not known.
     """
-    parts = _all_gaussians(scene)
+    parts = scene.all_gaussians
     rgb = np.concatenate([_constant_colors(part) for part in parts])
     weights = np.concatenate([_extents(part) for part in parts])
     if not weights.sum() > 0:
@@ -213,7 +213,7 @@ def _add(
 def _pictures(scene: Scene, views: Sequence[Camera]) -> Float[Tensor, "B 3 256 256"]:
     images = []
     for camera in views:
-        view = _square(camera)
+        view = camera.resized(PICTURE_SIZE, PICTURE_SIZE)
         rgb, alpha = _render(scene, view)
         if bool((alpha > 0).any()):
             image = composite_sky(rgb, alpha, view, scene.sky)
@@ -225,7 +225,7 @@ def _pictures(scene: Scene, views: Sequence[Camera]) -> Float[Tensor, "B 3 256 2
 
 def _palette(scene: Scene) -> Float[Tensor, "3 256 256"]:
     """Colours of Gaussians, each as often as its weight says, in no order that means aught."""
-    parts = _all_gaussians(scene)
+    parts = scene.all_gaussians
     rgb = np.concatenate([_constant_colors(part) for part in parts])
     weights = np.concatenate([_extents(part) for part in parts])
     if not weights.sum() > 0:
@@ -248,13 +248,7 @@ def _marked_scene(scene: Scene) -> Scene:
     """The scene with Gaussians of the colours (1, 0, 0) on roads, (0, 1, 0) on vegetation,
     (0, 0, 1) on the rest, so that a picture of it holds every pixel's weights of the three.
     """
-    return dataclasses.replace(
-        scene,
-        background=_marked(scene.background),
-        actors=tuple(
-            dataclasses.replace(actor, gaussians=_marked(actor.gaussians)) for actor in scene.actors
-        ),
-    )
+    return scene.with_gaussians(_marked)
 
 
 def _marked(gaussians: Gaussians) -> Gaussians:
@@ -286,25 +280,8 @@ def _extents(gaussians: Gaussians) -> np.ndarray:
     return gaussians.opacities.detach().double().numpy() * sides
 
 
-def _all_gaussians(scene: Scene) -> list[Gaussians]:
-    return [scene.background, *(actor.gaussians for actor in scene.actors)]
-
-
 def _small(camera: Camera) -> Camera:
     return camera.scaled(min(1.0, math.sqrt(VIEW_PIXELS / (camera.width * camera.height))))
-
-
-def _square(camera: Camera) -> Camera:
-    sx, sy = PICTURE_SIZE / camera.width, PICTURE_SIZE / camera.height
-    return dataclasses.replace(
-        camera,
-        width=PICTURE_SIZE,
-        height=PICTURE_SIZE,
-        fx=camera.fx * sx,
-        fy=camera.fy * sy,
-        cx=camera.cx * sx,
-        cy=camera.cy * sy,
-    )
 
 
 def _camera_key(camera: Camera) -> tuple:

@@ -33,6 +33,7 @@ from augment.render.buffers import ALPHA, RGB
 from augment.render.rasterize import rasterize
 from augment.render.sh import SH_C0
 from augment.scene import PosedGaussians, Scene
+from augment.style.content import select_views
 from augment.style.losses import GaussianColors
 
 KEPT_COLORS = 65536  # Gaussians of a scene that are remembered to draw samples from
@@ -65,7 +66,7 @@ def views_of(
         SceneError: the scene has no cameras.
     """
     return [
-        open_view(scene, squeezed(camera, size_px), with_parts=with_parts)
+        open_view(scene, camera.resized(size_px, size_px), with_parts=with_parts)
         for camera in spread_cameras(scene, count)
     ]
 
@@ -81,43 +82,19 @@ def open_view(scene: Scene, camera: Camera, *, with_parts: bool = True) -> Scene
     return SceneView(camera, picture, alpha, sky, _seen(parts, camera) if with_parts else ())
 
 
-def spread_cameras(scene: Scene, count: int) -> list[Camera]:
+def spread_cameras(scene: Scene, count: int) -> tuple[Camera, ...]:
     """At most `count` of the scene's cameras: names in turn, spread over the drive.
 
     Raises:
         SceneError: it has none.
     """
-    by_name = {
-        name: [frame.cameras[name] for frame in scene.frames if name in frame.cameras]
-        for name in scene.camera_names
-    }
-    groups = [cameras for cameras in by_name.values() if cameras]
-    if not groups:
+    chosen = select_views(scene, None, count)
+    if not chosen:
         raise SceneError(
             f"scene {scene.name!r} ({scene.source}) has no cameras to look through; name some with "
             f"camera_path=FILE in its URI"
         )
-    count = min(count, sum(map(len, groups)))
-    chosen: dict[int, Camera] = {}
-    for number in range(count):
-        group = groups[number % len(groups)]
-        camera = group[int((number + 0.5) / count * len(group))]
-        chosen.setdefault(id(camera), camera)
-    return list(chosen.values())
-
-
-def squeezed(camera: Camera, size_px: int) -> Camera:
-    """The same view as a square picture, whatever its shape."""
-    sx, sy = size_px / camera.width, size_px / camera.height
-    return dataclasses.replace(
-        camera,
-        width=size_px,
-        height=size_px,
-        fx=camera.fx * sx,
-        fy=camera.fy * sy,
-        cx=camera.cx * sx,
-        cy=camera.cy * sy,
-    )
+    return chosen
 
 
 def folded_pictures(
@@ -159,7 +136,7 @@ def colors_of(scene: Scene, *, count: int = KEPT_COLORS, seed: int = 0) -> Gauss
 
     Shapes are [1, N, ...]; bands are those of the background's degree.
     """
-    parts = [scene.background, *(actor.gaussians for actor in scene.actors)]
+    parts = scene.all_gaussians
     k = max(part.sh.shape[1] for part in parts)
     sizes = torch.tensor([len(part) for part in parts])
     total = int(sizes.sum())

@@ -6,6 +6,7 @@ import torch
 
 from augment.cameras import Camera
 from augment.geometry import rigid, rotmat_from_quat
+from tests.scenes import camera_ahead
 
 
 def camera(**changes) -> Camera:
@@ -70,3 +71,16 @@ def test_impossible_cameras_are_refused(changes, message):
 def test_scale_must_be_positive(unchecked):
     with pytest.raises(ValueError, match="scale must be a finite number > 0; got 0"):
         camera().scaled(0)
+
+
+def test_a_resized_view_spans_the_same_angles():
+    camera = camera_ahead(33, 21)
+    square = camera.resized(12, 12)
+    assert (square.width, square.height) == (12, 12)
+    for before, after in (
+        (camera.cx / camera.fx, square.cx / square.fx),
+        ((camera.width - camera.cx) / camera.fx, (12 - square.cx) / square.fx),
+        (camera.cy / camera.fy, square.cy / square.fy),
+        ((camera.height - camera.cy) / camera.fy, (12 - square.cy) / square.fy),
+    ):
+        assert after == pytest.approx(before, rel=1e-12)

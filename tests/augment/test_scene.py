@@ -161,3 +161,13 @@ def test_colour_maps_are_checked_and_none_where_they_change_nothing(unchecked):
     s = dataclasses.replace(scene(), color_maps=maps)
     assert s.color_map("front") is maps["front"]
     assert s.color_map("rear") is None and s.color_map("left") is None
+
+
+def test_all_gaussians_are_changed_and_nothing_else():
+    whole = scene((Actor("a", "car", some(3), track(), (4.0, 2.0, 1.5)),), some(5))
+    background, own = whole.all_gaussians
+    assert background is whole.background and own is whole.actors[0].gaussians
+    half = whole.with_gaussians(lambda g: dataclasses.replace(g, opacities=g.opacities / 2))
+    for before, after in zip(whole.all_gaussians, half.all_gaussians, strict=True):
+        assert torch.equal(after.opacities, before.opacities / 2) and after.means is before.means
+    assert half.actors[0].track is whole.actors[0].track and half.sky is whole.sky

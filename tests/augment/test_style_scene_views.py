@@ -18,7 +18,6 @@ from augment.style.scene_views import (
     open_view,
     rendered_pictures,
     spread_cameras,
-    squeezed,
     views_of,
 )
 from augment.track import Track
@@ -159,8 +158,8 @@ def test_views_are_squares_of_cameras_spread_over_the_drive():
     views = views_of(scene, 3, 12)
     assert [tuple(view.picture.shape) for view in views] == [(3, 12, 12)] * 3
     wide = camera_ahead()
-    corners = [c.ray_directions(torch.float64) for c in (wide, squeezed(wide, 12))]
-    half_px = (1 / wide.fx + 1 / squeezed(wide, 12).fx) / 2
+    corners = [c.ray_directions(torch.float64) for c in (wide, wide.resized(12, 12))]
+    half_px = (1 / wide.fx + 1 / wide.resized(12, 12).fx) / 2
     assert (corners[0][0, 0] - corners[1][0, 0]).abs().max() < half_px + 0.02
 
 
