@@ -12,7 +12,7 @@ from tools.bench_flood_cost import bench_camera, bench_cost
 from tools.bench_flood_error import bench_error, fresnel_table
 from tools.bench_flood_masks import bench_masks, dry_views
 from tools.bench_flood_memory import flood_peak_mib
-from tools.machine import load_average, machine_facts
+from tools.machine import load_average, machine_facts, machine_line
 
 
 @dataclass(frozen=True)
@@ -94,10 +94,8 @@ def _memory(case: FloodCase) -> dict[str, float | None]:
 
 def flood_text(figures: dict[str, Any]) -> str:
     """The figures as tables for people."""
-    machine = figures["machine"]
     lines = [
-        f"{machine['processor']}, {machine['cores']} cores, {machine['threads']} threads; "
-        f"load {machine['load']} before, {figures['load_after']} after",
+        machine_line(figures),
         "",
         *_cost_lines(figures["cost"]),
         "",

@@ -6,14 +6,13 @@ from typing import Any
 
 from tools.bench_snow_depths import OFF_M, ZONES
 from tools.bench_snow_masks import SAME_M, SAME_SHARE
+from tools.machine import machine_line
 
 
 def snow_text(figures: dict[str, Any]) -> str:
     """All tables."""
-    machine = figures["machine"]
     lines = [
-        f"{machine['processor']}, {machine['cores']} cores, {machine['threads']} threads; "
-        f"load {machine['load']} before, {figures['load_after']} after",
+        machine_line(figures),
         "",
         *_accuracy_lines(figures["street"], figures["accuracy"]),
         "",

@@ -5,14 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 from tools.bench_style_views import KINDS
+from tools.machine import machine_line
 
 
 def style_text(figures: dict[str, Any]) -> str:
     """All tables."""
-    machine = figures["machine"]
     lines = [
-        f"{machine['processor']}, {machine['cores']} cores, {machine['threads']} threads; "
-        f"load {machine['load']} before, {figures['load_after']} after",
+        machine_line(figures),
         "",
         *_folding_lines(figures["folding"]),
         "",

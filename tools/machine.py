@@ -5,8 +5,10 @@ from __future__ import annotations
 import importlib.metadata
 import os
 import platform
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 PACKAGES = ("climategs", "numpy", "torch", "numba", "llvmlite", "tbb")
 
@@ -93,3 +95,12 @@ def _version(package: str) -> str | None:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:
         return None
+
+
+def machine_line(figures: Mapping[str, Any]) -> str:
+    """What a benchmark's figures were measured on. figures: with `machine` and `load_after`."""
+    machine = figures["machine"]
+    return (
+        f"{machine['processor']}, {machine['cores']} cores, {machine['threads']} threads; "
+        f"load {machine['load']} before, {figures['load_after']} after"
+    )
