@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Protocol
 
 from adapters.cameras.paths import with_camera_path
+from adapters.signatures import looked_for, recognised
 from adapters.uri import (
     CAMERA_PATH_KEY,
     GROUND_KEY,
@@ -27,7 +28,6 @@ from adapters.uri import (
 from augment.errors import AdapterError
 from augment.ground import Ground
 from augment.scene import Scene
-from augment.scene_files import is_scene_folder
 
 
 class Adapter(Protocol):
@@ -91,57 +91,13 @@ def recognise(path: Path) -> str:
     """
     if not path.exists():
         raise AdapterError(_missing(str(path)))
-    if path.is_file():
-        if path.suffix.lower() == ".splat" or _starts_with_ply(path):
-            return "gaussians"
-        looked_for = "a .ply or .splat file"
-    else:
-        if is_scene_folder(path):
-            return "scene"
-        if (path / "camera").is_dir() and (path / "lidar").is_dir():
-            return "pandaset"
-        if _is_recording(path):
-            return "recording"
-        if _holds_splats(path):
-            return "gaussians"
-        looked_for = (
-            "a PandaSet sequence (camera/ and lidar/), a recording (calibration.json and images/), "
-            "a fitted scene (scene.json), a trained 3DGS model "
-            "(point_cloud/iteration_N/point_cloud.ply), or a single .ply or .splat file in it"
+    scheme = recognised(path)
+    if scheme is None:
+        raise AdapterError(
+            f"{path}: not recognised as a scene; looked for {looked_for(path)}. "
+            f"Or name the scheme: {known_schemes()}"
         )
-        looked_for += _hint_below(path)
-    raise AdapterError(
-        f"{path}: not recognised as a scene; looked for {looked_for}. "
-        f"Or name the scheme: {known_schemes()}"
-    )
-
-
-def _hint_below(folder: Path) -> str:
-    """Which folders inside are scenes, where one above them was given."""
-    below = sorted(p.parent for p in folder.glob("*/lidar") if (p.parent / "camera").is_dir())
-    if below:
-        return f". It holds PandaSet sequences: give one, such as {below[0]}"
-    inside = [*folder.glob("*/calibration.json"), *folder.glob("*/*/calibration.json")]
-    recordings = sorted(p.parent for p in inside if _is_recording(p.parent))
-    return f". It holds recordings: give one, such as {recordings[0]}" if recordings else ""
-
-
-def _is_recording(folder: Path) -> bool:
-    return (folder / "calibration.json").is_file() and (folder / "images").is_dir()
-
-
-def _holds_splats(folder: Path) -> bool:
-    if any(folder.glob("point_cloud/iteration_*/point_cloud.ply")):
-        return True
-    return sum(1 for p in folder.iterdir() if p.suffix.lower() in (".ply", ".splat")) == 1
-
-
-def _starts_with_ply(path: Path) -> bool:
-    try:
-        with path.open("rb") as file:
-            return file.read(4) in (b"ply\n", b"ply\r")
-    except OSError as error:
-        raise AdapterError(f"{path}: cannot be read: {error}") from error
+    return scheme
 
 
 def _open_builtin(scheme: str, entry: Scheme, path: str, query: dict[str, str]) -> Scene:

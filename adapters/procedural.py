@@ -44,6 +44,15 @@ def open_procedural(query: Mapping[str, str]) -> Scene:
     return build_scene(parse_parameters(query))
 
 
+def procedural_labels(path: str, query: Mapping[str, str]) -> StreetLabels:
+    """The labels of a street's query.
+
+    Raises:
+        AdapterError: unknown keys or values outside their limits.
+    """
+    return StreetLabels(parse_parameters(query))
+
+
 def build_scene(parameters: StreetParameters) -> Scene:
     """A street as Gaussians, actors, sky, cameras and labels. Equal parameters, equal bits."""
     begun = time.perf_counter()

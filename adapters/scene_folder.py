@@ -9,6 +9,7 @@ the scene was fitted to. `data` says where that is now, if it has moved.
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -83,25 +84,16 @@ def recorded_labels(recording: Recording) -> LabelSource | None:
     of this URI has none.
 
     Raises:
-        AdapterError: the query of a procedural street that cannot be used.
+        AdapterError: a query that cannot be used, or calibration that the labels need is missing.
     """
     if CAMERA_PATH_KEY in recording.query:  # the frames are not the recorded ones
         return None
-    if recording.scheme == "pandaset":
-        from adapters.pandaset.labels import PandaSetLabels
-
-        return PandaSetLabels(Path(recording.path))
-    if recording.scheme == "recording":
-        from adapters.recording.labels import RecordingLabels
-
-        return RecordingLabels(Path(recording.path))
-    if recording.scheme == "procedural":
-        from adapters.street.labels import StreetLabels
-        from adapters.street.parameters import parse_parameters
-
-        query = {key: value for key, value in recording.query.items() if key != GROUND_KEY}
-        return StreetLabels(parse_parameters(query))
-    return None
+    scheme = SCHEMES[recording.scheme]
+    if scheme.labels is None:
+        return None
+    query = {key: value for key, value in recording.query.items() if key != GROUND_KEY}
+    find = getattr(importlib.import_module(scheme.module), scheme.labels)
+    return find(recording.path, query)
 
 
 def _given(uri: str) -> Recording:

@@ -22,22 +22,60 @@ _SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9_+.-]*):(?!\\)")
 @dataclass(frozen=True)
 class Scheme:
     """What opens a kind of scene. module, function: imported when used. builtin: the names that
-    the path may be where it is no file.
+    the path may be where it is no file. labels: the module's function from path and query to the
+    labels alone (a LabelSource or None), which a scene fitted to such data needs.
     """
 
     module: str
     function: str
     example: str
     builtin: tuple[str, ...] = ()
+    labels: str | None = None
 
 
 SCHEMES = {
     "procedural": Scheme(
-        "adapters.procedural", "open_procedural", "procedural:street?seed=3", ("street",)
+        "adapters.procedural",
+        "open_procedural",
+        "procedural:street?seed=3",
+        ("street",),
+        labels="procedural_labels",
     ),
-    "pandaset": Scheme("adapters.pandaset", "open_pandaset", "pandaset:data/pandaset/002"),
+    "pandaset": Scheme(
+        "adapters.pandaset",
+        "open_pandaset",
+        "pandaset:data/pandaset/002",
+        labels="pandaset_labels",
+    ),
+    "nuscenes": Scheme(
+        "adapters.nuscenes",
+        "open_nuscenes",
+        "nuscenes:data/nuscenes?scene=scene-0061",
+        labels="nuscenes_labels",
+    ),
+    "kitti": Scheme(
+        "adapters.kitti",
+        "open_kitti",
+        "kitti:data/kitti/2011_09_26/2011_09_26_drive_0001_sync",
+        labels="kitti_labels",
+    ),
+    "street_gaussians": Scheme(
+        "adapters.street_gaussians",
+        "open_street_gaussians",
+        "street_gaussians:output/waymo/002?data=data/waymo/002",
+        labels="street_gaussians_labels",
+    ),
+    "drivestudio": Scheme(
+        "adapters.drivestudio",
+        "open_drivestudio",
+        "drivestudio:output/omnire/run?data=data/waymo/processed/training/023",
+        labels="drivestudio_labels",
+    ),
     "recording": Scheme(
-        "adapters.recording", "open_recording", "recording:out/street-seed3/clear-000"
+        "adapters.recording",
+        "open_recording",
+        "recording:out/street-seed3/clear-000",
+        labels="recording_labels",
     ),
     "gaussians": Scheme(
         "adapters.gaussian_files", "open_gaussians", "gaussians:model/point_cloud.ply?up=-y"

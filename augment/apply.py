@@ -169,7 +169,7 @@ def render_buffers(
         rgb, raster = _without_water(sky, parts, camera, plan, backend)
     if look is not None and plan.styles_picture:
         rgb = map_colors(rgb, look.maps.picture, fast=backend != "reference")
-    color_map = scene.color_map(camera.name) if plan.recorded_exposure else None
+    color_map = scene.color_map(camera) if plan.recorded_exposure else None
     if color_map is not None:  # a camera exposes what the weather has left, so this comes last
         rgb = map_colors(rgb, color_map, fast=backend != "reference")
     water = None if flooded is None else flooded.water

@@ -225,12 +225,12 @@ def _snow_steps(snow: PlacedSnow | None, reason: str, bare_buffers: set[str]) ->
 
 def _exposure_step(recipe: Recipe, scene: Scene) -> Step:
     name = "camera colour map"
-    mapped = sum(scene.color_map(camera) is not None for camera in scene.camera_names)
-    if mapped == 0:
+    mapped = scene.mapped_cameras
+    if not mapped:
         return Step(name, False, "the scene's cameras record the scene's own colours")
     if recipe.render.exposure == "neutral":
         return Step(name, False, "render.exposure is 'neutral'")
-    why = f"{mapped} of {len(scene.camera_names)} cameras have one, applied after the weather"
+    why = f"{len(mapped)} of {len(scene.camera_names)} cameras have one, applied after the weather"
     return Step(name, True, why)
 
 

@@ -12,6 +12,7 @@ from jaxtyping import Float, Int16
 from torch import Tensor
 
 from augment.cameras import Camera, Frame
+from augment.color_waves import ColorWaves
 from augment.errors import SceneError
 from augment.ground_heights import Ground
 from augment.labels import Boxes, LabelSource, LidarSweep
@@ -109,6 +110,9 @@ class Gaussians:
 class Actor:
     """A rigid moving object: its Gaussians in its own frame (x forward, y left, z up, origin at the
     box centre), its track, and its box size (length, width, height in metres).
+
+    color_waves: how its colours change over time; None where they do not. It has a row for each of
+    the Gaussians.
     """
 
     track_id: str
@@ -116,6 +120,21 @@ class Actor:
     gaussians: Gaussians
     track: Track
     size_m: tuple[float, float, float]
+    color_waves: ColorWaves | None = None
+
+    def __post_init__(self) -> None:
+        waves = self.color_waves
+        if waves is not None and len(waves.coefficients) != len(self.gaussians):
+            raise ValueError(
+                f"actor {self.track_id!r}: colour waves must have a row for each of its "
+                f"{len(self.gaussians)} Gaussians; got {len(waves.coefficients)}"
+            )
+
+    def gaussians_at(self, timestamp_ns: int) -> Gaussians:
+        """Its Gaussians in the colours they have at a time."""
+        if self.color_waves is None:
+            return self.gaussians
+        return self.color_waves.at(self.gaussians, timestamp_ns)
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +195,8 @@ class Scene:
     source: the URI the scene was opened from; open_scene(source) opens it again.
     color_maps: how a camera's recorded colours differ from the scene's, by camera name: float32
     [3, 4], recorded = M[:, :3] @ rgb + M[:, 3], display-encoded. A camera without one records the
-    scene's own colours.
+    scene's own colours. image_color_maps: the same for single images, by camera name and
+    timestamp_ns; they go before color_maps.
     recorded_source: the URI of the recording that a fitted scene was made from, for its labels;
     None where `source` itself is the recording. made_by: how the Gaussians came about, facts for
     people and reports in JSON's own types.
@@ -198,10 +218,13 @@ class Scene:
     made_by: Mapping[str, Any] = field(default_factory=dict)
     ground: Ground | None = None
     has_known_gravity: bool = True
+    image_color_maps: Mapping[tuple[str, int], Float[Tensor, "3 4"]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for name, color_map in self.color_maps.items():
             _check_color_map(self.name, name, color_map)
+        for (name, timestamp_ns), color_map in self.image_color_maps.items():
+            _check_color_map(self.name, f"{name} at {timestamp_ns} ns", color_map)
         if len(self.background) + sum(len(a.gaussians) for a in self.actors) == 0:
             raise SceneError(
                 f"scene {self.name!r} ({self.source}) holds no Gaussians; nothing can be rendered"
@@ -246,18 +269,31 @@ class Scene:
         for number, actor in enumerate(self.actors, start=1):
             pose = actor.track.pose_at(timestamp_ns)
             if pose is not None:
-                yield PosedGaussians(actor.gaussians, pose, instance_id=number)
+                posed = actor.gaussians_at(timestamp_ns)
+                yield PosedGaussians(posed, pose, instance_id=number)
 
     def parts_for(self, camera: Camera) -> tuple[PosedGaussians, ...]:
         """The parts at the moment the camera took its image."""
         return tuple(self.parts_at(camera.timestamp_ns))
 
-    def color_map(self, camera_name: str) -> Float[Tensor, "3 4"] | None:
-        """The camera's colour map; None where it has none, or one that changes nothing."""
-        color_map = self.color_maps.get(camera_name)
+    def color_map(self, camera: Camera) -> Float[Tensor, "3 4"] | None:
+        """The image's colour map, or else the camera's; None where there is none, or one that
+        changes nothing.
+        """
+        color_map = self.image_color_maps.get((camera.name, camera.timestamp_ns))
+        if color_map is None:
+            color_map = self.color_maps.get(camera.name)
         if color_map is None or torch.equal(color_map, torch.eye(3, 4)):
             return None
         return color_map
+
+    @property
+    def mapped_cameras(self) -> tuple[str, ...]:
+        """Names of the cameras that have a colour map, or whose images have, in their order."""
+        maps = [*self.color_maps.items(), *((n, m) for (n, _), m in self.image_color_maps.items())]
+        identity = torch.eye(3, 4)
+        changing = {name for name, color_map in maps if not torch.equal(color_map, identity)}
+        return tuple(name for name in self.camera_names if name in changing)
 
     def boxes(self, frame_index: int) -> Boxes:
         return Boxes.empty() if self.labels is None else self.labels.boxes(frame_index)

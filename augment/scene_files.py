@@ -30,6 +30,7 @@ from augment.sky import ConstantSky, CubemapSky, LatLongSky, Sky
 
 DOCUMENT, GAUSSIANS, SKY = "scene.json", "gaussians.safetensors", "sky.safetensors"
 FILES = (DOCUMENT, GAUSSIANS, SKY)
+SCENE_SUFFIX = ".climategs"
 _ARRAYS = ("means", "quats", "scales", "opacities", "sh")
 _QUAT_TOLERANCE = 1e-4  # of unit length; what is further off is normalised
 _MARK = re.compile(rb'\s*\{\s*"format"\s*:\s*"' + FORMAT.encode() + rb'"')
@@ -42,6 +43,11 @@ def is_scene_folder(folder: Path) -> bool:
             return _MARK.match(file.read(200)) is not None
     except OSError:
         return False
+
+
+def is_scene_file(path: Path) -> bool:
+    """Whether a file is named as a scene in one file is; it may be damaged all the same."""
+    return path.suffix.lower() == SCENE_SUFFIX
 
 
 def save_scene(scene: Scene, folder: str | Path) -> None:

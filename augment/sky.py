@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
+from weakref import WeakKeyDictionary
 
 import torch
 from jaxtyping import Float
@@ -50,7 +52,7 @@ class LatLongSky:
 @dataclass(frozen=True, eq=False)
 class CubemapSky:
     """Six square faces in the order +x, -x, +y, -y, +z, -z, float32 [6, R, R, 3], with the texture
-    axes of OpenGL and nvdiffrast; bilinear inside a face, clamped at its edge.
+    axes of OpenGL and nvdiffrast; bilinear inside a face and across its edges.
     """
 
     faces: Float[Tensor, "6 R R 3"]
@@ -58,9 +60,65 @@ class CubemapSky:
     def sample(self, directions: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3"]:
         face, s, t = cubemap_coordinates(directions)
         size = self.faces.shape[1]
-        column = (s * 0.5 + 0.5) * size - 0.5
-        row = (t * 0.5 + 0.5) * size - 0.5
-        return _bilinear(self.faces, row.clamp(0, size - 1), column.clamp(0, size - 1), face=face)
+        column = (s * 0.5 + 0.5) * size + 0.5
+        row = (t * 0.5 + 0.5) * size + 0.5
+        return _bilinear(bordered_faces(self), row, column, face=face)
+
+
+def sample_within_faces(
+    faces: Float[Tensor, "6 R R 3"], directions: Float[Tensor, "*B 3"]
+) -> Float[Tensor, "*B 3"]:
+    """As `CubemapSky.sample`, but clamped at a face's edge: a sky that is being learnt, each of
+    whose texels stands for itself.
+    """
+    face, s, t = cubemap_coordinates(directions)
+    size = faces.shape[1]
+    column = (s * 0.5 + 0.5) * size - 0.5
+    row = (t * 0.5 + 0.5) * size - 0.5
+    return _bilinear(faces, row.clamp(0, size - 1), column.clamp(0, size - 1), face=face)
+
+
+_bordered: WeakKeyDictionary[CubemapSky, tuple[int, Tensor]] = WeakKeyDictionary()
+
+
+def bordered_faces(sky: CubemapSky) -> Float[Tensor, "6 S S 3"]:
+    """The faces with one texel of their neighbours around each, S = R + 2; kept with the sky.
+
+    A corner, where three faces meet, has the mean of their texels, as nvdiffrast has it.
+    """
+    faces = sky.faces
+    known = _bordered.get(sky)
+    if known is None or known[0] != faces._version:
+        known = _bordered[sky] = (faces._version, with_border(faces))
+    return known[1]
+
+
+def with_border(faces: Float[Tensor, "6 R R C"]) -> Float[Tensor, "6 S S C"]:
+    """Faces of a cube map with one texel of their neighbours around each, S = R + 2."""
+    size, channels = faces.shape[1], faces.shape[3]
+    out = torch.empty(6, size + 2, size + 2, channels, dtype=faces.dtype)
+    out[:, 1:-1, 1:-1] = faces
+    flat = faces.reshape(-1, channels)
+    edges = _neighbours(size)  # [6, 4, R]
+    out[:, 0, 1:-1], out[:, -1, 1:-1] = flat[edges[:, 0]], flat[edges[:, 1]]
+    out[:, 1:-1, 0], out[:, 1:-1, -1] = flat[edges[:, 2]], flat[edges[:, 3]]
+    for row, column, r, c in ((0, 0, 1, 1), (0, -1, 1, -2), (-1, 0, -2, 1), (-1, -1, -2, -2)):
+        out[:, row, column] = (out[:, r, c] + out[:, row, c] + out[:, r, column]) / 3
+    return out
+
+
+@functools.lru_cache(maxsize=4)
+def _neighbours(size: int) -> Tensor:
+    """Flat index of the texel beyond each edge texel: int64 [6, 4, R]; edges above, below, left and
+    right of a face.
+    """
+    along = (torch.arange(size, dtype=torch.float64) + 0.5) / size * 2 - 1
+    beyond = torch.full_like(along, 1 + 1 / size)
+    edges = ((along, -beyond), (along, beyond), (-beyond, along), (beyond, along))
+    directions = torch.stack([_directions_of_faces(s, t) for s, t in edges], 1)
+    face, s, t = cubemap_coordinates(directions)
+    column, row = (((v * 0.5 + 0.5) * size - 0.5).round().long() for v in (s, t))
+    return (face * size + row) * size + column
 
 
 def cubemap_coordinates(directions: Float[Tensor, "*B 3"]) -> tuple[Tensor, Tensor, Tensor]:
@@ -84,14 +142,18 @@ def directions_of_cubemap(size: int) -> Float[Tensor, "6 R R 3"]:
     """World direction of every texel centre: the inverse of `cubemap_coordinates`."""
     ticks = (torch.arange(size, dtype=torch.float64) + 0.5) / size * 2 - 1
     t, s = torch.meshgrid(ticks, ticks, indexing="ij")
+    return torch.nn.functional.normalize(_directions_of_faces(s, t), dim=-1).float()
+
+
+def _directions_of_faces(s: Tensor, t: Tensor) -> Tensor:
+    """Directions [6, ..., 3] through texture coordinates of each face, with 1 along its axis."""
     one = torch.ones_like(s)
     faces = [
         (one, -t, -s), (-one, -t, s),
         (s, one, t), (s, -one, -t),
         (s, -t, one), (-s, -t, -one),
     ]  # fmt: skip
-    stacked = torch.stack([torch.stack(face, -1) for face in faces])
-    return torch.nn.functional.normalize(stacked, dim=-1).float()
+    return torch.stack([torch.stack(face, -1) for face in faces])
 
 
 def _bilinear(

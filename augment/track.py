@@ -26,11 +26,14 @@ class Track:
     timestamps_ns: int64 [T], strictly increasing. world_from_actor: float64 [T, 4, 4].
     hold_ns: how long before the first and after the last sample the actor stays at that pose
     (cameras of a frame fire at slightly different moments); beyond it the actor is absent.
+    max_gap_ns: between samples further apart than this the actor is absent too, but for hold_ns
+    after the one and before the other, where it stays at that pose; None: always interpolated.
     """
 
     timestamps_ns: Tensor
     world_from_actor: Float[Tensor, "T 4 4"]
     hold_ns: int = 100_000_000
+    max_gap_ns: int | None = None
 
     def __post_init__(self) -> None:
         count = self.timestamps_ns.shape[0]
@@ -54,6 +57,11 @@ class Track:
             return self.world_from_actor[-1]
         after = bisect_right(times, timestamp_ns)
         before = after - 1
+        if self.max_gap_ns is not None and times[after] - times[before] > self.max_gap_ns:
+            if timestamp_ns - times[before] <= self.hold_ns:
+                return self.world_from_actor[before]
+            is_near = times[after] - timestamp_ns <= self.hold_ns
+            return self.world_from_actor[after] if is_near else None
         fraction = (timestamp_ns - times[before]) / (times[after] - times[before])
         rows = _rotation(_slerp(knots.quats[before], knots.quats[after], fraction))
         for row, a, b in zip(rows, knots.centres[before], knots.centres[after], strict=True):

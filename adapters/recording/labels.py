@@ -56,3 +56,8 @@ class RecordingLabels:
         meanings = read_lidar_classes(self.root)
         table, _ = class_table(self.root, np.unique(numbers), meanings)
         return None if table is None else table[numbers]
+
+
+def recording_labels(path: str, query: dict[str, str]) -> RecordingLabels:
+    """The labels of a folder; whatever the query, they are those of all its frames."""
+    return RecordingLabels(Path(path))

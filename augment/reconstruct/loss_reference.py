@@ -12,7 +12,7 @@ from torch.nn.functional import conv2d
 from augment.cameras import Camera
 from augment.reconstruct.config import LossWeights
 from augment.reconstruct.view import RecordedView
-from augment.sky import CubemapSky
+from augment.sky import sample_within_faces
 
 RADIUS, SIGMA = 5, 1.5
 C1, C2 = 0.01**2, 0.03**2
@@ -42,7 +42,7 @@ def reference_picture(
 ) -> Float[Tensor, "H W 3"]:
     """color_map(rgb + (1 - alpha) sky(direction)); no sky where 1 - alpha < least_sky."""
     through = 1 - alpha
-    sky = CubemapSky(sky_faces).sample(camera.ray_directions(rgb.dtype))
+    sky = sample_within_faces(sky_faces, camera.ray_directions(rgb.dtype))
     sky = torch.where((through >= least_sky)[..., None], sky, torch.zeros_like(sky))
     return (rgb + through[..., None] * sky) @ color_map[:, :3].T + color_map[:, 3]
 

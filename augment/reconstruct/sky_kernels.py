@@ -1,6 +1,6 @@
 """Numba kernels for a sky that is learnt: a cube map's colours behind a view, and their gradient.
 
-The lookup is that of `augment.sky.CubemapSky`, bilinear inside a face and clamped at its edge. What
+The lookup is `augment.sky.sample_within_faces`, bilinear and clamped at the edge of a face. What
 it found is kept (texel, fractions), so that the way back computes no direction again.
 """
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from augment.cameras import Camera
 from augment.render import composite_kernels
 from augment.render.threads import kernel_threads
-from augment.sky import ConstantSky, CubemapSky, Sky
+from augment.sky import ConstantSky, CubemapSky, Sky, bordered_faces
 from augment.weather.smog import (
     SmogMedium,
     blend_airlight,
@@ -62,7 +62,7 @@ def composite_sky(
         )
     tracked = torch.is_grad_enabled() and (rgb.requires_grad or alpha.requires_grad)
     if fast and not tracked and isinstance(sky, CubemapSky) and rgb.dtype == torch.float32:
-        return _composite_cubemap(rgb, alpha, camera, sky.faces, smog)
+        return _composite_cubemap(rgb, alpha, camera, bordered_faces(sky), smog)
     directions = camera.ray_directions(rgb.dtype)
     color = sky.sample(directions)
     if smog is not None:

@@ -10,15 +10,15 @@ import numpy as np
 
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
 def composite_cubemap(rgb, alpha, faces, rotation, ifx, ify, cx, cy, strength, airlight, out):
-    """out = rgb + (1 - alpha) sky of a cube map [6, R, R, 3], through smog where strength >= 0.
+    """out = rgb + (1 - alpha) sky of a cube map, through smog where strength >= 0.
 
-    rotation: world_from_camera. ifx, ify: 1 / focal length. strength: optical depth straight up.
+    faces: [6, R + 2, R + 2, 3], with a border (augment.sky.with_border). rotation:
+    world_from_camera. ifx, ify: 1 / focal length. strength: optical depth straight up.
     """
     height, width = alpha.shape
-    size = faces.shape[1]
     half, one = np.float32(0.5), np.float32(1)
-    last = np.float32(size - 1)
-    scale = np.float32(size) * half
+    scale = np.float32(faces.shape[1] - 2) * half
+    middle = scale + half  # of a face, from the centre of the first texel of its border
     for i in numba.prange(height):
         v = (np.float32(i) + half - cy) * ify
         bx = rotation[0, 1] * v + rotation[0, 2]
@@ -43,10 +43,9 @@ def composite_cubemap(rgb, alpha, faces, rotation, ifx, ify, cx, cy, strength, a
                 face = 4 if z >= 0 else 5
                 s = x if z >= 0 else -x
             inverse = scale / major
-            column = min(max(s * inverse + scale - half, np.float32(0)), last)
-            row = min(max(t * inverse + scale - half, np.float32(0)), last)
+            column, row = s * inverse + middle, t * inverse + middle
             c0, r0 = int(column), int(row)
-            c1, r1 = min(c0 + 1, size - 1), min(r0 + 1, size - 1)
+            c1, r1 = c0 + 1, r0 + 1
             fc, fr = column - np.float32(c0), row - np.float32(r0)
             through = one - alpha[i, j]
             visible = one

@@ -390,7 +390,7 @@ def _fetch_blurred(s, starts, column, row, mips):
 
 @inner()
 def _sky(s, faces, size, x, y, z, near, medium):
-    """Colours of a cube map, flat, in directions that climb, behind smog."""
+    """Colours of a cube map with a border, flat, in directions that climb, behind smog."""
     zero = v8.splat(ZERO)
     ax, ay = v8.absolute(x), v8.absolute(y)
     by_x = v8.both(v8.at_least(ax, ay), v8.at_least(ax, z))
@@ -403,9 +403,9 @@ def _sky(s, faces, size, x, y, z, near, medium):
     face = v8.select(by_y, v8.select(ahead, v8.splat(F(2)), v8.splat(F(3))), v8.splat(F(4)))
     face = v8.select(by_x, v8.select(right, zero, v8.splat(ONE)), face)
     side = v8.splat(F(np.int32(size)))
-    scale = v8.splat(HALF) * side
-    inverse = scale / major
-    _place(s, across * inverse + scale, down * inverse + scale, side, side)
+    middle = v8.splat(HALF) * side
+    inverse = (middle - v8.splat(ONE)) / major
+    _place(s, across * inverse + middle, down * inverse + middle, side, side)
     v8.store(s, R0, v8.load(s, R0) + face * side)
     for k in range(LANES):
         at = _pixel(s[R0 + k]) * size + _pixel(s[C0 + k])
@@ -612,9 +612,10 @@ def shade(
 
     u [W], v [H]: image coordinates at unit depth. axes [3, 3]: world_from_camera, float64. offset:
     (left, top) of the camera's window in the bed's. front: the layer of the screen-space reflection
-    whose rays run front_distance. faces: flat cube map of `size` squared texels a face, each four
-    numbers. mirror_mips: the mirrored layer and its averages, four numbers a pixel. mirror_sizes
-    [levels, 3]: their first pixels, widths, heights. Both arrays go on a row and a pixel beyond.
+    whose rays run front_distance. faces: flat cube map with its border, `size` squared texels a
+    face, each four numbers. mirror_mips: the mirrored layer and its averages, four numbers a pixel.
+    mirror_sizes [levels, 3]: their first pixels, widths, heights. Both arrays go on a row and a
+    pixel beyond.
     """
     height, width = cover.shape
     left, top = offset

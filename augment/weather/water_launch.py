@@ -13,7 +13,15 @@ from torch import Tensor
 from augment.cameras import Camera
 from augment.render.composite import sky_behind
 from augment.render.threads import kernel_threads
-from augment.sky import ConstantSky, CubemapSky, LatLongSky, Sky, directions_of_cubemap
+from augment.sky import (
+    ConstantSky,
+    CubemapSky,
+    LatLongSky,
+    Sky,
+    bordered_faces,
+    directions_of_cubemap,
+    with_border,
+)
 from augment.weather import layer_lookup, mip_kernels, reflection_lookup, refraction, water_surface
 from augment.weather import water_kernels as kernels
 from augment.weather.flood import FloodMedium, Layer
@@ -81,19 +89,20 @@ def _array(part: Tensor) -> np.ndarray:
 
 
 def _faces(sky: Sky, smog: SmogMedium | None) -> tuple[np.ndarray, int, SmogMedium | None]:
-    """A flat cube map for the kernel, the size of its faces, the smog before them."""
+    """A flat cube map for the kernel, the size of its faces with border, the smog before them."""
     seen, layered = sky_behind(sky, smog)
     if isinstance(seen, ConstantSky):
-        return _padded(seen.rgb.expand(6, 1, 1, 3)), 1, layered
+        return _padded(seen.rgb.expand(6, 3, 3, 3)), 3, layered
     if not isinstance(seen, CubemapSky | LatLongSky):
-        return _padded(_sampled(seen)), SKY_SIZE, layered
+        return _padded(with_border(_sampled(seen))), SKY_SIZE + 2, layered
     image = seen.faces if isinstance(seen, CubemapSky) else seen.image
     known = _known_faces.get(seen)
     if known is None or known[0] != image._version:
-        faces = seen.faces if isinstance(seen, CubemapSky) else _sampled(seen)
+        is_cube = isinstance(seen, CubemapSky)
+        faces = bordered_faces(seen) if is_cube else with_border(_sampled(seen))
         known = _known_faces[seen] = (image._version, _padded(faces))
     size = seen.faces.shape[1] if isinstance(seen, CubemapSky) else SKY_SIZE
-    return known[1], size, layered
+    return known[1], size + 2, layered
 
 
 def _sampled(sky: Sky) -> Tensor:

@@ -4,6 +4,8 @@ import pickle
 import pytest
 import torch
 
+from augment.cameras import Camera
+from augment.color_waves import ColorWaves
 from augment.errors import SceneError
 from augment.geometry import quat_from_rotmat, rigid, rotmat_from_quat, slerp
 from augment.scene import Actor, Gaussians, Scene, Track, check_gaussians
@@ -20,6 +22,11 @@ def some(count: int = 5) -> Gaussians:
         opacities=torch.full((count,), 0.5),
         sh=torch.zeros(count, 4, 3),
     )
+
+
+def named(name: str, timestamp_ns: int = 0) -> Camera:
+    pose = torch.eye(4, dtype=torch.float64)
+    return Camera(name, 4, 3, 4.0, 4.0, 2.0, 1.5, pose, timestamp_ns)
 
 
 def track() -> Track:
@@ -159,8 +166,52 @@ def test_colour_maps_are_checked_and_none_where_they_change_nothing(unchecked):
         dataclasses.replace(scene(), color_maps={"front": torch.full((3, 4), torch.nan)})
     maps = {"front": torch.eye(3, 4) * 0.5, "rear": torch.eye(3, 4)}
     s = dataclasses.replace(scene(), color_maps=maps)
-    assert s.color_map("front") is maps["front"]
-    assert s.color_map("rear") is None and s.color_map("left") is None
+    front, rear, left = (named(name) for name in ("front", "rear", "left"))
+    assert s.color_map(front) is maps["front"]
+    assert s.color_map(rear) is None and s.color_map(left) is None
+
+
+def test_a_colour_map_of_an_image_goes_before_that_of_its_camera():
+    own, common = torch.eye(3, 4) * 0.5, torch.eye(3, 4) * 0.7
+    s = dataclasses.replace(
+        scene(), color_maps={"front": common}, image_color_maps={("front", 5): own}
+    )
+    assert s.color_map(named("front", 5)) is own
+    assert s.color_map(named("front", 6)) is common
+    assert s.color_map(named("rear", 5)) is None
+
+
+def waves(count: int = 3) -> ColorWaves:
+    times, phases = torch.tensor([1_000, 2_000]), torch.tensor([0.0, 1.0], dtype=torch.float64)
+    coefficients = torch.arange(count * 12, dtype=torch.float32).reshape(count, 4, 3) / 10
+    return ColorWaves(coefficients, times, phases)
+
+
+def test_an_actors_colours_follow_its_waves():
+    actor = Actor("a", "car", some(3), track(), (4.0, 2.0, 1.5), waves())
+    (_, part) = scene((actor,)).parts_at(1_250)
+    c = actor.color_waves.coefficients
+    # At t = 1/4: sin(2 pi t) = 1, cos(2 pi t) = 0, sin(4 pi t) = 0, cos(4 pi t) = -1.
+    expected = actor.gaussians.sh[:, 0] + c[:, 0] - c[:, 3]
+    assert torch.allclose(part.gaussians.sh[:, 0], expected, atol=1e-6)
+    assert torch.equal(part.gaussians.sh[:, 1:], actor.gaussians.sh[:, 1:])
+    with pytest.raises(ValueError, match="row for each of its 3 Gaussians; got 2"):
+        dataclasses.replace(actor, color_waves=waves(2))
+
+
+def test_colour_waves_are_held_beyond_their_times():
+    assert [waves().phase_at(t) for t in (0, 1_000, 1_500, 2_000, 9_000)] == [0, 0, 0.5, 1, 1]
+    with pytest.raises(ValueError, match="strictly increasing"):
+        dataclasses.replace(waves(), timestamps_ns=torch.tensor([2, 2]))
+
+
+def test_an_actor_is_absent_in_a_gap_of_its_track():
+    whole = track()
+    gappy = dataclasses.replace(whole, max_gap_ns=500)
+    assert whole.pose_at(1_500) is not None and gappy.pose_at(1_500) is None
+    assert torch.equal(gappy.pose_at(1_100), whole.world_from_actor[0])
+    assert torch.equal(gappy.pose_at(1_900), whole.world_from_actor[1])
+    assert dataclasses.replace(whole, max_gap_ns=1_000).pose_at(1_500) is not None
 
 
 def test_all_gaussians_are_changed_and_nothing_else():

@@ -6,6 +6,7 @@ from augment.sky import (
     LatLongSky,
     cubemap_coordinates,
     directions_of_cubemap,
+    with_border,
 )
 
 
@@ -46,9 +47,54 @@ def test_opengl_faces():
 def test_a_cubemap_reproduces_a_smooth_function():
     sky = CubemapSky(smooth(directions_of_cubemap(64)))
     directions = random_directions()
-    # Bilinear error is about (texel angle)^2 / 8 times the curvature, and half a texel is clamped
-    # at face edges: 0.02 at 64 texels a face.
-    assert (sky.sample(directions) - smooth(directions)).abs().max() < 0.02
+    # Bilinear error is about (texel angle)^2 / 8 times the curvature, also across face edges.
+    assert (sky.sample(directions) - smooth(directions)).abs().max() < 0.004
+
+
+def test_a_cubemap_has_no_seams():
+    """Steps across every edge are as small as steps inside faces."""
+    size = 32
+    sky = CubemapSky(smooth(directions_of_cubemap(size)))
+    along = torch.linspace(-1, 1, 401, dtype=torch.float64)
+    near = torch.full_like(along, 1e-6)
+    for first in range(3):
+        for second in range(first + 1, 3):
+            for signs in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+                sides = []
+                for way in (-1, 1):
+                    d = torch.zeros(401, 3, dtype=torch.float64)
+                    d[:, first], d[:, second] = (
+                        signs[0] * (1 - way * near),
+                        signs[1] * (1 + way * near),
+                    )
+                    d[:, 3 - first - second] = along
+                    sides.append(sky.sample(d))
+                assert (sides[0] - sides[1]).abs().max() < 2 / 255
+                assert (sides[0] - smooth(d)).abs().max() < 0.01
+
+
+def test_noise_is_continuous_across_edges():
+    sky = CubemapSky(torch.rand(6, 8, 8, 3, generator=torch.Generator().manual_seed(1)))
+    one = torch.tensor([[1.0, 1 - 1e-6, 0.3], [-0.2, 1.0, -1 + 1e-6]], dtype=torch.float64)
+    other = torch.tensor([[1 - 1e-6, 1.0, 0.3], [-0.2, 1 - 1e-6, -1.0]], dtype=torch.float64)
+    assert (sky.sample(one) - sky.sample(other)).abs().max() < 1e-4
+
+
+def test_a_corner_is_the_mean_of_its_three_texels():
+    faces = torch.rand(6, 4, 4, 3, generator=torch.Generator().manual_seed(1))
+    bordered = with_border(faces)
+    # Face +x holds s along -z and t along -y: its upper left corner looks to (1, 1, 1), as the
+    # upper right of +z and the lower right of +y do.
+    meet = (faces[0, 0, 0] + faces[4, 0, 3] + faces[2, 3, 3]) / 3
+    assert torch.allclose(bordered[0, 0, 0], meet)
+    assert torch.allclose(CubemapSky(faces).sample(torch.ones(3)), meet, atol=0.2)
+
+
+def test_the_border_follows_faces_that_change():
+    sky = CubemapSky(torch.zeros(6, 4, 4, 3))
+    assert float(sky.sample(torch.ones(3)).max()) == 0
+    sky.faces.fill_(0.5)
+    assert torch.allclose(sky.sample(torch.ones(3)), torch.full((3,), 0.5))
 
 
 def test_a_latlong_image_reproduces_a_smooth_function():

@@ -1,0 +1,1 @@
+"""drivestudio runs as scenes."""

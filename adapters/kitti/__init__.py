@@ -1,0 +1,1 @@
+"""KITTI as scenes."""

@@ -1,0 +1,128 @@
+"""Small files of a dataset: JSON and tables of numbers, and paths that stay inside its folder."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from augment.errors import AdapterError
+
+
+def read_text(path: Path) -> str:
+    """A UTF-8 file.
+
+    Raises:
+        AdapterError: missing, unreadable, or not UTF-8.
+    """
+    try:
+        return path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise AdapterError(f"{path} does not exist; copy it from the dataset") from None
+    except (OSError, ValueError) as error:
+        raise AdapterError(f"{path} cannot be read as text: {error}") from None
+
+
+def read_json(path: Path, kind: type = dict) -> Any:
+    """The contents of a JSON file, a `kind` (dict or list) at its top.
+
+    Raises:
+        AdapterError: missing, no JSON, or something else at the top.
+    """
+    text = read_text(path)
+    try:
+        content = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise AdapterError(f"{path} is not readable JSON ({error}); copy it again") from None
+    if not isinstance(content, kind):
+        names = {dict: "an object", list: "a list"}
+        raise AdapterError(
+            f"{path} must hold {names.get(kind, kind.__name__)}; got {type(content).__name__}"
+        )
+    return content
+
+
+def read_numbers(path: Path, shape: Sequence[int] | None = None) -> np.ndarray:
+    """The finite numbers of a text file, float64 in that shape, or flat.
+
+    Raises:
+        AdapterError: missing, something that is no finite number, or another count.
+    """
+    words = read_text(path).replace(",", " ").split()
+    try:
+        values = np.array([float(word) for word in words], np.float64)
+    except ValueError as error:
+        raise AdapterError(f"{path} must hold numbers only ({error})") from None
+    if not np.isfinite(values).all():
+        raise AdapterError(f"{path} holds NaN or infinite numbers")
+    if shape is None:
+        return values
+    if values.size != int(np.prod(shape)):
+        expected = " x ".join(map(str, shape))
+        raise AdapterError(f"{path} must hold {expected} numbers; it holds {values.size}")
+    return values.reshape(shape)
+
+
+def read_pose(path: Path) -> np.ndarray:
+    """A rigid transform from a file of 4 x 4 or 3 x 4 numbers, float64 [4, 4].
+
+    Raises:
+        AdapterError: as for read_numbers, or no rotation and translation.
+    """
+    values = read_numbers(path)
+    if values.size not in (12, 16):
+        raise AdapterError(f"{path} must hold 4 x 4 numbers, a pose; it holds {values.size}")
+    return checked_pose(values.reshape(-1, 4), str(path))
+
+
+def checked_pose(matrix: np.ndarray, where: str) -> np.ndarray:
+    """A matrix [3, 4] or [4, 4] as float64 [4, 4] with an exactly orthonormal rotation.
+
+    Raises:
+        AdapterError: not finite, or more than 1e-3 off a rotation and a translation.
+    """
+    pose = np.eye(4)
+    pose[: len(matrix)] = matrix
+    rotation = pose[:3, :3]
+    with np.errstate(all="ignore"):
+        error = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    is_pose = np.isfinite(pose).all() and error < 1e-3 and np.linalg.det(rotation) > 0
+    if not is_pose or not np.allclose(pose[3], [0, 0, 0, 1]):
+        raise AdapterError(
+            f"{where} must be a rotation and a translation (metres) with 0 0 0 1 in its last row; "
+            f"got {pose.tolist()}"
+        )
+    u, _, vt = np.linalg.svd(rotation)
+    pose[:3, :3] = u @ vt
+    pose[3] = [0, 0, 0, 1]
+    return pose
+
+
+def inside(root: Path, name: str, where: str) -> Path:
+    """The file of a dataset that a table names relative to the dataset's folder.
+
+    Links inside the folder are followed as long as they stay in it; so are the folder's own
+    entries, which people link to where their disks are.
+
+    where: the table and row, for messages.
+
+    Raises:
+        AdapterError: the name is absolute, holds '..' or leads outside through a link.
+    """
+    parts = PurePosixPath(name).parts if isinstance(name, str) else ()
+    if not parts or parts[0] == "/" or ".." in parts or "\\" in name or "\0" in name:
+        raise AdapterError(
+            f"{where} names the file {name!r}; names must be relative to {root}, without '..'"
+        )
+    path = root.joinpath(*parts)
+    real = path.resolve()
+    entries = (root.resolve(), (root / parts[0]).resolve()) if len(parts) > 1 else (root.resolve(),)
+    if not any(real.is_relative_to(entry) for entry in entries):
+        raise AdapterError(
+            f"{where} names {name!r}, which leads through a link to {real}, outside {root}; put "
+            f"the file itself there"
+        )
+    return path

@@ -1,0 +1,1 @@
+"""Street Gaussians models and their data as scenes."""
