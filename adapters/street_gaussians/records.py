@@ -23,7 +23,7 @@ class ModelConfig:
     """
 
     source_path: str = ""
-    cameras: tuple[int, ...] = (0, 1, 2, 3, 4)
+    cameras: tuple[int, ...] = (0, 1, 2)
     selected_frames: tuple[int, int] | None = None
     use_tracker: bool = False
     split_test: int = -1
