@@ -21,7 +21,7 @@ from torch import Tensor
 
 from augment.render.sh import SH_C0
 from augment.render.threads import kernel_threads
-from augment.scene import Gaussians, Scene
+from augment.scene import Actor, Gaussians, Scene
 from augment.sky import ConstantSky, CubemapSky, LatLongSky, Sky
 from augment.style import sh_kernels
 from augment.style.maps import StyleMaps
@@ -78,6 +78,21 @@ def style_gaussians(
     if not aligned:
         target.copy_(written)
     return dataclasses.replace(gaussians, sh=target)
+
+
+def style_actor(actor: Actor, maps: StyleMaps) -> Actor:
+    """The actor in mapped colours, at all times: its waves add to sh_00, so only M acts on them."""
+    waves, splats = actor.color_waves, maps.splats
+    if waves is not None:
+        matrices = fold_maps(splats, waves.coefficients.dtype)[:, :9].reshape(-1, 3, 3)
+        classes = _rows_of(actor.gaussians, len(splats))
+        rows = matrices[:1] if classes is None else matrices[classes.long()]
+        mapped = torch.einsum(
+            "nij,ntj->nti", rows.expand(len(actor.gaussians), 3, 3), waves.coefficients
+        )
+        waves = dataclasses.replace(waves, coefficients=mapped)
+    gaussians = style_gaussians(actor.gaussians, maps)
+    return dataclasses.replace(actor, gaussians=gaussians, color_waves=waves)
 
 
 def map_sh(
@@ -145,10 +160,7 @@ def styled_scene(scene: Scene, maps: StyleMaps) -> Scene:
     return dataclasses.replace(
         scene,
         background=style_gaussians(scene.background, maps, levels=sky_levels(scene, maps)),
-        actors=tuple(
-            dataclasses.replace(actor, gaussians=style_gaussians(actor.gaussians, maps))
-            for actor in scene.actors
-        ),
+        actors=tuple(style_actor(actor, maps) for actor in scene.actors),
         sky=style_sky(scene.sky, maps.sky),
     )
 

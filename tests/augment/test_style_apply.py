@@ -7,13 +7,14 @@ import torch
 from fitted_scenes import fitted_scene
 from scenes import camera_ahead, random_gaussians
 
+from augment.color_waves import ColorWaves
 from augment.render.composite import composite_sky, map_colors
 from augment.render.rasterize import rasterize
 from augment.render.sh import SH_C0, evaluate_sh
 from augment.render.threads import limit_threads
-from augment.scene import PosedGaussians
+from augment.scene import Actor, PosedGaussians, Track
 from augment.sky import ConstantSky, CubemapSky, LatLongSky
-from augment.style.apply import map_sh, style_gaussians, style_sky, styled_scene
+from augment.style.apply import map_sh, style_actor, style_gaussians, style_sky, styled_scene
 from augment.style.maps import CLASSES, StyleMaps, identity_map
 from augment.style.scene_maps import identity_maps
 
@@ -244,3 +245,20 @@ def test_without_directions_a_colour_below_0_is_mapped_as_the_black_that_it_show
     maps = StyleMaps(lift[None], lift, lift)
     colors = 0.5 + SH_C0 * style_gaussians(dark, maps, fast=fast).sh[:, 0]
     torch.testing.assert_close(colors, lift[:, 3].expand(3, 3), rtol=0, atol=1e-6)
+
+
+def test_colours_that_change_over_time_are_mapped_at_all_times():
+    gaussians = with_classes(50, 1)
+    waves = ColorWaves(
+        0.1 * torch.randn(50, 4, 3, generator=torch.Generator().manual_seed(3)),
+        torch.tensor([0, 1_000]),
+        torch.tensor([0.0, 1.0], dtype=torch.float64),
+    )
+    track = Track(torch.tensor([0]), torch.eye(4, dtype=torch.float64)[None])
+    actor = Actor("a", "car", gaussians, track, (4.0, 2.0, 1.5), waves)
+    for maps in (maps_of(some_map()[None]), maps_by_class()):
+        styled = style_actor(actor, maps)
+        for timestamp_ns in (0, 300, 1_000):
+            expected = style_gaussians(actor.gaussians_at(timestamp_ns), maps).sh
+            got = styled.gaussians_at(timestamp_ns).sh
+            torch.testing.assert_close(got, expected, rtol=1e-5, atol=1e-5)
