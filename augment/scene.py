@@ -244,6 +244,13 @@ class Scene:
         """The background's, then each actor's in its own frame."""
         return (self.background, *(actor.gaussians for actor in self.actors))
 
+    @property
+    def gaussian_bytes(self) -> int:
+        """Of all Gaussians, their colours over time among them."""
+        waves = (actor.color_waves for actor in self.actors)
+        own = sum(gaussians.nbytes for gaussians in self.all_gaussians)
+        return own + sum(wave.nbytes for wave in waves if wave is not None)
+
     def with_gaussians(self, change: Callable[[Gaussians], Gaussians]) -> Scene:
         """The scene with every part's Gaussians changed."""
         return replace(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections import Counter
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ def describe_scene(scene: Scene) -> dict[str, Any]:
             "track_id": a.track_id,
             "label": a.label,
             "gaussians": len(a.gaussians),
+            "color_terms": 1 if a.color_waves is None else 1 + a.color_waves.coefficients.shape[1],
             "size_m": list(a.size_m),
             "from_ns": int(a.track.timestamps_ns[0]),
             "to_ns": int(a.track.timestamps_ns[-1]),
@@ -33,7 +35,7 @@ def describe_scene(scene: Scene) -> dict[str, Any]:
         "name": scene.name,
         "source": scene.source,
         "gaussians": sum(len(g) for g in all_gaussians),
-        "gaussian_bytes": sum(g.nbytes for g in all_gaussians),
+        "gaussian_bytes": scene.gaussian_bytes,
         "background": _describe_gaussians(scene.background),
         "actors": actors,
         "sky": type(scene.sky).__name__,
@@ -47,6 +49,7 @@ def describe_scene(scene: Scene) -> dict[str, Any]:
         "world_origin_m": [float(v) for v in scene.world_origin_m],
         "recorded_source": scene.recorded_source,
         "color_maps": {name: matrix.tolist() for name, matrix in scene.color_maps.items()},
+        "image_color_maps": dict(Counter(name for name, _ in scene.image_color_maps)),
         "made_by": dict(scene.made_by),
         "problems": list(scene.problems),
     }
@@ -152,10 +155,12 @@ def scene_text(facts: dict[str, Any]) -> str:
         f"  camera      {c['name']}: {c['width']}x{c['height']} px, "
         f"{c['horizontal_fov_deg']:.0f} deg wide, {c['images']} images"
         + _gains(facts["color_maps"].get(c["name"]))
+        + _own_maps(facts["image_color_maps"].get(c["name"], 0))
         for c in facts["cameras"]
     ]
     lines += [
         f"  actor       {a['track_id']} ({a['label']}): {a['gaussians']:,} Gaussians"
+        + ("" if a["color_terms"] == 1 else f", colours over time in {a['color_terms']} terms")
         for a in facts["actors"]
     ]
     boxes, lidar = labels["boxes"], labels["lidar"]
@@ -185,6 +190,10 @@ def _gains(color_map: list[list[float]] | None) -> str:
         return ""
     gains = (sum(row[:3]) + row[3] / 0.5 for row in color_map)
     return f", records mid grey x {' '.join(f'{gain:.2f}' for gain in gains)}"
+
+
+def _own_maps(count: int) -> str:
+    return f", {count} images with a colour map of their own" if count else ""
 
 
 def _short(value: Any) -> str:

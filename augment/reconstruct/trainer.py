@@ -131,6 +131,7 @@ class Trainer:
                 actor,
                 gaussians=self.splats.gaussians(number),
                 track=self.actor_poses.track(number - 1, actor.track),
+                color_waves=None,  # learnt colours are those of all times
             )
             for number, actor in enumerate(self._scene.actors, start=1)
         )
@@ -142,6 +143,7 @@ class Trainer:
             frames=tuple(self._frame(frame) for frame in self._scene.frames),
             sky=CubemapSky(torch.from_numpy(self.sky_faces.copy())),
             color_maps=maps if self.config.exposure else {},
+            image_color_maps={},
         )
 
     def _frame(self, frame: Frame) -> Frame:
