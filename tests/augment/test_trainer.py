@@ -24,7 +24,7 @@ from augment.render.cpu_backward import Tape
 from augment.render.cpu_layout import BLOCK
 from augment.render.threads import limit_threads
 from augment.scene import Actor, Gaussians, Scene, Track
-from augment.sky import ConstantSky, CubemapSky
+from augment.sky import ConstantSky, CubemapSky, cubemap_coordinates
 from recipes.schema import Output, Recipe
 from tests.scenes import camera_ahead, random_gaussians
 
@@ -422,7 +422,12 @@ def test_the_fitted_scene_shows_what_the_trainer_sees(recorded):
         # The right camera fires between samples of the track, where a fitted pose is interpolated
         # and a trained one is the interpolated label corrected: micrometres, 1e-4 of a pixel.
         tolerance = 1e-6 if key.camera == "left" else 2e-3
-        assert np.abs(show(scene, camera).rgb.numpy() - own).max() < tolerance, key
+        difference = np.abs(show(scene, camera).rgb.numpy() - own)
+        # Half a texel beside an edge of the sky, a learnt one is looked up in one face only.
+        _, s, t = cubemap_coordinates(camera.ray_directions())
+        inner = (torch.maximum(s.abs(), t.abs()) < 1 - 1.01 / scene.sky.faces.shape[1]).numpy()
+        opaque = tape.alpha > 0.999
+        assert difference[inner | opaque].max() < tolerance and (inner | opaque).mean() > 0.4, key
     assert [a.track_id for a in scene.actors] == ["car"]
     assert [f.index for f in scene.frames] == list(range(FRAMES))
 
