@@ -48,7 +48,8 @@ class StreetImage:
 
     world_from_ego: float64 [4, 4], at the moment of the image. camera_from_ego: float64 [4, 4],
     OpenCV axes. width, height, fx, fy, cx, cy: of the recorded image, pixels. is_held_out: not
-    trained on.
+    trained on. number: its position among all images of the selected frames and cameras, by frame,
+    then camera, those included that are left out: the index of per-image corrections.
     """
 
     frame: int
@@ -64,6 +65,7 @@ class StreetImage:
     cx: float
     cy: float
     is_held_out: bool
+    number: int
 
     @property
     def name(self) -> str:
@@ -109,9 +111,10 @@ class StreetData:
     """A dataset directory as a model sees it.
 
     frames: selected numbers, ascending. frame_times_s: float64 [F]. world_from_ego: float64
-    [F, 4, 4] at the frames' times. images: of the selected frames and cameras, by frame, then
-    camera: their position is the index of per-image corrections. objects: in order of their first
-    appearance in the track file, static ones left out.
+    [F, 4, 4] at the frames' times; between its neighbours' where the file is missing, so that the
+    rows stay those of the model, but such a frame has no images. images: of the selected frames and
+    cameras, by frame, then camera. objects: in order of their first appearance in the track file,
+    static ones left out.
     """
 
     root: Path
