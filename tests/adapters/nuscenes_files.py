@@ -415,9 +415,8 @@ def write_keyframe(root: Path, source: Path) -> Path:
             _copy(source, root, channel, image["img_path"]), is_key_frame=True, size=(1600, 900),
         )  # fmt: skip
     for number, thing in enumerate(frame["instances"]):
-        category = next(
-            c for c in CATEGORIES if c.endswith(_ENDINGS[names[thing["bbox_label_3d"]]])
-        )
+        ending = _ENDINGS.get(names.get(thing["bbox_label_3d"], ""), ".debris")
+        category = next(c for c in CATEGORIES if c.endswith(ending))
         x, y, z, length, width, height, yaw = thing["bbox_3d"]
         box = np.eye(4)
         box[:3, :3] = Rotation.from_euler("z", yaw).as_matrix()
