@@ -12,11 +12,9 @@ quarter about z. Times are seconds, stored here as integer nanoseconds.
 
 from __future__ import annotations
 
-import json
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -24,6 +22,7 @@ import pandas as pd
 import torch
 
 from adapters.lidar.origin import drive_origin
+from adapters.plain_files import read_json
 from adapters.safe_pickle import read_frame
 from augment.errors import AdapterError
 from augment.geometry import rigid, rotmat_from_quat
@@ -152,7 +151,7 @@ def _read_table(path: Path, needed: tuple[str, ...]) -> pd.DataFrame:
 
 
 def _read_camera(folder: Path, frames: int, problems: list[str]) -> CameraTrack:
-    intrinsics = _read_json(folder / "intrinsics.json")
+    intrinsics = read_json(folder / "intrinsics.json")
     try:
         fx, fy, cx, cy = (float(intrinsics[name]) for name in ("fx", "fy", "cx", "cy"))
     except (TypeError, KeyError, ValueError) as error:
@@ -232,21 +231,9 @@ def _folder(path: Path) -> Path:
     return path
 
 
-def _read_json(path: Path) -> Any:
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise AdapterError(
-            f"{path} does not exist; a PandaSet sequence cannot be read without it, "
-            f"copy it from the dataset"
-        ) from None
-    except (OSError, ValueError) as error:
-        raise AdapterError(f"{path} is not readable JSON ({error}); copy it again") from None
-
-
 def _read_times(path: Path, *, expected: int, what: str) -> np.ndarray:
     """Nanoseconds, int64 [expected]."""
-    seconds = _read_json(path)
+    seconds = read_json(path, list)
     try:
         times = np.array([float(s) for s in seconds], dtype=np.float64)
     except (TypeError, ValueError):
@@ -260,7 +247,7 @@ def _read_times(path: Path, *, expected: int, what: str) -> np.ndarray:
 
 def _read_poses(path: Path) -> np.ndarray:
     """Rigid transforms, float64 [F, 4, 4]."""
-    entries = _read_json(path)
+    entries = read_json(path, list)
     try:
         positions = [[float(e["position"][axis]) for axis in "xyz"] for e in entries]
         quats = [[float(e["heading"][axis]) for axis in "wxyz"] for e in entries]

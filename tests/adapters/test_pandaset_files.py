@@ -33,7 +33,7 @@ def edit(path: Path, change) -> None:
     ("name", "change", "message"),
     [
         ("camera/left_camera/intrinsics.json", lambda v: {"fx": 1.0}, "must hold numbers fx, fy"),
-        ("camera/left_camera/intrinsics.json", lambda v: [1, 2], "must hold numbers fx, fy"),
+        ("camera/left_camera/intrinsics.json", lambda v: [1, 2], "must hold an object; got list"),
         ("camera/left_camera/poses.json", lambda v: v[:-1], "has 2 poses; lidar/poses.json has 3"),
         ("camera/left_camera/timestamps.json", lambda v: v[:-1], "has 2 entries; there are 3"),
         ("camera/left_camera/timestamps.json", lambda v: v[::-1], "finite and increasing"),
