@@ -7,7 +7,6 @@ Tensors are mapped from the file: what is not looked at (an optimiser's state) i
 from __future__ import annotations
 
 import ctypes
-import ctypes.util
 import mmap
 import pickle
 from collections.abc import Mapping, Sequence
@@ -118,15 +117,5 @@ def release(source: Tensor) -> None:
     end = begin + source.numel() * source.element_size()
     first = -(-begin // mmap.PAGESIZE) * mmap.PAGESIZE
     last = end // mmap.PAGESIZE * mmap.PAGESIZE
-    if last > first and _LIBC is not None:
-        _LIBC.madvise(ctypes.c_void_p(first), ctypes.c_size_t(last - first), _DONTNEED)
-
-
-def _libc() -> ctypes.CDLL | None:
-    try:
-        return ctypes.CDLL(None)
-    except OSError:
-        return None
-
-
-_LIBC = _libc()
+    if last > first:
+        ctypes.CDLL(None).madvise(ctypes.c_void_p(first), ctypes.c_size_t(last - first), _DONTNEED)
