@@ -5,6 +5,7 @@ first bytes of a file.
 from __future__ import annotations
 
 import itertools
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -85,6 +86,14 @@ def _is_drivestudio(folder: Path) -> bool:
     return (folder / "config.yaml").is_file() and any(folder.glob("checkpoint_*.pth"))
 
 
+def _is_street_gaussians_file(path: Path) -> bool:
+    return _is_multi_part(path) or re.fullmatch(r"iteration_\d+\.pth", path.name) is not None
+
+
+def _is_drivestudio_file(path: Path) -> bool:
+    return re.fullmatch(r"checkpoint_\w+\.pth", path.name) is not None
+
+
 def _is_recording(folder: Path) -> bool:
     return (folder / "calibration.json").is_file() and (folder / "images").is_dir()
 
@@ -140,5 +149,7 @@ FOLDERS = (
 )
 FILES = (
     Signature("scene", is_scene_file, "a scene file (.climategs)"),
+    Signature("street_gaussians", _is_street_gaussians_file, "iteration_N.pth of Street Gaussians"),
+    Signature("drivestudio", _is_drivestudio_file, "checkpoint_*.pth of drivestudio"),
     Signature("gaussians", _is_splat_file, "a .ply or .splat file"),
 )
