@@ -60,7 +60,11 @@ def test_a_model_in_several_parts_is_no_plain_splat_file(tmp_path):
 
 
 def test_files_are_recognised(tmp_path):
-    grow(tmp_path, ["iteration_7.pth", "checkpoint_final.pth", "a.climategs", "a.splat", "a.pth"])
+    grow(
+        tmp_path,
+        ["iteration_7.pth", "checkpoint_final.pth", "a.climategs", "a.splat", "a.pth"],
+        b"x",
+    )
     found = {path.name: recognised(path) for path in sorted(tmp_path.iterdir())}
     assert found == {
         "a.climategs": "scene",
