@@ -1,8 +1,9 @@
-"""Scene folders of our own (`climategs fit` writes them), with the labels of their recording.
+"""Scenes in files of our own, a folder (`climategs fit` writes them) or a single .climategs file,
+with the labels of their recording.
 
     scene:PATH?data=pandaset:PATH/002
 
-A scene folder holds no labels: boxes and LiDAR are read, when asked for, from the recording that
+Such files hold no labels: boxes and LiDAR are read, when asked for, from the recording that
 the scene was fitted to. `data` says where that is now, if it has moved.
 """
 
@@ -19,7 +20,7 @@ from augment.cameras import Frame
 from augment.errors import AdapterError
 from augment.labels import LabelSource
 from augment.scene import Scene
-from augment.scene_files import read_scene_folder
+from augment.scene_files import read_saved_scene
 
 _DATA_KEY = "data"
 
@@ -42,7 +43,7 @@ class Recording:
 
 
 def open_scene_folder(path: str, query: dict[str, str]) -> Scene:
-    """The scene of a scene folder.
+    """The scene of a scene folder or a scene file.
 
     query: data, the URI or path of the recording, where it has moved.
 
@@ -55,10 +56,10 @@ def open_scene_folder(path: str, query: dict[str, str]) -> Scene:
         raise AdapterError(
             f"scene:{path} does not know {', '.join(map(repr, unknown))}; it takes {_DATA_KEY}"
         )
-    folder = read_scene_folder(path)
-    scene = dataclasses.replace(folder.scene, source=format_uri("scene", path, query))
+    saved = read_saved_scene(path)
+    scene = dataclasses.replace(saved.scene, source=format_uri("scene", path, query))
     assert scene.recorded_source is not None
-    recorded = _recording(scene.recorded_source, folder.working_folder)
+    recorded = _recording(scene.recorded_source, saved.working_folder)
     if _DATA_KEY in query:
         found = _given(query[_DATA_KEY])
         if recorded is not None:

@@ -1,4 +1,4 @@
-"""scene.json: everything of a scene folder but its arrays, in numbers that read back to the bit."""
+"""scene.json: everything of a saved scene but its arrays, in numbers that read back to the bit."""
 
 from __future__ import annotations
 
@@ -12,25 +12,28 @@ import torch
 from torch import Tensor
 
 from augment.cameras import Camera, Frame
+from augment.color_waves import ColorWaves
 from augment.errors import SceneError
 from augment.ground_heights import Ground
-from augment.scene import Actor, Gaussians, Scene, Track
+from augment.scene import Actor, Scene, Track
 from augment.scene_schema import (
     FORMAT,
     VERSION,
     ActorEntry,
     FrameEntry,
+    Precision,
     SceneDocument,
     checked_document,
 )
-from augment.sky import ConstantSky, CubemapSky, LatLongSky, Sky
+from augment.scene_tensors import SKY_KINDS, SavedPart
+from augment.sky import Sky
 
-SKY_KINDS: dict[type, str] = {ConstantSky: "constant", LatLongSky: "latlong", CubemapSky: "cubemap"}
+_LISTS = ("actors", "frames", "problems", "image_color_maps")  # with a line an item
 _ROTATION_TOLERANCE = 1e-3  # cameras are held to 1e-4 by their own class
 
 
-def scene_document(scene: Scene) -> dict[str, Any]:
-    """The contents of scene.json.
+def scene_document(scene: Scene, precision: Precision = "float32") -> dict[str, Any]:
+    """The contents of scene.json. Where precision is not float32, made_by says so for good.
 
     Raises:
         SceneError: the scene has something that the file could not give back.
@@ -44,6 +47,7 @@ def scene_document(scene: Scene) -> dict[str, Any]:
     document = {
         "format": FORMAT,
         "version": VERSION,
+        "precision": precision,
         "name": scene.name,
         "recorded_source": scene.recorded_source or scene.source,
         "working_folder": os.getcwd(),
@@ -55,7 +59,12 @@ def scene_document(scene: Scene) -> dict[str, Any]:
         "sky": kind,
         "background_gaussians": len(scene.background),
         "color_maps": {name: matrix.tolist() for name, matrix in scene.color_maps.items()},
-        "made_by": _json_facts(scene),
+        "image_color_maps": [
+            {"camera": name, "timestamp_ns": int(timestamp_ns), "rows": matrix.tolist()}
+            for (name, timestamp_ns), matrix in scene.image_color_maps.items()
+        ],
+        "made_by": _json_facts(scene)
+        | ({} if precision == "float32" else {"precision": precision}),
         "problems": list(scene.problems),
         "actors": [_actor_entry(actor) for actor in scene.actors],
         "frames": [_frame_entry(frame) for frame in scene.frames],
@@ -65,14 +74,14 @@ def scene_document(scene: Scene) -> dict[str, Any]:
 
 
 def document_text(document: dict[str, Any]) -> str:
-    """JSON with a line a key, and a line an actor, frame or problem."""
+    """JSON with a line a key, and a line an actor, frame, problem or image's colour map."""
 
     def text(value: Any) -> str:
         return json.dumps(value, ensure_ascii=False, allow_nan=False)
 
     lines = []
     for key, value in document.items():
-        if key in ("actors", "frames", "problems") and value:
+        if key in _LISTS and value:
             rows = ",\n".join(f"  {text(item)}" for item in value)
             lines.append(f"{text(key)}: [\n{rows}\n]")
         else:
@@ -81,7 +90,7 @@ def document_text(document: dict[str, Any]) -> str:
 
 
 def scene_of(
-    document: SceneDocument, parts: list[Gaussians], sky: Sky, *, source: str, where: str
+    document: SceneDocument, parts: list[SavedPart], sky: Sky, *, source: str, where: str
 ) -> Scene:
     """The scene of a document; parts: background first, then its actors. It has no labels.
 
@@ -90,17 +99,23 @@ def scene_of(
     """
     try:
         actors = tuple(
-            _actor(entry, gaussians)
-            for entry, gaussians in zip(document.actors, parts[1:], strict=True)
+            _actor(entry, part) for entry, part in zip(document.actors, parts[1:], strict=True)
         )
         frames = tuple(_frame(entry) for entry in document.frames)
         repeated = len(frames) - len({frame.index for frame in frames})
         if repeated:
             raise ValueError(f"{repeated} frame numbers are given twice")
+        image_color_maps = {
+            (entry.camera, entry.timestamp_ns): torch.tensor(entry.rows, dtype=torch.float32)
+            for entry in document.image_color_maps
+        }
+        repeated = len(document.image_color_maps) - len(image_color_maps)
+        if repeated:
+            raise ValueError(f"{repeated} images' colour maps are given twice")
         return Scene(
             name=document.name,
             source=source,
-            background=parts[0],
+            background=parts[0].gaussians,
             actors=actors,
             sky=sky,
             frames=frames,
@@ -114,6 +129,7 @@ def scene_of(
                 name: torch.tensor(rows, dtype=torch.float32)
                 for name, rows in document.color_maps.items()
             },
+            image_color_maps=image_color_maps,
             recorded_source=document.recorded_source,
             made_by=document.made_by,
         )
@@ -121,33 +137,52 @@ def scene_of(
         raise SceneError(f"{where}: {error}") from error
 
 
+def track_entry(track: Track, where: str) -> dict[str, Any]:
+    """A track as JSON holds it.
+
+    Raises:
+        SceneError: poses that are not float64, or not rigid.
+    """
+    return {
+        "hold_ns": int(track.hold_ns),
+        "max_gap_ns": None if track.max_gap_ns is None else int(track.max_gap_ns),
+        "timestamps_ns": track.timestamps_ns.tolist(),
+        "world_from_actor": _rigid_rows(track.world_from_actor, where),
+    }
+
+
 def _actor_entry(actor: Actor) -> dict[str, Any]:
+    waves = actor.color_waves
     return {
         "track_id": actor.track_id,
         "label": actor.label,
         "size_m": [float(v) for v in actor.size_m],
         "gaussians": len(actor.gaussians),
-        "track": {
-            "hold_ns": int(actor.track.hold_ns),
-            "timestamps_ns": actor.track.timestamps_ns.tolist(),
-            "world_from_actor": _rigid_rows(
-                actor.track.world_from_actor, f"actor {actor.track_id!r}"
-            ),
-        },
+        "track": track_entry(actor.track, f"actor {actor.track_id!r}"),
+        "color_waves": None
+        if waves is None
+        else {"timestamps_ns": waves.timestamps_ns.tolist(), "phases": waves.phases.tolist()},
     }
 
 
-def _actor(entry: ActorEntry, gaussians: Gaussians) -> Actor:
+def _actor(entry: ActorEntry, part: SavedPart) -> Actor:
     where = f"actor {entry.track_id!r}"
     poses = torch.tensor(entry.track.world_from_actor, dtype=torch.float64).reshape(-1, 4, 4)
     _check_rigid(poses, where)
     length, width, height = entry.size_m
     try:
         times = torch.tensor(entry.track.timestamps_ns, dtype=torch.int64)
-        track = Track(times, poses, entry.track.hold_ns)
+        track = Track(times, poses, entry.track.hold_ns, entry.track.max_gap_ns)
+        waves = None
+        if entry.color_waves is not None:
+            assert part.waves is not None
+            times = torch.tensor(entry.color_waves.timestamps_ns, dtype=torch.int64)
+            phases = torch.tensor(entry.color_waves.phases, dtype=torch.float64)
+            waves = ColorWaves(part.waves, times, phases)
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from error
-    return Actor(entry.track_id, entry.label, gaussians, track, (length, width, height))
+    size_m = (length, width, height)
+    return Actor(entry.track_id, entry.label, part.gaussians, track, size_m, waves)
 
 
 def _frame_entry(frame: Frame) -> dict[str, Any]:
@@ -171,6 +206,7 @@ def _camera_entry(camera: Camera) -> dict[str, Any]:
         **{name: float(getattr(camera, name)) for name in ("fx", "fy", "cx", "cy")},
         "timestamp_ns": int(camera.timestamp_ns),
         "camera_from_world": _rigid_rows(camera.camera_from_world, f"camera {camera.name!r}"),
+        **({"is_orthographic": True} if camera.is_orthographic else {}),
     }
 
 
@@ -214,7 +250,8 @@ def _check_rigid(transforms: Tensor, where: str) -> None:
 
 def _json_facts(scene: Scene) -> dict[str, Any]:
     try:
-        return json.loads(json.dumps(dict(scene.made_by), allow_nan=False))
+        text = json.dumps(dict(scene.made_by), allow_nan=False, ensure_ascii=False)
+        return json.loads(text.encode())  # unpaired surrogates cannot be written
     except (TypeError, ValueError) as error:
         raise SceneError(
             f"scene {scene.name!r}: made_by must hold JSON's own types and finite numbers: {error}"

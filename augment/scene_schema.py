@@ -9,13 +9,14 @@ import json
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from augment.errors import SceneError
 from augment.ground_heights import GroundSource
 
 FORMAT = "climategs-scene"
-VERSION = 1
+VERSION = 2  # of what is written
+READABLE = (1, 2)
 MOST_BYTES = 256 << 20  # of a scene.json; a drive of an hour has about 30 MB
 _MOST_PROBLEMS_SHOWN = 5
 
@@ -31,9 +32,11 @@ def _plain_text(text: str) -> str:
     return text
 
 
+Precision = Literal["float32", "float16"]
 Text = Annotated[str, AfterValidator(_plain_text)]
 Int64 = Annotated[int, Field(ge=-(2**63), lt=2**63)]
 Count = Annotated[int, Field(ge=0, lt=2**31)]
+Phase = Annotated[float, Field(ge=-1e9, le=1e9)]  # of which sine and cosine are known
 Pixels = Annotated[int, Field(ge=1, le=100_000)]
 Row3 = Annotated[list[float], Field(min_length=3, max_length=3)]
 Row4 = Annotated[list[float], Field(min_length=4, max_length=4)]
@@ -56,6 +59,7 @@ class CameraEntry(_Closed):
     cy: float
     timestamp_ns: Int64
     camera_from_world: Matrix4x4
+    is_orthographic: bool = False
 
 
 class FrameEntry(_Closed):
@@ -72,16 +76,39 @@ class TrackEntry(_Closed):
     hold_ns: Int64
     timestamps_ns: list[Int64]
     world_from_actor: list[Matrix4x4]
+    max_gap_ns: Int64 | None = None
+
+
+class WavesEntry(_Closed):
+    """The times of an actor's colour waves; their coefficients are its array `waves`."""
+
+    timestamps_ns: list[Int64]
+    phases: list[Phase]
+
+    @model_validator(mode="after")
+    def _belong_together(self) -> WavesEntry:
+        if len(self.timestamps_ns) != len(self.phases):
+            raise ValueError("there must be as many phases as timestamps")
+        return self
 
 
 class ActorEntry(_Closed):
-    """An actor. gaussians: how many it has in gaussians.safetensors."""
+    """An actor. gaussians: how many rows its arrays have."""
 
     track_id: Text
     label: Text
     size_m: Row3
     gaussians: Count
     track: TrackEntry
+    color_waves: WavesEntry | None = None
+
+
+class ImageColorMapEntry(_Closed):
+    """A colour map of a single image, which is known by its camera and its time."""
+
+    camera: Text
+    timestamp_ns: Int64
+    rows: Matrix3x4
 
 
 class GroundEntry(_Closed):
@@ -96,12 +123,14 @@ class GroundEntry(_Closed):
 
 
 class SceneDocument(_Closed):
-    """The whole file. working_folder: what relative paths in recorded_source start from. The keys
-    with a default are not in older files.
+    """The whole file. working_folder: what relative paths in recorded_source start from. precision:
+    what quaternions, opacities and colours are stored as. The keys with a default are not in older
+    files.
     """
 
     format: Literal["climategs-scene"]
-    version: Literal[1]
+    version: Literal[1, 2]
+    precision: Precision = "float32"
     name: Text
     recorded_source: Text
     working_folder: Text
@@ -113,6 +142,7 @@ class SceneDocument(_Closed):
     sky: Literal["constant", "latlong", "cubemap"]
     background_gaussians: Count
     color_maps: dict[Text, Matrix3x4]
+    image_color_maps: list[ImageColorMapEntry] = []
     made_by: dict[str, Any]
     problems: list[Text]
     actors: list[ActorEntry]
@@ -129,22 +159,44 @@ def read_document(path: Path) -> SceneDocument:
         size = path.stat().st_size
         if size > MOST_BYTES:
             raise SceneError(f"{path}: {size} bytes; a scene.json has at most {MOST_BYTES}")
-        raw = json.loads(path.read_bytes().decode("utf-8"), parse_constant=_no_constant)
+        return parsed_document(path.read_bytes(), str(path))
     except OSError as error:
         raise SceneError(f"{path} cannot be read: {error.strerror}") from error
+
+
+def parsed_document(text: bytes | str, where: str) -> SceneDocument:
+    """The checked contents of a scene's JSON text.
+
+    Raises:
+        SceneError: no JSON, another format or version, or wrong contents.
+    """
+    try:
+        text = text.decode("utf-8") if isinstance(text, bytes) else text
+        raw = json.loads(text, parse_constant=_no_constant)
     except (ValueError, RecursionError) as error:  # also what is no UTF-8
-        raise SceneError(f"{path} is no JSON: {error or 'nested too deeply'}") from None
-    found = raw.get("format") if isinstance(raw, dict) else None
+        raise SceneError(f"{where} is no JSON: {error or 'nested too deeply'}") from None
+    if not isinstance(raw, dict):
+        raise SceneError(f"{where} describes no scene: expected an object; got {raw!r:.80}")
+    check_format(raw.get("format"), raw.get("version"), where)
+    return checked_document(raw, where)
+
+
+def check_format(found: object, version: object, where: str) -> None:
+    """That this is a scene, and of a version that is known.
+
+    Raises:
+        SceneError: it is not.
+    """
     if found != FORMAT:
         raise SceneError(
-            f'{path} describes no scene: its "format" must be {FORMAT!r}; got {found!r:.80}'
+            f'{where} describes no scene: its "format" must be {FORMAT!r}; got {found!r:.80}'
         )
-    if raw.get("version") != VERSION:
+    if version not in READABLE:
+        known = " and ".join(map(str, READABLE))
         raise SceneError(
-            f"{path}: this version reads scene folders of version {VERSION}; got "
-            f"{raw.get('version')!r:.80}. A newer one is read by a newer ClimateGS"
+            f"{where}: this ClimateGS reads scenes of versions {known}; got {version!r:.80}. "
+            f"A newer one is read by a newer ClimateGS"
         )
-    return checked_document(raw, str(path))
 
 
 def checked_document(raw: dict[str, Any], where: str) -> SceneDocument:

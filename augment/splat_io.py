@@ -6,20 +6,16 @@ and quaternions of any length, `Gaussians` holds metres, [0, 1] and unit quatern
 
 from __future__ import annotations
 
-import contextlib
 import logging
-import os
-import secrets
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 import torch
 from jaxtyping import Float
 
-from augment.batch.atomic import flush_folder, make_folder, output_error
+from augment.atomic_file import replaced_file
 from augment.errors import SceneError
 from augment.ply_io import ROWS_PER_CHUNK, count_surplus_bytes, read_ply_header
 from augment.ply_layout import (
@@ -157,7 +153,7 @@ def write_ply(
         lines.append(f"comment {key}: {value}")
     lines.append(f"element vertex {len(gaussians)}")
     lines += [f"property {_PLY_NAMES[code]} {name}" for name, code in columns]
-    with _atomic_file(Path(path)) as file:
+    with replaced_file(Path(path)) as file:
         file.write(("\n".join([*lines, "end_header"]) + "\n").encode())
         for start in range(0, len(gaussians), ROWS_PER_CHUNK):
             stop = min(start + ROWS_PER_CHUNK, len(gaussians))
@@ -183,7 +179,7 @@ def write_splat(path: str | Path, gaussians: Gaussians) -> None:
     records["rgba"] = (rgba * 255).round().detach().cpu().numpy()
     quats = (gaussians.quats * 128 + 128).round().clamp(0, 255)
     records["quat"] = quats.detach().cpu().numpy()
-    with _atomic_file(Path(path)) as file:
+    with replaced_file(Path(path)) as file:
         file.write(records.tobytes())
 
 
@@ -215,22 +211,3 @@ def _activate(columns: dict[str, np.ndarray], *, wide: bool) -> tuple[Gaussians,
         semantic=None if semantic is None else torch.from_numpy(semantic),
     )
     return gaussians, origin
-
-
-@contextlib.contextmanager
-def _atomic_file(path: Path) -> Iterator[BinaryIO]:
-    """A file that takes its name only once it is whole and on the disk; makes missing folders."""
-    partial = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.partial")
-    try:
-        make_folder(path.parent)
-        try:
-            with partial.open("wb") as file:
-                yield file
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(partial, path)
-            flush_folder(path.parent)
-        finally:
-            partial.unlink(missing_ok=True)
-    except OSError as error:
-        raise output_error(path, error) from error

@@ -1,4 +1,4 @@
-"""A small scene with everything a scene folder holds, and what it means that two are equal."""
+"""A small scene with everything a saved scene holds, and what it means that two are equal."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import torch
 from scenes import camera_ahead, random_gaussians, random_pose
 
 from augment.cameras import Frame
+from augment.color_waves import ColorWaves
 from augment.ground_heights import Ground
 from augment.scene import Actor, Gaussians, Scene, Track
 from augment.sky import CubemapSky
@@ -17,17 +18,22 @@ START_NS = 1_557_540_079_200_123_457  # too many digits for a float64
 
 
 def fitted_scene(**changes) -> Scene:
-    """Two actors of unlike degrees, one of them without classes; two frames of two cameras."""
+    """Two actors of unlike degrees, one of them without classes, one with colours that change; two
+    frames of two cameras.
+    """
     rng = np.random.default_rng(7)
     background = with_classes(random_gaussians(50, seed=1, sh_degree=1))
     poses = torch.stack([random_pose(i, rng.normal(size=3)) for i in range(3)])
     times = torch.tensor([START_NS, START_NS + 99_999_999, START_NS + 200_000_001])
     car = Track(times, poses, hold_ns=5)
-    person = Track(times[:1], poses[:1])
+    person = Track(times[:1], poses[:1], max_gap_ns=300_000_001)
+    phases = torch.tensor([0.1, 1 / 3, 2.0], dtype=torch.float64)
+    waves = ColorWaves(torch.from_numpy(rng.normal(0, 0.1, (7, 4, 3)).astype("f4")), times, phases)
     actors = (
-        Actor("car/1", "Car", random_gaussians(7, sh_degree=0), car, (4.0, 2.0, 1.5)),
+        Actor("car/1", "Car", random_gaussians(7, sh_degree=0), car, (4.0, 2.0, 1.5), waves),
         Actor("é", "Person", with_classes(random_gaussians(3)), person, (0.7, 0.6, 1.8)),
     )
+    color_map, image_map = torch.from_numpy(rng.normal(size=(2, 3, 4)).astype(np.float32))
     frames = tuple(frame(number, START_NS + number * 100_000_000) for number in (4, 5))
     scene = Scene(
         name="drive 2",
@@ -40,7 +46,8 @@ def fitted_scene(**changes) -> Scene:
         ground_z_m=-1.2345678901234567,
         has_metric_scale=False,
         problems=("left/000003.jpg is missing", "one more"),
-        color_maps={"ahead": torch.from_numpy(rng.normal(size=(3, 4)).astype(np.float32))},
+        color_maps={"ahead": color_map},
+        image_color_maps={("left", START_NS + 500_000_000 - 1): image_map, ("gone", 0): color_map},
         recorded_source="test:recording",
         made_by={"steps": 30, "loss": [0.1, None], "config": {"seed": 0, "name": "ß"}},
         ground=Ground(-1.2345678901234567, -1.1, "lidar labels", 1 / 70, 41_233, None),

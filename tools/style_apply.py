@@ -27,7 +27,7 @@ from augment.render.composite import composite_sky, quantise
 from augment.render.rasterize import rasterize
 from augment.render.sh import SH_C0
 from augment.scene import Gaussians, Scene
-from augment.scene_files import is_scene_folder, read_scene_folder, save_scene
+from augment.scene_files import is_scene_folder, read_saved_scene, save_scene
 from augment.semantics import SemanticClass
 from augment.style.apply import style_gaussians, styled_scene
 from augment.style.content import content_pictures, content_statistics, select_views
@@ -118,7 +118,7 @@ def _open(uri: str) -> Scene:
     scheme, path, _ = parse_uri(scene.source)
     if scheme != "scene" or scene.labels is not None or scene.recorded_source is None:
         return scene
-    folder = read_scene_folder(path)
+    folder = read_saved_scene(path)
     recorded, place, query = parse_uri(scene.recorded_source)
     if recorded in SCHEMES and place not in SCHEMES[recorded].builtin:
         place = os.path.normpath(folder.working_folder / place)

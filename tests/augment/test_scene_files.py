@@ -22,13 +22,27 @@ from safetensors.numpy import load_file, save_file
 from scenes import camera_ahead, random_gaussians
 
 from augment import atomic_folder
+from augment.color_waves import ColorWaves
 from augment.errors import OutputError, SceneError
 from augment.render.rasterize import rasterize
-from augment.scene import Gaussians
-from augment.scene_files import FILES, is_scene_folder, load_scene_parts, save_scene
+from augment.scene import Actor, Gaussians, Track
+from augment.scene_files import (
+    FILES,
+    is_scene_folder,
+    load_scene_parts,
+    save_scene,
+    save_scene_file,
+)
 from augment.sky import ConstantSky, LatLongSky
 
 DIFFERENT = ("source", "labels")  # a loaded scene is opened from its folder
+
+
+def waving(terms: int) -> Actor:
+    """An actor of one Gaussian, whose colours change in so many terms."""
+    waves = ColorWaves(torch.zeros(1, terms, 3), torch.tensor([0]), torch.zeros(1).double())
+    track = Track(torch.tensor([0]), torch.eye(4, dtype=torch.float64)[None])
+    return Actor("1", "Car", random_gaussians(1), track, (1.0, 1.0, 1.0), waves)
 
 
 @pytest.fixture
@@ -75,6 +89,38 @@ def test_what_else_a_scene_may_be(tmp_path):
     assert load_scene_parts(tmp_path / "fit").actors == ()
 
 
+def test_scenes_of_version_1_still_open(saved):
+    """A document as version 1 wrote it: nothing of what came later is in it."""
+    scene = fitted_scene(image_color_maps={})
+    car, person = scene.actors
+    person = dataclasses.replace(person, track=dataclasses.replace(person.track, max_gap_ns=None))
+    scene = dataclasses.replace(scene, actors=(dataclasses.replace(car, color_waves=None), person))
+    save_scene(scene, saved)
+    new = json.loads((saved / "scene.json").read_text())
+    keys = ["format", "version", "name", "recorded_source", "working_folder", "world_origin_m",
+            "ground_z_m", "has_metric_scale", "ground", "has_known_gravity", "sky", "color_maps",
+            "background_gaussians", "made_by", "problems", "actors", "frames"]  # fmt: skip
+    old = {key: new[key] for key in keys} | {"version": 1}
+    old["actors"] = [
+        {key: actor[key] for key in ("track_id", "label", "size_m", "gaussians")}
+        | {
+            "track": {
+                k: actor["track"][k] for k in ("hold_ns", "timestamps_ns", "world_from_actor")
+            }
+        }
+        for actor in new["actors"]
+    ]
+    (saved / "scene.json").write_text(json.dumps(old))
+    assert_same(load_scene_parts(saved), scene, but=DIFFERENT)
+
+
+def test_cameras_from_above_stay_so(tmp_path):
+    above = dataclasses.replace(camera_ahead(), is_orthographic=True)
+    frame = dataclasses.replace(fitted_scene().frames[0], cameras={"ahead": above}, image_paths={})
+    save_scene(fitted_scene(frames=(frame,)), tmp_path / "fit")
+    assert load_scene_parts(tmp_path / "fit").frames[0].cameras["ahead"].is_orthographic
+
+
 def test_folders_from_before_grounds_were_kept_still_open(saved):
     document = json.loads((saved / "scene.json").read_text())
     del document["ground"], document["has_known_gravity"]
@@ -118,11 +164,13 @@ def test_what_cannot_be_kept_is_refused(tmp_path):
     stretched = dataclasses.replace(scene.frames[0], world_from_ego=ego)
     for changes, message in (
         ({"sky": OwnSky(torch.zeros(3))}, "a sky of class OwnSky cannot be saved"),
-        ({"background": wide}, "float32 Gaussians; got torch.float64"),
+        ({"background": wide}, "saved scenes hold float32; got torch.float64"),
         ({"made_by": {"loss": float("nan")}}, "made_by must hold JSON's own types"),
         ({"made_by": {"config": object()}}, "made_by must hold JSON's own types"),
         ({"frames": (stretched,)}, "frame 4: a pose must be a rotation and a translation"),
+        ({"made_by": {"name": "\ud800"}}, "made_by must hold JSON's own types"),
         ({"name": "a\0b"}, "name: .*NUL"),
+        ({"actors": (waving(1001),)}, "waves of 1001 terms; saved scenes hold 1000"),
     ):
         with pytest.raises(SceneError, match=message):
             save_scene(dataclasses.replace(scene, **changes), tmp_path / "fit")
@@ -219,14 +267,13 @@ scene_files.save_scene(fitted_scene(name="killed"), {str(saved)!r})
 def test_a_full_disk_is_said(tmp_path, monkeypatch):
     from augment import scene_files
 
-    def full(tensors, path):
-        raise scene_files.SafetensorError(
-            f"Error while serializing: I/O error: No space left on device (os error 28) at {path}"
-        )
+    def full(*_):
+        raise OSError(28, os.strerror(28))
 
-    monkeypatch.setattr(scene_files, "save_file", full)
-    with pytest.raises(OutputError, match="the disk is full"):
-        save_scene(fitted_scene(), tmp_path / "fit")
+    monkeypatch.setattr(scene_files, "write_tensors", full)
+    for save, name in ((save_scene, "fit"), (save_scene_file, "fit.climategs")):
+        with pytest.raises(OutputError, match="the disk is full"):
+            save(fitted_scene(), tmp_path / name)
     assert not list(tmp_path.iterdir())
 
 
@@ -262,7 +309,10 @@ def change_document(folder: Path, change) -> None:
     ("path", "value", "message"),
     [
         (("format",), "other", r'"format" must be \'climategs-scene\'; got \'other\''),
-        (("version",), 2, "reads scene folders of version 1; got 2"),
+        (("version",), 3, "reads scenes of versions 1 and 2; got 3"),
+        (("version",), [], r"reads scenes of versions 1 and 2; got \[\]"),
+        (("precision",), "float16", r"background\.quats must be float16; got torch\.float32"),
+        (("precision",), "float64", "'float32' or 'float16'; got 'float64'"),
         (("colour_maps",), {}, "colour_maps: Extra inputs are not permitted"),
         (("background_gaussians",), 51, "means must have 51 rows.*do not belong together"),
         (("actors", 0, "gaussians"), "7", r"actors\.0\.gaussians: .*valid integer; got '7'"),
@@ -272,6 +322,23 @@ def change_document(folder: Path, change) -> None:
         (("actors", 0, "track", "timestamps_ns"), [2**63], "less than"),
         (("actors", 0, "track", "world_from_actor", 1, 0, 0), 9.0, "'car/1': a pose must be"),
         (("actors", 0, "track", "world_from_actor", 1, 0, 0), 1e300, "'car/1': a pose must be"),
+        (("actors", 0, "track", "max_gap_ns"), 0.5, "max_gap_ns: .*valid integer"),
+        (("actors", 0, "color_waves"), None, r"does not know: \['actors\.0\.waves'\]"),
+        (
+            ("actors", 1, "color_waves"),
+            {"timestamps_ns": [0], "phases": [0.0]},
+            "lacks actors.1",
+        ),
+        (("actors", 0, "color_waves", "timestamps_ns"), [3, 2, 1], "'car/1': timestamps of colour"),
+        (("actors", 0, "color_waves", "phases"), [0.0], "color_waves: .*as many phases as times"),
+        (("actors", 0, "color_waves", "phases", 0), 1e300, "less than or equal to"),
+        (("image_color_maps", 0, "rows"), [[1.0] * 4] * 2, "at least 3 items"),
+        (("image_color_maps", 0, "rows", 0, 0), 1e300, "must be finite"),
+        (
+            ("image_color_maps", 0),
+            {"camera": "gone", "timestamp_ns": 0, "rows": [[1.0] * 4] * 3},
+            "1 images' colour maps are given twice",
+        ),
         (("frames", 0, "world_from_ego", 0, 0), -1e308, "frame 4: a pose must be"),
         (("frames", 0, "cameras", "left", "fx"), -1.0, "camera 'left': fx must be finite and > 0"),
         (("frames", 0, "cameras", "left", "fx"), 1e999, "no number of JSON"),
@@ -364,6 +431,10 @@ def test_any_document_is_a_scene_or_a_scene_error(tmp_path_factory, data):
         (lambda t: t.update({"background.semantic": np.zeros(9, np.int16)}), r"be int16 \[50\]"),
         (lambda t: t.update({"background.opacities": np.array(1, "f4")}), "must have 50 rows"),
         (lambda t: t["actors.0.opacities"].fill(np.nan), "holds no usable Gaussians"),
+        (lambda t: t["actors.0.waves"].fill(np.nan), "holds no usable Gaussians"),
+        (lambda t: t.update({"actors.0.waves": t["actors.0.waves"][1:]}), "must have 7 rows"),
+        (lambda t: t.update({"actors.0.waves": np.zeros((7, 1001, 3), "f4")}), "most 1000 terms"),
+        (lambda t: t.update({"actors.1.waves": t["actors.0.waves"]}), "does not know"),
     ],
 )
 def test_wrong_arrays_are_refused(saved, change, message):
@@ -372,6 +443,23 @@ def test_wrong_arrays_are_refused(saved, change, message):
     save_file({k: np.ascontiguousarray(v) for k, v in tensors.items()}, saved / FILES[1])
     with pytest.raises(SceneError, match=message):
         load_scene_parts(saved)
+
+
+def test_colour_waves_follow_their_gaussians(saved):
+    tensors = load_file(saved / FILES[1])
+    whole = load_scene_parts(saved).actors[0]
+    tensors["actors.0.means"][1] = np.inf
+    tensors["actors.0.waves"][3, 2, 1] = np.nan
+    tensors["actors.0.quats"][5] = 0
+    save_file(tensors, saved / FILES[1])
+    scene = load_scene_parts(saved)
+    actor, kept = scene.actors[0], torch.tensor([0, 2, 4, 6])
+    assert [p.split(", ")[-1] for p in scene.problems[2:]] == [
+        "actors.0: left out 2 of 7 Gaussians with NaN or infinite values",
+        "actors.0: left out 1 of 7 Gaussians with a zero quaternion",
+    ]
+    assert torch.equal(actor.gaussians.means, whole.gaussians.means[kept])
+    assert torch.equal(actor.color_waves.coefficients, whole.color_waves.coefficients[kept])
 
 
 def test_undrawable_gaussians_are_left_out_and_counted(saved):
