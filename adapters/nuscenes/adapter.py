@@ -1,0 +1,176 @@
+"""A nuScenes scene: Gaussians from accumulated, image-coloured LiDAR.
+
+World: nuScenes' global one, less whole metres where the drive is further than a kilometre from its
+origin. Ego: nuScenes' (x forward, y left, z up, origin on the ground below the rear axle), as it
+stood at the frame's LiDAR time. Images are undistorted as published. Cameras stand where the ego
+pose of their own image puts them. Frame numbers count the LiDAR's files, or keyframes, from 0 in
+order of time; `frame_tokens` says which rows of sample_data they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from adapters.lidar.image_views import View
+from adapters.lidar.origin import drive_origin
+from adapters.lidar.scene import DrivenPath, build_lidar_scene
+from adapters.nuscenes.frames import FrameFiles, scene_frames
+from adapters.nuscenes.labels import NuScenesLabels
+from adapters.nuscenes.options import NuScenesOptions
+from adapters.nuscenes.sweeps import read_sweeps
+from adapters.nuscenes.tables import SceneTables, SensorFile, read_tables
+from adapters.nuscenes.tracks import read_tracks
+from adapters.plain_files import inside
+from adapters.recorded.images import ImageFault, read_scaled
+from adapters.uri import format_uri
+from augment.cameras import Camera, Frame
+from augment.errors import AdapterError
+from augment.geometry import invert_rigid
+from augment.scene import Scene
+
+_LIDAR_TOP_DEG = 10.67  # the sensor's uppermost channel
+# The back camera looks over the recording car's own edge, which on a published image begins at row
+# 854 of 900.
+_ROWS_ABOVE_CAR = {"CAM_BACK": 0.945}
+_CHECK_SCALE = 0.125
+_MOST_FAULTS = 3  # sentences about one camera's images; more become one
+
+
+def open_nuscenes(path: str, query: dict[str, str]) -> Scene:
+    """One scene of a nuScenes dataset; path: the folder that holds v1.0-mini or such.
+
+    query: version (a folder of tables), scene (name or token), both needed only where there are
+    several; sweeps (1, the default: frames are keyframes and the LiDAR's sweeps between them; 0:
+    keyframes only); and frames, voxel_m, max_gaussians, image_scale, sky_size, held_out, see
+    DriveOptions. Opening is deterministic: the same files and options give the same bits.
+
+    Raises:
+        AdapterError: a wrong option, tables that are missing, damaged or contradict each other, no
+            LiDAR, or a camera none of whose images can be used. Single images and sweeps that are
+            missing or damaged are Scene.problems.
+    """
+    options = NuScenesOptions.from_query(query)
+    tables = read_tables(Path(path), options.version, options.scene)
+    files, unused = scene_frames(tables, sweeps=options.sweeps)
+    where = f"nuscenes:{path}, scene {tables.name}"
+    if not files:
+        raise AdapterError(f"{where} has no keyframe of LIDAR_TOP; sweeps=1 takes its sweeps")
+    chosen = options.drive.select(range(len(files)), where=where)
+    used = [files[number] for number in chosen.numbers]
+    origin = drive_origin(np.array([file.sweep.world_from_ego[:3, 3] for file in files]))
+    sweeps, lidar_problems = read_sweeps(tables, used, origin, held_out=chosen.held_out)
+    if sum(len(sweep) for sweep in sweeps) == 0:
+        raise AdapterError(
+            f"{where}: no LiDAR returns in frames {used[0].index} to {used[-1].index} "
+            f"({used[0].sweep.filename} and on); a scene cannot be built without them, unpack "
+            f"samples/LIDAR_TOP and sweeps/LIDAR_TOP"
+        )
+    usable, image_problems = _usable_images(tables, used)
+    frames = tuple(_frame(file, origin, usable) for file in used)
+    positions = np.array([file.sweep.world_from_ego[:3, 3] - origin for file in used])
+    built = build_lidar_scene(
+        sweeps,
+        read_tracks(tables, used, origin),
+        _views([frame for frame in frames if frame.index not in chosen.held_out]),
+        DrivenPath(positions, np.array([file.sweep.timestamp_ns for file in used])),
+        options.drive.scene_options(lidar_top_deg=_LIDAR_TOP_DEG),
+    )
+    return Scene(
+        name=tables.name,
+        source=format_uri("nuscenes", path, query),
+        background=built.background,
+        actors=built.actors,
+        sky=built.sky,
+        frames=frames,
+        labels=NuScenesLabels(tables, files),
+        world_origin_m=origin,
+        ground_z_m=built.ground_z_m,
+        ground=built.ground,
+        problems=unused + chosen.problems + lidar_problems + image_problems + built.problems,
+    )
+
+
+def _usable_images(
+    tables: SceneTables, frames: Sequence[FrameFiles]
+) -> tuple[dict[str, Path], tuple[str, ...]]:
+    """The images that can be used, by token; what is wrong with others, one sentence each.
+
+    Raises:
+        AdapterError: no image of a camera that has some is usable.
+    """
+    paths: dict[str, Path] = {}
+    problems: list[str] = []
+    for channel in tables.images:
+        of_camera = [(f.index, f.images[channel]) for f in frames if channel in f.images]
+        faults, damaged = [], 0
+        for index, image in of_camera:
+            path = inside(tables.root, image.filename, f"sample_data {image.token!r}")
+            try:
+                camera = _camera(image, np.zeros(3))
+                read_scaled(path, camera, camera.scaled(_CHECK_SCALE))
+            except ImageFault as fault:
+                faults.append(f"camera {channel}, frame {index}: image {image.filename} {fault}")
+                damaged += path.exists()
+            else:
+                paths[image.token] = path
+        if damaged and len(faults) == len(of_camera):
+            raise AdapterError(
+                f"{tables.root / tables.version}, scene {tables.name}: none of the {len(faults)} "
+                f"images of {channel} can be used; {faults[0]}; unpack them again"
+            )
+        if len(faults) > _MOST_FAULTS:
+            faults = [f"{faults[0]}; so are {len(faults) - 1} more of {len(of_camera)}: left out"]
+        problems += faults
+    return paths, tuple(problems)
+
+
+def _frame(file: FrameFiles, origin: np.ndarray, usable: dict[str, Path]) -> Frame:
+    images = dict(sorted(file.images.items()))
+    world_from_ego = file.sweep.world_from_ego.copy()
+    world_from_ego[:3, 3] -= origin
+    return Frame(
+        index=file.index,
+        timestamp_ns=file.sweep.timestamp_ns,
+        world_from_ego=torch.from_numpy(world_from_ego),
+        cameras={name: _camera(image, origin) for name, image in images.items()},
+        image_paths={
+            name: str(usable[image.token])
+            for name, image in images.items()
+            if image.token in usable
+        },
+    )
+
+
+def _camera(image: SensorFile, origin: np.ndarray) -> Camera:
+    assert image.intrinsic is not None
+    fx, fy, cx, cy = image.intrinsic
+    world_from_camera = image.world_from_sensor
+    world_from_camera[:3, 3] -= origin
+    return Camera(
+        name=image.channel,
+        width=image.width,
+        height=image.height,
+        fx=fx,
+        fy=fy,
+        cx=cx,
+        cy=cy,
+        camera_from_world=invert_rigid(torch.from_numpy(world_from_camera)),
+        timestamp_ns=image.timestamp_ns,
+    )
+
+
+def _views(frames: Sequence[Frame]) -> tuple[View, ...]:
+    return tuple(
+        View(
+            frame.cameras[name],
+            Path(path),
+            frame.index,
+            used_rows=_ROWS_ABOVE_CAR.get(name, 1.0),
+        )
+        for frame in frames
+        for name, path in frame.image_paths.items()
+    )
