@@ -5,15 +5,21 @@ from __future__ import annotations
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 from adapters.base import open_scene
 from augment.batch.job import JobResult, RenderJob, run_job
+from augment.batch.layout import variant_name
+from augment.batch.mirror import Links
 from augment.errors import ClimateGSError
 from augment.ground import ground_of
 from augment.plan import make_plan
 from augment.scene import Scene
 from recipes.load import load_recipe
 from recipes.schema import Recipe
+from tools.mirror import mirror_outputs, recipes_for_source
+
+Layout = Literal["standard", "source"]
 
 
 def render_recipe(
@@ -30,8 +36,14 @@ def render_recipe(
     camera_path: Path | None = None,
     overwrite: bool = False,
     sheet: bool = True,
+    layout: Layout = "standard",
+    links: Links = "hard",
 ) -> int:
-    """Runs the job and prints what became of it. Returns the exit code: 1 where images failed."""
+    """Runs the job and prints what became of it. Returns the exit code: 1 where images failed.
+
+    layout: source also makes a copy of the scene's dataset with the images in place of the
+    recorded ones. links: of that copy, see `tools.mirror.mirror_outputs`.
+    """
     from tools.warm_up import warm_up
 
     recipes = resolve_variants(recipe, variants, scale)
@@ -41,6 +53,9 @@ def render_recipe(
     scene = open_scene(scene_uri)
     for problem in scene.problems:
         _say(f"note: {problem}")
+    if layout == "source":
+        _check_no_path(camera_path)
+        recipes = recipes_for_source(scene, out, recipes, overwrite=overwrite)
     if any(resolved.weather.flood is not None for resolved in recipes):
         scene = replace(scene, ground=ground_of(scene))  # looked for once, not by every worker
     for resolved in recipes:
@@ -58,6 +73,10 @@ def render_recipe(
     )
     result = run_job(job, scene_loader=lambda _uri: scene)
     _report(result)
+    if layout == "source":
+        names = [variant_name(resolved) for resolved in recipes]
+        for sentence in mirror_outputs(scene, out, variants=names, links=links):
+            print(sentence)
     if sheet and result.written + result.skipped:
         from tools.pictures import draw_sheet
 
@@ -126,6 +145,14 @@ def _frames_of(camera_path: Path | None, scene: Scene):
     from adapters.cameras.paths import frames_from_path_file
 
     return frames_from_path_file(camera_path, scene)
+
+
+def _check_no_path(camera_path: Path | None) -> None:
+    if camera_path is not None:
+        raise ClimateGSError(
+            f"--camera-path {camera_path} shows frames that the dataset does not have: "
+            f"--layout source is for the scene's own frames"
+        )
 
 
 def _report(result: JobResult) -> None:

@@ -1,0 +1,194 @@
+"""The files of a dataset, as a copy of it in another place has to have them.
+
+A dataset's own entries (`samples`, `camera` ...) may be links to other disks: what they lead to
+belongs to it. Links below them must stay within the dataset, and stay links in the copy; others
+would make the copy reach files that nobody meant.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import stat
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+from augment.errors import AdapterError
+
+
+@dataclass(frozen=True)
+class SourceTree:
+    """A dataset in a folder. root: absolute; its name is the copy's name too.
+
+    uri: what it was opened by. images: a regular expression that the paths of its camera images,
+    relative to root, match in full. entries: what in root belongs to it; None for all.
+    """
+
+    uri: str
+    root: Path
+    images: str
+    entries: tuple[str, ...] | None = None
+
+    @cached_property
+    def bases(self) -> tuple[tuple[str, str], ...]:
+        """Real paths of the folders and files that make up the dataset, and where each belongs
+        relative to root: root itself, then what its own entries lead to elsewhere.
+
+        Raises:
+            AdapterError: root is no folder, or one of its entries leads to nothing or to a folder
+                that holds the dataset itself.
+        """
+        real_root = os.path.realpath(self.root)
+        try:
+            names = sorted(os.listdir(real_root))
+        except OSError as error:
+            raise AdapterError(f"{self.root} cannot be listed: {error.strerror}") from error
+        if not self.root.name:
+            raise AdapterError(f"{self.root} has no name; a dataset must lie in a folder")
+        found = [(real_root, "")]
+        for name in names:
+            path = os.path.join(real_root, name)
+            if not self._has(name) or not os.path.islink(path):
+                continue
+            real = os.path.realpath(path)
+            if is_within(real, real_root):
+                continue
+            if not os.path.exists(real):
+                raise AdapterError(
+                    f"{path} is a link to {real}, which does not exist; put it there, or delete "
+                    f"the link"
+                )
+            if is_within(real_root, real):
+                raise AdapterError(
+                    f"{path} is a link to {real}, which holds the dataset itself; delete the link"
+                )
+            found.append((real, name))
+        return tuple(found)
+
+    def relative(self, path: str | Path) -> str | None:
+        """Where a file or folder belongs relative to root, links followed; None outside."""
+        real = os.path.realpath(path)
+        for base, name in self.bases:
+            if is_within(real, base):
+                inner = os.path.relpath(real, base)
+                parts = [part for part in (name, inner) if part not in ("", ".")]
+                within = "/".join(parts)
+                return within if not within or self._has(within.split("/")[0]) else None
+        return None
+
+    def is_image(self, relative: str) -> bool:
+        """Whether this is the path of a camera image."""
+        return re.fullmatch(self.images, relative) is not None
+
+    def _has(self, name: str) -> bool:
+        return self.entries is None or name in self.entries
+
+
+@dataclass(frozen=True)
+class SourceFile:
+    """relative: to the dataset's root. path: where its bytes are. facts: as os.lstat of that."""
+
+    relative: str
+    path: str
+    facts: os.stat_result
+
+
+@dataclass(frozen=True)
+class SourceFolder:
+    """What is directly in one folder. relative: to the root, "" for itself. links: relative path
+    and what the link says, which leads to another part of the dataset.
+    """
+
+    relative: str
+    files: tuple[SourceFile, ...]
+    folders: tuple[str, ...]
+    links: tuple[tuple[str, str], ...]
+
+
+@dataclass(frozen=True)
+class Survey:
+    """How much a dataset is. images: camera images among the files."""
+
+    files: int
+    size: int
+    images: int
+
+
+def survey(tree: SourceTree) -> Survey:
+    """Look at all that belongs to a dataset, reading no file.
+
+    Raises:
+        AdapterError: as for walk.
+    """
+    files = size = images = 0
+    for folder in walk(tree):
+        files += len(folder.files)
+        size += sum(file.facts.st_size for file in folder.files)
+        images += sum(1 for file in folder.files if tree.is_image(file.relative))
+    return Survey(files, size, images)
+
+
+def walk(tree: SourceTree) -> Iterator[SourceFolder]:
+    """The folders of a dataset, each before those in it, in order of name.
+
+    Raises:
+        AdapterError: a folder cannot be read, a link leads out of the dataset, or there is
+            something that is neither file nor folder nor link.
+    """
+    elsewhere = {name: real for real, name in tree.bases if name}
+    waiting = [("", os.path.realpath(tree.root))]
+    while waiting:
+        relative, path = waiting.pop()
+        folder, inner = _read_folder(tree, relative, path, {} if relative else elsewhere)
+        yield folder
+        waiting += reversed(inner)
+
+
+def is_within(path: str, folder: str) -> bool:
+    """Whether a real path is a folder's or of something in it."""
+    return path == folder or path.startswith(folder.rstrip("/") + "/")
+
+
+def _read_folder(
+    tree: SourceTree, relative: str, path: str, elsewhere: dict[str, str]
+) -> tuple[SourceFolder, list[tuple[str, str]]]:
+    """The folder, and the relative and real paths of those in it. elsewhere: by name."""
+    files, inner, links = [], [], []
+    try:
+        with os.scandir(path) as entries:
+            found = sorted(entries, key=lambda entry: entry.name)
+        for entry in found:
+            if not relative and tree.entries is not None and entry.name not in tree.entries:
+                continue
+            within = f"{relative}/{entry.name}" if relative else entry.name
+            real = elsewhere.get(entry.name, entry.path)
+            facts = os.lstat(real) if entry.name in elsewhere else entry.stat(follow_symlinks=False)
+            if stat.S_ISREG(facts.st_mode):
+                files.append(SourceFile(within, real, facts))
+            elif stat.S_ISDIR(facts.st_mode):
+                inner.append((within, real))
+            elif stat.S_ISLNK(facts.st_mode):
+                links.append((within, _link_text(tree, within, real)))
+            else:
+                raise AdapterError(
+                    f"{entry.path} is neither a file nor a folder nor a link; a dataset's copy "
+                    f"cannot have it, move it elsewhere"
+                )
+    except OSError as error:
+        raise AdapterError(f"{error.filename or path} cannot be read: {error.strerror}") from error
+    folders = tuple(within for within, _ in inner)
+    return SourceFolder(relative, tuple(files), folders, tuple(links)), inner
+
+
+def _link_text(tree: SourceTree, within: str, path: str) -> str:
+    """What the copy's link has to say to lead to the same part of the dataset's copy."""
+    target = tree.relative(path)
+    if target is None:
+        raise AdapterError(
+            f"{path} is a link to {os.path.realpath(path)}, outside {tree.root}. A copy of the "
+            f"dataset can have links within it, and {tree.root}'s own entries may be links to "
+            f"other places: put the file itself there, or the link higher up"
+        )
+    return os.path.relpath(target or ".", os.path.dirname(within) or ".")

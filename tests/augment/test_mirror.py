@@ -1,0 +1,519 @@
+"""A copy of a dataset with weathered images: what it is made of, and what stays untouched."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+from pathlib import Path
+
+import batch_scenes
+import cv2
+import mirror_trees as trees
+import numpy as np
+import pytest
+
+from augment.batch import mirror as mirror_module
+from augment.batch.atomic import TEMPORARY_SUFFIX
+from augment.batch.encode import decode_image
+from augment.batch.mirror_images import dataset_format, weathered_images
+from augment.errors import AdapterError, OutputError
+
+
+@pytest.fixture
+def source(tmp_path) -> Path:
+    return trees.write_dataset(tmp_path / "drive")
+
+
+@pytest.fixture
+def out(source, tmp_path) -> Path:
+    trees.render(source, tmp_path / "out")
+    return tmp_path / "out"
+
+
+def image_of(out: Path, camera: str, frame: int, variant: str = "fog-000") -> Path:
+    folder = {"front": "front", "rear": "rear_left-" + "*"}[camera]
+    (found,) = (out / "street" / variant / "images").glob(f"{folder}/{frame:06d}.*")
+    return found
+
+
+def places(suffix: str = "png") -> set[str]:
+    return {f"camera/{name}/{f:02d}.{suffix}" for name in ("front", "rear") for f in range(4)}
+
+
+def test_the_copy_is_the_source_in_all_but_the_images(source, out):
+    before = trees.snapshot(source)
+    done = trees.mirror(source, out)
+    copy = out / "street/fog-000/source/drive"
+    assert done.folder == copy
+    assert trees.listing(copy) == trees.listing(source)
+    recorded, shown = trees.contents(source), trees.contents(copy)
+    assert {name for name in recorded if recorded[name] != shown[name]} == places()
+    for camera in ("front", "rear"):
+        for frame in range(4):
+            rendered = image_of(out, camera, frame)
+            assert (copy / f"camera/{camera}/{frame:02d}.png").samefile(rendered)
+    for name in recorded.keys() - places():
+        assert (copy / name).samefile(source / name)
+    assert trees.snapshot(source) == before
+    assert done.linked == len(recorded) - 8 and done.copied == done.new == 0
+    assert done.linked_size == sum(len(recorded[name]) for name in recorded.keys() - places())
+    assert (done.images, set(done.replaced)) == (8, places())
+    assert done.changed == len(recorded)
+
+
+def test_the_record_says_what_the_copy_is(source, out):
+    trees.mirror(source, out)
+    record = json.loads((out / "street/fog-000/source/climategs-mirror.json").read_text())
+    assert record["dataset"] == f"test:{source}" and record["folder"] == str(source)
+    assert record["variant"] == "fog-000" and record["links"] == "hard"
+    assert record["files"] == {
+        "linked": 5, "copied": 0, "symbolic_links": 0, "camera_images": 8, "replaced_images": 8,
+    }  # fmt: skip
+    row = batch_scenes.tree_digest(out)["street/fog-000/images/front/000002.png"]
+    assert record["replaced"]["camera/front/02.png"] == {
+        "image": "street/fog-000/images/front/000002.png",
+        "sha256": row,
+    }
+
+
+def test_building_again_changes_nothing(source, out):
+    trees.mirror(source, out)
+    before = trees.snapshot(out / "street/fog-000/source")
+    done = trees.mirror(source, out)
+    assert done.changed == 0 and len(done.replaced) == 8
+    assert trees.snapshot(out / "street/fog-000/source") == before
+
+
+def test_more_images_come_in(source, tmp_path):
+    out = tmp_path / "out"
+    trees.render(source, out, frames=[1], cameras=["front"])
+    done = trees.mirror(source, out)
+    copy = done.folder
+    assert set(done.replaced) == {"camera/front/01.png"} and done.images == 8
+    assert (copy / "camera/rear/01.png").samefile(source / "camera/rear/01.png")
+    before = trees.snapshot(source)
+    trees.render(source, out, frames=[1, 3])
+    done = trees.mirror(source, out)
+    assert len(done.replaced) == 4 and done.changed == 3
+    assert (copy / "camera/rear/03.png").samefile(image_of(out, "rear", 3))
+    assert (copy / "camera/rear/02.png").samefile(source / "camera/rear/02.png")
+    assert trees.snapshot(source) == before  # links were replaced, not what they led to
+
+
+def test_images_rendered_anew_replace_the_old(source, out):
+    done = trees.mirror(source, out)
+    image = image_of(out, "front", 0)
+    old = image.read_bytes()
+    image.unlink()
+    image.write_bytes(old + b"x")
+    assert (done.folder / "camera/front/00.png").read_bytes() == old
+    assert trees.mirror(source, out).changed == 1
+    assert (done.folder / "camera/front/00.png").samefile(image)
+
+
+def test_an_image_that_failed_stays_clear(source, tmp_path):
+    def broken(scene, camera, recipe, *, backend):
+        if camera.name == "front":
+            raise ValueError("no")
+        return batch_scenes.fake_render(scene, camera, recipe, backend=backend)
+
+    out = tmp_path / "out"
+    trees.render(source, out, frames=[0], renderer=broken)
+    done = trees.mirror(source, out)
+    assert set(done.replaced) == {"camera/rear/00.png"}
+    assert (done.folder / "camera/front/00.png").samefile(source / "camera/front/00.png")
+
+
+def test_variants_stand_side_by_side(source, out):
+    trees.render(source, out, name="clear")
+    one, two = trees.mirror(source, out), trees.mirror(source, out, "clear-000")
+    assert one.folder != two.folder
+    assert trees.listing(one.folder) == trees.listing(two.folder) == trees.listing(source)
+    a, b = trees.contents(one.folder), trees.contents(two.folder)
+    assert {name for name in a if a[name] != b[name]} == places()
+
+
+def test_going_on_after_a_kill_at_any_point(tmp_path, monkeypatch):
+    """Stopped before or after each change of the disk: no half file, and the rest is done later."""
+    source, out = trees.write_dataset(tmp_path / "drive", frames=1), tmp_path / "out"
+    trees.render(source, out, frames=[0])
+    (source / "camera" / "also").symlink_to("front")
+    copy = out / "street/fog-000/source"
+    options = {"links": "copy"}
+    uninterrupted = trees.mirror(source, out, **options)
+    whole, before = trees.contents(copy), trees.snapshot(source)
+    assert uninterrupted.copied > 0
+    calls = 0
+    while True:
+        calls += 1
+        remove_tree(copy)
+        stopped = False
+        with monkeypatch.context() as patch:
+            stop_at(patch, calls)
+            try:
+                trees.mirror(source, out, **options)
+            except KeyboardInterrupt:
+                stopped = True
+        if not stopped:
+            break
+        half = trees.contents(copy) if copy.is_dir() else {}
+        is_final = {n: n in whole for n in half if not n.endswith(TEMPORARY_SUFFIX)}
+        assert all(is_final.values()), is_final
+        assert all(half[name] == whole[name] for name in is_final), f"stopped at {calls}"
+        trees.mirror(source, out, **options)
+        assert trees.contents(copy) == whole, f"stopped at {calls}"
+        assert trees.snapshot(source) == before
+    assert calls > 20
+
+
+def stop_at(patch, wanted: int) -> None:
+    """Raise around the given change of the disk: odd before it, even after it."""
+    met = 0
+
+    def watched(call):
+        def wrapper(*arguments, **options):
+            nonlocal met
+            met += 1
+            mine = met
+            if 2 * mine - 1 == wanted:
+                raise KeyboardInterrupt
+            result = call(*arguments, **options)
+            if 2 * mine == wanted:
+                raise KeyboardInterrupt
+            return result
+
+        return wrapper
+
+    for name in ("link", "replace", "mkdir", "symlink", "sendfile", "utime"):
+        patch.setattr(os, name, watched(getattr(os, name)))
+
+
+def remove_tree(folder: Path) -> None:
+    for path in sorted(folder.rglob("*"), reverse=True):
+        path.rmdir() if path.is_dir() and not path.is_symlink() else path.unlink()
+
+
+def test_a_stopped_update_does_not_say_that_it_is_complete(source, tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    trees.render(source, out, frames=[0])
+    trees.mirror(source, out)
+    trees.render(source, out)
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            mirror_module, "link_file", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt)
+        )
+        with pytest.raises(KeyboardInterrupt):
+            trees.mirror(source, out)
+    record = out / "street/fog-000/source/climategs-mirror.json"
+    assert not record.exists()
+    trees.mirror(source, out)
+    assert len(json.loads(record.read_text())["replaced"]) == 8
+
+
+@pytest.mark.parametrize("call", ["sendfile", "fsync", "replace"])
+def test_a_full_disk_leaves_no_half_file(source, out, monkeypatch, call):
+    whole, before = trees.contents(source), trees.snapshot(source)
+
+    def full(*_, **__):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, call, full)
+        with pytest.raises(OutputError, match=r"cannot write .*free some space"):
+            trees.mirror(source, out, links="copy")
+    copy = out / "street/fog-000/source"
+    assert not any(p.name.endswith(TEMPORARY_SUFFIX) for p in copy.rglob("*"))
+    for name, data in trees.contents(copy / "drive").items():
+        assert data == whole[name]
+    assert not (copy / "climategs-mirror.json").exists()
+    assert trees.snapshot(source) == before
+
+
+@pytest.mark.parametrize("number", [errno.EXDEV, errno.EPERM, errno.EMLINK, errno.EOPNOTSUPP])
+def test_files_are_copied_where_they_cannot_be_linked(source, out, monkeypatch, number):
+    def refuse(*_, **__):
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(os, "link", refuse)
+    done = trees.mirror(source, out)
+    assert done.linked == 0 and done.copied == 5 and done.new == 8
+    assert trees.listing(done.folder) == trees.listing(source)
+    for name in trees.contents(source):
+        assert not (done.folder / name).samefile(source / name)
+    kept, again = source / "lidar/raw/00.bin", done.folder / "lidar/raw/00.bin"
+    assert again.read_bytes() == kept.read_bytes()
+    assert again.stat().st_mtime_ns == kept.stat().st_mtime_ns
+    assert trees.mirror(source, out).changed == 0
+    kept.write_bytes(b"of another length")
+    assert trees.mirror(source, out).changed == 1
+    assert again.read_bytes() == b"of another length"
+
+
+def test_a_copy_that_shares_nothing(source, out):
+    trees.mirror(source, out)
+    done = trees.mirror(source, out, links="copy")  # gives up the links that were there
+    assert done.linked == 0 and done.copied == 5
+    before = trees.snapshot(source)
+    for path in done.folder.rglob("*"):
+        if path.is_file():
+            path.write_bytes(b"mine")
+    assert trees.snapshot(source) == before
+    assert image_of(out, "front", 0).read_bytes() != b"mine"
+
+
+def test_a_changed_source_is_noticed(source, out):
+    done = trees.mirror(source, out)
+    table, new = source / "README.md", source / "camera/front/poses2.json"
+    table.unlink()
+    table.write_text("Another dataset.\n")
+    new.write_text("[]")
+    (source / "lidar/nothing.txt").unlink()
+    again = trees.mirror(source, out)
+    assert again.changed == 2
+    assert (done.folder / "README.md").samefile(table)
+    assert (done.folder / "camera/front/poses2.json").samefile(new)
+    assert again.others == ["lidar/nothing.txt"]  # nobody here may decide to delete it
+
+
+def test_others_files_stay_and_leftovers_go(source, out):
+    done = trees.mirror(source, out)
+    (done.folder / "infos.pkl").write_bytes(b"a loader's cache")
+    (done.folder / "camera" / f".1-2{TEMPORARY_SUFFIX}").write_bytes(b"half")
+    assert trees.mirror(source, out).others == ["infos.pkl"]
+    assert set(trees.listing(done.folder)) - set(trees.listing(source)) == {"infos.pkl"}
+
+
+def test_links_within_the_dataset_stay_links(source, out):
+    (source / "camera/also").symlink_to("front")
+    (source / "lidar/same.bin").symlink_to(source / "lidar/raw/00.bin")  # absolute
+    (source / "lidar/gone").symlink_to("not/there")
+    done = trees.mirror(source, out)
+    copy = done.folder
+    assert done.links == 3 and trees.listing(copy) == trees.listing(source)
+    assert os.readlink(copy / "camera/also") == "front"
+    assert os.readlink(copy / "lidar/same.bin") == "raw/00.bin"
+    assert os.readlink(copy / "lidar/gone") == "not/there"
+    # Through the link the weathered images are seen as well.
+    assert (copy / "camera/also/00.png").samefile(image_of(out, "front", 0))
+    assert trees.mirror(source, out).changed == 0
+
+
+def test_images_that_are_named_through_a_link(source, tmp_path):
+    """As a dataset whose camera folder is a link: the image stands where it really is."""
+    (source / "camera/front").rename(source / "images")
+    (source / "camera/front").symlink_to("../images")
+    out = tmp_path / "out"
+    trees.render(source, out)
+    before = trees.snapshot(source)
+    done = trees.mirror(source, out)
+    assert (done.folder / "images/02.png").samefile(image_of(out, "front", 2))
+    assert trees.listing(done.folder) == trees.listing(source)
+    assert trees.snapshot(source) == before
+
+
+def test_own_entries_may_lie_elsewhere(source, tmp_path):
+    """What people do whose disks are full; a link below them may lead to another of them."""
+    (source / "camera").rename(tmp_path / "disk")
+    (source / "camera").symlink_to(tmp_path / "disk")
+    (source / "README.md").rename(tmp_path / "text")
+    (source / "README.md").symlink_to(tmp_path / "text")
+    (tmp_path / "disk/rear/sweep").symlink_to(source / "lidar/raw")
+    out = tmp_path / "out"
+    trees.render(source, out)
+    before = trees.snapshot(source), trees.snapshot(tmp_path / "disk")
+    copy = trees.mirror(source, out).folder
+    assert not (copy / "camera").is_symlink() and not (copy / "README.md").is_symlink()
+    assert (copy / "README.md").samefile(tmp_path / "text")
+    assert (copy / "camera/front/00.png").samefile(image_of(out, "front", 0))
+    assert (copy / "camera/rear/poses.json").samefile(tmp_path / "disk/rear/poses.json")
+    assert os.readlink(copy / "camera/rear/sweep") == "../../lidar/raw"
+    assert (trees.snapshot(source), trees.snapshot(tmp_path / "disk")) == before
+
+
+def test_a_source_that_is_a_link_itself(source, tmp_path):
+    (tmp_path / "named").symlink_to(source)
+    out = tmp_path / "out"
+    trees.render(tmp_path / "named", out)
+    done = trees.mirror(tmp_path / "named", out)
+    assert done.folder.name == "named" and len(done.replaced) == 8
+    assert not done.folder.is_symlink()
+
+
+@pytest.mark.parametrize(
+    ("link", "text", "message"),
+    [
+        ("camera/secret", "../../secret", r"camera/secret is a link to .*secret, outside"),
+        ("camera/front/09.png", "/etc/hostname", r"09\.png is a link to /etc/hostname, outside"),
+        ("sweeps", "../gone", r"sweeps is a link to .*gone, which does not exist"),
+        ("loop", "..", r"loop is a link to .*, which holds the dataset itself"),
+    ],
+)
+def test_links_that_lead_out_are_refused(source, out, tmp_path, link, text, message):
+    (tmp_path / "secret").write_text("secret")
+    (source / link).symlink_to(text)
+    with pytest.raises(AdapterError, match=message):
+        trees.mirror(source, out)
+    assert not (out / "street/fog-000/source").exists()
+
+
+def test_what_is_no_file_is_refused(source, out):
+    os.mkfifo(source / "lidar/pipe")
+    with pytest.raises(AdapterError, match="pipe is neither a file nor a folder nor a link"):
+        trees.mirror(source, out)
+
+
+@pytest.mark.parametrize("place", ["", "drive", "drive/camera"])
+def test_nothing_is_written_through_a_link_in_the_output(source, out, place):
+    """A copy that somebody began with `ln -s` would lead into the source."""
+    before = trees.snapshot(source)
+    folder = out / "street/fog-000/source" / place
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    folder.symlink_to(source / place.removeprefix("drive").lstrip("/"))
+    with pytest.raises(OutputError, match="is a link; the copy of the dataset needs a folder"):
+        trees.mirror(source, out)
+    assert trees.snapshot(source) == before
+
+
+@pytest.mark.parametrize("links", ["hard", "copy"])
+def test_a_link_in_a_files_place_is_replaced_itself(source, out, links):
+    before = trees.snapshot(source)
+    folder = out / "street/fog-000/source/drive/camera/front"
+    folder.mkdir(parents=True)
+    (folder / "00.png").symlink_to(source / "camera/front/00.png")
+    (folder / "poses.json").symlink_to(source / "camera/front/poses.json")
+    trees.mirror(source, out, links=links)
+    assert not (folder / "00.png").is_symlink() and not (folder / "poses.json").is_symlink()
+    assert trees.snapshot(source) == before
+
+
+def test_a_folder_in_a_files_place_is_said(source, out):
+    (out / "street/fog-000/source/drive/README.md/mine").mkdir(parents=True)
+    with pytest.raises(OutputError, match=r"cannot write .*README\.md"):
+        trees.mirror(source, out)
+    assert (out / "street/fog-000/source/drive/README.md/mine").is_dir()
+
+
+def test_a_source_that_cannot_be_written(source, out):
+    folders = [source, *(path for path in source.rglob("*") if path.is_dir())]
+    for path in [*folders, *(p for p in source.rglob("*") if p.is_file())]:
+        path.chmod(0o555 if path.is_dir() else 0o444)
+    before = trees.snapshot(source)
+    try:
+        done = trees.mirror(source, out)
+        assert trees.snapshot(source) == before
+        # The copy is the user's: it can be deleted and built again.
+        assert all(path.stat().st_mode & 0o200 for path in done.folder.rglob("*") if path.is_dir())
+    finally:
+        for path in folders:
+            path.chmod(0o755)
+
+
+def test_only_what_belongs_to_the_dataset(source, out):
+    tree = trees.tree_of(source, entries=("camera", "README.md"))
+    done = trees.mirror(source, out, tree=tree)
+    assert sorted(path.name for path in done.folder.iterdir()) == ["README.md", "camera"]
+
+
+@pytest.mark.parametrize("place", [".", "out", "lidar/out"])
+def test_an_output_folder_in_the_dataset_is_refused(source, place):
+    with pytest.raises(OutputError, match="lies in the dataset's own folder"):
+        mirror_module.check_apart(trees.tree_of(source), source / place)
+    tree = trees.tree_of(source, entries=("camera",))
+    if place == "out":  # beside what belongs to it
+        mirror_module.check_apart(tree, source / place)
+
+
+@pytest.mark.parametrize(
+    ("scale", "method"), [(0.5, cv2.INTER_CUBIC), (2.0, cv2.INTER_AREA)], ids=["up", "down"]
+)
+@pytest.mark.parametrize("suffix", ["png", "jpg"])
+def test_images_of_another_size_are_resized(tmp_path, scale, method, suffix):
+    source, out = trees.write_dataset(tmp_path / "drive", suffix=suffix), tmp_path / "out"
+    trees.render(source, out, scale=scale, image=suffix)
+    done = trees.mirror(source, out)
+    width, height = batch_scenes.SIZE
+    rendered = (round(width * scale), round(height * scale))
+    assert done.resized == [(rendered, (width, height))] * 8
+    file = done.folder / f"camera/front/01.{suffix}"
+    shown = decode_image(file.read_bytes()).astype(int)
+    assert shown.shape == (height, width, 3)
+    image = decode_image(image_of(out, "front", 1).read_bytes())
+    expected = cv2.resize(image, (width, height), interpolation=method).astype(int)
+    # Noise of half the image's frequency, at quality 92: JPEG alone is off by some levels.
+    assert np.abs(shown - expected).mean() <= (0 if suffix == "png" else 8)
+    assert done.new == 8 and done.new_size == sum(
+        p.stat().st_size for p in (done.folder / "camera").glob(f"*/*.{suffix}")
+    )
+    before = trees.snapshot(done.folder)
+    assert trees.mirror(source, out).changed == 0
+    assert trees.snapshot(done.folder) == before
+
+
+def test_images_of_another_format_are_encoded_anew(tmp_path):
+    source, out = trees.write_dataset(tmp_path / "drive", suffix="jpg"), tmp_path / "out"
+    trees.render(source, out, image="png")
+    done = trees.mirror(source, out)
+    assert done.resized == [] and done.new == 8
+    file = done.folder / "camera/front/01.jpg"
+    assert file.read_bytes()[:2] == b"\xff\xd8"
+    image = decode_image(image_of(out, "front", 1).read_bytes()).astype(int)
+    assert np.abs(decode_image(file.read_bytes()) - image).mean() < 8
+
+
+def test_grey_images_stay_grey(source, tmp_path):
+    path, out = source / "camera/front/00.png", tmp_path / "out"
+    cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
+    trees.render(source, out, frames=[0])
+    done = trees.mirror(source, out)
+    shown = cv2.imread(str(done.folder / "camera/front/00.png"), cv2.IMREAD_UNCHANGED)
+    assert shown.ndim == 2
+    rgb = decode_image(image_of(out, "front", 0).read_bytes())
+    assert np.abs(shown - rgb @ [0.299, 0.587, 0.114]).max() < 1
+    assert trees.mirror(source, out).changed == 0
+
+
+def test_recorded_images_that_are_none_stay(source, out):
+    (source / "camera/front/00.png").write_bytes(b"GIF89a")
+    (source / "camera/front/01.png").unlink()
+    rows = trees.read_manifest(out).to_pylist()
+    frames = trees.scene_of(source).frames
+    images, notes = weathered_images(out, rows, frames, trees.tree_of(source))
+    assert notes == [
+        "1 rendered images, such as frame 1, camera front, have no recorded image in the dataset: "
+        "they are not in its copy"
+    ]
+    extent = trees.survey(trees.tree_of(source))
+    assert extent.images == 7
+    done = mirror_module.mirror_variant(
+        trees.tree_of(source), out / "street/fog-000", images, {}, extent=extent, progress=False
+    )
+    assert done.unusable == ["camera/front/00.png"] and len(done.replaced) == 6
+    assert (done.folder / "camera/front/00.png").read_bytes() == b"GIF89a"
+
+
+def test_a_rendered_image_that_is_gone_or_damaged_is_said(tmp_path):
+    source, out = trees.write_dataset(tmp_path / "drive", suffix="jpg"), tmp_path / "out"
+    trees.render(source, out, frames=[0], image="png")
+    image = image_of(out, "front", 0)
+    image.write_bytes(image.read_bytes()[:30])
+    with pytest.raises(OutputError, match=r"000000\.png is damaged .*render again"):
+        trees.mirror(source, out)
+    image.unlink()
+    with pytest.raises(OutputError, match=r"000000\.png, which the manifest names, cannot be read"):
+        trees.mirror(source, out)
+
+
+@pytest.mark.parametrize(
+    ("names", "format"),
+    [(["a.jpg", "b.JPEG"], "jpg"), (["a.png"], "png"), (["a.png", "b.jpg"], "png")],
+)
+def test_the_format_to_render_in(names, format):
+    frame = batch_scenes.make_frame(0)
+    paths = {str(number): name for number, name in enumerate(names)}
+    assert dataset_format([trees.dataclasses.replace(frame, image_paths=paths)]) == format
+
+
+def test_a_scene_without_recorded_images_is_refused():
+    with pytest.raises(AdapterError, match="knows no recorded image"):
+        dataset_format([batch_scenes.make_frame(0)])

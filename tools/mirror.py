@@ -1,0 +1,213 @@
+"""`--layout source` and `climategs mirror`: a variant as a copy of the dataset it was made from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from adapters.source_trees import source_tree
+from augment.batch.layout import MANIFEST, variant_folder, variant_name
+from augment.batch.lock import OutputLock
+from augment.batch.manifest import read_manifest, rows_of
+from augment.batch.mirror import Links, Mirrored, check_apart, mirror_variant
+from augment.batch.mirror_images import dataset_format, weathered_images
+from augment.batch.mirror_tree import SourceTree, Survey, survey
+from augment.batch.trajectory import RECORDED
+from augment.errors import OutputError
+from augment.scene import Scene
+from recipes.load import load_recipe
+from recipes.schema import Recipe
+
+
+def recipes_for_source(
+    scene: Scene, out: Path, recipes: Sequence[Recipe], *, overwrite: bool = False
+) -> list[Recipe]:
+    """The recipes with images in the dataset's format, after a look at whether the dataset can be
+    copied and images that are there go on or are overwritten.
+
+    Raises:
+        AdapterError: the scene is of no dataset, or one that cannot be copied.
+        OutputError: the output folder lies in it, or holds these images in another format.
+    """
+    tree = source_tree(scene)
+    survey(tree)
+    written_as = dataset_format(scene.frames)
+    for recipe in recipes:
+        check_apart(tree, out / variant_folder(scene.name, variant_name(recipe)))
+        if not overwrite:
+            _check_format(scene, out, recipe, written_as)
+    return [_with_format(recipe, written_as) for recipe in recipes]
+
+
+def mirror_outputs(
+    scene: Scene,
+    out: Path,
+    *,
+    variants: Sequence[str] | None = None,
+    links: Links = "hard",
+    progress: bool = True,
+) -> list[str]:
+    """Build or bring up to date the dataset's copy beside each variant's images.
+
+    scene: the one they were rendered from. variants: names, or None for all of the scene's that the
+    manifest has. Returns what to tell: for each variant where its copy is and what it is made of.
+
+    Raises:
+        AdapterError: the scene is of no dataset, or one that cannot be copied.
+        OutputError: no such images, a folder that is in use or cannot be written.
+    """
+    out = out.absolute()
+    tree = source_tree(scene)
+    extent = survey(tree)
+    said = []
+    with OutputLock(out):
+        found = _rows(scene, out, variants)
+        for name, rows in found.items():
+            said += _mirror_rows(scene, out, tree, extent, name, rows, links, progress)
+    return said
+
+
+def mirror_folder(out: Path, scene_uri: str | None = None, *, links: Links = "hard") -> int:
+    """`climategs mirror`: opens the scene, builds the copies, prints. Returns the exit code."""
+    from adapters.base import open_scene
+
+    if scene_uri is None:
+        rows = read_manifest(out).select(["source"]).to_pylist()
+        sources: list[str] = sorted({row["source"] for row in rows})
+        if len(sources) != 1:
+            raise OutputError(
+                f"{out / MANIFEST} has images of {len(sources)} scenes: {', '.join(sources)}; name "
+                f"one of them with --scene"
+            )
+        scene_uri = sources[0]
+    for sentence in mirror_outputs(open_scene(scene_uri), out, links=links):
+        print(sentence)
+    return 0
+
+
+def _mirror_rows(
+    scene: Scene,
+    out: Path,
+    tree: SourceTree,
+    extent: Survey,
+    name: str,
+    rows: list[dict[str, Any]],
+    links: Links,
+    progress: bool,
+) -> list[str]:
+    folder = out / variant_folder(scene.name, name)
+    images, notes = weathered_images(out, rows, scene.frames, tree)
+    facts = {
+        "scene": scene.name,
+        "variant": name,
+        **{key: rows[0][key] for key in ("source", "recipe_hash", "version", "backend")},
+    }
+    done = mirror_variant(
+        tree,
+        folder,
+        images,
+        facts,
+        extent=extent,
+        links=links,
+        jpeg_quality=load_recipe(folder / "recipe.yaml").resolve(0).output.jpeg_quality,
+        progress=progress,
+    )
+    return [*_sentences(done, tree, links), *notes]
+
+
+def _rows(
+    scene: Scene, out: Path, variants: Sequence[str] | None
+) -> dict[str, list[dict[str, Any]]]:
+    """The manifest's rows of the scene's variants, by name."""
+    table = read_manifest(out)
+    if variants is None:
+        pairs = zip(table["scene"].to_pylist(), table["variant"].to_pylist(), strict=True)
+        variants = sorted({variant for name, variant in pairs if name == scene.name})
+    found = {name: rows_of(table, {(scene.name, name)}) for name in variants}
+    absent = sorted(name for name, rows in found.items() if not rows)
+    if absent or not found:
+        raise OutputError(
+            f"{out / MANIFEST} has no images of scene {scene.name!r}"
+            + (f" and {', '.join(absent)}" if absent else "")
+            + "; render them first, or name another scene"
+        )
+    for name, rows in found.items():
+        _check_rows(scene, out, name, rows[0])
+    return found
+
+
+def _check_rows(scene: Scene, out: Path, name: str, row: dict[str, Any]) -> None:
+    where = out / variant_folder(scene.name, name)
+    if row["trajectory"] != RECORDED:
+        raise OutputError(
+            f"{where} shows a camera path; a dataset's copy takes images of its own frames"
+        )
+    if row["source"] != scene.source:
+        raise OutputError(
+            f"{where} was rendered from {row['source']}, not from {scene.source}; name that scene"
+        )
+
+
+def _check_format(scene: Scene, out: Path, recipe: Recipe, written_as: str) -> None:
+    """Images of the same recipe in another format are not rendered twice beside each other."""
+    if not (out / MANIFEST).is_file() or recipe.output.image == written_as:
+        return
+    rows = rows_of(read_manifest(out), {(scene.name, variant_name(recipe))})
+    if rows and rows[0]["recipe_hash"] == recipe.hash:
+        folder = out / variant_folder(scene.name, variant_name(recipe))
+        raise OutputError(
+            f"{folder} holds these images as {recipe.output.image}, and the dataset has "
+            f"{written_as}: `climategs mirror {out} --scene URI` makes the dataset's copy from the "
+            f"images there; or choose another output folder, or overwrite them (--overwrite)"
+        )
+
+
+def _with_format(recipe: Recipe, written_as: str) -> Recipe:
+    output = recipe.output.model_copy(update={"image": written_as})
+    return recipe.model_copy(update={"output": output})
+
+
+def _sentences(done: Mirrored, tree: SourceTree, links: Links) -> list[str]:
+    replaced = len(done.replaced)
+    said = [
+        f"dataset: {done.folder} ({done.changed} of {done.linked + done.copied + replaced} files "
+        f"put in place now, the rest were there)",
+        f"  {replaced} weathered images ({_megabytes(done.new_size)} of {done.new} of them beside "
+        f"the rendered files), {done.linked} files shared with {tree.root} "
+        f"({_megabytes(done.linked_size)}, no disk used), {done.copied} copied "
+        f"({_megabytes(done.copied_size)})",
+    ]
+    if done.images > replaced:
+        said.append(
+            f"  {done.images - replaced} of {done.images} camera images are the source's own, "
+            f"clear ones"
+        )
+    if done.linked:
+        said.append(
+            f"  to change files there in place would change {tree.root} too; --links copy shares "
+            f"nothing"
+        )
+    if done.copied and links == "hard":
+        said.append(
+            "  files were copied where the system cannot link them (another disk, or another "
+            "user's files)"
+        )
+    if done.resized:
+        (rendered, recorded) = done.resized[0]
+        said.append(
+            f"  {len(done.resized)} images were rendered at another size than recorded, such as "
+            f"{rendered[0]}x{rendered[1]} for {recorded[0]}x{recorded[1]} pixels: they are resized"
+        )
+    for names, what in (
+        (done.unusable, "recorded images are neither PNG nor JPEG and stay as they are"),
+        (done.missing, "recorded images are no longer in the source: nothing stands for them"),
+        (done.others, "files in the copy are not the source's: they are left"),
+    ):
+        if names:
+            said.append(f"  {len(names)} {what}; the first is {names[0]}")
+    return said
+
+
+def _megabytes(size: int) -> str:
+    return f"{size / 1e6:.1f} MB"
