@@ -109,7 +109,7 @@ def read_ego_path(root: Path) -> EgoPath:
     found = {int(m[1]): p for p in folder.iterdir() if (m := _FRAME_POSE.fullmatch(p.name))}
     if not found:
         raise AdapterError(f"{folder} holds no pose NNNNNN.txt; copy the folder from the dataset")
-    times = _read_times(root / TIMES)
+    times = read_times(root / TIMES)
     timed = times["FRAME"]
     untimed = sorted(set(found) - set(timed))
     if untimed:
@@ -143,8 +143,12 @@ def _said(folder: Path, numbers: range, known: np.ndarray) -> list[str]:
     ]
 
 
-def _read_times(path: Path) -> dict[str, dict[int, float]]:
-    """Seconds by FRAME or camera name and frame number."""
+def read_times(path: Path) -> dict[str, dict[int, float]]:
+    """Seconds by FRAME or camera name, then frame number.
+
+    Raises:
+        AdapterError: missing, without FRAME, or something else in it.
+    """
     content = read_json(path)
     times: dict[str, dict[int, float]] = {}
     for name, entries in content.items():
