@@ -170,11 +170,13 @@ def _add(kept: dict[str, Row], row: Row) -> None:
 
 def _rows(path: Path, file: Any) -> Iterator[Row]:
     decoder = json.JSONDecoder()
-    text = file.read(_CHUNK)
-    start = len(text) - len(text.lstrip())
-    if text[start : start + 1] != "[":
-        raise AdapterError(f"{path} must hold a list of rows; it starts with {text[:20]!r}")
-    position, number, ended = start + 1, 0, False
+    first = file.read(1)
+    while first.isspace():
+        first = file.read(1)
+    if first != "[":
+        start = first + file.read(20)
+        raise AdapterError(f"{path} must hold a list of rows; it starts with {start!r}")
+    text, position, number, ended = "", 0, 0, False
     while True:
         between = _BETWEEN.match(text, position)
         assert between is not None

@@ -5,7 +5,7 @@
     lidarseg/v1.0-*/<token>_lidarseg.bin     class of each return of keyframes, where published
 
 Each table is read once, row by row, and only what belongs to the scene is kept. Of mini that takes
-a second; of trainval, whose tables have 2 GB, the better part of a minute. Rows are taken in order
+a second; of trainval, whose tables have 2 GB, about half a minute. Rows are taken in order
 of time; prev and next links are not needed. Coordinates are nuScenes' global ones in metres, times
 are nanoseconds.
 """
