@@ -1,0 +1,368 @@
+"""What of drivestudio's files is refused, and what is gone on without and said."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections import OrderedDict
+from pathlib import Path
+
+import drivestudio_files as files
+import numpy as np
+import pytest
+import torch
+
+from adapters.base import open_scene
+from adapters.drivestudio import drivestudio_labels, open_drivestudio
+from adapters.drivestudio.conventions import convention_of
+from adapters.signatures import recognised
+from augment.errors import AdapterError
+from augment.sky import ConstantSky
+
+
+@pytest.fixture
+def numbers(tmp_path):
+    return files.write_run(tmp_path)
+
+
+def opened(numbers, **query):
+    return open_drivestudio(str(numbers.folder), query)
+
+
+def change_checkpoint(numbers, change) -> None:
+    path = numbers.folder / "checkpoint_final.pth"
+    content = torch.load(path, weights_only=True)
+    change(content)
+    torch.save(content, path)
+
+
+def refused(numbers, message: str, **query) -> str:
+    with pytest.raises(AdapterError, match=message) as caught:
+        opened(numbers, **query)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("data.dataset", "mars", "data.dataset is 'mars'.*waymo, nuscenes, pandaset, argoverse"),
+        ("data.dataset", None, "lacks data.dataset"),
+        ("data.dataset", 3, "data.dataset must be a text; got 3"),
+        ("data.start_timestep", "${start}", r"data.start_timestep is '\$\{start\}', which refers"),
+        ("data.data_root", "${root}/x", r"data.data_root is '\$\{root\}/x', which refers"),
+        ("data.pixel_source.cameras", ["${cam}"], r"data.pixel_source.cameras is '\$\{cam\}'"),
+        ("data.start_timestep", 1.5, "data.start_timestep must be a whole number; got 1.5"),
+        ("data.start_timestep", 6, "frames data.start_timestep 6 to data.end_timestep 5 .* none"),
+        ("data.pixel_source.cameras", [0, 5], r"numbers of cameras, 0 to 4, .*; got \[0, 5\]"),
+        ("data.pixel_source.cameras", [0, 0, 1], "each once"),
+        ("data.pixel_source.cameras", [], "must list numbers"),
+        ("data.pixel_source.cameras", [True, 2, 3], "must list numbers"),
+        ("data.pixel_source.downscale_when_loading", [2, 2], "factor > 0 for each of the 3"),
+        ("data.pixel_source.downscale_when_loading", [2, 0, 2], "factor > 0"),
+        ("data.pixel_source.downscale_when_loading", [2000, 2, 2], "leaves no pixel of 1920x1280"),
+        ("data.pixel_source.test_image_stride", -1, "must be >= 0; got -1"),
+        ("data.data_root", "/nowhere", r"/nowhere/007 of its config.yaml is not here.*data=DIR"),
+        ("data.scene_idx", None, "does not say where the data is.*data=DIR"),
+    ],
+)
+def test_a_config_that_cannot_be_used_is_refused(numbers, key, value, message):
+    files.write_config(numbers.folder, numbers.data.parent, "waymo", {key: value})
+    refused(numbers, message)
+
+
+def test_a_config_that_is_none_is_refused(numbers):
+    path = numbers.folder / "config.yaml"
+    path.write_text("a: [")
+    refused(numbers, r"config.yaml is no readable YAML")
+    path.write_text("- 1")
+    refused(numbers, "must hold a mapping; got list")
+    path.write_text("!!python/object/apply:os.system ['true']")
+    refused(numbers, "no readable YAML")
+    path.unlink()
+    refused(numbers, "config.yaml does not exist; a drivestudio run is")
+
+
+def test_options_that_cannot_be_used_are_refused(numbers):
+    refused(
+        numbers, "unknown option 'nodes'; known are data: .*; checkpoint: .*; frames:", nodes="1"
+    )
+    refused(numbers, "frames must be first:stop", frames="3")
+    refused(numbers, "frames must be first:stop", frames="4:2")
+    refused(numbers, "frames=7:6 selects none of the run's frames 1 to 5", frames="7:")
+    refused(numbers, "no such folder; give the processed scene's", data="/nowhere")
+    refused(numbers, "data must be the processed scene's folder", data="")
+    refused(numbers, "does not exist; the run has checkpoint_final.pth", checkpoint="b.pth")
+    refused(numbers, "without '..'", checkpoint="../b.pth")
+
+
+def test_runs_are_recognised_and_data_found(numbers, tmp_path, monkeypatch):
+    assert recognised(numbers.folder) == "drivestudio"
+    assert open_scene(str(numbers.folder)).name == "run"
+    # A relative root is one from above the run, or from where one is.
+    files.write_config(numbers.folder, Path("data"), "waymo", {})
+    assert opened(numbers).frames[0].image_paths["front_camera"].startswith(str(tmp_path))
+    elsewhere = tmp_path / "elsewhere"
+    (tmp_path / "data").rename(elsewhere)
+    refused(numbers, "data/007 of its config.yaml is not here")
+    found = opened(numbers, data=str(elsewhere / "007"))
+    assert found.frames[0].image_paths["front_camera"].startswith(str(elsewhere))
+    monkeypatch.chdir(elsewhere.rename(tmp_path / "cwd").parent)
+    (tmp_path / "cwd").rename(tmp_path / "data")
+    assert len(opened(numbers).frames) == files.COUNT
+
+
+def test_the_newest_checkpoint_is_taken_where_none_is_final(numbers):
+    final = numbers.folder / "checkpoint_final.pth"
+    content = torch.load(final, weights_only=True)
+    final.unlink()
+    refused(numbers, "holds no checkpoint_final.pth and no checkpoint_NNNNN.pth")
+    for name, count in (("09000", 3), ("15000", 11), ("100000", 2)):
+        content["models"]["SMPLNodes"]["_means"] = torch.zeros(count, 3)
+        torch.save(content, numbers.folder / f"checkpoint_{name}.pth")
+    assert any("2 Gaussians of SMPL" in p for p in opened(numbers).problems)
+    chosen = opened(numbers, checkpoint="checkpoint_15000.pth")
+    assert any("11 Gaussians of SMPL" in p for p in chosen.problems)
+    file = str(numbers.folder / "checkpoint_09000.pth")
+    assert any("3 Gaussians of SMPL" in p for p in open_drivestudio(file, {}).problems)
+    with pytest.raises(AdapterError, match="is a checkpoint already"):
+        open_drivestudio(file, {"checkpoint": "checkpoint_15000.pth"})
+
+
+class _Malicious:
+    def __init__(self, path: str) -> None:
+        self.path = path
+
+    def __reduce__(self):
+        return os.mkdir, (self.path,)
+
+
+def test_a_malicious_checkpoint_does_not_run(numbers, tmp_path):
+    proof = tmp_path / "proof"
+    torch.save({"models": _Malicious(str(proof))}, numbers.folder / "checkpoint_final.pth")
+    refused(numbers, "nothing in it was run")
+    assert not proof.exists()
+
+
+def put(model: str, name: str, value):
+    def change(content):
+        content["models"][model][name] = value
+
+    return change
+
+
+def drop(*keys: str):
+    def change(content):
+        for key in keys[:-1]:
+            content = content[key]
+        del content[keys[-1]]
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (drop("models"), "holds no dictionary 'models'; it holds step"),
+        (drop("step"), "step must be a number of training steps; got None"),
+        (drop("models", "Background"), "holds no dictionary 'Background'; it holds RigidNodes"),
+        (drop("models", "Background", "_quats"), "Background lacks the tensor '_quats'"),
+        (put("Background", "_scales", torch.zeros(80, 2)), r"_scales must be .*\[80, 3\]; got"),
+        (put("Background", "_means", torch.zeros(80, 3).double()), "_means must be float32"),
+        (put("Background", "_features_rest", torch.zeros(80, 24, 3)), "0, 3, 8 or 15 rows.*got 24"),
+        (put("Background", "_features_rest", torch.zeros(80, 4, 3)), "0, 3, 8 or 15 rows.*got 4"),
+        (put("Background", "_taus", torch.zeros(80, 1)), "holds _taus besides plain Gaussians"),
+        (put("RigidNodes", "points_ids", torch.full((40, 1), 2)), "points_ids must be 0 to 1"),
+        (put("RigidNodes", "points_ids", torch.zeros(40, dtype=torch.long)), "points_ids must be"),
+        (put("RigidNodes", "instances_fv", torch.ones(9, 2).bool()), "instances_fv has 9 frames;"),
+        (put("RigidNodes", "instances_fv", torch.ones(5, 2)), "instances_fv must be bool"),
+        (put("RigidNodes", "instances_quats", torch.zeros(5, 2, 4)), "NaN, infinite or zero"),
+        (put("RigidNodes", "instances_trans", torch.zeros(5, 3, 3)), r"instances_trans must be"),
+        (drop("models", "RigidNodes", "instances_size"), "lacks the tensor 'instances_size'"),
+        (put("Sky", "base", torch.zeros(6, 8, 4, 3)), r"base must be \[6, R, R, 3\]"),
+        (put("Sky", "base", torch.full((6, 2, 2, 3), torch.nan)), "base holds NaN"),
+        (put("Affine", "embedding.weight", torch.zeros(14, 4)), r"embedding.weight must be .*15"),
+        (put("Affine", "decoder.0.weight", torch.zeros(16, 5)), "must take the 4 numbers"),
+        (put("Affine", "decoder.2.bias", torch.zeros(9)), r"decoder.2.bias must be .*\[12\]"),
+        (put("CamPose", "embeds.weight", torch.zeros(15, 6)), r"embeds.weight must be .*\[15, 9\]"),
+        (put("CamPose", "embeds.weight", -torch.eye(15, 9).roll(3, 1)), "that are no rotation"),
+        (put("CamPose", "embeds.weight", torch.full((15, 9), torch.inf)), "NaN or infinite"),
+    ],
+)
+def test_a_checkpoint_of_another_layout_is_refused(numbers, change, message):
+    change_checkpoint(numbers, change)
+    said = refused(numbers, message)
+    assert "checkpoint_final.pth" in said
+
+
+def test_data_that_is_missing_or_wrong_is_refused(numbers):
+    bin_file = numbers.data / "lidar" / "002.bin"
+    bin_file.write_bytes(bin_file.read_bytes()[:-4])
+    with pytest.raises(AdapterError, match=r"002\.bin must hold rows of 14 float32"):
+        opened(numbers).lidar(2)
+    pose = numbers.data / "ego_pose" / "002.txt"
+    text = pose.read_text()
+    pose.write_text("1 2 3")
+    refused(numbers, r"002\.txt must hold 4 x 4 numbers")
+    pose.write_text(text)
+    intrinsics = numbers.data / "intrinsics" / "2.txt"
+    intrinsics.write_text("0 1 2 3")
+    refused(numbers, r"2\.txt must hold fx fy cx cy")
+    intrinsics.unlink()
+    refused(numbers, r"2\.txt does not exist")
+
+
+def test_data_of_another_scene_is_refused(numbers):
+    (numbers.data / "ego_pose" / "005.txt").unlink()
+    refused(numbers, "embedding.weight must be")
+    change_checkpoint(numbers, drop("models", "Affine"))
+    change_checkpoint(numbers, drop("models", "CamPose"))
+    refused(numbers, "instances_fv has 5 frames; .* have 4 .1 to 4.. Is it the scene")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda v: {"a": v["0"]}, "must have a number as its key"),
+        (lambda v: {"0": {"id": 1}}, "must have a number as its key, and id"),
+        (lambda v: {"0": v["0"], "1": v["0"]}, "ids of objects repeat"),
+        (lambda v: {"0": notes(v["0"], frame_idx=[0])}, "must be of equal length; got 1, 6 and 6"),
+        (lambda v: {"0": notes(v["0"], frame_idx=[0] * 6)}, "frame numbers, each once"),
+        (lambda v: {"0": notes(v["0"], frame_idx=["x"] * 6)}, "frame_idx must hold T numbers"),
+        (lambda v: {"0": notes(v["0"], box_size=[[1, 2]] * 6)}, "box_size must hold T x 3 numbers"),
+        (lambda v: {"0": notes(v["0"], box_size=[[1, 2, 0]] * 6)}, "box_size > 0"),
+        (
+            lambda v: {
+                "0": notes(v["0"], obj_to_world=(2 * np.eye(4)[None].repeat(6, 0)).tolist())
+            },
+            "must be rotations and translations",
+        ),
+    ],
+)
+def test_objects_that_are_none_are_refused(numbers, change, message):
+    path = numbers.data / "instances" / "instances_info.json"
+    path.write_text(json.dumps(change(json.loads(path.read_text()))))
+    assert "instances_info.json" in refused(numbers, message)
+
+
+def notes(entry: dict, **values) -> dict:
+    return {**entry, "frame_annotations": {**entry["frame_annotations"], **values}}
+
+
+def test_objects_that_cannot_be_told_keep_their_numbers(numbers):
+    path = numbers.data / "instances" / "instances_info.json"
+    info = json.loads(path.read_text())
+    twin = {**info["2"], "id": "car-c"}
+    path.write_text(json.dumps({**info, "3": twin}))
+    scene = opened(numbers)
+    assert [a.track_id for a in scene.actors] == ["rigid-0", "car-b"]
+    assert scene.actors[0].label == "vehicle"
+    assert any("could not be told" in p and p.endswith("rigid-0") for p in scene.problems)
+    path.unlink()
+    scene = opened(numbers)
+    assert [a.track_id for a in scene.actors] == ["rigid-0", "rigid-1"]
+    assert any("holds no instances/instances_info.json" in p for p in scene.problems)
+    assert len(scene.boxes(1)) == 0
+
+
+def test_objects_elsewhere_or_of_another_size_are_not_taken_for_the_model_s(numbers):
+    path = numbers.data / "instances" / "instances_info.json"
+    info = json.loads(path.read_text())
+    moved = np.array(info["2"]["frame_annotations"]["obj_to_world"])
+    moved[:, 0, 3] += 5
+    info["2"] = notes(info["2"], obj_to_world=moved.tolist())
+    info["1"] = notes(info["1"], box_size=[[4.5, 1.9, 1.7]] * 4)
+    path.write_text(json.dumps(info))
+    assert [a.track_id for a in opened(numbers).actors] == ["rigid-0", "rigid-1"]
+
+
+def test_what_is_gone_on_without_is_said(numbers):
+    (numbers.data / "images" / "002_0.jpg").unlink()
+    first = numbers.data / "images" / "000_3.jpg"
+    first.write_bytes((numbers.data / "images" / "000_0.jpg").read_bytes())
+
+    def change(content):
+        models = content["models"]
+        del models["Sky"]
+        width = torch.zeros(16, 6)
+        models["Affine"]["decoder.0.weight"] = width
+        models["Extra"] = OrderedDict(weight=torch.zeros(2))
+        models["RigidNodes"]["instances_fv"][:, 1] = False
+        models["Background"]["_means"][:3] = torch.nan
+        rotated = torch.tensor([1.0, 0, 0, 1])
+        models["RigidNodes"]["instances_quats"][0, 0] = rotated
+
+    change_checkpoint(numbers, change)
+    changes = {"data.pixel_source.undistort": False, "trainer.render.antialiased": True}
+    files.write_config(numbers.folder, numbers.data.parent, "waymo", changes)
+    scene = opened(numbers)
+    assert isinstance(scene.sky, ConstantSky) and scene.color_maps == scene.image_color_maps == {}
+    said = "\n".join(scene.problems)
+    for part in (
+        "1 of 15 images are missing, the first 002_0.jpg",
+        "000_3.jpg is of 1920x1280 pixels; drivestudio takes the intrinsics of left_camera to be",
+        "holds no Sky; the sky is black",
+        "differ over the image (pixel_affine); they are left out",
+        "the model Extra is left out",
+        "no actors: rigid-1",
+        "left out 3 of 80 Gaussians with NaN",
+        "as if it had none (undistort is off)",
+        "trainer.render.antialiased",
+        "middle of the tracks of car-a",
+    ):
+        assert part in said
+    assert "front_camera" not in scene.frame(2).image_paths
+    assert len(scene.background) == 77
+
+
+def test_a_sky_of_another_kind_is_black_and_said(numbers):
+    change_checkpoint(numbers, lambda c: c["models"].update(Sky={"grid": torch.zeros(2)}))
+    scene = opened(numbers)
+    assert isinstance(scene.sky, ConstantSky)
+    assert any("not known here (grid); the sky is black" in p for p in scene.problems)
+
+
+def test_a_run_without_objects_or_corrections_is_a_scene(numbers):
+    for name in ("RigidNodes", "Affine", "CamPose", "SMPLNodes", "DeformableNodes"):
+        change_checkpoint(numbers, drop("models", name))
+    scene = opened(numbers)
+    assert scene.actors == () and scene.color_maps == {}
+    camera = scene.frame(1).cameras["front_camera"]
+    expected = files.ego_from_opencv(0)
+    assert np.allclose(camera.world_from_camera.numpy(), expected, atol=1e-9)
+    assert len(scene.boxes(1)) == 3
+
+
+def test_perturbed_poses_are_applied_before_the_learnt_ones(numbers):
+    def change(content):
+        shift = torch.zeros(15, 9)
+        shift[:, 0] = 0.5
+        quarter = torch.zeros(15, 9)
+        quarter[:, 3:] = torch.tensor([-1.0, -1, 0, 1, -1, 0])  # rows (0 -1 0) and (1 0 0)
+        content["models"]["CamPosePerturb"] = {"embeds.weight": quarter}
+        content["models"]["CamPose"] = {"embeds.weight": shift}
+
+    change_checkpoint(numbers, change)
+    camera = opened(numbers).frame(1).cameras["front_camera"]
+    turned = files.pose(np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), [0, 0, 0])
+    expected = files.ego_from_opencv(0) @ turned @ files.pose(np.eye(3), [0.5, 0, 0])
+    assert np.allclose(camera.world_from_camera.numpy(), expected, atol=1e-7)
+
+
+def test_labels_need_no_readable_checkpoint(numbers):
+    (numbers.folder / "checkpoint_final.pth").write_bytes(b"")
+    labels = drivestudio_labels(str(numbers.folder), {"frames": "2:3"})
+    assert labels.boxes(1).track_ids == ("walker", "car-b", "car-a")
+
+
+@pytest.mark.parametrize("name", ["waymo", "nuscenes", "pandaset", "argoverse", "kitti", "nuplan"])
+def test_axes_of_datasets_are_rotations(name):
+    convention = convention_of(name, "here")
+    for axes in (
+        convention.camera_from_opencv,
+        convention.scene_from_model,
+        convention.pose_from_ego,
+        convention.object_from_actor,
+    ):
+        assert np.array_equal(axes @ axes.T, np.eye(3)) and np.linalg.det(axes) > 0
+    assert {"x", "y", "z"} <= set(convention.lidar_columns)
+    assert len({camera.name for camera in convention.cameras}) == len(convention.cameras)
