@@ -8,7 +8,7 @@ import sys
 
 import tyro
 
-from tools import commands, style_commands
+from tools import commands, export_commands, style_commands
 
 COMMANDS = {
     "render": commands.render,
@@ -20,6 +20,8 @@ COMMANDS = {
     "bench": commands.bench,
     "demo": commands.demo,
     "style": commands.style,
+    "export": export_commands.export,
+    "mirror": export_commands.mirror,
 }
 # Commands of commands, which take over where the first word names one.
 GROUPS = {

@@ -29,6 +29,8 @@ def render(
     camera_path: Path | None = None,
     overwrite: bool = False,
     sheet: bool = True,
+    layout: Literal["standard", "source"] = "standard",
+    links: Literal["hard", "copy"] = "hard",
 ) -> int:
     """Render a scene under a recipe into images, depth, labels and a manifest.
 
@@ -36,8 +38,8 @@ def render(
 
     Args:
         recipe: A recipe file (.yaml), or the name of a preset; `climategs recipes` lists them.
-        scene: procedural:street?seed=3, pandaset:PATH/002, gaussians:PATH/point_cloud.ply, or a
-            bare path, which is recognised by what it holds.
+        scene: procedural:street?seed=3, pandaset:PATH/002, gaussians:PATH/point_cloud.ply, and
+            others (docs/scenes.md), or a bare path, which is recognised by what it holds.
         out: The output folder. Further recipes and scenes may go into the same one.
         frames: Frame numbers: all, 4, 0,5,9, or 0:20:2 (start:stop:step, stop excluded).
         cameras: Camera names separated by commas, or all.
@@ -48,6 +50,10 @@ def render(
         camera_path: A JSON file of camera poses to render instead of the scene's own.
         overwrite: Replace what this scene and recipe wrote before.
         sheet: Also write a contact sheet of the result.
+        layout: source: also lay the images into a copy of the scene's dataset, in the place, format
+            and size of the recorded ones, for the dataset's own loader.
+        links: Of that copy: hard: unchanged files share the dataset's disk space. copy: nothing is
+            shared.
     """
     from tools.render import render_recipe
 
@@ -64,6 +70,8 @@ def render(
         camera_path=camera_path,
         overwrite=overwrite,
         sheet=sheet,
+        layout=layout,
+        links=links,
     )
 
 
@@ -221,7 +229,7 @@ def sheet(
 
 
 def bench(
-    what: Positional[Literal["raster", "smog", "flood", "snow", "style", "fit"]] = "raster",
+    what: Positional[Literal["raster", "smog", "flood", "snow", "style", "fit", "open"]] = "raster",
     repeats: int = 7,
     quick: bool = False,
     scene: str | None = None,
@@ -238,7 +246,8 @@ def bench(
     much of the open ground it covers and how high, what placing and drawing it costs, and whether
     cameras agree on it. style: what a style costs, how exact its maps are, whether views of a
     styled scene agree, and how the methods do on photos. fit: time of each stage of a
-    reconstruction's step, and memory.
+    reconstruction's step, and memory. open: time and memory of opening a trained scene of a million
+    Gaussians, and the same scene saved.
 
     Args:
         what: Which benchmark.
@@ -295,6 +304,11 @@ def bench(
 
         result = bench_fit(scene, quick=quick)
         text = fit_text(result)
+    elif what == "open":
+        from tools.bench_open import bench_open, open_text
+
+        result = bench_open(quick=quick, repeats=repeats)
+        text = open_text(result)
     else:
         from tools.bench import bench_raster, bench_text
 
