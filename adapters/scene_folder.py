@@ -80,6 +80,21 @@ def open_scene_folder(path: str, query: dict[str, str]) -> Scene:
     return dataclasses.replace(scene, labels=labels, recorded_source=recorded.uri)
 
 
+def storable(scene: Scene) -> Scene:
+    """An opened scene with what belongs into another saved scene: where the recording of a saved
+    scene is not found today, that is no fact about the scene, and a relative path to it stays one
+    to the same place.
+    """
+    scheme, path, _ = parse_uri(scene.source)
+    if scheme != "scene" or scene.labels is not None or scene.recorded_source is None:
+        return scene
+    saved = read_saved_scene(path)
+    recorded = _recording(scene.recorded_source, saved.working_folder)
+    if recorded is not None:
+        scene = dataclasses.replace(scene, recorded_source=recorded.uri)
+    return dataclasses.replace(scene, problems=saved.scene.problems)
+
+
 def recorded_labels(recording: Recording) -> LabelSource | None:
     """The labels of a recording without its Gaussians, which take long to build; None where a scene
     of this URI has none.

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass, field
 
 import numpy as np
 import torch
 
+from augment.bake import moved_gaussians
 from augment.errors import AdapterError
-from augment.geometry import multiply_quats, quat_from_rotmat
-from augment.render.sh import rotate_sh
 from augment.scene import Gaussians
 
-_PIECE = 65536  # Gaussians
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
@@ -50,27 +47,7 @@ class WorldChange:
         if not turned and self.scale == 1.0 and not shift.any():
             return gaussians
         rotation = torch.from_numpy(np.ascontiguousarray(self.rotation))
-        means = self.scale * (gaussians.means.double() @ rotation.T) + torch.from_numpy(shift)
-        moved = dataclasses.replace(
-            gaussians, means=means.float(), scales=gaussians.scales * self.scale
-        )
-        if not turned:
-            return moved
-        quat = quat_from_rotmat(rotation).to(gaussians.quats.dtype).expand_as(gaussians.quats)
-        sh = (
-            gaussians.sh
-            if gaussians.sh_degree == 0
-            else _rotate_sh_in_pieces(gaussians.sh, rotation)
-        )
-        return dataclasses.replace(moved, quats=multiply_quats(quat, gaussians.quats), sh=sh)
-
-
-def _rotate_sh_in_pieces(sh: torch.Tensor, rotation: torch.Tensor) -> torch.Tensor:
-    """rotate_sh without temporaries as large as the coefficients of a large scene."""
-    turned = torch.empty_like(sh)
-    for start in range(0, len(sh), _PIECE):
-        turned[start : start + _PIECE] = rotate_sh(sh[start : start + _PIECE], rotation)
-    return turned
+        return moved_gaussians(gaussians, rotation, torch.from_numpy(shift), self.scale)
 
 
 def parse_up(text: str) -> np.ndarray:

@@ -5,7 +5,7 @@
     actors.0.means ...: the same of each actor; actors.0.waves [n, F - 1, 3] of its colour waves
     rgb [3], image [H, W, 3] or faces [6, R, R, 3]: the sky, float32
 
-At precision float16, quats, opacities, sh and waves are float16.
+At precision float16, quats, opacities, sh, waves and the sky are float16.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ _SKY_ARRAYS = {"constant": "rgb", "latlong": "image", "cubemap": "faces"}
 _ARRAYS = ("means", "quats", "scales", "opacities", "sh")
 _HALVED = ("quats", "opacities", "sh", "waves")
 _ROWS = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": ()}
+_FLOAT16_END = 65520  # rounds to infinity
 _QUAT_TOLERANCE = 1e-4  # of unit length; what is further off is normalised
 
 
@@ -70,10 +71,16 @@ def part_arrays(scene: Scene, precision: Precision) -> dict[str, np.ndarray]:
     return arrays
 
 
-def sky_arrays(scene: Scene) -> dict[str, np.ndarray]:
-    """The one array of the scene's sky, whose class is among SKY_KINDS."""
+def sky_arrays(scene: Scene, precision: Precision) -> dict[str, np.ndarray]:
+    """The one array of the scene's sky, whose class is among SKY_KINDS.
+
+    Raises:
+        SceneError: it holds numbers beyond float16 where that is asked for.
+    """
     name = _SKY_ARRAYS[SKY_KINDS[type(scene.sky)]]
-    return {name: _array(getattr(scene.sky, name))}
+    values = getattr(scene.sky, name)
+    is_halved = precision == "float16"
+    return {name: _array(_half(values, f"scene {scene.name!r}: sky") if is_halved else values)}
 
 
 def take_parts(
@@ -101,7 +108,7 @@ def take_parts(
     return parts, problems
 
 
-def take_sky(tensors: dict[str, Tensor], kind: str, where: str) -> Sky:
+def take_sky(tensors: dict[str, Tensor], kind: str, precision: Precision, where: str) -> Sky:
     """The sky of its one array.
 
     Raises:
@@ -118,11 +125,13 @@ def take_sky(tensors: dict[str, Tensor], kind: str, where: str) -> Sky:
         "image": len(shape) == 3 and shape[2] == 3,
         "faces": len(shape) == 4 and shape[0] == 6 and shape[1] == shape[2] and shape[3] == 3,
     }[name]
-    if not fits or values.dtype != torch.float32 or values.numel() == 0:
+    is_type = values.dtype == (torch.float16 if precision == "float16" else torch.float32)
+    if not fits or not is_type or values.numel() == 0:
         expected = {"rgb": "[3]", "image": "[H, W, 3]", "faces": "[6, R, R, 3]"}[name]
         raise SceneError(
-            f"{where}: {name} must be float32 {expected}; got {values.dtype} {list(shape)}"
+            f"{where}: {name} must be {precision} {expected}; got {values.dtype} {list(shape)}"
         )
+    values = values.float()
     if not np.isfinite(_range(values)).all():
         raise SceneError(f"{where}: {name} holds NaN or infinite values")
     return sky_class(values)
@@ -137,13 +146,13 @@ def _array(tensor: Tensor) -> np.ndarray:
 
 
 def _half(tensor: Tensor, where: str) -> Tensor:
-    half = tensor.half()
-    if not np.isfinite(_range(half)).all():
+    low, high = _range(tensor)
+    if not max(-low, high) < _FLOAT16_END:
         raise SceneError(
-            f"{where}: float16 holds numbers up to {torch.finfo(torch.half).max:.0f}; got "
-            f"{_range(tensor)}. Write it at full precision"
+            f"{where}: float16 holds numbers up to 65504; got {low} to {high}. Write it at full "
+            f"precision"
         )
-    return half
+    return tensor.half()
 
 
 def _take_part(

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import os
 import sys
 import time
 from collections.abc import Mapping
@@ -27,7 +26,7 @@ from augment.render.composite import composite_sky, quantise
 from augment.render.rasterize import rasterize
 from augment.render.sh import SH_C0
 from augment.scene import Gaussians, Scene
-from augment.scene_files import is_scene_folder, read_saved_scene, save_scene
+from augment.scene_files import is_scene_folder, save_scene
 from augment.semantics import SemanticClass
 from augment.style.apply import style_gaussians, styled_scene
 from augment.style.content import content_pictures, content_statistics, select_views
@@ -106,24 +105,13 @@ def apply_style(
 
 
 def _open(uri: str) -> Scene:
-    """The scene with what belongs into another scene folder: where its own recording is not found
-    today, that is said, but not kept, and a relative path stays one to the same place.
-    """
     from adapters.base import open_scene
-    from adapters.uri import SCHEMES, format_uri, parse_uri
+    from adapters.scene_folder import storable
 
     scene = open_scene(uri)
     for problem in scene.problems:
         _say(f"note: {problem}")
-    scheme, path, _ = parse_uri(scene.source)
-    if scheme != "scene" or scene.labels is not None or scene.recorded_source is None:
-        return scene
-    folder = read_saved_scene(path)
-    recorded, place, query = parse_uri(scene.recorded_source)
-    if recorded in SCHEMES and place not in SCHEMES[recorded].builtin:
-        place = os.path.normpath(folder.working_folder / place)
-        scene = dataclasses.replace(scene, recorded_source=format_uri(recorded, place, query))
-    return dataclasses.replace(scene, problems=folder.scene.problems)
+    return storable(scene)
 
 
 def picture_path(out: Path) -> Path:

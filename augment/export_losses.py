@@ -1,0 +1,96 @@
+"""What of a scene an exported file cannot keep, a sentence each, for people."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Literal
+
+from augment.scene import Scene
+
+_SEEN_PX = 0.1
+ExportKind = Literal["scene", "file", "ply", "ply-parts", "splat"]
+
+
+def export_losses(
+    scene: Scene, kind: ExportKind, timestamp_ns: int | None = None, *, half: bool = False
+) -> tuple[str, ...]:
+    """What is lost, or has to be known, of a scene in a file of that kind.
+
+    timestamp_ns: the moment at which ply and splat are baked.
+    """
+    if kind in ("scene", "file"):
+        return tuple(_of_saved(scene, half=half))
+    found = [*_of_places(scene, kind, timestamp_ns), *_of_colours(scene, kind)]
+    return (*found, *_of_facts(scene, kind))
+
+
+def _of_saved(scene: Scene, *, half: bool) -> Iterator[str]:
+    recording = scene.recorded_source or scene.source
+    yield (
+        f"boxes, LiDAR and recorded images are not in it: they are read from {recording}; where "
+        f"that has moved, open it with ?data=URI"
+    )
+    if half:
+        yield (
+            "rotations, opacities and colours are rounded to float16: colours by up to 0.1/255, "
+            "rotations by up to 0.05 degrees, opacities by up to 0.00025"
+        )
+
+
+def _of_places(scene: Scene, kind: ExportKind, timestamp_ns: int | None) -> Iterator[str]:
+    if kind == "ply-parts":
+        if any(len(part) == 0 for part in scene.all_gaussians):
+            yield "parts without Gaussians have no file"
+    elif scene.actors:
+        assert timestamp_ns is not None
+        there = sum(actor.track.pose_at(timestamp_ns) is not None for actor in scene.actors)
+        yield f"actors ({there}) stand still where they are at {timestamp_ns} ns"
+        if there < len(scene.actors):
+            yield f"actors ({len(scene.actors) - there}) that are not there then are left out"
+    if kind == "splat" and scene.world_origin_m.any():
+        place = ", ".join(f"{v:.3f}" for v in scene.world_origin_m)
+        yield f"where the scene lies in the dataset's world ({place}) is left out"
+    if kind == "splat":
+        yield "which way is up and how long a unit is are left out: open it with ?up=+z&scale=1"
+
+
+def _of_colours(scene: Scene, kind: ExportKind) -> Iterator[str]:
+    yield "the sky is left out"
+    if scene.mapped_cameras:
+        yield (
+            f"how the recorded colours of {', '.join(scene.mapped_cameras)} differ from the "
+            f"scene's (colour maps) is left out"
+        )
+    waves = sum(actor.color_waves is not None for actor in scene.actors)
+    if waves:
+        which = "their constant part" if kind == "ply-parts" else "those of that moment"
+        yield f"colours of actors ({waves}) that change over time are {which}"
+    if kind == "splat":
+        yield "colours, opacities and rotations have 8 bits; colours below 0 or above 1 are cut off"
+        if any(part.sh_degree > 0 for part in scene.all_gaussians):
+            yield "colours do not depend on the direction of view: SH bands above 0 are left out"
+        if any(part.semantic is not None for part in scene.all_gaussians):
+            yield "semantic classes are left out"
+
+
+def _of_facts(scene: Scene, kind: ExportKind) -> Iterator[str]:
+    if scene.labels is not None:
+        yield f"boxes and LiDAR stay with {scene.recorded_source or scene.source}"
+    if scene.ground_z_m is not None:
+        yield f"the road's height is left out: open it with ?ground_z={scene.ground_z_m:.3f}"
+    cameras = [camera for frame in scene.frames for camera in frame.cameras.values()]
+    if cameras:
+        off = max(
+            max(abs(camera.cx - camera.width / 2), abs(camera.cy - camera.height / 2))
+            for camera in cameras
+        )
+        yield "times of images are left out of cameras.json"
+        if off >= _SEEN_PX:
+            yield (
+                f"viewers take the principal points of cameras.json to be in the middle of the "
+                f"image; they lie up to {off:.1f} px off"
+            )
+    if any(camera.is_orthographic for camera in cameras):
+        yield "orthographic cameras are left out"
+    if scene.made_by:
+        yield "how the scene was made (made_by) is left out"

@@ -1,0 +1,128 @@
+"""`climategs export`: a scene for other programs, or in one file to share."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from adapters.base import open_scene
+from adapters.scene_folder import storable
+from augment.errors import ClimateGSError, OutputError
+from augment.export_losses import ExportKind, export_losses
+from augment.gaussian_export import (
+    CAMERAS,
+    PARTS,
+    export_cameras,
+    export_ply,
+    export_ply_parts,
+    export_splat,
+)
+from augment.scene import Scene
+from augment.scene_files import (
+    FILES,
+    SCENE_SUFFIX,
+    is_scene_folder,
+    save_scene,
+    save_scene_file,
+)
+
+_SUFFIXES = {"file": SCENE_SUFFIX, "ply": ".ply", "splat": ".splat"}
+_BAKED = ("ply", "splat")
+
+
+def export_scene(
+    uri: str,
+    out: Path,
+    *,
+    kind: ExportKind = "file",
+    frame: int | None = None,
+    half: bool = False,
+    overwrite: bool = False,
+) -> int:
+    """Writes the scene, prints what was written and what could not be kept. Returns 0.
+
+    kind: scene (a scene folder), file (the same in one .climategs file), ply and splat (baked at a
+    frame, with cameras.json beside it), ply-parts (a folder of .ply files). A file's suffix is
+    added where it lacks. frame: at which ply and splat are baked; the first without. half: of a
+    file, about half the size at a small loss.
+
+    Raises:
+        SceneError: the scene cannot be opened, or has no such frame, or cannot be kept in such a
+            file. OutputError: OUT holds something, or cannot be written.
+    """
+    if frame is not None and kind not in _BAKED:
+        raise ClimateGSError(f"--frame is for ply and splat, which show one moment; not for {kind}")
+    if half and kind != "file":
+        raise ClimateGSError(f"--half is for a single scene file (--kind file); not for {kind}")
+    out = _named(Path(out), kind)
+    _check_out(out, kind, overwrite)
+    scene = open_scene(uri)
+    for problem in scene.problems:
+        _say(f"note: {problem}")
+    moment = _moment(scene, frame)
+    written = _write(storable(scene), out, kind, moment, half)
+    for path in written:
+        print(f"wrote {path} ({path.stat().st_size / 1e6:.1f} MB)")
+    for loss in export_losses(scene, kind, moment, half=half):
+        print(f"note: {loss}")
+    return 0
+
+
+def _write(scene: Scene, out: Path, kind: ExportKind, moment: int, half: bool) -> list[Path]:
+    if kind == "scene":
+        save_scene(scene, out.absolute())
+        return [out / name for name in FILES]
+    if kind == "file":
+        save_scene_file(scene, out, half=half)
+        return [out]
+    if kind == "ply-parts":
+        export_ply_parts(scene, out)
+        return [out / PARTS, *sorted(out.rglob("*.ply")), *out.glob(CAMERAS)]
+    if kind == "ply":
+        export_ply(scene, out, moment)
+    else:
+        export_splat(scene, out, moment)
+    cameras = out.parent / CAMERAS
+    if export_cameras(scene, out.parent):
+        return [out, cameras] if cameras.exists() else [out]
+    _say(
+        f"note: {cameras} is there already and not this scene's; it is left as it is. Viewers that "
+        f"look for cameras there find its cameras: export into a folder of its own"
+    )
+    return [out]
+
+
+def _moment(scene: Scene, frame: int | None) -> int:
+    """The time of the frame, or of the first; without frames, the first at which an actor is there.
+
+    Raises:
+        SceneError: there is no such frame.
+    """
+    if frame is not None:
+        return scene.frame(frame).timestamp_ns
+    if scene.frames:
+        return scene.frames[0].timestamp_ns
+    return min((int(actor.track.timestamps_ns[0]) for actor in scene.actors), default=0)
+
+
+def _named(out: Path, kind: ExportKind) -> Path:
+    suffix = _SUFFIXES.get(kind, "")
+    if not out.resolve().name:
+        raise OutputError(f"--out {out} is the file system's root: name a file or folder below it")
+    return out if out.suffix.lower() == suffix or not suffix else out.with_name(out.name + suffix)
+
+
+def _check_out(out: Path, kind: ExportKind, overwrite: bool) -> None:
+    """What is at OUT is nothing, or may be replaced; known before anything is opened."""
+    if not out.exists() or (out.is_dir() and kind not in _SUFFIXES and not any(out.iterdir())):
+        return
+    if out.is_dir() and kind in _SUFFIXES:
+        raise OutputError(f"{out} is a folder: choose another --out")
+    if kind == "scene" and not is_scene_folder(out):
+        raise OutputError(f"{out} holds something else than a scene: choose another --out")
+    if not overwrite:
+        raise OutputError(f"{out} is there already: choose another --out, or add --overwrite")
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr)
