@@ -17,10 +17,11 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-MAX_ARRAY_BYTES = 1 << 28  # a sweep of 200,000 points takes 5 MB
+MAX_ARRAY_BYTES = 1 << 27  # a sweep of 200,000 points takes 5 MB
 MAX_BYTES = 1 << 35
 _MAX_LINE = 1 << 12
-_MAX_STEPS = 1 << 20  # of the program; a frame takes about forty
+_MAX_STEPS = 1 << 18  # of the program; a frame takes twenty
+_MOST_TEXT = 1 << 12
 _MEMO_BYTES = 1 << 10  # longer bytes are an array's own and nothing refers back to them
 _DTYPE = re.compile(r"[fiu][1248]|b1|O8?")
 
@@ -57,7 +58,7 @@ class _Dtype:
 
 @dataclass
 class _Array:
-    """An array that is being made; content is None until its bytes are there, and once given."""
+    """An array that is being made, or that was handed over."""
 
     is_given: bool = False
 
@@ -83,7 +84,7 @@ def stream_arrays(file: BinaryIO) -> Iterator[tuple[int, np.ndarray]]:
             if step is None:
                 raise PickleStreamError(f"it holds {opcode.name}, which arrays do not need")
             if count > _MAX_STEPS:
-                raise PickleStreamError("it takes more than a million steps")
+                raise PickleStreamError(f"it takes more than {_MAX_STEPS} steps")
             step(machine, argument)
             if machine.ready is not None:
                 yield machine.ready
@@ -118,11 +119,24 @@ class _Bounded:
 
 @dataclass
 class _Machine:
-    """The state of the program: its stack, what it may refer back to, and an entry to hand over."""
+    """The state of the program: its stack, what it may refer back to, and an entry to hand over.
+
+    held_bytes: of the values that wait for their array.
+    """
 
     stack: list[Any] = field(default_factory=list)
     memo: dict[int, Any] = field(default_factory=dict)
     ready: tuple[int, np.ndarray] | None = None
+    held_bytes: int = 0
+
+    def push_value(self, value: int | str | bytes) -> None:
+        if isinstance(value, str) and len(value) > _MOST_TEXT:
+            raise PickleStreamError(f"it holds a text of {len(value)} characters")
+        if isinstance(value, bytes):
+            self.held_bytes += len(value)
+            if self.held_bytes > MAX_ARRAY_BYTES:
+                raise PickleStreamError(f"it holds {self.held_bytes} bytes that are in no array")
+        self.push(value)
 
     def push(self, value: Any) -> None:
         self.stack.append(value)
@@ -183,6 +197,7 @@ class _Machine:
             target.is_given = True
             if shape != ():  # else the one that the dictionary is wrapped in
                 array = _array(shape, dtype.numpy, is_fortran, content)
+                self.held_bytes -= len(content)
                 number = self.stack[-2]
                 if type(number) is not int:
                     raise PickleStreamError("it holds an array under something that is no number")
@@ -215,7 +230,10 @@ def _global(machine: _Machine, argument: str) -> None:
 
 
 def _recall(machine: _Machine, key: int) -> None:
-    machine.push(machine.memo[key])
+    value = machine.memo[key]
+    if isinstance(value, _Array) and value.is_given:
+        raise PickleStreamError("it holds one array twice")
+    machine.push(value)
 
 
 def _drop_one_pair(machine: _Machine, _: Any) -> None:
@@ -232,7 +250,7 @@ _STEPS: dict[str, _Step] = {
     **dict.fromkeys(
         ("BININT", "BININT1", "BININT2", "LONG1", "BINBYTES", "SHORT_BINBYTES", "BINBYTES8",
          "BINUNICODE", "SHORT_BINUNICODE"),
-        _Machine.push,
+        _Machine.push_value,
     ),
     "NONE": lambda machine, _: machine.push(None),
     "NEWTRUE": lambda machine, _: machine.push(True),

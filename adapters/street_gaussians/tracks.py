@@ -83,18 +83,18 @@ def read_track_table(path: Path) -> TrackTable:
             f"differs from the first row"
         )
     _check_single(path, rows)
-    numbers = np.array([row[4] for row in rows], np.float64).reshape(len(rows), -1)
     has_speed = bool(words_of and words_of[0])
+    numbers = np.array([row[4] for row in rows], np.float64).reshape(len(rows), 8 + has_speed)
     return TrackTable(
         path=path,
         lines=np.array([row[0] for row in rows], np.int64),
         frames=np.array([row[1] for row in rows], np.int64),
         ids=np.array([row[2] for row in rows], np.int64),
         labels=tuple(row[3] for row in rows),
-        alphas=numbers[:, 0] if rows else np.zeros(0),
-        sizes_m=numbers[:, 3:0:-1].copy() if rows else np.zeros((0, 3)),
-        centers_m=numbers[:, 4:7] if rows else np.zeros((0, 3)),
-        headings=numbers[:, 7] if rows else np.zeros(0),
+        alphas=numbers[:, 0],
+        sizes_m=numbers[:, 3:0:-1].copy(),
+        centers_m=numbers[:, 4:7],
+        headings=numbers[:, 7],
         speeds_mps=numbers[:, 8] if has_speed else None,
         problems=_headless(path, texts),
     )

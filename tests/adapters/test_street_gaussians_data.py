@@ -1,0 +1,415 @@
+"""A drive in Street Gaussians' layout: cameras, images, labels, and a scene from it alone."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import shutil
+import struct
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from street_gaussians_files import NAMES, ROAD_RGB, Facts, write_dataset
+
+from adapters.street_gaussians.data import frames_of, held_out_steps, read_data
+from adapters.street_gaussians.labels import StreetGaussiansLabels, labels_of
+from adapters.street_gaussians.raw import open_raw
+from adapters.street_gaussians.records import ModelConfig
+from adapters.uri import format_uri
+from augment.errors import AdapterError
+from augment.geometry import rotmat_from_quat
+from augment.labels import LabelSource
+from augment.render.sh import SH_C0
+
+FRONT = ModelConfig(cameras=(0, 1, 2))
+ALL = ModelConfig(cameras=(0, 1, 2, 3, 4))
+QUERY = {"voxel_m": "0.15", "image_scale": "1", "sky_size": "32"}
+
+
+@pytest.fixture(scope="module")
+def street(tmp_path_factory):
+    return write_dataset(tmp_path_factory.mktemp("street"))
+
+
+@pytest.fixture()
+def own_street(street, tmp_path) -> Facts:
+    """A copy whose files a test may change."""
+    shutil.copytree(street.root, tmp_path / "own")
+    return Facts(tmp_path / "own", street.numbers, street.cameras, street.size, street.objects)
+
+
+def test_the_world_is_centred_on_the_mean_of_all_frames(street):
+    data = read_data(street.root, ModelConfig(cameras=(0,), selected_frames=(1, 2)))
+    np.testing.assert_allclose(data.world_origin_m, street.origin_m, atol=1e-9)
+    for step, number in enumerate((1, 2)):
+        pose = street.world_from_ego(number)
+        pose[:3, 3] -= street.origin_m
+        np.testing.assert_allclose(data.world_from_ego[step], pose, atol=1e-9)
+
+
+def test_cameras_stand_where_the_car_was_at_their_own_time(street):
+    frames = frames_of(read_data(street.root, ALL))
+    assert [frame.index for frame in frames] == list(street.numbers)
+    for frame in frames:
+        assert frame.timestamp_ns == round(street.time_s(frame.index) * 1e9)
+        assert list(frame.cameras) == list(NAMES)
+        for cam, name in enumerate(NAMES):
+            camera = frame.cameras[name]
+            pose = street.world_from_ego(frame.index, cam) @ street.ego_from_camera(cam)
+            pose[:3, 3] -= street.origin_m
+            np.testing.assert_allclose(camera.world_from_camera.numpy(), pose, atol=1e-9)
+            assert camera.timestamp_ns == round(street.time_s(frame.index, cam) * 1e9)
+            assert (camera.width, camera.height) == street.image_size(cam)
+            intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
+            assert intrinsics == pytest.approx(street.intrinsics(cam))
+            assert frame.image_paths[name] == str(street.image_path(frame.index, cam))
+
+
+def test_points_fall_on_the_pixels_that_the_file_says(street):
+    """The whole chain, from the vehicle's frame to an image taken later by a turned camera."""
+    scene_frames = frames_of(read_data(street.root, ALL))
+    labels = StreetGaussiansLabels(street.root)
+    checked = 0
+    for frame in scene_frames:
+        sweep = labels.lidar(frame.index)
+        for cam, name in enumerate(NAMES):
+            own = sweep.columns["camera"] == cam
+            camera = frame.cameras[name]
+            transform = camera.camera_from_world.numpy()
+            world = sweep.points_m[own] - street.origin_m
+            local = world @ transform[:3, :3].T + transform[:3, 3]
+            u = camera.fx * local[:, 0] / local[:, 2] + camera.cx
+            v = camera.fy * local[:, 1] / local[:, 2] + camera.cy
+            # Whole pixels in the file: floor, but for the last digits of the arithmetic.
+            assert np.abs(u - 0.5 - sweep.columns["u"][own]).max() < 0.5 + 1e-6
+            assert np.abs(v - 0.5 - sweep.columns["v"][own]).max() < 0.5 + 1e-6
+            checked += int(own.sum())
+    assert checked > 10_000
+
+
+def test_the_images_number_counts_all_of_the_selection(street):
+    data = read_data(street.root, ModelConfig(cameras=(2, 0), selected_frames=(1, 3)))
+    assert [(i.frame, i.cam, i.number) for i in data.images] == [
+        (1, 0, 0), (1, 2, 1), (2, 0, 2), (2, 2, 3), (3, 0, 4), (3, 2, 5),
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("split_test", "split_train", "held_out"),
+    [
+        (-1, -1, []),
+        (2, -1, [2, 4, 6]),
+        (4, -1, [4]),
+        (1, -1, [1, 2, 3, 4, 5, 6]),
+        (-1, 1, []),
+        (-1, 3, [1, 2, 4, 5]),
+        (2, 3, [2, 4, 6]),
+    ],
+)
+def test_held_out_images_follow_the_split(split_test, split_train, held_out):
+    config = ModelConfig(split_test=split_test, split_train=split_train)
+    assert sorted(held_out_steps(7, config)) == held_out
+
+
+def test_the_split_counts_selected_frames_not_their_numbers(street):
+    config = ModelConfig(cameras=(0,), selected_frames=(1, 3), split_test=2)
+    images = read_data(street.root, config).images
+    assert [(i.frame, i.is_held_out) for i in images] == [(1, False), (2, False), (3, True)]
+
+
+def test_frames_need_not_begin_at_zero(tmp_path):
+    facts = write_dataset(tmp_path, first_frame=17, frames=3, images=False, lidar=False)
+    data = read_data(facts.root, FRONT)
+    assert data.frames == (17, 18, 19)
+    assert {(i.frame, i.number) for i in data.images if i.cam == 0} == {(17, 0), (18, 3), (19, 6)}
+    assert data.tracklets.ids.tolist() == [[1]] * 3  # the rider is in view too shortly
+
+
+def test_jpegs_are_images_too(tmp_path):
+    facts = write_dataset(tmp_path, frames=1, suffix=".jpg", lidar=False)
+    data = read_data(facts.root, FRONT)
+    assert {(i.width, i.height, i.path.suffix) for i in data.images} == {(96, 64, ".jpg")}
+
+
+def test_without_images_the_sizes_are_waymos(street, tmp_path):
+    facts = write_dataset(tmp_path, images=False, lidar=False)
+    data = read_data(facts.root, ALL)
+    sizes = {i.cam: (i.width, i.height) for i in data.images}
+    assert sizes == {
+        0: (1920, 1280),
+        1: (1920, 1280),
+        2: (1920, 1280),
+        3: (1920, 886),
+        4: (1920, 886),
+    }
+    (said,) = data.problems
+    assert "images" in said and "5 cameras" in said and "1920x886 for SIDE_LEFT" in said
+    assert all(not frame.image_paths for frame in frames_of(data))
+    assert len(frames_of(data)) == 4
+
+
+def test_missing_images_of_some_frames_leave_the_cameras(own_street):
+    own_street.image_path(1, 0).unlink()
+    data = read_data(own_street.root, FRONT)
+    assert data.problems == ()
+    frame = frames_of(data)[1]
+    assert "FRONT" in frame.cameras and "FRONT" not in frame.image_paths
+
+
+def test_an_image_of_another_size_is_left_out_by_name(own_street):
+    path = own_street.image_path(0, 1)
+    cv2.imwrite(str(path), np.zeros((32, 48, 3), np.uint8))
+    data = read_data(own_street.root, FRONT)
+    (said,) = data.problems
+    assert str(path) in said and "48x32" in said and "96x64" in said
+    assert "FRONT_LEFT" not in frames_of(data)[0].image_paths
+    assert frames_of(data)[0].cameras["FRONT_LEFT"].width == 96
+
+
+def test_a_damaged_image_is_left_out_by_name(own_street):
+    path = own_street.image_path(2, 0)
+    path.write_bytes(path.read_bytes()[:20])
+    data = read_data(own_street.root, FRONT)
+    assert any(str(path) in said and "damaged" in said for said in data.problems)
+
+
+def test_sizes_are_read_without_decoding(own_street):
+    """Only the head of a file is looked at: there may be thousands, of several megabytes."""
+    for cam in (0, 1, 2):
+        for number in own_street.numbers:
+            path = own_street.image_path(number, cam)
+            path.write_bytes(path.read_bytes()[:24] + b"no picture")
+    data = read_data(own_street.root, FRONT)
+    assert data.problems == () and data.images[0].width == 96
+
+
+def test_a_principal_point_outside_the_images_is_an_error(own_street):
+    for number in own_street.numbers:
+        path = own_street.image_path(number, 0)
+        head = path.read_bytes()
+        path.write_bytes(head[:16] + struct.pack(">II", 40, 30) + head[24:])
+    with pytest.raises(AdapterError, match=r"intrinsics/0\.txt: cx, cy .* 40x30 .* got 48\.75"):
+        read_data(own_street.root, FRONT)
+
+
+def test_two_files_of_one_image_are_an_error(own_street):
+    shutil.copy(own_street.image_path(0, 0), own_street.root / "images" / "000000_0.jpg")
+    with pytest.raises(AdapterError, match=r"000000_0\.jpg and .*000000_0\.png are one image"):
+        read_data(own_street.root, FRONT)
+
+
+@pytest.mark.parametrize("name", ["extrinsics/1.txt", "intrinsics/2.txt", "timestamps.json"])
+def test_missing_calibration_is_named(own_street, name):
+    (own_street.root / name).unlink()
+    with pytest.raises(AdapterError, match=rf"{name} does not exist"):
+        read_data(own_street.root, FRONT)
+
+
+def test_cameras_that_are_not_used_need_no_calibration(own_street):
+    (own_street.root / "extrinsics/4.txt").unlink()
+    (own_street.root / "intrinsics/4.txt").unlink()
+    assert len(read_data(own_street.root, FRONT).images) == 12
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("intrinsics/0.txt", "900 900", r"intrinsics/0\.txt must begin with fx fy cx cy"),
+        ("intrinsics/0.txt", "-1 900 48 32", r"intrinsics/0\.txt must begin with"),
+        ("extrinsics/0.txt", "1 2 3", r"extrinsics/0\.txt must hold 4 x 4"),
+        ("ego_pose/000001.txt", "nan " * 16, r"000001\.txt holds NaN"),
+        ("ego_pose/000001_0.txt", "1 " * 16, r"000001_0\.txt must be a rotation"),
+        ("timestamps.json", "[]", r"timestamps\.json must hold an object"),
+        ("timestamps.json", "{}", r"timestamps\.json must hold FRAME"),
+        ("timestamps.json", '{"FRAME": {"000000": "x"}}', r"FRAME must hold seconds by frame"),
+        ("timestamps.json", '{"FRAME": {"000000": NaN}}', r"FRAME must hold seconds by frame"),
+        ("timestamps.json", '{"FRAME": {"000000": 1.0}}', r"FRAME lacks frame 000001"),
+    ],
+)
+def test_damaged_calibration_is_named(own_street, name, text, message):
+    (own_street.root / name).write_text(text)
+    with pytest.raises(AdapterError, match=message):
+        read_data(own_street.root, FRONT)
+
+
+def edit_times(root: Path, change) -> None:
+    path = root / "timestamps.json"
+    times = json.loads(path.read_text())
+    change(times)
+    path.write_text(json.dumps(times))
+
+
+def test_times_must_increase_and_be_there_for_every_image(own_street):
+    edit_times(own_street.root, lambda times: times["FRONT_LEFT"].pop("000002"))
+    with pytest.raises(AdapterError, match="FRONT_LEFT lacks frame 000002"):
+        read_data(own_street.root, FRONT)
+    edit_times(own_street.root, lambda times: times["FRAME"].update({"000002": 1.5e9}))
+    with pytest.raises(AdapterError, match="must increase"):
+        read_data(own_street.root, FRONT)
+
+
+def test_frames_without_a_pose_are_left_out_and_nothing_shifts(own_street):
+    (own_street.root / "ego_pose/000002.txt").unlink()
+    data = read_data(own_street.root, FRONT)
+    (said,) = data.problems
+    assert "lacks the poses of 1 of 4 frames" in said and "000002" in said
+    assert [frame.index for frame in frames_of(data)] == [0, 1, 3]
+    # The rows and numbers stay those of the model that was trained on all of them, and the middle
+    # of the drive, had with a guess between its neighbours, stays within a millimetre.
+    assert data.frames == (0, 1, 2, 3)
+    assert data.tracklets.ids.tolist() == [[1, -1], [1, 4], [1, 4], [1, 4]]
+    assert [i.number for i in data.images if i.cam == 0] == [0, 3, 9]
+    np.testing.assert_allclose(data.world_origin_m, own_street.origin_m, atol=1e-3)
+    guess, pose = data.world_from_ego[2], own_street.world_from_ego(2)
+    np.testing.assert_allclose(guess[:3, :3], pose[:3, :3], atol=1e-6)
+
+
+def test_the_last_frames_may_lack_poses(own_street):
+    for number in (0, 3):
+        (own_street.root / f"ego_pose/{number:06d}.txt").unlink()
+    data = read_data(own_street.root, FRONT)
+    assert [frame.index for frame in frames_of(data)] == [1, 2]
+    np.testing.assert_allclose(data.world_origin_m, own_street.origin_m, atol=1e-3)
+
+
+def test_images_without_a_pose_are_left_out(own_street):
+    (own_street.root / "ego_pose/000001_2.txt").unlink()
+    data = read_data(own_street.root, FRONT)
+    (said,) = data.problems
+    assert "1 images are left out" in said and "000001_2.txt" in said
+    assert list(frames_of(data)[1].cameras) == ["FRONT", "FRONT_LEFT"]
+
+
+def test_without_any_pose_there_is_no_scene(own_street):
+    for path in (own_street.root / "ego_pose").glob("*_*.txt"):
+        path.unlink()
+    with pytest.raises(AdapterError, match=r"ego_pose lacks poses NNNNNN_0\.txt"):
+        read_data(own_street.root, FRONT)
+    for path in (own_street.root / "ego_pose").iterdir():
+        path.unlink()
+    with pytest.raises(AdapterError, match=r"ego_pose holds no pose"):
+        read_data(own_street.root, FRONT)
+    (own_street.root / "ego_pose").rmdir()
+    with pytest.raises(AdapterError, match=r"ego_pose does not exist; expected a drive"):
+        read_data(own_street.root, FRONT)
+    with pytest.raises(AdapterError, match=r"nowhere is not a folder"):
+        read_data(own_street.root / "nowhere", FRONT)
+
+
+def test_a_selection_beyond_the_dataset(street):
+    data = read_data(street.root, ModelConfig(cameras=(0,), selected_frames=(2, 90)))
+    assert data.frames == (2, 3) and any("2 to 90" in said for said in data.problems)
+    with pytest.raises(AdapterError, match=r"selected_frames are 50 to 90; .* has 0 to 3"):
+        read_data(street.root, ModelConfig(cameras=(0,), selected_frames=(50, 90)))
+    with pytest.raises(AdapterError, match=r"data\.cameras must be some of 0 to 4"):
+        read_data(street.root, ModelConfig(cameras=(0, 5)))
+
+
+def test_boxes_are_all_rows_of_the_frame_in_the_datasets_world(street):
+    labels = labels_of(street.root)
+    assert isinstance(labels, LabelSource)
+    assert pickle.loads(pickle.dumps(labels)) == labels
+    boxes = labels.boxes(2)
+    assert boxes.track_ids == ("0", "1", "2", "3", "4", "6")
+    assert boxes.labels[2] == "sign" and boxes.centers_m.dtype == np.float64
+    for i, track_id in enumerate(map(int, boxes.track_ids)):
+        pose = street.world_from_object(track_id, street.seconds(2))
+        np.testing.assert_allclose(boxes.centers_m[i], pose[:3, 3], atol=1e-9)
+        rotation = rotmat_from_quat(torch.from_numpy(boxes.quats[i])).numpy()
+        np.testing.assert_allclose(rotation, pose[:3, :3], atol=1e-9)
+        length, width, height = street.object(track_id).size_m
+        np.testing.assert_allclose(boxes.sizes_m[i], (length + 0.2, width, height))
+    np.testing.assert_allclose(boxes.attributes["alpha"], -10)
+    np.testing.assert_allclose(boxes.attributes["speed"][[0, 1, 5]], (0, 12, 9.5))
+    assert len(labels.boxes(0)) == 5 and len(labels.boxes(99)) == 0
+
+
+def test_boxes_follow_a_file_that_changes(own_street):
+    labels = StreetGaussiansLabels(own_street.root)
+    assert len(labels.boxes(0)) == 5
+    path = own_street.root / "track/track_info.txt"
+    path.write_text("\n".join(path.read_text().splitlines()[:3]))
+    assert len(labels.boxes(0)) == 2
+    path.unlink()
+    assert len(labels.boxes(0)) == 0
+
+
+def test_sweeps_are_in_the_datasets_world_at_the_frames_time(street):
+    sweep = labels_of(street.root).lidar(3)
+    pose = street.world_from_ego(3)
+    expected = street.points[3] @ pose[:3, :3].T + pose[:3, 3]
+    np.testing.assert_allclose(sweep.points_m, expected, atol=1e-9)
+    assert sweep.columns["x"].dtype == np.float64
+    assert set(sweep.columns) == {"x", "y", "z", "timestamp_ns", "camera", "u", "v"}
+    assert set(sweep.columns["timestamp_ns"].tolist()) == {round(street.time_s(3) * 1e9)}
+    for i, name in enumerate(("camera", "u", "v")):
+        np.testing.assert_array_equal(sweep.columns[name], street.projections[3][:, i])
+
+
+def test_frames_without_pose_or_points_have_no_labels(own_street):
+    labels = labels_of(own_street.root)
+    assert labels.lidar(44) is None
+    (own_street.root / "ego_pose/000001.txt").unlink()
+    assert labels.lidar(1) is None and len(labels.boxes(1)) == 0
+    (own_street.root / "pointcloud.npz").unlink()
+    assert labels.lidar(0) is None and len(labels.boxes(0)) == 5
+    assert labels_of(own_street.root / "images") is None
+
+
+@pytest.fixture(scope="module")
+def raw_scene(street):
+    return open_raw(street.root, QUERY)
+
+
+def test_a_dataset_alone_is_a_scene_of_its_lidar(street, raw_scene):
+    scene = raw_scene
+    assert scene.source == format_uri("street_gaussians", street.root, QUERY)
+    assert scene.problems == () and len(scene.frames) == 4
+    np.testing.assert_allclose(scene.world_origin_m, street.origin_m, atol=1e-9)
+    assert scene.ground_z_m == pytest.approx(0, abs=0.02)
+    assert len(scene.frames[0].image_paths) == 5
+    assert len(scene.boxes(0)) == 5 and len(scene.lidar(0)) == len(street.points[0])
+    road = scene.background.means[:, 2].abs() < 0.1
+    colour = (scene.background.sh[road, 0] * SH_C0 + 0.5).median(dim=0).values * 255
+    np.testing.assert_allclose(colour.numpy(), ROAD_RGB, atol=8)
+
+
+def test_labelled_objects_that_move_become_actors(street, raw_scene):
+    assert {a.track_id for a in raw_scene.actors} == {"1", "4", "6"}
+    for actor in raw_scene.actors:
+        found = street.object(int(actor.track_id))
+        assert actor.label == found.label
+        for number in street.numbers:
+            if not found.is_in(number):
+                continue
+            pose = street.world_from_object(found.track_id, street.seconds(number))
+            pose[:3, 3] -= street.origin_m
+            there = actor.track.pose_at(round(street.time_s(number) * 1e9))
+            np.testing.assert_allclose(there.numpy(), pose, atol=1e-4)
+        colour = (actor.gaussians.sh[:, 0] * SH_C0 + 0.5).median(dim=0).values * 255
+        np.testing.assert_allclose(colour.numpy(), found.rgb, atol=12)
+        half = np.array(found.size_m) / 2 + 0.2
+        assert (np.abs(actor.gaussians.means.numpy()) < half).all()
+
+
+def test_a_scene_of_some_frames(street):
+    scene = open_raw(street.root, QUERY | {"frames": "1:4", "held_out": "2:3"})
+    assert [frame.index for frame in scene.frames] == [1, 2, 3]
+    with pytest.raises(AdapterError, match="unknown option 'data'"):
+        open_raw(street.root, {"data": "x"})
+
+
+def test_a_scene_needs_lidar_and_images(own_street):
+    shutil.rmtree(own_street.root / "images")
+    with pytest.raises(AdapterError, match=r"images holds no usable image"):
+        open_raw(own_street.root, QUERY)
+    write_dataset(own_street.root)
+    (own_street.root / "pointcloud.npz").unlink()
+    with pytest.raises(AdapterError, match=r"pointcloud\.npz holds no returns of frames 0 to 3"):
+        open_raw(own_street.root, QUERY)
+    shutil.rmtree(own_street.root / "extrinsics")
+    with pytest.raises(AdapterError, match=r"extrinsics holds no calibration"):
+        open_raw(own_street.root, QUERY)
