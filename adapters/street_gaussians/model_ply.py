@@ -31,7 +31,7 @@ _PREFIX = "vertex_"
 _FIXED = (
     *"xyz", "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4)),
 )  # fmt: skip
-_NUMBERED = re.compile(r"(f_dc|f_rest|semantic)_(\d+)")
+_NUMBERED = re.compile(r"(f_dc|f_rest|semantic)_(0|[1-9]\d{0,6})")
 
 
 def read_point_cloud(path: Path, config: ModelConfig) -> TrainedModel:
@@ -100,9 +100,7 @@ def _lacks(path: Path, config: ModelConfig) -> str:
     text = f"{path}: a .ply holds Gaussians only"
     if not names:
         return text
-    return (
-        f"{text}; {', '.join(names)} are missing: take trained_model/iteration_N.pth (weights=pth)"
-    )
+    return f"{text}; left out: {', '.join(names)}. They are in trained_model/iteration_N.pth"
 
 
 def _read_part(header: PlyHeader, element: PlyElement, name: str) -> tuple[Part | None, list[str]]:

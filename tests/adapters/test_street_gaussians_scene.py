@@ -1,0 +1,443 @@
+"""Trained Street Gaussians models as scenes, against pictures composed from their raw numbers."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from scipy.spatial.transform import Rotation
+from street_gaussians_files import Facts, write_dataset
+from street_gaussians_models import RawModel, RawPart, config_tree, random_part, write_model
+
+from adapters.base import open_scene
+from adapters.signatures import recognised
+from adapters.street_gaussians import open_street_gaussians, street_gaussians_labels
+from augment.apply import render_buffers
+from augment.cameras import Camera
+from augment.errors import AdapterError
+from augment.plan import make_plan
+from augment.render.rasterize import rasterize
+from augment.scene import Gaussians, PosedGaussians, Scene
+from augment.sky import ConstantSky
+from recipes.schema import Recipe
+from tests.assertions import assert_images_close
+
+C0, C1 = 0.28209479177387814, 0.4886025119029199
+CAMS = (0, 1, 2)
+# Columns that the moving objects 1 and 4 have among these cameras' tracks in the four frames; the
+# object 6 is seen by another camera only.
+COLUMNS = {1: (0, 0, 0, 0), 4: (None, 1, 1, 1)}
+SPAN = {1: (0, 3), 4: (1, 3)}
+FACES = ((0, 1), (0, -1), (1, 1), (1, -1), (2, 1), (2, -1))  # axis and sign
+# s and t of a direction (x, y, z) on each face, OpenGL 4.6 table 8.19: which axis and sign.
+SC = ((2, -1), (2, 1), (0, 1), (0, 1), (0, 1), (0, -1))
+TC = ((1, -1), (1, -1), (2, 1), (2, -1), (1, -1), (1, -1))
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory) -> Facts:
+    """Without images and LiDAR, which a trained model does not need."""
+    return without_images(tmp_path_factory.mktemp("drive") / "seq")
+
+
+def without_images(root: Path, **how) -> Facts:
+    """Cameras are then those of Waymo; 96 pixels wide they are those of the facts."""
+    facts = write_dataset(root, images=False, lidar=False, **how)
+    for cam in facts.cameras:
+        path = root / "intrinsics" / f"{cam}.txt"
+        values = np.loadtxt(path)
+        np.savetxt(path, [*(20 * values[:4]), *values[4:]])
+    return facts
+
+
+def raw_model(facts: Facts, **changes) -> RawModel:
+    """A street of splats along the drive, and those of the actors 1 and 4."""
+    background = random_part(0, 400, low=(-20, -8, -1), high=(30, 8, 6), size_m=0.5)
+    heading = Rotation.from_euler("z", 0.7)  # of the street in the dataset's world
+    background = dataclasses.replace(
+        background, xyz=heading.apply(background.xyz).astype(np.float32)
+    )
+    rng = np.random.default_rng(7)
+    opt_rots = np.zeros((len(facts.numbers), 2, 1))
+    opt_rots[:, 0], opt_rots[:, 1] = 0.03, -0.05  # the same in all frames: headings stay
+    raw = RawModel(
+        background=background,
+        actors={
+            1: random_part(1, 60, terms=5, low=(-2, -0.9, -0.7), high=(2, 0.9, 0.7)),
+            4: random_part(2, 60, terms=5, low=(-1.5, -0.6, -0.8), high=(1.5, 0.6, 0.8)),
+        },
+        opt_trans=0.2 * rng.normal(size=(len(facts.numbers), 2, 3)),
+        opt_rots=opt_rots,
+        sky=smooth_sky(32),
+    )
+    return dataclasses.replace(raw, **changes)
+
+
+def smooth_sky(size: int) -> np.ndarray:
+    """Faces that differ from each other, each with slopes of its own."""
+    ticks = (np.arange(size) + 0.5) / size
+    t, s = np.meshgrid(ticks, ticks, indexing="ij")
+    return np.stack([
+        np.stack([0.1 + 0.12 * f + 0.1 * s, 0.9 - 0.1 * f - 0.2 * t, 0.3 + 0.5 * s * t], -1)
+        for f in range(6)
+    ])  # fmt: skip
+
+
+def tree(facts: Facts, **changes) -> dict:
+    return config_tree(**{"source_path": str(facts.root), "data.cameras": list(CAMS), **changes})
+
+
+def saved(folder: Path, facts: Facts, raw: RawModel, how: dict | None = None, **config) -> Path:
+    return write_model(folder / "run", raw, tree(facts, **config), **(how or {}))
+
+
+def opened(path: Path, **query: str) -> Scene:
+    return open_street_gaussians(str(path), {"width": "96", **query})
+
+
+def render(scene: Scene, camera: Camera) -> torch.Tensor:
+    return render_buffers(scene, camera, make_plan(Recipe(), scene), backend="reference").rgb
+
+
+# --- the picture, from the raw numbers alone ---
+
+
+def world_from_camera(facts: Facts, frame: int, cam: int) -> np.ndarray:
+    pose = facts.world_from_ego(frame, cam) @ facts.ego_from_camera(cam)
+    pose[:3, 3] -= facts.origin_m
+    return pose
+
+
+def vehicle_pose(facts: Facts, raw: RawModel, number: int, frame: int) -> np.ndarray:
+    """In the vehicle's axes at the frame's time, as trained."""
+    pose = facts.ego_from_object(number, frame)
+    column = COLUMNS[number][frame]
+    if raw.opt_trans is not None:
+        pose[:3, 3] += raw.opt_trans[frame, column]
+        pose[:3, :3] = (
+            pose[:3, :3] @ Rotation.from_euler("z", 2 * raw.opt_rots[frame, column, 0]).as_matrix()
+        )
+    return pose
+
+
+def actor_pose(facts: Facts, raw: RawModel, number: int, frame: int, cam: int) -> np.ndarray:
+    """World pose at the camera's time, between the frames nearest to it."""
+    time = facts.time_s(frame, cam)
+    frames = [f for f in facts.numbers if COLUMNS[number][f] is not None]
+    a, b = sorted(frames, key=lambda f: abs(facts.time_s(f) - time))[:2]
+    share = (time - facts.time_s(a)) / (facts.time_s(b) - facts.time_s(a))
+    first, second = (vehicle_pose(facts, raw, number, f) for f in (a, b))
+    turn = Rotation.from_matrix(first[:3, :3].T @ second[:3, :3]).as_rotvec()
+    pose = np.eye(4)
+    pose[:3, :3] = first[:3, :3] @ Rotation.from_rotvec(share * turn).as_matrix()
+    pose[:3, 3] = (1 - share) * first[:3, 3] + share * second[:3, 3]
+    world = facts.world_from_ego(frame, cam) @ pose
+    world[:3, 3] -= facts.origin_m
+    return world
+
+
+def constant_colour(part: RawPart, phase: float) -> np.ndarray:
+    """The Fourier sum of a frame, [N, 3]."""
+    total = np.zeros((len(part.xyz), 3))
+    for k in range(part.dc.shape[1]):
+        b = math.cos(math.pi * phase * k) if k % 2 == 0 else math.sin(math.pi * phase * (k + 1))
+        total += b * part.dc[:, k]
+    return total
+
+
+def placed(part: RawPart, pose: np.ndarray, eye: np.ndarray, phase: float = 0.0) -> Gaussians:
+    """Splats in the world in the one colour that the eye sees, directions in the world's axes."""
+    means = part.xyz @ pose[:3, :3].T + pose[:3, 3]
+    own = Rotation.from_quat(np.roll(part.rotation, -1, axis=1))
+    quats = np.roll((Rotation.from_matrix(pose[:3, :3]) * own).as_quat(), 1, axis=1)
+    to = means - eye
+    x, y, z = (to / np.linalg.norm(to, axis=1, keepdims=True)).T[:, :, None]
+    rgb = 0.5 + C0 * constant_colour(part, phase)
+    rgb += C1 * (-y * part.rest[:, 0] + z * part.rest[:, 1] - x * part.rest[:, 2])
+    return Gaussians(
+        means=torch.tensor(means, dtype=torch.float32),
+        quats=torch.tensor(quats, dtype=torch.float32),
+        scales=torch.tensor(np.exp(part.scaling)),
+        opacities=torch.tensor(1 / (1 + np.exp(-part.opacity[:, 0]))),
+        sh=torch.tensor((np.maximum(rgb, 0) - 0.5) / C0, dtype=torch.float32)[:, None],
+    )
+
+
+def sky_at(faces: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Colours [P, 3] of directions [P, 3], and whether all four texels are of one face."""
+    size = faces.shape[1]
+    colours, inside = np.zeros((len(directions), 3)), np.zeros(len(directions), bool)
+    for index, direction in enumerate(directions):
+        axis = int(np.abs(direction).argmax())
+        face = FACES.index((axis, 1 if direction[axis] > 0 else -1))
+        s = SC[face][1] * direction[SC[face][0]] / abs(direction[axis])
+        t = TC[face][1] * direction[TC[face][0]] / abs(direction[axis])
+        column, row = (s + 1) / 2 * size - 0.5, (t + 1) / 2 * size - 0.5
+        inside[index] = 0 <= column < size - 1 and 0 <= row < size - 1
+        if inside[index]:
+            c, r = int(column), int(row)
+            fc, fr = column - c, row - r
+            top = faces[face, r, c] * (1 - fc) + faces[face, r, c + 1] * fc
+            low = faces[face, r + 1, c] * (1 - fc) + faces[face, r + 1, c + 1] * fc
+            colours[index] = top * (1 - fr) + low * fr
+    return colours, inside
+
+
+def composed(
+    facts: Facts, raw: RawModel, frame: int, cam: int, *, move: np.ndarray | None = None,
+    affine: np.ndarray | None = None, white: bool = False,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """The picture float64 [H, W, 3], and where the sky is known without other faces' texels."""
+    pose = world_from_camera(facts, frame, cam)
+    width, height = facts.image_size(cam)
+    fx, fy, cx, cy = facts.intrinsics(cam)
+    view = Camera("test", width, height, fx, fy, cx, cy, torch.from_numpy(np.linalg.inv(pose)))
+    parts = [placed(raw.background, np.eye(4) if move is None else move, pose[:3, 3])]
+    for number, part in raw.actors.items():
+        start, end = SPAN[number]
+        if facts.time_s(start) - 0.1 <= facts.time_s(frame, cam) <= facts.time_s(end) + 0.1:
+            phase = (frame - start) / (end - start)
+            world = actor_pose(facts, raw, number, frame, cam)
+            parts.append(placed(part, world, pose[:3, 3], phase))
+    drawn = rasterize([PosedGaussians(part) for part in parts], view, backend="reference")
+    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    rays = np.stack([(u - cx) / fx, (v - cy) / fy, np.ones_like(u)], -1) @ pose[:3, :3].T
+    if raw.sky is None:
+        sky, known = np.full((height, width, 3), float(white)), np.ones((height, width), bool)
+    else:
+        found = sky_at(raw.sky.clip(0, 1), rays.reshape(-1, 3))
+        sky, known = found[0].reshape(height, width, 3), found[1].reshape(height, width)
+    rgb = drawn.rgb.double().numpy() + (1 - drawn.alpha.double().numpy())[..., None] * sky
+    if affine is not None:
+        rgb = rgb @ affine[:, :3].T + affine[:, 3]
+    return rgb, known
+
+
+def assert_shows(scene: Scene, facts: Facts, raw: RawModel, frame: int, cam: int, **how) -> None:
+    tolerance = how.pop("tolerance", 2e-4)
+    name = ("FRONT", "FRONT_LEFT", "FRONT_RIGHT")[cam]
+    rgb = render(scene, scene.frame(frame).cameras[name]).double().numpy()
+    expected, known = composed(facts, raw, frame, cam, **how)
+    assert known.mean() > 0.8 and expected.std() > 0.05
+    rgb[~known] = expected[~known] = 0
+    assert_images_close(rgb, expected, p999=tolerance, flip=10 * tolerance, max_flips=3)
+
+
+# --- scenes ---
+
+
+@pytest.mark.parametrize(("frame", "cam"), [(0, 0), (1, 2), (3, 0)])
+def test_a_model_shows_what_its_numbers_say(tmp_path: Path, drive: Facts, frame, cam) -> None:
+    raw = raw_model(drive)
+    scene = opened(saved(tmp_path, drive, raw))
+    assert not (drive.root / "images").exists()
+    assert [actor.track_id for actor in scene.actors] == ["1", "4"]
+    assert scene.problems and all("image" in problem for problem in scene.problems)
+    assert_shows(scene, drive, raw, frame, cam)
+
+
+def test_actors_show(tmp_path: Path, drive: Facts) -> None:
+    """The comparison above is worth something: actors, their turns and their times are seen."""
+    raw = raw_model(drive)
+    whole, _ = composed(drive, raw, 1, 0)
+    for less in (
+        dataclasses.replace(raw, actors={1: raw.actors[1]}),
+        dataclasses.replace(raw, opt_rots=0 * raw.opt_rots),
+        dataclasses.replace(raw, opt_trans=0 * raw.opt_trans),
+    ):
+        assert np.abs(composed(drive, less, 1, 0)[0] - whole).max() > 0.02
+
+
+def test_colours_and_poses_are_corrected(tmp_path: Path, drive: Facts) -> None:
+    rng = np.random.default_rng(3)
+    affine = np.eye(3, 4) + 0.1 * rng.normal(size=(12, 3, 4))
+    # Turns of a milliradian: what directions of view lose by them stays below the tolerance.
+    turns = np.concatenate([np.ones((12, 1)), 0.0005 * rng.normal(size=(12, 3))], 1) * 1.7
+    moves = 0.1 * rng.normal(size=(12, 3))
+    raw = raw_model(drive, affine=affine, moves=moves, turns=turns)
+    config = {"model.use_color_correction": True, "model.use_pose_correction": True}
+    scene = opened(saved(tmp_path, drive, raw, **config))
+    for frame, cam in ((0, 1), (2, 0)):
+        number = 3 * frame + cam
+        move = np.eye(4)
+        move[:3, :3] = Rotation.from_quat(np.roll(turns[number], -1)).as_matrix()
+        move[:3, 3] = moves[number]
+        how = {"move": move, "affine": affine[number]}
+        assert_shows(scene, drive, raw, frame, cam, tolerance=2e-3, **how)
+    front = torch.tensor(affine[[0, 3, 6, 9]].mean(0), dtype=torch.float32)
+    torch.testing.assert_close(scene.color_maps["FRONT"], front)
+
+
+def test_a_camera_has_one_map_in_all_its_images(tmp_path: Path, drive: Facts) -> None:
+    affine = np.eye(3, 4) + 0.1 * np.random.default_rng(3).normal(size=(3, 3, 4))
+    raw = raw_model(drive, affine=affine, sky=None)
+    config = {
+        "model.use_color_correction": True, "model.color_correction.mode": "sensor",
+        "model.nsg.include_sky": False, "data.white_background": True,
+    }  # fmt: skip
+    scene = opened(saved(tmp_path, drive, raw, **config))
+    assert scene.image_color_maps == {}
+    assert isinstance(scene.sky, ConstantSky) and scene.sky.rgb.tolist() == [1, 1, 1]
+    assert_shows(scene, drive, raw, 1, 2, affine=affine[2], white=True)
+
+
+def test_weights_in_a_point_cloud_show_the_same_without_what_they_lack(
+    tmp_path: Path, drive: Facts
+) -> None:
+    raw = raw_model(drive)
+    model = saved(tmp_path, drive, raw)
+    scene = opened(model, weights="ply")
+    assert any("left out" in p and "learnt poses, the sky" in p for p in scene.problems)
+    bare = dataclasses.replace(raw, opt_trans=None, opt_rots=None, sky=None)
+    assert_shows(scene, drive, bare, 2, 0)
+    file = model / "point_cloud" / "iteration_50000" / "point_cloud.ply"
+    by_file = opened(file)
+    assert torch.equal(by_file.background.means, scene.background.means)
+    assert by_file.name == "run" and by_file.made_by["iteration"] == 50000
+
+
+def test_the_older_release_can_be_had(tmp_path: Path, drive: Facts) -> None:
+    raw = raw_model(drive)
+    raw.opt_rots[1, 0] += 0.1
+    model = saved(tmp_path, drive, raw)
+    times = [scene_time(opened(model), 1), scene_time(opened(model, rotation_bug="1"), 1)]
+    assert not torch.equal(times[0], times[1])
+    torch.testing.assert_close(times[0][:3, 3], times[1][:3, 3], rtol=0, atol=1e-9)
+
+
+def scene_time(scene: Scene, frame: int) -> torch.Tensor:
+    stamp = scene.frame(frame).cameras["FRONT_LEFT"].timestamp_ns
+    return scene.actors[0].track.pose_at(stamp)
+
+
+def test_what_a_scene_knows(tmp_path: Path, drive: Facts) -> None:
+    model = saved(tmp_path, drive, raw_model(drive))
+    scene = open_scene(str(model))
+    assert recognised(model) == "street_gaussians"
+    assert (scene.name, scene.source) == ("run", f"street_gaussians:{model}")
+    assert scene.recorded_source == f"street_gaussians:{drive.root}"
+    assert scene.has_metric_scale and scene.ground is None and scene.ground_z_m is None
+    np.testing.assert_allclose(scene.world_origin_m, drive.origin_m)
+    assert scene.made_by["config"].endswith("config_000000.yaml")
+    assert scene.camera_names == ("FRONT", "FRONT_LEFT", "FRONT_RIGHT")
+    assert len(scene.boxes(1)) == 6
+    labels = [street_gaussians_labels(str(path), {}) for path in (model, drive.root)]
+    for found in labels:
+        np.testing.assert_array_equal(found.boxes(1).centers_m, scene.boxes(1).centers_m)
+    part = opened(model, frames="1:3")
+    assert [frame.index for frame in part.frames] == [1, 2]
+    assert torch.equal(part.actors[0].track.timestamps_ns, scene.actors[0].track.timestamps_ns)
+
+
+def test_images_are_capped_as_the_project_renders_them(tmp_path: Path) -> None:
+    facts = without_images(tmp_path / "seq", frames=3)
+    raw = raw_model(facts)
+    raw = dataclasses.replace(raw, actors={}, opt_trans=None, opt_rots=None)
+    model = saved(tmp_path, facts, raw, **{"data.cameras": [0, 4]})
+    views = {}
+    for query in ({}, {"width": "0"}, {"width": "96"}):
+        views[query.get("width")] = open_street_gaussians(str(model), query).frames[0].cameras
+    sizes = {key: [(c.width, c.height) for c in found.values()] for key, found in views.items()}
+    assert sizes == {
+        None: [(1600, 1066), (1600, 738)],
+        "0": [(1920, 1280), (1920, 886)],
+        "96": [(96, 64), (96, 44)],
+    }
+    for name in ("fx", "fy", "cx", "cy"):
+        whole, capped = (getattr(views[key]["FRONT"], name) for key in ("0", None))
+        assert capped == pytest.approx(whole / 1.2)
+
+
+def test_parts_and_tracks_that_do_not_belong_together_are_said(
+    tmp_path: Path, drive: Facts
+) -> None:
+    raw = raw_model(drive)
+    raw = dataclasses.replace(raw, actors={1: raw.actors[1], 99: raw.actors[4]})
+    scene = opened(saved(tmp_path, drive, raw))
+    assert [actor.track_id for actor in scene.actors] == ["1"]
+    assert any("obj_004 of the tracks has no Gaussians" in p for p in scene.problems)
+    assert any("obj_099 has no track" in p for p in scene.problems)
+
+
+def test_poses_that_belong_to_other_tracks_are_refused(tmp_path: Path, drive: Facts) -> None:
+    raw = raw_model(drive)
+    model = saved(tmp_path, drive, raw, **{"data.selected_frames": [0, 2]})
+    with pytest.raises(AdapterError, match=r"4 frames and 2 columns.*3 frames and 1 columns"):
+        opened(model)
+
+
+def test_of_several_iterations_the_newest_or_the_named(tmp_path: Path, drive: Facts) -> None:
+    model = saved(tmp_path, drive, raw_model(drive))
+    early = raw_model(drive, background=random_part(9, 11, high=(20, 5, 5)))
+    saved(tmp_path, drive, early, how={"iteration": 7000, "is_final": False})
+    assert len(opened(model).background) == 400
+    assert len(opened(model, iteration="7000").background) == 11
+    assert len(opened(model / "trained_model" / "iteration_7000.pth").background) == 11
+    assert opened(model, iteration="7000", weights="ply").made_by["iteration"] == 7000
+    with pytest.raises(AdapterError, match=r"no \.pth of iteration 8000; it has 7000, 50000"):
+        opened(model, iteration="8000")
+    shutil.rmtree(model / "trained_model")
+    assert len(opened(model).actors) == 2
+    with pytest.raises(AdapterError, match=r"holds no \.pth"):
+        opened(model, weights="pth")
+
+
+def test_where_the_data_are(tmp_path: Path, drive: Facts) -> None:
+    model = saved(tmp_path, drive, raw_model(drive))
+    config = model / "configs" / "config_000000.yaml"
+    config.write_text(yaml.safe_dump(tree(drive, source_path="/elsewhere/002")))
+    with pytest.raises(AdapterError, match=r"'/elsewhere/002' is not here.*data=DIR"):
+        opened(model)
+    scene = opened(model, data=str(drive.root))
+    assert scene.recorded_source == f"street_gaussians:{drive.root}"
+    assert street_gaussians_labels(str(model), {"data": str(drive.root)}) is not None
+    with pytest.raises(AdapterError, match="no such folder"):
+        opened(model, data=str(tmp_path / "none"))
+    with pytest.raises(AdapterError, match=re.escape(str(model / "configs" / "nothing"))):
+        opened(model, data=str(model / "configs" / "nothing"))
+    shutil.rmtree(model / "configs")
+    with pytest.raises(AdapterError, match=r"config_\*.yaml; which column"):
+        opened(model, data=str(drive.root))
+
+
+@pytest.mark.parametrize(
+    ("query", "words"),
+    [
+        ({"scale": "2"}, "unknown option 'scale'.*data: .*rotation_bug"),
+        ({"iteration": "last"}, "iteration must be a whole number"),
+        ({"width": "-5"}, "width must be a whole number"),
+        ({"weights": "npz"}, "weights must be pth or ply; got 'npz'"),
+        ({"rotation_bug": "yes"}, "rotation_bug must be 0 or 1"),
+        ({"frames": "5"}, "frames must be first:stop"),
+        ({"frames": "50:60"}, "selects none of the 4 frames"),
+    ],
+)
+def test_wrong_options(tmp_path: Path, drive: Facts, query: dict, words: str) -> None:
+    model = saved(tmp_path, drive, raw_model(drive))
+    with pytest.raises(AdapterError, match=words):
+        opened(model, **query)
+
+
+def test_paths_that_are_no_model(tmp_path: Path, drive: Facts) -> None:
+    with pytest.raises(AdapterError, match=r"expected trained_model/iteration_N\.pth"):
+        opened(tmp_path)
+    (tmp_path / "notes.txt").write_text("x")
+    with pytest.raises(AdapterError, match=r"a model's folder, \.pth or \.ply"):
+        opened(tmp_path / "notes.txt")
+    model = saved(tmp_path, drive, raw_model(drive))
+    with pytest.raises(AdapterError, match="is one file, so iteration= and weights="):
+        opened(model / "trained_model" / "iteration_50000.pth", iteration="3")
+
+
+def test_a_dataset_alone_opens_as_a_raw_drive(drive: Facts, monkeypatch) -> None:
+    asked = []
+    monkeypatch.setattr("adapters.street_gaussians.adapter.open_raw", lambda *a: asked.append(a))
+    open_street_gaussians(str(drive.root), {"voxel_m": "0.3"})
+    assert asked == [(drive.root, {"voxel_m": "0.3"})]
