@@ -23,6 +23,7 @@ _NEIGHBOURS = 12
 _FLAT = 0.05  # a normal is believed where its variance is less than this of the next
 _STAGES = ((4.0, 12), (1.5, 12), (0.5, 15))  # reach of a match in metres, iterations
 _LOOSE_M = 0.2  # of a residual, in the last stage, where its weight has fallen to half
+_SETTLED = 1e-6  # metres and radians that a step still changes
 _FEWEST = 200
 _POOR_FITNESS = 0.5
 
@@ -104,7 +105,10 @@ def _match(after: _Surface, before: _Surface, guess: np.ndarray) -> Match:
         for _ in range(iterations):
             moved, index, near = _nearest(tree, after, transform, reach_m)
             residual = _residuals(moved[near], before, index[near])
-            transform = _step(moved[near], before.normals[index[near]], residual, loose) @ transform
+            step = _step(moved[near], before.normals[index[near]], residual, loose)
+            transform = step @ transform
+            if np.abs(step - np.eye(4)).max() < _SETTLED:
+                break
     moved, index, near = _nearest(tree, after, transform, _STAGES[-1][0])
     residual = _residuals(moved[near], before, index[near])
     rmse = float(np.sqrt(np.mean(residual**2))) if near.any() else float("inf")
@@ -156,14 +160,15 @@ def _surface(points: np.ndarray, number: int) -> _Surface:
 
 def _thinned(points: np.ndarray) -> np.ndarray:
     """The mean of the points of each voxel."""
-    cells = np.floor(points / _VOXEL_M).astype(np.int64)
-    _, cell, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
-    sums = [np.bincount(cell.ravel(), points[:, i], len(counts)) for i in range(3)]
+    x, y, z = np.floor((points + _FAR_M) / _VOXEL_M).astype(np.int64).T
+    side = int(2 * _FAR_M / _VOXEL_M) + 1
+    _, cell, counts = np.unique((x * side + y) * side + z, return_inverse=True, return_counts=True)
+    sums = [np.bincount(cell, points[:, i], len(counts)) for i in range(3)]
     return np.stack(sums, axis=1) / counts[:, None]
 
 
 def _normals(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The direction of least spread of each point's neighbours [N, 3]; whether they are flat [N]."""
+    """The direction of least spread around each point [N, 3]; whether that is flat, bool [N]."""
     _, index = cKDTree(points).query(points, _NEIGHBOURS)
     offset = points[index] - points[index].mean(axis=1, keepdims=True)
     variance, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", offset, offset))

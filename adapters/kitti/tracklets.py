@@ -124,10 +124,11 @@ def _parsed(path: Path) -> ET.Element:
     if path.stat().st_size > _MOST_BYTES:
         raise AdapterError(f"{path} is larger than {_MOST_BYTES // 2**20} MiB; no drive has that")
     text = _OWN_DOCTYPE.sub("", read_text(path), count=1)
-    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+    # A parser takes text with NUL characters for UTF-16, in which declarations look otherwise.
+    if "\0" in text or "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise AdapterError(
-            f"{path} declares a document type or entities of its own, which KITTI's files do not; "
-            f"copy it from the dataset"
+            f"{path} is not UTF-8, or declares a document type or entities, as no file of KITTI "
+            f"does; copy it from the dataset"
         )
     parser = ET.XMLParser(target=_BoundedBuilder(path))
     try:
