@@ -10,10 +10,12 @@ import cv2
 import numpy as np
 
 from augment.errors import OutputError
+from tools.drawing import text_width
 
 CELL_WIDTH = 400  # px of one image on a contact sheet
 MARGIN = 6
 CAPTION = 26
+_TITLE_SIZE = 0.6
 
 
 def contact_sheet(rows: Sequence[tuple[str, Sequence[tuple[str, np.ndarray]]]]) -> np.ndarray:
@@ -26,11 +28,12 @@ def contact_sheet(rows: Sequence[tuple[str, Sequence[tuple[str, np.ndarray]]]]) 
         round(image.shape[0] * CELL_WIDTH / image.shape[1]) for _, r in rows for _, image in r
     )
     row_height = CAPTION + cell_height + CAPTION + MARGIN
-    width = MARGIN + columns * (CELL_WIDTH + MARGIN)
+    longest = max(text_width(title, _TITLE_SIZE) for title, _ in rows)
+    width = MARGIN + max(columns * (CELL_WIDTH + MARGIN), 2 + longest + MARGIN)
     sheet = np.full((row_height * len(rows) + MARGIN, width, 3), 24, np.uint8)
     for r, (title, images) in enumerate(rows):
         top = MARGIN + r * row_height
-        _write(sheet, title, MARGIN + 2, top + CAPTION - 8, 0.6, (255, 255, 255))
+        _write(sheet, title, MARGIN + 2, top + CAPTION - 8, _TITLE_SIZE, (255, 255, 255))
         for c, (caption, image) in enumerate(images):
             left = MARGIN + c * (CELL_WIDTH + MARGIN)
             height = round(image.shape[0] * CELL_WIDTH / image.shape[1])
