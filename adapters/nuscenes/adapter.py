@@ -3,8 +3,9 @@
 World: nuScenes' global one, less whole metres where the drive is further than a kilometre from its
 origin. Ego: nuScenes' (x forward, y left, z up, origin on the ground below the rear axle), as it
 stood at the frame's LiDAR time. Images are undistorted as published. Cameras stand where the ego
-pose of their own image puts them. Frame numbers count the LiDAR's files, or keyframes, from 0 in
-order of time; `frame_tokens` says which rows of sample_data they are.
+pose of their own image puts them, and moving objects where the LiDAR met them (see turning.py).
+Frame numbers count the LiDAR's files, or keyframes, from 0 in order of time; `frame_tokens` says
+which rows of sample_data they are.
 """
 
 from __future__ import annotations
@@ -50,8 +51,8 @@ def open_nuscenes(path: str, query: dict[str, str]) -> Scene:
 
     Raises:
         AdapterError: a wrong option, tables that are missing, damaged or contradict each other, no
-            LiDAR, or a camera none of whose images can be used. Single images and sweeps that are
-            missing or damaged are Scene.problems.
+            LiDAR, no image, or a camera all of whose images are damaged. Single images and sweeps
+            that are missing or damaged are Scene.problems.
     """
     options = NuScenesOptions.from_query(query)
     tables = read_tables(Path(path), options.version, options.scene)
@@ -71,11 +72,19 @@ def open_nuscenes(path: str, query: dict[str, str]) -> Scene:
         )
     usable, image_problems = _usable_images(tables, used)
     frames = tuple(_frame(file, origin, usable) for file in used)
+    views = _views([frame for frame in frames if frame.index not in chosen.held_out])
+    if not views:
+        but = " but those held out" if chosen.held_out else ""
+        raise AdapterError(
+            f"{where}: none of frames {used[0].index} to {used[-1].index}{but} has a usable image, "
+            f"and colours come from images; choose more frames, or unpack samples/CAM_* and "
+            f"sweeps/CAM_*" + "".join(f"; {problem}" for problem in image_problems[:1])
+        )
     positions = np.array([file.sweep.world_from_ego[:3, 3] - origin for file in used])
     built = build_lidar_scene(
         sweeps,
         read_tracks(tables, used, origin),
-        _views([frame for frame in frames if frame.index not in chosen.held_out]),
+        views,
         DrivenPath(positions, np.array([file.sweep.timestamp_ns for file in used])),
         options.drive.scene_options(lidar_top_deg=_LIDAR_TOP_DEG),
     )
@@ -100,7 +109,7 @@ def _usable_images(
     """The images that can be used, by token; what is wrong with others, one sentence each.
 
     Raises:
-        AdapterError: no image of a camera that has some is usable.
+        AdapterError: a camera has images, but none is usable.
     """
     paths: dict[str, Path] = {}
     problems: list[str] = []

@@ -32,9 +32,9 @@ class NuScenesLabels:
     instance, the later box stands as it is. So it is in the devkit's get_boxes.
 
     Sweeps: columns x y z (metres, float64, nuScenes' global world), intensity (0 to 255) and ring
-    (both float32 as in the file), timestamp_ns (the file's time for all returns: those of each are
-    not published), and semantic (lidarseg's numbers, uint8) where the sweep has them. Returns of
-    the recording car are among them.
+    (both float32 as in the file), timestamp_ns (not published: the file's time less how long before
+    it the LiDAR looked there, see turning.py), and semantic (lidarseg's numbers, uint8) where the
+    sweep has them. Returns of the recording car are among them.
     """
 
     tables: SceneTables
@@ -54,7 +54,7 @@ class NuScenesLabels:
             return None
         columns = {name: returns.points_m[:, i] for i, name in enumerate("xyz")}
         columns |= {"intensity": returns.intensity, "ring": returns.ring}
-        columns["timestamp_ns"] = np.full(len(returns), frame.sweep.timestamp_ns)
+        columns["timestamp_ns"] = returns.timestamps_ns
         if returns.classes is not None:
             columns["semantic"] = returns.classes
         return LidarSweep(columns)

@@ -1,9 +1,9 @@
 """nuScenes' LiDAR files: returns in the global world, and sweeps of usable ones for a scene.
 
 A file holds records of five float32: x, y, z (metres, sensor's axes), intensity (0 to 255), ring.
-When each return was measured is not stored. The published files are taken as they are described:
-compensated for the car's motion during the turn of 50 ms, so that one pose, that of the file's own
-time, carries all of its returns.
+The published files are taken as they are described: compensated for the car's motion during the
+turn of 50 ms, so that one pose, that of the file's own time, carries all of its returns. When each
+was measured is not stored; its bearing tells (see turning.py).
 """
 
 from __future__ import annotations
@@ -37,9 +37,11 @@ class SweepFault(Exception):
 @dataclass(frozen=True, eq=False)
 class Returns:
     """What one LiDAR file holds. points_m: float64 [N, 3], global. intensity, ring: float32 [N], as
-    in the file. classes: uint8 [N], lidarseg's numbers, or None. problem: a sentence or ''."""
+    in the file. timestamps_ns: int64 [N], told by bearing. classes: uint8 [N], lidarseg's numbers,
+    or None. problem: a sentence or ''."""
 
     points_m: np.ndarray
+    timestamps_ns: np.ndarray
     intensity: np.ndarray
     ring: np.ndarray
     classes: np.ndarray | None
@@ -64,9 +66,18 @@ def read_returns(tables: SceneTables, sweep: SensorFile) -> Returns:
     records = np.frombuffer(content, "<f4").reshape(-1, 5)
     pose = sweep.world_from_sensor
     with np.errstate(all="ignore"):  # returns that are no numbers stay none
-        points = records[:, :3].astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
+        local = records[:, :3].astype(np.float64)
+        points = local @ pose[:3, :3].T + pose[:3, 3]
+        before = tables.turn.before_ns(local @ sweep.ego_from_sensor[:3, :3].T)
     classes, problem = _read_classes(tables, sweep, len(records))
-    return Returns(points, records[:, 3].copy(), records[:, 4].copy(), classes, problem)
+    return Returns(
+        points_m=points,
+        timestamps_ns=sweep.timestamp_ns - before,
+        intensity=records[:, 3].copy(),
+        ring=records[:, 4].copy(),
+        classes=classes,
+        problem=problem,
+    )
 
 
 def read_sweeps(
@@ -119,7 +130,7 @@ def _usable(
         semantic = table[returns.classes]
         keep &= (semantic != NO_SURFACE) & (returns.classes != EGO_CLASS)
     points = (returns.points_m[keep] - world_origin_m).astype(np.float32)
-    return Sweep(points, np.full(len(points), sweep.timestamp_ns), semantic[keep])
+    return Sweep(points, returns.timestamps_ns[keep], semantic[keep])
 
 
 def _bytes(path: Path) -> bytes:

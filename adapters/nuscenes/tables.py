@@ -12,13 +12,14 @@ are nanoseconds.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from adapters.nuscenes.rows import Row, read_all, read_rows, read_where, referred
+from adapters.nuscenes.turning import Turn
 from adapters.plain_files import inside
 from augment.errors import AdapterError
 
@@ -83,7 +84,7 @@ class SceneTables:
     """One scene, everything in order of time.
 
     lidar: sweeps of LIDAR_TOP. images: by camera. semantic_files: the lidarseg file of a sweep by
-    its token. class_names: by the numbers in those files.
+    its token. class_names: by the numbers in those files. turn: how the LiDAR turns.
     """
 
     root: Path
@@ -94,6 +95,7 @@ class SceneTables:
     images: Mapping[str, tuple[SensorFile, ...]]
     semantic_files: Mapping[str, str]
     class_names: Mapping[int, str]
+    turn: Turn
 
 
 def read_tables(root: Path, version: str | None, scene: str | None) -> SceneTables:
@@ -118,6 +120,7 @@ def read_tables(root: Path, version: str | None, scene: str | None) -> SceneTabl
             f"a scene cannot be built without LiDAR"
         )
     cameras = sorted({file.channel for file in files if file.intrinsic is not None})
+    images = {name: tuple(f for f in files if f.channel == name) for name in cameras}
     categories = read_all(folder / "category.json")
     return SceneTables(
         root=root,
@@ -125,10 +128,23 @@ def read_tables(root: Path, version: str | None, scene: str | None) -> SceneTabl
         name=row.text("name"),
         samples=_read_samples(folder, samples, categories),
         lidar=lidar,
-        images={name: tuple(f for f in files if f.channel == name) for name in cameras},
+        images=images,
         semantic_files=_read_semantic_files(root, folder, {file.token for file in lidar}),
         class_names=_class_names(categories),
+        turn=_read_turn(lidar, images),
     )
+
+
+def _read_turn(lidar: Sequence[SensorFile], images: Mapping[str, tuple[SensorFile, ...]]) -> Turn:
+    sweeps = {file.sample_token: file.timestamp_ns for file in lidar if file.is_key_frame}
+    keys = [
+        (np.arctan2(file.ego_from_sensor[1, 2], file.ego_from_sensor[0, 2]), file)
+        for files in images.values()
+        for file in files
+        if file.is_key_frame and file.sample_token in sweeps
+    ]
+    before = [sweeps[file.sample_token] - file.timestamp_ns for _, file in keys]
+    return Turn.of_images(np.array([bearing for bearing, _ in keys]), np.array(before))
 
 
 def _choose_version(root: Path, version: str | None) -> str:

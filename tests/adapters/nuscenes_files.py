@@ -50,7 +50,10 @@ SWEEPS, SWEEP_S = 11, 0.1  # of the LiDAR, keyframes among them
 IMAGES, IMAGE_S = 5, 0.25  # of each camera, keyframes among them
 START_US = (1_532_402_927_647_951, 1_535_000_000_000_000)
 # Channel: the street's camera, and how long before the LiDAR's keyframe it takes its own.
-CAMERAS = {"CAM_FRONT": ("front_camera", 30_000), "CAM_FRONT_LEFT": ("left_camera", 10_000)}
+# The LiDAR turns clockwise in 50 ms, and a camera is triggered as it looks along its axis; the turn
+# ends, and the sweep has its time, at 104.4 degrees to the left. So it is in the real keyframe.
+TURN_S, TURN_END_DEG = 0.05, 104.4
+CAMERAS = {"CAM_FRONT": ("front_camera", 35_500), "CAM_FRONT_LEFT": ("left_camera", 48_000)}
 EGO_FROM_LIDAR = np.array([[0.0, 1, 0, 0.94], [-1, 0, 0, 0], [0, 0, 1, 1.84], [0, 0, 0, 1]])
 _TURN = Rotation.from_euler("z", 30, degrees=True).as_matrix()
 _FAR = np.vstack([np.column_stack([_TURN, [2100.25, 900.5, 3.0]]), [0, 0, 0, 1]])
@@ -242,11 +245,24 @@ def world_from_ego(scene: int, time_s: float) -> np.ndarray:
     return WORLD_FROM_STREET[scene] @ pose
 
 
-def box_pose(scene: int, thing: str, time_s: float) -> np.ndarray:
-    """world_from_box of a thing of the street, which all look along the street's x."""
-    pose = np.eye(4)
+def place(thing: str, time_s: float) -> np.ndarray:
+    """Where the centre of a thing is in the street."""
     walked = np.array([12.0 + time_s, -4.0, street.GROUND_Z + 0.9])
-    pose[:3, 3] = {CAR: street.car_centre(time_s), PARKED: PARKED_AT, WALKER: walked}[thing]
+    return {CAR: street.car_centre(time_s), PARKED: PARKED_AT, WALKER: walked}[thing]
+
+
+def met_s(thing: str, time_s: float) -> float:
+    """When the sweep that has this time met a thing."""
+    x, y, _ = place(thing, time_s) - [street.EGO_SPEED_MPS * time_s + EGO_FROM_LIDAR[0, 3], 0, 0]
+    turned = (np.degrees(np.arctan2(y, x)) - TURN_END_DEG) % 360 / 360
+    return float(time_s - turned * TURN_S)
+
+
+def box_pose(scene: int, thing: str, time_s: float) -> np.ndarray:
+    """world_from_box of a thing as a keyframe of this time has it: where the LiDAR met it. All look
+    along the street's x."""
+    pose = np.eye(4)
+    pose[:3, 3] = place(thing, met_s(thing, time_s))
     return WORLD_FROM_STREET[scene] @ pose
 
 
@@ -299,7 +315,7 @@ def sweep(number: int) -> tuple[np.ndarray, np.ndarray]:
     a, b = rng.uniform(-0.5, 0.5, 300), rng.uniform(-0.4, 0.5, 300)
     half = np.full_like(a, 0.5)
     faces = [np.stack(face, 1) for face in ([-half, a, b], [a, -half, b], [a, b, half])]
-    car = np.concatenate(faces) * street.CAR_SIZE_M + street.car_centre(time)
+    car = np.concatenate(faces) * street.CAR_SIZE_M + place(CAR, met_s(CAR, time))
     own = np.array([[0.5, 0.3, 1.45], [1.5, -0.4, 1.4]]) + np.array(
         [street.EGO_SPEED_MPS * time, 0, street.GROUND_Z]
     )

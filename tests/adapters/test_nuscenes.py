@@ -80,7 +80,7 @@ def test_ego_and_cameras_have_their_own_poses_and_times(scene):
     np.testing.assert_allclose(frame.world_from_ego, expected, atol=1e-9)
     camera = frame.cameras["CAM_FRONT"]
     assert camera.timestamp_ns == files.image_times_us(1, "CAM_FRONT")[3] * 1000
-    pose = files.world_from_ego(1, 0.72) @ files.ego_from_camera("CAM_FRONT")
+    pose = files.world_from_ego(1, 0.7145) @ files.ego_from_camera("CAM_FRONT")
     pose[:3, 3] -= ORIGIN
     np.testing.assert_allclose(camera.world_from_camera, pose, atol=1e-9)
     assert frame.image_paths["CAM_FRONT"].endswith(files.filename(1, "CAM_FRONT", 3))
@@ -102,8 +102,9 @@ def test_the_moving_car_is_an_actor_where_its_boxes_are(scene):
     inside = np.abs(actor.gaussians.means.numpy()) <= street.CAR_SIZE_M / 2 + 0.1
     assert inside.all()
     for time in (0.0, 0.2, 0.5, 0.83):
+        # In the sweep's 40 ms before its boxes' time it moved by 0.24 m: that is accounted for.
         pose = actor.track.pose_at(files.START_US[1] * 1000 + round(time * 1e9)).numpy()
-        np.testing.assert_allclose(into_street(pose[:3, 3]), street.car_centre(time), atol=1e-6)
+        np.testing.assert_allclose(into_street(pose[:3, 3]), street.car_centre(time), atol=2e-3)
     # Where the car was at any time, nothing of it stays behind.
     means = into_street(scene.background.means.numpy().astype(np.float64))
     above = means[:, 2] > street.GROUND_Z + 0.2
@@ -184,7 +185,7 @@ def test_a_few_frames_between_keyframes_have_their_tracks(folder):
     assert [f.index for f in scene.frames] == [6, 7, 8]
     car = next(a for a in scene.actors if a.label == "vehicle.car")
     pose = car.track.pose_at(scene.frame(7).timestamp_ns)
-    np.testing.assert_allclose(pose[:3, 3], street.car_centre(0.7), atol=1e-6)
+    np.testing.assert_allclose(pose[:3, 3], street.car_centre(0.7), atol=2e-3)
     with pytest.raises(AdapterError, match=r"frames=20:30 selects none of the 11 frames"):
         open_nuscenes(str(folder), QUICK | {"frames": "20:30"})
 
@@ -252,6 +253,13 @@ def test_none_at_all_is_an_error(copy):
         open_nuscenes(str(copy), QUICK)
 
 
+def test_frames_without_images_are_an_error(folder):
+    with pytest.raises(AdapterError, match="none of frames 1 to 1 has a usable image, and"):
+        open_nuscenes(str(folder), QUICK | {"frames": "1:2"})
+    with pytest.raises(AdapterError, match="none of frames 5 to 6 but those held out has a usable"):
+        open_nuscenes(str(folder), QUICK | {"frames": "5:7", "held_out": "5:6"})
+
+
 @pytest.fixture(scope="module")
 def source(shared_dir) -> Path:
     folder = shared_dir / "data/nuscenes_keyframe"
@@ -289,6 +297,16 @@ def test_real_returns_project_as_by_the_sources_own_matrices(real, source):
         assert visible.sum() > 1500
         apart = np.linalg.norm((theirs[:2] / theirs[2] - ours[:2] / ours[2])[:, visible], axis=0)
         assert apart.mean() < 0.1, (name, apart.mean())
+
+
+def test_real_images_were_taken_as_the_lidar_looked_there(real):
+    turn = real.labels.tables.turn
+    assert np.degrees(turn.end_rad) == pytest.approx(files.TURN_END_DEG, abs=3)
+    for files_of in real.labels.tables.images.values():
+        (image,) = files_of
+        expected = turn.before_ns(image.ego_from_sensor[None, :3, 2])[0]
+        taken = real.frame(0).timestamp_ns - image.timestamp_ns
+        assert abs(expected - taken) < 1_000_000, image.channel
 
 
 def test_real_boxes_hold_their_returns(real):

@@ -60,7 +60,7 @@ def test_one_scene_is_read_in_order_of_time(folder):
     image = read.images["CAM_FRONT_LEFT"][1]
     assert image.filename == files.filename(1, "CAM_FRONT_LEFT", 1)
     assert (image.width, image.height, image.intrinsic) == (160, 96, (80.0, 80.0, 80.0, 48.0))
-    np.testing.assert_allclose(image.world_from_ego, files.world_from_ego(1, 0.24), atol=1e-9)
+    np.testing.assert_allclose(image.world_from_ego, files.world_from_ego(1, 0.202), atol=1e-9)
     np.testing.assert_allclose(
         image.ego_from_sensor, files.ego_from_camera("CAM_FRONT_LEFT"), atol=1e-12
     )
@@ -97,10 +97,12 @@ def test_boxes_between_keyframes_are_interpolated(folder):
     labels = nuscenes_labels(str(folder), {"scene": ONE})
     for frame in (6, 7, 8, 9):  # of the last keyframe at 1 s, after the one at 0.5 s
         boxes = labels.boxes(frame)
-        time = files.SWEEP_S * frame
         assert boxes.attributes["interpolated"].all() and len(boxes) == 3
-        expected = [files.box_pose(0, t, time)[:3, 3] for t in (files.CAR, files.PARKED)]
-        np.testing.assert_allclose(boxes.centers_m[:2], expected, atol=1e-9)
+        fraction = (files.SWEEP_S * frame - 0.5) / 0.5
+        for i, thing in enumerate((files.CAR, files.PARKED, files.WALKER)):
+            before, after = (files.box_pose(0, thing, t)[:3, 3] for t in (0.5, 1.0))
+            expected = before + fraction * (after - before)
+            np.testing.assert_allclose(boxes.centers_m[i], expected, atol=1e-9)
     early = labels.boxes(2)
     # The first keyframe has no walker: the second's stands as it is.
     assert early.track_ids[2] == files.instance_token(0, files.WALKER)
@@ -135,16 +137,35 @@ def test_sweeps_pass_through_in_the_global_world(folder):
     np.testing.assert_allclose(sweep.points_m, expected, atol=1e-5)  # float32 at 40 m
     np.testing.assert_array_equal(sweep.columns["ring"], np.arange(len(points)) % 32)
     np.testing.assert_array_equal(sweep.columns["intensity"], np.arange(len(points)) % 256)
-    assert set(sweep.columns["timestamp_ns"].tolist()) == {files.sweep_times_us(1)[5] * 1000}
+    # The car is met where it is, some 39 ms before the sweep's time.
+    car = np.median(sweep.columns["timestamp_ns"][classes == 17]) - files.START_US[1] * 1000
+    assert car == pytest.approx(files.met_s(files.CAR, 0.5) * 1e9, abs=1e6)
+    before = files.sweep_times_us(1)[5] * 1000 - sweep.columns["timestamp_ns"]
+    assert 0 <= before.min() < 1e6 and 49e6 < before.max() <= 50e6
     np.testing.assert_array_equal(sweep.columns["semantic"], classes)
     assert "semantic" not in labels.lidar(4).columns
+
+
+def test_unlike_cameras_tell_no_turn(copy, folder):
+    assert np.degrees(tables(folder).turn.end_rad) == pytest.approx(files.TURN_END_DEG, abs=0.5)
+    content = files.read_table(copy, "sample_data")
+    for row in content:
+        if "CAM_FRONT__" in row["filename"]:
+            row["timestamp"] += 20_000  # of a turn of 50 ms
+    files.write_table(copy, "sample_data", content)
+    assert tables(copy).turn.end_rad is None
+    times = nuscenes_labels(str(copy), {"scene": ONE}).lidar(3).columns["timestamp_ns"]
+    assert set(times.tolist()) == {files.sweep_times_us(0)[3] * 1000}
+    alone = [row for row in content if "CAM_FRONT__" not in row["filename"]]
+    files.write_table(copy, "sample_data", alone)
+    assert tables(copy).turn.end_rad is None
 
 
 def test_frames_name_their_rows(folder):
     found = frame_tokens(str(folder), {"scene": TWO})
     assert list(found) == list(range(files.SWEEPS))
     assert all(found[i]["LIDAR_TOP"].token == files.data_token(1, "LIDAR_TOP", i) for i in found)
-    # Images at -0.03, 0.22, 0.47, 0.72, 0.97 s; sweeps each tenth of a second.
+    # Images some 0.04 s before 0, 0.25, 0.5, 0.75, 1 s; sweeps each tenth of a second.
     for channel in files.CAMERAS:
         numbers = {0: 0, 2: 1, 5: 2, 7: 3, 10: 4}
         assert {i: f[channel].token for i, f in found.items() if channel in f} == {
