@@ -7,12 +7,11 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from adapters.uri import CAMERA_PATH_KEY, parse_uri
-from augment.batch.mirror import MIRROR_FOLDER
 from augment.batch.mirror_tree import SourceTree
 from augment.errors import AdapterError
 from augment.scene import Scene
 
-_KITTI_CAMERA = r"image_\d\d/data/[^/]+\.png"
+_KITTI_CAMERA = r"image_\d\d/data/\d+\.(?i:png|jpg)"
 
 
 def source_tree(scene: Scene) -> SourceTree:
@@ -56,23 +55,23 @@ def _nuscenes(folder: Path) -> tuple[Path, str, None]:
 
 def _kitti(folder: Path) -> tuple[Path, str, Iterable[str] | None]:
     """A drive with the calibration beside it, in the folder of its date; or the folder itself."""
-    if not (folder / "velodyne_points").is_dir():
-        return folder, r"((training|testing)/)?image_\d/[^/]+\.png", None
-    if (folder / "calib_cam_to_cam.txt").is_file():
+    from adapters.kitti.layout import VELODYNE, kitti_root
+
+    if not (folder / VELODYNE).is_dir():
+        return folder, r"((training|testing)/)?image_\d/\d+\.(?i:png|jpg)", None
+    _, calibrated = kitti_root(folder)
+    if calibrated == folder:
         return folder, _KITTI_CAMERA, None
-    date = folder.parent
-    calibration = (path.name for path in date.glob("calib_*.txt"))
-    return date, rf"[^/]+/{_KITTI_CAMERA}", (folder.name, *calibration)
+    calibration = (path.name for path in calibrated.glob("calib_*.txt"))
+    return calibrated, rf"[^/]+/{_KITTI_CAMERA}", (folder.name, *calibration)
 
 
 def _street_gaussians(folder: Path) -> tuple[Path, str, None]:
     return folder, r"images/[^/]+\.(png|jpg)", None
 
 
-def _recording(folder: Path) -> tuple[Path, str, Iterable[str]]:
-    """All but the copy of a dataset that `climategs render` may have put beside its images."""
-    names = (name for name in os.listdir(folder) if name != MIRROR_FOLDER)
-    return folder, r"images/[^/]+/\d+\.(?i:png|jpe?g)", names
+def _recording(folder: Path) -> tuple[Path, str, None]:
+    return folder, r"images/[^/]+/\d+\.(?i:png|jpe?g)", None
 
 
 _TREES: dict[str, Callable[[Path], tuple[Path, str, Iterable[str] | None]]] = {

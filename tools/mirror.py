@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from adapters.source_trees import source_tree
-from augment.batch.layout import MANIFEST, variant_folder, variant_name
+from augment.batch.layout import MANIFEST, folder_name, variant_folder, variant_name
 from augment.batch.lock import OutputLock
-from augment.batch.manifest import read_manifest, rows_of
-from augment.batch.mirror import Links, Mirrored, check_apart, mirror_variant
-from augment.batch.mirror_images import dataset_format, weathered_images
+from augment.batch.manifest import OK, read_manifest, rows_of
+from augment.batch.mirror import (
+    MIRROR_FOLDER,
+    Links,
+    Mirrored,
+    check_apart,
+    mirror_dataset,
+    mirror_folder,
+    read_record,
+)
+from augment.batch.mirror_images import Weathered, dataset_format, weathered_images
 from augment.batch.mirror_tree import SourceTree, Survey, survey
 from augment.batch.trajectory import RECORDED
-from augment.errors import OutputError
+from augment.errors import AdapterError, OutputError
 from augment.scene import Scene
 from recipes.load import load_recipe
 from recipes.schema import Recipe
@@ -30,11 +38,12 @@ def recipes_for_source(
         AdapterError: the scene is of no dataset, or one that cannot be copied.
         OutputError: the output folder lies in it, or holds these images in another format.
     """
-    tree = source_tree(scene)
-    survey(tree)
+    tree, _ = _dataset(scene)
     written_as = dataset_format(scene.frames)
     for recipe in recipes:
-        check_apart(tree, out / variant_folder(scene.name, variant_name(recipe)))
+        for folder in (variant_folder(scene.name, variant_name(recipe)), MIRROR_FOLDER):
+            check_apart(tree, out / folder)
+        read_record(tree, mirror_folder(out, variant_name(recipe)))
         if not overwrite:
             _check_format(scene, out, recipe, written_as)
     return [_with_format(recipe, written_as) for recipe in recipes]
@@ -48,18 +57,19 @@ def mirror_outputs(
     links: Links = "hard",
     progress: bool = True,
 ) -> list[str]:
-    """Build or bring up to date the dataset's copy beside each variant's images.
+    """Build the copies of the dataset in the weather of each variant, or bring them up to date:
+    `out/source/<variant>/<the dataset's folder>`.
 
-    scene: the one they were rendered from. variants: names, or None for all of the scene's that the
-    manifest has. Returns what to tell: for each variant where its copy is and what it is made of.
+    scene: the one the images were rendered from. variants: names, or None for all of the scene's
+    that the manifest has. Images that a copy has from other scenes of the dataset stay in it.
+    Returns what to tell: for each variant where its copy is and what it is made of.
 
     Raises:
         AdapterError: the scene is of no dataset, or one that cannot be copied.
         OutputError: no such images, a folder that is in use or cannot be written.
     """
     out = out.absolute()
-    tree = source_tree(scene)
-    extent = survey(tree)
+    tree, extent = _dataset(scene)
     said = []
     with OutputLock(out):
         found = _rows(scene, out, variants)
@@ -68,7 +78,7 @@ def mirror_outputs(
     return said
 
 
-def mirror_folder(out: Path, scene_uri: str | None = None, *, links: Links = "hard") -> int:
+def mirror_again(out: Path, scene_uri: str | None = None, *, links: Links = "hard") -> int:
     """`climategs mirror`: opens the scene, builds the copies, prints. Returns the exit code."""
     from adapters.base import open_scene
 
@@ -86,6 +96,17 @@ def mirror_folder(out: Path, scene_uri: str | None = None, *, links: Links = "ha
     return 0
 
 
+def _dataset(scene: Scene) -> tuple[SourceTree, Survey]:
+    tree = source_tree(scene)
+    extent = survey(tree)
+    if not extent.images:
+        raise AdapterError(
+            f"{tree.root}, which {tree.uri} names, holds no camera images ({tree.images}); there "
+            f"is nothing that weathered images could replace"
+        )
+    return tree, extent
+
+
 def _mirror_rows(
     scene: Scene,
     out: Path,
@@ -96,24 +117,57 @@ def _mirror_rows(
     links: Links,
     progress: bool,
 ) -> list[str]:
-    folder = out / variant_folder(scene.name, name)
-    images, notes = weathered_images(out, rows, scene.frames, tree)
-    facts = {
-        "scene": scene.name,
-        "variant": name,
-        **{key: rows[0][key] for key in ("source", "recipe_hash", "version", "backend")},
-    }
-    done = mirror_variant(
+    folder = mirror_folder(out, name)
+    record = read_record(tree, folder)
+    quality = _jpeg_quality(out, scene.name, name)
+    images, notes = weathered_images(out, rows, scene.frames, tree, quality)
+    others, more = _of_other_scenes(scene, out, name, record["replaced"])
+    facts = {key: rows[0][key] for key in ("source", "recipe_hash", "version", "backend")}
+    known = {image.scene for image in others.values()}
+    scenes = {key: record["scenes"][key] for key in sorted(known & record["scenes"].keys())}
+    done = mirror_dataset(
         tree,
         folder,
-        images,
-        facts,
+        {**others, **images},
+        {**scenes, scene.name: facts},
         extent=extent,
         links=links,
-        jpeg_quality=load_recipe(folder / "recipe.yaml").resolve(0).output.jpeg_quality,
         progress=progress,
     )
-    return [*_sentences(done, tree, links), *notes]
+    return [*_sentences(done, tree, links), *(f"  {note}" for note in [*notes, *more])]
+
+
+def _of_other_scenes(
+    scene: Scene, out: Path, variant: str, recorded: Mapping[str, Mapping[str, Any]]
+) -> tuple[dict[str, Weathered], list[str]]:
+    """The images that the copy has from other scenes of the dataset, as far as they are there."""
+    images = {place: entry for place, entry in recorded.items() if entry["scene"] != scene.name}
+    if not images:
+        return {}, []
+    table = read_manifest(out)
+    pairs = {(entry["scene"], variant) for entry in images.values()}
+    rows = {row["image_path"]: row for row in rows_of(table, pairs) if row["status"] == OK}
+    qualities = {name: 0 for name, _ in pairs}
+    for name in qualities:
+        if any(row["scene"] == name for row in rows.values()):
+            qualities[name] = _jpeg_quality(out, name, variant)
+    found = {
+        place: Weathered.of_row(out, rows[entry["image"]], qualities[entry["scene"]])
+        for place, entry in images.items()
+        if entry["image"] in rows
+    }
+    gone = sorted(images.keys() - found.keys())
+    if not gone:
+        return found, []
+    return found, [
+        f"{len(gone)} images of other scenes, such as {gone[0]}, are no longer in the manifest: "
+        f"the source's own stand there again"
+    ]
+
+
+def _jpeg_quality(out: Path, scene: str, variant: str) -> int:
+    recipe = load_recipe(out / variant_folder(scene, variant) / "recipe.yaml")
+    return recipe.resolve(0).output.jpeg_quality
 
 
 def _rows(
@@ -121,8 +175,15 @@ def _rows(
 ) -> dict[str, list[dict[str, Any]]]:
     """The manifest's rows of the scene's variants, by name."""
     table = read_manifest(out)
+    pairs = {
+        (row["scene"], row["variant"]) for row in table.select(["scene", "variant"]).to_pylist()
+    }
+    if MIRROR_FOLDER in {folder_name(name) for name, _ in pairs}:
+        raise OutputError(
+            f"{out} has images of a scene called {MIRROR_FOLDER!r}, and copies of datasets lie in "
+            f"{out / MIRROR_FOLDER}: choose another output folder"
+        )
     if variants is None:
-        pairs = zip(table["scene"].to_pylist(), table["variant"].to_pylist(), strict=True)
         variants = sorted({variant for name, variant in pairs if name == scene.name})
     found = {name: rows_of(table, {(scene.name, name)}) for name in variants}
     absent = sorted(name for name, rows in found.items() if not rows)

@@ -1,10 +1,11 @@
 """A dataset's folder once more, with the images of a variant in place of the recorded ones.
 
-    <out>/<scene>/<variant>/source/<dataset's folder>/...   what the dataset's own tools read
-    <out>/<scene>/<variant>/source/climategs-mirror.json    what it is; there once it is complete
+    <out>/source/<variant>/<dataset's folder>/...                   what the dataset's tools read
+    <out>/source/<variant>/climategs-mirror-<dataset's folder>.json what it is; once it is complete
 
 All that is not replaced is the source's own file under a second name (a hard link), or a copy of it
 where links cannot be had. Building again goes on after a kill, and brings an older copy up to date.
+A dataset of many scenes has one copy, to which each scene adds its images.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from typing import Any, Literal
 from tqdm import tqdm
 
 from augment.batch.atomic import flush_folder, output_error, write_atomic
+from augment.batch.layout import folder_name
 from augment.batch.mirror_files import (
     COPIED,
     LINKED,
@@ -35,7 +37,7 @@ from augment.batch.mirror_tree import SourceFile, SourceFolder, SourceTree, Surv
 from augment.batch.writer import WritePump
 from augment.errors import AdapterError, OutputError
 
-MIRROR_FOLDER, MIRROR_RECORD = "source", "climategs-mirror.json"
+MIRROR_FOLDER = "source"
 Links = Literal["hard", "copy"]
 
 
@@ -77,37 +79,72 @@ def check_apart(tree: SourceTree, out_dir: Path) -> None:
         )
 
 
-def mirror_variant(
+def mirror_folder(out_dir: Path, variant: str) -> Path:
+    """Where the copies of datasets in a variant's weather lie."""
+    return out_dir / MIRROR_FOLDER / folder_name(variant)
+
+
+def read_record(tree: SourceTree, folder: Path) -> dict[str, Any]:
+    """What is known of the copy of a dataset: the images that stand in it, under `replaced`, by
+    place, with their scenes. Also of a copy that was being changed when it was stopped; nothing
+    where there is none.
+
+    Raises:
+        OutputError: the record is damaged, or the copy is that of another dataset.
+    """
+    path = next((p for p in _records(tree, folder) if p.is_file()), None)
+    if path is None:
+        return {"scenes": {}, "replaced": {}}
+    try:
+        record = json.loads(path.read_bytes())
+        scenes = {str(name): dict(facts) for name, facts in record["scenes"].items()}
+        images = {str(place): dict(image) for place, image in record["replaced"].items()}
+        if not all({"scene", "image", "sha256"} <= image.keys() for image in images.values()):
+            raise ValueError("an image lacks its scene")
+        root = record["folder"]
+    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+        raise OutputError(
+            f"{path} is damaged ({error!r}). Delete it and build the copy again, once for each "
+            f"scene whose images are in it"
+        ) from error
+    if root != str(tree.root):
+        raise OutputError(
+            f"{folder / tree.root.name} is the copy of {root}, not of {tree.root}: choose another "
+            f"output folder"
+        )
+    return {"scenes": scenes, "replaced": images}
+
+
+def mirror_dataset(
     tree: SourceTree,
-    variant_dir: Path,
+    folder: Path,
     images: Mapping[str, Weathered],
-    facts: Mapping[str, Any],
+    scenes: Mapping[str, Any],
     *,
     extent: Survey,
     links: Links = "hard",
-    jpeg_quality: int = 92,
     progress: bool = True,
 ) -> Mirrored:
-    """Build the copy of a dataset beside a variant's images, or bring it up to date.
+    """Build the copy of a dataset in a folder, or bring it up to date.
 
-    images: by place in the dataset. facts: for the record, in JSON's types. extent: `survey(tree)`.
-    links: hard, or copy for a copy that shares nothing with source and images. jpeg_quality: of
-    images that have to be encoded anew. Needs the lock of the output folder.
+    images: by place in the dataset, all that shall stand in the copy. scenes: facts of those that
+    the images are of, in JSON's types, for the record. extent: `survey(tree)`. links: hard, or copy
+    for a copy that shares nothing with source and images. Needs the lock of the output folder.
 
     Raises:
         AdapterError: a file of the source cannot be read, or a link leads out of it.
         OutputError: the system refused, or a link is in the way. No file is left half-written.
     """
-    check_apart(tree, variant_dir)
-    run = _Mirroring(tree, variant_dir / MIRROR_FOLDER, images, links, jpeg_quality)
+    check_apart(tree, folder)
+    run = _Mirroring(tree, folder, images, links)
     with tqdm(total=extent.files, unit="file", desc="copy", disable=not progress) as bar:
         run.go(bar)
-    run.finish(facts)
+    run.finish(scenes)
     return run.done
 
 
 class _Mirroring:
-    """One call of mirror_variant."""
+    """One call of mirror_dataset."""
 
     def __init__(
         self,
@@ -115,20 +152,19 @@ class _Mirroring:
         folder: Path,
         images: Mapping[str, Weathered],
         links: Links,
-        jpeg_quality: int,
     ) -> None:
         self.tree, self.folder, self.images = tree, folder, images
-        self.may_link, self.links, self.jpeg_quality = links == "hard", links, jpeg_quality
+        self.may_link, self.links = links == "hard", links
         self.root = str(folder / tree.root.name)
-        self.record = folder / MIRROR_RECORD
+        self.record, self.begun_record = _records(tree, folder)
         self.done = Mirrored(folder / tree.root.name)
         self.changed_folders: set[str] = set()
         self.fitted: list[str] = []
         self.is_begun = False
 
     def go(self, bar: tqdm) -> None:
-        for folder in (str(self.folder), self.root):
-            self._own(folder)
+        for folder in (self.folder.parent, self.folder, self.root):
+            self._own(str(folder))
         self.pump = WritePump()
         try:
             for folder in walk(self.tree):
@@ -141,22 +177,28 @@ class _Mirroring:
         done.new_size += sum(os.lstat(path).st_size for path in self.fitted)
         done.missing = sorted(self.images.keys() - done.replaced.keys() - set(done.unusable))
 
-    def finish(self, facts: Mapping[str, Any]) -> None:
+    def finish(self, scenes: Mapping[str, Any]) -> None:
         """Make the names durable, then say that the copy is complete."""
         try:
             for folder in sorted(self.changed_folders):
                 flush_folder(Path(folder))
         except OSError as error:
             raise output_error(self.folder, error) from error
-        text = json.dumps(self._described(facts), indent=1) + "\n"
+        text = json.dumps(self._described(scenes), indent=1) + "\n"
         if not (self.record.is_file() and self.record.read_bytes() == text.encode()):
             write_atomic(self.record, text.encode())
+        try:
+            self.begun_record.unlink(missing_ok=True)
+        except OSError as error:
+            raise output_error(self.begun_record, error) from error
 
     def _fill(self, folder: SourceFolder) -> None:
         path = self._target(folder.relative)
         names = [file.relative for file in folder.files] + [name for name, _ in folder.links]
         expected = {os.path.basename(name) for name in [*names, *folder.folders]}
         others = others_in(path, expected)
+        if not folder.relative:  # other drives, which the copy has from other scenes
+            others = [name for name in others if not os.path.lexists(self.tree.root / name)]
         self.done.others += [f"{folder.relative}/{name}".lstrip("/") for name in others]
         for inner in folder.folders:
             self._own(self._target(inner))
@@ -203,7 +245,11 @@ class _Mirroring:
         elif self._place(str(image.path), rendered, target) == COPIED:
             self.done.new += 1
             self.done.new_size += rendered.st_size
-        self.done.replaced[file.relative] = {"image": image.name, "sha256": image.checksum}
+        self.done.replaced[file.relative] = {
+            "scene": image.scene,
+            "image": image.name,
+            "sha256": image.checksum,
+        }
         sizes = (image.form.width, image.form.height), (recorded.width, recorded.height)
         if sizes[0] != sizes[1]:
             self.done.resized.append(sizes)
@@ -228,8 +274,7 @@ class _Mirroring:
         if _is_fitted(target, recorded, mtime_ns):
             return
         self._begin()
-        quality = self.jpeg_quality
-        self.pump.submit(lambda: write_file(fitted(image, recorded, quality), target, mtime_ns))
+        self.pump.submit(lambda: write_file(fitted(image, recorded), target, mtime_ns))
         self._changed(os.path.dirname(target))
 
     def _begin(self) -> None:
@@ -239,7 +284,7 @@ class _Mirroring:
         self.is_begun = True
         try:
             if self.record.exists():
-                self.record.unlink()
+                os.replace(self.record, self.begun_record)
                 flush_folder(self.folder)
         except OSError as error:
             raise output_error(self.record, error) from error
@@ -256,13 +301,12 @@ class _Mirroring:
     def _target(self, relative: str) -> str:
         return os.path.join(self.root, relative) if relative else self.root
 
-    def _described(self, facts: Mapping[str, Any]) -> dict[str, Any]:
+    def _described(self, scenes: Mapping[str, Any]) -> dict[str, Any]:
         done = self.done
         return {
-            **facts,
-            "dataset": self.tree.uri,
             "folder": str(self.tree.root),
             "links": self.links,
+            "scenes": scenes,
             "files": {
                 "linked": done.linked,
                 "copied": done.copied,
@@ -277,6 +321,12 @@ class _Mirroring:
             },
             "replaced": done.replaced,
         }
+
+
+def _records(tree: SourceTree, folder: Path) -> tuple[Path, Path]:
+    """The record of a complete copy, and its name while the copy is being changed."""
+    record = folder / f"climategs-mirror-{tree.root.name}.json"
+    return record, record.with_name(record.name + ".begun")
 
 
 def _is_fitted(target: str, recorded: ImageForm, mtime_ns: int) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -39,15 +39,28 @@ class ImageForm:
 class Weathered:
     """A finished image of ours and where the dataset has the recorded one.
 
-    place: relative to the dataset's root. path: of our file. name: the same, relative to the
-    output folder. form: what our file is. checksum: its SHA-256.
+    scene: whose image it is. path: of our file. name: the same, relative to the output folder.
+    form: what our file is. checksum: its SHA-256. jpeg_quality: for writing it anew.
     """
 
-    place: str
+    scene: str
     path: Path
     name: str
     form: ImageForm
     checksum: str
+    jpeg_quality: int
+
+    @staticmethod
+    def of_row(out_dir: Path, row: Mapping[str, Any], jpeg_quality: int) -> Weathered:
+        """The image of a manifest's row.
+
+        Raises:
+            OutputError: the row names a file outside the output folder.
+        """
+        name = row["image_path"]
+        form = ImageForm("jpg" if name.endswith(".jpg") else "png", row["width"], row["height"])
+        path = resolve_inside(out_dir, name)
+        return Weathered(row["scene"], path, name, form, row["checksum"], jpeg_quality)
 
 
 def image_form(path: str | Path) -> ImageForm | None:
@@ -83,7 +96,11 @@ def dataset_format(frames: Iterable[Frame]) -> str:
 
 
 def weathered_images(
-    out_dir: Path, rows: Sequence[Mapping[str, Any]], frames: Sequence[Frame], tree: SourceTree
+    out_dir: Path,
+    rows: Sequence[Mapping[str, Any]],
+    frames: Sequence[Frame],
+    tree: SourceTree,
+    jpeg_quality: int,
 ) -> tuple[dict[str, Weathered], list[str]]:
     """The finished images of a variant's rows by their place in the dataset, and a sentence for
     those that have none.
@@ -104,9 +121,7 @@ def weathered_images(
             continue
         if place in found:
             doubled.append(place)
-        form = ImageForm(_format_of(row["image_path"]), row["width"], row["height"])
-        file = resolve_inside(out_dir, row["image_path"])
-        found[place] = Weathered(place, file, row["image_path"], form, row["checksum"])
+        found[place] = Weathered.of_row(out_dir, row, jpeg_quality)
     notes = []
     if unplaced:
         notes.append(
@@ -126,7 +141,7 @@ def fits(image: Weathered, recorded: ImageForm) -> bool:
     return image.form == recorded
 
 
-def fitted(image: Weathered, recorded: ImageForm, jpeg_quality: int) -> bytes:
+def fitted(image: Weathered, recorded: ImageForm) -> bytes:
     """Our image as a file of the recorded one's form: smaller by area, larger by cubic splines.
 
     Raises:
@@ -146,26 +161,13 @@ def fitted(image: Weathered, recorded: ImageForm, jpeg_quality: int) -> bytes:
         method = cv2.INTER_AREA if is_smaller else cv2.INTER_CUBIC
         rgb = np.asarray(cv2.resize(rgb, size, interpolation=method), np.uint8)
     if recorded.is_grey:
-        return encode_grey(rgb)
-    output = Output.model_validate({"image": recorded.format, "jpeg_quality": jpeg_quality})
-    return encode_image(rgb, output)
+        return _encode_grey(rgb)
+    settings = {"image": recorded.format, "jpeg_quality": image.jpeg_quality}
+    return encode_image(rgb, Output.model_validate(settings))
 
 
-def encode_grey(rgb: np.ndarray) -> bytes:
+def _encode_grey(rgb: np.ndarray) -> bytes:
     """uint8 [H, W, 3] as a PNG of its luma."""
     done, data = cv2.imencode(".png", cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY))
     assert done
     return data.tobytes()
-
-
-def resized(images: Collection[tuple[Weathered, ImageForm]]) -> list[tuple[Weathered, ImageForm]]:
-    """Those of another size than the recorded image."""
-    return [
-        (image, form)
-        for image, form in images
-        if (image.form.width, image.form.height) != (form.width, form.height)
-    ]
-
-
-def _format_of(name: str) -> str:
-    return "jpg" if name.endswith(".jpg") else "png"

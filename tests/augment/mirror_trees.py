@@ -8,14 +8,14 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from batch_scenes import SIZE, FakeLabels, fake_render, make_recipe, open_fake
 
 from augment.batch.job import RenderJob, run_job
 from augment.batch.manifest import read_manifest
-from augment.batch.mirror import Mirrored, mirror_variant
+from augment.batch.mirror import Mirrored, mirror_dataset, mirror_folder
 from augment.batch.mirror_images import weathered_images
 from augment.batch.mirror_tree import SourceTree, survey
 from augment.scene import Scene
+from tests.augment.batch_scenes import SIZE, FakeLabels, fake_render, make_recipe, open_fake
 
 IMAGES = r"camera/[^/]+/\d+\.(png|jpg)"
 CAMERAS = {"front": "front", "rear/left": "rear"}  # and their folders
@@ -78,13 +78,13 @@ def mirror(root: Path, out: Path, variant: str = "fog-000", **options) -> Mirror
     """Build the copy of the dataset with the images that `render` made."""
     tree = options.pop("tree", None) or tree_of(root)
     rows = [row for row in read_manifest(out).to_pylist() if row["variant"] == variant]
-    images, notes = weathered_images(out, rows, scene_of(root).frames, tree)
+    images, notes = weathered_images(out, rows, scene_of(root).frames, tree, 92)
     assert notes == []
-    return mirror_variant(
+    return mirror_dataset(
         tree,
-        out / "street" / variant,
+        mirror_folder(out, variant),
         images,
-        {"variant": variant},
+        {"street": {"seed": 7}},
         extent=survey(tree),
         progress=False,
         **options,

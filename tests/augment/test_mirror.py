@@ -44,7 +44,7 @@ def places(suffix: str = "png") -> set[str]:
 def test_the_copy_is_the_source_in_all_but_the_images(source, out):
     before = trees.snapshot(source)
     done = trees.mirror(source, out)
-    copy = out / "street/fog-000/source/drive"
+    copy = out / "source/fog-000/drive"
     assert done.folder == copy
     assert trees.listing(copy) == trees.listing(source)
     recorded, shown = trees.contents(source), trees.contents(copy)
@@ -64,14 +64,15 @@ def test_the_copy_is_the_source_in_all_but_the_images(source, out):
 
 def test_the_record_says_what_the_copy_is(source, out):
     trees.mirror(source, out)
-    record = json.loads((out / "street/fog-000/source/climategs-mirror.json").read_text())
-    assert record["dataset"] == f"test:{source}" and record["folder"] == str(source)
-    assert record["variant"] == "fog-000" and record["links"] == "hard"
+    record = json.loads((out / "source/fog-000/climategs-mirror-drive.json").read_text())
+    assert record["scenes"] == {"street": {"seed": 7}}
+    assert record["folder"] == str(source) and record["links"] == "hard"
     assert record["files"] == {
         "linked": 5, "copied": 0, "symbolic_links": 0, "camera_images": 8, "replaced_images": 8,
     }  # fmt: skip
     row = batch_scenes.tree_digest(out)["street/fog-000/images/front/000002.png"]
     assert record["replaced"]["camera/front/02.png"] == {
+        "scene": "street",
         "image": "street/fog-000/images/front/000002.png",
         "sha256": row,
     }
@@ -79,10 +80,10 @@ def test_the_record_says_what_the_copy_is(source, out):
 
 def test_building_again_changes_nothing(source, out):
     trees.mirror(source, out)
-    before = trees.snapshot(out / "street/fog-000/source")
+    before = trees.snapshot(out / "source/fog-000")
     done = trees.mirror(source, out)
     assert done.changed == 0 and len(done.replaced) == 8
-    assert trees.snapshot(out / "street/fog-000/source") == before
+    assert trees.snapshot(out / "source/fog-000") == before
 
 
 def test_more_images_come_in(source, tmp_path):
@@ -139,7 +140,7 @@ def test_going_on_after_a_kill_at_any_point(tmp_path, monkeypatch):
     source, out = trees.write_dataset(tmp_path / "drive", frames=1), tmp_path / "out"
     trees.render(source, out, frames=[0])
     (source / "camera" / "also").symlink_to("front")
-    copy = out / "street/fog-000/source"
+    copy = out / "source/fog-000"
     options = {"links": "copy"}
     uninterrupted = trees.mirror(source, out, **options)
     whole, before = trees.contents(copy), trees.snapshot(source)
@@ -205,9 +206,13 @@ def test_a_stopped_update_does_not_say_that_it_is_complete(source, tmp_path, mon
         )
         with pytest.raises(KeyboardInterrupt):
             trees.mirror(source, out)
-    record = out / "street/fog-000/source/climategs-mirror.json"
+    record = out / "source/fog-000/climategs-mirror-drive.json"
     assert not record.exists()
+    # What stood in the copy is still known, for images of other scenes.
+    known = mirror_module.read_record(trees.tree_of(source), record.parent)
+    assert set(known["replaced"]) == {"camera/front/00.png", "camera/rear/00.png"}
     trees.mirror(source, out)
+    assert [p.name for p in record.parent.iterdir() if p.is_file()] == [record.name]
     assert len(json.loads(record.read_text())["replaced"]) == 8
 
 
@@ -222,11 +227,11 @@ def test_a_full_disk_leaves_no_half_file(source, out, monkeypatch, call):
         patch.setattr(os, call, full)
         with pytest.raises(OutputError, match=r"cannot write .*free some space"):
             trees.mirror(source, out, links="copy")
-    copy = out / "street/fog-000/source"
+    copy = out / "source/fog-000"
     assert not any(p.name.endswith(TEMPORARY_SUFFIX) for p in copy.rglob("*"))
     for name, data in trees.contents(copy / "drive").items():
         assert data == whole[name]
-    assert not (copy / "climategs-mirror.json").exists()
+    assert not (copy / "climategs-mirror-drive.json").exists()
     assert trees.snapshot(source) == before
 
 
@@ -354,7 +359,7 @@ def test_links_that_lead_out_are_refused(source, out, tmp_path, link, text, mess
     (source / link).symlink_to(text)
     with pytest.raises(AdapterError, match=message):
         trees.mirror(source, out)
-    assert not (out / "street/fog-000/source").exists()
+    assert not (out / "source/fog-000").exists()
 
 
 def test_what_is_no_file_is_refused(source, out):
@@ -367,10 +372,10 @@ def test_what_is_no_file_is_refused(source, out):
 def test_nothing_is_written_through_a_link_in_the_output(source, out, place):
     """A copy that somebody began with `ln -s` would lead into the source."""
     before = trees.snapshot(source)
-    folder = out / "street/fog-000/source" / place
+    folder = out / "source/fog-000" / place
     folder.parent.mkdir(parents=True, exist_ok=True)
     folder.symlink_to(source / place.removeprefix("drive").lstrip("/"))
-    with pytest.raises(OutputError, match="is a link; the copy of the dataset needs a folder"):
+    with pytest.raises(OutputError, match=r"is a link; the copy of the data|lies in the dataset"):
         trees.mirror(source, out)
     assert trees.snapshot(source) == before
 
@@ -378,7 +383,7 @@ def test_nothing_is_written_through_a_link_in_the_output(source, out, place):
 @pytest.mark.parametrize("links", ["hard", "copy"])
 def test_a_link_in_a_files_place_is_replaced_itself(source, out, links):
     before = trees.snapshot(source)
-    folder = out / "street/fog-000/source/drive/camera/front"
+    folder = out / "source/fog-000/drive/camera/front"
     folder.mkdir(parents=True)
     (folder / "00.png").symlink_to(source / "camera/front/00.png")
     (folder / "poses.json").symlink_to(source / "camera/front/poses.json")
@@ -388,10 +393,10 @@ def test_a_link_in_a_files_place_is_replaced_itself(source, out, links):
 
 
 def test_a_folder_in_a_files_place_is_said(source, out):
-    (out / "street/fog-000/source/drive/README.md/mine").mkdir(parents=True)
+    (out / "source/fog-000/drive/README.md/mine").mkdir(parents=True)
     with pytest.raises(OutputError, match=r"cannot write .*README\.md"):
         trees.mirror(source, out)
-    assert (out / "street/fog-000/source/drive/README.md/mine").is_dir()
+    assert (out / "source/fog-000/drive/README.md/mine").is_dir()
 
 
 def test_a_source_that_cannot_be_written(source, out):
@@ -478,15 +483,16 @@ def test_recorded_images_that_are_none_stay(source, out):
     (source / "camera/front/01.png").unlink()
     rows = trees.read_manifest(out).to_pylist()
     frames = trees.scene_of(source).frames
-    images, notes = weathered_images(out, rows, frames, trees.tree_of(source))
+    images, notes = weathered_images(out, rows, frames, trees.tree_of(source), 92)
     assert notes == [
         "1 rendered images, such as frame 1, camera front, have no recorded image in the dataset: "
         "they are not in its copy"
     ]
     extent = trees.survey(trees.tree_of(source))
     assert extent.images == 7
-    done = mirror_module.mirror_variant(
-        trees.tree_of(source), out / "street/fog-000", images, {}, extent=extent, progress=False
+    folder = mirror_module.mirror_folder(out, "fog-000")
+    done = mirror_module.mirror_dataset(
+        trees.tree_of(source), folder, images, {}, extent=extent, progress=False
     )
     assert done.unusable == ["camera/front/00.png"] and len(done.replaced) == 6
     assert (done.folder / "camera/front/00.png").read_bytes() == b"GIF89a"

@@ -1,0 +1,370 @@
+"""Copies of datasets with weathered images, as the datasets' own loaders find them."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import cv2
+import numpy as np
+import nuscenes_files
+import pandaset_folder
+import pytest
+import recording_folder
+
+from adapters.base import open_scene
+from adapters.source_trees import source_tree
+from adapters.uri import format_uri
+from augment.batch.job import RenderJob, run_job
+from augment.batch.mirror_tree import survey
+from augment.errors import AdapterError
+from augment.scene import Scene
+from augment.scene_files import save_scene
+from recipes.schema import Recipe
+from tests.augment.batch_scenes import fake_render, make_recipe, open_fake
+from tests.augment.mirror_trees import contents, listing, snapshot
+from tools.mirror import mirror_outputs, recipes_for_source
+
+SMALL = {"voxel_m": "0.5", "image_scale": "0.5", "sky_size": "16", "max_gaussians": "3000"}
+KITTI = {**SMALL, "image_scale": "0.25"}
+
+
+def weather(scene: Scene, out: Path, *, scale: float = 1.0, **selection) -> tuple[Path, list[str]]:
+    """Images by a stand-in renderer, and the dataset's copy: its folder, and what was said."""
+    recipe = make_recipe(semantic=False, instance=False, depth="none", lidar=False)
+    settings = recipe.render.model_copy(update={"scale": scale})
+    (recipe,) = recipes_for_source(scene, out, [recipe.model_copy(update={"render": settings})])
+    job = RenderJob(scene.source, [recipe], out, **selection)
+    result = run_job(job, scene_loader=lambda _: scene, renderer=fake_render, progress=False)
+    assert result.failed == 0
+    said = mirror_outputs(scene, out, progress=False)
+    return out / "source" / "fog-000", said
+
+
+def changed_files(source: Path, copy: Path) -> set[str]:
+    """Files that differ; there are no others in either."""
+    assert listing(copy) == listing(source)
+    a, b = contents(source), contents(copy)
+    return {name for name in a if a[name] != b[name]}
+
+
+def relative_images(scene: Scene, root: Path) -> set[str]:
+    return {
+        str(Path(path).relative_to(root))
+        for frame in scene.frames
+        for path in frame.image_paths.values()
+    }
+
+
+def assert_same_but_colours(scene: Scene, again: Scene, old: Path, new: Path) -> None:
+    """Calibration, times, poses, labels, LiDAR; recorded images by another path."""
+    assert len(again.frames) == len(scene.frames)
+    for a, b in zip(scene.frames, again.frames, strict=True):
+        assert (a.index, a.timestamp_ns) == (b.index, b.timestamp_ns)
+        assert (a.world_from_ego == b.world_from_ego).all()
+        assert a.cameras.keys() == b.cameras.keys()
+        for name, camera in a.cameras.items():
+            other = b.cameras[name]
+            assert camera.timestamp_ns == other.timestamp_ns
+            assert (camera.width, camera.height, camera.fx) == (other.width, other.height, other.fx)
+            assert (camera.camera_from_world == other.camera_from_world).all()
+        moved = {name: path.replace(str(old), str(new)) for name, path in a.image_paths.items()}
+        assert moved == dict(b.image_paths)
+        boxes, same = scene.boxes(a.index), again.boxes(a.index)
+        assert boxes.track_ids == same.track_ids
+        assert (boxes.centers_m == same.centers_m).all() and (boxes.quats == same.quats).all()
+        sweep, equal = scene.lidar(a.index), again.lidar(a.index)
+        assert (sweep is None) == (equal is None)
+        if sweep is not None:
+            for name, column in sweep.columns.items():
+                assert np.array_equal(column, equal.columns[name])
+
+
+def test_a_pandaset_sequence(tmp_path):
+    root = pandaset_folder.write_sequence(tmp_path / "002")
+    scene = open_scene(format_uri("pandaset", root, SMALL))
+    before = snapshot(root)
+    copy, said = weather(scene, tmp_path / "out")
+    assert changed_files(root, copy / "002") == relative_images(scene, root)
+    again = open_scene(format_uri("pandaset", copy / "002", SMALL))
+    assert again.problems == scene.problems
+    assert_same_but_colours(scene, again, root, copy / "002")
+    assert snapshot(root) == before
+    shown = cv2.imread(str(copy / "002/camera/left_camera/01.jpg"))
+    rendered = cv2.imread(str(tmp_path / "out/002/fog-000/images/left_camera/000001.jpg"))
+    assert shown.shape == (pandaset_folder.HEIGHT, pandaset_folder.WIDTH, 3)
+    assert (shown == rendered).all()
+    assert "clear ones" not in "".join(said)
+
+
+def test_some_frames_and_cameras_of_a_sequence(tmp_path):
+    root = pandaset_folder.write_sequence(tmp_path / "002")
+    scene = open_scene(format_uri("pandaset", root, {**SMALL, "frames": "0:2"}))
+    copy, said = weather(scene, tmp_path / "out", frames=[1], cameras=["front_camera"])
+    assert changed_files(root, copy / "002") == {"camera/front_camera/01.jpg"}
+    assert "  5 of 6 camera images are the source's own, clear ones" in said
+
+
+def test_a_recording(tmp_path):
+    root = recording_folder.write_recording(tmp_path / "drive", depth=True)
+    scene = open_scene(format_uri("recording", root, SMALL))
+    copy, _ = weather(scene, tmp_path / "out")
+    assert changed_files(root, copy / "drive") == relative_images(scene, root)
+    again = open_scene(format_uri("recording", copy / "drive", SMALL))
+    assert_same_but_colours(scene, again, root, copy / "drive")
+
+
+def test_a_nuscenes_dataset(tmp_path):
+    root = nuscenes_files.write_dataset(tmp_path / "nuscenes")
+    uri = format_uri("nuscenes", root, {**SMALL, "scene": "scene-0001", "sweeps": "0"})
+    scene = open_scene(uri)
+    before = snapshot(root)
+    copy, said = weather(scene, tmp_path / "out")
+    copy = copy / "nuscenes"
+    assert changed_files(root, copy) == relative_images(scene, root)
+    assert len(relative_images(scene, root)) == nuscenes_files.SAMPLES * 2
+    for table in nuscenes_files.TABLES:
+        path = f"{nuscenes_files.VERSION}/{table}.json"
+        assert (copy / path).read_bytes() == (root / path).read_bytes()
+    for row in nuscenes_files.read_table(copy, "sample_data"):
+        assert (copy / row["filename"]).is_file()
+    again = open_scene(uri.replace(str(root), str(copy)))
+    assert_same_but_colours(scene, again, root, copy)
+    assert snapshot(root) == before
+    # Of two scenes with five images of each of two cameras, keyframes of one.
+    assert "  14 of 20 camera images are the source's own, clear ones" in said
+
+
+def test_nuscenes_sweeps_are_replaced_where_frames_have_them(tmp_path):
+    root = nuscenes_files.write_dataset(tmp_path / "nuscenes", scenes=["scene-0001"])
+    scene = open_scene(format_uri("nuscenes", root, {**SMALL, "sweeps": "1"}))
+    copy, _ = weather(scene, tmp_path / "out")
+    changed = changed_files(root, copy / "nuscenes")
+    assert changed == relative_images(scene, root)
+    assert any(name.startswith("sweeps/CAM_FRONT/") for name in changed)
+
+
+DEVKIT = """
+import json, sys
+from nuscenes.nuscenes import NuScenes
+found = []
+for root in sys.argv[1:]:
+    nusc = NuScenes(version="v1.0-mini", dataroot=root, verbose=False)
+    shown = {}
+    for sample in nusc.sample:
+        for channel, token in sample["data"].items():
+            path, boxes, intrinsic = nusc.get_sample_data(token)
+            key = path.replace(root, "")
+            shown[key] = [
+                open(path, "rb").read()[:8].hex(),
+                [[b.name, list(b.center), list(b.orientation.q)] for b in boxes],
+                None if intrinsic is None else [list(row) for row in intrinsic],
+            ]
+    found.append(shown)
+assert found[0].keys() == found[1].keys()
+for key in found[0]:
+    assert found[0][key][1:] == found[1][key][1:], key
+print(json.dumps(sorted(found[0])))
+"""
+
+
+def test_the_official_devkit_reads_the_copy(tmp_path):
+    python = os.environ.get("CLIMATEGS_NUSCENES_DEVKIT")
+    if python is None:
+        pytest.skip("CLIMATEGS_NUSCENES_DEVKIT names no Python with nuscenes-devkit")
+    root = nuscenes_files.write_dataset(tmp_path / "nuscenes", scenes=["scene-0001"])
+    scene = open_scene(format_uri("nuscenes", root, SMALL))
+    copy, _ = weather(scene, tmp_path / "out")
+    command = [python, "-c", DEVKIT, str(root), str(copy / "nuscenes")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    images = {name for name in json.loads(done.stdout) if "CAM_" in name}
+    assert len(images) == 2 * nuscenes_files.SAMPLES
+
+
+def write_kitti_drive(shared_dir: Path, folder: Path, *, calibration: str) -> Path:
+    """The real frames as a drive, whose calibration is in the drive's folder or the day's."""
+    real = shared_dir / "data/kitti_raw_seq/2011_09_26"
+    if not real.is_dir():
+        pytest.skip(f"no KITTI drive at {real}")
+    day = folder / "2011_09_26"
+    drive = day / "2011_09_26_drive_0001_sync"
+    drive.mkdir(parents=True)
+    for name in ("image_02", "velodyne_points"):
+        shutil.copytree(real / name, drive / name, copy_function=shutil.copyfile)
+        for path in (drive / name, drive / name / "data"):
+            path.chmod(0o755)
+    for path in real.glob("calib_*.txt"):
+        shutil.copyfile(path, (day if calibration == "day" else drive) / path.name)
+    (day / "another_drive_sync").mkdir()
+    return drive
+
+
+def test_drives_of_one_day_share_a_copy(shared_dir, tmp_path):
+    """As `pykitti.raw(folder, date, drive)` reads them; the day's third drive stays out."""
+    drive = write_kitti_drive(shared_dir, tmp_path, calibration="day")
+    other = Path(shutil.copytree(drive, drive.with_name("2011_09_26_drive_0002_sync")))
+    for place in (drive, other):
+        scene = open_scene(format_uri("kitti", place, {**KITTI, "frames": "2:3"}))
+        copy, said = weather(scene, tmp_path / "out", scale=0.1)
+        assert not any("not the source's" in sentence for sentence in said)
+    day = copy / "2011_09_26"
+    for place in (drive, other):
+        assert changed_files(place, day / place.name) == {"image_02/data/0000000002.png"}
+    assert not (day / "another_drive_sync").exists()
+
+
+@pytest.mark.parametrize("calibration", ["day", "drive"])
+def test_a_kitti_drive(shared_dir, tmp_path, calibration):
+    drive = write_kitti_drive(shared_dir, tmp_path, calibration=calibration)
+    query = {**KITTI, "frames": "1:2"}  # one frame needs no poses
+    scene = open_scene(format_uri("kitti", drive, query))
+    root = drive.parent if calibration == "day" else drive
+    copy, said = weather(scene, tmp_path / "out", scale=0.1)
+    copy = copy / root.name
+    again = copy / drive.name if calibration == "day" else copy
+    assert changed_files(drive, again) == {"image_02/data/0000000001.png"}
+    if calibration == "day":
+        assert sorted(path.name for path in copy.iterdir()) == sorted(
+            [drive.name, "calib_cam_to_cam.txt", "calib_velo_to_cam.txt"]
+        )
+    assert_same_but_colours(scene, open_scene(format_uri("kitti", again, query)), drive, again)
+    assert "  3 of 4 camera images are the source's own, clear ones" in said
+    recorded = cv2.imread(str(drive / "image_02/data/0000000001.png"))
+    shown = cv2.imread(str(again / "image_02/data/0000000001.png"))
+    assert shown.shape == recorded.shape
+    (resized,) = (sentence for sentence in said if "rendered at another size" in sentence)
+    assert f"for {recorded.shape[1]}x{recorded.shape[0]} pixels" in resized
+
+
+def test_kitti_object_frames(shared_dir, tmp_path):
+    """Each is a scene of its own: one copy of the dataset takes the images of all of them."""
+    real = shared_dir / "data/kitti_object"
+    if not real.is_dir():
+        pytest.skip(f"no KITTI frames at {real}")
+    root = tmp_path / "object"
+    shutil.copytree(real, root / "training", copy_function=shutil.copyfile)
+    for path in [root, *root.rglob("*")]:
+        path.chmod(0o755)
+    (root / "ImageSets").mkdir()
+    expected = set()
+    for frame in ("1", "2"):
+        scene = open_scene(format_uri("kitti", root, {**KITTI, "frame": frame}))
+        copy, _ = weather(scene, tmp_path / "out", scale=0.1)
+        expected |= relative_images(scene, root)
+        assert changed_files(root, copy / "object") == expected
+    assert expected == {f"training/image_2/00000{frame}.png" for frame in (1, 2)}
+
+
+def street_scene(root: Path, **changes) -> Scene:
+    """A scene of Street Gaussians' data, or of a model trained on it, by its images alone."""
+    scene = open_fake("fake:waymo")
+    names = {"front": 0, "rear/left": 3}
+    frames = tuple(
+        dataclasses.replace(
+            frame,
+            image_paths={
+                name: str(root / "images" / f"{frame.index:06d}_{number}.png")
+                for name, number in names.items()
+            },
+        )
+        for frame in scene.frames
+    )
+    return dataclasses.replace(scene, frames=frames, **changes)
+
+
+@pytest.mark.parametrize("is_model", [False, True])
+def test_street_gaussians_data(tmp_path, is_model):
+    """Rendered by a model at another size than recorded, as the project's own are."""
+    root = tmp_path / "data" / "waymo" / "002"
+    (root / "images").mkdir(parents=True)
+    (root / "ego_pose").mkdir()
+    (root / "ego_pose" / "000000.txt").write_text("1 0 0 0\n")
+    for frame in range(4):
+        for camera in (0, 3, 4):
+            image = np.full((19, 29, 3), 10 * camera, np.uint8)
+            cv2.imwrite(str(root / "images" / f"{frame:06d}_{camera}.png"), image)
+    data = f"street_gaussians:{root}"
+    model = {"source": f"street_gaussians:{tmp_path}/model", "recorded_source": data}
+    scene = street_scene(root, **(model if is_model else {"source": data}))
+    copy, said = weather(scene, tmp_path / "out")
+    assert changed_files(root, copy / "002") == relative_images(scene, root)
+    assert cv2.imread(str(copy / "002/images/000001_3.png")).shape == (19, 29, 3)
+    assert "  4 of 12 camera images are the source's own, clear ones" in said
+
+
+def test_a_fitted_scene_has_its_recordings_tree(tmp_path):
+    root = pandaset_folder.write_sequence(tmp_path / "002")
+    scene = open_scene(format_uri("pandaset", root, SMALL))
+    save_scene(scene, tmp_path / "fitted")
+    fitted = open_scene(f"scene:{tmp_path / 'fitted'}")
+    assert source_tree(fitted).root == root
+    root.rename(tmp_path / "moved")
+    with pytest.raises(AdapterError, match=r"002, which the scene was made from, .*data=URI"):
+        source_tree(open_scene(f"scene:{tmp_path / 'fitted'}"))
+    moved = open_scene(f"scene:{tmp_path / 'fitted'}?data=pandaset:{tmp_path / 'moved'}")
+    copy, _ = weather(moved, tmp_path / "out")
+    assert changed_files(tmp_path / "moved", copy / "moved") == relative_images(
+        moved, tmp_path / "moved"
+    )
+
+
+def test_the_real_sequence_at_a_twentieth(shared_dir, tmp_path):
+    real = shared_dir / "data/pandaset_mini/002"
+    if not real.is_dir():
+        pytest.skip(f"no PandaSet sequence at {real}")
+    query = {"frames": "10:12", "voxel_m": "0.5", "image_scale": "0.25", "sky_size": "16"}
+    scene = open_scene(format_uri("pandaset", real, query))
+    before = {path: path.stat().st_mtime_ns for path in real.rglob("*")}
+    chosen = {"frames": [11], "cameras": ["back_camera", "front_camera"]}
+    copy, said = weather(scene, tmp_path / "out", scale=0.05, **chosen)
+    names = {f"camera/{name}/11.jpg" for name in chosen["cameras"]}
+    assert listing(copy / "002") == listing(real)
+    for path in real.rglob("*"):
+        within = str(path.relative_to(real))
+        if path.is_file():
+            same = (copy / "002" / within).read_bytes() == path.read_bytes()
+            assert same == (within not in names), within
+    assert before == {path: path.stat().st_mtime_ns for path in real.rglob("*")}
+    assert "  154 of 156 camera images are the source's own, clear ones" in said
+    for name in names:
+        assert cv2.imread(str(copy / "002" / name)).shape == (1080, 1920, 3)
+    again = open_scene(format_uri("pandaset", copy / "002", query))
+    assert again.problems == scene.problems
+    assert_same_but_colours(scene, again, real, copy / "002")
+
+
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        ("procedural:street?seed=3", "has no dataset's folder .*pandaset, nuscenes, kitti, "),
+        ("gaussians:model.ply", "has no dataset's folder"),
+        ("fake:street", "has no dataset's folder"),
+        ("pandaset:/no/such/002", "/no/such/002, which the scene was made from, is no folder"),
+        ("pandaset:.?camera_path=path.json", "shows the frames of a camera path"),
+    ],
+)
+def test_scenes_without_a_tree_are_refused(source, message):
+    scene = dataclasses.replace(open_fake("fake:street"), source=source)
+    with pytest.raises(AdapterError, match=message):
+        source_tree(scene)
+
+
+def test_a_dataset_without_images_is_refused(tmp_path):
+    (tmp_path / "model").mkdir()
+    scene = street_scene(tmp_path, source=f"street_gaussians:{tmp_path / 'model'}")
+    recipe: Recipe = make_recipe()
+    with pytest.raises(AdapterError, match=r"model, which .* names, holds no camera images"):
+        recipes_for_source(scene, tmp_path / "out", [recipe])
+
+
+def test_images_are_counted_by_their_place(tmp_path):
+    root = nuscenes_files.write_dataset(tmp_path / "nuscenes")
+    (root / "maps").mkdir(exist_ok=True)
+    (root / "maps" / "more.png").write_bytes(b"")
+    tree = source_tree(dataclasses.replace(open_fake("fake:x"), source=f"nuscenes:{root}"))
+    assert survey(tree).images == 20

@@ -1,0 +1,298 @@
+"""`--layout source`: what is checked before rendering, what is said, and copies of many scenes."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from augment.batch.job import RenderJob, run_job
+from augment.batch.manifest import read_manifest
+from augment.errors import AdapterError, ClimateGSError, OutputError
+from augment.scene import Scene
+from tests.augment.batch_scenes import SIZE, fake_render, make_recipe, open_fake
+from tests.augment.mirror_trees import contents
+from tools import render as render_tools
+from tools.mirror import mirror_again, mirror_outputs, recipes_for_source
+
+CAMERAS = {"front": "front", "rear/left": "left"}
+FRAMES = 4
+
+
+def write_sequence(root: Path, suffix: str = "jpg", size: tuple[int, int] = SIZE) -> Path:
+    """The images of a PandaSet sequence: enough to be copied, too little to be opened."""
+    for folder in CAMERAS.values():
+        (root / "camera" / folder).mkdir(parents=True)
+        for frame in range(FRAMES):
+            image = np.full((*size[::-1], 3), 40 * frame, np.uint8)
+            cv2.imwrite(str(root / "camera" / folder / f"{frame:02d}.{suffix}"), image)
+    (root / "lidar").mkdir()
+    (root / "lidar" / "poses.json").write_text("[]")
+    return root
+
+
+def scene_of(root: Path, name: str = "street", frames: tuple[int, ...] = (0, 1, 2, 3)) -> Scene:
+    """A scene of some frames of the sequence."""
+    scene = open_fake(f"fake:{name}")
+    chosen = [
+        dataclasses.replace(
+            scene.frame(number),
+            image_paths={
+                camera: str(root / "camera" / folder / f"{number:02d}.jpg")
+                for camera, folder in CAMERAS.items()
+            },
+        )
+        for number in frames
+    ]
+    source = f"pandaset:{root}?scene={name}"
+    return dataclasses.replace(scene, source=source, frames=tuple(chosen))
+
+
+def recipe_of(name: str = "fog", **options):
+    return make_recipe(
+        name, semantic=False, instance=False, depth="none", lidar=False, labels=False, **options
+    )
+
+
+def render(scene: Scene, out: Path, recipe=None, **selection) -> None:
+    recipe = recipe or recipes_for_source(scene, out, [recipe_of()])[0]
+    job = RenderJob(scene.source, [recipe], out, **selection)
+    run_job(job, scene_loader=lambda _: scene, renderer=fake_render, progress=False)
+
+
+def changed(root: Path, copy: Path) -> set[str]:
+    a, b = contents(root), contents(copy)
+    assert a.keys() == b.keys()
+    return {name for name in a if a[name] != b[name]}
+
+
+@pytest.fixture
+def root(tmp_path) -> Path:
+    return write_sequence(tmp_path / "002")
+
+
+def test_recipes_get_the_datasets_format(root, tmp_path):
+    (recipe,) = recipes_for_source(scene_of(root), tmp_path / "out", [recipe_of()])
+    assert recipe.output.image == "jpg" and recipe.hash != recipe_of().hash
+    assert recipe.hash == recipe_of(image="jpg").hash
+
+
+def test_what_is_said(root, tmp_path):
+    scene, out = scene_of(root), tmp_path / "out"
+    render(scene, out, frames=[1, 2], cameras=["front"])
+    said = mirror_outputs(scene, out, progress=False)
+    copy = out / "source/fog-000/002"
+    shared = sum(len(data) for data in contents(root).values()) - sum(
+        (root / f"camera/front/0{frame}.jpg").stat().st_size for frame in (1, 2)
+    )
+    assert said == [
+        f"dataset: {copy} (9 of 9 files put in place now, the rest were there)",
+        f"  2 weathered images (0.0 MB of 0 of them beside the rendered files), 7 files shared "
+        f"with {root} ({shared / 1e6:.1f} MB, no disk used), 0 copied (0.0 MB)",
+        "  6 of 8 camera images are the source's own, clear ones",
+        f"  to change files there in place would change {root} too; --links copy shares nothing",
+    ]
+    assert changed(root, copy) == {"camera/front/01.jpg", "camera/front/02.jpg"}
+    again = mirror_outputs(scene, out, links="copy", progress=False)
+    assert "(9 of 9 files put in place now" in again[0] and not any("--links" in s for s in again)
+    assert "(0 of 9 files put in place now" in mirror_outputs(scene, out, progress=False)[0]
+
+
+def test_variants_have_copies_of_their_own(root, tmp_path):
+    scene, out = scene_of(root), tmp_path / "out"
+    for name in ("fog", "clear"):
+        render(scene, out, *recipes_for_source(scene, out, [recipe_of(name)]), frames=[0])
+    mirror_outputs(scene, out, variants=["clear-000"], progress=False)
+    assert [path.name for path in (out / "source").iterdir()] == ["clear-000"]
+    mirror_outputs(scene, out, progress=False)
+    fog, clear = (contents(out / f"source/{n}-000/002") for n in ("fog", "clear"))
+    assert fog["camera/left/00.jpg"] != clear["camera/left/00.jpg"]
+    assert fog["camera/left/01.jpg"] == clear["camera/left/01.jpg"]
+
+
+def test_scenes_of_one_dataset_share_a_copy(root, tmp_path):
+    """As the scenes of nuScenes, whose loader takes the dataset as a whole."""
+    one, two = scene_of(root, "one", (0, 1)), scene_of(root, "two", (2,))
+    out, copy = tmp_path / "out", tmp_path / "out/source/fog-000/002"
+    render(one, out)
+    mirror_outputs(one, out, progress=False)
+    render(two, out)
+    said = mirror_outputs(two, out, progress=False)
+    whole = {f"camera/{c}/{f:02d}.jpg" for c in CAMERAS.values() for f in (0, 1, 2)}
+    assert changed(root, copy) == whole
+    assert "(2 of 9 files put in place now" in said[0] and said[2].startswith("  2 of 8 camera")
+    record = json.loads((out / "source/fog-000/climategs-mirror-002.json").read_text())
+    assert sorted(record["scenes"]) == ["one", "two"]
+    assert record["scenes"]["one"]["source"] == one.source
+    # Neither scene's next run gives up the other's.
+    assert "(0 of 9 files" in mirror_outputs(one, out, progress=False)[0]
+    assert changed(root, copy) == whole
+
+
+def test_a_stopped_copy_keeps_other_scenes(root, tmp_path, monkeypatch):
+    one, two = scene_of(root, "one", (0, 1)), scene_of(root, "two", (2,))
+    out = tmp_path / "out"
+    render(one, out)
+    mirror_outputs(one, out, progress=False)
+    render(two, out)
+
+    def stopped(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("augment.batch.mirror.link_file", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            mirror_outputs(two, out, progress=False)
+    mirror_outputs(two, out, progress=False)
+    assert len(changed(root, out / "source/fog-000/002")) == 6
+
+
+def test_images_that_are_gone_give_way_to_the_clear_ones(root, tmp_path):
+    one, two = scene_of(root, "one", (0, 1)), scene_of(root, "two", (2,))
+    out = tmp_path / "out"
+    render(one, out)
+    mirror_outputs(one, out, progress=False)
+
+    def broken(*_, **__):
+        raise ValueError("no")
+
+    job = RenderJob(one.source, [recipe_of(image="jpg")], out, overwrite=True)
+    run_job(job, scene_loader=lambda _: one, renderer=broken, progress=False)
+    render(two, out)
+    said = mirror_outputs(two, out, progress=False)
+    assert said[-1] == (
+        "  4 images of other scenes, such as camera/front/00.jpg, are no longer in the manifest: "
+        "the source's own stand there again"
+    )
+    assert changed(root, out / "source/fog-000/002") == {
+        "camera/front/02.jpg",
+        "camera/left/02.jpg",
+    }
+
+
+def test_images_in_another_format_are_not_rendered_twice(root, tmp_path):
+    scene, out = scene_of(root), tmp_path / "out"
+    render(scene, out, recipe_of(), frames=[0])
+    with pytest.raises(OutputError, match=r"holds these images as png, and the dataset has jpg"):
+        recipes_for_source(scene, out, [recipe_of()])
+    recipes_for_source(scene, out, [recipe_of()], overwrite=True)
+    # What it advises: the copy is made from what is there.
+    mirror_outputs(scene, out, progress=False)
+    copy = out / "source/fog-000/002"
+    assert changed(root, copy) == {"camera/front/00.jpg", "camera/left/00.jpg"}
+    assert (copy / "camera/front/00.jpg").read_bytes()[:2] == b"\xff\xd8"
+
+
+def test_making_the_copy_again_by_itself(root, tmp_path, monkeypatch, capsys):
+    scene, out = scene_of(root), tmp_path / "out"
+    render(scene, out, frames=[0])
+    opened = []
+    monkeypatch.setattr("adapters.base.open_scene", lambda uri: opened.append(uri) or scene)
+    assert mirror_again(out) == 0
+    assert opened == [scene.source]
+    assert str(out / "source/fog-000/002") in capsys.readouterr().out
+    render(scene_of(root, "other"), out, frames=[0])
+    with pytest.raises(OutputError, match=r"has images of 2 scenes: .*name one of them"):
+        mirror_again(out)
+    assert mirror_again(out, "pandaset:002", links="copy") == 0
+
+
+def test_wrong_scenes_and_folders_are_refused(root, tmp_path):
+    scene, out = scene_of(root), tmp_path / "out"
+    render(scene, out, frames=[0])
+    with pytest.raises(OutputError, match="has no images of scene 'other'"):
+        mirror_outputs(scene_of(root, "other"), out, progress=False)
+    with pytest.raises(OutputError, match="has no images of scene 'street' and snow-000"):
+        mirror_outputs(scene, out, variants=["fog-000", "snow-000"], progress=False)
+    elsewhere = dataclasses.replace(scene, source=f"{scene.source}&frames=0:2")
+    with pytest.raises(OutputError, match=r"was rendered from .*, not from .*frames=0:2"):
+        mirror_outputs(elsewhere, out, progress=False)
+    with pytest.raises(OutputError, match="lies in the dataset's own folder"):
+        recipes_for_source(scene, root / "out", [recipe_of()])
+    with pytest.raises(OutputError, match="is no finished output folder"):
+        mirror_outputs(scene, tmp_path / "nothing", progress=False)
+
+
+def test_another_dataset_of_that_name_is_refused(root, tmp_path):
+    scene, out = scene_of(root), tmp_path / "out"
+    render(scene, out, frames=[0])
+    mirror_outputs(scene, out, progress=False)
+    other = scene_of(write_sequence(tmp_path / "more" / "002"), "other")
+    with pytest.raises(OutputError, match=r"is the copy of .*/002, not of .*/more/002: choose"):
+        recipes_for_source(other, out, [recipe_of()])
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"scenes": {}, "replaced": {"a": {}}, "folder": ""}'])
+def test_a_damaged_record_is_said(root, tmp_path, text):
+    scene, out = scene_of(root), tmp_path / "out"
+    render(scene, out, frames=[0])
+    mirror_outputs(scene, out, progress=False)
+    record = out / "source/fog-000/climategs-mirror-002.json"
+    record.write_text(text)
+    with pytest.raises(OutputError, match=r"climategs-mirror-002\.json is damaged"):
+        mirror_outputs(scene, out, progress=False)
+    record.unlink()
+    mirror_outputs(scene, out, progress=False)
+
+
+def test_a_record_names_no_files_outside(root, tmp_path):
+    """Images of other scenes count as far as the manifest knows them."""
+    scene, out = scene_of(root), tmp_path / "out"
+    render(scene, out, frames=[0])
+    mirror_outputs(scene, out, progress=False)
+    path = out / "source/fog-000/climategs-mirror-002.json"
+    record = json.loads(path.read_text())
+    for place in ("camera/front/03.jpg", "../../secret"):
+        record["replaced"][place] = {"scene": "x", "image": "../../../etc/passwd", "sha256": ""}
+    path.write_text(json.dumps(record))
+    mirror_outputs(scene, out, progress=False)
+    assert len(changed(root, out / "source/fog-000/002")) == 2
+
+
+def test_a_scene_called_as_the_copies_folder_is_refused(root, tmp_path):
+    scene, out = scene_of(root, "source"), tmp_path / "out"
+    render(scene, out, frames=[0])
+    with pytest.raises(OutputError, match="has images of a scene called 'source'"):
+        mirror_outputs(scene, out, progress=False)
+
+
+def test_camera_paths_are_refused(root, tmp_path):
+    scene, out = scene_of(root), tmp_path / "out"
+    render(scene, out, camera_path=scene.frames[:1])
+    assert read_manifest(out)["trajectory"][0].as_py() != "recorded"
+    with pytest.raises(OutputError, match="shows a camera path"):
+        mirror_outputs(scene, out, progress=False)
+
+
+def test_render_takes_the_layout(root, tmp_path, monkeypatch, capsys):
+    """`climategs render --layout source`, with a stand-in for opening and rendering."""
+    scene, out = scene_of(root), tmp_path / "out"
+    fog = tmp_path / "fog.yaml"
+    fog.write_text(
+        "weather: {smog: {visibility_m: 50}}\noutput: {depth: none, lidar: false, labels: false}\n"
+    )
+
+    def job(what, *, scene_loader):
+        return run_job(what, scene_loader=scene_loader, renderer=fake_render, progress=False)
+
+    monkeypatch.setattr(render_tools, "open_scene", lambda _: scene)
+    monkeypatch.setattr(render_tools, "run_job", job)
+    monkeypatch.setattr("tools.warm_up.warm_up", lambda _: 0.0)
+    options = {"sheet": False, "layout": "source"}
+    done = render_tools.render_recipe(str(fog), "", out, scale=0.5, frames="1:3", **options)
+    assert done == 0
+    said = capsys.readouterr().out
+    assert f"dataset: {out / 'source/fog-000/002'}" in said
+    assert "  4 images were rendered at another size than recorded, such as 12x8 for 24x16" in said
+    assert len(changed(root, out / "source/fog-000/002")) == 4
+    assert sorted(path.suffix for path in (out / "street").rglob("00000?.*")) == [".jpg"] * 4
+    path = tmp_path / "path.json"
+    with pytest.raises(ClimateGSError, match=r"--camera-path .*path\.json shows frames that"):
+        render_tools.render_recipe(str(fog), "", out, camera_path=path, **options)
+    monkeypatch.setattr(render_tools, "open_scene", lambda _: open_fake("fake:street"))
+    with pytest.raises(AdapterError, match="has no dataset's folder"):
+        render_tools.render_recipe(str(fog), "", out, **options)
