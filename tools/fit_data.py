@@ -16,7 +16,8 @@ from augment.scene import Scene
 from tools.fit_options import FitOptions, resolved_uri
 
 HELD_OUT_KEY = "held_out"
-HELD_OUT_SCHEMES = ("pandaset", "recording")  # those that build a scene without some frames
+# Those that can build a scene without some of its frames.
+HELD_OUT_SCHEMES = ("pandaset", "recording", "nuscenes", "kitti", "street_gaussians")
 
 
 def open_to_fit(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -65,18 +65,25 @@ class DriveOptions:
     held_out: HeldOut | None = None
 
     @staticmethod
-    def from_query(scheme: str, query: dict[str, str]) -> DriveOptions:
-        """The options of a URI's query. scheme: for messages.
+    def from_query(
+        scheme: str, query: Mapping[str, str], own: Mapping[str, str] | None = None
+    ) -> DriveOptions:
+        """The options of a URI's query. scheme: for messages. own: keys that the scheme has besides
+        and reads itself, with what their values may be.
 
         Raises:
             AdapterError: an unknown key, or a value of the wrong kind or out of range.
         """
-        unknown = sorted(set(query) - set(_KEYS))
+        own = own or {}
+        unknown = sorted(set(query) - set(_KEYS) - set(own))
         if unknown:
-            allowed = "; ".join(f"{key}: {kind}" for key, (_, kind) in _KEYS.items())
+            kinds = {key: kind for key, (_, kind) in _KEYS.items()} | dict(own)
+            allowed = "; ".join(f"{key}: {kind}" for key, kind in kinds.items())
             raise AdapterError(f"{scheme}: unknown option {unknown[0]!r}; allowed are {allowed}")
         fields: dict[str, Any] = {}
         for key, text in query.items():
+            if key in own:
+                continue
             parse, kind = _KEYS[key]
             try:
                 fields |= parse(key, text)

@@ -34,12 +34,5 @@ class NuScenesOptions:
         sweeps = query.get("sweeps", "1")
         if sweeps not in ("0", "1"):
             raise AdapterError(f"nuscenes: sweeps must be {_OWN['sweeps']}; got {sweeps!r}")
-        others = {key: value for key, value in query.items() if key not in _OWN}
-        try:
-            drive = DriveOptions.from_query("nuscenes", others)
-        except AdapterError as error:
-            if "unknown option" not in str(error):
-                raise
-            own = "; ".join(f"{key}: {kind}" for key, kind in _OWN.items())
-            raise AdapterError(f"{error}; {own}") from None
+        drive = DriveOptions.from_query("nuscenes", query, _OWN)
         return NuScenesOptions(query.get("version"), query.get("scene"), sweeps == "1", drive)
