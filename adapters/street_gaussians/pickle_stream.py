@@ -112,8 +112,8 @@ class _Bounded:
 
     def readline(self) -> bytes:
         line = self._file.readline(_MAX_LINE)
-        if not line.endswith(b"\n"):
-            raise PickleStreamError("it holds a line without end")
+        if not line.endswith(b"\n") or b"\\" in line:
+            raise PickleStreamError("it holds a name without end or with escapes")
         return line
 
 

@@ -12,6 +12,8 @@ from multiprocessing import get_context
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from street_gaussians_files import npy_of_pickle, write_members, write_point_clouds
 
 from adapters.street_gaussians.pickle_stream import PickleStreamError, stream_arrays
@@ -205,9 +207,10 @@ def test_what_a_hostile_file_asks_for_is_refused_by_name(
         (b"\x80\x04t.", "no mark|damaged"),
         (b"\x80\x04h\x07.", "damaged"),
         (b"\x80\x04B\xff\xff\xff\x7f", "states 2147483647 bytes"),
-        (b"\x80\x04cnumpy" + b"x" * 5000, "line without end"),
+        (b"\x80\x04cnumpy" + b"x" * 5000, "name without end"),
         (b"\x80\x04)" + b"\x85" * 300_000 + b".", "more than 262144 steps"),
         (b"\x80\x04)" + b"\x94" * 300_000 + b".", "more than 262144 steps"),
+        (b"\x80\x04cnumpy\nd\\type\n.", "with escapes"),
         (b"\x80\x04\x97.", "NEXT_BUFFER"),
         (b"\x80\x04P1\n.", "PERSID"),
     ],
@@ -215,6 +218,19 @@ def test_what_a_hostile_file_asks_for_is_refused_by_name(
 def test_damaged_and_strange_pickles_are_refused(data, message):
     with pytest.raises(PickleStreamError, match=message):
         list(stream_arrays(io.BytesIO(data)))
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.lists(st.tuples(st.integers(2, 400), st.integers(0, 255)), min_size=1, max_size=4))
+def test_changed_bytes_give_arrays_or_an_error_of_ours(changes):
+    data = bytearray(pickle.dumps({0: np.ones((2, 3)), np.int64(1): np.zeros((1, 3))}))
+    for at, value in changes:
+        data[at % len(data)] = value
+    try:
+        found = dict(stream_arrays(io.BytesIO(bytes(data))))
+    except PickleStreamError:
+        return
+    assert all(type(array) is np.ndarray and array.dtype.kind in "fiub" for array in found.values())
 
 
 def test_a_value_that_grows_when_it_is_shown_is_not_shown():
