@@ -9,10 +9,10 @@ from adapters.lidar.options import DriveOptions
 from augment.errors import AdapterError
 
 ICP = "icp"
-_OWN = (
-    "poses: icp, or a file with a line of 12 numbers a frame (raw drives); "
-    "frame: a frame's number (object folders)"
-)
+_OWN = {
+    "poses": "icp, or a file with a line of 12 numbers a frame (raw drives)",
+    "frame": "a frame's number (object folders)",
+}
 
 
 @dataclass(frozen=True)
@@ -32,17 +32,13 @@ class KittiOptions:
         Raises:
             AdapterError: an unknown key, or a value that is none.
         """
-        shared = {key: value for key, value in query.items() if key not in ("poses", "frame")}
-        try:
-            drive = DriveOptions.from_query("kitti", shared)
-        except AdapterError as error:
-            raise AdapterError(f"{error}. KITTI also has {_OWN}") from None
+        drive = DriveOptions.from_query("kitti", query, _OWN)
         poses, frame = query.get("poses"), query.get("frame")
         wrong = "poses" if is_object and poses is not None else None
         wrong = "frame" if not is_object and frame is not None else wrong
         if wrong:
             what = "an object folder, whose frames are unrelated" if is_object else "a raw drive"
-            raise AdapterError(f"kitti: {wrong}= means nothing for {what}; there are {_OWN}")
+            raise AdapterError(f"kitti: {wrong}= means nothing for {what}; it is {_OWN[wrong]}")
         if frame is not None and not re.fullmatch("[0-9]{1,9}", frame):
             raise AdapterError(f"kitti: frame must be a frame's number; got {frame!r}")
         if poses == "":

@@ -86,7 +86,7 @@ def test_folders_that_are_no_drive(drive, tmp_path):
 @pytest.mark.parametrize(
     ("query", "message"),
     [
-        ({"voxels": "1"}, r"unknown option 'voxels'.*KITTI also has poses:"),
+        ({"voxels": "1"}, r"unknown option 'voxels'.*poses: icp"),
         ({"frame": "1"}, r"frame= means nothing for a raw drive"),
         ({"poses": ""}, r"poses must be icp or the name of a file"),
         ({"frames": "7:9"}, r"frames=7:9 selects none of the 3 frames"),
