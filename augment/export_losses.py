@@ -19,17 +19,20 @@ def export_losses(
     timestamp_ns: the moment at which ply and splat are baked.
     """
     if kind in ("scene", "file"):
-        return tuple(_of_saved(scene, half=half))
+        return tuple(_of_saved(scene, kind, half=half))
     found = [*_of_places(scene, kind, timestamp_ns), *_of_colours(scene, kind)]
     return (*found, *_of_facts(scene, kind))
 
 
-def _of_saved(scene: Scene, *, half: bool) -> Iterator[str]:
-    recording = scene.recorded_source or scene.source
-    yield (
-        f"boxes, LiDAR and recorded images are not in it: they are read from {recording}; where "
-        f"that has moved, open it with ?data=URI"
-    )
+def _of_saved(scene: Scene, kind: ExportKind, *, half: bool) -> Iterator[str]:
+    has_images = any(frame.image_paths for frame in scene.frames)
+    if scene.labels is not None or scene.recorded_source is not None or has_images:
+        yield (
+            f"boxes, LiDAR and recorded images are not in it: they are read from "
+            f"{scene.recorded_source or scene.source}; where that has moved, open it with ?data=URI"
+        )
+    if kind == "file":
+        yield "it names folders of this machine: the working folder, the recording's, the images'"
     if half:
         yield (
             "rotations, opacities and colours are rounded to float16: colours by up to 0.1/255, "
@@ -47,6 +50,11 @@ def _of_places(scene: Scene, kind: ExportKind, timestamp_ns: int | None) -> Iter
         yield f"actors ({there}) stand still where they are at {timestamp_ns} ns"
         if there < len(scene.actors):
             yield f"actors ({len(scene.actors) - there}) that are not there then are left out"
+        if off_ns := _greatest_delay_ns(scene, timestamp_ns):
+            yield (
+                f"the frame's cameras took their images up to {off_ns / 1e6:.0f} ms from that "
+                f"moment, so that moving actors are a little off in them"
+            )
     if kind == "splat" and scene.world_origin_m.any():
         place = ", ".join(f"{v:.3f}" for v in scene.world_origin_m)
         yield f"where the scene lies in the dataset's world ({place}) is left out"
@@ -94,3 +102,14 @@ def _of_facts(scene: Scene, kind: ExportKind) -> Iterator[str]:
         yield "orthographic cameras are left out"
     if scene.made_by:
         yield "how the scene was made (made_by) is left out"
+
+
+def _greatest_delay_ns(scene: Scene, timestamp_ns: int) -> int:
+    """How far from a frame's own time its cameras took their images; 0 of another time."""
+    delays = [
+        abs(camera.timestamp_ns - timestamp_ns)
+        for frame in scene.frames
+        if frame.timestamp_ns == timestamp_ns
+        for camera in frame.cameras.values()
+    ]
+    return max(delays, default=0)

@@ -60,7 +60,10 @@ def export_cameras(scene: Scene, folder: str | Path) -> bool:
     if text is None:
         return not path.exists()
     if path.exists():
-        return path.is_file() and path.read_bytes() == text
+        try:
+            return path.read_bytes() == text
+        except OSError:  # a folder, or what may not be read
+            return False
     write_atomic(path, text)
     return True
 
@@ -94,13 +97,13 @@ def export_ply_parts(scene: Scene, folder: str | Path) -> None:
             as it was.
     """
     folder = Path(folder).resolve()
-    if folder.exists() and not is_parts_folder(folder):
-        raise OutputError(
-            f"{folder} holds something else than exported parts, so it is not replaced; choose "
-            f"another folder"
-        )
     new = folder.with_name(f".{folder.name}.{os.getpid()}-{secrets.token_hex(4)}.partial")
     try:
+        if folder.exists() and not is_parts_folder(folder):
+            raise OutputError(
+                f"{folder} holds something else than exported parts, so it is not replaced; choose "
+                f"another folder"
+            )
         make_folder(folder.parent)
         try:
             _write_parts(scene, new)

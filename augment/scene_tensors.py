@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from augment.errors import SceneError
+from augment.gaussian_checks import drawable_rows, is_drawable
 from augment.scene import SH_COUNTS, Gaussians, Scene, SemanticClass, check_gaussians
 from augment.sky import ConstantSky, CubemapSky, LatLongSky, Sky
 
@@ -31,7 +32,6 @@ _ARRAYS = ("means", "quats", "scales", "opacities", "sh")
 _HALVED = ("quats", "opacities", "sh", "waves")
 _ROWS = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": ()}
 _FLOAT16_END = 65520  # rounds to infinity
-_QUAT_TOLERANCE = 1e-4  # of unit length; what is further off is normalised
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,23 +219,9 @@ def _check_semantic(semantic: Tensor, count: int, where: str) -> None:
 
 def _is_drawable(part: SavedPart) -> bool:
     """Whether `_drawable` would leave every bit as it is, told in one look at each number."""
-    gaussians = part.gaussians
-    if len(gaussians) == 0:
-        return True
-    ranges = {name: _range(getattr(gaussians, name)) for name in _ARRAYS}
-    if part.waves is not None:
-        ranges["waves"] = _range(part.waves)
-    quats = gaussians.quats.numpy()
-    with np.errstate(over="ignore", invalid="ignore"):
-        lengths = _range(np.sqrt(np.einsum("ni,ni->n", quats, quats)))
-    return (
-        all(np.isfinite(ends).all() for ends in ranges.values())
-        and lengths[0] > 1 - _QUAT_TOLERANCE
-        and lengths[1] < 1 + _QUAT_TOLERANCE
-        and ranges["scales"][0] > 0
-        and ranges["opacities"][0] >= 0
-        and ranges["opacities"][1] <= 1
-    )
+    waves = part.waves
+    has_finite_waves = waves is None or bool(np.isfinite(_range(waves)).all())
+    return is_drawable(part.gaussians) and has_finite_waves
 
 
 def _drawable(part: SavedPart, where: str) -> tuple[SavedPart, tuple[str, ...]]:
@@ -247,16 +233,14 @@ def _drawable(part: SavedPart, where: str) -> tuple[SavedPart, tuple[str, ...]]:
     finite = torch.isfinite(waves.sum((1, 2)))
     unknown = torch.where(finite, 0.0, torch.nan)  # makes means that check_gaussians leaves out
     gaussians = replace(gaussians, means=gaussians.means + unknown[:, None])
-    sums = [getattr(gaussians, name).reshape(len(finite), -1).sum(1) for name in _ARRAYS]
-    kept = torch.isfinite(torch.stack(sums)).all(0)
-    kept &= (gaussians.quats.norm(dim=1) > 0) & (gaussians.scales.amin(1) > 0)
+    kept = drawable_rows(gaussians)
     gaussians, problems = check_gaussians(gaussians, where=where)
     return SavedPart(gaussians, waves[kept]), problems
 
 
-def _range(values: Tensor | np.ndarray) -> tuple[float, float]:
+def _range(values: Tensor) -> tuple[float, float]:
     """Lowest and highest value; NaN where there is one. By NumPy, which wakes no threads."""
-    array = values.numpy() if isinstance(values, Tensor) else values
+    array = values.detach().cpu().numpy()
     if array.size == 0:
         return 0.0, 0.0
     with np.errstate(invalid="ignore"):

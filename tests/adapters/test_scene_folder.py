@@ -14,10 +14,11 @@ from pandaset_folder import write_sequence
 
 from adapters.base import open_scene, recognise
 from adapters.pandaset.labels import PandaSetLabels
+from adapters.scene_folder import storable
 from augment.batch.shared_scene import share_scene
 from augment.errors import AdapterError, SceneError
 from augment.scene import Scene
-from augment.scene_files import save_scene
+from augment.scene_files import save_scene, save_scene_file
 from tools.scene_report import describe_scene, scene_text
 
 STREET = "procedural:street?seed=5&frames=6&gaussians=60000&lidar_columns=16"
@@ -57,6 +58,38 @@ def test_bad_uris_and_folders(tmp_path):
     assert recognise(folder) == "scene"  # so that what is wrong with it is said
     with pytest.raises(SceneError, match=r"it has no sky\.safetensors"):
         open_scene(str(folder))
+
+
+def test_a_scene_file_is_recognised_and_opened(tmp_path):
+    path = tmp_path / "fit.CLIMATEGS"
+    save_scene_file(fitted_scene(recorded_source=STREET), path)
+    assert recognise(path) == "scene"
+    scene = open_scene(str(path))
+    assert scene.source == f"scene:{path}" and scene.problems == fitted_scene().problems
+    assert_same(scene, fitted_scene(), but=("source", "labels", "recorded_source"))
+    assert scene.labels is not None and open_scene(scene.source).labels == scene.labels
+    assert open_scene(f"scene:{path}?data={STREET.replace('&', '%26')}").labels == scene.labels
+    path.write_bytes(path.read_bytes()[:-1])
+    with pytest.raises(SceneError, match=r"fit\.CLIMATEGS is damaged"):
+        open_scene(str(path))
+    path.rename(tmp_path / "other")
+    with pytest.raises(AdapterError, match=r"a scene file \(\.climategs\)"):
+        open_scene(str(tmp_path / "other"))
+
+
+def test_what_is_saved_again_is_storable(tmp_path, monkeypatch):
+    """Also where the recording, named relative to another folder, is not there today."""
+    monkeypatch.chdir(tmp_path)
+    folder = save(tmp_path, recorded_source="pandaset:raw/002")
+    (tmp_path / "other").mkdir()
+    monkeypatch.chdir(tmp_path / "other")
+    scene = open_scene(f"scene:{folder}")
+    assert "boxes and LiDAR are left out" in scene.problems[-1]
+    kept = storable(scene)
+    assert kept.problems == fitted_scene().problems
+    assert kept.recorded_source == f"pandaset:{tmp_path}/raw/002"
+    street = open_scene(STREET)
+    assert storable(street) is street
 
 
 def test_labels_come_from_the_recording(tmp_path):

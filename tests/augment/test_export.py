@@ -229,6 +229,8 @@ def test_cameras_are_inrias(tmp_path):
     np.testing.assert_allclose(seen, expected, atol=1e-12)
     assert (view["cx"], view["cy"]) == (camera.cx, camera.cy)
 
+    (tmp_path / "folder" / "cameras.json").mkdir(parents=True)
+    assert not export_cameras(scene, tmp_path / "folder")
     (tmp_path / "cameras.json").write_text("[]")
     assert not export_cameras(scene, tmp_path)
     assert (tmp_path / "cameras.json").read_text() == "[]"
@@ -355,9 +357,16 @@ def test_losses_are_said():
     assert any("8 bits" in s for s in splat) and any("SH bands above 0" in s for s in splat)
     assert not any("8 bits" in s or "stand still" in s for s in parts)
 
+    late = dataclasses.replace(camera_ahead(), timestamp_ns=START_NS + 40_000_000)
+    scene = drive(frames=(dataclasses.replace(frame(4, START_NS), cameras={"ahead": late}),))
+    assert any("up to 40 ms from that" in s for s in export_losses(scene, "ply", START_NS))
+    assert not any("from that" in s for s in (*ply, *export_losses(scene, "ply-parts")))
+
     least = drive(actors=(), color_maps={}, image_color_maps={}, frames=(), made_by={},
                   ground_z_m=None, ground=None)  # fmt: skip
     assert export_losses(least, "ply", NOW) == ("the sky is left out",)
-    (saved,) = export_losses(scene, "file")
+    (saved,) = export_losses(scene, "scene")
     assert "read from test:recording" in saved
-    assert "0.05 degrees" in export_losses(scene, "file", half=True)[1]
+    assert "folders of this machine" in export_losses(scene, "file")[1]
+    assert "0.05 degrees" in export_losses(scene, "file", half=True)[2]
+    assert export_losses(dataclasses.replace(least, recorded_source=None), "scene") == ()
