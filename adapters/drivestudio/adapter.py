@@ -7,8 +7,9 @@ read; people and what else deforms is left out, with its count in Scene.problems
 model's, z up (see adapters.drivestudio.drive). Cameras are those of training: pinholes of the size
 that images were scaled to, with their corrected poses.
 
-Differences from the project's own renderer, which clamps each splat's colour, and what the splats
-blend to, to at most 1: here neither is, so what is brighter stays so until the image is written.
+Differences from the project's own renderer: it clamps each splat's colour, and what the splats
+blend to, to at most 1, where here what is brighter stays so until the image is written; and it
+draws nothing nearer than its near plane of 0.1 m.
 """
 
 from __future__ import annotations

@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -92,13 +93,13 @@ def _instance(key: str, entry: Any, where: str) -> Instance:
 
 
 def _array(notes: Mapping[str, Any], name: str, shape: tuple[int, ...], where: str) -> np.ndarray:
+    """float64 [T, *shape]; rows may be flat."""
     try:
         values = np.array(notes.get(name), np.float64)
     except (TypeError, ValueError):
         values = np.zeros(())
-    if values.size == 0 and isinstance(notes.get(name), list):
-        return np.zeros((0, *shape))
-    if values.ndim != len(shape) + 1 or values.shape[1:] != shape or not np.isfinite(values).all():
+    length = len(values) if values.ndim else -1
+    if values.size != length * math.prod(shape) or not np.isfinite(values).all():
         expected = " x ".join(("T", *map(str, shape)))
         raise AdapterError(f"{where}: {name} must hold {expected} numbers")
-    return values
+    return values.reshape(length, *shape)

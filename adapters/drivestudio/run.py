@@ -9,11 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
-
+from adapters.drivestudio.config import integer_of, lookup, needed, read_config, text_of
 from adapters.drivestudio.conventions import Convention, convention_of
 from adapters.drivestudio.options import RunOptions
-from adapters.plain_files import inside, read_text
+from adapters.plain_files import inside
 from augment.errors import AdapterError
 
 _CHECKPOINT = re.compile(r"checkpoint_(\d+)\.pth", re.ASCII)
@@ -48,12 +47,12 @@ class Run:
 
     @property
     def antialiased(self) -> bool:
-        return _lookup(self.config, "trainer.render.antialiased") is True
+        return lookup(self.config, "trainer.render.antialiased") is True
 
     def sh_interval(self, node: str) -> int:
         """Steps of training for each degree of a node's spherical harmonics."""
         for name in (f"model.{node}.ctrl", "trainer.gaussian_ctrl_general_cfg"):
-            value = _lookup(self.config, f"{name}.sh_degree_interval")
+            value = lookup(self.config, f"{name}.sh_degree_interval")
             if isinstance(value, int) and value > 0:
                 return value
         return _SH_INTERVAL
@@ -72,13 +71,13 @@ def find_run(path: Path, options: RunOptions) -> Run:
     """
     folder = path if path.is_dir() else path.parent
     config_file = folder / "config.yaml"
-    config = _read_config(config_file)
+    config = read_config(config_file)
     where = str(config_file)
-    convention = convention_of(_text(config, "data.dataset", where), where)
+    convention = convention_of(text_of(config, "data.dataset", where), where)
     cameras = _camera_numbers(config, convention, where)
     checkpoint = _find_checkpoint(path, folder, options)
     data = _find_data(config, folder, options, where)
-    stride = _integer(config, "data.pixel_source.test_image_stride", where, otherwise=0)
+    stride = integer_of(config, "data.pixel_source.test_image_stride", where, otherwise=0)
     if stride < 0:
         raise AdapterError(
             f"{where}: data.pixel_source.test_image_stride must be >= 0; got {stride}"
@@ -91,25 +90,10 @@ def find_run(path: Path, options: RunOptions) -> Run:
         frames=_frames(config, data, where),
         cameras=cameras,
         downscale=_downscale(config, len(cameras), where),
-        undistort=_lookup(config, "data.pixel_source.undistort") is True,
+        undistort=lookup(config, "data.pixel_source.undistort") is True,
         test_stride=stride,
         config=config,
     )
-
-
-def _read_config(path: Path) -> Mapping[str, Any]:
-    if not path.is_file():
-        raise AdapterError(
-            f"{path} does not exist; a drivestudio run is a folder with config.yaml and "
-            f"checkpoint_*.pth"
-        )
-    try:
-        config = yaml.safe_load(read_text(path))
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise AdapterError(f"{path} is no readable YAML: {error}") from None
-    if not isinstance(config, dict):
-        raise AdapterError(f"{path} must hold a mapping; got {type(config).__name__}")
-    return config
 
 
 def _find_checkpoint(path: Path, folder: Path, options: RunOptions) -> Path:
@@ -149,7 +133,7 @@ def _find_data(config: Mapping[str, Any], folder: Path, options: RunOptions, whe
                 f"data/waymo/processed/training/023"
             )
         return data
-    root, scene = _lookup(config, "data.data_root"), _lookup(config, "data.scene_idx")
+    root, scene = lookup(config, "data.data_root"), lookup(config, "data.scene_idx")
     said = "its config.yaml does not say where the data is"
     if isinstance(root, str) and isinstance(scene, int | str):
         name = f"{int(scene):03d}" if str(scene).isdecimal() else str(scene)
@@ -167,8 +151,8 @@ def _find_data(config: Mapping[str, Any], folder: Path, options: RunOptions, whe
 
 def _frames(config: Mapping[str, Any], data: Path, where: str) -> range:
     """start_timestep to end_timestep, both included; -1 stands for the data's last."""
-    start = _integer(config, "data.start_timestep", where)
-    end = _integer(config, "data.end_timestep", where)
+    start = integer_of(config, "data.start_timestep", where)
+    end = integer_of(config, "data.end_timestep", where)
     if end == -1:
         folders = [data / name for name in ("ego_pose", "lidar_pose") if (data / name).is_dir()]
         if not folders:
@@ -189,7 +173,7 @@ def _camera_numbers(
     config: Mapping[str, Any], convention: Convention, where: str
 ) -> tuple[int, ...]:
     key = "data.pixel_source.cameras"
-    numbers = _needed(config, key, where)
+    numbers = needed(config, key, where)
     known = range(len(convention.cameras))
     is_list = isinstance(numbers, list) and len(numbers) > 0
     if (
@@ -206,7 +190,7 @@ def _camera_numbers(
 
 def _downscale(config: Mapping[str, Any], cameras: int, where: str) -> tuple[float, ...]:
     key = "data.pixel_source.downscale_when_loading"
-    factors = _needed(config, key, where)
+    factors = needed(config, key, where)
     if (
         not isinstance(factors, list)
         or len(factors) < cameras
@@ -217,47 +201,3 @@ def _downscale(config: Mapping[str, Any], cameras: int, where: str) -> tuple[flo
             f"got {factors!r}"
         )
     return tuple(float(factor) for factor in factors[:cameras])
-
-
-def _lookup(config: Mapping[str, Any], key: str) -> Any:
-    """The value of a dotted key; None where there is none.
-
-    Raises:
-        AdapterError: it still refers to something else, as in ${data.root}.
-    """
-    value: Any = config
-    for name in key.split("."):
-        value = value.get(name) if isinstance(value, Mapping) else None
-    for item in value if isinstance(value, list) else [value]:
-        if isinstance(item, str) and "${" in item:
-            raise AdapterError(
-                f"config.yaml: {key} is {item!r}, which refers to something else; write its value "
-                f"there, as OmegaConf.resolve does"
-            )
-    return value
-
-
-def _needed(config: Mapping[str, Any], key: str, where: str) -> Any:
-    value = _lookup(config, key)
-    if value is None:
-        raise AdapterError(f"{where} lacks {key}; expected the config that drivestudio saved")
-    return value
-
-
-def _text(config: Mapping[str, Any], key: str, where: str) -> str:
-    value = _needed(config, key, where)
-    if not isinstance(value, str):
-        raise AdapterError(f"{where}: {key} must be a text; got {value!r}")
-    return value
-
-
-def _integer(
-    config: Mapping[str, Any], key: str, where: str, *, otherwise: int | None = None
-) -> int:
-    value = _lookup(config, key)
-    if value is None and otherwise is not None:
-        return otherwise
-    value = _needed(config, key, where)
-    if type(value) is not int:
-        raise AdapterError(f"{where}: {key} must be a whole number; got {value!r}")
-    return value

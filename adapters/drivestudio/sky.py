@@ -59,17 +59,31 @@ def read_sky(
 def turned_faces(faces: Tensor, source_from_target: np.ndarray) -> Tensor:
     """A cube map that shows in direction d what `faces` show in source_from_target @ d, exactly.
 
-    faces: [6, R, R, 3]. source_from_target: [3, 3], a permutation of axes with signs.
+    faces: [6, R, R, 3]. source_from_target: [3, 3], a permutation of axes with signs, no mirror.
     """
-    assert (np.abs(source_from_target) == np.eye(3)[np.abs(source_from_target).argmax(1)]).all()
-    size = faces.shape[1]
-    flat, turned = faces.reshape(-1, 3), torch.empty_like(faces)
-    turn = torch.from_numpy(source_from_target).float()
-    for target, directions in enumerate(directions_of_cubemap(size)):
-        face, s, t = cubemap_coordinates(directions @ turn.T)
-        column, row = (((v * 0.5 + 0.5) * size - 0.5).round().long() for v in (s, t))
-        turned[target] = flat[(face * size + row) * size + column]
+    turned = torch.empty_like(faces)
+    for target, (source, quarters) in enumerate(_turns_of_faces(source_from_target)):
+        turned[target] = torch.rot90(faces[source], quarters)
     return turned
+
+
+def _turns_of_faces(source_from_target: np.ndarray) -> list[tuple[int, int]]:
+    """For each face, the one that it shows and by how many quarter turns, found on a cube map of
+    two texels an edge: where four texels go, all do.
+    """
+    turn = torch.from_numpy(source_from_target).float()
+    face, s, t = cubemap_coordinates(directions_of_cubemap(2) @ turn.T)
+    shown = face * 4 + (t > 0) * 2 + (s > 0)
+    texels = torch.arange(24).reshape(6, 2, 2)
+    return [
+        next(
+            (source, quarters)
+            for source in range(6)
+            for quarters in range(4)
+            if torch.equal(torch.rot90(texels[source], quarters), wanted)
+        )
+        for wanted in shown
+    ]
 
 
 def _baked(

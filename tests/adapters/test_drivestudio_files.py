@@ -264,6 +264,20 @@ def test_objects_that_cannot_be_told_keep_their_numbers(numbers):
     assert len(scene.boxes(1)) == 0
 
 
+def test_poses_of_objects_may_be_flat(numbers):
+    before = opened(numbers).boxes(1)
+    path = numbers.data / "instances" / "instances_info.json"
+    info = json.loads(path.read_text())
+    for key, entry in info.items():
+        poses = np.array(entry["frame_annotations"]["obj_to_world"]).reshape(-1, 16)
+        info[key] = notes(entry, obj_to_world=poses.tolist())
+    nothing = {name: [] for name in ("frame_idx", "obj_to_world", "box_size")}
+    info["3"] = {"id": 9, "frame_annotations": nothing}
+    path.write_text(json.dumps(info, indent=4))
+    os.utime(path, ns=(0, 0))
+    assert np.array_equal(opened(numbers).boxes(1).centers_m, before.centers_m)
+
+
 def test_objects_elsewhere_or_of_another_size_are_not_taken_for_the_model_s(numbers):
     path = numbers.data / "instances" / "instances_info.json"
     info = json.loads(path.read_text())
