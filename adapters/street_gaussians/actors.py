@@ -103,8 +103,8 @@ def _in_world(
     ego_from_actor[:, :3, :3] = rotations_of(poses.quats)
     ego_from_actor[:, :3, 3] = poses.positions
     world_from_ego = np.stack([data.images[i].world_from_ego for i in images])
-    changes = [np.linalg.inv(camera_changes.of(data.images[i])) for i in images]
-    return np.stack(changes) @ world_from_ego @ ego_from_actor
+    world_from_moved = camera_changes.inverses[[camera_changes.row(data.images[i]) for i in images]]
+    return world_from_moved @ world_from_ego @ ego_from_actor
 
 
 def _hold_ns(knots: np.ndarray, data: StreetData) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -23,8 +24,15 @@ class CameraChanges:
     changes: np.ndarray = field(default_factory=lambda: np.eye(4)[None])
     rows: Mapping[tuple[int, int], int] = field(default_factory=dict)
 
+    def row(self, image: StreetImage) -> int:
+        return self.rows.get((image.frame, image.cam), 0)
+
     def of(self, image: StreetImage) -> np.ndarray:
-        return self.changes[self.rows.get((image.frame, image.cam), 0)]
+        return self.changes[self.row(image)]
+
+    @cached_property
+    def inverses(self) -> np.ndarray:
+        return np.linalg.inv(self.changes)
 
 
 def camera_changes(

@@ -11,6 +11,7 @@ import numpy as np
 from torch import Tensor
 
 from adapters.checkpoints import load_checkpoint, release, section, taken, tensor
+from adapters.street_gaussians.numpy_scalars import passing_over_numpy_scalars
 from adapters.street_gaussians.parameters import (
     Parameters,
     actor_id,
@@ -58,7 +59,8 @@ def read_checkpoint(path: Path, config: ModelConfig) -> TrainedModel:
     Raises:
         AdapterError: not such a file, damaged, or lacking what the configuration says was trained.
     """
-    content = load_checkpoint(path)
+    with passing_over_numpy_scalars():
+        content = load_checkpoint(path)
     if "background" not in content:
         keys = ", ".join(map(str, list(content)[:12])) or "nothing"
         raise AdapterError(

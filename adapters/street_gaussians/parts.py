@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -108,9 +107,13 @@ def turn_colours(part: Part, part_from_world: np.ndarray) -> Part:
     """The part with colours that were trained for directions in the world's axes as seen in its
     own, in place. part_from_world: float64 [3, 3].
     """
-    sh = part.gaussians.sh
+    sh = part.gaussians.sh.numpy()
     if sh.shape[1] > 1:
-        rotation = torch.from_numpy(np.ascontiguousarray(part_from_world))
+        # What becomes of each coefficient alone: the columns of a matrix [K, K].
+        each = torch.eye(sh.shape[1])[:, :, None].expand(-1, -1, 3)
+        turned = rotate_sh(each, torch.from_numpy(np.ascontiguousarray(part_from_world)))
+        matrix = np.ascontiguousarray(turned[1:, 1:, 0].T.numpy())
         for start in range(0, len(sh), _ROWS):
-            sh[start : start + _ROWS] = rotate_sh(sh[start : start + _ROWS], rotation)
-    return dataclasses.replace(part, gaussians=dataclasses.replace(part.gaussians, sh=sh))
+            piece = sh[start : start + _ROWS, 1:]
+            piece[:] = np.einsum("ij,njc->nic", matrix, piece)
+    return part

@@ -179,7 +179,7 @@ def _part_entry(part: RawPart, is_final: bool) -> dict:
     count = len(part.xyz)
     return {
         **parameters,
-        "spatial_lr_scale": 20.5,
+        "spatial_lr_scale": np.float64(20.5),
         "denom": torch.zeros(count, 1),
         "max_radii2D": torch.zeros(count),
         "xyz_gradient_accum": torch.zeros(count, 2),

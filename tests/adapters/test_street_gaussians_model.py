@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import os
+import pickle
 from pathlib import Path
 
 import numpy as np
@@ -305,6 +306,16 @@ def test_nothing_in_a_hostile_file_runs(tmp_path: Path) -> None:
     with pytest.raises(FileExistsError):  # the trap itself works
         (tmp_path / "ran").mkdir()
         torch.load(path, weights_only=False)
+
+
+def test_numbers_of_numpy_are_passed_over_only_there(tmp_path: Path) -> None:
+    path = saved(tmp_path, checkpoint(raw_model(), 1, is_final=False))
+    read_checkpoint(path, PLAIN)
+    with pytest.raises(pickle.UnpicklingError):
+        torch.load(path, weights_only=True)
+    number = with_value(checkpoint(raw_model(), 1), np.float64(1), "background", "xyz")
+    with pytest.raises(AdapterError, match="lacks the tensor 'xyz'"):
+        read_checkpoint(saved(tmp_path, number), PLAIN)
 
 
 def test_damaged_files(tmp_path: Path) -> None:
