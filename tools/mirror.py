@@ -231,14 +231,15 @@ def _with_format(recipe: Recipe, written_as: str) -> Recipe:
 
 def _sentences(done: Mirrored, tree: SourceTree, links: Links) -> list[str]:
     replaced = len(done.replaced)
-    said = [
-        f"dataset: {done.folder} ({done.changed} of {done.linked + done.copied + replaced} files "
-        f"put in place now, the rest were there)",
-        f"  {replaced} weathered images ({_megabytes(done.new_size)} of {done.new} of them beside "
-        f"the rendered files), {done.linked} files shared with {tree.root} "
-        f"({_megabytes(done.linked_size)}, no disk used), {done.copied} copied "
-        f"({_megabytes(done.copied_size)})",
-    ]
+    state = f"{done.changed} files put in place" if done.changed else "up to date"
+    said = [f"dataset: {done.folder} ({state})"]
+    parts = [f"{replaced} weathered images" + _anew(done)]
+    if done.linked:
+        size = _megabytes(done.linked_size)
+        parts.append(f"{done.linked} files shared with {tree.root} ({size} that take no disk)")
+    if done.copied:
+        parts.append(f"{done.copied} files copied ({_megabytes(done.copied_size)})")
+    said.append(f"  {', '.join(parts)}")
     if done.images > replaced:
         said.append(
             f"  {done.images - replaced} of {done.images} camera images are the source's own, "
@@ -268,6 +269,13 @@ def _sentences(done: Mirrored, tree: SourceTree, links: Links) -> list[str]:
         if names:
             said.append(f"  {len(names)} {what}; the first is {names[0]}")
     return said
+
+
+def _anew(done: Mirrored) -> str:
+    """How many of the images are not one with the rendered files."""
+    if not done.new:
+        return ""
+    return f" ({done.new} of them files of their own, {_megabytes(done.new_size)})"
 
 
 def _megabytes(size: int) -> str:

@@ -90,16 +90,22 @@ def test_what_is_said(root, tmp_path):
         (root / f"camera/front/0{frame}.jpg").stat().st_size for frame in (1, 2)
     )
     assert said == [
-        f"dataset: {copy} (9 of 9 files put in place now, the rest were there)",
-        f"  2 weathered images (0.0 MB of 0 of them beside the rendered files), 7 files shared "
-        f"with {root} ({shared / 1e6:.1f} MB, no disk used), 0 copied (0.0 MB)",
+        f"dataset: {copy} (9 files put in place)",
+        f"  2 weathered images, 7 files shared with {root} ({shared / 1e6:.1f} MB that take no "
+        f"disk)",
         "  6 of 8 camera images are the source's own, clear ones",
         f"  to change files there in place would change {root} too; --links copy shares nothing",
     ]
     assert changed(root, copy) == {"camera/front/01.jpg", "camera/front/02.jpg"}
     again = mirror_outputs(scene, out, links="copy", progress=False)
-    assert "(9 of 9 files put in place now" in again[0] and not any("--links" in s for s in again)
-    assert "(0 of 9 files put in place now" in mirror_outputs(scene, out, progress=False)[0]
+    own = sum((copy / f"camera/front/0{frame}.jpg").stat().st_size for frame in (1, 2))
+    assert again[:2] == [
+        f"dataset: {copy} (9 files put in place)",
+        f"  2 weathered images (2 of them files of their own, {own / 1e6:.1f} MB), 7 files copied "
+        f"({shared / 1e6:.1f} MB)",
+    ]
+    assert not any("--links" in sentence for sentence in again)
+    assert "(up to date)" in mirror_outputs(scene, out, progress=False)[0]
 
 
 def test_variants_have_copies_of_their_own(root, tmp_path):
@@ -124,12 +130,12 @@ def test_scenes_of_one_dataset_share_a_copy(root, tmp_path):
     said = mirror_outputs(two, out, progress=False)
     whole = {f"camera/{c}/{f:02d}.jpg" for c in CAMERAS.values() for f in (0, 1, 2)}
     assert changed(root, copy) == whole
-    assert "(2 of 9 files put in place now" in said[0] and said[2].startswith("  2 of 8 camera")
+    assert "(2 files put in place)" in said[0] and said[2].startswith("  2 of 8 camera")
     record = json.loads((out / "source/fog-000/climategs-mirror-002.json").read_text())
     assert sorted(record["scenes"]) == ["one", "two"]
     assert record["scenes"]["one"]["source"] == one.source
     # Neither scene's next run gives up the other's.
-    assert "(0 of 9 files" in mirror_outputs(one, out, progress=False)[0]
+    assert "(up to date)" in mirror_outputs(one, out, progress=False)[0]
     assert changed(root, copy) == whole
 
 
