@@ -6,6 +6,7 @@ A car drives six frames; the run was trained on frames 1 to 5, of which 4 (posit
 
 from __future__ import annotations
 
+import functools
 import json
 from collections import OrderedDict
 from dataclasses import dataclass
@@ -246,10 +247,6 @@ def _write_data(data: Path, dataset: str, cars: list, cameras: list) -> None:
         (data / name).mkdir(parents=True)
     poses = data / ("lidar_pose" if dataset == "nuscenes" else "ego_pose")
     poses.mkdir()
-    pictures = {
-        size: cv2.imencode(".jpg", np.zeros((size[1], size[0], 3), np.uint8))[1].tobytes()
-        for size in set(SIZES[dataset])
-    }
     for position, number in enumerate(CAMERAS):
         width, height = SIZES[dataset][position]
         values = [FOCAL_PX, FOCAL_PX * 1.02, 0.49 * width, 0.52 * height, *DISTORTION]
@@ -264,11 +261,17 @@ def _write_data(data: Path, dataset: str, cars: list, cameras: list) -> None:
         np.savetxt(poses / f"{frame:03d}.txt", cars[frame])
         for position, number in enumerate(CAMERAS):
             file = data / "images" / f"{frame:03d}_{number}.jpg"
-            file.write_bytes(pictures[SIZES[dataset][position]])
+            file.write_bytes(picture(*SIZES[dataset][position]))
             if not is_fixed:
                 name = f"{frame:03d}_{number}.txt"
                 np.savetxt(data / "extrinsics" / name, cameras[frame][position])
         lidar_rows(dataset, frame).tofile(data / "lidar" / f"{frame:03d}.bin")
+
+
+@functools.cache
+def picture(width: int, height: int) -> bytes:
+    """A black JPEG file."""
+    return cv2.imencode(".jpg", np.zeros((height, width, 3), np.uint8))[1].tobytes()
 
 
 def lidar_rows(dataset: str, frame: int) -> np.ndarray:
