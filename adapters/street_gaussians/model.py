@@ -10,16 +10,16 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from adapters.checkpoints import load_checkpoint, release, section, taken, tensor
+from adapters.checkpoints import load_checkpoint, release, section, taken
 from adapters.street_gaussians.numpy_scalars import passing_over_numpy_scalars
 from adapters.street_gaussians.parameters import (
     Parameters,
     actor_id,
+    held,
     read_camera_changes,
     read_color_maps,
     read_pose_changes,
     read_sky,
-    whole,
 )
 from adapters.street_gaussians.parts import Part, allocate, check_counts, finish_part
 from adapters.street_gaussians.poses import PoseChanges
@@ -98,14 +98,14 @@ def read_checkpoint(path: Path, config: ModelConfig) -> TrainedModel:
 def _read_part(content: Mapping[str, Any], path: Path, name: str) -> tuple[Part | None, list[str]]:
     """A part, None for an actor without usable Gaussians, and sentences."""
     where = f"{path}, {name}"
-    means = whole(tensor(content, "xyz", (None, 3), where), where, "xyz")
+    means = held(content, "xyz", (None, 3), where)
     count = len(means)
-    colours = whole(tensor(content, "feature_dc", (count, None, 3), where), where, "feature_dc")
-    rest = whole(tensor(content, "feature_rest", (count, None, 3), where), where, "feature_rest")
+    colours = held(content, "feature_dc", (count, None, 3), where)
+    rest = held(content, "feature_rest", (count, None, 3), where)
     sources = {"means": means}
     for key, own, columns in (("scaling", "scales", 3), ("rotation", "quats", 4)):
-        sources[own] = whole(tensor(content, key, (count, columns), where), where, key)
-    logits = whole(tensor(content, "opacity", (count, 1), where), where, "opacity")
+        sources[own] = held(content, key, (count, columns), where)
+    logits = held(content, "opacity", (count, 1), where)
     is_background = name == "background"
     check_counts(where, rest.shape[1], colours.shape[1], is_background=is_background)
     problems = _doubts(content, where)

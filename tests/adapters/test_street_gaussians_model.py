@@ -250,6 +250,10 @@ def with_value(content: dict, value: object, *keys: str) -> dict:
             "xyz says it is .*does not hold as many",
         ),
         (
+            lambda c: with_value(c, torch.zeros(50, 3, device="meta"), "background", "xyz"),
+            "xyz must be float32 numbers",
+        ),
+        (
             lambda c: with_value(
                 c, torch.full((4, 2, 3), torch.inf), "actor_pose", "params", "opt_trans"
             ),
