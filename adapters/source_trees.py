@@ -5,8 +5,9 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import NamedTuple
 
-from adapters.uri import CAMERA_PATH_KEY, parse_uri
+from adapters.uri import CAMERA_PATH_KEY, GROUND_KEY, parse_uri
 from augment.batch.mirror_tree import SourceTree
 from augment.errors import AdapterError
 from augment.scene import Scene
@@ -28,56 +29,75 @@ def source_tree(scene: Scene) -> SourceTree:
                 f"{part} shows the frames of a camera path; a dataset's copy takes images of its "
                 f"own frames, leave {CAMERA_PATH_KEY} out"
             )
-    scheme, path, _ = parse_uri(uri)
+    scheme, path, query = parse_uri(uri)
+    query.pop(GROUND_KEY, None)
     find = _TREES.get(scheme or "")
     if find is None:
         raise AdapterError(
             f"{uri} has no dataset's folder that could be copied with weathered images; "
             f"{', '.join(_TREES)} scenes have one, and scenes fitted to them"
         )
-    folder = Path(os.path.abspath(path))
-    if not folder.is_dir():
+    if not Path(path).exists():
         raise AdapterError(
-            f"{folder}, which the scene was made from, is no folder; where it has moved, say so in "
+            f"{path}, which the scene was made from, is not there; where it has moved, say so in "
             f"the scene's URI (data=URI)"
         )
-    root, images, entries = find(folder)
-    return SourceTree(uri, root, images, None if entries is None else tuple(sorted(entries)))
+    found = find(Path(os.path.abspath(path)), query)
+    entries = None if found.entries is None else tuple(sorted(found.entries))
+    return SourceTree(uri, found.root, found.images, entries)
 
 
-def _pandaset(folder: Path) -> tuple[Path, str, None]:
-    return folder, r"camera/[^/]+/\d+\.jpg", None
+class _Found(NamedTuple):
+    """As of SourceTree."""
+
+    root: Path
+    images: str
+    entries: Iterable[str] | None = None
 
 
-def _nuscenes(folder: Path) -> tuple[Path, str, None]:
-    return folder, r"(samples|sweeps)/CAM_[^/]+/[^/]+\.jpg", None
+def _pandaset(folder: Path, _query: dict[str, str]) -> _Found:
+    return _Found(folder, r"camera/[^/]+/\d+\.jpg")
 
 
-def _kitti(folder: Path) -> tuple[Path, str, Iterable[str] | None]:
+def _nuscenes(folder: Path, _query: dict[str, str]) -> _Found:
+    return _Found(folder, r"(samples|sweeps)/CAM_[^/]+/[^/]+\.jpg")
+
+
+def _kitti(folder: Path, _query: dict[str, str]) -> _Found:
     """A drive with the calibration beside it, in the folder of its date; or the folder itself."""
     from adapters.kitti.layout import VELODYNE, kitti_root
 
     if not (folder / VELODYNE).is_dir():
-        return folder, r"((training|testing)/)?image_\d/\d+\.(?i:png|jpg)", None
+        return _Found(folder, r"((training|testing)/)?image_\d/\d+\.(?i:png|jpg)")
     _, calibrated = kitti_root(folder)
     if calibrated == folder:
-        return folder, _KITTI_CAMERA, None
+        return _Found(folder, _KITTI_CAMERA)
     calibration = (path.name for path in calibrated.glob("calib_*.txt"))
-    return calibrated, rf"[^/]+/{_KITTI_CAMERA}", (folder.name, *calibration)
+    return _Found(calibrated, rf"[^/]+/{_KITTI_CAMERA}", (folder.name, *calibration))
 
 
-def _street_gaussians(folder: Path) -> tuple[Path, str, None]:
-    return folder, r"images/[^/]+\.(png|jpg)", None
+def _street_gaussians(folder: Path, _query: dict[str, str]) -> _Found:
+    return _Found(folder, r"images/[^/]+\.(png|jpg)")
 
 
-def _recording(folder: Path) -> tuple[Path, str, None]:
-    return folder, r"images/[^/]+/\d+\.(?i:png|jpe?g)", None
+def _drivestudio(path: Path, query: dict[str, str]) -> _Found:
+    """The processed data that a run was trained on."""
+    from adapters.drivestudio.options import RunOptions
+    from adapters.drivestudio.run import find_run
+
+    data = find_run(path, RunOptions.from_query(query)).data
+    return _Found(Path(os.path.abspath(data)), r"images/\d+_\d+\.jpg")
 
 
-_TREES: dict[str, Callable[[Path], tuple[Path, str, Iterable[str] | None]]] = {
+def _recording(folder: Path, _query: dict[str, str]) -> _Found:
+    return _Found(folder, r"images/[^/]+/\d+\.(?i:png|jpe?g)")
+
+
+_TREES: dict[str, Callable[[Path, dict[str, str]], _Found]] = {
     "pandaset": _pandaset,
     "nuscenes": _nuscenes,
     "kitti": _kitti,
     "street_gaussians": _street_gaussians,
+    "drivestudio": _drivestudio,
     "recording": _recording,
 }

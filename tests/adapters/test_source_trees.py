@@ -10,11 +10,13 @@ import subprocess
 from pathlib import Path
 
 import cv2
+import drivestudio_files
 import numpy as np
 import nuscenes_files
 import pandaset_folder
 import pytest
 import recording_folder
+import street_gaussians_files
 
 from adapters.base import open_scene
 from adapters.source_trees import source_tree
@@ -277,24 +279,44 @@ def street_scene(root: Path, **changes) -> Scene:
     return dataclasses.replace(scene, frames=frames, **changes)
 
 
-@pytest.mark.parametrize("is_model", [False, True])
-def test_street_gaussians_data(tmp_path, is_model):
-    """Rendered by a model at another size than recorded, as the project's own are."""
+def test_street_gaussians_data(tmp_path):
+    root = street_gaussians_files.write_dataset(tmp_path / "002", frames=2, depth=True).root
+    scene = open_scene(format_uri("street_gaussians", root, SMALL))
+    copy, said = weather(scene, tmp_path / "out", frames=[1])
+    changed = changed_files(root, copy / "002")
+    assert changed == {f"images/000001_{camera}.png" for camera in range(5)}
+    assert "  5 of 10 camera images are the source's own, clear ones" in said
+    again = open_scene(format_uri("street_gaussians", copy / "002", SMALL))
+    assert_same_but_colours(scene, again, root, copy / "002")
+
+
+def test_a_street_gaussians_model_has_its_datas_tree(tmp_path):
+    """Rendered at another size than recorded, as the project's own models are."""
     root = tmp_path / "data" / "waymo" / "002"
     (root / "images").mkdir(parents=True)
-    (root / "ego_pose").mkdir()
-    (root / "ego_pose" / "000000.txt").write_text("1 0 0 0\n")
     for frame in range(4):
         for camera in (0, 3, 4):
             image = np.full((19, 29, 3), 10 * camera, np.uint8)
             cv2.imwrite(str(root / "images" / f"{frame:06d}_{camera}.png"), image)
-    data = f"street_gaussians:{root}"
-    model = {"source": f"street_gaussians:{tmp_path}/model", "recorded_source": data}
-    scene = street_scene(root, **(model if is_model else {"source": data}))
+    model = {"source": f"street_gaussians:{tmp_path}/model"}
+    scene = street_scene(root, **model, recorded_source=f"street_gaussians:{root}")
     copy, said = weather(scene, tmp_path / "out")
     assert changed_files(root, copy / "002") == relative_images(scene, root)
     assert cv2.imread(str(copy / "002/images/000001_3.png")).shape == (19, 29, 3)
     assert "  4 of 12 camera images are the source's own, clear ones" in said
+
+
+def test_a_drivestudio_run_has_its_datas_tree(tmp_path):
+    numbers = drivestudio_files.write_run(tmp_path)
+    scene = open_scene(f"drivestudio:{numbers.folder}?data={numbers.data}&ground_z=0")
+    frame = scene.frames[1].index
+    copy, _ = weather(scene, tmp_path / "out", scale=0.05, frames=[frame])
+    changed = changed_files(numbers.data, copy / "007")
+    assert changed == {
+        os.path.relpath(path, numbers.data) for path in scene.frame(frame).image_paths.values()
+    }
+    name = min(changed)
+    assert cv2.imread(str(copy / "007" / name)).shape == cv2.imread(str(numbers.data / name)).shape
 
 
 def test_a_fitted_scene_has_its_recordings_tree(tmp_path):
@@ -344,7 +366,7 @@ def test_the_real_sequence_at_a_twentieth(shared_dir, tmp_path):
         ("procedural:street?seed=3", "has no dataset's folder .*pandaset, nuscenes, kitti, "),
         ("gaussians:model.ply", "has no dataset's folder"),
         ("fake:street", "has no dataset's folder"),
-        ("pandaset:/no/such/002", "/no/such/002, which the scene was made from, is no folder"),
+        ("pandaset:/no/such/002", "/no/such/002, which the scene was made from, is not there"),
         ("pandaset:.?camera_path=path.json", "shows the frames of a camera path"),
     ],
 )
