@@ -102,7 +102,7 @@ def _clear(old: Path, target: Path, own: Collection[str]) -> None:
     they and the folder stay, since nobody here may decide to delete them.
     """
     for entry in list(old.iterdir()):
-        if entry.name in own or entry.name.startswith(".tmp"):  # what safetensors left half-written
+        if entry.name in own:
             entry.unlink()
         elif target.is_dir() and not (target / entry.name).exists():
             os.rename(entry, target / entry.name)

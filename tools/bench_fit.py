@@ -31,7 +31,7 @@ from augment.scene import Scene
 from recipes.load import load_recipe
 from tools.bench import Spread
 from tools.bench_memory import RESET_PEAK, return_free_memory, status_mib
-from tools.fit_data import HELD_OUT_SCHEMES, check_recorded, splat_count
+from tools.fit_data import can_hold_out, check_recorded, splat_count
 from tools.fit_options import resolved_uri, without_growth
 from tools.machine import MachineFacts, load_average, machine_facts
 
@@ -160,7 +160,7 @@ def _recording(scene_uri: str | None) -> Iterator[tuple[str, float]]:
 def _with_count(uri: str) -> str:
     """The URI with a bound that leaves SPLATS or some more."""
     scheme, path, query = resolved_uri(uri)
-    if scheme in HELD_OUT_SCHEMES:
+    if can_hold_out(scheme, path):
         query = {"max_gaussians": str(2 * SPLATS), **query}
     return format_uri(scheme, path, query)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from adapters.recorded.holdout import holdout_step
@@ -16,8 +17,7 @@ from augment.scene import Scene
 from tools.fit_options import FitOptions, resolved_uri
 
 HELD_OUT_KEY = "held_out"
-# Those that can build a scene without some of its frames.
-HELD_OUT_SCHEMES = ("pandaset", "recording", "nuscenes", "kitti", "street_gaussians")
+_HELD_OUT_SCHEMES = ("pandaset", "recording", "nuscenes", "kitti")
 
 
 def open_to_fit(
@@ -36,7 +36,7 @@ def open_to_fit(
             f"--holdout says which frames are held out, of the scene and of the views alike"
         )
     step = holdout_step(options.holdout)
-    if step is None or scheme not in HELD_OUT_SCHEMES:
+    if step is None or not can_hold_out(scheme, path):
         scene = open_scene(format_uri(scheme, path, query))
         check_recorded(scene)
         warning = f"{scheme} scenes cannot be built without them"
@@ -55,6 +55,15 @@ def open_to_fit(
     if better is not None and (guess is None or holds(better, numbers) != holds(guess, numbers)):
         scene = open_scene(format_uri(scheme, path, {**query, HELD_OUT_KEY: better}))
     return scene, ()
+
+
+def can_hold_out(scheme: str, path: str) -> bool:
+    """Whether such a scene can be built without some of its frames."""
+    if scheme == "street_gaussians":
+        from adapters.street_gaussians.model_files import is_dataset
+
+        return is_dataset(Path(path))
+    return scheme in _HELD_OUT_SCHEMES
 
 
 def check_recorded(scene: Scene) -> None:

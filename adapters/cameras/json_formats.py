@@ -36,6 +36,8 @@ class _InriaCamera(_Foreign):
     height: Pixels
     fx: Focal
     fy: Focal
+    cx: FiniteFloat | None = None
+    cy: FiniteFloat | None = None
     position: Vector
     rotation: tuple[Vector, Vector, Vector]
 
@@ -104,7 +106,8 @@ def validate(model: type[Model], content: object, path: Path, kind: str) -> Mode
 
 
 def inria_views(content: list[object], path: Path) -> ViewSet:
-    """Views of INRIA's list; its cameras have no principal point, which is the middle then.
+    """Views of INRIA's list. Its cameras have no principal point, which is the middle then; our own
+    exports add cx and cy.
 
     Raises:
         AdapterError: a field is missing or out of range; names it.
@@ -121,8 +124,8 @@ def inria_views(content: list[object], path: Path) -> ViewSet:
                 height=camera.height,
                 fx=camera.fx,
                 fy=camera.fy,
-                cx=camera.width / 2,
-                cy=camera.height / 2,
+                cx=camera.width / 2 if camera.cx is None else camera.cx,
+                cy=camera.height / 2 if camera.cy is None else camera.cy,
                 world_from_camera=check_pose(pose, where=f"{path}: {number} ({camera.img_name})"),
             )
         )

@@ -65,6 +65,8 @@ def test_inria_cameras(tmp_path: Path) -> None:
     assert (view.name, view.width, view.height, view.fx, view.fy) == ("00001", 640, 480, 500, 510)
     assert (view.cx, view.cy) == (320, 240)  # the format has none: the middle
     assert found.problems == ()
+    own = read_views(save(tmp_path / "cameras.json", [inria_entry(cx=310.5, cy=251)]))
+    assert (own.views[0].cx, own.views[0].cy) == (310.5, 251)  # but our own exports do
 
 
 def test_nerfstudio_axes_and_intrinsics(tmp_path: Path) -> None:
