@@ -91,9 +91,9 @@ def save_scene_file(scene: Scene, path: str | Path, *, half: bool = False) -> No
     replaced. What `load_scene_parts` gives back is equal to the bit, the labels excepted.
 
     half: quaternions, opacities, colours, their waves and the sky as float16, for about half the
-    size (55 % at SH degree 3). Measured: colours move by up to 0.09/255 at degree 3 and 0.04/255 at degree 0
-    (of colours from 0 to 1), rotations by up to 0.05 degrees, opacities by up to 0.00024; 99.9 % of
-    a street's pixels by less than 0.1/255. That it was done is in made_by for good.
+    size (55 % at SH degree 3). Measured: colours move by up to 0.09/255 at degree 3 and 0.04/255 at
+    degree 0 (of colours from 0 to 1), rotations by up to 0.05 degrees, opacities by up to 0.00024;
+    99.9 % of a street's pixels by less than 0.1/255. That it was done is in made_by for good.
 
     Raises:
         SceneError: the scene has something the file cannot hold: as for save_scene, text beyond
