@@ -140,6 +140,15 @@ def test_tables_beside_the_gaussians(tmp_path: Path) -> None:
     ]  # fmt: skip
 
 
+def test_poses_that_were_not_trained_are_left_alone(tmp_path: Path) -> None:
+    fixed = dataclasses.replace(PLAIN, opt_track=False)
+    bare = opened(tmp_path, raw_model(opt_trans=None, extra={"actor_pose": {}}), fixed)
+    assert bare.pose_changes is None and list(bare.problems) == []
+    unused = opened(tmp_path, raw_model(), fixed)
+    assert unused.pose_changes is None
+    assert "actor_pose is left out, as the configuration has not" in unused.problems[0]
+
+
 def test_networks_are_left_out_with_a_sentence(tmp_path: Path) -> None:
     content = checkpoint(raw_model(), 1)
     content["sky_cubemap"] = {
