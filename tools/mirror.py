@@ -10,16 +10,9 @@ from adapters.source_trees import source_tree
 from augment.batch.layout import MANIFEST, folder_name, variant_folder, variant_name
 from augment.batch.lock import OutputLock
 from augment.batch.manifest import OK, read_manifest, rows_of
-from augment.batch.mirror import (
-    MIRROR_FOLDER,
-    Links,
-    Mirrored,
-    check_apart,
-    mirror_dataset,
-    mirror_folder,
-    read_record,
-)
+from augment.batch.mirror import Links, Mirrored, check_apart, mirror_dataset
 from augment.batch.mirror_images import Weathered, dataset_format, weathered_images
+from augment.batch.mirror_record import MIRROR_FOLDER, mirror_folder, read_record
 from augment.batch.mirror_tree import SourceTree, Survey, survey
 from augment.batch.trajectory import RECORDED
 from augment.errors import AdapterError, OutputError
@@ -121,10 +114,10 @@ def _mirror_rows(
     record = read_record(tree, folder)
     quality = _jpeg_quality(out, scene.name, name)
     images, notes = weathered_images(out, rows, scene.frames, tree, quality)
-    others, more = _of_other_scenes(scene, out, name, record["replaced"])
+    others, more = _of_other_scenes(scene, out, name, record.replaced)
     facts = {key: rows[0][key] for key in ("source", "recipe_hash", "version", "backend")}
     known = {image.scene for image in others.values()}
-    scenes = {key: record["scenes"][key] for key in sorted(known & record["scenes"].keys())}
+    scenes = {key: record.scenes[key] for key in sorted(known & record.scenes.keys())}
     done = mirror_dataset(
         tree,
         folder,
@@ -147,15 +140,12 @@ def _of_other_scenes(
     table = read_manifest(out)
     pairs = {(entry["scene"], variant) for entry in images.values()}
     rows = {row["image_path"]: row for row in rows_of(table, pairs) if row["status"] == OK}
-    qualities = {name: 0 for name, _ in pairs}
-    for name in qualities:
-        if any(row["scene"] == name for row in rows.values()):
-            qualities[name] = _jpeg_quality(out, name, variant)
-    found = {
-        place: Weathered.of_row(out, rows[entry["image"]], qualities[entry["scene"]])
-        for place, entry in images.items()
-        if entry["image"] in rows
-    }
+    names = {row["scene"] for row in rows.values()}
+    quality = {name: _jpeg_quality(out, name, variant) for name in names}
+    found = {}
+    for place, entry in images.items():
+        if (row := rows.get(entry["image"])) is not None:
+            found[place] = Weathered.of_row(out, row, quality[row["scene"]])
     gone = sorted(images.keys() - found.keys())
     if not gone:
         return found, []

@@ -20,7 +20,6 @@ from typing import Any, Literal
 from tqdm import tqdm
 
 from augment.batch.atomic import flush_folder, output_error, write_atomic
-from augment.batch.layout import folder_name
 from augment.batch.mirror_files import (
     COPIED,
     LINKED,
@@ -33,11 +32,11 @@ from augment.batch.mirror_files import (
     write_file,
 )
 from augment.batch.mirror_images import ImageForm, Weathered, fits, fitted, image_form
+from augment.batch.mirror_record import record_names
 from augment.batch.mirror_tree import SourceFile, SourceFolder, SourceTree, Survey, walk
 from augment.batch.writer import WritePump
 from augment.errors import AdapterError, OutputError
 
-MIRROR_FOLDER = "source"
 Links = Literal["hard", "copy"]
 
 
@@ -77,42 +76,6 @@ def check_apart(tree: SourceTree, out_dir: Path) -> None:
             f"{out_dir} lies in the dataset's own folder {tree.root}; a copy of the dataset cannot "
             f"be made there, choose an output folder elsewhere"
         )
-
-
-def mirror_folder(out_dir: Path, variant: str) -> Path:
-    """Where the copies of datasets in a variant's weather lie."""
-    return out_dir / MIRROR_FOLDER / folder_name(variant)
-
-
-def read_record(tree: SourceTree, folder: Path) -> dict[str, Any]:
-    """What is known of the copy of a dataset: the images that stand in it, under `replaced`, by
-    place, with their scenes. Also of a copy that was being changed when it was stopped; nothing
-    where there is none.
-
-    Raises:
-        OutputError: the record is damaged, or the copy is that of another dataset.
-    """
-    path = next((p for p in _records(tree, folder) if p.is_file()), None)
-    if path is None:
-        return {"scenes": {}, "replaced": {}}
-    try:
-        record = json.loads(path.read_bytes())
-        scenes = {str(name): dict(facts) for name, facts in record["scenes"].items()}
-        images = {str(place): dict(image) for place, image in record["replaced"].items()}
-        if not all({"scene", "image", "sha256"} <= image.keys() for image in images.values()):
-            raise ValueError("an image lacks its scene")
-        root = record["folder"]
-    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
-        raise OutputError(
-            f"{path} is damaged ({error!r}). Delete it and build the copy again, once for each "
-            f"scene whose images are in it"
-        ) from error
-    if root != str(tree.root):
-        raise OutputError(
-            f"{folder / tree.root.name} is the copy of {root}, not of {tree.root}: choose another "
-            f"output folder"
-        )
-    return {"scenes": scenes, "replaced": images}
 
 
 def mirror_dataset(
@@ -156,7 +119,7 @@ class _Mirroring:
         self.tree, self.folder, self.images = tree, folder, images
         self.may_link, self.links = links == "hard", links
         self.root = str(folder / tree.root.name)
-        self.record, self.begun_record = _records(tree, folder)
+        self.record, self.begun_record = record_names(tree, folder)
         self.done = Mirrored(folder / tree.root.name)
         self.changed_folders: set[str] = set()
         self.fitted: list[str] = []
@@ -321,12 +284,6 @@ class _Mirroring:
             },
             "replaced": done.replaced,
         }
-
-
-def _records(tree: SourceTree, folder: Path) -> tuple[Path, Path]:
-    """The record of a complete copy, and its name while the copy is being changed."""
-    record = folder / f"climategs-mirror-{tree.root.name}.json"
-    return record, record.with_name(record.name + ".begun")
 
 
 def _is_fitted(target: str, recorded: ImageForm, mtime_ns: int) -> bool:

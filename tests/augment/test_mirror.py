@@ -17,7 +17,11 @@ from augment.batch import mirror as mirror_module
 from augment.batch.atomic import TEMPORARY_SUFFIX
 from augment.batch.encode import decode_image
 from augment.batch.mirror_images import dataset_format, weathered_images
+from augment.batch.mirror_record import mirror_folder, read_record
 from augment.errors import AdapterError, OutputError
+
+
+STRIDE = 3  # odd, so that stops come before and after changes; 1 tries every point
 
 
 @pytest.fixture
@@ -145,9 +149,9 @@ def test_going_on_after_a_kill_at_any_point(tmp_path, monkeypatch):
     uninterrupted = trees.mirror(source, out, **options)
     whole, before = trees.contents(copy), trees.snapshot(source)
     assert uninterrupted.copied > 0
-    calls = 0
+    calls = 1 - STRIDE
     while True:
-        calls += 1
+        calls += STRIDE
         remove_tree(copy)
         stopped = False
         with monkeypatch.context() as patch:
@@ -209,8 +213,8 @@ def test_a_stopped_update_does_not_say_that_it_is_complete(source, tmp_path, mon
     record = out / "source/fog-000/climategs-mirror-drive.json"
     assert not record.exists()
     # What stood in the copy is still known, for images of other scenes.
-    known = mirror_module.read_record(trees.tree_of(source), record.parent)
-    assert set(known["replaced"]) == {"camera/front/00.png", "camera/rear/00.png"}
+    known = read_record(trees.tree_of(source), record.parent)
+    assert set(known.replaced) == {"camera/front/00.png", "camera/rear/00.png"}
     trees.mirror(source, out)
     assert [p.name for p in record.parent.iterdir() if p.is_file()] == [record.name]
     assert len(json.loads(record.read_text())["replaced"]) == 8
@@ -253,6 +257,27 @@ def test_files_are_copied_where_they_cannot_be_linked(source, out, monkeypatch, 
     kept.write_bytes(b"of another length")
     assert trees.mirror(source, out).changed == 1
     assert again.read_bytes() == b"of another length"
+    time_ns = kept.stat().st_mtime_ns
+    kept.write_bytes(b"of another length, at that time")
+    os.utime(kept, ns=(time_ns, time_ns))
+    assert trees.mirror(source, out).changed == 1
+
+
+def test_a_leftover_that_is_a_link_is_not_written(source, out, monkeypatch):
+    """Numbers of processes return: a killed run's temporary name may lead to a source's file."""
+    table = source / "README.md"
+    before = table.read_bytes()
+
+    def taken(target: str) -> str:
+        path = os.path.join(os.path.dirname(target), f".1-1{TEMPORARY_SUFFIX}")
+        if not os.path.lexists(path):
+            os.link(table, path)
+        return path
+
+    monkeypatch.setattr("augment.batch.mirror_files._temporary", taken)
+    with pytest.raises(OutputError, match="cannot write"):
+        trees.mirror(source, out, links="copy")
+    assert table.read_bytes() == before
 
 
 def test_a_copy_that_shares_nothing(source, out):
@@ -490,7 +515,7 @@ def test_recorded_images_that_are_none_stay(source, out):
     ]
     extent = trees.survey(trees.tree_of(source))
     assert extent.images == 7
-    folder = mirror_module.mirror_folder(out, "fog-000")
+    folder = mirror_folder(out, "fog-000")
     done = mirror_module.mirror_dataset(
         trees.tree_of(source), folder, images, {}, extent=extent, progress=False
     )
