@@ -66,8 +66,14 @@ def mirror_outputs(
     said = []
     with OutputLock(out):
         found = _rows(scene, out, variants)
-        for name, rows in found.items():
-            said += _mirror_rows(scene, out, tree, extent, name, rows, links, progress)
+        try:
+            for name, rows in found.items():
+                said += _mirror_rows(scene, out, tree, extent, name, rows, links, progress)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(
+                "stopped while the dataset was being copied; run the same command again to go on "
+                "from there"
+            ) from None
     return said
 
 

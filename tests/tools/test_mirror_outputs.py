@@ -151,7 +151,7 @@ def test_a_stopped_copy_keeps_other_scenes(root, tmp_path, monkeypatch):
 
     with monkeypatch.context() as patch:
         patch.setattr("augment.batch.mirror.link_file", stopped)
-        with pytest.raises(KeyboardInterrupt):
+        with pytest.raises(KeyboardInterrupt, match="run the same command again"):
             mirror_outputs(two, out, progress=False)
     mirror_outputs(two, out, progress=False)
     assert len(changed(root, out / "source/fog-000/002")) == 6
