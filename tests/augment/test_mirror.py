@@ -479,6 +479,18 @@ def test_images_of_another_size_are_resized(tmp_path, scale, method, suffix):
     assert trees.snapshot(done.folder) == before
 
 
+def test_resized_images_follow_what_they_were_made_from(source, tmp_path):
+    out = tmp_path / "out"
+    trees.render(source, out, scale=0.5)
+    done = trees.mirror(source, out)
+    image, recorded = image_of(out, "front", 0), source / "camera/front/01.png"
+    cv2.imwrite(str(image), np.full((8, 12, 3), 77, np.uint8))  # rendered anew
+    cv2.imwrite(str(recorded), np.zeros((10, 14, 3), np.uint8))  # of another size now
+    assert trees.mirror(source, out).changed == 2
+    assert (cv2.imread(str(done.folder / "camera/front/00.png")) == 77).all()
+    assert cv2.imread(str(done.folder / "camera/front/01.png")).shape == (10, 14, 3)
+
+
 def test_images_of_another_format_are_encoded_anew(tmp_path):
     source, out = trees.write_dataset(tmp_path / "drive", suffix="jpg"), tmp_path / "out"
     trees.render(source, out, image="png")
