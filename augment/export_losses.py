@@ -73,6 +73,11 @@ def _of_colours(scene: Scene, kind: ExportKind) -> Iterator[str]:
     if waves:
         which = "their constant part" if kind == "ply-parts" else "those of that moment"
         yield f"colours of actors ({waves}) that change over time are {which}"
+    if kind == "ply-parts" and any(actor.colors_in_world for actor in scene.actors):
+        yield (
+            "colours of actors by direction are for directions of the world, and viewers turn them "
+            "with the actor"
+        )
     if kind == "splat":
         yield "colours, opacities and rotations have 8 bits; colours below 0 or above 1 are cut off"
         if any(part.sh_degree > 0 for part in scene.all_gaussians):

@@ -16,6 +16,7 @@ from augment.color_waves import ColorWaves
 from augment.errors import SceneError
 from augment.ground_heights import Ground
 from augment.labels import Boxes, LabelSource, LidarSweep
+from augment.render.sh import rotate_sh
 from augment.semantics import SemanticClass
 from augment.sky import Sky
 from augment.track import Track
@@ -112,7 +113,8 @@ class Actor:
     box centre), its track, and its box size (length, width, height in metres).
 
     color_waves: how its colours change over time; None where they do not. It has a row for each of
-    the Gaussians.
+    the Gaussians. colors_in_world: its SH are for directions of the world, whichever way it is
+    turned, as Street Gaussians and drivestudio train them, and not for those of its own frame.
     """
 
     track_id: str
@@ -121,6 +123,7 @@ class Actor:
     track: Track
     size_m: tuple[float, float, float]
     color_waves: ColorWaves | None = None
+    colors_in_world: bool = False
 
     def __post_init__(self) -> None:
         waves = self.color_waves
@@ -131,10 +134,14 @@ class Actor:
             )
 
     def gaussians_at(self, timestamp_ns: int) -> Gaussians:
-        """Its Gaussians in the colours they have at a time."""
-        if self.color_waves is None:
-            return self.gaussians
-        return self.color_waves.at(self.gaussians, timestamp_ns)
+        """Its Gaussians in the colours they have at a time, SH for directions in its own frame."""
+        gaussians = self.gaussians
+        if self.color_waves is not None:
+            gaussians = self.color_waves.at(gaussians, timestamp_ns)
+        pose = self.track.pose_at(timestamp_ns) if self.colors_in_world else None
+        if pose is None or gaussians.sh_degree == 0:
+            return gaussians
+        return replace(gaussians, sh=rotate_sh(gaussians.sh, pose[:3, :3].T))
 
 
 @dataclass(frozen=True, eq=False)

@@ -162,6 +162,7 @@ def _actor_entry(actor: Actor) -> dict[str, Any]:
         "color_waves": None
         if waves is None
         else {"timestamps_ns": waves.timestamps_ns.tolist(), "phases": waves.phases.tolist()},
+        "colors_in_world": bool(actor.colors_in_world),
     }
 
 
@@ -182,7 +183,9 @@ def _actor(entry: ActorEntry, part: SavedPart) -> Actor:
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from error
     size_m = (length, width, height)
-    return Actor(entry.track_id, entry.label, part.gaussians, track, size_m, waves)
+    return Actor(
+        entry.track_id, entry.label, part.gaussians, track, size_m, waves, entry.colors_in_world
+    )
 
 
 def _frame_entry(frame: Frame) -> dict[str, Any]:

@@ -101,6 +101,7 @@ class ActorEntry(_Closed):
     gaussians: Count
     track: TrackEntry
     color_waves: WavesEntry | None = None
+    colors_in_world: bool = False
 
 
 class ImageColorMapEntry(_Closed):

@@ -30,7 +30,15 @@ def fitted_scene(**changes) -> Scene:
     phases = torch.tensor([0.1, 1 / 3, 2.0], dtype=torch.float64)
     waves = ColorWaves(torch.from_numpy(rng.normal(0, 0.1, (7, 4, 3)).astype("f4")), times, phases)
     actors = (
-        Actor("car/1", "Car", random_gaussians(7, sh_degree=0), car, (4.0, 2.0, 1.5), waves),
+        Actor(
+            "car/1",
+            "Car",
+            random_gaussians(7, sh_degree=0),
+            car,
+            (4.0, 2.0, 1.5),
+            waves,
+            colors_in_world=True,
+        ),
         Actor("é", "Person", with_classes(random_gaussians(3)), person, (0.7, 0.6, 1.8)),
     )
     color_map, image_map = torch.from_numpy(rng.normal(size=(2, 3, 4)).astype(np.float32))

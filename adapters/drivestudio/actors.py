@@ -12,7 +12,7 @@ import torch
 from adapters.checkpoints import taken, tensor
 from adapters.drivestudio.drive import FRAME_NS
 from adapters.drivestudio.instances import Instance
-from adapters.drivestudio.nodes import turn_between_deg, turned_to_actor
+from adapters.drivestudio.nodes import turned_to_actor
 from adapters.drivestudio.run import Run
 from augment.errors import AdapterError, SceneError
 from augment.geometry import rigid, rotmat_from_quat, slerp
@@ -23,7 +23,6 @@ _LABEL = "vehicle"  # of an object that none of the data's is known to be
 _SAME_SIZE_M = 0.01
 _NEAR_M = 2.0  # training moves an object less far from where it was labelled
 _CLEARER = 2.0  # how many times farther the next candidate must be
-_TURN_DEG = 5.0  # beyond which colours that turn with the actor are worth a sentence
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +97,7 @@ def make_actors(
     owners: int64 [N], the object of each of the Gaussians. A track has a knot at each frame's time,
     which is that of its images, and the actor is absent from frames in which it is not visible.
     """
-    actors, problems, absent, turning = [], [], [], []
+    actors, problems, absent = [], [], []
     for index, identity in enumerate(identities):
         track_id = f"rigid-{index}" if identity is None else identity.track_id
         own = np.flatnonzero(owners == index)
@@ -107,7 +106,6 @@ def make_actors(
             absent.append(track_id)
             continue
         rotations = poses.rotations[seen, index]
-        usual = rotations[len(rotations) // 2]
         try:
             usable, about = check_gaussians(
                 gaussians.select(torch.from_numpy(own)), where=f"{where} object {index}"
@@ -116,28 +114,21 @@ def make_actors(
             problems.append(str(error))
             continue
         problems += about
-        if usable.sh_degree > 0 and turn_between_deg(rotations, usual) > _TURN_DEG:
-            turning.append(track_id)
         axes = run.convention.object_from_actor
         actors.append(
             Actor(
                 track_id=track_id,
                 label=_LABEL if identity is None else identity.label,
-                gaussians=turned_to_actor(usable, axes, usual),
+                gaussians=turned_to_actor(usable, axes, run.convention.scene_from_model),
                 track=_track(poses.positions[seen, index], rotations @ axes, seen, run),
                 size_m=tuple((poses.sizes_m[index] @ np.abs(axes)).tolist()),
+                colors_in_world=True,
             )
         )
     if absent:
         problems.append(
             f"{where}: objects without Gaussians, or visible in no frame, are no actors: "
             f"{', '.join(absent)}"
-        )
-    if turning:
-        problems.append(
-            f"{where}: colours that depend on the view were trained for directions of the world, "
-            f"and turn with the actor here; they are right for the middle of the tracks of "
-            f"{', '.join(turning)}, which turn by more than {_TURN_DEG:g} degrees from there"
         )
     return tuple(actors), tuple(problems)
 

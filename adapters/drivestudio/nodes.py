@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -93,20 +92,19 @@ def left_out(models: Mapping[str, Any], where: str) -> tuple[str, ...]:
 
 
 def turned_to_actor(
-    gaussians: Gaussians, object_from_actor: np.ndarray, world_from_object: np.ndarray
+    gaussians: Gaussians, object_from_actor: np.ndarray, scene_from_model: np.ndarray
 ) -> Gaussians:
-    """An object's Gaussians in its actor's axes, their view-dependent colours too.
+    """An object's Gaussians in its actor's axes, colours for directions of the scene's world.
 
     The project looks up spherical harmonics in directions of the world, whichever way the object
-    is turned; ours turn with the actor. world_from_object: [3, 3], where both agree.
+    is turned. scene_from_model: [3, 3].
     """
-    actor_from_object = torch.from_numpy(object_from_actor.T.copy())
-    actor_from_world = actor_from_object @ torch.from_numpy(world_from_object.T.copy())
     sh = gaussians.sh
-    if gaussians.sh_degree > 0:
-        sh = rotate_sh(sh, actor_from_world)
+    if gaussians.sh_degree > 0 and not np.array_equal(scene_from_model, np.eye(3)):
+        sh = rotate_sh(sh, torch.from_numpy(scene_from_model))
     if np.array_equal(object_from_actor, np.eye(3)):
         return dataclasses.replace(gaussians, sh=sh)
+    actor_from_object = torch.from_numpy(object_from_actor.T.copy())
     turn = quat_from_rotmat(actor_from_object).to(gaussians.quats.dtype)
     return dataclasses.replace(
         gaussians,
@@ -114,9 +112,3 @@ def turned_to_actor(
         quats=multiply_quats(turn.expand_as(gaussians.quats), gaussians.quats),
         sh=sh,
     )
-
-
-def turn_between_deg(rotations: np.ndarray, other: np.ndarray) -> float:
-    """The largest angle from `other` [3, 3] to one of the rotations [T, 3, 3], degrees."""
-    cosine = (np.einsum("tij,ij->t", rotations, other) - 1) / 2
-    return math.degrees(math.acos(float(np.clip(cosine.min(), -1, 1))))

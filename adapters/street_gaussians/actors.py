@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 
 from adapters.street_gaussians.corrections import CameraChanges
-from adapters.street_gaussians.parts import Part, turn_colours
+from adapters.street_gaussians.parts import Part
 from adapters.street_gaussians.poses import PoseChanges, Poses, image_poses, rotations_of
 from adapters.street_gaussians.records import ModelConfig, StreetData, TrackedObject
 from augment.color_waves import ColorWaves
@@ -17,7 +16,6 @@ from augment.scene import Actor
 from augment.track import Track
 
 _LONGEST_HOLD_NS = 100_000_000
-_TURNING_DEG = 15.0  # an actor that turns by more is said to
 _SAME_MOMENT_M = 0.01
 
 
@@ -42,11 +40,7 @@ def make_actor(
     camera_changes: CameraChanges,
     settings: ActorSettings,
 ) -> tuple[Actor | None, tuple[str, ...]]:
-    """The actor of an object's Gaussians, None where no image shows it, and sentences.
-
-    The model's colours depend on directions in the world's axes, an actor's on those in its own:
-    they are turned by its mean orientation, which is exact for an object that keeps its heading.
-    """
+    """The actor of an object's Gaussians, None where no image shows it, and sentences."""
     name = f"obj_{tracked.track_id:03d}"
     times = np.array([image.timestamp_s for image in data.images])
     shown = np.flatnonzero((times >= tracked.start_s) & (times <= tracked.end_s))
@@ -72,18 +66,12 @@ def make_actor(
             f"{name} is at places up to {apart:.2f} m apart in images of one moment; the first "
             f"camera's is taken"
         )
-    mean, turn_deg = _mean_rotation(world_from_actor[first, :3, :3])
-    if part.gaussians.sh_degree > 0 and turn_deg > _TURNING_DEG:
-        problems.append(
-            f"{name} turns by up to {turn_deg:.0f} degrees from its mean orientation: its colours "
-            f"by direction, which were trained in the world's axes, turn with it here"
-        )
     if part.terms is not None and tracked.start_frame == tracked.end_frame:
         problems.append(f"{name} is tracked in one frame only; its colours do not change over time")
     actor = Actor(
         track_id=str(tracked.track_id),
         label=tracked.label,
-        gaussians=turn_colours(part, mean.T).gaussians,
+        gaussians=part.gaussians,
         track=Track(
             torch.from_numpy(knots),
             torch.from_numpy(world_from_actor[first]),
@@ -91,6 +79,7 @@ def make_actor(
         ),
         size_m=tracked.size_m,
         color_waves=_waves(data, tracked, part, shown[first], knots, settings.fourier_scale),
+        colors_in_world=True,
     )
     return actor, tuple(problems)
 
@@ -114,14 +103,6 @@ def _hold_ns(knots: np.ndarray, data: StreetData) -> int:
         [knots[0] - stamps[stamps < knots[0]], stamps[stamps > knots[-1]] - knots[-1]]
     )
     return int(min([_LONGEST_HOLD_NS, *(away - 1)]))
-
-
-def _mean_rotation(rotations: np.ndarray) -> tuple[np.ndarray, float]:
-    """The rotation nearest to all of [T, 3, 3], and the largest angle to it, degrees."""
-    u, _, vt = np.linalg.svd(rotations.mean(0))
-    mean = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
-    traces = np.einsum("ij,tij->t", mean, rotations)
-    return mean, math.degrees(math.acos(float(np.clip((traces.min() - 1) / 2, -1, 1))))
 
 
 def _waves(

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from augment.errors import AdapterError, SceneError
 from augment.gaussian_checks import drawable_rows, is_drawable
-from augment.render.sh import rotate_sh
 from augment.scene import SH_COUNTS, Gaussians, check_gaussians
 
 _ROWS = 1 << 15  # Gaussians changed at a time: temporaries of a few megabytes
@@ -101,19 +100,3 @@ def _mark_bad_terms(means: Tensor, terms: Tensor) -> None:
         bad = ~np.isfinite(terms[piece].numpy()).all((1, 2))
         if bad.any():
             means[piece][torch.from_numpy(bad)] = torch.nan
-
-
-def turn_colours(part: Part, part_from_world: np.ndarray) -> Part:
-    """The part with colours that were trained for directions in the world's axes as seen in its
-    own, in place. part_from_world: float64 [3, 3].
-    """
-    sh = part.gaussians.sh.numpy()
-    if sh.shape[1] > 1:
-        # What becomes of each coefficient alone: the columns of a matrix [K, K].
-        each = torch.eye(sh.shape[1])[:, :, None].expand(-1, -1, 3)
-        turned = rotate_sh(each, torch.from_numpy(np.ascontiguousarray(part_from_world)))
-        matrix = np.ascontiguousarray(turned[1:, 1:, 0].T.numpy())
-        for start in range(0, len(sh), _ROWS):
-            piece = sh[start : start + _ROWS, 1:]
-            piece[:] = np.einsum("ij,njc->nic", matrix, piece)
-    return part

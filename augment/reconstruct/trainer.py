@@ -131,7 +131,8 @@ class Trainer:
                 actor,
                 gaussians=self.splats.gaussians(number),
                 track=self.actor_poses.track(number - 1, actor.track),
-                color_waves=None,  # learnt colours are those of all times
+                color_waves=None,  # learnt colours are those of all times, in the actor's frame
+                colors_in_world=False,
             )
             for number, actor in enumerate(self._scene.actors, start=1)
         )

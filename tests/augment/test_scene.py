@@ -8,6 +8,7 @@ from augment.cameras import Camera
 from augment.color_waves import ColorWaves
 from augment.errors import SceneError
 from augment.geometry import quat_from_rotmat, rigid, rotmat_from_quat, slerp
+from augment.render.sh import evaluate_sh
 from augment.scene import Actor, Gaussians, Scene, Track, check_gaussians
 from augment.sky import ConstantSky
 
@@ -203,6 +204,24 @@ def test_colour_waves_are_held_beyond_their_times():
     assert [waves().phase_at(t) for t in (0, 1_000, 1_500, 2_000, 9_000)] == [0, 0, 0.5, 1, 1]
     with pytest.raises(ValueError, match="strictly increasing"):
         dataclasses.replace(waves(), timestamps_ns=torch.tensor([2, 2]))
+
+
+def test_colours_in_the_world_stand_still_while_an_actor_turns():
+    gaussians = dataclasses.replace(
+        some(3), sh=torch.randn(3, 16, 3, generator=torch.Generator().manual_seed(1))
+    )
+    actor = Actor("a", "car", gaussians, track(), (4.0, 2.0, 1.5), colors_in_world=True)
+    directions = torch.nn.functional.normalize(torch.tensor([[1.0, 2, 3], [-1, 0.5, 0]]), dim=1)
+    for timestamp_ns in (1_000, 1_600, 2_000):
+        (_, part) = scene((actor,)).parts_at(timestamp_ns)
+        own = directions @ part.world_from_part[:3, :3].float()  # as its own frame sees them
+        for k in range(3):
+            sh = gaussians.sh[k].expand(2, 16, 3)
+            expected = evaluate_sh(sh, directions)
+            seen = evaluate_sh(part.gaussians.sh[k].expand(2, 16, 3), own)
+            assert torch.allclose(seen, expected, atol=1e-5)
+    fixed = dataclasses.replace(actor, colors_in_world=False)
+    assert fixed.gaussians_at(1_600) is gaussians
 
 
 def test_an_actor_is_absent_in_a_gap_of_its_track():

@@ -94,7 +94,8 @@ def test_scenes_of_version_1_still_open(saved):
     scene = fitted_scene(image_color_maps={})
     car, person = scene.actors
     person = dataclasses.replace(person, track=dataclasses.replace(person.track, max_gap_ns=None))
-    scene = dataclasses.replace(scene, actors=(dataclasses.replace(car, color_waves=None), person))
+    car = dataclasses.replace(car, color_waves=None, colors_in_world=False)
+    scene = dataclasses.replace(scene, actors=(car, person))
     save_scene(scene, saved)
     new = json.loads((saved / "scene.json").read_text())
     keys = ["format", "version", "name", "recorded_source", "working_folder", "world_origin_m",
