@@ -6,10 +6,11 @@ Tensors are mapped from the file: what is not looked at (an optimiser's state) i
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import mmap
 import pickle
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +21,18 @@ from augment.errors import AdapterError
 
 _CHUNK = 1 << 18  # numbers copied at a time: a megabyte
 _DONTNEED = 4  # linux/mman.h
+_NUMPY_SCALARS = (
+    "numpy.core.multiarray.scalar",  # as NumPy 1 writes it
+    "numpy._core.multiarray.scalar",
+    "numpy.dtype",
+)
 
 
 def load_checkpoint(path: Path) -> dict[str, Any]:
     """The dictionary of a checkpoint, its tensors mapped, in the processor's memory.
+
+    NumPy's numbers, which models hold that were saved before the end of their training, are passed
+    over.
 
     Raises:
         AdapterError: missing, damaged, of the old format of torch < 1.6, holding code or objects
@@ -32,7 +41,8 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise AdapterError(f"{path} does not exist; expected a checkpoint (.pth)")
     try:
-        found = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+        with _passing_over_numpy_scalars():
+            found = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
     except pickle.UnpicklingError as error:
         reason = str(error).split("\n")[0]
         raise AdapterError(
@@ -74,21 +84,29 @@ def tensor(
     """A tensor of a checkpoint, checked. shape: None stands for any length. dtype: None for any.
 
     Raises:
-        AdapterError: missing, no tensor, or of another shape or type.
+        AdapterError: missing, no tensor, of another shape or type, or without all its numbers: a
+            small file can announce a tensor of any size.
     """
     found = content.get(name)
     if not isinstance(found, Tensor):
         keys = ", ".join(map(str, list(content)[:12])) or "nothing"
         raise AdapterError(f"{where} lacks the tensor {name!r}; it holds {keys}")
+    if found.layout != torch.strided or found.is_nested or found.is_meta:
+        raise AdapterError(f"{where}: {name} must be plain numbers; got a tensor of another kind")
     fits = len(found.shape) == len(shape) and all(
         want is None or have == want for have, want in zip(found.shape, shape, strict=True)
     )
-    if not fits or (dtype is not None and found.dtype != dtype) or found.layout != torch.strided:
+    if not fits or (dtype is not None and found.dtype != dtype):
         expected = ", ".join("any" if want is None else str(want) for want in shape)
         kind = "" if dtype is None else f"{dtype} ".replace("torch.", "")
         raise AdapterError(
             f"{where}: {name} must be {kind}[{expected}]; got "
             f"{str(found.dtype).replace('torch.', '')} {list(found.shape)}"
+        )
+    if found.numel() * found.element_size() > found.untyped_storage().nbytes():
+        raise AdapterError(
+            f"{where}: {name} says it is {list(found.shape)} but the file does not hold as many "
+            f"numbers; obtain the file again"
         )
     return found.detach()
 
@@ -119,3 +137,17 @@ def release(source: Tensor) -> None:
     last = end // mmap.PAGESIZE * mmap.PAGESIZE
     if last > first:
         ctypes.CDLL(None).madvise(ctypes.c_void_p(first), ctypes.c_size_t(last - first), _DONTNEED)
+
+
+class _PassedOver:
+    """Stands for a NumPy number that was not read: nothing that a file says of it is evaluated."""
+
+    def __init__(self, *_: object) -> None: ...
+
+    def __setstate__(self, _: object) -> None: ...
+
+
+@contextlib.contextmanager
+def _passing_over_numpy_scalars() -> Iterator[None]:
+    with torch.serialization.safe_globals([(_PassedOver, name) for name in _NUMPY_SCALARS]):
+        yield

@@ -1,5 +1,6 @@
 """The semantic classes of Gaussians and pixels, few enough to hold across datasets."""
 
+import re
 from enum import IntEnum
 
 
@@ -23,3 +24,25 @@ class SemanticClass(IntEnum):
     SKY = 14
     WATER = 15
     SNOW = 16
+
+
+_WORDS: dict[SemanticClass, frozenset[str]] = {
+    SemanticClass.TWO_WHEELER: frozenset(
+        {"bicycle", "bike", "cyclist", "motorbike", "motorcycle", "moped", "rider", "scooter"}
+    ),
+    SemanticClass.PEDESTRIAN: frozenset({"human", "pedestrian", "person"}),
+    SemanticClass.VEHICLE: frozenset(
+        {"ambulance", "automobile", "bus", "car", "coach", "lorry", "minivan", "pickup", "suv"}
+        | {"taxi", "trailer", "tram", "truck", "van", "vehicle"}
+    ),
+}
+
+
+def class_of_label(label: str) -> SemanticClass:
+    """What a dataset's name for an object means, such as vehicle.bus.rigid or Cyclist; UNKNOWN for
+    words that are not known.
+    """
+    words = set(re.findall("[a-z]+", label.lower()))
+    return next(
+        (c for c, own in _WORDS.items() if not own.isdisjoint(words)), SemanticClass.UNKNOWN
+    )

@@ -44,6 +44,6 @@ def mirror(
         scene: The scene of the images. By default what the manifest says.
         links: hard: unchanged files share the dataset's disk space. copy: nothing is shared.
     """
-    from tools.mirror import mirror_folder
+    from tools.mirror import mirror_again
 
-    return mirror_folder(out, scene, links=links)
+    return mirror_again(out, scene, links=links)

@@ -14,6 +14,7 @@ from adapters.drivestudio.drive import FRAME_NS
 from adapters.drivestudio.instances import Instance
 from adapters.drivestudio.nodes import turned_to_actor
 from adapters.drivestudio.run import Run
+from adapters.join import with_class_of
 from augment.errors import AdapterError, SceneError
 from augment.geometry import rigid, rotmat_from_quat, slerp
 from augment.scene import Actor, Gaussians, check_gaussians
@@ -115,11 +116,13 @@ def make_actors(
             continue
         problems += about
         axes = run.convention.object_from_actor
+        label = _LABEL if identity is None else identity.label
+        turned = turned_to_actor(usable, axes, run.convention.scene_from_model)
         actors.append(
             Actor(
                 track_id=track_id,
-                label=_LABEL if identity is None else identity.label,
-                gaussians=turned_to_actor(usable, axes, run.convention.scene_from_model),
+                label=label,
+                gaussians=with_class_of(label, turned),
                 track=_track(poses.positions[seen, index], rotations @ axes, seen, run),
                 size_m=tuple((poses.sizes_m[index] @ np.abs(axes)).tolist()),
                 colors_in_world=True,

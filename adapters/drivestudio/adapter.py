@@ -131,5 +131,6 @@ def _about_renderer(run: Run) -> tuple[str, ...]:
         return ()
     return (
         f"{run.config_file}: the run was trained with trainer.render.antialiased, which draws "
-        f"small splats fainter than they are drawn here",
+        f"small splats fainter than they are drawn here; a recipe's render: {{antialiased: true}} "
+        f"does the same",
     )

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from adapters.join import with_class_of
 from adapters.street_gaussians.corrections import CameraChanges
 from adapters.street_gaussians.parts import Part
 from adapters.street_gaussians.poses import PoseChanges, Poses, image_poses, rotations_of
@@ -71,7 +72,7 @@ def make_actor(
     actor = Actor(
         track_id=str(tracked.track_id),
         label=tracked.label,
-        gaussians=part.gaussians,
+        gaussians=with_class_of(tracked.label, part.gaussians),
         track=Track(
             torch.from_numpy(knots),
             torch.from_numpy(world_from_actor[first]),

@@ -10,12 +10,10 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from adapters.checkpoints import load_checkpoint, release, section, taken
-from adapters.street_gaussians.numpy_scalars import passing_over_numpy_scalars
+from adapters.checkpoints import load_checkpoint, release, section, taken, tensor
 from adapters.street_gaussians.parameters import (
     Parameters,
     actor_id,
-    held,
     read_camera_changes,
     read_color_maps,
     read_pose_changes,
@@ -59,8 +57,7 @@ def read_checkpoint(path: Path, config: ModelConfig) -> TrainedModel:
     Raises:
         AdapterError: not such a file, damaged, or lacking what the configuration says was trained.
     """
-    with passing_over_numpy_scalars():
-        content = load_checkpoint(path)
+    content = load_checkpoint(path)
     if "background" not in content:
         keys = ", ".join(map(str, list(content)[:12])) or "nothing"
         raise AdapterError(
@@ -98,14 +95,14 @@ def read_checkpoint(path: Path, config: ModelConfig) -> TrainedModel:
 def _read_part(content: Mapping[str, Any], path: Path, name: str) -> tuple[Part | None, list[str]]:
     """A part, None for an actor without usable Gaussians, and sentences."""
     where = f"{path}, {name}"
-    means = held(content, "xyz", (None, 3), where)
+    means = tensor(content, "xyz", (None, 3), where)
     count = len(means)
-    colours = held(content, "feature_dc", (count, None, 3), where)
-    rest = held(content, "feature_rest", (count, None, 3), where)
+    colours = tensor(content, "feature_dc", (count, None, 3), where)
+    rest = tensor(content, "feature_rest", (count, None, 3), where)
     sources = {"means": means}
     for key, own, columns in (("scaling", "scales", 3), ("rotation", "quats", 4)):
-        sources[own] = held(content, key, (count, columns), where)
-    logits = held(content, "opacity", (count, 1), where)
+        sources[own] = tensor(content, key, (count, columns), where)
+    logits = tensor(content, "opacity", (count, 1), where)
     is_background = name == "background"
     check_counts(where, rest.shape[1], colours.shape[1], is_background=is_background)
     problems = _doubts(content, where)

@@ -26,25 +26,6 @@ def actor_id(name: str) -> int | None:
     return number if number is not None and name == f"obj_{number:03d}" else None
 
 
-def held(content: Mapping[str, Any], key: str, shape: Sequence[int | None], where: str) -> Tensor:
-    """A float32 tensor of which the file holds every number: a small one can else announce any
-    size.
-
-    Raises:
-        AdapterError: missing, of another shape or type, or without its numbers.
-    """
-    found = content.get(key)
-    if isinstance(found, Tensor) and (found.is_nested or found.is_meta):
-        raise AdapterError(f"{where}: {key} must be float32 numbers; got a tensor of another kind")
-    found = tensor(content, key, shape, where)
-    if found.numel() * found.element_size() > found.untyped_storage().nbytes():
-        raise AdapterError(
-            f"{where}: {key} says it is {list(found.shape)} but the file does not hold as many "
-            f"numbers; obtain the file again"
-        )
-    return found
-
-
 class Parameters:
     """Networks and tables of a checkpoint beside its Gaussians, with sentences about them."""
 
@@ -88,7 +69,7 @@ class Parameters:
             AdapterError: missing, of another shape, or not finite.
         """
         where = f"{self.path}, {name}.params"
-        found = held(params, key, shape, where).double().numpy()
+        found = tensor(params, key, shape, where).double().numpy()
         if not np.isfinite(found).all():
             raise AdapterError(f"{where}: {key} holds NaN or infinite numbers")
         return found
@@ -143,7 +124,7 @@ def read_sky(parameters: Parameters, config: ModelConfig) -> Tensor | None:
             f"background's colour instead"
         )
         return None
-    faces = held(params, "sky_cube_map", (6, None, None, 3), where)
+    faces = tensor(params, "sky_cube_map", (6, None, None, 3), where)
     if faces.shape[1] != faces.shape[2] or faces.shape[1] == 0:
         raise AdapterError(
             f"{where}: sky_cube_map must be float32 [6, R, R, 3]; got {list(faces.shape)}"

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import re
 
 import numpy as np
 import torch
 
 from augment.labels import EGO_VEHICLE
 from augment.scene import Actor, Gaussians, PosedGaussians
-from augment.semantics import SemanticClass
+from augment.semantics import SemanticClass, class_of_label
 from augment.snow.cell_lists import cells_at, make_cells
 from augment.snow.cells import FLUSH, SnowCells
 from augment.snow.height_map import (
@@ -37,10 +36,6 @@ _GROUND = (
     SemanticClass.SIDEWALK,
     SemanticClass.TERRAIN,
 )
-_VEHICLE_WORDS = frozenset(
-    {"ambulance", "automobile", "bus", "car", "coach", "lorry", "minivan", "pickup", "suv", "taxi"}
-    | {"trailer", "tram", "truck", "van", "vehicle"}
-)
 
 
 def is_vehicle(actor: Actor) -> bool:
@@ -53,7 +48,7 @@ def is_vehicle(actor: Actor) -> bool:
     own = classes[~np.isin(classes, (*_GROUND, SemanticClass.UNKNOWN))]
     if len(own):
         return int(np.bincount(own).argmax()) == SemanticClass.VEHICLE
-    return not _VEHICLE_WORDS.isdisjoint(re.findall("[a-z]+", actor.label.lower()))
+    return class_of_label(actor.label) == SemanticClass.VEHICLE
 
 
 def moves(actor: Actor) -> bool:

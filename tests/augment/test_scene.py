@@ -10,6 +10,7 @@ from augment.errors import SceneError
 from augment.geometry import quat_from_rotmat, rigid, rotmat_from_quat, slerp
 from augment.render.sh import evaluate_sh
 from augment.scene import Actor, Gaussians, Scene, Track, check_gaussians
+from augment.semantics import SemanticClass, class_of_label
 from augment.sky import ConstantSky
 
 
@@ -241,3 +242,16 @@ def test_all_gaussians_are_changed_and_nothing_else():
     for before, after in zip(whole.all_gaussians, half.all_gaussians, strict=True):
         assert torch.equal(after.opacities, before.opacities / 2) and after.means is before.means
     assert half.actors[0].track is whole.actors[0].track and half.sky is whole.sky
+
+
+def test_datasets_names_for_objects_have_classes():
+    names = {
+        "vehicle.bus.rigid": SemanticClass.VEHICLE,
+        "Pickup Truck": SemanticClass.VEHICLE,
+        "human.pedestrian.adult": SemanticClass.PEDESTRIAN,
+        "vehicle.bicycle": SemanticClass.TWO_WHEELER,
+        "Cyclist": SemanticClass.TWO_WHEELER,
+        "Pylons": SemanticClass.UNKNOWN,
+        "carrot": SemanticClass.UNKNOWN,
+    }
+    assert {name: class_of_label(name) for name in names} == names
