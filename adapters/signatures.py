@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from augment.errors import AdapterError
-from augment.scene_files import is_scene_file, is_scene_folder
+from augment.files.scene_files import is_scene_file, is_scene_folder
 
 _MOST_ENTRIES = 1000  # of a folder that are looked at below the one given
 _MULTI_PART = b"element vertex_"  # how a Street Gaussians .ply names its parts

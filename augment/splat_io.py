@@ -15,10 +15,10 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from augment.atomic_file import replaced_file
 from augment.errors import SceneError
-from augment.ply_io import ROWS_PER_CHUNK, count_surplus_bytes, read_ply_header
-from augment.ply_layout import (
+from augment.files.atomic_file import replaced_file
+from augment.files.ply_io import ROWS_PER_CHUNK, count_surplus_bytes, read_ply_header
+from augment.files.ply_layout import (
     SEMANTIC,
     column_types,
     has_wide_means,

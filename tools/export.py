@@ -8,8 +8,8 @@ from pathlib import Path
 from adapters.base import open_scene
 from adapters.scene_folder import storable
 from augment.errors import ClimateGSError, OutputError
-from augment.export_losses import ExportKind, export_losses
-from augment.gaussian_export import (
+from augment.files.export_losses import ExportKind, export_losses
+from augment.files.gaussian_export import (
     CAMERAS,
     PARTS,
     export_cameras,
@@ -17,14 +17,14 @@ from augment.gaussian_export import (
     export_ply_parts,
     export_splat,
 )
-from augment.scene import Scene
-from augment.scene_files import (
+from augment.files.scene_files import (
     FILES,
     SCENE_SUFFIX,
     is_scene_folder,
     save_scene,
     save_scene_file,
 )
+from augment.scene import Scene
 
 _SUFFIXES = {"file": SCENE_SUFFIX, "ply": ".ply", "splat": ".splat"}
 _BAKED = ("ply", "splat")

@@ -20,9 +20,9 @@ from typing import Any
 from augment.batch.layout import STATE_FOLDER
 from augment.batch.lock import OutputLock
 from augment.errors import OutputError
+from augment.files.scene_files import is_scene_folder
 from augment.reconstruct.view import ViewSource
 from augment.scene import Scene
-from augment.scene_files import is_scene_folder
 from tools.fit_checkpoint import (
     PLAN_FILE,
     Checkpoint,

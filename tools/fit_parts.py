@@ -94,8 +94,8 @@ def real_parts() -> FitParts:
     """The library's own."""
     from adapters.base import open_scene
     from adapters.recorded.starting_scene import starting_scene
+    from augment.files.scene_files import save_scene
     from augment.reconstruct.trainer import Trainer
-    from augment.scene_files import save_scene
 
     return FitParts(
         open_scene=open_scene,

@@ -22,11 +22,11 @@ from pydantic import ValidationError
 from augment.batch.atomic import write_atomic
 from augment.cameras import Camera
 from augment.errors import ClimateGSError, OutputError, StyleError
+from augment.files.scene_files import is_scene_folder, save_scene
 from augment.render.composite import composite_sky, quantise
 from augment.render.rasterize import rasterize
 from augment.render.sh import SH_C0
 from augment.scene import Gaussians, Scene
-from augment.scene_files import is_scene_folder, save_scene
 from augment.semantics import SemanticClass
 from augment.style.apply import style_gaussians, styled_scene
 from augment.style.content import content_pictures, content_statistics, select_views

@@ -19,7 +19,7 @@ from adapters.street_gaussians.parameters import actor_id
 from adapters.street_gaussians.parts import Part, allocate, check_counts, finish_part
 from adapters.street_gaussians.records import ModelConfig
 from augment.errors import AdapterError, SceneError
-from augment.ply_io import (
+from augment.files.ply_io import (
     PlyElement,
     PlyHeader,
     count_surplus_bytes,

@@ -17,8 +17,8 @@ from adapters.pandaset.labels import PandaSetLabels
 from adapters.scene_folder import storable
 from augment.batch.shared_scene import share_scene
 from augment.errors import AdapterError, SceneError
+from augment.files.scene_files import save_scene, save_scene_file
 from augment.scene import Scene
-from augment.scene_files import save_scene, save_scene_file
 from tools.scene_report import describe_scene, scene_text
 
 STREET = "procedural:street?seed=5&frames=6&gaussians=60000&lidar_columns=16"

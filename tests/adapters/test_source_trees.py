@@ -24,8 +24,8 @@ from adapters.uri import format_uri
 from augment.batch.job import RenderJob, run_job
 from augment.batch.mirror_tree import survey
 from augment.errors import AdapterError
+from augment.files.scene_files import save_scene
 from augment.scene import Scene
-from augment.scene_files import save_scene
 from recipes.schema import Recipe
 from tests.augment.batch_scenes import fake_render, make_recipe, open_fake
 from tests.augment.mirror_trees import contents, listing, snapshot

@@ -20,8 +20,8 @@ from augment import gaussian_export
 from augment.bake import baked, moved_gaussians
 from augment.color_waves import ColorWaves
 from augment.errors import OutputError, SceneError
-from augment.export_losses import export_losses
-from augment.gaussian_export import (
+from augment.files.export_losses import export_losses
+from augment.files.gaussian_export import (
     export_cameras,
     export_ply,
     export_ply_parts,

@@ -24,15 +24,15 @@ from scenes import camera_ahead, random_gaussians
 from augment import atomic_folder
 from augment.color_waves import ColorWaves
 from augment.errors import OutputError, SceneError
-from augment.render.rasterize import rasterize
-from augment.scene import Actor, Gaussians, Track
-from augment.scene_files import (
+from augment.files.scene_files import (
     FILES,
     is_scene_folder,
     load_scene_parts,
     save_scene,
     save_scene_file,
 )
+from augment.render.rasterize import rasterize
+from augment.scene import Actor, Gaussians, Track
 from augment.sky import ConstantSky, LatLongSky
 
 DIFFERENT = ("source", "labels")  # a loaded scene is opened from its folder

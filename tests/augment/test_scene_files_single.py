@@ -21,15 +21,15 @@ from scenes import random_gaussians
 
 from augment import tensor_files
 from augment.errors import OutputError, SceneError
-from augment.geometry import multiply_quats
-from augment.render.sh import evaluate_sh
-from augment.scene_files import (
+from augment.files.scene_files import (
     is_scene_file,
     load_scene_parts,
     read_saved_scene,
     save_scene,
     save_scene_file,
 )
+from augment.geometry import multiply_quats
+from augment.render.sh import evaluate_sh
 from augment.sky import ConstantSky, LatLongSky
 
 DIFFERENT = ("source", "labels")

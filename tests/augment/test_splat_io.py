@@ -18,7 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from augment.errors import OutputError, SceneError
-from augment.ply_io import iterate_rows, read_ply_header
+from augment.files.ply_io import iterate_rows, read_ply_header
 from augment.scene import Gaussians
 from augment.splat_io import (
     read_ply,

@@ -13,10 +13,10 @@ import numpy as np
 import torch
 
 from augment.cameras import Camera, Frame
+from augment.files.scene_schema import FORMAT
 from augment.reconstruct.config import FitConfig
 from augment.reconstruct.view import RecordedView, ViewKey
 from augment.scene import Gaussians, Scene
-from augment.scene_schema import FORMAT
 from augment.sky import ConstantSky
 from tools.fit_parts import FitParts
 

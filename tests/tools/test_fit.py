@@ -17,10 +17,10 @@ from adapters.base import open_scene
 from adapters.recorded.depth_priors import DepthPriors
 from augment.batch.lock import OutputLock
 from augment.errors import ClimateGSError, OutputError
+from augment.files.scene_schema import FORMAT
 from augment.reconstruct.config import FitConfig
 from augment.reconstruct.densify import densify_due
 from augment.reconstruct.view import ViewKey
-from augment.scene_schema import FORMAT
 from tools import fit, fit_checkpoint
 from tools.cli import main
 from tools.fit import fit_scene, state_folder

@@ -9,7 +9,7 @@ import torch
 
 from adapters.base import open_scene
 from augment.errors import OutputError, StyleError
-from augment.scene_files import load_scene_parts, save_scene
+from augment.files.scene_files import load_scene_parts, save_scene
 from augment.style.apply import style_gaussians, style_sky
 from augment.style.scene_maps import style_maps
 from recipes.style import Style

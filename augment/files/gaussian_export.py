@@ -1,6 +1,6 @@
 """Scenes as plain splat files: baked at a moment, or part by part; with cameras for viewers.
 
-`augment.export_losses` says what such files cannot keep. Scales and opacities are stored as logs
+`augment.files.export_losses` says what such files cannot keep. Scales and opacities are stored as logs
 and logits, so that they read back to rounding, not to the bit.
 """
 
@@ -19,8 +19,8 @@ from augment.batch.atomic import flush_folder, make_folder, output_error, write_
 from augment.batch.layout import folder_name
 from augment.cameras import Camera
 from augment.errors import OutputError, SceneError
+from augment.files.scene_document import document_text, track_entry
 from augment.scene import Gaussians, Scene
-from augment.scene_document import document_text, track_entry
 from augment.splat_io import write_ply, write_splat
 
 BACKGROUND, CAMERAS, PARTS, ACTORS = "background.ply", "cameras.json", "parts.json", "actors"

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from augment.errors import SceneError
-from augment.ply_io import PlyElement, PlyHeader, iterate_rows
+from augment.files.ply_io import PlyElement, PlyHeader, iterate_rows
 from augment.render.sh import SH_C0
 from augment.scene import SH_COUNTS, Gaussians
 

@@ -23,7 +23,7 @@ from augment.scene import SH_COUNTS, Gaussians, Scene, SemanticClass, check_gaus
 from augment.sky import ConstantSky, CubemapSky, LatLongSky, Sky
 
 if TYPE_CHECKING:
-    from augment.scene_schema import Precision, SceneDocument
+    from augment.files.scene_schema import Precision, SceneDocument
 
 SKY_KINDS: dict[type, str] = {ConstantSky: "constant", LatLongSky: "latlong", CubemapSky: "cubemap"}
 MOST_WAVES = 1000  # terms; what is summed for every image must not take for ever

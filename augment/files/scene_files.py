@@ -22,12 +22,11 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from augment.atomic_file import replaced_file
-from augment.atomic_folder import replaced_folder
 from augment.errors import OutputError, SceneError
-from augment.scene import Scene
-from augment.scene_document import document_text, scene_document, scene_of
-from augment.scene_schema import (
+from augment.files.atomic_file import replaced_file
+from augment.files.atomic_folder import replaced_folder
+from augment.files.scene_document import document_text, scene_document, scene_of
+from augment.files.scene_schema import (
     FORMAT,
     READABLE,
     VERSION,
@@ -36,8 +35,9 @@ from augment.scene_schema import (
     parsed_document,
     read_document,
 )
-from augment.scene_tensors import part_arrays, sky_arrays, take_parts, take_sky
-from augment.tensor_files import read_tensors, write_tensors
+from augment.files.scene_tensors import part_arrays, sky_arrays, take_parts, take_sky
+from augment.files.tensor_files import read_tensors, write_tensors
+from augment.scene import Scene
 
 DOCUMENT, GAUSSIANS, SKY = "scene.json", "gaussians.safetensors", "sky.safetensors"
 FILES = (DOCUMENT, GAUSSIANS, SKY)

@@ -14,9 +14,7 @@ from torch import Tensor
 from augment.cameras import Camera, Frame
 from augment.color_waves import ColorWaves
 from augment.errors import SceneError
-from augment.ground_heights import Ground
-from augment.scene import Actor, Scene, Track
-from augment.scene_schema import (
+from augment.files.scene_schema import (
     FORMAT,
     VERSION,
     ActorEntry,
@@ -25,7 +23,9 @@ from augment.scene_schema import (
     SceneDocument,
     checked_document,
 )
-from augment.scene_tensors import SKY_KINDS, SavedPart
+from augment.files.scene_tensors import SKY_KINDS, SavedPart
+from augment.ground_heights import Ground
+from augment.scene import Actor, Scene, Track
 from augment.sky import Sky
 
 _LISTS = ("actors", "frames", "problems", "image_color_maps")  # with a line an item

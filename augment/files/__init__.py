@@ -1,0 +1,1 @@
+"""Scenes as files: our own format, and what other programs read."""
