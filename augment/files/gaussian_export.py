@@ -1,7 +1,7 @@
 """Scenes as plain splat files: baked at a moment, or part by part; with cameras for viewers.
 
-`augment.files.export_losses` says what such files cannot keep. Scales and opacities are stored as logs
-and logits, so that they read back to rounding, not to the bit.
+`augment.files.export_losses` says what such files cannot keep. Scales and opacities are stored as
+logs and logits, so that they read back to rounding, not to the bit.
 """
 
 from __future__ import annotations

@@ -16,10 +16,10 @@ from hypothesis import strategies as st
 from scenes import camera_ahead, random_gaussians, slight_pose
 
 from adapters.base import open_scene
-from augment import gaussian_export
 from augment.bake import baked, moved_gaussians
 from augment.color_waves import ColorWaves
 from augment.errors import OutputError, SceneError
+from augment.files import gaussian_export
 from augment.files.export_losses import export_losses
 from augment.files.gaussian_export import (
     export_cameras,

@@ -21,9 +21,9 @@ from hypothesis import strategies as st
 from safetensors.numpy import load_file, save_file
 from scenes import camera_ahead, random_gaussians
 
-from augment import atomic_folder
 from augment.color_waves import ColorWaves
 from augment.errors import OutputError, SceneError
+from augment.files import atomic_folder
 from augment.files.scene_files import (
     FILES,
     is_scene_folder,
@@ -253,7 +253,7 @@ def test_a_killed_save_is_cleared_by_the_next(tmp_path, saved):
     code = f"""
 import os, sys
 sys.path.insert(0, {str(Path(__file__).parents[1])!r})
-from augment import atomic_folder, scene_files
+from augment.files import atomic_folder, scene_files
 from fitted_scenes import fitted_scene
 atomic_folder._put_in_place = lambda *_: os.kill(os.getpid(), 9)
 scene_files.save_scene(fitted_scene(name="killed"), {str(saved)!r})
@@ -266,7 +266,7 @@ scene_files.save_scene(fitted_scene(name="killed"), {str(saved)!r})
 
 
 def test_a_full_disk_is_said(tmp_path, monkeypatch):
-    from augment import scene_files
+    from augment.files import scene_files
 
     def full(*_):
         raise OSError(28, os.strerror(28))

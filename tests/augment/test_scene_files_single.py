@@ -19,8 +19,8 @@ from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 from scenes import random_gaussians
 
-from augment import tensor_files
 from augment.errors import OutputError, SceneError
+from augment.files import tensor_files
 from augment.files.scene_files import (
     is_scene_file,
     load_scene_parts,
