@@ -7,9 +7,9 @@ and actors' poses. World: the dataset's, minus the mean position of the car. Cam
 the project's renders: at most `width` pixels wide, without distortion. The dataset's folder alone
 opens as a raw drive.
 
-Where pictures differ from the project's: an actor's colours by direction turn with it (see
-`actors.make_actor`); colours above 1 are not cut before the sky and the colour map; with a pose
-correction the sky turns with the background, by the fraction of a degree that corrections have.
+Where pictures differ from the project's: colours above 1 are not cut before the sky and the colour
+map; with a pose correction the sky turns with the background, by the fraction of a degree that
+corrections have.
 
 rotation_bug=1 turns actors as an older release of the project did, which models that were trained
 with that release have learnt to live with.
