@@ -145,7 +145,7 @@ def test_what_a_job_wrote_is_a_recording(tmp_path):
     assert run_job(job, scene_loader=lambda _: source).failed == 0
     folder = tmp_path / "raw" / source.name / "clear-000"
     assert recognise(folder) == "recording"
-    with pytest.raises(AdapterError, match=r"It holds recordings: give one, such as .*clear-000"):
+    with pytest.raises(AdapterError, match=r"It holds scenes: give one, such as .*clear-000"):
         recognise(tmp_path / "raw")
     scene = open_scene(f"{folder}?image_scale=1&sky_size=32&max_gaussians=40000")
     assert scene.problems == () and scene.name == f"{source.name}-clear-000"
