@@ -9,15 +9,16 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-if TYPE_CHECKING:
-    from augment.scene import Gaussians
+from augment import color_kernels
+from augment.render.sh import rotate_sh, sh_turn
+from augment.render.threads import kernel_threads
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,23 +59,17 @@ class ColorWaves:
         share = (timestamp_ns - times[after - 1]) / (times[after] - times[after - 1])
         return phases[after - 1] + share * (phases[after] - phases[after - 1])
 
+    def weights_at(self, timestamp_ns: int) -> list[float]:
+        """b_1 to b_{F-1} at a time."""
+        return basis(self.phase_at(timestamp_ns), self.coefficients.shape[1] + 1)[1:]
+
     def change_at(self, timestamp_ns: int) -> Float[Tensor, "N 3"]:
         """What is added to sh[:, 0] at a time."""
-        weights = basis(self.phase_at(timestamp_ns), self.coefficients.shape[1] + 1)[1:]
+        weights = self.weights_at(timestamp_ns)
         change = torch.zeros_like(self.coefficients[:, 0])
         for term, weight in enumerate(weights):
             change.add_(self.coefficients[:, term], alpha=weight)
         return change
-
-    def at(self, gaussians: Gaussians, timestamp_ns: int) -> Gaussians:
-        """The Gaussians in the colours of a time."""
-        sh = gaussians.sh.clone()
-        sh[:, 0] += self.change_at(timestamp_ns)
-        return replace(gaussians, sh=sh)
-
-    def select(self, index: Tensor) -> ColorWaves:
-        """Those of the Gaussians at the given indices or mask, in that order."""
-        return replace(self, coefficients=self.coefficients[index])
 
 
 def basis(phase: float, terms: int) -> list[float]:
@@ -83,3 +78,45 @@ def basis(phase: float, terms: int) -> list[float]:
         math.cos(math.pi * k * phase) if k % 2 == 0 else math.sin(math.pi * (k + 1) * phase)
         for k in range(terms)
     ]
+
+
+def colors_at(
+    sh: Float[Tensor, "N K 3"],
+    waves: ColorWaves | None,
+    timestamp_ns: int,
+    turn: Float[Tensor, "3 3"] | None,
+    *,
+    fast: bool = True,
+) -> Float[Tensor, "N K 3"]:
+    """SH in the colours of a time, and turned by a rotation, where there are such.
+
+    fast: float32 goes through the CPU kernel, equal to the definition here within float rounding.
+    """
+    if fast and sh.dtype == torch.float32 and not sh.requires_grad:
+        return _colors_by_kernel(sh, waves, timestamp_ns, turn)
+    if waves is not None:
+        first = sh[:, :1] + waves.change_at(timestamp_ns)[:, None]
+        sh = torch.cat([first, sh[:, 1:]], 1)
+    return sh if turn is None or sh.shape[1] == 1 else rotate_sh(sh, turn)
+
+
+def _colors_by_kernel(
+    sh: Tensor, waves: ColorWaves | None, timestamp_ns: int, turn: Tensor | None
+) -> Tensor:
+    coefficients, weights = np.zeros((len(sh), 0, 3), np.float32), []
+    if waves is not None:
+        coefficients = waves.coefficients.detach().contiguous().numpy()
+        weights = waves.weights_at(timestamp_ns)
+    matrix = np.zeros((0, 0), np.float32)
+    if turn is not None and sh.shape[1] > 1:
+        matrix = sh_turn(turn, math.isqrt(sh.shape[1]) - 1).numpy().astype(np.float32)
+    out = np.empty(tuple(sh.shape), np.float32)
+    with kernel_threads(1):
+        color_kernels.colors_at(
+            sh.detach().contiguous().numpy(),
+            coefficients,
+            np.asarray(weights, np.float32),
+            matrix,
+            out,
+        )
+    return torch.from_numpy(out)

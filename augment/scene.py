@@ -12,11 +12,10 @@ from jaxtyping import Float, Int16
 from torch import Tensor
 
 from augment.cameras import Camera, Frame
-from augment.color_waves import ColorWaves
+from augment.color_waves import ColorWaves, colors_at
 from augment.errors import SceneError
 from augment.ground_heights import Ground
 from augment.labels import Boxes, LabelSource, LidarSweep
-from augment.render.sh import rotate_sh
 from augment.semantics import SemanticClass
 from augment.sky import Sky
 from augment.track import Track
@@ -135,13 +134,12 @@ class Actor:
 
     def gaussians_at(self, timestamp_ns: int) -> Gaussians:
         """Its Gaussians in the colours they have at a time, SH for directions in its own frame."""
-        gaussians = self.gaussians
-        if self.color_waves is not None:
-            gaussians = self.color_waves.at(gaussians, timestamp_ns)
         pose = self.track.pose_at(timestamp_ns) if self.colors_in_world else None
-        if pose is None or gaussians.sh_degree == 0:
-            return gaussians
-        return replace(gaussians, sh=rotate_sh(gaussians.sh, pose[:3, :3].T))
+        turn = None if pose is None or self.gaussians.sh_degree == 0 else pose[:3, :3].T
+        if self.color_waves is None and turn is None:
+            return self.gaussians
+        sh = colors_at(self.gaussians.sh, self.color_waves, timestamp_ns, turn)
+        return replace(self.gaussians, sh=sh)
 
 
 @dataclass(frozen=True, eq=False)

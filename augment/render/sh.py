@@ -7,8 +7,10 @@ Green 2003, "Spherical harmonic lighting: the gritty details", lists the polynom
 
 from __future__ import annotations
 
+import functools
 import math
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -71,21 +73,35 @@ def evaluate_sh(
 
 
 def rotate_sh(sh: Float[Tensor, "N K 3"], rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "N K 3"]:
-    """Coefficients of the function turned by `rotation`: f'(R d) = f(d), exact in every band.
-
-    A turn mixes the functions of one band only, so each band's matrix follows from the values at
-    more directions than it has functions: Y(d) c' = Y(R^T d) c. It is solved in float64.
-    """
+    """Coefficients of the function turned by `rotation`: f'(R d) = f(d), exact in every band."""
     degree = math.isqrt(sh.shape[1]) - 1
-    directions = _sphere_samples(4 * sh.shape[1])
-    turned = directions @ rotation.to(torch.float64)  # rows R^T d
-    here, there = sh_basis(directions, degree), sh_basis(turned, degree)
-    bands = []
-    for band in range(degree + 1):
-        of_band = slice(band * band, (band + 1) ** 2)
-        matrix = torch.linalg.lstsq(here[:, of_band], there[:, of_band]).solution
-        bands.append(torch.einsum("ij,njc->nic", matrix.to(sh.dtype), sh[:, of_band]))
-    return torch.cat(bands, 1)
+    turn = sh_turn(rotation, degree).to(sh.dtype)
+    bands = [slice(band * band, (band + 1) ** 2) for band in range(degree + 1)]
+    return torch.cat([torch.einsum("ij,njc->nic", turn[b, b], sh[:, b]) for b in bands], 1)
+
+
+def sh_turn(rotation: Float[Tensor, "3 3"], degree: int) -> Float[Tensor, "K K"]:
+    """What turns coefficients by a rotation, float64; a block for each band.
+
+    A turn mixes the functions of one band only, so each block follows from the values at more
+    directions than it has functions: Y(d) c' = Y(R^T d) c.
+    """
+    directions, inverses = _turn_solver(degree)
+    there = sh_basis(directions @ rotation.to(torch.float64), degree).numpy()  # at rows R^T d
+    turn = np.zeros((there.shape[1], there.shape[1]))
+    for band, inverse in enumerate(inverses):
+        block = slice(band * band, (band + 1) ** 2)
+        turn[block, block] = inverse @ there[:, block]
+    return torch.from_numpy(turn)
+
+
+@functools.lru_cache(maxsize=MAX_DEGREE + 1)
+def _turn_solver(degree: int) -> tuple[Tensor, tuple[np.ndarray, ...]]:
+    """Directions, and for each band the pseudo-inverse of its functions there."""
+    directions = _sphere_samples(4 * (degree + 1) ** 2)
+    here = sh_basis(directions, degree).numpy()
+    bands = range(degree + 1)
+    return directions, tuple(np.linalg.pinv(here[:, b * b : (b + 1) ** 2]) for b in bands)
 
 
 def _sphere_samples(count: int) -> Float[Tensor, "S 3"]:

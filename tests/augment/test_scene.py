@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from augment.cameras import Camera
-from augment.color_waves import ColorWaves
+from augment.color_waves import ColorWaves, colors_at
 from augment.errors import SceneError
 from augment.geometry import quat_from_rotmat, rigid, rotmat_from_quat, slerp
 from augment.render.sh import evaluate_sh
@@ -223,6 +223,20 @@ def test_colours_in_the_world_stand_still_while_an_actor_turns():
             assert torch.allclose(seen, expected, atol=1e-5)
     fixed = dataclasses.replace(actor, colors_in_world=False)
     assert fixed.gaussians_at(1_600) is gaussians
+
+
+@pytest.mark.parametrize("bands", [1, 4, 9, 16])
+@pytest.mark.parametrize("has_waves", [False, True])
+@pytest.mark.parametrize("turns", [False, True])
+def test_the_kernel_of_colours_equals_their_definition(bands, has_waves, turns):
+    count = 5_000  # more than two blocks
+    sh = torch.randn(count, bands, 3, generator=torch.Generator().manual_seed(4))
+    changing = waves(count) if has_waves else None
+    turn = track().pose_at(1_700)[:3, :3] if turns else None
+    got = colors_at(sh, changing, 1_300, turn)
+    expected = colors_at(sh, changing, 1_300, turn, fast=False)
+    torch.testing.assert_close(got, expected, rtol=1e-5, atol=1e-5)
+    assert bands == 1 or turns != torch.equal(got[:, 1:], sh[:, 1:])
 
 
 def test_an_actor_is_absent_in_a_gap_of_its_track():
