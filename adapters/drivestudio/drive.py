@@ -21,10 +21,9 @@ from adapters.plain_files import read_numbers, read_pose
 from augment.cameras import Camera, Frame
 from augment.errors import AdapterError
 from augment.geometry import invert_rigid
-from augment.style.image_header import image_header
+from augment.image_header import read_image_header
 
 FRAME_NS = 100_000_000
-_HEADER_BYTES = 1 << 18
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,8 +141,7 @@ def _about_size(folder: Path, number: int, kind: CameraKind) -> list[str]:
     first = min(folder.glob(f"*_{number}.jpg"), default=None)
     if first is None:
         return []
-    with first.open("rb") as file:
-        header = image_header(file.read(_HEADER_BYTES))
+    header = read_image_header(first)
     if header is None or (header.width, header.height) == (kind.width, kind.height):
         return []
     return [

@@ -11,12 +11,11 @@ from pathlib import Path
 from adapters.street_gaussians.calibration import Lens
 from adapters.street_gaussians.records import CAMERA_NAMES
 from augment.errors import AdapterError
-from augment.style.image_header import image_header
+from augment.image_header import read_image_header
 
 _NAME = re.compile(r"([0-9]{1,9})_([0-9])\.(png|jpg|jpeg)", re.IGNORECASE)
 _FULL_SIZE = (1920, 1280)  # of Waymo's front cameras, and of its side cameras:
 _SIDE_SIZE = (1920, 886)
-_HEAD_BYTES = (4096, 1 << 22)  # of a JPEG, whose size may lie behind thumbnails
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,15 +68,11 @@ def _listed(folder: Path) -> dict[tuple[int, int], Path]:
 
 def _size(path: Path) -> tuple[int, int] | None:
     """Width and height, or None for what is no image."""
-    for limit in _HEAD_BYTES:
-        try:
-            with path.open("rb") as file:
-                header = image_header(file.read(limit))
-        except OSError:
-            return None
-        if header is not None:
-            return header.width, header.height
-    return None
+    try:
+        header = read_image_header(path)
+    except OSError:
+        return None
+    return None if header is None else (header.width, header.height)
 
 
 def _waymo_size(cam: int) -> tuple[int, int]:

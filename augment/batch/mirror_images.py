@@ -17,12 +17,10 @@ from augment.batch.manifest import OK
 from augment.batch.mirror_tree import SourceTree
 from augment.cameras import Frame
 from augment.errors import AdapterError, OutputError
-from augment.style.image_header import image_header
+from augment.image_header import read_image_header
 from recipes.schema import Output
 
-FORMATS = {"PNG": "png", "JPEG": "jpg"}  # of image_header, and of recipes
-_HEAD = 4096  # bytes that hold the size of nearly any image
-_PNG_GREY = (0, 4)  # colour types without and with alpha
+FORMATS = {"PNG": "png", "JPEG": "jpg"}  # of ImageHeader, and of recipes
 
 
 @dataclass(frozen=True)
@@ -65,16 +63,10 @@ class Weathered:
 
 def image_form(path: str | Path) -> ImageForm | None:
     """Of an image file by its first bytes; None where it is neither PNG nor JPEG."""
-    with open(path, "rb") as file:
-        data = file.read(_HEAD)
-        header = image_header(data)
-        if header is None:  # a preview or profile may come before the size
-            data += file.read()
-            header = image_header(data)
+    header = read_image_header(path)
     if header is None or header.format not in FORMATS:
         return None
-    is_grey = header.format == "PNG" and len(data) > 25 and data[25] in _PNG_GREY
-    return ImageForm(FORMATS[header.format], header.width, header.height, is_grey)
+    return ImageForm(FORMATS[header.format], header.width, header.height, header.is_grey)
 
 
 def dataset_format(frames: Iterable[Frame]) -> str:

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from augment.errors import StyleError
-from augment.style.image_header import FORMATS, ImageHeader, image_header
+from augment.image_header import FORMATS, ImageHeader, image_header
 from augment.style.image_regions import find_sky, region_masks
 from augment.style.statistics import LAND, SKY, WHOLE, ColorStatistics, Statistics
 

@@ -7,7 +7,6 @@ from style_files import cmyk_jpeg, png, with_orientation
 
 from augment.errors import StyleError
 from augment.style import images
-from augment.style.image_header import ImageHeader, image_header
 from augment.style.images import SIDE_PX, StyleImage, image_statistics, read_style_image
 from augment.style.statistics import LAND, REST, ROAD, SKY, VEGETATION, WHOLE, statistics_of
 
@@ -201,22 +200,6 @@ def test_a_file_too_large_is_not_read(tmp_path, monkeypatch):
     monkeypatch.setattr(images, "MAX_BYTES", 50)
     with pytest.raises(StyleError, match="larger than 50 bytes"):
         read_style_image(saved(tmp_path, "a.png", halves(RED, BLUE)))
-
-
-@pytest.mark.parametrize("name", ["a.png", "a.bmp", "a.tif", "a.webp", "a.jpg"])
-def test_headers_know_the_size(name):
-    kind = {"p": "PNG", "b": "BMP", "t": "TIFF", "w": "WebP", "j": "JPEG"}[name[2]]
-    for width, height in ((1, 1), (300, 7), (17, 301)):
-        data = cv2.imencode(name[1:], np.zeros((height, width, 3), np.uint8))[1].tobytes()
-        assert image_header(data) == ImageHeader(kind, width, height)
-        for length in range(0, 24):
-            assert image_header(data[:length]) is None or length > 20
-
-
-def test_lossless_webp_headers_too():
-    pixels = np.zeros((9, 33, 4), np.uint8)
-    data = cv2.imencode(".webp", pixels, [cv2.IMWRITE_WEBP_QUALITY, 101])[1].tobytes()
-    assert image_header(data) == ImageHeader("WebP", 33, 9)
 
 
 SKIES = {

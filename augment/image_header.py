@@ -4,20 +4,38 @@ from __future__ import annotations
 
 import struct
 from dataclasses import dataclass
+from pathlib import Path
 
 FORMATS = "JPEG, PNG, WebP, TIFF or BMP"
 
+_FIRST_BYTES = 4096  # hold the header of nearly any image
+_MOST_BYTES = 1 << 22  # of a JPEG whose previews and profiles lie before its size
+_PNG_GREY = (b"\0", b"\4")  # colour types without and with alpha
 _JPEG_ALONE = {0x01, *range(0xD0, 0xD9)}  # markers without a length
 _JPEG_FRAMES = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # SOF0-15 less DHT, JPG, DAC
 
 
 @dataclass(frozen=True)
 class ImageHeader:
-    """format: one of FORMATS. width, height: as stored, before any turn that EXIF asks for."""
+    """format: one of FORMATS. width, height: as stored, before any turn that EXIF asks for.
+    is_grey: one channel (told of PNG only).
+    """
 
     format: str
     width: int
     height: int
+    is_grey: bool = False
+
+
+def read_image_header(path: str | Path) -> ImageHeader | None:
+    """Of a file by its first bytes; None as for `image_header`.
+
+    Raises:
+        OSError: the file cannot be read.
+    """
+    with open(path, "rb") as file:
+        data = file.read(_FIRST_BYTES)
+        return image_header(data) or image_header(data + file.read(_MOST_BYTES))
 
 
 def image_header(data: bytes) -> ImageHeader | None:
@@ -35,7 +53,8 @@ def image_header(data: bytes) -> ImageHeader | None:
                 found = size(data)
             except (struct.error, IndexError):
                 return None
-            return None if found is None or min(found) < 1 else ImageHeader(name, *found)
+            is_grey = name == "PNG" and data[25:26] in _PNG_GREY
+            return None if found is None or min(found) < 1 else ImageHeader(name, *found, is_grey)
     return None
 
 
