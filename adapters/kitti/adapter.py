@@ -11,7 +11,6 @@ rises above is in the sky.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -24,8 +23,8 @@ from adapters.kitti.layout import some
 from adapters.kitti.source import Source, find_source
 from adapters.kitti.sweeps import LIDAR_TOP_DEG, read_returns, usable_sweep
 from adapters.lidar.box_tracks import BoxSample, join_tracks
-from adapters.lidar.image_views import View
-from adapters.lidar.scene import DrivenPath, build_lidar_scene
+from adapters.lidar.drive_scene import path_of, scene_of, views_of
+from adapters.lidar.scene import build_lidar_scene
 from adapters.lidar.split import Sweep
 from adapters.recording.tables import TimedBoxes
 from adapters.recording.tracks import read_objects
@@ -68,8 +67,8 @@ def open_kitti(path: str, query: dict[str, str]) -> Scene:
     built = build_lidar_scene(
         sweeps,
         join_tracks(samples),
-        _views(used),
-        _path(frames),
+        views_of(used),
+        path_of(frames),
         options.drive.scene_options(lidar_top_deg=LIDAR_TOP_DEG),
     )
     if len(built.background) + len(built.actors) == 0:
@@ -77,23 +76,18 @@ def open_kitti(path: str, query: dict[str, str]) -> Scene:
             f"{source.root}: none of the sweeps' points is in any image; check that calibration, "
             f"sweeps and images are of one day"
         )
-    return Scene(
+    return scene_of(
+        built,
         name=source.name,
         source=format_uri("kitti", path, query),
-        background=built.background,
-        actors=built.actors,
-        sky=built.sky,
         frames=frames,
         labels=source.labels,
         world_origin_m=source.world_origin_m,
-        ground_z_m=built.ground_z_m,
-        ground=built.ground,
         problems=(
             *source.problems,
             *(problem for found in images.values() for problem in found.problems),
             *sweep_problems,
             *sample_problems,
-            *built.problems,
         ),
     )
 
@@ -183,19 +177,4 @@ def _camera(
         camera_from_world=torch.from_numpy(camera.camera_from_velodyne)
         @ invert_rigid(world_from_ego),
         timestamp_ns=time_ns,
-    )
-
-
-def _views(frames: Sequence[Frame]) -> tuple[View, ...]:
-    return tuple(
-        View(frame.cameras[name], Path(path), frame.index)
-        for frame in frames
-        for name, path in frame.image_paths.items()
-    )
-
-
-def _path(frames: Sequence[Frame]) -> DrivenPath:
-    return DrivenPath(
-        np.stack([frame.world_from_ego[:3, 3].numpy() for frame in frames]),
-        np.array([frame.timestamp_ns for frame in frames], np.int64),
     )

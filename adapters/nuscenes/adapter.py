@@ -16,9 +16,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from adapters.lidar.image_views import View
+from adapters.lidar.drive_scene import path_of, scene_of, views_of
 from adapters.lidar.origin import drive_origin
-from adapters.lidar.scene import DrivenPath, build_lidar_scene
+from adapters.lidar.scene import build_lidar_scene
 from adapters.nuscenes.frames import FrameFiles, scene_frames
 from adapters.nuscenes.labels import NuScenesLabels
 from adapters.nuscenes.options import NuScenesOptions
@@ -72,7 +72,7 @@ def open_nuscenes(path: str, query: dict[str, str]) -> Scene:
         )
     usable, image_problems = _usable_images(tables, used)
     frames = tuple(_frame(file, origin, usable) for file in used)
-    views = _views([frame for frame in frames if frame.index not in chosen.held_out])
+    views = views_of((f for f in frames if f.index not in chosen.held_out), _ROWS_ABOVE_CAR)
     if not views:
         but = " but those held out" if chosen.held_out else ""
         raise AdapterError(
@@ -80,26 +80,21 @@ def open_nuscenes(path: str, query: dict[str, str]) -> Scene:
             f"and colours come from images; choose more frames, or unpack samples/CAM_* and "
             f"sweeps/CAM_*" + "".join(f"; {problem}" for problem in image_problems[:1])
         )
-    positions = np.array([file.sweep.world_from_ego[:3, 3] - origin for file in used])
     built = build_lidar_scene(
         sweeps,
         read_tracks(tables, used, origin),
         views,
-        DrivenPath(positions, np.array([file.sweep.timestamp_ns for file in used])),
+        path_of(frames),
         options.drive.scene_options(lidar_top_deg=_LIDAR_TOP_DEG),
     )
-    return Scene(
+    return scene_of(
+        built,
         name=tables.name,
         source=format_uri("nuscenes", path, query),
-        background=built.background,
-        actors=built.actors,
-        sky=built.sky,
         frames=frames,
         labels=NuScenesLabels(tables, files),
         world_origin_m=origin,
-        ground_z_m=built.ground_z_m,
-        ground=built.ground,
-        problems=unused + chosen.problems + lidar_problems + image_problems + built.problems,
+        problems=unused + chosen.problems + lidar_problems + image_problems,
     )
 
 
@@ -169,17 +164,4 @@ def _camera(image: SensorFile, origin: np.ndarray) -> Camera:
         cy=cy,
         camera_from_world=invert_rigid(torch.from_numpy(world_from_camera)),
         timestamp_ns=image.timestamp_ns,
-    )
-
-
-def _views(frames: Sequence[Frame]) -> tuple[View, ...]:
-    return tuple(
-        View(
-            frame.cameras[name],
-            Path(path),
-            frame.index,
-            used_rows=_ROWS_ABOVE_CAR.get(name, 1.0),
-        )
-        for frame in frames
-        for name, path in frame.image_paths.items()
     )

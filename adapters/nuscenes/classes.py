@@ -9,7 +9,7 @@ import numpy as np
 from augment.semantics import SemanticClass
 
 NO_SURFACE = -1  # stands for returns that no surface made, where a SemanticClass is expected
-NOISE_CLASS, EGO_CLASS = 0, 31
+EGO_CLASS = 31
 
 # As published, numbered from 0.
 _S = SemanticClass

@@ -8,15 +8,14 @@ its first box, and the labels keep both boxes of a sibling pair.
 
 from __future__ import annotations
 
-from collections.abc import Sequence as Seq
 from pathlib import Path
 
 import torch
 
 from adapters.lidar.box_tracks import join_tracks
-from adapters.lidar.image_views import View
+from adapters.lidar.drive_scene import path_of, scene_of, views_of
 from adapters.lidar.options import DriveOptions
-from adapters.lidar.scene import DrivenPath, build_lidar_scene
+from adapters.lidar.scene import build_lidar_scene
 from adapters.pandaset.files import CameraTrack, Sequence, read_sequence
 from adapters.pandaset.labels import PandaSetLabels
 from adapters.pandaset.sweeps import read_drive
@@ -51,27 +50,22 @@ def open_pandaset(path: str, query: dict[str, str]) -> Scene:
             f"{Path(path) / 'lidar'} holds no returns for frames {chosen.used[0]} to "
             f"{chosen.used[-1]}; a scene cannot be built without them, unpack the sequence again"
         )
-    numbers = list(chosen.numbers)
-    frames = tuple(_frame(sequence, number) for number in numbers)
+    frames = tuple(_frame(sequence, number) for number in chosen.numbers)
     built = build_lidar_scene(
         drive.sweeps,
         join_tracks(drive.samples),
-        _views([frame for frame in frames if frame.index not in chosen.held_out]),
-        DrivenPath(sequence.world_from_ego[numbers, :3, 3], sequence.timestamps_ns[numbers]),
+        views_of((f for f in frames if f.index not in chosen.held_out), _ROWS_ABOVE_CAR),
+        path_of(frames),
         options.scene_options(lidar_top_deg=_LIDAR_TOP_DEG),
     )
-    return Scene(
+    return scene_of(
+        built,
         name=Path(path).name,
         source=format_uri("pandaset", path, query),
-        background=built.background,
-        actors=built.actors,
-        sky=built.sky,
         frames=frames,
         labels=PandaSetLabels(Path(path)),
         world_origin_m=sequence.world_origin_m,
-        ground_z_m=built.ground_z_m,
-        ground=built.ground,
-        problems=sequence.problems + chosen.problems + drive.problems + built.problems,
+        problems=sequence.problems + chosen.problems + drive.problems,
     )
 
 
@@ -98,17 +92,4 @@ def _camera(track: CameraTrack, number: int) -> Camera:
         cy=track.cy,
         camera_from_world=invert_rigid(torch.from_numpy(track.world_from_camera[number])),
         timestamp_ns=int(track.timestamps_ns[number]),
-    )
-
-
-def _views(frames: Seq[Frame]) -> tuple[View, ...]:
-    return tuple(
-        View(
-            frame.cameras[name],
-            Path(path),
-            frame.index,
-            used_rows=_ROWS_ABOVE_CAR.get(name, 1.0),
-        )
-        for frame in frames
-        for name, path in frame.image_paths.items()
     )

@@ -16,8 +16,6 @@ from augment.semantics import SemanticClass
 
 NO_SURFACE = -1  # stands for returns that no surface made, where a SemanticClass is expected
 
-NO_SURFACE_CLASSES = (1, 2, 3, 4)  # their numbers in the published classes.json
-
 # The published classes.json, numbered from 1.
 _S = SemanticClass
 _CLASSES: tuple[tuple[str, int], ...] = (

@@ -19,10 +19,10 @@ from pathlib import Path
 import numpy as np
 
 from adapters.join import join_gaussians
-from adapters.lidar.box_tracks import ObjectTrack, join_tracks
-from adapters.lidar.image_views import View
+from adapters.lidar.box_tracks import join_tracks
+from adapters.lidar.drive_scene import path_of, scene_of, views_of, without_points
 from adapters.lidar.options import DriveOptions
-from adapters.lidar.scene import DrivenPath, LidarScene, build_lidar_scene
+from adapters.lidar.scene import LidarScene, LidarSceneOptions, build_lidar_scene
 from adapters.lidar.split import Sweep
 from adapters.recording.calibration import CALIBRATION, Calibration, read_calibration
 from adapters.recording.depth_images import depth_sweeps
@@ -85,17 +85,13 @@ def open_recording(path: str, query: dict[str, str]) -> Scene:
             f"calibration.json that camera axes are x right, y down, z forward, and that LiDAR "
             f"and poses are in one world with z up"
         )
-    return Scene(
+    return scene_of(
+        built,
         name=calibration.name,
         source=format_uri("recording", path, query),
-        background=built.background,
-        actors=built.actors,
-        sky=built.sky,
         frames=frames,
         labels=RecordingLabels(root),
         world_origin_m=calibration.world_origin_m,
-        ground_z_m=built.ground_z_m,
-        ground=built.ground,
         has_metric_scale=calibration.has_metric_scale,
         problems=(
             *unlisted_images(root, calibration.frames),
@@ -103,7 +99,6 @@ def open_recording(path: str, query: dict[str, str]) -> Scene:
             *chosen.problems,
             *objects.problems,
             *problems,
-            *built.problems,
         ),
     )
 
@@ -141,24 +136,20 @@ class _Start:
         return self._guess(), (*problems, said)
 
     def _surfaces(self, sweeps: Sequence[Sweep], top_deg: float) -> LidarScene:
-        tracks = join_tracks(self.objects.moving)
-        options = self.options.scene_options(lidar_top_deg=top_deg)
-        built = build_lidar_scene(sweeps, tracks, self._views(), self._path(), options)
-        return dataclasses.replace(built, problems=(*built.problems, *_pointless(tracks, built)))
+        return self._built(sweeps, self.options.scene_options(lidar_top_deg=top_deg))
 
     def _guess(self) -> LidarScene:
         road = ground_heights(self.frames, self.calibration.ego_above_ground_m)
         check_cameras_above(self.root / CALIBRATION, self.frames, road)
         most = min(MOST_GAUSSIANS, self.options.max_gaussians)
-        shells = guess_shells(self._views(), road, round(most * SHELL_SHARE))
+        shells = guess_shells(views_of(self.used), road, round(most * SHELL_SHARE))
         coarse = dataclasses.replace(
             self.options.scene_options(lidar_top_deg=_SKY_ABOVE_DEG),
             voxel_m=max(VOXEL_M, self.options.voxel_m),
             max_gaussians=most - len(shells),
         )
         sweeps = guess_surfaces(road, self.objects.moving, self.objects.still)
-        tracks = join_tracks(self.objects.moving)
-        built = build_lidar_scene(sweeps, tracks, self._views(), self._path(), coarse)
+        built = self._built(sweeps, coarse)
         # Whatever was found in the guessed surfaces is the height they were given.
         assumed = Ground(float(road[:, 2].min()), float(np.median(road[:, 2])), "ego path")
         return dataclasses.replace(
@@ -166,30 +157,12 @@ class _Start:
             background=join_gaussians([built.background, shells]),
             ground_z_m=assumed.lowest_z_m,
             ground=assumed,
-            problems=(*built.problems, *_pointless(tracks, built)),
         )
 
-    def _views(self) -> tuple[View, ...]:
-        return tuple(
-            View(frame.cameras[name], Path(path), frame.index)
-            for frame in self.used
-            for name, path in frame.image_paths.items()
+    def _built(self, sweeps: Sequence[Sweep], options: LidarSceneOptions) -> LidarScene:
+        tracks = join_tracks(self.objects.moving)
+        views, path = views_of(self.used), path_of(self.frames)
+        built = build_lidar_scene(sweeps, tracks, views, path, options)
+        return dataclasses.replace(
+            built, problems=(*built.problems, *without_points(tracks, built))
         )
-
-    def _path(self) -> DrivenPath:
-        return DrivenPath(
-            np.stack([frame.world_from_ego[:3, 3].numpy() for frame in self.frames]),
-            np.array([frame.timestamp_ns for frame in self.frames], np.int64),
-        )
-
-
-def _pointless(tracks: Sequence[ObjectTrack], built: LidarScene) -> list[str]:
-    """A sentence for the moving objects of which nothing was measured, or that no image shows."""
-    there = {actor.track_id for actor in built.actors}
-    missing = [track.track_id for track in tracks if track.track_id not in there]
-    if not missing:
-        return []
-    return [
-        f"{len(missing)} moving objects, such as {missing[0]!r}, have too few points in their "
-        f"boxes or are in no image: they are not in the scene, their boxes stay in the labels"
-    ]

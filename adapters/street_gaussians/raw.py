@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from adapters.lidar.box_tracks import BoxSample, ObjectTrack, join_tracks
-from adapters.lidar.image_views import View
+from adapters.lidar.box_tracks import BoxSample, join_tracks
+from adapters.lidar.drive_scene import path_of, scene_of, views_of, without_points
 from adapters.lidar.options import DriveOptions
-from adapters.lidar.scene import DrivenPath, LidarScene, build_lidar_scene
+from adapters.lidar.scene import build_lidar_scene
 from adapters.lidar.split import Sweep
 from adapters.street_gaussians.calibration import calibrated_cameras
 from adapters.street_gaussians.data import frames_of, read_data
@@ -69,35 +69,18 @@ def open_raw(root: Path, query: dict[str, str]) -> Scene:
     built = build_lidar_scene(
         sweeps,
         tracks,
-        [
-            View(frame.cameras[name], Path(path), frame.index)
-            for frame in used
-            for name, path in frame.image_paths.items()
-        ],
-        DrivenPath(
-            np.stack([frame.world_from_ego[:3, 3].numpy() for frame in frames]),
-            np.array([frame.timestamp_ns for frame in frames], np.int64),
-        ),
+        views_of(used),
+        path_of(frames),
         options.scene_options(lidar_top_deg=_LIDAR_TOP_DEG),
     )
-    return Scene(
+    return scene_of(
+        built,
         name=root.absolute().name,
         source=format_uri("street_gaussians", root, query),
-        background=built.background,
-        actors=built.actors,
-        sky=built.sky,
         frames=frames,
         labels=StreetGaussiansLabels(root),
         world_origin_m=data.world_origin_m,
-        ground_z_m=built.ground_z_m,
-        ground=built.ground,
-        problems=(
-            *data.problems,
-            *chosen.problems,
-            *problems,
-            *built.problems,
-            *_pointless(tracks, built),
-        ),
+        problems=data.problems + chosen.problems + problems + without_points(tracks, built),
     )
 
 
@@ -161,15 +144,3 @@ def _moving_ids(samples: Sequence[BoxSample]) -> Collection[str]:
         places.setdefault(sample.object_id, []).append(sample.world_from_box[:2, 3])
     extents = {name: np.ptp(np.array(xy), axis=0) for name, xy in places.items()}
     return {name for name, extent in extents.items() if np.hypot(*extent) > _MOVED_M}
-
-
-def _pointless(tracks: Sequence[ObjectTrack], built: LidarScene) -> list[str]:
-    """A sentence for the moving objects of which nothing was measured, or that no image shows."""
-    there = {actor.track_id for actor in built.actors}
-    missing = [track.track_id for track in tracks if track.track_id not in there]
-    if not missing:
-        return []
-    return [
-        f"{len(missing)} moving objects, such as {missing[0]!r}, have too few points in their "
-        f"boxes or are in no image: they are not in the scene, their boxes stay in the labels"
-    ]
