@@ -26,7 +26,7 @@ from augment.files.scene_files import (
 )
 from augment.scene import Scene
 
-_SUFFIXES = {"file": SCENE_SUFFIX, "ply": ".ply", "splat": ".splat"}
+_SUFFIXES: dict[ExportKind, str] = {"file": SCENE_SUFFIX, "ply": ".ply", "splat": ".splat"}
 _BAKED = ("ply", "splat")
 
 
@@ -43,8 +43,8 @@ def export_scene(
 
     kind: scene (a scene folder), file (the same in one .climategs file), ply and splat (baked at a
     frame, with cameras.json beside it), ply-parts (a folder of .ply files). A file's suffix is
-    added where it lacks. frame: at which ply and splat are baked; the first without. half: of a
-    file, about half the size at a small loss.
+    added where it lacks; another kind's is refused. frame: at which ply and splat are baked; the
+    first without. half: of a file, about half the size at a small loss.
 
     Raises:
         SceneError: the scene cannot be opened, or has no such frame, or cannot be kept in such a
@@ -109,7 +109,16 @@ def _named(out: Path, kind: ExportKind) -> Path:
     suffix = _SUFFIXES.get(kind, "")
     if not out.resolve().name:
         raise OutputError(f"--out {out} is the file system's root: name a file or folder below it")
-    return out if out.suffix.lower() == suffix or not suffix else out.with_name(out.name + suffix)
+    named = out.suffix.lower()
+    if named == suffix:
+        return out
+    other = next((kind for kind, ending in _SUFFIXES.items() if ending == named), None)
+    if other is not None:
+        raise ClimateGSError(
+            f"--out {out} is named as --kind {other} writes it, and this is --kind {kind}: say "
+            f"--kind {other}, or give a name without {named}"
+        )
+    return out.with_name(out.name + suffix) if suffix else out
 
 
 def _check_out(out: Path, kind: ExportKind, overwrite: bool) -> None:

@@ -41,7 +41,7 @@ def mirror(
 
     Args:
         out: A folder that `climategs render` wrote.
-        scene: The scene of the images. By default what the manifest says.
+        scene: Only of this scene. By default of all that the manifest names.
         links: hard: unchanged files share the dataset's disk space. copy: nothing is shared.
     """
     from tools.mirror import mirror_again

@@ -24,22 +24,26 @@ from recipes.schema import Recipe
 def recipes_for_source(
     scene: Scene, out: Path, recipes: Sequence[Recipe], *, overwrite: bool = False
 ) -> list[Recipe]:
-    """The recipes with images in the dataset's format, after a look at whether the dataset can be
-    copied and images that are there go on or are overwritten.
+    """The recipes with images in the dataset's format, or PNG where they are of another size, after
+    a look at whether the dataset can be copied and images that are there go on or are overwritten.
 
     Raises:
         AdapterError: the scene is of no dataset, or one that cannot be copied.
         OutputError: the output folder lies in it, or holds these images in another format.
     """
     tree, _ = _dataset(scene)
-    written_as = dataset_format(scene.frames)
+    recorded_as = dataset_format(scene.frames)
+    rendered = []
     for recipe in recipes:
+        # What is resized afterwards is compressed once, then.
+        written_as = recorded_as if recipe.render.scale == 1 else "png"
         for folder in (variant_folder(scene.name, variant_name(recipe)), MIRROR_FOLDER):
             check_apart(tree, out / folder)
         read_record(tree, mirror_folder(out, variant_name(recipe)))
         if not overwrite:
             _check_format(scene, out, recipe, written_as)
-    return [_with_format(recipe, written_as) for recipe in recipes]
+        rendered.append(_with_format(recipe, written_as))
+    return rendered
 
 
 def mirror_outputs(
@@ -78,20 +82,16 @@ def mirror_outputs(
 
 
 def mirror_again(out: Path, scene_uri: str | None = None, *, links: Links = "hard") -> int:
-    """`climategs mirror`: opens the scene, builds the copies, prints. Returns the exit code."""
+    """`climategs mirror`: opens the scene, or all that the manifest has in turn, builds the copies,
+    prints. Returns the exit code."""
     from adapters.base import open_scene
 
-    if scene_uri is None:
-        rows = read_manifest(out).select(["source"]).to_pylist()
-        sources: list[str] = sorted({row["source"] for row in rows})
-        if len(sources) != 1:
-            raise OutputError(
-                f"{out / MANIFEST} has images of {len(sources)} scenes: {', '.join(sources)}; name "
-                f"one of them with --scene"
-            )
-        scene_uri = sources[0]
-    for sentence in mirror_outputs(open_scene(scene_uri), out, links=links):
-        print(sentence)
+    sources = [scene_uri] if scene_uri else sorted(set(read_manifest(out)["source"].to_pylist()))
+    if not sources:
+        raise OutputError(f"{out / MANIFEST} lists no images; render some first")
+    for source in sources:
+        for sentence in mirror_outputs(open_scene(source), out, links=links):
+            print(sentence)
     return 0
 
 
@@ -214,9 +214,9 @@ def _check_format(scene: Scene, out: Path, recipe: Recipe, written_as: str) -> N
     if rows and rows[0]["recipe_hash"] == recipe.hash:
         folder = out / variant_folder(scene.name, variant_name(recipe))
         raise OutputError(
-            f"{folder} holds these images as {recipe.output.image}, and the dataset has "
-            f"{written_as}: `climategs mirror {out} --scene URI` makes the dataset's copy from the "
-            f"images there; or choose another output folder, or overwrite them (--overwrite)"
+            f"{folder} holds these images as {recipe.output.image}, and they would be rendered as "
+            f"{written_as} for the dataset's copy: `climategs mirror {out} --scene URI` makes it "
+            f"from the images there; or choose another output folder, or add --overwrite"
         )
 
 
@@ -229,34 +229,24 @@ def _sentences(done: Mirrored, tree: SourceTree, links: Links) -> list[str]:
     replaced = len(done.replaced)
     state = f"{done.changed} files put in place" if done.changed else "up to date"
     said = [f"dataset: {done.folder} ({state})"]
-    parts = [f"{replaced} weathered images" + _anew(done)]
-    if done.linked:
-        size = _megabytes(done.linked_size)
-        parts.append(f"{done.linked} files shared with {tree.root} ({size} that take no disk)")
-    if done.copied:
-        parts.append(f"{done.copied} files copied ({_megabytes(done.copied_size)})")
-    said.append(f"  {', '.join(parts)}")
-    if done.images > replaced:
-        said.append(
-            f"  {done.images - replaced} of {done.images} camera images are the source's own, "
-            f"clear ones"
-        )
-    if done.linked:
-        said.append(
-            f"  to change files there in place would change {tree.root} too; --links copy shares "
-            f"nothing"
-        )
-    if done.copied and links == "hard":
-        said.append(
-            "  files were copied where the system cannot link them (another disk, or another "
-            "user's files)"
-        )
+    clear = f"; {done.images - replaced} stay clear, as recorded" if done.images > replaced else ""
+    said.append(f"  {replaced} of {done.images} camera images are weathered{clear}")
     if done.resized:
         (rendered, recorded) = done.resized[0]
         said.append(
-            f"  {len(done.resized)} images were rendered at another size than recorded, such as "
-            f"{rendered[0]}x{rendered[1]} for {recorded[0]}x{recorded[1]} pixels: they are resized"
+            f"  {len(done.resized)} were rendered at another size and resized, such as "
+            f"{rendered[0]}x{rendered[1]} to {recorded[0]}x{recorded[1]} pixels"
         )
+    if done.linked:
+        said.append(
+            f"  {done.linked} files are shared with {tree.root} ({_megabytes(done.linked_size)}): "
+            f"changed in place, they change there too; --links copy shares nothing"
+        )
+    if done.copied:
+        why = " that the system cannot link, from another disk or user" if links == "hard" else ""
+        said.append(f"  {done.copied} files{why} are copies ({_megabytes(done.copied_size)})")
+    if done.new:
+        said.append(f"  weathered images there take {_megabytes(done.new_size)} of their own")
     for names, what in (
         (done.unusable, "recorded images are neither PNG nor JPEG and stay as they are"),
         (done.missing, "recorded images are no longer in the source: nothing stands for them"),
@@ -265,13 +255,6 @@ def _sentences(done: Mirrored, tree: SourceTree, links: Links) -> list[str]:
         if names:
             said.append(f"  {len(names)} {what}; the first is {names[0]}")
     return said
-
-
-def _anew(done: Mirrored) -> str:
-    """How many of the images are not one with the rendered files."""
-    if not done.new:
-        return ""
-    return f" ({done.new} of them files of their own, {_megabytes(done.new_size)})"
 
 
 def _megabytes(size: int) -> str:

@@ -55,10 +55,12 @@ def kitti_root(path: str | Path) -> tuple[Path, Path]:
             return place, place / "calib"
     drives = sorted(p.parent for p in root.glob(f"*/{VELODYNE}"))
     if drives:
-        raise AdapterError(f"{root} holds {len(drives)} drives; give one, such as {drives[0]}")
+        raise AdapterError(f"{root} holds drives, it is none itself; give one: {_few(drives)}")
+    above = next((p for p in root.absolute().parents[:2] if _is_kitti(p)), None)
     raise AdapterError(
         f"{root} is no KITTI folder: expected {VELODYNE}/ (a raw drive), or calib/ beside "
         f"velodyne/ or image_2/ (the object benchmark)"
+        + (f"; {above}, above it, is one" if above else "")
     )
 
 
@@ -66,6 +68,16 @@ def is_object_folder(root: Path) -> bool:
     """Whether a folder is one of the object benchmark."""
     data = (root / "velodyne", root / "image_2")
     return (root / "calib").is_dir() and any(folder.is_dir() for folder in data)
+
+
+def _is_kitti(root: Path) -> bool:
+    return (root / VELODYNE).is_dir() or is_object_folder(root)
+
+
+def _few(drives: Sequence[Path]) -> str:
+    rest = len(drives) - _MOST_NAMED
+    named = ", ".join(map(str, drives[:_MOST_NAMED]))
+    return named + (f" and {rest} more" if rest > 0 else "")
 
 
 def numbered(root: Path, folder: str, suffixes: Sequence[str], digits: int) -> dict[int, str]:

@@ -62,8 +62,13 @@ def odometry_poses(
     numbers: the drive's frames.
 
     Raises:
-        AdapterError: a line is no pose, or no line is of any frame.
+        AdapterError: no such file, a line is no pose, or no line is of any frame.
     """
+    if not path.is_file():
+        raise AdapterError(
+            f"kitti: poses must be icp or a file of poses; got {str(path)!r}, and there is no file "
+            f"{path.absolute()}"
+        )
     lines = [line for line in read_text(path).splitlines() if line.strip()]
     in_order = len(lines) == len(numbers)
     poses = {}

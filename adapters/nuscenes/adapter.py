@@ -66,9 +66,8 @@ def open_nuscenes(path: str, query: dict[str, str]) -> Scene:
     sweeps, lidar_problems = read_sweeps(tables, used, origin, held_out=chosen.held_out)
     if sum(len(sweep) for sweep in sweeps) == 0:
         raise AdapterError(
-            f"{where}: no LiDAR returns in frames {used[0].index} to {used[-1].index} "
-            f"({used[0].sweep.filename} and on); a scene cannot be built without them, unpack "
-            f"samples/LIDAR_TOP and sweeps/LIDAR_TOP"
+            f"{where}: no LiDAR returns in {_span(used)}; a scene cannot be built without them, "
+            f"unpack samples/LIDAR_TOP and sweeps/LIDAR_TOP" + _first(lidar_problems)
         )
     usable, image_problems = _usable_images(tables, used)
     frames = tuple(_frame(file, origin, usable) for file in used)
@@ -76,9 +75,8 @@ def open_nuscenes(path: str, query: dict[str, str]) -> Scene:
     if not views:
         but = " but those held out" if chosen.held_out else ""
         raise AdapterError(
-            f"{where}: none of frames {used[0].index} to {used[-1].index}{but} has a usable image, "
-            f"and colours come from images; choose more frames, or unpack samples/CAM_* and "
-            f"sweeps/CAM_*" + "".join(f"; {problem}" for problem in image_problems[:1])
+            f"{where}: no usable image in {_span(used)}{but}, and colours come from images; choose "
+            f"more frames, or unpack samples/CAM_* and sweeps/CAM_*" + _first(image_problems)
         )
     built = build_lidar_scene(
         sweeps,
@@ -96,6 +94,15 @@ def open_nuscenes(path: str, query: dict[str, str]) -> Scene:
         world_origin_m=origin,
         problems=unused + chosen.problems + lidar_problems + image_problems,
     )
+
+
+def _span(frames: Sequence[FrameFiles]) -> str:
+    first, last = frames[0].index, frames[-1].index
+    return f"frame {first}" if first == last else f"frames {first} to {last}"
+
+
+def _first(problems: Sequence[str]) -> str:
+    return "".join(f" ({problem})" for problem in problems[:1])
 
 
 def _usable_images(

@@ -152,10 +152,11 @@ def _choose_version(root: Path, version: str | None) -> str:
         raise AdapterError(f"{root} is not a folder; expected a nuScenes dataset with v1.0-*/")
     found = sorted(path.parent.name for path in root.glob("v1.0-*/scene.json"))
     if not found:
-        above = " Give the folder above it." if (root / "scene.json").is_file() else ""
+        above = root.absolute().parent
+        is_above = any(above.glob("v1.0-*/scene.json")) or (root / "scene.json").is_file()
         raise AdapterError(
-            f"{root} holds no nuScenes tables (v1.0-*/scene.json), such as those of v1.0-mini."
-            f"{above}"
+            f"{root} holds no nuScenes tables (v1.0-*/scene.json), such as those of v1.0-mini; "
+            + (f"give the folder above it, {above}" if is_above else "unpack the metadata there")
         )
     if version is None and len(found) > 1:
         raise AdapterError(f"{root} holds several versions; add version= one of {_listed(found)}")
@@ -177,7 +178,7 @@ def _choose_scene(folder: Path, scene: str | None) -> Row:
             f"{folder} holds {len(rows)} scenes; add scene= the name or token of one: {names}"
         )
     if not chosen:
-        raise AdapterError(f"{folder} has no scene {scene!r}; its {len(rows)} are {names}")
+        raise AdapterError(f"{folder} has no scene {scene!r}; it has {len(rows)}: {names}")
     tokens = ", ".join(row.token for row in chosen)
     raise AdapterError(f"{folder} has {len(chosen)} scenes {scene!r}; give a token: {tokens}")
 

@@ -47,7 +47,7 @@ def _of_places(scene: Scene, kind: ExportKind, timestamp_ns: int | None) -> Iter
     elif scene.actors:
         assert timestamp_ns is not None
         there = sum(actor.track.pose_at(timestamp_ns) is not None for actor in scene.actors)
-        yield f"actors ({there}) stand still where they are at {timestamp_ns} ns"
+        yield f"actors ({there}) stand still where they are {_moment(scene, timestamp_ns)}"
         if there < len(scene.actors):
             yield f"actors ({len(scene.actors) - there}) that are not there then are left out"
         if off_ns := _greatest_delay_ns(scene, timestamp_ns):
@@ -107,6 +107,11 @@ def _of_facts(scene: Scene, kind: ExportKind) -> Iterator[str]:
         yield "orthographic cameras are left out"
     if scene.made_by:
         yield "how the scene was made (made_by) is left out"
+
+
+def _moment(scene: Scene, timestamp_ns: int) -> str:
+    number = next((f.index for f in scene.frames if f.timestamp_ns == timestamp_ns), None)
+    return f"at {timestamp_ns} ns" if number is None else f"in frame {number}"
 
 
 def _greatest_delay_ns(scene: Scene, timestamp_ns: int) -> int:

@@ -247,16 +247,21 @@ def test_none_at_all_is_an_error(copy):
         cv2.imwrite(str(path), np.zeros((48, 80, 3), np.uint8))
     with pytest.raises(AdapterError, match=r"none of the 5 images of CAM_FRONT .* 160x96"):
         open_nuscenes(str(copy), QUICK)
-    for number in range(files.SWEEPS):
-        (copy / files.filename(0, "LIDAR_TOP", number)).unlink()
-    with pytest.raises(AdapterError, match="no LiDAR returns in frames 0 to 10"):
+    sweeps = [copy / files.filename(0, "LIDAR_TOP", number) for number in range(files.SWEEPS)]
+    for path in sweeps:
+        path.write_bytes(path.read_bytes()[:-7])
+    with pytest.raises(AdapterError, match=r"unpack .* \(frame 0: .*pcd\.bin .* it is cut short"):
+        open_nuscenes(str(copy), QUICK)
+    for path in sweeps:
+        path.unlink()
+    with pytest.raises(AdapterError, match="no LiDAR returns in frames 0 to 10; .*11 of 11 LiDAR"):
         open_nuscenes(str(copy), QUICK)
 
 
 def test_frames_without_images_are_an_error(folder):
-    with pytest.raises(AdapterError, match="none of frames 1 to 1 has a usable image, and"):
+    with pytest.raises(AdapterError, match="no usable image in frame 1, and"):
         open_nuscenes(str(folder), QUICK | {"frames": "1:2"})
-    with pytest.raises(AdapterError, match="none of frames 5 to 6 but those held out has a usable"):
+    with pytest.raises(AdapterError, match="no usable image in frames 5 to 6 but those"):
         open_nuscenes(str(folder), QUICK | {"frames": "5:7", "held_out": "5:6"})
 
 

@@ -213,7 +213,7 @@ def test_the_only_version_and_scene_need_no_name(tmp_path):
 def test_several_are_listed(folder, copy):
     with pytest.raises(AdapterError, match=f"holds 2 scenes; add scene= .*: {ONE}, {TWO}$"):
         tables(folder, None)
-    with pytest.raises(AdapterError, match=f"no scene 'scene-9'; its 2 are {ONE}, {TWO}"):
+    with pytest.raises(AdapterError, match=f"no scene 'scene-9'; it has 2: {ONE}, {TWO}"):
         tables(folder, "scene-9")
     shutil.copytree(copy / files.VERSION, copy / "v1.0-trainval")
     with pytest.raises(AdapterError, match=r"several versions.*v1\.0-mini, v1\.0-trainval"):
@@ -235,10 +235,11 @@ def test_several_are_listed(folder, copy):
 def test_no_dataset_is_an_error(folder, tmp_path):
     with pytest.raises(AdapterError, match="is not a folder"):
         tables(tmp_path / "nothing")
-    with pytest.raises(AdapterError, match="holds no nuScenes tables"):
+    with pytest.raises(AdapterError, match=r"holds no nuScenes tables .* unpack the meta"):
         tables(tmp_path)
-    with pytest.raises(AdapterError, match="Give the folder above it"):
-        tables(folder / files.VERSION)
+    for inner in (files.VERSION, "samples"):
+        with pytest.raises(AdapterError, match=f"give the folder above it, {folder}$"):
+            tables(folder / inner)
 
 
 @pytest.mark.parametrize(

@@ -70,16 +70,14 @@ def test_baked_files_have_cameras_beside_them(uri, tmp_path, capsys):
         said = capsys.readouterr().out
         assert f"wrote {tmp_path / kind / 'cameras.json'}" in said
         assert "note: the sky is left out" in said
-        assert f"at {fitted_scene().frame(5).timestamp_ns} ns" in said
+        assert "stand still where they are in frame 5" in said
         again = open_scene(str(tmp_path / kind / f"a.{kind}"))
         assert (
             again.camera_names == ("ahead", "left") and len(again.background) == 50
         )  # no actor then
     export_scene(uri, tmp_path / "ply" / "b.ply", kind="ply")
     said = capsys.readouterr()
-    assert (
-        f"at {fitted_scene().frame(4).timestamp_ns} ns" in said.out and "not this" not in said.err
-    )
+    assert "stand still where they are in frame 4" in said.out and "not this" not in said.err
     (tmp_path / "ply" / "cameras.json").write_text("[]")
     export_scene(uri, tmp_path / "ply" / "b.ply", kind="ply", overwrite=True)
     assert "not this scene's; it is left as it is" in capsys.readouterr().err
@@ -112,6 +110,11 @@ def test_what_is_refused(uri, tmp_path):
     ):
         with pytest.raises(ClimateGSError, match=message):
             export_scene(uri, tmp_path / "a", **arguments)
+    for kind, name in (("file", "a.ply"), ("ply", "a.climategs"), ("scene", "a.splat")):
+        with pytest.raises(
+            ClimateGSError, match=rf"is named as --kind \w+ .* is --kind {kind}: say"
+        ):
+            export_scene(uri, tmp_path / name, kind=kind)
     with pytest.raises(SceneError, match="has no frame 7; it has 4 to 5"):
         export_scene(uri, tmp_path / "a", kind="ply", frame=7)
     with pytest.raises(OutputError, match="root"):

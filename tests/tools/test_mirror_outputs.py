@@ -81,6 +81,21 @@ def test_recipes_get_the_datasets_format(root, tmp_path):
     assert recipe.hash == recipe_of(image="jpg").hash
 
 
+def test_images_of_another_size_are_compressed_once(root, tmp_path):
+    scene, out = scene_of(root), tmp_path / "out"
+    half = recipe_of(image="jpg")
+    half = half.model_copy(update={"render": half.render.model_copy(update={"scale": 0.5})})
+    (recipe,) = recipes_for_source(scene, out, [half])
+    assert recipe.output.image == "png"
+    render(scene, out, recipe, frames=[0], cameras=["front"])
+    said = mirror_outputs(scene, out, progress=False)
+    assert any("1 were rendered at another size" in sentence for sentence in said)
+    assert changed(root, out / "source/fog-000/002") == {"camera/front/00.jpg"}
+    (image,) = (out / scene.name / "fog-000/images/front").iterdir()
+    assert image.suffix == ".png"
+    assert recipes_for_source(scene, out, [half]) == [recipe]  # and they go on from there
+
+
 def test_what_is_said(root, tmp_path):
     scene, out = scene_of(root), tmp_path / "out"
     render(scene, out, frames=[1, 2], cameras=["front"])
@@ -91,20 +106,19 @@ def test_what_is_said(root, tmp_path):
     )
     assert said == [
         f"dataset: {copy} (9 files put in place)",
-        f"  2 weathered images, 7 files shared with {root} ({shared / 1e6:.1f} MB that take no "
-        f"disk)",
-        "  6 of 8 camera images are the source's own, clear ones",
-        f"  to change files there in place would change {root} too; --links copy shares nothing",
+        "  2 of 8 camera images are weathered; 6 stay clear, as recorded",
+        f"  7 files are shared with {root} ({shared / 1e6:.1f} MB): changed in place, they change "
+        f"there too; --links copy shares nothing",
     ]
     assert changed(root, copy) == {"camera/front/01.jpg", "camera/front/02.jpg"}
     again = mirror_outputs(scene, out, links="copy", progress=False)
     own = sum((copy / f"camera/front/0{frame}.jpg").stat().st_size for frame in (1, 2))
-    assert again[:2] == [
+    assert again == [
         f"dataset: {copy} (9 files put in place)",
-        f"  2 weathered images (2 of them files of their own, {own / 1e6:.1f} MB), 7 files copied "
-        f"({shared / 1e6:.1f} MB)",
+        "  2 of 8 camera images are weathered; 6 stay clear, as recorded",
+        f"  7 files are copies ({shared / 1e6:.1f} MB)",
+        f"  weathered images there take {own / 1e6:.1f} MB of their own",
     ]
-    assert not any("--links" in sentence for sentence in again)
     assert "(up to date)" in mirror_outputs(scene, out, progress=False)[0]
 
 
@@ -130,7 +144,7 @@ def test_scenes_of_one_dataset_share_a_copy(root, tmp_path):
     said = mirror_outputs(two, out, progress=False)
     whole = {f"camera/{c}/{f:02d}.jpg" for c in CAMERAS.values() for f in (0, 1, 2)}
     assert changed(root, copy) == whole
-    assert "(2 files put in place)" in said[0] and said[2].startswith("  2 of 8 camera")
+    assert "(2 files put in place)" in said[0] and said[1].startswith("  6 of 8 camera")
     record = json.loads((out / "source/fog-000/climategs-mirror-002.json").read_text())
     assert sorted(record["scenes"]) == ["one", "two"]
     assert record["scenes"]["one"]["source"] == one.source
@@ -183,7 +197,7 @@ def test_images_that_are_gone_give_way_to_the_clear_ones(root, tmp_path):
 def test_images_in_another_format_are_not_rendered_twice(root, tmp_path):
     scene, out = scene_of(root), tmp_path / "out"
     render(scene, out, recipe_of(), frames=[0])
-    with pytest.raises(OutputError, match=r"holds these images as png, and the dataset has jpg"):
+    with pytest.raises(OutputError, match=r"images as png, and they would be rendered as jpg"):
         recipes_for_source(scene, out, [recipe_of()])
     recipes_for_source(scene, out, [recipe_of()], overwrite=True)
     # What it advises: the copy is made from what is there.
@@ -196,15 +210,24 @@ def test_images_in_another_format_are_not_rendered_twice(root, tmp_path):
 def test_making_the_copy_again_by_itself(root, tmp_path, monkeypatch, capsys):
     scene, out = scene_of(root), tmp_path / "out"
     render(scene, out, frames=[0])
+    other = scene_of(root, "other", frames=(3,))
     opened = []
-    monkeypatch.setattr("adapters.base.open_scene", lambda uri: opened.append(uri) or scene)
+
+    def opened_scene(uri: str) -> Scene:
+        opened.append(uri)
+        return scene if uri == scene.source else other
+
+    monkeypatch.setattr("adapters.base.open_scene", opened_scene)
     assert mirror_again(out) == 0
     assert opened == [scene.source]
     assert str(out / "source/fog-000/002") in capsys.readouterr().out
-    render(scene_of(root, "other"), out, frames=[0])
-    with pytest.raises(OutputError, match=r"has images of 2 scenes: .*name one of them"):
-        mirror_again(out)
-    assert mirror_again(out, "pandaset:002", links="copy") == 0
+    render(other, out)
+    assert mirror_again(out) == 0
+    assert opened[1:] == sorted([scene.source, other.source])
+    said = capsys.readouterr().out
+    assert said.count("dataset: ") == 2 and "4 of 8 camera images are weathered" in said
+    assert mirror_again(out, scene.source, links="copy") == 0
+    assert opened[3:] == [scene.source]
 
 
 def test_wrong_scenes_and_folders_are_refused(root, tmp_path):
@@ -293,9 +316,9 @@ def test_render_takes_the_layout(root, tmp_path, monkeypatch, capsys):
     assert done == 0
     said = capsys.readouterr().out
     assert f"dataset: {out / 'source/fog-000/002'}" in said
-    assert "  4 images were rendered at another size than recorded, such as 12x8 for 24x16" in said
+    assert "  4 were rendered at another size and resized, such as 12x8 to 24x16 pixels" in said
     assert len(changed(root, out / "source/fog-000/002")) == 4
-    assert sorted(path.suffix for path in (out / "street").rglob("00000?.*")) == [".jpg"] * 4
+    assert sorted(path.suffix for path in (out / "street").rglob("00000?.*")) == [".png"] * 4
     path = tmp_path / "path.json"
     with pytest.raises(ClimateGSError, match=r"--camera-path .*path\.json shows frames that"):
         render_tools.render_recipe(str(fog), "", out, camera_path=path, **options)
