@@ -254,7 +254,7 @@ def test_none_at_all_is_an_error(copy):
         open_nuscenes(str(copy), QUICK)
     for path in sweeps:
         path.unlink()
-    with pytest.raises(AdapterError, match="no LiDAR returns in frames 0 to 10; .*11 of 11 LiDAR"):
+    with pytest.raises(AdapterError, match=r"no LiDAR returns in frames 0 to 10; .*11 of 11 LiDAR"):
         open_nuscenes(str(copy), QUICK)
 
 
