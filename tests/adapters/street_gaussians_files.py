@@ -180,7 +180,7 @@ def write_dataset(
         facts.projections[number] = _projections(facts, number)
     if lidar:
         write_point_clouds(facts.root, facts.points, facts.projections)
-    for number in numbers:
+    for number in numbers if images or depth else ():
         for camera in facts.cameras:
             rgb, is_sky, is_object = picture(facts, number, camera)
             stem = f"{number:06d}_{camera}"

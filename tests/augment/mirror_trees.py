@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import os
 from pathlib import Path
 
@@ -48,9 +49,12 @@ def tree_of(root: Path, **options) -> SourceTree:
     return SourceTree(f"test:{root}", root.absolute(), IMAGES, **options)
 
 
+_open = functools.cache(open_fake)
+
+
 def scene_of(root: Path, name: str = "street") -> Scene:
     """The scene of a dataset: recorded images where there are any."""
-    scene = open_fake(f"fake:{name}")
+    scene = _open(f"fake:{name}")
     frames = []
     for frame in scene.frames:
         found = {

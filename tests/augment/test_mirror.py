@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import shutil
 from pathlib import Path
 
 import batch_scenes
@@ -28,10 +29,16 @@ def source(tmp_path) -> Path:
     return trees.write_dataset(tmp_path / "drive")
 
 
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("rendered")
+    trees.render(trees.write_dataset(folder / "drive"), folder / "out")
+    return folder / "out"
+
+
 @pytest.fixture
-def out(source, tmp_path) -> Path:
-    trees.render(source, tmp_path / "out")
-    return tmp_path / "out"
+def out(rendered, tmp_path) -> Path:
+    return Path(shutil.copytree(rendered, tmp_path / "out"))
 
 
 def image_of(out: Path, camera: str, frame: int, variant: str = "fog-000") -> Path:

@@ -7,8 +7,6 @@ import dataclasses
 import json
 import os
 import shutil
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -45,10 +43,16 @@ def waving(terms: int) -> Actor:
     return Actor("1", "Car", random_gaussians(1), track, (1.0, 1.0, 1.0), waves)
 
 
+@pytest.fixture(scope="module")
+def written(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("saved") / "fit"
+    save_scene(fitted_scene(), folder)
+    return folder
+
+
 @pytest.fixture
-def saved(tmp_path: Path) -> Path:
-    save_scene(fitted_scene(), tmp_path / "fit")
-    return tmp_path / "fit"
+def saved(written, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(written, tmp_path / "fit"))
 
 
 def hidden(folder: Path) -> list[str]:
@@ -250,15 +254,14 @@ def test_an_error_at_any_moment_leaves_one_of_the_two(
 
 
 def test_a_killed_save_is_cleared_by_the_next(tmp_path, saved):
-    code = f"""
-import os, sys
-sys.path.insert(0, {str(Path(__file__).parents[1])!r})
-from augment.files import atomic_folder, scene_files
-from fitted_scenes import fitted_scene
-atomic_folder._put_in_place = lambda *_: os.kill(os.getpid(), 9)
-scene_files.save_scene(fitted_scene(name="killed"), {str(saved)!r})
-"""
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == -9
+    child = os.fork()
+    if child == 0:
+        atomic_folder._put_in_place = lambda *_: os.kill(os.getpid(), 9)
+        try:
+            save_scene(fitted_scene(name="killed"), saved)
+        finally:
+            os._exit(1)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -9
     assert len(hidden(tmp_path)) == 1
     assert load_scene_parts(saved).name == "drive 2"
     save_scene(fitted_scene(name="new"), saved)
