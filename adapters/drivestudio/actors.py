@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from adapters.checkpoints import taken, tensor
-from adapters.drivestudio.drive import FRAME_NS
+from adapters.drivestudio.drive import FRAME_NS, scene_from_model
 from adapters.drivestudio.instances import Instance
 from adapters.drivestudio.nodes import turned_to_actor
 from adapters.drivestudio.run import Run
@@ -99,6 +99,7 @@ def make_actors(
     which is that of its images, and the actor is absent from frames in which it is not visible.
     """
     actors, problems, absent = [], [], []
+    axes, turn = run.convention.object_from_actor, scene_from_model(run)
     for index, identity in enumerate(identities):
         track_id = f"rigid-{index}" if identity is None else identity.track_id
         own = np.flatnonzero(owners == index)
@@ -115,15 +116,14 @@ def make_actors(
             problems.append(str(error))
             continue
         problems += about
-        axes = run.convention.object_from_actor
         label = _LABEL if identity is None else identity.label
-        turned = turned_to_actor(usable, axes, run.convention.scene_from_model)
+        turned = turned_to_actor(usable, axes, turn)
         actors.append(
             Actor(
                 track_id=track_id,
                 label=label,
                 gaussians=with_class_of(label, turned),
-                track=_track(poses.positions[seen, index], rotations @ axes, seen, run),
+                track=_track(poses.positions[seen, index], rotations @ axes, seen, run, turn),
                 size_m=tuple((poses.sizes_m[index] @ np.abs(axes)).tolist()),
                 colors_in_world=True,
             )
@@ -176,14 +176,14 @@ def identify(
     ]
 
 
-def _track(positions: np.ndarray, rotations: np.ndarray, seen: np.ndarray, run: Run) -> Track:
-    poses = rigid(torch.from_numpy(rotations), torch.from_numpy(positions))
-    turn = torch.eye(4, dtype=torch.float64)
-    turn[:3, :3] = torch.from_numpy(run.convention.scene_from_model)
+def _track(
+    positions: np.ndarray, rotations: np.ndarray, seen: np.ndarray, run: Run, turn: np.ndarray
+) -> Track:
+    poses = rigid(torch.from_numpy(turn @ rotations), torch.from_numpy(positions @ turn.T))
     times = (run.frames.start + seen).astype(np.int64) * FRAME_NS
     return Track(
         torch.from_numpy(times),
-        turn @ poses,
+        poses,
         hold_ns=FRAME_NS // 2 - 1,  # the frame before and after are without it
         max_gap_ns=FRAME_NS,
     )

@@ -4,8 +4,8 @@
 
 Background, rigid objects, the sky, and what was learnt for each image (colours, camera pose) are
 read; people and what else deforms is left out, with its count in Scene.problems. World: the
-model's, z up (see adapters.drivestudio.drive). Cameras are those of training: pinholes of the size
-that images were scaled to, with their corrected poses.
+model's, turned until z is up (see adapters.drivestudio.drive). Cameras are those of training:
+pinholes of the size that images were scaled to, with their corrected poses.
 
 Differences from the project's own renderer: it clamps each splat's colour, and what the splats
 blend to, to at most 1, where here what is brighter stays so until the image is written; and it
@@ -24,7 +24,7 @@ import torch
 from adapters.checkpoints import load_checkpoint, section, taken, tensor
 from adapters.drivestudio.actors import identify, make_actors, read_poses
 from adapters.drivestudio.corrections import read_corrections
-from adapters.drivestudio.drive import read_drive, scene_from_dataset
+from adapters.drivestudio.drive import model_from_dataset, read_drive, scene_from_model
 from adapters.drivestudio.instances import read_instances
 from adapters.drivestudio.labels import DriveStudioLabels
 from adapters.drivestudio.nodes import BACKGROUND, RIGID, left_out, read_gaussians
@@ -59,7 +59,7 @@ def open_drivestudio(path: str, query: dict[str, str]) -> Scene:
     models = section(content, "models", where)
     corrections = read_corrections(models, run, where)
     drive = read_drive(run, numbers, corrections)
-    sky, about_sky = read_sky(models, run.convention.scene_from_model, where)
+    sky, about_sky = read_sky(models, scene_from_model(run), where)
     background, about_background = read_gaussians(
         section(models, BACKGROUND, where),
         step=step,
@@ -67,7 +67,7 @@ def open_drivestudio(path: str, query: dict[str, str]) -> Scene:
         where=f"{where} {BACKGROUND}",
     )
     background, unusable = check_gaussians(background, where=f"{where} {BACKGROUND}")
-    change = WorldChange(rotation=run.convention.scene_from_model)
+    change = WorldChange(rotation=scene_from_model(run))
     actors, about_actors = _actors(models, run, step, where)
     return Scene(
         name=run.folder.absolute().name,
@@ -89,6 +89,12 @@ def open_drivestudio(path: str, query: dict[str, str]) -> Scene:
             *drive.problems,
             *_about_renderer(run),
         ),
+        made_by={
+            "method": "drivestudio",
+            "checkpoint": where,
+            "step": step,
+            "config": str(run.config_file),
+        },
     )
 
 
@@ -111,10 +117,7 @@ def _actors(
             f"{owners.min()} to {owners.max()}"
         )
     instances = read_instances(run.data)
-    model_from_dataset = np.eye(4)
-    model_from_dataset[:3, :3] = run.convention.scene_from_model.T
-    model_from_dataset = model_from_dataset @ scene_from_dataset(run)
-    identities = identify(poses, instances or (), model_from_dataset, run.frames)
+    identities = identify(poses, instances or (), model_from_dataset(run), run.frames)
     unknown = [f"rigid-{i}" for i, identity in enumerate(identities) if identity is None]
     if unknown:
         reason = "" if instances else f" ({run.data} holds no instances/instances_info.json)"

@@ -35,9 +35,10 @@ class Convention:
     extrinsics/{frame}_{camera}.txt is world_from_camera; else extrinsics/{camera}.txt is
     ego_from_camera. world_of_front_camera: the model's world is camera 0's first frame, else the
     first ego_pose. camera_from_opencv: [3, 3], the axes of the extrinsics. scene_from_model:
-    [3, 3], a permutation of axes that turns the model's world z up. pose_from_ego: [3, 3], ego axes
-    (x forward, y left, z up) in those of ego_pose, or of camera 0 where that is the world's.
-    object_from_actor: [3, 3], x forward, y left, z up in the axes of its boxes.
+    [3, 3], a permutation of axes that turns the model's world z up, as far as the car stands level.
+    pose_from_ego: [3, 3], ego axes (x forward, y left, z up) in those of ego_pose, or of camera 0
+    where that is the world's. object_from_actor: [3, 3], x forward, y left, z up in the axes of its
+    boxes.
     """
 
     cameras: tuple[CameraKind, ...]

@@ -1,8 +1,9 @@
 """The drive that a run was trained on, from its processed data: where car and cameras were.
 
-The scene's world is the model's, whose origin is the first frame's car (nuScenes: front camera),
-with its axes permuted where z does not point up in it. Frame t is at t tenths of a second: the data
-hold no times, and all cameras of a frame were trained as one moment.
+The scene's world is the model's, whose origin and axes are the first frame's car (nuScenes: front
+camera), turned until z is up as it is in the dataset's world: a car stands on a slope, and its
+brakes tip it. Frame t is at t tenths of a second: the data hold no times, and all cameras of a
+frame were trained as one moment.
 """
 
 from __future__ import annotations
@@ -18,12 +19,15 @@ from adapters.drivestudio.conventions import CameraKind
 from adapters.drivestudio.corrections import ImageCorrections
 from adapters.drivestudio.run import Run
 from adapters.plain_files import read_numbers, read_pose
+from adapters.world import rotation_to_z_up
 from augment.cameras import Camera, Frame
 from augment.errors import AdapterError
 from augment.geometry import invert_rigid
 from augment.image_header import read_image_header
 
 FRAME_NS = 100_000_000
+_LEVEL = 1e-4  # slope that is none: a centimetre in 100 m
+_STEEPEST_UP = 0.9  # cosine of a slope that no road has
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,14 +38,44 @@ class Drive:
     problems: tuple[str, ...]
 
 
-def scene_from_dataset(run: Run) -> np.ndarray:
-    """The rigid transform from the dataset's world to the scene's, float64 [4, 4].
+def model_from_dataset(run: Run) -> np.ndarray:
+    """The rigid transform from the dataset's world to the model's, float64 [4, 4].
 
     Raises:
         AdapterError: the first frame's pose is missing or none.
     """
-    model_from_dataset = np.linalg.inv(_world_pose(run, run.frames.start))
-    return _rigid(run.convention.scene_from_model) @ model_from_dataset
+    return np.linalg.inv(_world_pose(run, run.frames.start))
+
+
+def scene_from_model(run: Run) -> np.ndarray:
+    """The rotation from the model's world to the scene's, float64 [3, 3]: a permutation of axes
+    where that leaves z as good as up, or where the dataset's z cannot be what is up.
+
+    Raises:
+        AdapterError: as model_from_dataset.
+    """
+    axes, up = run.convention.scene_from_model, _up(run)
+    if _is_steep(up) or np.hypot(up[0], up[1]) < _LEVEL:
+        return axes
+    return rotation_to_z_up(up / np.linalg.norm(up)) @ axes
+
+
+def _up(run: Run) -> np.ndarray:
+    """The dataset's z axis as the first frame's car has it, x forward, y left, z up."""
+    return run.convention.scene_from_model @ model_from_dataset(run)[:3, 2]
+
+
+def _is_steep(up: np.ndarray) -> bool:
+    return up[2] < _STEEPEST_UP * np.linalg.norm(up)
+
+
+def scene_from_dataset(run: Run) -> np.ndarray:
+    """The rigid transform from the dataset's world to the scene's, float64 [4, 4].
+
+    Raises:
+        AdapterError: as model_from_dataset.
+    """
+    return _rigid(scene_from_model(run)) @ model_from_dataset(run)
 
 
 def read_drive(run: Run, numbers: tuple[int, ...], corrections: ImageCorrections) -> Drive:
@@ -52,6 +86,11 @@ def read_drive(run: Run, numbers: tuple[int, ...], corrections: ImageCorrections
     """
     scene = scene_from_dataset(run)
     problems: list[str] = []
+    if _is_steep(_up(run)):
+        problems.append(
+            f"{run.data}: z of its world is not what is up for the first frame's car, which is "
+            f"therefore taken to stand level"
+        )
     cameras = [_calibrated(run, position, problems) for position in range(len(run.cameras))]
     frames, missing = [], []
     for number in numbers:

@@ -1,7 +1,7 @@
 """The sky of a run as a cube map of the scene's world.
 
-drivestudio looks a direction (x, y, z) of its world up at (x, z, -y), in nvdiffrast's faces. The
-scene's world differs from it by a permutation of axes, so both turns together take texels to
+drivestudio looks a direction (x, y, z) of its world up at (x, z, -y), in nvdiffrast's faces. Where
+the scene's world differs from it by a permutation of axes, both turns together take texels to
 texels, and no colour is interpolated.
 """
 
@@ -15,7 +15,9 @@ import torch
 from torch import Tensor
 
 from adapters.checkpoints import section, taken, tensor
+from augment.cameras import Camera
 from augment.errors import AdapterError
+from augment.render.composite import composite_sky
 from augment.sky import ConstantSky, CubemapSky, Sky, cubemap_coordinates, directions_of_cubemap
 
 _LOOKUP_FROM_MODEL = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
@@ -30,7 +32,7 @@ def read_sky(
     """The sky of a checkpoint's models, black where there is none that is known here, and what is
     not as it was trained.
 
-    scene_from_model: [3, 3], a permutation of axes with signs.
+    scene_from_model: [3, 3], a rotation.
 
     Raises:
         AdapterError: tensors of another shape than the project's.
@@ -57,14 +59,32 @@ def read_sky(
 
 
 def turned_faces(faces: Tensor, source_from_target: np.ndarray) -> Tensor:
-    """A cube map that shows in direction d what `faces` show in source_from_target @ d, exactly.
+    """A cube map that shows in direction d what `faces` show in source_from_target @ d: exactly
+    where that is a permutation of axes with signs, else at the middle of each texel.
 
-    faces: [6, R, R, 3]. source_from_target: [3, 3], a permutation of axes with signs, no mirror.
+    faces: [6, R, R, 3]. source_from_target: [3, 3], a rotation.
     """
+    if not np.isin(source_from_target, (-1.0, 0.0, 1.0)).all():
+        return _drawn_faces(CubemapSky(faces), source_from_target)
     turned = torch.empty_like(faces)
     for target, (source, quarters) in enumerate(_turns_of_faces(source_from_target)):
         turned[target] = torch.rot90(faces[source], quarters)
     return turned
+
+
+def _drawn_faces(sky: CubemapSky, source_from_target: np.ndarray) -> Tensor:
+    """Each face as a camera of 90 degrees sees it; a face is the mirror image of such a picture."""
+    size = sky.faces.shape[1]
+    faces = torch.empty_like(sky.faces)
+    for face, corners in enumerate(directions_of_cubemap(2).double()):
+        left, down = corners[0, 0] - corners[0, 1], corners[1, 0] - corners[0, 0]
+        axes = torch.nn.functional.normalize(torch.stack([left, down, corners.sum((0, 1))]))
+        pose = torch.eye(4, dtype=torch.float64)
+        pose[:3, :3] = axes @ torch.from_numpy(source_from_target.T.copy())
+        camera = Camera("face", size, size, *[size / 2] * 4, camera_from_world=pose)
+        empty = torch.zeros(size, size, 3)
+        faces[face] = composite_sky(empty, empty[..., 0], camera, sky).flip(1)
+    return faces
 
 
 def _turns_of_faces(source_from_target: np.ndarray) -> list[tuple[int, int]]:

@@ -59,7 +59,6 @@ def read_config(path: Path) -> ModelConfig:
         use_tracker=values.of("data.use_tracker", bool, default.use_tracker),
         split_test=values.of("data.split_test", int, default.split_test),
         split_train=values.of("data.split_train", int, default.split_train),
-        box_scale=values.of("data.box_scale", float, default.box_scale),
         white_background=values.of("data.white_background", bool, default.white_background),
         sh_degree=values.of("model.gaussian.sh_degree", int, default.sh_degree),
         fourier_dim=values.of("model.gaussian.fourier_dim", int, default.fourier_dim),

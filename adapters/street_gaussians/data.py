@@ -69,7 +69,7 @@ def read_data(root: Path, config: ModelConfig) -> StreetData:
         world_from_ego=world_from_ego,
         images=images,
         objects=tracked_objects(
-            table, seen, tracklets.ids, frames, times, (min(moments), max(moments)), config
+            table, seen, tracklets.ids, frames, times, (min(moments), max(moments))
         ),
         tracklets=tracklets,
         problems=(*path.problems, *problems, *image_problems, *table.problems),

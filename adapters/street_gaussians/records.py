@@ -28,7 +28,6 @@ class ModelConfig:
     use_tracker: bool = False
     split_test: int = -1
     split_train: int = -1
-    box_scale: float = 1.0
     sh_degree: int = 3
     fourier_dim: int = 1
     fourier_scale: float = 1.0
@@ -80,7 +79,8 @@ class StreetImage:
 class TrackedObject:
     """A moving object of the model: `obj_{track_id:03d}`.
 
-    size_m: length, width, height. start_frame, end_frame: first and last in which it is tracked.
+    size_m: length, width, height; training kept splats in a box that was wider and longer by
+    data.box_scale. start_frame, end_frame: first and last in which it is tracked.
     start_s, end_s: when it is drawn.
     """
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from adapters.plain_files import read_json, read_text
-from adapters.street_gaussians.records import ModelConfig, TrackedObject, Tracklets
+from adapters.street_gaussians.records import TrackedObject, Tracklets
 from augment.errors import AdapterError
 
 NOT_TRACKED = ("sign", "misc")  # classes
@@ -268,21 +268,19 @@ def tracked_objects(
     frames: Sequence[int],
     frame_times_s: np.ndarray,
     drawn_s: tuple[float, float],
-    config: ModelConfig,
 ) -> tuple[TrackedObject, ...]:
     """The objects that have a column, in the order of the rows.
 
     rows: those that were seen, in all frames of the file; sizes are the largest of them. ids:
     int64 [F, M]. drawn_s: the first and last moment of any image or frame.
     """
-    scale = np.array([config.box_scale, config.box_scale, 1.0])
     objects = []
     for track_id in dict.fromkeys(table.ids[rows].tolist()):
         steps = np.flatnonzero((ids == track_id).any(axis=1))
         if len(steps) == 0:
             continue
         own = rows[table.ids[rows] == track_id]
-        length, width, height = (table.sizes_m[own].max(axis=0) * scale).tolist()
+        length, width, height = (table.sizes_m[own].max(axis=0)).tolist()
         start, end = frame_times_s[steps[0]] - _HOLD_S, frame_times_s[steps[-1]] + _HOLD_S
         objects.append(
             TrackedObject(

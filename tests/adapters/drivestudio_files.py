@@ -62,10 +62,7 @@ def pose(rotation: np.ndarray, place) -> np.ndarray:
 
 
 def dataset_from_ego(frame: int) -> np.ndarray:
-    c, s = np.cos(0.02), np.sin(0.02)
-    on_a_slope = np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
-    rotation = turn_z(0.6 + 0.02 * frame) @ on_a_slope
-    return pose(rotation, [3000 + 0.9 * frame, -2000 + 0.6 * frame, 55.0])
+    return pose(turn_z(0.6 + 0.02 * frame), [3000 + 0.9 * frame, -2000 + 0.6 * frame, 55.0])
 
 
 def ego_from_opencv(position: int) -> np.ndarray:

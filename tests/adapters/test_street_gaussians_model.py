@@ -383,7 +383,7 @@ def test_configurations(tmp_path: Path) -> None:
     path.write_text(yaml.safe_dump(tree))
     assert read_config(path) == ModelConfig(
         source_path="data/002", cameras=(0, 3), selected_frames=(5, 90), split_test=4,
-        split_train=1, box_scale=1.5, sh_degree=1, fourier_dim=5, fourier_scale=2.0,
+        split_train=1, sh_degree=1, fourier_dim=5, fourier_scale=2.0,
         include_sky=True, use_pose_correction=True, pose_correction_mode="frame",
         color_correction_mode="sensor",
     )  # fmt: skip

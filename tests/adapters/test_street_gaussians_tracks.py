@@ -57,13 +57,13 @@ def test_places_and_turns_are_those_of_the_objects_in_the_vehicles_frame(street)
             np.testing.assert_allclose(turn, pose, atol=1e-9)
 
 
-def test_sizes_are_the_largest_of_the_whole_file_times_the_box_scale(tmp_path):
+def test_sizes_are_the_largest_of_the_whole_file(tmp_path):
     fast = StreetObject(1, "vehicle", (4.4, 1.9, 1.5), (16, 3, 0.75), (-30, 0), np.pi)
     facts = write_dataset(tmp_path, objects=(fast,), images=False, lidar=False)
-    config = ModelConfig(cameras=(0,), selected_frames=(0, 1), box_scale=1.5)
+    config = ModelConfig(cameras=(0,), selected_frames=(0, 1))
     (car,) = read_data(facts.root, config).objects
-    # The largest box is of frame 2, which is not selected; heights are not scaled.
-    np.testing.assert_allclose(car.size_m, (4.6 * 1.5, 1.9 * 1.5, 1.5))
+    # The largest box is of frame 2, which is not selected.
+    np.testing.assert_allclose(car.size_m, (4.6, 1.9, 1.5))
 
 
 def test_objects_are_drawn_a_little_longer_than_they_are_tracked(street):
