@@ -94,10 +94,9 @@ def _apart(uri: str, what: str) -> float:
 def _open_once(uri: str, what: str) -> float:
     from adapters.base import open_scene
 
-    if what == "memory":
-        _import_all(uri)
-        return extra_mib(lambda: open_scene(uri))
     _import_all(uri)
+    if what == "memory":
+        return extra_mib(lambda: open_scene(uri))
     begun = time.perf_counter()
     open_scene(uri)
     return time.perf_counter() - begun

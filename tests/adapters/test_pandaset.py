@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import pickle
 import shutil
 from pathlib import Path
@@ -14,6 +13,7 @@ import pandaset_folder as street
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
+from shown import assert_same_bits, psnr, psnr_of, render
 
 from adapters.pandaset import open_pandaset
 from adapters.uri import format_uri
@@ -37,16 +37,6 @@ def scene(folder):
 @pytest.fixture
 def copy(folder, tmp_path) -> Path:
     return Path(shutil.copytree(folder, tmp_path / "002"))
-
-
-def render(scene, camera) -> np.ndarray:
-    out = rasterize(scene.parts_for(camera), camera)
-    sky = scene.sky.sample(camera.ray_directions())
-    return (out.rgb + (1 - out.alpha)[..., None] * sky).clamp(0, 1).numpy()
-
-
-def psnr(image: np.ndarray, recorded: np.ndarray) -> float:
-    return -10 * math.log10(np.mean((image - recorded) ** 2))
 
 
 def test_the_scene_is_described(scene, folder):
@@ -78,10 +68,8 @@ def test_cameras_have_their_own_pose_and_time(scene):
 
 @pytest.mark.parametrize("camera", ["front_camera", "left_camera"])
 def test_the_scene_looks_like_the_recorded_image(scene, camera):
-    frame = scene.frame(1)
-    recorded = cv2.imread(frame.image_paths[camera])[..., ::-1] / 255
     # 26 dB when written; edges are as blurred as the voxels of 10 cm are wide.
-    assert psnr(render(scene, frame.cameras[camera]), recorded) > 24.5
+    assert psnr_of(scene, 1, camera) > 24.5
 
 
 def test_the_ground_is_closed_under_the_car_too(scene):
@@ -133,15 +121,6 @@ def test_the_sky_is_what_the_images_show_above(scene):
     # The zenith is in no image: it is filled from the whole sky, wall tops at its rim included.
     for sampled, tolerance in zip(scene.sky.sample(up_ahead), (0.02, 0.02, 0.1), strict=True):
         np.testing.assert_allclose(sampled, street.SKY / 255, atol=tolerance)
-
-
-def assert_same_bits(scene, again):
-    pairs = [(scene.background, again.background)]
-    pairs += [(a.gaussians, b.gaussians) for a, b in zip(scene.actors, again.actors, strict=True)]
-    for a, b in pairs:
-        for name in ("means", "quats", "scales", "opacities", "sh", "semantic"):
-            assert torch.equal(getattr(a, name), getattr(b, name)), name
-    assert torch.equal(scene.sky.faces, again.sky.faces)
 
 
 def test_opening_twice_gives_the_same_bits(scene, folder):

@@ -3,7 +3,6 @@ and with neither."""
 
 from __future__ import annotations
 
-import math
 import pickle
 import shutil
 from pathlib import Path
@@ -13,8 +12,8 @@ import numpy as np
 import pandaset_folder as street
 import pytest
 import recording_folder as recording
-import torch
 from recording_folder import QUERY, write_recording
+from shown import assert_same_bits, psnr_of, render
 
 from adapters.base import open_scene, recognise
 from adapters.lidar.depth import lidar_depth
@@ -23,7 +22,6 @@ from adapters.recording.calibration import read_calibration
 from adapters.uri import format_uri
 from augment.batch.job import RenderJob, run_job
 from augment.errors import AdapterError
-from augment.render.rasterize import rasterize
 from augment.semantics import SemanticClass
 from recipes.load import load_recipe
 
@@ -43,27 +41,6 @@ def copy(folder, tmp_path) -> Path:
     return Path(shutil.copytree(folder, tmp_path / "drive"))
 
 
-def render(scene, camera) -> np.ndarray:
-    out = rasterize(scene.parts_for(camera), camera)
-    sky = scene.sky.sample(camera.ray_directions())
-    return (out.rgb + (1 - out.alpha)[..., None] * sky).clamp(0, 1).numpy()
-
-
-def psnr(scene, frame: int, name: str) -> float:
-    recorded = cv2.imread(scene.frame(frame).image_paths[name])[..., ::-1] / 255
-    image = render(scene, scene.frame(frame).cameras[name])
-    return -10 * math.log10(np.mean((image - recorded) ** 2))
-
-
-def assert_same_bits(scene, again):
-    pairs = [(scene.background, again.background)]
-    pairs += [(a.gaussians, b.gaussians) for a, b in zip(scene.actors, again.actors, strict=True)]
-    for a, b in pairs:
-        for name in ("means", "quats", "scales", "opacities", "sh", "semantic"):
-            assert torch.equal(getattr(a, name), getattr(b, name)), name
-    assert torch.equal(scene.sky.faces, again.sky.faces)
-
-
 def test_the_scene_is_described(scene, folder):
     assert scene.name == "drive" and scene.problems == ()
     assert scene.source == format_uri("recording", str(folder), QUERY)
@@ -79,7 +56,7 @@ def test_the_scene_is_described(scene, folder):
 @pytest.mark.parametrize("camera", ["front_camera", "left_camera"])
 def test_it_looks_like_the_recorded_image(scene, camera):
     # 26 dB when written; edges are as blurred as the voxels of 10 cm are wide.
-    assert psnr(scene, 1, camera) > 24.5
+    assert psnr_of(scene, 1, camera) > 24.5
 
 
 def test_what_moves_is_an_actor_and_what_is_parked_is_not(scene):
@@ -135,7 +112,7 @@ def test_a_world_far_from_its_origin_is_recentred(tmp_path):
     np.testing.assert_array_equal(moved.boxes(0).centers_m[0], street.car_centre(0) + offset)
     pose = moved.actors[0].track.pose_at(recording.time_ns(0))
     np.testing.assert_allclose(pose[:3, 3], street.car_centre(0) + shift, atol=1e-6)
-    assert psnr(moved, 1, "front_camera") > 24.5
+    assert psnr_of(moved, 1, "front_camera") > 24.5
 
 
 def test_what_a_job_wrote_is_a_recording(tmp_path):
@@ -177,7 +154,7 @@ def test_without_lidar_depth_images_are_the_start(tmp_path):
     (actor,) = scene.actors
     assert actor.track_id == "car"
     # The wall is 8 m away: single pixels are 10 cm on it, no coarser than with LiDAR.
-    assert psnr(scene, 1, "left_camera") > 24.5 and psnr(scene, 1, "front_camera") > 22
+    assert psnr_of(scene, 1, "left_camera") > 24.5 and psnr_of(scene, 1, "front_camera") > 22
 
 
 def test_damaged_depth_images_are_problems(tmp_path):

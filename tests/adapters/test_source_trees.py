@@ -11,6 +11,7 @@ from pathlib import Path
 
 import cv2
 import drivestudio_files
+import kitti_files
 import numpy as np
 import nuscenes_files
 import pandaset_folder
@@ -32,7 +33,6 @@ from tests.augment.mirror_trees import contents, listing, snapshot
 from tools.mirror import mirror_outputs, recipes_for_source
 
 SMALL = {"voxel_m": "0.5", "image_scale": "0.5", "sky_size": "16", "max_gaussians": "3000"}
-KITTI = {**SMALL, "image_scale": "0.25"}
 
 
 def weather(scene: Scene, out: Path, *, scale: float = 1.0, **selection) -> tuple[Path, list[str]]:
@@ -188,30 +188,22 @@ def test_the_official_devkit_reads_the_copy(tmp_path):
     assert len(images) == 2 * nuscenes_files.SAMPLES
 
 
-def write_kitti_drive(shared_dir: Path, folder: Path, *, calibration: str) -> Path:
-    """The real frames as a drive, whose calibration is in the drive's folder or the day's."""
-    real = shared_dir / "data/kitti_raw_seq/2011_09_26"
-    if not real.is_dir():
-        pytest.skip(f"no KITTI drive at {real}")
-    day = folder / "2011_09_26"
-    drive = day / "2011_09_26_drive_0001_sync"
-    drive.mkdir(parents=True)
-    for name in ("image_02", "velodyne_points"):
-        shutil.copytree(real / name, drive / name, copy_function=shutil.copyfile)
-        for path in (drive / name, drive / name / "data"):
-            path.chmod(0o755)
-    for path in real.glob("calib_*.txt"):
-        shutil.copyfile(path, (day if calibration == "day" else drive) / path.name)
-    (day / "another_drive_sync").mkdir()
+def write_kitti_drive(folder: Path, *, calibration: str) -> Path:
+    """A drive whose calibration is in its own folder or the day's, beside another drive."""
+    drive = kitti_files.write_raw(folder / "2011_09_26", cameras=("02",))
+    if calibration == "drive":
+        for path in drive.parent.glob("calib_*.txt"):
+            path.rename(drive / path.name)
+    (drive.parent / "another_drive_sync").mkdir()
     return drive
 
 
-def test_drives_of_one_day_share_a_copy(shared_dir, tmp_path):
+def test_drives_of_one_day_share_a_copy(tmp_path):
     """As `pykitti.raw(folder, date, drive)` reads them; the day's third drive stays out."""
-    drive = write_kitti_drive(shared_dir, tmp_path, calibration="day")
+    drive = write_kitti_drive(tmp_path, calibration="day")
     other = Path(shutil.copytree(drive, drive.with_name("2011_09_26_drive_0002_sync")))
     for place in (drive, other):
-        scene = open_scene(format_uri("kitti", place, {**KITTI, "frames": "2:3"}))
+        scene = open_scene(format_uri("kitti", place, {**SMALL, "frames": "2:3"}))
         copy, said = weather(scene, tmp_path / "out", scale=0.1)
         assert not any("not the source's" in sentence for sentence in said)
     day = copy / "2011_09_26"
@@ -221,9 +213,9 @@ def test_drives_of_one_day_share_a_copy(shared_dir, tmp_path):
 
 
 @pytest.mark.parametrize("calibration", ["day", "drive"])
-def test_a_kitti_drive(shared_dir, tmp_path, calibration):
-    drive = write_kitti_drive(shared_dir, tmp_path, calibration=calibration)
-    query = {**KITTI, "frames": "1:2"}  # one frame needs no poses
+def test_a_kitti_drive(tmp_path, calibration):
+    drive = write_kitti_drive(tmp_path, calibration=calibration)
+    query = {**SMALL, "frames": "1:2"}
     scene = open_scene(format_uri("kitti", drive, query))
     root = drive.parent if calibration == "day" else drive
     copy, said = weather(scene, tmp_path / "out", scale=0.1)
@@ -232,10 +224,13 @@ def test_a_kitti_drive(shared_dir, tmp_path, calibration):
     assert changed_files(drive, again) == {"image_02/data/0000000001.png"}
     if calibration == "day":
         assert sorted(path.name for path in copy.iterdir()) == sorted(
-            [drive.name, "calib_cam_to_cam.txt", "calib_velo_to_cam.txt"]
+            [
+                drive.name,
+                *(f"calib_{what}.txt" for what in ("cam_to_cam", "imu_to_velo", "velo_to_cam")),
+            ]
         )
     assert_same_but_colours(scene, open_scene(format_uri("kitti", again, query)), drive, again)
-    assert "  1 of 4 camera images are weathered; 3 stay clear, as recorded" in said
+    assert "  1 of 3 camera images are weathered; 2 stay clear, as recorded" in said
     recorded = cv2.imread(str(drive / "image_02/data/0000000001.png"))
     shown = cv2.imread(str(again / "image_02/data/0000000001.png"))
     assert shown.shape == recorded.shape
@@ -243,19 +238,14 @@ def test_a_kitti_drive(shared_dir, tmp_path, calibration):
     assert resized.endswith(f" to {recorded.shape[1]}x{recorded.shape[0]} pixels")
 
 
-def test_kitti_object_frames(shared_dir, tmp_path):
+def test_kitti_object_frames(tmp_path):
     """Each is a scene of its own: one copy of the dataset takes the images of all of them."""
-    real = shared_dir / "data/kitti_object"
-    if not real.is_dir():
-        pytest.skip(f"no KITTI frames at {real}")
     root = tmp_path / "object"
-    shutil.copytree(real, root / "training", copy_function=shutil.copyfile)
-    for path in [root, *root.rglob("*")]:
-        path.chmod(0o755)
+    kitti_files.write_object(root / "training", numbers=(1, 2, 3))
     (root / "ImageSets").mkdir()
     expected = set()
     for frame in ("1", "2"):
-        scene = open_scene(format_uri("kitti", root, {**KITTI, "frame": frame}))
+        scene = open_scene(format_uri("kitti", root, {**SMALL, "frame": frame}))
         copy, _ = weather(scene, tmp_path / "out", scale=0.1)
         expected |= relative_images(scene, root)
         assert changed_files(root, copy / "object") == expected
@@ -339,7 +329,7 @@ def test_the_real_sequence_at_a_twentieth(shared_dir, tmp_path):
     real = shared_dir / "data/pandaset_mini/002"
     if not real.is_dir():
         pytest.skip(f"no PandaSet sequence at {real}")
-    query = {"frames": "10:12", "voxel_m": "0.5", "image_scale": "0.25", "sky_size": "16"}
+    query = {"frames": "11:12", "voxel_m": "1", "image_scale": "0.125", "sky_size": "16"}
     scene = open_scene(format_uri("pandaset", real, query))
     before = {path: path.stat().st_mtime_ns for path in real.rglob("*")}
     chosen = {"frames": [11], "cameras": ["back_camera", "front_camera"]}
