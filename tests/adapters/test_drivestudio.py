@@ -18,7 +18,7 @@ from augment.cameras import Camera
 from augment.plan import make_plan
 from augment.render.rasterize import rasterize
 from augment.scene import Gaussians, PosedGaussians
-from augment.sky import CubemapSky
+from augment.sky import CubemapSky, directions_of_cubemap
 from recipes.schema import Recipe
 
 FRAME_NS = 100_000_000
@@ -372,6 +372,14 @@ def test_turning_there_and_back_is_exact():
     turn = files.OPENCV_AXES
     assert torch.equal(turned_faces(turned_faces(faces, turn), turn.T), faces)
     assert not torch.equal(turned_faces(faces, turn), faces)
+
+
+def test_a_sky_on_a_slope_is_looked_up_between_texels():
+    faces = torch.rand(6, 9, 9, 3, generator=torch.Generator().manual_seed(3))
+    turn = rotation_of(np.array([0.9, 0.3, -0.2, 0.25]))
+    shown = turned_faces(faces, turn)
+    there = directions_of_cubemap(9) @ torch.from_numpy(turn.T).float()
+    assert torch.allclose(shown, CubemapSky(faces).sample(there), atol=1e-5)
 
 
 @pytest.mark.parametrize("appearances", [0, 4])
