@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from adapters.source_trees import source_tree
+from adapters.uri import parse_uri
 from augment.batch.layout import MANIFEST, folder_name, variant_folder, variant_name
 from augment.batch.lock import OutputLock
 from augment.batch.manifest import OK, read_manifest, rows_of
@@ -190,20 +191,38 @@ def _rows(
             + "; render them first, or name another scene"
         )
     for name, rows in found.items():
-        _check_rows(scene, out, name, rows[0])
+        _check_rows(scene, out, name, rows)
     return found
 
 
-def _check_rows(scene: Scene, out: Path, name: str, row: dict[str, Any]) -> None:
-    where = out / variant_folder(scene.name, name)
-    if row["trajectory"] != RECORDED:
+def _check_rows(scene: Scene, out: Path, name: str, rows: list[dict[str, Any]]) -> None:
+    where, source = out / variant_folder(scene.name, name), rows[0]["source"]
+    if rows[0]["trajectory"] != RECORDED:
         raise OutputError(
             f"{where} shows a camera path; a dataset's copy takes images of its own frames"
         )
-    if row["source"] != scene.source:
+    if source != scene.source and not (
+        _without_path(source) == _without_path(scene.source) and _has_all(scene, rows)
+    ):
         raise OutputError(
-            f"{where} was rendered from {row['source']}, not from {scene.source}; name that scene"
+            f"{where} was rendered from {source}, not from {scene.source}; name that scene, or the "
+            f"same one where it is now"
         )
+
+
+def _without_path(uri: str) -> tuple[str | None, dict[str, str]]:
+    scheme, _, query = parse_uri(uri)
+    return scheme, query
+
+
+def _has_all(scene: Scene, rows: list[dict[str, Any]]) -> bool:
+    """Whether every image of the rows is one of the scene's, by its time."""
+    times = {
+        (frame.index, name): camera.timestamp_ns
+        for frame in scene.frames
+        for name, camera in frame.cameras.items()
+    }
+    return all(times.get((row["frame"], row["camera"])) == row["timestamp_ns"] for row in rows)
 
 
 def _check_format(scene: Scene, out: Path, recipe: Recipe, written_as: str) -> None:

@@ -66,6 +66,6 @@ def read_record(tree: SourceTree, folder: Path) -> MirrorRecord:
     if root != os.path.realpath(tree.root):
         raise OutputError(
             f"{folder / tree.root.name} is the copy of {root}, not of {tree.root}: choose another "
-            f"output folder"
+            f"output folder, or delete that copy"
         )
     return record

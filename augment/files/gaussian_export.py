@@ -11,6 +11,7 @@ import os
 import re
 import secrets
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +46,8 @@ def export_splat(scene: Scene, path: str | Path, timestamp_ns: int) -> None:
     Raises:
         SceneError: nothing is there at that moment. OutputError: as write_splat.
     """
-    write_splat(path, _something(scene, timestamp_ns))
+    gaussians = _something(scene, timestamp_ns)
+    write_splat(path, replace(gaussians, sh=gaussians.sh[:, :1]))  # export_losses says so
 
 
 def export_cameras(scene: Scene, folder: str | Path) -> bool:

@@ -63,7 +63,7 @@ def test_a_recording_is_found_from_the_exported_file(tmp_path, monkeypatch):
     assert again.problems == fitted_scene().problems
 
 
-def test_baked_files_have_cameras_beside_them(uri, tmp_path, capsys):
+def test_baked_files_have_cameras_beside_them(uri, tmp_path, capsys, caplog):
     for kind in ("ply", "splat"):
         assert export_scene(uri, tmp_path / kind / "a", kind=kind, frame=5) == 0
         assert names(tmp_path / kind) == [f"a.{kind}", "cameras.json"]
@@ -75,6 +75,7 @@ def test_baked_files_have_cameras_beside_them(uri, tmp_path, capsys):
         assert (
             again.camera_names == ("ahead", "left") and len(again.background) == 50
         )  # no actor then
+    assert not caplog.messages  # what is lost is said once
     export_scene(uri, tmp_path / "ply" / "b.ply", kind="ply")
     said = capsys.readouterr()
     assert "stand still where they are in frame 4" in said.out and "not this" not in said.err

@@ -246,6 +246,32 @@ def test_wrong_scenes_and_folders_are_refused(root, tmp_path):
         mirror_outputs(scene, tmp_path / "nothing", progress=False)
 
 
+def test_a_dataset_that_has_moved_is_taken(root, tmp_path):
+    scene, out = scene_of(root), tmp_path / "out"
+    render(scene, out, frames=[0])
+    moved = scene_of(root.rename(tmp_path / "moved"))
+    late = dataclasses.replace(
+        moved,
+        frames=tuple(
+            dataclasses.replace(
+                frame,
+                cameras={
+                    name: dataclasses.replace(camera, timestamp_ns=camera.timestamp_ns + 1)
+                    for name, camera in frame.cameras.items()
+                },
+            )
+            for frame in moved.frames
+        ),
+    )
+    with pytest.raises(OutputError, match=r"was rendered from .*/002.*, or the same one where"):
+        mirror_outputs(late, out, progress=False)
+    mirror_outputs(moved, out, progress=False)
+    assert changed(tmp_path / "moved", out / "source/fog-000/moved") == {
+        "camera/front/00.jpg",
+        "camera/left/00.jpg",
+    }
+
+
 def test_another_dataset_of_that_name_is_refused(root, tmp_path):
     scene, out = scene_of(root), tmp_path / "out"
     render(scene, out, frames=[0])
