@@ -361,13 +361,20 @@ def test_perturbed_poses_are_applied_before_the_learnt_ones(numbers):
     assert np.allclose(camera.world_from_camera.numpy(), expected, atol=1e-7)
 
 
-@pytest.mark.parametrize(("slope", "lies"), [(0.3, False), (0.6, True), (np.pi / 2, True)])
-def test_a_car_on_no_road_is_taken_to_stand_level(tmp_path, monkeypatch, slope, lies):
+@pytest.mark.parametrize(
+    ("dataset", "slope", "lies"),
+    [
+        *[(dataset, 0.3, False) for dataset in ("waymo", "nuscenes", "pandaset", "argoverse")],
+        ("waymo", 0.6, True),
+        ("nuscenes", np.pi / 2, True),
+    ],
+)
+def test_a_car_on_no_road_is_taken_to_stand_level(tmp_path, monkeypatch, dataset, slope, lies):
     level = files.dataset_from_ego
     c, s = np.cos(slope), np.sin(slope)
     nose_up = files.pose(np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]), [0, 0, 0])
     monkeypatch.setattr(files, "dataset_from_ego", lambda frame: level(frame) @ nose_up)
-    scene = opened(files.write_run(tmp_path))
+    scene = opened(files.write_run(tmp_path, dataset=dataset))
     assert any("taken to stand level" in problem for problem in scene.problems) == lies
     expected = np.eye(3)[2] if lies else [-s, 0, c]
     assert np.allclose(scene.frames[0].world_from_ego[2, :3].numpy(), expected, atol=1e-12)
