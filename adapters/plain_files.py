@@ -11,9 +11,11 @@ import numpy as np
 
 from augment.errors import AdapterError
 
+_FROM_DATASET = "copy it from the dataset"
 
-def read_text(path: Path) -> str:
-    """A UTF-8 file.
+
+def read_text(path: Path, *, if_missing: str = _FROM_DATASET) -> str:
+    """A UTF-8 file. if_missing: what to do then, for the message.
 
     Raises:
         AdapterError: missing, unreadable, or not UTF-8.
@@ -21,18 +23,18 @@ def read_text(path: Path) -> str:
     try:
         return path.read_text(encoding="utf-8")
     except FileNotFoundError:
-        raise AdapterError(f"{path} does not exist; copy it from the dataset") from None
+        raise AdapterError(f"{path} does not exist; {if_missing}") from None
     except (OSError, ValueError) as error:
         raise AdapterError(f"{path} cannot be read as text: {error}") from None
 
 
-def read_json(path: Path, kind: type = dict) -> Any:
+def read_json(path: Path, kind: type = dict, *, if_missing: str = _FROM_DATASET) -> Any:
     """The contents of a JSON file, a `kind` (dict or list) at its top.
 
     Raises:
         AdapterError: missing, no JSON, or something else at the top.
     """
-    text = read_text(path)
+    text = read_text(path, if_missing=if_missing)
     try:
         content = json.loads(text)
     except (ValueError, RecursionError) as error:

@@ -8,12 +8,11 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
+from adapters.image_checks import look_at_image
 from adapters.kitti.layout import file_in, some
-from adapters.lidar.image_views import read_image
 from augment.errors import AdapterError
 
 _READERS = 4  # threads that decode; decoding releases the interpreter
-_ENDS = ((b"\x89PNG\r\n\x1a\n", b"IEND"), (b"\xff\xd8", b"\xff\xd9"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +43,7 @@ def find_images(
     problems = [f"camera {camera}: {some(missing)} without an image"] if missing else []
     paths = {number: file_in(root, names[number]) for number in wanted}
     with ThreadPoolExecutor(_READERS) as pool:
-        looked_at = dict(zip(wanted, pool.map(_look_at, paths.values()), strict=True))
+        looked_at = dict(zip(wanted, pool.map(look_at_image, paths.values()), strict=True))
     sizes = Counter(seen for seen in looked_at.values() if not isinstance(seen, str))
     if not sizes:
         faults = [f"{paths[n]} {looked_at[n]}" for n in wanted[:3]] or problems
@@ -66,19 +65,6 @@ def find_images(
         fault = seen if isinstance(seen, str) else f"is {_text(seen)} pixels, not {_text(expected)}"
         problems.append(f"camera {camera}, frame {number}: image {paths[number]} {fault}; left out")
     return CameraImages(usable, expected, tuple(problems))
-
-
-def _look_at(path: Path) -> tuple[int, int] | str:
-    """Width and height of an image, or what is wrong with it."""
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        return f"cannot be read ({error.strerror})"
-    # Decoders fill what is cut off with grey.
-    if not any(data.startswith(start) and end in data[-64:] for start, end in _ENDS):
-        return "is cut short, or neither PNG nor JPEG"
-    image = read_image(path, 1.0)
-    return "cannot be decoded" if image is None else (image.shape[1], image.shape[0])
 
 
 def _text(size: tuple[int, int] | str) -> str:

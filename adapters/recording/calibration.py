@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -26,6 +25,7 @@ import numpy as np
 import torch
 
 from adapters.lidar.origin import drive_origin
+from adapters.plain_files import read_json
 from augment.batch.calibration import read_camera
 from augment.cameras import Camera, Frame
 from augment.errors import AdapterError
@@ -33,6 +33,7 @@ from augment.geometry import invert_rigid
 from augment.semantics import SemanticClass
 
 CALIBRATION = "calibration.json"
+_IF_MISSING = "a recording needs it, docs/scenes.md shows what is in it"
 NO_SURFACE = -1  # stands for returns that no surface made, where a SemanticClass is expected
 # Rotations written with six digits are off by a few millionths.
 _RIGID = 1e-4
@@ -64,7 +65,7 @@ def read_calibration(root: Path) -> Calibration:
             the file, the frame and the camera.
     """
     path = root / CALIBRATION
-    content = _read_json(path)
+    content = read_json(path, if_missing=_IF_MISSING)
     entries = content.get("frames")
     if not isinstance(entries, list) or not entries:
         raise AdapterError(f"{path} must hold a list 'frames' with at least one entry")
@@ -97,21 +98,8 @@ def read_lidar_classes(root: Path) -> Mapping[int, int] | None:
         AdapterError: the file is missing or damaged, or names no classes.
     """
     path = root / CALIBRATION
-    return _lidar_classes(path, _read_json(path).get("lidar_classes"))
-
-
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise AdapterError(
-            f"{path} does not exist; a recording needs it, docs/scenes.md shows what is in it"
-        ) from None
-    except (OSError, ValueError, RecursionError) as error:
-        raise AdapterError(f"{path} is not readable JSON ({error}); write it again") from None
-    if not isinstance(content, dict):
-        raise AdapterError(f"{path} must hold a JSON object; it holds a {type(content).__name__}")
-    return content
+    content = read_json(path, if_missing=_IF_MISSING)
+    return _lidar_classes(path, content.get("lidar_classes"))
 
 
 def _frame(path: Path, entry: Any) -> Frame:

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from adapters.lidar.image_views import read_image
+from adapters.image_checks import look_at_image
 from augment.batch.layout import folder_name
 from augment.cameras import Camera, Frame
 from augment.errors import AdapterError
@@ -123,27 +123,12 @@ def _fault(path: Path | None, camera: Camera) -> str:
     """What is wrong with an image, or nothing."""
     if path is None:
         return "its image is missing"
-    try:
-        data = path.read_bytes()
-        if not _is_whole(data):
-            return f"image {path} is cut short, or neither PNG nor JPEG"
-    except OSError as error:
-        return f"image {path} cannot be read ({error.strerror})"
-    image = read_image(path, 1.0)
-    if image is None:
-        return f"image {path} cannot be decoded"
-    height, width, _ = image.shape
-    if (width, height) != (camera.width, camera.height):
+    seen = look_at_image(path)
+    if isinstance(seen, str):
+        return f"image {path} {seen}"
+    if seen != (camera.width, camera.height):
         return (
-            f"image {path} is {width}x{height} pixels, calibration.json says "
+            f"image {path} is {seen[0]}x{seen[1]} pixels, calibration.json says "
             f"{camera.width}x{camera.height}; left out"
         )
     return ""
-
-
-def _is_whole(data: bytes) -> bool:
-    """Whether a PNG or JPEG file has its ends: decoders fill what is cut off with grey."""
-    tail = data[-64:]
-    if data.startswith(b"\x89PNG\r\n\x1a\n"):
-        return b"IEND" in tail
-    return data.startswith(b"\xff\xd8") and b"\xff\xd9" in tail

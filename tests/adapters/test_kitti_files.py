@@ -30,9 +30,14 @@ def drive(original, tmp_path) -> Path:
     return Path(shutil.copytree(original.parent, tmp_path / "day")) / original.name
 
 
+@pytest.fixture(scope="module")
+def original_objects(tmp_path_factory) -> Path:
+    return street.write_object(tmp_path_factory.mktemp("object"), numbers=(1, 7, 9, 12))
+
+
 @pytest.fixture
-def objects(tmp_path) -> Path:
-    return street.write_object(tmp_path / "object", numbers=(1, 7, 9, 12))
+def objects(original_objects, tmp_path) -> Path:
+    return Path(shutil.copytree(original_objects, tmp_path / "object"))
 
 
 def problems_of(path: Path, **query: str) -> str:
