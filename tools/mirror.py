@@ -262,8 +262,8 @@ def _sentences(done: Mirrored, tree: SourceTree, links: Links) -> list[str]:
             f"changed in place, they change there too; --links copy shares nothing"
         )
     if done.copied:
-        why = " that the system cannot link, from another disk or user" if links == "hard" else ""
-        said.append(f"  {done.copied} files{why} are copies ({_megabytes(done.copied_size)})")
+        why = ", made by --links copy or where the system cannot link" if links == "hard" else ""
+        said.append(f"  {done.copied} files are copies ({_megabytes(done.copied_size)}){why}")
     if done.new:
         said.append(f"  weathered images there take {_megabytes(done.new_size)} of their own")
     for names, what in (
