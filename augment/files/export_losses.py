@@ -21,7 +21,7 @@ def export_losses(
     if kind in ("scene", "file"):
         return tuple(_of_saved(scene, kind, half=half))
     found = [*_of_places(scene, kind, timestamp_ns), *_of_colours(scene, kind)]
-    return (*found, *_of_facts(scene, kind))
+    return (*found, *_of_facts(scene))
 
 
 def _of_saved(scene: Scene, kind: ExportKind, *, half: bool) -> Iterator[str]:
@@ -86,7 +86,7 @@ def _of_colours(scene: Scene, kind: ExportKind) -> Iterator[str]:
             yield "semantic classes are left out"
 
 
-def _of_facts(scene: Scene, kind: ExportKind) -> Iterator[str]:
+def _of_facts(scene: Scene) -> Iterator[str]:
     if scene.labels is not None:
         yield f"boxes and LiDAR stay with {scene.recorded_source or scene.source}"
     if scene.ground_z_m is not None:

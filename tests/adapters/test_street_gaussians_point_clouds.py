@@ -220,7 +220,7 @@ def test_damaged_and_strange_pickles_are_refused(data, message):
         list(stream_arrays(io.BytesIO(data)))
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=150, deadline=None)
 @given(st.lists(st.tuples(st.integers(2, 400), st.integers(0, 255)), min_size=1, max_size=4))
 def test_changed_bytes_give_arrays_or_an_error_of_ours(changes):
     data = bytearray(pickle.dumps({0: np.ones((2, 3)), np.int64(1): np.zeros((1, 3))}))

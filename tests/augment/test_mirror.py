@@ -21,7 +21,7 @@ from augment.batch.mirror_images import dataset_format, weathered_images
 from augment.batch.mirror_record import mirror_folder, read_record
 from augment.errors import AdapterError, OutputError
 
-STRIDE = 3  # odd, so that stops come before and after changes; 1 tries every point
+STRIDE = 5  # odd, so that stops come before and after changes; 1 tries every point
 
 
 @pytest.fixture
