@@ -9,6 +9,7 @@ from typing import Any
 
 from adapters.lidar.scene import LidarSceneOptions
 from augment.errors import AdapterError
+from recipes.nearest import nearest_word
 
 IMAGE_SCALES = (1.0, 0.5, 0.25, 0.125)  # the fractions a JPEG decodes to without a second resize
 
@@ -79,7 +80,11 @@ class DriveOptions:
         if unknown:
             kinds = {key: kind for key, (_, kind) in _KEYS.items()} | dict(own)
             allowed = "; ".join(f"{key}: {kind}" for key, kind in kinds.items())
-            raise AdapterError(f"{scheme}: unknown option {unknown[0]!r}; allowed are {allowed}")
+            near = nearest_word(unknown[0], tuple(kinds))
+            guess = "" if near is None else f"did you mean {near!r}? "
+            raise AdapterError(
+                f"{scheme}: unknown option {unknown[0]!r}; {guess}allowed are {allowed}"
+            )
         fields: dict[str, Any] = {}
         for key, text in query.items():
             if key in own:

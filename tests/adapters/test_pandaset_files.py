@@ -178,7 +178,7 @@ def test_options_are_typed():
     [
         (
             {"voxels": "1"},
-            r"unknown option 'voxels'; allowed are frames: .*; sky_size: ",
+            r"unknown option 'voxels'; did you mean 'voxel_m'. allowed are frames: .*; sky_size: ",
         ),
         ({"frames": "3"}, "frames must be first:stop.*got '3'"),
         ({"frames": "5:5"}, "frames must be first:stop"),
