@@ -245,7 +245,10 @@ def test_no_dataset_is_an_error(folder, tmp_path):
 @pytest.mark.parametrize(
     ("query", "message"),
     [
-        ({"voxels": "1"}, r"unknown option 'voxels'; did you mean 'voxel_m'. allowed are frames: .*; version: .*; sweeps: "),
+        (
+            {"voxels": "1"},
+            r"'voxels'; did you mean 'voxel_m'. allowed are frames: .*; version: .*; sweeps: ",
+        ),
         ({"sweeps": "yes"}, "sweeps must be 1 for keyframes and .*got 'yes'"),
         ({"voxel_m": "0"}, "nuscenes: voxel_m must be"),
     ],
