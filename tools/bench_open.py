@@ -94,7 +94,7 @@ def _apart(uri: str, what: str) -> float:
 def _open_once(uri: str, what: str) -> float:
     from adapters.base import open_scene
 
-    _import_all(uri)
+    _import_all()
     if what == "memory":
         return extra_mib(lambda: open_scene(uri))
     begun = time.perf_counter()
@@ -102,15 +102,14 @@ def _open_once(uri: str, what: str) -> float:
     return time.perf_counter() - begun
 
 
-def _import_all(uri: str) -> None:
+def _import_all() -> None:
     """What opening imports is not measured: a long-lived process imports it once."""
     import importlib
 
-    from adapters.uri import SCHEMES, parse_uri
+    from adapters.uri import SCHEMES
 
-    scheme = parse_uri(uri)[0]
-    assert scheme is not None
-    importlib.import_module(SCHEMES[scheme].module)
+    for scheme in ("scene", "street_gaussians"):  # a saved scene has the labels of its source
+        importlib.import_module(SCHEMES[scheme].module)
 
 
 def main(arguments: Sequence[str]) -> None:

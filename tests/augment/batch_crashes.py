@@ -29,7 +29,7 @@ from augment.snow import beds
 from recipes.flood import Flood
 from recipes.snow import Snow
 
-STRIDE = 17  # odd, so that kills come before and after calls; 1 tries every point
+STRIDE = 27  # odd, so that kills come before and after calls; 1 tries every point
 SYNC_POINTS = ("fsync", "replace", "unlink", "rename", "rmdir")
 
 
