@@ -20,7 +20,7 @@ from augment.sky import Sky
 from augment.snow.covers import cover_of
 from augment.style.looks import look_of
 from augment.weather.flood_view import Painter, render_flooded
-from augment.weather.smog import fog_raster
+from augment.weather.smog import SmogMedium, fog_raster
 from augment.weather.water_plane import plane_depth
 from recipes.schema import Recipe
 
@@ -83,6 +83,20 @@ class SnowyView:
 
 
 @dataclass(frozen=True, eq=False)
+class SmoggyView:
+    """What the labels in a view's smog are measured from.
+
+    medium: None where the recipe's smog has no density. surface_depth_m: float32 [H, W], z of the
+    surface that is seen through the smog, snow included and water not; 0 = none. None where no
+    label needs it. water_level_z_m: of the flood, scene world; None where none is drawn.
+    """
+
+    medium: SmogMedium | None
+    surface_depth_m: np.ndarray | None
+    water_level_z_m: float | None
+
+
+@dataclass(frozen=True, eq=False)
 class WeatheredView:
     """One finished view as it is written to files.
 
@@ -90,7 +104,8 @@ class WeatheredView:
     instance: uint16 [H, W], 0 = background or sky, else 1 + the actor's index in the scene.
     water: uint8 [H, W], 255 where a ray meets water first, else 0; None where the recipe has no
     flood. flood: None where the recipe has no flood. snow: uint8 [H, W], 255 where snow is what the
-    pixel shows, else 0. snow, snowy: None where the recipe has no snow.
+    pixel shows, else 0. snow, snowy: None where the recipe has no snow. smoggy: None where it has
+    no smog.
     """
 
     camera: Camera
@@ -102,6 +117,7 @@ class WeatheredView:
     flood: FloodedView | None = None
     snow: np.ndarray | None = None
     snowy: SnowyView | None = None
+    smoggy: SmoggyView | None = None
 
 
 def render_view(
@@ -139,6 +155,7 @@ def render_view(
         flood=_flooded(buffers, plan),
         snow=_mask(buffers.snow, camera=buffers.camera) if recipe.weather.snow else None,
         snowy=_snowy(buffers, plan, recipe),
+        smoggy=_smoggy(buffers, plan, recipe),
     )
 
 
@@ -253,6 +270,14 @@ def _snowy(buffers: WeatheredBuffers, plan: Plan, recipe: Recipe) -> SnowyView |
     in_view = buffers.snow is not None and bool(buffers.snow.any())
     depth = buffers.depth_m if plan.measures_snow and in_view else None
     return SnowyView(None if depth is None else depth.float().numpy(), recipe.weather.snow.depth_m)
+
+
+def _smoggy(buffers: WeatheredBuffers, plan: Plan, recipe: Recipe) -> SmoggyView | None:
+    if recipe.weather.smog is None:
+        return None
+    depth = buffers.depth_m if plan.measures_smog else None
+    level_z_m = None if plan.flood is None else plan.flood.level_z_m
+    return SmoggyView(plan.smog, None if depth is None else depth.float().numpy(), level_z_m)
 
 
 def semantic_table(parts: tuple[PosedGaussians, ...]) -> np.ndarray:

@@ -6,6 +6,7 @@ dataset's less `world_origin_m`. A box's own axes: x along its length, y its wid
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,12 +60,25 @@ def count_pixels(
 ) -> BoxPixels:
     """How many pixels show each box, and how many of them are 255 in the mask.
 
+    depth_m: as for `shown_pixels`.
+    """
+    pixels = np.zeros(len(placed), np.int64)
+    marked = np.zeros(len(placed), np.int64)
+    for number, rows, columns in shown_pixels(placed, camera, depth_m):
+        pixels[number] = len(rows)
+        marked[number] = np.count_nonzero(mask[rows, columns] == 255)
+    return BoxPixels(pixels, marked)
+
+
+def shown_pixels(
+    placed: PlacedBoxes, camera: Camera, depth_m: Float32[np.ndarray, "H W"]
+) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+    """(box, rows [P], columns [P]) of the pixels that show each box, for boxes that have any.
+
     depth_m: z of the surface that decides whose pixel it is; 0 = none. A pixel belongs to a box if
     the surface there lies in the part of the box that owns surfaces, so what hides a box, or stands
     beside it, does not count. Where boxes overlap, a pixel belongs to each.
     """
-    pixels = np.zeros(len(placed), np.int64)
-    marked = np.zeros(len(placed), np.int64)
     windows = _windows(placed, camera)
     world_from_camera = camera.world_from_camera.numpy()
     across = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx  # x / z of the pixels' rays
@@ -75,9 +89,9 @@ def count_pixels(
         window = np.s_[top:bottom, left:right]
         rays = across[left:right], down[top:bottom]
         inside = _inside(placed, number, world_from_camera, rays, depth_m[window])
-        pixels[number] = len(inside)
-        marked[number] = np.count_nonzero(mask[window].ravel()[inside] == 255)
-    return BoxPixels(pixels, marked)
+        if len(inside):
+            rows, columns = np.divmod(inside, right - left)
+            yield number, rows + top, columns + left
 
 
 @dataclass(frozen=True, eq=False)

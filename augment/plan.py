@@ -46,6 +46,7 @@ class Plan:
     images show the water's surface or the scene's under it. measures_flood: whether views with
     water need the depth of the scene's surfaces, for what labels say of the flood.
     snow: None where there is none. measures_snow: whether labels need the depth of its surface.
+    measures_smog: whether they need the depth of what is seen through the smog.
     bare_buffers: what depth, semantic and instance images take from a render of the scene without
     its snow; empty where they show the snow.
     style: what the colours of the scene are turned into; None leaves them. styles_picture: whether
@@ -67,6 +68,7 @@ class Plan:
     measures_flood: bool = False
     snow: PlacedSnow | None = None
     measures_snow: bool = False
+    measures_smog: bool = False
     bare_buffers: frozenset[str] = frozenset()
     style: Style | None = None
     styles_picture: bool = False
@@ -103,6 +105,7 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
     depth_buffer = DEPTH_ESTIMATORS.get(recipe.output.depth)
     labelled = recipe.output.labels and scene.labels is not None
     measures_flood, measures_snow = flood is not None and labelled, snow is not None and labelled
+    measures_smog = smog is not None and labelled
     for_images = {ALPHA, depth_buffer} if depth_buffer else set[str]()
     if recipe.output.semantic or recipe.output.instance:
         for_images |= {ALPHA, SPLAT_IDS}
@@ -111,8 +114,8 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
         buffers.add(SNOW)
         if recipe.output.surface == "scene":
             buffers, bare_buffers = {RGB, ALPHA, SNOW}, for_images
-        if measures_snow and depth_buffer not in buffers:
-            buffers.add(EXPECTED_DEPTH)
+    if (measures_snow or measures_smog) and depth_buffer not in buffers:
+        buffers.add(EXPECTED_DEPTH)
     if smog and not per_gaussian:
         buffers.add(EXPECTED_DEPTH)
     settings = RasterSettings(
@@ -138,6 +141,7 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
         measures_flood=measures_flood,
         snow=snow,
         measures_snow=measures_snow,
+        measures_smog=measures_smog,
         bare_buffers=frozenset(bare_buffers),
         style=style,
         styles_picture=styles_picture,

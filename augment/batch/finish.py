@@ -58,7 +58,7 @@ def finish(ledger: Ledger, trajectory: str, boxes: BoxCache) -> None:
     for variant in variants:
         if variant.recipe.output.labels and ledger.index.labels is not None:
             _write_boxes(ledger, variant, boxes)
-            for kind in box_weather_files(variant.recipe):
+            for kind in _tables(variant):
                 _write_box_weather(ledger, variant, kind)
         _write_calibration(ledger, variant, trajectory)
     if variants:
@@ -84,9 +84,20 @@ def _companions(ledger: Ledger, variant: VariantState) -> dict[str, Path]:
     paths = {"calibration": folder / "calibration.json"}
     if variant.recipe.output.labels and ledger.index.labels is not None:
         paths["labels"] = folder / "labels" / "boxes.parquet"
-        tables = box_weather_files(variant.recipe)
-        paths |= {kind: folder / file for kind, file in tables.items()}
+        paths |= {kind: folder / file for kind, file in _tables(variant).items()}
     return paths
+
+
+def _tables(variant: VariantState) -> dict[str, str]:
+    """The files of what its weather does to boxes, less those that came with a later version than
+    the one that rendered the images: only rendering again would tell what is in them.
+    """
+    labelled = [row for row in variant.rows.values() if row["labels_path"] is not None]
+    return {
+        kind: file
+        for kind, file in box_weather_files(variant.recipe).items()
+        if not labelled or any(row[f"{kind}_path"] is not None for row in labelled)
+    }
 
 
 def _write_boxes(ledger: Ledger, variant: VariantState, cache: BoxCache) -> None:

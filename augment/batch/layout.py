@@ -16,7 +16,11 @@ from recipes.schema import Recipe
 MANIFEST = "manifest.parquet"
 STATE_FOLDER = ".climategs"
 # What weather does to the boxes, inside a variant's folder.
-_BOX_WEATHER = {"box_water": "labels/water.parquet", "box_snow": "labels/snow.parquet"}
+_BOX_WEATHER = {
+    "box_water": "labels/water.parquet",
+    "box_snow": "labels/snow.parquet",
+    "box_smog": "labels/smog.parquet",
+}
 
 _SAFE = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 _UNSAFE_CHARACTERS = re.compile(r"[^A-Za-z0-9._-]+")
@@ -55,6 +59,7 @@ class ItemPaths:
     labels: str | None
     box_water: str | None
     box_snow: str | None
+    box_smog: str | None
     calibration: str
 
     def columns(self) -> dict[str, str | None]:
@@ -75,6 +80,7 @@ def box_weather_files(recipe: Recipe) -> dict[str, str]:
     present = {
         "box_water": recipe.weather.flood is not None,
         "box_snow": recipe.weather.snow is not None,
+        "box_smog": recipe.weather.smog is not None,
     }
     return {k: _BOX_WEATHER[k] for k, there in present.items() if there and recipe.output.labels}
 
@@ -98,8 +104,17 @@ def item_paths(scene: str, recipe: Recipe, camera: str, frame: int) -> ItemPaths
         labels=f"{base}/labels/boxes.parquet" if output.labels else None,
         box_water=f"{base}/{tables['box_water']}" if "box_water" in tables else None,
         box_snow=f"{base}/{tables['box_snow']}" if "box_snow" in tables else None,
+        box_smog=f"{base}/{tables['box_smog']}" if "box_smog" in tables else None,
         calibration=f"{base}/calibration.json",
     )
+
+
+def relative_parts(path: str) -> tuple[str, ...] | None:
+    """The components of a path that stays below its root; None: empty, absolute, or it climbs."""
+    parts = PurePosixPath(path).parts
+    if not parts or parts[0].startswith("/") or ".." in parts or "\\" in path or "\0" in path:
+        return None
+    return parts
 
 
 def resolve_inside(root: Path, relative: str) -> Path:
@@ -108,13 +123,22 @@ def resolve_inside(root: Path, relative: str) -> Path:
     Raises:
         OutputError: the path is absolute, climbs with `..`, or leaves `root` through a link.
     """
-    parts = PurePosixPath(relative).parts
-    if not parts or parts[0] == "/" or ".." in parts or "\\" in relative or "\0" in relative:
+    parts = relative_parts(relative)
+    if parts is None:
         raise OutputError(
             f"{root / MANIFEST} names the file {relative!r}; paths there must be relative to "
             f"{root}, without '..'. The manifest is damaged or not from this project: do not "
             f"trust the folder"
         )
+    return path_below(root, parts)
+
+
+def path_below(root: Path, parts: tuple[str, ...]) -> Path:
+    """The path of these components, which no link leads out of the root.
+
+    Raises:
+        OutputError: it does.
+    """
     path = root.joinpath(*parts)
     real_root = root.resolve()
     if not path.resolve().is_relative_to(real_root):

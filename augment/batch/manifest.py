@@ -54,6 +54,7 @@ LATER: dict[str, str | None] = {
     "snow_path": None,
     "box_water_path": None,
     "box_snow_path": None,
+    "box_smog_path": None,
     "surface": "solid",
     "style": None,
     "style_method": None,

@@ -16,6 +16,7 @@ import numpy as np
 from augment.batch.atomic import write_atomic
 from augment.batch.encode import encode_depth, encode_ids, encode_image, encode_mask
 from augment.batch.layout import ItemPaths
+from augment.batch.smog_labels import Smoggy
 from augment.batch.snow_labels import Snowy
 from augment.batch.water_labels import Flooded
 from augment.cameras import Camera
@@ -34,6 +35,7 @@ class View(Protocol):
     flood: Flooded | None
     snow: np.ndarray | None  # uint8 [H, W], 0 or 255
     snowy: Snowy | None
+    smoggy: Smoggy | None
 
 
 @dataclass(frozen=True)
@@ -54,6 +56,7 @@ def check_view(view: View, camera: Camera, recipe: Recipe) -> None:
     has_flood, has_snow = weather.flood is not None, weather.snow is not None
     _check_fact("water level", view.flood is not None, "a flood", has_flood)
     _check_fact("snow depth", view.snowy is not None, "snow", has_snow)
+    _check_fact("smog density", view.smoggy is not None, "smog", weather.smog is not None)
     wanted = {
         "rgb": True,
         "depth_m": output.depth != "none",

@@ -33,6 +33,7 @@ class _View:
     instance: None = None
     snow: None = None
     snowy: None = None
+    smoggy: None = None
 
 
 def _render(scene, camera, recipe, *, backend) -> _View:

@@ -24,6 +24,7 @@ from augment.snow.beds import bed_of
 from augment.snow.cells import OPEN_EDGE, SnowBed, SnowCells
 from augment.snow.placement import PlacementSettings
 from augment.style.maps import StyleMaps
+from augment.weather.smog import SmogMedium
 from recipes.flood import Flood
 from recipes.schema import Output, Recipe, Smog, Weather
 from recipes.snow import Snow
@@ -87,6 +88,13 @@ class FakeSnowy:
 
 
 @dataclass(frozen=True)
+class FakeSmoggy:
+    medium: SmogMedium | None
+    surface_depth_m: np.ndarray | None
+    water_level_z_m: float | None
+
+
+@dataclass(frozen=True)
 class FakeView:
     rgb: np.ndarray
     depth_m: np.ndarray | None
@@ -96,6 +104,7 @@ class FakeView:
     flood: FakeFlood | None = None
     snow: np.ndarray | None = None
     snowy: FakeSnowy | None = None
+    smoggy: FakeSmoggy | None = None
 
 
 def open_fake(uri: str) -> Scene:
@@ -181,6 +190,7 @@ def fake_render(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str) -
         instance=rng.integers(0, 600, shape).astype(np.uint16) if output.instance else None,
         **(fake_flood(camera, rng) if weather.flood is not None else {}),
         **(fake_snow(camera, rng) if weather.snow is not None else {}),
+        **(fake_smog(camera, rng, weather.smog) if weather.smog is not None else {}),
     )
 
 
@@ -204,6 +214,13 @@ def fake_snow(camera: Camera, rng: np.random.Generator) -> dict:
         "snow": np.where(rng.random(shape) < 1 / 2, 255, 0).astype(np.uint8),
         "snowy": FakeSnowy(rng.uniform(0, 4, shape).astype(np.float32), THICKNESS_M),
     }
+
+
+def fake_smog(camera: Camera, rng: np.random.Generator, smog: Smog) -> dict:
+    """Surfaces where the boxes are."""
+    depth = rng.uniform(0, 4, (camera.height, camera.width)).astype(np.float32)
+    medium = SmogMedium(smog.sigma_per_m, smog.color) if smog.sigma_per_m else None
+    return {"smoggy": FakeSmoggy(medium, depth, None)}
 
 
 def make_bed(x_m: float) -> SnowBed:

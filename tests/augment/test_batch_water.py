@@ -287,10 +287,10 @@ def test_labels_that_cannot_be_measured_fail_their_image(recipe, tmp_path: Path)
 
 
 def test_manifests_of_older_versions_are_read_and_gone_on_with(tmp_path: Path) -> None:
-    """Without the columns that came later: no style; no water or snow, so surfaces are alike."""
+    """Without the columns that came later: no style; no weather, so surfaces are alike."""
     whole, old = tmp_path / "whole", tmp_path / "old"
-    run(RenderJob("fake:street", [make_recipe()], whole))
-    run(RenderJob("fake:street", [make_recipe()], old, frames=[0, 1]))
+    run(RenderJob("fake:street", [make_recipe("clear")], whole))
+    run(RenderJob("fake:street", [make_recipe("clear")], old, frames=[0, 1]))
     manifest = old / "manifest.parquet"
     table = pq.read_table(manifest)
     numbers = [
@@ -307,24 +307,24 @@ def test_manifests_of_older_versions_are_read_and_gone_on_with(tmp_path: Path) -
     assert read_manifest(old)["surface"].to_pylist() == ["solid"] * 4
     sample = WeatherDataset(old)[0]
     assert sample["surface"] == "solid" and sample["water"] is sample["snow"] is None
-    assert sample["boxes"]["submerged_fraction"] is None
-    assert run(RenderJob("fake:street", [make_recipe()], old)).skipped == 4
+    assert sample["boxes"]["submerged_fraction"] is sample["boxes"]["transmittance"] is None
+    assert run(RenderJob("fake:street", [make_recipe("clear")], old)).skipped == 4
     assert tree_digest(old / "street") == tree_digest(whole / "street")
     rows, expected = read_manifest(old).to_pylist(), read_manifest(whole).to_pylist()
     assert [repr(row) for row in rows] == [repr(row) for row in expected]
 
 
 def test_journals_of_older_versions_are_gone_on_with(tmp_path: Path) -> None:
-    run(RenderJob("fake:street", [make_recipe()], tmp_path / "whole"))
+    run(RenderJob("fake:street", [make_recipe("clear")], tmp_path / "whole"))
     out = tmp_path / "old"
-    run(RenderJob("fake:street", [make_recipe()], out, frames=[0, 1]))
+    run(RenderJob("fake:street", [make_recipe("clear")], out, frames=[0, 1]))
     rows = read_manifest(out).to_pylist()
     (out / "manifest.parquet").unlink()
     identity = ("source", "recipe_hash", "trajectory", "version", "backend")
     lines = [{name: rows[0][name] for name in identity}]
     lines += [{name: row[name] for name in row if name not in LATER} for row in rows]
-    journal = out / ".climategs" / "journal" / "street" / "fog-000.jsonl"
+    journal = out / ".climategs" / "journal" / "street" / "clear-000.jsonl"
     journal.parent.mkdir(parents=True)
     journal.write_text("".join(json.dumps(line) + "\n" for line in lines))
-    assert run(RenderJob("fake:street", [make_recipe()], out)).skipped == 4
+    assert run(RenderJob("fake:street", [make_recipe("clear")], out)).skipped == 4
     assert tree_digest(out) == tree_digest(tmp_path / "whole")
