@@ -15,6 +15,8 @@ from augment.errors import ClimateGSError
 from augment.ground import ground_of
 from augment.plan import make_plan
 from augment.scene import Scene
+from recipes.frames import FramePattern, parse_frames
+from recipes.job import scaled_recipe
 from recipes.load import load_recipe
 from recipes.schema import Recipe
 from tools.mirror import mirror_outputs, recipes_for_source
@@ -64,7 +66,7 @@ def render_recipe(
         scene_uri=scene_uri,
         recipes=recipes,
         out_dir=out,
-        frames=parse_frames(frames),
+        frames=_pattern(frames).select([frame.index for frame in scene.frames]),
         cameras=None if cameras == "all" else tuple(cameras.split(",")),
         camera_path=_frames_of(camera_path, scene),
         workers=workers,
@@ -95,48 +97,7 @@ def resolve_variants(recipe: str, variants: int | None = None, scale: float = 1.
     if count < 1:
         raise ClimateGSError(f"--variants must be >= 1; got {count}")
     resolved = [template.resolve(number) for number in range(count)]
-    return resolved if scale == 1 else [scaled_recipe(r, scale) for r in resolved]
-
-
-def scaled_recipe(recipe: Recipe, scale: float) -> Recipe:
-    """The recipe at another resolution, recorded as its render.scale."""
-    from pydantic import ValidationError
-
-    numbers = recipe.model_dump()
-    numbers["render"]["scale"] = recipe.render.scale * scale
-    try:
-        return Recipe.model_validate(numbers)
-    except ValidationError as error:
-        limits = error.errors()[0]["msg"]
-        raise ClimateGSError(
-            f"--scale {scale} times the recipe's render.scale {recipe.render.scale} is not "
-            f"possible: {limits}"
-        ) from None
-
-
-def parse_frames(text: str) -> tuple[int, ...] | None:
-    """`all`, or frame numbers and ranges: `4`, `0,5,9`, `0:20:2` (start:stop:step, stop excluded).
-
-    Raises:
-        ClimateGSError: the text is none of these.
-    """
-    if text == "all":
-        return None
-    numbers: list[int] = []
-    try:
-        for piece in text.split(","):
-            values = [int(v) for v in piece.split(":")]
-            if len(values) > 3 or (len(values) == 3 and values[2] < 1):
-                raise ValueError
-            numbers += values if len(values) == 1 else range(*values)
-    except ValueError:
-        numbers = []
-    if not numbers:
-        raise ClimateGSError(
-            f"--frames {text!r} is not understood; write all, 4, 0,5,9 or 0:20:2 "
-            f"(start:stop:step, stop excluded)"
-        )
-    return tuple(dict.fromkeys(numbers))
+    return [scaled_recipe(r, scale) for r in resolved]
 
 
 def _frames_of(camera_path: Path | None, scene: Scene):
@@ -145,6 +106,13 @@ def _frames_of(camera_path: Path | None, scene: Scene):
     from adapters.cameras.paths import frames_from_path_file
 
     return frames_from_path_file(camera_path, scene)
+
+
+def _pattern(text: str) -> FramePattern:
+    try:
+        return parse_frames(text)
+    except ValueError as error:
+        raise ClimateGSError(f"--frames {error}") from None
 
 
 def _check_no_path(camera_path: Path | None) -> None:

@@ -10,17 +10,21 @@ from __future__ import annotations
 import contextlib
 import logging
 import multiprocessing
-import os
 import pickle
-import signal
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
-from multiprocessing import reduction, resource_tracker
+from collections.abc import Callable, Sequence
+from multiprocessing import reduction
 from multiprocessing.connection import wait
 
 from augment.batch.lock import OutputLock
 from augment.batch.manifest import FAILED
+from augment.batch.processes import (
+    available_cores,
+    describe_exit,
+    interrupts_blocked,
+    thread_limits,
+)
 from augment.batch.runner import Chunk, FrameRunner, Outcome, Renderer, Setup
 from augment.batch.shared_scene import SharedScene
 from augment.batch.worker import Failure, Ready, worker_main
@@ -91,7 +95,7 @@ class _Worker:
         self.process = context.Process(
             target=worker_main, args=(*arguments, pool.lock.inherited()), daemon=True
         )
-        with _thread_limits(pool.threads), _interrupts_blocked():
+        with thread_limits(pool.threads), interrupts_blocked():
             self.process.start()
         child.close()
         self.is_ready = False
@@ -185,7 +189,7 @@ class _Pool:
         self.workers.remove(worker)
         if worker.is_stopping:
             return
-        ending = _describe_exit(worker.process.exitcode)
+        ending = describe_exit(worker.process.exitcode)
         if not worker.is_ready:
             raise ClimateGSError(
                 f"a worker process {ending} while starting; what it printed says more. A script "
@@ -222,45 +226,3 @@ class _Pool:
                 worker.process.join()
                 worker.connection.close()
             self.workers = []
-
-
-def available_cores() -> int:
-    """Cores this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
-def _describe_exit(code: int | None) -> str:
-    if code is not None and code < 0:
-        return f"was killed by {signal.Signals(-code).name}"
-    return f"ended with exit code {code}"
-
-
-@contextlib.contextmanager
-def _thread_limits(threads: int) -> Iterator[None]:
-    """Environment that makes a child's libraries share the cores; they read it when loaded."""
-    names = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-    before = {name: os.environ.get(name) for name in names}
-    for name, value in before.items():
-        limit = min(threads, int(value)) if value and value.isdigit() else threads
-        os.environ[name] = str(max(1, limit))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
-
-
-@contextlib.contextmanager
-def _interrupts_blocked() -> Iterator[None]:
-    """A child started inside never sees Ctrl-C: the parent tells it to stop instead."""
-    resource_tracker.ensure_running()  # starting it later, with the child, would lift the block
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)

@@ -52,6 +52,7 @@ class RenderJob:
     camera_path: frames to render in place of the scene's own, poses in the scene's world; labels
     and LiDAR pass through where a frame of the scene has the same number and timestamp.
     workers: 1 renders in this process. overwrite: replace the variants' folders, finished or not.
+    beds_dir: where it is kept where snow can lie, for later jobs; in the output folder if None.
     """
 
     scene_uri: str
@@ -63,6 +64,7 @@ class RenderJob:
     workers: int = 1
     backend: str = "auto"
     overwrite: bool = False
+    beds_dir: Path | None = None
 
     def __post_init__(self) -> None:
         if self.workers < 1:
@@ -101,12 +103,14 @@ def run_job(
     scene_loader: SceneLoader,
     renderer: Renderer | None = None,
     progress: bool = True,
+    tell: Callable[[Outcome], None] | None = None,
 ) -> JobResult:
     """Render what is missing, then write labels, calibration and manifest.
 
     scene_loader: called once with `job.scene_uri`. renderer: `augment.apply.render_view` if None;
     with several workers it must be an importable function, and the scene's labels and sky of
-    importable classes, since both are sent to other processes. progress: a bar on stderr.
+    importable classes, since both are sent to other processes. progress: a bar on stderr. tell: is
+    called after each image with what became of it, from several threads, one at a time.
 
     An image that fails is recorded in the manifest and the rest goes on. A KeyboardInterrupt
     finishes the images at hand, writes the manifest of what there is, and is raised again.
@@ -118,7 +122,7 @@ def run_job(
         OutputError: the folder cannot be written, is in use, or holds something else.
     """
     started = time.perf_counter()
-    run = _Run(job, scene_loader(job.scene_uri), renderer)
+    run = _Run(job, scene_loader(job.scene_uri), renderer, tell)
     run.timings["open"] = time.perf_counter() - started
     run.go(progress)
     return JobResult(
@@ -135,8 +139,14 @@ def run_job(
 class _Run:
     """One call of run_job."""
 
-    def __init__(self, job: RenderJob, scene: Scene, renderer: Renderer | None) -> None:
-        self.job, self.renderer = job, renderer
+    def __init__(
+        self,
+        job: RenderJob,
+        scene: Scene,
+        renderer: Renderer | None,
+        tell: Callable[[Outcome], None] | None,
+    ) -> None:
+        self.job, self.renderer, self.tell = job, renderer, tell
         self.scene: Scene | None = scene  # None once workers have it
         self.recipes = tuple(map(with_digest, job.recipes))
         # A stand-in has its own idea of backends.
@@ -256,7 +266,7 @@ class _Run:
             self.timings["style"] += time.perf_counter() - started
         if snowy:
             started = time.perf_counter()
-            folder = self.out_dir / STATE_FOLDER
+            folder = self.job.beds_dir or self.out_dir / STATE_FOLDER
             self.beds = store_beds(self.scene, snowy, folder, cameras=cameras, progress=progress)
             self.timings["place"] += time.perf_counter() - started
 
@@ -298,6 +308,8 @@ class _Run:
                 self.failures.append(f"{folder}, {where}: {outcome.message}")
                 self.bar.set_postfix(failed=self.counts[FAILED], refresh=False)
             self.bar.update()
+            if self.tell is not None:
+                self.tell(outcome)
 
     def _finish(self) -> None:
         started = time.perf_counter()

@@ -34,6 +34,7 @@ from augment.batch.manifest import (
     rows_of,
     write_manifest,
 )
+from augment.batch.rows import Pictured, image_row
 from augment.batch.runner import Chunk, Outcome
 from augment.batch.selection import SceneIndex
 from augment.cameras import Frame
@@ -211,27 +212,16 @@ class Ledger:
             paths["labels_path"] = None
         for kind in TABLES.keys() - outcome.box_weather.keys():
             paths[f"{kind}_path"] = None
-        if outcome.status != OK:
-            paths = dict.fromkeys(paths)
-        return {
-            "scene": index.name,
-            "variant": variant.name,
-            "frame": frame.index,
-            "camera": outcome.camera,
-            "timestamp_ns": camera.timestamp_ns,
-            **paths,
-            "width": camera.width,
-            "height": camera.height,
-            "surface": recipe.output.surface,
-            **recipe.style_words(),
-            **recipe.weather_numbers(),
-            "seed": recipe.seed,
-            "recipe": recipe.name,
-            **vars(variant.identity),
-            "checksum": outcome.checksum,
-            "status": outcome.status,
-            "message": outcome.message,
-        }
+        return image_row(
+            index.name,
+            recipe,
+            variant.identity,
+            Pictured(frame.index, camera.name, camera.timestamp_ns, camera.width, camera.height),
+            paths=paths,
+            status=outcome.status,
+            message=outcome.message,
+            checksum=outcome.checksum,
+        )
 
 
 def _read_table(kind: str, path: Path) -> dict[Item, BoxNumbers]:

@@ -7,7 +7,7 @@ made: the same images give the same file to the bit.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -62,6 +62,7 @@ LATER: dict[str, str | None] = {
 # What a row without them means by weather numbers that others have; NaN for all else.
 LATER_NUMBERS = {"style_strength": 0.0}
 KEY = ("scene", "variant", "frame", "camera")
+_RANK = "rank"
 
 Row = Mapping[str, Any]
 
@@ -99,15 +100,28 @@ def read_manifest(out_dir: Path) -> pa.Table:
             f"manifest when it ends; run it again to let it finish"
         )
     try:
-        table = pq.ParquetFile(path).read(use_threads=False)
+        data = path.read_bytes()
+    except OSError as error:
+        raise OutputError(f"{path} cannot be read: {error.strerror}") from error
+    return parse_manifest(data, str(path))
+
+
+def parse_manifest(data: bytes, where: str) -> pa.Table:
+    """The table in a manifest's bytes, with the columns that an older version lacks.
+
+    Raises:
+        OutputError: the bytes are damaged, or lack columns; `where` they were read.
+    """
+    try:
+        table = pq.ParquetFile(pa.BufferReader(data)).read(use_threads=False)
     except (OSError, pa.ArrowException) as error:
-        raise OutputError(f"{path} is not a readable Parquet file: {error}") from error
+        raise OutputError(f"{where} is not a readable Parquet file: {error}") from error
     table = _with_later_columns(table)
     wanted = {**LEADING, **TRAILING}
     wrong = [n for n, k in wanted.items() if n not in table.column_names or table[n].type != k]
     if wrong:
         raise OutputError(
-            f"{path} lacks the columns {wrong} or holds them in another type; it was written by "
+            f"{where} lacks the columns {wrong} or holds them in another type; it was written by "
             f"another program or version. Write to another output folder"
         )
     return table
@@ -121,9 +135,27 @@ def merge_rows(
     if old is None:
         return new
     kept = old.filter(pa.array(~_in_variants(old, replaced)))
-    weather = sorted({*weather_columns(kept), *weather_columns(new)})
-    order = [*LEADING, *weather, *TRAILING]
-    return _sorted(pa.concat_tables([_with_columns(t, weather).select(order) for t in (kept, new)]))
+    return _sorted(concat_rows([kept, new]))
+
+
+def latest_rows(tables: Sequence[pa.Table]) -> pa.Table:
+    """One row an image out of several tables, sorted: that of the first table that has one.
+
+    Of an image's rows in one table, one that is finished comes before one that failed.
+    """
+    rank = [np.full(table.num_rows, number, np.int64) for number, table in enumerate(tables)]
+    table = concat_rows(list(tables))
+    failed = table["status"].to_numpy(zero_copy_only=False) != OK
+    failed_last = np.concatenate(rank) * 2 + failed
+    table = table.append_column(_RANK, pa.array(failed_last))
+    order = [(name, "ascending") for name in (*KEY, _RANK)]
+    table = table.sort_by(order).combine_chunks().drop_columns(_RANK)
+    is_first = np.zeros(table.num_rows, bool)
+    is_first[:1] = True
+    for name in KEY:
+        column = table[name].to_numpy(zero_copy_only=False)
+        is_first[1:] |= column[1:] != column[:-1]
+    return table if is_first.all() else table.filter(pa.array(is_first)).combine_chunks()
 
 
 def rows_of(table: pa.Table, variants: set[tuple[str, str]]) -> list[dict[str, Any]]:
@@ -138,12 +170,24 @@ def write_manifest(out_dir: Path, table: pa.Table) -> Path:
         OutputError: the system refused; the old manifest then still stands.
     """
     path = Path(out_dir) / MANIFEST
-    sink = pa.BufferOutputStream()
-    pq.write_table(table, sink, version="2.6", compression="zstd", row_group_size=1 << 16)
-    data = sink.getvalue().to_pybytes()
+    data = manifest_bytes(table)
     if not (path.is_file() and path.read_bytes() == data):
         write_atomic(path, data)
     return path
+
+
+def manifest_bytes(table: pa.Table) -> bytes:
+    """The table as a Parquet file: the same rows, the same bytes."""
+    sink = pa.BufferOutputStream()
+    pq.write_table(table, sink, version="2.6", compression="zstd", row_group_size=1 << 16)
+    return sink.getvalue().to_pybytes()
+
+
+def concat_rows(tables: Sequence[pa.Table]) -> pa.Table:
+    """Tables below each other, with the weather numbers of all; unsorted."""
+    weather = sorted({name for table in tables for name in weather_columns(table)})
+    order = [*LEADING, *weather, *TRAILING]
+    return pa.concat_tables([_with_columns(table, weather).select(order) for table in tables])
 
 
 def _in_variants(table: pa.Table, variants: set[tuple[str, str]]) -> np.ndarray:

@@ -21,7 +21,7 @@ from batch_scenes import (
     tree_digest,
 )
 
-from augment.batch.executors import _thread_limits, available_cores
+from augment.batch.processes import available_cores, thread_limits
 from augment.batch.job import RenderJob, run_job
 from augment.batch.manifest import read_manifest
 from augment.batch.shared_scene import share_scene
@@ -124,7 +124,7 @@ def test_a_worker_that_cannot_start_ends_the_job(tmp_path: Path, monkeypatch) ->
 def test_workers_share_the_cores(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     monkeypatch.delenv("NUMBA_NUM_THREADS", raising=False)
-    with _thread_limits(4):
+    with thread_limits(4):
         assert os.environ["NUMBA_NUM_THREADS"] == "4"
         assert os.environ["OMP_NUM_THREADS"] == "1"  # the user's own limit stands
     assert "NUMBA_NUM_THREADS" not in os.environ

@@ -1,0 +1,291 @@
+"""A job file: which scenes, under which recipes, how many variants of each.
+
+    name: winter
+    scenes:
+      - pandaset:data/002
+      - {uri: "drivestudio:runs/*", frames: "::5", cameras: [front]}
+    recipes:
+      - dense-fog
+      - {recipe: recipes/flood.yaml, variants: 4}
+    draws: per_scene
+
+Every scene is rendered under every recipe, or under those that it names itself.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, Field, ValidationError, field_validator, model_validator
+
+from recipes.errors import Problems, RecipeError, short
+from recipes.frames import parse_frames
+from recipes.load import load_recipe, preset_names
+from recipes.nearest import nearest_word
+from recipes.schema import Recipe
+from recipes.template import RecipeTemplate
+from recipes.types import Closed, Number, Whole
+from recipes.yaml_tree import ListNode, MapNode, Node, ScalarNode, read_tree
+
+MAX_BYTES = 4 << 20
+_NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
+Text = Annotated[str, Field(min_length=1, max_length=4096, strict=True)]
+Name = Annotated[str, Field(pattern=_NAME, strict=True)]
+
+
+def _in_full(key: str) -> BeforeValidator:
+    return BeforeValidator(lambda value: {key: value} if isinstance(value, str) else value)
+
+
+class JobScene(Closed):
+    """A scene of the job, or with `*` in its path all that match."""
+
+    uri: Text = Field(description="What opens the scene; a relative path starts at the job file.")
+    name: Name | None = Field(
+        default=None, description="Its folder in the output, where the scene's own will not do."
+    )
+    frames: Text = Field(
+        default="all",
+        description="Frame numbers: all, 4, 0,5,9, 0:20:2 or ::5; ranges end with the scene.",
+    )
+    cameras: tuple[Text, ...] | None = Field(
+        default=None, min_length=1, description="Names of cameras; null for all."
+    )
+    recipes: tuple[Text, ...] | None = Field(
+        default=None, min_length=1, description="Names of the job's recipes; null for all."
+    )
+
+    @field_validator("frames")
+    @classmethod
+    def _is_pattern(cls, text: str) -> str:
+        parse_frames(text)
+        return text
+
+
+class JobRecipe(Closed):
+    """A recipe of the job."""
+
+    recipe: Text = Field(description="A preset's name, or a file relative to the job file.")
+    name: Name | None = Field(
+        default=None, description="Its name in this job and the output; its own if absent."
+    )
+    variants: Whole | None = Field(
+        default=None, ge=1, le=100_000, description="How many to draw; as many as it says if null."
+    )
+
+
+class Job(Closed):
+    """What a job file says."""
+
+    version: Literal[1] = Field(default=1, description="Version of the format.")
+    name: Name = Field(default="job", description="The file's name if absent.")
+    scenes: tuple[Annotated[JobScene, _in_full("uri")], ...] = Field(
+        min_length=1, description="URIs, or mappings with a uri."
+    )
+    recipes: tuple[Annotated[JobRecipe, _in_full("recipe")], ...] = Field(
+        min_length=1, description="Presets and files, or mappings with a recipe."
+    )
+    draws: Literal["per_scene", "shared"] = Field(
+        default="per_scene",
+        description="per_scene draws a recipe's ranges anew for every scene; shared gives variant "
+        "k of a recipe the same numbers in every scene.",
+    )
+    scale: Number = Field(
+        default=1.0, gt=0, le=4, description="Resolution, times the recipes' own render.scale."
+    )
+    block_images: Whole = Field(
+        default=64,
+        ge=1,
+        le=10_000,
+        description="About how many images are published at once: what is lost with a machine.",
+    )
+
+    @model_validator(mode="after")
+    def _names_known_recipes(self) -> Job:
+        known = [entry.name or Path(entry.recipe).stem for entry in self.recipes]
+        repeated = sorted({name for name in known if known.count(name) > 1})
+        if repeated:
+            raise ValueError(
+                f"recipes are called the same: {', '.join(repeated)}; give one of them a name"
+            )
+        for scene in self.scenes:
+            for name in scene.recipes or ():
+                if name not in known:
+                    near = nearest_word(name, tuple(known))
+                    guess = f"did you mean {near}? " if near else ""
+                    raise ValueError(
+                        f"scene {scene.uri!r} names the recipe {name!r}, which the job has not; "
+                        f"{guess}it has {', '.join(known)}"
+                    )
+        return self
+
+
+@dataclasses.dataclass(frozen=True)
+class JobRecipes:
+    """The job's recipes, loaded. templates: by their names in the job, in its order."""
+
+    job: Job
+    templates: dict[str, RecipeTemplate]
+
+    def of_scene(self, entry: JobScene, scene_name: str) -> list[Recipe]:
+        """The recipes in numbers that a scene is rendered under.
+
+        Raises:
+            RecipeError: a draw breaks a rule of the schema.
+        """
+        wanted = self.templates if entry.recipes is None else dict.fromkeys(entry.recipes)
+        resolved = []
+        for name in wanted:
+            template = self.templates[name]
+            if self.job.draws == "per_scene":
+                seed = seed_for_scene(template.seed, scene_name)
+                template = dataclasses.replace(template, seed=seed)
+            drawn = [template.resolve(number) for number in range(template.variants)]
+            resolved += [scaled_recipe(recipe, self.job.scale) for recipe in drawn]
+        return resolved
+
+
+def load_job(path: Path) -> Job:
+    """The job in a YAML file.
+
+    Raises:
+        RecipeError: there is no such file, or it is no valid job; one line for each problem.
+    """
+    source = str(path)
+    try:
+        with path.open("rb") as file:
+            data = file.read(MAX_BYTES + 1)
+    except FileNotFoundError:
+        raise RecipeError(f"{source}: no such file; a job is a YAML file") from None
+    except OSError as error:
+        raise RecipeError(f"{source}: cannot be read: {error.strerror}") from None
+    if len(data) > MAX_BYTES:
+        raise RecipeError(f"{source}: larger than {MAX_BYTES} bytes; name scenes by a pattern (*)")
+    try:
+        text = data.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise RecipeError(f"{source}: not UTF-8 text at byte {error.start}") from None
+    return parse_job(text, source=source, name=path.stem)
+
+
+def parse_job(text: str, *, source: str, name: str = "job") -> Job:
+    """The job in YAML `text`. source: stands before the line in messages. name: the default.
+
+    Raises:
+        RecipeError: it is no valid job; one line for each problem.
+    """
+    problems = Problems(source)
+    if not text.strip():
+        raise problems.fail(1, "the file is empty; a job names scenes and recipes")
+    tree = read_tree(text, problems)
+    if not isinstance(tree, MapNode):
+        raise problems.fail(tree.line, "a job is a mapping with scenes and recipes")
+    problems.raise_if_any()
+    data: Any = _plain(tree)
+    try:
+        return Job.model_validate({"name": name, **data})
+    except ValidationError as error:
+        for problem in error.errors(include_url=False, include_context=False):
+            if problem["type"] == "too_short" and problem["input"]:
+                continue  # it has items, each of them with a problem of its own
+            where, line = _place(tree, problem["loc"])
+            problems.add(line, f"{where}{_said(problem)}")
+    problems.raise_if_any()
+    raise AssertionError("pydantic found a problem and named none")
+
+
+def load_job_recipes(job: Job, folder: Path) -> JobRecipes:
+    """The job's recipes from their presets and files. folder: where relative paths start.
+
+    Raises:
+        RecipeError: a recipe is missing or invalid.
+    """
+    templates = {}
+    for entry in job.recipes:
+        is_preset = entry.recipe in preset_names()
+        template = load_recipe(entry.recipe if is_preset else folder / entry.recipe)
+        name = entry.name or Path(entry.recipe).stem
+        if entry.name is not None:
+            template = dataclasses.replace(template, name=entry.name)
+        if entry.variants is not None:
+            template = dataclasses.replace(template, variants=entry.variants)
+        templates[name] = template
+    names = [template.name for template in templates.values()]
+    repeated = sorted({name for name in names if names.count(name) > 1})
+    if repeated:
+        raise RecipeError(
+            f"job {job.name}: recipes write to the same folders: {', '.join(repeated)}; give one "
+            f"of them a name in the job"
+        )
+    return JobRecipes(job, templates)
+
+
+def seed_for_scene(seed: int, scene_name: str) -> int:
+    """A seed of the scene's own: the first 63 bits of a SHA-256 of both."""
+    digest = hashlib.sha256(f"climategs scene seed 1 {seed} {scene_name}".encode()).digest()
+    return int.from_bytes(digest[:8], "big") >> 1
+
+
+def scaled_recipe(recipe: Recipe, scale: float) -> Recipe:
+    """The recipe at another resolution, recorded as its render.scale.
+
+    Raises:
+        RecipeError: beyond the schema's limits.
+    """
+    if scale == 1:
+        return recipe
+    numbers = recipe.model_dump()
+    numbers["render"]["scale"] = recipe.render.scale * scale
+    try:
+        return Recipe.model_validate(numbers)
+    except ValidationError as error:
+        limits = error.errors()[0]["msg"]
+        raise RecipeError(
+            f"a scale of {scale} times the recipe's render.scale {recipe.render.scale} is not "
+            f"possible: {limits}"
+        ) from None
+
+
+def _plain(node: Node) -> Any:
+    if isinstance(node, MapNode):
+        return {key: _plain(value) for key, (_, value) in node.entries.items()}
+    if isinstance(node, ListNode):
+        return tuple(_plain(item) for item in node.items)
+    return node.value
+
+
+def _place(tree: Node, location: tuple[int | str, ...]) -> tuple[str, int]:
+    """`scenes[1].uri: ` and its line, or those of the nearest thing above that the file has."""
+    said, line, node = "", tree.line, tree
+    for part in location:
+        if isinstance(part, int):
+            if not isinstance(node, ListNode) or part >= len(node.items):
+                break
+            node, said = node.items[part], f"{said}[{part}]"
+            line = node.line
+        elif isinstance(node, MapNode) and part in node.entries:
+            line, node = node.entries[part]
+            said = f"{said}.{short(part)}" if said else short(part)
+        elif not isinstance(node, ScalarNode):
+            said = f"{said}.{short(part)}" if said else short(part)
+            break
+    return f"{said}: " if said else "", line
+
+
+def _said(problem: Any) -> str:
+    if problem["type"] == "extra_forbidden":
+        known = {**JobScene.model_fields, **JobRecipe.model_fields, **Job.model_fields}
+        near = nearest_word(str(problem["loc"][-1]), tuple(known))
+        return "unknown field" + (f"; did you mean {near}?" if near else "")
+    short_words = {
+        "missing": "is missing",
+        "tuple_type": "must be a list, with a line '- ...' for each",
+        "too_short": "names none; at least one is needed",
+        "model_type": "must be a text, or a mapping of fields",
+    }
+    if problem["type"] in short_words:
+        return short_words[problem["type"]]
+    return problem["msg"].removeprefix("Value error, ")
