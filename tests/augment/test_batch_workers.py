@@ -21,9 +21,9 @@ from batch_scenes import (
     tree_digest,
 )
 
-from augment.batch.processes import available_cores, thread_limits
 from augment.batch.job import RenderJob, run_job
 from augment.batch.manifest import read_manifest
+from augment.batch.processes import available_cores, thread_limits
 from augment.batch.shared_scene import share_scene
 from augment.errors import ClimateGSError
 from augment.scene import Actor, Track

@@ -178,7 +178,7 @@ def test_recipes_lists_prints_and_exports(tmp_path, capsys):
         (["render", "clear", "--scene", "SCENE", "--out", "OUT", "--frames", "x"], "--frames 'x'"),
         (["render", "clear", "--scene", "SCENE", "--out", "OUT", "--frames", "9"], "no frame 9"),
         (["render", "clear", "--scene", "SCENE", "--out", "OUT", "--cameras", "q"], "no camera q"),
-        (["render", "clear", "--scene", "SCENE", "--out", "OUT", "--scale", "99"], "--scale 99"),
+        (["render", "clear", "--scene", "SCENE", "--out", "OUT", "--scale", "99"], "a scale of 99"),
         (["render", "clear", "--scene", "SCENE", "--out", "OUT", "--variants", "0"], "--variants"),
         (["sheet", "OUT"], "manifest.parquet does not exist"),
         (["inspect", "SCENE", "--json", "/nowhere/facts.json"], "cannot write /nowhere/facts.json"),
