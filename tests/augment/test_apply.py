@@ -7,7 +7,9 @@ import pytest
 import torch
 
 from augment.apply import render_buffers, render_view
+from augment.batch.smog_labels import measure_smog
 from augment.cameras import Camera, Frame
+from augment.labels import Boxes
 from augment.plan import make_plan
 from augment.scene import Actor, Gaussians, Scene, Track
 from augment.semantics import SemanticClass
@@ -56,6 +58,18 @@ def scene() -> Scene:
     frame = Frame(0, 0, torch.eye(4, dtype=torch.float64), {"front": view})
     sky = ConstantSky(torch.tensor(SKY))
     return Scene("toy", "test:toy", background, (car,), sky, (frame,), ground_z_m=-2.0)
+
+
+class CarLabels:
+    """The car, and another behind the building."""
+
+    def boxes(self, frame_index: int) -> Boxes:
+        places = np.array([[-1.0, 5, 0], [-3, 20, 0]])
+        sizes, turns = np.full((2, 3), 1.2), np.array([[1.0, 0, 0, 0]] * 2)
+        return Boxes(("car", "hidden"), ("Car", "Car"), places, sizes, turns)
+
+    def lidar(self, frame_index: int) -> None:
+        return None
 
 
 BUILDING, CAR, NOTHING = (10, 4), (24, 20), (24, 60)  # row, column
@@ -111,6 +125,29 @@ def test_smog_changes_neither_depth_nor_classes(scene):
     foggy = view_of(scene, Smog(visibility_m=10), semantic=True)
     assert np.array_equal(clean.depth_m, foggy.depth_m)
     assert np.array_equal(clean.semantic, foggy.semantic)
+
+
+def test_boxes_are_measured_by_the_surfaces_in_the_smog(scene):
+    """The pixels of a car in the smog are mixed with the airlight as its label says."""
+    smog = Smog(extinction_per_m=0.1, color=AIRLIGHT)
+    labelled = dataclasses.replace(scene, labels=CarLabels())
+    view, clean = view_of(labelled, smog, depth="none"), view_of(scene)
+    assert view.depth_m is None and view.smoggy.water_level_z_m is None
+    measured = measure_smog(CarLabels().boxes(0), np.zeros(3), camera(), view.smoggy)
+    assert measured.pixels[0] > 100 and measured.pixels[1] == 0
+    t = (view.rgb[CAR] - 255 * AIRLIGHT[0]) / (clean.rgb[CAR] - 255 * AIRLIGHT[0])
+    assert measured.transmittance[0] == pytest.approx(t.mean(), abs=0.01)  # of 8-bit colours
+    # Behind the wall that the camera sees.
+    assert measured.transmittance[1] == pytest.approx(np.exp(-0.1 * np.hypot(3, 20)), rel=0.01)
+
+
+def test_smog_is_named_wherever_there_is_some_and_measured_for_labels_alone(scene):
+    unlabelled = view_of(scene, Smog(visibility_m=30)).smoggy
+    assert unlabelled.medium is not None and unlabelled.surface_depth_m is None
+    labelled = dataclasses.replace(scene, labels=CarLabels())
+    nothing = view_of(labelled, Smog(extinction_per_m=0.0), depth="none").smoggy
+    assert nothing.medium is None and nothing.surface_depth_m is None
+    assert view_of(labelled).smoggy is None
 
 
 def test_thin_haze_shows_the_zenith_and_hides_the_horizon(scene):

@@ -5,6 +5,7 @@ import torch
 
 from augment.cameras import Camera, Frame
 from augment.errors import SceneError
+from augment.labels import Boxes, LidarSweep
 from augment.plan import Plan, make_plan
 from augment.scene import Gaussians, Scene
 from augment.sky import ConstantSky
@@ -57,6 +58,35 @@ def test_deferred_smog_needs_expected_depth():
     plan = plan_of(Smog(visibility_m=100, model="deferred"))
     assert plan.buffers == {"rgb", "alpha", "expected_depth"}
     assert plan.smog_in_splats is None and plan.smog_on_buffers is not None
+
+
+class Labels:
+    """A source that is asked nothing."""
+
+    def boxes(self, frame_index: int) -> Boxes:
+        raise AssertionError("no plan reads boxes")
+
+    def lidar(self, frame_index: int) -> LidarSweep | None:
+        raise AssertionError("no plan reads sweeps")
+
+
+@pytest.mark.parametrize(
+    ("depth", "labels", "extinction_per_m", "buffers"),
+    [
+        ("none", True, 0.1, {"rgb", "alpha", "expected_depth"}),
+        ("median", True, 0.1, {"rgb", "alpha", "median_depth"}),
+        ("expected", True, 0.1, {"rgb", "alpha", "expected_depth"}),
+        ("none", False, 0.1, {"rgb", "alpha"}),
+        ("none", True, 0.0, {"rgb", "alpha"}),
+    ],
+)
+def test_boxes_in_smog_need_a_depth_and_any_will_do(depth, labels, extinction_per_m, buffers):
+    weather = Weather(smog=Smog(extinction_per_m=extinction_per_m))
+    recipe = Recipe(weather=weather, output=Output(depth=depth, labels=labels))
+    plan = make_plan(recipe, scene(labels=Labels()))
+    assert plan.buffers == buffers
+    assert plan.measures_smog == (labels and extinction_per_m > 0)
+    assert not make_plan(recipe, scene()).measures_smog
 
 
 def test_smog_with_a_scale_height_stands_on_the_road_and_shows_sky():
