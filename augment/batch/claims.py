@@ -24,7 +24,7 @@ CLAIMS_FOLDER = f"{STATE_FOLDER}/claims"
 class ClaimTimes:
     """How often a remote claim is renewed, when one counts as dead, and how contenders part.
 
-    The lifetime must exceed the renewal several times, and by seconds: stores tell full ones.
+    The lifetime must exceed the renewal several times.
     Contenders that see each other try again, `attempts` times in all, each after a random wait.
     """
 
@@ -57,7 +57,7 @@ class Claim(Protocol):
     def __exit__(self, *_: object) -> None: ...
 
 
-def try_claim(store: Store, name: str, times: ClaimTimes = CLAIM_TIMES) -> Claim | None:
+def try_claim(store: Store, name: str, times: ClaimTimes | None = None) -> Claim | None:
     """The claim of that name, or None: a live process, here or elsewhere, holds it.
 
     The name is one component of a path: letters, digits, `.`, `_`, `-` (see layout.folder_name).
@@ -76,4 +76,4 @@ def try_claim(store: Store, name: str, times: ClaimTimes = CLAIM_TIMES) -> Claim
         return try_lock(store.local_dir / CLAIMS_FOLDER / f"{name}.lock")
     from augment.batch.remote_claims import contend
 
-    return contend(store, f"{CLAIMS_FOLDER}/{name}", times)
+    return contend(store, f"{CLAIMS_FOLDER}/{name}", times or CLAIM_TIMES)

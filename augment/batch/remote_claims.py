@@ -21,6 +21,7 @@ from augment.batch.store import Store
 from augment.errors import OutputError
 
 _log = logging.getLogger(__name__)
+_RESOLUTION_S = 1.0  # of the times that stores tell
 _random = SystemRandom()  # processes with one seed must part
 
 
@@ -40,7 +41,8 @@ class ObjectClaim:
         atexit.register(self.release)
 
     def check(self) -> None:
-        if not self._lost and not self._is_released:
+        is_ours = self._process == os.getpid()  # a forked child does not see renewals
+        if is_ours and not self._lost and not self._is_released:
             self._note_age()
         if not self._lost and not self._is_released and not self._store.exists(self._path):
             self._lost = "its object was deleted"
@@ -111,7 +113,10 @@ def contend(store: Store, folder: str, times: ClaimTimes) -> ObjectClaim | None:
             is_held, is_alone = _look_around(store, folder, path, times)
             if is_alone:
                 store.write(path, _who())
-                return ObjectClaim(store, path, times, started_s)
+                # Past its lifetime, others have taken it for dead, and one of them may hold it.
+                is_alone = _clock_s() - started_s <= times.lifetime_s
+                if is_alone:
+                    return ObjectClaim(store, path, times, started_s)
         finally:
             if not is_alone:
                 _withdraw(store, path, times)
@@ -128,7 +133,8 @@ def _look_around(store: Store, folder: str, own: str, times: ClaimTimes) -> tupl
     if own not in objects:
         return False, False  # deleted as dead: this machine stood still for that long
     now_s = objects.pop(own).modified_s
-    alive = {path: o for path, o in objects.items() if now_s - o.modified_s <= times.lifetime_s}
+    longest_s = times.lifetime_s + _RESOLUTION_S
+    alive = {path: o for path, o in objects.items() if now_s - o.modified_s <= longest_s}
     dead = sorted(objects.keys() - alive.keys())
     if dead:
         _log.warning("%s: claims of processes that have died: %s", store.uri, ", ".join(dead))

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 _DELETES_AT_ONCE = 8
 _numbers = itertools.count()
+_of_parents: list[FileSystem | None] = []
 _random = SystemRandom()  # the jitter of processes with one seed must differ
 _T = TypeVar("_T")
 
@@ -61,10 +62,10 @@ class RemoteStore:
 
     local_dir = None
 
-    def __init__(self, uri: str, patience: Patience = PATIENCE) -> None:
+    def __init__(self, uri: str, patience: Patience | None = None) -> None:
         self._place = RemoteUri.parse(uri)
-        self._patience = patience
-        self._forget()
+        self._patience = patience or PATIENCE
+        self._reset()
 
     @property
     def uri(self) -> str:
@@ -145,6 +146,9 @@ class RemoteStore:
                 failure = error
             cause = self._place.without_secrets(" ".join(str(failure).split()))
             if is_permanent(failure) or attempt == patience.attempts:
+                if isinstance(failure, _WrongSizeError):  # half a file is worse than none
+                    with contextlib.suppress(Exception):
+                        self._system().delete_file(path)
                 times = "" if attempt == 1 else f" after {attempt} attempts"
                 # Without its cause, whose text may hold credentials.
                 raise OutputError(
@@ -157,17 +161,19 @@ class RemoteStore:
 
     def _system(self) -> FileSystem:
         """This process's connections. Those of a parent process must not be used after a fork."""
-        with self._lock if self._process == os.getpid() else contextlib.nullcontext():
-            if self._process != os.getpid():
-                self._forget()
+        if self._process != os.getpid():
+            # Closing them here would end the parent's: both share the sockets.
+            _of_parents.append(self._opened)
+            self._reset()
+        with self._lock:
             if self._opened is None:
                 self._opened = self._place.open(self._patience.timeout_s)
             return self._opened
 
-    def _forget(self) -> None:
-        self._process = os.getpid()
-        self._lock = threading.Lock()
+    def _reset(self) -> None:
+        self._lock = threading.Lock()  # a new one: a thread of the parent may hold the old one
         self._opened: FileSystem | None = None
+        self._process = os.getpid()
 
     def _where(self, path: str) -> str:
         base, _, options = self.uri.partition("?")
@@ -175,10 +181,14 @@ class RemoteStore:
         return f"{name} ({options})" if options else name
 
 
+class _WrongSizeError(OSError):
+    """What was stored is not what was sent."""
+
+
 def _restored(place: RemoteUri, patience: Patience) -> RemoteStore:
     store = RemoteStore.__new__(RemoteStore)
     store._place, store._patience = place, patience
-    store._forget()
+    store._reset()
     return store
 
 
@@ -217,9 +227,7 @@ def _put_and_move(system: FileSystem, path: str, data: bytes) -> None:
 def _check_size(system: FileSystem, path: str, expected: int) -> None:
     size = system.get_file_info(path).size
     if size != expected:
-        with contextlib.suppress(Exception):
-            system.delete_file(path)  # half a file is worse than none
-        raise OSError(f"{size} bytes of {expected} arrived")
+        raise _WrongSizeError(f"{size} bytes of {expected} arrived")
 
 
 def _uninterrupted(call: Callable[[], None]) -> None:

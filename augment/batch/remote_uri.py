@@ -25,6 +25,7 @@ _S3_OPTIONS = (
     "tls_ca_file_path",
 )
 _SECRET_OPTION = re.compile(r"key|secret|token|password|credential|signature|^sig$", re.IGNORECASE)
+_CONTROL = re.compile(r"[\x00-\x1f\x7f]")
 _CONNECT_TIMEOUT_S = 10
 
 
@@ -50,7 +51,7 @@ class RemoteUri:
         except ValueError as error:
             raise OutputError(f"{uri.partition(':')[0]}://... is no URI: {error}") from None
         user, _, host = parsed.netloc.rpartition("@")
-        if parsed.scheme in ("abfs", "abfss"):  # there it is the container
+        if parsed.scheme in ("abfs", "abfss") or user == "anonymous":  # a container, nobody
             user, host = "", parsed.netloc
         shown = [(name, value) for name, value in query if not _SECRET_OPTION.search(name)]
         hidden = [value for name, value in query if _SECRET_OPTION.search(name)]
@@ -85,11 +86,18 @@ class RemoteUri:
         if self.scheme == "s3":
             system, root = self._open_s3(timeout_s)
         else:
-            system, root = FileSystem.from_uri(self._uri)
+            system, root = FileSystem.from_uri(self._with_limits(timeout_s))
         bucket = root.split("/")[0]
         if self.writes_whole and system.get_file_info(bucket).type == FileType.NotFound:
             raise OSError(f"there is no bucket {bucket!r}")
         return SubTreeFileSystem(root, system)
+
+    def _with_limits(self, timeout_s: float) -> str:
+        """Google's library would try for a quarter of an hour."""
+        if self.scheme not in ("gs", "gcs") or "retry_limit_seconds=" in self._uri:
+            return self._uri
+        mark = "&" if "?" in self._uri else "?"
+        return f"{self._uri}{mark}retry_limit_seconds={timeout_s:g}"
 
     def _open_s3(self, timeout_s: float) -> tuple[FileSystem, str]:
         from pyarrow.fs import AwsStandardS3RetryStrategy, S3FileSystem
@@ -129,7 +137,7 @@ def _check_kind(scheme: str, host: str, public: str) -> None:
 
 def _check_folder(path: str, fragment: str, public: str) -> None:
     folder = urllib.parse.unquote(path).strip("/")
-    is_clean = "/".join(relative_parts(folder) or ()) == folder and folder.isprintable()
+    is_clean = "/".join(relative_parts(folder) or ()) == folder and not _CONTROL.search(folder)
     if fragment or not is_clean:
         raise OutputError(
             f"{public}: the folder must be named without '.', '..', '#', backslashes and double "

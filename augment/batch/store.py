@@ -5,6 +5,7 @@ Paths are relative to the folder, with forward slashes. A file is there whole or
 
 from __future__ import annotations
 
+import re
 import urllib.parse
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -13,6 +14,8 @@ from typing import Protocol
 
 from augment.batch.layout import relative_parts
 from augment.errors import OutputError
+
+_UNSAFE = re.compile("[\x00-\x1f\x7f\ud800-\udfff]")  # control characters, bytes that are no text
 
 
 class StoredFileMissing(OutputError):
@@ -30,7 +33,9 @@ class StoredFile:
 class Store(Protocol):
     """Files below one folder. All methods raise OutputError, and may be called by any thread.
 
-    A store can be pickled and used after a fork: each process opens its own connections.
+    A store can be pickled and used after a fork: each process opens its own connections. (A child
+    that os.fork made and that used S3 must end by os._exit, as those of multiprocessing do: at a
+    normal exit, pyarrow waits for threads that did not follow it.)
     """
 
     @property
@@ -96,10 +101,10 @@ def stored_path(path: str, uri: str) -> str:
     """The path with single slashes between its components.
 
     Raises:
-        OutputError: it is absolute, empty, climbs with `..`, or is no text of UTF-8.
+        OutputError: it is absolute, empty, climbs with `..`, or holds control characters.
     """
     parts = relative_parts(path)
-    if parts is None or not path.isprintable():
+    if parts is None or _UNSAFE.search(path):
         raise OutputError(
             f"{uri}: {path!r} is no path of a file there; paths must be relative to it, with "
             f"forward slashes and without '..' or control characters. Where a manifest names "

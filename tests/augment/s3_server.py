@@ -133,7 +133,6 @@ def s3_server() -> Iterator[S3Server]:
         return _answer(server, application, environ, start_response)
 
     listener = make_server("127.0.0.1", 0, answer, threaded=True, request_handler=Quiet)
-    listener.daemon_threads = True
     host, port = listener.server_address[:2]
     server.endpoint = f"{host}:{port}"
     thread = threading.Thread(target=listener.serve_forever, args=(0.02,), daemon=True)
