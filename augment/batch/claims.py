@@ -12,7 +12,7 @@ been renewed for the lifetime, by the clock of the store, is dead, and may be de
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from augment.batch.layout import STATE_FOLDER, folder_name
 from augment.batch.store import Store
@@ -37,6 +37,7 @@ class ClaimTimes:
 CLAIM_TIMES = ClaimTimes()
 
 
+@runtime_checkable
 class Claim(Protocol):
     """Held by this process until released; leaving its `with` block releases it."""
 

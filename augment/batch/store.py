@@ -10,7 +10,7 @@ import urllib.parse
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from augment.batch.layout import relative_parts
 from augment.errors import OutputError
@@ -30,6 +30,7 @@ class StoredFile:
     modified_s: float
 
 
+@runtime_checkable
 class Store(Protocol):
     """Files below one folder. All methods raise OutputError, and may be called by any thread.
 
