@@ -14,6 +14,11 @@ from torch import Tensor
 from augment.geometry import invert_rigid
 
 
+def scaled_size(width: int, height: int, scale: float) -> tuple[int, int]:
+    """Width and height at another resolution: rounded, at least 1 pixel."""
+    return max(1, round(width * scale)), max(1, round(height * scale))
+
+
 @dataclass(frozen=True, eq=False)
 class Camera:
     """A camera at one instant. OpenCV axes: x right, y down, z forward; pixel centres +0.5.
@@ -89,7 +94,7 @@ class Camera:
             raise ValueError(f"scale must be a finite number > 0; got {scale}")
         if scale == 1:
             return self
-        return self.resized(max(1, round(self.width * scale)), max(1, round(self.height * scale)))
+        return self.resized(*scaled_size(self.width, self.height, scale))
 
     def resized(self, width: int, height: int) -> Camera:
         """The same view in an image of another size, squeezed where its shape is another."""

@@ -7,9 +7,11 @@ its last worker has gone. flock does not reach across machines on every network 
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import os
 import time
+from collections.abc import Iterator
 from multiprocessing import reduction
 from pathlib import Path
 from typing import Any
@@ -19,6 +21,25 @@ from augment.batch.layout import STATE_FOLDER
 from augment.errors import OutputError
 
 ORPHANS_S = 30.0  # how long to wait for the workers of a killed job to notice
+
+
+@contextlib.contextmanager
+def file_lock(path: Path) -> Iterator[None]:
+    """Be the only process of this machine inside; waits for the one that is, however it ends.
+
+    Raises:
+        OutputError: the file cannot be made.
+    """
+    try:
+        make_folder(path.parent)
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+    except OSError as error:
+        raise output_error(path, error) from error
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
 
 
 class OutputLock:

@@ -1,9 +1,10 @@
 """What a reader sees of an output, here or in an object store, also while jobs are running.
 
 `generate` jobs publish a block of images at a time: first its files, then its rows as one part,
-`.climategs/parts/<block>-<digest>.parquet`. From time to time somebody merges all parts into
-`manifest.parquet`, whose metadata lists them. Parts stay: they are what is true, and the manifest
-can be made from them again. So no two writers can lose each other's rows, whatever the order.
+`.climategs/parts/<scene>/<block>-<digest>.parquet`. From time to time somebody merges all parts
+into `manifest.parquet`, whose metadata lists them. Parts stay: they are what is true, and the
+manifest can be made from them again. So no two writers can lose each other's rows, whatever the
+order.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from dataclasses import dataclass
 import pyarrow as pa
 
 from augment.batch.layout import MANIFEST, STATE_FOLDER
-from augment.batch.manifest import concat_rows, latest_rows, manifest_bytes, parse_manifest
+from augment.batch.manifest import FAILED, concat_rows, latest_rows, manifest_bytes, parse_manifest
 from augment.batch.store import Store, StoredFileMissing
 from augment.errors import OutputError
 
@@ -28,7 +29,7 @@ _LISTED = b"climategs.parts"
 
 @dataclass(frozen=True)
 class Part:
-    """The rows of a finished block. key: the block's. has_failures: some of its images failed."""
+    """The rows of a finished block. key: `<scene>/<block>`. has_failures: some images failed."""
 
     key: str
     digest: str
@@ -39,22 +40,30 @@ class Part:
     def name(self) -> str:
         return f"{self.key}-{self.digest}{_FAILED if self.has_failures else ''}{_SUFFIX}"
 
+    @property
+    def path(self) -> str:
+        return f"{PARTS}/{self.name}"
+
     @staticmethod
-    def parse(name: str, modified_s: float = 0.0) -> Part | None:
-        """The part of a file name; None where it is none."""
-        if not name.endswith(_SUFFIX):
+    def parse(path: str, modified_s: float = 0.0) -> Part | None:
+        """The part of a path in the output; None where it is none."""
+        if not (path.startswith(f"{PARTS}/") and path.endswith(_SUFFIX)):
             return None
-        stem = name[: -len(_SUFFIX)]
+        stem = path[len(PARTS) + 1 : -len(_SUFFIX)]
         has_failures = stem.endswith(_FAILED)
         key, dash, digest = stem.removesuffix(_FAILED).rpartition("-")
         return Part(key, digest, has_failures, modified_s) if dash else None
 
 
-def list_parts(store: Store) -> dict[str, Part]:
-    """The part of every block that has one, by the block's key; one listing, no file is read."""
+def list_parts(store: Store, scene_folder: str | None = None) -> dict[str, Part]:
+    """The part of every block that has one, by the block's key; no file is read.
+
+    scene_folder: of one scene only.
+    """
     found: dict[str, Part] = {}
-    for path, file in store.list(PARTS).items():
-        part = Part.parse(path.rsplit("/", 1)[-1], file.modified_s)
+    folder = PARTS if scene_folder is None else f"{PARTS}/{scene_folder}"
+    for path, file in store.list(folder).items():
+        part = Part.parse(path, file.modified_s)
         if part is not None:
             older = found.get(part.key)
             found[part.key] = part if older is None else _better(older, part)
@@ -64,15 +73,14 @@ def list_parts(store: Store) -> dict[str, Part]:
 def publish_part(store: Store, key: str, rows: pa.Table) -> Part:
     """Make a block's rows visible: in one step, and in place of what the block had before."""
     data = manifest_bytes(rows)
-    failed = "failed" in rows["status"].to_pylist()
+    failed = FAILED in rows["status"].to_pylist()
     part = Part(key, hashlib.sha256(data).hexdigest()[:12], failed)
-    store.write(f"{PARTS}/{part.name}", data)
-    older = [
-        path
-        for path in store.list(PARTS)
-        if (other := Part.parse(path.rsplit("/", 1)[-1])) and other.key == key
-    ]
-    store.delete(path for path in older if not path.endswith(f"/{part.name}"))
+    store.write(part.path, data)
+    scene_folder = key.rsplit("/", 1)[0]
+    for path in store.list(f"{PARTS}/{scene_folder}"):
+        other = Part.parse(path)
+        if other is not None and other.key == key and other.name != part.name:
+            store.delete([path])
     return part
 
 
@@ -134,8 +142,7 @@ def _manifest(store: Store) -> tuple[pa.Table | None, bytes | None]:
 
 
 def _read_part(store: Store, part: Part) -> pa.Table:
-    path = f"{PARTS}/{part.name}"
-    return parse_manifest(store.read(path), f"{store.uri}/{path}")
+    return parse_manifest(store.read(part.path), f"{store.uri}/{part.path}")
 
 
 def _listed(table: pa.Table | None) -> Collection[str]:

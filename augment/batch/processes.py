@@ -5,8 +5,11 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
 from multiprocessing import resource_tracker
+from multiprocessing.connection import Connection
+from typing import Any
 
 
 def available_cores() -> int:
@@ -49,3 +52,17 @@ def interrupts_blocked() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def sender(connection: Connection) -> Callable[[Any], None]:
+    """In a worker: a send that several threads may call; ends the process if nobody listens."""
+    lock = threading.Lock()
+
+    def send(message: Any) -> None:
+        with lock:
+            try:
+                connection.send(message)
+            except OSError:
+                os._exit(1)
+
+    return send

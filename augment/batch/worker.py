@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from queue import SimpleQueue
 
 from augment.batch.lock import InheritedLock
-from augment.batch.runner import Chunk, FrameRunner, Outcome, Renderer, Setup, describe
+from augment.batch.processes import sender
+from augment.batch.runner import Chunk, FrameRunner, Renderer, Setup, describe
 from augment.batch.shared_scene import SharedScene
 from augment.batch.writer import WritePump
 from augment.errors import OutputError
@@ -46,7 +46,7 @@ def worker_main(
     inbox: SimpleQueue[Chunk | None] = SimpleQueue()
     stopped = threading.Event()
     threading.Thread(target=_listen, args=(connection, inbox, stopped), daemon=True).start()
-    send = _sender(connection)
+    send = sender(connection)
     try:
         scene = shared.open()
         for bed in setup.beds:
@@ -79,17 +79,3 @@ def _listen(connection: Connection, inbox: SimpleQueue, stopped: threading.Event
         if chunk is None:
             stopped.set()
         inbox.put(chunk)
-
-
-def _sender(connection: Connection) -> Callable[[Ready | Failure | Outcome], None]:
-    """A send that several threads may call."""
-    lock = threading.Lock()
-
-    def send(message: Ready | Failure | Outcome) -> None:
-        with lock:
-            try:
-                connection.send(message)
-            except OSError:
-                os._exit(1)
-
-    return send

@@ -1,0 +1,68 @@
+"""Scenes of a job as its file names them: patterns taken apart, relative paths made absolute."""
+
+from __future__ import annotations
+
+import glob
+from collections.abc import Iterable
+from pathlib import Path
+
+from adapters.base import recognise
+from adapters.uri import SCHEMES, format_uri, parse_uri
+from augment.errors import AdapterError
+from recipes.job import JobScene
+
+
+def scenes_of(entries: Iterable[JobScene], folder: Path) -> list[JobScene]:
+    """Every scene once, in the order of the job; those of a pattern in the order of their paths.
+
+    An entry whose path has `*`, `**` or `[...]` stands for all that match, as in a shell (a `?`
+    begins the query); each keeps the entry's query, frames, cameras and recipes. folder: where
+    relative paths start.
+
+    Raises:
+        AdapterError: a pattern matches nothing, a scene is named twice, or a pattern has a name.
+    """
+    scenes: dict[str, JobScene] = {}
+    for entry in entries:
+        found = _expanded(entry, folder)
+        if entry.name is not None and len(found) > 1:
+            raise AdapterError(
+                f"{entry.uri!r} stands for {len(found)} scenes, which cannot all be called "
+                f"{entry.name!r}; leave the name out, or list them one by one"
+            )
+        for scene in found:
+            if scene.uri in scenes:
+                raise AdapterError(
+                    f"the job names the scene {scene.uri!r} twice (by {entry.uri!r}); give its "
+                    f"frames, cameras and recipes in one entry"
+                )
+            scenes[scene.uri] = scene
+    return list(scenes.values())
+
+
+def _expanded(entry: JobScene, folder: Path) -> list[JobScene]:
+    scheme, path, query = parse_uri(entry.uri)
+    known = SCHEMES.get(scheme) if scheme is not None else None
+    if scheme is not None and (known is None or path in known.builtin):
+        return [entry]  # an unknown scheme is refused where it is opened
+    query = {key: _from(folder, value) for key, value in query.items()}
+    whole = folder.absolute() / path
+    matches = [str(whole)]
+    if glob.has_magic(path) and not whole.exists():
+        matches = sorted(glob.glob(str(whole), recursive=True))
+    if not matches:
+        raise AdapterError(f"{entry.uri!r}: nothing matches {whole}")
+    return [entry.model_copy(update={"uri": _uri(scheme, match, query)}) for match in matches]
+
+
+def _from(folder: Path, value: str) -> str:
+    """A value of the query that names a file beside the job, as an absolute path."""
+    beside = folder.absolute() / value
+    names_a_file = ("/" in value or "." in value) and beside.exists()
+    return str(beside) if names_a_file else value
+
+
+def _uri(scheme: str | None, path: str, query: dict[str, str]) -> str:
+    if scheme is None and query:
+        scheme = recognise(Path(path))
+    return path if scheme is None else format_uri(scheme, path, query)

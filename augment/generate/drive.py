@@ -1,0 +1,206 @@
+"""Hands a job's tasks to a pool of workers and takes in what becomes of them."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+from augment.batch.manifest import FAILED
+from augment.batch.runner import Outcome
+from augment.errors import OutputError
+from augment.generate.pools import Event, Lost, WorkerPool
+from augment.generate.queue import BlockQueue
+from augment.generate.records import Block, SceneRecord
+from augment.generate.workshop import BlockDone, BlockTask, IndexTask, TaskFailed
+
+WAIT_S = 1.0
+ELSEWHERE_S = 2.0  # how long to leave a block alone that another process is at
+_log = logging.getLogger(__name__)
+
+MakePool = Callable[[Callable[[int, Outcome], None]], WorkerPool]
+FailBlock = Callable[[Block, str], None]
+
+
+@dataclass
+class Tally:
+    """Images so far. done: those whose blocks are published, or were before. failures: lines."""
+
+    written: int = 0
+    skipped: int = 0
+    failed: int = 0
+    failures: list[str] = field(default_factory=list)
+    seconds: defaultdict[str, float] = field(default_factory=lambda: defaultdict(float))
+
+
+class Driver:
+    """Runs tasks in a pool. on_image: told how many images are done, and how many of them failed.
+
+    idle: called now and then between events.
+    """
+
+    def __init__(
+        self,
+        make_pool: MakePool,
+        *,
+        on_image: Callable[[int, int], None] = lambda done, failed: None,
+        idle: Callable[[], None] = lambda: None,
+    ) -> None:
+        self.tally = Tally()
+        self._partial: dict[int, list[int]] = defaultdict(lambda: [0, 0])  # by slot: done, failed
+        self._on_image, self._idle = on_image, idle
+        self._pool = make_pool(self._tick)
+        self._open: list[str | None] = [None] * self._pool.slots  # the scene of every slot
+
+    def close(self) -> None:
+        self._pool.close()
+
+    def index(
+        self, tasks: Sequence[IndexTask], each: Callable[[IndexTask, SceneRecord | str], None]
+    ) -> None:
+        """Open scenes and tell `each` what is in them, or why that is not known."""
+        waiting, busy = list(reversed(tasks)), dict[int, IndexTask]()
+        while waiting or busy:
+            for slot in range(self._pool.slots):
+                if waiting and slot not in busy:
+                    busy[slot] = waiting.pop()
+                    self._pool.give(slot, busy[slot])
+            for event in self._pool.wait(WAIT_S):
+                task = busy.pop(event.slot)
+                if isinstance(event, Lost):
+                    each(task, f"the worker process {event.how} while opening the scene")
+                elif isinstance(event.result, SceneRecord):
+                    self._open[event.slot] = event.result.name
+                    each(task, event.result)
+                else:
+                    assert isinstance(event.result, TaskFailed)
+                    _raise_if_output(event.result)
+                    each(task, event.result.text)
+
+    def render(
+        self, blocks: Sequence[Block], names: dict[str, str | None], fail: FailBlock
+    ) -> None:
+        """Render and publish the blocks. names: by scene, what it is called if not by itself.
+
+        fail: records all images of a block as failed. A block whose worker dies is tried once more
+        while no other worker is busy, each of its images in a process of its own.
+
+        Raises:
+            OutputError: nothing can be written any more.
+        """
+        run = _Rendering(self, BlockQueue(blocks), names, fail)
+        while run.hand_out():
+            for event in self._pool.wait(WAIT_S):
+                run.take_in(event)
+            self._idle()
+
+    def _tick(self, slot: int, outcome: Outcome) -> None:
+        partial = self._partial[slot]
+        partial[0] += 1
+        partial[1] += outcome.status == FAILED
+        self.report()
+
+    def report(self) -> None:
+        tally, partial = self.tally, list(self._partial.values())
+        done = tally.written + tally.skipped + tally.failed + sum(p[0] for p in partial)
+        self._on_image(done, tally.failed + sum(p[1] for p in partial))
+
+
+class _Rendering:
+    """The blocks of one run, and who is at which."""
+
+    def __init__(
+        self, driver: Driver, queue: BlockQueue, names: dict[str, str | None], fail: FailBlock
+    ) -> None:
+        self._driver, self._pool = driver, driver._pool
+        self._queue, self._names, self._fail = queue, names, fail
+        self._busy: dict[int, BlockTask] = {}
+        self._trials: list[Block] = []
+        self._later: list[tuple[float, Block]] = []  # another process is at them
+
+    def hand_out(self) -> bool:
+        """Give work to idle workers; False when there is none left, in hand or waiting."""
+        now = time.monotonic()
+        for when, block in list(self._later):
+            if when <= now:
+                self._later.remove((when, block))
+                self._queue.put_back(block)
+        if self._trials:  # alone: memory may be what it died of
+            if not self._busy:
+                self._give(0, self._trials.pop(0), is_trial=True)
+            return True
+        for slot in range(self._pool.slots):
+            if slot in self._busy:
+                continue
+            open_scenes = self._driver._open
+            others = [open_scenes[s] for s in self._busy]
+            block = self._queue.take(open_scenes[slot], [name for name in others if name])
+            if block is not None:
+                self._give(slot, block)
+        if not self._busy and self._later:
+            time.sleep(min(WAIT_S, max(0.0, self._later[0][0] - now)))
+        return bool(self._busy or self._later or len(self._queue))
+
+    def _give(self, slot: int, block: Block, *, is_trial: bool = False) -> None:
+        task = BlockTask(block, self._names.get(block.scene), is_trial)
+        self._busy[slot] = task
+        self._driver._open[slot] = block.scene
+        self._pool.give(slot, task)
+
+    def take_in(self, event: Event) -> None:
+        task = self._busy.pop(event.slot)
+        self._driver._partial.pop(event.slot, None)
+        block = task.block
+        if isinstance(event, Lost):
+            self._driver._open[event.slot] = None
+            self._lost(task, event.how)
+        elif isinstance(event.result, TaskFailed):
+            _raise_if_output(event.result)
+            self._failed(block, event.result)
+        else:
+            assert isinstance(event.result, BlockDone)
+            if event.result.is_elsewhere:
+                self._later.append((time.monotonic() + ELSEWHERE_S, block))
+            else:
+                self._done(block, event.result)
+        self._driver.report()
+
+    def _done(self, block: Block, done: BlockDone) -> None:
+        tally = self._driver.tally
+        tally.written += done.written
+        tally.skipped += done.skipped
+        tally.failed += done.failed
+        tally.failures += done.failures
+        for kind, seconds in (done.seconds or {}).items():
+            tally.seconds[kind] += seconds
+
+    def _lost(self, task: BlockTask, how: str) -> None:
+        block = task.block
+        if not task.is_trial:
+            _log.warning("a worker %s; its block %s is tried once more", how, block.key)
+            self._trials.append(block)
+            return
+        self._give_up(
+            block,
+            f"the worker {how} while at this block of images, and again when it was tried alone; "
+            f"if memory ran out, use fewer workers or a machine with more",
+        )
+
+    def _failed(self, block: Block, failed: TaskFailed) -> None:
+        self._give_up(block, failed.text)
+        if failed.of_scene:
+            for other in self._queue.take_all(block.scene):
+                self._give_up(other, failed.text)
+
+    def _give_up(self, block: Block, message: str) -> None:
+        self._fail(block, message)
+        tally = self._driver.tally
+        tally.failed += block.images
+        tally.failures.append(f"{block.scene}/{block.variant}, {block.images} images: {message}")
+
+
+def _raise_if_output(failed: TaskFailed) -> None:
+    if failed.is_output:
+        raise OutputError(failed.text)

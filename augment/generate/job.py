@@ -1,0 +1,331 @@
+"""A dataset job: many scenes under many recipes into one output, by any number of workers.
+
+What is finished shows in the output alone, so a job that was killed, wherever and however, goes on
+when it is started again, and any number of processes on any number of machines can be at the same
+job: blocks of images are claimed, rendered, and published one by one. The files do not depend on
+who rendered what, nor on how often that was interrupted.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import logging
+import os
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pyarrow as pa
+from tqdm import tqdm
+
+import augment
+from augment.batch.atomic import output_error
+from augment.batch.claims import try_claim
+from augment.batch.journal import Identity
+from augment.batch.layout import MANIFEST, PATH_KINDS, STATE_FOLDER
+from augment.batch.manifest import FAILED, OK, rows_to_table
+from augment.batch.parts import compact, list_parts, parts_to_merge, publish_part, read_finished
+from augment.batch.rows import image_row
+from augment.batch.store import Store, StoredFileMissing, open_store
+from augment.errors import OutputError
+from augment.generate.drive import Driver
+from augment.generate.plan import Plan, make_plan, shard_of, store_plan
+from augment.generate.pools import SerialPool, Tick, WorkerPool
+from augment.generate.records import Block, SceneRecord
+from augment.generate.workshop import IndexTask, WorkSetup
+from recipes.job import JobRecipes, JobScene
+from recipes.schema import Recipe
+
+SCENES = f"{STATE_FOLDER}/scenes"
+EXECUTORS = ("serial", "processes", "ray")
+_COMPACT_S = 60.0
+_CLAIM_S = 30.0
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class GenerateJob:
+    """recipes: of the job, loaded. scenes: the job's, without patterns. executor: who renders:
+    `serial` this process, `processes` several of this machine, `ray` actors on a cluster. workers:
+    how many, None for the executor's own choice. shard: which part of the job is done here, from 1,
+    and how many there are. rescan: open all scenes anew, in case they have changed.
+    """
+
+    recipes: JobRecipes
+    scenes: Sequence[JobScene]
+    setup: WorkSetup
+    executor: str = "processes"
+    workers: int | None = None
+    shard: tuple[int, int] = (1, 1)
+    rescan: bool = False
+
+    def __post_init__(self) -> None:
+        if self.executor not in EXECUTORS:
+            raise ValueError(f"executor must be one of {EXECUTORS}; got {self.executor!r}")
+        if self.workers is not None and self.workers < 1:
+            raise ValueError(f"workers must be >= 1; got {self.workers}")
+        number, count = self.shard
+        if not 1 <= number <= count:
+            raise ValueError(f"shard must be i/n with 1 <= i <= n; got {number}/{count}")
+
+
+@dataclass(frozen=True)
+class GenerateResult:
+    """Images of this shard. skipped: finished before, here or elsewhere. unusable: scenes by URI.
+
+    timings: seconds by kind of work, summed over threads and workers, and `plan` and `scan`.
+    """
+
+    written: int
+    skipped: int
+    failed: int
+    unusable: dict[str, str]
+    failures: tuple[str, ...]
+    seconds: float
+    timings: dict[str, float] = field(default_factory=dict)
+
+
+def run_generate(
+    job: GenerateJob,
+    *,
+    progress: bool = True,
+    prepare: Callable[[list[Recipe]], None] = lambda recipes: None,
+) -> GenerateResult:
+    """Render and publish what of the job is not finished yet.
+
+    progress: bars on stderr. prepare: called before the first image is rendered, if any has to be,
+    with one recipe of each name; to compile kernels once and not in every worker, say. A KeyboardInterrupt lets workers finish the images they have at hand,
+    merges what is published into the manifest, and is raised again.
+
+    Raises:
+        OutputError: the output cannot be written, or holds images of another kind under the same
+            names; nothing was written then. ClimateGSError: no scene can be used.
+        RecipeError: a recipe cannot be used.
+    """
+    return _Generation(job, progress, prepare).go()
+
+
+def plan_job(job: GenerateJob, *, progress: bool = True, keep: bool = False) -> Plan:
+    """The job's plan, for which its scenes are opened that have not been; writes nothing.
+
+    keep: write what was found of the scenes into the output, for the next time.
+    """
+    store = open_store(job.setup.store_uri)
+    driver = Driver(lambda tick: make_pool(job, tick))
+    with contextlib.closing(driver):
+        return _plan(job, store, driver, progress, keep)
+
+
+def make_pool(job: GenerateJob, tick: Tick) -> WorkerPool:
+    """The workers that the job asks for."""
+    if job.executor == "serial":
+        return SerialPool(job.setup, tick)
+    if job.executor == "ray":
+        from augment.generate.ray_pool import RayPool
+
+        return RayPool(job.setup, tick, job.workers)
+    from augment.batch.processes import available_cores
+    from augment.generate.process_pool import ProcessPool
+
+    return ProcessPool(job.setup, tick, job.workers or available_cores())
+
+
+def default_scratch(store_uri: str) -> Path | None:
+    """A folder of this user's for blocks on their way to that output; None for a local one.
+
+    Raises:
+        OutputError: the folder belongs to somebody else.
+    """
+    store = open_store(store_uri)
+    if store.local_dir is not None:
+        return None
+    digest = hashlib.sha256(store.uri.encode()).hexdigest()[:16]
+    root = Path(tempfile.gettempdir()) / f"climategs-{os.getuid()}"
+    try:
+        root.mkdir(mode=0o700, exist_ok=True)
+        if root.stat().st_uid != os.getuid() or root.is_symlink():
+            raise OutputError(f"{root} belongs to somebody else; name another folder (--scratch)")
+        return root / digest
+    except OSError as error:
+        raise output_error(root, error) from error
+
+
+class _Generation:
+    """One call of run_generate."""
+
+    def __init__(
+        self, job: GenerateJob, progress: bool, prepare: Callable[[list[Recipe]], None]
+    ) -> None:
+        self._job, self._progress, self._prepare = job, progress, prepare
+        self._store = open_store(job.setup.store_uri)
+        self._merged_at, self._merge_s = time.monotonic(), 0.0
+        self._timings: dict[str, float] = {}
+
+    def go(self) -> GenerateResult:
+        started = time.perf_counter()
+        self._driver = Driver(
+            lambda tick: make_pool(self._job, tick), on_image=self._show, idle=self._merge_at_times
+        )
+        with contextlib.closing(self._driver):
+            self._plan = plan = _plan(self._job, self._store, self._driver, self._progress, True)
+            self._timings["plan"] = time.perf_counter() - started
+            blocks = shard_of(plan.blocks, *self._job.shard)
+            pending = self._pending(blocks)
+            self._timings["scan"] = time.perf_counter() - started - self._timings["plan"]
+            done = sum(b.images for b in blocks) - sum(b.images for b in pending)
+            self._driver.tally.skipped = done
+            self._render(pending, total=sum(block.images for block in blocks))
+        self._merge(wait=True)
+        tally = self._driver.tally
+        return GenerateResult(
+            tally.written,
+            tally.skipped,
+            tally.failed,
+            dict(plan.unusable),
+            tuple(tally.failures),
+            time.perf_counter() - started,
+            {**tally.seconds, **self._timings},
+        )
+
+    def _pending(self, blocks: Sequence[Block]) -> list[Block]:
+        """What is not published, or with failures that are tried again; refuses a mixed output."""
+        parts = list_parts(self._store)
+        pending = [b for b in blocks if b.key not in parts or parts[b.key].has_failures]
+        new = [block for block in pending if block.key not in parts]
+        if new:
+            _check_not_mixed(self._store, self._plan, new)
+        store_plan(self._store, self._plan)
+        return pending
+
+    def _render(self, pending: Sequence[Block], total: int) -> None:
+        if pending:
+            self._prepare(list({block.recipe.name: block.recipe for block in pending}.values()))
+        self._bar = tqdm(
+            total=total,
+            initial=self._driver.tally.skipped,
+            unit="image",
+            disable=not self._progress,
+        )
+        with self._bar:
+            try:
+                if pending:
+                    self._driver.render(pending, dict(self._plan.names), self._fail)
+            except KeyboardInterrupt:
+                self._driver.close()
+                self._merge(wait=True)
+                raise KeyboardInterrupt(
+                    "stopped; start the same job again to go on from there"
+                ) from None
+
+    def _show(self, done: int, failed: int) -> None:
+        if failed:
+            self._bar.set_postfix(failed=failed, refresh=False)
+        self._bar.update(done - self._bar.n)
+
+    def _fail(self, block: Block, message: str) -> None:
+        """Publish a block whose images have all failed, unless others have finished it."""
+        record = self._plan.records[block.scene]
+        identity = _identity(record, block, self._plan.backend)
+        nowhere = {f"{kind}_path": None for kind in PATH_KINDS}
+        rows = [
+            image_row(
+                block.scene,
+                block.recipe,
+                identity,
+                pictured,
+                paths=nowhere,
+                status=FAILED,
+                message=message,
+            )
+            for pictured in block.pictured(record)
+        ]
+        publish_part(self._store, block.key, rows_to_table(rows))
+
+    def _merge_at_times(self) -> None:
+        """Keep the manifest fresh, for at most a twentieth of the time."""
+        if time.monotonic() - self._merged_at > max(_COMPACT_S, 20 * self._merge_s):
+            self._merge(wait=False)
+
+    def _merge(self, *, wait: bool) -> None:
+        """Merge the parts into the manifest; left to others where they are just doing so."""
+        started = time.monotonic()
+        while parts_to_merge(self._store):
+            claim = try_claim(self._store, "manifest")
+            if claim is not None:
+                with claim:
+                    compact(self._store)
+                break
+            if not wait or time.monotonic() - started > _CLAIM_S:
+                _log.info("%s is being written by another process", MANIFEST)
+                break
+            time.sleep(0.2)
+        self._merged_at = time.monotonic()
+        self._merge_s = self._merged_at - started
+
+
+def _plan(job: GenerateJob, store: Store, driver: Driver, progress: bool, keep: bool) -> Plan:
+    found: dict[tuple[str, str | None], SceneRecord | str] = {}
+    for entry in job.scenes:
+        record = None if job.rescan else _known(store, entry)
+        if record is not None:
+            found[entry.uri, entry.name] = record
+    tasks = [IndexTask(e.uri, e.name) for e in job.scenes if (e.uri, e.name) not in found]
+    with tqdm(
+        total=len(tasks), unit="scene", desc="opening", disable=not progress or not tasks
+    ) as bar:
+
+        def each(task: IndexTask, record: SceneRecord | str) -> None:
+            found[task.uri, task.name] = record
+            if keep and isinstance(record, SceneRecord):
+                store.write(_record_path(task.uri, task.name), record.to_json())
+            bar.update()
+
+        driver.index(list(dict.fromkeys(tasks)), each)
+    return make_plan(job.recipes, job.scenes, found, job.setup.backend)
+
+
+def _known(store: Store, entry: JobScene) -> SceneRecord | None:
+    path = _record_path(entry.uri, entry.name)
+    try:
+        return SceneRecord.from_json(store.read(path), f"{store.uri}/{path}")
+    except StoredFileMissing:
+        return None
+    except OutputError as error:
+        _log.warning("%s", error)
+        return None
+
+
+def _record_path(uri: str, name: str | None) -> str:
+    digest = hashlib.sha256(f"{augment.__version__}\n{uri}\n{name or ''}".encode()).hexdigest()
+    return f"{SCENES}/{digest[:20]}.json"
+
+
+def _identity(record: SceneRecord, block: Block, backend: str) -> Identity:
+    return Identity(record.source, block.recipe.hash, "recorded", augment.__version__, backend)
+
+
+def _check_not_mixed(store: Store, plan: Plan, blocks: Sequence[Block]) -> None:
+    """Refuse to put images beside others of the same name that were made otherwise."""
+    try:
+        table = read_finished(store)
+    except OutputError:
+        if store.exists(MANIFEST):
+            raise
+        return
+    for found in _identities(table):
+        scene, variant, identity = found
+        block = next((b for b in blocks if (b.scene, b.variant) == (scene, variant)), None)
+        if block is not None:
+            mine = _identity(plan.records[scene], block, identity.backend)
+            mine.check(identity, f"{store.uri}/{scene}/{variant}")
+
+
+def _identities(table: pa.Table) -> list[tuple[str, str, Identity]]:
+    """The kinds of finished images there are, each once."""
+    names = ["scene", "variant", *Identity.__dataclass_fields__]
+    kinds = table.filter(pa.array([status == OK for status in table["status"].to_pylist()]))
+    rows = kinds.select(names).group_by(names, use_threads=False).aggregate([]).to_pylist()
+    return [(row["scene"], row["variant"], Identity.of_row(row)) for row in rows]

@@ -1,0 +1,168 @@
+"""A pool of worker processes on this machine, each with a scene of its own.
+
+They are started afresh (`spawn`). One that dies is replaced; all end when this process does.
+"""
+
+from __future__ import annotations
+
+import _thread
+import contextlib
+import multiprocessing
+import os
+import threading
+import time
+from multiprocessing.connection import Connection, wait
+from queue import SimpleQueue
+
+from augment.batch.processes import (
+    available_cores,
+    describe_exit,
+    interrupts_blocked,
+    sender,
+    thread_limits,
+)
+from augment.batch.runner import Outcome
+from augment.errors import ClimateGSError
+from augment.generate.pools import Event, Finished, Lost, Tick
+from augment.generate.workshop import Task, WorkSetup, Workshop
+
+STOP_S = 60.0  # how long a worker may take to finish the images it has at hand
+_READY = "ready"
+
+
+class ProcessPool:
+    """`slots` worker processes that share the cores.
+
+    Raises:
+        ClimateGSError: from wait: a process ended while starting.
+    """
+
+    def __init__(self, setup: WorkSetup, tick: Tick, slots: int) -> None:
+        self.slots = slots
+        self._setup, self._tick = setup, tick
+        self._threads = max(1, available_cores() // slots)
+        self._workers: list[_Worker | None] = [None] * slots
+
+    def give(self, slot: int, task: Task) -> None:
+        worker = self._workers[slot]
+        if worker is None:
+            worker = self._workers[slot] = _Worker(self._setup, self._threads)
+        with contextlib.suppress(OSError):  # one that has just died shows when it is waited for
+            worker.connection.send(task)
+
+    def wait(self, timeout_s: float) -> list[Event]:
+        deadline = time.monotonic() + timeout_s
+        events: list[Event] = []
+        while not events:
+            left = deadline - time.monotonic()
+            started = {w.connection: slot for slot, w in enumerate(self._workers) if w is not None}
+            ready = wait(list(started), max(0.0, left))
+            if not ready and left <= 0:
+                break
+            for connection in ready:
+                event = self._read(started[connection])  # pyright: ignore[reportArgumentType]
+                if event is not None:
+                    events.append(event)
+        return events
+
+    def close(self) -> None:
+        workers = [worker for worker in self._workers if worker is not None]
+        self._workers = [None] * self.slots
+        try:
+            for worker in workers:
+                worker.stop()
+            deadline = time.monotonic() + STOP_S
+            for worker in workers:
+                worker.drain(deadline)
+        finally:
+            for worker in workers:
+                worker.kill()
+
+    def _read(self, slot: int) -> Event | None:
+        worker = self._workers[slot]
+        assert worker is not None
+        try:
+            message = worker.connection.recv()
+        except (EOFError, OSError):
+            return self._bury(slot, worker)
+        if message == _READY:
+            worker.is_ready = True
+        elif isinstance(message, Outcome):
+            self._tick(slot, message)
+        else:
+            return Finished(slot, message)
+        return None
+
+    def _bury(self, slot: int, worker: _Worker) -> Event:
+        worker.process.join()
+        worker.connection.close()
+        self._workers[slot] = None
+        ending = describe_exit(worker.process.exitcode)
+        if not worker.is_ready:
+            raise ClimateGSError(
+                f"a worker process {ending} while starting; what it printed says more. A script "
+                f"that generates with processes needs `if __name__ == '__main__':` around it; if "
+                f"memory ran out, use fewer workers"
+            )
+        return Lost(slot, ending)
+
+
+class _Worker:
+    def __init__(self, setup: WorkSetup, threads: int) -> None:
+        context = multiprocessing.get_context("spawn")
+        self.connection, child = context.Pipe()
+        # No daemon: on trial it has processes of its own. It ends when the connection does.
+        self.process = context.Process(target=_main, args=(child, setup, threads))
+        with thread_limits(threads), interrupts_blocked():
+            self.process.start()
+        child.close()
+        self.is_ready = False
+
+    def stop(self) -> None:
+        with contextlib.suppress(OSError):
+            self.connection.send(None)
+
+    def drain(self, deadline: float) -> None:
+        """Take in what the worker still says until it ends, or it would block on saying it."""
+        with contextlib.suppress(EOFError, OSError):
+            while (left := deadline - time.monotonic()) > 0 and self.connection.poll(left):
+                self.connection.recv()
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.process.join()
+        self.connection.close()
+
+
+def _main(connection: Connection, setup: WorkSetup, threads: int) -> None:
+    import cv2
+    import torch
+
+    torch.set_num_threads(threads)
+    cv2.setNumThreads(1)
+    send = sender(connection)
+    workshop = Workshop(setup, send)
+    inbox: SimpleQueue[Task | None] = SimpleQueue()
+    working = threading.Event()
+    threading.Thread(target=_listen, args=(connection, inbox, working), daemon=True).start()
+    send(_READY)
+    with contextlib.suppress(KeyboardInterrupt):  # asked to stop in the midst of a block
+        while (task := inbox.get()) is not None:
+            working.set()
+            try:
+                result = workshop.do(task)
+            finally:
+                working.clear()
+            send(result)
+
+
+def _listen(connection: Connection, inbox: SimpleQueue, working: threading.Event) -> None:
+    """Receive beside the work, so that a stop or the parent's end is noticed at once."""
+    while True:
+        try:
+            task = connection.recv()
+        except (EOFError, OSError):
+            os._exit(1)  # the parent has gone: what is finished is on the disk
+        inbox.put(task)
+        if task is None and working.is_set():
+            _thread.interrupt_main()

@@ -1,0 +1,116 @@
+"""Takes a block from the folder it was rendered in to the output, where it appears at once.
+
+Its files go there one by one, those of an image as soon as it is finished; nobody sees them before
+the block's rows follow in one step. What belongs to several images lies by blocks, for no two
+blocks ever write the same file: `labels/boxes/000016-3fc0a1b2d4e5.parquet`.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path, PurePosixPath
+
+import pyarrow as pa
+
+from augment.batch.layout import PATH_KINDS, STATE_FOLDER, item_paths
+from augment.batch.manifest import OK, read_manifest
+from augment.batch.parts import Part, publish_part
+from augment.batch.runner import Outcome
+from augment.batch.store import Store
+from augment.errors import OutputError
+from augment.generate.records import Block
+
+_OF_BLOCK = ("labels", "box_smog", "box_water", "box_snow", "calibration")
+_OF_IMAGE = tuple(kind for kind in PATH_KINDS if kind not in _OF_BLOCK)
+REMOTE_UPLOADS = 8  # at a time: most of the time of one is waiting
+
+
+class Publisher:
+    """Publishes one block. folder: where `run_job` renders it. Use as a context manager."""
+
+    def __init__(self, store: Store, folder: Path, block: Block) -> None:
+        self._store, self._folder, self._block = store, folder, block
+        uploads = 1 if store.local_dir is not None else REMOTE_UPLOADS
+        self._pool = ThreadPoolExecutor(uploads, thread_name_prefix="publish")
+        self._sent: dict[str, Future[None]] = {}
+
+    def __enter__(self) -> Publisher:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._pool.shutdown(wait=True, cancel_futures=True)
+
+    def image_done(self, outcome: Outcome) -> None:
+        """Send the files of a finished image on their way."""
+        if outcome.status != OK:
+            return
+        recipe = self._block.recipe
+        paths = item_paths(self._block.scene, recipe, outcome.camera, outcome.frame).columns()
+        for kind in _OF_IMAGE:
+            path = paths[f"{kind}_path"]
+            if path is not None and (kind != "lidar" or outcome.lidar):
+                self._send(path, path)
+
+    def finish(self) -> Part:
+        """Send what is left, then make the block visible.
+
+        Raises:
+            OutputError: a file could not be written; the block is invisible then.
+        """
+        rows = read_manifest(self._folder)
+        new = _renamed(rows, self._block.file_stem)
+        for kind in PATH_KINDS:
+            here, there = rows[f"{kind}_path"].to_pylist(), new[f"{kind}_path"].to_pylist()
+            for source, target in dict(zip(here, there, strict=True)).items():
+                if source is not None and target not in self._sent:
+                    self._send(source, target)
+        for path in self._of_variant():
+            self._send(path, path)
+        for future in self._sent.values():
+            future.result()
+        return publish_part(self._store, self._block.key, new)
+
+    def clear(self) -> None:
+        """Delete the folder that the block was rendered in."""
+        try:
+            shutil.rmtree(self._folder)
+        except OSError as error:
+            raise OutputError(f"cannot delete {self._folder}: {error.strerror}") from error
+
+    def _send(self, source: str, target: str) -> None:
+        self._sent[target] = self._pool.submit(self._store.put_file, target, self._folder / source)
+
+    def _of_variant(self) -> Iterator[str]:
+        """The recipe, and the files of its style: every block of a variant has the same."""
+        for path in sorted(self._folder.glob("*/*/recipe.yaml")):
+            yield path.relative_to(self._folder).as_posix()
+        for path in sorted(self._folder.glob("*/*/style/*")):
+            yield path.relative_to(self._folder).as_posix()
+
+
+def staging_folder(store: Store, scratch: Path | None, block: Block) -> Path:
+    """Where a block is rendered: on the output's own disk, else in `scratch`.
+
+    There a killed job finds again what it had finished of the block.
+    """
+    if store.local_dir is not None:
+        return store.local_dir / STATE_FOLDER / "blocks" / block.claim
+    assert scratch is not None, "a store elsewhere needs a folder to render in"
+    return scratch / "blocks" / block.claim
+
+
+def _renamed(rows: pa.Table, stem: str) -> pa.Table:
+    for kind in _OF_BLOCK:
+        name = f"{kind}_path"
+        paths = [None if p is None else _of_block(p, stem) for p in rows[name].to_pylist()]
+        place = rows.column_names.index(name)
+        rows = rows.set_column(place, rows.schema.field(place), pa.array(paths, pa.string()))
+    return rows.combine_chunks()
+
+
+def _of_block(path: str, stem: str) -> str:
+    """`labels/boxes.parquet` -> `labels/boxes/<stem>.parquet`."""
+    whole = PurePosixPath(path)
+    return str(whole.with_suffix("") / f"{stem}{whole.suffix}")

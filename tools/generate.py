@@ -1,0 +1,228 @@
+"""`climategs generate`: a job file becomes a plan, and the plan a dataset."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import signal
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from adapters.base import open_scene
+from adapters.patterns import scenes_of
+from augment.batch.store import open_store
+from augment.errors import ClimateGSError
+from augment.generate.job import (
+    GenerateJob,
+    GenerateResult,
+    default_scratch,
+    plan_job,
+    run_generate,
+)
+from augment.generate.plan import Plan, shard_of
+from augment.generate.status import JobStatus, read_status
+from augment.generate.workshop import WorkSetup
+from recipes.job import load_job, load_job_recipes
+
+if TYPE_CHECKING:
+    from recipes.schema import Recipe
+
+Executor = Literal["serial", "processes", "ray"]
+_MOST_LINES = 20
+
+
+def generate_dataset(
+    job: Path,
+    out: str,
+    *,
+    executor: Executor = "processes",
+    workers: int | None = None,
+    shard: str = "1/1",
+    backend: str = "auto",
+    scratch: Path | None = None,
+    rescan: bool = False,
+    dry_run: bool = False,
+) -> int:
+    """Runs the job and prints what became of it. Returns the exit code: 1 where images failed."""
+    wanted = load_job(job)
+    recipes = load_job_recipes(wanted, job.parent)
+    setup = WorkSetup(
+        store_uri=str(out),
+        scratch=scratch or default_scratch(out),
+        backend=backend,
+        open_scene=open_scene,
+    )
+    task = GenerateJob(
+        recipes,
+        scenes_of(wanted.scenes, job.parent),
+        setup,
+        executor=executor,
+        workers=workers,
+        shard=parse_shard(shard),
+        rescan=rescan,
+    )
+    if dry_run:
+        return _dry_run(task)
+    with _ended_by_sigterm():
+        result = run_generate(task, prepare=_warm_up)
+    _report(result, out)
+    return 1 if result.failed or result.unusable else 0
+
+
+def show_status(out: str) -> int:
+    """Prints how far the jobs of an output have come. Returns the exit code: 1 for unfinished ones.
+
+    Raises:
+        ClimateGSError: no job was ever started there.
+    """
+    found = read_status(open_store(out))
+    if not found:
+        raise ClimateGSError(f"{out}: no job has been started there (no .climategs/jobs)")
+    for status in found:
+        _print_status(status)
+    return 0 if all(_is_done(status) for status in found) else 1
+
+
+def parse_shard(text: str) -> tuple[int, int]:
+    """`2/8`, the second of eight.
+
+    Raises:
+        ClimateGSError: the text is something else.
+    """
+    number, slash, count = text.partition("/")
+    if not (slash and number.isdecimal() and count.isdecimal()) or not (
+        1 <= int(number) <= int(count)
+    ):
+        raise ClimateGSError(f"--shard {text!r}: write i/n with i from 1 to n, as in 2/8")
+    return int(number), int(count)
+
+
+def _dry_run(job: GenerateJob) -> int:
+    from augment.generate.estimate import estimate
+
+    plan = plan_job(job)
+    blocks = shard_of(plan.blocks, *job.shard)
+    _print_plan(plan, len(blocks), job)
+    guess = estimate(plan, open_scene, each=lambda name: _say(f"trying {name}"))
+    for name, sample in guess.samples.items():
+        print(
+            f"  {name}: {sample.seconds_per_mpx:.2f} s and {_size(sample.bytes_per_mpx)} a "
+            f"megapixel, {sample.prepare_s:.1f} s to prepare"
+        )
+    if guess.unsampled:
+        print(f"  taken as their mean: {', '.join(guess.unsampled)}")
+    print(
+        f"about {_duration(guess.seconds)} of one worker, {_size(guess.bytes)} "
+        f"(from one picture a recipe; right to a factor of two or so)"
+    )
+    return 1 if plan.unusable else 0
+
+
+def _print_plan(plan: Plan, blocks: int, job: GenerateJob) -> None:
+    recipes = dict.fromkeys(block.recipe.name for block in plan.blocks)
+    variants = len({(block.scene, block.variant) for block in plan.blocks})
+    print(
+        f"{plan.job}: {len(plan.records)} scenes, {len(recipes)} recipes, {variants} variants, "
+        f"{plan.images} images in {len(plan.blocks)} blocks"
+    )
+    number, count = job.shard
+    if count > 1:
+        images = sum(block.images for block in shard_of(plan.blocks, number, count))
+        print(f"shard {number}/{count}: {images} images in {blocks} blocks")
+    for name, record in list(plan.records.items())[:_MOST_LINES]:
+        images = sum(block.images for block in plan.blocks if block.scene == name)
+        print(f"  {name}: {images} images, opened in {record.open_s:.1f} s")
+    if len(plan.records) > _MOST_LINES:
+        print(f"  ... and {len(plan.records) - _MOST_LINES} more")
+    for uri, why in plan.unusable.items():
+        print(f"  cannot be used: {uri}: {why}")
+
+
+def _report(result: GenerateResult, out: str) -> None:
+    rate = result.written / result.seconds if result.seconds else 0.0
+    print(
+        f"{result.written} images written, {result.skipped} already there, {result.failed} failed; "
+        f"{_duration(result.seconds)}, {rate:.1f} images/s"
+    )
+    for failure in result.failures[:_MOST_LINES]:
+        _say(f"failed: {failure}")
+    if len(result.failures) > _MOST_LINES:
+        more = len(result.failures) - _MOST_LINES
+        _say(f"... and {more} more; the manifest has them all")
+    for uri, why in result.unusable.items():
+        _say(f"cannot be used: {uri}: {why}")
+    print(f"output: {out}   (climategs report {out} shows it)")
+
+
+def _print_status(status: JobStatus) -> None:
+    total = status.total
+    share = 100 * total.published / max(total.planned, 1)
+    print(
+        f"{status.job}: {total.published} of {total.planned} images published ({share:.1f} %), "
+        f"{status.blocks_published} of {status.blocks} blocks"
+    )
+    if status.staged:
+        print(f"  {status.staged} more are finished in blocks that are not")
+    if status.claims:
+        print(f"  {status.claims} blocks are being worked on")
+    if status.left_s and not _is_done(status):
+        print(f"  {status.images_per_s:.1f} images/s; about {_duration(status.left_s)} left")
+    for kind, groups in (("scene", status.by_scene), ("recipe", status.by_recipe)):
+        open_ones = {n: g for n, g in groups.items() if g.published < g.planned}
+        for name, group in list(open_ones.items())[:_MOST_LINES]:
+            print(f"  {kind} {name}: {group.published} of {group.planned}")
+        if len(open_ones) > _MOST_LINES:
+            print(f"  ... and {len(open_ones) - _MOST_LINES} more {kind}s")
+    if total.in_failed_blocks:
+        print(
+            f"  with failures: blocks of {total.in_failed_blocks} images; start it again to retry"
+        )
+    for uri, why in status.unusable.items():
+        print(f"  cannot be used: {uri}: {why}")
+
+
+def _is_done(status: JobStatus) -> bool:
+    total = status.total
+    return total.published == total.planned and not total.in_failed_blocks and not status.unusable
+
+
+def _warm_up(recipes: list[Recipe]) -> None:
+    from tools.warm_up import warm_up
+
+    seconds = warm_up(recipes)
+    if seconds > 1:
+        _say(f"compiled the kernels in {seconds:.1f} s (kept for the next run)")
+
+
+@contextlib.contextmanager
+def _ended_by_sigterm() -> Iterator[None]:
+    """Let a scheduler's SIGTERM end the job as Ctrl-C does."""
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 90:
+        return f"{seconds:.1f} s"
+    if seconds < 5400:
+        return f"{seconds / 60:.0f} min"
+    return f"{seconds / 3600:.1f} h"
+
+
+def _size(count: float) -> str:
+    steps = ("B", "kB", "MB", "GB", "TB")
+    step = min(int(math.log(max(count, 1), 1000)), len(steps) - 1)
+    return f"{count / 1000**step:.1f} {steps[step]}"
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr)
