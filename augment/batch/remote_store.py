@@ -88,6 +88,7 @@ class RemoteStore:
 
     def put_file(self, path: str, source: Path) -> None:
         """The file is read into memory first: one that fails to be read must not be uploaded."""
+        path = stored_path(path, self.uri)
         try:
             data = source.read_bytes()
         except OSError as error:
@@ -212,8 +213,10 @@ def _put(system: FileSystem, path: str, data: bytes) -> None:
 
 def _put_and_move(system: FileSystem, path: str, data: bytes) -> None:
     folder, _, name = path.rpartition("/")
-    temporary = f"{folder}/.{name}.{os.getpid()}-{next(_numbers)}{TEMPORARY_SUFFIX}"
-    system.create_dir(folder, recursive=True)
+    hidden = f".{name}.{os.getpid()}-{next(_numbers)}{TEMPORARY_SUFFIX}"
+    temporary = f"{folder}/{hidden}" if folder else hidden
+    if folder:
+        system.create_dir(folder, recursive=True)
     try:
         _put(system, temporary, data)
         system.move(temporary, path)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 import urllib.parse
 from dataclasses import dataclass, field
@@ -126,17 +125,16 @@ class RemoteUri:
 
 def _check_kind(scheme: str, host: str, public: str) -> None:
     if scheme not in _KINDS and not scheme.startswith("fsspec+"):
-        near = difflib.get_close_matches(scheme, _KINDS, 1)
         raise OutputError(
             f"{public}: there are no stores of the kind {scheme!r}; use a path of this machine, "
-            f"or one of {', '.join(_KINDS)}" + (f". Did you mean {near[0]}://?" if near else "")
+            f"or one of {', '.join(_KINDS)}"
         )
     if scheme in _OBJECT_STORES and not host:
         raise OutputError(f"{public} names no bucket; expected {scheme}://bucket/folder")
 
 
 def _check_folder(path: str, fragment: str, public: str) -> None:
-    folder = urllib.parse.unquote(path).strip("/")
+    folder = urllib.parse.unquote(path).removeprefix("/")
     is_clean = "/".join(relative_parts(folder) or ()) == folder and not _CONTROL.search(folder)
     if fragment or not is_clean:
         raise OutputError(

@@ -88,8 +88,8 @@ def open_store(uri: str | Path) -> Store:
 
     if isinstance(uri, Path) or "://" not in uri:
         return LocalStore(Path(uri).absolute())
-    parsed = urllib.parse.urlsplit(uri)
-    if parsed.scheme == "file":
+    if uri.lower().startswith("file:"):
+        parsed = urllib.parse.urlsplit(uri)
         if parsed.netloc not in ("", "localhost") or not parsed.path.startswith("/"):
             raise OutputError(f"{uri!r} must be file:///absolute/path")
         return LocalStore(Path(urllib.parse.unquote(parsed.path)))
