@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from augment.apply import render_buffers, render_view
-from augment.dataset_scene import SceneDataset
+from augment.dataset import SceneDataset
 from augment.plan import make_plan
 from augment.render.rasterize import rasterize
 from augment.scene import Scene

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Any
 
+import torch
 from torch.utils.data import Dataset
 
 from augment.batch.backends import choose_backend
@@ -16,8 +17,18 @@ from augment.batch.runner import Renderer, default_renderer
 from augment.batch.selection import SceneIndex, select_frames
 from augment.batch.snow_beds import find_bed, remember, snow_to_lay
 from augment.batch.style_maps import store_maps
-from augment.batch.writer import check_view
-from augment.dataset_samples import ImageType, Pixels, make_sample
+from augment.batch.writer import View, check_view
+from augment.cameras import Camera, Frame
+from augment.dataset.boxes import BoxFrame
+from augment.dataset.samples import (
+    BUFFERS,
+    DEFAULT_LOAD,
+    ImageType,
+    Labels,
+    Pixels,
+    SampleOptions,
+    make_sample,
+)
 from augment.scene import Scene
 from recipes.files import with_digest
 from recipes.schema import Recipe
@@ -33,12 +44,14 @@ class SceneDataset(Dataset):
     samples and worker processes.
 
     scene: an open scene. frames, cameras: what to keep, None for all. backend: as in `rasterize`.
-    renderer: `augment.apply.render_view` if None.
+    renderer: `augment.apply.render_view` if None. load, box_frame, transform: as for
+    `WeatherDataset`; a live scene passes no sweeps on.
 
     Raises:
         SceneError: an unknown frame or camera, or the scene cannot have the recipe's snow.
         RecipeError, StyleError: a file of the recipe's style cannot be used.
-        BackendUnavailable, ValueError: the backend.
+        BackendUnavailable: the backend.
+        ValueError: the backend, or an unknown option.
     """
 
     def __init__(
@@ -51,11 +64,17 @@ class SceneDataset(Dataset):
         backend: str = "auto",
         image_type: ImageType = "float32",
         renderer: Renderer | None = None,
+        load: Collection[str] = DEFAULT_LOAD,
+        box_frame: BoxFrame = "world",
+        transform: Callable[[dict[str, Any]], Any] | None = None,
     ) -> None:
-        if image_type not in ("float32", "uint8"):
-            raise ValueError(f"image_type must be 'float32' or 'uint8'; got {image_type!r}")
-        self.scene, self.recipe = scene, with_digest(recipe)
-        self.image_type: ImageType = image_type
+        self.options = SampleOptions.checked(image_type, load, box_frame)
+        if "lidar" in load:
+            raise ValueError(
+                "load must not have 'lidar' for a live scene: run a job with output: {lidar: true} "
+                "and read it with WeatherDataset"
+            )
+        self.scene, self.recipe, self.transform = scene, with_digest(recipe), transform
         self._backend = choose_backend(backend, scene) if renderer is None else backend
         self._renderer = renderer or default_renderer()
         self._index = SceneIndex.of(scene)
@@ -78,33 +97,26 @@ class SceneDataset(Dataset):
     def __len__(self) -> int:
         return len(self._items)
 
-    def __getitem__(self, index: int) -> dict[str, Any]:
+    def __getitem__(self, index: int) -> Any:
         if not -len(self) <= index < len(self):
             raise IndexError(f"sample {index} of a dataset of {len(self)}")
-        frame, name = self._items[index]
-        camera, recipe = frame.cameras[name], self.recipe
+        sample = self._render(*self._items[index])
+        return sample if self.transform is None else self.transform(sample)
+
+    def _render(self, frame: Frame, name: str) -> dict[str, Any]:
+        camera, recipe, load = frame.cameras[name], self.recipe, self.options.load
         view = self._renderer(self.scene, camera, recipe, backend=self._backend)
         written = camera.scaled(recipe.render.scale)
         check_view(view, written, recipe)
-        rgb = view.rgb
-        if recipe.output.image != "png":
-            rgb = decode_image(encode_image(rgb, recipe.output))
-        has_labels = recipe.output.labels and frame.index in self._index.labelled
-        boxes = self.scene.boxes(frame.index) if has_labels else None
         origin_m = self._index.world_origin_m
+        world_from_ego = frame.world_from_ego.clone()
+        world_from_ego[:3, 3] += torch.from_numpy(origin_m)
         return make_sample(
-            pixels=Pixels(
-                rgb,
-                None if view.depth_m is None else quantise_depth(view.depth_m),
-                view.semantic,
-                view.instance,
-                view.water,
-                view.snow,
-            ),
-            image_type=self.image_type,
+            options=self.options,
+            pixels=self._pixels(view),
             camera=camera_record(written, origin_m),
-            boxes=boxes,
-            box_weather={} if boxes is None else measure_boxes(boxes, origin_m, written, view),
+            world_from_ego=world_from_ego,
+            labels=self._labels(frame, written, view) if "boxes" in load else Labels(),
             weather=recipe.weather_numbers(),
             paths=dict.fromkeys(PATH_KINDS),
             names={
@@ -115,3 +127,23 @@ class SceneDataset(Dataset):
                 "surface": recipe.output.surface,
             },
         )
+
+    def _pixels(self, view: View) -> Pixels:
+        """What of a view the samples hold, as files would."""
+        load, output, rgb = self.options.load, self.recipe.output, None
+        if "image" in load:
+            rgb = view.rgb
+            if output.image != "png":
+                rgb = decode_image(encode_image(rgb, output))
+        depth = None if view.depth_m is None else quantise_depth(view.depth_m)
+        buffers = (depth, view.semantic, view.instance, view.water, view.snow)
+        return Pixels(
+            rgb, *(b if kind in load else None for kind, b in zip(BUFFERS, buffers, strict=True))
+        )
+
+    def _labels(self, frame: Frame, camera: Camera, view: View) -> Labels:
+        """The boxes of a frame, as the files of a job would have them. camera: as written."""
+        if not (self.recipe.output.labels and frame.index in self._index.labelled):
+            return Labels()
+        boxes = self.scene.boxes(frame.index)
+        return Labels(boxes, measure_boxes(boxes, self._index.world_origin_m, camera, view))
