@@ -8,7 +8,6 @@ import threading
 import pytest
 from s3_server import s3_server
 
-from augment.batch import remote_store
 from augment.batch.remote_errors import advice, is_permanent
 from augment.batch.remote_store import Patience, RemoteStore
 from augment.batch.store import StoredFileMissing, open_store
@@ -202,10 +201,21 @@ def test_interrupts_wait_for_the_upload(server, store):
     assert store.read("a") == b"22"
 
 
-def test_uploads_are_out_of_reach_of_signals():
-    threads = []
-    remote_store._uninterrupted(lambda: threads.append(threading.current_thread()))
-    assert threads[0] is not threading.main_thread()
+def test_uploads_are_out_of_reach_of_signals(store):
+    """An exception between opening and writing would replace the file by an empty one."""
+    store.write("a", b"1")
+    system, threads = store._system(), []
+
+    class Spy:
+        get_file_info = staticmethod(system.get_file_info)
+
+        def open_output_stream(self, *arguments, **options):
+            threads.append(threading.current_thread())
+            return system.open_output_stream(*arguments, **options)
+
+    store._opened = Spy()
+    store.write("a", b"2")
+    assert len(threads) == 1 and threads[0] is not threading.main_thread()
 
 
 def _in_child(store, connection):
