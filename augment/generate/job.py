@@ -76,7 +76,8 @@ class GenerateJob:
 class GenerateResult:
     """Images of this shard. skipped: finished before, here or elsewhere. unusable: scenes by URI.
 
-    timings: seconds by kind of work, summed over threads and workers, and `plan` and `scan`.
+    timings: seconds by kind of work, summed over threads and workers, and by the clock: `plan`,
+    with the scenes' opening, `scan` of what is finished, and `render_wall`, all else.
     """
 
     written: int
@@ -93,30 +94,31 @@ def run_generate(
     *,
     progress: bool = True,
     prepare: Callable[[list[Recipe]], None] = lambda recipes: None,
+    on_image: Callable[[int, int], None] = lambda done, failed: None,
 ) -> GenerateResult:
     """Render and publish what of the job is not finished yet.
 
     progress: bars on stderr. prepare: called before the first image is rendered, if any has to be,
-    with one recipe of each name; to compile kernels once and not in every worker, say. A KeyboardInterrupt lets workers finish the images they have at hand,
-    merges what is published into the manifest, and is raised again.
+    with one recipe of each name; to compile kernels once and not in every worker, say. on_image: is
+    told how many images are done and how many of them failed, from several threads.
+
+    A KeyboardInterrupt lets workers finish the images they have at hand, merges what is published
+    into the manifest, and is raised again.
 
     Raises:
         OutputError: the output cannot be written, or holds images of another kind under the same
             names; nothing was written then. ClimateGSError: no scene can be used.
         RecipeError: a recipe cannot be used.
     """
-    return _Generation(job, progress, prepare).go()
+    return _Generation(job, progress, prepare, on_image).go()
 
 
-def plan_job(job: GenerateJob, *, progress: bool = True, keep: bool = False) -> Plan:
-    """The job's plan, for which its scenes are opened that have not been; writes nothing.
-
-    keep: write what was found of the scenes into the output, for the next time.
-    """
+def plan_job(job: GenerateJob, *, progress: bool = True) -> Plan:
+    """The job's plan, for which its scenes are opened that have not been; writes nothing."""
     store = open_store(job.setup.store_uri)
     driver = Driver(lambda tick: make_pool(job, tick))
     with contextlib.closing(driver):
-        return _plan(job, store, driver, progress, keep)
+        return _plan(job, store, driver, progress, keep=False)
 
 
 def make_pool(job: GenerateJob, tick: Tick) -> WorkerPool:
@@ -157,9 +159,14 @@ class _Generation:
     """One call of run_generate."""
 
     def __init__(
-        self, job: GenerateJob, progress: bool, prepare: Callable[[list[Recipe]], None]
+        self,
+        job: GenerateJob,
+        progress: bool,
+        prepare: Callable[[list[Recipe]], None],
+        on_image: Callable[[int, int], None],
     ) -> None:
-        self._job, self._progress, self._prepare = job, progress, prepare
+        self._job, self._progress = job, progress
+        self._prepare, self._on_image = prepare, on_image
         self._store = open_store(job.setup.store_uri)
         self._merged_at, self._merge_s = time.monotonic(), 0.0
         self._timings: dict[str, float] = {}
@@ -170,14 +177,18 @@ class _Generation:
             lambda tick: make_pool(self._job, tick), on_image=self._show, idle=self._merge_at_times
         )
         with contextlib.closing(self._driver):
-            self._plan = plan = _plan(self._job, self._store, self._driver, self._progress, True)
+            self._plan = plan = _plan(
+                self._job, self._store, self._driver, self._progress, keep=True
+            )
             self._timings["plan"] = time.perf_counter() - started
             blocks = shard_of(plan.blocks, *self._job.shard)
             pending = self._pending(blocks)
             self._timings["scan"] = time.perf_counter() - started - self._timings["plan"]
             done = sum(b.images for b in blocks) - sum(b.images for b in pending)
             self._driver.tally.skipped = done
+            begun = time.perf_counter()
             self._render(pending, total=sum(block.images for block in blocks))
+            self._timings["render_wall"] = time.perf_counter() - begun
         self._merge(wait=True)
         tally = self._driver.tally
         return GenerateResult(
@@ -224,6 +235,7 @@ class _Generation:
         if failed:
             self._bar.set_postfix(failed=failed, refresh=False)
         self._bar.update(done - self._bar.n)
+        self._on_image(done, failed)
 
     def _fail(self, block: Block, message: str) -> None:
         """Publish a block whose images have all failed, unless others have finished it."""
@@ -266,7 +278,7 @@ class _Generation:
         self._merge_s = self._merged_at - started
 
 
-def _plan(job: GenerateJob, store: Store, driver: Driver, progress: bool, keep: bool) -> Plan:
+def _plan(job: GenerateJob, store: Store, driver: Driver, progress: bool, *, keep: bool) -> Plan:
     found: dict[tuple[str, str | None], SceneRecord | str] = {}
     for entry in job.scenes:
         record = None if job.rescan else _known(store, entry)

@@ -6,7 +6,7 @@ import time
 from collections import defaultdict
 from dataclasses import dataclass
 
-from augment.batch.claims import CLAIMS_FOLDER
+from augment.batch.claims import CLAIMS_FOLDER, try_claim
 from augment.batch.layout import STATE_FOLDER
 from augment.batch.parts import Part, list_parts
 from augment.batch.store import Store
@@ -29,7 +29,7 @@ class JobStatus:
     """staged: images that are finished in blocks that are not published, on this machine.
 
     images_per_s: of the last blocks together, None where too few tell. claims: blocks that
-    somebody works on, or did when it was killed.
+    somebody works on.
     """
 
     job: str
@@ -125,6 +125,16 @@ def _staged(store: Store) -> dict[str, int]:
 
 
 def _claims(store: Store) -> set[str]:
-    """Names of what is claimed; of a process that was killed on another machine for a while yet."""
+    """Names of what is claimed; elsewhere also by a process that was killed some seconds ago."""
     paths = store.list(CLAIMS_FOLDER)
-    return {p.removeprefix(f"{CLAIMS_FOLDER}/").split("/")[0].removesuffix(".lock") for p in paths}
+    names = {p.removeprefix(f"{CLAIMS_FOLDER}/").split("/")[0].removesuffix(".lock") for p in paths}
+    return names if store.local_dir is None else {name for name in names if _is_held(store, name)}
+
+
+def _is_held(store: Store, name: str) -> bool:
+    """Whether the claim's holder lives; a dead one's is cleared away."""
+    claim = try_claim(store, name)
+    if claim is None:
+        return True
+    claim.release()
+    return False
