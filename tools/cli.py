@@ -8,15 +8,17 @@ import sys
 
 import tyro
 
-from tools import commands, export_commands, style_commands
+from tools import commands, export_commands, generate_commands, report_command, style_commands
 
 COMMANDS = {
     "render": commands.render,
+    "generate": generate_commands.generate,
     "fit": commands.fit,
     "inspect": commands.inspect,
     "explain": commands.explain,
     "recipes": commands.recipes,
     "sheet": commands.sheet,
+    "report": report_command.report,
     "bench": commands.bench,
     "demo": commands.demo,
     "style": commands.style,

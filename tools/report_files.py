@@ -1,0 +1,81 @@
+"""Reading an output's files for its report: what cannot be read is noted, and does not stop it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import PurePosixPath
+from typing import Protocol
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from augment.batch.store import StoredFileMissing
+from augment.errors import OutputError
+
+LARGEST_FILE = 1 << 28  # bytes; a report needs no larger one
+MOST_PROBLEMS = 50  # that the page lists
+
+
+class Readable(Protocol):
+    """What a report asks of a store (`augment.batch.store`)."""
+
+    @property
+    def uri(self) -> str: ...
+
+    def read(self, path: str) -> bytes: ...
+
+
+class Sized(Protocol):
+    """A file in a store's listing."""
+
+    @property
+    def size(self) -> int: ...
+
+
+class ReportFiles:
+    """The files of one output. listing: of the whole store.
+
+    problems: why files could not be read, by path. unlisted: how many more there are.
+    """
+
+    def __init__(self, store: Readable, listing: Mapping[str, Sized]) -> None:
+        self._store, self._listing = store, listing
+        self.problems: dict[str, str] = {}
+        self.unlisted = 0
+
+    def read(self, path: str) -> bytes | None:
+        """The file's content; None, and noted, where there is none that can be used."""
+        parts = PurePosixPath(path).parts
+        if not parts or parts[0] == "/" or ".." in parts or "\\" in path or "\0" in path:
+            return self.note(path, "the path leads out of the output: do not trust this manifest")
+        stored = self._listing.get(path)
+        if stored is not None and stored.size > LARGEST_FILE:
+            return self.note(path, f"larger than {LARGEST_FILE >> 20} MiB: not looked at")
+        try:
+            return self._store.read(path)
+        except StoredFileMissing:
+            return self.note(path, "missing")
+        except OutputError as error:
+            # A page that is handed on says nothing of the machine that it was made on.
+            return self.note(path, str(error).replace(self._store.uri, "OUT"))
+
+    def read_columns(self, path: str, wanted: tuple[str, ...]) -> pa.Table | None:
+        """Those of `wanted` that a Parquet file has; None, and noted, where it is none."""
+        data = self.read(path)
+        if data is None:
+            return None
+        try:
+            file = pq.ParquetFile(pa.BufferReader(data))
+            there = [name for name in wanted if name in file.schema_arrow.names]
+            return file.read(columns=there, use_threads=False)
+        except (OSError, ValueError, pa.ArrowException) as error:
+            return self.note(path, f"not a readable Parquet file: {error}")
+
+    def note(self, path: str, why: str) -> None:
+        """Remember that a file is damaged."""
+        if path in self.problems:
+            return
+        if len(self.problems) < MOST_PROBLEMS:
+            self.problems[path] = why
+        else:
+            self.unlisted += 1
