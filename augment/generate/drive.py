@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
@@ -60,17 +60,28 @@ class Driver:
     def index(
         self, tasks: Sequence[IndexTask], each: Callable[[IndexTask, SceneRecord | str], None]
     ) -> None:
-        """Open scenes and tell `each` what is in them, or why that is not known."""
-        waiting, busy = list(reversed(tasks)), dict[int, IndexTask]()
-        while waiting or busy:
+        """Open scenes and tell `each` what is in them, or why that is not known.
+
+        A scene whose worker dies is tried once more, while no other worker is busy.
+        """
+        waiting, alone = deque(tasks), deque[IndexTask]()
+        busy: dict[int, IndexTask] = {}
+        tried_alone: set[IndexTask] = set()
+        while waiting or alone or busy:
             for slot in range(self._pool.slots):
                 if waiting and slot not in busy:
-                    busy[slot] = waiting.pop()
+                    busy[slot] = waiting.popleft()
                     self._pool.give(slot, busy[slot])
+            if alone and not busy:
+                busy[0] = alone.popleft()
+                tried_alone.add(busy[0])
+                self._pool.give(0, busy[0])
             for event in self._pool.wait(WAIT_S):
                 task = busy.pop(event.slot)
-                if isinstance(event, Lost):
-                    each(task, f"the worker process {event.how} while opening the scene")
+                if _wants_memory(event) and task not in tried_alone:
+                    alone.append(task)
+                elif isinstance(event, Lost):
+                    each(task, f"the worker {event.how} while opening the scene, alone too")
                 elif isinstance(event.result, SceneRecord):
                     self._open[event.slot] = event.result.name
                     each(task, event.result)
@@ -155,7 +166,11 @@ class _Rendering:
         block = task.block
         if isinstance(event, Lost):
             self._driver._open[event.slot] = None
-            self._lost(task, event.how)
+        if _wants_memory(event) and not task.is_trial:
+            _log.warning("%s is tried once more, alone: %s", block.key, _why(event))
+            self._trials.append(block)
+        elif isinstance(event, Lost):
+            self._give_up(block, _lost_twice(event))
         elif isinstance(event.result, TaskFailed):
             _raise_if_output(event.result)
             self._failed(block, event.result)
@@ -176,18 +191,6 @@ class _Rendering:
         for kind, seconds in (done.seconds or {}).items():
             tally.seconds[kind] += seconds
 
-    def _lost(self, task: BlockTask, how: str) -> None:
-        block = task.block
-        if not task.is_trial:
-            _log.warning("a worker %s; its block %s is tried once more", how, block.key)
-            self._trials.append(block)
-            return
-        self._give_up(
-            block,
-            f"the worker {how} while at this block of images, and again when it was tried alone; "
-            f"if memory ran out, use fewer workers or a machine with more",
-        )
-
     def _failed(self, block: Block, failed: TaskFailed) -> None:
         self._give_up(block, failed.text)
         if failed.of_scene:
@@ -199,6 +202,26 @@ class _Rendering:
         tally = self._driver.tally
         tally.failed += block.images
         tally.failures.append(f"{block.scene}/{block.variant}, {block.images} images: {message}")
+
+
+def _wants_memory(event: Event) -> bool:
+    """Whether the task may succeed alone: its worker died, or ran out of memory."""
+    if isinstance(event, Lost):
+        return True
+    return isinstance(event.result, TaskFailed) and event.result.of_memory
+
+
+def _why(event: Event) -> str:
+    if isinstance(event, Lost):
+        return f"its worker {event.how}"
+    return event.result.text if isinstance(event.result, TaskFailed) else ""
+
+
+def _lost_twice(event: Lost) -> str:
+    return (
+        f"the worker {event.how} while at this block of images, and again when it was tried alone; "
+        f"if memory ran out, use fewer workers or a machine with more"
+    )
 
 
 def _raise_if_output(failed: TaskFailed) -> None:

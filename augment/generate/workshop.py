@@ -83,12 +83,14 @@ class BlockDone:
 class TaskFailed:
     """The task could not be done. is_output: nothing can be written, so that all others would fail.
 
-    of_scene: the scene could not be opened, so that its other blocks would fail too.
+    of_scene: the scene could not be opened, so that its other blocks would fail too. of_memory: it
+    may succeed while no other worker takes any.
     """
 
     text: str
     is_output: bool = False
     of_scene: bool = False
+    of_memory: bool = False
 
 
 Result = SceneRecord | BlockDone | TaskFailed
@@ -113,10 +115,11 @@ class Workshop:
         except OutputError as error:
             return TaskFailed(str(error), is_output=True)
         except _SceneFailed as error:
-            return TaskFailed(str(error), of_scene=True)
+            of_memory = isinstance(error.__cause__, MemoryError)
+            return TaskFailed(str(error), of_scene=True, of_memory=of_memory)
         except Exception as error:
             _log.debug("task failed", exc_info=True)
-            return TaskFailed(_said(error))
+            return TaskFailed(_said(error), of_memory=isinstance(error, MemoryError))
 
     def _index(self, task: IndexTask) -> SceneRecord:
         started = time.perf_counter()
