@@ -1,8 +1,8 @@
 """Another process that claims things; light to start.
 
-claim_holder.py hold URI NAME                claims, says so, and stays until it is killed
-claim_holder.py leave URI NAME               claims, and ends without releasing it by itself
-claim_holder.py contend URI NAME COUNT LOG   holds it COUNT times; LOG must never hold two
+claim_holder.py hold NAME URI ...                  claims, says so, and stays until it is killed
+claim_holder.py leave NAME URI ...                 claims, and ends without releasing anything
+claim_holder.py contend NAME (URI COUNT LOG) ...   holds it COUNT times; two never have LOG
 """
 
 import os
@@ -12,37 +12,40 @@ import time
 from augment.batch.claims import ClaimTimes, try_claim
 from augment.batch.store import open_store
 
-TIMES = ClaimTimes(renewal_s=0.1, lifetime_s=0.5, attempts=4, longest_wait_s=0.02)
 PATIENT = ClaimTimes(renewal_s=5.0, lifetime_s=60.0, attempts=4, longest_wait_s=0.02)
 
 
-def contend(uri: str, name: str, count: int, log: str) -> None:
-    """Hold the claim `count` times; the file `log` is made and deleted by whoever holds it.
+def contend(name: str, places: list[str]) -> None:
+    """Hold the claim so many times at each place: URI, COUNT, LOG; one after the other.
 
     Raises:
         FileExistsError: two hold it at once. TimeoutError: it cannot be had.
     """
-    store, deadline_s = open_store(uri), time.monotonic() + 60
-    while count:
-        claim = try_claim(store, name, PATIENT)
-        if claim is not None:
-            with claim:
-                os.close(os.open(log, os.O_CREAT | os.O_EXCL))
-                claim.check()
-                time.sleep(0.002)
-                os.unlink(log)
-            count -= 1
-        elif time.monotonic() > deadline_s:
-            raise TimeoutError(name)
-        time.sleep(0.002)
+    deadline_s = time.monotonic() + 60
+    for uri, count, log in zip(places[::3], places[1::3], places[2::3], strict=True):
+        store, left = open_store(uri), int(count)
+        while left:
+            claim = try_claim(store, name, PATIENT)
+            if claim is not None:
+                with claim:
+                    os.close(os.open(log, os.O_CREAT | os.O_EXCL))
+                    claim.check()
+                    time.sleep(0.002)
+                    os.unlink(log)
+                left -= 1
+            elif time.monotonic() > deadline_s:
+                raise TimeoutError(name)
+            time.sleep(0.002)
 
 
 def main() -> None:
-    action, uri, name, *rest = sys.argv[1:]
+    action, name, *rest = sys.argv[1:]
     if action == "contend":
-        contend(uri, name, int(rest[0]), rest[1])
+        print("contending", flush=True)
+        contend(name, rest)
         return
-    assert try_claim(open_store(uri), name, TIMES) is not None
+    claims = [try_claim(open_store(uri), name, PATIENT) for uri in rest]
+    assert None not in claims
     print("holding", flush=True)
     if action == "hold":
         time.sleep(60)

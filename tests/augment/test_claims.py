@@ -8,11 +8,12 @@ import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import claim_holder
 import pytest
-from claim_holder import PATIENT, TIMES, contend
+from claim_holder import PATIENT, contend
 from s3_server import s3_server
 
 from augment.batch import remote_claims
@@ -21,6 +22,8 @@ from augment.batch.local_claims import try_lock
 from augment.batch.remote_store import Patience, RemoteStore
 from augment.batch.store import open_store
 from augment.errors import OutputError
+
+OFTEN = ClaimTimes(renewal_s=0.05, lifetime_s=60.0)
 
 
 @pytest.fixture(scope="module")
@@ -77,26 +80,17 @@ def test_names_are_safe(store, name):
         try_claim(store, name)
 
 
-def test_threads_and_processes_contend(store, tmp_path):
-    rounds, log = 10 if store.local_dir else 2, str(tmp_path / "held")
-    arguments = ("contend", store.uri, "a", str(rounds), log)
-    with other_process(*arguments) as first, ThreadPoolExecutor(2) as pool:
-        threads = [pool.submit(contend, store.uri, "a", rounds, log) for _ in range(2)]
+def test_threads_and_processes_contend(remote, tmp_path):
+    """Three at a time on this machine, and three through the server."""
+    local = open_store(tmp_path / "out")
+    places = [local.uri, "10", str(tmp_path / "log"), remote.uri, "2", str(tmp_path / "remote log")]
+    with other_process("contend", "a", *places) as other, ThreadPoolExecutor(2) as pool:
+        assert other.stdout.readline() == "contending\n"
+        threads = [pool.submit(contend, "a", places) for _ in range(2)]
         for thread in threads:
             thread.result()
-        assert first.wait(60) == 0
-    assert store.list("") == {}
-
-
-def test_locally_a_dead_process_is_followed_at_once(tmp_path):
-    store = open_store(tmp_path)
-    with other_process("hold", store.uri, "a") as holder:
-        assert holder.stdout.readline() == "holding\n"
-        assert try_claim(store, "a") is None
-        holder.kill()
-        holder.wait()
-        with try_claim(store, "a") as claim:
-            claim.check()
+        assert other.wait(60) == 0
+    assert remote.list("") == local.list("") == {}
 
 
 def test_a_lock_file_that_changes_hands_while_it_is_opened(tmp_path, monkeypatch):
@@ -117,25 +111,51 @@ def test_a_lock_file_that_changes_hands_while_it_is_opened(tmp_path, monkeypatch
         claim.check()
 
 
-def test_remotely_a_dead_process_is_followed_after_its_lifetime(remote):
-    with other_process("hold", remote.uri, "dead") as holder:
+class Aged:
+    """The store as it will be when what it holds now has grown old; new objects are new."""
+
+    def __init__(self, store, age_s):
+        self._store, self._age_s, self._old = store, age_s, set(store.list(""))
+
+    def __getattr__(self, name):
+        return getattr(self._store, name)
+
+    def list(self, folder):
+        found = self._store.list(folder)
+        for path in self._old & found.keys():
+            found[path] = replace(found[path], modified_s=found[path].modified_s - self._age_s)
+        return found
+
+
+def test_a_dead_process_is_followed(remote, tmp_path):
+    """At once on this machine, after its lifetime elsewhere."""
+    local = open_store(tmp_path)
+    with other_process("hold", "a", local.uri, remote.uri) as holder:
         assert holder.stdout.readline() == "holding\n"
-        with try_claim(remote, "alive", TIMES) as alive:
-            holder.kill()
-            holder.wait()
-            assert try_claim(remote, "dead", TIMES) is None
-            deadline_s = time.monotonic() + 30
-            while (claim := try_claim(remote, "dead", TIMES)) is None:
-                assert time.monotonic() < deadline_s
-                time.sleep(0.1)
-            # As old as the dead one, and renewed.
-            assert try_claim(remote, "alive", TIMES) is None
-            alive.check()
-            claim.release()
+        assert try_claim(local, "a") is None
+        holder.kill()
+        holder.wait()
+        with try_claim(local, "a") as claim:
+            claim.check()
+    for age_s in (0, PATIENT.lifetime_s - 30):
+        assert try_claim(Aged(remote, age_s), "a", PATIENT) is None
+    with try_claim(Aged(remote, PATIENT.lifetime_s + 2), "a", PATIENT) as claim:
+        claim.check()
+        assert len(remote.list("")) == 1
+        assert try_claim(remote, "a", PATIENT) is None
 
 
-def test_claims_end_with_the_process(server, remote):
-    with other_process("leave", remote.uri, "a") as process:
+def test_claims_are_renewed(server, remote):
+    with try_claim(remote, "renewed", OFTEN) as claim:
+        seen, deadline_s = len(server.requests), time.monotonic() + 60
+        while sum("PUT" in line and "renewed" in line for line in server.requests[seen:]) < 3:
+            assert time.monotonic() < deadline_s
+            time.sleep(0.01)
+        claim.check()
+
+
+def test_claims_end_with_the_process(remote):
+    with other_process("leave", "a", remote.uri) as process:
         assert process.wait(60) == 0
     assert remote.list("") == {}
 
@@ -151,23 +171,30 @@ def test_deleted_claims_are_lost(store):
 
 
 def test_a_lost_claim_is_not_renewed(remote):
-    with try_claim(remote, "a", TIMES) as claim:
-        remote.delete(remote.list(CLAIMS_FOLDER))
-        time.sleep(3 * TIMES.renewal_s)
+    with try_claim(remote, "a", OFTEN) as claim:
+        deadline_s = time.monotonic() + 60
+        while claim._thread.is_alive():  # a renewal under way may bring it back
+            assert time.monotonic() < deadline_s
+            remote.delete(remote.list(CLAIMS_FOLDER))
         assert remote.list(CLAIMS_FOLDER) == {}
         with pytest.raises(OutputError, match="object was deleted"):
             claim.check()
 
 
-def test_claims_that_cannot_be_renewed_are_lost(server, remote, caplog):
-    with try_claim(remote, "a", TIMES) as claim:
+def test_claims_that_cannot_be_renewed_are_lost(server, remote, caplog, monkeypatch):
+    with try_claim(remote, "a", OFTEN) as claim:
         server.fail(1000, status=503)
-        claim._thread.join(30)
+        deadline_s = time.monotonic() + 60
+        while "a claim was not renewed: cannot" not in caplog.text:
+            assert time.monotonic() < deadline_s
+            time.sleep(0.01)
+        now_s = remote_claims._clock_s()
+        monkeypatch.setattr(remote_claims, "_clock_s", lambda: now_s + OFTEN.lifetime_s + 1)
+        claim._thread.join(60)
         assert not claim._thread.is_alive()
         server.forgive()
         with pytest.raises(OutputError, match="not renewed"):
             claim.check()
-    assert "a claim was not renewed: cannot" in caplog.text
 
 
 def test_a_renewal_that_comes_too_late_is_taken_back(remote, monkeypatch):
@@ -182,7 +209,7 @@ def test_a_renewal_that_comes_too_late_is_taken_back(remote, monkeypatch):
 
 
 def test_a_contender_that_stood_still_withdraws(remote, monkeypatch):
-    clock_s = iter([0.0, TIMES.lifetime_s + 1, 0.0, TIMES.lifetime_s + 1])
+    clock_s = iter([0.0, 1.0, 0.0, 1.0])
     monkeypatch.setattr(remote_claims, "_clock_s", lambda: next(clock_s))
     assert try_claim(remote, "a", ClaimTimes(0.1, 0.5, attempts=2, longest_wait_s=0.01)) is None
     assert remote.list("") == {}

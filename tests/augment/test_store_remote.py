@@ -4,6 +4,7 @@ import multiprocessing
 import pickle
 import signal
 import threading
+import time
 
 import pytest
 from s3_server import s3_server
@@ -95,7 +96,7 @@ def test_other_operations_outlast_failures(server, store):
 
 def test_a_server_that_stands_still_is_left(server, store):
     store.write("a", b"1")
-    impatient = RemoteStore(store.uri, Patience(2, 0.001, 0.001, timeout_s=1.0))
+    impatient = RemoteStore(store.uri, Patience(6, 0.001, 0.001, timeout_s=1.0))
     server.fail(1, method="PUT", delay_s=1.6, status=500)
     impatient.write("a", b"2")
     assert store.read("a") == b"2"
@@ -193,11 +194,18 @@ def test_unreadable_sources_send_nothing(server, store, tmp_path):
 def test_interrupts_wait_for_the_upload(server, store):
     store.write("a", b"1")
     server.fail(1, method="PUT", delay_s=0.3)
-    timer = threading.Timer(0.1, lambda: signal.raise_signal(signal.SIGINT))
-    timer.start()
+    before = len(server.requests)
+
+    def interrupt():
+        while len(server.requests) == before:
+            time.sleep(0.01)
+        signal.raise_signal(signal.SIGINT)
+
+    interrupter = threading.Thread(target=interrupt)
+    interrupter.start()
     with pytest.raises(KeyboardInterrupt):
         store.write("a", b"22")
-    timer.join()
+    interrupter.join()
     assert store.read("a") == b"22"
 
 
