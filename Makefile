@@ -3,6 +3,9 @@ PYTHON ?= python3.11
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+# Python compiles a module when it first imports it, and most of what comes along never is: compiling
+# it all takes longer than unpacking. Where Python may not keep what it has compiled, pip does it.
+COMPILE := $(if $(PYTHONDONTWRITEBYTECODE),,--no-compile)
 
 .DEFAULT_GOAL := help
 .PHONY: help setup demo test lint bench check-system clean
@@ -19,8 +22,8 @@ setup: $(STAMP)
 $(STAMP): pyproject.toml constraints.txt | check-system
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --upgrade "pip>=23.1"
-	$(BIN)/pip install --quiet torch --constraint constraints.txt
-	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[test]" \
+	$(BIN)/pip install --quiet $(COMPILE) torch --constraint constraints.txt
+	$(BIN)/pip install --quiet $(COMPILE) --constraint constraints.txt --editable ".[test]" \
 	  >$(VENV)/install.log 2>&1 || { cat $(VENV)/install.log; exit 1; }
 	touch $(STAMP)
 
