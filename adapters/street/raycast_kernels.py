@@ -166,7 +166,7 @@ def build(
         if parent >= 0:
             node_first[parent] = node
         bounds = node_bounds[node]
-        bounds[:3], bounds[3:] = math.inf, -math.inf
+        _empty(bounds)
         for entry in range(start, stop):
             _grow(bounds, low[order[entry]], high[order[entry]])
         if stop - start <= leaf_shapes:
@@ -178,6 +178,13 @@ def build(
         todo[top + 1, 0], todo[top + 1, 1], todo[top + 1, 2] = start, middle, -1
         top += 2
     return nodes
+
+
+# Element by element: assignments to slices, whose shapes numba checks, take seconds to compile.
+@njit(cache=True)
+def _empty(bounds):
+    for axis in range(3):
+        bounds[axis], bounds[3 + axis] = math.inf, -math.inf
 
 
 @njit(cache=True)
@@ -209,24 +216,25 @@ def _split(low, high, order, start, stop, scratch):
         spans[axis, 0], spans[axis, 1] = first, last
         if last <= first:
             continue
-        boxes[:, :3], boxes[:, 3:] = math.inf, -math.inf
-        counts[:] = 0
+        for b in range(BINS):
+            _empty(boxes[b])
+            counts[b] = 0
         for entry in range(start, stop):
             p = order[entry]
             b = min(BINS - 1, int((low[p, axis] + high[p, axis] - first) / (last - first) * BINS))
             counts[b] += 1
             _grow(boxes[b], low[p], high[p])
-        running[:3], running[3:] = math.inf, -math.inf
+        _empty(running)
         total = 0
         for b in range(BINS - 1, 0, -1):
             total += counts[b]
-            _grow(running, boxes[b, :3], boxes[b, 3:])
+            _grow(running, boxes[b], boxes[b, 3:])
             right[b, 0], right[b, 1] = total, _area(running) if total > 0 else 0.0
-        running[:3], running[3:] = math.inf, -math.inf
+        _empty(running)
         total = 0
         for b in range(BINS - 1):
             total += counts[b]
-            _grow(running, boxes[b, :3], boxes[b, 3:])
+            _grow(running, boxes[b], boxes[b, 3:])
             if total == 0 or right[b + 1, 0] == 0:
                 continue
             cost = total * _area(running) + right[b + 1, 0] * right[b + 1, 1]
@@ -245,5 +253,6 @@ def _split(low, high, order, start, stop, scratch):
         else:
             scratch[kept] = p
             kept += 1
-    order[left:stop] = scratch[:kept]
+    for entry in range(kept):
+        order[left + entry] = scratch[entry]
     return left
