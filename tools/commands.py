@@ -229,11 +229,14 @@ def sheet(
 
 
 def bench(
-    what: Positional[Literal["raster", "smog", "flood", "snow", "style", "fit", "open"]] = "raster",
+    what: Positional[
+        Literal["raster", "smog", "flood", "snow", "style", "fit", "open", "training"]
+    ] = "raster",
     repeats: int = 7,
     quick: bool = False,
     scene: str | None = None,
     photos: Path | None = None,
+    out: Path = Path("out/training"),
     pictures: Path | None = None,
     json_file: JsonFile = None,
 ) -> int:
@@ -247,19 +250,21 @@ def bench(
     cameras agree on it. style: what a style costs, how exact its maps are, whether views of a
     styled scene agree, and how the methods do on photos. fit: time of each stage of a
     reconstruction's step, and memory. open: time and memory of opening a trained scene of a million
-    Gaussians, and the same scene saved.
+    Gaussians, and the same scene saved. training: what a small segmentation network trained on
+    weather scores on streets and weather that are new to it, beside one trained on clean images.
 
     Args:
         what: Which benchmark.
         repeats: Timed frames a scene (raster) or a kind of flood, snow or style.
-        quick: The smaller scene, one view, or fewer steps, only.
+        quick: The smaller scene, one view, or fewer steps, only (training: too few to learn much).
         scene: Raw data to fit (fit); by default a drive down the procedural street is recorded.
             Or the scene whose frames are timed (flood), as for render; by default the procedural
             street with a million Gaussians. Or a scene that is measured beside it (snow, style).
         photos: A folder of photographs to score styles on (style).
+        out: The folder of the images to train on (training); what is there is not rendered again.
         pictures: Also draw levels, waves and reflections with their time and error here (flood),
-            depths, shadings, estimators and masks (snow), or methods, presets, strengths, regions,
-            orders and failures (style).
+            depths, shadings, estimators and masks (snow), methods, presets, strengths, regions,
+            orders and failures (style), or scores and predictions (training).
         json_file: Also write the figures to this file.
     """
     if what == "smog":
@@ -309,6 +314,19 @@ def bench(
 
         result = bench_open(quick=quick, repeats=repeats)
         text = open_text(result)
+    elif what == "training":
+        from tools import training_case
+        from tools.bench_training import bench_training
+        from tools.training_text import training_text
+
+        trained = bench_training(out, training_case.QUICK if quick else training_case.WHOLE)
+        result = trained.figures
+        text = training_text(result)
+        if pictures is not None:
+            from tools.training_pictures import draw_training_pictures
+
+            drawn = draw_training_pictures(pictures, trained)
+            text += "".join(f"\nwrote {path}" for path in drawn)
     else:
         from tools.bench import bench_raster, bench_text
 
