@@ -8,7 +8,14 @@ import sys
 
 import tyro
 
-from tools import commands, export_commands, generate_commands, report_command, style_commands
+from tools import (
+    bench_commands,
+    commands,
+    export_commands,
+    generate_commands,
+    report_command,
+    style_commands,
+)
 
 COMMANDS = {
     "render": commands.render,
@@ -27,6 +34,17 @@ COMMANDS = {
 }
 # Commands of commands, which take over where the first word names one.
 GROUPS = {
+    "bench": {
+        "raster": bench_commands.raster,
+        "smog": bench_commands.smog,
+        "flood": bench_commands.flood,
+        "snow": bench_commands.snow,
+        "style": bench_commands.style,
+        "fit": bench_commands.fit,
+        "open": bench_commands.open_,
+        "generate": bench_commands.generate,
+        "training": bench_commands.training,
+    },
     "style": {
         "apply": style_commands.apply,
         "train": style_commands.train,

@@ -5,7 +5,7 @@ import pytest
 
 from augment.weather import flood_view
 from tests.streets import SMALL_STREET, open_street
-from tools import bench_flood, commands
+from tools import bench_commands, bench_flood
 from tools.bench_flood import FloodCase, flood_text
 from tools.bench_flood_cost import FRONT, MIRROR, STAGES, TIERS, bench_camera, cost_cases
 from tools.bench_flood_masks import neighbours
@@ -106,7 +106,7 @@ def test_the_command_passes_its_options_on(monkeypatch, capsys, figures, tmp_pat
 
     monkeypatch.setattr(bench_flood, "bench_flood", stand_in)
     file = tmp_path / "flood.json"
-    assert commands.bench("flood", repeats=3, quick=True, scene="a:b", json_file=file) == 0
+    assert bench_commands.flood(repeats=3, quick=True, scene="a:b", json_file=file) == 0
     assert asked == {"case": bench_flood.QUICK, "scene_uri": "a:b", "repeats": 3}
     assert "COST" in capsys.readouterr().out
     assert json.loads(file.read_text())["dry_views"] == figures["dry_views"]

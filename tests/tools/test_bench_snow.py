@@ -11,7 +11,7 @@ from adapters.street.truth import open_truth
 from augment.semantics import SemanticClass
 from augment.snow.cells import FLUSH, SnowCells
 from tests.streets import SMALL_STREET, open_street
-from tools import bench_snow, commands
+from tools import bench_commands, bench_snow
 from tools.bench_snow import SnowCase
 from tools.bench_snow_accuracy import AccuracyCase
 from tools.bench_snow_cells import bed_heights, cells_over, height_error, sheltered_share
@@ -210,7 +210,7 @@ def test_the_command_passes_its_options_on(monkeypatch, capsys, figures, tmp_pat
 
     monkeypatch.setattr(bench_snow, "bench_snow", stand_in)
     file = tmp_path / "snow.json"
-    assert commands.bench("snow", repeats=3, quick=True, scene="a:b", json_file=file) == 0
+    assert bench_commands.snow(repeats=3, quick=True, scene="a:b", json_file=file) == 0
     assert asked == {"case": bench_snow.QUICK, "scene_uri": "a:b", "repeats": 3}
     assert "ACCURACY" in capsys.readouterr().out
     assert json.loads(file.read_text())["masks"] == figures["masks"]

@@ -13,7 +13,7 @@ from augment.scene import Scene
 from augment.semantics import SemanticClass
 from tests.scenes import camera_ahead
 from tests.snow_scenes import drive, sheet, wall
-from tools import bench_training, commands
+from tools import bench_commands, bench_training
 from tools.training_case import QUICK, RECIPES, WHOLE, TrainingCase, draw
 from tools.training_data import CLASSES, IGNORED, Views, generate, grouped, read_views
 from tools.training_network import new_network
@@ -273,7 +273,7 @@ def test_the_command_passes_on_what_it_is_told(monkeypatch, tmp_path, trained, c
 
     monkeypatch.setattr(bench_training, "bench_training", bench)
     words = {"out": tmp_path / "data", "pictures": tmp_path, "json_file": tmp_path / "f.json"}
-    assert commands.bench("training", quick=True, **words) == 0
+    assert bench_commands.training(quick=True, **words) == 0
     assert seen == [(tmp_path / "data", QUICK)]
     assert json.loads(words["json_file"].read_text())["summary"] == trained.figures["summary"]
     assert str(tmp_path / "training-scores.png") in capsys.readouterr().out

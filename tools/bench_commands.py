@@ -1,0 +1,203 @@
+"""The commands of `climategs bench`: each measures one thing on this machine."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from tools.json_files import JsonFile, write_json
+
+
+def raster(repeats: int = 7, quick: bool = False, json_file: JsonFile = None) -> int:
+    """The rasteriser on random scenes: each stage's time, memory, the torch reference beside it.
+
+    Args:
+        repeats: Timed frames a scene.
+        quick: The smaller scene only.
+        json_file: Also write the figures to this file.
+    """
+    from tools.bench import bench_raster, bench_text
+
+    return _say(bench_raster(repeats=repeats, quick=quick), bench_text, json_file)
+
+
+def smog(quick: bool = False, json_file: JsonFile = None) -> int:
+    """The error of both smog models against exact per-pixel smog on the procedural street.
+
+    Args:
+        quick: One view only.
+        json_file: Also write the figures to this file.
+    """
+    from tools.bench_smog import bench_smog, smog_text
+
+    result = bench_smog(cameras=("front",), frames=(5,)) if quick else bench_smog()
+    return _say(result, smog_text, json_file)
+
+
+def flood(
+    repeats: int = 7,
+    quick: bool = False,
+    scene: str | None = None,
+    pictures: Path | None = None,
+    json_file: JsonFile = None,
+) -> int:
+    """What flooded frames cost, how exact reflections are, whether cameras agree on the water.
+
+    Args:
+        repeats: Timed frames a kind of flood.
+        quick: A small scene and few kinds.
+        scene: The scene whose frames are timed; by default the procedural street with a million
+            Gaussians.
+        pictures: Also draw levels, waves and reflections with their time and error here.
+        json_file: Also write the figures to this file.
+    """
+    from tools.bench_flood import QUICK, WHOLE, bench_flood, flood_text
+
+    result = bench_flood(QUICK if quick else WHOLE, scene_uri=scene, repeats=repeats)
+    drawn: list[Path] = []
+    if pictures is not None:
+        from tools.flood_pictures import draw_flood_pictures
+
+        drawn = draw_flood_pictures(pictures)
+    return _say(result, flood_text, json_file, drawn)
+
+
+def snow(
+    repeats: int = 7,
+    quick: bool = False,
+    scene: str | None = None,
+    pictures: Path | None = None,
+    json_file: JsonFile = None,
+) -> int:
+    """How much of the open ground snow covers, what it costs, whether cameras agree on it.
+
+    Args:
+        repeats: Timed frames a kind of snow.
+        quick: A small scene and few kinds.
+        scene: A scene that is measured beside the procedural street.
+        pictures: Also draw depths, shadings, estimators and masks here.
+        json_file: Also write the figures to this file.
+    """
+    from tools import bench_snow
+    from tools.bench_snow_text import snow_text
+
+    case = bench_snow.QUICK if quick else bench_snow.WHOLE
+    result = bench_snow.bench_snow(case, scene_uri=scene, repeats=repeats)
+    drawn: list[Path] = []
+    if pictures is not None:
+        from tools.snow_pictures import draw_snow_pictures
+
+        drawn = draw_snow_pictures(pictures)
+    return _say(result, snow_text, json_file, drawn)
+
+
+def style(
+    repeats: int = 7,
+    quick: bool = False,
+    scene: str | None = None,
+    photos: Path | None = None,
+    pictures: Path | None = None,
+    json_file: JsonFile = None,
+) -> int:
+    """What a style costs, how exact its maps are, and how the methods do on photos.
+
+    Args:
+        repeats: Timed frames a kind of style.
+        quick: A small scene and few kinds.
+        scene: A scene that is measured beside the procedural street.
+        photos: A folder of photographs to score styles on.
+        pictures: Also draw methods, presets, strengths, regions, orders and failures here.
+        json_file: Also write the figures to this file.
+    """
+    from tools import bench_style
+    from tools.bench_style_text import style_text
+
+    case = bench_style.QUICK if quick else bench_style.WHOLE
+    result = bench_style.bench_style(case, scene_uri=scene, photos=photos, repeats=repeats)
+    drawn: list[Path] = []
+    if pictures is not None:
+        from tools.style_pictures import draw_style_pictures
+
+        drawn = draw_style_pictures(pictures, photos=photos)
+    return _say(result, style_text, json_file, drawn)
+
+
+def fit(scene: str | None = None, quick: bool = False, json_file: JsonFile = None) -> int:
+    """Time of each stage of a reconstruction's step, and memory.
+
+    Args:
+        scene: Raw data to fit; by default a drive down the procedural street is recorded.
+        quick: Fewer steps.
+        json_file: Also write the figures to this file.
+    """
+    from tools.bench_fit import bench_fit, fit_text
+
+    return _say(bench_fit(scene, quick=quick), fit_text, json_file)
+
+
+def open_(repeats: int = 7, quick: bool = False, json_file: JsonFile = None) -> int:
+    """Time and memory of opening a trained scene of a million Gaussians, and the same saved.
+
+    Args:
+        repeats: How often each is opened.
+        quick: A smaller scene.
+        json_file: Also write the figures to this file.
+    """
+    from tools.bench_open import bench_open, open_text
+
+    return _say(bench_open(quick=quick, repeats=repeats), open_text, json_file)
+
+
+def generate(repeats: int = 3, quick: bool = False, json_file: JsonFile = None) -> int:
+    """What the machinery of `climategs generate` adds to bare rendering, and a job of 10,000.
+
+    Args:
+        repeats: How often each way is timed.
+        quick: A few tiny images, and a job of 500.
+        json_file: Also write the figures to this file.
+    """
+    from tools.bench_generate import QUICK, WHOLE, bench_generate, generate_text
+
+    result = bench_generate(QUICK if quick else WHOLE, repeats=repeats)
+    return _say(result, generate_text, json_file)
+
+
+def training(
+    out: Path = Path("out/training"),
+    quick: bool = False,
+    pictures: Path | None = None,
+    json_file: JsonFile = None,
+) -> int:
+    """A small segmentation network trained on clean images, and one on weathered ones, compared.
+
+    Both are scored on streets and weather that are new to them.
+
+    Args:
+        out: The folder of the images to train on; what is there is not rendered again.
+        quick: Too few images and steps to learn much.
+        pictures: Also draw scores and predictions here.
+        json_file: Also write the figures to this file.
+    """
+    from tools import training_case
+    from tools.bench_training import bench_training
+    from tools.training_text import training_text
+
+    trained = bench_training(out, training_case.QUICK if quick else training_case.WHOLE)
+    drawn: list[Path] = []
+    if pictures is not None:
+        from tools.training_pictures import draw_training_pictures
+
+        drawn = list(draw_training_pictures(pictures, trained))
+    return _say(trained.figures, training_text, json_file, drawn)
+
+
+def _say(
+    result: dict[str, Any],
+    text: Callable[[dict[str, Any]], str],
+    json_file: Path | None,
+    drawn: list[Path] | tuple[Path, ...] = (),
+) -> int:
+    print(text(result) + "".join(f"\nwrote {path}" for path in drawn))
+    write_json(json_file, result)
+    return 0
