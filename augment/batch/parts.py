@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Collection, Iterable
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import pyarrow as pa
@@ -25,6 +25,7 @@ PARTS = f"{STATE_FOLDER}/parts"
 _SUFFIX = ".parquet"
 _FAILED = ".failed"
 _LISTED = b"climategs.parts"
+_MOST_RACES = 100  # times that a part is replaced just before it is read
 
 
 @dataclass(frozen=True)
@@ -61,26 +62,27 @@ def list_parts(store: Store, scene_folder: str | None = None) -> dict[str, Part]
     scene_folder: of one scene only.
     """
     found: dict[str, Part] = {}
-    folder = PARTS if scene_folder is None else f"{PARTS}/{scene_folder}"
-    for path, file in store.list(folder).items():
-        part = Part.parse(path, file.modified_s)
-        if part is not None:
-            older = found.get(part.key)
-            found[part.key] = part if older is None else _better(older, part)
+    for part in _all_parts(store, scene_folder):
+        other = found.get(part.key)
+        found[part.key] = part if other is None else max(other, part, key=_worth)
     return found
 
 
 def publish_part(store: Store, key: str, rows: pa.Table) -> Part:
-    """Make a block's rows visible: in one step, and in place of what the block had before."""
+    """Make a block's rows visible: in one step, and in place of what the block had before.
+
+    A part without failures is never replaced by one with some. Returns the part that stands.
+    """
     data = manifest_bytes(rows)
     failed = FAILED in rows["status"].to_pylist()
     part = Part(key, hashlib.sha256(data).hexdigest()[:12], failed)
+    # Listed before it is written: of two who publish a block at once, none can delete the other's.
+    before = [p for p in _all_parts(store, key.rsplit("/", 1)[0]) if p.key == key]
+    whole = [p for p in before if not p.has_failures]
+    if failed and whole:
+        return max(whole, key=_worth)
     store.write(part.path, data)
-    scene_folder = key.rsplit("/", 1)[0]
-    for path in store.list(f"{PARTS}/{scene_folder}"):
-        other = Part.parse(path)
-        if other is not None and other.key == key and other.name != part.name:
-            store.delete([path])
+    store.delete([other.path for other in before if other.name != part.name])
     return part
 
 
@@ -90,7 +92,7 @@ def read_finished(store: Store) -> pa.Table:
     Raises:
         OutputError: nothing is finished yet, or a file is damaged.
     """
-    table = _merged(store, list_parts(store).values())[0]
+    table = _merged(store)[0]
     if table is None:
         raise OutputError(
             f"{store.uri} holds neither {MANIFEST} nor finished blocks: it is no output folder, or "
@@ -104,14 +106,15 @@ def compact(store: Store) -> pa.Table | None:
 
     Whoever calls holds the claim on the manifest, so that the last to write has seen all parts.
     """
-    parts = sorted(list_parts(store).values(), key=lambda part: part.name)
-    table, before = _merged(store, parts)
+    table, before, parts = _merged(store)
     if table is None:
         return None
     listed = json.dumps([part.name for part in parts], separators=(",", ":")).encode()
     data = manifest_bytes(table.replace_schema_metadata({_LISTED: listed} if parts else None))
     if data != before:
         store.write(MANIFEST, data)
+    stands = {part.key: _worth(part) for part in parts}
+    store.delete([p.path for p in _all_parts(store) if _worth(p) < stands.get(p.key, _worth(p))])
     return table
 
 
@@ -121,16 +124,26 @@ def parts_to_merge(store: Store) -> int:
     return sum(part.name not in listed for part in list_parts(store).values())
 
 
-def _merged(store: Store, parts: Iterable[Part]) -> tuple[pa.Table | None, bytes | None]:
-    """The rows of the manifest and of the parts, and the manifest's bytes as they are."""
-    table, data = _manifest(store)
-    listed = _listed(table)
-    new = [part for part in parts if part.name not in listed]
-    read = [_read_part(store, part) for part in sorted(new, key=lambda part: part.name)]
-    table = None if table is None else table.replace_schema_metadata(None)
-    if not read:
-        return table, data
-    return latest_rows([concat_rows(read), *([] if table is None else [table])]), data
+def _merged(store: Store) -> tuple[pa.Table | None, bytes | None, list[Part]]:
+    """The rows of the manifest and of the parts, the manifest's bytes as they are, and the parts.
+
+    A part may be replaced between being listed and being read: then all is looked at again.
+    """
+    for attempt in range(_MOST_RACES):
+        parts = sorted(list_parts(store).values(), key=lambda part: part.name)
+        table, data = _manifest(store)
+        listed = _listed(table)
+        try:
+            read = [_read_part(store, part) for part in parts if part.name not in listed]
+        except StoredFileMissing:
+            if attempt == _MOST_RACES - 1:
+                raise
+            continue
+        table = None if table is None else table.replace_schema_metadata(None)
+        if read:
+            table = latest_rows([concat_rows(read), *([] if table is None else [table])])
+        return table, data, parts
+    raise AssertionError
 
 
 def _manifest(store: Store) -> tuple[pa.Table | None, bytes | None]:
@@ -149,10 +162,23 @@ def _listed(table: pa.Table | None) -> Collection[str]:
     note = None if table is None else (table.schema.metadata or {}).get(_LISTED)
     if note is None:
         return frozenset()
-    names = json.loads(note)
+    try:
+        names = json.loads(note)
+    except ValueError:  # damaged: the parts tell it all again
+        names = []
+    if not isinstance(names, list):
+        return frozenset()
     return frozenset(name for name in names if isinstance(name, str))
 
 
-def _better(one: Part, other: Part) -> Part:
-    """Of two parts of a block: the one without failures, else the later one."""
-    return max(one, other, key=lambda p: (not p.has_failures, p.modified_s, p.name))
+def _all_parts(store: Store, scene_folder: str | None = None) -> list[Part]:
+    """Also those that a killed process left beside the ones that took their place."""
+    folder = PARTS if scene_folder is None else f"{PARTS}/{scene_folder}"
+    files = store.list(folder).items()
+    parts = [Part.parse(path, file.modified_s) for path, file in files]
+    return [part for part in parts if part is not None]
+
+
+def _worth(part: Part) -> tuple[bool, float, str]:
+    """Of two parts of a block the greater one stands: without failures, else the later one."""
+    return not part.has_failures, part.modified_s, part.name

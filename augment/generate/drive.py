@@ -138,9 +138,9 @@ class _Rendering:
             if when <= now:
                 self._later.remove((when, block))
                 self._queue.put_back(block)
-        if self._trials:  # alone: memory may be what it died of
-            if not self._busy:
-                self._give(0, self._trials.pop(0), is_trial=True)
+        if self._trials and not self._busy:  # alone: memory may be what it died of
+            self._give(0, self._trials.pop(0), is_trial=True)
+        if self._trials or any(task.is_trial for task in self._busy.values()):
             return True
         for slot in range(self._pool.slots):
             if slot in self._busy:

@@ -32,6 +32,7 @@ from augment.batch.rows import image_row
 from augment.batch.store import Store, StoredFileMissing, open_store
 from augment.errors import OutputError
 from augment.generate.drive import Driver
+from augment.generate.leftovers import clear_leftovers
 from augment.generate.plan import Plan, make_plan, shard_of, store_plan
 from augment.generate.pools import SerialPool, Tick, WorkerPool
 from augment.generate.records import Block, SceneRecord
@@ -209,6 +210,9 @@ class _Generation:
         if new:
             _check_not_mixed(self._store, self._plan, new)
         store_plan(self._store, self._plan)
+        left = {block.key for block in pending}
+        published = [block for block in blocks if block.key not in left]
+        clear_leftovers(self._store, self._job.setup.scratch, published)
         return pending
 
     def _render(self, pending: Sequence[Block], total: int) -> None:
@@ -254,7 +258,10 @@ class _Generation:
             )
             for pictured in block.pictured(record)
         ]
-        publish_part(self._store, block.key, rows_to_table(rows))
+        claim = try_claim(self._store, block.claim)
+        if claim is not None:  # else another process is at it, and will say
+            with claim:
+                publish_part(self._store, block.key, rows_to_table(rows))
 
     def _merge_at_times(self) -> None:
         """Keep the manifest fresh, for at most a twentieth of the time."""
@@ -327,9 +334,9 @@ def _check_not_mixed(store: Store, plan: Plan, blocks: Sequence[Block]) -> None:
         if store.exists(MANIFEST):
             raise
         return
-    for found in _identities(table):
-        scene, variant, identity = found
-        block = next((b for b in blocks if (b.scene, b.variant) == (scene, variant)), None)
+    planned = {(block.scene, block.variant): block for block in blocks}
+    for scene, variant, identity in _identities(table):
+        block = planned.get((scene, variant))
         if block is not None:
             mine = _identity(plan.records[scene], block, identity.backend)
             mine.check(identity, f"{store.uri}/{scene}/{variant}")

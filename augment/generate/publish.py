@@ -7,7 +7,6 @@ blocks ever write the same file: `labels/boxes/000016-3fc0a1b2d4e5.parquet`.
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path, PurePosixPath
@@ -19,7 +18,6 @@ from augment.batch.manifest import OK, read_manifest
 from augment.batch.parts import Part, publish_part
 from augment.batch.runner import Outcome
 from augment.batch.store import Store
-from augment.errors import OutputError
 from augment.generate.records import Block
 
 _OF_BLOCK = ("labels", "box_smog", "box_water", "box_snow", "calibration")
@@ -50,7 +48,9 @@ class Publisher:
         paths = item_paths(self._block.scene, recipe, outcome.camera, outcome.frame).columns()
         for kind in _OF_IMAGE:
             path = paths[f"{kind}_path"]
-            if path is not None and (kind != "lidar" or outcome.lidar):
+            if path is None or path in self._sent:  # cameras of a frame share its sweep
+                continue
+            if kind != "lidar" or outcome.lidar:
                 self._send(path, path)
 
     def finish(self) -> Part:
@@ -71,13 +71,6 @@ class Publisher:
         for future in self._sent.values():
             future.result()
         return publish_part(self._store, self._block.key, new)
-
-    def clear(self) -> None:
-        """Delete the folder that the block was rendered in."""
-        try:
-            shutil.rmtree(self._folder)
-        except OSError as error:
-            raise OutputError(f"cannot delete {self._folder}: {error.strerror}") from error
 
     def _send(self, source: str, target: str) -> None:
         self._sent[target] = self._pool.submit(self._store.put_file, target, self._folder / source)

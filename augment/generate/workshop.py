@@ -20,6 +20,7 @@ from augment.batch.parts import list_parts
 from augment.batch.runner import Outcome, Renderer, describe
 from augment.batch.store import Store, open_store
 from augment.errors import ClimateGSError, OutputError
+from augment.generate.leftovers import clear_block, clear_files_of
 from augment.generate.publish import Publisher, staging_folder
 from augment.generate.records import Block, SceneRecord
 from augment.scene import Scene
@@ -153,6 +154,7 @@ class Workshop:
         with claim:
             part = list_parts(self._store, folder_name(block.scene)).get(block.key)
             if part is not None and not part.has_failures:
+                clear_block(self._store, self._setup.scratch, block)  # killed just before it did
                 return BlockDone(skipped=block.images)
             return self._render_claimed(task)
 
@@ -163,6 +165,8 @@ class Workshop:
         else:
             self._lay_bed(block, self._scene_of(block.uri, task.name))
         folder = staging_folder(self._store, self._setup.scratch, block)
+        if folder.is_dir():
+            clear_files_of(self._store, block)
         job = RenderJob(
             scene_uri=block.uri,
             recipes=[block.recipe],
@@ -188,7 +192,7 @@ class Workshop:
             )
             publisher.finish()
             if not result.failed:
-                publisher.clear()
+                clear_block(self._store, self._setup.scratch, block)
         return BlockDone(
             result.written, result.skipped, result.failed, result.failures, seconds=result.timings
         )

@@ -1,0 +1,91 @@
+"""Clears away what killed processes have left in an output: nobody reads it, but it takes room.
+
+Temporary files of processes of this machine that have ended, the folders that published blocks
+were rendered in, and the claims' files of the dead. What live processes hold stays; should one on
+another machine lose a temporary file all the same, its store writes it again.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+from collections.abc import Iterable
+from pathlib import Path
+
+from augment.batch.atomic import TEMPORARY_SUFFIX, output_error
+from augment.batch.claims import CLAIMS_FOLDER, try_claim
+from augment.batch.layout import STATE_FOLDER, variant_folder
+from augment.batch.parts import PARTS
+from augment.batch.store import Store
+from augment.errors import OutputError
+from augment.generate.publish import staging_folder
+from augment.generate.records import Block
+
+_PROCESS = re.compile(rf"\.(\d+)-\d+{re.escape(TEMPORARY_SUFFIX)}$")
+
+
+def clear_leftovers(store: Store, scratch: Path | None, published: Iterable[Block]) -> None:
+    """published: blocks that need no further work.
+
+    Raises:
+        OutputError: the system refused.
+    """
+    for block in published:
+        if staging_folder(store, scratch, block).is_dir():
+            claim = try_claim(store, block.claim)
+            if claim is not None:
+                with claim:
+                    clear_block(store, scratch, block)
+    if store.local_dir is None:
+        return
+    state = store.local_dir / STATE_FOLDER
+    _clear_temporaries(store.local_dir, is_deep=False)
+    for folder in ("jobs", "scenes", PARTS.removeprefix(f"{STATE_FOLDER}/")):
+        _clear_temporaries(state / folder)
+    for path in store.list(CLAIMS_FOLDER):
+        claim = try_claim(store, path.removeprefix(f"{CLAIMS_FOLDER}/").removesuffix(".lock"))
+        if claim is not None:
+            claim.release()
+
+
+def clear_block(store: Store, scratch: Path | None, block: Block) -> None:
+    """Delete the folder that a block was rendered in; who calls holds its claim."""
+    folder = staging_folder(store, scratch, block)
+    clear_files_of(store, block)
+    try:
+        shutil.rmtree(folder)
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        raise OutputError(f"cannot delete {folder}: {error.strerror}") from error
+
+
+def clear_files_of(store: Store, block: Block) -> None:
+    """Delete what was half-way into the output when a worker at this block was killed."""
+    if store.local_dir is not None:
+        _clear_temporaries(store.local_dir / variant_folder(block.scene, block.variant))
+
+
+def _clear_temporaries(folder: Path, *, is_deep: bool = True) -> None:
+    for place, below, names in os.walk(folder):  # passes over folders that vanish meanwhile
+        for name in names:
+            writer = _PROCESS.search(name)
+            if writer is not None and not _is_running(int(writer[1])):
+                path = Path(place) / name
+                try:
+                    path.unlink(missing_ok=True)
+                except OSError as error:
+                    raise output_error(path, error) from error
+        if not is_deep:
+            below.clear()
+
+
+def _is_running(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:  # it lives, and belongs to another user
+        return True
+    return True
