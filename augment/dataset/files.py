@@ -87,7 +87,9 @@ class WeatherDataset(Dataset):
         if not -count <= index < count:
             raise IndexError(f"sample {index} of a dataset of {count}")
         if get_worker_info() is not None:
-            cv2.setNumThreads(1)  # the workers are the parallelism
+            # The workers are the parallelism. Not 1: a worker forked after its parent used OpenCV's
+            # threads would wait for theirs for ever.
+            cv2.setNumThreads(0)
         row, rows, reader = index % count, self.rows, self._reader
         load = self.options.load.difference(without)
         camera, world_from_ego = reader.camera(rows, row)

@@ -30,6 +30,8 @@ class Column(Protocol):
     def __len__(self) -> int: ...
     def __getitem__(self, row: int) -> Any: ...
     def take(self, rows: np.ndarray) -> Column: ...
+    @property
+    def nbytes(self) -> int: ...
     def arrow(self, kind: pa.DataType) -> pa.Array: ...
 
 
@@ -45,6 +47,10 @@ class Coded:
 
     def __getitem__(self, row: int) -> Any:
         return self.values[self.codes[row]]
+
+    @property
+    def nbytes(self) -> int:
+        return self.codes.nbytes
 
     def take(self, rows: np.ndarray) -> Coded:
         return Coded(self.codes[rows], self.values)
@@ -64,6 +70,10 @@ class Numbers:
 
     def __getitem__(self, row: int) -> Any:
         return self.numbers[row].item()
+
+    @property
+    def nbytes(self) -> int:
+        return self.numbers.nbytes
 
     def take(self, rows: np.ndarray) -> Numbers:
         return Numbers(self.numbers[rows])
@@ -91,6 +101,10 @@ class Paths:
         name = self.names[row]
         return None if name is None else (self.folders[row], name)
 
+    @property
+    def nbytes(self) -> int:
+        return self.folders.nbytes + self.names.nbytes
+
     def take(self, rows: np.ndarray) -> Paths:
         return Paths(self.folders.take(rows), self.names.take(rows))
 
@@ -112,6 +126,10 @@ class Digests:
 
     def __getitem__(self, row: int) -> str:
         return self.digests[row].tobytes().hex()
+
+    @property
+    def nbytes(self) -> int:
+        return self.digests.nbytes
 
     def take(self, rows: np.ndarray) -> Digests:
         return Digests(self.digests[rows])
@@ -145,6 +163,11 @@ class Rows:
 
     def __getitem__(self, name: str) -> Column:
         return self.columns[name]
+
+    @property
+    def nbytes(self) -> int:
+        """Of the columns' arrays; their distinct values come on top."""
+        return sum(column.nbytes for column in self.columns.values())
 
     def take(self, rows: np.ndarray) -> Rows:
         """The rows of these numbers, or where a mask is true."""

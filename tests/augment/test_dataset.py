@@ -22,6 +22,7 @@ from batch_scenes import (
     must_not_render,
     open_fake,
 )
+from dataset_folders import assert_same_sample
 from torch.utils.data import DataLoader
 
 from augment.batch.job import RenderJob, run_job
@@ -56,23 +57,6 @@ def one_image(tmp_path: Path) -> Path:
     job = RenderJob("fake:street", [make_recipe()], tmp_path, frames=[1], cameras=["front"])
     run_job(job, scene_loader=open_fake, renderer=fake_render, progress=False)
     return tmp_path
-
-
-def assert_same_sample(a, b, *, but: tuple[str, ...] = ()) -> None:
-    assert type(a) is type(b)
-    if isinstance(a, dict):
-        assert a.keys() == b.keys()
-        for key in a.keys() - set(but):
-            assert_same_sample(a[key], b[key])
-    elif isinstance(a, torch.Tensor):
-        same = np.array_equal(a.numpy(), b.numpy(), equal_nan=a.is_floating_point())
-        assert a.dtype == b.dtype and same
-    elif isinstance(a, np.ndarray):
-        assert a.dtype == b.dtype and [repr(v) for v in a.ravel()] == [repr(v) for v in b.ravel()]
-    elif isinstance(a, float):
-        assert a == b or (a != a and b != b)
-    else:
-        assert a == b
 
 
 @pytest.mark.parametrize("recipe", RECIPES, ids=["png", "jpg", "no depth", "flood"])
@@ -314,7 +298,7 @@ def test_a_manifest_cannot_name_files_outside(one_image: Path, path: str, tmp_pa
 
 
 def test_folders_that_hold_no_dataset(tmp_path: Path) -> None:
-    with pytest.raises(OutputError, match="holds neither manifest.parquet nor finished blocks"):
+    with pytest.raises(OutputError, match=r"holds neither manifest.parquet nor finished blocks"):
         WeatherDataset(tmp_path)
     (tmp_path / "manifest.parquet").write_bytes(b"PAR1 no")
     with pytest.raises(OutputError, match="not a readable Parquet file"):

@@ -1,0 +1,367 @@
+"""Splits, clips, pairs, mixtures and shards."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+import torch
+from batch_scenes import make_recipe
+from dataset_folders import CLEAR, FLOODED, FOGGY, assert_same_sample, write_scene
+from torch.utils.data import DataLoader
+
+from augment.dataset import (
+    ClipDataset,
+    MixedDataset,
+    PairedDataset,
+    ShardedSampler,
+    WeatherDataset,
+    clean_frames,
+    collate_frames,
+    split_by_scene,
+)
+from augment.dataset.rows import Numbers
+
+FRAMES = 6
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Scene street under three recipes and scene alley under one: six frames of two cameras."""
+    out = tmp_path_factory.mktemp("training") / "out"
+    write_scene(out, [CLEAR, FOGGY, FLOODED], frames=FRAMES)
+    write_scene(out, [CLEAR], name="alley", frames=FRAMES)
+    return out
+
+
+def scenes_of(parts: dict) -> dict[str, set[str]]:
+    return {name: set(part["scene"].to_pylist()) for name, part in parts.items()}
+
+
+def many_scenes(count: int) -> pa.Table:
+    names = [f"scene-{k:03d}" for k in range(count) for _ in range(2)]
+    return pa.table({"scene": names, "variant": ["clear-000", "fog-000"] * count})
+
+
+def test_a_split_shares_no_scene_and_loses_none() -> None:
+    whole = many_scenes(300)
+    fractions = {"train": 0.7, "val": 0.2, "test": 0.1}
+    found = scenes_of(split_by_scene(whole, fractions, seed=3))
+    assert sum(map(len, found.values())) == 300
+    assert set.union(*found.values()) == set(whole["scene"].to_pylist())
+    for name, fraction in fractions.items():
+        # Four standard deviations of a binomial distribution.
+        assert abs(len(found[name]) - 300 * fraction) < 4 * (300 * fraction * (1 - fraction)) ** 0.5
+    assert found != scenes_of(split_by_scene(whole, fractions, seed=4))
+
+
+def test_a_scene_stays_where_it_is_when_others_come() -> None:
+    few, many = (scenes_of(split_by_scene(many_scenes(count))) for count in (40, 90))
+    assert all(few[name] == {s for s in many[name] if s < "scene-040"} for name in few)
+    # Of this name and seed for ever: other versions must not move it.
+    assert {"scene-000", "scene-002", "scene-003", "scene-010"} <= few["val"]
+    assert {"scene-001", "scene-004", "scene-005", "scene-011"} <= few["train"]
+
+
+@pytest.mark.parametrize("count", [0, 1, 3, 10, 45])
+def test_exact_splits(count: int) -> None:
+    fractions = {"train": 0.75, "val": 0.15, "test": 0.1}
+    found = scenes_of(split_by_scene(many_scenes(count), fractions, exact=True))
+    assert sum(map(len, found.values())) == count
+    assert all(abs(len(found[name]) - f * count) < 1 for name, f in fractions.items())
+
+
+def test_splits_of_datasets(written: Path) -> None:
+    parts = split_by_scene(WeatherDataset(written), {"a": 0.5, "b": 0.5}, exact=True)
+    found = {name: set(part.table["scene"].to_pylist()) for name, part in parts.items()}
+    assert sorted(map(sorted, found.values())) == [["alley"], ["street"]]
+    assert {len(part) for part in parts.values()} == {12, 36}
+    assert all(part[0]["scene"] in found[name] for name, part in parts.items())
+    for fractions in ({}, {"train": 0.8}, {"train": 1.2, "val": -0.2}):
+        with pytest.raises(ValueError, match="fractions must be >= 0 and add up to 1"):
+            split_by_scene(WeatherDataset(written), fractions)
+
+
+def frames_of(clips: ClipDataset) -> list[list[int]]:
+    frame = clips.frames.rows["frame"]
+    return [[frame[int(row)] for row in clips.row_numbers(k)[:, 0]] for k in range(len(clips))]
+
+
+def test_clips_are_the_samples_of_their_frames(written: Path) -> None:
+    options = {"load": ("image", "depth", "water", "boxes", "lidar"), "box_frame": "ego"}
+    frames = WeatherDataset(written, scenes=["street"], variants=["clear-009"], **options)
+    clips = ClipDataset(frames, 3)
+    assert len(clips) == 4 and frames_of(clips)[1] == [1, 2, 3]
+    clip = clips[1]
+    for t in range(3):
+        for c, camera in enumerate(("front", "rear/left")):
+            sample = frames[2 * (1 + t) + c]
+            assert sample["camera"]["name"] == camera == clip["camera"]["name"][c]
+            for key in ("image", "depth", "water"):
+                assert torch.equal(clip[key][t, c], sample[key])
+            for key in ("K", "world_from_camera"):
+                assert torch.equal(clip["camera"][key][t, c], sample["camera"][key])
+            assert torch.equal(
+                clip["camera"]["world_from_ego"][t], sample["camera"]["world_from_ego"]
+            )
+            assert clip["camera"]["timestamp_ns"][t, c] == sample["camera"]["timestamp_ns"]
+            boxes = clip["boxes"][t]
+            assert torch.equal(boxes["centers_m"], sample["boxes"]["centers_m"])
+            per_image = boxes["hidden_fraction"][c], sample["boxes"]["hidden_fraction"]
+            np.testing.assert_array_equal(*per_image)
+            assert clip["paths"][t][c] == sample["paths"]
+    assert clip["frame"].tolist() == [1, 2, 3] and clip["semantic"] is None
+    assert [sweep is None for sweep in clip["lidar"]] == [False, False, True]
+    assert (clip["scene"], clip["variant"]) == ("street", "clear-009")
+
+
+def test_boxes_of_clips_in_the_cameras_frames(written: Path) -> None:
+    frames = WeatherDataset(written, scenes=["alley"], load=("boxes", "lidar"), box_frame="camera")
+    clip = ClipDataset(frames, 2, cameras=["rear/left", "front"], transform=dict)[2]
+    assert clip["image"] is None and clip["camera"]["name"] == ["rear/left", "front"]
+    boxes = clip["boxes"][1]
+    assert boxes["centers_m"].shape == (2, 3, 3) and boxes["sizes_m"].shape == (3, 3)
+    assert torch.equal(boxes["centers_m"][1], frames[6]["boxes"]["centers_m"])
+    assert [None if s is None else s["points_m"].shape for s in clip["lidar"]] == [(50, 3), None]
+
+
+def test_clips_never_span_gaps(written: Path) -> None:
+    whole = WeatherDataset(written, load=())
+    # Four sequences (three variants and another scene) of six frames.
+    assert len(ClipDataset(whole, 6)) == 4 and len(ClipDataset(whole, 7)) == 0
+    assert frames_of(ClipDataset(whole, 2, step=3, stride=2))[:2] == [[0, 3], [2, 5]]
+    one = whole.select(np.arange(12))
+    rows = one.table
+    lacking = np.array([row != (2, "front") for row in zip(
+        rows["frame"].to_pylist(), rows["camera"].to_pylist(), strict=True)])  # fmt: skip
+    assert frames_of(ClipDataset(one.select(lacking), 2)) == [[0, 1], [3, 4], [4, 5]]
+    other = ClipDataset(one.select(lacking), 2, cameras=["rear/left"])
+    assert len(other) == 5 and other.row_numbers(1).shape == (2, 1)
+    even = whole.select(whole.rows.numbers("frame") % 2 == 0)  # a job over every second frame
+    assert frames_of(ClipDataset(even, 3)) == [[0, 2, 4]] * 4
+    with pytest.raises(ValueError, match="length, step and stride must be >= 1; got"):
+        ClipDataset(whole, 0)
+    with pytest.raises(ValueError, match=r"no camera \['back'\]; there are"):
+        ClipDataset(whole, 2, cameras=["back"])
+    with pytest.raises(IndexError, match="clip 4 of a dataset of 4"):
+        ClipDataset(whole, 6)[4]
+    assert len(ClipDataset(whole.select(np.zeros(len(whole), bool)), 1)) == 0
+
+
+def test_clips_never_span_a_pause(written: Path) -> None:
+    one = WeatherDataset(written, scenes=["alley"])
+    times = one.rows.numbers("timestamp_ns").copy()
+    times[one.rows.numbers("frame") >= 4] += 300_000_000
+    columns = {**one.rows.columns, "timestamp_ns": Numbers(times)}
+    one.rows = dataclasses.replace(one.rows, columns=columns)
+    assert frames_of(ClipDataset(one, 2)) == [[0, 1], [1, 2], [2, 3], [4, 5]]
+
+
+def test_batches_of_clips_and_pairs(written: Path) -> None:
+    clips = ClipDataset(WeatherDataset(written), 2)
+    batch = collate_frames([clips[0], clips[7]])
+    assert batch["image"].shape == (2, 2, 2, 3, 16, 24)
+    assert batch["camera"]["K"].shape == (2, 2, 2, 3, 3) and batch["frame"].shape == (2, 2)
+    assert batch["camera"]["timestamp_ns"].shape == (2, 2, 2)
+    assert len(batch["boxes"]) == len(batch["boxes"][0]) == 2
+    pairs = PairedDataset.of(WeatherDataset(written))
+    batch = collate_frames([pairs[0], pairs[1]])
+    assert batch["clean"]["image"].shape == batch["weathered"]["image"].shape == (2, 3, 16, 24)
+
+
+def test_pairs_show_the_same_moment(written: Path) -> None:
+    whole = WeatherDataset(written)
+    pairs = PairedDataset.of(whole)
+    assert len(pairs) == 24 and pairs.unpaired == 0
+    seen = set()
+    for index in range(len(pairs)):
+        clean, weathered = pairs[index]["clean"], pairs[index]["weathered"]
+        for key in ("scene", "frame"):
+            assert clean[key] == weathered[key]
+        assert clean["camera"]["name"] == weathered["camera"]["name"]
+        assert clean["variant"] == "clear-000"
+        seen.add(weathered["variant"])
+    assert seen == {"fog-000", "clear-009"}
+    named = PairedDataset.of(whole, clean_variant="fog-000")
+    assert len(named) == 24 and named[0]["clean"]["variant"] == "fog-000"
+    assert named.unpaired == 12  # alley has no fog
+
+
+def test_what_is_clean(written: Path, tmp_path: Path) -> None:
+    from recipes.flood import Flood
+    from recipes.snow import Snow
+
+    level = make_recipe("clear", variant=1, flood=Flood(level_m=0.0))
+    bare = make_recipe("clear", variant=2, snow=Snow(depth_m=0.0))
+    write_scene(tmp_path, [CLEAR, level, bare], frames=2)
+    found = clean_frames(WeatherDataset(tmp_path))
+    # Water at a level of 0 is water; snow of no depth is none.
+    assert set(found.table["variant"].to_pylist()) == {"clear-000", "clear-002"}
+    whole = WeatherDataset(tmp_path)
+    with pytest.raises(ValueError, match=r"frame 0, camera 'front' has more than one clean image"):
+        PairedDataset.of(whole)
+    assert len(PairedDataset.of(whole, "clear-002")) == 8
+    with pytest.raises(ValueError, match=r"no variant 'x'; there are clear-000, clear-001"):
+        clean_frames(whole, "x")
+    foggy = WeatherDataset(written, scenes=["street"], variants=["fog-000"], frames=[5])
+    with pytest.raises(ValueError, match="no clean image has the scene, frame and camera"):
+        PairedDataset(clean_frames(whole, "clear-000"), foggy)
+
+
+def test_mixtures_depend_on_seed_epoch_and_index_only(written: Path) -> None:
+    whole = WeatherDataset(written, load=())
+    clean = clean_frames(whole)
+    weathered = whole.select(whole.rows.numbers("frame") < 5)
+    weathered = weathered.select(
+        np.array([name != "clear-000" for name in weathered.table["variant"].to_pylist()])
+    )
+    mixed = MixedDataset(clean, weathered, 0.5, seed=1)
+    assert len(mixed) == len(clean) == 24
+    drawn: Counter[str] = Counter()
+    for epoch in range(40):
+        mixed.set_epoch(epoch)
+        for index in range(24):
+            row = mixed.weathered_row(index)
+            if clean.rows["scene"][index] == "street" and clean.rows["frame"][index] < 5:
+                drawn["clear-000" if row is None else weathered.rows["variant"][row]] += 1
+            else:
+                assert row is None
+            if row is not None:
+                for name in ("scene", "frame", "camera"):
+                    assert weathered.rows[name][row] == clean.rows[name][index]
+    # 400 draws; four standard deviations.
+    assert abs(drawn["clear-000"] - 200) < 40 and abs(drawn["fog-000"] - 100) < 35
+    mixed.set_epoch(3)
+    again = MixedDataset(clean, weathered, 0.5, seed=1)
+    again.set_epoch(3)
+    rows = [mixed.weathered_row(k) for k in range(24)]
+    for index in (rows.index(None), next(k for k in range(24) if rows[k] is not None)):
+        row = rows[index]
+        expected = clean[index] if row is None else weathered[row]
+        assert_same_sample(mixed[index], expected)
+    assert rows == [again.weathered_row(k) for k in reversed(range(24))][::-1]
+    assert rows != [MixedDataset(clean, weathered, 0.5, seed=2).weathered_row(k) for k in range(24)]
+    never = MixedDataset(clean, weathered, 0.0)
+    assert [never.weathered_row(k) for k in range(24)] == [None] * 24
+    with pytest.raises(ValueError, match=r"fraction must be 0 to 1; got 1\.5"):
+        MixedDataset(clean, weathered, 1.5)
+
+
+def test_workers_that_live_on_see_a_new_epoch(written: Path) -> None:
+    whole = WeatherDataset(written, load=())
+    mixed = MixedDataset(clean_frames(whole), whole.select(~clean_rows(whole)), 0.5)
+    loader = DataLoader(
+        mixed, batch_size=6, num_workers=1, collate_fn=collate_frames, persistent_workers=True,
+        multiprocessing_context="fork",
+    )  # fmt: skip
+    found = []
+    for epoch in (0, 1):
+        mixed.set_epoch(epoch)
+        found.append([name for batch in loader for name in batch["variant"]])
+        assert found[-1] == [mixed[k]["variant"] for k in range(len(mixed))]
+    assert found[0] != found[1]
+
+
+def clean_rows(dataset: WeatherDataset) -> np.ndarray:
+    return np.array([name == "clear-000" for name in dataset.table["variant"].to_pylist()])
+
+
+@pytest.mark.parametrize("uneven", ["exact", "pad", "drop"])
+def test_every_sample_once_over_all_ranks(uneven) -> None:
+    for count in (0, 1, 7, 24):
+        for ranks in (1, 2, 3, 5):
+            samplers = [
+                ShardedSampler(count, rank=rank, ranks=ranks, seed=5, uneven=uneven)
+                for rank in range(ranks)
+            ]
+            shares = [list(sampler) for sampler in samplers]
+            assert [len(share) for share in shares] == [len(sampler) for sampler in samplers]
+            given = Counter(index for share in shares for index in share)
+            if uneven == "exact":
+                assert given == Counter(range(count))
+            else:
+                assert len(set(map(len, shares))) == 1
+                extra = given.total() - count
+                assert -ranks < extra < ranks and (extra >= 0) == (uneven == "pad" or extra == 0)
+                assert set(given) <= set(range(count)) and len(given) == min(count, given.total())
+
+
+def test_orders_differ_by_epoch_and_seed() -> None:
+    one, other = ShardedSampler(50, seed=1), ShardedSampler(50, seed=1)
+    first = list(one)
+    assert first == list(one) == list(other) and sorted(first) == list(range(50))
+    one.set_epoch(1)
+    assert list(one) != first and list(ShardedSampler(50, seed=2)) != first
+    assert list(ShardedSampler(range(5), shuffle=False)) == [0, 1, 2, 3, 4]
+
+
+@pytest.mark.parametrize("ranks_after", [1, 2, 3])
+def test_an_epoch_goes_on_after_an_interruption(ranks_after: int) -> None:
+    before = [ShardedSampler(23, rank=rank, ranks=2, seed=4) for rank in range(2)]
+    for sampler in before:
+        sampler.set_epoch(6)
+    trained = [index for sampler in before for index in list(sampler)[:5]]
+    state = json.loads(json.dumps(before[1].state_dict(given=5)))
+    after = [ShardedSampler(23, rank=r, ranks=ranks_after, seed=4) for r in range(ranks_after)]
+    for sampler in after:
+        sampler.load_state_dict(state)
+        assert sampler.epoch == 6
+    left = [index for sampler in after for index in sampler]
+    assert Counter(trained + left) == Counter(range(23))
+    assert sum(map(len, after)) == 13
+    # Stopped again, three samples of each rank later.
+    again = ShardedSampler(23, seed=4)
+    again.load_state_dict(after[0].state_dict(given=3))
+    assert len(again) == 13 - 3 * ranks_after
+    again.set_epoch(7)
+    assert len(again) == 23
+
+
+def test_a_sampler_knows_what_it_gave_out() -> None:
+    sampler = ShardedSampler(10, seed=4)
+    given = iter(sampler)
+    first = [next(given) for _ in range(4)]
+    other = ShardedSampler(10, seed=4)
+    other.load_state_dict(sampler.state_dict())
+    assert sorted(first + list(other)) == list(range(10))
+    assert other.state_dict()["done"] == 10 and ShardedSampler(10).state_dict()["done"] == 0
+    with pytest.raises(ValueError, match="the state is of another sampler: seed 4 there and 9"):
+        ShardedSampler(10, seed=9).load_state_dict(sampler.state_dict())
+
+
+def test_samplers_that_cannot_be(unchecked) -> None:
+    with pytest.raises(ValueError, match="rank must be 0 to 1 of 2; got 2"):
+        ShardedSampler(4, rank=2, ranks=2)
+    with pytest.raises(ValueError, match="uneven must be one of exact, pad, drop; got 'cut'"):
+        ShardedSampler(4, uneven="cut")
+
+
+def test_ranks_and_workers_share_an_epoch(written: Path) -> None:
+    dataset = WeatherDataset(written, load=())
+    seen: Counter[tuple] = Counter()
+    for rank in range(2):
+        loader = DataLoader(
+            dataset, batch_size=5, num_workers=2, collate_fn=collate_frames,
+            sampler=ShardedSampler(dataset, rank=rank, ranks=2), multiprocessing_context="fork",
+        )  # fmt: skip
+        for batch in loader:
+            keys = (
+                batch["scene"],
+                batch["variant"],
+                batch["frame"].tolist(),
+                batch["camera"]["name"],
+            )
+            seen.update(zip(*keys, strict=True))
+    assert len(seen) == 48 and set(seen.values()) == {1}
+
+
+def test_samples_survive_the_trip_from_a_worker(written: Path) -> None:
+    dataset = WeatherDataset(written, variants=["clear-009"], frames=[2], load=("image", "boxes"))
+    loader = DataLoader(dataset, batch_size=2, num_workers=1, collate_fn=collate_frames)
+    (batch,) = list(loader)
+    assert_same_sample(batch, collate_frames([dataset[0], dataset[1]]))
