@@ -26,7 +26,7 @@ def test_figures_are_of_every_way(result):
     assert result["rows"][0]["of_limit"] == 1
     assert all(row["images_per_s"] > 0 and row["of_limit"] > 0 for row in result["rows"])
     memory = result["memory"]
-    # Some hundred bytes a row, where the Arrow table has about nine hundred.
+    # Some eighty bytes a row, where the Arrow table has 440.
     assert memory["rows"] == 700 and 700 * 32 < memory["held_mib"] * 2**20 < 700 * 200
 
 
