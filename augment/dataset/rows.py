@@ -1,8 +1,9 @@
 """A manifest's rows in a fifth of its memory, with random access to single ones.
 
 A row of a manifest with short names takes 440 bytes in an Arrow table and 84 here: most of it are
-paths and names that repeat. Here a column is its distinct values and one small number a row; paths are split into folder
-and file name, of which there are few. Rows are NumPy arrays, so forked workers share them.
+paths and names that repeat. Here a column is its distinct values and one small number a row; paths
+are split into folder and file name, of which there are few. Rows are NumPy arrays, so
+forked workers share them.
 """
 
 from __future__ import annotations
