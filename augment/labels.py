@@ -107,3 +107,14 @@ class ClassifiesLidar(Protocol):
         made it; None where the sweep has no classes, or they are not known to mean anything.
         """
         ...
+
+
+@runtime_checkable
+class KnowsLidarOrigins(Protocol):
+    """A LabelSource that also knows where its sensors were, for weather along the beams."""
+
+    def lidar_origins(self, frame_index: int, sweep: LidarSweep) -> np.ndarray | None:
+        """Where the beam of each of the sweep's returns started, float64 [N, 3], dataset world;
+        None where it is not known for this frame.
+        """
+        ...

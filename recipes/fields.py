@@ -24,6 +24,7 @@ from recipes.types import (
     Colour,
     Digest,
     FilePath,
+    Flag,
     Number,
     PerMetre,
     Rates,
@@ -75,7 +76,8 @@ class FieldSpec:
     """One field that holds a value.
 
     path: as in a file, with [] for the items of a list. limits: pairs such as (">", 0.0). words:
-    what a WORD may be. rangeable: a range may stand here. required: there is no default.
+    what a WORD may be, or a FLAG besides true and false. rangeable: a range may stand here.
+    required: there is no default.
     annotation: what pydantic checks a value against. channel: what each of a COLOUR's or RATES'
     three numbers is; None for other kinds.
     """
@@ -122,6 +124,8 @@ class FieldSpec:
         """What may stand here. `value`: the one refused; what is right about it goes unsaid."""
         if self.kind is Kind.WORD:
             text = f"one of {', '.join(self.words)}"
+        elif self.kind is Kind.FLAG and self.words:
+            text = f"true, false or {' or '.join(self.words)}"
         elif self.channel is not None:
             text = f"[red, green, blue], each {self.channel.allowed()}"
         elif self.kind is Kind.TEXT:
@@ -267,8 +271,11 @@ def _without_none(annotation: Any) -> tuple[Any, bool]:
     nullable = False
     if get_origin(annotation) in (Union, types.UnionType):
         members = [member for member in get_args(annotation) if member is not type(None)]
-        assert len(members) == 1, f"a field is of one type or null; got {annotation}"
-        annotation, nullable = members[0], True
+        nullable = len(members) < len(get_args(annotation))
+        if len(members) == 2 and members[0] == Flag and get_origin(members[1]) is Literal:
+            return members[0] | members[1], nullable
+        assert len(members) == 1, f"a field is of one type or null, or a flag or a word; {members}"
+        annotation = members[0]
     if get_origin(annotation) is Annotated and all(annotation != text for text, _ in _TEXTS):
         annotation = get_args(annotation)[0]
     return annotation, nullable
@@ -277,6 +284,8 @@ def _without_none(annotation: Any) -> tuple[Any, bool]:
 def _words(annotation: Any) -> tuple[str, ...]:
     if annotation == StyleName:
         return style_preset_names()
+    if get_origin(annotation) in (Union, types.UnionType):  # true, false, or a word
+        annotation = get_args(annotation)[1]
     return tuple(map(str, get_args(annotation))) if get_origin(annotation) is Literal else ()
 
 
@@ -290,6 +299,8 @@ def _kind(annotation: Any) -> Kind:
         return Kind.RATES
     if get_origin(annotation) is Literal:
         return Kind.WORD
+    if get_origin(annotation) in (Union, types.UnionType):
+        return Kind.FLAG
     return {float: Kind.NUMBER, int: Kind.WHOLE, bool: Kind.FLAG, str: Kind.TEXT}[annotation]
 
 

@@ -54,7 +54,7 @@ def which_range(node: MapNode, spec: FieldSpec) -> str:
 def _text_hint(text: str, spec: FieldSpec) -> str:
     if spec.kind is Kind.FLAG and text.lower() in _YAML_1_1_FLAGS:
         return f"; write {_YAML_1_1_FLAGS[text.lower()]}"
-    if spec.kind is Kind.WORD:
+    if spec.words:
         near = nearest_word(text, spec.words)
         return f"; did you mean {near}?" if near else ""
     if spec.kind in (Kind.NUMBER, Kind.WHOLE):

@@ -89,6 +89,8 @@ def _literal(spec: FieldSpec) -> Schema:
     null = ["null"] if spec.nullable else []
     if spec.kind is Kind.WORD:
         return {"enum": [*spec.words, *(None for _ in null)]}
+    if spec.kind is Kind.FLAG and spec.words:
+        return {"enum": [True, False, *spec.words, *(None for _ in null)]}
     if spec.channel is not None:
         return {
             "type": ["array", *null],

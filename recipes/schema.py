@@ -157,7 +157,11 @@ class Output(Closed):
     instance: Flag = Field(
         default=False, description="Write the actor number of the heaviest splat."
     )
-    lidar: Flag = Field(default=True, description="Pass LiDAR sweeps through.")
+    lidar: Flag | Literal["weather"] = Field(
+        default=True,
+        description="Pass LiDAR sweeps through; weather writes them as the recipe's smog, flood "
+        "and snow would have them.",
+    )
     labels: Flag = Field(default=True, description="Pass 3D boxes through.")
 
 

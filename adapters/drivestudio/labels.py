@@ -76,6 +76,18 @@ class DriveStudioLabels:
             columns |= {name: values[:, i].copy() for i, name in enumerate(group)}
         return LidarSweep(columns)
 
+    def lidar_origins(self, frame_index: int, sweep: LidarSweep) -> np.ndarray | None:
+        """Waymo's own origins, return by return; nuScenes' sensor in lidar_pose. The other
+        datasets' files have returns in the car's frame and do not say where the sensor is on it.
+        """
+        names = _MOVED[1]
+        if all(name in sweep.columns for name in names):
+            return np.stack([np.asarray(sweep.columns[name], np.float64) for name in names], axis=1)
+        if not self.run.convention.world_of_front_camera:
+            return None
+        pose = scene_from_dataset(self.run) @ dataset_from_lidar(self.run, frame_index)
+        return np.broadcast_to(pose[:3, 3], (len(sweep), 3))
+
 
 def drivestudio_labels(path: str, query: dict[str, str]) -> DriveStudioLabels:
     """The labels of a run's data; whatever frames the query asks for, they are those of all.

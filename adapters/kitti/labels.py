@@ -38,6 +38,12 @@ class LocatedSweeps:
             return None
         return labelled_sweep(returns, pose, self.timestamps_ns[frame])
 
+    def origins(self, frame: int, sweep: LidarSweep) -> np.ndarray | None:
+        """The Velodyne's place in its pose of the frame; what the car drives within the turn of
+        0.1 s is left out, as it is left in the returns."""
+        pose = self.world_from_velodyne.get(frame)
+        return None if pose is None else np.broadcast_to(pose[:3, 3], (len(sweep), 3))
+
 
 @dataclass(frozen=True, eq=False)
 class RawLabels:
@@ -53,6 +59,9 @@ class RawLabels:
 
     def lidar(self, frame_index: int) -> LidarSweep | None:
         return self.sweeps.read(frame_index)
+
+    def lidar_origins(self, frame_index: int, sweep: LidarSweep) -> np.ndarray | None:
+        return self.sweeps.origins(frame_index, sweep)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +81,9 @@ class ObjectLabels:
 
     def lidar(self, frame_index: int) -> LidarSweep | None:
         return self.sweeps.read(frame_index)
+
+    def lidar_origins(self, frame_index: int, sweep: LidarSweep) -> np.ndarray | None:
+        return self.sweeps.origins(frame_index, sweep)
 
 
 def object_label_file(root: Path, frame: int) -> Path:

@@ -73,6 +73,15 @@ class NuScenesLabels:
         table = class_table(self.tables.class_names)
         return table[np.clip(classes.astype(np.int64), 0, len(table) - 1)]
 
+    def lidar_origins(self, frame_index: int, sweep: LidarSweep) -> np.ndarray | None:
+        """The sensor's place at the time of the file, to which its returns are compensated: within
+        the turn of 50 ms it was up to half of the way elsewhere that the car drives in it.
+        """
+        frame = self._frame(frame_index)
+        if frame is None:
+            return None
+        return np.broadcast_to(frame.sweep.world_from_sensor[:3, 3], (len(sweep), 3))
+
     def _frame(self, index: int) -> FrameFiles | None:
         return self.frames[index] if 0 <= index < len(self.frames) else None
 

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import cv2
@@ -95,6 +96,26 @@ def read_sequence(root: Path) -> Sequence:
         camera.world_from_camera[:, :3, 3] -= origin
     ego = poses @ LIDAR_POSE_FROM_EGO
     return Sequence(root, origin, ego, times, tuple(cameras), tuple(problems))
+
+
+def read_ego_track(root: Path) -> tuple[np.ndarray, np.ndarray]:
+    """world_from_ego [F, 4, 4] in the dataset's own world, and the times [F] of the sweeps' ends.
+
+    Remembered as long as the files stay as they are.
+
+    Raises:
+        AdapterError: as for read_sequence.
+    """
+    files = [root / "lidar" / name for name in ("poses.json", "timestamps.json")]
+    state = tuple((f.stat().st_mtime_ns, f.stat().st_size) if f.exists() else None for f in files)
+    return _ego_track(root, state)
+
+
+@lru_cache(maxsize=2)
+def _ego_track(root: Path, state: object) -> tuple[np.ndarray, np.ndarray]:
+    poses = _read_poses(root / "lidar" / "poses.json")
+    times = _read_times(root / "lidar" / "timestamps.json", expected=len(poses), what="LiDAR poses")
+    return poses @ LIDAR_POSE_FROM_EGO, times
 
 
 def frame_file(root: Path, folder: str, frame: int) -> Path:

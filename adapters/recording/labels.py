@@ -57,6 +57,15 @@ class RecordingLabels:
         table, _ = class_table(self.root, np.unique(numbers), meanings)
         return None if table is None else table[numbers]
 
+    def lidar_origins(self, frame_index: int, sweep: LidarSweep) -> np.ndarray | None:
+        """The columns origin_x, origin_y, origin_z, in the world of the returns, where all three
+        hold numbers.
+        """
+        columns = [sweep.columns.get(f"origin_{axis}") for axis in "xyz"]
+        if any(c is None or np.asarray(c).dtype.kind not in "fiu" for c in columns):
+            return None
+        return np.stack([np.asarray(column, np.float64) for column in columns], axis=1)
+
 
 def recording_labels(path: str, query: dict[str, str]) -> RecordingLabels:
     """The labels of a folder; whatever the query, they are those of all its frames."""

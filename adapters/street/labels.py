@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adapters.street.lidar import sweep
+from adapters.street.lidar import sensor_origins, sweep
 from adapters.street.parameters import StreetParameters
 from adapters.street.rig import frame_time_ns
 from adapters.street.truth import StreetTruth
@@ -57,6 +57,11 @@ class StreetLabels:
     def lidar_classes(self, sweep: LidarSweep) -> np.ndarray:
         """The SemanticClass of each return: the sweeps' own numbers."""
         return np.asarray(sweep.columns["semantic"], np.int16)
+
+    def lidar_origins(self, frame_index: int, sweep: LidarSweep) -> np.ndarray:
+        """Where the sensor was at each return's own time, exactly."""
+        self._time_ns(frame_index)
+        return sensor_origins(self.parameters, np.asarray(sweep.columns["timestamp_ns"], np.int64))
 
     def _time_ns(self, frame_index: int) -> int:
         if not 0 <= frame_index < self.parameters.frames:

@@ -7,6 +7,7 @@ from __future__ import annotations
 import numpy as np
 
 from adapters.street.layout import FRAME_NS
+from adapters.street.parameters import StreetParameters
 from adapters.street.rig import ego_pose, frame_time_ns
 from adapters.street.truth import StreetTruth
 from adapters.street.world import Street
@@ -44,9 +45,6 @@ def lidar_rays(street: Street, frame_index: int) -> tuple[np.ndarray, np.ndarray
     turn = (np.arange(columns) + 0.5) / columns - 0.5
     times = frame_time_ns(frame_index) + np.round(turn * FRAME_NS).astype(np.int64)
     pose = ego_pose(parameters, times)
-    forward, left, up = SENSOR_M
-    c, s = np.cos(pose.yaws), np.sin(pose.yaws)
-    offset = np.stack([c * forward - s * left, s * forward + c * left, np.full(columns, up)], 1)
     azimuth = (pose.yaws - 2 * np.pi * turn)[:, None]
     elevation = np.radians(np.linspace(LOWEST_DEG, HIGHEST_DEG, rings))[None, :]
     directions = np.stack(
@@ -57,7 +55,16 @@ def lidar_rays(street: Street, frame_index: int) -> tuple[np.ndarray, np.ndarray
         ],
         -1,
     )
-    return pose.positions + offset, directions, times
+    return sensor_origins(parameters, times), directions, times
+
+
+def sensor_origins(parameters: StreetParameters, timestamps_ns: np.ndarray) -> np.ndarray:
+    """Where the sensor is at times [N], float64 [N, 3]."""
+    pose = ego_pose(parameters, timestamps_ns)
+    forward, left, up = SENSOR_M
+    c, s = np.cos(pose.yaws), np.sin(pose.yaws)
+    offset = np.stack([c * forward - s * left, s * forward + c * left, np.full(len(c), up)], 1)
+    return pose.positions + offset
 
 
 def sweep(truth: StreetTruth, frame_index: int) -> LidarSweep:

@@ -17,6 +17,9 @@ from augment.errors import AdapterError
 from augment.geometry import quat_from_rotmat
 from augment.labels import Boxes, LidarSweep
 
+# Of Waymo's cars, from the ego origin: forward, left, up.
+ROOF_SENSOR_M = np.array([1.43, 0.0, 2.18])
+
 
 @dataclass(frozen=True)
 class StreetGaussiansLabels:
@@ -49,6 +52,16 @@ class StreetGaussiansLabels:
         if frame_index not in times:
             raise AdapterError(f"{self.root / TIMES}: FRAME lacks frame {frame_index:06d}")
         return sweep_of(cloud, pose, round(times[frame_index] * 1e9))
+
+    def lidar_origins(self, frame_index: int, sweep: LidarSweep) -> np.ndarray | None:
+        """Waymo's roof sensor in the car's pose of the frame. The files join the returns of five
+        sensors and do not tell them apart: those of the four at the bumpers and sides, which see
+        20 m far, are taken for the roof's, too.
+        """
+        pose = self._world_from_ego(frame_index)
+        if pose is None:
+            return None
+        return np.broadcast_to(pose[:3, :3] @ ROOF_SENSOR_M + pose[:3, 3], (len(sweep), 3))
 
     def _world_from_ego(self, frame: int) -> np.ndarray | None:
         path = self.root / "ego_pose" / f"{frame:06d}.txt"

@@ -195,7 +195,7 @@ class FrameRunner:
         self._deliver(replace(done, checksum=written.checksum, lidar=passed, seconds=seconds))
 
     def _pass_lidar(self, chunk: Chunk, recipe: Recipe) -> bool | str:
-        """Copy the frame's sweep unless it is there already.
+        """Write the frame's sweep, in the weather or as it is, unless it is there already.
 
         Returns whether the frame has one, or a message where it cannot be read.
         """
@@ -208,6 +208,10 @@ class FrameRunner:
             return True
         try:
             sweep = self._scene.lidar(chunk.frame)
+            if sweep is not None and recipe.output.lidar == "weather":
+                from augment.lidar_weather.apply import weathered_sweep  # it brings the kernels
+
+                sweep = weathered_sweep(self._scene, recipe, chunk.frame, sweep)
             data = None if sweep is None else lidar_bytes(sweep)
         except Exception as error:
             return describe(error, "reading the LiDAR sweep")

@@ -1,0 +1,28 @@
+"""What a weathered sweep says of each return, and sweeps without what was lost."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from augment.labels import LidarSweep
+
+CODE_COLUMN, INDEX_COLUMN = "weather_code", "source_index"
+
+# weather_code. Where several hold, the greatest of LOST, SCATTERED, MOVED, ATTENUATED in this order
+# of precedence is given: what a trainer has to know first.
+UNCHANGED = 0  # the row is the source's, to the bit
+ATTENUATED = 1  # the same surface at the same place, with less intensity
+SCATTERED = 2  # made by droplets in the air, or by muddy water at its surface: no surface is there
+LOST = 3  # nothing came back above the sensor's noise: x, y, z are NaN, the intensity is 0
+MOVED = 4  # a surface elsewhere on the beam: that of the snow, or a bed as seen through water
+
+
+def drop_lost(sweep: LidarSweep) -> LidarSweep:
+    """The sweep without lost returns: what the sensor would have sent. `source_index` still says
+    which return of the source each row was. A sweep without codes is returned as it is.
+    """
+    codes = sweep.columns.get(CODE_COLUMN)
+    if codes is None:
+        return sweep
+    kept = np.asarray(codes) != LOST
+    return LidarSweep({name: np.asarray(column)[kept] for name, column in sweep.columns.items()})

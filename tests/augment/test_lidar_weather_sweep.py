@@ -1,0 +1,157 @@
+"""Weathered sweeps as a whole: what stays to the bit, codes, jobs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from batch_scenes import fake_render, make_recipe, open_fake
+
+from augment.batch.job import RenderJob, run_job
+from augment.batch.label_files import lidar_bytes, read_lidar
+from augment.batch.manifest import read_manifest
+from augment.labels import LidarSweep
+from augment.lidar_weather import LOST, MOVED, SCATTERED, UNCHANGED, drop_lost
+from augment.lidar_weather.apply import weathered_sweep
+from augment.lidar_weather.sensors import origins_of
+from recipes.flood import Flood
+from recipes.schema import Output, Recipe, Smog, Weather
+from recipes.snow import Snow
+from tests.lidar_sweeps import WORLD_ORIGIN_M, SensorLabels, recipe, some_points, street, sweep_of
+
+ADDED = {"source_index", "weather_code"}
+
+
+@pytest.mark.parametrize(
+    "weather",
+    [
+        {},
+        {"smog": Smog(extinction_per_m=0.0)},
+        {"snow": Snow(depth_m=0.0)},
+        {"snow": Snow(depth_m=0.3, coverage=0.0)},
+        {"flood": Flood(level_m=-50.0, reference="absolute")},
+    ],
+)
+def test_no_weather_is_the_source_to_the_bit(weather: dict) -> None:
+    sweep = sweep_of(
+        some_points(100),
+        intensity=np.linspace(0, 1, 100),
+        ring=np.arange(100, dtype=np.uint8),
+        note=np.array(["a", "b"] * 50, object),
+    )
+    out = weathered_sweep(street(), recipe(**weather), 0, sweep)
+    assert list(out.columns) == [*sweep.columns, "source_index", "weather_code"]
+    assert not out.columns["weather_code"].any()
+    plain = LidarSweep({k: v for k, v in out.columns.items() if k not in ADDED})
+    assert lidar_bytes(plain) == lidar_bytes(sweep)
+
+
+def test_every_row_keeps_its_place() -> None:
+    points = some_points(500)
+    sweep = sweep_of(points, ring=np.arange(500, dtype=np.uint16))
+    out = weathered_sweep(street(), recipe(smog=60, flood=0.1), 0, sweep)
+    assert out.columns["source_index"].dtype == np.int32
+    assert out.columns["weather_code"].dtype == np.uint8
+    np.testing.assert_array_equal(out.columns["source_index"], np.arange(500))
+    np.testing.assert_array_equal(out.columns["ring"], sweep.columns["ring"])
+    assert {k: v.dtype for k, v in sweep.columns.items()} == {
+        k: v.dtype for k, v in out.columns.items() if k not in ADDED
+    }
+    code = out.columns["weather_code"]
+    same = (out.points_m == sweep.points_m).all(1)
+    assert not same[np.isin(code, [SCATTERED, LOST, MOVED])].any()
+    assert same[~np.isin(code, [SCATTERED, LOST, MOVED])].all()
+    kept = drop_lost(out)
+    assert len(kept) == (code != LOST).sum() < 500
+    assert np.isfinite(kept.points_m).all()
+    np.testing.assert_array_equal(kept.columns["ring"], kept.columns["source_index"])
+    assert drop_lost(sweep) is sweep
+
+
+def test_returns_that_are_none_and_sweeps_without_intensity() -> None:
+    points = some_points(60)
+    points[::7] = np.nan
+    points[3] = np.inf
+    points[5] = [0.0, 0.0, 1.8]  # at the sensor itself
+    bad = ~np.isfinite(points).all(1)
+    bad[5] = True
+    sweep = sweep_of(points, intensity=None)
+    out = weathered_sweep(street(), recipe(smog=Smog(visibility_m=40, scale_height_m=50)), 0, sweep)
+    assert "intensity" not in out.columns
+    assert (out.columns["weather_code"][bad] == UNCHANGED).all()
+    np.testing.assert_array_equal(out.points_m[bad], sweep.points_m[bad])
+    assert (out.columns["weather_code"] == SCATTERED).any()
+    with_gap = np.where(bad, np.nan, 0.4)
+    shown = weathered_sweep(street(), recipe(smog=40, flood=0.1), 0, sweep_of(points, with_gap))
+    np.testing.assert_array_equal(np.isnan(shown.columns["intensity"]), bad)
+    empty = weathered_sweep(street(), recipe(smog=40, flood=0.1), 0, sweep_of(np.zeros((0, 3))))
+    assert len(empty) == 0 and set(empty.columns) >= ADDED
+
+
+def test_coordinates_of_whole_numbers() -> None:
+    columns = {name: np.arange(30, dtype=np.int32) * 3 for name in "xyz"}
+    scene = street(labels=SensorLabels((0.0, 0.0, 0.0)))
+    out = weathered_sweep(scene, recipe(smog=10), 0, LidarSweep(columns))
+    assert out.columns["weather_code"].any()
+    assert {out.columns[name].dtype for name in "xyz"} == {np.dtype(np.float64)}
+
+
+def test_the_same_in_every_process_and_order() -> None:
+    sweep, seeded = sweep_of(some_points(300), 0.2), recipe(smog=40, seed=7)
+    first = weathered_sweep(street(), seeded, 0, sweep)
+    weathered_sweep(street(), recipe(smog=500), 1, sweep)
+    again = weathered_sweep(street(), seeded, 0, sweep)
+    assert lidar_bytes(first) == lidar_bytes(again)
+    for other in (recipe(smog=40, seed=8), seeded):
+        changed = weathered_sweep(street(), other, 1 if other is seeded else 0, sweep)
+        assert lidar_bytes(changed) != lidar_bytes(first)
+    assert first.columns["x"][:2] == pytest.approx(again.columns["x"][:2], nan_ok=True)
+
+
+def test_weather_twice_is_refused() -> None:
+    out = weathered_sweep(street(), recipe(smog=100), 0, sweep_of(some_points(5)))
+    with pytest.raises(ValueError, match="'weather_code' already"):
+        weathered_sweep(street(), recipe(smog=100), 0, out)
+
+
+def test_origins_by_default_and_wrong_ones() -> None:
+    sweep = sweep_of(some_points(4))
+    unknown = street(labels=SensorLabels(None))
+    expected = WORLD_ORIGIN_M + np.array([0.0, 0.0, 1.8])
+    np.testing.assert_allclose(origins_of(unknown, 0, sweep), np.tile(expected, (4, 1)))
+
+    class Wrong(SensorLabels):
+        def lidar_origins(self, frame_index, sweep):
+            return np.zeros((1, 3))
+
+    with pytest.raises(ValueError, match=r"must be \[4, 3\].*got \[1, 3\]"):
+        origins_of(street(labels=Wrong(None)), 0, sweep)
+
+
+def test_a_job_writes_weathered_sweeps(tmp_path: Path) -> None:
+    weather = Weather(smog=Smog(visibility_m=0.5))
+    wanted = Recipe(name="fog", weather=weather, output=Output(lidar="weather"))
+    job = RenderJob("fake:street", [wanted], tmp_path / "one")
+    assert run_job(job, scene_loader=open_fake, renderer=fake_render, progress=False).failed == 0
+    rows = read_manifest(tmp_path / "one").to_pylist()
+    paths = {row["lidar_path"] for row in rows} - {None}
+    assert len(paths) == 3
+    for path in paths:
+        sweep = read_lidar(tmp_path / "one" / path)
+        scene, frame = open_fake("fake:street"), int(Path(path).stem)
+        source = scene.lidar(frame)
+        assert len(sweep) == len(source) and set(sweep.columns) >= ADDED
+        assert sweep.columns["weather_code"].any()
+        again = weathered_sweep(scene, wanted, frame, source)
+        assert lidar_bytes(again) == (tmp_path / "one" / path).read_bytes()
+    off = make_recipe().model_copy(update={"output": Output(lidar=False)})
+    job = RenderJob("fake:street", [off], tmp_path / "off")
+    run_job(job, scene_loader=open_fake, renderer=fake_render, progress=False)
+    assert {row["lidar_path"] for row in read_manifest(tmp_path / "off").to_pylist()} == {None}
+
+
+def test_recipes_hashes_stay() -> None:
+    assert Recipe().hash == "8553a2737c7b8e42"
+    hashes = {Recipe(output=Output(lidar=kind)).hash for kind in (True, False, "weather")}
+    assert len(hashes) == 3
