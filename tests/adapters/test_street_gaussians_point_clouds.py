@@ -241,12 +241,12 @@ def test_a_value_that_grows_when_it_is_shown_is_not_shown():
     grown = b")" + b"".join(b"q%ch%c\x86" % (n, n) for n in range(60))
     array = b"cnumpy.core.multiarray\n_reconstruct\n)R"
     dtype = b"cnumpy\ndtype\nX\x02\x00\x00\x00f8\x85R"
-    start = time.perf_counter()
+    start = time.process_time()
     for key, shape in ((grown, b"K\x01\x85"), (b"K\x00", grown)):
         state = b"(K\x01" + shape + dtype + b"\x89C\x08" + bytes(8) + b"t"
         with pytest.raises(PickleStreamError):
             list(stream_arrays(io.BytesIO(b"\x80\x03}" + key + array + state + b"bs.")))
-    assert time.perf_counter() - start < 1
+    assert time.process_time() - start < 1
 
 
 def test_bytes_that_no_array_takes_are_not_piled_up(monkeypatch):

@@ -145,9 +145,9 @@ def test_a_key_is_found_quickly() -> None:
         )
     )
     scene = drive(many)
-    start = time.perf_counter()
+    start = time.process_time()
     bed_key(scene, cameras_of(scene), SETTINGS)
-    assert time.perf_counter() - start < 1.0  # about 0.1 s on a quiet machine
+    assert time.process_time() - start < 1.0  # about 0.1 s
 
 
 def test_files_of_something_else_are_refused(bed: SnowBed, tmp_path: Path) -> None:

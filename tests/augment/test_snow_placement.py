@@ -273,10 +273,10 @@ def test_coarse_cells() -> None:
 
 def test_cells_that_would_take_too_much_memory_are_refused_at_once() -> None:
     scene = drive(GROUND)
-    start = time.perf_counter()
+    start = time.process_time()
     with pytest.raises(SceneError, match=r"0\.001 m would take [\d,]+ million cells.* GB.*cell_m"):
         place_snow_bed(scene, cameras_of(scene), PlacementSettings(cell_m=0.001))
-    assert time.perf_counter() - start < 1.0
+    assert time.process_time() - start < 1.0
 
 
 def test_far_from_the_origin_nothing_breaks() -> None:
