@@ -58,7 +58,7 @@ demo: setup
 	$(BIN)/climategs demo
 
 test: setup
-	$(BIN)/python -m pytest -q --numprocesses auto --dist loadfile
+	$(BIN)/python -m pytest -q --numprocesses auto --dist loadfile --no-loadscope-reorder
 
 lint: setup
 	$(BIN)/ruff check .

@@ -36,6 +36,22 @@ def _checked_modules() -> list[str]:
 install_import_hook(_checked_modules(), "beartype.beartype")
 
 
+# Files of a few long tests. At the end one of them would keep a single core busy.
+LONG = {
+    f"test_{name}.py"
+    for name in (
+        "batch_resume", "batch_workers", "bench_flood", "bench_open", "bench_snow", "fit",
+        "flood_accuracy", "packages", "procedural", "recording_flood", "render_backward",
+        "smog_accuracy", "snow_accuracy", "trained_street",
+    )
+}  # fmt: skip
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Long files first (make test tells pytest-xdist to keep to this order)."""
+    items.sort(key=lambda item: item.path.name not in LONG)
+
+
 @pytest.fixture(scope="session", autouse=True)
 def interruptible():
     """Ctrl-C works in tests also where a shell in the background has switched it off."""
