@@ -163,6 +163,26 @@ def generate(repeats: int = 3, quick: bool = False, json_file: JsonFile = None) 
     return _say(result, generate_text, json_file)
 
 
+def dataset(
+    folder: Path | None = None,
+    repeats: int = 3,
+    quick: bool = False,
+    json_file: JsonFile = None,
+) -> int:
+    """Images a second out of an output folder, beside decoding alone; memory of a long manifest.
+
+    Args:
+        folder: An output folder with JPEG images; by default one is made.
+        repeats: How often each way is timed.
+        quick: Few small images.
+        json_file: Also write the figures to this file.
+    """
+    from tools.bench_dataset import QUICK, WHOLE, bench_dataset, dataset_text
+
+    result = bench_dataset(QUICK if quick else WHOLE, folder=folder, repeats=repeats)
+    return _say(result, dataset_text, json_file)
+
+
 def training(
     out: Path = Path("out/training"),
     quick: bool = False,

@@ -43,6 +43,7 @@ GROUPS = {
         "fit": bench_commands.fit,
         "open": bench_commands.open_,
         "generate": bench_commands.generate,
+        "dataset": bench_commands.dataset,
         "training": bench_commands.training,
     },
     "style": {
