@@ -1,0 +1,128 @@
+"""Dataset jobs on a Ray cluster of this machine, with stand-in scenes and renderers."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import types
+from functools import partial
+from pathlib import Path
+
+import pytest
+from batch_scenes import FakeView, fake_render, slow_render
+from generate_jobs import leftovers, make_job, outputs
+
+from augment.cameras import Camera
+from augment.errors import ClimateGSError
+from augment.generate.job import run_generate
+from augment.scene import Scene
+from recipes.schema import Recipe
+
+HERE = Path(__file__).parent
+PATHS = os.pathsep.join([str(HERE), str(HERE.parents[1])])
+CPUS = 2
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    """A cluster whose workers can import what the tests do."""
+    ray = pytest.importorskip("ray")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+        ray.init(
+            address="local",
+            num_cpus=CPUS,
+            include_dashboard=False,
+            log_to_driver=False,
+            logging_level="ERROR",
+            object_store_memory=100 << 20,
+            runtime_env={"env_vars": {"PYTHONPATH": PATHS}},
+        )
+        yield ray
+        ray.shutdown()
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> dict[str, str]:
+    """Digests of what one process renders."""
+    out = tmp_path_factory.mktemp("serial") / "out"
+    run_generate(make_job(out), progress=False)
+    return outputs(out)
+
+
+def dying_once(
+    scene: Scene, camera: Camera, recipe: Recipe, *, backend: str, marker: Path
+) -> FakeView:
+    """Kills its process at the second frame, the first time that any process comes to it."""
+    if camera.timestamp_ns == scene.frames[1].timestamp_ns:
+        try:
+            marker.touch(exist_ok=False)
+        except FileExistsError:
+            pass
+        else:
+            os.kill(os.getpid(), signal.SIGKILL)
+    return fake_render(scene, camera, recipe, backend=backend)
+
+
+@pytest.mark.usefixtures("cluster")
+def test_job_gives_the_serial_bytes_on_fewer_cpus_than_wanted(whole, tmp_path):
+    job = make_job(tmp_path / "out", executor="ray", workers=CPUS + 1)  # one finds no place
+    seen = []
+    result = run_generate(job, progress=False, on_image=lambda done, failed: seen.append(done))
+    assert (result.written, result.failed) == (28, 0), result.failures
+    assert outputs(tmp_path / "out") == whole
+    assert not leftovers(tmp_path / "out")
+    assert len(set(seen)) > 8, f"images are told of one by one, not in blocks: {seen}"
+
+
+@pytest.mark.usefixtures("cluster")
+def test_nothing_is_lost_with_an_actor_that_is_killed(whole, tmp_path):
+    marker = tmp_path / "killed"
+    dying = partial(dying_once, marker=marker)
+    job = make_job(tmp_path / "out", executor="ray", workers=2, renderer=dying)
+    result = run_generate(job, progress=False)
+    assert marker.exists()
+    assert result.failed == 0, result.failures
+    assert outputs(tmp_path / "out") == whole
+    assert not leftovers(tmp_path / "out")
+
+
+@pytest.mark.usefixtures("cluster")
+def test_interrupt_lets_actors_finish_their_images(whole, tmp_path):
+    def interrupt(done: int, failed: int) -> None:
+        if done:
+            raise KeyboardInterrupt
+
+    job = make_job(tmp_path / "out", executor="ray", workers=1, renderer=slow_render)
+    with pytest.raises(KeyboardInterrupt, match="stopped"):
+        run_generate(job, progress=False, on_image=interrupt)
+    held = [path for path in leftovers(tmp_path / "out") if "claims" in path]
+    assert not held, "a killed actor would have left its claim"
+    result = run_generate(make_job(tmp_path / "out"), progress=False)
+    assert result.written < 28, "what was finished is not rendered again"
+    assert outputs(tmp_path / "out") == whole
+
+
+@pytest.mark.usefixtures("cluster")
+def test_scenes_that_actors_cannot_import_end_the_job(tmp_path, monkeypatch):
+    module = types.ModuleType("only_on_this_machine")
+    exec("def opener(uri): ...", module.__dict__)
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    job = make_job(tmp_path / "out", executor="ray", workers=1, opener=module.opener)
+    with pytest.raises(ClimateGSError, match=r"while starting.*only_on_this_machine"):
+        run_generate(job, progress=False)
+
+
+def test_without_ray_it_says_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(ClimateGSError, match=r"pip install \"climategs\[ray\]\""):
+        run_generate(make_job(tmp_path / "out", executor="ray"), progress=False)
+
+
+def test_ray_client_is_refused(tmp_path, monkeypatch):
+    ray = pytest.importorskip("ray")
+    monkeypatch.setattr(ray, "is_initialized", lambda: False)
+    monkeypatch.setenv("RAY_ADDRESS", "ray://head:10001")
+    with pytest.raises(ClimateGSError, match="client protocol"):
+        run_generate(make_job(tmp_path / "out", executor="ray"), progress=False)
