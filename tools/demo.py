@@ -10,7 +10,7 @@ from adapters.base import open_scene
 from augment.batch.job import RenderJob, run_job
 from recipes.load import load_recipe
 from tools.pictures import draw_sheet, draw_video
-from tools.warm_up import warm_up
+from tools.warm_up import warm_up, warming_up_beside
 
 RECIPES = ("clear", "dense-fog", "street-flood", "fresh-snow", "evening")
 CAMERA = "front"  # the one that is shown as a video
@@ -21,9 +21,10 @@ def run_demo(out: Path, frames: int) -> int:
     started = time.perf_counter()
     uri = f"procedural:street?seed=3&frames={frames}"
     print(f"building {uri} and compiling the kernels (kept for the next run)", file=sys.stderr)
-    scene = open_scene(uri)
     recipes = [load_recipe(name).resolve(0) for name in RECIPES]
-    warm_up(recipes)
+    with warming_up_beside(recipes):
+        scene = open_scene(uri)
+        warm_up(recipes)
     ready = time.perf_counter()
     job = RenderJob(scene_uri=uri, recipes=recipes, out_dir=out)
     result = run_job(job, scene_loader=lambda _uri: scene)

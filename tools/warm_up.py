@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 import torch
 
@@ -13,6 +15,7 @@ from augment.geometry import rigid
 from augment.ground_heights import Ground
 from augment.labels import Boxes, LidarSweep
 from augment.render import cpu
+from augment.render.threads import thread_count
 from augment.scene import Gaussians, Scene
 from augment.sky import CubemapSky
 from recipes.schema import Recipe
@@ -25,6 +28,31 @@ def warm_up(recipes: Sequence[Recipe]) -> float:
     """Compile the CPU kernels that the recipes take, or load them; seconds it took."""
     seconds = cpu.warm_up()
     started = time.perf_counter()
+    _warm_recipes(recipes)
+    return seconds + time.perf_counter() - started
+
+
+@contextmanager
+def warming_up_beside(recipes: Sequence[Recipe]) -> Iterator[None]:
+    """Meanwhile a second process compiles for the last recipes first, where there is a core for it.
+
+    numba compiles one kernel at a time in a process, and finds in its cache what another process
+    has compiled: `warm_up` in this one goes on from the first recipe until they meet.
+    """
+    if thread_count() < 2:
+        yield
+        return
+    spawn = multiprocessing.get_context("spawn")
+    beside = spawn.Process(target=_warm_recipes, args=(recipes[::-1],), daemon=True)
+    beside.start()
+    try:
+        yield
+        beside.join()
+    finally:
+        beside.kill()
+
+
+def _warm_recipes(recipes: Sequence[Recipe]) -> None:
     seen = set()
     for recipe in recipes:
         flood, snow, output = recipe.weather.flood, recipe.weather.snow, recipe.output
@@ -40,7 +68,6 @@ def warm_up(recipes: Sequence[Recipe]) -> float:
             level_z_m = 0.0 if flood is None else flood.level_m
             scene = _yard(level_z_m, with_labels=output.labels)
             render_view(scene, scene.frames[0].cameras["warm-up"], recipe)
-    return seconds + time.perf_counter() - started
 
 
 def _yard(level_z_m: float, *, with_labels: bool) -> Scene:
