@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from tools.bench_training import Trained
-from tools.drawing import CAPTION_PX, GAP_PX, Color, captioned, strip, text_width, write
+from tools.drawing import CAPTION_PX, GAP_PX, Color, captioned, strip, text_width, write, write_jpeg
 from tools.sheet import write_rgb
 from tools.training_data import CLASSES, IGNORED
 from tools.training_scores import confusion, intersection_over_union, predict, views_under
@@ -40,15 +40,12 @@ _ENLARGED = 1.5  # of the images
 
 
 def draw_training_pictures(folder: Path, trained: Trained) -> list[Path]:
-    """training-scores.png and training-samples.png."""
+    """training-scores.png and training-samples.jpg."""
     folder.mkdir(parents=True, exist_ok=True)
-    drawn = {
-        "training-scores.png": draw_scores(trained.figures),
-        "training-samples.png": draw_samples(trained),
-    }
-    for name, image in drawn.items():
-        write_rgb(folder / name, image)
-    return [folder / name for name in drawn]
+    scores, samples = folder / "training-scores.png", folder / "training-samples.jpg"
+    write_rgb(scores, draw_scores(trained.figures))
+    write_jpeg(samples, draw_samples(trained))
+    return [scores, samples]
 
 
 def draw_scores(figures: Mapping[str, Any]) -> np.ndarray:

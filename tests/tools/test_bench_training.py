@@ -260,7 +260,7 @@ def test_text_and_pictures_show_every_figure(trained, tmp_path):
     mean = trained.figures["summary"]["weather"]["conditions"]["thick-smog"]["mean"]
     assert "| other: thick-smog |" in text and f" {100 * mean:.1f} (" in text
     paths = draw_training_pictures(tmp_path, trained)
-    assert [path.name for path in paths] == ["training-scores.png", "training-samples.png"]
+    assert [path.name for path in paths] == ["training-scores.png", "training-samples.jpg"]
     assert all(path.stat().st_size > 1000 for path in paths)
 
 
