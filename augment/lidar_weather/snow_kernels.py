@@ -65,9 +65,12 @@ def meet_layer(
                 last,
             )
             leaves = max(leaves, inside)
-            if min(oz + t * dz, oz + leaves * dz) > highest[block_row, block_column]:
+            ceiling = highest[block_row, block_column]
+            if min(oz + t * dz, oz + leaves * dz) > ceiling:
                 t = leaves
                 continue
+            if oz + t * dz > ceiling:  # it falls: nothing is met before it comes so low
+                t = max(t, min((ceiling - oz) / dz, leaves))
             while t < leaves:
                 inside = t + _STEP_M
                 column = min(max(math.floor(ox + inside * dx), 0), columns - 1)
