@@ -43,13 +43,19 @@ def scenes_of(entries: Iterable[JobScene], folder: Path) -> list[JobScene]:
 def _expanded(entry: JobScene, folder: Path) -> list[JobScene]:
     scheme, path, query = parse_uri(entry.uri)
     known = SCHEMES.get(scheme) if scheme is not None else None
-    if scheme is not None and (known is None or path in known.builtin):
-        return [entry]  # an unknown scheme is refused where it is opened
     query = {key: _from(folder, value) for key, value in query.items()}
+    if scheme is not None and known is None:
+        return [entry]  # refused where it is opened
+    if scheme is not None and known is not None and path in known.builtin:
+        return [entry.model_copy(update={"uri": format_uri(scheme, path, query)})]
     whole = folder.absolute() / path
     matches = [str(whole)]
     if glob.has_magic(path) and not whole.exists():
-        matches = sorted(glob.glob(str(whole), recursive=True))
+        # The job's own folder may be called [x] too.
+        pattern = (
+            path if Path(path).is_absolute() else f"{glob.escape(str(folder.absolute()))}/{path}"
+        )
+        matches = sorted(glob.glob(pattern, recursive=True))
     if not matches:
         raise AdapterError(f"{entry.uri!r}: nothing matches {whole}")
     return [entry.model_copy(update={"uri": _uri(scheme, match, query)}) for match in matches]

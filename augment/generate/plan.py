@@ -180,8 +180,21 @@ def _from_json(data: bytes, where: str) -> StoredPlan:
         if facts["format"] != _FORMAT:
             raise ValueError("it is of another version")
         blocks = tuple(PlannedBlock(*block) for block in facts["blocks"])
-        return StoredPlan(facts["job"], facts["version"], blocks, facts["unusable"])
-    except (ValueError, TypeError, KeyError) as error:
+        plan = StoredPlan(facts["job"], facts["version"], blocks, facts["unusable"])
+        _check_types(plan)
+        return plan
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         raise OutputError(f"{where} is damaged: {error}. Delete it and start the job again") from (
             error
         )
+
+
+def _check_types(plan: StoredPlan) -> None:
+    texts = [plan.job, plan.version, *plan.unusable.keys(), *plan.unusable.values()]
+    for block in plan.blocks:
+        texts += [block.key, block.scene, block.variant, block.recipe]
+        if type(block.images) is not int or block.images < 1:
+            raise ValueError(f"a block of {block.images!r} images")
+    for text in texts:
+        if not isinstance(text, str):
+            raise ValueError(f"{text!r} in place of a text")

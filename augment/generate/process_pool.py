@@ -9,6 +9,7 @@ import _thread
 import contextlib
 import multiprocessing
 import os
+import signal
 import threading
 import time
 from multiprocessing.connection import Connection, wait
@@ -34,7 +35,7 @@ class ProcessPool:
     """`slots` worker processes that share the cores.
 
     Raises:
-        ClimateGSError: from wait: a process ended while starting.
+        ClimateGSError: from wait: a process ended while starting, and none has ever started.
     """
 
     def __init__(self, setup: WorkSetup, tick: Tick, slots: int) -> None:
@@ -42,6 +43,7 @@ class ProcessPool:
         self._setup, self._tick = setup, tick
         self._threads = max(1, available_cores() // slots)
         self._workers: list[_Worker | None] = [None] * slots
+        self._has_started = False  # any of them
 
     def give(self, slot: int, task: Task) -> None:
         worker = self._workers[slot]
@@ -86,7 +88,7 @@ class ProcessPool:
         except (EOFError, OSError):
             return self._bury(slot, worker)
         if message == _READY:
-            worker.is_ready = True
+            worker.is_ready = self._has_started = True
         elif isinstance(message, Outcome):
             self._tick(slot, message)
         else:
@@ -98,7 +100,7 @@ class ProcessPool:
         worker.connection.close()
         self._workers[slot] = None
         ending = describe_exit(worker.process.exitcode)
-        if not worker.is_ready:
+        if not worker.is_ready and not self._has_started:
             raise ClimateGSError(
                 f"a worker process {ending} while starting; what it printed says more. A script "
                 f"that generates with processes needs `if __name__ == '__main__':` around it; if "
@@ -141,6 +143,8 @@ def _main(connection: Connection, setup: WorkSetup, threads: int) -> None:
     torch.set_num_threads(threads)
     cv2.setNumThreads(1)
     send = sender(connection)
+    # A shell's background job ignores Ctrl-C, and so would `interrupt_main`.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     workshop = Workshop(setup, send)
     inbox: SimpleQueue[Task | None] = SimpleQueue()
     working = threading.Event()

@@ -269,6 +269,6 @@ def _ending(error: Exception) -> str:
         return "was ended by Ray because memory ran out"
     if "worker process has died" in text:
         return "was killed or crashed, or memory ran out"
-    if "node" in text and "died" in text:
-        return "was lost with its machine"
+    if "Unavailable" in type(error).__name__ or ("node" in text and "died" in text):
+        return "was lost, perhaps with its machine"
     return f"was lost ({type(error).__name__}: {last_line(error)})"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections import defaultdict
 from dataclasses import dataclass
@@ -10,6 +11,7 @@ from augment.batch.claims import CLAIMS_FOLDER, try_claim
 from augment.batch.layout import STATE_FOLDER
 from augment.batch.parts import Part, list_parts
 from augment.batch.store import Store
+from augment.errors import OutputError
 from augment.generate.plan import StoredPlan, stored_plans
 
 _RECENT = 20  # blocks whose times tell how fast it goes
@@ -117,10 +119,9 @@ def _staged(store: Store) -> dict[str, int]:
         return {}
     counts: dict[str, int] = {}
     for folder in (store.local_dir / STATE_FOLDER / "blocks").glob("*"):
-        journals = folder.glob(f"{STATE_FOLDER}/journal/*/*.jsonl")
-        counts[folder.name] = sum(
-            line.count(b'"status":"ok"') for path in journals for line in path.open("rb")
-        )
+        with contextlib.suppress(OSError):  # published meanwhile
+            journals = list(folder.glob(f"{STATE_FOLDER}/journal/*/*.jsonl"))
+            counts[folder.name] = sum(j.read_bytes().count(b'"status":"ok"') for j in journals)
     return counts
 
 
@@ -133,8 +134,10 @@ def _claims(store: Store) -> set[str]:
 
 def _is_held(store: Store, name: str) -> bool:
     """Whether the claim's holder lives; a dead one's is cleared away."""
-    claim = try_claim(store, name)
-    if claim is None:
+    try:
+        claim = try_claim(store, name)
+    except OutputError:  # somebody else's output, which can be read and no more
         return True
-    claim.release()
-    return False
+    if claim is not None:
+        claim.release()
+    return claim is None
