@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import re
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -32,6 +33,7 @@ from recipes.yaml_tree import ListNode, MapNode, Node, ScalarNode, read_tree
 
 MAX_BYTES = 4 << 20
 _NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
+_NAMES = "letters, digits, '.', '_' and '-', at most 64"
 Text = Annotated[str, Field(min_length=1, max_length=4096, strict=True)]
 Name = Annotated[str, Field(pattern=_NAME, strict=True)]
 
@@ -185,6 +187,10 @@ def parse_job(text: str, *, source: str, name: str = "job") -> Job:
         raise problems.fail(tree.line, "a job is a mapping with scenes and recipes")
     problems.raise_if_any()
     data: Any = _plain(tree)
+    if "name" not in data and not re.fullmatch(_NAME, name):
+        raise problems.fail(
+            1, f"the file's own name is no name for a job; give it a name: {_NAMES}"
+        )
     try:
         return Job.model_validate({"name": name, **data})
     except ValidationError as error:

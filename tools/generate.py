@@ -92,9 +92,8 @@ def parse_shard(text: str) -> tuple[int, int]:
         ClimateGSError: the text is something else.
     """
     number, slash, count = text.partition("/")
-    if not (slash and number.isdecimal() and count.isdecimal()) or not (
-        1 <= int(number) <= int(count)
-    ):
+    are_numbers = slash and number.isdecimal() and count.isdecimal() and len(text) < 20
+    if not are_numbers or not 1 <= int(number) <= int(count):
         raise ClimateGSError(f"--shard {text!r}: write i/n with i from 1 to n, as in 2/8")
     return int(number), int(count)
 

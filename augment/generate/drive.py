@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections import defaultdict, deque
+from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
@@ -17,6 +17,7 @@ from augment.generate.records import Block, SceneRecord
 from augment.generate.workshop import BlockDone, BlockTask, IndexTask, TaskFailed
 
 WAIT_S = 1.0
+MOST_LOST = 3  # blocks of a scene whose workers die even alone, before the scene is given up
 ELSEWHERE_S = 2.0  # how long to leave a block alone that another process is at
 _log = logging.getLogger(__name__)
 
@@ -129,6 +130,7 @@ class _Rendering:
         self._queue, self._names, self._fail = queue, names, fail
         self._busy: dict[int, BlockTask] = {}
         self._trials: list[Block] = []
+        self._lost_alone: Counter[str] = Counter()  # blocks of a scene that nobody survived
         self._later: list[tuple[float, Block]] = []  # another process is at them
 
     def hand_out(self) -> bool:
@@ -171,6 +173,10 @@ class _Rendering:
             self._trials.append(block)
         elif isinstance(event, Lost):
             self._give_up(block, _lost_twice(event))
+            self._lost_alone[block.scene] += 1
+            if self._lost_alone[block.scene] == MOST_LOST:
+                for other in self._queue.take_all(block.scene):
+                    self._give_up(other, _lost_twice(event))
         elif isinstance(event.result, TaskFailed):
             _raise_if_output(event.result)
             self._failed(block, event.result)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from augment.batch.runner import Outcome
 from augment.generate.workshop import Result, Task, WorkSetup, Workshop
@@ -30,6 +30,7 @@ Event = Finished | Lost
 Tick = Callable[[int, Outcome], None]  # the slot, and an image that its worker is done with
 
 
+@runtime_checkable
 class WorkerPool(Protocol):
     """Workers are numbered 0 to slots - 1; every one has at most one task.
 

@@ -1,0 +1,70 @@
+"""`climategs generate`: its arguments, what it prints, and how it ends."""
+
+from __future__ import annotations
+
+import signal
+from pathlib import Path
+
+import pytest
+
+from augment.batch.atomic import write_atomic
+from augment.errors import ClimateGSError
+from tools.cli import main
+from tools.generate import _ended_by_sigterm, generate_dataset, parse_shard
+
+
+def test_shards() -> None:
+    assert parse_shard("1/1") == (1, 1) and parse_shard("07/8") == (7, 8)
+
+
+@pytest.mark.parametrize("text", ["", "1", "/", "0/3", "4/3", "-1/3", "1/3/5", "a/b", "1 of 3",
+                                  "1/", "1.0/2", "1/" + "9" * 5000])  # fmt: skip
+def test_what_is_no_shard(text: str) -> None:
+    with pytest.raises(ClimateGSError, match="write i/n with i from 1 to n, as in 2/8"):
+        parse_shard(text)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["job.yaml"], "--out is missing"),
+        (["--out", "o"], "no job file is named"),
+        (["job.yaml", "--out", "o"], "no such file; a job is a YAML file"),
+        (["--out", "o", "--status"], "no job has been started there"),
+        (["--out", "ftp://x/y", "--status"], "ftp"),
+    ],
+)
+def test_arguments_that_cannot_be(
+    arguments: list[str],
+    said: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["generate", *arguments]) == 2
+    assert said in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_sigterm_is_as_ctrl_c() -> None:
+    before = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(KeyboardInterrupt), _ended_by_sigterm():
+        signal.raise_signal(signal.SIGTERM)
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_a_job_whose_scenes_cannot_be_opened(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    (tmp_path / "job.yaml").write_text("scenes: [missing]\nrecipes: [clear]\n")
+    job, out = tmp_path / "job.yaml", tmp_path / "out"
+    assert main(["generate", str(job), "--out", str(out), "--executor", "serial"]) == 2
+    said = capsys.readouterr().err
+    assert "none of its scenes can be used" in said and str(tmp_path / "missing") in said
+    with pytest.raises(ClimateGSError, match="none of its scenes"):
+        generate_dataset(job, str(out), executor="serial", dry_run=True)
+
+
+def test_a_damaged_plan_is_told(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    write_atomic(tmp_path / ".climategs/jobs/j.json", b'{"format":1}')
+    assert main(["generate", "--out", str(tmp_path), "--status"]) == 2
+    assert "j.json is damaged" in capsys.readouterr().err
