@@ -8,7 +8,8 @@ from collections import defaultdict
 from dataclasses import dataclass
 
 from augment.batch.claims import CLAIMS_FOLDER, try_claim
-from augment.batch.layout import STATE_FOLDER
+from augment.batch.layout import MANIFEST, STATE_FOLDER
+from augment.batch.manifest import OK, read_manifest
 from augment.batch.parts import Part, list_parts
 from augment.batch.store import Store
 from augment.errors import OutputError
@@ -119,9 +120,12 @@ def _staged(store: Store) -> dict[str, int]:
         return {}
     counts: dict[str, int] = {}
     for folder in (store.local_dir / STATE_FOLDER / "blocks").glob("*"):
-        with contextlib.suppress(OSError):  # published meanwhile
+        with contextlib.suppress(OSError, OutputError):  # published meanwhile
             journals = list(folder.glob(f"{STATE_FOLDER}/journal/*/*.jsonl"))
-            counts[folder.name] = sum(j.read_bytes().count(b'"status":"ok"') for j in journals)
+            finished = sum(j.read_bytes().count(b'"status":"ok"') for j in journals)
+            if (folder / MANIFEST).is_file():  # a run that was stopped, or had failures
+                finished += read_manifest(folder)["status"].to_pylist().count(OK)
+            counts[folder.name] = finished
     return counts
 
 

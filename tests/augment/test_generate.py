@@ -1,0 +1,313 @@
+"""Dataset jobs in one process: what is rendered, what is left alone, what becomes of failures."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from batch_scenes import make_recipe, must_not_render, open_fake
+from generate_jobs import (
+    DRY,
+    check_reader,
+    image_name,
+    leftovers,
+    make_job,
+    make_recipes,
+    open_without_memory,
+    outputs,
+    raising_render,
+)
+
+from augment.batch.atomic import write_atomic
+from augment.batch.job import RenderJob, run_job
+from augment.batch.layout import folder_name
+from augment.batch.manifest import read_manifest
+from augment.batch.parts import list_parts, read_finished
+from augment.batch.store import open_store
+from augment.errors import ClimateGSError, OutputError
+from augment.generate.job import GenerateJob, GenerateResult, run_generate
+from augment.generate.plan import stored_plans
+from augment.generate.status import read_status
+from recipes.job import JobScene
+
+
+@pytest.fixture(autouse=True)
+def few_collections(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A worker collects garbage between scenes: here, that of all tests so far."""
+    lazy = SimpleNamespace(collect=lambda: None)
+    monkeypatch.setattr("augment.generate.workshop.gc", lazy)
+
+
+def run(job: GenerateJob) -> GenerateResult:
+    return run_generate(job, progress=False)
+
+
+def rendered(job: GenerateJob) -> list[str]:
+    """Runs the job; the images that it rendered, in order."""
+    names: list[str] = []
+
+    def renderer(scene, camera, recipe, *, backend):
+        names.append(image_name(scene, camera, recipe))
+        return job.setup.renderer(scene, camera, recipe, backend=backend)
+
+    run(replace(job, setup=replace(job.setup, renderer=renderer)))
+    return names
+
+
+def rows_of(out: Path, **wanted) -> list[dict]:
+    rows = read_finished(open_store(out)).to_pylist()
+    return [r for r in rows if all(r[key] == value for key, value in wanted.items())]
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("finished") / "out"
+    result = run(make_job(out))
+    assert (result.written, result.skipped, result.failed) == (28, 0, 0)
+    return out
+
+
+@pytest.fixture
+def whole(finished: Path) -> dict[str, str]:
+    return outputs(finished)
+
+
+def test_every_image_once_and_nothing_but_them_left(finished: Path, whole: dict) -> None:
+    rows = read_manifest(finished).to_pylist()
+    assert len(rows) == 28 and check_reader(finished, whole) == 28
+    named = {row[k] for row in rows for k in row if k.endswith("_path") and row[k] is not None}
+    recipes = {f"{s}/{v}-000/recipe.yaml" for s in "ab" for v in ("fog", "wet")}
+    assert whole.keys() == named | recipes | {"manifest.parquet"}
+    assert leftovers(finished) == []
+    boxes = sorted(path.name[:7] for path in (finished / "a/fog-000/labels/boxes").iterdir())
+    assert boxes == ["000000-", "000002-"]
+
+
+def test_a_finished_job_renders_nothing_and_touches_nothing(finished: Path) -> None:
+    before = {p: p.stat().st_mtime_ns for p in finished.rglob("*") if p.is_file()}
+    result = run(make_job(finished, renderer=must_not_render))
+    assert (result.written, result.skipped, result.failed) == (0, 28, 0)
+    assert {p: p.stat().st_mtime_ns for p in finished.rglob("*") if p.is_file()} == before
+
+
+def test_shards_in_any_order_give_the_files_of_one_run(tmp_path: Path, whole: dict) -> None:
+    results = [run(make_job(tmp_path, shard=(k, 5))) for k in (4, 1, 5, 2, 3)]
+    assert sum(result.written for result in results) == 28
+    assert outputs(tmp_path) == whole
+    assert run(make_job(tmp_path, shard=(2, 2), renderer=must_not_render)).written == 0
+
+
+def test_only_what_is_new_is_rendered(tmp_path: Path) -> None:
+    """More frames, scenes, recipes and variants, one after the other."""
+    dry, both = make_recipes(["dry"]), make_recipes(["dry", "wet"])
+    doubled = make_recipes(["dry", "wet"], variants=2)
+    small = [JobScene(uri="fake:a?frames=3", frames="0:2")]
+    assert len(rendered(make_job(tmp_path, small, dry))) == 4
+    names = rendered(make_job(tmp_path, ["fake:a?frames=3"], dry))
+    assert {n.split("/")[2] for n in names} == {"2"} and len(names) == 2
+    scenes = ["fake:a?frames=3", "fake:b?frames=1"]
+    names = rendered(make_job(tmp_path, scenes, dry))
+    assert {n.split("/")[0] for n in names} == {"b"} and len(names) == 2
+    names = rendered(make_job(tmp_path, scenes, both))
+    assert {n.split("/")[1] for n in names} == {"wet-000"} and len(names) == 8
+    names = rendered(make_job(tmp_path, scenes, doubled))
+    assert {n.split("/")[1] for n in names} == {"dry-001", "wet-001"} and len(names) == 16
+    run(make_job(tmp_path / "once", scenes, doubled))
+    once = outputs(tmp_path / "once")
+    assert {k: v for k, v in outputs(tmp_path).items() if not k.startswith("once")} == once
+
+
+def test_draws_differ_from_scene_to_scene_unless_they_are_shared(tmp_path: Path) -> None:
+    scenes = ["fake:a?frames=1", "fake:b?frames=1"]
+    run(make_job(tmp_path / "own", scenes, make_recipes(["fog"])))
+    run(make_job(tmp_path / "shared", scenes, make_recipes(["fog"], draws="shared")))
+    own = {row["recipe_hash"] for row in rows_of(tmp_path / "own")}
+    shared = {row["recipe_hash"] for row in rows_of(tmp_path / "shared")}
+    assert (len(own), len(shared)) == (2, 1)
+
+
+def test_another_recipe_of_the_same_name_is_refused(finished: Path) -> None:
+    before = outputs(finished)
+    parts = list_parts(open_store(finished))
+    plans = stored_plans(open_store(finished))
+    changed = make_recipes(texts={"fog": DRY})
+    with pytest.raises(OutputError, match=r"a/fog-000 already holds.*recipe hash.*Give the recipe"):
+        run(make_job(finished, recipes=changed, renderer=must_not_render))
+    assert outputs(finished) == before and leftovers(finished) == []
+    assert list_parts(open_store(finished)) == parts
+    assert stored_plans(open_store(finished)) == plans
+
+
+def test_an_image_that_fails_costs_itself_and_is_tried_again(tmp_path: Path, whole: dict) -> None:
+    result = run(make_job(tmp_path, renderer=raising_render))
+    assert (result.written, result.failed) == (27, 1)
+    assert "rendering: ValueError: the picture is cut short" in result.failures[0]
+    (row,) = rows_of(tmp_path, status="failed")
+    image = row["scene"], row["variant"], row["frame"], row["camera"]
+    assert image == ("a", "fog-000", 1, "front")
+    assert "cut short" in row["message"] and row["image_path"] is None
+    assert read_manifest(tmp_path).num_rows == 28
+    assert rendered(make_job(tmp_path, renderer=raising_render)) == ["a/fog-000/1/front"]
+    assert rendered(make_job(tmp_path)) == ["a/fog-000/1/front"]
+    assert outputs(tmp_path) == whole and leftovers(tmp_path) == []
+
+
+def test_a_frame_whose_labels_are_broken(tmp_path: Path) -> None:
+    scenes = ["fake:a?frames=4&unreadable=2", "fake:b?frames=3"]
+    result = run(make_job(tmp_path, scenes))
+    assert (result.written, result.failed) == (24, 4)
+    failed = {(r["scene"], r["frame"]) for r in rows_of(tmp_path, status="failed")}
+    assert failed == {("a", 2)}
+    assert all("cut short" in row["message"] for row in rows_of(tmp_path, status="failed"))
+    assert read_status(open_store(tmp_path))[0].total.in_failed_blocks == 8
+
+
+def test_a_scene_that_memory_does_not_suffice_for(tmp_path: Path, whole: dict) -> None:
+    result = run(make_job(tmp_path, opener=open_without_memory))
+    assert (result.written, result.failed) == (16, 0)
+    assert list(result.unusable) == ["fake:b?frames=3"]
+    assert "memory ran out (bad allocation)" in result.unusable["fake:b?frames=3"]
+    assert read_status(open_store(tmp_path))[0].unusable == result.unusable
+    assert run(make_job(tmp_path)).written == 12
+    assert outputs(tmp_path) == whole
+
+
+def test_a_scene_that_could_be_opened_once(tmp_path: Path, whole: dict) -> None:
+    """All its images are failed rows, and are tried again."""
+    run(make_job(tmp_path, shard=(1, 28)))
+    result = run(make_job(tmp_path, opener=open_without_memory))
+    assert (result.written + result.skipped, result.failed) == (16, 12)
+    assert {row["scene"] for row in rows_of(tmp_path, status="failed")} == {"b"}
+    assert len(rows_of(tmp_path)) == 28
+    assert all("memory ran out" in r["message"] for r in rows_of(tmp_path, status="failed"))
+    assert run(make_job(tmp_path)).failed == 0
+    assert outputs(tmp_path) == whole and leftovers(tmp_path) == []
+
+
+def test_no_scene_at_all_can_be_opened(tmp_path: Path) -> None:
+    with pytest.raises(ClimateGSError, match=r"none of its scenes can be used: fake:b: memory ran"):
+        run(make_job(tmp_path, ["fake:b"], opener=open_without_memory))
+
+
+@pytest.mark.parametrize("name", ["../../etc", "x" * 300, "новый", ".hidden", "a\nb", "CON "])
+def test_hostile_names_stay_inside(tmp_path: Path, name: str) -> None:
+    def opener(uri: str):
+        return replace(open_fake("fake:x?frames=1"), name=name)
+
+    out = tmp_path / "out"
+    job = make_job(out, ["fake:x"], make_recipes(["dry"]), opener=opener)
+    assert run(job).written == 2
+    assert [p.name for p in tmp_path.iterdir()] == ["out"]
+    assert (out / folder_name(name) / "dry-000" / "recipe.yaml").is_file()
+    assert {row["scene"] for row in rows_of(out)} == {name}
+    assert run(replace(job, setup=replace(job.setup, renderer=must_not_render))).skipped == 2
+    assert read_status(open_store(out))[0].total.published == 2
+
+
+def test_scenes_of_one_name_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ClimateGSError, match=r"both called 'a', so they would share a folder"):
+        run(make_job(tmp_path, ["fake:a?frames=1", "fake:a?frames=2"]))
+    named = [JobScene(uri="fake:a?frames=1"), JobScene(uri="fake:a?frames=2", name="second")]
+    assert run(make_job(tmp_path, named, make_recipes(["dry"]))).written == 6
+    assert (tmp_path / "second" / "dry-000").is_dir()
+
+
+def test_status_in_every_state(tmp_path: Path) -> None:
+    store = open_store(tmp_path)
+    assert read_status(store) == []
+    calls = []
+
+    def stops(scene, camera, recipe, *, backend):
+        calls.append(camera.name)
+        if len(calls) == 8:
+            raise KeyboardInterrupt
+        return make_job(tmp_path).setup.renderer(scene, camera, recipe, backend=backend)
+
+    with pytest.raises(KeyboardInterrupt, match="start the same job again"):
+        run(make_job(tmp_path, renderer=stops))
+    (status,) = read_status(store)
+    assert (status.total.planned, status.total.published, status.staged) == (28, 6, 1)
+    assert (status.blocks, status.blocks_published, status.claims) == (8, 2, 0)
+    assert read_manifest(tmp_path).num_rows == 6
+    run(make_job(tmp_path, renderer=raising_render))
+    (status,) = read_status(store)
+    assert (status.total.published, status.total.in_failed_blocks, status.staged) == (28, 4, 0)
+    assert status.by_scene["a"].planned == 16 and status.by_recipe["wet"].published == 14
+
+
+DAMAGES = [b"", b"{", b"[]", b"null", b'{"format":1}', b"\xff", b"[" * 100_000,
+           b'{"format":1,"job":"j","version":"1","blocks":[["k","s","v","r","9"]],"unusable":{}}',
+           b'{"format":1,"job":"j","version":"1","blocks":[["k"]],"unusable":{}}',
+           b'{"format":1,"job":"j","version":"1","blocks":[],"unusable":[]}',
+           b'{"format":1,"job":["j"],"version":"1","blocks":[],"unusable":{}}',
+           b'{"format":2,"job":"j","version":"1","blocks":[],"unusable":{}}']  # fmt: skip
+
+
+@pytest.mark.parametrize("data", DAMAGES, ids=lambda data: data[:12].decode("latin1"))
+@pytest.mark.usefixtures("unchecked")
+def test_a_damaged_plan_is_told_and_written_again(tmp_path: Path, data: bytes) -> None:
+    write_atomic(tmp_path / ".climategs" / "jobs" / "job.json", data)
+    with pytest.raises(OutputError, match=r"job\.json is damaged: .*Delete it"):
+        read_status(open_store(tmp_path))
+    job = make_job(tmp_path, ["fake:a?frames=1"], make_recipes(["dry"]))
+    assert run(job).written == 2
+    assert read_status(open_store(tmp_path))[0].total.published == 2
+
+
+def test_a_damaged_record_of_a_scene_is_made_again(tmp_path: Path) -> None:
+    job = make_job(tmp_path, ["fake:a?frames=1"], make_recipes(["dry"]))
+    run(job)
+    (record,) = (tmp_path / ".climategs" / "scenes").iterdir()
+    whole = record.read_bytes()
+    facts = json.loads(whole)
+    for damaged in (b"", b"{}", b"[1]", json.dumps({**facts, "frames": [[1]]}).encode(),
+                    json.dumps({**facts, "extra": 1}).encode()):  # fmt: skip
+        record.write_bytes(damaged)
+        assert run(job).skipped == 2
+        assert json.loads(record.read_bytes())["frames"] == facts["frames"]
+
+
+def test_a_folder_that_may_not_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The tests may run as root, whom nothing stops."""
+
+    def refuse(*_: object, **__: object) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr("os.replace", refuse)
+    with pytest.raises(OutputError, match="not writable for this user"):
+        run(make_job(tmp_path))
+
+
+def test_a_render_job_into_the_same_folder(tmp_path: Path) -> None:
+    """Before, between and after: neither loses the other's rows."""
+
+    def render(name: str) -> None:
+        job = RenderJob("fake:a?frames=2", [make_recipe(name, depth="none")], tmp_path)
+        run_job(job, scene_loader=open_fake, renderer=make_job("x").setup.renderer, progress=False)
+
+    def variants() -> dict[str, int]:
+        names = [row["variant"] for row in rows_of(tmp_path, status="ok")]
+        return {name: names.count(name) for name in sorted(set(names))}
+
+    render("clear")
+    run(make_job(tmp_path, ["fake:a?frames=2"], make_recipes(["wet"])))
+    assert variants() == {"clear-000": 4, "wet-000": 4}
+    render("haze")
+    assert variants() == {"clear-000": 4, "haze-000": 4, "wet-000": 4}
+    run(make_job(tmp_path, ["fake:a?frames=3"], make_recipes(["wet"])))
+    assert variants() == {"clear-000": 4, "haze-000": 4, "wet-000": 6}
+    assert read_manifest(tmp_path).num_rows == 14
+    with pytest.raises(OutputError, match="a/haze-000 already holds"):
+        run(make_job(tmp_path, ["fake:a?frames=2"], make_recipes(["haze"], texts={"haze": DRY})))
+
+
+@pytest.fixture(autouse=True)
+def no_threads_left() -> Iterator[None]:
+    yield
+    import threading
+
+    assert not [t for t in threading.enumerate() if t.name.startswith(("publish", "writer"))]

@@ -1,0 +1,39 @@
+"""Dataset jobs that are killed, stopped, starved of disk, or run several times at once."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture
+def quick_folder() -> Iterator[Path]:
+    """A folder in memory where there is one: these tests flush thousands of files."""
+    memory = Path("/dev/shm")
+    folder = Path(tempfile.mkdtemp(dir=memory if memory.is_dir() else None))
+    yield folder
+    shutil.rmtree(folder)
+
+
+def test_killed_jobs_go_on_to_identical_files(quick_folder: Path) -> None:
+    """What has to hold is in the script, which ends with a message where it does not."""
+    script = Path(__file__).with_name("generate_crashes.py")
+    done = subprocess.run(
+        [sys.executable, script, quick_folder], capture_output=True, text=True, timeout=600
+    )
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert found["kill_the_driver"]["kills"] >= 50
+    assert found["kill_the_driver"]["seen"] >= 3  # readers met outputs of as many sizes
+    assert found["fill_the_disk"]["failures"] >= 4
+    assert sum(found["kill_workers"][who] for who in ("workers_killed", "drivers_killed")) >= 4
+    assert len(found["stop_a_job_with_workers"]["finished"]) == 2
+    assert found["die_at_one_image"]["rendered_again"] == 1
+    assert {"run_several_drivers", "die_while_opening"} <= found.keys()
