@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import contextlib
 import math
+import shlex
 import signal
 import sys
+import uuid
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from adapters.base import open_scene
 from adapters.patterns import scenes_of
-from augment.batch.store import open_store
+from augment.batch.layout import STATE_FOLDER
+from augment.batch.store import Store, open_store
 from augment.errors import ClimateGSError
 from augment.generate.job import (
     GenerateJob,
@@ -46,10 +49,13 @@ def generate_dataset(
     dry_run: bool = False,
 ) -> int:
     """Runs the job and prints what became of it. Returns the exit code: 1 where images failed."""
+    if workers is not None and workers < 1:
+        raise ClimateGSError(f"--workers must be 1 or more; got {workers}")
     wanted = load_job(job)
     recipes = load_job_recipes(wanted, job.parent)
+    store = open_store(out)
     setup = WorkSetup(
-        store_uri=str(out),
+        store_uri=out if store.local_dir is None else store.uri,
         scratch=scratch or default_scratch(out),
         backend=backend,
         open_scene=open_scene,
@@ -65,6 +71,7 @@ def generate_dataset(
     )
     if dry_run:
         return _dry_run(task)
+    _check_writable(open_store(out))
     with _ended_by_sigterm():
         result = run_generate(task, prepare=_warm_up)
     _report(result, out)
@@ -96,6 +103,13 @@ def parse_shard(text: str) -> tuple[int, int]:
     if not are_numbers or not 1 <= int(number) <= int(count):
         raise ClimateGSError(f"--shard {text!r}: write i/n with i from 1 to n, as in 2/8")
     return int(number), int(count)
+
+
+def _check_writable(store: Store) -> None:
+    """Learn that an output cannot be written before scenes are opened, which may take hours."""
+    name = f"{STATE_FOLDER}/probe-{uuid.uuid4().hex}"
+    store.write(name, b"")
+    store.delete([name])
 
 
 def _dry_run(job: GenerateJob) -> int:
@@ -152,7 +166,7 @@ def _report(result: GenerateResult, out: str) -> None:
         _say(f"... and {more} more; the manifest has them all")
     for uri, why in result.unusable.items():
         _say(f"cannot be used: {uri}: {why}")
-    print(f"output: {out}   (climategs report {out} shows it)")
+    print(f"output: {out}   (climategs report {shlex.quote(out)} shows it)")
 
 
 def _print_status(status: JobStatus) -> None:

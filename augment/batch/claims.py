@@ -11,11 +11,15 @@ been renewed for the lifetime, by the clock of the store, is dead, and may be de
 
 from __future__ import annotations
 
+import contextlib
+import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 from augment.batch.layout import STATE_FOLDER, folder_name
 from augment.batch.store import Store
+from augment.errors import OutputError
 
 CLAIMS_FOLDER = f"{STATE_FOLDER}/claims"
 
@@ -78,3 +82,22 @@ def try_claim(store: Store, name: str, times: ClaimTimes | None = None) -> Claim
     from augment.batch.remote_claims import contend
 
     return contend(store, f"{CLAIMS_FOLDER}/{name}", times or CLAIM_TIMES)
+
+
+@contextlib.contextmanager
+def hold(store: Store, name: str, patience_s: float = 120.0) -> Iterator[None]:
+    """Be inside with the claim; waits for others that are.
+
+    Raises:
+        OutputError: they took longer than that.
+    """
+    deadline = time.monotonic() + patience_s
+    while (claim := try_claim(store, name)) is None:
+        if time.monotonic() > deadline:
+            raise OutputError(
+                f"{store.uri}: another process has held the claim {name!r} for {patience_s:.0f} s; "
+                f"end it, then run the same command again"
+            )
+        time.sleep(0.05)
+    with claim:
+        yield

@@ -16,6 +16,7 @@ import pyarrow as pa
 from augment.batch.atomic import flush_folder, make_folder, output_error, remove_temporaries
 from augment.batch.box_tables import BoxNumbers, Item
 from augment.batch.box_weather import TABLES
+from augment.batch.claims import hold
 from augment.batch.journal import Identity, Journal, journalled_variants
 from augment.batch.layout import (
     MANIFEST,
@@ -37,6 +38,7 @@ from augment.batch.manifest import (
 from augment.batch.rows import Pictured, image_row
 from augment.batch.runner import Chunk, Outcome
 from augment.batch.selection import SceneIndex
+from augment.batch.store import open_store
 from augment.cameras import Frame
 from augment.errors import OutputError
 from recipes.schema import Recipe
@@ -137,7 +139,7 @@ class Ledger:
         """Put the rows of these variants into the manifest."""
         keys = {(self.index.name, variant.name) for variant in variants}
         rows = [row for variant in variants for row in variant.rows.values()]
-        return write_manifest(self.out_dir, merge_rows(self._table, rows, keys))
+        return self._replace_rows(rows, keys)
 
     def close(self) -> None:
         for variant in self.variants:
@@ -187,16 +189,23 @@ class Ledger:
                     raise output_error(folder, error) from error
         if self._table is not None:
             keys = {(self.index.name, variant.name) for variant in variants}
-            self._table = merge_rows(self._table, [], keys)
-            write_manifest(self.out_dir, self._table)
+            self._replace_rows([], keys)
         for variant in variants:
             variant.journal.remove()
         _remove_tree(trash)
 
+    def _replace_rows(self, rows: Sequence[dict[str, Any]], keys: set[tuple[str, str]]) -> Path:
+        """Exchange rows of the manifest as it is now: other jobs may have merged theirs."""
+        with hold(open_store(self.out_dir), "manifest"):
+            there = (self.out_dir / MANIFEST).is_file()
+            self._table = merge_rows(read_manifest(self.out_dir) if there else None, rows, keys)
+            return write_manifest(self.out_dir, self._table)
+
     def _clear_leftovers(self) -> None:
         state = self.out_dir / STATE_FOLDER
         remove_temporaries(self.out_dir, recursive=False)
-        remove_temporaries(state)
+        remove_temporaries(state, recursive=False)  # blocks of other jobs may be at work below it
+        remove_temporaries(state / "journal")
         _remove_tree(state / "trash")
         mine = {variant.folder for variant in self.variants}
         for folder in sorted(mine | set(journalled_variants(self.out_dir))):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import os
 from pathlib import Path
@@ -36,6 +37,8 @@ class FileClaim:
         try:
             if _is_named(self._path, descriptor):
                 self._path.unlink(missing_ok=True)
+                with contextlib.suppress(OSError):  # where there are no others
+                    self._path.parent.rmdir()
         except OSError as error:
             raise output_error(self._path, error) from error
         finally:

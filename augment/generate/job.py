@@ -108,7 +108,7 @@ def run_generate(
 
     Raises:
         OutputError: the output cannot be written, or holds images of another kind under the same
-            names; nothing was written then. ClimateGSError: no scene can be used.
+            names; none of its images was written then. ClimateGSError: no scene can be used.
         RecipeError: a recipe cannot be used.
     """
     return _Generation(job, progress, prepare, on_image).go()
@@ -244,7 +244,7 @@ class _Generation:
     def _fail(self, block: Block, message: str) -> None:
         """Publish a block whose images have all failed, unless others have finished it."""
         record = self._plan.records[block.scene]
-        identity = _identity(record, block, self._plan.backend)
+        identity = block.identity(self._plan.backend)
         nowhere = {f"{kind}_path": None for kind in PATH_KINDS}
         rows = [
             image_row(
@@ -322,8 +322,11 @@ def _record_path(uri: str, name: str | None) -> str:
     return f"{SCENES}/{digest[:20]}.json"
 
 
-def _identity(record: SceneRecord, block: Block, backend: str) -> Identity:
-    return Identity(record.source, block.recipe.hash, "recorded", augment.__version__, backend)
+def _check_writable(store: Store) -> None:
+    """Before scenes are opened, which takes long: an output that cannot be written is refused."""
+    path = f"{STATE_FOLDER}/writable"
+    store.write(path, b"")
+    store.delete([path])
 
 
 def _check_not_mixed(store: Store, plan: Plan, blocks: Sequence[Block]) -> None:
@@ -338,8 +341,7 @@ def _check_not_mixed(store: Store, plan: Plan, blocks: Sequence[Block]) -> None:
     for scene, variant, identity in _identities(table):
         block = planned.get((scene, variant))
         if block is not None:
-            mine = _identity(plan.records[scene], block, identity.backend)
-            mine.check(identity, f"{store.uri}/{scene}/{variant}")
+            block.identity(identity.backend).check(identity, f"{store.uri}/{scene}/{variant}")
 
 
 def _identities(table: pa.Table) -> list[tuple[str, str, Identity]]:

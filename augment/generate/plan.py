@@ -76,8 +76,8 @@ def make_plan(
         records[record.name] = record
         blocks += cut
     if not records:
-        reasons = "; ".join(f"{uri}: {why}" for uri, why in list(unusable.items())[:5])
-        raise ClimateGSError(f"job {recipes.job.name}: none of its scenes can be used: {reasons}")
+        reasons = "".join(f"\n  {uri}: {why}" for uri, why in list(unusable.items())[:5])
+        raise ClimateGSError(f"job {recipes.job.name}: none of its scenes can be used:{reasons}")
     names = {record.name: entry.name for entry, record in _pairs(scenes, found)}
     return Plan(recipes.job.name, backend, tuple(blocks), records, names, unusable)
 

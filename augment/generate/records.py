@@ -9,9 +9,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import augment
+from augment.batch.journal import Identity
 from augment.batch.layout import folder_name, variant_name
 from augment.batch.rows import Pictured
 from augment.batch.selection import SceneIndex, select_frames
+from augment.batch.trajectory import RECORDED
 from augment.cameras import scaled_size
 from augment.errors import OutputError, SceneError
 from augment.scene import Scene
@@ -101,12 +103,14 @@ class Block:
     """Images that one worker renders in a row and that appear in the output at once.
 
     key: `<scene>/<variant>-<first frame>-<digest>`; the digest is of all that decides the block's
-    images, so it stays the same whatever else is in the job. uri: what opens the scene. scene: its
-    name in the output. frames, cameras: in order. images: how many it has.
+    images, so it stays the same whatever else is in the job. uri: what opens the scene. source:
+    the scene's own word for that. scene: its name in the output. frames, cameras: in order.
+    images: how many it has.
     """
 
     key: str
     uri: str
+    source: str
     scene: str
     recipe: Recipe
     frames: tuple[int, ...]
@@ -126,6 +130,10 @@ class Block:
     def file_stem(self) -> str:
         """What its files are called that belong to several images: `000016-3fc0a1b2`."""
         return self.key.rsplit("/", 1)[-1].removeprefix(folder_name(self.variant) + "-")
+
+    def identity(self, backend: str) -> Identity:
+        """What its images are made from. backend: as named, or as chosen where that is known."""
+        return Identity(self.source, self.recipe.hash, RECORDED, augment.__version__, backend)
 
     def pictured(self, record: SceneRecord) -> list[Pictured]:
         """All images of the block, by frame and camera."""
@@ -187,7 +195,18 @@ def cut_into_blocks(
             if held:
                 names = tuple(sorted(wanted_cameras & {n for f in run for n in f.cameras}))
                 key = _key(record, recipe, run[0].number, held, names, backend)
-                blocks.append(Block(key, record.uri, record.name, recipe, held, names, sum(counts)))
+                blocks.append(
+                    Block(
+                        key,
+                        record.uri,
+                        record.source,
+                        record.name,
+                        recipe,
+                        held,
+                        names,
+                        sum(counts),
+                    )
+                )
     if not blocks:
         raise SceneError(
             f"scene {record.name!r} ({record.uri}): frames {frames!r} and cameras "

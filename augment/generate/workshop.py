@@ -23,6 +23,7 @@ from augment.errors import ClimateGSError, OutputError
 from augment.generate.leftovers import clear_block, clear_files_of
 from augment.generate.publish import Publisher, staging_folder
 from augment.generate.records import Block, SceneRecord
+from augment.generate.variants import enter_variant
 from augment.scene import Scene
 
 _log = logging.getLogger(__name__)
@@ -106,6 +107,7 @@ class Workshop:
         self._store: Store = open_store(setup.store_uri)
         self._scene: Scene | None = None
         self._opened: tuple[str, str | None] | None = None
+        self._entered: set[tuple[str, str]] = set()
 
     def do(self, task: Task) -> Result:
         """The task's result; errors that concern the task alone are results too."""
@@ -164,6 +166,7 @@ class Workshop:
             self._forget()
         else:
             self._lay_bed(block, self._scene_of(block.uri, task.name))
+        self._enter(block)
         folder = staging_folder(self._store, self._setup.scratch, block)
         if folder.is_dir():
             clear_files_of(self._store, block)
@@ -196,6 +199,12 @@ class Workshop:
         return BlockDone(
             result.written, result.skipped, result.failed, result.failures, seconds=result.timings
         )
+
+    def _enter(self, block: Block) -> None:
+        variant = (block.scene, block.variant)
+        if variant not in self._entered:
+            enter_variant(self._store, *variant, block.identity(self._setup.backend))
+            self._entered.add(variant)
 
     def _beds_dir(self) -> Path:
         if self._store.local_dir is not None:

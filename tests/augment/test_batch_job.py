@@ -36,7 +36,7 @@ from augment.batch.job import JobResult, RenderJob, run_job
 from augment.batch.label_files import read_boxes, read_lidar
 from augment.batch.layout import item_paths, resolve_inside
 from augment.batch.lock import OutputLock
-from augment.batch.manifest import read_manifest
+from augment.batch.manifest import read_manifest, write_manifest
 from augment.cameras import Frame
 from augment.errors import OutputError, SceneError
 from recipes.load import load_recipe
@@ -433,3 +433,13 @@ def test_the_librarys_own_renderer(tmp_path: Path) -> None:
     assert row["backend"] == "reference"
     image = cv2.imread(str(tmp_path / row["image_path"]))
     assert image.std() > 1  # something of the scene is in it
+
+
+def test_rows_that_are_merged_while_a_job_runs_stay(tmp_path: Path) -> None:
+    """As `generate` does in the same output."""
+    run(RenderJob("fake:other", [make_recipe()], tmp_path / "other"))
+    others, out = read_manifest(tmp_path / "other"), tmp_path / "out"
+    street = RenderJob("fake:street", [make_recipe()], out)
+    run(street, tell=lambda _: write_manifest(out, others))
+    scenes = read_manifest(out)["scene"].to_pylist()
+    assert scenes.count("other") == scenes.count("street") == others.num_rows
