@@ -28,6 +28,7 @@ from adapters.uri import (
 from augment.errors import AdapterError
 from augment.ground import Ground
 from augment.scene import Scene
+from recipes.nearest import nearest_word
 
 
 class Adapter(Protocol):
@@ -54,7 +55,9 @@ def open_scene(uri: str) -> Scene:
         scheme = recognise(Path(path))
     entry = SCHEMES.get(scheme)
     if entry is None:
-        raise AdapterError(f"{uri!r}: unknown scheme {scheme!r}; known: {known_schemes()}")
+        near = nearest_word(scheme, tuple(SCHEMES))
+        guess = f"; did you mean {near}?" if near else ";"
+        raise AdapterError(f"unknown scheme {scheme!r} in {uri!r}{guess} known: {known_schemes()}")
     if entry.builtin:
         scene = _open_builtin(scheme, entry, path, query)
     else:

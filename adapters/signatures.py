@@ -95,7 +95,10 @@ def _is_drivestudio_file(path: Path) -> bool:
 
 
 def _is_recording(folder: Path) -> bool:
-    return (folder / "calibration.json").is_file() and (folder / "images").is_dir()
+    is_calibrated = (folder / "calibration.json").is_file() or any(
+        folder.glob("calibration/*.json")
+    )
+    return is_calibrated and (folder / "images").is_dir()
 
 
 def _holds_splats(folder: Path) -> bool:

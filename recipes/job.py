@@ -212,7 +212,10 @@ def load_job_recipes(job: Job, folder: Path) -> JobRecipes:
     templates = {}
     for entry in job.recipes:
         is_preset = entry.recipe in preset_names()
-        template = load_recipe(entry.recipe if is_preset else folder / entry.recipe)
+        try:
+            template = load_recipe(entry.recipe if is_preset else folder / entry.recipe)
+        except RecipeError as error:
+            raise RecipeError(f"job {job.name}, recipe {entry.recipe!r}: {error}") from None
         name = entry.name or Path(entry.recipe).stem
         if entry.name is not None:
             template = dataclasses.replace(template, name=entry.name)
@@ -294,4 +297,10 @@ def _said(problem: Any) -> str:
     }
     if problem["type"] in short_words:
         return short_words[problem["type"]]
-    return problem["msg"].removeprefix("Value error, ")
+    if problem["type"] == "value_error":
+        return problem["msg"].removeprefix("Value error, ")
+    if problem["type"] == "string_pattern_mismatch":
+        expected = "must be letters, digits, '.', '_', '-', at most 64, first a letter or digit"
+    else:
+        expected = problem["msg"].replace("Input should be", "must be", 1)
+    return f"{expected}; got {short(repr(problem['input']))}"

@@ -55,8 +55,10 @@ def render(
         links: Of that copy: hard: unchanged files share the dataset's disk space. copy: nothing is
             shared.
     """
+    from tools.local_output import check_local
     from tools.render import render_recipe
 
+    check_local(out, "`climategs generate` writes to object stores")
     return render_recipe(
         recipe,
         scene,
@@ -215,13 +217,15 @@ def sheet(
     """Draw pictures of an output folder: a contact sheet, and a video of one camera.
 
     Args:
-        out: A folder that `climategs render` wrote.
+        out: A folder that `climategs render` or `generate` wrote.
         frame: Which frame the contact sheet shows. The middle one by default.
         video_camera: Also write an MP4 of this camera, all variants side by side.
         fps: Frames per second of the video.
     """
+    from tools.local_output import check_local
     from tools.pictures import draw_sheet, draw_video
 
+    check_local(out, "`climategs report` reads object stores; or copy the output here")
     print(draw_sheet(out, frame))
     if video_camera is not None:
         print(draw_video(out, video_camera, fps))

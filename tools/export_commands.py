@@ -40,10 +40,12 @@ def mirror(
     """Lay rendered images into copies of their dataset, as `render --layout source` does.
 
     Args:
-        out: A folder that `climategs render` wrote.
+        out: A folder that `climategs render` or `generate` wrote.
         scene: Only of this scene. By default of all that the manifest names.
         links: hard: unchanged files share the dataset's disk space. copy: nothing is shared.
     """
+    from tools.local_output import check_local
     from tools.mirror import mirror_again
 
+    check_local(out, "copy the output here")
     return mirror_again(out, scene, links=links)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -87,13 +88,23 @@ def mirror_again(out: Path, scene_uri: str | None = None, *, links: Links = "har
     prints. Returns the exit code."""
     from adapters.base import open_scene
 
-    sources = [scene_uri] if scene_uri else sorted(set(read_manifest(out)["source"].to_pylist()))
+    named = _scene_names(out)
+    sources = [scene_uri] if scene_uri else sorted(named)
     if not sources:
         raise OutputError(f"{out / MANIFEST} lists no images; render some first")
     for source in sources:
-        for sentence in mirror_outputs(open_scene(source), out, links=links):
-            print(sentence)
+        scene = open_scene(source)
+        for name in named.get(scene.source, [scene.name]):
+            for sentence in mirror_outputs(dataclasses.replace(scene, name=name), out, links=links):
+                print(sentence)
     return 0
+
+
+def _scene_names(out: Path) -> dict[str, list[str]]:
+    """What the scenes are called in the manifest, by source: a job can give them other names."""
+    rows = read_manifest(out).select(["source", "scene"]).to_pylist()
+    pairs = sorted({(row["source"], row["scene"]) for row in rows})
+    return {source: [name for s, name in pairs if s == source] for source, _ in pairs}
 
 
 def _dataset(scene: Scene) -> tuple[SourceTree, Survey]:

@@ -1,8 +1,10 @@
 """`calibration.json` of a recording: frames and cameras, checked one by one.
 
-It is the file that a render job writes (augment.batch.calibration). Only `frames` is required, and
-in each frame `frame`, `timestamp_ns`, `world_from_ego` and `cameras`; a camera's timestamp_ns is
-the frame's where it has none. Further keys that only a recording has, all optional:
+It is the file that a render job writes (augment.batch.calibration); where there is none, those of
+a `generate` job, `calibration/*.json`, each of some frames and cameras, are taken together.
+
+Only `frames` is required, and in each frame `frame`, `timestamp_ns`, `world_from_ego` and
+`cameras`; a camera's timestamp_ns is the frame's where it has none. Further keys that only a recording has, all optional:
 
     ego_above_ground_m   height of the ego origin above the road, 0 by default
     ego_box_m            [[x, y, z], [x, y, z]], lowest and highest corner of the recording car in
@@ -26,6 +28,7 @@ import torch
 
 from adapters.lidar.origin import drive_origin
 from adapters.plain_files import read_json
+from adapters.recording.files import block_files
 from augment.batch.calibration import read_camera
 from augment.cameras import Camera, Frame
 from augment.errors import AdapterError
@@ -64,8 +67,7 @@ def read_calibration(root: Path) -> Calibration:
         AdapterError: missing, damaged, or a pose that is not finite and rigid; the message names
             the file, the frame and the camera.
     """
-    path = root / CALIBRATION
-    content = read_json(path, if_missing=_IF_MISSING)
+    path, content = _content(root)
     entries = content.get("frames")
     if not isinstance(entries, list) or not entries:
         raise AdapterError(f"{path} must hold a list 'frames' with at least one entry")
@@ -97,9 +99,34 @@ def read_lidar_classes(root: Path) -> Mapping[int, int] | None:
     Raises:
         AdapterError: the file is missing or damaged, or names no classes.
     """
-    path = root / CALIBRATION
-    content = read_json(path, if_missing=_IF_MISSING)
+    path, content = _content(root)
     return _lidar_classes(path, content.get("lidar_classes"))
+
+
+def _content(root: Path) -> tuple[Path, dict[str, Any]]:
+    """The calibration's file, or the folder of a job's blocks, and what it holds."""
+    path = root / CALIBRATION
+    blocks = [] if path.exists() else block_files(root, "calibration", ".json")
+    if not blocks:
+        return path, read_json(path, if_missing=_IF_MISSING)
+    parts = [read_json(block) for block in blocks]
+    frames: dict[Any, dict[str, Any]] = {}
+    for block, part in zip(blocks, parts, strict=True):
+        for entry in part.get("frames") or ():
+            if not isinstance(entry, dict) or not isinstance(entry.get("cameras"), dict):
+                raise AdapterError(f"{block}: each of 'frames' must be an object with cameras")
+            number = entry.get("frame")
+            known = frames.get(number) if isinstance(number, int) else None
+            if known is None:
+                frames[number if isinstance(number, int) else repr(number)] = entry
+                continue
+            if any(known.get(key) != entry.get(key) for key in ("timestamp_ns", "world_from_ego")):
+                raise AdapterError(
+                    f"{block}: frame {number} has another time or ego pose than in the files "
+                    f"before it; the folder holds blocks of different recordings"
+                )
+            frames[number] = known | {"cameras": known["cameras"] | entry["cameras"]}
+    return blocks[0].parent, parts[0] | {"frames": list(frames.values())}
 
 
 def _frame(path: Path, entry: Any) -> Frame:

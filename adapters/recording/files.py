@@ -3,6 +3,8 @@
     images/<camera>/<frame>.png|jpg   depth/<camera>/<frame>.png   lidar/<frame>.parquet
     labels/boxes.parquet              calibration.json
 
+What a `generate` job wrote has labels/boxes/*.parquet and calibration/*.json in their place.
+
 Frame numbers may have leading zeros or not. A camera's folder is its name, or, for a name that is
 no safe folder name, what `augment.batch.layout.folder_name` makes of it.
 """
@@ -44,6 +46,15 @@ def numbered_files(root: Path, folder: str, suffixes: Sequence[str]) -> dict[int
             )
         found[number] = inside(root, path)
     return found
+
+
+def block_files(root: Path, folder: str, suffix: str) -> list[Path]:
+    """The files of a folder by blocks of frames, as a `generate` job writes them, in order.
+
+    Raises:
+        AdapterError: a file lies outside `root` through a link.
+    """
+    return [inside(root, path) for path in sorted((root / folder).glob(f"*{suffix}"))]
 
 
 def inside(root: Path, path: Path) -> Path:

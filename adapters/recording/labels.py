@@ -9,15 +9,15 @@ import numpy as np
 
 from adapters.recording.calibration import read_lidar_classes
 from adapters.recording.classes import class_numbers, class_table
-from adapters.recording.files import inside, numbered_files
+from adapters.recording.files import block_files, inside, numbered_files
 from adapters.recording.tables import TimedBoxes, read_frame_boxes, read_sweep
 from augment.labels import Boxes, LidarSweep
 
 
-def boxes_file(root: Path) -> Path | None:
-    """labels/boxes.parquet where there is one."""
+def boxes_files(root: Path) -> list[Path]:
+    """labels/boxes.parquet where there is one, else those of a job's blocks."""
     path = root / "labels" / "boxes.parquet"
-    return inside(root, path) if path.exists() else None
+    return [inside(root, path)] if path.exists() else block_files(root, "labels/boxes", ".parquet")
 
 
 def lidar_files(root: Path) -> dict[int, Path]:
@@ -26,9 +26,13 @@ def lidar_files(root: Path) -> dict[int, Path]:
 
 
 def all_boxes(root: Path) -> dict[int, TimedBoxes]:
-    """The boxes of every frame that has any; none without the file."""
-    path = boxes_file(root)
-    return {} if path is None else read_frame_boxes(path)
+    """The boxes of every frame that has any; none without a file. Blocks that share a frame have
+    all of its boxes each.
+    """
+    found: dict[int, TimedBoxes] = {}
+    for path in boxes_files(root):
+        found = read_frame_boxes(path) | found
+    return found
 
 
 @dataclass(frozen=True)

@@ -53,7 +53,7 @@ class Identity:
             raise OutputError(
                 f"{where} already holds images of another kind: {'; '.join(different)}. Give the "
                 f"recipe another name, choose another output folder, or ask for the variant to be "
-                f"overwritten (overwrite=True)"
+                f"overwritten (render --overwrite, overwrite=True)"
             )
 
 

@@ -3,6 +3,7 @@ and with neither."""
 
 from __future__ import annotations
 
+import json
 import pickle
 import shutil
 from pathlib import Path
@@ -10,8 +11,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pandaset_folder as street
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import recording_folder as recording
+import torch
 from recording_folder import QUERY, write_recording
 from shown import assert_same_bits, psnr_of, render
 
@@ -304,3 +308,42 @@ def test_the_example_in_the_docs_is_a_recording(tmp_path, monkeypatch):
     front = read_calibration(Path("my-drive")).frames[0].cameras["front"]
     assert (front.width, front.timestamp_ns) == (1920, 1700000000412000000)
     np.testing.assert_allclose(front.ray_directions()[540, 960], [1, 0, 0], atol=1e-3)
+
+
+def in_blocks(root: Path) -> Path:
+    """The same recording as a `generate` job lays it out: by blocks that share frame 1."""
+    whole = json.loads((root / "calibration.json").read_text())
+    boxes = pq.ParquetFile(root / "labels" / "boxes.parquet").read()
+    (root / "calibration").mkdir()
+    (root / "labels" / "boxes").mkdir()
+    first, *others = street.CAMERAS
+    later = {n: list(street.CAMERAS) for n in range(2, len(whole["frames"]))}
+    write_block(root, 0, whole, boxes, {0: list(street.CAMERAS), 1: [first]})
+    write_block(root, 1, whole, boxes, {1: others, **later})
+    (root / "calibration.json").unlink()
+    (root / "labels" / "boxes.parquet").unlink()
+    return root
+
+
+def write_block(root: Path, block: int, whole: dict, boxes: pa.Table, frames: dict) -> None:
+    entries = [
+        entry | {"cameras": {name: entry["cameras"][name] for name in frames[entry["frame"]]}}
+        for entry in whole["frames"]
+        if entry["frame"] in frames
+    ]
+    name = f"{min(frames):06d}-{block}"
+    (root / f"calibration/{name}.json").write_text(json.dumps(whole | {"frames": entries}))
+    shown = [number in frames for number in boxes["frame"].to_pylist()]
+    pq.write_table(boxes.filter(pa.array(shown)), root / f"labels/boxes/{name}.parquet")
+
+
+def test_a_generated_variant_opens_as_a_rendered_one_does(tmp_path):
+    expected = open_recording(str(write_recording(tmp_path / "whole")), QUERY)
+    root = in_blocks(write_recording(tmp_path / "blocks"))
+    scene = open_recording(str(root), QUERY)
+    assert recognise(root) == "recording"
+    assert [f.cameras.keys() for f in scene.frames] == [f.cameras.keys() for f in expected.frames]
+    assert torch.equal(scene.background.means, expected.background.means)
+    for frame in expected.frames:
+        boxes = scene.labels.boxes(frame.index)
+        assert boxes.track_ids == expected.labels.boxes(frame.index).track_ids

@@ -189,7 +189,9 @@ def test_a_scene_that_could_be_opened_once(tmp_path: Path, whole: dict) -> None:
 
 
 def test_no_scene_at_all_can_be_opened(tmp_path: Path) -> None:
-    with pytest.raises(ClimateGSError, match=r"none of its scenes can be used: fake:b: memory ran"):
+    with pytest.raises(
+        ClimateGSError, match=r"none of its scenes can be used:\n  fake:b: memory ran"
+    ):
         run(make_job(tmp_path, ["fake:b"], opener=open_without_memory))
 
 

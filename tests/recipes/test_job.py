@@ -75,7 +75,7 @@ SCENES, RECIPES = "scenes: [a]\n", "recipes: [dense-fog]\n"
         (RECIPES + "scenes:\n  - {uri: a, name: ../b}\n", "job.yaml:3: scenes[0].name: "),
         (RECIPES + "scenes:\n  - {uri: a, recipes: [dense-fg]}\n", "did you mean dense-fog?"),
         (SCENES + "recipes:\n  - {recipe: a, variants: 0}\n",
-         "job.yaml:3: recipes[0].variants: Input should be greater"),
+         "job.yaml:3: recipes[0].variants: must be greater"),
         (SCENES + "recipes: [a/fog.yaml, b/fog.yaml]\n", "recipes are called the same: fog; give"),
         (SCENES + RECIPES + "block_images: 0\n", "job.yaml:3: block_images: "),
         (SCENES + RECIPES + "draws: once\n", "job.yaml:3: draws: "),

@@ -231,6 +231,15 @@ def test_making_the_copy_again_by_itself(root, tmp_path, monkeypatch, capsys):
     assert opened[3:] == [scene.source]
 
 
+def test_scenes_that_a_job_renamed_are_copied(root, tmp_path, monkeypatch):
+    scene, out = scene_of(root), tmp_path / "out"
+    render(dataclasses.replace(scene, name="drive-7"), out, frames=[0])
+    monkeypatch.setattr("adapters.base.open_scene", lambda uri: scene)
+    assert mirror_again(out) == 0
+    assert changed(root, out / "source/fog-000/002")
+    assert mirror_again(out, scene.source) == 0
+
+
 def test_wrong_scenes_and_folders_are_refused(root, tmp_path):
     scene, out = scene_of(root), tmp_path / "out"
     render(scene, out, frames=[0])
