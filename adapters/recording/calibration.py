@@ -4,7 +4,8 @@ It is the file that a render job writes (augment.batch.calibration); where there
 a `generate` job, `calibration/*.json`, each of some frames and cameras, are taken together.
 
 Only `frames` is required, and in each frame `frame`, `timestamp_ns`, `world_from_ego` and
-`cameras`; a camera's timestamp_ns is the frame's where it has none. Further keys that only a recording has, all optional:
+`cameras`; a camera's timestamp_ns is the frame's where it has none. Further keys that
+only a recording has, all optional:
 
     ego_above_ground_m   height of the ego origin above the road, 0 by default
     ego_box_m            [[x, y, z], [x, y, z]], lowest and highest corner of the recording car in
