@@ -9,6 +9,7 @@ import torch
 
 from augment.cameras import Camera
 from augment.geometry import quat_from_rotmat, rotmat_from_quat
+from augment.render.buffers import ALPHA, RGB, SNOW
 from augment.render.rasterize import rasterize
 from augment.scene import Gaussians, PosedGaussians, SplatShading
 from augment.weather.smog import SmogMedium
@@ -78,6 +79,11 @@ def shaded(gaussians: Gaussians, sun, wrap=0.0, slopes=(0.5, 0.5, 0.5)) -> Posed
     return PosedGaussians(gaussians, shading=light)
 
 
+def render(parts, view, **options):
+    """With the buffers that pictures of snow ask for, whose kernel there is."""
+    return rasterize(parts, view, buffers=(RGB, ALPHA, SNOW), **options)
+
+
 @pytest.mark.parametrize(
     ("smog", "orthographic"),
     [(None, False), (SmogMedium(0.2, (0.7, 0.6, 0.5)), False), (None, True)],
@@ -85,12 +91,12 @@ def shaded(gaussians: Gaussians, sun, wrap=0.0, slopes=(0.5, 0.5, 0.5)) -> Posed
 def test_the_kernel_shows_what_the_definition_says(smog, orthographic):
     view = camera(is_orthographic=True, fx=12.0, fy=11.0) if orthographic else camera()
     fast, slow = (
-        rasterize(some_parts(), view, smog=smog, backend=name) for name in ("cpu", "reference")
+        render(some_parts(), view, smog=smog, backend=name) for name in ("cpu", "reference")
     )
     difference = (fast.rgb - slow.rgb).abs()
     assert float(difference.quantile(0.999)) < 1e-4
     assert float(difference.max()) < 5e-3  # an alpha at its cut-off may fall on either side
-    plain = rasterize(some_parts(shaded=False), view, smog=smog)
+    plain = render(some_parts(shaded=False), view, smog=smog)
     assert float((fast.rgb - plain.rgb).abs().max()) > 0.1
     assert torch.equal(fast.alpha, plain.alpha)
 
@@ -132,7 +138,7 @@ def test_a_pixel_is_lit_by_the_papers_normal():
 
 
 def test_the_side_of_a_splat_towards_the_light_is_brighter():
-    image = rasterize([shaded(disc(), (1.0, 0.0, -1.0))], camera())
+    image = render([shaded(disc(), (1.0, 0.0, -1.0))], camera())
     row = (image.rgb / image.alpha.clamp_min(1e-6)[..., None])[SIZE // 2, :, 0]
     left, right = SIZE // 2 - 6, SIZE // 2 + 5
     assert float(row[right] - row[left]) > 0.1
@@ -140,16 +146,16 @@ def test_the_side_of_a_splat_towards_the_light_is_brighter():
 
 
 def test_light_from_behind_adds_nothing_and_wrapping_lets_some_through():
-    base = rasterize([PosedGaussians(disc())], camera())
-    dark = rasterize([shaded(disc(), (0.0, 0.0, 1.0))], camera())
+    base = render([PosedGaussians(disc())], camera())
+    dark = render([shaded(disc(), (0.0, 0.0, 1.0))], camera())
     assert torch.allclose(dark.rgb, base.rgb, atol=1e-6)
-    wrapped = rasterize([shaded(disc(), (1.0, 0.0, 0.3), wrap=0.6)], camera())
+    wrapped = render([shaded(disc(), (1.0, 0.0, 0.3), wrap=0.6)], camera())
     assert float((wrapped.rgb - base.rgb).max()) > 0.05
 
 
 def test_a_splat_seen_from_behind_is_lit_on_the_side_that_is_seen():
-    front = rasterize([shaded(disc((0.1, 0.2, -1.0)), (0.0, 0.0, -1.0))], camera())
-    back = rasterize([shaded(disc((-0.1, -0.2, 1.0)), (0.0, 0.0, -1.0))], camera())
+    front = render([shaded(disc((0.1, 0.2, -1.0)), (0.0, 0.0, -1.0))], camera())
+    back = render([shaded(disc((-0.1, -0.2, 1.0)), (0.0, 0.0, -1.0))], camera())
     assert torch.allclose(front.rgb, back.rgb, atol=1e-5)
 
 
@@ -157,7 +163,7 @@ def test_a_splat_seen_from_behind_is_lit_on_the_side_that_is_seen():
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
 def test_splats_seen_edge_on_stay_finite(normal, backend):
     part = shaded(disc(normal), (0.6, -0.8, 0.0), wrap=0.2)
-    image = rasterize([part], camera(), backend=backend)
+    image = render([part], camera(), backend=backend)
     assert torch.isfinite(image.rgb).all()
     assert float(image.rgb.max()) <= 0.2 + 0.5 + 1e-5
 
