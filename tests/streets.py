@@ -11,6 +11,12 @@ from augment.scene import Scene
 # The cheapest street there is: as few Gaussians as it can have, and few things in it.
 SMALL_STREET = "procedural:street?seed=3&frames=2&gaussians=60000&parked=4&moving=1&pedestrians=0"
 
+# With sweeps, and one of each kind of thing that has a box.
+LABELLED_STREET = (
+    "procedural:street?seed=3&frames=2&width=160&height=96&gaussians=60000&lidar_columns=96"
+    "&parked=1&moving=1&pedestrians=1"
+)
+
 _built = functools.lru_cache(maxsize=4)(base.open_scene)
 
 

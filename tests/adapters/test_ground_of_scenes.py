@@ -140,6 +140,7 @@ def test_recordings_say_what_their_classes_mean(tmp_path: Path) -> None:
 def test_a_stated_height_is_the_ground() -> None:
     scene = open_scene(
         "procedural:street?frames=1&gaussians=60000&width=16&height=16&ground_z=-1.5"
+        "&parked=0&moving=0&pedestrians=0"
     )
     assert ground_of(scene) == Ground(-1.5, -1.5, "stated")
     assert scene.ground_z_m == -1.5

@@ -22,6 +22,7 @@ from augment.semantics import SemanticClass
 
 QUERY = {"seed": "3", "width": "480", "height": "270"}
 SMALL = {"gaussians": "60000", "frames": "2", "width": "64", "height": "36"}
+SMALL |= {"parked": "1", "moving": "1", "pedestrians": "1"}  # one of each kind
 
 
 @pytest.fixture(scope="module")

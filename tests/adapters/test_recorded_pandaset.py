@@ -62,6 +62,6 @@ def test_its_calibration_is_right_and_a_turned_camera_is_noticed(scene):
         for frame in few.frames
     )
     wrong = dataclasses.replace(few, frames=frames)
-    said = check_views(wrong, recorded_views(wrong, scale=0.25, cameras=cameras)).problems
+    said = check_views(wrong, recorded_views(wrong, scale=0.25, cameras=cameras[:2])).problems
     assert len(said) == 1, said
     assert said[0].startswith("camera front_camera: its images lie 0.")

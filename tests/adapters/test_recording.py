@@ -28,6 +28,7 @@ from augment.batch.job import RenderJob, run_job
 from augment.errors import AdapterError
 from augment.semantics import SemanticClass
 from recipes.load import load_recipe
+from tests.streets import LABELLED_STREET, open_street
 
 
 @pytest.fixture(scope="module")
@@ -120,15 +121,14 @@ def test_a_world_far_from_its_origin_is_recentred(tmp_path):
 
 
 def test_what_a_job_wrote_is_a_recording(tmp_path):
-    uri = "procedural:street?seed=3&frames=2&width=160&height=96&gaussians=60000&lidar_columns=256"
-    source = open_scene(uri)
-    job = RenderJob(uri, [load_recipe("clear").resolve(0)], tmp_path / "raw")
+    source = open_street(LABELLED_STREET)
+    job = RenderJob(LABELLED_STREET, [load_recipe("clear").resolve(0)], tmp_path / "raw")
     assert run_job(job, scene_loader=lambda _: source).failed == 0
     folder = tmp_path / "raw" / source.name / "clear-000"
     assert recognise(folder) == "recording"
     with pytest.raises(AdapterError, match=r"It holds scenes: give one, such as .*clear-000"):
         recognise(tmp_path / "raw")
-    scene = open_scene(f"{folder}?image_scale=1&sky_size=32&max_gaussians=40000")
+    scene = open_scene(f"{folder}?image_scale=1&sky_size=32&voxel_m=0.3")
     assert scene.problems == () and scene.name == f"{source.name}-clear-000"
     assert scene.source.startswith("recording:")
     for frame in source.frames:

@@ -21,7 +21,10 @@ from augment.files.scene_files import save_scene, save_scene_file
 from augment.scene import Scene
 from tools.scene_report import describe_scene, scene_text
 
-STREET = "procedural:street?seed=5&frames=6&gaussians=60000&lidar_columns=16"
+STREET = (
+    "procedural:street?seed=5&frames=6&gaussians=60000&lidar_columns=16"
+    "&parked=1&moving=1&pedestrians=0"
+)
 
 
 def save(tmp_path: Path, **changes) -> Path:

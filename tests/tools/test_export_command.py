@@ -47,7 +47,7 @@ def test_a_file_is_the_scene(uri, tmp_path, capsys):
 
 
 def test_a_recording_is_found_from_the_exported_file(tmp_path, monkeypatch):
-    street = "procedural:street?seed=5&frames=2&gaussians=60000&lidar_columns=16"
+    street = "procedural:street?seed=5&frames=2&gaussians=60000&lidar_columns=16&parked=0"
     save_scene(fitted_scene(recorded_source=street), tmp_path / "scene")
     export_scene(f"scene:{tmp_path / 'scene'}", tmp_path / "a")
     scene = open_scene(str(tmp_path / "a.climategs"))
