@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -65,6 +65,20 @@ class LocalStore:
         except OSError as error:
             raise _read_error(source, error) from error
         _with_folder(lambda: _link_or_copy(original, file))
+
+    def put_files(self, files: Mapping[str, Path]) -> None:
+        """As put_file, for files that are durable already; each folder is flushed once, at the end.
+
+        files: the local file by its path here.
+        """
+        placed = {self._file(path): source for path, source in files.items()}
+        for file, source in placed.items():
+            _with_folder(lambda file=file, source=source: _link_or_copy(source, file, flush=False))
+        for folder in sorted({file.parent for file in placed}):
+            try:
+                flush_folder(folder)
+            except OSError as error:
+                raise output_error(folder, error) from error
 
     def list(self, folder: str) -> dict[str, StoredFile]:
         top = self.root if folder == "" else self._file(folder)
@@ -131,7 +145,7 @@ def _with_folder(write: Callable[[], None]) -> None:
                 raise
 
 
-def _link_or_copy(original: Path, file: Path) -> None:
+def _link_or_copy(original: Path, file: Path, *, flush: bool = True) -> None:
     name = f".{file.name}.{os.getpid()}-{next(_numbers)}{TEMPORARY_SUFFIX}"
     temporary = file.with_name(name)
     try:
@@ -146,7 +160,8 @@ def _link_or_copy(original: Path, file: Path) -> None:
         finally:
             # Renaming does nothing where both names are links of one file already.
             temporary.unlink(missing_ok=True)
-        flush_folder(file.parent)
+        if flush:
+            flush_folder(file.parent)
     except OSError as error:
         raise output_error(file, error) from error
 

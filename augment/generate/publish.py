@@ -1,8 +1,8 @@
 """Takes a block from the folder it was rendered in to the output, where it appears at once.
 
-Its files go there one by one, those of an image as soon as it is finished; nobody sees them before
-the block's rows follow in one step. What belongs to several images lies by blocks, for no two
-blocks ever write the same file: `labels/boxes/000016-3fc0a1b2d4e5.parquet`.
+Its files go there first, to an object store those of an image as soon as it is finished; nobody
+sees them before the block's rows follow in one step. What belongs to several images lies by blocks,
+for no two blocks ever write the same file: `labels/boxes/000016-3fc0a1b2d4e5.parquet`.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from pathlib import Path, PurePosixPath
 import pyarrow as pa
 
 from augment.batch.layout import PATH_KINDS, STATE_FOLDER, item_paths
+from augment.batch.local_store import LocalStore
 from augment.batch.manifest import OK, read_manifest
 from augment.batch.parts import Part, publish_part
 from augment.batch.runner import Outcome
@@ -30,8 +31,7 @@ class Publisher:
 
     def __init__(self, store: Store, folder: Path, block: Block) -> None:
         self._store, self._folder, self._block = store, folder, block
-        uploads = 1 if store.local_dir is not None else REMOTE_UPLOADS
-        self._pool = ThreadPoolExecutor(uploads, thread_name_prefix="publish")
+        self._pool = ThreadPoolExecutor(REMOTE_UPLOADS, thread_name_prefix="publish")
         self._sent: dict[str, Future[None]] = {}
 
     def __enter__(self) -> Publisher:
@@ -41,8 +41,8 @@ class Publisher:
         self._pool.shutdown(wait=True, cancel_futures=True)
 
     def image_done(self, outcome: Outcome) -> None:
-        """Send the files of a finished image on their way."""
-        if outcome.status != OK:
+        """Send the files of a finished image on their way; on this disk they only get a name."""
+        if outcome.status != OK or isinstance(self._store, LocalStore):
             return
         recipe = self._block.recipe
         paths = item_paths(self._block.scene, recipe, outcome.camera, outcome.frame).columns()
@@ -61,15 +61,17 @@ class Publisher:
         """
         rows = read_manifest(self._folder)
         new = _renamed(rows, self._block.file_stem)
+        left = {path: path for path in self._of_variant()}
         for kind in PATH_KINDS:
-            here, there = rows[f"{kind}_path"].to_pylist(), new[f"{kind}_path"].to_pylist()
-            for source, target in dict(zip(here, there, strict=True)).items():
-                if source is not None and target not in self._sent:
-                    self._send(source, target)
-        for path in self._of_variant():
-            self._send(path, path)
-        for future in self._sent.values():
-            future.result()
+            there, here = new[f"{kind}_path"].to_pylist(), rows[f"{kind}_path"].to_pylist()
+            left |= {t: h for t, h in zip(there, here, strict=True) if h is not None}
+        if isinstance(self._store, LocalStore):
+            self._store.put_files({target: self._folder / left[target] for target in left})
+        else:
+            for target in left.keys() - self._sent.keys():
+                self._send(left[target], target)
+            for future in self._sent.values():
+                future.result()
         return publish_part(self._store, self._block.key, new)
 
     def _send(self, source: str, target: str) -> None:
