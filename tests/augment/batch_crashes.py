@@ -218,7 +218,7 @@ def kill_at_random(folder: Path) -> dict[str, int]:
 
 def stop_a_job_with_workers(folder: Path) -> dict[str, int]:
     """Press Ctrl-C on a job with two workers, run it again, kill its process alone, resume."""
-    run_forked(render(job(folder / "whole", frames=60)))
+    run_forked(render(job(folder / "whole", frames=30)))
     out, printed = folder / "stopped", folder / "stderr"
     child = start_with_workers(out, printed)
     wait_for_finished(out, 3)
@@ -235,7 +235,7 @@ def stop_a_job_with_workers(folder: Path) -> dict[str, int]:
     os.waitpid(child, 0)
     finished = count_finished(out)
     whole = tree_digest(folder / "whole")
-    resume_and_compare(job(out, frames=60), out, whole, finished, "parent killed")
+    resume_and_compare(job(out, frames=30), out, whole, finished, "parent killed")
     return {"finished": finished}
 
 
@@ -247,7 +247,7 @@ def start_with_workers(out: Path, printed: Path) -> int:
         with printed.open("w") as file:
             os.dup2(file.fileno(), 2)
         try:
-            render(job(out, frames=60, workers=2), slow_render)()
+            render(job(out, frames=30, workers=2), slow_render)()
         except KeyboardInterrupt as stopped:
             os.write(2, f"{stopped}\n".encode())
             os._exit(130)
