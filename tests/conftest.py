@@ -41,8 +41,8 @@ LONG = {
     f"test_{name}.py"
     for name in (
         "batch_resume", "batch_workers", "bench_flood", "bench_open", "bench_snow", "fit",
-        "flood_accuracy", "packages", "procedural", "recording_flood", "render_backward",
-        "smog_accuracy", "snow_accuracy", "trained_street",
+        "flood_accuracy", "generate", "generate_crashes", "generate_ray", "packages", "procedural",
+        "recording_flood", "render_backward", "smog_accuracy", "snow_accuracy", "trained_street",
     )
 }  # fmt: skip
 
