@@ -7,6 +7,7 @@ rendering, encoding and writing the same images; which executor is the faster; a
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import resource
 import statistics
@@ -20,11 +21,16 @@ from typing import Any
 from adapters.base import open_scene
 from augment.apply import render_view
 from augment.batch.encode import encode_depth, encode_image
+from augment.batch.layout import variant_name
+from augment.batch.parts import compact
 from augment.batch.store import open_store
 from augment.batch.writer import WritePump
-from augment.generate.job import GenerateJob, run_generate
+from augment.generate.drive import Driver
+from augment.generate.job import GenerateJob, make_pool, run_generate
+from augment.generate.plan import make_plan
+from augment.generate.records import Block, SceneRecord
 from augment.generate.status import read_status
-from augment.generate.workshop import WorkSetup
+from augment.generate.workshop import IndexTask, WorkSetup
 from recipes.job import Job, JobRecipes
 from recipes.load import load_recipe
 from recipes.parse import parse_recipe
@@ -39,17 +45,24 @@ _PLAIN = "output: {labels: false, lidar: false}\n"
 
 @dataclass(frozen=True)
 class Case:
-    """scene, scale, recipes: of the images that are compared. images: of the long job, tiny."""
+    """scene, scale, recipes, variants: of the images that are compared. images: of the long job,
+    tiny.
+    """
 
     scene: str
     scale: float
     recipes: tuple[str, ...]
+    variants: int
     repeats: int
     images: int
 
 
-WHOLE = Case("procedural:street?seed=3&frames=8", 0.5, ("clear", "dense-fog"), 3, 10_000)
-QUICK = Case("procedural:street?seed=3&frames=2", 0.1, ("dense-fog",), 1, 500)
+# Several variants in small blocks: work for both workers from the first to the last.
+WHOLE = Case(
+    "procedural:street?seed=3&frames=4&width=1600&height=1066", 1.0, ("dense-fog",), 3, 3, 10_000
+)
+QUICK = Case("procedural:street?seed=3&frames=4", 0.1, ("dense-fog",), 3, 1, 500)
+_BLOCK_IMAGES = 12
 
 
 def bench_generate(case: Case = WHOLE, *, repeats: int | None = None) -> dict[str, Any]:
@@ -67,8 +80,8 @@ def generate_text(result: dict[str, Any]) -> str:
     bare = rows[0]["seconds"]
     lines = [
         machine_line(result),
-        f"{rows[0]['images']} images of {rows[0]['size']}, PNG and depth; the pace after the first "
-        f"quarter, without starting and opening scenes",
+        f"{rows[0]['images']} images of {rows[0]['size']}, PNG and depth; without starting, "
+        f"opening scenes and loading kernels",
         f"{'':34} {'an image':>9} {'spread':>8} {'images/s':>9} {'to bare':>8}",
     ]
     lines += [
@@ -98,9 +111,9 @@ def _compare(case: Case, folder: Path, repeats: int) -> list[dict[str, Any]]:
     del scene
     ways: dict[str, Callable[[Path], float]] = {
         "render, encode, write (bare)": lambda out: _bare(case, recipes, out),
-        "generate, this process": lambda out: _generate(job, images, out, "serial", 1),
-        "generate, 1 process of its own": lambda out: _generate(job, images, out, "processes", 1),
-        "generate, 2 processes": lambda out: _generate(job, images, out, "processes", 2),
+        "generate, this process": lambda out: _generate(job, out, "serial", 1),
+        "generate, 1 process of its own": lambda out: _generate(job, out, "processes", 1),
+        "generate, 2 processes": lambda out: _generate(job, out, "processes", 2),
     }
     took: dict[str, list[float]] = {what: [] for what in ways}
     for number in range(1 + repeats):  # in turn, for the machine's speed changes; the first warms
@@ -118,21 +131,6 @@ def _compare(case: Case, folder: Path, repeats: int) -> list[dict[str, Any]]:
     ]
 
 
-class _Pace:
-    """Seconds an image in the long run: from the end of the first quarter to the end of all."""
-
-    def __init__(self, images: int) -> None:
-        self._images, self._first = images, max(1, images // 4)
-        self._began = 0.0
-
-    def done(self, images: int) -> None:
-        if images <= self._first:
-            self._began = time.perf_counter()
-
-    def per_image_s(self) -> float:
-        return (time.perf_counter() - self._began) / (self._images - self._first)
-
-
 def _bare(case: Case, recipes: JobRecipes, out: Path) -> float:
     """The same images by a loop: nothing is durable, nothing remembered."""
     scene = open_scene(case.scene)
@@ -143,14 +141,14 @@ def _bare(case: Case, recipes: JobRecipes, out: Path) -> float:
         for frame in scene.frames
         for name, camera in frame.cameras.items()
     ]
-    pump, pace = WritePump(), _Pace(len(views))
-    for number, (recipe, frame, name, camera) in enumerate(views):
+    render_view(scene, views[0][-1], views[0][0])
+    pump, started = WritePump(), time.perf_counter()
+    for recipe, frame, name, camera in views:
         view = render_view(scene, camera, recipe)
-        path = out / recipe.name / f"{name.replace('/', '_')}-{frame.index}"
+        path = out / variant_name(recipe) / f"{name.replace('/', '_')}-{frame.index}"
         pump.submit(lambda view=view, path=path, recipe=recipe: _write(view, path, recipe))
-        pace.done(number + 1)
     pump.close()
-    return pace.per_image_s()
+    return (time.perf_counter() - started) / len(views)
 
 
 def _write(view: Any, path: Path, recipe: Any) -> None:
@@ -159,14 +157,31 @@ def _write(view: Any, path: Path, recipe: Any) -> None:
     path.with_suffix(".png").write_bytes(encode_image(view.rgb, recipe.output))
 
 
-def _generate(job: GenerateJob, images: int, out: Path, executor: str, workers: int) -> float:
+def _generate(job: GenerateJob, out: Path, executor: str, workers: int) -> float:
+    """As a job does it once all its workers have the scene and their kernels."""
     setup = dataclasses.replace(job.setup, store_uri=str(out))
     run = dataclasses.replace(job, setup=setup, executor=executor, workers=workers)
-    pace = _Pace(images)
-    result = run_generate(run, progress=False, on_image=lambda done, _: pace.done(done))
-    if result.failed or result.unusable or result.written != images:
-        raise RuntimeError(f"the job did not do what is measured: {result}")
-    return pace.per_image_s()
+    uri = job.scenes[0].uri
+    found: dict[tuple[str, str | None], SceneRecord | str] = {}
+    driver = Driver(lambda tick: make_pool(run, tick))
+    with contextlib.closing(driver):
+        tasks = [IndexTask(uri, None)] * workers
+        driver.index(tasks, lambda task, record: found.update({(task.uri, task.name): record}))
+        plan = make_plan(job.recipes, job.scenes, found, setup.backend)
+        first, rest = plan.blocks[:workers], plan.blocks[workers:]
+        driver.render(first, dict(plan.names), _never)
+        started = time.perf_counter()
+        driver.render(rest, dict(plan.names), _never)
+        compact(open_store(out))
+        took = time.perf_counter() - started
+    images = sum(block.images for block in rest)
+    if driver.tally.failed or driver.tally.written != plan.images:
+        raise RuntimeError(f"the job did not do what is measured: {driver.tally}")
+    return took / images
+
+
+def _never(block: Block, message: str) -> None:
+    raise RuntimeError(f"{block.key}: {message}")
 
 
 def _long_job(images: int, out: Path) -> dict[str, Any]:
@@ -197,13 +212,19 @@ def _long_job(images: int, out: Path) -> dict[str, Any]:
 def _recipes(case: Case) -> JobRecipes:
     templates = [load_recipe(name) for name in case.recipes]
     off = parse_recipe(_PLAIN, source="bench", name="bench").values
-    plain = [dataclasses.replace(t, values=(*t.values, *off), variants=1) for t in templates]
-    return _with(plain, scale=case.scale)
+    plain = [
+        dataclasses.replace(t, values=(*t.values, *off), variants=case.variants) for t in templates
+    ]
+    return _with(plain, scale=case.scale, block_images=_BLOCK_IMAGES)
 
 
-def _with(templates: list[RecipeTemplate], scale: float = 1.0) -> JobRecipes:
+def _with(
+    templates: list[RecipeTemplate], scale: float = 1.0, block_images: int = 64
+) -> JobRecipes:
     names = [template.name for template in templates]
-    job = Job(scenes=({"uri": "-"},), recipes=tuple({"recipe": n} for n in names), scale=scale)  # pyright: ignore
+    job = Job.model_validate(
+        {"scenes": ["-"], "recipes": names, "scale": scale, "block_images": block_images}
+    )
     return JobRecipes(job, dict(zip(names, templates, strict=True)))
 
 
