@@ -30,10 +30,10 @@ MOST_OF_HEIGHT = 0.25
 SIDES_M = 0.10
 NEAR_M = 0.01  # what of a box is nearer to the camera's plane, or behind it, is not projected
 
-_CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 # Corners that differ in one axis are joined by an edge.
-_EDGES = np.array([
-    (a, b) for a in range(8) for b in range(a) if (_CORNERS[a] != _CORNERS[b]).sum() == 1
+EDGES = np.array([
+    (a, b) for a in range(8) for b in range(a) if (CORNERS[a] != CORNERS[b]).sum() == 1
 ])  # fmt: skip
 
 
@@ -125,7 +125,7 @@ class PlacedBoxes:
         sizes = np.where(finite[:, None], boxes.sizes_m, 0.0)
         low, high = -sizes / 2 - SIDES_M, sizes / 2 + SIDES_M
         low[:, 2] = -sizes[:, 2] / 2 + np.minimum(BOTTOM_M, MOST_OF_HEIGHT * sizes[:, 2])
-        corners = _to_world(centres, rotations, _CORNERS * sizes[:, None, :])
+        corners = _to_world(centres, rotations, CORNERS * sizes[:, None, :])
         return PlacedBoxes(finite, centres, sizes, rotations, low, high, corners)
 
 
@@ -140,11 +140,11 @@ def _windows(placed: PlacedBoxes, camera: Camera) -> np.ndarray:
     """
     middle = (placed.low_m + placed.high_m)[:, None, :] / 2
     extent = (placed.high_m - placed.low_m)[:, None, :]
-    corners = _to_world(placed.centres_m, placed.rotations, middle + _CORNERS * extent)
+    corners = _to_world(placed.centres_m, placed.rotations, middle + CORNERS * extent)
     camera_from_world = camera.camera_from_world.numpy()
     corners = corners @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
-    a, b = corners[:, _EDGES[:, 0]], corners[:, _EDGES[:, 1]]  # [B, 12, 3]
-    ends = np.concatenate([_cut(a, b), _cut(b, a)], axis=1)
+    a, b = corners[:, EDGES[:, 0]], corners[:, EDGES[:, 1]]  # [B, 12, 3]
+    ends = np.concatenate([cut_edges(a, b), cut_edges(b, a)], axis=1)
     seen = (np.maximum(a[..., 2], b[..., 2]) > NEAR_M) & placed.is_finite[:, None]
     seen = np.concatenate([seen, seen], axis=1)
     z = np.where(seen, ends[..., 2], 1.0)
@@ -159,7 +159,7 @@ def _windows(placed: PlacedBoxes, camera: Camera) -> np.ndarray:
     return windows
 
 
-def _cut(end: np.ndarray, other: np.ndarray) -> np.ndarray:
+def cut_edges(end: np.ndarray, other: np.ndarray) -> np.ndarray:
     """`end` of each edge [..., 3], moved along the edge to z = NEAR_M where it lies nearer."""
     length = other[..., 2] - end[..., 2]
     behind = (end[..., 2] < NEAR_M) & (length > 0)

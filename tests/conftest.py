@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import signal
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 # Before torch is loaded. Processes that share the cores wait for each other's threads at the end of
@@ -67,6 +70,15 @@ def shared_dir() -> Path:
     if not folder.is_dir():
         pytest.skip(f"real data and reference renders are not at {folder}")
     return folder
+
+
+@pytest.fixture
+def quick_folder() -> Iterator[Path]:
+    """A folder in memory where there is one: for tests that flush thousands of files."""
+    memory = Path("/dev/shm")
+    folder = Path(tempfile.mkdtemp(dir=memory if memory.is_dir() else None))
+    yield folder
+    shutil.rmtree(folder)
 
 
 @pytest.fixture

@@ -18,6 +18,7 @@ from typing import Any
 
 from augment.batch.atomic import make_folder, output_error
 from augment.batch.layout import STATE_FOLDER
+from augment.batch.processes import is_running
 from augment.errors import OutputError
 
 ORPHANS_S = 30.0  # how long to wait for the workers of a killed job to notice
@@ -82,7 +83,7 @@ class OutputLock:
                 break
             except BlockingIOError:
                 holder = os.pread(self._descriptor, 32, 0).decode("ascii", "replace").strip()
-                if _is_running(holder) or time.monotonic() > deadline:
+                if _is_held_by(holder) or time.monotonic() > deadline:
                     raise OutputError(
                         f"{self._path.parent.parent} is being written by another job"
                         + (f" (process {holder})" if holder else "")
@@ -107,14 +108,6 @@ def _inherit(duplicate: Any) -> InheritedLock:
     return InheritedLock(duplicate.detach())
 
 
-def _is_running(holder: str) -> bool:
+def _is_held_by(holder: str) -> bool:
     """Whether the process that took the lock lives; False while its number is being written."""
-    if not holder.isdigit():
-        return False
-    try:
-        os.kill(int(holder), 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:  # it lives, and belongs to another user
-        return True
-    return True
+    return holder.isdigit() and is_running(int(holder))

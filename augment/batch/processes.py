@@ -12,6 +12,17 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 
+def is_running(process: int) -> bool:
+    """Whether a process of this number lives, whoever owns it."""
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:  # it lives, and belongs to another user
+        return True
+    return True
+
+
 def available_cores() -> int:
     """Cores this process may use."""
     if hasattr(os, "sched_getaffinity"):

@@ -14,17 +14,11 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from augment.batch.box_weather import TABLES, BoxWeather, visibility
+from augment.box_pixels import CORNERS, EDGES, NEAR_M, cut_edges
 from augment.labels import Boxes
 
 BoxFrame = Literal["world", "ego", "camera"]
 BOX_FRAMES = ("world", "ego", "camera")
-NEAR_M = 0.01  # what of a box is nearer to the camera's plane, or behind it, is not projected
-
-_CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
-# Corners that differ in one axis are joined by an edge.
-_EDGES = np.array([
-    (a, b) for a in range(8) for b in range(a) if (_CORNERS[a] != _CORNERS[b]).sum() == 1
-])  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +100,7 @@ def boxes_2d(sample: Mapping[str, Any]) -> Boxes2d:
     finite = np.logical_and.reduce(np.isfinite(numbers), axis=1)
     centers_m, sizes_m = np.where(finite[:, None], (centers_m, sizes_m), 0.0)
     rotations = np.where(finite[:, None, None], rotations, np.eye(3))
-    corners_m = centers_m[:, None] + (_CORNERS * sizes_m[:, None]) @ rotations.transpose(0, 2, 1)
+    corners_m = centers_m[:, None] + (CORNERS * sizes_m[:, None]) @ rotations.transpose(0, 2, 1)
     size = np.array([camera["width"], camera["height"]], np.float64)
     K = camera["K"].numpy()
     ends, seen = _edges_in_image(corners_m, K, size)  # [B, E, 2]
@@ -173,9 +167,9 @@ def _edges_in_image(
     corners_m: [B, 8, 3], camera frame. Returns pixels [B, 24, 2] and whether an edge has such a
     part [B, 24].
     """
-    a, b = corners_m[:, _EDGES[:, 0]], corners_m[:, _EDGES[:, 1]]  # [B, 12, 3]
+    a, b = corners_m[:, EDGES[:, 0]], corners_m[:, EDGES[:, 1]]  # [B, 12, 3]
     seen = np.maximum(a[..., 2], b[..., 2]) > NEAR_M
-    a, b = _project(_cut(a, b), K), _project(_cut(b, a), K)  # [B, 12, 2]
+    a, b = _project(cut_edges(a, b), K), _project(cut_edges(b, a), K)  # [B, 12, 2]
     # Liang and Barsky 1984: the part t in [start, end] of a + t (b - a) between both borders.
     along = np.where(a == b, 1e-300, b - a)
     with np.errstate(over="ignore"):  # of an edge that is a point: outside or inside, both infinite
@@ -185,14 +179,6 @@ def _edges_in_image(
     seen &= start <= end
     ends = [a + np.where(seen, t, 0.0)[..., None] * (b - a) for t in (start, end)]
     return np.concatenate(ends, axis=1).clip(0.0, size), np.concatenate([seen, seen], axis=1)
-
-
-def _cut(end: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """`end` of each edge [..., 3], moved along the edge to z = NEAR_M where it lies nearer."""
-    length = other[..., 2] - end[..., 2]
-    behind = (end[..., 2] < NEAR_M) & (length > 0)
-    t = np.where(behind, (NEAR_M - end[..., 2]) / np.where(behind, length, 1.0), 0.0)
-    return end + t[..., None] * (other - end)
 
 
 def _project(points_m: np.ndarray, K: np.ndarray) -> np.ndarray:

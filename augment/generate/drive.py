@@ -27,7 +27,7 @@ FailBlock = Callable[[Block, str], None]
 
 @dataclass
 class Tally:
-    """Images so far. done: those whose blocks are published, or were before. failures: lines."""
+    """Images of the blocks done so far. skipped: finished before. failures: a line each."""
 
     written: int = 0
     skipped: int = 0

@@ -322,13 +322,6 @@ def _record_path(uri: str, name: str | None) -> str:
     return f"{SCENES}/{digest[:20]}.json"
 
 
-def _check_writable(store: Store) -> None:
-    """Before scenes are opened, which takes long: an output that cannot be written is refused."""
-    path = f"{STATE_FOLDER}/writable"
-    store.write(path, b"")
-    store.delete([path])
-
-
 def _check_not_mixed(store: Store, plan: Plan, blocks: Sequence[Block]) -> None:
     """Refuse to put images beside others of the same name that were made otherwise."""
     try:

@@ -17,6 +17,7 @@ from augment.batch.atomic import TEMPORARY_SUFFIX, output_error
 from augment.batch.claims import CLAIMS_FOLDER, try_claim
 from augment.batch.layout import STATE_FOLDER, variant_folder
 from augment.batch.parts import PARTS
+from augment.batch.processes import is_running
 from augment.batch.store import Store
 from augment.errors import OutputError
 from augment.generate.publish import staging_folder
@@ -71,7 +72,7 @@ def _clear_temporaries(folder: Path, *, is_deep: bool = True) -> None:
     for place, below, names in os.walk(folder):  # passes over folders that vanish meanwhile
         for name in names:
             writer = _PROCESS.search(name)
-            if writer is not None and not _is_running(int(writer[1])):
+            if writer is not None and not is_running(int(writer[1])):
                 path = Path(place) / name
                 try:
                     path.unlink(missing_ok=True)
@@ -79,13 +80,3 @@ def _clear_temporaries(folder: Path, *, is_deep: bool = True) -> None:
                     raise output_error(path, error) from error
         if not is_deep:
             below.clear()
-
-
-def _is_running(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except (ProcessLookupError, OverflowError):
-        return False
-    except PermissionError:  # it lives, and belongs to another user
-        return True
-    return True

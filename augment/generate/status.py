@@ -20,7 +20,7 @@ _RECENT = 20  # blocks whose times tell how fast it goes
 
 @dataclass
 class Progress:
-    """Images of a group. failed: in blocks that some of their images failed of, all counted."""
+    """Images of a group. in_failed_blocks: all those of blocks of which some image failed."""
 
     planned: int = 0
     published: int = 0

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import json
-import shutil
 import subprocess
 import sys
-import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -28,15 +25,6 @@ IDENTITY = ("source", "recipe_hash", "trajectory", "version", "backend")
 
 def run(job: RenderJob, renderer=fake_render) -> JobResult:
     return run_job(job, scene_loader=open_fake, renderer=renderer, progress=False)
-
-
-@pytest.fixture
-def quick_folder() -> Iterator[Path]:
-    """A folder in memory where there is one: these tests flush thousands of files."""
-    memory = Path("/dev/shm")
-    folder = Path(tempfile.mkdtemp(dir=memory if memory.is_dir() else None))
-    yield folder
-    shutil.rmtree(folder)
 
 
 def test_killed_jobs_resume_to_identical_files(quick_folder: Path) -> None:
