@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import yaml
 
+from recipes.knobs import free_knobs
 from recipes.schema import Recipe
 from recipes.values import is_number
 
@@ -28,7 +29,15 @@ def dump_recipe(recipe: Recipe) -> str:
 
     `parse_recipe(dump_recipe(r), ...).resolve(0)` equals r: floats keep all their bits, and the
     variant's number is kept. Paths of files are written as they are, and a recipe file names files
-    from its own folder only: give them such names first, as a job does.
+    from its own folder only: give them such names first, as a job does. Settings that the recipe's
+    quality has still to choose, in view of a scene, are left out.
     """
-    body = yaml.dump(recipe.model_dump(), Dumper=_Dumper, sort_keys=False, allow_unicode=False)
+    data = recipe.model_dump()
+    for knob in free_knobs(recipe) if recipe.quality.is_open else ():
+        *sections, name = knob.path.split(".")
+        holder = data
+        for section in sections:
+            holder = holder[section]
+        del holder[name]
+    body = yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=False)
     return f"# A recipe in numbers, hash {recipe.hash}.\n{body}"

@@ -163,6 +163,7 @@ class SectionSpec:
     """A mapping of fields. effect: it may be absent, and then has a probability of being there.
 
     items: set where not one such mapping stands but a list of them; the path then ends in [].
+    shorthand: name of the field whose value may stand in place of the mapping.
     """
 
     path: str
@@ -170,6 +171,7 @@ class SectionSpec:
     description: str
     effect: bool = False
     items: ListSpec | None = None
+    shorthand: str | None = None
     fields: dict[str, FieldSpec] = field(default_factory=dict)
     sections: dict[str, SectionSpec] = field(default_factory=dict)
     extra: dict[str, FieldSpec] = field(default_factory=dict)
@@ -200,7 +202,9 @@ def join(path: str, name: str) -> str:
 def _section(
     path: str, model: type[BaseModel], *, effect: bool = False, items: ListSpec | None = None
 ) -> SectionSpec:
-    spec = SectionSpec(path, model, (model.__doc__ or "").strip(), effect, items)
+    description = " ".join((model.__doc__ or "").split())
+    shorthand: str | None = getattr(model, "SHORTHAND", None)
+    spec = SectionSpec(path, model, description, effect, items, shorthand)
     for name, info in model.model_fields.items():
         below = join(path, name)
         inner, nullable = _without_none(info.annotation)

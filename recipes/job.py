@@ -22,6 +22,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, ValidationError, field_validator, model_validator
 
+from recipes.change import changed
 from recipes.errors import Problems, RecipeError, short
 from recipes.frames import parse_frames
 from recipes.load import load_recipe, preset_names
@@ -246,10 +247,8 @@ def scaled_recipe(recipe: Recipe, scale: float) -> Recipe:
     """
     if scale == 1:
         return recipe
-    numbers = recipe.model_dump()
-    numbers["render"]["scale"] = recipe.render.scale * scale
     try:
-        return Recipe.model_validate(numbers)
+        return changed(recipe, {"render.scale": recipe.render.scale * scale})
     except ValidationError as error:
         limits = error.errors()[0]["msg"]
         raise RecipeError(

@@ -59,7 +59,10 @@ def _section(section: SectionSpec, definitions: Schema) -> Schema:
             said = {"description": below.items.description, "maxItems": below.items.most}
             schema = {"type": "array", "items": schema, **said}
         # 'weather:' with nothing after it is null
-        properties[name] = {"oneOf": [schema, {"type": "null"}]}
+        ways = [schema, {"type": "null"}]
+        if below.shorthand is not None:
+            ways.append(_literal(below.fields[below.shorthand].without_null))
+        properties[name] = {"oneOf": ways}
     required = [name for name, spec in section.fields.items() if spec.required]
     extra = section.model.model_config.get("json_schema_extra") or {}
     assert isinstance(extra, dict), "the models state what else holds as JSON, not as functions"

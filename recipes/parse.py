@@ -119,6 +119,11 @@ class _Compiler:
         given: dict[str, Value | Items] = {}
         if isinstance(node, ScalarNode) and node.value is None and spec.items is None:
             return given  # 'weather:' with nothing below it: it is empty, an effect absent
+        if isinstance(node, ScalarNode) and spec.shorthand is not None:
+            value = self._parser.literal(node, spec.fields[spec.shorthand].without_null, path)
+            if value is not None:
+                given[spec.shorthand] = self._values[join(path, spec.shorthand)] = value
+            return given
         if not isinstance(node, MapNode):
             known = ", ".join(spec.known)
             text = f"{path} = {show(node)}: must be a mapping, with {known}"

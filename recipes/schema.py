@@ -14,7 +14,10 @@ from typing import Literal
 from pydantic import ConfigDict, Field, model_validator
 from pydantic.config import JsonDict
 
+from recipes.change import replaced
 from recipes.flood import Flood
+from recipes.knobs import tier_settings
+from recipes.quality import Quality
 from recipes.snow import Snow
 from recipes.style import FILES, Style
 from recipes.types import Closed, Colour, Flag, Number, Whole
@@ -27,6 +30,7 @@ _LATER_FIELDS = (
     ("weather", "snow"),
     ("output", "surface"),
     ("", "style"),
+    ("", "quality"),
 )
 MAX_EXTINCTION_PER_M = 100.0  # nothing is seen through 10 cm of it
 
@@ -185,8 +189,20 @@ class Recipe(Closed):
     )
     weather: Weather = Weather()
     style: Style | None = None
+    quality: Quality = Quality()
     render: Render = Render()
     output: Output = Output()
+
+    @model_validator(mode="after")
+    def _settings_of_tier(self) -> Recipe:
+        """A tier stands for numbers: it is resolved once, here, and stays as a word beside them."""
+        if self.quality.tier is not None:
+            for path, value in tier_settings(self, self.quality.tier).items():
+                name, _, rest = path.partition(".")
+                section = replaced(getattr(self, name), rest, value)
+                object.__setattr__(self, name, section)  # as yet nobody else has it
+                self.model_fields_set.add(name)
+        return self
 
     def canonical_json(self) -> str:
         """One text per recipe: sorted keys, no spaces, floats that read back to the same bits.
@@ -200,7 +216,8 @@ class Recipe(Closed):
         data = self.model_dump(mode="json")
         for section, name in _LATER_FIELDS:
             model, holder = (getattr(self, section), data[section]) if section else (self, data)
-            if holder[name] == type(model).model_fields[name].default:
+            default = type(model).model_fields[name].default
+            if getattr(model, name) == default:
                 del holder[name]
         for name in FILES if self.style is not None else ():
             del data["style"][name]
