@@ -37,7 +37,7 @@ def render_trial(
     renderer: Renderer | None = None,
     clock: Callable[[], float] = time.perf_counter,
 ) -> Trial:
-    """The view of `camera` (before recipe.render.scale) under the recipe, as it is written to files.
+    """The view of `camera` (before recipe.render.scale) under the recipe, in 8 bits as in files.
 
     size: width and height of the reference, pixels; None for the camera's own, which is that of
     render.scale 1. renderer: `augment.apply.render_view` if None. clock: in seconds.
@@ -63,7 +63,7 @@ def render_trial(
 def upsampled(picture: np.ndarray, width: int, height: int) -> np.ndarray:
     """The picture [H, W, 3] at another size, in its own type, as a viewer would show it.
 
-    Bilinear where it grows, means over areas where it shrinks; the same array where it does neither.
+    Bilinear where it grows, means over areas where it shrinks, else the same array.
     """
     if picture.shape[:2] == (height, width):
         return picture
