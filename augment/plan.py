@@ -21,6 +21,7 @@ from augment.scene import Scene
 from augment.snow.placed import PlacedSnow
 from augment.weather.flood import FloodMedium
 from augment.weather.smog import SmogMedium
+from recipes.errors import RecipeError
 from recipes.schema import Recipe
 from recipes.style import Style
 
@@ -92,7 +93,14 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
 
     Raises:
         SceneError: the recipe needs a fact that the scene does not know (the road's height).
+        RecipeError: the recipe's quality has still to choose its settings.
     """
+    if recipe.quality.is_open:
+        raise RecipeError(
+            f"recipe {recipe.name}, variant {recipe.variant}: quality {recipe.quality.words} has "
+            f"still to choose its settings in view of a scene, as jobs do; settle the recipe first "
+            f"(augment.quality.settle)"
+        )
     flood, flood_reason = place_flood(recipe, scene)
     level_z_m = None if flood is None else flood.level_z_m
     if flood is not None and not gaussians_below(scene, flood.level_z_m):
