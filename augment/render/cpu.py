@@ -239,11 +239,12 @@ class Tiles:
             [
                 settings.alpha_max,
                 math.log2(ALPHA_MIN),
-                TRANSMITTANCE_STOP,
+                min(settings.transmittance_stop, TRANSMITTANCE_STOP),
                 camera.is_orthographic,
                 settings.mode_depth_floor_m,
                 camera.fx**-2,
                 camera.fy**-2,
+                settings.transmittance_stop,
             ],
             np.float32,
         )

@@ -90,10 +90,11 @@ def blend_tiles(
 
     records: flat float32. members, starts: lists of slots. tiles: uint8 [tiles], CLOSED, OPEN or
     FRESH, updated. states: float32 [tiles * used part of STATE], where open tiles wait for the
-    next slice. size: image width and height. limits: float32, alpha_max, log2(ALPHA_MIN),
-    TRANSMITTANCE_STOP, 1 where rays are parallel, mode depth's floor, 1/fx^2, 1/fy^2. rgb to snow:
-    flat images; all but alpha may be None. cuts, lights: flat, of each slot as cpu_clip and
-    cpu_shading have them, or None.
+    next slice. size: image width and height. limits: float32, alpha_max, log2(ALPHA_MIN), what a
+    splat must leave more of than this to be blended, 1 where rays are parallel, mode depth's floor,
+    1/fx^2, 1/fy^2, the transmittance at which a pixel is finished. rgb to snow: flat images; all
+    but alpha may be None. cuts, lights: flat, of each slot as cpu_clip and cpu_shading have them,
+    or None.
     """
     columns = (size[0] + TILE_W - 1) // TILE_W
     used = states.size // tiles.size
@@ -298,7 +299,8 @@ def _blend_items(
     edges: None where no splat is cut.
     """
     alpha_max, log_cut = v8.splat(limits[0]), v8.splat(limits[1])
-    stop, zero, half = v8.splat(limits[2]), v8.splat(np.float32(0)), v8.splat(np.float32(0.5))
+    least, end = v8.splat(limits[2]), v8.splat(limits[7])
+    zero, half = v8.splat(np.float32(0)), v8.splat(np.float32(0.5))
     n = U(BATCH)
     places[items] = 0  # one item is read beyond the last
     splat = U(places[0])
@@ -314,9 +316,9 @@ def _blend_items(
         through = v8.load(state, at)
         weight = alpha * through
         after = through - weight
-        kept = v8.greater(after, stop)
+        kept = v8.greater(after, least)
         weight = v8.select(kept, weight, zero)
-        v8.store(state, at, v8.select(kept, after, v8.minus_abs(through)))
+        v8.store(state, at, light_left(through, after, kept, end))
         if rgb is not None:
             _add(state, at + P_RED, weight, staged[U(RED) * n + splat])
             _add(state, at + P_GREEN, weight, staged[U(GREEN) * n + splat])
@@ -359,6 +361,13 @@ def alpha_of(staged, values, splat, item, alpha_max, log_cut):
     e = v8.fmuladd(v8.negate(off), off, v8.splat(values[item]))
     alpha = v8.minimum(exp2(e), alpha_max)
     return v8.select(v8.at_least(e, log_cut), alpha, v8.splat(np.float32(0)))
+
+
+@inner()
+def light_left(through, after, kept, end):
+    """Transmittance behind a splat, negative where the pixel is finished. kept: it is blended."""
+    final = v8.minus_abs(v8.select(kept, after, through))
+    return v8.select(v8.greater(after, end), after, final)
 
 
 @inner()

@@ -22,7 +22,7 @@ import numpy as np
 from numba import prange
 
 from augment.render import cpu_simd as v8
-from augment.render.cpu_blend import alpha_of, is_closed, shrink
+from augment.render.cpu_blend import alpha_of, is_closed, light_left, shrink
 from augment.render.cpu_items import BATCH, ITEMS, find_spans, list_items, stage
 from augment.render.cpu_jit import inner, kernel
 from augment.render.cpu_layout import (
@@ -196,7 +196,8 @@ def _add_share(state, staged, values, places, k, item, end, limits, d_depth, sha
     """Blend one splat into its rows of a strip, adding what each pixel says of it."""
     n = U(BATCH)
     alpha_max, log_cut = v8.splat(limits[0]), v8.splat(limits[1])
-    stop, zero, one = v8.splat(limits[2]), v8.splat(np.float32(0)), v8.splat(np.float32(1))
+    least, end_light = v8.splat(limits[2]), v8.splat(limits[7])
+    zero, one = v8.splat(np.float32(0)), v8.splat(np.float32(1))
     sharp = staged[U(SHARP_X) * n + k]
     fall = v8.splat(staged[U(FALL_Y) * n + k])
     tilt = v8.splat(-sharp * staged[U(LEAN_X) * n + k])
@@ -217,9 +218,9 @@ def _add_share(state, staged, values, places, k, item, end, limits, d_depth, sha
         through = v8.load(state, at)
         weight = alpha * through
         after = through - weight
-        kept = v8.greater(after, stop)
+        kept = v8.greater(after, least)
         weight = v8.select(kept, weight, zero)
-        v8.store(state, at, v8.select(kept, after, v8.minus_abs(through)))
+        v8.store(state, at, light_left(through, after, kept, end_light))
         g_red, g_green = v8.load(state, at + G_RED), v8.load(state, at + G_GREEN)
         g_blue = v8.load(state, at + G_BLUE)
         q = v8.fmuladd(g_red, red, v8.load(state, at + G_ALPHA))

@@ -24,6 +24,7 @@ from augment.scene import PosedGaussians
 from augment.weather.smog import SmogMedium
 
 _NO_CLIP = 1e30  # a height at which everything is on the kept side
+_NO_RADIUS_CLIP = -1.0  # no splat is as small, not even one of alpha 1/255 in its centre only
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,6 +158,7 @@ def part_views(
             views[:, layout.V_EYE_HEIGHT] = above / smog.scale_height_m
             views[:, layout.V_UP :][:, :3] = poses[:, 2, :3] / smog.scale_height_m
     views[:, layout.V_PARALLEL] = camera.is_orthographic
+    views[:, layout.V_RADIUS_CLIP] = settings.radius_clip_px or _NO_RADIUS_CLIP
     views[:, layout.V_EXTENT] = MAX_EXTENT_SIGMAS
     views[:, layout.V_CLIP_EYE] = views[:, layout.V_CLIP_REACH] = _NO_CLIP
     if clip is not None:

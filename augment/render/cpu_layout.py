@@ -51,6 +51,7 @@ V_SNOW = 52  # 1 where the part is snow, else 0
 V_SUN, V_WRAP = 53, 56  # towards the light, in the camera's axes; how far it is wrapped
 V_LIT = 57  # 1 where the part is lit pixel by pixel, else 0
 V_MAPS = 58  # how many colour maps the part has
+V_RADIUS_CLIP = 59  # pixels; splats no larger are left out; negative for none
 VIEW = 64
 
 # What a part is read from: arrays of these by address.

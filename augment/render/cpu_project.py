@@ -83,6 +83,7 @@ from augment.render.cpu_layout import (
     V_MAPS,
     V_NEAR,
     V_PARALLEL,
+    V_RADIUS_CLIP,
     V_SIZE,
     V_SNOW,
     U,
@@ -171,12 +172,31 @@ def _rank_eight(means, scales, opacities, view, picked, depths, at, areas):
     height, size = height_of(d, view), v8.splat(view[V_EXTENT]) * longest
     seen = v8.both(seen, v8.at_least(height + size, zero))
     seen = v8.both(seen, v8.at_least(v8.splat(view[V_CLIP_REACH]), height - size))
+    if view[V_RADIUS_CLIP] > np.float32(0):
+        seen = v8.both(seen, _may_exceed_clip(opacity, reach, view))
     v8.store(depths, at, v8.select(seen, z, zero))
     # Mean over all directions of the ellipse's area, 2 pi sigma^2; it only cuts z into slices.
     squares = s0 * s1 + s1 * s2 + s0 * s2
     focal = v8.splat(view[V_FOCAL] * view[V_FOCAL + 1] * np.float32(2 * math.pi / 3))
     area = v8.fmuladd(focal * squares, inverse * inverse, two) * opacity
     v8.store(areas, U(0), v8.minimum(area, v8.splat(view[V_SIZE] * view[V_SIZE + 1])))
+
+
+@inner()
+def _may_exceed_clip(opacity, reach, view):
+    """False only of splats that are surely no larger than the view's radius clip.
+
+    reach: longest semi-axis over the divisor. The bound is that of the projection with the longest
+    axis for all and the opacity before antialiasing, which only lowers it; the margins are a
+    thousand times what rounding may take off.
+    """
+    k = v8.splat(np.float32(0.5) * LOG2_E)
+    budget = v8.maximum(log2(opacity) - v8.splat(view[V_LOG_CUT]), v8.splat(np.float32(0))) / k
+    gain = max(view[V_GAIN], view[V_GAIN + 1]) / view[V_EXTENT]
+    axis = v8.splat(gain) * reach
+    square = (budget + v8.splat(np.float32(1e-3))) * v8.fmuladd(axis, axis, v8.splat(view[V_BLUR]))
+    clip = view[V_RADIUS_CLIP]
+    return v8.greater(square, v8.splat(clip * clip * np.float32(1 - 1e-3)))
 
 
 @kernel
@@ -352,6 +372,8 @@ def _project_eight(means, quats, scales, opacities, view, picked, at, functions,
     drawn = v8.both(
         v8.at_least(log_opacity, log_cut), v8.at_least(v8.splat(_HUGE), blurred_x + blurred_y)
     )
+    larger = v8.maximum(radius_x, radius_y)
+    drawn = v8.both(drawn, v8.greater(larger, v8.splat(view[V_RADIUS_CLIP])))
     if modes[M_CLIP]:
         partly, offset, lx, ly, gx, gy, deep = cut_eight(
             quats, scales, picked, at, d, x, y, inverse, view

@@ -15,7 +15,7 @@ from augment.cameras import Camera
 from augment.errors import BackendUnavailable
 from augment.render.buffers import ALPHA, BUFFERS, DIFFERENTIABLE, RGB, RenderOutput
 from augment.render.clip import HeightClip
-from augment.render.constants import RasterSettings
+from augment.render.constants import MOST_TRANSMITTANCE_STOP, RasterSettings
 from augment.render.reference import rasterize_reference
 from augment.render.sh import MAX_DEGREE
 from augment.scene import Gaussians, PosedGaussians
@@ -275,6 +275,17 @@ def _check_settings(settings: RasterSettings) -> None:
         raise ValueError(
             f"settings.mode_depth_floor_m must be finite and > 0 (metres); "
             f"got {settings.mode_depth_floor_m}"
+        )
+    if not 0 < settings.transmittance_stop <= MOST_TRANSMITTANCE_STOP:
+        raise ValueError(
+            f"settings.transmittance_stop must be > 0 and at most {MOST_TRANSMITTANCE_STOP}, "
+            f"since median depth is where less than half the light is left; "
+            f"got {settings.transmittance_stop}"
+        )
+    if not (math.isfinite(settings.radius_clip_px) and settings.radius_clip_px >= 0):
+        raise ValueError(
+            f"settings.radius_clip_px must be finite and >= 0 (pixels); "
+            f"got {settings.radius_clip_px}"
         )
     if settings.sh_degree is not None and not 0 <= settings.sh_degree <= MAX_DEGREE:
         raise ValueError(

@@ -35,12 +35,16 @@ from augment.render.clip import HeightClip
 from augment.render.constants import (
     ALPHA_MIN,
     DEPTH_EPS,
-    MAX_EXTENT_SIGMAS,
     TRANSMITTANCE_STOP,
     RasterSettings,
 )
 from augment.render.mode_depth import Clusters
-from augment.render.reference_project import Splats, order_by_depth, project_parts
+from augment.render.reference_project import (
+    Splats,
+    half_extents,
+    order_by_depth,
+    project_parts,
+)
 from augment.render.shading import TINY, light_share
 from augment.scene import PosedGaussians
 from augment.weather.smog import SmogMedium
@@ -104,10 +108,9 @@ def bin_to_tiles(splats: Splats, camera: Camera) -> TileLists:
 
 def _tile_span(splats: Splats, axis: int, tiles: int) -> tuple[Tensor, Tensor]:
     """First tile and one past the last along x (axis 0) or y (axis 1) of each splat's box."""
-    opacities, centres = splats.opacities.detach(), splats.means2d.detach()[:, axis]
-    sigmas = torch.sqrt(2 * torch.log(opacities / ALPHA_MIN).clamp_min(0))
-    half = sigmas.clamp_max(MAX_EXTENT_SIGMAS) * torch.sqrt(splats.covs2d.detach()[:, 2 * axis])
-    half = half * (1 + 1e-5) + 1e-3  # rounding must not lose a pixel whose alpha is just 1/255
+    centres = splats.means2d.detach()[:, axis]
+    # Rounding must not lose a pixel whose alpha is just 1/255.
+    half = half_extents(splats)[:, axis] * (1 + 1e-5) + 1e-3
     first = torch.floor((centres - half) / TILE).clamp(0, tiles).long()
     last = torch.floor((centres + half) / TILE).clamp(-1, tiles - 1).long()
     return first, last + 1
@@ -192,7 +195,7 @@ def blend_tile(
             ids = torch.where(weight > heaviest, near.ids[row], ids)
             heaviest = torch.maximum(heaviest, weight)
         transmittance = after[-1]
-        if bool((transmittance <= TRANSMITTANCE_STOP).all()):
+        if bool((transmittance <= settings.transmittance_stop).all()):
             break
     values = {
         RGB: rgb,
@@ -216,8 +219,8 @@ def blend_weights(
     """Weight of every splat at every pixel, and the transmittance behind it.
 
     pixels: x, y of their centres. transmittance: in front of the first splat. Transmittance never
-    grows, so the splat that would bring it to the stop and all behind it are those with
-    `after <= stop`; they get no weight.
+    grows, so the splats that are not blended are those that stand behind the stop, and the one that
+    would leave no more than TRANSMITTANCE_STOP, or the stop where that is less (RasterSettings).
     """
     dx = pixels[0] - splats.means2d[:, :1]  # [S, P]
     dy = pixels[1] - splats.means2d[:, 1:]
@@ -229,7 +232,9 @@ def blend_weights(
         alphas = alphas * (at + slope_x * dx + slope_y * dy).clamp(0, 1)
     after = transmittance * torch.cumprod(1 - alphas, 0)
     before = torch.cat([transmittance[None], after[:-1]])
-    weights = torch.where(after > TRANSMITTANCE_STOP, alphas * before, torch.zeros_like(alphas))
+    stop = settings.transmittance_stop
+    kept = (after > min(stop, TRANSMITTANCE_STOP)) & (before > stop)
+    weights = torch.where(kept, alphas * before, torch.zeros_like(alphas))
     return weights, after
 
 

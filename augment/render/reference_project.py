@@ -156,11 +156,20 @@ def _project_part(
                 tau = _optical_depths(gaussians, offsets, part, camera, smog)
                 lights[:, 6:] *= torch.exp(-tau)[:, None]
         splats = dataclasses.replace(splats, lights=lights)
-    if clip is None:
-        return splats
-    heights = clip.sign * _heights(gaussians, offsets, part, camera, clip)
-    cuts, partly = _cut(heights, axes, points, camera, clip)
-    return dataclasses.replace(splats, cuts=cuts).select(partly)
+    if clip is not None:
+        heights = clip.sign * _heights(gaussians, offsets, part, camera, clip)
+        cuts, partly = _cut(heights, axes, points, camera, clip)
+        splats = dataclasses.replace(splats, cuts=cuts).select(partly)
+    if settings.radius_clip_px > 0:
+        splats = splats.select(half_extents(splats).amax(1) > settings.radius_clip_px)
+    return splats
+
+
+def half_extents(splats: Splats) -> Float[Tensor, "M 2"]:
+    """Half the width and height, px, of the boxes in which the splats' alpha can reach 1/255."""
+    opacities, covs2d = splats.opacities.detach(), splats.covs2d.detach()
+    sigmas = torch.sqrt(2 * torch.log(opacities / ALPHA_MIN).clamp_min(0))
+    return sigmas.clamp_max(MAX_EXTENT_SIGMAS)[:, None] * torch.sqrt(covs2d[:, ::2])
 
 
 def _heights(
