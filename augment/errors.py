@@ -23,3 +23,7 @@ class OutputError(ClimateGSError):
 
 class StyleError(ClimateGSError):
     """A style image, mask, preset or network cannot be used as it is."""
+
+
+class MetricError(ClimateGSError):
+    """A metric's weights cannot be used as they are."""

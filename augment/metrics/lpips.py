@@ -1,0 +1,259 @@
+"""LPIPS: how different two pictures look, by the features of a network (Zhang et al. 2018).
+
+Version 0.1 of the metric, on AlexNet or VGG-16. The networks are described here and their weights
+come from files that the user has: nothing is downloaded. Which network a file is for is told from
+its first convolution.
+
+    heads v0.1     d = sum over layers of the mean over pixels of  w . (f(a) - f(b))^2
+    f              the layer's features, each pixel's vector divided by its length
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+from augment.errors import MetricError
+
+# Applied to pictures in [-1, 1]: about ImageNet's means and deviations.
+SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
+_LEAST_LENGTH = 1e-10  # of a feature vector: one of zeros stays zeros
+
+
+@dataclass(frozen=True)
+class Conv:
+    """A convolution followed by a ReLU. index: its number among torchvision's `features`."""
+
+    index: int
+    channels: int
+    kernel: int = 3
+    stride: int = 1
+    padding: int = 1
+
+
+@dataclass(frozen=True)
+class Architecture:
+    """slices: convolutions whose last output is compared, one slice after the other. pools: the
+    slices that begin with a max pooling of `pool_px` and stride 2. least_px: the smallest side.
+    """
+
+    name: str
+    slices: tuple[tuple[Conv, ...], ...]
+    pools: tuple[int, ...]
+    pool_px: int
+    least_px: int
+
+
+ALEX = Architecture(
+    "alex",
+    (
+        (Conv(0, 64, 11, 4, 2),),
+        (Conv(3, 192, 5, 1, 2),),
+        (Conv(6, 384),),
+        (Conv(8, 256),),
+        (Conv(10, 256),),
+    ),
+    pools=(1, 2),
+    pool_px=3,
+    least_px=31,
+)
+VGG16 = Architecture(
+    "vgg16",
+    (
+        (Conv(0, 64), Conv(2, 64)),
+        (Conv(5, 128), Conv(7, 128)),
+        (Conv(10, 256), Conv(12, 256), Conv(14, 256)),
+        (Conv(17, 512), Conv(19, 512), Conv(21, 512)),
+        (Conv(24, 512), Conv(26, 512), Conv(28, 512)),
+    ),
+    pools=(1, 2, 3, 4),
+    pool_px=2,
+    least_px=16,
+)
+
+
+class Lpips:
+    """LPIPS of one network. weights: by the names of `expected_shapes`, float32."""
+
+    def __init__(self, architecture: Architecture, weights: Mapping[str, Tensor]) -> None:
+        self.architecture = architecture
+        self.name = architecture.name
+        self._weights = dict(weights)
+
+    @torch.no_grad()
+    def __call__(
+        self, a: Float[Tensor, "B 3 H W"], b: Float[Tensor, "B 3 H W"]
+    ) -> Float[Tensor, " B"]:
+        """The distance of each pair of display-encoded pictures in [0, 1]; 0 for equal ones.
+
+        Raises:
+            ValueError: shapes differ, or the pictures are too small for the network.
+        """
+        least = self.architecture.least_px
+        if a.shape != b.shape or a.ndim != 4 or a.shape[1] != 3 or min(a.shape[2:]) < least:
+            raise ValueError(
+                f"pictures must be two of [B, 3, H, W] with H, W >= {least} for {self.name}; got "
+                f"{list(a.shape)} and {list(b.shape)}"
+            )
+        total = torch.zeros(len(a))
+        pairs = zip(self._features(a), self._features(b), strict=True)
+        for number, (one, other) in enumerate(pairs):
+            squared = (_normalised(one) - _normalised(other)) ** 2
+            total += F.conv2d(squared, self._weights[_head(number)]).mean((1, 2, 3))
+        return total
+
+    def _features(self, pictures: Tensor) -> list[Tensor]:
+        shift, scale = (torch.tensor(each)[:, None, None] for each in (SHIFT, SCALE))
+        x = (2 * pictures.float() - 1 - shift) / scale
+        taken = []
+        for number, convs in enumerate(self.architecture.slices):
+            if number in self.architecture.pools:
+                x = F.max_pool2d(x, self.architecture.pool_px, 2)
+            for conv in convs:
+                weight, bias = (self._weights[name] for name in _names(number, conv))
+                x = F.relu(F.conv2d(x, weight, bias, conv.stride, conv.padding))
+            taken.append(x)
+        return taken
+
+
+def picture_lpips(
+    network: Lpips, picture: np.ndarray, reference: np.ndarray, weight: np.ndarray | None = None
+) -> float:
+    """The distance of two display-encoded pictures, floats [H, W, 3] in [0, 1].
+
+    weight: bool [H, W]; where it is false the picture is taken to be the reference, so those pixels
+    add nothing of their own. The mean stays one over the whole picture.
+
+    Raises:
+        ValueError: as Lpips.
+    """
+    if weight is not None:
+        picture = np.where(weight[..., None], picture, reference)
+    a, b = (
+        torch.from_numpy(np.ascontiguousarray(each, np.float32)).permute(2, 0, 1)[None]
+        for each in (picture, reference)
+    )
+    return float(network(a, b))
+
+
+def load_lpips(weights: Path, heads: Path | None = None) -> Lpips:
+    """LPIPS with weights from files: `.safetensors`, or state dicts that torch saved (.pth).
+
+    weights: the state dict of a whole `lpips.LPIPS(net="alex")` or `"vgg"` (`net.slice1.0.weight`,
+    ..., `lin0.model.1.weight`, ...); or, with `heads`, torchvision's `alexnet` or `vgg16`
+    (`features.0.weight`, ...; its classifier is left out). heads: LPIPS's own file of linear heads
+    (`lin0.model.1.weight`, ...), version 0.1.
+
+    Raises:
+        MetricError: no such file, not one of these kinds, or tensors that are missing, of another
+            shape or dtype, or not finite; says which.
+    """
+    found = _read_state_dict(weights)
+    origin = dict.fromkeys(found, weights)
+    if heads is not None:
+        own = _read_state_dict(heads)
+        found, origin = found | own, origin | dict.fromkeys(own, heads)
+    architecture = _recognised(found, weights)
+    from_torchvision = "features.0.weight" in found
+    filled = {}
+    for name, shape in expected_shapes(architecture).items():
+        theirs = _torchvision_name(name) if from_torchvision else name
+        filled[name] = _checked(found.get(theirs), theirs, shape, origin.get(theirs, weights))
+    for name, ours in (("shift", SHIFT), ("scale", SCALE)):
+        given = found.get(f"scaling_layer.{name}")
+        if given is not None and not torch.allclose(given.flatten().float(), torch.tensor(ours)):
+            raise MetricError(
+                f"{weights}: scaling_layer.{name} is {given.flatten().tolist()}; LPIPS 0.1 has "
+                f"{list(ours)}"
+            )
+    return Lpips(architecture, filled)
+
+
+def expected_shapes(architecture: Architecture) -> dict[str, tuple[int, ...]]:
+    """The tensors of the whole metric, by the names that `lpips.LPIPS` gives them."""
+    shapes: dict[str, tuple[int, ...]] = {}
+    channels = 3
+    for number, convs in enumerate(architecture.slices):
+        for conv in convs:
+            weight, bias = _names(number, conv)
+            shapes[weight] = (conv.channels, channels, conv.kernel, conv.kernel)
+            shapes[bias] = (conv.channels,)
+            channels = conv.channels
+        shapes[_head(number)] = (1, channels, 1, 1)
+    return shapes
+
+
+def _names(number: int, conv: Conv) -> tuple[str, str]:
+    base = f"net.slice{number + 1}.{conv.index}"
+    return f"{base}.weight", f"{base}.bias"
+
+
+def _head(number: int) -> str:
+    return f"lin{number}.model.1.weight"
+
+
+def _torchvision_name(name: str) -> str:
+    return f"features.{name.split('.', 2)[2]}" if name.startswith("net.") else name
+
+
+def _normalised(features: Tensor) -> Tensor:
+    return features / (features.square().sum(1, keepdim=True).sqrt() + _LEAST_LENGTH)
+
+
+def _recognised(found: Mapping[str, Tensor], path: Path) -> Architecture:
+    first = found.get("net.slice1.0.weight", found.get("features.0.weight"))
+    for architecture in (ALEX, VGG16):
+        wanted = expected_shapes(architecture)["net.slice1.0.weight"]
+        if first is not None and tuple(first.shape) == wanted:
+            return architecture
+    told = f"it is {list(first.shape)}" if first is not None else "there is none"
+    raise MetricError(
+        f"{path}: expected a first convolution net.slice1.0.weight (LPIPS) or features.0.weight "
+        f"(torchvision) of AlexNet [64, 3, 11, 11] or VGG-16 [64, 3, 3, 3]; {told}. The file holds "
+        f"{', '.join(list(found)[:4]) or 'nothing'}"
+    )
+
+
+def _checked(given: Tensor | None, name: str, shape: tuple[int, ...], path: Path) -> Tensor:
+    if given is None:
+        hint = ". The linear heads have a file of their own: name it too" * name.startswith("lin")
+        raise MetricError(f"{path} lacks {name}, a tensor {list(shape)}{hint}")
+    if tuple(given.shape) != shape or not given.dtype.is_floating_point:
+        raise MetricError(
+            f"{path}: {name} must be floats {list(shape)}; got {given.dtype} {list(given.shape)}"
+        )
+    if not bool(torch.isfinite(given).all()):
+        raise MetricError(f"{path}: {name} holds NaN or infinite values")
+    return given.float()
+
+
+def _read_state_dict(path: Path) -> dict[str, Tensor]:
+    if not path.is_file():
+        raise MetricError(f"{path}: there is no such file of weights")
+    try:
+        if path.suffix == ".safetensors":
+            from safetensors.torch import load_file
+
+            found: Any = load_file(path)
+        else:
+            found = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # both readers raise many kinds, with no base of their own
+        reason = (str(error) or repr(error)).splitlines()[0]
+        raise MetricError(
+            f"{path} cannot be read as weights: {reason}; expected a state dict saved by torch, or "
+            f"a .safetensors file"
+        ) from error
+    if not isinstance(found, Mapping) or not all(isinstance(v, Tensor) for v in found.values()):
+        raise MetricError(
+            f"{path} holds a {type(found).__name__} and not a state dict of tensors; save "
+            f"model.state_dict()"
+        )
+    return {str(name): value for name, value in found.items()}
