@@ -131,6 +131,8 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
         alpha_max=recipe.render.alpha_max,
         antialiased=recipe.render.antialiased,
         sh_degree=recipe.render.sh_degree,
+        transmittance_stop=recipe.render.transmittance_stop,
+        radius_clip_px=recipe.render.radius_clip_px,
     )
     exposure = _exposure_step(recipe, scene)
     actors = f"background and {len(scene.actors)} actors posed at the camera's timestamp"

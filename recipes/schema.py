@@ -26,9 +26,12 @@ VERSION = 1
 KOSCHMIEDER = 3.912  # -ln(0.02): visibility is where contrast falls to 2 %
 _LATER_FIELDS = (
     ("render", "exposure"),
+    ("render", "transmittance_stop"),
+    ("render", "radius_clip_px"),
     ("weather", "flood"),
     ("weather", "snow"),
     ("output", "surface"),
+    ("style", "evaluated"),
     ("", "style"),
     ("", "quality"),
 )
@@ -141,6 +144,21 @@ class Render(Closed):
         description="recorded gives each camera's picture the colours of its recording, where the "
         "scene knows them; neutral leaves the scene's own.",
     )
+    transmittance_stop: Number = Field(
+        default=1e-4,
+        ge=1e-6,
+        le=0.25,
+        description="A pixel is finished once no more than this share of the light behind shines "
+        "through: what is lost is at most that share, and the sky shows in its place. 1e-6 blends "
+        "what no picture in 8 bits shows; 0.5 would leave no median depth, hence the limit.",
+    )
+    radius_clip_px: Number = Field(
+        default=0.0,
+        ge=0,
+        le=64,
+        description="Splats that reach no farther than this from their centre along x or y, pixels "
+        "of the rendered picture, are left out; 0 leaves out none.",
+    )
 
 
 class Output(Closed):
@@ -216,6 +234,8 @@ class Recipe(Closed):
         data = self.model_dump(mode="json")
         for section, name in _LATER_FIELDS:
             model, holder = (getattr(self, section), data[section]) if section else (self, data)
+            if model is None:
+                continue
             default = type(model).model_fields[name].default
             if getattr(model, name) == default:
                 del holder[name]

@@ -63,6 +63,12 @@ class Style(Closed):
         default="scene",
         description="scene styles what stands in the weather, picture also the weather itself.",
     )
+    evaluated: Literal["color", "sh"] = Field(
+        default="color",
+        description="color maps every colour as it is seen; sh maps the background's spherical "
+        "harmonics once, which frames pay nothing for and which differs where colours that change "
+        "with the direction reach below 0. Of applied_to scene.",
+    )
     checkpoint: FilePath | None = Field(
         default=None,
         description="A trained network for gscm; null for the one that comes with the package.",
