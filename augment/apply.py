@@ -17,8 +17,9 @@ from augment.render.rasterize import rasterize
 from augment.scene import PosedGaussians, Scene
 from augment.semantics import SemanticClass
 from augment.sky import Sky
-from augment.snow.covers import cover_of
+from augment.stopwatch import lap
 from augment.style.looks import look_of
+from augment.view_plan import ViewPlan, cover_for, plan_view
 from augment.weather.flood_view import Painter, render_flooded
 from augment.weather.smog import SmogMedium, fog_raster
 from augment.weather.water_plane import plane_depth
@@ -43,8 +44,9 @@ class WeatheredBuffers:
     raster: the buffers of the scene's surfaces; with water in view, of those under it too, without
     colours. depth_m [H, W]: z along the optical axis of the scene's surface, 0 where there is none;
     None unless planned. water [H, W]: where a ray meets water first; None where no water is in
-    view. snow [H, W]: where snow is what the pixel shows; None where none is planned; it is a
+    view. snow [H, W]: where snow is what the pixel shows; None where none can be in view; it is a
     surface of the scene for raster, depth_m and parts. bare: the scene without it, if planned.
+    parts: those drawn, by which splat_ids count. view: what of the plan was carried out.
     """
 
     camera: Camera
@@ -52,6 +54,7 @@ class WeatheredBuffers:
     raster: RenderOutput
     depth_m: Float[Tensor, "H W"] | None
     parts: tuple[PosedGaussians, ...]
+    view: ViewPlan
     water: Bool[Tensor, "H W"] | None = None
     snow: Bool[Tensor, "H W"] | None = None
     bare: BareBuffers | None = None
@@ -130,24 +133,29 @@ def render_view(
     shown = buffers.bare or buffers  # the scene's surfaces that the other images show
     semantic = instance = depth = None
     if plan.semantic:
-        table = semantic_table(shown.parts)
-        semantic = _look_up(shown.raster, table, int(SemanticClass.SKY), np.uint8)
-        if first is not None:
-            semantic[first.numpy()] = int(SemanticClass.WATER)
+        with lap("semantic image"):
+            table = semantic_table(shown.parts)
+            semantic = _look_up(shown.raster, table, int(SemanticClass.SKY), np.uint8)
+            if first is not None:
+                semantic[first.numpy()] = int(SemanticClass.WATER)
     if plan.instance:
-        instance = _look_up(shown.raster, instance_table(shown.parts), 0, np.uint16)
-        if first is not None:
-            instance[first.numpy()] = 0
+        with lap("instance image"):
+            instance = _look_up(shown.raster, instance_table(shown.parts), 0, np.uint16)
+            if first is not None:
+                instance[first.numpy()] = 0
     if plan.depth_buffer is not None and shown.depth_m is not None:
         depth = shown.depth_m
         if first is not None:
             assert plan.flood is not None
-            surface = plane_depth(buffers.camera, plan.flood.level_z_m).to(depth.dtype)
-            in_air = float(buffers.camera.centre[2]) > plan.flood.level_z_m
-            depth = torch.where(first, surface if in_air else torch.zeros_like(depth), depth)
+            with lap("depth image"):
+                surface = plane_depth(buffers.camera, plan.flood.level_z_m).to(depth.dtype)
+                in_air = float(buffers.camera.centre[2]) > plan.flood.level_z_m
+                depth = torch.where(first, surface if in_air else torch.zeros_like(depth), depth)
+    with lap("8 bits"):
+        rgb = quantise(buffers.rgb)
     return WeatheredView(
         camera=buffers.camera,
-        rgb=quantise(buffers.rgb),
+        rgb=rgb,
         depth_m=None if depth is None else depth.float().numpy(),
         semantic=semantic,
         instance=instance,
@@ -163,50 +171,61 @@ def render_buffers(
     scene: Scene, camera: Camera, plan: Plan, *, backend: str = "auto"
 ) -> WeatheredBuffers:
     """The view of `camera` at its own resolution, as floats."""
-    parts = bare_parts = scene.parts_for(camera)
-    look = None if plan.style is None else look_of(scene, plan.style)
-    worn = None if plan.styles_picture else look
-    if plan.snow is not None:
-        parts = cover_of(scene, plan.snow, worn).parts_for(scene, camera)
+    with lap("view plan"):
+        view = plan_view(plan, scene, camera)
+    with lap("parts"):
+        look = None if plan.style is None else look_of(scene, plan.style)
+        worn = None if plan.styles_picture else look
+        parts = bare_parts = scene.parts_for(camera, view.actors)
+    cover = cover_for(plan, scene) if view.snow else None
+    if cover is not None:
+        with lap("snow: placement and layer"):
+            parts = cover.parts_for(scene, camera, parts, view.snowy)
     sky = scene.sky
     if worn is not None:
         parts, sky = worn.on(parts), worn.sky
     flooded = None
-    if plan.flood is not None:
+    if plan.flood is not None and view.water:
         painter = Painter(
             parts, sky, plan.settings, plan.smog_in_splats, plan.smog_on_buffers, backend
         )
-        buffers = plan.buffers
+        buffers = view.buffers
         if plan.measures_flood and plan.depth_buffer not in buffers:
             buffers = buffers | {EXPECTED_DEPTH}
         flooded = render_flooded(painter, camera, plan.flood, buffers)
     if flooded is not None:
         rgb, raster = flooded.rgb, flooded.scene
+        if flooded.is_hidden:
+            view = view.with_hidden_water()
     else:
-        rgb, raster = _without_water(sky, parts, camera, plan, backend)
+        rgb, raster = _without_water(sky, parts, camera, plan, view.buffers, backend)
     if look is not None and plan.styles_picture:
-        rgb = map_colors(rgb, look.maps.picture, fast=backend != "reference")
+        with lap("style on the picture"):
+            rgb = map_colors(rgb, look.maps.picture, fast=backend != "reference")
     color_map = scene.color_map(camera) if plan.recorded_exposure else None
     if color_map is not None:  # a camera exposes what the weather has left, so this comes last
-        rgb = map_colors(rgb, color_map, fast=backend != "reference")
+        with lap("camera colour map"):
+            rgb = map_colors(rgb, color_map, fast=backend != "reference")
     water = None if flooded is None else flooded.water
     return WeatheredBuffers(
         camera,
         rgb,
         raster,
-        _surface_depth(raster, plan),
+        _surface_depth(raster, plan, plan.buffers),
         parts,
+        view,
         water=water,
         snow=_snow_mask(raster, water),
-        bare=_bare(bare_parts, camera, plan, backend),
+        bare=_bare(raster, bare_parts, camera, plan, view, backend),
     )
 
 
-def _surface_depth(raster: RenderOutput, plan: Plan) -> Tensor | None:
-    """z of the surfaces by the planned estimator, else by the one that labels need."""
-    z = getattr(raster, plan.depth_buffer or EXPECTED_DEPTH)
-    if z is None:
-        z = raster.expected_depth
+def _surface_depth(raster: RenderOutput, plan: Plan, buffers: frozenset[str]) -> Tensor | None:
+    """z of the surfaces by the planned estimator if it is among the buffers, else by the one that
+    labels need.
+    """
+    by = plan.depth_buffer if plan.depth_buffer in buffers else None
+    z = getattr(raster, by or EXPECTED_DEPTH)
     if z is None or raster.alpha is None:
         return None
     return torch.where(raster.alpha >= SURFACE_ALPHA, z, torch.zeros_like(z))
@@ -221,32 +240,52 @@ def _snow_mask(raster: RenderOutput, water: Tensor | None) -> Tensor | None:
 
 
 def _bare(
-    parts: tuple[PosedGaussians, ...], camera: Camera, plan: Plan, backend: str
+    raster: RenderOutput,
+    parts: tuple[PosedGaussians, ...],
+    camera: Camera,
+    plan: Plan,
+    view: ViewPlan,
+    backend: str,
 ) -> BareBuffers | None:
+    """What images show of the scene without its snow. raster: of the picture, which is that scene
+    where the view has no pass for it.
+    """
     if not plan.bare_buffers:
         return None
-    raster = rasterize(
-        parts, camera, buffers=plan.bare_buffers, settings=plan.settings, backend=backend
-    )
-    return BareBuffers(raster, _surface_depth(raster, plan), parts)
+    if view.bare_buffers:
+        with lap("snow: bare surface"):
+            raster = rasterize(
+                parts, camera, buffers=view.bare_buffers, settings=plan.settings, backend=backend
+            )
+    return BareBuffers(raster, _surface_depth(raster, plan, plan.bare_buffers), parts)
 
 
 def _without_water(
-    sky: Sky, parts: tuple[PosedGaussians, ...], camera: Camera, plan: Plan, backend: str
+    sky: Sky,
+    parts: tuple[PosedGaussians, ...],
+    camera: Camera,
+    plan: Plan,
+    buffers: frozenset[str],
+    backend: str,
 ) -> tuple[Tensor, RenderOutput]:
-    raster = rasterize(
-        parts,
-        camera,
-        buffers=plan.buffers,
-        settings=plan.settings,
-        smog=plan.smog_in_splats,
-        backend=backend,
-    )
+    with lap("rasterise"):
+        raster = rasterize(
+            parts,
+            camera,
+            buffers=buffers,
+            settings=plan.settings,
+            smog=plan.smog_in_splats,
+            backend=backend,
+        )
     assert raster.rgb is not None and raster.alpha is not None
     rgb = raster.rgb
     if plan.smog_on_buffers is not None:
-        rgb = fog_raster(raster, camera, plan.smog_on_buffers)
-    rgb = composite_sky(rgb, raster.alpha, camera, sky, smog=plan.smog, fast=backend != "reference")
+        with lap("smog on buffers"):
+            rgb = fog_raster(raster, camera, plan.smog_on_buffers)
+    with lap("sky"):
+        rgb = composite_sky(
+            rgb, raster.alpha, camera, sky, smog=plan.smog, fast=backend != "reference"
+        )
     return rgb, raster
 
 

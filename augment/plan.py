@@ -1,6 +1,7 @@
 """Recipe + scene -> exactly the passes and buffers that the picture requires, before rendering.
 
-A plan is made of plain facts, so it can be printed, compared and tested; `apply` carries it out.
+A plan is made of plain facts, so it can be printed, compared and tested. `view_plan` leaves out of
+it what one camera cannot see, and `apply` carries that out.
 """
 
 from __future__ import annotations
@@ -48,8 +49,9 @@ class Plan:
     water need the depth of the scene's surfaces, for what labels say of the flood.
     snow: None where there is none. measures_snow: whether labels need the depth of its surface.
     measures_smog: whether they need the depth of what is seen through the smog.
-    bare_buffers: what depth, semantic and instance images take from a render of the scene without
-    its snow; empty where they show the snow.
+    snowless_buffers: what takes the place of buffers in views that no snow is in. bare_buffers:
+    what depth, semantic and instance images take from a render of the scene without its snow;
+    empty where they show the snow.
     style: what the colours of the scene are turned into; None leaves them. styles_picture: whether
     it is put on the finished picture, weather and all, and not on the scene in it.
     """
@@ -70,6 +72,7 @@ class Plan:
     snow: PlacedSnow | None = None
     measures_snow: bool = False
     measures_smog: bool = False
+    snowless_buffers: frozenset[str] = frozenset()
     bare_buffers: frozenset[str] = frozenset()
     style: Style | None = None
     styles_picture: bool = False
@@ -117,14 +120,13 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
     for_images = {ALPHA, depth_buffer} if depth_buffer else set[str]()
     if recipe.output.semantic or recipe.output.instance:
         for_images |= {ALPHA, SPLAT_IDS}
-    buffers, bare_buffers = {RGB, ALPHA} | for_images, set[str]()
-    if snow is not None:
-        buffers.add(SNOW)
-        if recipe.output.surface == "scene":
-            buffers, bare_buffers = {RGB, ALPHA, SNOW}, for_images
-    if (measures_snow or measures_smog) and depth_buffer not in buffers:
-        buffers.add(EXPECTED_DEPTH)
-    if smog and not per_gaussian:
+    snowless, bare_buffers = {RGB, ALPHA} | for_images, set[str]()
+    if snow is not None and recipe.output.surface == "scene":
+        snowless, bare_buffers = {RGB, ALPHA}, for_images
+    if (smog and not per_gaussian) or (measures_smog and depth_buffer not in snowless):
+        snowless.add(EXPECTED_DEPTH)
+    buffers = snowless | {SNOW} if snow is not None else set(snowless)
+    if measures_snow and depth_buffer not in buffers:
         buffers.add(EXPECTED_DEPTH)
     settings = RasterSettings(
         near_m=recipe.render.near_m,
@@ -139,6 +141,7 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
     return Plan(
         settings=settings,
         buffers=frozenset(buffers),
+        snowless_buffers=frozenset(snowless),
         smog_in_splats=smog if per_gaussian else None,
         smog_on_buffers=None if per_gaussian else smog,
         depth_buffer=depth_buffer,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -275,18 +275,26 @@ class Scene:
             + (f"{known[0]} to {known[-1]} ({len(known)} frames)" if known else "none")
         )
 
-    def parts_at(self, timestamp_ns: int) -> Iterator[PosedGaussians]:
-        """Background and every actor that exists at this time, posed."""
+    def parts_at(
+        self, timestamp_ns: int, only: Collection[int] | None = None
+    ) -> Iterator[PosedGaussians]:
+        """Background and every actor that exists at this time, posed. only: instance_ids of the
+        actors to take; None for all.
+        """
         yield PosedGaussians(self.background)
         for number, actor in enumerate(self.actors, start=1):
+            if only is not None and number not in only:
+                continue
             pose = actor.track.pose_at(timestamp_ns)
             if pose is not None:
                 posed = actor.gaussians_at(timestamp_ns)
                 yield PosedGaussians(posed, pose, instance_id=number)
 
-    def parts_for(self, camera: Camera) -> tuple[PosedGaussians, ...]:
-        """The parts at the moment the camera took its image."""
-        return tuple(self.parts_at(camera.timestamp_ns))
+    def parts_for(
+        self, camera: Camera, only: Collection[int] | None = None
+    ) -> tuple[PosedGaussians, ...]:
+        """The parts at the moment the camera took its image. only: as for parts_at."""
+        return tuple(self.parts_at(camera.timestamp_ns, only))
 
     def color_map(self, camera: Camera) -> Float[Tensor, "3 4"] | None:
         """The image's colour map, or else the camera's; None where there is none, or one that

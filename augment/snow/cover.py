@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,22 +50,33 @@ class SnowCover:
     thickness_m: float
     grain: Grain
 
-    def parts_for(self, scene: Scene, camera: Camera) -> tuple[PosedGaussians, ...]:
+    def layer_on(self, scene: Scene, instance_id: int) -> Layer | None:
+        """The snow on the background (0) or an actor (1 + its index); None where it has none."""
+        if instance_id == 0:
+            return self.ground
+        return self.actors.get(scene.actors[instance_id - 1].track_id)
+
+    def parts_for(
+        self,
+        scene: Scene,
+        camera: Camera,
+        bare: Sequence[PosedGaussians] | None = None,
+        snowy: Collection[int] | None = None,
+    ) -> tuple[PosedGaussians, ...]:
         """The scene's parts and the snow on them at the moment the camera took its image.
 
         The scene's own come first and in their order, so that what is neither buried nor covered
-        keeps its number.
+        keeps its number. bare: those parts that are drawn, the background first. snowy: instance
+        ids of the parts whose snow is; None for all.
         """
-        bare, eye_m = scene.parts_for(camera), camera.centre
+        bare = scene.parts_for(camera) if bare is None else bare
         parts, snow = [], []
+        eye_m = camera.centre
         for part in bare:
-            layer = self.ground
-            if part.instance_id > 0:
-                track_id = scene.actors[part.instance_id - 1].track_id
-                if track_id not in self.actors:
-                    parts.append(part)
-                    continue
-                layer = self.actors[track_id]
+            layer = self.layer_on(scene, part.instance_id)
+            if layer is None or (snowy is not None and part.instance_id not in snowy):
+                parts.append(part)
+                continue
             kept = dataclasses.replace(part.gaussians, opacities=layer.opacities)
             parts.append(dataclasses.replace(part, gaussians=kept))
             if len(layer.gaussians):

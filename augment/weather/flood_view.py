@@ -31,6 +31,7 @@ from augment.render.constants import RasterSettings
 from augment.render.rasterize import REFERENCE, rasterize
 from augment.scene import PosedGaussians
 from augment.sky import Sky
+from augment.stopwatch import lap
 from augment.weather.flood import FloodMedium, Layer
 from augment.weather.pour import both_sides, find_water, pour
 from augment.weather.screen_space import ScreenReflection, trace_screen
@@ -113,12 +114,14 @@ class Painter:
 class FloodedImage:
     """rgb [H, W, 3]: with sky and water, not clamped. scene: buffers of the scene's own surfaces,
     through the water where there is some: those asked for, with alpha, if any besides colour and
-    alpha are. water [H, W]: where a ray meets water first.
+    alpha are. water [H, W]: where a ray meets water first. is_hidden: whether what stands before
+    the water hides all of it, so that only the front was drawn.
     """
 
     rgb: Float[Tensor, "H W 3"]
     scene: RenderOutput
     water: Bool[Tensor, "H W"]
+    is_hidden: bool = False
 
 
 def as_layer(camera: Camera, raster: RenderOutput) -> Layer:
@@ -153,36 +156,47 @@ def _from_above(
     wanted = buffers | {RGB, ALPHA}
     if medium.reflection == "screen_space":
         wanted = wanted | {EXPECTED_DEPTH}
-    front = painter.draw(camera, above, wanted)
+    with lap("rasterise"):
+        front = painter.draw(camera, above, wanted)
     assert front.rgb is not None and front.alpha is not None
     sky, smog, fast = painter.sky, painter.medium, painter.fast
     water, most_shown = find_water(front.alpha, camera, fast=fast)
     if most_shown < 1 - HIDDEN_COVER:
-        image = composite_sky(front.rgb, front.alpha, camera, sky, smog=smog, fast=fast)
-        return FloodedImage(image, front, water)
+        with lap("sky"):
+            image = composite_sky(front.rgb, front.alpha, camera, sky, smog=smog, fast=fast)
+        return FloodedImage(image, front, water, is_hidden=True)
 
     crop = window.of(camera)
     cover = window.cut(front.alpha)
     seen = cover <= HIDDEN_COVER
-    field = wave_field(medium.waves, crop, medium.level_z_m, fast=fast)
+    with lap("flood: waves"):
+        field = wave_field(medium.waves, crop, medium.level_z_m, fast=fast)
     margins = _bed_margins(camera, medium)
     bed_window = window.grown(margins)
     bed_camera = bed_window.of(camera)
-    bed = _draw_bed(painter, bed_camera, medium, buffers - {RGB, ALPHA}, margins, seen)
-    color = shade_water(
-        crop,
-        cover,
-        medium,
-        field,
-        as_layer(bed_camera, bed),
-        mirror=_mirror_layer(painter, camera, medium, window, seen),
-        screen=_screen_reflection(painter, camera, medium, crop, field, front),
-        sky=sky,
-        smog=smog,
-        fast=fast,
-    )
-    image = pour(front, camera, window, color, sky, smog, fast=fast)
-    return FloodedImage(image, both_sides(front, bed, bed_window, buffers, fast=fast), water)
+    with lap("flood: bed"):
+        bed = _draw_bed(painter, bed_camera, medium, buffers - {RGB, ALPHA}, margins, seen)
+    with lap("flood: mirrored view"):
+        mirror = _mirror_layer(painter, camera, medium, window, seen)
+    with lap("flood: screen march"):
+        screen = _screen_reflection(painter, camera, medium, crop, field, front)
+    with lap("flood: colours of the water"):
+        color = shade_water(
+            crop,
+            cover,
+            medium,
+            field,
+            as_layer(bed_camera, bed),
+            mirror=mirror,
+            screen=screen,
+            sky=sky,
+            smog=smog,
+            fast=fast,
+        )
+    with lap("flood: layers joined"):
+        image = pour(front, camera, window, color, sky, smog, fast=fast)
+        scene = both_sides(front, bed, bed_window, buffers, fast=fast)
+    return FloodedImage(image, scene, water)
 
 
 def _draw_bed(
@@ -281,9 +295,10 @@ def _from_below(
     """From under the water, or exactly at its surface."""
     wanted = buffers | {RGB, ALPHA, EXPECTED_DEPTH}
     in_air = replace(painter, smog=None, smog_on_buffers=None)
-    front = in_air.draw(camera, HeightClip(medium.level_z_m, BELOW), wanted)
-    above = HeightClip(medium.level_z_m, ABOVE, overlaps=True)
-    air = painter.draw(camera, above, wanted)
+    with lap("rasterise"):
+        front = in_air.draw(camera, HeightClip(medium.level_z_m, BELOW), wanted)
+        above = HeightClip(medium.level_z_m, ABOVE, overlaps=True)
+        air = painter.draw(camera, above, wanted)
     image = view_from_below(
         as_layer(camera, front), as_layer(camera, air), medium, painter.sky, painter.medium
     )
