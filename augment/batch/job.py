@@ -30,6 +30,7 @@ from augment.batch.runner import Chunk, Outcome, Renderer, Setup
 from augment.batch.selection import SceneIndex, select_frames
 from augment.batch.shared_scene import share_scene
 from augment.batch.snow_beds import StoredBed, snow_to_lay, store_beds
+from augment.batch.store import open_store
 from augment.batch.style_files import check_kept, copy_style_files, portable_recipe
 from augment.batch.style_maps import StoredMaps, store_maps, style_to_apply
 from augment.batch.trajectory import frames_to_json, trajectory_id
@@ -47,11 +48,13 @@ class RenderJob:
     """What to render, and where to.
 
     recipes: resolved recipes, one a variant; their `name` and `variant` number make the folder.
-    Where a style names files without a digest, the job fills it in.
+    Where a style names files without a digest, the job fills it in; where a quality has still to
+    choose its settings, they are chosen once and kept in the output, for every later run.
     frames: the dataset's frame numbers, or None for all. cameras: names, or None for all.
     camera_path: frames to render in place of the scene's own, poses in the scene's world; labels
     and LiDAR pass through where a frame of the scene has the same number and timestamp.
-    workers: 1 renders in this process. overwrite: replace the variants' folders, finished or not.
+    workers: 1 renders in this process. overwrite: replace the variants' folders, finished or not,
+    and choose their settings anew.
     beds_dir: where it is kept where snow can lie, for later jobs; in the output folder if None.
     """
 
@@ -84,8 +87,8 @@ class JobResult:
     """Counts of images of this job. skipped: finished by earlier runs. failures: one line each.
 
     manifest: its path. seconds: wall clock. timings: seconds by kind of work, summed over
-    threads and workers (render, encode, write), or of the job itself (open, place, style, labels,
-    share, finish).
+    threads and workers (render, encode, write), or of the job itself (open, settle, place, style,
+    labels, share, finish).
     """
 
     written: int
@@ -122,8 +125,8 @@ def run_job(
         OutputError: the folder cannot be written, is in use, or holds something else.
     """
     started = time.perf_counter()
-    run = _Run(job, scene_loader(job.scene_uri), renderer, tell)
-    run.timings["open"] = time.perf_counter() - started
+    run = _Run(job, scene_loader(job.scene_uri), renderer, tell, progress)
+    run.timings["open"] = time.perf_counter() - started - run.timings.get("settle", 0.0)
     run.go(progress)
     return JobResult(
         written=run.counts[OK],
@@ -145,21 +148,22 @@ class _Run:
         scene: Scene,
         renderer: Renderer | None,
         tell: Callable[[Outcome], None] | None,
+        progress: bool,
     ) -> None:
         self.job, self.renderer, self.tell = job, renderer, tell
         self.scene: Scene | None = scene  # None once workers have it
-        self.recipes = tuple(map(with_digest, job.recipes))
+        self.timings: defaultdict[str, float] = defaultdict(float)
         # A stand-in has its own idea of backends.
         self.backend = job.backend if renderer else choose_backend(job.backend, scene)
         self.index = SceneIndex.of(scene, job.camera_path)
         self.selection = select_frames(self.index, job.frames, job.cameras)
         self.out_dir = Path(job.out_dir).absolute()
         self.trajectory = trajectory_id(job.camera_path)
+        self.recipes = tuple(self._settled(with_digest(r), progress) for r in job.recipes)
         self.ledger = Ledger(self.out_dir, self.index, self.recipes, self._identities())
         self.boxes = BoxCache(self.index)
         self.beds: tuple[StoredBed, ...] = ()
         self.maps: tuple[StoredMaps, ...] = ()
-        self.timings: defaultdict[str, float] = defaultdict(float)
         self.counts: Counter[str] = Counter()
         self.failures: list[str] = []
         self.counting = threading.Lock()  # outcomes arrive from several threads
@@ -229,6 +233,27 @@ class _Run:
             )
         finally:
             shared.remove()
+
+    def _settled(self, recipe: Recipe, progress: bool) -> Recipe:
+        """The recipe with the settings that its quality chooses here, or has chosen before."""
+        if not recipe.quality.is_open:
+            return recipe
+        from augment.quality.record import settle_for
+
+        started = time.perf_counter()
+        assert self.scene is not None
+        settled = settle_for(
+            open_store(self.out_dir),
+            recipe,
+            self.scene,
+            backend=self.backend,
+            camera_path=self.job.camera_path,
+            renderer=self.renderer,
+            anew=self.job.overwrite,
+            progress=progress,
+        )
+        self.timings["settle"] += time.perf_counter() - started
+        return settled
 
     def _identities(self) -> list[Identity]:
         return [

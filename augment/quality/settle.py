@@ -23,7 +23,6 @@ from augment.quality.choose import (
 )
 from augment.quality.views import View, calibration_views
 from augment.scene import Scene
-from recipes.files import with_digest
 from recipes.knobs import Value, free_knobs, with_settings
 from recipes.schema import Recipe
 
@@ -102,6 +101,9 @@ def settle(
     bar = tqdm(unit="picture", desc=f"choosing settings of {recipe.name}", disable=not progress)
     with bar:
 
+        def each() -> None:
+            bar.update()
+
         def bench_of(reference: Recipe) -> Bench:
             return Bench(
                 reference,
@@ -111,10 +113,10 @@ def settle(
                 cameras=cameras,
                 renderer=renderer,
                 clock=clock,
-                each=lambda: bar.update() and None,
+                each=each,
             )
 
-        chosen = _chosen(with_digest(recipe), bench_of)
+        chosen = _chosen(recipe, bench_of)
     chosen.bench.hand_over(chosen.settings, scene)
     report = Report(
         settings=chosen.settings,
