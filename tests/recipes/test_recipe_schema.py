@@ -15,6 +15,7 @@ from recipes.fields import CHANNEL, RATE, ROOT, FieldSpec, Kind
 from recipes.flood import Flood, Wave, Waves
 from recipes.load import load_recipe
 from recipes.parse import parse_recipe
+from recipes.quality import Quality
 from recipes.schema import KOSCHMIEDER, Output, Recipe, Render, Smog, Weather
 from recipes.snow import Snow
 from recipes.style import Style
@@ -195,6 +196,10 @@ OTHER = {
     "style.evaluated": "sh",
     "style.checkpoint": None,
     "style.digest": "1" * 64,
+    "quality.tier": "draft",
+    "quality.max_flip": 0.1,
+    "quality.budget_ms": 100,
+    "quality.settled": None,  # belongs to a target: below
     "render.scale": 0.5,
     "render.near_m": 0.02,
     "render.alpha_max": 0.99,
@@ -224,6 +229,7 @@ def test_every_field_changes_the_hash() -> None:
     cleared = flood.model_copy(update={"absorption_per_m": (1.0, 1.0, 1.0)})
     hashes = {base.hash, smoggy(extinction_per_m=0.01).hash}
     hashes.add(Recipe(weather=Weather(smog=smog, flood=cleared, snow=snow)).hash)
+    hashes.add(base.model_copy(update={"quality": Quality(max_flip=0.1, settled=True)}).hash)
     hashes |= {Recipe(weather=weather, style=style).hash for style in (None, Style(preset="dusk"))}
     changes = {path: value for path, value in OTHER.items() if value is not None}
     for path, value in changes.items():
@@ -235,7 +241,7 @@ def test_every_field_changes_the_hash() -> None:
             inner = inner[key] if key == section else inner[key][0]
         inner[name] = value
         hashes.add(Recipe.model_validate(data).hash)
-    assert len(hashes) == len(changes) + 5
+    assert len(hashes) == len(changes) + 6
     scene = Recipe(output=Output(surface="scene"))
     assert len({scene.hash, Recipe().hash, Recipe(output=Output(surface="first")).hash}) == 3
 
