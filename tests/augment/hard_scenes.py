@@ -1,0 +1,134 @@
+"""Gaussians and cameras at the limits of what files may hold. World: x ahead, z up.
+
+All are drawn from a seed, placed by angle and log of distance so that each camera sees most of
+them, however wide it looks.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import torch
+
+from augment.cameras import Camera
+from augment.geometry import rigid
+from augment.render.constants import ALPHA_MIN
+from augment.render.sh import SH_C0
+from augment.scene import Gaussians, PosedGaussians, SplatShading
+from augment.weather.smog import SmogMedium
+
+LEAST_SCALE, MOST_SCALE = 1e-8, 1e4  # metres
+EDGE = np.float32(ALPHA_MIN)
+# Opacities at which something begins or ends: nothing, the least that is drawn and its neighbours,
+# the stop of one splat, all.
+OPACITIES = np.array(
+    [0, np.nextafter(EDGE, np.float32(0)), EDGE, np.nextafter(EDGE, np.float32(1)),
+     0.5, 0.998, 0.999, np.nextafter(np.float32(1), np.float32(0)), 1],
+    np.float32,
+)  # fmt: skip
+SIZES = ((33, 21), (1, 1), (8192, 1), (1, 513), (16, 16))
+SMOGS = {
+    "clear": None,
+    "uniform": SmogMedium(0.15, (0.8, 0.7, 0.5)),
+    "layered": SmogMedium(0.3, (0.8, 0.7, 0.5), scale_height_m=2.0, base_z_m=-1.0),
+}
+
+
+def wide_camera(
+    fov_deg: float, size: tuple[int, int] = (33, 21), *, at=(0.0, 0.0, 0.0), turn: float = 0.0
+) -> Camera:
+    """A camera along +x that sees fov_deg over the longer side of its image, rolled by `turn`."""
+    width, height = size
+    focal = 0.5 * max(size) / math.tan(math.radians(fov_deg) / 2)
+    c, s = math.cos(turn), math.sin(turn)
+    ahead = torch.tensor([[0.0, -c, -s], [0.0, s, -c], [1.0, 0.0, 0.0]], dtype=torch.float64)
+    pose = rigid(ahead, -ahead @ torch.tensor(at, dtype=torch.float64))
+    return Camera("wide", width, height, focal, focal, 0.48 * width, 0.53 * height, pose)
+
+
+def hard_gaussians(
+    kind: str,
+    camera: Camera,
+    count: int = 60,
+    *,
+    seed: int = 0,
+    sh_degree: int = 1,
+    dtype=torch.float32,
+) -> Gaussians:
+    """Gaussians that `camera` sees.
+
+    kind: "plain" (a few pixels to half the image wide), "round" (balls of 1e-8 to 1e4 m), "mixed"
+    (every axis of its own length in that range), "needles" (1 m to 10 km long, thinner than 1 cm,
+    centred up to ten images beside this one), "edges" (opacities at the thresholds), "near"
+    (distances about the near plane).
+    """
+    rng = np.random.default_rng(seed)
+    z = np.exp(rng.uniform(math.log(0.5), math.log(50.0), count))
+    if kind == "near":
+        z = rng.uniform(0.005, 0.03, count)
+    beside = 10.0 if kind == "needles" else 0.2
+    columns = rng.uniform(-beside, 1 + beside, count) * camera.width
+    rows = rng.uniform(-beside, 1 + beside, count) * camera.height
+    x, y = (columns - camera.cx) / camera.fx * z, (rows - camera.cy) / camera.fy * z
+    centre, rotation = camera.centre.numpy(), camera.camera_from_world.numpy()[:3, :3]
+    means = np.stack([x, y, z], 1) @ rotation + centre
+    span = 0.3 * max(camera.width, camera.height) / camera.fx * z
+    scales = span[:, None] * np.exp(rng.uniform(math.log(0.02), 0, (count, 3)))
+    low, high = math.log(LEAST_SCALE), math.log(MOST_SCALE)
+    if kind == "round":
+        scales = np.exp(rng.uniform(low, high, (count, 1))).repeat(3, 1)
+    elif kind == "mixed":
+        scales = np.exp(rng.uniform(low, high, (count, 3)))
+    elif kind == "needles":
+        scales = 10 ** np.stack([rng.uniform(0, 4, count), *rng.uniform(-8, -2, (2, count))], 1)
+    opacities = rng.uniform(0.02, 0.98, count)
+    if kind == "edges":
+        opacities = rng.choice(OPACITIES, count)
+    quats = rng.normal(size=(count, 4))
+    sh = rng.normal(0, 0.15, (count, (sh_degree + 1) ** 2, 3))
+    sh[:, 0] = (rng.uniform(0, 1, (count, 3)) - 0.5) / SH_C0
+    fields = {
+        "means": means,
+        "quats": quats / np.linalg.norm(quats, axis=1, keepdims=True),
+        "scales": scales,
+        "opacities": opacities,
+        "sh": sh,
+    }
+    semantic = torch.from_numpy(rng.integers(0, 5, count).astype(np.int16))
+    return Gaussians(
+        **{n: torch.from_numpy(v).to(dtype) for n, v in fields.items()}, semantic=semantic
+    )
+
+
+KINDS = ("plain", "round", "mixed", "needles", "edges", "near")
+
+
+def colour_maps(seed: int = 0) -> torch.Tensor:
+    """Maps [5, 3, 4] as styles have them, one a class; the first is extreme."""
+    rng = np.random.default_rng(seed)
+    maps = np.concatenate([np.eye(3)[None] + rng.normal(0, 0.3, (5, 3, 3)),
+                           rng.normal(0, 0.1, (5, 3, 1))], 2)  # fmt: skip
+    maps[0] *= 3
+    return torch.from_numpy(maps).float()
+
+
+def snow_light(count: int, seed: int = 0) -> SplatShading:
+    """Light per pixel on `count` splats, from a low sun."""
+    slopes = torch.from_numpy(np.random.default_rng(seed).uniform(0, 1, (count, 3))).float()
+    return SplatShading(slopes, (0.6, 0.0, 0.8), 0.4)
+
+
+def in_float64(parts: list[PosedGaussians]) -> list[PosedGaussians]:
+    """The same numbers in the precision in which the definition is taken for exact."""
+    names = ("means", "quats", "scales", "opacities", "sh")
+    return [
+        dataclasses.replace(
+            part,
+            gaussians=dataclasses.replace(
+                part.gaussians, **{n: getattr(part.gaussians, n).double() for n in names}
+            ),
+        )
+        for part in parts
+    ]
