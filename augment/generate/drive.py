@@ -7,6 +7,7 @@ import time
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 from augment.batch.manifest import FAILED
 from augment.batch.runner import Outcome
@@ -14,14 +15,24 @@ from augment.errors import OutputError
 from augment.generate.pools import Event, Lost, WorkerPool
 from augment.generate.queue import BlockQueue
 from augment.generate.records import Block, SceneRecord
-from augment.generate.workshop import BlockDone, BlockTask, IndexTask, TaskFailed
+from augment.generate.workshop import (
+    BlockDone,
+    BlockTask,
+    IndexTask,
+    Result,
+    SettledRecipes,
+    SettleTask,
+    TaskFailed,
+)
 
 WAIT_S = 1.0
 MOST_LOST = 3  # blocks of a scene whose workers die even alone, before the scene is given up
 ELSEWHERE_S = 2.0  # how long to leave a block alone that another process is at
+_SETTLING = "choosing the settings of its recipes"
 _log = logging.getLogger(__name__)
 
 MakePool = Callable[[Callable[[int, Outcome], None]], WorkerPool]
+_First = TypeVar("_First", IndexTask, SettleTask)
 FailBlock = Callable[[Block, str], None]
 
 
@@ -65,11 +76,40 @@ class Driver:
 
         A scene whose worker dies is tried once more, while no other worker is busy.
         """
-        waiting, alone = deque(tasks), deque[IndexTask]()
-        busy: dict[int, IndexTask] = {}
-        tried_alone: set[IndexTask] = set()
+
+        def take(task: IndexTask, result: Result | str) -> None:
+            assert isinstance(result, (SceneRecord, str))
+            each(task, result)
+
+        self._do_first(tasks, take, self._pool.slots)
+
+    def settle(
+        self,
+        tasks: Sequence[SettleTask],
+        each: Callable[[SettleTask, SettledRecipes | str], None],
+        *,
+        one_by_one: bool,
+    ) -> None:
+        """As `index`, for recipes that have still to choose their settings in a scene.
+
+        one_by_one: no two at a time, so that none is in the way of another's frame times.
+        """
+
+        def take(task: SettleTask, result: Result | str) -> None:
+            assert isinstance(result, (SettledRecipes, str))
+            each(task, result)
+
+        self._do_first(tasks, take, 1 if one_by_one else self._pool.slots)
+
+    def _do_first(
+        self, tasks: Sequence[_First], each: Callable[[_First, Result | str], None], slots: int
+    ) -> None:
+        """What comes before the blocks: results, or why there is none."""
+        waiting, alone = deque(tasks), deque[_First]()
+        busy: dict[int, _First] = {}
+        tried_alone: set[_First] = set()
         while waiting or alone or busy:
-            for slot in range(self._pool.slots):
+            for slot in range(slots):
                 if waiting and slot not in busy:
                     busy[slot] = waiting.popleft()
                     self._pool.give(slot, busy[slot])
@@ -82,14 +122,15 @@ class Driver:
                 if _wants_memory(event) and task not in tried_alone:
                     alone.append(task)
                 elif isinstance(event, Lost):
-                    each(task, f"the worker {event.how} while opening the scene, alone too")
-                elif isinstance(event.result, SceneRecord):
-                    self._open[event.slot] = event.result.name
-                    each(task, event.result)
-                else:
-                    assert isinstance(event.result, TaskFailed)
+                    doing = "opening the scene" if isinstance(task, IndexTask) else _SETTLING
+                    each(task, f"the worker {event.how} while {doing}, alone too")
+                elif isinstance(event.result, TaskFailed):
                     _raise_if_output(event.result)
                     each(task, event.result.text)
+                else:
+                    if isinstance(event.result, SceneRecord):
+                        self._open[event.slot] = event.result.name
+                    each(task, event.result)
 
     def render(
         self, blocks: Sequence[Block], names: dict[str, str | None], fail: FailBlock

@@ -31,6 +31,7 @@ from augment.batch.parts import compact, list_parts, parts_to_merge, publish_par
 from augment.batch.rows import image_row
 from augment.batch.store import Store, StoredFileMissing, open_store
 from augment.errors import OutputError
+from augment.generate.choices import settle_recipes
 from augment.generate.drive import Driver
 from augment.generate.leftovers import clear_leftovers
 from augment.generate.plan import Plan, make_plan, shard_of, store_plan
@@ -303,7 +304,8 @@ def _plan(job: GenerateJob, store: Store, driver: Driver, progress: bool, *, kee
             bar.update()
 
         driver.index(list(dict.fromkeys(tasks)), each)
-    return make_plan(job.recipes, job.scenes, found, job.setup.backend)
+    settled = settle_recipes(job, store, driver, found, progress=progress, keep=keep)
+    return make_plan(job.recipes, job.scenes, found, job.setup.backend, settled)
 
 
 def _known(store: Store, entry: JobScene) -> SceneRecord | None:

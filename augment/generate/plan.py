@@ -9,13 +9,15 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import augment
-from augment.batch.layout import STATE_FOLDER, folder_name
+from augment.batch.layout import STATE_FOLDER, folder_name, variant_name
 from augment.batch.store import Store
 from augment.errors import ClimateGSError, OutputError, SceneError
 from augment.generate.records import Block, SceneRecord, claim_name, cut_into_blocks
 from recipes.job import JobRecipes, JobScene
+from recipes.schema import Recipe
 
 JOBS = f"{STATE_FOLDER}/jobs"
 _FORMAT = 1
@@ -44,9 +46,11 @@ def make_plan(
     scenes: Sequence[JobScene],
     found: Mapping[tuple[str, str | None], SceneRecord | str],
     backend: str,
+    settled: Mapping[tuple[str, str], Recipe | str] = MappingProxyType({}),
 ) -> Plan:
     """The plan of a job. scenes: without patterns. found: the scene of every URI and name, or why
-    it cannot be opened.
+    it cannot be opened. settled: by scene and variant, those recipes whose quality had to choose
+    its settings in the scene, or why it could not: no recipe of that scene is rendered then.
 
     Raises:
         ClimateGSError: two scenes would share a folder, or none of them can be used.
@@ -61,10 +65,15 @@ def make_plan(
             unusable[entry.uri] = record
             continue
         _check_folder(records, record)
+        drawn = recipes.of_scene(entry, record.name)
+        chosen = [settled.get((record.name, variant_name(recipe)), recipe) for recipe in drawn]
+        if failed := [why for why in chosen if isinstance(why, str)]:
+            unusable[entry.uri] = failed[0]
+            continue
         try:
             cut = cut_into_blocks(
                 record,
-                recipes.of_scene(entry, record.name),
+                [recipe for recipe in chosen if isinstance(recipe, Recipe)],
                 frames=entry.frames,
                 cameras=entry.cameras,
                 block_images=recipes.job.block_images,

@@ -19,12 +19,13 @@ from augment.batch.lock import file_lock
 from augment.batch.parts import list_parts
 from augment.batch.runner import Outcome, Renderer, describe
 from augment.batch.store import Store, open_store
-from augment.errors import ClimateGSError, OutputError
+from augment.errors import ClimateGSError, OutputError, SceneError, StyleError
 from augment.generate.leftovers import clear_block, clear_files_of
 from augment.generate.publish import Publisher, staging_folder
 from augment.generate.records import Block, SceneRecord
 from augment.generate.variants import enter_variant
 from augment.scene import Scene
+from recipes.schema import Recipe
 
 _log = logging.getLogger(__name__)
 
@@ -63,7 +64,20 @@ class BlockTask:
     is_trial: bool = False
 
 
-Task = IndexTask | BlockTask
+@dataclass(frozen=True)
+class SettleTask:
+    """Let the qualities of recipes choose their settings in a scene, or find what they have chosen.
+
+    name: as of an IndexTask. keep: whether a new choice is kept in the output.
+    """
+
+    uri: str
+    name: str | None
+    recipes: tuple[Recipe, ...]
+    keep: bool = True
+
+
+Task = IndexTask | SettleTask | BlockTask
 
 
 @dataclass(frozen=True)
@@ -82,6 +96,13 @@ class BlockDone:
 
 
 @dataclass(frozen=True)
+class SettledRecipes:
+    """The recipes of a SettleTask, in its order."""
+
+    recipes: tuple[Recipe, ...]
+
+
+@dataclass(frozen=True)
 class TaskFailed:
     """The task could not be done. is_output: nothing can be written, so that all others would fail.
 
@@ -95,7 +116,7 @@ class TaskFailed:
     of_memory: bool = False
 
 
-Result = SceneRecord | BlockDone | TaskFailed
+Result = SceneRecord | SettledRecipes | BlockDone | TaskFailed
 Tell = Callable[[Outcome], None]
 
 
@@ -114,6 +135,8 @@ class Workshop:
         try:
             if isinstance(task, IndexTask):
                 return self._index(task)
+            if isinstance(task, SettleTask):
+                return SettledRecipes(tuple(self._settle(task, recipe) for recipe in task.recipes))
             return self._render(task)
         except OutputError as error:
             return TaskFailed(str(error), is_output=True)
@@ -128,6 +151,25 @@ class Workshop:
         started = time.perf_counter()
         scene = self._scene_of(task.uri, task.name)
         return SceneRecord.of(scene, task.uri, time.perf_counter() - started)
+
+    def _settle(self, task: SettleTask, recipe: Recipe) -> Recipe:
+        from augment.quality.record import settle_for
+
+        scene, setup = self._scene_of(task.uri, task.name), self._setup
+        try:
+            return settle_for(
+                self._store,
+                recipe,
+                scene,
+                backend=setup.backend,
+                renderer=setup.renderer,
+                keep=task.keep,
+            )
+        except (SceneError, StyleError) as error:
+            raise ClimateGSError(
+                f"recipe {recipe.name}, variant {recipe.variant}: quality {recipe.quality.words} "
+                f"cannot choose its settings: {error}"
+            ) from error
 
     def _scene_of(self, uri: str, name: str | None) -> Scene:
         if self._opened != (uri, name) or self._scene is None:

@@ -77,13 +77,14 @@ def settle_for(
     camera_path: Sequence[Frame] | None = None,
     renderer: Renderer | None = None,
     anew: bool = False,
+    keep: bool = True,
     progress: bool = False,
 ) -> Recipe:
     """The recipe with the settings that the output has for it in this scene, or that are chosen
     now; the same recipe where its quality has nothing to choose.
 
-    camera_path: frames that are rendered in place of the scene's own. The others: as in
-    `settle_once` and `settle`.
+    camera_path: frames that are rendered in place of the scene's own. anew: as in `settle_once`.
+    keep: whether a new choice is kept in the output. The others: as in `settle`.
 
     Raises:
         SceneError: the scene cannot be rendered under the recipe. OutputError: as settle_once.
@@ -107,7 +108,10 @@ def settle_for(
             progress=progress,
         )
 
-    return settle_once(store, question, choose, anew=anew)
+    if keep:
+        return settle_once(store, question, choose, anew=anew)
+    found = None if anew else recorded(store, question)
+    return found or choose().recipe
 
 
 def recorded(store: Store, question: Question) -> Recipe | None:
