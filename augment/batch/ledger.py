@@ -35,7 +35,7 @@ from augment.batch.manifest import (
     rows_of,
     write_manifest,
 )
-from augment.batch.rows import Pictured, image_row
+from augment.batch.rows import Pictured, image_row, shown_words
 from augment.batch.runner import Chunk, Outcome
 from augment.batch.selection import SceneIndex
 from augment.batch.store import open_store
@@ -166,7 +166,7 @@ class Ledger:
                     item = row["frame"], row["camera"]
                     variant.box_weather[kind][item] = table.from_json(numbers)
         # The recipe's hash agrees, so the rows show what it says, whatever their version called it.
-        shown = {"surface": variant.recipe.output.surface, **variant.recipe.style_words()}
+        shown = shown_words(variant.recipe)
         known = [{**LATER, **row, **shown} for row in [*rows, *journalled]]
         variant.rows = {(row["frame"], row["camera"]): row for row in known}
         return False

@@ -35,6 +35,9 @@ LEADING = {
     "surface": pa.string(),
     "style": pa.string(),
     "style_method": pa.string(),
+    "quality": pa.string(),
+    "render_scale": pa.float64(),
+    "settings": pa.string(),
 }
 TRAILING = {
     "seed": pa.int64(),
@@ -49,6 +52,7 @@ TRAILING = {
 }
 # Columns younger than the first release, and what a row without them means.
 # Without water and snow all surfaces are the same; new rows of such a variant say the default.
+# What old rows were rendered with is in their recipes, and not known here.
 LATER: dict[str, str | None] = {
     "water_path": None,
     "snow_path": None,
@@ -58,6 +62,9 @@ LATER: dict[str, str | None] = {
     "surface": "solid",
     "style": None,
     "style_method": None,
+    "quality": None,
+    "render_scale": None,
+    "settings": None,
 }
 # What a row without them means by weather numbers that others have; NaN for all else.
 LATER_NUMBERS = {"style_strength": 0.0}
@@ -211,7 +218,7 @@ def _with_columns(table: pa.Table, weather: list[str]) -> pa.Table:
 def _with_later_columns(table: pa.Table) -> pa.Table:
     for name, meaning in LATER.items():
         if name not in table.column_names:
-            column = pa.array([meaning] * table.num_rows, pa.string())
+            column = pa.array([meaning] * table.num_rows, LEADING[name])
             place = [n for n in LEADING if n in table.column_names or n == name].index(name)
             table = table.add_column(place, name, column)
     return table

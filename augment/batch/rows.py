@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from augment.batch.journal import Identity
 from augment.batch.layout import variant_name
 from augment.batch.manifest import OK
+from recipes.change import found
+from recipes.knobs import knobs_of
 from recipes.schema import Recipe
 
 
@@ -38,8 +41,7 @@ def image_row(
         "variant": variant_name(recipe),
         **pictured._asdict(),
         **(paths if status == OK else dict.fromkeys(paths)),
-        "surface": recipe.output.surface,
-        **recipe.style_words(),
+        **shown_words(recipe),
         **recipe.weather_numbers(),
         "seed": recipe.seed,
         "recipe": recipe.name,
@@ -47,4 +49,20 @@ def image_row(
         "checksum": checksum,
         "status": status,
         "message": message,
+    }
+
+
+def shown_words(recipe: Recipe) -> dict[str, str | float | None]:
+    """What a recipe says of its images beside the weather's numbers, by columns.
+
+    settings: JSON of the values of the knobs that trade speed for accuracy (recipes.knobs), by
+    dotted path, as far as they have an effect.
+    """
+    chosen = {k.path: found(recipe, k.path) for k in knobs_of(recipe) if k.chosen}
+    return {
+        "surface": recipe.output.surface,
+        **recipe.style_words(),
+        "quality": recipe.quality.words,
+        "render_scale": recipe.render.scale,
+        "settings": json.dumps(chosen, separators=(",", ":")),
     }
