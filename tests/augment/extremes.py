@@ -1,0 +1,531 @@
+"""Scenes, cameras and recipes at their extremes, as hypothesis draws them, and what every frame of
+them must be. World: x ahead, z up, metres; the road is at z = 0.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from hypothesis import assume
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from augment.apply import WeatheredBuffers, WeatheredView, render_buffers, render_view
+from augment.cameras import Camera
+from augment.geometry import rigid
+from augment.ground_heights import Ground
+from augment.plan import make_plan
+from augment.render.composite import quantise
+from augment.scene import Actor, Gaussians, Scene, Track
+from augment.semantics import SemanticClass
+from augment.sky import ConstantSky, CubemapSky, LatLongSky, Sky
+from augment.snow.beds import bed_of, remember_bed
+from augment.snow.covers import placement_settings
+from recipes.fields import ROOT, FieldSpec, Kind, SectionSpec
+from recipes.schema import Recipe
+from tests.augment.examples import examples
+from tests.snow_scenes import box_car, drive, sheet, side_wall, wall
+
+SOAKING = examples(0) > 0  # asked for by the environment: kernels may take their time to compile
+CELL_M = 0.2  # of the snow on the street: drawing cells as they come would place snow anew
+SLOPES_DEG = (0.0, 50.0, 85.0)  # steepest that it lies on, for the same reason
+
+# Coordinates, semi-axes and colours that the promises hold for; docs/stability.md states them.
+FAR_M, WIDEST_M, BRIGHTEST = 1e6, 1e4, 1e4
+_PLACES_M = (0.0, 5e-324, 1e-40, 1e-8, 0.01, 0.5, 1.2, 3.0, 6.0, 100.0, 1e4, FAR_M)
+_SIZES_M = (1e-45, 1e-20, 1e-8, 1e-3, 0.05, 0.5, 3.0, 100.0, WIDEST_M)
+_OPACITIES = (0.0, 1e-45, 1 / 256, 1 / 255, 0.05, 0.5, 0.99, 1.0)
+_COLOURS = (0.0, 1e-45, 0.1, 1.0, 10.0, BRIGHTEST)
+_UNIT_QUATS = (
+    (1.0, 0.0, 0.0, 0.0),
+    (-1.0, 0.0, 0.0, 0.0),
+    (0.0, 0.0, 0.0, 1.0),
+    (0.0, 1.0, 0.0, 0.0),
+    (math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0),
+    (0.5, -0.5, 0.5, -0.5),
+    (1.0, 1e-20, 1e-40, 0.0),
+    (0.99995, 0.0, 0.0, 0.0),  # as far off unit length as files may be
+    (0.8, 0.0, 0.6, 0.0),
+)
+
+
+def _signed(values: Sequence[float]) -> list[float]:
+    return [*values, *(-value for value in values)]
+
+
+_coordinates = st.sampled_from(_signed(_PLACES_M)) | st.floats(-8, 8, width=32)
+_means = st.tuples(_coordinates, _coordinates, _coordinates)
+_scales = st.tuples(*[st.sampled_from(_SIZES_M)] * 3)
+_splats = st.tuples(
+    _means,
+    st.sampled_from(_UNIT_QUATS),
+    _scales,
+    st.sampled_from(_OPACITIES),
+    st.tuples(*[st.sampled_from(_signed(_COLOURS))] * 3),
+    st.sampled_from([int(c) for c in SemanticClass]),
+)
+
+
+@st.composite
+def wild_gaussians(draw: st.DrawFn, most: int = 6) -> Gaussians:
+    """Up to `most` Gaussians, each number of which may be extreme."""
+    splats = draw(st.lists(_splats, max_size=most))
+    degree = draw(st.sampled_from((0, 3)))
+    if not splats:
+        return nothing(degree)
+    means, quats, scales, opacities, colours, classes = zip(*splats, strict=True)
+    sh = torch.zeros(len(splats), (degree + 1) ** 2, 3)
+    sh[:, 0] = torch.tensor(colours)
+    if degree:
+        sh[:, 1:] = torch.tensor(colours)[:, None] * torch.tensor([1.0, -1.0, 0.5])
+    return Gaussians(
+        means=torch.tensor(means, dtype=torch.float64).float(),
+        quats=torch.tensor(quats),
+        scales=torch.tensor(scales, dtype=torch.float64).float(),
+        opacities=torch.tensor(opacities, dtype=torch.float64).float(),
+        sh=sh,
+        semantic=torch.tensor(classes, dtype=torch.int16),
+    )
+
+
+def nothing(sh_degree: int = 0) -> Gaussians:
+    """No Gaussians, whose classes are known."""
+    empty = Gaussians.empty(sh_degree)
+    return dataclasses.replace(empty, semantic=torch.zeros(0, dtype=torch.int16))
+
+
+@functools.cache
+def street() -> Scene:
+    """A road with a wall at its end and one beside it, and a car; snow is placed on it once."""
+    car = box_car(size=(2.0, 1.0, 0.8), start=(4.0, 1.0), moved_m=0.5, semantic=10)
+    road = sheet((0.6, 7), (-2, 2), semantic=int(SemanticClass.ROAD))
+    walls = [wall(7, (-2, 2), (0, 2)), side_wall(-2, (0.6, 7), (0, 1))]
+    walls = [_classed(w, SemanticClass.BUILDING) for w in walls]
+    stated = Ground(0.0, 0.0, "stated")
+    return drive(
+        road, *walls, actors=[car], places=((0.0, 0.0, 1.2),), ground_z_m=0.0, ground=stated
+    )
+
+
+def _classed(gaussians: Gaussians, semantic: SemanticClass) -> Gaussians:
+    classes = torch.full((len(gaussians),), int(semantic), dtype=torch.int16)
+    return dataclasses.replace(gaussians, semantic=classes)
+
+
+SKIES = 6
+
+
+@functools.cache
+def skies() -> tuple[Sky, ...]:
+    rng = np.random.default_rng(0)
+    faces = torch.from_numpy(rng.uniform(0, 1, (6, 4, 4, 3)).astype(np.float32))
+    dots = torch.from_numpy(rng.integers(0, 2, (3, 5, 3)).astype(np.float32))
+    constants = [ConstantSky(torch.tensor([v] * 3)) for v in (0.0, 0.7, 1.0)]
+    one_texel = CubemapSky(torch.full((6, 1, 1, 3), 0.5))
+    return (*constants, CubemapSky(faces), one_texel, LatLongSky(dots))
+
+
+def joined(*parts: Gaussians) -> Gaussians:
+    """One after the other, their SH padded to the highest degree among them."""
+    count = max(part.sh.shape[1] for part in parts)
+    padded = [torch.cat([p.sh, p.sh.new_zeros(len(p), count - p.sh.shape[1], 3)], 1) for p in parts]
+    fields = {
+        name: torch.cat([getattr(part, name) for part in parts])
+        for name in ("means", "quats", "scales", "opacities", "semantic")
+    }
+    return Gaussians(**fields, sh=torch.cat(padded))
+
+
+@dataclass(frozen=True)
+class Place:
+    """A scene in numbers: nothing is drawn or placed before `scene` is called. sky: its number."""
+
+    wild: Gaussians
+    sky: int
+    on_street: bool
+    actor: Actor | None = None
+
+    def scene(self) -> Scene:
+        """The street, or nothing, with more Gaussians in it; its snow lies where the street's does.
+
+        Without the street there are no frames: no camera has seen any ground that snow could be
+        placed on.
+        """
+        base, sky = street(), skies()[self.sky]
+        actors = () if self.actor is None else (self.actor,)
+        if not self.on_street:
+            return dataclasses.replace(
+                base, background=self.wild, actors=actors, sky=sky, frames=()
+            )
+        scene = dataclasses.replace(
+            base,
+            background=joined(base.background, self.wild),
+            actors=(*base.actors, *actors),
+            sky=sky,
+        )
+        for slope in SLOPES_DEG:
+            settings = placement_settings(snow_model(max_slope_deg=slope))
+            remember_bed(scene, settings, bed_of(base, settings))
+        return scene
+
+
+def snow_model(**fields: Any) -> Any:
+    """The recipe's snow on the street's cells."""
+    snow = {"depth_m": 0.1, "cell_m": CELL_M, **fields}
+    return Recipe.model_validate({"weather": {"snow": snow}}).weather.snow
+
+
+@st.composite
+def wild_actors(draw: st.DrawFn) -> Actor:
+    """A thing of a few Gaussians at an extreme place, turned any way."""
+    gaussians = draw(wild_gaussians(most=2))
+    place = torch.tensor(draw(_means), dtype=torch.float64)
+    yaw = draw(st.sampled_from((0.0, math.pi / 2, math.pi, 1e-9)))
+    turn = torch.tensor(
+        [[math.cos(yaw), -math.sin(yaw), 0.0], [math.sin(yaw), math.cos(yaw), 0.0], [0, 0, 1.0]],
+        dtype=torch.float64,
+    )
+    track = Track(torch.tensor([0]), rigid(turn, place)[None])
+    label = draw(st.sampled_from(("Car", "Pedestrian")))
+    size = draw(st.sampled_from(((1e-3, 1e-3, 1e-3), (4.0, 2.0, 1.5), (1e4, 1e4, 1e4))))
+    in_world = draw(st.booleans())
+    return Actor("wild", label, gaussians, track, size, colors_in_world=in_world)
+
+
+@st.composite
+def places(draw: st.DrawFn) -> Place:
+    """Mostly the street with a few Gaussians that are extreme; also those alone, down to one."""
+    wild = draw(wild_gaussians())
+    actor = draw(st.none() | wild_actors())
+    held = len(wild) + (0 if actor is None else len(actor.gaussians))
+    on_street = held == 0 or draw(st.integers(0, 3)) > 0
+    return Place(wild, draw(st.integers(0, SKIES - 1)), on_street, actor)
+
+
+_SHAPES = ((24, 16), (1, 1), (1, 33), (33, 1), (17, 13))
+_EYES_M = (
+    (0.0, 0.0, 1.2),
+    (0.0, 0.0, 0.2),
+    (3.0, 0.5, 0.0),  # on the road
+    (3.0, 0.0, -0.5),
+    (2.0, -0.3, 6.0),
+    (6.99, 0.0, 1.0),  # with the wall across the near plane
+    (0.0, 0.0, 1e4),
+    (FAR_M, -FAR_M, 1.2),
+)
+_PITCHES_DEG = (0.0, -10.0, -90.0, 90.0, -89.999, 45.0, 180.0)
+
+
+def camera_at(
+    eye_m: Sequence[float],
+    *,
+    yaw_deg: float = 0.0,
+    pitch_deg: float = 0.0,
+    roll_deg: float = 0.0,
+    fov_deg: float = 80.0,
+    size: tuple[int, int] = (24, 16),
+    centre: tuple[float, float] = (0.5, 0.5),
+    timestamp_ns: int = 0,
+) -> Camera:
+    """A camera that looks along +x, turned left, up and about its axis. fov_deg: of the longer
+    side. centre: the principal point in images' widths and heights.
+    """
+    yaw, pitch, roll = (math.radians(a) for a in (yaw_deg, pitch_deg, roll_deg))
+    ahead = [math.cos(yaw) * math.cos(pitch), math.sin(yaw) * math.cos(pitch), math.sin(pitch)]
+    right = [math.sin(yaw), -math.cos(yaw), 0.0]
+    ahead_t, right_t = (torch.tensor(v, dtype=torch.float64) for v in (ahead, right))
+    down_t = torch.linalg.cross(ahead_t, right_t)
+    turned = math.cos(roll) * right_t + math.sin(roll) * down_t
+    rotation = torch.stack([turned, torch.linalg.cross(ahead_t, turned), ahead_t])
+    eye = torch.tensor(eye_m, dtype=torch.float64)
+    focal = 0.5 * max(size) / math.tan(math.radians(fov_deg) / 2)
+    return Camera(
+        name="extreme",
+        width=size[0],
+        height=size[1],
+        fx=focal,
+        fy=focal,
+        cx=centre[0] * size[0],
+        cy=centre[1] * size[1],
+        camera_from_world=rigid(rotation, -rotation @ eye),
+        timestamp_ns=timestamp_ns,
+    )
+
+
+@st.composite
+def cameras(draw: st.DrawFn, levels_m: Sequence[float] = ()) -> Camera:
+    """Small images of any field of view, from any place in any direction.
+
+    levels_m: heights at which the eye may be too, exactly and nearly.
+    """
+    x, y, z = draw(st.sampled_from(_EYES_M))
+    if levels_m:
+        level = draw(st.sampled_from(levels_m))
+        beside = [level, math.nextafter(level, math.inf), level - 1e-7, level + 1e-7, level + 1e-3]
+        z = draw(st.sampled_from([z, *beside]))
+    return camera_at(
+        (x, y, z),
+        yaw_deg=draw(st.sampled_from((0.0, 90.0, 180.0, 33.0))),
+        pitch_deg=draw(st.sampled_from(_PITCHES_DEG)),
+        roll_deg=draw(st.sampled_from((0.0, 90.0, 180.0, 17.0))),
+        fov_deg=draw(st.sampled_from((80.0, 1.0, 170.0, 120.0))),
+        size=draw(st.sampled_from(_SHAPES)),
+        centre=draw(st.sampled_from(((0.5, 0.5), (-1.5, 0.5), (0.5, 4.0), (0.0, 1.0)))),
+        timestamp_ns=draw(st.sampled_from((0, -(2**40), 1_700_000_000_123_456_789))),
+    )
+
+
+def numbers_of(field: FieldSpec) -> list[float | int]:
+    """A number field's allowed values worth trying: its ends, 0, the smallest, its default."""
+    low, high = _ends(field)
+    values: list[float] = [low, high, 0, 1, -1, low + (high - low) / 2]
+    if field.kind is Kind.NUMBER:
+        values += [math.nextafter(low, high), math.nextafter(high, low), 1e-8, 5e-324, 0.3]
+    if isinstance(field.default, int | float):
+        values.append(field.default)
+    cast = float if field.kind is Kind.NUMBER else int
+    return list(dict.fromkeys(v for v in map(cast, values) if field.accepts(v)))
+
+
+def ends_of(field: FieldSpec) -> list[float | int]:
+    """Its least and greatest allowed values, 0 where that is allowed, and the smallest above 0."""
+    low, high = _ends(field)
+    cast = float if field.kind is Kind.NUMBER else int
+    values = [low, high, 0, 5e-324 if field.kind is Kind.NUMBER else 1]
+    return list(dict.fromkeys(v for v in map(cast, values) if field.accepts(v)))
+
+
+def numbers_beyond(field: FieldSpec) -> list[float | int]:
+    """Values that a number field must refuse: just past its ends, far past them, not finite."""
+    low, high = _ends(field)
+    values: list[float] = []
+    for sign, bound in field.limits:
+        if sign in (">", "<"):
+            values.append(bound)
+    if field.kind is Kind.NUMBER:
+        values += [math.nan, math.inf, -math.inf]
+        values += [math.nextafter(low, -math.inf), math.nextafter(high, math.inf), 1e308, -1e308]
+    else:
+        values += [int(low) - 1, int(high) + 1, 10**30, -(10**30)]
+    return values
+
+
+def _ends(field: FieldSpec) -> tuple[float, float]:
+    """The least and the greatest allowed value."""
+    whole = field.kind is Kind.WHOLE
+    low, high = -math.inf, math.inf
+    for sign, bound in field.limits:
+        step = 1 if whole else 0
+        if sign == ">=":
+            low = bound
+        elif sign == ">":
+            low = bound + step if whole else math.nextafter(bound, math.inf)
+        elif sign == "<=":
+            high = bound
+        else:
+            high = bound - step if whole else math.nextafter(bound, -math.inf)
+    return low, high
+
+
+def number_fields(section: SectionSpec = ROOT) -> list[FieldSpec]:
+    """Every field of a recipe that holds numbers, colours' and rates' channels among them."""
+    fields = []
+    for spec in section.walk():
+        for field in spec.fields.values():
+            if field.kind in (Kind.NUMBER, Kind.WHOLE) or field.channel is not None:
+                fields.append(field)
+    return fields
+
+
+# What is drawn as a rule, where the schema would allow what takes minutes or needs a file.
+_TAMED: dict[str, st.SearchStrategy[Any]] = {
+    "version": st.just(1),
+    "name": st.just("extreme"),
+    "render.scale": st.sampled_from((1.0, 5e-324, 0.3, 4.0)),
+    "weather.snow.cell_m": st.just(CELL_M),
+    "weather.snow.max_slope_deg": st.sampled_from(SLOPES_DEG),
+    "style.image": st.none(),
+    "style.mask": st.none(),
+    "style.checkpoint": st.none(),
+    "style.digest": st.none(),
+    "style.method": st.sampled_from(("mkl", "reinhard")),
+    "style.preset": st.sampled_from(("dusk", "night")),
+}
+_NOT_OF_FRAMES = ("quality",)  # chooses settings, which a frame is then made with
+_ALTERNATIVES = (  # at most one of each is given
+    ("weather.smog.visibility_m", "weather.smog.extinction_per_m"),
+    ("weather.flood.turbidity_ntu", "weather.flood.absorption_per_m"),
+)
+
+
+def values_of(field: FieldSpec) -> st.SearchStrategy[Any]:
+    """Allowed values of a field, the extreme ones before others."""
+    tamed = _TAMED.get(field.path)
+    if tamed is not None:
+        return tamed
+    if field.channel is not None:
+        drawn: st.SearchStrategy[Any] = st.tuples(*[st.sampled_from(numbers_of(field.channel))] * 3)
+    elif field.kind is Kind.WORD:
+        drawn = st.sampled_from(field.words)
+    elif field.kind is Kind.FLAG:
+        drawn = st.booleans() | st.sampled_from(field.words or (False,))
+    elif field.kind in (Kind.NUMBER, Kind.WHOLE):
+        drawn = st.sampled_from(numbers_of(field))
+    else:
+        drawn = st.just(field.default)
+    return st.none() | drawn if field.nullable else drawn
+
+
+@st.composite
+def sections(draw: st.DrawFn, spec: SectionSpec, effects: frozenset[str]) -> dict[str, Any]:
+    """A section's mapping; of the effects below it, those that are asked for."""
+    found: dict[str, Any] = {}
+    absent = {a if draw(st.booleans()) else b for a, b in _ALTERNATIVES if spec.path in a}
+    for name, field in spec.fields.items():
+        if field.path in absent:
+            continue
+        if field.required or draw(st.integers(0, 2)) > 0:
+            found[name] = draw(values_of(field))
+    for name, below in spec.sections.items():
+        if below.items is not None:
+            if draw(st.integers(0, 3)) == 0:
+                found[name] = draw(st.lists(sections(below, effects), max_size=3).map(tuple))
+        elif name not in _NOT_OF_FRAMES and (not below.effect or name in effects):
+            found[name] = draw(sections(below, effects))
+    return found
+
+
+EFFECTS = ("smog", "flood", "snow", "style")
+PAIRS = [frozenset(pair) for pair in itertools.combinations(EFFECTS, 2)]
+
+
+@st.composite
+def recipes(draw: st.DrawFn, effects: frozenset[str] | None = None) -> Recipe:
+    """A valid recipe of extreme numbers, with the given effects, or some of them."""
+    if effects is None:
+        effects = draw(st.frozensets(st.sampled_from(EFFECTS)))
+    data = draw(sections(ROOT, effects))
+    for name, spec in ROOT.sections["weather"].sections.items():
+        for pair in _ALTERNATIVES:
+            if spec.path in pair[0] and name in data["weather"]:
+                _give_one(data["weather"][name], pair)
+    waves = data["weather"].get("flood", {}).get("waves", {})
+    for wave in waves.get("components", None) or ():
+        wave["amplitude_m"] = min(wave["amplitude_m"], wave["wavelength_m"] / 6.2832)
+        wave["steepness"] = min(wave.get("steepness", 0.0), 0.33)
+    if "style" in data:
+        data["style"].setdefault("preset", "dusk")
+        if data["style"].get("applied_to") == "picture":
+            data["style"]["per_region"] = False
+    data["output"] = draw(outputs(data))
+    try:
+        return Recipe.model_validate(data)
+    except ValidationError:  # a rule between fields that is younger than this file
+        assume(False)
+        raise
+
+
+def _give_one(section: dict[str, Any], pair: tuple[str, str]) -> None:
+    """A density where smog lacks one; of two alternatives the first that is given."""
+    first, second = (path.rpartition(".")[2] for path in pair)
+    if section.get(first) is not None:
+        section.pop(second, None)
+    elif section.get(second) is None and second == "extinction_per_m":
+        section[second] = 0.1
+        section.pop(first, None)
+    if first == "visibility_m" and section.get(first) is not None:
+        section[first] = max(section[first], 0.03913)  # what the most allowed extinction means
+
+
+@st.composite
+def outputs(draw: st.DrawFn, data: dict[str, Any]) -> dict[str, Any]:
+    """Images to ask for, from the sets of buffers whose kernels other tests compile anyway."""
+    weather = data["weather"]
+    flood, snow, smog = (weather.get(name) for name in ("flood", "snow", "smog"))
+    deferred = smog is not None and smog.get("model") == "deferred"
+    options: list[tuple[str, bool, str]] = []  # depth, whether classes are shown, surface
+    if flood is None:
+        options += [("expected", True, "solid"), ("expected", True, "first")]
+    if flood is None and snow is None:
+        options += [("median", False, "solid"), ("none", False, "scene")]
+        if not deferred:
+            options += [("median", True, "first")]
+    elif flood is None:
+        lit = snow.get("shading") == "per_pixel"
+        if not deferred:
+            options += [("none", False, "solid"), ("median", False, "first")]
+            options += [("mode", False, "solid"), ("none", True, "scene")][: 1 if lit else 2]
+    elif snow is None:
+        options += [("expected", True, "first"), ("median", True, "solid")]
+        options += [("none", False, "first")]
+    else:
+        options += [("expected", False, "solid"), ("expected", False, "first")]
+        if not SOAKING:  # light per pixel in a flood takes kernels that nothing else does
+            snow["shading"] = "per_splat"
+    depth, classes, surface = draw(st.sampled_from(options))
+    return {"depth": depth, "semantic": classes, "instance": classes, "surface": surface}
+
+
+def rendered(scene: Scene, camera: Camera, recipe: Recipe) -> WeatheredView:
+    """The view, after checking all that is promised of every frame."""
+    view = render_view(scene, camera, recipe)
+    plan = make_plan(recipe, scene)
+    buffers = render_buffers(scene, camera.scaled(recipe.render.scale), plan)
+    check_buffers(buffers)
+    check_view(view, scene, recipe)
+    assert np.array_equal(quantise(buffers.rgb), view.rgb), "two renders of one frame differ"
+    return view
+
+
+def check_buffers(buffers: WeatheredBuffers) -> None:
+    """Finite colours; alpha and snow in [0, 1]; depth of what is seen positive, else 0."""
+    size = (buffers.camera.height, buffers.camera.width)
+    assert tuple(buffers.rgb.shape) == (*size, 3)
+    assert bool(torch.isfinite(buffers.rgb).all()), "a colour is not finite"
+    rasters = [buffers.raster] + ([] if buffers.bare is None else [buffers.bare.raster])
+    for raster in rasters:
+        alpha = raster.alpha
+        assert alpha is not None
+        assert bool(((alpha >= 0) & (alpha <= 1)).all()), f"alpha {alpha.min()} to {alpha.max()}"
+        for name in ("expected_depth", "median_depth", "mode_depth"):
+            depth = getattr(raster, name)
+            if depth is not None:
+                assert bool(torch.isfinite(depth).all()), f"{name} is not finite"
+                assert bool((depth >= 0).all()), f"{name} {depth.min()}"
+        if raster.snow is not None:
+            # Two sums of the same weights: they differ by rounding.
+            assert bool((raster.snow >= 0).all())
+            assert bool((raster.snow <= alpha + 1e-5).all()), "more snow than surface"
+    if buffers.depth_m is not None:
+        assert bool(torch.isfinite(buffers.depth_m).all()) and bool((buffers.depth_m >= 0).all())
+
+
+def check_view(view: WeatheredView, scene: Scene, recipe: Recipe) -> None:
+    """Images of one size; depth finite and >= 0; masks of 0 and 255 that agree with the classes."""
+    size = (view.camera.height, view.camera.width)
+    assert view.rgb.dtype == np.uint8 and view.rgb.shape == (*size, 3)
+    assert (view.depth_m is None) == (recipe.output.depth == "none")
+    if view.depth_m is not None:
+        assert view.depth_m.dtype == np.float32 and view.depth_m.shape == size
+        assert np.isfinite(view.depth_m).all() and (view.depth_m >= 0).all()
+    for mask, effect in ((view.water, recipe.weather.flood), (view.snow, recipe.weather.snow)):
+        assert (mask is None) == (effect is None)
+        if mask is not None:
+            assert mask.dtype == np.uint8 and mask.shape == size
+            assert np.isin(mask, (0, 255)).all()
+    if view.water is not None and view.snow is not None:
+        assert not (view.water & view.snow).any(), "a pixel shows snow and water first"
+    if view.semantic is not None:
+        assert np.isin(view.semantic, [int(c) for c in SemanticClass]).all()
+        if view.water is not None and recipe.output.surface == "first":
+            assert ((view.semantic == SemanticClass.WATER) >= (view.water == 255)).all()
+    if view.instance is not None:
+        assert (view.instance <= len(scene.actors)).all()
