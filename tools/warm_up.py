@@ -94,6 +94,7 @@ def _yard(level_z_m: float, *, with_labels: bool) -> Scene:
         sky,
         (frame,),
         labels=_NoLabels() if with_labels else None,
+        ground_z_m=0.0,  # smog that thins with height asks for it
         ground=Ground(0.0, 0.0, "stated"),
     )
 
