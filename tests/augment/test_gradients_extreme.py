@@ -1,0 +1,313 @@
+"""Gradients of what is trained, where scenes, cameras and pictures are extreme: finite everywhere,
+and every step of every optimiser leaves numbers that can be rendered.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from augment.geometry import rigid
+from augment.reconstruct import adam_kernels as adam
+from augment.reconstruct.config import FitConfig, LossWeights
+from augment.reconstruct.dense_adam import ColorAdam, DenseAdam
+from augment.reconstruct.forces import part_forces
+from augment.reconstruct.inputs import splat_inputs
+from augment.reconstruct.knots import Knots
+from augment.reconstruct.loss import IDENTITY_MAP, ViewLoss, view_loss
+from augment.reconstruct.loss_reference import LEAST_ALPHA, LEAST_SKY, reference_loss
+from augment.reconstruct.rates import CORRECTIONS, splat_rates
+from augment.reconstruct.splats import Splats
+from augment.reconstruct.view import RecordedView
+from augment.render import cpu_backward
+from augment.render.buffers import ALPHA, EXPECTED_DEPTH, RGB
+from augment.render.constants import RasterSettings
+from augment.render.cpu_inputs import part_poses
+from augment.render.cpu_scratch import Scratch
+from augment.render.rasterize import rasterize
+from augment.render.threads import kernel_threads
+from augment.scene import Gaussians, PosedGaussians
+from augment.style.closed_form import closed_maps
+from augment.style.losses import (
+    GaussianColors,
+    color_distance,
+    picture_distance,
+    style_loss,
+    weighted_sum,
+)
+from augment.style.network import Gscm
+from augment.style.pair_losses import PairWeights, pair_losses, weighted
+from augment.style.pairs import PairBatch
+from augment.style.statistics import WHOLE, ColorStatistics
+from tests.augment.examples import drawing
+from tests.augment.hard_scenes import (
+    KINDS,
+    OPACITIES,
+    SMOGS,
+    hard_gaussians,
+    in_float64,
+    wide_camera,
+)
+
+FIELDS = ("means", "quats", "scales", "opacities", "sh")
+kinds, seeds = st.sampled_from(KINDS), st.integers(0, 2**31)
+fovs = st.sampled_from((1, 10, 60, 120, 170))
+sizes = st.sampled_from(((33, 21), (1, 1), (17, 1), (16, 16)))
+
+
+def learnt(gaussians: Gaussians) -> Gaussians:
+    tensors = {n: getattr(gaussians, n).clone().requires_grad_() for n in FIELDS}
+    return dataclasses.replace(gaussians, **tensors)
+
+
+def gradients(gaussians: Gaussians, camera, *, backend: str, seed: int, **options) -> dict:
+    """Of a loss in which every pixel of colour, alpha and depth has a weight of its own."""
+    own = learnt(gaussians)
+    output = rasterize(
+        [PosedGaussians(own)],
+        camera,
+        buffers=(RGB, ALPHA, EXPECTED_DEPTH),
+        backend=backend,
+        **options,
+    )
+    generator = torch.Generator().manual_seed(seed % 2**31)
+    loss = output.alpha.new_zeros(())
+    for image in (output.rgb, output.alpha, output.expected_depth):
+        assert torch.isfinite(image).all()
+        loss = loss + (image * torch.rand(image.shape, generator=generator).to(image)).sum()
+    loss.backward()
+    return {name: getattr(own, name).grad for name in FIELDS}
+
+
+def assert_finite(found: dict) -> None:
+    for name, value in found.items():
+        assert value is not None and bool(torch.isfinite(torch.as_tensor(value)).all()), name
+
+
+@drawing(25)
+@given(kinds, seeds, fovs, sizes, st.booleans())
+def test_of_the_cpu_rasteriser(kind, seed, fov_deg, size, antialiased):
+    camera = wide_camera(fov_deg, size)
+    gaussians = hard_gaussians(kind, camera, 60, seed=seed)
+    settings = RasterSettings(antialiased=antialiased)
+    assert_finite(gradients(gaussians, camera, backend="cpu", seed=seed, settings=settings))
+
+
+@pytest.mark.parametrize("smog", SMOGS)
+@drawing(4)
+@given(kinds, seeds, fovs, st.booleans(), st.booleans())
+def test_of_the_definition(smog, kind, seed, fov_deg, antialiased, is_double):
+    camera = wide_camera(fov_deg, (16, 9))
+    gaussians = hard_gaussians(kind, camera, 30, seed=seed)
+    if is_double:
+        gaussians = in_float64([PosedGaussians(gaussians)])[0].gaussians
+    settings = RasterSettings(antialiased=antialiased)
+    found = gradients(
+        gaussians, camera, backend="reference", seed=seed, settings=settings, smog=SMOGS[smog]
+    )
+    assert_finite(found)
+
+
+# ---- reconstruction ------------------------------------------------------------------------------
+
+# Values at which the loss changes its mind, on both sides, and the ends of what a render holds.
+ALPHAS = (0.0, 1e-7, LEAST_ALPHA, LEAST_ALPHA + 1e-6, 0.5, 1 - LEAST_SKY, 1 - 1e-6, 1.0)
+DEPTHS = (0.0, 0.01, 1.0, 1e6)
+COLOURS = (0.0, 1e-40, 0.5, 1.0, 1e4)
+WEIGHTS = LossWeights(d_ssim=0.3, depth=0.7, sky=0.2, surface=0.1)
+
+
+def hard_view(seed: int, height: int, width: int, fov_deg: float, *, is_constant: bool) -> dict:
+    """Arguments of view_loss: every pixel, prior and texel at one of its extremes."""
+    rng = np.random.default_rng(seed)
+    size = (height, width)
+
+    def pick(values, *shape: int) -> np.ndarray:
+        chosen = rng.choice(values) if is_constant else rng.choice(values, shape)
+        return np.broadcast_to(np.float32(chosen), shape).copy()
+
+    count = int(rng.integers(0, height * width + 1))
+    view = RecordedView(
+        camera=wide_camera(fov_deg, (width, height)),
+        rgb=pick((0.0, 1.0, 128.0, 255.0), *size, 3).astype(np.uint8),
+        weight=pick((0.0, 1e-6, 1.0), *size),
+        sky=rng.random(size) < 0.3,
+        depth_pixels=np.sort(rng.choice(height * width, count, replace=False)).astype(np.int32),
+        depth_m=pick((0.01, 1.0, 1e6), count),
+        depth_weight=pick((0.0, 1.0), count),
+    )
+    return {
+        "rgb": pick(COLOURS, *size, 3),
+        "alpha": pick(ALPHAS, *size),
+        "expected_depth": pick(DEPTHS, *size),
+        "view": view,
+        "sky_faces": pick((0.0, 0.5, 1.0), 6, 8, 8, 3),
+        "color_map": IDENTITY_MAP * np.float32(rng.choice((0.0, 1.0, 3.0))),
+        "weights": WEIGHTS,
+    }
+
+
+def loss_arrays(loss: ViewLoss) -> dict[str, np.ndarray]:
+    found = {
+        "total": np.array(loss.total),
+        "rgb": loss.d_rgb,
+        "alpha": loss.d_alpha,
+        "expected_depth": loss.d_expected_depth,
+        "color_map": loss.d_color_map,
+    }
+    return found if loss.d_sky is None else found | {"sky": loss.d_sky.grads}
+
+
+views = st.sampled_from(((1, 1), (1, 40), (23, 17))), fovs, st.booleans()
+
+
+@drawing(25)
+@given(seeds, *views)
+def test_of_the_loss_of_a_view(seed, size, fov_deg, is_constant):
+    """By the kernels and by their definition, in float32 as they and in float64."""
+    arguments = hard_view(seed, *size, fov_deg, is_constant=is_constant)
+    assert_finite(loss_arrays(view_loss(**arguments)))
+    for dtype in (torch.float32, torch.float64):
+        tensors = {
+            name: torch.from_numpy(arguments[name]).to(dtype).requires_grad_()
+            for name in ("rgb", "alpha", "expected_depth", "sky_faces", "color_map")
+        }
+        loss = reference_loss(**tensors, view=arguments["view"], weights=WEIGHTS)
+        loss.total.backward()
+        grads = {name: tensor.grad for name, tensor in tensors.items()}
+        assert_finite({name: grad for name, grad in grads.items() if grad is not None})
+
+
+@drawing(15)
+@given(seeds, *views)
+def test_sky_and_colour_maps_after_steps(seed, size, fov_deg, is_constant):
+    arguments = hard_view(seed, *size, fov_deg, is_constant=is_constant)
+    faces, color_map = arguments["sky_faces"], arguments["color_map"].copy()
+    sky, colors = ColorAdam(faces.reshape(-1, 3)), DenseAdam(color_map)
+    for _ in range(3):
+        loss = view_loss(**(arguments | {"color_map": color_map}))
+        colors.update(loss.d_color_map, 0.1)
+        if loss.d_sky is not None:
+            sky.update(loss.d_sky.texels, loss.d_sky.grads, 0.1)
+    assert np.isfinite(color_map).all()
+    assert np.isfinite(faces).all() and faces.min() >= 0 and faces.max() <= 1
+
+
+@drawing(20)
+@given(kinds, seeds, fovs, st.sampled_from((0.0, 1e-30, 1.0, 1e10)))
+def test_splats_and_poses_after_a_step(kind, seed, fov_deg, steepness):
+    """Adam keeps logarithms of scales and logits of opacities within what can be drawn."""
+    camera = wide_camera(fov_deg)
+    start = hard_gaussians(kind, camera, 60, seed=seed, sh_degree=3)
+    pose = rigid(torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
+    splats = Splats.of([start, start.select(torch.arange(20))], 3)
+    poses = part_poses([None, pose])
+    config = FitConfig(steps=10, loss=LossWeights(opacity_decay=0.02, scale_decay=0.03))
+    inputs = splat_inputs(splats, [0, 1], poses, camera, RasterSettings())
+    knots = Knots([np.array([0, 10])], 6)
+    rng, scratch = np.random.default_rng(seed), Scratch()
+    for step in range(2):
+        tape = cpu_backward.record(inputs, camera, RasterSettings(), scratch, with_depth=True)
+        images = [
+            (steepness * rng.normal(size=image.shape)).astype(np.float32)
+            for image in (tape.rgb, tape.alpha, tape.expected_depth)
+        ]
+        found = tape.backward(*images)
+        forces = part_forces(inputs, found)
+        on_camera = forces.on_camera(camera.camera_from_world.numpy() @ poses)
+        knots.update(0, 5, on_camera, np.full(6, 0.1), 1e-3)
+        with kernel_threads():
+            adam.update_splats(
+                inputs.addresses, inputs.sizes, inputs.views, inputs.blocks, inputs.first_ids,
+                found.rows.reshape(-1), found.ids, found.counts, 16,
+                splat_rates(config, step, camera, 50.0), CORRECTIONS.reshape(-1),
+                splats.geometry_m.reshape(-1), splats.geometry_v.reshape(-1),
+                splats.sh_m.reshape(-1), splats.sh_v.reshape(-1), splats.age,
+                splats.grads.reshape(-1),
+            )  # fmt: skip
+    for name, array in splats.arrays().items():
+        assert np.isfinite(array).all(), name
+    assert np.isfinite(knots.values).all() and np.isfinite(on_camera).all()
+    assert splats.scales.min() > 0
+    assert splats.opacities.min() >= 0 and splats.opacities.max() <= 1
+    np.testing.assert_allclose(np.linalg.norm(splats.quats, axis=1), 1, atol=1e-5)
+
+
+# ---- styles --------------------------------------------------------------------------------------
+
+PLAIN = {
+    "black": (0.0, 0.0, 0.0),
+    "white": (1.0, 1.0, 1.0),
+    "red": (1.0, 0.0, 0.0),
+    "grey": (0.5, 0.5, 0.5),
+}
+
+
+def plain(name: str, px: int = 32, count: int = 2) -> torch.Tensor:
+    return torch.tensor(PLAIN[name])[None, :, None, None].expand(count, 3, px, px).clone()
+
+
+@pytest.mark.parametrize("second", PLAIN)
+@pytest.mark.parametrize("first", ["black", "red", "grey"])
+def test_of_the_style_losses_of_plain_pictures(first, second):
+    """Pictures, features and colours without any variance, and equal ones without a difference."""
+    one, other = plain(first).requires_grad_(), plain(second)
+    base, bands = plain(first)[0].flatten(1).T[None], torch.zeros(1, 32 * 32, 3, 3)
+    base.requires_grad_()
+    maps = torch.eye(3, 4)[None].clone().requires_grad_()
+    colors = GaussianColors(base, bands)
+    terms = {
+        "style": style_loss((one, 0 * one), (other, other)),
+        "colors": color_distance(colors.mapped(maps), colors),
+        "pictures": picture_distance(one, other),
+    }
+    weighted_sum(terms, dict.fromkeys(terms, 1.0)).backward()
+    assert_finite({"picture": one.grad, "base": base.grad, "maps": maps.grad})
+
+
+@pytest.fixture(scope="module")
+def network() -> Gscm:
+    torch.manual_seed(0)
+    return Gscm("small")
+
+
+@pytest.mark.parametrize(("first", "second"), [("black", "white"), ("red", "red"), ("grey", "red")])
+def test_of_the_style_network_of_plain_pictures(network, first, second):
+    batch = PairBatch(plain(first), plain(second), plain(second), plain(first))
+    network.zero_grad()
+    losses = pair_losses(network, batch)
+    assert_finite(losses)
+    weighted(losses, PairWeights()).backward()
+    assert_finite({n: p.grad for n, p in network.named_parameters() if p.grad is not None})
+
+
+spreads = st.sampled_from((0.0, 1e-12, 1e-4, 0.08))
+colours = st.tuples(*[st.sampled_from((0.0, 1e-8, 0.5, 1.0))] * 3)
+
+
+@drawing(40)
+@given(colours, colours, spreads, spreads, st.sampled_from(("mkl", "reinhard")),
+       st.sampled_from((0.0, 1.0, 2.0)), st.booleans())  # fmt: skip
+def test_closed_forms_of_plain_pictures(one, other, narrow, wide, method, strength, is_flat):
+    """Of one colour, or spread along one line of colours only."""
+    shape = np.outer((1, 0.5, 0.2), (1, 0.5, 0.2)) if is_flat else np.eye(3)
+    content, style = (
+        {WHOLE: ColorStatistics(np.array(mean), spread * shape)}
+        for mean, spread in ((one, narrow), (other, wide))
+    )
+    maps = closed_maps(content, style, method=method, strength=strength, per_region=False)
+    for value in (maps.splats, maps.sky, maps.picture):
+        assert torch.isfinite(value).all()
+        # Of gains at most 3 (closed_form.Limits), and the least contrast beside them.
+        assert torch.linalg.matrix_norm(value[..., :3], 2).max() < 3.5
+
+
+def test_opacities_at_the_thresholds_are_among_the_extremes():
+    camera = wide_camera(60.0)
+    found = set(hard_gaussians("edges", camera, 300).opacities.tolist())
+    assert found == set(OPACITIES.tolist())
