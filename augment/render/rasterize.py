@@ -17,6 +17,7 @@ from augment.render.buffers import ALPHA, BUFFERS, DIFFERENTIABLE, RGB, RenderOu
 from augment.render.clip import HeightClip
 from augment.render.constants import MOST_TRANSMITTANCE_STOP, RasterSettings
 from augment.render.reference import rasterize_reference
+from augment.render.remainder import needs_remainder, share_remainder
 from augment.render.sh import MAX_DEGREE
 from augment.scene import Gaussians, PosedGaussians
 from augment.weather.smog import SmogMedium
@@ -66,8 +67,26 @@ def rasterize(
             f"wanted must be bool [{camera.height}, {camera.width}] (the camera's size); got "
             f"{wanted.dtype} {list(wanted.shape)}"
         )
-    names = frozenset(buffers)
-    if _choose(parts, camera, backend, names, smog, clip) == REFERENCE:
+    names, stop = frozenset(buffers), settings.transmittance_stop
+    chosen = _choose(parts, camera, backend, names, smog, clip)
+    if not needs_remainder(stop):
+        return _rasterize(parts, camera, names, settings, smog, clip, wanted, chosen)
+    drawn = _rasterize(parts, camera, names | {ALPHA}, settings, smog, clip, wanted, chosen)
+    shared = share_remainder(drawn, stop, fast=chosen == CPU)
+    return shared if ALPHA in names else dataclasses.replace(shared, alpha=None)
+
+
+def _rasterize(
+    parts: Sequence[PosedGaussians],
+    camera: Camera,
+    names: frozenset[str],
+    settings: RasterSettings,
+    smog: SmogMedium | None,
+    clip: HeightClip | None,
+    wanted: torch.Tensor | None,
+    backend: str,
+) -> RenderOutput:
+    if backend == REFERENCE:
         return rasterize_reference(parts, camera, names, settings, smog, clip)
     cpu = _import_cpu()
     if _tracked(parts):
