@@ -1,0 +1,167 @@
+"""docs/trade.md's tables and charts, from the kept figures of docs/trade/*.json.
+
+    python -m tools.trade_docs
+
+rewrites what lies between the document's markers, a page of every scene's figures, and its chart.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+
+from recipes.knobs import KNOBS, Knob, Value
+from recipes.quality import TIERS
+from tools.bench_trade import table_of
+from tools.machine import machine_line
+from tools.trade_cases import DEFAULTS, JPEG, REFERENCE, WHOLE
+from tools.trade_measure import Row
+from tools.trade_plots import draw_chart
+from tools.trade_text import markdown, number, percent, trade_markdown, value_text, views_line
+from tools.trade_tiers import BOUNDS
+
+DOCS = Path(__file__).resolve().parents[1] / "docs"
+PAGE = DOCS / "trade.md"
+SCENES = ("street", "pandaset")
+START, END = "<!-- {name}: made by python -m tools.trade_docs -->", "<!-- end of {name} -->"
+
+
+def read_tables(folder: Path = DOCS / "trade") -> list[dict[str, Any]]:
+    """The kept figures of SCENES."""
+    return [json.loads((folder / f"{name}.json").read_text()) for name in SCENES]
+
+
+def document(text: str, tables: Sequence[Mapping[str, Any]]) -> str:
+    """The document with its tables made anew.
+
+    Raises:
+        ValueError: it lacks a marker.
+    """
+    for name, lines in _sections(tables).items():
+        start, end = START.format(name=name), END.format(name=name)
+        before, found, rest = text.partition(start)
+        _, closed, after = rest.partition(end)
+        if not (found and closed):
+            raise ValueError(f"the document has no '{start}' with '{end}' after it")
+        text = "\n".join([before + start, "", *lines, "", end]) + after
+    return text
+
+
+def _sections(tables: Sequence[Mapping[str, Any]]) -> dict[str, list[str]]:
+    return {
+        "machine": [f"- {machine_line(t)}; {views_line(t)}." for t in tables],
+        "tiers": list(_tier_table()),
+        "wholes": list(_whole_table(tables)),
+        "knobs": list(_knob_table(tables)),
+        "files": list(_file_table(tables)),
+    }
+
+
+def _tier_table() -> Iterator[str]:
+    rows = []
+    for knob in KNOBS:
+        if knob.chosen:
+            set_to = [TIERS[name].get(knob.path, knob.reference) for name in BOUNDS]
+            values = (*set_to, knob.reference)
+            rows.append((f"`{knob.path}`", knob.what, *map(value_text, values)))
+    yield from markdown(("knob", "what it is", *BOUNDS, REFERENCE), rows)
+
+
+def _whole_table(tables: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    header = ("scene", "recipe", "settings", "ms", "x reference", "x clean", "FLIP", "worst FLIP",
+              "PSNR", "flicker", "MiB", "kept")  # fmt: skip
+    rows = [
+        (
+            row["scene"],
+            row["recipe"],
+            row["value"],
+            number(row["ms"], ".0f"),
+            number(row["over_reference"], ".2f"),
+            number(row["over_clean"], ".2f"),
+            number(row["flip"], ".4f"),
+            number(row["worst_flip"], ".4f"),
+            "same" if row["psnr"] is None else number(row["psnr"], ".1f"),
+            number(row["flicker"], ".4f"),
+            number(row.get("mib"), ".0f"),
+            number(row.get("kept_mib"), ".0f"),
+        )
+        for row in _all_rows(tables)
+        if row["knob"] == WHOLE and row["value"] in (*BOUNDS, DEFAULTS, REFERENCE)
+    ]
+    yield from markdown(header, rows)
+
+
+def _knob_table(tables: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    """Over all recipes that a knob has an effect on: mean ratio of times with least and most, and
+    the worst errors; the scenes beside each other.
+    """
+    each = ("x reference (least-most)", "worst FLIP", "flicker", "depth off")
+    header = ("knob", "value", *(f"{t['scene']}: {name}" for t in tables for name in each))
+    rows = []
+    for knob in KNOBS:
+        for value in knob.values if not knob.chosen else knob.values[:-1]:
+            if knob.path == JPEG:
+                continue
+            cells = [cell for table in tables for cell in _knob_cells(table, knob, value)]
+            rows.append((f"`{knob.path}`", value_text(value), *cells))
+    yield from markdown(header, rows)
+
+
+def _knob_cells(table: Mapping[str, Any], knob: Knob, value: Value) -> tuple[str, str, str, str]:
+    rows = [r for r in table_of(table) if r["knob"] == knob.path and r["value"] == value]
+    if not rows:
+        return "-", "-", "-", "-"
+    ratios = [row["over_reference"] for row in rows]
+    mean = math.exp(sum(map(math.log, ratios)) / len(ratios))
+    return (
+        f"{mean:.2f} ({min(ratios):.2f}-{max(ratios):.2f})",
+        number(max(row["worst_flip"] for row in rows), ".4f"),
+        number(_most(rows, "flicker"), ".4f"),
+        percent(_most(rows, "off_5cm")),
+    )
+
+
+def _file_table(tables: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    header = ("scene", "quality", "ms", "kB", "FLIP, least", "FLIP, most", "SSIM, least")
+    rows = []
+    for table in tables:
+        own = [row for row in table_of(table) if row["knob"] == JPEG]
+        for quality in dict.fromkeys(row["value"] for row in own):
+            of = [row for row in own if row["value"] == quality]
+            rows.append((
+                table["scene"],
+                value_text(quality),
+                number(sum(row["ms"] for row in of) / len(of), ".1f"),
+                number(sum(row["kilobytes"] for row in of) / len(of), ".0f"),
+                number(min(row["flip"] for row in of), ".4f"),
+                number(max(row["flip"] for row in of), ".4f"),
+                number(min(row["ssim"] for row in of), ".4f"),
+            ))  # fmt: skip
+    yield from markdown(header, rows)
+
+
+def _all_rows(tables: Sequence[Mapping[str, Any]]) -> list[Row]:
+    return [row for table in tables for row in table_of(table)]
+
+
+def _most(rows: Sequence[Row], name: str) -> float | None:
+    known = [row[name] for row in rows if row[name] is not None]
+    return max(known, default=None)
+
+
+def main() -> None:
+    tables = read_tables()
+    PAGE.write_text(document(PAGE.read_text(), tables))
+    for name, table in zip(SCENES, tables, strict=True):
+        (DOCS / "trade" / f"{name}.md").write_text(trade_markdown(table))
+        chart = str(DOCS / "images" / f"trade_{name}.png")
+        cv2.imwrite(chart, draw_chart(table)[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])
+
+
+if __name__ == "__main__":
+    main()
