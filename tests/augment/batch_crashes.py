@@ -7,6 +7,7 @@ batch package does not hold.
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import random
@@ -19,11 +20,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from batch_scenes import fake_render, make_bed, make_recipe, open_fake, slow_render, tree_digest
+from fork_server import keep_in_forks, start_fork_server
 
 from augment.batch.atomic import TEMPORARY_SUFFIX
 from augment.batch.job import RenderJob, run_job
 from augment.batch.journal import Journal
-from augment.batch.label_files import lidar_bytes
 from augment.batch.layout import STATE_FOLDER
 from augment.snow import beds
 from recipes.flood import Flood
@@ -34,7 +35,13 @@ SYNC_POINTS = ("fsync", "replace", "unlink", "rename", "rmdir")
 
 
 def main(folder: Path) -> None:
-    lidar_bytes(open_fake("fake:warm").labels.lidar(0))  # loads the Parquet code before the forks
+    start_fork_server("batch_scenes", "augment.batch.worker")
+    keep_in_forks()
+    beds.place_snow_bed = lambda *_, **__: make_bed(1.0)
+    for warm in (job(folder / "warm"), snowy_job(folder / "warm-snow")):
+        render(warm)()  # imports before the forks what is imported late
+    gc.collect()
+    gc.freeze()  # or every fork looks through all that was imported
     found = {}
     for kill in (sweep_fresh, sweep_snow, sweep_overwrite, kill_at_random, stop_a_job_with_workers):
         (folder / kill.__name__).mkdir()
@@ -47,6 +54,11 @@ def job(folder: Path, frames: int = 2, **options) -> RenderJob:
     weather = {"flood": Flood(level_m=0.3), "snow": Snow(depth_m=0)}
     recipe = make_recipe(instance=False, semantic=False, **weather)
     return RenderJob(f"fake:street?frames={frames}", [recipe], folder, **options)
+
+
+def snowy_job(out: Path) -> RenderJob:
+    recipe = make_recipe(instance=False, semantic=False, snow=Snow(depth_m=0.1))
+    return RenderJob("fake:street?frames=1", [recipe], out)
 
 
 def clear_job(folder: Path, **options) -> RenderJob:
@@ -149,12 +161,6 @@ def sweep_fresh(folder: Path) -> dict[str, int]:
 
 def sweep_snow(folder: Path) -> dict[str, int]:
     """Kill a run while it stores where snow can lie, and while it writes the first files."""
-    beds.place_snow_bed = lambda *_, **__: make_bed(1.0)
-    recipe = make_recipe(instance=False, semantic=False, snow=Snow(depth_m=0.1))
-
-    def snowy_job(out: Path) -> RenderJob:
-        return RenderJob("fake:street?frames=1", [recipe], out)
-
     require(run_forked(render(snowy_job(folder / "whole"))).code == 0, "the snowy run failed")
     # The state's own files go by what they hold, and a job's do not tell of it.
     whole = tree_digest(folder / "whole" / "street")
@@ -196,20 +202,24 @@ def sweep_overwrite(folder: Path) -> dict[str, int]:
 
 
 def kill_at_random(folder: Path) -> dict[str, int]:
-    """Kill one job again and again after random times until it gets through."""
+    """Kill one job again and again at random times of its own until it gets through.
+
+    Times of the processor, not of a clock: on a machine that is busy it would be killed for ever.
+    """
     run_forked(render(job(folder / "whole", frames=6)))
     whole = tree_digest(folder / "whole")
     out, rng, kills = folder / "killed", random.Random(5), 0
     while True:
+        limit_s = rng.uniform(0.01, 0.03 + 0.005 * kills)  # it gets through on any machine
         child = os.fork()
         if child == 0:
-            render(job(out, frames=6), slow_render)()
+            signal.setitimer(signal.ITIMER_PROF, limit_s)
+            render(job(out, frames=6))()
             os._exit(0)
-        time.sleep(rng.uniform(0.05, 0.25))
-        os.kill(child, signal.SIGKILL)
         _, status = os.waitpid(child, 0)
         if status == 0:
             break
+        require(os.waitstatus_to_exitcode(status) == -signal.SIGPROF, f"at random: {status}")
         kills += 1
         check_only_whole_files(out, whole, f"kill {kills}")
     require(tree_digest(out) == whole, "the resumed tree differs")

@@ -1,9 +1,8 @@
 """Kills dataset jobs at chosen and random moments and goes on with them; prints what it found.
 
 Run as a script, in a process of its own: each job runs in a fork of it, which is quick to start
-and can be killed without harm to the tests. Workers come from a fork server, which has imported
-everything: started afresh, as the library does, each would take seconds. Exits non-zero, saying
-why, when a promise of `climategs generate` does not hold.
+and can be killed without harm to the tests. Exits non-zero, saying why, when a promise of
+`climategs generate` does not hold.
 """
 
 from __future__ import annotations
@@ -12,7 +11,6 @@ import errno
 import faulthandler
 import gc
 import json
-import multiprocessing
 import os
 import random
 import shutil
@@ -23,11 +21,11 @@ import time
 import traceback
 from collections.abc import Callable
 from dataclasses import replace
-from multiprocessing import forkserver
 from pathlib import Path
 
 import generate_jobs as jobs
 from batch_scenes import open_fake
+from fork_server import keep_in_forks, server_process, start_fork_server
 from generate_jobs import (
     check_reader,
     dying_render,
@@ -65,7 +63,8 @@ def main(folder: Path, names: list[str]) -> None:
     tqdm.set_lock(threading.RLock())
     faulthandler.register(signal.SIGUSR1)
     take_notes(folder / "notes")
-    _start_fork_server()
+    start_fork_server("generate_jobs", "augment.generate.process_pool")
+    keep_in_forks()
     drive.ELSEWHERE_S = drive.WAIT_S = 0.05
     lidar_bytes(open_fake("fake:warm").labels.lidar(0))
     run_generate(make_job(folder / "warm"), progress=False)  # imports what is imported late
@@ -80,19 +79,6 @@ def main(folder: Path, names: list[str]) -> None:
             found[kill.__name__] = kill(place)
             found[kill.__name__]["seconds"] = round(time.perf_counter() - started, 2)
     print(json.dumps(found))
-
-
-def _start_fork_server() -> None:
-    multiprocessing.set_forkserver_preload(["generate_jobs", "augment.generate.process_pool"])
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    forkserver.ensure_running()
-    signal.pthread_sigmask(signal.SIG_SETMASK, before)
-    # Forks of this process use its server, and would look for it among their own children.
-    forkserver._forkserver.ensure_running = lambda: None
-    multiprocessing.get_context = lambda method=None: _contexts["forkserver"]
-
-
-_contexts = {name: multiprocessing.get_context(name) for name in ("forkserver", "fork")}
 
 
 # Driving
@@ -342,7 +328,7 @@ def _is_done(job: GenerateJob) -> bool:
 
 def workers_of_server() -> list[int]:
     """Worker processes: those that the fork server has started and that live."""
-    server = forkserver._forkserver._forkserver_pid
+    server = server_process()
     found = []
     for entry in os.listdir("/proc"):
         if entry.isdigit():

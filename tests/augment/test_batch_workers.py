@@ -20,6 +20,7 @@ from batch_scenes import (
     render_dying_at_frame_2,
     tree_digest,
 )
+from fork_server import quick_context, start_fork_server
 
 from augment.batch.job import RenderJob, run_job
 from augment.batch.manifest import read_manifest
@@ -36,10 +37,11 @@ from recipes.style import Style
 def test_a_dying_worker_costs_one_image_and_workers_change_no_file(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Three promises in one test, for every start of a worker imports torch anew.
-
-    The third: workers take over the job's bed and maps. What they found themselves would show.
+    """The third promise: workers take over the job's bed and maps. What they found themselves would
+    show.
     """
+    start_fork_server("batch_scenes", "augment.batch.worker")
+    monkeypatch.setattr("multiprocessing.get_context", quick_context)
     monkeypatch.setattr("augment.snow.beds.place_snow_bed", lambda *_, **__: make_bed(3.0))
     monkeypatch.setattr("augment.style.scene_maps._find_maps", lambda *_: make_maps(0.4))
     style = Style(preset="dusk")
