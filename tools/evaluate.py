@@ -5,6 +5,7 @@ The protocol is in docs/evaluation.md; warping is `augment.metrics.consistency`'
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -110,7 +111,7 @@ def compare(views: Views, pair: Pair) -> Compared:
     a, b = one.depth_view, other.depth_view
     carried = carry(views.paths(pair.a), a, b, one.shows_actor)
     alpha = np.where(carried.unclear_b, np.float32(0), b.alpha)
-    warp = find_warp(a, _with_alpha(b, alpha), carried.points_m)
+    warp = find_warp(a, dataclasses.replace(b, alpha=alpha), carried.points_m)
     water = None
     if one.shows_water is not None and other.shows_water is not None:
         # Bilinear: above 0 where any of the four neighbours is water.
@@ -152,12 +153,6 @@ def _record(views: Views, drive: Drive, pair: Pair, network: Lpips | None) -> di
         distance = picture_lpips(network, seen.warped, seen.a.depth_view.picture, counts)
         record[ALL] |= {"lpips": distance, "lpips_counted": distance / record[ALL]["share"]}
     return record
-
-
-def _with_alpha(view: Any, alpha: np.ndarray) -> Any:
-    import dataclasses
-
-    return dataclasses.replace(view, alpha=alpha)
 
 
 def _summaries(

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.compute as pc
 
 from augment.batch.encode import depth_in_metres
@@ -89,7 +90,7 @@ class Views:
                     f"{store.uri} has no {column} {unknown}; finished are: "
                     f"{', '.join(sorted(there)) or 'none'}"
                 )
-            table = table.filter(pc.is_in(table[column], pa_strings(wanted)))
+            table = table.filter(pc.is_in(table[column], pa.array(wanted, pa.string())))
         self.rows = Rows.of(table)
         self._store = store
         self._reader = RowReader(store, verify=False)
@@ -202,25 +203,19 @@ def _neighbours(views: Views, rows: Sequence[int]) -> Iterator[tuple[int, int]]:
 def _effects(rows: Rows, row: int) -> str:
     """Which effects the manifest's numbers name: `smog + snow`."""
     present = {
-        "smog": (rows["smog_extinction_per_m"][row] or 0) > 0
-        if "smog_extinction_per_m" in rows.weather
-        else False,
-        "flood": _is_number(rows, row, "flood_level_m"),
-        "snow": _is_number(rows, row, "snow_depth_m"),
+        "smog": _number(rows, row, "smog_extinction_per_m") > 0,
+        "flood": not math.isnan(_number(rows, row, "flood_level_m")),
+        "snow": _number(rows, row, "snow_depth_m") > 0,
         "style": rows["style"][row] is not None,
     }
     return " + ".join(name for name, there in present.items() if there) or "other"
 
 
-def _is_number(rows: Rows, row: int, name: str) -> bool:
-    return name in rows.weather and not math.isnan(rows[name][row])
+def _number(rows: Rows, row: int, name: str) -> float:
+    """A weather number; NaN where there is none."""
+    value = rows[name][row] if name in rows.weather else None
+    return math.nan if value is None else value
 
 
 def _read_paths(path: Any) -> tuple[ActorPaths]:
     return (ActorPaths(read_boxes(path)),)
-
-
-def pa_strings(values: Sequence[str]) -> Any:
-    import pyarrow as pa
-
-    return pa.array(values, pa.string())

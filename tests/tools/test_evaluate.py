@@ -1,0 +1,188 @@
+"""`climategs evaluate` on an output of a painted wall, whose pictures are known exactly."""
+
+import functools
+import json
+import math
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from report_outputs import make_row
+from safetensors.torch import save_file
+from walls import FRAME_NS, board_boxes, driving_camera, wall_view
+
+from augment.batch.calibration import frame_entry
+from augment.batch.encode import encode_depth, encode_ids, encode_image, encode_mask
+from augment.batch.label_files import boxes_bytes
+from augment.batch.manifest import rows_to_table, write_manifest
+from augment.cameras import Frame
+from augment.errors import OutputError
+from augment.metrics.lpips import ALEX, expected_shapes
+from recipes.schema import Output
+from tools.evaluate import evaluate_output
+from tools.evaluate_command import evaluate
+from tools.evaluate_text import PAPER
+from tools.json_files import write_json
+
+FRAMES = 9
+CAMERAS = {"ahead": 0.0, "left": 0.5, "behind": math.pi}  # name: yaw, radians
+FLICKER = 8 / 255
+
+
+def camera_of(name, frame):
+    return driving_camera(frame, name=name, yaw=CAMERAS[name])
+
+
+@functools.cache
+def boxes_file():
+    return boxes_bytes(board_boxes(FRAMES))
+
+
+@functools.cache
+def calibration_file():
+    ego, origin_m = torch.eye(4, dtype=torch.float64), np.zeros(3)
+    frames = [
+        Frame(n, n * FRAME_NS, ego, {name: camera_of(name, n) for name in CAMERAS})
+        for n in range(FRAMES)
+    ]
+    return json.dumps({"frames": [frame_entry(f, CAMERAS, 1.0, origin_m) for f in frames]}).encode()
+
+
+def write_image(out, row, *, depth=True, instance=False):
+    """The files of a row. Flooded ones flicker in the lower half, where their water is."""
+    base, stem = f"{row['scene']}/{row['variant']}", f"{row['camera']}/{row['frame']:06d}.png"
+    view = wall_view(camera_of(row["camera"], row["frame"]))
+    picture, depth_m = view.picture.copy(), view.depth_m.astype(np.float32)
+    wet = np.zeros(depth_m.shape, bool)
+    if row["recipe"] == "flood":
+        wet[len(wet) // 2 :] = True
+        picture[wet] += FLICKER * (row["frame"] % 2)
+    rgb = (picture.clip(0, 1) * 255).round().astype(np.uint8)
+    files = {"image": (f"{base}/images/{stem}", encode_image(rgb, Output()))}
+    files["labels"] = (f"{base}/labels/boxes.parquet", boxes_file())
+    files["calibration"] = (f"{base}/calibration.json", calibration_file())
+    if depth:
+        files["depth"] = (f"{base}/depth/{stem}", encode_depth(depth_m))
+    if row["recipe"] == "flood":
+        files["water"] = (f"{base}/water/{stem}", encode_mask(wet.astype(np.uint8) * 255))
+    if instance:
+        ids = (depth_m < 7).astype(np.uint16)
+        files["instance"] = (f"{base}/instance/{stem}", encode_ids(ids, np.uint16))
+    for kind, (path, data) in files.items():
+        row[f"{kind}_path"] = path
+        if not (out / path).exists():
+            (out / path).parent.mkdir(parents=True, exist_ok=True)
+            (out / path).write_bytes(data)
+
+
+def write_walls(out, recipes=("clear",), frames=range(FRAMES), **kwargs):
+    size = {"width": 64, "height": 48}
+    weather = {"clear": {}, "flood": {"flood_level_m": 0.3}, "fog": {"smog_extinction_per_m": 0.1}}
+    rows = [
+        make_row("wall", recipe, 0, frame, camera, **weather[recipe], **size)
+        for recipe in recipes
+        for frame in frames
+        for camera in CAMERAS
+    ]
+    for row in rows:
+        write_image(out, row, **kwargs)
+    write_manifest(out, rows_to_table(rows))
+    return out
+
+
+@pytest.fixture(scope="module")
+def walls(tmp_path_factory):
+    return write_walls(tmp_path_factory.mktemp("walls"), ("clear", "flood"), instance=True)
+
+
+@pytest.fixture(scope="module")
+def facts(walls):
+    return evaluate_output(walls, progress=False)
+
+
+def test_a_clean_wall_has_the_errors_of_its_files(facts):
+    clear = facts["recipes"][0]
+    assert clear["recipe"] == "clear" and clear["effects"] == "clean"
+    # Cameras that look back see the wall behind the world: depth below 0 is none.
+    assert [clear[k]["pairs"] for k in ("short", "long", "cameras")] == [16, 4, 9]
+    assert [clear[k]["left_out"] for k in ("short", "long", "cameras")] == [8, 2, 0]
+    for kind in ("short", "long", "cameras"):
+        # 8 bits: two roundings of +-1/2 of 255, less where four are blended.
+        assert 0 < clear[kind]["all"]["rmse"]["mean"] < 0.41 / 255
+        assert clear[kind]["water"] is None
+    assert clear["short"]["seconds_apart"] == pytest.approx(0.1)
+    assert clear["long"]["meters_apart"] == pytest.approx(0.7)
+    assert clear["long"]["moved_share"] > 0.005
+
+
+def test_water_is_reported_apart(facts):
+    flood = facts["recipes"][1]
+    assert flood["effects"] == "flood"
+    short = flood["short"]
+    assert short["water"]["rmse"]["mean"] == pytest.approx(FLICKER, rel=0.05)
+    assert short["dry"]["rmse"]["mean"] < 0.41 / 255
+    assert short["dry"]["rmse"]["mean"] < short["all"]["rmse"]["mean"] < FLICKER
+    shares = [short[part]["share"]["mean"] for part in ("all", "dry", "water")]
+    assert shares[0] == pytest.approx(shares[1] + shares[2])
+    assert flood["cameras"]["water"]["rmse"]["mean"] < 0.41 / 255  # of one frame: no flicker
+    worst = next(w for w in facts["worst"] if (w["recipe"], w["kind"]) == ("flood", "short"))
+    assert worst["all"]["rmse"] == max(
+        p["all"]["rmse"] or 0 for p in facts["pairs"] if p["recipe"] == "flood"
+    )
+
+
+def test_command(walls, tmp_path, capsys):
+    shapes = expected_shapes(ALEX)
+    generator = torch.Generator().manual_seed(1)
+    tensors = {n: torch.randn(s, generator=generator).abs() / 50 for n, s in shapes.items()}
+    save_file(tensors, tmp_path / "alex.safetensors")
+    code = evaluate(
+        str(walls),
+        pairs=2,
+        recipes="flood",
+        lpips=tmp_path / "alex.safetensors",
+        pictures=tmp_path / "worst",
+        json_file=tmp_path / "facts.json",
+    )
+    out = capsys.readouterr().out
+    assert code == 0
+    assert "1 frame apart" in out and "7 frames apart" in out and "Neighbouring cameras" in out
+    assert "| flood | flood | 2 | 0 | 0.10 m, 0.10 s |" in out and "| water only |" in out
+    assert all(name in out for name in PAPER) and "0.057 | 0.053 | 0.171 | 0.175" in out
+    facts = json.loads((tmp_path / "facts.json").read_text())
+    assert facts["lpips"] == "alex" and len(facts["pairs"]) == 6
+    short = next(p for p in facts["pairs"] if p["kind"] == "short")["all"]
+    assert short["lpips"] == pytest.approx(short["lpips_counted"] * short["share"])
+    assert short["lpips"] > 0
+    for kind in ("short", "long", "cameras"):
+        picture = cv2.imread(str(tmp_path / "worst" / f"flood-{kind}.png"))
+        assert picture.shape[2] == 3 and picture.std() > 10
+
+
+def test_frames_that_are_not_consecutive_have_no_pairs(tmp_path):
+    write_walls(tmp_path / "out", frames=(0, 2, 4))
+    facts = evaluate_output(tmp_path / "out", progress=False)
+    clear = facts["recipes"][0]
+    assert clear["short"] is None and clear["long"] is None and clear["cameras"]["pairs"] == 3
+    two = evaluate_output(tmp_path / "out", short=2, long=4, progress=False)["recipes"][0]
+    assert two["short"]["pairs"] + two["short"]["left_out"] == 6
+    write_json(tmp_path / "f.json", facts)  # None and numbers only
+
+
+def test_errors_say_what_to_do(walls, tmp_path):
+    with pytest.raises(OutputError, match="nothing in it is finished yet"):
+        evaluate_output(tmp_path)
+    with pytest.raises(OutputError, match=r"no recipe \['snow'\]; finished are: clear, flood"):
+        evaluate_output(walls, recipes=["snow"])
+    with pytest.raises(OutputError, match="1 <= short < long"):
+        evaluate_output(walls, short=7, long=7)
+    write_walls(tmp_path / "flat", frames=(0, 1), depth=False)
+    with pytest.raises(OutputError, match=r"has no depth images.*depth: median"):
+        evaluate_output(tmp_path / "flat", progress=False)
+    one = tmp_path / "one"
+    row = make_row("wall", "clear", 0, 0, "ahead", width=64, height=48)
+    write_image(one, row)
+    write_manifest(one, rows_to_table([row]))
+    with pytest.raises(OutputError, match="no two images to compare"):
+        evaluate_output(one, progress=False)
