@@ -11,6 +11,7 @@ import tyro
 from tools import (
     bench_commands,
     commands,
+    evaluate_command,
     export_commands,
     generate_commands,
     report_command,
@@ -26,6 +27,7 @@ COMMANDS = {
     "recipes": commands.recipes,
     "sheet": commands.sheet,
     "report": report_command.report,
+    "evaluate": evaluate_command.evaluate,
     "bench": commands.bench,
     "demo": commands.demo,
     "style": commands.style,
