@@ -82,9 +82,9 @@ def within_budget(
 ) -> Budgeted:
     """Accurate settings whose frames together take no longer than the budget.
 
-    From reference on, the step is taken that saves the most time for the error that it adds, by
-    what each knob costs alone, and the time of all together measured again, until it is within the
-    budget or no step is left that saves anything.
+    From reference on, the knob goes a step on that saves the most time for the error that it adds,
+    by what each costs alone, and the time of all together is measured again, until it is within
+    the budget or no step is left that saves anything.
 
     costs: of every value of every knob, its reference included. ms_of: time of settings together.
     """
@@ -95,15 +95,11 @@ def within_budget(
         ms = ms_of(settings)
         if ms <= budget_ms:
             return Budgeted(settings, ms, is_met=True)
-        steps = [
-            (_worth(ladder[places[path]], ladder[place]), path, place)
-            for path, ladder in ladders.items()
-            for place in range(places[path] + 1, len(ladder))
-        ]
-        if not steps:
+        left = [path for path, ladder in ladders.items() if places[path] < len(ladder) - 1]
+        if not left:
             return Budgeted(settings, ms, is_met=False)
-        _, path, place = max(steps, key=lambda step: step[0])
-        places[path] = place
+        best = max(left, key=lambda path: _worth(ladders[path][places[path] :]))
+        places[best] += 1
 
 
 def useful(costs: Sequence[Cost]) -> list[Cost]:
@@ -120,7 +116,11 @@ def useful(costs: Sequence[Cost]) -> list[Cost]:
     return kept
 
 
-def _worth(before: Cost, after: Cost) -> tuple[float, float]:
-    """Time saved for the error added, then time saved."""
-    saved, added = before.ms - after.ms, after.flip - before.flip
-    return (saved / added if added > 0 else math.inf), saved
+def _worth(ladder: Sequence[Cost]) -> tuple[float, float]:
+    """Time saved for the error added, then time saved, of the best of the steps down a ladder.
+
+    Where a step is poor and the one behind it good, it is the way there.
+    """
+    before, *after = ladder
+    saved = [(before.ms - cost.ms, cost.flip - before.flip) for cost in after]
+    return max((ms / error if error > 0 else math.inf, ms) for ms, error in saved)

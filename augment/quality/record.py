@@ -26,7 +26,7 @@ from augment.errors import OutputError
 from augment.quality.settle import Report, Settled, settle, settled_recipe
 from augment.quality.views import calibration_views
 from augment.scene import Scene
-from recipes.knobs import free_knobs
+from recipes.knobs import BY_PATH, free_knobs
 from recipes.schema import Recipe
 
 FOLDER = f"{STATE_FOLDER}/quality"
@@ -133,6 +133,7 @@ def recorded(store: Store, question: Question) -> Recipe | None:
         settings = document["choice"]["settings"]
         if not isinstance(settings, dict):
             raise TypeError(f"its settings are {settings!r}")
+        _check_values(settings)
         return settled_recipe(question.recipe, settings)
     except (ValueError, TypeError, KeyError, RecursionError) as error:
         said = f"{error} is missing" if isinstance(error, KeyError) else str(error)
@@ -166,6 +167,13 @@ def settle_once(
             claim.check()
             store.write(question.path, _to_json(question, settled.report))
     return found
+
+
+def _check_values(settings: dict[str, Any]) -> None:
+    for path, value in settings.items():
+        knob = BY_PATH.get(path)
+        if knob is None or not any(value == v and type(value) is type(v) for v in knob.values):
+            raise ValueError(f"{path} = {value!r} is none of the values to choose from")
 
 
 def _claimed(store: Store, question: Question) -> Claim:
