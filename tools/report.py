@@ -34,7 +34,15 @@ IMAGES = 48
 LARGEST_PAGE = 5_000_000  # bytes
 MOST_RECIPES = 12  # whose labels and sweeps are looked at
 # Of a million rows they take some hundred megabytes, over and over.
-_UNUSED = ["timestamp_ns", "instance_path", "calibration_path", "recipe_hash", "style_method"]
+_UNUSED = [
+    "timestamp_ns",
+    "instance_path",
+    "calibration_path",
+    "recipe_hash",
+    "style_method",
+    "render_scale",
+    "settings",
+]
 _SECTIONS = {
     "compare": "Before and after",
     "images": "Images",

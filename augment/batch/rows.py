@@ -55,14 +55,17 @@ def image_row(
 def shown_words(recipe: Recipe) -> dict[str, str | float | None]:
     """What a recipe says of its images beside the weather's numbers, by columns.
 
-    settings: JSON of the values of the knobs that trade speed for accuracy (recipes.knobs), by
-    dotted path, as far as they have an effect.
+    settings: JSON of the values of the knobs that a quality may set (recipes.knobs) and that have
+    an effect, by dotted path; None where the recipe has no quality.
     """
-    chosen = {k.path: found(recipe, k.path) for k in knobs_of(recipe) if k.chosen}
+    words, settings = recipe.quality.words, None
+    if words is not None:
+        values = {knob.path: found(recipe, knob.path) for knob in knobs_of(recipe) if knob.chosen}
+        settings = json.dumps(values, separators=(",", ":"))
     return {
         "surface": recipe.output.surface,
         **recipe.style_words(),
-        "quality": recipe.quality.words,
+        "quality": words,
         "render_scale": recipe.render.scale,
-        "settings": json.dumps(chosen, separators=(",", ":")),
+        "settings": settings,
     }
