@@ -149,8 +149,8 @@ class Render(Closed):
         ge=1e-6,
         le=0.25,
         description="A pixel is finished once no more than this share of the light behind shines "
-        "through: what is lost is at most that share, and the sky shows in its place. 1e-6 blends "
-        "what no picture in 8 bits shows; 0.5 would leave no median depth, hence the limit.",
+        "through; what it shows by then stands for the rest. 1e-6 blends what no picture in 8 bits "
+        "shows; 0.5 would leave no median depth, hence the limit.",
     )
     radius_clip_px: Number = Field(
         default=0.0,

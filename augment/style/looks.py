@@ -27,12 +27,18 @@ _MOST_LOOKS = 4  # of a scene, that are kept: a job goes through its variants fr
 class Look:
     """The maps of a style in a scene, and the scene's sky under them. levels [N]: how much of each
     background splat is sky; None where none is any.
+
+    folds: the background's SH are mapped once and kept, as much memory as they take themselves, in
+    place of the colours that they evaluate to, which a map does not commute with where the clamp to
+    >= 0 acts (augment.style.apply). Actors' colours are mapped either way: their SH are turned and
+    changed from frame to frame, and they are few.
     """
 
     maps: StyleMaps
     sky: Sky
     bare: Scene
     levels: Int16[Tensor, "N"] | None = None
+    folds: bool = False
 
     def on(self, parts: Sequence[PosedGaussians]) -> tuple[PosedGaussians, ...]:
         """The parts under the maps; snow among them keeps its colours."""
@@ -46,9 +52,16 @@ class Look:
         return dataclasses.replace(self.bare, background=flat, sky=self.sky)
 
     def _mapped(self, part: PosedGaussians) -> PosedGaussians:
+        if self.folds and part.gaussians.sh is self.bare.background.sh:
+            styled = dataclasses.replace(part.gaussians, sh=self._folded_sh)
+            return dataclasses.replace(part, gaussians=styled)
         if self.levels is None or part.instance_id > 0:
             return dataclasses.replace(part, color_maps=self.maps.splats)
         return dataclasses.replace(part, color_maps=self._level_maps, color_rows=self._rows)
+
+    @cached_property
+    def _folded_sh(self) -> Float[Tensor, "N K 3"]:
+        return style_gaussians(self.bare.background, self.maps, levels=self.levels).sh
 
     @cached_property
     def _level_maps(self) -> Float[Tensor, "R 3 4"]:
@@ -74,7 +87,7 @@ def look_of(scene: Scene, style: Style) -> Look:
         # The scene itself would be kept alive by what is remembered for as long as it lives.
         bare = dataclasses.replace(scene)
         sky, levels = style_sky(scene.sky, maps.sky), sky_levels(scene, maps)
-        look = looks[style] = Look(maps, sky, bare, levels)
+        look = looks[style] = Look(maps, sky, bare, levels, folds=style.evaluated == "sh")
     looks.move_to_end(style)
     while len(looks) > _MOST_LOOKS:
         looks.popitem(last=False)

@@ -7,9 +7,10 @@ import torch
 
 from augment.errors import BackendUnavailable
 from augment.render import rasterize as module
-from augment.render.buffers import BUFFERS
+from augment.render.buffers import BUFFERS, RenderOutput
 from augment.render.constants import RasterSettings
 from augment.render.rasterize import available_backends, rasterize
+from augment.render.remainder import share_remainder
 from augment.scene import Gaussians, PosedGaussians
 from augment.weather.smog import SmogMedium
 from tests.assertions import assert_images_close
@@ -69,6 +70,41 @@ def test_backends_draw_the_same_picture(parts):
     # float32 in two orders of operations; flips at the 1/255 cut-off are allowed for
     assert_images_close(cpu.rgb, reference.rgb, p999=1e-4, max_flips=3)
     assert_images_close(cpu.alpha, reference.alpha, p999=1e-4, max_flips=3)
+
+
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+def test_what_a_raised_stop_leaves_is_shared(parts, backend):
+    """Finished pixels are opaque and keep their hue; the others are as ever."""
+    camera, stop = camera_ahead(61, 43, 55.0), 0.2
+    settings = RasterSettings(transmittance_stop=stop)
+    exact = rasterize(parts, camera, backend=backend)
+    output = rasterize(parts, camera, settings=settings, backend=backend)
+    finished = output.alpha == 1
+    assert torch.equal(output.rgb[~finished], exact.rgb[~finished])
+    assert (
+        float(output.alpha[~finished].max()) < 1 - stop < float(exact.alpha[finished].min()) + 1e-6
+    )
+    drawn = module._rasterize(
+        parts, camera, frozenset(BUFFERS), settings, None, None, None, backend
+    )
+    expected = drawn.rgb[finished] / drawn.alpha[finished][:, None]
+    torch.testing.assert_close(output.rgb[finished], expected, rtol=1e-6, atol=0)
+    every = rasterize(parts, camera, buffers=BUFFERS, settings=settings, backend=backend)
+    assert torch.equal(every.rgb, output.rgb) and torch.equal(every.snow, 0 * every.snow)
+    alone = rasterize(parts, camera, buffers={"rgb"}, settings=settings, backend=backend)
+    assert alone.alpha is None and torch.equal(alone.rgb, output.rgb)
+
+
+def test_kernel_and_definition_share_the_rest_alike():
+    rng = torch.Generator().manual_seed(0)
+    images = {"rgb": (9, 7, 3), "alpha": (9, 7), "snow": (9, 7)}
+    images = {name: torch.rand(shape, generator=rng) for name, shape in images.items()}
+    images["alpha"][0, :3] = torch.tensor([0.75, 1.0, 0.0])
+    slow = share_remainder(RenderOutput(**images), 0.25, fast=False)
+    fast = share_remainder(RenderOutput(**{n: i.clone() for n, i in images.items()}), 0.25)
+    for name in images:
+        torch.testing.assert_close(getattr(fast, name), getattr(slow, name), rtol=3e-7, atol=0)
+    assert slow.alpha[0, 0] == 1 and slow.alpha[0, 2] == 0
 
 
 # ---- choice of backend ------------------------------------------------------------------------
@@ -154,6 +190,16 @@ def test_a_failing_import_names_the_reason_and_the_way_out(monkeypatch):
         ({"settings": RasterSettings(near_m=0.0)}, ValueError, "near_m must be finite and > 0"),
         ({"settings": RasterSettings(alpha_max=1.0)}, ValueError, "alpha_max must lie between"),
         ({"settings": RasterSettings(sh_degree=4)}, ValueError, "None or 0 to 3; got 4"),
+        (
+            {"settings": RasterSettings(transmittance_stop=0.3)},
+            ValueError,
+            "> 0 and at most 0.25, since median depth",
+        ),
+        (
+            {"settings": RasterSettings(radius_clip_px=-1.0)},
+            ValueError,
+            "finite and >= 0 (pixels); got -1.0",
+        ),
     ],
 )
 def test_arguments_that_are_refused(parts, arguments, error, message):

@@ -174,6 +174,19 @@ def test_random_gaussians(size, antialiased):
     )
 
 
+def test_settings_that_leave_splats_out():
+    settings = RasterSettings(transmittance_stop=0.05, radius_clip_px=6.0)
+    found = assert_gradients_match(
+        posed(crowd(600, opacity=0.6), random_gaussians(300)),
+        camera_ahead(37, 21, 28.0),
+        settings,
+        tolerance=1e-4,
+        max_flips=8,
+    )
+    small = found[1]["sh"]  # of random sizes
+    assert 20 < (np.abs(small).reshape(300, -1).any(1)).sum() < 250
+
+
 def test_an_image_of_one_pixel():
     assert_gradients_match(posed(random_gaussians(200, size=0.6)), camera_ahead(1, 1, 2.0))
 

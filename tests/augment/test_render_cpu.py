@@ -24,7 +24,9 @@ from augment.render.buffers import (
 )
 from augment.render.constants import RasterSettings
 from augment.render.cpu import rasterize_cpu, warm_up
+from augment.render.cpu_inputs import gather_inputs
 from augment.render.reference import rasterize_reference
+from augment.render.reference_project import project_parts
 from augment.scene import Gaussians, PosedGaussians
 from augment.weather.smog import SmogMedium
 from tests.assertions import assert_images_close, assert_labels_equal
@@ -138,12 +140,33 @@ def test_random_scenes(size, seed):
         RasterSettings(antialiased=True),
         RasterSettings(alpha_max=0.99, near_m=1.5),
         RasterSettings(sh_degree=1),
+        RasterSettings(transmittance_stop=0.05, radius_clip_px=6.0),
+        RasterSettings(transmittance_stop=1e-6, radius_clip_px=2.5, antialiased=True),
     ],
-    ids=["antialiased", "near and alpha_max", "sh_degree"],
+    ids=["antialiased", "near and alpha_max", "sh_degree", "coarse", "fine"],
 )
 def test_settings(settings):
     parts = [PosedGaussians(random_gaussians(400, size=0.1))]
     assert_matches_definition(parts, camera_ahead(97, 61, 80.0), settings)
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("clip_px", [1e-4, 1.0, 2.0, 8.0])
+def test_ranking_keeps_every_splat_that_is_larger_than_the_clip(clip_px, antialiased):
+    """Its bound on the radius is generous, and what it drops would pay no further."""
+    settings = RasterSettings(radius_clip_px=clip_px, antialiased=antialiased)
+    parts = [PosedGaussians(random_gaussians(3000, size=0.3, sh_degree=0), slight_pose())]
+    camera = camera_ahead(37, 21, 9.0)  # wide, so that bounds at the image's edge matter
+    with cpu_scratch.borrowed_scratch() as scratch:
+        inputs = gather_inputs(parts, camera, settings, None, with_color=True)
+        kept = cpu.rank(inputs, camera, scratch)[0][:3000].copy() > 0
+        plain = gather_inputs(parts, camera, RasterSettings(), None, with_color=True)
+        seen = cpu.rank(plain, camera, scratch)[0][:3000].copy() > 0
+    exact = np.zeros(3000, bool)
+    exact[project_parts(in_float64(parts), camera, settings).ids] = True
+    assert not (seen & exact & ~kept).any()
+    if clip_px >= 2:
+        assert (seen & ~kept).sum() > 0.2 * (seen & ~exact).sum()
 
 
 @pytest.mark.parametrize("sh_degree", [0, 1, 2])

@@ -12,7 +12,7 @@ from augment.geometry import (
 )
 from augment.render import reference
 from augment.render.buffers import ALPHA, BUFFERS, EXPECTED_DEPTH, MEDIAN_DEPTH, RGB
-from augment.render.constants import RasterSettings
+from augment.render.constants import MOST_TRANSMITTANCE_STOP, RasterSettings
 from augment.render.reference import rasterize_reference
 from augment.render.reference_project import order_by_depth, project_parts
 from augment.render.sh import rotate_sh
@@ -61,7 +61,7 @@ def loop_pixel(splats, column, row, settings):
         if alpha < 1 / 255:
             continue
         behind = transmittance * (1 - alpha)
-        if behind <= 1e-4:
+        if behind <= min(settings.transmittance_stop, 1e-4):
             stopped = True
             break
         weight = alpha * transmittance
@@ -73,6 +73,9 @@ def loop_pixel(splats, column, row, settings):
         if transmittance >= 0.5 and behind < 0.5:
             median = float(splats.depths[i])
         transmittance = behind
+        if transmittance <= settings.transmittance_stop:
+            stopped = True
+            break
     return rgb, 1 - transmittance, depth_sum / max(weight_sum, 1e-10), median, best_id, stopped
 
 
@@ -93,13 +96,18 @@ def assert_equals_loops(gaussians, camera, settings=DEFAULT):
     return pixels_stopped
 
 
-@pytest.mark.parametrize("antialiased", [False, True])
-def test_against_loops_over_pixels_and_splats(antialiased):
+@pytest.mark.parametrize(
+    "settings",
+    [DEFAULT, RasterSettings(antialiased=True), RasterSettings(transmittance_stop=0.1)],
+    ids=["default", "antialiased", "stop"],
+)
+def test_against_loops_over_pixels_and_splats(settings):
     gaussians = random_gaussians(400, dtype=torch.float64, size=0.7)
     camera = camera_ahead(19, 13, 15.0)
-    settings = RasterSettings(antialiased=antialiased)
     stopped = assert_equals_loops(gaussians, camera, settings)
-    assert 0 < stopped < 13 * 19  # both kinds of pixel occur
+    assert stopped > 0
+    if settings.transmittance_stop == DEFAULT.transmittance_stop:
+        assert stopped < 13 * 19  # both kinds of pixel occur
 
 
 @pytest.mark.parametrize(("width", "height"), [(1, 1), (16, 16), (17, 1), (3, 50)])
@@ -245,6 +253,37 @@ def test_blending_stops_before_the_splat_that_would_reach_the_stop():
     stopped = render(stack(*walls[:3]), camera_ahead(6, 4))
     assert_outputs_close(output, stopped, 0.0)
     assert float(output.alpha.max()) == pytest.approx(0.999, abs=1e-5)
+
+
+def test_a_greater_stop_blends_the_splat_that_reaches_it():
+    # transmittance 0.1, 0.001; the third is not blended
+    walls = [wall(2, 0.9), wall(3, 0.99), wall(4, 0.5, (9, 9, 9))]
+    settings = RasterSettings(transmittance_stop=0.05)
+    output = render(stack(*walls), camera_ahead(6, 4), settings=settings)
+    assert_outputs_close(output, render(stack(*walls[:2]), camera_ahead(6, 4)), 0.0)
+    assert float(output.alpha.max()) == pytest.approx(0.999, abs=1e-5)
+
+
+@pytest.mark.parametrize("stop", [1e-6, 0.01, MOST_TRANSMITTANCE_STOP])
+def test_no_stop_moves_the_median_depth(stop):
+    gaussians, camera = random_gaussians(400, dtype=torch.float64, size=0.7), camera_ahead(19, 13)
+    settings = RasterSettings(transmittance_stop=stop)
+    expected = render(gaussians, camera).median_depth
+    assert torch.equal(render(gaussians, camera, settings=settings).median_depth, expected)
+
+
+@pytest.mark.parametrize("orthographic", [False, True])
+def test_splats_no_larger_than_the_radius_clip_are_left_out(orthographic):
+    """An upright ellipsoid on the axis: 3 px right and 6 px down at one sigma, before the blur."""
+    camera = camera_ahead(81, 81, 60.0)
+    camera = dataclasses.replace(camera, cx=40.5, cy=40.5, is_orthographic=orthographic)
+    divisor = 1 if orthographic else 4
+    scale = (0.01, 3 * divisor / camera.fx, 6 * divisor / camera.fy)
+    ball = one_gaussian((4.0, 0, 0), scale, 0.5, dtype=torch.float64)
+    radius = math.sqrt(2 * math.log(255 * 0.5) * (36 + 0.3))
+    for clip, is_drawn in ((0.0, True), (radius - 1e-4, True), (radius + 1e-4, False)):
+        output = render(ball, camera, settings=RasterSettings(radius_clip_px=clip))
+        assert bool(output.alpha.any()) == is_drawn
 
 
 def test_the_stop_itself_is_not_reached():

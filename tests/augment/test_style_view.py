@@ -12,11 +12,11 @@ from augment.apply import render_buffers, render_view
 from augment.dataset import SceneDataset
 from augment.plan import make_plan
 from augment.render.rasterize import rasterize
-from augment.scene import Scene
+from augment.scene import PosedGaussians, Scene
 from augment.semantics import SemanticClass
 from augment.snow.covers import cover_of
 from augment.style import scene_maps
-from augment.style.looks import look_of
+from augment.style.looks import Look, look_of
 from augment.style.maps import CLASSES, StyleMaps
 from augment.style.scene_maps import remember_maps, style_maps
 from recipes.flood import Flood, Waves
@@ -198,6 +198,55 @@ def test_maps_are_made_once(scene):
     other = StyleMaps(gentle(1)[None], gentle(2), gentle(3))
     remember_maps(scene, STYLE, other)
     assert look_of(scene, STYLE).maps is other
+
+
+def with_directions(scene: Scene, spread: float) -> Scene:
+    """The scene with a background of degree 1 whose colours change with the direction."""
+    first = scene.background.sh
+    rng = torch.Generator().manual_seed(7)
+    more = spread * (torch.rand(len(first), 3, 3, generator=rng) - 0.5)
+    background = dataclasses.replace(scene.background, sh=torch.cat([first, more], 1))
+    return dataclasses.replace(scene, background=background)
+
+
+@pytest.mark.parametrize("backend", ["cpu", "reference"])
+@pytest.mark.parametrize("weather", [{}, {"snow": Snow(depth_m=0.1, cell_m=0.1, coverage=0.3)}])
+def test_folded_maps_draw_the_same_where_no_colour_is_clamped(scene, weather, backend):
+    scene = with_directions(scene, 0.1)
+    folding = Style(preset="dusk", evaluated="sh")
+    for style in (STYLE, folding):
+        known_maps(scene, style)
+    by_color, by_sh = (
+        buffers_of(scene, recipe_of(style, **weather), backend) for style in (STYLE, folding)
+    )
+    # 1e-5: sums of 4 terms in float32, folded or not, blended.
+    torch.testing.assert_close(by_sh.rgb, by_color.rgb, rtol=0, atol=1e-5)
+    ground = by_sh.parts[0]
+    assert ground.color_maps is None and by_color.parts[0].color_maps is not None
+    again = buffers_of(scene, recipe_of(folding, **weather), backend)
+    assert again.parts[0].gaussians.sh is ground.gaussians.sh  # once for all frames
+    assert torch.equal(ground.gaussians.means, scene.background.means)
+    assert not torch.equal(ground.gaussians.sh, scene.background.sh)
+    assert by_sh.parts[1].color_maps is not None  # of an actor
+
+
+def test_folded_maps_know_the_splats_that_paint_sky(scene):
+    levels = torch.zeros(len(scene.background), dtype=torch.int16)
+    levels[::3] = 5
+    maps = StyleMaps(gentle(1)[None], gentle(2), gentle(3))
+    by_color, by_sh = (
+        Look(maps, scene.sky, scene, levels, folds=folds).on(scene.parts_for(camera_of(scene)))
+        for folds in (False, True)
+    )
+    images = [rasterize(parts, camera_of(scene)).rgb for parts in (by_color, by_sh)]
+    torch.testing.assert_close(*images, rtol=0, atol=1e-5)
+
+
+def test_a_background_of_other_splats_is_mapped_by_colour(scene):
+    look = Look(known_maps(scene), scene.sky, scene, folds=True)
+    some = scene.background.select(torch.arange(10))
+    [part] = look.on([PosedGaussians(some)])
+    assert part.color_maps is not None and part.gaussians is some
 
 
 def test_a_preset_darkens_the_day(scene):
