@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from augment.render import cpu_simd as v8
-from augment.render.cpu_geometry import dot, rotation_row, semi_axes
+from augment.render.cpu_geometry import cross, dot, rotation_row, semi_axes
 from augment.render.cpu_items import BATCH
 from augment.render.cpu_jit import inner
 from augment.render.cpu_layout import (
@@ -70,16 +70,7 @@ def cut_eight(quats, scales, picked, at, d, x, y, inverse, view):
     sigma = v8.sqrt(dot(rise0, rise1, rise2, rise0, rise1, rise2))
     reach = v8.splat(view[V_EXTENT]) * sigma
 
-    # Slope of depth: the image's covariance, inverted, times that of position and depth.
-    blur = v8.splat(_SHARP)
-    xx = blur + dot(right[0], right[1], right[2], right[0], right[1], right[2])
-    yy = blur + dot(down[0], down[1], down[2], down[0], down[1], down[2])
-    xy = dot(right[0], right[1], right[2], down[0], down[1], down[2])
-    cx = dot(right[0], right[1], right[2], away0, away1, away2)
-    cy = dot(down[0], down[1], down[2], away0, away1, away2)
-    lean = xy / yy
-    gx = (cx - lean * cy) / v8.maximum(xx - lean * xy, blur)
-    gy = (cy - xy * gx) / yy
+    gx, gy = _depth_slope(right, down, (away0, away1, away2))
 
     fall = v8.splat(view[V_CLIP_FALL]) * inverse * inverse
     lx = v8.splat(view[V_CLIP_CAMERA] / view[V_FOCAL]) - fall * gx
@@ -99,6 +90,41 @@ def cut_eight(quats, scales, picked, at, d, x, y, inverse, view):
         v8.at_least(v8.splat(view[V_CLIP_REACH]), height - reach),
     )
     return partly, offset + v8.splat(view[V_CLIP_EDGE]), lx, ly, gx * inverse, gy * inverse, deep
+
+
+@inner()
+def _depth_slope(x, y, z):
+    """g = S2^-1 c of semi-axes right, down and away (see augment.render.clip), per px.
+
+    By the identities of Lagrange and Binet-Cauchy, with S2 = [x.x + b, x.y; x.y, y.y + b],
+
+        det S2 gx = (x cross y).(z cross y) + b x.z        det S2 = |x cross y|^2 + b (...)
+        det S2 gy = (y cross x).(z cross x) + b y.z
+
+    Written out, S2's determinant would lose all digits of needles and of sheets seen edge-on. All
+    is divided by y.y + b, each cross product by its root, so that nothing overflows.
+    """
+    one, blur = v8.splat(np.float32(1)), v8.splat(_SHARP)
+    inverse = one / (blur + dot(y[0], y[1], y[2], y[0], y[1], y[2]))
+    root = v8.sqrt(inverse)
+    c0, c1, c2 = cross(x, y, root)
+    right0, right1, right2 = cross(z, y, root)
+    down0, down1, down2 = cross(x, z, root)
+    by_blur = blur * inverse
+    det = dot(c0, c1, c2, c0, c1, c2) + v8.fmuladd(
+        by_blur, dot(x[0], x[1], x[2], x[0], x[1], x[2]), blur
+    )
+    gx = v8.fmuladd(
+        by_blur,
+        dot(x[0], x[1], x[2], z[0], z[1], z[2]),
+        dot(c0, c1, c2, right0, right1, right2),
+    )
+    gy = v8.fmuladd(
+        by_blur,
+        dot(y[0], y[1], y[2], z[0], z[1], z[2]),
+        dot(c0, c1, c2, down0, down1, down2),
+    )
+    return gx / det, gy / det
 
 
 @inner()

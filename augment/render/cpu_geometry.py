@@ -43,6 +43,16 @@ def dot(ax, ay, az, bx, by, bz):
 
 
 @inner()
+def cross(a, b, scale):
+    """The cross product of two triples, times a number."""
+    return (
+        (a[1] * b[2] - a[2] * b[1]) * scale,
+        (a[2] * b[0] - a[0] * b[2]) * scale,
+        (a[0] * b[1] - a[1] * b[0]) * scale,
+    )
+
+
+@inner()
 def rotation_row(view, row):
     at = U(V_ROTATION) + U(3) * row
     return v8.splat(view[at]), v8.splat(view[at + U(1)]), v8.splat(view[at + U(2)])
@@ -109,11 +119,7 @@ def image_covariance(quats, scales, picked, at, x, y, inverse, view):
     )
     # Lagrange's identity, det = |x cross y|^2, each term divided before it is squared.
     scale = v8.splat(np.float32(1)) / v8.sqrt(yy + v8.splat(view[V_BLUR]))
-    c0, c1, c2 = (
-        (x1 * y2 - x2 * y1) * scale,
-        (x2 * y0 - x0 * y2) * scale,
-        (x0 * y1 - x1 * y0) * scale,
-    )
+    c0, c1, c2 = cross(right, down, scale)
     return xx, xy, yy, dot(c0, c1, c2, c0, c1, c2)
 
 

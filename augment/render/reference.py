@@ -139,9 +139,13 @@ def blend(
             )
         else:
             tiles.append(blend_tile(*args))
-    return RenderOutput(
-        **{name: _assemble([getattr(t, name) for t in tiles], lists, camera) for name in buffers}
-    )
+    images = {name: _assemble([getattr(t, name) for t in tiles], lists, camera) for name in buffers}
+    if recompute and len(lists.members) == 0:
+        # A view of nothing is a function of the splats too: its gradients are 0, not an error.
+        floats = [value for value in splats.columns().values() if value.is_floating_point()]
+        nothing = torch.stack([value[:0].sum() for value in floats]).sum()
+        images = {n: i + nothing if i.is_floating_point() else i for n, i in images.items()}
+    return RenderOutput(**images)
 
 
 def _assemble(tiles: list[Tensor], lists: TileLists, camera: Camera) -> Tensor:

@@ -192,12 +192,7 @@ def _cut(
     """Cuts, and which splats have a part on the kept side. heights: positive there."""
     up = (clip.sign * camera.camera_from_world[:3, 2]).to(axes.dtype)
     reach = MAX_EXTENT_SIGMAS * (up @ axes).norm(dim=-1)
-    right, down = _image_axes(points, axes, camera)
-    xx, yy = right.square().sum(1) + SHARP_PX2, down.square().sum(1) + SHARP_PX2
-    xy = (right * down).sum(1)
-    cx, cy = (right * axes[:, 2]).sum(1), (down * axes[:, 2]).sum(1)
-    gx = (cx - xy / yy * cy) / (xx - xy / yy * xy).clamp_min(SHARP_PX2)
-    gy = (cy - xy * gx) / yy
+    gx, gy = _depth_slope(*_image_axes(points, axes, camera), axes[:, 2])
     by = _divisors(points, camera)
     fall = clip.sign * (float(camera.centre[2]) - clip.z_m) / by**2
     most = LONGEST
@@ -212,6 +207,25 @@ def _cut(
     slope = torch.where(whole[:, None], torch.zeros_like(slope), slope / length[:, None])
     cuts = torch.cat([offset[:, None], slope, torch.stack([gx / by, gy / by, deep], -1)], 1)
     return cuts, (heights >= -reach) & (heights - reach <= clip.reach_m)
+
+
+def _depth_slope(
+    right: Float[Tensor, "M 3"], down: Float[Tensor, "M 3"], away: Float[Tensor, "M 3"]
+) -> tuple[Float[Tensor, "M"], Float[Tensor, "M"]]:
+    """g = S2^-1 c (augment.render.clip), per px right and down, of semi-axes.
+
+    Determinants are written as products of cross products (Lagrange, Binet-Cauchy): of needles, and
+    of sheets seen edge-on, all digits would cancel, even in float64.
+    """
+    scale = (down.square().sum(1) + SHARP_PX2).rsqrt()[:, None]
+    minors = torch.linalg.cross(right, down) * scale
+    blur = SHARP_PX2 * scale[:, 0] ** 2
+    det = minors.square().sum(1) + blur * right.square().sum(1) + SHARP_PX2
+    gx = (minors * (torch.linalg.cross(away, down) * scale)).sum(1)
+    gy = (minors * (torch.linalg.cross(right, away) * scale)).sum(1)
+    gx = gx + blur * (right * away).sum(1)
+    gy = gy + blur * (down * away).sum(1)
+    return gx / det, gy / det
 
 
 def _offsets_from_eye(
