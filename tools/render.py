@@ -3,20 +3,28 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
 from adapters.base import open_scene
+from augment.batch.backends import choose_backend
 from augment.batch.job import JobResult, RenderJob, run_job
 from augment.batch.layout import variant_name
 from augment.batch.mirror import Links
+from augment.batch.store import open_store
+from augment.cameras import Frame
 from augment.errors import ClimateGSError
 from augment.ground import ground_of
 from augment.plan import make_plan
+from augment.quality.record import settle_for
+from augment.quality.settle import recipes_to_try
 from augment.scene import Scene
+from recipes.change import found
 from recipes.frames import FramePattern, parse_frames
 from recipes.job import scaled_recipe
+from recipes.knobs import free_knobs
 from recipes.load import load_recipe
 from recipes.schema import Recipe
 from tools.mirror import mirror_outputs, recipes_for_source
@@ -49,7 +57,7 @@ def render_recipe(
     from tools.warm_up import warm_up
 
     recipes = resolve_variants(recipe, variants, scale)
-    seconds = warm_up(recipes)
+    seconds = warm_up([tried for resolved in recipes for tried in recipes_to_try(resolved)])
     if seconds > 1:
         _say(f"compiled the kernels in {seconds:.1f} s (kept for the next run)")
     scene = open_scene(scene_uri)
@@ -60,6 +68,10 @@ def render_recipe(
         recipes = recipes_for_source(scene, out, recipes, overwrite=overwrite)
     if any(resolved.weather.flood is not None for resolved in recipes):
         scene = replace(scene, ground=ground_of(scene))  # looked for once, not by every worker
+    path = _frames_of(camera_path, scene)
+    recipes = [
+        _settled(resolved, scene, out, path, backend, overwrite=overwrite) for resolved in recipes
+    ]
     for resolved in recipes:
         make_plan(resolved, scene)  # what the scene cannot give is said once, not for every image
     job = RenderJob(
@@ -68,7 +80,7 @@ def render_recipe(
         out_dir=out,
         frames=_pattern(frames).select([frame.index for frame in scene.frames]),
         cameras=None if cameras == "all" else tuple(cameras.split(",")),
-        camera_path=_frames_of(camera_path, scene),
+        camera_path=path,
         workers=workers,
         backend=backend,
         overwrite=overwrite,
@@ -100,7 +112,33 @@ def resolve_variants(recipe: str, variants: int | None = None, scale: float = 1.
     return [scaled_recipe(r, scale) for r in resolved]
 
 
-def _frames_of(camera_path: Path | None, scene: Scene):
+def _settled(
+    recipe: Recipe,
+    scene: Scene,
+    out: Path,
+    path: Sequence[Frame] | None,
+    backend: str,
+    *,
+    overwrite: bool,
+) -> Recipe:
+    """The recipe with the settings of its quality, which are told where it had to choose them."""
+    if not recipe.quality.is_open:
+        return recipe
+    settled = settle_for(
+        open_store(out),
+        recipe,
+        scene,
+        backend=choose_backend(backend, scene),
+        camera_path=path,
+        anew=overwrite,
+        progress=True,
+    )
+    settings = [f"{k.path} {found(settled, k.path)}" for k in free_knobs(recipe)]
+    _say(f"{variant_name(recipe)}: quality {recipe.quality.words} chose {', '.join(settings)}")
+    return settled
+
+
+def _frames_of(camera_path: Path | None, scene: Scene) -> Sequence[Frame] | None:
     if camera_path is None:
         return None
     from adapters.cameras.paths import frames_from_path_file
