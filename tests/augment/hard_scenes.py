@@ -28,7 +28,6 @@ OPACITIES = np.array(
      0.5, 0.998, 0.999, np.nextafter(np.float32(1), np.float32(0)), 1],
     np.float32,
 )  # fmt: skip
-SIZES = ((33, 21), (1, 1), (8192, 1), (1, 513), (16, 16))
 SMOGS = {
     "clear": None,
     "uniform": SmogMedium(0.15, (0.8, 0.7, 0.5)),

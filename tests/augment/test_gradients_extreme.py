@@ -113,6 +113,18 @@ def test_of_the_definition(smog, kind, seed, fov_deg, antialiased, is_double):
     assert_finite(found)
 
 
+@pytest.mark.parametrize("backend", ["cpu", "reference"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_of_a_view_of_nothing(kind, backend):
+    """Zeros, by both backends: a training step that sees no splat is no error."""
+    gaussians = hard_gaussians(kind, wide_camera(60.0), 30)
+    away = wide_camera(60.0, (16, 9), at=(1e3, 0.0, 0.0))
+    found = gradients(gaussians, away, backend=backend, seed=0)
+    if kind in ("plain", "edges", "near"):  # the others reach back to the camera
+        assert all(not value.any() for value in found.values())
+    assert_finite(found)
+
+
 # ---- reconstruction ------------------------------------------------------------------------------
 
 # Values at which the loss changes its mind, on both sides, and the ends of what a render holds.
