@@ -127,7 +127,8 @@ def render_view(
     scene: Scene, camera: Camera, recipe: Recipe, *, backend: str = "auto"
 ) -> WeatheredView:
     """The view of `camera` (before recipe.render.scale) under the recipe's weather, in 8 bits."""
-    plan = make_plan(recipe, scene)
+    with lap("plan"):
+        plan = make_plan(recipe, scene)
     buffers = render_buffers(scene, camera.scaled(recipe.render.scale), plan, backend=backend)
     first = buffers.water if plan.shows_water else None  # pixels that show the water itself
     shown = buffers.bare or buffers  # the scene's surfaces that the other images show
@@ -207,11 +208,13 @@ def render_buffers(
         with lap("camera colour map"):
             rgb = map_colors(rgb, color_map, fast=backend != "reference")
     water = None if flooded is None else flooded.water
+    with lap("depth of surfaces"):
+        depth_m = _surface_depth(raster, plan, plan.buffers)
     return WeatheredBuffers(
         camera,
         rgb,
         raster,
-        _surface_depth(raster, plan, plan.buffers),
+        depth_m,
         parts,
         view,
         water=water,
@@ -282,7 +285,8 @@ def _without_water(
     if plan.smog_on_buffers is not None:
         with lap("smog on buffers"):
             rgb = fog_raster(raster, camera, plan.smog_on_buffers)
-    with lap("sky"):
+    uniform = plan.smog is not None and plan.smog.scale_height_m is None  # hides the sky
+    with lap("airlight behind the splats" if uniform else "sky"):
         rgb = composite_sky(
             rgb, raster.alpha, camera, sky, smog=plan.smog, fast=backend != "reference"
         )

@@ -170,19 +170,24 @@ def inspect(
 
 
 def explain(
-    recipe: Positional[str], scene: str, variant: int = 0, json_file: JsonFile = None
+    recipe: Positional[str],
+    scene: str,
+    variant: int = 0,
+    times: bool = True,
+    json_file: JsonFile = None,
 ) -> int:
-    """Show the plan: which passes and buffers a recipe takes on a scene, and why.
+    """Show the plan: which passes and buffers a recipe takes on a scene, why, and what they cost.
 
     Args:
         recipe: A recipe file or the name of a preset.
         scene: The scene, as for render.
         variant: Which draw from the recipe's ranges.
+        times: Render a few views to measure each pass's share of the time.
         json_file: Also write the plan to this file.
     """
     from tools.explain import explain_recipe, explanation_text
 
-    facts = explain_recipe(recipe, scene, variant)
+    facts = explain_recipe(recipe, scene, variant, times=times)
     print(explanation_text(facts))
     write_json(json_file, facts)
     return 0

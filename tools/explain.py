@@ -3,11 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from augment.plan import Plan
+    from augment.scene import Scene
 
 
-def explain_recipe(recipe: str, scene_uri: str, variant: int = 0) -> dict[str, Any]:
-    """Resolved numbers, plan and scene facts that decide what is rendered."""
+def explain_recipe(
+    recipe: str, scene_uri: str, variant: int = 0, *, times: bool = True
+) -> dict[str, Any]:
+    """Resolved numbers, plan and scene facts that decide what is rendered, and, with times, where
+    the time of a few rendered views went.
+    """
     from adapters.base import open_scene
     from augment.plan import make_plan
     from recipes.load import load_recipe
@@ -16,7 +24,7 @@ def explain_recipe(recipe: str, scene_uri: str, variant: int = 0) -> dict[str, A
     resolved = template.resolve(variant)
     scene = open_scene(scene_uri)
     plan = make_plan(resolved, scene)
-    return {
+    facts = {
         "recipe": resolved.model_dump(mode="json"),
         "recipe_hash": resolved.hash,
         "variants": template.variants,
@@ -27,6 +35,33 @@ def explain_recipe(recipe: str, scene_uri: str, variant: int = 0) -> dict[str, A
             "frames": len(scene.frames),
         },
         "plan": plan.as_dict(),
+        "times": None,
+    }
+    if times and any(frame.cameras for frame in scene.frames):
+        from tools.pass_times import measure_passes
+
+        facts["times"] = measure_passes(resolved, scene).as_dict()
+    return facts | {"views": _view_facts(plan, scene, resolved.render.scale, with_snow=times)}
+
+
+def _view_facts(plan: Plan, scene: Scene, scale: float, *, with_snow: bool) -> dict[str, Any]:
+    """In how many of the scene's views water, snow and actors can be seen. with_snow: else the snow
+    is not laid, which takes long, and `snow` is None.
+    """
+    from dataclasses import replace
+
+    from augment.view_plan import plan_view
+
+    asked = plan if with_snow else replace(plan, snow=None)
+    cameras = [camera for frame in scene.frames for camera in frame.cameras.values()]
+    views = [plan_view(asked, scene, camera.scaled(scale)) for camera in cameras]
+    return {
+        "count": len(views),
+        "water": sum(view.water for view in views) if plan.flood is not None else None,
+        "snow": sum(view.snow for view in views) if asked.snow is not None else None,
+        "actors": sum(bool(view.actors) for view in views) if scene.actors else None,
+        "mean_actors": sum(len(view.actors) for view in views) / len(views) if views else None,
+        "scene_actors": len(scene.actors),
     }
 
 
@@ -47,13 +82,76 @@ def explanation_text(facts: dict[str, Any]) -> str:
     lines += [
         f"  {path} = {value}" for name in effects for path, value in _flat(name, effects[name])
     ] or ["  none: this is the clean render"]
-    lines += ["", "passes, in order:"]
-    width = max(len(step["name"]) for step in plan["steps"])
-    lines += [
-        f"  {'runs ' if step['runs'] else 'skips'}  {step['name']:<{width}}  {step['why']}"
-        for step in plan["steps"]
-    ]
+    lines += ["", *_pass_lines(plan["steps"], facts["times"]), *_view_lines(facts["views"])]
     return "\n".join(lines)
+
+
+def _pass_lines(steps: list[dict[str, Any]], times: dict[str, Any] | None) -> list[str]:
+    """One line a pass, with its share of the time where that was measured."""
+    share = times["share"] if times else {}
+    named = {step["name"] for step in steps if step["runs"]}
+    others = [name for name in share if name not in named]
+    width = max(len(name) for name in (*named, *others))
+    shares = {step["name"]: _share(step["name"], times) for step in steps if step["runs"]}
+    column = max((len(text) for text in shares.values()), default=0)
+    lines = ["passes, in order:"]
+    lines += [
+        f"  {'runs ' if step['runs'] else 'skips'}  {step['name']:<{width}}  "
+        f"{shares.get(step['name'], ''):>{column}}{'  ' if column else ''}{step['why']}"
+        for step in steps
+    ]
+    if times:
+        lines += [f"         {name:<{width}}  {_percent(share[name]):>{column}}" for name in others]
+        lines += ["", *_method_lines(times)]
+    return lines
+
+
+def _share(name: str, times: dict[str, Any] | None) -> str:
+    """A pass's own time, and in brackets what it adds inside the rasteriser; nothing where neither
+    was measured.
+    """
+    if times is None:
+        return ""
+    texts = [_percent(times["share"][name])] if name in times["share"] else []
+    if name in times["folded"]:
+        inside, noise = times["folded"][name], times["noise"]
+        texts.append(f"({100 * inside:+.1f} %)" if abs(inside) > noise else "(within noise)")
+    return " ".join(texts)
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.1f} %"
+
+
+def _method_lines(times: dict[str, Any]) -> list[str]:
+    """How the shares were found."""
+    lines = [
+        f"shares of {times['frame_ms']:.0f} ms a view: {times['views']} views spread over frames "
+        f"and cameras,",
+        f"the fastest of {times['rounds']} runs each after a warm-up, {times['threads']} threads; "
+        f"files are not written",
+    ]
+    if times["folded"]:
+        lines += [
+            "in brackets: runs inside the rasteriser and part of the shares of what is drawn; by",
+            f"the difference to the same views without it; noise, from run to run: "
+            f"{_percent(times['noise'])}",
+        ]
+    lines += [f"once for the scene: {name}, {s:.1f} s" for name, s in times["once_s"].items()]
+    return lines
+
+
+def _view_lines(views: dict[str, Any]) -> list[str]:
+    if not views["count"]:
+        return []
+    lines = [
+        f"  {what} can be in view in {views[what]} of {views['count']}"
+        for what in ("water", "snow", "actors")
+        if views[what] is not None
+    ]
+    if views["actors"] is not None:
+        lines[-1] += f", {views['mean_actors']:.1f} of {views['scene_actors']} on average"
+    return ["", "cameras (the others skip it):", *lines] if lines else []
 
 
 def _flat(path: str, value: Any) -> Iterator[tuple[str, Any]]:

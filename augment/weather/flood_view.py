@@ -160,7 +160,8 @@ def _from_above(
         front = painter.draw(camera, above, wanted)
     assert front.rgb is not None and front.alpha is not None
     sky, smog, fast = painter.sky, painter.medium, painter.fast
-    water, most_shown = find_water(front.alpha, camera, fast=fast)
+    with lap("flood: where it is seen"):
+        water, most_shown = find_water(front.alpha, camera, fast=fast)
     if most_shown < 1 - HIDDEN_COVER:
         with lap("sky"):
             image = composite_sky(front.rgb, front.alpha, camera, sky, smog=smog, fast=fast)
