@@ -27,13 +27,14 @@ from tools.trade_tiers import BOUNDS
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 PAGE = DOCS / "trade.md"
-SCENES = ("street", "pandaset")
+SCENES = {"street": "procedural street", "pandaset": "PandaSet mini 002, fitted"}
 START, END = "<!-- {name}: made by python -m tools.trade_docs -->", "<!-- end of {name} -->"
 
 
 def read_tables(folder: Path = DOCS / "trade") -> list[dict[str, Any]]:
-    """The kept figures of SCENES."""
-    return [json.loads((folder / f"{name}.json").read_text()) for name in SCENES]
+    """The kept figures of SCENES, under the names that people know them by."""
+    files = {said: folder / f"{name}.json" for name, said in SCENES.items()}
+    return [{**json.loads(path.read_text()), "scene": said} for said, path in files.items()]
 
 
 def document(text: str, tables: Sequence[Mapping[str, Any]]) -> str:
