@@ -103,6 +103,8 @@ def _has_effect(knob: Knob, recipe: BaseModel) -> bool:
     if knob.path == "weather.flood.waves.count":
         waves = found(recipe, "weather.flood.waves")
         return bool(waves.components is None and waves.preset != "still" and waves.height > 0)
+    if knob.path == "style.evaluated":
+        return bool(found(recipe, "style.applied_to") == "scene")
     if knob.path == "output.jpeg_quality":
         return bool(found(recipe, "output.image") == "jpg")
     return True

@@ -209,7 +209,7 @@ def _style_facts(style: Style) -> dict[str, Any]:
     """What is kept with the scene: names and contents of files, not where they lay."""
     facts = {
         name: value
-        for name, value in style.model_dump(exclude={"applied_to", "digest"}).items()
+        for name, value in style.model_dump(exclude={"applied_to", "evaluated", "digest"}).items()
         if value is not None
     }
     for name in ("image", "mask", "checkpoint"):

@@ -15,6 +15,7 @@ from recipes.job import scaled_recipe
 from recipes.parse import parse_recipe
 from recipes.quality import TIERS, Quality
 from recipes.schema import Recipe, Render, Weather
+from recipes.style import Style
 
 SNOW_AND_FLOOD = "weather: {snow: {depth_m: 0.1}, flood: {level_m: 0.2}}\n"
 
@@ -119,6 +120,10 @@ def test_knobs_of_what_is_not_there_have_no_effect() -> None:
     assert count not in paths(Flood(level_m=0.2, waves=Waves(height=0)))
     listed = Waves(components=(Wave(amplitude_m=0.01, wavelength_m=1.0),))
     assert count not in paths(Flood(level_m=0.2, waves=listed))
+    for place, has_effect in (("scene", True), ("picture", False)):
+        style = Style(preset="dusk", applied_to=place)
+        known = {knob.path for knob in knobs.knobs_of(Recipe(style=style))}
+        assert ("style.evaluated" in known) is has_effect
     assert "output.jpeg_quality" not in {knob.path for knob in knobs.knobs_of(Recipe())}
 
 
