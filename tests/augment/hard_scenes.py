@@ -101,6 +101,15 @@ def hard_gaussians(
     )
 
 
+def untied(gaussians: Gaussians, camera: Camera) -> Gaussians:
+    """Those that are not at the z of another, in the order given; float32 may round z to 1e-6."""
+    z = (gaussians.means.double() - camera.centre) @ camera.camera_from_world[2, :3]
+    z, order = z.sort()
+    apart = torch.ones(len(z), dtype=torch.bool)
+    apart[1:] = z[1:] - z[:-1] > 1e-6 * z[1:].abs()
+    return gaussians.select(order[apart].sort().values)
+
+
 KINDS = ("plain", "round", "mixed", "needles", "edges", "near")
 
 

@@ -26,6 +26,7 @@ from tests.augment.hard_scenes import (
     colour_maps,
     hard_gaussians,
     snow_light,
+    untied,
     wide_camera,
 )
 from tests.scenes import one_gaussian, slight_pose, stack
@@ -71,7 +72,7 @@ def assert_same_bits(actual: RenderOutput, expected: RenderOutput) -> None:
 def test_bits_do_not_depend_on_the_order_of_gaussians(kind, weather, seed, fov_deg, count):
     """Shuffled within its part, a splat keeps its z, and with no equal z the picture its bits."""
     camera = wide_camera(fov_deg)
-    gaussians = _untied(hard_gaussians(kind, camera, count, seed=seed), camera)
+    gaussians = untied(hard_gaussians(kind, camera, count, seed=seed), camera)
     order = torch.from_numpy(np.random.default_rng(seed).permutation(len(gaussians)))
     first = images(render([part_of(gaussians, weather, seed)], camera, weather))
     part = part_of(gaussians, weather, seed)
@@ -85,15 +86,6 @@ def test_bits_do_not_depend_on_the_order_of_gaussians(kind, weather, seed, fov_d
         second[SPLAT_IDS] = torch.where(ids < 0, ids, order[ids.clamp_min(0).long()].int())
     for name, image in first.items():
         assert torch.equal(second[name], image), name
-
-
-def _untied(gaussians: Gaussians, camera: Camera) -> Gaussians:
-    """Those that are not at the z of another, in the order given; float32 may round z to 1e-6."""
-    z = (gaussians.means.double() - camera.centre) @ camera.camera_from_world[2, :3]
-    z, order = z.sort()
-    apart = torch.ones(len(z), dtype=torch.bool)
-    apart[1:] = z[1:] - z[:-1] > 1e-6 * z[1:].abs()
-    return gaussians.select(order[apart].sort().values)
 
 
 def test_of_equal_depths_the_first_is_in_front():

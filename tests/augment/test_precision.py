@@ -86,7 +86,7 @@ def errors(actual: dict[str, torch.Tensor], expected: dict[str, torch.Tensor]) -
     return found
 
 
-# Of the pixels that are no flips 99 % are off by less than this: measured by a long soak, times 3.
+# Of the pixels that are no flips 99 % are off by less than this: 2 to 10 times the worst of 420 images.
 # Colour: forty float32 blends, an exp2 that is good to 3e-6, style maps of gain 3.
 BOUNDS = {
     RGB: 3e-5,
@@ -143,10 +143,12 @@ def test_kernels_match_the_definition(kind, camera, weather, seed):
 
 @pytest.mark.parametrize("size", [(8192, 1), (1, 513)])
 def test_long_images(size):
-    """A mean's place is rounded to 2.4e-4 px at column 8192, and to 3e-5 px at row 513."""
+    """In light per pixel, which asks for fewest buffers: the definition takes tile after tile.
+
+    A mean's place is rounded to 2.4e-4 px at column 8192, and to 3e-5 px at row 513."""
     camera = wide_camera(170.0, size)
-    found = compare(hard_gaussians("plain", camera, 200, seed=5), camera, "uniform", 1)
-    assert_within(found, LONG, "uniform")
+    found = compare(hard_gaussians("plain", camera, 40, seed=5), camera, "light", 1)
+    assert_within(found, LONG, "light")
 
 
 # ---- far from the origin -------------------------------------------------------------------------

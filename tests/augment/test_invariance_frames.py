@@ -1,0 +1,47 @@
+"""Whole frames do not depend on the order of Gaussians and the number of threads."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from augment.apply import render_view
+from augment.cameras import Camera, Frame
+from augment.ground_heights import Ground
+from augment.render.threads import limit_threads
+from augment.scene import Gaussians, Scene
+from augment.sky import ConstantSky
+from recipes.schema import Flood, Output, Recipe, Smog, Weather
+from tests.augment.hard_scenes import hard_gaussians, untied, wide_camera
+
+
+def _valley(gaussians: Gaussians, camera: Camera) -> Scene:
+    frame = Frame(0, 0, torch.eye(4, dtype=torch.float64), {"wide": camera})
+    sky = ConstantSky(torch.tensor([0.6, 0.7, 0.9]))
+    ground = Ground(-1.5, -1.5, "stated")
+    return Scene(
+        "valley", "test:valley", gaussians, (), sky, (frame,), ground_z_m=-1.5, ground=ground
+    )
+
+
+@pytest.mark.parametrize("effect", ["smog", "flood", "all"])
+def test_weathered_frames_do_not_depend_on_order_and_threads(effect):
+    """Through every pass, down to the 8 bits of the picture. (Snow grows from the order of what it
+    lies on: its frames depend on it, and not on threads, see test_snow_layer.)
+    """
+    smog = Smog(visibility_m=60.0, scale_height_m=5.0) if effect != "flood" else None
+    flood = Flood(level_m=0.8) if effect != "smog" else None
+    recipe = Recipe(weather=Weather(smog=smog, flood=flood), output=Output(depth="median"))
+    camera = wide_camera(70.0, (70, 53))
+    gaussians = untied(hard_gaussians("plain", camera, 40, seed=2), camera)
+    order = torch.randperm(len(gaussians), generator=torch.Generator().manual_seed(0))
+    first = render_view(_valley(gaussians, camera), camera, recipe)
+    assert effect == "smog" or first.water.any()
+    try:
+        limit_threads(1)
+        shuffled = render_view(_valley(gaussians.select(order), camera), camera, recipe)
+    finally:
+        limit_threads(None)
+    for name in ("rgb", "depth_m", "water"):
+        np.testing.assert_array_equal(getattr(shuffled, name), getattr(first, name), err_msg=name)
