@@ -27,9 +27,7 @@ def _valley(gaussians: Gaussians, camera: Camera) -> Scene:
 
 @pytest.mark.parametrize("effect", ["smog", "flood", "all"])
 def test_weathered_frames_do_not_depend_on_order_and_threads(effect):
-    """Through every pass, down to the 8 bits of the picture. (Snow grows from the order of what it
-    lies on: its frames depend on it, and not on threads, see test_snow_layer.)
-    """
+    """Through every pass, down to the 8 bits of the picture. (Of snow see test_snow_layer.)"""
     smog = Smog(visibility_m=60.0, scale_height_m=5.0) if effect != "flood" else None
     flood = Flood(level_m=0.8) if effect != "smog" else None
     recipe = Recipe(weather=Weather(smog=smog, flood=flood), output=Output(depth="median"))

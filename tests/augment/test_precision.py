@@ -86,7 +86,8 @@ def errors(actual: dict[str, torch.Tensor], expected: dict[str, torch.Tensor]) -
     return found
 
 
-# Of the pixels that are no flips 99 % are off by less than this: 2 to 10 times the worst of 420 images.
+# Of the pixels that are no flips 99 % are off by less than this: at least twice the worst of 420
+# images.
 # Colour: forty float32 blends, an exp2 that is good to 3e-6, style maps of gain 3.
 BOUNDS = {
     RGB: 3e-5,
