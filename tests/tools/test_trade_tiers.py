@@ -1,23 +1,11 @@
-"""The rule that makes tiers of tables; and that what is published agrees with itself."""
+"""The rule that makes tiers of tables."""
 
 import pytest
 
 from recipes.knobs import BY_PATH
-from recipes.quality import TIERS
-from tools import trade_docs
 from tools.trade_cases import WHOLE
-from tools.trade_docs import DOCS, PAGE, SCENES, document, read_tables
-from tools.trade_text import trade_markdown
-from tools.trade_tiers import (
-    INVISIBLE_FLIP,
-    Unmeasured,
-    invisible_evidence,
-    settle,
-    tier_from,
-    tiers_from,
-)
+from tools.trade_tiers import Unmeasured, settle, tier_from
 
-MOST_BYTES = 150_000
 STOP, CLIP, FRESNEL = "render.transmittance_stop", "render.radius_clip_px", "weather.flood.fresnel"
 
 
@@ -109,32 +97,3 @@ def test_settling_adds_what_the_rule_asks_for(monkeypatch):
     names = [r["value"] for r in made_up["recipes"][0]["rows"] if r["knob"] == WHOLE]
     assert names == ["candidate 1", "candidate 2"]
     assert [uri for uri, *_ in asked] == ["some:scene"] * 2
-
-
-@pytest.fixture(scope="module")
-def tables():
-    return read_tables()
-
-
-def test_tiers_are_what_the_rule_gives_for_the_published_tables(tables):
-    assert {name: dict(settings) for name, settings in TIERS.items()} == tiers_from(tables)
-
-
-def test_the_invisible_bound_is_below_a_good_jpegs_error(tables):
-    evidence = invisible_evidence(tables)
-    assert len(evidence) == sum(len(table["recipes"]) for table in tables)
-    assert min(evidence) >= INVISIBLE_FLIP
-
-
-def test_the_document_agrees_with_the_tables(tables):
-    assert PAGE.read_text() == document(PAGE.read_text(), tables)
-    for name, one in zip(SCENES, tables, strict=True):
-        assert (DOCS / "trade" / f"{name}.md").read_text() == trade_markdown(one)
-        assert (DOCS / "trade" / f"{name}.json").stat().st_size < MOST_BYTES
-        assert (DOCS / "images" / f"trade_{name}.png").is_file()
-
-
-def test_a_document_without_markers_is_refused(tables):
-    with pytest.raises(ValueError, match="end of machine"):
-        document("nothing", tables)
-    assert trade_docs.START.format(name="tiers") in PAGE.read_text()
