@@ -12,7 +12,6 @@ import dataclasses
 import importlib
 import math
 from pathlib import Path
-from typing import Protocol
 
 from adapters.cameras.paths import with_camera_path
 from adapters.signatures import looked_for, recognised
@@ -29,16 +28,6 @@ from augment.errors import AdapterError
 from augment.ground import Ground
 from augment.scene import Scene
 from recipes.nearest import nearest_word
-
-
-class Adapter(Protocol):
-    """Turns a dataset or file into a Scene.
-
-    query: the URI's keys and values; an adapter raises AdapterError for keys it does not know.
-    The scene's `source` is `format_uri(scheme, path, query)`, so that it can be opened again.
-    """
-
-    def __call__(self, path: str, query: dict[str, str]) -> Scene: ...
 
 
 def open_scene(uri: str) -> Scene:

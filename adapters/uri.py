@@ -21,9 +21,11 @@ _SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9_+.-]*):(?!\\)")
 
 @dataclass(frozen=True)
 class Scheme:
-    """What opens a kind of scene. module, function: imported when used. builtin: the names that
-    the path may be where it is no file. labels: the module's function from path and query to the
-    labels alone (a LabelSource or None), which a scene fitted to such data needs.
+    """What opens a kind of scene. module, function: imported when used; from path and query to a
+    Scene whose `source` is `format_uri(scheme, path, query)`, with an AdapterError for keys that it
+    does not know. builtin: the names that the path may be where it is no file; the function takes
+    the query alone then. labels: the module's function from path and query to the labels alone (a
+    LabelSource or None), which a scene fitted to such data needs.
     """
 
     module: str

@@ -1,4 +1,4 @@
-"""Other cameras for a scene: from a path file, or made for a scene that has none.
+"""Other cameras for a scene, from a path file.
 
 The path file is a camera path (`adapters.cameras.path_json`), an INRIA cameras.json, a nerfstudio
 transforms.json or a COLMAP model. Its poses are in the scene's world before recentring: metres, +z
@@ -12,13 +12,13 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
-from adapters.cameras.default_paths import NO_CAMERAS, PathKind, make_default_path
+from adapters.cameras.default_paths import NO_CAMERAS
 from adapters.cameras.files import read_views
 from adapters.cameras.frames import frames_from_views
 from adapters.uri import CAMERA_PATH_KEY, add_to_uri
 from adapters.world import WorldChange
 from augment.cameras import Frame
-from augment.scene import Gaussians, Scene
+from augment.scene import Scene
 
 
 def frames_from_path_file(path: str | Path, scene: Scene) -> tuple[Frame, ...]:
@@ -45,14 +45,6 @@ def with_camera_path(scene: Scene, path: str | Path) -> Scene:
         source=add_to_uri(scene.source, CAMERA_PATH_KEY, str(path)),
         problems=(*(p for p in scene.problems if not p.startswith(NO_CAMERAS)), *problems),
     )
-
-
-def default_frames(
-    gaussians: Gaussians, *, is_metric: bool = True, kind: PathKind = "auto"
-) -> tuple[tuple[Frame, ...], str]:
-    """Frames of a drive or an orbit, and a sentence that says which."""
-    made = make_default_path(gaussians, is_metric=is_metric, kind=kind)
-    return frames_from_views(made.views, WorldChange())[0], made.note
 
 
 def _frames_and_problems(path: Path, scene: Scene) -> tuple[tuple[Frame, ...], tuple[str, ...]]:

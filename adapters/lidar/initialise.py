@@ -14,22 +14,21 @@ from augment.geometry import quat_from_rotmat
 from augment.render.sh import SH_C0
 from augment.scene import Gaussians
 
+_GROUND_SIGMA_PER_SPACING = 0.6  # wider than elsewhere: the ground must not leak
+_THICKNESS = 0.15  # standard deviation along the normal over the smaller tangent one
+_MIN_THICKNESS_M = 0.005
+
 
 @dataclass(frozen=True)
 class SplatShape:
     """How a surfel becomes a Gaussian.
 
     sigma_per_spacing: standard deviation along a tangent axis over the spacing there; 0.4 leaves
-    a lattice visible, 0.6 blurs. ground_sigma_per_spacing: the same on the ground, which must not
-    leak. thickness: standard deviation along the normal over the smaller
-    tangent one, at least min_thickness_m. opacity: of every splat; high, so that a surface hides
+    a lattice visible, 0.6 blurs. opacity: of every splat; high, so that a surface hides
     what lies behind it.
     """
 
     sigma_per_spacing: float = 0.5
-    ground_sigma_per_spacing: float = 0.6
-    thickness: float = 0.15
-    min_thickness_m: float = 0.005
     opacity: float = 0.95
 
 
@@ -47,9 +46,9 @@ def gaussians_from_surfels(
     axes = np.stack([surfels.major, second, surfels.normals], axis=2)  # columns
     sigma = np.full(len(surfels), shape.sigma_per_spacing, np.float32)
     if semantic is not None:
-        sigma[is_flat(semantic)] = shape.ground_sigma_per_spacing
+        sigma[is_flat(semantic)] = _GROUND_SIGMA_PER_SPACING
     tangent = surfels.spacing * sigma[:, None]
-    thin = np.maximum(tangent.min(axis=1) * shape.thickness, shape.min_thickness_m)
+    thin = np.maximum(tangent.min(axis=1) * _THICKNESS, _MIN_THICKNESS_M)
     scales = np.concatenate([tangent, thin[:, None]], axis=1).astype(np.float32)
     return Gaussians(
         means=torch.from_numpy(np.ascontiguousarray(surfels.centres, np.float32)),

@@ -53,14 +53,13 @@ def surfels_from_points(
     edge_m: np.ndarray,
     *,
     semantic: np.ndarray | None = None,
-    normals: np.ndarray | None = None,
 ) -> Surfels:
     """A surfel for every point.
 
     points: float32 [N, 3]. edge_m: float32 [N], distance that the points were thinned to there.
     semantic: int16 [N], SemanticClass: says how wide a gap may be closed, that ground has no rim,
-    and which way a lone ring faces: up on the ground, sideways on a building. normals: float32
-    [N, 3] where they are known; else they come from the principal axes of the nearest points.
+    and which way a lone ring faces: up on the ground, sideways on a building. Normals come from the
+    principal axes of the nearest points.
     """
     count = len(points)
     if count < 4:
@@ -75,7 +74,7 @@ def surfels_from_points(
             np.zeros((count, 0), int),
         )
     index, distance = find_neighbours(points, edge_m)
-    axes = _principal_axes(points, index, semantic) if normals is None else _axes_about(normals)
+    axes = _principal_axes(points, index, semantic)
     if semantic is None:
         semantic = np.zeros(count, np.int16)
     endless = is_flat(semantic)
@@ -116,17 +115,6 @@ def _principal_axes(
 
 def _is_upright(semantic: np.ndarray) -> np.ndarray:
     return np.isin(semantic, _UPRIGHT)
-
-
-def _axes_about(normals: np.ndarray) -> np.ndarray:
-    """Tangent axes of given unit normals, the first as level as can be, float32 [N, 3 axes, 3]."""
-    up = np.array([0.0, 0.0, 1.0])
-    level = np.cross(up, normals)
-    steep = np.linalg.norm(level, axis=1, keepdims=True) > 1e-3
-    level = np.where(steep, level, np.array([1.0, 0.0, 0.0]))
-    level -= normals * (level * normals).sum(1, keepdims=True)
-    level /= np.linalg.norm(level, axis=1, keepdims=True)
-    return np.stack([level, np.cross(normals, level), normals], axis=1).astype(np.float32)
 
 
 @numba.njit(cache=True)

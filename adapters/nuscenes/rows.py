@@ -76,14 +76,14 @@ class Row:
             raise self.fault(field, f"an integer of at least {low}")
         return value
 
-    def nanoseconds(self, field: str = "timestamp") -> int:
-        """A time that the table has in microseconds."""
-        value = self.fields.get(field)
+    def nanoseconds(self) -> int:
+        """The field `timestamp`, which the table has in microseconds."""
+        value = self.fields.get("timestamp")
         # Some converters write the same number as a float.
         if isinstance(value, float) and value.is_integer():
             value = int(value)
         if type(value) is not int or not 0 < value < 2**62 // 1000:
-            raise self.fault(field, "a time in microseconds, a whole number above 0")
+            raise self.fault("timestamp", "a time in microseconds, a whole number above 0")
         return value * 1000
 
     def flag(self, field: str) -> bool:

@@ -84,7 +84,7 @@ def read_sequence(root: Path) -> Sequence:
     if not root.is_dir():
         raise AdapterError(f"{root} is not a folder; expected a PandaSet sequence such as .../002")
     poses = _read_poses(root / "lidar" / "poses.json")
-    times = _read_times(root / "lidar" / "timestamps.json", expected=len(poses), what="LiDAR poses")
+    times = _read_times(root / "lidar" / "timestamps.json", expected=len(poses))
     folders = sorted(p for p in _folder(root / "camera").iterdir() if p.is_dir())
     if not folders:
         raise AdapterError(f"{root / 'camera'} holds no camera folder; unpack the sequence again")
@@ -114,7 +114,7 @@ def read_ego_track(root: Path) -> tuple[np.ndarray, np.ndarray]:
 @lru_cache(maxsize=2)
 def _ego_track(root: Path, state: object) -> tuple[np.ndarray, np.ndarray]:
     poses = _read_poses(root / "lidar" / "poses.json")
-    times = _read_times(root / "lidar" / "timestamps.json", expected=len(poses), what="LiDAR poses")
+    times = _read_times(root / "lidar" / "timestamps.json", expected=len(poses))
     return poses @ LIDAR_POSE_FROM_EGO, times
 
 
@@ -184,7 +184,7 @@ def _read_camera(folder: Path, frames: int, problems: list[str]) -> CameraTrack:
         raise AdapterError(
             f"{folder / 'poses.json'} has {len(poses)} poses; lidar/poses.json has {frames}"
         )
-    times = _read_times(folder / "timestamps.json", expected=frames, what="LiDAR poses")
+    times = _read_times(folder / "timestamps.json", expected=frames)
     images, (height, width) = _find_images(folder, frames, problems)
     return CameraTrack(folder.name, width, height, fx, fy, cx, cy, poses, times, images)
 
@@ -252,7 +252,7 @@ def _folder(path: Path) -> Path:
     return path
 
 
-def _read_times(path: Path, *, expected: int, what: str) -> np.ndarray:
+def _read_times(path: Path, *, expected: int) -> np.ndarray:
     """Nanoseconds, int64 [expected]."""
     seconds = read_json(path, list)
     try:
@@ -260,7 +260,7 @@ def _read_times(path: Path, *, expected: int, what: str) -> np.ndarray:
     except (TypeError, ValueError):
         raise AdapterError(f"{path} must be a list of seconds") from None
     if len(times) != expected:
-        raise AdapterError(f"{path} has {len(times)} entries; there are {expected} {what}")
+        raise AdapterError(f"{path} has {len(times)} entries; there are {expected} LiDAR poses")
     if not (np.isfinite(times).all() and (np.diff(times) > 0).all()):
         raise AdapterError(f"{path} must be finite and increasing; copy it again")
     return np.round(times * 1e9).astype(np.int64)

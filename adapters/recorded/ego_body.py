@@ -20,7 +20,7 @@ from adapters.lidar.surfels import Surfels
 from augment.cameras import Camera
 from augment.geometry import rigid
 from augment.labels import EGO_VEHICLE
-from augment.reconstruct.view import ViewKey, ViewSource
+from augment.reconstruct.view import ViewSource
 from augment.scene import Actor, Gaussians, Scene, Track
 from augment.semantics import SemanticClass
 
@@ -46,14 +46,12 @@ def ego_body(
     camera_name: str,
     mask: np.ndarray,
     source: ViewSource,
-    *,
-    keys: Sequence[ViewKey] | None = None,
 ) -> Actor | None:
     """The part of the recording car that a camera sees; None without a mask or images.
 
     mask: bool [H, W] of that camera's images at any scale, True where they show the car. source:
-    recorded views; the median over time of those of the camera among keys (source.train if None)
-    gives the colours. The actor's frame is the camera's own, turned to x forward, y left, z up and
+    recorded views; the median over time of those of the camera that are trained on gives the
+    colours. The actor's frame is the camera's own, turned to x forward, y left, z up and
     moved to the box's centre; its track are the camera's poses at its own times, so that the body
     stands still in every image. Its label is EGO_VEHICLE and its class OTHER: it has no box.
 
@@ -75,7 +73,7 @@ def ego_body(
     rows, columns = np.nonzero(part >= _COVERED)
     if len(rows) < _LEAST_SPLATS:
         return None
-    colours = _median_colours(camera_name, source, keys, size, rows, columns)
+    colours = _median_colours(camera_name, source, size, rows, columns)
     if colours is None:
         return None
     points, spacing = _place(grid, rows, columns)
@@ -106,13 +104,12 @@ def _check_mask(mask: np.ndarray, camera: Camera) -> None:
 def _median_colours(
     camera_name: str,
     source: ViewSource,
-    keys: Sequence[ViewKey] | None,
     size: tuple[int, int],
     rows: np.ndarray,
     columns: np.ndarray,
 ) -> np.ndarray | None:
     """Median over the images, float32 [N, 3] in [0, 1], or None without any."""
-    own = [k for k in (source.train if keys is None else keys) if k.camera == camera_name]
+    own = [k for k in source.train if k.camera == camera_name]
     every = max(1, math.ceil(len(own) / _MOST_IMAGES))
     samples = []
     for key in own[::every]:

@@ -28,6 +28,7 @@ logger = logging.getLogger(__name__)
 MAX_VIEWS = 300  # as many are looked at, evenly over the drive: what is coarse needs no more
 VOXEL_M = 0.08
 _RIM_MARGIN_RAD = math.radians(3.0)
+_MOST_GAUSSIANS = 40_000
 _HEIGHT_M = 30.0  # above the lowest camera
 _SHAPE = SplatShape(opacity=0.6)  # hides most of the sky, yet gives way while it is learnt
 
@@ -36,17 +37,15 @@ def wall_tops(
     scene: Scene,
     source: ViewSource,
     *,
-    keys: Sequence[ViewKey] | None = None,
     lidar_top_deg: float = 15.0,
-    max_gaussians: int = 40_000,
 ) -> Gaussians:
     """Degree-0 Gaussians that continue the background above the LiDAR's view; perhaps none.
 
     scene: as initialised from LiDAR. source: recorded views whose `sky` masks tell what sky looks
-    like and whose `weight` masks out the recording car. keys: the views to use, source.train if
-    None. lidar_top_deg: highest elevation that the LiDAR looks at. Deterministic.
+    like and whose `weight` masks out the recording car. lidar_top_deg: highest elevation that the
+    LiDAR looks at. Deterministic.
     """
-    views = _load_views(scene, source, source.train if keys is None else keys, lidar_top_deg)
+    views = _load_views(scene, source, lidar_top_deg)
     path = np.array([frame.world_from_ego[:3, 3].numpy() for frame in scene.frames])
     if not any(len(view.rims.points) for view in views) or len(path) == 0:
         return Gaussians.empty()
@@ -58,18 +57,16 @@ def wall_tops(
         keep, colours = vote(pieces, columns, views, looks, math.radians(lidar_top_deg))
         kept = int(keep.sum())
         logger.info("%d of %d pieces of walls kept at %.3f m", kept, len(keep), voxel_m)
-        if kept <= max_gaussians:
+        if kept <= _MOST_GAUSSIANS:
             break
-        voxel_m *= max(1.05, math.sqrt(kept / max_gaussians))
+        voxel_m *= max(1.05, math.sqrt(kept / _MOST_GAUSSIANS))
     return _gaussians(pieces, columns, keep, colours)
 
 
-def _load_views(
-    scene: Scene, source: ViewSource, keys: Sequence[ViewKey], lidar_top_deg: float
-) -> list[WallView]:
-    every = max(1, math.ceil(len(keys) / MAX_VIEWS))
+def _load_views(scene: Scene, source: ViewSource, lidar_top_deg: float) -> list[WallView]:
+    every = max(1, math.ceil(len(source.train) / MAX_VIEWS))
     by_camera: dict[str, list[ViewKey]] = defaultdict(list)
-    for key in keys:
+    for key in source.train:
         by_camera[key.camera].append(key)
     chosen = [key for group in by_camera.values() for key in group[::every]]
     lowest = math.radians(lidar_top_deg) - _RIM_MARGIN_RAD

@@ -18,7 +18,7 @@ SHADOW_RGB = np.array([0.03, 0.032, 0.04])
 
 @dataclass(frozen=True, eq=False)
 class ContactShadow:
-    """Share of `rgb` mixed into the ground, on a grid in the mover's frame.
+    """Share of SHADOW_RGB mixed into the ground, on a grid in the mover's frame.
 
     values [X, Y]: cover in [0, MOST_COVER], zero at the rim. origin: x, y of values[0, 0], metres.
     """
@@ -26,7 +26,6 @@ class ContactShadow:
     values: np.ndarray
     origin: np.ndarray
     ground_z: float
-    rgb: np.ndarray
 
     def cover(self, points: np.ndarray) -> np.ndarray:
         """Bilinear cover at points [N, 3] of the mover's frame; zero away from the ground."""
@@ -70,4 +69,4 @@ def contact_shadow(mover: MovingBody) -> ContactShadow:
     cover = 1 - ((sun + sky) / lit) ** 0.45  # the display's encoding of that ratio, nearly
     rim = np.min(np.minimum(grid - origin, -origin - grid), axis=1)  # fade out before the grid ends
     cover = np.minimum(cover, MOST_COVER) * np.clip(rim / 0.3, 0, 1)
-    return ContactShadow(cover.reshape(counts), origin, mover.ground_z, SHADOW_RGB)
+    return ContactShadow(cover.reshape(counts), origin, mover.ground_z)

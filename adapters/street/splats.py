@@ -9,7 +9,7 @@ import torch
 
 from adapters.join import join_gaussians
 from adapters.street.materials import Material
-from adapters.street.shadows import ContactShadow
+from adapters.street.shadows import SHADOW_RGB, ContactShadow
 from adapters.street.shapes import U0, U1, V0, V1, Kind, Shapes
 from adapters.street.spacing import LEAST_M, Spacing, plan_spacing, split_long
 from adapters.street.surfels import Cells, cell_counts, make_cells, total_cells
@@ -182,7 +182,7 @@ def shadow_gaussians(shadow: ContactShadow) -> Gaussians:
     opacity = -np.log1p(-cover) / (2 * np.pi)
     sigma = np.tile([SHADOW_SPACING_M, SHADOW_SPACING_M, 0.004], (len(points), 1))
     frames = np.tile(np.eye(3), (len(points), 1, 1))
-    rgb = np.tile(shadow.rgb, (len(points), 1))
+    rgb = np.tile(SHADOW_RGB, (len(points), 1))
     semantic = np.full(len(points), SemanticClass.ROAD, np.int16)
     points[:, 2] += SHADOW_HEIGHT_M
     return make_gaussians(points, frames, sigma, opacity, rgb, semantic)

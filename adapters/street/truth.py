@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from adapters.street.parameters import parse_parameters
-from adapters.street.shadows import ContactShadow, contact_shadow
+from adapters.street.shadows import SHADOW_RGB, ContactShadow, contact_shadow
 from adapters.street.sky import build_sky
 from adapters.street.world import Body, Street, build_street
 from augment.cameras import Camera
@@ -142,7 +142,7 @@ class StreetTruth:
                 centres, present = mover.motion.at(times[seen])
                 relative = (points - centres) @ _turn(mover.motion.yaw)
                 cover = shadow.cover(relative) * present
-                rgb[seen] += cover[:, None] * (shadow.rgb - rgb[seen])
+                rgb[seen] += cover[:, None] * (SHADOW_RGB - rgb[seen])
         return RayHits(distance, normal, semantic, instance, shape, rgb)
 
     def _body(self, instance: int) -> tuple[Body, np.ndarray]:

@@ -11,8 +11,9 @@ import torch
 from splat_scenes import gaussians_at, street
 
 from adapters.cameras.default_paths import CAMERA_HEIGHT_M, NO_CAMERAS, make_default_path
+from adapters.cameras.frames import frames_from_views
 from adapters.cameras.ground_estimate import ground_grid, ground_under, lowest_ground, solid_points
-from adapters.cameras.paths import default_frames
+from adapters.world import WorldChange
 from augment.scene import Gaussians
 from augment.splat_io import read_splats
 
@@ -97,12 +98,12 @@ def test_kinds_can_be_insisted_on() -> None:
 @pytest.mark.parametrize("count", [1, 2, 40])
 def test_degenerate_scenes_get_a_path(kind, count: int) -> None:
     """One Gaussian, or many in one place: no division by their extent."""
-    frames, note = default_frames(gaussians_at(torch.ones(count, 3)), kind=kind)
-    assert frames and note.startswith(NO_CAMERAS)
+    made = make_default_path(gaussians_at(torch.ones(count, 3)), is_metric=True, kind=kind)
+    assert frames_from_views(made.views, WorldChange())[0] and made.note.startswith(NO_CAMERAS)
 
 
 def test_frames_of_a_default_path() -> None:
-    frames, _ = default_frames(street())
+    frames, _ = frames_from_views(make_default_path(street(), is_metric=True).views, WorldChange())
     assert [frame.index for frame in frames] == list(range(len(frames)))
     assert list(frames[0].cameras) == ["front", "left", "right"]
     np.testing.assert_allclose(

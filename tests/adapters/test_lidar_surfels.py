@@ -124,14 +124,6 @@ def test_a_lone_ring_faces_as_its_class_does():
         np.testing.assert_allclose(np.abs(surfels.normals[:, axis]), 1, atol=1e-4)
 
 
-def test_given_normals_are_kept():
-    points = plane((0, 0, 1))
-    normals = np.tile(np.float32([0, 0.6, 0.8]), (len(points), 1))
-    surfels = surfels_from_points(points, np.full(len(points), 0.1, np.float32), normals=normals)
-    np.testing.assert_allclose(surfels.normals, normals, atol=1e-6)
-    np.testing.assert_allclose((surfels.normals * surfels.major).sum(1), 0, atol=1e-6)
-
-
 def test_a_point_far_from_all_others_is_isolated():
     points = np.concatenate([plane((0, 0, 1)), np.float32([[0, 0, 5]])])
     surfels = surfels_from_points(points, np.full(len(points), 0.1, np.float32))

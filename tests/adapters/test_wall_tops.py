@@ -126,17 +126,20 @@ def test_without_known_sky_only_what_is_not_white_goes_on():
     assert len(new) > 100
 
 
-def test_budget_repetition_and_no_views():
+def test_budget_repetition_and_no_views(monkeypatch):
     scene = scene_of(wall_splats(RIM_M))
     source = Images(scene, 6.5)
     full, again = wall_tops(scene, source), wall_tops(scene, source)
     assert torch.equal(full.means, again.means) and torch.equal(full.sh, again.sh)
-    few = wall_tops(scene, source, max_gaussians=len(full) // 3)
+    source.train = source.train[:1]
+    one = wall_tops(scene, source)  # its own only witness
+    assert len(one) > 0
+    source.train = ()
+    assert len(wall_tops(scene, source)) == 0
+    monkeypatch.setattr("adapters.recorded.wall_tops._MOST_GAUSSIANS", len(full) // 3)
+    few = wall_tops(scene, Images(scene, 6.5))
     assert 0 < len(few) <= len(full) // 3
     assert few.means[:, 2].max() == pytest.approx(6.5, abs=0.5)
-    assert len(wall_tops(scene, source, keys=())) == 0
-    one = wall_tops(scene, source, keys=source.train[:1])  # its own only witness
-    assert len(one) > 0
 
 
 def test_a_scene_without_classes_and_masked_out_images():
