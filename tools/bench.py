@@ -106,7 +106,6 @@ def bench_raster(
     repeats: int = 7,
     quick: bool = False,
     memory: bool = True,
-    seed: int = 0,
     progress: bool = True,
 ) -> dict[str, Any]:
     """Measure the CPU backend; the figures of BenchFigures as plain numbers for JSON.
@@ -120,18 +119,16 @@ def bench_raster(
     machine = machine_facts()
     warm_up_s = warm_up()
     with tqdm(total=len(cases) * (repeats + 1), unit="pair", disable=not progress) as bar:
-        figures = tuple(_measure_case(case, repeats, seed, memory, bar) for case in cases)
-    reference = _measure_reference(SMALL, min(repeats, 3), seed)
+        figures = tuple(_measure_case(case, repeats, memory, bar) for case in cases)
+    reference = _measure_reference(SMALL, min(repeats, 3))
     report = BenchFigures(machine, warm_up_s, figures, reference, load_average())
     return dataclasses.asdict(report)
 
 
-def _measure_case(
-    case: RasterCase, repeats: int, seed: int, memory: bool, bar: tqdm
-) -> CaseFigures:
+def _measure_case(case: RasterCase, repeats: int, memory: bool, bar: tqdm) -> CaseFigures:
     bar.set_description(case.name)
-    extra = peak_extra_mib(case, seed=seed) if memory else None
-    gaussians, camera = random_scene(case, seed=seed)
+    extra = peak_extra_mib(case) if memory else None
+    gaussians, camera = random_scene(case)
     parts = [PosedGaussians(gaussians)]
     stages: list[dict[str, float]] = []
     clear, smog = [], []
@@ -173,8 +170,8 @@ def _time_frame(
 
 
 @torch.no_grad()
-def _measure_reference(case: RasterCase, repeats: int, seed: int) -> ReferenceFigures:
-    gaussians, camera = random_scene(case, seed=seed)
+def _measure_reference(case: RasterCase, repeats: int) -> ReferenceFigures:
+    gaussians, camera = random_scene(case)
     parts = [PosedGaussians(gaussians)]
     cpu, reference = [], []
     for _ in range(repeats + 1):

@@ -23,7 +23,7 @@ from tools.bench_scene import RasterCase
 _STATUS, RESET_PEAK = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
 
-def peak_extra_mib(case: RasterCase, *, seed: int = 0) -> float | None:
+def peak_extra_mib(case: RasterCase) -> float | None:
     """MiB above the scene at the highest moment of one clear frame; None where /proc is missing.
 
     Raises:
@@ -31,8 +31,7 @@ def peak_extra_mib(case: RasterCase, *, seed: int = 0) -> float | None:
     """
     if not (_STATUS.is_file() and RESET_PEAK.is_file()):
         return None
-    arguments = {**dataclasses.asdict(case), "seed": seed}
-    return measured_apart("tools.bench_memory", arguments, case.name)
+    return measured_apart("tools.bench_memory", dataclasses.asdict(case), case.name)
 
 
 def measured_apart(module: str, arguments: dict[str, Any], what: str) -> float:
@@ -53,7 +52,7 @@ def measured_apart(module: str, arguments: dict[str, Any], what: str) -> float:
     return float(done.stdout.strip().splitlines()[-1])
 
 
-def _render_once(case: RasterCase, seed: int) -> float:
+def _render_once(case: RasterCase) -> float:
     from augment.render.buffers import ALPHA, RGB
     from augment.render.constants import RasterSettings
     from augment.render.cpu import rasterize_cpu, warm_up
@@ -61,7 +60,7 @@ def _render_once(case: RasterCase, seed: int) -> float:
     from tools.bench_scene import random_scene
 
     warm_up()
-    gaussians, camera = random_scene(case, seed=seed)
+    gaussians, camera = random_scene(case)
     parts, buffers = [PosedGaussians(gaussians)], frozenset({RGB, ALPHA})
     return extra_mib(lambda: rasterize_cpu(parts, camera, buffers, RasterSettings(), None))
 
@@ -98,6 +97,4 @@ def status_mib(field: str) -> float:
 
 
 if __name__ == "__main__":
-    numbers = json.loads(sys.argv[1])
-    seed = numbers.pop("seed")
-    print(_render_once(RasterCase(**numbers), seed))
+    print(_render_once(RasterCase(**json.loads(sys.argv[1]))))

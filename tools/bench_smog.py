@@ -18,6 +18,7 @@ from tqdm import tqdm
 
 from adapters.base import open_scene
 from adapters.street.truth import StreetTruth, TrueView, open_truth
+from adapters.uri import parse_uri
 from augment.apply import render_buffers
 from augment.cameras import Camera
 from augment.plan import make_plan
@@ -38,6 +39,7 @@ SMOGS = {
     "uniform, visibility 300 m": Smog(visibility_m=300),
     "scale height 15 m, visibility 80 m": Smog(visibility_m=80, scale_height_m=15),
 }
+STREET, SCALE = "procedural:street?seed=3", 0.5
 SMOOTH = 5  # px: a pixel is away from silhouettes where this square around it is one surface
 SMOOTH_DEPTH = 0.1  # largest relative change of depth within that square
 
@@ -53,32 +55,25 @@ class TruthView:
 
 
 def bench_smog(
-    query: dict[str, str] | None = None,
     cameras: Sequence[str] = ("front", "left", "back"),
     frames: Sequence[int] = (0, 5),
-    scale: float = 0.5,
-    backend: str = "auto",
 ) -> dict[str, Any]:
     """Errors of both smog models in 1/255, by smog and region: median, p99, share above 4/255."""
-    query = {"seed": "3"} if query is None else query
-    uri = "procedural:street?" + "&".join(f"{k}={v}" for k, v in query.items())
-    scene, truth = open_scene(uri), open_truth(query)
-    wanted = [scene.frame(f).cameras[c].scaled(scale) for f in frames for c in cameras]
-    views = [truth_view(scene, truth, camera, backend) for camera in tqdm(wanted, unit="view")]
+    scene, truth = open_scene(STREET), open_truth(parse_uri(STREET)[2])
+    wanted = [scene.frame(f).cameras[c].scaled(SCALE) for f in frames for c in cameras]
+    views = [truth_view(scene, truth, camera) for camera in tqdm(wanted, unit="view")]
     results = [
-        _measure(name, smog.model_copy(update={"model": model}), scene, views, backend)
+        _measure(name, smog.model_copy(update={"model": model}), scene, views)
         for name, smog in SMOGS.items()
         for model in ("per_gaussian", "deferred")
     ]
-    return {"scene": uri, "cameras": list(cameras), "frames": list(frames), "results": results}
+    return {"scene": STREET, "cameras": list(cameras), "frames": list(frames), "results": results}
 
 
-def _measure(
-    name: str, smog: Smog, scene: Scene, views: Sequence[TruthView], backend: str
-) -> dict[str, Any]:
+def _measure(name: str, smog: Smog, scene: Scene, views: Sequence[TruthView]) -> dict[str, Any]:
     errors: dict[str, list[np.ndarray]] = {}
     for view in views:
-        error = smog_error(smog, scene, view, backend)
+        error = smog_error(smog, scene, view)
         for region, mask in view.regions.items():
             errors.setdefault(region, []).append(error[mask])
     regions = {}
@@ -94,16 +89,14 @@ def _measure(
     return {"smog": name, "model": smog.model, "regions": regions}
 
 
-def truth_view(
-    scene: Scene, truth: StreetTruth, camera: Camera, backend: str = "auto"
-) -> TruthView:
+def truth_view(scene: Scene, truth: StreetTruth, camera: Camera) -> TruthView:
     """What `smog_error` compares with, and the pixels of each region.
 
     Regions: `smooth` is all pixels away from silhouettes, `silhouette` the other surface pixels;
     the classes are parts of `smooth`.
     """
     recipe = Recipe(output=Output(depth="none"))
-    clean = render_buffers(scene, camera, make_plan(recipe, scene), backend=backend).rgb
+    clean = render_buffers(scene, camera, make_plan(recipe, scene)).rgb
     exact = truth.render(camera)
     surface = np.isfinite(exact.depth)
     smooth = surface & away_from_silhouettes(exact.depth, exact.semantic, exact.instance)
@@ -113,12 +106,12 @@ def truth_view(
     return TruthView(camera, clean, exact, regions)
 
 
-def smog_error(smog: Smog, scene: Scene, view: TruthView, backend: str = "auto") -> np.ndarray:
+def smog_error(smog: Smog, scene: Scene, view: TruthView) -> np.ndarray:
     """Largest channel error [H, W] of the fogged splats against exact smog, in 1/255."""
     recipe = Recipe(weather=Weather(smog=smog), output=Output(depth="none"))
     plan = make_plan(recipe, scene)
     assert plan.smog is not None
-    fogged = render_buffers(scene, view.camera, plan, backend=backend).rgb
+    fogged = render_buffers(scene, view.camera, plan).rgb
     depth = np.where(np.isfinite(view.exact.depth), view.exact.depth, 1.0)
     exact = _exact(view.clean, depth, view.camera, plan.smog)
     return (fogged - exact).abs().amax(-1).numpy() * 255

@@ -51,16 +51,14 @@ def still(truth: StreetTruth) -> StreetTruth:
     return StreetTruth(dataclasses.replace(truth.street, movers=()))
 
 
-def camera_from_above(
-    cameras: Sequence[Camera], *, reach_m: float, pixel_m: float, z_m: float = SKY_Z_M
-) -> Camera:
+def camera_from_above(cameras: Sequence[Camera], *, reach_m: float, pixel_m: float) -> Camera:
     """An orthographic camera that looks down on all that is within reach_m of the cameras, in level
     distance along x and y; rows towards -y.
     """
     centres = np.stack([camera.centre.numpy()[:2] for camera in cameras])
     low, high = centres.min(0) - reach_m, centres.max(0) + reach_m
     width, height = (int(n) for n in np.ceil((high - low) / pixel_m))
-    eye = torch.tensor([*((low + high) / 2), z_m], dtype=torch.float64)
+    eye = torch.tensor([*((low + high) / 2), SKY_Z_M], dtype=torch.float64)
     rotation = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
     return Camera(
         name="from above",

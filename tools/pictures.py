@@ -8,6 +8,7 @@ from typing import Any
 
 from tools import sheet
 
+VIDEO_WIDTH = 1440
 MOST_SHOWN = 12  # scenes and variants in one picture
 
 
@@ -59,7 +60,7 @@ def draw_sheet(out: Path, frame: int | None = None) -> Path:
     return path
 
 
-def draw_video(out: Path, camera: str, frames_per_second: float = 10.0, width: int = 1440) -> Path:
+def draw_video(out: Path, camera: str, frames_per_second: float = 10.0) -> Path:
     """Writes OUT/video_<camera>.mp4: scenes and variants side by side, frame by frame."""
     rows = [row for row in read_rows(out) if row["camera"] == camera]
     by_key = {(row["scene"], row["variant"], row["frame"]): row for row in rows}
@@ -74,7 +75,7 @@ def draw_video(out: Path, camera: str, frames_per_second: float = 10.0, width: i
         for frame in frames:
             shown = [by_key[(*group, frame)] for group in groups]
             images = [(_weather(row), sheet.read_rgb(out / row["image_path"])) for row in shown]
-            yield sheet.side_by_side(images, width)
+            yield sheet.side_by_side(images, VIDEO_WIDTH)
 
     path = out / f"video_{camera}.mp4"
     sheet.write_video(path, pictures(), frames_per_second)

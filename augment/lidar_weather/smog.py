@@ -101,15 +101,13 @@ class SoftEcho:
     share: np.ndarray
 
 
-def soft_response(
-    alpha_per_m: float, echoes_m: np.ndarray, model: LidarModel, *, steps: int = _PULSE_STEPS
-) -> np.ndarray:
+def soft_response(alpha_per_m: float, echoes_m: np.ndarray, model: LidarModel) -> np.ndarray:
     """The soft integral, without near_gain, at reported ranges [K]; midpoint rule over the pulse.
 
     An echo at R is reported at R - w. Droplets nearer than overlap_from_m are not seen.
     """
     w = model.pulse_m
-    x = (np.arange(steps) + 0.5) * (2 * w / steps)
+    x = (np.arange(_PULSE_STEPS) + 0.5) * (2 * w / _PULSE_STEPS)
     r = echoes_m[:, None] + w - x
     seen = np.clip(
         (r - model.overlap_from_m) / (model.overlap_full_m - model.overlap_from_m), 0.0, 1.0
@@ -117,7 +115,7 @@ def soft_response(
     r = np.maximum(r, model.overlap_from_m)
     echo = np.sin(math.pi * x / (2 * w)) ** 2 * np.exp(-2 * alpha_per_m * r) * seen / r**2
     beta = BACKSCATTER_MOR * alpha_per_m / MOR_OPTICAL_DEPTH
-    return beta * echo.sum(1) * (2 * w / steps)
+    return beta * echo.sum(1) * (2 * w / _PULSE_STEPS)
 
 
 @functools.lru_cache(maxsize=256)

@@ -18,6 +18,7 @@ from augment.reconstruct.splats import Splats
 MOST_COPIES = 51  # of one splat after a round, as in the authors' code
 OPAQUE = 1 - 1e-6  # no root of a transmittance of 0 spreads it over several splats
 NOISE_STEEPNESS = 100.0
+NOISE_KNEE = 0.005  # the opacity at which half of the noise is left, theirs
 NOISE_REACH = 0.1  # of opacity above the knee: beyond, less than 1/20000 of the noise is left
 
 _ORDERS = np.arange(1, MOST_COPIES + 1)
@@ -136,21 +137,19 @@ def add_noise(
     rows: np.ndarray | None,
     lr: float,
     rng: np.random.Generator,
-    *,
-    knee: float = 0.005,
 ) -> None:
     """Shakes the means of faint splats within their own shape, in place (section 4.2 there).
 
-    step = lr sigmoid(-100 (opacity - knee)) covariance normal(0, 1). rows: int64, without
+    step = lr sigmoid(-100 (opacity - NOISE_KNEE)) covariance normal(0, 1). rows: int64, without
     repetition, or None for all. lr: 1/m; the authors take 5e5 times the means' learning rate.
-    knee: opacity at which half the noise is left, their 0.005. Only rows within NOISE_REACH above
-    it cost anything. Departure: no axis's step is drawn wider than the splat itself, since a
-    covariance in m2 would throw a distant splat of some metres out of the scene.
+    Only rows within NOISE_REACH above the knee cost anything. Departure: no axis's step is drawn
+    wider than the splat itself, since a covariance in m2 would throw a distant splat of some metres
+    out of the scene.
     """
     opacities = splats.opacities if rows is None else splats.opacities[rows]
-    faint = np.flatnonzero(opacities < knee + NOISE_REACH)
+    faint = np.flatnonzero(opacities < NOISE_KNEE + NOISE_REACH)
     rows = faint if rows is None else rows[faint]
-    gate = lr / (1 + np.exp(NOISE_STEEPNESS * (opacities[faint] - knee)))
+    gate = lr / (1 + np.exp(NOISE_STEEPNESS * (opacities[faint] - NOISE_KNEE)))
     scales = splats.scales[rows]
     sigma = np.minimum(gate[:, None].astype(np.float32) * scales, np.float32(1)) * scales
     # The covariance times isotropic noise, R S S R^T n, is R S S n in distribution.

@@ -76,13 +76,11 @@ def score_pairs(
     return PairScores(**{name: float(np.mean(values)) for name, values in found.items()})
 
 
-def score_harm(
-    method: Method, photos: Float[Tensor, "P 3 S S"], *, pairs: int = 400, seed: int = 0
-) -> HarmScores:
+def score_harm(method: Method, photos: Float[Tensor, "P 3 S S"], *, pairs: int = 400) -> HarmScores:
     """`pairs` pairs of different photos (all of them, where there are fewer)."""
     count = len(photos)
     every = [(a, b) for a in range(count) for b in range(count) if a != b]
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     chosen = torch.randperm(len(every), generator=generator)[:pairs].tolist()
     gradients = [_gradient(photo) for photo in photos]
     saturated = [_saturated(torch.eye(3, 4), photo) for photo in photos]
@@ -103,11 +101,11 @@ def score_harm(
 
 
 def least_squares_limit(
-    photos: Float[Tensor, "P 3 S S"], *, offset: bool, repeats: int = 4, seed: int = 0
+    photos: Float[Tensor, "P 3 S S"], *, offset: bool, repeats: int = 4
 ) -> float:
     """What no map can pass in `same`: the PSNR (dB) of the best 3x4, or 3x3, of each case."""
     found: list[float] = []
-    for photo, recolored, _ in _cases(photos, repeats, seed):
+    for photo, recolored, _ in _cases(photos, repeats, 0):
         columns, wanted = photo.flatten(1).T.double(), recolored.flatten(1).T.double()
         if offset:
             columns = functional.pad(columns, (0, 1), value=1.0)
