@@ -25,7 +25,7 @@ TINY = FloodCase(
 def figures():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(bench_flood, "open_scene", open_street)
-        return bench_flood.bench_flood(TINY, repeats=2, memory=False, progress=False)
+        return bench_flood.bench_flood(TINY, repeats=1, memory=False, progress=False)
 
 
 def test_figures_are_json_and_hang_together(figures):

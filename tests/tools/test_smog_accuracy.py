@@ -3,19 +3,20 @@
 import numpy as np
 import pytest
 
-from adapters.base import open_scene
 from adapters.street.truth import open_truth
+from adapters.uri import parse_uri
 from recipes.schema import Smog
+from tests.streets import open_street
 from tools.bench_smog import away_from_silhouettes, smog_error, truth_view
 
-QUERY = {"seed": "3", "frames": "2"}
+STREET = "procedural:street?seed=3&frames=1&gaussians=150000&parked=4&moving=1&pedestrians=1"
 
 
 @pytest.fixture(scope="module")
 def street():
-    scene = open_scene("procedural:street?seed=3&frames=2")
-    camera = scene.frames[0].cameras["front"].scaled(0.35)
-    return scene, truth_view(scene, open_truth(QUERY), camera)
+    scene = open_street(STREET)
+    camera = scene.frames[0].cameras["front"].scaled(0.25)
+    return scene, truth_view(scene, open_truth(parse_uri(STREET)[2]), camera)
 
 
 @pytest.mark.parametrize("model", ["per_gaussian", "deferred"])
@@ -25,7 +26,7 @@ def test_smog_is_within_a_grey_level_away_from_silhouettes(street, model, scale_
     smog = Smog(visibility_m=80, scale_height_m=scale_height_m, model=model)
     error = smog_error(smog, scene, view)
     smooth = error[view.regions["smooth"]]
-    assert len(smooth) > 20_000  # most of the picture is measured
+    assert len(smooth) > 10_000  # most of the picture that is not sky is measured
     # The bounds a viewer cannot see: one grey level at the median, four at the worst hundredth.
     assert np.median(smooth) <= 1.0
     assert np.quantile(smooth, 0.99) <= 4.0
