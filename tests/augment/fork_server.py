@@ -16,7 +16,10 @@ _FORK_SERVER = multiprocessing.get_context("forkserver")
 
 
 def start_fork_server(*modules: str) -> None:
-    """Start the server, with these modules and what label files need. Ctrl-C does not reach it."""
+    """Start the server, with these modules and what label files need, and wait until it has them.
+
+    Ctrl-C does not reach it.
+    """
     multiprocessing.set_forkserver_preload([*modules, "pandas", "pyarrow.parquet"])
     path = os.environ.get("PYTHONPATH")
     # It is told of this process's sys.path, and in Python 3.11 leaves it unused.
@@ -24,7 +27,9 @@ def start_fork_server(*modules: str) -> None:
     os.environ["PYTHONPATH"] = os.pathsep.join([str(here), str(here.parents[1]), path or ""])
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
-        forkserver.ensure_running()
+        first = _FORK_SERVER.Process(target=int)
+        first.start()
+        first.join()
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
         if path is None:

@@ -37,6 +37,7 @@ from generate_jobs import (
     read_notes,
     slow_noting_render,
     take_notes,
+    very_slow_noting_render,
 )
 from tqdm import tqdm
 
@@ -110,7 +111,7 @@ def fork(work: Callable[[], object], prepare: Callable[[], object] | None = None
     return child
 
 
-def end_of(child: int, limit_s: float = 60) -> int:
+def end_of(child: int, limit_s: float = 150) -> int:
     """The exit code of a fork, -9 where it was killed; fails where it does not end."""
     deadline = time.monotonic() + limit_s
     while time.monotonic() < deadline:
@@ -356,7 +357,7 @@ def stop_a_job_with_workers(folder: Path) -> dict:
 
     whole = whole_of(folder, lambda out: make_job(out))
     out, stops = folder / "stopped", []
-    job = make_job(out, renderer=slow_noting_render, executor="processes", workers=2)
+    job = make_job(out, renderer=very_slow_noting_render, executor="processes", workers=2)
 
     def work() -> None:
         with _ended_by_sigterm():
@@ -386,7 +387,7 @@ def notes_of(kind: str) -> set[str]:
 
 def wait_for_notes(more: int, child: int | None = None) -> int | None:
     """Until so many more images are finished, or the child has ended: then its exit code."""
-    wanted, deadline = len(notes_of("A")) + more, time.monotonic() + 60
+    wanted, deadline = len(notes_of("A")) + more, time.monotonic() + 150
     while len(notes_of("A")) < wanted:
         pid, status = (0, 0) if child is None else os.waitpid(child, os.WNOHANG)
         if pid:

@@ -100,6 +100,14 @@ def slow_noting_render(scene: Scene, camera: Camera, recipe: Recipe, *, backend:
     return noting_render(scene, camera, recipe, backend=backend)
 
 
+def very_slow_noting_render(
+    scene: Scene, camera: Camera, recipe: Recipe, *, backend: str
+) -> FakeView:
+    """So slow that a job is still at it when a busy machine comes to stop it."""
+    time.sleep(0.1)
+    return noting_render(scene, camera, recipe, backend=backend)
+
+
 def dying_render(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str) -> FakeView:
     """Kills its process at one image: frame 1 of the front camera of scene a in fog."""
     name = image_name(scene, camera, recipe)
