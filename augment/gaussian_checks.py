@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from augment.scene import Gaussians
+from augment.scene import Gaussians, quat_lengths
 
 _QUAT_TOLERANCE = 1e-4  # of unit length; what is further off is to be normalised
 _ROWS = 1 << 16  # looked at together: temporaries stay in the cache
@@ -30,7 +30,7 @@ def drawable_rows(gaussians: Gaussians) -> Bool[Tensor, "N"]:
     keep = torch.isfinite(gaussians.opacities)
     for tensor in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.sh):
         keep &= torch.isfinite(tensor.reshape(len(gaussians), -1).sum(1))
-    return keep & (gaussians.quats.norm(dim=1) > 0) & (gaussians.scales.amin(1) > 0)
+    return keep & (quat_lengths(gaussians.quats) > 0) & (gaussians.scales.amin(1) > 0)
 
 
 def _piece_is_drawable(gaussians: Gaussians, rows: slice) -> bool:

@@ -347,7 +347,7 @@ def check_gaussians(gaussians: Gaussians, *, where: str) -> tuple[Gaussians, tup
     for tensor in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.sh):
         finite &= torch.isfinite(tensor.reshape(len(gaussians), -1).sum(1))
     finite &= torch.isfinite(gaussians.opacities)
-    norms = gaussians.quats.norm(dim=1)
+    norms = quat_lengths(gaussians.quats)
     # In order: each count names what the earlier checks did not already leave out.
     bad = {
         "with NaN or infinite values": ~finite,
@@ -366,13 +366,23 @@ def check_gaussians(gaussians: Gaussians, *, where: str) -> tuple[Gaussians, tup
         raise SceneError(f"{where} holds no usable Gaussians. " + " ".join(problems))
     unit = Gaussians(
         means=gaussians.means,
-        quats=gaussians.quats / norms[:, None],
+        quats=(gaussians.quats / norms[:, None]).to(gaussians.quats.dtype),
         scales=gaussians.scales,
         opacities=gaussians.opacities.clamp(0, 1),
         sh=gaussians.sh,
         semantic=gaussians.semantic,
     )
     return unit, problems
+
+
+def quat_lengths(quats: Float[Tensor, "N 4"]) -> Float[Tensor, "N"]:
+    """Lengths of quaternions, in float64 where the squares of some leave float32's range: 1e-30 is
+    no zero, and 1e20 has an end.
+    """
+    lengths = quats.norm(dim=1)
+    if bool(((lengths > 1e-15) & (lengths < 1e15)).all()):
+        return lengths
+    return quats.double().norm(dim=1)
 
 
 __all__ = [
@@ -383,4 +393,5 @@ __all__ = [
     "SemanticClass",
     "Track",
     "check_gaussians",
+    "quat_lengths",
 ]
