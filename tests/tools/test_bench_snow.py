@@ -44,7 +44,7 @@ TINY = SnowCase(
 def figures():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(bench_snow, "open_scene", open_street)
-        return bench_snow.bench_snow(TINY, repeats=2, memory=False, progress=False)
+        return bench_snow.bench_snow(TINY, repeats=1, memory=False, progress=False)
 
 
 @pytest.fixture(scope="module")
