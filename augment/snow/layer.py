@@ -31,7 +31,7 @@ CELLS = 2048  # that a thread takes at a time
 # A rasteriser stops before the splat that would leave 1e-4 of the light behind it. With opaque
 # discs up to a tenth may still shine through then; with these, no more than a two-hundredth.
 OPACITY = 0.98
-LEAST_STEPS, MOST_STEPS = 6, 10  # of evening out the surface beneath and the light
+LEAST_STEPS, MOST_STEPS = 6, 10  # of evening out the light; the surface beneath takes the most
 
 
 class Look(NamedTuple):
@@ -181,10 +181,9 @@ def _splats(
         cells.centers_m, cells.normals, cells.sizes_m, cells.neighbours, cells.tracks
     )
     heights = depths.heights
-    settled_z, light = _settled(cells, heights, depth_m)
-    tops, counts = np.empty(len(cells), np.float64), np.empty(len(cells), np.int64)
+    light = _softened_light(cells, heights, depth_m)
+    tops, counts = surface_heights(cells, heights), np.empty(len(cells), np.int64)
     with kernel_threads(CELLS):
-        splat_kernels.find_tops(centers, heights, settled_z, tops)
         splat_kernels.count_splats(neighbours, sizes, centers, heights, tops, counts)
         lasts = np.cumsum(counts)
         total = int(lasts[-1]) if len(cells) else 0
@@ -221,25 +220,34 @@ def _splats(
     return gaussians, normals if keep_normals else None, slopes if keep_slopes else None
 
 
-def _settled(
-    cells: SnowCells, heights: np.ndarray, depth_m: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Height of what lies beneath the snow and the light on it, evened out: deep snow shows less
-    of the ground's relief, and no snow shows a recording's finest spots.
+def surface_heights(cells: SnowCells, heights: np.ndarray) -> np.ndarray:
+    """World z of every cell's surface, float64 [C], with snow of these heights on it. It evens out
+    the relief beneath it, and never lies lower where it is deeper.
     """
-    sizes, neighbours, z, light = _arrays(
-        cells.sizes_m, cells.neighbours, cells.centers_m[:, 2], cells.light
-    )
+    centers, neighbours = _arrays(cells.centers_m, cells.neighbours)
+    z, tops = np.ascontiguousarray(centers[:, 2]), np.empty(len(cells), np.float64)
+    with kernel_threads(CELLS):
+        for _ in range(MOST_STEPS):
+            next_z = np.empty(len(z), np.float32)
+            splat_kernels.settle(neighbours, z, next_z)
+            z = next_z
+        splat_kernels.find_tops(centers, heights, z, tops)
+    return tops
+
+
+def _softened_light(cells: SnowCells, heights: np.ndarray, depth_m: float) -> np.ndarray:
+    """The light on the bare surface without its finest spots, float32 [C]: the deeper the snow, the
+    less of them it shows.
+    """
+    sizes, neighbours, light = _arrays(cells.sizes_m, cells.neighbours, cells.light)
     finest = float(sizes.min()) if len(sizes) else 1.0
     steps = min(max(math.ceil(2 * depth_m / finest), LEAST_STEPS), MOST_STEPS)
     with kernel_threads(CELLS):
         for _ in range(steps):
-            next_z, next_light = np.empty((2, len(z)), np.float32)
-            splat_kernels.settle(
-                neighbours, heights, sizes, float(depth_m), z, light, next_z, next_light
-            )
-            z, light = next_z, next_light
-    return z, light
+            next_light = np.empty(len(light), np.float32)
+            splat_kernels.soften(neighbours, heights, light, next_light)
+            light = next_light
+    return light
 
 
 def _left_visible(cells: SnowCells, own: Gaussians, heights: np.ndarray) -> Tensor:

@@ -53,21 +53,32 @@ def _uniform(bits, number):
 
 
 @kernel
-def settle(neighbours, heights, sizes, depth, z, light, settled_z, settled_light):
-    """One step of evening out the surface beneath the snow and the light on it, all [C].
+def settle(neighbours, z, settled_z):
+    """One step of evening out the surface beneath the snow, all [C].
 
-    Towards the mean of opposite neighbours, where both carry snow: slopes stay as they are.
+    Towards the mean of opposite neighbours: slopes stay as they are. Whatever snow lies there, or
+    deeper snow would stand lower where it evens out more.
     """
-    for i in prange(len(sizes)):
-        dz = dl = 0.0
+    for i in prange(len(z)):
+        dz = 0.0
+        for axis in range(2):
+            a, b = neighbours[i, 2 * axis], neighbours[i, 2 * axis + 1]
+            if a >= 0 and b >= 0:
+                dz += 0.5 * (np.float64(z[a]) + z[b]) - z[i]
+        settled_z[i] = np.float32(z[i] + 0.25 * dz)
+
+
+@kernel
+def soften(neighbours, heights, light, softened):
+    """One step of evening out the light on the snow, as `settle` does, where both carry snow."""
+    for i in prange(len(heights)):
+        dl = 0.0
         if heights[i] > 0:
             for axis in range(2):
                 a, b = neighbours[i, 2 * axis], neighbours[i, 2 * axis + 1]
                 if a >= 0 and b >= 0 and heights[a] > 0 and heights[b] > 0:
-                    dz += 0.5 * (np.float64(z[a]) + z[b]) - z[i]
                     dl += 0.5 * (np.float64(light[a]) + light[b]) - light[i]
-        settled_z[i] = np.float32(z[i] + 0.25 * min(depth / sizes[i], 1.0) * dz)
-        settled_light[i] = np.float32(light[i] + 0.25 * dl)
+        softened[i] = np.float32(light[i] + 0.25 * dl)
 
 
 @kernel
