@@ -49,6 +49,7 @@ class ProcessPool:
         worker = self._workers[slot]
         if worker is None:
             worker = self._workers[slot] = _Worker(self._setup, self._threads)
+        worker.has_task = True
         with contextlib.suppress(OSError):  # one that has just died shows when it is waited for
             worker.connection.send(task)
 
@@ -92,10 +93,12 @@ class ProcessPool:
         elif isinstance(message, Outcome):
             self._tick(slot, message)
         else:
+            worker.has_task = False
             return Finished(slot, message)
         return None
 
-    def _bury(self, slot: int, worker: _Worker) -> Event:
+    def _bury(self, slot: int, worker: _Worker) -> Event | None:
+        """What becomes of the task of a worker that died; of one that had none nothing is lost."""
         worker.process.join()
         worker.connection.close()
         self._workers[slot] = None
@@ -106,7 +109,7 @@ class ProcessPool:
                 f"that generates with processes needs `if __name__ == '__main__':` around it; if "
                 f"memory ran out, use fewer workers"
             )
-        return Lost(slot, ending)
+        return Lost(slot, ending) if worker.has_task else None
 
 
 class _Worker:
@@ -118,7 +121,7 @@ class _Worker:
         with thread_limits(threads), interrupts_blocked():
             self.process.start()
         child.close()
-        self.is_ready = False
+        self.is_ready = self.has_task = False
 
     def stop(self) -> None:
         with contextlib.suppress(OSError):

@@ -47,6 +47,9 @@ from augment.batch.parts import read_finished
 from augment.batch.store import open_store
 from augment.errors import OutputError
 from augment.generate.job import GenerateJob, GenerateResult, run_generate
+from augment.generate.pools import Finished
+from augment.generate.process_pool import ProcessPool
+from augment.generate.workshop import IndexTask
 
 CHANGES = ("fsync", "replace", "unlink", "rename", "rmdir", "link", "mkdir")
 DISK_FULL, INTERRUPTED = 28, 130
@@ -348,6 +351,27 @@ def wait_for_workers(limit_s: float = 20) -> None:
     while workers_of_server():
         require(time.monotonic() < deadline, f"workers live on: {workers_of_server()}")
         time.sleep(0.01)
+
+
+@scenario
+def kill_an_idle_worker(folder: Path) -> dict:
+    """A worker that dies without a task is no loss: the next task gets a new one."""
+    setup = make_job(folder / "idle").setup
+
+    def work() -> None:
+        pool, task = ProcessPool(setup, lambda slot, outcome: None, 1), IndexTask("fake:a", None)
+        for _ in range(2):
+            pool.give(0, task)
+            (event,) = pool.wait(60)
+            require(isinstance(event, Finished), f"idle: {event}")
+            (worker,) = workers_of_server()
+            os.kill(worker, signal.SIGKILL)
+            wait_for_workers()
+            require(pool.wait(0.2) == [], "idle: it counts as lost")
+        pool.close()
+
+    require(end_of(fork(work)) == 0, "idle: the pool failed")
+    return {}
 
 
 @scenario

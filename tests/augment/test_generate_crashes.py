@@ -22,4 +22,4 @@ def test_killed_jobs_go_on_to_identical_files(quick_folder: Path) -> None:
     assert sum(found["kill_workers"][who] for who in ("workers_killed", "drivers_killed")) >= 4
     assert len(found["stop_a_job_with_workers"]["finished"]) == 2
     assert found["die_at_one_image"]["rendered_again"] == 1
-    assert {"run_several_drivers", "die_while_opening"} <= found.keys()
+    assert {"run_several_drivers", "die_while_opening", "kill_an_idle_worker"} <= found.keys()
