@@ -78,9 +78,9 @@ class Stage:
     def scene_for(self, recipe: Recipe) -> Scene:
         key = _dress(recipe)
         if key not in self._dressed:
-            scene = dataclasses.replace(self._bare)
-            self._place(scene, recipe)
-            self._dressed[key] = scene
+            if not self._dressed:  # kernels and tables that are loaded once belong to no scene
+                self._kept(self._placed(recipe), recipe)
+            scene = self._dressed[key] = self._placed(recipe)
             self.kept_mib[key] = self._kept(scene, recipe)
         return self._dressed[key]
 
@@ -88,8 +88,9 @@ class Stage:
         """MiB that stay with the scene after the first frame: the snow's splats, styled colours."""
         return self.kept_mib[_dress(recipe)]
 
-    def _place(self, scene: Scene, recipe: Recipe) -> None:
+    def _placed(self, recipe: Recipe) -> Scene:
         """What is the same for all values of a knob is looked for in the bare scene, once."""
+        scene = dataclasses.replace(self._bare)
         snow, style = recipe.weather.snow, recipe.style
         if snow is not None:
             settings = placement_settings(snow)
@@ -97,6 +98,7 @@ class Stage:
         if style is not None:
             usual = style.model_copy(update={"evaluated": "color"})
             remember_maps(scene, style, style_maps(self._bare, usual))
+        return scene
 
     def _kept(self, scene: Scene, recipe: Recipe) -> float | None:
         if not RESET_PEAK.is_file():

@@ -117,22 +117,26 @@ def cropped(picture: np.ndarray) -> np.ndarray:
 def _panel(recipe: str, rows: Sequence[Row], colors: Mapping[str, Color]) -> np.ndarray:
     image = np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
     drawn = [row for row in rows if row["knob"] not in (DEPTH, JPEG) and not _is_candidate(row)]
-    times = [row["ms"] for row in drawn]
+    times = [row["over_reference"] for row in drawn]
     flips = [max(row["flip"], FLOOR) for row in drawn]
-    low_ms, high_ms = 0.0, 1.08 * max(times)
+    most = 1.08 * max(times)
     high = 1.6 * max(max(flips), 10 * FLOOR)
 
     def place(row: Row) -> tuple[float, float]:
-        return at(row["ms"], row["flip"])
+        return at(row["over_reference"], row["flip"])
 
-    def at(ms: float, flip: float) -> tuple[float, float]:
+    def at(time: float, flip: float) -> tuple[float, float]:
         share = np.log(max(flip, FLOOR) / FLOOR) / np.log(high / FLOOR)
-        x = LEFT + (WIDTH - LEFT - RIGHT) * (ms - low_ms) / (high_ms - low_ms)
+        x = LEFT + (WIDTH - LEFT - RIGHT) * time / most
         return x, HEIGHT - BOTTOM - (HEIGHT - BOTTOM - TOP) * share
 
-    _axes(image, recipe, at, high_ms, high)
+    _axes(image, recipe, at, most, high)
     _front(
-        image, [at(*point) for point in pareto([(r["ms"], max(r["flip"], FLOOR)) for r in drawn])]
+        image,
+        [
+            at(*point)
+            for point in pareto([(r["over_reference"], max(r["flip"], FLOOR)) for r in drawn])
+        ],
     )
     reference = next(r for r in drawn if (r["knob"], r["value"]) == (WHOLE, REFERENCE))
     for knob, color in colors.items():
@@ -148,20 +152,28 @@ def _panel(recipe: str, rows: Sequence[Row], colors: Mapping[str, Color]) -> np.
     return image
 
 
-def _axes(image: np.ndarray, recipe: str, at: Any, high_ms: float, high: float) -> None:
+def _axes(image: np.ndarray, recipe: str, at: Any, most: float, high: float) -> None:
     left, bottom = at(0.0, FLOOR)
-    right, top = at(high_ms, high)
+    right, top = at(most, high)
     write(image, recipe, left, 26, size=0.6, color=INK)
     for flip in log_ticks(FLOOR, high):
         _, y = at(0.0, flip)
         _line(image, (left, y), (right, y), GRID, 1)
         write(image, f"{flip:g}", left - 6, y + 4, size=0.4, align="right")
-    for ms in linear_ticks(0.0, high_ms):
-        x, _ = at(ms, FLOOR)
+    for time in linear_ticks(0.0, most):
+        x, _ = at(time, FLOOR)
         _line(image, (x, bottom), (x, top), GRID, 1)
-        write(image, short_number(ms), x, bottom + 16, size=0.4, align="centre")
+        write(image, short_number(time), x, bottom + 16, size=0.4, align="centre")
     cv2.rectangle(image, _whole((left, top)), _whole((right, bottom)), SOFT, 1)
-    write(image, "ms a frame", right, bottom + 34, size=0.4, color=SOFT, align="right")
+    write(
+        image,
+        "time of a frame over the reference's",
+        right,
+        bottom + 34,
+        size=0.4,
+        color=SOFT,
+        align="right",
+    )
     write(image, "mean FLIP against the reference", left, bottom + 34, size=0.4, color=SOFT)
 
 
@@ -181,7 +193,7 @@ def _mark(image: np.ndarray, place: tuple[float, float], name: str) -> None:
     cv2.polylines(image, [corners], True, INK, 1, cv2.LINE_AA)
     ends_at = x + 10 + text_width(name, 0.42)
     beside = (x - 10, "right") if ends_at > WIDTH - RIGHT else (x + 10, "left")
-    lift = {DEFAULTS: -16, "balanced": -6, REFERENCE: -6}.get(name, 4)
+    lift = {REFERENCE: -6, DEFAULTS: -18, "balanced": -30, "draft": -42}.get(name, 4)
     write(image, name, beside[0], y + lift, size=0.42, align=beside[1])
 
 

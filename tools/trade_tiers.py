@@ -2,7 +2,7 @@
 
 1. Of each knob the values that save time: those faster than every more accurate one by at least
    LEAST_SAVED of the reference's time. A value's time is the geometric mean of its ratios to the
-   reference, over all recipes and scenes where the knob has an effect.
+   reference, over all recipes and scenes that have the knob.
 2. The fastest of them whose worst FLIP, over all recipes, scenes and views, is within the bound.
 3. All knobs together, rendered: while the worst FLIP is beyond the bound, the knob that has the
    most error alone goes a step back towards reference (augment.quality.choose.within_flip).

@@ -30,7 +30,7 @@ from tools.trade_plots import FLOOR, cropped, draw_trade, pareto
 from tools.trade_text import trade_markdown, trade_text
 
 TINY = TradeCase(width=64, repeats=1, depths=("none", "expected", "median"), memory=False)
-SOME = ("render.scale", "render.radius_clip_px", "weather.flood.fresnel", DEPTH, JPEG)
+SOME = ("render.scale", "weather.flood.fresnel", DEPTH, JPEG)
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +53,6 @@ def test_figures_are_json_and_have_a_row_for_every_value(trade, rows):
     assert json.loads(json.dumps(trade.figures, allow_nan=False)) is not None
     assert len(rows) == len(bench_trade.table_of(trade.figures))
     wanted = [("render.scale", value) for value in (0.25, 0.5, 0.75)]
-    wanted += [("render.radius_clip_px", value) for value in (3.0, 2.0, 1.0)]
     wanted += [("weather.flood.fresnel", "schlick"), (DEPTH, "none"), (DEPTH, "median")]
     wanted += [(WHOLE, name) for name in (REFERENCE, DEFAULTS, "draft", "balanced")]
     wanted += [(JPEG, quality) for quality in ("png", 60, 75, 92, 100)]
