@@ -26,7 +26,7 @@ from tools.trade_cases import (
     trade_recipe,
     trade_views,
 )
-from tools.trade_errors import true_depth
+from tools.trade_errors import true_depths
 from tools.trade_measure import Measured, Row, measure_recipe
 from tools.warm_up import warm_up
 
@@ -63,7 +63,7 @@ def bench_trade(
     machine = dataclasses.asdict(machine_facts())
     counts = [len(settings_of_trade(recipe, case, wholes)) for recipe in drawn]
     warm_up(drawn)
-    true_m = [true_depth(scene_uri, view.camera) for view in views]
+    true_m = true_depths(scene_uri, [view.camera for view in views])
     found: dict[str, Measured] = {}
     with tqdm(total=sum(counts), unit="setting", disable=not progress) as bar:
         for recipe in drawn:

@@ -163,8 +163,10 @@ def flicker(
     return math.sqrt(float((change**2).mean()))
 
 
-def true_depth(uri: str, camera: Camera) -> np.ndarray | None:
-    """z of the procedural street's surfaces, float64 [H, W], infinite in the sky; else None."""
+def true_depths(uri: str, cameras: Sequence[Camera]) -> list[np.ndarray] | None:
+    """z of the procedural street's surfaces, float64 [H, W] each, infinite in the sky; None of
+    other scenes.
+    """
     from adapters.base import parse_uri
     from adapters.street.truth import open_truth
 
@@ -172,7 +174,10 @@ def true_depth(uri: str, camera: Camera) -> np.ndarray | None:
     if scheme != "procedural":
         return None
     truth = open_truth(query)
-    rays = camera.ray_directions(torch.float64).reshape(-1, 3).numpy()
-    hits = truth.cast(camera.centre.numpy(), rays, camera.timestamp_ns, with_rgb=False)
-    lengths = np.linalg.norm(rays, axis=1)
-    return (hits.distance / lengths).reshape(camera.height, camera.width)
+    depths = []
+    for camera in cameras:
+        rays = camera.ray_directions(torch.float64).reshape(-1, 3).numpy()
+        hits = truth.cast(camera.centre.numpy(), rays, camera.timestamp_ns, with_rgb=False)
+        depth = hits.distance / np.linalg.norm(rays, axis=1)
+        depths.append(depth.reshape(camera.height, camera.width))
+    return depths

@@ -115,7 +115,7 @@ def measure_recipe(
     case: TradeCase,
     *,
     wholes: Mapping[str, Mapping[str, Value]] | None = None,
-    true_m: Sequence[np.ndarray | None] | None = None,
+    true_m: Sequence[np.ndarray] | None = None,
     bar: tqdm | None = None,
 ) -> Measured:
     """wholes: as of settings_of_trade. true_m: the scene's exact depth by view; it is not used for
@@ -125,11 +125,10 @@ def measure_recipe(
     stage = Stage(scene, views[0])
     clean = Setting(CLEAN, CLEAN, clean_recipe(recipe))
     best = settings[0]
-    if true_m is None or recipe.weather.snow is not None:
-        true_m = [None] * len(views)
+    known = true_m if recipe.weather.snow is None else None
     standards = [
         standard_of(stage.scene_for(best.recipe), view, best.recipe, true)
-        for view, true in zip(views, true_m, strict=True)
+        for view, true in zip(views, known or [None] * len(views), strict=True)
     ]
     rows: list[Row] = []
     pictures: dict[str, np.ndarray] = {}
