@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from augment.apply import render_buffers, render_view
@@ -93,7 +93,7 @@ def test_denser_smog_on_buffers_never_adds_contrast_to_any_airlight(
         assert_never_grows(less, more)
 
 
-@drawing(30)
+@drawing(20)
 @given(
     places(),
     cameras(),
@@ -140,6 +140,8 @@ def surface(cells: SnowCells, snow: Snow, seed: int) -> np.ndarray:
     st.sampled_from(("auto", "always", "never")),
     st.integers(0, 1000),
 )
+# Evening out the relief once hung on the snow's depth: 4 mm lower where it was 2 cm deeper.
+@example(0.1, [0.03, 0.05], 1.0, 1.0, "never", 1)
 def test_deeper_snow_never_lowers_the_surface(
     relief_m: float | None, depths: list[float], coverage: float, drift: float, tracks: str, seed
 ):

@@ -75,7 +75,7 @@ def assert_same_bits(view: WeatheredView, clean: WeatheredView) -> None:
         assert one is None or np.array_equal(one, other), f"{name} differs"
 
 
-@drawing(40)
+@drawing(30)
 @given(places(), cameras(), recipes(frozenset()), st.data())
 def test_effects_without_strength_change_no_bit(
     place: Place, camera: Camera, recipe: Recipe, data: st.DataObject
