@@ -9,7 +9,8 @@
 
     python -m tools.trade_tiers TABLE.json=SCENE_URI ...
 
-renders what step 3 asks for and the tables lack, adds it to them, and prints the tiers.
+renders what step 3 asks for and the tables lack, adds it to them, then the tiers themselves, in
+place of rows of earlier ones, and prints what they set. TABLE_tiers.jpg beside a table shows them.
 """
 
 from __future__ import annotations
@@ -21,11 +22,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from augment.quality.choose import Cost, Settings, useful, within_flip
 from recipes.knobs import KNOBS, Knob, Value
-from tools.bench_trade import bench_trade, table_of
+from tools.bench_trade import Trade, bench_trade, table_of
+from tools.drawing import write_jpeg
 from tools.trade_cases import JPEG, WHOLE, TradeCase
 from tools.trade_measure import Row
+from tools.trade_plots import draw_tiers
 
 # What a viewer takes for the same picture: on every published scene under every recipe it is below
 # the FLIP of a JPEG at quality 92, which is what people who look at pictures take for lossless.
@@ -135,6 +140,19 @@ def _measure(table: dict[str, Any], uri: str, settings: Settings, case: TradeCas
         entry["rows"] += [row for row in new["rows"] if row["value"] == name]
 
 
+def measure_tiers(
+    table: dict[str, Any], uri: str, tiers: Mapping[str, Mapping[str, Value]], case: TradeCase
+) -> Trade:
+    """Render the tiers on the table's scene and put their rows in place of the table's own."""
+    names = [entry["recipe"] for entry in table["recipes"]]
+    trade = bench_trade(uri, names, case, wholes=tiers)
+    for entry, new in zip(table["recipes"], trade.figures["recipes"], strict=True):
+        kept = [row for row in entry["rows"] if row["knob"] != WHOLE or row["value"] not in tiers]
+        added = [row for row in new["rows"] if row["knob"] == WHOLE and row["value"] in tiers]
+        entry["rows"] = kept + added
+    return trade
+
+
 def _is_of(row: Row, settings: Settings) -> bool:
     given = row.get("settings")
     return (
@@ -152,8 +170,12 @@ def main(arguments: Sequence[str]) -> None:
     paths, uris = [Path(path) for path, _, _ in pairs], [uri for _, _, uri in pairs]
     tables = [json.loads(path.read_text()) for path in paths]
     width = max(view["width"] for view in tables[0]["views"])
-    tiers = settle(tables, uris, TradeCase(width=width, repeats=tables[0]["repeats"]))
-    for path, table in zip(paths, tables, strict=True):
+    case = TradeCase(width=width, repeats=tables[0]["repeats"])
+    tiers = settle(tables, uris, case)
+    for path, uri, table in zip(paths, uris, tables, strict=True):
+        trade = measure_tiers(table, uri, tiers, case)
+        rows = [draw_tiers(name, drawn, trade.figures) for name, drawn in trade.pictures.items()]
+        write_jpeg(path.with_name(f"{path.stem}_tiers.jpg"), np.concatenate(rows))
         path.write_text(json.dumps(table, indent=1) + "\n")
     for name, settings in tiers.items():
         print(f"{name}: {settings}")

@@ -4,7 +4,7 @@ import pytest
 
 from recipes.knobs import BY_PATH
 from tools.trade_cases import WHOLE
-from tools.trade_tiers import Unmeasured, settle, tier_from
+from tools.trade_tiers import Unmeasured, measure_tiers, settle, tier_from
 
 STOP, CLIP, FRESNEL = "render.transmittance_stop", "render.radius_clip_px", "weather.flood.fresnel"
 
@@ -97,3 +97,13 @@ def test_settling_adds_what_the_rule_asks_for(monkeypatch):
     names = [r["value"] for r in made_up["recipes"][0]["rows"] if r["knob"] == WHOLE]
     assert names == ["candidate 1", "candidate 2"]
     assert [uri for uri, *_ in asked] == ["some:scene"] * 2
+
+
+def test_rows_of_tiers_replace_those_of_earlier_ones(monkeypatch):
+    old = [row(WHOLE, "reference", 1.0, 0.0, {}), row(WHOLE, "draft", 0.9, 0.3, {}), *SINGLE]
+    made_up = table(clean=old)
+    new = [row(WHOLE, "reference", 1.0, 0.0, {}), row(WHOLE, "draft", 0.5, 0.1, {CLIP: 2.0})]
+    trade = type("Trade", (), {"figures": table(clean=new)})
+    monkeypatch.setattr("tools.trade_tiers.bench_trade", lambda *_, **__: trade)
+    assert measure_tiers(made_up, "some:scene", {"draft": {CLIP: 2.0}}, None) is trade
+    assert made_up["recipes"][0]["rows"] == [old[0], *SINGLE, new[1]]
