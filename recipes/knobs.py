@@ -22,8 +22,9 @@ Value = float | int | str | bool | None
 class Knob:
     """One field. path: dotted. values: from the fastest to the most accurate, which is reference.
     effect: dotted path of the section without which it is of no effect; '' for none. chosen:
-    whether a tier or a target may set it; else it says what is written, which is the user's to
-    say, and it is only measured. what: of which error and which time, in a few words.
+    whether a tier or a target may set it; else it is only measured: it says what is written, which
+    is the user's to say, or has no value that saves time. what: of which error and which time, in
+    a few words.
     """
 
     path: str
@@ -37,27 +38,85 @@ class Knob:
         return self.values[-1]
 
 
+# Those that save most come first: they have first call on an error that is allowed.
 KNOBS = (
-    Knob("render.scale", (0.25, 0.5, 0.75, 1.0), "resolution, enlarged again for the comparison"),
-    Knob("render.sh_degree", (0, 1, 2, None), "bands of the colours' spherical harmonics"),
-    Knob("render.transmittance_stop", (0.05, 0.01, 1e-3, 1e-4), "light behind it is given up"),
-    Knob("render.radius_clip_px", (3.0, 2.0, 1.0, 0.0), "splats no larger are left out"),
-    Knob("weather.smog.model", ("deferred", "per_gaussian"), "smog on buffers or on splats",
-         "weather.smog"),
-    Knob("weather.flood.reflection", ("sky", "screen_space", "mirrored"), "what water reflects",
-         "weather.flood"),
-    Knob("weather.flood.fresnel", ("schlick", "exact"), "share of reflected light",
-         "weather.flood"),
-    Knob("weather.flood.waves.count", (6, 12, 24), "waves that make up the surface",
-         "weather.flood"),
-    Knob("weather.snow.shading", ("per_splat", "per_pixel"), "light on the snow", "weather.snow"),
-    Knob("weather.snow.cell_m", (0.2, 0.1, 0.05), "size of the snow's splats near the path",
-         "weather.snow"),
-    Knob("style.evaluated", ("sh", "color"), "map folded into the scene or put on each colour",
-         "style"),
-    Knob("output.depth", ("none", "expected", "median", "mode"), "depth estimator", chosen=False),
-    Knob("output.jpeg_quality", (60, 75, 92, 100), "size and error of jpg files", chosen=False),
-)  # fmt: skip
+    Knob(
+        "render.scale",
+        (0.25, 0.5, 0.75, 1.0),
+        "resolution, enlarged again for the comparison",
+    ),
+    Knob(
+        "weather.flood.reflection",
+        ("sky", "screen_space", "mirrored"),
+        "what water reflects",
+        effect="weather.flood",
+    ),
+    Knob(
+        "weather.snow.cell_m",
+        (0.2, 0.1, 0.05),
+        "size of the snow's splats near the path",
+        effect="weather.snow",
+    ),
+    Knob(
+        "weather.snow.shading",
+        ("per_splat", "per_pixel"),
+        "light on the snow",
+        effect="weather.snow",
+    ),
+    Knob(
+        "render.radius_clip_px",
+        (3.0, 2.0, 1.0, 0.0),
+        "splats no larger are left out",
+    ),
+    Knob(
+        "render.transmittance_stop",
+        (0.05, 0.01, 1e-3, 1e-4),
+        "light behind it is given up",
+    ),
+    Knob(
+        "render.sh_degree",
+        (0, 1, 2, None),
+        "bands of the colours' spherical harmonics",
+    ),
+    Knob(
+        "weather.flood.waves.count",
+        (6, 12, 24),
+        "waves that make up the surface",
+        effect="weather.flood",
+    ),
+    Knob(
+        "weather.flood.fresnel",
+        ("schlick", "exact"),
+        "share of reflected light",
+        effect="weather.flood",
+    ),
+    Knob(
+        "style.evaluated",
+        ("sh", "color"),
+        "map folded into the scene or put on each colour",
+        effect="style",
+    ),
+    # Smog on buffers saves nothing here, whatever it costs.
+    Knob(
+        "weather.smog.model",
+        ("deferred", "per_gaussian"),
+        "smog on buffers or on splats",
+        effect="weather.smog",
+        chosen=False,
+    ),
+    Knob(
+        "output.depth",
+        ("none", "expected", "median", "mode"),
+        "depth estimator",
+        chosen=False,
+    ),
+    Knob(
+        "output.jpeg_quality",
+        (60, 75, 92, 100),
+        "size and error of jpg files",
+        chosen=False,
+    ),
+)
 BY_PATH = {knob.path: knob for knob in KNOBS}
 
 

@@ -15,19 +15,33 @@ def explain_recipe(
 ) -> dict[str, Any]:
     """Resolved numbers, plan and scene facts that decide what is rendered, and, with times, where
     the time of a few rendered views went.
+
+    A quality that has still to choose its settings does so with times, which also takes rendering;
+    without, the plan is that of reference.
     """
     from adapters.base import open_scene
     from augment.plan import make_plan
+    from augment.quality.settle import settle, settled_recipe
+    from recipes.knobs import free_knobs, settings_of
     from recipes.load import load_recipe
 
     template = load_recipe(recipe)
     resolved = template.resolve(variant)
     scene = open_scene(scene_uri)
+    is_open = resolved.quality.is_open
+    if is_open and times:
+        resolved = settle(resolved, scene, progress=True).recipe
+    elif is_open:
+        reference = {knob.path: knob.reference for knob in free_knobs(resolved)}
+        resolved = settled_recipe(resolved, reference)
     plan = make_plan(resolved, scene)
     facts = {
         "recipe": resolved.model_dump(mode="json"),
         "recipe_hash": resolved.hash,
         "variants": template.variants,
+        "quality": resolved.quality.words,
+        "is_chosen": times or not is_open,
+        "settings": settings_of(resolved),
         "scene": {
             "name": scene.name,
             "source": scene.source,
@@ -82,8 +96,23 @@ def explanation_text(facts: dict[str, Any]) -> str:
     lines += [
         f"  {path} = {value}" for name in effects for path, value in _flat(name, effects[name])
     ] or ["  none: this is the clean render"]
+    lines += _quality_lines(facts)
     lines += ["", *_pass_lines(plan["steps"], facts["times"]), *_view_lines(facts["views"])]
     return "\n".join(lines)
+
+
+def _quality_lines(facts: dict[str, Any]) -> list[str]:
+    """What the recipe trades speed for accuracy with, and who says so."""
+    wish, settings = facts["quality"], facts["settings"]
+    title = f"quality {wish}" if wish else "no quality is asked for"
+    if not facts["is_chosen"]:
+        title += ", chosen in view of the scene when a job starts; until then reference"
+    listed = ", ".join(f"{path} {_word(value)}" for path, value in settings.items())
+    return ["", f"{title}:", f"  {listed}"]
+
+
+def _word(value: Any) -> str:
+    return "all" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def _pass_lines(steps: list[dict[str, Any]], times: dict[str, Any] | None) -> list[str]:
@@ -91,7 +120,7 @@ def _pass_lines(steps: list[dict[str, Any]], times: dict[str, Any] | None) -> li
     share = times["share"] if times else {}
     named = {step["name"] for step in steps if step["runs"]}
     others = [name for name in share if name not in named]
-    width = max(len(name) for name in (*named, *others))
+    width = max(len(name) for name in (*(step["name"] for step in steps), *others))
     shares = {step["name"]: _share(step["name"], times) for step in steps if step["runs"]}
     column = max((len(text) for text in shares.values()), default=0)
     lines = ["passes, in order:"]

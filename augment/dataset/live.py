@@ -29,6 +29,7 @@ from augment.dataset.samples import (
     SampleOptions,
     make_sample,
 )
+from augment.quality.settle import settle
 from augment.scene import Scene
 from recipes.files import with_digest
 from recipes.schema import Recipe
@@ -41,7 +42,8 @@ class SceneDataset(Dataset):
     JPEG the image passes through JPEG in memory. `paths` holds only None.
 
     Where the recipe's snow can lie and which maps its style takes are found here, once for all
-    samples and worker processes.
+    samples and worker processes. So are the settings of a recipe whose quality has still to choose
+    them: `recipe` has them in numbers.
 
     scene: an open scene. frames, cameras: what to keep, None for all. backend: as in `rasterize`.
     renderer: `augment.apply.render_view` if None. load, box_frame, transform: as for
@@ -74,14 +76,16 @@ class SceneDataset(Dataset):
                 "load must not have 'lidar' for a live scene: run a job with output: {lidar: true} "
                 "and read it with WeatherDataset"
             )
-        self.scene, self.recipe, self.transform = scene, with_digest(recipe), transform
+        self.scene, self.transform = scene, transform
         self._backend = choose_backend(backend, scene) if renderer is None else backend
+        recipe = with_digest(recipe)
+        self.recipe = settle(recipe, scene, backend=self._backend, renderer=renderer).recipe
         self._renderer = renderer or default_renderer()
         self._index = SceneIndex.of(scene)
         selection = select_frames(self._index, frames, cameras)
         self._items = [(frame, name) for frame, names in selection for name in names]
 
-        snow = snow_to_lay(recipe)
+        snow = snow_to_lay(self.recipe)
         self._bed = None if snow is None else find_bed(scene, snow)
         self._maps = store_maps(scene, [self.recipe])
 

@@ -48,30 +48,22 @@ def within_flip(
 ) -> Settings:
     """Fast settings whose pictures together are within the bound.
 
-    Every knob starts at its fastest value whose own error is within the bound. While all together
-    exceed it, the knob with the largest own error goes a step back towards reference.
+    Knob after knob, in the order of `options`, takes the fastest value with which all that are
+    chosen so far stay within the bound, the rest at reference. So the first ones, which should be
+    those that save most, have most of the room.
 
     own_flip: error of one knob at one value, all others at reference; of a value that is beyond the
     bound any number beyond it will do. exceeds: whether settings together are beyond the bound; not
     asked of the reference, whose error is 0.
     """
-    places: dict[str, int] = {}
+    settings = reference_settings(options)
     for path, values in options.items():
-        last = len(values) - 1
-        fit = (n for n in range(last) if own_flip(path, values[n]) <= bound)
-        places[path] = next(fit, last)
-
-    def at_places() -> Settings:
-        return {path: options[path][place] for path, place in places.items()}
-
-    def error(path: str) -> float:
-        return own_flip(path, options[path][places[path]])
-
-    while left := [path for path, place in places.items() if place < len(options[path]) - 1]:
-        if not exceeds(at_places()):
-            break
-        places[max(left, key=error)] += 1  # of equal ones the first of the table
-    return at_places()
+        for value in values[:-1]:
+            tried = settings | {path: value}
+            if own_flip(path, value) <= bound and not exceeds(tried):
+                settings = tried
+                break
+    return settings
 
 
 def within_budget(
@@ -94,12 +86,38 @@ def within_budget(
         settings = {path: ladder[places[path]].value for path, ladder in ladders.items()}
         ms = ms_of(settings)
         if ms <= budget_ms:
-            return Budgeted(settings, ms, is_met=True)
+            return _given_back(ladders, places, budget_ms, ms, ms_of)
         left = [path for path, ladder in ladders.items() if places[path] < len(ladder) - 1]
         if not left:
             return Budgeted(settings, ms, is_met=False)
         best = max(left, key=lambda path: _worth(ladders[path][places[path] :]))
         places[best] += 1
+
+
+def _given_back(
+    ladders: Mapping[str, Sequence[Cost]],
+    places: dict[str, int],
+    budget_ms: float,
+    ms: float,
+    ms_of: Callable[[Settings], float],
+) -> Budgeted:
+    """Settings within a budget, each knob as close to reference as the others leave time for."""
+
+    def settings() -> Settings:
+        return {path: ladder[places[path]].value for path, ladder in ladders.items()}
+
+    def error(path: str) -> float:
+        return ladders[path][places[path]].flip
+
+    for path in sorted(ladders, key=error, reverse=True):
+        while places[path] > 0:
+            places[path] -= 1
+            tried_ms = ms_of(settings())
+            if tried_ms > budget_ms:
+                places[path] += 1
+                break
+            ms = tried_ms
+    return Budgeted(settings(), ms, is_met=True)
 
 
 def useful(costs: Sequence[Cost]) -> list[Cost]:

@@ -53,25 +53,25 @@ def test_each_knob_takes_its_fastest_value_within_the_bound() -> None:
     assert flip_choice(table, 0.04) == {"a": 2, "b": "slow", "c": 0.5}
 
 
-def test_the_knob_with_the_largest_error_goes_back_first() -> None:
-    table = Table({("a", 1): 0.03, ("a", 2): 0.02, ("b", "fast"): 0.025, ("c", 0.5): 0.001})
-    # 0.056 together; a goes to 2: 0.046; then b: 0.021.
-    assert flip_choice(table, 0.04) == {"a": 2, "b": "slow", "c": 0.5}
+def test_the_first_knobs_have_first_call_on_the_error() -> None:
+    table = Table({("a", 1): 0.03, ("a", 2): 0.02, ("b", "fast"): 0.025, ("c", 0.5): 0.01})
+    assert flip_choice(table, 0.04) == {"a": 1, "b": "slow", "c": 0.5}
     assert table.asked == [
-        {"a": 1, "b": "fast", "c": 0.5},
-        {"a": 2, "b": "fast", "c": 0.5},
-        {"a": 2, "b": "slow", "c": 0.5},
+        {"a": 1, "b": "slow", "c": 1.0},
+        {"a": 1, "b": "fast", "c": 1.0},
+        {"a": 1, "b": "slow", "c": 0.5},
     ]
 
 
-def test_of_equal_errors_the_first_knob_goes_back() -> None:
-    table = Table({("b", "fast"): 0.03, ("c", 0.5): 0.03})
-    assert flip_choice(table, 0.04) == {"a": 1, "b": "slow", "c": 0.5}
+def test_a_value_that_is_beyond_the_bound_alone_is_not_tried_with_others() -> None:
+    table = Table({("a", 1): 0.2, ("a", 2): 0.02, ("b", "fast"): 0.2, ("c", 0.5): 0.2})
+    assert flip_choice(table, 0.04) == {"a": 2, "b": "slow", "c": 1.0}
+    assert table.asked == [{"a": 2, "b": "slow", "c": 1.0}]
 
 
 def test_errors_that_only_appear_together_lead_to_reference() -> None:
     table = Table({("a", 1): 0.01, ("a", 2): 0.01, ("b", "fast"): 0.01}, synergy=100)
-    assert flip_choice(table, 0.04) == {"a": 3, "b": "slow", "c": 0.5}
+    assert flip_choice(table, 0.04) == {"a": 3, "b": "slow", "c": 0.5}  # c has none of its own
     table = Table(dict.fromkeys([("a", 1), ("a", 2), ("b", "fast"), ("c", 0.5)], 0.01), synergy=9)
     assert flip_choice(table, 0.04) == {"a": 3, "b": "slow", "c": 1.0}
     assert {"a": 3, "b": "slow", "c": 1.0} not in table.asked  # its error is 0 by definition
@@ -108,6 +108,16 @@ def test_the_step_that_saves_most_for_its_error_comes_first() -> None:
     ]  # fmt: skip
     assert [c.is_met for c in chosen] == [True, True, True, True, True]
     assert chosen[-1].ms == 0
+
+
+def test_what_the_budget_leaves_room_for_is_given_back() -> None:
+    """Two steps whose sum is more than was needed: the first is undone where the second does."""
+    table = Table(
+        {("a", 2): 0.01, ("b", "fast"): 0.05, ("c", 0.5): 0.2},
+        {("a", 2): 10, ("b", "fast"): 12, ("c", 0.5): 45},
+    )
+    chosen = within_budget(OPTIONS, 60.0, table.costs(), table.ms)
+    assert (chosen.settings, chosen.ms) == ({"a": 3, "b": "slow", "c": 0.5}, 55)
 
 
 def test_a_budget_beyond_reach_gets_the_fastest_and_is_not_met() -> None:

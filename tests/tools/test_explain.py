@@ -94,3 +94,14 @@ def test_sampled_views_are_spread_over_frames_and_cameras(scene):
     picked = sample_views(dataclasses.replace(scene, frames=frames), 4)
     assert [c.name for c in picked] == list(names)
     assert [c.timestamp_ns for c in picked] == [1, 3, 5, 7]
+
+
+def test_settings_are_those_of_the_quality(monkeypatch, tmp_path, scene):
+    facts, text = explained(monkeypatch, tmp_path, scene, "quality: reference\n", times=False)
+    assert facts["settings"]["render.scale"] == 1 and "\nquality reference:\n" in text
+    open_ = "quality: {max_flip: 0.1}\nrender: {scale: 0.5}\n"
+    facts, text = explained(monkeypatch, tmp_path, scene, open_, times=False)
+    assert facts["settings"]["render.scale"] == 0.5 and not facts["is_chosen"]
+    assert "quality max_flip 0.1, chosen in view of the scene when a job starts" in text
+    _, text = explained(monkeypatch, tmp_path, scene, "{}\n", times=False)
+    assert "\nno quality is asked for:\n" in text
