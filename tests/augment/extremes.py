@@ -479,13 +479,13 @@ def rendered(scene: Scene, camera: Camera, recipe: Recipe) -> WeatheredView:
     view = render_view(scene, camera, recipe)
     plan = make_plan(recipe, scene)
     buffers = render_buffers(scene, camera.scaled(recipe.render.scale), plan)
-    check_buffers(buffers)
+    check_buffers(buffers, recipe)
     check_view(view, scene, recipe)
     assert np.array_equal(quantise(buffers.rgb), view.rgb), "two renders of one frame differ"
     return view
 
 
-def check_buffers(buffers: WeatheredBuffers) -> None:
+def check_buffers(buffers: WeatheredBuffers, recipe: Recipe) -> None:
     """Finite colours; alpha and snow in [0, 1]; depth of what is seen positive, else 0."""
     size = (buffers.camera.height, buffers.camera.width)
     assert tuple(buffers.rgb.shape) == (*size, 3)
@@ -503,9 +503,11 @@ def check_buffers(buffers: WeatheredBuffers) -> None:
                 assert bool(torch.isfinite(depth).all()), f"{name} is not finite"
                 assert bool((depth >= 0).all()), f"{name} {depth.min()}"
         if raster.snow is not None:
-            # Two sums of the same weights: they differ by rounding.
+            # Two sums of the same weights: they differ by rounding. An alpha below float32's step at
+            # 1 is lost in transmittance, which thousands of splats then leave at 1.
+            room = 1e-5 if recipe.render.alpha_max > 6e-8 else 1e-3
             assert bool((raster.snow >= 0).all())
-            assert bool((raster.snow <= alpha + 1e-5).all()), "more snow than surface"
+            assert bool((raster.snow <= alpha + room).all()), "more snow than surface"
     if buffers.depth_m is not None:
         assert bool(torch.isfinite(buffers.depth_m).all()) and bool((buffers.depth_m >= 0).all())
 
