@@ -503,8 +503,8 @@ def check_buffers(buffers: WeatheredBuffers, recipe: Recipe) -> None:
                 assert bool(torch.isfinite(depth).all()), f"{name} is not finite"
                 assert bool((depth >= 0).all()), f"{name} {depth.min()}"
         if raster.snow is not None:
-            # Two sums of the same weights: they differ by rounding. An alpha below float32's step at
-            # 1 is lost in transmittance, which thousands of splats then leave at 1.
+            # Two sums of the same weights: they differ by rounding. An alpha below float32's step
+            # at 1 is lost in transmittance, which thousands of splats then leave at 1.
             room = 1e-5 if recipe.render.alpha_max > 6e-8 else 1e-3
             assert bool((raster.snow >= 0).all())
             assert bool((raster.snow <= alpha + room).all()), "more snow than surface"
