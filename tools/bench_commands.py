@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from tyro.conf import UseAppendAction
 
 from tools.json_files import JsonFile, write_json
 
@@ -147,6 +149,42 @@ def open_(repeats: int = 7, quick: bool = False, json_file: JsonFile = None) -> 
     from tools.bench_open import bench_open, open_text
 
     return _say(bench_open(quick=quick, repeats=repeats), open_text, json_file)
+
+
+def trade(
+    scene: str = "procedural:street?seed=3&frames=6",
+    recipe: Annotated[tuple[str, ...], UseAppendAction] = (),
+    quick: bool = False,
+    table: Path | None = None,
+    pictures: Path | None = None,
+    json_file: JsonFile = None,
+) -> int:
+    """What each setting that buys speed costs in accuracy on a scene, and the tiers as a whole.
+
+    Args:
+        scene: What is rendered.
+        recipe: A preset or a file, or clean, smog, flood, snow, style or all; may be given several
+            times. By default those six.
+        quick: Small pictures, one timed frame of each, and no memory.
+        table: Also write the tables to this file, as Markdown.
+        pictures: Also draw error against time, and the tiers side by side, here.
+        json_file: Also write the figures to this file.
+    """
+    from tools import trade_cases
+    from tools.bench_trade import bench_trade
+    from tools.trade_text import trade_markdown, trade_text
+
+    case = trade_cases.QUICK if quick else trade_cases.WHOLE_CASE
+    found = bench_trade(scene, recipe or trade_cases.RECIPES, case)
+    drawn: list[Path] = []
+    if table is not None:
+        table.write_text(trade_markdown(found.figures), encoding="utf-8")
+        drawn.append(table)
+    if pictures is not None:
+        from tools.trade_plots import draw_trade
+
+        drawn += draw_trade(pictures, found.figures, found.pictures)
+    return _say(found.figures, trade_text, json_file, drawn)
 
 
 def generate(repeats: int = 3, quick: bool = False, json_file: JsonFile = None) -> int:

@@ -44,6 +44,7 @@ GROUPS = {
         "style": bench_commands.style,
         "fit": bench_commands.fit,
         "open": bench_commands.open_,
+        "trade": bench_commands.trade,
         "generate": bench_commands.generate,
         "dataset": bench_commands.dataset,
         "training": bench_commands.training,

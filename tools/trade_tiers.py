@@ -2,14 +2,14 @@
 
 1. Of each knob the values that save time: those faster than every more accurate one by at least
    LEAST_SAVED of the reference's time. A value's time is the geometric mean of its ratios to the
-   reference, over all recipes and scenes that have the knob.
-2. The fastest of them whose worst FLIP, over all recipes, scenes and views, is within the bound.
-3. All knobs together, rendered: while the worst FLIP is beyond the bound, the knob that has the
-   most error alone goes a step back towards reference (augment.quality.choose.within_flip).
+   reference, over all recipes and scenes in which it changes the picture.
+2. Knob after knob, that which saves most first, takes the fastest of them with which the worst FLIP
+   of all that are chosen so far, rendered together, is within the bound: over all recipes, scenes
+   and views (augment.quality.choose.within_flip).
 
     python -m tools.trade_tiers TABLE.json=SCENE_URI ...
 
-renders what step 3 asks for and the tables lack, adds it to them, then the tiers themselves, in
+renders what step 2 asks for and the tables lack, adds it to them, then the tiers themselves, in
 place of rows of earlier ones, and prints what they set. TABLE_tiers.jpg beside a table shows them.
 """
 
@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from augment.quality.choose import Cost, Settings, useful, within_flip
-from recipes.knobs import KNOBS, Knob, Value
+from recipes.knobs import BY_PATH, KNOBS, Knob, Value
 from tools.bench_trade import Trade, bench_trade, table_of
 from tools.drawing import write_jpeg
 from tools.trade_cases import JPEG, WHOLE, TradeCase
@@ -73,8 +73,9 @@ def tier_from(tables: Tables, bound: float) -> dict[str, Value]:
     # From the fastest to reference, as within_flip takes them.
     ladders = {path: useful(each)[::-1] for path, each in costs.items()}
     flips = {path: {cost.value: cost.flip for cost in each} for path, each in costs.items()}
+    by_saving = sorted(ladders, key=lambda path: _least_ms(ladders[path], bound))
     chosen = within_flip(
-        {path: [cost.value for cost in ladder] for path, ladder in ladders.items()},
+        {path: [cost.value for cost in ladders[path]] for path in by_saving},
         bound,
         lambda path, value: flips[path][value],
         lambda settings: whole_flip(rows, settings) > bound,
@@ -83,14 +84,24 @@ def tier_from(tables: Tables, bound: float) -> dict[str, Value]:
     return {path: value for path, value in chosen.items() if value != references[path]}
 
 
+def _least_ms(ladder: Sequence[Cost], bound: float) -> float:
+    """Of the values that are within the bound alone."""
+    return min(cost.ms for cost in ladder if cost.flip <= bound)
+
+
 def knob_costs(rows: Sequence[Row], knob: Knob) -> list[Cost]:
     """Of its values, fast to accurate. ms: here per cent of the reference's time. flip: the worst.
 
-    Values that no table has are left out.
+    Values that no table has, and those that change no picture, are left out: of the latter a time
+    would be noise.
     """
     costs = []
     for value in knob.values[:-1]:
-        own = [row for row in rows if row["knob"] == knob.path and row["value"] == value]
+        own = [
+            row
+            for row in rows
+            if row["knob"] == knob.path and row["value"] == value and row["worst_flip"] > 0
+        ]
         if own:
             ratio = math.exp(sum(math.log(row["over_reference"]) for row in own) / len(own))
             costs.append(Cost(value, 100 * ratio, max(row["worst_flip"] for row in own)))
@@ -107,10 +118,22 @@ def whole_flip(rows: Sequence[Row], settings: Settings) -> float:
     for recipe in sorted({(row["scene"], row["recipe"]) for row in rows}):
         own = [row for row in rows if (row["scene"], row["recipe"]) == recipe]
         found = [row["worst_flip"] for row in own if _is_of(row, settings)]
+        found += _alone(own, settings)
         if not found:
             raise Unmeasured(settings)
         worst = max(worst, *found)
     return worst
+
+
+def _alone(rows: Sequence[Row], settings: Settings) -> list[float]:
+    """The error of settings of which one, or none, differs from reference for a recipe."""
+    knobs = {row["knob"] for row in rows}
+    moved = {p: v for p, v in settings.items() if p in knobs and v != BY_PATH[p].reference}
+    if not moved:
+        return [0.0]
+    if len(moved) > 1:
+        return []
+    return [row["worst_flip"] for row in rows if (row["knob"], row["value"]) in moved.items()]
 
 
 def invisible_evidence(tables: Tables) -> list[float]:

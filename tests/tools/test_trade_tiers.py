@@ -54,9 +54,24 @@ def test_the_worst_recipe_counts():
     }
 
 
-def test_the_knob_with_most_error_steps_back_while_the_whole_is_beyond_the_bound():
-    beyond = [whole(0.03, stop=0.01, clip=1.0), whole(0.019, stop=0.01)]
-    assert tier_from([table(clean=[*SINGLE, *beyond])], 0.02) == {STOP: 0.01}
+def test_the_knob_that_saves_most_comes_first_and_the_others_fit_beside_it():
+    beyond = [whole(0.03, stop=0.01, clip=1.0), whole(0.019, stop=1e-3, clip=1.0)]
+    assert tier_from([table(clean=[*SINGLE, *beyond])], 0.02) == {STOP: 1e-3, CLIP: 1.0}
+    beyond = [whole(0.03, stop=0.01, clip=1.0), whole(0.021, stop=1e-3, clip=1.0)]
+    assert tier_from([table(clean=[*SINGLE, *beyond])], 0.02) == {CLIP: 1.0}
+
+
+def test_a_knob_alone_needs_no_rendering_together():
+    """The snow's recipe has one knob that differs, and one that is not its own."""
+    snow = [row for row in SINGLE if row["knob"] == STOP]
+    rows = [*SINGLE, whole(0.018, stop=0.01, clip=1.0)]
+    assert tier_from([table(clean=rows, snow=snow)], 0.02) == {STOP: 0.01, CLIP: 1.0}
+
+
+def test_times_of_values_that_change_nothing_are_noise():
+    noise = [row(STOP, 0.05, 0.5, 0.0), row(CLIP, 2.0, 0.5, 0.0)]
+    alone = [row(STOP, 0.05, 0.5, 0.0), row(CLIP, 2.0, 1.0, 0.01)]
+    assert tier_from([table(clean=noise, snow=alone)], 0.02) == {}
 
 
 def test_what_has_not_been_rendered_together_is_asked_for():
@@ -69,7 +84,7 @@ def test_what_has_not_been_rendered_together_is_asked_for():
 
 
 def test_a_value_that_saves_nothing_is_never_taken():
-    rows = [row(STOP, 0.05, 1.02, 0.0), row(STOP, 0.01, 0.99, 0.0), row(CLIP, 2.0, 0.5, 0.01)]
+    rows = [row(STOP, 0.05, 1.02, 0.001), row(STOP, 0.01, 0.99, 0.001), row(CLIP, 2.0, 0.5, 0.01)]
     rows.append(whole(0.01, clip=2.0))
     assert tier_from([table(clean=rows)], 0.02) == {CLIP: 2.0}
 
