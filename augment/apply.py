@@ -342,5 +342,7 @@ def instance_table(parts: tuple[PosedGaussians, ...]) -> np.ndarray:
 def _look_up(raster: RenderOutput, table: np.ndarray, none: int, dtype: type) -> np.ndarray:
     assert raster.splat_ids is not None and raster.alpha is not None
     index = raster.splat_ids.numpy()
+    if len(table) == 0:  # no part has a splat: an empty background, and actors that are not there
+        return np.full(index.shape, none, dtype)
     seen = (index >= 0) & (raster.alpha.numpy() >= SURFACE_ALPHA)
     return np.where(seen, table[np.maximum(index, 0)], none).astype(dtype)

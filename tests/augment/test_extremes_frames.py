@@ -10,11 +10,14 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from augment.apply import render_view
 from augment.cameras import Camera
 from augment.errors import SceneError
-from augment.scene import Gaussians, Scene, check_gaussians
+from augment.scene import Actor, Gaussians, Scene, check_gaussians
+from augment.semantics import SemanticClass
 from augment.snow.beds import bed_of
 from augment.snow.covers import placement_settings
+from augment.track import Track
 from recipes.schema import Recipe
 from tests.augment.examples import drawing
 from tests.augment.extremes import (
@@ -118,6 +121,19 @@ def test_two_million_gaussians():
 def test_nothing_at_all_is_refused():
     with pytest.raises(SceneError, match="holds no Gaussians"):
         Place(nothing(), 0, on_street=False).scene()
+
+
+def test_actors_that_are_all_gone_leave_the_sky():
+    """Without a background: no part of the view has a splat to look up."""
+    track = Track(torch.tensor([0]), torch.eye(4, dtype=torch.float64)[None])
+    actor = Actor("a", "Car", one_gaussian(), track, (1.0, 1.0, 1.0))
+    scene = Place(nothing(), 0, on_street=False, actor=actor).scene()
+    output = {"depth": "expected", "semantic": True, "instance": True}
+    camera = camera_at((0.0, 0.0, 0.0), timestamp_ns=2**40)
+    view = render_view(scene, camera, Recipe.model_validate({"output": output}))
+    assert view.semantic is not None and (view.semantic == SemanticClass.SKY).all()
+    assert view.instance is not None and not view.instance.any()
+    assert view.depth_m is not None and not view.depth_m.any()
 
 
 @pytest.mark.parametrize("quat", [(0.0, 0.0, 0.0, 0.0), (1e-30, 0.0, 0.0, 0.0), (1e20, 0, 0, 0.0)])
