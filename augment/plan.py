@@ -180,12 +180,18 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
 
 
 def _style_step(how: str, style: Style | None, chosen: bool, reason: str) -> Step:
-    """On the scene it takes no pass of its own: splats are mapped as they are projected."""
+    """On the scene it takes no pass of its own: splats are mapped as they are projected, or were
+    once for all views.
+    """
     if style is not None and not chosen:
         reason = f"style.applied_to is {style.applied_to!r}"
     elif style is not None and how == "on the scene":
         maps = "a map for every region" if style.per_region else "one map for all splats"
-        reason += f", {maps}, applied as they are projected; snow and water keep their colours"
+        when = {
+            "color": "applied as they are projected",
+            "sh": "folded into the background's SH once, applied to actors as they are projected",
+        }[style.evaluated]
+        reason += f", {maps}, {when}; snow and water keep their colours"
     return Step(f"style {how}", style is not None and chosen, reason)
 
 

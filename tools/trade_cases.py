@@ -34,7 +34,7 @@ class TradeCase:
     """
 
     width: int = 640
-    repeats: int = 3
+    repeats: int = 9
     depths: tuple[str, ...] = ("none", "expected", "median", "mode")
     memory: bool = True
 
