@@ -73,10 +73,17 @@ class Quality(Closed):
 
 
 # What each tier sets, by the fields' dotted paths, but for those that a recipe gives and those of
-# effects that it has not. reference is the last value of every knob (recipes.knobs).
+# effects that it has not; the rest are at reference, the last value of every knob (recipes.knobs).
+# By the rule of docs/trade.md from the tables there.
 TIERS = MappingProxyType(
     {
-        "draft": MappingProxyType({}),
-        "balanced": MappingProxyType({}),
+        "draft": MappingProxyType(
+            {
+                "render.scale": 0.75,
+                "render.transmittance_stop": 0.01,
+                "weather.snow.shading": "per_splat",
+            }
+        ),
+        "balanced": MappingProxyType({"render.transmittance_stop": 0.01}),
     }
 )

@@ -107,7 +107,7 @@ def settings_of_trade(
     chosen = [knob for knob in knobs_of(recipe) if knob.chosen]
     found = [Setting(WHOLE, REFERENCE, best, {k.path: k.reference for k in chosen})]
     if wholes is None:
-        for knob in chosen:
+        for knob in (k for k in knobs_of(recipe) if not k.path.startswith("output.")):
             for value in knob.values[:-1]:
                 found.append(Setting(knob.path, value, with_settings(best, {knob.path: value})))
         found += [Setting(DEPTH, name, changed(best, {DEPTH: name})) for name in case.depths]

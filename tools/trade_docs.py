@@ -19,7 +19,7 @@ from recipes.knobs import KNOBS, Knob, Value
 from recipes.quality import TIERS
 from tools.bench_trade import table_of
 from tools.machine import machine_line
-from tools.trade_cases import DEFAULTS, JPEG, REFERENCE, WHOLE
+from tools.trade_cases import DEFAULTS, DEPTH, JPEG, REFERENCE, WHOLE
 from tools.trade_measure import Row
 from tools.trade_plots import draw_chart
 from tools.trade_text import markdown, number, percent, trade_markdown, value_text, views_line
@@ -105,9 +105,9 @@ def _knob_table(tables: Sequence[Mapping[str, Any]]) -> Iterator[str]:
     header = ("knob", "value", *(f"{t['scene']}: {name}" for t in tables for name in each))
     rows = []
     for knob in KNOBS:
-        for value in knob.values if not knob.chosen else knob.values[:-1]:
-            if knob.path == JPEG:
-                continue
+        if knob.path == JPEG:
+            continue
+        for value in knob.values if knob.path == DEPTH else knob.values[:-1]:
             cells = [cell for table in tables for cell in _knob_cells(table, knob, value)]
             rows.append((f"`{knob.path}`", value_text(value), *cells))
     yield from markdown(header, rows)

@@ -20,7 +20,7 @@ class Finished:
 
 @dataclass(frozen=True)
 class Lost:
-    """The worker died at its task, and another one takes its place. how: "was killed by SIGKILL", say."""
+    """The worker died at its task; another takes its place. how: "was killed by SIGKILL", say."""
 
     slot: int
     how: str
