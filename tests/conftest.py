@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
-import hashlib
 import os
 import re
 import shutil
@@ -18,8 +16,6 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest
 from jaxtyping import config, install_import_hook
-from numba.core.caching import NullCache
-from numba.core.dispatcher import Dispatcher
 
 ROOT = Path(__file__).resolve().parents[1]
 KERNELS = re.compile(r"^(import numba|from numba|from augment\.render\.cpu_jit)", re.MULTILINE)
@@ -43,27 +39,6 @@ def _checked_modules() -> list[str]:
 install_import_hook(_checked_modules(), "beartype.beartype")
 
 
-def _compile_once() -> None:
-    """Of the processes that need a kernel at one moment one compiles it, the others read it.
-
-    Without that, the workers of a first run on a fresh clone compile the same for seconds each.
-    """
-    compile_ = Dispatcher.compile
-    folder = Path(tempfile.gettempdir()) / f"climategs-tests-{os.getuid()}"
-    folder.mkdir(exist_ok=True)
-
-    def compile_once(dispatcher: Dispatcher, signature: object) -> object:
-        if isinstance(dispatcher._cache, NullCache):  # a kernel's inner function
-            return compile_(dispatcher, signature)
-        named = f"{ROOT} {dispatcher.__module__}.{dispatcher.__name__} {signature}"
-        name = hashlib.sha256(named.encode()).hexdigest()[:20]
-        with (folder / name).open("w") as file:
-            fcntl.flock(file, fcntl.LOCK_EX)
-            return compile_(dispatcher, signature)
-
-    Dispatcher.compile = compile_once
-
-
 # Files of a few long tests. At the end one of them would keep a single core busy.
 LONG = {
     f"test_{name}.py"
@@ -80,9 +55,6 @@ LONG = {
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Long files first (make test tells pytest-xdist to keep to this order)."""
     items.sort(key=lambda item: item.path.name not in LONG)
-
-
-_compile_once()
 
 
 @pytest.fixture(scope="session", autouse=True)
