@@ -47,21 +47,21 @@ def weather(depth: str = "expected", **effects) -> Recipe:
     return Recipe.model_validate({"weather": effects, "style": style, "output": output})
 
 
-@drawing(45)
+@drawing(24)
 @given(places(), cameras(levels_m=(0.2,)), recipes())
 def test_any_scene_from_anywhere_in_any_weather(place: Place, camera: Camera, recipe: Recipe):
     rendered(place.scene(), camera, recipe)
 
 
 @pytest.mark.parametrize("pair", PAIRS, ids=lambda pair: "-".join(sorted(pair)))
-@drawing(8)
+@drawing(4)
 @given(data=st.data())
 def test_every_pair_of_effects(pair: frozenset[str], data: st.DataObject):
     place, camera = data.draw(places()), data.draw(cameras(levels_m=(0.2,)))
     rendered(place.scene(), camera, data.draw(recipes(pair)))
 
 
-@drawing(15)
+@drawing(8)
 @given(cameras(levels_m=(0.2,)), recipes(frozenset({"flood"})))
 def test_the_eye_at_below_and_above_the_water(camera: Camera, recipe: Recipe):
     """The eye at the recipe's level, the next number beside it, or a little away from it."""

@@ -60,7 +60,7 @@ def assert_never_grows(less: torch.Tensor, more: torch.Tensor) -> None:
     assert worst <= room, f"denser smog adds {worst} of contrast; rounding may add {room}"
 
 
-@drawing(30)
+@drawing(15)
 @given(
     places(),
     cameras(),
@@ -77,7 +77,7 @@ def test_denser_smog_never_adds_contrast_to_a_black_airlight(
         assert_never_grows(less, more)
 
 
-@drawing(20)
+@drawing(10)
 @given(
     places(),
     cameras(),
@@ -93,7 +93,7 @@ def test_denser_smog_on_buffers_never_adds_contrast_to_any_airlight(
         assert_never_grows(less, more)
 
 
-@drawing(20)
+@drawing(10)
 @given(
     places(),
     cameras(),
@@ -131,7 +131,7 @@ def surface(cells: SnowCells, snow: Snow, seed: int) -> np.ndarray:
     return surface_heights(cells, depths.heights)
 
 
-@drawing(40)
+@drawing(20)
 @given(
     st.sampled_from((0.0, 0.003, 0.1, 3.0)) | st.none(),
     st.lists(st.sampled_from(DEPTHS_M), min_size=2, unique=True).map(sorted),

@@ -89,7 +89,7 @@ def assert_finite(found: dict) -> None:
         assert value is not None and bool(torch.isfinite(torch.as_tensor(value)).all()), name
 
 
-@drawing(25)
+@drawing(12)
 @given(kinds, seeds, fovs, sizes, st.booleans())
 def test_of_the_cpu_rasteriser(kind, seed, fov_deg, size, antialiased):
     camera = wide_camera(fov_deg, size)
@@ -178,7 +178,7 @@ def loss_arrays(loss: ViewLoss) -> dict[str, np.ndarray]:
 views = st.sampled_from(((1, 1), (1, 40), (23, 17))), fovs, st.booleans()
 
 
-@drawing(25)
+@drawing(10)
 @given(seeds, *views)
 def test_of_the_loss_of_a_view(seed, size, fov_deg, is_constant):
     """By the kernels and by their definition, in float32 as they and in float64."""
@@ -195,7 +195,7 @@ def test_of_the_loss_of_a_view(seed, size, fov_deg, is_constant):
         assert_finite({name: grad for name, grad in grads.items() if grad is not None})
 
 
-@drawing(15)
+@drawing(8)
 @given(seeds, *views)
 def test_sky_and_colour_maps_after_steps(seed, size, fov_deg, is_constant):
     arguments = hard_view(seed, *size, fov_deg, is_constant=is_constant)
@@ -210,7 +210,7 @@ def test_sky_and_colour_maps_after_steps(seed, size, fov_deg, is_constant):
     assert np.isfinite(faces).all() and faces.min() >= 0 and faces.max() <= 1
 
 
-@drawing(20)
+@drawing(10)
 @given(kinds, seeds, fovs, st.sampled_from((0.0, 1e-30, 1.0, 1e10)))
 def test_splats_and_poses_after_a_step(kind, seed, fov_deg, steepness):
     """Adam keeps logarithms of scales and logits of opacities within what can be drawn."""
@@ -302,7 +302,7 @@ spreads = st.sampled_from((0.0, 1e-12, 1e-4, 0.08))
 colours = st.tuples(*[st.sampled_from((0.0, 1e-8, 0.5, 1.0))] * 3)
 
 
-@drawing(40)
+@drawing(20)
 @given(colours, colours, spreads, spreads, st.sampled_from(("mkl", "reinhard")),
        st.sampled_from((0.0, 1.0, 2.0)), st.booleans())  # fmt: skip
 def test_closed_forms_of_plain_pictures(one, other, narrow, wide, method, strength, is_flat):

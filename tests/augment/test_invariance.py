@@ -67,7 +67,7 @@ def assert_same_bits(actual: RenderOutput, expected: RenderOutput) -> None:
 # ---- the order of the Gaussians ------------------------------------------------------------------
 
 
-@drawing(20)
+@drawing(10)
 @given(st.sampled_from(KINDS), weathers, seeds, st.sampled_from((1, 60, 170)), st.integers(1, 3000))
 def test_bits_do_not_depend_on_the_order_of_gaussians(kind, weather, seed, fov_deg, count):
     """Shuffled within its part, a splat keeps its z, and with no equal z the picture its bits."""
@@ -105,7 +105,7 @@ def test_of_equal_depths_the_first_is_in_front():
         assert torch.equal(render(parts, camera, weather).rgb[middle], behind)
 
 
-@drawing(12)
+@drawing(8)
 @given(st.sampled_from(KINDS), weathers, seeds, st.booleans(), st.integers(0, 3000))
 def test_a_part_split_in_two_has_the_same_bits(kind, weather, seed, is_posed, cut):
     """Ids too, for they count through the parts. Blocks of 2048 begin anew with each part."""
@@ -128,7 +128,7 @@ def _sliced(gaussians: Gaussians, rows: slice) -> Gaussians:
 
 
 @pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="one core: nothing to compare")
-@drawing(6)
+@drawing(4)
 @given(st.sampled_from(KINDS), weathers, seeds)
 def test_bits_do_not_depend_on_the_number_of_threads(kind, weather, seed):
     """As in clear air (test_render_cpu), so in every weather."""
@@ -182,7 +182,7 @@ def _centred(gaussians: Gaussians, camera: Camera, left=0, top=0, right=0, botto
 shifts = st.tuples(st.integers(-15, 15), st.integers(-15, 15))
 
 
-@drawing(25)
+@drawing(12)
 @given(st.sampled_from(KINDS), weathers, seeds, shifts, st.sampled_from((10, 60, 120, 170)))
 def test_a_picture_moved_over_the_tiles_is_the_same(kind, weather, seed, shift, fov_deg):
     camera = wide_camera(fov_deg, (70, 53), turn=0.3)
@@ -200,7 +200,7 @@ def test_a_picture_moved_over_the_tiles_is_the_same(kind, weather, seed, shift, 
     assert_same_picture(moved_back, {n: image[here] for n, image in first.items()}, 40)
 
 
-@drawing(12)
+@drawing(8)
 @given(st.sampled_from(KINDS), weathers, seeds, st.integers(1, 40), st.integers(1, 30))
 def test_a_larger_image_holds_the_smaller_one_to_the_bit(kind, weather, seed, wider, higher):
     camera = wide_camera(60.0, (45, 37))
@@ -212,7 +212,7 @@ def test_a_larger_image_holds_the_smaller_one_to_the_bit(kind, weather, seed, wi
         assert torch.equal(whole[name][:37, :45], image), name
 
 
-@drawing(12)
+@drawing(8)
 @given(st.sampled_from(KINDS), weathers, seeds, st.integers(0, 40), st.integers(0, 30))
 def test_a_window_shows_its_part_of_the_picture(kind, weather, seed, left, top):
     """By a camera whose principal point is moved, as tiles of a picture are rendered apart."""
