@@ -3,8 +3,8 @@ PYTHON ?= python3.11
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
-# Two more than there are cores: some tests wait for disks, timers and other processes.
-TEST_WORKERS := $(shell expr $$(nproc 2>/dev/null || echo 1) + 2)
+# One more than there are cores: some tests wait for disks, timers and other processes.
+TEST_WORKERS := $(shell expr $$(nproc 2>/dev/null || echo 1) + 1)
 # Python compiles a module when it first imports it, and most of what comes along never is: compiling
 # it all takes longer than unpacking. Where Python may not keep what it has compiled, pip does it.
 COMPILE := $(if $(PYTHONDONTWRITEBYTECODE),,--no-compile)

@@ -43,11 +43,9 @@ install_import_hook(_checked_modules(), "beartype.beartype")
 LONG = {
     f"test_{name}.py"
     for name in (
-        "batch_resume", "batch_workers", "bench_flood", "bench_open", "bench_snow",
-        "extremes_frames", "extremes_monotone", "extremes_zero", "fit", "flood_accuracy",
-        "generate", "generate_crashes", "generate_ray", "gradients_extreme", "kernels_run",
-        "packages", "precision", "procedural", "quality_settle", "recording_flood",
-        "render_backward", "smog_accuracy", "snow_accuracy", "trained_street", "view_plan",
+        "batch_resume", "batch_workers", "bench_flood", "bench_open", "bench_snow", "fit",
+        "flood_accuracy", "generate", "generate_crashes", "generate_ray", "packages", "procedural",
+        "recording_flood", "render_backward", "smog_accuracy", "snow_accuracy", "trained_street",
     )
 }  # fmt: skip
 
