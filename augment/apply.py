@@ -202,11 +202,11 @@ def render_buffers(
         rgb, raster = _without_water(sky, parts, camera, plan, view.buffers, backend)
     if look is not None and plan.styles_picture:
         with lap("style on the picture"):
-            rgb = map_colors(rgb, look.maps.picture, fast=backend != "reference")
+            rgb = map_colors(rgb, look.maps.picture, backend=backend)
     color_map = scene.color_map(camera) if plan.recorded_exposure else None
     if color_map is not None:  # a camera exposes what the weather has left, so this comes last
         with lap("camera colour map"):
-            rgb = map_colors(rgb, color_map, fast=backend != "reference")
+            rgb = map_colors(rgb, color_map, backend=backend)
     water = None if flooded is None else flooded.water
     with lap("depth of surfaces"):
         depth_m = _surface_depth(raster, plan, plan.buffers)
@@ -287,9 +287,7 @@ def _without_water(
             rgb = fog_raster(raster, camera, plan.smog_on_buffers)
     uniform = plan.smog is not None and plan.smog.scale_height_m is None  # hides the sky
     with lap("airlight behind the splats" if uniform else "sky"):
-        rgb = composite_sky(
-            rgb, raster.alpha, camera, sky, smog=plan.smog, fast=backend != "reference"
-        )
+        rgb = composite_sky(rgb, raster.alpha, camera, sky, smog=plan.smog, backend=backend)
     return rgb, raster
 
 

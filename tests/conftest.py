@@ -15,14 +15,21 @@ from pathlib import Path
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest
+import torch
 from jaxtyping import config, install_import_hook
 
 ROOT = Path(__file__).resolve().parents[1]
-KERNELS = re.compile(r"^(import numba|from numba|from augment\.render\.cpu_jit)", re.MULTILINE)
+KERNELS = re.compile(
+    r"^(import numba|from numba|from augment\.render\.cpu_jit|import triton)", re.MULTILINE
+)
+
+# Triton reads this where a kernel is defined: without a GPU its kernels run in Python.
+if not torch.cuda.is_available():
+    os.environ.setdefault("TRITON_INTERPRET", "1")
 
 
 def _checked_modules() -> list[str]:
-    """Modules of the library, without those that hold numba kernels.
+    """Modules of the library, without those that hold numba or Triton kernels.
 
     The hook wraps every function it sees, and a wrapped kernel can be neither compiled nor cached.
     """
@@ -51,8 +58,15 @@ LONG = {
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Long files first (make test tells pytest-xdist to keep to this order)."""
+    """Long files first (make test tells pytest-xdist to keep to this order). Without a GPU the
+    tests that need one are skipped.
+    """
     items.sort(key=lambda item: item.path.name not in LONG)
+    if not torch.cuda.is_available():
+        skip = pytest.mark.skip(reason="needs a GPU")
+        for item in items:
+            if "gpu" in item.keywords:
+                item.add_marker(skip)
 
 
 @pytest.fixture(scope="session", autouse=True)

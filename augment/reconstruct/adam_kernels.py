@@ -17,7 +17,6 @@ from augment.render import cpu_simd as v8
 from augment.render.cpu_color import write_basis
 from augment.render.cpu_geometry import from_eye
 from augment.render.cpu_jit import inner, kernel
-from augment.render.cpu_layout import BLOCK, LANES, V_FOCAL, V_ROTATION, U
 from augment.render.cpu_math import LOG2_E, exp2_fine, floats_at
 from augment.render.cpu_project_backward import (
     G_ABS,
@@ -28,6 +27,7 @@ from augment.render.cpu_project_backward import (
     G_SCALE,
     GRAD,
 )
+from augment.render.layout import BLOCK, LANES, V_FOCAL, V_ROTATION, U
 
 # Numbers of an update, float32: step sizes of a row's first 16 columns as GRAD lists them (negative
 # for opacity, whose odds are divided), of the SH, and the rest.

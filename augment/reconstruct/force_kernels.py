@@ -8,9 +8,9 @@ import numpy as np
 from numba import prange
 
 from augment.render.cpu_jit import inner, kernel
-from augment.render.cpu_layout import BLOCK, U
 from augment.render.cpu_math import floats_at
 from augment.render.cpu_project_backward import G_MEAN, G_QUAT, GRAD
+from augment.render.layout import BLOCK, U
 
 # Of a block, with g = dL/d mean and p the mean: sums of g (3) and p x g (3), to which is added what
 # turning the splats themselves does.

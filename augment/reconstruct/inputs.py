@@ -8,9 +8,10 @@ import numpy as np
 
 from augment.cameras import Camera
 from augment.reconstruct.splats import Splats
-from augment.render import cpu_layout as layout
+from augment.render import layout
 from augment.render.constants import RasterSettings
-from augment.render.cpu_inputs import Inputs, part_views, raster_modes
+from augment.render.cpu_inputs import Inputs
+from augment.render.part_views import part_views, raster_modes
 
 _FIELDS = ("means", "quats", "scales", "opacities", "sh")
 

@@ -35,9 +35,10 @@ from augment.reconstruct.splats import Splats
 from augment.reconstruct.view import RecordedView, ViewKey, ViewSource
 from augment.render import cpu_backward
 from augment.render.constants import RasterSettings
-from augment.render.cpu_inputs import Inputs, part_poses
-from augment.render.cpu_layout import BLOCK, M_FUNCTIONS
+from augment.render.cpu_inputs import Inputs
 from augment.render.cpu_scratch import Scratch
+from augment.render.layout import BLOCK, M_FUNCTIONS
+from augment.render.part_views import part_poses
 from augment.render.threads import kernel_threads
 from augment.rng import rng_for
 from augment.scene import Scene

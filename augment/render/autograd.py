@@ -19,8 +19,8 @@ from augment.render import cpu_project_backward as rows
 from augment.render.buffers import ALPHA, EXPECTED_DEPTH, RGB, RenderOutput
 from augment.render.constants import RasterSettings
 from augment.render.cpu_inputs import gather_inputs
-from augment.render.cpu_layout import BLOCK, V_EYE
 from augment.render.cpu_scratch import Scratch
+from augment.render.layout import BLOCK, V_EYE
 from augment.render.sh import sh_basis
 from augment.scene import Gaussians, PosedGaussians
 

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from augment.cameras import Camera
 from augment.render import composite_kernels
+from augment.render.backends import CPU, REFERENCE, kernels_for
 from augment.render.threads import kernel_threads
 from augment.sky import ConstantSky, CubemapSky, Sky, bordered_faces
 from augment.weather.smog import (
@@ -44,13 +45,13 @@ def composite_sky(
     sky: Sky,
     *,
     smog: SmogMedium | None = None,
-    fast: bool = True,
+    backend: str = CPU,
 ) -> Float[Tensor, "H W 3"]:
     """The finished display-encoded image, not clamped.
 
-    smog: with it the sky is seen through the smog up to infinity. fast: cube maps in float32 go
-    through the CPU kernel, equal to this definition within float rounding, unless gradients are
-    recorded, which the kernel has none of.
+    smog: with it the sky is seen through the smog up to infinity. backend: with kernels, cube maps
+    in float32 go through them, equal to this definition within float rounding, unless gradients are
+    recorded, which they have none of.
     """
     sky, smog = sky_behind(sky, smog)
     if isinstance(sky, ConstantSky) and smog is None:  # no direction matters
@@ -60,8 +61,7 @@ def composite_sky(
             f"camera {camera.name!r} is orthographic: its rays are parallel and see the sky in one "
             f"direction only; composite a ConstantSky, without layered smog"
         )
-    tracked = torch.is_grad_enabled() and (rgb.requires_grad or alpha.requires_grad)
-    if fast and not tracked and isinstance(sky, CubemapSky) and rgb.dtype == torch.float32:
+    if isinstance(sky, CubemapSky) and kernels_for(backend, rgb, alpha) == CPU:
         return _composite_cubemap(rgb, alpha, camera, bordered_faces(sky), smog)
     directions = camera.ray_directions(rgb.dtype)
     color = sky.sample(directions)
@@ -98,15 +98,15 @@ def _composite_cubemap(
 
 
 def map_colors(
-    rgb: Float[Tensor, "H W 3"], color_map: Float[Tensor, "3 4"], *, fast: bool = True
+    rgb: Float[Tensor, "H W 3"], color_map: Float[Tensor, "3 4"], *, backend: str = CPU
 ) -> Float[Tensor, "H W 3"]:
     """M[:, :3] @ rgb + M[:, 3] at every pixel, not clamped.
 
-    fast: float32 without gradients goes through the CPU kernel, equal to this definition within
-    float rounding, which overwrites `rgb`: fresh memory would take as long as the arithmetic.
+    backend: with kernels, float32 without gradients goes through them, equal to this definition
+    within float rounding, and `rgb` is overwritten: fresh memory would take as long as the
+    arithmetic.
     """
-    tracked = torch.is_grad_enabled() and (rgb.requires_grad or color_map.requires_grad)
-    if not fast or tracked or rgb.dtype != torch.float32 or not rgb.is_contiguous():
+    if kernels_for(backend, rgb, color_map) == REFERENCE or not rgb.is_contiguous():
         color_map = color_map.to(rgb.dtype)
         return rgb @ color_map[:, :3].T + color_map[:, 3]
     with kernel_threads(ROWS):

@@ -22,8 +22,7 @@ import numpy as np
 import torch
 
 from augment.cameras import Camera
-from augment.render import cpu_bin, cpu_blend, cpu_clip, cpu_project, cpu_shading
-from augment.render import cpu_layout as layout
+from augment.render import cpu_bin, cpu_blend, cpu_clip, cpu_project, cpu_shading, layout
 from augment.render.buffers import (
     ALPHA,
     BUFFERS,

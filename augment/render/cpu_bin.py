@@ -10,7 +10,7 @@ import numpy as np
 from numba import prange
 
 from augment.render.cpu_jit import inner, kernel
-from augment.render.cpu_layout import BIN_SHIFT, BLOCK, U
+from augment.render.layout import BIN_SHIFT, BLOCK, U
 
 _DIGIT_BITS = BIN_SHIFT // 2  # what z bins leave to sort, in two passes
 _DIGITS = 1 << _DIGIT_BITS

@@ -24,7 +24,18 @@ from augment.render.cpu_clip import (
 )
 from augment.render.cpu_items import BATCH, ITEMS, find_spans, list_items, stage
 from augment.render.cpu_jit import inner, kernel
-from augment.render.cpu_layout import (
+from augment.render.cpu_math import exp2
+from augment.render.cpu_mode import MODE, MODE_PLANES, add_sample, can_grow, close_clusters
+from augment.render.cpu_shading import (
+    L_BLUE,
+    L_GREEN,
+    L_RED,
+    LIT,
+    is_lit,
+    light_share,
+    stage_lights,
+)
+from augment.render.layout import (
     BLUE,
     DEPTH,
     GREEN,
@@ -40,17 +51,6 @@ from augment.render.cpu_layout import (
     TILE_H,
     TILE_W,
     U,
-)
-from augment.render.cpu_math import exp2
-from augment.render.cpu_mode import MODE, MODE_PLANES, add_sample, can_grow, close_clusters
-from augment.render.cpu_shading import (
-    L_BLUE,
-    L_GREEN,
-    L_RED,
-    LIT,
-    is_lit,
-    light_share,
-    stage_lights,
 )
 
 GROUP = 8  # tiles a thread takes at a time

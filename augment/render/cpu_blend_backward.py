@@ -9,7 +9,7 @@ where rest starts as the sum over the whole pixel, known from the finished image
 at every splat: no transmittance is ever divided by.
 
 A splat's share of a tile is kept as sums over its pixels of g = dL/de (e: log2 of alpha, see
-cpu_layout) times powers of `off` (sharp pixels off the ridge) and `dy`, from which
+augment.render.layout) times powers of `off` (sharp pixels off the ridge) and `dy`, from which
 cpu_project_backward derives everything geometric. Each list entry has its own place for them, so
 nothing is added in an order that depends on threads.
 """
@@ -25,7 +25,7 @@ from augment.render import cpu_simd as v8
 from augment.render.cpu_blend import alpha_of, is_closed, light_left, shrink
 from augment.render.cpu_items import BATCH, ITEMS, find_spans, list_items, stage
 from augment.render.cpu_jit import inner, kernel
-from augment.render.cpu_layout import (
+from augment.render.layout import (
     BLUE,
     DEPTH,
     FALL_Y,

@@ -14,7 +14,7 @@ from augment.render import cpu_simd as v8
 from augment.render.cpu_geometry import cross, dot, rotation_row, semi_axes
 from augment.render.cpu_items import BATCH
 from augment.render.cpu_jit import inner
-from augment.render.cpu_layout import (
+from augment.render.layout import (
     LANES,
     MEAN_X,
     MEAN_Y,

@@ -12,7 +12,8 @@ import numpy as np
 
 from augment.render import cpu_simd as v8
 from augment.render.cpu_jit import inner
-from augment.render.cpu_layout import (
+from augment.render.cpu_math import LOG2_E, exp2_fine, fmuladd
+from augment.render.layout import (
     BLUE,
     GREEN,
     LANES,
@@ -25,7 +26,6 @@ from augment.render.cpu_layout import (
     V_UP,
     U,
 )
-from augment.render.cpu_math import LOG2_E, exp2_fine, fmuladd
 from augment.weather.smog import MAX_EXPONENT
 
 MAX_FUNCTIONS = 16

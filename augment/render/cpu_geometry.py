@@ -6,7 +6,7 @@ import numpy as np
 
 from augment.render import cpu_simd as v8
 from augment.render.cpu_jit import inner
-from augment.render.cpu_layout import (
+from augment.render.layout import (
     V_BLUR,
     V_CENTRE,
     V_EYE,

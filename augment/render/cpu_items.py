@@ -13,7 +13,8 @@ import numpy as np
 
 from augment.render import cpu_simd as v8
 from augment.render.cpu_jit import inner
-from augment.render.cpu_layout import (
+from augment.render.cpu_math import fmuladd
+from augment.render.layout import (
     BLUE,
     BLUNT_Y,
     DEPTH,
@@ -36,7 +37,6 @@ from augment.render.cpu_layout import (
     TILE_H,
     U,
 )
-from augment.render.cpu_math import fmuladd
 
 BATCH = 32  # splats between two looks at what is still open
 ITEMS = BATCH * TILE_H + TILE_H  # a batch's items at most, and room for the surplus

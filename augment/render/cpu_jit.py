@@ -21,7 +21,8 @@ inner = functools.partial(numba.njit, no_cpython_wrapper=True, no_cfunc_wrapper=
 
 
 def _hash_sources() -> str:
-    sources = sorted(Path(__file__).parent.glob("cpu_*.py"))
+    folder = Path(__file__).parent
+    sources = [*sorted(folder.glob("cpu_*.py")), folder / "layout.py"]
     return hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()
 
 

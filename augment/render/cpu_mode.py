@@ -9,7 +9,7 @@ import numpy as np
 
 from augment.render import cpu_simd as v8
 from augment.render.cpu_jit import inner
-from augment.render.cpu_layout import LANES, PIXELS, U
+from augment.render.layout import LANES, PIXELS, U
 from augment.render.mode_depth import BETA_PER_SIGMA, FARTHER, GAMMA, NEARER
 
 # Planes of a tile, from where the caller says: of the running cluster the depth it began with and

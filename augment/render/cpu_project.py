@@ -36,7 +36,19 @@ from augment.render.cpu_geometry import (
     to_image,
 )
 from augment.render.cpu_jit import inner, kernel
-from augment.render.cpu_layout import (
+from augment.render.cpu_math import LOG2_E, floats_at, log2, shorts_at
+from augment.render.cpu_shading import (
+    L_FACING,
+    L_LEAN_X,
+    L_LEAN_Y,
+    L_RED,
+    L_WRAP,
+    L_X,
+    L_Y,
+    LINES,
+    light_eight,
+)
+from augment.render.layout import (
     A_MAPS,
     A_MEANS,
     A_OPACITIES,
@@ -88,18 +100,6 @@ from augment.render.cpu_layout import (
     V_SNOW,
     U,
 )
-from augment.render.cpu_math import LOG2_E, floats_at, log2, shorts_at
-from augment.render.cpu_shading import (
-    L_FACING,
-    L_LEAN_X,
-    L_LEAN_Y,
-    L_RED,
-    L_WRAP,
-    L_X,
-    L_Y,
-    LINES,
-    light_eight,
-)
 
 # Rows of eight that the projection leaves for writing: a record, the pixels a splat covers, colour.
 _COLOR = 0
@@ -115,9 +115,9 @@ _HUGE = np.float32(1e37)  # px^2; beyond it float32 overflows, and no pixel coul
 def rank_splats(addresses, sizes, views, blocks, depths, histograms):
     """z of every Gaussian that may be seen, 0 for the others, and where along z the image is paid.
 
-    addresses: uint64 [P, ADDRESSES], see cpu_layout. sizes: int64 [P, 2], Gaussians and SH
-    functions. views: float32 [P, VIEW]. blocks: int64 [B, 3], part, first and last + 1. depths:
-    float32 [B BLOCK]. histograms: float64 [C, BINS], each of C runs of blocks its own: opacity
+    addresses: uint64 [P, ADDRESSES], see layout. sizes: int64 [P, 2], Gaussians and SH functions.
+    views: float32 [P, VIEW]. blocks: int64 [B, 3], part, first and last + 1. depths: float32
+    [B BLOCK]. histograms: float64 [C, BINS], each of C runs of blocks its own: opacity
     times area, px^2.
     """
     runs, total = histograms.shape[0], blocks.shape[0]

@@ -36,7 +36,8 @@ from augment.render.cpu_geometry import (
     to_camera,
 )
 from augment.render.cpu_jit import inner, kernel
-from augment.render.cpu_layout import (
+from augment.render.cpu_math import LOG2_E, floats_at
+from augment.render.layout import (
     BLOCK,
     BLUE,
     GREEN,
@@ -54,7 +55,6 @@ from augment.render.cpu_layout import (
     V_LOW,
     U,
 )
-from augment.render.cpu_math import LOG2_E, floats_at
 
 # A row of gradients, one cache line: by mean (3, metres, in the part's axes), unit quaternion (4,
 # tangential), logarithms of scales (3) and opacity, colour before its clamp at 0 (3). Between them

@@ -11,7 +11,7 @@ from augment.render import cpu_simd as v8
 from augment.render.cpu_geometry import dot, rotation_row
 from augment.render.cpu_items import BATCH, ITEMS
 from augment.render.cpu_jit import inner
-from augment.render.cpu_layout import (
+from augment.render.layout import (
     LANES,
     LOG_OPACITY,
     MEAN_X,

@@ -7,12 +7,20 @@ import functools
 import logging
 import math
 from collections.abc import Collection, Sequence
-from types import ModuleType
 
 import torch
 
 from augment.cameras import Camera
 from augment.errors import BackendUnavailable
+from augment.render.backends import (
+    AUTO,
+    BACKENDS,
+    CPU,
+    CUDA,
+    REFERENCE,
+    import_cpu,
+    import_cuda,
+)
 from augment.render.buffers import ALPHA, BUFFERS, DIFFERENTIABLE, RGB, RenderOutput
 from augment.render.clip import HeightClip
 from augment.render.constants import MOST_TRANSMITTANCE_STOP, RasterSettings
@@ -23,9 +31,6 @@ from augment.scene import Gaussians, PosedGaussians
 from augment.weather.smog import SmogMedium
 
 logger = logging.getLogger(__name__)
-
-AUTO, REFERENCE, CPU = "auto", "reference", "cpu"
-BACKENDS = (AUTO, REFERENCE, CPU)
 
 
 def rasterize(
@@ -47,14 +52,17 @@ def rasterize(
     wanted: bool [H, W], the pixels that will be looked at; a backend may leave the others 0.
     backend: "cpu" (numba, float32; gradients of rgb, alpha and expected_depth, of pinhole cameras,
     without smog, clip, light per pixel or colour maps and where no other buffer is asked for),
-    "reference" (torch, float32 or float64, gradients of all), or "auto": cpu where it can do the
-    job, else reference.
+    "cuda" (Triton, float32; parts may lie on either side, and are kept on the GPU as long as their
+    tensors live; the buffers lie there; gradients as augment.render.cuda_autograd says),
+    "reference" (torch, float32 or float64, gradients of all, on the CPU), or "auto": cuda where the
+    Gaussians lie on a GPU, else cpu where it can do the job, else reference.
 
     Raises:
         ValueError, TypeError: an argument no backend, or not the one named, can take.
         BackendUnavailable: the backend named cannot run on this machine.
     """
     _check_arguments(parts, camera, buffers, settings)
+    _check_places(parts, backend)
     if smog is not None and camera.is_orthographic:
         raise ValueError(
             f"camera {camera.name!r} is orthographic: there is no eye from which to measure how "
@@ -72,7 +80,7 @@ def rasterize(
     if not needs_remainder(stop):
         return _rasterize(parts, camera, names, settings, smog, clip, wanted, chosen)
     drawn = _rasterize(parts, camera, names | {ALPHA}, settings, smog, clip, wanted, chosen)
-    shared = share_remainder(drawn, stop, fast=chosen == CPU)
+    shared = share_remainder(drawn, stop, backend=chosen)
     return shared if ALPHA in names else dataclasses.replace(shared, alpha=None)
 
 
@@ -88,7 +96,9 @@ def _rasterize(
 ) -> RenderOutput:
     if backend == REFERENCE:
         return rasterize_reference(parts, camera, names, settings, smog, clip)
-    cpu = _import_cpu()
+    if backend == CUDA:
+        return _rasterize_cuda(parts, camera, names, settings, smog, clip, wanted)
+    cpu = import_cpu()
     if _tracked(parts):
         from augment.render.autograd import rasterize_with_gradients
 
@@ -104,13 +114,23 @@ def _rasterize(
     )
 
 
-def available_backends() -> dict[str, str | None]:
-    """Every backend but "auto", with None where it can run and else the reason why it cannot."""
-    try:
-        _import_cpu()
-    except BackendUnavailable as error:
-        return {REFERENCE: None, CPU: str(error)}
-    return {REFERENCE: None, CPU: None}
+def _rasterize_cuda(
+    parts: Sequence[PosedGaussians],
+    camera: Camera,
+    names: frozenset[str],
+    settings: RasterSettings,
+    smog: SmogMedium | None,
+    clip: HeightClip | None,
+    wanted: torch.Tensor | None,
+) -> RenderOutput:
+    cuda = import_cuda()
+    if _tracked(parts):
+        from augment.render.cuda_autograd import rasterize_with_gradients
+
+        return rasterize_with_gradients(parts, camera, names, settings)
+    return cuda.rasterize_cuda(
+        [_detached(p) for p in parts], camera, names, settings, smog, clip, wanted
+    )
 
 
 def _choose(
@@ -124,25 +144,28 @@ def _choose(
     """The backend to use; the first time a choice is made for a reason, it is logged."""
     if backend not in BACKENDS:
         raise ValueError(f"backend must be one of {', '.join(BACKENDS)}; got {backend!r}")
+    first = parts[0].gaussians.means
+    if backend == AUTO and first.device.type != "cpu":
+        backend = CUDA
     if backend == REFERENCE:
         return REFERENCE
-    dtype = parts[0].gaussians.means.dtype
+    dtype = first.dtype
     obstacle = None
     if dtype != torch.float32:
         obstacle = f"the Gaussians are {dtype}, it takes torch.float32"
     elif _tracked(parts):
         what = _beyond_its_gradients(parts, camera, buffers, smog, clip)
         obstacle = what and f"gradients {what} are asked for, it has none"
-    if backend == CPU:
+    if backend in (CPU, CUDA):
         if obstacle:
             raise ValueError(
-                f"backend 'cpu' cannot render these Gaussians: {obstacle}; convert or detach "
+                f"backend {backend!r} cannot render these Gaussians: {obstacle}; convert or detach "
                 f"them, or use backend 'auto' or 'reference'"
             )
-        return CPU
+        return backend
     if obstacle is None:
         try:
-            _import_cpu()
+            import_cpu()
         except BackendUnavailable as error:
             obstacle = str(error)
     if obstacle:
@@ -179,17 +202,6 @@ def _log_choice(backend: str, reason: str, level: int) -> None:
     logger.log(level, "backend 'auto' renders with %r (%s)", backend, reason)
 
 
-def _import_cpu() -> ModuleType:
-    try:
-        from augment.render import cpu
-    except ImportError as error:
-        raise BackendUnavailable(
-            f"backend 'cpu' is unavailable: {error}. Install the package's dependencies (numba, "
-            f"tbb), or use backend 'reference', which needs torch only and is far slower"
-        ) from error
-    return cpu
-
-
 def _check_arguments(
     parts: Sequence[PosedGaussians],
     camera: Camera,
@@ -218,11 +230,28 @@ def _check_arguments(
                 f"all parts must share one dtype; part 0 is {first.dtype}, "
                 f"part {number} is {means.dtype}"
             )
-        if means.device.type != "cpu":
-            raise ValueError(f"part {number} is on {means.device}; move it with .cpu()")
         _check_pose(part, number, camera)
         _check_shading(part, number)
         _check_color_maps(part, number)
+
+
+def _check_places(parts: Sequence[PosedGaussians], backend: str) -> None:
+    """All tensors on the CPU, or, for a backend that can take it, all of one GPU."""
+    if backend in (AUTO, CUDA):
+        places = {part.gaussians.means.device for part in parts}
+        away = {place for place in places if place.type != "cpu"}
+        if backend == AUTO and away and places != away:
+            raise ValueError(
+                f"parts lie on {', '.join(sorted(map(str, places)))}; move all to one device, or "
+                f"name the backend"
+            )
+        return
+    for number, part in enumerate(parts):
+        if part.gaussians.means.device.type != "cpu":
+            raise ValueError(
+                f"part {number} is on {part.gaussians.means.device}, where backend {backend!r} "
+                f"cannot read it; move it with .cpu(), or use backend 'cuda'"
+            )
 
 
 def _check_shading(part: PosedGaussians, number: int) -> None:

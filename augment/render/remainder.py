@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from augment.render.backends import CPU, kernels_for
 from augment.render.buffers import RenderOutput
 from augment.render.constants import TRANSMITTANCE_STOP
 
@@ -22,17 +23,16 @@ def needs_remainder(stop: float) -> bool:
     return stop > TRANSMITTANCE_STOP
 
 
-def share_remainder(output: RenderOutput, stop: float, *, fast: bool = True) -> RenderOutput:
-    """Pixels of alpha >= 1 - stop become opaque. output: with alpha; written to where fast.
+def share_remainder(output: RenderOutput, stop: float, *, backend: str = CPU) -> RenderOutput:
+    """Pixels of alpha >= 1 - stop become opaque. output: with alpha; written to by kernels.
 
-    fast: float32 without gradients goes through the CPU kernel, equal within float rounding.
+    backend: with kernels, float32 without gradients goes through them, equal within float rounding.
     """
     alpha = output.alpha
     assert alpha is not None
     images = {name: getattr(output, name) for name in ("rgb", "snow")}
     images = {name: image for name, image in images.items() if image is not None}
-    tracked = any(image.requires_grad for image in (alpha, *images.values()))
-    if fast and not tracked and alpha.dtype == torch.float32:
+    if kernels_for(backend, alpha, *images.values()) == CPU:
         _by_kernel(alpha, images, stop)
         return output
     finished = alpha >= 1 - stop

@@ -12,7 +12,7 @@ from numba.core import types
 from numba.extending import intrinsic
 
 from augment.render.cpu_jit import inner, kernel
-from augment.render.cpu_layout import LANES, U
+from augment.render.layout import LANES, U
 from augment.render.sh import SH_C0
 
 SPLATS = 2048  # of a piece of work

@@ -28,7 +28,7 @@ from augment.render.buffers import ALPHA, EXPECTED_DEPTH, RGB, RenderOutput
 from augment.render.clip import ABOVE, BELOW, HeightClip
 from augment.render.composite import composite_sky
 from augment.render.constants import RasterSettings
-from augment.render.rasterize import REFERENCE, rasterize
+from augment.render.rasterize import rasterize
 from augment.scene import PosedGaussians
 from augment.sky import Sky
 from augment.stopwatch import lap
@@ -70,10 +70,6 @@ class Painter:
     smog: SmogMedium | None
     smog_on_buffers: SmogMedium | None
     backend: str
-
-    @property
-    def fast(self) -> bool:
-        return self.backend != REFERENCE
 
     @property
     def medium(self) -> SmogMedium | None:
@@ -159,19 +155,19 @@ def _from_above(
     with lap("rasterise"):
         front = painter.draw(camera, above, wanted)
     assert front.rgb is not None and front.alpha is not None
-    sky, smog, fast = painter.sky, painter.medium, painter.fast
+    sky, smog, backend = painter.sky, painter.medium, painter.backend
     with lap("flood: where it is seen"):
-        water, most_shown = find_water(front.alpha, camera, fast=fast)
+        water, most_shown = find_water(front.alpha, camera, backend=backend)
     if most_shown < 1 - HIDDEN_COVER:
         with lap("sky"):
-            image = composite_sky(front.rgb, front.alpha, camera, sky, smog=smog, fast=fast)
+            image = composite_sky(front.rgb, front.alpha, camera, sky, smog=smog, backend=backend)
         return FloodedImage(image, front, water, is_hidden=True)
 
     crop = window.of(camera)
     cover = window.cut(front.alpha)
     seen = cover <= HIDDEN_COVER
     with lap("flood: waves"):
-        field = wave_field(medium.waves, crop, medium.level_z_m, fast=fast)
+        field = wave_field(medium.waves, crop, medium.level_z_m, backend=backend)
     margins = _bed_margins(camera, medium)
     bed_window = window.grown(margins)
     bed_camera = bed_window.of(camera)
@@ -192,11 +188,11 @@ def _from_above(
             screen=screen,
             sky=sky,
             smog=smog,
-            fast=fast,
+            backend=backend,
         )
     with lap("flood: layers joined"):
-        image = pour(front, camera, window, color, sky, smog, fast=fast)
-        scene = both_sides(front, bed, bed_window, buffers, fast=fast)
+        image = pour(front, camera, window, color, sky, smog, backend=backend)
+        scene = both_sides(front, bed, bed_window, buffers, backend=backend)
     return FloodedImage(image, scene, water)
 
 
@@ -256,7 +252,7 @@ def _screen_reflection(
         return None
     needed = is_smooth(field, crop)  # rough water takes the mirrored view alone
     layer = as_layer(camera, front)
-    return trace_screen(layer, crop, medium.level_z_m, needed=needed, fast=painter.fast)
+    return trace_screen(layer, crop, medium.level_z_m, needed=needed, backend=painter.backend)
 
 
 def _mirror_margins(camera: Camera, medium: FloodMedium) -> Margins:
@@ -305,5 +301,5 @@ def _from_below(
     )
     water = torch.ones(camera.height, camera.width, dtype=torch.bool)
     whole = Window(0, 0, camera.width, camera.height)
-    scene = both_sides(front, air, whole, buffers, fast=painter.fast)
+    scene = both_sides(front, air, whole, buffers, backend=painter.backend)
     return FloodedImage(image, scene, water)

@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from augment.cameras import Camera
+from augment.render.backends import CPU, REFERENCE, kernels_for
 from augment.render.buffers import ALPHA, EXPECTED_DEPTH, RGB, SPLAT_IDS, RenderOutput
 from augment.render.composite import composite_sky
 from augment.render.constants import DEPTH_EPS
@@ -21,13 +22,13 @@ ROWS = 32  # image rows a thread takes at a time
 
 
 def find_water(
-    alpha: Float[Tensor, "H W"], camera: Camera, *, fast: bool = True
+    alpha: Float[Tensor, "H W"], camera: Camera, *, backend: str = CPU
 ) -> tuple[Bool[Tensor, "H W"], float]:
     """Where a camera above the water sees it first, and the largest share of it in any pixel.
 
     alpha: of what stands before the water. It is seen first where that leaves more than half.
     """
-    if fast and alpha.dtype == torch.float32:
+    if kernels_for(backend, alpha) == CPU:
         water = np.empty(tuple(alpha.shape), np.uint8)
         shown = np.empty(len(alpha), np.float32)
         with kernel_threads(ROWS):
@@ -45,17 +46,17 @@ def pour(
     sky: Sky,
     smog: SmogMedium | None,
     *,
-    fast: bool = True,
+    backend: str = CPU,
 ) -> Float[Tensor, "H W 3"]:
     """front + (1 - front's alpha) times the water's colour where rays fall, the sky's elsewhere.
 
-    color: of the window's pixels. fast: float32 is worked on in place, in the front's own colours:
-    fresh memory would take as long as the arithmetic.
+    color: of the window's pixels. backend: kernels work on float32 in place, in the front's own
+    colours: fresh memory would take as long as the arithmetic.
     """
     assert front.rgb is not None and front.alpha is not None
     rgb, alpha = front.rgb, front.alpha
-    if not fast or rgb.dtype != torch.float32:
-        image = composite_sky(rgb, alpha, camera, sky, smog=smog, fast=fast)
+    if kernels_for(backend, rgb, alpha) == REFERENCE:
+        image = composite_sky(rgb, alpha, camera, sky, smog=smog, backend=backend)
         mixed = window.cut(rgb) + (1 - window.cut(alpha))[..., None] * color
         meets = falling(window.of(camera))[..., None]
         window.paste(image, torch.where(meets, mixed, window.cut(image)))
@@ -102,20 +103,20 @@ def both_sides(
     window: Window,
     buffers: frozenset[str],
     *,
-    fast: bool = True,
+    backend: str = CPU,
 ) -> RenderOutput:
     """Buffers of two layers as one scene's, colour excepted: what stands before the water, and, in
     the window, what is seen through it.
 
     Alpha and expected depth are what one render would give. Median depth and the heaviest splat
-    are those of the layer that covers more of the pixel. fast: float32 is worked on in place.
+    are those of the layer that covers more of the pixel. backend: kernels work on float32 in place.
     """
     assert front.alpha is not None and behind.alpha is not None
     wanted = buffers - {RGB, ALPHA}
     if not wanted:
         return RenderOutput()
     values = {name: getattr(front, name) for name in (*wanted, ALPHA)}
-    if fast and front.alpha.dtype == torch.float32:
+    if kernels_for(backend, front.alpha) == CPU:
         here, there = window.overlap(front.alpha)
         alphas = (front.alpha.numpy()[here], behind.alpha.numpy()[there])
         with kernel_threads(ROWS):

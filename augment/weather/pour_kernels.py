@@ -6,7 +6,7 @@ import numpy as np
 from numba import prange
 
 from augment.render.cpu_jit import inner, kernel
-from augment.render.cpu_layout import U
+from augment.render.layout import U
 
 
 @inner()

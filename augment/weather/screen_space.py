@@ -26,6 +26,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from augment.cameras import Camera
+from augment.render.backends import CPU, REFERENCE, kernels_for
 from augment.render.threads import kernel_threads
 from augment.weather import screen_space_kernels as kernels
 from augment.weather.flood import Layer
@@ -64,7 +65,7 @@ def trace_screen(
     *,
     needed: Bool[Tensor, "h w"] | None = None,
     stride: int = 4,
-    fast: bool = True,
+    backend: str = CPU,
 ) -> ScreenReflection:
     """What the mirrored rays of the flat surface z = level_z_m meet, for the pixels of `camera`.
 
@@ -75,7 +76,7 @@ def trace_screen(
     come back to the camera's plane, or are lost behind something that is thinner than the way
     behind it. The weight falls to 0 over the outer 4 % of the image.
 
-    fast: through the CPU kernels, equal to this definition but for rays that pass a silhouette's
+    backend: kernels are equal to this definition but for rays that pass a silhouette's
     pixel by its corner. They trace every `stride`-th pixel of rows and columns (1, 2 or 4),
     interpolate where four agree and trace what is left; the definition traces every pixel.
 
@@ -95,7 +96,7 @@ def trace_screen(
             f"needed must be [{camera.height}, {camera.width}] as camera {camera.name!r} is; "
             f"got {list(needed.shape)}"
         )
-    run = _trace_fast if fast else _trace
+    run = _trace if kernels_for(backend) == REFERENCE else _trace_fast
     distance, weight = run(front, camera, level_z_m, left, top, stride, needed)
     return ScreenReflection(front, distance, weight)
 

@@ -13,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from augment.cameras import Camera
+from augment.render.backends import CPU, kernels_for
 from augment.sky import Sky
 from augment.weather import water_launch
 from augment.weather.flood import FloodMedium, Layer
@@ -54,7 +55,7 @@ def shade_water(
     screen: ScreenReflection | None = None,
     sky: Sky,
     smog: SmogMedium | None = None,
-    fast: bool = True,
+    backend: str = CPU,
 ) -> Float[Tensor, "h w 3"]:
     """Colour of the water where the camera's rays meet it, not clamped; 0 where they do not.
 
@@ -63,8 +64,8 @@ def shade_water(
     from a window of the same image, best a larger one. mirror: from the eye mirrored in the plane.
     screen: its layer is of the same eye; it serves the pixels that are smooth
     (`water_surface.is_smooth`), in the others' blur a coarse mirror is as sharp. Layers are fogged
-    already; smog here dims the sky and the water's own colour. fast: float32 goes through the CPU
-    kernel, equal to this definition within float rounding, unless gradients are recorded.
+    already; smog here dims the sky and the water's own colour. backend: with kernels, float32 goes
+    through them, equal to this definition within float rounding, unless gradients are recorded.
 
     Raises:
         ValueError: the eye is not above the water, or cameras, images and fields do not fit.
@@ -78,8 +79,7 @@ def shade_water(
         *([] if screen is None else [screen.layer]),
     ]
     images = [cover, *(part for layer in layers for part in (layer.rgb, layer.alpha, layer.depth))]
-    tracked = torch.is_grad_enabled() and any(image.requires_grad for image in images)
-    if fast and not tracked and bed.rgb.dtype == torch.float32:
+    if kernels_for(backend, *images) == CPU:
         return water_launch.shade(
             camera, cover, HIDDEN_COVER, medium, field, bed, mirror, screen, sky, smog
         )

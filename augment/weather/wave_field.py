@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from augment.cameras import Camera
+from augment.render.backends import CPU, REFERENCE, kernels_for
 from augment.render.threads import kernel_threads
 from augment.weather import waves_kernels
 from augment.weather.waves import (
@@ -35,10 +36,12 @@ UPRIGHT = 1e-6  # horizontal part of a ray, at unit z, below which its direction
 ROWS = 8  # image rows a thread takes at a time
 
 
-def wave_field(waves: WaveSet, camera: Camera, level_z_m: float, *, fast: bool = True) -> WaveField:
+def wave_field(
+    waves: WaveSet, camera: Camera, level_z_m: float, *, backend: str = CPU
+) -> WaveField:
     """The waves at every pixel of a camera, at its own time. level_z_m: the plane, scene world.
 
-    fast: by the CPU kernel, equal to the definition in float64 within 1e-5 of a normal's
+    backend: with kernels by them, equal to the definition in float64 within 1e-5 of a normal's
     components (for surfaces that keep clear of cusps).
 
     Raises:
@@ -50,7 +53,7 @@ def wave_field(waves: WaveSet, camera: Camera, level_z_m: float, *, fast: bool =
     if waves.is_flat or abs(height) < TOUCHING_M:
         still = torch.zeros(camera.height, camera.width)
         return WaveField(still, still, still)
-    return (_run_kernel if fast else _define)(waves, camera, height)
+    return (_define if kernels_for(backend) == REFERENCE else _run_kernel)(waves, camera, height)
 
 
 def _define(waves: WaveSet, camera: Camera, height: float) -> WaveField:

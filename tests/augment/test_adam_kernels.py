@@ -16,8 +16,6 @@ from augment.reconstruct.inputs import splat_inputs
 from augment.reconstruct.rates import BETA1, BETA2, CORRECTIONS, splat_rates
 from augment.reconstruct.splats import Splats
 from augment.render.constants import RasterSettings
-from augment.render.cpu_inputs import part_poses
-from augment.render.cpu_layout import BLOCK
 from augment.render.cpu_project_backward import (
     G_ABS,
     G_COLOR,
@@ -28,6 +26,8 @@ from augment.render.cpu_project_backward import (
     G_SCALE,
     GRAD,
 )
+from augment.render.layout import BLOCK
+from augment.render.part_views import part_poses
 from augment.render.sh import sh_basis
 from augment.render.threads import kernel_threads, limit_threads
 from augment.scene import Gaussians

@@ -31,7 +31,7 @@ def test_the_kernel_matches_the_definition(camera, smog):
     alpha = torch.rand(37, 61, generator=generator)
     sky = CubemapSky(torch.rand(6, 16, 16, 3, generator=generator))
     fast = composite_sky(rgb, alpha, camera, sky, smog=smog)
-    slow = composite_sky(rgb, alpha, camera, sky, smog=smog, fast=False)
+    slow = composite_sky(rgb, alpha, camera, sky, smog=smog, backend="reference")
     # Noise textures of 16 texels: float32 rounding of coordinates (1e-6) times 16 texels; a
     # pixel whose direction lies on an edge between faces may fall to either side.
     difference = (fast - slow).abs().amax(-1)
@@ -92,7 +92,7 @@ COLOR_MAP = torch.tensor([[1.1, 0.05, 0.0, 0.02], [-0.1, 0.9, 0.1, 0.0], [0.0, 0
 def test_colour_maps_match_their_definition(size):
     rgb = torch.rand(*size, 3) * 1.5 - 0.2  # pictures are not clamped before
     expected = rgb.double() @ COLOR_MAP[:, :3].double().T + COLOR_MAP[:, 3].double()
-    slow = map_colors(rgb, COLOR_MAP, fast=False)
+    slow = map_colors(rgb, COLOR_MAP, backend="reference")
     fast = map_colors(rgb.clone(), COLOR_MAP)
     # Sums of four float32 products below 2.
     torch.testing.assert_close(slow.double(), expected, atol=1e-6, rtol=0)

@@ -27,8 +27,8 @@ from augment.reconstruct.view import RecordedView
 from augment.render import cpu_backward
 from augment.render.buffers import ALPHA, EXPECTED_DEPTH, RGB
 from augment.render.constants import RasterSettings
-from augment.render.cpu_inputs import part_poses
 from augment.render.cpu_scratch import Scratch
+from augment.render.part_views import part_poses
 from augment.render.rasterize import rasterize
 from augment.render.threads import kernel_threads
 from augment.scene import Gaussians, PosedGaussians

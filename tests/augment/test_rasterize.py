@@ -6,10 +6,11 @@ import pytest
 import torch
 
 from augment.errors import BackendUnavailable
+from augment.render import backends
 from augment.render import rasterize as module
 from augment.render.buffers import BUFFERS, RenderOutput
 from augment.render.constants import RasterSettings
-from augment.render.rasterize import available_backends, rasterize
+from augment.render.rasterize import rasterize
 from augment.render.remainder import share_remainder
 from augment.scene import Gaussians, PosedGaussians
 from augment.weather.smog import SmogMedium
@@ -36,7 +37,8 @@ def without_numba(monkeypatch):
     def missing():
         raise BackendUnavailable("backend 'cpu' is unavailable: no numba here")
 
-    monkeypatch.setattr(module, "_import_cpu", missing)
+    monkeypatch.setattr(module, "import_cpu", missing)
+    monkeypatch.setattr(backends, "import_cpu", missing)
 
 
 def tracked(part):
@@ -100,7 +102,7 @@ def test_kernel_and_definition_share_the_rest_alike():
     images = {"rgb": (9, 7, 3), "alpha": (9, 7), "snow": (9, 7)}
     images = {name: torch.rand(shape, generator=rng) for name, shape in images.items()}
     images["alpha"][0, :3] = torch.tensor([0.75, 1.0, 0.0])
-    slow = share_remainder(RenderOutput(**images), 0.25, fast=False)
+    slow = share_remainder(RenderOutput(**images), 0.25, backend="reference")
     fast = share_remainder(RenderOutput(**{n: i.clone() for n, i in images.items()}), 0.25)
     for name in images:
         torch.testing.assert_close(getattr(fast, name), getattr(slow, name), rtol=3e-7, atol=0)
@@ -156,10 +158,9 @@ def test_naming_a_backend_that_is_missing_raises(parts, monkeypatch):
     without_numba(monkeypatch)
     with pytest.raises(BackendUnavailable, match="no numba here"):
         rasterize(parts, camera_ahead(), backend="cpu")
-    assert available_backends() == {
-        "reference": None,
-        "cpu": "backend 'cpu' is unavailable: no numba here",
-    }
+    obstacles = backends.available_backends()
+    assert obstacles["cpu"] == "backend 'cpu' is unavailable: no numba here"
+    assert obstacles["reference"] is None and set(obstacles) == {"reference", "cpu", "cuda"}
 
 
 def test_a_failing_import_names_the_reason_and_the_way_out(monkeypatch):
@@ -170,7 +171,7 @@ def test_a_failing_import_names_the_reason_and_the_way_out(monkeypatch):
     monkeypatch.delattr(augment.render, "cpu", raising=False)
     monkeypatch.setitem(sys.modules, "augment.render.cpu", None)
     with pytest.raises(BackendUnavailable, match=r"unavailable: .*numba, tbb.*'reference'"):
-        module._import_cpu()
+        backends.import_cpu()
 
 
 # ---- refused ----------------------------------------------------------------------------------
@@ -186,7 +187,7 @@ def test_a_failing_import_names_the_reason_and_the_way_out(monkeypatch):
         ),
         ({"buffers": []}, ValueError, "no buffers asked for; known: rgb, alpha"),
         ({"buffers": "rgb"}, TypeError, "collection of names; got the string 'rgb'"),
-        ({"backend": "gpu"}, ValueError, "one of auto, reference, cpu; got 'gpu'"),
+        ({"backend": "gpu"}, ValueError, "one of auto, reference, cpu, cuda; got 'gpu'"),
         ({"settings": RasterSettings(near_m=0.0)}, ValueError, "near_m must be finite and > 0"),
         ({"settings": RasterSettings(alpha_max=1.0)}, ValueError, "alpha_max must lie between"),
         ({"settings": RasterSettings(sh_degree=4)}, ValueError, "None or 0 to 3; got 4"),

@@ -87,12 +87,12 @@ def projected(camera: Camera, way: torch.Tensor) -> torch.Tensor:
 VIEWS = [(0, 0), (8, 0), (0, 25), (12, -40), (-10, 5), (35, 90)]
 
 
-@pytest.mark.parametrize("fast", [False, True])
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
 @pytest.mark.parametrize(("pitch", "roll"), VIEWS)
-def test_rays_meet_a_wall_where_geometry_says(pitch, roll, fast):
+def test_rays_meet_a_wall_where_geometry_says(pitch, roll, backend):
     camera = looking(pitch, roll)
     front = see(camera, WALL)
-    found = trace_screen(front, camera, LEVEL_M, stride=1, fast=fast)
+    found = trace_screen(front, camera, LEVEL_M, stride=1, backend=backend)
     way, height = mirrored_way(camera, WALL_M)
     at = projected(camera, way)
     size = torch.tensor([camera.width, camera.height], dtype=torch.float64)
@@ -122,12 +122,12 @@ def test_a_wall_is_as_smooth_between_the_traced_pixels(stride):
     assert torch.allclose(found[sure].double(), way[sure], rtol=0.02, atol=0.02)
 
 
-@pytest.mark.parametrize("fast", [False, True])
-def test_a_car_before_a_wall_is_met_first_and_sky_is_above_both(fast):
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+def test_a_car_before_a_wall_is_met_first_and_sky_is_above_both(backend):
     camera = looking(height=101)
     car_top, wall_top = 0.6, 5.0  # low and high enough for rays between them to be in the image
     front = see(camera, (*CAR[:4], car_top), (*WALL[:4], wall_top))
-    found = trace_screen(front, camera, LEVEL_M, stride=1, fast=fast)
+    found = trace_screen(front, camera, LEVEL_M, stride=1, backend=backend)
     to_car, car_height = mirrored_way(camera, CAR[0])
     to_wall, wall_height = mirrored_way(camera, WALL_M)
     rays = camera.ray_directions(torch.float64)
@@ -148,12 +148,12 @@ def test_a_car_before_a_wall_is_met_first_and_sky_is_above_both(fast):
     assert found.distance[sky].isinf().all() and (found.weight[sky] == 1).all()
 
 
-@pytest.mark.parametrize("fast", [False, True])
-def test_what_is_lost_behind_a_thin_thing_is_not_known(fast):
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+def test_what_is_lost_behind_a_thin_thing_is_not_known(backend):
     """A sign hangs before the sky: rays of water far behind it pass behind it."""
     camera = looking(0, height=151)
     front = see(camera, SIGN)
-    found = trace_screen(front, camera, LEVEL_M, stride=1, fast=fast)
+    found = trace_screen(front, camera, LEVEL_M, stride=1, backend=backend)
     rays = camera.ray_directions(torch.float64)
     s = EYE_M / -rays[..., 2]
     # Where the mirrored ray, seen from the eye, crosses the middle of the sign (0.7 m over it).
@@ -168,47 +168,47 @@ def test_what_is_lost_behind_a_thin_thing_is_not_known(fast):
     assert found.distance[beside].isinf().all() and int((found.weight[beside] == 1).sum()) > 20
 
 
-@pytest.mark.parametrize("fast", [False, True])
-def test_what_stands_above_the_image_is_not_known(fast):
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+def test_what_stands_above_the_image_is_not_known(backend):
     camera = looking(30)  # the horizon lies above the image
     front = see(camera, (WALL_M, -1e3, 1e3, 0.0, 1e3))
-    found = trace_screen(front, camera, LEVEL_M, fast=fast)
+    found = trace_screen(front, camera, LEVEL_M, backend=backend)
     at = projected(camera, mirrored_way(camera, WALL_M)[0])
     above = water(camera, front) & (at[..., 1] < -1)
     assert int(above.sum()) > 100
     assert (found.weight[above] == 0).all() and found.distance[above].isinf().all()
 
 
-@pytest.mark.parametrize("fast", [False, True])
-def test_rays_that_come_back_to_the_camera_are_not_known(fast):
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+def test_rays_that_come_back_to_the_camera_are_not_known(backend):
     """Looking straight down, past the point under the camera."""
     for roll in (0, 30):
         camera = looking(90, roll, 41, 41)
         front = see(camera)
-        found = trace_screen(front, camera, LEVEL_M, stride=1, fast=fast)
+        found = trace_screen(front, camera, LEVEL_M, stride=1, backend=backend)
         assert (found.weight == 0).all() and found.distance.isinf().all()
 
 
-@pytest.mark.parametrize("fast", [False, True])
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
 @pytest.mark.parametrize("stride", [1, 2, 4])
-def test_nothing_stands_anywhere(fast, stride):
+def test_nothing_stands_anywhere(backend, stride):
     camera = looking(0, height=65)
     front = see(camera)
-    found = trace_screen(front, camera, LEVEL_M, stride=stride, fast=fast)
+    found = trace_screen(front, camera, LEVEL_M, stride=stride, backend=backend)
     assert found.distance.isinf().all()
     middle = found.weight[40:60, 8:-8]  # these rays end between rows 5 and 25 of 65
     assert (middle == 1).all()
     assert (found.weight[:32] == 0).all()  # above the horizon there is no water
 
 
-@pytest.mark.parametrize("fast", [False, True])
-def test_pixels_without_water_have_no_reflection(fast):
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+def test_pixels_without_water_have_no_reflection(backend):
     camera = looking(10)
     everything = dataclasses.replace(
         see(camera), alpha=torch.ones(75, 97), depth=torch.full((75, 97), 0.5)
     )
     for front, level in ((everything, LEVEL_M), (see(camera), 5.0)):  # covered; under water
-        found = trace_screen(front, camera, level, fast=fast)
+        found = trace_screen(front, camera, level, backend=backend)
         assert (found.weight == 0).all() and found.distance.isinf().all()
 
 
@@ -238,7 +238,7 @@ def test_the_kernel_matches_the_definition(pitch, roll):
     camera = looking(pitch, roll, 131, 90, fx=80.0)
     front = see(camera, SIGN, CAR, WALL, (30.0, 2.0, 9.0, 1.0, 8.0))
     fast = trace_screen(front, camera, LEVEL_M, stride=1)
-    slow = trace_screen(front, camera, LEVEL_M, fast=False)
+    slow = trace_screen(front, camera, LEVEL_M, backend="reference")
     close = torch.isclose(fast.distance, slow.distance, rtol=1e-3, atol=1e-3)
     close &= (fast.weight - slow.weight).abs() < 1e-3
     # The definition steps over corners of pixels (a quarter of a pixel a step): there a ray may
@@ -246,16 +246,16 @@ def test_the_kernel_matches_the_definition(pitch, roll):
     assert int((~close).sum()) <= 0.005 * close.numel()
 
 
-@pytest.mark.parametrize("fast", [False, True])
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
 @pytest.mark.parametrize("stride", [1, 2, 4])
-def test_only_needed_pixels_are_traced(stride, fast):
+def test_only_needed_pixels_are_traced(stride, backend):
     camera = looking(6, 10)
     front = see(camera, CAR, WALL)
-    whole = trace_screen(front, camera, LEVEL_M, stride=1, fast=fast)
+    whole = trace_screen(front, camera, LEVEL_M, stride=1, backend=backend)
     needed = torch.zeros(camera.height, camera.width, dtype=torch.bool)
     needed[40:60, 5:70] = True
     needed[65::3, 1::3] = True  # alone between pixels that are not
-    part = trace_screen(front, camera, LEVEL_M, needed=needed, stride=stride, fast=fast)
+    part = trace_screen(front, camera, LEVEL_M, needed=needed, stride=stride, backend=backend)
     assert (part.weight[~needed] == 0).all() and part.distance[~needed].isinf().all()
     assert (part.weight >= 0).all() and int((part.weight[needed] > 0).sum()) > 500
     if stride == 1:

@@ -21,7 +21,7 @@ from augment.reconstruct.trainer import Trainer
 from augment.reconstruct.view import RecordedView, ViewKey, ViewSource
 from augment.render.composite import quantise
 from augment.render.cpu_backward import Tape
-from augment.render.cpu_layout import BLOCK
+from augment.render.layout import BLOCK
 from augment.render.threads import limit_threads
 from augment.scene import Actor, Gaussians, Scene, Track
 from augment.sky import ConstantSky, CubemapSky, cubemap_coordinates

@@ -296,8 +296,8 @@ def test_a_cusp_counts_as_level():
     assert wave_normals(waves, points, 0).tolist() == [[0, 0, 1]]
     # A camera over it, whose middle pixel is the cusp: float32 may see either flank, not NaN.
     camera = camera_at([1.0, 0, 3.0], down_deg=90, size=(9, 9), time=0)
-    for fast in (True, False):
-        field = fields_of(waves, camera, fast=fast)
+    for backend in ("cpu", "reference"):
+        field = fields_of(waves, camera, backend=backend)
         assert bool((field[:2].norm(dim=0) <= 1 + 1e-6).all())
 
 
@@ -327,16 +327,16 @@ SETS = {
 }
 
 
-def fields_of(waves: WaveSet, camera: Camera, *, fast: bool, level_z_m: float = 0.0):
-    field = wave_field(waves, camera, level_z_m, fast=fast)
+def fields_of(waves: WaveSet, camera: Camera, *, backend: str, level_z_m: float = 0.0):
+    field = wave_field(waves, camera, level_z_m, backend=backend)
     return torch.stack([field.normal_x, field.normal_y, field.slope_variance])
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
 @pytest.mark.parametrize("waves", SETS)
 def test_the_kernel_matches_the_definition(camera, waves):
-    fast = fields_of(SETS[waves], CAMERAS[camera], fast=True)
-    slow = fields_of(SETS[waves], CAMERAS[camera], fast=False)
+    fast = fields_of(SETS[waves], CAMERAS[camera], backend="cpu")
+    slow = fields_of(SETS[waves], CAMERAS[camera], backend="reference")
     assert fast.shape == slow.shape and fast.dtype == slow.dtype == torch.float32
     # Turns from an anchor at most 64 pixels away, at 4 pixels a turn: 16 * 6e-8 * 2 pi = 6e-6
     # radians at worst, times a slope of at most 1, over the 0.2 that the steepest crest leaves
@@ -364,7 +364,7 @@ def footprint_by_differences(camera: Camera, row: int, column: int) -> tuple[np.
 @pytest.mark.parametrize("camera", ["driving", "rolled", "down", "tele"])
 def test_the_field_is_what_its_definition_says_pixel_by_pixel(camera):
     camera, waves = CAMERAS[camera], waves_of(12, steepness=0.6, slope=1.0, low=0.05, high=3.0)
-    field = fields_of(waves, camera, fast=False)
+    field = fields_of(waves, camera, backend="reference")
     rays = camera.ray_directions(torch.float64)
     seen = torch.nonzero(rays[..., 2] < -0.02)[::37].tolist()
     assert len(seen) > 20
@@ -402,10 +402,10 @@ def test_pixels_above_the_horizon_and_eyes_in_the_plane_see_no_water():
     rays = camera.ray_directions(torch.float64)
     meets = (rays[..., 2] < 0) & (-1.5 / rays[..., 2] <= FARTHEST_M)
     assert 0.2 < float(meets.double().mean()) < 0.9
-    for fast in (True, False):
-        field = fields_of(waves, camera, fast=fast)
+    for backend in ("cpu", "reference"):
+        field = fields_of(waves, camera, backend=backend)
         assert bool((field[:, ~meets] == 0).all()) and bool((field[2, meets] > 0).any())
-        assert bool((fields_of(waves, camera, fast=fast, level_z_m=1.5) == 0).all())
+        assert bool((fields_of(waves, camera, backend=backend, level_z_m=1.5) == 0).all())
     with pytest.raises(ValueError, match="level_z_m must be finite"):
         wave_field(waves, camera, math.inf)
 
@@ -417,7 +417,7 @@ def test_still_water_runs_no_kernel(monkeypatch):
     monkeypatch.setattr(waves_kernels, "fill_field", ran)
     for recipe in (Waves(preset="still"), Waves(preset="wind", height=0.0)):
         waves = make_waves(recipe, seed=0, depth_m=1.0)
-        assert bool((fields_of(waves, CAMERAS["driving"], fast=True) == 0).all())
+        assert bool((fields_of(waves, CAMERAS["driving"], backend="cpu") == 0).all())
     with pytest.raises(AssertionError, match="the kernel ran"):
         wave_field(SETS["one"], CAMERAS["driving"], 0.0)
 
@@ -434,8 +434,8 @@ def test_two_cameras_see_one_surface():
     # The principal point is moved until the centre of pixel (20, 50) is where the point appears.
     second = dataclasses.replace(second, cx=50.5 - second.fx * x / z, cy=20.5 - second.fy * y / z)
     expected = wave_normals(waves, point[:2], NOW)[:2].tolist()
-    for fast in (True, False):
-        a, b = (fields_of(waves, camera, fast=fast) for camera in (first, second))
+    for backend in ("cpu", "reference"):
+        a, b = (fields_of(waves, camera, backend=backend) for camera in (first, second))
         assert a[2, row, column] == b[2, 20, 50] == 0  # nothing is faded
         assert a[:2, row, column].tolist() == pytest.approx(expected, abs=1e-5)  # the contract
         assert b[:2, 20, 50].tolist() == pytest.approx(expected, abs=1e-5)
@@ -444,7 +444,7 @@ def test_two_cameras_see_one_surface():
 def test_the_distance_does_not_glitter():
     waves = make_waves(Waves(preset="wind"), seed=0, depth_m=0.5)
     camera = camera_at([0.0, 0, 1.5], down_deg=1.0, size=(9, 400), focal=900.0)
-    field = fields_of(waves, camera, fast=True)
+    field = fields_of(waves, camera, backend="cpu")
     rays = camera.ray_directions(torch.float64)
     seen = rays[:, 4, 2] < 0
     tilt, variance = field[:2, seen, 4].norm(dim=0), field[2, seen, 4]
@@ -468,7 +468,7 @@ def test_bits_do_not_depend_on_threads():
     for count in (1, 2):
         limit_threads(count)
         try:
-            alone.append(fields_of(SETS["64"], camera, fast=True))
+            alone.append(fields_of(SETS["64"], camera, backend="cpu"))
         finally:
             limit_threads(None)
     assert torch.equal(*alone)
@@ -476,7 +476,7 @@ def test_bits_do_not_depend_on_threads():
 
 def test_a_window_of_the_image_sees_the_same_waves():
     camera, waves = CAMERAS["rolled"], SETS["24"]
-    whole = fields_of(waves, camera, fast=True)
-    window = fields_of(waves, camera.cropped(11, 20, 40, 30), fast=True)
+    whole = fields_of(waves, camera, backend="cpu")
+    window = fields_of(waves, camera.cropped(11, 20, 40, 30), backend="cpu")
     # Other anchors: the kernel's error twice.
     assert torch.allclose(window, whole[:, 20:50, 11:51], atol=2e-5)

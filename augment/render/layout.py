@@ -1,6 +1,6 @@
-"""How the CPU kernels lay out what they hand to each other.
+"""How kernels lay out what they hand to each other, on the CPU and, where it says so, on the GPU.
 
-Arrays are flat and indices unsigned, which is what lets the compiler keep loops simple.
+Arrays are flat; the CPU's indices are unsigned, which is what lets the compiler keep loops simple.
 """
 
 from __future__ import annotations
