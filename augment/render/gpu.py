@@ -102,8 +102,18 @@ def launch(kernel: Any, grid: tuple[int, ...], *arguments: Any, **constants: Any
     if 0 in grid:
         return
     given = [_kernel_argument(argument) for argument in arguments]
-    # Fused multiply-add is Triton's own choice too, until a version that asks to be told.
-    kernel[grid](*given, enable_fp_fusion=True, **constants)
+    # Interpreted kernels run in numpy, which warns of infinities that a GPU goes on with.
+    with np.errstate(all="ignore"):
+        # Fused multiply-add is Triton's own choice too, until a version that asks to be told.
+        kernel[grid](*given, enable_fp_fusion=True, **constants)
+
+
+def address_of(tensor: Tensor) -> int:
+    """Where a tensor's numbers lie on the GPU, for kernels that take many parts in one launch.
+
+    Whoever launches them keeps the tensor alive.
+    """
+    return _kernel_argument(tensor).data_ptr()
 
 
 def _kernel_argument(argument: Any) -> Any:
