@@ -1,0 +1,75 @@
+"""Every kernel of the GPU backend compiles for a Hopper GPU, without one, into what it should."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from augment.render import gpu
+
+pytest.importorskip("triton")
+if not gpu.is_interpreted():
+    pytest.skip("launches are recorded while kernels are interpreted", allow_module_level=True)
+
+from tests.augment import compiled_kernels as kernels
+from tools.gpu_kernels import complaints, report
+from tools.kernel_compiling import Compiled, compile_launches
+from tools.kernel_launches import Recording, recorded_launches
+
+
+def record_small_kernels() -> Recording:
+    source, target = torch.ones(40), torch.zeros(40)
+    with recorded_launches() as recording:
+        for count in (1, 16, 39):
+            gpu.launch(kernels.scale, (3,), source, target, count, 2.5, BLOCK=16, num_warps=1)
+        assert target[:39].eq(1.25).all() and target[39] == 0  # they run all the same
+        gpu.launch(kernels.scale, (1,), source[1:], target, 3, 1.0, BLOCK=16, num_warps=2)
+        gpu.launch(kernels.add_wide, (1,), source, target, BLOCK=16, num_warps=1)
+        gpu.launch(kernels.scale, (0,), source, target, 0, 1.0, BLOCK=64)
+    return recording
+
+
+def test_launches_are_told_apart_by_what_is_compiled_for_them():
+    recording = record_small_kernels()
+    assert [(each.name, n) for each, n in recording.counts.items()] == [
+        ("scale", 3), ("scale", 1), ("add_wide", 1)
+    ]  # fmt: skip
+    assert list(recording.programs.values()) == [9, 1, 1]
+    first, unaligned, _ = [each.arguments for each in recording.counts]
+    assert first["source"] == {"tensor": "float32", "aligned": True} and first["BLOCK"] == 16
+    assert not unaligned["source"]["aligned"] and unaligned["num_warps"] == 2
+
+
+def test_what_is_wrong_with_a_kernel_is_seen():
+    recording = record_small_kernels()
+    with recorded_launches() as broken, pytest.raises(Exception, match="arange"):
+        gpu.launch(kernels.broken, (1,), torch.ones(40), BLOCK=16)
+    with recorded_launches() as crowded:
+        many = torch.ones(2048)
+        gpu.launch(kernels.crowd, (1,), many, many, BLOCK=2048, num_warps=1, maxnreg=32)
+    for other in (broken, crowded):
+        recording.counts |= other.counts
+        recording.programs |= other.programs
+    table, compiled = report(recording)
+    by_name = {each.kernel.partition(":")[2]: each for each in compiled}
+    good = [each for each in compiled if each.kernel.endswith(":scale")]
+    assert not complaints(good) and len(good) == 2
+    assert all(each.registers > 0 and each.instructions for each in good)
+    assert table.count("`scale`") == 2 and "source float32 unaligned, num_warps 2" in table
+    assert by_name["add_wide"].doubles > 0 and by_name["add_wide"].atomics
+    assert by_name["crowd"].stack_bytes > 0
+    assert "power of 2" in (by_name["broken"].error or "")
+    wrong = "\n".join(complaints(compiled))
+    assert all(part in wrong for part in ("does not compile", "float64", "atomics", "spills"))
+
+
+def test_threads_at_once_follow_from_registers_and_shared_memory():
+    assert Compiled("k", "", registers=32, warps=4).occupancy == 1
+    assert Compiled("k", "", registers=33, warps=4).occupancy == 48 / 64
+    assert Compiled("k", "", registers=128, warps=8).occupancy == 16 / 64
+    assert Compiled("k", "", registers=16, warps=1).occupancy == 32 / 64
+    assert Compiled("k", "", registers=16, shared_bytes=100 * 1024, warps=4).occupancy == 8 / 64
+
+
+def test_nothing_to_compile_starts_nothing():
+    assert compile_launches([]) == []
