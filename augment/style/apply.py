@@ -19,11 +19,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from augment.render import gpu
+from augment.render.backends import AUTO, CUDA, REFERENCE, kernels_for
 from augment.render.sh import SH_C0
 from augment.render.threads import kernel_threads
 from augment.scene import Actor, Gaussians, Scene
 from augment.sky import ConstantSky, CubemapSky, LatLongSky, Sky
-from augment.style import sh_kernels
+from augment.style import sh_kernels, sh_layout
 from augment.style.maps import StyleMaps
 from augment.style.sky_splats import level_maps, map_rows, sky_levels
 
@@ -36,15 +38,16 @@ def style_gaussians(
     *,
     levels: Tensor | None = None,
     out: Tensor | None = None,
-    fast: bool = True,
+    backend: str = AUTO,
 ) -> Gaussians:
     """The same Gaussians with mapped SH; every other tensor is shared, and all of them where no
     map changes anything.
 
     levels [N]: how much of each is sky (see sky_levels). out: where the SH are written, contiguous
     and of their shape and dtype; may be `gaussians.sh` itself. New memory by default, whose first
-    touch takes as long as the mapping. fast: float32 without gradients goes through the CPU kernel,
-    equal to `map_sh` within float rounding.
+    touch takes as long as the mapping. backend: of what maps float32 without gradients, equal to
+    `map_sh` within float rounding; "cuda" takes SH of either side and gives new ones on the GPU,
+    "auto" goes where the SH lie.
 
     Raises:
         ValueError: maps by class, and a class that has none; or out does not fit.
@@ -58,12 +61,20 @@ def style_gaussians(
     folded = fold_maps(splats)
     if out is None and not bool(_changes(splats).any()):
         return gaussians
-    tracked = torch.is_grad_enabled() and sh.requires_grad
-    if not fast or tracked or sh.dtype != torch.float32:
+    kernels = kernels_for(backend, sh)
+    if kernels == REFERENCE:
         mapped = map_sh(sh, splats, classes)
-        if out is not None:
-            mapped = out.copy_(mapped)
-        return dataclasses.replace(gaussians, sh=mapped)
+        return dataclasses.replace(gaussians, sh=mapped if out is None else out.copy_(mapped))
+    mapped = (_on_gpu if kernels == CUDA else _on_cpu)(sh, out, classes, folded)
+    return dataclasses.replace(gaussians, sh=mapped)
+
+
+def _on_cpu(
+    sh: Float[Tensor, "N K 3"],
+    out: Tensor | None,
+    classes: Tensor | None,
+    folded: Float[Tensor, "C 13"],
+) -> Float[Tensor, "N K 3"]:
     target = _new_memory(sh.shape) if out is None else out
     aligned = target.data_ptr() % sh_kernels.ALIGNMENT == 0  # a view may begin anywhere
     written = target if aligned else _new_memory(sh.shape)
@@ -75,9 +86,23 @@ def style_gaussians(
             np.empty(0, np.int16) if classes is None else classes.contiguous().numpy(),
             folded.numpy(),
         )
-    if not aligned:
-        target.copy_(written)
-    return dataclasses.replace(gaussians, sh=target)
+    return target if aligned else target.copy_(written)
+
+
+def _on_gpu(
+    sh: Float[Tensor, "N K 3"],
+    out: Tensor | None,
+    classes: Tensor | None,
+    folded: Float[Tensor, "C 13"],
+) -> Float[Tensor, "N K 3"]:
+    from augment.style import cuda_sh
+
+    source = gpu.resident(sh)
+    target = torch.empty_like(source) if out is None else out
+    if target.device != source.device:
+        raise ValueError(f"out must lie on {source.device}, as what is mapped; got {target.device}")
+    cuda_sh.map_sh(source, target.detach(), classes, folded)
+    return target
 
 
 def style_actor(actor: Actor, maps: StyleMaps) -> Actor:
@@ -103,9 +128,12 @@ def map_sh(
     A map that changes nothing leaves every bit of its splats. Of degree 0, a colour below 0 is
     mapped as the black that it shows.
     """
-    folded = fold_maps(maps, sh.dtype)
-    rows = folded[torch.zeros(len(sh), dtype=torch.long) if classes is None else classes.long()]
-    shown = sh.clamp_min(float(sh_kernels.BLACK)) if sh.shape[1] == 1 else sh
+    folded = fold_maps(maps, sh.dtype).to(sh.device)
+    if classes is None:
+        rows = folded[:1].expand(len(sh), sh_layout.FOLDED)
+    else:
+        rows = folded[classes.long().to(sh.device)]
+    shown = sh.clamp_min(float(sh_layout.BLACK)) if sh.shape[1] == 1 else sh
     mapped = torch.einsum("nij,nkj->nki", rows[:, :9].reshape(-1, 3, 3), shown)
     first = mapped[:, :1] + rows[:, None, 9:12]
     mapped = torch.cat([first, mapped[:, 1:]], 1)
@@ -191,14 +219,18 @@ def _rows_of(gaussians: Gaussians, count: int) -> Tensor | None:
     classes = gaussians.semantic
     if count == 1 or classes is None or not len(classes):
         return None
-    values = classes.numpy()
-    low, high = int(values.min()), int(values.max())
+    low, high = _extent(classes)
     if low < 0 or high >= count:
         raise ValueError(
             f"the style has maps for classes 0 to {count - 1}; the Gaussians' classes are "
             f"{low} to {high}"
         )
     return classes
+
+
+def _extent(classes: Tensor) -> tuple[int, int]:
+    values = classes.cpu().numpy()  # torch's own least and greatest take longer on the CPU
+    return int(values.min()), int(values.max())
 
 
 def _check_out(out: Tensor, sh: Tensor) -> None:

@@ -12,6 +12,7 @@ from weakref import WeakKeyDictionary
 from jaxtyping import Float, Int16
 from torch import Tensor
 
+from augment.render.backends import AUTO, CUDA
 from augment.scene import PosedGaussians, Scene
 from augment.sky import Sky
 from augment.style.apply import style_gaussians, style_sky
@@ -28,10 +29,10 @@ class Look:
     """The maps of a style in a scene, and the scene's sky under them. levels [N]: how much of each
     background splat is sky; None where none is any.
 
-    folds: the background's SH are mapped once and kept, as much memory as they take themselves, in
-    place of the colours that they evaluate to, which a map does not commute with where the clamp to
-    >= 0 acts (augment.style.apply). Actors' colours are mapped either way: their SH are turned and
-    changed from frame to frame, and they are few.
+    folds: the background's SH are mapped once and kept, as much memory as they take themselves (of
+    the GPU where that draws), in place of the colours that they evaluate to, which a map does not
+    commute with where the clamp to >= 0 acts (augment.style.apply). Actors' colours are mapped
+    either way: their SH are turned and changed from frame to frame, and they are few.
     """
 
     maps: StyleMaps
@@ -40,9 +41,11 @@ class Look:
     levels: Int16[Tensor, "N"] | None = None
     folds: bool = False
 
-    def on(self, parts: Sequence[PosedGaussians]) -> tuple[PosedGaussians, ...]:
-        """The parts under the maps; snow among them keeps its colours."""
-        return tuple(part if part.is_snow else self._mapped(part) for part in parts)
+    def on(
+        self, parts: Sequence[PosedGaussians], *, backend: str = AUTO
+    ) -> tuple[PosedGaussians, ...]:
+        """The parts under the maps; snow among them keeps its colours. backend: that draws them."""
+        return tuple(part if part.is_snow else self._mapped(part, backend) for part in parts)
 
     @cached_property
     def witness(self) -> Scene:
@@ -51,17 +54,22 @@ class Look:
         flat = style_gaussians(flat, self.maps, levels=self.levels)
         return dataclasses.replace(self.bare, background=flat, sky=self.sky)
 
-    def _mapped(self, part: PosedGaussians) -> PosedGaussians:
+    def _mapped(self, part: PosedGaussians, backend: str) -> PosedGaussians:
         if self.folds and part.gaussians.sh is self.bare.background.sh:
-            styled = dataclasses.replace(part.gaussians, sh=self._folded_sh)
-            return dataclasses.replace(part, gaussians=styled)
+            sh = self._folded_on_gpu if backend == CUDA else self._folded
+            return dataclasses.replace(part, gaussians=dataclasses.replace(part.gaussians, sh=sh))
         if self.levels is None or part.instance_id > 0:
             return dataclasses.replace(part, color_maps=self.maps.splats)
         return dataclasses.replace(part, color_maps=self._level_maps, color_rows=self._rows)
 
     @cached_property
-    def _folded_sh(self) -> Float[Tensor, "N K 3"]:
+    def _folded(self) -> Float[Tensor, "N K 3"]:
         return style_gaussians(self.bare.background, self.maps, levels=self.levels).sh
+
+    @cached_property
+    def _folded_on_gpu(self) -> Float[Tensor, "N K 3"]:
+        background = self.bare.background
+        return style_gaussians(background, self.maps, levels=self.levels, backend=CUDA).sh
 
     @cached_property
     def _level_maps(self) -> Float[Tensor, "R 3 4"]:

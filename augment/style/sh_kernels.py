@@ -13,13 +13,11 @@ from numba.extending import intrinsic
 
 from augment.render.cpu_jit import inner, kernel
 from augment.render.layout import LANES, U
-from augment.render.sh import SH_C0
+from augment.style.sh_layout import BLACK, FOLDED
 
 SPLATS = 2048  # of a piece of work
 RUN = 128  # splats mapped at a time, whose results (24 KB at degree 3) stay in the first cache
-FOLDED = 13  # numbers of a folded map: 9 of M row by row, 3 that the first function gets, changes
 ALIGNMENT = 4 * LANES  # bytes, of the target
-BLACK = np.float32(-0.5 / SH_C0)  # sh_00 of a colour of 0
 
 
 @intrinsic

@@ -8,6 +8,7 @@ from fitted_scenes import fitted_scene
 from scenes import camera_ahead, random_gaussians
 
 from augment.color_waves import ColorWaves
+from augment.render import gpu
 from augment.render.composite import composite_sky, map_colors
 from augment.render.rasterize import rasterize
 from augment.render.sh import SH_C0, evaluate_sh
@@ -17,6 +18,7 @@ from augment.sky import ConstantSky, CubemapSky, LatLongSky
 from augment.style.apply import map_sh, style_actor, style_gaussians, style_sky, styled_scene
 from augment.style.maps import CLASSES, StyleMaps, identity_map
 from augment.style.scene_maps import identity_maps
+from tests.augment.pretend_gpu import pretended_gpu
 
 
 def some_map(seed: int = 0, size: float = 0.2) -> torch.Tensor:
@@ -46,15 +48,18 @@ def directions(count: int) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("sh_degree", [0, 1, 2, 3])
-@pytest.mark.parametrize("count", [1, 7, 128, 4500])
-def test_the_kernel_equals_the_definition(sh_degree, count):
-    """Sizes that no run and no register divides; sums of three products round alike."""
+@pytest.mark.parametrize(
+    "backend, count",
+    [*(("cpu", count) for count in (1, 7, 128, 4500)), *(("cuda", count) for count in (1, 7, 80))],
+)
+def test_the_kernel_equals_the_definition(backend, sh_degree, count):
+    """Sizes that no run, no register and no program divides; sums of three products round alike."""
     gaussians = with_classes(count, sh_degree)
     for maps in (maps_of(some_map()[None]), maps_by_class()):
         classes = None if len(maps.splats) == 1 else gaussians.semantic
         expected = map_sh(gaussians.sh, maps.splats, classes)
         torch.testing.assert_close(
-            style_gaussians(gaussians, maps).sh, expected, rtol=1e-6, atol=1e-6
+            style_gaussians(gaussians, maps, backend=backend).sh, expected, rtol=1e-6, atol=1e-6
         )
 
 
@@ -83,16 +88,17 @@ def test_gaussians_without_classes_take_the_map_of_unknown():
     assert torch.equal(style_gaussians(gaussians, maps).sh, expected.sh)
 
 
-def test_identities_leave_every_bit():
-    gaussians = with_classes(300, 2)
+@pytest.mark.parametrize("backend", ["cpu", "cuda"])
+def test_identities_leave_every_bit(backend):
+    gaussians = with_classes(100, 2)
     odd = torch.tensor([-0.0, float("nan"), float("inf"), 1e-42])
     gaussians.sh.view(-1)[: len(odd)] = odd
     bits = gaussians.sh.clone().view(torch.int32)
     every = maps_of(identity_map().repeat(CLASSES, 1, 1))
     for maps in (identity_maps(), every):
-        assert style_gaussians(gaussians, maps) is gaussians
+        assert style_gaussians(gaussians, maps, backend=backend) is gaussians
         out = torch.zeros_like(gaussians.sh)
-        assert style_gaussians(gaussians, maps, out=out).sh is out
+        assert style_gaussians(gaussians, maps, out=out, backend=backend).sh is out
         assert torch.equal(out.view(torch.int32), bits)
     slow = map_sh(gaussians.sh, identity_map()[None])
     assert torch.equal(slow.view(torch.int32), bits)
@@ -130,17 +136,42 @@ def test_bits_do_not_depend_on_threads():
         limit_threads(None)
 
 
-def test_none_and_strided_and_float64():
+def test_on_the_gpu_sh_of_either_side_give_new_ones_there_or_change_in_place(monkeypatch):
+    """And some maps of classes leave their splats' bits."""
+    gaussians, maps = with_classes(80, 3), maps_by_class()
+    bits = gaussians.sh.clone()
+    expected = style_gaussians(gaussians, maps).sh
+    with pretended_gpu(monkeypatch):
+        styled = style_gaussians(gaussians, maps, backend="cuda")
+        assert styled.sh.device == gpu.gpu_device() and styled.means is gaussians.means
+        got = styled.sh.cpu()
+        torch.testing.assert_close(got, expected, rtol=1e-6, atol=1e-6)
+        assert torch.equal(gaussians.sh, bits)
+        still = gaussians.semantic == 3
+        assert still.any() and torch.equal(got[still], bits[still])
+        there = dataclasses.replace(gaussians, sh=gpu.upload(gaussians.sh))
+        assert torch.equal(style_gaussians(there, maps).sh.cpu(), got)
+        in_place = style_gaussians(there, maps, out=there.sh).sh
+        assert in_place is there.sh and torch.equal(in_place.cpu(), got)
+        with pytest.raises(ValueError, match="out must lie on meta"):
+            style_gaussians(gaussians, maps, out=torch.zeros_like(bits), backend="cuda")
+
+
+@pytest.mark.parametrize("backend", ["cpu", "cuda"])
+def test_none_and_strided_and_float64(backend):
     maps = maps_by_class()
     none = with_classes(5, 1).select(torch.zeros(0, dtype=torch.long))
-    assert style_gaussians(none, maps).sh.shape == (0, 4, 3)
+    assert style_gaussians(none, maps, backend=backend).sh.shape == (0, 4, 3)
     wide = with_classes(40, 3)
     strided = dataclasses.replace(wide, sh=wide.sh[:, :4])
     tight = dataclasses.replace(wide, sh=wide.sh[:, :4].contiguous())
-    assert torch.equal(style_gaussians(strided, maps).sh, style_gaussians(tight, maps).sh)
+    assert torch.equal(
+        style_gaussians(strided, maps, backend=backend).sh,
+        style_gaussians(tight, maps, backend=backend).sh,
+    )
     double = random_gaussians(40, sh_degree=1, dtype=torch.float64)
     single = random_gaussians(40, sh_degree=1)
-    styled = style_gaussians(double, maps)
+    styled = style_gaussians(double, maps, backend=backend)
     assert styled.sh.dtype == torch.float64
     torch.testing.assert_close(
         styled.sh.float(), style_gaussians(single, maps).sh, rtol=1e-6, atol=1e-6
@@ -238,12 +269,12 @@ def test_a_styled_scene_keeps_everything_else():
 changed = {"background", "actors", "sky"}
 
 
-@pytest.mark.parametrize("fast", [True, False])
-def test_without_directions_a_colour_below_0_is_mapped_as_the_black_that_it_shows(fast):
+@pytest.mark.parametrize("backend", ["reference", "cpu", "cuda"])
+def test_without_directions_a_colour_below_0_is_mapped_as_the_black_that_it_shows(backend):
     dark = dataclasses.replace(random_gaussians(3, sh_degree=0), sh=torch.full((3, 1, 3), -9.0))
     lift = torch.cat([0.5 * torch.eye(3), torch.tensor([[0.2], [0.1], [0.3]])], 1)
     maps = StyleMaps(lift[None], lift, lift)
-    colors = 0.5 + SH_C0 * style_gaussians(dark, maps, fast=fast).sh[:, 0]
+    colors = 0.5 + SH_C0 * style_gaussians(dark, maps, backend=backend).sh[:, 0]
     torch.testing.assert_close(colors, lift[:, 3].expand(3, 3), rtol=0, atol=1e-6)
 
 

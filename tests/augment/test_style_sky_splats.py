@@ -113,7 +113,11 @@ def test_folding_by_levels_is_the_definitions():
     levels = torch.tensor([0, 1, 4, 7, LEVELS], dtype=torch.int16)
     rng = torch.Generator().manual_seed(1)
     some = maps(torch.rand(CLASSES, 3, 4, generator=rng))
-    fast, slow = (style_gaussians(gaussians, some, levels=levels, fast=f).sh for f in (True, False))
+    slow, fast, on_gpu = (
+        style_gaussians(gaussians, some, levels=levels, backend=backend).sh
+        for backend in ("reference", "cpu", "cuda")
+    )
     torch.testing.assert_close(fast, slow, rtol=0, atol=1e-6)
+    torch.testing.assert_close(on_gpu, slow, rtol=0, atol=1e-6)
     alone = style_gaussians(gaussians, some).sh
     assert torch.equal(fast[0], alone[0]) and not torch.allclose(fast[1], alone[1])

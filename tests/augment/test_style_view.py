@@ -11,6 +11,7 @@ import torch
 from augment.apply import render_buffers, render_view
 from augment.dataset import SceneDataset
 from augment.plan import make_plan
+from augment.render import gpu
 from augment.render.rasterize import rasterize
 from augment.scene import PosedGaussians, Scene
 from augment.semantics import SemanticClass
@@ -23,6 +24,7 @@ from recipes.flood import Flood, Waves
 from recipes.schema import Output, Recipe, Smog, Weather
 from recipes.snow import Snow
 from recipes.style import Style
+from tests.augment.pretend_gpu import pretended_gpu
 from tests.snow_scenes import box_car, drive, sheet, side_wall
 
 ROAD, BUILDING, CAR = (int(SemanticClass[name]) for name in ("ROAD", "BUILDING", "VEHICLE"))
@@ -240,6 +242,17 @@ def test_folded_maps_know_the_splats_that_paint_sky(scene):
     )
     images = [rasterize(parts, camera_of(scene)).rgb for parts in (by_color, by_sh)]
     torch.testing.assert_close(*images, rtol=0, atol=1e-5)
+
+
+def test_a_view_drawn_on_the_gpu_gets_sh_that_are_folded_there(scene, monkeypatch):
+    parts = scene.parts_for(camera_of(scene))
+    look = Look(known_maps(scene), scene.sky, scene, folds=True)
+    expected = look.on(parts, backend="cpu")[0].gaussians.sh
+    with pretended_gpu(monkeypatch):
+        folded = look.on(parts, backend="cuda")[0].gaussians
+        assert folded.sh.device == gpu.gpu_device() and folded.means is parts[0].gaussians.means
+        torch.testing.assert_close(folded.sh.cpu(), expected, rtol=0, atol=1e-6)
+        assert look.on(parts, backend="cuda")[0].gaussians.sh is folded.sh  # once for all frames
 
 
 def test_a_background_of_other_splats_is_mapped_by_colour(scene):
