@@ -24,6 +24,7 @@ from augment.render.backends import (
 from augment.render.buffers import ALPHA, BUFFERS, DIFFERENTIABLE, RGB, RenderOutput
 from augment.render.clip import HeightClip
 from augment.render.constants import MOST_TRANSMITTANCE_STOP, RasterSettings
+from augment.render.gsplat_backend import tracked_geometry
 from augment.render.reference import rasterize_reference
 from augment.render.remainder import needs_remainder, share_remainder
 from augment.render.sh import MAX_DEGREE
@@ -154,13 +155,14 @@ def _choose(
     if dtype != torch.float32:
         obstacle = f"the Gaussians are {dtype}, it takes torch.float32"
     elif _tracked(parts):
-        what = _beyond_its_gradients(parts, camera, buffers, smog, clip)
+        what = _beyond_its_gradients(parts, camera, buffers, smog, clip, backend)
         obstacle = what and f"gradients {what} are asked for, it has none"
     if backend in (CPU, CUDA):
         if obstacle:
+            others = "'auto' or 'reference'" if backend == CPU else "'reference', on the CPU"
             raise ValueError(
                 f"backend {backend!r} cannot render these Gaussians: {obstacle}; convert or detach "
-                f"them, or use backend 'auto' or 'reference'"
+                f"them, or use backend {others}"
             )
         return backend
     if obstacle is None:
@@ -181,8 +183,9 @@ def _beyond_its_gradients(
     buffers: frozenset[str],
     smog: SmogMedium | None,
     clip: HeightClip | None,
+    backend: str,
 ) -> str | None:
-    """What the cpu backend would need gradients of and has none; None where it has all."""
+    """What the backend would need gradients of and has none; None where it has all."""
     if any(part.shading is not None for part in parts):
         return "of light per pixel"
     if any(part.color_maps is not None for part in parts):
@@ -191,6 +194,8 @@ def _beyond_its_gradients(
         return "through smog"
     if clip is not None:
         return "of a clip"
+    if backend == CUDA and not tracked_geometry(parts):
+        return None  # colours move no other buffer, and any camera has its own kernels' gradients
     if camera.is_orthographic:
         return "of an orthographic camera"
     others = buffers - DIFFERENTIABLE

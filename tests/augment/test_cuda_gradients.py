@@ -1,0 +1,344 @@
+"""Gradients on the GPU: colours' by our own kernels, interpreted here; the others' by gsplat."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("triton")
+
+from augment.cameras import Camera
+from augment.errors import BackendUnavailable
+from augment.render import gpu, layout
+from augment.render.buffers import ALPHA, EXPECTED_DEPTH, MEDIAN_DEPTH, RGB, SPLAT_IDS
+from augment.render.constants import RasterSettings
+from augment.render.cuda_blend_backward import color_gradients
+from augment.render.cuda_splats import HIDDEN, CudaSplats, CudaTiles
+from augment.render.gsplat_backend import draw_with_gsplat
+from augment.render.rasterize import rasterize
+from augment.render.reference import LOG2_E, bin_to_tiles, rasterize_reference
+from augment.render.reference_project import order_by_depth, project_parts
+from augment.scene import Gaussians, PosedGaussians
+from augment.weather.smog import SmogMedium
+from tests.augment import gsplat_stand_in
+from tests.augment.pretend_gpu import AwayTensor, pretended_gpu
+from tests.scenes import camera_ahead, one_gaussian, random_gaussians, slight_pose, stack
+
+DEFAULT = RasterSettings()
+FIELDS = ("means", "quats", "scales", "opacities", "sh")
+
+
+def tracked(part: PosedGaussians, *names: str, dtype=torch.float32) -> PosedGaussians:
+    """The part with copies of its tensors, of which the named ones record gradients."""
+    tensors = {name: getattr(part.gaussians, name).detach().to(dtype).clone() for name in FIELDS}
+    for name in names:
+        tensors[name].requires_grad_()
+    return dataclasses.replace(part, gaussians=Gaussians(**tensors))
+
+
+def weights_of(camera: Camera, channels: int = 3) -> torch.Tensor:
+    rng = np.random.default_rng(camera.width)
+    return torch.from_numpy(rng.normal(size=(camera.height, camera.width, channels))).float()
+
+
+def sh_gradients(parts, camera, backend, settings=DEFAULT, buffers=(RGB,)) -> list[torch.Tensor]:
+    """dL by sh of every part, of a random weighting of rgb."""
+    dtype = torch.float64 if backend == "reference" else torch.float32
+    leaves = [tracked(part, "sh", dtype=dtype) for part in parts]
+    out = rasterize(leaves, camera, buffers=buffers, settings=settings, backend=backend)
+    (out.rgb * weights_of(camera)).sum().backward()
+    return [part.gaussians.sh.grad for part in leaves]
+
+
+def assert_close(actual, expected, tolerance: float) -> None:
+    """Relative l2 error of all together; where nothing is expected, nothing is found."""
+    for got, want in zip(actual, expected, strict=True):
+        assert torch.isfinite(got).all() and got.shape == want.shape
+        assert not got[want == 0].any()
+    error = sum(float((a - b).square().sum()) for a, b in zip(actual, expected, strict=True))
+    size = sum(float(b.double().square().sum()) for b in expected)
+    assert math.sqrt(error) <= tolerance * math.sqrt(size), math.sqrt(error / max(size, 1e-30))
+
+
+def small_scene(count: int = 90) -> list[PosedGaussians]:
+    return [
+        PosedGaussians(random_gaussians(count, seed=4)),
+        PosedGaussians(Gaussians.empty(sh_degree=2), slight_pose(), 1),
+        PosedGaussians(random_gaussians(count // 3, seed=5, sh_degree=1), slight_pose(), 2),
+    ]
+
+
+# ---- colours -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        DEFAULT,
+        RasterSettings(antialiased=True, sh_degree=1),
+        RasterSettings(transmittance_stop=0.1),
+    ],
+    ids=["default", "antialiased-degree-1", "coarse-stop"],
+)
+def test_colours_gradients_are_those_of_the_definition(settings):
+    # float32 against float64: 1e-6 of sums of pixels, and 3e-6 of alpha by exp2.
+    parts, camera = small_scene(), camera_ahead(19, 18, 17.0)
+    expected = sh_gradients(parts, camera, "reference", settings)
+    assert_close(sh_gradients(parts, camera, "cuda", settings), expected, 2e-5)
+
+
+def test_colours_gradients_are_those_of_the_cpu_backend():
+    parts, camera = small_scene(), camera_ahead(17, 15, 16.0)
+    expected = sh_gradients(parts, camera, "cpu", buffers=(RGB, ALPHA))
+    assert_close(sh_gradients(parts, camera, "cuda"), expected, 1e-5)
+
+
+def test_a_colour_held_by_its_clamp_has_no_gradient():
+    dark = one_gaussian(rgb=(-0.2, 0.4, 0.9))
+    (found,) = sh_gradients([PosedGaussians(dark)], camera_ahead(9, 9, 9.0), "cuda")
+    assert found[0, 0, 0] == 0 and found[0, 0, 1:].all()
+
+
+def test_parallel_rays_see_every_splat_from_one_side():
+    camera = dataclasses.replace(camera_ahead(9, 7, 2.0), is_orthographic=True)
+    parts = [PosedGaussians(random_gaussians(40, seed=2))]
+    expected = sh_gradients(parts, camera, "reference")
+    assert_close(sh_gradients(parts, camera, "cuda"), expected, 2e-5)
+
+
+def test_other_buffers_beside_rgb_are_constants():
+    camera, part = camera_ahead(9, 8, 9.0), tracked(PosedGaussians(random_gaussians(20)), "sh")
+    names = (ALPHA, MEDIAN_DEPTH, RGB, SPLAT_IDS)
+    out = rasterize([part], camera, buffers=names, backend="cuda")
+    plain = rasterize([PosedGaussians(random_gaussians(20))], camera, buffers=names, backend="cuda")
+    assert out.rgb is not None and out.rgb.requires_grad
+    for name in names:
+        image = getattr(out, name)
+        assert image.requires_grad == (name == RGB)
+        assert torch.equal(image.detach(), getattr(plain, name))
+
+
+def test_only_what_asks_for_gradients_gets_them():
+    camera, own = camera_ahead(9, 8, 9.0), PosedGaussians(random_gaussians(20))
+    part = tracked(own, "sh")
+    out = rasterize([own, part], camera, buffers=(RGB, ALPHA), backend="cuda")
+    assert out.rgb is not None
+    out.rgb.sum().backward()
+    assert own.gaussians.sh.grad is None and part.gaussians.sh.grad is not None
+    out = rasterize([part], camera, buffers=(ALPHA,), backend="cuda")
+    assert out.alpha is not None and not out.alpha.requires_grad
+
+
+def test_splats_changed_before_backward_are_noticed():
+    part = tracked(PosedGaussians(one_gaussian()), "sh")
+    out = rasterize([part], camera_ahead(5, 5, 5.0), buffers=(RGB,), backend="cuda")
+    assert out.rgb is not None
+    if gpu.gpu_device().type == "cpu":  # elsewhere the GPU keeps a copy of what was rendered
+        part.gaussians.means.add_(1)
+        with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+            out.rgb.sum().backward()
+
+
+# ---- the transposed blend alone ----------------------------------------------------------------
+
+
+def reference_splats(parts, camera, settings=DEFAULT) -> tuple[CudaSplats, CudaTiles]:
+    """What the projection and the lists of the backend would hand over, by the definition."""
+    with torch.no_grad():
+        splats = order_by_depth(project_parts(parts, camera, settings))
+        lists = bin_to_tiles(splats, camera)
+    count = sum(len(part.gaussians) for part in parts)
+    (xx, xy, yy), dets, opacities = splats.covs2d.T, splats.dets, splats.opacities
+    del xx
+    half = 0.5 * LOG2_E
+    records = torch.full((count, layout.RECORD), math.nan)  # of what is not drawn: anything
+    fields = {
+        layout.MEAN_X: splats.means2d[:, 0],
+        layout.MEAN_Y: splats.means2d[:, 1],
+        layout.LEAN_X: xy / yy,
+        layout.SHARP_X: torch.sqrt(half * yy / dets),
+        layout.FALL_Y: half / yy,
+        layout.LOG_OPACITY: torch.log2(opacities),
+    }
+    for field, value in fields.items():
+        records[splats.ids, field] = value
+    assert splats.colors is not None
+    records[splats.ids, layout.RED : layout.RED + 3] = splats.colors
+    keys = torch.full((count,), HIDDEN, dtype=torch.int32)
+    keys[splats.ids] = splats.depths.view(torch.int32)
+    none = torch.zeros(count, 2, dtype=torch.int32)
+    device = gpu.gpu_device()
+    return (
+        CudaSplats(records.to(device), keys.to(device), none.to(device), none[:, 0].to(device),
+                   None, None),
+        CudaTiles(
+            splats.ids[lists.members].int().to(device),
+            lists.starts.int().to(device),
+            lists.columns,
+            lists.rows,
+        ),
+    )  # fmt: skip
+
+
+def expected_color_gradients(parts, camera, d_rgb) -> torch.Tensor:
+    """Of parts of one SH function, whose slope is that of the colour."""
+    leaves = [tracked(part, "sh") for part in parts]
+    out = rasterize_reference(leaves, camera, frozenset({RGB}), DEFAULT, None)
+    assert out.rgb is not None
+    (out.rgb * d_rgb).sum().backward()
+    grads = [part.gaussians.sh.grad for part in leaves]
+    return torch.cat([grad[:, 0] for grad in grads if grad is not None]) * math.sqrt(4 * math.pi)
+
+
+def crowded() -> list[PosedGaussians]:
+    """Lists of several batches, which light does not come through, and a splat in every tile."""
+    wall = random_gaussians(80, seed=9, sh_degree=0, size=0.5)
+    wall = dataclasses.replace(wall, opacities=torch.full((80,), 0.95))
+    broad = one_gaussian((9.0, 0.0, 0.0), 4.0, 0.4)
+    hidden = one_gaussian((-3.0, 0.0, 0.0))
+    return [PosedGaussians(stack(broad, hidden)), PosedGaussians(wall)]
+
+
+def test_every_tile_adds_its_share():
+    parts, camera = crowded(), camera_ahead(37, 21, 28.0)
+    d_rgb = weights_of(camera)
+    splats, tiles = reference_splats(parts, camera)
+    found = color_gradients(splats, tiles, camera, DEFAULT, d_rgb.to(gpu.gpu_device())).cpu()
+    assert_close([found], [expected_color_gradients(parts, camera, d_rgb)], 1e-5)
+    assert not found[1].any() and found[0].all()
+    again = color_gradients(splats, tiles, camera, DEFAULT, d_rgb.to(gpu.gpu_device())).cpu()
+    assert torch.equal(found, again)
+
+
+def test_an_image_of_nothing_moves_nothing():
+    camera = camera_ahead(9, 9, 9.0)
+    splats, tiles = reference_splats([PosedGaussians(one_gaussian((-3.0, 0.0, 0.0)))], camera)
+    assert len(tiles.members) == 0
+    d_rgb = weights_of(camera).to(gpu.gpu_device())
+    assert not color_gradients(splats, tiles, camera, DEFAULT, d_rgb).any()
+
+
+@pytest.mark.gpu
+def test_many_splats_on_a_real_gpu():
+    parts, camera = [PosedGaussians(random_gaussians(20000, size=0.1))], camera_ahead(320, 180, 300)
+    expected = sh_gradients(parts, camera, "cpu", buffers=(RGB, ALPHA))
+    found = sh_gradients(parts, camera, "cuda")
+    assert_close(found, expected, 1e-3)  # some splats flip at a threshold
+    assert torch.equal(found[0], sh_gradients(parts, camera, "cuda")[0])
+
+
+# ---- where tensors lie -------------------------------------------------------------------------
+
+
+def test_all_stays_on_the_gpu(monkeypatch):
+    parts, camera = small_scene(30), camera_ahead(9, 8, 9.0)
+    expected = sh_gradients(parts, camera, "cuda")
+    with pretended_gpu(monkeypatch):
+        device = gpu.gpu_device()
+        away = [
+            dataclasses.replace(
+                part,
+                gaussians=Gaussians(
+                    **{name: getattr(part.gaussians, name).to(device) for name in FIELDS}
+                ),
+            )
+            for part in parts
+        ]
+        for part in away:
+            part.gaussians.sh.requires_grad_()
+        out = rasterize(away, camera, buffers=(RGB, ALPHA))
+        assert isinstance(out.rgb, AwayTensor) and isinstance(out.alpha, AwayTensor)
+        (out.rgb * weights_of(camera).to(device)).sum().backward()
+        found = [part.gaussians.sh.grad for part in away]
+        assert all(isinstance(grad, AwayTensor) for grad in found)
+        assert all(torch.equal(a.cpu(), b) for a, b in zip(found, expected, strict=True))
+
+
+# ---- geometry, by gsplat -----------------------------------------------------------------------
+
+
+def all_gradients(parts, camera, backend, settings=DEFAULT):
+    dtype = torch.float64 if backend == "reference" else torch.float32
+    leaves = [tracked(part, *FIELDS, dtype=dtype) for part in parts]
+    names = (RGB, ALPHA, EXPECTED_DEPTH)
+    out = rasterize(leaves, camera, buffers=names, settings=settings, backend=backend)
+    weights = weights_of(camera, 5)
+    (out.rgb * weights[..., :3]).sum().add(
+        (out.alpha * weights[..., 3]).sum() + (out.expected_depth * weights[..., 4]).sum()
+    ).backward()
+    return {name: [getattr(part.gaussians, name).grad for part in leaves] for name in FIELDS}
+
+
+def moved(part: PosedGaussians, by: torch.Tensor) -> PosedGaussians:
+    means = part.gaussians.means + by
+    return dataclasses.replace(part, gaussians=dataclasses.replace(part.gaussians, means=means))
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_geometrys_gradients_are_gsplats(monkeypatch, antialiased):
+    gsplat_stand_in.install(monkeypatch)
+    settings = RasterSettings(antialiased=antialiased, sh_degree=2)
+    camera = camera_ahead(19, 14, 18.0, position=(3.0, -2.0, 1.5), yaw=0.2)
+    parts = [moved(part, torch.tensor([3.0, -2.0, 1.5])) for part in small_scene()]
+    expected = all_gradients(parts, camera, "reference", settings)
+    found = all_gradients(parts, camera, "cuda", settings)
+    for name in FIELDS:
+        # Of quats, what changes their length is nothing in truth and the rounding of a product.
+        scale = 1e-3 if name == "quats" else 1e-4
+        for got, want in zip(found[name], expected[name], strict=True):
+            got, want = torch.zeros(0) if got is None else got, want
+            error = float((got - want).norm()) if len(want) else 0.0
+            assert error <= scale * float(want.norm()) + 1e-9, name
+
+
+def test_gsplat_says_which_splats_it_drew(monkeypatch):
+    gsplat_stand_in.install(monkeypatch)
+    gaussians = stack(one_gaussian((-3.0, 0.0, 0.0)), one_gaussian())
+    part = tracked(PosedGaussians(gaussians), "means")
+    drawn = draw_with_gsplat([part], camera_ahead(9, 9, 9.0), DEFAULT, with_depth=False)
+    assert drawn.ids.tolist() == [1] and drawn.means2d.shape == (1, 2)
+    assert drawn.expected_depth is None and drawn.colors.shape == (2, 3)
+    drawn.rgb.sum().backward()
+    assert drawn.means2d.absgrad.shape == (1, 2)
+
+
+def test_without_gsplat_both_ways_out_are_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "gsplat", None)
+    part = tracked(PosedGaussians(one_gaussian()), "means")
+    with pytest.raises(BackendUnavailable, match=r"climategs\[gsplat\].*backend 'cpu'"):
+        rasterize([part], camera_ahead(9, 9, 9.0), backend="cuda")
+    gsplat_stand_in.install(monkeypatch, __version__="1.6.0")
+    with pytest.raises(BackendUnavailable, match=r"gsplat 1\.6\.0 is installed"):
+        rasterize([part], camera_ahead(9, 9, 9.0), backend="cuda")
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (RasterSettings(alpha_max=0.99), "alpha_max must be 0.999"),
+        (RasterSettings(transmittance_stop=0.01), "transmittance_stop must be 0.0001"),
+    ],
+)
+def test_what_is_compiled_into_gsplat_cannot_be_set(monkeypatch, settings, message):
+    gsplat_stand_in.install(monkeypatch)
+    part = tracked(PosedGaussians(one_gaussian()), "scales")
+    with pytest.raises(ValueError, match=message):
+        rasterize([part], camera_ahead(9, 9, 9.0), settings=settings, backend="cuda")
+
+
+def test_gradients_that_no_kernel_has_are_refused():
+    camera = camera_ahead(9, 9, 9.0)
+    colour, shape = (tracked(PosedGaussians(one_gaussian()), name) for name in ("sh", "means"))
+    smog = SmogMedium(sigma_per_m=0.1, rgb=(0.5, 0.5, 0.5))
+    with pytest.raises(ValueError, match=r"gradients through smog.* 'reference', on the CPU"):
+        rasterize([colour], camera, smog=smog, backend="cuda")
+    with pytest.raises(ValueError, match="gradients of median_depth"):
+        rasterize([shape], camera, buffers=(MEDIAN_DEPTH,), backend="cuda")
+    above = dataclasses.replace(camera, is_orthographic=True)
+    with pytest.raises(ValueError, match="of an orthographic camera"):
+        rasterize([shape], above, backend="cuda")
