@@ -25,7 +25,7 @@ def render(
     scale: float = 1.0,
     variants: int | None = None,
     workers: int = 1,
-    backend: Literal["auto", "reference", "cpu"] = "auto",
+    backend: Literal["auto", "reference", "cpu", "cuda"] = "auto",
     camera_path: Path | None = None,
     overwrite: bool = False,
     sheet: bool = True,
@@ -45,8 +45,8 @@ def render(
         cameras: Camera names separated by commas, or all.
         scale: Resolution relative to the recipe's.
         variants: How many draws from the recipe's ranges. The recipe's own number by default.
-        workers: Processes. The bits do not depend on it.
-        backend: Which rasteriser draws.
+        workers: Processes. The bits do not depend on it. One is best where a GPU draws.
+        backend: Which rasteriser draws. auto: on the GPU (cuda) where there is one, else the CPU.
         camera_path: A JSON file of camera poses to render instead of the scene's own.
         overwrite: Replace what this scene and recipe wrote before.
         sheet: Also write a contact sheet of the result.

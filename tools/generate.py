@@ -16,6 +16,7 @@ from adapters.base import open_scene
 from adapters.patterns import scenes_of
 from augment.batch.layout import STATE_FOLDER
 from augment.batch.store import Store, open_store
+from augment.batch.times import shares_of
 from augment.errors import ClimateGSError
 from augment.generate.job import (
     GenerateJob,
@@ -73,7 +74,7 @@ def generate_dataset(
         return _dry_run(task)
     _check_writable(open_store(out))
     with _ended_by_sigterm():
-        result = run_generate(task, prepare=_warm_up)
+        result = run_generate(task, prepare=lambda recipes: _warm_up(recipes, backend))
     _report(result, out)
     return 1 if result.failed or result.unusable else 0
 
@@ -159,6 +160,8 @@ def _report(result: GenerateResult, out: str) -> None:
         f"{result.written} images written, {result.skipped} already there, {result.failed} failed; "
         f"{_duration(result.seconds)}, {rate:.1f} images/s"
     )
+    if shares := shares_of(result.timings):
+        print(shares.sentence)
     for failure in result.failures[:_MOST_LINES]:
         _say(f"failed: {failure}")
     if len(result.failures) > _MOST_LINES:
@@ -201,10 +204,10 @@ def _is_done(status: JobStatus) -> bool:
     return total.published == total.planned and not total.in_failed_blocks and not status.unusable
 
 
-def _warm_up(recipes: list[Recipe]) -> None:
-    from tools.warm_up import warm_up
+def _warm_up(recipes: list[Recipe], backend: str) -> None:
+    from tools.warm_up import warm_up_for_workers
 
-    seconds = warm_up(recipes)
+    seconds = warm_up_for_workers(recipes, backend)
     if seconds > 1:
         _say(f"compiled the kernels in {seconds:.1f} s (kept for the next run)")
 

@@ -19,7 +19,7 @@ def generate(
     status: bool = False,
     rescan: bool = False,
     scratch: Path | None = None,
-    backend: Literal["auto", "reference", "cpu"] = "auto",
+    backend: Literal["auto", "reference", "cpu", "cuda"] = "auto",
 ) -> int:
     """Make a dataset: many scenes under many recipes, as a job file says (docs/generate.md).
 
@@ -30,7 +30,8 @@ def generate(
         job: The job file (.yaml): scenes, recipes, variants.
         out: The output: a folder, or s3://bucket/path, gs://bucket/path.
         executor: Who renders: this process, processes of this machine, or actors of a Ray cluster.
-        workers: How many; a process for every core by default.
+        workers: How many; a process for every core by default, one where a GPU draws, on Ray an
+            actor for every GPU then.
         shard: i/n: do only the i-th of n parts, for schedulers such as SLURM.
         dry_run: Open the scenes, say what would be rendered, and about how long it takes and how
             large it gets. Nothing is written.
@@ -38,7 +39,8 @@ def generate(
             if all is done.
         rescan: Open all scenes again, in case they have got frames since.
         scratch: Where images are kept until their block is uploaded, for outputs elsewhere.
-        backend: Which rasteriser draws.
+        backend: Which rasteriser draws. auto: on the GPU (cuda) where there is one, else the CPU;
+            on Ray the CPU.
     """
     from augment.errors import ClimateGSError
 

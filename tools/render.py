@@ -14,6 +14,7 @@ from augment.batch.job import JobResult, RenderJob, run_job
 from augment.batch.layout import variant_name
 from augment.batch.mirror import Links
 from augment.batch.store import open_store
+from augment.batch.times import shares_of
 from augment.cameras import Frame
 from augment.errors import ClimateGSError
 from augment.ground import ground_of
@@ -57,7 +58,8 @@ def render_recipe(
     from tools.warm_up import warm_up
 
     recipes = resolve_variants(recipe, variants, scale)
-    seconds = warm_up([tried for resolved in recipes for tried in recipes_to_try(resolved)])
+    tried = [each for resolved in recipes for each in recipes_to_try(resolved)]
+    seconds = warm_up(tried, backend)
     if seconds > 1:
         _say(f"compiled the kernels in {seconds:.1f} s (kept for the next run)")
     scene = open_scene(scene_uri)
@@ -86,7 +88,7 @@ def render_recipe(
         overwrite=overwrite,
     )
     result = run_job(job, scene_loader=lambda _uri: scene)
-    _report(result)
+    _report(result, workers)
     if layout == "source":
         names = [variant_name(resolved) for resolved in recipes]
         for sentence in mirror_outputs(scene, out, variants=names, links=links):
@@ -161,7 +163,7 @@ def _check_no_path(camera_path: Path | None) -> None:
         )
 
 
-def _report(result: JobResult) -> None:
+def _report(result: JobResult, workers: int) -> None:
     rate = result.written / result.seconds if result.seconds else 0.0
     print(
         f"{result.written} images written, {result.skipped} already there, {result.failed} failed; "
@@ -171,6 +173,8 @@ def _report(result: JobResult) -> None:
         kinds = ("render", "encode", "write")
         each = [f"{1000 * result.timings.get(k, 0.0) / result.written:.0f} ms {k}" for k in kinds]
         print(f"per image: {', '.join(each)} (on threads that overlap)")
+    if shares := shares_of(result.timings, held_up=workers):
+        print(shares.sentence)
     for failure in result.failures[:20]:
         _say(f"failed: {failure}")
     if len(result.failures) > 20:

@@ -10,11 +10,14 @@ from contextlib import contextmanager
 import torch
 
 from augment.apply import render_view
+from augment.batch.backends import renders_on_gpu
 from augment.cameras import Camera, Frame
 from augment.geometry import rigid
 from augment.ground_heights import Ground
 from augment.labels import Boxes, LidarSweep
 from augment.render import cpu
+from augment.render.backends import CPU, CUDA
+from augment.render.gpu import is_interpreted
 from augment.render.threads import thread_count
 from augment.scene import Gaussians, Scene
 from augment.sky import CubemapSky
@@ -24,12 +27,32 @@ SIZE = 32  # pixels a side
 ACROSS, SPACING_M = 10, 0.1  # splats of the road to each side, and between them
 
 
-def warm_up(recipes: Sequence[Recipe]) -> float:
-    """Compile the CPU kernels that the recipes take, or load them; seconds it took."""
-    seconds = cpu.warm_up()
+def warm_up(recipes: Sequence[Recipe], backend: str = CPU) -> float:
+    """Compile the kernels that the recipes take, or load them; seconds it took."""
+    if not renders_on_gpu(backend):
+        seconds = cpu.warm_up()
+        started = time.perf_counter()
+        _warm_recipes(recipes)
+        return seconds + time.perf_counter() - started
+    if is_interpreted():  # there is nothing to compile, and drawing takes long
+        return 0.0
     started = time.perf_counter()
-    _warm_recipes(recipes)
-    return seconds + time.perf_counter() - started
+    _warm_recipes(recipes, CUDA)
+    return time.perf_counter() - started
+
+
+def warm_up_for_workers(recipes: Sequence[Recipe], backend: str) -> float:
+    """As `warm_up`, for other processes, which find what was compiled in the caches on the disk.
+
+    A GPU is used in a process of its own: this one would hold a part of its memory until it ends.
+    """
+    if not renders_on_gpu(backend):
+        return warm_up(recipes)
+    started = time.perf_counter()
+    apart = multiprocessing.get_context("spawn").Process(target=warm_up, args=(recipes, backend))
+    apart.start()
+    apart.join()
+    return time.perf_counter() - started
 
 
 @contextmanager
@@ -52,12 +75,13 @@ def warming_up_beside(recipes: Sequence[Recipe]) -> Iterator[None]:
         beside.kill()
 
 
-def _warm_recipes(recipes: Sequence[Recipe]) -> None:
+def _warm_recipes(recipes: Sequence[Recipe], backend: str = CPU) -> None:
     seen = set()
     for recipe in recipes:
         flood, snow, output = recipe.weather.flood, recipe.weather.snow, recipe.output
         style = recipe.style if recipe.style and recipe.style.changes else None
-        if flood is None and snow is None and style is None:
+        is_clear = flood is None and snow is None and style is None
+        if is_clear and backend == CPU:  # `cpu.warm_up` has drawn one
             continue
         ids = output.semantic or output.instance
         water, light = flood and flood.reflection, snow and snow.shading
@@ -67,7 +91,7 @@ def _warm_recipes(recipes: Sequence[Recipe]) -> None:
             seen.add(kernels)
             level_z_m = 0.0 if flood is None else flood.level_m
             scene = _yard(level_z_m, with_labels=output.labels)
-            render_view(scene, scene.frames[0].cameras["warm-up"], recipe)
+            render_view(scene, scene.frames[0].cameras["warm-up"], recipe, backend=backend)
 
 
 def _yard(level_z_m: float, *, with_labels: bool) -> Scene:

@@ -8,28 +8,41 @@ from augment.errors import BackendUnavailable
 from augment.scene import Scene
 
 
-def choose_backend(backend: str, scene: Scene) -> str:
+def choose_backend(backend: str, scene: Scene, *, gpu: bool = True) -> str:
     """The backend that will render the scene: `auto` resolved, any other name checked. `auto` takes
-    the GPU where there is one.
+    the GPU where there is one, unless `gpu` says that it must not.
 
     Resolved once for the whole job, so that a resumed job cannot mix backends in one folder.
 
     Raises:
         ValueError: no such backend. BackendUnavailable: it cannot run on this machine.
     """
-    from augment.render.backends import available_backends
+    from augment.render.backends import available_backends, import_cpu
     from augment.render.gpu import has_gpu
 
-    obstacles = available_backends()
-    if backend == "auto":
+    if backend == "auto":  # asks for no more than it takes: nothing of triton without a GPU
         means = [scene.background.means, *(actor.gaussians.means for actor in scene.actors)]
         plain = all(m.dtype == torch.float32 and not m.requires_grad for m in means)
-        if plain and has_gpu():
+        if plain and gpu and has_gpu():
             return "cuda"
-        return "cpu" if plain and obstacles["cpu"] is None else "reference"
+        try:
+            import_cpu()
+        except BackendUnavailable:
+            return "reference"
+        return "cpu" if plain else "reference"
+    obstacles = available_backends()
     if backend not in obstacles:
         raise ValueError(f"backend must be one of auto, {', '.join(obstacles)}; got {backend!r}")
     obstacle = obstacles[backend]
     if obstacle is not None:
         raise BackendUnavailable(obstacle)
     return backend
+
+
+def renders_on_gpu(backend: str) -> bool:
+    """Whether a job that names this backend draws on a GPU: `auto` does where there is one."""
+    if backend == "auto":
+        from augment.render.gpu import has_gpu
+
+        return has_gpu()
+    return backend == "cuda"

@@ -12,7 +12,7 @@ import logging
 import multiprocessing
 import pickle
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from multiprocessing import reduction
 from multiprocessing.connection import wait
@@ -27,7 +27,7 @@ from augment.batch.processes import (
 )
 from augment.batch.runner import Chunk, FrameRunner, Outcome, Renderer, Setup
 from augment.batch.shared_scene import SharedScene
-from augment.batch.worker import Failure, Ready, worker_main
+from augment.batch.worker import Failure, Ready, Spent, worker_main
 from augment.batch.writer import WritePump
 from augment.errors import ClimateGSError, OutputError
 from augment.scene import Scene
@@ -45,14 +45,19 @@ def run_serially(
     chunks: Sequence[Chunk],
     renderer: Renderer | None,
     deliver: Deliver,
-) -> None:
-    """Render in this thread; two more threads encode and write. An interrupt ends cleanly."""
-    runner = FrameRunner(scene, setup, renderer, deliver, WritePump())
+) -> dict[str, float]:
+    """Render in this thread, encode and write in others. An interrupt ends cleanly.
+
+    Returns seconds by the kinds of `times`.
+    """
+    pump = WritePump.beside(setup.backend, available_cores())
+    runner = FrameRunner(scene, setup, renderer, deliver, pump)
     try:
         for chunk in chunks:
             runner.run(chunk)
     finally:
-        runner.close()
+        seconds = runner.close()
+    return seconds
 
 
 def run_in_processes(
@@ -64,8 +69,10 @@ def run_in_processes(
     renderer: Renderer | None,
     deliver: Deliver,
     lock: OutputLock,
-) -> None:
+) -> dict[str, float]:
     """Render in `workers` processes; `deliver` is called in this thread.
+
+    Returns seconds by the kinds of `times`, without those of workers that died.
 
     What a dead worker had in hand is tried once more, each image alone; if its process dies again
     the image is recorded as failed.
@@ -83,6 +90,7 @@ def run_in_processes(
         ) from error
     pool = _Pool(setup, shared, renderer, deliver, lock, chunks)
     pool.run(min(workers, len(chunks)))
+    return dict(pool.seconds)
 
 
 class _Worker:
@@ -142,6 +150,7 @@ class _Pool:
         self.retries: deque[Chunk] = deque()
         self.workers: list[_Worker] = []
         self.threads = 1
+        self.seconds: Counter[str] = Counter()
 
     def run(self, count: int) -> None:
         self.threads = max(1, available_cores() // count)
@@ -178,6 +187,8 @@ class _Pool:
             worker.is_ready = True
         elif isinstance(message, Failure):
             raise (OutputError if message.is_output else ClimateGSError)(message.text)
+        elif isinstance(message, Spent):
+            self.seconds.update(message.seconds)
         else:
             worker.take(message)
             self.deliver(message)

@@ -33,6 +33,7 @@ from augment.batch.snow_beds import StoredBed, snow_to_lay, store_beds
 from augment.batch.store import open_store
 from augment.batch.style_files import check_kept, copy_style_files, portable_recipe
 from augment.batch.style_maps import StoredMaps, store_maps, style_to_apply
+from augment.batch.times import WORKERS
 from augment.batch.trajectory import frames_to_json, trajectory_id
 from augment.cameras import Frame
 from augment.scene import Scene
@@ -87,8 +88,8 @@ class JobResult:
     """Counts of images of this job. skipped: finished by earlier runs. failures: one line each.
 
     manifest: its path. seconds: wall clock. timings: seconds by kind of work, summed over
-    threads and workers (render, encode, write), or of the job itself (open, settle, place, style,
-    labels, share, finish).
+    threads and workers (the kinds of `times`), or of the job itself (open, settle, place, style,
+    labels, share, finish). `times.shares_of` says what the job was bound by.
     """
 
     written: int
@@ -128,12 +129,14 @@ def run_job(
     run = _Run(job, scene_loader(job.scene_uri), renderer, tell, progress)
     run.timings["open"] = time.perf_counter() - started - run.timings.get("settle", 0.0)
     run.go(progress)
+    seconds = time.perf_counter() - started
+    run.timings[WORKERS] = job.workers * seconds
     return JobResult(
         written=run.counts[OK],
         skipped=run.skipped,
         failed=run.counts[FAILED],
         manifest=run.out_dir / MANIFEST,
-        seconds=time.perf_counter() - started,
+        seconds=seconds,
         failures=tuple(sorted(run.failures)),
         timings=dict(run.timings),
     )
@@ -215,14 +218,15 @@ class _Run:
         if not chunks:
             return
         if self.job.workers == 1:
-            run_serially(self.scene, setup, chunks, self.renderer, self._deliver)
+            spent = run_serially(self.scene, setup, chunks, self.renderer, self._deliver)
+            self.timings.update(spent)
             return
         started = time.perf_counter()
         shared = share_scene(self.scene, self.out_dir / STATE_FOLDER)
         self.scene = None  # this process needs no more of it than the index
         self.timings["share"] += time.perf_counter() - started
         try:
-            run_in_processes(
+            spent = run_in_processes(
                 setup,
                 chunks,
                 workers=self.job.workers,
@@ -233,6 +237,7 @@ class _Run:
             )
         finally:
             shared.remove()
+        self.timings.update(spent)
 
     def _settled(self, recipe: Recipe, progress: bool) -> Recipe:
         """The recipe with the settings that its quality chooses here, or has chosen before."""
@@ -292,7 +297,14 @@ class _Run:
         if snowy:
             started = time.perf_counter()
             folder = self.job.beds_dir or self.out_dir / STATE_FOLDER
-            self.beds = store_beds(self.scene, snowy, folder, cameras=cameras, progress=progress)
+            self.beds = store_beds(
+                self.scene,
+                snowy,
+                folder,
+                cameras=cameras,
+                backend=self.backend,
+                progress=progress,
+            )
             self.timings["place"] += time.perf_counter() - started
 
     def _begin(self, chunks: Sequence[Chunk]) -> None:
@@ -325,8 +337,6 @@ class _Run:
         self.ledger.record(outcome, self.index.frames_by_number[outcome.frame])
         with self.counting:
             self.counts[outcome.status] += 1
-            for kind, seconds in outcome.seconds.items():
-                self.timings[kind] += seconds
             if outcome.status == FAILED:
                 where = f"frame {outcome.frame}, camera {outcome.camera}"
                 folder = self.ledger.variants[outcome.variant].folder

@@ -6,6 +6,7 @@ The same code runs in the job's own process and in its workers.
 from __future__ import annotations
 
 import logging
+import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -16,15 +17,29 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from augment.batch.atomic import write_atomic
+from augment.batch.backends import renders_on_gpu
 from augment.batch.box_weather import BoxWeather, has_box_weather, measure_boxes
 from augment.batch.label_files import lidar_bytes
 from augment.batch.layout import item_paths
 from augment.batch.manifest import FAILED, OK
 from augment.batch.snow_beds import StoredBed
 from augment.batch.style_maps import StoredMaps
+from augment.batch.times import (
+    AWAIT,
+    ENCODE,
+    HELD,
+    LIDAR,
+    MEASURE,
+    RENDER,
+    RENDERERS,
+    WRITE,
+    WRITERS,
+    WorkTimes,
+)
 from augment.batch.trajectory import frames_from_json
 from augment.batch.writer import View, WritePump, check_view, write_view
 from augment.cameras import Camera
+from augment.errors import OutputError
 from augment.labels import Boxes
 from augment.scene import Scene
 from recipes.schema import Recipe
@@ -35,9 +50,21 @@ _log = logging.getLogger(__name__)
 
 @runtime_checkable
 class Renderer(Protocol):
-    """`augment.apply.render_view`, or a stand-in. Returns a `writer.View`."""
+    """`augment.apply.render_view`, `begin_view`, or a stand-in.
+
+    Returns a `writer.View`, or a `Pending` one: a job then begins the next view before it waits.
+    """
 
     def __call__(self, scene: Scene, camera: Camera, recipe: Recipe, *, backend: str) -> Any: ...
+
+
+@runtime_checkable
+class Pending(Protocol):
+    """A view that is begun; `augment.views.PendingView` is one."""
+
+    def result(self) -> Any:
+        """The `writer.View`, once it is there."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -72,7 +99,7 @@ class Outcome:
     """What became of one image.
 
     lidar: whether the frame has a sweep. box_weather: what each effect of the recipe does to its
-    boxes, where there are labels. seconds: by kind of work.
+    boxes, where there are labels.
     """
 
     variant: int
@@ -83,7 +110,6 @@ class Outcome:
     checksum: str = ""
     lidar: bool = False
     box_weather: BoxWeather = field(default_factory=dict)
-    seconds: dict[str, float] = field(default_factory=dict)
 
 
 def describe(error: BaseException, doing: str) -> str:
@@ -99,8 +125,34 @@ def default_renderer() -> Renderer:
     return render_view
 
 
+def job_renderer(backend: str) -> Renderer:
+    """The library's own for a job: on a GPU it begins views and does not wait for them.
+
+    On the CPU a begun view would be a finished one, whose files would come a view too late.
+    """
+    from augment.apply import begin_view, render_view
+
+    return begin_view if renders_on_gpu(backend) else render_view
+
+
+@dataclass(frozen=True, eq=False)
+class _Drawn:
+    """An image that the renderer has drawn, or begun. camera: at the written resolution.
+
+    lidar: what `_pass_lidar` says of its frame.
+    """
+
+    chunk: Chunk
+    recipe: Recipe
+    camera: Camera
+    lidar: Future
+
+
 class FrameRunner:
     """Renders chunks in this thread, writes on others, and tells `deliver` of each image.
+
+    Where the renderer returns pending views one of them is in flight: the next is begun before the
+    last one is waited for, so that a GPU has work while its pictures come back and are handed over.
 
     deliver: called from the writing threads, after all files of the image are on the disk.
     An error of the scene or the renderer concerns one image; an OutputError ends the run, since
@@ -120,79 +172,133 @@ class FrameRunner:
             frames = frames_from_json(setup.camera_path)
         self._cameras = {f.index: f.cameras for f in frames}
         self._scene, self._setup = scene, setup
-        self._renderer = renderer or default_renderer()
+        self._renderer = renderer or job_renderer(setup.backend)
         self._deliver, self._pump = deliver, pump
         self._maps = {stored.style: stored for stored in setup.maps}
         self._boxes: dict[int, Boxes] = {}  # of the frames so far
+        self._reading_boxes = threading.Lock()
+        self._in_flight: tuple[_Drawn, Pending] | None = None
+        self._times, self._started = WorkTimes(), time.perf_counter()
 
     def run(self, chunk: Chunk, stopped: Callable[[], bool] = lambda: False) -> None:
-        """Render the chunk's images; those not begun when `stopped()` turns true are left."""
+        """Render the chunk's images; those not begun when `stopped()` turns true are left.
+
+        The last of them may still be in flight afterwards, until `land` or the next one.
+        """
         recipe = self._setup.recipes[chunk.variant]
         if recipe.style in self._maps:  # one at a time: a scene remembers few
             self._maps[recipe.style].take_over(self._scene)
-        lidar = self._pump.submit(lambda: self._pass_lidar(chunk, recipe))
+        lidar = self._submit(lambda: self._pass_lidar(chunk, recipe))
         for name in chunk.cameras:
             if stopped():
                 return
             self._render(chunk, recipe, name, lidar)
 
-    def close(self) -> None:
-        """Wait for the writes; raises what stopped them."""
-        self._pump.close()
+    def land(self) -> None:
+        """Wait for the view in flight, if there is one, and hand it over."""
+        if self._in_flight is None:
+            return
+        drawn, pending = self._in_flight
+        try:
+            with self._times.spent(RENDER, AWAIT):
+                view = pending.result()
+        except Exception as error:
+            self._in_flight = None
+            self._fail(drawn.chunk, drawn.camera.name, error)
+            return
+        self._in_flight = None  # no sooner: what an interrupt finds in flight is left to `close`
+        self._hand_over(drawn, view)
+
+    def close(self) -> dict[str, float]:
+        """Wait for the writes; raises what stopped them. Returns the seconds by `times`' kinds."""
+        try:
+            self.land()
+        finally:
+            with self._times.spent(HELD):
+                self._pump.close()
+        seconds = time.perf_counter() - self._started
+        self._times.add(RENDERERS, seconds)
+        self._times.add(WRITERS, seconds * self._pump.threads)
+        return self._times.so_far()
 
     def _render(self, chunk: Chunk, recipe: Recipe, name: str, lidar: Future) -> None:
         camera = self._cameras[chunk.frame][name]
-        started = time.perf_counter()
-        doing = "rendering"
         try:
-            view = self._renderer(self._scene, camera, recipe, backend=self._setup.backend)
-            written = camera.scaled(recipe.render.scale)
-            check_view(view, written, recipe)
-            doing = "measuring the boxes in the weather"
-            box_weather = self._measure(chunk.frame, recipe, written, view)
+            with self._times.spent(RENDER):
+                view = self._renderer(self._scene, camera, recipe, backend=self._setup.backend)
+        except Exception as error:
+            self._fail(chunk, name, error)
+            return
+        drawn = _Drawn(chunk, recipe, camera.scaled(recipe.render.scale), lidar)
+        if isinstance(view, Pending):
+            self.land()
+            self._in_flight = drawn, view
+        else:
+            self._hand_over(drawn, view)
+
+    def _hand_over(self, drawn: _Drawn, view: View) -> None:
+        """Give a view to the writing threads."""
+        try:
+            check_view(view, drawn.camera, drawn.recipe)
+        except Exception as error:
+            self._fail(drawn.chunk, drawn.camera.name, error)
+            return
+        self._submit(lambda: self._write(drawn, view))
+
+    def _fail(self, chunk: Chunk, name: str, error: Exception) -> None:
+        _log.debug("frame %d, camera %s", chunk.frame, name, exc_info=error)
+        message = describe(error, "rendering")
+        outcome = Outcome(chunk.variant, chunk.frame, name, FAILED, message)
+        self._submit(lambda: self._deliver(outcome))
+
+    def _submit(self, task: Callable[[], Any]) -> Future:
+        with self._times.spent(HELD):
+            return self._pump.submit(task)
+
+    def _write(self, drawn: _Drawn, view: View) -> None:
+        """Write the files of a view; it is delivered when its frame's sweep is there too."""
+        chunk, recipe, name = drawn.chunk, drawn.recipe, drawn.camera.name
+        paths = item_paths(self._scene.name, recipe, name, chunk.frame)
+        failed = Outcome(chunk.variant, chunk.frame, name, FAILED)
+        doing = "measuring the boxes in the weather"
+        try:
+            with self._times.spent(MEASURE):
+                box_weather = self._measure(chunk.frame, recipe, drawn.camera, view)
+            doing = "encoding"
+            written = write_view(Path(self._setup.out_dir), paths, view, recipe)
+        except OutputError:
+            raise
         except Exception as error:
             _log.debug("frame %d, camera %s", chunk.frame, name, exc_info=True)
-            message = describe(error, doing)
-            outcome = Outcome(chunk.variant, chunk.frame, name, FAILED, message)
-            self._pump.submit(lambda: self._deliver(outcome))
+            self._deliver(replace(failed, message=describe(error, doing)))
             return
-        render_s = time.perf_counter() - started
-        done = Outcome(
-            chunk.variant,
-            chunk.frame,
-            name,
-            OK,
-            box_weather=box_weather,
-            seconds={"render": render_s},
-        )
-        self._pump.submit(lambda: self._write(done, recipe, view, lidar))
+        self._times.add(ENCODE, written.encode_s)
+        self._times.add(WRITE, written.write_s)
+        done = replace(failed, status=OK, checksum=written.checksum, box_weather=box_weather)
+        self._pump.after(drawn.lidar, lambda: self._complete(done, drawn.lidar, written.files))
+
+    def _complete(self, done: Outcome, lidar: Future, files: tuple[str, ...]) -> None:
+        """Deliver an image whose files are there, or a failure where its sweep has failed."""
+        passed = lidar.result()
+        if isinstance(passed, str):
+            for file in files:
+                (Path(self._setup.out_dir) / file).unlink(missing_ok=True)
+            done = Outcome(done.variant, done.frame, done.camera, FAILED, passed)
+        else:
+            done = replace(done, lidar=passed)
+        with self._times.spent(WRITE):
+            self._deliver(done)
 
     def _measure(self, frame: int, recipe: Recipe, camera: Camera, view: View) -> BoxWeather:
         """What the weather does to the frame's boxes; nothing without labels."""
         has_labels = recipe.output.labels and frame in self._setup.labelled
         if not has_labels or not has_box_weather(view):
             return {}
-        if frame not in self._boxes:
-            self._boxes[frame] = self._scene.boxes(frame)
+        with self._reading_boxes:
+            if frame not in self._boxes:
+                self._boxes[frame] = self._scene.boxes(frame)
         origin = np.asarray(self._scene.world_origin_m, np.float64)
         return measure_boxes(self._boxes[frame], origin, camera, view)
-
-    def _write(self, done: Outcome, recipe: Recipe, view: View, lidar: Future) -> None:
-        """Write the files of a view and deliver `done`, completed, or a failure in its place."""
-        out_dir = Path(self._setup.out_dir)
-        paths = item_paths(self._scene.name, recipe, done.camera, done.frame)
-        passed = lidar.result()
-        if isinstance(passed, str):
-            self._deliver(Outcome(done.variant, done.frame, done.camera, FAILED, passed))
-            return
-        try:
-            written = write_view(out_dir, paths, view, recipe)
-        except ValueError as error:
-            message = describe(error, "encoding")
-            self._deliver(Outcome(done.variant, done.frame, done.camera, FAILED, message))
-            return
-        seconds = {**done.seconds, "encode": written.encode_s, "write": written.write_s}
-        self._deliver(replace(done, checksum=written.checksum, lidar=passed, seconds=seconds))
 
     def _pass_lidar(self, chunk: Chunk, recipe: Recipe) -> bool | str:
         """Write the frame's sweep, in the weather or as it is, unless it is there already.
@@ -206,16 +312,17 @@ class FrameRunner:
         target = Path(self._setup.out_dir) / paths.lidar
         if target.exists():
             return True
-        try:
-            sweep = self._scene.lidar(chunk.frame)
-            if sweep is not None and recipe.output.lidar == "weather":
-                from augment.lidar_weather.apply import weathered_sweep  # it brings the kernels
+        with self._times.spent(LIDAR):
+            try:
+                sweep = self._scene.lidar(chunk.frame)
+                if sweep is not None and recipe.output.lidar == "weather":
+                    from augment.lidar_weather.apply import weathered_sweep  # brings the kernels
 
-                sweep = weathered_sweep(self._scene, recipe, chunk.frame, sweep)
-            data = None if sweep is None else lidar_bytes(sweep)
-        except Exception as error:
-            return describe(error, "reading the LiDAR sweep")
-        if data is None:
-            return False
-        write_atomic(target, data)
-        return True
+                    sweep = weathered_sweep(self._scene, recipe, chunk.frame, sweep)
+                data = None if sweep is None else lidar_bytes(sweep)
+            except Exception as error:
+                return describe(error, "reading the LiDAR sweep")
+            if data is None:
+                return False
+            write_atomic(target, data)
+            return True

@@ -51,8 +51,9 @@ def remember(scene: Scene, snow: Snow, bed: SnowBed) -> None:
     remember_bed(scene, placement_settings(snow), bed)
 
 
-def find_bed(scene: Scene, snow: Snow) -> SnowBed:
-    """The bed of a snow for all of the scene's cameras, remembered for this scene object.
+def find_bed(scene: Scene, snow: Snow, *, backend: str = "auto") -> SnowBed:
+    """The bed of a snow for all of the scene's cameras, remembered for this scene object. backend:
+    that renders the pictures.
 
     Raises:
         SceneError: it cannot be placed.
@@ -60,7 +61,7 @@ def find_bed(scene: Scene, snow: Snow) -> SnowBed:
     from augment.snow.beds import bed_of
     from augment.snow.covers import placement_settings
 
-    return bed_of(scene, placement_settings(snow))
+    return bed_of(scene, placement_settings(snow), backend=backend)
 
 
 def store_beds(
@@ -69,12 +70,14 @@ def store_beds(
     folder: Path,
     *,
     cameras: Sequence[Camera] | None = None,
+    backend: str = "auto",
     progress: bool = False,
 ) -> tuple[StoredBed, ...]:
     """The beds of all snow in the recipes, in `folder` and remembered for this scene object.
 
     cameras: all that a camera path has, or None for the scene's: never a selection, so that no
-    image depends on what else is rendered. progress: a bar on stderr for each bed that is placed.
+    image depends on what else is rendered. backend: that renders the images, which places their
+    snow, too. progress: a bar on stderr for each bed that is placed.
 
     Raises:
         SceneError: a bed cannot be placed. OutputError: it cannot be written.
@@ -88,8 +91,10 @@ def store_beds(
     wanted = {placement_settings(s): s for r in recipes if (s := snow_to_lay(r)) is not None}
     stored = []
     for settings, snow in wanted.items():
-        bed = bed_of(scene, settings, cameras=cameras, folder=folder, progress=progress)
-        key = bed_key(scene, cameras, settings)
+        bed = bed_of(
+            scene, settings, cameras=cameras, folder=folder, backend=backend, progress=progress
+        )
+        key = bed_key(scene, cameras, settings, backend=backend)
         path = bed_path(folder, key)
         if not path.is_file():  # this process knew the bed from a job in another folder
             save_bed(path, bed, key)

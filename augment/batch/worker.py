@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from queue import SimpleQueue
 
+from augment.batch.backends import renders_on_gpu
 from augment.batch.lock import InheritedLock
 from augment.batch.processes import sender
 from augment.batch.runner import Chunk, FrameRunner, Renderer, Setup, describe
@@ -27,6 +28,13 @@ class Failure:
 
     is_output: bool
     text: str
+
+
+@dataclass(frozen=True)
+class Spent:
+    """The worker has ended as it was told to. seconds: by the kinds of `times`."""
+
+    seconds: dict[str, float]
 
 
 def worker_main(
@@ -55,14 +63,22 @@ def worker_main(
         send(Failure(False, describe(error, "taking over the scene in a worker process")))
         return
     send(Ready())
-    # One writing thread and little waiting: the memory of a view counts once per worker.
-    runner = FrameRunner(scene, setup, renderer, send, WritePump(threads=1, waiting=2))
+    if renders_on_gpu(setup.backend):
+        pump = WritePump.beside(setup.backend, threads)
+    else:  # one thread and little waiting: the memory of a view counts once per worker
+        pump = WritePump(threads=1, waiting=2)
+    runner = FrameRunner(scene, setup, renderer, send, pump)
     try:
         try:
-            while (chunk := inbox.get()) is not None:
+            while True:
+                if inbox.empty():  # the next chunk may depend on what becomes of the last view
+                    runner.land()
+                if (chunk := inbox.get()) is None:
+                    break
                 runner.run(chunk, stopped.is_set)
         finally:
-            runner.close()
+            seconds = runner.close()
+        send(Spent(seconds))
     except OutputError as error:
         send(Failure(True, str(error)))
     except Exception as error:

@@ -14,6 +14,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from augment.batch.atomic import write_atomic
+from augment.batch.backends import renders_on_gpu
 from augment.batch.encode import encode_depth, encode_ids, encode_image, encode_mask
 from augment.batch.layout import ItemPaths
 from augment.batch.smog_labels import Smoggy
@@ -40,9 +41,12 @@ class View(Protocol):
 
 @dataclass(frozen=True)
 class Written:
-    """checksum: SHA-256 of the image file, hexadecimal. Times in seconds."""
+    """checksum: SHA-256 of the image file, hexadecimal. files: relative to the output folder.
+    Times in seconds.
+    """
 
     checksum: str
+    files: tuple[str, ...]
     encode_s: float
     write_s: float
 
@@ -116,20 +120,32 @@ def write_view(out_dir: Path, paths: ItemPaths, view: View, recipe: Recipe) -> W
     encoded = time.perf_counter()
     for relative, data in files.items():
         write_atomic(out_dir / relative, data)
-    return Written(checksum, encoded - started, time.perf_counter() - encoded)
+    return Written(checksum, tuple(files), encoded - started, time.perf_counter() - encoded)
 
 
 class WritePump:
-    """Runs writes on a few threads beside the renderer, with few waiting: memory stays bounded.
+    """Runs writes on threads beside the renderer, with few waiting: memory stays bounded.
 
     OpenCV's encoders and file writes release the GIL, so they overlap with rendering. The first
     exception of a task stops the pump: `submit` and `close` raise it.
     """
 
     def __init__(self, threads: int = 2, waiting: int = 4) -> None:
+        """waiting: how many tasks there are at most, those included that threads are at."""
+        self.threads = threads
         self._pool = ThreadPoolExecutor(threads, thread_name_prefix="writer")
         self._slots = threading.BoundedSemaphore(waiting)
         self._error: BaseException | None = None
+
+    @staticmethod
+    def beside(backend: str, cores: int) -> WritePump:
+        """For pictures that `backend` draws in a process that has so many cores.
+
+        A CPU backend draws on the same cores, so two threads do. A GPU leaves all cores free, and
+        draws faster than one of them can encode. Two pictures more than threads wait, so that none
+        is idle while one is handed over.
+        """
+        return WritePump(cores, cores + 2) if renders_on_gpu(backend) else WritePump()
 
     def submit(self, task: Callable[[], Any]) -> Future:
         """Queue a task; blocks while too many wait. Tasks start in the order they come."""
@@ -140,6 +156,20 @@ class WritePump:
         future = self._pool.submit(task)
         future.add_done_callback(self._done)
         return future
+
+    def after(self, future: Future, task: Callable[[], Any]) -> None:
+        """Run a short task as soon as `future` is done: now, or in the thread that is at it.
+
+        So no thread waits for another one's task.
+        """
+
+        def run(_: Future) -> None:
+            try:
+                task()
+            except BaseException as error:  # a future would only log it
+                self._error = self._error or error
+
+        future.add_done_callback(run)
 
     def close(self) -> None:
         """Wait for all tasks. Raises what one of them raised."""

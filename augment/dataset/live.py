@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Collection, Sequence
 from typing import Any
 
@@ -29,10 +30,17 @@ from augment.dataset.samples import (
     SampleOptions,
     make_sample,
 )
+from augment.errors import BackendUnavailable
 from augment.quality.settle import settle
+from augment.render.backends import CUDA
 from augment.scene import Scene
 from recipes.files import with_digest
 from recipes.schema import Recipe
+
+_FORKED = (
+    "backend 'cuda' cannot render in a forked process, which the GPU does not answer: give the "
+    "DataLoader num_workers=0 or multiprocessing_context='spawn', or take backend 'cpu'"
+)
 
 
 class SceneDataset(Dataset):
@@ -45,7 +53,9 @@ class SceneDataset(Dataset):
     samples and worker processes. So are the settings of a recipe whose quality has still to choose
     them: `recipe` has them in numbers.
 
-    scene: an open scene. frames, cameras: what to keep, None for all. backend: as in `rasterize`.
+    scene: an open scene. frames, cameras: what to keep, None for all. backend: as in `rasterize`;
+    "auto" never takes a GPU, which processes that a DataLoader forks could not use. "cuda" is for
+    samples of this process, or of workers that are started afresh (`spawn`).
     renderer: `augment.apply.render_view` if None. load, box_frame, transform: as for
     `WeatherDataset`; a live scene passes no sweeps on.
 
@@ -77,7 +87,10 @@ class SceneDataset(Dataset):
                 "and read it with WeatherDataset"
             )
         self.scene, self.transform = scene, transform
-        self._backend = choose_backend(backend, scene) if renderer is None else backend
+        self._backend = backend
+        if renderer is None:
+            self._backend = choose_backend(backend, scene, gpu=False)
+        self._process = os.getpid()
         recipe = with_digest(recipe)
         self.recipe = settle(recipe, scene, backend=self._backend, renderer=renderer).recipe
         self._renderer = renderer or default_renderer()
@@ -86,12 +99,13 @@ class SceneDataset(Dataset):
         self._items = [(frame, name) for frame, names in selection for name in names]
 
         snow = snow_to_lay(self.recipe)
-        self._bed = None if snow is None else find_bed(scene, snow)
+        self._bed = None if snow is None else find_bed(scene, snow, backend=self._backend)
         self._maps = store_maps(scene, [self.recipe])
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """In another process the scene is another object, which knows of no bed and no maps yet."""
         self.__dict__.update(state)
+        self._process = os.getpid()
         snow = snow_to_lay(self.recipe)
         if snow is not None and self._bed is not None:
             remember(self.scene, snow, self._bed)
@@ -109,6 +123,8 @@ class SceneDataset(Dataset):
 
     def _render(self, frame: Frame, name: str) -> dict[str, Any]:
         camera, recipe, load = frame.cameras[name], self.recipe, self.options.load
+        if self._backend == CUDA and self._process != os.getpid():  # not unpickled: forked
+            raise BackendUnavailable(_FORKED)
         view = self._renderer(self.scene, camera, recipe, backend=self._backend)
         written = camera.scaled(recipe.render.scale)
         check_view(view, written, recipe)

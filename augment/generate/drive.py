@@ -66,6 +66,11 @@ class Driver:
         self._pool = make_pool(self._tick)
         self._open: list[str | None] = [None] * self._pool.slots  # the scene of every slot
 
+    @property
+    def slots(self) -> int:
+        """How many workers there are at most."""
+        return self._pool.slots
+
     def close(self) -> None:
         self._pool.close()
 

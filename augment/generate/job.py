@@ -15,7 +15,7 @@ import os
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import pyarrow as pa
@@ -23,6 +23,7 @@ from tqdm import tqdm
 
 import augment
 from augment.batch.atomic import output_error
+from augment.batch.backends import renders_on_gpu
 from augment.batch.claims import try_claim
 from augment.batch.journal import Identity
 from augment.batch.layout import MANIFEST, PATH_KINDS, STATE_FOLDER
@@ -30,6 +31,7 @@ from augment.batch.manifest import FAILED, OK, rows_to_table
 from augment.batch.parts import compact, list_parts, parts_to_merge, publish_part, read_finished
 from augment.batch.rows import image_row
 from augment.batch.store import Store, StoredFileMissing, open_store
+from augment.batch.times import WORKERS
 from augment.errors import OutputError
 from augment.generate.choices import settle_recipes
 from augment.generate.drive import Driver
@@ -38,6 +40,7 @@ from augment.generate.plan import Plan, make_plan, shard_of, store_plan
 from augment.generate.pools import SerialPool, Tick, WorkerPool
 from augment.generate.records import Block, SceneRecord
 from augment.generate.workshop import IndexTask, WorkSetup
+from augment.render.backends import AUTO, CUDA
 from recipes.job import JobRecipes, JobScene
 from recipes.schema import Recipe
 
@@ -52,8 +55,9 @@ _log = logging.getLogger(__name__)
 class GenerateJob:
     """recipes: of the job, loaded. scenes: the job's, without patterns. executor: who renders:
     `serial` this process, `processes` several of this machine, `ray` actors on a cluster. workers:
-    how many, None for the executor's own choice. shard: which part of the job is done here, from 1,
-    and how many there are. rescan: open all scenes anew, in case they have changed.
+    how many, None for the executor's own choice: where a GPU renders one process, or an actor for
+    each GPU of the cluster; else one for every core. shard: which part of the job is done here,
+    from 1, and how many there are. rescan: open all scenes anew, in case they have changed.
     """
 
     recipes: JobRecipes
@@ -78,8 +82,9 @@ class GenerateJob:
 class GenerateResult:
     """Images of this shard. skipped: finished before, here or elsewhere. unusable: scenes by URI.
 
-    timings: seconds by kind of work, summed over threads and workers, and by the clock: `plan`,
-    with the scenes' opening, `scan` of what is finished, and `render_wall`, all else.
+    timings: seconds by kind of work, summed over threads and workers, of which
+    `batch.times.shares_of` says what the job was bound by; and by the clock: `plan`, with the
+    scenes' opening, `scan` of what is finished, and `render_wall`, all else.
     """
 
     written: int
@@ -112,11 +117,12 @@ def run_generate(
             names; none of its images was written then. ClimateGSError: no scene can be used.
         RecipeError: a recipe cannot be used.
     """
-    return _Generation(job, progress, prepare, on_image).go()
+    return _Generation(_with_backend(job), progress, prepare, on_image).go()
 
 
 def plan_job(job: GenerateJob, *, progress: bool = True) -> Plan:
     """The job's plan, for which its scenes are opened that have not been; writes nothing."""
+    job = _with_backend(job)
     store = open_store(job.setup.store_uri)
     driver = Driver(lambda tick: make_pool(job, tick))
     with contextlib.closing(driver):
@@ -134,7 +140,20 @@ def make_pool(job: GenerateJob, tick: Tick) -> WorkerPool:
     from augment.batch.processes import available_cores
     from augment.generate.process_pool import ProcessPool
 
-    return ProcessPool(job.setup, tick, job.workers or available_cores())
+    # Several processes would share one GPU, and each have a copy of its scene there.
+    default = 1 if renders_on_gpu(job.setup.backend) else available_cores()
+    return ProcessPool(job.setup, tick, job.workers or default)
+
+
+def _with_backend(job: GenerateJob) -> GenerateJob:
+    """`auto` gets its name where this machine's GPU renders, so that others which share the work or
+    go on with it cannot add pictures of a CPU. Ray's machines differ: there `auto` is a CPU.
+    """
+    setup = job.setup
+    is_open = setup.backend == AUTO and setup.renderer is None and job.executor != "ray"
+    if not (is_open and renders_on_gpu(AUTO)):
+        return job
+    return replace(job, setup=replace(setup, backend=CUDA))
 
 
 def default_scratch(store_uri: str) -> Path | None:
@@ -172,6 +191,7 @@ class _Generation:
         self._store = open_store(job.setup.store_uri)
         self._merged_at, self._merge_s = time.monotonic(), 0.0
         self._timings: dict[str, float] = {}
+        self._rendering_s = 0.0
 
     def go(self) -> GenerateResult:
         started = time.perf_counter()
@@ -191,6 +211,7 @@ class _Generation:
             begun = time.perf_counter()
             self._render(pending, total=sum(block.images for block in blocks))
             self._timings["render_wall"] = time.perf_counter() - begun
+            self._timings[WORKERS] = self._rendering_s * self._driver.slots
         self._merge(wait=True)
         tally = self._driver.tally
         return GenerateResult(
@@ -228,7 +249,9 @@ class _Generation:
         with self._bar:
             try:
                 if pending:
+                    started = time.perf_counter()
                     self._driver.render(pending, dict(self._plan.names), self._fail)
+                    self._rendering_s = time.perf_counter() - started
             except KeyboardInterrupt:
                 self._driver.close()
                 self._merge(wait=True)
@@ -336,7 +359,9 @@ def _check_not_mixed(store: Store, plan: Plan, blocks: Sequence[Block]) -> None:
     for scene, variant, identity in _identities(table):
         block = planned.get((scene, variant))
         if block is not None:
-            block.identity(identity.backend).check(identity, f"{store.uri}/{scene}/{variant}")
+            is_chosen = plan.backend == AUTO and identity.backend != CUDA
+            backend = identity.backend if is_chosen else plan.backend
+            block.identity(backend).check(identity, f"{store.uri}/{scene}/{variant}")
 
 
 def _identities(table: pa.Table) -> list[tuple[str, str, Identity]]:

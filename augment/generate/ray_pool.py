@@ -23,18 +23,20 @@ from augment.errors import ClimateGSError
 from augment.generate.pools import Event, Finished, Lost, Tick
 from augment.generate.ray_cluster import connect, import_ray, last_line
 from augment.generate.workshop import Result, Task, WorkSetup, Workshop
+from augment.render.backends import CUDA
 
 STOP_S = 60.0  # how long actors may take to finish the images they have at hand
 _STARTS = 3  # in a row that may be lost, with their machines say, before the job ends
 _PATIENCE_S = 60.0  # without a worker, before the log says so
-_ONE_THREAD = dict.fromkeys(
-    ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"
-)
+_THREADS = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _log = logging.getLogger(__name__)
 
 
 class RayPool:
     """`slots` actors of one CPU each, as many as the cluster has CPUs if None.
+
+    Where the backend is `cuda` they have a GPU each, and as many CPUs as there are to a GPU, and
+    None is as many as the cluster has GPUs. The others see no GPU.
 
     They run on the cluster that this process is connected to, else on the one that RAY_ADDRESS
     names, else on one that is started here and ends with the pool. One that dies is replaced. Where
@@ -42,14 +44,17 @@ class RayPool:
 
     Raises:
         ClimateGSError: Ray is missing, or the cluster cannot be reached. From wait: actors cannot
-            start.
+            start, or no machine of the cluster has a GPU.
     """
 
     def __init__(self, setup: WorkSetup, tick: Tick, slots: int | None) -> None:
         self._ray = import_ray()
         self._setup, self._tick = setup, tick
-        self._is_ours = connect(self._ray, slots)
-        self.slots = slots or max(1, int(self._ray.cluster_resources().get("CPU", 1)))
+        on_gpu = setup.backend == CUDA
+        self._is_ours = connect(self._ray, None if on_gpu else slots)
+        self._cpus, self._gpus = (_cpus_of_a_gpu(self._ray), 1) if on_gpu else (1, 0)
+        of_all = self._ray.cluster_resources().get("GPU" if on_gpu else "CPU", 1)
+        self.slots = slots or max(1, int(of_all))
         self._workers: list[_Worker | None] = [None] * self.slots
         self._given: dict[int, Task] = {}  # by slot, for want of a worker that is ready
         self._lost_starts = 0
@@ -93,15 +98,20 @@ class RayPool:
 
     def _start(self) -> _Worker:
         options = {
-            "num_cpus": 1,
+            "num_cpus": self._cpus,
+            "num_gpus": self._gpus,
             "max_restarts": 0,  # the pool sees every death, and the block is tried alone
             "max_task_retries": 0,
             "max_concurrency": 2,  # a stop comes in beside the work
             "scheduling_strategy": "SPREAD",
-            "runtime_env": {"env_vars": _ONE_THREAD},
+            "runtime_env": {"env_vars": self._environment()},
         }
-        actor = self._ray.remote(_Actor).options(**options).remote(self._setup)
+        actor = self._ray.remote(_Actor).options(**options).remote(self._setup, self._cpus)
         return _Worker(actor, actor.version.remote())
+
+    def _environment(self) -> dict[str, str]:
+        limits: dict[str, str] = dict.fromkeys(_THREADS, str(self._cpus))
+        return limits if self._gpus else {**limits, "CUDA_VISIBLE_DEVICES": ""}
 
     def _hand_out(self) -> None:
         """Send tasks to workers that are ready; a slot whose own is not swaps with an idle one."""
@@ -224,11 +234,11 @@ class _Actor:
     Tasks are done in a thread of its own, which can be interrupted: Ray's main thread cannot.
     """
 
-    def __init__(self, setup: WorkSetup) -> None:
+    def __init__(self, setup: WorkSetup, threads: int) -> None:
         import cv2
         import torch
 
-        torch.set_num_threads(1)
+        torch.set_num_threads(threads)
         cv2.setNumThreads(1)
         self._inbox: SimpleQueue[Task] = SimpleQueue()
         self._outbox: SimpleQueue[Outcome | Result | None] = SimpleQueue()
@@ -260,6 +270,17 @@ class _Actor:
             pass
         finally:
             self._outbox.put(None)
+
+
+def _cpus_of_a_gpu(ray: Any) -> int:
+    """How many CPUs come to a GPU on the machine that has the fewest."""
+    machines = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+    shares = [int(m.get("CPU", 0) / m["GPU"]) for m in machines if m.get("GPU", 0)]
+    if not shares:
+        raise ClimateGSError(
+            "backend 'cuda' on Ray: no machine of the cluster has a GPU that Ray knows of"
+        )
+    return max(1, min(shares))
 
 
 def _ending(error: Exception) -> str:

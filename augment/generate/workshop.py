@@ -8,6 +8,7 @@ from __future__ import annotations
 import gc
 import logging
 import time
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,6 +20,7 @@ from augment.batch.lock import file_lock
 from augment.batch.parts import list_parts
 from augment.batch.runner import Outcome, Renderer, describe
 from augment.batch.store import Store, open_store
+from augment.batch.times import WorkTimes
 from augment.errors import ClimateGSError, OutputError, SceneError, StyleError
 from augment.generate.leftovers import clear_block, clear_files_of
 from augment.generate.publish import Publisher, staging_folder
@@ -84,7 +86,8 @@ Task = IndexTask | SettleTask | BlockTask
 class BlockDone:
     """What became of a block. skipped: images that were finished before, here or elsewhere.
 
-    is_elsewhere: another process is at it; nothing was done. seconds: by kind of work.
+    is_elsewhere: another process is at it; nothing was done. seconds: by kind of work, as of
+    `batch.times`.
     """
 
     written: int = 0
@@ -203,11 +206,14 @@ class Workshop:
             return self._render_claimed(task)
 
     def _render_claimed(self, task: BlockTask) -> BlockDone:
-        block = task.block
+        block, times = task.block, WorkTimes()
         if task.is_trial:  # its processes share a scene of their own: not two at a time
             self._forget()
         else:
-            self._lay_bed(block, self._scene_of(block.uri, task.name))
+            with times.spent("open"):
+                scene = self._scene_of(block.uri, task.name)
+            with times.spent("place"):
+                self._lay_bed(block, scene)
         self._enter(block)
         folder = staging_folder(self._store, self._setup.scratch, block)
         if folder.is_dir():
@@ -235,11 +241,14 @@ class Workshop:
                 progress=False,
                 tell=tell,
             )
-            publisher.finish()
+            with times.spent("publish"):
+                publisher.finish()
             if not result.failed:
                 clear_block(self._store, self._setup.scratch, block)
+        seconds = Counter(result.timings)
+        seconds.update(times.so_far())
         return BlockDone(
-            result.written, result.skipped, result.failed, result.failures, seconds=result.timings
+            result.written, result.skipped, result.failed, result.failures, seconds=dict(seconds)
         )
 
     def _enter(self, block: Block) -> None:
@@ -261,7 +270,7 @@ class Workshop:
         if snow_to_lay(block.recipe) is not None:
             folder = self._beds_dir()
             with file_lock(folder / f"beds-{folder_name(block.scene)}.lock"):
-                store_beds(scene, [block.recipe], folder)
+                store_beds(scene, [block.recipe], folder, backend=self._setup.backend)
 
 
 class _SceneFailed(ClimateGSError):
