@@ -24,6 +24,55 @@ def raster(repeats: int = 7, quick: bool = False, json_file: JsonFile = None) ->
     return _say(bench_raster(repeats=repeats, quick=quick), bench_text, json_file)
 
 
+def gpu(
+    repeats: int = 30,
+    quick: bool = False,
+    placement: Annotated[tuple[str, ...], UseAppendAction] = (),
+    sections: tuple[str, ...] = (),
+    cpu: bool = True,
+    minutes: float = 9.0,
+    table: Path | None = None,
+    json_file: JsonFile = None,
+) -> int:
+    """Every figure of the GPU backend, beside what it is to reach and the least it can take.
+
+    Times, stages, achieved bandwidth, memory, determinism, and the pictures' distance from the CPU
+    backend's and, where it is installed, gsplat's.
+
+    Args:
+        repeats: Timed runs of each.
+        quick: A small scene.
+        placement: A scene to find a place for snow in, besides the street; may be given several
+            times.
+        sections: Some of raster, style, frames and placement; by default all.
+        cpu: Whether pictures are compared with the CPU backend's.
+        minutes: After these a section that still runs is stopped, and no other begins.
+        table: Also write the tables, as Markdown: into a document's marked place, or a file of
+            their own.
+        json_file: Also write the figures to this file, after every section.
+    """
+    import dataclasses
+
+    from tools.bench_gpu import QUICK, SECTIONS, WHOLE, bench_gpu
+    from tools.bench_gpu_text import gpu_text, write_table
+    from tools.gpu_clock import Timing, check_gpu
+
+    check_gpu()
+    case = dataclasses.replace(
+        QUICK if quick else WHOLE, placement=placement, cpu=cpu, minutes=minutes
+    )
+    result = bench_gpu(
+        case,
+        sections=sections or tuple(SECTIONS),
+        timing=Timing(repeats=repeats),
+        json_file=json_file,
+    )
+    if table is not None:
+        write_table(table, result)
+    _say(result, gpu_text, json_file, () if table is None else (table,))
+    return int(any("failed" in found for found in result.values() if isinstance(found, dict)))
+
+
 def smog(quick: bool = False, json_file: JsonFile = None) -> int:
     """The error of both smog models against exact per-pixel smog on the procedural street.
 

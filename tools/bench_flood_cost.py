@@ -77,7 +77,7 @@ def cost_cases(camera: Camera) -> list[CostCase]:
     return cases
 
 
-def bench_camera(scene: Scene, width: int, height: int) -> Camera:
+def bench_camera(scene: Scene, width: int, height: int, backend: str = "auto") -> Camera:
     """The front camera of the middle frame, zoomed where less or more than a third is water."""
     cameras = scene.frames[len(scene.frames) // 2].cameras
     name = min((n for n in cameras if "front" in n), key=len, default=next(iter(cameras)))
@@ -97,15 +97,15 @@ def bench_camera(scene: Scene, width: int, height: int) -> Camera:
     recipe = flood_recipe("sky")
     choice = []
     for camera in map(zoomed, ZOOMS):
-        off = abs(water_share(scene, camera.scaled(LOOK), recipe) - WANTED_SHARE)
+        off = abs(water_share(scene, camera.scaled(LOOK), recipe, backend) - WANTED_SHARE)
         if off <= NEAR_SHARE:
             return camera
         choice.append((off, camera))
     return min(choice, key=lambda entry: entry[0])[1]
 
 
-def water_share(scene: Scene, camera: Camera, recipe: Recipe) -> float:
-    return float(draw(scene, camera, recipe).water.mean())
+def water_share(scene: Scene, camera: Camera, recipe: Recipe, backend: str = "auto") -> float:
+    return float(draw(scene, camera, recipe, backend).water.mean())
 
 
 def bench_cost(

@@ -64,12 +64,12 @@ def flood_recipe(
     return Recipe(weather=Weather(flood=flood), output=output or PICTURE_ONLY)
 
 
-def draw(scene: Scene, camera: Camera, recipe: Recipe) -> Picture:
-    buffers = render_buffers(scene, camera, make_plan(recipe, scene))
+def draw(scene: Scene, camera: Camera, recipe: Recipe, backend: str = "auto") -> Picture:
+    buffers = render_buffers(scene, camera, make_plan(recipe, scene), backend=backend)
     water = buffers.water
     if water is None:
         water = torch.zeros(camera.height, camera.width, dtype=torch.bool)
-    return Picture(buffers.rgb.clamp(0, 1).numpy(), water.numpy())
+    return Picture(buffers.rgb.clamp(0, 1).cpu().numpy(), water.cpu().numpy())
 
 
 def inside(water: np.ndarray, margin_px: int = EDGE_PX) -> np.ndarray:

@@ -45,7 +45,7 @@ def bench_apply(case: RasterCase, repeats: int) -> dict[str, Any]:
     )
     moved = 2 * gaussians.sh.numel() * gaussians.sh.element_size()
     found: dict[str, Any] = {"gaussians": len(gaussians), "bytes": moved}
-    maps = {"one map": _some_maps(1), "a map a class": _some_maps(CLASSES)}
+    maps = {"one map": some_maps(1), "a map a class": some_maps(CLASSES)}
     cases = [(name, where) for name in maps for where in ("in place", "new memory")]
     seconds: dict[tuple[str, str], list[float]] = {case: [] for case in cases}
     for repeat in range(repeats + 1):
@@ -62,7 +62,7 @@ def bench_apply(case: RasterCase, repeats: int) -> dict[str, Any]:
     return found
 
 
-def _some_maps(count: int) -> StyleMaps:
+def some_maps(count: int) -> StyleMaps:
     """Gains about 0.9, so that colours stay finite however often they are mapped."""
     maps = 0.9 * torch.eye(3, 4).repeat(count, 1, 1)
     maps[:, :, 3] = 0.05

@@ -38,6 +38,7 @@ COMMANDS = {
 GROUPS = {
     "bench": {
         "raster": bench_commands.raster,
+        "gpu": bench_commands.gpu,
         "smog": bench_commands.smog,
         "flood": bench_commands.flood,
         "snow": bench_commands.snow,

@@ -12,8 +12,8 @@ from tyro.conf import arg
 JsonFile = Annotated[Path | None, arg(name="json", metavar="FILE")]
 
 
-def write_json(path: Path | None, facts: dict[str, Any]) -> None:
-    """Write facts to a file, if one is named, and say so.
+def write_json(path: Path | None, facts: dict[str, Any], *, say: bool = True) -> None:
+    """Write facts to a file, if one is named, and by default say so.
 
     Raises:
         OutputError: the file cannot be written.
@@ -26,4 +26,5 @@ def write_json(path: Path | None, facts: dict[str, Any]) -> None:
         path.write_text(json.dumps(facts, indent=2) + "\n")
     except OSError as error:
         raise OutputError(f"cannot write {path}: {error.strerror}") from error
-    print(f"wrote {path}", file=sys.stderr)
+    if say:
+        print(f"wrote {path}", file=sys.stderr)

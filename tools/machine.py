@@ -52,7 +52,7 @@ def machine_facts() -> MachineFacts:
         load=load_average(),
         platform=platform.platform(),
         python=platform.python_version(),
-        versions={name: version for name in PACKAGES if (version := _version(name))},
+        versions={name: version for name in PACKAGES if (version := version_of(name))},
     )
 
 
@@ -90,7 +90,8 @@ def _field(path: str, name: str) -> str | None:
     return None
 
 
-def _version(package: str) -> str | None:
+def version_of(package: str) -> str | None:
+    """Of an installed package; None where it is not."""
     try:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:

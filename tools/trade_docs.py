@@ -19,10 +19,11 @@ from recipes.knobs import KNOBS, Knob, Value
 from recipes.quality import TIERS
 from tools.bench_trade import table_of
 from tools.machine import machine_line
+from tools.tables import markdown
 from tools.trade_cases import DEFAULTS, DEPTH, JPEG, REFERENCE, WHOLE
 from tools.trade_measure import Row
 from tools.trade_plots import draw_chart
-from tools.trade_text import markdown, number, percent, trade_markdown, value_text, views_line
+from tools.trade_text import number, percent, trade_markdown, value_text, views_line
 from tools.trade_tiers import BOUNDS
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from tools.machine import machine_line
+from tools.tables import aligned, markdown
 from tools.trade_cases import JPEG, WHOLE, knob_order
 from tools.trade_measure import Row
 
@@ -22,9 +23,9 @@ def trade_text(figures: Mapping[str, Any]) -> str:
     for entry in figures["recipes"]:
         knobs, files = _parted(entry["rows"])
         lines += ["", f"{entry['recipe']}:"]
-        lines += _aligned([COLUMNS, *map(cells, knobs)])
+        lines += aligned([COLUMNS, *map(cells, knobs)])
         if files:
-            lines += ["", *_aligned([JPEG_COLUMNS, *map(jpeg_cells, files)])]
+            lines += ["", *aligned([JPEG_COLUMNS, *map(jpeg_cells, files)])]
     return "\n".join(lines)
 
 
@@ -94,12 +95,6 @@ def percent(share: float | None) -> str:
     return "-" if share is None else f"{100 * share:.2f} %"
 
 
-def markdown(header: Sequence[str], rows: Any) -> list[str]:
-    """Lines of a table; all columns but the first two to the right."""
-    marks = ["---" if n < 2 else "---:" for n in range(len(header))]
-    return [f"| {' | '.join(line)} |" for line in (header, marks, *rows)]
-
-
 def _parted(rows: Sequence[Row]) -> tuple[list[Row], list[Row]]:
     """Rows of rendering, wholes first, then in the order of the table of knobs; rows of files."""
     order = knob_order()
@@ -110,14 +105,3 @@ def _parted(rows: Sequence[Row]) -> tuple[list[Row], list[Row]]:
 
 def _psnr(row: Row) -> str:
     return "same" if row["psnr"] is None else f"{row['psnr']:.1f}"
-
-
-def _aligned(rows: Sequence[Sequence[str]]) -> list[str]:
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return [
-        "  ".join(
-            cell.ljust(width) if n < 2 else cell.rjust(width)
-            for n, (cell, width) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
-        for row in rows
-    ]
