@@ -6,7 +6,7 @@ import triton
 import triton.language as tl
 
 from augment.render import clip, layout
-from augment.render.cuda_geometry_kernels import along_axes, cross, dot, three
+from augment.render.cuda_geometry_kernels import along_axes, cross, dot, eight, three
 
 FAR = tl.constexpr(clip.FAR_PX)
 SHARP = tl.constexpr(clip.SHARP_PX2)
@@ -24,7 +24,7 @@ V_CLIP_LONGEST = tl.constexpr(layout.V_CLIP_LONGEST)
 
 @triton.jit
 def cut_of(d, right, down, columns, sizes, inverse, view):
-    """Which splats have a part on the kept side, and the six numbers of their cuts."""
+    """Which splats have a part on the kept side, and their cuts, [B, CUT] as in cpu_clip."""
     up = three(view + V_CLIP_PART)
     extent = tl.load(view + V_EXTENT)
     rise = along_axes(up, columns, sizes)
@@ -44,7 +44,9 @@ def cut_of(d, right, down, columns, sizes, inverse, view):
     deep = tl.sqrt(dot(away, away)) * inverse
     deep = tl.minimum(extent * deep, tl.load(view + V_CLIP_LONGEST))
     partly = (height + reach >= 0.0) & (height - reach <= tl.load(view + V_CLIP_REACH))
-    return partly, offset, lx, ly, gx * inverse, gy * inverse, deep
+    zero = tl.zeros_like(deep)
+    cut = eight(offset, lx, ly, gx * inverse, gy * inverse, deep, zero, zero)
+    return partly, cut
 
 
 @triton.jit

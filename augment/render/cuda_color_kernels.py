@@ -8,7 +8,7 @@ import triton
 import triton.language as tl
 
 from augment.render import layout
-from augment.render.cuda_geometry_kernels import dot, floats_at, three
+from augment.render.cuda_geometry_kernels import dot, four_where, three
 from augment.weather import smog
 
 LOG2_E = tl.constexpr(math.log2(math.e))
@@ -62,64 +62,95 @@ def _layered_density(d, view):
 
 
 @triton.jit
-def _add(color, sh, k, value, mask):
-    """Colour plus the coefficients of SH function k times its value; sh: of every splat."""
-    at = sh + 3 * k
-    return (
-        tl.fma(value, tl.load(at, mask, 0.0), color[0]),
-        tl.fma(value, tl.load(at + 1, mask, 0.0), color[1]),
-        tl.fma(value, tl.load(at + 2, mask, 0.0), color[2]),
-    )
-
-
-@triton.jit
 def color_of(sh, functions, towards, distance, mask, FUNCTIONS: tl.constexpr):
-    """max(0.5 + sum sh Y, 0). sh: pointers to every splat's coefficients, of which `functions` are
-    read, FUNCTIONS at most. towards: from the eye, in the part's axes, of length `distance`.
+    """max(0.5 + sum sh Y, 0). sh: pointers to every splat's coefficients, of `functions` functions;
+    FUNCTIONS: how many are read at most. towards: from the eye, in the part's axes, of length
+    `distance`.
     """
     inverse = 1.0 / distance
     x, y, z = towards[0] * inverse, towards[1] * inverse, towards[2] * inverse
-    read = tl.where(mask, functions, 0)
+    basis = _basis(x, y, z, FUNCTIONS)
     half = tl.full(x.shape, 0.5, tl.float32)
     color = (half, half, half)
-    color = _add(color, sh, 0, C0, mask)
-    if FUNCTIONS > 1:
-        more = read > 1
-        color = _add(color, sh, 1, y * -C1, more)
-        color = _add(color, sh, 2, z * C1, more)
-        color = _add(color, sh, 3, x * -C1, more)
-    if FUNCTIONS > 4:
-        more = read > 4
-        xx, yy, zz, xy = x * x, y * y, z * z, x * y
-        color = _add(color, sh, 4, xy * C2_XY, more)
-        color = _add(color, sh, 5, y * z * -C2_XY, more)
-        color = _add(color, sh, 6, (2.0 * zz - xx - yy) * C2_ZZ, more)
-        color = _add(color, sh, 7, x * z * -C2_XY, more)
-        color = _add(color, sh, 8, (xx - yy) * C2_XX, more)
-        if FUNCTIONS > 9:
-            more = read > 9
-            color = _add(color, sh, 9, y * (3.0 * xx - yy) * -C3_CUBIC, more)
-            color = _add(color, sh, 10, xy * z * C3_XYZ, more)
-            color = _add(color, sh, 11, y * (4.0 * zz - xx - yy) * -C3_ZZ, more)
-            color = _add(color, sh, 12, z * (2.0 * zz - 3.0 * (xx + yy)) * C3_ZZZ, more)
-            color = _add(color, sh, 13, x * (4.0 * zz - xx - yy) * -C3_ZZ, more)
-            color = _add(color, sh, 14, z * (xx - yy) * C3_ZXX, more)
-            color = _add(color, sh, 15, x * (xx - 3.0 * yy) * -C3_CUBIC, more)
+    read = tl.where(mask, functions, 0)
+    if functions % 4 == 0:
+        color = _sum_fours(color, sh, basis, read, FUNCTIONS)
+    else:
+        color = _sum_ones(color, sh, basis, read, FUNCTIONS)
     return tl.maximum(color[0], 0.0), tl.maximum(color[1], 0.0), tl.maximum(color[2], 0.0)
 
 
 @triton.jit
-def mapped(color, maps_address, rows_address, map_count, row, mask):
-    """Colours under their maps; maps [C, 3, 4] and int16 rows lie at the addresses.
+def _basis(x, y, z, FUNCTIONS: tl.constexpr):
+    """Spherical harmonics of unit directions, as render.sh lists them; 0 for those not read."""
+    zero = tl.zeros_like(x)
+    y0 = zero + C0
+    y1, y2, y3, y4, y5, y6, y7, y8 = zero, zero, zero, zero, zero, zero, zero, zero
+    y9, y10, y11, y12, y13, y14, y15 = zero, zero, zero, zero, zero, zero, zero
+    if FUNCTIONS > 1:
+        y1, y2, y3 = y * -C1, z * C1, x * -C1
+    if FUNCTIONS > 4:
+        xx, yy, zz, xy = x * x, y * y, z * z, x * y
+        y4, y5, y7 = xy * C2_XY, y * z * -C2_XY, x * z * -C2_XY
+        y6, y8 = (2.0 * zz - xx - yy) * C2_ZZ, (xx - yy) * C2_XX
+        if FUNCTIONS > 9:
+            y9, y15 = y * (3.0 * xx - yy) * -C3_CUBIC, x * (xx - 3.0 * yy) * -C3_CUBIC
+            y10, y14 = xy * z * C3_XYZ, z * (xx - yy) * C3_ZXX
+            y11, y13 = y * (4.0 * zz - xx - yy) * -C3_ZZ, x * (4.0 * zz - xx - yy) * -C3_ZZ
+            y12 = z * (2.0 * zz - 3.0 * (xx + yy)) * C3_ZZZ
+    return y0, y1, y2, y3, y4, y5, y6, y7, y8, y9, y10, y11, y12, y13, y14, y15
 
-    row: of the Gaussians in their part. Rows that are none mean the first map.
+
+@triton.jit
+def _sum_ones(color, sh, basis, read, FUNCTIONS: tl.constexpr):
+    """Colour plus coefficients times basis; read: of how many functions. Any number in a row."""
+    for k in tl.static_range(FUNCTIONS):
+        at, mask = sh + 3 * k, read > k
+        red, green, blue = (
+            tl.load(at, mask, 0.0),
+            tl.load(at + 1, mask, 0.0),
+            tl.load(at + 2, mask, 0.0),
+        )
+        color = _add(color, basis[k], red, green, blue)
+    return color
+
+
+@triton.jit
+def _sum_fours(color, sh, basis, read, FUNCTIONS: tl.constexpr):
+    """As _sum_ones, by 16 bytes: four functions of a splat fill three such pieces, and rows of 4
+    and of 16 functions begin at a multiple of 16 bytes.
     """
-    own = tl.zeros(row.shape, tl.int32)
+    for k in tl.static_range(0, FUNCTIONS, 4):
+        red, green, blue, red1 = four_where(sh + 3 * k, read > k)
+        color = _add(color, basis[k], red, green, blue)
+        if k + 1 < FUNCTIONS:
+            green1, blue1, red2, green2 = four_where(sh + 3 * k + 4, read > k)
+            blue2, red3, green3, blue3 = four_where(sh + 3 * k + 8, read > k)
+            color = _add(color, basis[k + 1], red1, green1, blue1)
+            color = _add(color, basis[k + 2], red2, green2, blue2)
+            color = _add(color, basis[k + 3], red3, green3, blue3)
+    return color
+
+
+@triton.jit
+def _add(color, value, red, green, blue):
+    return (
+        tl.fma(value, red, color[0]),
+        tl.fma(value, green, color[1]),
+        tl.fma(value, blue, color[2]),
+    )
+
+
+@triton.jit
+def mapped(color, maps, rows, map_count, mask):
+    """Colours under their maps. maps: of the part, [C, 3, 4]; rows: pointers to every Gaussian's,
+    int16, read where there is more than one map. Rows that are none mean the first.
+    """
+    own = tl.zeros(mask.shape, tl.int32)
     if map_count > 1:
-        rows = rows_address.to(tl.pointer_type(tl.int16))
-        own = tl.load(rows + row, mask, 0).to(tl.int32)
+        own = tl.load(rows, mask, 0).to(tl.int32)
         own = tl.where((own >= 0) & (own < map_count), own, 0)
-    at = floats_at(maps_address) + own * MAP
+    at = maps + own * MAP
     return (
         _map_channel(at, color, mask),
         _map_channel(at + 4, color, mask),
@@ -129,9 +160,10 @@ def mapped(color, maps_address, rows_address, map_count, row, mask):
 
 @triton.jit
 def _map_channel(at, color, mask):
-    value = tl.fma(tl.load(at, mask, 0.0), color[0], tl.load(at + 3, mask, 0.0))
-    value = tl.fma(tl.load(at + 1, mask, 0.0), color[1], value)
-    return tl.maximum(tl.fma(tl.load(at + 2, mask, 0.0), color[2], value), 0.0)
+    """One row of the maps applied to the colours; not below 0."""
+    red, green, blue, more = four_where(at, mask)
+    value = tl.fma(green, color[1], tl.fma(red, color[0], more))
+    return tl.maximum(tl.fma(blue, color[2], value), 0.0)
 
 
 @triton.jit

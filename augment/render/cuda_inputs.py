@@ -64,7 +64,7 @@ def gather_inputs(
     table = np.zeros((len(parts), COLUMNS), np.int64)
     for row, part in zip(table, parts, strict=True):
         for column, tensor in _read_of(part).items():
-            own = resident(tensor)
+            own = _aligned(resident(tensor))
             tensors.append(own)
             row[column] = address_of(own)
         row[T_COUNT], row[T_FUNCTIONS] = part.gaussians.sh.shape[:2]
@@ -86,6 +86,11 @@ def gather_inputs(
         modes=modes,
         tensors=tensors,
     )
+
+
+def _aligned(tensor: Tensor) -> Tensor:
+    """The tensor, or a copy of it where it begins at no multiple of 16 bytes, as within another."""
+    return tensor if address_of(tensor) % 16 == 0 else tensor.clone()
 
 
 def _read_of(part: PosedGaussians) -> dict[int, Tensor]:

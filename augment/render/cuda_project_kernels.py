@@ -13,7 +13,9 @@ from augment.render.cuda_color_kernels import color_of, in_smog, mapped, through
 from augment.render.cuda_geometry_kernels import (
     cross,
     dot,
+    eight,
     floats_at,
+    four_where,
     from_eye,
     image_axes,
     inverse_divisor,
@@ -22,7 +24,7 @@ from augment.render.cuda_geometry_kernels import (
     three_where,
     to_image,
 )
-from augment.render.cuda_light_kernels import light_lines
+from augment.render.cuda_light_kernels import store_lights
 
 CUT, LINES = 8, shading.LINES
 COLUMNS = tl.constexpr(cuda_inputs.COLUMNS)
@@ -67,46 +69,32 @@ def project_gaussians(
 ):
     """Splats of the Gaussians of every part; each program takes BLOCK of one part.
 
-    table, views, block_parts: see cuda_inputs. The rest: of cuda_splats, and written. In capitals:
-    the modes (see layout).
+    table, views, block_parts: see cuda_inputs. The rest: of cuda_splats, and written; cuts and
+    lights where CLIP and LIGHT ask for them. In capitals: the modes (see layout).
     """
     program = tl.program_id(0)
     part = tl.load(block_parts + program)
-    table_row, view = table + part * COLUMNS, views + part * VIEW
+    row, view = table + part * COLUMNS, views + part * VIEW
+    # Places in memory are int64 as far as all lanes share them, and int32 beyond.
+    first = (program - tl.load(row + T_BLOCK)) * BLOCK
+    out = tl.load(row + T_FIRST) + first
     lane = tl.arange(0, BLOCK)
-    # In int64 as far as all lanes share it: places in memory may exceed 2^31.
-    first = (program - tl.load(table_row + T_BLOCK)) * BLOCK
-    inside = lane < tl.load(table_row + T_COUNT) - first
-    out = tl.load(table_row + T_FIRST) + first
+    inside = lane < (tl.load(row + T_COUNT) - first).to(tl.int32)
 
-    means = floats_at(tl.load(table_row + A_MEANS)) + first * 3 + lane * 3
-    quats = floats_at(tl.load(table_row + A_QUATS)) + first * 4 + lane * 4
-    scales = floats_at(tl.load(table_row + A_SCALES)) + first * 3 + lane * 3
-    opacities = floats_at(tl.load(table_row + A_OPACITIES)) + first + lane
+    means = floats_at(tl.load(row + A_MEANS)) + first * 3 + lane * 3
     d = from_eye(three_where(means, inside), view)
-    opacity = tl.load(opacities, inside, 0.0)
+    opacity = tl.load(floats_at(tl.load(row + A_OPACITIES)) + first + lane, inside, 0.0)
     r, s, t = rotation_rows(view)
     x, y, z = dot(r, d), dot(s, d), dot(t, d)
     seen = (z >= tl.load(view + V_NEAR)) & (opacity >= tl.load(view + V_ALPHA_MIN))
-
     inverse = inverse_divisor(z, view)
-    columns = rotation_columns(
-        tl.load(quats, seen, 0.0),
-        tl.load(quats + 1, seen, 0.0),
-        tl.load(quats + 2, seen, 0.0),
-        tl.load(quats + 3, seen, 0.0),
-    )
-    sizes = three_where(scales, seen)
-    right, down = image_axes(x, y, inverse, columns, sizes, view)
-    xx, xy, yy = dot(right, right), dot(right, down), dot(down, down)
-    blur = tl.load(view + V_BLUR)
-    blurred_x, blurred_y = xx + blur, yy + blur
+    quats = floats_at(tl.load(row + A_QUATS)) + first * 4 + lane * 4
+    columns = rotation_columns(four_where(quats, seen))
+    scales = three_where(floats_at(tl.load(row + A_SCALES)) + first * 3 + lane * 3, seen)
+    right, down = image_axes(x, y, inverse, columns, scales, view)
+
+    xy, blurred_x, blurred_y, minors, along = _covariance(right, down, tl.load(view + V_BLUR))
     inverse_x, inverse_y = 1.0 / blurred_x, 1.0 / blurred_y
-    # Variance along a row, det / yy, by Lagrange's identity, det = |right cross down|^2: no digits
-    # cancel, and each term is divided before it is squared, so that nothing overflows.
-    across = cross(right, down, tl.sqrt(inverse_y))
-    minors = dot(across, across)
-    along = blur + tl.fma(blur * xx, inverse_y, minors)
     log_opacity = tl.log2(opacity)
     if ANTIALIASED:
         log_opacity = tl.fma(0.5, tl.log2(minors / along), log_opacity)
@@ -116,76 +104,71 @@ def project_gaussians(
     drawn = seen & (log_opacity >= log_cut) & (blurred_x + blurred_y <= HUGE)
     drawn = drawn & (tl.maximum(radius_x, radius_y) > tl.load(view + V_RADIUS_CLIP))
     if CLIP:
-        partly, offset, lx, ly, gx, gy, deep = cut_of(d, right, down, columns, sizes, inverse, view)
+        partly, cut = cut_of(d, right, down, columns, scales, inverse, view)
         drawn = drawn & partly
-
     mean_x, mean_y = to_image(x, y, inverse, view)
-    x_lo, x_hi = _pixels(mean_x, radius_x, tl.load(view + V_SIZE))
-    y_lo, y_hi = _pixels(mean_y, radius_y, tl.load(view + V_SIZE + 1))
-    drawn = drawn & (x_lo <= x_hi) & (y_lo <= y_hi)
-    column, last_column = _tile(x_lo, drawn), _tile(x_hi, drawn)
-    row, last_row = _tile(y_lo, drawn), _tile(y_hi, drawn)
-    touched = (last_column - column + 1) * (last_row - row + 1)
+    first_x, last_x = _pixels(mean_x, radius_x, tl.load(view + V_SIZE))
+    first_y, last_y = _pixels(mean_y, radius_y, tl.load(view + V_SIZE + 1))
+    drawn = drawn & (first_x <= last_x) & (first_y <= last_y)
+
+    c0, c1 = _tile(first_x, drawn), _tile(last_x, drawn)
+    r0, r1 = _tile(first_y, drawn), _tile(last_y, drawn)
     tl.store(keys + out + lane, tl.where(drawn, z.to(tl.int32, bitcast=True), HIDDEN), inside)
-    tl.store(counts + out + lane, tl.where(drawn, touched, 0), inside)
-    tl.store(rects + out * 2 + lane * 2, column + (row << 16), drawn)
-    tl.store(rects + out * 2 + lane * 2 + 1, last_column + (last_row << 16), drawn)
+    tl.store(counts + out + lane, tl.where(drawn, (c1 - c0 + 1) * (r1 - r0 + 1), 0), inside)
+    _store_rows(rects + out * 2, tl.join(c0 + (r0 << 16), c1 + (r1 << 16)), drawn, BLOCK, 2)
 
     zero = tl.zeros_like(z)
-    color = (zero, zero, zero)
+    color, through = (zero, zero, zero), zero + 1.0
     if COLOR:
         towards = d
         if tl.load(view + V_PARALLEL) > 0.0:
             towards = (t[0] + zero, t[1] + zero, t[2] + zero)
         distance = tl.sqrt(dot(towards, towards))
-        step = tl.load(table_row + T_FUNCTIONS).to(tl.int32)
-        sh = floats_at(tl.load(table_row + A_SH)) + first * 3 * step + lane * 3 * step
-        color = color_of(sh, step, towards, distance, drawn, FUNCTIONS)
+        functions = tl.load(row + T_FUNCTIONS).to(tl.int32)
+        sh = floats_at(tl.load(row + A_SH)) + first * 3 * functions + lane * 3 * functions
+        color = color_of(sh, functions, towards, distance, drawn, FUNCTIONS)
         map_count = tl.load(view + V_MAPS).to(tl.int32)
         if map_count > 0:
-            maps, rows = tl.load(table_row + A_MAPS), tl.load(table_row + A_ROWS)
-            color = mapped(color, maps, rows, map_count, first + lane, drawn)
+            maps = floats_at(tl.load(row + A_MAPS))
+            map_rows = tl.load(row + A_ROWS).to(tl.pointer_type(tl.int16)) + first + lane
+            color = mapped(color, maps, map_rows, map_count, drawn)
         if SMOG != NO_SMOG:
             through = through_smog(towards, distance, view, SMOG)
             color = in_smog(color, through, view)
 
-    if CLIP:
-        cut = _eight(offset, lx, ly, gx, gy, deep, zero, zero)
-        at = (out + lane)[:, None] * N_CUT + tl.arange(0, N_CUT)[None, :]
-        tl.store(cuts + at, cut, drawn[:, None])
-    if LIGHT:
-        is_lit = tl.where(drawn, tl.load(view + V_LIT), 0.0) > 0.0
-        parallel = tl.load(view + V_PARALLEL) > 0.0
-        ray = (tl.where(parallel, 0.0, x), tl.where(parallel, 0.0, y), tl.where(parallel, 1.0, z))
-        lines = light_lines(columns[2], ray, view)
-        slopes = floats_at(tl.load(table_row + A_SLOPES)) + first * 3 + lane * 3
-        red, green, blue = three_where(slopes, is_lit)
-        if SMOG != NO_SMOG:
-            red, green, blue = through * red, through * green, through * blue
-        line = lights + out * N_LINES + lane * N_LINES
-        tl.store(line, tl.where(is_lit, lines[0], 0.0), drawn)
-        tl.store(line + 1, tl.where(is_lit, lines[1], 0.0), drawn)
-        tl.store(line + 2, tl.where(is_lit, lines[2], 0.0), drawn)
-        tl.store(line + 3, tl.where(is_lit, lines[3], 0.0), drawn)
-        tl.store(line + 4, tl.where(is_lit, lines[4], 0.0), drawn)
-        tl.store(line + 5, tl.where(is_lit, lines[5], 0.0), drawn)
-        tl.store(line + 6, red, drawn)
-        tl.store(line + 7, green, drawn)
-        tl.store(line + 8, blue, drawn)
-
-    number = (out + lane).to(tl.int32).to(tl.float32, bitcast=True)
-    sharp_x, blunt_y = tl.sqrt(1.0 / along * K), tl.sqrt(along * blurred_y * inverse_x / K)
+    number = (out.to(tl.int32) + lane).to(tl.float32, bitcast=True)
+    snow = zero + tl.load(view + V_SNOW)
     # In layout's order of fields, those of even number and those of odd number.
-    even = _eight(
+    even = eight(
         mean_x, xy * inverse_y, inverse_y * K, radius_y, xy * inverse_x, z, color[0], color[2]
     )
-    odd = _eight(
-        mean_y, sharp_x, log_opacity, inverse_x * K, blunt_y, number, color[1],
-        zero + tl.load(view + V_SNOW),
+    odd = eight(
+        mean_y, tl.sqrt(1.0 / along * K), log_opacity, inverse_x * K,
+        tl.sqrt(along * blurred_y * inverse_x / K), number, color[1], snow,
     )  # fmt: skip
     record = tl.reshape(tl.join(even, odd), (BLOCK, N_RECORD))
-    at = (out + lane)[:, None] * N_RECORD + tl.arange(0, N_RECORD)[None, :]
-    tl.store(records + at, record, drawn[:, None])
+    _store_rows(records + out * N_RECORD, record, drawn, BLOCK, N_RECORD)
+    if CLIP:
+        _store_rows(cuts + out * N_CUT, cut, drawn, BLOCK, N_CUT)
+    if LIGHT:
+        lit = tl.where(drawn, tl.load(view + V_LIT), 0.0) > 0.0
+        slopes = three_where(floats_at(tl.load(row + A_SLOPES)) + first * 3 + lane * 3, lit)
+        lines = lights + out * N_LINES + lane * N_LINES
+        store_lights(lines, columns[2], (x, y, z), slopes, through, lit, drawn, view)
+
+
+@triton.jit
+def _covariance(right, down, blur):
+    """xy, and blurred xx and yy, px^2; variances along a row, det / yy, before the blur and after.
+
+    By Lagrange's identity, det = |right cross down|^2, no digits cancel; each term is divided
+    before it is squared, so that nothing overflows.
+    """
+    xx, xy, yy = dot(right, right), dot(right, down), dot(down, down)
+    inverse = 1.0 / (yy + blur)
+    across = cross(right, down, tl.sqrt(inverse))
+    minors = dot(across, across)
+    return xy, xx + blur, yy + blur, minors, blur + tl.fma(blur * xx, inverse, minors)
 
 
 @triton.jit
@@ -202,8 +185,6 @@ def _tile(pixel, drawn):
 
 
 @triton.jit
-def _eight(a, b, c, d, e, f, g, h):
-    """Eight blocks side by side, [B, 8]. The last pairing alternates fastest, the first slowest."""
-    even = tl.join(tl.join(a, e), tl.join(c, g))
-    odd = tl.join(tl.join(b, f), tl.join(d, h))
-    return tl.reshape(tl.join(even, odd), (a.shape[0], 8))
+def _store_rows(pointer, rows, mask, ROWS: tl.constexpr, FIELDS: tl.constexpr):
+    at = tl.arange(0, ROWS)[:, None] * FIELDS + tl.arange(0, FIELDS)[None, :]
+    tl.store(pointer + at, rows, mask[:, None])
