@@ -63,18 +63,18 @@ def render_buffers(
 ) -> WeatheredBuffers:
     """The view of `camera` at its own resolution, as floats."""
     with lap("view plan"):
-        view = plan_view(plan, scene, camera)
+        view = plan_view(plan, scene, camera, backend=backend)
     with lap("parts"):
         look = None if plan.style is None else look_of(scene, plan.style)
         worn = None if plan.styles_picture else look
         parts = bare_parts = scene.parts_for(camera, view.actors)
-    cover = cover_for(plan, scene) if view.snow else None
+    cover = cover_for(plan, scene, backend=backend) if view.snow else None
     if cover is not None:
         with lap("snow: placement and layer"):
             parts = cover.parts_for(scene, camera, parts, view.snowy)
     sky = scene.sky
     if worn is not None:
-        parts, sky = worn.on(parts), worn.sky
+        parts, sky = worn.on(parts, backend=backend), worn.sky
     flooded = None
     if plan.flood is not None and view.water:
         painter = Painter(
@@ -174,7 +174,7 @@ def _without_water(
     rgb = raster.rgb
     if plan.smog_on_buffers is not None:
         with lap("smog on buffers"):
-            rgb = fog_raster(raster, camera, plan.smog_on_buffers)
+            rgb = fog_raster(raster, camera, plan.smog_on_buffers, backend=backend)
     uniform = plan.smog is not None and plan.smog.scale_height_m is None  # hides the sky
     with lap("airlight behind the splats" if uniform else "sky"):
         rgb = composite_sky(rgb, raster.alpha, camera, sky, smog=plan.smog, backend=backend)

@@ -117,34 +117,42 @@ class Camera:
             self, width=width, height=height, cx=self.cx - left, cy=self.cy - top
         )
 
-    def ray_directions(self, dtype: torch.dtype = torch.float32) -> Float[Tensor, "H W 3"]:
+    def ray_directions(
+        self, dtype: torch.dtype = torch.float32, device: torch.device | None = None
+    ) -> Float[Tensor, "H W 3"]:
         """World directions through the pixel centres with unit z in the camera (not unit length).
 
         A point at depth z along pixel p is `centre + z * ray_directions()[p]`; its ray distance is
-        `z * norm(ray_directions()[p])`.
+        `z * norm(ray_directions()[p])`. device: where they are wanted; the CPU if None.
 
         Raises:
             ValueError: the camera is orthographic.
         """
         self._check_pinhole("rays of its own at every pixel")
-        u = (torch.arange(self.width, dtype=torch.float64) + 0.5 - self.cx) / self.fx
-        v = (torch.arange(self.height, dtype=torch.float64) + 0.5 - self.cy) / self.fy
-        rotation = self.world_from_camera[:3, :3]
+        u, v = self._slopes(device)
+        rotation = self.world_from_camera[:3, :3].to(u.device)
         rays = (
             u[None, :, None] * rotation[:, 0] + v[:, None, None] * rotation[:, 1] + rotation[:, 2]
         )
         return rays.to(dtype)
 
-    def ray_lengths(self, dtype: torch.dtype = torch.float32) -> Float[Tensor, "H W"]:
+    def ray_lengths(
+        self, dtype: torch.dtype = torch.float32, device: torch.device | None = None
+    ) -> Float[Tensor, "H W"]:
         """Ray distance per unit of depth at each pixel: sqrt(1 + u^2 + v^2).
 
         Raises:
             ValueError: the camera is orthographic.
         """
         self._check_pinhole("ray lengths that differ")
-        u = (torch.arange(self.width, dtype=torch.float64) + 0.5 - self.cx) / self.fx
-        v = (torch.arange(self.height, dtype=torch.float64) + 0.5 - self.cy) / self.fy
+        u, v = self._slopes(device)
         return torch.sqrt(1 + u[None, :] ** 2 + v[:, None] ** 2).to(dtype)
+
+    def _slopes(self, device: torch.device | None) -> tuple[Float[Tensor, "W"], Float[Tensor, "H"]]:
+        """x / z of the rays of every column and y / z of every row, float64."""
+        columns = torch.arange(self.width, dtype=torch.float64, device=device)
+        rows = torch.arange(self.height, dtype=torch.float64, device=device)
+        return (columns + 0.5 - self.cx) / self.fx, (rows + 0.5 - self.cy) / self.fy
 
     def _unit(self, name: str) -> str:
         return "pixels per metre" if self.is_orthographic and name[0] == "f" else "pixels"

@@ -11,6 +11,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from augment.render.gpu import resident
+
 
 @runtime_checkable
 class Sky(Protocol):
@@ -63,6 +65,17 @@ class CubemapSky:
         column = (s * 0.5 + 0.5) * size + 0.5
         row = (t * 0.5 + 0.5) * size + 0.5
         return _bilinear(bordered_faces(self), row, column, face=face)
+
+
+def sample_at(sky: Sky, directions: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3"]:
+    """The sky's colours where the directions lie, though its own tensors lie on the CPU."""
+    if directions.device.type == "cpu":
+        return sky.sample(directions)
+    if isinstance(sky, ConstantSky):
+        return ConstantSky(sky.rgb.to(directions.device)).sample(directions)
+    if isinstance(sky, LatLongSky):
+        return LatLongSky(resident(sky.image)).sample(directions)
+    return sky.sample(directions.cpu()).to(directions.device)
 
 
 def sample_within_faces(

@@ -33,12 +33,12 @@ class ViewImages:
     """
 
     rgb: np.ndarray
-    depth_m: np.ndarray | None
-    semantic: np.ndarray | None
-    instance: np.ndarray | None
-    water: np.ndarray | None
-    snow: np.ndarray | None
-    scene_depth_m: np.ndarray | None
+    depth_m: np.ndarray | None = None
+    semantic: np.ndarray | None = None
+    instance: np.ndarray | None = None
+    water: np.ndarray | None = None
+    snow: np.ndarray | None = None
+    scene_depth_m: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +69,7 @@ def begin_images(view: WeatheredBuffers, plan: Plan, *, backend: str) -> Callabl
     returned waits for them, where there is something to wait for.
     """
     wanted = _wanted(view, plan)
-    if kernels_for(backend, wanted.rgb) == CUDA:
+    if kernels_for(backend, wanted.rgb.detach()) == CUDA:
         from augment.render.cuda_images import begin_cuda_images
 
         with lap("images"):

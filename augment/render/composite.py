@@ -12,9 +12,9 @@ from torch import Tensor
 
 from augment.cameras import Camera
 from augment.render import composite_kernels
-from augment.render.backends import CPU, REFERENCE, kernels_for
+from augment.render.backends import AUTO, CPU, CUDA, REFERENCE, kernels_for
 from augment.render.threads import kernel_threads
-from augment.sky import ConstantSky, CubemapSky, Sky, bordered_faces
+from augment.sky import ConstantSky, CubemapSky, Sky, bordered_faces, sample_at
 from augment.weather.smog import (
     SmogMedium,
     blend_airlight,
@@ -50,21 +50,30 @@ def composite_sky(
     """The finished display-encoded image, not clamped.
 
     smog: with it the sky is seen through the smog up to infinity. backend: with kernels, cube maps
-    in float32 go through them, equal to this definition within float rounding, unless gradients are
-    recorded, which they have none of.
+    (on a GPU, single colours too) in float32 go through them, equal to this definition within float
+    rounding, unless gradients are recorded, which they have none of.
     """
     sky, smog = sky_behind(sky, smog)
+    kernels = kernels_for(backend, rgb, alpha)
     if isinstance(sky, ConstantSky) and smog is None:  # no direction matters
+        if kernels == CUDA:
+            from augment.render import cuda_composite
+
+            return cuda_composite.composite_color(rgb, alpha, sky.rgb)
         return rgb + (1 - alpha)[..., None] * sky.rgb.to(rgb.dtype)
     if camera.is_orthographic:
         raise ValueError(
             f"camera {camera.name!r} is orthographic: its rays are parallel and see the sky in one "
             f"direction only; composite a ConstantSky, without layered smog"
         )
-    if isinstance(sky, CubemapSky) and kernels_for(backend, rgb, alpha) == CPU:
+    if isinstance(sky, CubemapSky) and kernels == CPU:
         return _composite_cubemap(rgb, alpha, camera, bordered_faces(sky), smog)
-    directions = camera.ray_directions(rgb.dtype)
-    color = sky.sample(directions)
+    if isinstance(sky, CubemapSky) and kernels == CUDA:
+        from augment.render import cuda_composite
+
+        return cuda_composite.composite_cubemap(rgb, alpha, camera, bordered_faces(sky), smog)
+    directions = camera.ray_directions(rgb.dtype, rgb.device)
+    color = sample_at(sky, directions)
     if smog is not None:
         slope = directions[..., 2] / directions.norm(dim=-1)
         tau = sky_optical_depth(smog, slope, float(camera.centre[2]))
@@ -106,9 +115,15 @@ def map_colors(
     within float rounding, and `rgb` is overwritten: fresh memory would take as long as the
     arithmetic.
     """
-    if kernels_for(backend, rgb, color_map) == REFERENCE or not rgb.is_contiguous():
-        color_map = color_map.to(rgb.dtype)
+    kernels = kernels_for(backend, rgb, color_map)
+    if kernels == REFERENCE or not rgb.is_contiguous():
+        color_map = color_map.to(rgb.device, rgb.dtype)
         return rgb @ color_map[:, :3].T + color_map[:, 3]
+    if kernels == CUDA:
+        from augment.render import cuda_composite
+
+        cuda_composite.map_colors(rgb, color_map)
+        return rgb
     with kernel_threads(ROWS):
         composite_kernels.map_colors(rgb.detach().numpy(), color_map.detach().contiguous().numpy())
     return rgb
@@ -116,10 +131,10 @@ def map_colors(
 
 def quantise(rgb: Float[Tensor, "H W 3"]) -> np.ndarray:
     """uint8 [H, W, 3]: clamped to [0, 1], times 255, rounded to the nearest."""
-    if rgb.dtype == torch.float32:
+    if kernels_for(AUTO, rgb.detach()) == CPU:
         out = np.empty(tuple(rgb.shape), np.uint8)
         rows = rgb.detach().contiguous().numpy()
         with kernel_threads(ROWS):
             composite_kernels.quantise(rows.reshape(len(rows), -1), out.reshape(len(rows), -1))
         return out
-    return (rgb.detach().clamp(0, 1) * 255 + 0.5).to(torch.uint8).numpy()
+    return (rgb.detach().clamp(0, 1) * 255 + 0.5).to(torch.uint8).cpu().numpy()

@@ -1,12 +1,142 @@
-"""The images of a view, made on the GPU and brought back in one copy."""
+"""The images of a view, made on the GPU by one kernel and brought back in one copy."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
 
 from augment.cameras import Camera
+from augment.render import cuda_images_kernels as kernels
+from augment.render.gpu import address_of, gpu_device, launch, resident, upload
+from augment.render.gpu_copies import Download
+from augment.scene import PosedGaussians
+from augment.semantics import SemanticClass
 from augment.view_images import ViewImages, Wanted
+from augment.views import SURFACE_ALPHA
+
+BLOCK = 512  # pixels of a program
+ALIGNMENT = 16  # bytes, of every image in the memory that is copied
+# What the kernel writes. torch computes with no uint16, so instances are written as int16.
+KINDS = {
+    "rgb": (torch.uint8, np.uint8),
+    "depth_m": (torch.float32, np.float32),
+    "scene_depth_m": (torch.float32, np.float32),
+    "water": (torch.uint8, np.uint8),
+    "snow": (torch.uint8, np.uint8),
+    "semantic": (torch.uint8, np.uint8),
+    "instance": (torch.int16, np.uint16),
+}
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Where an image lies in the memory that is copied. start: in bytes."""
+
+    start: int
+    shape: tuple[int, ...]
+    on_gpu: torch.dtype
+    on_cpu: type
+
+    @property
+    def end(self) -> int:
+        return self.start + math.prod(self.shape) * self.on_gpu.itemsize
+
+    def of(self, packed: Tensor) -> Tensor:
+        return packed[self.start : self.end].view(self.on_gpu)
+
+    def read(self, memory: np.ndarray) -> np.ndarray:
+        return memory[self.start : self.end].view(self.on_cpu).reshape(self.shape)
 
 
 def begin_cuda_images(wanted: Wanted, camera: Camera) -> Callable[[], ViewImages]:
-    raise NotImplementedError
+    """Launches the kernel and the copy. What is returned waits for them."""
+    shares_depth = wanted.scene_depth_m is wanted.depth_m and wanted.first is None
+    asked = {
+        "rgb": True,
+        "depth_m": wanted.depth_m is not None,
+        "scene_depth_m": wanted.scene_depth_m is not None and not shares_depth,
+        "water": wanted.water is not None,
+        "snow": wanted.snow is not None,
+        "semantic": wanted.semantic,
+        "instance": wanted.instance,
+    }
+    places = _places([name for name in KINDS if asked[name]], camera)
+    packed = torch.empty(
+        max(place.end for place in places.values()), dtype=torch.uint8, device=gpu_device()
+    )
+    _make({name: place.of(packed) for name, place in places.items()}, wanted, camera)
+    copy = Download(packed)
+
+    def finish() -> ViewImages:
+        memory = copy.result().numpy()
+        images = {name: place.read(memory) for name, place in places.items()}
+        if shares_depth and "depth_m" in images:
+            images["scene_depth_m"] = images["depth_m"]
+        return ViewImages(rgb=images.pop("rgb"), **images)
+
+    return finish
+
+
+def _places(names: Sequence[str], camera: Camera) -> dict[str, _Place]:
+    """One image after the other."""
+    places, end = dict[str, _Place](), 0
+    for name in names:
+        shape = (camera.height, camera.width, 3) if name == "rgb" else (camera.height, camera.width)
+        start = -(-end // ALIGNMENT) * ALIGNMENT
+        places[name] = _Place(start, shape, *KINDS[name])
+        end = places[name].end
+    return places
+
+
+def _make(images: dict[str, Tensor], wanted: Wanted, camera: Camera) -> None:
+    looked_up = wanted.semantic or wanted.instance
+    table = upload(_table_of(wanted.parts)) if looked_up else None
+    shown = wanted.shown
+    pose = camera.world_from_camera
+    eye_m = 0.0 if wanted.plane_z_m is None else float(pose[2, 3]) - wanted.plane_z_m
+    count = camera.height * camera.width
+    launch(
+        kernels.make_images,
+        (-(-count // BLOCK),),
+        wanted.rgb.detach().contiguous(),
+        _plain(wanted.depth_m),
+        _plain(wanted.scene_depth_m if "scene_depth_m" in images else None),
+        _plain(wanted.water),
+        _plain(wanted.snow),
+        _plain(shown.alpha if looked_up else None),
+        _plain(shown.splat_ids if looked_up else None),
+        table,
+        *(images.get(name) for name in KINDS),
+        *(count, camera.width, len(wanted.parts), (len(wanted.parts) - 1).bit_length()),
+        *(camera.cx, camera.cy, 1 / camera.fx, 1 / camera.fy),
+        *(-pose[2, :3]).tolist(),
+        eye_m,
+        *(SURFACE_ALPHA, int(SemanticClass.SKY), int(SemanticClass.WATER)),
+        SHOWS_WATER=wanted.first is not None,
+        IN_AIR=wanted.plane_z_m is not None,
+        BLOCK=BLOCK,
+    )
+
+
+def _table_of(parts: Sequence[PosedGaussians]) -> np.ndarray:
+    """int64 [P, 3]: first splat, address of the classes on the GPU or 0, instance."""
+    table = np.zeros((len(parts), 3), np.int64)
+    table[1:, 0] = np.cumsum([len(part.gaussians) for part in parts[:-1]])
+    for row, part in zip(table, parts, strict=True):
+        if part.gaussians.semantic is not None:
+            row[1] = address_of(resident(part.gaussians.semantic))
+        row[2] = part.instance_id
+    return table
+
+
+def _plain(image: Tensor | None) -> Tensor | None:
+    """As the kernel reads it: contiguous, and bools as bytes."""
+    if image is None:
+        return None
+    image = image.detach().contiguous()
+    return image.view(torch.uint8) if image.dtype == torch.bool else image

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from augment.render.backends import CPU, kernels_for
+from augment.render.backends import CPU, CUDA, kernels_for
 from augment.render.buffers import RenderOutput
 from augment.render.constants import TRANSMITTANCE_STOP
 
@@ -32,8 +32,14 @@ def share_remainder(output: RenderOutput, stop: float, *, backend: str = CPU) ->
     assert alpha is not None
     images = {name: getattr(output, name) for name in ("rgb", "snow")}
     images = {name: image for name, image in images.items() if image is not None}
-    if kernels_for(backend, alpha, *images.values()) == CPU:
+    kernels = kernels_for(backend, alpha, *images.values())
+    if kernels == CPU:
         _by_kernel(alpha, images, stop)
+        return output
+    if kernels == CUDA:
+        from augment.render import cuda_composite
+
+        cuda_composite.share_remainder(alpha, images.get("rgb"), images.get("snow"), stop)
         return output
     finished = alpha >= 1 - stop
     scale = torch.where(finished, 1 / alpha.clamp_min(1 - stop), torch.ones_like(alpha))

@@ -21,6 +21,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from augment.cameras import Camera
+from augment.render.backends import AUTO, CUDA, kernels_for
 from augment.render.buffers import RenderOutput
 
 MAX_EXPONENT = 80.0  # exp(80) is still finite in float32; smog that dense has t = 0 at any distance
@@ -103,7 +104,7 @@ def blend_airlight(
 ) -> Float[Tensor, "*B 3"]:
     """t rgb + (1 - t) airlight, with t = exp(-tau). tau = 0 returns rgb to the bit."""
     t = torch.exp(-tau)[..., None]
-    airlight = torch.tensor(medium.rgb, dtype=rgb.dtype)
+    airlight = torch.tensor(medium.rgb, dtype=rgb.dtype, device=rgb.device)
     return t * rgb + (1 - t) * airlight
 
 
@@ -122,18 +123,26 @@ def fog_buffers(
     """
     tau = optical_depth(medium, ray_distance, eye_z_m, point_z_m)
     t = torch.exp(-tau)[..., None]
-    airlight = torch.tensor(medium.rgb, dtype=rgb.dtype)
+    airlight = torch.tensor(medium.rgb, dtype=rgb.dtype, device=rgb.device)
     return t * rgb + (1 - t) * alpha[..., None] * airlight
 
 
-def fog_raster(raster: RenderOutput, camera: Camera, medium: SmogMedium) -> Float[Tensor, "H W 3"]:
-    """Deferred smog on a render with colour, alpha and expected depth."""
-    assert raster.rgb is not None
-    assert raster.alpha is not None and raster.expected_depth is not None
-    depth = raster.expected_depth
-    ray_distance = depth * camera.ray_lengths(depth.dtype)
+def fog_raster(
+    raster: RenderOutput, camera: Camera, medium: SmogMedium, *, backend: str = AUTO
+) -> Float[Tensor, "H W 3"]:
+    """Deferred smog on a render with colour, alpha and expected depth.
+
+    backend: on a GPU, float32 without gradients goes through a kernel, equal within float rounding.
+    """
+    rgb, alpha, depth = raster.rgb, raster.alpha, raster.expected_depth
+    assert rgb is not None and alpha is not None and depth is not None
+    if kernels_for(backend, rgb, alpha, depth) == CUDA:
+        from augment.render import cuda_composite
+
+        return cuda_composite.fog(rgb, alpha, depth, camera, medium)
+    ray_distance = depth * camera.ray_lengths(depth.dtype, depth.device)
     eye_z_m = float(camera.centre[2])
     point_z_m = None
     if medium.scale_height_m is not None:
-        point_z_m = eye_z_m + depth * camera.ray_directions(depth.dtype)[..., 2]
-    return fog_buffers(raster.rgb, raster.alpha, ray_distance, medium, eye_z_m, point_z_m)
+        point_z_m = eye_z_m + depth * camera.ray_directions(depth.dtype, depth.device)[..., 2]
+    return fog_buffers(rgb, alpha, ray_distance, medium, eye_z_m, point_z_m)
