@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from batch_scenes import FakeView, bed_render, fake_render
+from batch_scenes import FakeView, fake_render
 
 from augment.cameras import Camera
 from augment.scene import Scene
@@ -45,10 +45,6 @@ class Gpu:
 
     def awaited(self, number: int) -> None:
         self.notes.append(("await", number))
-
-
-def begin_bed(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str) -> FakePending:
-    return FakePending(lambda: bed_render(scene, camera, recipe, backend=backend))
 
 
 def begin_fake(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str) -> FakePending:

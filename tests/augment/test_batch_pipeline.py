@@ -10,8 +10,7 @@ from pathlib import Path
 
 import pytest
 from batch_scenes import FakeLabels, fake_render, make_recipe, open_fake, tree_digest
-from fork_server import quick_context, start_fork_server
-from pending_views import Gpu, begin_fake
+from pending_views import Gpu
 
 from augment.batch import runner
 from augment.batch.job import JobResult, RenderJob, run_job
@@ -89,18 +88,6 @@ def test_an_interrupt_lands_what_is_in_flight(tmp_path: Path, whole) -> None:
     assert gpu.notes[-1] == ("await", 2)
     result = run(RenderJob("fake:street", [make_recipe()], tmp_path))
     assert (result.written, result.skipped) == (5, 3)
-    assert tree_digest(tmp_path) == whole
-
-
-def test_processes_do_not_wait_for_a_view_that_nothing_follows(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, whole
-) -> None:
-    start_fork_server("pending_views", "augment.batch.worker")
-    monkeypatch.setattr("multiprocessing.get_context", quick_context)
-    job = RenderJob("fake:street", [make_recipe()], tmp_path, workers=2)
-    result = run(job, begin_fake)
-    assert result.written == 8 and result.timings["await"] > 0
-    assert result.timings["renderers"] < result.timings["workers"]
     assert tree_digest(tmp_path) == whole
 
 

@@ -21,6 +21,7 @@ from batch_scenes import (
     tree_digest,
 )
 from fork_server import quick_context, start_fork_server
+from pending_views import begin_fake
 
 from augment.batch.job import RenderJob, run_job
 from augment.batch.manifest import read_manifest
@@ -63,6 +64,19 @@ def test_a_dying_worker_costs_one_image_and_workers_change_no_file(
     assert tree_digest(tmp_path / "two" / "street") == tree_digest(one / "street")
     manifest = (tmp_path / "two" / "manifest.parquet").read_bytes()
     assert manifest == (one / "manifest.parquet").read_bytes()
+
+
+def test_workers_finish_a_view_that_nothing_follows(tmp_path: Path, monkeypatch) -> None:
+    """They have it in flight when they have no more to do, and the job waits for it."""
+    start_fork_server("batch_scenes", "augment.batch.worker")
+    monkeypatch.setattr("multiprocessing.get_context", quick_context)
+    job = RenderJob("fake:street", [make_recipe()], tmp_path / "begun", workers=2)
+    result = run_job(job, scene_loader=open_fake, renderer=begin_fake, progress=False)
+    assert result.written == 8 and result.timings["await"] > 0
+    assert 0 < result.timings["renderers"] < result.timings["workers"]
+    alone = RenderJob("fake:street", [make_recipe()], tmp_path / "drawn")
+    run_job(alone, scene_loader=open_fake, renderer=fake_render, progress=False)
+    assert tree_digest(tmp_path / "begun") == tree_digest(tmp_path / "drawn")
 
 
 def test_a_renderer_that_workers_cannot_import_is_refused(tmp_path: Path) -> None:

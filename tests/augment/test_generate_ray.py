@@ -6,6 +6,7 @@ import os
 import signal
 import sys
 import types
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from generate_jobs import leftovers, make_job, outputs
 from augment.cameras import Camera
 from augment.errors import ClimateGSError
 from augment.generate.job import run_generate
+from augment.generate.ray_pool import _cpus_of_a_gpu
 from augment.scene import Scene
 from recipes.schema import Recipe
 
@@ -33,6 +35,7 @@ def cluster():
         ray.init(
             address="local",
             num_cpus=CPUS,
+            num_gpus=1,  # says Ray: nobody asks it for one
             include_dashboard=False,
             log_to_driver=False,
             logging_level="ERROR",
@@ -97,6 +100,40 @@ def test_interrupt_lets_actors_finish_their_images(whole, tmp_path):
     result = run_generate(make_job(tmp_path / "out"), progress=False)
     assert result.written < 28, "what was finished is not rendered again"
     assert outputs(tmp_path / "out") == whole
+
+
+def noting_gpus(
+    scene: Scene, camera: Camera, recipe: Recipe, *, backend: str, notes: Path
+) -> FakeView:
+    names = ("CUDA_VISIBLE_DEVICES", "NUMBA_NUM_THREADS")
+    notes.write_text(" ".join([backend, *(os.environ.get(name, "-") for name in names)]))
+    return fake_render(scene, camera, recipe, backend=backend)
+
+
+@pytest.mark.usefixtures("cluster")
+def test_an_actor_that_draws_on_a_gpu_has_it_and_its_cpus(tmp_path):
+    notes = tmp_path / "notes"
+    job = make_job(
+        tmp_path / "out",
+        ["fake:a?frames=1"],
+        executor="ray",
+        renderer=partial(noting_gpus, notes=notes),
+    )
+    job = replace(job, setup=replace(job.setup, backend="cuda"))
+    assert run_generate(job, progress=False).failed == 0
+    assert notes.read_text() == f"cuda 0 {CPUS}"
+
+
+def test_cpus_that_come_to_a_gpu():
+    machines = [
+        {"Alive": True, "Resources": {"CPU": 64.0, "GPU": 4.0}},
+        {"Alive": True, "Resources": {"CPU": 20.0, "GPU": 2.0}},
+        {"Alive": True, "Resources": {"CPU": 8.0}},
+        {"Alive": False, "Resources": {"CPU": 2.0, "GPU": 2.0}},
+    ]
+    assert _cpus_of_a_gpu(types.SimpleNamespace(nodes=lambda: machines)) == 10
+    with pytest.raises(ClimateGSError, match="no machine of the cluster has a GPU"):
+        _cpus_of_a_gpu(types.SimpleNamespace(nodes=lambda: machines[2:]))
 
 
 @pytest.mark.usefixtures("cluster")
