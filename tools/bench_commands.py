@@ -4,21 +4,31 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from tyro.conf import UseAppendAction
 
 from tools.json_files import JsonFile, write_json
 
+Device = Literal["cpu", "cuda"]
 
-def raster(repeats: int = 7, quick: bool = False, json_file: JsonFile = None) -> int:
+
+def raster(
+    repeats: int = 7,
+    quick: bool = False,
+    device: Device = "cpu",
+    json_file: JsonFile = None,
+) -> int:
     """The rasteriser on random scenes: each stage's time, memory, the torch reference beside it.
 
     Args:
         repeats: Timed frames a scene.
         quick: The smaller scene only.
+        device: On cuda the GPU's rasteriser, on the larger scene: `bench gpu --sections raster`.
         json_file: Also write the figures to this file.
     """
+    if device == "cuda":
+        return gpu(repeats, quick, sections=("raster",), json_file=json_file)
     from tools.bench import bench_raster, bench_text
 
     return _say(bench_raster(repeats=repeats, quick=quick), bench_text, json_file)
@@ -204,6 +214,7 @@ def trade(
     scene: str = "procedural:street?seed=3&frames=6",
     recipe: Annotated[tuple[str, ...], UseAppendAction] = (),
     quick: bool = False,
+    device: Device = "cpu",
     table: Path | None = None,
     pictures: Path | None = None,
     json_file: JsonFile = None,
@@ -215,6 +226,7 @@ def trade(
         recipe: A preset or a file, or clean, smog, flood, snow, style or all; may be given several
             times. By default those six.
         quick: Small pictures, one timed frame of each, and no memory.
+        device: What renders.
         table: Also write the tables to this file, as Markdown.
         pictures: Also draw error against time, and the tiers side by side, here.
         json_file: Also write the figures to this file.
@@ -223,8 +235,12 @@ def trade(
     from tools.bench_trade import bench_trade
     from tools.trade_text import trade_markdown, trade_text
 
+    if device == "cuda":
+        from tools.gpu_clock import check_gpu
+
+        check_gpu()
     case = trade_cases.QUICK if quick else trade_cases.WHOLE_CASE
-    found = bench_trade(scene, recipe or trade_cases.RECIPES, case)
+    found = bench_trade(scene, recipe or trade_cases.RECIPES, case, backend=device)
     drawn: list[Path] = []
     if table is not None:
         table.write_text(trade_markdown(found.figures), encoding="utf-8")

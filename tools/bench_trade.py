@@ -13,9 +13,11 @@ from tqdm import tqdm
 
 from adapters.base import open_scene
 from augment.ground import ground_of
+from augment.render.backends import CPU
 from augment.scene import Scene
 from recipes.knobs import Value
 from recipes.schema import Recipe
+from tools.gpu_clock import gpu_facts
 from tools.machine import load_average, machine_facts
 from tools.trade_cases import (
     RECIPES,
@@ -48,9 +50,11 @@ def bench_trade(
     *,
     progress: bool = True,
     wholes: Mapping[str, Mapping[str, Value]] | None = None,
+    backend: str = CPU,
 ) -> Trade:
     """recipes: of trade_cases.RECIPES, presets or files. wholes: settings of many knobs that are
-    measured instead of single ones, by name.
+    measured instead of single ones, by name. backend: CPU or CUDA. Times are the host's, to 8 bits
+    that lie there.
 
     Interrupted, it says so and gives what it has of finished recipes, if it has any.
 
@@ -61,6 +65,7 @@ def bench_trade(
     scene = _opened(scene_uri, drawn)
     views = trade_views(scene, case)
     machine = dataclasses.asdict(machine_facts())
+    gpu = gpu_facts() if backend != CPU else None
     counts = [len(settings_of_trade(recipe, case, wholes)) for recipe in drawn]
     warm_up(drawn)
     true_m = true_depths(scene_uri, [view.camera for view in views])
@@ -69,7 +74,14 @@ def bench_trade(
         for recipe in drawn:
             try:
                 found[recipe.name] = measure_recipe(
-                    scene, views, recipe, case, wholes=wholes, true_m=true_m, bar=bar
+                    scene,
+                    views,
+                    recipe,
+                    case,
+                    wholes=wholes,
+                    true_m=true_m,
+                    bar=bar,
+                    backend=backend,
                 )
             except KeyboardInterrupt:
                 if not found:
@@ -82,6 +94,8 @@ def bench_trade(
         "views": [_view_facts(view) for view in views],
         "repeats": case.repeats,
         "machine": machine,
+        "gpu": None if gpu is None else dataclasses.asdict(gpu),
+        "backend": backend,
         "load_after": load_average(),
         "recipes": [
             {"recipe": name, "rows": [_short(row) for row in measured.rows]}

@@ -165,6 +165,15 @@ def peak_gpu_mib(action: Action) -> tuple[float, float] | None:
     return highest / 2**20, (highest - before) / 2**20
 
 
+def gpu_mib() -> float | None:
+    """MiB of tensors that lie on the GPU now; None without one."""
+    if not torch.cuda.is_available():
+        return None
+    gc.collect()
+    torch.cuda.synchronize()
+    return torch.cuda.memory_allocated() / 2**20
+
+
 def check_gpu() -> None:
     """Raises BackendUnavailable where there is no GPU to measure."""
     from augment.errors import BackendUnavailable

@@ -99,9 +99,10 @@ def version_of(package: str) -> str | None:
 
 
 def machine_line(figures: Mapping[str, Any]) -> str:
-    """What a benchmark's figures were measured on. figures: with `machine` and `load_after`."""
-    machine = figures["machine"]
-    return (
+    """What a benchmark's figures were measured on. figures: with `machine` and `load_after`, and
+    `gpu` where one did the work."""
+    machine, gpu = figures["machine"], figures.get("gpu")
+    return (f"{gpu['name']}; " if gpu else "") + (
         f"{machine['processor']}, {machine['cores']} cores, {machine['threads']} threads; "
         f"load {machine['load']} before, {figures['load_after']} after"
     )

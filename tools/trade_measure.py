@@ -20,6 +20,7 @@ from tqdm import tqdm
 
 from augment.batch.encode import decode_image, encode_image
 from augment.quality.trial import Trial, render_trial
+from augment.render.backends import CPU, CUDA
 from augment.render.cpu_scratch import release_scratch
 from augment.scene import Scene
 from augment.snow.beds import bed_of, remember_bed
@@ -29,6 +30,7 @@ from recipes.knobs import BY_PATH, Value
 from recipes.schema import Output, Recipe
 from tools.bench_memory import RESET_PEAK, extra_mib, return_free_memory, status_mib
 from tools.bench_pairs import spread_ms, turns
+from tools.gpu_clock import gpu_mib, peak_gpu_mib
 from tools.trade_cases import (
     CLEAN,
     DEPTH,
@@ -66,12 +68,13 @@ class Measured:
 
 
 class Stage:
-    """A scene for each snow and style: what is laid and mapped for one is remembered as long as its
-    scene lives, a few of them only, and must not be made anew between two timed frames.
+    """A scene for each snow and style, and what renders them: what is laid and mapped for one is
+    remembered as long as its scene lives, a few of them only, and must not be made anew between two
+    timed frames.
     """
 
-    def __init__(self, scene: Scene, view: View) -> None:
-        self._bare, self._view = scene, view
+    def __init__(self, scene: Scene, view: View, backend: str) -> None:
+        self._bare, self._view, self.backend = scene, view, backend
         self._dressed: dict[str, Scene] = {}
         self.kept_mib: dict[str, float | None] = {}
 
@@ -101,11 +104,10 @@ class Stage:
         return scene
 
     def _kept(self, scene: Scene, recipe: Recipe) -> float | None:
-        if not RESET_PEAK.is_file():
-            return None
-        before = _resident_mib()
-        render_trial(scene, self._view.camera.scaled(SMALL), recipe)
-        return max(0.0, _resident_mib() - before)
+        before = _resident_mib(self.backend)
+        render_trial(scene, self._view.camera.scaled(SMALL), recipe, self.backend)
+        after = _resident_mib(self.backend)
+        return None if before is None or after is None else max(0.0, after - before)
 
 
 def measure_recipe(
@@ -117,12 +119,14 @@ def measure_recipe(
     wholes: Mapping[str, Mapping[str, Value]] | None = None,
     true_m: Sequence[np.ndarray] | None = None,
     bar: tqdm | None = None,
+    backend: str = CPU,
 ) -> Measured:
     """wholes: as of settings_of_trade. true_m: the scene's exact depth by view; it is not used for
-    recipes with snow, whose surface is another.
+    recipes with snow, whose surface is another. backend: of what is timed and compared; on which
+    pixels errors count is the CPU backend's to say.
     """
     settings = settings_of_trade(recipe, case, wholes)
-    stage = Stage(scene, views[0])
+    stage = Stage(scene, views[0], backend)
     clean = Setting(CLEAN, CLEAN, clean_recipe(recipe))
     best = settings[0]
     known = true_m if recipe.weather.snow is None else None
@@ -188,7 +192,7 @@ def time_group(
         for repeat in range(repeats + 1):
             for name in turns(by_name, repeat):
                 recipe = by_name[name].recipe
-                trial = render_trial(stage.scene_for(recipe), view.camera, recipe)
+                trial = render_trial(stage.scene_for(recipe), view.camera, recipe, stage.backend)
                 if repeat:
                     timed.seconds[name].append(trial.seconds)
                 else:
@@ -257,12 +261,18 @@ def _memory(stage: Stage, view: View, setting: Setting) -> Row:
     """mib: of a frame above its scene, at its highest moment. kept_mib: what stays with the scene.
 
     The renderer's work space is given back before; so the frame takes all it needs anew, as in a
-    process of its own (docs/trade.md has both beside each other).
+    process of its own (docs/trade.md has both beside each other). On a GPU both are of its memory.
     """
-    if not RESET_PEAK.is_file():
-        return {"mib": None, "kept_mib": None}
     scene = stage.scene_for(setting.recipe)
-    mib = frame_mib(lambda: render_trial(scene, view.camera, setting.recipe))
+
+    def frame() -> object:
+        return render_trial(scene, view.camera, setting.recipe, stage.backend)
+
+    if stage.backend == CUDA:
+        peak = peak_gpu_mib(frame)
+        mib = None if peak is None else peak[1]
+    else:
+        mib = frame_mib(frame) if RESET_PEAK.is_file() else None
     return {"mib": mib, "kept_mib": stage.kept_of(setting.recipe)}
 
 
@@ -271,7 +281,12 @@ def frame_mib(action: Callable[[], object]) -> float:
     return extra_mib(action)
 
 
-def _resident_mib() -> float:
+def _resident_mib(backend: str) -> float | None:
+    """What the process, or on a GPU its tensors, take now; None where nothing tells."""
+    if backend == CUDA:
+        return gpu_mib()
+    if not RESET_PEAK.is_file():
+        return None
     release_scratch()
     gc.collect()
     return_free_memory()
