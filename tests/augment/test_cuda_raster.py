@@ -1,0 +1,474 @@
+"""Tile lists and blending on the GPU, and the whole rasteriser: against stored renders, against the
+definition, against the CPU's kernels and against itself. Without a GPU the kernels are interpreted.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+
+import numpy as np
+import pytest
+import torch
+
+from augment.geometry import rigid
+from augment.render import gpu
+from augment.render.backends import CPU, CUDA
+from augment.render.buffers import (
+    ALPHA,
+    BUFFERS,
+    EXPECTED_DEPTH,
+    MEDIAN_DEPTH,
+    MODE_DEPTH,
+    RGB,
+    SNOW,
+    SPLAT_IDS,
+    RenderOutput,
+)
+from augment.render.clip import UNCUT, HeightClip
+from augment.render.constants import RasterSettings
+from augment.render.cuda import rasterize_cuda
+from augment.render.cuda_blend import blend
+from augment.render.cuda_splats import HIDDEN, TILE, CudaSplats, CudaTiles, StageClock
+from augment.render.cuda_tiles import list_tiles
+from augment.render.rasterize import rasterize
+from augment.render.reference import rasterize_reference
+from augment.scene import Gaussians, PosedGaussians
+from tests.assertions import assert_images_close, assert_labels_equal
+from tests.augment import hard_scenes
+from tests.augment.drawn_splats import drawn_splats
+from tests.augment.hard_scenes import colour_maps, hard_gaussians, in_float64, snow_light
+from tests.augment.pretend_gpu import AwayTensor, pretended_gpu
+from tests.scenes import (
+    camera_ahead,
+    golden_view,
+    one_gaussian,
+    random_gaussians,
+    slight_pose,
+    stack,
+)
+
+ALL = frozenset(BUFFERS)
+COLOR = frozenset({RGB, ALPHA})
+DEFAULT = RasterSettings()
+
+
+def on_gpu(splats: CudaSplats) -> CudaSplats:
+    device = gpu.gpu_device()
+    fields = {f.name: getattr(splats, f.name) for f in dataclasses.fields(splats)}
+    return CudaSplats(**{n: None if v is None else v.to(device) for n, v in fields.items()})
+
+
+def as_given(parts) -> list[PosedGaussians]:
+    return [PosedGaussians(parts)] if isinstance(parts, Gaussians) else parts
+
+
+def on_cpu(output: RenderOutput) -> RenderOutput:
+    fields = {f.name: getattr(output, f.name) for f in dataclasses.fields(output)}
+    return RenderOutput(**{n: None if v is None else v.cpu() for n, v in fields.items()})
+
+
+def render(parts, camera, buffers=ALL, settings=DEFAULT, **more) -> RenderOutput:
+    return on_cpu(
+        rasterize(as_given(parts), camera, buffers=buffers, settings=settings, backend=CUDA, **more)
+    )
+
+
+def blend_alone(parts, camera, buffers=ALL, settings=DEFAULT, clip=None) -> RenderOutput:
+    """Splats of the definition's projection through the lists and the blend."""
+    splats = on_gpu(drawn_splats(as_given(parts), camera, settings, clip))
+    images = blend(splats, list_tiles(splats, camera, None), camera, buffers, settings)
+    return on_cpu(RenderOutput(**images))
+
+
+def assert_same_bits(actual, expected, buffers=ALL):
+    for name in buffers:
+        assert torch.equal(getattr(actual, name), getattr(expected, name)), name
+
+
+def assert_agrees(actual, expected, *, max_flips=2, depth_p999=2e-4, buffers=ALL):
+    """As far as float32 allows: forty blends, an exp2 good to 3e-6, depths of up to 9 m."""
+    for name in buffers & {RGB, ALPHA, SNOW}:
+        assert_images_close(
+            getattr(actual, name), getattr(expected, name), p999=1e-5, max_flips=max_flips
+        )
+    for name, more in ((EXPECTED_DEPTH, 0), (MEDIAN_DEPTH, 2), (MODE_DEPTH, 4)):
+        # A pixel may name the next splat, or leave a sample out of a cluster, by another rounding.
+        if name in buffers:
+            assert_images_close(
+                getattr(actual, name),
+                getattr(expected, name),
+                p999=depth_p999,
+                flip=5e-3,
+                max_flips=max_flips + more,
+            )
+    if SPLAT_IDS in buffers:
+        assert_labels_equal(actual.splat_ids, expected.splat_ids, max_flips=max_flips + 2)
+
+
+def assert_matches_definition(
+    parts, camera, settings=DEFAULT, *, max_flips=2, depth_p999=2e-4, smog=None, clip=None
+):
+    parts = as_given(parts)
+    actual = render(parts, camera, ALL, settings, smog=smog, clip=clip)
+    expected = rasterize(
+        in_float64(parts),
+        camera,
+        buffers=ALL,
+        settings=settings,
+        smog=smog,
+        clip=clip,
+        backend="reference",
+    )
+    assert_agrees(actual, expected, max_flips=max_flips, depth_p999=depth_p999)
+
+
+# ---- tile lists --------------------------------------------------------------------------------
+
+
+def brute_force_lists(splats: CudaSplats, columns: int, rows: int) -> list[list[int]]:
+    lists: list[list[int]] = [[] for _ in range(columns * rows)]
+    for row in np.argsort(splats.keys.numpy(), kind="stable").tolist():
+        if splats.counts[row] > 0:
+            first, last = splats.rects[row].tolist()
+            spans = zip(divmod(first, 1 << 16), divmod(last, 1 << 16), strict=True)
+            for down, across in itertools.product(*(range(a, b + 1) for a, b in spans)):
+                lists[down * columns + across].append(row)
+    return lists
+
+
+def listed(tiles: CudaTiles) -> list[list[int]]:
+    members, starts = tiles.members.cpu().tolist(), tiles.starts.cpu().tolist()
+    return [members[a:b] for a, b in itertools.pairwise(starts)]
+
+
+def random_splats(count: int, columns: int, rows: int, seed: int = 0) -> CudaSplats:
+    """A third is hidden; few depths, so that most are shared."""
+    rng = np.random.default_rng(seed)
+    across = np.sort(rng.integers(0, columns, (count, 2)), 1)
+    down = np.sort(rng.integers(0, rows, (count, 2)), 1)
+    counts = (across[:, 1] - across[:, 0] + 1) * (down[:, 1] - down[:, 0] + 1)
+    keys = rng.integers(1, 9, count).astype(np.float32).view(np.int32)
+    hidden = rng.random(count) < 1 / 3
+    counts[hidden], keys[hidden] = 0, HIDDEN
+    rects = (across + (down << 16)).astype(np.int32)
+    rects[hidden] = -1
+    return CudaSplats(
+        torch.empty(count, 16),
+        torch.from_numpy(keys),
+        torch.from_numpy(rects),
+        torch.from_numpy(counts.astype(np.int32)),
+        None,
+        None,
+    )
+
+
+@pytest.mark.parametrize(
+    ("count", "columns", "rows"), [(300, 5, 3), (1, 1, 1), (7, 2, 9), (3, 200, 170), (0, 3, 2)]
+)
+def test_lists_hold_every_pair_once_in_order_of_depth(count, columns, rows):
+    """34 000 tiles do not fit into 16 bits."""
+    splats = random_splats(count, columns, rows)
+    camera = camera_ahead(columns * TILE - 3, rows * TILE)
+    tiles = list_tiles(on_gpu(splats), camera, None)
+    assert (tiles.columns, tiles.rows) == (columns, rows)
+    assert tiles.members.dtype == tiles.starts.dtype == torch.int32
+    assert listed(tiles) == brute_force_lists(splats, columns, rows)
+
+
+def test_tiles_without_a_wanted_pixel_own_nothing():
+    splats, camera = random_splats(200, 5, 4), camera_ahead(5 * TILE - 7, 4 * TILE - 1)
+    wanted = torch.zeros(camera.height, camera.width, dtype=torch.bool)
+    wanted[17, 33] = wanted[-1, -1] = wanted[30, 0] = True
+    tiles = list_tiles(on_gpu(splats), camera, wanted.to(gpu.gpu_device()))
+    drawn = {1 * 5 + 2, 3 * 5 + 4, 1 * 5}
+    expected = brute_force_lists(splats, 5, 4)
+    assert listed(tiles) == [own if i in drawn else [] for i, own in enumerate(expected)]
+    none = list_tiles(on_gpu(splats), camera, torch.zeros_like(wanted).to(gpu.gpu_device()))
+    assert listed(none) == [[]] * 20
+
+
+def test_more_pairs_than_can_be_counted_are_refused():
+    splats = random_splats(4, 200, 170)
+    splats.counts.fill_(2**30)
+    with pytest.raises(ValueError, match="touch 4294967296 tiles"):
+        list_tiles(on_gpu(splats), camera_ahead(200 * TILE, 170 * TILE), None)
+
+
+# ---- blending ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "size", [(33, 21), (16, 8), (1, 1), (5, 19)], ids=lambda s: f"{s[0]}x{s[1]}"
+)
+def test_blending_random_splats(size):
+    camera = camera_ahead(*size, 0.9 * max(size))
+    parts = [PosedGaussians(random_gaussians(60, seed=sum(size), size=0.4))]
+    expected = rasterize_reference(in_float64(parts), camera, ALL, DEFAULT, None)
+    assert_agrees(blend_alone(in_float64(parts), camera), expected)
+
+
+@pytest.mark.parametrize("stop", [0.25, 0.01, 1e-6])
+def test_a_pixel_is_finished_at_the_stop(stop):
+    """Layers over layers; ids, depths and sums end where the definition's do."""
+    layers = [one_gaussian((2 + 0.3 * i, 0.02 * i, 0), 0.5 + 0.05 * i, 0.6) for i in range(45)]
+    parts, camera = [PosedGaussians(stack(*layers))], camera_ahead(13, 18, 20.0)
+    settings = RasterSettings(transmittance_stop=stop, alpha_max=0.5)
+    expected = rasterize_reference(in_float64(parts), camera, ALL, settings, None)
+    assert_agrees(blend_alone(in_float64(parts), camera, settings=settings), expected)
+
+
+def test_no_pixel_is_lost_to_the_look_at_blocks():
+    """Thin splats in all directions, whose ellipses graze blocks: every pixel that the definition
+    gives them gets its share.
+    """
+    scene = random_gaussians(150, seed=3, sh_degree=0)
+    thin = dataclasses.replace(
+        scene,
+        scales=torch.tensor([[0.5, 0.004, 0.004]]).expand(150, 3),
+        opacities=torch.full((150,), 0.02),  # so that nothing hides what is behind
+    )
+    camera = camera_ahead(48, 32, 45.0)
+    parts = [PosedGaussians(thin)]
+    actual = blend_alone(in_float64(parts), camera, frozenset({ALPHA}))
+    expected = rasterize_reference(in_float64(parts), camera, frozenset({ALPHA}), DEFAULT, None)
+    # A lost share is 1/255 and more; at the cut itself another rounding may take or give one.
+    assert_images_close(actual.alpha, expected.alpha, p999=1e-5, flip=1e-3, max_flips=6)
+
+
+def test_hidden_rows_are_not_read():
+    """They hold NaN here, and anything on a GPU."""
+    scene = stack(one_gaussian((-1.0, 0, 0)), one_gaussian(), one_gaussian(opacity=0.001))
+    output = blend_alone(scene, camera_ahead(9, 9, 20.0))
+    assert all(bool(torch.isfinite(getattr(output, n)).all()) for n in ALL - {SPLAT_IDS})
+    assert set(output.splat_ids.unique().tolist()) <= {-1, 1}
+
+
+@pytest.mark.parametrize("buffer", sorted(ALL))
+def test_bits_do_not_depend_on_the_buffers_asked_for(buffer):
+    parts, camera = random_gaussians(60, size=0.5), camera_ahead(20, 17, 20.0)
+    whole = blend_alone(parts, camera)
+    alone = blend_alone(parts, camera, frozenset({buffer}))
+    assert_same_bits(alone, whole, {buffer})
+    assert all(getattr(alone, name) is None for name in ALL - {buffer})
+
+
+# ---- the whole rasteriser ----------------------------------------------------------------------
+
+
+def test_a_stored_render(shared_dir):
+    check_stored_render(shared_dir, "opaque", "a99_aa")
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize(
+    "mode",
+    [
+        *("a999_classic", "a999_aa", "a99_classic", "a99_aa"),
+        *(f"a99_classic_sh{degree}" for degree in range(4)),
+    ],
+)
+@pytest.mark.parametrize("name", ["edge", "garden_small", "opaque"])
+def test_all_stored_renders(shared_dir, name, mode):
+    check_stored_render(shared_dir, name, mode)
+
+
+def check_stored_render(shared_dir, name: str, mode: str) -> None:
+    with_sh = mode[-3:-1] == "sh"
+    parts, camera, arrays = golden_view(shared_dir / "golden" / f"{name}.npz", with_sh=with_sh)
+    settings = RasterSettings(
+        alpha_max=0.999 if mode.startswith("a999") else 0.99,
+        antialiased="_aa" in mode,
+        sh_degree=int(mode[-1]) if with_sh else None,
+    )
+    output = render(parts, camera, frozenset({RGB, ALPHA, EXPECTED_DEPTH}), settings)
+    for key, image in {"rgb": output.rgb, "alpha": output.alpha}.items():
+        if f"{mode}_{key}" in arrays:
+            assert_images_close(image, arrays[f"{mode}_{key}"], p999=1e-5, max_flips=5)
+    if not with_sh:
+        expected = torch.from_numpy(arrays[f"{mode}_ED"]).reshape(output.alpha.shape)
+        relative = output.expected_depth / expected.clamp_min(1e-3)
+        assert_images_close(relative, expected / expected.clamp_min(1e-3), p999=1e-5, max_flips=5)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        DEFAULT,
+        RasterSettings(antialiased=True, sh_degree=1),
+        RasterSettings(alpha_max=0.99, near_m=1.5),
+        RasterSettings(transmittance_stop=0.05, radius_clip_px=2.5),
+    ],
+    ids=["default", "antialiased", "near and alpha_max", "coarse"],
+)
+def test_settings(settings):
+    parts = [PosedGaussians(random_gaussians(80, size=0.4))]
+    assert_matches_definition(parts, camera_ahead(25, 19, 20.0), settings)
+
+
+@pytest.mark.parametrize("smog", ["uniform", "layered"])
+def test_all_kinds_of_parts(smog):
+    """A street, an actor, snow lit pixel by pixel, splats under colour maps; seen through smog."""
+    street, actor = random_gaussians(40, size=0.4), random_gaussians(20, seed=1, sh_degree=1)
+    lit = random_gaussians(20, seed=2, sh_degree=0, size=0.5)
+    styled = random_gaussians(20, seed=3, sh_degree=2)
+    rows = torch.arange(20, dtype=torch.int16) % 6
+    parts = [
+        PosedGaussians(street),
+        PosedGaussians(actor, slight_pose(), 1),
+        PosedGaussians(lit, is_snow=True, shading=snow_light(20)),
+        PosedGaussians(styled, color_maps=colour_maps(), color_rows=rows),
+        PosedGaussians(Gaussians.empty(sh_degree=1)),
+    ]
+    assert_matches_definition(parts, camera_ahead(25, 19, 20.0), smog=hard_scenes.SMOGS[smog])
+
+
+@pytest.mark.parametrize(
+    ("clip", "is_orthographic"),
+    [
+        (UNCUT, False),
+        (HeightClip(0.1, "above"), False),
+        (HeightClip(0.1, "above"), True),
+        (HeightClip(0.2, "below", overlaps=True), True),
+    ],
+)
+def test_clips_and_parallel_rays(clip, is_orthographic):
+    camera = camera_ahead(25, 19, 20.0, position=(0.0, 0.0, 0.9))
+    if is_orthographic:
+        camera = dataclasses.replace(camera, is_orthographic=True, fx=5.0, fy=5.5)
+    parts = [
+        PosedGaussians(random_gaussians(40, size=0.5, sh_degree=1)),
+        PosedGaussians(random_gaussians(20, seed=1, sh_degree=0, size=0.5), slight_pose(), 1),
+    ]
+    # Where a cut leaves little of a pixel, its depth is a small sum over a small alpha.
+    assert_matches_definition(parts, camera, clip=clip, max_flips=4, depth_p999=2e-3)
+
+
+@pytest.mark.parametrize("kind", hard_scenes.KINDS)
+def test_hard_scenes(kind):
+    """Finite and in range whatever comes, and as the CPU's kernels draw it."""
+    camera = hard_scenes.wide_camera(100.0, (23, 18))
+    parts = [PosedGaussians(hard_gaussians(kind, camera, 25))]
+    actual = render(parts, camera)
+    for name in ALL - {SPLAT_IDS}:
+        assert bool(torch.isfinite(getattr(actual, name)).all()), name
+    expected = rasterize(parts, camera, buffers=ALL, backend=CPU)
+    # Of balls and needles kilometres long, float32 keeps three digits of where a pixel lies.
+    assert_images_close(actual.rgb, expected.rgb, p999=1e-3, flip=5e-3, max_flips=4)
+    assert_images_close(actual.alpha, expected.alpha, p999=1e-3, flip=5e-3, max_flips=4)
+    assert_labels_equal(actual.splat_ids, expected.splat_ids, max_flips=6)
+
+
+def test_nothing_to_see():
+    camera = camera_ahead(19, 7)
+    behind, aside = one_gaussian(mean=(-4.0, 0.0, 0.0)), one_gaussian(mean=(4.0, 90.0, 0.0))
+    for parts in (
+        Gaussians.empty(3),
+        stack(behind, aside, one_gaussian(opacity=0.0039)),
+        [PosedGaussians(Gaussians.empty()), PosedGaussians(behind, slight_pose())],
+    ):
+        output = render(parts, camera)
+        for name in ALL - {SPLAT_IDS}:
+            assert torch.count_nonzero(getattr(output, name)) == 0
+        assert (output.splat_ids == -1).all()
+
+
+def test_one_gaussian():
+    assert_matches_definition(one_gaussian(), camera_ahead(), max_flips=0)
+
+
+def test_equal_depths_keep_the_order_of_indices():
+    """Layers at one depth: what is seen depends on their order alone."""
+    layers = [one_gaussian(opacity=0.3, rgb=(i % 7 / 7, 0.5, i / 40)) for i in range(40)]
+    assert_matches_definition(stack(*layers), camera_ahead(17, 5, 15.0), max_flips=0)
+
+
+def test_wanted_pixels_have_the_bits_of_the_whole_image():
+    parts, camera = random_gaussians(50, size=0.3), camera_ahead(35, 19, 30.0)
+    wanted = torch.zeros(19, 35, dtype=torch.bool)
+    wanted[17, 30:34] = True
+    whole = render(parts, camera)
+    partly = render(parts, camera, wanted=wanted)
+    for name in ALL:
+        assert torch.equal(getattr(partly, name)[wanted], getattr(whole, name)[wanted]), name
+    assert torch.count_nonzero(partly.alpha[:16]) == 0
+
+
+def test_two_runs_give_the_same_bits():
+    parts, camera = random_gaussians(50, size=0.4), camera_ahead(19, 12, 16.0)
+    assert_same_bits(render(parts, camera), render(parts, camera))
+
+
+def test_everything_lies_on_the_gpu(monkeypatch):
+    """A pretended one, which refuses what a real one would; and the bits are the same there."""
+    street = PosedGaussians(random_gaussians(40, size=0.4))
+    snow = PosedGaussians(
+        random_gaussians(20, seed=2, sh_degree=0), is_snow=True, shading=snow_light(20)
+    )
+    camera, clip = camera_ahead(19, 12, 16.0), HeightClip(-0.2, "above")
+    settings = RasterSettings(transmittance_stop=0.02)
+    arguments = {"buffers": ALL, "settings": settings, "clip": clip, "backend": CUDA}
+    wanted = torch.ones(camera.height, camera.width, dtype=torch.bool)
+    expected = rasterize([street, snow], camera, **arguments)
+    with pretended_gpu(monkeypatch):
+        output = rasterize([street, snow], camera, wanted=wanted, **arguments)
+        assert all(isinstance(getattr(output, name), AwayTensor) for name in ALL)
+        held = on_cpu(output)
+    assert_same_bits(held, on_cpu(expected))
+
+
+def test_a_clock_is_told_of_the_stages():
+    clock = StageClock()
+    parts = [PosedGaussians(stack(one_gaussian(), one_gaussian((-3.0, 0, 0))))]
+    rasterize_cuda(parts, camera_ahead(16, 16, 8.0), COLOR, DEFAULT, None, clock=clock)
+    assert clock.counts == {"visible": 1, "pairs": 1}
+    assert set(clock.milliseconds()) == {"project", "list", "blend"}
+
+
+# ---- on a real GPU -----------------------------------------------------------------------------
+
+
+@pytest.fixture
+def crowd():
+    """A few hundred thousand Gaussians in three parts; hundreds deep, opaque and not."""
+    parts = [
+        PosedGaussians(random_gaussians(300_000, size=0.05, sh_degree=3)),
+        PosedGaussians(random_gaussians(50_000, seed=1, size=0.1, sh_degree=1), slight_pose(), 1),
+        PosedGaussians(random_gaussians(500, seed=2, size=2.0, sh_degree=0)),
+    ]
+    return parts, camera_ahead(801, 533, 500.0)
+
+
+@pytest.mark.gpu
+def test_a_crowd_looks_as_on_the_cpu(crowd):
+    parts, camera = crowd
+    actual = render(parts, camera)
+    expected = rasterize(parts, camera, buffers=ALL, backend=CPU)
+    pixels = camera.width * camera.height
+    for name in (RGB, ALPHA, SNOW):
+        assert_images_close(
+            getattr(actual, name), getattr(expected, name), p999=1e-3, max_flips=pixels // 2000
+        )
+    for name in (EXPECTED_DEPTH, MEDIAN_DEPTH, MODE_DEPTH):
+        assert_images_close(
+            getattr(actual, name),
+            getattr(expected, name),
+            p999=1e-3,
+            flip=5e-3,
+            max_flips=pixels // 500,
+        )
+    assert_labels_equal(actual.splat_ids, expected.splat_ids, max_flips=pixels // 500)
+
+
+@pytest.mark.gpu
+def test_a_crowd_has_the_same_bits_every_time(crowd):
+    first = render(*crowd)
+    for _ in range(3):
+        assert_same_bits(render(*crowd), first)
+
+
+@pytest.mark.gpu
+def test_kilometres_from_the_origin():
+    pose = rigid(torch.eye(3, dtype=torch.float64), torch.tensor([31e3, -17e3, 250.0]).double())
+    camera = camera_ahead(97, 61, 80.0, position=(31_000.1, -17_000.3, 250.2))
+    assert_matches_definition([PosedGaussians(random_gaussians(300), pose)], camera)
