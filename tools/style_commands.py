@@ -121,7 +121,7 @@ def train(
         holdout: Every so many photos are kept for scores; 0 for none.
         half_precision: Write the network's numbers in 16 bits.
         through: Render mapped Gaussians for every step, or map pictures rendered once.
-        device: Where torch trains.
+        device: Where torch trains: cpu, or cuda, where through renderer renders on the GPU, too.
         ablations: Train without each loss, and 3x3 maps, too, and write a table.
         overwrite: Begin anew and replace what is there.
         json_file: Also write the report to this file.

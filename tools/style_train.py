@@ -26,7 +26,7 @@ from adapters.base import open_scene
 from augment.batch.atomic import write_atomic
 from augment.batch.layout import STATE_FOLDER
 from augment.batch.lock import OutputLock
-from augment.errors import OutputError
+from augment.errors import ClimateGSError, OutputError
 from augment.style.checkpoint import save_network
 from augment.style.encoder import B0Encoder, load_imagenet_weights
 from augment.style.features import FeatureExtractor, open_features
@@ -133,6 +133,7 @@ class _Data:
 
 
 def _prepare(options: StyleTrainOptions, folder: Path, before: Checkpoint | None) -> _Run:
+    _take_device(options.device)
     data = _open_data(options)
     for problem in data.problems:
         _say(f"note: {problem}")
@@ -177,6 +178,18 @@ def _prepare(options: StyleTrainOptions, folder: Path, before: Checkpoint | None
     )
 
 
+def _take_device(device: str) -> None:
+    """Make it the current one, on which the renderer's kernels run, too."""
+    try:
+        torch.zeros(1, device=device)
+    except (RuntimeError, AssertionError) as error:  # of torch without CUDA
+        reason = str(error).splitlines()[0]
+        raise ClimateGSError(f"--device {device}: {reason}; train on cpu, or cuda") from error
+    place = torch.device(device)
+    if place.type == "cuda" and place.index is not None:
+        torch.cuda.set_device(place)
+
+
 def _open_data(options: StyleTrainOptions) -> _Data:
     size = options.picture_px
     views: list[Content] = []
@@ -201,13 +214,15 @@ def _open_data(options: StyleTrainOptions) -> _Data:
         "held_out_photos": len(photos.held_out),
         "held_out_sha256": _digest([photos.held_out]),
     }
+    pool = pool.to(options.device)  # once, for all trainers
     scored = _scored(pool, photos, options)
     return _Data(pool, scored, photos.held_out, facts, (*problems, *photos.problems))
 
 
 def _scored(pool: TrainingPool, photos: Photos, options: StyleTrainOptions) -> Draw:
     """What networks are scored by: held-out photos where there are any, and the scenes' views."""
-    apart = TrainingPool(pool.views, photos.held_out) if len(photos.held_out) else pool
+    held_out = photos.held_out.to(options.device)
+    apart = TrainingPool(pool.views, held_out) if len(held_out) else pool
     return apart.draw(
         generator_for(0, 0, "scores"),  # whatever the seed: trainings are compared by them
         SCORED,
@@ -215,7 +230,7 @@ def _scored(pool: TrainingPool, photos: Photos, options: StyleTrainOptions) -> D
         perturbed=0.5,
         colors=1,
         recolor=recolor,
-    ).to(options.device)
+    )
 
 
 def _digest(pictures: Iterable[torch.Tensor]) -> str:
@@ -238,9 +253,7 @@ def _trainer(
         options.config(steps),
         features,
         recolor=recolor,
-        pairs=pair_loss_of(pool, options.config(steps).pair_weights, options.device)
-        if options.pairs > 0
-        else None,
+        pairs=pair_loss_of(pool, options.config(steps).pair_weights) if options.pairs > 0 else None,
         frozen_norm=options.encoder_weights is not None,
         device=options.device,
     )

@@ -100,7 +100,7 @@ def _affine(matrix: Float[Tensor, "B 3 3"], offset: Float[Tensor, "B 3"]) -> Flo
 def _own(mean: Float[Tensor, "B 3"], covariance: Float[Tensor, "B 3 3"]) -> Float[Tensor, "B 9"]:
     """The picture's own mean (3) and root of the covariance (6)."""
     root, _ = _roots(covariance)
-    upper = torch.triu_indices(3, 3)
+    upper = torch.triu_indices(3, 3, device=root.device)
     return torch.cat([4 * mean - 1.7, 8 * root[:, upper[0], upper[1]] - 0.7], dim=1).float()
 
 
@@ -123,7 +123,8 @@ def _levels(normal: Float[Tensor, "B 3 R R"]) -> Float[Tensor, "B F"]:
     that range, so levels tell how far light or a camera moved a picture."""
     sample = normal[:, :, ::2, ::2].flatten(2).sort(dim=2).values
     places = [round(level * (sample.shape[2] - 1)) for level in LEVELS]
-    levels = sample[:, :, places].clamp(-1, 2)  # [B, 3, LEVELS]
+    # One by one: a list of places would be copied to a GPU, and waited for.
+    levels = torch.stack([sample[:, :, place] for place in places], 2).clamp(-1, 2)  # [B, 3, L]
     found = [3 * (levels - 0.43).flatten(1)]
     for index in _PAIRED_LEVELS:
         low, high = levels[:, :, index], levels[:, :, -1 - index]

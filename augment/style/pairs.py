@@ -57,12 +57,13 @@ class Recoloring:
     curve: Float[Tensor, "B"]
 
     def __call__(self, images: Float[Tensor, "B 3 H W"]) -> Float[Tensor, "B 3 H W"]:
-        """Pictures in [0, 1], each under its recolouring."""
-        bent = images.clamp_min(1e-6) ** self.gamma[:, :, None, None]
-        mapped = torch.einsum("bij,bjhw->bihw", self.maps[:, :, :3], bent)
-        mapped = (mapped + self.maps[:, :, 3, None, None]).clamp(0, 1)
+        """Pictures in [0, 1], each under its recolouring, on the device where they lie."""
+        maps, gamma, curve = (v.to(images.device) for v in (self.maps, self.gamma, self.curve))
+        bent = images.clamp_min(1e-6) ** gamma[:, :, None, None]
+        mapped = torch.einsum("bij,bjhw->bihw", maps[:, :, :3], bent)
+        mapped = (mapped + maps[:, :, 3, None, None]).clamp(0, 1)
         smooth = mapped * mapped * (3 - 2 * mapped)
-        return torch.lerp(mapped, smooth, self.curve[:, None, None, None])
+        return torch.lerp(mapped, smooth, curve[:, None, None, None])
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +127,8 @@ def sample_pairs(
     size_px: int = 128,
     settings: RecolorSettings | None = None,
 ) -> PairBatch:
-    """A batch from photos in [0, 1]; the same for the same state of the generator.
+    """A batch from photos in [0, 1], on the device where they lie; the same for the same state of
+    the generator, which is the CPU's.
 
     Photos are cut (half to all of each side), mirrored at random, and squeezed to size_px squares;
     every second one shares its square with another, and each is recoloured a little before all
@@ -141,6 +143,7 @@ def sample_pairs(
     first = torch.randint(count, (batch,), generator=generator)
     second = (first + torch.randint(1, count, (batch,), generator=generator)) % count
     recoloring = sample_recolorings(batch, generator, settings)
+    first, second = first.to(photos.device), second.to(photos.device)
     one = _varied(_cut(photos[first], generator, size_px), generator, settings)
     two = _varied(_cut(photos[second], generator, size_px), generator, settings)
     return PairBatch(one, recoloring(one), two, recoloring(two))
@@ -158,7 +161,7 @@ def _varied(
     below = (torch.rand((count, 1, 1), generator=generator) < 0.5).expand(-1, size, size)
     foreign = torch.where(below, beyond.transpose(1, 2), beyond)
     foreign = foreign & (torch.rand((count, 1, 1), generator=generator) < MIXED_SHARE)
-    mixed = torch.where(foreign[:, None], photos.roll(1, 0), photos)
+    mixed = torch.where(foreign[:, None].to(photos.device), photos.roll(1, 0), photos)
     own = settings or RecolorSettings()
     little = RecolorSettings(*(0.0 if "share" in n else VARIED * v for n, v in vars(own).items()))
     return sample_recolorings(count, generator, little)(mixed)
@@ -186,5 +189,6 @@ def _cut(
     theta = torch.zeros(count, 2, 3)
     theta[:, 0, 0], theta[:, 1, 1] = sides[:, 0] * mirrored, sides[:, 1]
     theta[:, :, 2] = centres
+    theta = theta.to(photos.device)
     grid = functional.affine_grid(theta, [count, 3, size_px, size_px], align_corners=False)
     return functional.grid_sample(photos, grid, padding_mode="border", align_corners=False)

@@ -32,7 +32,7 @@ from augment.errors import SceneError
 from augment.render.buffers import ALPHA, RGB
 from augment.render.rasterize import rasterize
 from augment.render.sh import SH_C0
-from augment.scene import PosedGaussians, Scene
+from augment.scene import Gaussians, PosedGaussians, Scene
 from augment.style.content import select_views
 from augment.style.losses import GaussianColors
 
@@ -52,6 +52,11 @@ class SceneView:
     alpha: Float[Tensor, "1 H W"]
     sky: Float[Tensor, "3 H W"]
     parts: tuple[PosedGaussians, ...]
+
+    def to(self, device: str | torch.device) -> SceneView:
+        """The same on the device, where `rendered_pictures` then renders it."""
+        images = (self.picture.to(device), self.alpha.to(device), self.sky.to(device))
+        return SceneView(self.camera, *images, tuple(_moved(part, device) for part in self.parts))
 
 
 def views_of(
@@ -169,6 +174,19 @@ def _rendered(view: SceneView, color_map: Tensor) -> Tensor:
     assert output.rgb is not None
     sky = folded_pictures(view.sky[None], color_map[None])[0]
     return output.rgb.permute(2, 0, 1) + (1 - view.alpha) * sky
+
+
+def _moved(part: PosedGaussians, device: str | torch.device) -> PosedGaussians:
+    own = part.gaussians
+    there = Gaussians(
+        means=own.means.to(device),
+        quats=own.quats.to(device),
+        scales=own.scales.to(device),
+        opacities=own.opacities.to(device),
+        sh=own.sh.to(device),
+        semantic=None if own.semantic is None else own.semantic.to(device),
+    )
+    return dataclasses.replace(part, gaussians=there)
 
 
 def _seen(parts: Sequence[PosedGaussians], camera: Camera) -> tuple[PosedGaussians, ...]:

@@ -34,19 +34,14 @@ class Content:
 
 @dataclass(frozen=True, eq=False)
 class Draw:
-    """One step's contents and, item by item, their styles, float32 [B, 3, S, S] in about [0, 1]."""
+    """One step's contents and, item by item, their styles, float32 [B, 3, S, S] in about [0, 1];
+    all on the pool's device.
+    """
 
     contents: tuple[Content, ...]
     pictures: Float[Tensor, "B 3 S S"]
     colors: GaussianColors
     styles: Float[Tensor, "B 3 S S"]
-
-    def to(self, device: str) -> Draw:
-        """The same with its tensors on the device; contents stay where they are."""
-        if device == "cpu":
-            return self
-        colors = GaussianColors(self.colors.base.to(device), self.colors.bands.to(device))
-        return Draw(self.contents, self.pictures.to(device), colors, self.styles.to(device))
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +62,22 @@ class TrainingPool:
     @property
     def size_px(self) -> int:
         return self.views[0].picture.shape[1] if self.views else self.photos.shape[2]
+
+    def to(self, device: str | torch.device) -> TrainingPool:
+        """The same on the device, Gaussians too, so that a step copies nothing but the few numbers
+        that it draws: those come from the CPU's generators wherever pictures lie.
+        """
+        moved: dict[int, GaussianColors] = {}  # views of a scene share its colours
+
+        def there(content: Content) -> Content:
+            colors = content.colors
+            if id(colors) not in moved:
+                own = GaussianColors(colors.base.to(device), colors.bands.to(device))
+                moved[id(colors)] = own
+            view = None if content.view is None else content.view.to(device)
+            return Content(content.picture.to(device), moved[id(colors)], view)
+
+        return TrainingPool(tuple(map(there, self.views)), self.photos.to(device))
 
     def pictures(self) -> Float[Tensor, "P 3 S S"]:
         """Of views, then photos, float32."""
@@ -150,6 +161,7 @@ def generator_for(seed: int, step: int, use: str) -> torch.Generator:
 
 def _sample(colors: GaussianColors, count: int, generator: torch.Generator) -> GaussianColors:
     index = torch.randint(colors.base.shape[1], (count,), generator=generator)
+    index = index.to(colors.base.device)
     return GaussianColors(colors.base[:, index], colors.bands[:, index])
 
 

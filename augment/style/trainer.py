@@ -63,8 +63,9 @@ class StyleTrainer:
     """Trains `net` in place.
 
     pairs: None where there are no photos. frozen_norm: keep the statistics of batch normalisation,
-    of an encoder that came with some. device: torch's name of where to compute; bits are promised
-    on "cpu" alone.
+    of an encoder that came with some. device: torch's name of where to compute and to keep the
+    pool; on a GPU it must be the current one, whose kernels render. What a step draws is the same
+    everywhere; bits are promised on "cpu" alone.
     """
 
     def __init__(
@@ -80,7 +81,7 @@ class StyleTrainer:
         device: str = "cpu",
     ) -> None:
         self.net = net.to(device)
-        self.pool = pool
+        self.pool = pool.to(device)
         self.config = config
         self.step = 0
         self._features = features.to(device)
@@ -100,7 +101,7 @@ class StyleTrainer:
         """
         config, step = self.config, self.step
         self._train_mode()
-        with fixed_threads(), _own_generator(config.seed, step):
+        with fixed_threads(), _own_generator(config.seed, step, self._device):
             try:
                 terms = self._terms(step)
             except torch.linalg.LinAlgError as error:  # pyright: ignore[reportPrivateImportUsage]
@@ -168,7 +169,7 @@ class StyleTrainer:
             perturbed=config.perturbed,
             colors=config.colors,
             recolor=self._recolor,
-        ).to(self._device)
+        )
         warming_up = config.is_warming_up(step)
         terms = paper_terms(
             self.net, draw, self._features, only_cycle=warming_up, through=config.through
@@ -255,8 +256,7 @@ def _pictures(draw: Draw, maps: Tensor, through: Through) -> Tensor:
     pictures = list(folded)
     for number, content in enumerate(draw.contents):
         if content.view is not None:  # a photograph has no other way
-            own = rendered_pictures([content.view], maps[number : number + 1].cpu())
-            pictures[number] = own[0].to(maps.device)
+            pictures[number] = rendered_pictures([content.view], maps[number : number + 1])[0]
     return torch.stack(pictures)
 
 
@@ -276,8 +276,9 @@ def fixed_threads() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _own_generator(seed: int, step: int) -> Iterator[None]:
-    """torch's global generator, which encoders may use, as the step has it; then as it was."""
-    with torch.random.fork_rng(devices=[]):
+def _own_generator(seed: int, step: int, device: str) -> Iterator[None]:
+    """torch's global generators, which encoders may use, as the step has them; then as before."""
+    gpus = [torch.device(device)] if device.startswith("cuda") else []
+    with torch.random.fork_rng(devices=gpus):
         torch.manual_seed(generator_for(seed, step, "network").initial_seed())
         yield

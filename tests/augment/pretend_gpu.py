@@ -100,7 +100,7 @@ def _moved(tensor: torch.Tensor, args: tuple[Any, ...], kwargs: dict[str, Any]) 
         elif isinstance(arg, torch.Tensor):
             device = arg.device
             rest.append(arg.dtype)
-        else:
+        elif isinstance(arg, torch.dtype):  # not the bool that says whether to wait
             rest.append(arg)
     others = {k: v for k, v in kwargs.items() if k not in ("device", "non_blocking")}
     was_away = isinstance(tensor, AwayTensor)
