@@ -108,7 +108,7 @@ def shares_of(seconds: Mapping[str, float], held_up: int = 1) -> Shares | None:
     rendering, held = seconds[RENDER] / whole, seconds.get(HELD, 0.0) / whole
     rest = max(0.0, 1 - rendering - held)
     beside = {words: held_up * seconds.get(k, 0.0) / whole for k, words in _BESIDE.items()}
-    beside["starting, and having nothing to do"] = rest - sum(beside.values())
+    beside["workers that start or have nothing to do"] = rest - sum(beside.values())
     return Shares(
         rendering=rendering,
         awaiting=seconds.get(AWAIT, 0.0) / whole,

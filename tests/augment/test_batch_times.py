@@ -32,7 +32,9 @@ def test_who_is_busiest_bounds_the_job() -> None:
         "looking where snow can lie"
     )
     # Nothing of the job's own explains where four fifths went.
-    assert bound(render=2.0, held=0.0, open=1.0).bound_by == "starting, and having nothing to do"
+    assert (
+        bound(render=2.0, held=0.0, open=1.0).bound_by == "workers that start or have nothing to do"
+    )
 
 
 def test_shares_are_of_all_workers_from_begin_to_end() -> None:

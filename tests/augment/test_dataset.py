@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
 
@@ -28,7 +29,7 @@ from torch.utils.data import DataLoader
 from augment.batch.job import RenderJob, run_job
 from augment.batch.water_labels import WATER_TABLE, BoxWater
 from augment.dataset import SceneDataset, WeatherDataset, collate_frames
-from augment.errors import OutputError, SceneError
+from augment.errors import BackendUnavailable, OutputError, SceneError
 from augment.weather.flood_labels import hidden_pixels, submerged_fraction
 from recipes.flood import Flood
 from recipes.schema import Recipe
@@ -318,3 +319,24 @@ def test_live_rendering_by_the_library(tmp_path: Path) -> None:
     for index in range(2):
         assert_same_sample(live[index], files[index], but=("paths",))
     assert files[0]["image"].std() > 0
+
+
+def test_live_samples_take_no_gpu_unasked(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("augment.render.gpu.has_gpu", lambda: True)
+    live = SceneDataset(open_fake("fake:street"), make_recipe(), frames=[0])
+    assert live._backend == "cpu"
+
+
+def test_a_forked_worker_cannot_draw_on_the_gpu() -> None:
+    live = SceneDataset(
+        open_fake("fake:street"), make_recipe(), frames=[0], renderer=fake_render, backend="cuda"
+    )
+    assert len(list(DataLoader(live, batch_size=None))) == 2
+    forked = DataLoader(live, batch_size=None, num_workers=1, multiprocessing_context="fork")
+    with pytest.raises(BackendUnavailable, match=r"multiprocessing_context='spawn'"):
+        next(iter(forked))
+    pickled = bytes(ForkingPickler.dumps(live))  # what a worker started by spawn receives
+    live._process = 0  # as if it had been made in another process
+    with pytest.raises(BackendUnavailable, match="in a forked process"):
+        live[0]
+    assert pickle.loads(pickled)[0]["image"].shape == (3, 16, 24)
