@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numba
 import numpy as np
+from numba import prange
 
 from augment.cameras import Camera
 from augment.render.constants import ALPHA_MIN, TRANSMITTANCE_STOP, RasterSettings
 from augment.render.cpu_clip import C_AT, C_X, C_Y
+from augment.render.cpu_jit import kernel
 from augment.render.cuda_splats import TILE, CudaSplats, CudaTiles
 from augment.render.layout import FALL_Y, LEAN_X, LOG_OPACITY, MEAN_X, MEAN_Y, SHARP_X
 from augment.render.threads import select_thread_pool
@@ -65,8 +66,8 @@ def count_blends(
     )
 
 
-@numba.njit(parallel=True, error_model="numpy")
-def _count_tiles(records, cuts, members, starts, sizes, limits, used):  # type: ignore
+@kernel
+def _count_tiles(records, cuts, members, starts, sizes, limits, used):
     """Blends, pixels reached and entries reached of every tile; see layout.RECORD.
 
     used: uint8 [N], set to 1 for the splats of reached entries.
@@ -77,7 +78,7 @@ def _count_tiles(records, cuts, members, starts, sizes, limits, used):  # type: 
     tiles = len(starts) - 1
     done, reached = np.zeros(tiles, np.int64), np.zeros(tiles, np.int64)
     lasts = np.zeros(tiles, np.int64)
-    for tile in numba.prange(tiles):
+    for tile in prange(tiles):
         left, top = TILE * (tile % columns), TILE * (tile // columns)
         right, bottom = min(left + TILE, width), min(top + TILE, height)
         pixels = (right - left) * (bottom - top)
