@@ -8,9 +8,12 @@ import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 from batch_scenes import FakeLabels, fake_render, make_recipe, open_fake, tree_digest
 from pending_views import Gpu
+from pretend_gpu import pretended_gpu
 
 from augment.batch import runner
 from augment.batch.job import JobResult, RenderJob, run_job
@@ -194,3 +197,33 @@ def test_what_fails_after_a_task_stops_the_pump() -> None:
         pump.submit(lambda: 4)
     with pytest.raises(OutputError, match="the disk is full"):
         pump.close()
+
+
+def test_a_job_on_a_gpu_gives_the_pictures_of_the_cpu(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Drawn as jobs draw there, one view in flight, and one by one: the same bytes."""
+    pytest.importorskip("triton")
+    from augment.apply import render_view
+
+    def of_job(folder: str, backend: str, renderer=None) -> RenderJob:
+        job = RenderJob(
+            "fake:street", [make_recipe()], tmp_path / folder, frames=[1], backend=backend
+        )
+        assert run(job, renderer).failures == ()
+        return job
+
+    with pretended_gpu(monkeypatch):
+        of_job("begun", "cuda")
+        of_job("drawn", "cuda", render_view)
+    of_job("cpu", "cpu")
+    assert tree_digest(tmp_path / "begun") == tree_digest(tmp_path / "drawn")
+    folder = tmp_path / "begun/street"
+    images = sorted(folder.rglob("*.png"))
+    assert len(images) == 8
+    for path in images:
+        theirs = tmp_path / "cpu/street" / path.relative_to(folder)
+        ours = cv2.imread(str(path), cv2.IMREAD_UNCHANGED).astype(int)
+        # Sums in another order: a step of 8 bits, or of 1/256 m.
+        difference = np.abs(ours - cv2.imread(str(theirs), cv2.IMREAD_UNCHANGED)).max()
+        assert difference <= (0 if "semantic" in str(path) or "instance" in str(path) else 1)
