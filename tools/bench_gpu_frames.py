@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Mapping
 from typing import Any
@@ -10,7 +11,7 @@ import torch
 
 from augment.apply import begin_view, render_buffers, render_view
 from augment.cameras import Camera
-from augment.plan import make_plan
+from augment.plan import Plan, make_plan
 from augment.scene import Scene
 from augment.views import WeatheredBuffers
 from recipes.knobs import Value, knobs_of, with_settings
@@ -24,6 +25,7 @@ from tools.bench_pairs import spread, spread_ratio
 from tools.bench_snow_cost import snow_recipe
 from tools.gpu_clock import Timing, peak_gpu_mib, times_in_turns
 from tools.trade_cases import trade_recipe
+from tools.trade_measure import dressed
 
 BACKEND = "cuda"
 CLEAN, SMOG, FLOOD, SCREEN = "clean", "smog", "flood balanced", "flood balanced, screen space"
@@ -70,35 +72,44 @@ def bench_frames(
     """Times of every recipe's frame, in turns. ms: on the GPU, to finished floats there.
     over_clean: turn by turn. delivered: as `render` takes them, 8 bits on the host.
 
-    The first frame of each lays snow and finds styles, which is no frame's time: first_s.
+    The first frame of each compiles, copies the scene and lays snow, which is no frame's time:
+    first_s.
     """
     plans = {name: make_plan(recipe, scene) for name, recipe in recipes.items()}
 
-    def frame(name: str, backend: str = BACKEND) -> WeatheredBuffers:
-        return render_buffers(scene, camera, plans[name], backend=backend)
+    def frame(name: str, own: Scene, backend: str = BACKEND) -> WeatheredBuffers:
+        return render_buffers(own, camera, plans[name], backend=backend)
 
     rows: dict[str, dict[str, Any]] = {}
-    for name in recipes:
+    for name, recipe in recipes.items():  # one after the other: nobody else's snow counts as memory
+        own = dressed(scene, recipe, BACKEND)
         start = time.perf_counter()
-        frame(name)
+        frame(name, own)
         timing.clock.wait()
         first_s = time.perf_counter() - start
-        memory = peak_gpu_mib(lambda name=name: frame(name))
+        memory = peak_gpu_mib(functools.partial(frame, name, own))
         rows[name] = {
             "first_s": first_s,
             "peak_mib": None if memory is None else memory[0],
             "frame_mib": None if memory is None else memory[1],
-            "same_bits": torch.equal(frame(name).rgb.cpu(), frame(name).rgb.cpu()),
-            "floor": _floor(scene, camera, plans[name], ceilings),
+            "same_bits": torch.equal(frame(name, own).rgb.cpu(), frame(name, own).rgb.cpu()),
+            "floor": _floor(own, camera, plans[name], ceilings),
         }
-    times = times_in_turns({name: lambda name=name: frame(name) for name in recipes}, timing)
+        del own
+    scenes = {name: dressed(scene, recipe, BACKEND) for name, recipe in recipes.items()}
+    actions = {name: functools.partial(frame, name, own) for name, own in scenes.items()}
+    for action in actions.values():  # lays what stays with its scene
+        action()
+    times = times_in_turns(actions, timing)
     for name, row in rows.items():
         row["ms"] = spread(times[name])
         row["over_clean"] = spread_ratio(times[name], times[CLEAN])
-        row["delivered"] = delivered(scene, camera, recipes[name], timing)
+        row["delivered"] = delivered(scenes[name], camera, recipes[name], timing)
     if beside_cpu:
-        for name, row in rows.items():
-            row["against_cpu"] = difference(frame(name).rgb, frame(name, "cpu").rgb)
+        for name, own in scenes.items():
+            rows[name]["against_cpu"] = difference(
+                frame(name, own).rgb, frame(name, own, "cpu").rgb
+            )
     return {
         "camera": f"{camera.name} {camera.width}x{camera.height}, focal length {camera.fx:.0f} px",
         "gaussians": sum(len(part.gaussians) for part in scene.parts_for(camera)),
@@ -107,7 +118,7 @@ def bench_frames(
     }
 
 
-def _floor(scene: Scene, camera: Camera, plan: Any, ceilings: Ceilings) -> dict[str, Any]:
+def _floor(scene: Scene, camera: Camera, plan: Plan, ceilings: Ceilings) -> dict[str, Any]:
     from tools.bench_gpu_floor import frame_floor, noted_passes
 
     with noted_passes() as passes:

@@ -82,8 +82,8 @@ class Stage:
         key = _dress(recipe)
         if key not in self._dressed:
             if not self._dressed:  # kernels and tables that are loaded once belong to no scene
-                self._kept(self._placed(recipe), recipe)
-            scene = self._dressed[key] = self._placed(recipe)
+                self._kept(dressed(self._bare, recipe, self.backend), recipe)
+            scene = self._dressed[key] = dressed(self._bare, recipe, self.backend)
             self.kept_mib[key] = self._kept(scene, recipe)
         return self._dressed[key]
 
@@ -91,23 +91,26 @@ class Stage:
         """MiB that stay with the scene after the first frame: the snow's splats, styled colours."""
         return self.kept_mib[_dress(recipe)]
 
-    def _placed(self, recipe: Recipe) -> Scene:
-        """What is the same for all values of a knob is looked for in the bare scene, once."""
-        scene = dataclasses.replace(self._bare)
-        snow, style = recipe.weather.snow, recipe.style
-        if snow is not None:
-            settings = placement_settings(snow)
-            remember_bed(scene, settings, bed_of(self._bare, settings))
-        if style is not None:
-            usual = style.model_copy(update={"evaluated": "color"})
-            remember_maps(scene, style, style_maps(self._bare, usual))
-        return scene
-
     def _kept(self, scene: Scene, recipe: Recipe) -> float | None:
         before = _resident_mib(self.backend)
         render_trial(scene, self._view.camera.scaled(SMALL), recipe, self.backend)
         after = _resident_mib(self.backend)
         return None if before is None or after is None else max(0.0, after - before)
+
+
+def dressed(bare: Scene, recipe: Recipe, backend: str) -> Scene:
+    """A scene of the same arrays for one recipe's snow and style to stay with. Where snow can lie
+    and what a style maps colours to is looked for in the bare scene, once.
+    """
+    scene = dataclasses.replace(bare)
+    snow, style = recipe.weather.snow, recipe.style
+    if snow is not None:
+        settings = placement_settings(snow)
+        remember_bed(scene, settings, bed_of(bare, settings, backend=backend))
+    if style is not None:
+        usual = style.model_copy(update={"evaluated": "color"})
+        remember_maps(scene, style, style_maps(bare, usual))
+    return scene
 
 
 def measure_recipe(
