@@ -94,10 +94,11 @@ def _basis(x, y, z, FUNCTIONS: tl.constexpr):
         y4, y5, y7 = xy * C2_XY, y * z * -C2_XY, x * z * -C2_XY
         y6, y8 = (2.0 * zz - xx - yy) * C2_ZZ, (xx - yy) * C2_XX
         if FUNCTIONS > 9:
-            y9, y15 = y * (3.0 * xx - yy) * -C3_CUBIC, x * (xx - 3.0 * yy) * -C3_CUBIC
+            y9 = y * tl.fma(3.0, xx, -yy) * -C3_CUBIC
+            y15 = x * tl.fma(-3.0, yy, xx) * -C3_CUBIC
             y10, y14 = xy * z * C3_XYZ, z * (xx - yy) * C3_ZXX
             y11, y13 = y * (4.0 * zz - xx - yy) * -C3_ZZ, x * (4.0 * zz - xx - yy) * -C3_ZZ
-            y12 = z * (2.0 * zz - 3.0 * (xx + yy)) * C3_ZZZ
+            y12 = z * tl.fma(-3.0, xx + yy, 2.0 * zz) * C3_ZZZ
     return y0, y1, y2, y3, y4, y5, y6, y7, y8, y9, y10, y11, y12, y13, y14, y15
 
 

@@ -1,0 +1,376 @@
+"""The GPU's projection: its splats against the definition, and against those of the CPU's kernels.
+
+Without a GPU its kernel is interpreted.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+
+from augment.render import cpu, cuda_inputs, gpu, layout
+from augment.render.clip import ABOVE, BELOW, UNCUT, HeightClip
+from augment.render.constants import RasterSettings
+from augment.render.cpu_clip import C_REACH
+from augment.render.cpu_inputs import gather_inputs as gather_cpu_inputs
+from augment.render.cpu_scratch import borrowed_scratch
+from augment.render.cuda_inputs import BLOCK, gather_inputs
+from augment.render.cuda_project import project
+from augment.render.cuda_splats import HIDDEN, TILE, CudaSplats
+from augment.scene import Gaussians, PosedGaussians
+from augment.weather.smog import SmogMedium
+from tests.augment.drawn_splats import drawn_splats
+from tests.augment.examples import drawing
+from tests.augment.extremes import wild_gaussians
+from tests.augment.hard_scenes import (
+    KINDS,
+    SMOGS,
+    colour_maps,
+    hard_gaussians,
+    in_float64,
+    snow_light,
+    wide_camera,
+)
+from tests.augment.pretend_gpu import AwayTensor, pretended_gpu
+from tests.scenes import camera_ahead, one_gaussian, random_gaussians, slight_pose, stack
+
+DEFAULT = RasterSettings()
+WEATHERS = (*SMOGS, ABOVE, BELOW, "light", "maps")
+# Relative errors of float32 against float64: of what is far from 0, and, of slopes and centres
+# about 0, absolute. At least twice the worst of the scenes here.
+CLOSE, NEAR_ZERO = 1e-4, 2e-4
+FLIPS = 2  # splats on the other side of a threshold, or in one more tile
+
+
+def splats_of(parts, camera, settings=DEFAULT, smog=None, clip=None, *, with_color=True):
+    """What the GPU projects, on the CPU; NaN in rows that nobody may read."""
+    inputs = gather_inputs(parts, camera, settings, smog, clip, with_color=with_color)
+    splats = project(inputs)
+    fields = {f.name: getattr(splats, f.name) for f in dataclasses.fields(splats)}
+    fields = {name: None if v is None else v.cpu() for name, v in fields.items()}
+    for name in ("records", "cuts", "lights"):
+        if fields[name] is not None:
+            fields[name][fields["counts"] == 0] = math.nan
+    fields["rects"][fields["counts"] == 0] = -1
+    return CudaSplats(**fields)
+
+
+def bits(tensor: torch.Tensor) -> torch.Tensor:
+    return tensor.contiguous().view(torch.int32)
+
+
+def assert_close(actual: CudaSplats, expected: CudaSplats, flips: int = FLIPS) -> None:
+    """The same splats, but for rounding and for a few at a threshold."""
+    drawn = (actual.counts > 0) & (expected.counts > 0)
+    assert int(((actual.counts > 0) != (expected.counts > 0)).sum()) <= flips
+    assert bool((actual.keys[actual.counts == 0] == HIDDEN).all())
+    assert int((actual.rects[drawn] != expected.rects[drawn]).any(1).sum()) <= flips
+    same = drawn & (actual.rects == expected.rects).all(1)
+    assert torch.equal(actual.counts[same], expected.counts[same])
+    z = [splats.keys[drawn].view(torch.float32) for splats in (actual, expected)]
+    torch.testing.assert_close(*z, rtol=3e-7, atol=0)
+    ids = [bits(splats.records[drawn, layout.SPLAT_ID]) for splats in (actual, expected)]
+    assert torch.equal(*ids)
+    for name in ("records", "cuts", "lights"):
+        ours, theirs = getattr(actual, name), getattr(expected, name)
+        assert (ours is None) == (theirs is None), name
+        if ours is None:
+            continue
+        for column in range(ours.shape[1] if name != "cuts" else C_REACH + 1):
+            if (name, column) != ("records", layout.SPLAT_ID):
+                torch.testing.assert_close(
+                    ours[drawn, column], theirs[drawn, column], rtol=CLOSE, atol=NEAR_ZERO,
+                    msg=lambda text, at=(name, column): f"{at}: {text}",
+                )  # fmt: skip
+
+
+# ---- against the definition ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("weather", WEATHERS)
+def test_splats_are_the_definitions(kind, weather):
+    seed = KINDS.index(kind) + 10 * WEATHERS.index(weather)
+    camera = wide_camera((60.0, 10.0, 120.0)[seed % 3], at=(3.1, -2.2, 0.4), turn=0.2 * seed)
+    gaussians = hard_gaussians(kind, camera, 100, seed=seed, sh_degree=3)
+    part = PosedGaussians(gaussians, is_snow=bool(seed % 2))
+    level = 0.397 if kind == "near" else 0.3
+    clip = HeightClip(level, weather) if weather in (ABOVE, BELOW) else None
+    if weather == "light":
+        part = dataclasses.replace(part, shading=snow_light(100, seed))
+    if weather == "maps":
+        part = dataclasses.replace(part, color_maps=colour_maps(seed))
+    smog = SMOGS.get(weather)
+    actual = splats_of([part], camera, DEFAULT, smog, clip)
+    expected = drawn_splats(in_float64([part]), camera, DEFAULT, clip, smog)
+    assert int((actual.counts > 0).sum()) > 20
+    assert_close(actual, expected)
+
+
+SETTINGS = {
+    "antialiased": RasterSettings(antialiased=True),
+    "near": RasterSettings(near_m=3.0),
+    "large ones": RasterSettings(radius_clip_px=2.5),
+}
+
+
+@pytest.mark.parametrize("settings", SETTINGS.values(), ids=SETTINGS)
+def test_settings(settings):
+    camera, part = camera_ahead(), PosedGaussians(random_gaussians(60, seed=3))
+    actual = splats_of([part], camera, settings)
+    assert 10 < int((actual.counts > 0).sum()) < int((splats_of([part], camera).counts > 0).sum())
+    assert_close(actual, drawn_splats(in_float64([part]), camera, settings), flips=0)
+
+
+@pytest.mark.parametrize("most", [0, 1, 2, None])
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_spherical_harmonics_of_every_degree(degree, most):
+    camera, settings = camera_ahead(), RasterSettings(sh_degree=most)
+    part = PosedGaussians(random_gaussians(40, seed=3, sh_degree=degree))
+    actual = splats_of([part], camera, settings)
+    assert_close(actual, drawn_splats(in_float64([part]), camera, settings), flips=0)
+
+
+@pytest.mark.parametrize("weather", ["clear", ABOVE, "light"])
+def test_an_orthographic_camera(weather):
+    camera = dataclasses.replace(camera_ahead(focal=6.0), is_orthographic=True)
+    part = PosedGaussians(random_gaussians(80, seed=5), slight_pose())
+    if weather == "light":
+        part = dataclasses.replace(part, shading=snow_light(80))
+    clip = None if weather != ABOVE else HeightClip(0.2, ABOVE)
+    assert_close(
+        splats_of([part], camera, clip=clip), drawn_splats(in_float64([part]), camera, None, clip)
+    )
+
+
+@pytest.mark.parametrize("keep", [ABOVE, BELOW])
+def test_what_a_clip_cannot_reach_is_not_drawn(keep):
+    camera, part = camera_ahead(), PosedGaussians(random_gaussians(100, seed=6))
+    clip = HeightClip(0.1, keep, reach_m=0.5, overlaps=True)
+    actual = splats_of([part], camera, clip=clip)
+    assert_close(actual, drawn_splats(in_float64([part]), camera, None, clip))
+    whole = splats_of([part], camera)
+    assert 0 < int((actual.counts > 0).sum()) < int((whole.counts > 0).sum())
+
+
+@pytest.mark.parametrize("rows", ["classes", "rows", "one map"])
+def test_maps_by_class_by_row_or_one_for_all(rows):
+    camera, gaussians = camera_ahead(), random_gaussians(70, seed=7)
+    # Rows that are none mean the first map.
+    numbers = torch.arange(70, dtype=torch.int16) % 9 - 2
+    maps = colour_maps(2)
+    part = PosedGaussians(dataclasses.replace(gaussians, semantic=numbers), color_maps=maps)
+    if rows == "rows":
+        part = dataclasses.replace(part, color_rows=numbers.flip(0))
+    if rows == "one map":
+        part = dataclasses.replace(part, color_maps=maps[2:3])
+    assert_close(splats_of([part], camera), drawn_splats(in_float64([part]), camera))
+
+
+# ---- against the CPU's kernels -------------------------------------------------------------------
+
+
+def cpu_splats(parts, camera, settings=DEFAULT, smog=None, clip=None) -> CudaSplats:
+    """What the CPU's kernels project, as the GPU lays it out."""
+    inputs = gather_cpu_inputs(parts, camera, settings, smog, clip, with_color=True)
+    count = sum(len(part.gaussians) for part in parts)
+    records = torch.full((count, layout.RECORD), math.nan)
+    keys = torch.full((count,), HIDDEN, dtype=torch.int32)
+    rects, counts = torch.full((count, 2), -1).int(), torch.zeros(count, dtype=torch.int32)
+    cuts = torch.full((count, 8), math.nan) if clip is not None else None
+    lights = torch.full((count, 9), math.nan) if inputs.modes[layout.M_LIGHT] else None
+    with borrowed_scratch() as scratch:
+        tiles = cpu.Tiles(camera, {}, settings, scratch)
+        depths, _ = cpu.rank(inputs, camera, scratch)
+        found = cpu.project(inputs, depths, (1, layout.BINS), tiles, scratch)
+        rows = found.records.reshape(-1, layout.RECORD)
+        for block, filled in enumerate(found.found):
+            for slot in range(block * layout.BLOCK, block * layout.BLOCK + int(filled)):
+                at = int(rows[slot, layout.SPLAT_ID].view(np.int32))
+                records[at] = torch.from_numpy(rows[slot].copy())
+                keys[at] = int(found.keys[slot])
+                c0, r0, c1, r1 = (
+                    int(found.rects[slot]) >> shift & 0xFFFF for shift in (0, 16, 32, 48)
+                )
+                rects[at] = torch.tensor([c0 + (r0 << 16), c1 + (r1 << 16)])
+                counts[at] = (c1 - c0 + 1) * (r1 - r0 + 1)
+                for array, own in ((cuts, found.cuts), (lights, found.lights)):
+                    if array is not None:
+                        line = own.reshape(-1, array.shape[1])[slot]
+                        array[at] = torch.from_numpy(line.copy())
+    return CudaSplats(records, keys, rects, counts, cuts, lights)
+
+
+def street_of_parts() -> list[PosedGaussians]:
+    """Parts of all kinds: of every degree, posed, snow, empty, lit, mapped, larger than a block."""
+    one = random_gaussians(150, seed=1, sh_degree=3)
+    classes = torch.arange(150, dtype=torch.int16) % 6
+    few = [random_gaussians(40, seed=degree, sh_degree=degree) for degree in range(4)]
+    return [
+        PosedGaussians(dataclasses.replace(one, semantic=classes), color_maps=colour_maps()),
+        PosedGaussians(few[0], slight_pose(), instance_id=1),
+        PosedGaussians(Gaussians.empty(3), slight_pose(), instance_id=2),
+        PosedGaussians(few[1], slight_pose((0.5, 0.1, 0.2)), is_snow=True, shading=snow_light(40)),
+        PosedGaussians(few[2], color_maps=colour_maps(3)[1:2]),
+        PosedGaussians(few[3], slight_pose((1.0, 0.0, 0.0)), is_snow=True),
+    ]
+
+
+@pytest.mark.parametrize("weather", ["clear", "uniform", "layered", ABOVE])
+def test_many_parts_are_the_cpus_in_one_launch(weather):
+    camera, parts = camera_ahead(), street_of_parts()
+    clip, smog = (HeightClip(0.1, ABOVE) if weather == ABOVE else None), SMOGS.get(weather)
+    actual = splats_of(parts, camera, smog=smog, clip=clip)
+    assert_close(actual, cpu_splats(parts, camera, smog=smog, clip=clip))
+    assert len(actual.keys) == 310 > BLOCK
+    # Lights of splats of one colour are 0.
+    lit = torch.zeros(310, dtype=torch.bool)
+    lit[190:230] = True
+    drawn = actual.counts > 0
+    assert actual.lights is not None
+    assert bool((actual.lights[drawn & ~lit] == 0).all())
+    assert bool((actual.lights[drawn & lit][:, 6:].amax(1) > 0).all())
+
+
+def test_parts_do_not_touch_each_other():
+    """A part's splats have the same bits wherever in the list it stands."""
+    camera, parts = camera_ahead(), street_of_parts()
+    together = splats_of(parts, camera)
+    first = 0
+    for part in parts:
+        last = first + len(part.gaussians)
+        alone = splats_of([part], camera)
+        ours = together.records[first:last]
+        assert torch.equal(together.rects[first:last], alone.rects)
+        assert torch.equal(together.keys[first:last], alone.keys)
+        others = [field for field in range(layout.RECORD) if field != layout.SPLAT_ID]
+        assert torch.equal(bits(ours[:, others]), bits(alone.records[:, others]))
+        first = last
+
+
+# ---- what must not change a bit ------------------------------------------------------------------
+
+
+def test_smog_that_is_not_there_changes_nothing():
+    camera, parts = camera_ahead(), street_of_parts()[3:]
+    clear = splats_of(parts, camera)
+    for scale_height in (None, 2.0):
+        none = SmogMedium(0.0, (0.8, 0.7, 0.5), scale_height_m=scale_height)
+        foggy = splats_of(parts, camera, smog=none)
+        assert torch.equal(bits(foggy.records), bits(clear.records))
+        assert foggy.lights is not None and clear.lights is not None
+        assert torch.equal(bits(foggy.lights), bits(clear.lights))
+
+
+def test_places_do_not_depend_on_what_else_is_asked_for():
+    camera, parts = camera_ahead(), street_of_parts()[3:]
+    clear = splats_of(parts, camera)
+    colours = [layout.RED, layout.GREEN, layout.BLUE]
+    places = [field for field in range(layout.RECORD) if field not in colours]
+    for other in (
+        splats_of(parts, camera, with_color=False),
+        splats_of(parts, camera, clip=UNCUT),
+        splats_of(parts, camera, smog=SMOGS["layered"]),
+    ):
+        assert torch.equal(bits(other.records[:, places]), bits(clear.records[:, places]))
+        assert torch.equal(other.keys, clear.keys) and torch.equal(other.rects, clear.rects)
+    assert splats_of(parts, camera, with_color=False).lights is None
+
+
+def test_ties_stay_ties():
+    """The same mean has the same z at any place of the list."""
+    one = one_gaussian((4.2, 0.3, -0.1))
+    gaussians = stack(
+        random_gaussians(37, seed=8, sh_degree=0),
+        one,
+        random_gaussians(150, seed=9, sh_degree=0),
+        one,
+    )
+    splats = splats_of([PosedGaussians(gaussians, slight_pose())], camera_ahead())
+    assert splats.keys[37] == splats.keys[-1] != HIDDEN
+    assert torch.equal(splats.rects[37], splats.rects[-1])
+
+
+# ---- extremes ------------------------------------------------------------------------------------
+
+
+@drawing(8)
+@given(wild_gaussians())
+def test_whatever_is_drawn_is_finite(gaussians):
+    camera = camera_ahead()
+    columns, rows = -(-camera.width // TILE), -(-camera.height // TILE)
+    for clip, settings in ((None, DEFAULT), (UNCUT, RasterSettings(antialiased=True))):
+        smog = SMOGS["layered"]
+        splats = splats_of([PosedGaussians(gaussians)], camera, settings, smog, clip)
+        drawn = splats.counts > 0
+        assert bool(torch.isfinite(splats.records[drawn]).all())
+        assert bool((splats.records[drawn, layout.SHARP_X] > 0).all())
+        assert splats.cuts is None or bool(torch.isfinite(splats.cuts[drawn]).all())
+        corners = splats.rects[drawn]
+        assert bool((corners & 0xFFFF < columns).all()) and bool((corners >> 16 < rows).all())
+        assert bool((corners >= 0).all())
+
+
+def test_nothing_at_all():
+    splats = splats_of([PosedGaussians(Gaussians.empty(3))], camera_ahead())
+    assert len(splats.keys) == 0 and splats.records.shape == (0, layout.RECORD)
+
+
+def test_nothing_that_is_seen():
+    behind = one_gaussian((-4.0, 0.0, 0.0))
+    faint = one_gaussian(opacity=0.003)
+    splats = splats_of([PosedGaussians(stack(behind, faint))], camera_ahead())
+    assert splats.counts.tolist() == [0, 0] and splats.keys.tolist() == [HIDDEN, HIDDEN]
+
+
+# ---- on a GPU ------------------------------------------------------------------------------------
+
+
+def test_all_that_a_kernel_reads_lies_on_the_gpu(monkeypatch):
+    camera, parts = camera_ahead(), street_of_parts()
+    here = splats_of(parts, camera, smog=SMOGS["layered"], clip=HeightClip(0.1, ABOVE))
+    with pretended_gpu(monkeypatch):
+        uploads = []
+        upload = cuda_inputs.upload
+        monkeypatch.setattr(cuda_inputs, "upload", lambda a: uploads.append(a) or upload(a))
+        for _ in range(2):
+            inputs = gather_inputs(
+                parts, camera, DEFAULT, SMOGS["layered"], HeightClip(0.1, ABOVE), with_color=True
+            )
+            splats = project(inputs)
+        tensors = [inputs.table, inputs.views, inputs.block_parts, *inputs.tensors]
+        tensors += [getattr(splats, f.name) for f in dataclasses.fields(splats)]
+        assert all(isinstance(tensor, AwayTensor) for tensor in tensors)
+        # One small upload a frame; the Gaussians are copied once.
+        assert len(uploads) == 2 and uploads[0].nbytes < 10_000
+        again = gather_inputs(parts, camera, DEFAULT, None, with_color=True)
+        old = {gpu.address_of(tensor) for tensor in inputs.tensors}
+        assert {gpu.address_of(tensor) for tensor in again.tensors} <= old
+        found = CudaSplats(*(None if t is None else t.cpu() for t in tensors[-6:]))
+    drawn = here.counts > 0
+    assert torch.equal(found.counts, here.counts) and torch.equal(found.keys, here.keys)
+    assert torch.equal(bits(found.records[drawn]), bits(here.records[drawn]))
+    assert found.cuts is not None and found.lights is not None
+    assert torch.equal(bits(found.cuts[drawn]), bits(here.cuts[drawn]))
+    assert torch.equal(bits(found.lights[drawn]), bits(here.lights[drawn]))
+
+
+def test_gaussians_within_a_larger_tensor_on_the_gpu(monkeypatch):
+    """As a trainer holds them: they need not begin at a multiple of 16 bytes, nor be contiguous."""
+    camera, gaussians = camera_ahead(), random_gaussians(50, seed=4)
+    expected = splats_of([PosedGaussians(gaussians)], camera)
+    names = ("means", "quats", "scales", "opacities", "sh")
+    with pretended_gpu(monkeypatch):
+        given = {}
+        for name in names:
+            values = getattr(gaussians, name)
+            flat = torch.cat([torch.zeros(1), values.flatten()]).to(gpu.gpu_device())
+            given[name] = flat[1:].view(values.shape)
+        given["quats"] = given["quats"].t().contiguous().t()
+        splats = splats_of([PosedGaussians(Gaussians(**given))], camera)
+    assert torch.equal(bits(splats.records), bits(expected.records))
