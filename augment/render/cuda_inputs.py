@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -14,9 +15,9 @@ from augment.cameras import Camera
 from augment.render import layout
 from augment.render.clip import HeightClip
 from augment.render.constants import RasterSettings
-from augment.render.gpu import address_of, resident, upload
+from augment.render.gpu import address_of, gpu_device, resident, upload
 from augment.render.part_views import raster_modes, views_of
-from augment.scene import PosedGaussians
+from augment.scene import Gaussians, PosedGaussians
 from augment.weather.smog import SmogMedium
 
 BLOCK = 128  # Gaussians that one program projects, all of one part
@@ -60,14 +61,16 @@ def gather_inputs(
     """Addresses and numbers of all parts. Tensors are copied to the GPU the first time only; per
     frame there is one small upload.
     """
+    device = gpu_device()
     tensors: list[Tensor] = []
-    table = np.zeros((len(parts), COLUMNS), np.int64)
-    for row, part in zip(table, parts, strict=True):
-        for column, tensor in _read_of(part).items():
-            own = _aligned(resident(tensor))
-            tensors.append(own)
-            row[column] = address_of(own)
-        row[T_COUNT], row[T_FUNCTIONS] = part.gaussians.sh.shape[:2]
+    rows: list[list[int]] = []
+    for part in parts:
+        gaussians = _resident_gaussians(part.gaussians, device)
+        others = [None if tensor is None else _readable(tensor) for tensor in _looks(part)]
+        tensors += gaussians.tensors + [tensor for tensor in others if tensor is not None]
+        addresses = [0 if tensor is None else address_of(tensor) for tensor in others]
+        rows.append([*gaussians.addresses, *addresses, *part.gaussians.sh.shape[:2], 0, 0])
+    table = np.array(rows, np.int64)
     blocks = -(-table[:, T_COUNT] // BLOCK)
     for column, sizes in ((T_FIRST, table[:, T_COUNT]), (T_BLOCK, blocks)):
         table[1:, column] = np.cumsum(sizes[:-1])
@@ -88,26 +91,47 @@ def gather_inputs(
     )
 
 
-def _aligned(tensor: Tensor) -> Tensor:
-    """The tensor, or a copy of it where it begins at no multiple of 16 bytes, as within another."""
-    return tensor if address_of(tensor) % 16 == 0 else tensor.clone()
+@dataclass(frozen=True, eq=False)
+class _Resident:
+    """Gaussians on the GPU, as `layout` lists what a part is read from. versions: of the tensors
+    when that was.
+    """
+
+    device: torch.device
+    versions: list[int]
+    tensors: list[Tensor]
+    addresses: list[int]
 
 
-def _read_of(part: PosedGaussians) -> dict[int, Tensor]:
-    """What a part is read from, by its column in the table."""
-    g = part.gaussians
-    floats = {
-        layout.A_MEANS: g.means,
-        layout.A_QUATS: g.quats,
-        layout.A_SCALES: g.scales,
-        layout.A_OPACITIES: g.opacities,
-        layout.A_SH: g.sh,
-    }
-    if part.shading is not None:
-        floats[layout.A_SLOPES] = part.shading.slopes
-    if part.color_maps is not None:
-        floats[layout.A_MAPS] = part.color_maps
-    read = {column: tensor.to(torch.float32) for column, tensor in floats.items()}
-    if part.map_rows is not None:
-        read[layout.A_ROWS] = part.map_rows
-    return read
+# Of scenes' parts, which stay the same from frame to frame: asking for every tensor of every part
+# anew would take longer than the GPU takes to project them.
+_known: weakref.WeakKeyDictionary[Gaussians, _Resident] = weakref.WeakKeyDictionary()
+
+
+def _resident_gaussians(gaussians: Gaussians, device: torch.device) -> _Resident:
+    g = gaussians
+    given = (g.means, g.quats, g.scales, g.opacities, g.sh)
+    versions = [tensor._version for tensor in given]
+    known = _known.get(g)
+    if known is not None and known.versions == versions and known.device == device:
+        return known
+    tensors = [_readable(tensor) for tensor in given]
+    known = _Resident(device, versions, tensors, [address_of(tensor) for tensor in tensors])
+    _known[g] = known
+    return known
+
+
+def _looks(part: PosedGaussians) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
+    """What a part is read from besides its Gaussians, as `layout` lists it."""
+    slopes = None if part.shading is None else part.shading.slopes
+    return slopes, part.color_maps, part.map_rows
+
+
+def _readable(tensor: Tensor) -> Tensor:
+    """Float32, or int16 as it is, on the GPU; a copy where it would begin at no multiple of 16
+    bytes, as within another tensor.
+    """
+    if tensor.is_floating_point() and tensor.dtype != torch.float32:
+        tensor = tensor.to(torch.float32)
+    own = resident(tensor)
+    return own if address_of(own) % 16 == 0 else own.clone()

@@ -39,8 +39,12 @@ def _obstacle() -> str | None:
     return f"torch {torch.__version__} sees no GPU; use backend 'cpu'"
 
 
+@functools.cache
 def is_interpreted() -> bool:
-    """Whether Triton interprets kernels (TRITON_INTERPRET=1) instead of compiling them."""
+    """Whether Triton interprets kernels (TRITON_INTERPRET=1) instead of compiling them.
+
+    Decided once: a kernel is of one kind or the other from the time it is imported.
+    """
     import triton
 
     return bool(triton.knobs.runtime.interpret)
