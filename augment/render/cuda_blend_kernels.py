@@ -15,32 +15,13 @@ import triton.language as tl
 from augment.render import constants, cpu_clip, cpu_shading, cuda_splats, layout
 from augment.render.cuda_mode_kernels import add_sample, can_grow, heaviest_mode
 
+# Records and cuts are read four numbers at a time, in their order (the launch module checks it).
 TILE = tl.constexpr(cuda_splats.TILE)
 DEPTH_EPS = tl.constexpr(constants.DEPTH_EPS)
 RECORD, CUT, LINES = (
     tl.constexpr(layout.RECORD),
     tl.constexpr(cpu_clip.CUT),
     tl.constexpr(cpu_shading.LINES),
-)
-MEAN_X, MEAN_Y = tl.constexpr(layout.MEAN_X), tl.constexpr(layout.MEAN_Y)
-LEAN_X, SHARP_X = tl.constexpr(layout.LEAN_X), tl.constexpr(layout.SHARP_X)
-FALL_Y, LOG_OPACITY = tl.constexpr(layout.FALL_Y), tl.constexpr(layout.LOG_OPACITY)
-LEAN_Y, DEPTH, SPLAT_ID, IS_SNOW = (
-    tl.constexpr(layout.LEAN_Y),
-    tl.constexpr(layout.DEPTH),
-    tl.constexpr(layout.SPLAT_ID),
-    tl.constexpr(layout.IS_SNOW),
-)
-RED, GREEN, BLUE = (
-    tl.constexpr(layout.RED),
-    tl.constexpr(layout.GREEN),
-    tl.constexpr(layout.BLUE),
-)
-C_AT, C_X, C_Y = tl.constexpr(cpu_clip.C_AT), tl.constexpr(cpu_clip.C_X), tl.constexpr(cpu_clip.C_Y)
-C_RIGHT, C_DOWN, C_REACH = (
-    tl.constexpr(cpu_clip.C_RIGHT),
-    tl.constexpr(cpu_clip.C_DOWN),
-    tl.constexpr(cpu_clip.C_REACH),
 )
 L_FACING, L_X, L_Y, L_WRAP = (
     tl.constexpr(cpu_shading.L_FACING),
@@ -55,7 +36,7 @@ L_RED, L_GREEN, L_BLUE = (
     tl.constexpr(cpu_shading.L_BLUE),
 )
 TINY = tl.constexpr(1e-20)  # augment.render.shading.TINY
-BATCH = tl.constexpr(32)  # splats looked at together: the bits of an int32
+LANES = tl.constexpr(32)  # threads of a warp, splats looked at together, bits of an int32
 # Rounding must not lose a pixel: splats that stay this far below the cut (log2 of alpha) anywhere
 # in a block are left out, others tried.
 MARGIN = tl.constexpr(0.0625)
@@ -111,32 +92,35 @@ def blend_blocks(
     tile, block = tl.program_id(0) // blocks, tl.program_id(0) % blocks
     left = tile % columns * TILE + block % across * BLOCK_W
     top = tile // columns * TILE + block // across * BLOCK_H
-    west, north = left.to(tl.float32) + 0.5, top.to(tl.float32) + 0.5  # its first pixel's centre
 
-    # Axis 1 runs over threads first, so that a thread's pixels lie in one row, and what a splat is
-    # in a row is found once a thread.
-    i, j = tl.arange(0, BLOCK_W)[:, None], tl.arange(0, BLOCK_H)[None, :]
-    x, y = i.to(tl.float32), j.to(tl.float32)
-    is_inside = (left + i < width) & (top + j < height)
-    nothing = tl.zeros([BLOCK_W, BLOCK_H], tl.float32)
+    # Axis 1 runs over the warp's threads. The pixels of each, axis 0, lie in one row, in even
+    # steps: what a splat is in a row is found once a thread, and the steps are constants.
+    STEP: tl.constexpr = LANES // BLOCK_H
+    EACH: tl.constexpr = BLOCK_W // STEP
+    lanes = tl.arange(0, LANES)
+    steps = (tl.arange(0, EACH) * STEP)[:, None]
+    first_x, y = left + lanes % STEP, top + lanes // STEP
+    is_inside = (first_x[None, :] + steps < width) & (y < height)[None, :]
+    west, north = first_x.to(tl.float32) + 0.5, y.to(tl.float32) + 0.5  # the first pixel's centre
+    ahead = steps.to(tl.float32)
+    nothing = tl.zeros([EACH, LANES], tl.float32)
     # Negative where the pixel is finished; its size is then the final transmittance.
     through = tl.where(is_inside, 1.0, -1.0)
     red, green, blue, white = nothing, nothing, nothing, nothing
     weighted_depth, middle, heaviest = nothing, nothing, nothing
-    number = tl.full([BLOCK_W, BLOCK_H], -1, tl.int32)
+    number = tl.full([EACH, LANES], -1, tl.int32)
     first, mass, moment, square = nothing, nothing, nothing, nothing
-    best, best_first, best_moment, best_spread = nothing, nothing, nothing, nothing
+    best, best_mode = nothing, nothing
 
     at = tl.load(starts + tile)
     last = tl.load(starts + tile + 1)
-    lanes = tl.arange(0, BATCH)
     is_open = at < last
     while is_open:
-        row = tl.load(members + at + lanes, mask=at + lanes < last, other=0)
-        reaches = _reaches(
-            records + row.to(tl.int64) * RECORD, west, north, BLOCK_W - 1, BLOCK_H - 1, log_cut
+        is_listed = at + lanes < last
+        row = tl.load(members + at + lanes, mask=is_listed, other=0)
+        reaches = is_listed & _reaches(
+            records + row.to(tl.int64) * RECORD, left, top, BLOCK_W - 1, BLOCK_H - 1, log_cut
         )
-        reaches = reaches & (at + lanes < last)
         left_over = tl.sum(tl.where(reaches, 1 << lanes, 0), 0)  # one bit a splat
         # Behind what outweighs all that is left, samples cannot change the mode.
         grows = HAS_MODE
@@ -148,83 +132,84 @@ def blend_blocks(
             # The exponent of a power of two says which it is.
             k = (lowest.to(tl.float32).to(tl.int32, bitcast=True) >> 23) - 127
             slot = tl.load(members + at + k).to(tl.int64)
-            record = records + slot * RECORD
+            # Every thread reads the whole record, which costs a warp no more than one of them.
+            record = (records + slot * RECORD) + tl.zeros([LANES], tl.int32)
+            mean_x, mean_y, lean_x, sharp_x = _quarter(record, 0)
+            fall_y, log_opacity, _, _ = _quarter(record, 1)
 
             # log2 of alpha: e = peak - off^2, peak and where off begins being one a row.
-            mean_x, mean_y = tl.load(record + MEAN_X), tl.load(record + MEAN_Y)
-            sharp, opacity = tl.load(record + SHARP_X), tl.load(record + LOG_OPACITY)
-            dy = y + (north - mean_y)
-            peak = opacity - tl.load(record + FALL_Y) * dy * dy
-            begin = sharp * (west - mean_x) - sharp * tl.load(record + LEAN_X) * dy
-            off = sharp * x + begin
-            e = peak - off * off
+            dx, dy = west - mean_x, north - mean_y
+            peak = log_opacity - fall_y * dy * dy
+            off = (sharp_x * dx - sharp_x * lean_x * dy)[None, :] + sharp_x[None, :] * ahead
+            e = peak[None, :] - off * off
             a = tl.where(e >= log_cut, tl.minimum(tl.exp2(e), alpha_max), 0.0)
             if HAS_CUTS:
-                cut = cuts + slot * CUT
-                slope_x, slope_y = tl.load(cut + C_X), tl.load(cut + C_Y)
-                share = slope_y * dy + (tl.load(cut + C_AT) + slope_x * (west - mean_x))
-                a *= tl.minimum(tl.maximum(slope_x * x + share, 0.0), 1.0)
+                cut = (cuts + slot * CUT) + tl.zeros([LANES], tl.int32)
+                kept, slope_x, slope_y, right = _quarter(cut, 0)
+                share = (kept + slope_x * dx + slope_y * dy)[None, :] + slope_x[None, :] * ahead
+                a *= tl.minimum(tl.maximum(share, 0.0), 1.0)
             weight = a * through
             after = through - weight
             is_kept = after > least
             weight = tl.where(is_kept, weight, 0.0)
 
+            if HAS_RGB or HAS_SNOW:
+                splat_red, splat_green, splat_blue, is_snow = _quarter(record, 3)
             if HAS_RGB:
-                red += weight * tl.load(record + RED)
-                green += weight * tl.load(record + GREEN)
-                blue += weight * tl.load(record + BLUE)
+                red += weight * splat_red[None, :]
+                green += weight * splat_green[None, :]
+                blue += weight * splat_blue[None, :]
                 if HAS_LIGHTS:
                     lines = lights + slot * LINES
                     more_red, more_green = tl.load(lines + L_RED), tl.load(lines + L_GREEN)
                     more_blue = tl.load(lines + L_BLUE)
                     if tl.abs(more_red) + tl.abs(more_green) + tl.abs(more_blue) > 0:
-                        dx = x + (west - mean_x)
-                        rim = (opacity - e) / tl.maximum(opacity - log_cut, TINY)
-                        lit = weight * _light_share(lines, dx, dy, rim, inverse_fx2, inverse_fy2)
-                        red += lit * more_red
-                        green += lit * more_green
-                        blue += lit * more_blue
+                        reach = tl.maximum(log_opacity - log_cut, TINY)[None, :]
+                        rim = (log_opacity[None, :] - e) / reach
+                        aside = dx[None, :] + ahead
+                        share = _light_share(
+                            lines, aside, dy[None, :], rim, inverse_fx2, inverse_fy2
+                        )
+                        red += weight * share * more_red
+                        green += weight * share * more_green
+                        blue += weight * share * more_blue
             if HAS_SNOW:
-                white += weight * tl.load(record + IS_SNOW)
-            if HAS_EXPECTED or HAS_MEDIAN or HAS_MODE:
-                centre = tl.load(record + DEPTH)
+                white += weight * is_snow[None, :]
+            if HAS_EXPECTED or HAS_MEDIAN or HAS_MODE or HAS_IDS:
+                _, _, depth, own_id = _quarter(record, 2)
             if HAS_EXPECTED or HAS_MODE:
                 if HAS_CUTS:
-                    growth = tl.load(cut + C_RIGHT) * (x + (west - mean_x))
-                    growth += tl.load(cut + C_DOWN) * dy
-                    most = tl.load(cut + C_REACH)
-                    growth = tl.minimum(tl.maximum(growth, -most), most)
-                    z = (centre + parallel * growth) / (1.0 - (1.0 - parallel) * growth)
+                    down, most, _, _ = _quarter(cut, 1)
+                    growth = (right * dx + down * dy)[None, :] + right[None, :] * ahead
+                    growth = tl.minimum(tl.maximum(growth, -most[None, :]), most[None, :])
+                    z = depth[None, :] + parallel * growth
+                    z = z / (1.0 - (1.0 - parallel) * growth)
                 else:
-                    z = nothing + centre
+                    z = nothing + depth[None, :]
                 if HAS_EXPECTED:
                     weighted_depth += weight * z
                 if grows:
-                    first, mass, moment, square, best, best_first, best_moment, best_spread = (
-                        add_sample(
-                            z, weight, floor, first, mass, moment, square,
-                            best, best_first, best_moment, best_spread,
-                        )
-                    )  # fmt: skip
+                    first, mass, moment, square, best, best_mode = add_sample(
+                        z, weight, floor, first, mass, moment, square, best, best_mode
+                    )
             if HAS_MEDIAN:
                 is_crossed = is_kept & (through >= 0.5) & (after < 0.5)
-                middle = tl.where(is_crossed, centre, middle)
+                middle = tl.where(is_crossed, depth[None, :], middle)
             if HAS_IDS:
                 is_heavier = weight > heaviest
                 heaviest = tl.where(is_heavier, weight, heaviest)
-                own = tl.load(record + SPLAT_ID).to(tl.int32, bitcast=True)
-                number = tl.where(is_heavier, own, number)
+                number = tl.where(is_heavier, own_id.to(tl.int32, bitcast=True)[None, :], number)
             if IS_COARSE:
                 final = -tl.abs(tl.where(is_kept, after, through))
                 through = tl.where(after > end, after, final)
             else:
                 through = tl.where(is_kept, after, -tl.abs(through))
-        at += BATCH
+        at += LANES
         # Of float32 numbers that are positive the bits are in the same order, which integers
         # compare in one step.
         is_open = (at < last) & (tl.max(tl.max(through.to(tl.int32, bitcast=True), 0), 0) > 0)
 
-    pixel = (top + j) * width + left + i
+    pixel = (y * width + first_x)[None, :] + steps
     covered = 1.0 - tl.abs(through)
     tl.store(alpha + pixel, covered, mask=is_inside)
     if HAS_RGB:
@@ -238,35 +223,43 @@ def blend_blocks(
     if HAS_IDS:
         tl.store(ids + pixel, number, mask=is_inside)
     if HAS_MODE:
-        depth = heaviest_mode(
-            first, mass, moment, square, best, best_first, best_moment, best_spread
-        )
-        tl.store(mode + pixel, depth, mask=is_inside)
+        z = heaviest_mode(first, mass, moment, square, best, best_mode)
+        tl.store(mode + pixel, z, mask=is_inside)
     if HAS_SNOW:
         tl.store(snow + pixel, white, mask=is_inside)
 
 
 @triton.jit
-def _reaches(record, west, north, wide, high, log_cut):
-    """Whether alpha may reach the cut at a pixel of the block, wide x high from its first centre.
+def _quarter(pointers, which: tl.constexpr):
+    """Numbers 4 which to 4 which + 3 of every row, in one read each. Rows begin at 16 bytes."""
+    places = pointers[:, None] + (4 * which + tl.arange(0, 4))[None, :]
+    numbers = tl.load(tl.multiple_of(places, (16, 16)))
+    even, odd = tl.split(tl.reshape(numbers, (LANES, 2, 2)))
+    first, third = tl.split(even)
+    second, fourth = tl.split(odd)
+    return first, second, third, fourth
+
+
+@triton.jit
+def _reaches(record, left, top, wide, high, log_cut):
+    """Whether alpha may reach the cut at a pixel of the block at (left, top), wide + 1 x high + 1.
 
     Where the mean lies outside, alpha is largest on the side that faces it, in x or in y: there,
     where the ellipse's ridge crosses that side, or as near to it as the block goes.
     """
-    left = west - tl.load(record + MEAN_X)
-    up = north - tl.load(record + MEAN_Y)
-    right, down = left + wide, up + high
-    x = tl.minimum(tl.maximum(0.0, left), right)
-    y = tl.minimum(tl.maximum(0.0, up), down)
-    lean = tl.load(record + LEAN_X)
-    sharp, fall = tl.load(record + SHARP_X), tl.load(record + FALL_Y)
-    above = tl.load(record + LOG_OPACITY) - log_cut + MARGIN
-    y_there = tl.minimum(tl.maximum(tl.load(record + LEAN_Y) * x, up), down)
-    x_there = tl.minimum(tl.maximum(lean * y, left), right)
-    across, along = sharp * (x - lean * y_there), sharp * (x_there - lean * y)
-    by_x = across * across + fall * y_there * y_there
-    by_y = along * along + fall * y * y
-    return tl.minimum(by_x, by_y) <= above
+    mean_x, mean_y, lean_x, sharp_x = _quarter(record, 0)
+    fall_y, log_opacity, _, _ = _quarter(record, 1)
+    lean_y, _, _, _ = _quarter(record, 2)
+    west, north = left.to(tl.float32) + 0.5 - mean_x, top.to(tl.float32) + 0.5 - mean_y
+    east, south = west + wide, north + high
+    x = tl.minimum(tl.maximum(0.0, west), east)
+    y = tl.minimum(tl.maximum(0.0, north), south)
+    y_there = tl.minimum(tl.maximum(lean_y * x, north), south)
+    x_there = tl.minimum(tl.maximum(lean_x * y, west), east)
+    off_x, off_y = sharp_x * (x - lean_x * y_there), sharp_x * (x_there - lean_x * y)
+    by_x = off_x * off_x + fall_y * y_there * y_there
+    by_y = off_y * off_y + fall_y * y * y
+    return tl.minimum(by_x, by_y) <= log_opacity - log_cut + MARGIN
 
 
 @triton.jit

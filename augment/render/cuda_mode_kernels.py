@@ -1,7 +1,6 @@
 """Triton functions: mode depth (augment.render.mode_depth), one sample of every pixel at a time.
 
 Sums are kept times the cluster's weight, so that a sample that joins costs no division and no root.
-Of the heaviest cluster, too, the sums are kept, and its mode is formed once, at the end.
 """
 
 from __future__ import annotations
@@ -20,14 +19,11 @@ SLACK = tl.constexpr(1e-4)  # what rounding may add to a sum of weights; far mor
 
 
 @triton.jit
-def add_sample(
-    depth, weight, floor, first, mass, moment, square, best, best_first, best_moment, best_spread
-):
+def add_sample(depth, weight, floor, first, mass, moment, square, best, best_mode):
     """The clusters with every pixel's next sample; those of weight 0 change nothing.
 
     Of the running cluster: first, the depth it began with, and the sums of w, w (z - first) and
-    w (z - first)^2. Of the heaviest closed one: its weight, first, sum of w (z - first), and its
-    weight^2 times the variance.
+    w (z - first)^2. Of the heaviest closed one: its weight and its mode.
     """
     off = depth - first
     aside = off * mass - moment  # mass (z - mean)
@@ -38,17 +34,17 @@ def add_sample(
     by_floor = floor * reach * mass - tl.abs(aside)
     by_spread = reach_2 * spread - aside * aside
     begins = (weight > 0) & (tl.maximum(by_floor, by_spread) <= 0)
-    is_best = begins & (mass > best)
-    best = tl.where(is_best, mass, best)
-    best_first = tl.where(is_best, first, best_first)
-    best_moment = tl.where(is_best, moment, best_moment)
-    best_spread = tl.where(is_best, spread, best_spread)
-    first = tl.where(begins, depth, first)
-    weighted = tl.where(begins, 0.0, weight * off)
-    mass = tl.where(begins, 0.0, mass) + weight
-    square = tl.where(begins, 0.0, square) + weighted * off
-    moment = tl.where(begins, 0.0, moment) + weighted
-    return first, mass, moment, square, best, best_first, best_moment, best_spread
+    if tl.max(tl.max(begins.to(tl.int32), 0), 0) > 0:
+        is_best = begins & (mass > best)
+        best_mode = tl.where(is_best, _mode(first, mass, moment, spread), best_mode)
+        best = tl.where(is_best, mass, best)
+        first = tl.where(begins, depth, first)
+        off = tl.where(begins, 0.0, off)
+        mass = tl.where(begins, 0.0, mass)
+        moment = tl.where(begins, 0.0, moment)
+        square = tl.where(begins, 0.0, square)
+    weighted = weight * off
+    return first, mass + weight, moment + weighted, square + weighted * off, best, best_mode
 
 
 @triton.jit
@@ -61,17 +57,18 @@ def can_grow(through, mass, best):
 
 
 @triton.jit
-def heaviest_mode(first, mass, moment, square, best, best_first, best_moment, best_spread):
+def heaviest_mode(first, mass, moment, square, best, best_mode):
     """Mode of the heaviest cluster, the running one included; 0 where there is none."""
-    is_last = mass > best
-    spread = tl.where(is_last, _spread(mass, moment, square), best_spread)
-    moment = tl.where(is_last, moment, best_moment)
-    first = tl.where(is_last, first, best_first)
-    mass = tl.maximum(mass, best)
-    return first + (moment - BACK * tl.sqrt(spread)) / tl.where(mass > 0, mass, 1.0)
+    last = _mode(first, mass, moment, _spread(mass, moment, square))
+    return tl.where(mass > best, last, best_mode)
 
 
 @triton.jit
 def _spread(mass, moment, square):
     """mass^2 times the variance."""
     return tl.maximum(mass * square - moment * moment, 0.0)
+
+
+@triton.jit
+def _mode(first, mass, moment, spread):
+    return first + (moment - BACK * tl.sqrt(spread)) / tl.where(mass > 0, mass, 1.0)
