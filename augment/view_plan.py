@@ -16,6 +16,7 @@ import numpy as np
 from augment.bounds import Bounds, bound, bound_chunks, bound_points, may_show
 from augment.cameras import Camera
 from augment.plan import Plan, Step
+from augment.render.backends import AUTO
 from augment.scene import Gaussians, Scene
 from augment.snow.cover import Layer, SnowCover
 from augment.snow.covers import cover_of
@@ -67,10 +68,11 @@ class ViewPlan:
         return replace(self, steps=tuple(_replaced(self.steps, dict.fromkeys(WATER_PASSES, why))))
 
 
-def plan_view(plan: Plan, scene: Scene, camera: Camera) -> ViewPlan:
+def plan_view(plan: Plan, scene: Scene, camera: Camera, *, backend: str = AUTO) -> ViewPlan:
     """The parts, passes and buffers of the plan that the camera's image can show.
 
-    The first call for a scene bounds its actors; under snow, it also lays the snow (cover_of).
+    The first call for a scene bounds its actors; under snow, it also lays the snow (cover_of), by
+    `backend`.
 
     Raises:
         SceneError: snow cannot be placed in this scene.
@@ -80,7 +82,7 @@ def plan_view(plan: Plan, scene: Scene, camera: Camera) -> ViewPlan:
     poses = _poses(scene, camera)
     near_m = plan.settings.near_m
     drawn = _owners_seen(_actor_boxes(scene), poses, cameras, near_m)
-    cover, snowy = cover_for(plan, scene), set[int]()
+    cover, snowy = cover_for(plan, scene, backend=backend), set[int]()
     if cover is not None:
         on_ground, on_actors = _snow_boxes(scene, cover)
         if any(may_show(on_ground, None, view, near_m).any() for view in cameras):
@@ -98,12 +100,12 @@ def plan_view(plan: Plan, scene: Scene, camera: Camera) -> ViewPlan:
     )
 
 
-def cover_for(plan: Plan, scene: Scene) -> SnowCover | None:
-    """The plan's snow as it lies in the scene; None without one."""
+def cover_for(plan: Plan, scene: Scene, *, backend: str = AUTO) -> SnowCover | None:
+    """The plan's snow as it lies in the scene; None without one. backend: see cover_of."""
     if plan.snow is None:
         return None
     worn = None if plan.style is None or plan.styles_picture else look_of(scene, plan.style)
-    return cover_of(scene, plan.snow, worn)
+    return cover_of(scene, plan.snow, worn, backend=backend)
 
 
 def _water(plan: Plan, camera: Camera) -> tuple[bool, str | None]:

@@ -117,7 +117,7 @@ class Bench:
         if snow is not None and self._cameras is None:
             from augment.batch.snow_beds import find_bed, remember
 
-            remember(scene, snow, find_bed(self._scene, snow))
+            remember(scene, snow, find_bed(self._scene, snow, backend=self._backend))
 
     def _picture(self, view: View, settings: Mapping[str, Value]) -> np.ndarray:
         return self._trial(view, settings).picture
@@ -146,7 +146,8 @@ class Bench:
             from augment.snow.beds import bed_of
             from augment.snow.covers import placement_settings
 
-            bed_of(self._scene, placement_settings(snow), cameras=self._cameras)
+            settings = placement_settings(snow)
+            bed_of(self._scene, settings, cameras=self._cameras, backend=self._backend)
         if style is not None:
             from augment.style.scene_maps import remember_maps, style_maps
 

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from augment.labels import EGO_VEHICLE
+from augment.render.backends import AUTO
 from augment.scene import Actor, Gaussians, PosedGaussians
 from augment.semantics import SemanticClass, class_of_label
 from augment.snow.cell_lists import cells_at, make_cells
@@ -58,9 +59,15 @@ def moves(actor: Actor) -> bool:
 
 
 def find_actor_cells(
-    actor: Actor, *, cell_m: float, max_slope_deg: float, estimator: Estimator
+    actor: Actor,
+    *,
+    cell_m: float,
+    max_slope_deg: float,
+    estimator: Estimator,
+    backend: str = AUTO,
 ) -> SnowCells | None:
-    """Cells on a vehicle, in its own frame; None where it has too few to carry snow.
+    """Cells on a vehicle, in its own frame; None where it has too few to carry snow. backend: that
+    draws it.
 
     Its open edges are all round: what does not rise beside a cell falls away.
     """
@@ -85,6 +92,7 @@ def find_actor_cells(
         shape=shape,
         estimator=estimator,
         with_thin=False,
+        backend=backend,
     )
     bottom = np.float32(_BOTTOM_M - actor.size_m[2] / 2)
     limit = min(max_slope_deg, DRIVEN_MAX_SLOPE_DEG) if moves(actor) else max_slope_deg

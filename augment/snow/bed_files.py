@@ -18,6 +18,7 @@ from torch import Tensor
 from augment.batch.atomic import write_atomic
 from augment.cameras import Camera
 from augment.errors import SceneError
+from augment.render.backends import AUTO, CUDA
 from augment.scene import Gaussians, Scene
 from augment.snow.cells import FLUSH, SnowBed, SnowCells
 from augment.snow.placement import PlacementSettings
@@ -34,11 +35,20 @@ _DTYPES = {
 _COLUMNS = {"centers_m": 3, "normals": 3, "neighbours": 4, "banks": 2, "buried_by": 5}
 
 
-def bed_key(scene: Scene, cameras: Sequence[Camera], settings: PlacementSettings) -> str:
-    """Hex digest of all that a bed depends on: Gaussians, tracks, cameras, poses, settings, and the
-    version of this code. Of colours, what all directions share. Order of the cameras counts.
+def bed_key(
+    scene: Scene,
+    cameras: Sequence[Camera],
+    settings: PlacementSettings,
+    *,
+    backend: str = AUTO,
+) -> str:
+    """Hex digest of all that a bed depends on: Gaussians, tracks, cameras, poses, settings, what
+    places it (the GPU rounds otherwise than the CPU), and the version of this code. Of colours,
+    what all directions share. Order of the cameras counts.
     """
     digest = hashlib.blake2b(FORMAT.encode(), digest_size=20)
+    if backend == CUDA:
+        digest.update(CUDA.encode())
     digest.update(repr((settings.cell_m, settings.max_slope_deg, settings.estimator)).encode())
     _add_gaussians(digest, scene.background)
     for actor in scene.actors:

@@ -9,6 +9,7 @@ from weakref import WeakKeyDictionary
 
 from augment.cameras import Camera
 from augment.errors import SceneError
+from augment.render.backends import AUTO
 from augment.scene import Scene
 from augment.snow.bed_files import bed_key, load_bed, save_bed
 from augment.snow.cells import SnowBed
@@ -25,6 +26,7 @@ def bed_of(
     *,
     cameras: Sequence[Camera] | None = None,
     folder: Path | None = None,
+    backend: str = AUTO,
     progress: bool = False,
 ) -> SnowBed:
     """The bed of a scene: remembered, else read from the folder, else placed and written there.
@@ -32,7 +34,8 @@ def bed_of(
     cameras: those that must see the snow; None for all of the scene's. Only the bed of all cameras
     is remembered under the settings alone; `remember_bed` gives that place to another.
     folder: beds are kept there as snow-<key>.safetensors. A file that cannot be used is replaced,
-    with a warning.
+    with a warning. backend: that places what is not remembered yet, see place_snow_bed; a scene has
+    one bed, so that its pictures, sweeps and labels agree.
 
     Raises:
         SceneError: as place_snow_bed.
@@ -44,7 +47,7 @@ def bed_of(
     seeing = cameras
     if seeing is None:
         seeing = [camera for frame in scene.frames for camera in frame.cameras.values()]
-    bed = _kept(scene, seeing, settings, folder, progress)
+    bed = _kept(scene, seeing, settings, folder, backend, progress)
     remember_bed(scene, settings, bed)
     return bed
 
@@ -64,17 +67,18 @@ def _kept(
     cameras: Sequence[Camera],
     settings: PlacementSettings,
     folder: Path | None,
+    backend: str,
     progress: bool,
 ) -> SnowBed:
     if folder is None:
-        return place_snow_bed(scene, cameras, settings, progress=progress)
-    key = bed_key(scene, cameras, settings)
+        return place_snow_bed(scene, cameras, settings, backend=backend, progress=progress)
+    key = bed_key(scene, cameras, settings, backend=backend)
     path = bed_path(folder, key)
     if path.exists():
         try:
             return load_bed(path, key)
         except SceneError as error:
             logger.warning("the snow of %s is placed anew: %s", scene.name, error)
-    bed = place_snow_bed(scene, cameras, settings, progress=progress)
+    bed = place_snow_bed(scene, cameras, settings, backend=backend, progress=progress)
     save_bed(path, bed, key)
     return bed

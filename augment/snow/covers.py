@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from weakref import WeakKeyDictionary
 
+from augment.render.backends import AUTO
 from augment.scene import Scene
 from augment.snow.beds import bed_of
 from augment.snow.cells import SnowBed
@@ -24,18 +25,21 @@ def placement_settings(snow: Snow) -> PlacementSettings:
     return PlacementSettings(cell_m=snow.cell_m, max_slope_deg=snow.max_slope_deg)
 
 
-def cover_of(scene: Scene, placed: PlacedSnow, look: Look | None = None) -> SnowCover:
+def cover_of(
+    scene: Scene, placed: PlacedSnow, look: Look | None = None, *, backend: str = AUTO
+) -> SnowCover:
     """The snow in the scene; remembered for as long as the scene lives and no third is asked for.
 
     look: the style that the scene wears; the snow lies in the light that it shows.
 
-    The first call finds where snow can lie, unless a bed is remembered (augment.snow.beds).
+    The first call finds where snow can lie, unless a bed is remembered (augment.snow.beds), by
+    `backend` (augment.snow.placement).
 
     Raises:
         SceneError: snow cannot be placed in this scene, or not with cells this small.
     """
     covers = _covers.setdefault(scene, OrderedDict())
-    bed = bed_of(scene, placement_settings(placed.snow))
+    bed = bed_of(scene, placement_settings(placed.snow), backend=backend)
     laid_on, cover = covers.get((placed, look), (None, None))
     if cover is None or laid_on is not bed:
         cover = lay_snow(

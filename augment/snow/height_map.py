@@ -12,6 +12,8 @@ import numpy as np
 import torch
 
 from augment.cameras import Camera
+from augment.render import gpu
+from augment.render.backends import AUTO, CUDA
 from augment.render.buffers import (
     ALPHA,
     BUFFERS,
@@ -111,10 +113,11 @@ def draw_from_above(
     estimator: Estimator,
     wanted: np.ndarray | None = None,
     with_thin: bool = True,
+    backend: str = AUTO,
 ) -> HeightMap:
     """Draw parts of plain Gaussians from above. corner_m: least x and y. shape: rows and columns of
     cells. wanted: bool of that shape; the others may be left empty. with_thin: what is thin is
-    looked for.
+    looked for. backend: that draws.
 
     A pixel of the drawing is opaque for the share that is truly covered; a second drawing, in which
     whatever is thin is blurred to a pixel's width, shows what is thin.
@@ -138,15 +141,19 @@ def draw_from_above(
         is_orthographic=True,
     )
     shown = None if wanted is None else torch.from_numpy(np.ascontiguousarray(wanted[::-1]))
+    if shown is not None and backend == CUDA:
+        shown = gpu.upload(shown)
     names = (ALPHA, DEPTH_ESTIMATORS[estimator], MEDIAN_DEPTH, RGB, SPLAT_IDS)
     alpha, depths, medians, rgb, ids = _draw(
-        parts, camera, names, shown, antialiased=cell_m <= _TRUE_M
+        parts, camera, names, shown, antialiased=cell_m <= _TRUE_M, backend=backend
     )
     covered, height = _heights(alpha, depths, float(eye[2]))
     alpha = np.where(covered, alpha, np.minimum(alpha, np.float32(COVERED / 2)))
     is_thin = np.zeros(shape, bool)
     if with_thin and cell_m <= _FINE_M:
-        alpha_wide, depths = _draw(parts, camera, names[:2], shown, antialiased=False)
+        alpha_wide, depths = _draw(
+            parts, camera, names[:2], shown, antialiased=False, backend=backend
+        )
         covered_wide, height_wide = _heights(alpha_wide, depths, float(eye[2]))
         shelters = covered & covered_wide & (height_wide - height > _SHELTER_M)
         wide = np.ones((_SHELTER_CELLS, _SHELTER_CELLS), np.uint8)
@@ -175,10 +182,11 @@ def _draw(
     wanted: torch.Tensor | None,
     *,
     antialiased: bool,
+    backend: str,
 ) -> list[np.ndarray]:
     """Buffers of a view from above, rows towards +y."""
     # Other depths than the mode's are for comparing them: rather slower with all buffers, which
-    # takes a kernel that there is, than at once after one has been compiled for each.
+    # takes a kernel of the CPU that there is, than at once after one has been compiled for each.
     out = rasterize(
         parts,
         camera,
@@ -186,8 +194,9 @@ def _draw(
         settings=RasterSettings(sh_degree=0, antialiased=antialiased),
         clip=UNCUT,
         wanted=wanted,
+        backend=backend,
     )
-    return [np.ascontiguousarray(getattr(out, name).numpy()[::-1]) for name in names]
+    return [np.ascontiguousarray(getattr(out, name).cpu().numpy()[::-1]) for name in names]
 
 
 def _heights(alpha: np.ndarray, depths: np.ndarray, eye_z_m: float) -> tuple[np.ndarray, ...]:

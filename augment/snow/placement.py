@@ -26,6 +26,7 @@ from augment.cameras import Camera
 from augment.errors import SceneError
 from augment.ground import check_metric_and_level
 from augment.labels import EGO_VEHICLE
+from augment.render.backends import AUTO, CUDA
 from augment.scene import Gaussians, PosedGaussians, Scene
 from augment.semantics import SemanticClass
 from augment.snow.actor_cells import find_actor_cells, is_vehicle, moves
@@ -88,17 +89,21 @@ def place_snow_bed(
     cameras: Sequence[Camera],
     settings: PlacementSettings = PlacementSettings(),
     *,
+    backend: str = AUTO,
     progress: bool = False,
 ) -> SnowBed:
     """The cells of a scene that snow can lie on and that some of the cameras can see.
 
     The same bits on any number of threads. Without cameras, or where nothing open is seen, the bed
-    is empty. progress: shows a bar.
+    is empty. backend: "cuda" draws and looks on the GPU; any other on the CPU, since the torch
+    definition would take hours. progress: shows a bar.
 
     Raises:
         SceneError: metres or gravity are not known, or the cells would take too much memory.
     """
     check_metric_and_level(scene)
+    if backend != CUDA:
+        backend = AUTO
     clock = _Clock()
     views = views_along(cameras)
     background = plain_gaussians(scene.background)
@@ -121,12 +126,14 @@ def place_snow_bed(
         unit="step",
     ) as bar:
         seen_from = draw_views(
-            views, [PosedGaussians(background), *parked], after_each=lambda: bar.update()
+            views,
+            [PosedGaussians(background), *parked],
+            backend=backend,
+            after_each=lambda: bar.update(),
         )
         clock.lap("views")
-        work = _Ground(
-            background, parked, plan, views, seen_from, wheel_paths(scene), settings, clock
-        )
+        paths = wheel_paths(scene)
+        work = _Ground(background, parked, plan, views, seen_from, paths, settings, backend, clock)
         for level, window in squares:
             work.add_square(level, window)
             bar.update()
@@ -137,6 +144,7 @@ def place_snow_bed(
                 cell_m=settings.cell_m,
                 max_slope_deg=settings.max_slope_deg,
                 estimator=settings.estimator,
+                backend=backend,
             )
             if cells is not None:
                 actors[actor.track_id] = cells
@@ -183,11 +191,12 @@ class _Ground:
         views: Views,
         paths: tuple[WheelPath, ...],
         settings: PlacementSettings,
+        backend: str,
         clock: _Clock,
     ) -> None:
         self._background, self._parked, self._plan = background, parked, plan
         self._views, self._paths, self._settings = views, paths, settings
-        self._clock = clock
+        self._backend, self._clock = backend, clock
         self._classes = classes_of(background)
         self._path = path_points(cameras)
         self._numbers = CellNumbers(plan)
@@ -252,9 +261,9 @@ class _Ground:
         far = (corner[0] + window.width * cell, corner[1] + window.height * cell)
         chosen = in_box(self._background, np.array(corner), np.array(far))
         near = self._background
-        if 2 * len(chosen) < len(near):
+        if 2 * len(chosen) < len(near) and self._backend != CUDA:
             near = near.select(torch.from_numpy(chosen))
-        else:  # a copy would take longer than what lies outside
+        else:  # a copy would take longer than what lies outside; the GPU has all of them already
             chosen = np.arange(len(near))
         margin = _margin(cell)
         around = np.ones((2 * margin + 1, 2 * margin + 1), np.uint8)
@@ -266,6 +275,7 @@ class _Ground:
             shape=shape,
             estimator=self._settings.estimator,
             wanted=wanted,
+            backend=self._backend,
         )
         is_ground = (view.ids >= 0) & (view.ids < len(chosen))
         classes = np.full(shape, SemanticClass.UNKNOWN, np.int16)

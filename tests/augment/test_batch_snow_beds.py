@@ -41,7 +41,7 @@ class Placements(list):
 
     before: Callable[[], None] = staticmethod(lambda: None)
 
-    def __call__(self, scene, cameras, settings, *, progress=False):
+    def __call__(self, scene, cameras, settings, *, backend="auto", progress=False):
         self.before()
         self.append((settings, list(cameras)))
         return make_bed(len(self[-1][1]) + settings.cell_m)

@@ -58,7 +58,7 @@ def around(camera: Camera) -> list[Camera]:
     return found
 
 
-def everything(plan, scene: Scene, camera: Camera) -> ViewPlan:
+def everything(plan, scene: Scene, camera: Camera, **_) -> ViewPlan:
     """Nothing left out of the plan."""
     actors = tuple(range(1, len(scene.actors) + 1))
     snowy = () if plan.snow is None else (0, *actors)
