@@ -17,6 +17,10 @@ class BackendUnavailable(ClimateGSError):
     """A rasteriser backend was named that this machine cannot run."""
 
 
+class GpuLost(ClimateGSError):
+    """The GPU no longer answers this process; another process may still use it."""
+
+
 class OutputError(ClimateGSError):
     """The output folder cannot be written, or holds something else."""
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 
 from augment.errors import BackendUnavailable
+from augment.render.backends import AUTO, CPU, CUDA, REFERENCE, available_backends, import_cpu
 from augment.scene import Scene
 
 
@@ -17,19 +18,18 @@ def choose_backend(backend: str, scene: Scene, *, gpu: bool = True) -> str:
     Raises:
         ValueError: no such backend. BackendUnavailable: it cannot run on this machine.
     """
-    from augment.render.backends import available_backends, import_cpu
     from augment.render.gpu import has_gpu
 
-    if backend == "auto":  # asks for no more than it takes: nothing of triton without a GPU
+    if backend == AUTO:  # asks for no more than it takes: nothing of triton without a GPU
         means = [scene.background.means, *(actor.gaussians.means for actor in scene.actors)]
         plain = all(m.dtype == torch.float32 and not m.requires_grad for m in means)
         if plain and gpu and has_gpu():
-            return "cuda"
+            return CUDA
         try:
             import_cpu()
         except BackendUnavailable:
-            return "reference"
-        return "cpu" if plain else "reference"
+            return REFERENCE
+        return CPU if plain else REFERENCE
     obstacles = available_backends()
     if backend not in obstacles:
         raise ValueError(f"backend must be one of auto, {', '.join(obstacles)}; got {backend!r}")
@@ -39,10 +39,23 @@ def choose_backend(backend: str, scene: Scene, *, gpu: bool = True) -> str:
     return backend
 
 
+def gpu_is_lost(backend: str) -> bool:
+    """Whether the GPU no longer answers this process, as after a kernel that went astray: then
+    nothing succeeds that is asked of it later. Waits for the GPU.
+    """
+    if backend != CUDA or not torch.cuda.is_initialized():
+        return False
+    try:
+        torch.cuda.synchronize()
+    except RuntimeError:
+        return True
+    return False
+
+
 def renders_on_gpu(backend: str) -> bool:
     """Whether a job that names this backend draws on a GPU: `auto` does where there is one."""
-    if backend == "auto":
+    if backend == AUTO:
         from augment.render.gpu import has_gpu
 
         return has_gpu()
-    return backend == "cuda"
+    return backend == CUDA

@@ -17,7 +17,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from augment.batch.atomic import write_atomic
-from augment.batch.backends import renders_on_gpu
+from augment.batch.backends import gpu_is_lost, renders_on_gpu
 from augment.batch.box_weather import BoxWeather, has_box_weather, measure_boxes
 from augment.batch.label_files import lidar_bytes
 from augment.batch.layout import item_paths
@@ -39,7 +39,7 @@ from augment.batch.times import (
 from augment.batch.trajectory import frames_from_json
 from augment.batch.writer import View, WritePump, check_view, write_view
 from augment.cameras import Camera
-from augment.errors import OutputError
+from augment.errors import GpuLost, OutputError
 from augment.labels import Boxes
 from augment.scene import Scene
 from recipes.schema import Recipe
@@ -155,8 +155,8 @@ class FrameRunner:
     last one is waited for, so that a GPU has work while its pictures come back and are handed over.
 
     deliver: called from the writing threads, after all files of the image are on the disk.
-    An error of the scene or the renderer concerns one image; an OutputError ends the run, since
-    the next write would fail too.
+    An error of the scene or the renderer concerns one image. An OutputError ends the run, since the
+    next write would fail too, and so does GpuLost.
     """
 
     def __init__(
@@ -248,6 +248,11 @@ class FrameRunner:
     def _fail(self, chunk: Chunk, name: str, error: Exception) -> None:
         _log.debug("frame %d, camera %s", chunk.frame, name, exc_info=error)
         message = describe(error, "rendering")
+        if gpu_is_lost(self._setup.backend):
+            raise GpuLost(
+                f"the GPU no longer answers this process since frame {chunk.frame}, camera {name} "
+                f"({message}); start the same again to go on from there"
+            ) from error
         outcome = Outcome(chunk.variant, chunk.frame, name, FAILED, message)
         self._submit(lambda: self._deliver(outcome))
 

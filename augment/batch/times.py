@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-# Of the threads that render. `render` holds `await`: for a GPU to be done with a view.
+# Of the threads that render. `render` holds `await`: for the view in flight to be done.
 RENDER, AWAIT, HELD, RENDERERS = "render", "await", "held", "renderers"
 # Of the threads that write.
 ENCODE, WRITE, MEASURE, LIDAR, WRITERS = "encode", "write", "measure", "lidar", "writers"
@@ -63,8 +63,8 @@ class WorkTimes:
 class Shares:
     """Parts of a job's time, 0 to 1.
 
-    Of the workers' time: rendering; awaiting, the part of rendering that is waiting for a GPU;
-    held, waiting for files; beside, all else, and the greatest part of that in words.
+    Of the workers' time: rendering; awaiting, the part of rendering that is waiting for views
+    in flight; held, waiting for files; beside, all else, and the greatest part of that in words.
     Of the writing threads' time: writing, by kind of work, in words.
     """
 
@@ -85,11 +85,11 @@ class Shares:
     @property
     def sentence(self) -> str:
         """All of it in one line."""
-        gpu = f" ({_percent(self.awaiting)} waiting for the GPU)" if self.awaiting else ""
+        wait = f" ({_percent(self.awaiting)} for views in flight)" if self.awaiting else ""
         beside = f"other work {_percent(self.beside)}, first of all {self.beside_by}"
         kinds = ", ".join(f"{kind} {_percent(share)}" for kind, share in self.writing.items())
         return (
-            f"bound by {self.bound_by}: rendering {_percent(self.rendering)} of the time{gpu}, "
+            f"bound by {self.bound_by}: rendering {_percent(self.rendering)} of the time{wait}, "
             f"waiting for files {_percent(self.held)}, {beside}; "
             f"writing threads {_percent(sum(self.writing.values()))} busy ({kinds})"
         )

@@ -14,7 +14,7 @@ from augment.batch.processes import sender
 from augment.batch.runner import Chunk, FrameRunner, Renderer, Setup, describe
 from augment.batch.shared_scene import SharedScene
 from augment.batch.writer import WritePump
-from augment.errors import OutputError
+from augment.errors import GpuLost, OutputError
 
 
 @dataclass(frozen=True)
@@ -81,6 +81,8 @@ def worker_main(
         send(Spent(seconds))
     except OutputError as error:
         send(Failure(True, str(error)))
+    except GpuLost:  # as any death of a worker: another one tries what this has in hand
+        raise
     except Exception as error:
         send(Failure(False, describe(error, "in a worker process")))
 

@@ -21,7 +21,7 @@ from augment.batch.parts import list_parts
 from augment.batch.runner import Outcome, Renderer, describe
 from augment.batch.store import Store, open_store
 from augment.batch.times import WorkTimes
-from augment.errors import ClimateGSError, OutputError, SceneError, StyleError
+from augment.errors import ClimateGSError, GpuLost, OutputError, SceneError, StyleError
 from augment.generate.leftovers import clear_block, clear_files_of
 from augment.generate.publish import Publisher, staging_folder
 from augment.generate.records import Block, SceneRecord
@@ -134,7 +134,11 @@ class Workshop:
         self._entered: set[tuple[str, str]] = set()
 
     def do(self, task: Task) -> Result:
-        """The task's result; errors that concern the task alone are results too."""
+        """The task's result; errors that concern the task alone are results too.
+
+        Raises:
+            GpuLost: this process can do no other task either.
+        """
         try:
             if isinstance(task, IndexTask):
                 return self._index(task)
@@ -143,6 +147,8 @@ class Workshop:
             return self._render(task)
         except OutputError as error:
             return TaskFailed(str(error), is_output=True)
+        except GpuLost:
+            raise
         except _SceneFailed as error:
             of_memory = isinstance(error.__cause__, MemoryError)
             return TaskFailed(str(error), of_scene=True, of_memory=of_memory)

@@ -16,10 +16,11 @@ from pending_views import Gpu
 from pretend_gpu import pretended_gpu
 
 from augment.batch import runner
+from augment.batch.backends import gpu_is_lost
 from augment.batch.job import JobResult, RenderJob, run_job
 from augment.batch.manifest import read_manifest
 from augment.batch.writer import WritePump
-from augment.errors import OutputError
+from augment.errors import GpuLost, OutputError
 
 SOON_S = 10.0  # for what takes no time, on a machine that is busy
 
@@ -73,6 +74,32 @@ def test_failures_are_those_of_the_view_they_happen_to(tmp_path: Path, whole) ->
     assert [n for kind, n in gpu.notes if kind == "await"] == [0, 1, 2, 4, 5, 6, 7]
     run(RenderJob("fake:street", [make_recipe()], tmp_path))
     assert tree_digest(tmp_path) == whole
+
+
+def test_a_lost_gpu_ends_the_run_and_fails_no_image(tmp_path: Path, monkeypatch, whole) -> None:
+    class Lost(Gpu):
+        def awaited(self, number: int) -> None:
+            if number >= 3:
+                raise RuntimeError("CUDA error: an illegal memory access was encountered")
+
+    job = RenderJob("fake:street", [make_recipe()], tmp_path)
+    with monkeypatch.context() as patch:
+        patch.setattr(runner, "gpu_is_lost", lambda backend: True)
+        with pytest.raises(GpuLost, match=r"since frame 1, camera rear/left \(rendering: "):
+            run(job, Lost())
+    result = run(job)
+    assert (result.written, result.skipped, result.failed) == (5, 3, 0)
+    assert tree_digest(tmp_path) == whole
+
+
+def test_a_gpu_that_nobody_has_used_is_not_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail() -> None:
+        raise RuntimeError("CUDA error")
+
+    assert not gpu_is_lost("cuda") and not gpu_is_lost("cpu")
+    monkeypatch.setattr("torch.cuda.is_initialized", lambda: True)
+    monkeypatch.setattr("torch.cuda.synchronize", fail)
+    assert gpu_is_lost("cuda") and not gpu_is_lost("cpu")
 
 
 def test_an_interrupt_lands_what_is_in_flight(tmp_path: Path, whole) -> None:

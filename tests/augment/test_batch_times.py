@@ -48,7 +48,7 @@ def test_shares_are_of_all_workers_from_begin_to_end() -> None:
 def test_the_sentence() -> None:
     shares = bound(render=6.0, held=3.0, **{"await": 2.0}, encode=15.0, write=3.0, open=0.75)
     assert shares.sentence == (
-        "bound by encoding: rendering 60 % of the time (20 % waiting for the GPU), waiting for "
+        "bound by encoding: rendering 60 % of the time (20 % for views in flight), waiting for "
         "files 30 %, other work 10 %, first of all opening scenes; writing threads 90 % busy "
         "(encoding 75 %, writing to disk 15 %, boxes 0 %, LiDAR 0 %)"
     )

@@ -6,12 +6,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from generate_jobs import make_job, make_recipes, outputs
+from generate_jobs import make_job, make_recipes, outputs, raising_render
 
 from augment.batch.backends import renders_on_gpu
 from augment.batch.processes import available_cores
 from augment.batch.times import shares_of
-from augment.errors import OutputError
+from augment.errors import GpuLost, OutputError
 from augment.generate.job import GenerateJob, make_pool, plan_job, run_generate
 
 SCENES = ["fake:a?frames=2"]
@@ -57,6 +57,16 @@ def test_pictures_of_a_gpu_and_a_cpu_never_mix(tmp_path: Path, first: str, secon
     with pytest.raises(OutputError, match=rf"backend there '{first}', here '{second}'"):
         run_generate(job_of(tmp_path, second), progress=False)
     assert outputs(tmp_path) == before
+
+
+def test_a_lost_gpu_fails_no_block(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    job = job_of(tmp_path, "cuda", renderer=raising_render)
+    with monkeypatch.context() as patch:
+        patch.setattr("augment.batch.runner.gpu_is_lost", lambda backend: True)
+        with pytest.raises(GpuLost, match="since frame 1, camera front"):
+            run_generate(job, progress=False)
+    result = run_generate(job_of(tmp_path, "cuda"), progress=False)
+    assert result.failed == 0 and result.written + result.skipped == 4
 
 
 def test_a_dataset_job_measures_what_bound_it(tmp_path: Path) -> None:
