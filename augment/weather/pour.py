@@ -1,4 +1,4 @@
-"""Putting the layers of a flooded view together: the torch definition, and kernels for the CPU."""
+"""Putting the layers of a flooded view together: the torch definition, and the way to kernels."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from augment.cameras import Camera
-from augment.render.backends import CPU, REFERENCE, kernels_for
+from augment.render.backends import CPU, CUDA, REFERENCE, kernels_for
 from augment.render.buffers import ALPHA, EXPECTED_DEPTH, RGB, SPLAT_IDS, RenderOutput
 from augment.render.composite import composite_sky
 from augment.render.constants import DEPTH_EPS
@@ -28,7 +28,13 @@ def find_water(
 
     alpha: of what stands before the water. It is seen first where that leaves more than half.
     """
-    if kernels_for(backend, alpha) == CPU:
+    kernels = kernels_for(backend, alpha)
+    if kernels == CUDA:
+        from augment.weather import cuda_pour
+
+        water, most = cuda_pour.find_water(alpha, camera)
+        return water, float(most)  # waits for the GPU: what is drawn next depends on it
+    if kernels == CPU:
         water = np.empty(tuple(alpha.shape), np.uint8)
         shown = np.empty(len(alpha), np.float32)
         with kernel_threads(ROWS):
@@ -55,13 +61,23 @@ def pour(
     """
     assert front.rgb is not None and front.alpha is not None
     rgb, alpha = front.rgb, front.alpha
-    if kernels_for(backend, rgb, alpha) == REFERENCE:
+    kernels = kernels_for(backend, rgb, alpha)
+    if kernels == REFERENCE:
         image = composite_sky(rgb, alpha, camera, sky, smog=smog, backend=backend)
         mixed = window.cut(rgb) + (1 - window.cut(alpha))[..., None] * color
         meets = falling(window.of(camera))[..., None]
         window.paste(image, torch.where(meets, mixed, window.cut(image)))
         return image
     dry = _dry_rows(camera)
+    if kernels == CUDA:
+        from augment.weather import cuda_pour
+
+        part = rgb[:0]
+        if dry:
+            above = camera.cropped(0, 0, camera.width, dry)
+            part = composite_sky(rgb[:dry], alpha[:dry], above, sky, smog=smog, backend=backend)
+        cuda_pour.pour(rgb, alpha, camera, window, color, part)
+        return rgb
     if dry:
         part = composite_sky(
             rgb[:dry], alpha[:dry], camera.cropped(0, 0, camera.width, dry), sky, smog=smog
@@ -116,7 +132,15 @@ def both_sides(
     if not wanted:
         return RenderOutput()
     values = {name: getattr(front, name) for name in (*wanted, ALPHA)}
-    if kernels_for(backend, front.alpha) == CPU:
+    kernels = kernels_for(backend, front.alpha)
+    if kernels == CUDA:
+        from augment.weather import cuda_pour
+
+        pairs = {name: (values[name], getattr(behind, name)) for name in sorted(wanted)}
+        depths = pairs.pop(EXPECTED_DEPTH, None)
+        cuda_pour.join(front.alpha, behind.alpha, depths, list(pairs.values()), window)
+        return RenderOutput(**values)
+    if kernels == CPU:
         here, there = window.overlap(front.alpha)
         alphas = (front.alpha.numpy()[here], behind.alpha.numpy()[there])
         with kernel_threads(ROWS):

@@ -26,6 +26,7 @@ SETTLED_M = 0.01  # unless the last one was smaller
 # Where less of any colour comes up from the depth of the bed straight behind a pixel, no bed is
 # looked for: a quarter of an 8-bit step at most, but for beds that rise before the pixel's own.
 LEAST_TRANSMITTANCE = 1 / 1024
+MOST_OPTICAL_DEPTH = -math.log(LEAST_TRANSMITTANCE)
 
 
 def window_offset(outer: Camera, inner: Camera) -> tuple[int, int]:
@@ -75,7 +76,7 @@ def through_the_surface(
     if bends:
         ray = refracted(surface.to_eye, normal, medium.refraction_index)
     opaque = _optical_depth(own_depth / -ray[..., 2], extinction.min())
-    own_solid = own_solid & (opaque < -math.log(LEAST_TRANSMITTANCE))
+    own_solid = own_solid & (opaque < MOST_OPTICAL_DEPTH)
     image = stacked(bed)
     own_colors = bilinear(image, own_column, own_row)
     found, depth, colors = own_solid, own_depth, own_colors

@@ -26,7 +26,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from augment.cameras import Camera
-from augment.render.backends import CPU, REFERENCE, kernels_for
+from augment.render.backends import CPU, CUDA, REFERENCE, kernels_for
 from augment.render.threads import kernel_threads
 from augment.weather import screen_space_kernels as kernels
 from augment.weather.flood import Layer
@@ -77,8 +77,9 @@ def trace_screen(
     behind it. The weight falls to 0 over the outer 4 % of the image.
 
     backend: kernels are equal to this definition but for rays that pass a silhouette's
-    pixel by its corner. They trace every `stride`-th pixel of rows and columns (1, 2 or 4),
-    interpolate where four agree and trace what is left; the definition traces every pixel.
+    pixel by its corner. Those of the CPU trace every `stride`-th pixel of rows and columns (1, 2 or
+    4), interpolate where four agree and trace what is left; the definition and the GPU trace every
+    pixel.
 
     Raises:
         ValueError: another stride, or a camera that is no window of the front's.
@@ -87,16 +88,19 @@ def trace_screen(
         raise ValueError(f"stride must be one of {STRIDES}; got {stride}")
     left, top = _window_origin(front.camera, camera)
     if float(camera.centre[2]) <= level_z_m:
-        distance = torch.full((camera.height, camera.width), math.inf)
+        size, device = (camera.height, camera.width), front.alpha.device
+        distance = torch.full(size, math.inf, device=device)
         return ScreenReflection(front, distance, torch.zeros_like(distance))
     if needed is None:
-        needed = torch.ones(camera.height, camera.width, dtype=torch.bool)
+        size, device = (camera.height, camera.width), front.alpha.device
+        needed = torch.ones(size, dtype=torch.bool, device=device)
     elif tuple(needed.shape) != (camera.height, camera.width):
         raise ValueError(
             f"needed must be [{camera.height}, {camera.width}] as camera {camera.name!r} is; "
             f"got {list(needed.shape)}"
         )
-    run = _trace if kernels_for(backend) == REFERENCE else _trace_fast
+    chosen = kernels_for(backend, front.alpha.detach())
+    run = {REFERENCE: _trace, CPU: _trace_fast, CUDA: _trace_on_gpu}[chosen]
     distance, weight = run(front, camera, level_z_m, left, top, stride, needed)
     return ScreenReflection(front, distance, weight)
 
@@ -156,6 +160,22 @@ def _trace_fast(
             pyramid, view, alpha, asked, left, top, stride, ways, trust, distance, weight
         )
     return torch.from_numpy(distance), torch.from_numpy(weight)
+
+
+def _trace_on_gpu(
+    front: Layer,
+    camera: Camera,
+    level_z_m: float,
+    left: int,
+    top: int,
+    stride: int,
+    needed: Bool[Tensor, "h w"],
+) -> tuple[Tensor, Tensor]:
+    """`stride` is the affair of the CPU's kernel."""
+    from augment.weather import cuda_screen
+
+    vertical = _vertical(front.camera, level_z_m)
+    return cuda_screen.trace(front, camera, left, top, needed, vertical)
 
 
 @dataclass(frozen=True, eq=False)

@@ -37,11 +37,11 @@ EDGE = np.float32(0.04)  # share of the image over which the weight falls to 0
 LEVELS = 3  # above the pixels
 BLOCK = 4**LEVELS  # pixels along a cell of the highest one
 
-_MAX_STEPS = 1024  # cells a ray may look at; streets need 20 on average
-_NUDGE = np.float32(1e-3)  # pixels past a cell's border, against rounding
+MOST_STEPS = 1024  # cells a ray may look at; streets need 20 on average
+NUDGE = np.float32(1e-3)  # pixels past a cell's border, against rounding
 _ZERO, _HALF, _ONE = np.float32(0), np.float32(0.5), np.float32(1)
 _INFINITE = np.float32(math.inf)
-_FARTHEST = np.float32(1e-9)  # inverse depth; nothing is seen beyond
+FARTHEST = np.float32(1e-9)  # inverse depth; nothing is seen beyond
 # Ways (in |x|) that one bilinear patch may hold: those of one surface.
 _SMOOTH, _SMOOTH_WAY = np.float32(0.2), np.float32(0.05)
 
@@ -165,7 +165,7 @@ def _set_up(view, xs, ys, first):
     # Nothing is met in the pixel that the ray starts from.
     t = v8.splat(_HALF) * v8.minimum(v8.absolute(inverse_x), v8.absolute(inverse_y))
     size = v8.splat(np.float32(4))
-    state = (t + v8.splat(_NUDGE), end, size, one / size, zero, one, zero)
+    state = (t + v8.splat(NUDGE), end, size, one / size, zero, one, zero)
     return ray, state, to_sky, scale
 
 
@@ -191,7 +191,7 @@ def _step(pyramid, ray, state):
     leave_x = ((cell_x + ahead_x) * size - x0) * inverse_x
     leave_y = ((cell_y + ahead_y) * size - y0) * inverse_y
     leave = v8.maximum(v8.minimum(v8.minimum(leave_x, leave_y), end), t)
-    beyond = leave + v8.splat(_NUDGE)
+    beyond = leave + v8.splat(NUDGE)
     # Up only out of the parent, which has been looked into already.
     above = inverse * quarter
     other_x = v8.floor(v8.fmuladd(beyond, dx, x0) * above) - v8.floor(cell_x * quarter)
@@ -201,7 +201,7 @@ def _step(pyramid, ray, state):
         v8.greater(v8.absolute(other_x) + v8.absolute(other_y), half),
     )
     k0, k1 = near - change * t, near - change * leave
-    nearest = v8.maximum(v8.minimum(k0, k1), v8.splat(_FARTHEST))
+    nearest = v8.maximum(v8.minimum(k0, k1), v8.splat(FARTHEST))
     reached = v8.both(going, v8.at_least(surface, nearest))
     thick = v8.maximum(v8.splat(THICKNESS), v8.splat(THICKNESS_M) * surface)
     entered = v8.at_least(v8.maximum(k0, k1) * (one + thick), surface)
@@ -228,7 +228,7 @@ def _march(pyramid, view, lanes, xs, ys, first, ways, trusts):
     xs, ys: pixel centres, read from `first` on; the results go to the same places. lanes: scratch.
     """
     ray, state, to_sky, scale = _set_up(view, xs, ys, first)
-    for _ in range(_MAX_STEPS):
+    for _ in range(MOST_STEPS):
         # The sign is clear where a ray goes on; one that has ended just here does no harm.
         if not v8.any_not_negative(state[1] - state[0]):
             break

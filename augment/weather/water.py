@@ -8,12 +8,14 @@ comes from the mirrored direction and T what comes up through the surface.
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from augment.cameras import Camera
-from augment.render.backends import CPU, kernels_for
+from augment.render.backends import CPU, REFERENCE, kernels_for
 from augment.sky import Sky
 from augment.weather import water_launch
 from augment.weather.flood import FloodMedium, Layer
@@ -79,10 +81,10 @@ def shade_water(
         *([] if screen is None else [screen.layer]),
     ]
     images = [cover, *(part for layer in layers for part in (layer.rgb, layer.alpha, layer.depth))]
-    if kernels_for(backend, *images) == CPU:
-        return water_launch.shade(
-            camera, cover, HIDDEN_COVER, medium, field, bed, mirror, screen, sky, smog
-        )
+    kernels = kernels_for(backend, *images)
+    if kernels != REFERENCE:
+        shade = water_launch.shade if kernels == CPU else _shade_on_gpu
+        return shade(camera, cover, HIDDEN_COVER, medium, field, bed, mirror, screen, sky, smog)
     surface = meet_plane(camera, medium.level_z_m, bed.rgb.dtype)
     smooth = is_smooth(field, camera)
     taps = tilted_normals(surface, field, smooth)
@@ -102,6 +104,12 @@ def shade_water(
     plain = torch.tensor(medium.rgb if smog is None else smog.rgb, dtype=out.dtype)
     out = torch.where((cover <= HIDDEN_COVER)[..., None], out, plain)
     return torch.where(surface.meets[..., None], out, 0)
+
+
+def _shade_on_gpu(*arguments: Any) -> Tensor:
+    from augment.weather import cuda_water
+
+    return cuda_water.shade(*arguments)
 
 
 def reflected_share(

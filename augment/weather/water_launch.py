@@ -1,8 +1,7 @@
-"""Arrays for the kernels that shade water, and their launch."""
+"""Arrays for the kernels that shade water on the CPU, and their launch."""
 
 from __future__ import annotations
 
-import math
 from itertools import pairwise
 from weakref import WeakKeyDictionary
 
@@ -32,7 +31,7 @@ from augment.weather.waves import WaveField
 ROWS = 8  # image rows a thread takes at a time: rows without water cost nothing
 MIP_ROWS = 32
 SKY_SIZE = 256  # texels along a face where a sky that is no cube map is sampled onto one
-_known_faces: WeakKeyDictionary[Sky, tuple[int, np.ndarray]] = WeakKeyDictionary()
+_known_faces: WeakKeyDictionary[Sky, tuple[int, Tensor]] = WeakKeyDictionary()
 LARGEST = 1e30  # stands for infinity: its products with 0 are 0
 
 
@@ -49,7 +48,7 @@ def shade(
     smog: SmogMedium | None,
 ) -> Tensor:
     """As `water.shade_water`; smog is None where it has no density."""
-    faces, size, layered = _faces(sky, smog)
+    faces, size, layered = flat_faces(sky, smog)
     limit = water_surface.smooth_variance(camera)
     rough = bool((field.slope_variance >= limit).any())
     out = np.empty((camera.height, camera.width, 3), np.float32)
@@ -73,9 +72,9 @@ def shade(
         screen is not None,
         _array(distance),
         _array(weight),
-        faces,
+        faces.numpy(),
         np.uint64(size),
-        _medium(camera, medium, smog, layered),
+        medium_numbers(camera, medium, smog, layered),
         _limits(hidden_cover, limit),
         out,
     )
@@ -88,8 +87,11 @@ def _array(part: Tensor) -> np.ndarray:
     return part.detach().float().contiguous().numpy()
 
 
-def _faces(sky: Sky, smog: SmogMedium | None) -> tuple[np.ndarray, int, SmogMedium | None]:
-    """A flat cube map for the kernel, the size of its faces with border, the smog before them."""
+def flat_faces(sky: Sky, smog: SmogMedium | None) -> tuple[Tensor, int, SmogMedium | None]:
+    """A flat cube map for the kernels, the size of its faces with border, the smog before them.
+
+    The map of a sky that is an image is the same tensor until the image changes.
+    """
     seen, layered = sky_behind(sky, smog)
     if isinstance(seen, ConstantSky):
         return _padded(seen.rgb.expand(6, 3, 3, 3)), 3, layered
@@ -109,12 +111,12 @@ def _sampled(sky: Sky) -> Tensor:
     return sky.sample(directions_of_cubemap(SKY_SIZE))
 
 
-def _padded(faces: Tensor) -> np.ndarray:
+def _padded(faces: Tensor) -> Tensor:
     """Four numbers a texel, and a row and a texel beyond them."""
     size = faces.shape[1]
     out = np.zeros((6 * size * size + size + 1, 4), np.float32)
     out[: 6 * size * size, :3] = _array(faces).reshape(-1, 3)
-    return out.reshape(-1)
+    return torch.from_numpy(out.reshape(-1))
 
 
 def _layer(layer: Layer | None) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -122,14 +124,20 @@ def _layer(layer: Layer | None) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.
     if layer is None:
         nothing = np.zeros(1, np.float32)
         return np.zeros(22, np.float32), nothing, nothing, nothing
-    camera = layer.camera
+    rgb, alpha, depth = (_array(part).reshape(-1) for part in (layer.rgb, layer.alpha, layer.depth))
+    return view_numbers(layer.camera), rgb, alpha, depth
+
+
+def view_numbers(camera: Camera) -> np.ndarray:
+    """Float32 [22]: focal length times the camera's right, down (fx, fy) and forward axes;
+    coefficients of column, row and 1 in the x, y, z of a pixel's ray; cx, cy, width, height.
+    """
     rotation = camera.camera_from_world[:3, :3].numpy()
     fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
     project = rotation * [[fx], [fy], [1.0]]
     rays = rotation.T @ [[1 / fx, 0.0, -cx / fx], [0.0, 1 / fy, -cy / fy], [0.0, 0.0, 1.0]]
     numbers = [*project.reshape(-1), *rays.reshape(-1), cx, cy, camera.width, camera.height]
-    rgb, alpha, depth = (_array(part).reshape(-1) for part in (layer.rgb, layer.alpha, layer.depth))
-    return np.asarray(numbers, np.float32), rgb, alpha, depth
+    return np.asarray(numbers, np.float32)
 
 
 def _averages(layer: Layer | None, rough: bool) -> tuple[np.ndarray, np.ndarray]:
@@ -153,7 +161,7 @@ def _averages(layer: Layer | None, rough: bool) -> tuple[np.ndarray, np.ndarray]
     return mips.reshape(-1), np.asarray(shapes, np.int64)
 
 
-def _medium(
+def medium_numbers(
     camera: Camera, medium: FloodMedium, smog: SmogMedium | None, layered: SmogMedium | None
 ) -> np.ndarray:
     """`kernels.Medium`."""
@@ -175,5 +183,5 @@ def _limits(hidden_cover: float, smooth_variance: float) -> np.ndarray:
     numbers = [hidden_cover, surface.FARTHEST, surface.LEAST_COSINE, smooth_variance]
     numbers += [surface.STEEPEST, lookup.LEAST_DEPTH, lookup.SOLID_ALPHA, refraction.BED_STEPS]
     numbers += [reflection.EDGE, reflection.MATCH_M, reflection.MATCH_SHARE, refraction.SETTLED_M]
-    numbers += [-math.log(refraction.LEAST_TRANSMITTANCE), reflection.FAINT]
+    numbers += [refraction.MOST_OPTICAL_DEPTH, reflection.FAINT]
     return np.asarray(numbers, np.float32)

@@ -32,18 +32,36 @@ class Margins:
         """A window's mask as one of the grown window, grown by the reach: in whole squares, so that
         nothing is missed.
         """
+        if mask.device.type != "cpu":
+            return self._around_by_torch(mask, reach)
         height, width = mask.shape
         inside = np.zeros((height + self.top + self.bottom, width + self.left + self.right), bool)
         inside[self.top : self.top + height, self.left : self.left + width] = mask.numpy()
         coarse = any_in_squares(inside, GRAIN)
-        left, up, right, down = (
-            math.ceil(n / GRAIN) for n in (reach.left, reach.top, reach.right, reach.bottom)
-        )
+        left, up, right, down = reach.in_squares()
         square = np.ones((up + down + 1, left + right + 1), np.uint8)
         # OpenCV grows towards what lies before the anchor in the kernel's own direction.
         grown = cv2.dilate(coarse.astype(np.uint8), square, anchor=(right, down))
         fine = grown.repeat(GRAIN, 0).repeat(GRAIN, 1)[: inside.shape[0], : inside.shape[1]]
         return torch.from_numpy(np.ascontiguousarray(fine)).view(torch.bool)
+
+    def in_squares(self) -> tuple[int, int, int, int]:
+        return (
+            math.ceil(self.left / GRAIN),
+            math.ceil(self.top / GRAIN),
+            math.ceil(self.right / GRAIN),
+            math.ceil(self.bottom / GRAIN),
+        )
+
+    def _around_by_torch(self, mask: Tensor, reach: Margins) -> Tensor:
+        """`around` of a mask on a GPU: the same squares."""
+        pad, pool = torch.nn.functional.pad, torch.nn.functional.max_pool2d
+        inside = pad(mask.float()[None, None], (self.left, self.right, self.top, self.bottom))
+        coarse = pool(inside, GRAIN, ceil_mode=True)
+        left, up, right, down = reach.in_squares()
+        grown = pool(pad(coarse, (right, left, down, up)), (up + down + 1, left + right + 1), 1)
+        fine = grown[0, 0].repeat_interleave(GRAIN, 0).repeat_interleave(GRAIN, 1)
+        return (fine[: inside.shape[2], : inside.shape[3]] > 0).contiguous()
 
 
 @dataclass(frozen=True)
@@ -158,6 +176,10 @@ def mirrored_camera(camera: Camera, level_z_m: float) -> Camera:
 
 def resized(mask: Bool[Tensor, "H W"], camera: Camera) -> Bool[Tensor, "h w"]:
     """The mask at a camera's smaller size: true where any of a pixel is."""
+    if mask.device.type != "cpu":
+        wide = mask.float()[None, None]
+        size = (camera.height, camera.width)
+        return torch.nn.functional.adaptive_max_pool2d(wide, size)[0, 0] > 0
     size = (camera.width, camera.height)
     share = cv2.resize(mask.float().numpy(), size, interpolation=cv2.INTER_AREA)
     return torch.from_numpy(share > 0).reshape(camera.height, camera.width)

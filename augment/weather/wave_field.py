@@ -17,7 +17,8 @@ import torch
 from torch import Tensor
 
 from augment.cameras import Camera
-from augment.render.backends import CPU, REFERENCE, kernels_for
+from augment.render.backends import CPU, CUDA, REFERENCE, kernels_for
+from augment.render.gpu import gpu_device
 from augment.render.threads import kernel_threads
 from augment.weather import waves_kernels
 from augment.weather.waves import (
@@ -42,7 +43,7 @@ def wave_field(
     """The waves at every pixel of a camera, at its own time. level_z_m: the plane, scene world.
 
     backend: with kernels by them, equal to the definition in float64 within 1e-5 of a normal's
-    components (for surfaces that keep clear of cusps).
+    components (for surfaces that keep clear of cusps). "cuda" leaves the field on the GPU.
 
     Raises:
         ValueError: level_z_m is not finite.
@@ -50,10 +51,18 @@ def wave_field(
     if not math.isfinite(level_z_m):
         raise ValueError(f"level_z_m must be finite; got {level_z_m}")
     height = float(camera.centre[2]) - level_z_m
-    if waves.is_flat or abs(height) < TOUCHING_M:
-        still = torch.zeros(camera.height, camera.width)
+    kernels = kernels_for(backend)
+    is_still = waves.is_flat or abs(height) < TOUCHING_M
+    if is_still:
+        device = gpu_device() if kernels == CUDA else None
+        still = torch.zeros(camera.height, camera.width, device=device)
         return WaveField(still, still, still)
-    return (_define if kernels_for(backend) == REFERENCE else _run_kernel)(waves, camera, height)
+    if kernels == CUDA:
+        from augment.weather import cuda_waves
+
+        limits = (UPRIGHT, FADED_PX, FULL_PX)
+        return cuda_waves.fill_field(waves, camera, height, farthest=FARTHEST_M, limits=limits)
+    return (_define if kernels == REFERENCE else _run_kernel)(waves, camera, height)
 
 
 def _define(waves: WaveSet, camera: Camera, height: float) -> WaveField:

@@ -26,14 +26,13 @@ from augment.render.cpu_jit import inner, kernel
 
 CHUNK = 64  # columns that share an anchor; few enough for float32 turns good to 1e-6
 KEPT, FADING = 7, 10  # float32 numbers that are laid out per wave
-_ZERO, _HALF, _ONE, _THREE, _TINY = (np.float32(x) for x in (0, 0.5, 1, 3, 1e-24))
+_ZERO, _HALF, _ONE, _THREE = (np.float32(x) for x in (0, 0.5, 1, 3))
+TINY = np.float32(1e-24)  # square of a normal's length, before it is made 1, at a cusp
 # sin(pi r) / r and cos(pi r) in powers of r^2 for |r| <= 1/2, least maximal error (3e-9, 5e-8).
-_S0, _S1, _S2, _S3, _S4 = (
-    np.float32(c) for c in (3.14159258, -5.16770688, 2.55003138, -0.598045173, 0.0772201257)
-)
-_C0, _C1, _C2, _C3, _C4 = (
-    np.float32(c) for c in (0.999999953, -4.93479286, 4.05841191, -1.33188016, 0.219696799)
-)
+SINE = (3.14159258, -5.16770688, 2.55003138, -0.598045173, 0.0772201257)
+COSINE = (0.999999953, -4.93479286, 4.05841191, -1.33188016, 0.219696799)
+_S0, _S1, _S2, _S3, _S4 = (np.float32(c) for c in SINE)
+_C0, _C1, _C2, _C3, _C4 = (np.float32(c) for c in COSINE)
 
 
 @inner()
@@ -208,7 +207,7 @@ def _shade_chunk(kept, many, fading, some, faded, ray, height, limits, begin, en
         ny = v8.negate(v8.fmuladd(xy, gx, wide * gy))
         nz = v8.maximum(wide * deep - xy * xy, zero)
         square = v8.fmuladd(nx, nx, v8.fmuladd(ny, ny, nz * nz))
-        scale = one / v8.sqrt(v8.maximum(square, v8.splat(_TINY)))
+        scale = one / v8.sqrt(v8.maximum(square, v8.splat(TINY)))
         at = np.uint64(8 * block)
         v8.store(out, at, nx * scale)
         v8.store(out, at + np.uint64(CHUNK), ny * scale)

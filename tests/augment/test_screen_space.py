@@ -7,8 +7,10 @@ import torch
 from augment.cameras import Camera
 from augment.geometry import rigid, rotmat_from_quat
 from augment.render.threads import limit_threads
+from augment.weather import screen_space
 from augment.weather.flood import Layer
-from augment.weather.screen_space import trace_screen
+from augment.weather.screen_space import ScreenReflection
+from tests.augment.flood_programs import few_programs
 
 EYE_M = 1.5  # over the water, whose level is LEVEL_M
 LEVEL_M = 0.3
@@ -22,6 +24,16 @@ def one_torch_thread():
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
+
+
+@pytest.fixture(autouse=True)
+def large_programs(monkeypatch):
+    few_programs(monkeypatch, 128)
+
+
+def trace_screen(*args, **kwargs) -> ScreenReflection:
+    found = screen_space.trace_screen(*args, **kwargs)
+    return dataclasses.replace(found, distance=found.distance.cpu(), weight=found.weight.cpu())
 
 
 def looking(
@@ -87,7 +99,7 @@ def projected(camera: Camera, way: torch.Tensor) -> torch.Tensor:
 VIEWS = [(0, 0), (8, 0), (0, 25), (12, -40), (-10, 5), (35, 90)]
 
 
-@pytest.mark.parametrize("backend", ["reference", "cpu"])
+@pytest.mark.parametrize("backend", ["reference", "cpu", "cuda"])
 @pytest.mark.parametrize(("pitch", "roll"), VIEWS)
 def test_rays_meet_a_wall_where_geometry_says(pitch, roll, backend):
     camera = looking(pitch, roll)
@@ -122,7 +134,7 @@ def test_a_wall_is_as_smooth_between_the_traced_pixels(stride):
     assert torch.allclose(found[sure].double(), way[sure], rtol=0.02, atol=0.02)
 
 
-@pytest.mark.parametrize("backend", ["reference", "cpu"])
+@pytest.mark.parametrize("backend", ["reference", "cpu", "cuda"])
 def test_a_car_before_a_wall_is_met_first_and_sky_is_above_both(backend):
     camera = looking(height=101)
     car_top, wall_top = 0.6, 5.0  # low and high enough for rays between them to be in the image
@@ -148,7 +160,7 @@ def test_a_car_before_a_wall_is_met_first_and_sky_is_above_both(backend):
     assert found.distance[sky].isinf().all() and (found.weight[sky] == 1).all()
 
 
-@pytest.mark.parametrize("backend", ["reference", "cpu"])
+@pytest.mark.parametrize("backend", ["reference", "cpu", "cuda"])
 def test_what_is_lost_behind_a_thin_thing_is_not_known(backend):
     """A sign hangs before the sky: rays of water far behind it pass behind it."""
     camera = looking(0, height=151)
@@ -168,7 +180,7 @@ def test_what_is_lost_behind_a_thin_thing_is_not_known(backend):
     assert found.distance[beside].isinf().all() and int((found.weight[beside] == 1).sum()) > 20
 
 
-@pytest.mark.parametrize("backend", ["reference", "cpu"])
+@pytest.mark.parametrize("backend", ["reference", "cpu", "cuda"])
 def test_what_stands_above_the_image_is_not_known(backend):
     camera = looking(30)  # the horizon lies above the image
     front = see(camera, (WALL_M, -1e3, 1e3, 0.0, 1e3))
@@ -179,7 +191,7 @@ def test_what_stands_above_the_image_is_not_known(backend):
     assert (found.weight[above] == 0).all() and found.distance[above].isinf().all()
 
 
-@pytest.mark.parametrize("backend", ["reference", "cpu"])
+@pytest.mark.parametrize("backend", ["reference", "cpu", "cuda"])
 def test_rays_that_come_back_to_the_camera_are_not_known(backend):
     """Looking straight down, past the point under the camera."""
     for roll in (0, 30):
@@ -189,7 +201,7 @@ def test_rays_that_come_back_to_the_camera_are_not_known(backend):
         assert (found.weight == 0).all() and found.distance.isinf().all()
 
 
-@pytest.mark.parametrize("backend", ["reference", "cpu"])
+@pytest.mark.parametrize("backend", ["reference", "cpu", "cuda"])
 @pytest.mark.parametrize("stride", [1, 2, 4])
 def test_nothing_stands_anywhere(backend, stride):
     camera = looking(0, height=65)
@@ -201,7 +213,7 @@ def test_nothing_stands_anywhere(backend, stride):
     assert (found.weight[:32] == 0).all()  # above the horizon there is no water
 
 
-@pytest.mark.parametrize("backend", ["reference", "cpu"])
+@pytest.mark.parametrize("backend", ["reference", "cpu", "cuda"])
 def test_pixels_without_water_have_no_reflection(backend):
     camera = looking(10)
     everything = dataclasses.replace(
@@ -233,11 +245,14 @@ def test_every_size_of_image_and_window(size, stride):
     assert float(beyond.weight.sum()) == pytest.approx(float(whole.weight.sum()), rel=1e-5)
 
 
-@pytest.mark.parametrize(("pitch", "roll"), [*VIEWS, (80, 20)])
-def test_the_kernel_matches_the_definition(pitch, roll):
+@pytest.mark.parametrize(
+    ("backend", "pitch", "roll"),
+    [*(("cpu", *view) for view in (*VIEWS, (80, 20))), ("cuda", 12, -40), ("cuda", 35, 90)],
+)
+def test_the_kernel_matches_the_definition(backend, pitch, roll):
     camera = looking(pitch, roll, 131, 90, fx=80.0)
     front = see(camera, SIGN, CAR, WALL, (30.0, 2.0, 9.0, 1.0, 8.0))
-    fast = trace_screen(front, camera, LEVEL_M, stride=1)
+    fast = trace_screen(front, camera, LEVEL_M, stride=1, backend=backend)
     slow = trace_screen(front, camera, LEVEL_M, backend="reference")
     close = torch.isclose(fast.distance, slow.distance, rtol=1e-3, atol=1e-3)
     close &= (fast.weight - slow.weight).abs() < 1e-3
@@ -246,9 +261,11 @@ def test_the_kernel_matches_the_definition(pitch, roll):
     assert int((~close).sum()) <= 0.005 * close.numel()
 
 
-@pytest.mark.parametrize("backend", ["reference", "cpu"])
-@pytest.mark.parametrize("stride", [1, 2, 4])
-def test_only_needed_pixels_are_traced(stride, backend):
+@pytest.mark.parametrize(
+    ("backend", "stride"),
+    [("reference", 1), ("cpu", 1), ("cpu", 2), ("cpu", 4), ("cuda", 1)],
+)
+def test_only_needed_pixels_are_traced(backend, stride):
     camera = looking(6, 10)
     front = see(camera, CAR, WALL)
     whole = trace_screen(front, camera, LEVEL_M, stride=1, backend=backend)

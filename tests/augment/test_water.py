@@ -1,6 +1,7 @@
-"""The water's picture against hand-made cases, and its kernel against its definition."""
+"""The water's picture against hand-made cases, and its kernels against their definition."""
 
 import dataclasses
+import itertools
 import math
 
 import numpy as np
@@ -10,13 +11,14 @@ import torch
 from augment.cameras import Camera
 from augment.geometry import invert_rigid
 from augment.sky import ConstantSky, CubemapSky, LatLongSky
+from augment.weather import water as water_module
 from augment.weather.flood import FloodMedium, Layer
 from augment.weather.fresnel import reflectance
 from augment.weather.screen_space import ScreenReflection
 from augment.weather.smog import SmogMedium, blend_airlight, optical_depth
-from augment.weather.water import shade_water
 from augment.weather.water_surface import is_smooth, smooth_variance
 from augment.weather.waves import WaveField, WaveSet
+from tests.augment.flood_programs import few_programs
 
 NONE = np.zeros(0)
 STILL = WaveSet(np.zeros((0, 2)), NONE, NONE, NONE, NONE, 1.0)
@@ -118,7 +120,16 @@ def margin(eye: Camera, pixels: int = 12) -> Camera:
     return eye.cropped(-pixels, -pixels, eye.width + 2 * pixels, eye.height + 2 * pixels)
 
 
-BOTH = pytest.mark.parametrize("backend", ["reference", "cpu"])
+@pytest.fixture(autouse=True)
+def large_programs(monkeypatch):
+    few_programs(monkeypatch)
+
+
+def shade_water(*args, **kwargs) -> torch.Tensor:
+    return water_module.shade_water(*args, **kwargs).cpu()
+
+
+ALL = pytest.mark.parametrize("backend", ["reference", "cpu", "cuda"])
 SMOGS = {
     "clear": None,
     "uniform": SmogMedium(0.02, GREY),
@@ -126,18 +137,26 @@ SMOGS = {
 }
 
 
-@pytest.mark.parametrize("smog", SMOGS.values(), ids=SMOGS)
-@pytest.mark.parametrize("tier", ["sky", "mirrored", "screen_space"])
+TIERS = ["sky", "mirrored", "screen_space"]
+VIEWS = [
+    ((61, 43), 0.0, "exact"),
+    ((61, 43), 2e-3, "schlick"),
+    ((1, 1), 2e-3, "exact"),
+    ((17, 90), 2e-3, "exact"),
+]
+
+
 @pytest.mark.parametrize(
-    ("size", "variance", "fresnel"),
+    ("backend", "smog", "tier", "view"),
     [
-        ((61, 43), 0.0, "exact"),
-        ((61, 43), 2e-3, "schlick"),
-        ((1, 1), 2e-3, "exact"),
-        ((17, 90), 2e-3, "exact"),
+        *itertools.product(["cpu"], SMOGS, TIERS, VIEWS),
+        *itertools.product(["cuda"], ["layered"], TIERS, VIEWS[:2]),
+        *itertools.product(["cuda"], ["clear", "uniform"], ["screen_space"], VIEWS[1:2]),
+        *itertools.product(["cuda"], ["layered"], ["mirrored"], VIEWS[2:]),
     ],
 )
-def test_the_kernel_matches_the_definition(smog, tier, size, variance, fresnel):
+def test_the_kernel_matches_the_definition(backend, smog, tier, view):
+    (size, variance, fresnel), smog = view, SMOGS[smog]
     eye = camera(*size)
     field = wavy_field(eye, variance=variance)
     bed = plane_layer(margin(eye), LEVEL - 0.4)
@@ -155,7 +174,7 @@ def test_the_kernel_matches_the_definition(smog, tier, size, variance, fresnel):
         exact["screen"] = ScreenReflection(doubled(front), distance, weight)
     water = medium(fresnel=fresnel)
     cover = uncovered(eye)
-    fast = shade_water(eye, cover, water, field, bed, sky=sky, smog=smog, **layers)
+    fast = shade_water(eye, cover, water, field, bed, sky=sky, smog=smog, backend=backend, **layers)
     slow = shade_water(eye, cover, water, field, doubled(bed), sky=sky, smog=smog, **exact)
     assert slow.dtype == torch.float64 and bool((slow != 0).any())
     difference = (fast - slow).abs().amax(-1)
@@ -167,10 +186,15 @@ def test_the_kernel_matches_the_definition(smog, tier, size, variance, fresnel):
     assert int((difference > 5e-5).sum()) <= 0.002 * difference.numel()
 
 
-@BOTH
-@pytest.mark.parametrize("tier", ["sky", "mirrored", "screen_space"])
-@pytest.mark.parametrize("index", [1.0, 1.333, 3.0])
-@pytest.mark.parametrize("extinction", [0.0, 1.0, math.inf])
+@pytest.mark.parametrize(
+    ("backend", "tier", "index", "extinction"),
+    [
+        *itertools.product(["reference", "cpu"], TIERS, [1.0, 1.333, 3.0], [0.0, 1.0, math.inf]),
+        ("cuda", "sky", 1.0, 0.0),
+        ("cuda", "mirrored", 3.0, math.inf),
+        ("cuda", "screen_space", 1.333, 1.0),
+    ],
+)
 def test_a_world_of_one_colour_keeps_it(backend, tier, index, extinction):
     eye = camera()
     layers = {}
@@ -185,7 +209,8 @@ def test_a_world_of_one_colour_keeps_it(backend, tier, index, extinction):
     bed = constant_layer(margin(eye), GREY, 8.0, 1)
     field = wavy_field(eye, slope=0.3, variance=0.01)
     sky = ConstantSky(torch.tensor(GREY))
-    for smog in (None, *[SmogMedium(0.05, GREY, height) for height in (None, 5.0)]):
+    smogs = [None, *[SmogMedium(0.05, GREY, height) for height in (None, 5.0)]]
+    for smog in smogs[::2] if backend == "cuda" else smogs:
         out = shade_water(
             eye, uncovered(eye), water, field, bed, sky=sky, smog=smog, backend=backend, **layers
         )
@@ -196,7 +221,7 @@ def test_a_world_of_one_colour_keeps_it(backend, tier, index, extinction):
         )
 
 
-@BOTH
+@ALL
 def test_without_refraction_and_absorption_the_bed_is_seen_as_it_is(backend):
     eye = camera(pitch_deg=-40)
     bed = plane_layer(margin(eye, 5), LEVEL - 0.5)
@@ -222,7 +247,7 @@ def refract_exactly(eye: Camera, depth: float, index: float) -> tuple[torch.Tens
     return ends, way
 
 
-@BOTH
+@ALL
 @pytest.mark.parametrize("index", [1.333, 2.5])
 def test_refracted_rays_meet_the_bed_where_snell_says(backend, index):
     eye, depth = camera(pitch_deg=-40), 0.6
@@ -247,7 +272,7 @@ def test_refracted_rays_meet_the_bed_where_snell_says(backend, index):
     assert float((seen - straight)[..., 0].abs().mean()) > 0.05  # it does bend
 
 
-@BOTH
+@ALL
 @pytest.mark.parametrize("slope", [(0.0, 0.0), (0.03, -0.02)])
 def test_the_mirrored_wall_is_where_the_mirrored_ray_meets_it(backend, slope):
     eye = camera(pitch_deg=-8)
@@ -284,7 +309,7 @@ def test_the_mirrored_wall_is_where_the_mirrored_ray_meets_it(backend, slope):
     assert float(error.quantile(0.99)) < 4e-3
 
 
-@BOTH
+@ALL
 def test_the_sky_tier_shows_the_sky_of_the_mirrored_direction(backend):
     eye = camera(pitch_deg=0)
     bed = plane_layer(eye, LEVEL - 0.3)
@@ -302,7 +327,7 @@ def test_the_sky_tier_shows_the_sky_of_the_mirrored_direction(backend):
     assert torch.equal(out[rays[..., 2] >= 0], torch.zeros_like(out[rays[..., 2] >= 0]))
 
 
-@BOTH
+@ALL
 @pytest.mark.parametrize("smog", list(SMOGS.values())[1:], ids=list(SMOGS)[1:])
 def test_smog_fogs_the_water_as_a_surface_of_its_colour(backend, smog):
     eye = camera(pitch_deg=-40)
@@ -327,7 +352,7 @@ def test_smog_fogs_the_water_as_a_surface_of_its_colour(backend, smog):
     torch.testing.assert_close(out.double(), expected, atol=2e-6, rtol=0)  # a few float32 roundings
 
 
-@BOTH
+@ALL
 def test_uniform_smog_leaves_its_own_colour_of_the_sky(backend):
     eye = camera(pitch_deg=-40)
     bed = plane_layer(eye, LEVEL - 0.3)
@@ -349,9 +374,14 @@ def test_uniform_smog_leaves_its_own_colour_of_the_sky(backend):
     assert float((out - share * torch.tensor(GREY)).abs().max()) < 1e-4
 
 
-@BOTH
-@pytest.mark.parametrize("above", [1e-6, 0.01, 5e3])
-@pytest.mark.parametrize("pitch_deg", [-90.0, 0.0, 35.0])
+@pytest.mark.parametrize(
+    ("backend", "above", "pitch_deg"),
+    [
+        *itertools.product(["reference", "cpu"], [1e-6, 0.01, 5e3], [-90.0, 0.0, 35.0]),
+        ("cuda", 1e-6, 0.0),
+        ("cuda", 5e3, 35.0),
+    ],
+)
 def test_extreme_views_stay_finite(backend, above, pitch_deg):
     eye = camera(above=above, pitch_deg=pitch_deg, roll=0.0)
     bed = constant_layer(eye, MUD, 3.0, 1)
@@ -369,7 +399,7 @@ def test_extreme_views_stay_finite(backend, above, pitch_deg):
         assert float(out.max()) <= 1 + 1e-5  # no more light than the brightest colour
 
 
-@BOTH
+@ALL
 def test_a_dry_bed_is_not_dimmed_by_any_water(backend):
     eye = camera()
     bed = dataclasses.replace(plane_layer(eye, LEVEL), alpha=torch.ones(43, 61))
@@ -382,7 +412,7 @@ def test_a_dry_bed_is_not_dimmed_by_any_water(backend):
     assert torch.equal(out, bed.rgb)
 
 
-@BOTH
+@ALL
 def test_the_bed_is_not_looked_for_where_it_cannot_be_seen(backend):
     eye = camera(pitch_deg=-40)
     field, black = flat_field(eye), ConstantSky(torch.zeros(3))
@@ -398,7 +428,7 @@ def test_the_bed_is_not_looked_for_where_it_cannot_be_seen(backend):
         assert difference > 1e-3 if seen else difference == 0
 
 
-@BOTH
+@ALL
 def test_rough_pixels_take_the_mirror_and_smooth_ones_the_image(backend):
     eye = camera(pitch_deg=-8)
     white, grey = (
@@ -436,7 +466,7 @@ def test_rough_pixels_take_the_mirror_and_smooth_ones_the_image(backend):
     assert float(ratio.max()) < 2 + 1e-5 and int((ratio > 2 - 1e-5).sum()) > 500
 
 
-@BOTH
+@ALL
 def test_covered_pixels_are_one_colour(backend):
     eye = camera()
     cover = uncovered(eye)
@@ -452,7 +482,7 @@ def test_covered_pixels_are_one_colour(backend):
     assert torch.equal(out[30:40], torch.tensor(smog.rgb).expand_as(out[30:40]))
 
 
-@BOTH
+@ALL
 def test_several_slopes_show_one_blurred_picture(backend):
     """A bright line reflected in rough water spreads evenly instead of showing three times."""
     eye = camera(pitch_deg=-8)
@@ -476,7 +506,8 @@ def test_several_slopes_show_one_blurred_picture(backend):
     assert float(rises[top:].max()) < 0.15 * float(column[top])
 
 
-def test_other_skies_go_through_a_cube_map():
+@pytest.mark.parametrize("backend", ["cpu", "cuda"])
+def test_other_skies_go_through_a_cube_map(backend):
     eye = camera()
     image = torch.rand(4, 8, 3, generator=torch.Generator().manual_seed(2))
     bed = plane_layer(eye, LEVEL - 0.3)
@@ -490,19 +521,23 @@ def test_other_skies_go_through_a_cube_map():
             sky=LatLongSky(image),
             backend=choice,
         )
-        for choice in ("cpu", "reference")
+        for choice in (backend, "reference")
     )
     # A texel of the cube map is 1/80 of the image's: a kink between its pixels is cut that much.
     assert float((fast - slow).abs().max()) < 5e-3
 
 
-def test_a_sky_that_is_painted_over_is_seen_anew():
+@pytest.mark.parametrize("backend", ["cpu", "cuda"])
+def test_a_sky_that_is_painted_over_is_seen_anew(backend):
     eye = camera()
     bed, field, sky = plane_layer(eye, LEVEL - 0.3), flat_field(eye), noise_sky()
-    before = shade_water(eye, uncovered(eye), medium(), field, bed, sky=sky)
+
+    def shaded(seen: CubemapSky) -> torch.Tensor:
+        return shade_water(eye, uncovered(eye), medium(), field, bed, sky=seen, backend=backend)
+
+    before = shaded(sky)
     sky.faces.mul_(0.5)
-    after = shade_water(eye, uncovered(eye), medium(), field, bed, sky=sky)
-    fresh = shade_water(eye, uncovered(eye), medium(), field, bed, sky=CubemapSky(sky.faces))
+    after, fresh = shaded(sky), shaded(CubemapSky(sky.faces))
     assert torch.equal(after, fresh) and float((before - after).abs().max()) > 0.01
 
 

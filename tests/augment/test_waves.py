@@ -296,7 +296,7 @@ def test_a_cusp_counts_as_level():
     assert wave_normals(waves, points, 0).tolist() == [[0, 0, 1]]
     # A camera over it, whose middle pixel is the cusp: float32 may see either flank, not NaN.
     camera = camera_at([1.0, 0, 3.0], down_deg=90, size=(9, 9), time=0)
-    for backend in ("cpu", "reference"):
+    for backend in ("cpu", "reference", "cuda"):
         field = fields_of(waves, camera, backend=backend)
         assert bool((field[:2].norm(dim=0) <= 1 + 1e-6).all())
 
@@ -329,20 +329,50 @@ SETS = {
 
 def fields_of(waves: WaveSet, camera: Camera, *, backend: str, level_z_m: float = 0.0):
     field = wave_field(waves, camera, level_z_m, backend=backend)
-    return torch.stack([field.normal_x, field.normal_y, field.slope_variance])
+    return torch.stack([field.normal_x, field.normal_y, field.slope_variance]).cpu()
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
 @pytest.mark.parametrize("waves", SETS)
 def test_the_kernel_matches_the_definition(camera, waves):
-    fast = fields_of(SETS[waves], CAMERAS[camera], backend="cpu")
-    slow = fields_of(SETS[waves], CAMERAS[camera], backend="reference")
+    assert_matches_the_definition(SETS[waves], CAMERAS[camera], "cpu")
+    seen = fields_of(SETS[waves], CAMERAS[camera], backend="reference")
+    assert bool((seen != 0).any()) == (camera != "up")
+
+
+def assert_matches_the_definition(waves: WaveSet, camera: Camera, backend: str) -> None:
+    fast = fields_of(waves, camera, backend=backend)
+    slow = fields_of(waves, camera, backend="reference")
     assert fast.shape == slow.shape and fast.dtype == slow.dtype == torch.float32
     # Turns from an anchor at most 64 pixels away, at 4 pixels a turn: 16 * 6e-8 * 2 pi = 6e-6
     # radians at worst, times a slope of at most 1, over the 0.2 that the steepest crest leaves
     # of a unit area.
     assert float((fast - slow).abs().max()) < 1e-5
-    assert bool((slow != 0).any()) == (camera != "up")
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+@pytest.mark.parametrize(("waves", "rows"), [("one", 6), ("24", 1)])
+def test_the_gpu_s_kernel_matches_the_definition(camera, waves, rows):
+    camera = CAMERAS[camera]
+    for top in (camera.height // 2, camera.height - rows):  # an interpreted row takes its time
+        part = camera.cropped(0, top, camera.width, min(rows, camera.height))
+        assert_matches_the_definition(SETS[waves], part, "cuda")
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("waves", SETS)
+def test_whole_images_on_a_gpu_match_the_definition(waves):
+    for camera in CAMERAS.values():
+        assert_matches_the_definition(SETS[waves], camera, "cuda")
+
+
+@pytest.mark.parametrize("backend", ["cpu", "cuda"])
+def test_a_wide_image_far_from_the_origin_is_as_exact(backend):
+    """Waves that turn hundreds of times between the eye and the image's corner."""
+    camera = camera_at([4e5, -3e5, 1.5], down_deg=2, size=(1600, 2), focal=1500.0, time=10**18)
+    camera = dataclasses.replace(camera, cy=-30.0)
+    waves = waves_of(6, steepness=0.3, slope=0.6, low=0.3, high=6.0)
+    assert_matches_the_definition(waves, camera, backend)
 
 
 def footprint_by_differences(camera: Camera, row: int, column: int) -> tuple[np.ndarray, ...]:
@@ -398,11 +428,12 @@ def test_the_field_is_what_its_definition_says_pixel_by_pixel(camera):
 
 
 def test_pixels_above_the_horizon_and_eyes_in_the_plane_see_no_water():
-    camera, waves = CAMERAS["rolled"], SETS["24"]
+    camera, waves = CAMERAS["rolled"], SETS["one"]
+    camera = camera.cropped(0, 20, camera.width, 20)
     rays = camera.ray_directions(torch.float64)
     meets = (rays[..., 2] < 0) & (-1.5 / rays[..., 2] <= FARTHEST_M)
     assert 0.2 < float(meets.double().mean()) < 0.9
-    for backend in ("cpu", "reference"):
+    for backend in ("cpu", "reference", "cuda"):
         field = fields_of(waves, camera, backend=backend)
         assert bool((field[:, ~meets] == 0).all()) and bool((field[2, meets] > 0).any())
         assert bool((fields_of(waves, camera, backend=backend, level_z_m=1.5) == 0).all())
@@ -417,7 +448,8 @@ def test_still_water_runs_no_kernel(monkeypatch):
     monkeypatch.setattr(waves_kernels, "fill_field", ran)
     for recipe in (Waves(preset="still"), Waves(preset="wind", height=0.0)):
         waves = make_waves(recipe, seed=0, depth_m=1.0)
-        assert bool((fields_of(waves, CAMERAS["driving"], backend="cpu") == 0).all())
+        for backend in ("cpu", "cuda"):
+            assert bool((fields_of(waves, CAMERAS["driving"], backend=backend) == 0).all())
     with pytest.raises(AssertionError, match="the kernel ran"):
         wave_field(SETS["one"], CAMERAS["driving"], 0.0)
 
@@ -434,11 +466,12 @@ def test_two_cameras_see_one_surface():
     # The principal point is moved until the centre of pixel (20, 50) is where the point appears.
     second = dataclasses.replace(second, cx=50.5 - second.fx * x / z, cy=20.5 - second.fy * y / z)
     expected = wave_normals(waves, point[:2], NOW)[:2].tolist()
-    for backend in ("cpu", "reference"):
-        a, b = (fields_of(waves, camera, backend=backend) for camera in (first, second))
-        assert a[2, row, column] == b[2, 20, 50] == 0  # nothing is faded
-        assert a[:2, row, column].tolist() == pytest.approx(expected, abs=1e-5)  # the contract
-        assert b[:2, 20, 50].tolist() == pytest.approx(expected, abs=1e-5)
+    for backend in ("cpu", "reference", "cuda"):
+        for camera, i, j in ((first, row, column), (second, 20, 50)):
+            alone = camera.cropped(0, i, camera.width, 1)
+            field = fields_of(waves, alone, backend=backend)[:, 0, j]
+            assert field[2] == 0  # nothing is faded
+            assert field[:2].tolist() == pytest.approx(expected, abs=1e-5)  # the contract
 
 
 def test_the_distance_does_not_glitter():

@@ -1,0 +1,19 @@
+"""Interpreted Triton kernels take their time by the operation, hardly by the pixel."""
+
+from __future__ import annotations
+
+import pytest
+
+from augment.render import gpu
+
+
+def few_programs(monkeypatch: pytest.MonkeyPatch, size: int = 64) -> None:
+    """Lets the flood's kernels take squares of so many pixels a side where they are interpreted."""
+    if not gpu.is_interpreted():
+        return
+    from augment.weather import cuda_pour, cuda_screen, cuda_water
+
+    for module in (cuda_screen, cuda_water):
+        monkeypatch.setattr(module, "WIDE", size)
+        monkeypatch.setattr(module, "HIGH", size)
+    monkeypatch.setattr(cuda_pour, "LANES", size * size)
