@@ -94,6 +94,7 @@ def fit(
     depth: str = "lidar",
     ego_masks: Path | None = None,
     truth: str | None = None,
+    device: Literal["cpu", "cuda"] = "cpu",
     overwrite: bool = False,
     json_file: JsonFile = None,
 ) -> int:
@@ -121,6 +122,8 @@ def fit(
         ego_masks: A folder of CAMERA.png, white where the image shows the recording car.
         truth: The procedural street that a recording was rendered from: the report then holds
             the error against its exact depth.
+        device: Where views are rendered: cpu, or cuda by gsplat (an extra), of which no two runs
+            give the same bytes.
         overwrite: Begin anew and replace what is there.
         json_file: Also write the report to this file.
     """
@@ -144,6 +147,7 @@ def fit(
         depth=depth,
         ego_masks=ego_masks,
         truth=truth,
+        device=device,
         overwrite=overwrite,
     )
     outcome = fit_scene(options)

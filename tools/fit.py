@@ -72,7 +72,7 @@ def fit_scene(
             if before.finished and (done := _finished(options, folder, before)) is not None:
                 return done
         try:
-            run = _prepare(options, parts or real_parts(), folder, before)
+            run = _prepare(options, parts or real_parts(options.device), folder, before)
         except BaseException:
             _remove_unused(folder)
             raise

@@ -17,6 +17,7 @@ from adapters.recorded.holdout import holdout_step
 from adapters.uri import format_uri, parse_uri
 from augment.errors import ClimateGSError
 from augment.reconstruct.config import DensifyConfig, FitConfig
+from augment.reconstruct.renderers import DEVICES
 from tools.fit_truth import open_street
 
 DEFAULT_MINUTES = 10.0
@@ -32,6 +33,7 @@ class FitOptions:
 
     scene: URI of the raw data. minutes, steps: one of them or neither (10 minutes). cameras: names,
     None for all. depth_weight, sh_degree, max_splats: None for FitConfig's. depth: see parse_depth.
+    device: where views are rendered, cpu, or cuda by gsplat.
     truth: URI of the street a recording shows, for the report alone.
 
     Raises:
@@ -54,6 +56,7 @@ class FitOptions:
     depth: str = "lidar"
     ego_masks: Path | None = None
     truth: str | None = None
+    device: str = "cpu"
     overwrite: bool = False
 
     def __post_init__(self) -> None:
@@ -70,6 +73,8 @@ class FitOptions:
         self._check("--image-cache-mb", self.image_cache_mb, 0, math.inf, "megabytes, >= 0")
         if self.densify not in DENSIFY:
             raise ClimateGSError(f"--densify is one of {', '.join(DENSIFY)}; got {self.densify!r}")
+        if self.device not in DEVICES:
+            raise ClimateGSError(f"--device is one of {', '.join(DEVICES)}; got {self.device!r}")
         if self.cameras is not None and not all(self.cameras):
             raise ClimateGSError("--cameras is names separated by commas, or all")
         parse_depth(self.depth)
@@ -128,6 +133,7 @@ class FitOptions:
             "densify": self.densify,
             "depth": _depth_text(parse_depth(self.depth)),
             "ego_masks": None if self.ego_masks is None else str(self.ego_masks.absolute()),
+            **({} if self.device == "cpu" else {"device": self.device}),
             **_flat(config),
         }
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -90,8 +91,8 @@ class Checked:
     facts: Mapping[str, Any] = field(default_factory=dict)
 
 
-def real_parts() -> FitParts:
-    """The library's own."""
+def real_parts(device: str = "cpu") -> FitParts:
+    """The library's own. device: where views are rendered during the fit."""
     from adapters.base import open_scene
     from adapters.recorded.starting_scene import starting_scene
     from augment.files.scene_files import save_scene
@@ -101,7 +102,7 @@ def real_parts() -> FitParts:
         open_scene=open_scene,
         views=_recorded_views,
         start=starting_scene,
-        trainer=Trainer,
+        trainer=partial(Trainer, device=device),
         score=_mean_scores,
         save=save_scene,
         report=_report,

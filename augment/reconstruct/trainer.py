@@ -30,13 +30,13 @@ from augment.reconstruct.loss import ViewLoss, view_loss
 from augment.reconstruct.loss_buffers import LossScratch
 from augment.reconstruct.poses import ActorPoses, CameraPoses
 from augment.reconstruct.rates import CORRECTIONS, decayed, splat_rates
+from augment.reconstruct.renderers import ViewTape, fit_renderer
 from augment.reconstruct.sky import paint_below_horizon, starting_sky
 from augment.reconstruct.splats import Splats
 from augment.reconstruct.view import RecordedView, ViewKey, ViewSource
-from augment.render import cpu_backward
 from augment.render.constants import RasterSettings
+from augment.render.cpu_backward import SplatGradients
 from augment.render.cpu_inputs import Inputs
-from augment.render.cpu_scratch import Scratch
 from augment.render.layout import BLOCK, M_FUNCTIONS
 from augment.render.part_views import part_poses
 from augment.render.threads import kernel_threads
@@ -65,8 +65,12 @@ class StepRecord:
 class Trainer:
     """A scene while it is fitted to its recorded views."""
 
-    def __init__(self, scene: Scene, source: ViewSource, config: FitConfig) -> None:
-        """scene: what is started from; it is not changed. source: at least one training view."""
+    def __init__(
+        self, scene: Scene, source: ViewSource, config: FitConfig, *, device: str = "cpu"
+    ) -> None:
+        """scene: what is started from; it is not changed. source: at least one training view.
+        device: where views are rendered (augment.reconstruct.renderers); bits are those of "cpu".
+        """
         if not source.train:
             raise ValueError("the view source has no training views; nothing can be learnt")
         self.config = config
@@ -82,7 +86,7 @@ class Trainer:
         self._scene = scene
         self._source = source
         self._settings = RasterSettings()
-        self._scratch = Scratch()
+        self._renderer = fit_renderer(device)
         self._loss_scratch = LossScratch()
         self.actor_poses = ActorPoses(scene.actors)
         self.camera_poses = CameraPoses(source)
@@ -210,14 +214,15 @@ class Trainer:
                     )
         return _PosedParts(numbers, poses)
 
-    def _render(self, parts: _PosedParts, camera: Camera) -> cpu_backward.Tape:
+    def _render(self, parts: _PosedParts, camera: Camera) -> ViewTape:
         inputs = splat_inputs(self.splats, parts.numbers, parts.poses, camera, self._settings)
         inputs.modes[M_FUNCTIONS] = self._functions
-        return cpu_backward.record(
+        return self._renderer.record(
+            self.splats,
             inputs,
+            parts.poses,
             camera,
             self._settings,
-            self._scratch,
             with_depth=self.config.loss.depth > 0,
         )
 
@@ -232,7 +237,7 @@ class Trainer:
         degree = min(self.config.sh_degree, self.step // max(self.config.sh_every, 1))
         return (degree + 1) ** 2
 
-    def _loss(self, tape: cpu_backward.Tape, view: RecordedView, key: ViewKey) -> ViewLoss:
+    def _loss(self, tape: ViewTape, view: RecordedView, key: ViewKey) -> ViewLoss:
         return view_loss(
             tape.rgb,
             tape.alpha,
@@ -248,7 +253,7 @@ class Trainer:
         self,
         parts: _PosedParts,
         inputs: Inputs,
-        grads: cpu_backward.SplatGradients,
+        grads: SplatGradients,
         camera: Camera,
         loss: ViewLoss,
     ) -> None:
@@ -303,7 +308,7 @@ class Trainer:
                 pull=self.config.pose_pull,
             )
 
-    def _shake(self, inputs: Inputs, grads: cpu_backward.SplatGradients) -> None:
+    def _shake(self, inputs: Inputs, grads: SplatGradients) -> None:
         """Noise on the means of faint splats that the view shows."""
         config = self.config
         firsts = inputs.first_ids[inputs.blocks[:, 0]]

@@ -37,16 +37,17 @@ class GsplatImages:
     """One camera's images and what gsplat tells of the splats in them, recorded by autograd.
 
     rgb [H, W, 3], alpha [H, W], expected_depth [H, W] or None. colors: [N, 3], of all splats before
-    their clamp at 0. means2d [M, 2], radii [M, 2] (px, half a box) and ids [M], of the splats that
-    were drawn; after backward means2d.absgrad [M, 2] holds the sums of absolute gradients.
+    their clamp at 0. means2d [M, 2], conics [M, 3] (inverse covariances: xx, xy, yy, px^-2) and ids
+    [M], of the splats that were drawn; after backward means2d.absgrad [M, 2] holds, x and y, the
+    sums over pixels of absolute gradients, 1/px.
     """
 
     rgb: Float32[Tensor, "H W 3"]
     alpha: Float32[Tensor, "H W"]
     expected_depth: Float32[Tensor, "H W"] | None
     colors: Float32[Tensor, "N 3"]
-    means2d: Tensor
-    radii: Tensor
+    means2d: Any  # a Tensor, to which gsplat adds an attribute
+    conics: Tensor
     ids: Tensor
 
 
@@ -97,9 +98,11 @@ def draw_with_gsplat(
     *,
     with_depth: bool,
     functions: int | None = None,
+    keep_color_slopes: bool = False,
 ) -> GsplatImages:
     """The parts in one picture, differentiable in all their float tensors, which may lie on either
     side; the images lie on the GPU. functions: SH functions used, None for the settings'.
+    keep_color_slopes: after backward, colors.grad holds theirs, though sh asks for none.
 
     Everything is counted from the eye, so that float32 keeps its digits in scenes that are
     kilometres wide, and colours are evaluated in each part's own axes.
@@ -117,6 +120,9 @@ def draw_with_gsplat(
             *(_placed(gsplat, p, camera, settings, functions, device) for p in parts), strict=True
         )
     )
+    if keep_color_slopes:
+        colors = colors if colors.requires_grad else colors.requires_grad_()
+        colors.retain_grad()
     view = torch.eye(4, dtype=torch.float64)
     view[:3, :3] = camera.camera_from_world[:3, :3]
     intrinsics = [[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]]
@@ -144,7 +150,7 @@ def draw_with_gsplat(
         expected_depth=rendered[0, :, :, 3] if with_depth else None,
         colors=colors,
         means2d=meta["means2d"],
-        radii=meta["radii"],
+        conics=meta["conics"],
         ids=meta["gaussian_ids"],
     )
 

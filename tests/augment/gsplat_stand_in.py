@@ -24,6 +24,7 @@ from augment.render.reference import bin_to_tiles, blend
 from augment.render.reference_project import half_extents, order_by_depth, project_parts
 from augment.render.sh import SH_C0, evaluate_sh
 from augment.scene import Gaussians, PosedGaussians
+from tests.augment.pretend_gpu import AwayTensor, held_by
 
 
 def install(monkeypatch: pytest.MonkeyPatch, **replaced: Any) -> None:
@@ -69,6 +70,10 @@ def rasterization(
     absgrad: bool = False,
     rasterize_mode: str = "classic",
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    given = {k: v for k, v in locals().items() if not isinstance(v, Tensor)}
+    tensors = (means, quats, scales, opacities, colors, viewmats, Ks)
+    if isinstance(means, AwayTensor):
+        return _on_the_pretended_gpu(tensors, given)
     assert (far_plane, tile_size, backgrounds, sparse_grad) == (1e10, 16, None, False)
     assert (sh_degree, packed, eps2d) == (None, True, COV2D_BLUR)
     assert colors.shape == means.shape and bool((colors >= 0).all())
@@ -107,6 +112,7 @@ def rasterization(
     meta = {
         "means2d": means2d,
         "radii": torch.ceil(half_extents(splats)).int(),
+        "conics": splats.covs2d[:, [2, 1, 0]] * torch.tensor([1.0, -1, 1]) / splats.dets[:, None],
         "gaussian_ids": splats.ids,
         "width": width,
         "height": height,
@@ -114,3 +120,32 @@ def rasterization(
         "tile_width": math.ceil(width / tile_size),
     }
     return rendered[None], images.alpha[None, :, :, None], meta
+
+
+def _on_the_pretended_gpu(
+    tensors: tuple[Tensor, ...], given: dict[str, Any]
+) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    """All on the CPU, by what the tensors hold; every one of them must lie on the GPU."""
+    meta: dict[str, Any] = {}
+    rendered, alphas = _Held.apply(given, meta, *tensors)
+    return rendered, alphas, meta
+
+
+class _Held(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, given: dict[str, Any], meta: dict[str, Any], *tensors: Tensor):
+        held = [held_by(t).detach().requires_grad_(t.requires_grad) for t in tensors]
+        with torch.enable_grad():
+            rendered, alphas, found = rasterization(*held, **given)
+        ctx.held, ctx.made, ctx.found, ctx.meta = held, (rendered, alphas), found, meta
+        for name, value in found.items():
+            meta[name] = AwayTensor(value.detach()) if isinstance(value, Tensor) else value
+        return AwayTensor(rendered.detach()), AwayTensor(alphas.detach())
+
+    @staticmethod
+    def backward(ctx: Any, *slopes: Tensor):
+        moving = [t for t in ctx.held if t.requires_grad]
+        inner = [held_by(slope) for slope in slopes]
+        found = iter(torch.autograd.grad(ctx.made, moving, inner))
+        ctx.meta["means2d"].absgrad = AwayTensor(ctx.found["means2d"].absgrad)
+        return None, None, *(AwayTensor(next(found)) if t.requires_grad else None for t in ctx.held)
