@@ -95,3 +95,7 @@ def _is_ours(error: Exception) -> bool:
         return True
     errors = sys.modules.get("augment.errors")  # not loaded: then none of it was raised
     return errors is not None and isinstance(error, errors.ClimateGSError)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -9,6 +9,7 @@ import os
 import sys
 import time
 import types
+from pathlib import Path
 
 import pytest
 import torch
@@ -306,6 +307,12 @@ def test_without_any_section_every_target_says_why():
     for found in ({}, {"raster": {"left_out": "no time was left"}}):
         lines = targets_of(found)
         assert len(lines) == 12 and all(line.met is None and line.why for line in lines)
+
+
+def test_the_page_has_a_place_for_the_tables():
+    page = (Path(__file__).parents[2] / "docs" / "performance.md").read_text()
+    before, found, rest = page.partition(START)
+    assert before and found and END in rest
 
 
 def test_text_and_page(figures, tmp_path):
