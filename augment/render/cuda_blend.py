@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from augment.cameras import Camera
-from augment.render import gpu
+from augment.render import cpu_clip, gpu, layout
 from augment.render.buffers import (
     ALPHA,
     BUFFERS,
@@ -24,8 +24,16 @@ from augment.render.cuda_blend_kernels import blend_blocks
 from augment.render.cuda_splats import TILE, CudaSplats, CudaTiles
 
 # Pixels of a program, which is one warp. Larger blocks spend less on reading their lists, smaller
-# ones less on pixels that a splat does not cover; four pixels a thread hide what both wait for.
+# ones less on pixels that a splat does not cover. Powers of 2; the warp's threads must fit into it.
 _BLOCK_W, _BLOCK_H = 16, 8
+
+# The kernel reads records and cuts four numbers at a time and names them in this order.
+assert (layout.MEAN_X, layout.MEAN_Y, layout.LEAN_X, layout.SHARP_X) == (0, 1, 2, 3)
+assert (layout.FALL_Y, layout.LOG_OPACITY, layout.LEAN_Y) == (4, 5, 8)
+assert (layout.DEPTH, layout.SPLAT_ID) == (10, 11)
+assert (layout.RED, layout.GREEN, layout.BLUE, layout.IS_SNOW) == (12, 13, 14, 15)
+assert (cpu_clip.C_AT, cpu_clip.C_X, cpu_clip.C_Y, cpu_clip.C_RIGHT) == (0, 1, 2, 3)
+assert (cpu_clip.C_DOWN, cpu_clip.C_REACH) == (4, 5)
 
 
 def blend(
@@ -61,7 +69,7 @@ def blend(
         camera.fx**-2,
         camera.fy**-2,
         HAS_CUTS=splats.cuts is not None,
-        HAS_LIGHTS=splats.lights is not None,
+        HAS_LIGHTS=splats.lights is not None and RGB in images,
         HAS_RGB=RGB in images,
         HAS_EXPECTED=EXPECTED_DEPTH in images,
         HAS_MEDIAN=MEDIAN_DEPTH in images,

@@ -114,10 +114,12 @@ def blend_blocks(
 
     at = tl.load(starts + tile)
     last = tl.load(starts + tile + 1)
+    row = tl.load(members + at + lanes, mask=at + lanes < last, other=0)
     is_open = at < last
     while is_open:
         is_listed = at + lanes < last
-        row = tl.load(members + at + lanes, mask=is_listed, other=0)
+        # The next batch's, which is there by then.
+        following = tl.load(members + at + LANES + lanes, mask=at + LANES + lanes < last, other=0)
         reaches = is_listed & _reaches(
             records + row.to(tl.int64) * RECORD, left, top, BLOCK_W - 1, BLOCK_H - 1, log_cut
         )
@@ -159,20 +161,6 @@ def blend_blocks(
                 red += weight * splat_red[None, :]
                 green += weight * splat_green[None, :]
                 blue += weight * splat_blue[None, :]
-                if HAS_LIGHTS:
-                    lines = lights + slot * LINES
-                    more_red, more_green = tl.load(lines + L_RED), tl.load(lines + L_GREEN)
-                    more_blue = tl.load(lines + L_BLUE)
-                    if tl.abs(more_red) + tl.abs(more_green) + tl.abs(more_blue) > 0:
-                        reach = tl.maximum(log_opacity - log_cut, TINY)[None, :]
-                        rim = (log_opacity[None, :] - e) / reach
-                        aside = dx[None, :] + ahead
-                        share = _light_share(
-                            lines, aside, dy[None, :], rim, inverse_fx2, inverse_fy2
-                        )
-                        red += weight * share * more_red
-                        green += weight * share * more_green
-                        blue += weight * share * more_blue
             if HAS_SNOW:
                 white += weight * is_snow[None, :]
             if HAS_EXPECTED or HAS_MEDIAN or HAS_MODE or HAS_IDS:
@@ -199,11 +187,24 @@ def blend_blocks(
                 is_heavier = weight > heaviest
                 heaviest = tl.where(is_heavier, weight, heaviest)
                 number = tl.where(is_heavier, own_id.to(tl.int32, bitcast=True)[None, :], number)
+            if HAS_LIGHTS:  # last, when most of what is above need not be kept
+                lines = lights + slot * LINES
+                more_red, more_green = tl.load(lines + L_RED), tl.load(lines + L_GREEN)
+                more_blue = tl.load(lines + L_BLUE)
+                if tl.abs(more_red) + tl.abs(more_green) + tl.abs(more_blue) > 0:
+                    reach = tl.maximum(log_opacity - log_cut, TINY)[None, :]
+                    rim = (log_opacity[None, :] - e) / reach
+                    aside = dx[None, :] + ahead
+                    share = _light_share(lines, aside, dy[None, :], rim, inverse_fx2, inverse_fy2)
+                    red += weight * share * more_red
+                    green += weight * share * more_green
+                    blue += weight * share * more_blue
             if IS_COARSE:
                 final = -tl.abs(tl.where(is_kept, after, through))
                 through = tl.where(after > end, after, final)
             else:
                 through = tl.where(is_kept, after, -tl.abs(through))
+        row = following
         at += LANES
         # Of float32 numbers that are positive the bits are in the same order, which integers
         # compare in one step.
