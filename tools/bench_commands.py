@@ -39,7 +39,6 @@ def gpu(
     quick: bool = False,
     placement: Annotated[tuple[str, ...], UseAppendAction] = (),
     sections: tuple[str, ...] = (),
-    cpu: bool = True,
     minutes: float = 9.0,
     table: Path | None = None,
     json_file: JsonFile = None,
@@ -54,8 +53,8 @@ def gpu(
         quick: A small scene.
         placement: A scene to find a place for snow in, besides the street; may be given several
             times.
-        sections: Some of raster, style, frames and placement; by default all.
-        cpu: Whether pictures are compared with the CPU backend's.
+        sections: Some of raster, style, frames, placement and agreement (with the CPU backend's
+            pictures); by default all.
         minutes: After these a section that still runs is stopped, and no other begins.
         table: Also write the tables, as Markdown: into a document's marked place, or a file of
             their own.
@@ -68,9 +67,7 @@ def gpu(
     from tools.gpu_clock import Timing, check_gpu
 
     check_gpu()
-    case = dataclasses.replace(
-        QUICK if quick else WHOLE, placement=placement, cpu=cpu, minutes=minutes
-    )
+    case = dataclasses.replace(QUICK if quick else WHOLE, placement=placement, minutes=minutes)
     result = bench_gpu(
         case,
         sections=sections or tuple(SECTIONS),

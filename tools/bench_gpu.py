@@ -17,6 +17,8 @@ from typing import Any
 
 from tqdm import tqdm
 
+from augment.cameras import Camera
+from augment.scene import Scene
 from tools.apart import apart, guarded
 from tools.bench_gpu_ceilings import Ceilings, Load, measure_ceilings
 from tools.bench_scene import DEFAULT_CASES, RasterCase
@@ -28,8 +30,8 @@ from tools.machine import load_average, machine_facts
 @dataclass(frozen=True)
 class GpuCase:
     """What is measured on. raster: the random scene. street: of the weathered frames, width x
-    height pixels. placement: scenes for snow, besides the street. cell_m: of the snow. cpu: whether
-    pictures are compared with the CPU backend's. minutes: after which no further section begins.
+    height pixels. placement: scenes for snow, besides the street. cell_m: of the snow. minutes:
+    after which no further section begins, and one that runs is stopped.
     """
 
     raster: RasterCase = DEFAULT_CASES[-1]
@@ -38,7 +40,6 @@ class GpuCase:
     height: int = 1066
     placement: tuple[str, ...] = ()
     cell_m: float = 0.05
-    cpu: bool = True
     minutes: float = 9.0
     load: Load = field(default_factory=Load)
 
@@ -53,13 +54,15 @@ QUICK = GpuCase(
 
 
 def _ceilings(case: GpuCase, timing: Timing, _: Ceilings | None) -> dict[str, Any]:
-    return dataclasses.asdict(measure_ceilings(timing, case.load))
+    gpu = gpu_facts()
+    found = dataclasses.asdict(measure_ceilings(timing, case.load))
+    return {**found, "gpu": None if gpu is None else dataclasses.asdict(gpu)}
 
 
 def _raster(case: GpuCase, timing: Timing, ceilings: Ceilings) -> dict[str, Any]:
     from tools.bench_gpu_raster import bench_gpu_case
 
-    return bench_gpu_case(case.raster, timing, ceilings, beside_cpu=case.cpu)
+    return bench_gpu_case(case.raster, timing, ceilings)
 
 
 def _style(case: GpuCase, timing: Timing, ceilings: Ceilings) -> dict[str, Any]:
@@ -69,15 +72,20 @@ def _style(case: GpuCase, timing: Timing, ceilings: Ceilings) -> dict[str, Any]:
 
 
 def _frames(case: GpuCase, timing: Timing, ceilings: Ceilings) -> dict[str, Any]:
+    from tools.bench_gpu_frames import bench_frames, frame_recipes
+
+    scene, camera = _street(case)
+    found = bench_frames(scene, camera, frame_recipes(case.cell_m), timing, ceilings)
+    return {"scene": case.street, **found}
+
+
+def _street(case: GpuCase) -> tuple[Scene, Camera]:
     from adapters.base import open_scene
     from tools.bench_flood_cost import bench_camera
-    from tools.bench_gpu_frames import BACKEND, bench_frames, frame_recipes
+    from tools.bench_gpu_frames import BACKEND
 
     scene = open_scene(case.street)
-    camera = bench_camera(scene, case.width, case.height, BACKEND)
-    recipes = frame_recipes(case.cell_m)
-    found = bench_frames(scene, camera, recipes, timing, ceilings, beside_cpu=case.cpu)
-    return {"scene": case.street, **found}
+    return scene, bench_camera(scene, case.width, case.height, BACKEND)
 
 
 def _placement(case: GpuCase, timing: Timing, _: Ceilings) -> dict[str, Any]:
@@ -91,6 +99,16 @@ def _placement(case: GpuCase, timing: Timing, _: Ceilings) -> dict[str, Any]:
     return {"scenes": found}
 
 
+def _agreement(case: GpuCase, timing: Timing, _: Ceilings) -> dict[str, Any]:
+    from tools.bench_gpu_frames import frame_agreement, frame_recipes
+    from tools.bench_gpu_raster import case_agreement
+
+    return {
+        "raster": case_agreement(case.raster),
+        "frames": frame_agreement(*_street(case), frame_recipes(case.cell_m)),
+    }
+
+
 CEILINGS = "ceilings"
 SECTIONS: dict[str, Callable[..., dict[str, Any]]] = {
     CEILINGS: _ceilings,
@@ -98,6 +116,7 @@ SECTIONS: dict[str, Callable[..., dict[str, Any]]] = {
     "style": _style,
     "frames": _frames,
     "placement": _placement,
+    "agreement": _agreement,
 }
 
 
@@ -121,7 +140,9 @@ def bench_gpu(
     if unknown:
         raise ValueError(f"sections are {', '.join(SECTIONS)}; got {', '.join(unknown)}")
     timing, start = timing or Timing(), time.perf_counter()
-    figures = _facts(timing) | {name: {"left_out": "not asked for"} for name in SECTIONS}
+    figures: dict[str, Any] = _facts(timing) | {
+        name: {"left_out": "not asked for"} for name in SECTIONS
+    }
     wanted = [name for name in SECTIONS if name in sections or name == CEILINGS]
     ceilings: Ceilings | None = None
     for name in tqdm(wanted, "sections", unit="section", disable=not progress):
@@ -136,6 +157,7 @@ def bench_gpu(
             else guarded(SECTIONS[name], arguments)
         )
         if name == CEILINGS and "failed" not in figures[name]:
+            figures["gpu"] = figures[name].get("gpu")
             ceilings = Ceilings(**{f: figures[name][f] for f in Ceilings.__dataclass_fields__})
         figures["minutes"] = round((time.perf_counter() - start) / 60, 2)
         figures["load_after"] = load_average()
@@ -145,11 +167,10 @@ def bench_gpu(
 
 
 def _facts(timing: Timing) -> dict[str, Any]:
-    gpu = gpu_facts()
     return {
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
         "machine": dataclasses.asdict(machine_facts()),
-        "gpu": None if gpu is None else dataclasses.asdict(gpu),
+        "gpu": None,
         "repeats": timing.repeats,
         "warm_up": timing.warm_up,
     }

@@ -66,8 +66,6 @@ def bench_frames(
     recipes: Mapping[str, Recipe],
     timing: Timing,
     ceilings: Ceilings,
-    *,
-    beside_cpu: bool = True,
 ) -> dict[str, Any]:
     """Times of every recipe's frame, in turns. ms: on the GPU, to finished floats there.
     over_clean: turn by turn. delivered: as `render` takes them, 8 bits on the host.
@@ -77,8 +75,8 @@ def bench_frames(
     """
     plans = {name: make_plan(recipe, scene) for name, recipe in recipes.items()}
 
-    def frame(name: str, own: Scene, backend: str = BACKEND) -> WeatheredBuffers:
-        return render_buffers(own, camera, plans[name], backend=backend)
+    def frame(name: str, own: Scene) -> WeatheredBuffers:
+        return render_buffers(own, camera, plans[name], backend=BACKEND)
 
     rows: dict[str, dict[str, Any]] = {}
     for name, recipe in recipes.items():  # one after the other: nobody else's snow counts as memory
@@ -105,17 +103,26 @@ def bench_frames(
         row["ms"] = spread(times[name])
         row["over_clean"] = spread_ratio(times[name], times[CLEAN])
         row["delivered"] = delivered(scenes[name], camera, recipes[name], timing)
-    if beside_cpu:
-        for name, own in scenes.items():
-            rows[name]["against_cpu"] = difference(
-                frame(name, own).rgb, frame(name, own, "cpu").rgb
-            )
     return {
         "camera": f"{camera.name} {camera.width}x{camera.height}, focal length {camera.fx:.0f} px",
         "gaussians": sum(len(part.gaussians) for part in scene.parts_for(camera)),
         "repeats": timing.repeats,
         "frames": rows,
     }
+
+
+def frame_agreement(
+    scene: Scene, camera: Camera, recipes: Mapping[str, Recipe]
+) -> dict[str, dict[str, float]]:
+    """How far the GPU's colours are from the CPU backend's, by recipe; snow lies where one of them
+    found a place for it.
+    """
+    found = {}
+    for name, recipe in recipes.items():
+        own, plan = dressed(scene, recipe, BACKEND), make_plan(recipe, scene)
+        images = [render_buffers(own, camera, plan, backend=b).rgb for b in (BACKEND, "cpu")]
+        found[name] = difference(images[0], images[1])
+    return found
 
 
 def _floor(scene: Scene, camera: Camera, plan: Plan, ceilings: Ceilings) -> dict[str, Any]:

@@ -26,7 +26,16 @@ from tools.apart import apart
 from tools.bench_gpu import GpuCase
 from tools.bench_gpu_blends import count_blends
 from tools.bench_gpu_ceilings import LANES, Ceilings, Load, measure_ceilings
-from tools.bench_gpu_frames import CLEAN, FLOOD, SMOG, SNOW, balanced, bench_frames, frame_recipes
+from tools.bench_gpu_frames import (
+    CLEAN,
+    FLOOD,
+    SMOG,
+    SNOW,
+    balanced,
+    bench_frames,
+    frame_agreement,
+    frame_recipes,
+)
 from tools.bench_gpu_gsplat import gsplat_draws
 from tools.bench_gpu_raster import BUFFERS, SETTINGS, bench_gpu_case, difference
 from tools.bench_gpu_targets import targets_of
@@ -161,8 +170,6 @@ def test_the_raster_section(raster):
     assert raster["ms"]["clean"]["median"] == raster["smog_over_clean"]["median"] == 1.0
     assert raster["stages_ms"].keys() == {"project", "list", "blend"}
     assert raster["same_bits"] and "not installed" in raster["gsplat"]["left_out"]
-    for each in raster["against_cpu"].values():
-        assert each["p999"] < 1e-4 and each["pixels"] == 20 * 17
 
 
 def test_the_frames_section(frames):
@@ -170,10 +177,20 @@ def test_the_frames_section(frames):
     assert frames["frames"].keys() == {CLEAN, SMOG, FLOOD, SNOW}
     for row in frames["frames"].values():
         assert row["over_clean"]["median"] == 1.0 and row["same_bits"]
-        assert row["against_cpu"]["max"] == 0 and row["peak_mib"] is None
+        assert row["peak_mib"] is None
         assert row["delivered"]["in_a_row_ms"] > 0 and row["delivered"]["views"] == 2
     sizes = {name: row["floor"]["bytes_of"]["pixels"] for name, row in frames["frames"].items()}
     assert sizes[CLEAN] == 12 * 40 * 22  # nothing was drawn on a GPU, so only what is finished
+
+
+def test_the_agreement_section(street, monkeypatch):
+    for each in bench_gpu_raster.case_agreement(TINY).values():
+        assert each["p999"] < 1e-4 and each["pixels"] == 20 * 17
+    monkeypatch.setattr(bench_gpu_frames, "BACKEND", "cpu")
+    camera = street.frames[0].cameras["ahead"].scaled(0.25)
+    recipes = {name: frame_recipes(0.4)[name] for name in (CLEAN, SNOW)}
+    found = frame_agreement(street, camera, recipes)
+    assert [each["max"] for each in found.values()] == [0, 0]
 
 
 def test_recipes_are_of_their_tiers():
@@ -268,12 +285,14 @@ def figures(raster, frames, monkeypatch, tmp_path):
         "scene": "drive", "uri": "u", "gaussians": 9, "cameras": 1, "cell_m": 0.05, "cells": 5,
         "place_s": {"min": 0.5, "median": 0.75, "p90": 1.5}, "stages_s": {}, "named": True,
     }  # fmt: skip
+    same = {"p999": 2e-3, "max": 0.5, "flipped": 7, "pixels": 340}
     found = {
-        "ceilings": lambda *_: dataclasses.asdict(SPEEDS),
+        "ceilings": lambda *_: {**dataclasses.asdict(SPEEDS), "gpu": None},
         "raster": lambda *_: raster,
         "style": broken,
         "frames": lambda *_: {"scene": "a street", **frames},
         "placement": lambda *_: {"scenes": [placed, {**placed, "named": False}]},
+        "agreement": lambda *_: {"raster": {"clean": same}, "frames": {CLEAN: same}},
     }
     monkeypatch.setattr(bench_gpu, "SECTIONS", found)
     path = tmp_path / "gpu.json"
@@ -295,6 +314,7 @@ def test_targets_are_met_missed_or_not_measured_and_say_why(figures):
     assert lines["clean frame"].met and lines["clean frame"].value == 1.0
     assert lines["clean frame"].share == pytest.approx(figures["raster"]["floor"]["ms"]["frame"])
     assert lines["placement of snow, PandaSet"].value == 0.75
+    assert lines["rgb off the CPU backend's, 99.9 %"].met is False
     assert lines["clean frame, over gsplat's"].met is None
     assert "not installed" in lines["clean frame, over gsplat's"].why
     assert "no such lane" in lines["style: fold and apply to all SH"].why
@@ -377,4 +397,4 @@ def test_a_small_run_on_a_gpu(tmp_path):
     assert found["raster"]["same_bits"] and found["raster"]["peak_mib"] > 0
     for line in targets_of(found):
         assert line.value is None or line.value > 0
-    assert "frames" in gpu_text(found) or gpu_text(found)
+    assert found["gpu"]["name"] in gpu_text(found)

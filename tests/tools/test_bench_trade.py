@@ -11,7 +11,7 @@ from augment.cameras import Camera
 from augment.quality.trial import Trial
 from recipes.knobs import knobs_of
 from tests.streets import SMALL_STREET, open_street
-from tools import bench_trade, trade_cases
+from tools import bench_trade, trade_cases, trade_measure
 from tools.trade_cases import (
     CLEAN,
     DEFAULTS,
@@ -133,6 +133,24 @@ def test_recipes_by_name():
     assert trade_recipe("overcast").style.preset == "overcast"  # any preset
     everything = trade_recipe("all")
     assert None not in (everything.style, *dict(everything.weather).values())
+
+
+def test_what_is_named_renders_and_its_memory_counts(monkeypatch):
+    asked = []
+
+    def render(scene, camera, recipe, backend):
+        asked.append(backend)
+        return Trial(np.zeros((2, 2, 3), np.uint8), None, 0.25)
+
+    monkeypatch.setattr(trade_measure, "render_trial", render)
+    monkeypatch.setattr(trade_measure, "gpu_mib", lambda: 10.0 + len(asked))
+    monkeypatch.setattr(trade_measure, "peak_gpu_mib", lambda action: (action(), 7.0))
+    (setting, *_) = settings_of_trade(trade_recipe(CLEAN), TINY)
+    stage = trade_measure.Stage(open_street(), View(0, WALL), "cuda")
+    timed = trade_measure.time_group(stage, [View(0, WALL)], [setting], 2)
+    assert list(timed.seconds.values()) == [[0.25, 0.25]]
+    assert trade_measure._memory(stage, View(0, WALL), setting) == {"mib": 7.0, "kept_mib": 1.0}
+    assert set(asked) == {"cuda"}
 
 
 # Flicker: a wall 10 m ahead, seen twice by a camera that stands still, so that nothing moves.
