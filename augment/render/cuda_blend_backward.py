@@ -24,10 +24,8 @@ from augment.render.gpu import launch
 # All pixels of a tile times BATCH entries in the registers of two warps: more entries do not fit,
 # more warps wait for each other.
 _BATCH, _TILE_WARPS = 8, 2
-_SPLATS, _LANES = (
-    8,
-    32,
-)  # most splats are in few tiles, and those that are in all must not take long
+# Most splats are in few tiles; one that is in all must not take long either.
+_SPLATS, _LANES = 8, 16
 _SH_SPLATS = 32
 
 

@@ -74,7 +74,25 @@ def import_gsplat() -> ModuleType:
             f"gsplat {version} is installed, whose thresholds may be others than those of "
             f"{_VERSIONS}x: `pip install 'gsplat==1.5.3'`, or use backend 'cpu'"
         )
+    _check_compiled()
     return gsplat
+
+
+def _check_compiled() -> None:
+    """Its kernels are there; or they are compiled now, which takes minutes the first time."""
+    try:
+        from gsplat.cuda import _backend  # pyright: ignore[reportMissingImports]
+    except Exception as error:  # also of the compilers that it starts
+        if isinstance(error, ModuleNotFoundError) and str(error.name).startswith("gsplat"):
+            return  # a release that keeps them elsewhere
+        raise BackendUnavailable(
+            f"gsplat could not be set up: {error}. Mend its installation, or use backend 'cpu'"
+        ) from error
+    if getattr(_backend, "_C", True) is None:
+        raise BackendUnavailable(
+            "gsplat is installed without its kernels, and found no CUDA toolkit (nvcc) to compile "
+            "them with: install one, or a gsplat built for this torch, or use backend 'cpu'"
+        )
 
 
 def rasterize_gsplat(

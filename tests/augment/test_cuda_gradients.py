@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import sys
+import types
 
 import numpy as np
 import pytest
@@ -314,6 +315,16 @@ def test_without_gsplat_both_ways_out_are_named(monkeypatch):
         rasterize([part], camera_ahead(9, 9, 9.0), backend="cuda")
     gsplat_stand_in.install(monkeypatch, __version__="1.6.0")
     with pytest.raises(BackendUnavailable, match=r"gsplat 1\.6\.0 is installed"):
+        rasterize([part], camera_ahead(9, 9, 9.0), backend="cuda")
+
+
+def test_a_gsplat_without_kernels_is_named(monkeypatch):
+    gsplat_stand_in.install(monkeypatch)
+    folder, backend = types.ModuleType("gsplat.cuda"), types.ModuleType("gsplat.cuda._backend")
+    folder._backend, backend._C = backend, None
+    monkeypatch.setitem(sys.modules, "gsplat.cuda", folder)
+    part = tracked(PosedGaussians(one_gaussian()), "quats")
+    with pytest.raises(BackendUnavailable, match="found no CUDA toolkit"):
         rasterize([part], camera_ahead(9, 9, 9.0), backend="cuda")
 
 
