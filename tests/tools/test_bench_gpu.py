@@ -365,6 +365,13 @@ def test_sections_by_name(monkeypatch):
         bench_gpu.bench_gpu(GpuCase(), sections=("y",), timing=once())
 
 
+def test_without_ceilings_nothing_else_is_measured(monkeypatch):
+    monkeypatch.setitem(bench_gpu.SECTIONS, "ceilings", lambda *_: {"left_out": "no time was left"})
+    found = bench_gpu.bench_gpu(GpuCase(), timing=once(), in_processes=False, progress=False)
+    assert "could not be measured" in found["raster"]["left_out"]
+    assert "no time was left" in gpu_text(found)
+
+
 def test_work_apart_ends_in_a_record_whatever_its_end(capfd):
     assert apart(dict, ({"a": 1},), 60)["a"] == 1
     assert apart(os._exit, (3,), 60) == {"failed": "its process ended with code 3"}
