@@ -45,9 +45,10 @@ def pour(
     camera: Camera,
     window: Window,
     color: Float[Tensor, "h w 3"],
-    sky: Float[Tensor, "dry W 3"],
+    sky: Float[Tensor, "S W 3"],
+    dry: int,
 ) -> None:
-    """Water into rgb, and the finished rows of `sky` where rays do not fall."""
+    """Water into rgb, and the first `dry` rows of `sky`, finished, where rays do not fall."""
     launch(
         kernels.pour,
         (-(-alpha.numel() // LANES),),
@@ -55,7 +56,7 @@ def pour(
         alpha,
         color.contiguous(),
         sky.contiguous(),
-        len(sky),
+        dry,
         window.left,
         window.top,
         window.right,

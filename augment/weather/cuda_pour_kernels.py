@@ -28,7 +28,7 @@ def find_water(rows, alpha, width, count, shown, water, LANES: tl.constexpr):
     tl.store(shown + program, tl.max(share, 0))
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["dry", "left", "top", "right", "bottom"])
 def pour(
     rows, alpha, color, sky, dry, left, top, right, bottom, width, count, rgb, LANES: tl.constexpr
 ):
@@ -54,7 +54,11 @@ def pour(
         tl.store(rgb + at, seen, mask=wet | rest)
 
 
-@triton.jit
+@triton.jit(
+    do_not_specialize=[
+        "left", "top", "behind_left", "behind_top", "wide", "count", "behind_width"
+    ]
+)  # fmt: skip
 def join(
     alpha, behind_alpha, depth, behind_depth, a, behind_a, b, behind_b, c, behind_c, d, behind_d,
     least, left, top, behind_left, behind_top, wide, count, width, behind_width,

@@ -51,7 +51,7 @@ def _fraction(x):
     return x - tl.floor(x)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["count", "width", "per_row"])
 def fill_field(
     stretches, waves, count, width, per_row, height, step_z, bend_x, bend_y, upright, gone, full,
     normal_x, normal_y, variance, LANES: tl.constexpr,

@@ -24,6 +24,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from augment.cameras import Camera
+from augment.render.backends import AUTO, CUDA
 from augment.render.buffers import ALPHA, EXPECTED_DEPTH, RGB, RenderOutput
 from augment.render.clip import ABOVE, BELOW, HeightClip
 from augment.render.composite import composite_sky
@@ -155,7 +156,8 @@ def _from_above(
     with lap("rasterise"):
         front = painter.draw(camera, above, wanted)
     assert front.rgb is not None and front.alpha is not None
-    sky, smog, backend = painter.sky, painter.medium, painter.backend
+    sky, smog = painter.sky, painter.medium
+    backend = _follows(painter.backend, front.alpha)
     with lap("flood: where it is seen"):
         water, most_shown = find_water(front.alpha, camera, backend=backend)
     if most_shown < 1 - HIDDEN_COVER:
@@ -176,7 +178,7 @@ def _from_above(
     with lap("flood: mirrored view"):
         mirror = _mirror_layer(painter, camera, medium, window, seen)
     with lap("flood: screen march"):
-        screen = _screen_reflection(painter, camera, medium, crop, field, front)
+        screen = _screen_reflection(camera, medium, crop, field, front, backend)
     with lap("flood: colours of the water"):
         color = shade_water(
             crop,
@@ -194,6 +196,12 @@ def _from_above(
         image = pour(front, camera, window, color, sky, smog, backend=backend)
         scene = both_sides(front, bed, bed_window, buffers, backend=backend)
     return FloodedImage(image, scene, water)
+
+
+def _follows(backend: str, image: Tensor) -> str:
+    """The backend of passes without an image of their own: where layers lie on a GPU, theirs."""
+    follows = backend == AUTO and image.device.type != "cpu"
+    return CUDA if follows else backend
 
 
 def _draw_bed(
@@ -241,18 +249,18 @@ def _mirror_layer(
 
 
 def _screen_reflection(
-    painter: Painter,
     camera: Camera,
     medium: FloodMedium,
     crop: Camera,
     field: WaveField,
     front: RenderOutput,
+    backend: str,
 ) -> ScreenReflection | None:
     if medium.reflection != "screen_space":
         return None
     needed = is_smooth(field, crop)  # rough water takes the mirrored view alone
     layer = as_layer(camera, front)
-    return trace_screen(layer, crop, medium.level_z_m, needed=needed, backend=painter.backend)
+    return trace_screen(layer, crop, medium.level_z_m, needed=needed, backend=backend)
 
 
 def _mirror_margins(camera: Camera, medium: FloodMedium) -> Margins:
@@ -299,7 +307,8 @@ def _from_below(
     image = view_from_below(
         as_layer(camera, front), as_layer(camera, air), medium, painter.sky, painter.medium
     )
-    water = torch.ones(camera.height, camera.width, dtype=torch.bool)
+    size = (camera.height, camera.width)
+    water = torch.ones(size, dtype=torch.bool, device=image.device)
     whole = Window(0, 0, camera.width, camera.height)
     scene = both_sides(front, air, whole, buffers, backend=painter.backend)
     return FloodedImage(image, scene, water)

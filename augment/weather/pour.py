@@ -68,16 +68,17 @@ def pour(
         meets = falling(window.of(camera))[..., None]
         window.paste(image, torch.where(meets, mixed, window.cut(image)))
         return image
-    dry = _dry_rows(camera)
     if kernels == CUDA:
         from augment.weather import cuda_pour
+        from augment.weather.cuda_rows import dry_rows
 
-        part = rgb[:0]
+        part, dry = rgb, dry_rows(camera)
         if dry:
             above = camera.cropped(0, 0, camera.width, dry)
             part = composite_sky(rgb[:dry], alpha[:dry], above, sky, smog=smog, backend=backend)
-        cuda_pour.pour(rgb, alpha, camera, window, color, part)
+        cuda_pour.pour(rgb, alpha, camera, window, color, part, dry)
         return rgb
+    dry = _dry_rows(camera)
     if dry:
         part = composite_sky(
             rgb[:dry], alpha[:dry], camera.cropped(0, 0, camera.width, dry), sky, smog=smog

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from augment.render.composite import sky_behind
-from augment.sky import Sky
+from augment.sky import Sky, sample_at
 from augment.weather.flood import FloodMedium, Layer
 from augment.weather.fresnel import exact
 from augment.weather.smog import SmogMedium, blend_airlight, sky_optical_depth
@@ -22,27 +22,28 @@ def view_from_below(
 ) -> Float[Tensor, "H W 3"]:
     """The picture of an eye at or below the water's surface, not clamped.
 
-    front: what lies under water. air: what lies above, from the same camera. smog: in the air.
+    front: what lies under water. air: what lies above, from the same camera, on the same device.
+    smog: in the air.
     """
     camera = front.camera
-    rgb = front.rgb
-    lengths = camera.ray_lengths(rgb.dtype)
-    deep = torch.tensor(medium.rgb, dtype=rgb.dtype)
+    rgb, device = front.rgb, front.rgb.device
+    lengths = camera.ray_lengths(rgb.dtype, device)
+    deep = torch.tensor(medium.rgb, dtype=rgb.dtype, device=device)
     through = transmittance(medium, front.depth * lengths)
     seen = through * rgb + front.alpha[..., None] * (1 - through) * deep
 
-    directions = camera.ray_directions(rgb.dtype)
+    directions = camera.ray_directions(rgb.dtype, device)
     up = directions[..., 2] / lengths
     bent = _into_air(directions / lengths[..., None], medium.refraction_index)
     reflected = exact(up.clamp_min(0), 1 / medium.refraction_index)[..., None]
     behind, smog = sky_behind(sky, smog)
-    sky_rgb = behind.sample(bent)
+    sky_rgb = sample_at(behind, bent)
     if smog is not None:
         tau = sky_optical_depth(smog, bent[..., 2], medium.level_z_m)
         sky_rgb = blend_airlight(sky_rgb, tau, smog)
     outside = air.rgb + (1 - air.alpha)[..., None] * sky_rgb
     surface = (1 - reflected) * outside + reflected * deep
-    depth = plane_depth(camera, medium.level_z_m).to(rgb.dtype)
+    depth = plane_depth(camera, medium.level_z_m, device).to(rgb.dtype)
     meets = depth.isfinite()
     distance = torch.where(meets, depth, torch.zeros_like(depth)) * lengths
     to_surface = transmittance(medium, distance)
@@ -54,7 +55,7 @@ def view_from_below(
 
 def transmittance(medium: FloodMedium, length_m: Float[Tensor, "*B"]) -> Float[Tensor, "*B 3"]:
     """exp(-extinction length) per channel; 1 over no length, also where extinction is infinite."""
-    extinction = torch.tensor(medium.extinction_per_m, dtype=length_m.dtype)
+    extinction = torch.tensor(medium.extinction_per_m, dtype=length_m.dtype, device=length_m.device)
     t = torch.exp(-extinction * length_m[..., None])
     return torch.where((length_m[..., None] == 0) | (extinction == 0), torch.ones_like(t), t)
 

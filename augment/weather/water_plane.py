@@ -146,10 +146,12 @@ def falling(camera: Camera) -> Bool[Tensor, "H W"]:
     return camera.ray_directions(torch.float64)[..., 2] < 0
 
 
-def plane_depth(camera: Camera, level_z_m: float) -> Float[Tensor, "H W"]:
+def plane_depth(
+    camera: Camera, level_z_m: float, device: torch.device | None = None
+) -> Float[Tensor, "H W"]:
     """z in metres, float64, at which pixels' rays meet the plane before the eye; else infinite."""
     height = float(camera.centre[2]) - level_z_m
-    fall = -camera.ray_directions(torch.float64)[..., 2]
+    fall = -camera.ray_directions(torch.float64, device)[..., 2]
     meets = fall > 0 if height > 0 else fall < 0
     depth = height / torch.where(meets, fall, torch.ones_like(fall))
     return torch.where(meets, depth, torch.full_like(depth, math.inf))

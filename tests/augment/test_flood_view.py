@@ -222,6 +222,22 @@ def test_kernels_match_the_definition(scene, reflection, waves):
     assert bool((fast.water == slow.water).float().mean() > 0.999)
 
 
+@pytest.mark.gpu
+@pytest.mark.parametrize("reflection", ["sky", "screen_space", "mirrored"])
+def test_a_gpu_shows_the_cpu_s_picture(scene, reflection):
+    water = flood(reflection=reflection, waves=Waves(preset="breeze"), turbidity_ntu=5)
+    smog = Smog(extinction_per_m=0.02, scale_height_m=20)
+    plan = make_plan(recipe_of(water, smog, depth="expected"), scene)
+    view = camera(640, 480, focal=480.0)
+    there, here = (render_buffers(scene, view, plan, backend=name) for name in ("cuda", "cpu"))
+    error = (there.rgb.cpu() - here.rgb).abs().amax(-1)
+    assert float(error.median()) < 1e-5
+    # The screen's march interpolates on the CPU, and traces all pixels on the GPU.
+    budget = 0.05 if reflection == "screen_space" else 0.001
+    assert float((error > 1e-3).float().mean()) < budget
+    assert bool((there.water.cpu() == here.water).float().mean() > 0.999)
+
+
 def test_deferred_smog_reaches_every_layer(scene):
     """In dense deferred smog the water far away is smog, as with smog per Gaussian."""
     pictures = [
