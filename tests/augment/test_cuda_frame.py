@@ -9,18 +9,30 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator
 
+import numpy as np
 import pytest
 import torch
 
+from augment.apply import begin_view, render_view
 from augment.cameras import Camera
 from augment.geometry import rigid, rotmat_from_quat
+from augment.ground_heights import Ground
+from augment.labels import Boxes
 from augment.render.buffers import RenderOutput
 from augment.render.composite import composite_sky, map_colors, quantise
 from augment.render.gpu import upload
 from augment.render.remainder import share_remainder
+from augment.scene import Scene
+from augment.semantics import SemanticClass
 from augment.sky import ConstantSky, CubemapSky, LatLongSky, Sky
+from augment.views import WeatheredView
 from augment.weather.smog import SmogMedium, fog_raster
-from tests.augment.pretend_gpu import pretended_gpu
+from recipes.schema import Output, Recipe, Render, Smog, Weather
+from recipes.snow import Snow
+from recipes.style import Style
+from tests import snow_scenes
+from tests.augment import pretend_gpu
+from tests.augment.pretend_gpu import AwayTensor, pretended_gpu
 
 WIDTH, HEIGHT = 33, 21
 UNIFORM = SmogMedium(0.03, (0.5, 0.6, 0.7))
@@ -129,3 +141,131 @@ def test_finished_pixels_become_opaque(away, without):
 def test_eight_bits_of_an_image_on_the_gpu(away):
     rgb = 1.4 * images().rgb - 0.2
     assert (quantise(upload(rgb)) == quantise(rgb)).all()
+
+
+# --- whole views --------------------------------------------------------------------------------
+
+
+class Labels:
+    """One box around the car, so that labels are measured."""
+
+    def boxes(self, frame_index: int) -> Boxes:
+        return Boxes(("car",), ("Car",), np.array([[4.0, -0.5, 0.3]]), np.array([[1.2, 0.8, 0.6]]),
+                     np.array([[1.0, 0, 0, 0]]))  # fmt: skip
+
+    def lidar(self, frame_index: int) -> None:
+        return None
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    """A road, a wall and a car of so few splats that interpreted kernels draw them in a second."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(snow_scenes, "STEP_M", 0.6)
+        road = snow_scenes.sheet((1.0, 7.0), (-1.6, 1.6), semantic=int(SemanticClass.ROAD))
+        wall = snow_scenes.side_wall(1.6, (2.0, 7.0), (0.0, 1.0))
+        wall = dataclasses.replace(
+            wall, semantic=torch.full((len(wall),), int(SemanticClass.BUILDING), dtype=torch.int16)
+        )
+        car = snow_scenes.box_car(start=(4.0, -0.5), moved_m=1.0, size=(1.2, 0.8, 0.6))
+        built = snow_scenes.drive(road, wall, actors=[car], places=((0.0, 0, 1.0), (0.2, 0, 1.0)))
+    return dataclasses.replace(
+        built,
+        sky=skies()["cube"],
+        ground_z_m=0.0,
+        ground=Ground(0.0, 0.0, "stated", None, 0, None),
+        labels=Labels(),
+        color_maps={"ahead": torch.eye(3, 4) * 0.8 + 0.05},
+    )
+
+
+EVERYTHING = Recipe(output=Output(semantic=True, instance=True))
+SNOW = Snow(depth_m=0.1, cell_m=1.0, tracks="never", shading="per_splat")
+LOW = Smog(visibility_m=20, scale_height_m=9.0, model="deferred")
+RECIPES = {
+    "smog, style on the picture": Recipe(
+        weather=Weather(smog=Smog(visibility_m=20)),
+        style=Style(preset="dusk", applied_to="picture"),
+        output=Output(depth="none"),
+    ),
+    "layered smog on buffers, early stop": Recipe(
+        weather=Weather(smog=LOW),
+        render=Render(transmittance_stop=0.2),
+        output=Output(depth="expected", instance=True),
+    ),
+    "snow, bare images": Recipe(
+        weather=Weather(snow=SNOW), output=Output(semantic=True, surface="scene")
+    ),
+}
+
+
+def scaled(recipe: Recipe) -> Recipe:
+    return recipe.model_copy(update={"render": recipe.render.model_copy(update={"scale": 0.1})})
+
+
+def view_of(scene: Scene, recipe: Recipe, backend: str) -> WeatheredView:
+    return render_view(scene, scene.frames[0].cameras["ahead"], scaled(recipe), backend=backend)
+
+
+def check_same(got: WeatheredView, expected: WeatheredView) -> None:
+    """Of two float32 backends: what is rounded may fall to either side, and single pixels may flip
+    at a cut-off.
+    """
+    for field in dataclasses.fields(WeatheredView):
+        a, b = getattr(got, field.name), getattr(expected, field.name)
+        assert (a is None) == (b is None), field.name
+        if not isinstance(b, np.ndarray):
+            continue
+        assert a.dtype == b.dtype and a.shape == b.shape, field.name
+        if field.name == "rgb":
+            assert np.abs(a.astype(int) - b).max() <= 1
+        else:
+            close = np.isclose(a, b, rtol=1e-4, atol=0)
+            assert (~close).sum() <= 2, f"{field.name}: {(~close).sum()} pixels differ"
+    for name, depth in (
+        ("flood", "scene_depth_m"),
+        ("snowy", "surface_depth_m"),
+        ("smoggy", "surface_depth_m"),
+    ):
+        a, b = (getattr(getattr(view, name), depth, None) for view in (got, expected))
+        assert (a is None) == (b is None), name
+        if b is not None:
+            assert (~np.isclose(a, b, rtol=1e-4, atol=0)).sum() <= 2, name
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_a_view_is_that_of_the_cpu(scene, away, name):
+    got = view_of(scene, RECIPES[name], "cuda")
+    expected = view_of(scene, RECIPES[name], "cpu")
+    check_same(got, expected)
+    assert expected.rgb.std() > 5  # there is something to see
+
+
+def test_a_view_is_begun_without_waiting_for_it(scene, away, monkeypatch):
+    """The host asks the GPU for one number a raster pass, and for all images at once."""
+    asked = []
+    run = pretend_gpu._run
+
+    def watched(func, args, kwargs):
+        out = run(func, args, kwargs)
+        if isinstance(args[0], AwayTensor) and not isinstance(out, AwayTensor | tuple | list):
+            asked.append(args[0].numel())
+        return out
+
+    monkeypatch.setattr(pretend_gpu, "_run", watched)
+    camera = scene.frames[0].cameras["ahead"]
+    begun = begin_view(scene, camera, scaled(EVERYTHING), backend="cuda")
+    pixels = 16 * 9  # of three colours, depth, class and instance
+    assert asked == [1, pixels * (3 + 4 + 1 + 2)]
+    assert begun.result() is begun.result() and len(asked) == 2
+    check_same(begun.result(), view_of(scene, EVERYTHING, "cpu"))
+
+
+def test_two_views_under_way_do_not_mix(scene, away):
+    recipe = scaled(Recipe(output=Output(depth="none", labels=False)))
+    cameras = [frame.cameras["ahead"] for frame in scene.frames]
+    begun = [begin_view(scene, camera, recipe, backend="cuda") for camera in cameras]
+    alone = [render_view(scene, camera, recipe, backend="cpu") for camera in cameras]
+    for view, expected in zip(reversed(begun), reversed(alone), strict=True):
+        check_same(view.result(), expected)
+    assert not np.array_equal(alone[0].rgb, alone[1].rgb)

@@ -288,7 +288,7 @@ def test_smog_and_skies_are_refused():
     with pytest.raises(ValueError, match="orthographic: there is no eye"):
         rasterize([PosedGaussians(scene)], camera, smog=SmogMedium(0.1, (1.0, 1.0, 1.0)))
     rgb, alpha = torch.zeros(43, 61, 3), torch.zeros(43, 61)
-    for backend in ("cpu", "reference"):
+    for backend in ("cpu", "cuda", "reference"):
         with pytest.raises(ValueError, match="see the sky in one"):
             composite_sky(rgb, alpha, camera, CubemapSky(torch.zeros(6, 2, 2, 3)), backend=backend)
     grey = composite_sky(rgb, alpha, camera, ConstantSky(torch.full((3,), 0.5)))
