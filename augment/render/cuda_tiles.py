@@ -19,8 +19,8 @@ from augment.render import gpu
 from augment.render.cuda_splats import TILE, CudaSplats, CudaTiles
 from augment.render.cuda_tiles_kernels import count_tiles, list_pairs
 
-_BLOCK = 256  # splats or pairs of a program
-_MOST_PAIRS = 2**31 - 1  # tiles' lists begin at an int32
+_SPLATS, _PAIRS = 256, 512  # of a program; a thread looks for the owners of four pairs at once
+_MOST_PAIRS = 2**31 - 1024  # tiles' lists begin at an int32, and are read some way beyond
 
 
 def list_tiles(splats: CudaSplats, camera: Camera, wanted: Tensor | None) -> CudaTiles:
@@ -29,7 +29,7 @@ def list_tiles(splats: CudaSplats, camera: Camera, wanted: Tensor | None) -> Cud
     Waits for the GPU once, to learn how many pairs there are.
 
     Raises:
-        ValueError: there are more than 2^31 - 1 pairs.
+        ValueError: there are more pairs than an int32 can count.
     """
     columns, rows = -(-camera.width // TILE), -(-camera.height // TILE)
     count, tiles, device = len(splats.keys), columns * rows, splats.keys.device
@@ -40,7 +40,7 @@ def list_tiles(splats: CudaSplats, camera: Camera, wanted: Tensor | None) -> Cud
     counts = torch.empty(count, dtype=torch.int32, device=device)
     gpu.launch(
         count_tiles,
-        (-(-count // _BLOCK),),
+        (-(-count // _SPLATS),),
         order,
         splats.counts,
         splats.rects,
@@ -49,7 +49,7 @@ def list_tiles(splats: CudaSplats, camera: Camera, wanted: Tensor | None) -> Cud
         count,
         columns,
         IS_PARTIAL=is_wanted is not None,
-        BLOCK=_BLOCK,
+        BLOCK=_SPLATS,
     )
     ends = torch.cumsum(counts, 0, dtype=torch.int64)
     pairs = int(ends[-1]) if count else 0
@@ -66,7 +66,7 @@ def list_tiles(splats: CudaSplats, camera: Camera, wanted: Tensor | None) -> Cud
     owners = torch.empty(pairs, dtype=torch.int32, device=device)
     gpu.launch(
         list_pairs,
-        (-(-pairs // _BLOCK),),
+        (-(-pairs // _PAIRS),),
         order,
         ends,
         splats.rects,
@@ -79,7 +79,7 @@ def list_tiles(splats: CudaSplats, camera: Camera, wanted: Tensor | None) -> Cud
         columns,
         tiles,
         IS_PARTIAL=is_wanted is not None,
-        BLOCK=_BLOCK,
+        BLOCK=_PAIRS,
     )
     grouped, index = torch.sort(tile_of, stable=True)
     edges = torch.arange(tiles + 1, dtype=numbers, device=device)
