@@ -17,12 +17,14 @@ from collections.abc import Callable, Sequence
 from multiprocessing import reduction
 from multiprocessing.connection import wait
 
+from augment.batch.backends import renders_on_gpu
 from augment.batch.lock import OutputLock
 from augment.batch.manifest import FAILED
 from augment.batch.processes import (
     available_cores,
     describe_exit,
     interrupts_blocked,
+    quick_turns,
     thread_limits,
 )
 from augment.batch.runner import Chunk, FrameRunner, Outcome, Renderer, Setup
@@ -52,11 +54,12 @@ def run_serially(
     """
     pump = WritePump.beside(setup.backend, available_cores())
     runner = FrameRunner(scene, setup, renderer, deliver, pump)
-    try:
-        for chunk in chunks:
-            runner.run(chunk)
-    finally:
-        seconds = runner.close()
+    with quick_turns(renders_on_gpu(setup.backend)):
+        try:
+            for chunk in chunks:
+                runner.run(chunk)
+        finally:
+            seconds = runner.close()
     return seconds
 
 

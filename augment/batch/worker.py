@@ -10,7 +10,7 @@ from queue import SimpleQueue
 
 from augment.batch.backends import renders_on_gpu
 from augment.batch.lock import InheritedLock
-from augment.batch.processes import sender
+from augment.batch.processes import quick_turns, sender
 from augment.batch.runner import Chunk, FrameRunner, Renderer, Setup, describe
 from augment.batch.shared_scene import SharedScene
 from augment.batch.writer import WritePump
@@ -69,15 +69,16 @@ def worker_main(
         pump = WritePump(threads=1, waiting=2)
     runner = FrameRunner(scene, setup, renderer, send, pump)
     try:
-        try:
-            while True:
-                if inbox.empty():  # the next chunk may depend on what becomes of the last view
-                    runner.land()
-                if (chunk := inbox.get()) is None:
-                    break
-                runner.run(chunk, stopped.is_set)
-        finally:
-            seconds = runner.close()
+        with quick_turns(renders_on_gpu(setup.backend)):
+            try:
+                while True:
+                    if inbox.empty():  # the next chunk may depend on what becomes of the last view
+                        runner.land()
+                    if (chunk := inbox.get()) is None:
+                        break
+                    runner.run(chunk, stopped.is_set)
+            finally:
+                seconds = runner.close()
         send(Spent(seconds))
     except OutputError as error:
         send(Failure(True, str(error)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import sys
 import threading
 import time
 from dataclasses import dataclass, field
@@ -209,6 +210,21 @@ def test_threads_that_write_beside_a_gpu() -> None:
     assert pump.threads == 16
     pump.close()
     assert WritePump.beside("cpu", 16).threads == 2 and WritePump.beside("auto", 1).threads == 2
+
+
+@pytest.mark.parametrize(("backend", "turn_s"), [("cuda", 0.0005), ("cpu", 0.005)])
+def test_threads_take_turns_quickly_beside_a_gpu(tmp_path, backend: str, turn_s: float) -> None:
+    turns = []
+
+    def render(*arguments, **options):
+        turns.append(sys.getswitchinterval())
+        return fake_render(*arguments, **options)
+
+    before = sys.getswitchinterval()
+    assert before == pytest.approx(0.005)
+    run(RenderJob("fake:s", [make_recipe()], tmp_path, frames=[0], backend=backend), render)
+    assert turns == pytest.approx([turn_s, turn_s])
+    assert sys.getswitchinterval() == before
 
 
 def test_what_fails_after_a_task_stops_the_pump() -> None:
