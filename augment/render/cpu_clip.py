@@ -1,9 +1,5 @@
-"""Numba functions: splats cut at a height (see augment.render.clip for the geometry).
-
-A splat's cut is CUT float32. With x and y from its mean, in pixels, the kept share of its alpha is
-clamp(C_AT + C_X x + C_Y y, 0, 1), and its surface's depth is its centre's over
-1 - clamp(C_RIGHT x + C_DOWN y, -C_REACH, C_REACH), or, seen by an orthographic camera, its centre's
-plus that clamped line.
+"""Numba functions: splats cut at a height (see augment.render.clip for the geometry, layout for
+what is stored of it).
 """
 
 from __future__ import annotations
@@ -15,6 +11,13 @@ from augment.render.cpu_geometry import cross, dot, rotation_row, semi_axes
 from augment.render.cpu_items import BATCH
 from augment.render.cpu_jit import inner
 from augment.render.layout import (
+    C_AT,
+    C_DOWN,
+    C_REACH,
+    C_RIGHT,
+    C_X,
+    C_Y,
+    CUT,
     LANES,
     MEAN_X,
     MEAN_Y,
@@ -31,8 +34,6 @@ from augment.render.layout import (
     U,
 )
 
-CUT = 8
-C_AT, C_X, C_Y, C_RIGHT, C_DOWN, C_REACH = 0, 1, 2, 3, 4, 5
 SHARE, SURFACE = 0, 3 * BATCH  # where a batch's lines of each kind begin: value, slope in x and y
 REACHES = 6 * BATCH
 LINES = 7 * BATCH

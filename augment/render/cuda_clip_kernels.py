@@ -1,4 +1,4 @@
-"""Triton functions: splats cut at a height (see augment.render.clip, cpu_clip)."""
+"""Triton functions: splats cut at a height (see augment.render.clip)."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ V_CLIP_LONGEST = tl.constexpr(layout.V_CLIP_LONGEST)
 
 @triton.jit
 def cut_of(d, right, down, columns, sizes, inverse, view):
-    """Which splats have a part on the kept side, and their cuts, [B, CUT] as in cpu_clip."""
+    """Which splats have a part on the kept side, and their cuts, [B, CUT] as in layout."""
     up = three(view + V_CLIP_PART)
     extent = tl.load(view + V_EXTENT)
     rise = along_axes(up, columns, sizes)

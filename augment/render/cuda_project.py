@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import torch
 
-from augment.render import layout
+from augment.render import layout, shading
 from augment.render.cuda_inputs import BLOCK, CudaInputs
-from augment.render.cuda_project_kernels import CUT, LINES, project_gaussians
+from augment.render.cuda_project_kernels import project_gaussians
 from augment.render.cuda_splats import CudaSplats
 from augment.render.gpu import launch
 
@@ -26,8 +26,8 @@ def project(inputs: CudaInputs) -> CudaSplats:
         keys=ints(count),
         rects=ints(count, 2),
         counts=ints(count),
-        cuts=floats(CUT) if modes[layout.M_CLIP] else None,
-        lights=floats(LINES) if modes[layout.M_LIGHT] else None,
+        cuts=floats(layout.CUT) if modes[layout.M_CLIP] else None,
+        lights=floats(shading.LINES) if modes[layout.M_LIGHT] else None,
     )
     launch(
         project_gaussians,

@@ -26,7 +26,6 @@ from augment.render.cuda_geometry_kernels import (
 )
 from augment.render.cuda_light_kernels import store_lights
 
-CUT, LINES = 8, shading.LINES
 COLUMNS = tl.constexpr(cuda_inputs.COLUMNS)
 T_COUNT, T_FUNCTIONS = tl.constexpr(cuda_inputs.T_COUNT), tl.constexpr(cuda_inputs.T_FUNCTIONS)
 T_FIRST, T_BLOCK = tl.constexpr(cuda_inputs.T_FIRST), tl.constexpr(cuda_inputs.T_BLOCK)
@@ -45,7 +44,8 @@ NO_SMOG = tl.constexpr(layout.NO_SMOG)
 HIDDEN, TILE = tl.constexpr(cuda_splats.HIDDEN), tl.constexpr(cuda_splats.TILE)
 K = tl.constexpr(0.5 * math.log2(math.e))  # exponents of alpha are of 2
 HUGE = tl.constexpr(1e37)  # px^2; beyond it float32 overflows, and no pixel could tell
-N_CUT, N_LINES, N_RECORD = tl.constexpr(CUT), tl.constexpr(LINES), tl.constexpr(layout.RECORD)
+CUT, LINES = tl.constexpr(layout.CUT), tl.constexpr(shading.LINES)
+RECORD = tl.constexpr(layout.RECORD)
 
 
 @triton.jit
@@ -146,14 +146,14 @@ def project_gaussians(
         mean_y, tl.sqrt(1.0 / along * K), log_opacity, inverse_x * K,
         tl.sqrt(along * blurred_y * inverse_x / K), number, color[1], snow,
     )  # fmt: skip
-    record = tl.reshape(tl.join(even, odd), (BLOCK, N_RECORD))
-    _store_rows(records + out * N_RECORD, record, drawn, BLOCK, N_RECORD)
+    record = tl.reshape(tl.join(even, odd), (BLOCK, RECORD))
+    _store_rows(records + out * RECORD, record, drawn, BLOCK, RECORD)
     if CLIP:
-        _store_rows(cuts + out * N_CUT, cut, drawn, BLOCK, N_CUT)
+        _store_rows(cuts + out * CUT, cut, drawn, BLOCK, CUT)
     if LIGHT:
         lit = tl.where(drawn, tl.load(view + V_LIT), 0.0) > 0.0
         slopes = three_where(floats_at(tl.load(row + A_SLOPES)) + first * 3 + lane * 3, lit)
-        lines = lights + out * N_LINES + lane * N_LINES
+        lines = lights + out * LINES + lane * LINES
         store_lights(lines, columns[2], (x, y, z), slopes, through, lit, drawn, view)
 
 

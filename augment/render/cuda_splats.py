@@ -18,8 +18,8 @@ class CudaSplats:
 
     records: as augment.render.layout's RECORD. keys: bits of float32 z, HIDDEN where not drawn.
     rects: first tile of a splat, column + (row << 16), and its last, likewise; not written where it
-    is not drawn. counts: how many tiles that is, 0 where not drawn. cuts: of a clip, as
-    augment.render.cpu_clip's CUT; None without one. lights: augment.render.shading's lines; None
+    is not drawn. counts: how many tiles that is, 0 where not drawn. cuts: of a clip, as layout's
+    CUT; None without one. lights: augment.render.shading's lines; None
     where no part is lit pixel by pixel or no colour is asked for.
     """
 

@@ -31,6 +31,13 @@ MEAN_X, MEAN_Y, LEAN_X, SHARP_X, FALL_Y, LOG_OPACITY = 0, 1, 2, 3, 4, 5
 RADIUS_Y, FALL_X, LEAN_Y, BLUNT_Y, DEPTH = 6, 7, 8, 9, 10
 SPLAT_ID, RED, GREEN, BLUE, IS_SNOW = 11, 12, 13, 14, 15
 
+# The cut of a splat that is clipped at a height: CUT float32. With x and y from its mean, pixels,
+# the kept share of its alpha is clamp(C_AT + C_X x + C_Y y, 0, 1), and its surface's depth is its
+# centre's over 1 - clamp(C_RIGHT x + C_DOWN y, -C_REACH, C_REACH), or, seen by an orthographic
+# camera, its centre's plus that clamped line.
+CUT = 8
+C_AT, C_X, C_Y, C_RIGHT, C_DOWN, C_REACH = 0, 1, 2, 3, 4, 5
+
 # A view: VIEW float32 for every part of the scene.
 V_ROTATION = 0  # camera_from_part, 9 numbers, row by row
 V_EYE = 9  # camera centre in the part, 3, and the 3 remainders that float32 could not hold

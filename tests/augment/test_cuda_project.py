@@ -17,12 +17,12 @@ from hypothesis import given
 from augment.render import cpu, cuda_inputs, gpu, layout
 from augment.render.clip import ABOVE, BELOW, UNCUT, HeightClip
 from augment.render.constants import RasterSettings
-from augment.render.cpu_clip import C_REACH
 from augment.render.cpu_inputs import gather_inputs as gather_cpu_inputs
 from augment.render.cpu_scratch import borrowed_scratch
 from augment.render.cuda_inputs import BLOCK, gather_inputs
 from augment.render.cuda_project import project
 from augment.render.cuda_splats import HIDDEN, TILE, CudaSplats
+from augment.render.shading import LINES
 from augment.scene import Gaussians, PosedGaussians
 from augment.weather.smog import SmogMedium
 from tests.augment.drawn_splats import drawn_splats
@@ -82,7 +82,7 @@ def assert_close(actual: CudaSplats, expected: CudaSplats, flips: int = FLIPS) -
         assert (ours is None) == (theirs is None), name
         if ours is None:
             continue
-        for column in range(ours.shape[1] if name != "cuts" else C_REACH + 1):
+        for column in range(ours.shape[1] if name != "cuts" else layout.C_REACH + 1):
             if (name, column) != ("records", layout.SPLAT_ID):
                 torch.testing.assert_close(
                     ours[drawn, column], theirs[drawn, column], rtol=CLOSE, atol=NEAR_ZERO,
@@ -183,8 +183,8 @@ def cpu_splats(parts, camera, settings=DEFAULT, smog=None, clip=None) -> CudaSpl
     records = torch.full((count, layout.RECORD), math.nan)
     keys = torch.full((count,), HIDDEN, dtype=torch.int32)
     rects, counts = torch.full((count, 2), -1).int(), torch.zeros(count, dtype=torch.int32)
-    cuts = torch.full((count, 8), math.nan) if clip is not None else None
-    lights = torch.full((count, 9), math.nan) if inputs.modes[layout.M_LIGHT] else None
+    cuts = torch.full((count, layout.CUT), math.nan) if clip is not None else None
+    lights = torch.full((count, LINES), math.nan) if inputs.modes[layout.M_LIGHT] else None
     with borrowed_scratch() as scratch:
         tiles = cpu.Tiles(camera, {}, settings, scratch)
         depths, _ = cpu.rank(inputs, camera, scratch)
