@@ -28,7 +28,7 @@ def gpu_text(figures: Figures) -> str:
     """Everything that was measured, in columns, and what was not."""
     lines = list(_facts(figures))
     for title, header, rows in _tables(figures):
-        lines += ["", f"{title}:", *aligned([header, *rows])]
+        lines += ["", f"{title}:", *aligned([header, *rows], left=1)]
     return "\n".join([*lines, *_missing(figures)])
 
 
@@ -36,7 +36,7 @@ def gpu_markdown(figures: Figures) -> list[str]:
     """The same as lines of a document."""
     lines = [f"- {fact}." for fact in _facts(figures)]
     for title, header, rows in _tables(figures):
-        lines += ["", f"**{title}**", "", *markdown(header, rows)]
+        lines += ["", f"**{title}**", "", *markdown(header, rows, left=1)]
     return [*lines, *_missing(figures)]
 
 
