@@ -10,10 +10,19 @@ from numba import prange
 
 from augment.cameras import Camera
 from augment.render.constants import ALPHA_MIN, TRANSMITTANCE_STOP, RasterSettings
-from augment.render.cpu_clip import C_AT, C_X, C_Y
 from augment.render.cpu_jit import kernel
 from augment.render.cuda_splats import TILE, CudaSplats, CudaTiles
-from augment.render.layout import FALL_Y, LEAN_X, LOG_OPACITY, MEAN_X, MEAN_Y, SHARP_X
+from augment.render.layout import (
+    C_AT,
+    C_X,
+    C_Y,
+    FALL_Y,
+    LEAN_X,
+    LOG_OPACITY,
+    MEAN_X,
+    MEAN_Y,
+    SHARP_X,
+)
 from augment.render.threads import select_thread_pool
 
 
