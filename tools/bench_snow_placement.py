@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+from augment.render.backends import AUTO
 from augment.scene import Scene
 from augment.snow.bed_files import bed_key, load_bed, save_bed
 from augment.snow.beds import remember_bed
@@ -25,15 +26,19 @@ PLACEMENTS = 3  # that count
 DEPTHS_M = (0.05, 0.1, 0.3)  # laid in turns
 
 
-def bench_placement(scene: Scene, *, cell_m: float = 0.05, repeats: int = 7) -> dict[str, Any]:
-    """Seconds of the bed of all cameras and of the snow on it; remembers the bed for the scene."""
+def bench_placement(
+    scene: Scene, *, cell_m: float = 0.05, repeats: int = 7, backend: str = AUTO
+) -> dict[str, Any]:
+    """Seconds of the bed of all cameras and of the snow on it; remembers the bed for the scene.
+    backend: that places it.
+    """
     cameras = [camera for frame in scene.frames for camera in frame.cameras.values()]
     settings = placement_settings(Snow(depth_m=0, cell_m=cell_m))
     wholes, stages = [], []
-    bed = place_snow_bed(scene, cameras, settings)
+    bed = place_snow_bed(scene, cameras, settings, backend=backend)
     for _ in range(min(repeats, PLACEMENTS)):
         start = time.perf_counter()
-        bed = place_snow_bed(scene, cameras, settings)
+        bed = place_snow_bed(scene, cameras, settings, backend=backend)
         wholes.append(time.perf_counter() - start)
         stages.append(bed.seconds)
     remember_bed(scene, settings, bed)

@@ -1,21 +1,42 @@
 """The GPU backend's kernels as a table: registers, instructions, threads that run at once.
 
-python -m tools.gpu_kernels renders small frames with interpreted kernels, compiles every kernel
-that they launched for a Hopper GPU, and prints Markdown. It needs no GPU, and times nothing.
+python -m tools.gpu_kernels [FOLDER] renders small views with interpreted kernels, compiles every
+kernel that they launched for a Hopper GPU, and prints Markdown; into the folder go PTX and
+disassembly. It needs no GPU, and times nothing. Where a kernel is not as it should be, it says why
+and exits with 1.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+import sys
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
+from tqdm import tqdm
+
 from tools.kernel_compiling import Compiled, compile_launches
-from tools.kernel_launches import Recording
+from tools.kernel_launches import Recording, recorded_launches
 
 HEADER = (
     "| kernel | variant | programs | registers | stack | shared | instructions | occupancy |\n"
     "| --- | --- | --- | --- | --- | --- | --- | --- |"
 )
+
+
+def record_views(names: Collection[str] | None = None, *, progress: bool = False) -> Recording:
+    """What small views launch; all of `tools.kernel_frames` by default. Kernels are interpreted.
+
+    Raises:
+        RuntimeError: they are not (set TRITON_INTERPRET=1 before anything is imported).
+    """
+    from tools.kernel_frames import views
+
+    with recorded_launches() as recording:
+        every = views()
+        for name in tqdm(names or every, "views", disable=not progress):
+            every[name]()
+    return recording
 
 
 def report(recording: Recording, *, dump: Path | None = None) -> tuple[str, list[Compiled]]:
@@ -74,3 +95,17 @@ def _short(given: object) -> str:
         case None:
             return "none"
     return str(given)
+
+
+def _main(folder: str | None = None) -> int:
+    os.environ["TRITON_INTERPRET"] = "1"
+    recording = record_views(progress=True)
+    table, compiled = report(recording, dump=None if folder is None else Path(folder))
+    print(table)
+    wrong = complaints(compiled)
+    print("\n".join(wrong), file=sys.stderr)
+    return int(bool(wrong))
+
+
+if __name__ == "__main__":
+    sys.exit(_main(*sys.argv[1:2]))

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import pytest
 import torch
 
 from augment.render import gpu
 
 pytest.importorskip("triton")
-if not gpu.is_interpreted():
-    pytest.skip("launches are recorded while kernels are interpreted", allow_module_level=True)
-
 from tests.augment import compiled_kernels as kernels
-from tools.gpu_kernels import complaints, report
+from tools.gpu_kernels import complaints, record_views, report
 from tools.kernel_compiling import Compiled, compile_launches
 from tools.kernel_launches import Recording, recorded_launches
+
+interpreted = pytest.mark.skipif(
+    not gpu.is_interpreted(), reason="launches are recorded while kernels are interpreted"
+)
 
 
 def record_small_kernels() -> Recording:
@@ -29,6 +33,7 @@ def record_small_kernels() -> Recording:
     return recording
 
 
+@interpreted
 def test_launches_are_told_apart_by_what_is_compiled_for_them():
     recording = record_small_kernels()
     assert [(each.name, n) for each, n in recording.counts.items()] == [
@@ -40,6 +45,7 @@ def test_launches_are_told_apart_by_what_is_compiled_for_them():
     assert not unaligned["source"]["aligned"] and unaligned["num_warps"] == 2
 
 
+@interpreted
 def test_what_is_wrong_with_a_kernel_is_seen():
     recording = record_small_kernels()
     with recorded_launches() as broken, pytest.raises(Exception, match="arange"):
@@ -73,3 +79,23 @@ def test_threads_at_once_follow_from_registers_and_shared_memory():
 
 def test_nothing_to_compile_starts_nothing():
     assert compile_launches([]) == []
+
+
+@interpreted
+def test_kernels_of_views_compile_into_what_they_should():
+    """One of each kernel of a few views, since compiling takes seconds; all of them below."""
+    recording = record_views(["clean", "style folded into SH", "ground is seen"])
+    assert {each.name for each in recording.counts} >= {
+        "project_gaussians", "count_tiles", "list_pairs", "blend_blocks", "make_images", "map_sh",
+        "find_seen",
+    }  # fmt: skip
+    compiled = compile_launches(list({each.name: each for each in recording.counts}.values()))
+    assert not complaints(compiled)
+
+
+@pytest.mark.gpu
+def test_kernels_of_all_views_compile_into_what_they_should():
+    done = subprocess.run(
+        [sys.executable, "-m", "tools.gpu_kernels"], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
