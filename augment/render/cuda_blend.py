@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from augment.cameras import Camera
-from augment.render import cpu_clip, gpu, layout
+from augment.render import gpu, layout
 from augment.render.buffers import (
     ALPHA,
     BUFFERS,
@@ -32,8 +32,8 @@ assert (layout.MEAN_X, layout.MEAN_Y, layout.LEAN_X, layout.SHARP_X) == (0, 1, 2
 assert (layout.FALL_Y, layout.LOG_OPACITY, layout.LEAN_Y) == (4, 5, 8)
 assert (layout.DEPTH, layout.SPLAT_ID) == (10, 11)
 assert (layout.RED, layout.GREEN, layout.BLUE, layout.IS_SNOW) == (12, 13, 14, 15)
-assert (cpu_clip.C_AT, cpu_clip.C_X, cpu_clip.C_Y, cpu_clip.C_RIGHT) == (0, 1, 2, 3)
-assert (cpu_clip.C_DOWN, cpu_clip.C_REACH) == (4, 5)
+assert (layout.C_AT, layout.C_X, layout.C_Y, layout.C_RIGHT) == (0, 1, 2, 3)
+assert (layout.C_DOWN, layout.C_REACH) == (4, 5)
 
 
 def blend(

@@ -12,7 +12,7 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from augment.render import constants, cpu_clip, cpu_shading, cuda_splats, layout
+from augment.render import constants, cpu_shading, cuda_splats, layout
 from augment.render.cuda_mode_kernels import add_sample, can_grow, heaviest_mode
 
 # Records and cuts are read four numbers at a time, in their order (the launch module checks it).
@@ -20,7 +20,7 @@ TILE = tl.constexpr(cuda_splats.TILE)
 DEPTH_EPS = tl.constexpr(constants.DEPTH_EPS)
 RECORD, CUT, LINES = (
     tl.constexpr(layout.RECORD),
-    tl.constexpr(cpu_clip.CUT),
+    tl.constexpr(layout.CUT),
     tl.constexpr(cpu_shading.LINES),
 )
 L_FACING, L_X, L_Y, L_WRAP = (

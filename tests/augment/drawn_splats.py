@@ -11,8 +11,8 @@ from augment.cameras import Camera
 from augment.render import layout
 from augment.render.clip import HeightClip
 from augment.render.constants import ALPHA_MIN, RasterSettings
-from augment.render.cpu_clip import CUT
 from augment.render.cuda_splats import HIDDEN, TILE, CudaSplats
+from augment.render.layout import CUT
 from augment.render.reference_project import half_extents, project_parts
 from augment.render.shading import LINES
 from augment.scene import PosedGaussians
