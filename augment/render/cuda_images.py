@@ -19,7 +19,7 @@ from augment.semantics import SemanticClass
 from augment.view_images import ViewImages, Wanted
 from augment.views import SURFACE_ALPHA
 
-BLOCK = 512  # pixels of a program
+BLOCK = 512  # pixels of a program: four a thread, whose bytes are written as words
 ALIGNMENT = 16  # bytes, of every image in the memory that is copied
 # What the kernel writes. torch computes with no uint16, so instances are written as int16.
 KINDS = {
