@@ -151,7 +151,7 @@ VIEWS = [
     [
         *itertools.product(["cpu"], SMOGS, TIERS, VIEWS),
         *itertools.product(["cuda"], ["layered"], TIERS, VIEWS[:2]),
-        *itertools.product(["cuda"], ["clear", "uniform"], ["screen_space"], VIEWS[1:2]),
+        *itertools.product(["cuda"], ["uniform"], ["screen_space"], VIEWS[1:2]),
         *itertools.product(["cuda"], ["layered"], ["mirrored"], VIEWS[2:]),
     ],
 )

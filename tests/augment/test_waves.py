@@ -351,10 +351,11 @@ def assert_matches_the_definition(waves: WaveSet, camera: Camera, backend: str) 
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
-@pytest.mark.parametrize(("waves", "rows"), [("one", 6), ("24", 1)])
+@pytest.mark.parametrize(("waves", "rows"), [("one", 2), ("24", 1)])
 def test_the_gpu_s_kernel_matches_the_definition(camera, waves, rows):
     camera = CAMERAS[camera]
-    for top in (camera.height // 2, camera.height - rows):  # an interpreted row takes its time
+    tops = (camera.height // 2, camera.height - rows)  # an interpreted row takes its time
+    for top in tops if waves == "one" else tops[1:]:
         part = camera.cropped(0, top, camera.width, min(rows, camera.height))
         assert_matches_the_definition(SETS[waves], part, "cuda")
 
