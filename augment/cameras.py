@@ -65,12 +65,14 @@ class Camera:
             )
         # In numpy: every view of a frame is checked, and torch takes ten times as long for it.
         rotation = pose.detach().numpy()[:3, :3]
-        error = np.abs(rotation @ rotation.T - np.eye(3)).max()
-        if not error < 1e-4 or np.linalg.det(rotation) < 0:  # `not <` also catches NaN
+        with np.errstate(invalid="ignore"):
+            error = np.abs(rotation @ rotation.T - np.eye(3)).max()
+            determinant = np.linalg.det(rotation)
+        if not error < 1e-4 or determinant < 0:  # `not <` also catches NaN
             raise ValueError(
                 f"camera {self.name!r}: camera_from_world must be rigid with determinant +1; "
                 f"its rotation is off orthonormal by {error:.3g}, "
-                f"determinant {np.linalg.det(rotation):.3g}"
+                f"determinant {determinant:.3g}"
             )
 
     @property
