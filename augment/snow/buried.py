@@ -10,6 +10,7 @@ import torch
 
 from augment.geometry import rotmat_from_quat
 from augment.scene import Gaussians
+from augment.snow.in_threads import in_order, slices_of
 
 BELOW_M, ABOVE_M = 0.5, 0.08  # of the bed; above, half a cell at least
 FACING_RAD = math.radians(40)  # between a flat Gaussian's normal and the bed's
@@ -41,10 +42,28 @@ def find_buried(
 
     centers_m float64 [C, 3], normals [C, 3], sizes_m [C], edge_m [C]: of the cells.
     """
-    none = np.zeros(0, np.int32), np.zeros((0, 5), np.int32)
-    if len(centers_m) == 0:
-        return none
-    means = gaussians.means.numpy().astype(np.float64)
+    found = []
+    if len(centers_m):
+        cells = (centers_m, normals, sizes_m, edge_m)
+        parts = slices_of(len(gaussians))
+        found = in_order(lambda part: _find_part(gaussians, numbers, part, *cells), parts)
+    return (
+        np.concatenate([np.zeros(0, np.int32), *(buried for buried, _ in found)]),
+        np.concatenate([np.zeros((0, 5), np.int32), *(by for _, by in found)]),
+    )
+
+
+def _find_part(
+    gaussians: Gaussians,
+    numbers: NumbersCells,
+    part: slice,
+    centers_m: np.ndarray,
+    normals: np.ndarray,
+    sizes_m: np.ndarray,
+    edge_m: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """As find_buried, of part of the Gaussians: of so few that what is found lies in the caches."""
+    means = gaussians.means[part].numpy().astype(np.float64)
     under = numbers.at(means[:, :2])
     index = np.flatnonzero(under >= 0)
     cell = under[index]
@@ -52,11 +71,9 @@ def find_buried(
     rise = (offset * normals[cell]).sum(1) / normals[cell, 2]  # above the cell's plane, along z
     near = (rise > -BELOW_M) & (rise < np.maximum(ABOVE_M, sizes_m[cell] / 2))
     index, cell, rise = index[near], cell[near], rise[near]
-    if len(index) == 0:
-        return none
     rows = torch.from_numpy(index)
-    axes = rotmat_from_quat(gaussians.quats[rows]).numpy()  # columns: the axes
-    scales = gaussians.scales[rows].numpy()
+    axes = rotmat_from_quat(gaussians.quats[part][rows]).numpy()  # columns: the axes
+    scales = gaussians.scales[part][rows].numpy()
     order = np.argsort(scales, axis=1, kind="stable")
     axes = np.take_along_axis(axes, order[:, None, :], 2)
     scales = np.take_along_axis(scales, order, 1)
@@ -72,4 +89,4 @@ def find_buried(
             over.append(numbers.at(means[index, :2] + reach))
     buried_by = np.stack(over, 1)
     whole = (buried_by >= 0).all(1)
-    return index[whole].astype(np.int32), buried_by[whole].astype(np.int32)
+    return (part.start + index[whole]).astype(np.int32), buried_by[whole].astype(np.int32)

@@ -11,6 +11,7 @@ import torch
 from augment.scene import Gaussians
 from augment.snow.buried import NumbersCells, find_buried
 from augment.snow.cells import FLUSH, SnowCells
+from augment.snow.in_threads import in_order, slices_of
 from augment.snow.surface import Surface, normals_of
 from augment.snow.surface_kernels import LINK
 
@@ -91,16 +92,22 @@ def cells_at(
     )
 
 
+def _link(cells: CellList, numbers: NumbersCells, part: slice, neighbours: np.ndarray) -> None:
+    """Put the numbers of the cells that part of the cells are linked to into int32 [P, 4]."""
+    centers_m, sizes_m, sides = cells.centers_m[part, :2], cells.sizes_m[part], cells.sides[part]
+    for side, step in enumerate(((-1, 0), (1, 0), (0, -1), (0, 1))):
+        linked = np.flatnonzero(sides[:, side] == LINK)
+        to = numbers.at(centers_m[linked] + np.array(step) * sizes_m[linked, None])
+        same = (to >= 0) & (cells.sizes_m[to] == sizes_m[linked])
+        neighbours[linked, side] = np.where(same, to, FLUSH)
+
+
 def make_cells(
     cells: CellList, light: np.ndarray, numbers: NumbersCells, gaussians: Gaussians
 ) -> SnowCells:
     """The record: neighbours found by their places, and the Gaussians that the cells bury."""
     neighbours = cells.sides.astype(np.int32)
-    for side, step in enumerate(((-1, 0), (1, 0), (0, -1), (0, 1))):
-        linked = np.flatnonzero(cells.sides[:, side] == LINK)
-        to = numbers.at(cells.centers_m[linked, :2] + np.array(step) * cells.sizes_m[linked, None])
-        same = (to >= 0) & (cells.sizes_m[to] == cells.sizes_m[linked])
-        neighbours[linked, side] = np.where(same, to, FLUSH)
+    in_order(lambda part: _link(cells, numbers, part, neighbours[part]), slices_of(len(cells)))
     buried, buried_by = find_buried(
         gaussians,
         numbers,

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import threading
-
 import numpy as np
 from torch import Tensor
 
@@ -12,8 +10,6 @@ from augment.snow import cuda_visibility_kernels
 from augment.snow.visibility_layout import CENTRE
 
 _POINTS = 64  # of one warp
-
-_one_at_a_time = threading.Lock()  # squares are worked on by several threads
 
 
 def find_seen(
@@ -33,24 +29,23 @@ def find_seen(
     origin = points.mean(0)
     about = views.copy()
     about[:, CENTRE : CENTRE + 3] -= origin
-    with _one_at_a_time:
-        seen = gpu.upload(np.empty(len(points), np.uint8))
-        gpu.launch(
-            cuda_visibility_kernels.find_seen,
-            (-(-len(points) // _POINTS),),
-            gpu.upload((points - origin).astype(np.float32).T),
-            gpu.upload(normals.astype(np.float32).T),
-            gpu.upload(is_sure.astype(np.uint8)),
-            gpu.upload(about.astype(np.float32)),
-            gpu.upload(sizes.astype(np.int32)),
-            depths,
-            gpu.upload(tolerances.astype(np.float32)),
-            gpu.upload(lifts.astype(np.float32)),
-            seen,
-            len(points),
-            len(views),
-            LIFTS=len(lifts),
-            BLOCK=_POINTS,
-            num_warps=1,
-        )
-        return seen.cpu().numpy() > 0
+    seen = gpu.upload(np.empty(len(points), np.uint8))
+    gpu.launch(
+        cuda_visibility_kernels.find_seen,
+        (-(-len(points) // _POINTS),),
+        gpu.upload((points - origin).astype(np.float32).T),
+        gpu.upload(normals.astype(np.float32).T),
+        gpu.upload(is_sure.astype(np.uint8)),
+        gpu.upload(about.astype(np.float32)),
+        gpu.upload(sizes.astype(np.int32)),
+        depths,
+        gpu.upload(tolerances.astype(np.float32)),
+        gpu.upload(lifts.astype(np.float32)),
+        seen,
+        len(points),
+        len(views),
+        LIFTS=len(lifts),
+        BLOCK=_POINTS,
+        num_warps=1,
+    )
+    return seen.cpu().numpy() > 0

@@ -28,9 +28,10 @@ def ground_luminance(
     classes: int16 [H, W]. Each class is blurred by itself; under lane markings, the road about them
     shows how bright it is.
     """
-    rgb = np.clip(height_map.rgb, 0, 1)
+    rgb = np.clip(height_map.rgb[can_carry], 0, 1)
     linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** np.float32(2.4))
-    luminance = (linear.astype(np.float32) * _LUMINANCE).sum(-1)
+    luminance = np.zeros(can_carry.shape, np.float32)
+    luminance[can_carry] = (linear.astype(np.float32) * _LUMINANCE).sum(-1)
     out = np.full(luminance.shape, np.nan, np.float32)
     marking = classes == _MARKING
     around = 2 * max(1, round(_PAINT_M / height_map.cell_m)) + 1

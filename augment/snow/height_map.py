@@ -28,6 +28,7 @@ from augment.render.constants import ALPHA_MIN, MAX_EXTENT_SIGMAS, RasterSetting
 from augment.render.rasterize import rasterize
 from augment.scene import Gaussians, PosedGaussians
 from augment.semantics import SemanticClass
+from augment.snow.in_threads import on_device
 
 Estimator = Literal["mode", "expected", "median"]
 
@@ -141,8 +142,6 @@ def draw_from_above(
         is_orthographic=True,
     )
     shown = None if wanted is None else torch.from_numpy(np.ascontiguousarray(wanted[::-1]))
-    if shown is not None and backend == CUDA:
-        shown = gpu.upload(shown)
     names = (ALPHA, DEPTH_ESTIMATORS[estimator], MEDIAN_DEPTH, RGB, SPLAT_IDS)
     alpha, depths, medians, rgb, ids = _draw(
         parts, camera, names, shown, antialiased=cell_m <= _TRUE_M, backend=backend
@@ -187,16 +186,21 @@ def _draw(
     """Buffers of a view from above, rows towards +y."""
     # Other depths than the mode's are for comparing them: rather slower with all buffers, which
     # takes a kernel of the CPU that there is, than at once after one has been compiled for each.
-    out = rasterize(
-        parts,
-        camera,
-        buffers=names if MODE_DEPTH in names else BUFFERS,
-        settings=RasterSettings(sh_degree=0, antialiased=antialiased),
-        clip=UNCUT,
-        wanted=wanted,
-        backend=backend,
-    )
-    return [np.ascontiguousarray(getattr(out, name).cpu().numpy()[::-1]) for name in names]
+    asked = names if MODE_DEPTH in names else BUFFERS
+
+    def draw() -> list[np.ndarray]:
+        out = rasterize(
+            parts,
+            camera,
+            buffers=asked,
+            settings=RasterSettings(sh_degree=0, antialiased=antialiased),
+            clip=UNCUT,
+            wanted=gpu.upload(wanted) if wanted is not None and backend == CUDA else wanted,
+            backend=backend,
+        )
+        return [getattr(out, name).cpu().numpy() for name in names]
+
+    return [np.ascontiguousarray(image[::-1]) for image in on_device(draw, backend)]
 
 
 def _heights(alpha: np.ndarray, depths: np.ndarray, eye_z_m: float) -> tuple[np.ndarray, ...]:

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -42,6 +42,7 @@ from augment.snow.height_map import (
     plain_gaussians,
 )
 from augment.snow.holes import fill_holes
+from augment.snow.in_threads import in_order
 from augment.snow.surface import Surface, banks_of, find_surface, narrow_things, normals_of
 from augment.snow.surface_kernels import LINK, RISES
 from augment.snow.tiles import (
@@ -94,9 +95,11 @@ def place_snow_bed(
 ) -> SnowBed:
     """The cells of a scene that snow can lie on and that some of the cameras can see.
 
-    The same bits on any number of threads. Without cameras, or where nothing open is seen, the bed
-    is empty. backend: "cuda" draws and looks on the GPU; any other on the CPU, since the torch
-    definition would take hours. progress: shows a bar.
+    Several threads work on squares of the ground, and any number gives the same bits. The bed's
+    seconds hold how long all squares took, and beside it their stages, added up over the threads.
+    Without cameras, or where nothing open is seen, the bed is empty. backend: "cuda" draws and
+    looks on the GPU; any other on the CPU, since the torch definition would take hours. progress:
+    shows a bar.
 
     Raises:
         SceneError: metres or gravity are not known, or the cells would take too much memory.
@@ -133,24 +136,31 @@ def place_snow_bed(
         )
         clock.lap("views")
         paths = wheel_paths(scene)
-        work = _Ground(background, parked, plan, views, seen_from, paths, settings, backend, clock)
-        for level, window in squares:
-            work.add_square(level, window)
-            bar.update()
-        actors = {}
-        for actor in vehicles:
-            cells = find_actor_cells(
+        work = _Ground(background, parked, plan, views, seen_from, paths, settings, backend)
+        clock.lap("plan")
+        found = in_order(work.find, squares, after_each=bar.update)
+        clock.lap("squares")
+        on_vehicles = in_order(
+            lambda actor: find_actor_cells(
                 actor,
                 cell_m=settings.cell_m,
                 max_slope_deg=settings.max_slope_deg,
                 estimator=settings.estimator,
                 backend=backend,
-            )
-            if cells is not None:
-                actors[actor.track_id] = cells
-            bar.update()
+            ),
+            vehicles,
+            after_each=bar.update,
+        )
+        actors = {
+            actor.track_id: cells
+            for actor, cells in zip(vehicles, on_vehicles, strict=True)
+            if cells is not None
+        }
         clock.lap("actors")
-    ground = work.joined()
+    ground = work.joined(found)
+    clock.lap("join")
+    for square in found:
+        clock.add(square.seconds)
     return SnowBed(ground, actors, clock.seconds)
 
 
@@ -163,8 +173,12 @@ class _Clock:
 
     def lap(self, name: str) -> None:
         now = time.perf_counter()
-        self.seconds[name] = self.seconds.get(name, 0.0) + now - self._last
+        self.add({name: now - self._last})
         self._last = now
+
+    def add(self, seconds: Mapping[str, float]) -> None:
+        for name, more in seconds.items():
+            self.seconds[name] = self.seconds.get(name, 0.0) + more
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,8 +193,21 @@ class _Square:
     own: np.ndarray
 
 
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """Cells of a level's window; None where it has none. columns, rows: int64 [C], counted from the
+    plan's origin. seconds: what finding them took, by stage.
+    """
+
+    level: int
+    columns: np.ndarray
+    rows: np.ndarray
+    cells: CellList | None
+    seconds: Mapping[str, float]
+
+
 class _Ground:
-    """The background's cells, collected square by square."""
+    """Finds the background's cells, square by square: several at once, as each is by itself."""
 
     def __init__(
         self,
@@ -192,60 +219,60 @@ class _Ground:
         paths: tuple[WheelPath, ...],
         settings: PlacementSettings,
         backend: str,
-        clock: _Clock,
     ) -> None:
         self._background, self._parked, self._plan = background, parked, plan
         self._views, self._paths, self._settings = views, paths, settings
-        self._backend, self._clock = backend, clock
+        self._backend = backend
         self._classes = classes_of(background)
         self._path = path_points(cameras)
-        self._numbers = CellNumbers(plan)
-        self._lists: list[CellList] = []
-        self._count = 0
 
-    def add_square(self, level: int, window: Window) -> None:
-        """Find the cells of one window of a level."""
-        square = _with_margin(self._plan, level, window)
+    def find(self, level_and_window: tuple[int, Window]) -> _Found:
+        """The cells of one window of a level."""
+        clock = _Clock()
+        square = _with_margin(self._plan, *level_and_window)
         view, classes, lies, filled = self._draw(square)
-        self._clock.lap("above")
+        clock.lap("above")
         surface = find_surface(view, lies, max_slope_deg=self._settings.max_slope_deg)
-        self._clock.lap("surface")
+        clock.lap("surface")
         seen = self._seen(surface, square, filled)
-        self._clock.lap("seen")
+        clock.lap("seen")
         rows, columns = np.nonzero(surface.can_carry & seen & square.inner)
-        if len(rows) == 0:
-            return
-        cells = cells_at(
-            surface,
-            rows,
-            columns,
-            sides=_sides(surface, seen & square.own),
-            luminance=ground_luminance(view, classes, surface.can_carry),
-            tracks=draw_tracks(self._paths, surface, classes),
-            banks=banks_of(surface),
-            classes=classes,
+        cells = None
+        if len(rows):
+            cells = cells_at(
+                surface,
+                rows,
+                columns,
+                sides=_sides(surface, seen & square.own),
+                luminance=ground_luminance(view, classes, surface.can_carry),
+                tracks=draw_tracks(self._paths, surface, classes),
+                banks=banks_of(surface),
+                classes=classes,
+            )
+        clock.lap("ground")
+        return _Found(
+            square.level,
+            columns.astype(np.int64) + square.window.left,
+            rows.astype(np.int64) + square.window.bottom,
+            cells,
+            clock.seconds,
         )
-        numbers = self._count + np.arange(len(rows), dtype=np.int32)
-        corner = square.window
-        self._numbers.put(
-            level,
-            columns.astype(np.int64) + corner.left,
-            rows.astype(np.int64) + corner.bottom,
-            numbers,
-        )
-        self._lists.append(cells)
-        self._count += len(rows)
-        self._clock.lap("ground")
 
-    def joined(self) -> SnowCells:
-        """All cells found so far, linked across squares."""
-        if not self._lists:
+    def joined(self, found: Sequence[_Found]) -> SnowCells:
+        """All those cells, one square's after another's, linked across squares."""
+        numbers, lists, count = CellNumbers(self._plan), [], 0
+        for square in found:
+            if square.cells is None:
+                continue
+            to = count + np.arange(len(square.cells), dtype=np.int32)
+            numbers.put(square.level, square.columns, square.rows, to)
+            lists.append(square.cells)
+            count += len(square.cells)
+        if not lists:
             return _no_cells()
-        cells = CellList.joined(self._lists)
+        cells = CellList.joined(lists)
         light = relative_light(cells.luminance, cells.semantic)
-        made = make_cells(cells, light, self._numbers, self._background)
-        self._clock.lap("join")
-        return made
+        return make_cells(cells, light, numbers, self._background)
 
     def _draw(self, square: _Square) -> tuple[HeightMap, np.ndarray, np.ndarray, np.ndarray]:
         """The square from above, its classes, where what is seen is of the background and no

@@ -96,7 +96,8 @@ def find_surface(
     covered |= filled
     sides = _compare(fitted, lowest, covered, can_carry, step)
     edges = np.empty(shape, np.float32)
-    surface_kernels.edge_distances(can_carry, sides, max(EDGE_CAP_M / cell, 0.5), edges)
+    with kernel_threads(_ROWS):
+        surface_kernels.edge_distances(can_carry, sides, max(EDGE_CAP_M / cell, 0.5), edges)
     return Surface(height_map, fitted, slopes, can_carry, sides, edges * np.float32(cell))
 
 

@@ -14,6 +14,10 @@ from numba import prange
 
 LINK, OPEN, RISES = 0, -1, -2  # what is on a cell's side; the last two are those of SnowCells
 
+_LEFT, _RIGHT, _DOWN, _UP = 1, 2, 4, 8  # bits: neighbours on the same surface
+_DOWN_LEFT, _DOWN_RIGHT, _UP_LEFT, _UP_RIGHT = 16, 32, 64, 128
+_UNKNOWN = 1 << 30  # half cells to an edge that is not known yet
+
 
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
 def median_heights(height, covered, radius, out):
@@ -122,25 +126,124 @@ def compare_sides(height, lowest, covered, can_carry, step, sides):
                     sides[i, j, side] = OPEN if falls else RISES
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _nearer(offsets, i, j, k, m, dx, dy):
-    """Let cell (i, j) take the nearest edge of its neighbour (k, m), which is dx, dy away."""
-    x, y = offsets[k, m, 0] + dx, offsets[k, m, 1] + dy
-    if x * x + y * y < offsets[i, j, 0] ** 2 + offsets[i, j, 1] ** 2:
+@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
+def _find_links(can_carry, sides, links, offsets):
+    """links uint8 [H, W]: bits of the neighbours beside, below and above that each cell is linked
+    to. offsets int32 [H, W, 2]: x and y, in half cells, of its own open edge, or _UNKNOWN.
+    """
+    rows, columns = can_carry.shape
+    for row in prange(rows):
+        i = np.int64(row)
+        for j in range(columns):
+            links[i, j] = 0
+            offsets[i, j, 0] = offsets[i, j, 1] = _UNKNOWN
+            if not can_carry[i, j]:
+                continue
+            for side in range(4):
+                if sides[i, j, side] == OPEN:
+                    sign = 1 if side % 2 else -1
+                    offsets[i, j, 0] = sign if side < 2 else 0
+                    offsets[i, j, 1] = 0 if side < 2 else sign
+            if j > 0 and sides[i, j, 0] == LINK and can_carry[i, j - 1]:
+                links[i, j] |= _LEFT
+            if j < columns - 1 and sides[i, j, 1] == LINK and can_carry[i, j + 1]:
+                links[i, j] |= _RIGHT
+            if i > 0 and sides[i, j, 2] == LINK and can_carry[i - 1, j]:
+                links[i, j] |= _DOWN
+            if i < rows - 1 and sides[i, j, 3] == LINK and can_carry[i + 1, j]:
+                links[i, j] |= _UP
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _leads(links, i, j, across, along):
+    """Whether a cell hangs together with a diagonal neighbour, by way of one between them."""
+    dx, dy = (-1 if across == _LEFT else 1), (-1 if along == _DOWN else 1)
+    return (links[i, j] & across and links[i, j + dx] & along) or (
+        links[i, j] & along and links[i + dy, j] & across
+    )
+
+
+@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
+def _find_ways(links, ways):
+    """ways uint8 [H, W]: the links, and the bits of diagonal neighbours that they lead to."""
+    rows, columns = links.shape
+    for row in prange(rows):
+        i = np.int64(row)
+        for j in range(columns):
+            way = links[i, j]
+            if _leads(links, i, j, _LEFT, _DOWN):
+                way |= _DOWN_LEFT
+            if _leads(links, i, j, _RIGHT, _DOWN):
+                way |= _DOWN_RIGHT
+            if _leads(links, i, j, _LEFT, _UP):
+                way |= _UP_LEFT
+            if _leads(links, i, j, _RIGHT, _UP):
+                way |= _UP_RIGHT
+            ways[i, j] = way
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _nearer(offsets, k, m, dx, dy, x, y, square):
+    """The edge at (x, y), in half cells, or that of the neighbour (k, m), which is (dx, dy) away,
+    where that is nearer; with its distance squared.
+    """
+    if offsets[k, m, 0] == _UNKNOWN:
+        return x, y, square
+    x_there, y_there = np.int64(offsets[k, m, 0]) + dx, np.int64(offsets[k, m, 1]) + dy
+    square_there = x_there * x_there + y_there * y_there
+    if square_there < square:
+        return x_there, y_there, square_there
+    return x, y, square
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _take(offsets, ways, i, j, straight, beside, dx, before, after, dy):
+    """Let cell (i, j) take the nearest edge of those that its neighbours know: the one straight
+    below or above (dy), the one beside it (dx), and the diagonal ones of the same row as the first.
+    The bits of the ways there: straight, beside, before (to -x), after (to +x).
+    """
+    way = ways[i, j]
+    if not way & (straight | beside | before | after):
+        return
+    own_x, own_y = np.int64(offsets[i, j, 0]), np.int64(offsets[i, j, 1])
+    own = own_x * own_x + own_y * own_y
+    x, y, square = own_x, own_y, own
+    if way & straight:
+        x, y, square = _nearer(offsets, i + dy, j, 0, 2 * dy, x, y, square)
+    if way & beside:
+        x, y, square = _nearer(offsets, i, j + dx, 2 * dx, 0, x, y, square)
+    if way & before:
+        x, y, square = _nearer(offsets, i + dy, j - 1, -2, 2 * dy, x, y, square)
+    if way & after:
+        x, y, square = _nearer(offsets, i + dy, j + 1, 2, 2 * dy, x, y, square)
+    if square < own:
         offsets[i, j, 0], offsets[i, j, 1] = x, y
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _take_diagonal(offsets, can_carry, sides, i, j, k, m):
-    """As _nearer, from a diagonal neighbour that is linked by way of one of the two between."""
-    rows, columns = can_carry.shape
-    if k < 0 or m < 0 or k >= rows or m >= columns or not can_carry[k, m]:
-        return
-    across, along = (0 if m < j else 1), (2 if k < i else 3)
-    if (sides[i, j, across] == LINK and can_carry[i, m] and sides[i, m, along] == LINK) or (
-        sides[i, j, along] == LINK and can_carry[k, j] and sides[k, j, across] == LINK
-    ):
-        _nearer(offsets, i, j, k, m, float(m - j), float(k - i))
+def _sweep(ways, offsets):
+    """Hand offsets on from row to row, up and down again, and along each row both ways."""
+    rows, columns = ways.shape
+    for i in range(rows):
+        for j in range(columns):
+            _take(offsets, ways, i, j, _DOWN, _LEFT, -1, _DOWN_LEFT, _DOWN_RIGHT, -1)
+        for j in range(columns - 2, -1, -1):
+            _take(offsets, ways, i, j, 0, _RIGHT, 1, 0, 0, 0)
+    for i in range(rows - 1, -1, -1):
+        for j in range(columns - 1, -1, -1):
+            _take(offsets, ways, i, j, _UP, _RIGHT, 1, _UP_LEFT, _UP_RIGHT, 1)
+        for j in range(1, columns):
+            _take(offsets, ways, i, j, 0, _LEFT, -1, 0, 0, 0)
+
+
+@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
+def _distances(offsets, far, out):
+    rows, columns = out.shape
+    for row in prange(rows):
+        i = np.int64(row)
+        for j in range(columns):
+            x, y = 0.5 * offsets[i, j, 0], 0.5 * offsets[i, j, 1]
+            out[i, j] = min(math.sqrt(x * x + y * y), far)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -149,44 +252,12 @@ def edge_distances(can_carry, sides, far, out):
     into out [H, W] float32; at most far.
 
     Offsets to edges are handed from cell to cell (Danielsson 1980), along links only, in two
-    sweeps there and back.
+    sweeps there and back. In half cells they are whole numbers, and so exact.
     """
-    rows, columns = can_carry.shape
-    offsets = np.full((rows, columns, 2), 1e9)
-    for i in range(rows):
-        for j in range(columns):
-            if can_carry[i, j]:
-                for side in range(4):
-                    if sides[i, j, side] == OPEN:
-                        sign = 0.5 if side % 2 else -0.5
-                        offsets[i, j, 0] = sign if side < 2 else 0.0
-                        offsets[i, j, 1] = 0.0 if side < 2 else sign
+    links, ways = np.empty(can_carry.shape, np.uint8), np.empty(can_carry.shape, np.uint8)
+    offsets = np.empty((can_carry.shape[0], can_carry.shape[1], 2), np.int32)
+    _find_links(can_carry, sides, links, offsets)
+    _find_ways(links, ways)
     for _ in range(2):
-        for i in range(rows):
-            for j in range(columns):
-                if can_carry[i, j]:
-                    if i > 0 and sides[i, j, 2] == LINK and can_carry[i - 1, j]:
-                        _nearer(offsets, i, j, i - 1, j, 0.0, -1.0)
-                    if j > 0 and sides[i, j, 0] == LINK and can_carry[i, j - 1]:
-                        _nearer(offsets, i, j, i, j - 1, -1.0, 0.0)
-                    _take_diagonal(offsets, can_carry, sides, i, j, i - 1, j - 1)
-                    _take_diagonal(offsets, can_carry, sides, i, j, i - 1, j + 1)
-            for j in range(columns - 2, -1, -1):
-                if can_carry[i, j] and sides[i, j, 1] == LINK and can_carry[i, j + 1]:
-                    _nearer(offsets, i, j, i, j + 1, 1.0, 0.0)
-        for i in range(rows - 1, -1, -1):
-            for j in range(columns - 1, -1, -1):
-                if can_carry[i, j]:
-                    if i < rows - 1 and sides[i, j, 3] == LINK and can_carry[i + 1, j]:
-                        _nearer(offsets, i, j, i + 1, j, 0.0, 1.0)
-                    if j < columns - 1 and sides[i, j, 1] == LINK and can_carry[i, j + 1]:
-                        _nearer(offsets, i, j, i, j + 1, 1.0, 0.0)
-                    _take_diagonal(offsets, can_carry, sides, i, j, i + 1, j - 1)
-                    _take_diagonal(offsets, can_carry, sides, i, j, i + 1, j + 1)
-            for j in range(1, columns):
-                if can_carry[i, j] and sides[i, j, 0] == LINK and can_carry[i, j - 1]:
-                    _nearer(offsets, i, j, i, j - 1, -1.0, 0.0)
-    for i in range(rows):
-        for j in range(columns):
-            x, y = offsets[i, j, 0], offsets[i, j, 1]
-            out[i, j] = min(math.sqrt(x * x + y * y), far)
+        _sweep(ways, offsets)
+    _distances(offsets, far, out)

@@ -19,6 +19,7 @@ from augment.render.threads import kernel_threads
 from augment.scene import PosedGaussians
 from augment.snow import visibility_kernels
 from augment.snow.height_map import COVERED
+from augment.snow.in_threads import on_device
 from augment.snow.visibility_layout import CENTRE, PARALLEL, VIEW
 
 WIDTH_PX = 200  # of the depth images: they tell houses apart, not posts
@@ -66,8 +67,9 @@ class Views:
         if self.on_gpu:
             from augment.snow import cuda_visibility
 
-            return cuda_visibility.find_seen(
-                points, normals, is_sure, self.views, self.sizes, self.depths, lifts, tolerances
+            given = (self.views, self.sizes, self.depths, lifts, tolerances)
+            return on_device(
+                lambda: cuda_visibility.find_seen(points, normals, is_sure, *given), CUDA
             )
         seen = np.empty(len(points), bool)
         with kernel_threads(_ROWS):

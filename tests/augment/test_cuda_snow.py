@@ -11,6 +11,7 @@ import torch
 from augment.cameras import Camera
 from augment.render import gpu
 from augment.scene import PosedGaussians
+from augment.snow import placement
 from augment.snow.height_map import plain_gaussians
 from augment.snow.placement import PlacementSettings, place_snow_bed
 from augment.snow.visibility import Views, draw_views
@@ -77,6 +78,7 @@ def test_a_bed_placed_on_the_gpu_is_the_cpus(monkeypatch):
     scene = drive(ground, places=[(-3.0, 0.0, 1.5)])
     cameras = [camera.scaled(0.12) for camera in cameras_of(scene)]
     settings = PlacementSettings(cell_m=4.0)
+    monkeypatch.setattr(placement, "_SQUARE_CELLS", 32)  # several, which threads work on
     expected = place_snow_bed(scene, cameras, settings)
     assert len(expected.ground) > 5
     with pretended_gpu(monkeypatch):

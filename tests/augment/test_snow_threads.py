@@ -1,0 +1,71 @@
+"""Work on several threads: order, failures, and whose thread uses the GPU."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import pytest
+
+from augment.snow import in_threads
+from augment.snow.in_threads import in_order, on_device, slices_of
+
+
+@pytest.fixture(autouse=True, params=[1, 4])
+def threads(request, monkeypatch) -> int:
+    monkeypatch.setattr(in_threads, "thread_count", lambda: request.param)
+    return request.param
+
+
+def test_results_are_in_the_items_order(threads: int) -> None:
+    seen, told = set(), []
+
+    def late_first(item: int) -> int:
+        time.sleep(0.002 * (5 - item))
+        seen.add(threading.current_thread())
+        return item * item
+
+    found = in_order(late_first, range(5), after_each=lambda: told.append(1))
+    assert found == [0, 1, 4, 9, 16]
+    assert len(told) == 5
+    assert (threading.current_thread() in seen) == (threads == 1)
+    assert in_order(late_first, []) == []
+
+
+def test_the_gpu_is_used_by_the_caller_alone(threads: int) -> None:
+    here = threading.current_thread()
+
+    def where(item: int) -> list[threading.Thread]:
+        return [on_device(threading.current_thread, backend) for backend in ("cuda", "cpu")]
+
+    found = in_order(where, range(9))
+    assert all(on_gpu is here for on_gpu, _ in found)
+    assert all((on_cpu is here) == (threads == 1) for _, on_cpu in found)
+    assert on_device(threading.current_thread, "cuda") is here
+
+
+def test_a_failure_is_the_callers_and_leaves_nobody_waiting() -> None:
+    begun = []
+
+    def fails(item: int) -> int:
+        begun.append(item)
+        return on_device(lambda: 1 // (item - 1), "cuda")
+
+    with pytest.raises(ZeroDivisionError):
+        in_order(fails, range(1, 500))
+    assert len(begun) < 499
+
+
+def test_work_within_work_begins_no_more_threads() -> None:
+    def inner(item: int) -> list[threading.Thread]:
+        own = threading.current_thread()
+        assert in_order(lambda _: threading.current_thread(), range(3)) == [own] * 3
+        return [own]
+
+    assert len(in_order(inner, range(4))) == 4
+
+
+@pytest.mark.parametrize("count", [0, 1, 8192, 8193, 20_000])
+def test_slices_are_the_whole_once(count: int) -> None:
+    rows = [row for part in slices_of(count) for row in range(count)[part]]
+    assert rows == list(range(count))
