@@ -41,7 +41,7 @@ def share_colors(
     transmittances as the only chain.
     """
     tile = tl.program_id(0)
-    entries = tl.load(starts + tl.num_programs(0))
+    entries = tl.load(starts + tl.num_programs(0)).to(tl.int64)  # three times as many places
     at = tl.load(starts + tile)
     last = tl.load(starts + tile + 1)
     pixel = tl.arange(0, _PIXELS)

@@ -95,7 +95,9 @@ def _places(names: Sequence[str], camera: Camera) -> dict[str, _Place]:
 
 def _make(images: dict[str, Tensor], wanted: Wanted, camera: Camera) -> None:
     looked_up = wanted.semantic or wanted.instance
-    table = upload(_table_of(wanted.parts)) if looked_up else None
+    parts = wanted.parts if looked_up else ()
+    classes = [_resident_classes(part) for part in parts]  # kept until the launch
+    table = upload(_table_of(parts, classes)) if looked_up else None
     shown = wanted.shown
     pose = camera.world_from_camera
     eye_m = 0.0 if wanted.plane_z_m is None else float(pose[2, 3]) - wanted.plane_z_m
@@ -123,14 +125,17 @@ def _make(images: dict[str, Tensor], wanted: Wanted, camera: Camera) -> None:
     )
 
 
-def _table_of(parts: Sequence[PosedGaussians]) -> np.ndarray:
+def _resident_classes(part: PosedGaussians) -> Tensor | None:
+    semantic = part.gaussians.semantic
+    return None if semantic is None else resident(semantic)
+
+
+def _table_of(parts: Sequence[PosedGaussians], classes: Sequence[Tensor | None]) -> np.ndarray:
     """int64 [P, 3]: first splat, address of the classes on the GPU or 0, instance."""
     table = np.zeros((len(parts), 3), np.int64)
     table[1:, 0] = np.cumsum([len(part.gaussians) for part in parts[:-1]])
-    for row, part in zip(table, parts, strict=True):
-        if part.gaussians.semantic is not None:
-            row[1] = address_of(resident(part.gaussians.semantic))
-        row[2] = part.instance_id
+    table[:, 1] = [0 if own is None else address_of(own) for own in classes]
+    table[:, 2] = [part.instance_id for part in parts]
     return table
 
 

@@ -15,7 +15,7 @@ from augment.cameras import Camera
 from augment.render import layout
 from augment.render.clip import HeightClip
 from augment.render.constants import RasterSettings
-from augment.render.gpu import address_of, gpu_device, resident, upload
+from augment.render.gpu import address_of, gpu_device, resident, upload, version_of
 from augment.render.part_views import raster_modes, views_of
 from augment.scene import Gaussians, PosedGaussians
 from augment.weather.smog import SmogMedium
@@ -98,7 +98,7 @@ class _Resident:
     """
 
     device: torch.device
-    versions: list[int]
+    versions: list[int | None]
     tensors: list[Tensor]
     addresses: list[int]
 
@@ -111,13 +111,14 @@ _known: weakref.WeakKeyDictionary[Gaussians, _Resident] = weakref.WeakKeyDiction
 def _resident_gaussians(gaussians: Gaussians, device: torch.device) -> _Resident:
     g = gaussians
     given = (g.means, g.quats, g.scales, g.opacities, g.sh)
-    versions = [tensor._version for tensor in given]
+    versions = [version_of(tensor) for tensor in given]
     known = _known.get(g)
     if known is not None and known.versions == versions and known.device == device:
         return known
     tensors = [_readable(tensor) for tensor in given]
     known = _Resident(device, versions, tensors, [address_of(tensor) for tensor in tensors])
-    _known[g] = known
+    if None not in versions:
+        _known[g] = known
     return known
 
 

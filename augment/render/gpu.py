@@ -34,9 +34,27 @@ def _obstacle() -> str | None:
             f"{error}. Install triton (it comes with torch's CUDA builds), or use backend 'cpu', "
             f"which needs no GPU"
         )
-    if is_interpreted() or torch.cuda.is_available():
+    if is_interpreted():
         return None
-    return f"torch {torch.__version__} sees no GPU; use backend 'cpu'"
+    if not torch.cuda.is_available():
+        return f"torch {torch.__version__} sees no GPU; use backend 'cpu'"
+    return _driver_obstacle()
+
+
+def _driver_obstacle() -> str | None:
+    """Why Triton cannot launch: it compiles its own launchers, by what the machine has for that."""
+    from triton.runtime import driver
+
+    try:
+        # Made when it is first asked for.
+        driver.active.utils  # noqa: B018  # pyright: ignore[reportAttributeAccessIssue]
+    except Exception as error:  # of a compiler, a linker, a folder: whatever stands in its way
+        return (
+            f"Triton cannot build what launches its kernels ({type(error).__name__}: {error}). It "
+            f"needs a C compiler (gcc or clang), the headers of this Python, and a home folder or "
+            f"TRITON_CACHE_DIR that can be written to; or use backend 'cpu'"
+        )
+    return None
 
 
 @functools.cache
@@ -47,7 +65,7 @@ def is_interpreted() -> bool:
     """
     import triton
 
-    return bool(triton.knobs.runtime.interpret)
+    return bool(triton.knobs.runtime.interpret)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def has_gpu() -> bool:
@@ -88,24 +106,35 @@ def resident(tensor: Tensor) -> Tensor:
     device = gpu_device()
     if tensor.device == device:
         return tensor.detach().contiguous()
-    key = (id(tensor), str(device))
+    key, version = (id(tensor), str(device)), version_of(tensor)
     known = _copies.get(key)
-    if known is not None and known[0]() is tensor and known[1] == tensor._version:
+    if known is not None and known[0]() is tensor and known[1] == version:
         return known[2]
     copy = tensor.detach().contiguous().to(device)
-    _copies[key] = (weakref.ref(tensor, lambda _: _copies.pop(key, None)), tensor._version, copy)
+    if version is not None:
+        _copies[key] = (weakref.ref(tensor, lambda _: _copies.pop(key, None)), version, copy)
     return copy
+
+
+def version_of(tensor: Tensor) -> int | None:
+    """Another number after every change in place; None where torch does not count these, as of
+    tensors made in its inference mode: what such a tensor held may be kept by nobody.
+    """
+    return None if tensor.is_inference() else tensor._version
 
 
 def launch(kernel: Any, grid: tuple[int, ...], *arguments: Any, **constants: Any) -> None:
     """Run a Triton kernel over a grid of programs; nothing where the grid is empty.
 
-    arguments: in the kernel's order; tensors must lie on the GPU and be contiguous. constants: its
-    tl.constexpr parameters by name, and num_warps where the usual 4 are not wanted.
+    arguments: in the kernel's order; tensors must lie on the GPU and be contiguous; numbers may be
+    numpy's. constants: its tl.constexpr parameters by name, and num_warps where the usual 4 are not
+    wanted.
     """
     if 0 in grid:
         return
-    given = [_kernel_argument(argument) for argument in arguments]
+    # Triton refuses integers of numpy where it compiles, but not where it interprets.
+    plain = (a.item() if isinstance(a, np.generic) else a for a in arguments)
+    given = [_kernel_argument(argument) for argument in plain]
     # Interpreted kernels run in numpy, which warns of infinities that a GPU goes on with.
     with np.errstate(all="ignore"):
         # Fused multiply-add is Triton's own choice too, until a version that asks to be told.
