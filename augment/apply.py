@@ -71,7 +71,7 @@ def render_buffers(
     cover = cover_for(plan, scene, backend=backend) if view.snow else None
     if cover is not None:
         with lap("snow: placement and layer"):
-            parts = cover.parts_for(scene, camera, parts, view.snowy)
+            parts = cover.parts_for(scene, camera, parts, view.snowy, backend=backend)
     sky = scene.sky
     if worn is not None:
         parts, sky = worn.on(parts, backend=backend), worn.sky

@@ -58,6 +58,12 @@ RECIPES = {
         weather=Weather(snow=Snow(depth_m=0.1, cell_m=0.8, tracks="never", shading="per_pixel")),
         output=_PLAIN,
     ),
+    "snow, close and glinting": Recipe(
+        weather=Weather(
+            snow=Snow(depth_m=0.1, cell_m=0.8, tracks="never", shading="per_splat", sparkle=1.0)
+        ),
+        output=_PLAIN,
+    ),
     "style": Recipe(style=Style(preset="dusk", per_region=True), output=_PLAIN),
     "style folded into SH": Recipe(style=Style(preset="dusk", evaluated="sh"), output=_PLAIN),
 }

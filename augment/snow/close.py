@@ -66,7 +66,7 @@ def split_near(
 
     gaussians: of the world. sun: unit, towards it.
     """
-    finest = max(FINEST_PX / max(camera.fx, camera.fy), FINEST)
+    finest = finest_split(camera)
     splits = _count_splits(gaussians, camera, finest)
     chosen = np.flatnonzero(splits)
     if len(chosen) == 0:
@@ -83,17 +83,15 @@ def split_near(
         semantic=None if gaussians.semantic is None else gaussians.semantic[:1].expand(total),
     )
     fine_slopes = torch.empty(0 if slopes is None else total, 3)
-    level = sun.numpy() * np.array([1.0, 1.0, 0.0])
-    step = 0.25 * CRUMB_M * level / max(float(np.linalg.norm(level)), 1e-9)
     with kernel_threads(ROWS):
         close_kernels.split(
             chosen,
             splits,
             lasts - splits.astype(np.int64) ** 2,
             camera.centre.numpy(),
-            step,
-            _shift_m(grain.seed),
-            _noise(),
+            sun_step(sun.numpy()),
+            shift_m(grain.seed),
+            noise_table(),
             grain.amount * grain.contrast * RELIEF,
             grain.amount * MOTTLE,
             finest,
@@ -109,30 +107,47 @@ def split_near(
     )
 
 
+def finest_split(camera: Camera) -> float:
+    """Standard deviation of a disc over its distance that splitting stops at."""
+    return max(FINEST_PX / max(camera.fx, camera.fy), FINEST)
+
+
+def view_limits(camera: Camera) -> np.ndarray:
+    """Lowest and highest x / z, then y / z, of the discs that are split, float64 [4]."""
+    wide = (1 + MARGIN) * np.array([-1.0, 1.0])
+    across = (0.5 * camera.width - camera.cx + 0.5 * camera.width * wide) / camera.fx
+    down = (0.5 * camera.height - camera.cy + 0.5 * camera.height * wide) / camera.fy
+    return np.concatenate([across, down])
+
+
+def sun_step(sun: np.ndarray) -> np.ndarray:
+    """Half a step of the relief towards the sun, level, metres, float64 [3]. sun: unit."""
+    level = sun * np.array([1.0, 1.0, 0.0])
+    return 0.25 * CRUMB_M * level / max(float(np.linalg.norm(level)), 1e-9)
+
+
 @functools.cache
-def _noise() -> np.ndarray:
+def noise_table() -> np.ndarray:
     """float32 [TABLE, TABLE] of unit deviation, smooth over a crumb, whose borders meet."""
     white = np.random.Generator(np.random.PCG64(0)).standard_normal((TABLE, TABLE))
     smooth = ndimage.gaussian_filter(white, 0.5 * CRUMB_M / TEXEL_M, mode="wrap")
     return (smooth / smooth.std()).astype(np.float32)
 
 
-def _shift_m(seed: int) -> np.ndarray:
+@functools.lru_cache(8)
+def shift_m(seed: int) -> np.ndarray:
     """Where a recipe's grain begins in the table, float64 [2]."""
     return np.random.Generator(np.random.PCG64(seed)).uniform(0, TABLE * TEXEL_M, 2)
 
 
 def _count_splits(gaussians: Gaussians, camera: Camera, finest: float) -> np.ndarray:
-    wide = (1 + MARGIN) * np.array([-1.0, 1.0])
-    across = (0.5 * camera.width - camera.cx + 0.5 * camera.width * wide) / camera.fx
-    down = (0.5 * camera.height - camera.cy + 0.5 * camera.height * wide) / camera.fy
     splits = np.empty(len(gaussians), np.uint8)
     with kernel_threads(ROWS):
         close_kernels.count_splits(
             gaussians.means.numpy(),
             gaussians.scales.numpy(),
             np.ascontiguousarray(camera.camera_from_world.numpy()[:3]),
-            np.concatenate([across, down]),
+            view_limits(camera),
             finest,
             splits,
         )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
@@ -12,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from augment.cameras import Camera
+from augment.render.backends import AUTO, CUDA
 from augment.render.sh import SH_C0
 from augment.scene import Gaussians, PosedGaussians, Scene, SplatShading
 from augment.snow.close import Grain, split_near
@@ -62,26 +64,35 @@ class SnowCover:
         camera: Camera,
         bare: Sequence[PosedGaussians] | None = None,
         snowy: Collection[int] | None = None,
+        *,
+        backend: str = AUTO,
     ) -> tuple[PosedGaussians, ...]:
         """The scene's parts and the snow on them at the moment the camera took its image.
 
         The scene's own come first and in their order, so that what is neither buried nor covered
         keeps its number. bare: those parts that are drawn, the background first. snowy: instance
-        ids of the parts whose snow is; None for all.
+        ids of the parts whose snow is; None for all. backend: that draws them; what changes with
+        the view lies on the GPU where that is "cuda", and equals the CPU's within float rounding.
         """
         bare = scene.parts_for(camera) if bare is None else bare
-        parts, snow = [], []
-        eye_m = camera.centre
+        parts, covered = [], []
         for part in bare:
             layer = self.layer_on(scene, part.instance_id)
             if layer is None or (snowy is not None and part.instance_id not in snowy):
                 parts.append(part)
                 continue
-            kept = dataclasses.replace(part.gaussians, opacities=layer.opacities)
-            parts.append(dataclasses.replace(part, gaussians=kept))
+            left = _left_visible(layer, part.gaussians)
+            parts.append(dataclasses.replace(part, gaussians=left))
             if len(layer.gaussians):
-                snow.extend(self._posed(layer, part, camera, eye_m))
-        return (*parts, *snow)
+                covered.append((layer, part))
+        if backend == CUDA:
+            from augment.snow.cuda_cover import pose_layers
+
+            return (*parts, *pose_layers(self, covered, camera))
+        eye_m = camera.centre
+        for layer, part in covered:
+            parts.extend(self._posed(layer, part, camera, eye_m))
+        return tuple(parts)
 
     def _posed(
         self,
@@ -120,6 +131,19 @@ class SnowCover:
             )
             for splats, added in drawn
         )
+
+
+_left: WeakKeyDictionary[Layer, tuple[Gaussians, Gaussians]] = WeakKeyDictionary()
+
+
+def _left_visible(layer: Layer, own: Gaussians) -> Gaussians:
+    """A part's Gaussians less those that the snow buries: one object for as long as the part's own
+    is one, so that what a GPU knows of it is not asked for anew every frame.
+    """
+    known = _left.get(layer)
+    if known is None or known[0] is not own:
+        known = _left[layer] = (own, dataclasses.replace(own, opacities=layer.opacities))
+    return known[1]
 
 
 def _lit(
