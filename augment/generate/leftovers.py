@@ -22,6 +22,8 @@ from augment.batch.store import Store
 from augment.errors import OutputError
 from augment.generate.publish import staging_folder
 from augment.generate.records import Block
+from augment.generate.variants import VARIANTS
+from augment.quality.record import FOLDER as QUALITY
 
 _PROCESS = re.compile(rf"\.(\d+)-\d+{re.escape(TEMPORARY_SUFFIX)}$")
 
@@ -42,8 +44,10 @@ def clear_leftovers(store: Store, scratch: Path | None, published: Iterable[Bloc
         return
     state = store.local_dir / STATE_FOLDER
     _clear_temporaries(store.local_dir, is_deep=False)
-    for folder in ("jobs", "scenes", PARTS.removeprefix(f"{STATE_FOLDER}/")):
-        _clear_temporaries(state / folder)
+    for folder in (state / "jobs", state / "scenes"):
+        _clear_temporaries(folder)
+    for kept in (PARTS, VARIANTS, QUALITY):
+        _clear_temporaries(store.local_dir / kept)
     for path in store.list(CLAIMS_FOLDER):
         claim = try_claim(store, path.removeprefix(f"{CLAIMS_FOLDER}/").removesuffix(".lock"))
         if claim is not None:

@@ -346,7 +346,7 @@ def test_render_takes_the_layout(root, tmp_path, monkeypatch, capsys):
 
     monkeypatch.setattr(render_tools, "open_scene", lambda _: scene)
     monkeypatch.setattr(render_tools, "run_job", job)
-    monkeypatch.setattr("tools.warm_up.warm_up", lambda _: 0.0)
+    monkeypatch.setattr("tools.warm_up.warm_up", lambda *_: 0.0)
     options = {"sheet": False, "layout": "source"}
     done = render_tools.render_recipe(str(fog), "", out, scale=0.5, frames="1:3", **options)
     assert done == 0
