@@ -5,7 +5,15 @@ from __future__ import annotations
 import torch
 
 from augment.errors import BackendUnavailable
-from augment.render.backends import AUTO, CPU, CUDA, REFERENCE, available_backends, import_cpu
+from augment.render.backends import (
+    AUTO,
+    BACKENDS,
+    CPU,
+    CUDA,
+    REFERENCE,
+    import_cpu,
+    import_cuda,
+)
 from augment.scene import Scene
 
 
@@ -30,12 +38,12 @@ def choose_backend(backend: str, scene: Scene, *, gpu: bool = True) -> str:
         except BackendUnavailable:
             return REFERENCE
         return CPU if plain else REFERENCE
-    obstacles = available_backends()
-    if backend not in obstacles:
-        raise ValueError(f"backend must be one of auto, {', '.join(obstacles)}; got {backend!r}")
-    obstacle = obstacles[backend]
-    if obstacle is not None:
-        raise BackendUnavailable(obstacle)
+    if backend not in BACKENDS:
+        raise ValueError(f"backend must be one of {', '.join(BACKENDS)}; got {backend!r}")
+    if backend == CPU:
+        import_cpu()
+    if backend == CUDA:  # only who names the GPU wakes it
+        import_cuda()
     return backend
 
 

@@ -18,6 +18,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from augment.cameras import Camera
+from augment.render import gpu
 from augment.render.buffers import ALPHA, EXPECTED_DEPTH, RGB
 from augment.render.constants import COV2D_BLUR, RasterSettings
 from augment.render.reference import bin_to_tiles, blend
@@ -28,7 +29,11 @@ from tests.augment.pretend_gpu import AwayTensor, held_by
 
 
 def install(monkeypatch: pytest.MonkeyPatch, **replaced: Any) -> None:
-    """Make it what `import gsplat` finds. replaced: attributes that are others than these."""
+    """Make it what `import gsplat` finds. replaced: attributes that are others than these. Skips
+    the test where kernels are compiled: it computes on the CPU.
+    """
+    if not gpu.is_interpreted():
+        pytest.skip("the stand-in computes on the CPU; TRITON_INTERPRET=1 interprets kernels")
     module = types.ModuleType("gsplat")
     named = {
         "__version__": "1.5.3",

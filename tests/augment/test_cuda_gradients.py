@@ -52,7 +52,7 @@ def sh_gradients(parts, camera, backend, settings=DEFAULT, buffers=(RGB,)) -> li
     dtype = torch.float64 if backend == "reference" else torch.float32
     leaves = [tracked(part, "sh", dtype=dtype) for part in parts]
     out = rasterize(leaves, camera, buffers=buffers, settings=settings, backend=backend)
-    (out.rgb * weights_of(camera)).sum().backward()
+    (out.rgb * weights_of(camera).to(out.rgb.device)).sum().backward()
     return [part.gaussians.sh.grad for part in leaves]
 
 
@@ -268,7 +268,7 @@ def all_gradients(parts, camera, backend, settings=DEFAULT):
     leaves = [tracked(part, *FIELDS, dtype=dtype) for part in parts]
     names = (RGB, ALPHA, EXPECTED_DEPTH)
     out = rasterize(leaves, camera, buffers=names, settings=settings, backend=backend)
-    weights = weights_of(camera, 5)
+    weights = weights_of(camera, 5).to(out.rgb.device)
     (out.rgb * weights[..., :3]).sum().add(
         (out.alpha * weights[..., 3]).sum() + (out.expected_depth * weights[..., 4]).sum()
     ).backward()
