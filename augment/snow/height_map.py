@@ -94,15 +94,41 @@ def classes_of(gaussians: Gaussians) -> np.ndarray:
     return gaussians.semantic.numpy()
 
 
+class Footprints:
+    """What Gaussians may cover, seen from above: rectangles (x, y) of those that are not too faint,
+    and the heights of all.
+    """
+
+    def __init__(self, gaussians: Gaussians) -> None:
+        means, reach = gaussians.means.numpy(), gaussians.scales.numpy().max(1, initial=0)
+        reach = reach * np.float32(MAX_EXTENT_SIGMAS)
+        self._shown = np.flatnonzero(gaussians.opacities.numpy() >= np.float32(ALPHA_MIN))
+        middles, reach = means[self._shown, :2].T, reach[self._shown]
+        self._least, self._most = middles - reach, middles + reach  # [2, N]
+        self._z_m = np.ascontiguousarray(means[:, 2])
+
+    def in_box(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        """int64: numbers of the Gaussians that may be seen between two corners (x, y)."""
+        inside = np.ones(len(self._shown), bool)
+        for axis in range(2):
+            inside &= self._most[axis] >= low[axis]
+            inside &= self._least[axis] <= high[axis]
+        return self._shown[inside]
+
+    def top_m(self, chosen: np.ndarray | None = None) -> float:
+        """z of the highest centre, of those chosen by number; -inf where there is none."""
+        z_m = self._z_m if chosen is None else self._z_m[chosen]
+        return float(z_m.max(initial=-np.inf))
+
+
 def in_box(gaussians: Gaussians, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     """int64: numbers of the Gaussians that may be seen, from above, between two corners (x, y)."""
-    means, reach = gaussians.means.numpy(), gaussians.scales.numpy().max(1, initial=0)
-    reach = reach * np.float32(MAX_EXTENT_SIGMAS)
-    inside = gaussians.opacities.numpy() >= np.float32(ALPHA_MIN)
-    for axis in range(2):
-        inside &= means[:, axis] + reach >= low[axis]
-        inside &= means[:, axis] - reach <= high[axis]
-    return np.flatnonzero(inside)
+    return Footprints(gaussians).in_box(low, high)
+
+
+def top_of(parts: Sequence[PosedGaussians]) -> float:
+    """z that no centre of the parts exceeds, world; -inf where there is none."""
+    return max((_top_m(part) for part in parts if len(part.gaussians)), default=-math.inf)
 
 
 def draw_from_above(
@@ -114,17 +140,20 @@ def draw_from_above(
     estimator: Estimator,
     wanted: np.ndarray | None = None,
     with_thin: bool = True,
+    top_m: float | None = None,
     backend: str = AUTO,
 ) -> HeightMap:
     """Draw parts of plain Gaussians from above. corner_m: least x and y. shape: rows and columns of
     cells. wanted: bool of that shape; the others may be left empty. with_thin: what is thin is
-    looked for. backend: that draws.
+    looked for. top_m: as `top_of` finds it, where that is known. backend: that draws.
 
     A pixel of the drawing is opaque for the share that is truly covered; a second drawing, in which
     whatever is thin is blurred to a pixel's width, shows what is thin.
     """
     rows, columns = shape
-    top = max((_top_m(part) for part in parts if len(part.gaussians)), default=0.0)
+    if top_m is None:
+        top_m = top_of(parts)
+    top = top_m if math.isfinite(top_m) else 0.0
     middle = (corner_m[0] + columns * cell_m / 2, corner_m[1] + rows * cell_m / 2)
     pose = torch.eye(4, dtype=torch.float64)
     pose[1, 1] = pose[2, 2] = -1.0  # x to +x, rows towards -y, depth downwards

@@ -13,6 +13,7 @@ import math
 import cv2
 import numpy as np
 
+from augment.snow import hole_kernels
 from augment.snow.height_map import HeightMap
 
 LEAST_M2, MOST_M2 = 0.1, 7.0  # what is smaller is left to `surface`
@@ -21,6 +22,7 @@ MOST_ON_PATH_M2 = 80.0  # where the path of the cameras leads over it
 _PATH_M = 1.0  # on both sides of it
 _RIM_CELLS = 3
 _ALIKE_M, _FIRST_M = 0.12, 0.5  # off the plane of what lies around; and off its middle, at first
+_FEWEST_CELLS = 8
 _FEWEST_ALIKE, _OCTANTS, _OCTANTS_ON_PATH = 0.6, 7, 5
 _STEEPEST = math.tan(math.radians(20))
 _MOST_SAMPLES = 160  # of a rim that heights are taken from
@@ -42,7 +44,8 @@ def fill_holes(
     wanted: bool, what was drawn. path_xy [P, 2]: places of the cameras.
     """
     filled = np.zeros(lies.shape, bool)
-    empty = wanted & (~height_map.covered | height_map.is_thin | narrow)
+    covered = height_map.covered
+    empty = wanted & (~covered | height_map.is_thin | narrow)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(
         empty.astype(np.uint8), connectivity=4
     )
@@ -69,7 +72,7 @@ def fill_holes(
         rim = (cv2.dilate(inside.astype(np.uint8), around) > 0) & ~inside
         if not on_path[hole] and bool((rim & ~wanted[window]).any()):
             continue  # it goes on where nothing was drawn
-        known = rim & height_map.covered[window] & ~height_map.is_thin[window] & ~narrow[window]
+        known = rim & covered[window] & ~height_map.is_thin[window] & ~narrow[window]
         plane, alike = _plane_around(
             known, lies[window], height_map.height_m[window], height_map.cell_m
         )
@@ -115,21 +118,19 @@ def _plane_around(
     """
     rows, columns = np.nonzero(known)
     alike = np.zeros_like(known)
-    if len(rows) < 8:
+    if len(rows) < _FEWEST_CELLS:
         return None, alike
     z = height[rows, columns].astype(np.float64)
-    terms = np.stack([np.ones(len(z)), columns, rows], 1)
-    fits = np.abs(z - np.median(z)) < _FIRST_M
-    plane = np.zeros(3)
-    for _ in range(4):
-        if fits.sum() < 8:
-            return None, alike
-        plane = np.linalg.lstsq(terms[fits], z[fits], rcond=None)[0]
-        fits = np.abs(z - terms @ plane) < _ALIKE_M
+    used, fits = np.empty(len(z), bool), np.empty(len(z), bool)
+    slopes = hole_kernels.find_plane(
+        rows, columns, z, _FIRST_M, _ALIKE_M, _FEWEST_CELLS, used, fits
+    )
     fits &= lies[rows, columns]
+    if not (fits.mean() >= _FEWEST_ALIKE and math.hypot(*slopes) <= _STEEPEST * cell):
+        return None, alike
     alike[rows[fits], columns[fits]] = True
-    is_plain = fits.mean() >= _FEWEST_ALIKE and math.hypot(plane[1], plane[2]) <= _STEEPEST * cell
-    return (plane if is_plain else None), alike
+    terms = np.stack([np.ones(len(z)), columns, rows], 1)
+    return np.linalg.lstsq(terms[used], z[used], rcond=None)[0], alike
 
 
 def _surrounds(inside: np.ndarray, alike: np.ndarray, fewest: int) -> bool:

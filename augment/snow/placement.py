@@ -35,11 +35,12 @@ from augment.snow.cells import EDGE_CAP_M, FLUSH, SnowBed, SnowCells
 from augment.snow.ground_light import ground_luminance, relative_light
 from augment.snow.height_map import (
     Estimator,
+    Footprints,
     HeightMap,
     classes_of,
     draw_from_above,
-    in_box,
     plain_gaussians,
+    top_of,
 )
 from augment.snow.holes import fill_holes
 from augment.snow.in_threads import in_order
@@ -224,6 +225,7 @@ class _Ground:
         self._views, self._paths, self._settings = views, paths, settings
         self._backend = backend
         self._classes = classes_of(background)
+        self._footprints, self._parked_top_m = Footprints(background), top_of(parked)
         self._path = path_points(cameras)
 
     def find(self, level_and_window: tuple[int, Window]) -> _Found:
@@ -286,12 +288,13 @@ class _Ground:
         )
         shape = (window.height, window.width)
         far = (corner[0] + window.width * cell, corner[1] + window.height * cell)
-        chosen = in_box(self._background, np.array(corner), np.array(far))
-        near = self._background
-        if 2 * len(chosen) < len(near) and self._backend != CUDA:
-            near = near.select(torch.from_numpy(chosen))
-        else:  # a copy would take longer than what lies outside; the GPU has all of them already
-            chosen = np.arange(len(near))
+        near, chosen = self._background, None
+        if self._backend != CUDA:  # where all of them lie already
+            chosen = self._footprints.in_box(np.array(corner), np.array(far))
+            if 2 * len(chosen) < len(near):
+                near = near.select(torch.from_numpy(chosen))
+            else:  # a copy would take longer than what lies outside
+                chosen = None
         margin = _margin(cell)
         around = np.ones((2 * margin + 1, 2 * margin + 1), np.uint8)
         wanted = cv2.dilate(square.inner.astype(np.uint8), around).astype(bool)
@@ -302,11 +305,13 @@ class _Ground:
             shape=shape,
             estimator=self._settings.estimator,
             wanted=wanted,
+            top_m=max(self._footprints.top_m(chosen), self._parked_top_m),
             backend=self._backend,
         )
-        is_ground = (view.ids >= 0) & (view.ids < len(chosen))
+        is_ground = (view.ids >= 0) & (view.ids < len(near))
         classes = np.full(shape, SemanticClass.UNKNOWN, np.int16)
-        classes[is_ground] = self._classes[chosen[view.ids[is_ground]]]
+        ids = view.ids[is_ground]
+        classes[is_ground] = self._classes[ids if chosen is None else chosen[ids]]
         lies = is_ground & ~view.is_thin
         narrow = narrow_things(view, lies)
         view, filled = fill_holes(view, classes, lies, narrow, wanted, self._path[:, :2])

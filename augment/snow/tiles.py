@@ -11,6 +11,7 @@ import numpy as np
 
 from augment.cameras import Camera
 from augment.errors import SceneError
+from augment.snow import tile_kernels
 
 # Cells double in size at each of these level distances from the cameras' path, metres; beyond the
 # last there are none.
@@ -129,25 +130,19 @@ class CellNumbers:
 
     def at(self, xy: np.ndarray) -> np.ndarray:
         """int32 [P]: numbers of the cells under points float64 [P, 2], -1 where there is none."""
-        rows_of_tiles, columns_of_tiles = self._plan.levels.shape
-        out = np.full(len(xy), -1, np.int32)
-        if self._numbers.size == 0:
-            return out
-        place = (xy - np.asarray(self._plan.origin_m)) / self._plan.side_m
-        with np.errstate(invalid="ignore"):
-            tile = np.floor(np.clip(place, -1, max(rows_of_tiles, columns_of_tiles)))
-        tile = np.nan_to_num(tile, nan=-1).astype(np.int64)
-        inside = (tile >= 0).all(1) & (tile[:, 0] < columns_of_tiles) & (tile[:, 1] < rows_of_tiles)
-        number = tile[inside, 1] * columns_of_tiles + tile[inside, 0]
-        side = self._sides[number]
-        within = (place[inside] - tile[inside]) * side[:, None]
-        cell = np.clip(within.astype(np.int64), 0, np.maximum(side - 1, 0)[:, None])
-        found = self._numbers[
-            np.minimum(
-                self._starts[number] + cell[:, 1] * side + cell[:, 0], self._numbers.size - 1
-            )
-        ]
-        out[inside] = np.where(side > 0, found, -1)
+        tile_rows, tile_columns = self._plan.levels.shape
+        out = np.empty(len(xy), np.int32)
+        tile_kernels.find_numbers(
+            np.ascontiguousarray(xy, np.float64),
+            self._plan.origin_m,
+            self._plan.side_m,
+            tile_rows,
+            tile_columns,
+            self._sides,
+            self._starts,
+            self._numbers,
+            out,
+        )
         return out
 
 
