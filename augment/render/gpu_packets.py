@@ -10,21 +10,24 @@ from torch import Tensor
 
 from augment.render.gpu import upload
 
-_ALIGNMENT = 16  # bytes, at multiples of which every array begins
+_ALIGNED = 4  # words of 4 bytes, at multiples of which every array begins
+_DTYPES = {"i4": torch.int32, "i8": torch.int64, "f4": torch.float32}
 
 
 def upload_together(arrays: Sequence[np.ndarray]) -> list[Tensor]:
-    """Copies on the GPU, for this frame only, of arrays of 4 or 8 bytes a number: one upload."""
-    ends, pieces = [0], []
+    """Copies on the GPU, for this frame only, of int32, int64 and float32 arrays: one upload."""
+    starts, end = [], 0
     for array in arrays:
-        words = np.ascontiguousarray(array).reshape(-1).view(np.int32)
-        padding = -len(words) % (_ALIGNMENT // words.itemsize)
-        pieces += [words, np.zeros(padding, np.int32)]
-        ends.append(ends[-1] + len(words) + padding)
-    packed = upload(np.concatenate(pieces))
-    out = []
-    for array, start in zip(arrays, ends, strict=False):
-        words = packed[start : start + array.nbytes // packed.itemsize]
-        dtype = torch.from_numpy(np.empty(0, array.dtype)).dtype
-        out.append(words.view(dtype).reshape(array.shape))
-    return out
+        starts.append(end)
+        end += -(-(array.nbytes // 4) // _ALIGNED) * _ALIGNED
+    words = np.zeros(end, np.int32)
+    for start, array in zip(starts, arrays, strict=True):
+        own = words[start : start + array.nbytes // 4].view(array.dtype)
+        own[:] = array.reshape(-1)
+    packed = upload(words)
+    return [
+        packed[start : start + array.nbytes // 4]
+        .view(_DTYPES[array.dtype.str[1:]])
+        .reshape(array.shape)
+        for start, array in zip(starts, arrays, strict=True)
+    ]

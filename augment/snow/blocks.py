@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Int
 
 _SQUARE_M = 0.25  # points of one square need no order among themselves
+_GROUP = 32  # blocks
+_MANY = 1024  # blocks, of which groups are looked at first
 _BITS = 16  # of a square's number, along x and along y
 
 
@@ -26,15 +29,30 @@ class Blocks:
     def __len__(self) -> int:
         return len(self.lows)
 
-    @property
-    def counts(self) -> np.ndarray:
-        """Points of every block."""
-        return np.minimum(self.size, len(self.order) - self.size * np.arange(len(self)))
+    def counts(self, chosen: Int[np.ndarray, "C"]) -> Int[np.ndarray, "C"]:
+        """Points of the chosen blocks."""
+        return np.minimum(self.size, len(self.order) - self.size * chosen)
 
-    def distances_m(self, eye_m: Float[np.ndarray, "3"]) -> np.ndarray:
-        """Of the blocks' boxes from the eye, 0 within; no point of a block is nearer."""
-        gaps = np.maximum(np.maximum(self.lows - eye_m, eye_m - self.highs), 0.0)
-        return np.sqrt((gaps * gaps).sum(1))
+    def near(
+        self, eye_m: Float[np.ndarray, "3"], reach_m: float
+    ) -> tuple[Int[np.ndarray, "C"], Float[np.ndarray, "C"]]:
+        """Blocks whose boxes are nearer to the eye than that, and how near; 0 within a box."""
+        if len(self) > _MANY:
+            lows, highs = self._groups
+            groups = np.flatnonzero(_distances(lows, highs, eye_m) < reach_m)
+            some = (groups[:, None] * _GROUP + np.arange(_GROUP)).reshape(-1)
+            some = some[some < len(self)]
+        else:
+            some = np.arange(len(self))
+        distances = _distances(self.lows[some], self.highs[some], eye_m)
+        inside = distances < reach_m
+        return some[inside], distances[inside]
+
+    @cached_property
+    def _groups(self) -> tuple[np.ndarray, np.ndarray]:
+        """Boxes around as many blocks at a time, so that few are looked at one by one."""
+        starts = np.arange(0, len(self), _GROUP)
+        return np.minimum.reduceat(self.lows, starts), np.maximum.reduceat(self.highs, starts)
 
     def may_lie_in(self, chosen: np.ndarray, sides: np.ndarray) -> np.ndarray:
         """bool: whether a point of each chosen block may have sides [S, 4] @ (x, y, z, 1) >= 0 in
@@ -69,6 +87,11 @@ def blocks_of(points: Float[np.ndarray, "P 3"], size: int) -> Blocks:
         np.minimum.reduceat(sorted_points, starts, axis=0),
         np.maximum.reduceat(sorted_points, starts, axis=0),
     )
+
+
+def _distances(lows: np.ndarray, highs: np.ndarray, eye_m: np.ndarray) -> np.ndarray:
+    gaps = np.maximum(np.maximum(lows - eye_m, eye_m - highs), 0.0)
+    return np.sqrt(np.einsum("ij,ij->i", gaps, gaps))
 
 
 def _spread(numbers: np.ndarray) -> np.ndarray:

@@ -35,7 +35,7 @@ from augment.snow.close import (
 from augment.snow.close_kernels import COARSER, FARTHEST_M, MOST_SPLITS, REACH, TEXEL_M
 from augment.snow.cuda_constants import snow_classes
 
-_ROUNDING = 1e-4  # of float32, on the safe side: of distances, and metres at a side of the view
+_ROUNDING = 1e-4  # of float32, on the safe side: of distances, and metres at the view's sides
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,13 +98,15 @@ def plan_split(
         return None
     discs, finest, eye = _discs_of(gaussians), finest_split(camera), camera.centre.numpy()
     blocks = discs.blocks
-    nearest = np.maximum(blocks.distances_m(eye) * (1 - _ROUNDING) - _ROUNDING, 1e-9)
-    splits = np.minimum(np.floor(discs.widest / (finest * nearest) + 0.5), MOST_SPLITS).astype(int)
-    chosen = np.flatnonzero((nearest < FARTHEST_M) & (splits > 1))
-    chosen = chosen[blocks.may_lie_in(chosen, _sides(camera))]
+    near, distances = blocks.near(eye, FARTHEST_M * (1 + _ROUNDING))
+    distances = np.maximum(distances * (1 - _ROUNDING), 1e-9)
+    most = np.minimum(np.floor(discs.widest[near] / (finest * distances) + 0.5), MOST_SPLITS)
+    chosen, splits = near[most > 1], most[most > 1].astype(int)
+    seen = blocks.may_lie_in(chosen, _sides(camera))
+    chosen, splits = chosen[seen], splits[seen]
     if not len(chosen):
         return None
-    counts, splits = blocks.counts[chosen], splits[chosen]
+    counts = blocks.counts(chosen)
     ends = np.cumsum(counts * splits**2)
     rows = np.empty((len(chosen), layout.ROW), np.int32)
     rows[:, layout.R_FIRST], rows[:, layout.R_COUNT] = chosen * blocks.size, counts

@@ -72,8 +72,8 @@ def plan_glints(
         if own is not None and len(own.places_m):
             sorted_ = _sorted(own)
             layers[number] = sorted_.addresses()
-            near = np.flatnonzero(sorted_.blocks.distances_m(eye_m) < FARTHEST_M)
-            counts = sorted_.blocks.counts[near]
+            near = sorted_.blocks.near(eye_m, FARTHEST_M)[0]
+            counts = sorted_.blocks.counts(near)
             ends = np.cumsum(np.minimum(counts, layout.MOST))
             row = np.empty((len(near), layout.ROW), np.int32)
             row[:, layout.R_LAYER], row[:, layout.R_FIRST] = number, near * layout.BLOCK

@@ -17,6 +17,7 @@ from augment.render.gpu_packets import upload_together
 from augment.render.sh import SH_C0
 from augment.scene import Actor, Gaussians, PosedGaussians, Track
 from augment.semantics import SemanticClass
+from augment.snow import blocks as blocks_module
 from augment.snow import cuda_close, glint_layout
 from augment.snow.blocks import blocks_of
 from augment.snow.close import Grain, split_near
@@ -308,20 +309,29 @@ def test_crystals_that_all_face_alike_leave_no_block_its_bounds(monkeypatch):
     assert torch.isfinite(held_by(found.gaussians.means)).all() and float(opacities.max()) <= 1
 
 
-def test_blocks_hold_every_point_once_and_are_compact():
+@pytest.mark.parametrize("many", [0, 1024], ids=["groups first", "all blocks"])
+def test_blocks_hold_every_point_once_and_are_compact(many, monkeypatch):
+    monkeypatch.setattr(blocks_module, "_MANY", many)
     rng = np.random.default_rng(0)
     points = rng.uniform((-30, 5, -1), (30, 40, 2), (5000, 3)).astype(np.float32)
     blocks = blocks_of(points, 128)
     assert sorted(blocks.order.tolist()) == list(range(5000))
-    assert blocks.counts.sum() == 5000 and len(blocks) == 40
+    assert blocks.counts(np.arange(40)).sum() == 5000 and len(blocks) == 40
     extents = blocks.highs - blocks.lows
     assert np.median(extents[:, :2]) < 15  # of 60 m by 35 m
-    eye = np.array([3.0, 10.0, 1.0])
-    nearest = np.linalg.norm(points.astype(np.float64) - eye, axis=1)[blocks.order]
-    for number, distance in enumerate(blocks.distances_m(eye)):
-        assert distance <= nearest[128 * number : 128 * (number + 1)].min() + 1e-9
+    for eye in (np.array([3.0, 10.0, 1.0]), np.array([90.0, 0.0, 1.0])):
+        gaps = np.linalg.norm(points.astype(np.float64) - eye, axis=1)[blocks.order]
+        nearest = np.minimum.reduceat(gaps, np.arange(0, 5000, 128))
+        for reach in (1.0, 12.0, 200.0):
+            near, distances = blocks.near(eye, reach)
+            assert set(np.flatnonzero(nearest < reach)) <= set(near.tolist())
+            assert (distances <= nearest[near] + 1e-9).all() and (distances < reach).all()
+        assert len(near) == 40
     assert (blocks.largest(points[:, 0])[0] == points[blocks.order[:128], 0].max()).all()
-    assert len(blocks_of(points[:0], 128)) == 0 and len(blocks_of(points[:0], 8).counts) == 0
+    assert (
+        len(blocks_of(points[:0], 128)) == 0
+        and len(blocks_of(points[:0], 8).near(eye, 9.0)[0]) == 0
+    )
 
 
 def test_arrays_of_several_kinds_travel_together(monkeypatch):
