@@ -363,6 +363,7 @@ def test_all_that_a_kernel_reads_lies_on_the_gpu(monkeypatch):
 
 def test_a_change_in_place_is_seen_and_copies_go_with_their_gaussians(monkeypatch):
     camera, gaussians = camera_ahead(), random_gaussians(20, seed=4, sh_degree=0)
+    gc.collect()  # what other tests have left
     before = len(cuda_inputs._known), len(gpu._copies)
     with pretended_gpu(monkeypatch):
         first = splats_of([PosedGaussians(gaussians)], camera)

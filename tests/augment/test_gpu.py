@@ -16,6 +16,7 @@ from tests.augment.pretend_gpu import AwayTensor, pretended_gpu
 
 
 def test_a_copy_lives_as_long_as_its_tensor_and_follows_its_changes(monkeypatch):
+    gc.collect()  # what other tests have left
     with pretended_gpu(monkeypatch):
         before = len(gpu._copies)
         tensor = torch.arange(6.0)
