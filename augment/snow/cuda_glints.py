@@ -23,7 +23,8 @@ _ALIGNED = 4  # slots: a layer's arrays begin at a multiple of 16 bytes
 @dataclass(frozen=True, eq=False)
 class Glints:
     """What is asked of a view's crystals. rows, layers, numbers: see glint_layout. spans: first
-    slot and number of slots of every layer, 0 where none of it is near.
+    slot and number of slots of every layer, 0 where none of it is near. tensors: what the layers'
+    addresses point to, kept alive by this.
     """
 
     rows: np.ndarray
@@ -31,6 +32,7 @@ class Glints:
     numbers: np.ndarray
     spans: Sequence[tuple[int, int]]
     total: int
+    tensors: Sequence[Tensor]
 
     def run(self, rows: Tensor, layers: Tensor, numbers: Tensor) -> list[Gaussians | None]:
         """Of every layer; None where it is too far for any. Arguments: as they lie on the GPU."""
@@ -65,13 +67,15 @@ def plan_glints(
 
     suns: unit, towards it; eyes_m: the camera's centre; float64 [L, 3], in the layers' frames.
     """
-    rows, spans, slot = [], [], 0
+    rows, spans, slot, tensors = [], [], 0, list[Tensor]()
     layers = np.zeros((len(crystals), layout.ADDRESSES), np.int64)
     for number, (own, eye_m) in enumerate(zip(crystals, eyes_m, strict=True)):
         first = slot
         if own is not None and len(own.places_m):
             sorted_ = _sorted(own)
-            layers[number] = sorted_.addresses()
+            own_tensors = [gpu.resident(sorted_.places), gpu.resident(sorted_.mirrors)]
+            layers[number] = [gpu.address_of(tensor) for tensor in own_tensors]
+            tensors += own_tensors
             near = sorted_.blocks.near(eye_m, FARTHEST_M)[0]
             counts = sorted_.blocks.counts(near)
             ends = np.cumsum(np.minimum(counts, layout.MOST))
@@ -90,7 +94,7 @@ def plan_glints(
     numbers[:, layout.N_EYE :][:, :6] = np.concatenate([coarse, eyes_m - coarse], 1)
     numbers[:, layout.N_SUN :][:, :3] = suns
     numbers[:, layout.N_STRENGTH] = [0 if own is None else own.strength for own in crystals]
-    return Glints(np.concatenate(rows), layers, numbers.astype(np.float32), spans, slot)
+    return Glints(np.concatenate(rows), layers, numbers.astype(np.float32), spans, slot, tensors)
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,11 +104,6 @@ class _Sorted:
     blocks: Blocks
     places: Tensor
     mirrors: Tensor
-
-    def addresses(self) -> tuple[int, int]:
-        """On the GPU, where they stay."""
-        places, mirrors = gpu.resident(self.places), gpu.resident(self.mirrors)
-        return gpu.address_of(places), gpu.address_of(mirrors)
 
 
 _known: WeakKeyDictionary[Crystals, _Sorted] = WeakKeyDictionary()
