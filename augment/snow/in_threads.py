@@ -14,7 +14,7 @@ from augment.render.threads import thread_count
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-_MOST_AT_ONCE = 8  # a square of cells takes up to 200 MB while it is worked on
+_MOST_AT_ONCE = 8  # a square of cells takes up to some 300 MB while it is worked on
 _ROWS = 8192  # of arrays, in one part: what is made from them stays in a core's caches
 
 

@@ -77,8 +77,8 @@ def test_a_bed_placed_on_the_gpu_is_the_cpus(monkeypatch):
     ground = dataclasses.replace(small, means=16 * small.means, scales=16 * small.scales)
     scene = drive(ground, places=[(-3.0, 0.0, 1.5)])
     cameras = [camera.scaled(0.12) for camera in cameras_of(scene)]
-    settings = PlacementSettings(cell_m=4.0)
-    monkeypatch.setattr(placement, "_SQUARE_CELLS", 32)  # several, which threads work on
+    settings = PlacementSettings(cell_m=8.0)
+    monkeypatch.setattr(placement, "_SQUARE_CELLS", 16)  # several, which threads work on
     expected = place_snow_bed(scene, cameras, settings)
     assert len(expected.ground) > 5
     with pretended_gpu(monkeypatch):
