@@ -96,8 +96,7 @@ def place_snow_bed(
 ) -> SnowBed:
     """The cells of a scene that snow can lie on and that some of the cameras can see.
 
-    Several threads work on squares of the ground, and any number gives the same bits. The bed's
-    seconds hold how long all squares took, and beside it their stages, added up over the threads.
+    Several threads work on squares of the ground, and any number gives the same bits.
     Without cameras, or where nothing open is seen, the bed is empty. backend: "cuda" draws and
     looks on the GPU; any other on the CPU, since the torch definition would take hours. progress:
     shows a bar.
@@ -140,7 +139,7 @@ def place_snow_bed(
         work = _Ground(background, parked, plan, views, seen_from, paths, settings, backend)
         clock.lap("plan")
         found = in_order(work.find, squares, after_each=bar.update)
-        clock.lap("squares")
+        clock.share_lap([square.seconds for square in found])
         on_vehicles = in_order(
             lambda actor: find_actor_cells(
                 actor,
@@ -160,8 +159,6 @@ def place_snow_bed(
         clock.lap("actors")
     ground = work.joined(found)
     clock.lap("join")
-    for square in found:
-        clock.add(square.seconds)
     return SnowBed(ground, actors, clock.seconds)
 
 
@@ -174,12 +171,19 @@ class _Clock:
 
     def lap(self, name: str) -> None:
         now = time.perf_counter()
-        self.add({name: now - self._last})
+        self.seconds[name] = self.seconds.get(name, 0.0) + now - self._last
         self._last = now
 
-    def add(self, seconds: Mapping[str, float]) -> None:
-        for name, more in seconds.items():
-            self.seconds[name] = self.seconds.get(name, 0.0) + more
+    def share_lap(self, stages: Sequence[Mapping[str, float]]) -> None:
+        """End a lap of several threads: its seconds go to stages as those of the threads did."""
+        sums: dict[str, float] = {}
+        for each in stages:
+            for name, seconds in each.items():
+                sums[name] = sums.get(name, 0.0) + seconds
+        now = time.perf_counter()
+        share = (now - self._last) / max(sum(sums.values()), 1e-9)
+        self.seconds |= {name: share * seconds for name, seconds in sums.items()}
+        self._last = now
 
 
 @dataclass(frozen=True, eq=False)
