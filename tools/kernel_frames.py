@@ -6,6 +6,7 @@ views one or a few tiles.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 
 import numpy as np
@@ -15,6 +16,8 @@ from augment.apply import render_view
 from augment.cameras import Camera, Frame
 from augment.geometry import rigid
 from augment.ground import Ground
+from augment.render.buffers import RGB
+from augment.render.rasterize import rasterize
 from augment.render.sh import SH_C0
 from augment.scene import Actor, Gaussians, PosedGaussians, Scene, Track
 from augment.semantics import SemanticClass
@@ -44,8 +47,12 @@ RECIPES = {
         weather=Weather(smog=Smog(visibility_m=_DENSE, model="deferred")), output=_PLAIN
     ),
     "flood": Recipe(
-        weather=Weather(flood=Flood(level_m=0.2, waves=Waves(preset="breeze", seed=1))),
-        output=_PLAIN,
+        weather=Weather(
+            flood=Flood(
+                level_m=0.2, reflection="screen_space", waves=Waves(preset="breeze", seed=1)
+            )
+        ),
+        output=Output(depth="expected", labels=False),
     ),
     "flood, mirrored": Recipe(
         weather=Weather(flood=Flood(level_m=0.2, reflection="mirrored")), output=_PLAIN
@@ -79,7 +86,17 @@ def views(scene: Scene | None = None) -> dict[str, Callable[[], object]]:
 
     out: dict[str, Callable[[], object]] = {n: render(r) for n, r in RECIPES.items()}
     out["ground is seen"] = lambda: _see_ground(scene, camera)
+    out["gradients of colours"] = lambda: _learn_colors(scene, camera)
     return out
+
+
+def _learn_colors(scene: Scene, camera: Camera) -> None:
+    """What training a style through the renderer asks for."""
+    sh = scene.background.sh.clone().requires_grad_()
+    part = PosedGaussians(dataclasses.replace(scene.background, sh=sh))
+    out = rasterize([part], camera, buffers=(RGB,), backend="cuda")
+    assert out.rgb is not None
+    out.rgb.sum().backward()
 
 
 def _see_ground(scene: Scene, camera: Camera) -> None:

@@ -129,10 +129,7 @@ def _looks(part: PosedGaussians) -> tuple[Tensor | None, Tensor | None, Tensor |
 
 
 def _readable(tensor: Tensor) -> Tensor:
-    """Float32, or int16 as it is, on the GPU; a copy where it would begin at no multiple of 16
-    bytes, as within another tensor.
-    """
+    """Float32, or int16 as it is, on the GPU."""
     if tensor.is_floating_point() and tensor.dtype != torch.float32:
         tensor = tensor.to(torch.float32)
-    own = resident(tensor)
-    return own if address_of(own) % 16 == 0 else own.clone()
+    return resident(tensor)

@@ -101,11 +101,13 @@ _copies: dict[tuple[int, str], tuple[weakref.ref[Tensor], int, Tensor]] = {}
 def resident(tensor: Tensor) -> Tensor:
     """The tensor on the GPU, detached and contiguous; copied once for as long as it lives.
 
-    A tensor that is there already is not copied, unless it is not contiguous.
+    A tensor that is there already is not copied, unless it is not contiguous, or begins at no
+    multiple of 16 bytes, as within another tensor: kernels read as many at a time.
     """
     device = gpu_device()
     if tensor.device == device:
-        return tensor.detach().contiguous()
+        own = tensor.detach().contiguous()
+        return own if address_of(own) % 16 == 0 else own.clone()
     key, version = (id(tensor), str(device)), version_of(tensor)
     known = _copies.get(key)
     if known is not None and known[0]() is tensor and known[1] == version:

@@ -39,7 +39,7 @@ class Light:
         programs = -(-int(counts.max()) // layout.BLOCK)
         gpu.launch(
             kernels.light_splats,
-            (len(self.rows), programs),
+            (programs, len(self.rows)),
             *(rows, numbers, lit),
             BLOCK=layout.BLOCK,
         )

@@ -19,11 +19,11 @@ N_SUN, N_WRAP = tl.constexpr(light_layout.N_SUN), tl.constexpr(light_layout.N_WR
 
 @triton.jit
 def light_splats(rows, numbers, lit, BLOCK: tl.constexpr):
-    """SH of the splats of layer program_id(0), BLOCK of them a program.
+    """SH of the splats of layer program_id(1), BLOCK of them a program.
 
     rows int64 [L, ROW], numbers float32 [L, NUMBERS]: see light_layout. lit [S, 3]: written.
     """
-    layer, first = tl.program_id(0), tl.program_id(1) * BLOCK
+    layer, first = tl.program_id(1), tl.program_id(0) * BLOCK
     row, view = rows + layer * ROW, numbers + layer * NUMBERS
     count = tl.load(row + R_COUNT).to(tl.int32)
     if first < count:
