@@ -9,12 +9,9 @@ import triton.language as tl
 
 from augment.render import layout
 from augment.render.cuda_geometry_kernels import dot, four_where, three
-from augment.weather import smog
+from augment.render.cuda_sky_kernels import mean_density, transmittance
 
-LOG2_E = tl.constexpr(math.log2(math.e))
 LAYERED_SMOG = tl.constexpr(layout.LAYERED_SMOG)
-MAX_EXPONENT = tl.constexpr(smog.MAX_EXPONENT)
-LOWEST = tl.constexpr(-126.0)  # 2^-126: nothing is seen through it
 MAP = tl.constexpr(layout.MAP)
 V_SIGMA, V_AIRLIGHT = tl.constexpr(layout.V_SIGMA), tl.constexpr(layout.V_AIRLIGHT)
 V_EYE_HEIGHT, V_UP = tl.constexpr(layout.V_EYE_HEIGHT), tl.constexpr(layout.V_UP)
@@ -36,29 +33,8 @@ def through_smog(d, distance, view, SMOG: tl.constexpr):
     """Transmittance from the eye to splats; d: from the eye, in the part's axes."""
     tau = tl.load(view + V_SIGMA) * distance
     if SMOG == LAYERED_SMOG:
-        tau = tau * _layered_density(d, view)
-    return tl.exp2(tl.maximum(tau * -LOG2_E, LOWEST))
-
-
-@triton.jit
-def _layered_density(d, view):
-    """Mean density along the way, relative to the base: exp(-min(a, b)) (1 - exp(-x)) / x.
-
-    a, b: heights of eye and splat in scale heights, x = |b - a|; see weather.smog.
-    """
-    up = dot(three(view + V_UP), d)
-    x = tl.abs(up)
-    lowest = tl.load(view + V_EYE_HEIGHT) + tl.minimum(up, 0.0)
-    series = tl.fma(x, 1 / 120, -1 / 24)
-    series = tl.fma(x, series, 1 / 6)
-    series = tl.fma(x, series, -1 / 2)
-    series = tl.fma(x, series, 1.0)
-    # Below 0.1 the difference 1 - exp(-x) has lost a digit, and the series' next term is 1e-8.
-    short = x < 0.1
-    fade = tl.exp2(tl.maximum(x * -LOG2_E, LOWEST))
-    mean = tl.where(short, series, (1.0 - fade) / tl.where(short, 1.0, x))
-    power = tl.minimum(-lowest, MAX_EXPONENT) * LOG2_E
-    return tl.exp2(tl.maximum(power, LOWEST)) * mean
+        tau = tau * mean_density(tl.load(view + V_EYE_HEIGHT), dot(three(view + V_UP), d))
+    return transmittance(tau)
 
 
 @triton.jit
