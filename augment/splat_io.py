@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from augment.batch.atomic import replaced_file
 from augment.errors import SceneError
-from augment.files.atomic_file import replaced_file
 from augment.files.ply_io import ROWS_PER_CHUNK, count_surplus_bytes, read_ply_header
 from augment.files.ply_layout import (
     SEMANTIC,

@@ -20,11 +20,11 @@ from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 
 from augment.batch.atomic import (
-    TEMPORARY_SUFFIX,
     flush_folder,
     make_folder,
     output_error,
     remove_temporaries,
+    temporary_beside,
     write_atomic,
 )
 from augment.errors import OutputError
@@ -167,7 +167,7 @@ def _write_state(path: Path, arrays: dict[str, np.ndarray]) -> str:
     Raises:
         OutputError: the system refused.
     """
-    temporary = path.with_name(f".{path.name}{TEMPORARY_SUFFIX}")
+    temporary = temporary_beside(path)
     try:
         make_folder(path.parent)
         save_file({name: np.asarray(a, order="C") for name, a in arrays.items()}, temporary)
@@ -180,6 +180,8 @@ def _write_state(path: Path, arrays: dict[str, np.ndarray]) -> str:
         raise output_error(path, error) from error
     except SafetensorError as error:  # how it reports a full disk
         raise OutputError(f"cannot write {path}: {error}; see whether the disk is full") from error
+    finally:
+        temporary.unlink(missing_ok=True)
     return checksum
 
 

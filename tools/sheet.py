@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from augment.batch.atomic import replaced_file, write_atomic
 from augment.errors import OutputError
 from tools.drawing import text_width
 
@@ -71,27 +72,18 @@ def write_video(path: Path, frames: Iterable[np.ndarray], frames_per_second: flo
     Raises:
         OutputError: the file cannot be written, or there are no frames.
     """
-    temporary = path.with_name(f".{path.stem}.tmp{path.suffix}")
-    writer = None
-    try:
+    with replaced_file(path, ending=path.suffix) as file:
+        writer = None
         for frame in frames:
             if writer is None:
-                writer = _open_video(temporary, frame.shape[1], frame.shape[0], frames_per_second)
+                code, (height, width) = cv2.VideoWriter.fourcc(*"mp4v"), frame.shape[:2]
+                writer = cv2.VideoWriter(file.name, code, frames_per_second, (width, height))
+                if not writer.isOpened():
+                    raise OutputError(f"cannot write the video {path}: does its name end in .mp4?")
             writer.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
         if writer is None:
             raise OutputError(f"no frames for the video {path}")
         writer.release()
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-def _open_video(path: Path, width: int, height: int, frames_per_second: float) -> cv2.VideoWriter:
-    code = cv2.VideoWriter.fourcc(*"mp4v")
-    writer = cv2.VideoWriter(str(path), code, frames_per_second, (width, height))
-    if not writer.isOpened():
-        raise OutputError(f"cannot write the video {path}: is the folder writable?")
-    return writer
 
 
 def read_rgb(path: Path) -> np.ndarray:
@@ -112,10 +104,8 @@ def write_rgb(path: Path, image: np.ndarray) -> None:
     Raises:
         OutputError: the file cannot be written.
     """
-    temporary = path.with_name(f".{path.stem}.tmp{path.suffix}")
-    if not cv2.imwrite(str(temporary), cv2.cvtColor(image, cv2.COLOR_RGB2BGR)):
-        raise OutputError(f"cannot write {path}: is the folder writable, the disk full?")
-    temporary.replace(path)
+    _, data = cv2.imencode(path.suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+    write_atomic(path, data.tobytes())
 
 
 def _write(

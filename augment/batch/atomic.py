@@ -2,19 +2,31 @@
 
 A file is written under a temporary name in its own folder, flushed to the disk, and renamed; then
 the folder is flushed, so that the name survives a power cut too.
+
+Temporary names are random: in containers every run has the same process numbers. Who writes a
+temporary file holds the kernel's lock of it (flock), which ends with the process, however that
+ends. So whoever comes next can tell what a dead one left from what a living one is writing, on
+other machines too where the file system has locks among them.
 """
 
 from __future__ import annotations
 
+import contextlib
 import errno
-import itertools
+import fcntl
 import os
+import re
+import secrets
+import time
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import BinaryIO
 
 from augment.errors import OutputError
 
 TEMPORARY_SUFFIX = ".climategs-tmp"
-_numbers = itertools.count()
+_MAX_SHOWN = 200  # bytes of the final name in the temporary one, which may have 255
+_MAX_WRITING_S = 86400.0  # where the file system has no locks, older files count as left behind
 
 _HINTS = {
     errno.ENOSPC: "the disk is full: free some space and run the same command again",
@@ -30,24 +42,78 @@ _HINTS = {
 }
 
 
-def write_atomic(path: Path, data: bytes) -> None:
-    """Put `data` at `path`, replacing what was there in one step; makes missing folders.
+def write_atomic(path: Path, data: bytes, *, clear: bool = True) -> None:
+    """Put `data` at `path`, replacing what was there in one step; see replaced_file."""
+    with replaced_file(path, clear=clear) as file:
+        file.write(data)
+
+
+@contextlib.contextmanager
+def replaced_file(
+    path: Path, *, clear: bool = True, flush: bool = True, ending: str = ""
+) -> Iterator[BinaryIO]:
+    """A file that takes its name only once it is whole and on the disk; makes missing folders.
+
+    clear: delete what killed writers of this file left. A job that writes many files into one
+    folder does that once, at its start. flush: make the name durable too. ending: of the temporary
+    name, for libraries that write to a name and go by it.
 
     Raises:
         OutputError: the system refused (disk full, no permission ...); `path` is then as it was.
     """
     try:
         make_folder(path.parent)
-        temporary = path.with_name(f".{path.name}.{os.getpid()}-{next(_numbers)}{TEMPORARY_SUFFIX}")
-        try:
-            _write_flushed(temporary, data)
-            os.replace(temporary, path)
-        except BaseException:
-            temporary.unlink(missing_ok=True)
-            raise
-        flush_folder(path.parent)
+        if clear:
+            remove_temporaries(path.parent, name=path.name, recursive=False)
+        temporary, file = _locked_temporary(path, ending)
+        with file:
+            try:
+                yield file
+                file.flush()
+                os.fsync(file.fileno())
+                os.replace(temporary, path)
+            except BaseException:
+                temporary.unlink(missing_ok=True)
+                raise
+        if flush:
+            flush_folder(path.parent)
     except OSError as error:
         raise output_error(path, error) from error
+
+
+def temporary_beside(path: Path) -> Path:
+    """A new name in the folder of `path`."""
+    return path.with_name(f".{_shown(path.name)}.{secrets.token_hex(8)}{TEMPORARY_SUFFIX}")
+
+
+def hold_temporary(temporary: Path, descriptor: int) -> bool:
+    """Lock a file or folder that was just made; False where it is taken for left behind already."""
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:  # a file system without locks
+        return True
+    return is_named(temporary, descriptor)
+
+
+def is_held(descriptor: int) -> bool:
+    """Whether a living process is writing this temporary file or folder."""
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:  # a file system without locks
+        return time.time() - os.fstat(descriptor).st_mtime < _MAX_WRITING_S
+    return False
+
+
+def is_named(path: Path, descriptor: int) -> bool:
+    """Whether the path is the name of this open file."""
+    try:
+        return os.path.samestat(os.stat(path, follow_symlinks=False), os.fstat(descriptor))
+    except FileNotFoundError:
+        return False
 
 
 def make_folder(folder: Path) -> None:
@@ -71,14 +137,27 @@ def flush_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
-def remove_temporaries(folder: Path, *, recursive: bool = True) -> None:
-    """Delete what a killed run left under temporary names."""
-    pattern = f".*{TEMPORARY_SUFFIX}"
-    for path in folder.rglob(pattern) if recursive else folder.glob(pattern):
-        try:
-            path.unlink(missing_ok=True)
-        except OSError as error:
-            raise output_error(path, error) from error
+def remove_temporaries(folder: Path, *, name: str = "", recursive: bool = True) -> None:
+    """Delete what killed processes left under temporary names; what a living one writes stays.
+
+    name: of the file that they were to become; of any if empty.
+    """
+    for place, _, names in os.walk(folder):  # passes over folders that vanish meanwhile
+        for found in temporary_names(names, name):
+            path = Path(place) / found
+            try:
+                _remove_if_abandoned(path)
+            except OSError as error:
+                raise output_error(path, error) from error
+        if not recursive:
+            return
+
+
+def temporary_names(names: Iterable[str], name: str = "") -> list[str]:
+    """Those of the names that `temporary_beside` has made, for the file `name` if it is given."""
+    middle = rf"{re.escape(_shown(name))}\.[^.]+(\.old)?" if name else ".*"
+    pattern = re.compile(rf"\.{middle}{re.escape(TEMPORARY_SUFFIX)}(\.[^.]+)?", re.DOTALL)
+    return [found for found in names if pattern.fullmatch(found)]
 
 
 def output_error(path: Path, error: OSError) -> OutputError:
@@ -87,12 +166,35 @@ def output_error(path: Path, error: OSError) -> OutputError:
     return OutputError(f"cannot write {path}: {error.strerror}; {hint}")
 
 
-def _write_flushed(path: Path, data: bytes) -> None:
-    descriptor = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666)
+def _shown(name: str) -> str:
+    return os.fsdecode(os.fsencode(name)[:_MAX_SHOWN])
+
+
+def _locked_temporary(path: Path, ending: str) -> tuple[Path, BinaryIO]:
+    while True:
+        temporary = temporary_beside(path)
+        temporary = temporary.with_name(temporary.name + ending)
+        file = temporary.open("xb")
+        if hold_temporary(temporary, file.fileno()):
+            return temporary, file
+        file.close()
+        temporary.unlink(missing_ok=True)
+
+
+def _remove_if_abandoned(path: Path) -> None:
     try:
-        view = memoryview(data)
-        while view:
-            view = view[os.write(descriptor, view) :]
-        os.fsync(descriptor)
+        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+    except FileNotFoundError:
+        return
+    except PermissionError:  # another user's, who may be alive
+        return
+    except OSError as error:
+        if error.errno != errno.ELOOP:  # a link, which is not written but made
+            raise
+        path.unlink(missing_ok=True)
+        return
+    try:
+        if not is_held(descriptor):
+            path.unlink(missing_ok=True)
     finally:
         os.close(descriptor)

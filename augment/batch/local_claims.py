@@ -7,7 +7,7 @@ import fcntl
 import os
 from pathlib import Path
 
-from augment.batch.atomic import make_folder, output_error
+from augment.batch.atomic import is_named, make_folder, output_error
 from augment.errors import OutputError
 
 _MOST_RACES = 1000  # times that the file is deleted by its holder while it is being opened
@@ -22,7 +22,7 @@ class FileClaim:
         self._process = os.getpid()
 
     def check(self) -> None:
-        if self._descriptor < 0 or not _is_named(self._path, self._descriptor):
+        if self._descriptor < 0 or not is_named(self._path, self._descriptor):
             raise OutputError(
                 f"the claim {self._path} is lost: its file was deleted or the claim released. Do "
                 f"not delete {self._path.parent} while jobs are running; run the same command again"
@@ -35,7 +35,7 @@ class FileClaim:
         # First the name: after it, nobody else can open this file, and who has opened it already
         # sees that it has no name and opens the next one.
         try:
-            if _is_named(self._path, descriptor):
+            if is_named(self._path, descriptor):
                 self._path.unlink(missing_ok=True)
                 with contextlib.suppress(OSError):  # where there are no others
                     self._path.parent.rmdir()
@@ -67,7 +67,7 @@ def try_lock(path: Path) -> FileClaim | None:
                 continue
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                if _is_named(path, descriptor):
+                if is_named(path, descriptor):
                     return FileClaim(path, descriptor)
             except BlockingIOError:
                 os.close(descriptor)
@@ -79,11 +79,3 @@ def try_lock(path: Path) -> FileClaim | None:
     except OSError as error:
         raise output_error(path, error) from error
     return None
-
-
-def _is_named(path: Path, descriptor: int) -> bool:
-    """Whether the path is the name of this open file."""
-    try:
-        return os.path.samestat(os.stat(path, follow_symlinks=False), os.fstat(descriptor))
-    except FileNotFoundError:
-        return False

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import itertools
 import os
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -17,11 +16,10 @@ from augment.batch.atomic import (
     write_atomic,
 )
 from augment.batch.layout import path_below
-from augment.batch.mirror_files import copy_file
+from augment.batch.mirror_files import copy_file, link_file
 from augment.batch.store import StoredFile, StoredFileMissing, stored_path
 from augment.errors import OutputError
 
-_numbers = itertools.count()
 _MOST_RACES = 100  # times that others delete a folder in which a file is just being made
 
 
@@ -50,7 +48,7 @@ class LocalStore:
 
     def write(self, path: str, data: bytes) -> None:
         file = self._file(path)
-        _with_folder(lambda: write_atomic(file, data))
+        _with_folder(lambda: write_atomic(file, data, clear=False))
 
     def put_file(self, path: str, source: Path) -> None:
         """A hard link where the system can, else a copy; either way flushed to the disk."""
@@ -146,20 +144,10 @@ def _with_folder(write: Callable[[], None]) -> None:
 
 
 def _link_or_copy(original: Path, file: Path, *, flush: bool = True) -> None:
-    name = f".{file.name}.{os.getpid()}-{next(_numbers)}{TEMPORARY_SUFFIX}"
-    temporary = file.with_name(name)
     try:
         make_folder(file.parent)
-        try:
-            os.link(original, temporary)
-            os.replace(temporary, file)
-        except FileNotFoundError:
-            raise
-        except OSError:  # another disk, no hard links there, another user's file, too many links
+        if not link_file(str(original), str(file)):
             copy_file(str(original), str(file))
-        finally:
-            # Renaming does nothing where both names are links of one file already.
-            temporary.unlink(missing_ok=True)
         if flush:
             flush_folder(file.parent)
     except OSError as error:

@@ -18,7 +18,7 @@ from typing import Any
 
 from augment.batch.atomic import make_folder, output_error
 from augment.batch.layout import STATE_FOLDER
-from augment.batch.processes import is_running
+from augment.batch.processes import process_mark
 from augment.errors import OutputError
 
 ORPHANS_S = 30.0  # how long to wait for the workers of a killed job to notice
@@ -86,12 +86,12 @@ class OutputLock:
                 if _is_held_by(holder) or time.monotonic() > deadline:
                     raise OutputError(
                         f"{self._path.parent.parent} is being written by another job"
-                        + (f" (process {holder})" if holder else "")
+                        + (f" (process {holder.split()[0]})" if holder else "")
                         + "; wait for it to end, or choose another output folder"
                     ) from None
                 time.sleep(0.05)
         os.ftruncate(self._descriptor, 0)
-        os.pwrite(self._descriptor, str(os.getpid()).encode(), 0)
+        os.pwrite(self._descriptor, process_mark(os.getpid()).encode(), 0)
 
 
 class InheritedLock:
@@ -110,4 +110,5 @@ def _inherit(duplicate: Any) -> InheritedLock:
 
 def _is_held_by(holder: str) -> bool:
     """Whether the process that took the lock lives; False while its number is being written."""
-    return holder.isdigit() and is_running(int(holder))
+    number = holder.partition(" ")[0]
+    return number.isdigit() and process_mark(int(number)) == holder

@@ -7,12 +7,11 @@ has the place; then the name is moved. So the original of a link that was there 
 from __future__ import annotations
 
 import errno
-import itertools
 import os
 import stat
 from pathlib import Path
 
-from augment.batch.atomic import TEMPORARY_SUFFIX, output_error
+from augment.batch.atomic import output_error, replaced_file, temporary_beside, temporary_names
 from augment.errors import OutputError
 
 LINKED, COPIED = "linked", "copied"
@@ -25,7 +24,6 @@ _CANNOT_LINK = (
     errno.ENOTSUP,
     errno.ENOSYS,
 )
-_numbers = itertools.count()
 
 
 def found_as(target: str, original: os.stat_result) -> str | None:
@@ -46,12 +44,12 @@ def link_file(original: str, target: str) -> bool:
         OutputError: the system refused otherwise.
     """
     try:
-        if _facts(target) is None:
+        try:
             os.link(original, target, follow_symlinks=False)
-            return True
-        temporary = _temporary(target)
-        os.link(original, temporary, follow_symlinks=False)
-        _move(temporary, target)
+        except FileExistsError:
+            temporary = temporary_beside(Path(target))
+            os.link(original, temporary, follow_symlinks=False)
+            _move(temporary, target)
     except OSError as error:
         if error.errno in _CANNOT_LINK:
             return False
@@ -65,20 +63,16 @@ def copy_file(original: str, target: str) -> None:
     Raises:
         OutputError: the system refused; `target` is then as it was.
     """
-    try:
+    with replaced_file(Path(target), clear=False, flush=False) as file:
         source = os.open(original, os.O_RDONLY)
         try:
-            temporary = _temporary(target)
-            try:
-                _copy(source, temporary)
-                _move(temporary, target)
-            except BaseException:
-                _remove(temporary)
-                raise
+            at = 0
+            while sent := os.sendfile(file.fileno(), source, at, 1 << 26):
+                at += sent
+            facts = os.fstat(source)
+            os.utime(file.fileno(), ns=(facts.st_mtime_ns, facts.st_mtime_ns))
         finally:
             os.close(source)
-    except OSError as error:
-        raise output_error(Path(target), error) from error
 
 
 def write_file(data: bytes, target: str, mtime_ns: int) -> None:
@@ -87,20 +81,10 @@ def write_file(data: bytes, target: str, mtime_ns: int) -> None:
     Raises:
         OutputError: the system refused; `target` is then as it was.
     """
-    temporary = _temporary(target)
-    try:
-        try:
-            with open(temporary, "xb") as file:
-                file.write(data)
-                file.flush()
-                os.utime(file.fileno(), ns=(mtime_ns, mtime_ns))
-                os.fsync(file.fileno())
-            _move(temporary, target)
-        except BaseException:
-            _remove(temporary)
-            raise
-    except OSError as error:
-        raise output_error(Path(target), error) from error
+    with replaced_file(Path(target), clear=False, flush=False) as file:
+        file.write(data)
+        file.flush()
+        os.utime(file.fileno(), ns=(mtime_ns, mtime_ns))
 
 
 def put_link(text: str, target: str) -> bool:
@@ -112,7 +96,7 @@ def put_link(text: str, target: str) -> bool:
     try:
         if os.path.islink(target) and os.readlink(target) == text:
             return False
-        temporary = _temporary(target)
+        temporary = temporary_beside(Path(target))
         os.symlink(text, temporary)
         _move(temporary, target)
     except OSError as error:
@@ -146,11 +130,11 @@ def others_in(folder: str, expected: set[str]) -> list[str]:
     """Names in a folder of the copy that are not expected; what a killed run left is deleted."""
     others = []
     try:
-        for name in sorted(set(os.listdir(folder)) - expected):
-            if name.startswith(".") and name.endswith(TEMPORARY_SUFFIX):
-                os.unlink(os.path.join(folder, name))
-            else:
-                others.append(name)
+        found = set(os.listdir(folder)) - expected
+        left = set(temporary_names(found))
+        for name in left:
+            os.unlink(os.path.join(folder, name))
+        others += sorted(found - left)
     except OSError as error:
         raise output_error(Path(folder), error) from error
     return others
@@ -163,33 +147,9 @@ def _facts(path: str) -> os.stat_result | None:
         return None
 
 
-def _temporary(target: str) -> str:
-    name = f".{os.getpid()}-{next(_numbers)}{TEMPORARY_SUFFIX}"
-    return os.path.join(os.path.dirname(target), name)
-
-
-def _copy(source: int, path: str) -> None:
-    # Exclusively: an old file of this name might be one with an original.
-    descriptor = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666)
-    try:
-        at = 0
-        while sent := os.sendfile(descriptor, source, at, 1 << 26):
-            at += sent
-        facts = os.fstat(source)
-        os.utime(descriptor, ns=(facts.st_mtime_ns, facts.st_mtime_ns))
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def _move(temporary: str, target: str) -> None:
+def _move(temporary: Path, target: str) -> None:
     try:
         os.replace(temporary, target)
-    except BaseException:
-        _remove(temporary)
-        raise
-
-
-def _remove(path: str) -> None:
-    if _facts(path) is not None:
-        os.unlink(path)
+    finally:
+        # Renaming does nothing where both names are links of one file already.
+        temporary.unlink(missing_ok=True)

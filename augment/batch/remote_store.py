@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import os
+import secrets
 import threading
 import time
 from collections.abc import Callable, Iterable
@@ -30,7 +31,6 @@ if TYPE_CHECKING:
     from pyarrow.fs import FileSystem
 
 _DELETES_AT_ONCE = 8
-_numbers = itertools.count()
 _of_parents: list[FileSystem | None] = []
 _random = SystemRandom()  # the jitter of processes with one seed must differ
 _T = TypeVar("_T")
@@ -213,7 +213,7 @@ def _put(system: FileSystem, path: str, data: bytes) -> None:
 
 def _put_and_move(system: FileSystem, path: str, data: bytes) -> None:
     folder, _, name = path.rpartition("/")
-    hidden = f".{name}.{os.getpid()}-{next(_numbers)}{TEMPORARY_SUFFIX}"
+    hidden = f".{name}.{secrets.token_hex(8)}{TEMPORARY_SUFFIX}"
     temporary = f"{folder}/{hidden}" if folder else hidden
     if folder:
         system.create_dir(folder, recursive=True)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import functools
 import io
-import os
 import pickle
 from dataclasses import dataclass
 from multiprocessing.reduction import ForkingPickler
@@ -19,7 +18,7 @@ from typing import Any, BinaryIO
 import numpy as np
 import torch
 
-from augment.batch.atomic import TEMPORARY_SUFFIX, make_folder, output_error
+from augment.batch.atomic import make_folder, output_error, temporary_beside
 from augment.scene import Scene
 
 ALIGNMENT = 64  # bytes: a cache line, and any vector register
@@ -47,16 +46,17 @@ class SharedScene:
 
 
 def share_scene(scene: Scene, folder: Path) -> SharedScene:
-    """Lay the scene's tensors into a temporary file of `folder`, which a later job clears away.
+    """Lay the scene's tensors into a temporary file of `folder`, which a later job clears away
+    once it holds the folder.
 
     Raises:
         OutputError: the file cannot be written. ValueError: a part of the scene, such as its label
             source, cannot be sent to another process.
     """
-    path = folder / f".scene.{os.getpid()}{TEMPORARY_SUFFIX}"
+    path = temporary_beside(folder / "scene")
     try:
         make_folder(folder)
-        with path.open("wb") as file:
+        with path.open("xb") as file:
             skeleton = io.BytesIO()
             try:
                 _ScenePickler(skeleton, file, str(path)).dump(scene)

@@ -119,7 +119,7 @@ def write_view(out_dir: Path, paths: ItemPaths, view: View, recipe: Recipe) -> W
     checksum = hashlib.sha256(files[paths.image]).hexdigest()
     encoded = time.perf_counter()
     for relative, data in files.items():
-        write_atomic(out_dir / relative, data)
+        write_atomic(out_dir / relative, data, clear=False)
     return Written(checksum, tuple(files), encoded - started, time.perf_counter() - encoded)
 
 

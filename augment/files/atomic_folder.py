@@ -8,51 +8,66 @@ from __future__ import annotations
 
 import ctypes
 import errno
-import itertools
 import os
-import re
+import shutil
 from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from augment.batch.atomic import TEMPORARY_SUFFIX, flush_folder, make_folder, output_error
+from augment.batch.atomic import (
+    TEMPORARY_SUFFIX,
+    flush_folder,
+    hold_temporary,
+    is_held,
+    make_folder,
+    output_error,
+    temporary_beside,
+    temporary_names,
+)
 
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2  # linux/fcntl.h, linux/fs.h
 _CANNOT_EXCHANGE = (errno.ENOSYS, errno.EINVAL, errno.EOPNOTSUPP, errno.ENOTTY, errno.EPERM)
-_numbers = itertools.count()
-_being_written: set[Path] = set()
 
 
 @contextmanager
 def replaced_folder(target: Path, own: Collection[str]) -> Iterator[Path]:
     """A new, empty folder that takes the place of `target` when the block ends without an error.
 
-    own: names of the files that make up such a folder. They must all be written by the block, and
-    those of the old folder are deleted; anything else in the old folder is kept.
+    own: names of the files and folders that make up such a folder. Those of the old folder are
+    deleted; anything else in the old folder is kept.
 
     Raises:
         OutputError: the system refused (disk full, no permission ...); `target` is then as it was.
     """
     target = target.resolve()  # a link to a folder stays a link
-    new = target.with_name(f".{target.name}.{os.getpid()}-{next(_numbers)}{TEMPORARY_SUFFIX}")
     try:
         make_folder(target.parent)
-        new.mkdir()
-        _being_written.add(new)
+        new, descriptor = _locked_folder(target)
         try:
             yield new
-            for name in own:
-                _flush_file(new / name)
-            flush_folder(new)
+            for path in [*new.rglob("*"), new]:
+                flush_folder(path)  # or a file
             _put_in_place(new, target)
             flush_folder(target.parent)
             _clear_leftovers(target, own)
         finally:
-            _being_written.discard(new)
-            if new.is_dir():
-                _clear(new, target, own)
+            _clear(new, target, own)
+            os.close(descriptor)
     except OSError as error:
         raise output_error(target, error) from error
+
+
+def _locked_folder(target: Path) -> tuple[Path, int]:
+    while True:
+        new = temporary_beside(target)
+        new.mkdir()
+        try:
+            descriptor = os.open(new, os.O_RDONLY)
+        except FileNotFoundError:  # taken for left behind
+            continue
+        if hold_temporary(new, descriptor):
+            return new, descriptor
+        os.close(descriptor)
 
 
 def _put_in_place(new: Path, target: Path) -> None:
@@ -88,43 +103,30 @@ def _exchange(one: Path, other: Path) -> bool:
 
 def _clear_leftovers(target: Path, own: Collection[str]) -> None:
     """Clear what killed processes left beside the folder."""
-    pattern = re.compile(
-        rf"\.{re.escape(target.name)}\.(\d+)-\d+(\.old)?{re.escape(TEMPORARY_SUFFIX)}"
-    )
-    for entry in list(target.parent.iterdir()):
-        match = pattern.fullmatch(entry.name)
-        if match and entry.is_dir() and not _is_in_use(entry, int(match[1])):
-            _clear(entry, target, own)
+    for name in temporary_names(os.listdir(target.parent), target.name):
+        entry = target.with_name(name)
+        try:
+            descriptor = os.open(entry, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+        except OSError:  # a file, gone since, or another user's
+            continue
+        try:
+            if not is_held(descriptor):
+                _clear(entry, target, own)
+        finally:
+            os.close(descriptor)
 
 
 def _clear(old: Path, target: Path, own: Collection[str]) -> None:
     """Delete a temporary folder. Entries that are not ours move to `target`; where they cannot,
     they and the folder stay, since nobody here may decide to delete them.
     """
-    for entry in list(old.iterdir()):
-        if entry.name in own:
-            entry.unlink()
-        elif target.is_dir() and not (target / entry.name).exists():
-            os.rename(entry, target / entry.name)
-    if not any(old.iterdir()):
-        old.rmdir()
-
-
-def _is_in_use(folder: Path, process_id: int) -> bool:
-    if process_id == os.getpid():  # numbers return: it may be an earlier process's
-        return folder in _being_written
-    try:
-        os.kill(process_id, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
-    return True
-
-
-def _flush_file(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+    with suppress(FileNotFoundError):  # somebody else who saves there clears it too
+        for entry in list(old.iterdir()):
+            if entry.name in own and entry.is_dir():
+                shutil.rmtree(entry)
+            elif entry.name in own:
+                entry.unlink()
+            elif target.is_dir() and not (target / entry.name).exists():
+                os.rename(entry, target / entry.name)
+        if not any(old.iterdir()):
+            old.rmdir()

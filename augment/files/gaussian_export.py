@@ -7,19 +7,17 @@ logs and logits, so that they read back to rounding, not to the bit.
 from __future__ import annotations
 
 import json
-import os
 import re
-import secrets
-import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from augment.bake import baked
-from augment.batch.atomic import flush_folder, make_folder, output_error, write_atomic
+from augment.batch.atomic import output_error, write_atomic
 from augment.batch.layout import folder_name
 from augment.cameras import Camera
 from augment.errors import OutputError, SceneError
+from augment.files.atomic_folder import replaced_folder
 from augment.files.scene_document import document_text, track_entry
 from augment.scene import Gaussians, Scene
 from augment.splat_io import write_ply, write_splat
@@ -99,21 +97,17 @@ def export_ply_parts(scene: Scene, folder: str | Path) -> None:
             as it was.
     """
     folder = Path(folder).resolve()
-    new = folder.with_name(f".{folder.name}.{os.getpid()}-{secrets.token_hex(4)}.partial")
     try:
-        if folder.exists() and not is_parts_folder(folder):
-            raise OutputError(
-                f"{folder} holds something else than exported parts, so it is not replaced; choose "
-                f"another folder"
-            )
-        make_folder(folder.parent)
-        try:
-            _write_parts(scene, new)
-            _put_in_place(new, folder)
-        finally:
-            shutil.rmtree(new, ignore_errors=True)
+        is_free = not folder.exists() or is_parts_folder(folder)
     except OSError as error:
         raise output_error(folder, error) from error
+    if not is_free:
+        raise OutputError(
+            f"{folder} holds something else than exported parts, so it is not replaced; choose "
+            f"another folder"
+        )
+    with replaced_folder(folder, (BACKGROUND, CAMERAS, PARTS, ACTORS)) as new:
+        _write_parts(scene, new)
 
 
 def is_parts_folder(folder: Path) -> bool:
@@ -168,21 +162,6 @@ def _write_parts(scene: Scene, folder: Path) -> None:
     if (cameras := inria_cameras(scene)) is not None:
         write_atomic(folder / CAMERAS, cameras)
     write_atomic(folder / PARTS, document_text(facts).encode())
-
-
-def _put_in_place(new: Path, folder: Path) -> None:
-    if not folder.exists():
-        os.rename(new, folder)
-    else:
-        old = new.with_name(f"{new.name}.old")
-        os.rename(folder, old)
-        try:
-            os.rename(new, folder)
-        except BaseException:
-            os.rename(old, folder)
-            raise
-        shutil.rmtree(old)
-    flush_folder(folder.parent)
 
 
 def _something(scene: Scene, timestamp_ns: int) -> Gaussians:

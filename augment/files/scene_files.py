@@ -22,8 +22,8 @@ from typing import NamedTuple
 
 from torch import Tensor
 
+from augment.batch.atomic import replaced_file
 from augment.errors import OutputError, SceneError
-from augment.files.atomic_file import replaced_file
 from augment.files.atomic_folder import replaced_folder
 from augment.files.scene_document import document_text, scene_document, scene_of
 from augment.files.scene_schema import (

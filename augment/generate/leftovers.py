@@ -1,31 +1,26 @@
 """Clears away what killed processes have left in an output: nobody reads it, but it takes room.
 
-Temporary files of processes of this machine that have ended, the folders that published blocks
-were rendered in, and the claims' files of the dead. What live processes hold stays; should one on
-another machine lose a temporary file all the same, its store writes it again.
+Temporary files of processes that have ended, the folders that published blocks were rendered in,
+and the claims' files of the dead. What live processes hold stays; should one on another machine
+lose a temporary file all the same, because locks do not reach there, its store writes it again.
 """
 
 from __future__ import annotations
 
-import os
-import re
 import shutil
 from collections.abc import Iterable
 from pathlib import Path
 
-from augment.batch.atomic import TEMPORARY_SUFFIX, output_error
+from augment.batch.atomic import remove_temporaries
 from augment.batch.claims import CLAIMS_FOLDER, try_claim
 from augment.batch.layout import STATE_FOLDER, variant_folder
 from augment.batch.parts import PARTS
-from augment.batch.processes import is_running
 from augment.batch.store import Store
 from augment.errors import OutputError
 from augment.generate.publish import staging_folder
 from augment.generate.records import Block
 from augment.generate.variants import VARIANTS
 from augment.quality.record import FOLDER as QUALITY
-
-_PROCESS = re.compile(rf"\.(\d+)-\d+{re.escape(TEMPORARY_SUFFIX)}$")
 
 
 def clear_leftovers(store: Store, scratch: Path | None, published: Iterable[Block]) -> None:
@@ -43,11 +38,11 @@ def clear_leftovers(store: Store, scratch: Path | None, published: Iterable[Bloc
     if store.local_dir is None:
         return
     state = store.local_dir / STATE_FOLDER
-    _clear_temporaries(store.local_dir, is_deep=False)
+    remove_temporaries(store.local_dir, recursive=False)
     for folder in (state / "jobs", state / "scenes"):
-        _clear_temporaries(folder)
+        remove_temporaries(folder)
     for kept in (PARTS, VARIANTS, QUALITY):
-        _clear_temporaries(store.local_dir / kept)
+        remove_temporaries(store.local_dir / kept)
     for path in store.list(CLAIMS_FOLDER):
         claim = try_claim(store, path.removeprefix(f"{CLAIMS_FOLDER}/").removesuffix(".lock"))
         if claim is not None:
@@ -69,18 +64,4 @@ def clear_block(store: Store, scratch: Path | None, block: Block) -> None:
 def clear_files_of(store: Store, block: Block) -> None:
     """Delete what was half-way into the output when a worker at this block was killed."""
     if store.local_dir is not None:
-        _clear_temporaries(store.local_dir / variant_folder(block.scene, block.variant))
-
-
-def _clear_temporaries(folder: Path, *, is_deep: bool = True) -> None:
-    for place, below, names in os.walk(folder):  # passes over folders that vanish meanwhile
-        for name in names:
-            writer = _PROCESS.search(name)
-            if writer is not None and not is_running(int(writer[1])):
-                path = Path(place) / name
-                try:
-                    path.unlink(missing_ok=True)
-                except OSError as error:
-                    raise output_error(path, error) from error
-        if not is_deep:
-            below.clear()
+        remove_temporaries(store.local_dir / variant_folder(block.scene, block.variant))

@@ -37,6 +37,7 @@ from augment.batch.label_files import read_boxes, read_lidar
 from augment.batch.layout import item_paths, resolve_inside
 from augment.batch.lock import OutputLock
 from augment.batch.manifest import read_manifest, write_manifest
+from augment.batch.processes import process_mark
 from augment.cameras import Frame
 from augment.errors import OutputError, SceneError
 from recipes.load import load_recipe
@@ -316,9 +317,9 @@ def test_a_second_job_on_the_same_folder_is_refused(tmp_path: Path) -> None:
 def test_the_lock_of_a_dead_process_does_not_last(tmp_path: Path) -> None:
     state = tmp_path / ".climategs"
     state.mkdir()
-    (state / "lock").write_text("4194305")  # above the kernel's largest process number
+    (state / "lock").write_text("4194305 1")  # above the kernel's largest process number
     with OutputLock(tmp_path):
-        assert (state / "lock").read_text().isdigit()
+        assert (state / "lock").read_text() == process_mark(os.getpid())
     assert (state / "lock").read_bytes() == b""
 
 
@@ -333,7 +334,11 @@ def test_a_worker_keeps_its_share_of_the_lock(tmp_path, monkeypatch) -> None:
         assert ours.recv() == "holding"
     with pytest.raises(OutputError, match="is being written by another job; wait"):
         OutputLock(tmp_path).__enter__()
-    ours.send("end")
+    # The dead parent had this process's number, as in another run of a container.
+    (tmp_path / ".climategs" / "lock").write_text(f"{os.getpid()} 1")
+    monkeypatch.setattr("augment.batch.lock.ORPHANS_S", 20)
+    threading.Timer(0.2, ours.send, ["end"]).start()
+    OutputLock(tmp_path).__enter__().__exit__()
     child.join()
     with OutputLock(tmp_path):
         pass
@@ -382,16 +387,16 @@ def test_a_refused_write_leaves_no_partial_file(tmp_path: Path) -> None:
 
 
 def test_a_full_disk_stops_the_job_and_says_what_to_do(tmp_path, monkeypatch) -> None:
-    real, left = os.write, [30]
+    real, left = os.fsync, [80]
 
-    def write(descriptor, data):
+    def flush(descriptor):
         left[0] -= 1
         if left[0] < 0:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        return real(descriptor, data)
+        return real(descriptor)
 
     job = RenderJob("fake:street", [make_recipe()], tmp_path)
-    monkeypatch.setattr(os, "write", write)
+    monkeypatch.setattr(os, "fsync", flush)
     with pytest.raises(OutputError, match=r"cannot write .*: No space left.*free some space"):
         run(job)
     monkeypatch.undo()

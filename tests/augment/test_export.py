@@ -19,7 +19,7 @@ from adapters.base import open_scene
 from augment.bake import baked, moved_gaussians
 from augment.color_waves import ColorWaves
 from augment.errors import OutputError, SceneError
-from augment.files import gaussian_export
+from augment.files import atomic_folder
 from augment.files.export_losses import export_losses
 from augment.files.gaussian_export import (
     export_cameras,
@@ -302,7 +302,8 @@ def test_parts_are_replaced_as_a_whole(tmp_path, monkeypatch):
                 raise OSError(28, os.strerror(28))
             rename(one, other)
 
-        monkeypatch.setattr(gaussian_export.os, "rename", failing)
+        monkeypatch.setattr(atomic_folder, "_exchange", lambda one, other: False)
+        monkeypatch.setattr(os, "rename", failing)
         with pytest.raises(OutputError, match="the disk is full"):
             export_ply_parts(drive(name="newer"), folder)
         monkeypatch.undo()

@@ -14,6 +14,7 @@ import mirror_trees as trees
 import numpy as np
 import pytest
 
+from augment.batch import atomic
 from augment.batch import mirror as mirror_module
 from augment.batch.atomic import TEMPORARY_SUFFIX
 from augment.batch.encode import decode_image
@@ -270,17 +271,17 @@ def test_files_are_copied_where_they_cannot_be_linked(source, out, monkeypatch, 
 
 
 def test_a_leftover_that_is_a_link_is_not_written(source, out, monkeypatch):
-    """Numbers of processes return: a killed run's temporary name may lead to a source's file."""
+    """A killed run's temporary name may lead to a source's file."""
     table = source / "README.md"
     before = table.read_bytes()
 
-    def taken(target: str) -> str:
-        path = os.path.join(os.path.dirname(target), f".1-1{TEMPORARY_SUFFIX}")
+    def taken(target: Path) -> Path:
+        path = target.with_name(f".1-1{TEMPORARY_SUFFIX}")
         if not os.path.lexists(path):
             os.link(table, path)
         return path
 
-    monkeypatch.setattr("augment.batch.mirror_files._temporary", taken)
+    monkeypatch.setattr(atomic, "temporary_beside", taken)
     with pytest.raises(OutputError, match="cannot write"):
         trees.mirror(source, out, links="copy")
     assert table.read_bytes() == before

@@ -234,7 +234,7 @@ def test_an_error_at_any_moment_leaves_one_of_the_two(
         return call
 
     (saved / "notes.txt").write_text("keep")
-    for name in ("_flush_file", "flush_folder", "_exchange"):
+    for name in ("flush_folder", "_exchange"):
         monkeypatch.setattr(atomic_folder, name, failing(getattr(atomic_folder, name)))
     with monkeypatch.context() as patch:
         patch.setattr(os, "rename", failing(os.rename))

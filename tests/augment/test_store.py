@@ -119,7 +119,7 @@ def test_local_files_are_linked_or_else_copied(tmp_path, monkeypatch):
     assert os.path.samefile(source, tmp_path / "out/a/linked")
     assert not (tmp_path / "out/a/linked").is_symlink()
 
-    def refuse(*_):
+    def refuse(*_, **__):
         raise OSError(errno.EXDEV, "another disk")
 
     monkeypatch.setattr(os, "link", refuse)
@@ -135,7 +135,7 @@ def test_a_full_disk_leaves_the_old_file(tmp_path, monkeypatch):
     store.write("a/b", b"old")
     (tmp_path / "source").write_bytes(b"new")
 
-    def refuse(*_):
+    def refuse(*_, **__):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(os, "replace", refuse)
@@ -183,7 +183,7 @@ def test_temporaries_are_not_files(tmp_path):
 def test_unreadable_folders_are_told(tmp_path, monkeypatch):
     store = LocalStore(tmp_path)
 
-    def refuse(*_):
+    def refuse(*_, **__):
         raise PermissionError(errno.EACCES, "Permission denied")
 
     monkeypatch.setattr(local_store.os, "scandir", refuse)
