@@ -2,8 +2,8 @@
 
 World: PandaSet's own, unless the drive is further than a kilometre from its origin. Ego: the LiDAR
 pose turned by a quarter about z, so that x is forward, y left, z up; its origin is the pose's. One
-actor stands for each moving object, whichever sensor's boxes it has; its track_id is the uuid of
-its first box, and the labels keep both boxes of a sibling pair.
+actor stands for each moving object, whichever sensor's boxes it has; its track_id is the one that
+the object's boxes have in the labels.
 """
 
 from __future__ import annotations

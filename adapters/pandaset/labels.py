@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +16,7 @@ from adapters.pandaset.files import (
     read_lidar,
     read_semantics,
 )
+from adapters.pandaset.siblings import read_objects
 from augment.errors import AdapterError
 from augment.labels import Boxes, LidarSweep
 from augment.semantics import SemanticClass
@@ -80,18 +81,23 @@ def semantic_table(root: Path) -> np.ndarray:
 class PandaSetLabels:
     """Labels of one sequence, read when asked.
 
-    Boxes: track_ids are uuids, both boxes of a sibling pair are kept, and attributes hold every
-    column of the file under its own name (None where a text is missing), the yaw and sibling
-    included. Sweeps: columns x y z (metres), i (intensity 0 to 255), t (seconds), d (0: the
-    spinning sensor, 1: the forward one) exactly as in the file, and semantic (the dataset's own
-    class numbers) where the frame has them.
+    Boxes: one an object; where both sensors' cuboids of it are in the file, the one that
+    `siblings.Objects` ranks first. A track_id is the uuid of the object's best box, the same in all
+    frames; attributes hold every column of the file under its own name (None where a text is
+    missing), the box's own uuid, yaw and sibling included. Sweeps: columns x y z (metres), i
+    (intensity 0 to 255), t (seconds), d (0: the spinning sensor, 1: the forward one) exactly as in
+    the file, and semantic (the dataset's own class numbers) where the frame has them.
     """
 
     root: Path
 
     def boxes(self, frame_index: int) -> Boxes:
         table = read_cuboids(self.root, frame_index)
-        return Boxes.empty() if table is None else boxes_of_cuboids(table)
+        if table is None:
+            return Boxes.empty()
+        objects = read_objects(self.root)
+        boxes = boxes_of_cuboids(table[objects.kept(table["uuid"].astype(str))])
+        return replace(boxes, track_ids=tuple(objects.names[uuid] for uuid in boxes.track_ids))
 
     @property
     def no_surface_classes(self) -> tuple[int, ...]:

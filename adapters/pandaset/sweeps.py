@@ -16,6 +16,7 @@ from adapters.lidar.box_tracks import BoxSample
 from adapters.lidar.split import Sweep
 from adapters.pandaset.files import Sequence, read_cuboids, read_lidar, read_semantics
 from adapters.pandaset.labels import NO_SURFACE, boxes_of_cuboids, semantic_table
+from adapters.pandaset.siblings import Objects, read_objects, sensors_of
 from augment.geometry import rotmat_from_quat
 from augment.semantics import SemanticClass
 
@@ -52,7 +53,8 @@ def read_drive(
     table = semantic_table(sequence.root)
     sweeps, samples, problems = [], [], []
     cuboids = {frame: read_cuboids(sequence.root, frame) for frame in frames}
-    moving = _moving_ids([c for c in cuboids.values() if c is not None])
+    objects = read_objects(sequence.root)
+    moving = _moving_objects([c for c in cuboids.values() if c is not None], objects)
     for frame in tqdm(frames, desc="LiDAR", unit="frame", disable=None):
         lidar = read_lidar(sequence.root, frame)
         if lidar is None:
@@ -74,7 +76,7 @@ def read_drive(
             )
             continue
         seen = None if lidar is None else raw
-        samples += _samples(boxes, frame, moving, seen, sequence)
+        samples += _samples(boxes, frame, moving, objects, seen, sequence)
     return Drive(tuple(sweeps), tuple(samples), tuple(problems))
 
 
@@ -116,8 +118,8 @@ class _RawSweep:
         return Sweep(self.points[keep], self.timestamps_ns[keep], self.semantic[keep])
 
 
-def _moving_ids(tables: Seq[pd.DataFrame]) -> set[str]:
-    """uuids of objects that are labelled moving, or that travel although labelled stationary."""
+def _moving_objects(tables: Seq[pd.DataFrame], objects: Objects) -> set[str]:
+    """Names of objects that are labelled moving, or that travel although labelled stationary."""
     if not tables:
         return set()
     table = pd.concat(tables, ignore_index=True)
@@ -126,38 +128,34 @@ def _moving_ids(tables: Seq[pd.DataFrame]) -> set[str]:
     extent = (position.groupby(uuid).max() - position.groupby(uuid).min()).to_numpy()
     travelled = np.hypot(extent[:, 0], extent[:, 1]) > _MOVED_M
     labelled = ~table["stationary"].astype(bool)
-    names = position.groupby(uuid).max().index.to_numpy()
-    return set(uuid[labelled]) | set(names[travelled])
+    uuids = position.groupby(uuid).max().index.to_numpy()
+    return {objects.names[u] for u in (*uuid[labelled], *uuids[travelled])}
 
 
 def _samples(
     table: pd.DataFrame,
     frame: int,
     moving: set[str],
+    objects: Objects,
     seen: _RawSweep | None,
     sequence: Sequence,
 ) -> list[BoxSample]:
-    table = table[[str(uuid) in moving for uuid in table["uuid"]]]
+    """The boxes of moving objects, both sensors' under the object's name."""
+    table = table[[objects.names[str(uuid)] in moving for uuid in table["uuid"]]]
     if len(table) == 0:
         return []
     boxes = boxes_of_cuboids(table)
     rotations = rotmat_from_quat(torch.from_numpy(boxes.quats)).numpy()
-    siblings = boxes.attributes.get("cuboids.sibling_id", np.full(len(boxes), "-", object))
-    sensors = boxes.attributes.get("cuboids.sensor_id", np.full(len(boxes), -1))
+    sensors = sensors_of(table)
     out = []
     for i in range(len(boxes)):
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = rotations[i], boxes.centers_m[i] - sequence.world_origin_m
         time = int(sequence.timestamps_ns[frame])
         if seen is not None:
-            time = _time_seen(seen, pose, boxes.sizes_m[i], int(sensors[i]), sequence, frame, time)
-        sibling = siblings[i]
-        sibling = None if sibling is None or sibling == "-" else str(sibling)
-        out.append(
-            BoxSample(
-                boxes.track_ids[i], sibling, boxes.labels[i], frame, time, pose, boxes.sizes_m[i]
-            )
-        )
+            time = _time_seen(seen, pose, boxes.sizes_m[i], sensors[i], sequence, frame, time)
+        name = objects.names[boxes.track_ids[i]]
+        out.append(BoxSample(name, None, boxes.labels[i], frame, time, pose, boxes.sizes_m[i]))
     return out
 
 

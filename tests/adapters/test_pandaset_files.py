@@ -98,17 +98,17 @@ def test_tables_without_their_columns_are_refused(folder):
 
 def test_boxes_turn_to_x_forward_and_keep_every_column(folder):
     boxes = PandaSetLabels(folder).boxes(1)
-    assert boxes.track_ids == (*street.CAR_IDS, "parked") and boxes.labels == ("Car",) * 3
+    assert boxes.track_ids == (street.CAR_IDS[0], "parked") and boxes.labels == ("Car",) * 2
     np.testing.assert_allclose(boxes.sizes_m[0], street.CAR_SIZE_M)
     np.testing.assert_allclose(boxes.centers_m[0], street.car_centre(0.1))
     forward = rotmat_from_quat(torch.from_numpy(boxes.quats))[0, :, 0]
     np.testing.assert_allclose(forward, [1, 0, 0], atol=1e-12)
     columns = boxes.attributes
-    assert list(columns["cuboids.sibling_id"]) == [street.CAR_IDS[1], street.CAR_IDS[0], "-"]
-    assert list(columns["cuboids.sensor_id"]) == [0, 1, -1]
+    assert list(columns["cuboids.sibling_id"]) == [street.CAR_IDS[1], "-"]
+    assert list(columns["cuboids.sensor_id"]) == [0, -1]
     np.testing.assert_allclose(columns["yaw"], -np.pi / 2)
     np.testing.assert_allclose(columns["dimensions.y"], street.CAR_SIZE_M[0])
-    assert list(columns["attributes.object_motion"]) == ["Moving", "Moving", "Parked"]
+    assert list(columns["attributes.object_motion"]) == ["Moving", "Parked"]
     assert len(columns) == 15
 
 
@@ -119,7 +119,7 @@ def test_missing_texts_are_none(folder):
     }
     street.write_table(path, table)
     status = PandaSetLabels(folder).boxes(0).attributes["attributes.rider_status"]
-    assert list(status) == ["With Rider", None, None]
+    assert list(status) == ["With Rider", None]
 
 
 def test_sweeps_pass_through_bit_for_bit(folder):
@@ -162,7 +162,7 @@ def test_a_box_called_stationary_that_travels_is_an_actor(folder):
         table["position.x"] = table["position.x"] + [2.0 * frame, 2.0 * frame, 0]
         street.write_table(folder / f"annotations/cuboids/{frame:02d}.pkl.gz", table)
     samples = read_drive(read_sequence(folder), range(street.FRAMES)).samples
-    assert {s.object_id for s in samples} == set(street.CAR_IDS)
+    assert {s.object_id for s in samples} == {street.CAR_IDS[0]}
 
 
 def test_options_are_typed():
