@@ -1,118 +1,70 @@
-"""Pickled pandas tables from strangers, read without running what they ask for.
-
-A pickle names functions for the reader to call. This reader knows the dozen that tables of numbers
-and strings need, by exact module and name, and refuses every other before anything is called.
-"""
+"""Pickled tables and dictionaries of arrays from strangers (`augment.files.pickles`)."""
 
 from __future__ import annotations
 
 import gzip
 import io
-import pickle
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from io import BufferedIOBase
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from pandas._libs import internals
-from pandas.core.indexes import base as index_base
-from pandas.core.internals import managers
 
 from augment.errors import AdapterError
+from augment.files.pickles import (
+    ARRAY_NAMES,
+    ArrayRecord,
+    Name,
+    Pickle,
+    PickleError,
+    Record,
+    read_npy,
+    read_npy_header,
+)
 
 MAX_BYTES = 1 << 29  # unpacked; a sweep of 170,000 points takes 8 MB
 _CHUNK = 1 << 22
 _GZIP_MAGIC = b"\x1f\x8b"
 
 
-def _encode_latin1(text: str, encoding: str = "utf-8") -> bytes:
-    """What protocol 2 pickles use to carry bytes; any other codec is refused."""
-    if encoding not in ("latin1", "latin-1"):
-        raise pickle.UnpicklingError(f"codec {encoding!r} is not needed by a table")
-    return text.encode("latin1")
-
-
-def _bytearray(text: str = "", encoding: str = "latin-1") -> bytearray:
-    return bytearray(_encode_latin1(text, encoding))
-
-
-def _allowed() -> dict[tuple[str, str], Callable[..., Any]]:
-    multiarray = np.empty(0).__reduce__()[
-        0
-    ]  # numpy's own _reconstruct, wherever this version keeps it
-    frombuffer = np.empty(0).__reduce_ex__(5)[0]  # and its _frombuffer
-    scalar = np.float64(0).__reduce__()[0]
-    table: dict[tuple[str, str], Callable[..., Any]] = {
-        ("builtins", "slice"): slice,
-        ("__builtin__", "slice"): slice,
-        ("builtins", "bytearray"): _bytearray,
-        ("__builtin__", "bytearray"): _bytearray,
-        ("_codecs", "encode"): _encode_latin1,
-        ("numpy", "ndarray"): np.ndarray,
-        ("numpy", "dtype"): np.dtype,
-        ("pandas._libs.internals", "_unpickle_block"): internals._unpickle_block,
-        ("pandas.core.indexes.base", "_new_Index"): index_base._new_Index,
-        ("pandas.core.internals.managers", "BlockManager"): managers.BlockManager,
-        ("pandas.core.internals", "BlockManager"): managers.BlockManager,
-    }
-    # numpy 2 renamed numpy.core to numpy._core; files of either kind must open under either.
-    for core in ("numpy.core", "numpy._core"):
-        table[f"{core}.multiarray", "_reconstruct"] = multiarray
-        table[f"{core}.multiarray", "scalar"] = scalar
-        table[f"{core}.numeric", "_frombuffer"] = frombuffer
-    for module in ("pandas", "pandas.core.frame"):
-        table[module, "DataFrame"] = pd.DataFrame
-    for module in ("pandas", "pandas.core.indexes.range"):
-        table[module, "RangeIndex"] = pd.RangeIndex
-    for module in ("pandas", "pandas.core.indexes.base"):
-        table[module, "Index"] = pd.Index
-    # Before pandas 2 an index of integers had a class of its own.
-    for module in ("pandas", "pandas.core.indexes.numeric"):
-        for name in ("Int64Index", "UInt64Index", "Float64Index"):
-            table[module, name] = pd.Index
-    return table
-
-
-_ALLOWED = _allowed()
-
-
-class _TableUnpickler(pickle.Unpickler):
-    def find_class(self, module_name: str, global_name: str) -> Any:
-        try:
-            return _ALLOWED[module_name, global_name]
-        except KeyError:
-            raise pickle.UnpicklingError(
-                f"it asks for {module_name}.{global_name}, which a table does not need"
-            ) from None
-
-
 def read_frame(path: Path, *, max_bytes: int = MAX_BYTES) -> pd.DataFrame:
     """The pandas table pickled in a file, gzipped or not.
 
     Numbers, booleans and object columns (strings, None, NaN) of pandas 0.25 to 3; pandas' own
-    string columns are refused, since restoring them trusts lengths that the file states.
+    string columns, dates and categories are refused.
 
     Raises:
         AdapterError: the file is missing, truncated, larger than max_bytes when unpacked, asks for
             anything but tables and arrays, or holds no table.
     """
-    data = _read_bounded(path, max_bytes)
+    stream = io.BytesIO(_read_bounded(path, max_bytes))
     try:
-        frame = _TableUnpickler(io.BytesIO(data)).load()
-    except pickle.UnpicklingError as error:
+        found = Pickle(_TABLE_NAMES).read(stream)
+        if isinstance(found, _Frame):
+            return found.frame()
+    except PickleError as error:
         raise AdapterError(
             f"{path} was not read: {error}. Only pickled pandas tables of numbers and object "
             f"columns of strings are accepted: obtain the file from the dataset's publisher again"
         ) from None
-    except Exception as error:  # a hostile or damaged pickle can raise anything at all
-        raise AdapterError(
-            f"{path} holds a damaged table ({type(error).__name__}: {error}); download it again"
-        ) from error
-    if type(frame) is not pd.DataFrame:
-        raise AdapterError(f"{path} must hold a pandas table; it holds a {type(frame).__name__}")
-    return frame
+    kind = "ndarray" if isinstance(found, ArrayRecord) else type(found).__name__.lstrip("_")
+    raise AdapterError(f"{path} must hold a pandas table; it holds a {kind}")
+
+
+def read_array(path: Path, *, max_bytes: int = MAX_BYTES) -> np.ndarray:
+    """The numbers of a .npy file.
+
+    Raises:
+        AdapterError: the file is missing, truncated, too large, or holds no plain numbers.
+    """
+    try:
+        return read_npy(io.BytesIO(_read_bounded(path, max_bytes)))
+    except PickleError as error:
+        raise AdapterError(f"{path} is no readable array of numbers: {error}") from None
 
 
 def read_array_dict(path: Path, *, max_bytes: int = MAX_BYTES) -> dict[str, np.ndarray]:
@@ -124,36 +76,231 @@ def read_array_dict(path: Path, *, max_bytes: int = MAX_BYTES) -> dict[str, np.n
     """
     stream = io.BytesIO(_read_bounded(path, max_bytes))
     try:
-        version = np.lib.format.read_magic(stream)
-        read_header = {
-            (1, 0): np.lib.format.read_array_header_1_0,
-            (2, 0): np.lib.format.read_array_header_2_0,
-        }[version]
-        shape, _, dtype = read_header(stream)
-        if shape != () or not dtype.hasobject:
-            raise AdapterError(
-                f"{path} must hold one dictionary of arrays; it holds {dtype} {list(shape)}"
-            )
-        held = _TableUnpickler(stream).load()
-        found = held.item() if type(held) is np.ndarray and held.shape == () else held
-    except AdapterError:
-        raise
-    except pickle.UnpicklingError as error:
+        check_holds_object(stream)
+        found = _unwrapped(Pickle(ARRAY_NAMES).read(stream))
+        arrays = {
+            name: value.take()
+            for name, value in found.items()
+            if type(name) is str and isinstance(value, ArrayRecord)
+        }
+    except PickleError as error:
         raise AdapterError(
-            f"{path} was not read: {error}. Only a dictionary of arrays is accepted"
+            f"{path} was not read: {error}. Only a .npy file of one dictionary of arrays is "
+            f"accepted"
         ) from None
-    except Exception as error:  # a hostile or damaged file can raise anything at all
-        raise AdapterError(
-            f"{path} is no .npy file of a dictionary, or a damaged one "
-            f"({type(error).__name__}: {error})"
-        ) from error
-    is_plain = type(found) is dict and all(
-        type(name) is str and type(value) is np.ndarray and not value.dtype.hasobject
-        for name, value in found.items()
-    )
-    if not is_plain:
+    if len(arrays) != len(found) or any(array.dtype.hasobject for array in arrays.values()):
         raise AdapterError(f"{path} must hold a dictionary of arrays; it holds something else")
+    return arrays
+
+
+def check_holds_object(file: BufferedIOBase) -> None:
+    """Read the header of a .npy file that must hold one pickled object.
+
+    Raises:
+        PickleError: it holds an array, or is no .npy file.
+    """
+    header = read_npy_header(file)
+    if header.dtype is not None or header.shape != ():
+        raise PickleError(
+            f"it must hold one dictionary of arrays; it holds {header.dtype or 'objects'} "
+            f"{list(header.shape)}"
+        )
+
+
+def stream_arrays(file: BufferedIOBase) -> Iterator[tuple[int, np.ndarray]]:
+    """Number and array of every entry of a pickled dictionary, in the pickle's order.
+
+    file: read forward from its position to the pickle's end. The pickle is a dictionary, bare or
+    the only object of an array without axes, as `np.save` has it. Each array is handed over and
+    forgotten before the next is read: a file of many gigabytes passes through little memory.
+
+    Raises:
+        PickleError: anything else is in it, or it is cut short.
+    """
+    pickle = Pickle(ARRAY_NAMES, is_streamed=True)
+    count = 0
+    for record in pickle.steps(file):
+        if isinstance(record, ArrayRecord) and record.values is not None:
+            number = pickle.stack[-2] if len(pickle.stack) > 1 else None
+            number = number.item() if isinstance(number, np.generic) else number
+            if type(number) is not int:
+                raise PickleError("it holds an array under something that is no number")
+            array = record.take()
+            if array.dtype.hasobject:
+                raise PickleError("it holds an array of objects where numbers are expected")
+            count += 1
+            yield number, array
+    found = _unwrapped(pickle.stack[-1])
+    if len(found) != count or not all(isinstance(v, ArrayRecord) for v in found.values()):
+        raise PickleError("it holds one array twice, or something that is no array")
+
+
+def _unwrapped(found: Any) -> dict[Any, Any]:
+    found = found.wrapped if isinstance(found, ArrayRecord) else found
+    if type(found) is not dict:
+        raise PickleError("it holds no dictionary")
     return found
+
+
+# ---- tables ----------------------------------------------------------------------------------
+
+
+class _Frame(Record):
+    """A DataFrame. Its state is a dictionary: `_mgr` (before pandas 1.1 `_data`) holds it all."""
+
+    def __init__(self) -> None:
+        self.manager: Any = None
+
+    def build(self, state: Any) -> None:
+        if type(state) is not dict:
+            raise PickleError("it holds a table without its columns")
+        self.manager = state.get("_mgr", state.get("_data"))
+
+    def frame(self) -> pd.DataFrame:
+        if not isinstance(self.manager, _Manager) or len(self.manager.axes) != 2:
+            raise PickleError("it holds a table without its columns")
+        names, rows = (_index(axis) for axis in self.manager.axes)
+        columns: list[np.ndarray | None] = [None] * len(names)
+        for block in self.manager.blocks:
+            for place, column in _columns(block, len(names), len(rows)):
+                if columns[place] is not None:
+                    raise PickleError(f"it holds column {place} twice")
+                columns[place] = column
+        if missing := [place for place, column in enumerate(columns) if column is None]:
+            raise PickleError(f"it lacks column {missing[0]} of {len(names)}")
+        # A type is given with each column: pandas would make its own text columns of objects.
+        series = {
+            place: pd.Series(column, index=rows, dtype=column.dtype)
+            for place, column in enumerate(columns)
+            if column is not None
+        }
+        table = pd.DataFrame(series, index=rows)
+        table.columns = names
+        return table
+
+
+class _Manager(Record):
+    """The columns of a table in blocks of one type. blocks: (values [columns, rows], places)."""
+
+    def __init__(self, blocks: Any = (), axes: Any = (), *_: Any) -> None:
+        self.blocks, self.axes = blocks, axes
+        if blocks:
+            self.blocks = [(block.values, block.places) for block in blocks]
+
+    def build(self, state: Any) -> None:
+        """As pandas before 1.3 has it: the last of the state is what counts."""
+        held = state[-1]["0.14.1"]
+        self.axes = held["axes"]
+        self.blocks = [(block["values"], block["mgr_locs"]) for block in held["blocks"]]
+
+
+@dataclass(frozen=True)
+class _Block:
+    values: Any
+    places: Any
+    dimensions: Any = 2
+
+
+@dataclass(frozen=True)
+class _Slice:
+    start: Any
+    stop: Any
+    step: Any = None
+
+
+class _IndexClass:
+    """Stands for pandas' Index and what it was called by kind of number."""
+
+
+@dataclass(frozen=True)
+class _Index:
+    data: Any
+    name: Any
+
+
+@dataclass(frozen=True)
+class _RangeIndex:
+    start: Any
+    stop: Any
+    step: Any
+    name: Any = None
+
+
+def _new_index(kind: Any, attributes: Any) -> _Index | _RangeIndex:
+    if type(kind) is not Name or type(attributes) is not dict:
+        raise PickleError("it holds an index of another kind")
+    if kind.make is _RangeIndex:
+        return _RangeIndex(**{str(key): value for key, value in attributes.items()})
+    if kind.make is not _IndexClass:
+        raise PickleError("it holds an index of another kind")
+    return _Index(attributes["data"], attributes.get("name"))
+
+
+def _index(record: Any) -> pd.Index:
+    if isinstance(record, _RangeIndex):
+        bounds = (record.start, record.stop, record.step)
+        if not all(type(bound) is int and abs(bound) < 1 << 48 for bound in bounds):
+            raise PickleError("it numbers its rows by what are no numbers")
+        values: Any = pd.RangeIndex(*bounds)
+        if len(values) > MAX_BYTES:
+            raise PickleError(f"it numbers {len(values)} rows")
+    elif isinstance(record, _Index) and isinstance(record.data, ArrayRecord):
+        array = record.data.take()
+        if array.ndim != 1:
+            raise PickleError(f"it names rows or columns by an array {list(array.shape)}")
+        values = pd.Index(array, dtype=array.dtype)
+    else:
+        raise PickleError("it holds rows or columns without names")
+    name = record.name
+    return values.rename(name if type(name) in (str, int) else None)
+
+
+def _columns(block: Any, count: int, rows: int) -> Iterator[tuple[int, np.ndarray]]:
+    """(place, values [rows]) of the columns of a block."""
+    record, places = block
+    if not isinstance(record, ArrayRecord):
+        raise PickleError("it holds columns of another kind than numbers and objects")
+    values = record.take()
+    if isinstance(places, ArrayRecord):
+        listed = places.take().tolist()
+    elif isinstance(places, _Slice):
+        listed = range(count)[slice(places.start, places.stop, places.step)]
+    else:
+        raise PickleError("it does not say which columns it holds")
+    if values.shape != (len(listed), rows):
+        raise PickleError(
+            f"it holds values {list(values.shape)} for {len(listed)} columns of {rows} rows"
+        )
+    for place, column in zip(listed, values, strict=True):
+        if type(place) is not int or not 0 <= place < count:
+            raise PickleError(f"it holds a column {place} of {count}")
+        yield place, column
+
+
+def _table_names() -> dict[tuple[str, str], Callable[..., Any]]:
+    table: dict[tuple[str, str], Callable[..., Any]] = {
+        **ARRAY_NAMES,
+        **{(module, "slice"): _Slice for module in ("builtins", "__builtin__")},
+        ("pandas._libs.internals", "_unpickle_block"): _Block,
+        ("pandas.core.indexes.base", "_new_Index"): _new_index,
+    }
+    homes = {
+        "DataFrame": ("pandas.core.frame", _Frame),
+        "RangeIndex": ("pandas.core.indexes.range", _RangeIndex),
+        "Index": ("pandas.core.indexes.base", _IndexClass),
+        # Before pandas 2 an index of numbers had a class of its own.
+        "Int64Index": ("pandas.core.indexes.numeric", _IndexClass),
+        "UInt64Index": ("pandas.core.indexes.numeric", _IndexClass),
+        "Float64Index": ("pandas.core.indexes.numeric", _IndexClass),
+    }
+    for name, (home, made) in homes.items():
+        table["pandas", name] = table[home, name] = made
+    for module in ("pandas.core.internals.managers", "pandas.core.internals"):
+        table[module, "BlockManager"] = _Manager
+    return table
+
+
+_TABLE_NAMES = _table_names()
 
 
 def _read_bounded(path: Path, max_bytes: int) -> bytes:

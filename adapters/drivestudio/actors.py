@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from adapters.checkpoints import taken, tensor
 from adapters.drivestudio.drive import FRAME_NS, scene_from_model
 from adapters.drivestudio.instances import Instance
 from adapters.drivestudio.nodes import turned_to_actor
 from adapters.drivestudio.run import Run
 from adapters.join import with_class_of
 from augment.errors import AdapterError, SceneError
+from augment.files.checkpoints import taken, tensor
 from augment.geometry import rigid, rotmat_from_quat, slerp
 from augment.scene import Actor, Gaussians, check_gaussians
 from augment.track import Track

@@ -21,7 +21,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from adapters.checkpoints import load_checkpoint, section, taken, tensor
 from adapters.drivestudio.actors import identify, make_actors, read_poses
 from adapters.drivestudio.corrections import read_corrections
 from adapters.drivestudio.drive import model_from_dataset, read_drive, scene_from_model
@@ -34,6 +33,7 @@ from adapters.drivestudio.sky import read_sky
 from adapters.uri import format_uri
 from adapters.world import WorldChange
 from augment.errors import AdapterError
+from augment.files.checkpoints import load_checkpoint, section, taken, tensor
 from augment.scene import Actor, Scene, check_gaussians
 
 

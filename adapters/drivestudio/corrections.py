@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from adapters.checkpoints import section, taken, tensor
 from adapters.drivestudio.run import Run
 from augment.cameras import Frame
 from augment.errors import AdapterError
+from augment.files.checkpoints import section, taken, tensor
 
 _POSES = ("CamPosePerturb", "CamPose")  # in the order in which they apply
 

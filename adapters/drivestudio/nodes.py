@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from adapters.checkpoints import section, taken, tensor
 from augment.errors import AdapterError
+from augment.files.checkpoints import section, taken, tensor
 from augment.geometry import multiply_quats, quat_from_rotmat
 from augment.render.sh import SH_C0, rotate_sh
 from augment.scene import SH_COUNTS, Gaussians

@@ -14,9 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from adapters.checkpoints import section, taken, tensor
 from augment.cameras import Camera
 from augment.errors import AdapterError
+from augment.files.checkpoints import section, taken, tensor
 from augment.render.composite import composite_sky
 from augment.sky import ConstantSky, CubemapSky, Sky, cubemap_coordinates, directions_of_cubemap
 

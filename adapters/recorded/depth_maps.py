@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from adapters.safe_pickle import read_array_dict
+from adapters.safe_pickle import read_array, read_array_dict
 from augment.cameras import Camera
 from augment.errors import AdapterError
 from augment.reconstruct.view import ViewKey
@@ -82,10 +82,7 @@ def read_metric(path: Path) -> np.ndarray:
 def read_relative(path: Path) -> np.ndarray:
     """float32 [h, w] of any unit, larger where nearer, NaN where unknown, from .npy or an image."""
     if path.suffix.lower() == ".npy":
-        try:
-            values = np.load(path, allow_pickle=False)
-        except (OSError, ValueError, EOFError) as error:
-            raise AdapterError(f"{path} is no readable array of numbers ({error})") from None
+        values = read_array(path)
     else:
         values = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         if values is None:

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from adapters.checkpoints import load_checkpoint, release, section, taken, tensor
 from adapters.street_gaussians.parameters import (
     Parameters,
     actor_id,
@@ -23,6 +22,7 @@ from adapters.street_gaussians.parts import Part, allocate, check_counts, finish
 from adapters.street_gaussians.poses import PoseChanges
 from adapters.street_gaussians.records import ModelConfig
 from augment.errors import AdapterError
+from augment.files.checkpoints import load_checkpoint, release, section, taken, tensor
 
 _TENSORS = ("xyz", "feature_dc", "feature_rest", "scaling", "rotation", "opacity", "semantic")
 _TRAINING = (

@@ -11,10 +11,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from adapters.checkpoints import section, taken, tensor
 from adapters.street_gaussians.poses import PoseChanges, rotations_of
 from adapters.street_gaussians.records import ModelConfig
 from augment.errors import AdapterError
+from augment.files.checkpoints import section, taken, tensor
 
 _ACTOR = re.compile(r"obj_(\d{3,9})")
 

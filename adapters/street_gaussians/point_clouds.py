@@ -22,8 +22,9 @@ from typing import BinaryIO
 import numpy as np
 
 from adapters.recorded.byte_cache import ByteCache
-from adapters.street_gaussians.pickle_stream import PickleStreamError, stream_arrays
+from adapters.safe_pickle import check_holds_object, stream_arrays
 from augment.errors import AdapterError
+from augment.files.pickles import PickleError
 
 FILE = "pointcloud.npz"
 _POINTS, _PROJECTIONS = "pointcloud.npy", "camera_projection.npy"
@@ -152,21 +153,9 @@ def _clouds(path: Path) -> Generator[tuple[int, PointCloud]]:
 def _entries(path: Path, member: str, file: BinaryIO) -> Iterator[tuple[int, np.ndarray]]:
     where = f"{path}, {member}"
     try:
-        version = np.lib.format.read_magic(file)
-        read_header = {
-            (1, 0): np.lib.format.read_array_header_1_0,
-            (2, 0): np.lib.format.read_array_header_2_0,
-        }[version]
-        shape, _, dtype = read_header(file)
-    except (ValueError, KeyError) as error:
-        raise AdapterError(f"{where} is no .npy file ({error}); copy {path} again") from None
-    if shape != () or not dtype.hasobject:
-        raise AdapterError(
-            f"{where} must hold one dictionary of arrays by frame; it holds {dtype} {list(shape)}"
-        )
-    try:
+        check_holds_object(file)
         yield from stream_arrays(file)
-    except PickleStreamError as error:
+    except PickleError as error:
         raise AdapterError(
             f"{where} was not read: {error}. Only a dictionary of arrays of numbers by frame is "
             f"accepted"

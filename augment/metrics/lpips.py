@@ -13,7 +13,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -22,6 +21,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from augment.errors import MetricError
+from augment.files.checkpoints import read_state_dict
 
 # Applied to pictures in [-1, 1]: about ImageNet's means and deviations.
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
@@ -156,10 +156,10 @@ def load_lpips(weights: Path, heads: Path | None = None) -> Lpips:
         MetricError: no such file, not one of these kinds, or tensors that are missing, of another
             shape or dtype, or not finite; says which.
     """
-    found = _read_state_dict(weights)
+    found = read_state_dict(weights, MetricError)
     origin = dict.fromkeys(found, weights)
     if heads is not None:
-        own = _read_state_dict(heads)
+        own = read_state_dict(heads, MetricError)
         found, origin = found | own, origin | dict.fromkeys(own, heads)
     architecture = _recognised(found, weights)
     from_torchvision = "features.0.weight" in found
@@ -233,27 +233,3 @@ def _checked(given: Tensor | None, name: str, shape: tuple[int, ...], path: Path
     if not bool(torch.isfinite(given).all()):
         raise MetricError(f"{path}: {name} holds NaN or infinite values")
     return given.float()
-
-
-def _read_state_dict(path: Path) -> dict[str, Tensor]:
-    if not path.is_file():
-        raise MetricError(f"{path}: there is no such file of weights")
-    try:
-        if path.suffix == ".safetensors":
-            from safetensors.torch import load_file
-
-            found: Any = load_file(path)
-        else:
-            found = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # both readers raise many kinds, with no base of their own
-        reason = (str(error) or repr(error)).splitlines()[0]
-        raise MetricError(
-            f"{path} cannot be read as weights: {reason}; expected a state dict saved by torch, or "
-            f"a .safetensors file"
-        ) from error
-    if not isinstance(found, Mapping) or not all(isinstance(v, Tensor) for v in found.values()):
-        raise MetricError(
-            f"{path} holds a {type(found).__name__} and not a state dict of tensors; save "
-            f"model.state_dict()"
-        )
-    return {str(name): value for name, value in found.items()}

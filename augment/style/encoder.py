@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -16,6 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from augment.errors import StyleError
+from augment.files.checkpoints import read_state_dict
 
 ENCODERS = ("small", "b0")
 LOOKED_AT_PX = 32  # by the small encoder: the arrangement of colours, not the detail
@@ -90,14 +90,15 @@ class B0Encoder(nn.Module):
 def load_imagenet_weights(encoder: B0Encoder, path: Path) -> None:
     """Fill EfficientNet-B0 with weights trained on ImageNet, from a file the user has.
 
-    path: .safetensors, or a state dict that torch saved (read with weights_only=True). Names are
+    path: .safetensors, or a state dict that torch saved. Names are
     torchvision's (`efficientnet_b0`), lukemelas' (`efficientnet-b0`) or MONAI's; what belongs to
     the classifier is left out.
 
     Raises:
         StyleError: the file cannot be read, or is not of this network.
     """
-    weights = _read_state_dict(path)
+    found = read_state_dict(path, StyleError, wrapped_in=("state_dict", "model"))
+    weights = {name.removeprefix("module."): value for name, value in found.items()}
     own = encoder.net.state_dict()
     names = _names_in_file(own, weights)
     filled: dict[str, Tensor] = {}
@@ -116,24 +117,6 @@ def load_imagenet_weights(encoder: B0Encoder, path: Path) -> None:
             raise StyleError(f"{path}: {names[name]!r} holds values that are not finite")
         filled[name] = given.to(value.dtype)
     encoder.net.load_state_dict(filled)
-
-
-def _read_state_dict(path: Path) -> Mapping[str, Tensor]:
-    try:
-        if path.suffix == ".safetensors":
-            from safetensors.torch import load_file
-
-            found: Any = load_file(path)
-        else:
-            found = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # both readers raise many kinds, none their own base
-        raise StyleError(f"{path}: no weights could be read: {error}") from error
-    for key in ("state_dict", "model"):  # as training scripts wrap them
-        if isinstance(found, dict) and isinstance(found.get(key), dict):
-            found = found[key]
-    if not isinstance(found, dict) or not all(isinstance(v, Tensor) for v in found.values()):
-        raise StyleError(f"{path}: expected a state dict, names and tensors; got {type(found)}")
-    return {name.removeprefix("module."): value for name, value in found.items()}
 
 
 def _names_in_file(own: Mapping[str, Tensor], weights: Mapping[str, Tensor]) -> dict[str, str]:

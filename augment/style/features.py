@@ -8,18 +8,16 @@ colours and contrasts at several scales, and nothing of what things are.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
-from safetensors import SafetensorError
-from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from augment.errors import StyleError
+from augment.files.checkpoints import read_state_dict
 
 Features = tuple[Tensor, ...]  # [B, C, h, w] of every layer
 
@@ -102,13 +100,13 @@ def load_vgg19(path: Path, *, width: float = 1.0) -> Vgg19:
     """VGG-19 with the weights of a .safetensors or .pth file that names them as torchvision does.
 
     Layers beyond relu4_1, which such files hold too, are left out. A .pth file is read without
-    running what it may hold (weights_only).
+    running what it may hold.
 
     Raises:
         StyleError: no such file, not one of these kinds, or tensors that are missing, of another
             shape or dtype, or not finite; says which.
     """
-    found = _read_tensors(path)
+    found = read_state_dict(path, StyleError)
     network = Vgg19(width=width)
     wanted = network.state_dict()
     lacking = [name for name in wanted if name not in found]
@@ -129,31 +127,6 @@ def load_vgg19(path: Path, *, width: float = 1.0) -> Vgg19:
             raise StyleError(f"{path}: {name} holds NaN or infinite values")
     network.load_state_dict({name: found[name].float() for name in wanted})
     return network
-
-
-def _read_tensors(path: Path) -> Mapping[str, Tensor]:
-    if not path.is_file():
-        raise StyleError(f"{path}: there is no such file of VGG-19 weights")
-    try:
-        if path.suffix == ".safetensors":
-            return load_file(path)
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except SafetensorError as error:
-        raise StyleError(f"{path} is no .safetensors file: {error}") from error
-    except Exception as error:  # torch raises whatever the file makes it meet
-        reason = (str(error) or repr(error)).splitlines()[0]
-        raise StyleError(
-            f"{path} cannot be read as weights: {reason}; expected a state dict saved by torch, or "
-            f"a .safetensors file"
-        ) from error
-    if not isinstance(content, Mapping) or not all(
-        isinstance(value, Tensor) for value in content.values()
-    ):
-        raise StyleError(
-            f"{path} holds a {type(content).__name__} and not a state dict of tensors; save "
-            f"model.state_dict()"
-        )
-    return content
 
 
 # ---- a bank of filters ------------------------------------------------------------------------

@@ -245,7 +245,7 @@ def test_a_dictionary_file_may_hold_arrays_only(tmp_path):
     with pytest.raises(AdapterError, match="one dictionary of arrays; it holds float64"):
         read_array_dict(path)
     path.write_bytes(pickle.dumps({"a": np.ones(2)}))
-    with pytest.raises(AdapterError, match=r"no \.npy file"):
+    with pytest.raises(AdapterError, match=r"start as a \.npy file"):
         read_array_dict(path)
     np.save(path, {"a": np.arange(3)})
     assert read_array_dict(path)["a"].tolist() == [0, 1, 2]

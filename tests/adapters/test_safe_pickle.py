@@ -147,9 +147,9 @@ def test_a_dotted_name_does_not_reach_into_an_allowed_class(tmp_path):
 
 
 def test_bytes_are_decoded_by_no_other_codec(tmp_path):
-    data = b"c_codecs\nencode\n(V\x41\nVzlib\ntR."
+    data = b"c_codecs\nencode\nX\x01\x00\x00\x00AX\x04\x00\x00\x00zlib\x86R."
     (tmp_path / "bad.pkl").write_bytes(data)
-    with pytest.raises(AdapterError, match="codec 'zlib'"):
+    with pytest.raises(AdapterError, match="decodes by 'zlib'"):
         read_frame(tmp_path / "bad.pkl")
 
 
@@ -205,7 +205,7 @@ def test_a_zip_bomb_stops_at_the_bound(tmp_path):
 def test_a_table_that_claims_a_huge_array_fails_without_the_memory(tmp_path):
     data = pickle.dumps(Calls(np.ndarray, (1 << 50,)), protocol=2)
     (tmp_path / "t.pkl").write_bytes(data)
-    with pytest.raises(AdapterError, match="damaged table"):
+    with pytest.raises(AdapterError, match="an array without its bytes"):
         read_frame(tmp_path / "t.pkl")
 
 

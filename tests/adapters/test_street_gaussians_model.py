@@ -260,7 +260,7 @@ def with_value(content: dict, value: object, *keys: str) -> dict:
         ),
         (
             lambda c: with_value(c, torch.zeros(50, 3, device="meta"), "background", "xyz"),
-            "xyz must be plain numbers",
+            "asks for torch._utils._rebuild_meta",
         ),
         (
             lambda c: with_value(
