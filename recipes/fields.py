@@ -125,7 +125,7 @@ class FieldSpec:
         if self.kind is Kind.WORD:
             text = f"one of {', '.join(self.words)}"
         elif self.kind is Kind.FLAG and self.words:
-            text = f"true, false or {' or '.join(self.words)}"
+            text = f"{', '.join(('true', 'false', *self.words[:-1]))} or {self.words[-1]}"
         elif self.channel is not None:
             text = f"[red, green, blue], each {self.channel.allowed()}"
         elif self.kind is Kind.TEXT:

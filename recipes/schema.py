@@ -179,10 +179,11 @@ class Output(Closed):
     instance: Flag = Field(
         default=False, description="Write the actor number of the heaviest splat."
     )
-    lidar: Flag | Literal["weather"] = Field(
-        default=True,
-        description="Pass LiDAR sweeps through; weather writes them as the recipe's smog, flood "
-        "and snow would have them.",
+    lidar: Flag | Literal["auto", "weather"] = Field(
+        default="auto",
+        description="LiDAR sweeps: true passes them through as recorded, weather writes them as the "
+        "recipe's smog, flood and snow would have them, false writes none; auto is weather where "
+        "the recipe has snow or a flood and surface is not scene, else true.",
     )
     labels: Flag = Field(default=True, description="Pass 3D boxes through.")
 
@@ -228,6 +229,8 @@ class Recipe(Closed):
         Fields younger than the first release are left out at their defaults, which mean what
         recipes without them meant: their hashes stay, and with them the folders they resume.
 
+        Sweeps that auto passes through are those of `lidar: true`, and so is the text.
+
         Where files lie is left out, too: what they hold is in their digest, which
         `recipes.files.with_digest` fills in where a recipe lacks it.
         """
@@ -239,6 +242,8 @@ class Recipe(Closed):
             default = type(model).model_fields[name].default
             if getattr(model, name) == default:
                 del holder[name]
+        if self.output.lidar == "auto" and self.lidar == "clean":
+            data["output"]["lidar"] = True
         for name in FILES if self.style is not None else ():
             del data["style"][name]
         return json.dumps(data, sort_keys=True, separators=(",", ":"))
@@ -247,6 +252,43 @@ class Recipe(Closed):
     def hash(self) -> str:
         """First 16 hex digits of the SHA-256 of canonical_json()."""
         return hashlib.sha256(self.canonical_json().encode()).hexdigest()[:16]
+
+    @property
+    def lidar(self) -> Literal["weather", "clean"] | None:
+        """Which LiDAR sweeps are written, auto resolved: those that agree with the depth images."""
+        asked = self.output.lidar
+        if asked == "auto":
+            in_weather = bool(self._surfaces()) and self.output.surface != "scene"
+            return "weather" if in_weather else "clean"
+        return ("clean" if asked else None) if asked != "weather" else "weather"
+
+    def lidar_note(self, lidar: Literal["weather", "clean"] | None) -> str | None:
+        """Where images, depth and sweeps show different surfaces, if sweeps are such as `lidar`
+        says; None where they agree, or there are no sweeps.
+        """
+        output = self.output
+        has_depth = output.depth != "none" or output.semantic or output.instance
+        notes = []
+        for what, in_depth in self._surfaces().items() if lidar else ():
+            there, absent = ["images"], []
+            if has_depth:
+                (there if in_depth else absent).append("depth")
+            (there if lidar == "weather" else absent).append("sweeps")
+            if absent:
+                notes.append(f"{what} in {' and '.join(there)}, not in {' or '.join(absent)}")
+        asked = str(output.lidar).lower()
+        settings = f"(output: {{lidar: {asked}, surface: {output.surface}}})"
+        return f"{'; '.join(notes)} {settings}" if notes else None
+
+    def _surfaces(self) -> dict[str, bool]:
+        """What of the weather a ray can end on, and whether depth images show it."""
+        snow, shown = self.weather.snow, self.output.surface
+        found = {}
+        if snow is not None and snow.lies:
+            found[f"snow {snow.depth_m:.3g} m deep"] = shown != "scene"
+        if self.weather.flood is not None:
+            found["water"] = shown == "first"
+        return found
 
     def weather_numbers(self) -> dict[str, float]:
         """Flat numbers for the manifest: NaN where absent.

@@ -13,6 +13,8 @@ from augment.batch.backends import choose_backend
 from augment.batch.job import JobResult, RenderJob, run_job
 from augment.batch.layout import variant_name
 from augment.batch.mirror import Links
+from augment.batch.rows import lidar_notes
+from augment.batch.selection import SceneIndex, has_lidar
 from augment.batch.store import open_store
 from augment.batch.times import shares_of
 from augment.cameras import Frame
@@ -76,11 +78,16 @@ def render_recipe(
     ]
     for resolved in recipes:
         make_plan(resolved, scene)  # what the scene cannot give is said once, not for every image
+    chosen = _pattern(frames).select([frame.index for frame in scene.frames])
+    notes = lidar_notes(recipes)
+    if notes and has_lidar(scene, SceneIndex.of(scene, path).labelled.intersection(chosen)):
+        for note in notes:
+            _say(f"note: {note}")
     job = RenderJob(
         scene_uri=scene_uri,
         recipes=recipes,
         out_dir=out,
-        frames=_pattern(frames).select([frame.index for frame in scene.frames]),
+        frames=chosen,
         cameras=None if cameras == "all" else tuple(cameras.split(",")),
         camera_path=path,
         workers=workers,

@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
+import numpy as np
 import torch
 
 from augment.apply import render_view
@@ -15,6 +16,7 @@ from augment.cameras import Camera, Frame
 from augment.geometry import rigid
 from augment.ground_heights import Ground
 from augment.labels import Boxes, LidarSweep
+from augment.lidar_weather.apply import weathered_sweep
 from augment.render import cpu
 from augment.render.backends import CPU, CUDA
 from augment.render.gpu import is_interpreted
@@ -86,12 +88,14 @@ def _warm_recipes(recipes: Sequence[Recipe], backend: str = CPU) -> None:
         ids = output.semantic or output.instance
         water, light = flood and flood.reflection, snow and snow.shading
         worn = style and (style.applied_to, style.method)
-        kernels = (water, light, output.depth, ids, output.surface, worn)
+        kernels = (water, light, output.depth, ids, output.surface, worn, recipe.lidar)
         if kernels not in seen:
             seen.add(kernels)
             level_z_m = 0.0 if flood is None else flood.level_m
             scene = _yard(level_z_m, with_labels=output.labels)
             render_view(scene, scene.frames[0].cameras["warm-up"], recipe, backend=backend)
+            if recipe.lidar == "weather":
+                weathered_sweep(scene, recipe, 0, _one_return(level_z_m))
 
 
 def _yard(level_z_m: float, *, with_labels: bool) -> Scene:
@@ -131,6 +135,11 @@ class _NoLabels:
 
     def lidar(self, frame_index: int) -> LidarSweep | None:
         return None
+
+
+def _one_return(z_m: float) -> LidarSweep:
+    """Of the road, ahead."""
+    return LidarSweep({name: np.array([value]) for name, value in zip("xyz", (4.0, 0.0, z_m))})
 
 
 def _camera(z_m: float) -> Camera:

@@ -98,15 +98,27 @@ def read_parquet(path: Path) -> tuple[pa.Table, dict[str, object]]:
     Raises:
         OutputError: the file is missing, damaged, or without that metadata.
     """
+    note = read_note(path)
     try:
         # One thread: this runs in DataLoader workers, which bring their own parallelism.
-        table = pq.ParquetFile(path).read(use_threads=False)
+        return pq.ParquetFile(path).read(use_threads=False), note
+    except (OSError, pa.ArrowException) as error:
+        raise OutputError(f"{path} is not a readable Parquet file: {error}") from error
+
+
+def read_note(path: Path) -> dict[str, object]:
+    """The metadata that `parquet_bytes` put beside a table.
+
+    Raises:
+        OutputError: as for read_parquet.
+    """
+    try:
+        note = (pq.read_schema(path).metadata or {}).get(METADATA_KEY)
     except (OSError, pa.ArrowException) as error:
         raise OutputError(f"{path} is missing or not a readable Parquet file: {error}") from error
-    note = (table.schema.metadata or {}).get(METADATA_KEY)
     if note is None:
         raise OutputError(f"{path} was not written by this project: its metadata are missing")
-    return table, json.loads(note)
+    return json.loads(note)
 
 
 def _to_arrow(piece: np.ndarray) -> pa.Array | None:

@@ -14,6 +14,7 @@ from augment.batch.columns import (
     column_type,
     pack_column,
     parquet_bytes,
+    read_note,
     read_parquet,
     unpack_column,
 )
@@ -36,14 +37,18 @@ class FrameBoxes:
     boxes: Boxes
 
 
-def lidar_bytes(sweep: LidarSweep) -> bytes:
-    """The sweep as a Parquet file: the source's columns, in its order."""
+def lidar_bytes(sweep: LidarSweep, *, note: str | None = None) -> bytes:
+    """The sweep as a Parquet file: the source's columns, in its order.
+
+    note: kept beside them for `read_lidar_note`.
+    """
     columns, kinds = {}, {}
     for name, column in sweep.columns.items():
         packed = pack_column([column], where=f"LiDAR column {name!r}")
         columns[name] = packed.data
         kinds[name] = [column_type(column), packed.encoding]
-    return parquet_bytes(pa.table(columns), {"kind": "lidar", "columns": kinds})
+    said = {} if note is None else {"note": note}
+    return parquet_bytes(pa.table(columns), {"kind": "lidar", "columns": kinds, **said})
 
 
 def read_lidar(path: Path) -> LidarSweep:
@@ -55,6 +60,19 @@ def read_lidar(path: Path) -> LidarSweep:
     table, note = _read(Path(path), "lidar")
     kinds = note["columns"]
     return LidarSweep({name: unpack_column(table[name], *kinds[name]) for name in kinds})
+
+
+def read_lidar_note(path: Path) -> str | None:
+    """The note that a sweep was written with; its returns are not read.
+
+    Raises:
+        OutputError: as for read_lidar.
+    """
+    note = read_note(path)
+    if note.get("kind") != "lidar":
+        raise OutputError(f"{path} holds {note.get('kind')!r} data; expected 'lidar'")
+    text = note.get("note")
+    return None if text is None else str(text)
 
 
 def boxes_bytes(frames: Mapping[int, FrameBoxes]) -> bytes:

@@ -100,7 +100,7 @@ def item_paths(scene: str, recipe: Recipe, camera: str, frame: int) -> ItemPaths
         instance=f"{base}/instance/{stem}.png" if output.instance else None,
         water=None if weather.flood is None else f"{base}/water/{stem}.png",
         snow=None if weather.snow is None else f"{base}/snow/{stem}.png",
-        lidar=f"{base}/lidar/{frame:06d}.parquet" if output.lidar else None,
+        lidar=f"{base}/lidar/{frame:06d}.parquet" if recipe.lidar else None,
         labels=f"{base}/labels/boxes.parquet" if output.labels else None,
         box_water=f"{base}/{tables['box_water']}" if "box_water" in tables else None,
         box_snow=f"{base}/{tables['box_snow']}" if "box_snow" in tables else None,

@@ -230,6 +230,8 @@ class Ledger:
             status=outcome.status,
             message=outcome.message,
             checksum=outcome.checksum,
+            lidar=outcome.lidar,
+            lidar_note=outcome.lidar_note,
         )
 
 

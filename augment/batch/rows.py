@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 from augment.batch.journal import Identity
@@ -34,6 +34,8 @@ def image_row(
     status: str,
     message: str = "",
     checksum: str = "",
+    lidar: str | None = None,
+    lidar_note: str | None = None,
 ) -> dict[str, Any]:
     """The row by columns. paths: by column; a failed image has none, whatever they say."""
     return {
@@ -42,6 +44,8 @@ def image_row(
         **pictured._asdict(),
         **(paths if status == OK else dict.fromkeys(paths)),
         **shown_words(recipe),
+        "lidar": lidar,
+        "lidar_note": lidar_note,
         **recipe.weather_numbers(),
         "seed": recipe.seed,
         "recipe": recipe.name,
@@ -69,3 +73,19 @@ def shown_words(recipe: Recipe) -> dict[str, str | float | None]:
         "render_scale": recipe.render.scale,
         "settings": settings,
     }
+
+
+def lidar_notes(recipes: Iterable[Recipe]) -> list[str]:
+    """Where LiDAR sweeps show another world than images or depth: a line for each recipe of which
+    they do, about its first such variant."""
+    noted: dict[str, list[str]] = {}
+    for recipe in recipes:
+        note = recipe.lidar_note(recipe.lidar)
+        if note is not None:
+            how = "meets the weather" if recipe.lidar == "weather" else "passes through clean"
+            line = f"{variant_name(recipe)}: LiDAR {how}: {note}"
+            noted.setdefault(recipe.name, []).append(line)
+    return [
+        lines[0] + (f", and {len(lines) - 1} more variants likewise" if lines[1:] else "")
+        for lines in noted.values()
+    ]

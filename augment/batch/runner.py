@@ -5,6 +5,7 @@ The same code runs in the job's own process and in its workers.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import threading
 import time
@@ -12,15 +13,15 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
 from augment.batch.atomic import write_atomic
 from augment.batch.backends import gpu_is_lost, renders_on_gpu
 from augment.batch.box_weather import BoxWeather, has_box_weather, measure_boxes
-from augment.batch.label_files import lidar_bytes
-from augment.batch.layout import item_paths
+from augment.batch.label_files import lidar_bytes, read_lidar_note
+from augment.batch.layout import item_paths, variant_name
 from augment.batch.manifest import FAILED, OK
 from augment.batch.snow_beds import StoredBed
 from augment.batch.style_maps import StoredMaps
@@ -40,7 +41,7 @@ from augment.batch.trajectory import frames_from_json
 from augment.batch.writer import View, WritePump, check_view, write_view
 from augment.cameras import Camera
 from augment.errors import GpuLost, OutputError
-from augment.labels import Boxes
+from augment.labels import Boxes, LidarSweep
 from augment.scene import Scene
 from recipes.schema import Recipe
 
@@ -98,7 +99,7 @@ class Chunk:
 class Outcome:
     """What became of one image.
 
-    lidar: whether the frame has a sweep. box_weather: what each effect of the recipe does to its
+    lidar, lidar_note: as of PassedLidar. box_weather: what each effect of the recipe does to its
     boxes, where there are labels.
     """
 
@@ -108,8 +109,16 @@ class Outcome:
     status: str
     message: str = ""
     checksum: str = ""
-    lidar: bool = False
+    lidar: str | None = None
+    lidar_note: str | None = None
     box_weather: BoxWeather = field(default_factory=dict)
+
+
+class PassedLidar(NamedTuple):
+    """A frame's sweep. lidar: weather or clean, None without one. note: as of Recipe.lidar_note."""
+
+    lidar: str | None = None
+    note: str | None = None
 
 
 def describe(error: BaseException, doing: str) -> str:
@@ -177,6 +186,7 @@ class FrameRunner:
         self._maps = {stored.style: stored for stored in setup.maps}
         self._boxes: dict[int, Boxes] = {}  # of the frames so far
         self._reading_boxes = threading.Lock()
+        self._warned: set[str] = set()  # variants of which a sweep could not be weathered
         self._in_flight: tuple[_Drawn, Pending] | None = None
         self._times, self._started = WorkTimes(), time.perf_counter()
 
@@ -290,7 +300,7 @@ class FrameRunner:
                 (Path(self._setup.out_dir) / file).unlink(missing_ok=True)
             done = Outcome(done.variant, done.frame, done.camera, FAILED, passed)
         else:
-            done = replace(done, lidar=passed)
+            done = replace(done, lidar=passed.lidar, lidar_note=passed.note)
         with self._times.spent(WRITE):
             self._deliver(done)
 
@@ -305,29 +315,55 @@ class FrameRunner:
         origin = np.asarray(self._scene.world_origin_m, np.float64)
         return measure_boxes(self._boxes[frame], origin, camera, view)
 
-    def _pass_lidar(self, chunk: Chunk, recipe: Recipe) -> bool | str:
+    def _pass_lidar(self, chunk: Chunk, recipe: Recipe) -> PassedLidar | str:
         """Write the frame's sweep, in the weather or as it is, unless it is there already.
 
-        Returns whether the frame has one, or a message where it cannot be read.
+        Returns what became of it, or a message where it cannot be read.
         """
-        if not recipe.output.lidar or chunk.frame not in self._setup.labelled:
-            return False
+        if recipe.lidar is None or chunk.frame not in self._setup.labelled:
+            return PassedLidar()
         paths = item_paths(self._scene.name, recipe, "", chunk.frame)
         assert paths.lidar is not None
         target = Path(self._setup.out_dir) / paths.lidar
         if target.exists():
-            return True
+            with contextlib.suppress(OutputError):  # a damaged one is written anew
+                return _passed(recipe, read_lidar_note(target))
         with self._times.spent(LIDAR):
             try:
                 sweep = self._scene.lidar(chunk.frame)
-                if sweep is not None and recipe.output.lidar == "weather":
-                    from augment.lidar_weather.apply import weathered_sweep  # brings the kernels
-
-                    sweep = weathered_sweep(self._scene, recipe, chunk.frame, sweep)
-                data = None if sweep is None else lidar_bytes(sweep)
+                if sweep is None:
+                    return PassedLidar()
+                sweep, fault = self._weathered(sweep, chunk.frame, recipe)
+                data = lidar_bytes(sweep, note=fault)
             except Exception as error:
                 return describe(error, "reading the LiDAR sweep")
-            if data is None:
-                return False
-            write_atomic(target, data)
-            return True
+            write_atomic(target, data, clear=False)
+            return _passed(recipe, fault)
+
+    def _weathered(
+        self, sweep: LidarSweep, frame: int, recipe: Recipe
+    ) -> tuple[LidarSweep, str | None]:
+        """The sweep as the recipe wants it. Where only `auto` asks for weather, one that cannot
+        have it is passed through, with the reason."""
+        if recipe.lidar != "weather":
+            return sweep, None
+        from augment.lidar_weather.apply import weathered_sweep  # brings the kernels
+
+        try:
+            return weathered_sweep(self._scene, recipe, frame, sweep), None
+        except Exception as error:
+            if recipe.output.lidar != "auto":
+                raise
+            fault = describe(error, "no weather on this sweep")
+            variant = variant_name(recipe)
+            if variant not in self._warned:  # of its other frames the manifest tells
+                self._warned.add(variant)
+                _log.warning("%s, frame %d: LiDAR passes through: %s", variant, frame, fault)
+            return sweep, fault
+
+
+def _passed(recipe: Recipe, fault: str | None) -> PassedLidar:
+    """What the manifest says of a sweep. fault: why it has no weather, where it should have."""
+    if fault is None:
+        return PassedLidar(recipe.lidar, recipe.lidar_note(recipe.lidar))
+    return PassedLidar("clean", f"{recipe.lidar_note('clean')}: {fault}")

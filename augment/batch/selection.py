@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -86,6 +86,20 @@ def select_frames(
             f"{len(known)} frames and the cameras {_listed(names) or 'none'}"
         )
     return selected
+
+
+def has_lidar(scene: Scene, frames: Iterable[int]) -> bool:
+    """Whether any of the frames has a LiDAR sweep, readable or not."""
+    labels = scene.labels
+    if labels is None:
+        return False
+    for number in frames:
+        try:
+            if labels.lidar(number) is not None:
+                return True
+        except Exception:  # of a damaged file its own frame tells
+            return True
+    return False
 
 
 def _listed(values: Sequence[object]) -> str:

@@ -29,7 +29,7 @@ from augment.batch.journal import Identity
 from augment.batch.layout import MANIFEST, PATH_KINDS, STATE_FOLDER
 from augment.batch.manifest import FAILED, OK, rows_to_table
 from augment.batch.parts import compact, list_parts, parts_to_merge, publish_part, read_finished
-from augment.batch.rows import image_row
+from augment.batch.rows import image_row, lidar_notes
 from augment.batch.store import Store, StoredFileMissing, open_store
 from augment.batch.times import WORKERS
 from augment.errors import OutputError
@@ -239,6 +239,10 @@ class _Generation:
 
     def _render(self, pending: Sequence[Block], total: int) -> None:
         if pending:
+            records = self._plan.records
+            with_lidar = [block for block in pending if records[block.scene].has_lidar]
+            for note in lidar_notes({b.variant: b.recipe for b in with_lidar}.values()):
+                _log.warning("note: %s", note)
             self._prepare(list({block.recipe.name: block.recipe for block in pending}.values()))
         self._bar = tqdm(
             total=total,

@@ -12,7 +12,7 @@ import augment
 from augment.batch.journal import Identity
 from augment.batch.layout import folder_name, variant_name
 from augment.batch.rows import Pictured
-from augment.batch.selection import SceneIndex, select_frames
+from augment.batch.selection import SceneIndex, has_lidar, select_frames
 from augment.batch.trajectory import RECORDED
 from augment.cameras import scaled_size
 from augment.errors import OutputError, SceneError
@@ -36,7 +36,7 @@ class FrameRecord:
 class SceneRecord:
     """A scene's frames and cameras. uri: as the job names it. source: as the scene does itself.
 
-    has_labels: whether boxes can pass through. open_s: how long opening it took. gaussians_bytes:
+    has_labels: whether boxes can pass through. has_lidar: whether a frame has a sweep. open_s: how long opening it took. gaussians_bytes:
     of its splats.
     """
 
@@ -47,6 +47,7 @@ class SceneRecord:
     open_s: float
     gaussian_bytes: int
     frames: tuple[FrameRecord, ...]
+    has_lidar: bool = True  # in records of before it was asked
 
     @staticmethod
     def of(scene: Scene, uri: str, open_s: float) -> SceneRecord:
@@ -56,6 +57,7 @@ class SceneRecord:
             name=scene.name,
             source=scene.source,
             has_labels=scene.labels is not None,
+            has_lidar=has_lidar(scene, [frame.index for frame in scene.frames]),
             open_s=open_s,
             gaussian_bytes=scene.gaussian_bytes,
             frames=tuple(

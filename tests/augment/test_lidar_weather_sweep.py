@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import dataclasses
+import re
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
-from batch_scenes import fake_render, make_recipe, open_fake
+from batch_scenes import FakeLabels, fake_render, make_recipe, open_fake
 
 from augment.batch.job import RenderJob, run_job
 from augment.batch.label_files import lidar_bytes, read_lidar
 from augment.batch.manifest import read_manifest
+from augment.batch.rows import lidar_notes
+from augment.batch.selection import has_lidar
+from augment.errors import OutputError
 from augment.labels import LidarSweep
 from augment.lidar_weather import LOST, MOVED, SCATTERED, UNCHANGED, drop_lost
 from augment.lidar_weather.apply import weathered_sweep
@@ -149,6 +155,63 @@ def test_a_job_writes_weathered_sweeps(tmp_path: Path) -> None:
     job = RenderJob("fake:street", [off], tmp_path / "off")
     run_job(job, scene_loader=open_fake, renderer=fake_render, progress=False)
     assert {row["lidar_path"] for row in read_manifest(tmp_path / "off").to_pylist()} == {None}
+
+
+@dataclass(frozen=True)
+class _Misfit(FakeLabels):
+    """Labels whose origins do not fit frame 1."""
+
+    def lidar_origins(self, frame_index, sweep):
+        return np.zeros((len(sweep) - (frame_index == 1), 3))
+
+
+def test_auto_weathers_what_it_can_and_tells_of_the_rest(tmp_path: Path) -> None:
+    scene = dataclasses.replace(open_fake("fake:street"), labels=_Misfit())
+    wet = make_recipe("wet", flood=Flood(level_m=40, reference="absolute"), depth="none")
+    strict = wet.model_copy(update={"output": wet.output.model_copy(update={"lidar": "weather"})})
+
+    def outcome(recipe: Recipe, out: Path, **options) -> tuple[int, dict[int, tuple]]:
+        job = RenderJob("fake:street", [recipe], out, cameras=["front"], **options)
+        done = run_job(job, scene_loader=lambda _: scene, renderer=fake_render, progress=False)
+        rows = read_manifest(out).to_pylist()
+        return done.failed, {row["frame"]: (row["lidar"], row["lidar_note"]) for row in rows}
+
+    failed, shown = outcome(wet, tmp_path / "out")
+    assert failed == 0 and shown[0] == shown[2] == ("weather", shown[0][1])
+    assert shown[3] == (None, None)  # there is no sweep
+    kind, note = shown[1]
+    assert kind == "clean" and "not in depth or sweeps" in note
+    assert re.search(r"no weather on this sweep: ValueError: lidar_origins of _Misfit", note)
+    paths = [tmp_path / f"out/street/wet-000/lidar/{n:06d}.parquet" for n in range(3)]
+    sweeps = [read_lidar(path) for path in paths]
+    assert [ADDED <= set(sweep.columns) for sweep in sweeps] == [True, False, True]
+    assert lidar_bytes(sweeps[1]) == lidar_bytes(scene.lidar(1))
+    # Sweeps that another run has left say what they are; a damaged one is written anew.
+    before = [path.read_bytes() for path in paths]
+    for image in (tmp_path / "out/street/wet-000/images/front").iterdir():
+        image.unlink()
+    paths[2].write_bytes(before[2][:100])
+    assert outcome(wet, tmp_path / "out") == (0, shown)
+    assert [path.read_bytes() for path in paths] == before
+    failed, shown = outcome(strict, tmp_path / "strict")
+    assert failed == 1 and shown[1] == (None, None) and shown[0][0] == "weather"
+    with pytest.raises(OutputError, match="recipe hash there"):
+        outcome(strict, tmp_path / "out")
+
+
+def test_the_notes_of_a_job_are_one_line_a_recipe() -> None:
+    clean = {"lidar": True, "depth": "none"}
+    snowy = [make_recipe("snowy", n, snow=Snow(depth_m=0.1 + n), **clean) for n in range(3)]
+    dry, wet = make_recipe("dry", **clean), make_recipe("wet", flood=Flood(level_m=0.1))
+    assert lidar_notes([*snowy, dry, wet]) == [
+        "snowy-000: LiDAR passes through clean: snow 0.1 m deep in images and depth, not in sweeps "
+        "(output: {lidar: true, surface: solid}), and 2 more variants likewise",
+        "wet-000: LiDAR meets the weather: water in images and sweeps, not in depth "
+        "(output: {lidar: auto, surface: solid})",
+    ]
+    scene = open_fake("fake:street")
+    assert has_lidar(scene, [3, 0]) and not has_lidar(scene, [3])
+    assert not has_lidar(dataclasses.replace(scene, labels=None), [0])
 
 
 def test_recipes_hashes_stay() -> None:

@@ -97,8 +97,10 @@ def test_the_hash_is_pinned() -> None:
     """Output folders are resumed by it: it changes only with the format."""
     assert smoggy(visibility_m=300).hash == "272920d93c3e113c"
     assert Recipe().hash == "8553a2737c7b8e42"
-    assert Recipe(weather=Weather(flood=Flood(level_m=0.2))).hash == "efb12819c12b5307"
-    assert Recipe(weather=Weather(snow=Snow(depth_m=0.1))).hash == "0b005b8e06d7eedd"
+    clean = Output(lidar=True)
+    flooded, snowy = Weather(flood=Flood(level_m=0.2)), Weather(snow=Snow(depth_m=0.1))
+    assert Recipe(weather=flooded, output=clean).hash == "efb12819c12b5307"
+    assert Recipe(weather=snowy, output=clean).hash == "0b005b8e06d7eedd"
     assert Recipe(style=Style(preset="dusk")).hash == "535470ef48aaa9f4"
 
 
@@ -132,9 +134,49 @@ def test_recipes_from_before_snow_keep_their_hashes() -> None:
         "puddled": "602327c5f75e697a",
         "street-flood": "8e0fcd6fb1df7b39",
     }
-    assert {name: load_recipe(name).resolve(0).hash for name in before} == before
-    first = Recipe(weather=Weather(flood=Flood(level_m=0.2)), output=Output(surface="first"))
-    assert first.hash == "cac7905aab0116ca"
+    old = {"output": Output(lidar=True)}  # what they said of LiDAR where nothing was said
+    recipes = {name: load_recipe(name).resolve(0).model_copy(update=old) for name in before}
+    assert {name: recipe.hash for name, recipe in recipes.items()} == before
+    first = Output(surface="first", lidar=True)
+    flooded = Recipe(weather=Weather(flood=Flood(level_m=0.2)), output=first)
+    assert flooded.hash == "cac7905aab0116ca"
+
+
+def test_auto_weathers_lidar_where_the_depth_images_show_a_surface_of_the_weather() -> None:
+    """Recipes whose sweeps are as before keep their hashes; others are not mixed with them."""
+    smog, flood, snow = Smog(visibility_m=300), Flood(level_m=0.2), Snow(depth_m=0.1)
+    no_snow = [Snow(depth_m=0), Snow(depth_m=0.1, coverage=0)]
+    snow_depth, water_depth = "snow 0.1 m deep in images and", "water in images and"
+    for weather, surface, lidar, note in (
+        (Weather(), "solid", "clean", None),
+        (Weather(smog=smog), "first", "clean", None),
+        *((Weather(snow=each), "solid", "clean", None) for each in no_snow),
+        (Weather(smog=smog, snow=snow), "solid", "weather", None),
+        (Weather(snow=snow), "first", "weather", None),
+        (Weather(snow=snow), "scene", "clean", "snow 0.1 m deep in images, not in depth or sweeps"),
+        (Weather(flood=flood), "solid", "weather", f"{water_depth} sweeps, not in depth"),
+        (Weather(flood=flood), "first", "weather", None),
+        (Weather(flood=flood), "scene", "clean", "water in images, not in depth or sweeps"),
+    ):
+        recipe = Recipe(weather=weather, output=Output(surface=surface))
+        said = recipe.lidar_note(recipe.lidar)
+        expected = note and f"{note} (output: {{lidar: auto, surface: {surface}}})"
+        assert (recipe.lidar, said) == (lidar, expected), (weather, surface)
+        plain = Recipe(weather=weather, output=Output(surface=surface, lidar=True))
+        assert (recipe.hash == plain.hash) == (lidar == "clean")
+        for kind in (False, "weather"):
+            other = Recipe(weather=weather, output=Output(surface=surface, lidar=kind))
+            assert other.lidar == (kind or None) and other.hash not in (recipe.hash, plain.hash)
+    clean = Recipe(weather=Weather(flood=flood, snow=snow), output=Output(lidar=True))
+    assert clean.lidar_note("clean") == (
+        f"{snow_depth} depth, not in sweeps; water in images, not in depth or sweeps "
+        "(output: {lidar: true, surface: solid})"
+    )
+    assert clean.lidar_note(None) is None
+    forced = Recipe(
+        weather=Weather(snow=snow), output=Output(lidar="weather", surface="scene", depth="none")
+    )
+    assert forced.lidar_note("weather") is None  # there is no depth to disagree
 
 
 def test_the_hash_does_not_depend_on_how_a_number_was_written() -> None:
