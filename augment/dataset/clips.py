@@ -170,8 +170,7 @@ def _runs(rows: Rows, cameras: Sequence[str] | None) -> Iterator[np.ndarray]:
 
 def _by_variant(rows: Rows) -> Iterator[np.ndarray]:
     """The numbers of the rows of each scene under each variant, in the order of the rows."""
-    scenes, variants = rows.coded("scene"), rows.coded("variant")
-    keys = scenes.codes.astype(np.int64) * len(variants.values) + variants.codes
+    keys = rows.variants()[1]
     order = np.argsort(keys, kind="stable")
     yield from np.split(order, np.flatnonzero(np.diff(keys[order])) + 1) if len(order) else ()
 

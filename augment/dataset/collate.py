@@ -15,19 +15,26 @@ _MATRICES = ("K", "world_from_camera", "world_from_ego")
 def collate_frames(samples: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """A batch of samples, for `DataLoader(collate_fn=collate_frames)`.
 
-    Images and buffers of one size are stacked to [N, ...]; of unlike sizes, or where a sample has
-    none, they stay a list. camera: K [N, 3, 3], world_from_camera and world_from_ego [N, 4, 4] and
-    int64 [N] tensors, name a list. weather: float64 [N] per number, NaN where a sample lacks it.
-    Everything else, boxes above all, is a list with one entry a sample.
+    Images and buffers of one size are stacked to [N, ...]; of unlike sizes they stay a list, as do
+    masks of water and snow where a sample has none. camera: K [N, 3, 3], world_from_camera and
+    world_from_ego [N, 4, 4] and int64 [N] tensors, name a list. weather: float64 [N] per number,
+    NaN where a sample lacks it. Everything else, boxes above all, is a list with one entry a
+    sample.
 
     Clips gain the same dimension in front: image [N, T, C, 3, H, W], K [N, T, C, 3, 3], frame
     [N, T]. Pairs become a dictionary of two batches.
+
+    Raises:
+        ValueError: some samples have an image or buffer that others lack, masks excepted: datasets
+            of unlike outputs or `load` are mixed.
     """
     first = samples[0]
     if "weathered" in first and "clean" in first:
         return {side: collate_frames([pair[side] for pair in samples]) for side in first}
     batch: dict[str, Any] = {key: [sample[key] for sample in samples] for key in first}
     for key in IMAGES:
+        if key not in ("water", "snow"):  # only such weather has these masks
+            _check_all_have(key, samples)
         batch[key] = stacked(batch[key])
     batch["camera"] = _cameras(batch["camera"])
     numbers = dict.fromkeys(name for sample in samples for name in sample["weather"])
@@ -39,6 +46,17 @@ def collate_frames(samples: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     }
     batch["frame"] = _whole(batch["frame"])
     return batch
+
+
+def _check_all_have(key: str, samples: Sequence[Mapping[str, Any]]) -> None:
+    lacking = [sample for sample in samples if sample[key] is None]
+    if 0 < len(lacking) < len(samples):
+        names = {f"{sample['scene']}/{sample['variant']}": None for sample in lacking}
+        raise ValueError(
+            f"{len(lacking)} of a batch's {len(samples)} samples have no {key}: of scene/variant "
+            f"{', '.join(names)}. Leave {key!r} out of `load` in all datasets that are mixed, or "
+            f"mix only outputs that have it"
+        )
 
 
 def stacked(values: Sequence[Any]) -> Any:

@@ -104,10 +104,11 @@ class MixedDataset(Dataset):
     As long as `clean`. fraction: the probability of an exchange, where there is a weathered image;
     which of several is drawn too, each as likely. What an index yields depends on the seed, the
     epoch and the index only: not on the worker, nor on what was asked before. Both datasets need
-    the same `load`, `image_type` and `transform`, or their samples do not stack.
+    the same `image_type` and `transform`, or their samples do not stack.
 
     Raises:
-        ValueError: a fraction outside 0 to 1, or two clean images of one moment.
+        ValueError: a fraction outside 0 to 1, two clean images of one moment, or one dataset's
+            samples have what the other's lack (masks of water and snow excepted).
     """
 
     def __init__(
@@ -115,6 +116,8 @@ class MixedDataset(Dataset):
     ) -> None:
         if not 0 <= fraction <= 1:
             raise ValueError(f"fraction must be 0 to 1; got {fraction}")
+        if len(clean) and len(weathered):
+            _check_alike(clean, weathered)
         self.clean, self.weathered, self.fraction, self.seed = clean, weathered, fraction, seed
         partner = _partners(clean.rows, weathered.rows)
         # The weathered rows of clean row i are _rows[_ends[i]:_ends[i + 1]].
@@ -146,6 +149,18 @@ class MixedDataset(Dataset):
         if rng.random() >= self.fraction:
             return None
         return int(self._rows[rng.integers(start, end)])
+
+
+def _check_alike(clean: WeatherDataset, weathered: WeatherDataset) -> None:
+    sides = {"clean": clean, "weathered": weathered}
+    for name, other in (("clean", "weathered"), ("weathered", "clean")):
+        if lacking := sorted(sides[other].given() - sides[name].given()):
+            raise ValueError(
+                f"samples of `{name}` ({', '.join(sides[name].uris)}) have no "
+                f"{', '.join(lacking)}, those of `{other}` ({', '.join(sides[other].uris)}) have: "
+                f"batches would not stack. Open both with a `load` without it, or render it for "
+                f"`{name}` too"
+            )
 
 
 def _partners(clean: Rows, weathered: Rows) -> np.ndarray:

@@ -189,6 +189,38 @@ class Rows:
             raise TypeError(f"column {name!r} holds {type(column).__name__}, not names or numbers")
         return column
 
+    def with_outputs(self, uris: list[str], lengths: list[int]) -> Rows:
+        """The rows with a column `output`: the first rows are of the first URI, and so on."""
+        codes = _smallest(np.repeat(np.arange(len(uris)), lengths), len(uris))
+        schema = self.schema.append(pa.field("output", pa.string()))
+        return Rows({**self.columns, "output": Coded(codes, list(uris))}, schema, self.weather)
+
+    def output_of(self, row: int) -> int:
+        """Which of several outputs a row is of, by its number."""
+        return int(self.coded("output").codes[row]) if "output" in self.columns else 0
+
+    def variants(self) -> tuple[list[tuple[int, str, str]], np.ndarray]:
+        """The output's number, scene and variant of all that there are, and which of them each row
+        is of, int64 [N].
+        """
+        scenes, variants = self.coded("scene"), self.coded("variant")
+        keys = scenes.codes.astype(np.int64) * len(variants.values) + variants.codes
+        if "output" in self.columns:
+            outputs = self.coded("output").codes.astype(np.int64)
+            keys += outputs * len(scenes.values) * len(variants.values)
+        found, codes = np.unique(keys, return_inverse=True)
+        rest, variant = np.divmod(found, max(len(variants.values), 1))
+        output, scene = np.divmod(rest, max(len(scenes.values), 1))
+        each = zip(output.tolist(), scene.tolist(), variant.tolist(), strict=True)
+        return [(o, scenes.values[s], variants.values[v]) for o, s, v in each], codes
+
+    def has(self, kind: str) -> np.ndarray:
+        """bool [N]: the rows that name a file of a kind of `samples.LOADABLE`."""
+        column = self.columns[f"{'labels' if kind == 'boxes' else kind}_path"]
+        assert isinstance(column, Paths)
+        there = np.array([name is not None for name in column.names.values], bool)
+        return there[column.names.codes] if len(there) else np.zeros(len(self), bool)
+
     def numbers(self, name: str) -> np.ndarray:
         """A numeric column, [N]; null is NaN.
 

@@ -23,12 +23,19 @@ from batch_scenes import (
     must_not_render,
     open_fake,
 )
-from dataset_folders import assert_same_sample
+from dataset_folders import CLEAR, FOGGY, assert_same_sample, write_scene
 from torch.utils.data import DataLoader
 
 from augment.batch.job import RenderJob, run_job
 from augment.batch.water_labels import WATER_TABLE, BoxWater
-from augment.dataset import SceneDataset, WeatherDataset, collate_frames
+from augment.dataset import (
+    ClipDataset,
+    MixedDataset,
+    SceneDataset,
+    WeatherDataset,
+    clean_frames,
+    collate_frames,
+)
 from augment.errors import BackendUnavailable, OutputError, SceneError
 from augment.weather.flood_labels import hidden_pixels, submerged_fraction
 from recipes.flood import Flood
@@ -136,12 +143,12 @@ def test_batches_of_flooded_samples(written: Path) -> None:
 
 
 def test_filters(written: Path) -> None:
-    assert len(WeatherDataset(written)) == 32
+    assert len(WeatherDataset(written, load=["image"])) == 32
     flooded = WeatherDataset(written, where=pc.field("water_path").is_valid())
     assert set(flooded.table["variant"].to_pylist()) == {"clear-009"}
     foggy = WeatherDataset(written, where=pc.field("smog_extinction_per_m") > 0)
     assert set(foggy.table["variant"].to_pylist()) == {"fog-000", "fog-001"}
-    assert len(WeatherDataset(written, cameras=["front"], frames=[0, 2])) == 8
+    assert len(WeatherDataset(written, cameras=["front"], frames=[0, 2], load=())) == 8
     assert len(WeatherDataset(written, scenes=[])) == 0
     with pytest.raises(ValueError, match=r"no camera \['back'\]; finished are: front, rear/left"):
         WeatherDataset(written, cameras=["back"])
@@ -170,7 +177,7 @@ def test_bytes_on_request(written: Path) -> None:
 
 
 def test_in_a_data_loader_with_workers(written: Path) -> None:
-    files = WeatherDataset(written, variants=["fog-000", "clear-000"], frames=[2, 3])
+    files = WeatherDataset(written, variants=["fog-000", "clear-009"], frames=[2, 3])
     assert ForkingPickler.dumps(files)  # a worker started by spawn would receive this
     loader = DataLoader(
         files, batch_size=3, num_workers=2, collate_fn=collate_frames,
@@ -180,15 +187,62 @@ def test_in_a_data_loader_with_workers(written: Path) -> None:
     assert [len(batch["scene"]) for batch in batches] == [3, 3, 2]
     first, last = batches[0], batches[-1]
     assert first["image"].shape == (3, 3, 16, 24)
-    assert first["depth"] is None  # clear-000 comes first and has none
-    assert batches[1]["depth"][0] is None and batches[1]["depth"][1].shape == (16, 24)
-    assert last["depth"].shape == (2, 16, 24)
+    assert first["depth"].shape == first["water"].shape == (3, 16, 24)  # clear-009 comes first
+    assert last["water"] is None  # without a flood there is none
+    assert batches[1]["water"][1] is None and batches[1]["water"][0].shape == (16, 24)
     assert [len(boxes["labels"]) for boxes in first["boxes"]] == [2, 2, 3]
     assert first["camera"]["K"].shape == (3, 3, 3)
     assert first["camera"]["world_from_camera"].dtype == torch.float64
     assert first["camera"]["timestamp_ns"].dtype == torch.int64
     assert last["weather"]["smog_extinction_per_m"].shape == (2,)
     assert torch.equal(last["image"][1], files[7]["image"])
+
+
+def test_outputs_that_lack_what_others_have_are_refused_by_name(tmp_path: Path) -> None:
+    full, bare = tmp_path / "full", tmp_path / "bare"
+    write_scene(full, [CLEAR, FOGGY, FLOODED])
+    none = {"semantic": False, "labels": False, "lidar": False}
+    write_scene(bare, [make_recipe(variant=number, **none) for number in range(4)])
+    alike, poor = WeatherDataset(full), WeatherDataset(bare)  # masks need not be everywhere
+    assert len(WeatherDataset([full])) == len(alike) == 24
+    assert poor[0]["semantic"] is None and poor.given() == {"image", "depth", "instance"}
+    fog = "street/fog-000, street/fog-001, street/fog-002 and 1 more"
+    named = rf"boxes: none in {bare} \({fog}\); semantic: none in {bare} .* Leave it out "
+    with pytest.raises(ValueError, match=named + r"\(load=\('image', 'depth', 'instance', 'water'"):
+        WeatherDataset([full, bare])
+    with pytest.raises(ValueError, match=rf"lidar: none in {bare} .*load=\('depth',\)"):
+        WeatherDataset([full, bare], load=["lidar", "depth"])
+    assert len(WeatherDataset([full, bare], load=["image", "depth", "water"])) == 56
+    assert len(WeatherDataset([full, bare], variants=["clear-000", "clear-009"])) == 16
+    # Of datasets opened apart, by what takes them together.
+    with pytest.raises(ValueError, match=rf"`weathered` \({bare}\) have no boxes, semantic, those"):
+        MixedDataset(clean_frames(alike), poor, 0.5)
+    with pytest.raises(ValueError, match=r"`clean` \(.*full\) have no depth, those of `weathered`"):
+        MixedDataset(WeatherDataset(full, load=()), WeatherDataset(bare, load=["depth"]), 0.5)
+    with pytest.raises(
+        ValueError, match=r"1 of a batch's 2 samples have no semantic: .* street/fo"
+    ):
+        collate_frames([alike[0], poor[0]])
+    for root, fault in (([], "got an empty list"), ([full, tmp_path], "no output folder")):
+        with pytest.raises((ValueError, OutputError), match=fault):
+            WeatherDataset(root)
+
+
+def test_outputs_together_have_the_samples_of_each(tmp_path: Path) -> None:
+    one, other = tmp_path / "one", tmp_path / "other"
+    write_scene(one, [CLEAR, FLOODED])
+    write_scene(other, [CLEAR, FOGGY], frames=3)
+    apart = [WeatherDataset(one), WeatherDataset(other)]
+    both = pickle.loads(pickle.dumps(WeatherDataset([one, other])))
+    assert len(both) == len(apart[0]) + len(apart[1]) == 28
+    for index, of in ((0, apart[0][0]), (15, apart[0][15]), (16, apart[1][0]), (27, apart[1][11])):
+        assert_same_sample(both[index], of)
+    assert both.table["output"].to_pylist() == [str(one)] * 16 + [str(other)] * 12
+    foggy = WeatherDataset([one, other], where=pc.field("smog_extinction_per_m") > 0)
+    assert_same_sample(foggy[0], apart[1][6])
+    # A clip is of one output, though both have the scene and the variant.
+    lengths = [len(ClipDataset(dataset, 3)) for dataset in (*apart, both)]
+    assert lengths[2] == lengths[0] + lengths[1] > 0
 
 
 def test_failed_images_are_left_out(tmp_path: Path) -> None:

@@ -206,7 +206,7 @@ def test_companions_beyond_the_limit_are_read_again(written: Path, monkeypatch) 
     expected = WeatherDataset(written)
     for index in order:
         assert_same_sample(dataset[index], expected[index])
-        assert len(dataset._reader._calibration._values) == 1
+        assert len(dataset._readers[0]._calibration._values) == 1
 
 
 def test_packed_rows_are_the_manifests(written: Path, monkeypatch) -> None:
