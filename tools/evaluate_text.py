@@ -1,20 +1,10 @@
-"""The consistency of an output as Markdown tables, and what the paper reports beside it."""
+"""The consistency of an output as Markdown tables."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from typing import Any
 
-# ClimateGS, its table of consistency: LPIPS and RMSE over short range, then over long range.
-PAPER = {
-    "original images": (0.070, 0.069, 0.213, 0.198),
-    "FPRF": (0.082, 0.084, 0.154, 0.165),
-    "StyleGaussian": (0.062, 0.057, 0.181, 0.164),
-    "ClimateGS": (0.057, 0.053, 0.171, 0.175),
-}
-PAPER_NOTE = (
-    "The paper's figures, for context only: other scenes, and a protocol that is not published."
-)
 _PARTS = {"all": "", "dry": "without water", "water": "water only"}
 
 
@@ -36,14 +26,7 @@ def evaluation_text(facts: dict[str, Any]) -> str:
             f"count are taken to agree; `counted` is it divided by the share that counts.",
             "",
         ]
-    return "\n".join([*lines, PAPER_NOTE, "", *paper_lines()])
-
-
-def paper_lines() -> list[str]:
-    """The paper's table."""
-    head = "| | LPIPS, short | RMSE, short | LPIPS, long | RMSE, long |"
-    rows = (f"| {n} | {' | '.join(f'{v:.3f}' for v in each)} |" for n, each in PAPER.items())
-    return [head, "|---|---|---|---|---|", *rows]
+    return "\n".join(lines).rstrip()
 
 
 def _table(facts: dict[str, Any], kind: str, with_lpips: bool) -> list[str]:

@@ -22,7 +22,6 @@ from augment.metrics.lpips import ALEX, expected_shapes
 from recipes.schema import Output
 from tools.evaluate import evaluate_output
 from tools.evaluate_command import evaluate
-from tools.evaluate_text import PAPER
 from tools.json_files import write_json
 
 FRAMES = 8
@@ -149,7 +148,9 @@ def test_command(walls, tmp_path, capsys):
     assert code == 0
     assert "1 frame apart" in out and "7 frames apart" in out and "Neighbouring cameras" in out
     assert "| flood | flood | 2 | 0 | 0.10 m, 0.10 s |" in out and "| water only |" in out
-    assert all(name in out for name in PAPER) and "0.057 | 0.053 | 0.171 | 0.175" in out
+    # Every row is this output's: a method's published figures are no result of it.
+    rows = {line.split("|")[1].strip() for line in out.splitlines() if line.startswith("| ")}
+    assert rows == {"recipe", "flood", "without water", "water only"}
     facts = json.loads((tmp_path / "facts.json").read_text())
     assert facts["lpips"] == "alex" and len(facts["pairs"]) == 6
     short = next(p for p in facts["pairs"] if p["kind"] == "short")["all"]
