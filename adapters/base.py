@@ -50,8 +50,7 @@ def open_scene(uri: str) -> Scene:
     if entry.builtin:
         scene = _open_builtin(scheme, entry, path, query)
     else:
-        if not Path(path).exists():
-            raise AdapterError(_missing(path))
+        _check_there(Path(path))
         try:
             scene = _load(entry)(path, query)
         except OSError as error:
@@ -81,8 +80,7 @@ def recognise(path: Path) -> str:
     Raises:
         AdapterError: nothing there, or nothing known; says what was looked for.
     """
-    if not path.exists():
-        raise AdapterError(_missing(str(path)))
+    _check_there(path)
     scheme = recognised(path)
     if scheme is None:
         raise AdapterError(
@@ -105,8 +103,12 @@ def _load(entry: Scheme):
     return getattr(importlib.import_module(entry.module), entry.function)
 
 
-def _missing(path: str) -> str:
-    absolute = Path(path).absolute()
+def _check_there(path: Path) -> None:
+    if path.is_dir() or path.is_file():
+        return
+    if path.exists():
+        raise AdapterError(f"{path}: a pipe or device; a scene is a regular file or a folder")
+    absolute = path.absolute()
     parent = next((p for p in absolute.parents if p.exists()), Path("/"))
     where = "" if parent == absolute.parent else f"; the path exists up to {parent}"
-    return f"{path}: no such file or folder (looked at {absolute}{where})"
+    raise AdapterError(f"{path}: no such file or folder (looked at {absolute}{where})")

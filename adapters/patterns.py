@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import fnmatch
 import glob
-from collections.abc import Iterable
+import itertools
+import os
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from adapters.base import recognise
 from adapters.uri import SCHEMES, format_uri, parse_uri
 from augment.errors import AdapterError
 from recipes.job import JobScene
+
+MAX_LOOKED_AT = 500_000  # files and folders, for one pattern: a second or two
 
 
 def scenes_of(entries: Iterable[JobScene], folder: Path) -> list[JobScene]:
@@ -20,7 +25,8 @@ def scenes_of(entries: Iterable[JobScene], folder: Path) -> list[JobScene]:
     relative paths start.
 
     Raises:
-        AdapterError: a pattern matches nothing, a scene is named twice, or a pattern has a name.
+        AdapterError: a pattern matches nothing or too much is below it to be looked through, a
+            scene is named twice, or a pattern has a name.
     """
     scenes: dict[str, JobScene] = {}
     for entry in entries:
@@ -52,13 +58,58 @@ def _expanded(entry: JobScene, folder: Path) -> list[JobScene]:
     matches = [str(whole)]
     if glob.has_magic(path) and not whole.exists():
         # The job's own folder may be called [x] too.
-        pattern = (
-            path if Path(path).is_absolute() else f"{glob.escape(str(folder.absolute()))}/{path}"
+        top, parts = (
+            (Path("/"), Path(path).parts[1:])
+            if Path(path).is_absolute()
+            else (folder.absolute(), Path(path).parts)
         )
-        matches = sorted(glob.glob(pattern, recursive=True))
+        matches = _matches(top, parts, entry.uri)
     if not matches:
         raise AdapterError(f"{entry.uri!r}: nothing matches {whole}")
     return [entry.model_copy(update={"uri": _uri(scheme, match, query)}) for match in matches]
+
+
+def _matches(top: Path, parts: tuple[str, ...], what: str) -> list[str]:
+    """Paths that match, in order. parts: of the pattern below `top`. As glob.glob, but that `**`
+    follows no links, which may lead round in circles, and that there is an end to it.
+    """
+    looked_at = itertools.count()
+
+    def names(folder: str) -> Iterator[os.DirEntry[str]]:
+        try:
+            entries = os.scandir(folder)
+        except OSError:  # a file, or another user's
+            return
+        with entries:
+            for entry in entries:
+                if next(looked_at) >= MAX_LOOKED_AT:
+                    raise AdapterError(
+                        f"{what!r}: looked at {MAX_LOOKED_AT} files and folders and saw no end; "
+                        f"name more of the path, or fewer levels (**)"
+                    )
+                yield entry
+
+    def below(path: str, parts: tuple[str, ...]) -> Iterator[str]:
+        if not parts:
+            yield path
+        elif parts[0] == "**":
+            yield from below(path, parts[1:])
+            for entry in names(path):
+                if entry.name.startswith("."):
+                    continue
+                if entry.is_dir(follow_symlinks=False):
+                    yield from below(entry.path, parts)
+                elif len(parts) == 1:
+                    yield entry.path
+        elif glob.has_magic(parts[0]):
+            for entry in names(path):
+                is_shown = parts[0].startswith(".") or not entry.name.startswith(".")
+                if is_shown and fnmatch.fnmatchcase(entry.name, parts[0]):
+                    yield from below(entry.path, parts[1:])
+        elif os.path.lexists(inner := os.path.join(path, parts[0])):
+            yield from below(inner, parts[1:])
+
+    return sorted(set(below(str(top), parts)))
 
 
 def _from(folder: Path, value: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -10,7 +11,14 @@ from typing import Any
 import numpy as np
 
 from augment.errors import AdapterError
+from recipes.errors import RecipeError
+from recipes.files import open_file
+from recipes.yaml_tree import read_plain
 
+MAX_NESTING = 64  # lists and objects inside each other in a JSON file
+LARGEST = 1e9  # metres or pixels: float64 tells a micrometre there, and no drive goes as far
+_MAX_BYTES = 1 << 30  # of a text; the longest table of nuScenes' training set has 0.6 GB
+_MAX_YAML = 1 << 18  # characters; the configurations of trained scenes have some 10 000
 _FROM_DATASET = "copy it from the dataset"
 
 
@@ -21,22 +29,52 @@ def read_text(path: Path, *, if_missing: str = _FROM_DATASET) -> str:
         AdapterError: missing, unreadable, or not UTF-8.
     """
     try:
-        return path.read_text(encoding="utf-8")
+        with open_file(path) as file:
+            data = file.read(_MAX_BYTES + 1)
+        if len(data) > _MAX_BYTES:
+            raise AdapterError(f"{path} must have at most {_MAX_BYTES} bytes; it has more")
+        return data.decode("utf-8")
     except FileNotFoundError:
         raise AdapterError(f"{path} does not exist; {if_missing}") from None
     except (OSError, ValueError) as error:
         raise AdapterError(f"{path} cannot be read as text: {error}") from None
 
 
-def read_json(path: Path, kind: type = dict, *, if_missing: str = _FROM_DATASET) -> Any:
-    """The contents of a JSON file, a `kind` (dict or list) at its top.
+def read_yaml(path: Path, *, if_missing: str = _FROM_DATASET) -> dict[str, Any]:
+    """The mapping in a YAML file, read as recipes are (see recipes.yaml_tree): without tags and
+    merge keys, and with a bound on what aliases multiply.
 
     Raises:
-        AdapterError: missing, no JSON, or something else at the top.
+        AdapterError: missing, too large, no such YAML, or something else at the top.
+    """
+    text = read_text(path, if_missing=if_missing)
+    if len(text) > _MAX_YAML:
+        raise AdapterError(f"{path} must have at most {_MAX_YAML} characters; it has {len(text)}")
+    try:
+        content = read_plain(text, source=str(path))
+    except RecipeError as error:
+        raise AdapterError(f"{error}; copy it again") from None
+    if not isinstance(content, dict):
+        raise AdapterError(f"{path} must hold keys and values; got {type(content).__name__}")
+    return content
+
+
+def read_json(path: Path, kind: type = dict, *, if_missing: str = _FROM_DATASET) -> Any:
+    """The contents of a JSON file, a `kind` (dict, list, or object for either) at its top.
+
+    Python reads NaN, Infinity and whole numbers of any length from JSON; `number_of` and `array_of`
+    tell them apart.
+
+    Raises:
+        AdapterError: missing, no JSON, something else at the top, two values under one key, lists
+            in lists without end, or a text that is not Unicode.
     """
     text = read_text(path, if_missing=if_missing)
     try:
-        content = json.loads(text)
+        content = json.loads(text, object_pairs_hook=_unique)
+        _check_nesting(content)
+        if r"\ud" in text.lower():  # half a pair of surrogates is no character, and not written
+            json.dumps(content, ensure_ascii=False).encode()
     except (ValueError, RecursionError) as error:
         raise AdapterError(f"{path} is not readable JSON ({error}); copy it again") from None
     if not isinstance(content, kind):
@@ -45,6 +83,56 @@ def read_json(path: Path, kind: type = dict, *, if_missing: str = _FROM_DATASET)
             f"{path} must hold {names.get(kind, kind.__name__)}; got {type(content).__name__}"
         )
     return content
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    entries = dict(pairs)
+    if len(entries) < len(pairs):
+        key, count = Counter(key for key, _ in pairs).most_common(1)[0]
+        raise ValueError(f"an object has {count} entries {key!r:.80}")
+    return entries
+
+
+def _check_nesting(content: object) -> None:
+    """Raise ValueError where later steps, which may call themselves, could run out of stack."""
+    inner: list[Any] = [content]
+    for _ in range(MAX_NESTING):
+        values = (v.values() if isinstance(v, dict) else v for v in inner if _is_nested(v))
+        inner = [v for value in values for v in value if _is_nested(v)]
+        if not inner:
+            return
+    raise ValueError(f"more than {MAX_NESTING} lists and objects inside each other")
+
+
+def _is_nested(value: object) -> bool:
+    return isinstance(value, dict | list)
+
+
+def number_of(value: object, where: str, *, largest: float = LARGEST) -> float:
+    """A value from JSON as a number of at most `largest`, whatever its sign.
+
+    Raises:
+        AdapterError: it is none: NaN, infinite, larger, a text, true, false.
+    """
+    if type(value) not in (int, float) or not -largest <= value <= largest:  # type: ignore[operator]
+        raise AdapterError(
+            f"{where} must be a number from {-largest:g} to {largest:g}; got {value!r:.80}"
+        )
+    return float(value)  # type: ignore[arg-type]
+
+
+def array_of(value: object) -> np.ndarray | None:
+    """JSON's lists of numbers as float64, NaN and infinity included; None where there is anything
+    else in them (a text, true, a number beyond float64), or lists of unequal length."""
+    flat = [value]
+    while any(isinstance(v, list) for v in flat):
+        flat = [w for v in flat for w in (v if isinstance(v, list) else [v])]
+    if not all(type(v) in (int, float) for v in flat):
+        return None
+    try:
+        return np.array(value, np.float64)
+    except (ValueError, OverflowError):
+        return None
 
 
 def read_numbers(path: Path, shape: Sequence[int] | None = None) -> np.ndarray:

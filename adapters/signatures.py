@@ -4,7 +4,9 @@ first bytes of a file.
 
 from __future__ import annotations
 
+import contextlib
 import itertools
+import os
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -12,8 +14,10 @@ from pathlib import Path
 
 from augment.errors import AdapterError
 from augment.files.scene_files import is_scene_file, is_scene_folder
+from recipes.files import open_file
 
 _MOST_ENTRIES = 1000  # of a folder that are looked at below the one given
+_MAX_LISTED = 1_000_000  # names of a folder: some tenths of a second
 _MULTI_PART = b"element vertex_"  # how a Street Gaussians .ply names its parts
 
 
@@ -30,10 +34,13 @@ def recognised(path: Path) -> str | None:
     """The scheme of what lies at a path; None for what is not known.
 
     Raises:
-        AdapterError: a file cannot be read.
+        AdapterError: it cannot be read.
     """
     signatures = FILES if path.is_file() else FOLDERS
-    return next((s.scheme for s in signatures if s.is_here(path)), None)
+    try:
+        return next((s.scheme for s in signatures if s.is_here(path)), None)
+    except OSError as error:
+        raise AdapterError(f"{path}: cannot be read: {error}") from error
 
 
 def looked_for(path: Path) -> str:
@@ -48,13 +55,11 @@ def looked_for(path: Path) -> str:
 
 
 def _scenes_below(folder: Path) -> Iterator[Path]:
-    try:
-        for level in ("*", "*/*"):
-            for entry in sorted(itertools.islice(folder.glob(level), _MOST_ENTRIES)):
+    for level in ("*", "*/*"):
+        for entry in sorted(itertools.islice(folder.glob(level), _MOST_ENTRIES)):
+            with contextlib.suppress(OSError, AdapterError):  # another user's
                 if entry.is_dir() and recognised(entry) is not None:
                     yield entry
-    except OSError:
-        return
 
 
 def _is_pandaset(folder: Path) -> bool:
@@ -62,7 +67,8 @@ def _is_pandaset(folder: Path) -> bool:
 
 
 def _is_nuscenes(folder: Path) -> bool:
-    return any((tables / "scene.json").is_file() for tables in folder.glob("v1.0-*"))
+    versions = (name for name in _names(folder) if name.startswith("v1.0-"))
+    return any((folder / name / "scene.json").is_file() for name in versions)
 
 
 def _is_kitti(folder: Path) -> bool:
@@ -104,7 +110,7 @@ def _is_recording(folder: Path) -> bool:
 def _holds_splats(folder: Path) -> bool:
     if any(folder.glob("point_cloud/iteration_*/point_cloud.ply")):
         return True
-    return sum(1 for p in folder.iterdir() if p.suffix.lower() in (".ply", ".splat")) == 1
+    return sum(name.lower().endswith((".ply", ".splat")) for name in _names(folder)) == 1
 
 
 def _is_splat_file(path: Path) -> bool:
@@ -117,11 +123,13 @@ def _is_multi_part(path: Path) -> bool:
 
 
 def _start_of(path: Path) -> bytes:
-    try:
-        with path.open("rb") as file:
-            return file.read(4096)
-    except OSError as error:
-        raise AdapterError(f"{path}: cannot be read: {error}") from error
+    with open_file(path) as file:
+        return file.read(4096)
+
+
+def _names(folder: Path) -> list[str]:
+    with os.scandir(folder) as entries:
+        return [entry.name for entry in itertools.islice(entries, _MAX_LISTED)]
 
 
 # In this order: a later one may fit where an earlier one does.

@@ -6,6 +6,8 @@ import struct
 from dataclasses import dataclass
 from pathlib import Path
 
+from recipes.files import open_file
+
 FORMATS = "JPEG, PNG, WebP, TIFF or BMP"
 
 _FIRST_BYTES = 4096  # hold the header of nearly any image
@@ -33,7 +35,7 @@ def read_image_header(path: str | Path) -> ImageHeader | None:
     Raises:
         OSError: the file cannot be read.
     """
-    with open(path, "rb") as file:
+    with open_file(path) as file:
         data = file.read(_FIRST_BYTES)
         return image_header(data) or image_header(data + file.read(_MOST_BYTES))
 

@@ -7,6 +7,7 @@ contents; the paths are no part of its hash.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 import stat
@@ -101,6 +102,25 @@ def file_below(folder: Path, written: str) -> Path:
     return path
 
 
+def open_file(path: str | Path) -> BufferedReader:
+    """A file that somebody has named, for reading.
+
+    Raises:
+        OSError: it cannot be opened, or is a folder, a pipe or a device: to open a pipe might wait
+            for ever, and a device need not end.
+    """
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+    try:
+        kind = os.fstat(descriptor).st_mode
+        if not (stat.S_ISREG(kind) or stat.S_ISDIR(kind)):
+            text = "a pipe or device, not a regular file"
+            raise OSError(errno.EINVAL, text, str(path))
+        return os.fdopen(descriptor, "rb")  # which refuses folders
+    except BaseException:
+        os.close(descriptor)
+        raise
+
+
 def check_file(path: Path) -> None:
     """Raise ValueError unless the file can be read and is not too large.
 
@@ -108,18 +128,16 @@ def check_file(path: Path) -> None:
         FileNotFoundError: there is none. ValueError: it cannot be read; says why.
     """
     try:
-        status = path.stat()
-        if stat.S_ISDIR(status.st_mode):
-            raise ValueError("is a folder, not a file")
-        if not stat.S_ISREG(status.st_mode):  # to open a pipe might wait for ever
-            raise ValueError("is no regular file")
-        path.open("rb").close()
+        with open_file(path) as file:
+            size = os.fstat(file.fileno()).st_size
     except (FileNotFoundError, NotADirectoryError):
         raise FileNotFoundError(str(path)) from None
+    except IsADirectoryError:
+        raise ValueError("is a folder, not a file") from None
     except OSError as error:
         raise ValueError(f"cannot be read: {error.strerror}") from None
-    if status.st_size > MAX_MIB * 2**20:
-        mib = status.st_size / 2**20
+    if size > MAX_MIB * 2**20:
+        mib = size / 2**20
         raise ValueError(f"holds {mib:.0f} MiB, more than the {MAX_MIB} MiB that are read")
 
 
@@ -127,7 +145,7 @@ def _open(name: str, path: str) -> BufferedReader:
     shown = f"style.{name} = {path!r}"
     try:
         check_file(Path(path))
-        return Path(path).open("rb")
+        return open_file(path)
     except FileNotFoundError:
         raise ValueError(f"{shown}: there is no such file") from None
     except (OSError, ValueError) as error:

@@ -24,13 +24,14 @@ from pydantic import BeforeValidator, Field, ValidationError, field_validator, m
 
 from recipes.change import changed
 from recipes.errors import Problems, RecipeError, short
+from recipes.files import open_file
 from recipes.frames import parse_frames
 from recipes.load import load_recipe, preset_names
 from recipes.nearest import nearest_word
 from recipes.schema import Recipe
 from recipes.template import RecipeTemplate
 from recipes.types import Closed, Number, Whole
-from recipes.yaml_tree import ListNode, MapNode, Node, ScalarNode, read_tree
+from recipes.yaml_tree import ListNode, MapNode, Node, ScalarNode, plain, read_tree
 
 MAX_BYTES = 4 << 20
 _NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
@@ -159,7 +160,7 @@ def load_job(path: Path) -> Job:
     """
     source = str(path)
     try:
-        with path.open("rb") as file:
+        with open_file(path) as file:
             data = file.read(MAX_BYTES + 1)
     except FileNotFoundError:
         raise RecipeError(f"{source}: no such file; a job is a YAML file") from None
@@ -187,7 +188,7 @@ def parse_job(text: str, *, source: str, name: str = "job") -> Job:
     if not isinstance(tree, MapNode):
         raise problems.fail(tree.line, "a job is a mapping with scenes and recipes")
     problems.raise_if_any()
-    data: Any = _plain(tree)
+    data: Any = plain(tree)
     if "name" not in data and not re.fullmatch(_NAME, name):
         raise problems.fail(
             1, f"the file's own name is no name for a job; give it a name: {_NAMES}"
@@ -255,14 +256,6 @@ def scaled_recipe(recipe: Recipe, scale: float) -> Recipe:
             f"a scale of {scale} times the recipe's render.scale {recipe.render.scale} is not "
             f"possible: {limits}"
         ) from None
-
-
-def _plain(node: Node) -> Any:
-    if isinstance(node, MapNode):
-        return {key: _plain(value) for key, (_, value) in node.entries.items()}
-    if isinstance(node, ListNode):
-        return tuple(_plain(item) for item in node.items)
-    return node.value
 
 
 def _place(tree: Node, location: tuple[int | str, ...]) -> tuple[str, int]:

@@ -7,6 +7,7 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 
 from recipes.errors import RecipeError
+from recipes.files import open_file
 from recipes.nearest import nearest_word
 from recipes.parse import parse_recipe
 from recipes.template import RecipeTemplate
@@ -60,7 +61,7 @@ def _load_preset(name: str) -> RecipeTemplate:
 
 def _read(path: Path, source: str) -> bytes:
     try:
-        with path.open("rb") as file:
+        with open_file(path) as file:
             data = file.read(MAX_BYTES + 1)
     except (FileNotFoundError, NotADirectoryError):
         raise RecipeError(f"{source}: {_missing(source)}") from None

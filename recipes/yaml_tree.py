@@ -32,6 +32,7 @@ _WORDS: dict[str, bool | float | None] = {
 }
 
 ScalarValue = bool | int | float | str | None
+PlainValue = ScalarValue | list["PlainValue"] | dict[str, "PlainValue"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,13 +88,39 @@ class _Open:
         return ListNode(self.line, tuple(self.items), self.size, self.height)
 
 
-def read_tree(text: str, problems: Problems) -> Node:
+def read_tree(text: str, problems: Problems, *, empty: str = EMPTY) -> Node:
     """The tree of the one document in `text`; duplicate keys are added to `problems`.
+
+    empty: what to say where there is none.
 
     Raises:
         RecipeError: not YAML, or YAML that a recipe may not use.
     """
-    return _Builder(problems).build(_events(text, problems))
+    tree = _Builder(problems).build(_events(text, problems))
+    if tree is None:
+        raise problems.fail(1, empty)
+    return tree
+
+
+def read_plain(text: str, *, source: str) -> PlainValue:
+    """What YAML says as mappings, lists and scalars. source: stands before the line in messages.
+
+    Raises:
+        RecipeError: as for read_tree, or a key is given twice.
+    """
+    problems = Problems(source)
+    tree = read_tree(text, problems, empty="the file is empty")
+    problems.raise_if_any()
+    return plain(tree)
+
+
+def plain(node: Node) -> PlainValue:
+    """A tree without its lines."""
+    if isinstance(node, MapNode):
+        return {key: plain(value) for key, (_, value) in node.entries.items()}
+    if isinstance(node, ListNode):
+        return [plain(item) for item in node.items]
+    return node.value
 
 
 def plain_value(text: str) -> ScalarValue:
@@ -116,7 +143,7 @@ class _Builder:
         self._anchors: dict[str, Node | None] = {}  # None: named, but its end has not been read
         self._root: Node | None = None
 
-    def build(self, events: Iterator[yaml.Event]) -> Node:
+    def build(self, events: Iterator[yaml.Event]) -> Node | None:
         documents = 0
         for event in events:
             line = event.start_mark.line + 1
@@ -134,14 +161,12 @@ class _Builder:
                 self._attach(done.line, node)
             elif isinstance(event, yaml.ScalarEvent | yaml.CollectionStartEvent):
                 self._start(line, event)
-        if self._root is None:
-            raise self._problems.fail(1, EMPTY)
         return self._root
 
     def _start(self, line: int, event: yaml.ScalarEvent | yaml.CollectionStartEvent) -> None:
         if event.tag is not None:
             raise self._problems.fail(
-                line, f"the tag {short(str(event.tag))!r}: tags are not allowed in a recipe"
+                line, f"the tag {short(str(event.tag))!r}: tags are not allowed"
             )
         if isinstance(event, yaml.ScalarEvent):
             value = plain_value(event.value) if event.style is None else event.value

@@ -57,6 +57,20 @@ LONG = {
 }  # fmt: skip
 
 
+@pytest.fixture
+def ends_soon() -> Iterator[None]:
+    """Fails a test whose input would keep it busy or waiting, instead of hanging with it."""
+
+    def too_late(*_: object) -> None:
+        pytest.fail("still at work after 30 s")
+
+    before = signal.signal(signal.SIGALRM, too_late)
+    signal.alarm(30)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Long files first (make test tells pytest-xdist to keep to this order). Without a GPU the
     tests that need one are skipped.

@@ -6,9 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import yaml
-
-from adapters.plain_files import read_text
+from adapters.plain_files import read_yaml
 from augment.errors import AdapterError
 
 
@@ -18,18 +16,8 @@ def read_config(path: Path) -> Mapping[str, Any]:
     Raises:
         AdapterError: missing, no YAML, or no mapping.
     """
-    if not path.is_file():
-        raise AdapterError(
-            f"{path} does not exist; a drivestudio run is a folder with config.yaml and "
-            f"checkpoint_*.pth"
-        )
-    try:
-        config = yaml.safe_load(read_text(path))
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise AdapterError(f"{path} is no readable YAML: {error}") from None
-    if not isinstance(config, dict):
-        raise AdapterError(f"{path} must hold a mapping; got {type(config).__name__}")
-    return config
+    what = "a drivestudio run is a folder with config.yaml and checkpoint_*.pth"
+    return read_yaml(path, if_missing=what)
 
 
 def lookup(config: Mapping[str, Any], key: str) -> Any:

@@ -7,9 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import yaml
-
-from adapters.plain_files import read_text
+from adapters.plain_files import read_yaml
 from adapters.street_gaussians.records import CAMERA_NAMES, ModelConfig
 from augment.errors import AdapterError
 
@@ -43,14 +41,7 @@ def read_config(path: Path) -> ModelConfig:
     Raises:
         AdapterError: no YAML, or a value of another kind; names the key.
     """
-    try:
-        tree = yaml.safe_load(read_text(path))
-    except (yaml.YAMLError, RecursionError, ValueError) as error:
-        reason = " ".join(str(error).split())
-        raise AdapterError(f"{path} is not readable YAML ({reason}); copy it again") from None
-    if not isinstance(tree, Mapping):
-        raise AdapterError(f"{path} must hold keys and values; got {type(tree).__name__}")
-    values = _Values(tree, path)
+    values = _Values(read_yaml(path), path)
     default = ModelConfig()
     return ModelConfig(
         source_path=values.of("source_path", str, default.source_path),

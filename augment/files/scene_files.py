@@ -38,6 +38,7 @@ from augment.files.scene_schema import (
 from augment.files.scene_tensors import part_arrays, sky_arrays, take_parts, take_sky
 from augment.files.tensor_files import read_tensors, write_tensors
 from augment.scene import Scene
+from recipes.files import open_file
 
 DOCUMENT, GAUSSIANS, SKY = "scene.json", "gaussians.safetensors", "sky.safetensors"
 FILES = (DOCUMENT, GAUSSIANS, SKY)
@@ -49,7 +50,7 @@ _MARK = re.compile(rb'\s*\{\s*"format"\s*:\s*"' + FORMAT.encode() + rb'"')
 def is_scene_folder(folder: Path) -> bool:
     """Whether a folder says that it is a scene folder; it may be damaged all the same."""
     try:
-        with (folder / DOCUMENT).open("rb") as file:
+        with open_file(folder / DOCUMENT) as file:
             return _MARK.match(file.read(200)) is not None
     except OSError:
         return False

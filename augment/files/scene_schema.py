@@ -13,6 +13,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 
 from augment.errors import SceneError
 from augment.ground_heights import GroundSource
+from recipes.files import open_file
 
 FORMAT = "climategs-scene"
 VERSION = 2  # of what is written
@@ -157,10 +158,11 @@ def read_document(path: Path) -> SceneDocument:
         SceneError: unreadable, no JSON, another format or version, or wrong contents; says where.
     """
     try:
-        size = path.stat().st_size
-        if size > MOST_BYTES:
-            raise SceneError(f"{path}: {size} bytes; a scene.json has at most {MOST_BYTES}")
-        return parsed_document(path.read_bytes(), str(path))
+        with open_file(path) as file:
+            text = file.read(MOST_BYTES + 1)
+        if len(text) > MOST_BYTES:
+            raise SceneError(f"{path}: a scene.json has at most {MOST_BYTES} bytes")
+        return parsed_document(text, str(path))
     except OSError as error:
         raise SceneError(f"{path} cannot be read: {error.strerror}") from error
 

@@ -12,6 +12,7 @@ from safetensors import safe_open
 from torch import Tensor
 
 from augment.errors import SceneError
+from recipes.files import open_file
 
 MOST_HEADER_BYTES = 100_000_000  # the format's own limit
 _TYPES = {"<f4": "F32", "<f2": "F16", "<i2": "I16"}
@@ -55,6 +56,7 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
         SceneError: unreadable, damaged, or no safetensors file.
     """
     try:
+        open_file(path).close()  # to open a pipe would wait for ever
         with safe_open(path, framework="pt") as file:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
             return tensors, file.metadata() or {}

@@ -21,6 +21,7 @@ from augment.batch.atomic import write_atomic
 from augment.errors import StyleError
 from augment.style.encoder import ENCODERS
 from augment.style.network import SIZE_PX, Gscm
+from recipes.files import open_file
 
 FORMAT = 1
 METADATA_KEY = "climategs.gscm"
@@ -95,6 +96,7 @@ def network_facts(path: Path | None = None) -> dict[str, Any]:
     """
     path = SHIPPED if path is None else path
     try:
+        open_file(path).close()  # to open a pipe would wait for ever
         with safe_open(path, framework="pt") as file:
             return _header(path, file.metadata())
     except (OSError, SafetensorError) as error:
@@ -103,6 +105,7 @@ def network_facts(path: Path | None = None) -> dict[str, Any]:
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     try:
+        open_file(path).close()  # to open a pipe would wait for ever
         with safe_open(path, framework="pt") as file:
             header = _header(path, file.metadata())
             return header, {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118

@@ -12,6 +12,7 @@ from augment.errors import StyleError
 from augment.image_header import FORMATS, ImageHeader, image_header
 from augment.style.image_regions import find_sky, region_masks
 from augment.style.statistics import LAND, SKY, WHOLE, ColorStatistics, Statistics
+from recipes.files import open_file
 
 SIDE_PX = 512  # colours need no more, and everything after the reading costs the same for any file
 MAX_BYTES = 256 * 1024**2
@@ -148,7 +149,7 @@ def _read(path: Path, what: str) -> tuple[np.ndarray, np.ndarray | None]:
 
 def _bytes(path: Path, what: str) -> bytes:
     try:
-        with path.open("rb") as file:
+        with open_file(path) as file:
             data = file.read(MAX_BYTES + 1)
     except (FileNotFoundError, NotADirectoryError):
         raise StyleError(f"{what} {path}: there is no such file") from None

@@ -6,12 +6,12 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import yaml
 
 from augment.errors import StyleError
 from augment.style.statistics import LAND, SKY, WHOLE, ColorStatistics, Statistics
 from recipes.errors import RecipeError
 from recipes.style_presets import style_preset_text
+from recipes.yaml_tree import read_plain
 
 # Of a street's picture; they only matter where a map of the whole stands in for land and sky.
 SHARES: Mapping[str, float] = {LAND: 0.75, SKY: 0.25}
@@ -39,9 +39,9 @@ def parse_statistics(text: str, *, source: str) -> Statistics:
             is outside [0, 1], a covariance is not symmetric or is negative definite.
     """
     try:
-        document = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise StyleError(f"{source}: is no YAML: {error}") from None
+        document = read_plain(text, source=source)
+    except RecipeError as error:
+        raise StyleError(str(error)) from None
     regions = _fields(document, tuple(SHARES), source)
     found = {
         region: _statistics(regions[region], share, f"{source}: {region}")

@@ -67,3 +67,20 @@ def test_what_is_refused(folder: Path) -> None:
         uris(folder, JobScene(uri="runs/*", name="x"))
     with pytest.raises(AdapterError, match=r"names the scene '.*runs/a' twice \(by 'runs/a'\)"):
         uris(folder, "runs/*", "runs/a")
+
+
+def test_a_pattern_that_would_look_through_too_much_is_refused(tmp_path, monkeypatch, ends_soon):
+    for place in ("a", "b"):  # links back to the top: 2^40 ways down
+        (tmp_path / place / "deep").mkdir(parents=True)
+        for link in ("one", "two"):
+            (tmp_path / place / link).symlink_to(tmp_path)
+    assert uris(tmp_path, "**/deep") == [str(tmp_path / p / "deep") for p in ("a", "b")]
+    assert uris(tmp_path, "a/*/b/deep") == [str(tmp_path / f"a/{n}/b/deep") for n in ("one", "two")]
+    (tmp_path / ".hidden" / "deep").mkdir(parents=True)
+    assert len(uris(tmp_path, "*/deep")) == 2 and len(uris(tmp_path, ".*/deep")) == 1
+    assert set(uris(tmp_path, "**")) == {str(tmp_path / n) for n in (
+        "", "a", "a/deep", "a/one", "a/two", "b", "b/deep", "b/one", "b/two"
+    )}  # fmt: skip
+    monkeypatch.setattr("adapters.patterns.MAX_LOOKED_AT", 5)
+    with pytest.raises(AdapterError, match=r"'\*\*/no': looked at 5 files and folders and saw no"):
+        uris(tmp_path, "**/no")

@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from adapters.base import open_scene
+from adapters.drivestudio.config import read_config as drivestudio_config
 from adapters.plain_files import inside, read_json, read_numbers, read_pose
-from augment.errors import AdapterError
+from adapters.street_gaussians.config import read_config as street_gaussians_config
+from augment.errors import AdapterError, SceneError, StyleError
+from augment.files.scene_files import load_scene_parts
+from augment.style.checkpoint import load_network
+from augment.style.images import read_style_image
+from augment.style.presets import parse_statistics
+from recipes.errors import RecipeError
+from recipes.job import load_job
+from recipes.load import load_recipe
 
 
 def write(path: Path, text: str) -> Path:
@@ -53,7 +64,8 @@ def test_json_is_of_the_kind_expected(tmp_path):
     assert read_json(path, list) == [1]
     with pytest.raises(AdapterError, match=r"a\.json must hold an object; got list"):
         read_json(path)
-    for text in ("{", "[" * 100_000):
+    nested = "[" * 900 + "]" * 900
+    for text in ("{", "[" * 50_000, nested, '{"a": 1, "a": 2}', r'["\ud800"]', "1" * 5000):
         with pytest.raises(AdapterError, match="is not readable JSON"):
             read_json(write(tmp_path / "bad.json", text))
     (tmp_path / "latin.json").write_bytes(b'{"a": "\xff"}')
@@ -88,3 +100,73 @@ def test_a_folder_that_its_owner_linked_elsewhere_is_followed(tmp_path):
     (root / "one.jpg").symlink_to(disk / "samples" / "a.jpg")
     with pytest.raises(AdapterError, match="outside"):
         inside(root, "one.jpg", "row 1")
+
+
+def merged(levels: int) -> str:
+    """A merge key that copies 9^levels entries."""
+    lines = ["a0: &a0 {x: 1}"]
+    for n in range(levels):
+        lines.append(f"a{n + 1}: &a{n + 1} {{<<: [{', '.join(9 * [f'*a{n}'])}]}}")
+    return "\n".join(lines)
+
+
+def aliased(levels: int) -> str:
+    """A list of 9^levels items."""
+    lines = ["a0: &a0 [1]"]
+    lines += [f"a{n + 1}: &a{n + 1} [{', '.join(9 * [f'*a{n}'])}]" for n in range(levels)]
+    return "\n".join(lines)
+
+
+HOSTILE_YAML = {
+    merged(9): r"merge keys \(<<\) are not read",
+    aliased(9): "more than 20000 values, aliases expanded",
+    "a: &a [*a]": "stands inside its own anchor",
+    "[" * 50_000: "nested more than 32 levels deep",
+    "a: !!python/object/apply:os.system ['true']": "tags are not allowed",
+    "x" * 300_000: "larger than|at most 262144 characters|is a mapping",
+    "a: 1\na: 2": "a is given twice",
+    "": "the file is empty",
+}
+READERS = {
+    "street gaussians": street_gaussians_config,
+    "drivestudio": drivestudio_config,
+    "recipe": load_recipe,
+    "job": load_job,
+    "style": lambda path: parse_statistics(path.read_text(), source=str(path)),
+}
+
+
+@pytest.mark.parametrize("reader", READERS)
+def test_yaml_that_multiplies_or_runs_code_is_refused_at_once(tmp_path, reader, ends_soon):
+    path = tmp_path / "file.yaml"
+    for text, message in HOSTILE_YAML.items():
+        if reader == "style" and len(text) > 200_000:
+            continue  # those come with the package
+        path.write_text(text)
+        with pytest.raises((AdapterError, RecipeError, StyleError), match=message) as caught:
+            READERS[reader](path)
+        assert str(path) in str(caught.value)
+
+
+def test_pipes_devices_and_folders_are_no_files(tmp_path, ends_soon):
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    hurt = tmp_path / "scene"
+    hurt.mkdir()
+    os.mkfifo(hurt / "scene.json")
+    readers = {
+        **READERS,
+        "text": read_json,
+        "style image": read_style_image,
+        "network": load_network,
+        "scene": open_scene,
+        "scene by scheme": lambda path: open_scene(f"gaussians:{path}"),
+        "scene file": load_scene_parts,
+        "camera path": lambda path: open_scene(f"procedural:street?frames=1&camera_path={path}"),
+    }
+    del readers["style"]
+    for name, read in readers.items():
+        for path in (pipe, Path("/dev/zero"), tmp_path, hurt):
+            with pytest.raises((AdapterError, RecipeError, StyleError, SceneError)) as caught:
+                read(path)
+            assert str(path) in str(caught.value), name

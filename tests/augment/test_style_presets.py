@@ -136,13 +136,13 @@ def test_good_numbers_are_read_as_they_are():
         ("[[0, 0, 0]", "[[.inf, 0, 0]", "sky.covariance: expected 3 x 3 finite"),
         ("mean: [1", "means: [1", "sky: expected the keys mean, covariance; got"),
         ("sky:", "sea:", "expected the keys land, sky; got .*sea"),
-        ("sky:", "land: {}\nsky", "is no YAML"),
+        ("sky:", "land: {}\nsky", "not valid YAML"),
         ("sky:", "extra: 1\nsky:", "expected the keys land, sky; got .*extra"),
     ],
 )
 def test_wrong_files_say_where(old, new, words):
     assert old in GOOD
-    with pytest.raises(StyleError, match=f"^here: .*{words}|^here: {words}"):
+    with pytest.raises(StyleError, match=f"^here(:7)?: .*({words})"):
         parse_statistics(GOOD.replace(old, new, 1), source="here")
 
 
@@ -153,5 +153,5 @@ def test_unknown_names_list_the_styles():
 
 @pytest.mark.parametrize("text", ["", "3", "[1, 2]", "{"])
 def test_what_is_no_mapping_is_refused(text):
-    with pytest.raises(StyleError, match=r"^here: "):
+    with pytest.raises(StyleError, match=r"^here(:1)?: "):
         parse_statistics(text, source="here")

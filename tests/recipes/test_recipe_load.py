@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -71,10 +72,10 @@ def test_paths_that_are_no_files(tmp_path: Path) -> None:
 
 
 def test_a_file_without_permission(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(self: Path, mode: str) -> None:
-        raise PermissionError(13, "Permission denied", str(self))
+    def refuse(path: Path, *_: object) -> None:
+        raise PermissionError(13, "Permission denied", str(path))
 
-    monkeypatch.setattr(Path, "open", refuse)  # permissions themselves do not bind root
+    monkeypatch.setattr(os, "open", refuse)  # permissions themselves do not bind root
     with pytest.raises(RecipeError, match=r"r.yaml': cannot be read: .*Permission denied"):
         load_recipe(tmp_path / "r.yaml")
 
