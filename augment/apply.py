@@ -26,6 +26,7 @@ from augment.views import (
     PendingView,
     SmoggyView,
     SnowyView,
+    SurfaceView,
     WeatheredBuffers,
     WeatheredView,
 )
@@ -80,10 +81,7 @@ def render_buffers(
         painter = Painter(
             parts, sky, plan.settings, plan.smog_in_splats, plan.smog_on_buffers, backend
         )
-        buffers = view.buffers
-        if plan.measures_flood and plan.depth_buffer not in buffers:
-            buffers = buffers | {EXPECTED_DEPTH}
-        flooded = render_flooded(painter, camera, plan.flood, buffers)
+        flooded = render_flooded(painter, camera, plan.flood, view.buffers)
     if flooded is not None:
         rgb, raster = flooded.rgb, flooded.scene
         if flooded.is_hidden:
@@ -186,14 +184,16 @@ def _weathered(images: ViewImages, camera: Camera, plan: Plan, recipe: Recipe) -
     weather, depth = recipe.weather, images.scene_depth_m
     flood = snowy = smoggy = None
     if plan.flood_level_z_m is not None:
-        measured = plan.measures_flood and images.water is not None
-        flood = FloodedView(plan.flood_level_z_m, depth if measured else None)
+        seen = plan.flood is not None and images.water is not None
+        flood = FloodedView(plan.flood_level_z_m, depth if seen else None)
+    snow_m = 0.0
     if weather.snow is not None:
-        measured = plan.measures_snow and images.snow is not None and images.snow.any()
-        snowy = SnowyView(depth if measured else None, weather.snow.depth_m)
+        seen = plan.snow is not None and images.snow is not None and bool(images.snow.any())
+        snow_m = weather.snow.depth_m if seen else 0.0
+        snowy = SnowyView(depth if seen else None, weather.snow.depth_m)
     if weather.smog is not None:
         level_z_m = None if plan.flood is None else plan.flood.level_z_m
-        smoggy = SmoggyView(plan.smog, depth if plan.measures_smog else None, level_z_m)
+        smoggy = SmoggyView(plan.smog, None if plan.smog is None else depth, level_z_m)
     size = (camera.height, camera.width)
     water, snow = images.water, images.snow
     if weather.flood is not None and water is None:
@@ -203,12 +203,30 @@ def _weathered(images: ViewImages, camera: Camera, plan: Plan, recipe: Recipe) -
     return WeatheredView(
         camera=camera,
         rgb=images.rgb,
-        depth_m=images.depth_m,
-        semantic=images.semantic,
+        depth_m=None if plan.depth_buffer is None else images.depth_m,
+        semantic=images.semantic if plan.semantic else None,
         instance=images.instance,
         water=water,
         flood=flood,
         snow=snow,
         snowy=snowy,
         smoggy=smoggy,
+        surface=_surface_view(images, plan, snow_m),
+    )
+
+
+def _surface_view(images: ViewImages, plan: Plan, snow_m: float) -> SurfaceView | None:
+    """snow_m: of the snow in view."""
+    depth = images.scene_depth_m
+    if depth is None:
+        return None
+    is_bare = bool(plan.bare_buffers)
+    is_solid = not is_bare and not plan.shows_water
+    return SurfaceView(
+        depth_m=depth,
+        snow_m=snow_m,
+        actors=images.instance if is_solid else None,
+        shown_depth_m=images.depth_m if is_bare else depth,
+        shown_classes=images.semantic,
+        shown_snow_m=0.0 if is_bare else snow_m,
     )

@@ -7,7 +7,7 @@ dataset's less `world_origin_m`. A box's own axes: x along its length, y its wid
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -79,7 +79,7 @@ def shown_pixels(
     the surface there lies in the part of the box that owns surfaces, so what hides a box, or stands
     beside it, does not count. Where boxes overlap, a pixel belongs to each.
     """
-    windows = _windows(placed, camera)
+    windows = pixel_windows(placed, camera)
     world_from_camera = camera.world_from_camera.numpy()
     across = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx  # x / z of the pixels' rays
     down = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy  # y / z
@@ -128,14 +128,23 @@ class PlacedBoxes:
         corners = _to_world(centres, rotations, CORNERS * sizes[:, None, :])
         return PlacedBoxes(finite, centres, sizes, rotations, low, high, corners)
 
+    def without_margins(self) -> PlacedBoxes:
+        """The boxes whose sides own surfaces no further out than they are labelled; their tops and
+        bottoms stay.
+        """
+        half = self.sizes_m / 2
+        low, high = np.maximum(self.low_m, -half), np.minimum(self.high_m, half)
+        low[:, 2], high[:, 2] = self.low_m[:, 2], self.high_m[:, 2]
+        return replace(self, low_m=low, high_m=high)
+
 
 def _to_world(centres_m: np.ndarray, rotations: np.ndarray, points_m: np.ndarray) -> np.ndarray:
     """Points [B, K, 3] from their boxes' axes to the world."""
     return centres_m[:, None, :] + points_m @ rotations.transpose(0, 2, 1)
 
 
-def _windows(placed: PlacedBoxes, camera: Camera) -> np.ndarray:
-    """int64 [B, 4]: left, top, right, bottom of the pixels that can show the box; right and bottom
+def pixel_windows(placed: PlacedBoxes, camera: Camera) -> Int64[np.ndarray, "B 4"]:
+    """Left, top, right, bottom of the pixels that can show the box; right and bottom
     are excluded, and nothing is left of a box out of view.
     """
     middle = (placed.low_m + placed.high_m)[:, None, :] / 2

@@ -45,10 +45,9 @@ class Plan:
     recorded_exposure: whether cameras' colour maps apply to the finished picture.
     depth_buffer: which buffer is written as depth, or None. steps: every pass considered, in order.
     flood: the water, None where there is none. shows_water: whether depth, semantic and instance
-    images show the water's surface or the scene's under it. measures_flood: whether views with
-    water need the depth of the scene's surfaces, for what labels say of the flood.
-    snow: None where there is none. measures_snow: whether labels need the depth of its surface.
-    measures_smog: whether they need the depth of what is seen through the smog.
+    images show the water's surface or the scene's under it. snow: None where there is none.
+    finds_boxes: whether labels or instance images need the depth of the solid surfaces, snow
+    included, for what is seen of the boxes.
     snowless_buffers: what takes the place of buffers in views that no snow is in. bare_buffers:
     what depth, semantic and instance images take from a render of the scene without its snow;
     empty where they show the snow.
@@ -68,10 +67,8 @@ class Plan:
     flood: FloodMedium | None = None
     flood_level_z_m: float | None = None
     shows_water: bool = False
-    measures_flood: bool = False
     snow: PlacedSnow | None = None
-    measures_snow: bool = False
-    measures_smog: bool = False
+    finds_boxes: bool = False
     snowless_buffers: frozenset[str] = frozenset()
     bare_buffers: frozenset[str] = frozenset()
     style: Style | None = None
@@ -114,20 +111,19 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
     styles_picture = style is not None and style.applied_to == "picture"
     per_gaussian = recipe.weather.smog is not None and recipe.weather.smog.model == "per_gaussian"
     depth_buffer = DEPTH_ESTIMATORS.get(recipe.output.depth)
-    labelled = recipe.output.labels and scene.labels is not None
-    measures_flood, measures_snow = flood is not None and labelled, snow is not None and labelled
-    measures_smog = smog is not None and labelled
+    wants_boxes = recipe.output.labels or recipe.output.instance
+    finds_boxes = wants_boxes and scene.labels is not None
     for_images = {ALPHA, depth_buffer} if depth_buffer else set[str]()
     if recipe.output.semantic or recipe.output.instance:
         for_images |= {ALPHA, SPLAT_IDS}
+    if recipe.output.instance and finds_boxes and not depth_buffer:
+        for_images.add(EXPECTED_DEPTH)
     snowless, bare_buffers = {RGB, ALPHA} | for_images, set[str]()
     if snow is not None and recipe.output.surface == "scene":
         snowless, bare_buffers = {RGB, ALPHA}, for_images
-    if (smog and not per_gaussian) or (measures_smog and depth_buffer not in snowless):
+    if (smog and not per_gaussian) or (finds_boxes and depth_buffer not in snowless):
         snowless.add(EXPECTED_DEPTH)
     buffers = snowless | {SNOW} if snow is not None else set(snowless)
-    if measures_snow and depth_buffer not in buffers:
-        buffers.add(EXPECTED_DEPTH)
     settings = RasterSettings(
         near_m=recipe.render.near_m,
         alpha_max=recipe.render.alpha_max,
@@ -151,10 +147,8 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
         flood=flood,
         flood_level_z_m=level_z_m,
         shows_water=flood is not None and recipe.output.surface == "first",
-        measures_flood=measures_flood,
         snow=snow,
-        measures_snow=measures_snow,
-        measures_smog=measures_smog,
+        finds_boxes=finds_boxes,
         bare_buffers=frozenset(bare_buffers),
         style=style,
         styles_picture=styles_picture,

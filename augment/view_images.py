@@ -82,19 +82,16 @@ def _wanted(view: WeatheredBuffers, plan: Plan) -> Wanted:
     shown = view.bare or view  # the scene's surfaces that the other images show
     first = view.water if plan.shows_water else None
     in_air = plan.flood is not None and float(view.camera.centre[2]) > plan.flood.level_z_m
-    measured = (
-        plan.measures_smog
-        or (plan.measures_flood and view.water is not None)
-        or (plan.measures_snow and view.snow is not None)
-    )
+    paints_boxes = plan.instance and plan.finds_boxes  # by depth and class of what is shown
+    shows_depth = plan.depth_buffer is not None or (paints_boxes and view.bare is not None)
     return Wanted(
         rgb=view.rgb,
         shown=shown.raster,
         parts=shown.parts,
-        semantic=plan.semantic,
+        semantic=plan.semantic or paints_boxes,
         instance=plan.instance,
-        depth_m=None if plan.depth_buffer is None else shown.depth_m,
-        scene_depth_m=view.depth_m if measured else None,
+        depth_m=shown.depth_m if shows_depth else None,
+        scene_depth_m=view.depth_m if plan.finds_boxes else None,
         first=first,
         plane_z_m=plan.flood.level_z_m if plan.flood is not None and in_air else None,
         water=view.water,

@@ -90,15 +90,35 @@ class SmoggyView:
 
 
 @dataclass(frozen=True, eq=False)
+class SurfaceView:
+    """What the labelled boxes in a view are found by.
+
+    depth_m: float32 [H, W], z of the first solid surface, snow included and water not; 0 = none.
+    snow_m: the snow's depth, 0 where none is in view. actors: uint16 [H, W], the instance image of
+    those surfaces, which knows of actors only; None where there is none. shown_depth_m,
+    shown_classes, shown_snow_m: likewise of the surfaces that the view's instance image shows; None
+    without one.
+    """
+
+    depth_m: np.ndarray
+    snow_m: float
+    actors: np.ndarray | None
+    shown_depth_m: np.ndarray | None
+    shown_classes: np.ndarray | None
+    shown_snow_m: float
+
+
+@dataclass(frozen=True, eq=False)
 class WeatheredView:
     """One finished view as it is written to files.
 
     rgb: uint8 [H, W, 3]. depth_m: float32 [H, W], 0 = none. semantic: uint8 [H, W], SemanticClass.
-    instance: uint16 [H, W], 0 = background or sky, else 1 + the actor's index in the scene.
+    instance: uint16 [H, W], 0 = background or sky, else 1 + the actor's index in the scene; what is
+    written has boxes without an actor, too (`augment.batch.box_weather.label_view`).
     water: uint8 [H, W], 255 where a ray meets water first, else 0; None where the recipe has no
     flood. flood: None where the recipe has no flood. snow: uint8 [H, W], 255 where snow is what the
     pixel shows, else 0. snow, snowy: None where the recipe has no snow. smoggy: None where it has
-    no smog.
+    no smog. surface: None where nobody asks for boxes.
     """
 
     camera: Camera
@@ -111,6 +131,7 @@ class WeatheredView:
     snow: np.ndarray | None = None
     snowy: SnowyView | None = None
     smoggy: SmoggyView | None = None
+    surface: SurfaceView | None = None
 
 
 class PendingView:

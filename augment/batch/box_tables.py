@@ -15,7 +15,7 @@ from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 import numpy as np
 import pyarrow as pa
 
-from augment.batch.columns import parquet_bytes, read_parquet
+from augment.batch.columns import as_described, check_count, parquet_bytes, read_parquet, texts_of
 from augment.box_pixels import NOT_COUNTED
 from augment.errors import OutputError
 
@@ -102,22 +102,23 @@ class BoxTable(Generic[Numbers]):
         table, note = read_parquet(path)
         if note.get("kind") != self.kind:
             raise OutputError(f"{path} holds {note.get('kind')!r} data; expected {self.kind!r}")
-        track_ids = table["track_id"].to_pylist()
-        columns = {name: self._column(table[name], name) for name in self.stored}
-        items, start = {}, 0
-        images: Any = note["images"]
-        for frame, camera, count in images:
-            rows = slice(start, start + count)
-            # Copies: Arrow's own memory is read-only, which torch.from_numpy warns about.
-            values = {name: column[rows].copy() for name, column in columns.items()}
-            items[frame, camera] = self.record(track_ids=tuple(track_ids[rows]), **values)
-            start += count
+        with as_described(path):
+            track_ids = texts_of(table["track_id"])
+            columns = {name: self._column(table[name], name) for name in self.stored}
+            items, start = {}, 0
+            for frame, camera, count in note["images"]:
+                rows = slice(start, start + count)
+                # Copies: Arrow's own memory is read-only, which torch.from_numpy warns about.
+                values = {name: column[rows].copy() for name, column in columns.items()}
+                items[frame, camera] = self.record(track_ids=tuple(track_ids[rows]), **values)
+                start += count
+            check_count(table, start)
         return items
 
     def _column(self, data: pa.ChunkedArray, name: str) -> np.ndarray:
         if self.columns[name] is np.int64:
             data = data.fill_null(NOT_COUNTED)
-        return data.to_numpy()
+        return data.to_numpy().astype(self.columns[name], casting="safe", copy=False)
 
 
 def _joined(arrays: list[np.ndarray], dtype: type) -> np.ndarray:

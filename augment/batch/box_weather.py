@@ -1,7 +1,10 @@
-"""All that weather does to the boxes of an image, by the manifest's kind of path."""
+"""All that is measured of the boxes of an image, by the manifest's kind of path: what of each it
+shows, and what the weather does to them.
+"""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
@@ -9,34 +12,75 @@ import numpy as np
 from jaxtyping import Float64
 
 from augment.batch.box_tables import BoxNumbers, BoxTable
+from augment.batch.boxes_2d import BOX_2D_TABLE, measure_2d
 from augment.batch.smog_labels import SMOG_TABLE, BoxSmog, measure_smog
 from augment.batch.snow_labels import SNOW_TABLE, BoxSnow, measure_snow
 from augment.batch.water_labels import WATER_TABLE, BoxWater, measure_water
 from augment.batch.writer import View
+from augment.box_pixels import PlacedBoxes
 from augment.cameras import Camera
+from augment.instances import Instances, with_boxes
 from augment.labels import Boxes
+from augment.snow.labels import placed_in_snow
+from recipes.schema import Recipe
 
-BoxWeather = Mapping[str, BoxNumbers]  # what each effect in a view does to the boxes, by kind
+# What is seen of the boxes in a view, and what each effect there does to them, by kind.
+BoxWeather = Mapping[str, BoxNumbers]
 TABLES: Mapping[str, BoxTable[Any]] = {
+    "box_2d": BOX_2D_TABLE,
     "box_water": WATER_TABLE,
     "box_snow": SNOW_TABLE,
     "box_smog": SMOG_TABLE,
 }
 
 
-def has_box_weather(view: View) -> bool:
-    """Whether the view has an effect that boxes are measured for."""
-    return any(fact is not None for fact in (view.flood, view.snowy, view.smoggy))
+def uses_boxes(recipe: Recipe) -> bool:
+    """Whether images of the recipe take the boxes of their frame."""
+    return recipe.output.labels or recipe.output.instance
+
+
+def label_view(
+    boxes: Boxes,
+    instances: Instances,
+    world_origin_m: np.ndarray,
+    camera: Camera,
+    view: View,
+    recipe: Recipe,
+) -> tuple[View, BoxWeather]:
+    """One of a frame's images with the frame's boxes: in the instance image those that have no
+    actor, too; and what is measured of them, where labels are written.
+
+    camera: at the written resolution. view: one that `writer.check_view` has passed.
+    """
+    measured: BoxWeather = {}
+    if recipe.output.labels:
+        measured = measure_boxes(boxes, instances, world_origin_m, camera, view)
+    surface = view.surface
+    if view.instance is None or surface is None:
+        return view, measured
+    assert surface.shown_depth_m is not None and surface.shown_classes is not None
+    painted = with_boxes(
+        view.instance,
+        placed_in_snow(boxes, world_origin_m, surface.shown_snow_m)
+        if surface.shown_snow_m
+        else PlacedBoxes.of(boxes, world_origin_m),
+        instances.of(boxes.track_ids),
+        camera,
+        surface.shown_depth_m,
+        surface.shown_classes,
+        len(instances.actors),
+    )
+    changed: Any = view
+    return dataclasses.replace(changed, instance=painted), measured
 
 
 def measure_boxes(
-    boxes: Boxes, world_origin_m: np.ndarray, camera: Camera, view: View
+    boxes: Boxes, instances: Instances, world_origin_m: np.ndarray, camera: Camera, view: View
 ) -> BoxWeather:
-    """The boxes of a frame in one of its images. camera: at the written resolution.
-
-    view: one that `writer.check_view` has passed.
-    """
+    """The boxes of a frame in one of its images; camera and view as for `label_view`."""
     measured: dict[str, BoxNumbers] = {}
+    if view.surface is not None:
+        measured["box_2d"] = measure_2d(boxes, instances, world_origin_m, camera, view.surface)
     if view.flood is not None:
         assert view.water is not None
         measured["box_water"] = measure_water(boxes, world_origin_m, camera, view.water, view.flood)

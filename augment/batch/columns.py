@@ -7,10 +7,15 @@ Writing fails for a column that could not be restored exactly.
 
 from __future__ import annotations
 
+import base64
 import json
-from collections.abc import Sequence
+import re
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -19,6 +24,13 @@ import pyarrow.parquet as pq
 from augment.errors import OutputError
 
 METADATA_KEY = b"climategs"
+
+_UNLIKE_METADATA = (
+    *(ArithmeticError, AttributeError, LookupError, RecursionError),
+    *(SyntaxError, TypeError, ValueError, pa.ArrowException),
+)
+_BASE64 = re.compile(rb"[A-Za-z0-9+/]{24,}")
+_EXTENSION = b"ARROW:extension:name"
 
 
 @dataclass(frozen=True)
@@ -53,6 +65,23 @@ def pack_column(pieces: Sequence[np.ndarray], *, where: str) -> PackedColumn:
         return PackedColumn(pa.chunked_array(chunks, type=kind), "plain")
     texts = [pa.array(_to_json(piece, where), pa.string()) for piece in pieces]
     return PackedColumn(pa.chunked_array(texts, type=pa.string()), "json")
+
+
+def check_count(table: pa.Table, described: int) -> None:
+    """Raise ValueError where a table has other than the described number of rows."""
+    if table.num_rows != described:
+        raise ValueError(f"it has {table.num_rows} rows, its metadata describe {described}")
+
+
+def texts_of(data: pa.ChunkedArray) -> list[str]:
+    """The texts of a column without gaps.
+
+    Raises:
+        ValueError: it holds anything else.
+    """
+    if not pa.types.is_string(data.type) or data.null_count:
+        raise ValueError(f"expected texts; got {data.type} with {data.null_count} nulls")
+    return data.to_pylist()
 
 
 def unpack_column(data: pa.ChunkedArray, kind: str, encoding: str) -> np.ndarray:
@@ -92,33 +121,111 @@ def parquet_bytes(table: pa.Table, metadata: dict[str, object]) -> bytes:
     return sink.getvalue().to_pybytes()
 
 
-def read_parquet(path: Path) -> tuple[pa.Table, dict[str, object]]:
+def read_table(source: Path | bytes, where: str, columns: Sequence[str] | None = None) -> pa.Table:
+    """The table in a Parquet file from anybody: columns of Arrow's own types, valid throughout.
+
+    where: the file, for errors. columns: only those of these that it has.
+
+    Raises:
+        OutputError: the file is missing or damaged (texts that are not UTF-8 included), two of its
+            columns have one name, or a column has an extension type.
+    """
+    with _opened(source, where) as file:
+        there = Counter(file.schema_arrow.names)
+        if repeated := [name for name, count in there.items() if count > 1]:
+            raise OutputError(f"{where} has several columns {repeated[0]!r}; leave one")
+        wanted = None if columns is None else [name for name in columns if name in there]
+        # One thread: this runs in DataLoader workers, which bring their own parallelism.
+        table = file.read(wanted, use_threads=False)
+        table.validate(full=True)  # Arrow does not look at texts as it reads
+    return table
+
+
+def read_parquet(path: Path) -> tuple[pa.Table, dict[str, Any]]:
     """A table and the metadata that `parquet_bytes` put beside it.
 
     Raises:
-        OutputError: the file is missing, damaged, or without that metadata.
+        OutputError: as read_table, or the file is without that metadata.
     """
-    note = read_note(path)
-    try:
-        # One thread: this runs in DataLoader workers, which bring their own parallelism.
-        return pq.ParquetFile(path).read(use_threads=False), note
-    except (OSError, pa.ArrowException) as error:
-        raise OutputError(f"{path} is not a readable Parquet file: {error}") from error
+    table = read_table(path, str(path))
+    return table, _note(table.schema, path)
 
 
-def read_note(path: Path) -> dict[str, object]:
-    """The metadata that `parquet_bytes` put beside a table.
+def read_note(path: Path) -> dict[str, Any]:
+    """The metadata alone, without reading a column.
 
     Raises:
-        OutputError: as for read_parquet.
+        OutputError: as read_parquet.
     """
+    with _opened(path, str(path)) as file:
+        schema = file.schema_arrow
+    return _note(schema, path)
+
+
+def is_ours(path: Path) -> bool:
+    """Whether a Parquet file has metadata as `parquet_bytes` writes it.
+
+    Raises:
+        OutputError: as read_table.
+    """
+    with _opened(path, str(path)) as file:
+        return METADATA_KEY in (file.schema_arrow.metadata or {})
+
+
+def _note(schema: pa.Schema, path: Path) -> dict[str, Any]:
     try:
-        note = (pq.read_schema(path).metadata or {}).get(METADATA_KEY)
-    except (OSError, pa.ArrowException) as error:
-        raise OutputError(f"{path} is missing or not a readable Parquet file: {error}") from error
-    if note is None:
-        raise OutputError(f"{path} was not written by this project: its metadata are missing")
-    return json.loads(note)
+        note = json.loads((schema.metadata or {}).get(METADATA_KEY, b"null"))
+    except (ValueError, RecursionError):
+        note = None
+    if not isinstance(note, dict):
+        raise OutputError(
+            f"{path} was not written by this project: its metadata are missing or damaged"
+        )
+    return note
+
+
+@contextmanager
+def as_described(path: Path) -> Iterator[None]:
+    """While a file's columns are taken as its metadata say, what goes wrong is an OutputError."""
+    try:
+        yield
+    except _UNLIKE_METADATA as error:
+        raise OutputError(
+            f"{path} is damaged: its columns are not as its metadata say ({error!r:.200}). Delete "
+            f"it and run the job again, which makes it anew"
+        ) from error
+
+
+@contextmanager
+def _opened(source: Path | bytes, where: str) -> Iterator[pq.ParquetFile]:
+    """The file, for as long as it is read; what Arrow then raises becomes an OutputError."""
+    try:
+        with pa.BufferReader(source) if isinstance(source, bytes) else pa.OSFile(str(source)) as at:
+            if _has_extension_types(at):
+                raise OutputError(
+                    f"{where} has a column of an Arrow extension type, which is not read, for it "
+                    f"could run code; write plain numbers and texts instead"
+                )
+            yield pq.ParquetFile(at)
+    except (OSError, pa.ArrowException, UnicodeDecodeError) as error:
+        raise OutputError(f"{where} is missing or not a readable Parquet file: {error}") from error
+
+
+def _has_extension_types(file: pa.NativeFile) -> bool:
+    """Whether the Arrow schema in a Parquet file's footer names an extension type.
+
+    As a file is opened, Arrow hands what it says of such a type to whatever this process has
+    registered under the type's name; some unpickle it, as pyarrow's own did up to 14.0.0. So the
+    footer is searched beforehand, unparsed, for the schema: it is base64, and bytes before it may
+    look as if they belonged to it.
+    """
+    size = file.size()
+    file.seek(max(0, size - 8))
+    footer = min(int.from_bytes(file.read(4), "little"), max(0, size - 8))
+    file.seek(max(0, size - 8) - footer)
+    runs = [run[start:] for run in _BASE64.findall(file.read(footer)) for start in range(4)]
+    file.seek(0)
+    return any(_EXTENSION in base64.b64decode(run[: len(run) // 4 * 4]) for run in runs)
 
 
 def _to_arrow(piece: np.ndarray) -> pa.Array | None:

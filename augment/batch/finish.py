@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from augment.batch.atomic import write_atomic
@@ -89,7 +89,7 @@ def _companions(ledger: Ledger, variant: VariantState) -> dict[str, Path]:
 
 
 def _tables(variant: VariantState) -> dict[str, str]:
-    """The files of what its weather does to boxes, less those that came with a later version than
+    """The files of what is measured of boxes, less those that came with a later version than
     the one that rendered the images: only rendering again would tell what is in them.
     """
     labelled = [row for row in variant.rows.values() if row["labels_path"] is not None]
@@ -107,7 +107,10 @@ def _write_boxes(ledger: Ledger, variant: VariantState, cache: BoxCache) -> None
     if path.is_file():
         known = {n: b for n, b in _read_or_drop(path).items() if n in set(frames)}
     new = cache.get([number for number in frames if number not in known])
-    write_atomic(path, boxes_bytes({**known, **new}))
+    found = {**known, **new}
+    number_of = ledger.index.instances.of
+    numbered = {n: replace(b, instances=number_of(b.boxes.track_ids)) for n, b in found.items()}
+    write_atomic(path, boxes_bytes(numbered))
 
 
 def _write_box_weather(ledger: Ledger, variant: VariantState, kind: str) -> None:

@@ -19,6 +19,7 @@ from tqdm import tqdm
 import augment
 from augment.batch.atomic import write_atomic
 from augment.batch.backends import choose_backend
+from augment.batch.box_weather import uses_boxes
 from augment.batch.executors import run_in_processes, run_serially
 from augment.batch.finish import BoxCache, finish, needs_finish
 from augment.batch.journal import Identity
@@ -211,6 +212,7 @@ class _Run:
             backend=self.backend,
             camera_path=None if path is None else frames_to_json(path),
             labelled=self.index.labelled,
+            instances=self.index.instances,
             beds=self.beds,
             maps=self.maps,
         )
@@ -320,13 +322,15 @@ class _Run:
     def _leave_unlabelled(self, chunks: Sequence[Chunk]) -> list[Chunk]:
         """Record as failed what belongs to frames whose boxes cannot be read; return the rest."""
         started = time.perf_counter()
-        labelled = {c.frame for c in chunks if self.recipes[c.variant].output.labels}
+        labelled = {c.frame for c in chunks if uses_boxes(self.recipes[c.variant])}
         self.boxes.get(sorted(labelled))
+        if labelled:
+            _ = self.index.instances.by_track  # read once, and not by every worker
         self.timings["labels"] += time.perf_counter() - started
         rest = []
         for chunk in chunks:
             message = self.boxes.errors.get(chunk.frame)
-            if message is None or not self.recipes[chunk.variant].output.labels:
+            if message is None or not uses_boxes(self.recipes[chunk.variant]):
                 rest.append(chunk)
                 continue
             for name in chunk.cameras:

@@ -11,11 +11,14 @@ import numpy as np
 import pyarrow as pa
 
 from augment.batch.columns import (
+    as_described,
+    check_count,
     column_type,
     pack_column,
     parquet_bytes,
     read_note,
     read_parquet,
+    texts_of,
     unpack_column,
 )
 from augment.errors import OutputError
@@ -31,10 +34,14 @@ _VECTORS = {
 
 @dataclass(frozen=True, eq=False)
 class FrameBoxes:
-    """The boxes of one frame and the frame's reference time."""
+    """The boxes of one frame and the frame's reference time.
+
+    instances: uint16 [B], the objects' numbers (`augment.instances`); None in older files.
+    """
 
     timestamp_ns: int
     boxes: Boxes
+    instances: np.ndarray | None = None
 
 
 def lidar_bytes(sweep: LidarSweep, *, note: str | None = None) -> bytes:
@@ -58,8 +65,9 @@ def read_lidar(path: Path) -> LidarSweep:
         OutputError: the file is missing, damaged, or holds something else.
     """
     table, note = _read(Path(path), "lidar")
-    kinds = note["columns"]
-    return LidarSweep({name: unpack_column(table[name], *kinds[name]) for name in kinds})
+    with as_described(path):
+        kinds = note["columns"]
+        return LidarSweep({name: unpack_column(table[name], *kinds[name]) for name in kinds})
 
 
 def read_lidar_note(path: Path) -> str | None:
@@ -94,6 +102,8 @@ def boxes_bytes(frames: Mapping[int, FrameBoxes]) -> bytes:
     for field, names in _VECTORS.items():
         joined = np.concatenate([np.zeros((0, len(names)))] + [getattr(b, field) for b in listed])
         columns |= {name: joined[:, k].copy() for k, name in enumerate(names)}
+    if any(frame.instances is not None for frame in frames.values()):
+        columns["instance"] = pa.chunked_array([_instances(frames[n]) for n in order], pa.uint16())
     encodings = {}
     for name in dict.fromkeys(name for boxes in listed for name in boxes.attributes):
         columns[ATTRIBUTE_PREFIX + name], encodings[name] = _attribute(name, listed)
@@ -113,29 +123,42 @@ def read_boxes(path: Path) -> dict[int, FrameBoxes]:
         OutputError: the file is missing, damaged, or holds something else.
     """
     table, note = _read(Path(path), "boxes")
-    track_ids, labels = table["track_id"].to_pylist(), table["label"].to_pylist()
-    vectors = {
-        field: np.stack([table[name].to_numpy() for name in names], axis=1)
-        for field, names in _VECTORS.items()
-    }
-    frames, start = {}, 0
-    for index, timestamp_ns, count, kinds in note["frames"]:
-        rows = slice(start, start + count)
-        attributes = {
-            name: unpack_column(
-                table[ATTRIBUTE_PREFIX + name].slice(start, count), kind, note["encodings"][name]
-            )
-            for name, kind in kinds.items()
+    with as_described(path):
+        track_ids, labels = texts_of(table["track_id"]), texts_of(table["label"])
+        vectors = {
+            field: np.stack([table[name].to_numpy() for name in names], axis=1)
+            for field, names in _VECTORS.items()
         }
-        boxes = Boxes(
-            tuple(track_ids[rows]),
-            tuple(labels[rows]),
-            **{field: value[rows].copy() for field, value in vectors.items()},
-            attributes=attributes,
-        )
-        frames[index] = FrameBoxes(timestamp_ns, boxes)
-        start += count
+        names = set(table.column_names)
+        frames, start = {}, 0
+        for index, timestamp_ns, count, kinds in note["frames"]:
+            rows = slice(start, start + count)
+            attributes = {
+                name: unpack_column(
+                    table[ATTRIBUTE_PREFIX + name].slice(start, count),
+                    kind,
+                    note["encodings"][name],
+                )
+                for name, kind in kinds.items()
+            }
+            boxes = Boxes(
+                tuple(track_ids[rows]),
+                tuple(labels[rows]),
+                **{field: value[rows].copy() for field, value in vectors.items()},
+                attributes=attributes,
+            )
+            numbers = table["instance"].slice(start, count) if "instance" in names else None
+            instances = None if numbers is None or numbers.null_count else numbers.to_numpy().copy()
+            frames[index] = FrameBoxes(timestamp_ns, boxes, instances)
+            start += count
+        check_count(table, start)
     return frames
+
+
+def _instances(frame: FrameBoxes) -> pa.Array:
+    if frame.instances is None:
+        return pa.nulls(len(frame.boxes), pa.uint16())
+    return pa.array(frame.instances, pa.uint16())
 
 
 def _attribute(name: str, listed: list[Boxes]) -> tuple[pa.ChunkedArray, str]:

@@ -15,8 +15,9 @@ from recipes.schema import Recipe
 
 MANIFEST = "manifest.parquet"
 STATE_FOLDER = ".climategs"
-# What weather does to the boxes, inside a variant's folder.
+# What is measured of the boxes, inside a variant's folder.
 _BOX_WEATHER = {
+    "box_2d": "labels/boxes_2d.parquet",
     "box_water": "labels/water.parquet",
     "box_snow": "labels/snow.parquet",
     "box_smog": "labels/smog.parquet",
@@ -57,6 +58,7 @@ class ItemPaths:
     snow: str | None
     lidar: str | None
     labels: str | None
+    box_2d: str | None
     box_water: str | None
     box_snow: str | None
     box_smog: str | None
@@ -76,8 +78,11 @@ def variant_folder(scene: str, variant: str) -> str:
 
 
 def box_weather_files(recipe: Recipe) -> dict[str, str]:
-    """Files inside the variant's folder that say what its weather does to the boxes, by kind."""
+    """Files inside the variant's folder that say what is seen of the boxes, and what the weather
+    does to them, by kind.
+    """
     present = {
+        "box_2d": True,
         "box_water": recipe.weather.flood is not None,
         "box_snow": recipe.weather.snow is not None,
         "box_smog": recipe.weather.smog is not None,
@@ -102,6 +107,7 @@ def item_paths(scene: str, recipe: Recipe, camera: str, frame: int) -> ItemPaths
         snow=None if weather.snow is None else f"{base}/snow/{stem}.png",
         lidar=f"{base}/lidar/{frame:06d}.parquet" if recipe.lidar else None,
         labels=f"{base}/labels/boxes.parquet" if output.labels else None,
+        box_2d=f"{base}/{tables['box_2d']}" if "box_2d" in tables else None,
         box_water=f"{base}/{tables['box_water']}" if "box_water" in tables else None,
         box_snow=f"{base}/{tables['box_snow']}" if "box_snow" in tables else None,
         box_smog=f"{base}/{tables['box_smog']}" if "box_smog" in tables else None,

@@ -41,6 +41,7 @@ from augment.batch.selection import SceneIndex
 from augment.batch.store import open_store
 from augment.cameras import Frame
 from augment.errors import OutputError
+from augment.instances import Instances
 from recipes.schema import Recipe
 
 # What belongs to a whole variant is written when the job ends.
@@ -52,7 +53,7 @@ _log = logging.getLogger(__name__)
 class VariantState:
     """One variant of the job. rows: what is known of its images, from this run and earlier ones.
 
-    box_weather: what its weather does to the boxes of those images, by effect (see TABLES).
+    box_weather: what is measured of the boxes of those images, by kind (see TABLES).
     """
 
     recipe: Recipe
@@ -66,14 +67,20 @@ class VariantState:
     )
     is_journalled: bool = False
 
-    def is_finished(self, out_dir: Path, item: Item) -> bool:
-        """Whether the image's row says ok, and all its files and its boxes' numbers are there."""
+    def is_finished(self, out_dir: Path, item: Item, instances: Instances) -> bool:
+        """Whether the image's row says ok, and all its files and its boxes' numbers are there; and
+        its objects are numbered as today, when a frame may be read that could not be read then.
+        """
         row = self.rows.get(item)
         if row is None or row["status"] != OK:
             return False
         measured = [kind for kind in TABLES if row[f"{kind}_path"] is not None]
         if any(item not in self.box_weather[kind] for kind in measured):
             return False
+        if "box_2d" in measured:
+            numbers: Any = self.box_weather["box_2d"][item]
+            if not instances.agree(numbers.track_ids, numbers.instance):
+                return False
         paths = [row[f"{kind}_path"] for kind in PATH_KINDS if kind not in _OF_VARIANT]
         return all((out_dir / path).is_file() for path in paths if path is not None)
 
@@ -120,7 +127,13 @@ class Ledger:
         """What has to be rendered, in order: variant by variant, frame by frame."""
         for number, variant in enumerate(self.variants):
             for frame, names in selection:
-                left = [n for n in names if not variant.is_finished(self.out_dir, (frame.index, n))]
+                left = [
+                    name
+                    for name in names
+                    if not variant.is_finished(
+                        self.out_dir, (frame.index, name), self.index.instances
+                    )
+                ]
                 if left:
                     yield Chunk(number, frame.index, tuple(left))
 

@@ -7,19 +7,24 @@ made: the same images give the same file to the bit.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute
 import pyarrow.parquet as pq
 
 from augment.batch.atomic import write_atomic
+from augment.batch.columns import read_table
 from augment.batch.layout import MANIFEST, PATH_KINDS
 from augment.errors import OutputError
 
 OK, FAILED = "ok", "failed"
+
+pc: Any = pyarrow.compute  # type checkers do not see the functions that it makes on import
 
 # In the order of the file; the weather numbers of the recipes stand between the two groups.
 LEADING = {
@@ -58,6 +63,7 @@ TRAILING = {
 LATER: dict[str, str | None] = {
     "water_path": None,
     "snow_path": None,
+    "box_2d_path": None,
     "box_water_path": None,
     "box_snow_path": None,
     "box_smog_path": None,
@@ -73,7 +79,10 @@ LATER: dict[str, str | None] = {
 # What a row without them means by weather numbers that others have; NaN for all else.
 LATER_NUMBERS = {"style_strength": 0.0}
 KEY = ("scene", "variant", "frame", "camera")
+MAX_SIDE_PX = 1 << 16  # of an image; no camera has as many
 _RANK = "rank"
+# Absolute, upwards, or not what all systems and object stores take for the same file.
+_STRAYS = r"^$|^/|(^|/)\.{1,2}(/|$)|\\|\x00"
 
 Row = Mapping[str, Any]
 
@@ -102,7 +111,7 @@ def read_manifest(out_dir: Path) -> pa.Table:
     """The manifest of an output folder; one of an older version gains the columns it lacks.
 
     Raises:
-        OutputError: there is none, or it is damaged, or it lacks columns.
+        OutputError: there is none, or as parse_manifest raises it.
     """
     path = Path(out_dir) / MANIFEST
     if not path.is_file():
@@ -121,21 +130,81 @@ def parse_manifest(data: bytes, where: str) -> pa.Table:
     """The table in a manifest's bytes, with the columns that an older version lacks.
 
     Raises:
-        OutputError: the bytes are damaged, or lack columns; `where` they were read.
+        OutputError: the bytes are damaged, or a column is missing, of another type, or holds what
+            no job writes; `where` they were read.
     """
-    try:
-        table = pq.ParquetFile(pa.BufferReader(data)).read(use_threads=False)
-    except (OSError, pa.ArrowException) as error:
-        raise OutputError(f"{where} is not a readable Parquet file: {error}") from error
-    table = _with_later_columns(table)
-    wanted = {**LEADING, **TRAILING}
-    wrong = [n for n, k in wanted.items() if n not in table.column_names or table[n].type != k]
-    if wrong:
-        raise OutputError(
-            f"{where} lacks the columns {wrong} or holds them in another type; it was written by "
-            f"another program or version. Write to another output folder"
-        )
+    table = _with_later_columns(read_table(data, where))
+    _check_types(table, where)
+    for name in weather_columns(table):
+        if table[name].null_count:  # what some programs make of NaN
+            filled = pc.fill_null(table[name], math.nan)
+            table = table.set_column(table.column_names.index(name), name, filled)
+    _check_values(table, where)
     return table
+
+
+def _check_types(table: pa.Table, where: str) -> None:
+    wanted = {**LEADING, **dict.fromkeys(weather_columns(table), pa.float64()), **TRAILING}
+    advice = "It was written by another program or version: write to another output folder"
+    missing = sorted(wanted.keys() - set(table.column_names))
+    if missing:
+        raise OutputError(f"{where} lacks the columns {missing}. {advice}")
+    for field in table.schema:
+        if field.type != wanted[field.name]:
+            raise OutputError(
+                f"{where}: column {field.name!r} must be of type {wanted[field.name]}; got "
+                f"{field.type}. {advice}"
+            )
+
+
+def _check_values(table: pa.Table, where: str) -> None:
+    """Raise OutputError at the first value that no job writes."""
+    for name, column in zip(table.column_names, table.columns, strict=True):
+        is_path = name.removesuffix("_path") in PATH_KINDS
+        if column.null_count and not is_path and LATER.get(name, "") is not None:
+            _refuse(table, name, pc.is_null(column), "a value", where)
+        if column.null_count == table.num_rows:
+            continue
+        if is_path:
+            strays = pc.match_substring_regex(column, _STRAYS)
+            _refuse(table, name, strays, "a path inside the output folder, relative to it", where)
+        elif name in ("width", "height"):
+            wrong = pc.or_(pc.less(column, 1), pc.greater(column, MAX_SIDE_PX))
+            _refuse(table, name, wrong, f"1 to {MAX_SIDE_PX} (pixels)", where)
+        elif name == "render_scale":
+            scaled = pc.and_(pc.greater(column, 0), pc.is_finite(column))
+            _refuse(table, name, pc.invert(scaled), "a number above 0, or null", where)
+        elif pa.types.is_floating(column.type):
+            _refuse(table, name, pc.is_inf(column), "a finite number, or NaN", where)
+        elif name == "status":
+            known = pc.is_in(column, pa.array([OK, FAILED]))
+            _refuse(table, name, pc.invert(known), f"{OK!r} or {FAILED!r}", where)
+    if table["image_path"].null_count:
+        pathless = pc.and_(pc.equal(table["status"], OK), pc.is_null(table["image_path"]))
+        _refuse(table, "image_path", pathless, f"a path where status is {OK!r}", where)
+    if table.num_rows > table.group_by(list(KEY), use_threads=False).aggregate([]).num_rows:
+        raise _repeated(table, where)
+
+
+def _repeated(table: pa.Table, where: str) -> OutputError:
+    keys = list(zip(*(table[name].to_pylist() for name in KEY), strict=True))
+    key, count = Counter(keys).most_common(1)[0]
+    image = ", ".join(f"{name} {part!r:.80}" for name, part in zip(KEY, key, strict=True))
+    return OutputError(
+        f"{where}: an image must have one row; {count} are of {image}, the first of them row "
+        f"{keys.index(key)} (counted from 0). Leave one of them"
+    )
+
+
+def _refuse(table: pa.Table, name: str, wrong: pa.ChunkedArray, expected: str, where: str) -> None:
+    """Raise OutputError if `wrong` is true of a row."""
+    row = pc.index(wrong, True).as_py()
+    if row >= 0:
+        raise OutputError(
+            f"{where}: column {name!r}, row {row} (counted from 0) must be {expected}; got "
+            f"{table[name][row].as_py()!r:.200}. No job writes that: take the file from a copy, or "
+            f"write to another output folder"
+        )
 
 
 def merge_rows(

@@ -19,7 +19,7 @@ import numpy as np
 
 from augment.batch.atomic import write_atomic
 from augment.batch.backends import gpu_is_lost, renders_on_gpu
-from augment.batch.box_weather import BoxWeather, has_box_weather, measure_boxes
+from augment.batch.box_weather import BoxWeather, label_view, uses_boxes
 from augment.batch.label_files import lidar_bytes, read_lidar_note
 from augment.batch.layout import item_paths, variant_name
 from augment.batch.manifest import FAILED, OK
@@ -41,6 +41,7 @@ from augment.batch.trajectory import frames_from_json
 from augment.batch.writer import View, WritePump, check_view, write_view
 from augment.cameras import Camera
 from augment.errors import GpuLost, OutputError
+from augment.instances import Instances
 from augment.labels import Boxes, LidarSweep
 from augment.scene import Scene
 from recipes.schema import Recipe
@@ -73,8 +74,8 @@ class Setup:
     """What rendering needs besides the scene; small, and picklable.
 
     camera_path: JSON of `trajectory`, or None for the scene's frames. labelled: numbers of the
-    frames whose labels and LiDAR pass through. beds: where the recipes' snow can lie; the scene to
-    render remembers them. maps: those of the recipes' styles.
+    frames whose labels and LiDAR pass through. instances: of the scene's objects. beds: where the
+    recipes' snow can lie; the scene to render remembers them. maps: those of the recipes' styles.
     """
 
     out_dir: str
@@ -82,6 +83,7 @@ class Setup:
     backend: str
     camera_path: str | None
     labelled: frozenset[int]
+    instances: Instances
     beds: tuple[StoredBed, ...] = ()
     maps: tuple[StoredMaps, ...] = ()
 
@@ -99,8 +101,8 @@ class Chunk:
 class Outcome:
     """What became of one image.
 
-    lidar, lidar_note: as of PassedLidar. box_weather: what each effect of the recipe does to its
-    boxes, where there are labels.
+    lidar, lidar_note: as of PassedLidar. box_weather: what is seen of its boxes, and what each
+    effect of the recipe does to them, where there are labels.
     """
 
     variant: int
@@ -275,10 +277,10 @@ class FrameRunner:
         chunk, recipe, name = drawn.chunk, drawn.recipe, drawn.camera.name
         paths = item_paths(self._scene.name, recipe, name, chunk.frame)
         failed = Outcome(chunk.variant, chunk.frame, name, FAILED)
-        doing = "measuring the boxes in the weather"
+        doing = "measuring the boxes"
         try:
             with self._times.spent(MEASURE):
-                box_weather = self._measure(chunk.frame, recipe, drawn.camera, view)
+                view, box_weather = self._label(chunk.frame, recipe, drawn.camera, view)
             doing = "encoding"
             written = write_view(Path(self._setup.out_dir), paths, view, recipe)
         except OutputError:
@@ -304,16 +306,18 @@ class FrameRunner:
         with self._times.spent(WRITE):
             self._deliver(done)
 
-    def _measure(self, frame: int, recipe: Recipe, camera: Camera, view: View) -> BoxWeather:
-        """What the weather does to the frame's boxes; nothing without labels."""
-        has_labels = recipe.output.labels and frame in self._setup.labelled
-        if not has_labels or not has_box_weather(view):
-            return {}
+    def _label(
+        self, frame: int, recipe: Recipe, camera: Camera, view: View
+    ) -> tuple[View, BoxWeather]:
+        """The view with the frame's boxes, and what is measured of them, where they are wanted."""
+        if not uses_boxes(recipe) or frame not in self._setup.labelled:
+            return view, {}
         with self._reading_boxes:
             if frame not in self._boxes:
                 self._boxes[frame] = self._scene.boxes(frame)
         origin = np.asarray(self._scene.world_origin_m, np.float64)
-        return measure_boxes(self._boxes[frame], origin, camera, view)
+        boxes = self._boxes[frame]
+        return label_view(boxes, self._setup.instances, origin, camera, view, recipe)
 
     def _pass_lidar(self, chunk: Chunk, recipe: Recipe) -> PassedLidar | str:
         """Write the frame's sweep, in the weather or as it is, unless it is there already.

@@ -10,6 +10,7 @@ import numpy as np
 
 from augment.cameras import Frame
 from augment.errors import SceneError
+from augment.instances import Instances, instances_of
 from augment.labels import LabelSource
 from augment.scene import Scene
 
@@ -20,7 +21,8 @@ class SceneIndex:
 
     frames: those of the job, the scene's own or a camera path's. labelled: numbers of the frames
     whose boxes and LiDAR pass through: all of the scene's own; of a camera path, those that share
-    number and timestamp with a frame of the scene.
+    number and timestamp with a frame of the scene. instances: of the objects in all the scene's
+    own frames.
     """
 
     name: str
@@ -28,11 +30,14 @@ class SceneIndex:
     frames: tuple[Frame, ...]
     labels: LabelSource | None
     labelled: frozenset[int]
+    instances: Instances
     world_origin_m: np.ndarray
     has_metric_scale: bool
 
     @staticmethod
     def of(scene: Scene, camera_path: Sequence[Frame] | None = None) -> SceneIndex:
+        if camera_path is None:
+            check_frames(scene)
         frames = scene.frames if camera_path is None else tuple(camera_path)
         times = {frame.index: frame.timestamp_ns for frame in scene.frames}
         labelled = {f.index for f in frames if times.get(f.index) == f.timestamp_ns}
@@ -42,6 +47,7 @@ class SceneIndex:
             frames=frames,
             labels=scene.labels,
             labelled=frozenset(labelled) if scene.labels is not None else frozenset(),
+            instances=instances_of(scene),
             world_origin_m=np.asarray(scene.world_origin_m, np.float64),
             has_metric_scale=scene.has_metric_scale,
         )
@@ -49,6 +55,13 @@ class SceneIndex:
     @functools.cached_property
     def frames_by_number(self) -> dict[int, Frame]:
         return {frame.index: frame for frame in self.frames}
+
+
+def check_frames(scene: Scene) -> None:
+    """Raises SceneError, with what its adapter said, where a scene has no frames to render."""
+    if not scene.frames:
+        said = "; ".join(scene.problems) or "give camera_path=FILE in its URI"
+        raise SceneError(f"scene {scene.name!r} ({scene.source}) has no frames to render: {said}")
 
 
 def select_frames(

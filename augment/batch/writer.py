@@ -15,6 +15,7 @@ import numpy as np
 
 from augment.batch.atomic import write_atomic
 from augment.batch.backends import renders_on_gpu
+from augment.batch.boxes_2d import Surfaces
 from augment.batch.encode import encode_depth, encode_ids, encode_image, encode_mask
 from augment.batch.layout import ItemPaths
 from augment.batch.smog_labels import Smoggy
@@ -26,7 +27,7 @@ from recipes.schema import Recipe
 
 @runtime_checkable
 class View(Protocol):
-    """What a renderer returns; `augment.apply.WeatheredView` is one."""
+    """What a renderer returns, a dataclass; `augment.apply.WeatheredView` is one."""
 
     rgb: np.ndarray  # uint8 [H, W, 3]
     depth_m: np.ndarray | None  # float32 [H, W], 0 = none
@@ -37,6 +38,7 @@ class View(Protocol):
     snow: np.ndarray | None  # uint8 [H, W], 0 or 255
     snowy: Snowy | None
     smoggy: Smoggy | None
+    surface: Surfaces | None  # None where no boxes are found in the view
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from augment.batch.box_weather import TABLES, BoxWeather, visibility
-from augment.box_pixels import CORNERS, EDGES, NEAR_M, cut_edges
+from augment.boxes_2d import outline_boxes, rotations_of
 from augment.labels import Boxes
 
 BoxFrame = Literal["world", "ego", "camera"]
@@ -33,11 +33,22 @@ class Boxes2d:
 
 
 def box_tensors(
-    boxes: Boxes, weather: BoxWeather, box_frame: BoxFrame, world_from_frame: np.ndarray
+    boxes: Boxes,
+    weather: BoxWeather,
+    box_frame: BoxFrame,
+    world_from_frame: np.ndarray,
+    *,
+    instances: np.ndarray | None = None,
 ) -> dict[str, Any]:
     """centers_m [B, 3], sizes_m [B, 3] (length, width, height), quats [B, 4] (wxyz,
     frame_from_box): float64 tensors in `frame`, which is `box_frame`. labels, track_ids: lists of
     strings. attributes: the dataset's further columns, NumPy arrays by name.
+
+    instance: int32 [B], the objects' numbers in instance images. modal_xyxy: float32 [B, 4], as
+    `Boxes2d.xyxy`, but of the pixels that show a box; NaN where none does. visible_fraction:
+    float64 [B], of the pixels that show a box or what stands before it; NaN where there are
+    neither. truncated_fraction: float64 [B], of the projected box's area, outside the image. All
+    four None where the output is older than they.
 
     submerged_fraction, hidden_fraction: float64 [B], how much of a box's height is under water,
     and of its pixels behind water (NaN where the image shows none); None where there is no flood.
@@ -66,6 +77,7 @@ def box_tensors(
         "labels": list(boxes.labels),
         "track_ids": list(boxes.track_ids),
         "attributes": dict(boxes.attributes),
+        "instance": None if instances is None else torch.from_numpy(instances.astype(np.int32)),
         **fractions,
         "visibility": torch.from_numpy(visibility(weather, len(boxes))),
     }
@@ -94,26 +106,13 @@ def boxes_2d(sample: Mapping[str, Any]) -> Boxes2d:
             f"the dataset with 'boxes' in load, of a variant whose recipe writes labels"
         )
     centers_m, quats = boxes_in_camera(boxes, camera)
-    rotations = _rotations(quats)
-    sizes_m = boxes["sizes_m"].numpy()
-    numbers = np.concatenate([centers_m, sizes_m, rotations.reshape(-1, 9)], axis=1)
-    finite = np.logical_and.reduce(np.isfinite(numbers), axis=1)
-    centers_m, sizes_m = np.where(finite[:, None], (centers_m, sizes_m), 0.0)
-    rotations = np.where(finite[:, None, None], rotations, np.eye(3))
-    corners_m = centers_m[:, None] + (CORNERS * sizes_m[:, None]) @ rotations.transpose(0, 2, 1)
-    size = np.array([camera["width"], camera["height"]], np.float64)
-    K = camera["K"].numpy()
-    ends, seen = _edges_in_image(corners_m, K, size)  # [B, E, 2]
-    points = np.concatenate(
-        [ends, np.broadcast_to(_image_corners(size), (len(ends), 4, 2))], axis=1
+    size = (camera["width"], camera["height"])
+    outlines = outline_boxes(
+        centers_m, boxes["sizes_m"].numpy(), rotations_of(quats), camera["K"].numpy(), size
     )
-    shown = [seen, _hit(centers_m, sizes_m, rotations, _image_corners(size), K)]
-    shown = np.concatenate(shown, axis=1)[..., None]
-    low = np.where(shown, points, np.inf).min(axis=1, initial=np.inf)
-    high = np.where(shown, points, -np.inf).max(axis=1, initial=-np.inf)
-    in_view = finite & (high > low).all(axis=1)
-    xyxy = np.where(in_view[:, None], np.concatenate([low, high], axis=1), 0.0)
-    return Boxes2d(torch.from_numpy(xyxy.astype(np.float32)), torch.from_numpy(in_view))
+    return Boxes2d(
+        torch.from_numpy(outlines.xyxy.astype(np.float32)), torch.from_numpy(outlines.in_view)
+    )
 
 
 def boxes_in_camera(
@@ -145,67 +144,3 @@ def _turned(quats: np.ndarray, world_from_frame: np.ndarray) -> np.ndarray:
     left = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
     with np.errstate(invalid="ignore"):
         return quats @ left.T
-
-
-def _rotations(quats: np.ndarray) -> np.ndarray:
-    """[B, 3, 3]; NaN of quaternions that are zero or not finite."""
-    with np.errstate(invalid="ignore", divide="ignore"):
-        w, x, y, z = (quats / np.linalg.norm(quats, axis=1, keepdims=True)).T
-        rows = [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-        return np.moveaxis(np.array(rows), -1, 0)
-
-
-def _edges_in_image(
-    corners_m: np.ndarray, K: np.ndarray, size: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Both ends of those parts of the boxes' edges that the image shows.
-
-    corners_m: [B, 8, 3], camera frame. Returns pixels [B, 24, 2] and whether an edge has such a
-    part [B, 24].
-    """
-    a, b = corners_m[:, EDGES[:, 0]], corners_m[:, EDGES[:, 1]]  # [B, 12, 3]
-    seen = np.maximum(a[..., 2], b[..., 2]) > NEAR_M
-    a, b = _project(cut_edges(a, b), K), _project(cut_edges(b, a), K)  # [B, 12, 2]
-    # Liang and Barsky 1984: the part t in [start, end] of a + t (b - a) between both borders.
-    along = np.where(a == b, 1e-300, b - a)
-    with np.errstate(over="ignore"):  # of an edge that is a point: outside or inside, both infinite
-        crossings = np.sort(np.stack([-a / along, (size - a) / along]), axis=0)
-    start = crossings[0].max(axis=-1, initial=0.0).clip(0.0, None)
-    end = crossings[1].min(axis=-1, initial=1.0).clip(None, 1.0)
-    seen &= start <= end
-    ends = [a + np.where(seen, t, 0.0)[..., None] * (b - a) for t in (start, end)]
-    return np.concatenate(ends, axis=1).clip(0.0, size), np.concatenate([seen, seen], axis=1)
-
-
-def _project(points_m: np.ndarray, K: np.ndarray) -> np.ndarray:
-    z = np.maximum(points_m[..., 2:], NEAR_M)  # nearer ones belong to edges that are not seen
-    return points_m[..., :2] / z * K[[0, 1], [0, 1]] + K[:2, 2]
-
-
-def _image_corners(size: np.ndarray) -> np.ndarray:
-    return np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * size
-
-
-def _hit(
-    centers_m: np.ndarray,
-    sizes_m: np.ndarray,
-    rotations: np.ndarray,
-    pixels: np.ndarray,
-    K: np.ndarray,
-) -> np.ndarray:
-    """Whether the rays through some pixels [P, 2] meet boxes, all in the camera's frame: [B, P]."""
-    rays = np.concatenate(
-        [(pixels - K[:2, 2]) / K[[0, 1], [0, 1]], np.ones((len(pixels), 1))], axis=1
-    )
-    directions = rays @ rotations  # [B, P, 3], the boxes' axes
-    eyes = -(centers_m[:, None] @ rotations)  # [B, 1, 3]
-    directions = np.where(directions == 0, 1e-300, directions)
-    with np.errstate(over="ignore"):  # of a ray along a side
-        far = sizes_m[:, None] / 2
-        depths = np.sort(np.stack([(-far - eyes) / directions, (far - eyes) / directions]), axis=0)
-    enter, leave = depths[0].max(axis=-1), depths[1].min(axis=-1)
-    return np.maximum(enter, NEAR_M) <= leave

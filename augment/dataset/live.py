@@ -10,7 +10,7 @@ import torch
 from torch.utils.data import Dataset
 
 from augment.batch.backends import choose_backend
-from augment.batch.box_weather import measure_boxes
+from augment.batch.box_weather import label_view, uses_boxes
 from augment.batch.calibration import camera_record
 from augment.batch.encode import decode_image, encode_image, quantise_depth
 from augment.batch.layout import PATH_KINDS, variant_name
@@ -129,6 +129,7 @@ class SceneDataset(Dataset):
         written = camera.scaled(recipe.render.scale)
         check_view(view, written, recipe)
         origin_m = self._index.world_origin_m
+        view, labels = self._labelled(frame, written, view)
         world_from_ego = frame.world_from_ego.clone()
         world_from_ego[:3, 3] += torch.from_numpy(origin_m)
         return make_sample(
@@ -136,7 +137,7 @@ class SceneDataset(Dataset):
             pixels=self._pixels(view),
             camera=camera_record(written, origin_m),
             world_from_ego=world_from_ego,
-            labels=self._labels(frame, written, view) if "boxes" in load else Labels(),
+            labels=labels if "boxes" in load else Labels(),
             weather=recipe.weather_numbers(),
             paths=dict.fromkeys(PATH_KINDS),
             names={
@@ -161,9 +162,18 @@ class SceneDataset(Dataset):
             rgb, *(b if kind in load else None for kind, b in zip(BUFFERS, buffers, strict=True))
         )
 
-    def _labels(self, frame: Frame, camera: Camera, view: View) -> Labels:
-        """The boxes of a frame, as the files of a job would have them. camera: as written."""
-        if not (self.recipe.output.labels and frame.index in self._index.labelled):
-            return Labels()
+    def _labelled(self, frame: Frame, camera: Camera, view: View) -> tuple[View, Labels]:
+        """A view with the boxes of its frame, and these as the files of a job would have them.
+        camera: as written.
+        """
+        load, recipe, index = self.options.load, self.recipe, self._index
+        wanted = "boxes" in load or "instance" in load
+        if not (wanted and uses_boxes(recipe) and frame.index in index.labelled):
+            return view, Labels()
         boxes = self.scene.boxes(frame.index)
-        return Labels(boxes, measure_boxes(boxes, self._index.world_origin_m, camera, view))
+        view, measured = label_view(
+            boxes, index.instances, index.world_origin_m, camera, view, recipe
+        )
+        if not recipe.output.labels:
+            return view, Labels()
+        return view, Labels(boxes, measured, instances=index.instances.of(boxes.track_ids))

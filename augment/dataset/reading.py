@@ -14,14 +14,14 @@ from augment.batch.box_tables import BoxNumbers
 from augment.batch.box_weather import TABLES
 from augment.batch.calibration import CameraRecord, read_camera, read_entries
 from augment.batch.encode import decode_image, decode_png
-from augment.batch.label_files import read_boxes, read_lidar
+from augment.batch.label_files import FrameBoxes, read_boxes, read_lidar
 from augment.batch.layout import PATH_KINDS
 from augment.batch.store import Store
 from augment.dataset.rows import Rows
 from augment.dataset.samples import BUFFERS, Labels, Pixels
 from augment.dataset.stored import Companions, StoredFiles, damaged
 from augment.errors import OutputError
-from augment.labels import Boxes, LidarSweep
+from augment.labels import LidarSweep
 
 _TYPES = {
     "depth": np.uint16,
@@ -38,7 +38,7 @@ class RowReader:
     def __init__(self, store: Store, *, verify: bool) -> None:
         self.store, self.verify = store, verify
         self._files = StoredFiles(store)
-        self._boxes = Companions(self._files, _read_all_boxes)
+        self._boxes = Companions(self._files, read_boxes)
         self._box_weather = {k: Companions(self._files, table.read) for k, table in TABLES.items()}
         self._calibration = Companions(self._files, read_entries)
         self._sweeps = Companions(self._files, _read_one_sweep)
@@ -84,15 +84,20 @@ class RowReader:
         except KeyError as error:
             where = f"frame {frame}, camera {camera!r}"
             raise damaged(self._files.name(*parts), f"it lacks {error} ({where})") from error
+        except (ArithmeticError, RuntimeError, TypeError, ValueError) as error:
+            where = f"frame {frame}, camera {camera!r}"
+            raise damaged(self._files.name(*parts), f"{error} ({where})") from error
 
     def labels(self, rows: Rows, row: int, load: Collection[str]) -> Labels:
-        """The boxes of the row's frame, what weather does to them in its image, and the sweep."""
-        boxes = self._frame_boxes(rows, row) if "boxes" in load else None
+        """The boxes of the row's frame, what is measured of them in its image, and the sweep."""
+        frame = self._frame_boxes(rows, row) if "boxes" in load else None
+        boxes = None if frame is None else frame.boxes
         parts = _parts(rows, row, "lidar") if "lidar" in load else None
         return Labels(
             boxes=boxes,
             box_weather=None if boxes is None else self._weather_of(rows, row, len(boxes)),
             lidar=None if parts is None else self._sweeps.get(*parts)[0],
+            instances=None if frame is None else frame.instances,
         )
 
     def _image(self, rows: Rows, row: int) -> np.ndarray:
@@ -114,7 +119,7 @@ class RowReader:
         except ValueError as error:
             raise damaged(self._files.name(*parts), str(error)) from error
 
-    def _frame_boxes(self, rows: Rows, row: int) -> Boxes | None:
+    def _frame_boxes(self, rows: Rows, row: int) -> FrameBoxes | None:
         parts = _parts(rows, row, "labels")
         if parts is None:
             return None
@@ -157,10 +162,6 @@ def _parts(rows: Rows, row: int, kind: str) -> tuple[str, str] | None:
     """The folder and the name of a row's file; None where it has none."""
     column: Any = rows[f"{kind}_path"]
     return column.parts(row)
-
-
-def _read_all_boxes(path: Path) -> dict[int, Boxes]:
-    return {number: frame.boxes for number, frame in read_boxes(path).items()}
 
 
 def _read_one_sweep(path: Path) -> tuple[LidarSweep]:

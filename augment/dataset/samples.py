@@ -5,7 +5,7 @@ A sample is a dictionary:
     image             float32 [3, H, W] in [0, 1], or uint8 if asked for; RGB, display-encoded
     depth             float32 [H, W], metres along the optical axis, 0 = none; or None
     semantic          uint8 [H, W], augment.semantics.SemanticClass; or None
-    instance          int32 [H, W], 0 = none, else 1 + the actor's index; or None
+    instance          int32 [H, W], 0 = none, else the object's number: `boxes` has them; or None
     water             bool [H, W], where a ray meets water first; None where there is no flood
     snow              bool [H, W], where the pixel shows snow; None where there is no snow
     boxes             all boxes of the frame, see `boxes.box_tensors`; None where there are none
@@ -89,11 +89,14 @@ class Pixels:
 
 @dataclass(frozen=True, eq=False)
 class Labels:
-    """What a frame has beside its images, in the dataset's world. box_weather: for the boxes."""
+    """What a frame has beside its images, in the dataset's world. box_weather: for the boxes.
+    instances: uint16 [B], their numbers.
+    """
 
     boxes: Boxes | None = None
     box_weather: BoxWeather | None = None
     lidar: LidarSweep | None = None
+    instances: np.ndarray | None = None
 
 
 def make_sample(
@@ -120,7 +123,9 @@ def make_sample(
         "instance": None if instance is None else torch.from_numpy(instance.astype(np.int32)),
         "water": None if water is None else torch.from_numpy(water == 255),
         "snow": None if snow is None else torch.from_numpy(snow == 255),
-        "boxes": None if boxes is None else box_tensors(boxes, labels.box_weather or {}, *placed),
+        "boxes": None
+        if boxes is None
+        else box_tensors(boxes, labels.box_weather or {}, *placed, instances=labels.instances),
         "lidar": None if lidar is None else lidar_tensors(lidar, *placed),
         "camera": {
             "name": camera.name,

@@ -21,7 +21,7 @@ from augment.batch.runner import Outcome
 from augment.batch.store import Store
 from augment.generate.records import Block
 
-_OF_BLOCK = ("labels", "box_smog", "box_water", "box_snow", "calibration")
+_OF_BLOCK = ("labels", "box_2d", "box_smog", "box_water", "box_snow", "calibration")
 _OF_IMAGE = tuple(kind for kind in PATH_KINDS if kind not in _OF_BLOCK)
 REMOTE_UPLOADS = 8  # at a time: most of the time of one is waiting
 

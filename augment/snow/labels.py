@@ -31,8 +31,20 @@ def snow_pixels(
     """How many pixels show each box or the snow on it, and how many of them (`marked`) show snow.
 
     surface_depth_m: z of the first solid surface, snow included; 0 = none. snow: 255 where the
-    pixel shows snow. thickness_m: of the layer on level ground. The top of a box is raised, for the
-    snow on it counts as the box; so is its bottom, for the snow around its wheels does not.
+    pixel shows snow. thickness_m: of the layer on level ground.
+    """
+    return count_pixels(
+        placed_in_snow(boxes, world_origin_m, thickness_m), camera, surface_depth_m, snow
+    )
+
+
+def placed_in_snow(
+    boxes: Boxes, world_origin_m: Float64[np.ndarray, "3"], thickness_m: float
+) -> PlacedBoxes:
+    """The boxes with the snow on them. thickness_m: of the layer on level ground.
+
+    The top of a box is raised, for the snow on it counts as the box; so is its bottom, for the snow
+    around its wheels does not.
     """
     placed = PlacedBoxes.of(boxes, world_origin_m)
     height = placed.sizes_m[:, 2]
@@ -40,5 +52,4 @@ def snow_pixels(
     above_ground = np.minimum(thickness_m + MARGIN_M, (1 - KEPT_OF_HEIGHT) * height)
     low[:, 2] = np.maximum(low[:, 2], above_ground - height / 2)
     high[:, 2] = height / 2 + max(SIDES_M, DRIFTED * thickness_m + MARGIN_M)
-    placed = dataclasses.replace(placed, low_m=low, high_m=high)
-    return count_pixels(placed, camera, surface_depth_m, snow)
+    return dataclasses.replace(placed, low_m=low, high_m=high)

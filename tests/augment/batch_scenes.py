@@ -19,11 +19,13 @@ from augment.cameras import Camera, Frame
 from augment.errors import AdapterError
 from augment.labels import Boxes, LidarSweep
 from augment.scene import Gaussians, Scene
+from augment.semantics import SemanticClass
 from augment.sky import ConstantSky
 from augment.snow.beds import bed_of
 from augment.snow.cells import OPEN_EDGE, SnowBed, SnowCells
 from augment.snow.placement import PlacementSettings
 from augment.style.maps import StyleMaps
+from augment.views import SurfaceView
 from augment.weather.smog import SmogMedium
 from recipes.flood import Flood
 from recipes.schema import Output, Recipe, Smog, Weather
@@ -105,6 +107,7 @@ class FakeView:
     snow: np.ndarray | None = None
     snowy: FakeSnowy | None = None
     smoggy: FakeSmoggy | None = None
+    surface: SurfaceView | None = None
 
 
 def open_fake(uri: str) -> Scene:
@@ -191,7 +194,15 @@ def fake_render(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str) -
         **(fake_flood(camera, rng) if weather.flood is not None else {}),
         **(fake_snow(camera, rng) if weather.snow is not None else {}),
         **(fake_smog(camera, rng, weather.smog) if weather.smog is not None else {}),
+        surface=None if scene.labels is None else fake_surface(rng, shape),
     )
+
+
+def fake_surface(rng: np.random.Generator, shape: tuple[int, int]) -> SurfaceView:
+    """Surfaces where the boxes are, of classes that none is of."""
+    depth = rng.uniform(0, 4, shape).astype(np.float32)
+    classes = np.full(shape, SemanticClass.ROAD, np.uint8)
+    return SurfaceView(depth, 0.0, None, depth, classes, 0.0)
 
 
 def fake_flood(camera: Camera, rng: np.random.Generator) -> dict:

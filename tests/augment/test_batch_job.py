@@ -110,6 +110,7 @@ def test_manifest_has_a_row_for_every_image(tmp_path: Path) -> None:
         "settings": None,
         "water_path": None,
         "snow_path": None,
+        "box_2d_path": "street/fog-000/labels/boxes_2d.parquet",
         "box_water_path": None,
         "box_snow_path": None,
         "box_smog_path": "street/fog-000/labels/smog.parquet",
@@ -133,7 +134,7 @@ def test_manifest_has_a_row_for_every_image(tmp_path: Path) -> None:
     assert numbers["smog_extinction_per_m"] == recipe.weather_numbers()["smog_extinction_per_m"]
     assert rows[1]["lidar_path"] is None  # the dataset has no sweep there
     files = [row[name] for name in row if name.endswith("_path") and row[name] is not None]
-    assert len(files) == 8 and all((tmp_path / file).is_file() for file in files)
+    assert len(files) == 9 and all((tmp_path / file).is_file() for file in files)
 
 
 def test_labels_and_lidar_pass_through_to_the_bit(tmp_path: Path) -> None:

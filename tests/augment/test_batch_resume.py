@@ -94,7 +94,7 @@ def test_an_interrupt_finishes_what_is_at_hand_and_can_be_resumed(tmp_path: Path
 
 def test_half_a_line_in_a_journal_is_not_believed(tmp_path: Path) -> None:
     """As a kill in the midst of a write leaves it; whole lines before it still count."""
-    recipes = [make_recipe("clear")]  # whose rows are all that a line holds
+    recipes = [make_recipe("clear", labels=False)]  # whose rows are all that a line holds
     run(RenderJob("fake:street", recipes, tmp_path / "whole"))
     out = tmp_path / "torn"
     run(RenderJob("fake:street", recipes, out, frames=[0, 1]))

@@ -22,6 +22,7 @@ from batch_scenes import (
 
 from augment.batch.box_weather import TABLES, visibility
 from augment.batch.job import JobResult, RenderJob, run_job
+from augment.batch.layout import box_weather_files
 from augment.batch.manifest import read_manifest
 from augment.batch.smog_labels import SMOG_TABLE, BoxSmog, read_smog
 from augment.batch.snow_labels import BoxSnow
@@ -198,7 +199,7 @@ def test_visibility_is_what_all_effects_leave() -> None:
     np.testing.assert_array_equal(visibility({"box_water": water}, 4), [0.5, 1, 0, 1])
     np.testing.assert_array_equal(visibility({"box_snow": snow}, 4), [1, 1, 0.75, 1])
     everything = {"box_smog": smog, "box_water": water, "box_snow": snow}
-    assert everything.keys() == TABLES.keys()
+    assert everything.keys() == TABLES.keys() - {"box_2d"}  # which is not of the weather
     np.testing.assert_array_equal(visibility(everything, 4), [0.25, 0.25, 0, 1])
     assert visibility({}, 0).shape == (0,) and visibility({}, 0).dtype == np.float64
 
@@ -206,11 +207,9 @@ def test_visibility_is_what_all_effects_leave() -> None:
 def test_visibility_of_a_variant_with_all_effects(tmp_path: Path) -> None:
     recipe: Recipe = make_recipe(flood=Flood(level_m=0.3), snow=Snow(depth_m=0))
     run(RenderJob("fake:street", [recipe], tmp_path, frames=[3]))
-    labels = tmp_path / FOLDER / "labels"
-    tables = {
-        kind: table.read(labels / f"{kind.removeprefix('box_')}.parquet")
-        for kind, table in TABLES.items()
-    }
+    files = box_weather_files(recipe)
+    tables = {kind: TABLES[kind].read(tmp_path / FOLDER / files[kind]) for kind in files}
+    assert tables.keys() == TABLES.keys()
     for item in tables["box_smog"]:
         left = visibility({kind: table[item] for kind, table in tables.items()}, 3)
         assert ((left >= 0) & (left <= 1)).all()

@@ -117,7 +117,7 @@ def test_a_flood_and_snow_do_not_change_each_others_numbers(whole: Path, tmp_pat
     """The stand-in's water does not depend on whether it draws snow too."""
     labels = whole / FOLDER / "labels"
     assert sorted(path.name for path in labels.iterdir()) == [
-        "boxes.parquet", "smog.parquet", "snow.parquet", "water.parquet",
+        "boxes.parquet", "boxes_2d.parquet", "smog.parquet", "snow.parquet", "water.parquet",
     ]  # fmt: skip
     run(RenderJob("fake:street", [make_recipe()], tmp_path))
     bare = tmp_path / FOLDER

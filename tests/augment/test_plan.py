@@ -77,16 +77,24 @@ class Labels:
         ("median", True, 0.1, {"rgb", "alpha", "median_depth"}),
         ("expected", True, 0.1, {"rgb", "alpha", "expected_depth"}),
         ("none", False, 0.1, {"rgb", "alpha"}),
-        ("none", True, 0.0, {"rgb", "alpha"}),
+        ("none", True, 0.0, {"rgb", "alpha", "expected_depth"}),
     ],
 )
-def test_boxes_in_smog_need_a_depth_and_any_will_do(depth, labels, extinction_per_m, buffers):
+def test_boxes_need_a_depth_and_any_will_do(depth, labels, extinction_per_m, buffers):
     weather = Weather(smog=Smog(extinction_per_m=extinction_per_m))
     recipe = Recipe(weather=weather, output=Output(depth=depth, labels=labels))
     plan = make_plan(recipe, scene(labels=Labels()))
     assert plan.buffers == buffers
-    assert plan.measures_smog == (labels and extinction_per_m > 0)
-    assert not make_plan(recipe, scene()).measures_smog
+    assert plan.finds_boxes == labels
+    assert not make_plan(recipe, scene()).finds_boxes
+
+
+def test_instance_images_need_the_depth_and_class_of_boxes_without_an_actor():
+    recipe = Recipe(output=Output(depth="none", instance=True, labels=False))
+    plan = make_plan(recipe, scene(labels=Labels()))
+    assert plan.buffers == {"rgb", "alpha", "splat_ids", "expected_depth"}
+    assert plan.finds_boxes and not plan.semantic
+    assert make_plan(recipe, scene()).buffers == {"rgb", "alpha", "splat_ids"}
 
 
 def test_smog_with_a_scale_height_stands_on_the_road_and_shows_sky():

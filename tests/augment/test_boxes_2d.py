@@ -1,0 +1,372 @@
+"""Which pixels show a labelled box, what hides it, and the numbers of objects in images."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from snow_scenes import box_car, drive, stack_all
+
+from augment.apply import render_view
+from augment.batch.box_weather import label_view
+from augment.batch.boxes_2d import BOX_2D_TABLE, Box2d, measure_2d, read_boxes_2d
+from augment.batch.job import JobResult, RenderJob, run_job
+from augment.batch.label_files import read_boxes
+from augment.batch.manifest import read_manifest
+from augment.cameras import Camera
+from augment.dataset import SceneDataset, WeatherDataset, boxes_2d, torchvision_sample
+from augment.errors import AdapterError
+from augment.instances import MAX_INSTANCE, Instances, instances_of
+from augment.labels import Boxes
+from augment.scene import Gaussians, Scene
+from augment.semantics import SemanticClass
+from recipes.schema import Output, Recipe, Render, Weather
+from recipes.snow import Snow
+
+PARKED = np.array([14.0, 0.0, 0.75])
+SIZE = np.array([4.0, 1.8, 1.5])
+STEP_M = 0.06  # between splats
+ORIGIN = np.array([1000.0, -2000.0, 50.0])
+RECIPE = Recipe(name="clear", output=Output(semantic=True, instance=True))
+FOLDER = Path("sheets") / "clear-000"
+
+
+@dataclasses.dataclass(frozen=True)
+class StreetLabels:
+    """Of a car that drives and cars that stand; frame 1 shows one more. unreadable: a frame."""
+
+    unreadable: int | None = None
+
+    def boxes(self, frame_index: int) -> Boxes:
+        if frame_index == self.unreadable:
+            raise AdapterError("cuboids are cut short")
+        places = {
+            "later": [14.0, 5.0, 0.75],
+            "parked": PARKED,
+            "car": [6.0 + 5.0 * frame_index, 3.0, 0.75],
+            "behind": [-9.0, 0.0, 0.75],
+        }
+        if frame_index == 0:
+            del places["later"]
+        count = len(places)
+        return Boxes(
+            tuple(places), ("Car",) * count, np.array(list(places.values())) + ORIGIN,
+            np.tile(SIZE, (count, 1)), np.array([[1.0, 0, 0, 0]] * count),
+        )  # fmt: skip
+
+    def lidar(self, frame_index: int) -> None:
+        return None
+
+
+def plate(low, high, semantic: SemanticClass) -> Gaussians:
+    """An opaque rectangle between two corners, flat along one axis."""
+    spans = [
+        np.arange(a + STEP_M / 2, max(b, a + STEP_M), STEP_M)
+        for a, b in zip(low, high, strict=True)
+    ]
+    flat = [a == b for a, b in zip(low, high, strict=True)]
+    spans = [
+        np.array([a]) if is_flat else span
+        for a, is_flat, span in zip(low, flat, spans, strict=True)
+    ]
+    means = np.stack([grid.ravel() for grid in np.meshgrid(*spans)], axis=1)
+    count = len(means)
+    scales = torch.tensor([0.004 if is_flat else 0.6 * STEP_M for is_flat in flat])
+    return Gaussians(
+        means=torch.from_numpy(means).float(),
+        quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
+        scales=scales.repeat(count, 1),
+        opacities=torch.full((count,), 0.99),
+        sh=torch.zeros(count, 1, 3),
+        semantic=torch.full((count,), int(semantic), dtype=torch.int16),
+    )
+
+
+def car_at(centre: np.ndarray) -> Gaussians:
+    """The sides of a parked car that cameras see."""
+    low, high = centre - SIZE / 2, centre + SIZE / 2
+    return stack_all([
+        plate(low, [low[0], high[1], high[2]], SemanticClass.VEHICLE),
+        plate([low[0], low[1], high[2]], high, SemanticClass.VEHICLE),
+        plate(low, [high[0], low[1], high[2]], SemanticClass.VEHICLE),
+        plate([low[0], high[1], low[2]], high, SemanticClass.VEHICLE),
+    ])  # fmt: skip
+
+
+def street(
+    labels: StreetLabels | None = StreetLabels(), *, hidden_to_y: float = 0.0, eye_z_m: float = 1.5
+) -> Scene:
+    """A road, two parked cars, a wall before them up to y = hidden_to_y, and a car that drives."""
+    parts = [
+        plate([2.0, -6.0, 0.0], [24.0, 8.0, 0.0], SemanticClass.ROAD),
+        car_at(PARKED),
+        car_at(np.array([14.0, 5.0, 0.75])),
+    ]
+    if hidden_to_y > -4.0:
+        parts += [plate([7.0, -4.0, 0.0], [7.0, hidden_to_y, 3.0], SemanticClass.BUILDING)]
+    scene = drive(
+        *parts, actors=[box_car(with_shadow=False)], labels=labels, world_origin_m=ORIGIN,
+        ground_z_m=0.0, places=((0.0, 0.0, eye_z_m), (1.0, 0.0, eye_z_m)),
+    )  # fmt: skip
+    frames = [
+        dataclasses.replace(f, cameras={"ahead": f.cameras["ahead"].scaled(3.0)})
+        for f in scene.frames
+    ]
+    return dataclasses.replace(scene, frames=tuple(frames))
+
+
+def open_street(uri: str) -> Scene:
+    return street()
+
+
+def run(out: Path, opened=open_street, **options) -> JobResult:
+    job = RenderJob("test:sheets", [RECIPE], out, backend="cpu", **options)
+    return run_job(job, scene_loader=opened, progress=False)
+
+
+def measure(scene: Scene, camera: Camera, recipe: Recipe = RECIPE) -> tuple[Box2d, np.ndarray]:
+    """What is measured of frame 0's boxes, and the instance image as it is written."""
+    boxes, view = scene.boxes(0), render_view(scene, camera, recipe, backend="cpu")
+    instances = instances_of(scene)
+    numbers = measure_2d(boxes, instances, ORIGIN, camera, view.surface)
+    return numbers, label_view(boxes, instances, ORIGIN, camera, view, recipe)[0].instance
+
+
+def seen_by_rays(camera: Camera, hidden_to_y: float) -> tuple[np.ndarray, np.ndarray]:
+    """bool [H, W]: pixels whose rays meet the parked car, and those that the wall leaves of them,
+    by the planes of both.
+    """
+    eye = camera.centre.numpy()
+    rays = camera.ray_directions(torch.float64).numpy()
+    a, b = ((PARKED + side * SIZE / 2 - eye) / rays for side in (-1, 1))
+    enter, leave = np.minimum(a, b).max(axis=-1), np.maximum(a, b).min(axis=-1)
+    on_wall = eye + (7.0 - eye[0]) / rays[..., :1] * rays
+    covered = (on_wall[..., 1] < hidden_to_y) & (on_wall[..., 2] < 3.0)
+    return enter < leave, (enter < leave) & ~covered
+
+
+@pytest.mark.parametrize("hidden_to_y", [-4.0, -0.2, 0.2, 4.0])
+@pytest.mark.parametrize("instance", [True, False])
+def test_fractions_and_bounds_are_those_of_rays(hidden_to_y: float, instance: bool) -> None:
+    scene = street(hidden_to_y=hidden_to_y)
+    camera = scene.frames[0].cameras["ahead"]
+    recipe = Recipe(output=Output(instance=instance, depth="median"))
+    boxes, view = scene.boxes(0), render_view(scene, camera, recipe, backend="cpu")
+    numbers = measure_2d(boxes, instances_of(scene), ORIGIN, camera, view.surface)
+    whole, left = seen_by_rays(camera, hidden_to_y)
+    # Splats blur edges by a pixel, and the box's lowest 8 cm own no surface.
+    assert numbers.visible_fraction[0] == pytest.approx(left.sum() / whole.sum(), abs=0.04)
+    assert numbers.pixels[0] == pytest.approx(left.sum(), abs=0.1 * whole.sum())
+    assert numbers.truncated_fraction.tolist()[0::2] == [0, 1]
+    if not left.any():
+        assert np.isnan(numbers.modal_xyxy[0]).all()
+        return
+    rows, columns = np.nonzero(left)
+    bounds = [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]
+    np.testing.assert_allclose(numbers.modal_xyxy[0], bounds, atol=2)
+    rows, columns = np.nonzero(whole)
+    bounds = [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]
+    amodal = [getattr(numbers, side)[0] for side in ("x0", "y0", "x1", "y1")]
+    np.testing.assert_allclose(amodal, bounds, atol=1)
+
+
+def test_a_box_across_the_border_is_truncated_by_its_share_of_the_outline() -> None:
+    scene = street()
+    whole = scene.frames[0].cameras["ahead"]
+    x0, x1 = (getattr(measure(scene, whole)[0], side)[0] for side in ("x0", "x1"))
+    middle = round((x0 + x1) / 2)
+    cut = whole.cropped(middle, 0, 480 - middle, 270)  # symmetric: the car stands straight ahead
+    numbers, _ = measure(scene, cut)
+    assert numbers.truncated_fraction[0] == pytest.approx(0.5, abs=0.03)
+    assert numbers.x0[0] == 0 and numbers.x1[0] == pytest.approx(x1 - middle)
+    assert (
+        numbers.visible_fraction[2] != numbers.visible_fraction[2]
+    )  # behind the camera: not known
+
+
+def test_parked_cars_have_an_instance_and_the_road_in_their_box_has_none() -> None:
+    scene = street()
+    camera = scene.frames[0].cameras["ahead"]
+    plain = render_view(scene, camera, RECIPE, backend="cpu")
+    numbers, image = measure(scene, camera)
+    assert numbers.instance.tolist() == [2, 1, 3]  # the driving car is the only actor
+    _, left = seen_by_rays(camera, 0.0)
+    # 5 % are the lowest 8 cm, and edges are blurred by a pixel.
+    assert (image == 2)[left].mean() > 0.85 and (image == 2)[~left].mean() < 0.01
+    np.testing.assert_array_equal(image == 1, plain.instance == 1)  # as it was rendered
+    assert not image[np.isin(plain.semantic, [SemanticClass.ROAD, SemanticClass.SKY])].any()
+    # Nothing that one image shows depends on what else is written.
+    other = Recipe(output=Output(semantic=False, instance=True, depth="none", labels=False))
+    instance_only = render_view(scene, camera, other, backend="cpu")
+    assert instance_only.semantic is None and instance_only.depth_m is None
+
+
+def test_where_boxes_overlap_the_one_that_encloses_the_surface_has_it_then_the_smaller() -> None:
+    class Overlapping(StreetLabels):
+        def boxes(self, frame_index: int) -> Boxes:
+            beside, up = np.array([[0.0, SIZE[1] - 0.02, 0.0], [0.0, 0.0, SIZE[2]]])
+            centers = np.array([PARKED, PARKED + beside, PARKED + up])
+            sizes = np.array([SIZE, SIZE, SIZE * [1, 1, 3]])
+            quats = np.array([[1.0, 0, 0, 0]] * 3)
+            return Boxes(("own", "beside", "around"), ("Car",) * 3, centers + ORIGIN, sizes, quats)
+
+    scene = street(Overlapping(), hidden_to_y=-4.0)
+    camera = scene.frames[0].cameras["ahead"]
+    _, image = measure(scene, camera)
+    _, left = seen_by_rays(camera, -4.0)
+    assert (image == 2)[left].mean() > 0.85
+    assert not (image == 4)[left].any() and not (image == 3)[left].mean() > 0.02
+
+
+@pytest.mark.parametrize("surface", ["solid", "scene"])
+def test_snow_on_a_parked_car_is_the_car(surface: str) -> None:
+    """Of 0.3 m, which raises the surface out of the box; seen from above. `scene` looks through."""
+    scene = street(hidden_to_y=-4.0, eye_z_m=4.0)
+    camera = scene.frames[0].cameras["ahead"]
+    clear, bare = measure(scene, camera)
+    output = Output(semantic=True, instance=True, surface=surface)
+    snowy = Recipe(weather=Weather(snow=Snow(depth_m=0.3)), output=output)
+    numbers, image = measure(scene, camera, snowy)
+    assert numbers.visible_fraction[0] == pytest.approx(clear.visible_fraction[0], abs=0.05)
+    covered = render_view(scene, camera, snowy, backend="cpu").snow == 255
+    eye, rays = camera.centre.numpy(), camera.ray_directions(torch.float64).numpy()
+    on_top = np.abs(eye + (1.5 - eye[2]) / rays[..., 2:] * rays - PARKED) < SIZE / 2 - 0.3
+    on_roof = on_top[..., 0] & on_top[..., 1] & (rays[..., 2] < 0)
+    assert on_roof.sum() > 100 and covered[on_roof].mean() > 0.9
+    assert (image == 2)[on_roof].mean() > 0.95
+    if surface == "scene":
+        np.testing.assert_array_equal(image, bare)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("street") / "out"
+    assert run(out).failed == 0
+    return out
+
+
+def test_files_agree_over_frames_and_with_a_live_scene(whole: Path) -> None:
+    boxes = read_boxes(whole / FOLDER / "labels" / "boxes.parquet")
+    measured = read_boxes_2d(whole / FOLDER / "labels" / "boxes_2d.parquet")
+    ids = {
+        t: int(n)
+        for f in boxes.values()
+        for t, n in zip(f.boxes.track_ids, f.instances, strict=True)
+    }
+    # The actor, then tracks as frame 0 lists them, then what frame 1 adds.
+    assert ids == {"car": 1, "parked": 2, "behind": 3, "later": 4}
+    live = SceneDataset(street(), RECIPE, backend="cpu")
+    for row in read_manifest(whole).to_pylist():
+        frame = row["frame"]
+        assert row["box_2d_path"] == str(FOLDER / "labels/boxes_2d.parquet")
+        image = cv2.imread(str(whole / row["instance_path"]), cv2.IMREAD_UNCHANGED)
+        shown = {ids[t] for t in ("parked", "car", *(["later"] if frame else []))}
+        assert set(np.unique(image).tolist()) == {0, *shown}
+        assert boxes[frame].instances.tolist() == [ids[t] for t in boxes[frame].boxes.track_ids]
+        np.testing.assert_array_equal(measured[frame, "ahead"].instance, boxes[frame].instances)
+    stored = WeatherDataset(whole)
+    for sample, other in zip(stored, live, strict=True):
+        assert torch.equal(sample["instance"], other["instance"])
+        for key in ("instance", "modal_xyxy", "visible_fraction", "truncated_fraction"):
+            np.testing.assert_array_equal(sample["boxes"][key], other["boxes"][key])
+        numbers = measured[sample["frame"], "ahead"]
+        amodal = np.stack([numbers.x0, numbers.y0, numbers.x1, numbers.y1], axis=1)
+        np.testing.assert_allclose(boxes_2d(sample).xyxy, amodal, atol=1e-4)
+
+
+def files_of(out: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(out)): p.read_bytes() for p in out.rglob("*") if p.is_file()}
+
+
+def test_parts_in_any_order_and_workers_give_the_files_of_one_run(whole: Path, tmp_path) -> None:
+    run(tmp_path / "parts", frames=[1])
+    assert run(tmp_path / "parts").skipped == 1
+    assert files_of(tmp_path / "parts") == files_of(whole)
+    (tmp_path / "parts" / FOLDER / "labels" / "boxes_2d.parquet").unlink()
+    assert run(tmp_path / "parts").written == 2  # only rendering tells
+    assert files_of(tmp_path / "parts") == files_of(whole)
+
+
+def test_a_frame_that_could_not_be_read_renumbers_what_was_rendered_without_it(
+    whole: Path, tmp_path: Path
+) -> None:
+    """Frame 0 first shows a track: frame 1 has been numbered without it."""
+    result = run(tmp_path, opened=lambda uri: street(StreetLabels(unreadable=0)))
+    assert (result.written, result.failed) == (1, 1)
+    assert run(tmp_path).written == 2
+    assert files_of(tmp_path) == files_of(whole)
+    assert run(tmp_path).skipped == 2
+
+
+def test_objects_beyond_sixteen_bits_have_no_instance(caplog) -> None:
+    class Many(StreetLabels):
+        def boxes(self, frame_index: int) -> Boxes:
+            names = tuple(f"{frame_index}-{k}" for k in range(MAX_INSTANCE))
+            zeros = np.zeros((MAX_INSTANCE, 3))
+            return Boxes(names, names, zeros, zeros, np.zeros((MAX_INSTANCE, 4)))
+
+    many = Instances(("car",), (0, 1), Many())
+    assert many.of(("car", "0-0", f"0-{MAX_INSTANCE - 2}", f"0-{MAX_INSTANCE - 1}", "1-0", "no")
+                   ).tolist() == [1, 2, MAX_INSTANCE, 0, 0, 0]  # fmt: skip
+    assert "instance images number 65535 of them" in caplog.text
+
+
+def test_numbers_survive_the_journal_and_the_file_to_the_bit() -> None:
+    numbers, _ = measure(street(), street().frames[0].cameras["ahead"])
+    again = BOX_2D_TABLE.from_json(BOX_2D_TABLE.to_json(numbers))
+    assert BOX_2D_TABLE.to_bytes({(2, "x"): again}) == BOX_2D_TABLE.to_bytes({(2, "x"): numbers})
+
+
+def test_targets_of_what_is_seen(whole: Path) -> None:
+    sample = WeatherDataset(whole, frames=[0])[0]
+    _, amodal = torchvision_sample(sample)
+    assert amodal["track_ids"] == ["parked", "car"]
+    assert 0.3 < amodal["visible_fraction"][0] < 0.7 < 0.95 < amodal["visible_fraction"][1]
+    _, modal = torchvision_sample(sample, bounds="modal")
+    assert torch.equal(modal["boxes"], sample["boxes"]["modal_xyxy"][:2])
+    widths = [float(t["boxes"][0, 2] - t["boxes"][0, 0]) for t in (amodal, modal)]
+    assert 0.3 < widths[1] / widths[0] < 0.7  # the wall hides half of the parked car
+    _, seen = torchvision_sample(sample, min_visible_fraction=0.8)
+    assert seen["track_ids"] == ["car"]
+    hidden = street(hidden_to_y=2.0)
+    _, none = torchvision_sample(SceneDataset(hidden, RECIPE, backend="cpu")[0], bounds="modal")
+    assert none["track_ids"] == ["car"]
+
+    old = {key: None for key in ("modal_xyxy", "visible_fraction", "truncated_fraction")}
+    older = {**sample, "boxes": {**sample["boxes"], **old}}
+    assert "visible_fraction" not in torchvision_sample(older)[1]
+    for asked in ({"bounds": "modal"}, {"min_visible_fraction": 0.1}):
+        with pytest.raises(
+            ValueError, match=r"need what labels/boxes_2d.parquet says; scene 'shee"
+        ):
+            torchvision_sample(older, **asked)
+    unchecked = torchvision_sample.__wrapped__  # as in production, where nothing checks types
+    with pytest.raises(ValueError, match="bounds must be 'amodal' or 'modal'; got 'tight'"):
+        unchecked(sample, bounds="tight")
+
+
+def test_parked_cars_of_a_recorded_drive_have_an_instance(shared_dir) -> None:
+    from adapters.base import open_scene
+
+    root = shared_dir / "data" / "pandaset_mini" / "002"
+    if not root.is_dir():
+        pytest.skip(f"no PandaSet sequence at {root}")
+    query = "frames=10:12&voxel_m=0.15&image_scale=0.25&sky_size=128"
+    scene = open_scene(f"pandaset:{root}?{query}")
+    recipe = Recipe(output=Output(instance=True), render=Render(scale=0.5))
+    numbers = instances_of(scene)
+    cars = 0
+    for sample in SceneDataset(scene, recipe, cameras=["front_camera", "left_camera"]):
+        boxes = sample["boxes"]
+        counts = np.bincount(sample["instance"].flatten(), minlength=MAX_INSTANCE)
+        assert boxes["instance"].tolist() == numbers.of(tuple(boxes["track_ids"])).tolist()
+        fractions, xyxy = boxes["visible_fraction"].numpy(), boxes["modal_xyxy"].numpy()
+        area = (xyxy[:, 2] - xyxy[:, 0]) * (xyxy[:, 3] - xyxy[:, 1])
+        for k in np.flatnonzero((fractions > 0.5) & (area > 500)):
+            cars += boxes["instance"][k] > len(scene.actors)
+            assert counts[boxes["instance"][k]] > 200, (boxes["labels"][k], boxes["track_ids"][k])
+    assert cars > 10
