@@ -177,13 +177,15 @@ class Output(Closed):
     )
     semantic: Flag = Field(default=False, description="Write the class of the heaviest splat.")
     instance: Flag = Field(
-        default=False, description="Write the actor number of the heaviest splat."
+        default=False,
+        description="Write which object each pixel shows: an actor's heaviest splat, or the "
+        "labelled box that its surface lies in.",
     )
     lidar: Flag | Literal["auto", "weather"] = Field(
         default="auto",
-        description="LiDAR sweeps: true passes them through as recorded, weather writes them as the "
-        "recipe's smog, flood and snow would have them, false writes none; auto is weather where "
-        "the recipe has snow or a flood and surface is not scene, else true.",
+        description="LiDAR sweeps: true passes them through as recorded, weather writes them as "
+        "the recipe's smog, flood and snow would have them, false writes none; auto is weather "
+        "where the recipe has snow or a flood and surface is not scene, else true.",
     )
     labels: Flag = Field(default=True, description="Pass 3D boxes through.")
 

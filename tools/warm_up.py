@@ -12,6 +12,9 @@ import torch
 
 from augment.apply import render_view
 from augment.batch.backends import renders_on_gpu
+from augment.batch.box_weather import uses_boxes
+from augment.box_pixels import PlacedBoxes
+from augment.boxes_2d import find_occlusion
 from augment.cameras import Camera, Frame
 from augment.geometry import rigid
 from augment.ground_heights import Ground
@@ -79,16 +82,21 @@ def warming_up_beside(recipes: Sequence[Recipe]) -> Iterator[None]:
 
 def _warm_recipes(recipes: Sequence[Recipe], backend: str = CPU) -> None:
     seen = set()
+    if any(uses_boxes(recipe) for recipe in recipes):
+        nothing = PlacedBoxes.of(Boxes.empty(), np.zeros(3))
+        find_occlusion(nothing, _camera(1.0), np.zeros((SIZE, SIZE), np.float32))
     for recipe in recipes:
         flood, snow, output = recipe.weather.flood, recipe.weather.snow, recipe.output
         style = recipe.style if recipe.style and recipe.style.changes else None
         is_clear = flood is None and snow is None and style is None
-        if is_clear and backend == CPU:  # `cpu.warm_up` has drawn one
+        for_boxes = uses_boxes(recipe) and output.depth == "none"
+        if is_clear and not for_boxes and backend == CPU:  # `cpu.warm_up` has drawn one
             continue
         ids = output.semantic or output.instance
         water, light = flood and flood.reflection, snow and snow.shading
         worn = style and (style.applied_to, style.method)
-        kernels = (water, light, output.depth, ids, output.surface, worn, recipe.lidar)
+        shown = (output.depth, ids, output.surface, for_boxes)
+        kernels = (water, light, *shown, worn, recipe.lidar)
         if kernels not in seen:
             seen.add(kernels)
             level_z_m = 0.0 if flood is None else flood.level_m
@@ -139,7 +147,7 @@ class _NoLabels:
 
 def _one_return(z_m: float) -> LidarSweep:
     """Of the road, ahead."""
-    return LidarSweep({name: np.array([value]) for name, value in zip("xyz", (4.0, 0.0, z_m))})
+    return LidarSweep({"x": np.array([4.0]), "y": np.array([0.0]), "z": np.array([z_m])})
 
 
 def _camera(z_m: float) -> Camera:
