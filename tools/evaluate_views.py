@@ -114,17 +114,24 @@ class Views:
     def camera(self, row: int) -> Camera:
         """The row's camera in the dataset's world, which is that of the boxes."""
         record, _ = self._reader.camera(self.rows, row)
-        return Camera(
-            record.name,
-            record.width,
-            record.height,
-            float(record.K[0, 0]),
-            float(record.K[1, 1]),
-            float(record.K[0, 2]),
-            float(record.K[1, 2]),
-            invert_rigid(record.world_from_camera),
-            record.timestamp_ns,
-        )
+        try:
+            return Camera(
+                record.name,
+                record.width,
+                record.height,
+                float(record.K[0, 0]),
+                float(record.K[1, 1]),
+                float(record.K[0, 2]),
+                float(record.K[1, 2]),
+                invert_rigid(record.world_from_camera),
+                record.timestamp_ns,
+            )
+        except (RuntimeError, TypeError, ValueError) as error:
+            raise OutputError(
+                f"{self._store.uri}: {self.rows['calibration_path'][row]} is damaged (frame "
+                f"{self.rows['frame'][row]}, camera {record.name!r}: {error}); delete it and run "
+                f"the job again, which makes it anew"
+            ) from error
 
     def view(self, row: int) -> View:
         """What the row's files hold.

@@ -6,6 +6,9 @@ import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from augment.batch.layout import folder_name, resolve_inside
 from tools import sheet
 
 VIDEO_WIDTH = 1440
@@ -45,11 +48,7 @@ def draw_sheet(out: Path, frame: int | None = None) -> Path:
         }
         if group:
             title = f"{scene}, frame {frame}: {_weather(next(iter(group.values())))}"
-            images = [
-                (name, sheet.read_rgb(out / group[name]["image_path"]))
-                for name in cameras
-                if name in group
-            ]
+            images = [(name, _read(out, group[name])) for name in cameras if name in group]
             lines.append((title, images))
     if not lines:
         from augment.errors import OutputError
@@ -74,12 +73,16 @@ def draw_video(out: Path, camera: str, frames_per_second: float = 10.0) -> Path:
     def pictures():
         for frame in frames:
             shown = [by_key[(*group, frame)] for group in groups]
-            images = [(_weather(row), sheet.read_rgb(out / row["image_path"])) for row in shown]
+            images = [(_weather(row), _read(out, row)) for row in shown]
             yield sheet.side_by_side(images, VIDEO_WIDTH)
 
-    path = out / f"video_{camera}.mp4"
+    path = out / f"video_{folder_name(camera)}.mp4"
     sheet.write_video(path, pictures(), frames_per_second)
     return path
+
+
+def _read(out: Path, row: dict[str, Any]) -> np.ndarray:
+    return sheet.read_rgb(resolve_inside(out, row["image_path"]))
 
 
 def _shown(groups: list[tuple[str, str]]) -> list[tuple[str, str]]:
@@ -91,13 +94,19 @@ def _groups(rows: list[dict[str, Any]]) -> list[tuple[str, str]]:
     """Scene and variant of every row, each once: a scene's clearest, driest and barest first."""
     weather = {
         (row["scene"], row["variant"]): (
-            row["smog_extinction_per_m"],
+            _extinction(row),
             _water_level(row),
             _snow_depth(row),
         )
         for row in rows
     }
     return sorted(weather, key=lambda group: (group[0], *weather[group], group[1]))
+
+
+def _extinction(row: dict[str, Any]) -> float:
+    """Of the recipe's smog, per metre; 0 where it has none."""
+    extinction = row.get("smog_extinction_per_m", math.nan)
+    return 0.0 if math.isnan(extinction) else extinction
 
 
 def _water_level(row: dict[str, Any]) -> float:
@@ -118,8 +127,8 @@ def _weather(row: dict[str, Any]) -> str:
 
     said = []
     if style := row.get("style"):
-        said.append(f"{style} x {row['style_strength']:.2g}")
-    if extinction := row["smog_extinction_per_m"]:
+        said.append(f"{style} x {row.get('style_strength', math.nan):.2g}")
+    if (extinction := _extinction(row)) > 0:
         said.append(f"visibility {KOSCHMIEDER / extinction:.0f} m")
     if math.isfinite(level := _water_level(row)):
         said.append(f"water at {level:.2f} m")

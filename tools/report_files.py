@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import PurePosixPath
 from typing import Protocol
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 
+from augment.batch.columns import read_table
 from augment.batch.store import StoredFileMissing
 from augment.errors import OutputError
 
@@ -45,9 +44,6 @@ class ReportFiles:
 
     def read(self, path: str) -> bytes | None:
         """The file's content; None, and noted, where there is none that can be used."""
-        parts = PurePosixPath(path).parts
-        if not parts or parts[0] == "/" or ".." in parts or "\\" in path or "\0" in path:
-            return self.note(path, "the path leads out of the output: do not trust this manifest")
         stored = self._listing.get(path)
         if stored is not None and stored.size > LARGEST_FILE:
             return self.note(path, f"larger than {LARGEST_FILE >> 20} MiB: not looked at")
@@ -65,11 +61,9 @@ class ReportFiles:
         if data is None:
             return None
         try:
-            file = pq.ParquetFile(pa.BufferReader(data))
-            there = [name for name in wanted if name in file.schema_arrow.names]
-            return file.read(columns=there, use_threads=False)
-        except (OSError, ValueError, pa.ArrowException) as error:
-            return self.note(path, f"not a readable Parquet file: {error}")
+            return read_table(data, path, wanted)
+        except OutputError as error:
+            return self.note(path, str(error))
 
     def note(self, path: str, why: str) -> None:
         """Remember that a file is damaged."""

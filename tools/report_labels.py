@@ -24,6 +24,7 @@ _LEFT: dict[str, tuple[str, Callable[[np.ndarray], np.ndarray]]] = {
     "box_snow": ("snow_fraction", lambda value: 1 - value),
 }
 _BOX = ("frame", "camera", "box")
+_TYPES = [pa.int64(), pa.string(), pa.int64(), pa.int64(), pa.float64()]  # and pixels and a share
 
 
 @dataclass(frozen=True)
@@ -152,6 +153,8 @@ def _visible(paths: dict[str, str | None], files: ReportFiles) -> np.ndarray | N
             return None
         if found.num_columns < 5:  # `pixels` of smog are younger than its transmittance
             continue
+        if found.schema.types != _TYPES:
+            return files.note(path, "its columns are not of the types that a job writes")
         value = left(np.asarray(pc.fill_null(found[name], np.nan), np.float64))
         shown = pc.fill_null(pc.greater(found["pixels"], 0), False).cast(pa.int8())
         part = found.select(list(_BOX))

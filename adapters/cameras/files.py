@@ -9,9 +9,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from adapters.cameras.colmap import find_colmap_model, read_colmap_views
-from adapters.cameras.json_formats import inria_views, load_json, nerfstudio_views
+from adapters.cameras.json_formats import inria_views, nerfstudio_views
 from adapters.cameras.path_json import path_views
 from adapters.cameras.posed_views import ViewSet
+from adapters.plain_files import read_json
 from augment.errors import AdapterError
 
 _JSON_NAMES = ("cameras.json", "transforms.json")
@@ -52,7 +53,7 @@ def read_camera_json(path: Path) -> ViewSet:
         AdapterError: not JSON, none of the formats, or a field that is missing or out of range
             (named with its place in the file).
     """
-    content = load_json(path)
+    content = read_json(path, object)
     if isinstance(content, list):
         return inria_views(content, path)
     frames = content.get("frames") if isinstance(content, dict) else None

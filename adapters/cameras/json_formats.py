@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections import Counter
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from adapters.cameras.posed_views import PosedView, ViewSet, check_pose
+from adapters.plain_files import LARGEST
+from augment.batch.manifest import MAX_SIDE_PX
 from augment.errors import AdapterError
 
 Model = TypeVar("Model", bound=BaseModel)
-Vector = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
-Row = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
+# No texts, true or false, which pydantic otherwise takes for numbers; and none beyond LARGEST.
+Number = Annotated[float, Field(strict=True, ge=-LARGEST, le=LARGEST, allow_inf_nan=False)]
+Vector = tuple[Number, Number, Number]
+Row = tuple[Number, Number, Number, Number]
 Pose = Annotated[list[Row], Field(min_length=3, max_length=4)]
-Pixels = Annotated[int, Field(ge=1, le=65536)]
-Focal = Annotated[FiniteFloat, Field(gt=0)]
+Pixels = Annotated[Number, Field(ge=1, le=MAX_SIDE_PX, multiple_of=1), AfterValidator(int)]
+Focal = Annotated[Number, Field(gt=0)]
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 _ERRORS_SHOWN = 5
 
@@ -36,8 +39,8 @@ class _InriaCamera(_Foreign):
     height: Pixels
     fx: Focal
     fy: Focal
-    cx: FiniteFloat | None = None
-    cy: FiniteFloat | None = None
+    cx: Number | None = None
+    cy: Number | None = None
     position: Vector
     rotation: tuple[Vector, Vector, Vector]
 
@@ -53,16 +56,16 @@ class _Intrinsics(_Foreign):
     h: Pixels | None = None
     fl_x: Focal | None = None
     fl_y: Focal | None = None
-    cx: FiniteFloat | None = None
-    cy: FiniteFloat | None = None
-    camera_angle_x: Annotated[FiniteFloat, Field(gt=0, lt=math.pi)] | None = None
+    cx: Number | None = None
+    cy: Number | None = None
+    camera_angle_x: Annotated[Number, Field(gt=0, lt=math.pi)] | None = None
     camera_model: str | None = None
-    k1: FiniteFloat | None = None
-    k2: FiniteFloat | None = None
-    k3: FiniteFloat | None = None
-    k4: FiniteFloat | None = None
-    p1: FiniteFloat | None = None
-    p2: FiniteFloat | None = None
+    k1: Number | None = None
+    k2: Number | None = None
+    k3: Number | None = None
+    k4: Number | None = None
+    p1: Number | None = None
+    p2: Number | None = None
 
 
 class _NerfstudioFrame(_Intrinsics):
@@ -72,18 +75,6 @@ class _NerfstudioFrame(_Intrinsics):
 
 class _NerfstudioFile(_Intrinsics):
     frames: Annotated[list[_NerfstudioFrame], Field(min_length=1)]
-
-
-def load_json(path: Path) -> object:
-    """The content of a JSON file.
-
-    Raises:
-        AdapterError: it cannot be read or is not JSON; says where.
-    """
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
-        raise AdapterError(f"{path}: cannot be read as JSON: {error}") from error
 
 
 def validate(model: type[Model], content: object, path: Path, kind: str) -> Model:

@@ -19,12 +19,13 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from adapters.cameras.json_formats import Focal, Pixels, Pose, Vector, validate
+from adapters.cameras.json_formats import Focal, Number, Pixels, Pose, Vector, validate
 from adapters.cameras.posed_views import PosedView, ViewSet, check_pose, look_at_pose
 
-Seconds = Annotated[FiniteFloat, Field(ge=-9e9, le=9e9)]  # int64 nanoseconds reach 9.2e9 s
+# int64 nanoseconds reach 9.2e9 s.
+Seconds = Annotated[float, Field(strict=True, ge=-9e9, le=9e9, allow_inf_nan=False)]
 
 
 class _PathFrame(BaseModel):
@@ -49,8 +50,8 @@ class _PathFile(BaseModel):
     height: Pixels
     fx: Focal
     fy: Focal | None = None
-    cx: FiniteFloat | None = None
-    cy: FiniteFloat | None = None
+    cx: Number | None = None
+    cy: Number | None = None
     frames: Annotated[list[_PathFrame], Field(min_length=1)]
 
     @model_validator(mode="after")

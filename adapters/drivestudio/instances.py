@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from adapters.plain_files import read_json
+from adapters.plain_files import array_of, read_json
 from augment.errors import AdapterError
 
 
@@ -59,7 +60,7 @@ def _read(path: Path, _written_ns: int) -> tuple[Instance, ...]:
 
 def _instance(key: str, entry: Any, where: str) -> Instance:
     notes = entry.get("frame_annotations") if isinstance(entry, Mapping) else None
-    if not key.isdecimal() or not isinstance(notes, Mapping) or "id" not in entry:
+    if not re.fullmatch("[0-9]{1,9}", key) or not isinstance(notes, Mapping) or "id" not in entry:
         raise AdapterError(
             f"{where} must have a number as its key, and id, class_name and frame_annotations"
         )
@@ -94,12 +95,9 @@ def _instance(key: str, entry: Any, where: str) -> Instance:
 
 def _array(notes: Mapping[str, Any], name: str, shape: tuple[int, ...], where: str) -> np.ndarray:
     """float64 [T, *shape]; rows may be flat."""
-    try:
-        values = np.array(notes.get(name), np.float64)
-    except (TypeError, ValueError):
-        values = np.zeros(())
-    length = len(values) if values.ndim else -1
-    if values.size != length * math.prod(shape) or not np.isfinite(values).all():
+    values = array_of(notes.get(name))
+    length = len(values) if values is not None and values.ndim else -1
+    if values is None or values.size != length * math.prod(shape) or not np.isfinite(values).all():
         expected = " x ".join(("T", *map(str, shape)))
         raise AdapterError(f"{where}: {name} must hold {expected} numbers")
     return values.reshape(length, *shape)

@@ -41,10 +41,16 @@ def whole_numbers(column: np.ndarray, name: str) -> np.ndarray:
         return np.zeros(0, np.int64)
     if column.dtype.kind == "M" and not np.isnat(column).any():
         return column.astype("datetime64[ns]").astype(np.int64)
-    if column.dtype.kind == "f" and np.isfinite(column).all() and (column % 1 == 0).all():
-        return column.astype(np.int64)
-    if column.dtype.kind not in "iu":
+    is_whole = column.dtype.kind in "iu" or (
+        column.dtype.kind == "f" and np.isfinite(column).all() and (column % 1 == 0).all()
+    )
+    if not is_whole:
         raise ValueError(
             f"column {name} must hold whole numbers without gaps; it is {column.dtype}"
+        )
+    if max(abs(float(column.min())), abs(float(column.max()))) > 2**62:
+        raise ValueError(
+            f"column {name} must hold numbers from -2^62 to 2^62; it holds {column.min()} to "
+            f"{column.max()}"
         )
     return column.astype(np.int64)

@@ -7,16 +7,16 @@ gigabyte, of which one scene needs a thousandth, so a table is never in memory a
 from __future__ import annotations
 
 import json
-import math
 import re
 from collections.abc import Container, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from adapters.plain_files import LARGEST
 from augment.errors import AdapterError
 
 _CHUNK = 1 << 22  # characters read at a time
@@ -54,19 +54,22 @@ class Row:
 
     def fault(self, field: str, expected: str) -> AdapterError:
         """The error that the field is not what was expected."""
-        got = repr(self.fields[field]) if field in self.fields else "no such field"
+        try:
+            got = repr(self.fields[field]) if field in self.fields else "no such field"
+        except RecursionError:
+            got = "lists in lists"
         got = got if len(got) <= 200 else got[:200] + "…"
         return AdapterError(f"{self}: field {field!r} must be {expected}; got {got}")
 
     def text(self, field: str) -> str:
         value = self.fields.get(field)
-        if not isinstance(value, str):
+        if not _is_text(value):
             raise self.fault(field, "a text")
         return value
 
     def texts(self, field: str) -> tuple[str, ...]:
         value = self.fields.get(field)
-        if not isinstance(value, list) or not all(isinstance(v, str) for v in value):
+        if not isinstance(value, list) or not all(map(_is_text, value)):
             raise self.fault(field, "a list of texts")
         return tuple(value)
 
@@ -96,7 +99,7 @@ class Row:
         """float64 [count], finite."""
         value = self.fields.get(field)
         if not isinstance(value, list) or len(value) != count or not all(map(_is_finite, value)):
-            raise self.fault(field, f"a list of {count} finite numbers")
+            raise self.fault(field, f"a list of {count} finite numbers of at most {LARGEST:g}")
         return np.array(value, np.float64)
 
     def quaternion(self) -> np.ndarray:
@@ -204,4 +207,11 @@ def _rows(path: Path, file: Any) -> Iterator[Row]:
 
 
 def _is_finite(value: object) -> bool:
-    return type(value) in (int, float) and math.isfinite(value)  # type: ignore[arg-type]
+    return type(value) in (int, float) and -LARGEST <= value <= LARGEST  # type: ignore[operator]
+
+
+def _is_text(value: object) -> TypeGuard[str]:
+    """Whether a text can be written again: half a pair of surrogates, as JSON can have, cannot."""
+    if not isinstance(value, str):
+        return False
+    return value.isascii() or not any("\ud800" <= letter <= "\udfff" for letter in value)

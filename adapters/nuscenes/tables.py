@@ -3,6 +3,7 @@
     v1.0-*/scene.json, sample.json, sample_data.json, sample_annotation.json, ...   the tables
     samples/<CHANNEL>/, sweeps/<CHANNEL>/    files of keyframes, and of what lies between them
     lidarseg/v1.0-*/<token>_lidarseg.bin     class of each return of keyframes, where published
+    panoptic/v1.0-*/<token>_panoptic.npz     class and object of each, likewise
 
 Each table is read once, row by row, and only what belongs to the scene is kept. Of mini that takes
 a second; of trainval, whose tables have 2 GB, about half a minute. Rows are taken in order
@@ -20,7 +21,7 @@ import numpy as np
 
 from adapters.nuscenes.rows import Row, read_all, read_rows, read_where, referred
 from adapters.nuscenes.turning import Turn
-from adapters.plain_files import inside
+from adapters.plain_files import array_of, inside
 from augment.errors import AdapterError
 
 LIDAR = "LIDAR_TOP"
@@ -83,8 +84,9 @@ class Sample:
 class SceneTables:
     """One scene, everything in order of time.
 
-    lidar: sweeps of LIDAR_TOP. images: by camera. semantic_files: the lidarseg file of a sweep by
-    its token. class_names: by the numbers in those files. turn: how the LiDAR turns.
+    lidar: sweeps of LIDAR_TOP. images: by camera. semantic_files, panoptic_files: the lidarseg and
+    panoptic file of a sweep by its token. class_names: by the numbers in those files. turn: how
+    the LiDAR turns.
     """
 
     root: Path
@@ -94,6 +96,7 @@ class SceneTables:
     lidar: tuple[SensorFile, ...]
     images: Mapping[str, tuple[SensorFile, ...]]
     semantic_files: Mapping[str, str]
+    panoptic_files: Mapping[str, str]
     class_names: Mapping[int, str]
     turn: Turn
 
@@ -129,7 +132,8 @@ def read_tables(root: Path, version: str | None, scene: str | None) -> SceneTabl
         samples=_read_samples(folder, samples, categories),
         lidar=lidar,
         images=images,
-        semantic_files=_read_semantic_files(root, folder, {file.token for file in lidar}),
+        semantic_files=_files_of_sweeps(root, folder / "lidarseg.json", lidar),
+        panoptic_files=_files_of_sweeps(root, folder / "panoptic.json", lidar),
         class_names=_class_names(categories),
         turn=_read_turn(lidar, images),
     )
@@ -232,11 +236,8 @@ def _sensor_file(root: Path, row: Row, calibration: Row, sensor: Row, pose: Row)
 
 def _intrinsic(row: Row) -> tuple[float, float, float, float]:
     expected = "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx and fy above 0"
-    try:
-        matrix = np.array(row.fields.get("camera_intrinsic"), np.float64)
-    except (TypeError, ValueError):
-        raise row.fault("camera_intrinsic", expected) from None
-    if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
+    matrix = array_of(row.fields.get("camera_intrinsic"))
+    if matrix is None or matrix.shape != (3, 3) or not np.isfinite(matrix).all():
         raise row.fault("camera_intrinsic", expected)
     fx, fy, cx, cy = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
     plain = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
@@ -289,10 +290,11 @@ def _size(row: Row) -> np.ndarray:
     return np.array([length, width, height])
 
 
-def _read_semantic_files(root: Path, folder: Path, sweeps: set[str]) -> dict[str, str]:
-    path = folder / "lidarseg.json"
+def _files_of_sweeps(root: Path, path: Path, lidar: Sequence[SensorFile]) -> dict[str, str]:
+    """The files that a table names for sweeps, by the sweep's token; none without the table."""
     if not path.exists():
         return {}
+    sweeps = {file.token for file in lidar}
     files: dict[str, str] = {}
     for row in read_rows(path):
         sweep = row.text("sample_data_token")

@@ -16,6 +16,7 @@ import re
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -23,11 +24,13 @@ import pandas as pd
 import torch
 
 from adapters.lidar.origin import drive_origin
-from adapters.plain_files import read_json
+from adapters.plain_files import number_of, read_json
 from adapters.safe_pickle import read_frame
 from augment.errors import AdapterError
 from augment.geometry import rigid, rotmat_from_quat
 
+_INTRINSICS = ("fx", "fy", "cx", "cy")
+_LATEST_S = 9e9  # int64 nanoseconds reach 9.2e9 s
 LIDAR_COLUMNS = ("x", "y", "z", "i", "t", "d")
 # Columns: ego x (forward), y (left), z in the axes of the LiDAR pose (x right, y forward).
 LIDAR_POSE_FROM_EGO = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
@@ -172,13 +175,11 @@ def _read_table(path: Path, needed: tuple[str, ...]) -> pd.DataFrame:
 
 
 def _read_camera(folder: Path, frames: int, problems: list[str]) -> CameraTrack:
-    intrinsics = read_json(folder / "intrinsics.json")
-    try:
-        fx, fy, cx, cy = (float(intrinsics[name]) for name in ("fx", "fy", "cx", "cy"))
-    except (TypeError, KeyError, ValueError) as error:
-        raise AdapterError(
-            f"{folder / 'intrinsics.json'} must hold numbers fx, fy, cx, cy ({error!r})"
-        ) from None
+    path = folder / "intrinsics.json"
+    lens = read_json(path)
+    fx, fy, cx, cy = (number_of(lens.get(k), f"{path}: {k} (pixels)") for k in _INTRINSICS)
+    if min(fx, fy) <= 0:
+        raise AdapterError(f"{path}: fx and fy (pixels) must be above 0; got {fx} and {fy}")
     poses = _read_poses(folder / "poses.json")
     if len(poses) != frames:
         raise AdapterError(
@@ -254,34 +255,53 @@ def _folder(path: Path) -> Path:
 
 def _read_times(path: Path, *, expected: int) -> np.ndarray:
     """Nanoseconds, int64 [expected]."""
-    seconds = read_json(path, list)
-    try:
-        times = np.array([float(s) for s in seconds], dtype=np.float64)
-    except (TypeError, ValueError):
-        raise AdapterError(f"{path} must be a list of seconds") from None
+    times = np.array(
+        [
+            number_of(seconds, f"{path}, frame {frame}: the time in seconds", largest=_LATEST_S)
+            for frame, seconds in enumerate(read_json(path, list))
+        ]
+    )
     if len(times) != expected:
         raise AdapterError(f"{path} has {len(times)} entries; there are {expected} LiDAR poses")
-    if not (np.isfinite(times).all() and (np.diff(times) > 0).all()):
-        raise AdapterError(f"{path} must be finite and increasing; copy it again")
+    if not (np.diff(times) > 0).all():
+        frame = int(np.argmin(np.diff(times) > 0)) + 1
+        raise AdapterError(
+            f"{path} must be increasing; frame {frame} is at {times[frame]} s after "
+            f"{times[frame - 1]} s. Copy it again"
+        )
     return np.round(times * 1e9).astype(np.int64)
 
 
 def _read_poses(path: Path) -> np.ndarray:
     """Rigid transforms, float64 [F, 4, 4]."""
-    entries = read_json(path, list)
-    try:
-        positions = [[float(e["position"][axis]) for axis in "xyz"] for e in entries]
-        quats = [[float(e["heading"][axis]) for axis in "wxyz"] for e in entries]
-    except (TypeError, KeyError, ValueError) as error:
-        raise AdapterError(
-            f"{path} must be a list of position x y z and heading w x y z ({error!r})"
-        ) from None
-    values = np.array([p + q for p, q in zip(positions, quats, strict=True)], dtype=np.float64)
+    values = np.array(
+        [
+            _pose_numbers(entry, f"{path}, frame {i}")
+            for i, entry in enumerate(read_json(path, list))
+        ]
+    )
     if len(values) == 0:
         raise AdapterError(f"{path} holds no poses")
     norms = np.linalg.norm(values[:, 3:], axis=1)
     # Headings are stored to 16 digits; a norm off by a thousandth is no rotation.
-    if not (np.isfinite(values).all() and (np.abs(norms - 1) < 1e-3).all()):
-        raise AdapterError(f"{path} must hold finite positions and unit headings; copy it again")
+    if not (np.abs(norms - 1) < 1e-3).all():
+        frame = int(np.argmax(np.abs(norms - 1) >= 1e-3))
+        raise AdapterError(
+            f"{path}, frame {frame}: heading must be a unit quaternion w x y z; got "
+            f"{values[frame, 3:].tolist()}. Copy the file again"
+        )
     rotation = rotmat_from_quat(torch.from_numpy(values[:, 3:]))
     return rigid(rotation, torch.from_numpy(values[:, :3])).numpy()
+
+
+def _pose_numbers(entry: Any, where: str) -> list[float]:
+    """x y z and w x y z of an entry of poses.json."""
+    numbers = []
+    for group, axes in (("position", "xyz"), ("heading", "wxyz")):
+        values = entry.get(group) if isinstance(entry, dict) else None
+        if not isinstance(values, dict):
+            raise AdapterError(
+                f"{where} must have a position x y z and a heading w x y z; got {entry!r:.80}"
+            )
+        numbers += [number_of(values.get(axis), f"{where}: {group}.{axis}") for axis in axes]
+    return numbers

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-import json
+import gzip
+import io
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,14 +13,18 @@ import pandas as pd
 
 from adapters.pandaset.files import (
     LIDAR_COLUMNS,
+    frame_file,
     read_cuboids,
     read_ego_track,
     read_lidar,
     read_semantics,
 )
 from adapters.pandaset.siblings import read_objects
+from adapters.plain_files import read_json
+from adapters.safe_pickle import read_frame
 from augment.errors import AdapterError
 from augment.labels import Boxes, LidarSweep
+from augment.lidar_weather.codes import INDEX_COLUMN
 from augment.semantics import SemanticClass
 
 NO_SURFACE = -1  # stands for returns that no surface made, where a SemanticClass is expected
@@ -62,12 +68,13 @@ def semantic_table(root: Path) -> np.ndarray:
     names = {number: name for number, (name, _) in enumerate(_CLASSES, start=1)}
     path = root / "annotations" / "semseg" / "classes.json"
     if path.exists():
-        try:
-            names = {
-                int(k): str(v) for k, v in json.loads(path.read_text(encoding="utf-8")).items()
-            }
-        except (OSError, ValueError, AttributeError) as error:
-            raise AdapterError(f"{path} must map class numbers to names ({error})") from None
+        found = read_json(path)
+        for key, name in found.items():
+            if not (re.fullmatch("[0-9]{1,9}", key) and isinstance(name, str)):
+                raise AdapterError(
+                    f"{path} must map class numbers to names; got {key!r:.80}: {name!r:.80}"
+                )
+        names = {int(key): name for key, name in found.items()}
     meaning = dict(_CLASSES)
     table = np.full(256, SemanticClass.UNKNOWN, dtype=np.int16)
     for number, name in names.items():
@@ -134,6 +141,21 @@ class PandaSetLabels:
         if classes is not None:
             columns["semantic"] = classes
         return LidarSweep(columns)
+
+    def lidar_files(self, frame_index: int) -> tuple[Path, ...]:
+        folders = ("lidar", "annotations/semseg")
+        files = tuple(frame_file(self.root, folder, frame_index) for folder in folders)
+        return tuple(file for file in files if file.exists()) if files[0].exists() else ()
+
+    def lidar_content(self, frame_index: int, file: Path, sweep: LidarSweep) -> bytes:
+        """Tables of those rows under their own index: rows of both files still name each other."""
+        table = read_frame(file).iloc[sweep.columns[INDEX_COLUMN]].copy()
+        if file == frame_file(self.root, "lidar", frame_index):
+            for name in "xyzi":
+                table[name] = sweep.columns[name]
+        stream = io.BytesIO()
+        table.to_pickle(stream, compression=None, protocol=4)
+        return gzip.compress(stream.getvalue(), compresslevel=6, mtime=0)
 
 
 def places_at(places_m: np.ndarray, times_s: np.ndarray, wanted_s: np.ndarray) -> np.ndarray:

@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,9 +27,10 @@ import numpy as np
 import torch
 
 from adapters.lidar.origin import drive_origin
-from adapters.plain_files import read_json
+from adapters.plain_files import array_of, number_of, read_json
 from adapters.recording.files import block_files
 from augment.batch.calibration import read_camera
+from augment.batch.manifest import MAX_SIDE_PX
 from augment.cameras import Camera, Frame
 from augment.errors import AdapterError
 from augment.geometry import invert_rigid
@@ -88,7 +88,9 @@ def read_calibration(root: Path) -> Calibration:
         frames=tuple(_recentred(frame, origin) for frame in frames),
         world_origin_m=origin,
         has_metric_scale=content.get("has_metric_scale") is not False,
-        ego_above_ground_m=_number(path, content, "ego_above_ground_m", 0.0),
+        ego_above_ground_m=number_of(
+            content.get("ego_above_ground_m", 0.0), f"{path}: ego_above_ground_m"
+        ),
         ego_box_m=_ego_box(path, content.get("ego_box_m")),
         lidar_classes=_lidar_classes(path, content.get("lidar_classes")),
     )
@@ -113,7 +115,8 @@ def _content(root: Path) -> tuple[Path, dict[str, Any]]:
     parts = [read_json(block) for block in blocks]
     frames: dict[Any, dict[str, Any]] = {}
     for block, part in zip(blocks, parts, strict=True):
-        for entry in part.get("frames") or ():
+        entries = part.get("frames")
+        for entry in entries if isinstance(entries, list) else [entries]:
             if not isinstance(entry, dict) or not isinstance(entry.get("cameras"), dict):
                 raise AdapterError(f"{block}: each of 'frames' must be an object with cameras")
             number = entry.get("frame")
@@ -131,19 +134,20 @@ def _content(root: Path) -> tuple[Path, dict[str, Any]]:
 
 
 def _frame(path: Path, entry: Any) -> Frame:
-    number = entry.get("frame") if isinstance(entry, dict) else None
-    if type(number) is not int or number < 0:
+    index = entry.get("frame") if isinstance(entry, dict) else None
+    if type(index) is not int or not 0 <= index < 2**62:
         raise AdapterError(
-            f"{path}: every entry of 'frames' needs a number 'frame', 0 or greater; got {number!r}"
+            f"{path}: every entry of 'frames' needs a number 'frame', 0 or greater; got "
+            f"{index!r:.80}"
         )
-    where = f"{path}, frame {number}"
+    where = f"{path}, frame {index}"
     timestamp_ns = _time(where, entry.get("timestamp_ns"))
     world_from_ego = _rigid(where, "world_from_ego", entry.get("world_from_ego"))
     cameras = entry.get("cameras")
     if not isinstance(cameras, dict):
         raise AdapterError(f"{where}: 'cameras' must map names to cameras; got {cameras!r}")
     return Frame(
-        index=number,
+        index=index,
         timestamp_ns=timestamp_ns,
         world_from_ego=world_from_ego,
         cameras={
@@ -160,11 +164,13 @@ def _camera(where: str, name: str, camera: Any, frame_ns: int) -> Camera:
     camera = {"timestamp_ns": frame_ns} | camera
     _time(where, camera["timestamp_ns"])
     size = [camera.get(side) for side in ("width", "height")]
-    if any(type(side) is not int for side in size):
-        raise AdapterError(f"{where}: width and height must be whole pixels; got {size}")
+    if any(type(side) is not int or not 1 <= side <= MAX_SIDE_PX for side in size):
+        raise AdapterError(
+            f"{where}: width and height must be whole pixels, 1 to {MAX_SIDE_PX}; got {size!r:.80}"
+        )
     for key in ("fx", "fy", "cx", "cy"):
-        if isinstance(camera.get(key, 0), bool) or not isinstance(camera.get(key, 0), int | float):
-            raise AdapterError(f"{where}: {key} must be a number of pixels; got {camera[key]!r}")
+        if key in camera:
+            number_of(camera[key], f"{where}: {key} (pixels)")
     try:
         record = read_camera({"cameras": {name: camera}}, name)
         k = record.K
@@ -187,11 +193,8 @@ def _camera(where: str, name: str, camera: Any, frame_ns: int) -> Camera:
 
 def _rigid(where: str, name: str, value: Any) -> torch.Tensor:
     """A rigid transform, float64 [4, 4]."""
-    try:
-        matrix = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        matrix = np.zeros(0)
-    if matrix.shape != (4, 4):
+    matrix = array_of(value)
+    if matrix is None or matrix.shape != (4, 4):
         raise AdapterError(f"{where}: {name} must be 4 rows of 4 numbers; got {value!r:.200}")
     if not np.isfinite(matrix).all():
         raise AdapterError(
@@ -235,21 +238,12 @@ def _name(content: Mapping[str, Any], root: Path) -> str:
     return "-".join(given) if given else root.resolve().name
 
 
-def _number(path: Path, content: Mapping[str, Any], key: str, otherwise: float) -> float:
-    value = content.get(key, otherwise)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise AdapterError(f"{path}: {key} must be a number of metres; got {value!r}")
-    return float(value)
-
-
 def _ego_box(path: Path, value: Any) -> np.ndarray | None:
     if value is None:
         return None
-    try:
-        box = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        box = np.zeros(0)
-    if box.shape != (2, 3) or not np.isfinite(box).all() or not (box[0] < box[1]).all():
+    box = array_of(value)
+    is_box = box is not None and box.shape == (2, 3) and np.isfinite(box).all()
+    if box is None or not is_box or not (box[0] < box[1]).all():
         raise AdapterError(
             f"{path}: ego_box_m must be [[x, y, z], [x, y, z]], the lowest and the highest corner "
             f"in ego axes; got {value!r:.200}"

@@ -11,6 +11,7 @@ from tqdm import tqdm
 
 from adapters.lidar.split import Sweep
 from adapters.lidar.sweep_times import sweep_times
+from adapters.plain_files import LARGEST
 from adapters.recording.calibration import NO_SURFACE, Calibration
 from adapters.recording.classes import class_numbers, class_table
 from adapters.recording.labels import lidar_files
@@ -87,7 +88,7 @@ class _Raw:
         sweep = read_sweep(path)
         world = sweep.points_m - calibration.world_origin_m
         pose = frame.world_from_ego.numpy()
-        keep = np.isfinite(world).all(axis=1)
+        keep = (np.abs(world) <= LARGEST).all(axis=1)  # not NaN, and float32 has it
         ego = (np.where(keep[:, None], world, 0) - pose[:3, 3]) @ pose[:3, :3]
         if keep.any() and np.median(np.abs(ego[keep]).max(axis=1)) > _FAR_M:
             raise AdapterError(

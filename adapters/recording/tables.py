@@ -17,10 +17,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from adapters.lidar.sweep_times import whole_numbers
-from augment.batch.columns import METADATA_KEY
+from augment.batch.columns import is_ours, read_table
 from augment.batch.label_files import ATTRIBUTE_PREFIX, read_boxes, read_lidar
 from augment.errors import AdapterError, OutputError
 from augment.labels import Boxes, LidarSweep
+from augment.lidar_weather.codes import INDEX_COLUMN
+from augment.lidar_weather.sensors import intensity_column
 
 _VECTORS = {
     "centers_m": ("center_x_m", "center_y_m", "center_z_m"),
@@ -49,15 +51,37 @@ def read_sweep(path: Path) -> LidarSweep:
     """
 
     def read() -> LidarSweep:
-        if _is_ours(path):
+        if is_ours(path):
             sweep = read_lidar(path)
         else:
-            table = pq.ParquetFile(path).read(use_threads=False)
+            table = read_table(path, str(path))
             sweep = LidarSweep({n: _column(table, n) for n in table.column_names})
         _ = sweep.points_m  # numbers, not texts
         return sweep
 
     return _reading(path, "a LiDAR file with columns x, y, z", read)
+
+
+def sweep_content(path: Path, sweep: LidarSweep) -> bytes:
+    """The LiDAR file with a weathered sweep in place of its own: the same columns, types and notes.
+
+    Raises:
+        AdapterError: damaged; the message names the file.
+    """
+
+    def content() -> bytes:
+        table = read_table(path, str(path)).take(pa.array(sweep.columns[INDEX_COLUMN]))
+        for name in {*"xyz", intensity_column(sweep)} - {None}:
+            at = table.schema.get_field_index(name)
+            field = table.schema.field(at)
+            values = np.asarray(sweep.columns[name])
+            values = np.rint(values) if pa.types.is_integer(field.type) else values
+            table = table.set_column(at, field, pa.array(values).cast(field.type, safe=False))
+        sink = pa.BufferOutputStream()
+        pq.write_table(table, sink)
+        return sink.getvalue().to_pybytes()
+
+    return _reading(path, "a LiDAR file with columns x, y, z", content)
 
 
 def read_frame_boxes(path: Path) -> dict[int, TimedBoxes]:
@@ -76,12 +100,12 @@ def read_frame_boxes(path: Path) -> dict[int, TimedBoxes]:
 
 @lru_cache(maxsize=_CACHED_FILES)
 def _read_boxes(path: Path, _changed_ns: int, _size: int) -> dict[int, TimedBoxes]:
-    if _is_ours(path):
+    if is_ours(path):
         return {
             number: TimedBoxes(f.boxes, np.full(len(f.boxes), f.timestamp_ns, np.int64))
             for number, f in read_boxes(path).items()
         }
-    table = pq.ParquetFile(path).read(use_threads=False)
+    table = read_table(path, str(path))
     missing = [name for name in _REQUIRED if name not in table.column_names]
     if missing:
         raise ValueError(f"it lacks {missing}; it has {table.column_names}")
@@ -118,10 +142,6 @@ def _boxes_at(columns: dict[str, np.ndarray], rows: np.ndarray) -> TimedBoxes:
 def _column(table: pa.Table, name: str) -> np.ndarray:
     # A copy: Arrow's own memory is read-only, which torch.from_numpy warns about.
     return np.array(table[name].to_numpy())
-
-
-def _is_ours(path: Path) -> bool:
-    return METADATA_KEY in (pq.read_schema(path).metadata or {})
 
 
 def _reading(path: Path, expected: str, read: Callable[[], Value]) -> Value:

@@ -104,7 +104,7 @@ def read_entries(path: Path) -> dict[int, dict[str, Any]]:
     try:
         frames = json.loads(Path(path).read_bytes())["frames"]
         return {entry["frame"]: entry for entry in frames}
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, LookupError, TypeError, RecursionError) as error:
         raise OutputError(f"{path} is missing or not a calibration file: {error!r}") from error
 
 

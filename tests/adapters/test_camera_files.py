@@ -166,7 +166,7 @@ def test_bad_json_names_the_field(tmp_path: Path, content: object, message: str)
 @pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe", b"[" * 100_000])
 def test_what_is_not_json(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "cameras.json").write_bytes(content)
-    with pytest.raises(AdapterError, match=r"cameras\.json: cannot be read as JSON"):
+    with pytest.raises(AdapterError, match=r"cameras\.json (is not readable|cannot be read)"):
         read_views(tmp_path / "cameras.json")
 
 

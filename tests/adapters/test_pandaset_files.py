@@ -32,19 +32,23 @@ def edit(path: Path, change) -> None:
 @pytest.mark.parametrize(
     ("name", "change", "message"),
     [
-        ("camera/left_camera/intrinsics.json", lambda v: {"fx": 1.0}, "must hold numbers fx, fy"),
+        (
+            "camera/left_camera/intrinsics.json",
+            lambda v: {"fx": 1.0},
+            "fy .pixels. must be a number",
+        ),
         ("camera/left_camera/intrinsics.json", lambda v: [1, 2], "must hold an object; got list"),
         ("camera/left_camera/poses.json", lambda v: v[:-1], "has 2 poses; lidar/poses.json has 3"),
         ("camera/left_camera/timestamps.json", lambda v: v[:-1], "has 2 entries; there are 3"),
-        ("camera/left_camera/timestamps.json", lambda v: v[::-1], "finite and increasing"),
-        ("camera/left_camera/timestamps.json", lambda v: ["now"] * 3, "must be a list of seconds"),
+        ("camera/left_camera/timestamps.json", lambda v: v[::-1], "must be increasing; frame 1"),
+        ("camera/left_camera/timestamps.json", lambda v: ["now"] * 3, "frame 0: the time in s"),
         ("lidar/timestamps.json", lambda v: [*v, v[-1] + 1], "has 4 entries; there are 3"),
         ("lidar/poses.json", lambda v: [], "holds no poses"),
-        ("lidar/poses.json", lambda v: [{"position": v[0]["position"]}] * 3, "heading w x y z"),
+        ("lidar/poses.json", lambda v: [{"position": v[0]["position"]}] * 3, "a heading w x y z"),
         (
             "lidar/poses.json",
             lambda v: [{**p, "heading": {"w": 2, "x": 0, "y": 0, "z": 0}} for p in v],
-            "unit headings",
+            "frame 0: heading must be a unit",
         ),
     ],
 )
@@ -53,6 +57,46 @@ def test_calibration_that_contradicts_itself_is_refused(folder, name, change, me
     with pytest.raises(AdapterError, match=message) as caught:
         read_sequence(folder)
     assert Path(name).name in str(caught.value)
+
+
+# What JSON allows where a number is due: (as text, as in the error).
+NO_NUMBERS = {
+    "NaN": "nan",
+    "-Infinity": "-inf",
+    "1e999": "inf",
+    "1e39": "1e\\+39",
+    "1" + "0" * 39: "10000",
+    "1" + "0" * 400: "10000",
+    '"1.5"': "'1.5'",
+    "true": "True",
+    "null": "None",
+    "[1]": r"\[1\]",
+}
+
+
+def test_no_number_is_refused_by_file_frame_and_field(folder):
+    poses, times = folder / "camera/left_camera/poses.json", folder / "lidar/timestamps.json"
+    lens = folder / "camera/left_camera/intrinsics.json"
+    for text, shown in NO_NUMBERS.items():
+        for path, place, where in (
+            (lens, lambda v: v | {"cy": "?"}, "intrinsics.json: cy .pixels."),
+            (times, lambda v: [v[0], "?", v[2]], "timestamps.json, frame 1: the time in seconds"),
+            (
+                poses,
+                lambda v: [*v[:2], v[2] | {"position": v[2]["position"] | {"y": "?"}}],
+                "poses.json, frame 2: position.y",
+            ),
+            (
+                poses,
+                lambda v: [v[0] | {"heading": v[0]["heading"] | {"w": "?"}}, *v[1:]],
+                "poses.json, frame 0: heading.w",
+            ),
+        ):
+            whole = path.read_text()
+            path.write_text(json.dumps(place(json.loads(whole))).replace('"?"', text))
+            with pytest.raises(AdapterError, match=f"{where} must be a number .* got {shown}"):
+                read_sequence(folder)
+            path.write_text(whole)
 
 
 def test_json_that_is_none_is_refused(folder):
@@ -138,9 +182,10 @@ def test_classes_are_known_by_name(folder):
     (folder / "annotations/semseg/classes.json").write_text(json.dumps(names))
     table = semantic_table(folder)
     assert table[3] == SemanticClass.ROAD and table[9] == NO_SURFACE and table[5] == 0
-    (folder / "annotations/semseg/classes.json").write_text("[1, 2]")
-    with pytest.raises(AdapterError, match=r"classes\.json must map class numbers to names"):
-        semantic_table(folder)
+    for wrong in ([1, 2], {"x": "Road"}, {"9" * 5000: "Road"}, {"1": 2}):
+        (folder / "annotations/semseg/classes.json").write_text(json.dumps(wrong))
+        with pytest.raises(AdapterError, match=r"classes\.json must"):
+            semantic_table(folder)
 
 
 def test_own_car_and_mirror_images_are_left_out(folder):

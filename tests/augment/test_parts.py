@@ -30,13 +30,13 @@ from augment.errors import OutputError
 
 RECIPE = make_recipe()
 IDENTITY = Identity("fake:a", RECIPE.hash, "recorded", "1", "cpu")
-NOWHERE = {f"{kind}_path": None for kind in PATH_KINDS}
+PATHS = {f"{kind}_path": "a.png" if kind == "image" else None for kind in PATH_KINDS}
 
 
 def table(frames: dict[int, bool], message: str = "", scene: str = "a") -> pa.Table:
     """Rows of frames; the values say whether they are finished."""
     rows = [
-        image_row(scene, RECIPE, IDENTITY, Pictured(frame, "front", frame, 4, 3), paths=NOWHERE,
+        image_row(scene, RECIPE, IDENTITY, Pictured(frame, "front", frame, 4, 3), paths=PATHS,
                   status=OK if done else FAILED, message=message)
         for frame, done in frames.items()
     ]  # fmt: skip

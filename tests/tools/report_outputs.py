@@ -40,7 +40,7 @@ def make_row(
     row |= {"variant": f"{recipe}-{variant:03d}", "frame": frame, "camera": camera}
     row |= {"timestamp_ns": frame, "width": WIDTH, "height": HEIGHT, "surface": "solid"}
     row |= {"style": None, "style_method": None, "quality": None, "render_scale": 1.0}
-    row |= {"settings": None, "smog_extinction_per_m": 0.0}
+    row |= {"settings": None, "lidar": None, "lidar_note": None, "smog_extinction_per_m": 0.0}
     row |= {"flood_level_m": math.nan, "snow_depth_m": math.nan, "snow_coverage": math.nan}
     row |= {"style_strength": 0.0, "seed": 3, "recipe": recipe, "recipe_hash": "0"}
     row |= {"trajectory": "recorded", "version": "1.2.3", "backend": "cpu", "checksum": ""}

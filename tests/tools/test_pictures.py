@@ -27,7 +27,7 @@ def make_row(
     paths |= {"image_path": f"{variant}.png", "water_path": f"{variant}-water.png"}
     row = {"scene": "street", "source": "s", "variant": variant, "frame": 4, "camera": "front"}
     row |= {"timestamp_ns": 5, "width": 40, "height": 20, "surface": "scene", **paths}
-    row |= {"style": None, "style_method": None}
+    row |= {"style": None, "style_method": None, "lidar": None, "lidar_note": None}
     row |= {"quality": None, "render_scale": 1.0, "settings": None}
     row |= {"smog_extinction_per_m": extinction_per_m, "flood_level_m": level_m}
     row |= {"snow_depth_m": snow_m}
