@@ -6,24 +6,27 @@ Cameras are looked for beside the file (cameras.json, transforms.json, a COLMAP 
 and above it in a model's folder; `adapters.cameras.frames` says how images become frames. Without
 any, `adapters.cameras.default_paths` makes a path. Coordinates and cameras of the file are turned
 so that `up` points to +z, scaled to metres, and recentred where they lie beyond a kilometre from
-zero.
+zero. What neither the URI nor the file says of up and scale, `adapters.up_and_scale` estimates; a
+file whose ground is not clear gets no path.
 """
 
 from __future__ import annotations
 
 import math
 import re
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from adapters.cameras.default_paths import make_default_path
+from adapters.cameras.default_paths import NO_CAMERAS, make_default_path
 from adapters.cameras.files import find_camera_file, read_views
 from adapters.cameras.frames import frames_from_views
 from adapters.cameras.ground_estimate import lowest_ground, solid_points
 from adapters.cameras.posed_views import PosedView, ViewSet
 from adapters.gaussian_options import COLOURS, GaussianOptions
+from adapters.up_and_scale import doubt_about_metres, find_ground, scale_from_cameras
 from adapters.uri import format_uri
 from adapters.world import WorldChange, nearest_axis, parse_up, rotation_to_z_up
 from augment.cameras import Frame
@@ -43,8 +46,8 @@ def open_gaussians(path: str | Path, query: dict[str, str]) -> Scene:
     """A scene of a splat file or of a trained model's folder. The query's keys:
     adapters.gaussian_options.QUERY_KEYS.
 
-    has_metric_scale is True only where `scale` is given or the file's notes say `unit: metre`;
-    has_known_gravity only where `up` is given or in the notes, or the cameras are upright.
+    has_metric_scale and has_known_gravity are True where URI or file say scale and up, where the
+    cameras are upright, and where they could be estimated, which the scene's problems say.
 
     Raises:
         AdapterError: a query key or value, or a camera file, that cannot be used.
@@ -57,29 +60,22 @@ def open_gaussians(path: str | Path, query: dict[str, str]) -> Scene:
     found = _find_views(file, Path(path), options)
     views = found.views if found else ()
     problems += found.problems if found else ()
-    change, about_world = _world_change(splats, views, options)
+    world = _find_world(file, splats, views, options)
+    change = world.change
     gaussians = change.gaussians(splats.gaussians, splats.origin)
-    is_metric = options.scale is not None or splats.notes.get("unit") in ("metre", "metres", "m")
-    if not is_metric:
-        problems.append(
-            f"{file}: the file does not say how long a unit is; one unit is taken as one metre. "
-            "Give scale=METRES_PER_UNIT (scale=1 if it is in metres)"
-        )
-    frames, ground_z_m, about_frames = _frames_and_ground(
-        gaussians, views, change, options, is_metric=is_metric
-    )
+    frames, ground_z_m, about_frames = _frames_and_ground(gaussians, views, world, options)
     return Scene(
         name=_scene_name(file, Path(path)),
         source=format_uri("gaussians", path, query),
         background=gaussians,
         actors=(),
-        sky=ConstantSky(torch.tensor(options.sky or _trained_background(Path(path)))),
+        sky=ConstantSky(torch.tensor(options.sky or _stand_in_sky(Path(path)))),
         frames=frames,
         world_origin_m=change.origin_m,
         ground_z_m=ground_z_m,
-        has_metric_scale=is_metric,
-        has_known_gravity=_knows_gravity(splats, views, options, change),
-        problems=(*problems, *about_world, *about_frames),
+        has_metric_scale=world.is_metric,
+        has_known_gravity=world.knows_up,
+        problems=(*problems, *world.problems, *about_frames),
     )
 
 
@@ -109,12 +105,14 @@ def find_splat_file(path: Path, iteration: int | None = None) -> Path:
     return files[0]
 
 
-def _trained_background(path: Path) -> tuple[float, float, float]:
-    """What the Gaussians were trained in front of: black, unless the model's cfg_args say white."""
+def _stand_in_sky(path: Path) -> tuple[float, float, float]:
+    """An overcast sky, whose light tints nothing; white where the model's cfg_args say that it was
+    trained in front of white. (What was trained in front of black would stand in a black night.)
+    """
     arguments = path / "cfg_args"
     if arguments.is_file() and "white_background=True" in arguments.read_text(errors="replace"):
         return COLOURS["white"]
-    return COLOURS["black"]
+    return COLOURS["overcast"]
 
 
 def _find_views(file: Path, given: Path, options: GaussianOptions) -> ViewSet | None:
@@ -139,33 +137,38 @@ def _find_views(file: Path, given: Path, options: GaussianOptions) -> ViewSet | 
     return None
 
 
-def _world_change(
-    splats: SplatFile, views: tuple[PosedView, ...], options: GaussianOptions
-) -> tuple[WorldChange, list[str]]:
-    """From the file's world to the scene's, and sentences on doubts about it."""
-    problems = []
-    cameras_up = _mean_up(views)
-    if options.up == "cameras":
-        if cameras_up is None:
-            raise AdapterError(
-                "gaussians: up=cameras needs cameras that are upright on the whole; none were found"
-            )
-        up = cameras_up
-    else:
-        up = parse_up(options.up or splats.notes.get("up") or "+z")
-    if cameras_up is not None and options.up is None:
-        angle = math.degrees(math.acos(float(np.clip(cameras_up @ up, -1, 1))))
-        if angle > _UP_TOLERANCE_DEG:
-            problems.append(
-                f"the cameras' mean up direction is {angle:.0f} degrees from what was taken as up, "
-                f"{nearest_axis(up)}; weather needs gravity, so give up=cameras, or "
-                f"up={nearest_axis(cameras_up)} if that axis is vertical"
-            )
-    scale = 1.0 if options.scale is None else options.scale
-    turned = WorldChange(rotation_to_z_up(up), scale)
+@dataclass(frozen=True, eq=False)
+class _World:
+    """change: from the file's world to the scene's. problems: what is estimated or in doubt.
+    lacking: what of up and scale is not known; empty where both are.
+    """
+
+    change: WorldChange
+    knows_up: bool
+    is_metric: bool
+    problems: tuple[str, ...]
+    lacking: str
+
+
+def _find_world(
+    file: Path, splats: SplatFile, views: tuple[PosedView, ...], options: GaussianOptions
+) -> _World:
+    up, knows_up, about_up = _find_up(splats, views, options)
+    turned = WorldChange(rotation_to_z_up(up))
+    scale, is_metric, about_scale = 1.0, False, "to estimate it, up has to be known"
+    if knows_up or options.scale is not None:
+        scale, is_metric, about_scale = _find_scale(splats, views, options, turned)
+    if not is_metric:
+        about_scale = (
+            "the file does not say how long a unit is; one unit is taken as one metre. "
+            f"Give scale=METRES_PER_UNIT (scale=1 if it is in metres); {about_scale}"
+        )
+    facts = ((knows_up, "which way is up"), (is_metric, "how long a unit is"))
+    lacking = " and ".join(what for known, what in facts if not known)
+    problems = [f"{file}: {sentence}" for sentence in (about_scale, about_up) if sentence]
     means = splats.gaussians.means
     sample = means[:: 1 + len(means) // 100_000].double().numpy() + splats.origin
-    origin = recentring_origin(turned.points(sample))
+    origin = recentring_origin(scale * turned.points(sample))
     if origin.any() and not splats.origin.any():
         step = np.spacing(np.float32(np.abs(sample).max())) * scale
         problems.append(
@@ -173,18 +176,68 @@ def _world_change(
             f"them in steps of up to {step:.2g} m; they are recentred, but what rounding took "
             "before is lost"
         )
-    return WorldChange(turned.rotation, scale, origin), problems
+    change = WorldChange(turned.rotation, scale, origin)
+    return _World(change, knows_up, is_metric, tuple(problems), lacking)
 
 
-def _knows_gravity(
-    splats: SplatFile, views: tuple[PosedView, ...], options: GaussianOptions, change: WorldChange
-) -> bool:
-    if options.up is not None or splats.notes.get("up"):
-        return True
+def _find_up(
+    splats: SplatFile, views: tuple[PosedView, ...], options: GaussianOptions
+) -> tuple[np.ndarray, bool, str]:
+    """Up in the file's world, whether it is known, and what there is to say about it."""
     cameras_up = _mean_up(views)
-    if cameras_up is None:
-        return False
-    return float((change.rotation @ cameras_up)[2]) > math.cos(math.radians(_LEVEL_TOLERANCE_DEG))
+    if options.up == "cameras":
+        if cameras_up is None:
+            raise AdapterError(
+                "gaussians: up=cameras needs cameras that are upright on the whole; none were found"
+            )
+        return cameras_up, True, ""
+    stated = options.up or splats.notes.get("up")
+    up = parse_up(stated or "+z")
+    lean_deg = 0.0
+    if cameras_up is not None:
+        lean_deg = math.degrees(math.acos(float(np.clip(cameras_up @ up, -1, 1))))
+    if options.up is not None:
+        return up, True, ""
+    why = ""
+    if stated is None and (cameras_up is None or lean_deg >= _LEVEL_TOLERANCE_DEG):
+        found = find_ground(splats.gaussians, near=cameras_up)
+        if found is not None and found.is_clear:
+            return found.up, True, f"up is estimated to be {found.sentence}. Give up=AXIS if not"
+        why = "which way is up is not clear; " + (
+            f"the best guess is {found.sentence}" if found else "nothing in the file is flat"
+        )
+    if cameras_up is not None and lean_deg > _UP_TOLERANCE_DEG:
+        why = (
+            f"the cameras' mean up direction is {lean_deg:.0f} degrees from what was taken as up, "
+            f"{nearest_axis(up)}; weather needs gravity, so give up=cameras, or "
+            f"up={nearest_axis(cameras_up)} if that axis is vertical"
+        )
+    return up, stated is not None or not why, why
+
+
+def _find_scale(
+    splats: SplatFile, views: tuple[PosedView, ...], options: GaussianOptions, turned: WorldChange
+) -> tuple[float, bool, str]:
+    """Metres per unit, whether that is known, and what there is to say about it. turned: to a world
+    whose +z is up.
+    """
+    if options.scale is not None:
+        return options.scale, True, ""
+    if splats.notes.get("unit") in ("metre", "metres", "m"):
+        return 1.0, True, ""
+    points = turned.points(solid_points(splats.gaussians) + splats.origin)
+    scale, reason = 1.0, "nothing says otherwise, and it can be a street in metres"
+    if views:
+        poses = np.stack([turned.pose(view.world_from_camera) for view in views])
+        by_cameras = scale_from_cameras(points, poses)
+        if by_cameras is None:
+            return 1.0, False, "the cameras do not stand at one height, level, as on a car"
+        scale, reason = by_cameras
+    doubt = doubt_about_metres(scale * points, scale * splats.gaussians.scales)
+    if doubt is not None:
+        return 1.0, False, doubt
+    said = f"a unit is estimated to be {scale:.4g} m: {reason}"
+    return scale, True, f"{said}. Give scale=METRES_PER_UNIT if not"
 
 
 def _mean_up(views: tuple[PosedView, ...]) -> np.ndarray | None:
@@ -199,12 +252,18 @@ def _mean_up(views: tuple[PosedView, ...]) -> np.ndarray | None:
 def _frames_and_ground(
     gaussians: Gaussians,
     views: tuple[PosedView, ...],
-    change: WorldChange,
+    world: _World,
     options: GaussianOptions,
-    *,
-    is_metric: bool,
 ) -> tuple[tuple[Frame, ...], float | None, list[str]]:
+    change, is_metric = world.change, world.is_metric
     if not views:
+        if options.path == "auto" and world.lacking:
+            note = (
+                f"{NO_CAMERAS}, and no path is made where it is not known {world.lacking}; add "
+                "?up=+z&scale=1 to the file's name (its axis that points up, metres per unit), "
+                "path=orbit to circle it as it lies, or camera_path=FILE"
+            )
+            return (), None, [note]
         made = make_default_path(gaussians, is_metric=is_metric, kind=options.path)
         frames, problems = frames_from_views(made.views, WorldChange())
         return frames, made.ground_z_m, [made.note, *problems]

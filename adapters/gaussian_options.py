@@ -10,14 +10,16 @@ from adapters.world import parse_up
 from augment.errors import AdapterError
 
 QUERY_KEYS = {
-    "up": "the file's axis that points up (+x … -z), a vector 0,-1,0.1, or 'cameras': their mean",
-    "scale": "metres per unit of the file; 1 says that it is in metres",
+    "up": "the file's axis that points up (+x … -z), a vector 0,-1,0.1, or 'cameras': their mean; "
+    "estimated without it",
+    "scale": "metres per unit of the file; 1 says that it is in metres; estimated without it",
     "cameras": "a camera file or COLMAP folder in the file's world, or 'none'",
     "path": "without cameras: auto, drive or orbit",
     "iteration": "which iteration_N of a trained model; the newest by default",
-    "sky": "colour behind the Gaussians: black (as trained), white, or three numbers 0 to 1",
+    "sky": "colour behind the Gaussians: overcast (a light grey), black, white, or three numbers "
+    "0 to 1",
 }
-COLOURS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
+COLOURS = {"overcast": (0.85, 0.85, 0.85), "black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
 
 @dataclass(frozen=True)
@@ -86,7 +88,7 @@ def _parse_colour(text: str) -> tuple[float, float, float]:
         red = green = blue = math.nan
     if not all(0 <= value <= 1 for value in (red, green, blue)):
         raise AdapterError(
-            f"gaussians: sky must be black, white, or three numbers 0 to 1 such as 0.7,0.8,0.9; "
-            f"got {text!r}"
+            f"gaussians: sky must be {', '.join(COLOURS)}, or three numbers 0 to 1 such as "
+            f"0.7,0.8,0.9; got {text!r}"
         )
     return red, green, blue

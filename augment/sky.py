@@ -67,6 +67,13 @@ class CubemapSky:
         return _bilinear(bordered_faces(self), row, column, face=face)
 
 
+def is_stand_in(sky: Sky) -> bool:
+    """Whether the sky is one grey in every direction, black and white among them: nothing is known
+    of it, and its colour says nothing of the scene's.
+    """
+    return isinstance(sky, ConstantSky) and bool((sky.rgb == sky.rgb[0]).all())
+
+
 def sample_at(sky: Sky, directions: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3"]:
     """The sky's colours where the directions lie, though its own tensors lie on the CPU."""
     if directions.device.type == "cpu":

@@ -14,7 +14,7 @@ from augment.batch.job import JobResult, RenderJob, run_job
 from augment.batch.layout import variant_name
 from augment.batch.mirror import Links
 from augment.batch.rows import lidar_notes
-from augment.batch.selection import SceneIndex, has_lidar
+from augment.batch.selection import SceneIndex, check_frames, has_lidar
 from augment.batch.store import open_store
 from augment.batch.times import shares_of
 from augment.cameras import Frame
@@ -65,6 +65,8 @@ def render_recipe(
     if seconds > 1:
         _say(f"compiled the kernels in {seconds:.1f} s (kept for the next run)")
     scene = open_scene(scene_uri)
+    if camera_path is None:
+        check_frames(scene)
     for problem in scene.problems:
         _say(f"note: {problem}")
     if layout == "source":

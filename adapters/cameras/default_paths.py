@@ -14,7 +14,13 @@ from typing import Literal
 
 import numpy as np
 
-from adapters.cameras.ground_estimate import GroundGrid, ground_grid, solid_points_and_areas
+from adapters.cameras.ground_estimate import (
+    BULK_REACH,
+    GroundGrid,
+    ground_grid,
+    in_bulk,
+    solid_points_and_areas,
+)
 from adapters.cameras.posed_views import PosedView, look_at_pose
 from augment.scene import Gaussians
 
@@ -27,12 +33,14 @@ WIDTH, HEIGHT = 960, 540
 DRIVE_CAMERAS_DEG = {"front": 0.0, "left": 60.0, "right": -60.0}  # yaw; 75° wide each, so they meet
 _FIELD_OF_VIEW_DEG = {"drive": 75.0, "orbit": 55.0}
 _STEP_M = 0.5  # 5 m/s at 10 Hz
+_MAX_CELLS = 1010  # a side: up to half a kilometre every step is looked at, beyond that every nth
 _MOST_FRAMES = 100
 _ORBIT_FRAMES = 48
 _SHORTEST_DRIVE_M = 8.0
 _WIDE_M, _FLATNESS = 20.0, 0.5
 _CAR_M = (0.5, 2.5)  # above the ground: what lies between is in the way
 _HALF_WIDTH_M = 1.25
+_ROAD_REACH_M, _ROAD_LAYER_M = 2.5, 0.2
 _DETAIL_REACH_M, _COARSER_THAN_USUAL = 2.0, 1.7
 _BLOCKED_COST = 4.0  # passing half a metre of wall must cost more than it gains
 _BEHIND_SHARE, _AHEAD_SHARE = (
@@ -56,13 +64,15 @@ def make_default_path(
 ) -> DefaultPath:
     """A path for the scene; `kind` other than auto insists (a drive then takes units as metres)."""
     points, areas = solid_points_and_areas(gaussians)
+    near = in_bulk(points, BULK_REACH)
+    points, areas = points[near], areas[near]
     if kind == "orbit" or (kind == "auto" and not (is_metric and _is_wide_and_flat(points))):
         return _orbit(points, is_metric=is_metric, asked=kind == "orbit")
     grid = ground_grid(points, cell=1.0)
     start, end = _longest_free_line(points, areas, grid)
     if np.linalg.norm(end - start) < _SHORTEST_DRIVE_M and kind == "auto":
         return _orbit(points, is_metric=is_metric, asked=False)
-    return _drive(points, grid, start, end)
+    return _drive(points, areas, grid, start, end)
 
 
 def _is_wide_and_flat(points: np.ndarray) -> bool:
@@ -76,24 +86,28 @@ def _longest_free_line(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Ends [2] of the straight line with the most ground under it and the least in its way.
 
-    Every half metre of a line counts +1 over known ground, -1 elsewhere, and less by the share of
-    a car's front that Gaussians there hide; of every line the best stretch is taken.
+    Every half metre of a line (more in scenes of more than half a kilometre) counts +1 over known
+    ground, -1 elsewhere, and less by the share of a car's front that Gaussians there hide; of every
+    line the best stretch is taken.
     """
     worth, cell = _worth_of_cells(points, areas, grid)
     middle = grid.corner + 0.5 * grid.cell * np.array(grid.height.shape)
     reach = 0.5 * grid.cell * float(np.hypot(*grid.height.shape))
-    along = np.arange(-reach, reach, _STEP_M)
-    across = np.arange(-reach, reach, 2 * _STEP_M)
+    along = np.arange(-reach, reach, cell)
+    across = np.arange(-reach, reach, 2 * cell)
+    framed = np.pad(worth, 1, constant_values=-1.0)  # so that places outside need no mask
     best, ends = -math.inf, (middle, middle)
     for angle in np.arange(0, math.pi, math.pi / 36):
         forward = np.array([math.cos(angle), math.sin(angle)])
         left = np.array([-forward[1], forward[0]])
-        places = middle + along[None, :, None] * forward + across[:, None, None] * left
-        index = np.floor((places - grid.corner) / cell).astype(int)
-        inside = ((index >= 0) & (index < worth.shape)).all(-1)
-        x = index[..., 0].clip(0, worth.shape[0] - 1)
-        y = index[..., 1].clip(0, worth.shape[1] - 1)
-        total = np.cumsum(np.where(inside, worth[x, y], -1.0), axis=1)
+        places = tuple(
+            middle[axis] + along * forward[axis] + across[:, None] * left[axis] for axis in (0, 1)
+        )
+        x, y = (
+            1 + np.floor((places[a] - grid.corner[a]) / cell).astype(int).clip(-1, worth.shape[a])
+            for a in (0, 1)
+        )
+        total = np.cumsum(framed[x, y], axis=1)
         total = np.pad(total, ((0, 0), (1, 0)))
         floor = np.minimum.accumulate(total, axis=1)
         gain = total - floor
@@ -101,7 +115,8 @@ def _longest_free_line(
         if gain[row, stop] > best:
             best = gain[row, stop]
             begin = int(total[row, : stop + 1].argmin())
-            ends = (places[row, begin], places[row, max(begin, int(stop) - 1)])
+            end = max(begin, int(stop) - 1)
+            ends = tuple(np.array([p[row, i] for p in places]) for i in (begin, end))
     return ends
 
 
@@ -109,7 +124,7 @@ def _worth_of_cells(
     points: np.ndarray, areas: np.ndarray, grid: GroundGrid
 ) -> tuple[np.ndarray, float]:
     """What a step over each fine cell counts, and the cell's side."""
-    cell = min(_STEP_M, grid.cell)
+    cell = max(_STEP_M, grid.cell * max(grid.height.shape) / _MAX_CELLS)
     shape = np.ceil(np.array(grid.height.shape) * grid.cell / cell).astype(int)
     centres = grid.corner + (np.moveaxis(np.indices(tuple(shape)), 0, -1) + 0.5) * cell
     known = np.isfinite(grid.at(centres)) & _is_detailed(points, areas, grid.corner, cell, shape)
@@ -160,7 +175,9 @@ def _sum_around(values: np.ndarray, reach: int) -> np.ndarray:
     return values
 
 
-def _drive(points: np.ndarray, grid: GroundGrid, start: np.ndarray, end: np.ndarray) -> DefaultPath:
+def _drive(
+    points: np.ndarray, areas: np.ndarray, grid: GroundGrid, start: np.ndarray, end: np.ndarray
+) -> DefaultPath:
     whole = float(np.linalg.norm(end - start))
     forward = (end - start) / whole if whole > 1e-6 else np.array([1.0, 0.0])
     beyond = [
@@ -174,7 +191,8 @@ def _drive(points: np.ndarray, grid: GroundGrid, start: np.ndarray, end: np.ndar
     )
     count = max(2, min(_MOST_FRAMES, round(length / _STEP_M) + 1))
     places = start + np.linspace(0, length, count)[:, None] * forward
-    ground = _smooth_profile(grid.at(places), fallback=float(np.quantile(points[:, 2], 0.1)))
+    heights = _road_heights(points, areas, places, grid.at(places))
+    ground = _smooth_profile(heights, fallback=float(np.quantile(points[:, 2], 0.1)))
     views = []
     for frame, (place, height) in enumerate(zip(places, ground, strict=True)):
         eye = np.array([*place, height + CAMERA_HEIGHT_M])
@@ -189,6 +207,29 @@ def _drive(points: np.ndarray, grid: GroundGrid, start: np.ndarray, end: np.ndar
         "camera_path=FILE for another"
     )
     return DefaultPath(tuple(views), float(np.quantile(ground, 0.05)), note)
+
+
+def _road_heights(
+    points: np.ndarray, areas: np.ndarray, places: np.ndarray, low: np.ndarray
+) -> np.ndarray:
+    """Heights [P] that hold the most surface around places [P, 2]; NaN where nothing is near.
+
+    low: [P], heights of what lies low there, which a road may lie above: files have foundations,
+    and strays below the ground. Coarse splats lie under fine ones, so none counts for many.
+    """
+    heights, areas = np.full(len(places), np.nan), np.minimum(areas, np.median(areas))
+    for number, (place, least) in enumerate(zip(places, low, strict=True)):
+        offset = points[:, :2] - place
+        near = (offset * offset).sum(axis=1) < _ROAD_REACH_M**2
+        near &= np.abs(points[:, 2] - least) < _CAR_M[0] + _ROAD_LAYER_M
+        if near.any():
+            z, area = points[near, 2], areas[near]
+            bins = np.floor((z - z.min()) / (_ROAD_LAYER_M / 4)).astype(int)
+            layers = np.convolve(np.bincount(bins, area), np.ones(4))
+            top = z.min() + (layers.argmax() + 1) * _ROAD_LAYER_M / 4
+            layer = (z <= top) & (z >= top - _ROAD_LAYER_M)
+            heights[number] = np.average(z[layer], weights=area[layer])
+    return heights
 
 
 def _smooth_profile(heights: np.ndarray, *, fallback: float) -> np.ndarray:

@@ -16,6 +16,7 @@ from torch import Tensor
 from augment.scene import Gaussians
 
 SOLID_OPACITY = 0.3  # fainter Gaussians are haze and leftovers of training
+BULK_REACH = 8.0  # in median distances: of a drive that is dense in the middle, all
 _LOW_QUANTILE = 0.1
 _FEWEST_POINTS = 12
 _MOST_POINTS = 300_000
@@ -50,6 +51,17 @@ def _solid(gaussians: Gaussians) -> Tensor:
     if len(solid) < _FEWEST_POINTS:
         solid = torch.arange(len(gaussians))
     return solid[:: 1 + len(solid) // _MOST_POINTS]
+
+
+def in_bulk(points: np.ndarray, reach: float) -> np.ndarray:
+    """Which points [N, 3] lie within `reach` times the median distance from their middle: without
+    what floats far around a scene, which would stretch every extent.
+    """
+    inside = np.ones(len(points), bool)
+    for _ in range(3):  # the middle moves once the far ones are gone
+        distance = np.linalg.norm(points - np.median(points[inside], axis=0), axis=1)
+        inside = distance <= reach * np.median(distance[inside])
+    return inside
 
 
 def ground_under(

@@ -24,6 +24,7 @@ from augment.render.rasterize import rasterize
 from augment.render.sh import SH_C0
 from augment.scene import Gaussians, Scene
 from augment.semantics import SemanticClass
+from augment.sky import ConstantSky, Sky, is_stand_in
 from augment.style.maps import CLASSES
 from augment.style.statistics import (
     LAND,
@@ -61,6 +62,8 @@ def content_statistics(
     scene: Scene, cameras: Sequence[Camera] | None = None, *, per_region: bool
 ) -> Statistics:
     """Colour statistics of the scene: WHOLE always, LAND and SKY where they are seen.
+
+    A grey that stands in for a sky counts as SKY alone.
 
     cameras: those that the scene will be seen by; None for all of its own. per_region: also ROAD,
     VEGETATION and REST where they are seen, of a scene whose Gaussians know at least one of the
@@ -153,7 +156,11 @@ def _statistics(scene: Scene, views: Sequence[Camera], per_region: bool) -> Stat
     land = np.concatenate([view.land for view in seen])
     total = float(alpha.size)
     found: dict[str, ColorStatistics] = {}
-    _add(found, WHOLE, np.concatenate([view.picture for view in seen]), np.ones_like(alpha), total)
+    if is_stand_in(scene.sky):  # a grey that nobody saw has no part in the scene's mood
+        _add(found, WHOLE, land, alpha, float(alpha.sum(dtype=np.float64)))
+    else:
+        picture = np.concatenate([view.picture for view in seen])
+        _add(found, WHOLE, picture, np.ones_like(alpha), total)
     _add(found, LAND, land, alpha, total)
     open_share = np.clip(1 - alpha, 0, 1)
     if open_share.sum(dtype=np.float64) >= LEAST_SKY * total:
@@ -216,11 +223,18 @@ def _pictures(scene: Scene, views: Sequence[Camera]) -> Float[Tensor, "B 3 256 2
         view = camera.resized(PICTURE_SIZE, PICTURE_SIZE)
         rgb, alpha = _render(scene, view)
         if bool((alpha > 0).any()):
-            image = composite_sky(rgb, alpha, view, scene.sky)
+            image = composite_sky(rgb, alpha, view, _sky_of_pictures(scene, rgb, alpha))
             images.append(image.clamp(0, 1).permute(2, 0, 1))
     if not images:
         images = [_palette(scene)]
     return torch.stack(images).float().contiguous()
+
+
+def _sky_of_pictures(scene: Scene, rgb: Tensor, alpha: Tensor) -> Sky:
+    """The scene's; where that is a stand-in, one of the mean colour of what else is seen."""
+    if not is_stand_in(scene.sky):
+        return scene.sky
+    return ConstantSky((rgb.sum((0, 1)) / alpha.sum()).clamp(0, 1))
 
 
 def _palette(scene: Scene) -> Float[Tensor, "3 256 256"]:

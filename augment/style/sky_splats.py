@@ -19,6 +19,7 @@ from torch import Tensor
 
 from augment.render.sh import SH_C0
 from augment.scene import Scene
+from augment.sky import is_stand_in
 from augment.style.maps import StyleMaps
 
 LEVELS = 8  # steps from a splat of the land to one of the sky
@@ -31,13 +32,13 @@ _MOST_PLACES = 64  # that the sky is looked at from
 
 def sky_levels(scene: Scene, maps: StyleMaps) -> Int16[Tensor, "N"] | None:
     """How much of every background splat is sky, 0 to LEVELS; None where none is any, or where it
-    cannot be told: without cameras, or without knowing where up is.
+    cannot be told: without cameras, without knowing where up is, or in front of a grey stand-in.
 
     Each is looked at from the nearest of the scene's cameras. Remembered for as long as the scene
     lives, since it is the same for every style.
     """
     seen = maps.seen_sky
-    if seen is None:
+    if seen is None or is_stand_in(scene.sky):
         return None
     known, key = _remembered.setdefault(scene, {}), seen.numpy().tobytes()
     if key not in known:

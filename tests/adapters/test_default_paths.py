@@ -45,6 +45,28 @@ def test_drive_follows_the_road(heading_deg: float, slope: float) -> None:
     assert path.note.startswith(NO_CAMERAS) and "straight drive" in path.note
 
 
+def test_what_floats_far_away_does_not_move_the_drive() -> None:
+    rng = torch.Generator().manual_seed(4)
+    road = street(heading_deg=0)
+    far = 900 + 300 * torch.rand(len(road) // 4, 3, generator=rng)
+    alone = make_default_path(road, is_metric=True)
+    path = make_default_path(gaussians_at(torch.cat([road.means, far])), is_metric=True)
+    for one, other in zip(alone.views, path.views, strict=True):
+        np.testing.assert_array_equal(one.world_from_camera, other.world_from_camera)
+
+
+def test_a_road_above_its_foundations_is_driven_on() -> None:
+    """Layers some decimetres below a road, as foundations and floaters leave them."""
+    road = street(heading_deg=0)
+    rng = torch.Generator().manual_seed(6)
+    low = torch.rand(2000, 3, generator=rng) * torch.tensor([60.0, 8, 0.15])
+    low += torch.tensor([0.0, -4, -0.45])
+    path = make_default_path(gaussians_at(torch.cat([road.means, low])), is_metric=True)
+    eyes = np.stack([view.world_from_camera[:3, 3] for view in path.views])
+    np.testing.assert_allclose(eyes[:, 2], CAMERA_HEIGHT_M, atol=0.05)
+    assert path.ground_z_m == pytest.approx(0, abs=0.05)
+
+
 def test_drive_ends_with_scene_ahead() -> None:
     gaussians = street(heading_deg=0)
     path = make_default_path(gaussians, is_metric=True)

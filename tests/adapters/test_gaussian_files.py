@@ -14,9 +14,15 @@ from splat_scenes import gaussians_at, street
 from adapters.base import open_scene
 from adapters.cameras.posed_views import look_at_pose
 from adapters.gaussian_files import find_splat_file, open_gaussians
+from augment.apply import render_view
+from augment.batch.selection import check_frames
 from augment.errors import AdapterError, SceneError
 from augment.scene import Gaussians
+from augment.snow.light import illumination_of
 from augment.splat_io import write_ply, write_splat
+from recipes.flood import Flood
+from recipes.schema import Recipe, Weather
+from recipes.snow import Snow
 
 TO_Y_DOWN = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # z-up world to COLMAP's usual y-down
 
@@ -65,19 +71,57 @@ def problem_with(scene, words: str) -> str:
     return found[0]
 
 
-def test_a_bare_file_gets_a_path_and_says_what_it_lacks(tmp_path: Path) -> None:
-    write_ply(tmp_path / "corner.ply", street())
+def test_a_bare_street_is_turned_and_driven_and_says_what_was_estimated(tmp_path: Path) -> None:
+    write_ply(tmp_path / "corner.ply", turned(street(), TO_Y_DOWN))
     scene = open_gaussians(tmp_path / "corner.ply", {})
-    assert scene.name == "corner"
-    assert not scene.has_metric_scale
-    problem_with(scene, "scale=1 if it is in metres")
-    problem_with(scene, "no cameras came with the scene")
-    assert scene.camera_names == ("orbit",)
-    metric = open_gaussians(tmp_path / "corner.ply", {"scale": "1"})
-    assert metric.has_metric_scale
-    assert metric.camera_names == ("front", "left", "right")
-    assert metric.ground_z_m == pytest.approx(0, abs=0.3)
-    assert [p[:10] for p in metric.problems] == ["no cameras"]
+    assert scene.name == "corner" and scene.has_metric_scale and scene.has_known_gravity
+    assert "estimated to be -y: " in problem_with(scene, "up is estimated")
+    problem_with(scene, "a unit is estimated to be 1 m")
+    problem_with(scene, "no cameras came with the scene: made a straight drive")
+    assert scene.camera_names == ("front", "left", "right")
+    assert scene.ground_z_m == pytest.approx(0, abs=0.05)
+    stated = open_gaussians(tmp_path / "corner.ply", {"up": "-y", "scale": "1"})
+    assert torch.equal(stated.background.means, scene.background.means)
+    assert [p[:10] for p in stated.problems] == ["no cameras"]
+    for one, other in zip(scene.frames, stated.frames, strict=True):
+        assert torch.equal(one.world_from_ego, other.world_from_ego)
+
+
+def test_a_bare_file_that_may_be_anything_gets_no_path(tmp_path: Path) -> None:
+    """Opened, so that it can be looked at and exported; to render it says what to give."""
+    small = street()
+    small = Gaussians(**{**vars(small), "means": small.means / 20, "scales": small.scales / 20})
+    ball = torch.nn.functional.normalize(torch.randn(2000, 3), dim=1)
+    for gaussians, why in (
+        (small, "in metres it would be no street: "),
+        (gaussians_at(ball), "which way is up is not clear; the best guess is "),
+    ):
+        write_ply(tmp_path / "a.ply", gaussians)
+        scene = open_gaussians(tmp_path / "a.ply", {})
+        assert scene.frames == () and not scene.has_metric_scale
+        problem_with(scene, why)
+        with pytest.raises(SceneError, match=rf"no frames to render.*{why}.*\?up=\+z&scale=1"):
+            check_frames(scene)
+        circled = open_gaussians(tmp_path / "a.ply", {"path": "orbit"})
+        assert circled.camera_names == ("orbit",) and not circled.has_metric_scale
+        assert open_gaussians(tmp_path / "a.ply", {"up": "+z", "scale": "20"}).frames
+
+
+def test_cameras_on_a_car_give_up_and_unit(tmp_path: Path) -> None:
+    """As training from COLMAP leaves it: y down, in a unit of its own."""
+    source = turned(street(heading_deg=0), TO_Y_DOWN)
+    source = Gaussians(**{**vars(source), "means": source.means / 5, "scales": source.scales / 5})
+    poses = drive_poses(["1", "2", "3"], change=TO_Y_DOWN)
+    for pose in poses.values():
+        pose[:3, 3] /= 5
+    scene = open_gaussians(save_model(tmp_path, source, inria_cameras(poses)), {})
+    assert scene.has_metric_scale and scene.has_known_gravity
+    assert "which is taken as 1.6 m: a unit is" in problem_with(scene, "a unit is estimated")
+    problem_with(scene, "up is estimated to be -y")
+    heights = [float(f.cameras["camera"].centre[2]) for f in scene.frames]
+    # Splats lie up to 2 cm about the road, and parked cars and strays beside the cameras.
+    assert heights == pytest.approx([1.6] * 3, abs=0.1)
+    assert scene.ground_z_m == pytest.approx(0, abs=0.1)
 
 
 def test_notes_of_the_file_are_believed(tmp_path: Path) -> None:
@@ -118,8 +162,10 @@ def test_a_wrong_up_is_noticed(tmp_path: Path) -> None:
     names = [f"{n:03d}" for n in range(4)]
     source = turned(street(heading_deg=0), TO_Y_DOWN)
     cameras = inria_cameras(drive_poses(names, change=TO_Y_DOWN))
-    model = save_model(tmp_path, source, cameras)
-    text = problem_with(open_gaussians(model, {"scale": "1"}), "mean up direction")
+    write_ply(tmp_path / "cloud.ply", gaussians_at(torch.randn(2000, 3)))
+    query = {"cameras": str(tmp_path / "m" / "cameras.json"), "scale": "1"}
+    model = save_model(tmp_path / "m", source, cameras)
+    text = problem_with(open_gaussians(tmp_path / "cloud.ply", query), "mean up direction")
     assert "90 degrees from" in text and "+z;" in text and "up=-y if" in text
     for up in ("-y", "cameras", "0,-1,0"):
         scene = open_gaussians(model, {"scale": "1", "up": up})
@@ -237,7 +283,7 @@ def test_which_file_of_a_folder(tmp_path: Path) -> None:
         ({"scale": "1e300"}, "scale must be"),
         ({"path": "walk"}, "path must be one of auto, drive, orbit"),
         ({"iteration": "last"}, "iteration must be a whole number"),
-        ({"sky": "blue"}, "sky must be black, white"),
+        ({"sky": "blue"}, "sky must be overcast, black, white"),
         ({"sky": "0,0,2"}, "sky must be"),
         ({"cameras": "absent.json"}, r"absent\.json: no such file"),
     ],
@@ -248,14 +294,34 @@ def test_bad_queries(tmp_path: Path, query: dict[str, str], message: str) -> Non
         open_gaussians(tmp_path / "a.ply", query)
 
 
-def test_sky_is_what_was_trained_with(tmp_path: Path) -> None:
+def test_a_file_without_a_sky_has_an_overcast_one(tmp_path: Path) -> None:
     model = save_model(tmp_path, street(length=8))
     up = torch.tensor([[0.0, 0, 1]])
-    assert open_gaussians(model, {}).sky.sample(up).tolist() == [[0, 0, 0]]
+    red, green, blue = open_gaussians(model, {}).sky.sample(up)[0].tolist()
+    assert red == green == blue and 0.7 < red < 0.95
+    assert open_gaussians(model, {"sky": "black"}).sky.sample(up).tolist() == [[0, 0, 0]]
     (model / "cfg_args").write_text("Namespace(sh_degree=3, white_background=True)")
     assert open_gaussians(model, {}).sky.sample(up).tolist() == [[1, 1, 1]]
     grey = open_gaussians(model, {"sky": "0.5,0.5,0.5"}).sky.sample(up)
     assert grey.tolist() == [[0.5, 0.5, 0.5]]
+
+
+def test_a_grey_file_stays_grey_under_the_overcast_sky(tmp_path: Path) -> None:
+    """Snow is lit by it, water reflects it, and it shows: no tint of it in any of them."""
+    write_ply(tmp_path / "a.ply", street(length=24))
+    scene = open_gaussians(tmp_path / "a.ply", {})
+    light = illumination_of(scene, Snow(depth_m=0.1))
+    assert max(np.ptp(light.lit_rgb), np.ptp(light.shadow_rgb)) < 1 / 255
+    flood = Flood(level_m=0.3, color=(0.3, 0.3, 0.3), absorption_per_m=(1.0, 1.0, 1.0))
+    clear, snowy, flooded = (
+        render_view(scene, scene.frames[0].cameras["front"].scaled(0.15), Recipe(weather=weather))
+        for weather in (Weather(), Weather(snow=Snow(depth_m=0.1)), Weather(flood=flood))
+    )
+    clear, snowy, flooded = (view.rgb.astype(int) for view in (clear, snowy, flooded))
+    assert np.ptp(flooded, axis=-1).max() <= 1  # of 255
+    assert np.ptp(snowy.mean((0, 1))) < 1  # single grains have tints of their own
+    for weathered in (snowy, flooded):
+        assert np.abs(weathered - clear).mean() > 2
 
 
 def test_meshes_are_scene_errors(tmp_path: Path) -> None:
@@ -278,7 +344,8 @@ def test_view_dependent_colour_turns_with_the_scene(tmp_path: Path) -> None:
 
 def test_real_tiles_open(shared_dir: Path) -> None:
     tile = shared_dir / "data" / "splats" / "tile_x000_y002.splat"
-    scene = open_scene(f"{tile}?scale=1")
-    assert len(scene.background) == 121_833
+    bare = open_scene(str(tile))  # a blur without a ground
+    assert len(bare.background) == 121_833 and bare.frames == ()
+    scene = open_scene(f"{tile}?up=%2Bz&scale=1")
     assert scene.camera_names == ("front", "left", "right")
-    assert -4 < scene.ground_z_m < 1
+    assert scene.ground_z_m is not None and -4 < scene.ground_z_m < 1

@@ -90,6 +90,22 @@ def test_the_sky_has_to_be_seen():
     assert list(content_statistics(drive(*walls), per_region=True)) == [WHOLE, LAND]
 
 
+def test_a_grey_stand_in_for_a_sky_moves_nothing_but_its_own_statistics():
+    greys = [
+        dataclasses.replace(street(), sky=ConstantSky(torch.full((3,), level)))
+        for level in (0.0, 0.85)
+    ]
+    dark, bright = (content_statistics(scene, per_region=True) for scene in greys)
+    for region in (WHOLE, LAND, ROAD, VEGETATION):
+        assert np.array_equal(dark[region].mean, bright[region].mean), region
+        assert np.array_equal(dark[region].covariance, bright[region].covariance), region
+    assert np.array_equal(bright[WHOLE].mean, bright[LAND].mean) and bright[WHOLE].share == 1
+    assert np.abs(bright[SKY].mean - 0.85).max() < 1e-6
+    assert torch.equal(*(content_pictures(scene) for scene in greys))
+    blue = content_statistics(street(), per_region=True)  # a colour is there to be seen
+    assert np.abs(blue[WHOLE].mean - blue[LAND].mean).max() > 0.02
+
+
 def test_black_and_one_gaussian():
     black = drive(sheet((0.5, 8), (-4, 4), rgb=(0, 0, 0)))
     black = dataclasses.replace(black, sky=ConstantSky(torch.zeros(3)))

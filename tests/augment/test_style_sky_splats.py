@@ -73,6 +73,9 @@ def test_without_a_map_of_its_own_no_sky_is_looked_for():
     assert sky_levels(scene, maps(seen=None)) is None
     assert sky_levels(scene, maps()) is not None
     assert sky_levels(dataclasses.replace(scene, frames=()), maps()) is None
+    pale = scene_of(ball((30.0, 0.0, 12.0), (0.8, 0.8, 0.8)), sky=(0.8, 0.8, 0.8))
+    grey = torch.cat([torch.eye(3) / 100, torch.full((3, 1), 0.8)], 1)
+    assert sky_levels(pale, maps(seen=grey)) is None  # nobody saw that sky, so no splat paints it
     assert sky_levels(dataclasses.replace(scene, has_known_gravity=False), maps()) is None
     assert sky_levels(scene_of(ball((30.0, 0.0, 12.0), (0.1, 0.1, 0.1))), maps()) is None
 
