@@ -39,6 +39,7 @@ class _View:
     snow: None = None
     snowy: None = None
     smoggy: _Smoggy | None = None
+    surface: None = None
 
 
 def open_tiny(uri: str) -> Scene:

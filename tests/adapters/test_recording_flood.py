@@ -33,6 +33,7 @@ class _View:
     snow: None = None
     snowy: None = None
     smoggy: None = None
+    surface: None = None
 
 
 def _render(scene, camera, recipe, *, backend) -> _View:
