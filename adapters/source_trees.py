@@ -12,6 +12,7 @@ from augment.batch.mirror_tree import SourceTree
 from augment.errors import AdapterError
 from augment.scene import Scene
 
+_KITTI_SWEEP = r"velodyne_points/data/\d+\.bin"
 _KITTI_CAMERA = r"image_\d\d/data/\d+\.(?i:png|jpg)"
 
 
@@ -44,7 +45,7 @@ def source_tree(scene: Scene) -> SourceTree:
         )
     found = find(Path(os.path.abspath(path)), query)
     entries = None if found.entries is None else tuple(sorted(found.entries))
-    return SourceTree(uri, found.root, found.images, entries)
+    return SourceTree(uri, found.root, found.images, entries, found.sweeps)
 
 
 class _Found(NamedTuple):
@@ -52,15 +53,17 @@ class _Found(NamedTuple):
 
     root: Path
     images: str
+    sweeps: str = r"(?!)"
     entries: Iterable[str] | None = None
 
 
 def _pandaset(folder: Path, _query: dict[str, str]) -> _Found:
-    return _Found(folder, r"camera/[^/]+/\d+\.jpg")
+    return _Found(folder, r"camera/[^/]+/\d+\.jpg", r"lidar/\d+\.pkl\.gz")
 
 
 def _nuscenes(folder: Path, _query: dict[str, str]) -> _Found:
-    return _Found(folder, r"(samples|sweeps)/CAM_[^/]+/[^/]+\.jpg")
+    sweeps = r"(samples|sweeps)/LIDAR_TOP/[^/]+\.pcd\.bin"
+    return _Found(folder, r"(samples|sweeps)/CAM_[^/]+/[^/]+\.jpg", sweeps)
 
 
 def _kitti(folder: Path, _query: dict[str, str]) -> _Found:
@@ -68,12 +71,15 @@ def _kitti(folder: Path, _query: dict[str, str]) -> _Found:
     from adapters.kitti.layout import VELODYNE, kitti_root
 
     if not (folder / VELODYNE).is_dir():
-        return _Found(folder, r"((training|testing)/)?image_\d/\d+\.(?i:png|jpg)")
+        within = r"((training|testing)/)?"
+        images = rf"{within}image_\d/\d+\.(?i:png|jpg)"
+        return _Found(folder, images, rf"{within}velodyne/\d+\.bin")
     _, calibrated = kitti_root(folder)
     if calibrated == folder:
-        return _Found(folder, _KITTI_CAMERA)
+        return _Found(folder, _KITTI_CAMERA, _KITTI_SWEEP)
     calibration = (path.name for path in calibrated.glob("calib_*.txt"))
-    return _Found(calibrated, rf"[^/]+/{_KITTI_CAMERA}", (folder.name, *calibration))
+    images, sweeps = rf"[^/]+/{_KITTI_CAMERA}", rf"[^/]+/{_KITTI_SWEEP}"
+    return _Found(calibrated, images, sweeps, (folder.name, *calibration))
 
 
 def _street_gaussians(folder: Path, _query: dict[str, str]) -> _Found:
@@ -86,11 +92,11 @@ def _drivestudio(path: Path, query: dict[str, str]) -> _Found:
     from adapters.drivestudio.run import find_run
 
     data = find_run(path, RunOptions.from_query(query)).data
-    return _Found(Path(os.path.abspath(data)), r"images/\d+_\d+\.jpg")
+    return _Found(Path(os.path.abspath(data)), r"images/\d+_\d+\.jpg", r"lidar/\d+\.bin")
 
 
 def _recording(folder: Path, _query: dict[str, str]) -> _Found:
-    return _Found(folder, r"images/[^/]+/\d+\.(?i:png|jpe?g)")
+    return _Found(folder, r"images/[^/]+/\d+\.(?i:png|jpe?g)", r"lidar/\d+\.parquet")
 
 
 _TREES: dict[str, Callable[[Path, dict[str, str]], _Found]] = {

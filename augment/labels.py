@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -116,5 +117,22 @@ class KnowsLidarOrigins(Protocol):
     def lidar_origins(self, frame_index: int, sweep: LidarSweep) -> np.ndarray | None:
         """Where the beam of each of the sweep's returns started, float64 [N, 3], dataset world;
         None where it is not known for this frame.
+        """
+        ...
+
+
+@runtime_checkable
+class StoresLidar(Protocol):
+    """A LabelSource whose sweeps lie in files of their own, which can be written anew."""
+
+    def lidar_files(self, frame_index: int) -> tuple[Path, ...]:
+        """The file of the frame's returns, and those that say something of each of them in the
+        same order; none where the frame has no sweep.
+        """
+        ...
+
+    def lidar_content(self, frame_index: int, file: Path, sweep: LidarSweep) -> bytes:
+        """What one of those files holds when the sensor has seen `sweep` in place of the frame's
+        own: returns of that, some moved, as `source_index` names them, in that order.
         """
         ...

@@ -15,6 +15,7 @@ from augment.batch.manifest import OK, read_manifest, rows_of
 from augment.batch.mirror import Links, Mirrored, check_apart, mirror_dataset
 from augment.batch.mirror_images import Weathered, dataset_format, weathered_images
 from augment.batch.mirror_record import MIRROR_FOLDER, mirror_folder, read_record
+from augment.batch.mirror_sweeps import WeatheredSweep, is_weathered, weathered_sweeps
 from augment.batch.mirror_tree import SourceTree, Survey, survey
 from augment.batch.trajectory import RECORDED
 from augment.errors import AdapterError, OutputError
@@ -132,9 +133,11 @@ def _mirror_rows(
     record = read_record(tree, folder)
     quality = _jpeg_quality(out, scene.name, name)
     images, notes = weathered_images(out, rows, scene.frames, tree, quality)
+    sweeps, unplaced = weathered_sweeps(out, rows, scene.labels, tree)
     others, more = _of_other_scenes(scene, out, name, record.replaced)
+    other_sweeps = _sweeps_of_other_scenes(scene, out, name, record.sweeps)
     facts = {key: rows[0][key] for key in ("source", "recipe_hash", "version", "backend")}
-    known = {image.scene for image in others.values()}
+    known = {each.scene for each in (*others.values(), *other_sweeps.values())}
     scenes = {key: record.scenes[key] for key in sorted(known & record.scenes.keys())}
     done = mirror_dataset(
         tree,
@@ -142,10 +145,11 @@ def _mirror_rows(
         {**others, **images},
         {**scenes, scene.name: facts},
         extent=extent,
+        sweeps={**other_sweeps, **sweeps},
         links=links,
         progress=progress,
     )
-    return [*_sentences(done, tree, links), *(f"  {note}" for note in [*notes, *more])]
+    return [*_sentences(done, tree, links), *(f"  {note}" for note in [*notes, *unplaced, *more])]
 
 
 def _of_other_scenes(
@@ -171,6 +175,23 @@ def _of_other_scenes(
         f"{len(gone)} images of other scenes, such as {gone[0]}, are no longer in the manifest: "
         f"the source's own stand there again"
     ]
+
+
+def _sweeps_of_other_scenes(
+    scene: Scene, out: Path, variant: str, recorded: Mapping[str, Mapping[str, str]]
+) -> dict[str, WeatheredSweep]:
+    """The weathered sweeps that the copy has from other scenes, as far as they are there."""
+    entries = {place: entry for place, entry in recorded.items() if entry["scene"] != scene.name}
+    if not entries:
+        return {}
+    pairs = {(entry["scene"], variant) for entry in entries.values()}
+    rows = [row for row in rows_of(read_manifest(out), pairs) if row["status"] == OK]
+    known = {row["lidar_path"]: row for row in rows if is_weathered(row)}
+    return {
+        place: WeatheredSweep.of_row(out, known[entry["sweep"]])
+        for place, entry in entries.items()
+        if entry["sweep"] in known
+    }
 
 
 def _jpeg_quality(out: Path, scene: str, variant: str) -> int:
@@ -261,6 +282,14 @@ def _sentences(done: Mirrored, tree: SourceTree, links: Links) -> list[str]:
     said = [f"dataset: {done.folder} ({state})"]
     clear = f"; {done.images - replaced} stay clear, as recorded" if done.images > replaced else ""
     said.append(f"  {replaced} of {done.images} camera images are weathered{clear}")
+    if done.sweeps:
+        count = sum(tree.is_sweep(place) for place in done.weathered)
+        clear = f"; {done.sweeps - count} stay clear, as recorded" if done.sweeps > count else ""
+        said.append(
+            f"  {count} of {done.sweeps} LiDAR sweeps are weathered"
+            + (", lost returns left out" if count else "")
+            + clear
+        )
     if done.resized:
         (rendered, recorded) = done.resized[0]
         said.append(
@@ -280,6 +309,11 @@ def _sentences(done: Mirrored, tree: SourceTree, links: Links) -> list[str]:
     for names, what in (
         (done.unusable, "recorded images are neither PNG nor JPEG and stay as they are"),
         (done.missing, "recorded images are no longer in the source: nothing stands for them"),
+        (
+            done.outdated,
+            "files of LiDAR of other scenes are out of date: the source's own stand "
+            "there until their scenes are mirrored",
+        ),
         (done.others, "files in the copy are not the source's: they are left"),
     ):
         if names:

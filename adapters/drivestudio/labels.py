@@ -12,6 +12,7 @@ from adapters.drivestudio.drive import dataset_from_lidar, scene_from_dataset
 from adapters.drivestudio.instances import read_instances
 from adapters.drivestudio.options import RunOptions
 from adapters.drivestudio.run import Run, find_run
+from adapters.lidar.stored import stored_records
 from augment.errors import AdapterError
 from augment.geometry import quat_from_rotmat
 from augment.labels import Boxes, LidarSweep
@@ -56,7 +57,7 @@ class DriveStudioLabels:
         )
 
     def lidar(self, frame_index: int) -> LidarSweep | None:
-        file = self.run.data / "lidar" / f"{frame_index:03d}.bin"
+        file = self._lidar_file(frame_index)
         if not file.is_file():
             return None
         names = self.run.convention.lidar_columns
@@ -66,7 +67,7 @@ class DriveStudioLabels:
                 f"{file.stat().st_size} bytes are no whole number of them"
             )
         table = np.fromfile(file, "<f4").reshape(-1, len(names))
-        pose = scene_from_dataset(self.run) @ dataset_from_lidar(self.run, frame_index)
+        pose = self._world_from_lidar(frame_index)
         columns = {name: table[:, i].copy() for i, name in enumerate(names)}
         for group in (*_MOVED, _TURNED):
             if group[0] not in columns:
@@ -85,8 +86,22 @@ class DriveStudioLabels:
             return np.stack([np.asarray(sweep.columns[name], np.float64) for name in names], axis=1)
         if not self.run.convention.world_of_front_camera:
             return None
-        pose = scene_from_dataset(self.run) @ dataset_from_lidar(self.run, frame_index)
-        return np.broadcast_to(pose[:3, 3], (len(sweep), 3))
+        return np.broadcast_to(self._world_from_lidar(frame_index)[:3, 3], (len(sweep), 3))
+
+    def lidar_files(self, frame_index: int) -> tuple[Path, ...]:
+        file = self._lidar_file(frame_index)
+        return (file,) if file.is_file() else ()
+
+    def lidar_content(self, frame_index: int, file: Path, sweep: LidarSweep) -> bytes:
+        names = self.run.convention.lidar_columns
+        records = np.fromfile(file, "<f4").reshape(-1, len(names))
+        return stored_records(records, names, sweep, self._world_from_lidar(frame_index))
+
+    def _lidar_file(self, frame: int) -> Path:
+        return self.run.data / "lidar" / f"{frame:03d}.bin"
+
+    def _world_from_lidar(self, frame: int) -> np.ndarray:
+        return scene_from_dataset(self.run) @ dataset_from_lidar(self.run, frame)
 
 
 def drivestudio_labels(path: str, query: dict[str, str]) -> DriveStudioLabels:

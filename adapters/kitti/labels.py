@@ -12,8 +12,11 @@ from adapters.kitti.layout import OBJECT_DIGITS, file_in
 from adapters.kitti.object_labels import boxes_of_lines, read_object_lines
 from adapters.kitti.sweeps import labelled_sweep, read_returns
 from adapters.kitti.tracklets import Tracklet, boxes_at
+from adapters.lidar.stored import stored_records
 from augment.errors import AdapterError
 from augment.labels import Boxes, LidarSweep
+
+_RECORD = ("x", "y", "z", "intensity")  # of a sweep's file
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +47,19 @@ class LocatedSweeps:
         pose = self.world_from_velodyne.get(frame)
         return None if pose is None else np.broadcast_to(pose[:3, 3], (len(sweep), 3))
 
+    def files(self, frame: int) -> tuple[Path, ...]:
+        """The frame's file, where it is there and has a pose."""
+        name = self.names.get(frame)
+        if name is None or frame not in self.world_from_velodyne:
+            return ()
+        file = file_in(self.root, name)
+        return (file,) if file.exists() else ()
+
+    def content(self, frame: int, sweep: LidarSweep) -> bytes:
+        """That file with a weathered sweep in place of its own."""
+        records = read_returns(self.root, self.names[frame])
+        return stored_records(records, _RECORD, sweep, self.world_from_velodyne[frame])
+
 
 @dataclass(frozen=True, eq=False)
 class RawLabels:
@@ -62,6 +78,12 @@ class RawLabels:
 
     def lidar_origins(self, frame_index: int, sweep: LidarSweep) -> np.ndarray | None:
         return self.sweeps.origins(frame_index, sweep)
+
+    def lidar_files(self, frame_index: int) -> tuple[Path, ...]:
+        return self.sweeps.files(frame_index)
+
+    def lidar_content(self, frame_index: int, file: Path, sweep: LidarSweep) -> bytes:
+        return self.sweeps.content(frame_index, sweep)
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +106,12 @@ class ObjectLabels:
 
     def lidar_origins(self, frame_index: int, sweep: LidarSweep) -> np.ndarray | None:
         return self.sweeps.origins(frame_index, sweep)
+
+    def lidar_files(self, frame_index: int) -> tuple[Path, ...]:
+        return self.sweeps.files(frame_index)
+
+    def lidar_content(self, frame_index: int, file: Path, sweep: LidarSweep) -> bytes:
+        return self.sweeps.content(frame_index, sweep)
 
 
 def object_label_file(root: Path, frame: int) -> Path:

@@ -3,19 +3,26 @@
 from __future__ import annotations
 
 import dataclasses
+import io
+import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from adapters.lidar.stored import stored_records
 from adapters.nuscenes.classes import NO_SURFACE, class_table
 from adapters.nuscenes.frames import FrameFiles, scene_frames
 from adapters.nuscenes.options import NuScenesOptions
 from adapters.nuscenes.sweeps import SweepFault, read_returns
 from adapters.nuscenes.tables import Annotation, SceneTables, SensorFile, read_tables
+from adapters.plain_files import inside
+from augment.errors import AdapterError
 from augment.labels import Boxes, LidarSweep
+from augment.lidar_weather.codes import INDEX_COLUMN
 
+_RECORD = ("x", "y", "z", "intensity", "ring")  # of a sweep's file
 _STRAIGHT = 1e-9  # of the cosine: between nearly equal rotations a straight line is exact
 
 
@@ -82,8 +89,53 @@ class NuScenesLabels:
             return None
         return np.broadcast_to(frame.sweep.world_from_sensor[:3, 3], (len(sweep), 3))
 
+    def lidar_files(self, frame_index: int) -> tuple[Path, ...]:
+        """Sweep, classes (lidarseg) and objects (panoptic) of the returns, as far as they exist."""
+        frame, tables = self._frame(frame_index), self.tables
+        if frame is None:
+            return ()
+        token = frame.sweep.token
+        named = (tables.semantic_files.get(token), tables.panoptic_files.get(token))
+        names = [frame.sweep.filename, *(name for name in named if name is not None)]
+        where = f"sample_data {token!r}"
+        files = [inside(tables.root, name, where) for name in names]
+        return tuple(file for file in files if file.exists()) if files[0].exists() else ()
+
+    def lidar_content(self, frame_index: int, file: Path, sweep: LidarSweep) -> bytes:
+        sensor, rows = self.frames[frame_index].sweep, sweep.columns[INDEX_COLUMN]
+        if file.suffix == ".npz":
+            return _panoptic_of(file, rows)
+        content = np.fromfile(file, np.uint8)
+        if file != inside(self.tables.root, sensor.filename, f"sample_data {sensor.token!r}"):
+            if rows.max(initial=-1) >= len(content):
+                raise AdapterError(
+                    f"{file} has {len(content)} classes, fewer than {sensor.filename} has returns; "
+                    f"copy it again"
+                )
+            return content[rows].tobytes()
+        records = content.view("<f4").reshape(-1, 5)
+        return stored_records(records, _RECORD, sweep, sensor.world_from_sensor)
+
     def _frame(self, index: int) -> FrameFiles | None:
         return self.frames[index] if 0 <= index < len(self.frames) else None
+
+
+def _panoptic_of(file: Path, rows: np.ndarray) -> bytes:
+    """The numbers of those returns in a file of nuScenes' panoptic labels.
+
+    Raises:
+        AdapterError: the file is damaged, or has no number for one of them.
+    """
+    try:
+        with np.load(file, allow_pickle=False) as archive:
+            numbers = archive["data"][rows]
+    except (OSError, ValueError, KeyError, IndexError, zipfile.BadZipFile) as error:
+        raise AdapterError(
+            f"{file} must hold an array `data`, one number a return ({error}); copy it again"
+        ) from error
+    out = io.BytesIO()
+    np.savez_compressed(out, data=numbers)
+    return out.getvalue()
 
 
 def nuscenes_labels(path: str, query: dict[str, str]) -> NuScenesLabels:

@@ -10,7 +10,7 @@ import numpy as np
 from adapters.recording.calibration import read_lidar_classes
 from adapters.recording.classes import class_numbers, class_table
 from adapters.recording.files import block_files, inside, numbered_files
-from adapters.recording.tables import TimedBoxes, read_frame_boxes, read_sweep
+from adapters.recording.tables import TimedBoxes, read_frame_boxes, read_sweep, sweep_content
 from augment.labels import Boxes, LidarSweep
 
 
@@ -48,6 +48,13 @@ class RecordingLabels:
     def lidar(self, frame_index: int) -> LidarSweep | None:
         path = lidar_files(self.root).get(frame_index)
         return None if path is None else read_sweep(path)
+
+    def lidar_files(self, frame_index: int) -> tuple[Path, ...]:
+        path = lidar_files(self.root).get(frame_index)
+        return () if path is None else (path,)
+
+    def lidar_content(self, frame_index: int, file: Path, sweep: LidarSweep) -> bytes:
+        return sweep_content(file, sweep)
 
     def lidar_classes(self, sweep: LidarSweep) -> np.ndarray | None:
         """The SemanticClass of each return, or NO_SURFACE; None where the numbers are not known to

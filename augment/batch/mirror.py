@@ -1,4 +1,4 @@
-"""A dataset's folder once more, with the images of a variant in place of the recorded ones.
+"""A dataset's folder once more, with a variant's images and weathered sweeps in place of its own.
 
     <out>/source/<variant>/<dataset's folder>/...                   what the dataset's tools read
     <out>/source/<variant>/climategs-mirror-<dataset's folder>.json what it is; once it is complete
@@ -33,6 +33,7 @@ from augment.batch.mirror_files import (
 )
 from augment.batch.mirror_images import ImageForm, Weathered, fits, fitted, image_form
 from augment.batch.mirror_record import record_names
+from augment.batch.mirror_sweeps import WeatheredSweep
 from augment.batch.mirror_tree import SourceFile, SourceFolder, SourceTree, Survey, walk
 from augment.batch.writer import WritePump
 from augment.errors import AdapterError, OutputError
@@ -47,9 +48,11 @@ class Mirrored:
     linked, copied: files of the source. replaced: weathered images that stand for recorded ones;
     of these, new are files of their own, the others are one with the rendered ones. resized: the
     sizes rendered and recorded of those that differ. unusable: recorded images that are neither
-    PNG nor JPEG, which stay. missing: recorded images that the source has no longer. others: files
-    in the copy that the source does not have. changed: how many files and links this call has put
-    in place.
+    PNG nor JPEG, which stay. sweeps: LiDAR sweeps of the source; weathered: files of returns, and
+    of labels of returns, that stand for its own. outdated: files of such that another scene has
+    rendered anew, where the source's own stand. missing: recorded images that the source has no
+    longer. others: files in the copy that the source does not have. changed: how many files and
+    links this call has put in place.
     """
 
     folder: Path
@@ -64,6 +67,9 @@ class Mirrored:
     new_size: int = 0
     resized: list[tuple[tuple[int, int], tuple[int, int]]] = field(default_factory=list)
     unusable: list[str] = field(default_factory=list)
+    sweeps: int = 0
+    weathered: dict[str, dict[str, str]] = field(default_factory=dict)
+    outdated: list[str] = field(default_factory=list)
     missing: list[str] = field(default_factory=list)
     others: list[str] = field(default_factory=list)
     changed: int = 0
@@ -85,21 +91,23 @@ def mirror_dataset(
     scenes: Mapping[str, Any],
     *,
     extent: Survey,
+    sweeps: Mapping[str, WeatheredSweep] | None = None,
     links: Links = "hard",
     progress: bool = True,
 ) -> Mirrored:
     """Build the copy of a dataset in a folder, or bring it up to date.
 
     images: by place in the dataset, all that shall stand in the copy. scenes: facts of those that
-    the images are of, in JSON's types, for the record. extent: `survey(tree)`. links: hard, or copy
-    for a copy that shares nothing with source and images. Needs the lock of the output folder.
+    the images are of, in JSON's types, for the record. extent: `survey(tree)`. sweeps: as images.
+    links: hard, or copy for a copy that shares nothing with source and images. Needs the lock of
+    the output folder.
 
     Raises:
         AdapterError: a file of the source cannot be read, or a link leads out of it.
         OutputError: the system refused, or a link is in the way. No file is left half-written.
     """
     check_apart(tree, folder)
-    run = _Mirroring(tree, folder, images, links)
+    run = _Mirroring(tree, folder, images, sweeps or {}, links)
     with tqdm(total=extent.files, unit="file", desc="copy", disable=not progress) as bar:
         run.go(bar)
     run.finish(scenes)
@@ -114,9 +122,10 @@ class _Mirroring:
         tree: SourceTree,
         folder: Path,
         images: Mapping[str, Weathered],
+        sweeps: Mapping[str, WeatheredSweep],
         links: Links,
     ) -> None:
-        self.tree, self.folder, self.images = tree, folder, images
+        self.tree, self.folder, self.images, self.sweeps = tree, folder, images, sweeps
         self.may_link, self.links = links == "hard", links
         self.root = str(folder / tree.root.name)
         self.record, self.begun_record = record_names(tree, folder)
@@ -167,8 +176,10 @@ class _Mirroring:
             self._own(self._target(inner))
         for file in folder.files:
             self.done.images += self.tree.is_image(file.relative)
-            image = self.images.get(file.relative)
-            if image is None or not self._replace(file, image):
+            self.done.sweeps += self.tree.is_sweep(file.relative)
+            image, sweep = self.images.get(file.relative), self.sweeps.get(file.relative)
+            is_put = image is not None and self._replace(file, image)
+            if not is_put and (sweep is None or not self._put_sweep(file, sweep)):
                 self._keep(file)
         for name, text in folder.links:
             self.done.links += 1
@@ -195,13 +206,7 @@ class _Mirroring:
         if recorded is None:
             self.done.unusable.append(file.relative)
             return False
-        try:
-            rendered = os.stat(image.path)
-        except OSError as error:
-            raise OutputError(
-                f"{image.path}, which the manifest names, cannot be read ({error.strerror}); "
-                f"render again"
-            ) from error
+        rendered = _facts_of(image.path)
         target = self._target(file.relative)
         if not fits(image, recorded):
             self._fit(image, recorded, target, rendered.st_mtime_ns)
@@ -216,6 +221,22 @@ class _Mirroring:
         sizes = (image.form.width, image.form.height), (recorded.width, recorded.height)
         if sizes[0] != sizes[1]:
             self.done.resized.append(sizes)
+        return True
+
+    def _put_sweep(self, file: SourceFile, sweep: WeatheredSweep) -> bool:
+        """Write the file of a weathered sweep, where the one there is not: its time would be ours.
+        False where only another scene could write it.
+        """
+        mtime_ns, target = _facts_of(sweep.path).st_mtime_ns, self._target(file.relative)
+        content = sweep.content
+        if not _is_written(target, mtime_ns):
+            if content is None:
+                self.done.outdated.append(file.relative)
+                return False
+            self._begin()
+            self.pump.submit(lambda: write_file(content(), target, mtime_ns))
+            self._changed(os.path.dirname(target))
+        self.done.weathered[file.relative] = {"scene": sweep.scene, "sweep": sweep.name}
         return True
 
     def _place(self, original: str, facts: os.stat_result, target: str) -> str:
@@ -276,6 +297,8 @@ class _Mirroring:
                 "symbolic_links": done.links,
                 "camera_images": done.images,
                 "replaced_images": len(done.replaced),
+                "lidar_sweeps": done.sweeps,
+                "replaced_lidar_files": len(done.weathered),
             },
             "bytes": {
                 "linked": done.linked_size,
@@ -283,7 +306,24 @@ class _Mirroring:
                 "new_images": done.new_size,
             },
             "replaced": done.replaced,
+            "replaced_sweeps": done.weathered,
         }
+
+
+def _facts_of(path: Path) -> os.stat_result:
+    try:
+        return os.stat(path)
+    except OSError as error:
+        raise OutputError(
+            f"{path}, which the manifest names, cannot be read ({error.strerror}); render again"
+        ) from error
+
+
+def _is_written(target: str, mtime_ns: int) -> bool:
+    try:
+        return os.lstat(target).st_mtime_ns == mtime_ns
+    except OSError:
+        return False
 
 
 def _is_fitted(target: str, recorded: ImageForm, mtime_ns: int) -> bool:

@@ -14,17 +14,19 @@ from augment.batch.mirror_tree import SourceTree
 from augment.errors import OutputError
 
 MIRROR_FOLDER = "source"
-_IMAGE = ("scene", "image", "sha256")
+_IMAGE, _SWEEP = ("scene", "image", "sha256"), ("scene", "sweep")
 
 
 @dataclass(frozen=True)
 class MirrorRecord:
     """scenes: facts by name. replaced: by place in the dataset, the image that stands there: its
-    scene, its path relative to the output folder and its SHA-256.
+    scene, its path relative to the output folder and its SHA-256. sweeps: likewise, scene and path
+    of the weathered sweep in a file of returns; none in older records.
     """
 
     scenes: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     replaced: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    sweeps: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
 
 
 def mirror_folder(out_dir: Path, variant: str) -> Path:
@@ -53,10 +55,8 @@ def read_record(tree: SourceTree, folder: Path) -> MirrorRecord:
         root = os.path.realpath(content["folder"])
         record = MirrorRecord(
             {name: dict(facts) for name, facts in content["scenes"].items()},
-            {
-                place: {key: str(image[key]) for key in _IMAGE}
-                for place, image in content["replaced"].items()
-            },
+            _entries(content["replaced"], _IMAGE),
+            _entries(content.get("replaced_sweeps", {}), _SWEEP),
         )
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
         raise OutputError(
@@ -69,3 +69,7 @@ def read_record(tree: SourceTree, folder: Path) -> MirrorRecord:
             f"output folder, or delete that copy"
         )
     return record
+
+
+def _entries(content: Any, keys: tuple[str, ...]) -> dict[str, dict[str, str]]:
+    return {place: {key: str(entry[key]) for key in keys} for place, entry in content.items()}

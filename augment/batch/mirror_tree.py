@@ -22,14 +22,16 @@ from augment.errors import AdapterError
 class SourceTree:
     """A dataset in a folder. root: absolute; its name is the copy's name too.
 
-    uri: what it was opened by. images: a regular expression that the paths of its camera images,
-    relative to root, match in full. entries: what in root belongs to it; None for all.
+    uri: what it was opened by. images, sweeps: regular expressions that the paths of its camera
+    images and LiDAR sweeps, relative to root, match in full. entries: what in root belongs to it;
+    None for all.
     """
 
     uri: str
     root: Path
     images: str
     entries: tuple[str, ...] | None = None
+    sweeps: str = r"(?!)"  # none
 
     @cached_property
     def bases(self) -> tuple[tuple[str, str], ...]:
@@ -81,6 +83,10 @@ class SourceTree:
     def is_image(self, relative: str) -> bool:
         """Whether this is the path of a camera image."""
         return re.fullmatch(self.images, relative) is not None
+
+    def is_sweep(self, relative: str) -> bool:
+        """Whether this is the path of a LiDAR sweep."""
+        return re.fullmatch(self.sweeps, relative) is not None
 
     def _has(self, name: str) -> bool:
         return self.entries is None or name in self.entries

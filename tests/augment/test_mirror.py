@@ -80,6 +80,7 @@ def test_the_record_says_what_the_copy_is(source, out):
     assert record["folder"] == str(source) and record["links"] == "hard"
     assert record["files"] == {
         "linked": 5, "copied": 0, "symbolic_links": 0, "camera_images": 8, "replaced_images": 8,
+        "lidar_sweeps": 0, "replaced_lidar_files": 0,
     }  # fmt: skip
     row = batch_scenes.tree_digest(out)["street/fog-000/images/front/000002.png"]
     assert record["replaced"]["camera/front/02.png"] == {

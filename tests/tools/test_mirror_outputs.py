@@ -10,11 +10,16 @@ import cv2
 import numpy as np
 import pytest
 
+from adapters import source_trees
 from augment.batch.job import RenderJob, run_job
+from augment.batch.label_files import read_lidar
 from augment.batch.manifest import read_manifest
 from augment.errors import AdapterError, ClimateGSError, OutputError
+from augment.labels import LidarSweep
+from augment.lidar_weather import drop_lost
 from augment.scene import Scene
-from tests.augment.batch_scenes import SIZE, fake_render, make_recipe, open_fake
+from recipes.flood import Flood
+from tests.augment.batch_scenes import SIZE, FakeLabels, fake_render, make_recipe, open_fake
 from tests.augment.mirror_trees import contents
 from tools import render as render_tools
 from tools.mirror import mirror_again, mirror_outputs, recipes_for_source
@@ -121,6 +126,110 @@ def test_what_is_said(root, tmp_path):
     ]
     last = mirror_outputs(scene, out, progress=False)
     assert "(up to date)" in last[0] and last[2].endswith("or where the system cannot link")
+
+
+@dataclasses.dataclass(frozen=True)
+class Sweeps(FakeLabels):
+    """The sweeps of FakeLabels in files of their own: float64 x y z, and intensities in others."""
+
+    root: Path = Path()
+
+    def lidar_files(self, frame_index: int) -> tuple[Path, ...]:
+        files = (self.root / f"{kind}/{frame_index:02d}.bin" for kind in ("lidar", "intensity"))
+        return tuple(file for file in files if file.exists())
+
+    def lidar_content(self, frame_index: int, file: Path, sweep: LidarSweep) -> bytes:
+        if file.parent.name == "intensity":
+            return np.asarray(sweep.columns["intensity"]).tobytes()
+        return sweep.points_m.tobytes()
+
+
+def with_sweeps(root: Path, name: str = "street", frames: tuple[int, ...] = (0, 1, 2)) -> Scene:
+    labels = Sweeps(root=root)
+    for frame in frames:
+        for kind in ("lidar", "intensity"):
+            (root / kind).mkdir(exist_ok=True)
+            (root / kind / f"{frame:02d}.bin").write_bytes(b"recorded")
+    return dataclasses.replace(scene_of(root, name, frames), labels=labels)
+
+
+@pytest.fixture
+def bin_sweeps(monkeypatch):
+    """The little sequence's sweeps are no pickles."""
+    found = source_trees._pandaset
+    monkeypatch.setitem(
+        source_trees._TREES,
+        "pandaset",
+        lambda *asked: found(*asked)._replace(sweeps=r"lidar/\d+\.bin"),
+    )
+
+
+FLOOD = Flood(level_m=0.0, reference="absolute", turbidity_ntu=0)  # loses what is deep in it
+WET = {"flood": FLOOD, "semantic": False, "instance": False, "depth": "none", "image": "jpg"}
+LIDAR_FILES = {f"{kind}/{frame:02d}.bin" for kind in ("lidar", "intensity") for frame in range(3)}
+
+
+def lidar_line(said: list[str]) -> str:
+    (line,) = (sentence for sentence in said if "LiDAR sweeps" in sentence)
+    return line.strip()
+
+
+def test_weathered_sweeps_stand_in_the_copy(root, tmp_path, bin_sweeps):
+    scene, out = with_sweeps(root), tmp_path / "out"
+    copy = out / "source/wet-000/002"
+    before = contents(root)
+    render(scene, out, make_recipe("wet", **WET), frames=[0, 2], cameras=["front"])
+    said = mirror_outputs(scene, out, progress=False)
+    assert lidar_line(said) == (
+        "2 of 3 LiDAR sweeps are weathered, lost returns left out; 1 stay clear, as recorded"
+    )
+    lidar = {place for place in changed(root, copy) if place.endswith(".bin")}
+    assert lidar == {place for place in LIDAR_FILES if "01" not in place}
+    for frame in (0, 2):
+        sweep = drop_lost(read_lidar(out / f"street/wet-000/lidar/{frame:06d}.parquet"))
+        assert 0 < len(sweep) < 50
+        assert (copy / f"lidar/{frame:02d}.bin").read_bytes() == sweep.points_m.tobytes()
+        intensity = sweep.columns["intensity"].tobytes()
+        assert (copy / f"intensity/{frame:02d}.bin").read_bytes() == intensity
+    assert (copy / "lidar/01.bin").samefile(root / "lidar/01.bin")
+    assert "(up to date)" in mirror_outputs(scene, out, progress=False)[0]
+    # Sweeps that are rendered clean give way to the recorded ones.
+    clean = make_recipe("wet", lidar=True, **WET)
+    render(scene, out, clean, frames=[0, 2], cameras=["front"], overwrite=True)
+    assert lidar_line(mirror_outputs(scene, out, progress=False)) == (
+        "0 of 3 LiDAR sweeps are weathered; 3 stay clear, as recorded"
+    )
+    assert not changed(root, copy) & LIDAR_FILES and contents(root) == before
+
+
+def test_scenes_of_one_dataset_keep_each_others_sweeps(root, tmp_path, bin_sweeps):
+    one, two = with_sweeps(root, "one", (0, 1)), with_sweeps(root, "two", (2,))
+    out, copy, wet = (
+        tmp_path / "out",
+        tmp_path / "out/source/wet-000/002",
+        make_recipe("wet", **WET),
+    )
+    for scene in (one, two):
+        render(scene, out, wet)
+        said = mirror_outputs(scene, out, progress=False)
+    assert lidar_line(said) == "3 of 3 LiDAR sweeps are weathered, lost returns left out"
+    assert changed(root, copy) & LIDAR_FILES == LIDAR_FILES
+    render(one, out, wet, overwrite=True)
+    said = mirror_outputs(two, out, progress=False)
+    assert lidar_line(said).startswith("1 of 3 LiDAR sweeps are weathered")
+    assert "4 files of LiDAR of other scenes are out of date" in "\n".join(said)
+    said = mirror_outputs(one, out, progress=False)
+    assert lidar_line(said).startswith("3 of 3") and "out of date" not in "\n".join(said)
+
+
+def test_sweeps_that_the_dataset_has_no_files_for_are_told(root, tmp_path):
+    scene = dataclasses.replace(scene_of(root), labels=FakeLabels())
+    render(scene, tmp_path / "out", make_recipe("wet", **WET), frames=[1, 2])
+    said = mirror_outputs(scene, tmp_path / "out", progress=False)
+    assert said[-1] == (
+        f"  2 weathered LiDAR sweeps, the first of frame 1, have no file of their own in the "
+        f"dataset: its copy keeps the recorded ones, and {tmp_path / 'out'} has these"
+    )
 
 
 def test_variants_have_copies_of_their_own(root, tmp_path):
