@@ -36,8 +36,8 @@ class FrameRecord:
 class SceneRecord:
     """A scene's frames and cameras. uri: as the job names it. source: as the scene does itself.
 
-    has_labels: whether boxes can pass through. has_lidar: whether a frame has a sweep. open_s: how long opening it took. gaussians_bytes:
-    of its splats.
+    has_labels: whether boxes can pass through. has_lidar: whether a frame has a sweep. open_s: how
+    long opening it took. gaussians_bytes: of its splats.
     """
 
     uri: str

@@ -11,20 +11,25 @@ import numpy as np
 import pytest
 from batch_scenes import FakeLabels, fake_render, make_recipe, open_fake
 
+from augment.apply import render_view
 from augment.batch.job import RenderJob, run_job
 from augment.batch.label_files import lidar_bytes, read_lidar
 from augment.batch.manifest import read_manifest
 from augment.batch.rows import lidar_notes
 from augment.batch.selection import has_lidar
+from augment.cameras import Camera
 from augment.errors import OutputError
 from augment.labels import LidarSweep
 from augment.lidar_weather import LOST, MOVED, SCATTERED, UNCHANGED, drop_lost
 from augment.lidar_weather.apply import weathered_sweep
 from augment.lidar_weather.sensors import origins_of
+from augment.scene import Scene
+from augment.views import WeatheredView
 from recipes.flood import Flood
 from recipes.schema import Output, Recipe, Smog, Weather
 from recipes.snow import Snow
 from tests.lidar_sweeps import WORLD_ORIGIN_M, SensorLabels, recipe, some_points, street, sweep_of
+from tests.streets import LABELLED_STREET, open_street
 
 ADDED = {"source_index", "weather_code"}
 
@@ -157,6 +162,35 @@ def test_a_job_writes_weathered_sweeps(tmp_path: Path) -> None:
     assert {row["lidar_path"] for row in read_manifest(tmp_path / "off").to_pylist()} == {None}
 
 
+def _depth_gaps(scene: Scene, camera: Camera, view: WeatheredView, sweep: LidarSweep) -> np.ndarray:
+    """How far in front of or behind the depth image the returns on its snow pixels are, metres."""
+    pose = camera.camera_from_world.numpy()
+    offsets = sweep.points_m - np.asarray(scene.world_origin_m)
+    x, y, z = (offsets @ pose[:3, :3].T + pose[:3, 3]).T
+    ahead = z > 0.5
+    column, row = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+    seen = ahead & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    at = row[seen].astype(int), column[seen].astype(int)
+    return np.abs(z[seen] - view.depth_m[at])[(view.snow[at] == 255) & (view.depth_m[at] > 0)]
+
+
+def test_lidar_agrees_with_depth_under_snow_by_default() -> None:
+    scene = open_street(LABELLED_STREET)
+    deep = Recipe(weather=Weather(snow=Snow(depth_m=0.2)))
+    gaps: dict[bool, list[np.ndarray]] = {True: [], False: []}
+    source = scene.lidar(1)
+    sweep = drop_lost(weathered_sweep(scene, deep, 1, source))
+    for name in ("front", "left"):
+        camera = scene.frame(1).cameras[name].scaled(4.0)  # pixels that are small on the road
+        view = render_view(scene, camera, deep)
+        for is_weathered, returns in ((True, sweep), (False, source)):
+            gaps[is_weathered].append(_depth_gaps(scene, camera, view, returns))
+    after, before = (np.concatenate(gaps[kind]) for kind in (True, False))
+    assert deep.lidar == "weather" and len(after) > 300
+    # Beams are flat: a centimetre of height is several of depth. Now 0.06 m, and 0.64 m.
+    assert np.median(after) < 0.1 < 0.5 < np.median(before)
+
+
 @dataclass(frozen=True)
 class _Misfit(FakeLabels):
     """Labels whose origins do not fit frame 1."""
@@ -184,7 +218,7 @@ def test_auto_weathers_what_it_can_and_tells_of_the_rest(tmp_path: Path) -> None
     assert re.search(r"no weather on this sweep: ValueError: lidar_origins of _Misfit", note)
     paths = [tmp_path / f"out/street/wet-000/lidar/{n:06d}.parquet" for n in range(3)]
     sweeps = [read_lidar(path) for path in paths]
-    assert [ADDED <= set(sweep.columns) for sweep in sweeps] == [True, False, True]
+    assert [set(sweep.columns) >= ADDED for sweep in sweeps] == [True, False, True]
     assert lidar_bytes(sweeps[1]) == lidar_bytes(scene.lidar(1))
     # Sweeps that another run has left say what they are; a damaged one is written anew.
     before = [path.read_bytes() for path in paths]
