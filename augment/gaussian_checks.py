@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from augment.scene import Gaussians, quat_lengths
+from augment.scene import MAX_EXTENT_M, Gaussians, quat_lengths
 
 _QUAT_TOLERANCE = 1e-4  # of unit length; what is further off is to be normalised
 _ROWS = 1 << 16  # looked at together: temporaries stay in the cache
@@ -30,6 +30,8 @@ def drawable_rows(gaussians: Gaussians) -> Bool[Tensor, "N"]:
     keep = torch.isfinite(gaussians.opacities)
     for tensor in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.sh):
         keep &= torch.isfinite(tensor.reshape(len(gaussians), -1).sum(1))
+    for tensor in (gaussians.means, gaussians.scales):
+        keep &= tensor.abs().amax(1) <= MAX_EXTENT_M
     return keep & (quat_lengths(gaussians.quats) > 0) & (gaussians.scales.amin(1) > 0)
 
 
@@ -43,7 +45,8 @@ def _piece_is_drawable(gaussians: Gaussians, rows: slice) -> bool:
         bool(np.isfinite(ranges).all())
         and shortest > 1 - _QUAT_TOLERANCE
         and longest < 1 + _QUAT_TOLERANCE
-        and ranges[2][0] > 0
+        and -MAX_EXTENT_M <= ranges[0][0] <= ranges[0][1] <= MAX_EXTENT_M
+        and 0 < ranges[2][0] <= ranges[2][1] <= MAX_EXTENT_M
         and ranges[3][0] >= 0
         and ranges[3][1] <= 1
     )

@@ -20,6 +20,7 @@ from augment.semantics import SemanticClass
 from augment.sky import Sky
 from augment.track import Track
 
+MAX_EXTENT_M = 1e7  # float32 tells metres apart there, and squares and cells are still numbers
 SH_COUNTS = (1, 4, 9, 16)  # K = (degree + 1)^2 for degrees 0 to 3
 
 
@@ -338,7 +339,8 @@ def _check_color_map(scene: str, camera: str, color_map: Tensor) -> None:
 def check_gaussians(gaussians: Gaussians, *, where: str) -> tuple[Gaussians, tuple[str, ...]]:
     """Gaussians without those no rasteriser can draw, and a sentence for each kind left out.
 
-    Left out: NaN or infinite values, zero quaternions, scales <= 0. Quaternions are normalised.
+    Left out: NaN or infinite values, zero quaternions, scales <= 0, coordinates and scales beyond
+    MAX_EXTENT_M. Quaternions are normalised.
 
     Raises:
         SceneError: nothing usable remains.
@@ -348,11 +350,15 @@ def check_gaussians(gaussians: Gaussians, *, where: str) -> tuple[Gaussians, tup
         finite &= torch.isfinite(tensor.reshape(len(gaussians), -1).sum(1))
     finite &= torch.isfinite(gaussians.opacities)
     norms = quat_lengths(gaussians.quats)
+    largest = torch.maximum(gaussians.means.abs().amax(1), gaussians.scales.amax(1))
+    is_far = finite & (norms > 0) & (gaussians.scales.amin(1) > 0) & (largest > MAX_EXTENT_M)
+    first = f"; the first is number {int(is_far.int().argmax())}" if bool(is_far.any()) else ""
     # In order: each count names what the earlier checks did not already leave out.
     bad = {
         "with NaN or infinite values": ~finite,
         "with a zero quaternion": finite & (norms == 0),
         "with a scale <= 0": finite & (norms > 0) & (gaussians.scales.amin(1) <= 0),
+        f"with coordinates or scales beyond {MAX_EXTENT_M:.0e} m{first}": is_far,
     }
     problems = tuple(
         f"{where}: left out {int(mask.sum())} of {len(gaussians)} Gaussians {what}"

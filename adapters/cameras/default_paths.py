@@ -19,6 +19,7 @@ from adapters.cameras.ground_estimate import (
     GroundGrid,
     ground_grid,
     in_bulk,
+    road_heights,
     solid_points_and_areas,
 )
 from adapters.cameras.posed_views import PosedView, look_at_pose
@@ -35,12 +36,12 @@ _FIELD_OF_VIEW_DEG = {"drive": 75.0, "orbit": 55.0}
 _STEP_M = 0.5  # 5 m/s at 10 Hz
 _MAX_CELLS = 1010  # a side: up to half a kilometre every step is looked at, beyond that every nth
 _MOST_FRAMES = 100
+_LONGEST_DRIVE_M = 1000.0  # what lies between frames farther apart no image shows
 _ORBIT_FRAMES = 48
 _SHORTEST_DRIVE_M = 8.0
 _WIDE_M, _FLATNESS = 20.0, 0.5
 _CAR_M = (0.5, 2.5)  # above the ground: what lies between is in the way
 _HALF_WIDTH_M = 1.25
-_ROAD_REACH_M, _ROAD_LAYER_M = 2.5, 0.2
 _DETAIL_REACH_M, _COARSER_THAN_USUAL = 2.0, 1.7
 _BLOCKED_COST = 4.0  # passing half a metre of wall must cost more than it gains
 _BEHIND_SHARE, _AHEAD_SHARE = (
@@ -187,11 +188,11 @@ def _drive(
         start, end, forward = end, start, -forward
     start, length = (
         start + _BEHIND_SHARE * whole * forward,
-        (1 - _BEHIND_SHARE - _AHEAD_SHARE) * whole,
+        min((1 - _BEHIND_SHARE - _AHEAD_SHARE) * whole, _LONGEST_DRIVE_M),
     )
     count = max(2, min(_MOST_FRAMES, round(length / _STEP_M) + 1))
     places = start + np.linspace(0, length, count)[:, None] * forward
-    heights = _road_heights(points, areas, places, grid.at(places))
+    heights = road_heights(points, areas, places, grid.at(places))
     ground = _smooth_profile(heights, fallback=float(np.quantile(points[:, 2], 0.1)))
     views = []
     for frame, (place, height) in enumerate(zip(places, ground, strict=True)):
@@ -207,29 +208,6 @@ def _drive(
         "camera_path=FILE for another"
     )
     return DefaultPath(tuple(views), float(np.quantile(ground, 0.05)), note)
-
-
-def _road_heights(
-    points: np.ndarray, areas: np.ndarray, places: np.ndarray, low: np.ndarray
-) -> np.ndarray:
-    """Heights [P] that hold the most surface around places [P, 2]; NaN where nothing is near.
-
-    low: [P], heights of what lies low there, which a road may lie above: files have foundations,
-    and strays below the ground. Coarse splats lie under fine ones, so none counts for many.
-    """
-    heights, areas = np.full(len(places), np.nan), np.minimum(areas, np.median(areas))
-    for number, (place, least) in enumerate(zip(places, low, strict=True)):
-        offset = points[:, :2] - place
-        near = (offset * offset).sum(axis=1) < _ROAD_REACH_M**2
-        near &= np.abs(points[:, 2] - least) < _CAR_M[0] + _ROAD_LAYER_M
-        if near.any():
-            z, area = points[near, 2], areas[near]
-            bins = np.floor((z - z.min()) / (_ROAD_LAYER_M / 4)).astype(int)
-            layers = np.convolve(np.bincount(bins, area), np.ones(4))
-            top = z.min() + (layers.argmax() + 1) * _ROAD_LAYER_M / 4
-            layer = (z <= top) & (z >= top - _ROAD_LAYER_M)
-            heights[number] = np.average(z[layer], weights=area[layer])
-    return heights
 
 
 def _smooth_profile(heights: np.ndarray, *, fallback: float) -> np.ndarray:

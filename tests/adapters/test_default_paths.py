@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -43,6 +44,17 @@ def test_drive_follows_the_road(heading_deg: float, slope: float) -> None:
     assert abs(ahead @ [math.cos(angle), math.sin(angle)]) > math.cos(math.radians(6))
     assert path.ground_z_m == pytest.approx(min(0, slope * along.max()), abs=0.6)
     assert path.note.startswith(NO_CAMERAS) and "straight drive" in path.note
+
+
+def test_a_scene_of_any_extent_gets_a_drive_of_a_kilometre_at_most(ends_soon) -> None:
+    for size in (500.0, 4e3, 1e7):
+        ground = torch.rand(5000, 3, generator=torch.Generator().manual_seed(1))
+        ground = gaussians_at(ground * torch.tensor([size, 0.5 * size, 0.4]))
+        path = make_default_path(replace(ground, scales=ground.scales + size / 500), is_metric=True)
+        positions = np.array([v.world_from_camera[:3, 3] for v in path.views])
+        extent = np.ptp(positions[:, :2], axis=0)
+        assert 300 < np.hypot(*extent) <= 1000.1
+        assert (positions[:, :2] >= 0).all() and (positions[:, :2] <= [size, size / 2]).all()
 
 
 def test_what_floats_far_away_does_not_move_the_drive() -> None:

@@ -7,6 +7,7 @@ import torch
 from augment.cameras import Camera
 from augment.color_waves import ColorWaves, colors_at
 from augment.errors import SceneError
+from augment.gaussian_checks import drawable_rows, is_drawable
 from augment.geometry import quat_from_rotmat, rigid, rotmat_from_quat, slerp
 from augment.render.sh import evaluate_sh
 from augment.scene import Actor, Gaussians, Scene, Track, check_gaussians
@@ -64,6 +65,28 @@ def test_unusable_gaussians_are_left_out_and_counted():
         "scene.ply: left out 1 of 6 Gaussians with a zero quaternion",
         "scene.ply: left out 1 of 6 Gaussians with a scale <= 0",
     )
+
+
+def test_what_lies_beyond_ten_thousand_kilometres_is_left_out():
+    base = some(6)
+    for size in (1.01e7, 1e20, 3e38):
+        means, scales = base.means.clone(), base.scales.clone()
+        means[2, 1], scales[4, 0] = -size, size
+        hurt = dataclasses.replace(base, means=means, scales=scales)
+        clean, problems = check_gaussians(hurt, where="scene.ply")
+        assert torch.equal(clean.means, base.means[[0, 1, 3, 5]])
+        assert problems == (
+            "scene.ply: left out 2 of 6 Gaussians with coordinates or scales beyond 1e+07 m; the "
+            "first is number 2",
+        )
+        assert not is_drawable(hurt)
+        assert drawable_rows(hurt).tolist() == [True, True, False, True, False, True]
+    means, scales = base.means.clone(), base.scales.clone()
+    means[2], scales[4] = -1e7, 1e7
+    at_limit = dataclasses.replace(base, means=means, scales=scales)
+    clean, problems = check_gaussians(at_limit, where="scene.ply")
+    assert problems == () and is_drawable(at_limit) and drawable_rows(at_limit).all()
+    assert torch.equal(clean.means, means) and torch.equal(clean.scales, scales)
 
 
 def test_nothing_usable_is_an_error():

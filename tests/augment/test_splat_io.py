@@ -368,7 +368,7 @@ def test_bad_splat_files(tmp_path: Path) -> None:
     path.write_bytes(b"")
     with pytest.raises(SceneError, match="0 bytes"):
         read_splats(path)
-    path.write_bytes(np.random.default_rng(0).bytes(3200))
+    path.write_bytes(np.random.default_rng(0).bytes(32_000))
     with pytest.raises(SceneError, match=r"probably no \.splat"):
         read_splats(path)
     (tmp_path / "a.spz").write_bytes(b"\x1f\x8b")
