@@ -19,7 +19,13 @@ import numpy as np
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from adapters.cameras.ground_estimate import BULK_REACH, ground_under, in_bulk, solid_points
+from adapters.cameras.ground_estimate import (
+    BULK_REACH,
+    ground_under,
+    in_bulk,
+    road_heights,
+    solid_points,
+)
 from adapters.world import nearest_axis
 from augment.rng import rng_for
 from augment.scene import Gaussians
@@ -112,22 +118,23 @@ def scale_from_cameras(points: np.ndarray, poses: np.ndarray) -> tuple[float, st
     if np.median(np.abs(looks)) > math.sin(math.radians(_STEEPEST_LOOK_DEG)):
         return None
     radius = 0.25 * float(np.linalg.norm(np.ptp(eyes[:, :2], axis=0)))
-    height = 0.0
-    for _ in range(2):  # once more from nearby: a wide circle reaches into ditches and up slopes
-        ground, above = ground_under(points, eyes, radius=radius)
-        if len(ground) == 0:
-            return None
-        heights = above[:, 2] - ground
-        low, height, high = np.quantile(heights, [0.25, 0.5, 0.75])
-        if not high - low <= _HEIGHTS_SPREAD * height:
-            return None
-        radius = 3 * height
+    low, over = ground_under(points, eyes, radius=radius)
+    if len(low):  # once more from nearby: a wide circle reaches into ditches and up slopes
+        low, over = ground_under(points, eyes, radius=3 * float(np.median(over[:, 2] - low)))
+    if len(low) == 0:
+        return None
+    height = float(np.median(over[:, 2] - low))
+    unit = height / CAMERAS_ABOVE_GROUND_M
+    heights = over[:, 2] - road_heights(points, np.ones(len(points)), over, low, unit=unit)
+    least, height, most = np.nanquantile(heights, [0.25, 0.5, 0.75])
+    if not most - least <= _HEIGHTS_SPREAD * height:
+        return None
     if _METRIC_HEIGHTS_M[0] <= height <= _METRIC_HEIGHTS_M[1]:
-        return 1.0, f"the cameras stand {height:.2f} units above the ground: a unit is a metre"
+        return 1.0, f"the cameras stand {height:.2f} units above the ground"
     scale = CAMERAS_ABOVE_GROUND_M / height
     return scale, (
         f"the cameras stand {height:.3g} units above the ground, which is taken as "
-        f"{CAMERAS_ABOVE_GROUND_M} m: a unit is {scale:.3g} m, give or take a quarter"
+        f"{CAMERAS_ABOVE_GROUND_M} m, give or take a quarter"
     )
 
 

@@ -18,6 +18,7 @@ from augment.scene import Gaussians
 SOLID_OPACITY = 0.3  # fainter Gaussians are haze and leftovers of training
 BULK_REACH = 8.0  # in median distances: of a drive that is dense in the middle, all
 _LOW_QUANTILE = 0.1
+_ROAD_REACH_M, _ROAD_LAYER_M, _ROAD_ABOVE_LOW_M = 2.5, 0.2, 0.7
 _FEWEST_POINTS = 12
 _MOST_POINTS = 300_000
 _MOST_PLACES = 128
@@ -81,6 +82,31 @@ def ground_under(
             kept.append(position)
             heights.append(np.quantile(below, _LOW_QUANTILE))
     return np.array(heights), np.array(kept).reshape(-1, 3)
+
+
+def road_heights(
+    points: np.ndarray, areas: np.ndarray, places: np.ndarray, low: np.ndarray, *, unit: float = 1.0
+) -> np.ndarray:
+    """Heights [P] that hold the most surface around places [P, 2 or 3]; NaN where nothing is near.
+
+    low: [P], heights of what lies low there, which a road may lie above: files have foundations,
+    and strays below the ground. Coarse splats lie under fine ones, so none counts for many.
+    unit: a metre's length.
+    """
+    layer = unit * _ROAD_LAYER_M
+    heights, areas = np.full(len(places), np.nan), np.minimum(areas, np.median(areas))
+    for number, (place, least) in enumerate(zip(places, low, strict=True)):
+        offset = points[:, :2] - place[:2]
+        near = (offset * offset).sum(axis=1) < (unit * _ROAD_REACH_M) ** 2
+        near &= np.abs(points[:, 2] - least) < unit * _ROAD_ABOVE_LOW_M
+        if near.any():
+            z, area = points[near, 2], areas[near]
+            bins = np.floor((z - z.min()) / (layer / 4)).astype(int)
+            layers = np.convolve(np.bincount(bins, area), np.ones(4))
+            top = z.min() + (layers.argmax() + 1) * layer / 4
+            within = (z <= top) & (z >= top - layer)
+            heights[number] = np.average(z[within], weights=area[within])
+    return heights
 
 
 def lowest_ground(points: np.ndarray, positions: np.ndarray, *, radius: float) -> float | None:
