@@ -86,6 +86,6 @@ def lidar_notes(recipes: Iterable[Recipe]) -> list[str]:
             line = f"{variant_name(recipe)}: LiDAR {how}: {note}"
             noted.setdefault(recipe.name, []).append(line)
     return [
-        lines[0] + (f", and {len(lines) - 1} more variants likewise" if lines[1:] else "")
+        lines[0] + (f", and {len(lines) - 1} more likewise" if lines[1:] else "")
         for lines in noted.values()
     ]

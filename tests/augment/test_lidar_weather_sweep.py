@@ -239,7 +239,7 @@ def test_the_notes_of_a_job_are_one_line_a_recipe() -> None:
     dry, wet = make_recipe("dry", **clean), make_recipe("wet", flood=Flood(level_m=0.1))
     assert lidar_notes([*snowy, dry, wet]) == [
         "snowy-000: LiDAR passes through clean: snow 0.1 m deep in images and depth, not in sweeps "
-        "(output: {lidar: true, surface: solid}), and 2 more variants likewise",
+        "(output: {lidar: true, surface: solid}), and 2 more likewise",
         "wet-000: LiDAR meets the weather: water in images and sweeps, not in depth "
         "(output: {lidar: auto, surface: solid})",
     ]
