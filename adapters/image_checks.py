@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from adapters.lidar.image_views import read_image
+from recipes.files import open_file
 
 _ENDS = ((b"\x89PNG\r\n\x1a\n", b"IEND"), (b"\xff\xd8", b"\xff\xd9"))
 
@@ -13,7 +14,8 @@ def look_at_image(path: Path) -> tuple[int, int] | str:
     """Width and height of a PNG or JPEG, decoded once to be sure of it, or what is wrong with it as
     the end of a sentence."""
     try:
-        data = path.read_bytes()
+        with open_file(path) as file:
+            data = file.read()
     except OSError as error:
         return f"cannot be read ({error.strerror})"
     # Decoders fill what is cut off with grey.

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+import cv2
 import numpy as np
 
 from augment.errors import AdapterError
@@ -135,6 +136,16 @@ def array_of(value: object) -> np.ndarray | None:
         return None
 
 
+def decode_image(path: Path, flags: int) -> np.ndarray | None:
+    """As cv2.imread, but of regular files only: a pipe would keep it waiting."""
+    try:
+        with open_file(path) as file:
+            data = np.frombuffer(file.read(_MAX_BYTES), np.uint8)
+    except OSError:
+        return None
+    return cv2.imdecode(data, flags) if len(data) else None
+
+
 def read_numbers(path: Path, shape: Sequence[int] | None = None) -> np.ndarray:
     """The finite numbers of a text file, float64 in that shape, or flat.
 
@@ -179,7 +190,7 @@ def checked_pose(matrix: np.ndarray, where: str) -> np.ndarray:
     rotation = pose[:3, :3]
     with np.errstate(all="ignore"):
         error = np.abs(rotation @ rotation.T - np.eye(3)).max()
-    is_pose = np.isfinite(pose).all() and error < 1e-3 and np.linalg.det(rotation) > 0
+    is_pose = (np.abs(pose) <= LARGEST).all() and error < 1e-3 and np.linalg.det(rotation) > 0
     if not is_pose or not np.allclose(pose[3], [0, 0, 0, 1]):
         raise AdapterError(
             f"{where} must be a rotation and a translation (metres) with 0 0 0 1 in its last row; "

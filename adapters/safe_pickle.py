@@ -25,6 +25,7 @@ from augment.files.pickles import (
     read_npy,
     read_npy_header,
 )
+from recipes.files import open_file
 
 MAX_BYTES = 1 << 29  # unpacked; a sweep of 170,000 points takes 8 MB
 _CHUNK = 1 << 22
@@ -306,7 +307,7 @@ _TABLE_NAMES = _table_names()
 def _read_bounded(path: Path, max_bytes: int) -> bytes:
     """The file's bytes, unpacked if gzipped, never more than max_bytes of them."""
     try:
-        with open(path, "rb") as raw:
+        with open_file(path) as raw:
             zipped = raw.read(2) == _GZIP_MAGIC
             raw.seek(0)
             stream = gzip.GzipFile(fileobj=raw) if zipped else raw

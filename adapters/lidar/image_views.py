@@ -15,6 +15,7 @@ from adapters.lidar import kernels
 from adapters.lidar.box_tracks import ObjectTrack
 from adapters.lidar.sky import SkyGatherer
 from adapters.lidar.surfels import Surfels
+from adapters.plain_files import decode_image
 from augment.cameras import Camera
 
 logger = logging.getLogger(__name__)
@@ -101,7 +102,7 @@ def observe_views(
 
 def read_image(path: Path, image_scale: float) -> np.ndarray | None:
     """RGB uint8 [H, W, 3] at a fraction (1, 1/2, 1/4, 1/8) of its size; None if not decodable."""
-    image = cv2.imread(str(path), _REDUCED[image_scale])
+    image = decode_image(path, _REDUCED[image_scale])
     return None if image is None else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 

@@ -6,6 +6,7 @@ gigabyte, of which one scene needs a thousandth, so a table is never in memory a
 
 from __future__ import annotations
 
+import io
 import json
 import re
 from collections.abc import Container, Iterator
@@ -18,6 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from adapters.plain_files import LARGEST
 from augment.errors import AdapterError
+from recipes.files import open_file
 
 _CHUNK = 1 << 22  # characters read at a time
 _LONGEST_ROW = 1 << 24  # no published row has a ten-thousandth of it
@@ -125,7 +127,7 @@ def read_rows(path: Path) -> Iterator[Row]:
         AdapterError: missing, unreadable, no JSON, cut short, or no list of objects.
     """
     try:
-        with path.open(encoding="utf-8") as file:
+        with io.TextIOWrapper(open_file(path), encoding="utf-8") as file:
             yield from _rows(path, file)
     except FileNotFoundError:
         raise AdapterError(f"{path} does not exist; copy it from the dataset") from None

@@ -21,6 +21,7 @@ from adapters.nuscenes.frames import FrameFiles
 from adapters.nuscenes.tables import SceneTables, SensorFile
 from adapters.plain_files import inside
 from augment.semantics import SemanticClass
+from recipes.files import open_file
 
 RECORD_BYTES = 20
 # The recording car with its sensors in its own frame (x forward, y left, z up, origin on the ground
@@ -135,7 +136,8 @@ def _usable(
 
 def _bytes(path: Path) -> bytes:
     try:
-        return path.read_bytes()
+        with open_file(path) as file:
+            return file.read()
     except FileNotFoundError:
         raise
     except OSError as error:

@@ -24,10 +24,11 @@ import pandas as pd
 import torch
 
 from adapters.lidar.origin import drive_origin
-from adapters.plain_files import number_of, read_json
+from adapters.plain_files import decode_image, number_of, read_json
 from adapters.safe_pickle import read_frame
 from augment.errors import AdapterError
 from augment.geometry import rigid, rotmat_from_quat
+from recipes.files import open_file
 
 _INTRINSICS = ("fx", "fy", "cx", "cy")
 _LATEST_S = 9e9  # int64 nanoseconds reach 9.2e9 s
@@ -218,7 +219,7 @@ def _file_fault(path: Path) -> str:
     """What is wrong with a JPEG file by its ends: decoders fill what is missing with grey."""
     if not path.exists():
         return "does not exist"
-    with open(path, "rb") as file:
+    with open_file(path) as file:
         head = file.read(2)
         size = file.seek(0, 2)
         file.seek(max(0, size - 64))
@@ -230,7 +231,7 @@ def _file_fault(path: Path) -> str:
 
 def _picture_fault(path: Path, size: tuple[int, int]) -> str:
     """What is wrong with the picture in a JPEG file, decoded at an eighth of its size."""
-    image = cv2.imread(str(path), cv2.IMREAD_REDUCED_GRAYSCALE_8)
+    image = decode_image(path, cv2.IMREAD_REDUCED_GRAYSCALE_8)
     if image is None:
         return "cannot be decoded"
     if image.shape != tuple(-(-side // 8) for side in size):
@@ -241,7 +242,7 @@ def _picture_fault(path: Path, size: tuple[int, int]) -> str:
 def _image_size(folder: Path, paths: list[Path]) -> tuple[int, int]:
     """Rows and columns of the first image that can be decoded."""
     for path in paths:
-        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        image = decode_image(path, cv2.IMREAD_UNCHANGED)
         if image is not None:
             return image.shape[0], image.shape[1]
     raise AdapterError(f"{folder} holds no image that can be decoded; unpack the sequence again")

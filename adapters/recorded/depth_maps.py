@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from adapters.plain_files import decode_image
 from adapters.safe_pickle import read_array, read_array_dict
 from augment.cameras import Camera
 from augment.errors import AdapterError
@@ -68,7 +69,7 @@ def find_sparse(
 
 def read_metric(path: Path) -> np.ndarray:
     """float32 [h, w] metres, 0 where unknown, from a 16-bit image of metres x 256."""
-    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    image = decode_image(path, cv2.IMREAD_UNCHANGED)
     if image is None:
         raise AdapterError(f"{path} cannot be decoded")
     if image.dtype != np.uint16 or image.ndim != 2:
@@ -84,7 +85,7 @@ def read_relative(path: Path) -> np.ndarray:
     if path.suffix.lower() == ".npy":
         values = read_array(path)
     else:
-        values = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        values = decode_image(path, cv2.IMREAD_UNCHANGED)
         if values is None:
             raise AdapterError(f"{path} cannot be decoded")
         if values.ndim == 3 and (values[..., :1] == values[..., :3]).all():

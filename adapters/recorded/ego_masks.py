@@ -14,6 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from adapters.plain_files import decode_image
 from augment.cameras import Camera
 from augment.errors import AdapterError
 
@@ -166,7 +167,7 @@ def read_ego_mask(path: Path, camera: Camera) -> np.ndarray:
     Raises:
         AdapterError: not decodable, or of another shape than the camera's images.
     """
-    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    image = decode_image(path, cv2.IMREAD_GRAYSCALE)
     if image is None:
         raise AdapterError(f"{path} cannot be decoded; expected an image, white on the own car")
     error = (image.shape[1] / image.shape[0]) / (camera.width / camera.height) - 1

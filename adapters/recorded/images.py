@@ -7,10 +7,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from adapters.plain_files import decode_image
 from adapters.recorded.byte_cache import ByteCache
 from augment.cameras import Camera
 from augment.errors import AdapterError
 from augment.reconstruct.view import ViewKey
+from recipes.files import open_file
 
 # JPEG decoders can leave out the finest parts of each 8x8 block, which costs far less.
 _REDUCED = {
@@ -38,7 +40,7 @@ def read_scaled(path: Path, full: Camera, scaled: Camera) -> np.ndarray:
     """
     is_jpeg = _check_file(path)
     step = _reduction(full, scaled) if is_jpeg else 1
-    image = cv2.imread(str(path), _REDUCED[step])
+    image = decode_image(path, _REDUCED[step])
     if image is None:
         raise ImageFault("cannot be decoded")
     size = (-(-full.height // step), -(-full.width // step))
@@ -66,7 +68,7 @@ def _reduction(full: Camera, scaled: Camera) -> int:
 def _check_file(path: Path) -> bool:
     """Whether the file is a JPEG; its ends are looked at since decoders fill what is missing."""
     try:
-        with open(path, "rb") as file:
+        with open_file(path) as file:
             head = file.read(2)
             size = file.seek(0, 2)
             file.seek(max(0, size - _TAIL_BYTES))

@@ -17,6 +17,7 @@ from augment.batch.encode import decode_png, depth_in_metres
 from augment.batch.layout import folder_name
 from augment.cameras import Camera, Frame
 from augment.semantics import SemanticClass
+from recipes.files import open_file
 
 POINTS_PER_IMAGE = 40_000  # more than the voxels near the path need of each image of a drive
 _FARTHEST_M = 200.0  # beyond, one step of the file's may be less than the depth's own error
@@ -41,7 +42,8 @@ def depth_sweeps(root: Path, frames: Sequence[Frame]) -> tuple[tuple[Sweep, ...]
             if path is None:
                 continue
             try:
-                depth_m = depth_in_metres(decode_png(path.read_bytes(), np.uint16))
+                with open_file(path) as file:
+                    depth_m = depth_in_metres(decode_png(file.read(), np.uint16))
                 if depth_m.shape != (camera.height, camera.width):
                     raise ValueError(
                         f"it is {depth_m.shape[1]}x{depth_m.shape[0]} pixels, the camera "

@@ -23,6 +23,7 @@ from augment.errors import AdapterError, OutputError
 from augment.labels import Boxes, LidarSweep
 from augment.lidar_weather.codes import INDEX_COLUMN
 from augment.lidar_weather.sensors import intensity_column
+from recipes.files import open_file
 
 _VECTORS = {
     "centers_m": ("center_x_m", "center_y_m", "center_z_m"),
@@ -146,6 +147,7 @@ def _column(table: pa.Table, name: str) -> np.ndarray:
 
 def _reading(path: Path, expected: str, read: Callable[[], Value]) -> Value:
     try:
+        open_file(path).close()  # to open a pipe would wait for ever
         return read()
     except _DAMAGED as error:
         raise AdapterError(f"{path} is not {expected}: {error}") from error

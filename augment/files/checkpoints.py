@@ -23,6 +23,7 @@ from torch import Tensor
 
 from augment.errors import AdapterError, ClimateGSError
 from augment.files.pickles import ARRAY_NAMES, Name, Pickle, PickleError
+from recipes.files import open_file
 
 _CHUNK = 1 << 18  # numbers copied at a time: a megabyte
 _DONTNEED = 4  # linux/mman.h
@@ -94,7 +95,7 @@ def read_torch(path: Path) -> Any:
         PickleError: it holds something else than tensors and plain values, or is damaged.
     """
     try:
-        with open(path, "rb") as file:
+        with open_file(path) as file:
             content = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
             if content[:4] != b"PK\3\4":
                 return _read_legacy(file, content)

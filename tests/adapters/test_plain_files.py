@@ -3,16 +3,26 @@
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 from adapters.base import open_scene
+from adapters.cameras.files import read_views
 from adapters.drivestudio.config import read_config as drivestudio_config
-from adapters.plain_files import inside, read_json, read_numbers, read_pose
+from adapters.image_checks import look_at_image
+from adapters.lidar.image_views import read_image
+from adapters.nuscenes.rows import read_rows
+from adapters.plain_files import decode_image, inside, read_json, read_numbers, read_pose
+from adapters.recorded.depth_maps import read_metric
+from adapters.recording.tables import read_sweep
+from adapters.safe_pickle import read_array, read_frame
 from adapters.street_gaussians.config import read_config as street_gaussians_config
 from augment.errors import AdapterError, SceneError, StyleError
+from augment.files.checkpoints import load_checkpoint
 from augment.files.scene_files import load_scene_parts
 from augment.style.checkpoint import load_network
 from augment.style.images import read_style_image
@@ -162,7 +172,7 @@ def test_pipes_devices_and_folders_are_no_files(tmp_path, ends_soon):
         "scene": open_scene,
         "scene by scheme": lambda path: open_scene(f"gaussians:{path}"),
         "scene file": load_scene_parts,
-        "camera path": lambda path: open_scene(f"procedural:street?frames=1&camera_path={path}"),
+        "camera path": read_views,
     }
     del readers["style"]
     for name, read in readers.items():
@@ -170,3 +180,35 @@ def test_pipes_devices_and_folders_are_no_files(tmp_path, ends_soon):
             with pytest.raises((AdapterError, RecipeError, StyleError, SceneError)) as caught:
                 read(path)
             assert str(path) in str(caught.value), name
+
+
+def test_pipes_inside_datasets_are_faults_of_theirs(tmp_path, ends_soon):
+    for suffix in ("png", "npy", "pkl.gz", "pth", "safetensors", "parquet", "json"):
+        os.mkfifo(tmp_path / f"pipe.{suffix}")
+    refused = {
+        "png": read_metric,
+        "npy": read_array,
+        "pkl.gz": read_frame,
+        "pth": load_checkpoint,
+        "parquet": read_sweep,
+        "json": lambda path: list(read_rows(path)),
+    }
+    for suffix, read in refused.items():
+        path = tmp_path / f"pipe.{suffix}"
+        with pytest.raises(AdapterError, match=re.escape(str(path))):
+            read(path)
+    picture = tmp_path / "pipe.png"
+    assert read_image(picture, 1.0) is None
+    assert look_at_image(picture) == "cannot be read (a pipe or device, not a regular file)"
+
+
+def test_pictures_are_decoded_as_opencv_does(tmp_path):
+    rng = np.random.default_rng(0)
+    for suffix, kind in (("jpg", np.uint8), ("png", np.uint16)):
+        path = tmp_path / f"picture.{suffix}"
+        cv2.imwrite(str(path), rng.integers(0, 255, (37, 53, 3)).astype(kind))
+        for flags in (cv2.IMREAD_COLOR, cv2.IMREAD_UNCHANGED, cv2.IMREAD_REDUCED_COLOR_4):
+            assert np.array_equal(decode_image(path, flags), cv2.imread(str(path), flags))
+    for text in (b"", b"no picture"):
+        path.write_bytes(text)
+        assert decode_image(path, cv2.IMREAD_COLOR) is None
