@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from adapters.plain_files import LARGEST
 from augment.errors import AdapterError
 
 _ORTHONORMAL_TOLERANCE = 1e-4  # as in Camera: poses written with four decimals or fewer fail
@@ -50,10 +51,16 @@ def check_pose(world_from_camera: np.ndarray, *, where: str) -> np.ndarray:
     Raises:
         AdapterError: the rotation is not orthonormal with determinant +1, or a value not finite.
     """
-    rotation = np.asarray(world_from_camera, dtype=np.float64)[:3, :3]
-    error = np.abs(rotation @ rotation.T - np.eye(3)).max()
-    determinant = np.linalg.det(rotation)
-    if not (np.isfinite(world_from_camera).all() and error < _ORTHONORMAL_TOLERANCE):
+    pose = np.asarray(world_from_camera, dtype=np.float64)
+    if not (np.abs(pose) <= LARGEST).all():  # NaN included
+        raise AdapterError(
+            f"{where}: the pose must be finite, at most {LARGEST:g}; got {pose.tolist()}"
+        )
+    rotation = pose[:3, :3]
+    with np.errstate(all="ignore"):
+        error = np.abs(rotation @ rotation.T - np.eye(3)).max()
+        determinant = np.linalg.det(rotation)
+    if error >= _ORTHONORMAL_TOLERANCE:
         raise AdapterError(
             f"{where}: the rotation must be orthonormal to {_ORTHONORMAL_TOLERANCE:g}; it is off "
             f"by {error:.3g} (determinant {determinant:.3g}). Write more decimals, and take any "
@@ -64,9 +71,9 @@ def check_pose(world_from_camera: np.ndarray, *, where: str) -> np.ndarray:
             f"{where}: the rotation must have determinant +1; got {determinant:.3g}, a mirrored "
             "camera"
         )
-    pose = np.eye(4)
-    pose[:3] = np.asarray(world_from_camera, dtype=np.float64)[:3]
-    return pose
+    whole = np.eye(4)
+    whole[:3] = pose[:3]
+    return whole
 
 
 def look_at_pose(

@@ -27,7 +27,7 @@ import numpy as np
 import torch
 
 from adapters.lidar.origin import drive_origin
-from adapters.plain_files import array_of, number_of, read_json
+from adapters.plain_files import LARGEST, array_of, number_of, read_json
 from adapters.recording.files import block_files
 from augment.batch.calibration import read_camera
 from augment.batch.manifest import MAX_SIDE_PX
@@ -196,10 +196,10 @@ def _rigid(where: str, name: str, value: Any) -> torch.Tensor:
     matrix = array_of(value)
     if matrix is None or matrix.shape != (4, 4):
         raise AdapterError(f"{where}: {name} must be 4 rows of 4 numbers; got {value!r:.200}")
-    if not np.isfinite(matrix).all():
+    if not np.isfinite(matrix).all() or np.abs(matrix[:3, 3]).max() > LARGEST:
         raise AdapterError(
-            f"{where}: {name} must be finite; got {matrix.tolist()}. Leave the camera or the frame "
-            f"out where its pose is not known"
+            f"{where}: {name} must be finite, its place within {LARGEST:g} m; got "
+            f"{matrix.tolist()}. Leave the camera or the frame out where its pose is not known"
         )
     rotation = matrix[:3, :3].clip(-2, 2)  # larger entries are wrong anyway, and would overflow
     error = max(

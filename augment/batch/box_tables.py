@@ -15,7 +15,14 @@ from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 import numpy as np
 import pyarrow as pa
 
-from augment.batch.columns import as_described, check_count, parquet_bytes, read_parquet, texts_of
+from augment.batch.columns import (
+    as_described,
+    check_count,
+    parquet_bytes,
+    read_parquet,
+    texts_of,
+    whole,
+)
 from augment.box_pixels import NOT_COUNTED
 from augment.errors import OutputError
 
@@ -110,7 +117,9 @@ class BoxTable(Generic[Numbers]):
                 rows = slice(start, start + count)
                 # Copies: Arrow's own memory is read-only, which torch.from_numpy warns about.
                 values = {name: column[rows].copy() for name, column in columns.items()}
-                items[frame, camera] = self.record(track_ids=tuple(track_ids[rows]), **values)
+                items[whole(frame), camera] = self.record(
+                    track_ids=tuple(track_ids[rows]), **values
+                )
                 start += count
             check_count(table, start)
         return items

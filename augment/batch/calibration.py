@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from augment.batch.columns import whole
 from augment.batch.selection import SceneIndex
 from augment.cameras import Camera, Frame
 from augment.errors import OutputError
@@ -113,14 +114,15 @@ def read_camera(entry: Mapping[str, Any], name: str) -> CameraRecord:
 
     Raises:
         KeyError: the entry lacks the camera or one of its numbers.
+        ValueError, TypeError, RuntimeError: a number is none.
     """
     camera = entry["cameras"][name]
     rows = [[camera["fx"], 0.0, camera["cx"]], [0.0, camera["fy"], camera["cy"]], [0.0, 0.0, 1.0]]
     return CameraRecord(
         name,
-        camera["width"],
-        camera["height"],
-        camera["timestamp_ns"],
+        whole(camera["width"]),
+        whole(camera["height"]),
+        whole(camera["timestamp_ns"]),
         torch.tensor(rows, dtype=torch.float64),
         torch.tensor(camera["world_from_camera"], dtype=torch.float64),
     )

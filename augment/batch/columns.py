@@ -73,6 +73,17 @@ def check_count(table: pa.Table, described: int) -> None:
         raise ValueError(f"it has {table.num_rows} rows, its metadata describe {described}")
 
 
+def whole(value: object) -> int:
+    """A number of JSON that int64 holds.
+
+    Raises:
+        ValueError: it is anything else.
+    """
+    if type(value) is not int or not -(2**63) <= value < 2**63:
+        raise ValueError(f"expected a whole number; got {value!r:.80}")
+    return value
+
+
 def texts_of(data: pa.ChunkedArray) -> list[str]:
     """The texts of a column without gaps.
 
@@ -92,6 +103,8 @@ def unpack_column(data: pa.ChunkedArray, kind: str, encoding: str) -> np.ndarray
         return np.empty((0, *width), wanted)
     if encoding == "json":
         return _filled([json.loads(text) for text in data.to_pylist()], wanted)
+    if data.null_count:
+        raise ValueError(f"a column of {kind} has {data.null_count} gaps")
     array = pa.concat_arrays(data.chunks)
     if pa.types.is_fixed_size_list(array.type):
         flat = array.flatten().to_numpy(zero_copy_only=False)

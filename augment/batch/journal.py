@@ -75,7 +75,7 @@ class Journal:
         try:
             identity, *rows = [json.loads(line) for line in lines]
             return Identity(**identity), rows
-        except (ValueError, TypeError) as error:
+        except (ValueError, TypeError, RecursionError) as error:
             raise OutputError(
                 f"{self.path} is damaged: {error}. Delete it; what it lists is rendered again"
             ) from error

@@ -20,6 +20,7 @@ from augment.batch.columns import (
     read_parquet,
     texts_of,
     unpack_column,
+    whole,
 )
 from augment.errors import OutputError
 from augment.labels import Boxes, LidarSweep
@@ -149,7 +150,7 @@ def read_boxes(path: Path) -> dict[int, FrameBoxes]:
             )
             numbers = table["instance"].slice(start, count) if "instance" in names else None
             instances = None if numbers is None or numbers.null_count else numbers.to_numpy().copy()
-            frames[index] = FrameBoxes(timestamp_ns, boxes, instances)
+            frames[whole(index)] = FrameBoxes(whole(timestamp_ns), boxes, instances)
             start += count
         check_count(table, start)
     return frames

@@ -164,7 +164,7 @@ def _listed(table: pa.Table | None) -> Collection[str]:
         return frozenset()
     try:
         names = json.loads(note)
-    except ValueError:  # damaged: the parts tell it all again
+    except (ValueError, RecursionError):  # damaged: the parts tell it all again
         names = []
     if not isinstance(names, list):
         return frozenset()

@@ -34,7 +34,7 @@ def enter_variant(store: Store, scene: str, variant: str, identity: Identity) ->
             found = store.read(path)
     try:
         other = Identity(**json.loads(found))
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, RecursionError) as error:
         raise OutputError(
             f"{store.uri}/{path} is damaged: {error}. Delete it and start the job again"
         ) from error

@@ -228,6 +228,9 @@ def test_data_of_another_scene_is_refused(numbers):
         (lambda v: {"0": notes(v["0"], frame_idx=[0])}, "must be of equal length; got 1, 6 and 6"),
         (lambda v: {"0": notes(v["0"], frame_idx=[0] * 6)}, "frame numbers, each once"),
         (lambda v: {"0": notes(v["0"], frame_idx=["x"] * 6)}, "frame_idx must hold T numbers"),
+        (lambda v: {"0": notes(v["0"], frame_idx=[10**400] * 6)}, "frame_idx must hold T numbers"),
+        (lambda v: {"0": notes(v["0"], box_size=[["1"] * 3] * 6)}, "box_size must hold T x 3 numb"),
+        (lambda v: {"9" * 5000: v["0"]}, "must have a number as its key"),
         (lambda v: {"0": notes(v["0"], box_size=[[1, 2]] * 6)}, "box_size must hold T x 3 numbers"),
         (lambda v: {"0": notes(v["0"], box_size=[[1, 2, 0]] * 6)}, "box_size > 0"),
         (

@@ -184,7 +184,7 @@ def test_readers_while_blocks_are_published_and_merged(tmp_path: Path) -> None:
     assert frames_of(store) == {frame: (True, "") for frame in range(30)}
 
 
-@pytest.mark.parametrize("note", [b"{", b"5", b"null", b'{"a": 1}', b"[1, null]"])
+@pytest.mark.parametrize("note", [b"{", b"5", b"null", b'{"a": 1}', b"[1, null]", b"[" * 10**5])
 def test_a_damaged_note_in_the_manifest(tmp_path: Path, note: bytes) -> None:
     """The parts are what is true."""
     from augment.batch.manifest import manifest_bytes
