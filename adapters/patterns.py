@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import fnmatch
 import glob
 import itertools
@@ -14,7 +15,7 @@ from adapters.uri import SCHEMES, format_uri, parse_uri
 from augment.errors import AdapterError
 from recipes.job import JobScene
 
-MAX_LOOKED_AT = 500_000  # files and folders, for one pattern: a second or two
+MAX_LOOKED_AT = 200_000  # files and folders, for one pattern: a second or two
 
 
 def scenes_of(entries: Iterable[JobScene], folder: Path) -> list[JobScene]:
@@ -76,11 +77,7 @@ def _matches(top: Path, parts: tuple[str, ...], what: str) -> list[str]:
     looked_at = itertools.count()
 
     def names(folder: str) -> Iterator[os.DirEntry[str]]:
-        try:
-            entries = os.scandir(folder)
-        except OSError:  # a file, or another user's
-            return
-        with entries:
+        with contextlib.suppress(OSError), os.scandir(folder) as entries:  # a file, another user's
             for entry in entries:
                 if next(looked_at) >= MAX_LOOKED_AT:
                     raise AdapterError(

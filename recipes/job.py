@@ -182,9 +182,7 @@ def parse_job(text: str, *, source: str, name: str = "job") -> Job:
         RecipeError: it is no valid job; one line for each problem.
     """
     problems = Problems(source)
-    if not text.strip():
-        raise problems.fail(1, "the file is empty; a job names scenes and recipes")
-    tree = read_tree(text, problems)
+    tree = read_tree(text, problems, empty="the file is empty; a job names scenes and recipes")
     if not isinstance(tree, MapNode):
         raise problems.fail(tree.line, "a job is a mapping with scenes and recipes")
     problems.raise_if_any()
