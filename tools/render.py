@@ -82,7 +82,9 @@ def render_recipe(
         make_plan(resolved, scene)  # what the scene cannot give is said once, not for every image
     chosen = _pattern(frames).select([frame.index for frame in scene.frames])
     notes = lidar_notes(recipes)
-    if notes and has_lidar(scene, SceneIndex.of(scene, path).labelled.intersection(chosen)):
+    labelled = SceneIndex.of(scene, path).labelled
+    asked = labelled if chosen is None else labelled.intersection(chosen)
+    if notes and has_lidar(scene, asked):
         for note in notes:
             _say(f"note: {note}")
     job = RenderJob(

@@ -117,7 +117,8 @@ def _longest_free_line(
             best = gain[row, stop]
             begin = int(total[row, : stop + 1].argmin())
             end = max(begin, int(stop) - 1)
-            ends = tuple(np.array([p[row, i] for p in places]) for i in (begin, end))
+            first, last = (np.array([p[row, i] for p in places]) for i in (begin, end))
+            ends = first, last
     return ends
 
 

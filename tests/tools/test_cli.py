@@ -95,6 +95,17 @@ def test_render_a_flood_and_read_it_back(scene_uri, tmp_path, capsys):
     assert "flood: bed" in capsys.readouterr().out
 
 
+def test_a_job_says_at_its_start_that_sweeps_and_depth_differ(tmp_path, capsys):
+    scene = "procedural:street?seed=3&frames=1&gaussians=60000&lidar_columns=16"
+    (tmp_path / "seen-through.yaml").write_text(
+        "weather: {flood: {level_m: 0.3, reflection: sky}}\n"
+    )
+    asked = [str(tmp_path / "seen-through.yaml"), "--scene", scene, "--out", str(tmp_path / "out")]
+    for frames in ([], ["--frames", "0"]):
+        assert main(["render", *asked, *frames, "--scale", "0.1"]) == 0
+        assert "LiDAR meets the weather: " in capsys.readouterr().err
+
+
 def test_a_flood_asks_for_metres_and_gravity(scene_uri, tmp_path, capsys):
     bare = scene_uri.split("?")[0] + "?cameras=none"
     out = tmp_path / "out"
