@@ -6,7 +6,7 @@ but promise nothing between versions.
 
 from importlib import import_module
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 _PUBLIC = {
     "augment.apply": ("WeatheredView", "render_buffers", "render_view"),

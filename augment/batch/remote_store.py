@@ -22,6 +22,7 @@ from random import SystemRandom
 from typing import TYPE_CHECKING, TypeVar
 
 from augment.batch.atomic import TEMPORARY_SUFFIX
+from augment.batch.processes import uninterrupted
 from augment.batch.remote_errors import advice, is_permanent
 from augment.batch.remote_uri import RemoteUri
 from augment.batch.store import StoredFile, StoredFileMissing, stored_path
@@ -207,7 +208,7 @@ def _put(system: FileSystem, path: str, data: bytes) -> None:
         with system.open_output_stream(path, compression=None) as stream:
             stream.write(data)
 
-    _uninterrupted(upload)
+    uninterrupted(upload)
     _check_size(system, path, len(data))
 
 
@@ -231,14 +232,3 @@ def _check_size(system: FileSystem, path: str, expected: int) -> None:
     size = system.get_file_info(path).size
     if size != expected:
         raise _WrongSizeError(f"{size} bytes of {expected} arrived")
-
-
-def _uninterrupted(call: Callable[[], None]) -> None:
-    """Run where no signal's exception can come between two steps, and wait for the end.
-
-    Python runs the handlers of signals in the main thread only.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        return call()
-    with ThreadPoolExecutor(1) as pool:
-        pool.submit(call).result()

@@ -18,6 +18,7 @@ from augment.batch.backends import renders_on_gpu
 from augment.batch.boxes_2d import Surfaces
 from augment.batch.encode import encode_depth, encode_ids, encode_image, encode_mask
 from augment.batch.layout import ItemPaths
+from augment.batch.processes import uninterrupted
 from augment.batch.smog_labels import Smoggy
 from augment.batch.snow_labels import Snowy
 from augment.batch.water_labels import Flooded
@@ -151,7 +152,16 @@ class WritePump:
 
     def submit(self, task: Callable[[], Any]) -> Future:
         """Queue a task; blocks while too many wait. Tasks start in the order they come."""
+        if self._slots.acquire(blocking=False):
+            return self._queue(task)
+        # What has been drawn is written also where an interrupt comes during the wait.
+        return uninterrupted(lambda: self._queue_when_free(task))
+
+    def _queue_when_free(self, task: Callable[[], Any]) -> Future:
         self._slots.acquire()
+        return self._queue(task)
+
+    def _queue(self, task: Callable[[], Any]) -> Future:
         if self._error is not None:
             self._slots.release()
             raise self._error
