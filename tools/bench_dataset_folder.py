@@ -87,6 +87,8 @@ def _row(base: str, frame: int, camera: str, width: int, height: int) -> dict[st
         "width": width,
         "height": height,
         "surface": "solid",
+        "lidar": None,
+        "lidar_note": None,
         "style": None,
         "style_method": None,
         "quality": None,
@@ -102,7 +104,7 @@ def _row(base: str, frame: int, camera: str, width: int, height: int) -> dict[st
         "backend": "none",
         "checksum": "",
         "status": "ok",
-        "message": None,
+        "message": "",
     }
 
 

@@ -45,8 +45,8 @@ class _Watch:
     def __call__(self, event: str, arguments: tuple) -> None:
         if self.path is None or not event.startswith(WATCHED):
             return
-        if event == "open" and str(arguments[0]) == self.path:
-            return
+        if event == "open" and (str(arguments[0]) == self.path or isinstance(arguments[0], int)):
+            return  # the file, or a descriptor that is open already
         self.seen = f"{event} {arguments!r}"[:300]
 
 

@@ -51,7 +51,8 @@ def _render(scene, camera, recipe, *, backend) -> _View:
 
 
 def _written(source: Scene, out: Path, flood: Flood | None) -> Path:
-    recipe = Recipe(name="any", weather=Weather(flood=flood), output=Output(surface="first"))
+    output = Output(surface="first", lidar=True)  # the sweeps as they were
+    recipe = Recipe(name="any", weather=Weather(flood=flood), output=output)
     job = RenderJob(LABELLED_STREET, [recipe], out)
     result = run_job(job, scene_loader=lambda _: source, renderer=_render, progress=False)
     assert result.failures == ()

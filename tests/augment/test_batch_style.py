@@ -188,8 +188,8 @@ def test_the_manifest_says_the_style(searches, tmp_path: Path) -> None:
         ("dusk", "mkl", 0.5),
         ("sunset.png", "reinhard", 2.0),
     ]
-    at = table.column_names.index("surface")
-    assert table.column_names[at : at + 3] == ["surface", "style", "style_method"]
+    at = table.column_names.index("style")
+    assert table.column_names[at : at + 2] == ["style", "style_method"]
 
 
 def test_the_recipe_in_the_folder_renders_it_again(searches, tmp_path: Path) -> None:

@@ -281,9 +281,7 @@ def test_labels_that_cannot_be_measured_fail_their_image(recipe, tmp_path: Path)
 
     job = RenderJob("fake:street", [recipe], tmp_path, frames=[2], cameras=["front"])
     result = run(job, scene_loader=open_scene)
-    assert result.failures[0].endswith(
-        "measuring the boxes: EOFError: compressed file ended early"
-    )
+    assert result.failures[0].endswith("measuring the boxes: EOFError: compressed file ended early")
 
 
 def test_manifests_of_older_versions_are_read_and_gone_on_with(tmp_path: Path) -> None:

@@ -338,7 +338,8 @@ def test_labels_take_the_depth_under_water_and_only_where_there_is_water(scene, 
     assert np.abs(wet.flood.scene_depth_m[40:, :20] / road[40:, None] - 1).max() < 0.03
     up = view_of(labelled, flood(), camera(pitch=-1.0), depth="none")
     assert up.flood.level_z_m == wet.flood.level_z_m and up.flood.scene_depth_m is None
-    assert asked == [{"rgb", "alpha"}]  # of the clean frame alone
+    # Of the clean frame alone; its depth finds boxes.
+    assert asked == [{"rgb", "alpha", "expected_depth"}]
     unlabelled = view_of(scene, flood(), view, depth="none")
     assert unlabelled.flood.scene_depth_m is None
 

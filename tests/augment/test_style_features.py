@@ -89,7 +89,7 @@ def test_files_that_are_no_weights_are_refused(tmp_path, weights, capsys):
     refused(Evil(), "cannot be read as weights", lambda c, p: p.write_bytes(pickle.dumps(c)))
     assert "run by" not in capsys.readouterr().out
     (tmp_path / "w.safetensors").write_bytes(b"nothing of the kind")
-    with pytest.raises(StyleError, match="cannot be read as weights: .*header"):
+    with pytest.raises(StyleError, match=r"cannot be read as weights: .*header"):
         open_features(tmp_path / "w.safetensors")
     with pytest.raises(StyleError, match="there is no such file"):
         open_features(tmp_path / "absent.pth")
