@@ -5,9 +5,11 @@ from __future__ import annotations
 import dataclasses
 import io
 import zipfile
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -19,6 +21,7 @@ from adapters.nuscenes.sweeps import SweepFault, read_returns
 from adapters.nuscenes.tables import Annotation, SceneTables, SensorFile, read_tables
 from adapters.plain_files import inside
 from augment.errors import AdapterError
+from augment.files.pickles import read_npy
 from augment.labels import Boxes, LidarSweep
 from augment.lidar_weather.codes import INDEX_COLUMN
 
@@ -127,14 +130,18 @@ def _panoptic_of(file: Path, rows: np.ndarray) -> bytes:
         AdapterError: the file is damaged, or has no number for one of them.
     """
     try:
-        with np.load(file, allow_pickle=False) as archive:
-            numbers = archive["data"][rows]
-    except (OSError, ValueError, KeyError, IndexError, zipfile.BadZipFile) as error:
+        with zipfile.ZipFile(file) as archive, archive.open("data.npy") as member:
+            opened: Any = member
+            numbers = read_npy(opened)[rows]
+    except (OSError, ValueError, KeyError, IndexError, zlib.error, zipfile.BadZipFile) as error:
         raise AdapterError(
             f"{file} must hold an array `data`, one number a return ({error}); copy it again"
         ) from error
-    out = io.BytesIO()
-    np.savez_compressed(out, data=numbers)
+    content, out = io.BytesIO(), io.BytesIO()
+    np.save(content, numbers)
+    with zipfile.ZipFile(out, "w") as archive:  # np.savez would write the time of day
+        entry = zipfile.ZipInfo("data.npy")
+        archive.writestr(entry, content.getvalue(), zipfile.ZIP_DEFLATED)
     return out.getvalue()
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -139,7 +141,10 @@ def test_labels_of_nuscenes_returns_stay_with_their_returns(tmp_path: Path) -> N
     names = [file.parts[len(tmp_path.parts)] for file in labels.lidar_files(0)]
     assert names == ["samples", "lidarseg", "panoptic"]
     panoptic = labels.lidar_files(0)[2]
-    panoptic.write_bytes(labels.lidar_content(0, panoptic, wanted))
+    content = labels.lidar_content(0, panoptic, wanted)
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:  # no time of day: the same bytes again
+        assert archive.getinfo("data.npy").date_time == (1980, 1, 1, 0, 0, 0)
+    panoptic.write_bytes(content)
     with np.load(panoptic) as archive:
         assert archive["data"].dtype == np.uint16
         np.testing.assert_array_equal(archive["data"], wanted.columns["source_index"])
