@@ -139,18 +139,6 @@ def find_occlusion(
     return Occlusion(shown, found[:, 1], np.where(shown[:, None] > 0, bounds, np.nan))
 
 
-def rotations_of(quats: Float64[np.ndarray, "B 4"]) -> Float64[np.ndarray, "B 3 3"]:
-    """NaN of quaternions that are zero or not finite."""
-    with np.errstate(invalid="ignore", divide="ignore"):
-        w, x, y, z = (quats / np.linalg.norm(quats, axis=1, keepdims=True)).T
-        rows = [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-        return np.moveaxis(np.array(rows), -1, 0)
-
-
 def _edges_in_image(
     corners_m: np.ndarray, K: np.ndarray, size: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:

@@ -59,11 +59,12 @@ def label_view(
     if view.instance is None or surface is None:
         return view, measured
     assert surface.shown_depth_m is not None and surface.shown_classes is not None
+    placed = PlacedBoxes.of(boxes, world_origin_m)
+    if surface.shown_snow_m:
+        placed = placed_in_snow(placed, surface.shown_snow_m)
     painted = with_boxes(
         view.instance,
-        placed_in_snow(boxes, world_origin_m, surface.shown_snow_m)
-        if surface.shown_snow_m
-        else PlacedBoxes.of(boxes, world_origin_m),
+        placed,
         instances.of(boxes.track_ids),
         camera,
         surface.shown_depth_m,

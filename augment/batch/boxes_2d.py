@@ -96,7 +96,7 @@ def measure_2d(
     placed = PlacedBoxes.of(boxes, world_origin_m)
     outlines = outline_placed(placed, camera)
     if surfaces.snow_m:
-        placed = placed_in_snow(boxes, world_origin_m, surfaces.snow_m)
+        placed = placed_in_snow(placed, surfaces.snow_m)
     instance = instances.of(boxes.track_ids)
     actors = np.where(instance <= len(instances.actors), instance, 0)
     occlusion = find_occlusion(placed, camera, surfaces.depth_m, surfaces.actors, actors)

@@ -14,7 +14,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from augment.batch.box_weather import TABLES, BoxWeather, visibility
-from augment.boxes_2d import outline_boxes, rotations_of
+from augment.boxes_2d import outline_boxes
+from augment.geometry import rotmat_from_quat
 from augment.labels import Boxes
 
 BoxFrame = Literal["world", "ego", "camera"]
@@ -106,9 +107,10 @@ def boxes_2d(sample: Mapping[str, Any]) -> Boxes2d:
             f"the dataset with 'boxes' in load, of a variant whose recipe writes labels"
         )
     centers_m, quats = boxes_in_camera(boxes, camera)
+    rotations = rotmat_from_quat(torch.from_numpy(quats)).numpy()  # NaN of quaternions of zeros
     size = (camera["width"], camera["height"])
     outlines = outline_boxes(
-        centers_m, boxes["sizes_m"].numpy(), rotations_of(quats), camera["K"].numpy(), size
+        centers_m, boxes["sizes_m"].numpy(), rotations, camera["K"].numpy(), size
     )
     return Boxes2d(
         torch.from_numpy(outlines.xyxy.astype(np.float32)), torch.from_numpy(outlines.in_view)

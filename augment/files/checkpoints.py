@@ -121,7 +121,7 @@ def _read_zip(archive: zipfile.ZipFile, content: mmap.mmap) -> Any:
 
 
 def _place_in_zip(
-    content: mmap.mmap, members: Mapping[str, zipfile.ZipInfo], key: str, _: int
+    content: mmap.mmap, members: Mapping[str, zipfile.ZipInfo], key: str, *_: int
 ) -> tuple[int, int]:
     entry = members.get(f"data/{key}")
     if entry is None or entry.compress_type != zipfile.ZIP_STORED:
@@ -138,17 +138,20 @@ def _read_legacy(file: BufferedReader, content: mmap.mmap) -> Any:
         raise PickleError("it is no whole checkpoint of torch")
     Pickle({}).read(file)
     start = file.tell()
-    sizes: dict[str, int] = {}
-    storages = _Storages(None, lambda key, size: (0, sizes.setdefault(key, size)))
+    sizes: dict[str, tuple[int, int]] = {}
+    storages = _Storages(None, lambda key, *size: (0, math.prod(sizes.setdefault(key, size))))
     Pickle(_NAMES, storage=storages).read(file)
     keys = Pickle({}).read(file)
     places: dict[str, tuple[int, int]] = {}
     at = file.tell()
     for key in keys:
-        places[key] = (at + 8, sizes[key])  # 8: how many numbers follow
-        at += 8 + sizes[key]
+        count, itemsize = sizes[key]
+        if struct.unpack_from("<q", content, at) != (count,):  # how many numbers follow
+            raise PickleError(f"it does not hold the {count} numbers of storage {key}")
+        places[key] = (at + 8, count * itemsize)
+        at += 8 + count * itemsize
     file.seek(start)
-    return Pickle(_NAMES, storage=_Storages(content, lambda key, _: places[key])).read(file)
+    return Pickle(_NAMES, storage=_Storages(content, lambda key, *_: places[key])).read(file)
 
 
 @dataclass(frozen=True)
@@ -164,11 +167,12 @@ class _StorageType:
 @dataclass(frozen=True)
 class _Storages:
     """Makes the numbers that a checkpoint refers to, flat. content: the file; None makes them
-    without values. place: of a key and a number of bytes, where they start and how many there are.
+    without values. place: of a key, how many numbers and of how many bytes each, where they start
+    and how many bytes there are.
     """
 
     content: mmap.mmap | None
-    place: Callable[[str, int], tuple[int, int]]
+    place: Callable[[str, int, int], tuple[int, int]]
 
     def __call__(self, reference: Any) -> _Storage:
         what, name, key, _, count, *_ = reference
@@ -179,7 +183,7 @@ class _Storages:
             raise PickleError("it refers to numbers without a key or a length")
         dtype = kind.dtype
         size = count * dtype.itemsize
-        start, held = self.place(key, size)
+        start, held = self.place(key, count, dtype.itemsize)
         if held != size or (self.content is not None and start + size > len(self.content)):
             raise PickleError(f"it states {size} bytes for storage {key}, and holds {held}")
         if self.content is None or count == 0:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 import pickletools
 import re
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from io import BufferedIOBase
@@ -39,11 +40,11 @@ class PickleError(ValueError):
     """The file holds something else than plain values and arrays, or is damaged."""
 
 
-class Record:
+class Record(ABC):
     """What a pickle makes and then fills with a state, in the words of pickle: builds."""
 
-    def build(self, state: Any) -> None:
-        raise NotImplementedError
+    @abstractmethod
+    def build(self, state: Any) -> None: ...
 
 
 @dataclass(frozen=True)

@@ -33,20 +33,16 @@ def snow_pixels(
     surface_depth_m: z of the first solid surface, snow included; 0 = none. snow: 255 where the
     pixel shows snow. thickness_m: of the layer on level ground.
     """
-    return count_pixels(
-        placed_in_snow(boxes, world_origin_m, thickness_m), camera, surface_depth_m, snow
-    )
+    placed = placed_in_snow(PlacedBoxes.of(boxes, world_origin_m), thickness_m)
+    return count_pixels(placed, camera, surface_depth_m, snow)
 
 
-def placed_in_snow(
-    boxes: Boxes, world_origin_m: Float64[np.ndarray, "3"], thickness_m: float
-) -> PlacedBoxes:
+def placed_in_snow(placed: PlacedBoxes, thickness_m: float) -> PlacedBoxes:
     """The boxes with the snow on them. thickness_m: of the layer on level ground.
 
     The top of a box is raised, for the snow on it counts as the box; so is its bottom, for the snow
     around its wheels does not.
     """
-    placed = PlacedBoxes.of(boxes, world_origin_m)
     height = placed.sizes_m[:, 2]
     low, high = placed.low_m.copy(), placed.high_m.copy()
     above_ground = np.minimum(thickness_m + MARGIN_M, (1 - KEPT_OF_HEIGHT) * height)

@@ -111,6 +111,16 @@ def test_a_file_of_before_torch_1_6_gives_the_same(tmp_path):
             assert torch.equal(found[name], content[name])
             assert found[name].dtype == content[name].dtype
     assert torch.load(tmp_path / "old.pth", weights_only=True)["step"] == 7  # it is that format
+    torch.save({"x": torch.zeros(5)}, tmp_path / "old.pth", _use_new_zipfile_serialization=False)
+    whole = (tmp_path / "old.pth").read_bytes()
+    for wrong in (
+        whole.replace(struct.pack("<q", 5) + bytes(20), struct.pack("<q", 4) + bytes(20)),
+        whole[:-1],
+    ):
+        assert wrong != whole
+        (tmp_path / "old.pth").write_bytes(wrong)
+        with pytest.raises(AdapterError, match="does not hold the 5 numbers|states 20 bytes"):
+            load_checkpoint(tmp_path / "old.pth")
 
 
 def test_what_an_optimiser_and_a_training_run_keep_is_read(tmp_path):
