@@ -119,7 +119,7 @@ def test_a_file_of_before_torch_1_6_gives_the_same(tmp_path):
     ):
         assert wrong != whole
         (tmp_path / "old.pth").write_bytes(wrong)
-        with pytest.raises(AdapterError, match="does not hold the 5 numbers|states 20 bytes"):
+        with pytest.raises(AdapterError, match=r"does not hold the 5 numbers|states 20 bytes"):
             load_checkpoint(tmp_path / "old.pth")
 
 
