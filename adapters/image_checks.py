@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from adapters.lidar.image_views import read_image
+from adapters.lidar_scene.image_views import read_image
 from recipes.files import open_file
 
 _ENDS = ((b"\x89PNG\r\n\x1a\n", b"IEND"), (b"\xff\xd8", b"\xff\xd9"))

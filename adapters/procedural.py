@@ -1,7 +1,7 @@
 """A street made from a seed: the embedded default scene, and the tests' ground truth.
 
 `procedural:street?seed=3&frames=20` is a drive down a street with houses, trees, parked and moving
-cars and people, six cameras and a LiDAR. `adapters.street.truth.open_truth` answers exactly, for
+cars and people, six cameras and a LiDAR. `adapters.street.labels.open_truth` answers exactly, for
 the same query, what any ray through it meets.
 """
 
@@ -13,20 +13,26 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from adapters.join import join_gaussians
 from adapters.street.labels import StreetLabels
-from adapters.street.parameters import StreetParameters, parse_parameters
-from adapters.street.rig import build_frames, camera_path, ego_pose, frame_time_ns
-from adapters.street.shadows import contact_shadow
-from adapters.street.sky import build_sky
+from adapters.street.layout import (
+    StreetParameters,
+    build_frames,
+    camera_path,
+    ego_pose,
+    frame_time_ns,
+    parse_parameters,
+)
+from adapters.street.light import build_sky
 from adapters.street.splats import (
     SplatPlan,
     coarseness_for,
+    contact_shadow,
     plan_splats,
     shadow_gaussians,
     splat,
 )
 from adapters.street.world import MovingBody, Street, build_street
+from adapters.world import join_gaussians
 from augment.scene import Actor, Scene
 
 logger = logging.getLogger(__name__)

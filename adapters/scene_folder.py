@@ -18,7 +18,7 @@ from pathlib import Path
 from adapters.uri import CAMERA_PATH_KEY, GROUND_KEY, SCHEMES, format_uri, parse_uri
 from augment.cameras import Frame
 from augment.errors import AdapterError
-from augment.files.scene_files import read_saved_scene
+from augment.files.scene_file import read_saved_scene
 from augment.labels import LabelSource
 from augment.scene import Scene
 

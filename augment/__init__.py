@@ -9,13 +9,13 @@ from importlib import import_module
 __version__ = "0.2.0"
 
 _PUBLIC = {
-    "augment.apply": ("WeatheredView", "render_buffers", "render_view"),
-    "augment.batch.job": ("JobResult", "RenderJob", "run_job"),
-    "augment.batch.manifest": ("read_manifest",),
+    "augment.views": ("WeatheredView", "render_buffers", "render_view"),
+    "augment.jobs.render_job": ("JobResult", "RenderJob", "run_job"),
+    "augment.jobs.manifest": ("read_manifest",),
     "augment.cameras": ("Camera", "Frame"),
     "augment.dataset": ("SceneDataset", "WeatherDataset", "collate_frames", "split_by_scene"),
     "augment.errors": ("ClimateGSError",),
-    "augment.generate.job": ("GenerateJob", "GenerateResult", "run_generate"),
+    "augment.jobs.generate": ("GenerateJob", "GenerateResult", "run_generate"),
     "augment.labels": ("Boxes", "LidarSweep"),
     "augment.plan": ("make_plan",),
     "augment.render.buffers": ("RenderOutput",),
@@ -24,8 +24,8 @@ _PUBLIC = {
     "augment.scene": ("Actor", "Gaussians", "PosedGaussians", "Scene", "Track"),
     "augment.semantics": ("SemanticClass",),
     "augment.sky": ("ConstantSky", "CubemapSky", "LatLongSky"),
-    "augment.splat_io": ("read_splats", "write_ply", "write_splat"),
-    "augment.weather.smog": ("SmogMedium",),
+    "augment.files.ply": ("read_splats", "write_ply", "write_splat"),
+    "augment.effects.smog": ("SmogMedium",),
 }
 _HOMES = {name: module for module, names in _PUBLIC.items() for name in names}
 

@@ -6,25 +6,175 @@ it what one camera cannot see, and `apply` carries that out.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from weakref import WeakKeyDictionary
 
-from augment.place import gaussians_below, place_flood, place_smog, place_snow, place_style
+import numpy as np
+from jaxtyping import Float
+
+from augment.cameras import Camera
+from augment.effects.flood.flood import FloodMedium
+from augment.effects.flood.flood_view import COARSE, MOST_MARGIN, MOST_SHIFT
+from augment.effects.flood.water_plane import mirrored_camera, plane_window
+from augment.effects.flood.waves import make_waves
+from augment.effects.smog import SmogMedium
+from augment.effects.snow.near_camera import SIZE_M, Layer, SnowCover
+from augment.effects.snow.snow import PlacedSnow, cover_of
+from augment.effects.style.style import look_of
+from augment.errors import SceneError
+from augment.geometry import rotmat_from_quat
+from augment.ground import check_metric_and_level, ground_of
 from augment.render.buffers import (
     ALPHA,
+    AUTO,
     DEPTH_ESTIMATORS,
     EXPECTED_DEPTH,
     RGB,
     SNOW,
     SPLAT_IDS,
 )
-from augment.render.constants import RasterSettings
-from augment.scene import Scene
-from augment.snow.placed import PlacedSnow
-from augment.weather.flood import FloodMedium
-from augment.weather.smog import SmogMedium
+from augment.render.constants import ALPHA_MIN, MAX_EXTENT_SIGMAS, TAN_FOV_MARGIN, RasterSettings
+from augment.scene import Actor, Gaussians, Scene
 from recipes.errors import RecipeError
-from recipes.schema import Recipe
-from recipes.style import Style
+from recipes.schema import schema_Recipe
+from recipes.weather import Style
+
+# ------------------------------------------------------------------------------------------------
+# A recipe's weather put into a scene: heights and reasons become numbers that kernels take
+
+LEAST_DEPTH_M = 0.05  # waves run in at least this much water
+
+
+def place_style(recipe: schema_Recipe) -> tuple[Style | None, str]:
+    """The recipe's style, or None where it would change nothing; and why."""
+    style = recipe.style
+    if style is None:
+        return None, "the recipe has no style"
+    if not style.changes:
+        return None, "the style has no strength, so it changes nothing"
+    source = f"preset {style.preset!r}" if style.preset else f"image {Path(style.image or '').name}"
+    return style, f"{style.method} from {source} at strength {style.strength:g}"
+
+
+def place_smog(recipe: schema_Recipe, scene: Scene) -> tuple[SmogMedium | None, str]:
+    """The recipe's smog in the scene's heights, or None where it would change nothing; and why."""
+    smog = recipe.weather.smog
+    if smog is None:
+        return None, "the recipe has no smog"
+    if smog.sigma_per_m == 0:
+        return None, "the smog has no density, so it changes nothing"
+    base_z_m = 0.0
+    reason = f"extinction {smog.sigma_per_m:.6g}/m, model {smog.model}"
+    if smog.scale_height_m is not None:
+        if scene.ground_z_m is None:
+            raise SceneError(
+                f"weather.smog.scale_height_m = {smog.scale_height_m} needs the road's height, "
+                f"which scene {scene.name!r} ({scene.source}) does not know; remove "
+                f"scale_height_m, or add ground_z=HEIGHT to the scene's URI"
+            )
+        base_z_m = scene.ground_z_m + smog.base_height_m
+        reason += f", scale height {smog.scale_height_m:g} m above z = {base_z_m:.2f} m"
+    if not scene.has_metric_scale:
+        reason += "; the scene's unit is not known to be a metre, so densities are per scene unit"
+    return SmogMedium(smog.sigma_per_m, smog.color, smog.scale_height_m, base_z_m), reason
+
+
+def place_flood(recipe: schema_Recipe, scene: Scene) -> tuple[FloodMedium | None, str]:
+    """The recipe's flood at its height in the scene, or None without one; and why.
+
+    Raises:
+        SceneError: the scene's scale, gravity or road is not known.
+    """
+    flood = recipe.weather.flood
+    if flood is None:
+        return None, "the recipe has no flood"
+    ground = ground_of(scene)
+    bases = {"lowest": ground.lowest_z_m, "median": ground.median_z_m, "absolute": 0.0}
+    level_z_m = bases[flood.reference] + flood.level_m
+    depth_m = max(level_z_m - ground.lowest_z_m, LEAST_DEPTH_M)
+    seed = recipe.seed if flood.waves.seed is None else flood.waves.seed
+    medium = FloodMedium(
+        level_z_m=level_z_m,
+        extinction_per_m=flood.extinction_per_m_rgb,
+        rgb=flood.color,
+        waves=make_waves(flood.waves, seed=seed, depth_m=depth_m),
+        refraction_index=flood.refraction_index,
+        fresnel=flood.fresnel,
+        reflection=flood.reflection,
+    )
+    reason = (
+        f"surface at z = {level_z_m:.2f} m, {level_z_m - ground.lowest_z_m:.2f} m above the lowest "
+        f"road ({ground.source}), reflection {flood.reflection}, "
+        f"{len(medium.waves.amplitudes_m)} waves"
+    )
+    return medium, reason
+
+
+def place_snow(
+    recipe: schema_Recipe, scene: Scene, water_level_z_m: float | None
+) -> tuple[PlacedSnow | None, str]:
+    """The recipe's snow in the scene, or None where it would change nothing; and why.
+
+    water_level_z_m: of the recipe's flood, scene world.
+
+    Raises:
+        SceneError: the scene's scale or gravity is not known.
+    """
+    snow = recipe.weather.snow
+    if snow is None:
+        return None, "the recipe has no snow"
+    if not snow.lies:
+        nothing = "depth" if snow.depth_m == 0 else "coverage"
+        return None, f"the snow has no {nothing}, so it changes nothing"
+    check_metric_and_level(scene)
+    seed = recipe.seed if snow.seed is None else snow.seed
+    reason = (
+        f"{snow.depth_m:g} m deep on {100 * snow.coverage:.3g} % of what is open to the sky, no "
+        f"steeper than {snow.max_slope_deg:g} deg and seen by a camera; cells of "
+        f"{100 * snow.cell_m:g} cm near the path"
+    )
+    if water_level_z_m is not None:
+        reason += f"; none below the water's level, z = {water_level_z_m:.2f} m"
+    return PlacedSnow(snow, seed, water_level_z_m), reason
+
+
+def lowest_z_m(scene: Scene) -> float:
+    """Height below which no splat of the scene reaches at any time; worked out once per scene."""
+    if scene not in _LOWEST:
+        lows = [_lowest(scene.background), *(_lowest_of_actor(a) for a in scene.actors)]
+        _LOWEST[scene] = min(lows)
+    return _LOWEST[scene]
+
+
+_LOWEST: WeakKeyDictionary[Scene, float] = WeakKeyDictionary()
+
+
+def _lowest(gaussians: Gaussians) -> float:
+    if len(gaussians) == 0:
+        return math.inf
+    up = rotmat_from_quat(gaussians.quats)[:, 2]  # the world's z along each splat's axes
+    reach = MAX_EXTENT_SIGMAS * (up * gaussians.scales).norm(dim=1)
+    return float((gaussians.means[:, 2] - reach).min())
+
+
+def _lowest_of_actor(actor: Actor) -> float:
+    """By the sphere about the actor's origin that holds all its splats."""
+    g = actor.gaussians
+    if len(g) == 0:
+        return math.inf
+    radius = float((g.means.norm(dim=1) + MAX_EXTENT_SIGMAS * g.scales.amax(1)).max())
+    return float(actor.track.world_from_actor[:, 2, 3].min()) - radius
+
+
+def gaussians_below(scene: Scene, level_z_m: float) -> bool:
+    """Whether any splat of the scene reaches below a height: else no water stands anywhere."""
+    return lowest_z_m(scene) < level_z_m
+
+
+# ---- plan ----------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -88,7 +238,7 @@ class Plan:
         }
 
 
-def make_plan(recipe: Recipe, scene: Scene) -> Plan:
+def make_plan(recipe: schema_Recipe, scene: Scene) -> Plan:
     """The passes that `recipe` requires of `scene`.
 
     Raises:
@@ -99,7 +249,7 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
         raise RecipeError(
             f"recipe {recipe.name}, variant {recipe.variant}: quality {recipe.quality.words} has "
             f"still to choose its settings in view of a scene, as jobs do; settle the recipe first "
-            f"(augment.quality.settle)"
+            f"(augment.jobs.quality)"
         )
     flood, flood_reason = place_flood(recipe, scene)
     level_z_m = None if flood is None else flood.level_z_m
@@ -240,7 +390,7 @@ def _snow_steps(snow: PlacedSnow | None, reason: str, bare_buffers: set[str]) ->
     )
 
 
-def _exposure_step(recipe: Recipe, scene: Scene) -> Step:
+def _exposure_step(recipe: schema_Recipe, scene: Scene) -> Step:
     name = "camera colour map"
     mapped = scene.mapped_cameras
     if not mapped:
@@ -251,5 +401,379 @@ def _exposure_step(recipe: Recipe, scene: Scene) -> Step:
     return Step(name, True, why)
 
 
-def _asked(name: str, recipe: Recipe) -> str:
+def _asked(name: str, recipe: schema_Recipe) -> str:
     return f"output.{name} is {str(getattr(recipe.output, name)).lower()}"
+
+
+# ---- Boxes around Gaussians, and whether any of them can touch a camera's image ------------------
+# A rasteriser draws a Gaussian if its mean lies at `near_m` or beyond and its splat's box touches
+# the
+# image. With g = MAX_EXTENT_SIGMAS sqrt(1 + w^2), w the largest tangent that the projection's
+# Jacobian is clamped to, the splat of a Gaussian at depth z whose longest axis is s reaches at most
+# fx g s / z + 2 px from its mean's place (the 2 px: its blur). So it lies left of the image where
+#
+#     fx x / z + cx + fx g s / z + 2 < 0,    that is    fx x + (cx + 2) z + fx g s < 0 :
+#
+# a half-space of the mean, and so are the other sides. A box of means that lies wholly in one of
+# these, or before the near plane, shows nothing. Rays of an orthographic camera are parallel: z
+# drops
+# out of the sides, and w is 0.
+
+_BLUR_PX = 3.0  # 1.9 of it is the blur, the rest float32's rounding of pixels
+_ROUNDING = 1e-5  # of all terms of a sum: a hundred times float32's
+
+
+@dataclass(frozen=True, eq=False)
+class Bounds:
+    """B boxes along the axes of a part's frame that hold means. centres, halves [B, 3]: metres.
+
+    longest [B]: the largest standard deviation of a Gaussian in the box, metres.
+    """
+
+    centres: Float[np.ndarray, "B 3"]
+    halves: Float[np.ndarray, "B 3"]
+    longest: Float[np.ndarray, "B"]
+
+    def __len__(self) -> int:
+        return len(self.longest)
+
+    def grown(self, metres: Float[np.ndarray, "B"]) -> Bounds:
+        """The boxes with room on every side."""
+        return Bounds(self.centres, self.halves + metres[:, None], self.longest)
+
+    @staticmethod
+    def join(bounds: list[Bounds]) -> Bounds:
+        """All boxes of a list, in their order."""
+        return Bounds(
+            np.concatenate([np.zeros((0, 3)), *(b.centres for b in bounds)]),
+            np.concatenate([np.zeros((0, 3)), *(b.halves for b in bounds)]),
+            np.concatenate([np.zeros(0), *(b.longest for b in bounds)]),
+        )
+
+
+def bound(gaussians: Gaussians) -> Bounds:
+    """One box around all that are opaque enough to be drawn; none where there are none."""
+    shown = gaussians.opacities.detach().numpy() >= ALPHA_MIN
+    means, longest = _numbers(gaussians, shown)
+    return _boxes(means, longest, np.zeros(len(means), np.int64))
+
+
+def bound_chunks(gaussians: Gaussians, chosen: np.ndarray, side_m: float) -> Bounds:
+    """Boxes around the chosen (bool [N]), one for each square of x and y that has any."""
+    means, longest = _numbers(gaussians, chosen)
+    return bound_points(means, longest, side_m)
+
+
+def bound_points(
+    means: Float[np.ndarray, "N 3"], longest: Float[np.ndarray, "N"], side_m: float
+) -> Bounds:
+    """As bound_chunks, of means and the largest standard deviation of each."""
+    squares = np.floor(means[:, :2] / side_m).astype(np.int64)
+    return _boxes(means, longest, np.unique(squares, axis=0, return_inverse=True)[1].reshape(-1))
+
+
+def _numbers(gaussians: Gaussians, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    means = gaussians.means.detach().numpy()[chosen].astype(np.float64)
+    return means, gaussians.scales.detach().numpy()[chosen].max(1, initial=0).astype(np.float64)
+
+
+def _boxes(means: np.ndarray, longest: np.ndarray, numbers: np.ndarray) -> Bounds:
+    """Of the points that share a number, counted from 0 without gaps."""
+    if len(means) == 0:
+        return Bounds.join([])
+    order = np.argsort(numbers, kind="stable")
+    starts = np.flatnonzero(np.diff(numbers[order], prepend=-1))
+    lows = np.minimum.reduceat(means[order], starts, axis=0)
+    highs = np.maximum.reduceat(means[order], starts, axis=0)
+    widest = np.maximum.reduceat(longest[order], starts)
+    return Bounds((lows + highs) / 2, (highs - lows) / 2, widest)
+
+
+def may_show(
+    bounds: Bounds,
+    world_from_part: np.ndarray | None,
+    camera: Camera,
+    near_m: float,
+) -> np.ndarray:
+    """Whether a Gaussian of each box can touch the image, bool [B]; True where it is not known.
+
+    world_from_part: float64, [4, 4] of all boxes or [B, 4, 4]; None for the identity.
+    """
+    camera_from_part = camera.camera_from_world.numpy()
+    if world_from_part is not None:
+        camera_from_part = camera_from_part @ world_from_part
+    sides, offsets, reach = _half_spaces(camera, near_m)
+    rotation, shift = camera_from_part[..., :3, :3], camera_from_part[..., :3, 3]
+    axes = (sides @ rotation).reshape(-1, 5, 3)  # along the part's own axes, [1 or B, 5, 3]
+    centres = (axes * bounds.centres[:, None]).sum(-1)
+    extents = (np.abs(axes) * bounds.halves[:, None]).sum(-1)
+    placed = shift @ sides.T + offsets
+    most = centres + placed + extents + bounds.longest[:, None] * reach
+    slack = _ROUNDING * (np.abs(centres) + np.abs(placed) + extents)
+    return ~(most + slack < 0).any(-1)  # not `>=`: of NaN nothing is known
+
+
+def _half_spaces(camera: Camera, near_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of the camera's axes: sides [5, 3], offsets [5] and reach [5]. A Gaussian at p whose longest
+    axis is s is not drawn where sides . p + offsets + reach s < 0 in any row.
+    """
+    focal = np.array([camera.fx, camera.fy])
+    centre = np.array([camera.cx, camera.cy])
+    size = np.array([camera.width, camera.height], np.float64)
+    before, beyond = centre + _BLUR_PX, size - centre + _BLUR_PX  # px from the centre to the sides
+    sides, offsets = np.zeros((5, 3)), np.zeros(5)
+    sides[0, 2], offsets[0] = 1.0, -near_m
+    sides[[1, 2], [0, 1]], sides[[3, 4], [0, 1]] = focal, -focal
+    widest = np.zeros(2)
+    if camera.is_orthographic:
+        offsets[1:] = *before, *beyond
+    else:
+        sides[1:, 2] = *before, *beyond
+        margin = TAN_FOV_MARGIN * 0.5 * size
+        widest = (np.maximum(np.abs(centre), np.abs(size - centre)) + margin) / focal
+    reach = MAX_EXTENT_SIGMAS * focal * np.sqrt(1 + widest**2)
+    return sides, offsets, np.array([0.0, *reach, *reach])
+
+
+# ---- What one camera needs of a plan: parts, passes and buffers that can show in its image -------
+# A plan is made once for a recipe and a scene. A camera that looks away from the water, the snow or
+# an actor needs less, which is found from boxes around them before anything is drawn. What is left
+# out changes no bit of what is written.
+
+WATER_PASSES = ("flood: waves", "flood: bed", "flood: mirrored view", "flood: screen march")
+_CHUNK_M = 8.0  # side of the squares that snow is bounded in
+_SPARE_PX = 8.0  # of the margins in flood_view, and of the splats' blur at a coarse resolution
+
+
+@dataclass(frozen=True)
+class ViewPlan:
+    """What rendering one camera's image takes.
+
+    actors: instance ids (1 + index in the scene) of those drawn. snowy: of the parts whose snow is
+    drawn, 0 for the ground. water: whether the water's plane can be in view. buffers, bare_buffers:
+    as those of Plan. steps: the plan's, each with this camera's reason.
+    """
+
+    actors: tuple[int, ...]
+    snowy: tuple[int, ...]
+    water: bool
+    buffers: frozenset[str]
+    bare_buffers: frozenset[str]
+    steps: tuple[Step, ...]
+
+    @property
+    def snow(self) -> bool:
+        """Whether any snow can be in view."""
+        return bool(self.snowy)
+
+    def as_dict(self) -> dict[str, object]:
+        """For machines: buffers sorted, one entry a step."""
+        return {
+            "actors": list(self.actors),
+            "snowy": list(self.snowy),
+            "water": self.water,
+            "buffers": sorted(self.buffers),
+            "bare_buffers": sorted(self.bare_buffers),
+            "steps": [{"name": s.name, "runs": s.runs, "why": s.why} for s in self.steps],
+        }
+
+    def with_hidden_water(self) -> ViewPlan:
+        """The same view once its front layer has shown that nothing of the water is to be seen."""
+        why = "what stands before the water hides all of it"
+        return replace(self, steps=tuple(_replaced(self.steps, dict.fromkeys(WATER_PASSES, why))))
+
+
+def plan_view(plan: Plan, scene: Scene, camera: Camera, *, backend: str = AUTO) -> ViewPlan:
+    """The parts, passes and buffers of the plan that the camera's image can show.
+
+    The first call for a scene bounds its actors; under snow, it also lays the snow (cover_of), by
+    `backend`.
+
+    Raises:
+        SceneError: snow cannot be placed in this scene.
+    """
+    water, water_why = _water(plan, camera)
+    cameras = _lookers(plan, camera) if water else (camera,)
+    poses = _poses(scene, camera)
+    near_m = plan.settings.near_m
+    drawn = _owners_seen(_actor_boxes(scene), poses, cameras, near_m)
+    cover, snowy = cover_for(plan, scene, backend=backend), set[int]()
+    if cover is not None:
+        on_ground, on_actors = _snow_boxes(scene, cover)
+        if any(may_show(on_ground, None, view, near_m).any() for view in cameras):
+            snowy.add(0)
+        snowy |= _owners_seen(on_actors, poses, cameras, near_m)
+        drawn |= snowy - {0}
+    buffers, bare_buffers = _buffers(plan, bool(snowy), water)
+    return ViewPlan(
+        actors=tuple(sorted(drawn)),
+        snowy=tuple(sorted(snowy)),
+        water=water,
+        buffers=buffers,
+        bare_buffers=bare_buffers,
+        steps=_steps(plan, scene, poses, drawn, cover, snowy, water_why, buffers, bare_buffers),
+    )
+
+
+def cover_for(plan: Plan, scene: Scene, *, backend: str = AUTO) -> SnowCover | None:
+    """The plan's snow as it lies in the scene; None without one. backend: see cover_of."""
+    if plan.snow is None:
+        return None
+    worn = None if plan.style is None or plan.styles_picture else look_of(scene, plan.style)
+    return cover_of(scene, plan.snow, worn, backend=backend)
+
+
+def _water(plan: Plan, camera: Camera) -> tuple[bool, str | None]:
+    """Whether the water's plane can be in view; why its passes are skipped, if they are."""
+    if plan.flood is None:
+        return False, None
+    if float(camera.centre[2]) <= plan.flood.level_z_m:
+        return True, "the camera is under water: it sees what lies below and what lies above"
+    if plane_window(camera, plan.flood.level_z_m) is None:
+        return False, "no ray of this camera meets the water's plane"
+    return True, None
+
+
+def _lookers(plan: Plan, camera: Camera) -> tuple[Camera, ...]:
+    """Cameras that see, between them, what the layers of a view with water can show."""
+    assert plan.flood is not None
+    wide = _grown(camera, MOST_SHIFT * camera.height + _SPARE_PX)
+    if plan.flood.reflection == "sky" or float(camera.centre[2]) <= plan.flood.level_z_m:
+        return (wide,)
+    margin = MOST_MARGIN * max(camera.width, camera.height) + _SPARE_PX / COARSE
+    return wide, _grown(mirrored_camera(camera, plan.flood.level_z_m), margin)
+
+
+def _grown(camera: Camera, margin_px: float) -> Camera:
+    m = int(np.ceil(margin_px))
+    return camera.cropped(-m, -m, camera.width + 2 * m, camera.height + 2 * m)
+
+
+def _poses(scene: Scene, camera: Camera) -> dict[int, np.ndarray]:
+    """world_from_actor of the actors that exist when the image was taken, by instance id."""
+    found = ((n, a.track.pose_at(camera.timestamp_ns)) for n, a in enumerate(scene.actors, start=1))
+    return {number: pose.numpy() for number, pose in found if pose is not None}
+
+
+@dataclass(frozen=True, eq=False)
+class _Owned:
+    """Boxes in the frames of their owners. owners [B]: instance ids."""
+
+    bounds: Bounds
+    owners: np.ndarray
+
+
+def _owned(each: Iterable[tuple[int, Bounds]]) -> _Owned:
+    each = list(each)
+    counts = [len(bounds) for _, bounds in each]
+    return _Owned(
+        Bounds.join([bounds for _, bounds in each]),
+        np.repeat(np.array([number for number, _ in each], np.int64), counts),
+    )
+
+
+def _owners_seen(
+    boxes: _Owned, poses: dict[int, np.ndarray], cameras: Iterable[Camera], near_m: float
+) -> set[int]:
+    """Instance ids of which a box may be seen."""
+    rows = [row for row, owner in enumerate(boxes.owners.tolist()) if owner in poses]
+    if not rows:
+        return set()
+    b, owners = boxes.bounds, boxes.owners[rows]
+    bounds = Bounds(b.centres[rows], b.halves[rows], b.longest[rows])
+    placed = np.stack([poses[owner] for owner in owners.tolist()])
+    seen = np.zeros(len(rows), bool)
+    for camera in cameras:
+        seen |= may_show(bounds, placed, camera, near_m)
+    return set(owners[seen].tolist())
+
+
+def _actor_boxes(scene: Scene) -> _Owned:
+    """One box around each actor; worked out once per scene."""
+    if scene not in _of_actors:
+        numbered = enumerate(scene.actors, start=1)
+        _of_actors[scene] = _owned((number, bound(a.gaussians)) for number, a in numbered)
+    return _of_actors[scene]
+
+
+_of_actors: WeakKeyDictionary[Scene, _Owned] = WeakKeyDictionary()
+
+
+def _snow_boxes(scene: Scene, cover: SnowCover) -> tuple[Bounds, _Owned]:
+    """Around the ground's snow, and the actors'; worked out once per cover (of one scene)."""
+    if cover not in _of_covers:
+        on_ground = _bound_snow(cover.ground, scene.background)
+        layers = ((n, a, cover.layer_on(scene, n)) for n, a in enumerate(scene.actors, start=1))
+        on_actors = _owned((n, _bound_snow(own, a.gaussians)) for n, a, own in layers if own)
+        _of_covers[cover] = (on_ground, on_actors)
+    return _of_covers[cover]
+
+
+_of_covers: WeakKeyDictionary[SnowCover, tuple[Bounds, _Owned]] = WeakKeyDictionary()
+
+
+def _bound_snow(layer: Layer, own: Gaussians) -> Bounds:
+    """Around a part's snow, its glints, and what of the part it buries: where none of these is in
+    view, the part looks as it does without snow.
+    """
+    buried = (layer.opacities.numpy() == 0) & (own.opacities.numpy() > 0)
+    everywhere = np.ones(len(layer.gaussians), bool)
+    snow = bound_chunks(layer.gaussians, everywhere, _CHUNK_M)
+    # Close to a camera discs are split: their parts lie within one standard deviation.
+    bounds = [snow.grown(snow.longest), bound_chunks(own, buried, _CHUNK_M)]
+    if layer.crystals is not None:
+        places = layer.crystals.places_m.numpy().astype(np.float64)
+        bounds.append(bound_points(places, np.full(len(places), SIZE_M), _CHUNK_M))
+    return Bounds.join(bounds)
+
+
+def _buffers(plan: Plan, snow: bool, water: bool) -> tuple[frozenset[str], frozenset[str]]:
+    """Without snow in view the scene is the bare one already, but for its water."""
+    if plan.snow is None or snow:
+        return plan.buffers, plan.bare_buffers
+    if water:
+        return plan.snowless_buffers, plan.bare_buffers
+    return plan.snowless_buffers | plan.bare_buffers, frozenset()
+
+
+def _steps(
+    plan: Plan,
+    scene: Scene,
+    poses: dict[int, np.ndarray],
+    drawn: set[int],
+    cover: SnowCover | None,
+    snowy: set[int],
+    no_water: str | None,
+    buffers: frozenset[str],
+    bare_buffers: frozenset[str],
+) -> tuple[Step, ...]:
+    """The plan's steps with what this camera leaves out."""
+    skipped = dict[str, str]()
+    if no_water is not None:
+        skipped |= dict.fromkeys(WATER_PASSES, no_water)
+    if cover is not None:
+        if not snowy:
+            names = ("snow: placement and layer", "snow: light per pixel", "snow: bare surface")
+            skipped |= dict.fromkeys(names, "neither snow nor what it buries can be in view")
+        elif not any(_lit_per_pixel(cover.layer_on(scene, number)) for number in snowy):
+            skipped["snow: light per pixel"] = "no snow that is lit per pixel can be in view"
+        if bare_buffers:
+            skipped.pop("snow: bare surface", None)
+    steps = _replaced(plan.steps, skipped)
+    beyond, absent = len(poses) - len(drawn), len(scene.actors) - len(poses)
+    actors = (
+        f"background and {len(drawn)} of {len(scene.actors)} actors ({absent} absent at this time, "
+        f"{beyond} out of view); buffers {', '.join(sorted(buffers))}"
+    )
+    return tuple(Step(s.name, s.runs, actors) if s.name == "rasterise" else s for s in steps)
+
+
+def _lit_per_pixel(layer: Layer | None) -> bool:
+    return layer is not None and layer.slopes is not None and layer.normals is None
+
+
+def _replaced(steps: Iterable[Step], skipped: dict[str, str]) -> list[Step]:
+    """The steps, those that would run but are skipped with the reason."""
+    return [
+        Step(s.name, False, skipped[s.name]) if s.runs and s.name in skipped else s for s in steps
+    ]

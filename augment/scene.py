@@ -2,23 +2,241 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping
+import dataclasses
+import math
+from bisect import bisect_right
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int16
+from jaxtyping import Bool, Float, Int16, Int64
 from torch import Tensor
 
+from augment import kernels as color_kernels
 from augment.cameras import Camera, Frame
-from augment.color_waves import ColorWaves, colors_at
 from augment.errors import SceneError
+from augment.geometry import quat_from_rotmat
 from augment.ground_heights import Ground
 from augment.labels import Boxes, LabelSource, LidarSweep
+from augment.render.sh import rotate_sh, sh_turn
+from augment.render.threads import kernel_threads
 from augment.semantics import SemanticClass
 from augment.sky import Sky
-from augment.track import Track
+
+# ---- Where an actor is over time -----------------------------------------------------------------
+
+_STRAIGHT_RAD = 1e-6  # sin of a smaller angle loses its digits; the straight line is exact there
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """Where an actor is over time. Linear in position, slerp in rotation, between samples.
+
+    timestamps_ns: int64 [T], strictly increasing. world_from_actor: float64 [T, 4, 4].
+    hold_ns: how long before the first and after the last sample the actor stays at that pose
+    (cameras of a frame fire at slightly different moments); beyond it the actor is absent.
+    max_gap_ns: between samples further apart than this the actor is absent too, but for hold_ns
+    after the one and before the other, where it stays at that pose; None: always interpolated.
+    """
+
+    timestamps_ns: Tensor
+    world_from_actor: Float[Tensor, "T 4 4"]
+    hold_ns: int = 100_000_000
+    max_gap_ns: int | None = None
+
+    def __post_init__(self) -> None:
+        count = self.timestamps_ns.shape[0]
+        if count < 1 or tuple(self.world_from_actor.shape) != (count, 4, 4):
+            raise ValueError(
+                f"a track needs T >= 1 timestamps and world_from_actor [T, 4, 4]; "
+                f"got {count} and {list(self.world_from_actor.shape)}"
+            )
+        if count > 1 and not bool((self.timestamps_ns.diff() > 0).all()):
+            raise ValueError("track timestamps must be strictly increasing")
+
+    def pose_at(self, timestamp_ns: int) -> Float[Tensor, "4 4"] | None:
+        """world_from_actor at a time, float64, or None where the actor does not exist."""
+        knots = self._knots
+        times = knots.times_ns
+        if not times[0] - self.hold_ns <= timestamp_ns <= times[-1] + self.hold_ns:
+            return None
+        if timestamp_ns <= times[0]:
+            return self.world_from_actor[0]
+        if timestamp_ns >= times[-1]:
+            return self.world_from_actor[-1]
+        after = bisect_right(times, timestamp_ns)
+        before = after - 1
+        if self.max_gap_ns is not None and times[after] - times[before] > self.max_gap_ns:
+            if timestamp_ns - times[before] <= self.hold_ns:
+                return self.world_from_actor[before]
+            is_near = times[after] - timestamp_ns <= self.hold_ns
+            return self.world_from_actor[after] if is_near else None
+        fraction = (timestamp_ns - times[before]) / (times[after] - times[before])
+        rows = _rotation(_slerp(knots.quats[before], knots.quats[after], fraction))
+        for row, a, b in zip(rows, knots.centres[before], knots.centres[after], strict=True):
+            row.append(a + fraction * (b - a) if fraction < 0.5 else b - (b - a) * (1 - fraction))
+        return torch.tensor([*rows, [0.0, 0.0, 0.0, 1.0]], dtype=torch.float64)
+
+    @cached_property
+    def _knots(self) -> _Knots:
+        poses = self.world_from_actor.detach()
+        return _Knots(
+            self.timestamps_ns.tolist(),
+            quat_from_rotmat(poses[:, :3, :3]).tolist(),
+            poses[:, :3, 3].tolist(),
+        )
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without what is cached, which other processes make again in less time than it travels."""
+        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+
+
+@dataclass(frozen=True)
+class _Knots:
+    """A track in Python's own numbers: for a single pose, torch's and NumPy's calls take a hundred
+    times as long as the arithmetic. quats: wxyz, T of 4. centres: T of 3.
+    """
+
+    times_ns: list[int]
+    quats: list[list[float]]
+    centres: list[list[float]]
+
+
+def _slerp(a: Sequence[float], b: Sequence[float], fraction: float) -> list[float]:
+    """As augment.geometry.slerp."""
+    dot = a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]
+    angle = math.acos(min(abs(dot), 1.0))
+    weight_a, weight_b = 1 - fraction, fraction
+    if angle >= _STRAIGHT_RAD:
+        sin = math.sin(angle)
+        weight_a, weight_b = math.sin(weight_a * angle) / sin, math.sin(weight_b * angle) / sin
+    if dot < 0:  # the shorter way round
+        weight_b = -weight_b
+    return [weight_a * p + weight_b * q for p, q in zip(a, b, strict=True)]
+
+
+def _rotation(quat: Sequence[float]) -> list[list[float]]:
+    """Rows of the rotation of a wxyz quaternion of any length, as geometry.rotmat_from_quat."""
+    length = math.sqrt(sum(v * v for v in quat))
+    w, x, y, z = (v / length for v in quat)
+    return [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+
+
+# ---- Colours that change over time: a Fourier series of every splat's view-independent colour ----
+# Street Gaussians gives an actor's splats such colours (Yan et al. 2024, section 3.1, "4D spherical
+# harmonics"): sh_00(t) = sum_k c_k b_k(t) with b_k = cos(pi k t) for even k, sin(pi (k + 1) t) for
+# odd k.
+
+
+@dataclass(frozen=True, eq=False)
+class ColorWaves:
+    """What is added to sh[:, 0] of N Gaussians over time; c_0 is sh[:, 0] itself, as b_0 is 1.
+
+    coefficients [N, F - 1, 3]: c_1 to c_{F-1}, of the Gaussians' dtype. timestamps_ns [T]: strictly
+    increasing. phases: float64 [T], t at these times; linear between them, held beyond them.
+    """
+
+    coefficients: Float[Tensor, "N terms 3"]
+    timestamps_ns: Int64[Tensor, "T"]
+    phases: Float[Tensor, "T"]
+
+    def __post_init__(self) -> None:
+        count = self.timestamps_ns.shape[0]
+        if count < 1 or tuple(self.phases.shape) != (count,):
+            raise ValueError(
+                f"colour waves need T >= 1 timestamps and as many phases; got {count} and "
+                f"{list(self.phases.shape)}"
+            )
+        if count > 1 and not bool((self.timestamps_ns.diff() > 0).all()):
+            raise ValueError("timestamps of colour waves must be strictly increasing")
+        if not bool(torch.isfinite(self.phases).all()):
+            raise ValueError("phases of colour waves must be finite")
+
+    @property
+    def nbytes(self) -> int:
+        return self.coefficients.numel() * self.coefficients.element_size()
+
+    def phase_at(self, timestamp_ns: int) -> float:
+        times, phases = self.timestamps_ns.tolist(), self.phases.tolist()
+        after = bisect_right(times, timestamp_ns)
+        if after == 0:
+            return phases[0]
+        if after == len(times):
+            return phases[-1]
+        share = (timestamp_ns - times[after - 1]) / (times[after] - times[after - 1])
+        return phases[after - 1] + share * (phases[after] - phases[after - 1])
+
+    def weights_at(self, timestamp_ns: int) -> list[float]:
+        """b_1 to b_{F-1} at a time."""
+        return basis(self.phase_at(timestamp_ns), self.coefficients.shape[1] + 1)[1:]
+
+    def change_at(self, timestamp_ns: int) -> Float[Tensor, "N 3"]:
+        """What is added to sh[:, 0] at a time."""
+        weights = self.weights_at(timestamp_ns)
+        change = torch.zeros_like(self.coefficients[:, 0])
+        for term, weight in enumerate(weights):
+            change.add_(self.coefficients[:, term], alpha=weight)
+        return change
+
+
+def basis(phase: float, terms: int) -> list[float]:
+    """b_0 to b_{terms-1} at a phase."""
+    return [
+        math.cos(math.pi * k * phase) if k % 2 == 0 else math.sin(math.pi * (k + 1) * phase)
+        for k in range(terms)
+    ]
+
+
+def colors_at(
+    sh: Float[Tensor, "N K 3"],
+    waves: ColorWaves | None,
+    timestamp_ns: int,
+    turn: Float[Tensor, "3 3"] | None,
+    *,
+    fast: bool = True,
+) -> Float[Tensor, "N K 3"]:
+    """SH in the colours of a time, and turned by a rotation, where there are such.
+
+    fast: float32 goes through the CPU kernel, equal to the definition here within float rounding.
+    """
+    if fast and sh.dtype == torch.float32 and not sh.requires_grad:
+        return _colors_by_kernel(sh, waves, timestamp_ns, turn)
+    if waves is not None:
+        first = sh[:, :1] + waves.change_at(timestamp_ns)[:, None]
+        sh = torch.cat([first, sh[:, 1:]], 1)
+    return sh if turn is None or sh.shape[1] == 1 else rotate_sh(sh, turn)
+
+
+def _colors_by_kernel(
+    sh: Tensor, waves: ColorWaves | None, timestamp_ns: int, turn: Tensor | None
+) -> Tensor:
+    coefficients, weights = np.zeros((len(sh), 0, 3), np.float32), []
+    if waves is not None:
+        coefficients = waves.coefficients.detach().contiguous().numpy()
+        weights = waves.weights_at(timestamp_ns)
+    matrix = np.zeros((0, 0), np.float32)
+    if turn is not None and sh.shape[1] > 1:
+        matrix = sh_turn(turn, math.isqrt(sh.shape[1]) - 1).numpy().astype(np.float32)
+    out = np.empty(tuple(sh.shape), np.float32)
+    with kernel_threads(1):
+        color_kernels.colors_at(
+            sh.detach().contiguous().numpy(),
+            coefficients,
+            np.asarray(weights, np.float32),
+            matrix,
+            out,
+        )
+    return torch.from_numpy(out)
+
+
+# ---- scene ---------------------------------------------------------------------------------------
 
 MAX_EXTENT_M = 1e7  # float32 tells metres apart there, and squares and cells are still numbers
 SH_COUNTS = (1, 4, 9, 16)  # K = (degree + 1)^2 for degrees 0 to 3
@@ -401,3 +619,53 @@ __all__ = [
     "check_gaussians",
     "quat_lengths",
 ]
+
+
+# ---- Whether Gaussians can be drawn as they are, told without copying them -----------------------
+# `augment.scene.check_gaussians` leaves out what cannot be drawn, at the cost of copies; these say
+# beforehand whether it has anything to do, and of which rows.
+
+_QUAT_TOLERANCE = 1e-4  # of unit length; what is further off is to be normalised
+_ROWS = 1 << 16  # looked at together: temporaries stay in the cache
+
+
+def is_drawable(gaussians: Gaussians) -> bool:
+    """Whether `check_gaussians` would leave them as they are, told in one look at each number."""
+    return all(
+        _piece_is_drawable(gaussians, slice(start, start + _ROWS))
+        for start in range(0, len(gaussians), _ROWS)
+    )
+
+
+def drawable_rows(gaussians: Gaussians) -> Bool[Tensor, "N"]:
+    """The Gaussians that `check_gaussians` keeps."""
+    keep = torch.isfinite(gaussians.opacities)
+    for tensor in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.sh):
+        keep &= torch.isfinite(tensor.reshape(len(gaussians), -1).sum(1))
+    for tensor in (gaussians.means, gaussians.scales):
+        keep &= tensor.abs().amax(1) <= MAX_EXTENT_M
+    return keep & (quat_lengths(gaussians.quats) > 0) & (gaussians.scales.amin(1) > 0)
+
+
+def _piece_is_drawable(gaussians: Gaussians, rows: slice) -> bool:
+    means, quats, sh = gaussians.means[rows], gaussians.quats[rows], gaussians.sh[rows]
+    scales, opacities = gaussians.scales[rows], gaussians.opacities[rows]
+    ranges = [_range(tensor) for tensor in (means, quats, scales, opacities, sh)]
+    with np.errstate(over="ignore", invalid="ignore"):
+        shortest, longest = _range((quats.numpy() ** 2).sum(1) ** 0.5)
+    return (
+        bool(np.isfinite(ranges).all())
+        and shortest > 1 - _QUAT_TOLERANCE
+        and longest < 1 + _QUAT_TOLERANCE
+        and -MAX_EXTENT_M <= ranges[0][0] <= ranges[0][1] <= MAX_EXTENT_M
+        and 0 < ranges[2][0] <= ranges[2][1] <= MAX_EXTENT_M
+        and ranges[3][0] >= 0
+        and ranges[3][1] <= 1
+    )
+
+
+def _range(values: Tensor | np.ndarray) -> tuple[float, float]:
+    """Lowest and highest value; NaN where there is one. By NumPy, which wakes no threads."""
+    array = values.numpy() if isinstance(values, Tensor) else values
+    with np.errstate(invalid="ignore"):
+        return float(array.min()), float(array.max())

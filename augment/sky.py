@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from augment.render.gpu import resident
+from augment.render.cuda.runtime import resident
 
 
 @runtime_checkable

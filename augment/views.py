@@ -6,14 +6,27 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from augment.cameras import Camera
-from augment.render.buffers import RenderOutput
-from augment.scene import PosedGaussians
-from augment.view_plan import ViewPlan
-from augment.weather.smog import SmogMedium
+from augment.effects.flood.flood_view import Painter, render_flooded
+from augment.effects.flood.water_plane import plane_depth
+from augment.effects.smog import SmogMedium, fog_raster
+from augment.effects.style.style import look_of
+from augment.jobs.backends import choose_backend
+from augment.plan import Plan, ViewPlan, cover_for, make_plan, plan_view
+from augment.render.buffers import AUTO, CUDA, EXPECTED_DEPTH, RenderOutput, kernels_for
+from augment.render.composite import composite_sky, map_colors, quantise
+from augment.render.rasterize import rasterize
+from augment.scene import PosedGaussians, Scene
+from augment.semantics import SemanticClass
+from augment.sky import Sky
+from augment.timing import lap
+from recipes.schema import schema_Recipe
+
+# ---- views ---------------------------------------------------------------------------------------
 
 SURFACE_ALPHA = 0.5  # a pixel less covered than this shows more sky than surface: it has no depth
 
@@ -114,7 +127,7 @@ class WeatheredView:
 
     rgb: uint8 [H, W, 3]. depth_m: float32 [H, W], 0 = none. semantic: uint8 [H, W], SemanticClass.
     instance: uint16 [H, W], 0 = background or sky, else 1 + the actor's index in the scene; what is
-    written has boxes without an actor, too (`augment.batch.box_weather.label_view`).
+    written has boxes without an actor, too (`augment.jobs.view_files.label_view`).
     water: uint8 [H, W], 255 where a ray meets water first, else 0; None where the recipe has no
     flood. flood: None where the recipe has no flood. snow: uint8 [H, W], 255 where snow is what the
     pixel shows, else 0. snow, snowy: None where the recipe has no snow. smoggy: None where it has
@@ -149,3 +162,357 @@ class PendingView:
             self._view, self._finish = self._finish(), None
         assert self._view is not None
         return self._view
+
+
+# ------------------------------------------------------------------------------------------------
+# The images of a finished view as files hold them: 8 bits, depth, classes, instances and masks
+# On the CPU they are made here, image by image. On a GPU one kernel makes all of them, and one copy
+# brings them back (augment.render.cuda.images).
+
+
+@dataclass(frozen=True, eq=False)
+class ViewImages:
+    """rgb, depth_m, semantic, instance: as those of WeatheredView. water, snow: uint8 [H, W], 255
+    where the buffers of these names are true, None where there are none. scene_depth_m: float32
+    [H, W], the buffers' depth, where labels need it.
+    """
+
+    rgb: np.ndarray
+    depth_m: np.ndarray | None = None
+    semantic: np.ndarray | None = None
+    instance: np.ndarray | None = None
+    water: np.ndarray | None = None
+    snow: np.ndarray | None = None
+    scene_depth_m: np.ndarray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Wanted:
+    """What of a view's buffers becomes images.
+
+    shown: the surfaces that depth, semantic and instance images show, and the parts that its
+    splat_ids count through. first: pixels in which these images show the water instead.
+    plane_z_m: the water's surface, scene world, if an eye in the air sees it there; None leaves the
+    depth of such pixels 0. semantic, instance, depth_m, scene_depth_m: whether, or of what.
+    """
+
+    rgb: Float[Tensor, "H W 3"]
+    shown: RenderOutput
+    parts: tuple[PosedGaussians, ...]
+    semantic: bool
+    instance: bool
+    depth_m: Float[Tensor, "H W"] | None
+    scene_depth_m: Float[Tensor, "H W"] | None
+    first: Tensor | None
+    plane_z_m: float | None
+    water: Tensor | None
+    snow: Tensor | None
+
+
+def begin_images(view: WeatheredBuffers, plan: Plan, *, backend: str) -> Callable[[], ViewImages]:
+    """The images that the plan asks for, of buffers that lie where the backend leaves them. What is
+    returned waits for them, where there is something to wait for.
+    """
+    wanted = _wanted(view, plan)
+    if kernels_for(backend, wanted.rgb.detach()) == CUDA:
+        from augment.render.cuda.images import begin_cuda_images
+
+        with lap("images"):
+            return begin_cuda_images(wanted, view.camera)
+    images = _images(wanted, view)
+    return lambda: images
+
+
+def _wanted(view: WeatheredBuffers, plan: Plan) -> Wanted:
+    shown = view.bare or view  # the scene's surfaces that the other images show
+    first = view.water if plan.shows_water else None
+    in_air = plan.flood is not None and float(view.camera.centre[2]) > plan.flood.level_z_m
+    paints_boxes = plan.instance and plan.finds_boxes  # by depth and class of what is shown
+    shows_depth = plan.depth_buffer is not None or (paints_boxes and view.bare is not None)
+    return Wanted(
+        rgb=view.rgb,
+        shown=shown.raster,
+        parts=shown.parts,
+        semantic=plan.semantic or paints_boxes,
+        instance=plan.instance,
+        depth_m=shown.depth_m if shows_depth else None,
+        scene_depth_m=view.depth_m if plan.finds_boxes else None,
+        first=first,
+        plane_z_m=plan.flood.level_z_m if plan.flood is not None and in_air else None,
+        water=view.water,
+        snow=view.snow,
+    )
+
+
+def _images(wanted: Wanted, view: WeatheredBuffers) -> ViewImages:
+    """The definition, on the CPU."""
+    semantic = instance = depth = None
+    first, parts = wanted.first, wanted.parts
+    if wanted.semantic:
+        with lap("semantic image"):
+            table = semantic_table(parts)
+            semantic = _look_up(wanted.shown, table, int(SemanticClass.SKY), np.uint8)
+            if first is not None:
+                semantic[first.numpy()] = int(SemanticClass.WATER)
+    if wanted.instance:
+        with lap("instance image"):
+            instance = _look_up(wanted.shown, instance_table(parts), 0, np.uint16)
+            if first is not None:
+                instance[first.numpy()] = 0
+    if wanted.depth_m is not None:
+        depth = wanted.depth_m
+        if first is not None:
+            with lap("depth image"):
+                surface = torch.zeros_like(depth)
+                if wanted.plane_z_m is not None:
+                    surface = plane_depth(view.camera, wanted.plane_z_m).to(depth.dtype)
+                depth = torch.where(first, surface, depth)
+    with lap("8 bits"):
+        rgb = quantise(wanted.rgb)
+    return ViewImages(
+        rgb=rgb,
+        depth_m=_floats(depth),
+        semantic=semantic,
+        instance=instance,
+        water=_mask(wanted.water),
+        snow=_mask(wanted.snow),
+        scene_depth_m=_floats(wanted.scene_depth_m),
+    )
+
+
+def _floats(image: Tensor | None) -> np.ndarray | None:
+    return None if image is None else image.detach().float().numpy()
+
+
+def _mask(shown: Tensor | None) -> np.ndarray | None:
+    """uint8 [H, W]: 255 where `shown`, else 0."""
+    return None if shown is None else shown.numpy().astype(np.uint8) * np.uint8(255)
+
+
+def semantic_table(parts: tuple[PosedGaussians, ...]) -> np.ndarray:
+    """int16 [total splats]: the class of every splat, in the order splat_ids counts them."""
+    return np.concatenate([
+        np.zeros(len(p.gaussians), np.int16)
+        if p.gaussians.semantic is None
+        else p.gaussians.semantic.numpy()
+        for p in parts
+    ])  # fmt: skip
+
+
+def instance_table(parts: tuple[PosedGaussians, ...]) -> np.ndarray:
+    """uint16 [total splats]: the instance of every splat, in the order splat_ids counts them."""
+    counts = [len(p.gaussians) for p in parts]
+    return np.repeat(np.array([p.instance_id for p in parts], np.uint16), counts)
+
+
+def _look_up(raster: RenderOutput, table: np.ndarray, none: int, dtype: type) -> np.ndarray:
+    assert raster.splat_ids is not None and raster.alpha is not None
+    index = raster.splat_ids.numpy()
+    if len(table) == 0:  # no part has a splat: an empty background, and actors that are not there
+        return np.full(index.shape, none, dtype)
+    seen = (index >= 0) & (raster.alpha.detach().numpy() >= SURFACE_ALPHA)
+    return np.where(seen, table[np.maximum(index, 0)], none).astype(dtype)
+
+
+# ---- Carries out a plan: the order of the effects in plain sight ---------------------------------
+
+
+def render_view(
+    scene: Scene, camera: Camera, recipe: schema_Recipe, *, backend: str = AUTO
+) -> WeatheredView:
+    """The view of `camera` (before recipe.render.scale) under the recipe's weather, in 8 bits.
+
+    backend: as for `rasterize`, but "auto" takes the GPU where there is one.
+    """
+    return begin_view(scene, camera, recipe, backend=backend).result()
+
+
+def begin_view(
+    scene: Scene, camera: Camera, recipe: schema_Recipe, *, backend: str = AUTO
+) -> PendingView:
+    """The view of `render_view`, begun: its `result` waits for what the GPU has still to do. In the
+    meantime another view can be begun.
+    """
+    if backend == AUTO:
+        backend = choose_backend(backend, scene)
+    with lap("plan"):
+        plan = make_plan(recipe, scene)
+    buffers = render_buffers(scene, camera.scaled(recipe.render.scale), plan, backend=backend)
+    images = begin_images(buffers, plan, backend=backend)
+    view_camera = buffers.camera  # and not the buffers, which the images may long outlive
+    return PendingView(lambda: _weathered(images(), view_camera, plan, recipe))
+
+
+def render_buffers(
+    scene: Scene, camera: Camera, plan: Plan, *, backend: str = "auto"
+) -> WeatheredBuffers:
+    """The view of `camera` at its own resolution, as floats."""
+    with lap("view plan"):
+        view = plan_view(plan, scene, camera, backend=backend)
+    with lap("parts"):
+        look = None if plan.style is None else look_of(scene, plan.style)
+        worn = None if plan.styles_picture else look
+        parts = bare_parts = scene.parts_for(camera, view.actors)
+    cover = cover_for(plan, scene, backend=backend) if view.snow else None
+    if cover is not None:
+        with lap("snow: placement and layer"):
+            parts = cover.parts_for(scene, camera, parts, view.snowy, backend=backend)
+    sky = scene.sky
+    if worn is not None:
+        parts, sky = worn.on(parts, backend=backend), worn.sky
+    flooded = None
+    if plan.flood is not None and view.water:
+        painter = Painter(
+            parts, sky, plan.settings, plan.smog_in_splats, plan.smog_on_buffers, backend
+        )
+        flooded = render_flooded(painter, camera, plan.flood, view.buffers)
+    if flooded is not None:
+        rgb, raster = flooded.rgb, flooded.scene
+        if flooded.is_hidden:
+            view = view.with_hidden_water()
+    else:
+        rgb, raster = _without_water(sky, parts, camera, plan, view.buffers, backend)
+    if look is not None and plan.styles_picture:
+        with lap("style on the picture"):
+            rgb = map_colors(rgb, look.maps.picture, backend=backend)
+    color_map = scene.color_map(camera) if plan.recorded_exposure else None
+    if color_map is not None:  # a camera exposes what the weather has left, so this comes last
+        with lap("camera colour map"):
+            rgb = map_colors(rgb, color_map, backend=backend)
+    water = None if flooded is None else flooded.water
+    with lap("depth of surfaces"):
+        depth_m = _surface_depth(raster, plan, plan.buffers)
+    return WeatheredBuffers(
+        camera,
+        rgb,
+        raster,
+        depth_m,
+        parts,
+        view,
+        water=water,
+        snow=_snow_mask(raster, water),
+        bare=_bare(raster, bare_parts, camera, plan, view, backend),
+    )
+
+
+def _surface_depth(raster: RenderOutput, plan: Plan, buffers: frozenset[str]) -> Tensor | None:
+    """z of the surfaces by the planned estimator if it is among the buffers, else by the one that
+    labels need.
+    """
+    by = plan.depth_buffer if plan.depth_buffer in buffers else None
+    z = getattr(raster, by or EXPECTED_DEPTH)
+    if z is None or raster.alpha is None:
+        return None
+    return torch.where(raster.alpha >= SURFACE_ALPHA, z, 0.0)
+
+
+def _snow_mask(raster: RenderOutput, water: Tensor | None) -> Tensor | None:
+    """Where snow makes up half of the pixel or more; what a ray meets behind water is none."""
+    if raster.snow is None:
+        return None
+    shows = raster.snow >= SURFACE_ALPHA
+    return shows if water is None else shows & ~water
+
+
+def _bare(
+    raster: RenderOutput,
+    parts: tuple[PosedGaussians, ...],
+    camera: Camera,
+    plan: Plan,
+    view: ViewPlan,
+    backend: str,
+) -> BareBuffers | None:
+    """What images show of the scene without its snow. raster: of the picture, which is that scene
+    where the view has no pass for it.
+    """
+    if not plan.bare_buffers:
+        return None
+    if view.bare_buffers:
+        with lap("snow: bare surface"):
+            raster = rasterize(
+                parts, camera, buffers=view.bare_buffers, settings=plan.settings, backend=backend
+            )
+    return BareBuffers(raster, _surface_depth(raster, plan, plan.bare_buffers), parts)
+
+
+def _without_water(
+    sky: Sky,
+    parts: tuple[PosedGaussians, ...],
+    camera: Camera,
+    plan: Plan,
+    buffers: frozenset[str],
+    backend: str,
+) -> tuple[Tensor, RenderOutput]:
+    with lap("rasterise"):
+        raster = rasterize(
+            parts,
+            camera,
+            buffers=buffers,
+            settings=plan.settings,
+            smog=plan.smog_in_splats,
+            backend=backend,
+        )
+    assert raster.rgb is not None and raster.alpha is not None
+    rgb = raster.rgb
+    if plan.smog_on_buffers is not None:
+        with lap("smog on buffers"):
+            rgb = fog_raster(raster, camera, plan.smog_on_buffers, backend=backend)
+    uniform = plan.smog is not None and plan.smog.scale_height_m is None  # hides the sky
+    with lap("airlight behind the splats" if uniform else "sky"):
+        rgb = composite_sky(rgb, raster.alpha, camera, sky, smog=plan.smog, backend=backend)
+    return rgb, raster
+
+
+def _weathered(
+    images: ViewImages, camera: Camera, plan: Plan, recipe: schema_Recipe
+) -> WeatheredView:
+    """The images with what labels are measured from."""
+    weather, depth = recipe.weather, images.scene_depth_m
+    flood = snowy = smoggy = None
+    if plan.flood_level_z_m is not None:
+        seen = plan.flood is not None and images.water is not None
+        flood = FloodedView(plan.flood_level_z_m, depth if seen else None)
+    snow_m = 0.0
+    if weather.snow is not None:
+        seen = plan.snow is not None and images.snow is not None and bool(images.snow.any())
+        snow_m = weather.snow.depth_m if seen else 0.0
+        snowy = SnowyView(depth if seen else None, weather.snow.depth_m)
+    if weather.smog is not None:
+        level_z_m = None if plan.flood is None else plan.flood.level_z_m
+        smoggy = SmoggyView(plan.smog, None if plan.smog is None else depth, level_z_m)
+    size = (camera.height, camera.width)
+    water, snow = images.water, images.snow
+    if weather.flood is not None and water is None:
+        water = np.zeros(size, np.uint8)
+    if weather.snow is not None and snow is None:
+        snow = np.zeros(size, np.uint8)
+    return WeatheredView(
+        camera=camera,
+        rgb=images.rgb,
+        depth_m=None if plan.depth_buffer is None else images.depth_m,
+        semantic=images.semantic if plan.semantic else None,
+        instance=images.instance,
+        water=water,
+        flood=flood,
+        snow=snow,
+        snowy=snowy,
+        smoggy=smoggy,
+        surface=_surface_view(images, plan, snow_m),
+    )
+
+
+def _surface_view(images: ViewImages, plan: Plan, snow_m: float) -> SurfaceView | None:
+    """snow_m: of the snow in view."""
+    depth = images.scene_depth_m
+    if depth is None:
+        return None
+    is_bare = bool(plan.bare_buffers)
+    is_solid = not is_bare and not plan.shows_water
+    return SurfaceView(
+        depth_m=depth,
+        snow_m=snow_m,
+        actors=images.instance if is_solid else None,
+        shown_depth_m=images.depth_m if is_bare else depth,
+        shown_classes=images.semantic,
+        shown_snow_m=0.0 if is_bare else snow_m,
+    )

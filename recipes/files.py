@@ -15,16 +15,15 @@ from collections.abc import Mapping
 from io import BufferedReader
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
-from recipes.errors import RecipeError, short
-from recipes.nearest import nearest_word
-from recipes.schema import Recipe
-from recipes.style import FILES, Style
+from recipes.errors import RecipeError, nearest_word, short
+from recipes.schema import schema_Recipe
+from recipes.weather import FILES, Style
 
 MAX_MIB = 512  # of one file
 MOST_NAMES = 1000  # of files in a folder, to guess a misspelt one from
 
 
-def with_digest(recipe: Recipe) -> Recipe:
+def with_digest(recipe: schema_Recipe) -> schema_Recipe:
     """The recipe with the digest of its style's files; the same object where there is none.
 
     Raises:

@@ -3,19 +3,382 @@
 from __future__ import annotations
 
 import logging
+import re
 from pathlib import Path
 from typing import Any
 
-from recipes.errors import Problems, short
-from recipes.fields import ROOT, ListSpec, SectionSpec, join
-from recipes.hints import show
-from recipes.parse_value import ValueParser
-from recipes.rules import Items, broken_rules
+from recipes.errors import Problems, nearest_word, short
+from recipes.files import file_below
 from recipes.schema import VERSION
-from recipes.suggest import unknown_key
-from recipes.template import RecipeTemplate
-from recipes.values import Fixed, Value, as_number
+from recipes.template import (
+    ANY_NUMBER,
+    RANGE_KINDS,
+    ROOT,
+    Channels,
+    Choice,
+    FieldSpec,
+    Fixed,
+    Items,
+    Kind,
+    ListSpec,
+    LogUniform,
+    Normal,
+    RecipeTemplate,
+    SectionSpec,
+    TripleLine,
+    Uniform,
+    Value,
+    as_number,
+    as_triple,
+    broken_rules,
+    is_number,
+    join,
+)
 from recipes.yaml_tree import EMPTY, ListNode, MapNode, Node, ScalarNode, read_tree
+
+# ---- How messages show what was written, and what they guess was meant ---------------------------
+
+_YAML_1_1_FLAGS = {"yes": "true", "on": "true", "no": "false", "off": "false"}
+_DECIMAL_COMMA = re.compile(r"[-+]?[0-9]+,[0-9]+")
+_NUMBER_WITH_UNIT = re.compile(r"[-+]?[0-9.]+\s*[A-Za-z/%]+[0-9]?")
+
+
+def show(node: Node) -> str:
+    """The node as written, on one short line; text that is no number in quotes."""
+    if isinstance(node, ScalarNode):
+        if node.value is None:
+            return "null"
+        text = short(node.text)
+        return repr(text) if isinstance(node.value, str) else text
+    if isinstance(node, ListNode):
+        scalars = all(isinstance(item, ScalarNode) for item in node.items)
+        if scalars and len(node.items) <= 4:
+            return f"[{', '.join(map(show, node.items))}]"
+        return f"a list of {len(node.items)}"
+    keys = [f"{short(key, 20)}: ..." for key in list(node.entries)[:4]]
+    return "{" + ", ".join(keys) + ("}" if len(keys) == len(node.entries) else ", ...}")
+
+
+def hint(node: ScalarNode, spec: FieldSpec) -> str:
+    """What was probably meant, as the end of a message; '' without a guess."""
+    value = node.value
+    if isinstance(value, str):
+        return _text_hint(value.strip(), spec)
+    if spec.path == "channel" and is_number(value) and 1 < value <= 255:
+        return "; divide 0-255 values by 255"
+    return ""
+
+
+def which_range(node: MapNode, spec: FieldSpec) -> str:
+    """Why a mapping in the place of a value is no range."""
+    for key in node.entries:
+        near = nearest_word(key, RANGE_KINDS)
+        if near is not None and near != key:
+            return f"no range is called {short(key)!r}; did you mean {near}?"
+    ranges = ", ".join(RANGE_KINDS)
+    return f"must be {spec.allowed()}, or a range: a mapping with one of {ranges}"
+
+
+def _text_hint(text: str, spec: FieldSpec) -> str:
+    if spec.kind is Kind.FLAG and text.lower() in _YAML_1_1_FLAGS:
+        return f"; write {_YAML_1_1_FLAGS[text.lower()]}"
+    if spec.words:
+        near = nearest_word(text, spec.words)
+        return f"; did you mean {near}?" if near else ""
+    if spec.kind in (Kind.NUMBER, Kind.WHOLE):
+        if _DECIMAL_COMMA.fullmatch(text):
+            return "; decimals take a point"
+        if _NUMBER_WITH_UNIT.fullmatch(text):
+            return "; write the number alone"
+        return "; write it without quotes" if _is_quoted_number(text) else ""
+    return ""
+
+
+def _is_quoted_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+# ------------------------------------------------------------------------------------------------
+# One field of a file: a literal or a range, checked against the field's limits where it stands
+# A range is a mapping: {uniform: [a, b]}, {log_uniform: [a, b]}, {normal: {mean, std, min, max}} or
+# {choice: [...], weights: [...]}. Both ends, the mean and every option must be allowed values.
+
+NORMAL_KEYS = ("mean", "std", "min", "max")
+MAX_STD_PER_WIDTH = 1000  # a wider normal is uniform for all purposes, and loses digits
+
+
+class ValueParser:
+    """Turns the node of a field into its Value.
+
+    Every method returns None where something is wrong, which it has added to the problems. folder:
+    where the files that the recipe names lie; None for a text that comes from no file.
+    """
+
+    def __init__(self, problems: Problems, folder: Path | None = None) -> None:
+        self._problems, self._folder = problems, folder
+
+    def parse(self, node: Node, spec: FieldSpec, path: str) -> Value | None:
+        """The value of a field that may have a range."""
+        if isinstance(node, MapNode):
+            return self._range(node, spec, path)
+        if isinstance(node, ListNode) and spec.channel is not None and len(node.items) == 3:
+            return self._triple(node, spec.channel, path)
+        return self.literal(node, spec, path)
+
+    def literal(self, node: Node, spec: FieldSpec, path: str) -> Fixed | None:
+        """The value of a field that must be written out."""
+        if isinstance(node, MapNode) and not spec.rangeable:
+            return self._bad(node, path, f"must be {spec.allowed()}; it cannot be a range")
+        if not isinstance(node, ScalarNode):
+            return self._bad(node, path, f"must be {spec.allowed()}")
+        value = node.value
+        if spec.kind.is_text and value is not None:
+            value = node.text  # a name may look like a number
+        if not spec.accepts(value):
+            return self._bad(node, path, f"must be {spec.allowed(value)}{hint(node, spec)}")
+        if spec.kind is Kind.PATH and value is not None:
+            return self._file(node, path)
+        if spec.kind is Kind.NUMBER and value is not None:
+            return Fixed(float(as_number(value)))
+        return Fixed(value)
+
+    def _file(self, node: ScalarNode, path: str) -> Fixed | None:
+        """The name of a file as it is written, where that file can be read."""
+        if self._folder is None:
+            text = "this text is in no file, so there is no folder to look in; save it as one"
+            return self._bad(node, path, text)
+        try:
+            file_below(self._folder, node.text)
+        except ValueError as error:
+            return self._bad(node, path, str(error))
+        return Fixed(node.text)
+
+    def _bad(self, node: Node, path: str, text: str) -> None:
+        self._problems.add(node.line, f"{path} = {show(node)}: {text}")
+
+    def _number(self, node: Node, spec: FieldSpec, path: str) -> float | None:
+        fixed = self.literal(node, spec.without_null, path)
+        return None if fixed is None else as_number(fixed.value)
+
+    def _triple(self, node: ListNode, spec: FieldSpec, path: str) -> Value | None:
+        channels = [
+            self.parse(item, spec, f"{path}[{index}]") for index, item in enumerate(node.items)
+        ]
+        red, green, blue = channels
+        if red is None or green is None or blue is None:
+            return None
+        fixed = [channel.value for channel in channels if isinstance(channel, Fixed)]
+        return Fixed(as_triple(fixed)) if len(fixed) == 3 else Channels((red, green, blue))
+
+    def _range(self, node: MapNode, spec: FieldSpec, path: str) -> Value | None:
+        kinds = [key for key in node.entries if key in RANGE_KINDS]
+        if len(kinds) != 1:
+            return self._bad(node, path, which_range(node, spec))
+        kind = kinds[0]
+        allowed = {kind, "weights"} if kind == "choice" else {kind}
+        for key in node.entries.keys() - allowed:
+            line = node.entries[key][0]
+            self._problems.add(line, f"{path}.{short(key)}: no part of a range {kind!r}")
+            return None
+        body, below = node.entries[kind][1], f"{path}.{kind}"
+        if kind == "choice":
+            return self._choice(node, spec, path)
+        if spec.channel is not None and kind == "uniform":
+            return self._line(body, spec, below)
+        if spec.kind not in (Kind.NUMBER, Kind.WHOLE):
+            possible = "choice" if spec.channel is None else "uniform or choice"
+            return self._bad(node, path, f"{kind} is for numbers; a range here is {possible}")
+        if kind == "normal":
+            return self._normal(body, spec, below)
+        return self._interval(body, spec, below, log=kind == "log_uniform")
+
+    def _interval(self, body: Node, spec: FieldSpec, path: str, *, log: bool) -> Value | None:
+        if not isinstance(body, ListNode) or len(body.items) != 2:
+            return self._bad(body, path, "must be [low, high]")
+        low, high = (
+            self._number(item, spec, f"{path}[{index}]") for index, item in enumerate(body.items)
+        )
+        if low is None or high is None:
+            return None
+        if low > high:
+            return self._bad(body, path, "the low end comes first")
+        if log and low <= 0:
+            return self._bad(body.items[0], f"{path}[0]", "must be > 0: its logarithm is taken")
+        whole = spec.kind is Kind.WHOLE
+        return LogUniform(low, high, whole) if log else Uniform(low, high, whole)
+
+    def _normal(self, body: Node, spec: FieldSpec, path: str) -> Value | None:
+        if not isinstance(body, MapNode) or set(body.entries) != set(NORMAL_KEYS):
+            form = ", ".join(f"{key}: ..." for key in NORMAL_KEYS)
+            return self._bad(body, path, f"must be {{{form}}}, all four")
+        # neither the mean nor the deviation of whole numbers need be whole
+        specs = dict(zip(NORMAL_KEYS, (ANY_NUMBER, ANY_NUMBER, spec, spec), strict=True))
+        mean, std, low, high = (
+            self._number(body.entries[key][1], part, f"{path}.{key}") for key, part in specs.items()
+        )
+        if mean is None or std is None or low is None or high is None:
+            return None
+        if not low < high:
+            return self._bad(body.entries["max"][1], f"{path}.max", "must be > min")
+        if not low <= mean <= high:
+            text = f"must be from min to max, {low:g} to {high:g}"
+            return self._bad(body.entries["mean"][1], f"{path}.mean", text)
+        if not 0 < std <= MAX_STD_PER_WIDTH * (high - low):
+            text = f"must be > 0 and <= {MAX_STD_PER_WIDTH} (max - min); wider is uniform"
+            return self._bad(body.entries["std"][1], f"{path}.std", text)
+        return Normal(mean, std, low, high, spec.kind is Kind.WHOLE)
+
+    def _choice(self, node: MapNode, spec: FieldSpec, path: str) -> Value | None:
+        body, below = node.entries["choice"][1], f"{path}.choice"
+        if not isinstance(body, ListNode) or not body.items:
+            return self._bad(body, below, "must be a list of at least one option")
+        count = len(body.items)
+        parsed = [self.parse(item, spec, f"{below}[{i}]") for i, item in enumerate(body.items)]
+        options = tuple(option for option in parsed if option is not None)
+        weights: tuple[float, ...] | None = (1.0,) * count
+        if "weights" in node.entries:
+            weights = self._weights(node.entries["weights"][1], count, f"{path}.weights")
+        if weights is None or len(options) < count:
+            return None
+        return Choice(options, weights)
+
+    def _weights(self, node: Node, count: int, path: str) -> tuple[float, ...] | None:
+        if not isinstance(node, ListNode) or len(node.items) != count:
+            return self._bad(node, path, f"must be {count} numbers, one for each option")
+        read = [self._number(item, ANY_NUMBER, f"{path}[{i}]") for i, item in enumerate(node.items)]
+        weights = tuple(weight for weight in read if weight is not None)
+        if len(weights) < count:
+            return None
+        # bounds keep the sum finite and every share representable
+        if not any(weights) or any(w != 0 and not 1e-9 <= w <= 1e9 for w in weights):
+            return self._bad(node, path, "each is 0 or from 1e-9 to 1e9, and one is above 0")
+        return weights
+
+    def _line(self, body: Node, spec: FieldSpec, path: str) -> Value | None:
+        ends = "colours" if spec.kind is Kind.COLOUR else "triples of rates"
+        if not isinstance(body, ListNode) or len(body.items) != 2:
+            return self._bad(body, path, f"must be [from, to], two {ends}")
+        start, end = (
+            self.parse(item, spec, f"{path}[{index}]") for index, item in enumerate(body.items)
+        )
+        if start is None or end is None:
+            return None
+        if not (isinstance(start, Fixed) and isinstance(end, Fixed)):
+            return self._bad(body, path, f"the two {ends} must be written out, without ranges")
+        assert isinstance(start.value, tuple) and isinstance(end.value, tuple)
+        return TripleLine(start.value, end.value)
+
+
+# ---- Guesses what a misspelt key was meant to be -------------------------------------------------
+
+_UNIT = re.compile(
+    r"_(per_)?(k|c|m)?(m|metres?|meters?|ft|feet|mi|miles?|yards?|mps|kmh|kph|mph|deg|rad|ntu|fnu)$"
+)
+# What a key may have been meant to be, where the section has it.
+_SYNONYMS: dict[str, tuple[str, ...]] = {
+    "fog": ("smog",),
+    "haze": ("smog",),
+    "mist": ("smog",),
+    "beta": ("extinction_per_m",),
+    "density": ("extinction_per_m",),
+    "sigma": ("extinction_per_m",),
+    "airlight": ("color",),
+    "water": ("flood",),
+    "puddle": ("flood",),
+    "puddles": ("flood",),
+    "depth": ("level_m",),
+    "depth_m": ("level_m",),
+    "clarity": ("turbidity_ntu",),
+    "ior": ("refraction_index",),
+    "refraction": ("refraction_index",),
+    "wind": ("waves",),
+    "ripples": ("waves",),
+    "level": ("depth_m",),
+    "level_m": ("depth_m",),
+    "height": ("depth_m",),
+    "height_m": ("depth_m",),
+    "thickness": ("depth_m",),
+    "thickness_m": ("depth_m",),
+    "cover": ("coverage",),
+    "slope_deg": ("max_slope_deg",),
+    "glitter": ("sparkle",),
+    "reflectance": ("albedo",),
+    "azimuth": ("sun_azimuth_deg",),
+    "azimuth_deg": ("sun_azimuth_deg",),
+    "elevation": ("sun_elevation_deg",),
+    "elevation_deg": ("sun_elevation_deg",),
+    "drifts": ("drift",),
+    "mood": ("style",),
+    "look": ("style",),
+    "photo": ("image",),
+    "picture": ("image",),
+    "file": ("image",),
+    "path": ("image",),
+    "sky_mask": ("mask",),
+    "algorithm": ("method",),
+    "weight": ("strength",),
+    "amount": ("strength",),
+    "intensity": ("strength",),
+    "regions": ("per_region",),
+    "network": ("checkpoint",),
+    "weights": ("checkpoint",),
+    "sha256": ("digest",),
+}
+
+
+def unknown_key(key: str, section: SectionSpec) -> str:
+    """Why `key` is refused and which known one is nearest."""
+    if key in RANGE_KINDS:
+        return "a range stands for one field, not for a whole section"
+    nearest = _nearest(key, section)
+    if nearest is not None:
+        spec = {**section.fields, **section.extra}.get(nearest)
+        unit = f" ({spec.unit})" if spec and spec.unit else ""
+        return f"unknown field; did you mean {nearest}{unit}?"
+    elsewhere = [
+        (other, name)
+        for name in (key, *_SYNONYMS.get(key, ()))
+        for other in ROOT.walk()
+        if name in other.known and other is not section
+    ]
+    below = [place for place in elsewhere if place[0].path.startswith(f"{section.path}.")]
+    elsewhere = below or elsewhere
+    if elsewhere:
+        places = [join(o.path, name) if o.path else f"{name} at the top" for o, name in elsewhere]
+        return f"unknown field here; did you mean {' or '.join(places)}?"
+    return f"unknown field; known here: {', '.join(section.known)}"
+
+
+def _nearest(key: str, section: SectionSpec) -> str | None:
+    known, low = section.known, key.lower().replace("-", "_")
+    if low in known:
+        return low
+    bases = {_base(name): name for name in known}
+    if _base(low) in bases:  # visibility_km, visibility: the unit is what was wrong
+        return bases[_base(low)]
+    for meant in (*_SYNONYMS.get(low, ()), *_SYNONYMS.get(_base(low), ())):
+        if meant in known:
+            return meant
+    if any(low in other.known for other in ROOT.walk()):
+        return None  # spelt well, but in another place
+    close = nearest_word(low, known)
+    if close is None:
+        base = nearest_word(_base(low), tuple(bases))
+        close = bases[base] if base else None
+    return close
+
+
+def _base(name: str) -> str:
+    """The name without its unit."""
+    stripped = _UNIT.sub("", name)
+    return stripped or name
+
+
+# ---- parse ---------------------------------------------------------------------------------------
 
 _LOG = logging.getLogger(__name__)
 

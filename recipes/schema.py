@@ -9,18 +9,328 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from typing import Literal
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any, ClassVar, Literal, TypeVar
 
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 from pydantic.config import JsonDict
 
-from recipes.change import replaced
-from recipes.flood import Flood
-from recipes.knobs import tier_settings
-from recipes.quality import Quality
-from recipes.snow import Snow
-from recipes.style import FILES, Style
-from recipes.types import Closed, Colour, Flag, Number, Whole
+from recipes.change import changed, found, is_given, replaced
+from recipes.weather import FILES, Closed, Colour, Flag, Flood, Number, Snow, Style, Whole
+
+# ------------------------------------------------------------------------------------------------
+# What a recipe may say of speed against accuracy: a tier, or what an error or a frame may cost
+
+Tier = Literal["draft", "balanced", "reference"]
+TARGETS = ("max_flip", "budget_ms")
+
+
+class Quality(Closed):
+    """Speed against accuracy. It chooses every setting of the table of knobs that the recipe does
+    not give itself; `quality: balanced` is short for `quality: {tier: balanced}`.
+    """
+
+    SHORTHAND: ClassVar[str] = "tier"
+
+    tier: Literal["draft", "balanced", "reference"] | None = Field(
+        default=None,
+        description="draft is for a first look, balanced differs from reference by less than a "
+        "person sees, reference takes no shortcut; null leaves every setting at its default.",
+    )
+    max_flip: Number | None = Field(
+        default=None,
+        gt=0,
+        le=1,
+        description="The fastest settings whose pictures of this scene differ from reference by "
+        "no more than this: mean FLIP, the worst of a few views.",
+    )
+    budget_ms: Number | None = Field(
+        default=None,
+        gt=0,
+        le=1e7,
+        description="The most accurate settings whose frames of this scene take no longer than "
+        "this on the machine that starts the job: the median of a few views, writing left out.",
+    )
+    settled: Flag = Field(
+        default=False,
+        description="Whether max_flip or budget_ms has made its choice, which the recipe then "
+        "holds: so it is in the recipes that a job leaves, and nothing is chosen again.",
+    )
+
+    @model_validator(mode="after")
+    def _one_wish(self) -> Quality:
+        given = [name for name in ("tier", *TARGETS) if getattr(self, name) is not None]
+        if len(given) > 1:
+            raise ValueError(f"{' and '.join(given)} each choose the settings: keep one of them")
+        if self.settled and not self.has_target:
+            raise ValueError("settled belongs to max_flip or budget_ms, and neither is given")
+        return self
+
+    @property
+    def has_target(self) -> bool:
+        return self.max_flip is not None or self.budget_ms is not None
+
+    @property
+    def is_open(self) -> bool:
+        """Whether settings have still to be chosen, in view of a scene."""
+        return self.has_target and not self.settled
+
+    @property
+    def words(self) -> str | None:
+        """For the manifest: `balanced`, `max_flip 0.03`, `budget_ms 150`; None without a wish."""
+        for name in TARGETS:
+            if getattr(self, name) is not None:
+                return f"{name} {getattr(self, name):g}"
+        return self.tier
+
+
+# What each tier sets, by the fields' dotted paths, but for those that a recipe gives and those of
+# effects that it has not; the rest are at reference, the last value of every knob (recipes.schema).
+# By the rule of docs/trade.md from the tables there.
+TIERS = MappingProxyType(
+    {
+        "draft": MappingProxyType(
+            {
+                "render.scale": 0.75,
+                "render.transmittance_stop": 0.01,
+                "weather.snow.shading": "per_splat",
+            }
+        ),
+        "balanced": MappingProxyType({"render.transmittance_stop": 0.01}),
+    }
+)
+
+
+# ------------------------------------------------------------------------------------------------
+# The knobs that trade speed for accuracy: every field of a recipe that does, with its values
+# What each value costs and saves is measured by `climategs bench trade`; docs/trade.md has figures.
+
+Recipe = TypeVar(
+    "Recipe", bound=BaseModel
+)  # recipes.schema.schema_Recipe, which is made with this table
+Value = float | int | str | bool | None
+
+
+@dataclass(frozen=True)
+class Knob:
+    """One field. path: dotted. values: from the fastest to the most accurate, which is reference.
+    effect: dotted path of the section without which it is of no effect; '' for none. chosen:
+    whether a tier or a target may set it; else it is only measured: it says what is written, which
+    is the user's to say, or has no value that saves time. what: of which error and which time, in
+    a few words.
+    """
+
+    path: str
+    values: tuple[Value, ...]
+    what: str
+    effect: str = ""
+    chosen: bool = True
+
+    @property
+    def reference(self) -> Value:
+        return self.values[-1]
+
+
+# Those that save most come first: they have first call on an error that is allowed.
+KNOBS = (
+    Knob(
+        "render.scale",
+        (0.25, 0.5, 0.75, 1.0),
+        "resolution, enlarged again for the comparison",
+    ),
+    Knob(
+        "weather.flood.reflection",
+        ("sky", "screen_space", "mirrored"),
+        "what water reflects",
+        effect="weather.flood",
+    ),
+    Knob(
+        "weather.snow.cell_m",
+        (0.2, 0.1, 0.05),
+        "size of the snow's splats near the path",
+        effect="weather.snow",
+    ),
+    Knob(
+        "weather.snow.shading",
+        ("per_splat", "per_pixel"),
+        "light on the snow",
+        effect="weather.snow",
+    ),
+    Knob(
+        "render.radius_clip_px",
+        (3.0, 2.0, 1.0, 0.0),
+        "splats no larger are left out",
+    ),
+    Knob(
+        "render.transmittance_stop",
+        (0.05, 0.01, 1e-3, 1e-4),
+        "light behind it is given up",
+    ),
+    Knob(
+        "render.sh_degree",
+        (0, 1, 2, None),
+        "bands of the colours' spherical harmonics",
+    ),
+    Knob(
+        "weather.flood.waves.count",
+        (6, 12, 24),
+        "waves that make up the surface",
+        effect="weather.flood",
+    ),
+    Knob(
+        "weather.flood.fresnel",
+        ("schlick", "exact"),
+        "share of reflected light",
+        effect="weather.flood",
+    ),
+    Knob(
+        "style.evaluated",
+        ("sh", "color"),
+        "map folded into the scene or put on each colour",
+        effect="style",
+    ),
+    # Smog on buffers saves nothing here, whatever it costs.
+    Knob(
+        "weather.smog.model",
+        ("deferred", "per_gaussian"),
+        "smog on buffers or on splats",
+        effect="weather.smog",
+        chosen=False,
+    ),
+    Knob(
+        "output.depth",
+        ("none", "expected", "median", "mode"),
+        "depth estimator",
+        chosen=False,
+    ),
+    Knob(
+        "output.jpeg_quality",
+        (60, 75, 92, 100),
+        "size and error of jpg files",
+        chosen=False,
+    ),
+)
+BY_PATH = {knob.path: knob for knob in KNOBS}
+
+
+def knobs_of(recipe: BaseModel) -> tuple[Knob, ...]:
+    """The knobs that have an effect on the recipe's pictures or files."""
+    return tuple(knob for knob in KNOBS if _has_effect(knob, recipe))
+
+
+def free_knobs(recipe: BaseModel) -> tuple[Knob, ...]:
+    """Those of them that a tier or a target may set: the recipe does not give their field."""
+    return tuple(k for k in knobs_of(recipe) if k.chosen and not is_given(recipe, k.path))
+
+
+def settings_of(recipe: BaseModel) -> dict[str, Value]:
+    """The values of its knobs, by path."""
+    return {knob.path: found(recipe, knob.path) for knob in knobs_of(recipe)}
+
+
+def with_settings(recipe: Recipe, settings: Mapping[str, Value]) -> Recipe:
+    """The recipe with some knobs set, which count as given from then on.
+
+    Raises:
+        ValueError: the schema refuses a value.
+    """
+    return changed(recipe, settings)
+
+
+def tier_settings(recipe: BaseModel, tier: str) -> dict[str, Value]:
+    """What a tier sets of this recipe: of its free knobs."""
+    chosen: Mapping[str, Value] = TIERS.get(tier, {})
+    return {knob.path: chosen.get(knob.path, knob.reference) for knob in free_knobs(recipe)}
+
+
+def as_reference(recipe: Recipe) -> Recipe:
+    """The recipe with all its knobs that a tier may set at reference, given or not."""
+    return with_settings(recipe, {k.path: k.reference for k in knobs_of(recipe) if k.chosen})
+
+
+def _has_effect(knob: Knob, recipe: BaseModel) -> bool:
+    section: Any = found(recipe, knob.effect) if knob.effect else recipe
+    if section is None:
+        return False
+    if knob.path == "weather.flood.waves.count":
+        waves = found(recipe, "weather.flood.waves")
+        return bool(waves.components is None and waves.preset != "still" and waves.height > 0)
+    if knob.path == "style.evaluated":
+        return bool(found(recipe, "style.applied_to") == "scene")
+    if knob.path == "output.jpeg_quality":
+        return bool(found(recipe, "output.image") == "jpg")
+    return True
+
+
+# ---- Frame numbers as people write them: `all`, `4`, `0,5,9`, `0:20:2`, `::5` --------------------
+
+GRAMMAR = "write all, 4, 0,5,9, 0:20:2 or ::5 (start:stop:step, stop excluded)"
+
+
+@dataclass(frozen=True)
+class FramePattern:
+    """Numbers and ranges of numbers, in the order written. pieces: None stands for all frames."""
+
+    text: str
+    pieces: tuple[int | slice, ...] | None
+
+    def select(self, numbers: Sequence[int], *, clip: bool = False) -> tuple[int, ...] | None:
+        """The wanted numbers, each once, in the order written; None for all.
+
+        numbers: those there are, to which an open range goes. clip: leave out what of a range is
+        not among them; a number on its own is kept even so, for whoever looks it up to refuse.
+        """
+        if self.pieces is None:
+            return None
+        there, end = set(numbers), max(numbers, default=-1) + 1
+        wanted: list[int] = []
+        for piece in self.pieces:
+            if isinstance(piece, int):
+                wanted.append(piece)
+                continue
+            start = 0 if piece.start is None else piece.start
+            stop = end if piece.stop is None else piece.stop
+            is_open = piece.start is None or piece.stop is None
+            run = range(start, min(stop, end) if clip else stop, piece.step or 1)
+            wanted += [n for n in run if n in there] if clip or is_open else run
+        return tuple(dict.fromkeys(wanted))
+
+
+def parse_frames(text: str) -> FramePattern:
+    """The pattern in a text.
+
+    Raises:
+        ValueError: the text is none; says what is.
+    """
+    if text.strip() == "all":
+        return FramePattern(text, None)
+    try:
+        return FramePattern(text, tuple(_piece(piece) for piece in text.split(",")))
+    except ValueError:
+        raise ValueError(f"{text!r} is not understood; {GRAMMAR}") from None
+
+
+def _piece(text: str) -> int | slice:
+    if ":" not in text:
+        return _number(text)
+    values = [None if not part.strip() else _number(part) for part in text.split(":")]
+    if len(values) > 3 or (len(values) == 3 and values[2] == 0):
+        raise ValueError
+    start, stop, step = [*values, None][:3]
+    if start is not None and stop is not None and stop <= start:
+        raise ValueError
+    return slice(start, stop, step)
+
+
+def _number(text: str) -> int:
+    if not text.strip().isdecimal():
+        raise ValueError
+    return int(text)
+
+
+# ---- schema --------------------------------------------------------------------------------------
 
 VERSION = 1
 KOSCHMIEDER = 3.912  # -ln(0.02): visibility is where contrast falls to 2 %
@@ -190,7 +500,7 @@ class Output(Closed):
     labels: Flag = Field(default=True, description="Pass 3D boxes through.")
 
 
-class Recipe(Closed):
+class schema_Recipe(Closed):
     """A recipe in numbers: together with the package version it determines every pixel."""
 
     version: Literal[1] = Field(default=VERSION, description="Version of the recipe format.")
@@ -215,7 +525,7 @@ class Recipe(Closed):
     output: Output = Output()
 
     @model_validator(mode="after")
-    def _settings_of_tier(self) -> Recipe:
+    def _settings_of_tier(self) -> schema_Recipe:
         """A tier stands for numbers: it is resolved once, here, and stays as a word beside them."""
         if self.quality.tier is not None:
             for path, value in tier_settings(self, self.quality.tier).items():

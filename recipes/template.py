@@ -2,20 +2,608 @@
 
 from __future__ import annotations
 
+import enum
+import hashlib
+import itertools
+import json
+import math
 import re
-from dataclasses import dataclass
+import types
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from statistics import NormalDist
+from typing import Annotated, Any, Literal, Protocol, TypeGuard, Union, get_args, get_origin
 
-from pydantic import ValidationError
+import annotated_types
+from pydantic import BaseModel, Field, TypeAdapter, ValidationError
+from pydantic.fields import FieldInfo
 
 from recipes.errors import RecipeError
-from recipes.fields import ROOT
 from recipes.files import file_below, with_digest
-from recipes.sampler import Draws
-from recipes.schema import VERSION, Recipe
-from recipes.style import FILES
-from recipes.values import Value
+from recipes.schema import VERSION, schema_Recipe
+from recipes.weather import (
+    FILES,
+    MOST_PER_M,
+    Colour,
+    Digest,
+    FilePath,
+    Flag,
+    Number,
+    PerMetre,
+    Rates,
+    StyleName,
+    Unit,
+    Whole,
+    style_preset_names,
+)
+
+# ------------------------------------------------------------------------------------------------
+# The random numbers of a recipe: each a pure function of (seed, variant, name of the field)
+# There is no generator whose state one draw could hand to the next, so a new field or a new variant
+# leaves every other number as it was, in any process and in any order.
+
+_DOMAIN = "climategs recipe draw 1"  # a change of the scheme changes this, never silently a number
+
+
+@dataclass(frozen=True)
+class Draws:
+    """The numbers of one variant."""
+
+    seed: int
+    variant: int
+
+    def unit(self, path: str) -> float:
+        """The number in [0, 1) that belongs to `path`: 53 bits of a SHA-256."""
+        key = json.dumps([_DOMAIN, self.seed, self.variant, path])
+        digest = hashlib.sha256(key.encode()).digest()
+        return (int.from_bytes(digest[:8], "big") >> 11) * 2.0**-53
+
+
+# ---- How one field of a recipe gets its value: a fixed one, or a draw from a range ---------------
+# Draws of floats are rounded to 10 significant digits, then kept inside the ends: exp, log and erf
+# may differ in the last bit between platforms, and a recipe's numbers should not.
+
+Triple = tuple[float, float, float]  # a colour, or three rates
+RANGE_KINDS = ("uniform", "log_uniform", "normal", "choice")
+Plain = bool | int | float | str | Triple | None
+
+
+class Value(Protocol):
+    """What a template holds for a field."""
+
+    @property
+    def is_range(self) -> bool:
+        """False where every variant gets the same."""
+        ...
+
+    def draw(self, draws: Draws, path: str) -> Plain:
+        """The value of one variant; `path` names its random number."""
+        ...
+
+    def probes(self) -> tuple[Plain, ...]:
+        """The extreme values of the range, and every option of a choice: all must be allowed."""
+        ...
+
+    def describe(self) -> str:
+        """The range in words, without its unit."""
+        ...
+
+
+@dataclass(frozen=True)
+class Fixed:
+    value: Plain
+    is_range = False
+
+    def draw(self, draws: Draws, path: str) -> Plain:
+        return self.value
+
+    def probes(self) -> tuple[Plain, ...]:
+        return (self.value,)
+
+    def describe(self) -> str:
+        return words(self.value)
+
+
+@dataclass(frozen=True)
+class Uniform:
+    """Every value from low to high alike; both ends included where whole."""
+
+    low: float
+    high: float
+    whole: bool = False
+    is_range = True
+
+    def draw(self, draws: Draws, path: str) -> float:
+        unit = draws.unit(path)
+        if self.whole:
+            low, high = int(self.low), int(self.high)
+            return min(low + math.floor(unit * (high - low + 1)), high)
+        return _rounded(self.low + unit * (self.high - self.low), self.low, self.high)
+
+    def probes(self) -> tuple[float, ...]:
+        return (self.low, self.high)
+
+    def describe(self) -> str:
+        return f"uniform from {words(self.low)} to {words(self.high)}"
+
+
+@dataclass(frozen=True)
+class LogUniform:
+    """The logarithm is uniform: as often between 10 and 20 as between 100 and 200. 0 < low."""
+
+    low: float
+    high: float
+    whole: bool = False
+    is_range = True
+
+    def draw(self, draws: Draws, path: str) -> float:
+        top = self.high + 1 if self.whole else self.high  # k stands for the reals in [k, k + 1)
+        start, end = math.log(self.low), math.log(top)
+        drawn = math.exp(start + draws.unit(path) * (end - start))
+        if self.whole:
+            return min(max(math.floor(drawn), int(self.low)), int(self.high))
+        return _rounded(drawn, self.low, self.high)
+
+    def probes(self) -> tuple[float, ...]:
+        return (self.low, self.high)
+
+    def describe(self) -> str:
+        return f"log-uniform from {words(self.low)} to {words(self.high)}"
+
+
+@dataclass(frozen=True)
+class Normal:
+    """Normal, cut off at low and high, by the inverse of its distribution. low <= mean <= high."""
+
+    mean: float
+    std: float
+    low: float
+    high: float
+    whole: bool = False
+    is_range = True
+
+    def draw(self, draws: Draws, path: str) -> float:
+        margin = 0.5 if self.whole else 0.0  # a whole number stands for the reals that round to it
+        normal = NormalDist(self.mean, self.std)
+        below = normal.cdf(self.low - margin)
+        inside = normal.cdf(self.high + margin) - below
+        # inv_cdf takes no 0 or 1; the values it would give there are cut off to an end anyway
+        probability = min(max(below + draws.unit(path) * inside, 1e-300), 1 - 2.0**-53)
+        drawn = normal.inv_cdf(probability)
+        if self.whole:
+            return min(max(math.floor(drawn + 0.5), int(self.low)), int(self.high))
+        return _rounded(drawn, self.low, self.high)
+
+    def probes(self) -> tuple[float, ...]:
+        return (self.low, self.high)
+
+    def describe(self) -> str:
+        return (
+            f"normal with mean {words(self.mean)} and deviation {words(self.std)}, "
+            f"from {words(self.low)} to {words(self.high)}"
+        )
+
+
+@dataclass(frozen=True)
+class Choice:
+    """One of the options, which may be ranges themselves. weights: >= 0, their sum > 0."""
+
+    options: tuple[Value, ...]
+    weights: tuple[float, ...]
+    is_range = True
+
+    def draw(self, draws: Draws, path: str) -> Plain:
+        remaining = draws.unit(path) * math.fsum(self.weights)
+        chosen = -1
+        for index, weight in enumerate(self.weights):
+            if weight > 0:
+                chosen = index
+                if remaining < weight:
+                    break
+                remaining -= weight
+        return self.options[chosen].draw(draws, f"{path}.choice[{chosen}]")
+
+    def probes(self) -> tuple[Plain, ...]:
+        return tuple(probe for option in self.options for probe in option.probes())
+
+    def describe(self) -> str:
+        total = math.fsum(self.weights)
+        even = len(set(self.weights)) == 1
+        parts = [
+            option.describe() + ("" if even else f" ({100 * weight / total:.3g} %)")
+            for option, weight in zip(self.options, self.weights, strict=True)
+        ]
+        return f"one of {', '.join(parts)}"
+
+
+@dataclass(frozen=True)
+class TripleLine:
+    """On the straight line from one to another: one random number, so no odd mixtures."""
+
+    start: Triple
+    end: Triple
+    is_range = True
+
+    def draw(self, draws: Draws, path: str) -> Triple:
+        unit = draws.unit(path)
+        ends = zip(self.start, self.end, strict=True)
+        return as_triple(_rounded(a + unit * (b - a), min(a, b), max(a, b)) for a, b in ends)
+
+    def probes(self) -> tuple[Triple, ...]:
+        return (self.start, self.end)
+
+    def describe(self) -> str:
+        return f"uniform from {words(self.start)} to {words(self.end)}"
+
+
+@dataclass(frozen=True)
+class Channels:
+    """Three channels that are drawn one by one."""
+
+    channels: tuple[Value, Value, Value]
+    is_range = True
+
+    def draw(self, draws: Draws, path: str) -> Triple:
+        return as_triple(c.draw(draws, f"{path}[{i}]") for i, c in enumerate(self.channels))
+
+    def probes(self) -> tuple[Triple, ...]:
+        probes = [[as_number(probe) for probe in channel.probes()] for channel in self.channels]
+        return (as_triple(map(min, probes)), as_triple(map(max, probes)))
+
+    def describe(self) -> str:
+        return f"[{', '.join(channel.describe() for channel in self.channels)}]"
+
+
+def _rounded(drawn: float, low: float, high: float) -> float:
+    return min(max(float(f"{drawn:.10g}"), low), high)
+
+
+def is_number(value: object) -> TypeGuard[int | float]:
+    """Whether this is a number; True and False are none."""
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def as_number(value: Plain) -> float:
+    """The value of a field that was checked to hold a number."""
+    assert is_number(value), value
+    return value
+
+
+def as_triple(values: Iterable[Plain]) -> Triple:
+    """The three channels of a field that was checked to hold a colour or rates."""
+    red, green, blue = map(as_number, values)
+    return (red, green, blue)
+
+
+def words(value: Plain) -> str:
+    """A value as it would be written in a recipe, floats shortened."""
+    if value is None:
+        return "null"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, tuple):
+        return f"[{', '.join(words(channel) for channel in value)}]"
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+# ------------------------------------------------------------------------------------------------
+# The fields of a recipe as a table, read off the models of `schema`: nothing is stated twice
+# The loader, its messages, the JSON Schema and the documentation all walk `ROOT`.
+
+# the end of a field's name says its unit
+UNITS = {
+    "_per_m": "1/metre",
+    "_m": "metres",
+    "_deg": "degrees",
+    "_ntu": "nephelometric turbidity units",
+}
+
+_LIMITS = {
+    annotated_types.Gt: (">", "gt"),
+    annotated_types.Ge: (">=", "ge"),
+    annotated_types.Lt: ("<", "lt"),
+    annotated_types.Le: ("<=", "le"),
+}
+
+
+class Kind(enum.Enum):
+    """What a field holds, in the words of the messages."""
+
+    NUMBER = "a number"
+    WHOLE = "a whole number"
+    FLAG = "true or false"
+    WORD = "one of"
+    COLOUR = "a colour"
+    RATES = "three rates"
+    TEXT = "text"
+    PATH = "a file in the recipe's folder or below it"
+    DIGEST = "64 hexadecimal digits, small letters"
+
+    @property
+    def is_text(self) -> bool:
+        """Whether it is taken as it is written, though it may look like a number."""
+        return self in (Kind.TEXT, Kind.PATH, Kind.DIGEST)
+
+
+_TEXTS = ((StyleName, Kind.WORD), (FilePath, Kind.PATH), (Digest, Kind.DIGEST))
+
+
+@dataclass(frozen=True)
+class FieldSpec:
+    """One field that holds a value.
+
+    path: as in a file, with [] for the items of a list. limits: pairs such as (">", 0.0). words:
+    what a WORD may be, or a FLAG besides true and false. rangeable: a range may stand here.
+    required: there is no default.
+    annotation: what pydantic checks a value against. channel: what each of a COLOUR's or RATES'
+    three numbers is; None for other kinds.
+    """
+
+    path: str
+    kind: Kind
+    description: str
+    annotation: Any
+    nullable: bool = False
+    default: Any = None
+    limits: tuple[tuple[str, float], ...] = ()
+    words: tuple[str, ...] = ()
+    rangeable: bool = True
+    required: bool = False
+    channel: FieldSpec | None = None
+
+    @property
+    def name(self) -> str:
+        return self.path.rpartition(".")[2]
+
+    @property
+    def unit(self) -> str | None:
+        """The unit in words; None for a pure number."""
+        for suffix, unit in UNITS.items():
+            if self.name.endswith(suffix):
+                return unit
+        return None
+
+    @cached_property
+    def _adapter(self) -> TypeAdapter[Any]:
+        return TypeAdapter(self.annotation)
+
+    def accepts(self, value: object) -> bool:
+        """Whether the schema takes this value."""
+        if value is None:
+            return self.nullable
+        try:
+            self._adapter.validate_python(value)
+        except ValidationError:
+            return False
+        return True
+
+    def allowed(self, value: object = None) -> str:
+        """What may stand here. `value`: the one refused; what is right about it goes unsaid."""
+        if self.kind is Kind.WORD:
+            text = f"one of {', '.join(self.words)}"
+        elif self.kind is Kind.FLAG and self.words:
+            text = f"{', '.join(('true', 'false', *self.words[:-1]))} or {self.words[-1]}"
+        elif self.channel is not None:
+            text = f"[red, green, blue], each {self.channel.allowed()}"
+        elif self.kind is Kind.TEXT:
+            text = "up to 64 letters, digits, '.', '_' or '-', the first a letter or a digit"
+        elif self.kind.is_text:
+            text = self.kind.value
+        else:
+            text = self._allowed_number(value)
+        if self.unit and self.channel is None:
+            text += f" ({self.unit})"
+        return text + (", or null" if self.nullable and not is_number(value) else "")
+
+    def _allowed_number(self, value: object) -> str:
+        limits = " and ".join(f"{sign} {plain(bound)}" for sign, bound in self.limits)
+        right_type = is_number(value) and (isinstance(value, int) or self.kind is Kind.NUMBER)
+        if limits and right_type and value == value:
+            return limits
+        return f"{self.kind.value} {limits}".strip()
+
+    @property
+    def without_null(self) -> FieldSpec:
+        return replace(self, nullable=False)
+
+
+@dataclass(frozen=True)
+class ListSpec:
+    """A list of mappings, which may be absent. most: how many. description: of all of them."""
+
+    most: int
+    description: str
+
+
+@dataclass(frozen=True)
+class SectionSpec:
+    """A mapping of fields. effect: it may be absent, and then has a probability of being there.
+
+    items: set where not one such mapping stands but a list of them; the path then ends in [].
+    shorthand: name of the field whose value may stand in place of the mapping.
+    """
+
+    path: str
+    model: type[BaseModel]
+    description: str
+    effect: bool = False
+    items: ListSpec | None = None
+    shorthand: str | None = None
+    fields: dict[str, FieldSpec] = field(default_factory=dict)
+    sections: dict[str, SectionSpec] = field(default_factory=dict)
+    extra: dict[str, FieldSpec] = field(default_factory=dict)
+
+    @property
+    def known(self) -> tuple[str, ...]:
+        """Every key that may stand here, fields of the template alone included."""
+        return (*self.fields, *self.extra, *self.sections)
+
+    def walk(self) -> Iterator[SectionSpec]:
+        """This section, then all below it."""
+        yield self
+        for section in self.sections.values():
+            yield from section.walk()
+
+
+def plain(number: float) -> str:
+    """A number without exponent or trailing zeros where it is short so."""
+    whole = isinstance(number, int) or (number.is_integer() and abs(number) < 1e15)
+    return str(int(number)) if whole else repr(number)
+
+
+def join(path: str, name: str) -> str:
+    """The dotted path of a key in a section; '' is the top."""
+    return f"{path}.{name}" if path else name
+
+
+def _section(
+    path: str, model: type[BaseModel], *, effect: bool = False, items: ListSpec | None = None
+) -> SectionSpec:
+    description = " ".join((model.__doc__ or "").split())
+    shorthand: str | None = getattr(model, "SHORTHAND", None)
+    spec = SectionSpec(path, model, description, effect, items, shorthand)
+    for name, info in model.model_fields.items():
+        below = join(path, name)
+        inner, nullable = _without_none(info.annotation)
+        item = _item(inner)
+        if item is not None:
+            items = ListSpec(_most(info), info.description or "")
+            spec.sections[name] = _section(f"{below}[]", item, items=items)
+        elif isinstance(inner, type) and issubclass(inner, BaseModel):
+            spec.sections[name] = _section(below, inner, effect=nullable)
+        else:
+            spec.fields[name] = _field(below, info, rangeable=bool(path))
+    if effect:
+        spec.extra["probability"] = FieldSpec(
+            path=join(path, "probability"),
+            kind=Kind.NUMBER,
+            description="Share of the variants that have this effect.",
+            annotation=Unit,
+            default=1.0,
+            limits=((">=", 0.0), ("<=", 1.0)),
+            rangeable=False,
+        )
+    return spec
+
+
+def _field(path: str, info: FieldInfo, *, rangeable: bool) -> FieldSpec:
+    inner, nullable = _without_none(info.annotation)
+    bounds = [
+        (sign, getattr(rule, attribute))
+        for rule in info.metadata
+        for kind, (sign, attribute) in _LIMITS.items()
+        if isinstance(rule, kind)
+    ]
+    required, kind = info.is_required(), _kind(inner)
+    return FieldSpec(
+        path=path,
+        kind=kind,
+        description=info.description or "",
+        annotation=Annotated[info.annotation, info],
+        nullable=nullable,
+        default=None if required else info.default,
+        limits=tuple(bounds),
+        words=_words(inner),
+        rangeable=rangeable and kind is not Kind.DIGEST,
+        required=required,
+        channel={Kind.COLOUR: CHANNEL, Kind.RATES: RATE}.get(kind),
+    )
+
+
+def _item(annotation: Any) -> type[BaseModel] | None:
+    """The model of a list's items; None for what is no list of models."""
+    arguments = get_args(annotation)
+    if get_origin(annotation) is not tuple or arguments[1:] != (...,):
+        return None
+    item: type[BaseModel] = arguments[0]
+    return item
+
+
+def _most(info: FieldInfo) -> int:
+    (most,) = (r.max_length for r in info.metadata if isinstance(r, annotated_types.MaxLen))
+    return most
+
+
+def _without_none(annotation: Any) -> tuple[Any, bool]:
+    """The annotation without `| None` and `Annotated`, and whether None was there.
+
+    The kinds of text stay as they are annotated: nothing else tells them apart.
+    """
+    nullable = False
+    if get_origin(annotation) in (Union, types.UnionType):
+        members = [member for member in get_args(annotation) if member is not type(None)]
+        nullable = len(members) < len(get_args(annotation))
+        if len(members) == 2 and members[0] == Flag and get_origin(members[1]) is Literal:
+            return members[0] | members[1], nullable
+        assert len(members) == 1, f"a field is of one type or null, or a flag or a word; {members}"
+        annotation = members[0]
+    if get_origin(annotation) is Annotated and all(annotation != text for text, _ in _TEXTS):
+        annotation = get_args(annotation)[0]
+    return annotation, nullable
+
+
+def _words(annotation: Any) -> tuple[str, ...]:
+    if annotation == StyleName:
+        return style_preset_names()
+    if get_origin(annotation) in (Union, types.UnionType):  # true, false, or a word
+        annotation = get_args(annotation)[1]
+    return tuple(map(str, get_args(annotation))) if get_origin(annotation) is Literal else ()
+
+
+def _kind(annotation: Any) -> Kind:
+    for text, kind in _TEXTS:
+        if annotation == text:
+            return kind
+    if annotation == Colour:
+        return Kind.COLOUR
+    if annotation == Rates:
+        return Kind.RATES
+    if get_origin(annotation) is Literal:
+        return Kind.WORD
+    if get_origin(annotation) in (Union, types.UnionType):
+        return Kind.FLAG
+    return {float: Kind.NUMBER, int: Kind.WHOLE, bool: Kind.FLAG, str: Kind.TEXT}[annotation]
+
+
+CHANNEL = FieldSpec(
+    path="channel",
+    kind=Kind.NUMBER,
+    description="One channel of a colour.",
+    annotation=Unit,
+    limits=((">=", 0.0), ("<=", 1.0)),
+)
+RATE = FieldSpec(
+    path="rate_per_m",
+    kind=Kind.NUMBER,
+    description="One channel of three rates.",
+    annotation=PerMetre,
+    limits=((">=", 0.0), ("<=", MOST_PER_M)),
+)
+ANY_NUMBER = FieldSpec("number", Kind.NUMBER, "", Annotated[Number, Field(allow_inf_nan=False)])
+VARIANTS = FieldSpec(
+    path="variants",
+    kind=Kind.WHOLE,
+    description="How many recipes are drawn from this file.",
+    annotation=Annotated[Whole, Field(ge=1, le=1_000_000)],
+    default=1,
+    limits=((">=", 1), ("<=", 1_000_000)),
+    rangeable=False,
+)
+
+
+def _root() -> SectionSpec:
+    root = _section("", schema_Recipe)
+    root.extra["variants"] = VARIANTS
+    assert root.fields["version"].words == (str(VERSION),)
+    return root
+
+
+ROOT = _root()
+
+
+# ---- template ------------------------------------------------------------------------------------
 
 _INDEX = re.compile(r"\[[0-9]+\]")
 
@@ -41,7 +629,7 @@ class RecipeTemplate:
     lists: tuple[tuple[str, int], ...] = ()
     folder: Path | None = None
 
-    def resolve(self, variant: int) -> Recipe:
+    def resolve(self, variant: int) -> schema_Recipe:
         """The recipe number `variant`, counted from 0.
 
         Its numbers depend on the seed, on first_variant + variant and on each field's own path
@@ -79,7 +667,7 @@ class RecipeTemplate:
         where = f"{self.source}: variant {number}"
         self._find_files(data.get("style"), where)
         try:
-            return with_digest(Recipe.model_validate(data))
+            return with_digest(schema_Recipe.model_validate(data))
         except ValidationError as error:
             raise RecipeError(*(f"{where}: {text}" for text in readable(error))) from None
         except RecipeError as error:
@@ -134,3 +722,84 @@ def _put(data: dict[str, Any], path: str, value: object) -> None:
         # a list is put before its items' fields, with a mapping for each
         data = data[key][int(index)] if index else data.setdefault(key, {})
     data[name] = value
+
+
+# ---- Rules between the fields of a section, tried at the ends of their ranges before any draw ----
+
+Corner = tuple[dict[str, Any], ...]  # a list's items in numbers
+
+
+@dataclass(frozen=True)
+class Items:
+    """The mappings of a list, as a rule of the section that holds the list sees them."""
+
+    mappings: tuple[Mapping[str, Value | Items], ...]
+
+    @property
+    def is_range(self) -> bool:
+        return any(value.is_range for mapping in self.mappings for value in mapping.values())
+
+    def ends(self) -> tuple[Corner, Corner]:
+        """All numbers at their low ends, then all at their high ends.
+
+        Not every combination, of which there may be 2^300: no rule over a list's items trades one
+        number off against another.
+        """
+        low, high = (
+            tuple({k: _outer(v)[end] for k, v in mapping.items()} for mapping in self.mappings)
+            for end in (0, 1)
+        )
+        return (low, high)
+
+
+def broken_rules(spec: SectionSpec, given: Mapping[str, Value | Items]) -> Iterator[str]:
+    """What the section's model says against any combination of the ranges' ends, each text once."""
+    said: set[str] = set()
+    free = {name for name, field in spec.fields.items() if field.kind.is_text}
+    corners = {name: _ends(value, name in free) for name, value in given.items()}
+    for combination in itertools.product(*corners.values()):
+        corner = dict(zip(corners, combination, strict=True))
+        try:
+            spec.model.model_validate(corner)
+        except ValidationError as error:
+            ranged = [name for name, value in given.items() if value.is_range]
+            drawn = [_drawn(name, given[name], corner[name]) for name in ranged]
+            where = f" (in a draw with {', '.join(drawn)})" if drawn else ""
+            for text in readable(error):
+                if text not in said:
+                    said.add(text)
+                    yield f"{text}{where}"
+
+
+def _drawn(name: str, value: Value | Items, end: Any) -> str:
+    if isinstance(value, Items):
+        which = "low" if end == value.ends()[0] else "high"
+        return f"all {name} at the {which} ends of their ranges"
+    return f"{name} = {words(end)}"
+
+
+def _ends(value: Value | Items, is_free_text: bool) -> list[Any]:
+    """What a rule between fields can depend on: the extreme numbers, null, and every word.
+
+    A handful, so that the product over a section's fields stays in the hundreds. No rule compares
+    colours, rates or names of files, so one stands for all.
+    """
+    if isinstance(value, Items):
+        return list(value.ends())
+    probes = value.probes()
+    numbers = [p for p in probes if is_number(p)]
+    triples = [p for p in probes if isinstance(p, tuple)]
+    others = [p for p in probes if p is None or isinstance(p, str | bool)]
+    if is_free_text:
+        others = [p for p in others if p is None] + [p for p in others if p is not None][:1]
+    ends: list[Plain] = [min(numbers), max(numbers)] if numbers else []
+    return list(dict.fromkeys([*ends, *triples[:1], *others]))
+
+
+def _outer(value: Value | Items) -> tuple[Any, Any]:
+    """The least and the greatest number; of what is none, the first and the last option."""
+    if isinstance(value, Items):
+        return value.ends()
+    probes = value.probes()
+    numbers = [p for p in probes if is_number(p)]
+    return (min(numbers), max(numbers)) if numbers else (probes[0], probes[-1])

@@ -20,7 +20,7 @@ from jaxtyping import config, install_import_hook
 
 ROOT = Path(__file__).resolve().parents[1]
 KERNELS = re.compile(
-    r"^(import numba|from numba|from augment\.render\.cpu_jit|import triton)", re.MULTILINE
+    r"^(import numba|from numba|from augment\.render\.cpu\.jit|import triton)", re.MULTILINE
 )
 
 # Triton reads this where a kernel is defined: without a GPU its kernels run in Python.

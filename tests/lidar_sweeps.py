@@ -9,9 +9,8 @@ import numpy as np
 
 from augment.labels import Boxes, LidarSweep
 from augment.scene import Scene
-from recipes.flood import Flood
-from recipes.schema import Output, Recipe, Smog, Weather
-from recipes.snow import Snow
+from recipes.schema import Output, Smog, Weather, schema_Recipe
+from recipes.weather import Flood, Snow
 from tests.snow_scenes import drive, sheet
 
 WORLD_ORIGIN_M = np.array([448_262.125, 4_421_337.5, 41.5])
@@ -71,7 +70,7 @@ def some_points(count: int = 400, *, seed: int = 0) -> np.ndarray:
     return np.stack([reach * np.cos(angle), reach * np.sin(angle), height], 1)
 
 
-def recipe(smog=None, flood=None, snow=None, **options) -> Recipe:
+def recipe(smog=None, flood=None, snow=None, **options) -> schema_Recipe:
     """A recipe that weathers its LiDAR; visibility_m of the smog, level_m, depth_m, or models."""
     if isinstance(smog, (int, float)):
         smog = Smog(visibility_m=float(smog))
@@ -80,7 +79,7 @@ def recipe(smog=None, flood=None, snow=None, **options) -> Recipe:
     if isinstance(snow, (int, float)):
         snow = Snow(depth_m=float(snow))
     weather = Weather(smog=smog, flood=flood, snow=snow)
-    return Recipe(weather=weather, output=Output(lidar="weather"), **options)
+    return schema_Recipe(weather=weather, output=Output(lidar="weather"), **options)
 
 
 def ranges_of(sweep: LidarSweep) -> np.ndarray:

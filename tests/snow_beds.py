@@ -6,11 +6,11 @@ import numpy as np
 import torch
 
 from augment.cameras import Camera
+from augment.effects.snow.cells import EDGE_CAP_M, FLUSH, OPEN_EDGE, SnowBed, SnowCells
 from augment.geometry import rigid
 from augment.scene import Actor, Gaussians, Scene
 from augment.semantics import SemanticClass
 from augment.sky import ConstantSky
-from augment.snow.cells import EDGE_CAP_M, FLUSH, OPEN_EDGE, SnowBed, SnowCells
 from tests.scenes import sh_of
 
 LEFT, RIGHT, BACK, FRONT = range(4)

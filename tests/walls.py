@@ -6,8 +6,8 @@ import numpy as np
 import torch
 from scenes import camera_ahead
 
-from augment.batch.label_files import FrameBoxes
 from augment.cameras import Camera
+from augment.jobs.tables import FrameBoxes
 from augment.labels import Boxes
 from augment.metrics.consistency import DepthView
 

@@ -17,13 +17,12 @@ import torch
 from tqdm import tqdm
 
 from augment.cameras import Camera
+from augment.effects.smog import SmogMedium
 from augment.render.buffers import ALPHA, RGB
 from augment.render.constants import RasterSettings
-from augment.render.cpu import rasterize_cpu, warm_up
-from augment.render.reference import bin_to_tiles, rasterize_reference
-from augment.render.reference_project import project_parts
+from augment.render.cpu.driver import rasterize_cpu, warm_up
+from augment.render.reference import bin_to_tiles, project_parts, rasterize_reference
 from augment.scene import PosedGaussians
-from augment.weather.smog import SmogMedium
 from tools.bench_memory import peak_extra_mib
 from tools.bench_scene import DEFAULT_CASES, RasterCase, random_scene
 from tools.machine import MachineFacts, load_average, machine_facts

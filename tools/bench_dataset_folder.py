@@ -18,7 +18,7 @@ KINDS = 8  # different images; the others are copies of them
 
 def write_folder(folder: Path, images: int, width: int, height: int) -> None:
     """A clear variant of one scene: JPEGs, depth, boxes and calibration, with its manifest."""
-    from augment.batch.encode import encode_depth, encode_image
+    from augment.jobs.files import encode_depth, encode_image
 
     output = Output(image="jpg", jpeg_quality=92)
     made = [_picture(number, width, height) for number in range(min(KINDS, images))]
@@ -44,9 +44,9 @@ def write_manifest_of(folder: Path, rows: int) -> None:
     """A manifest of many images that are not there: 80 frames of four cameras a variant."""
     import pyarrow as pa
 
-    from augment.batch.atomic import write_atomic
-    from augment.batch.layout import MANIFEST
-    from augment.batch.manifest import manifest_bytes, rows_to_table
+    from augment.jobs.atomic import write_atomic
+    from augment.jobs.layout import MANIFEST
+    from augment.jobs.manifest import manifest_bytes, rows_to_table
 
     each = 80 * len(CAMERAS)
     pieces = []
@@ -67,7 +67,7 @@ def write_manifest_of(folder: Path, rows: int) -> None:
 
 
 def _row(base: str, frame: int, camera: str, width: int, height: int) -> dict[str, Any]:
-    from augment.batch.layout import PATH_KINDS
+    from augment.jobs.layout import PATH_KINDS
 
     stem = f"{camera}/{frame:06d}"
     paths = {
@@ -109,15 +109,15 @@ def _row(base: str, frame: int, camera: str, width: int, height: int) -> dict[st
 
 
 def _write_rows(folder: Path, rows: list[dict[str, Any]]) -> None:
-    from augment.batch.atomic import write_atomic
-    from augment.batch.layout import MANIFEST
-    from augment.batch.manifest import manifest_bytes, rows_to_table
+    from augment.jobs.atomic import write_atomic
+    from augment.jobs.layout import MANIFEST
+    from augment.jobs.manifest import manifest_bytes, rows_to_table
 
     write_atomic(folder / MANIFEST, manifest_bytes(rows_to_table(rows)))
 
 
 def _write_companions(variant: Path, frames: int, width: int, height: int) -> None:
-    from augment.batch.label_files import FrameBoxes, boxes_bytes
+    from augment.jobs.tables import FrameBoxes, boxes_bytes
     from augment.labels import Boxes
 
     rng = np.random.default_rng(0)

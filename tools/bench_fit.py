@@ -20,13 +20,13 @@ import torch
 from tqdm import tqdm
 
 from adapters.base import open_scene
-from adapters.recorded.views import recorded_views
+from adapters.training_views.views import recorded_views
 from adapters.uri import format_uri
-from augment.batch.job import RenderJob, run_job
-from augment.batch.layout import folder_name, variant_name
+from augment.jobs.layout import folder_name, variant_name
+from augment.jobs.render_job import RenderJob, run_job
 from augment.reconstruct.config import DensifyConfig, FitConfig
 from augment.reconstruct.view import ViewSource
-from augment.render.cpu import warm_up
+from augment.render.cpu.driver import warm_up
 from augment.scene import Scene
 from recipes.load import load_recipe
 from tools.bench import Spread

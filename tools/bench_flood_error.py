@@ -14,15 +14,14 @@ import cv2
 import numpy as np
 import torch
 
-from augment.apply import render_buffers
 from augment.cameras import Camera
+from augment.effects.flood.flood import FresnelModel, ReflectionTier, exact, schlick
 from augment.metrics.image import psnr
 from augment.plan import make_plan
 from augment.scene import Scene
-from augment.weather.flood import FresnelModel, ReflectionTier
-from augment.weather.fresnel import exact, schlick
-from recipes.flood import Flood, Waves
-from recipes.schema import Output, Recipe, Weather
+from augment.views import render_buffers
+from recipes.schema import Output, Weather, schema_Recipe
+from recipes.weather import Flood, Waves
 from tools.bench_flood_mirror import mirrored_picture
 
 WAVES = ("still", "calm")
@@ -51,7 +50,7 @@ def flood_recipe(
     opaque: bool = False,
     fresnel: FresnelModel = "exact",
     output: Output | None = None,
-) -> Recipe:
+) -> schema_Recipe:
     """Water level_m above the median road, the middle one of a drive that may have a slope."""
     flood = Flood(
         level_m=level_m,
@@ -61,10 +60,10 @@ def flood_recipe(
         fresnel=fresnel,
         reflection=reflection,
     )
-    return Recipe(weather=Weather(flood=flood), output=output or PICTURE_ONLY)
+    return schema_Recipe(weather=Weather(flood=flood), output=output or PICTURE_ONLY)
 
 
-def draw(scene: Scene, camera: Camera, recipe: Recipe, backend: str = "auto") -> Picture:
+def draw(scene: Scene, camera: Camera, recipe: schema_Recipe, backend: str = "auto") -> Picture:
     buffers = render_buffers(scene, camera, make_plan(recipe, scene), backend=backend)
     water = buffers.water
     if water is None:

@@ -18,7 +18,7 @@ from torch import Tensor
 from augment.cameras import Camera
 from augment.plan import Plan
 from augment.render.buffers import ALPHA, RGB, RenderOutput
-from augment.render.clip import ABOVE, BELOW, HeightClip
+from augment.render.layout import ABOVE, BELOW, HeightClip
 from augment.render.rasterize import rasterize
 from augment.scene import Gaussians, PosedGaussians, Scene
 

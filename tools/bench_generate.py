@@ -19,18 +19,17 @@ from pathlib import Path
 from typing import Any
 
 from adapters.base import open_scene
-from augment.apply import render_view
-from augment.batch.encode import encode_depth, encode_image
-from augment.batch.layout import variant_name
-from augment.batch.parts import compact
-from augment.batch.store import open_store
-from augment.batch.writer import WritePump
-from augment.generate.drive import Driver
-from augment.generate.job import GenerateJob, make_pool, run_generate
-from augment.generate.plan import make_plan
-from augment.generate.records import Block, SceneRecord
-from augment.generate.status import read_status
-from augment.generate.workshop import IndexTask, WorkSetup
+from augment.jobs.block_worker import IndexTask, WorkSetup
+from augment.jobs.blocks import Block, SceneRecord, make_plan
+from augment.jobs.files import encode_depth, encode_image
+from augment.jobs.generate import GenerateJob, make_pool, run_generate
+from augment.jobs.layout import variant_name
+from augment.jobs.manifest import compact
+from augment.jobs.scheduler import Driver
+from augment.jobs.status import read_status
+from augment.jobs.store import open_store
+from augment.jobs.view_files import WritePump
+from augment.views import render_view
 from recipes.job import Job, JobRecipes
 from recipes.load import load_recipe
 from recipes.parse import parse_recipe

@@ -10,8 +10,8 @@ from numba import prange
 
 from augment.cameras import Camera
 from augment.render.constants import ALPHA_MIN, TRANSMITTANCE_STOP, RasterSettings
-from augment.render.cpu_jit import kernel
-from augment.render.cuda_splats import TILE, CudaSplats, CudaTiles
+from augment.render.cpu.jit import kernel
+from augment.render.cuda.splats import TILE, CudaSplats, CudaTiles
 from augment.render.layout import (
     C_AT,
     C_X,

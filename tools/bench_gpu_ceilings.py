@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 
 from augment.render.constants import ALPHA_MIN, RasterSettings
-from augment.render.gpu import gpu_device, launch
+from augment.render.cuda.runtime import gpu_device, launch
 from tools.bench import Spread
 from tools.gpu_clock import Timing, times_in_turns
 

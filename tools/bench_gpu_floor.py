@@ -19,7 +19,7 @@ import torch
 from augment.cameras import Camera
 from augment.render.buffers import RGB, RenderOutput
 from augment.render.constants import RasterSettings
-from augment.render.cuda_splats import CudaSplats, CudaTiles
+from augment.render.cuda.splats import CudaSplats, CudaTiles
 from augment.scene import PosedGaussians
 from tools.bench_gpu_blends import Blends, count_blends
 from tools.bench_gpu_ceilings import Ceilings
@@ -46,7 +46,7 @@ def noted_passes() -> Iterator[list[RasterPass]]:
     """The runs of the GPU rasteriser while this is open. The stages are noted where they are
     called, so that what is counted is the frame as it is made.
     """
-    from augment.render import cuda
+    from augment.render.cuda import driver as cuda
 
     passes: list[RasterPass] = []
     rasterize, blend = cuda.rasterize_cuda, cuda.blend

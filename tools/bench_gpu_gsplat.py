@@ -10,7 +10,7 @@ from torch import Tensor
 
 from augment.cameras import Camera
 from augment.render.constants import COV2D_BLUR, RasterSettings
-from augment.render.gpu import gpu_device
+from augment.render.cuda.runtime import gpu_device
 from augment.scene import Gaussians
 
 Draw = Callable[[], Tensor]  # rgb [H, W, 3], on the GPU

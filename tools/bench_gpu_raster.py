@@ -12,11 +12,11 @@ import torch
 from torch import Tensor
 
 from augment.cameras import Camera
+from augment.effects.smog import SmogMedium
 from augment.render.buffers import ALPHA, RGB, RenderOutput
 from augment.render.constants import RasterSettings
-from augment.render.cuda_splats import StageClock
+from augment.render.cuda.splats import StageClock
 from augment.scene import Gaussians, PosedGaussians
-from augment.weather.smog import SmogMedium
 from tools.bench_gpu_ceilings import Ceilings
 from tools.bench_gpu_gsplat import gsplat_draws
 from tools.bench_pairs import spread, spread_ratio
@@ -68,7 +68,7 @@ def draw(
     smog: SmogMedium | None = None,
     clock: StageClock | None = None,
 ) -> RenderOutput:
-    from augment.render import cuda
+    from augment.render.cuda import driver as cuda
 
     return cuda.rasterize_cuda(parts, camera, BUFFERS, SETTINGS, smog, clock=clock)
 
@@ -125,7 +125,7 @@ def _beside_gsplat(
 @torch.no_grad()
 def case_agreement(case: RasterCase) -> dict[str, Any]:
     """How far the GPU's colours are from the CPU backend's, without and with smog."""
-    from augment.render.cpu import rasterize_cpu
+    from augment.render.cpu.driver import rasterize_cpu
 
     gaussians, camera = random_scene(case)
     parts, found = [PosedGaussians(gaussians)], {}

@@ -8,12 +8,12 @@ from typing import Any
 
 import torch
 
-from augment.render.gpu import gpu_device
+from augment.effects.snow.placement import place_snow_bed
+from augment.effects.snow.snow import placement_settings
+from augment.effects.style.color_maps import style_gaussians
+from augment.render.cuda.runtime import gpu_device
 from augment.scene import Gaussians, Scene
-from augment.snow.covers import placement_settings
-from augment.snow.placement import place_snow_bed
-from augment.style.apply import style_gaussians
-from recipes.snow import Snow
+from recipes.weather import Snow
 from tools.bench_gpu_ceilings import Ceilings
 from tools.bench_pairs import spread
 from tools.bench_scene import RasterCase, random_scene

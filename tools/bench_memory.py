@@ -55,7 +55,7 @@ def measured_apart(module: str, arguments: dict[str, Any], what: str) -> float:
 def _render_once(case: RasterCase) -> float:
     from augment.render.buffers import ALPHA, RGB
     from augment.render.constants import RasterSettings
-    from augment.render.cpu import rasterize_cpu, warm_up
+    from augment.render.cpu.driver import rasterize_cpu, warm_up
     from augment.scene import PosedGaussians
     from tools.bench_scene import random_scene
 

@@ -62,7 +62,7 @@ def open_text(result: dict[str, Any]) -> str:
 def _keep(uri: str, folder: Path) -> dict[str, tuple[Path, int]]:
     """The scene written in our own formats: where, and the bytes of its tensors."""
     from adapters.base import open_scene
-    from augment.files.scene_files import save_scene, save_scene_file
+    from augment.files.scene_file import save_scene, save_scene_file
 
     scene = open_scene(uri)
     held = scene.gaussian_bytes + scene.sky.faces.numel() * 4  # pyright: ignore

@@ -6,10 +6,10 @@ import dataclasses
 import time
 from collections.abc import Iterable, Mapping, Sequence
 
-from augment.apply import render_buffers
 from augment.cameras import Camera
 from augment.plan import Plan
 from augment.scene import Scene
+from augment.views import render_buffers
 from tools.bench import Spread
 
 

@@ -13,20 +13,20 @@ from typing import Any, get_args
 import numpy as np
 import torch
 
-from adapters.street.truth import StreetTruth
+from adapters.street.labels import StreetTruth
 from augment.cameras import Camera
+from augment.effects.snow.cells import SnowBed
+from augment.effects.snow.height_map import Estimator
+from augment.effects.snow.layer import lay_snow
+from augment.effects.snow.light import illumination_of
+from augment.effects.snow.near_camera import SnowCover
+from augment.effects.snow.placement import PlacementSettings, place_snow_bed
 from augment.render.buffers import BUFFERS
-from augment.render.clip import UNCUT
 from augment.render.constants import RasterSettings
+from augment.render.layout import UNCUT
 from augment.render.rasterize import rasterize
 from augment.scene import PosedGaussians, Scene
-from augment.snow.cells import SnowBed
-from augment.snow.cover import SnowCover
-from augment.snow.height_map import Estimator
-from augment.snow.layer import lay_snow
-from augment.snow.light import illumination_of
-from augment.snow.placement import PlacementSettings, place_snow_bed
-from recipes.snow import Snow
+from recipes.weather import Snow
 from tools.bench_snow_cells import (
     OVER_M,
     at_edges,

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from adapters.street.truth import StreetTruth
+from adapters.street.labels import StreetTruth
+from augment.effects.snow.cells import SnowBed, SnowCells
+from augment.effects.snow.surface import DRIVEN_MAX_SLOPE_DEG, moves
 from augment.scene import Scene
 from augment.semantics import SemanticClass
-from augment.snow.actor_cells import DRIVEN_MAX_SLOPE_DEG, moves
-from augment.snow.cells import SnowBed, SnowCells
 from tools.bench_snow_truth import TruePoints, body_tops, surface_below
 
 OVER_M = 0.2  # a cell farther above or below the true surface does not lie on it

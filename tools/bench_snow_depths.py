@@ -14,12 +14,12 @@ from typing import Any
 import cv2
 import numpy as np
 
-from adapters.lidar.depth import lidar_depth
-from adapters.street.truth import StreetTruth
+from adapters.lidar_scene.depth import lidar_depth
+from adapters.street.labels import StreetTruth
 from augment.cameras import Camera
 from augment.render.buffers import BUFFERS as EVERY_BUFFER
 from augment.render.buffers import EXPECTED_DEPTH, MEDIAN_DEPTH, MODE_DEPTH
-from augment.render.clip import UNCUT
+from augment.render.layout import UNCUT
 from augment.render.rasterize import rasterize
 from augment.scene import Scene
 

@@ -9,16 +9,15 @@ import time
 from pathlib import Path
 from typing import Any
 
-from augment.render.backends import AUTO
+from augment.effects.snow.cells import SnowBed
+from augment.effects.snow.layer import lay_snow
+from augment.effects.snow.light import illumination_of
+from augment.effects.snow.placement import place_snow_bed
+from augment.effects.snow.snow import placement_settings
+from augment.effects.snow.support import bed_key, load_bed, remember_bed, save_bed
+from augment.render.buffers import AUTO
 from augment.scene import Scene
-from augment.snow.bed_files import bed_key, load_bed, save_bed
-from augment.snow.beds import remember_bed
-from augment.snow.cells import SnowBed
-from augment.snow.covers import placement_settings
-from augment.snow.layer import lay_snow
-from augment.snow.light import illumination_of
-from augment.snow.placement import place_snow_bed
-from recipes.snow import Snow
+from recipes.weather import Snow
 from tools.bench_memory import RESET_PEAK, extra_mib, measured_apart
 from tools.bench_pairs import spread
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from adapters.base import open_scene
-from recipes.style_presets import style_preset_names
+from recipes.weather import style_preset_names
 from tools.bench_scene import RasterCase
 from tools.bench_style_cost import bench_apply, bench_frames, front_camera
 from tools.bench_style_exact import bench_exact, bench_folding

@@ -9,13 +9,12 @@ import torch
 from tqdm import tqdm
 
 from augment.cameras import Camera
+from augment.effects.style.color_maps import CLASSES, StyleMaps, style_gaussians
 from augment.plan import make_plan
 from augment.scene import Gaussians, Scene
 from augment.semantics import SemanticClass
-from augment.style.apply import style_gaussians
-from augment.style.maps import CLASSES, StyleMaps
-from recipes.schema import Recipe
-from recipes.style import Style
+from recipes.schema import schema_Recipe
+from recipes.weather import Style
 from tools.bench_flood_error import PICTURE_ONLY
 from tools.bench_pairs import spread, spread_ms, spread_ratio, time_in_turns
 from tools.bench_scene import RasterCase, random_scene
@@ -80,11 +79,13 @@ def bench_frames(
     if scene.background.sh.shape[1] == 1:
         kinds["SH 3"] = with_directions(scene)
     recipes = {
-        "clean": Recipe(output=PICTURE_ONLY),
-        "one map": Recipe(style=Style(preset=preset), output=PICTURE_ONLY),
+        "clean": schema_Recipe(output=PICTURE_ONLY),
+        "one map": schema_Recipe(style=Style(preset=preset), output=PICTURE_ONLY),
         # A preset knows land and sky only; its maps by class are the same, and cost the same.
-        "per region": Recipe(style=Style(preset=preset, per_region=True), output=PICTURE_ONLY),
-        "on the picture": Recipe(
+        "per region": schema_Recipe(
+            style=Style(preset=preset, per_region=True), output=PICTURE_ONLY
+        ),
+        "on the picture": schema_Recipe(
             style=Style(preset=preset, applied_to="picture"), output=PICTURE_ONLY
         ),
     }

@@ -9,8 +9,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from augment.style.checkpoint import SHIPPED, load_network, network_facts
-from augment.style.network import Gscm
+from augment.effects.style.network import SHIPPED, Gscm, load_network, network_facts
 
 _SEED = 0
 _HEAD = 0.02  # standard deviation of a random head's weights; a new one's are 0, and map nothing

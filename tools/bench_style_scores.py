@@ -1,4 +1,6 @@
-"""How well methods do on photographs that no network was trained on (augment.style.scores)."""
+"""How well methods do on photographs that no network was trained on
+(augment.effects.style.scores).
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,7 @@ from jaxtyping import UInt8
 from torch import Tensor
 from tqdm import tqdm
 
-from augment.style.scores import (
+from augment.effects.style.scores import (
     Method,
     closed_method,
     identity_method,
@@ -21,7 +23,7 @@ from augment.style.scores import (
     score_harm,
     score_pairs,
 )
-from augment.style.train_photos import read_photos
+from augment.effects.style.train import read_photos
 from tools.bench_style_network import BenchNetwork
 
 HOLDOUT = 8  # as `climategs style train` holds photos out by default

@@ -11,13 +11,13 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from augment.apply import render_buffers
 from augment.cameras import Camera
 from augment.metrics.consistency import Consistency, DepthView, warped_consistency
 from augment.plan import Plan, make_plan
 from augment.scene import Scene
-from recipes.schema import Output, Recipe, Render
-from recipes.style import Style
+from augment.views import render_buffers
+from recipes.schema import Output, Render, schema_Recipe
+from recipes.weather import Style
 from tools.bench_flood_masks import neighbours
 
 NEAR, FAR = 1, 7  # frames apart, as Lai et al. 2018 and its successors take them
@@ -43,7 +43,7 @@ def bench_views(
     pairs = {kind: _pairs(scene, frames, kind, width) for kind in KINDS}
     rows: list[dict[str, Any]] = []
     for name, style in styles.items():
-        plan = make_plan(Recipe(style=style, output=_DEPTH, render=_NEUTRAL), scene)
+        plan = make_plan(schema_Recipe(style=style, output=_DEPTH, render=_NEUTRAL), scene)
         found = {kind: _pooled(scene, plan, pairs[kind]) for kind in KINDS}
         for kind, each in found.items():
             clean = rows[0][kind] if rows else each

@@ -15,7 +15,7 @@ import torch
 from tqdm import tqdm
 
 from adapters.base import open_scene
-from augment.batch.job import SceneLoader
+from augment.jobs.render_job import SceneLoader
 from tools.machine import load_average, machine_facts
 from tools.training_case import WHOLE, TrainingCase
 from tools.training_data import CLASSES, Views, generate, read_views

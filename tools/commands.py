@@ -270,6 +270,6 @@ def open_with_path(uri: str, camera_path: Path | None) -> Scene:
     scene = open_scene(uri)
     if camera_path is None:
         return scene
-    from adapters.cameras.paths import with_camera_path
+    from adapters.camera_files.paths import with_camera_path
 
     return with_camera_path(scene, camera_path)

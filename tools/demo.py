@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 
 from adapters.base import open_scene
-from augment.batch.job import RenderJob, run_job
+from augment.jobs.render_job import RenderJob, run_job
 from recipes.load import load_recipe
 from tools.pictures import draw_sheet, draw_video
 from tools.warm_up import warm_up, warming_up_beside

@@ -15,10 +15,9 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from augment.batch.store import open_store
 from augment.errors import OutputError
-from augment.metrics.actors import carry
-from augment.metrics.consistency import Warp, consistency_of, find_warp
+from augment.jobs.store import open_store
+from augment.metrics.consistency import Warp, carry, consistency_of, find_warp
 from augment.metrics.lpips import Lpips, load_lpips, picture_lpips
 from tools.evaluate_views import KINDS, Drive, Pair, View, Views, pairs_of
 

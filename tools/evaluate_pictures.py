@@ -9,8 +9,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from augment.batch.layout import folder_name
 from augment.errors import OutputError
+from augment.jobs.layout import folder_name
 from tools.drawing import GAP_PX, captioned, color_mapped, strip
 from tools.evaluate_views import Views
 

@@ -12,20 +12,16 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from augment.batch.encode import depth_in_metres
-from augment.batch.label_files import read_boxes
-from augment.batch.manifest import OK
-from augment.batch.parts import read_finished
-from augment.batch.store import Store
 from augment.cameras import Camera
-from augment.dataset.pairs import clean_mask
-from augment.dataset.reading import RowReader
-from augment.dataset.rows import Rows
-from augment.dataset.stored import Companions, StoredFiles
+from augment.dataset.clips_pairs import clean_mask
+from augment.dataset.weather_dataset import Companions, RowReader, Rows, StoredFiles
 from augment.errors import OutputError
 from augment.geometry import invert_rigid
-from augment.metrics.actors import ActorPaths
-from augment.metrics.consistency import DepthView
+from augment.jobs.files import depth_in_metres
+from augment.jobs.manifest import OK, read_finished
+from augment.jobs.store import Store
+from augment.jobs.tables import read_boxes
+from augment.metrics.consistency import ActorPaths, DepthView
 from tools.report_pick import evenly
 
 SHORT, LONG, CAMERAS = "short", "long", "cameras"

@@ -20,10 +20,10 @@ def explain_recipe(
     without, the plan is that of reference.
     """
     from adapters.base import open_scene
+    from augment.jobs.quality import settle, settled_recipe
     from augment.plan import make_plan
-    from augment.quality.settle import settle, settled_recipe
-    from recipes.knobs import free_knobs, settings_of
     from recipes.load import load_recipe
+    from recipes.schema import free_knobs, settings_of
 
     template = load_recipe(recipe)
     resolved = template.resolve(variant)
@@ -64,7 +64,7 @@ def _view_facts(plan: Plan, scene: Scene, scale: float, *, with_snow: bool) -> d
     """
     from dataclasses import replace
 
-    from augment.view_plan import plan_view
+    from augment.plan import plan_view
 
     asked = plan if with_snow else replace(plan, snow=None)
     cameras = [camera for frame in scene.frames for camera in frame.cameras.values()]

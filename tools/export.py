@@ -8,16 +8,17 @@ from pathlib import Path
 from adapters.base import open_scene
 from adapters.scene_folder import storable
 from augment.errors import ClimateGSError, OutputError
-from augment.files.export_losses import ExportKind, export_losses
-from augment.files.gaussian_export import (
+from augment.files.export import (
     CAMERAS,
     PARTS,
+    ExportKind,
     export_cameras,
+    export_losses,
     export_ply,
     export_ply_parts,
     export_splat,
 )
-from augment.files.scene_files import (
+from augment.files.scene_file import (
     FILES,
     SCENE_SUFFIX,
     is_scene_folder,

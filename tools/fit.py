@@ -17,10 +17,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from augment.batch.layout import STATE_FOLDER
-from augment.batch.lock import OutputLock
 from augment.errors import OutputError
-from augment.files.scene_files import is_scene_folder
+from augment.files.scene_file import is_scene_folder
+from augment.jobs.layout import STATE_FOLDER
+from augment.jobs.processes import OutputLock
 from augment.reconstruct.view import ViewSource
 from augment.scene import Scene
 from tools.fit_checkpoint import (

@@ -19,7 +19,8 @@ import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 
-from augment.batch.atomic import (
+from augment.errors import OutputError
+from augment.jobs.atomic import (
     flush_folder,
     make_folder,
     output_error,
@@ -27,7 +28,6 @@ from augment.batch.atomic import (
     temporary_beside,
     write_atomic,
 )
-from augment.errors import OutputError
 from tools.fit_options import differences
 
 VERSION = 1

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from adapters.recorded.holdout import holdout_step
+from adapters.training_views.views import holdout_step
 from adapters.uri import format_uri
 from augment.cameras import Camera
 from augment.errors import AdapterError, ClimateGSError
@@ -60,7 +60,7 @@ def open_to_fit(
 def can_hold_out(scheme: str, path: str) -> bool:
     """Whether such a scene can be built without some of its frames."""
     if scheme == "street_gaussians":
-        from adapters.street_gaussians.model_files import is_dataset
+        from adapters.street_gaussians.model import is_dataset
 
         return is_dataset(Path(path))
     return scheme in _HELD_OUT_SCHEMES
@@ -74,7 +74,7 @@ def check_recorded(scene: Scene) -> None:
     """
     if any(frame.image_paths for frame in scene.frames):
         return
-    from augment.batch.layout import folder_name, variant_name
+    from augment.jobs.layout import folder_name, variant_name
     from recipes.load import load_recipe
 
     folder = f"raw/{folder_name(scene.name)}/{variant_name(load_recipe('clear').resolve(0))}"

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from adapters.base import recognise
-from adapters.recorded.depth_priors import DepthPriors
-from adapters.recorded.holdout import holdout_step
+from adapters.training_views.depth_priors import DepthPriors
+from adapters.training_views.views import holdout_step
 from adapters.uri import format_uri, parse_uri
 from augment.errors import ClimateGSError
 from augment.reconstruct.config import DensifyConfig, FitConfig
@@ -151,7 +151,7 @@ def without_growth(config: DensifyConfig) -> DensifyConfig:
 
 def parse_depth(text: str) -> DepthPriors:
     """`lidar`, `none`, or kinds separated by commas: lidar, sparse:DIR, metric:DIR, relative:DIR; a
-    DIR alone is metric. What they are: `adapters.recorded.depth_priors.DepthPriors`.
+    DIR alone is metric. What they are: `adapters.training_views.depth_priors.DepthPriors`.
 
     Raises:
         ClimateGSError: another kind, one given twice, or no such folder.

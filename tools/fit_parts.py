@@ -94,8 +94,8 @@ class Checked:
 def real_parts(device: str = "cpu") -> FitParts:
     """The library's own. device: where views are rendered during the fit."""
     from adapters.base import open_scene
-    from adapters.recorded.starting_scene import starting_scene
-    from augment.files.scene_files import save_scene
+    from adapters.training_views.starting_scene import starting_scene
+    from augment.files.scene_file import save_scene
     from augment.reconstruct.trainer import Trainer
 
     return FitParts(
@@ -111,8 +111,7 @@ def real_parts(device: str = "cpu") -> FitParts:
 
 
 def _checked(scene: Scene, source: Any, options: FitOptions) -> Checked:
-    from adapters.recorded.camera_timing import with_camera_times
-    from adapters.recorded.checks import check_views
+    from adapters.training_views.checks import check_views, with_camera_times
 
     checks = check_views(scene, source)
     late_s = checks.time_offset_s
@@ -130,7 +129,7 @@ def _checked(scene: Scene, source: Any, options: FitOptions) -> Checked:
 
 
 def _recorded_views(scene: Scene, options: FitOptions) -> Views:
-    from adapters.recorded.views import recorded_views
+    from adapters.training_views.views import recorded_views
 
     return recorded_views(
         scene,

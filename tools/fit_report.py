@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from augment.batch.atomic import make_folder, output_error, write_atomic
+from augment.jobs.atomic import make_folder, output_error, write_atomic
 from augment.reconstruct.view import ViewKey, ViewSource
 from augment.scene import Scene
 from tools.fit_curves import draw_curves

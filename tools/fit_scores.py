@@ -11,7 +11,6 @@ from functools import cache
 import numpy as np
 from tqdm import tqdm
 
-from augment.apply import SURFACE_ALPHA, render_buffers
 from augment.cameras import Camera
 from augment.metrics.image import DepthErrors, depth_errors, flip, psnr, ssim
 from augment.plan import make_plan
@@ -19,8 +18,9 @@ from augment.reconstruct.view import RecordedView, ViewKey, ViewSource
 from augment.render.buffers import EXPECTED_DEPTH, MEDIAN_DEPTH
 from augment.render.composite import quantise
 from augment.scene import Scene
+from augment.views import SURFACE_ALPHA, render_buffers
 from recipes.load import load_recipe
-from recipes.schema import Recipe
+from recipes.schema import schema_Recipe
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +141,7 @@ def found_camera(scene: Scene, key: ViewKey, camera: Camera) -> Camera:
 
 
 @cache
-def _clear() -> Recipe:
+def _clear() -> schema_Recipe:
     return load_recipe("clear").resolve(0)
 
 

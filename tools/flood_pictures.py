@@ -9,13 +9,13 @@ import numpy as np
 from tqdm import tqdm
 
 from adapters.base import open_scene
-from augment.apply import WeatheredBuffers, render_buffers
 from augment.cameras import Camera
 from augment.plan import make_plan
 from augment.render.composite import quantise
 from augment.scene import Scene
-from recipes.flood import Flood, Waves
-from recipes.schema import Output, Recipe, Weather
+from augment.views import WeatheredBuffers, render_buffers
+from recipes.schema import Output, Weather, schema_Recipe
+from recipes.weather import Flood, Waves
 from tools.bench_flood_error import inside
 from tools.drawing import captioned, strip, write_jpeg
 
@@ -68,7 +68,7 @@ def _panel(scene: Scene, camera: Camera, title: str, flood: Flood) -> np.ndarray
 
 def _timed(scene: Scene, camera: Camera, flood: Flood | None) -> tuple[float, WeatheredBuffers]:
     """Least seconds of a few frames after one that is not counted, and the frame."""
-    recipe = Recipe(weather=Weather(flood=flood), output=Output(depth="none", labels=False))
+    recipe = schema_Recipe(weather=Weather(flood=flood), output=Output(depth="none", labels=False))
     plan = make_plan(recipe, scene)
     frame = render_buffers(scene, camera, plan)
     seconds = []

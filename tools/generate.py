@@ -12,26 +12,25 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from adapters.base import open_scene
-from adapters.patterns import scenes_of
-from augment.batch.layout import STATE_FOLDER
-from augment.batch.store import Store, open_store
-from augment.batch.times import shares_of
+from adapters.base import open_scene, scenes_of
 from augment.errors import ClimateGSError
-from augment.generate.job import (
+from augment.jobs.block_worker import WorkSetup
+from augment.jobs.blocks import Plan, shard_of
+from augment.jobs.generate import (
     GenerateJob,
     GenerateResult,
     default_scratch,
     plan_job,
     run_generate,
 )
-from augment.generate.plan import Plan, shard_of
-from augment.generate.status import JobStatus, read_status
-from augment.generate.workshop import WorkSetup
+from augment.jobs.layout import STATE_FOLDER
+from augment.jobs.status import JobStatus, read_status
+from augment.jobs.store import Store, open_store
+from augment.jobs.times import shares_of
 from recipes.job import load_job, load_job_recipes
 
 if TYPE_CHECKING:
-    from recipes.schema import Recipe
+    from recipes.schema import schema_Recipe
 
 Executor = Literal["serial", "processes", "ray"]
 _MOST_LINES = 20
@@ -114,7 +113,7 @@ def _check_writable(store: Store) -> None:
 
 
 def _dry_run(job: GenerateJob) -> int:
-    from augment.generate.estimate import estimate
+    from augment.jobs.generate import estimate
 
     plan = plan_job(job)
     blocks = shard_of(plan.blocks, *job.shard)
@@ -204,7 +203,7 @@ def _is_done(status: JobStatus) -> bool:
     return total.published == total.planned and not total.in_failed_blocks and not status.unusable
 
 
-def _warm_up(recipes: list[Recipe], backend: str) -> None:
+def _warm_up(recipes: list[schema_Recipe], backend: str) -> None:
     from tools.warm_up import warm_up_for_workers
 
     seconds = warm_up_for_workers(recipes, backend)

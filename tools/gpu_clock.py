@@ -177,8 +177,8 @@ def gpu_mib() -> float | None:
 def check_gpu() -> None:
     """Raises BackendUnavailable where there is no GPU to measure."""
     from augment.errors import BackendUnavailable
-    from augment.render.backends import available_backends
-    from augment.render.gpu import has_gpu
+    from augment.render.buffers import available_backends
+    from augment.render.cuda.runtime import has_gpu
 
     if has_gpu():
         return

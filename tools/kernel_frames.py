@@ -12,8 +12,8 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from augment.apply import render_view
 from augment.cameras import Camera, Frame
+from augment.effects.snow.height_map import draw_views
 from augment.geometry import rigid
 from augment.ground import Ground
 from augment.render.buffers import RGB
@@ -22,31 +22,29 @@ from augment.render.sh import SH_C0
 from augment.scene import Actor, Gaussians, PosedGaussians, Scene, Track
 from augment.semantics import SemanticClass
 from augment.sky import CubemapSky
-from augment.snow.visibility import draw_views
-from recipes.flood import Flood, Waves
-from recipes.schema import Output, Recipe, Render, Smog, Weather
-from recipes.snow import Snow
-from recipes.style import Style
+from augment.views import render_view
+from recipes.schema import Output, Render, Smog, Weather, schema_Recipe
+from recipes.weather import Flood, Snow, Style, Waves
 
 WIDTH, HEIGHT = 20, 12
 _DENSE = 20.0  # metres of visibility: there is smog to see even here
 _PLAIN = Output(depth="none", labels=False)
 
 RECIPES = {
-    "clean": Recipe(output=Output(semantic=True, instance=True)),
-    "antialiased, stopped early": Recipe(
+    "clean": schema_Recipe(output=Output(semantic=True, instance=True)),
+    "antialiased, stopped early": schema_Recipe(
         render=Render(antialiased=True, transmittance_stop=0.2),
         output=Output(depth="expected", labels=False),
     ),
-    "mode depth": Recipe(output=Output(depth="mode", labels=False)),
-    "uniform smog": Recipe(weather=Weather(smog=Smog(visibility_m=_DENSE)), output=_PLAIN),
-    "layered smog": Recipe(
+    "mode depth": schema_Recipe(output=Output(depth="mode", labels=False)),
+    "uniform smog": schema_Recipe(weather=Weather(smog=Smog(visibility_m=_DENSE)), output=_PLAIN),
+    "layered smog": schema_Recipe(
         weather=Weather(smog=Smog(visibility_m=_DENSE, scale_height_m=9.0)), output=_PLAIN
     ),
-    "smog on buffers": Recipe(
+    "smog on buffers": schema_Recipe(
         weather=Weather(smog=Smog(visibility_m=_DENSE, model="deferred")), output=_PLAIN
     ),
-    "flood": Recipe(
+    "flood": schema_Recipe(
         weather=Weather(
             flood=Flood(
                 level_m=0.2, reflection="screen_space", waves=Waves(preset="breeze", seed=1)
@@ -54,25 +52,27 @@ RECIPES = {
         ),
         output=Output(depth="expected", labels=False),
     ),
-    "flood, mirrored": Recipe(
+    "flood, mirrored": schema_Recipe(
         weather=Weather(flood=Flood(level_m=0.2, reflection="mirrored")), output=_PLAIN
     ),
-    "flood, sky": Recipe(
+    "flood, sky": schema_Recipe(
         weather=Weather(flood=Flood(level_m=0.2, reflection="sky", fresnel="schlick")),
         output=_PLAIN,
     ),
-    "snow, lit per pixel": Recipe(
+    "snow, lit per pixel": schema_Recipe(
         weather=Weather(snow=Snow(depth_m=0.1, cell_m=0.8, tracks="never", shading="per_pixel")),
         output=_PLAIN,
     ),
-    "snow, close and glinting": Recipe(
+    "snow, close and glinting": schema_Recipe(
         weather=Weather(
             snow=Snow(depth_m=0.1, cell_m=0.8, tracks="never", shading="per_splat", sparkle=1.0)
         ),
         output=_PLAIN,
     ),
-    "style": Recipe(style=Style(preset="dusk", per_region=True), output=_PLAIN),
-    "style folded into SH": Recipe(style=Style(preset="dusk", evaluated="sh"), output=_PLAIN),
+    "style": schema_Recipe(style=Style(preset="dusk", per_region=True), output=_PLAIN),
+    "style folded into SH": schema_Recipe(
+        style=Style(preset="dusk", evaluated="sh"), output=_PLAIN
+    ),
 }
 
 
@@ -81,7 +81,7 @@ def views(scene: Scene | None = None) -> dict[str, Callable[[], object]]:
     scene = small_scene() if scene is None else scene
     camera = scene.frames[0].cameras["ahead"]
 
-    def render(recipe: Recipe) -> Callable[[], object]:
+    def render(recipe: schema_Recipe) -> Callable[[], object]:
         return lambda: render_view(scene, camera, recipe, backend="cuda")
 
     out: dict[str, Callable[[], object]] = {n: render(r) for n, r in RECIPES.items()}

@@ -58,7 +58,7 @@ def recorded_launches() -> Iterator[Recording]:
     """
     from triton.runtime.interpreter import InterpretedFunction
 
-    from augment.render.gpu import is_interpreted
+    from augment.render.cuda.runtime import is_interpreted
 
     if not is_interpreted():
         raise RuntimeError("launches are recorded while kernels are interpreted only")

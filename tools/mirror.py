@@ -7,26 +7,37 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from adapters.source_trees import source_tree
+from adapters.detect_format import source_tree
 from adapters.uri import parse_uri
-from augment.batch.layout import MANIFEST, folder_name, variant_folder, variant_name
-from augment.batch.lock import OutputLock
-from augment.batch.manifest import OK, read_manifest, rows_of
-from augment.batch.mirror import Links, Mirrored, check_apart, mirror_dataset
-from augment.batch.mirror_images import Weathered, dataset_format, weathered_images
-from augment.batch.mirror_record import MIRROR_FOLDER, mirror_folder, read_record
-from augment.batch.mirror_sweeps import WeatheredSweep, is_weathered, weathered_sweeps
-from augment.batch.mirror_tree import SourceTree, Survey, survey
-from augment.batch.trajectory import RECORDED
 from augment.errors import AdapterError, OutputError
+from augment.jobs.files import RECORDED
+from augment.jobs.layout import MANIFEST, folder_name, variant_folder, variant_name
+from augment.jobs.manifest import OK, read_manifest, rows_of
+from augment.jobs.mirror import (
+    MIRROR_FOLDER,
+    Links,
+    Mirrored,
+    Weathered,
+    WeatheredSweep,
+    check_apart,
+    dataset_format,
+    is_weathered,
+    mirror_dataset,
+    mirror_folder,
+    read_record,
+    weathered_images,
+    weathered_sweeps,
+)
+from augment.jobs.mirror_files import SourceTree, Survey, survey
+from augment.jobs.processes import OutputLock
 from augment.scene import Scene
 from recipes.load import load_recipe
-from recipes.schema import Recipe
+from recipes.schema import schema_Recipe
 
 
 def recipes_for_source(
-    scene: Scene, out: Path, recipes: Sequence[Recipe], *, overwrite: bool = False
-) -> list[Recipe]:
+    scene: Scene, out: Path, recipes: Sequence[schema_Recipe], *, overwrite: bool = False
+) -> list[schema_Recipe]:
     """The recipes with images in the dataset's format, or PNG where they are of another size, after
     a look at whether the dataset can be copied and images that are there go on or are overwritten.
 
@@ -257,7 +268,7 @@ def _has_all(scene: Scene, rows: list[dict[str, Any]]) -> bool:
     return all(times.get((row["frame"], row["camera"])) == row["timestamp_ns"] for row in rows)
 
 
-def _check_format(scene: Scene, out: Path, recipe: Recipe, written_as: str) -> None:
+def _check_format(scene: Scene, out: Path, recipe: schema_Recipe, written_as: str) -> None:
     """Images of the same recipe in another format are not rendered twice beside each other."""
     if not (out / MANIFEST).is_file() or recipe.output.image == written_as:
         return
@@ -271,7 +282,7 @@ def _check_format(scene: Scene, out: Path, recipe: Recipe, written_as: str) -> N
         )
 
 
-def _with_format(recipe: Recipe, written_as: str) -> Recipe:
+def _with_format(recipe: schema_Recipe, written_as: str) -> schema_Recipe:
     output = recipe.output.model_copy(update={"image": written_as})
     return recipe.model_copy(update={"output": output})
 

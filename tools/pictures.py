@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from augment.batch.layout import folder_name, resolve_inside
+from augment.jobs.layout import folder_name, resolve_inside
 from tools import sheet
 
 VIDEO_WIDTH = 1440
@@ -21,8 +21,8 @@ def read_rows(out: Path) -> list[dict[str, Any]]:
     Raises:
         OutputError: there is no manifest, or it holds no finished image.
     """
-    from augment.batch.manifest import read_manifest
     from augment.errors import OutputError
+    from augment.jobs.manifest import read_manifest
 
     rows = [row for row in read_manifest(out).to_pylist() if row["status"] == "ok"]
     if not rows:

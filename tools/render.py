@@ -9,27 +9,25 @@ from pathlib import Path
 from typing import Literal
 
 from adapters.base import open_scene
-from augment.batch.backends import choose_backend
-from augment.batch.job import JobResult, RenderJob, run_job
-from augment.batch.layout import variant_name
-from augment.batch.mirror import Links
-from augment.batch.rows import lidar_notes
-from augment.batch.selection import SceneIndex, check_frames, has_lidar
-from augment.batch.store import open_store
-from augment.batch.times import shares_of
 from augment.cameras import Frame
 from augment.errors import ClimateGSError
 from augment.ground import ground_of
+from augment.jobs.backends import choose_backend
+from augment.jobs.files import SceneIndex, check_frames, has_lidar
+from augment.jobs.layout import variant_name
+from augment.jobs.manifest import lidar_notes
+from augment.jobs.mirror import Links
+from augment.jobs.quality import recipes_to_try
+from augment.jobs.quality_record import settle_for
+from augment.jobs.render_job import JobResult, RenderJob, run_job
+from augment.jobs.store import open_store
+from augment.jobs.times import shares_of
 from augment.plan import make_plan
-from augment.quality.record import settle_for
-from augment.quality.settle import recipes_to_try
 from augment.scene import Scene
 from recipes.change import found
-from recipes.frames import FramePattern, parse_frames
 from recipes.job import scaled_recipe
-from recipes.knobs import free_knobs
 from recipes.load import load_recipe
-from recipes.schema import Recipe
+from recipes.schema import FramePattern, free_knobs, parse_frames, schema_Recipe
 from tools.mirror import mirror_outputs, recipes_for_source
 
 Layout = Literal["standard", "source"]
@@ -111,7 +109,9 @@ def render_recipe(
     return 1 if result.failed else 0
 
 
-def resolve_variants(recipe: str, variants: int | None = None, scale: float = 1.0) -> list[Recipe]:
+def resolve_variants(
+    recipe: str, variants: int | None = None, scale: float = 1.0
+) -> list[schema_Recipe]:
     """The recipe's variants in numbers, at `scale` times the recipe's resolution.
 
     Raises:
@@ -126,14 +126,14 @@ def resolve_variants(recipe: str, variants: int | None = None, scale: float = 1.
 
 
 def _settled(
-    recipe: Recipe,
+    recipe: schema_Recipe,
     scene: Scene,
     out: Path,
     path: Sequence[Frame] | None,
     backend: str,
     *,
     overwrite: bool,
-) -> Recipe:
+) -> schema_Recipe:
     """The recipe with the settings of its quality, which are told where it had to choose them."""
     if not recipe.quality.is_open:
         return recipe
@@ -154,7 +154,7 @@ def _settled(
 def _frames_of(camera_path: Path | None, scene: Scene) -> Sequence[Frame] | None:
     if camera_path is None:
         return None
-    from adapters.cameras.paths import frames_from_path_file
+    from adapters.camera_files.paths import frames_from_path_file
 
     return frames_from_path_file(camera_path, scene)
 

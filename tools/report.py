@@ -16,12 +16,11 @@ from urllib.parse import unquote, urlsplit
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from augment.batch.atomic import write_atomic
-from augment.batch.layout import folder_name
-from augment.batch.manifest import OK
-from augment.batch.parts import read_finished
-from augment.batch.store import Store, open_store
 from augment.errors import OutputError
+from augment.jobs.atomic import write_atomic
+from augment.jobs.layout import folder_name
+from augment.jobs.manifest import OK, read_finished
+from augment.jobs.store import Store, open_store
 from tools import report_label_page, report_labels, report_page, report_summary, report_tables
 from tools.report_files import ReportFiles
 from tools.report_gallery import MOST_IMAGES, Gallery, Shares

@@ -7,16 +7,16 @@ from typing import Protocol
 
 import pyarrow as pa
 
-from augment.batch.columns import read_table
-from augment.batch.store import StoredFileMissing
 from augment.errors import OutputError
+from augment.jobs.store import StoredFileMissing
+from augment.jobs.tables import read_table
 
 LARGEST_FILE = 1 << 28  # bytes; a report needs no larger one
 MOST_PROBLEMS = 50  # that the page lists
 
 
 class Readable(Protocol):
-    """What a report asks of a store (`augment.batch.store`)."""
+    """What a report asks of a store (`augment.jobs.store`)."""
 
     @property
     def uri(self) -> str: ...

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 
-from augment.lidar_weather import codes
+from augment.effects.lidar import codes
 from tools.report_charts import amount_bar, legend, share_bar
 from tools.report_html import Html, joined, tag
 from tools.report_labels import VISIBILITY_STEPS, Classes, Sample, Shares

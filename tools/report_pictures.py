@@ -11,8 +11,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from augment.batch.encode import decode_image, decode_png, depth_in_metres
-from augment.image_header import image_header
+from augment.files.image_size import image_header
+from augment.jobs.files import decode_image, decode_png, depth_in_metres
 from augment.semantics import SemanticClass
 from tools.report_files import ReportFiles
 from tools.report_html import Html

@@ -12,8 +12,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from augment.batch.layout import STATE_FOLDER
-from augment.batch.manifest import OK
+from augment.jobs.layout import STATE_FOLDER
+from augment.jobs.manifest import OK
 
 MOST_EXAMPLES = 3
 _DIGITS = re.compile(r"\d+")

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from augment.batch.manifest import weather_columns
+from augment.jobs.manifest import weather_columns
 from tools.report_numbers import Quantity, known_order, quantity_of, shown_values, with_unit
 from tools.report_summary import as_floats
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from augment.batch.atomic import replaced_file, write_atomic
 from augment.errors import OutputError
+from augment.jobs.atomic import replaced_file, write_atomic
 from tools.drawing import text_width
 
 CELL_WIDTH = 400  # px of one image on a contact sheet

@@ -12,20 +12,20 @@ import numpy as np
 from tqdm import tqdm
 
 from adapters.base import open_scene, parse_uri
-from adapters.street.truth import StreetTruth, open_truth
-from augment.apply import WeatheredBuffers, render_buffers
+from adapters.street.labels import StreetTruth, open_truth
 from augment.cameras import Camera
+from augment.effects.snow.height_map import Estimator
+from augment.effects.snow.layer import lay_snow
+from augment.effects.snow.light import illumination_of
+from augment.effects.snow.placement import PlacementSettings, place_snow_bed
+from augment.effects.snow.snow import placement_settings
+from augment.effects.snow.support import remember_bed
 from augment.plan import make_plan
 from augment.render.composite import quantise
 from augment.scene import Scene
-from augment.snow.beds import remember_bed
-from augment.snow.covers import placement_settings
-from augment.snow.height_map import Estimator
-from augment.snow.layer import lay_snow
-from augment.snow.light import illumination_of
-from augment.snow.placement import PlacementSettings, place_snow_bed
-from recipes.schema import Output, Recipe, Weather
-from recipes.snow import Snow
+from augment.views import WeatheredBuffers, render_buffers
+from recipes.schema import Output, Weather, schema_Recipe
+from recipes.weather import Snow
 from tools.bench_snow_accuracy import draw_snow
 from tools.bench_snow_truth import camera_from_above, pixel_places, still, surface_below
 from tools.drawing import captioned, color_mapped, strip, write_jpeg
@@ -155,7 +155,7 @@ def _window(camera: Camera, at: tuple[float, float, float, float], zoom: float) 
 
 
 def _frame(scene: Scene, camera: Camera, snow: Snow | None) -> WeatheredBuffers:
-    recipe = Recipe(weather=Weather(snow=snow), output=Output(depth="none", labels=False))
+    recipe = schema_Recipe(weather=Weather(snow=snow), output=Output(depth="none", labels=False))
     return render_buffers(scene, camera, make_plan(recipe, scene))
 
 

@@ -10,8 +10,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from augment.batch.atomic import write_atomic
-from augment.style.train_scores import DEFINITIONS
+from augment.effects.style.scores import DEFINITIONS
+from augment.jobs.atomic import write_atomic
 from tools.style_train import StyleTrainOutcome, train_style
 from tools.style_train_options import StyleTrainOptions
 

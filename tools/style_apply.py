@@ -19,23 +19,19 @@ import numpy as np
 import torch
 from pydantic import ValidationError
 
-from augment.batch.atomic import write_atomic
 from augment.cameras import Camera
+from augment.effects.style.color_maps import StyleMaps, sky_levels, style_gaussians, styled_scene
+from augment.effects.style.content import content_pictures, content_statistics, select_views
+from augment.effects.style.style import Look, style_maps
 from augment.errors import ClimateGSError, OutputError, StyleError
-from augment.files.scene_files import is_scene_folder, save_scene
+from augment.files.scene_file import is_scene_folder, save_scene
+from augment.jobs.atomic import write_atomic
 from augment.render.composite import composite_sky, quantise
 from augment.render.rasterize import rasterize
 from augment.render.sh import SH_C0
 from augment.scene import Gaussians, Scene
 from augment.semantics import SemanticClass
-from augment.style.apply import style_gaussians, styled_scene
-from augment.style.content import content_pictures, content_statistics, select_views
-from augment.style.looks import Look
-from augment.style.maps import StyleMaps
-from augment.style.scene_maps import style_maps
-from augment.style.sky_splats import sky_levels
-from recipes.style import Style
-from recipes.style_presets import no_such_style, style_preset_names
+from recipes.weather import Style, no_such_style, style_preset_names
 from tools.drawing import captioned, strip
 
 Method = Literal["mkl", "reinhard", "gscm"]

@@ -15,18 +15,16 @@ import numpy as np
 from tqdm import tqdm
 
 from adapters.base import open_scene
-from augment.apply import render_buffers
 from augment.cameras import Camera
+from augment.effects.style.images import read_style_image
+from augment.effects.style.network import SHIPPED
+from augment.effects.style.train import SUFFIXES
 from augment.plan import make_plan
 from augment.render.composite import quantise
 from augment.scene import Scene
-from augment.style.checkpoint import SHIPPED
-from augment.style.images import read_style_image
-from augment.style.train_photos import SUFFIXES
-from recipes.schema import Output, Recipe, Smog, Weather
-from recipes.snow import Snow
-from recipes.style import Style
-from recipes.style_presets import style_preset_names
+from augment.views import render_buffers
+from recipes.schema import Output, Smog, Weather, schema_Recipe
+from recipes.weather import Snow, Style, style_preset_names
 from tools.drawing import GAP_PX, captioned, strip, write_jpeg
 
 STREET = "procedural:street?seed=3"
@@ -102,7 +100,9 @@ class Stage:
 
     def panel(self, title: str, text: str = "", **recipe: Any) -> np.ndarray:
         """The scene under a recipe, with two lines below."""
-        plan = make_plan(Recipe(output=Output(depth="none", labels=False), **recipe), self.scene)
+        plan = make_plan(
+            schema_Recipe(output=Output(depth="none", labels=False), **recipe), self.scene
+        )
         picture = quantise(render_buffers(self.scene, self.camera, plan).rgb)
         return captioned(self._small(picture), title, text)
 

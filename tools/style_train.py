@@ -23,19 +23,28 @@ import torch
 from tqdm import tqdm
 
 from adapters.base import open_scene
-from augment.batch.atomic import write_atomic
-from augment.batch.layout import STATE_FOLDER
-from augment.batch.lock import OutputLock
+from augment.effects.style.losses import FeatureExtractor, open_features
+from augment.effects.style.network import B0Encoder, load_imagenet_weights, save_network
+from augment.effects.style.pairs import recolor
+from augment.effects.style.scores import DEFINITIONS, score_photos, score_training
+from augment.effects.style.train import (
+    Content,
+    Draw,
+    Photos,
+    StepRecord,
+    StyleTrainer,
+    TrainingPool,
+    fixed_threads,
+    generator_for,
+    new_network,
+    pair_loss_of,
+    read_photos,
+    scene_contents,
+)
 from augment.errors import ClimateGSError, OutputError
-from augment.style.checkpoint import save_network
-from augment.style.encoder import B0Encoder, load_imagenet_weights
-from augment.style.features import FeatureExtractor, open_features
-from augment.style.pairs import recolor
-from augment.style.train_pairs import pair_loss_of
-from augment.style.train_photos import Photos, read_photos
-from augment.style.train_pool import Content, Draw, TrainingPool, generator_for, scene_contents
-from augment.style.train_scores import DEFINITIONS, score_photos, score_training
-from augment.style.trainer import StepRecord, StyleTrainer, fixed_threads, new_network
+from augment.jobs.atomic import write_atomic
+from augment.jobs.layout import STATE_FOLDER
+from augment.jobs.processes import OutputLock
 from tools.fit_checkpoint import (
     Checkpoint,
     check_same,

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from augment.effects.style.network import ENCODERS
+from augment.effects.style.pairs import PairWeights
+from augment.effects.style.train import LEARNING_RATES, StyleTrainConfig
 from augment.errors import ClimateGSError
-from augment.style.encoder import ENCODERS
-from augment.style.pair_losses import PairWeights
-from augment.style.train_config import LEARNING_RATES, StyleTrainConfig
 from tools.fit_options import resolved_uri
 
 DEFAULT_MINUTES = 10.0
@@ -30,7 +30,7 @@ class StyleTrainOptions:
     scene. learning_rate: None for the encoder's usual one. pair_weights: of the losses of pairs, as
     same=1,look=2; what is not named keeps its weight. holdout: every so many photos are kept for
     scores; 0 for none. half_precision: of the file, not of the training. ablations: train without
-    each loss, and 3x3, too. The rest is as augment.style.train_config.StyleTrainConfig has it.
+    each loss, and 3x3, too. The rest is as augment.effects.style.train.StyleTrainConfig has it.
 
     Raises:
         ClimateGSError: a value outside its range, or two that exclude each other.

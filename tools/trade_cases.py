@@ -11,13 +11,20 @@ from augment.cameras import Camera
 from augment.errors import SceneError
 from augment.scene import Scene
 from recipes.change import changed
-from recipes.flood import Flood
-from recipes.knobs import KNOBS, Value, as_reference, knobs_of, with_settings
 from recipes.load import load_recipe
-from recipes.quality import TIERS, Quality
-from recipes.schema import Recipe, Smog, Weather
-from recipes.snow import Snow
-from recipes.style import Style
+from recipes.schema import (
+    KNOBS,
+    TIERS,
+    Quality,
+    Smog,
+    Value,
+    Weather,
+    as_reference,
+    knobs_of,
+    schema_Recipe,
+    with_settings,
+)
+from recipes.weather import Flood, Snow, Style
 
 WHOLE = "whole"  # stands for a knob where several are set
 DEPTH, JPEG = "output.depth", "output.jpeg_quality"
@@ -62,7 +69,7 @@ class Setting:
 
     knob: str
     value: Value
-    recipe: Recipe
+    recipe: schema_Recipe
     given: Mapping[str, Value] = field(default_factory=dict)
 
     @property
@@ -70,12 +77,12 @@ class Setting:
         return (self.knob, self.value) == (WHOLE, REFERENCE)
 
 
-def trade_recipe(name: str) -> Recipe:
+def trade_recipe(name: str) -> schema_Recipe:
     """One of RECIPES, a preset or a file: its first variant, without any wish for quality."""
     if name == CLEAN:
-        recipe = Recipe(name=CLEAN)
+        recipe = schema_Recipe(name=CLEAN)
     elif name == "all":
-        recipe = Recipe(
+        recipe = schema_Recipe(
             name="all",
             weather=Weather(
                 smog=Smog(visibility_m=400.0, scale_height_m=120.0),
@@ -90,13 +97,13 @@ def trade_recipe(name: str) -> Recipe:
     return recipe.model_copy(update={"quality": Quality()})
 
 
-def clean_recipe(recipe: Recipe) -> Recipe:
+def clean_recipe(recipe: schema_Recipe) -> schema_Recipe:
     """The reference without effects: the same files of the same scene."""
     return as_reference(recipe.model_copy(update={"weather": Weather(), "style": None}))
 
 
 def settings_of_trade(
-    recipe: Recipe, case: TradeCase, wholes: Mapping[str, Mapping[str, Value]] | None = None
+    recipe: schema_Recipe, case: TradeCase, wholes: Mapping[str, Mapping[str, Value]] | None = None
 ) -> list[Setting]:
     """Reference first, each knob's other values alone, then wholes: by default the tiers and the
     recipe with its own settings.

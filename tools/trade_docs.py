@@ -15,8 +15,7 @@ from typing import Any
 
 import cv2
 
-from recipes.knobs import KNOBS, Knob, Value
-from recipes.quality import TIERS
+from recipes.schema import KNOBS, TIERS, Knob, Value
 from tools.bench_trade import table_of
 from tools.machine import machine_line
 from tools.tables import markdown

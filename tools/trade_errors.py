@@ -17,16 +17,16 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from augment.apply import SURFACE_ALPHA, render_buffers
 from augment.cameras import Camera
+from augment.effects.flood.water_plane import plane_depth
+from augment.jobs.quality import Trial
 from augment.metrics.consistency import DepthView, warp_view
 from augment.metrics.image import CLOSE_M, flip, ssim
 from augment.plan import make_plan
-from augment.quality.trial import Trial
 from augment.scene import Scene
-from augment.weather.water_plane import plane_depth
+from augment.views import SURFACE_ALPHA, render_buffers
 from recipes.change import changed
-from recipes.schema import Recipe
+from recipes.schema import schema_Recipe
 from tools.trade_cases import DEPTH, View
 
 
@@ -55,7 +55,7 @@ class Standard:
 
 
 def standard_of(
-    scene: Scene, view: View, recipe: Recipe, true_m: np.ndarray | None = None
+    scene: Scene, view: View, recipe: schema_Recipe, true_m: np.ndarray | None = None
 ) -> Standard:
     """recipe: at reference. true_m: as Standard's."""
     if recipe.output.depth == "none":
@@ -168,7 +168,7 @@ def true_depths(uri: str, cameras: Sequence[Camera]) -> list[np.ndarray] | None:
     other scenes.
     """
     from adapters.base import parse_uri
-    from adapters.street.truth import open_truth
+    from adapters.street.labels import open_truth
 
     scheme, _, query = parse_uri(uri)
     if scheme != "procedural":

@@ -5,7 +5,7 @@
    reference, over all recipes and scenes in which it changes the picture.
 2. Knob after knob, that which saves most first, takes the fastest of them with which the worst FLIP
    of all that are chosen so far, rendered together, is within the bound: over all recipes, scenes
-   and views (augment.quality.choose.within_flip).
+   and views (augment.jobs.quality.within_flip).
 
     python -m tools.trade_tiers TABLE.json=SCENE_URI ...
 
@@ -24,8 +24,8 @@ from typing import Any
 
 import numpy as np
 
-from augment.quality.choose import Cost, Settings, useful, within_flip
-from recipes.knobs import BY_PATH, KNOBS, Knob, Value
+from augment.jobs.quality import Cost, Settings, useful, within_flip
+from recipes.schema import BY_PATH, KNOBS, Knob, Value
 from tools.bench_trade import Trade, bench_trade, table_of
 from tools.drawing import write_jpeg
 from tools.trade_cases import JPEG, WHOLE, TradeCase

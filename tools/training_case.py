@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from adapters.street.parameters import StreetParameters
+from adapters.street.layout import StreetParameters
 from recipes.parse import parse_recipe
-from recipes.schema import Recipe
+from recipes.schema import schema_Recipe
 
 # Labels show the scene without its weather, whatever hides it: road under snow or water is road.
 _HEAD = "output: {depth: none, semantic: true, surface: scene, lidar: false, labels: false}\n"
@@ -90,7 +90,7 @@ class TrainingCase:
         """What is tested on, in order."""
         return tuple(name for names in self.test_weather.values() for name in names)
 
-    def recipes_of(self, uri: str) -> list[Recipe]:
+    def recipes_of(self, uri: str) -> list[schema_Recipe]:
         """What is rendered of a scene. No two scenes, and no training and test, share a draw."""
         if uri in self.train_scenes:
             place, counts = self.train_scenes.index(uri), {CLEAN: 1, **self.train_weather}
@@ -108,7 +108,7 @@ class TrainingCase:
         ]
 
 
-def draw(name: str, variant: int) -> Recipe:
+def draw(name: str, variant: int) -> schema_Recipe:
     """One recipe in numbers."""
     return parse_recipe(_HEAD + RECIPES[name], source=name, name=name).resolve(variant)
 

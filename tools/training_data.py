@@ -13,11 +13,11 @@ import torch
 from torch.utils.data import DataLoader
 
 from adapters.base import open_scene
-from augment.batch.job import RenderJob, SceneLoader, run_job
-from augment.batch.layout import MANIFEST
-from augment.batch.manifest import OK, read_manifest
 from augment.dataset import WeatherDataset, collate_frames
 from augment.errors import OutputError
+from augment.jobs.layout import MANIFEST
+from augment.jobs.manifest import OK, read_manifest
+from augment.jobs.render_job import RenderJob, SceneLoader, run_job
 from augment.semantics import SemanticClass as S
 from recipes.files import with_digest
 from tools.training_case import CLEAN, TrainingCase

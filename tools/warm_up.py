@@ -10,29 +10,28 @@ from contextlib import contextmanager
 import numpy as np
 import torch
 
-from augment.apply import render_view
-from augment.batch.backends import renders_on_gpu
-from augment.batch.box_weather import uses_boxes
-from augment.box_pixels import PlacedBoxes
-from augment.boxes_2d import find_occlusion
+from augment.boxes import PlacedBoxes, find_occlusion
 from augment.cameras import Camera, Frame
+from augment.effects.lidar.beam import weathered_sweep
 from augment.geometry import rigid
 from augment.ground_heights import Ground
+from augment.jobs.backends import renders_on_gpu
+from augment.jobs.view_files import uses_boxes
 from augment.labels import Boxes, LidarSweep
-from augment.lidar_weather.apply import weathered_sweep
-from augment.render import cpu
-from augment.render.backends import CPU, CUDA
-from augment.render.gpu import is_interpreted
+from augment.render.buffers import CPU, CUDA
+from augment.render.cpu import driver as cpu
+from augment.render.cuda.runtime import is_interpreted
 from augment.render.threads import thread_count
 from augment.scene import Gaussians, Scene
 from augment.sky import CubemapSky
-from recipes.schema import Recipe
+from augment.views import render_view
+from recipes.schema import schema_Recipe
 
 SIZE = 32  # pixels a side
 ACROSS, SPACING_M = 10, 0.1  # splats of the road to each side, and between them
 
 
-def warm_up(recipes: Sequence[Recipe], backend: str = CPU) -> float:
+def warm_up(recipes: Sequence[schema_Recipe], backend: str = CPU) -> float:
     """Compile the kernels that the recipes take, or load them; seconds it took."""
     if not renders_on_gpu(backend):
         seconds = cpu.warm_up()
@@ -46,7 +45,7 @@ def warm_up(recipes: Sequence[Recipe], backend: str = CPU) -> float:
     return time.perf_counter() - started
 
 
-def warm_up_for_workers(recipes: Sequence[Recipe], backend: str) -> float:
+def warm_up_for_workers(recipes: Sequence[schema_Recipe], backend: str) -> float:
     """As `warm_up`, for other processes, which find what was compiled in the caches on the disk.
 
     A GPU is used in a process of its own: this one would hold a part of its memory until it ends.
@@ -61,7 +60,7 @@ def warm_up_for_workers(recipes: Sequence[Recipe], backend: str) -> float:
 
 
 @contextmanager
-def warming_up_beside(recipes: Sequence[Recipe]) -> Iterator[None]:
+def warming_up_beside(recipes: Sequence[schema_Recipe]) -> Iterator[None]:
     """Meanwhile a second process compiles for the last recipes first, where there is a core for it.
 
     numba compiles one kernel at a time in a process, and finds in its cache what another process
@@ -80,7 +79,7 @@ def warming_up_beside(recipes: Sequence[Recipe]) -> Iterator[None]:
         beside.kill()
 
 
-def _warm_recipes(recipes: Sequence[Recipe], backend: str = CPU) -> None:
+def _warm_recipes(recipes: Sequence[schema_Recipe], backend: str = CPU) -> None:
     seen = set()
     if any(uses_boxes(recipe) for recipe in recipes):
         nothing = PlacedBoxes.of(Boxes.empty(), np.zeros(3))

@@ -1,21 +1,27 @@
 """What a KITTI folder holds of the frames asked for, before images are decoded: calibration, poses,
-times and labels of a raw drive, or of one frame of the object benchmark."""
+times and labels of a raw drive, or of one frame of the object benchmark.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+from tqdm import tqdm
 
-from adapters.kitti.calibration import (
-    Calibration,
-    read_object_calibration,
-    read_raw_calibration,
-    read_velodyne_from_imu,
+from adapters.kitti.boxes import (
+    TRACKLETS,
+    Tracklet,
+    boxes_at,
+    boxes_of_lines,
+    read_object_lines,
+    read_tracklets,
 )
-from adapters.kitti.labels import LocatedSweeps, ObjectLabels, RawLabels, object_label_file
 from adapters.kitti.layout import (
     COLOUR_CAMERAS,
     GREY_CAMERAS,
@@ -24,21 +30,453 @@ from adapters.kitti.layout import (
     OBJECT_DIGITS,
     RAW_DIGITS,
     VELODYNE,
+    Calibration,
+    file_in,
+    frame_times,
     is_object_folder,
     kitti_root,
+    labelled_sweep,
     numbered,
+    read_object_calibration,
+    read_raw_calibration,
+    read_returns,
+    read_times,
+    read_velodyne_from_imu,
     some,
 )
-from adapters.kitti.object_labels import read_object_lines
-from adapters.kitti.options import ICP, KittiOptions
-from adapters.kitti.poses import Poses, odometry_poses, oxts_poses, without_poses
-from adapters.kitti.registration import registered_poses
-from adapters.kitti.sweeps import read_returns
-from adapters.kitti.times import frame_times, read_times
-from adapters.kitti.tracklets import TRACKLETS, read_tracklets
-from adapters.lidar.options import DriveFrames
-from adapters.lidar.origin import drive_origin
+from adapters.lidar_scene.scene import DriveFrames, DriveOptions, drive_origin, stored_records
+from adapters.plain_files import checked_pose, read_numbers, read_text
 from augment.errors import AdapterError
+from augment.labels import Boxes, LidarSweep
+
+# ---- What the URI of a KITTI scene may ask for ---------------------------------------------------
+
+ICP = "icp"
+_OWN = {
+    "poses": "icp, or a file with a line of 12 numbers a frame (raw drives)",
+    "frame": "a frame's number (object folders)",
+}
+
+
+@dataclass(frozen=True)
+class KittiOptions:
+    """drive: the options of every drive. poses: "icp", a file's name, or None for the drive's own
+    GPS/IMU. frame: which frame of an object folder; None: the only one.
+    """
+
+    drive: DriveOptions
+    poses: str | None = None
+    frame: int | None = None
+
+    @staticmethod
+    def from_query(query: dict[str, str], *, is_object: bool) -> KittiOptions:
+        """The options of a URI's query.
+
+        Raises:
+            AdapterError: an unknown key, or a value that is none.
+        """
+        drive = DriveOptions.from_query("kitti", query, _OWN)
+        poses, frame = query.get("poses"), query.get("frame")
+        wrong = "poses" if is_object and poses is not None else None
+        wrong = "frame" if not is_object and frame is not None else wrong
+        if wrong:
+            what = "an object folder, whose frames are unrelated" if is_object else "a raw drive"
+            raise AdapterError(f"kitti: {wrong}= means nothing for {what}; it is {_OWN[wrong]}")
+        if frame is not None and not re.fullmatch("[0-9]{1,9}", frame):
+            raise AdapterError(f"kitti: frame must be a frame's number; got {frame!r}")
+        if poses == "":
+            raise AdapterError("kitti: poses must be icp or the name of a file; got nothing")
+        return KittiOptions(drive, poses, None if frame is None else int(frame))
+
+
+# ---- KITTI's boxes and sweeps in the dataset's world, read when asked ----------------------------
+
+_RECORD = ("x", "y", "z", "intensity")  # of a sweep's file
+
+
+@dataclass(frozen=True, eq=False)
+class LocatedSweeps:
+    """Sweeps and where they were taken, by frame. names: files relative to the root.
+    world_from_velodyne: float64 [4, 4] in the dataset's world."""
+
+    root: Path
+    names: Mapping[int, str]
+    timestamps_ns: Mapping[int, int]
+    world_from_velodyne: Mapping[int, np.ndarray]
+
+    def read(self, frame: int) -> LidarSweep | None:
+        """The frame's sweep; None without a file or a pose, or where the file is damaged, which
+        the scene's problems say."""
+        name, pose = self.names.get(frame), self.world_from_velodyne.get(frame)
+        if name is None or pose is None:
+            return None
+        try:
+            returns = read_returns(self.root, name)
+        except AdapterError:
+            return None
+        return labelled_sweep(returns, pose, self.timestamps_ns[frame])
+
+    def origins(self, frame: int, sweep: LidarSweep) -> np.ndarray | None:
+        """The Velodyne's place in its pose of the frame; what the car drives within the turn of
+        0.1 s is left out, as it is left in the returns."""
+        pose = self.world_from_velodyne.get(frame)
+        return None if pose is None else np.broadcast_to(pose[:3, 3], (len(sweep), 3))
+
+    def files(self, frame: int) -> tuple[Path, ...]:
+        """The frame's file, where it is there and has a pose."""
+        name = self.names.get(frame)
+        if name is None or frame not in self.world_from_velodyne:
+            return ()
+        file = file_in(self.root, name)
+        return (file,) if file.exists() else ()
+
+    def content(self, frame: int, sweep: LidarSweep) -> bytes:
+        """That file with a weathered sweep in place of its own."""
+        records = read_returns(self.root, self.names[frame])
+        return stored_records(records, _RECORD, sweep, self.world_from_velodyne[frame])
+
+
+@dataclass(frozen=True, eq=False)
+class RawLabels:
+    """Labels of a raw drive. Boxes are tracklets (see tracklets.boxes_at); sweeps have the columns
+    x y z (metres), intensity (reflectance 0 to 1), timestamp_ns (the frame's)."""
+
+    sweeps: LocatedSweeps
+    tracklets: tuple[Tracklet, ...]
+
+    def boxes(self, frame_index: int) -> Boxes:
+        pose = self.sweeps.world_from_velodyne.get(frame_index)
+        return Boxes.empty() if pose is None else boxes_at(self.tracklets, frame_index, pose)
+
+    def lidar(self, frame_index: int) -> LidarSweep | None:
+        return self.sweeps.read(frame_index)
+
+    def lidar_origins(self, frame_index: int, sweep: LidarSweep) -> np.ndarray | None:
+        return self.sweeps.origins(frame_index, sweep)
+
+    def lidar_files(self, frame_index: int) -> tuple[Path, ...]:
+        return self.sweeps.files(frame_index)
+
+    def lidar_content(self, frame_index: int, file: Path, sweep: LidarSweep) -> bytes:
+        return self.sweeps.content(frame_index, sweep)
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectLabels:
+    """Labels of one frame of the object benchmark, in its Velodyne's frame; see
+    object_labels.boxes_of_lines and RawLabels for the columns."""
+
+    sweeps: LocatedSweeps
+    number: int
+    velodyne_from_rectified: np.ndarray
+
+    def boxes(self, frame_index: int) -> Boxes:
+        path = object_label_file(self.sweeps.root, frame_index)
+        if frame_index != self.number or not path.exists():
+            return Boxes.empty()
+        return boxes_of_lines(read_object_lines(path), self.velodyne_from_rectified)
+
+    def lidar(self, frame_index: int) -> LidarSweep | None:
+        return self.sweeps.read(frame_index)
+
+    def lidar_origins(self, frame_index: int, sweep: LidarSweep) -> np.ndarray | None:
+        return self.sweeps.origins(frame_index, sweep)
+
+    def lidar_files(self, frame_index: int) -> tuple[Path, ...]:
+        return self.sweeps.files(frame_index)
+
+    def lidar_content(self, frame_index: int, file: Path, sweep: LidarSweep) -> bytes:
+        return self.sweeps.content(frame_index, sweep)
+
+
+def object_label_file(root: Path, frame: int) -> Path:
+    """The label file of a frame, there or not."""
+    return file_in(root, f"label_2/{frame:0{OBJECT_DIGITS}d}.txt")
+
+
+# ------------------------------------------------------------------------------------------------
+# Where the Velodyne was in each frame of a raw drive: from GPS/IMU files or a file of poses
+# The ego frame is the Velodyne's: x forward, y left, z up, its origin 1.73 m above the road.
+
+EARTH_RADIUS_M = 6378137.0
+_OXTS_NUMBERS = 30
+_MOST_LATITUDE_DEG = 85.0  # Mercator's scale goes to infinity at the poles
+# Rows: a z-up world's x (camera's forward), y (its left), z (its up) in a camera's axes.
+_UP_FROM_CAMERA = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+
+
+@dataclass(frozen=True, eq=False)
+class Poses:
+    """world_from_velodyne: float64 [4, 4] by frame number, in the dataset's world, z up. problems:
+    one sentence each."""
+
+    world_from_velodyne: Mapping[int, np.ndarray]
+    problems: tuple[str, ...] = ()
+
+
+def oxts_poses(root: Path, names: Mapping[int, str], velodyne_from_imu: np.ndarray) -> Poses:
+    """Poses from the GPS/IMU files `names`, in KITTI's Mercator world: x east, y north, z the
+    altitude, metres, scaled by the cosine of the first file's latitude.
+
+    Raises:
+        AdapterError: no file is usable.
+    """
+    packets, problems = {}, []
+    for number, name in sorted(names.items()):
+        try:
+            packets[number] = _read_packet(file_in(root, name))
+        except AdapterError as error:
+            problems.append(f"frame {number} has no pose: {error}")
+    if not packets:
+        raise AdapterError(f"{root / 'oxts'}: no file can be used: {'; '.join(problems[:3])}")
+    scale = float(np.cos(np.radians(next(iter(packets.values()))[0])))
+    imu_from_velodyne = np.linalg.inv(velodyne_from_imu)
+    poses = {n: _mercator_pose(p, scale) @ imu_from_velodyne for n, p in packets.items()}
+    return Poses(poses, tuple(problems))
+
+
+def odometry_poses(
+    path: Path, numbers: Sequence[int], rectified_from_velodyne: np.ndarray
+) -> Poses:
+    """Poses from a file as of KITTI's odometry benchmark: a line of 12 numbers a frame, the rows of
+    world_from_camera for the rectified left grey camera 0, whose world is turned to z up here.
+
+    Lines are the frames in their order if there are as many, else line n (from 0) is frame n.
+    numbers: the drive's frames.
+
+    Raises:
+        AdapterError: no such file, a line is no pose, or no line is of any frame.
+    """
+    if not path.is_file():
+        raise AdapterError(
+            f"kitti: poses must be icp or a file of poses; got {str(path)!r}, and there is no file "
+            f"{path.absolute()}"
+        )
+    lines = [line for line in read_text(path).splitlines() if line.strip()]
+    in_order = len(lines) == len(numbers)
+    poses = {}
+    for row, line in enumerate(lines):
+        number = numbers[row] if in_order else row
+        where = f"{path}, line {row + 1}"
+        try:
+            values = np.array([float(word) for word in line.split()], np.float64)
+        except ValueError as error:
+            raise AdapterError(f"{where}: expected 12 numbers ({error})") from None
+        if values.size != 12:
+            raise AdapterError(f"{where}: expected 12 numbers, a pose; got {values.size}")
+        world_from_rectified = checked_pose(values.reshape(3, 4), where)
+        poses[number] = _UP_FROM_CAMERA @ world_from_rectified @ rectified_from_velodyne
+    if not set(poses) & set(numbers):
+        raise AdapterError(
+            f"{path} has {len(lines)} poses, none of them of frames {numbers[0]} to {numbers[-1]}"
+        )
+    return Poses(poses)
+
+
+def without_poses(numbers: Sequence[int], poses: Mapping[int, np.ndarray]) -> tuple[str, ...]:
+    """A sentence for the frames that have no pose."""
+    missing = [number for number in numbers if number not in poses]
+    return (f"left out {some(missing)}: no pose is known",) if missing else ()
+
+
+def _read_packet(path: Path) -> np.ndarray:
+    """The numbers of a GPS/IMU file: latitude and longitude (degrees), altitude (metres), roll,
+    pitch and yaw (radians), and 24 that are not used."""
+    values = read_numbers(path, (_OXTS_NUMBERS,))
+    latitude, longitude, altitude = values[:3]
+    if abs(latitude) > _MOST_LATITUDE_DEG or abs(longitude) > 180 or abs(altitude) > 1e4:
+        raise AdapterError(
+            f"{path} must begin with latitude, longitude (degrees) and altitude (metres); got "
+            f"{latitude:g} {longitude:g} {altitude:g}"
+        )
+    return values
+
+
+def _mercator_pose(packet: np.ndarray, scale: float) -> np.ndarray:
+    """world_from_imu, float64 [4, 4]."""
+    latitude, longitude, altitude, roll, pitch, yaw = packet[:6]
+    pose = np.eye(4)
+    pose[:3, :3] = _about(2, yaw) @ _about(1, pitch) @ _about(0, roll)
+    pose[0, 3] = scale * EARTH_RADIUS_M * np.radians(longitude)
+    pose[1, 3] = scale * EARTH_RADIUS_M * np.log(np.tan(np.pi * (90 + latitude) / 360))
+    pose[2, 3] = altitude
+    return pose
+
+
+def _about(axis: int, angle: float) -> np.ndarray:
+    """Rotation about x, y or z (0, 1, 2), float64 [3, 3]."""
+    cos, sin = np.cos(angle), np.sin(angle)
+    matrix = np.eye(3)
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    matrix[i, i] = matrix[j, j] = cos
+    matrix[i, j], matrix[j, i] = -sin, sin
+    return matrix
+
+
+# ------------------------------------------------------------------------------------------------
+# Poses from the sweeps themselves, where a drive has none: point-to-plane ICP between neighbours
+# Every step is NumPy on one thread, so that the same sweeps give the same bits; parallel sums, as
+# libraries for point clouds take them, change the last ones from run to run.
+
+_VOXEL_M = 0.25
+_NEAR_M, _FAR_M = 2.6, 60.0  # nearer is the recording car, further is sparse
+_NEIGHBOURS = 12
+_FLAT = 0.05  # a normal is believed where its variance is less than this of the next
+_STAGES = ((4.0, 12), (1.5, 12), (0.5, 15))  # reach of a match in metres, iterations
+_LOOSE_M = 0.2  # of a residual, in the last stage, where its weight has fallen to half
+_SETTLED = 1e-6  # metres and radians that a step still changes
+_FEWEST = 200
+_POOR_FITNESS = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class _Surface:
+    """Thinned points [N, 3] of a sweep, those of them on surfaces [M, 3], and normals [M, 3]."""
+
+    points: np.ndarray
+    flat: np.ndarray
+    normals: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Match:
+    """before_from_after: float64 [4, 4]. fitness: part of the points with a surface within half a
+    metre. rmse_m: of their distances from it."""
+
+    before_from_after: np.ndarray
+    fitness: float
+    rmse_m: float
+
+
+def registered_poses(numbers: Sequence[int], read: Callable[[int], np.ndarray | None]) -> Poses:
+    """Poses of the frames with a sweep, in the Velodyne's frame of the first.
+
+    read: the returns [N, 3 or more] of a frame in the Velodyne's frame, or None.
+    Each sweep is matched with the one before, starting from the motion between the two before.
+
+    Raises:
+        AdapterError: no frame has a sweep, or one has too few surfaces.
+    """
+    pose, step = np.eye(4), np.eye(4)
+    poses: dict[int, np.ndarray] = {}
+    matches: dict[int, Match] = {}
+    before: _Surface | None = None
+    for number in tqdm(numbers, desc="registration", unit="sweep", disable=None):
+        returns = read(number)
+        if returns is None:
+            continue
+        after = _surface(returns[:, :3].astype(np.float64), number)
+        if before is not None:
+            match = _match(after, before, step)
+            matches[number] = match
+            step = match.before_from_after
+            pose = pose @ step
+        poses[number] = pose
+        before = after
+    if not poses:
+        raise AdapterError(
+            f"poses=icp: frames {numbers[0]} to {numbers[-1]} have no sweep to find poses from"
+        )
+    return Poses(poses, _described(matches))
+
+
+def _described(matches: dict[int, Match]) -> tuple[str, ...]:
+    if not matches:
+        return ()
+    fitness = np.mean([m.fitness for m in matches.values()])
+    rmse = np.mean([m.rmse_m for m in matches.values()])
+    said = (
+        f"poses are from registering {len(matches) + 1} sweeps one after the other (poses=icp): "
+        f"mean fitness {fitness:.3f}, inlier RMSE {rmse:.3f} m; they drift over long drives"
+    )
+    poor = [number for number, m in matches.items() if m.fitness < _POOR_FITNESS]
+    if not poor:
+        return (said,)
+    return (
+        said,
+        f"the sweep of frame {poor[0]} and {len(poor) - 1} others hardly match the one before",
+    )
+
+
+def _match(after: _Surface, before: _Surface, guess: np.ndarray) -> Match:
+    tree = cKDTree(before.flat)
+    transform = guess
+    for reach_m, iterations in _STAGES:
+        loose = _LOOSE_M * reach_m / _STAGES[-1][0]
+        for _ in range(iterations):
+            moved, index, near = _nearest(tree, after, transform, reach_m)
+            residual = _residuals(moved[near], before, index[near])
+            step = _step(moved[near], before.normals[index[near]], residual, loose)
+            transform = step @ transform
+            if np.abs(step - np.eye(4)).max() < _SETTLED:
+                break
+    moved, index, near = _nearest(tree, after, transform, _STAGES[-1][0])
+    residual = _residuals(moved[near], before, index[near])
+    rmse = float(np.sqrt(np.mean(residual**2))) if near.any() else float("inf")
+    return Match(transform, float(near.mean()), rmse)
+
+
+def _nearest(
+    tree: cKDTree, after: _Surface, transform: np.ndarray, reach_m: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points moved [N, 3], the nearest surface point of each [N], and whether it is in reach."""
+    moved = after.points @ transform[:3, :3].T + transform[:3, 3]
+    distance, index = tree.query(moved, distance_upper_bound=reach_m)
+    return moved, index, np.isfinite(distance)
+
+
+def _residuals(points: np.ndarray, surface: _Surface, index: np.ndarray) -> np.ndarray:
+    return np.einsum("ij,ij->i", points - surface.flat[index], surface.normals[index])
+
+
+def _step(
+    points: np.ndarray, normals: np.ndarray, residual: np.ndarray, loose_m: float
+) -> np.ndarray:
+    """The Gauss-Newton step as a rigid transform; far residuals, as of what moves, weigh little."""
+    weight = 1 / (1 + (residual / loose_m) ** 2)
+    jacobian = np.concatenate([np.cross(points, normals), normals], axis=1)  # [N, 6]
+    hessian = np.einsum("n,ni,nj->ij", weight, jacobian, jacobian)
+    gradient = np.einsum("n,n,ni->i", weight, residual, jacobian)
+    # A direction that no surface holds stays where it is.
+    change = -np.linalg.solve(hessian + 1e-6 * np.trace(hessian) * np.eye(6), gradient)
+    step = np.eye(4)
+    step[:3, :3] = Rotation.from_rotvec(change[:3]).as_matrix()
+    step[:3, 3] = change[3:]
+    return step
+
+
+def _surface(points: np.ndarray, number: int) -> _Surface:
+    distance = np.linalg.norm(points, axis=1)
+    points = points[(distance > _NEAR_M) & (distance < _FAR_M)]  # False for NaN too
+    thin = _thinned(points)
+    if len(thin) >= _FEWEST:
+        normals, flat = _normals(thin)
+        if flat.sum() >= _FEWEST:
+            return _Surface(thin, thin[flat], normals[flat])
+    raise AdapterError(
+        f"poses=icp: the sweep of frame {number} has too few surfaces ({len(thin)} points) to be "
+        f"registered; give poses=FILE, or frames without it"
+    )
+
+
+def _thinned(points: np.ndarray) -> np.ndarray:
+    """The mean of the points of each voxel."""
+    x, y, z = np.floor((points + _FAR_M) / _VOXEL_M).astype(np.int64).T
+    side = int(2 * _FAR_M / _VOXEL_M) + 1
+    _, cell, counts = np.unique((x * side + y) * side + z, return_inverse=True, return_counts=True)
+    sums = [np.bincount(cell, points[:, i], len(counts)) for i in range(3)]
+    return np.stack(sums, axis=1) / counts[:, None]
+
+
+def _normals(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The direction of least spread around each point [N, 3]; whether that is flat, bool [N]."""
+    _, index = cKDTree(points).query(points, _NEIGHBOURS)
+    offset = points[index] - points[index].mean(axis=1, keepdims=True)
+    variance, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", offset, offset))
+    return axes[:, :, 0], variance[:, 0] < _FLAT * variance[:, 1]
+
+
+# ---- source --------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)

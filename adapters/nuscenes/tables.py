@@ -13,16 +13,305 @@ are nanoseconds.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import io
+import json
+import re
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, TypeGuard
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from adapters.nuscenes.rows import Row, read_all, read_rows, read_where, referred
-from adapters.nuscenes.turning import Turn
-from adapters.plain_files import array_of, inside
+from adapters.lidar_scene.scene import DriveOptions
+from adapters.plain_files import LARGEST, array_of, inside
 from augment.errors import AdapterError
+from recipes.files import open_file
+
+# ---- Rows of a nuScenes table, read one after another and checked field by field -----------------
+# A table is a JSON list of objects. The largest of trainval hold millions of rows and more than a
+# gigabyte, of which one scene needs a thousandth, so a table is never in memory as a whole.
+
+_CHUNK = 1 << 22  # characters read at a time
+_LONGEST_ROW = 1 << 24  # no published row has a ten-thousandth of it
+_BETWEEN = re.compile(r"[\s,]*")
+_UNIT_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True)
+class Row:
+    """One row. path: its table. fields: as in the file; further ones than are asked for may be
+    there, as later editions of the dataset have them.
+
+    All readers raise AdapterError, naming table, row and field, where a field is missing or wrong.
+    """
+
+    path: Path
+    number: int
+    fields: dict[str, Any]
+
+    def __str__(self) -> str:
+        name = self.fields.get("token")
+        return f"{self.path}: row {name!r}" if isinstance(name, str) else self._numbered
+
+    @property
+    def _numbered(self) -> str:
+        return f"{self.path}: row number {self.number}"
+
+    @property
+    def token(self) -> str:
+        token = self.text("token")
+        if not token:
+            raise AdapterError(f"{self._numbered}: field 'token' must not be empty")
+        return token
+
+    def fault(self, field: str, expected: str) -> AdapterError:
+        """The error that the field is not what was expected."""
+        try:
+            got = repr(self.fields[field]) if field in self.fields else "no such field"
+        except RecursionError:
+            got = "lists in lists"
+        got = got if len(got) <= 200 else got[:200] + "…"
+        return AdapterError(f"{self}: field {field!r} must be {expected}; got {got}")
+
+    def text(self, field: str) -> str:
+        value = self.fields.get(field)
+        if not _is_text(value):
+            raise self.fault(field, "a text")
+        return value
+
+    def texts(self, field: str) -> tuple[str, ...]:
+        value = self.fields.get(field)
+        if not isinstance(value, list) or not all(map(_is_text, value)):
+            raise self.fault(field, "a list of texts")
+        return tuple(value)
+
+    def integer(self, field: str, *, low: int = 0) -> int:
+        value = self.fields.get(field)
+        if type(value) is not int or not low <= value < 2**62:
+            raise self.fault(field, f"an integer of at least {low}")
+        return value
+
+    def nanoseconds(self) -> int:
+        """The field `timestamp`, which the table has in microseconds."""
+        value = self.fields.get("timestamp")
+        # Some converters write the same number as a float.
+        if isinstance(value, float) and value.is_integer():
+            value = int(value)
+        if type(value) is not int or not 0 < value < 2**62 // 1000:
+            raise self.fault("timestamp", "a time in microseconds, a whole number above 0")
+        return value * 1000
+
+    def flag(self, field: str) -> bool:
+        value = self.fields.get(field)
+        if not isinstance(value, bool):
+            raise self.fault(field, "true or false")
+        return value
+
+    def numbers(self, field: str, count: int) -> np.ndarray:
+        """float64 [count], finite."""
+        value = self.fields.get(field)
+        if not isinstance(value, list) or len(value) != count or not all(map(_is_finite, value)):
+            raise self.fault(field, f"a list of {count} finite numbers of at most {LARGEST:g}")
+        return np.array(value, np.float64)
+
+    def quaternion(self) -> np.ndarray:
+        """The field `rotation`, wxyz, as it is: float64 [4]."""
+        quat = self.numbers("rotation", 4)
+        if abs(float(np.linalg.norm(quat)) - 1) > _UNIT_TOLERANCE:
+            raise self.fault("rotation", "a quaternion wxyz of length 1")
+        return quat
+
+    def pose(self) -> np.ndarray:
+        """The fields `translation` (metres) and `rotation`, float64 [4, 4]."""
+        w, x, y, z = self.quaternion()
+        pose = np.eye(4)
+        pose[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix()
+        pose[:3, 3] = self.numbers("translation", 3)
+        return pose
+
+
+def read_rows(path: Path) -> Iterator[Row]:
+    """The rows of a table, in its order.
+
+    Raises:
+        AdapterError: missing, unreadable, no JSON, cut short, or no list of objects.
+    """
+    try:
+        with io.TextIOWrapper(open_file(path), encoding="utf-8") as file:
+            yield from _rows(path, file)
+    except FileNotFoundError:
+        raise AdapterError(f"{path} does not exist; copy it from the dataset") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise AdapterError(f"{path} cannot be read as text: {error}") from None
+
+
+def read_where(path: Path, field: str, wanted: Container[str]) -> dict[str, Row]:
+    """The rows whose text `field` is among those wanted, by their token, in the table's order.
+
+    Raises:
+        AdapterError: as read_rows; a row without the field; two of these rows with one token.
+    """
+    kept: dict[str, Row] = {}
+    for row in read_rows(path):
+        if row.text(field) in wanted:
+            _add(kept, row)
+    return kept
+
+
+def read_all(path: Path) -> dict[str, Row]:
+    """All rows of a table by their token, as read_where."""
+    kept: dict[str, Row] = {}
+    for row in read_rows(path):
+        _add(kept, row)
+    return kept
+
+
+def referred(row: Row, field: str, table: dict[str, Row], name: str) -> Row:
+    """The row that a field names by its token. name: the table's, for the message."""
+    found = table.get(row.text(field))
+    if found is None:
+        raise row.fault(field, f"the token of a row of {name}.json, which has no such row")
+    return found
+
+
+def _add(kept: dict[str, Row], row: Row) -> None:
+    if row.token in kept:
+        raise AdapterError(
+            f"{row}: the token of an earlier row too (row number {kept[row.token].number}); "
+            f"tokens must be unique, copy the table again"
+        )
+    kept[row.token] = row
+
+
+def _rows(path: Path, file: Any) -> Iterator[Row]:
+    decoder = json.JSONDecoder()
+    first = file.read(1)
+    while first.isspace():
+        first = file.read(1)
+    if first != "[":
+        start = first + file.read(20)
+        raise AdapterError(f"{path} must hold a list of rows; it starts with {start!r}")
+    text, position, number, ended = "", 0, 0, False
+    while True:
+        between = _BETWEEN.match(text, position)
+        assert between is not None
+        position = between.end()
+        if text[position : position + 1] == "]":
+            return
+        try:
+            fields, position = decoder.raw_decode(text, position)
+        except (ValueError, RecursionError) as error:
+            if ended or len(text) - position > _LONGEST_ROW or isinstance(error, RecursionError):
+                reason = "it is cut short" if ended and position >= len(text) else str(error)
+                raise AdapterError(
+                    f"{path} is not readable JSON after its first {number} rows ({reason}); copy "
+                    f"it again"
+                ) from None
+            more = file.read(_CHUNK)
+            text, position, ended = text[position:] + more, 0, not more
+            continue
+        if not isinstance(fields, dict):
+            raise AdapterError(
+                f"{path}: row number {number} must be an object; got {type(fields).__name__}"
+            )
+        yield Row(path, number, fields)
+        number += 1
+
+
+def _is_finite(value: object) -> bool:
+    return type(value) in (int, float) and -LARGEST <= value <= LARGEST  # type: ignore[operator]
+
+
+def _is_text(value: object) -> TypeGuard[str]:
+    """Whether a text can be written again: half a pair of surrogates, as JSON can have, cannot."""
+    if not isinstance(value, str):
+        return False
+    return value.isascii() or not any("\ud800" <= letter <= "\udfff" for letter in value)
+
+
+# ---- When the LiDAR looked where: the moment of a return from its bearing ------------------------
+# nuScenes publishes one time a sweep, that of the end of its turn, and no times of returns. But the
+# sensor turns clockwise in 50 ms, and each camera is triggered as the LiDAR sweeps across the
+# middle
+# of its view. So the keyframes' images tell the bearing at which a turn ends (to the left, a little
+# behind), and that tells the time of everything. It matters for what moves: its boxes stand where
+# the
+# LiDAR met it, up to 50 ms before the sweep's time, as do the images.
+
+TURN_NS = 50_000_000
+_TWO_PI = 2 * np.pi
+# Images of one keyframe published agree to 4 degrees; other data in nuScenes's form need not turn
+# like this at all.
+_MOST_SPREAD_RAD = np.radians(20)
+
+
+@dataclass(frozen=True)
+class Turn:
+    """end_rad: bearing of the end of a turn, from the car's forward axis to the left; None where it
+    is not known, then everything counts as seen at the sweep's time."""
+
+    end_rad: float | None
+
+    @staticmethod
+    def of_images(bearings_rad: np.ndarray, before_ns: np.ndarray) -> Turn:
+        """The turn told by images: where their cameras look, and how long before their keyframe's
+        sweep they were taken; both [N]."""
+        looks_apart = len(bearings_rad) > 1 and np.ptp(bearings_rad) > _MOST_SPREAD_RAD
+        if not looks_apart:
+            return Turn(None)
+        ends = bearings_rad - _TWO_PI * before_ns / TURN_NS
+        end = float(np.angle(np.exp(1j * ends).mean()))
+        spread = np.abs(np.angle(np.exp(1j * (ends - end))))
+        return Turn(end if np.quantile(spread, 0.9) < _MOST_SPREAD_RAD else None)
+
+    def before_ns(self, directions: np.ndarray) -> np.ndarray:
+        """How long before the sweep's time the LiDAR looked there, int64 [N].
+
+        directions: [N, 2 or 3] from the sensor, in the car's axes; no numbers count as forward.
+        """
+        if self.end_rad is None:
+            return np.zeros(len(directions), np.int64)
+        bearings = np.arctan2(directions[:, 1], directions[:, 0])
+        past = np.mod(np.nan_to_num(bearings) - self.end_rad, _TWO_PI) / _TWO_PI
+        return np.round(past * TURN_NS).astype(np.int64)
+
+
+# ---- What the URI of a nuScenes scene may ask for ------------------------------------------------
+
+_OWN = {
+    "version": "a folder of tables such as v1.0-mini",
+    "scene": "a scene's name or token",
+    "sweeps": "1 for keyframes and the sweeps between them, 0 for keyframes only",
+}
+
+
+@dataclass(frozen=True)
+class NuScenesOptions:
+    """version, scene: None for the only one there is. sweeps: whether the LiDAR's sweeps between
+    keyframes are frames too. drive: the options that all raw drives have."""
+
+    version: str | None
+    scene: str | None
+    sweeps: bool
+    drive: DriveOptions
+
+    @staticmethod
+    def from_query(query: dict[str, str]) -> NuScenesOptions:
+        """The options of a URI's query.
+
+        Raises:
+            AdapterError: an unknown key, or a value of the wrong kind or out of range.
+        """
+        sweeps = query.get("sweeps", "1")
+        if sweeps not in ("0", "1"):
+            raise AdapterError(f"nuscenes: sweeps must be {_OWN['sweeps']}; got {sweeps!r}")
+        drive = DriveOptions.from_query("nuscenes", query, _OWN)
+        return NuScenesOptions(query.get("version"), query.get("scene"), sweeps == "1", drive)
+
+
+# ---- tables --------------------------------------------------------------------------------------
 
 LIDAR = "LIDAR_TOP"
 _MOST_NAMES = 10  # that a message lists
@@ -308,3 +597,99 @@ def _class_names(categories: Mapping[str, Row]) -> dict[int, str]:
     """Class numbers of lidarseg files; tables without lidarseg do not number their categories."""
     numbered = [row for row in categories.values() if "index" in row.fields]
     return {row.integer("index"): row.text("name") for row in numbered}
+
+
+# ---- Which images and which sweep make a frame, and what the frames' files are in the tables -----
+
+# The LiDAR turns in 50 ms; further from a sweep than two turns an image belongs to none.
+_NEAR_NS = 100_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class FrameFiles:
+    """One frame. sweep: its LiDAR file, whose time is the frame's. images: by camera, those taken
+    nearest to that; a camera that took none near it is absent."""
+
+    index: int
+    sweep: SensorFile
+    images: Mapping[str, SensorFile]
+
+
+@dataclass(frozen=True)
+class FrameToken:
+    """What a frame's image or sweep is in the tables. token: of its row in sample_data. filename:
+    relative to the dataset's folder."""
+
+    token: str
+    filename: str
+    is_key_frame: bool
+
+
+def scene_frames(
+    tables: SceneTables, *, sweeps: bool
+) -> tuple[tuple[FrameFiles, ...], tuple[str, ...]]:
+    """The frames of a scene, numbered from 0 in order of time, and a sentence for each camera that
+    has images in none of them.
+
+    sweeps: one frame a LiDAR file, of keyframes and between them (20 a second; cameras take 12
+    images a second, so most frames lack some); else one a keyframe. A keyframe has its own images,
+    those of its sample; each other image goes to the nearest frame in time that has none of its
+    camera yet, nearest pairs first, and to no second one.
+    """
+    chosen = [file for file in tables.lidar if sweeps or file.is_key_frame]
+    images: list[dict[str, SensorFile]] = [{} for _ in chosen]
+    problems = []
+    for channel, files in tables.images.items():
+        if not sweeps:
+            files = tuple(file for file in files if file.is_key_frame)
+        matches = _match(chosen, files)
+        for number, file in matches.items():
+            images[number][channel] = file
+        unused = len(files) - len(matches)
+        if unused:
+            problems.append(
+                f"camera {channel}: {unused} of {len(files)} images have no frame, since no sweep "
+                f"of {LIDAR} that lacks an image of this camera lies within "
+                f"{_NEAR_NS / 1e9:.1f} s of them"
+            )
+    frames = zip(chosen, images, strict=True)
+    return tuple(FrameFiles(i, *frame) for i, frame in enumerate(frames)), tuple(problems)
+
+
+def frame_tokens(path: str, query: dict[str, str]) -> dict[int, dict[str, FrameToken]]:
+    """What every frame of a scene is in the dataset's tables: frame number (Frame.index) to channel
+    (LIDAR_TOP among them) to row of sample_data. Frames that frames= leaves out are there too, and
+    so are files that the tables name but that are missing.
+
+    Raises:
+        AdapterError: as open_nuscenes for the tables.
+    """
+    options = NuScenesOptions.from_query(query)
+    tables = read_tables(Path(path), options.version, options.scene)
+    frames, _ = scene_frames(tables, sweeps=options.sweeps)
+    return {
+        frame.index: {
+            file.channel: FrameToken(file.token, file.filename, file.is_key_frame)
+            for file in (frame.sweep, *frame.images.values())
+        }
+        for frame in frames
+    }
+
+
+def _match(sweeps: Sequence[SensorFile], files: Sequence[SensorFile]) -> dict[int, SensorFile]:
+    """One camera's images by the number of their sweep."""
+    pairs = []
+    for j, file in enumerate(files):
+        for i, sweep in enumerate(sweeps):
+            apart = abs(sweep.timestamp_ns - file.timestamp_ns)
+            own = sweep.is_key_frame and file.is_key_frame
+            own = own and sweep.sample_token == file.sample_token
+            if own or apart <= _NEAR_NS:
+                pairs.append((not own, apart, i, j))
+    matches: dict[int, SensorFile] = {}
+    taken: set[int] = set()
+    for _, _, i, j in sorted(pairs):
+        if i not in matches and j not in taken:
+            matches[i] = files[j]
+            taken.add(j)
+    return matches

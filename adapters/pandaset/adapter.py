@@ -8,22 +8,218 @@ the object's boxes have in the labels.
 
 from __future__ import annotations
 
+from collections.abc import Collection
+from collections.abc import Sequence as Seq
+from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+import pandas as pd
 import torch
+from tqdm import tqdm
 
-from adapters.lidar.box_tracks import join_tracks
-from adapters.lidar.drive_scene import path_of, scene_of, views_of
-from adapters.lidar.options import DriveOptions
-from adapters.lidar.scene import build_lidar_scene
-from adapters.pandaset.files import CameraTrack, Sequence, read_sequence
-from adapters.pandaset.labels import PandaSetLabels
-from adapters.pandaset.sweeps import read_drive
+from adapters.lidar_scene.actor_motion import indices_between, inside_box
+from adapters.lidar_scene.scene import DriveOptions, build_lidar_scene, path_of, scene_of, views_of
+from adapters.lidar_scene.split import BoxSample, Sweep, join_tracks
+from adapters.pandaset.files import (
+    CameraTrack,
+    Sequence,
+    read_cuboids,
+    read_lidar,
+    read_semantics,
+    read_sequence,
+)
+from adapters.pandaset.labels import (
+    NO_SURFACE,
+    Objects,
+    PandaSetLabels,
+    boxes_of_cuboids,
+    read_objects,
+    semantic_table,
+    sensors_of,
+)
 from adapters.uri import format_uri
 from augment.cameras import Camera, Frame
 from augment.errors import AdapterError
-from augment.geometry import invert_rigid
+from augment.geometry import invert_rigid, rotmat_from_quat
 from augment.scene import Scene
+from augment.semantics import SemanticClass
+
+# ---- PandaSet's LiDAR files into sweeps of usable returns, and its boxes into timed samples ------
+
+# The recording car in its own frame (x forward, y left, z up): no other surface can be in there.
+EGO_LOW_M = np.array([-3.0, -1.05, -1.0])
+EGO_HIGH_M = np.array([3.0, 1.05, 2.2])
+_TIMING_MARGIN_M = 0.25  # returns this near a box tell when its sensor saw the object
+_MOVED_M = 1.0  # a box labelled stationary that travels further than this is not
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """What the sensors and annotators saw, in the scene's world.
+
+    sweeps: one a frame that has a file and is not held out. samples: the boxes of moving objects,
+    in order of frames.
+    """
+
+    sweeps: tuple[Sweep, ...]
+    samples: tuple[BoxSample, ...]
+    problems: tuple[str, ...]
+
+
+def read_drive(
+    sequence: Sequence, frames: Seq[int], *, held_out: Collection[int] = frozenset()
+) -> Drive:
+    """Sweeps and moving boxes of the given frames.
+
+    held_out: frames whose sweeps only tell at what moment their boxes were seen, so that the tracks
+    are those of the whole drive.
+    Left out: returns of smoke, exhaust, spray and mirror images, and of the recording car itself.
+    Missing files of single frames are problems, not errors.
+    """
+    table = semantic_table(sequence.root)
+    sweeps, samples, problems = [], [], []
+    cuboids = {frame: read_cuboids(sequence.root, frame) for frame in frames}
+    objects = read_objects(sequence.root)
+    moving = _moving_objects([c for c in cuboids.values() if c is not None], objects)
+    for frame in tqdm(frames, desc="LiDAR", unit="frame", disable=None):
+        lidar = read_lidar(sequence.root, frame)
+        if lidar is None:
+            problems.append(f"frame {frame}: lidar/{frame:02d}.pkl.gz is missing, its points too")
+        else:
+            raw = _RawSweep.of(sequence, frame, lidar, table)
+            if raw.unlabelled:
+                problems.append(
+                    f"frame {frame}: annotations/semseg/{frame:02d}.pkl.gz is missing; "
+                    f"its points have no class"
+                )
+            if frame not in held_out:
+                sweeps.append(raw.usable())
+        boxes = cuboids[frame]
+        if boxes is None:
+            problems.append(
+                f"frame {frame}: annotations/cuboids/{frame:02d}.pkl.gz is missing; "
+                f"moving objects are interpolated"
+            )
+            continue
+        seen = None if lidar is None else raw
+        samples += _samples(boxes, frame, moving, objects, seen, sequence)
+    return Drive(tuple(sweeps), tuple(samples), tuple(problems))
+
+
+@dataclass(frozen=True, eq=False)
+class _RawSweep:
+    points: np.ndarray  # float32 [N, 3], scene world
+    timestamps_ns: np.ndarray
+    semantic: np.ndarray  # int16 [N], NO_SURFACE included
+    sensor: np.ndarray
+    of_ego: np.ndarray  # bool [N]
+    unlabelled: bool
+
+    @staticmethod
+    def of(
+        sequence: Sequence,
+        frame: int,
+        lidar: pd.DataFrame,
+        table: np.ndarray,
+    ) -> _RawSweep:
+        world = lidar[["x", "y", "z"]].to_numpy(dtype=np.float64) - sequence.world_origin_m
+        pose = sequence.world_from_ego[frame]
+        ego = (world - pose[:3, 3]) @ pose[:3, :3]
+        classes = read_semantics(sequence.root, frame, len(lidar))
+        if classes is None:
+            semantic = np.full(len(lidar), SemanticClass.UNKNOWN, dtype=np.int16)
+        else:
+            semantic = table[np.clip(classes, 0, len(table) - 1)]
+        return _RawSweep(
+            points=world.astype(np.float32),
+            timestamps_ns=np.round(lidar["t"].to_numpy(dtype=np.float64) * 1e9).astype(np.int64),
+            semantic=semantic,
+            sensor=lidar["d"].to_numpy(),
+            of_ego=((ego > EGO_LOW_M) & (ego < EGO_HIGH_M)).all(axis=1),
+            unlabelled=classes is None,
+        )
+
+    def usable(self) -> Sweep:
+        keep = ~self.of_ego & (self.semantic != NO_SURFACE) & np.isfinite(self.points).all(axis=1)
+        return Sweep(self.points[keep], self.timestamps_ns[keep], self.semantic[keep])
+
+
+def _moving_objects(tables: Seq[pd.DataFrame], objects: Objects) -> set[str]:
+    """Names of objects that are labelled moving, or that travel although labelled stationary."""
+    if not tables:
+        return set()
+    table = pd.concat(tables, ignore_index=True)
+    uuid = table["uuid"].astype(str)
+    position = table[["position.x", "position.y"]].astype(np.float64)
+    extent = (position.groupby(uuid).max() - position.groupby(uuid).min()).to_numpy()
+    travelled = np.hypot(extent[:, 0], extent[:, 1]) > _MOVED_M
+    labelled = ~table["stationary"].astype(bool)
+    uuids = position.groupby(uuid).max().index.to_numpy()
+    return {objects.names[u] for u in (*uuid[labelled], *uuids[travelled])}
+
+
+def _samples(
+    table: pd.DataFrame,
+    frame: int,
+    moving: set[str],
+    objects: Objects,
+    seen: _RawSweep | None,
+    sequence: Sequence,
+) -> list[BoxSample]:
+    """The boxes of moving objects, both sensors' under the object's name."""
+    table = table[[objects.names[str(uuid)] in moving for uuid in table["uuid"]]]
+    if len(table) == 0:
+        return []
+    boxes = boxes_of_cuboids(table)
+    rotations = rotmat_from_quat(torch.from_numpy(boxes.quats)).numpy()
+    sensors = sensors_of(table)
+    out = []
+    for i in range(len(boxes)):
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = rotations[i], boxes.centers_m[i] - sequence.world_origin_m
+        time = int(sequence.timestamps_ns[frame])
+        if seen is not None:
+            time = _time_seen(seen, pose, boxes.sizes_m[i], sensors[i], sequence, frame, time)
+        name = objects.names[boxes.track_ids[i]]
+        out.append(BoxSample(name, None, boxes.labels[i], frame, time, pose, boxes.sizes_m[i]))
+    return out
+
+
+def _time_seen(
+    sweep: _RawSweep,
+    pose: np.ndarray,
+    size_m: np.ndarray,
+    sensor: int,
+    sequence: Sequence,
+    frame: int,
+    otherwise: int,
+) -> int:
+    """When the box's sensor saw it: boxes were drawn around returns that took 0.1 s to collect.
+
+    The median time of its returns in the box; without any, the time of the return whose bearing
+    from the car is nearest to the box's.
+    """
+    reach = float(np.linalg.norm(size_m))
+    near = indices_between(sweep.points, pose[:3, 3] - reach, pose[:3, 3] + reach)
+    if sensor >= 0:
+        near = near[sweep.sensor[near] == sensor]
+    local = (sweep.points[near] - pose[:3, 3]) @ pose[:3, :3]
+    inside = near[inside_box(local, size_m, _TIMING_MARGIN_M)]
+    if len(inside):
+        return int(np.sort(sweep.timestamps_ns[inside])[len(inside) // 2])
+    finite = np.isfinite(sweep.points[:, 0])
+    ofs = finite & (sweep.sensor == sensor) if (sweep.sensor == sensor).any() else finite
+    if not ofs.any():
+        return otherwise
+    origin = sequence.world_from_ego[frame][:2, 3]
+    to_points = sweep.points[ofs, :2] - origin
+    to_box = pose[:2, 3] - origin
+    cosine = (to_points @ to_box) / np.maximum(np.linalg.norm(to_points, axis=1), 1e-6)
+    return int(sweep.timestamps_ns[ofs][np.argmax(cosine)])
+
+
+# ---- adapter -------------------------------------------------------------------------------------
 
 _LIDAR_TOP_DEG = 15.0  # the spinning sensor's uppermost channel
 # The back camera looks over the recording car's own roof, the same in every PandaSet sequence:

@@ -23,7 +23,7 @@ import numpy as np
 import pandas as pd
 import torch
 
-from adapters.lidar.origin import drive_origin
+from adapters.lidar_scene.scene import drive_origin
 from adapters.plain_files import decode_image, number_of, read_json
 from adapters.safe_pickle import read_frame
 from augment.errors import AdapterError

@@ -6,21 +6,35 @@
 What a `generate` job wrote has labels/boxes/*.parquet and calibration/*.json in their place.
 
 Frame numbers may have leading zeros or not. A camera's folder is its name, or, for a name that is
-no safe folder name, what `augment.batch.layout.folder_name` makes of it.
+no safe folder name, what `augment.jobs.layout.folder_name` makes of it.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
 
 from adapters.image_checks import look_at_image
-from augment.batch.layout import folder_name
+from adapters.lidar_scene.scene import drive_origin
+from adapters.plain_files import LARGEST, array_of, number_of, read_json
 from augment.cameras import Camera, Frame
 from augment.errors import AdapterError
+from augment.geometry import invert_rigid
+from augment.jobs.files import read_camera
+from augment.jobs.layout import folder_name
+from augment.jobs.manifest import MAX_SIDE_PX
+from augment.semantics import SemanticClass
+
+# ---- files ---------------------------------------------------------------------------------------
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 _READERS = 4  # threads that decode images to check them; decoding releases the interpreter
@@ -143,3 +157,246 @@ def _fault(path: Path | None, camera: Camera) -> str:
             f"{camera.width}x{camera.height}; left out"
         )
     return ""
+
+
+# ---- `calibration.json` of a recording: frames and cameras, checked one by one -------------------
+# It is the file that a render job writes (augment.jobs.files); where there is none, those of
+# a `generate` job, `calibration/*.json`, each of some frames and cameras, are taken together.
+#
+# Only `frames` is required, and in each frame `frame`, `timestamp_ns`, `world_from_ego` and
+# `cameras`; a camera's timestamp_ns is the frame's where it has none. Further keys that
+# only a recording has, all optional:
+#
+#     ego_above_ground_m   height of the ego origin above the road, 0 by default
+#     ego_box_m            [[x, y, z], [x, y, z]], lowest and highest corner of the recording car in
+#                          ego axes: LiDAR returns in it are left out
+#     lidar_classes        the LiDAR's class numbers by name of SemanticClass: {"7": "road"}; "none"
+#                          for returns that no surface made
+
+CALIBRATION = "calibration.json"
+_IF_MISSING = "a recording needs it, docs/scenes.md shows what is in it"
+NO_SURFACE = -1  # stands for returns that no surface made, where a SemanticClass is expected
+# Rotations written with six digits are off by a few millionths.
+_RIGID = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """A recording's cameras over time, in the scene's world: the file's minus world_origin_m.
+
+    frames: in order of number and time, without image paths. lidar_classes: SemanticClass, or
+    NO_SURFACE, by the LiDAR's own number; None where numbers are those of SemanticClass. ego_box_m:
+    float64 [2, 3] or None.
+    """
+
+    name: str
+    frames: tuple[Frame, ...]
+    world_origin_m: np.ndarray
+    has_metric_scale: bool
+    ego_above_ground_m: float
+    ego_box_m: np.ndarray | None
+    lidar_classes: Mapping[int, int] | None
+
+
+def read_calibration(root: Path) -> Calibration:
+    """The calibration of the recording in a folder.
+
+    Raises:
+        AdapterError: missing, damaged, or a pose that is not finite and rigid; the message names
+            the file, the frame and the camera.
+    """
+    path, content = _content(root)
+    entries = content.get("frames")
+    if not isinstance(entries, list) or not entries:
+        raise AdapterError(f"{path} must hold a list 'frames' with at least one entry")
+    frames = sorted((_frame(path, entry) for entry in entries), key=lambda f: f.index)
+    for before, after in itertools.pairwise(frames):
+        if after.index == before.index:
+            raise AdapterError(f"{path} lists frame {after.index} twice")
+        if after.timestamp_ns <= before.timestamp_ns:
+            raise AdapterError(
+                f"{path}: timestamp_ns must increase with the frame's number; frame "
+                f"{before.index} has {before.timestamp_ns}, frame {after.index} "
+                f"{after.timestamp_ns}"
+            )
+    origin = drive_origin(np.stack([f.world_from_ego[:3, 3].numpy() for f in frames]))
+    return Calibration(
+        name=_name(content, root),
+        frames=tuple(_recentred(frame, origin) for frame in frames),
+        world_origin_m=origin,
+        has_metric_scale=content.get("has_metric_scale") is not False,
+        ego_above_ground_m=number_of(
+            content.get("ego_above_ground_m", 0.0), f"{path}: ego_above_ground_m"
+        ),
+        ego_box_m=_ego_box(path, content.get("ego_box_m")),
+        lidar_classes=_lidar_classes(path, content.get("lidar_classes")),
+    )
+
+
+def read_lidar_classes(root: Path) -> Mapping[int, int] | None:
+    """The calibration's lidar_classes alone.
+
+    Raises:
+        AdapterError: the file is missing or damaged, or names no classes.
+    """
+    path, content = _content(root)
+    return _lidar_classes(path, content.get("lidar_classes"))
+
+
+def _content(root: Path) -> tuple[Path, dict[str, Any]]:
+    """The calibration's file, or the folder of a job's blocks, and what it holds."""
+    path = root / CALIBRATION
+    blocks = [] if path.exists() else block_files(root, "calibration", ".json")
+    if not blocks:
+        return path, read_json(path, if_missing=_IF_MISSING)
+    parts = [read_json(block) for block in blocks]
+    frames: dict[Any, dict[str, Any]] = {}
+    for block, part in zip(blocks, parts, strict=True):
+        entries = part.get("frames")
+        for entry in entries if isinstance(entries, list) else [entries]:
+            if not isinstance(entry, dict) or not isinstance(entry.get("cameras"), dict):
+                raise AdapterError(f"{block}: each of 'frames' must be an object with cameras")
+            number = entry.get("frame")
+            known = frames.get(number) if isinstance(number, int) else None
+            if known is None:
+                frames[number if isinstance(number, int) else repr(number)] = entry
+                continue
+            if any(known.get(key) != entry.get(key) for key in ("timestamp_ns", "world_from_ego")):
+                raise AdapterError(
+                    f"{block}: frame {number} has another time or ego pose than in the files "
+                    f"before it; the folder holds blocks of different recordings"
+                )
+            frames[number] = known | {"cameras": known["cameras"] | entry["cameras"]}
+    return blocks[0].parent, parts[0] | {"frames": list(frames.values())}
+
+
+def _frame(path: Path, entry: Any) -> Frame:
+    index = entry.get("frame") if isinstance(entry, dict) else None
+    if type(index) is not int or not 0 <= index < 2**62:
+        raise AdapterError(
+            f"{path}: every entry of 'frames' needs a number 'frame', 0 or greater; got "
+            f"{index!r:.80}"
+        )
+    where = f"{path}, frame {index}"
+    timestamp_ns = _time(where, entry.get("timestamp_ns"))
+    world_from_ego = _rigid(where, "world_from_ego", entry.get("world_from_ego"))
+    cameras = entry.get("cameras")
+    if not isinstance(cameras, dict):
+        raise AdapterError(f"{where}: 'cameras' must map names to cameras; got {cameras!r}")
+    return Frame(
+        index=index,
+        timestamp_ns=timestamp_ns,
+        world_from_ego=world_from_ego,
+        cameras={
+            name: _camera(f"{where}, camera {name!r}", name, camera, timestamp_ns)
+            for name, camera in cameras.items()
+        },
+    )
+
+
+def _camera(where: str, name: str, camera: Any, frame_ns: int) -> Camera:
+    if not isinstance(camera, dict):
+        raise AdapterError(f"{where}: must be an object with width, height, fx ...; got {camera!r}")
+    pose = _rigid(where, "world_from_camera", camera.get("world_from_camera"))
+    camera = {"timestamp_ns": frame_ns} | camera
+    _time(where, camera["timestamp_ns"])
+    size = [camera.get(side) for side in ("width", "height")]
+    if any(type(side) is not int or not 1 <= side <= MAX_SIDE_PX for side in size):
+        raise AdapterError(
+            f"{where}: width and height must be whole pixels, 1 to {MAX_SIDE_PX}; got {size!r:.80}"
+        )
+    for key in ("fx", "fy", "cx", "cy"):
+        if key in camera:
+            number_of(camera[key], f"{where}: {key} (pixels)")
+    try:
+        record = read_camera({"cameras": {name: camera}}, name)
+        k = record.K
+        return Camera(
+            name=name,
+            width=record.width,
+            height=record.height,
+            fx=float(k[0, 0]),
+            fy=float(k[1, 1]),
+            cx=float(k[0, 2]),
+            cy=float(k[1, 2]),
+            camera_from_world=invert_rigid(pose),
+            timestamp_ns=record.timestamp_ns,
+        )
+    except KeyError as error:
+        raise AdapterError(f"{where}: {error} is missing") from None
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+        raise AdapterError(f"{where}: {error}") from None
+
+
+def _rigid(where: str, name: str, value: Any) -> torch.Tensor:
+    """A rigid transform, float64 [4, 4]."""
+    matrix = array_of(value)
+    if matrix is None or matrix.shape != (4, 4):
+        raise AdapterError(f"{where}: {name} must be 4 rows of 4 numbers; got {value!r:.200}")
+    if not np.isfinite(matrix).all() or np.abs(matrix[:3, 3]).max() > LARGEST:
+        raise AdapterError(
+            f"{where}: {name} must be finite, its place within {LARGEST:g} m; got "
+            f"{matrix.tolist()}. Leave the camera or the frame out where its pose is not known"
+        )
+    rotation = matrix[:3, :3].clip(-2, 2)  # larger entries are wrong anyway, and would overflow
+    error = max(
+        np.abs(rotation @ rotation.T - np.eye(3)).max(),
+        np.abs(matrix[3] - np.array([0.0, 0, 0, 1])).max(),
+    )
+    if error > _RIGID or np.linalg.det(rotation) < 0:
+        raise AdapterError(
+            f"{where}: {name} must be a rotation and a translation, last row 0 0 0 1, determinant "
+            f"+1; it is off by {error:.3g}, determinant {np.linalg.det(rotation):.3g}"
+        )
+    return torch.from_numpy(matrix)
+
+
+def _time(where: str, value: Any) -> int:
+    if type(value) is not int or abs(value) > 2**62:
+        raise AdapterError(f"{where}: timestamp_ns must be whole nanoseconds; got {value!r}")
+    return value
+
+
+def _recentred(frame: Frame, origin: np.ndarray) -> Frame:
+    world_from_ego = frame.world_from_ego.clone()
+    world_from_ego[:3, 3] -= torch.from_numpy(origin)
+    cameras = {}
+    for name, camera in frame.cameras.items():
+        moved = camera.camera_from_world.clone()
+        moved[:3, 3] += moved[:3, :3] @ torch.from_numpy(origin)
+        cameras[name] = dataclasses.replace(camera, camera_from_world=moved)
+    return dataclasses.replace(frame, world_from_ego=world_from_ego, cameras=cameras)
+
+
+def _name(content: Mapping[str, Any], root: Path) -> str:
+    """What a job named its scene and variant, else the folder's name."""
+    parts = [content.get("scene"), content.get("variant")]
+    given = [part for part in parts if isinstance(part, str) and part]
+    return "-".join(given) if given else root.resolve().name
+
+
+def _ego_box(path: Path, value: Any) -> np.ndarray | None:
+    if value is None:
+        return None
+    box = array_of(value)
+    is_box = box is not None and box.shape == (2, 3) and np.isfinite(box).all()
+    if box is None or not is_box or not (box[0] < box[1]).all():
+        raise AdapterError(
+            f"{path}: ego_box_m must be [[x, y, z], [x, y, z]], the lowest and the highest corner "
+            f"in ego axes; got {value!r:.200}"
+        )
+    return box
+
+
+def _lidar_classes(path: Path, value: Any) -> Mapping[int, int] | None:
+    if value is None:
+        return None
+    meanings = {member.name.lower(): int(member) for member in SemanticClass}
+    meanings["none"] = NO_SURFACE
+    try:
+        return {int(number): meanings[str(name).lower()] for number, name in value.items()}
+    except (AttributeError, ValueError, KeyError) as error:
+        raise AdapterError(
+            f"{path}: lidar_classes must map class numbers to {', '.join(meanings)}; got "
+            f"{value!r:.200} ({error!r})"
+        ) from None

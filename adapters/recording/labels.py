@@ -2,16 +2,222 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import torch
+from tqdm import tqdm
 
-from adapters.recording.calibration import read_lidar_classes
-from adapters.recording.classes import class_numbers, class_table
-from adapters.recording.files import block_files, inside, numbered_files
-from adapters.recording.tables import TimedBoxes, read_frame_boxes, read_sweep, sweep_content
+from adapters.lidar_scene.depth import sweep_times, whole_numbers
+from adapters.lidar_scene.split import BoxSample, Sweep
+from adapters.plain_files import LARGEST
+from adapters.recording.files import (
+    NO_SURFACE,
+    Calibration,
+    block_files,
+    inside,
+    numbered_files,
+    read_lidar_classes,
+)
+from augment.cameras import Frame
+from augment.effects.lidar.beam import intensity_column
+from augment.effects.lidar.codes import INDEX_COLUMN
+from augment.errors import AdapterError, OutputError
+from augment.geometry import rotmat_from_quat
+from augment.jobs.tables import ATTRIBUTE_PREFIX, is_ours, read_boxes, read_lidar, read_table
 from augment.labels import Boxes, LidarSweep
+from augment.semantics import SemanticClass
+from recipes.files import open_file
+
+# ---- What the class numbers in a recording's LiDAR files mean ------------------------------------
+
+
+def class_numbers(path: Path, column: np.ndarray) -> np.ndarray:
+    """The column `semantic` as int64 [N]. path: its file or folder, for messages.
+
+    Raises:
+        AdapterError: it holds something else than whole numbers.
+    """
+    try:
+        return whole_numbers(column, "semantic")
+    except ValueError as error:
+        raise AdapterError(f"{path}: {error}") from None
+
+
+def class_table(
+    root: Path, numbers: np.ndarray, lidar_classes: Mapping[int, int] | None
+) -> tuple[np.ndarray | None, tuple[str, ...]]:
+    """SemanticClass (or NO_SURFACE) by the files' class number, int16, None where their meaning is
+    not known; and a sentence where that is so. numbers: those that occur.
+
+    Raises:
+        AdapterError: numbers out of range.
+    """
+    if len(numbers) == 0:
+        return None, ()
+    if lidar_classes is None:
+        known = (numbers >= 0) & (numbers < SemanticClass.SKY)
+        if not known.all():
+            return None, (
+                f"lidar/: the column semantic holds {int(numbers[~known][0])}, which is no "
+                f"SemanticClass (0 to {SemanticClass.SKY - 1}): classes are ignored. Say what the "
+                f'numbers mean in calibration.json: "lidar_classes": {{"7": "road", ...}}',
+            )
+        return np.arange(SemanticClass.SKY, dtype=np.int16), ()
+    size = max(0, int(numbers.max()), *lidar_classes) + 1
+    if numbers.min() < 0 or min(lidar_classes, default=0) < 0 or size > 2**16:
+        raise AdapterError(
+            f"{root / 'lidar'}: class numbers must lie in 0 to 65535; the files hold "
+            f"{int(numbers.min())} to {int(numbers.max())}, lidar_classes names "
+            f"{sorted(lidar_classes)}"
+        )
+    table = np.full(size, SemanticClass.UNKNOWN, np.int16)
+    for number, meaning in lidar_classes.items():
+        table[number] = meaning
+    return table, ()
+
+
+# ------------------------------------------------------------------------------------------------
+# Parquet files of a recording: those that a job wrote, and plain ones of any other program
+# A job's files carry NumPy's dtypes in their metadata and are read back to the bit by
+# augment.jobs.tables. Plain files are read as Arrow gives them.
+
+_VECTORS = {
+    "centers_m": ("center_x_m", "center_y_m", "center_z_m"),
+    "sizes_m": ("length_m", "width_m", "height_m"),
+    "quats": ("qw", "qx", "qy", "qz"),
+}
+_REQUIRED = ("frame", "track_id", "label", *(name for names in _VECTORS.values() for name in names))
+_CACHED_FILES = 4  # box files kept: every frame asks for its own part of one
+_DAMAGED = (OutputError, OSError, pa.ArrowException, KeyError, IndexError, TypeError, ValueError)
+Value = TypeVar("Value")
+
+
+@dataclass(frozen=True, eq=False)
+class TimedBoxes:
+    """Boxes of one frame. timestamps_ns: int64 [B], when each stood there; None: the frame's."""
+
+    boxes: Boxes
+    timestamps_ns: np.ndarray | None
+
+
+def read_sweep(path: Path) -> LidarSweep:
+    """The sweep in a file, every column under its own name.
+
+    Raises:
+        AdapterError: damaged, or without numbers x, y, z; the message names the file.
+    """
+
+    def read() -> LidarSweep:
+        if is_ours(path):
+            sweep = read_lidar(path)
+        else:
+            table = read_table(path, str(path))
+            sweep = LidarSweep({n: _column(table, n) for n in table.column_names})
+        _ = sweep.points_m  # numbers, not texts
+        return sweep
+
+    return _reading(path, "a LiDAR file with columns x, y, z", read)
+
+
+def sweep_content(path: Path, sweep: LidarSweep) -> bytes:
+    """The LiDAR file with a weathered sweep in place of its own: the same columns, types and notes.
+
+    Raises:
+        AdapterError: damaged; the message names the file.
+    """
+
+    def content() -> bytes:
+        table = read_table(path, str(path)).take(pa.array(sweep.columns[INDEX_COLUMN]))
+        for name in {*"xyz", intensity_column(sweep)} - {None}:
+            at = table.schema.get_field_index(name)
+            field = table.schema.field(at)
+            values = np.asarray(sweep.columns[name])
+            values = np.rint(values) if pa.types.is_integer(field.type) else values
+            table = table.set_column(at, field, pa.array(values).cast(field.type, safe=False))
+        sink = pa.BufferOutputStream()
+        pq.write_table(table, sink)
+        return sink.getvalue().to_pybytes()
+
+    return _reading(path, "a LiDAR file with columns x, y, z", content)
+
+
+def read_frame_boxes(path: Path) -> dict[int, TimedBoxes]:
+    """The boxes of every frame that has any.
+
+    Raises:
+        AdapterError: damaged, or without a column that a box needs; the message names the file.
+    """
+
+    def read() -> dict[int, TimedBoxes]:
+        state = path.stat()
+        return _read_boxes(path, state.st_mtime_ns, state.st_size)
+
+    return _reading(path, f"a table of boxes with columns {', '.join(_REQUIRED)}", read)
+
+
+@lru_cache(maxsize=_CACHED_FILES)
+def _read_boxes(path: Path, _changed_ns: int, _size: int) -> dict[int, TimedBoxes]:
+    if is_ours(path):
+        return {
+            number: TimedBoxes(f.boxes, np.full(len(f.boxes), f.timestamp_ns, np.int64))
+            for number, f in read_boxes(path).items()
+        }
+    table = read_table(path, str(path))
+    missing = [name for name in _REQUIRED if name not in table.column_names]
+    if missing:
+        raise ValueError(f"it lacks {missing}; it has {table.column_names}")
+    frames = whole_numbers(_column(table, "frame"), "frame")
+    order = np.argsort(frames, kind="stable")
+    numbers, starts = np.unique(frames[order], return_index=True)
+    parts = np.split(order, starts[1:]) if len(numbers) else []
+    columns = {name: _column(table, name) for name in table.column_names}
+    return {int(n): _boxes_at(columns, rows) for n, rows in zip(numbers, parts, strict=True)}
+
+
+def _boxes_at(columns: dict[str, np.ndarray], rows: np.ndarray) -> TimedBoxes:
+    vectors = {
+        field: np.stack([columns[name][rows].astype(np.float64) for name in names], axis=1)
+        for field, names in _VECTORS.items()
+    }
+    times = columns.get("timestamp_ns")
+    used = {*_REQUIRED, "timestamp_ns"}
+    return TimedBoxes(
+        Boxes(
+            tuple(str(value) for value in columns["track_id"][rows]),
+            tuple(str(value) for value in columns["label"][rows]),
+            **vectors,
+            attributes={
+                name.removeprefix(ATTRIBUTE_PREFIX): values[rows]
+                for name, values in columns.items()
+                if name not in used
+            },
+        ),
+        None if times is None else whole_numbers(times[rows], "timestamp_ns"),
+    )
+
+
+def _column(table: pa.Table, name: str) -> np.ndarray:
+    # A copy: Arrow's own memory is read-only, which torch.from_numpy warns about.
+    return np.array(table[name].to_numpy())
+
+
+def _reading(path: Path, expected: str, read: Callable[[], Value]) -> Value:
+    try:
+        open_file(path).close()  # to open a pipe would wait for ever
+        return read()
+    except _DAMAGED as error:
+        raise AdapterError(f"{path} is not {expected}: {error}") from error
+
+
+# ---- labels --------------------------------------------------------------------------------------
 
 
 def boxes_files(root: Path) -> list[Path]:
@@ -81,3 +287,260 @@ class RecordingLabels:
 def recording_labels(path: str, query: dict[str, str]) -> RecordingLabels:
     """The labels of a folder; whatever the query, they are those of all its frames."""
     return RecordingLabels(Path(path))
+
+
+# ---- A recording's LiDAR files into sweeps of usable returns -------------------------------------
+
+_FAR_M = 1000.0  # no LiDAR on the ground sees this far
+_OWN_M, _OWN_PART = 1.5, 1e-3  # a car's own returns are some hundreds a sweep
+_TOP_QUANTILE = 0.999
+_TOP_BEYOND_M = 5.0  # nearer, a camera's height says little of the sensor's
+_TOP_DEG = (2.0, 60.0)
+
+
+@dataclass(frozen=True, eq=False)
+class LidarDrive:
+    """sweeps: one a frame that has a file, scene world. top_deg: about the highest elevation that
+    the LiDAR looks at. problems: one sentence each."""
+
+    sweeps: tuple[Sweep, ...]
+    top_deg: float
+    problems: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return sum(len(sweep) for sweep in self.sweeps)
+
+
+def read_lidar_drive(root: Path, calibration: Calibration, frames: Sequence[Frame]) -> LidarDrive:
+    """The sweeps of the given frames.
+
+    Left out: returns that are not finite, of no surface, or of the recording car (ego_box_m).
+
+    Raises:
+        AdapterError: a damaged file, or returns that cannot be in the calibration's world.
+    """
+    files = lidar_files(root)
+    problems = []
+    if files:
+        missing = [f.index for f in frames if f.index not in files]
+        problems += [
+            f"frame {n}: lidar/{n:06d}.parquet is missing, its points too" for n in missing
+        ]
+    known = [(frame, files[frame.index]) for frame in frames if frame.index in files]
+    raws = [
+        _Raw.of(path, frame, calibration)
+        for frame, path in tqdm(known, desc="LiDAR", unit="frame", disable=None)
+    ]
+    timeless = [raw.frame for raw in raws if raw.timeless]
+    if timeless:
+        problems.append(
+            f"lidar/: no column timestamp_ns, or t in seconds, near the frame's time in "
+            f"{len(timeless)} sweeps (the first of frame {timeless[0]}); their frames' times are "
+            f"used, fast objects are smeared"
+        )
+    table, more = _class_table(root, raws, calibration)
+    sweeps = tuple(raw.usable(table) for raw in raws)
+    if calibration.ego_box_m is None:
+        problems += _own_returns(sweeps, known)
+    return LidarDrive(sweeps, _top_deg(sweeps, known), (*problems, *more))
+
+
+@dataclass(frozen=True, eq=False)
+class _Raw:
+    frame: int
+    points: np.ndarray  # float32 [N, 3], scene world, finite
+    timestamps_ns: np.ndarray  # int64 [N]
+    classes: np.ndarray | None  # int64 [N], the file's own numbers
+    timeless: bool
+
+    @staticmethod
+    def of(path: Path, frame: Frame, calibration: Calibration) -> _Raw:
+        sweep = read_sweep(path)
+        world = sweep.points_m - calibration.world_origin_m
+        pose = frame.world_from_ego.numpy()
+        keep = (np.abs(world) <= LARGEST).all(axis=1)  # not NaN, and float32 has it
+        ego = (np.where(keep[:, None], world, 0) - pose[:3, 3]) @ pose[:3, :3]
+        if keep.any() and np.median(np.abs(ego[keep]).max(axis=1)) > _FAR_M:
+            raise AdapterError(
+                f"{path}: most returns lie more than {_FAR_M:.0f} m from the car as "
+                f"calibration.json has it in frame {frame.index}; x, y, z must be metres in the "
+                f"world of its poses, not in the sensor's"
+            )
+        if calibration.ego_box_m is not None:
+            low, high = calibration.ego_box_m
+            keep &= ~((ego > low) & (ego < high)).all(axis=1)
+        times = _times(path, sweep, frame.timestamp_ns)
+        classes = sweep.columns.get("semantic")
+        if classes is not None:
+            classes = class_numbers(path, classes)[keep]
+        return _Raw(
+            frame.index,
+            world[keep].astype(np.float32),
+            np.full(int(keep.sum()), frame.timestamp_ns) if times is None else times[keep],
+            classes,
+            timeless=times is None,
+        )
+
+    def usable(self, table: np.ndarray | None) -> Sweep:
+        if self.classes is None or table is None:
+            unknown = np.full(len(self.points), SemanticClass.UNKNOWN, np.int16)
+            return Sweep(self.points, self.timestamps_ns, unknown)
+        semantic = table[np.clip(self.classes, 0, len(table) - 1)]
+        keep = semantic != NO_SURFACE
+        return Sweep(self.points[keep], self.timestamps_ns[keep], semantic[keep])
+
+
+def _times(path: Path, sweep: LidarSweep, frame_ns: int) -> np.ndarray | None:
+    try:
+        return sweep_times(sweep, frame_ns)
+    except ValueError as error:
+        raise AdapterError(f"{path}: {error}") from None
+
+
+def _class_table(
+    root: Path, raws: Sequence[_Raw], calibration: Calibration
+) -> tuple[np.ndarray | None, tuple[str, ...]]:
+    """As `class_table`, for the classes of all sweeps."""
+    present = [np.unique(raw.classes) for raw in raws if raw.classes is not None]
+    if not present:
+        return None, ()
+    return class_table(root, np.unique(np.concatenate(present)), calibration.lidar_classes)
+
+
+def _own_returns(sweeps: Sequence[Sweep], known: Sequence[tuple[Frame, Path]]) -> list[str]:
+    """A sentence where the LiDAR seems to see its own car."""
+    near = total = 0
+    for sweep, (frame, _) in zip(sweeps, known, strict=True):
+        if frame.cameras:
+            total += len(sweep)
+            distance = np.linalg.norm(sweep.points - _middle(frame), axis=1)
+            near += int((distance < _OWN_M).sum())
+    if near <= _OWN_PART * total:
+        return []
+    return [
+        f"lidar/: {near} of {total} returns lie within {_OWN_M} m of the cameras' middle, likely "
+        f"on the recording car, which they smear along the road; give ego_box_m in "
+        f"calibration.json to leave them out"
+    ]
+
+
+def _middle(frame: Frame) -> np.ndarray:
+    """The middle of a frame's cameras, float64 [3]."""
+    return np.mean([camera.centre.numpy() for camera in frame.cameras.values()], axis=0)
+
+
+def _top_deg(sweeps: Sequence[Sweep], known: Sequence[tuple[Frame, Path]]) -> float:
+    """About the elevation of the highest channel: that of nearly the steepest return, as seen from
+    the height of the cameras, for want of the sensor's own."""
+    rises = []
+    for sweep, (frame, _) in zip(sweeps, known, strict=True):
+        if not frame.cameras or not len(sweep):
+            continue
+        offset = sweep.points - _middle(frame)
+        reach = np.hypot(offset[:, 0], offset[:, 1])
+        far = reach > _TOP_BEYOND_M
+        rises.append(np.degrees(np.arctan2(offset[far, 2], reach[far])))
+    joined = np.concatenate(rises) if rises else np.zeros(0)
+    top = float(np.quantile(joined, _TOP_QUANTILE)) if len(joined) else 0.0
+    return float(np.clip(top, *_TOP_DEG))
+
+
+# ---- A recording's boxes into timed samples of the objects that move -----------------------------
+
+MOVED_M = 1.0  # an object whose boxes lie further apart than this moves
+# Attributes that say so themselves, as PandaSet's and the street's boxes do.
+STATIONARY = ("stationary", "is_parked")
+SIBLING = ("sibling_id", "cuboids.sibling_id")  # another sensor's box of the same object
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedObjects:
+    """moving: samples of the objects that move, in order of frames. still: one sample of each
+    object that does not. problems: one sentence each."""
+
+    moving: tuple[BoxSample, ...]
+    still: tuple[BoxSample, ...]
+    problems: tuple[str, ...]
+
+
+def read_objects(
+    frames: Sequence[Frame], boxes: Mapping[int, TimedBoxes], world_origin_m: np.ndarray
+) -> RecordedObjects:
+    """The objects of the frames. An object moves if an attribute says that it is not stationary or
+    if its boxes lie further apart than MOVED_M; others stay part of the static world."""
+    samples: list[BoxSample] = []
+    labelled: set[str] = set()
+    bad, twice = [], []
+    for frame in frames:
+        timed = boxes.get(frame.index)
+        seen: set[str] = set()
+        for sample, moves in [] if timed is None else _samples(frame, timed, world_origin_m):
+            if sample is None:
+                bad.append(frame.index)
+            elif sample.object_id in seen:
+                twice.append((sample.object_id, frame.index))
+            else:
+                seen.add(sample.object_id)
+                samples.append(sample)
+                labelled |= {sample.object_id} if moves else set()
+    moving = _moving_ids(samples, labelled)
+    still = {s.object_id: s for s in reversed(samples) if s.object_id not in moving}
+    problems = []
+    if bad:
+        problems.append(
+            f"labels/boxes.parquet: {len(bad)} boxes, the first in frame {bad[0]}, have a centre, "
+            f"size or rotation that is not finite or zero; objects are built without them"
+        )
+    if twice:
+        name, frame = twice[0]
+        problems.append(
+            f"labels/boxes.parquet: {len(twice)} boxes share track_id and frame with another, such "
+            f"as {name!r} in frame {frame}; the first one counts"
+        )
+    return RecordedObjects(
+        tuple(s for s in samples if s.object_id in moving),
+        tuple(reversed(still.values())),
+        tuple(problems),
+    )
+
+
+def _samples(frame: Frame, timed: TimedBoxes, world_origin_m: np.ndarray):
+    """Each box as a sample, None where it is unusable, and whether it is labelled as moving."""
+    boxes = timed.boxes
+    times = timed.timestamps_ns
+    values = np.concatenate([boxes.centers_m, boxes.sizes_m, boxes.quats], axis=1)
+    good = np.isfinite(values).all(1) & (boxes.sizes_m > 0).all(1)
+    good &= np.linalg.norm(boxes.quats, axis=1) > 1e-6
+    stationary = next((boxes.attributes[n] for n in STATIONARY if n in boxes.attributes), None)
+    siblings = next((boxes.attributes[n] for n in SIBLING if n in boxes.attributes), None)
+    for i in range(len(boxes)):
+        if not good[i]:
+            yield None, False
+            continue
+        pose = np.eye(4)
+        pose[:3, :3] = rotmat_from_quat(torch.from_numpy(boxes.quats[i])).numpy()
+        pose[:3, 3] = boxes.centers_m[i] - world_origin_m
+        sibling = None if siblings is None else siblings[i]
+        sample = BoxSample(
+            boxes.track_ids[i],
+            sibling if isinstance(sibling, str) and sibling not in ("", "-") else None,
+            boxes.labels[i],
+            frame.index,
+            frame.timestamp_ns if times is None else int(times[i]),
+            pose,
+            boxes.sizes_m[i],
+        )
+        yield sample, stationary is not None and _is_false(stationary[i])
+
+
+def _is_false(value: object) -> bool:
+    """False or 0; a missing value says nothing."""
+    return isinstance(value, bool | int | np.bool_ | np.integer) and not value
+
+
+def _moving_ids(samples: Sequence[BoxSample], labelled: set[str]) -> set[str]:
+    places: dict[str, list[np.ndarray]] = defaultdict(list)
+    for sample in samples:
+        places[sample.object_id].append(sample.world_from_box[:2, 3])
+    extents = {name: np.ptp(np.array(xy), axis=0) for name, xy in places.items()}
+    return labelled | {name for name, extent in extents.items() if np.hypot(*extent) > MOVED_M}

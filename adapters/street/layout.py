@@ -5,11 +5,102 @@ Each kind of thing draws from its own stream, so that one more car moves no tree
 
 from __future__ import annotations
 
+import dataclasses
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 
-from adapters.street.parameters import StreetParameters
+from augment.cameras import Camera, Frame
+from augment.errors import AdapterError
+from augment.scene import Track
+
+# ---- What a procedural street may be asked for, and the URI that says so -------------------------
+
+# Smallest and largest value of each parameter; both are allowed.
+LIMITS: dict[str, tuple[float, float]] = {
+    "seed": (0, 2**31 - 1),
+    "frames": (1, 300),
+    "width": (16, 4096),
+    "height": (16, 4096),
+    "speed_mps": (0.0, 20.0),
+    "gaussians": (60_000, 4_000_000),
+    "parked": (0, 40),
+    "moving": (0, 6),
+    "pedestrians": (0, 6),
+    "lidar_columns": (16, 4096),
+    "lidar_rings": (2, 256),
+}
+
+
+@dataclass(frozen=True)
+class StreetParameters:
+    """Everything that decides a street: equal parameters give equal bits.
+
+    seed: layout, colours, sky. frames: at 10 Hz. width, height: of every camera's image, pixels.
+    speed_mps: of the ego car. gaussians: how many to aim for, actors included (met within a few
+    per cent). parked, moving: cars beside and on the road. pedestrians: walking on the pavements.
+    lidar_columns, lidar_rings: rays per turn and per column.
+    """
+
+    seed: int = 0
+    frames: int = 20
+    width: int = 960
+    height: int = 540
+    speed_mps: float = 8.0
+    gaussians: int = 290_000
+    parked: int = 12
+    moving: int = 3
+    pedestrians: int = 2
+    lidar_columns: int = 1024
+    lidar_rings: int = 64
+
+    @property
+    def name(self) -> str:
+        return f"street-seed{self.seed}"
+
+    @property
+    def uri(self) -> str:
+        """Canonical: the seed, then whatever differs from its default, in the order above."""
+        shown = [
+            f"{field.name}={getattr(self, field.name)}"
+            for field in dataclasses.fields(self)
+            if field.name == "seed" or getattr(self, field.name) != field.default
+        ]
+        return "procedural:street?" + "&".join(shown)
+
+
+def parse_parameters(query: Mapping[str, str]) -> StreetParameters:
+    """Parameters of a URI's query.
+
+    Raises:
+        AdapterError: an unknown key, a value that is no number, or one outside its limits.
+    """
+    fields = {field.name: type(field.default) for field in dataclasses.fields(StreetParameters)}
+    unknown = sorted(set(query) - set(fields))
+    if unknown:
+        raise AdapterError(
+            f"procedural:street does not know {', '.join(map(repr, unknown))}; "
+            f"it takes {', '.join(fields)}"
+        )
+    return StreetParameters(**{k: _number(k, text, fields[k]) for k, text in query.items()})
+
+
+def _number(key: str, text: str, kind: type) -> int | float:
+    low, high = LIMITS[key]
+    expected = f"{'a whole number' if kind is int else 'a number'} from {low} to {high}"
+    try:
+        value = kind(text)
+    except ValueError as error:
+        raise AdapterError(f"procedural:street: {key} must be {expected}; got {text!r}") from error
+    if not (math.isfinite(value) and low <= value <= high):
+        raise AdapterError(f"procedural:street: {key} must be {expected}; got {text!r}")
+    return value
+
+
+# ---- layout --------------------------------------------------------------------------------------
 
 FRAME_NS = 100_000_000
 START_NS = 1_700_000_000_000_000_000
@@ -198,3 +289,150 @@ def _movers(rng: np.random.Generator, parameters: StreetParameters, length: floa
             )
         )
     return movers
+
+
+# ---- The ego car's path, its six cameras, and where moving actors are at any time ----------------
+
+FIELD_OF_VIEW_DEG = 72.0
+SWAY_M, SWAY_LENGTH_M = 0.10, 55.0
+CAMERA_Z_M = 1.6
+# name: (forward, left) of the ego origin in metres, yaw in degrees to the left. Each fires when the
+# LiDAR's beam, which turns clockwise once a frame and looks ahead at the frame's time, passes it.
+MOUNTS = {
+    "front": (1.6, 0.0, 0.0),
+    "front_left": (1.5, 0.45, 55.0),
+    "front_right": (1.5, -0.45, -55.0),
+    "left": (1.2, 0.55, 110.0),
+    "right": (1.2, -0.55, -110.0),
+    "back": (-1.2, 0.0, 180.0),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class EgoPose:
+    """Where the ego car is at each of N times: positions [N, 3] of its ground point, yaws [N]."""
+
+    positions: np.ndarray
+    yaws: np.ndarray
+
+
+def ego_pose(parameters: StreetParameters, timestamps_ns: np.ndarray) -> EgoPose:
+    """The ego car on its lane, swaying gently about the lane's middle."""
+    seconds = (np.asarray(timestamps_ns, np.int64) - START_NS) * 1e-9
+    x = parameters.speed_mps * seconds
+    phase = 2 * np.pi * x / SWAY_LENGTH_M
+    y = EGO_Y_M + SWAY_M * np.sin(phase)
+    yaw = np.arctan(SWAY_M * 2 * np.pi / SWAY_LENGTH_M * np.cos(phase))
+    return EgoPose(np.stack([x, y, road_z(y)], -1), yaw)
+
+
+def camera_path(parameters: StreetParameters, timestamps_ns: np.ndarray) -> np.ndarray:
+    """Where the cameras are at times [N], taken together: above the ego car's middle, [N, 3]."""
+    return ego_pose(parameters, timestamps_ns).positions + np.array([0.0, 0.0, CAMERA_Z_M])
+
+
+def world_from_ego(parameters: StreetParameters, timestamp_ns: int) -> np.ndarray:
+    """float64 [4, 4]: ego x forward, y left, z up, origin on the road."""
+    pose = ego_pose(parameters, np.array([timestamp_ns]))
+    return _rigid(pose.positions[0], float(pose.yaws[0]))
+
+
+def frame_time_ns(index: int) -> int:
+    return START_NS + index * FRAME_NS
+
+
+def build_frames(parameters: StreetParameters) -> tuple[Frame, ...]:
+    """All frames with their six cameras."""
+    frames = []
+    for index in range(parameters.frames):
+        time = frame_time_ns(index)
+        cameras = {name: _camera(parameters, name, time) for name in MOUNTS}
+        pose = torch.from_numpy(world_from_ego(parameters, time))
+        frames.append(Frame(index, time, pose, cameras))
+    return tuple(frames)
+
+
+def focal_px(parameters: StreetParameters) -> float:
+    return parameters.width / 2 / math.tan(math.radians(FIELD_OF_VIEW_DEG) / 2)
+
+
+def camera_offset_ns(name: str) -> int:
+    """How long after the frame's time a camera fires."""
+    return round(-MOUNTS[name][2] / 360 * FRAME_NS) % FRAME_NS - (
+        FRAME_NS if MOUNTS[name][2] > 0 and name != "back" else 0
+    )
+
+
+def _camera(parameters: StreetParameters, name: str, frame_ns: int) -> Camera:
+    forward, left, yaw_deg = MOUNTS[name]
+    time = frame_ns + camera_offset_ns(name)
+    mount = _rigid(np.array([forward, left, CAMERA_Z_M]), math.radians(yaw_deg))
+    mount[:3, :3] = mount[:3, :3] @ np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], np.float64)
+    world_from_camera = world_from_ego(parameters, time) @ mount
+    rotation = world_from_camera[:3, :3].T
+    camera_from_world = np.eye(4)
+    camera_from_world[:3, :3] = rotation
+    camera_from_world[:3, 3] = -rotation @ world_from_camera[:3, 3]
+    return Camera(
+        name=name,
+        width=parameters.width,
+        height=parameters.height,
+        fx=focal_px(parameters),
+        fy=focal_px(parameters),
+        cx=parameters.width / 2,
+        cy=parameters.height / 2,
+        camera_from_world=torch.from_numpy(camera_from_world),
+        timestamp_ns=time,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """A mover's box centre over time; its heading never changes.
+
+    times_ns: int64 [T], one frame beyond the drive on both sides, as far as the street goes.
+    centres: float64 [T, 3].
+    """
+
+    times_ns: np.ndarray
+    centres: np.ndarray
+    yaw: float
+
+    @property
+    def track(self) -> Track:
+        poses = np.stack([_rigid(centre, self.yaw) for centre in self.centres])
+        return Track(torch.from_numpy(self.times_ns.copy()), torch.from_numpy(poses))
+
+    def at(self, timestamps_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Centres [N, 3] at times [N], and whether the mover is there at all: as Track.pose_at."""
+        start, hold = int(self.times_ns[0]), Track.hold_ns
+        seconds = (timestamps_ns - start) * 1e-9
+        samples = (self.times_ns - start) * 1e-9
+        centres = np.stack([np.interp(seconds, samples, c) for c in self.centres.T], -1)
+        last = int(self.times_ns[-1])
+        return centres, (timestamps_ns >= start - hold) & (timestamps_ns <= last + hold)
+
+
+def motion_of(mover: Mover, layout: Layout, height_m: float, ground_z: float) -> Motion:
+    """Where a mover of this height goes while it is on the street."""
+    frames = np.arange(-1, layout.parameters.frames + 1)
+    x = mover.x_m + mover.speed_mps * frames * FRAME_NS * 1e-9
+    on_street = (x > layout.x0 + 3) & (x < layout.x1 - 3)
+    if not on_street.any():
+        on_street[0] = True
+    frames, x = frames[on_street], x[on_street]
+    centres = np.stack(
+        [x, np.full_like(x, mover.y_m), np.full_like(x, ground_z + height_m / 2)], -1
+    )
+    yaw = 0.0 if mover.speed_mps >= 0 else math.pi
+    return Motion(START_NS + frames.astype(np.int64) * FRAME_NS, centres, yaw)
+
+
+def _rigid(translation: np.ndarray, yaw_rad: float) -> np.ndarray:
+    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
+    if abs(s) < 1e-15:
+        s = 0.0
+    out = np.eye(4)
+    out[:2, :2] = [[c, -s], [s, c]]
+    out[:3, 3] = translation
+    return out

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from adapters.street.forms import Kind, Shapes
 from adapters.street.raycast_kernels import build, trace
-from adapters.street.shapes import Kind, Shapes
 
 LEAF_SHAPES = 4
 

@@ -7,16 +7,450 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from adapters.join import join_gaussians
+from adapters.street.forms import OPEN_DIAGONAL, U0, U1, V0, V1, Kind, Shapes, join
+from adapters.street.light import SKY_RGB, SUN_RGB
 from adapters.street.materials import Material
-from adapters.street.shadows import SHADOW_RGB, ContactShadow
-from adapters.street.shapes import U0, U1, V0, V1, Kind, Shapes
-from adapters.street.spacing import LEAST_M, Spacing, plan_spacing, split_long
-from adapters.street.surfels import Cells, cell_counts, make_cells, total_cells
-from adapters.street.world import Body
+from adapters.street.raycast import Tree
+from adapters.street.world import Body, MovingBody
+from adapters.world import join_gaussians
 from augment.geometry import quat_from_rotmat
 from augment.scene import Gaussians
 from augment.semantics import SemanticClass
+
+# ---- How far apart the splats of each surface may stand, and how far below it they must lie ------
+# A splat's footprint should look equally large wherever the ego cameras see it from, so its spacing
+# follows their nearest distance, and along a surface seen at a slant it is stretched.
+
+SPLIT_M = (1.6, 4.0)  # panels are never cut shorter than half the first; walls not left longer
+STEEPEST = 0.42  # sine of the steepest ray of a level camera, up or down
+MOST_STRETCH = 2.6
+HIDDEN_STRETCH = 3.5  # of surfaces that no camera sees
+# From which eyes sight is tried, by how near they are, and at how many places from each.
+LOOKS, PLACES = (0, 1, 2, 3, 5, 8, 13, 21, 34), 3
+LEAST_M = 0.02
+# Blending takes nearer splats first, which puts the weighted mean this many spacings too near,
+# along the surface: measured against the truth, for one layer of splats and for two (see `splats`).
+BLEND_LEAD = 0.62
+BACKED_BLEND_LEAD = 0.41
+
+
+@dataclass(frozen=True, eq=False)
+class Spacing:
+    """Per shape: along [P, 2] spacing in metres per unit of coarseness on both axes; sink [P] how
+    far below its surface splats lie, in spacings, so that their blend is seen on it; hidden [P]
+    whether no camera sees it, so that its splats may be few but must keep clear of rims.
+    """
+
+    along: np.ndarray
+    sink: np.ndarray
+    hidden: np.ndarray
+
+
+def split_long(shapes: Shapes, eyes: np.ndarray) -> Shapes:
+    """The same surfaces, long parallelograms halved until one spacing suits all of each."""
+    done = []
+    while len(shapes):
+        distance = _sightings(shapes, eyes)[0].min(0)
+        sides = np.linalg.norm(shapes.axes[:, :2], axis=2)
+        limit = np.maximum(SPLIT_M[0], 0.45 * distance)
+        built = shapes.semantic != SemanticClass.TERRAIN
+        limit[built] = np.minimum(limit, SPLIT_M[1])[built]
+        wanted = (sides.max(1) > limit) & (shapes.kind == Kind.PARALLELOGRAM)
+        done.append(shapes.select(np.flatnonzero(~wanted)))
+        shapes = _halved(shapes.select(np.flatnonzero(wanted)), sides[wanted].argmax(1))
+    return join(done)
+
+
+def _halved(shapes: Shapes, axis: np.ndarray) -> Shapes:
+    """Both halves of each parallelogram along its axis; only outer edges stay crisp."""
+    rows = np.arange(len(shapes))
+    first, second = shapes.select(rows), shapes.select(rows)
+    for half in (first, second):
+        half.axes[rows, axis] *= 0.5
+    second.origin[:] += second.axes[rows, axis]
+    low, high = np.array([U0, V0], np.uint8)[axis], np.array([U1, V1], np.uint8)[axis]
+    first.edges[:] &= ~high
+    second.edges[:] &= ~low
+    return join([first, second])
+
+
+def plan_spacing(shapes: Shapes, tree: Tree, eyes: np.ndarray) -> Spacing:
+    """Spacings of shapes seen from eyes [E, 3], in the shapes' frame; tree: what may hide them."""
+    distance, view = _sightings(shapes, eyes)
+    unit = shapes.axes[:, :2] / np.linalg.norm(shapes.axes[:, :2], axis=2, keepdims=True)
+    cosine = np.einsum("epk,pak->epa", view, unit)
+    stretch = 1 / np.sqrt(np.maximum(1 - cosine**2, 1 / MOST_STRETCH**2))
+    along = (distance[..., None] * stretch).min(0)
+    flat = shapes.kind <= Kind.DISC
+    slant = np.abs(np.einsum("epk,pk->ep", view, shapes.axes[:, 2]))
+    facing = np.einsum("epk,pk->ep", view, shapes.axes[:, 2]) < 0
+    tuft = shapes.material == Material.LEAF
+    hidden = ((shapes.kind != Kind.ELLIPSOID) | tuft) & ~_in_sight(shapes, tree, eyes)
+    along[hidden & flat] *= HIDDEN_STRETCH
+    along *= shapes.spacing[:, None]
+    sink = np.where(flat, _sink(distance, slant, facing, cosine, along, shapes.backed), 0.25)
+    return Spacing(along, sink, hidden)
+
+
+def _in_sight(shapes: Shapes, tree: Tree, eyes: np.ndarray) -> np.ndarray:
+    """Which shapes some of the eyes can see, bool [P]: a few places are tried, each time others."""
+    seen = np.zeros(len(shapes), bool)
+    round_form = shapes.kind >= Kind.ELLIPSOID
+    radius = np.where(round_form, np.linalg.norm(shapes.axes, axis=2)[:, :2].max(1) * 1.05, 0)
+    distance = np.linalg.norm(shapes.origin[None] - eyes[:, None], axis=2)
+    nearest = np.argsort(distance, axis=0, kind="stable")  # [E, P]: eyes by distance
+    ranks = [rank for rank in LOOKS if rank < len(eyes)]
+    for number in range(len(ranks) * PLACES):
+        index = np.flatnonzero(~seen)
+        target = _place(shapes, index, number)
+        back = eyes[nearest[ranks[number // PLACES], index]] - target
+        length = np.linalg.norm(back, axis=1)
+        front = round_form[index] | ((back * shapes.axes[index, 2]).sum(1) > 0)
+        front &= (np.abs(back[:, 2]) < 1.2 * STEEPEST * length) & (length > radius[index])
+        index, back, target, length = index[front], back[front], target[front], length[front]
+        start = (radius[index] / length)[:, None]
+        seen[index] = ~tree.occluded(target + start * back, (1 - start) * back, 1.0)
+    return seen
+
+
+def _place(shapes: Shapes, index: np.ndarray, number: int) -> np.ndarray:
+    """A place on each shape at index (on the axis of round forms), [I, 3]; numbers spread out."""
+    kind, (u, v, w) = shapes.kind[index], shapes.axes[index].transpose(1, 0, 2)
+    a, b = (0.06 + 0.88 * ((0.5 + number * step) % 1.0) for step in (0.7549, 0.5698))
+    folded = (kind == Kind.TRIANGLE) & (a + b > 1)
+    a, b = np.where(folded, 1 - a, a), np.where(folded, 1 - b, b)
+    centred = kind >= Kind.DISC
+    a, b = (np.where(centred, 1.4 * (c - 0.5), c)[:, None] for c in (a, b))
+    on_axis = (kind >= Kind.ELLIPSOID)[:, None]
+    return shapes.origin[index] + np.where(on_axis, b * w, a * u + b * v + 0.004 * w)
+
+
+def _sightings(shapes: Shapes, eyes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distance [E, P] and unit direction [E, P, 3] from each eye to the nearest visible place."""
+    nearest = shapes.origin[None] - eyes[:, None]  # [E, P, 3], from the eye
+    straight = shapes.kind <= Kind.TRIANGLE
+    for axis in range(2):
+        side = shapes.axes[:, axis] * straight[:, None]
+        square = np.maximum((side**2).sum(1), 1e-12)
+        share = np.clip(-np.einsum("epk,pk->ep", nearest, side) / square, 0, 1)
+        nearest = nearest + share[..., None] * side
+    length = np.maximum(np.linalg.norm(nearest, axis=2), 0.3)
+    view = nearest / length[..., None]
+    return np.maximum(length, np.abs(nearest[..., 2]) / STEEPEST), view
+
+
+def _sink(
+    distance: np.ndarray,
+    slant: np.ndarray,
+    facing: np.ndarray,
+    cosine: np.ndarray,
+    along: np.ndarray,
+    backed: np.ndarray,
+) -> np.ndarray:
+    """Depth below the surface, per unit of spacing, that puts the blend on it in the mean.
+
+    A splat that lies h below the surface is seen h / slant further along the ray; blending brings
+    it some part of a spacing nearer along the surface. No depth suits all eyes: the weighted median
+    makes the error least where most pixels are spent on the surface.
+    """
+    slant = np.clip(slant, 0.04, 1)
+    level = np.sqrt(1 - slant**2)
+    reach = np.sqrt((cosine**2 * along**2).sum(2)) / np.maximum(level, 1e-6)
+    lead = np.where(backed, BACKED_BLEND_LEAD, BLEND_LEAD)
+    wanted = lead * reach / along.max(1) * level * slant
+    weight = facing / distance**2  # pixels go with slant, what an error costs with 1 / slant
+    order = np.argsort(wanted, axis=0)
+    heard = np.cumsum(np.take_along_axis(weight, order, 0), axis=0)
+    middle = (heard < heard[-1] / 2).sum(0)
+    rows = np.take_along_axis(order, np.minimum(middle, len(order) - 1)[None], 0)
+    return np.minimum(np.take_along_axis(wanted, rows, 0)[0], 0.5)
+
+
+# ---- Cells of surfaces: where splats stand and how large each is ---------------------------------
+# Flat panels carry a lattice whose last rows narrow towards crisp edges; discs carry rings, round
+# forms a wrapped lattice or a spiral.
+
+# Where rows along a crisp edge end, in cells, by how many rows are added there: 0, 1 or 2.
+NARROWING = np.array([[0, 0, 0], [0, 0.3, 0], [0, 0.16, 0.46]])
+LEAST_ROUND = 8  # cells around a tube
+LEAST_BLOB = 30  # cells on an ellipsoid
+# Hidden panels: cells by which splats keep clear of crisp edges, and the side below which a panel
+# gets no splat at all; for tubes the girth.
+INSET = 0.5
+LEAST_HIDDEN_M = 0.4
+HIDDEN_TUFTS_DROPPED = 0.6
+FINE_FROM = 7  # cells along a side from which its crisp edges get two more rows, not one
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """shape [N]; local [N, 3]: the cell's middle; sides [N, 2, 3]: its sides in the shape's local
+    coordinates; edges [N, 2, 3]: the same in metres.
+    """
+
+    shape: np.ndarray
+    local: np.ndarray
+    sides: np.ndarray
+    edges: np.ndarray
+
+    def select(self, index: np.ndarray) -> Cells:
+        return Cells(self.shape[index], self.local[index], self.sides[index], self.edges[index])
+
+    def places(self) -> np.ndarray:
+        """Four places in each cell, local coordinates [4, N, 3]."""
+        a, b = self.sides[:, 0] / 4, self.sides[:, 1] / 4
+        return np.stack(
+            [self.local + i * a + j * b for i, j in ((-1, -1), (1, 1), (-1, 1), (1, -1))]
+        )
+
+
+def cell_counts(shapes: Shapes, spacing: np.ndarray, hidden: np.ndarray) -> np.ndarray:
+    """How many cells along both axes, [P, 2]; spacing [P, 2] in metres, hidden [P].
+
+    Discs: rings and cells in the outermost. Tubes: around and along. Ellipsoids: in all, and 1.
+    """
+    length = np.linalg.norm(shapes.axes, axis=2)
+    counts = np.ceil(length[:, :2] / spacing - 1e-9)
+    kind = shapes.kind
+    disc, tube, blob = (kind == k for k in (Kind.DISC, Kind.CYLINDER, Kind.ELLIPSOID))
+    round_length = 2 * np.pi * length[:, 0]
+    counts[disc, 1] = np.ceil(round_length / spacing.min(1))[disc]
+    counts[tube, 0] = np.maximum(LEAST_ROUND, np.ceil(round_length / spacing.min(1)))[tube]
+    counts[tube, 1] = np.maximum(2, np.ceil(2 * length[:, 2] / spacing.max(1)))[tube]
+    counts[blob, 0] = np.maximum(LEAST_BLOB, np.ceil(_area(length) / spacing.min(1) ** 2))[blob]
+    counts[blob, 1] = 1
+    tuft = shapes.material == Material.LEAF
+    counts[tuft] = 1
+    counts = np.maximum(counts, 1)
+    panel = shapes.kind == Kind.PARALLELOGRAM
+    counts[hidden & panel & (length[:, :2].max(1) < LEAST_HIDDEN_M)] = 0
+    counts[hidden & tuft & (shapes.variation < HIDDEN_TUFTS_DROPPED)] = 0
+    counts[hidden & tube & (length[:, 0] < LEAST_HIDDEN_M / 4)] = 0
+    return counts.astype(np.int64)
+
+
+def total_cells(shapes: Shapes, counts: np.ndarray, hidden: np.ndarray) -> int:
+    """How many cells these counts come to, nearly (triangles and discs are estimated)."""
+    m = counts + _graded(shapes, np.arange(len(shapes)), counts, hidden).sum(2)
+    each = (m[:, 0] * m[:, 1]).astype(np.float64)
+    each[shapes.kind == Kind.TRIANGLE] *= 0.5
+    each[shapes.kind == Kind.DISC] *= 0.5
+    tube = shapes.kind == Kind.CYLINDER
+    each[tube] = (counts[:, 0] * (counts[:, 1] + 2))[tube]
+    return int(each.sum())
+
+
+def make_cells(shapes: Shapes, counts: np.ndarray, hidden: np.ndarray) -> Cells:
+    """All cells of all shapes; counts [P, 2] and hidden [P] as in cell_counts."""
+    parts = []
+    for kinds, build in (
+        ((Kind.PARALLELOGRAM, Kind.TRIANGLE), _flat_cells),
+        ((Kind.DISC,), _disc_cells),
+        ((Kind.CYLINDER,), _tube_cells),
+        ((Kind.ELLIPSOID,), _blob_cells),
+    ):
+        index = np.flatnonzero(np.isin(shapes.kind, kinds) & (counts[:, 0] > 0))
+        if len(index):
+            parts.append(build(shapes, index, counts[index], hidden))
+    if not parts:
+        return Cells(
+            np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 2, 3)), np.zeros((0, 2, 3))
+        )
+    shape, local, sides = (np.concatenate(p) for p in zip(*parts, strict=True))
+    inset = hidden[shape] & (shapes.kind[shape] == Kind.PARALLELOGRAM)
+    _draw_in(shapes, counts, np.flatnonzero(inset), shape, local, sides)
+    return Cells(shape, local, sides, np.einsum("nak,nkj->naj", sides, shapes.axes[shape]))
+
+
+def _draw_in(
+    shapes: Shapes,
+    counts: np.ndarray,
+    index: np.ndarray,
+    shape: np.ndarray,
+    local: np.ndarray,
+    sides: np.ndarray,
+) -> None:
+    """Move the cells at index, in place, away from the crisp edges of their panels."""
+    for axis, (low_bit, high_bit) in enumerate(((U0, U1), (V0, V1))):
+        margin = np.minimum(INSET / counts[shape[index], axis], 0.25)
+        low = margin * ((shapes.edges[shape[index]] & low_bit) > 0)
+        high = margin * ((shapes.edges[shape[index]] & high_bit) > 0)
+        local[index, axis] = low + local[index, axis] * (1 - low - high)
+        sides[index, axis] *= (1 - low - high)[:, None]
+
+
+def _graded(
+    shapes: Shapes, index: np.ndarray, counts: np.ndarray, hidden: np.ndarray
+) -> np.ndarray:
+    """Rows added at both ends of both axes, [I, 2 axes, 2 ends], for the shapes at index."""
+    bits = np.array([[U0, U1], [V0, V1]], np.uint8)
+    flagged = (shapes.edges[index, None, None] & bits) > 0
+    rows = (counts >= 2).astype(np.int64) + (counts >= FINE_FROM)
+    rows *= ((shapes.kind == Kind.PARALLELOGRAM) & ~hidden)[index, None]
+    return flagged * rows[:, :, None]
+
+
+def _expand(each: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Owner and running number within the owner of sum(each) items."""
+    owner = np.repeat(np.arange(len(each)), each)
+    return owner, np.arange(len(owner)) - np.repeat(np.cumsum(each) - each, each)
+
+
+def _line(i: np.ndarray, cells: np.ndarray, low: np.ndarray, high: np.ndarray):
+    """Middle and width of cell i on [0, 1]: `cells` equal ones, with rows added at both ends."""
+    total = cells + low + high
+
+    def border(k: np.ndarray) -> np.ndarray:
+        near = NARROWING[low, np.minimum(k, low)]
+        far = NARROWING[high, np.minimum(total - k, high)]
+        at = np.where(k <= low, near, k - low)
+        return np.where(total - k <= high, cells - far, at)
+
+    a, b = border(i) / cells, border(i + 1) / cells
+    return (a + b) / 2, b - a
+
+
+def _flat_cells(shapes: Shapes, index: np.ndarray, counts: np.ndarray, hidden: np.ndarray):
+    graded = _graded(shapes, index, counts, hidden)
+    m = counts + graded.sum(2)
+    owner, number = _expand(m[:, 0] * m[:, 1])
+    i, j = number // m[owner, 1], number % m[owner, 1]
+    u, du = _line(i, counts[owner, 0], graded[owner, 0, 0], graded[owner, 0, 1])
+    v, dv = _line(j, counts[owner, 1], graded[owner, 1, 0], graded[owner, 1, 1])
+    shape = index[owner]
+    over = u + v - 1
+    opened = (shapes.edges[shape] & OPEN_DIAGONAL) > 0
+    inside = (shapes.kind[shape] != Kind.TRIANGLE) | (over < np.where(opened, -1e-9, 1e-9))
+    local = np.stack([u, v, np.zeros_like(u)], 1)[inside]
+    sides = np.zeros((len(u), 2, 3))
+    sides[:, 0, 0], sides[:, 1, 1] = du, dv
+    return shape[inside], local, sides[inside]
+
+
+def _disc_cells(shapes: Shapes, index: np.ndarray, counts: np.ndarray, hidden: np.ndarray):
+    ring_owner, ring = _expand(counts[:, 0])
+    rings = counts[ring_owner, 0]
+    around = np.maximum(1, np.round(counts[ring_owner, 1] * (ring + 0.5) / rings)).astype(np.int64)
+    around = np.where((ring == 0) & (rings > 1), np.maximum(around, 3), around)
+    owner, number = _expand(around)
+    whole = rings[owner] == 1
+    radius = np.where(whole, 0.0, (ring[owner] + 0.5) / rings[owner])
+    angle = 2 * np.pi * (number + 0.5 * (ring[owner] % 2)) / around[owner]
+    c, s, zero = np.cos(angle), np.sin(angle), np.zeros(len(angle))
+    depth = np.where(whole, 1.1, 1 / rings[owner])
+    width = np.where(whole, 1.1, 2 * np.pi * radius / around[owner])
+    sides = np.stack(
+        [
+            np.stack([c * depth, s * depth, zero], 1),
+            np.stack([-s * width, c * width, zero], 1),
+        ],
+        1,
+    )
+    return index[ring_owner[owner]], np.stack([radius * c, radius * s, zero], 1), sides
+
+
+def _tube_cells(shapes: Shapes, index: np.ndarray, counts: np.ndarray, hidden: np.ndarray):
+    rows = counts[:, 1] + 2
+    owner, number = _expand(counts[:, 0] * rows)
+    i, j = number // rows[owner], number % rows[owner]
+    angle = 2 * np.pi * (i + 0.5 * (j % 2)) / counts[owner, 0]
+    c, s, zero = np.cos(angle), np.sin(angle), np.zeros(len(angle))
+    width = 2 * np.pi / counts[owner, 0]
+    one = np.ones_like(j)
+    middle, height = _line(j, counts[owner, 1], one, one)
+    sides = np.stack(
+        [np.stack([-s * width, c * width, zero], 1), np.stack([zero, zero, 2 * height], 1)], 1
+    )
+    return index[owner], np.stack([c, s, 2 * middle - 1], 1), sides
+
+
+def _blob_cells(shapes: Shapes, index: np.ndarray, counts: np.ndarray, hidden: np.ndarray):
+    """A spiral of equal areas on the unit sphere."""
+    owner, number = _expand(counts[:, 0])
+    total = counts[owner, 0]
+    z = 1 - (2 * number + 1) / total
+    angle = number * 2.399963229728653
+    flat = np.sqrt(1 - z * z)
+    c, s, zero = np.cos(angle), np.sin(angle), np.zeros(len(angle))
+    size = np.sqrt(4 * np.pi / total)[:, None]
+    sides = np.stack(
+        [np.stack([-s, c, zero], 1) * size, np.stack([-z * c, -z * s, flat], 1) * size], 1
+    )
+    return index[owner], np.stack([flat * c, flat * s, z], 1), sides
+
+
+def _area(length: np.ndarray) -> np.ndarray:
+    """Surface of ellipsoids with semi-axes [P, 3] (Thomsen's approximation, within 1.1 %)."""
+    a, b, c = (length**1.6075).T
+    return 4 * np.pi * ((a * b + a * c + b * c) / 3) ** (1 / 1.6075)
+
+
+# ---- The shadow a mover casts on the ground, which travels with it as a soft dark layer ----------
+
+CELL_M = 0.06
+MARGIN_M = 2.0
+MOST_COVER = 0.5  # never more: what lies below must stay the heaviest thing in its pixels
+GROUND_BAND_M = 0.25  # surfaces this near the ground's plane receive the shadow
+SHADOW_RGB = np.array([0.03, 0.032, 0.04])
+
+
+@dataclass(frozen=True, eq=False)
+class ContactShadow:
+    """Share of SHADOW_RGB mixed into the ground, on a grid in the mover's frame.
+
+    values [X, Y]: cover in [0, MOST_COVER], zero at the rim. origin: x, y of values[0, 0], metres.
+    """
+
+    values: np.ndarray
+    origin: np.ndarray
+    ground_z: float
+
+    def cover(self, points: np.ndarray) -> np.ndarray:
+        """Bilinear cover at points [N, 3] of the mover's frame; zero away from the ground."""
+        cell = (points[:, :2] - self.origin) / CELL_M
+        low = np.floor(cell).astype(np.int64)
+        inside = np.all((low >= 0) & (low < np.array(self.values.shape) - 1), axis=1)
+        inside &= np.abs(points[:, 2] - self.ground_z) < GROUND_BAND_M
+        out = np.zeros(len(points))
+        i, j = low[inside].T
+        fx, fy = (cell[inside] - low[inside]).T
+        v = self.values
+        out[inside] = (v[i, j] * (1 - fx) + v[i + 1, j] * fx) * (1 - fy) + (
+            v[i, j + 1] * (1 - fx) + v[i + 1, j + 1] * fx
+        ) * fy
+        return out
+
+
+def contact_shadow(mover: MovingBody) -> ContactShadow:
+    """Sun shadow by ray casting, and sky shadow by the distance to the body's outline."""
+    lighting = mover.body.lighting
+    half = np.array(mover.size_m[:2]) / 2
+    length = mover.size_m[2] / np.tan(np.arcsin(lighting.to_sun[2]))
+    reach = half + np.minimum(length, MARGIN_M) + 0.4
+    counts = np.ceil(2 * reach / CELL_M).astype(int) + 1
+    origin = -(counts - 1) * CELL_M / 2
+    x, y = (origin[k] + CELL_M * np.arange(counts[k]) for k in range(2))
+    grid = np.stack(np.meshgrid(x, y, indexing="ij"), -1).reshape(-1, 2)
+    points = np.concatenate([grid, np.full((len(grid), 1), mover.ground_z)], 1)
+    directions = lighting.sun_directions()
+    shaded = np.zeros(len(points))
+    for direction in directions:
+        rays = np.broadcast_to(direction, points.shape)
+        shaded += mover.body.tree.occluded(points, rays)
+    full_sun = lighting.sunlit * lighting.to_sun[2] * SUN_RGB.mean()
+    sun = (1 - shaded / len(directions)) * full_sun
+    rounding = 0.8 * half.min()
+    outside = np.linalg.norm(np.maximum(np.abs(grid) - half + rounding, 0), axis=1) - rounding
+    hidden = 0.8 / (1 + np.exp((outside - 0.02) / (0.11 * half.min() / 0.9)))
+    sky = (1 - hidden) * SKY_RGB.mean() * 0.75
+    lit = full_sun + SKY_RGB.mean() * 0.75
+    cover = 1 - ((sun + sky) / lit) ** 0.45  # the display's encoding of that ratio, nearly
+    rim = np.min(np.minimum(grid - origin, -origin - grid), axis=1)  # fade out before the grid ends
+    cover = np.minimum(cover, MOST_COVER) * np.clip(rim / 0.3, 0, 1)
+    return ContactShadow(cover.reshape(counts), origin, mover.ground_z)
+
+
+# ---- splats --------------------------------------------------------------------------------------
 
 SH_C0 = 0.28209479177387814
 OPACITY = 0.99

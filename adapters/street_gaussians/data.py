@@ -2,38 +2,648 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from adapters.street_gaussians.calibration import (
-    EgoPath,
-    calibrated_cameras,
-    inverse,
-    read_camera_moments,
-    read_ego_path,
-    read_lens,
-)
-from adapters.street_gaussians.images import find_images
+from adapters.plain_files import read_json, read_numbers, read_pose, read_text
 from adapters.street_gaussians.records import (
     CAMERA_NAMES,
     ModelConfig,
     StreetData,
     StreetImage,
-)
-from adapters.street_gaussians.tracks import (
-    place_rows,
-    read_track_table,
-    read_visibility,
-    seen_rows,
-    track_files,
-    tracked_objects,
-    tracklets_of,
+    TrackedObject,
+    Tracklets,
 )
 from augment.cameras import Camera, Frame
 from augment.errors import AdapterError
+from augment.files.image_size import read_image_header
+from augment.geometry import quat_from_rotmat, rotmat_from_quat, slerp
+
+# ------------------------------------------------------------------------------------------------
+# Cameras, poses and times of a drive in Street Gaussians' layout, and which images there are
+# intrinsics/<cam>.txt             fx fy cx cy and distortion, which is not used
+# extrinsics/<cam>.txt             ego_from_camera, OpenCV axes
+# ego_pose/<frame>.txt             world_from_ego at the frame's time
+# ego_pose/<frame>_<cam>.txt       the same at the camera's
+# timestamps.json                  seconds by FRAME or camera name, then by frame
+
+TIMES = "timestamps.json"
+_FRAME_POSE = re.compile(r"([0-9]{1,9})\.txt")
+_MOST_GAPS = 1000  # numbers between the first frame and the last that nothing is known of
+
+
+@dataclass(frozen=True, eq=False)
+class Lens:
+    """fx, fy, cx, cy: pixels. camera_from_ego: float64 [4, 4], OpenCV axes. path: of the
+    intrinsics, for messages."""
+
+    path: Path
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    camera_from_ego: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class EgoPath:
+    """The car at every frame of the drive, in the dataset's world.
+
+    numbers: consecutive. times_s: float64 [N]. world_from_ego: float64 [N, 4, 4]. is_known: bool
+    [N], False where the pose is missing and was put between its neighbours. camera_times_s: by
+    camera name, then frame number. problems: one sentence each.
+    """
+
+    numbers: range
+    times_s: np.ndarray
+    world_from_ego: np.ndarray
+    is_known: np.ndarray
+    camera_times_s: Mapping[str, Mapping[int, float]]
+    problems: tuple[str, ...]
+
+    @property
+    def centre_m(self) -> np.ndarray:
+        """The mean position, float64 [3]: the origin of the models' worlds."""
+        return self.world_from_ego[:, :3, 3].mean(axis=0)
+
+
+def calibrated_cameras(root: Path) -> tuple[int, ...]:
+    """The numbers of the cameras that have extrinsics."""
+    return tuple(c for c in range(len(CAMERA_NAMES)) if (root / f"extrinsics/{c}.txt").exists())
+
+
+def read_lens(root: Path, cam: int) -> Lens:
+    """A camera's calibration.
+
+    Raises:
+        AdapterError: a file is missing, or holds no focal lengths or no pose.
+    """
+    path = root / "intrinsics" / f"{cam}.txt"
+    values = read_numbers(path)
+    if values.size < 4 or min(values[:2]) <= 0:
+        raise AdapterError(
+            f"{path} must begin with fx fy cx cy in pixels, fx and fy > 0; got {values.tolist()}"
+        )
+    fx, fy, cx, cy = values[:4].tolist()
+    ego_from_camera = read_pose(root / "extrinsics" / f"{cam}.txt")
+    return Lens(path, fx, fy, cx, cy, inverse(ego_from_camera))
+
+
+def inverse(pose: np.ndarray) -> np.ndarray:
+    """Of a rigid transform, float64 [4, 4]."""
+    out = np.eye(4)
+    out[:3, :3] = pose[:3, :3].T
+    out[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
+    return out
+
+
+def read_ego_path(root: Path) -> EgoPath:
+    """Every frame's pose and time.
+
+    Raises:
+        AdapterError: the folder is missing, holds no pose or a damaged one; times are missing, not
+            numbers, or do not increase.
+    """
+    folder = root / "ego_pose"
+    if not folder.is_dir():
+        raise AdapterError(
+            f"{folder} does not exist; expected a drive in Street Gaussians' layout, with "
+            f"ego_pose/, extrinsics/, intrinsics/, track/ and {TIMES}"
+        )
+    found = {int(m[1]): p for p in folder.iterdir() if (m := _FRAME_POSE.fullmatch(p.name))}
+    if not found:
+        raise AdapterError(f"{folder} holds no pose NNNNNN.txt; copy the folder from the dataset")
+    times = read_times(root / TIMES)
+    timed = times["FRAME"]
+    untimed = sorted(set(found) - set(timed))
+    if untimed:
+        raise AdapterError(
+            f"{root / TIMES}: FRAME lacks frame {untimed[0]:06d}, of which there is {folder}/"
+            f"{untimed[0]:06d}.txt; both must be of one conversion"
+        )
+    numbers = range(min(timed), max(timed) + 1)
+    if len(numbers) - len(timed) > _MOST_GAPS:
+        raise AdapterError(
+            f"{root / TIMES}: FRAME must hold consecutive frames; it holds {len(timed)} from "
+            f"{numbers[0]} to {numbers[-1]}"
+        )
+    known = np.array([number in found for number in numbers])
+    timed_numbers = np.array(sorted(timed))
+    times_s = np.interp(numbers, timed_numbers, [timed[n] for n in timed_numbers.tolist()])
+    if not (np.diff(times_s) > 0).all():
+        raise AdapterError(f"{root / TIMES}: the seconds of FRAME must increase with the frames")
+    poses = _fill(times_s, known, np.stack([read_pose(found[n]) for n in sorted(found)]))
+    return EgoPath(numbers, times_s, poses, known, times, tuple(_said(folder, numbers, known)))
+
+
+def _said(folder: Path, numbers: range, known: np.ndarray) -> list[str]:
+    missing = [number for number, is_known in zip(numbers, known, strict=True) if not is_known]
+    if not missing:
+        return []
+    return [
+        f"{folder} lacks the poses of {len(missing)} of {len(numbers)} frames, such as "
+        f"{missing[0]:06d}: these frames are left out, and the middle of the drive, on which the "
+        f"world of trained models is centred, is had with guesses from the frames beside them"
+    ]
+
+
+def read_times(path: Path) -> dict[str, dict[int, float]]:
+    """Seconds by FRAME or camera name, then frame number.
+
+    Raises:
+        AdapterError: missing, without FRAME, or something else in it.
+    """
+    content = read_json(path)
+    times: dict[str, dict[int, float]] = {}
+    for name, entries in content.items():
+        if name != "FRAME" and name not in CAMERA_NAMES:
+            continue
+        if not isinstance(entries, dict):
+            raise AdapterError(f"{path}: {name} must hold seconds by frame; got {entries!r:.80}")
+        times[name] = {}
+        for key, value in entries.items():
+            is_time = isinstance(value, int | float) and not isinstance(value, bool)
+            if not (is_time and 0 <= value < 9e9 and re.fullmatch(r"[0-9]{1,9}", key)):
+                raise AdapterError(
+                    f"{path}: {name} must hold seconds by frame, such as "
+                    f'"000000": 1550083467.3; got {key!r}: {value!r:.80}'
+                )
+            times[name][int(key)] = float(value)
+    if not times.get("FRAME"):
+        raise AdapterError(f"{path} must hold FRAME, seconds by frame; it holds {list(content)}")
+    return times
+
+
+def _fill(times_s: np.ndarray, known: np.ndarray, poses: np.ndarray) -> np.ndarray:
+    """The poses of all times, float64 [N, 4, 4], from those of the known ones: on the straight line
+    through the two nearest in time, turned as far as between them and no further."""
+    filled = np.empty((len(times_s), 4, 4))
+    filled[known] = poses
+    known_s = times_s[known]
+    for i in np.flatnonzero(~known):
+        if len(poses) == 1:
+            filled[i] = poses[0]
+            continue
+        after = int(np.clip(np.searchsorted(known_s, times_s[i]), 1, len(poses) - 1))
+        a, b = poses[after - 1], poses[after]
+        part = (times_s[i] - known_s[after - 1]) / (known_s[after] - known_s[after - 1])
+        filled[i] = a + part * (b - a)
+        filled[i, :3, :3] = _turned(a[:3, :3], b[:3, :3], min(max(part, 0.0), 1.0))
+    return filled
+
+
+def _turned(a: np.ndarray, b: np.ndarray, part: float) -> np.ndarray:
+    quats = quat_from_rotmat(torch.from_numpy(np.stack([a, b])))
+    turned = slerp(quats[0], quats[1], torch.tensor(part, dtype=torch.float64))
+    return rotmat_from_quat(turned).numpy()
+
+
+@dataclass(frozen=True, eq=False)
+class CameraMoment:
+    """When a camera took its image of a frame, and where the car was, dataset world."""
+
+    timestamp_s: float
+    world_from_ego: np.ndarray
+
+
+def read_camera_moments(
+    root: Path, path: EgoPath, frames: Sequence[int], cams: Sequence[int]
+) -> tuple[dict[tuple[int, int], CameraMoment], tuple[str, ...]]:
+    """The moments by frame and camera, and a sentence where poses are missing.
+
+    Raises:
+        AdapterError: a pose is damaged, has no time, or is missing everywhere.
+    """
+    moments: dict[tuple[int, int], CameraMoment] = {}
+    missing: list[Path] = []
+    for frame in frames:
+        if not path.is_known[path.numbers.index(frame)]:
+            continue
+        for cam in cams:
+            file = root / "ego_pose" / f"{frame:06d}_{cam}.txt"
+            if not file.exists():
+                missing.append(file)
+                continue
+            seconds = path.camera_times_s.get(CAMERA_NAMES[cam], {}).get(frame, math.nan)
+            if math.isnan(seconds):
+                raise AdapterError(
+                    f"{root / TIMES}: {CAMERA_NAMES[cam]} lacks frame {frame:06d}, of which there "
+                    f"is {file}; both must be of one conversion"
+                )
+            moments[frame, cam] = CameraMoment(seconds, read_pose(file))
+    if not moments:
+        raise AdapterError(
+            f"{root / 'ego_pose'} lacks poses NNNNNN_{cams[0]}.txt at the cameras' times for all "
+            f"frames from {frames[0]} to {frames[-1]}; copy the whole folder from the dataset"
+        )
+    if not missing:
+        return moments, ()
+    said = (
+        f"{len(missing)} images are left out for want of the car's pose at their time, such as "
+        f"{missing[0]}"
+    )
+    return moments, (said,)
+
+
+# ------------------------------------------------------------------------------------------------
+# The images of a drive in Street Gaussians' layout and their sizes, told by their first bytes
+
+_NAME = re.compile(r"([0-9]{1,9})_([0-9])\.(png|jpg|jpeg)", re.IGNORECASE)
+_FULL_SIZE = (1920, 1280)  # of Waymo's front cameras, and of its side cameras:
+_SIDE_SIZE = (1920, 886)
+
+
+@dataclass(frozen=True, eq=False)
+class Images:
+    """paths: of usable images by frame and camera. sizes: width and height by camera. problems: one
+    sentence each."""
+
+    paths: Mapping[tuple[int, int], Path]
+    sizes: Mapping[int, tuple[int, int]]
+    problems: tuple[str, ...]
+
+
+def find_images(root: Path, frames: range, lenses: Mapping[int, Lens]) -> Images:
+    """The images of these frames and cameras. Where a camera has none, its size is Waymo's.
+
+    Raises:
+        AdapterError: two files of one image, or a principal point outside the images.
+    """
+    listed = _listed(root / "images")
+    wanted = {key: p for key, p in listed.items() if key[0] in frames and key[1] in lenses}
+    paths: dict[tuple[int, int], Path] = {}
+    sizes: dict[int, tuple[int, int]] = {}
+    problems: list[str] = []
+    for cam, lens in lenses.items():
+        seen = {key: _size(path) for key, path in sorted(wanted.items()) if key[1] == cam}
+        counts = Counter(size for size in seen.values() if size is not None)
+        sizes[cam] = counts.most_common(1)[0][0] if counts else _waymo_size(cam)
+        for key, size in seen.items():
+            if size == sizes[cam]:
+                paths[key] = wanted[key]
+            else:
+                problems.append(_fault(wanted[key], size, sizes[cam], cam))
+        _check_centre(lens, cam, sizes[cam], is_assumed=not counts)
+    problems += _none(root, lenses, paths, sizes)
+    return Images(paths, sizes, tuple(problems))
+
+
+def _listed(folder: Path) -> dict[tuple[int, int], Path]:
+    found: dict[tuple[int, int], Path] = {}
+    for path in sorted(folder.iterdir()) if folder.is_dir() else ():
+        match = _NAME.fullmatch(path.name)
+        if match is None:
+            continue
+        key = int(match[1]), int(match[2])
+        if key in found:
+            raise AdapterError(f"{found[key]} and {path} are one image; delete one of them")
+        found[key] = path
+    return found
+
+
+def _size(path: Path) -> tuple[int, int] | None:
+    """Width and height, or None for what is no image."""
+    try:
+        header = read_image_header(path)
+    except OSError:
+        return None
+    return None if header is None else (header.width, header.height)
+
+
+def _waymo_size(cam: int) -> tuple[int, int]:
+    return _SIDE_SIZE if CAMERA_NAMES[cam].startswith("SIDE") else _FULL_SIZE
+
+
+def _fault(path: Path, size: tuple[int, int] | None, expected: tuple[int, int], cam: int) -> str:
+    if size is None:
+        return f"{path} is no image, or a damaged one; left out"
+    return (
+        f"{path} is {size[0]}x{size[1]} pixels, most images of {CAMERA_NAMES[cam]} are "
+        f"{expected[0]}x{expected[1]}; left out"
+    )
+
+
+def _check_centre(lens: Lens, cam: int, size: tuple[int, int], *, is_assumed: bool) -> None:
+    width, height = size
+    if 0 < lens.cx < width and 0 < lens.cy < height:
+        return
+    whose = "assumed for want of images" if is_assumed else "as its images are"
+    raise AdapterError(
+        f"{lens.path}: cx, cy (its third and fourth number) must lie in the {width}x{height} "
+        f"pixels of {CAMERA_NAMES[cam]}, {whose}; got {lens.cx:g}, {lens.cy:g}. If the images were "
+        f"resized, scale fx fy cx cy with them"
+    )
+
+
+def _none(
+    root: Path,
+    lenses: Mapping[int, Lens],
+    paths: Mapping[tuple[int, int], Path],
+    sizes: Mapping[int, tuple[int, int]],
+) -> list[str]:
+    """A sentence for the cameras without images."""
+    bare = sorted(set(lenses) - {cam for _, cam in paths})
+    if not bare:
+        return []
+    taken = ", ".join(f"{sizes[c][0]}x{sizes[c][1]} for {CAMERA_NAMES[c]}" for c in bare)
+    return [
+        f"{root / 'images'} holds no usable image NNNNNN_C.png or .jpg of {len(bare)} cameras: "
+        f"their size is taken to be Waymo's, {taken}"
+    ]
+
+
+# ---- The tracked objects of a drive, in the columns in which a trained model has them ------------
+# Nothing in a model says which column of its actors' poses is whose. The columns are had again by
+# going over the track file as it was gone over for training: rows in the file's order, each into
+# the
+# first free column of its frame; objects that hardly move are then taken out.
+
+NOT_TRACKED = ("sign", "misc")  # classes
+_COLUMNS = (
+    "frame_id track_id object_class alpha box_height box_width box_length "
+    "box_center_x box_center_y box_center_z box_heading"
+)
+_WORDS = len(_COLUMNS.split())  # of a row; a further one is the speed
+_SPREAD_M = 0.5  # standard deviation along an axis of the world above which an object moves
+_TRAVEL_M = 2.0  # or distance between its first place and its last
+_HOLD_S = 0.1  # an object is drawn so long before its first frame and after its last
+
+
+@dataclass(frozen=True, eq=False)
+class TrackTable:
+    """A track file of N rows in its order. All in the vehicle's frame at the frame's time.
+
+    lines: int64 [N], for messages. frames, ids: int64 [N]. labels: N. alphas: float64 [N].
+    sizes_m: float64 [N, 3], length, width, height. centers_m: float64 [N, 3]. headings: float64
+    [N], about z. speeds_mps: float64 [N], or None where the file has none. problems: one sentence
+    each.
+    """
+
+    path: Path
+    lines: np.ndarray
+    frames: np.ndarray
+    ids: np.ndarray
+    labels: tuple[str, ...]
+    alphas: np.ndarray
+    sizes_m: np.ndarray
+    centers_m: np.ndarray
+    headings: np.ndarray
+    speeds_mps: np.ndarray | None
+    problems: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+
+def track_files(root: Path, *, use_tracker: bool) -> tuple[Path, Path]:
+    """The track file and the one that says which cameras see its objects."""
+    suffix = "_castrack" if use_tracker else ""
+    folder = root / "track"
+    return folder / f"track_info{suffix}.txt", folder / f"track_camera_vis{suffix}.json"
+
+
+def read_track_table(path: Path) -> TrackTable:
+    """A track file.
+
+    Raises:
+        AdapterError: missing; a row is too short, holds something that is no finite number, or is
+            the second one of its object and frame. The message names the line.
+    """
+    texts = read_text(path).splitlines()
+    rows, words_of = [], []
+    for line, text in enumerate(texts[1:], start=2):
+        words = text.split()
+        if words:
+            rows.append((line, *_row(path, line, words)))
+            words_of.append(len(words) > _WORDS)
+    if len(set(words_of)) > 1:
+        odd = rows[words_of.index(not words_of[0])][0]
+        raise AdapterError(
+            f"{path}, line {odd}: all rows must hold a speed in column {_WORDS + 1}, or none; it "
+            f"differs from the first row"
+        )
+    _check_single(path, rows)
+    has_speed = bool(words_of and words_of[0])
+    numbers = np.array([row[4] for row in rows], np.float64).reshape(len(rows), 8 + has_speed)
+    return TrackTable(
+        path=path,
+        lines=np.array([row[0] for row in rows], np.int64),
+        frames=np.array([row[1] for row in rows], np.int64),
+        ids=np.array([row[2] for row in rows], np.int64),
+        labels=tuple(row[3] for row in rows),
+        alphas=numbers[:, 0],
+        sizes_m=numbers[:, 3:0:-1].copy(),
+        centers_m=numbers[:, 4:7],
+        headings=numbers[:, 7],
+        speeds_mps=numbers[:, 8] if has_speed else None,
+        problems=_headless(path, texts),
+    )
+
+
+def _row(path: Path, line: int, words: Sequence[str]) -> tuple[int, int, str, list[float]]:
+    """Frame, object, class and the numbers after it."""
+    where = f"{path}, line {line}"
+    if len(words) < _WORDS:
+        raise AdapterError(
+            f"{where}: a row must hold the {_WORDS} columns {_COLUMNS}; it holds {len(words)}"
+        )
+    frame, track_id = words[0], words[1]
+    if not all(re.fullmatch(r"[0-9]{1,9}", word) for word in (frame, track_id)):
+        raise AdapterError(
+            f"{where}: frame_id and track_id must be whole numbers >= 0; got {frame!r}, "
+            f"{track_id!r}"
+        )
+    values = []
+    names = [*_COLUMNS.split()[3:], "speed"]
+    for name, word in zip(names, words[3 : _WORDS + 1], strict=False):
+        try:
+            value = float(word)
+        except ValueError:
+            value = np.nan
+        needs_size = name in ("box_height", "box_width", "box_length")
+        if not np.isfinite(value) or (needs_size and value <= 0):
+            kind = "a number of metres > 0" if needs_size else "a finite number"
+            raise AdapterError(f"{where}: {name} must be {kind}; got {word!r}")
+        values.append(value)
+    return int(frame), int(track_id), words[2], values
+
+
+def _check_single(path: Path, rows: Sequence[tuple]) -> None:
+    first: dict[tuple[int, int], int] = {}
+    for line, frame, track_id, *_ in rows:
+        before = first.setdefault((frame, track_id), line)
+        if before != line:
+            raise AdapterError(
+                f"{path}, line {line}: object {track_id} is already in frame {frame} by line "
+                f"{before}; delete one of them"
+            )
+
+
+def _headless(path: Path, texts: Sequence[str]) -> tuple[str, ...]:
+    """A sentence where the first line, which is never read, holds an object."""
+    words = texts[0].split() if texts else []
+    if len(words) < _WORDS or not words[0].isdigit():
+        return ()
+    return (f"{path}: line 1, which is not read, should name the columns; it holds an object",)
+
+
+Visibility = Mapping[tuple[int, int], frozenset[int]]
+
+
+def read_visibility(path: Path) -> Visibility:
+    """The cameras that see an object, by object and frame.
+
+    Raises:
+        AdapterError: missing, or something else in it than cameras by object and frame.
+    """
+    visible: dict[tuple[int, int], frozenset[int]] = {}
+    for track_id, frames in read_json(path).items():
+        entries = frames.items() if isinstance(frames, dict) else [("?", frames)]
+        for frame, cams in entries:
+            is_list = isinstance(cams, list) and all(type(cam) is int for cam in cams)
+            if not (is_list and _is_number(track_id) and _is_number(frame)):
+                raise AdapterError(
+                    f"{path}: object {track_id!r}, frame {frame!r} must be whole numbers with a "
+                    f"list of camera numbers; got {cams!r:.80}"
+                )
+            visible[int(track_id), int(frame)] = frozenset(cams)
+    return visible
+
+
+def _is_number(text: str) -> bool:
+    return re.fullmatch(r"[0-9]{1,9}", text) is not None
+
+
+def seen_rows(
+    table: TrackTable, visible: Visibility, visible_path: Path, cams: Sequence[int]
+) -> np.ndarray:
+    """Indices of the rows of tracked classes that one of the cameras sees, int64 [R].
+
+    Raises:
+        AdapterError: of such a row it is not said who sees it.
+    """
+    kept = []
+    wanted = frozenset(cams)
+    for row, label in enumerate(table.labels):
+        if label in NOT_TRACKED:
+            continue
+        track_id, frame = int(table.ids[row]), int(table.frames[row])
+        if (track_id, frame) not in visible:
+            raise AdapterError(
+                f"{table.path}, line {table.lines[row]}: {visible_path} does not say which cameras "
+                f"see object {track_id} in frame {frame}; both must be of one conversion"
+            )
+        if visible[track_id, frame] & wanted:
+            kept.append(row)
+    return np.array(kept, np.int64)
+
+
+def place_rows(
+    table: TrackTable, rows: np.ndarray, frames: Sequence[int], world_from_ego: np.ndarray
+) -> np.ndarray:
+    """The row of the table in every frame and column, int64 [F, M], -1 for none.
+
+    rows: those that were seen. frames: consecutive. world_from_ego: float64 [F, 4, 4].
+    """
+    steps = table.frames[rows] - frames[0]
+    inside = (steps >= 0) & (steps < len(frames))
+    rows, steps = rows[inside], steps[inside]
+    columns = np.bincount(steps, minlength=len(frames)).max() if len(rows) else 0
+    placed = np.full((len(frames), columns), -1, np.int64)
+    used = np.zeros(len(frames), np.int64)
+    for row, step in zip(rows, steps, strict=True):
+        placed[step, used[step]] = row
+        used[step] += 1
+    placed = np.where(_moves(table, placed, world_from_ego), placed, -1)
+    most = int((placed >= 0).sum(1).max()) if columns else 0
+    if most < columns:
+        placed = _compacted(placed, most)
+    return placed if placed.shape[1] else np.full((len(frames), 1), -1, np.int64)
+
+
+def _moves(table: TrackTable, placed: np.ndarray, world_from_ego: np.ndarray) -> np.ndarray:
+    """Whether the object in each place moves, bool [F, M]."""
+    steps, columns = np.nonzero(placed >= 0)  # by frame, then column
+    rows = placed[steps, columns]
+    poses = world_from_ego[steps]
+    world = np.einsum("nij,nj->ni", poses[:, :3, :3], table.centers_m[rows]) + poses[:, :3, 3]
+    moving = np.zeros(placed.shape, bool)
+    for track_id in np.unique(table.ids[rows]):
+        own = table.ids[rows] == track_id
+        places = world[own]
+        spread = places.std(axis=0).max()
+        travel = np.linalg.norm(places[-1] - places[0])
+        moving[steps[own], columns[own]] = spread > _SPREAD_M or travel > _TRAVEL_M
+    return moving
+
+
+def _compacted(placed: np.ndarray, columns: int) -> np.ndarray:
+    """Every frame's rows in its first columns, in the same order, int64 [F, columns]."""
+    compact = np.full((len(placed), columns), -1, np.int64)
+    for step, row in enumerate(placed):
+        kept = row[row >= 0]
+        compact[step, : len(kept)] = kept
+    return compact
+
+
+def tracklets_of(table: TrackTable, placed: np.ndarray) -> Tracklets:
+    """What the placed rows say, zeros and no rotation in empty places."""
+    there = placed >= 0
+    if not len(table):
+        empty = np.zeros((*placed.shape, 3))
+        return Tracklets(placed, empty, np.tile([1.0, 0, 0, 0], (*placed.shape, 1)))
+    half = np.where(there, table.headings[placed], 0.0) / 2
+    zero = np.zeros_like(half)
+    return Tracklets(
+        ids=np.where(there, table.ids[placed], -1),
+        positions=np.where(there[..., None], table.centers_m[placed], 0.0),
+        quats=np.stack([np.cos(half), zero, zero, np.sin(half)], -1),
+    )
+
+
+def tracked_objects(
+    table: TrackTable,
+    rows: np.ndarray,
+    ids: np.ndarray,
+    frames: Sequence[int],
+    frame_times_s: np.ndarray,
+    drawn_s: tuple[float, float],
+) -> tuple[TrackedObject, ...]:
+    """The objects that have a column, in the order of the rows.
+
+    rows: those that were seen, in all frames of the file; sizes are the largest of them. ids:
+    int64 [F, M]. drawn_s: the first and last moment of any image or frame.
+    """
+    objects = []
+    for track_id in dict.fromkeys(table.ids[rows].tolist()):
+        steps = np.flatnonzero((ids == track_id).any(axis=1))
+        if len(steps) == 0:
+            continue
+        own = rows[table.ids[rows] == track_id]
+        length, width, height = (table.sizes_m[own].max(axis=0)).tolist()
+        start, end = frame_times_s[steps[0]] - _HOLD_S, frame_times_s[steps[-1]] + _HOLD_S
+        objects.append(
+            TrackedObject(
+                track_id=track_id,
+                label=table.labels[own[0]],
+                size_m=(length, width, height),
+                start_frame=frames[steps[0]],
+                end_frame=frames[steps[-1]],
+                start_s=float(np.clip(start, *drawn_s)),
+                end_s=float(np.clip(end, *drawn_s)),
+            )
+        )
+    return tuple(objects)
+
+
+# ---- data ----------------------------------------------------------------------------------------
 
 
 def read_data(root: Path, config: ModelConfig) -> StreetData:

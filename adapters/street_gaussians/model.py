@@ -2,27 +2,582 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import contextlib
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from torch import Tensor
 
-from adapters.street_gaussians.parameters import (
-    Parameters,
-    actor_id,
-    read_camera_changes,
-    read_color_maps,
-    read_pose_changes,
-    read_sky,
-)
-from adapters.street_gaussians.parts import Part, allocate, check_counts, finish_part
-from adapters.street_gaussians.poses import PoseChanges
-from adapters.street_gaussians.records import ModelConfig
-from augment.errors import AdapterError
+from adapters.lidar_scene.scene import DriveOptions
+from adapters.plain_files import read_yaml
+from adapters.street_gaussians.records import CAMERA_NAMES, ModelConfig, PoseChanges, rotations_of
+from augment.errors import AdapterError, SceneError
 from augment.files.checkpoints import load_checkpoint, release, section, taken, tensor
+from augment.files.ply import (
+    PlyElement,
+    PlyHeader,
+    count_surplus_bytes,
+    iterate_rows,
+    read_ply_header,
+)
+from augment.scene import SH_COUNTS, Gaussians, check_gaussians, drawable_rows, is_drawable
+
+# ------------------------------------------------------------------------------------------------
+# What the URI of a trained model may ask for, as in `street_gaussians:<path>?data=…&width=800`
+
+SCHEME = "street_gaussians"
+DEFAULT_WIDTH = 1600
+_KEYS = {
+    "data": "the dataset's folder, where it is not where the configuration says",
+    "iteration": "which of the saved iterations, a number; the newest without it",
+    "weights": "pth or ply; the .pth where there is one",
+    "width": f"images are at most so many pixels wide, {DEFAULT_WIDTH} without it; 0 as recorded",
+    "frames": "first:stop, frame numbers with stop excluded, either side may be empty",
+    "rotation_bug": "0 or 1; actors turned as an older release of the project turned them",
+}
+
+
+@dataclass(frozen=True)
+class ModelOptions:
+    """Options of one opening; see _KEYS. width: 0 for as recorded."""
+
+    data: Path | None = None
+    iteration: int | None = None
+    weights: str | None = None
+    width: int = DEFAULT_WIDTH
+    frames: DriveOptions = field(default_factory=DriveOptions)
+    rotation_bug: bool = False
+
+    @staticmethod
+    def from_query(query: dict[str, str]) -> ModelOptions:
+        """Raises:
+        AdapterError: an unknown key (lists the known ones), or a value of the wrong kind.
+        """
+        unknown = sorted(set(query) - set(_KEYS))
+        if unknown:
+            known = "; ".join(f"{key}: {meaning}" for key, meaning in _KEYS.items())
+            raise AdapterError(
+                f"{SCHEME}: unknown option {unknown[0]!r}; for a trained model allowed are {known}"
+            )
+        frames = {"frames": query["frames"]} if "frames" in query else {}
+        return ModelOptions(
+            data=Path(query["data"]).expanduser() if "data" in query else None,
+            iteration=_number(query, "iteration", None),
+            weights=_choice(query, "weights", ("pth", "ply")),
+            width=_number(query, "width", DEFAULT_WIDTH) or 0,
+            frames=DriveOptions.from_query(SCHEME, frames),
+            rotation_bug=_choice(query, "rotation_bug", ("0", "1")) == "1",
+        )
+
+
+def _number(query: dict[str, str], key: str, default: int | None) -> int | None:
+    text = query.get(key)
+    if text is None:
+        return default
+    if not (text.isascii() and text.isdigit() and len(text) < 10):
+        raise AdapterError(f"{SCHEME}: {key} must be a whole number, {_KEYS[key]}; got {text!r}")
+    return int(text)
+
+
+def _choice(query: dict[str, str], key: str, allowed: tuple[str, ...]) -> str | None:
+    text = query.get(key)
+    if text is not None and text not in allowed:
+        raise AdapterError(f"{SCHEME}: {key} must be {' or '.join(allowed)}; got {text!r}")
+    return text
+
+
+# ---- The configuration that a model was trained with: configs/config_{iteration:06d}.yaml --------
+
+_NAME = re.compile(r"config_(\d+)\.yaml")
+_MODES = {"color_correction": ("image", "sensor"), "pose_correction": ("image", "frame")}
+
+
+def newest_config(model: Path) -> Path:
+    """The configuration of a model's folder; of several the one of the latest iteration.
+
+    Raises:
+        AdapterError: there is none.
+    """
+    found = {}
+    for path in (model / "configs").glob("config_*.yaml"):
+        if match := _NAME.fullmatch(path.name):
+            found[int(match[1])] = path
+    if not found:
+        raise AdapterError(
+            f"{model / 'configs'} holds no config_*.yaml; which column of the actors' poses "
+            f"belongs to which object depends on it. Copy the folder configs/ of the training's "
+            f"output to {model}"
+        )
+    return found[max(found)]
+
+
+def read_config(path: Path) -> ModelConfig:
+    """What of a configuration decides how its model is read; keys it lacks have the project's
+    defaults.
+
+    Raises:
+        AdapterError: no YAML, or a value of another kind; names the key.
+    """
+    values = _Values(read_yaml(path), path)
+    default = ModelConfig()
+    return ModelConfig(
+        source_path=values.of("source_path", str, default.source_path),
+        cameras=values.cameras(default.cameras),
+        selected_frames=values.selected_frames(),
+        use_tracker=values.of("data.use_tracker", bool, default.use_tracker),
+        split_test=values.of("data.split_test", int, default.split_test),
+        split_train=values.of("data.split_train", int, default.split_train),
+        white_background=values.of("data.white_background", bool, default.white_background),
+        sh_degree=values.of("model.gaussian.sh_degree", int, default.sh_degree),
+        fourier_dim=values.of("model.gaussian.fourier_dim", int, default.fourier_dim),
+        fourier_scale=values.of("model.gaussian.fourier_scale", float, default.fourier_scale),
+        include_sky=values.of("model.nsg.include_sky", bool, default.include_sky),
+        opt_track=values.of("model.nsg.opt_track", bool, default.opt_track),
+        use_color_correction=values.of(
+            "model.use_color_correction", bool, default.use_color_correction
+        ),
+        color_correction_mode=values.mode("color_correction", default.color_correction_mode),
+        color_correction_mlp=values.of(
+            "model.color_correction.use_mlp", bool, default.color_correction_mlp
+        ),
+        use_pose_correction=values.of(
+            "model.use_pose_correction", bool, default.use_pose_correction
+        ),
+        pose_correction_mode=values.mode("pose_correction", default.pose_correction_mode),
+    )
+
+
+class _Values:
+    """Values of a configuration by keys such as data.cameras, checked."""
+
+    def __init__(self, tree: Mapping[str, Any], path: Path) -> None:
+        self._tree, self._path = tree, path
+
+    def _find(self, key: str) -> Any:
+        """The value; None where it is absent or null."""
+        found: Any = self._tree
+        for name in key.split("."):
+            if found is None:
+                return None
+            if not isinstance(found, Mapping):
+                raise self._wrong(key, "a key inside a section", found)
+            found = found.get(name)
+        return found
+
+    def of(self, key: str, kind: type, default: Any) -> Any:
+        found = self._find(key)
+        if found is None:
+            return default
+        if kind is float and type(found) is int:
+            found = float(found)
+        if type(found) is not kind:
+            raise self._wrong(key, f"a value of type {kind.__name__}", found)
+        if kind is float and not abs(found) < float("inf"):
+            raise self._wrong(key, "a finite number", found)
+        return found
+
+    def mode(self, section: str, default: str) -> str:
+        found = self.of(f"model.{section}.mode", str, default)
+        if found not in _MODES[section]:
+            raise self._wrong(f"model.{section}.mode", " or ".join(_MODES[section]), found)
+        return found
+
+    def cameras(self, default: tuple[int, ...]) -> tuple[int, ...]:
+        found = self._find("data.cameras")
+        if found is None:
+            return default
+        numbers = range(len(CAMERA_NAMES))
+        is_list = isinstance(found, list) and all(type(n) is int and n in numbers for n in found)
+        if not is_list or not found or len(set(found)) != len(found):
+            expected = f"different camera numbers from 0 to {numbers[-1]}, such as [0, 1, 2]"
+            raise self._wrong("data.cameras", expected, found)
+        return tuple(found)
+
+    def selected_frames(self) -> tuple[int, int] | None:
+        found = self._find("data.selected_frames")
+        if found is None:
+            return None
+        is_pair = isinstance(found, list) and [type(n) for n in found] == [int, int]
+        if not is_pair or not 0 <= found[0] <= found[1]:
+            raise self._wrong("data.selected_frames", "[first, last] or null", found)
+        return found[0], found[1]
+
+    def _wrong(self, key: str, expected: str, found: Any) -> AdapterError:
+        return AdapterError(f"{self._path}: {key} must be {expected}; got {str(found)[:80]!r}")
+
+
+# ---- Where the files of a trained model are ------------------------------------------------------
+
+_PTH, _PLY = re.compile(r"iteration_(\d+)\.pth"), re.compile(r"iteration_(\d+)")
+_DATA_FOLDERS = ("ego_pose", "extrinsics", "track")
+
+
+@dataclass(frozen=True)
+class ModelFiles:
+    """weights: a .pth or .ply. data: the folder of the dataset."""
+
+    folder: Path
+    weights: Path
+    iteration: int | None
+    config_file: Path
+    config: ModelConfig
+    data: Path
+
+
+def is_dataset(path: Path) -> bool:
+    """Whether a path is a dataset's folder and no model's."""
+    return all((path / name).is_dir() for name in _DATA_FOLDERS) and not _saved(path)
+
+
+def find_model(path: Path, options: ModelOptions) -> ModelFiles:
+    """The files of a model, given its folder or its weights.
+
+    Raises:
+        AdapterError: no weights, no such iteration, no configuration, or no dataset.
+    """
+    folder, weights, iteration = _weights(path, options)
+    config_file = newest_config(folder)
+    config = read_config(config_file)
+    return ModelFiles(
+        folder, weights, iteration, config_file, config, _data(config, config_file, options)
+    )
+
+
+def find_data(path: Path, options: ModelOptions) -> Path:
+    """The dataset of a model.
+
+    Raises:
+        AdapterError: as find_model.
+    """
+    return find_model(path, options).data
+
+
+def _weights(path: Path, options: ModelOptions) -> tuple[Path, Path, int | None]:
+    """The model's folder, its weights and their iteration, where their name says it."""
+    if path.is_file():
+        return _given_file(path, options)
+    saved = _saved(path)
+    if not saved:
+        raise AdapterError(
+            f"{path} is no Street Gaussians model and no dataset of one: expected "
+            f"trained_model/iteration_N.pth or point_cloud/iteration_N/point_cloud.ply in it, or "
+            f"{', '.join(f'{name}/' for name in _DATA_FOLDERS)}"
+        )
+    kind = options.weights or ("pth" if any(kind == "pth" for kind, _ in saved) else "ply")
+    of_kind = {number: file for (k, number), file in saved.items() if k == kind}
+    if not of_kind:
+        raise AdapterError(f"{path} holds no .{kind} of a saved iteration; give the other weights=")
+    iteration = max(of_kind) if options.iteration is None else options.iteration
+    if iteration not in of_kind:
+        known = ", ".join(map(str, sorted(of_kind)))
+        raise AdapterError(f"{path} has no .{kind} of iteration {iteration}; it has {known}")
+    return path, of_kind[iteration], iteration
+
+
+def _given_file(path: Path, options: ModelOptions) -> tuple[Path, Path, int | None]:
+    if options.iteration is not None or options.weights is not None:
+        raise AdapterError(
+            f"{path} is one file, so iteration= and weights= say nothing; give the model's folder "
+            f"or leave them out"
+        )
+    if path.suffix.lower() not in (".pth", ".ply"):
+        raise AdapterError(f"{path}: expected a model's folder, .pth or .ply")
+    is_pth = path.suffix.lower() == ".pth"
+    match = _PTH.fullmatch(path.name) if is_pth else _PLY.fullmatch(path.parent.name)
+    folders = path.absolute().parents[:3]
+    folder = next((folder for folder in folders if (folder / "configs").is_dir()), folders[-1])
+    return folder, path, int(match[1]) if match else None
+
+
+def _saved(folder: Path) -> dict[tuple[str, int], Path]:
+    """Weights by kind and iteration."""
+    found = {}
+    for file in folder.glob("trained_model/iteration_*.pth"):
+        if match := _PTH.fullmatch(file.name):
+            found["pth", int(match[1])] = file
+    for file in folder.glob("point_cloud/iteration_*/point_cloud.ply"):
+        if match := _PLY.fullmatch(file.parent.name):
+            found["ply", int(match[1])] = file
+    return found
+
+
+def _data(config: ModelConfig, config_file: Path, options: ModelOptions) -> Path:
+    if options.data is not None:
+        if not options.data.is_dir():
+            raise AdapterError(f"data={options.data}: no such folder; expected the model's dataset")
+        return options.data
+    if config.source_path and Path(config.source_path).is_dir():
+        return Path(config.source_path)
+    raise AdapterError(
+        f"{config_file}: source_path {config.source_path!r} is not here; the model needs poses, "
+        f"tracks and cameras of its dataset. Give its folder as data=DIR"
+    )
+
+
+# ---- Tables of a trained model beside its Gaussians: poses, sky, colour and pose correction ------
+
+_ACTOR = re.compile(r"obj_(\d{3,9})")
+
+
+def actor_id(name: str) -> int | None:
+    """The track id in a part's name, such as obj_003; None for other names."""
+    match = _ACTOR.fullmatch(name)
+    number = int(match[1]) if match else None
+    return number if number is not None and name == f"obj_{number:03d}" else None
+
+
+class Parameters:
+    """Networks and tables of a checkpoint beside its Gaussians, with sentences about them."""
+
+    def __init__(self, content: Mapping[str, Any], path: Path, problems: list[str]) -> None:
+        self.path, self.problems = path, problems
+        self._content = content
+        self._seen = {"background", "iter"}
+
+    def skip(self, name: str) -> None:
+        """Say that an entry is known."""
+        self._seen.add(name)
+
+    def of(self, name: str, key: str, is_used: bool) -> Mapping[str, Any] | None:
+        """The table `params` of an entry. key: what in the configuration says that it is used.
+
+        Raises:
+            AdapterError: it is used but not there.
+        """
+        self._seen.add(name)
+        if not is_used:
+            if self._content.get(name):
+                self.problems.append(
+                    f"{self.path}: {name} is left out, as the configuration has not {key}"
+                )
+            return None
+        if name not in self._content:
+            raise AdapterError(
+                f"{self.path} lacks {name!r}, although the configuration has {key}; it holds "
+                f"{', '.join(map(str, list(self._content)[:12]))}. Copy the model and its "
+                f"configs/ from the same training"
+            )
+        entry = section(self._content, name, str(self.path))
+        return section(entry, "params", f"{self.path}, {name}")
+
+    def numbers(
+        self, params: Mapping[str, Any], name: str, key: str, shape: Sequence[int | None]
+    ) -> np.ndarray:
+        """A small table, float64.
+
+        Raises:
+            AdapterError: missing, of another shape, or not finite.
+        """
+        where = f"{self.path}, {name}.params"
+        found = tensor(params, key, shape, where).double().numpy()
+        if not np.isfinite(found).all():
+            raise AdapterError(f"{where}: {key} holds NaN or infinite numbers")
+        return found
+
+    def report_unknown(self) -> None:
+        names = [name for name in self._content if name not in self._seen]
+        names = [str(name) for name in names if actor_id(str(name)) is None]
+        if names:
+            self.problems.append(
+                f"{self.path} also holds {', '.join(names[:8])}, which is not used: expected "
+                f"background, obj_000 ..., actor_pose, sky_cubemap, color_correction, "
+                f"pose_correction and iter"
+            )
+
+
+def read_pose_changes(
+    parameters: Parameters, config: ModelConfig, *, has_actors: bool
+) -> PoseChanges | None:
+    """What training added to the actors' poses; None where it left them.
+
+    Raises:
+        AdapterError: as Parameters.
+    """
+    if not has_actors:
+        parameters.skip("actor_pose")
+        return None
+    params = parameters.of("actor_pose", "model.nsg.opt_track", config.opt_track)
+    if params is None:
+        return None
+    positions = parameters.numbers(params, "actor_pose", "opt_trans", (None, None, 3))
+    shape = (*positions.shape[:2], 1)
+    half_turns = parameters.numbers(params, "actor_pose", "opt_rots", shape)
+    return PoseChanges(positions, half_turns[..., 0])
+
+
+def read_sky(parameters: Parameters, config: ModelConfig) -> Tensor | None:
+    """Faces of the sky, float32 [6, R, R, 3] in [0, 1]; None where there is none that can be used.
+
+    The project clamps what it looks up; clamped texels are the same but between texels of which
+    only some are out of range.
+
+    Raises:
+        AdapterError: as Parameters.
+    """
+    params = parameters.of("sky_cubemap", "model.nsg.include_sky", config.include_sky)
+    if params is None:
+        return None
+    where = f"{parameters.path}, sky_cubemap.params"
+    if any(str(key) == "sky_codebook" or str(key).startswith("mlp_shader") for key in params):
+        parameters.problems.append(
+            f"{where}: a sky made of a codebook and a network is not supported; the sky has the "
+            f"background's colour instead"
+        )
+        return None
+    faces = tensor(params, "sky_cube_map", (6, None, None, 3), where)
+    if faces.shape[1] != faces.shape[2] or faces.shape[1] == 0:
+        raise AdapterError(
+            f"{where}: sky_cube_map must be float32 [6, R, R, 3]; got {list(faces.shape)}"
+        )
+    own = torch.empty(faces.shape)
+    for face in range(6):
+        taken(faces[face], own[face])
+    lowest, highest = own.numpy().min(), own.numpy().max()
+    if not np.isfinite([lowest, highest]).all():
+        raise AdapterError(f"{where}: sky_cube_map holds NaN or infinite numbers")
+    return own.clamp_(0, 1)
+
+
+def read_color_maps(parameters: Parameters, config: ModelConfig) -> Tensor | None:
+    """Colour maps float32 [n, 3, 4]; None where there are none that can be used.
+
+    Raises:
+        AdapterError: as Parameters.
+    """
+    name = "color_correction"
+    params = parameters.of(name, "model.use_color_correction", config.use_color_correction)
+    if params is None:
+        return None
+    if config.color_correction_mlp or any(str(k).startswith("affine_trans.") for k in params):
+        parameters.problems.append(
+            f"{parameters.path}, {name}: colour correction by a network is not supported and left "
+            f"out; images have the scene's own colours"
+        )
+        return None
+    return torch.from_numpy(
+        parameters.numbers(params, name, "affine_trans", (None, 3, 4)).astype(np.float32)
+    )
+
+
+def read_camera_changes(parameters: Parameters, config: ModelConfig) -> np.ndarray | None:
+    """What the background is moved by before an image is taken, float64 [n, 4, 4].
+
+    Raises:
+        AdapterError: as Parameters.
+    """
+    name = "pose_correction"
+    params = parameters.of(name, "model.use_pose_correction", config.use_pose_correction)
+    if params is None:
+        return None
+    centres = parameters.numbers(params, name, "pose_correction_trans", (None, 3))
+    quats = parameters.numbers(params, name, "pose_correction_rots", (len(centres), 4))
+    if (np.linalg.norm(quats, axis=1) == 0).any():
+        raise AdapterError(
+            f"{parameters.path}, {name}.params: pose_correction_rots holds a quaternion of zeros"
+        )
+    changes = np.tile(np.eye(4), (len(centres), 1, 1))
+    changes[:, :3, :3] = rotations_of(quats)
+    changes[:, :3, 3] = centres
+    return changes
+
+
+# ---- One trained part, the background or an actor: from the numbers in a file to Gaussians -------
+
+_ROWS = 1 << 15  # Gaussians changed at a time: temporaries of a few megabytes
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """terms [N, F - 1, 3]: further Fourier terms of the colours; None where F is 1."""
+
+    gaussians: Gaussians
+    terms: Tensor | None
+
+    @property
+    def term_count(self) -> int:
+        """F."""
+        return 1 if self.terms is None else 1 + self.terms.shape[1]
+
+
+def allocate(count: int, sh_count: int, term_count: int) -> tuple[dict[str, Tensor], Tensor | None]:
+    """Memory of a part's numbers, to be filled as they stand in a file: log scales, opacity logits,
+    quaternions of any length. Named as in Gaussians; the second are the terms.
+    """
+    arrays = {
+        "means": torch.empty(count, 3),
+        "quats": torch.empty(count, 4),
+        "scales": torch.empty(count, 3),
+        "opacities": torch.empty(count),
+        "sh": torch.empty(count, sh_count, 3),
+    }
+    return arrays, torch.empty(count, term_count - 1, 3) if term_count > 1 else None
+
+
+def check_counts(where: str, rest: int, terms: int, *, is_background: bool) -> None:
+    """rest: SH coefficients above the constant one. terms: F.
+
+    Raises:
+        AdapterError: no such spherical harmonics, or a background whose colours change.
+    """
+    if rest + 1 not in SH_COUNTS:
+        known = ", ".join(str(count - 1) for count in SH_COUNTS)
+        raise AdapterError(
+            f"{where}: feature_rest must have {known} coefficients a channel (SH degrees 0 to 3); "
+            f"got {rest}"
+        )
+    if terms < 1 or (is_background and terms > 1):
+        expected = "1 colour term" if is_background else "1 colour term or more"
+        raise AdapterError(f"{where}: feature_dc must have {expected}; got {terms}")
+
+
+def finish_part(
+    arrays: Mapping[str, Tensor], terms: Tensor | None, where: str
+) -> tuple[Part, tuple[str, ...]]:
+    """Activate the numbers where they lie and leave out what cannot be drawn, with a sentence each.
+
+    Raises:
+        AdapterError: nothing usable remains.
+    """
+    _activate(arrays)
+    if terms is not None:
+        _mark_bad_terms(arrays["means"], terms)
+    gaussians = Gaussians(**arrays)
+    if len(gaussians) and is_drawable(gaussians):
+        return Part(gaussians, terms), ()
+    try:
+        kept, problems = check_gaussians(gaussians, where=where)
+    except SceneError as error:
+        raise AdapterError(str(error)) from None
+    return Part(kept, None if terms is None else terms[drawable_rows(gaussians)]), problems
+
+
+def _activate(arrays: Mapping[str, Tensor]) -> None:
+    arrays["scales"].exp_()
+    arrays["opacities"].sigmoid_()
+    quats = arrays["quats"].numpy()
+    for start in range(0, len(quats), _ROWS):
+        piece = quats[start : start + _ROWS]
+        # In float64, where lengths of any float32 neither overflow nor vanish.
+        lengths = np.sqrt(np.einsum("ni,ni->n", piece, piece, dtype=np.float64))
+        lengths[lengths == 0] = 1  # such a quaternion is left out later
+        piece /= lengths[:, None]
+
+
+def _mark_bad_terms(means: Tensor, terms: Tensor) -> None:
+    """A splat whose colours are not numbers at some time is none that can be drawn."""
+    for start in range(0, len(terms), _ROWS):
+        piece = slice(start, start + _ROWS)
+        bad = ~np.isfinite(terms[piece].numpy()).all((1, 2))
+        if bad.any():
+            means[piece][torch.from_numpy(bad)] = torch.nan
+
+
+# ---- model ---------------------------------------------------------------------------------------
 
 _TENSORS = ("xyz", "feature_dc", "feature_rest", "scaling", "rotation", "opacity", "semantic")
 _TRAINING = (
@@ -145,3 +700,162 @@ def _split(source: Tensor, first: Tensor, further: Tensor | None) -> None:
             further[start : start + rows] = piece[:, count:]
         if piece.is_contiguous():
             release(piece)
+
+
+# ---- The Gaussians of a trained model, read from point_cloud/iteration_N/point_cloud.ply ---------
+# One element for each part, vertex_background and vertex_obj_003. It has no sky, no colour
+# correction
+# and not what training added to poses.
+
+_PREFIX = "vertex_"
+_FIXED = (
+    *"xyz", "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4)),
+)  # fmt: skip
+_NUMBERED = re.compile(r"(f_dc|f_rest|semantic)_(0|[1-9]\d{0,6})")
+
+
+def read_point_cloud(path: Path, config: ModelConfig) -> TrainedModel:
+    """Read a .ply in pieces.
+
+    Raises:
+        AdapterError: not such a file, truncated, or columns missing or wrong in number.
+    """
+    with _as_adapter_errors():
+        header = read_ply_header(path)
+        elements = {e.name.removeprefix(_PREFIX): e for e in header.elements if _is_part(e)}
+        if "background" not in elements:
+            raise AdapterError(_not_a_model(header))
+        problems = [_lacks(path, config)]
+        others = [e.name for e in header.elements if not _is_part(e)]
+        if others:
+            problems.append(f"{path} also holds {', '.join(others[:8])}, which is not used")
+        parts: dict[str, Part] = {}
+        for name, element in elements.items():
+            part, found = _model_ply_read_part(header, element, name)
+            problems += found
+            if part is not None:
+                parts[name] = part
+    surplus = count_surplus_bytes(header)
+    if surplus:
+        problems.append(f"{path}: {surplus} bytes follow its rows and were ignored")
+    background = parts.pop("background")
+    actors = {int(name.removeprefix("obj_")): part for name, part in parts.items()}
+    return TrainedModel(path, background, actors, problems=problems)
+
+
+@contextlib.contextmanager
+def _as_adapter_errors() -> Iterator[None]:
+    try:
+        yield
+    except AdapterError:
+        raise
+    except SceneError as error:
+        raise AdapterError(str(error)) from None
+
+
+def _is_part(element: PlyElement) -> bool:
+    name = element.name.removeprefix(_PREFIX)
+    return element.name.startswith(_PREFIX) and (name == "background" or actor_id(name) is not None)
+
+
+def _not_a_model(header: PlyHeader) -> str:
+    found = [element.name for element in header.elements]
+    hint = ""
+    if "vertex" in found:
+        hint = f". A .ply with one element 'vertex' opens as gaussians:{header.path}"
+    return (
+        f"{header.path} is no Street Gaussians model: expected an element vertex_background and "
+        f"one such as vertex_obj_003 for each actor; found {', '.join(found[:12]) or 'none'}{hint}"
+    )
+
+
+def _lacks(path: Path, config: ModelConfig) -> str:
+    lost = {
+        "the actors' learnt poses": config.opt_track,
+        "the sky": config.include_sky,
+        "the colour correction": config.use_color_correction,
+        "the pose correction": config.use_pose_correction,
+    }
+    names = [name for name, was_trained in lost.items() if was_trained]
+    text = f"{path}: a .ply holds Gaussians only"
+    if not names:
+        return text
+    return f"{text}; left out: {', '.join(names)}. They are in trained_model/iteration_N.pth"
+
+
+def _model_ply_read_part(
+    header: PlyHeader, element: PlyElement, name: str
+) -> tuple[Part | None, list[str]]:
+    """A part, None for an actor without usable Gaussians, and sentences."""
+    where, is_background = f"{header.path}, {element.name}", name == "background"
+    colours, rest, semantic = _count_columns(element, where)
+    check_counts(where, rest, colours, is_background=is_background)
+    problems = [f"{where}: its semantic features are not used"] if semantic else []
+    if element.count == 0 and not is_background:
+        return None, [*problems, f"{where}: it has no Gaussians and is left out"]
+    arrays: dict[str, Tensor] = {}
+    terms: Tensor | None = None
+    done = 0
+    for rows in iterate_rows(header, element.name):
+        if not arrays:  # only now is the file known to be as long as its header says
+            arrays, terms = allocate(element.count, 1 + rest, colours)
+        _scatter(rows, arrays, terms, slice(done, done + len(rows)))
+        done += len(rows)
+    if not arrays:
+        arrays, terms = allocate(0, 1 + rest, colours)
+    try:
+        part, found = finish_part(arrays, terms, where)
+    except AdapterError as error:
+        if is_background:
+            raise
+        return None, [*problems, f"{error} It is left out"]
+    return part, [*problems, *found]
+
+
+def _count_columns(element: PlyElement, where: str) -> tuple[int, int, int]:
+    """Colour terms F, coefficients above the constant one, and semantic columns."""
+    missing = [name for name in _FIXED if name not in element.names]
+    numbers: dict[str, list[int]] = {"f_dc": [], "f_rest": [], "semantic": []}
+    for name in element.names:
+        if match := _NUMBERED.fullmatch(name):
+            numbers[match[1]].append(int(match[2]))
+    if missing or not numbers["f_dc"]:
+        raise AdapterError(
+            f"{where}: not the Gaussians of a model: {', '.join([*missing[:8], *_no_dc(numbers)])} "
+            f"missing; it has {', '.join(element.names[:12]) or 'no properties'}"
+        )
+    for name in ("f_dc", "f_rest"):
+        found = numbers[name]
+        if len(found) % 3 or sorted(found) != list(range(len(found))):
+            raise AdapterError(
+                f"{where}: {name}_0, {name}_1, … must be a multiple of 3 in number (a channel's "
+                f"values after the other's) and without gaps; got {len(found)}"
+            )
+    return len(numbers["f_dc"]) // 3, len(numbers["f_rest"]) // 3, len(numbers["semantic"])
+
+
+def _no_dc(numbers: dict[str, list[int]]) -> list[str]:
+    return [] if numbers["f_dc"] else ["f_dc_0"]
+
+
+def _scatter(
+    rows: np.ndarray, arrays: dict[str, Tensor], terms: Tensor | None, where: slice
+) -> None:
+    """Copy the columns of some rows to their places; no activation yet."""
+    values = {name: array.numpy()[where] for name, array in arrays.items()}
+    rest = values["sh"].shape[1] - 1
+    count = 1 if terms is None else 1 + terms.shape[1]
+    with np.errstate(over="ignore", invalid="ignore"):  # doubles beyond float32 become infinite
+        for axis, name in enumerate("xyz"):
+            values["means"][:, axis] = rows[name]
+            values["scales"][:, axis] = rows[f"scale_{axis}"]
+        for axis in range(4):
+            values["quats"][:, axis] = rows[f"rot_{axis}"]
+        values["opacities"][:] = rows["opacity"]
+        for channel in range(3):
+            values["sh"][:, 0, channel] = rows[f"f_dc_{channel * count}"]
+            for term in range(1, count):
+                assert terms is not None
+                terms.numpy()[where][:, term - 1, channel] = rows[f"f_dc_{channel * count + term}"]
+            for band in range(rest):
+                values["sh"][:, 1 + band, channel] = rows[f"f_rest_{channel * rest + band}"]

@@ -3,15 +3,12 @@
 Both yield the samples that `augment.dataset.samples` describes, with the same pixels.
 """
 
-from augment.dataset.boxes import Boxes2d, boxes_2d
-from augment.dataset.clips import ClipDataset
-from augment.dataset.collate import collate_frames
-from augment.dataset.files import WeatherDataset
+from augment.dataset.clips_pairs import ClipDataset, MixedDataset, PairedDataset, clean_frames
 from augment.dataset.live import SceneDataset
-from augment.dataset.pairs import MixedDataset, PairedDataset, clean_frames
-from augment.dataset.shards import ShardedSampler
-from augment.dataset.splits import split_by_scene
+from augment.dataset.samples import Boxes2d, boxes_2d, collate_frames
+from augment.dataset.splits import ShardedSampler, split_by_scene
 from augment.dataset.vision import box_masks, torchvision_sample
+from augment.dataset.weather_dataset import WeatherDataset
 
 __all__ = [
     "Boxes2d",

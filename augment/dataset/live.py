@@ -9,21 +9,11 @@ from typing import Any
 import torch
 from torch.utils.data import Dataset
 
-from augment.batch.backends import choose_backend
-from augment.batch.box_weather import label_view, uses_boxes
-from augment.batch.calibration import camera_record
-from augment.batch.encode import decode_image, encode_image, quantise_depth
-from augment.batch.layout import PATH_KINDS, variant_name
-from augment.batch.runner import Renderer, default_renderer
-from augment.batch.selection import SceneIndex, select_frames
-from augment.batch.snow_beds import find_bed, remember, snow_to_lay
-from augment.batch.style_maps import store_maps
-from augment.batch.writer import View, check_view
 from augment.cameras import Camera, Frame
-from augment.dataset.boxes import BoxFrame
 from augment.dataset.samples import (
     BUFFERS,
     DEFAULT_LOAD,
+    BoxFrame,
     ImageType,
     Labels,
     Pixels,
@@ -31,11 +21,24 @@ from augment.dataset.samples import (
     make_sample,
 )
 from augment.errors import BackendUnavailable
-from augment.quality.settle import settle
-from augment.render.backends import CUDA
+from augment.jobs.backends import choose_backend
+from augment.jobs.files import (
+    SceneIndex,
+    camera_record,
+    decode_image,
+    encode_image,
+    quantise_depth,
+    select_frames,
+)
+from augment.jobs.layout import PATH_KINDS, variant_name
+from augment.jobs.prepare import find_bed, remember, snow_to_lay, store_maps
+from augment.jobs.quality import settle
+from augment.jobs.view_files import View, check_view, label_view, uses_boxes
+from augment.jobs.worker import Renderer, default_renderer
+from augment.render.buffers import CUDA
 from augment.scene import Scene
 from recipes.files import with_digest
-from recipes.schema import Recipe
+from recipes.schema import schema_Recipe
 
 _FORKED = (
     "backend 'cuda' cannot render in a forked process, which the GPU does not answer: give the "
@@ -56,7 +59,7 @@ class SceneDataset(Dataset):
     scene: an open scene. frames, cameras: what to keep, None for all. backend: as in `rasterize`;
     "auto" never takes a GPU, which processes that a DataLoader forks could not use. "cuda" is for
     samples of this process, or of workers that are started afresh (`spawn`).
-    renderer: `augment.apply.render_view` if None. load, box_frame, transform: as for
+    renderer: `augment.views.render_view` if None. load, box_frame, transform: as for
     `WeatherDataset`; a live scene passes no sweeps on.
 
     Raises:
@@ -69,7 +72,7 @@ class SceneDataset(Dataset):
     def __init__(
         self,
         scene: Scene,
-        recipe: Recipe,
+        recipe: schema_Recipe,
         *,
         frames: Sequence[int] | None = None,
         cameras: Sequence[str] | None = None,

@@ -26,19 +26,240 @@ camera's (OpenCV) x right, y down, z forward. The first pixel's centre is at (0.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import cv2
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
+from torch.utils.data import get_worker_info
 
-from augment.batch.box_weather import BoxWeather
-from augment.batch.calibration import CameraRecord
-from augment.batch.encode import depth_in_metres
-from augment.dataset.boxes import BOX_FRAMES, BoxFrame, box_tensors, moved_points
+from augment.boxes import outline_boxes
+from augment.geometry import rotmat_from_quat
+from augment.jobs.files import CameraRecord, depth_in_metres
+from augment.jobs.view_files import TABLES, BoxWeather, visibility
 from augment.labels import Boxes, LidarSweep
+
+# ---- Boxes for training: in the frame of the world, the car or the camera, and as 2D boxes -------
+# Quaternions are wxyz. A box's own axes: x along its length, y its width, z its height.
+
+BoxFrame = Literal["world", "ego", "camera"]
+BOX_FRAMES = ("world", "ego", "camera")
+
+
+@dataclass(frozen=True, eq=False)
+class Boxes2d:
+    """Boxes in the image. xyxy: float32 [B, 4], pixels, left, top, right, bottom, inside the image
+    (0 to its width and height; the first pixel's centre is at 0.5); zeros of boxes out of view.
+    in_view: bool [B], whether any of the box lies in the image, hidden by others or not.
+    """
+
+    xyxy: torch.Tensor
+    in_view: torch.Tensor
+
+
+def box_tensors(
+    boxes: Boxes,
+    weather: BoxWeather,
+    box_frame: BoxFrame,
+    world_from_frame: np.ndarray,
+    *,
+    instances: np.ndarray | None = None,
+) -> dict[str, Any]:
+    """centers_m [B, 3], sizes_m [B, 3] (length, width, height), quats [B, 4] (wxyz,
+    frame_from_box): float64 tensors in `frame`, which is `box_frame`. labels, track_ids: lists of
+    strings. attributes: the dataset's further columns, NumPy arrays by name.
+
+    instance: int32 [B], the objects' numbers in instance images. modal_xyxy: float32 [B, 4], as
+    `Boxes2d.xyxy`, but of the pixels that show a box; NaN where none does. visible_fraction:
+    float64 [B], of the pixels that show a box or what stands before it; NaN where there are
+    neither. truncated_fraction: float64 [B], of the projected box's area, outside the image. All
+    four None where the output is older than they.
+
+    submerged_fraction, hidden_fraction: float64 [B], how much of a box's height is under water,
+    and of its pixels behind water (NaN where the image shows none); None where there is no flood.
+    snow_fraction: float64 [B], how much of its pixels is snow (as above); None without snow.
+    transmittance: float64 [B], of the smog before the box, 0 to 1; None without smog.
+    visibility: float64 [B], what all of that leaves of the box, 0 to 1
+    (`augment.jobs.view_files.visibility`).
+
+    world_from_frame: float64 [4, 4]; unused where the frame is the world, whose numbers keep their
+    bits.
+    """
+    centers_m, quats = boxes.centers_m.copy(), boxes.quats.copy()
+    if box_frame != "world":
+        centers_m = moved_points(centers_m, world_from_frame)
+        quats = _turned(quats, world_from_frame)
+    fractions = {
+        name: torch.from_numpy(getattr(weather[kind], name).copy()) if kind in weather else None
+        for kind, table in TABLES.items()
+        for name in table.sampled
+    }
+    return {
+        "frame": box_frame,
+        "centers_m": torch.from_numpy(centers_m),
+        "sizes_m": torch.from_numpy(boxes.sizes_m.copy()),
+        "quats": torch.from_numpy(quats),
+        "labels": list(boxes.labels),
+        "track_ids": list(boxes.track_ids),
+        "attributes": dict(boxes.attributes),
+        "instance": None if instances is None else torch.from_numpy(instances.astype(np.int32)),
+        **fractions,
+        "visibility": torch.from_numpy(visibility(weather, len(boxes))),
+    }
+
+
+def moved_points(points_m: np.ndarray, world_from_frame: np.ndarray) -> np.ndarray:
+    """Points of the world [N, 3] in another frame."""
+    with np.errstate(invalid="ignore"):  # of points that are not finite, and stay so
+        return (points_m - world_from_frame[:3, 3]) @ world_from_frame[:3, :3]
+
+
+def boxes_2d(sample: Mapping[str, Any]) -> Boxes2d:
+    """A sample's boxes as the image shows them: bounds of what lies inside the image, tight.
+
+    They enclose the projected box cut off at the image's borders, not the projected corners, whose
+    bounds are wider for a box that a border cuts. Weather and what hides a box change nothing. A
+    box whose numbers are not finite is out of view.
+
+    Raises:
+        ValueError: the sample has no boxes.
+    """
+    boxes, camera = sample["boxes"], sample["camera"]
+    if boxes is None:
+        raise ValueError(
+            f"scene {sample['scene']!r}, frame {sample['frame']}: the sample has no boxes; open "
+            f"the dataset with 'boxes' in load, of a variant whose recipe writes labels"
+        )
+    centers_m, quats = boxes_in_camera(boxes, camera)
+    rotations = rotmat_from_quat(torch.from_numpy(quats)).numpy()  # NaN of quaternions of zeros
+    size = (camera["width"], camera["height"])
+    outlines = outline_boxes(
+        centers_m, boxes["sizes_m"].numpy(), rotations, camera["K"].numpy(), size
+    )
+    return Boxes2d(
+        torch.from_numpy(outlines.xyxy.astype(np.float32)), torch.from_numpy(outlines.in_view)
+    )
+
+
+def boxes_in_camera(
+    boxes: Mapping[str, Any], camera: Mapping[str, Any]
+) -> tuple[np.ndarray, np.ndarray]:
+    """centers_m [B, 3] and quats [B, 4] of a sample's boxes in its camera's frame, float64,
+    whatever frame they are in.
+    """
+    centers_m, quats = boxes["centers_m"].numpy(), boxes["quats"].numpy()
+    if boxes["frame"] == "camera":
+        return centers_m, quats
+    frame_from_camera = camera["world_from_camera"].numpy()
+    if boxes["frame"] == "ego":
+        frame_from_camera = inverted(camera["world_from_ego"].numpy()) @ frame_from_camera
+    return moved_points(centers_m, frame_from_camera), _turned(quats, frame_from_camera)
+
+
+def inverted(transform: np.ndarray) -> np.ndarray:
+    """The inverse of a rigid transform [4, 4]."""
+    inverse = np.eye(4)
+    inverse[:3, :3] = transform[:3, :3].T
+    inverse[:3, 3] = -transform[:3, :3].T @ transform[:3, 3]
+    return inverse
+
+
+def _turned(quats: np.ndarray, world_from_frame: np.ndarray) -> np.ndarray:
+    """Rotations world_from_box as frame_from_box; the quaternions keep their norms."""
+    x, y, z, w = Rotation.from_matrix(world_from_frame[:3, :3].T).as_quat()
+    left = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
+    with np.errstate(invalid="ignore"):
+        return quats @ left.T
+
+
+# ---- Batches of samples for a DataLoader ---------------------------------------------------------
+
+IMAGES = ("image", "depth", "semantic", "instance", "water", "snow")
+_MATRICES = ("K", "world_from_camera", "world_from_ego")
+
+
+def collate_frames(samples: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """A batch of samples, for `DataLoader(collate_fn=collate_frames)`.
+
+    Images and buffers of one size are stacked to [N, ...]; of unlike sizes they stay a list, as do
+    masks of water and snow where a sample has none. camera: K [N, 3, 3], world_from_camera and
+    world_from_ego [N, 4, 4] and int64 [N] tensors, name a list. weather: float64 [N] per number,
+    NaN where a sample lacks it. Everything else, boxes above all, is a list with one entry a
+    sample.
+
+    Clips gain the same dimension in front: image [N, T, C, 3, H, W], K [N, T, C, 3, 3], frame
+    [N, T]. Pairs become a dictionary of two batches.
+
+    Raises:
+        ValueError: some samples have an image or buffer that others lack, masks excepted: datasets
+            of unlike outputs or `load` are mixed.
+    """
+    first = samples[0]
+    if "weathered" in first and "clean" in first:
+        return {side: collate_frames([pair[side] for pair in samples]) for side in first}
+    batch: dict[str, Any] = {key: [sample[key] for sample in samples] for key in first}
+    for key in IMAGES:
+        if key not in ("water", "snow"):  # only such weather has these masks
+            _check_all_have(key, samples)
+        batch[key] = stacked(batch[key])
+    batch["camera"] = _cameras(batch["camera"])
+    numbers = dict.fromkeys(name for sample in samples for name in sample["weather"])
+    batch["weather"] = {
+        name: torch.tensor(
+            [sample["weather"].get(name, float("nan")) for sample in samples], dtype=torch.float64
+        )
+        for name in numbers
+    }
+    batch["frame"] = _whole(batch["frame"])
+    return batch
+
+
+def _check_all_have(key: str, samples: Sequence[Mapping[str, Any]]) -> None:
+    lacking = [sample for sample in samples if sample[key] is None]
+    if 0 < len(lacking) < len(samples):
+        names = {f"{sample['scene']}/{sample['variant']}": None for sample in lacking}
+        raise ValueError(
+            f"{len(lacking)} of a batch's {len(samples)} samples have no {key}: of scene/variant "
+            f"{', '.join(names)}. Leave {key!r} out of `load` in all datasets that are mixed, or "
+            f"mix only outputs that have it"
+        )
+
+
+def stacked(values: Sequence[Any]) -> Any:
+    """Tensors of one shape as one tensor, in memory that a worker process shares with its parent;
+    None where there are only None; else the list.
+    """
+    tensors = [value for value in values if isinstance(value, torch.Tensor)]
+    if len(tensors) < len(values):
+        return None if all(value is None for value in values) else list(values)
+    first = tensors[0]
+    if len({tensor.shape for tensor in tensors}) > 1:
+        return tensors
+    if get_worker_info() is None:
+        return torch.stack(tensors)
+    # Else the queue to the parent would copy the batch once more, as torch's own collate knows.
+    size = (len(tensors), *first.shape)
+    storage = first._typed_storage()._new_shared(first.numel() * len(tensors), device=first.device)
+    return torch.stack(tensors, out=first.new(storage).resize_(size))
+
+
+def _cameras(cameras: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    values = {key: [camera[key] for camera in cameras] for key in cameras[0]}
+    return {
+        key: column if key == "name" else stacked(column) if key in _MATRICES else _whole(column)
+        for key, column in values.items()
+    }
+
+
+def _whole(values: Sequence[Any]) -> Any:
+    """Numbers as int64 [N]; tensors stacked."""
+    return stacked(values) if isinstance(values[0], torch.Tensor) else torch.tensor(values)
+
+
+# ---- samples -------------------------------------------------------------------------------------
 
 _WORLD = np.eye(4)
 ImageType = Literal["float32", "uint8"]

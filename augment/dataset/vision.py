@@ -8,10 +8,9 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from augment.box_pixels import PlacedBoxes, shown_pixels
+from augment.boxes import PlacedBoxes, shown_pixels
 from augment.cameras import Camera
-from augment.dataset.boxes import boxes_2d, boxes_in_camera
-from augment.dataset.collate import IMAGES
+from augment.dataset.samples import IMAGES, boxes_2d, boxes_in_camera
 from augment.labels import Boxes
 from augment.semantics import class_of_label
 
@@ -107,7 +106,7 @@ def box_masks(sample: Mapping[str, Any]) -> torch.Tensor:
     """bool [B, H, W]: the pixels that show each of a sample's boxes.
 
     A pixel does if the surface of the depth image there lies inside the box, its lowest centimetres
-    left out and the other sides 10 cm wider (`augment.box_pixels`); so what hides a box is not in
+    left out and the other sides 10 cm wider (`augment.boxes`); so what hides a box is not in
     its mask. Where boxes overlap a pixel is in both.
 
     Raises:

@@ -14,7 +14,7 @@ from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from augment.batch.atomic import (
+from augment.jobs.atomic import (
     TEMPORARY_SUFFIX,
     flush_folder,
     hold_temporary,

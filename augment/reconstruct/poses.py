@@ -9,16 +9,136 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 
 from augment.cameras import Camera
 from augment.labels import EGO_VEHICLE
-from augment.reconstruct.forces import Forces
-from augment.reconstruct.knots import Knots
+from augment.reconstruct.kernels import MOMENTS, sum_forces
 from augment.reconstruct.view import ViewSource
+from augment.render.cpu.backward import SplatGradients
+from augment.render.cpu.driver import Inputs
+from augment.render.threads import kernel_threads
 from augment.scene import Actor, Track
+
+# ---- Corrections over time: numbers at knots, linear between them, with an Adam of their own -----
+
+# Forces are some 1e-4 a metre: what is smaller than this is rounding, and must not be a direction.
+_BETA1, _BETA2, _EPS = 0.9, 0.999, 1e-10
+
+
+class Knots:
+    """D numbers at the knots of several things, float64, all zero to begin with.
+
+    Before the first and after the last knot the nearest one holds. A thing without knots is never
+    corrected.
+    """
+
+    def __init__(self, times_ns: Sequence[np.ndarray], width: int) -> None:
+        """times_ns: int64 [K] a thing, increasing."""
+        self._times = list(times_ns)
+        self._firsts = np.cumsum([0, *(len(times) for times in times_ns)])
+        shape = (int(self._firsts[-1]), width)
+        self.values = np.zeros(shape)
+        self._m, self._v = np.zeros(shape), np.zeros(shape)
+        self._count = np.zeros(shape[0], np.int64)
+
+    def at(self, number: int, timestamp_ns: int) -> np.ndarray | None:
+        """The thing's correction, float64 [D], at a time; None where it has no knots."""
+        place = self._place(number, timestamp_ns)
+        return None if place is None else place[1] @ self.values[place[0]]
+
+    def update(
+        self, number: int, timestamp_ns: int, gradient: np.ndarray, rates: np.ndarray, pull: float
+    ) -> None:
+        """A step of Adam for the knots around a time. gradient, rates: [D]. pull: towards 0."""
+        place = self._place(number, timestamp_ns)
+        if place is None:
+            return
+        for row, weight in zip(*place, strict=True):
+            if weight > 0:
+                self._step(row, weight * gradient + pull * self.values[row], rates)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        return {"values": self.values, "m": self._m, "v": self._v, "count": self._count}
+
+    def load(self, arrays: Mapping[str, np.ndarray]) -> None:
+        for name, array in self.arrays().items():
+            array[:] = arrays[name]
+
+    def _place(self, number: int, timestamp_ns: int) -> tuple[list[int], np.ndarray] | None:
+        """Rows of `values` around a time, and their weights."""
+        times = self._times[number]
+        if len(times) == 0:
+            return None
+        first = int(self._firsts[number])
+        after = int(np.searchsorted(times, timestamp_ns, side="right"))
+        if after == 0 or after == len(times):
+            return [first + min(after, len(times) - 1)], np.ones(1)
+        span = int(times[after]) - int(times[after - 1])
+        part = (timestamp_ns - int(times[after - 1])) / span
+        return [first + after - 1, first + after], np.array([1 - part, part])
+
+    def _step(self, row: int, gradient: np.ndarray, rates: np.ndarray) -> None:
+        self._count[row] += 1
+        n = int(self._count[row])
+        self._m[row] += (1 - _BETA1) * (gradient - self._m[row])
+        self._v[row] += (1 - _BETA2) * (gradient * gradient - self._v[row])
+        first, second = self._m[row] / (1 - _BETA1**n), self._v[row] / (1 - _BETA2**n)
+        self.values[row] -= rates * first / (np.sqrt(second) + _EPS)
+
+
+# ------------------------------------------------------------------------------------------------
+# How the loss of a view pulls at rigid things: at every part of the scene, and at the camera
+
+
+@dataclass(frozen=True, eq=False)
+class Forces:
+    """Of P parts, in each part's own axes, float64. seen: bool [P], whether the view shows it.
+
+    shift [P, 3]: dL by a shift of the part. turn [P, 3]: dL by a turn about its origin (rad), of
+    means and ellipsoids; that view-dependent colours turn along is left out.
+    """
+
+    seen: np.ndarray
+    shift: np.ndarray
+    turn: np.ndarray
+
+    def on_camera(self, camera_from_parts: np.ndarray) -> np.ndarray:
+        """dL [6] by a turn, then a shift, of everything as the camera sees it, in camera axes.
+
+        camera_from_parts: float64 [P, 4, 4].
+        """
+        rotations, offsets = camera_from_parts[:, :3, :3], camera_from_parts[:, :3, 3]
+        shift = (rotations @ self.shift[..., None])[..., 0]
+        turn = (rotations @ self.turn[..., None])[..., 0] + np.cross(offsets, shift)
+        return np.concatenate([turn.sum(0), shift.sum(0)])
+
+
+def part_forces(inputs: Inputs, grads: SplatGradients) -> Forces:
+    """The forces of one view's gradients, the same for any number of threads."""
+    moments = np.empty((len(inputs.blocks), MOMENTS))
+    with kernel_threads():
+        sum_forces(
+            inputs.addresses,
+            inputs.sizes,
+            inputs.blocks,
+            grads.rows.reshape(-1),
+            grads.ids,
+            grads.counts,
+            moments,
+        )
+    parts = len(inputs.sizes)
+    # Blocks of a part stand together; an empty part has none.
+    totals = np.zeros((parts, MOMENTS))
+    np.add.at(totals, inputs.blocks[:, 0], moments)
+    seen = np.bincount(inputs.blocks[:, 0], grads.counts, minlength=parts) > 0
+    return Forces(seen, totals[:, :3], totals[:, 3:])
+
+
+# ---- poses ---------------------------------------------------------------------------------------
 
 KNOT_EVERY = 4  # track samples between an actor's knots
 _REACH_M = 2.0  # a turn moves an actor's points about this far from its origin as a shift does

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -20,29 +20,78 @@ import numpy as np
 import torch
 
 from augment.cameras import Camera, Frame
-from augment.reconstruct.adam_kernels import update_splats
 from augment.reconstruct.config import FitConfig
-from augment.reconstruct.dense_adam import ColorAdam, DenseAdam
 from augment.reconstruct.densify import add_noise, densify, densify_due
-from augment.reconstruct.forces import part_forces
-from augment.reconstruct.inputs import splat_inputs
-from augment.reconstruct.loss import ViewLoss, view_loss
-from augment.reconstruct.loss_buffers import LossScratch
-from augment.reconstruct.poses import ActorPoses, CameraPoses
-from augment.reconstruct.rates import CORRECTIONS, decayed, splat_rates
+from augment.reconstruct.kernels import update_splats
+from augment.reconstruct.loss import LossScratch, ViewLoss, view_loss
+from augment.reconstruct.loss_reference import paint_below_horizon, starting_sky
+from augment.reconstruct.optimiser import CORRECTIONS, ColorAdam, DenseAdam, decayed, splat_rates
+from augment.reconstruct.poses import ActorPoses, CameraPoses, part_forces
 from augment.reconstruct.renderers import ViewTape, fit_renderer
-from augment.reconstruct.sky import paint_below_horizon, starting_sky
 from augment.reconstruct.splats import Splats
 from augment.reconstruct.view import RecordedView, ViewKey, ViewSource
+from augment.render import layout
 from augment.render.constants import RasterSettings
-from augment.render.cpu_backward import SplatGradients
-from augment.render.cpu_inputs import Inputs
+from augment.render.cpu.backward import SplatGradients
+from augment.render.cpu.driver import Inputs
 from augment.render.layout import BLOCK, M_FUNCTIONS
-from augment.render.part_views import part_poses
+from augment.render.part_views import part_poses, part_views, raster_modes
 from augment.render.threads import kernel_threads
 from augment.rng import rng_for
 from augment.scene import Scene
 from augment.sky import CubemapSky
+
+# ------------------------------------------------------------------------------------------------
+# The splats of a view as the CPU kernels take them: addresses into the arrays being fitted
+
+_FIELDS = ("means", "quats", "scales", "opacities", "sh")
+
+
+def splat_inputs(
+    splats: Splats,
+    parts: Sequence[int],
+    poses: np.ndarray,
+    camera: Camera,
+    settings: RasterSettings,
+) -> Inputs:
+    """Inputs of the parts that exist now. parts: their numbers. poses: world_from_part, float64
+    [P, 4, 4]. Nothing is copied: kernels read, and Adam writes, the arrays of `splats`, which must
+    outlive the inputs.
+
+    first_ids are positions in the arrays of `splats`.
+    """
+    starts = splats.starts[list(parts)]
+    counts = splats.starts[np.asarray(parts) + 1] - starts
+    functions = splats.sh.shape[1]
+    strides = [getattr(splats, name)[:1].nbytes for name in _FIELDS]
+    bases = [getattr(splats, name).ctypes.data for name in _FIELDS]
+    addresses = np.array(bases, np.uint64) + starts[:, None].astype(np.uint64) * np.array(
+        strides, np.uint64
+    )
+    # no part has slopes of light, or colour maps
+    absent = np.zeros((len(starts), layout.ADDRESSES - len(_FIELDS)), np.uint64)
+    return Inputs(
+        addresses=np.concatenate([addresses, absent], 1),
+        sizes=np.stack([counts, np.full_like(counts, functions)], 1),
+        first_ids=starts.copy(),
+        views=part_views(poses, camera, settings, None),
+        blocks=_blocks(counts),
+        modes=raster_modes(settings, None, with_color=True),
+        arrays=[getattr(splats, name) for name in _FIELDS],
+    )
+
+
+def _blocks(counts: np.ndarray) -> np.ndarray:
+    """int64 [B, 3]: part, first and last + 1 of every block."""
+    per_part = -(-counts // layout.BLOCK)
+    part = np.repeat(np.arange(len(counts)), per_part)
+    first_block = np.repeat(np.cumsum(per_part) - per_part, per_part)
+    first = (np.arange(len(part)) - first_block) * layout.BLOCK
+    last = np.minimum(first + layout.BLOCK, counts[part])
+    return np.stack([part, first, last], 1).astype(np.int64)
+
+
+# ---- trainer -------------------------------------------------------------------------------------
 
 _IDENTITY = np.eye(3, 4, dtype=np.float32)
 

@@ -3,9 +3,76 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from types import ModuleType
 
+import torch
 from jaxtyping import Float, Int32
 from torch import Tensor
+
+from augment.errors import BackendUnavailable
+
+# ---- The rasteriser's backends by name, and which of them can run here ---------------------------
+
+AUTO, REFERENCE, CPU, CUDA = "auto", "reference", "cpu", "cuda"
+BACKENDS = (AUTO, REFERENCE, CPU, CUDA)
+
+
+def available_backends() -> dict[str, str | None]:
+    """Every backend but "auto", with None where it can run and else the reason why it cannot."""
+    return {REFERENCE: None, CPU: _obstacle(import_cpu), CUDA: _obstacle(import_cuda)}
+
+
+def import_cpu() -> ModuleType:
+    """The numba backend. Raises BackendUnavailable, which says what is missing."""
+    try:
+        from augment.render.cpu import driver as cpu
+    except ImportError as error:
+        raise BackendUnavailable(
+            f"backend 'cpu' is unavailable: {error}. Install the package's dependencies (numba, "
+            f"tbb), or use backend 'reference', which needs torch only and is far slower"
+        ) from error
+    return cpu
+
+
+def import_cuda() -> ModuleType:
+    """The Triton backend. Raises BackendUnavailable, which says what is missing."""
+    from augment.render.cuda import runtime as gpu
+
+    gpu.check_can_run()
+    from augment.render.cuda import driver as cuda
+
+    return cuda
+
+
+def kernels_for(backend: str, *images: Tensor | None) -> str:
+    """Which kernels a pass over finished images takes: REFERENCE (plain torch), CPU or CUDA.
+
+    Kernels are for float32 without gradients; all else is left to torch. AUTO follows the images:
+    CUDA where they lie on a GPU.
+    """
+    given = [image for image in images if image is not None]
+    if backend == REFERENCE or not all(_for_kernels(image) for image in given):
+        return REFERENCE
+    if backend == AUTO:
+        return CUDA if any(image.device.type != "cpu" for image in given) else CPU
+    return backend
+
+
+def _for_kernels(image: Tensor) -> bool:
+    tracked = torch.is_grad_enabled() and image.requires_grad
+    return image.dtype == torch.float32 and not tracked
+
+
+def _obstacle(importing: object) -> str | None:
+    assert callable(importing)
+    try:
+        importing()
+    except BackendUnavailable as error:
+        return str(error)
+    return None
+
+
+# ---- buffers -------------------------------------------------------------------------------------
 
 RGB, ALPHA, EXPECTED_DEPTH, MEDIAN_DEPTH, SPLAT_IDS, MODE_DEPTH, SNOW = (
     "rgb",
@@ -28,7 +95,7 @@ class RenderOutput:
 
     rgb: sum of weights times colour, without background. alpha: 1 - final transmittance.
     expected_depth: sum(w z) / max(sum(w), 1e-10), metres; 0 where nothing was hit; z is that of a
-    splat's centre, or, with a clip, of its surface at the pixel (see augment.render.clip).
+    splat's centre, or, with a clip, of its surface at the pixel (see augment.render.layout).
     median_depth: z of the centre of the first splat that brings transmittance below 0.5, metres; 0
     where none does. splat_ids: index of the splat with the largest weight, counted through the
     parts in order; -1 where nothing was hit. The first of equal weights wins. mode_depth: mode of

@@ -11,16 +11,16 @@ from jaxtyping import Float
 from torch import Tensor
 
 from augment.cameras import Camera
-from augment.render import composite_kernels
-from augment.render.backends import AUTO, CPU, CUDA, REFERENCE, kernels_for
-from augment.render.threads import kernel_threads
-from augment.sky import ConstantSky, CubemapSky, Sky, bordered_faces, sample_at
-from augment.weather.smog import (
+from augment.effects.smog import (
     SmogMedium,
     blend_airlight,
     sky_optical_depth,
     vertical_optical_depth,
 )
+from augment.render import composite_kernels
+from augment.render.buffers import AUTO, CPU, CUDA, REFERENCE, kernels_for
+from augment.render.threads import kernel_threads
+from augment.sky import ConstantSky, CubemapSky, Sky, bordered_faces, sample_at
 
 ROWS = 32  # image rows a thread takes at a time
 
@@ -57,7 +57,7 @@ def composite_sky(
     kernels = kernels_for(backend, rgb, alpha)
     if isinstance(sky, ConstantSky) and smog is None:  # no direction matters
         if kernels == CUDA:
-            from augment.render import cuda_composite
+            from augment.render.cuda import images as cuda_composite
 
             return cuda_composite.composite_color(rgb, alpha, sky.rgb)
         return rgb + (1 - alpha)[..., None] * sky.rgb.to(rgb.dtype)
@@ -69,7 +69,7 @@ def composite_sky(
     if isinstance(sky, CubemapSky) and kernels == CPU:
         return _composite_cubemap(rgb, alpha, camera, bordered_faces(sky), smog)
     if isinstance(sky, CubemapSky) and kernels == CUDA:
-        from augment.render import cuda_composite
+        from augment.render.cuda import images as cuda_composite
 
         return cuda_composite.composite_cubemap(rgb, alpha, camera, bordered_faces(sky), smog)
     directions = camera.ray_directions(rgb.dtype, rgb.device)
@@ -120,7 +120,7 @@ def map_colors(
         color_map = color_map.to(rgb.device, rgb.dtype)
         return rgb @ color_map[:, :3].T + color_map[:, 3]
     if kernels == CUDA:
-        from augment.render import cuda_composite
+        from augment.render.cuda import images as cuda_composite
 
         cuda_composite.map_colors(rgb, color_map)
         return rgb

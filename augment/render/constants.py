@@ -32,7 +32,7 @@ class RasterSettings:
     blended, which at 1e-4 and below is gsplat's rule; a greater stop blends the splat that reaches
     it. (gsplat's rule with a greater stop would leave out whole surfaces: a wall of alpha 0.999
     leaves 1e-3.) What is lost are weights behind the stop, together at most the stop; `rasterize`
-    lets what has been blended stand for them (augment.render.remainder).
+    lets what has been blended stand for them (augment.render.rasterize).
 
     radius_clip_px: splats no larger than this are left out, by any camera; 0 leaves out none. A
     splat's size is the larger half-extent of the box in which its alpha can reach 1/255,

@@ -24,7 +24,7 @@ from augment.errors import BackendUnavailable
 from augment.geometry import multiply_quats, quat_from_rotmat
 from augment.render.buffers import ALPHA, EXPECTED_DEPTH, RGB, RenderOutput
 from augment.render.constants import COV2D_BLUR, TRANSMITTANCE_STOP, RasterSettings
-from augment.render.gpu import gpu_device
+from augment.render.cuda.runtime import gpu_device
 from augment.scene import PosedGaussians
 
 GEOMETRY = ("means", "quats", "scales", "opacities")

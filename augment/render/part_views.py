@@ -9,8 +9,8 @@ import numpy as np
 import torch
 
 from augment.cameras import Camera
+from augment.effects.smog import SmogMedium
 from augment.render import layout
-from augment.render.clip import LONGEST, HeightClip
 from augment.render.constants import (
     ALPHA_MIN,
     COV2D_BLUR,
@@ -18,9 +18,9 @@ from augment.render.constants import (
     TAN_FOV_MARGIN,
     RasterSettings,
 )
+from augment.render.layout import LONGEST, HeightClip
 from augment.render.sh import MAX_DEGREE
 from augment.scene import PosedGaussians
-from augment.weather.smog import SmogMedium
 
 _NO_CLIP = 1e30  # a height at which everything is on the kept side
 _NO_RADIUS_CLIP = -1.0  # no splat is as small, not even one of alpha 1/255 in its centre only

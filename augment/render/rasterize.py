@@ -8,28 +8,92 @@ import logging
 import math
 from collections.abc import Collection, Sequence
 
+import numpy as np
 import torch
+from torch import Tensor
 
 from augment.cameras import Camera
+from augment.effects.smog import SmogMedium
 from augment.errors import BackendUnavailable
-from augment.render.backends import (
+from augment.render.buffers import (
+    ALPHA,
     AUTO,
     BACKENDS,
+    BUFFERS,
     CPU,
     CUDA,
+    DIFFERENTIABLE,
     REFERENCE,
+    RGB,
+    RenderOutput,
     import_cpu,
     import_cuda,
+    kernels_for,
 )
-from augment.render.buffers import ALPHA, BUFFERS, DIFFERENTIABLE, RGB, RenderOutput
-from augment.render.clip import HeightClip
-from augment.render.constants import MOST_TRANSMITTANCE_STOP, RasterSettings
+from augment.render.constants import MOST_TRANSMITTANCE_STOP, TRANSMITTANCE_STOP, RasterSettings
 from augment.render.gsplat_backend import tracked_geometry
+from augment.render.layout import HeightClip
 from augment.render.reference import rasterize_reference
-from augment.render.remainder import needs_remainder, share_remainder
 from augment.render.sh import MAX_DEGREE
 from augment.scene import Gaussians, PosedGaussians
-from augment.weather.smog import SmogMedium
+
+# ------------------------------------------------------------------------------------------------
+# What shines through pixels that a raised transmittance stop has finished: more of the same
+# Behind the stop nothing has been blended, so at most this share of a pixel is unknown. Left
+# transparent it would show the sky through every wall; instead, what the pixel has blended stands
+# for
+# it: rgb and snow are divided by alpha, which becomes 1. At the default stop and below nothing is
+# done: 1e-4 is less than 8 bits show, and gsplat leaves it transparent, too.
+
+
+def needs_remainder(stop: float) -> bool:
+    return stop > TRANSMITTANCE_STOP
+
+
+def share_remainder(output: RenderOutput, stop: float, *, backend: str = CPU) -> RenderOutput:
+    """Pixels of alpha >= 1 - stop become opaque. output: with alpha; written to by kernels.
+
+    backend: with kernels, float32 without gradients goes through them, equal within float rounding.
+    """
+    alpha = output.alpha
+    assert alpha is not None
+    images = {name: getattr(output, name) for name in ("rgb", "snow")}
+    images = {name: image for name, image in images.items() if image is not None}
+    kernels = kernels_for(backend, alpha, *images.values())
+    if kernels == CPU:
+        _by_kernel(alpha, images, stop)
+        return output
+    if kernels == CUDA:
+        from augment.render.cuda import images as cuda_composite
+
+        cuda_composite.share_remainder(alpha, images.get("rgb"), images.get("snow"), stop)
+        return output
+    finished = alpha >= 1 - stop
+    scale = torch.where(finished, 1 / alpha.clamp_min(1 - stop), torch.ones_like(alpha))
+    scaled = {
+        name: image * (scale[..., None] if image.ndim == 3 else scale)
+        for name, image in images.items()
+    }
+    opaque = torch.where(finished, torch.ones_like(alpha), alpha)
+    return dataclasses.replace(output, alpha=opaque, **scaled)
+
+
+def _by_kernel(alpha: Tensor, images: dict[str, Tensor], stop: float) -> None:
+    from augment.render import composite_kernels as remainder_kernels
+    from augment.render.threads import kernel_threads
+
+    flat = {name: image.numpy().reshape(-1) for name, image in images.items()}
+    none = np.empty(0, np.float32)
+    with kernel_threads():
+        remainder_kernels.share_remainder(
+            alpha.numpy().reshape(-1),
+            flat.get("rgb", none),
+            flat.get("snow", none),
+            np.float32(1 - stop),
+        )
+
+
+# ---- rasterize -----------------------------------------------------------------------------------
 
 logger = logging.getLogger(__name__)
 
@@ -49,12 +113,13 @@ def rasterize(
 
     buffers: names from augment.render.buffers; the others are None in the result. splat_ids counts
     through the parts in the order given. smog: fades every splat's colour towards the airlight by
-    its own distance. clip: only what lies above, or below, a height is drawn (augment.render.clip).
+    its own distance. clip: only what lies above, or below, a height is drawn
+    (augment.render.layout).
     wanted: bool [H, W], the pixels that will be looked at; a backend may leave the others 0.
     backend: "cpu" (numba, float32; gradients of rgb, alpha and expected_depth, of pinhole cameras,
     without smog, clip, light per pixel or colour maps and where no other buffer is asked for),
     "cuda" (Triton, float32; parts may lie on either side, and are kept on the GPU as long as their
-    tensors live; the buffers lie there; gradients as augment.render.cuda_autograd says),
+    tensors live; the buffers lie there; gradients as augment.render.cuda.backward says),
     "reference" (torch, float32 or float64, gradients of all, on the CPU), or "auto": cuda where the
     Gaussians lie on a GPU, else cpu where it can do the job, else reference.
 
@@ -101,7 +166,7 @@ def _rasterize(
         return _rasterize_cuda(parts, camera, names, settings, smog, clip, wanted)
     cpu = import_cpu()
     if _tracked(parts):
-        from augment.render.autograd import rasterize_with_gradients
+        from augment.render.cpu.backward import rasterize_with_gradients
 
         return rasterize_with_gradients(parts, camera, names, settings)
     return cpu.rasterize_cpu(
@@ -126,7 +191,7 @@ def _rasterize_cuda(
 ) -> RenderOutput:
     cuda = import_cuda()
     if _tracked(parts):
-        from augment.render.cuda_autograd import rasterize_with_gradients
+        from augment.render.cuda.backward import rasterize_with_gradients
 
         return rasterize_with_gradients(parts, camera, names, settings)
     return cuda.rasterize_cuda(

@@ -11,16 +11,19 @@ below 1/255 outside min(3.33, sqrt(2 ln(255 opacity))) sigmas, so boxes and tile
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float, Int16, Int64
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from augment.cameras import Camera
+from augment.effects.smog import SmogMedium, blend_airlight, optical_depth
+from augment.geometry import rotmat_from_quat, transform_points
 from augment.render.buffers import (
     ALPHA,
     EXPECTED_DEPTH,
@@ -31,23 +34,354 @@ from augment.render.buffers import (
     SPLAT_IDS,
     RenderOutput,
 )
-from augment.render.clip import HeightClip
 from augment.render.constants import (
     ALPHA_MIN,
+    COV2D_BLUR,
     DEPTH_EPS,
+    MAX_EXTENT_SIGMAS,
+    TAN_FOV_MARGIN,
     TRANSMITTANCE_STOP,
     RasterSettings,
 )
+from augment.render.layout import FAR_PX, LONGEST, SHARP_PX2, HeightClip
 from augment.render.mode_depth import Clusters
-from augment.render.reference_project import (
-    Splats,
-    half_extents,
-    order_by_depth,
-    project_parts,
-)
-from augment.render.shading import TINY, light_share
-from augment.scene import PosedGaussians
-from augment.weather.smog import SmogMedium
+from augment.render.sh import evaluate_sh
+from augment.render.shading import LINES, TINY, light_share, shading_lines
+from augment.scene import Gaussians, PosedGaussians
+
+# ---- Projection of the reference rasteriser: Gaussians of a scene to splats of one image ---------
+# Positions are taken relative to the eye before anything else, so that float32 keeps its digits in
+# scenes that are kilometres wide. Zwicker et al. 2001, "EWA volume splatting", with the clamps and
+# thresholds of gsplat 1.5.3.
+
+
+@dataclass(frozen=True, eq=False)
+class Splats:
+    """M Gaussians seen by one camera.
+
+    ids: index counted through all parts. depths: z, metres. means2d: pixels. covs2d: xx, xy, yy,
+    px^2, blurred. dets: their determinants. opacities: after antialiasing. colors: display-encoded
+    and >= 0, in the smog where there is any; None where no colour was asked for. snow: 1 of those
+    that are snow, else 0. cuts: of splats
+    clipped at a height, value at means2d and slope in x and y, per px: clamp(value, 0, 1) is the
+    share of alpha that is kept at a pixel; then the growth of the surface's depth in x and y, its
+    share per px (seen by an orthographic camera: metres per px), and the most that it may grow or
+    shrink. None without a clip.
+    """
+
+    ids: Int64[Tensor, "M"]
+    depths: Float[Tensor, "M"]
+    means2d: Float[Tensor, "M 2"]
+    covs2d: Float[Tensor, "M 3"]
+    dets: Float[Tensor, "M"]
+    opacities: Float[Tensor, "M"]
+    colors: Float[Tensor, "M 3"] | None
+    snow: Float[Tensor, "M"]
+    cuts: Float[Tensor, "M 6"] | None = None
+    lights: Float[Tensor, "M 9"] | None = None
+
+    def __len__(self) -> int:
+        return self.ids.shape[0]
+
+    def columns(self) -> dict[str, Tensor]:
+        """The fields that are there, by name; one row a splat."""
+        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return {name: value for name, value in values.items() if value is not None}
+
+    def select(self, index: Tensor) -> Splats:
+        """The splats at the given indices or mask, in that order."""
+        return dataclasses.replace(self, **{k: v[index] for k, v in self.columns().items()})
+
+    def split(self, sizes: list[int] | int) -> list[Splats]:
+        """Consecutive runs of the splats, of the given sizes, as views."""
+        names = list(self.columns())
+        runs = zip(*(value.split(sizes) for value in self.columns().values()), strict=True)
+        return [dataclasses.replace(self, **dict(zip(names, run, strict=True))) for run in runs]
+
+
+def project_parts(
+    parts: Sequence[PosedGaussians],
+    camera: Camera,
+    settings: RasterSettings,
+    smog: SmogMedium | None = None,
+    clip: HeightClip | None = None,
+    *,
+    with_color: bool = True,
+) -> Splats:
+    """Splats of all parts that are in front of the camera and opaque enough, in index order."""
+    projected: list[Splats] = []
+    any_light = with_color and any(part.shading is not None for part in parts)
+    first_id = 0
+    for part in parts:
+        projected.append(
+            _project_part(part, first_id, camera, settings, smog, clip, with_color, any_light)
+        )
+        first_id += len(part.gaussians)
+    if len(projected) == 1:
+        return projected[0]
+    columns = [splats.columns() for splats in projected]
+    joined = {name: torch.cat([column[name] for column in columns]) for name in columns[0]}
+    return dataclasses.replace(projected[0], **joined)
+
+
+def _project_part(
+    part: PosedGaussians,
+    first_id: int,
+    camera: Camera,
+    settings: RasterSettings,
+    smog: SmogMedium | None,
+    clip: HeightClip | None,
+    with_color: bool,
+    any_light: bool,
+) -> Splats:
+    camera_from_part = camera.camera_from_world
+    if part.world_from_part is not None:
+        camera_from_part = camera_from_part @ part.world_from_part
+    rotation = camera_from_part[:3, :3].to(part.gaussians.means.dtype)
+    offsets = _offsets_from_eye(part.gaussians.means, camera_from_part)
+    # Term by term: a matrix product may round the same mean differently at another index, and ties
+    # would no longer be ties.
+    x, y, z = offsets.unbind(1)
+    depths = x * rotation[2, 0] + y * rotation[2, 1] + z * rotation[2, 2]
+    kept = (depths >= settings.near_m) & (part.gaussians.opacities >= ALPHA_MIN)
+    index = torch.nonzero(kept).squeeze(-1)
+
+    gaussians, offsets, depths = part.gaussians.select(index), offsets[index], depths[index]
+    points = torch.cat([offsets @ rotation[:2].T, depths[:, None]], 1)  # in the camera
+    axes = rotation @ rotmat_from_quat(gaussians.quats) * gaussians.scales[:, None, :]  # [M, 3, 3]
+    covs2d, det_sharp = _project_covariances(points, axes, camera)
+    # The same product written as a sum of positive terms, so that no digits cancel.
+    dets = det_sharp + COV2D_BLUR * (covs2d[:, 0] + covs2d[:, 2]) + COV2D_BLUR**2
+    opacities = gaussians.opacities
+    if settings.antialiased:
+        tiny = torch.finfo(dets.dtype).tiny  # the slope of sqrt is infinite at 0
+        opacities = opacities * torch.sqrt((det_sharp / dets).clamp_min(tiny))
+    colors = None
+    if with_color:
+        towards = rotation[2].expand_as(offsets) if camera.is_orthographic else offsets
+        rows = None if part.map_rows is None else part.map_rows[index]
+        colors = _colors(gaussians, rows, towards, part, camera, settings, smog)
+    splats = Splats(
+        ids=index + first_id,
+        depths=depths,
+        means2d=_project_points(points, camera),
+        covs2d=covs2d + torch.tensor([COV2D_BLUR, 0, COV2D_BLUR], dtype=covs2d.dtype),
+        dets=dets,
+        opacities=opacities,
+        colors=colors,
+        snow=torch.full_like(depths, float(part.is_snow)),
+    )
+    if any_light:
+        lights = splats.depths.new_zeros(len(splats), LINES)
+        if part.shading is not None:
+            lights = _lights(part, index, rotation, points, camera)
+            if smog is not None:
+                tau = _optical_depths(gaussians, offsets, part, camera, smog)
+                lights[:, 6:] *= torch.exp(-tau)[:, None]
+        splats = dataclasses.replace(splats, lights=lights)
+    if clip is not None:
+        heights = clip.sign * _heights(gaussians, offsets, part, camera, clip)
+        cuts, partly = _cut(heights, axes, points, camera, clip)
+        splats = dataclasses.replace(splats, cuts=cuts).select(partly)
+    if settings.radius_clip_px > 0:
+        splats = splats.select(half_extents(splats).amax(1) > settings.radius_clip_px)
+    return splats
+
+
+def half_extents(splats: Splats) -> Float[Tensor, "M 2"]:
+    """Half the width and height, px, of the boxes in which the splats' alpha can reach 1/255."""
+    opacities, covs2d = splats.opacities.detach(), splats.covs2d.detach()
+    sigmas = torch.sqrt(2 * torch.log(opacities / ALPHA_MIN).clamp_min(0))
+    return sigmas.clamp_max(MAX_EXTENT_SIGMAS)[:, None] * torch.sqrt(covs2d[:, ::2])
+
+
+def _heights(
+    gaussians: Gaussians, offsets: Tensor, part: PosedGaussians, camera: Camera, clip: HeightClip
+) -> Float[Tensor, "M"]:
+    """Heights of the means above the plane, by way of the eye, so that float32 keeps its digits."""
+    rise = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    if part.world_from_part is not None:
+        rise = part.world_from_part[2, :3]
+    return offsets @ rise.to(offsets.dtype) + (float(camera.centre[2]) - clip.z_m)
+
+
+def _cut(
+    heights: Float[Tensor, "M"],
+    axes: Float[Tensor, "M 3 3"],
+    points: Float[Tensor, "M 3"],
+    camera: Camera,
+    clip: HeightClip,
+) -> tuple[Float[Tensor, "M 6"], Tensor]:
+    """Cuts, and which splats have a part on the kept side. heights: positive there."""
+    up = (clip.sign * camera.camera_from_world[:3, 2]).to(axes.dtype)
+    reach = MAX_EXTENT_SIGMAS * (up @ axes).norm(dim=-1)
+    gx, gy = _depth_slope(*_image_axes(points, axes, camera), axes[:, 2])
+    by = _divisors(points, camera)
+    fall = clip.sign * (float(camera.centre[2]) - clip.z_m) / by**2
+    most = LONGEST
+    if camera.is_orthographic:
+        fall, most = -up[2], math.inf
+    slope = torch.stack([up[0] / camera.fx - fall * gx, up[1] / camera.fy - fall * gy], -1)
+    length = slope.norm(dim=-1).clamp_min(1e-20)
+    offset = (heights / by / length).clamp(-FAR_PX, FAR_PX)
+    deep = (MAX_EXTENT_SIGMAS * axes[:, 2].norm(dim=-1) / by).clamp_max(most)
+    whole = heights >= reach
+    offset = torch.where(whole, torch.full_like(offset, FAR_PX), offset) + clip.edge_px
+    slope = torch.where(whole[:, None], torch.zeros_like(slope), slope / length[:, None])
+    cuts = torch.cat([offset[:, None], slope, torch.stack([gx / by, gy / by, deep], -1)], 1)
+    return cuts, (heights >= -reach) & (heights - reach <= clip.reach_m)
+
+
+def _depth_slope(
+    right: Float[Tensor, "M 3"], down: Float[Tensor, "M 3"], away: Float[Tensor, "M 3"]
+) -> tuple[Float[Tensor, "M"], Float[Tensor, "M"]]:
+    """g = S2^-1 c (augment.render.layout), per px right and down, of semi-axes.
+
+    Determinants are written as products of cross products (Lagrange, Binet-Cauchy): of needles, and
+    of sheets seen edge-on, all digits would cancel, even in float64.
+    """
+    scale = (down.square().sum(1) + SHARP_PX2).rsqrt()[:, None]
+    minors = torch.linalg.cross(right, down) * scale
+    blur = SHARP_PX2 * scale[:, 0] ** 2
+    det = minors.square().sum(1) + blur * right.square().sum(1) + SHARP_PX2
+    gx = (minors * (torch.linalg.cross(away, down) * scale)).sum(1)
+    gy = (minors * (torch.linalg.cross(right, away) * scale)).sum(1)
+    gx = gx + blur * (right * away).sum(1)
+    gy = gy + blur * (down * away).sum(1)
+    return gx / det, gy / det
+
+
+def _offsets_from_eye(
+    means: Float[Tensor, "N 3"], camera_from_part: Float[Tensor, "4 4"]
+) -> Float[Tensor, "N 3"]:
+    """Means minus the camera's centre, in the part's axes.
+
+    The centre is the point that the transform takes to the origin, also where a rotation read from
+    a file is orthonormal to seven digits only. It is subtracted in two steps, since it rarely is a
+    float32 number.
+    """
+    eye = torch.linalg.solve(camera_from_part[:3, :3], -camera_from_part[:3, 3])
+    coarse = eye.to(means.dtype)
+    return (means - coarse) - (eye - coarse).to(means.dtype)
+
+
+def _project_points(points: Float[Tensor, "M 3"], camera: Camera) -> Float[Tensor, "M 2"]:
+    x, y, by = points[:, 0], points[:, 1], _divisors(points, camera)
+    return torch.stack([camera.fx * x / by + camera.cx, camera.fy * y / by + camera.cy], -1)
+
+
+def _divisors(points: Float[Tensor, "M 3"], camera: Camera) -> Float[Tensor, "M"]:
+    """What x and y are divided by in the projection: z, or 1 where rays are parallel."""
+    z = points[:, 2]
+    return torch.ones_like(z) if camera.is_orthographic else z
+
+
+def _project_covariances(
+    points: Float[Tensor, "M 3"], axes: Float[Tensor, "M 3 3"], camera: Camera
+) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M"]]:
+    """Covariances (xx, xy, yy) in px^2, not blurred, and their determinants.
+
+    axes: columns are the semi-axes in the camera, metres. The projection is linearised at the
+    splat's centre, or at the nearest point within a margin around the image where it lies outside.
+    """
+    right, down = _image_axes(points, axes, camera)
+    covs2d = torch.stack([(right * right).sum(1), (right * down).sum(1), (down * down).sum(1)], -1)
+    # Lagrange's identity: xx yy - xy^2 without its cancellation, which needles would suffer from.
+    return covs2d, torch.linalg.cross(right, down).square().sum(1)
+
+
+def _image_axes(
+    points: Float[Tensor, "M 3"], axes: Float[Tensor, "M 3 3"], camera: Camera
+) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M 3"]]:
+    """The semi-axes in the image, px right and px down."""
+    if camera.is_orthographic:
+        return camera.fx * axes[:, 0], camera.fy * axes[:, 1]
+    z = points[:, 2]
+    u = _clamp_to_image(points[:, 0] / z, camera.cx, camera.fx, camera.width)
+    v = _clamp_to_image(points[:, 1] / z, camera.cy, camera.fy, camera.height)
+    right = (camera.fx / z)[:, None] * (axes[:, 0] - u[:, None] * axes[:, 2])
+    down = (camera.fy / z)[:, None] * (axes[:, 1] - v[:, None] * axes[:, 2])
+    return right, down
+
+
+def _clamp_to_image(tangents: Tensor, centre: float, focal: float, size: int) -> Tensor:
+    margin = TAN_FOV_MARGIN * 0.5 * size / focal
+    return tangents.clamp(-(centre / focal + margin), (size - centre) / focal + margin)
+
+
+def _colors(
+    gaussians: Gaussians,
+    rows: Int16[Tensor, "M"] | None,
+    offsets: Float[Tensor, "M 3"],
+    part: PosedGaussians,
+    camera: Camera,
+    settings: RasterSettings,
+    smog: SmogMedium | None,
+) -> Float[Tensor, "M 3"]:
+    """max(SH + 0.5, 0), mapped, and seen through the smog. rows: of the colour maps. offsets: from
+    the eye, in the part's axes; without smog their lengths do not matter.
+    """
+    directions = torch.nn.functional.normalize(offsets, dim=-1)
+    colors = (evaluate_sh(gaussians.sh, directions, settings.sh_degree) + 0.5).clamp_min(0)
+    if part.color_maps is not None:
+        colors = _mapped(colors, part.color_maps.to(colors.dtype), rows)
+    if smog is None:
+        return colors
+    return blend_airlight(colors, _optical_depths(gaussians, offsets, part, camera, smog), smog)
+
+
+def _mapped(
+    colors: Float[Tensor, "M 3"],
+    maps: Float[Tensor, "C 3 4"],
+    rows: Int16[Tensor, "M"] | None,
+) -> Float[Tensor, "M 3"]:
+    """Every colour under its map, the first where there is no such row; not below 0."""
+    if rows is None:
+        return (colors @ maps[0, :, :3].T + maps[0, :, 3]).clamp_min(0)
+    index = torch.where((rows >= 0) & (rows < len(maps)), rows, 0).long()
+    own = maps[index]
+    return (torch.einsum("mij,mj->mi", own[..., :3], colors) + own[..., 3]).clamp_min(0)
+
+
+def _optical_depths(
+    gaussians: Gaussians,
+    offsets: Float[Tensor, "M 3"],
+    part: PosedGaussians,
+    camera: Camera,
+    smog: SmogMedium,
+) -> Float[Tensor, "M"]:
+    """Of the smog before every splat."""
+    heights = None
+    if smog.scale_height_m is not None:
+        heights = gaussians.means[:, 2]
+        if part.world_from_part is not None:
+            heights = transform_points(part.world_from_part, gaussians.means)[:, 2]
+    return optical_depth(smog, offsets.norm(dim=-1), float(camera.centre[2]), heights)
+
+
+def _lights(
+    part: PosedGaussians,
+    index: Int64[Tensor, "M"],
+    rotation: Float[Tensor, "3 3"],
+    points: Float[Tensor, "M 3"],
+    camera: Camera,
+) -> Float[Tensor, "M 9"]:
+    """The lines of a shaded part's splats (augment.render.shading). points: in the camera."""
+    assert part.shading is not None
+    normals = rotmat_from_quat(part.gaussians.quats[index])[:, :, 2] @ rotation.T
+    sun = rotation @ torch.tensor(part.shading.sun, dtype=rotation.dtype)
+    towards = torch.tensor([0.0, 0, 1]).to(points).expand_as(points)
+    towards = towards if camera.is_orthographic else points
+    slopes = part.shading.slopes[index].to(rotation.dtype)
+    return shading_lines(normals, towards, slopes, sun, part.shading.wrap, camera)
+
+
+def order_by_depth(splats: Splats) -> Splats:
+    """Nearest first by float32 z, whatever the dtype; equal depths stay in index order."""
+    return splats.select(torch.argsort(splats.depths.detach().float(), stable=True))
+
+
+# ---- reference -----------------------------------------------------------------------------------
 
 TILE = 16  # pixels a side
 # Splats of a tile that are blended at once. 256 pixels x 96 splats stay in a core's cache, and

@@ -14,7 +14,7 @@ from splat_scenes import street
 from adapters.base import open_scene, recognise
 from adapters.uri import add_to_uri, format_uri, parse_uri
 from augment.errors import AdapterError
-from augment.splat_io import write_ply, write_splat
+from augment.files.ply import write_ply, write_splat
 
 
 @pytest.mark.parametrize(

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from adapters.lidar.actor_motion import Motion, indices_between
-from adapters.lidar.box_tracks import BoxSample, join_tracks
-from adapters.lidar.split import FLOOR_M, HALO_M, Sweep, split_sweeps
+from adapters.lidar_scene.actor_motion import Motion, indices_between
+from adapters.lidar_scene.split import FLOOR_M, HALO_M, BoxSample, Sweep, join_tracks, split_sweeps
 from augment.geometry import rigid, rotmat_from_quat
 from augment.scene import Track
 from augment.semantics import SemanticClass

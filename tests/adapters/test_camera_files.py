@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from adapters.cameras.files import find_camera_file, read_views
+from adapters.camera_files.camera_files import find_camera_file, read_views
 from augment.errors import AdapterError
 
 # A camera at (1, 2, 3) that looks along world +x with world +z up, OpenCV axes as columns.

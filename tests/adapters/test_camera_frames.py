@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from adapters.cameras.frames import ego_from_front_camera, frames_from_views, split_names
-from adapters.cameras.posed_views import PosedView, look_at_pose
+from adapters.camera_files.camera_files import PosedView, look_at_pose
+from adapters.camera_files.paths import ego_from_front_camera, frames_from_views, split_names
 from adapters.world import WorldChange
 from augment.errors import AdapterError
 

@@ -13,12 +13,12 @@ import torch
 from splat_scenes import street
 
 from adapters.base import open_scene
-from adapters.cameras.files import read_views
-from adapters.cameras.paths import frames_from_path_file, with_camera_path
+from adapters.camera_files.camera_files import read_views
+from adapters.camera_files.paths import frames_from_path_file, with_camera_path
 from augment.errors import AdapterError
+from augment.files.ply import write_ply
 from augment.scene import Scene
 from augment.sky import ConstantSky
-from augment.splat_io import write_ply
 
 LENS = {"width": 96, "height": 54, "fx": 60.0}
 LEVEL = {"position": [1.0, 2.0, 3.0], "look_at": [5.0, 2.0, 3.0]}

@@ -11,12 +11,19 @@ import pytest
 import torch
 from splat_scenes import gaussians_at, street
 
-from adapters.cameras.default_paths import CAMERA_HEIGHT_M, NO_CAMERAS, make_default_path
-from adapters.cameras.frames import frames_from_views
-from adapters.cameras.ground_estimate import ground_grid, ground_under, lowest_ground, solid_points
+from adapters.camera_files.paths import (
+    CAMERA_HEIGHT_M,
+    NO_CAMERAS,
+    frames_from_views,
+    ground_grid,
+    ground_under,
+    lowest_ground,
+    make_default_path,
+    solid_points,
+)
 from adapters.world import WorldChange
+from augment.files.ply import read_splats
 from augment.scene import Gaussians
-from augment.splat_io import read_splats
 
 
 def along_and_across(positions: np.ndarray, heading_deg: float) -> tuple[np.ndarray, np.ndarray]:

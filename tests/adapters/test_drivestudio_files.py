@@ -13,9 +13,9 @@ import pytest
 import torch
 
 from adapters.base import open_scene
+from adapters.detect_format import recognised
 from adapters.drivestudio import drivestudio_labels, open_drivestudio
-from adapters.drivestudio.conventions import convention_of
-from adapters.signatures import recognised
+from adapters.drivestudio.run import convention_of
 from augment.errors import AdapterError
 from augment.sky import ConstantSky
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from adapters.lidar.depth import lidar_depth
-from adapters.recorded.ego_body import ego_body
+from adapters.lidar_scene.depth import lidar_depth
+from adapters.training_views.starting_scene import ego_body
 from augment.cameras import Camera, Frame
 from augment.geometry import transform_points
 from augment.labels import EGO_VEHICLE, Boxes, LidarSweep

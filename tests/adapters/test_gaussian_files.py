@@ -12,17 +12,16 @@ import torch
 from splat_scenes import gaussians_at, street
 
 from adapters.base import open_scene
-from adapters.cameras.posed_views import look_at_pose
+from adapters.camera_files.camera_files import look_at_pose
 from adapters.gaussian_files import find_splat_file, open_gaussians
-from augment.apply import render_view
-from augment.batch.selection import check_frames
+from augment.effects.snow.light import illumination_of
 from augment.errors import AdapterError, SceneError
+from augment.files.ply import write_ply, write_splat
+from augment.jobs.files import check_frames
 from augment.scene import Gaussians
-from augment.snow.light import illumination_of
-from augment.splat_io import write_ply, write_splat
-from recipes.flood import Flood
-from recipes.schema import Recipe, Weather
-from recipes.snow import Snow
+from augment.views import render_view
+from recipes.schema import Weather, schema_Recipe
+from recipes.weather import Flood, Snow
 
 TO_Y_DOWN = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # z-up world to COLMAP's usual y-down
 
@@ -316,7 +315,9 @@ def test_a_grey_file_stays_grey_under_the_overcast_sky(tmp_path: Path) -> None:
     assert max(np.ptp(light.lit_rgb), np.ptp(light.shadow_rgb)) < 1 / 255
     flood = Flood(level_m=0.3, color=(0.3, 0.3, 0.3), absorption_per_m=(1.0, 1.0, 1.0))
     clear, snowy, flooded = (
-        render_view(scene, scene.frames[0].cameras["front"].scaled(0.15), Recipe(weather=weather))
+        render_view(
+            scene, scene.frames[0].cameras["front"].scaled(0.15), schema_Recipe(weather=weather)
+        )
         for weather in (Weather(), Weather(snow=Snow(depth_m=0.1)), Weather(flood=flood))
     )
     clear, snowy, flooded = (view.rgb.astype(int) for view in (clear, snowy, flooded))

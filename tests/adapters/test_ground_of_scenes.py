@@ -19,12 +19,11 @@ from adapters.gaussian_files import open_gaussians
 from adapters.recording.labels import RecordingLabels
 from adapters.street.layout import CAMBER, EGO_Y_M, road_z
 from augment.errors import BackendUnavailable
-from augment.ground import Ground, ground_of
-from augment.ground_plane import load_open3d
+from augment.files.ply import write_ply
+from augment.ground import Ground, ground_of, load_open3d
 from augment.labels import ClassifiesLidar, LidarSweep
 from augment.scene import Scene
 from augment.semantics import SemanticClass
-from augment.splat_io import write_ply
 from tools.scene_report import describe_scene, scene_text
 
 SMALL = "voxel_m=0.15&image_scale=0.25&sky_size=16"

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import torch
 
-from adapters.lidar.box_tracks import BoxSample, join_tracks
-from adapters.lidar.image_views import Body, View, observe_views, read_image
-from adapters.lidar.sky import SkyGatherer
-from adapters.lidar.surfels import Surfels
+from adapters.lidar_scene.image_views import Body, View, observe_views, read_image
+from adapters.lidar_scene.kernels import SkyGatherer
+from adapters.lidar_scene.split import BoxSample, join_tracks
+from adapters.lidar_scene.surfels import Surfels
 from augment.cameras import Camera
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 32.0

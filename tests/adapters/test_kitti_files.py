@@ -11,11 +11,10 @@ import numpy as np
 import pytest
 import torch
 
-from adapters.kitti import kitti_labels, kitti_root, open_kitti, tracklets
-from adapters.kitti.poses import oxts_poses
-from adapters.kitti.registration import registered_poses
-from adapters.kitti.source import find_source
-from adapters.kitti.tracklets import boxes_at
+from adapters.kitti import boxes as tracklets
+from adapters.kitti import kitti_labels, kitti_root, open_kitti
+from adapters.kitti.boxes import boxes_at
+from adapters.kitti.source import find_source, oxts_poses, registered_poses
 from augment.errors import AdapterError
 from augment.geometry import rotmat_from_quat
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from adapters.lidar.depth import lidar_depth
+from adapters.lidar_scene.depth import lidar_depth
 from augment.cameras import Camera
 from augment.errors import AdapterError
 from augment.labels import Boxes, LidarSweep

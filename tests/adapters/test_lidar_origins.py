@@ -13,15 +13,14 @@ import pyarrow.parquet as pq
 import pytest
 from drivestudio_files import write_run
 
-from adapters.drivestudio.labels import drivestudio_labels
-from adapters.kitti.labels import LocatedSweeps, RawLabels
+from adapters.drivestudio.drive import drivestudio_labels
+from adapters.kitti.source import LocatedSweeps, RawLabels
 from adapters.nuscenes.labels import nuscenes_labels
 from adapters.pandaset.files import read_lidar
 from adapters.pandaset.labels import SENSORS_M, PandaSetLabels, places_at
 from adapters.recording.labels import RecordingLabels
-from adapters.street.labels import StreetLabels
-from adapters.street.lidar import LOWEST_DEG, lidar_rays
-from adapters.street.parameters import StreetParameters
+from adapters.street.labels import LOWEST_DEG, StreetLabels, lidar_rays
+from adapters.street.layout import StreetParameters
 from adapters.street_gaussians.labels import ROOF_SENSOR_M, StreetGaussiansLabels
 from augment.labels import KnowsLidarOrigins, LidarSweep
 

@@ -6,13 +6,26 @@ import numpy as np
 import pytest
 import torch
 
-from adapters.lidar.bridges import bridge_gaps
-from adapters.lidar.ground_fill import CLOSE_M, fill_ground, ground_points
-from adapters.lidar.initialise import SplatShape, borrow_colours, gaussians_from_surfels
-from adapters.lidar.split import PointSet
-from adapters.lidar.surfels import surfels_from_points
-from adapters.lidar.voxels import GROWTH, NEAR_M, coarse_sample, edges_at, thin_points
-from adapters.lidar.wall_fill import WIDEST_M, fill_walls
+from adapters.lidar_scene.fill import (
+    CLOSE_M,
+    WIDEST_M,
+    bridge_gaps,
+    fill_ground,
+    fill_walls,
+    ground_points,
+)
+from adapters.lidar_scene.split import PointSet
+from adapters.lidar_scene.surfels import (
+    GROWTH,
+    NEAR_M,
+    SplatShape,
+    borrow_colours,
+    coarse_sample,
+    edges_at,
+    gaussians_from_surfels,
+    surfels_from_points,
+    thin_points,
+)
 from augment.geometry import rotmat_from_quat
 from augment.semantics import SemanticClass as Class
 

@@ -17,7 +17,7 @@ from shown import assert_same_bits, psnr, psnr_of, render
 
 from adapters.base import open_scene, recognise
 from adapters.nuscenes import open_nuscenes
-from adapters.nuscenes.sweeps import EGO_HIGH_M, EGO_LOW_M
+from adapters.nuscenes.labels import EGO_HIGH_M, EGO_LOW_M
 from adapters.uri import format_uri
 from augment.errors import AdapterError
 from augment.labels import ClassifiesLidar

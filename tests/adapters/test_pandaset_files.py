@@ -10,10 +10,10 @@ import pandaset_folder as street
 import pytest
 import torch
 
-from adapters.lidar.options import DriveOptions, HeldOut
+from adapters.lidar_scene.scene import DriveOptions, HeldOut
+from adapters.pandaset.adapter import read_drive
 from adapters.pandaset.files import read_lidar, read_semantics, read_sequence
 from adapters.pandaset.labels import NO_SURFACE, PandaSetLabels, semantic_table
-from adapters.pandaset.sweeps import read_drive
 from augment.errors import AdapterError
 from augment.geometry import rotmat_from_quat
 from augment.semantics import SemanticClass

@@ -7,10 +7,9 @@ import pandas as pd
 import pandaset_folder as street
 import pytest
 
+from adapters.pandaset.adapter import read_drive
 from adapters.pandaset.files import read_cuboids, read_sequence
-from adapters.pandaset.labels import PandaSetLabels, boxes_of_cuboids
-from adapters.pandaset.siblings import find_objects, read_objects
-from adapters.pandaset.sweeps import read_drive
+from adapters.pandaset.labels import PandaSetLabels, boxes_of_cuboids, find_objects, read_objects
 from augment.errors import AdapterError
 
 LINKS = ["cuboids.sibling_id"]

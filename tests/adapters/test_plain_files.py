@@ -11,22 +11,22 @@ import numpy as np
 import pytest
 
 from adapters.base import open_scene
-from adapters.cameras.files import read_views
-from adapters.drivestudio.config import read_config as drivestudio_config
+from adapters.camera_files.camera_files import read_views
+from adapters.drivestudio.run import read_config as drivestudio_config
 from adapters.image_checks import look_at_image
-from adapters.lidar.image_views import read_image
-from adapters.nuscenes.rows import read_rows
+from adapters.lidar_scene.image_views import read_image
+from adapters.nuscenes.tables import read_rows
 from adapters.plain_files import decode_image, inside, read_json, read_numbers, read_pose
-from adapters.recorded.depth_maps import read_metric
-from adapters.recording.tables import read_sweep
+from adapters.recording.labels import read_sweep
 from adapters.safe_pickle import read_array, read_frame
-from adapters.street_gaussians.config import read_config as street_gaussians_config
+from adapters.street_gaussians.model import read_config as street_gaussians_config
+from adapters.training_views.depth_priors import read_metric
+from augment.effects.style.images import read_style_image
+from augment.effects.style.network import load_network
+from augment.effects.style.style import parse_statistics
 from augment.errors import AdapterError, SceneError, StyleError
 from augment.files.checkpoints import load_checkpoint
-from augment.files.scene_files import load_scene_parts
-from augment.style.checkpoint import load_network
-from augment.style.images import read_style_image
-from augment.style.presets import parse_statistics
+from augment.files.scene_file import load_scene_parts
 from recipes.errors import RecipeError
 from recipes.job import load_job
 from recipes.load import load_recipe

@@ -11,9 +11,15 @@ import torch
 
 from adapters.base import open_scene
 from adapters.procedural import open_procedural
-from adapters.street.layout import ROAD_HALF_M, draw_layout, pavement_z, road_z
-from adapters.street.parameters import StreetParameters, parse_parameters
-from adapters.street.truth import StreetTruth, TrueView, open_truth
+from adapters.street.labels import StreetTruth, TrueView, open_truth
+from adapters.street.layout import (
+    ROAD_HALF_M,
+    StreetParameters,
+    draw_layout,
+    parse_parameters,
+    pavement_z,
+    road_z,
+)
 from adapters.street.world import build_street
 from augment.errors import AdapterError, SceneError
 from augment.render.rasterize import rasterize

@@ -5,15 +5,29 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from adapters.street.forms import ball, boxes, disc, parallelograms, quads, triangle, tube
-from adapters.street.layout import START_NS
-from adapters.street.noise import fractal_noise, hashed, value_noise
-from adapters.street.parameters import StreetParameters
+from adapters.street.forms import (
+    ALL_EDGES,
+    U0,
+    U1,
+    V0,
+    V1,
+    Kind,
+    Look,
+    Shapes,
+    ball,
+    boxes,
+    cut,
+    disc,
+    join,
+    parallelograms,
+    quads,
+    triangle,
+    tube,
+)
+from adapters.street.layout import MOUNTS, START_NS, StreetParameters, camera_offset_ns, motion_of
+from adapters.street.materials import fractal_noise, hashed, value_noise
 from adapters.street.raycast import build_tree
-from adapters.street.rectangles import cut
-from adapters.street.rig import MOUNTS, camera_offset_ns, motion_of
-from adapters.street.shapes import ALL_EDGES, U0, U1, V0, V1, Kind, Look, Shapes, join
-from adapters.street.surfels import cell_counts, make_cells, total_cells
+from adapters.street.splats import cell_counts, make_cells, total_cells
 from adapters.street.world import build_street
 from augment.semantics import SemanticClass
 

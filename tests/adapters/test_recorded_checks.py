@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 import torch
 
-from adapters.recorded.camera_timing import with_camera_times
-from adapters.recorded.checks import check_views
-from adapters.recorded.views import recorded_views
+from adapters.training_views.checks import check_views, with_camera_times
+from adapters.training_views.views import recorded_views
 from augment.errors import AdapterError
 
 SPEED_MPS = 5.0

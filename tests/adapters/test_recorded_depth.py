@@ -10,15 +10,20 @@ import drives
 import numpy as np
 import pytest
 
-from adapters.lidar.depth import SparseDepth, depth_seen, read_returns
-from adapters.recorded.depth_maps import find_maps, find_sparse, read_relative
-from adapters.recorded.depth_priors import DepthPriors
-from adapters.recorded.lidar_priors import visible
-from adapters.recorded.map_priors import beside
-from adapters.recorded.prior_pixels import PriorPixels, join_priors
-from adapters.recorded.relative_depth import align
-from adapters.recorded.views import recorded_views
+from adapters.lidar_scene.depth import SparseDepth, depth_seen, read_returns
 from adapters.safe_pickle import read_array_dict
+from adapters.training_views.depth_priors import (
+    DepthPriors,
+    PriorPixels,
+    align,
+    beside,
+    find_maps,
+    find_sparse,
+    join_priors,
+    read_relative,
+    visible,
+)
+from adapters.training_views.views import recorded_views
 from augment.errors import AdapterError
 from augment.reconstruct.view import ViewKey
 

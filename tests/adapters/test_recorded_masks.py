@@ -7,9 +7,15 @@ import drives
 import numpy as np
 import pytest
 
-from adapters.recorded.ego_masks import find_ego_mask, moving_frames, read_ego_mask
-from adapters.recorded.sky_masks import lidar_top_rad, looks_like_sky, sky_mask
-from adapters.recorded.views import recorded_views
+from adapters.training_views.masks import (
+    find_ego_mask,
+    lidar_top_rad,
+    looks_like_sky,
+    moving_frames,
+    read_ego_mask,
+    sky_mask,
+)
+from adapters.training_views.views import recorded_views
 from augment.errors import AdapterError
 from augment.reconstruct.view import ViewKey
 

@@ -12,8 +12,8 @@ import torch
 from adapters.pandaset.adapter import _frame
 from adapters.pandaset.files import read_sequence
 from adapters.pandaset.labels import PandaSetLabels
-from adapters.recorded.checks import check_views
-from adapters.recorded.views import recorded_views
+from adapters.training_views.checks import check_views
+from adapters.training_views.views import recorded_views
 from augment.scene import Scene
 from augment.sky import ConstantSky
 

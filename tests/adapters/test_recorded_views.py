@@ -11,11 +11,15 @@ import drives
 import numpy as np
 import pytest
 
-from adapters.recorded.byte_cache import ByteCache
-from adapters.recorded.depth_priors import DepthPriors
-from adapters.recorded.holdout import holdout_step, is_held_out
-from adapters.recorded.images import ImageFault, read_scaled
-from adapters.recorded.views import recorded_views
+from adapters.training_views.byte_cache import ByteCache
+from adapters.training_views.depth_priors import DepthPriors
+from adapters.training_views.views import (
+    ImageFault,
+    holdout_step,
+    is_held_out,
+    read_scaled,
+    recorded_views,
+)
 from augment.errors import AdapterError
 from augment.reconstruct.view import ViewKey
 

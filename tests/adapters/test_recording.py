@@ -20,12 +20,12 @@ from recording_folder import QUERY, write_recording
 from shown import assert_same_bits, psnr_of, render
 
 from adapters.base import open_scene, recognise
-from adapters.lidar.depth import lidar_depth
+from adapters.lidar_scene.depth import lidar_depth
 from adapters.recording import open_recording
-from adapters.recording.calibration import read_calibration
+from adapters.recording.files import read_calibration
 from adapters.uri import format_uri
-from augment.batch.job import RenderJob, run_job
 from augment.errors import AdapterError
+from augment.jobs.render_job import RenderJob, run_job
 from augment.semantics import SemanticClass
 from recipes.load import load_recipe
 from tests.streets import LABELLED_STREET, open_street

@@ -14,15 +14,17 @@ import pytest
 import recording_folder as recording
 from recording_folder import edit_calibration, write_recording
 
-from adapters.recording.calibration import read_calibration
-from adapters.recording.files import find_images, numbered_files, unlisted_images
-from adapters.recording.labels import RecordingLabels, all_boxes
-from adapters.recording.sweeps import read_lidar_drive
-from adapters.recording.tables import read_sweep
-from adapters.recording.tracks import read_objects
-from augment.batch.label_files import lidar_bytes
-from augment.batch.layout import folder_name
+from adapters.recording.files import find_images, numbered_files, read_calibration, unlisted_images
+from adapters.recording.labels import (
+    RecordingLabels,
+    all_boxes,
+    read_lidar_drive,
+    read_objects,
+    read_sweep,
+)
 from augment.errors import AdapterError
+from augment.jobs.layout import folder_name
+from augment.jobs.tables import lidar_bytes
 from augment.semantics import SemanticClass
 
 

@@ -15,9 +15,9 @@ from pandaset_folder import write_sequence
 from adapters.base import open_scene, recognise
 from adapters.pandaset.labels import PandaSetLabels
 from adapters.scene_folder import storable
-from augment.batch.shared_scene import share_scene
 from augment.errors import AdapterError, SceneError
-from augment.files.scene_files import save_scene, save_scene_file
+from augment.files.scene_file import save_scene, save_scene_file
+from augment.jobs.processes import share_scene
 from augment.scene import Scene
 from tools.scene_report import describe_scene, scene_text
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from adapters.base import recognise
-from adapters.signatures import FILES, FOLDERS, looked_for, recognised
+from adapters.detect_format import FILES, FOLDERS, looked_for, recognised
 from adapters.uri import SCHEMES
 from augment.errors import AdapterError
 

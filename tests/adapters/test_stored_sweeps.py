@@ -17,18 +17,18 @@ import pytest
 from drivestudio_files import write_run
 from recording_folder import write_recording
 
-from adapters.drivestudio.labels import drivestudio_labels
-from adapters.kitti.labels import LocatedSweeps, ObjectLabels, RawLabels
+from adapters.drivestudio.drive import drivestudio_labels
+from adapters.kitti.source import LocatedSweeps, ObjectLabels, RawLabels
 from adapters.nuscenes.labels import nuscenes_labels
 from adapters.pandaset.labels import PandaSetLabels
 from adapters.recording.labels import RecordingLabels
 from adapters.street.labels import StreetLabels
 from adapters.street_gaussians.labels import StreetGaussiansLabels
-from augment.batch.label_files import lidar_bytes
+from augment.effects.lidar import ATTENUATED, LOST, MOVED, SCATTERED, UNCHANGED, drop_lost
+from augment.effects.lidar.beam import intensity_column
 from augment.errors import AdapterError
+from augment.jobs.tables import lidar_bytes
 from augment.labels import LidarSweep, StoresLidar
-from augment.lidar_weather import ATTENUATED, LOST, MOVED, SCATTERED, UNCHANGED, drop_lost
-from augment.lidar_weather.sensors import intensity_column
 
 CODES = np.array([UNCHANGED, UNCHANGED, ATTENUATED, LOST, MOVED, SCATTERED], np.uint8)
 PANOPTIC = "panoptic/v1.0-mini/0_panoptic.npz"

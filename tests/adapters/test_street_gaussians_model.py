@@ -22,10 +22,14 @@ from street_gaussians_models import (
     write_model,
 )
 
-from adapters.street_gaussians.config import newest_config, read_config
-from adapters.street_gaussians.model import TrainedModel, read_checkpoint
-from adapters.street_gaussians.model_ply import read_point_cloud
-from adapters.street_gaussians.parts import Part
+from adapters.street_gaussians.model import (
+    Part,
+    TrainedModel,
+    newest_config,
+    read_checkpoint,
+    read_config,
+    read_point_cloud,
+)
 from adapters.street_gaussians.records import ModelConfig
 from augment.errors import AdapterError
 

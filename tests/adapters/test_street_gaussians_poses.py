@@ -12,21 +12,21 @@ import torch
 from scipy.spatial.transform import Rotation
 from street_gaussians_models import random_part
 
-from adapters.street_gaussians.actors import ActorSettings, make_actor
-from adapters.street_gaussians.corrections import CameraChanges, camera_changes, color_maps
-from adapters.street_gaussians.parts import Part
-from adapters.street_gaussians.poses import (
-    PoseChanges,
-    check_changes,
-    image_poses,
-    vehicle_poses,
-)
+from adapters.street_gaussians.adapter import ActorSettings, make_actor
+from adapters.street_gaussians.model import Part
 from adapters.street_gaussians.records import (
+    CameraChanges,
     ModelConfig,
+    PoseChanges,
     StreetData,
     StreetImage,
     TrackedObject,
     Tracklets,
+    camera_changes,
+    check_changes,
+    color_maps,
+    image_poses,
+    vehicle_poses,
 )
 from augment.errors import AdapterError
 from augment.scene import Gaussians

@@ -17,16 +17,16 @@ from street_gaussians_files import Facts, write_dataset
 from street_gaussians_models import RawModel, RawPart, config_tree, random_part, write_model
 
 from adapters.base import open_scene
-from adapters.signatures import recognised
+from adapters.detect_format import recognised
 from adapters.street_gaussians import open_street_gaussians, street_gaussians_labels
-from augment.apply import render_buffers
 from augment.cameras import Camera
 from augment.errors import AdapterError
 from augment.plan import make_plan
 from augment.render.rasterize import rasterize
 from augment.scene import Gaussians, PosedGaussians, Scene
 from augment.sky import ConstantSky
-from recipes.schema import Recipe
+from augment.views import render_buffers
+from recipes.schema import schema_Recipe
 from tests.assertions import assert_images_close
 
 C0, C1 = 0.28209479177387814, 0.4886025119029199
@@ -103,7 +103,7 @@ def opened(path: Path, **query: str) -> Scene:
 
 
 def render(scene: Scene, camera: Camera) -> torch.Tensor:
-    return render_buffers(scene, camera, make_plan(Recipe(), scene), backend="reference").rgb
+    return render_buffers(scene, camera, make_plan(schema_Recipe(), scene), backend="reference").rgb
 
 
 # --- the picture, from the raw numbers alone ---

@@ -11,9 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from street_gaussians_files import HEADER, OBJECTS, StreetObject, pose_about_z, write_dataset
 
-from adapters.street_gaussians.data import read_data
+from adapters.street_gaussians.data import place_rows, read_data, read_track_table, tracklets_of
 from adapters.street_gaussians.records import ModelConfig
-from adapters.street_gaussians.tracks import place_rows, read_track_table, tracklets_of
 from augment.errors import AdapterError
 
 FRONT = ModelConfig(cameras=(0, 1, 2))

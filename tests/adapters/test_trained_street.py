@@ -23,11 +23,11 @@ from street_models import (
 )
 
 from adapters.base import open_scene
-from augment.apply import render_view
 from augment.ground import ground_of
 from augment.scene import Scene
 from augment.semantics import SemanticClass
-from recipes.schema import Recipe
+from augment.views import render_view
+from recipes.schema import schema_Recipe
 from tests.streets import open_street
 
 LEAST_DB = 55.0
@@ -52,7 +52,7 @@ def drivestudio(tmp_path_factory, street) -> tuple[DrivestudioRun, Scene]:
 
 
 def shown(scene: Scene, frame: int, name: str) -> np.ndarray:
-    return render_view(scene, scene.frame(frame).cameras[name], Recipe()).rgb
+    return render_view(scene, scene.frame(frame).cameras[name], schema_Recipe()).rgb
 
 
 def decibels(actual: np.ndarray, expected: np.ndarray) -> float:

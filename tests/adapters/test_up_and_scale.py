@@ -9,9 +9,9 @@ import pytest
 import torch
 from splat_scenes import gaussians_at, street
 
-from adapters.cameras.ground_estimate import solid_points
-from adapters.cameras.posed_views import look_at_pose
-from adapters.up_and_scale import doubt_about_metres, find_ground, scale_from_cameras
+from adapters.camera_files.camera_files import look_at_pose
+from adapters.camera_files.paths import solid_points
+from adapters.gaussian_files import doubt_about_metres, find_ground, scale_from_cameras
 from adapters.world import parse_up, rotation_to_z_up
 from augment.scene import Gaussians
 

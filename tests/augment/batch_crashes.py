@@ -22,20 +22,19 @@ from pathlib import Path
 from batch_scenes import fake_render, make_bed, make_recipe, open_fake, slow_render, tree_digest
 from fork_server import keep_in_forks, start_fork_server
 
-from augment.batch.atomic import TEMPORARY_SUFFIX
-from augment.batch.job import RenderJob, run_job
-from augment.batch.journal import Journal
-from augment.batch.layout import STATE_FOLDER
-from augment.snow import beds
-from recipes.flood import Flood
-from recipes.snow import Snow
+from augment.effects.snow import support as beds
+from augment.jobs.atomic import TEMPORARY_SUFFIX
+from augment.jobs.journal import Journal
+from augment.jobs.layout import STATE_FOLDER
+from augment.jobs.render_job import RenderJob, run_job
+from recipes.weather import Flood, Snow
 
 STRIDE = 27  # odd, so that kills come before and after calls; 1 tries every point
 SYNC_POINTS = ("fsync", "replace", "unlink", "rename", "rmdir")
 
 
 def main(folder: Path) -> None:
-    start_fork_server("batch_scenes", "augment.batch.worker")
+    start_fork_server("batch_scenes", "augment.jobs.pools")
     keep_in_forks()
     beds.place_snow_bed = lambda *_, **__: make_bed(1.0)
     for warm in (job(folder / "warm"), snowy_job(folder / "warm-snow")):

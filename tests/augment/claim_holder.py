@@ -9,8 +9,8 @@ import os
 import sys
 import time
 
-from augment.batch.claims import ClaimTimes, try_claim
-from augment.batch.store import open_store
+from augment.jobs.claims import ClaimTimes, try_claim
+from augment.jobs.store import open_store
 
 PATIENT = ClaimTimes(renewal_s=5.0, lifetime_s=60.0, attempts=4, longest_wait_s=0.02)
 

@@ -11,9 +11,9 @@ import numpy as np
 import torch
 from batch_scenes import fake_render, make_recipe, open_fake
 
-from augment.batch.job import RenderJob, run_job
-from augment.batch.store import StoredFile, StoredFileMissing
-from recipes.flood import Flood
+from augment.jobs.render_job import RenderJob, run_job
+from augment.jobs.store import StoredFile, StoredFileMissing
+from recipes.weather import Flood
 
 CLEAR = make_recipe("clear", lidar=True)
 FOGGY = make_recipe(image="jpg", lidar=True)

@@ -8,15 +8,14 @@ from collections.abc import Sequence
 import torch
 
 from augment.cameras import Camera
+from augment.effects.smog import SmogMedium
 from augment.render import layout
-from augment.render.clip import HeightClip
 from augment.render.constants import ALPHA_MIN, RasterSettings
-from augment.render.cuda_splats import HIDDEN, TILE, CudaSplats
-from augment.render.layout import CUT
-from augment.render.reference_project import half_extents, project_parts
+from augment.render.cuda.splats import HIDDEN, TILE, CudaSplats
+from augment.render.layout import CUT, HeightClip
+from augment.render.reference import half_extents, project_parts
 from augment.render.shading import LINES
 from augment.scene import PosedGaussians
-from augment.weather.smog import SmogMedium
 
 _K = 0.5 * math.log2(math.e)
 

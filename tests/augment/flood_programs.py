@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import pytest
 
-from augment.render import gpu
+from augment.render.cuda import runtime as gpu
 
 
 def few_programs(monkeypatch: pytest.MonkeyPatch, size: int = 64) -> None:
     """Lets the flood's kernels take squares of so many pixels a side where they are interpreted."""
     if not gpu.is_interpreted():
         return
-    from augment.weather import cuda_pour, cuda_screen, cuda_water
+    from augment.effects.flood import cuda_pour, cuda_screen, cuda_water
 
     for module in (cuda_screen, cuda_water):
         monkeypatch.setattr(module, "WIDE", size)

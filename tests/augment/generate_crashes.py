@@ -41,15 +41,14 @@ from generate_jobs import (
 )
 from tqdm import tqdm
 
-import augment.generate.drive as drive
-from augment.batch.label_files import lidar_bytes
-from augment.batch.parts import read_finished
-from augment.batch.store import open_store
+import augment.jobs.scheduler as drive
 from augment.errors import OutputError
-from augment.generate.job import GenerateJob, GenerateResult, run_generate
-from augment.generate.pools import Finished
-from augment.generate.process_pool import ProcessPool
-from augment.generate.workshop import IndexTask
+from augment.jobs.block_pools import Finished, ProcessPool
+from augment.jobs.block_worker import IndexTask
+from augment.jobs.generate import GenerateJob, GenerateResult, run_generate
+from augment.jobs.manifest import read_finished
+from augment.jobs.store import open_store
+from augment.jobs.tables import lidar_bytes
 
 CHANGES = ("fsync", "replace", "unlink", "rename", "rmdir", "link", "mkdir")
 DISK_FULL, INTERRUPTED = 28, 130
@@ -67,7 +66,7 @@ def main(folder: Path, names: list[str]) -> None:
     tqdm.set_lock(threading.RLock())
     faulthandler.register(signal.SIGUSR1)
     take_notes(folder / "notes")
-    start_fork_server("generate_jobs", "augment.generate.process_pool")
+    start_fork_server("generate_jobs", "augment.jobs.block_pools")
     keep_in_forks()
     drive.ELSEWHERE_S = drive.WAIT_S = 0.05
     lidar_bytes(open_fake("fake:warm").labels.lidar(0))

@@ -18,11 +18,16 @@ from torch import Tensor
 from torch.nn import functional
 
 from augment.cameras import Camera
-from augment.render import gpu
 from augment.render.buffers import ALPHA, EXPECTED_DEPTH, RGB
 from augment.render.constants import COV2D_BLUR, RasterSettings
-from augment.render.reference import bin_to_tiles, blend
-from augment.render.reference_project import half_extents, order_by_depth, project_parts
+from augment.render.cuda import runtime as gpu
+from augment.render.reference import (
+    bin_to_tiles,
+    blend,
+    half_extents,
+    order_by_depth,
+    project_parts,
+)
 from augment.render.sh import SH_C0, evaluate_sh
 from augment.scene import Gaussians, PosedGaussians
 from tests.augment.pretend_gpu import AwayTensor, held_by

@@ -13,11 +13,11 @@ import numpy as np
 import torch
 
 from augment.cameras import Camera
+from augment.effects.smog import SmogMedium
 from augment.geometry import rigid
 from augment.render.constants import ALPHA_MIN
 from augment.render.sh import SH_C0
 from augment.scene import Gaussians, PosedGaussians, SplatShading
-from augment.weather.smog import SmogMedium
 
 LEAST_SCALE, MOST_SCALE = 1e-8, 1e4  # metres
 EDGE = np.float32(ALPHA_MIN)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from multiprocessing.connection import Connection
 
-from augment.batch.lock import InheritedLock
+from augment.jobs.processes import InheritedLock
 
 
 def hold(lock: InheritedLock, connection: Connection) -> None:

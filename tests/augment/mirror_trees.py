@@ -10,12 +10,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from augment.batch.job import RenderJob, run_job
-from augment.batch.manifest import read_manifest
-from augment.batch.mirror import Mirrored, mirror_dataset
-from augment.batch.mirror_images import weathered_images
-from augment.batch.mirror_record import mirror_folder
-from augment.batch.mirror_tree import SourceTree, survey
+from augment.jobs.manifest import read_manifest
+from augment.jobs.mirror import Mirrored, mirror_dataset, mirror_folder, weathered_images
+from augment.jobs.mirror_files import SourceTree, survey
+from augment.jobs.render_job import RenderJob, run_job
 from augment.scene import Scene
 from tests.augment.batch_scenes import SIZE, FakeLabels, fake_render, make_recipe, open_fake
 

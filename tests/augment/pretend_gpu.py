@@ -17,7 +17,7 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten, tree_map
 
-from augment.render import gpu
+from augment.render.cuda import runtime as gpu
 
 AWAY = torch.device("meta")
 

@@ -6,10 +6,16 @@ import numpy as np
 import pytest
 from walls import BOARD_SIZE_M, FRAME_NS, board_boxes, board_centre, driving_camera, wall_view
 
-from augment.batch.label_files import FrameBoxes
+from augment.jobs.tables import FrameBoxes
 from augment.labels import Boxes
-from augment.metrics.actors import MAX_GAP_NS, STILL_M, ActorPaths, carry
-from augment.metrics.consistency import consistency_of, find_warp
+from augment.metrics.consistency import (
+    MAX_GAP_NS,
+    STILL_M,
+    ActorPaths,
+    carry,
+    consistency_of,
+    find_warp,
+)
 
 FRAMES = 9
 

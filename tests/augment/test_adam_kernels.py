@@ -9,14 +9,20 @@ import pytest
 import torch
 
 from augment.geometry import rigid, rotmat_from_quat
-from augment.reconstruct import adam_kernels as kernels
+from augment.reconstruct import kernels
 from augment.reconstruct.config import FitConfig, LearningRates, LossWeights
-from augment.reconstruct.dense_adam import ColorAdam, DenseAdam
-from augment.reconstruct.inputs import splat_inputs
-from augment.reconstruct.rates import BETA1, BETA2, CORRECTIONS, splat_rates
+from augment.reconstruct.optimiser import (
+    BETA1,
+    BETA2,
+    CORRECTIONS,
+    ColorAdam,
+    DenseAdam,
+    splat_rates,
+)
 from augment.reconstruct.splats import Splats
+from augment.reconstruct.trainer import splat_inputs
 from augment.render.constants import RasterSettings
-from augment.render.cpu_project_backward import (
+from augment.render.cpu.backward_kernels import (
     G_ABS,
     G_COLOR,
     G_MEAN,

@@ -11,11 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from augment.batch import atomic
-from augment.batch.atomic import TEMPORARY_SUFFIX, remove_temporaries, replaced_file, write_atomic
-from augment.batch.local_store import LocalStore
-from augment.batch.mirror_files import copy_file
 from augment.files.atomic_folder import replaced_folder
+from augment.jobs import atomic
+from augment.jobs.atomic import TEMPORARY_SUFFIX, remove_temporaries, replaced_file, write_atomic
+from augment.jobs.mirror_files import copy_file
+from augment.jobs.store import LocalStore
 
 DATA = b"whole" * 1000
 

@@ -32,14 +32,13 @@ from batch_scenes import (
 )
 
 import augment
-from augment.batch.job import JobResult, RenderJob, run_job
-from augment.batch.label_files import read_boxes, read_lidar
-from augment.batch.layout import item_paths, resolve_inside
-from augment.batch.lock import OutputLock
-from augment.batch.manifest import read_manifest, write_manifest
-from augment.batch.processes import process_mark
 from augment.cameras import Frame
 from augment.errors import OutputError, SceneError
+from augment.jobs.layout import item_paths, resolve_inside
+from augment.jobs.manifest import read_manifest, write_manifest
+from augment.jobs.processes import OutputLock, process_mark
+from augment.jobs.render_job import JobResult, RenderJob, run_job
+from augment.jobs.tables import read_boxes, read_lidar
 from recipes.load import load_recipe
 
 
@@ -326,7 +325,7 @@ def test_the_lock_of_a_dead_process_does_not_last(tmp_path: Path) -> None:
 
 def test_a_worker_keeps_its_share_of_the_lock(tmp_path, monkeypatch) -> None:
     """As after the parent was killed: the folder is free once the last worker has gone."""
-    monkeypatch.setattr("augment.batch.lock.ORPHANS_S", 0.1)
+    monkeypatch.setattr("augment.jobs.processes.ORPHANS_S", 0.1)
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
     with OutputLock(tmp_path) as lock:
@@ -337,7 +336,7 @@ def test_a_worker_keeps_its_share_of_the_lock(tmp_path, monkeypatch) -> None:
         OutputLock(tmp_path).__enter__()
     # The dead parent had this process's number, as in another run of a container.
     (tmp_path / ".climategs" / "lock").write_text(f"{os.getpid()} 1")
-    monkeypatch.setattr("augment.batch.lock.ORPHANS_S", 20)
+    monkeypatch.setattr("augment.jobs.processes.ORPHANS_S", 20)
     threading.Timer(0.2, ours.send, ["end"]).start()
     OutputLock(tmp_path).__enter__().__exit__()
     child.join()

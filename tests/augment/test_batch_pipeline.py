@@ -16,12 +16,12 @@ from batch_scenes import FakeLabels, fake_render, make_recipe, open_fake, tree_d
 from pending_views import Gpu
 from pretend_gpu import pretended_gpu
 
-from augment.batch import runner
-from augment.batch.backends import gpu_is_lost
-from augment.batch.job import JobResult, RenderJob, run_job
-from augment.batch.manifest import read_manifest
-from augment.batch.writer import WritePump
 from augment.errors import GpuLost, OutputError
+from augment.jobs import worker as runner
+from augment.jobs.backends import gpu_is_lost
+from augment.jobs.manifest import read_manifest
+from augment.jobs.render_job import JobResult, RenderJob, run_job
+from augment.jobs.view_files import WritePump
 
 SOON_S = 10.0  # for what takes no time, on a machine that is busy
 
@@ -247,7 +247,7 @@ def test_a_job_on_a_gpu_gives_the_pictures_of_the_cpu(
 ) -> None:
     """Drawn as jobs draw there, one view in flight, and one by one: the same bytes."""
     pytest.importorskip("triton")
-    from augment.apply import render_view
+    from augment.views import render_view
 
     def of_job(folder: str, backend: str, renderer=None) -> RenderJob:
         job = RenderJob(

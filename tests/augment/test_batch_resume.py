@@ -16,9 +16,9 @@ from batch_scenes import (
     tree_digest,
 )
 
-from augment.batch.job import JobResult, RenderJob, run_job
-from augment.batch.manifest import read_manifest
 from augment.errors import OutputError
+from augment.jobs.manifest import read_manifest
+from augment.jobs.render_job import JobResult, RenderJob, run_job
 
 IDENTITY = ("source", "recipe_hash", "trajectory", "version", "backend")
 

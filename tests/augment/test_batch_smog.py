@@ -20,18 +20,15 @@ from batch_scenes import (
     tree_digest,
 )
 
-from augment.batch.box_weather import TABLES, visibility
-from augment.batch.job import JobResult, RenderJob, run_job
-from augment.batch.layout import box_weather_files
-from augment.batch.manifest import read_manifest
-from augment.batch.smog_labels import SMOG_TABLE, BoxSmog, read_smog
-from augment.batch.snow_labels import BoxSnow
-from augment.batch.water_labels import BoxWater
 from augment.dataset import SceneDataset, WeatherDataset
-from augment.weather.smog_labels import box_transmittance
-from recipes.flood import Flood
-from recipes.schema import Recipe, Smog, Weather
-from recipes.snow import Snow
+from augment.effects.smog import box_transmittance
+from augment.jobs.box_tables import SMOG_TABLE, BoxSmog, BoxSnow, BoxWater, read_smog
+from augment.jobs.layout import box_weather_files
+from augment.jobs.manifest import read_manifest
+from augment.jobs.render_job import JobResult, RenderJob, run_job
+from augment.jobs.view_files import TABLES, visibility
+from recipes.schema import Smog, Weather, schema_Recipe
+from recipes.weather import Flood, Snow
 
 FOLDER = Path("street") / "fog-000"
 TABLE = FOLDER / "labels" / "smog.parquet"
@@ -205,7 +202,7 @@ def test_visibility_is_what_all_effects_leave() -> None:
 
 
 def test_visibility_of_a_variant_with_all_effects(tmp_path: Path) -> None:
-    recipe: Recipe = make_recipe(flood=Flood(level_m=0.3), snow=Snow(depth_m=0))
+    recipe: schema_Recipe = make_recipe(flood=Flood(level_m=0.3), snow=Snow(depth_m=0))
     run(RenderJob("fake:street", [recipe], tmp_path, frames=[3]))
     files = box_weather_files(recipe)
     tables = {kind: TABLES[kind].read(tmp_path / FOLDER / files[kind]) for kind in files}

@@ -20,15 +20,15 @@ from batch_scenes import (
     tree_digest,
 )
 
-from augment.batch.job import JobResult, RenderJob, run_job
-from augment.batch.snow_beds import snow_to_lay, store_beds
 from augment.cameras import Frame
 from augment.dataset import SceneDataset
+from augment.effects.snow import support as beds
+from augment.effects.snow.placement import PlacementSettings
 from augment.errors import OutputError, SceneError
-from augment.snow import beds
-from augment.snow.placement import PlacementSettings
-from recipes.schema import Recipe
-from recipes.snow import Snow
+from augment.jobs.prepare import snow_to_lay, store_beds
+from augment.jobs.render_job import JobResult, RenderJob, run_job
+from recipes.schema import schema_Recipe
+from recipes.weather import Snow
 
 FILES = ("*.png", "*.jsonl", "*.yaml", "*.json", "*.parquet")
 
@@ -54,7 +54,7 @@ def placements(monkeypatch: pytest.MonkeyPatch) -> Placements:
     return found
 
 
-def snowy(depth_m: float = 0.1, variant: int = 0, **snow) -> Recipe:
+def snowy(depth_m: float = 0.1, variant: int = 0, **snow) -> schema_Recipe:
     return make_recipe(variant=variant, snow=Snow(depth_m=depth_m, **snow))
 
 

@@ -23,18 +23,17 @@ from batch_scenes import (
     tree_digest,
 )
 
-from augment.batch.job import JobResult, RenderJob, run_job
-from augment.batch.manifest import read_manifest
-from augment.batch.style_files import portable_recipe, stored_names
-from augment.batch.style_maps import store_maps, style_to_apply
 from augment.cameras import Frame
+from augment.effects.style import style as scene_maps
 from augment.errors import OutputError, StyleError
-from augment.style import scene_maps
+from augment.jobs.manifest import read_manifest
+from augment.jobs.prepare import store_maps, style_to_apply
+from augment.jobs.render_job import JobResult, RenderJob, portable_recipe, run_job, stored_names
 from recipes.errors import RecipeError
 from recipes.files import with_digest
 from recipes.load import load_recipe
-from recipes.schema import Recipe
-from recipes.style import Style
+from recipes.schema import schema_Recipe
+from recipes.weather import Style
 
 
 class Searches(list):
@@ -58,7 +57,7 @@ def searches(monkeypatch: pytest.MonkeyPatch) -> Searches:
     return found
 
 
-def styled(strength: float = 1.0, variant: int = 0, **style) -> Recipe:
+def styled(strength: float = 1.0, variant: int = 0, **style) -> schema_Recipe:
     source = {} if "image" in style else {"preset": "dusk"}
     return make_recipe(variant=variant, style=Style(strength=strength, **source, **style))
 

@@ -9,9 +9,9 @@ import pytest
 from batch_scenes import fake_render, make_recipe, open_fake
 from pending_views import Gpu
 
-from augment.batch.encode import encode_image
-from augment.batch.job import RenderJob, run_job
-from augment.batch.times import Shares, WorkTimes, shares_of
+from augment.jobs.files import encode_image
+from augment.jobs.render_job import RenderJob, run_job
+from augment.jobs.times import Shares, WorkTimes, shares_of
 
 # 10 s of one worker with two writing threads.
 SECONDS = {"workers": 10.0, "renderers": 10.0, "writers": 20.0, "render": 9.0, "held": 0.5}
@@ -85,7 +85,7 @@ def test_a_job_measures_what_bounds_it(
         time.sleep(0.2 if slow == "encoding" else 0.0)
         return encode_image(*arguments)
 
-    monkeypatch.setattr("augment.batch.writer.encode_image", slow_encode)
+    monkeypatch.setattr("augment.jobs.view_files.encode_image", slow_encode)
     recipe = make_recipe("clear", depth="none", labels=False, lidar=False)
     job = RenderJob("fake:street", [recipe], tmp_path)
     result = run_job(job, scene_loader=open_fake, renderer=Slow(), progress=False)

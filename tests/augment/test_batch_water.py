@@ -26,14 +26,14 @@ from batch_scenes import (
     tree_digest,
 )
 
-from augment.batch.job import JobResult, RenderJob, run_job
-from augment.batch.manifest import LATER, read_manifest
-from augment.batch.water_labels import WATER_TABLE, BoxWater, read_water
 from augment.cameras import Frame
 from augment.dataset import WeatherDataset
-from augment.weather.flood_labels import hidden_pixels, submerged_fraction
-from recipes.flood import Flood
-from recipes.schema import Recipe
+from augment.effects.flood.flood import hidden_pixels, submerged_fraction
+from augment.jobs.box_tables import WATER_TABLE, BoxWater, read_water
+from augment.jobs.manifest import LATER, read_manifest
+from augment.jobs.render_job import JobResult, RenderJob, run_job
+from recipes.schema import schema_Recipe
+from recipes.weather import Flood
 
 FLOOD = Flood(level_m=0.3)
 FOLDER = Path("street") / "fog-000"
@@ -45,7 +45,7 @@ def run(job: RenderJob, renderer=fake_render, **options) -> JobResult:
 
 
 @pytest.fixture(scope="module")
-def recipe() -> Recipe:
+def recipe() -> schema_Recipe:
     return make_recipe(flood=FLOOD)
 
 
@@ -57,7 +57,7 @@ def whole(recipe, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_masks_hold_what_was_rendered(whole: Path, recipe: Recipe) -> None:
+def test_masks_hold_what_was_rendered(whole: Path, recipe: schema_Recipe) -> None:
     scene = open_fake("fake:street")
     rows = read_manifest(whole).to_pylist()
     assert {row["water_path"] for row in rows} == {
@@ -74,7 +74,7 @@ def test_masks_hold_what_was_rendered(whole: Path, recipe: Recipe) -> None:
     assert {row["surface"] for row in rows} == {"solid"}
 
 
-def test_boxes_have_their_numbers_beside_the_labels(whole: Path, recipe: Recipe) -> None:
+def test_boxes_have_their_numbers_beside_the_labels(whole: Path, recipe: schema_Recipe) -> None:
     """Read with any Parquet reader, a row per frame, camera and box."""
     path = whole / FOLDER / "labels" / "water.parquet"
     rows = pq.read_table(path).to_pylist()
@@ -150,7 +150,7 @@ def test_without_labels_there_is_only_the_mask(tmp_path: Path, uri: str, output:
     assert run(again, must_not_render).skipped == 8
 
 
-def test_a_camera_path_has_them_where_it_has_labels(tmp_path: Path, recipe: Recipe) -> None:
+def test_a_camera_path_has_them_where_it_has_labels(tmp_path: Path, recipe: schema_Recipe) -> None:
     recorded = make_frame(1)
     path = [
         Frame(1, recorded.timestamp_ns, recorded.world_from_ego,

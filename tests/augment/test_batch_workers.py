@@ -23,16 +23,13 @@ from batch_scenes import (
 from fork_server import quick_context, start_fork_server
 from pending_views import begin_fake
 
-from augment.batch.job import RenderJob, run_job
-from augment.batch.manifest import read_manifest
-from augment.batch.processes import available_cores, thread_limits
-from augment.batch.shared_scene import share_scene
 from augment.errors import ClimateGSError
+from augment.jobs.manifest import read_manifest
+from augment.jobs.processes import available_cores, share_scene, thread_limits
+from augment.jobs.render_job import RenderJob, run_job
 from augment.scene import Actor, Track
 from augment.sky import LatLongSky
-from recipes.flood import Flood
-from recipes.snow import Snow
-from recipes.style import Style
+from recipes.weather import Flood, Snow, Style
 
 
 def test_a_dying_worker_costs_one_image_and_workers_change_no_file(
@@ -41,10 +38,12 @@ def test_a_dying_worker_costs_one_image_and_workers_change_no_file(
     """The third promise: workers take over the job's bed and maps. What they found themselves would
     show.
     """
-    start_fork_server("batch_scenes", "augment.batch.worker")
+    start_fork_server("batch_scenes", "augment.jobs.pools")
     monkeypatch.setattr("multiprocessing.get_context", quick_context)
-    monkeypatch.setattr("augment.snow.beds.place_snow_bed", lambda *_, **__: make_bed(3.0))
-    monkeypatch.setattr("augment.style.scene_maps._find_maps", lambda *_: make_maps(0.4))
+    monkeypatch.setattr(
+        "augment.effects.snow.support.place_snow_bed", lambda *_, **__: make_bed(3.0)
+    )
+    monkeypatch.setattr("augment.effects.style.style._find_maps", lambda *_: make_maps(0.4))
     style = Style(preset="dusk")
     recipes = [make_recipe(flood=Flood(level_m=0.3), snow=Snow(depth_m=0.1), style=style)]
     one = tmp_path / "one"
@@ -68,7 +67,7 @@ def test_a_dying_worker_costs_one_image_and_workers_change_no_file(
 
 def test_workers_finish_a_view_that_nothing_follows(tmp_path: Path, monkeypatch) -> None:
     """They have it in flight when they have no more to do, and the job waits for it."""
-    start_fork_server("batch_scenes", "augment.batch.worker")
+    start_fork_server("batch_scenes", "augment.jobs.pools")
     monkeypatch.setattr("multiprocessing.get_context", quick_context)
     job = RenderJob("fake:street", [make_recipe()], tmp_path / "begun", workers=2)
     result = run_job(job, scene_loader=open_fake, renderer=begin_fake, progress=False)
@@ -131,7 +130,7 @@ def test_labels_that_cannot_be_sent_are_refused(tmp_path: Path) -> None:
 
 
 def test_a_worker_that_cannot_start_ends_the_job(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr("augment.batch.executors.worker_main", os.abort)
+    monkeypatch.setattr("augment.jobs.pools.worker_main", os.abort)
     job = RenderJob("fake:street", [make_recipe()], tmp_path, frames=[0], workers=2)
     with pytest.raises(ClimateGSError, match=r"worker process ended with exit code 1 while start"):
         run_job(job, scene_loader=open_fake, renderer=fake_render, progress=False)

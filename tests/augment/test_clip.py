@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import torch
 
+from augment.effects.flood.water_plane import mirrored_camera
 from augment.render.buffers import ALPHA, BUFFERS, EXPECTED_DEPTH, MODE_DEPTH, RGB
-from augment.render.clip import HeightClip
+from augment.render.layout import HeightClip
 from augment.render.rasterize import rasterize
 from augment.render.threads import limit_threads
 from augment.scene import Gaussians, PosedGaussians
-from augment.weather.water_plane import mirrored_camera
 from tests.assertions import assert_images_close
 from tests.scenes import camera_ahead, one_gaussian, random_gaussians, random_pose, sh_of, stack
 

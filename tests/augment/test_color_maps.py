@@ -5,9 +5,9 @@ import dataclasses
 import pytest
 import torch
 
+from augment.effects.smog import SmogMedium
 from augment.render.rasterize import rasterize
 from augment.scene import Gaussians, PosedGaussians, SplatShading
-from augment.weather.smog import SmogMedium
 from tests.assertions import assert_images_close
 from tests.scenes import camera_ahead, random_gaussians, random_pose
 

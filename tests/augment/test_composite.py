@@ -5,10 +5,10 @@ import pytest
 import torch
 
 from augment.cameras import Camera
+from augment.effects.smog import SmogMedium
 from augment.geometry import rigid, rotmat_from_quat
 from augment.render.composite import composite_sky, map_colors, quantise, sky_behind
 from augment.sky import ConstantSky, CubemapSky
-from augment.weather.smog import SmogMedium
 
 
 def cameras() -> list[Camera]:

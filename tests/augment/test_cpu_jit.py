@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from numba import prange
 
-from augment.render import cpu_jit
-from augment.render import cpu_simd as v8
-from augment.render.cpu_jit import kernel
-from augment.render.cpu_math import exp2, exp2_fine, log2
+from augment.render.cpu import jit as cpu_jit
+from augment.render.cpu import simd as v8
+from augment.render.cpu.jit import kernel
+from augment.render.cpu.simd import exp2, exp2_fine, log2
 from augment.render.threads import kernel_threads
 
 U = np.uint64
@@ -73,7 +73,7 @@ def test_importing_compiles_nothing():
         "import numba.core.event as e\n"
         "log = e.RecordingListener()\n"
         "e.register('numba:compile', log)\n"
-        "import augment.render.cpu\n"
+        "import augment.render.cpu.driver\n"
         "print(len(log.buffer))"
     )
     result = subprocess.run(

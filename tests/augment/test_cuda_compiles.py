@@ -9,8 +9,8 @@ import sys
 import pytest
 import torch
 
-from augment.apply import render_view
-from augment.render import gpu
+from augment.render.cuda import runtime as gpu
+from augment.views import render_view
 
 pytest.importorskip("triton")
 from tests.augment import compiled_kernels as kernels

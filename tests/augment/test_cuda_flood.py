@@ -9,8 +9,23 @@ import pytest
 import torch
 
 from augment.cameras import Camera
+from augment.effects.flood import flood_view
+from augment.effects.flood.flood import FloodMedium
+from augment.effects.flood.flood_view import FloodedImage, Painter, both_sides, render_flooded
+from augment.effects.flood.water_plane import (
+    ANCHOR,
+    BEGIN,
+    END,
+    FALL,
+    Margins,
+    Window,
+    falling,
+    falling_rows,
+    resized,
+)
+from augment.effects.flood.waves import make_waves
+from augment.effects.smog import SmogMedium
 from augment.geometry import rigid
-from augment.render import gpu
 from augment.render.buffers import (
     ALPHA,
     EXPECTED_DEPTH,
@@ -20,18 +35,11 @@ from augment.render.buffers import (
     RenderOutput,
 )
 from augment.render.constants import RasterSettings
+from augment.render.cuda import runtime as gpu
 from augment.render.rasterize import rasterize
 from augment.scene import Gaussians, PosedGaussians
 from augment.sky import CubemapSky
-from augment.weather import flood_view
-from augment.weather.flood import FloodMedium
-from augment.weather.flood_view import FloodedImage, Painter, render_flooded
-from augment.weather.plane_rows import ANCHOR, BEGIN, END, FALL, falling_rows
-from augment.weather.pour import both_sides
-from augment.weather.smog import SmogMedium
-from augment.weather.water_plane import Margins, Window, falling, resized
-from augment.weather.wave_spectrum import make_waves
-from recipes.flood import Waves
+from recipes.weather import Waves
 from tests.augment.flood_programs import few_programs
 from tests.augment.pretend_gpu import pretended_gpu
 from tests.scenes import sh_of

@@ -13,24 +13,22 @@ import numpy as np
 import pytest
 import torch
 
-from augment.apply import begin_view, render_view
 from augment.cameras import Camera
+from augment.effects.smog import SmogMedium, fog_raster
 from augment.geometry import rigid, rotmat_from_quat
 from augment.ground_heights import Ground
 from augment.labels import Boxes
 from augment.render.buffers import RenderOutput
 from augment.render.composite import composite_sky, map_colors, quantise
-from augment.render.gpu import upload
-from augment.render.remainder import share_remainder
+from augment.render.cuda.runtime import upload
+from augment.render.rasterize import share_remainder
 from augment.scene import Scene
 from augment.semantics import SemanticClass
 from augment.sky import ConstantSky, CubemapSky, LatLongSky, Sky
-from augment.stopwatch import lap, stopwatch
-from augment.views import WeatheredView
-from augment.weather.smog import SmogMedium, fog_raster
-from recipes.schema import Output, Recipe, Render, Smog, Weather
-from recipes.snow import Snow
-from recipes.style import Style
+from augment.timing import lap, stopwatch
+from augment.views import WeatheredView, begin_view, render_view
+from recipes.schema import Output, Render, Smog, Weather, schema_Recipe
+from recipes.weather import Snow, Style
 from tests import snow_scenes
 from tests.augment import pretend_gpu
 from tests.augment.pretend_gpu import AwayTensor, pretended_gpu
@@ -180,31 +178,31 @@ def scene() -> Scene:
     )
 
 
-EVERYTHING = Recipe(output=Output(semantic=True, instance=True))
+EVERYTHING = schema_Recipe(output=Output(semantic=True, instance=True))
 SNOW = Snow(depth_m=0.1, cell_m=1.0, tracks="never", shading="per_splat")
 LOW = Smog(visibility_m=20, scale_height_m=9.0, model="deferred")
 RECIPES = {
-    "smog, style on the picture": Recipe(
+    "smog, style on the picture": schema_Recipe(
         weather=Weather(smog=Smog(visibility_m=20)),
         style=Style(preset="dusk", applied_to="picture"),
         output=Output(depth="none"),
     ),
-    "layered smog on buffers, early stop": Recipe(
+    "layered smog on buffers, early stop": schema_Recipe(
         weather=Weather(smog=LOW),
         render=Render(transmittance_stop=0.2),
         output=Output(depth="expected", instance=True),
     ),
-    "snow, bare images": Recipe(
+    "snow, bare images": schema_Recipe(
         weather=Weather(snow=SNOW), output=Output(semantic=True, surface="scene")
     ),
 }
 
 
-def scaled(recipe: Recipe) -> Recipe:
+def scaled(recipe: schema_Recipe) -> schema_Recipe:
     return recipe.model_copy(update={"render": recipe.render.model_copy(update={"scale": 0.1})})
 
 
-def view_of(scene: Scene, recipe: Recipe, backend: str) -> WeatheredView:
+def view_of(scene: Scene, recipe: schema_Recipe, backend: str) -> WeatheredView:
     return render_view(scene, scene.frames[0].cameras["ahead"], scaled(recipe), backend=backend)
 
 
@@ -262,7 +260,7 @@ def test_a_view_is_begun_without_waiting_for_it(scene, away, monkeypatch):
 
 
 def test_two_views_under_way_do_not_mix(scene, away):
-    recipe = scaled(Recipe(output=Output(depth="none", labels=False)))
+    recipe = scaled(schema_Recipe(output=Output(depth="none", labels=False)))
     cameras = [frame.cameras["ahead"] for frame in scene.frames]
     begun = [begin_view(scene, camera, recipe, backend="cuda") for camera in cameras]
     alone = [render_view(scene, camera, recipe, backend="cpu") for camera in cameras]

@@ -14,18 +14,24 @@ import torch
 pytest.importorskip("triton")
 
 from augment.cameras import Camera
+from augment.effects.smog import SmogMedium
 from augment.errors import BackendUnavailable
-from augment.render import gpu, layout
+from augment.render import layout
 from augment.render.buffers import ALPHA, EXPECTED_DEPTH, MEDIAN_DEPTH, RGB, SPLAT_IDS
 from augment.render.constants import RasterSettings
-from augment.render.cuda_blend_backward import color_gradients
-from augment.render.cuda_splats import HIDDEN, CudaSplats, CudaTiles
+from augment.render.cuda import runtime as gpu
+from augment.render.cuda.backward import color_gradients
+from augment.render.cuda.splats import HIDDEN, CudaSplats, CudaTiles
 from augment.render.gsplat_backend import draw_with_gsplat
 from augment.render.rasterize import rasterize
-from augment.render.reference import LOG2_E, bin_to_tiles, rasterize_reference
-from augment.render.reference_project import order_by_depth, project_parts
+from augment.render.reference import (
+    LOG2_E,
+    bin_to_tiles,
+    order_by_depth,
+    project_parts,
+    rasterize_reference,
+)
 from augment.scene import Gaussians, PosedGaussians
-from augment.weather.smog import SmogMedium
 from tests.augment import gsplat_stand_in
 from tests.augment.pretend_gpu import AwayTensor, pretended_gpu
 from tests.scenes import camera_ahead, one_gaussian, random_gaussians, slight_pose, stack

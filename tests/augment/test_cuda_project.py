@@ -14,17 +14,19 @@ import pytest
 import torch
 from hypothesis import given
 
-from augment.render import cpu, cuda_inputs, gpu, layout
-from augment.render.clip import ABOVE, BELOW, UNCUT, HeightClip
+from augment.effects.smog import SmogMedium
+from augment.render import layout
 from augment.render.constants import RasterSettings
-from augment.render.cpu_inputs import gather_inputs as gather_cpu_inputs
-from augment.render.cpu_scratch import borrowed_scratch
-from augment.render.cuda_inputs import BLOCK, gather_inputs
-from augment.render.cuda_project import project
-from augment.render.cuda_splats import HIDDEN, TILE, CudaSplats
+from augment.render.cpu import driver as cpu
+from augment.render.cpu.driver import borrowed_scratch
+from augment.render.cpu.driver import gather_inputs as gather_cpu_inputs
+from augment.render.cuda import runtime as gpu
+from augment.render.cuda import splats as cuda_inputs
+from augment.render.cuda.driver import project
+from augment.render.cuda.splats import BLOCK, HIDDEN, TILE, CudaSplats, gather_inputs
+from augment.render.layout import ABOVE, BELOW, UNCUT, HeightClip
 from augment.render.shading import LINES
 from augment.scene import Gaussians, PosedGaussians
-from augment.weather.smog import SmogMedium
 from tests.augment.drawn_splats import drawn_splats
 from tests.augment.examples import drawing
 from tests.augment.extremes import wild_gaussians

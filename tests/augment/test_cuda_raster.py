@@ -12,11 +12,11 @@ import pytest
 import torch
 
 from augment.geometry import rigid
-from augment.render import cuda_blend, gpu
-from augment.render.backends import CPU, CUDA
 from augment.render.buffers import (
     ALPHA,
     BUFFERS,
+    CPU,
+    CUDA,
     EXPECTED_DEPTH,
     MEDIAN_DEPTH,
     MODE_DEPTH,
@@ -25,12 +25,12 @@ from augment.render.buffers import (
     SPLAT_IDS,
     RenderOutput,
 )
-from augment.render.clip import UNCUT, HeightClip
 from augment.render.constants import RasterSettings
-from augment.render.cuda import rasterize_cuda
-from augment.render.cuda_blend import blend
-from augment.render.cuda_splats import HIDDEN, TILE, CudaSplats, CudaTiles, StageClock
-from augment.render.cuda_tiles import list_tiles
+from augment.render.cuda import driver as cuda_blend
+from augment.render.cuda import runtime as gpu
+from augment.render.cuda.driver import blend, list_tiles, rasterize_cuda
+from augment.render.cuda.splats import HIDDEN, TILE, CudaSplats, CudaTiles, StageClock
+from augment.render.layout import UNCUT, HeightClip
 from augment.render.rasterize import rasterize
 from augment.render.reference import rasterize_reference
 from augment.scene import Gaussians, PosedGaussians

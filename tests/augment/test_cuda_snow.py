@@ -9,12 +9,11 @@ import pytest
 import torch
 
 from augment.cameras import Camera
-from augment.render import gpu
+from augment.effects.snow import placement
+from augment.effects.snow.height_map import Views, draw_views, plain_gaussians
+from augment.effects.snow.placement import PlacementSettings, place_snow_bed
+from augment.render.cuda import runtime as gpu
 from augment.scene import PosedGaussians
-from augment.snow import placement
-from augment.snow.height_map import plain_gaussians
-from augment.snow.placement import PlacementSettings, place_snow_bed
-from augment.snow.visibility import Views, draw_views
 from tests.augment.pretend_gpu import AwayTensor, pretended_gpu
 from tests.scenes import camera_ahead
 from tests.snow_scenes import box_car, cameras_of, drive, sheet, side_wall, stack_all

@@ -9,22 +9,21 @@ import numpy as np
 import pytest
 import torch
 
-from augment.apply import render_view
 from augment.cameras import Camera
+from augment.effects.snow import blocks as blocks_module
+from augment.effects.snow import cuda_close, glint_layout
+from augment.effects.snow.blocks import blocks_of
+from augment.effects.snow.cuda_cover import pose_layers
+from augment.effects.snow.kernels import MOST_SPLITS
+from augment.effects.snow.near_camera import Crystals, Grain, Layer, SnowCover, split_near
 from augment.geometry import rigid
-from augment.render import gpu, gpu_packets
-from augment.render.gpu_packets import upload_together
+from augment.render.cuda import runtime as gpu
+from augment.render.cuda import runtime as gpu_packets
+from augment.render.cuda.runtime import upload_together
 from augment.render.sh import SH_C0
 from augment.scene import Actor, Gaussians, PosedGaussians, Track
 from augment.semantics import SemanticClass
-from augment.snow import blocks as blocks_module
-from augment.snow import cuda_close, glint_layout
-from augment.snow.blocks import blocks_of
-from augment.snow.close import Grain, split_near
-from augment.snow.close_kernels import MOST_SPLITS
-from augment.snow.cover import Layer, SnowCover
-from augment.snow.cuda_cover import pose_layers
-from augment.snow.sparkle import Crystals
+from augment.views import render_view
 from tests.augment import pretend_gpu
 from tests.augment.pretend_gpu import AwayTensor, held_by, pretended_gpu
 from tests.snow_beds import scene_of

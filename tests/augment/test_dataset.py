@@ -26,8 +26,6 @@ from batch_scenes import (
 from dataset_folders import CLEAR, FOGGY, assert_same_sample, write_scene
 from torch.utils.data import DataLoader
 
-from augment.batch.job import RenderJob, run_job
-from augment.batch.water_labels import WATER_TABLE, BoxWater
 from augment.dataset import (
     ClipDataset,
     MixedDataset,
@@ -36,10 +34,12 @@ from augment.dataset import (
     clean_frames,
     collate_frames,
 )
+from augment.effects.flood.flood import hidden_pixels, submerged_fraction
 from augment.errors import BackendUnavailable, OutputError, SceneError
-from augment.weather.flood_labels import hidden_pixels, submerged_fraction
-from recipes.flood import Flood
-from recipes.schema import Recipe
+from augment.jobs.box_tables import WATER_TABLE, BoxWater
+from augment.jobs.render_job import RenderJob, run_job
+from recipes.schema import schema_Recipe
+from recipes.weather import Flood
 
 FLOODED = make_recipe("clear", variant=9, flood=Flood(level_m=0.3), surface="first")
 RECIPES = [
@@ -68,7 +68,7 @@ def one_image(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("recipe", RECIPES, ids=["png", "jpg", "no depth", "flood"])
-def test_live_samples_equal_written_ones(written: Path, recipe: Recipe) -> None:
+def test_live_samples_equal_written_ones(written: Path, recipe: schema_Recipe) -> None:
     scene = open_fake("fake:street")
     live = SceneDataset(scene, recipe, renderer=fake_render)
     files = WeatherDataset(written, variants=[f"{recipe.name}-{recipe.variant:03d}"])
@@ -376,7 +376,7 @@ def test_live_rendering_by_the_library(tmp_path: Path) -> None:
 
 
 def test_live_samples_take_no_gpu_unasked(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("augment.render.gpu.has_gpu", lambda: True)
+    monkeypatch.setattr("augment.render.cuda.runtime.has_gpu", lambda: True)
     live = SceneDataset(open_fake("fake:street"), make_recipe(), frames=[0])
     assert live._backend == "cpu"
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 
-from augment.batch.box_weather import BoxWeather
-from augment.batch.smog_labels import BoxSmog
 from augment.dataset import box_masks, boxes_2d, torchvision_sample
-from augment.dataset.boxes import BOX_FRAMES, box_tensors
+from augment.dataset.samples import BOX_FRAMES, box_tensors
 from augment.geometry import multiply_quats, quat_from_rotmat, rigid, rotmat_from_quat
+from augment.jobs.box_tables import BoxSmog
+from augment.jobs.view_files import BoxWeather
 from augment.labels import Boxes
 from augment.semantics import SemanticClass
 

@@ -15,13 +15,14 @@ from batch_scenes import FakeLabels, fake_render, open_fake
 from dataset_folders import CLEAR, FLOODED, FOGGY, MemoryStore, assert_same_sample, write_scene
 from torch.utils.data import DataLoader
 
-from augment.batch.layout import MANIFEST
-from augment.batch.manifest import parse_manifest
-from augment.batch.parts import publish_part
-from augment.dataset import SceneDataset, WeatherDataset, collate_frames, rows, stored
-from augment.dataset.rows import Rows
+from augment.dataset import SceneDataset, WeatherDataset, collate_frames
+from augment.dataset import weather_dataset as rows
+from augment.dataset import weather_dataset as stored
+from augment.dataset.weather_dataset import Rows
 from augment.errors import OutputError
 from augment.geometry import invert_rigid, rotmat_from_quat, transform_points
+from augment.jobs.layout import MANIFEST
+from augment.jobs.manifest import parse_manifest, publish_part
 
 ALL = ("image", "depth", "semantic", "instance", "water", "snow", "boxes", "lidar")
 

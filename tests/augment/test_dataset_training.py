@@ -25,7 +25,7 @@ from augment.dataset import (
     collate_frames,
     split_by_scene,
 )
-from augment.dataset.rows import Numbers
+from augment.dataset.weather_dataset import Numbers
 
 FRAMES = 6
 
@@ -193,8 +193,7 @@ def test_pairs_show_the_same_moment(written: Path) -> None:
 
 
 def test_what_is_clean(written: Path, tmp_path: Path) -> None:
-    from recipes.flood import Flood
-    from recipes.snow import Snow
+    from recipes.weather import Flood, Snow
 
     level = make_recipe("clear", variant=1, flood=Flood(level_m=0.0))
     bare = make_recipe("clear", variant=2, snow=Snow(depth_m=0.0))

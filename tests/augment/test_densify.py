@@ -10,10 +10,16 @@ import pytest
 from augment.errors import SceneError
 from augment.geometry import rotmat_from_quat
 from augment.reconstruct.config import DensifyConfig
-from augment.reconstruct.densify import add_noise, densify, densify_due, grows, rebuild
-from augment.reconstruct.densify_mcmc import MOST_COPIES, relocated
-from augment.reconstruct.splat_rows import rotate
-from augment.reconstruct.splats import GEOMETRY, Splats
+from augment.reconstruct.densify import (
+    MOST_COPIES,
+    add_noise,
+    densify,
+    densify_due,
+    grows,
+    rebuild,
+    relocated,
+)
+from augment.reconstruct.splats import GEOMETRY, Splats, rotate
 
 EXTENT_M = 100.0
 PARTS = (30, 0, 12, 8)

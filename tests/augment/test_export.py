@@ -16,24 +16,24 @@ from hypothesis import strategies as st
 from scenes import camera_ahead, random_gaussians, slight_pose
 
 from adapters.base import open_scene
-from augment.bake import baked, moved_gaussians
-from augment.color_waves import ColorWaves
 from augment.errors import OutputError, SceneError
 from augment.files import atomic_folder
-from augment.files.export_losses import export_losses
-from augment.files.gaussian_export import (
+from augment.files.export import (
+    baked,
     export_cameras,
+    export_losses,
     export_ply,
     export_ply_parts,
     export_splat,
     inria_cameras,
     is_parts_folder,
+    moved_gaussians,
 )
+from augment.files.ply import read_ply, read_splat
 from augment.geometry import rigid, rotmat_from_quat, transform_points
 from augment.render.rasterize import rasterize
 from augment.render.sh import evaluate_sh
-from augment.scene import Actor, Gaussians, PosedGaussians, Scene, SemanticClass, Track
-from augment.splat_io import read_ply, read_splat
+from augment.scene import Actor, ColorWaves, Gaussians, PosedGaussians, Scene, SemanticClass, Track
 
 NOW = START_NS + 100_000_000
 

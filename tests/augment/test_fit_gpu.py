@@ -12,8 +12,8 @@ pytest.importorskip("triton")
 from augment.errors import BackendUnavailable, ClimateGSError
 from augment.reconstruct.config import DensifyConfig
 from augment.reconstruct.trainer import Trainer
-from augment.render import cpu_project_backward as columns
-from augment.render import gpu
+from augment.render.cpu import backward_kernels as columns
+from augment.render.cuda import runtime as gpu
 from augment.render.layout import BLOCK
 from tests.augment import gsplat_stand_in
 from tests.augment.pretend_gpu import AwayTensor, pretended_gpu

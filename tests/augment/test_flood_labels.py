@@ -18,9 +18,9 @@ from box_views import (
     plane_depth,
 )
 
-from augment.box_pixels import BOTTOM_M, SIDES_M
+from augment.boxes import BOTTOM_M, SIDES_M
+from augment.effects.flood.flood import hidden_pixels, submerged_fraction
 from augment.labels import Boxes
-from augment.weather.flood_labels import hidden_pixels, submerged_fraction
 
 
 def test_an_upright_box_is_submerged_by_its_height() -> None:

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from augment.apply import render_buffers, render_view
 from augment.cameras import Camera, Frame
+from augment.effects.flood.flood_view import Painter, render_flooded
 from augment.geometry import rigid
 from augment.ground_heights import Ground
 from augment.labels import Boxes
@@ -18,9 +18,9 @@ from augment.render.composite import quantise
 from augment.scene import Actor, Gaussians, Scene, Track
 from augment.semantics import SemanticClass
 from augment.sky import ConstantSky, CubemapSky, Sky
-from augment.weather.flood_view import Painter, render_flooded
-from recipes.flood import Flood, Wave, Waves
-from recipes.schema import Output, Recipe, Smog, Weather
+from augment.views import render_buffers, render_view
+from recipes.schema import Output, Smog, Weather, schema_Recipe
+from recipes.weather import Flood, Wave, Waves
 from tests.scenes import sh_of
 
 ROAD_Z = -1.5
@@ -96,8 +96,8 @@ def scene() -> Scene:
     return make_scene()
 
 
-def recipe_of(flood: Flood | None, smog: Smog | None = None, **output) -> Recipe:
-    return Recipe(weather=Weather(flood=flood, smog=smog), output=Output(**output))
+def recipe_of(flood: Flood | None, smog: Smog | None = None, **output) -> schema_Recipe:
+    return schema_Recipe(weather=Weather(flood=flood, smog=smog), output=Output(**output))
 
 
 def view_of(scene, flood, view=None, *, smog=None, backend="auto", **output):
@@ -260,8 +260,8 @@ def test_no_water_in_view_is_the_clean_frame_to_the_bit(scene):
 
 
 def test_nothing_is_rasterised_twice_without_water_in_view(scene, monkeypatch):
-    import augment.apply as apply
-    import augment.weather.flood_view as flood_view
+    import augment.effects.flood.flood_view as flood_view
+    import augment.views as apply
 
     calls = []
     for module in (apply, flood_view):
@@ -282,7 +282,7 @@ def test_nothing_is_rasterised_twice_without_water_in_view(scene, monkeypatch):
 
 def test_water_behind_a_covering_front_is_not_shaded(scene, monkeypatch):
     """The wall fills the picture: the plane is in view, the water is not."""
-    import augment.weather.flood_view as flood_view
+    import augment.effects.flood.flood_view as flood_view
 
     monkeypatch.setattr(flood_view, "shade_water", lambda *a, **k: pytest.fail("shaded"))
     near = camera(position=(9.0, 0.0, 1.0), focal=400.0)
@@ -323,7 +323,7 @@ class NoBoxes:
 
 
 def test_labels_take_the_depth_under_water_and_only_where_there_is_water(scene, monkeypatch):
-    import augment.apply as apply
+    import augment.views as apply
 
     asked = []
     original = apply.rasterize

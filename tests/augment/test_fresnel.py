@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from augment.weather.fresnel import exact, reflectance, schlick
+from augment.effects.flood.flood import exact, reflectance, schlick
 
 
 def cosines(*degrees: float) -> torch.Tensor:

@@ -22,16 +22,15 @@ from generate_jobs import (
     raising_render,
 )
 
-from augment.batch.atomic import write_atomic
-from augment.batch.job import RenderJob, run_job
-from augment.batch.layout import folder_name
-from augment.batch.manifest import read_manifest
-from augment.batch.parts import list_parts, read_finished
-from augment.batch.store import open_store
 from augment.errors import ClimateGSError, OutputError
-from augment.generate.job import GenerateJob, GenerateResult, run_generate
-from augment.generate.plan import stored_plans
-from augment.generate.status import read_status
+from augment.jobs.atomic import write_atomic
+from augment.jobs.blocks import stored_plans
+from augment.jobs.generate import GenerateJob, GenerateResult, run_generate
+from augment.jobs.layout import folder_name
+from augment.jobs.manifest import list_parts, read_finished, read_manifest
+from augment.jobs.render_job import RenderJob, run_job
+from augment.jobs.status import read_status
+from augment.jobs.store import open_store
 from recipes.job import JobScene
 
 
@@ -39,7 +38,7 @@ from recipes.job import JobScene
 def few_collections(monkeypatch: pytest.MonkeyPatch) -> None:
     """A worker collects garbage between scenes: here, that of all tests so far."""
     lazy = SimpleNamespace(collect=lambda: None)
-    monkeypatch.setattr("augment.generate.workshop.gc", lazy)
+    monkeypatch.setattr("augment.jobs.block_worker.gc", lazy)
 
 
 def run(job: GenerateJob) -> GenerateResult:

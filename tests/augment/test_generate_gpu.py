@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 from generate_jobs import make_job, make_recipes, outputs, raising_render
 
-from augment.batch.backends import renders_on_gpu
-from augment.batch.processes import available_cores
-from augment.batch.times import shares_of
 from augment.errors import GpuLost, OutputError
-from augment.generate.job import GenerateJob, make_pool, plan_job, run_generate
+from augment.jobs.backends import renders_on_gpu
+from augment.jobs.generate import GenerateJob, make_pool, plan_job, run_generate
+from augment.jobs.processes import available_cores
+from augment.jobs.times import shares_of
 
 SCENES = ["fake:a?frames=2"]
 
@@ -32,7 +32,7 @@ def test_one_process_where_a_gpu_renders(tmp_path: Path, monkeypatch: pytest.Mon
     on_gpu = job_of(tmp_path, "cuda", executor="processes")
     assert slots_of(on_gpu) == 1 and slots_of(replace(on_gpu, workers=3)) == 3
     assert slots_of(job_of(tmp_path, "cpu", executor="processes")) == available_cores()
-    monkeypatch.setattr("augment.render.gpu.has_gpu", lambda: True)
+    monkeypatch.setattr("augment.render.cuda.runtime.has_gpu", lambda: True)
     assert renders_on_gpu("auto") and not renders_on_gpu("cpu")
     assert slots_of(job_of(tmp_path, "auto", executor="processes")) == 1
 
@@ -42,7 +42,7 @@ def test_auto_gets_its_name_where_there_is_a_gpu(
 ) -> None:
     job = job_of(tmp_path, "auto", renderer=None)
     assert plan_job(job, progress=False).backend == "auto"
-    monkeypatch.setattr("augment.render.gpu.has_gpu", lambda: True)
+    monkeypatch.setattr("augment.render.cuda.runtime.has_gpu", lambda: True)
     on_gpu = plan_job(job, progress=False)
     assert on_gpu.backend == "cuda"
     assert on_gpu.blocks[0].key == plan_job(job_of(tmp_path, "cuda"), progress=False).blocks[0].key
@@ -62,7 +62,7 @@ def test_pictures_of_a_gpu_and_a_cpu_never_mix(tmp_path: Path, first: str, secon
 def test_a_lost_gpu_fails_no_block(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     job = job_of(tmp_path, "cuda", renderer=raising_render)
     with monkeypatch.context() as patch:
-        patch.setattr("augment.batch.runner.gpu_is_lost", lambda backend: True)
+        patch.setattr("augment.jobs.worker.gpu_is_lost", lambda backend: True)
         with pytest.raises(GpuLost, match="since frame 1, camera front"):
             run_generate(job, progress=False)
     result = run_generate(job_of(tmp_path, "cuda"), progress=False)

@@ -10,10 +10,10 @@ import pytest
 from generate_jobs import image_name, make_job, make_recipes, outputs
 from s3_server import s3_server
 
-from augment.batch.claims import ClaimTimes
-from augment.batch.store import open_store
-from augment.generate.job import run_generate
-from augment.generate.status import read_status
+from augment.jobs.claims import ClaimTimes
+from augment.jobs.generate import run_generate
+from augment.jobs.status import read_status
+from augment.jobs.store import open_store
 
 
 def test_a_remote_output_has_the_files_of_a_local_one(
@@ -21,8 +21,8 @@ def test_a_remote_output_has_the_files_of_a_local_one(
 ) -> None:
     """Requests fail now and then; the job is stopped twice, and what was finished stays so."""
     lazy = SimpleNamespace(collect=lambda: None)
-    monkeypatch.setattr("augment.generate.workshop.gc", lazy)
-    monkeypatch.setattr("augment.batch.claims.CLAIM_TIMES", ClaimTimes(0.2, 2.0))
+    monkeypatch.setattr("augment.jobs.block_worker.gc", lazy)
+    monkeypatch.setattr("augment.jobs.claims.CLAIM_TIMES", ClaimTimes(0.2, 2.0))
     scenes, recipes = ["fake:a?frames=3"], make_recipes(["fog"], block_images=2)
     run_generate(make_job(tmp_path / "local", scenes, recipes), progress=False)
     whole = outputs(tmp_path / "local")

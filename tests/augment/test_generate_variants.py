@@ -6,10 +6,10 @@ import dataclasses
 
 import pytest
 
-from augment.batch.journal import Identity
-from augment.batch.store import open_store
 from augment.errors import OutputError
-from augment.generate.variants import VARIANTS, enter_variant
+from augment.jobs.block_worker import VARIANTS, enter_variant
+from augment.jobs.journal import Identity
+from augment.jobs.store import open_store
 
 FOG = Identity("fake:street", "0123456789abcdef", "recorded", "0.1.0", "auto")
 

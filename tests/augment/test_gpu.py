@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from augment.errors import BackendUnavailable
-from augment.render import gpu
-from augment.render.backends import AUTO, CPU, CUDA, REFERENCE, available_backends, kernels_for
+from augment.render.buffers import AUTO, CPU, CUDA, REFERENCE, available_backends, kernels_for
+from augment.render.cuda import runtime as gpu
 from tests.augment.pretend_gpu import AwayTensor, pretended_gpu
 
 

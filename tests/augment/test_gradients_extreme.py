@@ -12,38 +12,34 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from augment.geometry import rigid
-from augment.reconstruct import adam_kernels as adam
-from augment.reconstruct.config import FitConfig, LossWeights
-from augment.reconstruct.dense_adam import ColorAdam, DenseAdam
-from augment.reconstruct.forces import part_forces
-from augment.reconstruct.inputs import splat_inputs
-from augment.reconstruct.knots import Knots
-from augment.reconstruct.loss import IDENTITY_MAP, ViewLoss, view_loss
-from augment.reconstruct.loss_reference import LEAST_ALPHA, LEAST_SKY, reference_loss
-from augment.reconstruct.rates import CORRECTIONS, splat_rates
-from augment.reconstruct.splats import Splats
-from augment.reconstruct.view import RecordedView
-from augment.render import cpu_backward
-from augment.render.buffers import ALPHA, EXPECTED_DEPTH, RGB
-from augment.render.constants import RasterSettings
-from augment.render.cpu_scratch import Scratch
-from augment.render.part_views import part_poses
-from augment.render.rasterize import rasterize
-from augment.render.threads import kernel_threads
-from augment.scene import Gaussians, PosedGaussians
-from augment.style.closed_form import closed_maps
-from augment.style.losses import (
+from augment.effects.style.losses import (
     GaussianColors,
     color_distance,
     picture_distance,
     style_loss,
     weighted_sum,
 )
-from augment.style.network import Gscm
-from augment.style.pair_losses import PairWeights, pair_losses, weighted
-from augment.style.pairs import PairBatch
-from augment.style.statistics import WHOLE, ColorStatistics
+from augment.effects.style.network import Gscm
+from augment.effects.style.pairs import PairBatch, PairWeights, pair_losses, weighted
+from augment.effects.style.statistics import WHOLE, ColorStatistics, closed_maps
+from augment.geometry import rigid
+from augment.reconstruct import kernels as adam
+from augment.reconstruct.config import FitConfig, LossWeights
+from augment.reconstruct.loss import IDENTITY_MAP, ViewLoss, view_loss
+from augment.reconstruct.loss_reference import LEAST_ALPHA, LEAST_SKY, reference_loss
+from augment.reconstruct.optimiser import CORRECTIONS, ColorAdam, DenseAdam, splat_rates
+from augment.reconstruct.poses import Knots, part_forces
+from augment.reconstruct.splats import Splats
+from augment.reconstruct.trainer import splat_inputs
+from augment.reconstruct.view import RecordedView
+from augment.render.buffers import ALPHA, EXPECTED_DEPTH, RGB
+from augment.render.constants import RasterSettings
+from augment.render.cpu import backward as cpu_backward
+from augment.render.cpu.driver import Scratch
+from augment.render.part_views import part_poses
+from augment.render.rasterize import rasterize
+from augment.render.threads import kernel_threads
+from augment.scene import Gaussians, PosedGaussians
 from tests.augment.examples import drawing
 from tests.augment.hard_scenes import (
     KINDS,

@@ -18,9 +18,8 @@ from scenes import camera_ahead, one_gaussian
 import augment.ground
 from augment.cameras import Frame
 from augment.errors import BackendUnavailable, SceneError
-from augment.ground import ground_of, ground_sentence
+from augment.ground import ground_of, ground_points, ground_sentence, load_open3d
 from augment.ground_heights import Ground, Stretches, measure_ground
-from augment.ground_plane import ground_points, load_open3d
 from augment.labels import Boxes, LidarSweep
 from augment.scene import Gaussians, Scene
 from augment.semantics import SemanticClass as Class

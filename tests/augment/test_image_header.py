@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from augment.image_header import ImageHeader, image_header, read_image_header
+from augment.files.image_size import ImageHeader, image_header, read_image_header
 
 
 def encoded(suffix: str, pixels: np.ndarray, *options: int) -> bytes:

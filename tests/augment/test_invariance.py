@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from augment.cameras import Camera
 from augment.render.buffers import ALPHA, BUFFERS, RGB, SNOW, SPLAT_IDS, RenderOutput
-from augment.render.clip import HeightClip
+from augment.render.layout import HeightClip
 from augment.render.rasterize import rasterize
 from augment.render.threads import limit_threads
 from augment.scene import Gaussians, PosedGaussians

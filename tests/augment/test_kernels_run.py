@@ -12,18 +12,16 @@ import numpy as np
 import pytest
 import torch
 
-from augment.apply import render_view
 from augment.cameras import Camera
 from augment.geometry import rigid
 from augment.ground_heights import Ground
 from augment.labels import Boxes
-from augment.render import cpu
+from augment.render.cpu import driver as cpu
 from augment.scene import Scene
 from augment.sky import CubemapSky
-from recipes.flood import Flood, Waves
-from recipes.schema import Output, Recipe, Render, Smog, Weather
-from recipes.snow import Snow
-from recipes.style import Style
+from augment.views import render_view
+from recipes.schema import Output, Render, Smog, Weather, schema_Recipe
+from recipes.weather import Flood, Snow, Style, Waves
 from tests.augment.kernel_counts import CountingKernel, counted_kernels, launch_sites
 from tests.snow_scenes import box_car, drive, sheet, side_wall
 
@@ -78,7 +76,10 @@ def scene() -> Scene:
 
 
 def run(
-    scene: Scene, recipe: Recipe, monkeypatch: pytest.MonkeyPatch, camera: Camera | None = None
+    scene: Scene,
+    recipe: schema_Recipe,
+    monkeypatch: pytest.MonkeyPatch,
+    camera: Camera | None = None,
 ) -> Ran:
     """One image, once what is kept for later ones is there."""
     camera = scene.frames[0].cameras["ahead"] if camera is None else camera
@@ -104,8 +105,8 @@ def kernels(layers: int = 1, *names: str, sky: int = 1, **counts: int) -> dict[s
     return found | ({"composite_cubemap": sky} if sky else {})
 
 
-def recipe_of(style: Style | None = None, output: Output = PICTURE, **weather) -> Recipe:
-    return Recipe(style=style, weather=Weather(**weather), output=output)
+def recipe_of(style: Style | None = None, output: Output = PICTURE, **weather) -> schema_Recipe:
+    return schema_Recipe(style=style, weather=Weather(**weather), output=output)
 
 
 def test_every_way_to_a_kernel_is_counted_and_given_back():
@@ -113,7 +114,7 @@ def test_every_way_to_a_kernel_is_counted_and_given_back():
     launched = {name for _, name in sites}
     assert set(RASTER) | {"composite_cubemap", "quantise", "shade", "trace", "pour"} <= launched
     with counted_kernels():
-        from augment.render import cpu_project
+        from augment.render.cpu import project as cpu_project
 
         assert isinstance(cpu_project.rank_splats, CountingKernel)
     assert launch_sites() == sites

@@ -12,18 +12,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
-from augment.lidar_weather import ATTENUATED, LOST, SCATTERED, UNCHANGED
-from augment.lidar_weather.apply import weathered_sweep
-from augment.lidar_weather.sensors import LidarModel
-from augment.lidar_weather.smog import (
+from augment.effects import smog as image_smog
+from augment.effects.lidar import ATTENUATED, LOST, SCATTERED, UNCHANGED
+from augment.effects.lidar.beam import (
+    LidarModel,
     optical_depth,
     scatter_before,
     soft_echo,
     soft_response,
     wavelength_factor,
+    weathered_sweep,
 )
-from augment.weather import smog as image_smog
-from augment.weather.smog import SmogMedium
+from augment.effects.smog import SmogMedium
 from recipes.schema import KOSCHMIEDER, Smog
 from tests.lidar_sweeps import (
     SENSOR_M,

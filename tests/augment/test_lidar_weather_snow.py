@@ -10,15 +10,14 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from augment.lidar_weather import MOVED, UNCHANGED
-from augment.lidar_weather import snow as lidar_snow
-from augment.lidar_weather.apply import weathered_sweep
-from augment.lidar_weather.snow import LidarSnow, layer_of, meet_snow, snow_in
-from augment.snow.beds import remember_bed
-from augment.snow.cells import SnowBed, SnowCells
-from augment.snow.covers import cover_of, placement_settings
-from augment.snow.placed import PlacedSnow
-from recipes.snow import Snow
+from augment.effects.lidar import MOVED, UNCHANGED
+from augment.effects.lidar import snow as lidar_snow
+from augment.effects.lidar.beam import weathered_sweep
+from augment.effects.lidar.snow import LidarSnow, layer_of, meet_snow, snow_in
+from augment.effects.snow.cells import SnowBed, SnowCells
+from augment.effects.snow.snow import PlacedSnow, cover_of, placement_settings
+from augment.effects.snow.support import remember_bed
+from recipes.weather import Snow
 from tests.lidar_sweeps import (
     SENSOR_M,
     WORLD_ORIGIN_M,

@@ -11,23 +11,19 @@ import numpy as np
 import pytest
 from batch_scenes import FakeLabels, fake_render, make_recipe, open_fake
 
-from augment.apply import render_view
-from augment.batch.job import RenderJob, run_job
-from augment.batch.label_files import lidar_bytes, read_lidar
-from augment.batch.manifest import read_manifest
-from augment.batch.rows import lidar_notes
-from augment.batch.selection import has_lidar
 from augment.cameras import Camera
+from augment.effects.lidar import LOST, MOVED, SCATTERED, UNCHANGED, drop_lost
+from augment.effects.lidar.beam import origins_of, weathered_sweep
 from augment.errors import OutputError
+from augment.jobs.files import has_lidar
+from augment.jobs.manifest import lidar_notes, read_manifest
+from augment.jobs.render_job import RenderJob, run_job
+from augment.jobs.tables import lidar_bytes, read_lidar
 from augment.labels import LidarSweep
-from augment.lidar_weather import LOST, MOVED, SCATTERED, UNCHANGED, drop_lost
-from augment.lidar_weather.apply import weathered_sweep
-from augment.lidar_weather.sensors import origins_of
 from augment.scene import Scene
-from augment.views import WeatheredView
-from recipes.flood import Flood
-from recipes.schema import Output, Recipe, Smog, Weather
-from recipes.snow import Snow
+from augment.views import WeatheredView, render_view
+from recipes.schema import Output, Smog, Weather, schema_Recipe
+from recipes.weather import Flood, Snow
 from tests.lidar_sweeps import WORLD_ORIGIN_M, SensorLabels, recipe, some_points, street, sweep_of
 from tests.streets import LABELLED_STREET, open_street
 
@@ -142,7 +138,7 @@ def test_origins_by_default_and_wrong_ones() -> None:
 
 def test_a_job_writes_weathered_sweeps(tmp_path: Path) -> None:
     weather = Weather(smog=Smog(visibility_m=0.5))
-    wanted = Recipe(name="fog", weather=weather, output=Output(lidar="weather"))
+    wanted = schema_Recipe(name="fog", weather=weather, output=Output(lidar="weather"))
     job = RenderJob("fake:street", [wanted], tmp_path / "one")
     assert run_job(job, scene_loader=open_fake, renderer=fake_render, progress=False).failed == 0
     rows = read_manifest(tmp_path / "one").to_pylist()
@@ -176,7 +172,7 @@ def _depth_gaps(scene: Scene, camera: Camera, view: WeatheredView, sweep: LidarS
 
 def test_lidar_agrees_with_depth_under_snow_by_default() -> None:
     scene = open_street(LABELLED_STREET)
-    deep = Recipe(weather=Weather(snow=Snow(depth_m=0.2)))
+    deep = schema_Recipe(weather=Weather(snow=Snow(depth_m=0.2)))
     gaps: dict[bool, list[np.ndarray]] = {True: [], False: []}
     source = scene.lidar(1)
     sweep = drop_lost(weathered_sweep(scene, deep, 1, source))
@@ -204,7 +200,7 @@ def test_auto_weathers_what_it_can_and_tells_of_the_rest(tmp_path: Path) -> None
     wet = make_recipe("wet", flood=Flood(level_m=40, reference="absolute"), depth="none")
     strict = wet.model_copy(update={"output": wet.output.model_copy(update={"lidar": "weather"})})
 
-    def outcome(recipe: Recipe, out: Path, **options) -> tuple[int, dict[int, tuple]]:
+    def outcome(recipe: schema_Recipe, out: Path, **options) -> tuple[int, dict[int, tuple]]:
         job = RenderJob("fake:street", [recipe], out, cameras=["front"], **options)
         done = run_job(job, scene_loader=lambda _: scene, renderer=fake_render, progress=False)
         rows = read_manifest(out).to_pylist()
@@ -249,6 +245,6 @@ def test_the_notes_of_a_job_are_one_line_a_recipe() -> None:
 
 
 def test_recipes_hashes_stay() -> None:
-    assert Recipe().hash == "8553a2737c7b8e42"
-    hashes = {Recipe(output=Output(lidar=kind)).hash for kind in (True, False, "weather")}
+    assert schema_Recipe().hash == "8553a2737c7b8e42"
+    hashes = {schema_Recipe(output=Output(lidar=kind)).hash for kind in (True, False, "weather")}
     assert len(hashes) == 3

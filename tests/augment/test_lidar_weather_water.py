@@ -9,12 +9,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from augment.lidar_weather import LOST, MOVED, SCATTERED, UNCHANGED
-from augment.lidar_weather.apply import weathered_sweep
-from augment.lidar_weather.water import ABSORPTION_905_PER_M, meet_water, water_reflectance
-from augment.weather.flood import FloodMedium
-from augment.weather.wave_spectrum import make_waves
-from recipes.flood import Flood, Waves
+from augment.effects.flood.flood import FloodMedium
+from augment.effects.flood.waves import make_waves
+from augment.effects.lidar import LOST, MOVED, SCATTERED, UNCHANGED
+from augment.effects.lidar.beam import (
+    ABSORPTION_905_PER_M,
+    meet_water,
+    water_reflectance,
+    weathered_sweep,
+)
+from recipes.weather import Flood, Waves
 from tests.lidar_sweeps import (
     SENSOR_M,
     ground_points,

@@ -12,10 +12,10 @@ import pyarrow.parquet as pq
 import pytest
 from batch_scenes import fake_render, make_recipe, open_fake
 
-from augment.batch.columns import read_table
-from augment.batch.job import RenderJob, run_job
-from augment.batch.manifest import LATER, MAX_SIDE_PX, manifest_bytes, parse_manifest, read_manifest
 from augment.errors import OutputError
+from augment.jobs.manifest import LATER, MAX_SIDE_PX, manifest_bytes, parse_manifest, read_manifest
+from augment.jobs.render_job import RenderJob, run_job
+from augment.jobs.tables import read_table
 
 
 @pytest.fixture(scope="module")

@@ -14,13 +14,12 @@ import mirror_trees as trees
 import numpy as np
 import pytest
 
-from augment.batch import atomic
-from augment.batch import mirror as mirror_module
-from augment.batch.atomic import TEMPORARY_SUFFIX
-from augment.batch.encode import decode_image
-from augment.batch.mirror_images import dataset_format, weathered_images
-from augment.batch.mirror_record import mirror_folder, read_record
 from augment.errors import AdapterError, OutputError
+from augment.jobs import atomic
+from augment.jobs import mirror as mirror_module
+from augment.jobs.atomic import TEMPORARY_SUFFIX
+from augment.jobs.files import decode_image
+from augment.jobs.mirror import dataset_format, mirror_folder, read_record, weathered_images
 
 STRIDE = 5  # odd, so that stops come before and after changes; 1 tries every point
 

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 
-from augment.render import cpu
 from augment.render.buffers import (
     ALPHA,
     BUFFERS,
@@ -20,8 +19,9 @@ from augment.render.buffers import (
     RGB,
     SPLAT_IDS,
 )
-from augment.render.clip import UNCUT
 from augment.render.constants import RasterSettings
+from augment.render.cpu import driver as cpu
+from augment.render.layout import UNCUT
 from augment.render.mode_depth import GAMMA, HIGH, LOW, Clusters
 from augment.render.rasterize import rasterize
 from augment.scene import Gaussians, PosedGaussians

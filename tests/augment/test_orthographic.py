@@ -10,19 +10,18 @@ import pytest
 import torch
 
 from augment.cameras import Camera
+from augment.effects.smog import SmogMedium
 from augment.geometry import quat_from_rotmat, rigid, rotmat_from_quat
-from augment.render import cpu_backward
 from augment.render.buffers import ALPHA, BUFFERS, EXPECTED_DEPTH, MEDIAN_DEPTH, RGB
-from augment.render.clip import UNCUT, HeightClip
 from augment.render.composite import composite_sky
 from augment.render.constants import COV2D_BLUR, RasterSettings
-from augment.render.cpu_inputs import gather_inputs
-from augment.render.cpu_scratch import Scratch
+from augment.render.cpu import backward as cpu_backward
+from augment.render.cpu.driver import Scratch, gather_inputs
+from augment.render.layout import UNCUT, HeightClip
 from augment.render.rasterize import rasterize
-from augment.render.reference_project import project_parts
+from augment.render.reference import project_parts
 from augment.scene import Gaussians, PosedGaussians
 from augment.sky import ConstantSky, CubemapSky
-from augment.weather.smog import SmogMedium
 from tests.assertions import assert_images_close
 from tests.scenes import camera_ahead, one_gaussian, random_gaussians, random_pose, sh_of, stack
 

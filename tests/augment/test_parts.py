@@ -13,20 +13,24 @@ from batch_scenes import make_recipe
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from augment.batch.journal import Identity
-from augment.batch.layout import PATH_KINDS
-from augment.batch.manifest import FAILED, OK, latest_rows, rows_to_table
-from augment.batch.parts import (
+from augment.errors import OutputError
+from augment.jobs.journal import Identity
+from augment.jobs.layout import PATH_KINDS
+from augment.jobs.manifest import (
+    FAILED,
+    OK,
     Part,
+    Pictured,
     compact,
+    image_row,
+    latest_rows,
     list_parts,
     parts_to_merge,
     publish_part,
     read_finished,
+    rows_to_table,
 )
-from augment.batch.rows import Pictured, image_row
-from augment.batch.store import Store, open_store
-from augment.errors import OutputError
+from augment.jobs.store import Store, open_store
 
 RECIPE = make_recipe()
 IDENTITY = Identity("fake:a", RECIPE.hash, "recorded", "1", "cpu")
@@ -187,7 +191,7 @@ def test_readers_while_blocks_are_published_and_merged(tmp_path: Path) -> None:
 @pytest.mark.parametrize("note", [b"{", b"5", b"null", b'{"a": 1}', b"[1, null]", b"[" * 10**5])
 def test_a_damaged_note_in_the_manifest(tmp_path: Path, note: bytes) -> None:
     """The parts are what is true."""
-    from augment.batch.manifest import manifest_bytes
+    from augment.jobs.manifest import manifest_bytes
 
     store = open_store(tmp_path)
     publish_part(store, "a/b", table({0: True}))

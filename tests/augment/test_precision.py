@@ -27,7 +27,7 @@ from augment.render.buffers import (
     SNOW,
     SPLAT_IDS,
 )
-from augment.render.clip import HeightClip
+from augment.render.layout import HeightClip
 from augment.render.rasterize import rasterize
 from augment.scene import PosedGaussians
 from tests.augment.examples import drawing

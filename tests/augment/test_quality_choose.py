@@ -8,8 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from augment.cameras import Frame
-from augment.quality.choose import Cost, useful, within_budget, within_flip
-from augment.quality.views import calibration_views
+from augment.jobs.quality import Cost, calibration_views, useful, within_budget, within_flip
 
 OPTIONS = {"a": (1, 2, 3), "b": ("fast", "slow"), "c": (0.5, 1.0)}
 

@@ -14,31 +14,37 @@ import pytest
 from batch_scenes import FakeView, make_camera, open_fake
 from generate_jobs import make_job, make_recipes
 
-from augment.apply import render_view
-from augment.batch.job import RenderJob, run_job
-from augment.batch.manifest import read_manifest
-from augment.batch.store import open_store
 from augment.errors import OutputError, SceneError
-from augment.generate.job import plan_job, run_generate
+from augment.jobs import quality_record as record
+from augment.jobs.generate import plan_job, run_generate
+from augment.jobs.manifest import read_manifest
+from augment.jobs.quality import (
+    Report,
+    Settings,
+    Settled,
+    calibration_views,
+    recipes_to_try,
+    render_trial,
+    settle,
+    settled_recipe,
+    upsampled,
+)
+from augment.jobs.quality_record import Question, recorded, settle_once
+from augment.jobs.render_job import RenderJob, run_job
+from augment.jobs.store import open_store
 from augment.metrics.image import flip
 from augment.plan import make_plan
-from augment.quality import record
-from augment.quality.choose import Settings
-from augment.quality.record import Question, recorded, settle_once
-from augment.quality.settle import Report, Settled, recipes_to_try, settle, settled_recipe
-from augment.quality.trial import render_trial, upsampled
-from augment.quality.views import calibration_views
+from augment.views import render_view
 from recipes.change import found
 from recipes.errors import RecipeError
-from recipes.knobs import as_reference, free_knobs
 from recipes.load import load_recipe
 from recipes.parse import parse_recipe
-from recipes.schema import Recipe
+from recipes.schema import as_reference, free_knobs, schema_Recipe
 
 PLAIN = "output: {depth: none, labels: false, lidar: false}\n"
 
 
-def open_recipe(quality: str, text: str = "", name: str = "fog") -> Recipe:
+def open_recipe(quality: str, text: str = "", name: str = "fog") -> schema_Recipe:
     text = f"name: {name}\nquality: {{{quality}}}\n{text}{PLAIN}"
     return parse_recipe(text, source="test").resolve(0)
 
@@ -52,7 +58,7 @@ class Workbench:
     def clock(self) -> float:
         return self.now_s
 
-    def render(self, scene, camera, recipe: Recipe, *, backend: str) -> FakeView:
+    def render(self, scene, camera, recipe: schema_Recipe, *, backend: str) -> FakeView:
         make_plan(recipe, scene)  # as the real one, refuses what is not settled
         self.rendered += 1
         settings = recipe.render
@@ -75,7 +81,7 @@ def bench(monkeypatch: pytest.MonkeyPatch) -> Workbench:
     a tenth of a second however small the picture is.
     """
     bench = Workbench()
-    monkeypatch.setattr("augment.quality.bench.flip", _mean_error)
+    monkeypatch.setattr("augment.jobs.quality.flip", _mean_error)
     monkeypatch.setattr(record, "settle", functools.partial(settle, clock=bench.clock))
     return bench
 
@@ -142,7 +148,7 @@ def test_a_budget_beyond_reach_says_so(bench: Workbench, caplog: pytest.LogCaptu
 
 
 def test_snow_that_a_scene_cannot_have_so_fine_is_coarser() -> None:
-    def render(scene, camera, recipe: Recipe, *, backend: str) -> FakeView:
+    def render(scene, camera, recipe: schema_Recipe, *, backend: str) -> FakeView:
         assert recipe.weather.snow is not None
         if recipe.weather.snow.cell_m < 0.1:
             raise SceneError("too many cells")
@@ -343,6 +349,6 @@ def test_small_pictures_are_enlarged_and_depths_are_not_mixed() -> None:
         return FakeView(picture, np.array([[1, 9], [1, 9]], np.float32), None, None)
 
     trial = render_trial(
-        scene, make_camera("front", 0, 0.0), Recipe(), renderer=render, size=(4, 4)
+        scene, make_camera("front", 0, 0.0), schema_Recipe(), renderer=render, size=(4, 4)
     )
     assert trial.depth is not None and trial.depth[3].tolist() == [1, 1, 9, 9]

@@ -5,15 +5,14 @@ import re
 import pytest
 import torch
 
+from augment.effects.smog import SmogMedium
 from augment.errors import BackendUnavailable
-from augment.render import backends
+from augment.render import buffers as backends
 from augment.render import rasterize as module
 from augment.render.buffers import BUFFERS, RenderOutput
 from augment.render.constants import RasterSettings
-from augment.render.rasterize import rasterize
-from augment.render.remainder import share_remainder
+from augment.render.rasterize import rasterize, share_remainder
 from augment.scene import Gaussians, PosedGaussians
-from augment.weather.smog import SmogMedium
 from tests.assertions import assert_images_close
 from tests.scenes import camera_ahead, random_gaussians, slight_pose
 
@@ -169,7 +168,7 @@ def test_a_failing_import_names_the_reason_and_the_way_out(monkeypatch):
     import augment.render
 
     monkeypatch.delattr(augment.render, "cpu", raising=False)
-    monkeypatch.setitem(sys.modules, "augment.render.cpu", None)
+    monkeypatch.setitem(sys.modules, "augment.render.cpu.driver", None)
     with pytest.raises(BackendUnavailable, match=r"unavailable: .*numba, tbb.*'reference'"):
         backends.import_cpu()
 

@@ -10,15 +10,13 @@ import torch
 
 from augment.geometry import rigid, rotmat_from_quat
 from augment.labels import EGO_VEHICLE
-from augment.reconstruct.forces import Forces, part_forces
-from augment.reconstruct.inputs import splat_inputs
-from augment.reconstruct.knots import Knots
-from augment.reconstruct.poses import ActorPoses, CameraPoses
+from augment.reconstruct.poses import ActorPoses, CameraPoses, Forces, Knots, part_forces
 from augment.reconstruct.splats import Splats
+from augment.reconstruct.trainer import splat_inputs
 from augment.reconstruct.view import ViewKey
-from augment.render import cpu_backward
 from augment.render.constants import RasterSettings
-from augment.render.cpu_scratch import Scratch
+from augment.render.cpu import backward as cpu_backward
+from augment.render.cpu.driver import Scratch
 from augment.scene import Actor, Gaussians, Track
 from tests.scenes import camera_ahead, random_gaussians
 

@@ -12,8 +12,8 @@ import pytest
 import torch
 
 from augment.cameras import Camera
+from augment.effects.smog import SmogMedium
 from augment.geometry import multiply_quats, quat_from_rotmat, rigid, transform_points
-from augment.render import cpu, cpu_scratch
 from augment.render.buffers import (
     ALPHA,
     BUFFERS,
@@ -23,12 +23,11 @@ from augment.render.buffers import (
     SPLAT_IDS,
 )
 from augment.render.constants import RasterSettings
-from augment.render.cpu import rasterize_cpu, warm_up
-from augment.render.cpu_inputs import gather_inputs
-from augment.render.reference import rasterize_reference
-from augment.render.reference_project import project_parts
+from augment.render.cpu import driver as cpu
+from augment.render.cpu import driver as cpu_scratch
+from augment.render.cpu.driver import gather_inputs, rasterize_cpu, warm_up
+from augment.render.reference import project_parts, rasterize_reference
 from augment.scene import Gaussians, PosedGaussians
-from augment.weather.smog import SmogMedium
 from tests.assertions import assert_images_close, assert_labels_equal
 from tests.scenes import (
     camera_ahead,

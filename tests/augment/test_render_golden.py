@@ -6,8 +6,7 @@ import torch
 
 from augment.render.buffers import ALPHA, EXPECTED_DEPTH, RGB
 from augment.render.constants import RasterSettings
-from augment.render.reference import rasterize_reference
-from augment.render.reference_project import project_parts
+from augment.render.reference import project_parts, rasterize_reference
 from tests.assertions import assert_images_close
 from tests.scenes import golden_view
 

@@ -5,12 +5,12 @@ import dataclasses
 import pytest
 import torch
 
+from augment.effects.smog import SmogMedium
 from augment.render import reference
 from augment.render.buffers import BUFFERS
 from augment.render.constants import RasterSettings
 from augment.render.reference import rasterize_reference
 from augment.scene import Gaussians, PosedGaussians
-from augment.weather.smog import SmogMedium
 from tests.scenes import camera_ahead, random_gaussians, slight_pose, smooth_gaussians
 
 FIELDS = ("means", "quats", "scales", "opacities", "sh")

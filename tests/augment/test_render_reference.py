@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 
+from augment.effects.smog import SmogMedium
 from augment.geometry import (
     multiply_quats,
     quat_from_rotmat,
@@ -13,11 +14,9 @@ from augment.geometry import (
 from augment.render import reference
 from augment.render.buffers import ALPHA, BUFFERS, EXPECTED_DEPTH, MEDIAN_DEPTH, RGB
 from augment.render.constants import MOST_TRANSMITTANCE_STOP, RasterSettings
-from augment.render.reference import rasterize_reference
-from augment.render.reference_project import order_by_depth, project_parts
+from augment.render.reference import order_by_depth, project_parts, rasterize_reference
 from augment.render.sh import rotate_sh
 from augment.scene import Gaussians, PosedGaussians
-from augment.weather.smog import SmogMedium
 from tests.assertions import assert_images_close, assert_labels_equal
 from tests.scenes import (
     camera_ahead,

@@ -5,12 +5,20 @@ import pytest
 import torch
 
 from augment.cameras import Camera
-from augment.color_waves import ColorWaves, colors_at
 from augment.errors import SceneError
-from augment.gaussian_checks import drawable_rows, is_drawable
 from augment.geometry import quat_from_rotmat, rigid, rotmat_from_quat, slerp
 from augment.render.sh import evaluate_sh
-from augment.scene import Actor, Gaussians, Scene, Track, check_gaussians
+from augment.scene import (
+    Actor,
+    ColorWaves,
+    Gaussians,
+    Scene,
+    Track,
+    check_gaussians,
+    colors_at,
+    drawable_rows,
+    is_drawable,
+)
 from augment.semantics import SemanticClass, class_of_label
 from augment.sky import ConstantSky
 

@@ -18,10 +18,9 @@ from hypothesis import strategies as st
 from safetensors.numpy import load_file, save_file
 from scenes import camera_ahead, random_gaussians
 
-from augment.color_waves import ColorWaves
 from augment.errors import OutputError, SceneError
 from augment.files import atomic_folder
-from augment.files.scene_files import (
+from augment.files.scene_file import (
     FILES,
     is_scene_folder,
     load_scene_parts,
@@ -29,7 +28,7 @@ from augment.files.scene_files import (
     save_scene_file,
 )
 from augment.render.rasterize import rasterize
-from augment.scene import Actor, Gaussians, Track
+from augment.scene import Actor, ColorWaves, Gaussians, Track
 from augment.sky import ConstantSky, LatLongSky
 
 DIFFERENT = ("source", "labels")  # a loaded scene is opened from its folder
@@ -268,7 +267,7 @@ def test_a_killed_save_is_cleared_by_the_next(tmp_path, saved):
 
 
 def test_a_full_disk_is_said(tmp_path, monkeypatch):
-    from augment.files import scene_files
+    from augment.files import scene_file as scene_files
 
     def full(*_):
         raise OSError(28, os.strerror(28))

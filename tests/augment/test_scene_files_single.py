@@ -20,8 +20,8 @@ from safetensors.numpy import load_file, save_file
 from scenes import random_gaussians
 
 from augment.errors import OutputError, SceneError
-from augment.files import tensor_files
-from augment.files.scene_files import (
+from augment.files import scene_file as tensor_files
+from augment.files.scene_file import (
     is_scene_file,
     load_scene_parts,
     read_saved_scene,

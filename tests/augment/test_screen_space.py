@@ -6,11 +6,11 @@ import pytest
 import torch
 
 from augment.cameras import Camera
+from augment.effects.flood import screen_space
+from augment.effects.flood.flood import Layer
+from augment.effects.flood.screen_space import ScreenReflection
 from augment.geometry import rigid, rotmat_from_quat
 from augment.render.threads import limit_threads
-from augment.weather import screen_space
-from augment.weather.flood import Layer
-from augment.weather.screen_space import ScreenReflection
 from tests.augment.flood_programs import few_programs
 
 EYE_M = 1.5  # over the water, whose level is LEVEL_M

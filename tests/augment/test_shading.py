@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from augment.cameras import Camera
+from augment.effects.smog import SmogMedium
 from augment.geometry import quat_from_rotmat, rotmat_from_quat
 from augment.render.buffers import ALPHA, RGB, SNOW
 from augment.render.rasterize import rasterize
 from augment.scene import Gaussians, PosedGaussians, SplatShading
-from augment.weather.smog import SmogMedium
 
 C0 = 0.28209479177387814
 SIZE = 48

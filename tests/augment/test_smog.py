@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from augment.weather.smog import (
+from augment.effects.smog import (
     SmogMedium,
     blend_airlight,
     fog_buffers,

@@ -13,10 +13,10 @@ import pytest
 import torch
 
 from adapters.base import open_scene, parse_uri
-from adapters.street.truth import open_truth
+from adapters.street.labels import open_truth
+from augment.effects.snow.placement import PlacementSettings, place_snow_bed
 from augment.scene import Gaussians
 from augment.semantics import SemanticClass
-from augment.snow.placement import PlacementSettings, place_snow_bed
 from tools.bench_snow_accuracy import AccuracyCase, bench_accuracy
 from tools.bench_snow_cells import bed_heights, cells_over
 from tools.bench_snow_masks import bench_masks

@@ -14,13 +14,12 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
+from augment.effects.snow import support as beds
+from augment.effects.snow.cells import SnowBed, SnowCells
+from augment.effects.snow.placement import PlacementSettings, place_snow_bed
+from augment.effects.snow.support import FORMAT, bed_key, bed_of, load_bed, remember_bed, save_bed
 from augment.errors import OutputError, SceneError
 from augment.scene import Gaussians, Scene, Track
-from augment.snow import beds
-from augment.snow.bed_files import FORMAT, bed_key, load_bed, save_bed
-from augment.snow.beds import bed_of, remember_bed
-from augment.snow.cells import SnowBed, SnowCells
-from augment.snow.placement import PlacementSettings, place_snow_bed
 from tests.scenes import random_gaussians
 from tests.snow_scenes import box_car, cameras_of, drive, sheet
 

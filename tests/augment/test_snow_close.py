@@ -7,14 +7,14 @@ import pytest
 import torch
 
 from augment.cameras import Camera
+from augment.effects.snow.kernels import FARTHEST_M, MOST_SPLITS, REACH, SPREAD
+from augment.effects.snow.near_camera import Grain, split_near
 from augment.geometry import rigid
 from augment.render.buffers import ALPHA, RGB
 from augment.render.rasterize import rasterize
 from augment.render.sh import SH_C0
 from augment.render.threads import limit_threads
 from augment.scene import Gaussians, PosedGaussians
-from augment.snow.close import Grain, split_near
-from augment.snow.close_kernels import FARTHEST_M, MOST_SPLITS, REACH, SPREAD
 
 CELL_M, OPACITY = 0.05, 0.98
 SUN = torch.tensor([math.cos(0.6), 0.0, math.sin(0.6)], dtype=torch.float64)

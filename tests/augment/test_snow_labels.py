@@ -18,10 +18,10 @@ from box_views import (
     plane_depth,
 )
 
-from augment.box_pixels import SIDES_M
+from augment.boxes import SIDES_M
+from augment.effects.flood.flood import hidden_pixels
+from augment.effects.snow.snow import snow_pixels
 from augment.labels import Boxes
-from augment.snow.labels import snow_pixels
-from augment.weather.flood_labels import hidden_pixels
 
 ALL = np.full((106, 160), 255, np.uint8)
 

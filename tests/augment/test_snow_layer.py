@@ -9,20 +9,19 @@ import numpy as np
 import pytest
 import torch
 
+from augment.effects.snow.cells import FLUSH, OPEN_EDGE
+from augment.effects.snow.layer import OPACITY, find_depths, lay_snow
+from augment.effects.snow.light import Illumination
+from augment.effects.snow.near_camera import SnowCover
+from augment.effects.snow.profile import BARE_M, FILM_M, PRESSED, profile_of, share_covered
 from augment.geometry import rigid
 from augment.render.buffers import ALPHA, RGB
 from augment.render.rasterize import rasterize
 from augment.render.sh import SH_C0
 from augment.render.threads import limit_threads
-from augment.scene import Actor
+from augment.scene import Actor, Track
 from augment.semantics import SemanticClass
-from augment.snow.cells import FLUSH, OPEN_EDGE
-from augment.snow.cover import SnowCover
-from augment.snow.layer import OPACITY, find_depths, lay_snow
-from augment.snow.light import Illumination
-from augment.snow.profile import BARE_M, FILM_M, PRESSED, profile_of, share_covered
-from augment.track import Track
-from recipes.snow import Snow
+from recipes.weather import Snow
 from tests.snow_beds import bed_of_cells, cells_on_grid, grid_surface, level_bed, looking, scene_of
 
 CELL_M = 0.05

@@ -10,17 +10,17 @@ import pytest
 import torch
 
 from augment.cameras import Camera, Frame
-from augment.scene import Gaussians, Scene
-from augment.semantics import SemanticClass
-from augment.sky import ConstantSky, CubemapSky, LatLongSky, Sky
-from augment.snow.light import (
+from augment.effects.snow.light import (
     Illumination,
     display_from_linear,
     illumination_of,
     light_of,
     linear_from_display,
 )
-from recipes.snow import Snow, SnowLight
+from augment.scene import Gaussians, Scene
+from augment.semantics import SemanticClass
+from augment.sky import ConstantSky, CubemapSky, LatLongSky, Sky
+from recipes.weather import Snow, SnowLight
 
 SH_C0 = 0.28209479177387814
 HEIGHT = 180  # a row a degree

@@ -9,11 +9,18 @@ import numpy as np
 import pytest
 import torch
 
+from augment.effects.snow.layer import find_depths
+from augment.effects.snow.profile import (
+    field_of,
+    gradient_noise,
+    heights_of,
+    mottle_of,
+    octaves_of,
+    profile_of,
+    threshold_of,
+)
 from augment.render.threads import limit_threads
-from augment.snow.layer import find_depths
-from augment.snow.noise import field_of, gradient_noise, octaves_of, threshold_of
-from augment.snow.profile import heights_of, mottle_of, profile_of
-from recipes.snow import Snow
+from recipes.weather import Snow
 from tests.snow_beds import cells_on_grid
 
 SEED = np.uint64(77)

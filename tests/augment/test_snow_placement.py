@@ -11,19 +11,23 @@ import pytest
 import torch
 
 from augment.cameras import Camera
+from augment.effects.snow import placement, surface_kernels
+from augment.effects.snow.cells import EDGE_CAP_M, FLUSH, OPEN_EDGE, SnowBed, SnowCells
+from augment.effects.snow.placement import (
+    EGO_WIDTH_M,
+    WHEEL_SHARE,
+    PlacementSettings,
+    place_snow_bed,
+)
+from augment.effects.snow.surface import DRIVEN_MAX_SLOPE_DEG, is_vehicle
+from augment.effects.snow.surface_kernels import LINK, OPEN
+from augment.effects.snow.tiles import RINGS_M, CellNumbers, plan_tiles, views_along
 from augment.errors import SceneError
 from augment.geometry import quat_from_rotmat, rotmat_from_quat
 from augment.labels import EGO_VEHICLE
 from augment.render.threads import limit_threads
 from augment.scene import Gaussians, Scene
 from augment.semantics import SemanticClass
-from augment.snow import placement, surface_kernels
-from augment.snow.actor_cells import DRIVEN_MAX_SLOPE_DEG, is_vehicle
-from augment.snow.cells import EDGE_CAP_M, FLUSH, OPEN_EDGE, SnowBed, SnowCells
-from augment.snow.placement import PlacementSettings, place_snow_bed
-from augment.snow.surface_kernels import LINK, OPEN
-from augment.snow.tiles import RINGS_M, CellNumbers, plan_tiles, views_along
-from augment.snow.wheel_tracks import EGO_WIDTH_M, WHEEL_SHARE
 from tests.scenes import camera_ahead, one_gaussian, stack
 from tests.snow_scenes import box_car, cameras_of, drive, sheet, side_wall, stack_all, wall
 

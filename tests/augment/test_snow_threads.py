@@ -7,8 +7,8 @@ import time
 
 import pytest
 
-from augment.snow import in_threads
-from augment.snow.in_threads import in_order, on_device, slices_of
+from augment.effects.snow import height_map as in_threads
+from augment.effects.snow.height_map import in_order, on_device, slices_of
 
 
 @pytest.fixture(autouse=True, params=[1, 4])

@@ -6,17 +6,16 @@ import numpy as np
 import pytest
 import torch
 
-from augment.apply import render_buffers, render_view
+from augment.effects.snow.snow import cover_of
 from augment.errors import SceneError
 from augment.labels import Boxes
 from augment.plan import make_plan
 from augment.render.buffers import EXPECTED_DEPTH, MODE_DEPTH, SNOW, SPLAT_IDS
 from augment.scene import Scene
 from augment.semantics import SemanticClass
-from augment.snow.covers import cover_of
-from recipes.flood import Flood, Waves
-from recipes.schema import Output, Recipe, Smog, Weather
-from recipes.snow import Snow
+from augment.views import render_buffers, render_view
+from recipes.schema import Output, Smog, Weather, schema_Recipe
+from recipes.weather import Flood, Snow, Waves
 from tests.snow_scenes import box_car, drive, sheet, side_wall
 
 ROAD, BUILDING, CAR = (int(SemanticClass[name]) for name in ("ROAD", "BUILDING", "VEHICLE"))
@@ -48,9 +47,11 @@ def snow(**options) -> Snow:
     return Snow(**({"depth_m": DEPTH_M, "cell_m": CELL_M, "tracks": "never"} | options))
 
 
-def recipe_of(weather_snow: Snow | None = None, *, smog=None, flood=None, **output) -> Recipe:
+def recipe_of(
+    weather_snow: Snow | None = None, *, smog=None, flood=None, **output
+) -> schema_Recipe:
     weather = Weather(snow=weather_snow, smog=smog, flood=flood)
-    return Recipe(weather=weather, output=Output(**({"semantic": True} | output)))
+    return schema_Recipe(weather=weather, output=Output(**({"semantic": True} | output)))
 
 
 def view_of(scene: Scene, weather_snow: Snow | None = None, frame=0, backend="auto", **options):

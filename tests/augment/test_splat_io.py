@@ -18,16 +18,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from augment.errors import OutputError, SceneError
-from augment.files.ply_io import iterate_rows, read_ply_header
-from augment.scene import Gaussians
-from augment.splat_io import (
+from augment.files.ply import (
+    iterate_rows,
     read_ply,
+    read_ply_header,
     read_splat,
     read_splats,
     recentring_origin,
     write_ply,
     write_splat,
 )
+from augment.scene import Gaussians
 
 BASIC = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2",
          "rot_0", "rot_1", "rot_2", "rot_3"]  # fmt: skip

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from augment.squares import any_in_squares
+from augment.geometry import any_in_squares
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (16, 16), (17, 31), (5, 40), (48, 7), (64, 96)])

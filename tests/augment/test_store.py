@@ -9,11 +9,10 @@ from pathlib import Path
 import pytest
 from s3_server import s3_server
 
-from augment.batch import local_store
-from augment.batch.atomic import TEMPORARY_SUFFIX
-from augment.batch.local_store import LocalStore
-from augment.batch.store import StoredFileMissing, open_store
 from augment.errors import OutputError
+from augment.jobs import store as local_store
+from augment.jobs.atomic import TEMPORARY_SUFFIX
+from augment.jobs.store import LocalStore, StoredFileMissing, open_store
 
 
 @pytest.fixture(scope="module")

@@ -9,10 +9,9 @@ import time
 import pytest
 from s3_server import s3_server
 
-from augment.batch.remote_errors import advice, is_permanent
-from augment.batch.remote_store import Patience, RemoteStore
-from augment.batch.store import StoredFileMissing, open_store
 from augment.errors import OutputError
+from augment.jobs.remote_store import Patience, RemoteStore, advice, is_permanent
+from augment.jobs.store import StoredFileMissing, open_store
 
 BIG = b"0123456789" * 1_100_000  # two parts of an upload
 QUICK = Patience(attempts=4, first_wait_s=0.001, longest_wait_s=0.002, timeout_s=5.0)

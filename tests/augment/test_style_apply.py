@@ -7,17 +7,24 @@ import torch
 from fitted_scenes import fitted_scene
 from scenes import camera_ahead, random_gaussians
 
-from augment.color_waves import ColorWaves
-from augment.render import gpu
+from augment.effects.style.color_maps import (
+    CLASSES,
+    StyleMaps,
+    identity_map,
+    map_sh,
+    style_actor,
+    style_gaussians,
+    style_sky,
+    styled_scene,
+)
+from augment.effects.style.style import identity_maps
 from augment.render.composite import composite_sky, map_colors
+from augment.render.cuda import runtime as gpu
 from augment.render.rasterize import rasterize
 from augment.render.sh import SH_C0, evaluate_sh
 from augment.render.threads import limit_threads
-from augment.scene import Actor, PosedGaussians, Track
+from augment.scene import Actor, ColorWaves, PosedGaussians, Track
 from augment.sky import ConstantSky, CubemapSky, LatLongSky
-from augment.style.apply import map_sh, style_actor, style_gaussians, style_sky, styled_scene
-from augment.style.maps import CLASSES, StyleMaps, identity_map
-from augment.style.scene_maps import identity_maps
 from tests.augment.pretend_gpu import pretended_gpu
 
 

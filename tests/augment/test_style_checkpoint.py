@@ -8,15 +8,15 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from augment.errors import StyleError
-from augment.style.checkpoint import (
+from augment.effects.style.network import (
     METADATA_KEY,
     SHIPPED,
+    Gscm,
     load_network,
     network_facts,
     save_network,
 )
-from augment.style.network import Gscm
+from augment.errors import StyleError
 
 
 def different(**options) -> Gscm:

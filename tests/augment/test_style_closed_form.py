@@ -6,26 +6,24 @@ import numpy as np
 import pytest
 import torch
 
-from augment.semantics import SemanticClass
-from augment.style.closed_form import (
+from augment.effects.style.color_maps import CLASSES, with_strength
+from augment.effects.style.statistics import (
+    LAND,
     LAND_LIMITS,
+    REST,
+    ROAD,
+    SKY,
     SKY_LIMITS,
+    VEGETATION,
+    WHOLE,
+    ColorStatistics,
     Limits,
     closed_maps,
     mkl_map,
     reinhard_map,
-)
-from augment.style.maps import CLASSES, with_strength
-from augment.style.statistics import (
-    LAND,
-    REST,
-    ROAD,
-    SKY,
-    VEGETATION,
-    WHOLE,
-    ColorStatistics,
     statistics_of,
 )
+from augment.semantics import SemanticClass
 
 # Nothing of the limits acts on ordinary statistics with these; the floor is far below any spread.
 FREE = Limits(floor=1e-9, most_gain=1e6, least_gain=1e-6, least_contrast=1e-6)

@@ -12,19 +12,19 @@ from scenes import camera_ahead, one_gaussian, random_gaussians
 from snow_scenes import box_car, drive, sheet, wall
 
 from augment.cameras import Frame
-from augment.render.threads import limit_threads
-from augment.scene import Gaussians, Scene
-from augment.semantics import SemanticClass
-from augment.sky import ConstantSky
-from augment.style import content
-from augment.style.content import (
+from augment.effects.style import content
+from augment.effects.style.content import (
     content_pictures,
     content_statistics,
     gaussian_statistics,
     knows_regions,
     select_views,
 )
-from augment.style.statistics import LAND, REST, ROAD, SKY, VEGETATION, WHOLE
+from augment.effects.style.statistics import LAND, REST, ROAD, SKY, VEGETATION, WHOLE
+from augment.render.threads import limit_threads
+from augment.scene import Gaussians, Scene
+from augment.semantics import SemanticClass
+from augment.sky import ConstantSky
 
 ROAD_RGB, HEDGE_RGB, SKY_RGB = (0.3, 0.32, 0.35), (0.1, 0.4, 0.05), (0.5, 0.7, 0.9)
 

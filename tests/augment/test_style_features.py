@@ -7,9 +7,8 @@ import torch
 import torch.nn.functional as F
 from safetensors.torch import save_file
 
+from augment.effects.style.losses import FilterBank, Vgg19, load_vgg19, open_features, style_loss
 from augment.errors import StyleError
-from augment.style.features import FilterBank, Vgg19, load_vgg19, open_features
-from augment.style.losses import style_loss
 
 NARROW = 1 / 32  # of VGG-19's channels: 2, 4, 8 and 16
 

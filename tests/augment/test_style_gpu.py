@@ -7,14 +7,19 @@ import torch
 
 pytest.importorskip("triton")
 
-from augment.render import gpu
-from augment.style.features import FilterBank
-from augment.style.pairs import recolor
-from augment.style.scene_views import folded_pictures, rendered_pictures
-from augment.style.train_config import StyleTrainConfig
-from augment.style.train_pairs import pair_loss_of
-from augment.style.train_pool import TrainingPool, generator_for, scene_contents
-from augment.style.trainer import StyleTrainer, new_network
+from augment.effects.style.losses import FilterBank
+from augment.effects.style.pairs import recolor
+from augment.effects.style.scene_views import folded_pictures, rendered_pictures
+from augment.effects.style.train import (
+    StyleTrainConfig,
+    StyleTrainer,
+    TrainingPool,
+    generator_for,
+    new_network,
+    pair_loss_of,
+    scene_contents,
+)
+from augment.render.cuda import runtime as gpu
 from tests.augment.pretend_gpu import AwayTensor, pretended_gpu
 from tests.augment.test_style_trainer import SIZE, photos, tiny_scene
 

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 from style_files import cmyk_jpeg, png, with_orientation
 
+from augment.effects.style import images
+from augment.effects.style.images import SIDE_PX, StyleImage, image_statistics, read_style_image
+from augment.effects.style.statistics import LAND, REST, ROAD, SKY, VEGETATION, WHOLE, statistics_of
 from augment.errors import StyleError
-from augment.style import images
-from augment.style.images import SIDE_PX, StyleImage, image_statistics, read_style_image
-from augment.style.statistics import LAND, REST, ROAD, SKY, VEGETATION, WHOLE, statistics_of
 
 RED, BLUE = (255, 0, 0), (0, 0, 255)
 

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from augment.style.losses import (
+from augment.effects.style.losses import (
     GaussianColors,
     color_distance,
     moments,

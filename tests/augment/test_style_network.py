@@ -5,10 +5,17 @@ from __future__ import annotations
 import pytest
 import torch
 
+from augment.effects.style.network import (
+    FLOOR_STD,
+    B0Encoder,
+    Gscm,
+    apply_map,
+    compose,
+    gscm_map,
+    image_moments,
+    load_imagenet_weights,
+)
 from augment.errors import StyleError
-from augment.style.encoder import B0Encoder, load_imagenet_weights
-from augment.style.moments import FLOOR_STD, image_moments
-from augment.style.network import Gscm, apply_map, compose, gscm_map
 
 
 def pictures(count: int, seed: int = 0, px: int = 256) -> torch.Tensor:

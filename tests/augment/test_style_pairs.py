@@ -7,16 +7,18 @@ from dataclasses import replace
 import pytest
 import torch
 
-from augment.style.network import Gscm
-from augment.style.pair_losses import PairWeights, pair_losses, weighted
-from augment.style.pairs import (
+from augment.effects.style.network import Gscm
+from augment.effects.style.pairs import (
     GREY,
     PairBatch,
+    PairWeights,
     Recoloring,
     RecolorSettings,
+    pair_losses,
     recolor,
     sample_pairs,
     sample_recolorings,
+    weighted,
 )
 
 STILL = RecolorSettings(*[0.0] * 11)

@@ -5,11 +5,10 @@ import itertools
 import numpy as np
 import pytest
 
+from augment.effects.style.statistics import LAND, SKY, WHOLE, closed_maps, statistics_of
+from augment.effects.style.style import SHARES, parse_statistics, preset_statistics, together
 from augment.errors import StyleError
-from augment.style.closed_form import closed_maps
-from augment.style.presets import SHARES, parse_statistics, preset_statistics, together
-from augment.style.statistics import LAND, SKY, WHOLE, statistics_of
-from recipes.style_presets import style_preset_names, style_preset_text
+from recipes.weather import style_preset_names, style_preset_text
 
 NAMES = style_preset_names()
 GOOD = """

@@ -9,16 +9,17 @@ import torch
 from fitted_scenes import fitted_scene
 from snow_scenes import drive, sheet, wall
 
+from augment.effects.style import content
+from augment.effects.style import network as checkpoint
+from augment.effects.style import style as scene_maps
+from augment.effects.style.color_maps import CLASSES, StyleMaps, identity_map, styled_scene
+from augment.effects.style.content import content_pictures, content_statistics
+from augment.effects.style.images import StyleImage
+from augment.effects.style.network import Gscm
+from augment.effects.style.statistics import LAND, SKY
+from augment.effects.style.style import identity_maps, remember_maps, style_maps
 from augment.errors import StyleError
-from augment.style import checkpoint, content, scene_maps
-from augment.style.apply import styled_scene
-from augment.style.content import content_pictures, content_statistics
-from augment.style.images import StyleImage
-from augment.style.maps import CLASSES, StyleMaps, identity_map
-from augment.style.network import Gscm
-from augment.style.scene_maps import identity_maps, remember_maps, style_maps
-from augment.style.statistics import LAND, SKY
-from recipes.style import Style
+from recipes.weather import Style
 
 
 def colourful() -> object:
@@ -133,7 +134,7 @@ def test_the_network_gives_one_map_for_all(photo, network):
 
 
 def test_a_scene_is_looked_at_once_for_all_styles(photo, network, monkeypatch):
-    from augment.style import network as net
+    from augment.effects.style import network as net
 
     looked = []
     original = net.content_side
@@ -153,8 +154,8 @@ def test_a_scene_is_looked_at_once_for_all_styles(photo, network, monkeypatch):
 def test_the_networks_gains_are_limited(photo, network, monkeypatch, gain):
     """A map that is too steep is flattened about the content's mean."""
     color_map = torch.cat([gain * torch.eye(3), torch.full((3, 1), 0.1)], 1)
-    monkeypatch.setattr("augment.style.network.content_side", lambda *_: identity_map())
-    monkeypatch.setattr("augment.style.network.style_side", lambda *_: color_map)
+    monkeypatch.setattr("augment.effects.style.network.content_side", lambda *_: identity_map())
+    monkeypatch.setattr("augment.effects.style.network.style_side", lambda *_: color_map)
     scene = colourful()
     style = Style(image=str(photo), method="gscm", checkpoint=str(network))
     found = style_maps(scene, style).sky
@@ -169,7 +170,7 @@ def test_the_networks_gains_are_limited(photo, network, monkeypatch, gain):
 
 def test_a_network_without_a_finite_map_says_so(photo, network, monkeypatch):
     monkeypatch.setattr(
-        "augment.style.network.style_side", lambda *_: torch.full((3, 4), float("nan"))
+        "augment.effects.style.network.style_side", lambda *_: torch.full((3, 4), float("nan"))
     )
     style = Style(image=str(photo), method="gscm", checkpoint=str(network))
     with pytest.raises(StyleError, match=r"no finite map.*use another checkpoint"):

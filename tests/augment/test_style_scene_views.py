@@ -7,11 +7,7 @@ import torch
 from scenes import camera_ahead, one_gaussian, random_gaussians, sh_of, smooth_gaussians, stack
 
 from augment.cameras import Frame
-from augment.errors import SceneError
-from augment.render.sh import SH_C0, sh_basis
-from augment.scene import Actor, Gaussians, Scene
-from augment.sky import ConstantSky
-from augment.style.scene_views import (
+from augment.effects.style.scene_views import (
     colors_of,
     folded_pictures,
     map_sh,
@@ -20,7 +16,10 @@ from augment.style.scene_views import (
     spread_cameras,
     views_of,
 )
-from augment.track import Track
+from augment.errors import SceneError
+from augment.render.sh import SH_C0, sh_basis
+from augment.scene import Actor, Gaussians, Scene, Track
+from augment.sky import ConstantSky
 
 MILD = torch.tensor([[0.8, 0.1, 0.0, 0.05], [0.05, 0.7, 0.1, 0.1], [0.0, 0.15, 0.75, 0.02]])
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from augment.style.network import Gscm
-from augment.style.scores import (
+from augment.effects.style.network import Gscm
+from augment.effects.style.scores import (
     closed_method,
     identity_method,
     least_squares_limit,

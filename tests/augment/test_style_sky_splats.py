@@ -6,16 +6,22 @@ import numpy as np
 import pytest
 import torch
 
-from augment.apply import render_view
+from augment.effects.style.color_maps import (
+    CLASSES,
+    LEVELS,
+    StyleMaps,
+    level_maps,
+    map_rows,
+    sky_levels,
+    style_gaussians,
+    styled_scene,
+)
+from augment.effects.style.style import look_of, remember_maps
 from augment.scene import Gaussians, Scene
 from augment.sky import ConstantSky
-from augment.style.apply import style_gaussians, styled_scene
-from augment.style.looks import look_of
-from augment.style.maps import CLASSES, StyleMaps
-from augment.style.scene_maps import remember_maps
-from augment.style.sky_splats import LEVELS, level_maps, map_rows, sky_levels
-from recipes.schema import Recipe
-from recipes.style import Style
+from augment.views import render_view
+from recipes.schema import schema_Recipe
+from recipes.weather import Style
 from tests.scenes import one_gaussian, stack
 from tests.snow_scenes import drive, sheet
 
@@ -102,8 +108,8 @@ def test_the_halo_changes_with_the_sky_in_pictures_and_in_styled_scenes():
     look = look_of(scene, STYLE)
     rows = look.on(scene.parts_for(camera))[0].color_rows
     assert rows is not None and rows[-2:].tolist() == [LEVELS, 0] and not rows[:-2].any()
-    fused = render_view(scene, camera, Recipe(style=STYLE))
-    folded = render_view(styled_scene(scene, maps()), camera, Recipe())
+    fused = render_view(scene, camera, schema_Recipe(style=STYLE))
+    folded = render_view(styled_scene(scene, maps()), camera, schema_Recipe())
     assert np.abs(fused.rgb.astype(int) - folded.rgb).max() <= 1
     colors = (styled_scene(scene, maps()).background.sh[-2:, 0] * 0.28209479 + 0.5).tolist()
     np.testing.assert_allclose(colors, [[0.9, 0.1, 0.1], [0.1, 0.9, 0.1]], atol=1e-5)

@@ -9,20 +9,26 @@ import torch
 from scenes import camera_ahead, random_gaussians
 
 from augment.cameras import Frame
+from augment.effects.style.losses import FilterBank, GaussianColors
+from augment.effects.style.network import Gscm, apply_map
+from augment.effects.style.pairs import PairWeights, recolor
+from augment.effects.style.scores import score_photos, score_training
+from augment.effects.style.train import (
+    StyleTrainConfig,
+    StyleTrainer,
+    TrainingPool,
+    generator_for,
+    new_network,
+    pair_loss_of,
+    paper_terms,
+    read_photos,
+    scene_contents,
+    stacked,
+    transfer_maps,
+)
 from augment.errors import StyleError
 from augment.scene import Scene
 from augment.sky import ConstantSky
-from augment.style.features import FilterBank
-from augment.style.losses import GaussianColors
-from augment.style.network import Gscm, apply_map
-from augment.style.pair_losses import PairWeights
-from augment.style.pairs import recolor
-from augment.style.train_config import StyleTrainConfig
-from augment.style.train_pairs import pair_loss_of
-from augment.style.train_photos import read_photos
-from augment.style.train_pool import TrainingPool, generator_for, scene_contents, stacked
-from augment.style.train_scores import score_photos, score_training
-from augment.style.trainer import StyleTrainer, new_network, paper_terms, transfer_maps
 
 SIZE = 16
 

@@ -8,22 +8,19 @@ import numpy as np
 import pytest
 import torch
 
-from augment.apply import render_buffers, render_view
 from augment.dataset import SceneDataset
+from augment.effects.snow.snow import cover_of
+from augment.effects.style import style as scene_maps
+from augment.effects.style.color_maps import CLASSES, StyleMaps
+from augment.effects.style.style import Look, look_of, remember_maps, style_maps
 from augment.plan import make_plan
-from augment.render import gpu
+from augment.render.cuda import runtime as gpu
 from augment.render.rasterize import rasterize
 from augment.scene import PosedGaussians, Scene
 from augment.semantics import SemanticClass
-from augment.snow.covers import cover_of
-from augment.style import scene_maps
-from augment.style.looks import Look, look_of
-from augment.style.maps import CLASSES, StyleMaps
-from augment.style.scene_maps import remember_maps, style_maps
-from recipes.flood import Flood, Waves
-from recipes.schema import Output, Recipe, Smog, Weather
-from recipes.snow import Snow
-from recipes.style import Style
+from augment.views import render_buffers, render_view
+from recipes.schema import Output, Smog, Weather, schema_Recipe
+from recipes.weather import Flood, Snow, Style, Waves
 from tests.augment.pretend_gpu import pretended_gpu
 from tests.snow_scenes import box_car, drive, sheet, side_wall
 
@@ -61,12 +58,12 @@ def camera_of(scene: Scene, frame: int = 0):
     return scene.frames[frame].cameras["ahead"]
 
 
-def recipe_of(style: Style | None = STYLE, *, classes: bool = True, **weather) -> Recipe:
+def recipe_of(style: Style | None = STYLE, *, classes: bool = True, **weather) -> schema_Recipe:
     output = Output(semantic=classes, instance=classes)
-    return Recipe(style=style, weather=Weather(**weather), output=output)
+    return schema_Recipe(style=style, weather=Weather(**weather), output=output)
 
 
-def buffers_of(scene: Scene, recipe: Recipe, backend: str = "auto"):
+def buffers_of(scene: Scene, recipe: schema_Recipe, backend: str = "auto"):
     return render_buffers(scene, camera_of(scene), make_plan(recipe, scene), backend=backend)
 
 
@@ -74,7 +71,7 @@ def mapped(rgb: torch.Tensor, color_map: torch.Tensor) -> torch.Tensor:
     return rgb @ color_map[:, :3].T + color_map[:, 3]
 
 
-def ran(scene: Scene, recipe: Recipe) -> dict[str, bool]:
+def ran(scene: Scene, recipe: schema_Recipe) -> dict[str, bool]:
     return {step.name: step.runs for step in make_plan(recipe, scene).steps}
 
 

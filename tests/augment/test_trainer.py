@@ -10,22 +10,22 @@ import numpy as np
 import pytest
 import torch
 
-from augment.apply import render_buffers
 from augment.cameras import Camera, Frame
 from augment.geometry import rigid, rotmat_from_quat
 from augment.plan import make_plan
 from augment.reconstruct.config import DensifyConfig, FitConfig, LearningRates, LossWeights
-from augment.reconstruct.forces import part_forces
 from augment.reconstruct.loss import picture
+from augment.reconstruct.poses import part_forces
 from augment.reconstruct.trainer import Trainer
 from augment.reconstruct.view import RecordedView, ViewKey, ViewSource
 from augment.render.composite import quantise
-from augment.render.cpu_backward import Tape
+from augment.render.cpu.backward import Tape
 from augment.render.layout import BLOCK
 from augment.render.threads import limit_threads
 from augment.scene import Actor, Gaussians, Scene, Track
 from augment.sky import ConstantSky, CubemapSky, cubemap_coordinates
-from recipes.schema import Output, Recipe
+from augment.views import render_buffers
+from recipes.schema import Output, schema_Recipe
 from tests.scenes import camera_ahead, random_gaussians
 
 WIDTH, HEIGHT = 41, 29
@@ -33,7 +33,7 @@ FRAME_NS = 100_000_000
 FRAMES = 4
 HELD_OUT = 2
 GAIN = {"left": 1.0, "right": 0.9}  # the right camera records everything darker
-PLAN = Recipe(output=Output(depth="expected"))
+PLAN = schema_Recipe(output=Output(depth="expected"))
 ARRAYS = ("means", "quats", "scales", "opacities", "sh")
 QUICK = FitConfig(
     steps=120,

@@ -9,15 +9,14 @@ import pytest
 import torch
 
 from augment.cameras import Camera
+from augment.effects.flood import water as water_module
+from augment.effects.flood.flood import FloodMedium, Layer, reflectance
+from augment.effects.flood.refraction import is_smooth, smooth_variance
+from augment.effects.flood.screen_space import ScreenReflection
+from augment.effects.flood.waves import WaveField, WaveSet
+from augment.effects.smog import SmogMedium, blend_airlight, optical_depth
 from augment.geometry import invert_rigid
 from augment.sky import ConstantSky, CubemapSky, LatLongSky
-from augment.weather import water as water_module
-from augment.weather.flood import FloodMedium, Layer
-from augment.weather.fresnel import reflectance
-from augment.weather.screen_space import ScreenReflection
-from augment.weather.smog import SmogMedium, blend_airlight, optical_depth
-from augment.weather.water_surface import is_smooth, smooth_variance
-from augment.weather.waves import WaveField, WaveSet
 from tests.augment.flood_programs import few_programs
 
 NONE = np.zeros(0)

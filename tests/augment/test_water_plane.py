@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from augment.cameras import Camera
-from augment.geometry import rigid, rotmat_from_quat
-from augment.weather.water_plane import (
+from augment.effects.flood.water_plane import (
     Margins,
     Window,
     mirrored_camera,
@@ -16,6 +15,7 @@ from augment.weather.water_plane import (
     plane_depth,
     plane_window,
 )
+from augment.geometry import rigid, rotmat_from_quat
 from tests.scenes import camera_ahead
 
 

@@ -7,19 +7,21 @@ import pytest
 import torch
 
 from augment.cameras import Camera
-from augment.geometry import rigid
-from augment.render.threads import limit_threads
-from augment.weather import waves_kernels
-from augment.weather.wave_field import FARTHEST_M, wave_field
-from augment.weather.wave_spectrum import MOST_STEEPNESS, make_waves
-from augment.weather.waves import (
+from augment.effects.flood import kernels as waves_kernels
+from augment.effects.flood.waves import (
+    FARTHEST_M,
     GRAVITY_MPS2,
+    MOST_STEEPNESS,
     WaveSet,
     displaced_surface,
+    make_waves,
     turns_at,
+    wave_field,
     wave_normals,
 )
-from recipes.flood import Wave, Waves
+from augment.geometry import rigid
+from augment.render.threads import limit_threads
+from recipes.weather import Wave, Waves
 
 NOW = 1_700_000_000_123_456_789  # a timestamp of today's recordings
 RMS_SLOPES = {"calm": 0.012, "breeze": 0.04, "wind": 0.09}

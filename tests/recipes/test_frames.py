@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recipes.frames import parse_frames
+from recipes.schema import parse_frames
 
 TEN = range(10)
 

@@ -7,18 +7,18 @@ from pathlib import Path
 
 import pytest
 
-from recipes.documentation import field_table
 from recipes.errors import RecipeError
-from recipes.fields import ROOT
+from recipes.json_schema import field_table
 from recipes.load import preset_names
 from recipes.parse import parse_recipe
-from recipes.style_presets import style_preset_names
+from recipes.template import ROOT
+from recipes.weather import style_preset_names
 
 PAGE = (Path(__file__).parents[2] / "docs" / "recipes.md").read_text(encoding="utf-8")
 
 
 def test_the_table_of_fields_is_the_schemas() -> None:
-    """To renew it, replace the end of the page by recipes.documentation.field_table()."""
+    """To renew it, replace the end of the page by recipes.json_schema.field_table()."""
     assert PAGE.endswith(field_table())
 
 

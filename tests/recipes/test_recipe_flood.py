@@ -9,9 +9,9 @@ import pytest
 from pydantic import ValidationError
 
 from recipes.errors import RecipeError
-from recipes.flood import MOST_WAVES, PURE_WATER_PER_M, Flood, Wave, Waves
 from recipes.parse import parse_recipe
-from recipes.values import Channels, Choice, Fixed, TripleLine, Uniform
+from recipes.template import Channels, Choice, Fixed, TripleLine, Uniform
+from recipes.weather import MOST_WAVES, PURE_WATER_PER_M, Flood, Wave, Waves
 
 
 def problems(text: str) -> tuple[str, ...]:

@@ -5,11 +5,10 @@ from __future__ import annotations
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from recipes.dump import dump_recipe
 from recipes.errors import RecipeError
-from recipes.fields import ROOT
+from recipes.load import dump_recipe
 from recipes.parse import parse_recipe
-from recipes.template import RecipeTemplate
+from recipes.template import ROOT, RecipeTemplate
 
 KEYS = sorted(
     {key for section in ROOT.walk() for key in section.known}

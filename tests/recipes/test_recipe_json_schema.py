@@ -9,12 +9,11 @@ from typing import Any
 import pytest
 import yaml
 
-from recipes.dump import dump_recipe
 from recipes.errors import RecipeError
-from recipes.fields import ROOT
 from recipes.json_schema import DIALECT, recipe_json_schema, write_schema
-from recipes.load import load_recipe, preset_names
+from recipes.load import dump_recipe, load_recipe, preset_names
 from recipes.parse import parse_recipe
+from recipes.template import ROOT
 
 
 @pytest.fixture(scope="module")

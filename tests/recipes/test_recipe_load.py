@@ -81,7 +81,7 @@ def test_a_file_without_permission(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 
 def test_recipes_need_neither_torch_nor_the_library() -> None:
-    code = "import sys, recipes.load, recipes.dump, recipes.json_schema; print(*sys.modules)"
+    code = "import sys, recipes.load, recipes.load, recipes.json_schema; print(*sys.modules)"
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert not {"torch", "numpy", "augment", "adapters", "tools"} & set(ran.stdout.split())
 

@@ -6,7 +6,7 @@ import pytest
 
 from recipes.errors import MAX_SHOWN, RecipeError
 from recipes.parse import parse_recipe
-from recipes.values import Channels, Choice, Fixed, LogUniform, Normal, TripleLine, Uniform
+from recipes.template import Channels, Choice, Fixed, LogUniform, Normal, TripleLine, Uniform
 
 
 def problems(text: str) -> tuple[str, ...]:

@@ -8,12 +8,11 @@ from typing import Any
 import pytest
 from pydantic import BaseModel, ValidationError
 
-from recipes.dump import dump_recipe
 from recipes.errors import RecipeError
+from recipes.load import dump_recipe
 from recipes.parse import parse_recipe
-from recipes.snow import Snow, SnowLight, SnowWind
-from recipes.template import RecipeTemplate
-from recipes.values import Choice, Fixed, Uniform
+from recipes.template import Choice, Fixed, RecipeTemplate, Uniform
+from recipes.weather import Snow, SnowLight, SnowWind
 
 
 def problems(text: str) -> tuple[str, ...]:

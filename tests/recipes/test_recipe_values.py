@@ -9,10 +9,10 @@ from statistics import NormalDist
 
 import pytest
 
-from recipes.sampler import Draws
-from recipes.values import (
+from recipes.template import (
     Channels,
     Choice,
+    Draws,
     Fixed,
     LogUniform,
     Normal,

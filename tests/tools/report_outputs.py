@@ -10,14 +10,11 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from augment.batch.columns import parquet_bytes
-from augment.batch.encode import encode_depth, encode_ids, encode_image
-from augment.batch.label_files import FrameBoxes, boxes_bytes
-from augment.batch.layout import PATH_KINDS
-from augment.batch.manifest import rows_to_table, write_manifest
-from augment.batch.smog_labels import SMOG_TABLE, BoxSmog
-from augment.batch.snow_labels import SNOW_TABLE, BoxSnow
-from augment.batch.water_labels import WATER_TABLE, BoxWater
+from augment.jobs.box_tables import SMOG_TABLE, SNOW_TABLE, WATER_TABLE, BoxSmog, BoxSnow, BoxWater
+from augment.jobs.files import encode_depth, encode_ids, encode_image
+from augment.jobs.layout import PATH_KINDS
+from augment.jobs.manifest import rows_to_table, write_manifest
+from augment.jobs.tables import FrameBoxes, boxes_bytes, parquet_bytes
 from augment.labels import Boxes
 from recipes.schema import Output
 

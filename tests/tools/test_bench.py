@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from augment.render.reference_project import project_parts
+from augment.render.reference import project_parts
 from augment.scene import PosedGaussians
 from tools import bench
 from tools.bench import STAGES, Spread, bench_raster, bench_text

@@ -3,7 +3,7 @@ import math
 
 import pytest
 
-from augment.weather import flood_view
+from augment.effects.flood import flood_view
 from tests.streets import SMALL_STREET, open_street
 from tools import bench_commands, bench_flood
 from tools.bench_flood import FloodCase, flood_text

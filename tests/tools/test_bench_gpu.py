@@ -17,8 +17,12 @@ import torch
 from augment.errors import BackendUnavailable
 from augment.ground_heights import Ground
 from augment.render.constants import RasterSettings
-from augment.render.reference import blend_weights, order_by_depth, rasterize_reference
-from augment.render.reference_project import project_parts
+from augment.render.reference import (
+    blend_weights,
+    order_by_depth,
+    project_parts,
+    rasterize_reference,
+)
 from augment.scene import PosedGaussians
 from tests.snow_scenes import drive, sheet, wall
 from tools import bench_gpu, bench_gpu_frames, bench_gpu_raster, bench_gpu_scene
@@ -120,7 +124,7 @@ def test_ceilings_are_work_over_time():
 
 @pytest.mark.parametrize("stop", [1e-4, 0.05])
 def test_blends_are_those_of_the_definition(stop):
-    from augment.render import cuda
+    from augment.render.cuda import driver as cuda
     from tools.bench_gpu_floor import noted_passes
 
     gaussians, camera = random_scene(RasterCase(60, 20, 17))

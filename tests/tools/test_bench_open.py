@@ -53,7 +53,7 @@ def test_the_text_has_a_row_for_every_way(result):
 def test_what_opens_apart_prints_its_figure(tmp_path, capsys):
     from fitted_scenes import fitted_scene
 
-    from augment.files.scene_files import save_scene
+    from augment.files.scene_file import save_scene
 
     save_scene(fitted_scene(), tmp_path / "scene")
     bench_open.main([json.dumps({"uri": f"scene:{tmp_path / 'scene'}", "what": "time"})])

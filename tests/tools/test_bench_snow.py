@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from adapters.base import parse_uri
-from adapters.street.truth import open_truth
+from adapters.street.labels import open_truth
+from augment.effects.snow.cells import FLUSH, SnowCells
 from augment.semantics import SemanticClass
-from augment.snow.cells import FLUSH, SnowCells
 from tests.streets import SMALL_STREET, open_street
 from tools import bench_commands, bench_snow
 from tools.bench_snow import SnowCase

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from augment.cameras import Camera
-from augment.quality.trial import Trial
-from recipes.knobs import knobs_of
+from augment.jobs.quality import Trial
+from recipes.schema import knobs_of
 from tests.streets import SMALL_STREET, open_street
 from tools import bench_trade, trade_cases, trade_measure
 from tools.trade_cases import (

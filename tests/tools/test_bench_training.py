@@ -219,7 +219,7 @@ def test_views_are_read_with_their_weather(folder):
 
 def test_views_without_their_clean_image_are_refused(tmp_path):
     # A case whose scene lacks a recipe cannot come from `generate`, but from another job.
-    from augment.batch.job import RenderJob, run_job
+    from augment.jobs.render_job import RenderJob, run_job
 
     run_job(RenderJob("test:0", [draw("smog", 0)], tmp_path), scene_loader=corridor, progress=False)
     with pytest.raises(OutputError, match="no image of clear-000"):

@@ -10,9 +10,9 @@ import pytest
 import torch
 
 from augment.dataset import WeatherDataset
+from augment.files.ply import write_ply
 from augment.scene import Gaussians
-from augment.splat_io import write_ply
-from recipes.frames import parse_frames
+from recipes.schema import parse_frames
 from tools.cli import main
 from tools.commands import open_with_path
 from tools.render import resolve_variants
@@ -123,16 +123,16 @@ def test_render_takes_selections_and_scale(scene_uri, recipe, tmp_path):
 
 
 def test_a_failing_image_gives_exit_code_1(scene_uri, recipe, tmp_path, monkeypatch, capsys):
-    import augment.apply
+    import augment.views
 
-    real = augment.apply.render_view
+    real = augment.views.render_view
 
     def breaks_on_the_second_frame(scene, camera, recipe, *, backend):
         if camera.timestamp_ns > 0:
             raise RuntimeError("no light")
         return real(scene, camera, recipe, backend=backend)
 
-    monkeypatch.setattr(augment.apply, "render_view", breaks_on_the_second_frame)
+    monkeypatch.setattr(augment.views, "render_view", breaks_on_the_second_frame)
     out = tmp_path / "out"
     assert main(["render", recipe, "--scene", scene_uri, "--out", str(out), "--no-sheet"]) == 1
     streams = capsys.readouterr()

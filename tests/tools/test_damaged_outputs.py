@@ -15,11 +15,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from augment.batch.columns import METADATA_KEY
-from augment.batch.job import RenderJob, run_job
 from augment.dataset import WeatherDataset
 from augment.errors import ClimateGSError
-from recipes.flood import Flood
+from augment.jobs.render_job import RenderJob, run_job
+from augment.jobs.tables import METADATA_KEY
+from recipes.weather import Flood
 from tests.augment.batch_scenes import fake_render, make_recipe, open_fake
 from tools.evaluate import evaluate_output
 from tools.pictures import draw_sheet

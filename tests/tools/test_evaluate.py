@@ -12,12 +12,11 @@ from report_outputs import make_row
 from safetensors.torch import save_file
 from walls import FRAME_NS, board_boxes, driving_camera, wall_view
 
-from augment.batch.calibration import frame_entry
-from augment.batch.encode import encode_depth, encode_ids, encode_image, encode_mask
-from augment.batch.label_files import boxes_bytes
-from augment.batch.manifest import rows_to_table, write_manifest
 from augment.cameras import Frame
 from augment.errors import OutputError
+from augment.jobs.files import encode_depth, encode_ids, encode_image, encode_mask, frame_entry
+from augment.jobs.manifest import rows_to_table, write_manifest
+from augment.jobs.tables import boxes_bytes
 from augment.metrics.lpips import ALEX, expected_shapes
 from recipes.schema import Output
 from tools.evaluate import evaluate_output

@@ -11,7 +11,7 @@ from fitted_scenes import assert_same, fitted_scene
 
 from adapters.base import open_scene
 from augment.errors import ClimateGSError, OutputError, SceneError
-from augment.files.scene_files import load_scene_parts, save_scene
+from augment.files.scene_file import load_scene_parts, save_scene
 from tools.export import export_scene
 
 

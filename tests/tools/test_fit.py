@@ -14,10 +14,10 @@ from fake_fit import Fakes, FakeTrainer
 from safetensors import SafetensorError
 
 from adapters.base import open_scene
-from adapters.recorded.depth_priors import DepthPriors
-from augment.batch.lock import OutputLock
+from adapters.training_views.depth_priors import DepthPriors
 from augment.errors import ClimateGSError, OutputError
 from augment.files.scene_schema import FORMAT
+from augment.jobs.processes import OutputLock
 from augment.reconstruct.config import FitConfig
 from augment.reconstruct.densify import densify_due
 from augment.reconstruct.view import ViewKey

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from augment.batch.atomic import write_atomic
 from augment.errors import ClimateGSError
+from augment.jobs.atomic import write_atomic
 from tools.cli import main
 from tools.generate import _ended_by_sigterm, generate_dataset, parse_shard
 

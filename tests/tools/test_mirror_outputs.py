@@ -10,15 +10,15 @@ import cv2
 import numpy as np
 import pytest
 
-from adapters import source_trees
-from augment.batch.job import RenderJob, run_job
-from augment.batch.label_files import read_lidar
-from augment.batch.manifest import read_manifest
+from adapters import detect_format as source_trees
+from augment.effects.lidar import drop_lost
 from augment.errors import AdapterError, ClimateGSError, OutputError
+from augment.jobs.manifest import read_manifest
+from augment.jobs.render_job import RenderJob, run_job
+from augment.jobs.tables import read_lidar
 from augment.labels import LidarSweep
-from augment.lidar_weather import drop_lost
 from augment.scene import Scene
-from recipes.flood import Flood
+from recipes.weather import Flood
 from tests.augment.batch_scenes import SIZE, FakeLabels, fake_render, make_recipe, open_fake
 from tests.augment.mirror_trees import contents
 from tools import render as render_tools
@@ -274,7 +274,7 @@ def test_a_stopped_copy_keeps_other_scenes(root, tmp_path, monkeypatch):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("augment.batch.mirror.link_file", stopped)
+        patch.setattr("augment.jobs.mirror.link_file", stopped)
         with pytest.raises(KeyboardInterrupt, match="run the same command again"):
             mirror_outputs(two, out, progress=False)
     mirror_outputs(two, out, progress=False)

@@ -12,8 +12,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from augment.batch.layout import MANIFEST, PATH_KINDS
-from augment.batch.manifest import LATER, rows_to_table, write_manifest
+from augment.jobs.layout import MANIFEST, PATH_KINDS
+from augment.jobs.manifest import LATER, rows_to_table, write_manifest
 from tools import pictures, sheet
 
 DRY, THIN, DEEP = ("clear-000", 0.0, math.nan), ("wet-000", 0.0, -0.05), ("wet-001", 0.0, 0.5)

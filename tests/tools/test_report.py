@@ -11,11 +11,10 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
-from augment.batch.layout import MANIFEST
-from augment.batch.local_store import LocalStore
-from augment.batch.manifest import rows_to_table
-from augment.batch.parts import publish_part
 from augment.errors import OutputError
+from augment.jobs.layout import MANIFEST
+from augment.jobs.manifest import publish_part, rows_to_table
+from augment.jobs.store import LocalStore
 from tests.tools.report_outputs import make_row, street_rows, write_output
 from tools import report
 from tools.cli import main

@@ -8,10 +8,9 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from augment.batch.box_weather import TABLES, visibility
-from augment.batch.local_store import LocalStore
-from augment.batch.manifest import rows_to_table
-from augment.batch.store import StoredFile
+from augment.jobs.manifest import rows_to_table
+from augment.jobs.store import LocalStore, StoredFile
+from augment.jobs.view_files import TABLES, visibility
 from tests.tools.report_outputs import make_row, street_rows, write_output
 from tools import report_charts, report_html, report_labels, report_pick, report_pictures
 from tools import report_summary as summary

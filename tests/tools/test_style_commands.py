@@ -5,7 +5,7 @@ import inspect
 
 import pytest
 
-from recipes.style_presets import style_preset_names
+from recipes.weather import style_preset_names
 from tools import cli, style_commands
 from tools.style_train_options import StyleTrainOptions
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from augment.style.checkpoint import save_network
+from augment.effects.style.network import save_network
 from tests.tools.test_bench_style import sheets, write_photo
 from tools import style_pictures
 from tools.bench_style_network import random_network

@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from adapters.base import open_scene
+from augment.effects.style.color_maps import style_gaussians, style_sky
+from augment.effects.style.style import style_maps
 from augment.errors import OutputError, StyleError
-from augment.files.scene_files import load_scene_parts, save_scene
-from augment.style.apply import style_gaussians, style_sky
-from augment.style.scene_maps import style_maps
-from recipes.style import Style
+from augment.files.scene_file import load_scene_parts, save_scene
+from recipes.weather import Style
 from tests.fitted_scenes import fitted_scene
 from tools.style_apply import apply_style, picture_path, style_text
 

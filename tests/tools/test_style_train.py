@@ -13,12 +13,12 @@ import torch
 
 from adapters.base import open_scene
 from augment.cameras import Camera, Frame
+from augment.effects.style.network import load_network, network_facts
+from augment.effects.style.train import StyleTrainer
 from augment.errors import ClimateGSError, OutputError, StyleError
 from augment.geometry import rigid
 from augment.scene import Gaussians, Scene
 from augment.sky import ConstantSky
-from augment.style.checkpoint import load_network, network_facts
-from augment.style.trainer import StyleTrainer
 from tools import style_ablations, style_train
 from tools.style_ablations import VARIANTS, ablation_table
 from tools.style_curves import draw_style_curves

@@ -2,7 +2,7 @@
 
 import pytest
 
-from recipes.quality import TIERS
+from recipes.schema import TIERS
 from tools.trade_docs import DOCS, PAGE, SCENES, START, document, read_tables
 from tools.trade_text import trade_markdown
 from tools.trade_tiers import INVISIBLE_FLIP, invisible_evidence, tiers_from

@@ -2,7 +2,7 @@
 
 import pytest
 
-from recipes.knobs import BY_PATH
+from recipes.schema import BY_PATH
 from tools.trade_cases import WHOLE
 from tools.trade_tiers import Unmeasured, measure_tiers, settle, tier_from
 

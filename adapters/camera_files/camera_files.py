@@ -1,0 +1,516 @@
+"""Camera files: which there are, which lies beside a scene, and their views.
+
+Read are INRIA's cameras.json, nerfstudio's transforms.json, this project's camera paths
+(`adapters.camera_files.camera_files`) and COLMAP sparse models, all told apart by their contents.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import numpy as np
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from adapters.plain_files import LARGEST, read_json
+from augment.errors import AdapterError
+from augment.jobs.manifest import MAX_SIDE_PX
+
+# ---- Views: the images of a camera file, before they are grouped into frames ---------------------
+
+_ORTHONORMAL_TOLERANCE = 1e-4  # as in Camera: poses written with four decimals or fewer fail
+
+
+@dataclass(frozen=True, eq=False)
+class PosedView:
+    """One posed image in the file's own world (its axes, its unit of length).
+
+    name: the image's name in the file. fx, fy, cx, cy: pixels. world_from_camera: float64 [4, 4],
+    OpenCV axes (x right, y down, z forward). image_path: where the image lies, if it does.
+    camera, frame: its camera's name and its frame's number where the file says; both or neither.
+    timestamp_ns: since the scene's first frame; None where the file has no times.
+    """
+
+    name: str
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    world_from_camera: np.ndarray
+    image_path: str | None = None
+    camera: str | None = None
+    frame: int | None = None
+    timestamp_ns: int | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class ViewSet:
+    """All views of a camera file, and what was wrong in it, a sentence each."""
+
+    views: tuple[PosedView, ...]
+    problems: tuple[str, ...] = ()
+
+
+def check_pose(world_from_camera: np.ndarray, *, where: str) -> np.ndarray:
+    """The pose as float64 [4, 4] with an exact last row, once it is known to be rigid.
+
+    Raises:
+        AdapterError: the rotation is not orthonormal with determinant +1, or a value not finite.
+    """
+    pose = np.asarray(world_from_camera, dtype=np.float64)
+    if not (np.abs(pose) <= LARGEST).all():  # NaN included
+        raise AdapterError(
+            f"{where}: the pose must be finite, at most {LARGEST:g}; got {pose.tolist()}"
+        )
+    rotation = pose[:3, :3]
+    with np.errstate(all="ignore"):
+        error = np.abs(rotation @ rotation.T - np.eye(3)).max()
+        determinant = np.linalg.det(rotation)
+    if error >= _ORTHONORMAL_TOLERANCE:
+        raise AdapterError(
+            f"{where}: the rotation must be orthonormal to {_ORTHONORMAL_TOLERANCE:g}; it is off "
+            f"by {error:.3g} (determinant {determinant:.3g}). Write more decimals, and take any "
+            "scale out of the matrix"
+        )
+    if determinant < 0:
+        raise AdapterError(
+            f"{where}: the rotation must have determinant +1; got {determinant:.3g}, a mirrored "
+            "camera"
+        )
+    whole = np.eye(4)
+    whole[:3] = pose[:3]
+    return whole
+
+
+def look_at_pose(
+    position: Sequence[float] | np.ndarray, target: Sequence[float] | np.ndarray, *, where: str
+) -> np.ndarray:
+    """world_from_camera of an upright camera at `position` that looks at `target` (world +z up).
+
+    Straight up or down, where upright means nothing, the top of the image points to world +y.
+
+    Raises:
+        AdapterError: the two points coincide.
+    """
+    eye, forward = np.asarray(position, np.float64), np.subtract(target, position, dtype=np.float64)
+    length = np.linalg.norm(forward)
+    if not (np.isfinite(length) and length > 1e-9):
+        raise AdapterError(
+            f"{where}: look_at must differ from position; got {list(target)} for both"
+        )
+    forward /= length
+    up = np.array([0.0, 0.0, 1.0]) if abs(forward[2]) < 1 - 1e-9 else np.array([0.0, 1.0, 0.0])
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, 0], pose[:3, 1], pose[:3, 2] = right, np.cross(forward, right), forward
+    pose[:3, 3] = eye
+    return pose
+
+
+# ------------------------------------------------------------------------------------------------
+# Cameras that other tools wrote as JSON: INRIA's cameras.json and nerfstudio's transforms.json
+
+Model = TypeVar("Model", bound=BaseModel)
+# No texts, true or false, which pydantic otherwise takes for numbers; and none beyond LARGEST.
+Number = Annotated[float, Field(strict=True, ge=-LARGEST, le=LARGEST, allow_inf_nan=False)]
+Vector = tuple[Number, Number, Number]
+Row = tuple[Number, Number, Number, Number]
+Pose = Annotated[list[Row], Field(min_length=3, max_length=4)]
+Pixels = Annotated[Number, Field(ge=1, le=MAX_SIDE_PX, multiple_of=1), AfterValidator(int)]
+Focal = Annotated[Number, Field(gt=0)]
+_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+_ERRORS_SHOWN = 5
+
+
+class _Foreign(BaseModel):
+    """Other tools' formats carry more keys than are needed here."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+
+class _InriaCamera(_Foreign):
+    img_name: str
+    width: Pixels
+    height: Pixels
+    fx: Focal
+    fy: Focal
+    cx: Number | None = None
+    cy: Number | None = None
+    position: Vector
+    rotation: tuple[Vector, Vector, Vector]
+
+
+class _InriaFile(_Foreign):
+    cameras: Annotated[list[_InriaCamera], Field(min_length=1)]
+
+
+class _Intrinsics(_Foreign):
+    """nerfstudio's, which stand at the top, in a frame, or divided between both."""
+
+    w: Pixels | None = None
+    h: Pixels | None = None
+    fl_x: Focal | None = None
+    fl_y: Focal | None = None
+    cx: Number | None = None
+    cy: Number | None = None
+    camera_angle_x: Annotated[Number, Field(gt=0, lt=math.pi)] | None = None
+    camera_model: str | None = None
+    k1: Number | None = None
+    k2: Number | None = None
+    k3: Number | None = None
+    k4: Number | None = None
+    p1: Number | None = None
+    p2: Number | None = None
+
+
+class _NerfstudioFrame(_Intrinsics):
+    file_path: str
+    transform_matrix: Pose
+
+
+class _NerfstudioFile(_Intrinsics):
+    frames: Annotated[list[_NerfstudioFrame], Field(min_length=1)]
+
+
+def validate(model: type[Model], content: object, path: Path, kind: str) -> Model:
+    """`content` as the model.
+
+    Raises:
+        AdapterError: names the first fields that do not fit, with their place and value.
+    """
+    try:
+        return model.model_validate(content)
+    except ValidationError as error:
+        lines = [
+            f"{'.'.join(map(str, e['loc'])) or 'file'}: {e['msg']} (got {str(e['input'])[:60]})"
+            for e in error.errors()[:_ERRORS_SHOWN]
+        ]
+        more = error.error_count() - len(lines)
+        raise AdapterError(
+            f"{path}: not a valid {kind}: " + "; ".join(lines) + (f"; {more} more" if more else "")
+        ) from error
+
+
+def inria_views(content: list[object], path: Path) -> ViewSet:
+    """Views of INRIA's list. Its cameras have no principal point, which is the middle then; our own
+    exports add cx and cy.
+
+    Raises:
+        AdapterError: a field is missing or out of range; names it.
+    """
+    file = validate(_InriaFile, {"cameras": content}, path, "INRIA cameras.json")
+    views = []
+    for number, camera in enumerate(file.cameras):
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = camera.rotation, camera.position
+        views.append(
+            PosedView(
+                name=camera.img_name,
+                width=camera.width,
+                height=camera.height,
+                fx=camera.fx,
+                fy=camera.fy,
+                cx=camera.width / 2 if camera.cx is None else camera.cx,
+                cy=camera.height / 2 if camera.cy is None else camera.cy,
+                world_from_camera=check_pose(pose, where=f"{path}: {number} ({camera.img_name})"),
+            )
+        )
+    return ViewSet(tuple(views))
+
+
+def nerfstudio_views(content: object, path: Path) -> ViewSet:
+    """Views of nerfstudio's frames: OpenGL axes turned to OpenCV's, lens distortion left out.
+
+    Raises:
+        AdapterError: a field is missing or out of range, or a lens with no pinhole near it.
+    """
+    file = validate(_NerfstudioFile, content, path, "nerfstudio transforms.json")
+    views = []
+    distorted: Counter[str] = Counter()
+    shared = file.model_dump(exclude={"frames"}, exclude_none=True)
+    for number, frame in enumerate(file.frames):
+        where = f"{path}: frames.{number} ({frame.file_path})"
+        own = frame.model_dump(exclude={"file_path", "transform_matrix"}, exclude_none=True)
+        lens = _Intrinsics(**(shared | own))
+        model = (lens.camera_model or "OPENCV").upper()
+        if model.startswith(("EQUIRECT", "ORTHO")):
+            raise AdapterError(f"{where}: camera_model {model} has no pinhole camera near it")
+        if "FISHEYE" in model or any(getattr(lens, name) for name in _DISTORTION):
+            distorted[model] += 1
+        opencv_from_opengl = np.diag([1.0, -1.0, -1.0, 1.0])
+        pose = np.asarray(frame.transform_matrix, dtype=np.float64)
+        pose = check_pose(np.vstack([pose[:3], [0, 0, 0, 1]]) @ opencv_from_opengl, where=where)
+        image = path.parent / frame.file_path
+        views.append(
+            PosedView(
+                name=frame.file_path,
+                **_pinhole(lens, where),
+                world_from_camera=pose,
+                image_path=str(image) if image.is_file() else None,
+            )
+        )
+    problems = [distortion_problem(str(path), n, m) for m, n in distorted.items()]
+    return ViewSet(tuple(views), tuple(problems))
+
+
+def distortion_problem(where: str, count: int, model: str) -> str:
+    """The sentence for images whose lens is not a pinhole."""
+    return (
+        f"{where}: {count} images have lens distortion (model {model}), which is left out; they "
+        "are rendered as pinhole cameras and will not line up with the distorted images"
+    )
+
+
+def _pinhole(lens: _Intrinsics, where: str) -> dict[str, Any]:
+    if lens.w is None or lens.h is None:
+        raise AdapterError(f"{where}: w and h (image size, pixels) are missing; add them")
+    fl_x = lens.fl_x
+    if fl_x is None and lens.camera_angle_x is not None:
+        fl_x = 0.5 * lens.w / math.tan(0.5 * lens.camera_angle_x)
+    if fl_x is None:
+        raise AdapterError(f"{where}: fl_x (pixels) or camera_angle_x (radians) is missing; add it")
+    return {
+        "width": lens.w,
+        "height": lens.h,
+        "fx": fl_x,
+        "fy": fl_x if lens.fl_y is None else lens.fl_y,
+        "cx": lens.w / 2 if lens.cx is None else lens.cx,
+        "cy": lens.h / 2 if lens.cy is None else lens.cy,
+    }
+
+
+# ---- Cameras of a COLMAP sparse model (cameras, images; .bin or .txt), read by pycolmap ----------
+
+_MODEL_FOLDERS = (".", "sparse/0", "sparse", "colmap/sparse/0")
+
+
+def find_colmap_model(folder: Path) -> Path | None:
+    """The folder of the sparse model in or below `folder`, or None."""
+    for name in _MODEL_FOLDERS:
+        model = folder / name
+        for suffix in (".bin", ".txt"):
+            if all((model / f"{table}{suffix}").is_file() for table in ("cameras", "images")):
+                return model
+    return None
+
+
+def read_colmap_views(model: Path) -> ViewSet:
+    """Views of the registered images. Lens distortion is left out, and said so.
+
+    Raises:
+        AdapterError: the model is damaged or holds no posed image.
+    """
+    import pycolmap  # 0.2 s and a large native library: only those who have COLMAP models pay
+
+    try:
+        reconstruction = pycolmap.Reconstruction(str(model))
+    except (ValueError, RuntimeError, IndexError) as error:
+        raise AdapterError(
+            f"{model}: pycolmap cannot read this COLMAP model: {error}. Expected cameras, images "
+            "and points3D, all .bin or all .txt"
+        ) from error
+    folder = next((f for f in _image_folders(model) if f.is_dir()), None)
+    views = []
+    distorted: Counter[str] = Counter()
+    for image in sorted(reconstruction.images.values(), key=lambda image: image.name):
+        if not image.has_pose:
+            continue
+        camera = reconstruction.cameras[image.camera_id]
+        if not camera.is_undistorted():
+            distorted[camera.model_name] += 1
+        camera_from_world = np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
+        path = folder / image.name if folder else None
+        views.append(
+            PosedView(
+                name=image.name,
+                width=camera.width,
+                height=camera.height,
+                fx=camera.focal_length_x,
+                fy=camera.focal_length_y,
+                cx=camera.principal_point_x,
+                cy=camera.principal_point_y,
+                world_from_camera=_inverse(camera_from_world, f"{model}: image {image.name}"),
+                image_path=str(path) if path and path.is_file() else None,
+            )
+        )
+    if not views:
+        raise AdapterError(f"{model}: this COLMAP model holds no image with a pose")
+    problems = [distortion_problem(str(model), n, m) for m, n in distorted.items()]
+    return ViewSet(tuple(views), tuple(problems))
+
+
+def _image_folders(model: Path) -> list[Path]:
+    """Where COLMAP projects keep the images of project/sparse/0, project/sparse or project."""
+    return [parent / "images" for parent in (model, model.parent, model.parent.parent)]
+
+
+def _inverse(camera_from_world: np.ndarray, where: str) -> np.ndarray:
+    pose = check_pose(camera_from_world, where=where)
+    inverse = np.eye(4)
+    inverse[:3, :3] = pose[:3, :3].T
+    inverse[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
+    return inverse
+
+
+# ---- The camera path: a small JSON format for poses made by hand or by a script ------------------
+#     {"width": 960, "height": 540, "fx": 600, "fy": 600, "cx": 480, "cy": 270,
+#      "frames": [{"timestamp_s": 0.0, "camera": "front",
+#                  "position": [0, 0, 1.6], "look_at": [9, 0, 1.6]},
+#                 {"timestamp_s": 0.1, "camera": "front",
+#                  "world_from_camera": [[…], […], […], […]]}]}
+#
+# Lengths and axes are those of the world the path is used in; cameras are OpenCV (x right, y down,
+# z forward). `fy` defaults to `fx`, `cx, cy` to the middle, `camera` to "camera". `timestamp_s`
+# counts from the scene's first frame, and entries of one time are one frame. Without times, the
+# n-th
+# entry of every camera is frame n, 0.1 s apart.
+
+# int64 nanoseconds reach 9.2e9 s.
+Seconds = Annotated[float, Field(strict=True, ge=-9e9, le=9e9, allow_inf_nan=False)]
+
+
+class _PathFrame(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+    timestamp_s: Seconds | None = None
+    camera: Annotated[str, Field(pattern=r"^\w[\w.-]*$", max_length=64)] = "camera"
+    position: Vector | None = None
+    look_at: Vector | None = None
+    world_from_camera: Pose | None = None
+
+    @model_validator(mode="after")
+    def _has_one_pose(self) -> _PathFrame:
+        pair = (self.position is not None, self.look_at is not None)
+        if pair != ((self.world_from_camera is None),) * 2:
+            raise ValueError("give either position and look_at, or world_from_camera")
+        return self
+
+
+class _PathFile(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+    width: Pixels
+    height: Pixels
+    fx: Focal
+    fy: Focal | None = None
+    cx: Number | None = None
+    cy: Number | None = None
+    frames: Annotated[list[_PathFrame], Field(min_length=1)]
+
+    @model_validator(mode="after")
+    def _times_are_whole(self) -> _PathFile:
+        timed = [f.timestamp_s is not None for f in self.frames]
+        if any(timed) and not all(timed):
+            raise ValueError(
+                f"timestamp_s must be in all frames or in none; it is in {sum(timed)} of "
+                f"{len(timed)} (missing first in frames.{timed.index(False)})"
+            )
+        keys = Counter((f.timestamp_s, f.camera) for f in self.frames)
+        key, most = keys.most_common(1)[0]
+        if all(timed) and most > 1:
+            raise ValueError(f"camera {key[1]!r} stands {most} times at timestamp_s {key[0]}")
+        return self
+
+
+def path_views(content: object, path: Path) -> ViewSet:
+    """Views of a camera path.
+
+    Raises:
+        AdapterError: a field is unknown, missing or out of range; names its place and value.
+    """
+    file = validate(_PathFile, content, path, "camera path")
+    times = sorted({f.timestamp_s for f in file.frames if f.timestamp_s is not None})
+    rank = {time: number for number, time in enumerate(times)}
+    seen: Counter[str] = Counter()
+    views = []
+    for number, frame in enumerate(file.frames):
+        where = f"{path}: frames.{number}"
+        if frame.position is not None and frame.look_at is not None:
+            pose = look_at_pose(frame.position, frame.look_at, where=where)
+        else:
+            pose = check_pose(np.asarray(frame.world_from_camera), where=where)
+        time = frame.timestamp_s
+        views.append(
+            PosedView(
+                name=f"frames.{number}",
+                width=file.width,
+                height=file.height,
+                fx=file.fx,
+                fy=file.fx if file.fy is None else file.fy,
+                cx=file.width / 2 if file.cx is None else file.cx,
+                cy=file.height / 2 if file.cy is None else file.cy,
+                world_from_camera=pose,
+                camera=frame.camera,
+                frame=seen[frame.camera] if time is None else rank[time],
+                timestamp_ns=None if time is None else round(time * 1e9),
+            )
+        )
+        seen[frame.camera] += 1
+    return ViewSet(tuple(views))
+
+
+# ---- files ---------------------------------------------------------------------------------------
+
+_JSON_NAMES = ("cameras.json", "transforms.json")
+
+
+def read_views(path: Path) -> ViewSet:
+    """Views of a camera file, or of a folder that holds a COLMAP model or a JSON of a known name.
+
+    Raises:
+        AdapterError: no such file, an unknown format, or a damaged one; says what was expected.
+    """
+    if not path.exists():
+        raise AdapterError(
+            f"{path}: no such file; expected an INRIA cameras.json, a nerfstudio transforms.json, "
+            "a camera path (JSON) or a COLMAP sparse model"
+        )
+    found = find_camera_file(path) if path.is_dir() else path
+    if found is None:
+        raise AdapterError(
+            f"{path}: no cameras in this folder; looked for {', '.join(_JSON_NAMES)} and a COLMAP "
+            "sparse model (cameras and images, .bin or .txt) in it, sparse/0 and sparse"
+        )
+    return read_colmap_views(found) if found.is_dir() else read_camera_json(found)
+
+
+def find_camera_file(folder: Path) -> Path | None:
+    """The camera file of a folder (a COLMAP model is itself a folder), or None."""
+    for name in _JSON_NAMES:
+        if (folder / name).is_file():
+            return folder / name
+    return find_colmap_model(folder)
+
+
+def read_camera_json(path: Path) -> ViewSet:
+    """Read any of the three JSON formats, told apart by their keys.
+
+    Raises:
+        AdapterError: not JSON, none of the formats, or a field that is missing or out of range
+            (named with its place in the file).
+    """
+    content = read_json(path, object)
+    if isinstance(content, list):
+        return inria_views(content, path)
+    frames = content.get("frames") if isinstance(content, dict) else None
+    first = frames[0] if isinstance(frames, list) and frames else None
+    if isinstance(first, dict) and "transform_matrix" in first:
+        return nerfstudio_views(content, path)
+    if isinstance(content, dict) and "frames" in content:
+        return path_views(content, path)
+    raise AdapterError(
+        f"{path}: expected a list of cameras (INRIA cameras.json), 'frames' with "
+        "'transform_matrix' (nerfstudio transforms.json), or 'frames' with 'position' and "
+        f"'look_at' or 'world_from_camera' (a camera path); got {_describe(content)}"
+    )
+
+
+def _describe(content: object) -> str:
+    if isinstance(content, dict):
+        return f"an object with keys {sorted(content)[:8]}"
+    return f"a {type(content).__name__}"

@@ -1,0 +1,271 @@
+"""Which kind of scene a path holds, told by a few names in it; nothing is opened for it but the
+first bytes of a file.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import os
+import re
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+from adapters.uri import CAMERA_PATH_KEY, GROUND_KEY, parse_uri
+from augment.errors import AdapterError
+from augment.files.scene_file import is_scene_file, is_scene_folder
+from augment.jobs.mirror_files import SourceTree
+from augment.scene import Scene
+from recipes.files import open_file
+
+# ------------------------------------------------------------------------------------------------
+# Which folder and files make up the dataset behind a scene, for copies of it in other weather
+
+_KITTI_SWEEP = r"velodyne_points/data/\d+\.bin"
+_KITTI_CAMERA = r"image_\d\d/data/\d+\.(?i:png|jpg)"
+
+
+def source_tree(scene: Scene) -> SourceTree:
+    """The dataset that the scene was made from: the one it was opened from, or recorded in.
+
+    Raises:
+        AdapterError: the scene is of no dataset, has a camera path's frames, or the dataset is not
+            where it was.
+    """
+    uri = scene.recorded_source or scene.source
+    for part in (scene.source, uri):
+        if CAMERA_PATH_KEY in parse_uri(part)[2]:
+            raise AdapterError(
+                f"{part} shows the frames of a camera path; a dataset's copy takes images of its "
+                f"own frames, leave {CAMERA_PATH_KEY} out"
+            )
+    scheme, path, query = parse_uri(uri)
+    query.pop(GROUND_KEY, None)
+    find = _TREES.get(scheme or "")
+    if find is None:
+        raise AdapterError(
+            f"{uri} has no dataset's folder that could be copied with weathered images; "
+            f"{', '.join(_TREES)} scenes have one, and scenes fitted to them"
+        )
+    if not Path(path).exists():
+        raise AdapterError(
+            f"{path}, which the scene was made from, is not there; where it has moved, say so in "
+            f"the scene's URI (data=URI)"
+        )
+    found = find(Path(os.path.abspath(path)), query)
+    entries = None if found.entries is None else tuple(sorted(found.entries))
+    return SourceTree(uri, found.root, found.images, entries, found.sweeps)
+
+
+class _Found(NamedTuple):
+    """As of SourceTree."""
+
+    root: Path
+    images: str
+    sweeps: str = r"(?!)"
+    entries: Iterable[str] | None = None
+
+
+def _pandaset(folder: Path, _query: dict[str, str]) -> _Found:
+    return _Found(folder, r"camera/[^/]+/\d+\.jpg", r"lidar/\d+\.pkl\.gz")
+
+
+def _nuscenes(folder: Path, _query: dict[str, str]) -> _Found:
+    sweeps = r"(samples|sweeps)/LIDAR_TOP/[^/]+\.pcd\.bin"
+    return _Found(folder, r"(samples|sweeps)/CAM_[^/]+/[^/]+\.jpg", sweeps)
+
+
+def _kitti(folder: Path, _query: dict[str, str]) -> _Found:
+    """A drive with the calibration beside it, in the folder of its date; or the folder itself."""
+    from adapters.kitti.layout import VELODYNE, kitti_root
+
+    if not (folder / VELODYNE).is_dir():
+        within = r"((training|testing)/)?"
+        images = rf"{within}image_\d/\d+\.(?i:png|jpg)"
+        return _Found(folder, images, rf"{within}velodyne/\d+\.bin")
+    _, calibrated = kitti_root(folder)
+    if calibrated == folder:
+        return _Found(folder, _KITTI_CAMERA, _KITTI_SWEEP)
+    calibration = (path.name for path in calibrated.glob("calib_*.txt"))
+    images, sweeps = rf"[^/]+/{_KITTI_CAMERA}", rf"[^/]+/{_KITTI_SWEEP}"
+    return _Found(calibrated, images, sweeps, (folder.name, *calibration))
+
+
+def _street_gaussians(folder: Path, _query: dict[str, str]) -> _Found:
+    return _Found(folder, r"images/[^/]+\.(png|jpg)")
+
+
+def _drivestudio(path: Path, query: dict[str, str]) -> _Found:
+    """The processed data that a run was trained on."""
+    from adapters.drivestudio.run import RunOptions, find_run
+
+    data = find_run(path, RunOptions.from_query(query)).data
+    return _Found(Path(os.path.abspath(data)), r"images/\d+_\d+\.jpg", r"lidar/\d+\.bin")
+
+
+def _recording(folder: Path, _query: dict[str, str]) -> _Found:
+    return _Found(folder, r"images/[^/]+/\d+\.(?i:png|jpe?g)", r"lidar/\d+\.parquet")
+
+
+_TREES: dict[str, Callable[[Path, dict[str, str]], _Found]] = {
+    "pandaset": _pandaset,
+    "nuscenes": _nuscenes,
+    "kitti": _kitti,
+    "street_gaussians": _street_gaussians,
+    "drivestudio": _drivestudio,
+    "recording": _recording,
+}
+
+
+# ---- signatures ----------------------------------------------------------------------------------
+
+_MOST_ENTRIES = 1000  # of a folder that are looked at below the one given
+_MAX_LISTED = 1_000_000  # names of a folder: some tenths of a second
+_MULTI_PART = b"element vertex_"  # how a Street Gaussians .ply names its parts
+
+
+@dataclass(frozen=True)
+class Signature:
+    """How one kind of scene looks. what: that in words, for messages."""
+
+    scheme: str
+    is_here: Callable[[Path], bool]
+    what: str
+
+
+def recognised(path: Path) -> str | None:
+    """The scheme of what lies at a path; None for what is not known.
+
+    Raises:
+        AdapterError: it cannot be read.
+    """
+    signatures = FILES if path.is_file() else FOLDERS
+    try:
+        return next((s.scheme for s in signatures if s.is_here(path)), None)
+    except OSError as error:
+        raise AdapterError(f"{path}: cannot be read: {error}") from error
+
+
+def looked_for(path: Path) -> str:
+    """What was looked for at a path that is not recognised, and scenes that lie below it."""
+    signatures = FILES if path.is_file() else FOLDERS
+    *most, last = (s.what for s in signatures)
+    text = f"{', '.join(most)}, or {last}"
+    if path.is_file():
+        return text
+    below = next(_scenes_below(path), None)
+    return text if below is None else f"{text}. It holds scenes: give one, such as {below}"
+
+
+def _scenes_below(folder: Path) -> Iterator[Path]:
+    for level in ("*", "*/*"):
+        for entry in sorted(itertools.islice(folder.glob(level), _MOST_ENTRIES)):
+            with contextlib.suppress(OSError, AdapterError):  # another user's
+                if entry.is_dir() and recognised(entry) is not None:
+                    yield entry
+
+
+def _is_pandaset(folder: Path) -> bool:
+    return (folder / "camera").is_dir() and (folder / "lidar").is_dir()
+
+
+def _is_nuscenes(folder: Path) -> bool:
+    versions = (name for name in _names(folder) if name.startswith("v1.0-"))
+    return any((folder / name / "scene.json").is_file() for name in versions)
+
+
+def _is_kitti(folder: Path) -> bool:
+    raw = (folder / "velodyne_points").is_dir() and any(
+        (place / "calib_cam_to_cam.txt").is_file() for place in (folder, folder.absolute().parent)
+    )
+    return raw or any(
+        (place / "calib").is_dir() and (place / "image_2").is_dir()
+        for place in (folder, folder / "training")
+    )
+
+
+def _is_street_gaussians(folder: Path) -> bool:
+    is_data = all((folder / name).is_dir() for name in ("ego_pose", "extrinsics", "track"))
+    if is_data or any(folder.glob("trained_model/iteration_*.pth")):
+        return True
+    return any(map(_is_multi_part, folder.glob("point_cloud/iteration_*/point_cloud.ply")))
+
+
+def _is_drivestudio(folder: Path) -> bool:
+    return (folder / "config.yaml").is_file() and any(folder.glob("checkpoint_*.pth"))
+
+
+def _is_street_gaussians_file(path: Path) -> bool:
+    return _is_multi_part(path) or re.fullmatch(r"iteration_\d+\.pth", path.name) is not None
+
+
+def _is_drivestudio_file(path: Path) -> bool:
+    return re.fullmatch(r"checkpoint_\w+\.pth", path.name) is not None
+
+
+def _is_recording(folder: Path) -> bool:
+    is_calibrated = (folder / "calibration.json").is_file() or any(
+        folder.glob("calibration/*.json")
+    )
+    return is_calibrated and (folder / "images").is_dir()
+
+
+def _holds_splats(folder: Path) -> bool:
+    if any(folder.glob("point_cloud/iteration_*/point_cloud.ply")):
+        return True
+    return sum(name.lower().endswith((".ply", ".splat")) for name in _names(folder)) == 1
+
+
+def _is_splat_file(path: Path) -> bool:
+    return path.suffix.lower() == ".splat" or _start_of(path)[:4] in (b"ply\n", b"ply\r")
+
+
+def _is_multi_part(path: Path) -> bool:
+    start = _start_of(path)
+    return start.startswith(b"ply") and _MULTI_PART in start
+
+
+def _start_of(path: Path) -> bytes:
+    with open_file(path) as file:
+        return file.read(4096)
+
+
+def _names(folder: Path) -> list[str]:
+    with os.scandir(folder) as entries:
+        return [entry.name for entry in itertools.islice(entries, _MAX_LISTED)]
+
+
+# In this order: a later one may fit where an earlier one does.
+FOLDERS = (
+    Signature("scene", is_scene_folder, "a scene folder (scene.json)"),
+    Signature("pandaset", _is_pandaset, "a PandaSet sequence (camera/ and lidar/)"),
+    Signature("nuscenes", _is_nuscenes, "a nuScenes dataset (v1.0-*/scene.json)"),
+    Signature(
+        "street_gaussians",
+        _is_street_gaussians,
+        "a Street Gaussians model (trained_model/iteration_N.pth) or its dataset (ego_pose/, "
+        "extrinsics/, track/)",
+    ),
+    Signature("drivestudio", _is_drivestudio, "a drivestudio run (config.yaml, checkpoint_*.pth)"),
+    Signature(
+        "kitti",
+        _is_kitti,
+        "a KITTI drive (velodyne_points/, calib_cam_to_cam.txt in it or above) or object folder "
+        "(calib/ and image_2/)",
+    ),
+    Signature("recording", _is_recording, "a recording (calibration.json and images/)"),
+    Signature(
+        "gaussians",
+        _holds_splats,
+        "a trained 3DGS model (point_cloud/iteration_N/point_cloud.ply) or a single .ply or "
+        ".splat file in it",
+    ),
+)
+FILES = (
+    Signature("scene", is_scene_file, "a scene file (.climategs)"),
+    Signature("street_gaussians", _is_street_gaussians_file, "iteration_N.pth of Street Gaussians"),
+    Signature("drivestudio", _is_drivestudio_file, "checkpoint_*.pth of drivestudio"),
+    Signature("gaussians", _is_splat_file, "a .ply or .splat file"),
+)

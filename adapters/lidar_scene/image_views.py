@@ -1,0 +1,206 @@
+"""What the recorded images show of surfels and sky: one pass over all images of a drive."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from tqdm import tqdm
+
+from adapters.lidar_scene import kernels
+from adapters.lidar_scene.kernels import SkyGatherer
+from adapters.lidar_scene.split import ObjectTrack
+from adapters.lidar_scene.surfels import Surfels
+from adapters.plain_files import decode_image
+from augment.cameras import Camera
+
+logger = logging.getLogger(__name__)
+
+DEPTH_WIDTH = 480  # columns of the z-buffers
+DISC_PER_SPACING = 0.75  # radius of a disc in units of the spacing: neighbours overlap
+_LEVELS = 5
+_KEEP_SCORE = 0.5  # part of a camera's best score from which its observations count
+_CAMERA_POWER = 2.0  # of that best score, as the camera's weight
+_COVER_MARGIN_M = 0.15
+_REDUCED = {
+    1.0: cv2.IMREAD_COLOR,
+    0.5: cv2.IMREAD_REDUCED_COLOR_2,
+    0.25: cv2.IMREAD_REDUCED_COLOR_4,
+    0.125: cv2.IMREAD_REDUCED_COLOR_8,
+}
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A recorded image. used_rows: the part of its rows, from the top, that does not show the
+    recording car. frame: for messages."""
+
+    camera: Camera
+    path: Path
+    frame: int
+    used_rows: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """Surfels of the world (track None) or of a moving object, in its own frame."""
+
+    surfels: Surfels
+    track: ObjectTrack | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """colours: float32 [N, 3] in [0, 1]. seen: bool [N], whether any image shows the surfel."""
+
+    colours: np.ndarray
+    seen: np.ndarray
+
+
+def observe_views(
+    bodies: Sequence[Body],
+    views: Sequence[View],
+    sky: SkyGatherer,
+    *,
+    image_scale: float = 0.5,
+) -> tuple[tuple[Seen, ...], tuple[str, ...]]:
+    """The colour of every body's surfels, and a sentence for each image that cannot be decoded.
+
+    In each image the bodies as they stood then are drawn into a z-buffer; a surfel at its front
+    takes the image's colour there. A camera's nearest and most frontal observations count, by
+    their median; cameras are averaged with weights that fall towards an image's border, so that
+    unlike exposures meet softly. What no surfel covers goes to the sky.
+    """
+    names = list(dict.fromkeys(view.camera.name for view in views))
+    stores = [_Store.empty(len(body.surfels)) for body in bodies]
+    problems: list[str] = []
+    for view in tqdm(views, desc="colours from images", unit="image", disable=None):
+        image = read_image(view.path, image_scale)
+        if image is None:
+            problems.append(
+                f"camera {view.camera.name}, frame {view.frame}: "
+                f"image {view.path} cannot be decoded"
+            )
+            continue
+        if abs(image.shape[1] - view.camera.width * image_scale) > 1:
+            problems.append(
+                f"camera {view.camera.name}, frame {view.frame}: image {view.path} is "
+                f"{round(image.shape[1] / image_scale)} px wide, not {view.camera.width}; left out"
+            )
+            continue
+        _observe_one(bodies, stores, view, names.index(view.camera.name), image, sky)
+    seen = [
+        kernels.blended_colours(s.scores, s.colours, s.cameras, _KEEP_SCORE, _CAMERA_POWER)
+        for s in stores
+    ]
+    return tuple(Seen(*result) for result in seen), tuple(problems)
+
+
+def read_image(path: Path, image_scale: float) -> np.ndarray | None:
+    """RGB uint8 [H, W, 3] at a fraction (1, 1/2, 1/4, 1/8) of its size; None if not decodable."""
+    image = decode_image(path, _REDUCED[image_scale])
+    return None if image is None else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+@dataclass(frozen=True, eq=False)
+class _Store:
+    scores: np.ndarray
+    colours: np.ndarray
+    cameras: np.ndarray
+
+    @staticmethod
+    def empty(count: int) -> _Store:
+        return _Store(
+            np.zeros((count, kernels.KEPT), np.float32),
+            np.zeros((count, kernels.KEPT, 3), np.uint8),
+            np.zeros((count, kernels.KEPT), np.uint8),
+        )
+
+
+def _observe_one(
+    bodies: Sequence[Body],
+    stores: Sequence[_Store],
+    view: View,
+    camera_number: int,
+    image: np.ndarray,
+    sky: SkyGatherer,
+) -> None:
+    camera = view.camera.scaled(DEPTH_WIDTH / view.camera.width)
+    depth = np.full((camera.height, camera.width), np.inf, np.float32)
+    cover = depth.copy()
+    posed = []
+    for body in bodies:
+        transform = camera.camera_from_world.numpy()
+        if body.track is not None:
+            pose = body.track.motion.pose_at(camera.timestamp_ns)
+            if pose is None:
+                posed.append(None)
+                continue
+            transform = transform @ pose
+            _draw_cover(cover, camera, transform, body.track.size_m)
+        posed.append((transform[:3, :3].copy(), transform[:3, 3].copy()))
+    intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
+    extents = [body.surfels.spacing * np.float32(DISC_PER_SPACING) for body in bodies]
+    for body, extent, pose in zip(bodies, extents, posed, strict=True):
+        if pose is not None:
+            s = body.surfels
+            kernels.draw_depth(s.centres, s.normals, s.major, extent, *pose, *intrinsics, depth)
+    levels, sizes = _pyramid(image)
+    nothing = np.full_like(cover, np.inf)
+    for body, extent, pose, store in zip(bodies, extents, posed, stores, strict=True):
+        if pose is not None:
+            s = body.surfels
+            kernels.observe(
+                s.centres, s.normals, extent, *pose, *intrinsics,
+                depth, cover if body.track is None else nothing, levels, sizes, view.used_rows,
+                camera_number, store.scores, store.colours, store.cameras,
+            )  # fmt: skip
+    free = np.isinf(depth) & np.isinf(cover)
+    free[int(view.used_rows * camera.height) :] = False
+    sky.add(camera, free, levels, sizes)
+
+
+def _pyramid(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The image halved again and again, in one array with its corners filled; rows and columns."""
+    levels = np.zeros((_LEVELS, *image.shape), np.uint8)
+    sizes = np.zeros((_LEVELS, 2), np.int64)
+    for i in range(_LEVELS):
+        levels[i, : image.shape[0], : image.shape[1]] = image
+        sizes[i] = image.shape[:2]
+        half = (max(1, image.shape[1] // 2), max(1, image.shape[0] // 2))
+        image = cv2.resize(image, half, interpolation=cv2.INTER_AREA)
+    return levels, sizes
+
+
+_CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float64) / 2
+_EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if bin(a ^ b).count("1") == 1]
+_CLIP_M = 0.05
+
+
+def _draw_cover(
+    cover: np.ndarray, camera: Camera, camera_from_box: np.ndarray, size_m: np.ndarray
+) -> None:
+    """Fill the outline of a moving object's box, a little grown, with its nearest depth.
+
+    LiDAR sees through its windows and misses its dark paint, but the image shows the object there.
+    """
+    corners = _CORNERS * (size_m + 2 * _COVER_MARGIN_M)
+    corners = corners @ camera_from_box[:3, :3].T + camera_from_box[:3, 3]
+    points = [c for c in corners if c[2] >= _CLIP_M]
+    for a, b in _EDGES:
+        za, zb = corners[a, 2], corners[b, 2]
+        if (za - _CLIP_M) * (zb - _CLIP_M) < 0:
+            points.append(corners[a] + (corners[b] - corners[a]) * ((_CLIP_M - za) / (zb - za)))
+    if len(points) < 3:
+        return
+    p = np.array(points)
+    u = np.clip(camera.fx * p[:, 0] / p[:, 2] + camera.cx, -1e4, 1e4)
+    v = np.clip(camera.fy * p[:, 1] / p[:, 2] + camera.cy, -1e4, 1e4)
+    hull = cv2.convexHull(np.stack([u, v], 1).astype(np.int32))
+    mask = np.zeros(cover.shape, np.uint8)
+    cv2.fillConvexPoly(mask, hull, 1)
+    cover[mask > 0] = np.minimum(cover[mask > 0], np.float32(p[:, 2].min()))

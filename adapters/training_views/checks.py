@@ -1,0 +1,492 @@
+"""What to know of a drive before learning from it: does the calibration fit, is exposure steady."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+
+from adapters.lidar_scene.depth import SparseDepth
+from adapters.training_views.depth_priors import visible
+from adapters.training_views.views import RecordedViews
+from augment.cameras import Camera
+from augment.geometry import (
+    invert_rigid,
+    multiply_quats,
+    quat_from_rotmat,
+    rigid,
+    rotmat_from_quat,
+    slerp,
+)
+from augment.labels import LidarSweep
+from augment.reconstruct.view import ViewKey
+from augment.scene import Scene
+
+# ---- How far a camera's images are shifted against the LiDAR, from what both see of surfaces -----
+# Paint, signs and edges differ in reflectance as they do in brightness. Over a range of shifts of
+# the
+# projected returns the information that intensity and grey value share is measured; it is highest
+# where they lie on each other (Pandey et al. 2012, here with shifts for rotations).
+
+_WIDTH = 480  # columns of the images compared, at most
+_REACH_DEG = 1.2
+_NEAR_M = 8.0  # nearer returns shift with the camera's position and time, not only its rotation
+_BINS = 16
+_MOST_POINTS = 60_000
+_FEWEST_POINTS = 3000
+_CONTRAST = 0.1  # how much the best shift must stand out
+_AGREE_PX = 0.75  # between the measurement in every other frame and the rest
+_ALONE_PX = 2.0  # a single frame says less, and less exactly
+_INTENSITY, _SENSOR = ("intensity", "i"), ("sensor", "d")
+
+
+@dataclass(frozen=True)
+class CameraOffset:
+    """Where a camera's images lie beside the LiDAR's returns, pixels at `width_px` columns.
+
+    angle_deg: the same as an angle. is_sure: the shift stands out, lies within the range searched,
+    and two halves of the frames agree on it.
+    """
+
+    camera: str
+    right_px: float
+    down_px: float
+    width_px: int
+    angle_deg: float
+    is_sure: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Returns:
+    """A sweep's returns with intensity. points: float64 [N, 3], scene world. intensity: [N]."""
+
+    points: np.ndarray
+    intensity: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """Returns in one image: columns, rows int64 [M], intensity [M]; grey uint8 [H, W]."""
+
+    columns: np.ndarray
+    rows: np.ndarray
+    intensity: np.ndarray
+    grey: np.ndarray
+
+
+def measure_offset(
+    returns: Mapping[int, Returns], views: RecordedViews, cameras: Mapping[ViewKey, Camera]
+) -> CameraOffset | None:
+    """The shift of one camera's images; None if fewer than 3000 returns are seen.
+
+    returns: by frame. cameras: the views to compare, at any resolution.
+    """
+    seen = [
+        project_returns(
+            returns[key.frame], views, key, camera,
+            reach=_reach_px(_compared(camera)), near_m=_NEAR_M,
+        )
+        for key, camera in cameras.items()
+        if key.frame in returns
+    ]  # fmt: skip
+    if sum(len(points.rows) for points in seen) < _FEWEST_POINTS:
+        return None
+    camera = _compared(next(iter(cameras.values())))
+    reach = _reach_px(camera)
+    score = shared_information(seen, reach)
+    right, down = _peak(score)
+    halves = [_peak(shared_information(half, reach)) for half in (seen[::2], seen[1::2]) if half]
+    apart = max(math.hypot(right - h[0], down - h[1]) for h in halves)
+    # Repeated shapes can look shifted to all frames together, but not to most of them one by one.
+    single = [_peak(shared_information([points], reach)) for points in seen]
+    near = [math.hypot(right - p[0], down - p[1]) < _ALONE_PX for p in single]
+    contrast = float(score.max() / max(float(np.median(score)), 1e-12) - 1)
+    inside = max(abs(right), abs(down)) < reach - 0.5
+    return CameraOffset(
+        camera=camera.name,
+        right_px=right,
+        down_px=down,
+        width_px=camera.width,
+        angle_deg=math.degrees(math.hypot(right / camera.fx, down / camera.fy)),
+        # At the border of the range the shift is at least as large as that.
+        is_sure=contrast > _CONTRAST
+        and len(halves) == 2
+        and (apart < _AGREE_PX or not inside)
+        and 2 * sum(near) >= len(near),
+    )
+
+
+def _compared(camera: Camera) -> Camera:
+    return camera.scaled(min(1.0, _WIDTH / camera.width))
+
+
+def _reach_px(camera: Camera) -> int:
+    return min(max(round(math.radians(_REACH_DEG) * camera.fx), 4), 16)
+
+
+def _column(sweep: LidarSweep, names: Sequence[str]) -> np.ndarray | None:
+    found = [name for name in names if name in sweep.columns]
+    return np.asarray(sweep.columns[found[0]]) if found else None
+
+
+def read_intensities(scene: Scene, frames: Iterable[int]) -> dict[int, Returns]:
+    """The returns of each frame's sweep, of the sensor that has most; frames without intensity
+    left out."""
+    out: dict[int, Returns] = {}
+    for frame in dict.fromkeys(frames):
+        sweep = scene.lidar(frame)
+        intensity = None if sweep is None else _column(sweep, _INTENSITY)
+        if sweep is None or intensity is None:
+            continue
+        points = sweep.points_m - scene.world_origin_m
+        use = np.isfinite(points).all(axis=1) & np.isfinite(intensity.astype(np.float64))
+        sensor = _column(sweep, _SENSOR)
+        if sensor is not None and len(sensor):
+            names, counts = np.unique(sensor, return_counts=True)
+            use &= sensor == names[counts.argmax()]  # each sensor has its own scale of intensity
+        out[frame] = Returns(points[use], intensity[use])
+    return out
+
+
+def project_returns(
+    returns: Returns,
+    views: RecordedViews,
+    key: ViewKey,
+    camera: Camera,
+    *,
+    reach: int,
+    near_m: float,
+) -> Points:
+    """The returns beyond near_m that `camera` sees, with the image of `key`. reach: pixels from the
+    image's border that are left out."""
+    camera = _compared(camera)
+    grey = cv2.cvtColor(views.image(key), cv2.COLOR_RGB2GRAY)
+    grey = cv2.resize(grey, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+    pose = camera.camera_from_world.numpy()
+    local = returns.points @ pose[:3, :3].T + pose[:3, 3]
+    ahead = local[:, 2] > near_m
+    local, intensity = local[ahead], returns.intensity[ahead]
+    u = np.floor(camera.fx * local[:, 0] / local[:, 2] + camera.cx).astype(np.int64)
+    v = np.floor(camera.fy * local[:, 1] / local[:, 2] + camera.cy).astype(np.int64)
+    inside = (u >= reach) & (u < camera.width - reach) & (v >= reach) & (v < camera.height - reach)
+    u, v, z, intensity = u[inside], v[inside], local[inside, 2], intensity[inside]
+    order = np.lexsort((z, v * camera.width + u))
+    first = np.ones(len(order), np.bool_)
+    first[1:] = np.diff((v * camera.width + u)[order]) > 0
+    chosen = order[first]
+    uv = np.stack([u, v], 1)[chosen].astype(np.int32)
+    front = visible(SparseDepth(uv, z[chosen].astype(np.float32), chosen), camera)
+    kept = chosen[front]
+    return Points(u[kept], v[kept], intensity[kept], grey)
+
+
+def shared_information(seen: Sequence[Points], reach: int) -> np.ndarray:
+    """Mutual information of intensity and grey value over their joint entropy for each shift,
+    float64 [2 reach + 1, 2 reach + 1], rows of downward shifts."""
+    stride = max(1, -(-sum(len(points.rows) for points in seen) // _MOST_POINTS))
+    columns, rows, images, intensity = (
+        np.concatenate(parts)
+        for parts in zip(
+            *(
+                (p.columns[::stride], p.rows[::stride], np.full(len(p.rows[::stride]), i),
+                 p.intensity[::stride])
+                for i, p in enumerate(seen)
+            ),
+            strict=True,
+        )
+    )  # fmt: skip
+    grey = np.stack([points.grey for points in seen])
+    ranks = np.linspace(0, 1, _BINS + 1)[1:-1]
+    a = np.searchsorted(np.quantile(intensity, ranks), intensity) * _BINS
+    bins = np.quantile(grey[images, rows, columns], ranks)
+    levels = np.searchsorted(bins, np.arange(256)).astype(np.int64)[grey]
+    shifts = range(-reach, reach + 1)
+    out = np.zeros((len(shifts), len(shifts)))
+    for i, down in enumerate(shifts):
+        for j, right in enumerate(shifts):
+            b = levels[images, rows + down, columns + right]
+            joint = np.bincount(a + b, minlength=_BINS**2) / len(a)
+            both = _entropy(joint)
+            table = joint.reshape(_BINS, _BINS)
+            out[i, j] = (_entropy(table.sum(0)) + _entropy(table.sum(1)) - both) / max(both, 1e-12)
+    return out
+
+
+def _entropy(p: np.ndarray) -> float:
+    p = p[p > 0]
+    return float(-(p * np.log(p)).sum())
+
+
+def _peak(score: np.ndarray) -> tuple[float, float]:
+    """Shift to the right and down of the highest score, to fractions of a pixel by parabolas."""
+    reach = len(score) // 2
+    i, j = np.unravel_index(int(score.argmax()), score.shape)
+    down, right = float(i) - reach, float(j) - reach
+    if 0 < i < 2 * reach:
+        down += _vertex(score[i - 1, j], score[i, j], score[i + 1, j])
+    if 0 < j < 2 * reach:
+        right += _vertex(score[i, j - 1], score[i, j], score[i, j + 1])
+    return right, down
+
+
+def _vertex(before: float, here: float, after: float) -> float:
+    bend = before - 2 * here + after
+    return 0.0 if bend == 0 else float(0.5 * (before - after) / bend)
+
+
+# ------------------------------------------------------------------------------------------------
+# Cameras at other times than stamped: where they were then, and which time fits the LiDAR best
+# Rolling shutters, exposure and transport leave time stamps some tens of milliseconds beside the
+# moment an image shows. A car at 15 m/s moves 30 cm in 20 ms.
+
+_STEPS_S = np.arange(-5, 6) * 0.010
+_CAMERA_TIMING_NEAR_M = 3.0  # near returns shift most with time
+_LEAST_SPEED_MPS = 1.0
+_EVERY = 3  # return is enough
+_CAMERA_TIMING_CONTRAST = 0.02  # how much the best time must stand out from the range's mean
+
+
+def with_camera_times(scene: Scene, offset_s: float) -> Scene:
+    """The scene with every image taken offset_s later than stamped: poses and times of cameras.
+
+    Positions and rotations follow the camera's own path, straight on at its ends.
+    """
+    paths = {name: _path(scene, name) for name in scene.camera_names}
+    frames = tuple(
+        dataclasses.replace(
+            frame,
+            cameras={
+                name: camera_at(paths[name], camera, offset_s)
+                for name, camera in frame.cameras.items()
+            },
+        )
+        for frame in scene.frames
+    )
+    return dataclasses.replace(scene, frames=frames)
+
+
+def _path(scene: Scene, name: str) -> list[Camera]:
+    return [frame.cameras[name] for frame in scene.frames if name in frame.cameras]
+
+
+def camera_at(path: Sequence[Camera], camera: Camera, offset_s: float) -> Camera:
+    """The camera offset_s later, moving as its neighbours in the path say.
+
+    path: the same camera over time, in order, this one among them.
+    """
+    times = [other.timestamp_ns for other in path]
+    place = times.index(camera.timestamp_ns)
+    before, after = path[max(place - 1, 0)], path[min(place + 1, len(path) - 1)]
+    span_s = (after.timestamp_ns - before.timestamp_ns) * 1e-9
+    if span_s <= 0 or offset_s == 0:
+        return camera
+    part = torch.tensor(offset_s / span_s, dtype=torch.float64)
+    turn = after.world_from_camera[:3, :3] @ before.world_from_camera[:3, :3].T
+    still = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64)
+    turned = slerp(still, quat_from_rotmat(turn), part)
+    now = quat_from_rotmat(camera.world_from_camera[:3, :3])
+    pose = rigid(
+        rotmat_from_quat(multiply_quats(turned, now)),
+        camera.centre + (after.centre - before.centre) * part,
+    )
+    return dataclasses.replace(
+        camera,
+        camera_from_world=invert_rigid(pose),
+        timestamp_ns=camera.timestamp_ns + round(offset_s * 1e9),
+    )
+
+
+def measure_time_offset(
+    scene: Scene,
+    returns: Mapping[int, Returns],
+    views: RecordedViews,
+    keys: Mapping[str, Sequence[ViewKey]],
+) -> float | None:
+    """Seconds after their stamps at which images fit the LiDAR best, one number for all cameras.
+
+    returns: by frame. keys: views by camera, in order of time. Cameras count by how clearly they
+    show a time: those that look sideways do. None where the car hardly moves, sweeps have no
+    intensity, or no time within 50 ms stands out.
+    """
+    returns = {
+        frame: Returns(found.points[::_EVERY], found.intensity[::_EVERY])
+        for frame, found in returns.items()
+    }
+    total = np.zeros(len(_STEPS_S))
+    cameras = 0
+    for name, own in keys.items():
+        path = _path(scene, name)
+        own = [key for key in own if key.frame in returns]
+        moving = [key for key in own if _speed_mps(path, scene, key) > _LEAST_SPEED_MPS]
+        scores = [_fit(scene, returns, views, path, moving, float(offset)) for offset in _STEPS_S]
+        known = np.array([score for score in scores if score is not None])
+        if len(known) == len(_STEPS_S) and known.mean() > 0:
+            total += known / known.mean()
+            cameras += 1
+    i = int(total.argmax())
+    if (
+        cameras == 0
+        or not 0 < i < len(total) - 1
+        or total[i] < (1 + _CAMERA_TIMING_CONTRAST) * total.mean()
+    ):
+        return None
+    bend = total[i - 1] - 2 * total[i] + total[i + 1]
+    step = 0.0 if bend == 0 else 0.5 * (total[i - 1] - total[i + 1]) / bend
+    return float(_STEPS_S[i] + step * (_STEPS_S[1] - _STEPS_S[0]))
+
+
+def _fit(
+    scene: Scene,
+    returns: Mapping[int, Returns],
+    views: RecordedViews,
+    path: Sequence[Camera],
+    keys: Sequence[ViewKey],
+    offset_s: float,
+) -> float | None:
+    """How much images and returns tell of each other if images were taken later by offset_s."""
+    seen: list[Points] = []
+    for key in keys:
+        camera = camera_at(path, scene.frame(key.frame).cameras[key.camera], offset_s)
+        seen.append(
+            project_returns(
+                returns[key.frame], views, key, camera, reach=0, near_m=_CAMERA_TIMING_NEAR_M
+            )
+        )
+    return float(shared_information(seen, 0)[0, 0]) if seen else None
+
+
+def _speed_mps(path: Sequence[Camera], scene: Scene, key: ViewKey) -> float:
+    camera = scene.frame(key.frame).cameras[key.camera]
+    later = camera_at(path, camera, 0.01)
+    return float((later.centre - camera.centre).norm()) / 0.01
+
+
+# ---- checks --------------------------------------------------------------------------------------
+
+_WORST_TIME_S = 0.030  # rolling shutters alone make 10 to 20 ms
+_WORST_DEG = 0.35  # a pixel at 480 columns is up to 0.25
+_WORST_PX = 1.2
+_FRAMES = 7  # that the calibration is measured in
+_JUMP_STOPS = 0.4  # a third more or less light
+_JUMP_TIMES = 5.0  # this many times the camera's usual change
+_BLOCKS = (32, 18)  # columns and rows of the means that are compared
+_NAMED = 3  # jumps of a camera that are named one by one
+
+
+@dataclass(frozen=True)
+class Checks:
+    """problems: one sentence each. time_offset_s: how much later than stamped the images fit the
+    LiDAR best, None where unknown. offsets: how images and LiDAR are shifted, a camera each, once
+    that is taken into account.
+    """
+
+    problems: tuple[str, ...]
+    time_offset_s: float | None
+    offsets: tuple[CameraOffset, ...]
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """JSON-able, for reports: pixels of the image compared, to the right and down."""
+        late = self.time_offset_s
+        return {
+            "camera_time_offset_ms": None if late is None else 1e3 * late,
+            "calibration_offsets": {
+                o.camera: {
+                    "right_px": o.right_px,
+                    "down_px": o.down_px,
+                    "angle_deg": o.angle_deg,
+                    "is_sure": o.is_sure,
+                }
+                for o in self.offsets
+            },
+        }
+
+
+def check_views(scene: Scene, views: RecordedViews) -> Checks:
+    """Compare LiDAR with images and images with each other; takes some seconds.
+
+    The calibration is not checked where sweeps have no intensity.
+    """
+    keys = sorted((*views.train, *views.test), key=lambda key: key.frame)
+    own = {name: [k for k in keys if k.camera == name] for name in scene.camera_names}
+    own = {name: found for name, found in own.items() if found}
+    problems: list[str] = []
+    for found in own.values():
+        problems += exposure_jumps(views, found)
+    # What is measured changes the cameras, so held-out images have no part in it.
+    learnt = {name: [k for k in found if k in set(views.train)] for name, found in own.items()}
+    own = {name: _spread(found, _FRAMES) for name, found in learnt.items() if found}
+    returns = read_intensities(scene, (key.frame for found in own.values() for key in found))
+    late = measure_time_offset(scene, returns, views, own)
+    if late is not None and abs(late) > _WORST_TIME_S:
+        problems.append(
+            f"images fit the LiDAR best if they were taken {abs(late) * 1e3:.0f} ms "
+            f"{'after' if late > 0 else 'before'} their time stamps: one of the clocks is wrong"
+        )
+    timed = scene if late is None else with_camera_times(scene, late)
+    offsets = []
+    for found in own.values():
+        cameras = {k: timed.frame(k.frame).cameras[k.camera] for k in found}
+        offset = measure_offset(returns, views, cameras)
+        if offset is not None:
+            offsets.append(offset)
+            problems += _offset_problem(offset)
+    return Checks(tuple(problems), late, tuple(offsets))
+
+
+def _spread(keys: Sequence[ViewKey], count: int) -> list[ViewKey]:
+    places = np.linspace(0, len(keys) - 1, min(count, len(keys))).round().astype(int)
+    return [keys[i] for i in places]
+
+
+def _offset_problem(offset: CameraOffset) -> list[str]:
+    shift_px = float(np.hypot(offset.right_px, offset.down_px))
+    if not offset.is_sure or offset.angle_deg < _WORST_DEG or shift_px < _WORST_PX:
+        return []
+    return [
+        f"camera {offset.camera}: its images lie {offset.angle_deg:.2f} degrees beside the LiDAR "
+        f"({offset.right_px:+.1f} px to the right, {offset.down_px:+.1f} px down, of "
+        f"{offset.width_px} columns); its rotation, focal length or timestamps are wrong, and "
+        f"what it shows will be blurred or doubled"
+    ]
+
+
+def exposure_jumps(views: RecordedViews, keys: Sequence[ViewKey]) -> list[str]:
+    """A sentence for each sudden change of brightness between neighbouring images of a camera.
+
+    The change is the median, over blocks of the image, of the logarithm of their ratio, so that
+    what moves through the image hardly counts.
+    """
+    if len(keys) < 3:
+        return []
+    levels = [_block_stops(views.image(key)) for key in keys]
+    change = np.array([np.median(b - a) for a, b in itertools.pairwise(levels)])
+    usual = float(np.median(np.abs(change)))
+    bound = max(_JUMP_STOPS, _JUMP_TIMES * usual)
+    found = np.flatnonzero(np.abs(change) > bound)
+    out = [
+        f"camera {keys[i].camera}: brightness changes by a factor of {2 ** change[i]:.2f} between "
+        f"frames {keys[i].frame} and {keys[i + 1].frame}; one exposure for the whole drive will "
+        f"not fit both"
+        for i in found[:_NAMED]
+    ]
+    if len(found) > _NAMED:
+        out.append(
+            f"camera {keys[0].camera}: brightness jumps {len(found) - _NAMED} more times, last "
+            f"after frame {keys[found[-1]].frame}"
+        )
+    return out
+
+
+def _block_stops(rgb: np.ndarray) -> np.ndarray:
+    """Logarithm to base 2 of the blocks' mean brightness, float32."""
+    size = (min(_BLOCKS[0], rgb.shape[1]), min(_BLOCKS[1], rgb.shape[0]))
+    grey = cv2.resize(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA)
+    return np.log2(grey.astype(np.float32) + 4)  # a few levels, so that black does not count

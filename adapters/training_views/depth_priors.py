@@ -1,0 +1,618 @@
+"""Depth priors of every view from whatever is there: LiDAR sweeps, and folders of depth maps."""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from adapters.lidar_scene.depth import SparseDepth, depth_seen, read_returns
+from adapters.pandaset.labels import PandaSetLabels
+from adapters.plain_files import decode_image
+from adapters.safe_pickle import read_array, read_array_dict
+from adapters.training_views.byte_cache import ByteCache
+from adapters.training_views.depth_kernels import hidden_returns
+from augment.cameras import Camera
+from augment.errors import AdapterError
+from augment.reconstruct.view import ViewKey
+from augment.render.threads import kernel_threads
+from augment.scene import Scene
+
+# ---- Depth maps in folders: where each view's file is, and what is in it -------------------------
+
+METRIC_PER_M = 256.0  # levels per metre of 16-bit depth images
+_NUMBER = re.compile(r"\d{1,12}")
+_SPARSE_NAME = re.compile(r"(\d{1,12})_(.+)")
+_ASPECT_TOLERANCE = 0.02  # maps are often rounded to a multiple of 14 or 32 pixels
+
+
+def find_maps(
+    folder: Path, keys: Collection[ViewKey], image_stems: Mapping[ViewKey, str], suffixes: set[str]
+) -> dict[ViewKey, Path]:
+    """The file of each view that has one: DIR/<camera>/<name>, named as the recorded image is or,
+    where no file of the camera is, with the frame's number.
+
+    Raises:
+        AdapterError: the folder does not exist.
+    """
+    _check_folder(folder)
+    found: dict[ViewKey, Path] = {}
+    for camera in dict.fromkeys(key.camera for key in keys):
+        own = [key for key in keys if key.camera == camera]
+        files = sorted(p for p in (folder / camera).glob("*") if p.suffix.lower() in suffixes)
+        by_stem = {path.stem: path for path in files}
+        named = {k: by_stem[image_stems[k]] for k in own if image_stems.get(k) in by_stem}
+        by_number = {int(p.stem): p for p in files if _NUMBER.fullmatch(p.stem)}
+        found |= named or {k: by_number[k.frame] for k in own if k.frame in by_number}
+    return found
+
+
+def find_sparse(
+    folder: Path, keys: Collection[ViewKey], camera_names: Sequence[str]
+) -> dict[ViewKey, Path]:
+    """The file DIR/<frame>_<camera>.npy of each view that has one. <camera> is a camera's name, or
+    its number in the scene's order as Street Gaussians counts them.
+
+    Raises:
+        AdapterError: the folder does not exist.
+    """
+    _check_folder(folder)
+    wanted = set(keys)
+    found: dict[ViewKey, Path] = {}
+    for path in sorted(folder.glob("*.npy")):
+        match = _SPARSE_NAME.fullmatch(path.stem)
+        if match is None:
+            continue
+        name = match[2]
+        if name not in camera_names and _NUMBER.fullmatch(name) and int(name) < len(camera_names):
+            name = camera_names[int(name)]
+        key = ViewKey(int(match[1]), name)
+        if key in wanted:
+            found[key] = path
+    return found
+
+
+def read_metric(path: Path) -> np.ndarray:
+    """float32 [h, w] metres, 0 where unknown, from a 16-bit image of metres x 256."""
+    image = decode_image(path, cv2.IMREAD_UNCHANGED)
+    if image is None:
+        raise AdapterError(f"{path} cannot be decoded")
+    if image.dtype != np.uint16 or image.ndim != 2:
+        raise AdapterError(
+            f"{path} must be a 16-bit image of one channel, metres x {METRIC_PER_M:.0f}; "
+            f"it is {image.dtype} {list(image.shape)}"
+        )
+    return image.astype(np.float32) / np.float32(METRIC_PER_M)
+
+
+def read_relative(path: Path) -> np.ndarray:
+    """float32 [h, w] of any unit, larger where nearer, NaN where unknown, from .npy or an image."""
+    if path.suffix.lower() == ".npy":
+        values = read_array(path)
+    else:
+        values = decode_image(path, cv2.IMREAD_UNCHANGED)
+        if values is None:
+            raise AdapterError(f"{path} cannot be decoded")
+        if values.ndim == 3 and (values[..., :1] == values[..., :3]).all():
+            values = values[..., 0]  # grey written with three channels
+    values = values[0] if values.ndim == 3 and len(values) == 1 else values
+    if values.ndim != 2 or values.dtype.kind not in "fiu" or values.size == 0:
+        raise AdapterError(
+            f"{path} must be one inverse depth a pixel, [height, width], not colours; "
+            f"it is {values.dtype} {list(values.shape)}"
+        )
+    out = values.astype(np.float32)
+    out[~np.isfinite(out)] = np.nan
+    return out
+
+
+def read_sparse(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Street Gaussians' depth: mask bool [h, w] and the metres of its pixels, float32 [M]."""
+    held = read_array_dict(path)
+    mask, value = held.get("mask"), held.get("value")
+    if mask is None or value is None or mask.ndim != 2:
+        raise AdapterError(
+            f"{path} must hold 'mask' [height, width] and 'value'; it holds "
+            f"{ {name: list(array.shape) for name, array in held.items()} }"
+        )
+    mask = mask.astype(np.bool_)
+    if value.dtype.kind not in "fiu" or value.shape != (int(mask.sum()),):
+        raise AdapterError(
+            f"{path}: 'value' must hold a depth for each of the {int(mask.sum())} pixels of "
+            f"'mask'; it is {value.dtype} {list(value.shape)}"
+        )
+    return mask, value.astype(np.float32)
+
+
+def check_aspect(path: Path, shape: Sequence[int], camera: Camera) -> None:
+    """Refuse maps of another shape than the image: they are of another camera, or cropped."""
+    error = (shape[1] / shape[0]) / (camera.width / camera.height) - 1
+    if abs(error) > _ASPECT_TOLERANCE:
+        raise AdapterError(
+            f"{path} is of {shape[1]}x{shape[0]} pixels; a map of camera {camera.name!r} has the "
+            f"proportions of its image, {camera.width}x{camera.height}"
+        )
+
+
+def _check_folder(folder: Path) -> None:
+    if not folder.is_dir():
+        raise AdapterError(f"{folder}: no such folder; depth maps were to be read from it")
+
+
+# ---- Depth at some pixels of one image: the common form of all depth priors ----------------------
+
+
+@dataclass(frozen=True, eq=False)
+class PriorPixels:
+    """pixels: int32 [M], flat indices, increasing. depth_m: float32 [M]. weight: float32 [M]."""
+
+    pixels: np.ndarray
+    depth_m: np.ndarray
+    weight: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+    @property
+    def nbytes(self) -> int:
+        return self.pixels.nbytes + self.depth_m.nbytes + self.weight.nbytes
+
+    @staticmethod
+    def empty() -> PriorPixels:
+        return PriorPixels(np.zeros(0, np.int32), np.zeros(0, np.float32), np.zeros(0, np.float32))
+
+    @staticmethod
+    def of(pixels: np.ndarray, depth_m: np.ndarray) -> PriorPixels:
+        """Of weight 1. Pixels come in any order, some of them several times: the nearest depth of
+        each remains."""
+        order = np.lexsort((depth_m, pixels))
+        first = np.ones(len(order), np.bool_)
+        first[1:] = np.diff(pixels[order]) > 0
+        chosen = order[first]
+        return PriorPixels(
+            pixels[chosen].astype(np.int32),
+            depth_m[chosen].astype(np.float32),
+            np.ones(len(chosen), np.float32),
+        )
+
+    def select(self, keep: np.ndarray) -> PriorPixels:
+        return PriorPixels(self.pixels[keep], self.depth_m[keep], self.weight[keep])
+
+    def weighing(self, weight: float) -> PriorPixels:
+        """The same with another weight."""
+        return PriorPixels(self.pixels, self.depth_m, np.full(len(self), weight, np.float32))
+
+    def image(self, camera: Camera) -> np.ndarray:
+        """float32 [H, W], 0 where nothing is known."""
+        out = np.zeros(camera.height * camera.width, np.float32)
+        out[self.pixels] = self.depth_m
+        return out.reshape(camera.height, camera.width)
+
+
+def join_priors(priors: Sequence[PriorPixels]) -> PriorPixels:
+    """All of them; where several know a pixel, the first in the sequence is believed."""
+    priors = [prior for prior in priors if len(prior)]
+    if not priors:
+        return PriorPixels.empty()
+    if len(priors) == 1:
+        return priors[0]
+    pixels = np.concatenate([prior.pixels for prior in priors])
+    _, first = np.unique(pixels, return_index=True)  # the first occurrence, in order of pixels
+    return PriorPixels(
+        pixels[first],
+        np.concatenate([prior.depth_m for prior in priors])[first],
+        np.concatenate([prior.weight for prior in priors])[first],
+    )
+
+
+# ------------------------------------------------------------------------------------------------
+# Inverse depth up to scale and shift, brought to metres by the few distances that are known
+
+_FEWEST = 30  # known distances that two numbers may be fitted to
+_ROUNDS = 30
+_LEAST_SPREAD_PER_M = 1e-4  # residuals below this are as good as none
+_LEAST_CORRELATION = 0.5
+_NEAREST_M, _FURTHEST_M = 0.5, 120.0
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """1 / z = scale relative + shift, in 1/m; correlation: of the two, robustly weighted."""
+
+    scale: float
+    shift: float
+    correlation: float
+
+    def depth_m(self, relative: np.ndarray) -> np.ndarray:
+        """Depth of relative values, float32; NaN where it is too near or far to be believed."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            depth = 1.0 / (self.scale * relative.astype(np.float64) + self.shift)
+            depth[~((depth >= _NEAREST_M) & (depth <= _FURTHEST_M))] = np.nan
+        return depth.astype(np.float32)
+
+
+def align(relative: np.ndarray, depth_m: np.ndarray) -> Alignment | None:
+    """Robust least squares of inverse depth over known pixels, both [M]; None where it fails.
+
+    Iteratively reweighted with Cauchy's weights, whose spread follows the median residual (Holland
+    and Welsch 1977), from a line through the quartiles. It fails with fewer than 30 known pixels,
+    without contrast, or where larger values are not clearly nearer.
+    """
+    x, y = relative.astype(np.float64), 1.0 / depth_m.astype(np.float64)
+    known = np.isfinite(x) & np.isfinite(y)
+    x, y = x[known], y[known]
+    if len(x) < _FEWEST:
+        return None
+    low, middle, high = np.quantile(x, [0.1, 0.5, 0.9])
+    unit = high - low
+    if not unit > 0:
+        return None
+    x = (x - middle) / unit  # so that the normal equations are well conditioned
+    bottom, top = np.quantile(y, [0.1, 0.9])
+    scale, shift = top - bottom, float(np.median(y))
+    weight = np.ones_like(x)
+    for _ in range(_ROUNDS):
+        residual = y - (scale * x + shift)
+        spread = max(1.4826 * float(np.median(np.abs(residual))), _LEAST_SPREAD_PER_M)
+        weight = 1.0 / (1.0 + (residual / (2.385 * spread)) ** 2)
+        weight /= weight.sum()
+        mean_x, mean_y = float(weight @ x), float(weight @ y)
+        variance = float(weight @ (x - mean_x) ** 2)
+        covariance = float(weight @ ((x - mean_x) * (y - mean_y)))
+        if not variance > 0:
+            return None
+        scale = covariance / variance
+        shift = mean_y - scale * mean_x
+    spread_y = float(weight @ (y - mean_y) ** 2)
+    correlation = covariance / max((variance * spread_y) ** 0.5, 1e-12)
+    if correlation < _LEAST_CORRELATION:
+        return None
+    return Alignment(scale / unit, shift - scale * middle / unit, correlation)
+
+
+# ---- Depth maps from files as prior pixels of a training camera ----------------------------------
+
+_MAP_PRIORS_NEAREST_M, _MAP_PRIORS_FURTHEST_M = 0.1, 1000.0  # what a file may call a depth
+
+
+def sparse_prior(path: Path, camera: Camera) -> PriorPixels:
+    """Street Gaussians' depth, of a larger image, at the pixels it falls on.
+
+    Raises:
+        AdapterError: the file is damaged, or of an image of another shape.
+    """
+    mask, value = read_sparse(path)
+    check_aspect(path, mask.shape, camera)
+    rows, columns = np.nonzero(mask)
+    rows = (rows + 0.5) * camera.height / mask.shape[0]
+    columns = (columns + 0.5) * camera.width / mask.shape[1]
+    pixels = rows.astype(np.int64) * camera.width + columns.astype(np.int64)
+    usable = (value > _MAP_PRIORS_NEAREST_M) & (value < _MAP_PRIORS_FURTHEST_M)  # NaN is neither
+    return PriorPixels.of(pixels[usable], value[usable])
+
+
+def metric_prior(path: Path, camera: Camera, sky: np.ndarray, grid_px: int) -> PriorPixels:
+    """A dense map in metres at the pixels of a grid, 0 and sky left out.
+
+    Raises:
+        AdapterError: the file is no such map, or of an image of another shape.
+    """
+    depth = read_metric(path)
+    check_aspect(path, depth.shape, camera)
+    rows, columns = _grid(camera, grid_px)
+    # No interpolation: between a car and the wall behind it there is no surface.
+    at = _at_centres(depth, camera, rows, columns)
+    usable = (
+        (at > _MAP_PRIORS_NEAREST_M) & (at < _MAP_PRIORS_FURTHEST_M) & ~sky[np.ix_(rows, columns)]
+    )
+    return _of_grid(at, usable, rows, columns, camera)
+
+
+def relative_prior(
+    path: Path, camera: Camera, reference: np.ndarray, sky: np.ndarray, grid_px: int
+) -> PriorPixels:
+    """A dense inverse depth map, aligned to the reference depth [H, W] (0 where unknown), at the
+    pixels of a grid.
+
+    Raises:
+        AdapterError: the file is no such map, or it does not agree with the reference.
+    """
+    relative = read_relative(path)
+    check_aspect(path, relative.shape, camera)
+    size = (camera.width, camera.height)
+    enough = relative.shape[0] <= camera.height
+    how = cv2.INTER_LINEAR if enough else cv2.INTER_AREA
+    relative = cv2.resize(relative, size, interpolation=how)
+    known = reference > 0
+    found = align(relative[known], reference[known])
+    if found is None:
+        raise AdapterError(
+            f"{path} does not agree with the {int(known.sum())} known distances: there must be "
+            f"some, and larger values must be nearer (inverse depth, not depth)"
+        )
+    rows, columns = _grid(camera, grid_px)
+    at = found.depth_m(relative[np.ix_(rows, columns)])
+    return _of_grid(at, np.isfinite(at) & ~sky[np.ix_(rows, columns)], rows, columns, camera)
+
+
+def beside(dense: PriorPixels, known: PriorPixels, camera: Camera, grid_px: int) -> PriorPixels:
+    """The dense prior where no cell of its grid holds anything better known."""
+    if len(known) == 0:
+        return dense
+    columns = -(-camera.width // grid_px)
+
+    def cells(prior: PriorPixels) -> np.ndarray:
+        row, column = prior.pixels // camera.width, prior.pixels % camera.width
+        return row // grid_px * columns + column // grid_px
+
+    return dense.select(~np.isin(cells(dense), cells(known)))
+
+
+def _grid(camera: Camera, grid_px: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and columns in the middles of the grid's cells."""
+    rows = np.arange(min(grid_px // 2, camera.height - 1), camera.height, grid_px)
+    return rows, np.arange(min(grid_px // 2, camera.width - 1), camera.width, grid_px)
+
+
+def _at_centres(
+    image: np.ndarray, camera: Camera, rows: np.ndarray, columns: np.ndarray
+) -> np.ndarray:
+    y = ((rows + 0.5) * image.shape[0] / camera.height).astype(np.int64)
+    x = ((columns + 0.5) * image.shape[1] / camera.width).astype(np.int64)
+    return image[np.ix_(y, x)]
+
+
+def _of_grid(
+    depth_m: np.ndarray,
+    usable: np.ndarray,
+    rows: np.ndarray,
+    columns: np.ndarray,
+    camera: Camera,
+) -> PriorPixels:
+    pixels = rows[:, None] * camera.width + columns[None]
+    return PriorPixels.of(pixels[usable], depth_m[usable])
+
+
+# ---- Depth priors from the LiDAR sweep of an image's own frame -----------------------------------
+
+# A return is clearly behind another from this ratio of depths and this many metres more.
+_BEHIND_RATIO, _BEHIND_M = 1.05, 0.5
+_NEIGHBOURS = 16  # returns around one that say whether it is surrounded
+_WIDEST_PART = 0.02  # of the image's width: what is further away says nothing
+
+
+class LidarPriors:
+    """What the sweeps say of every view. A sweep is read once for all cameras of its frame."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        cameras: Mapping[ViewKey, Camera],
+        *,
+        without_semantic: Collection[int],
+        cache_bytes: int,
+    ) -> None:
+        """cameras: every view that may be asked for, at the training resolution."""
+        self._scene = scene
+        self._without = tuple(without_semantic)
+        self._frames: dict[int, dict[ViewKey, Camera]] = {}
+        for key, camera in cameras.items():
+            self._frames.setdefault(key.frame, {})[key] = camera
+        self._cache: ByteCache[PriorPixels] = ByteCache(cache_bytes)
+
+    def load(self, key: ViewKey) -> PriorPixels:
+        """Empty where the frame has no sweep."""
+        found = self._cache.get(key)
+        if found is not None:
+            return found
+        returns = read_returns(self._scene, key.frame, without_semantic=self._without)
+        wanted = PriorPixels.empty()
+        for other, camera in self._frames[key.frame].items():
+            prior = PriorPixels.empty()
+            if returns is not None:
+                seen = depth_seen(returns, camera)
+                prior = _as_prior(seen, visible(seen, camera), camera)
+            self._cache.put(other, prior, prior.nbytes)
+            if other == key:
+                wanted = prior
+        return wanted
+
+
+def visible(seen: SparseDepth, camera: Camera) -> np.ndarray:
+    """Which returns the camera sees too, bool [M].
+
+    The LiDAR stands elsewhere and looks past objects that hide what is behind them from the camera.
+    A return counts as hidden if clearly nearer ones are among its neighbours on three sides. Those
+    hidden just behind an edge are not found.
+    """
+    if len(seen) == 0:
+        return np.zeros(0, np.bool_)
+    pixels = seen.uv[:, 1] * np.int32(camera.width) + seen.uv[:, 0]
+    grid = np.zeros((camera.height, camera.width), np.float32)
+    grid.reshape(-1)[pixels] = seen.depth_m
+    with kernel_threads():
+        hidden = hidden_returns(
+            pixels, seen.depth_m, grid, _NEIGHBOURS, max(2, round(_WIDEST_PART * camera.width)),
+            np.float32(_BEHIND_RATIO), np.float32(_BEHIND_M),
+        )  # fmt: skip
+    return ~hidden
+
+
+def _as_prior(seen: SparseDepth, keep: np.ndarray, camera: Camera) -> PriorPixels:
+    pixels = seen.uv[keep, 1] * np.int32(camera.width) + seen.uv[keep, 0]
+    return PriorPixels(pixels, seen.depth_m[keep], np.ones(len(pixels), np.float32))
+
+
+# ---- depth priors --------------------------------------------------------------------------------
+
+logger = logging.getLogger(__name__)
+
+# Depth of a view at its training camera, float32 [H, W] metres, 0 where unknown.
+ReferenceDepth = Callable[[ViewKey, Camera], np.ndarray]
+
+
+@dataclass(frozen=True)
+class DepthPriors:
+    """Which priors to use. Where several know a pixel, the first of this order is believed.
+
+    lidar: the scene's sweeps. sparse_dir: Street Gaussians' lidar_depth folder. metric_dir: dense
+    depth in metres, DIR/<camera>/<frame>.png of uint16 metres x 256, 0 where unknown, as `climategs
+    render` writes. relative_dir: dense inverse depth up to scale and shift, as monocular networks
+    give, DIR/<camera>/<frame>.npy or .png. grid_px: dense maps are used at every grid_px-th pixel
+    of every grid_px-th row. relative_weight: how much those maps count beside LiDAR, which is 1.
+    """
+
+    lidar: bool = True
+    sparse_dir: Path | None = None
+    metric_dir: Path | None = None
+    relative_dir: Path | None = None
+    grid_px: int = 4
+    relative_weight: float = 0.1
+
+    def __post_init__(self) -> None:
+        if self.grid_px < 1:
+            raise ValueError(f"grid_px must be >= 1; got {self.grid_px}")
+        if not 0 < self.relative_weight <= 1:
+            raise ValueError(f"relative_weight must be > 0 and <= 1; got {self.relative_weight}")
+
+
+class DepthSource:
+    """The priors of all views, made when first asked for and remembered in a bounded memory."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        cameras: Mapping[ViewKey, Camera],
+        options: DepthPriors,
+        *,
+        cache_bytes: int,
+        reference: ReferenceDepth | None = None,
+    ) -> None:
+        """cameras: every view, at the training resolution. reference: distances that relative
+        maps are brought to metres by where the frame has no LiDAR."""
+        self.problems: list[str] = []
+        self._options, self._cameras, self._reference = options, cameras, reference
+        self._lidar: LidarPriors | None = None
+        if options.lidar and has_sweeps(scene, cameras):
+            self._lidar = LidarPriors(
+                scene,
+                cameras,
+                without_semantic=no_surface_classes(scene),
+                cache_bytes=cache_bytes // 2,
+            )
+        self._maps = _find_all(scene, cameras, options, self.problems)
+        self._cache: ByteCache[PriorPixels] = ByteCache(cache_bytes - cache_bytes // 2)
+        if not self.kinds:
+            self.problems.append(
+                "no depth priors: the scene has no LiDAR sweeps and no depth maps were found, so "
+                "distances are learnt from the images alone"
+            )
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """Which priors there are: lidar, sparse, metric, relative."""
+        found = tuple(kind for kind, maps in self._maps.items() if maps)
+        return found if self._lidar is None else ("lidar", *found)
+
+    def lidar(self, key: ViewKey) -> PriorPixels:
+        """What the sweep of the view's frame says."""
+        return PriorPixels.empty() if self._lidar is None else self._lidar.load(key)
+
+    def load(self, key: ViewKey, sky: np.ndarray) -> PriorPixels:
+        """All that is known of the view. sky: bool [H, W], where dense maps are not believed."""
+        if not any(self._maps.values()):
+            return self.lidar(key)
+        found = self._cache.get(key)
+        if found is None:
+            found = self._combine(key, sky)
+            self._cache.put(key, found, found.nbytes)
+        return found
+
+    def _combine(self, key: ViewKey, sky: np.ndarray) -> PriorPixels:
+        camera, options = self._cameras[key], self._options
+        priors = [self.lidar(key)]
+        for kind in ("sparse", "metric"):
+            priors.append(self._read(kind, key, sky))
+        known = join_priors(priors)
+        if key in self._maps["relative"]:
+            path = self._maps["relative"][key]
+            try:
+                reference = known.image(camera)
+                if len(known) == 0 and self._reference is not None:
+                    reference = self._reference(key, camera)
+                relative = relative_prior(path, camera, reference, sky, options.grid_px)
+            except AdapterError as error:
+                self._left_out(key, error)
+            else:
+                weighed = relative.weighing(options.relative_weight)
+                known = join_priors([known, beside(weighed, known, camera, options.grid_px)])
+        return known
+
+    def _read(self, kind: str, key: ViewKey, sky: np.ndarray) -> PriorPixels:
+        path = self._maps[kind].get(key)
+        if path is None:
+            return PriorPixels.empty()
+        camera = self._cameras[key]
+        try:
+            if kind == "sparse":
+                return sparse_prior(path, camera)
+            return metric_prior(path, camera, sky, self._options.grid_px)
+        except AdapterError as error:
+            self._left_out(key, error)
+            return PriorPixels.empty()
+
+    def _left_out(self, key: ViewKey, error: AdapterError) -> None:
+        sentence = f"camera {key.camera}, frame {key.frame}: {error}; its depth is left out"
+        logger.warning("%s", sentence)
+        if sentence not in self.problems:
+            self.problems.append(sentence)
+
+
+def _find_all(
+    scene: Scene,
+    cameras: Mapping[ViewKey, Camera],
+    options: DepthPriors,
+    problems: list[str],
+) -> dict[str, dict[ViewKey, Path]]:
+    stems = {key: Path(scene.frame(key.frame).image_paths[key.camera]).stem for key in cameras}
+    folders = {
+        "sparse": options.sparse_dir,
+        "metric": options.metric_dir,
+        "relative": options.relative_dir,
+    }
+    out: dict[str, dict[ViewKey, Path]] = {}
+    for kind, folder in folders.items():
+        if folder is None:
+            out[kind] = {}
+            continue
+        if kind == "sparse":
+            out[kind] = find_sparse(folder, cameras, scene.camera_names)
+        elif kind == "metric":
+            out[kind] = find_maps(folder, cameras, {}, {".png"})
+        else:
+            out[kind] = find_maps(folder, cameras, stems, {".npy", ".png"})
+        missing = [key for key in cameras if key not in out[kind]]
+        if missing:
+            problems.append(
+                f"{folder} holds no {kind} depth for {len(missing)} of {len(cameras)} images, "
+                f"first camera {missing[0].camera}, frame {missing[0].frame}"
+            )
+    return out
+
+
+def has_sweeps(scene: Scene, keys: Mapping[ViewKey, Camera]) -> bool:
+    """Whether any of the views' frames has a LiDAR sweep."""
+    if scene.labels is None:
+        return False
+    frames = dict.fromkeys(key.frame for key in keys)
+    return any(read_returns(scene, frame) is not None for frame in frames)
+
+
+def no_surface_classes(scene: Scene) -> tuple[int, ...]:
+    """The dataset's class numbers of returns that no surface made, such as mirror images."""
+    return scene.labels.no_surface_classes if isinstance(scene.labels, PandaSetLabels) else ()

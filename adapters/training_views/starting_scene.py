@@ -1,0 +1,215 @@
+"""What reconstruction starts from: the scene of a recording, and what its sensors leave out.
+
+Walls go on above the LiDAR's view, and the recording car's own body stands before some cameras.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import math
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+import torch
+
+from adapters.lidar_scene.surfels import SplatShape, Surfels, gaussians_from_surfels
+from adapters.training_views.views import RecordedViews
+from adapters.training_views.walls import wall_tops
+from augment.cameras import Camera
+from augment.geometry import rigid
+from augment.labels import EGO_VEHICLE
+from augment.reconstruct.view import ViewSource
+from augment.scene import Actor, Gaussians, Scene, Track
+from augment.semantics import SemanticClass
+
+# ------------------------------------------------------------------------------------------------
+# The recording car's own bonnet or roof as an actor that travels with the camera that sees it
+# Without it the body would be learnt into the road below, anew in every frame. It stands still in
+# the
+# image, so its true distance cannot be told from the images, and need not be: it is put near the
+# camera, where nothing else is and other cameras do not look.
+
+logger = logging.getLogger(__name__)
+
+_PX_PER_SPLAT = 8  # pixels of the recorded image from splat to splat: two at a quarter of its size
+_COLUMNS = (160, 320)  # fewest and most splats across a whole image
+_MOST_IMAGES = 48  # that the median is taken over
+_LEAST_SPLATS = 16  # a smaller mask is a speck, not a car
+_COVERED = 0.5  # part of a splat's cell that must lie in the mask
+_FAR_M, _NEAR_M = 1.6, 0.4  # along the optical axis
+_HALF_WIDTH_M = 0.95  # half a car's width: the body does not reach aside into other cameras' views
+_LEAST_SLOPE = 0.05  # a roof below the camera is seen at no flatter angle than this
+_MARGIN_M = 0.01
+_SHAPE = SplatShape(sigma_per_spacing=0.6, opacity=0.95)
+
+# Camera axes (x right, y down, z forward) to an actor's (x forward, y left, z up).
+_ACTOR_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+
+
+def ego_body(
+    scene: Scene,
+    camera_name: str,
+    mask: np.ndarray,
+    source: ViewSource,
+) -> Actor | None:
+    """The part of the recording car that a camera sees; None without a mask or images.
+
+    mask: bool [H, W] of that camera's images at any scale, True where they show the car. source:
+    recorded views; the median over time of those of the camera that are trained on gives the
+    colours. The actor's frame is the camera's own, turned to x forward, y left, z up and
+    moved to the box's centre; its track are the camera's poses at its own times, so that the body
+    stands still in every image. Its label is EGO_VEHICLE and its class OTHER: it has no box.
+
+    Raises:
+        ValueError: no such camera, or a mask that is not bool [H, W] with the camera's proportions.
+    """
+    cameras = [frame.cameras[camera_name] for frame in scene.frames if camera_name in frame.cameras]
+    if not cameras:
+        raise ValueError(
+            f"scene {scene.name!r} has no camera {camera_name!r}; it has "
+            f"{', '.join(scene.camera_names) or 'none'}"
+        )
+    first = cameras[0]
+    _check_mask(mask, first)
+    step = first.width / min(max(first.width / _PX_PER_SPLAT, _COLUMNS[0]), _COLUMNS[1])
+    grid = first.scaled(min(1.0, 1 / step))
+    size = (grid.width, grid.height)
+    part = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    rows, columns = np.nonzero(part >= _COVERED)
+    if len(rows) < _LEAST_SPLATS:
+        return None
+    colours = _median_colours(camera_name, source, size, rows, columns)
+    if colours is None:
+        return None
+    points, spacing = _place(grid, rows, columns)
+    gaussians, centre, size_m = _gaussians(points, spacing, colours)
+    logger.info("%d splats for the recording car in camera %s", len(gaussians), camera_name)
+    return Actor(
+        track_id=f"{EGO_VEHICLE}:{camera_name}",
+        label=EGO_VEHICLE,
+        gaussians=gaussians,
+        track=_track(cameras, centre),
+        size_m=size_m,
+    )
+
+
+def _check_mask(mask: np.ndarray, camera: Camera) -> None:
+    where = f"the mask of the recording car in camera {camera.name!r}"
+    if mask.dtype != np.bool_ or mask.ndim != 2 or mask.size == 0:
+        raise ValueError(f"{where} must be bool [H, W]; got {mask.dtype} {list(mask.shape)}")
+    height, width = mask.shape
+    expected = width * camera.height / camera.width
+    if abs(height - expected) > 1:
+        raise ValueError(
+            f"{where} must have the proportions of its images, {camera.width}x{camera.height}; "
+            f"got {width}x{height}"
+        )
+
+
+def _median_colours(
+    camera_name: str,
+    source: ViewSource,
+    size: tuple[int, int],
+    rows: np.ndarray,
+    columns: np.ndarray,
+) -> np.ndarray | None:
+    """Median over the images, float32 [N, 3] in [0, 1], or None without any."""
+    own = [k for k in source.train if k.camera == camera_name]
+    every = max(1, math.ceil(len(own) / _MOST_IMAGES))
+    samples = []
+    for key in own[::every]:
+        rgb = cv2.resize(source.load(key).rgb, size, interpolation=cv2.INTER_AREA)
+        samples.append(rgb[rows, columns])
+    if not samples:
+        return None
+    return (np.median(np.stack(samples), axis=0) / 255).astype(np.float32)
+
+
+def _place(grid: Camera, rows: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points on the rays through pixels of the grid, float64 [N, 3] in the camera's frame, and the
+    distance from one to the next, float64 [N].
+
+    They lie on a level surface below the camera, such as a roof, as far away as a car's width
+    allows; where a ray does not go down, on an upright one.
+    """
+    x = (columns + 0.5 - grid.cx) / grid.fx
+    y = (rows + 0.5 - grid.cy) / grid.fy
+    far_m = float(np.clip(_HALF_WIDTH_M / max(np.abs(x).max(), 1e-6), _NEAR_M, _FAR_M))
+    down = np.maximum(y, _LEAST_SLOPE)
+    depth = np.clip(far_m * down.min() / down, _NEAR_M, far_m)
+    rays = np.stack([x, y, np.ones_like(x)], axis=1)
+    return rays * depth[:, None], depth / min(grid.fx, grid.fy)
+
+
+def _gaussians(
+    points: np.ndarray, spacing: np.ndarray, colours: np.ndarray
+) -> tuple[Gaussians, np.ndarray, tuple[float, float, float]]:
+    """Discs that face the camera, in the actor's frame; the box's centre in the camera's axes
+    turned to the actor's, float64 [3]; and the box's size."""
+    turned = points @ _ACTOR_FROM_CAMERA.T
+    normals = turned / np.linalg.norm(turned, axis=1, keepdims=True)
+    major = np.cross([0.0, 0.0, 1.0], normals)
+    major /= np.linalg.norm(major, axis=1, keepdims=True)
+    low, high = turned.min(axis=0) - _MARGIN_M, turned.max(axis=0) + _MARGIN_M
+    centre = (low + high) / 2
+    surfels = Surfels(
+        centres=(turned - centre).astype(np.float32),
+        normals=normals.astype(np.float32),
+        major=major.astype(np.float32),
+        spacing=np.repeat(spacing[:, None], 2, axis=1).astype(np.float32),
+        isolated=np.zeros(len(points), np.bool_),
+        neighbours=np.zeros((len(points), 0), np.int64),
+    )
+    other = np.full(len(points), int(SemanticClass.OTHER), np.int16)
+    length, width, height = (float(v) for v in high - low)
+    return gaussians_from_surfels(surfels, colours, other, _SHAPE), centre, (length, width, height)
+
+
+def _track(cameras: Sequence[Camera], centre: np.ndarray) -> Track:
+    """The camera's poses as an actor's; of images of one time the first counts."""
+    rotation = torch.from_numpy(_ACTOR_FROM_CAMERA.T.copy())
+    camera_from_actor = rigid(rotation, rotation @ torch.from_numpy(centre))
+    poses = {}
+    for camera in cameras:
+        poses.setdefault(camera.timestamp_ns, camera.world_from_camera @ camera_from_actor)
+    times = sorted(poses)
+    return Track(
+        torch.tensor(times, dtype=torch.int64), torch.stack([poses[time] for time in times])
+    )
+
+
+# ---- starting scene ------------------------------------------------------------------------------
+
+
+def starting_scene(scene: Scene, views: RecordedViews) -> Scene:
+    """The scene with upper walls in its background and a body of the recording car for every
+    camera that sees it, both from training views alone.
+    """
+    top_deg = views.facts["lidar_top_deg"]
+    background = scene.background
+    if top_deg is not None:  # without LiDAR nothing ends at its highest view
+        background = _joined(background, wall_tops(scene, views, lidar_top_deg=top_deg))
+    bodies = [ego_body(scene, name, mask, views) for name, mask in views.ego_masks.items()]
+    actors = (*scene.actors, *(body for body in bodies if body is not None))
+    return dataclasses.replace(scene, background=background, actors=actors)
+
+
+def _joined(first: Gaussians, second: Gaussians) -> Gaussians:
+    """Both, at the first one's SH degree, which is not lower than the second's."""
+    if len(second) == 0:
+        return first
+    sh = torch.zeros(len(second), first.sh.shape[1], 3)
+    sh[:, : second.sh.shape[1]] = second.sh
+    semantic = None
+    if first.semantic is not None and second.semantic is not None:
+        semantic = torch.cat([first.semantic, second.semantic])
+    return Gaussians(
+        means=torch.cat([first.means, second.means]),
+        quats=torch.cat([first.quats, second.quats]),
+        scales=torch.cat([first.scales, second.scales]),
+        opacities=torch.cat([first.opacities, second.opacities]),
+        sh=torch.cat([first.sh, sh]),
+        semantic=semantic,
+    )

@@ -1,0 +1,478 @@
+"""The recorded images of a scene's frames as views to learn from."""
+
+from __future__ import annotations
+
+import logging
+import math
+import re
+import threading
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from tqdm import tqdm
+
+from adapters.plain_files import decode_image
+from adapters.training_views.byte_cache import ByteCache
+from adapters.training_views.depth_priors import DepthPriors, DepthSource, ReferenceDepth
+from adapters.training_views.masks import (
+    find_ego_mask,
+    lidar_top_rad,
+    moving_frames,
+    read_ego_mask,
+    sky_mask,
+)
+from augment.cameras import Camera
+from augment.errors import AdapterError
+from augment.reconstruct.view import RecordedView, ViewKey
+from augment.scene import Scene
+from recipes.files import open_file
+
+# ---- Recorded images at the training resolution, read on demand ----------------------------------
+
+# JPEG decoders can leave out the finest parts of each 8x8 block, which costs far less.
+_REDUCED = {
+    8: cv2.IMREAD_REDUCED_COLOR_8,
+    4: cv2.IMREAD_REDUCED_COLOR_4,
+    2: cv2.IMREAD_REDUCED_COLOR_2,
+    1: cv2.IMREAD_COLOR,
+}
+_JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
+_TAIL_BYTES = 64  # some cameras pad the file behind the end marker
+
+
+class ImageFault(Exception):
+    """What is wrong with an image file, as the end of a sentence that starts with its path."""
+
+
+def read_scaled(path: Path, full: Camera, scaled: Camera) -> np.ndarray:
+    """The image of camera `full` at the size of camera `scaled`: RGB uint8 [H, W, 3].
+
+    Each pixel is the mean of the area it covers. Files may be any kind that OpenCV decodes; their
+    size may differ from the camera's by less than the reduction of the decoder (8 pixels at most).
+
+    Raises:
+        ImageFault: missing, cut short, not decodable, or not of the camera's size.
+    """
+    is_jpeg = _check_file(path)
+    step = _reduction(full, scaled) if is_jpeg else 1
+    image = decode_image(path, _REDUCED[step])
+    if image is None:
+        raise ImageFault("cannot be decoded")
+    size = (-(-full.height // step), -(-full.width // step))
+    if image.shape[:2] != size:
+        height, width = image.shape[0] * step, image.shape[1] * step
+        about = "about " if step > 1 else ""
+        raise ImageFault(
+            f"is of {about}{width}x{height} pixels; its camera is of {full.width}x{full.height}"
+        )
+    if (scaled.height, scaled.width) != size:
+        image = cv2.resize(image, (scaled.width, scaled.height), interpolation=cv2.INTER_AREA)
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+def _reduction(full: Camera, scaled: Camera) -> int:
+    """The most that a JPEG can be reduced while it is decoded: not below the size wanted, and only
+    if it divides both sides, since an odd remainder would shift pixels."""
+    for step in (8, 4, 2):
+        divides = full.width % step == 0 and full.height % step == 0
+        if divides and full.width // step >= scaled.width and full.height // step >= scaled.height:
+            return step
+    return 1
+
+
+def _check_file(path: Path) -> bool:
+    """Whether the file is a JPEG; its ends are looked at since decoders fill what is missing."""
+    try:
+        with open_file(path) as file:
+            head = file.read(2)
+            size = file.seek(0, 2)
+            file.seek(max(0, size - _TAIL_BYTES))
+            tail = file.read()
+    except FileNotFoundError:
+        raise ImageFault("does not exist") from None
+    except OSError as error:
+        raise ImageFault(f"cannot be read ({error.strerror or error})") from None
+    if head != _JPEG_START:
+        return False
+    if _JPEG_END not in tail:
+        raise ImageFault("is cut short")
+    return True
+
+
+class Images:
+    """All recorded images by view; as many as fit in `cache_bytes` stay decoded."""
+
+    def __init__(self, cache_bytes: int) -> None:
+        self._sources: dict[ViewKey, tuple[Path, Camera, Camera]] = {}
+        self._cache: ByteCache[np.ndarray] = ByteCache(cache_bytes)
+
+    def add(self, key: ViewKey, path: Path, full: Camera, scaled: Camera) -> np.ndarray:
+        """Decode an image for the first time, and keep it while there is room for all so far.
+
+        Raises:
+            ImageFault: it is unusable, and was not added.
+        """
+        image = read_scaled(path, full, scaled)
+        self._sources[key] = (path, full, scaled)
+        if self._cache.has_room(image.nbytes):
+            self._cache.put(key, image, image.nbytes)
+        return image
+
+    def load(self, key: ViewKey) -> np.ndarray:
+        """uint8 [H, W, 3]; callers do not write into it.
+
+        Raises:
+            AdapterError: the file has changed since it was added.
+        """
+        image = self._cache.get(key)
+        if image is not None:
+            return image
+        path, full, scaled = self._sources[key]
+        try:
+            image = read_scaled(path, full, scaled)
+        except ImageFault as fault:
+            raise AdapterError(
+                f"camera {key.camera}, frame {key.frame}: image {path} {fault}; it could be read "
+                f"when the scene was opened, leave the files as they are while they are in use"
+            ) from None
+        self._cache.put(key, image, image.nbytes)
+        return image
+
+
+# ---- Which frames are held out of training, by their position in the drive -----------------------
+
+NONE = "none"
+_EVERY = re.compile(r"every-(\d{1,6})(?:st|nd|rd|th)")
+
+
+def holdout_step(holdout: str) -> int | None:
+    """N of "every-Nth", None of "none".
+
+    Raises:
+        AdapterError: anything else, or N below 2.
+    """
+    if holdout == NONE:
+        return None
+    match = _EVERY.fullmatch(holdout)
+    step = int(match[1]) if match else 0
+    if step < 2:
+        raise AdapterError(
+            f"holdout must be 'none' or 'every-Nth' with N >= 2, such as every-2nd or every-8th; "
+            f"got {holdout!r}"
+        )
+    return step
+
+
+def is_held_out(position: int, step: int | None) -> bool:
+    """Of the frame at this position of the drive, counted from 0: the last of every `step`."""
+    return step is not None and position % step == step - 1
+
+
+# ---- views ---------------------------------------------------------------------------------------
+
+logger = logging.getLogger(__name__)
+
+CACHE_BYTES = 1 << 30
+_FARTHEST_M = 1e6  # float32 has a resolution of 6 cm there
+_LEAST_FOCAL, _MOST_FOCAL = 0.05, 50.0  # focal length over width: a view of 169 or of 1.1 degrees
+_TOP_FRAMES = 5  # frames that the LiDAR's highest view is measured in
+
+
+def recorded_views(
+    scene: Scene,
+    *,
+    scale: float,
+    cameras: Sequence[str] | None = None,
+    holdout: str = "none",
+    cache_bytes: int = CACHE_BYTES,
+    depth: DepthPriors = DepthPriors(),  # noqa: B008 - frozen, so sharing it is safe
+    reference_depth: ReferenceDepth | None = None,
+    masks_dir: Path | None = None,
+    mask_ego: bool = False,
+) -> RecordedViews:
+    """The views of a scene that was opened from recordings.
+
+    scene: as initialised, before any optimisation; its Gaussians tell where sky must be. scale:
+    training resolution over recorded resolution, in (0, 1]. cameras: names, all by default.
+    holdout: "none" or "every-Nth": of the scene's frames the last of every N is held out.
+    cache_bytes: memory for decoded images, and half as much for depth priors; what does not fit is
+    read again. reference_depth: what relative depth maps are brought to metres by where there is no
+    LiDAR. masks_dir: DIR/<camera>.png, white where the image shows the recording car; a camera
+    without a file does not see it. By default such pixels are found by their standing still.
+    mask_ego: do not learn from them.
+
+    Every image is decoded once here. Unusable ones are left out and named in `problems`.
+
+    Raises:
+        AdapterError: an unknown camera or holdout, or no usable image.
+    """
+    if not 0 < scale <= 1:
+        raise ValueError(f"scale must be > 0 and <= 1; got {scale}")
+    return RecordedViews(
+        scene,
+        scale=scale,
+        names=_camera_names(scene, cameras),
+        holdout=holdout,
+        cache_bytes=cache_bytes,
+        depth=depth,
+        reference_depth=reference_depth,
+        masks_dir=masks_dir,
+        mask_ego=mask_ego,
+    )
+
+
+class RecordedViews:
+    """A `ViewSource`; made by `recorded_views`. `load` may be called from several threads.
+
+    ego_masks: for each camera that sees the recording car, where, bool [H, W] at the training
+    resolution. No depth priors are given there: the LiDAR looks past the car at the road behind.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        *,
+        scale: float,
+        names: Sequence[str],
+        holdout: str,
+        cache_bytes: int,
+        depth: DepthPriors,
+        reference_depth: ReferenceDepth | None,
+        masks_dir: Path | None,
+        mask_ego: bool,
+    ) -> None:
+        step = holdout_step(holdout)
+        self._scene = scene
+        self._images = Images(cache_bytes)
+        self._problems: list[str] = []
+        self._cameras = self._read_all(scene, names, scale)
+        positions = {frame.index: i for i, frame in enumerate(scene.frames)}
+        is_test = [is_held_out(positions[key.frame], step) for key in self._cameras]
+        self._train = tuple(k for k, t in zip(self._cameras, is_test, strict=True) if not t)
+        self._test = tuple(k for k, t in zip(self._cameras, is_test, strict=True) if t)
+        self._check_split(holdout)
+        self._depth = DepthSource(
+            scene,
+            self._cameras,
+            depth,
+            cache_bytes=cache_bytes // 2,
+            reference=reference_depth,
+        )
+        self._lidar_top_rad = self._measure_lidar_top()
+        self._skies: dict[ViewKey, np.ndarray] = {}  # one bit a pixel
+        self._weights: dict[str, np.ndarray] = {}
+        self.ego_masks = self._find_ego(names, masks_dir)
+        self._mask_ego = mask_ego
+        self._lock = threading.Lock()
+
+    @property
+    def train(self) -> tuple[ViewKey, ...]:
+        return self._train
+
+    @property
+    def test(self) -> tuple[ViewKey, ...]:
+        return self._test
+
+    @property
+    def problems(self) -> tuple[str, ...]:
+        """What was found wrong and gone on without, one sentence each; loading may add some."""
+        return (*self._problems, *self._depth.problems)
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What there is, for reports: JSON-able."""
+        sizes = {k.camera: [c.width, c.height] for k, c in self._cameras.items()}
+        top = self._lidar_top_rad
+        return {
+            "images": dict(Counter(key.camera for key in self._cameras)),
+            "sizes_px": sizes,
+            "train_images": len(self._train),
+            "test_images": len(self._test),
+            "depth_priors": list(self._depth.kinds),
+            "lidar_top_deg": None if top is None else float(np.degrees(top)),
+            "ego_mask_parts": {n: float(mask.mean()) for n, mask in self.ego_masks.items()},
+        }
+
+    def camera(self, key: ViewKey) -> Camera:
+        try:
+            return self._cameras[key]
+        except KeyError:
+            raise AdapterError(
+                f"scene {self._scene.name!r} has no usable image of camera {key.camera!r} in "
+                f"frame {key.frame}"
+            ) from None
+
+    def image(self, key: ViewKey) -> np.ndarray:
+        """The view's image alone, uint8 [H, W, 3]; callers do not write into it."""
+        self.camera(key)
+        with self._lock:
+            return self._images.load(key)
+
+    def load(self, key: ViewKey) -> RecordedView:
+        camera = self.camera(key)
+        with self._lock:
+            rgb = self._images.load(key)
+            sky = self._sky(key, camera, rgb)
+            prior = self._depth.load(key, sky)
+            ego = self._ego(camera)
+            if ego is not None:
+                prior = prior.select(~ego.reshape(-1)[prior.pixels])
+            return RecordedView(
+                camera=camera,
+                rgb=rgb,
+                weight=self._weight(camera),
+                sky=sky,
+                depth_pixels=prior.pixels,
+                depth_m=prior.depth_m,
+                depth_weight=prior.weight,
+            )
+
+    def _ego(self, camera: Camera) -> np.ndarray | None:
+        """Where the camera sees the recording car; None if it does not."""
+        mask = self.ego_masks.get(camera.name)
+        return mask if mask is not None and mask.shape == (camera.height, camera.width) else None
+
+    def _weight(self, camera: Camera) -> np.ndarray:
+        weight = self._weights.get(camera.name)
+        if weight is None or weight.shape != (camera.height, camera.width):
+            weight = np.ones((camera.height, camera.width), np.float32)
+            ego = self._ego(camera)
+            if ego is not None and self._mask_ego:
+                weight[ego] = 0
+            self._weights[camera.name] = weight
+        return weight
+
+    def _sky(self, key: ViewKey, camera: Camera, rgb: np.ndarray) -> np.ndarray:
+        packed = self._skies.get(key)
+        if packed is None:
+            returns = self._depth.lidar(key).pixels
+            mask = sky_mask(self._scene, camera, rgb, returns, self._lidar_top_rad)
+            ego = self._ego(camera)
+            if ego is not None:
+                mask &= ~ego
+            self._skies[key] = np.packbits(mask)
+            return mask
+        count = camera.height * camera.width
+        bits = np.unpackbits(packed, count=count).view(np.bool_)
+        return bits.reshape(camera.height, camera.width)
+
+    def _read_all(self, scene: Scene, names: Sequence[str], scale: float) -> dict[ViewKey, Camera]:
+        """The training camera of every view with a usable image, in order of frame and camera."""
+        wanted = [
+            (ViewKey(frame.index, name), frame.cameras[name], frame.image_paths.get(name))
+            for frame in scene.frames
+            for name in names
+            if name in frame.cameras
+        ]
+        cameras: dict[ViewKey, Camera] = {}
+        for key, full, path in tqdm(wanted, desc="images", unit="image", disable=None):
+            if path is None:
+                continue  # the adapter that left it out has said so
+            _check_camera(key, full)
+            scaled = full.scaled(scale)
+            try:
+                self._images.add(key, Path(path), full, scaled)
+            except ImageFault as fault:
+                self._problems.append(
+                    f"camera {key.camera}, frame {key.frame}: image {path} {fault}; left out"
+                )
+                continue
+            cameras[key] = scaled
+        if not cameras:
+            raise AdapterError(_no_images(scene, names, len(wanted), self._problems))
+        return cameras
+
+    def _check_split(self, holdout: str) -> None:
+        if not self._train:
+            raise AdapterError(
+                f"scene {self._scene.name!r}: holdout {holdout!r} leaves no image to learn from; "
+                f"choose a larger step or 'none'"
+            )
+        if holdout != "none" and not self._test:
+            frames = len({key.frame for key in self._cameras})
+            self._problems.append(
+                f"nothing is held out: {holdout} selects none of the {frames} "
+                f"frame{'s' if frames > 1 else ''} with images, so quality is known on training "
+                f"views only"
+            )
+
+    def _find_ego(self, names: Sequence[str], masks_dir: Path | None) -> dict[str, np.ndarray]:
+        """The masks that are there, from files or else from the images; empty ones left out."""
+        found: dict[str, np.ndarray] = {}
+        for name in names:
+            views = [(k, c) for k, c in self._cameras.items() if k.camera == name]
+            # Should a camera's size change, masks are for the size it has at first.
+            views = [(k, c) for k, c in views if (c.width, c.height) == _size(views[0][1])]
+            if not views:
+                continue
+            if masks_dir is not None:
+                path = masks_dir / f"{name}.png"
+                if path.exists():
+                    found[name] = read_ego_mask(path, views[0][1])
+                continue
+            moving = [views[i] for i in moving_frames([camera for _, camera in views])]
+            images = [self._images.load(key) for key, _ in moving]
+            found[name] = find_ego_mask([camera for _, camera in moving], images)
+        if masks_dir is not None and not found:
+            raise AdapterError(
+                f"{masks_dir} holds no mask {names[0]}.png or of another camera; expected images "
+                f"named like the cameras ({', '.join(names)}), white on the recording car"
+            )
+        return {name: mask for name, mask in found.items() if mask.any()}
+
+    def _measure_lidar_top(self) -> float | None:
+        frames = list(dict.fromkeys(key.frame for key in self._cameras))
+        spread = frames[:: max(1, -(-len(frames) // _TOP_FRAMES))]
+        top = lidar_top_rad(self._scene, spread)
+        if top is None:
+            self._problems.append(
+                "no sky masks: without LiDAR sweeps nothing tells sky from tall buildings"
+            )
+        return top
+
+
+def _check_camera(key: ViewKey, camera: Camera) -> None:
+    """Refuse what a Camera may be but a recording cannot."""
+    where = f"camera {key.camera}, frame {key.frame}"
+    position = camera.centre.tolist()
+    if not all(math.isfinite(x) and abs(x) < _FARTHEST_M for x in position):
+        raise AdapterError(
+            f"{where}: its position in the scene must be finite and within {_FARTHEST_M:.0f} m of "
+            f"the origin; got {position}. Check the pose in the dataset"
+        )
+    if not _LEAST_FOCAL < camera.fx / camera.width < _MOST_FOCAL:
+        raise AdapterError(
+            f"{where}: a focal length of {camera.fx:g} px is impossible for an image of "
+            f"{camera.width} columns; check the intrinsics and their unit (pixels)"
+        )
+
+
+def _size(camera: Camera) -> tuple[int, int]:
+    return camera.width, camera.height
+
+
+def _camera_names(scene: Scene, cameras: Sequence[str] | None) -> tuple[str, ...]:
+    known = scene.camera_names
+    if cameras is None:
+        return known
+    unknown = sorted(set(cameras) - set(known))
+    if unknown or not cameras:
+        raise AdapterError(
+            f"scene {scene.name!r} has no camera {', '.join(map(repr, unknown)) or 'named'}; "
+            f"it has {', '.join(known) or 'none'}"
+        )
+    return tuple(name for name in known if name in cameras)
+
+
+def _no_images(scene: Scene, names: Sequence[str], wanted: int, problems: Sequence[str]) -> str:
+    first = f" First: {problems[0]}." if problems else ""
+    return (
+        f"scene {scene.name!r} ({scene.source}) has no usable recorded image for "
+        f"{len(scene.frames)} frames of {', '.join(names) or 'no camera'} ({wanted} expected). "
+        f"A reconstruction needs recordings: open the raw drive, such as pandaset:PATH or "
+        f"recording:PATH, and see that its images are in place.{first}"
+    )

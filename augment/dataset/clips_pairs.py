@@ -1,0 +1,402 @@
+"""Clips: consecutive frames of all cameras, for models that look at time or around the car."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch.utils.data import Dataset
+
+from augment.dataset.samples import IMAGES
+from augment.dataset.weather_dataset import Rows, WeatherDataset
+
+# ---- Clean and weathered images of the same moment: side by side, or mixed into one dataset ------
+
+# What says that an effect is there; its other numbers may be given without it. Water at a level of
+# 0 is water.
+_PRESENCE = {
+    "smog": ("smog_extinction_per_m", False),
+    "flood": ("flood_level_m", True),
+    "snow": ("snow_depth_m", False),
+    "style": ("style_strength", False),
+}
+
+
+def clean_frames(dataset: WeatherDataset, variant: str | None = None) -> WeatherDataset:
+    """The images without weather and style, or those of one variant.
+
+    Without a variant's name: those whose manifest says no smog, flood, snow or style, and whose
+    other weather numbers are all zero or absent.
+
+    Raises:
+        ValueError: there is no such variant.
+    """
+    rows = dataset.rows
+    if variant is None:
+        return dataset.select(clean_mask(rows))
+    names = rows.coded("variant")
+    if variant not in names.values:
+        raise ValueError(f"no variant {variant!r}; there are {', '.join(sorted(names.values))}")
+    return dataset.select(names.codes == names.values.index(variant))
+
+
+def clean_mask(rows: Rows) -> np.ndarray:
+    """bool [N]: rows without weather and style."""
+    clean = np.ones(len(rows), bool)
+    for name in rows.weather:
+        leading, zero_is_present = _PRESENCE.get(name.partition("_")[0], (name, False))
+        if name != leading:
+            continue
+        numbers = rows.numbers(name).astype(np.float64)
+        clean &= np.isnan(numbers) | ((numbers == 0) & (not zero_is_present))
+    return clean
+
+
+class PairedDataset(Dataset):
+    """Every weathered image with the clean one of the same scene, frame and camera.
+
+    clean, weathered: over one output folder or two; each with its own options and transform. A
+    sample is `{"clean": sample, "weathered": sample}`, in the order of the weathered ones; those
+    without a clean one are left out, `unpaired` of them. Cameras of a pair have the same pose, and
+    the same size if their recipes' scale is the same.
+
+        frames = WeatherDataset("out/fog")
+        pairs = PairedDataset.of(frames)
+
+    Raises:
+        ValueError: two clean images of one moment, or no pair at all though both have images.
+    """
+
+    def __init__(self, clean: WeatherDataset, weathered: WeatherDataset) -> None:
+        self.clean, self.weathered = clean, weathered
+        partner = _partners(clean.rows, weathered.rows)
+        self._weathered_rows = np.flatnonzero(partner >= 0)
+        self._clean_rows = partner[self._weathered_rows]
+        self.unpaired = len(partner) - len(self._weathered_rows)
+        if len(clean) and len(weathered) and not len(self):
+            raise ValueError(
+                "no clean image has the scene, frame and camera of a weathered one; render the "
+                "same frames and cameras under both recipes"
+            )
+
+    @staticmethod
+    def of(dataset: WeatherDataset, clean_variant: str | None = None) -> PairedDataset:
+        """The pairs within one dataset: its clean images (`clean_frames`) and all others."""
+        clean = clean_frames(dataset, clean_variant)
+        if clean_variant is None:
+            others = ~clean_mask(dataset.rows)
+        else:
+            names = dataset.rows.coded("variant")
+            others = names.codes != names.values.index(clean_variant)
+        return PairedDataset(clean, dataset.select(others))
+
+    def __len__(self) -> int:
+        return len(self._weathered_rows)
+
+    def __getitem__(self, index: int) -> dict[str, Any]:
+        clean, weathered = int(self._clean_rows[index]), int(self._weathered_rows[index])
+        return {"clean": self.clean[clean], "weathered": self.weathered[weathered]}
+
+
+class MixedDataset(Dataset):
+    """The clean images, a part of them exchanged for weathered ones of the same moment.
+
+    As long as `clean`. fraction: the probability of an exchange, where there is a weathered image;
+    which of several is drawn too, each as likely. What an index yields depends on the seed, the
+    epoch and the index only: not on the worker, nor on what was asked before. Both datasets need
+    the same `image_type` and `transform`, or their samples do not stack.
+
+    Raises:
+        ValueError: a fraction outside 0 to 1, two clean images of one moment, or one dataset's
+            samples have what the other's lack (masks of water and snow excepted).
+    """
+
+    def __init__(
+        self, clean: WeatherDataset, weathered: WeatherDataset, fraction: float, *, seed: int = 0
+    ) -> None:
+        if not 0 <= fraction <= 1:
+            raise ValueError(f"fraction must be 0 to 1; got {fraction}")
+        if len(clean) and len(weathered):
+            _check_alike(clean, weathered)
+        self.clean, self.weathered, self.fraction, self.seed = clean, weathered, fraction, seed
+        partner = _partners(clean.rows, weathered.rows)
+        # The weathered rows of clean row i are _rows[_ends[i]:_ends[i + 1]].
+        self._rows = np.argsort(partner, kind="stable")[np.count_nonzero(partner < 0) :]
+        counts = np.bincount(partner[partner >= 0], minlength=len(clean))
+        self._ends = np.concatenate([[0], np.cumsum(counts)])
+        # Shared memory: workers that live on (persistent_workers) see a new epoch too.
+        self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()
+
+    def set_epoch(self, epoch: int) -> None:
+        """Draw anew, as another epoch does; before its first sample is asked for."""
+        self._epoch.fill_(epoch)
+
+    def __len__(self) -> int:
+        return len(self.clean)
+
+    def __getitem__(self, index: int) -> Any:
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"sample {index} of a dataset of {len(self)}")
+        row = self.weathered_row(index % len(self))
+        return self.clean[index] if row is None else self.weathered[row]
+
+    def weathered_row(self, index: int) -> int | None:
+        """Which weathered image this epoch has in place of a clean one; None: the clean one."""
+        start, end = self._ends[index], self._ends[index + 1]
+        if start == end:
+            return None
+        rng = np.random.default_rng([self.seed, int(self._epoch), index])
+        if rng.random() >= self.fraction:
+            return None
+        return int(self._rows[rng.integers(start, end)])
+
+
+def _check_alike(clean: WeatherDataset, weathered: WeatherDataset) -> None:
+    sides = {"clean": clean, "weathered": weathered}
+    for name, other in (("clean", "weathered"), ("weathered", "clean")):
+        if lacking := sorted(sides[other].given() - sides[name].given()):
+            raise ValueError(
+                f"samples of `{name}` ({', '.join(sides[name].uris)}) have no "
+                f"{', '.join(lacking)}, those of `{other}` ({', '.join(sides[other].uris)}) have: "
+                f"batches would not stack. Open both with a `load` without it, or render it for "
+                f"`{name}` too"
+            )
+
+
+def _partners(clean: Rows, weathered: Rows) -> np.ndarray:
+    """int64: of each weathered row the clean row of its scene, frame and camera, or -1."""
+    wanted, keys = _keys(clean, weathered)
+    order = np.argsort(wanted, kind="stable")
+    ordered = wanted[order]
+    if (twice := np.flatnonzero(ordered[1:] == ordered[:-1])).size:
+        row = int(order[twice[0]])
+        raise ValueError(
+            f"scene {clean['scene'][row]!r}, frame {clean['frame'][row]}, camera "
+            f"{clean['camera'][row]!r} has more than one clean image; choose a variant: "
+            f"clean_frames(dataset, variant)"
+        )
+    if not len(ordered):
+        return np.full(len(keys), -1)
+    place = np.searchsorted(ordered, keys).clip(max=len(ordered) - 1)
+    return np.where(ordered[place] == keys, order[place], -1)
+
+
+def _keys(one: Rows, other: Rows) -> tuple[np.ndarray, np.ndarray]:
+    """A number for each row's scene, frame and camera, the same in both."""
+    keys, sizes = np.zeros(len(one) + len(other), np.int64), []
+    for name in ("scene", "frame", "camera"):
+        columns = one.coded(name), other.coded(name)
+        values = {
+            value: n for n, value in enumerate(dict.fromkeys(columns[0].values + columns[1].values))
+        }
+        codes = [
+            np.array([values[value] for value in column.values], np.int64)[column.codes]
+            for column in columns
+            if len(column)
+        ]
+        sizes.append(len(values))
+        keys = keys * len(values) + np.concatenate([np.zeros(0, np.int64), *codes])
+    assert math.prod(sizes) < 2**63
+    return keys[: len(one)], keys[len(one) :]
+
+
+# ---- clips ---------------------------------------------------------------------------------------
+
+MOST_LATE = 1.5  # a frame later than this many usual intervals comes after a gap
+_PER_FRAME = ("sizes_m", "labels", "track_ids", "attributes", "frame")
+_PLACED = ("centers_m", "quats")
+
+
+class ClipDataset(Dataset):
+    """Clips of `length` frames of one scene under one variant, each with all cameras.
+
+    length: frames a clip, T. step: of how many recorded frames each is taken. stride: recorded
+    frames from one clip's first to the next's. cameras: names in the order of the samples, None for
+    all that a variant has. transform: called with every clip.
+
+    Frames follow each other where their numbers do (by the smallest distance that the variant's
+    numbers have) and their times: one that comes later than 1.5 of the usual intervals, or lacks a
+    camera, ends the clips before it. So a clip never spans a gap, two scenes or two variants.
+
+    A clip is a sample (`augment.dataset.samples`) with two dimensions more, of T frames and C
+    cameras:
+
+        image             [T, C, 3, H, W]; where sizes differ, a list of T lists of C; likewise
+                          depth, semantic, instance, water, snow
+        boxes             a list of T: a frame's boxes once, its numbers for each image [C, B]
+                          (visibility, hidden_fraction, ...); in the camera's frame centers_m
+                          [C, B, 3] and quats [C, B, 4] too
+        lidar             a list of T
+        camera            name: a list of C. K [T, C, 3, 3], world_from_camera [T, C, 4, 4],
+                          world_from_ego [T, 4, 4]; width, height, timestamp_ns int64 [T, C]
+        paths             a list of T lists of C
+        frame             int64 [T]
+        scene, variant, weather, recipe_hash, surface: as in a sample
+
+    The frames' dataset is asked without its own `transform`.
+
+    Raises:
+        ValueError: numbers below 1, or a camera that no variant has.
+    """
+
+    def __init__(
+        self,
+        frames: WeatherDataset,
+        length: int,
+        *,
+        step: int = 1,
+        stride: int = 1,
+        cameras: Sequence[str] | None = None,
+        transform: Callable[[dict[str, Any]], Any] | None = None,
+    ) -> None:
+        numbers = {"length": length, "step": step, "stride": stride}
+        if min(numbers.values()) < 1:
+            raise ValueError(f"length, step and stride must be >= 1; got {numbers}")
+        self.frames, self.length, self.transform = frames, length, transform
+        self._runs = list(_runs(frames.rows, cameras))
+        reach = (length - 1) * step
+        # Of each clip: its run, and the place of its first frame there.
+        self._starts = np.array(
+            [
+                (number, start)
+                for number, run in enumerate(self._runs)
+                for start in range(0, len(run) - reach, stride)
+            ],
+            np.int64,
+        ).reshape(-1, 2)
+        self._steps = np.arange(length) * step
+
+    def __len__(self) -> int:
+        return len(self._starts)
+
+    def __getitem__(self, index: int) -> Any:
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"clip {index} of a dataset of {len(self)}")
+        clip = join_clip(list(self._frames(index)))
+        return clip if self.transform is None else self.transform(clip)
+
+    def row_numbers(self, index: int) -> np.ndarray:
+        """int64 [T, C]: the numbers of the clip's images in `frames`."""
+        run, start = self._starts[index]
+        return self._runs[run][start + self._steps]
+
+    def _frames(self, index: int) -> Iterator[list[dict[str, Any]]]:
+        for rows in self.row_numbers(index):
+            # All cameras see the same sweep.
+            yield [
+                self.frames.sample(int(row), without=("lidar",) if number else ())
+                for number, row in enumerate(rows)
+            ]
+
+
+def join_clip(frames: Sequence[Sequence[Mapping[str, Any]]]) -> dict[str, Any]:
+    """Samples [T][C] as one clip."""
+    first = frames[0][0]
+    clip = {**first}
+    for key in IMAGES:
+        clip[key] = _joined([[sample[key] for sample in frame] for frame in frames])
+    clip["boxes"] = None if first["boxes"] is None else [_boxes(frame) for frame in frames]
+    clip["lidar"] = [frame[0]["lidar"] for frame in frames]
+    if all(sweep is None for sweep in clip["lidar"]):
+        clip["lidar"] = None
+    clip["camera"] = _cameras([[sample["camera"] for sample in frame] for frame in frames])
+    clip["paths"] = [[sample["paths"] for sample in frame] for frame in frames]
+    clip["frame"] = torch.tensor([frame[0]["frame"] for frame in frames])
+    return clip
+
+
+def _joined(values: list[list[Any]]) -> Any:
+    """[T][C] tensors as one; None where there are only None; else the lists."""
+    flat = [value for frame in values for value in frame]
+    if all(value is None for value in flat):
+        return None
+    if any(value is None for value in flat) or len({value.shape for value in flat}) > 1:
+        return values
+    return torch.stack(flat).unflatten(0, (len(values), -1))
+
+
+def _boxes(frame: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """A frame's boxes: what does not depend on the image once, the rest for every camera."""
+    every = [sample["boxes"] for sample in frame]
+    once = _PER_FRAME if every[0]["frame"] == "camera" else (*_PER_FRAME, *_PLACED)
+    return {
+        key: value if key in once or value is None else torch.stack([b[key] for b in every])
+        for key, value in every[0].items()
+    }
+
+
+def _cameras(cameras: list[list[Mapping[str, Any]]]) -> dict[str, Any]:
+    first = cameras[0]
+    whole = {
+        key: torch.tensor([[camera[key] for camera in frame] for frame in cameras])
+        for key in ("width", "height", "timestamp_ns")
+    }
+    return {
+        "name": [camera["name"] for camera in first],
+        **whole,
+        "K": _joined([[camera["K"] for camera in frame] for frame in cameras]),
+        "world_from_camera": _joined([[c["world_from_camera"] for c in f] for f in cameras]),
+        "world_from_ego": torch.stack([frame[0]["world_from_ego"] for frame in cameras]),
+    }
+
+
+def _runs(rows: Rows, cameras: Sequence[str] | None) -> Iterator[np.ndarray]:
+    """Row numbers int64 [F, C] of frames that follow each other without a gap."""
+    column, frames, times = (
+        rows.coded("camera"),
+        rows.numbers("frame"),
+        rows.numbers("timestamp_ns"),
+    )
+    known = {column.values[code]: int(code) for code in np.unique(column.codes)}
+    if cameras is not None and (unknown := [name for name in cameras if name not in known]):
+        raise ValueError(f"no camera {unknown}; there are {', '.join(known) or 'none'}")
+    asked = None if cameras is None else [known[name] for name in cameras]
+    for numbers in _by_variant(rows):
+        codes = column.codes[numbers]
+        wanted = np.unique(codes) if asked is None else np.array(asked, codes.dtype)
+        yield from _runs_of(numbers, frames[numbers], times[numbers], codes, wanted)
+
+
+def _by_variant(rows: Rows) -> Iterator[np.ndarray]:
+    """The numbers of the rows of each scene under each variant, in the order of the rows."""
+    keys = rows.variants()[1]
+    order = np.argsort(keys, kind="stable")
+    yield from np.split(order, np.flatnonzero(np.diff(keys[order])) + 1) if len(order) else ()
+
+
+def _runs_of(
+    numbers: np.ndarray,
+    frames: np.ndarray,
+    times: np.ndarray,
+    codes: np.ndarray,
+    wanted: np.ndarray,
+) -> Iterator[np.ndarray]:
+    """The runs of one variant. numbers, frames, times, codes (of cameras): [N] of its rows."""
+    present, place = np.unique(frames, return_inverse=True)
+    table = np.full((len(present), len(wanted)), -1, np.int64)
+    clock_ns = np.zeros_like(table)
+    for column, code in enumerate(wanted):
+        own = codes == code
+        table[place[own], column] = numbers[own]
+        clock_ns[place[own], column] = times[own]
+    whole = (table >= 0).all(axis=1)
+    if whole.any():
+        breaks = _gaps(present, present[whole]) | _late(clock_ns[whole])
+        yield from np.split(table[whole], np.flatnonzero(breaks) + 1)
+
+
+def _gaps(every: np.ndarray, present: np.ndarray) -> np.ndarray:
+    """bool [F - 1]: where frame numbers are farther apart than the variant's closest ones."""
+    usual = np.diff(every).min(initial=np.iinfo(np.int64).max)
+    return np.diff(present) > usual
+
+
+def _late(clock_ns: np.ndarray) -> np.ndarray:
+    """bool [F - 1]: where any camera's next image comes late. clock_ns: int64 [F, C]."""
+    waits = np.diff(clock_ns, axis=0)
+    usual = np.median(waits, axis=0) if len(waits) else np.zeros(clock_ns.shape[1])
+    late = (waits > MOST_LATE * usual) | (waits < 0)
+    return np.logical_or.reduce(late, axis=1)

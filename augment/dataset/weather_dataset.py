@@ -1,0 +1,800 @@
+"""The dataset over the files that jobs have written."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import os
+import tempfile
+from collections import OrderedDict, defaultdict
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence, Sized
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
+
+import cv2
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.dataset
+import torch
+from pyarrow.compute import Expression
+from torch.utils.data import Dataset, get_worker_info
+
+from augment.dataset.samples import (
+    BUFFERS,
+    DEFAULT_LOAD,
+    LOADABLE,
+    BoxFrame,
+    ImageType,
+    Labels,
+    Pixels,
+    SampleOptions,
+    make_sample,
+)
+from augment.errors import OutputError
+from augment.jobs.box_tables import BoxNumbers
+from augment.jobs.files import CameraRecord, decode_image, decode_png, read_camera, read_entries
+from augment.jobs.layout import PATH_KINDS, resolve_inside
+from augment.jobs.manifest import OK, concat_rows, read_finished, weather_columns
+from augment.jobs.store import Store, StoredFileMissing, open_store
+from augment.jobs.tables import FrameBoxes, read_boxes, read_lidar
+from augment.jobs.view_files import TABLES
+from augment.labels import LidarSweep
+
+# ---- A manifest's rows in a fifth of its memory, with random access to single ones ---------------
+# A row of a manifest with short names takes 440 bytes in an Arrow table and 84 here: most of it are
+# paths and names that repeat. Here a column is its distinct values and one small number a row;
+# paths
+# are split into folder and file name, of which there are few. Rows are NumPy arrays, so
+# forked workers share them.
+
+_PATH = r"(?s)^(?P<folder>.*/)?(?P<name>[^/]*)$"  # the folder with its slash
+_MOST_CODES = 1 << 16  # numbers of more distinct values are kept as they are
+_DIGEST_LENGTH = 64  # hexadecimal digits of a SHA-256
+_HEX_DIGITS = np.frombuffer(b"0123456789abcdef", np.uint8)
+
+
+@runtime_checkable
+class Column(Protocol):
+    """One column: a value by its row, or as an Arrow array."""
+
+    def __len__(self) -> int: ...
+    def __getitem__(self, row: int) -> Any: ...
+    def take(self, rows: np.ndarray) -> Column: ...
+    @property
+    def nbytes(self) -> int: ...
+    def arrow(self, kind: pa.DataType) -> pa.Array: ...
+
+
+@dataclass(frozen=True, eq=False)
+class Coded:
+    """values: the distinct ones. codes: unsigned [N], which of them a row has."""
+
+    codes: np.ndarray
+    values: list[Any]
+
+    def __len__(self) -> int:
+        return len(self.codes)
+
+    def __getitem__(self, row: int) -> Any:
+        return self.values[self.codes[row]]
+
+    @property
+    def nbytes(self) -> int:
+        return self.codes.nbytes
+
+    def take(self, rows: np.ndarray) -> Coded:
+        return Coded(self.codes[rows], self.values)
+
+    def arrow(self, kind: pa.DataType) -> pa.Array:
+        return pa.array(self.values, kind).take(pa.array(self.codes))
+
+
+@dataclass(frozen=True, eq=False)
+class Numbers:
+    """A number a row."""
+
+    numbers: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    def __getitem__(self, row: int) -> Any:
+        return self.numbers[row].item()
+
+    @property
+    def nbytes(self) -> int:
+        return self.numbers.nbytes
+
+    def take(self, rows: np.ndarray) -> Numbers:
+        return Numbers(self.numbers[rows])
+
+    def arrow(self, kind: pa.DataType) -> pa.Array:
+        return pa.array(self.numbers, kind)
+
+
+@dataclass(frozen=True, eq=False)
+class Paths:
+    """folders, names: whose texts joined are the path; None where a row has none."""
+
+    folders: Coded
+    names: Coded
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __getitem__(self, row: int) -> str | None:
+        parts = self.parts(row)
+        return None if parts is None else parts[0] + parts[1]
+
+    def parts(self, row: int) -> tuple[str, str] | None:
+        """The folder, with its slash or empty, and the file's name."""
+        name = self.names[row]
+        return None if name is None else (self.folders[row], name)
+
+    @property
+    def nbytes(self) -> int:
+        return self.folders.nbytes + self.names.nbytes
+
+    def take(self, rows: np.ndarray) -> Paths:
+        return Paths(self.folders.take(rows), self.names.take(rows))
+
+    def arrow(self, kind: pa.DataType) -> pa.Array:
+        joined: Any = pc.binary_join_element_wise(  # pyright: ignore[reportAttributeAccessIssue]
+            self.folders.arrow(kind), self.names.arrow(kind), ""
+        )
+        return joined
+
+
+@dataclass(frozen=True, eq=False)
+class Digests:
+    """SHA-256 digests, which all differ. digests: uint8 [N, 32]."""
+
+    digests: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.digests)
+
+    def __getitem__(self, row: int) -> str:
+        return self.digests[row].tobytes().hex()
+
+    @property
+    def nbytes(self) -> int:
+        return self.digests.nbytes
+
+    def take(self, rows: np.ndarray) -> Digests:
+        return Digests(self.digests[rows])
+
+    def arrow(self, kind: pa.DataType) -> pa.Array:
+        digits = np.stack([self.digests >> 4, self.digests & 15], axis=-1)
+        text = _HEX_DIGITS[digits].tobytes()
+        ends = np.arange(len(self) + 1, dtype=np.int32) * _DIGEST_LENGTH
+        return pa.StringArray.from_buffers(len(self), pa.py_buffer(ends), pa.py_buffer(text))
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Columns of equal length by name. schema: the manifest's, in its order of columns.
+
+    weather: the names of the columns that hold weather numbers.
+    """
+
+    columns: Mapping[str, Column]
+    schema: pa.Schema
+    weather: tuple[str, ...]
+
+    @staticmethod
+    def of(table: pa.Table) -> Rows:
+        """The rows of a manifest; its columns ending in `_path` hold paths."""
+        schema, weather = table.schema, tuple(weather_columns(table))
+        return Rows(dict(_packed_columns(table)), schema, weather)
+
+    def __len__(self) -> int:
+        return len(next(iter(self.columns.values())))
+
+    def __getitem__(self, name: str) -> Column:
+        return self.columns[name]
+
+    @property
+    def nbytes(self) -> int:
+        """Of the columns' arrays; their distinct values come on top."""
+        return sum(column.nbytes for column in self.columns.values())
+
+    def take(self, rows: np.ndarray) -> Rows:
+        """The rows of these numbers, or where a mask is true."""
+        columns = {name: column.take(rows) for name, column in self.columns.items()}
+        return Rows(columns, self.schema, self.weather)
+
+    def coded(self, name: str) -> Coded:
+        """A column of names or of other values that repeat.
+
+        Raises:
+            TypeError: the column is none of those.
+        """
+        column = self.columns[name]
+        if isinstance(column, Numbers):  # numbers that hardly repeat
+            values, codes = np.unique(column.numbers, return_inverse=True)
+            return Coded(_smallest(codes, len(values)), values.tolist())
+        if not isinstance(column, Coded):
+            raise TypeError(f"column {name!r} holds {type(column).__name__}, not names or numbers")
+        return column
+
+    def with_outputs(self, uris: list[str], lengths: list[int]) -> Rows:
+        """The rows with a column `output`: the first rows are of the first URI, and so on."""
+        codes = _smallest(np.repeat(np.arange(len(uris)), lengths), len(uris))
+        schema = self.schema.append(pa.field("output", pa.string()))
+        return Rows({**self.columns, "output": Coded(codes, list(uris))}, schema, self.weather)
+
+    def output_of(self, row: int) -> int:
+        """Which of several outputs a row is of, by its number."""
+        return int(self.coded("output").codes[row]) if "output" in self.columns else 0
+
+    def variants(self) -> tuple[list[tuple[int, str, str]], np.ndarray]:
+        """The output's number, scene and variant of all that there are, and which of them each row
+        is of, int64 [N].
+        """
+        scenes, variants = self.coded("scene"), self.coded("variant")
+        keys = scenes.codes.astype(np.int64) * len(variants.values) + variants.codes
+        if "output" in self.columns:
+            outputs = self.coded("output").codes.astype(np.int64)
+            keys += outputs * len(scenes.values) * len(variants.values)
+        found, codes = np.unique(keys, return_inverse=True)
+        rest, variant = np.divmod(found, max(len(variants.values), 1))
+        output, scene = np.divmod(rest, max(len(scenes.values), 1))
+        each = zip(output.tolist(), scene.tolist(), variant.tolist(), strict=True)
+        return [(o, scenes.values[s], variants.values[v]) for o, s, v in each], codes
+
+    def has(self, kind: str) -> np.ndarray:
+        """bool [N]: the rows that name a file of a kind of `samples.LOADABLE`."""
+        column = self.columns[f"{'labels' if kind == 'boxes' else kind}_path"]
+        assert isinstance(column, Paths)
+        there = np.array([name is not None for name in column.names.values], bool)
+        return there[column.names.codes] if len(there) else np.zeros(len(self), bool)
+
+    def numbers(self, name: str) -> np.ndarray:
+        """A numeric column, [N]; null is NaN.
+
+        Raises:
+            TypeError: the column holds no numbers.
+        """
+        column = self.columns[name]
+        if isinstance(column, Numbers):
+            return column.numbers
+        kind = self.schema.field(name).type
+        if not (isinstance(column, Coded) and (pa.types.is_integer(kind) or _is_float(kind))):
+            raise TypeError(f"column {name!r} holds {kind}, not numbers")
+        is_whole = pa.types.is_integer(kind) and None not in column.values
+        values = np.array(column.values, np.int64 if is_whole else np.float64)
+        return values[column.codes] if len(values) else np.zeros(0, values.dtype)
+
+    def to_arrow(self) -> pa.Table:
+        """The manifest's rows again."""
+        arrays = [self.columns[field.name].arrow(field.type) for field in self.schema]
+        return pa.Table.from_arrays(arrays, schema=self.schema)
+
+
+def _packed_columns(table: pa.Table) -> Iterator[tuple[str, Column]]:
+    for name in table.column_names:
+        column = table[name]
+        table = table.drop_columns(name)  # its memory is free as soon as it is packed
+        yield name, _packed(name, column)
+
+
+def _packed(name: str, column: pa.ChunkedArray) -> Column:
+    if name.endswith("_path") and pa.types.is_string(column.type):
+        parts: Any = pc.extract_regex(column, _PATH)  # pyright: ignore[reportAttributeAccessIssue]
+        folders, names = parts.combine_chunks().flatten() if len(column) else (column, column)
+        return Paths(_coded(pa.chunked_array([folders])), _coded(pa.chunked_array([names])))
+    if name == "checksum" and (digests := _digests(column)) is not None:
+        return Digests(digests)
+    coded = _coded(column)
+    is_number = pa.types.is_integer(column.type) or _is_float(column.type)
+    if is_number and len(coded.values) > _MOST_CODES and column.null_count == 0:
+        return Numbers(column.to_numpy())
+    return coded
+
+
+def _coded(column: pa.ChunkedArray) -> Coded:
+    # Nulls have no code in Arrow: they get the one behind the last.
+    encoded: Any = column.dictionary_encode().unify_dictionaries()
+    values = encoded.chunk(0).dictionary.to_pylist() if encoded.num_chunks else []
+    codes = np.concatenate(
+        [
+            np.zeros(0, np.int32),
+            *(
+                c.indices.fill_null(len(values)).to_numpy(zero_copy_only=False)
+                for c in encoded.chunks
+            ),
+        ]
+    )
+    if column.null_count:
+        values = [*values, None]
+    return Coded(_smallest(codes, len(values)), values)
+
+
+def _smallest(codes: np.ndarray, count: int) -> np.ndarray:
+    """Codes below `count` in as few bytes as hold them."""
+    return codes.astype(np.min_scalar_type(max(count - 1, 0)))
+
+
+def _digests(column: pa.ChunkedArray) -> np.ndarray | None:
+    """uint8 [N, 32] of a column of SHA-256 in lower-case digits; None where it is not one."""
+    if column.null_count:
+        return None
+    pieces: list[np.ndarray] = [np.zeros((0, _DIGEST_LENGTH // 2), np.uint8)]
+    value_of = np.full(256, 255, np.uint8)
+    value_of[_HEX_DIGITS] = np.arange(16)
+    for chunk in column.chunks:
+        lengths: Any = pc.binary_length(chunk)  # pyright: ignore[reportAttributeAccessIssue]
+        if (lengths.to_numpy(zero_copy_only=False) != _DIGEST_LENGTH).any():
+            return None
+        if not len(chunk):
+            continue
+        data = np.frombuffer(chunk.buffers()[2], np.uint8)
+        start = np.frombuffer(chunk.buffers()[1], np.int32)[chunk.offset]
+        digits = value_of[data[start : start + len(chunk) * _DIGEST_LENGTH]]
+        if (digits == 255).any():
+            return None
+        digits = digits.reshape(len(chunk), -1, 2)
+        pieces.append(digits[..., 0] << 4 | digits[..., 1])
+    return np.concatenate(pieces)
+
+
+def _is_float(kind: pa.DataType) -> bool:
+    return pa.types.is_floating(kind)
+
+
+# ---- The files that a manifest names, read from this machine or from an object store -------------
+# A manifest may come from anybody, so no path leaves the output folder, whether by `..` or
+# through a
+# link. Checking that takes longer than opening a file, so a folder's way is checked once, and a
+# file
+# itself is opened such that it cannot be a link.
+
+Value = TypeVar("Value")
+SizedValue = TypeVar("SizedValue", bound=Sized)
+
+CACHED_ENTRIES = 4096  # of companion files, each a frame's or an image's: tens of megabytes
+_FLAGS = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0)
+_CAN_REFUSE_LINKS = hasattr(os, "O_NOFOLLOW")
+
+
+class StoredFiles:
+    """Reads the files of an output folder by the manifest's paths; picklable."""
+
+    def __init__(self, store: Store) -> None:
+        self.store = store
+        root, mark, query = store.uri.partition("?")
+        if store.local_dir is not None:
+            root, mark, query = str(store.local_dir), "", ""
+        self._before, self._after = root.rstrip("/") + "/", mark + query
+        self._folders: dict[str, str] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_folders": {}}
+
+    def name(self, folder: str, name: str) -> str:
+        """What a file is called in messages and samples: its path here, or its URI."""
+        return f"{self._before}{folder}{name}{self._after}"
+
+    def read(self, folder: str, name: str) -> bytes:
+        """The bytes of a file. folder: with its slash, or empty.
+
+        Raises:
+            OutputError: there is no such file, it cannot be read, or it lies outside the folder.
+        """
+        try:
+            if self.store.local_dir is None:
+                return self.store.read(folder + name)
+            return self._read_here(self.store.local_dir, folder, name)
+        except StoredFileMissing as error:
+            raise _unreadable(self.name(folder, name), "there is no such file") from error
+        except OSError as error:
+            raise _unreadable(self.name(folder, name), error.strerror or str(error)) from error
+
+    def parse(self, folder: str, name: str, read: Callable[[Path], Value]) -> Value:
+        """What `read` makes of a file.
+
+        Raises:
+            OutputError: as `read` raises it, or as from `read` of this class.
+        """
+        if self.store.local_dir is not None:
+            return read(resolve_inside(self.store.local_dir, folder + name))
+        data = self.read(folder, name)
+        with tempfile.TemporaryDirectory(prefix="climategs-") as scratch:
+            copy = Path(scratch) / PurePosixPath(name).name
+            copy.write_bytes(data)
+            try:
+                return read(copy)
+            except OutputError as error:
+                told = str(error).replace(str(copy), self.name(folder, name))
+                raise OutputError(told) from error
+
+    def _read_here(self, root: Path, folder: str, name: str) -> bytes:
+        if not _CAN_REFUSE_LINKS or name in ("", ".", "..") or "\\" in name or "\0" in name:
+            return resolve_inside(root, folder + name).read_bytes()
+        try:
+            descriptor = os.open(self._folder(root, folder) + name, _FLAGS)
+        except OSError as error:
+            if error.errno != errno.ELOOP:
+                raise
+            return resolve_inside(root, folder + name).read_bytes()  # a link may stay inside
+        with open(descriptor, "rb", buffering=0) as file:
+            return file.read()
+
+    def _folder(self, root: Path, folder: str) -> str:
+        if folder not in self._folders:
+            checked = resolve_inside(root, folder) if folder else root
+            self._folders[folder] = f"{checked}/"
+        return self._folders[folder]
+
+
+class Companions(Generic[SizedValue]):
+    """Parsed files beside the images, the last used ones kept.
+
+    read: what makes something with entries of a file. At least one file is kept, and others as long
+    as they have no more than CACHED_ENTRIES together.
+    """
+
+    def __init__(self, files: StoredFiles, read: Callable[[Path], SizedValue]) -> None:
+        self._files, self._read = files, read
+        self._values: OrderedDict[tuple[str, str], SizedValue] = OrderedDict()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_values": OrderedDict()}
+
+    def get(self, folder: str, name: str) -> SizedValue:
+        key = (folder, name)
+        if key not in self._values:
+            self._values[key] = self._files.parse(folder, name, self._read)
+            held = sum(map(len, self._values.values()))
+            while held > CACHED_ENTRIES and len(self._values) > 1:
+                held -= len(self._values.popitem(last=False)[1])
+        self._values.move_to_end(key)
+        return self._values[key]
+
+
+def damaged(file: str, what: str) -> OutputError:
+    """The error of a file that holds something else than it should."""
+    return OutputError(
+        f"{file} is damaged: {what}. Delete it and run the job again, which renders it anew"
+    )
+
+
+def _unreadable(file: str, why: str) -> OutputError:
+    return OutputError(
+        f"{file} cannot be read ({why}), though the manifest lists it; run the job again: it "
+        f"renders what is missing"
+    )
+
+
+# ---- What the files of one manifest row hold -----------------------------------------------------
+
+_TYPES = {
+    "depth": np.uint16,
+    "semantic": np.uint8,
+    "instance": np.uint16,
+    "water": np.uint8,
+    "snow": np.uint8,
+}
+
+
+class RowReader:
+    """Reads what the rows of a manifest name, from one store. verify: compare checksums."""
+
+    def __init__(self, store: Store, *, verify: bool) -> None:
+        self.store, self.verify = store, verify
+        self._files = StoredFiles(store)
+        self._boxes = Companions(self._files, read_boxes)
+        self._box_weather = {k: Companions(self._files, table.read) for k, table in TABLES.items()}
+        self._calibration = Companions(self._files, read_entries)
+        self._sweeps = Companions(self._files, _read_one_sweep)
+
+    def names(self, rows: Rows, row: int) -> dict[str, str | None]:
+        """The row's files by kind, as they are called here."""
+        found = {kind: _parts(rows, row, kind) for kind in PATH_KINDS}
+        return {
+            k: None if parts is None else self._files.name(*parts) for k, parts in found.items()
+        }
+
+    def pixels(self, rows: Rows, row: int, load: Collection[str]) -> Pixels:
+        """The row's image and buffers, those of `load`."""
+        images = {}
+        if "image" in load:
+            images["rgb"] = self._image(rows, row)
+        for kind in BUFFERS:
+            parts = _parts(rows, row, kind) if kind in load else None
+            if parts is not None:
+                images[kind] = self._decoded(
+                    parts, lambda data, k=kind: decode_png(data, _TYPES[k])
+                )
+        size = (rows["height"][row], rows["width"][row])
+        for kind, image in images.items():
+            if image.shape[:2] != size:
+                parts = _parts(rows, row, "image" if kind == "rgb" else kind)
+                assert parts is not None
+                raise damaged(
+                    self._files.name(*parts),
+                    f"it is {image.shape[1]}x{image.shape[0]}, the manifest says "
+                    f"{size[1]}x{size[0]}",
+                )
+        return Pixels(**images)
+
+    def camera(self, rows: Rows, row: int) -> tuple[CameraRecord, torch.Tensor]:
+        """The row's camera, and world_from_ego, float64 [4, 4]."""
+        parts = self._needed(rows, row, "calibration")
+        frame, camera = rows["frame"][row], rows["camera"][row]
+        try:
+            entry = self._calibration.get(*parts)[frame]
+            ego = torch.tensor(entry["world_from_ego"], dtype=torch.float64)
+            return read_camera(entry, camera), ego
+        except KeyError as error:
+            where = f"frame {frame}, camera {camera!r}"
+            raise damaged(self._files.name(*parts), f"it lacks {error} ({where})") from error
+        except (ArithmeticError, RuntimeError, TypeError, ValueError) as error:
+            where = f"frame {frame}, camera {camera!r}"
+            raise damaged(self._files.name(*parts), f"{error} ({where})") from error
+
+    def labels(self, rows: Rows, row: int, load: Collection[str]) -> Labels:
+        """The boxes of the row's frame, what is measured of them in its image, and the sweep."""
+        frame = self._frame_boxes(rows, row) if "boxes" in load else None
+        boxes = None if frame is None else frame.boxes
+        parts = _parts(rows, row, "lidar") if "lidar" in load else None
+        return Labels(
+            boxes=boxes,
+            box_weather=None if boxes is None else self._weather_of(rows, row, len(boxes)),
+            lidar=None if parts is None else self._sweeps.get(*parts)[0],
+            instances=None if frame is None else frame.instances,
+        )
+
+    def _image(self, rows: Rows, row: int) -> np.ndarray:
+        parts = self._needed(rows, row, "image")
+        return self._decoded(parts, decode_image, rows["checksum"][row] if self.verify else None)
+
+    def _decoded(
+        self,
+        parts: tuple[str, str],
+        decode: Callable[[bytes], np.ndarray],
+        checksum: str | None = None,
+    ) -> np.ndarray:
+        data = self._files.read(*parts)
+        if checksum is not None and hashlib.sha256(data).hexdigest() != checksum:
+            name = self._files.name(*parts)
+            raise damaged(name, f"its SHA-256 is not the manifest's {checksum}")
+        try:
+            return decode(data)
+        except ValueError as error:
+            raise damaged(self._files.name(*parts), str(error)) from error
+
+    def _frame_boxes(self, rows: Rows, row: int) -> FrameBoxes | None:
+        parts = _parts(rows, row, "labels")
+        if parts is None:
+            return None
+        try:
+            return self._boxes.get(*parts)[rows["frame"][row]]
+        except KeyError as error:
+            name = self._files.name(*parts)
+            raise damaged(name, f"it lacks frame {rows['frame'][row]}") from error
+
+    def _weather_of(self, rows: Rows, row: int, count: int) -> dict[str, BoxNumbers]:
+        found = {}
+        item = (rows["frame"][row], rows["camera"][row])
+        for kind, tables in self._box_weather.items():
+            parts = _parts(rows, row, kind)
+            if parts is None:
+                continue
+            numbers = tables.get(*parts).get(item)
+            where = f"frame {item[0]}, camera {item[1]!r}"
+            if numbers is None:
+                raise damaged(self._files.name(*parts), f"it lacks {where}")
+            boxes = len(numbers.track_ids)
+            if boxes != count:
+                told = f"{where}: it has {boxes} boxes, the labels have {count}"
+                raise damaged(self._files.name(*parts), told)
+            found[kind] = numbers
+        return found
+
+    def _needed(self, rows: Rows, row: int, kind: str) -> tuple[str, str]:
+        parts = _parts(rows, row, kind)
+        if parts is None:
+            raise OutputError(
+                f"{self.store.uri}: the manifest's row of scene {rows['scene'][row]!r}, variant "
+                f"{rows['variant'][row]!r}, frame {rows['frame'][row]}, camera "
+                f"{rows['camera'][row]!r} has status ok and names no {kind} file; it is damaged"
+            )
+        return parts
+
+
+def _parts(rows: Rows, row: int, kind: str) -> tuple[str, str] | None:
+    """The folder and the name of a row's file; None where it has none."""
+    column: Any = rows[f"{kind}_path"]
+    return column.parts(row)
+
+
+def _read_one_sweep(path: Path) -> tuple[LidarSweep]:
+    return (read_lidar(path),)
+
+
+# ---- files ---------------------------------------------------------------------------------------
+
+_NAMES = ("scene", "variant", "frame", "recipe_hash", "surface")
+# What samples may lack beside others that have it: only such weather has these masks.
+_MASKS = ("water", "snow")
+Sample = dict[str, Any]
+
+
+class WeatherDataset(Dataset):
+    """The finished images of output folders, with depth, boxes, camera and weather.
+
+    root: where jobs have written or are writing: a path, a URI (`s3://bucket/fog`), or an open
+    store; or a list of them. where: an Arrow expression over the manifest's columns, such as
+    `pyarrow.compute.field("smog_extinction_per_m") > 0.02`. scenes, variants, cameras, frames: what
+    to keep, None for all. image_type: `float32` in [0, 1] or `uint8`. verify: compare every image
+    with its checksum, about 1 ms a megabyte. load: what to read, of image, depth, semantic,
+    instance, water, snow, boxes and lidar; all but lidar by default, and what is not read is None.
+    box_frame: whose axes boxes and LiDAR points are in: `world`, the dataset's own, unchanged to
+    the bit; `ego`, x forward, y left, z up; or `camera` (OpenCV), x right, y down, z forward.
+    transform: called with every sample; what it returns is the sample.
+
+    Holds the manifest only, in about a hundred bytes an image; files are read when asked for.
+    Samples come in the manifest's order: scene, variant, frame, camera; output after output.
+
+    Raises:
+        OutputError: no finished output folder; later, from indexing, a file that is missing,
+            damaged, or outside the folder.
+        ValueError: a name in a filter that no manifest has, an unknown option, no root, or what
+            `load` asks for is there for some variants and not for others (the masks of water and
+            snow excepted, which only such weather has): batches would not stack.
+    """
+
+    def __init__(
+        self,
+        root: str | Path | Store | Sequence[str | Path | Store],
+        *,
+        where: Expression | None = None,
+        scenes: Collection[str] | None = None,
+        variants: Collection[str] | None = None,
+        cameras: Collection[str] | None = None,
+        frames: Collection[int] | None = None,
+        image_type: ImageType = "float32",
+        verify: bool = True,
+        load: Collection[str] = DEFAULT_LOAD,
+        box_frame: BoxFrame = "world",
+        transform: Callable[[Sample], Any] | None = None,
+    ) -> None:
+        self.options = SampleOptions.checked(image_type, load, box_frame)
+        self.transform = transform
+        roots = [root] if isinstance(root, str | Path | Store) else list(root)
+        if not roots:
+            raise ValueError("root must be an output folder or a list of them; got an empty list")
+        self.stores = [r if isinstance(r, Store) else open_store(r) for r in roots]
+        self._readers = [RowReader(store, verify=verify) for store in self.stores]
+        wanted = {"scene": scenes, "variant": variants, "camera": cameras, "frame": frames}
+        self.rows = _read_rows(self.stores, where, wanted)
+        _check_all_have(self.rows, self.options.load, self.uris)
+
+    def given(self) -> frozenset[str]:
+        """What of `load` the samples have, the masks of water and snow left out."""
+        load = self.options.load.difference(_MASKS)
+        return frozenset(k for k in load if k == "image" or self.rows.has(k).any())
+
+    @property
+    def uris(self) -> list[str]:
+        """Of the outputs, in the order of `root`."""
+        return [store.uri for store in self.stores]
+
+    @property
+    def table(self) -> pa.Table:
+        """The manifest's rows behind the samples, in their order; put together anew each time."""
+        return self.rows.to_arrow()
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __getitem__(self, index: int) -> Any:
+        sample = self.sample(index)
+        return sample if self.transform is None else self.transform(sample)
+
+    def sample(self, index: int, *, without: Collection[str] = ()) -> Sample:
+        """One sample as it is before `transform`. without: what of `load` to leave out."""
+        count = len(self)
+        if not -count <= index < count:
+            raise IndexError(f"sample {index} of a dataset of {count}")
+        if get_worker_info() is not None:
+            # The workers are the parallelism. Not 1: a worker forked after its parent used OpenCV's
+            # threads would wait for theirs for ever.
+            cv2.setNumThreads(0)
+        row, rows = index % count, self.rows
+        reader = self._readers[rows.output_of(row)]
+        load = self.options.load.difference(without)
+        camera, world_from_ego = reader.camera(rows, row)
+        return make_sample(
+            options=self.options,
+            pixels=reader.pixels(rows, row, load),
+            camera=camera,
+            world_from_ego=world_from_ego,
+            labels=reader.labels(rows, row, load),
+            weather={name: rows[name][row] for name in rows.weather},
+            paths=reader.names(rows, row),
+            names={name: rows[name][row] for name in _NAMES},
+        )
+
+    def select(self, rows: np.ndarray) -> WeatherDataset:
+        """The dataset of some samples: their numbers int64 [K], or a mask bool [N]."""
+        chosen = object.__new__(WeatherDataset)
+        chosen.__dict__.update(self.__dict__, rows=self.rows.take(rows))
+        return chosen
+
+
+def _read_rows(
+    stores: Sequence[Store], where: Expression | None, wanted: dict[str, Collection | None]
+) -> Rows:
+    """The finished rows of the stores that a filter keeps."""
+    tables = [read_finished(store) for store in stores]
+    lengths, uris = [len(table) for table in tables], [store.uri for store in stores]
+    table = tables[0] if len(tables) == 1 else concat_rows(tables)
+    fits = None if where is None else _fitting(table, where)
+    rows = Rows.of(table)
+    del tables, table
+    if len(stores) > 1:
+        rows = rows.with_outputs(uris, lengths)
+    finished = _is_among(rows.coded("status"), {OK})
+    keep = finished.copy()
+    for name, values in wanted.items():
+        if values is None:
+            continue
+        if isinstance(values, str):
+            raise ValueError(f"{name}s must be a collection of names; got the string {values!r}")
+        column = rows.coded(name)
+        known = {column.values[code] for code in np.unique(column.codes[finished])}
+        if unknown := sorted(set(values) - known):
+            told = ", ".join(map(str, sorted(known))) or "none"
+            raise ValueError(f"{', '.join(uris)}: no {name} {unknown}; finished are: {told}")
+        keep &= _is_among(column, set(values))
+    if fits is not None:
+        keep &= fits
+    return rows if keep.all() else rows.take(keep)
+
+
+def _check_all_have(rows: Rows, load: Collection[str], uris: list[str]) -> None:
+    """Raise ValueError where some variants have what is to be loaded, and others have none of it.
+
+    A single frame without labels or a sweep is no fault: a dataset may lack its file.
+    """
+    groups, codes = rows.variants()
+    lacking = {}
+    for kind in sorted(set(load).difference(_MASKS, ["image"])):
+        given = np.bincount(codes[rows.has(kind)], minlength=len(groups)) > 0
+        if given.any() and not given.all():
+            lacking[kind] = [group for group, there in zip(groups, given, strict=True) if not there]
+    if not lacking:
+        return
+    told = "; ".join(f"{kind}: none in {_listed(found, uris)}" for kind, found in lacking.items())
+    kept = tuple(kind for kind in LOADABLE if kind in load and kind not in lacking)
+    raise ValueError(
+        f"load asks for what only a part of the outputs has, so that batches would not stack. "
+        f"{told}. Leave it out (load={kept!r}), choose outputs, scenes or variants that are alike, "
+        f"or render those again with it under the recipe's `output`"
+    )
+
+
+def _listed(variants: list[tuple[int, str, str]], uris: list[str]) -> str:
+    """Variants by their outputs, as a text; the first three of each."""
+    names = defaultdict(list)
+    for output, scene, variant in variants:
+        names[uris[output]].append(f"{scene}/{variant}")
+    more = {uri: f" and {len(n) - 3} more" if len(n) > 3 else "" for uri, n in names.items()}
+    return ", ".join(f"{uri} ({', '.join(n[:3])}{more[uri]})" for uri, n in names.items())
+
+
+def _fitting(table: pa.Table, where: Expression) -> np.ndarray:
+    """bool [N]: rows for which an expression is true."""
+    columns = {"fits": where}
+    found = pyarrow.dataset.dataset(table).scanner(columns=columns, use_threads=False).to_table()
+    return found["fits"].fill_null(False).to_numpy()
+
+
+def _is_among(column: Coded, values: set[Any]) -> np.ndarray:
+    wanted = np.array([value in values for value in column.values], bool)
+    return wanted[column.codes] if len(wanted) else np.zeros(len(column), bool)

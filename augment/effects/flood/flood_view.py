@@ -1,0 +1,536 @@
+"""A view of a flooded scene: the layers that are rasterised, and how they become one picture.
+
+For an eye above the water, a point of a ray lies in front of the water exactly if it lies above its
+plane. So nothing has to be guessed from a depth image: the scene is drawn in layers that are cut at
+the plane pixel by pixel (augment.render.layout),
+
+    front     what lies above, over the whole image
+    bed       what lies below, where the plane is in view
+    mirror    what lies above, from the eye mirrored in the plane
+
+    picture = front + (1 - front's alpha) (water, where the ray meets the plane, else the sky)
+
+and nothing in front of the water can leak into refraction or reflection.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from augment.cameras import Camera
+from augment.effects.flood import water_kernels as pour_kernels
+from augment.effects.flood.flood import FloodMedium, Layer, exact
+from augment.effects.flood.refraction import is_smooth
+from augment.effects.flood.screen_space import ScreenReflection, trace_screen
+from augment.effects.flood.water import HIDDEN_COVER, shade_water
+from augment.effects.flood.water_plane import (
+    Margins,
+    Window,
+    falling,
+    mirrored_camera,
+    mirrored_window,
+    plane_depth,
+    plane_window,
+    resized,
+)
+from augment.effects.flood.waves import WaveField, wave_field
+from augment.effects.smog import SmogMedium, blend_airlight, fog_raster, sky_optical_depth
+from augment.render.buffers import (
+    ALPHA,
+    AUTO,
+    CPU,
+    CUDA,
+    EXPECTED_DEPTH,
+    REFERENCE,
+    RGB,
+    SPLAT_IDS,
+    RenderOutput,
+    kernels_for,
+)
+from augment.render.composite import composite_sky, sky_behind
+from augment.render.constants import DEPTH_EPS, RasterSettings
+from augment.render.layout import ABOVE, BELOW, HeightClip
+from augment.render.rasterize import rasterize
+from augment.render.threads import kernel_threads
+from augment.scene import PosedGaussians
+from augment.sky import Sky, sample_at
+from augment.timing import lap
+
+# ------------------------------------------------------------------------------------------------
+# Putting the layers of a flooded view together: the torch definition, and the way to kernels
+
+ROWS = 32  # image rows a thread takes at a time
+
+
+def find_water(
+    alpha: Float[Tensor, "H W"], camera: Camera, *, backend: str = CPU
+) -> tuple[Bool[Tensor, "H W"], float]:
+    """Where a camera above the water sees it first, and the largest share of it in any pixel.
+
+    alpha: of what stands before the water. It is seen first where that leaves more than half.
+    """
+    kernels = kernels_for(backend, alpha)
+    if kernels == CUDA:
+        from augment.effects.flood import cuda_pour
+
+        water, most = cuda_pour.find_water(alpha, camera)
+        return water, float(most)  # waits for the GPU: what is drawn next depends on it
+    if kernels == CPU:
+        water = np.empty(tuple(alpha.shape), np.uint8)
+        shown = np.empty(len(alpha), np.float32)
+        with kernel_threads(ROWS):
+            pour_kernels.find_water(*_rays(camera), alpha.detach().numpy(), shown, water)
+        return torch.from_numpy(water).view(torch.bool), float(shown.max())
+    share = torch.where(falling(camera), 1 - alpha, torch.zeros_like(alpha))
+    return share > 0.5, float(share.max())
+
+
+def pour(
+    front: RenderOutput,
+    camera: Camera,
+    window: Window,
+    color: Float[Tensor, "h w 3"],
+    sky: Sky,
+    smog: SmogMedium | None,
+    *,
+    backend: str = CPU,
+) -> Float[Tensor, "H W 3"]:
+    """front + (1 - front's alpha) times the water's colour where rays fall, the sky's elsewhere.
+
+    color: of the window's pixels. backend: kernels work on float32 in place, in the front's own
+    colours: fresh memory would take as long as the arithmetic.
+    """
+    assert front.rgb is not None and front.alpha is not None
+    rgb, alpha = front.rgb, front.alpha
+    kernels = kernels_for(backend, rgb, alpha)
+    if kernels == REFERENCE:
+        image = composite_sky(rgb, alpha, camera, sky, smog=smog, backend=backend)
+        mixed = window.cut(rgb) + (1 - window.cut(alpha))[..., None] * color
+        meets = falling(window.of(camera))[..., None]
+        window.paste(image, torch.where(meets, mixed, window.cut(image)))
+        return image
+    if kernels == CUDA:
+        from augment.effects.flood import cuda_pour
+        from augment.effects.flood.cuda_pour import dry_rows
+
+        part, dry = rgb, dry_rows(camera)
+        if dry:
+            above = camera.cropped(0, 0, camera.width, dry)
+            part = composite_sky(rgb[:dry], alpha[:dry], above, sky, smog=smog, backend=backend)
+        cuda_pour.pour(rgb, alpha, camera, window, color, part, dry)
+        return rgb
+    dry = _dry_rows(camera)
+    if dry:
+        part = composite_sky(
+            rgb[:dry], alpha[:dry], camera.cropped(0, 0, camera.width, dry), sky, smog=smog
+        )
+        # Rows that show both: what falls there belongs to the water, the rest to the sky.
+        shared = rgb[window.top : dry].clone()
+        rgb[:dry] = part
+        if window.top < dry:
+            wet = falling(camera.cropped(0, window.top, camera.width, dry - window.top))
+            rgb[window.top : dry][wet] = shared[wet]
+    with kernel_threads(ROWS):
+        pour_kernels.pour(
+            *_rays(window.of(camera)),
+            window.top,
+            window.left,
+            alpha.numpy(),
+            color.contiguous().numpy(),
+            rgb.numpy(),
+        )
+    return rgb
+
+
+def _dry_rows(camera: Camera) -> int:
+    """One past the last row in which a ray does not fall."""
+    first, last = (falling(camera.cropped(c, 0, 1, camera.height)) for c in (0, camera.width - 1))
+    dry = torch.nonzero(~(first & last)[:, 0])
+    return int(dry.max()) + 1 if len(dry) else 0
+
+
+def _rays(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    u = (np.arange(camera.width, dtype=np.float64) + 0.5 - camera.cx) / camera.fx
+    v = (np.arange(camera.height, dtype=np.float64) + 0.5 - camera.cy) / camera.fy
+    return u, v, np.ascontiguousarray(camera.world_from_camera[2, :3].numpy())
+
+
+def both_sides(
+    front: RenderOutput,
+    behind: RenderOutput,
+    window: Window,
+    buffers: frozenset[str],
+    *,
+    backend: str = CPU,
+) -> RenderOutput:
+    """Buffers of two layers as one scene's, colour excepted: what stands before the water, and, in
+    the window, what is seen through it.
+
+    Alpha and expected depth are what one render would give. Median depth and the heaviest splat
+    are those of the layer that covers more of the pixel. backend: kernels work on float32 in place.
+    """
+    assert front.alpha is not None and behind.alpha is not None
+    wanted = buffers - {RGB, ALPHA}
+    if not wanted:
+        return RenderOutput()
+    values = {name: getattr(front, name) for name in (*wanted, ALPHA)}
+    kernels = kernels_for(backend, front.alpha)
+    if kernels == CUDA:
+        from augment.effects.flood import cuda_pour
+
+        pairs = {name: (values[name], getattr(behind, name)) for name in sorted(wanted)}
+        depths = pairs.pop(EXPECTED_DEPTH, None)
+        cuda_pour.join(front.alpha, behind.alpha, depths, list(pairs.values()), window)
+        return RenderOutput(**values)
+    if kernels == CPU:
+        here, there = window.overlap(front.alpha)
+        alphas = (front.alpha.numpy()[here], behind.alpha.numpy()[there])
+        with kernel_threads(ROWS):
+            for name in sorted(wanted):
+                pair = (values[name].numpy()[here], getattr(behind, name).numpy()[there])
+                if name == EXPECTED_DEPTH:
+                    pour_kernels.join_depth(*alphas, *pair, np.float32(DEPTH_EPS))
+                else:
+                    pour_kernels.join_heavier(*alphas, *pair)
+            pour_kernels.join_alpha(*alphas)
+        return RenderOutput(**values)
+    covered = torch.zeros_like(front.alpha)
+    window.paste(covered, behind.alpha)
+    share = (1 - front.alpha) * covered
+    values[ALPHA] = front.alpha + share
+    for name in wanted:
+        nearer = values[name]
+        other = torch.full_like(nearer, -1) if name == SPLAT_IDS else torch.zeros_like(nearer)
+        window.paste(other, getattr(behind, name))
+        if name == EXPECTED_DEPTH:
+            total = front.alpha * nearer + share * other
+            values[name] = total / values[ALPHA].clamp_min(DEPTH_EPS)
+        else:
+            values[name] = torch.where(share > front.alpha, other, nearer)
+    return RenderOutput(**values)
+
+
+# ---- The view from under the water: absorption on the way, and the air through Snell's window ----
+# The surface is taken as flat from below, and what it reflects back down as water.
+
+
+def view_from_below(
+    front: Layer, air: Layer, medium: FloodMedium, sky: Sky, smog: SmogMedium | None = None
+) -> Float[Tensor, "H W 3"]:
+    """The picture of an eye at or below the water's surface, not clamped.
+
+    front: what lies under water. air: what lies above, from the same camera, on the same device.
+    smog: in the air.
+    """
+    camera = front.camera
+    rgb, device = front.rgb, front.rgb.device
+    lengths = camera.ray_lengths(rgb.dtype, device)
+    deep = torch.tensor(medium.rgb, dtype=rgb.dtype, device=device)
+    through = transmittance(medium, front.depth * lengths)
+    seen = through * rgb + front.alpha[..., None] * (1 - through) * deep
+
+    directions = camera.ray_directions(rgb.dtype, device)
+    up = directions[..., 2] / lengths
+    bent = _into_air(directions / lengths[..., None], medium.refraction_index)
+    reflected = exact(up.clamp_min(0), 1 / medium.refraction_index)[..., None]
+    behind, smog = sky_behind(sky, smog)
+    sky_rgb = sample_at(behind, bent)
+    if smog is not None:
+        tau = sky_optical_depth(smog, bent[..., 2], medium.level_z_m)
+        sky_rgb = blend_airlight(sky_rgb, tau, smog)
+    outside = air.rgb + (1 - air.alpha)[..., None] * sky_rgb
+    surface = (1 - reflected) * outside + reflected * deep
+    depth = plane_depth(camera, medium.level_z_m, device).to(rgb.dtype)
+    meets = depth.isfinite()
+    distance = torch.where(meets, depth, torch.zeros_like(depth)) * lengths
+    to_surface = transmittance(medium, distance)
+    beyond = torch.where(
+        meets[..., None], to_surface * surface + (1 - to_surface) * deep, deep.expand_as(surface)
+    )
+    return seen + (1 - front.alpha)[..., None] * beyond
+
+
+def transmittance(medium: FloodMedium, length_m: Float[Tensor, "*B"]) -> Float[Tensor, "*B 3"]:
+    """exp(-extinction length) per channel; 1 over no length, also where extinction is infinite."""
+    extinction = torch.tensor(medium.extinction_per_m, dtype=length_m.dtype, device=length_m.device)
+    t = torch.exp(-extinction * length_m[..., None])
+    return torch.where((length_m[..., None] == 0) | (extinction == 0), torch.ones_like(t), t)
+
+
+def _into_air(directions: Float[Tensor, "*B 3"], index: float) -> Float[Tensor, "*B 3"]:
+    """Unit directions of rising rays after the surface; level ones beyond the critical angle."""
+    flat = index * directions[..., :2]
+    rise = (1 - flat.square().sum(-1)).clamp_min(0).sqrt()
+    return torch.nn.functional.normalize(torch.cat([flat, rise[..., None]], -1), dim=-1)
+
+
+# ---- flood view ----------------------------------------------------------------------------------
+
+COARSE = 0.25  # resolution of the mirrored view that fills what the screen does not show
+REACH_SIGMAS = 3.0  # slopes of the waves that the margins allow for
+MOST_MARGIN = 0.25  # of the image's longer side
+STEEPEST = 0.65  # fall of the ray whose bed refraction moves the most in the image
+MOST_SHIFT = 0.12  # of the image's height
+
+
+@dataclass(frozen=True, eq=False)
+class Painter:
+    """Draws the parts of a scene on one side of a level plane.
+
+    smog: blended per Gaussian. smog_on_buffers: applied to finished layers; at most one is set.
+    """
+
+    parts: Sequence[PosedGaussians]
+    sky: Sky
+    settings: RasterSettings
+    smog: SmogMedium | None
+    smog_on_buffers: SmogMedium | None
+    backend: str
+
+    @property
+    def medium(self) -> SmogMedium | None:
+        return self.smog or self.smog_on_buffers
+
+    def draw(
+        self,
+        camera: Camera,
+        clip: HeightClip,
+        buffers: frozenset[str],
+        wanted: Bool[Tensor, "H W"] | None = None,
+    ) -> RenderOutput:
+        """The layer's buffers; its colours are seen through the smog. wanted: as for rasterize."""
+        if self.smog_on_buffers is not None:
+            buffers = buffers | {EXPECTED_DEPTH}
+        raster = rasterize(
+            self.parts,
+            camera,
+            buffers=buffers,
+            settings=self.settings,
+            smog=self.smog,
+            clip=clip,
+            wanted=wanted,
+            backend=self.backend,
+        )
+        if self.smog_on_buffers is None:
+            return raster
+        return replace(raster, rgb=fog_raster(raster, camera, self.smog_on_buffers))
+
+    def layer(
+        self, camera: Camera, clip: HeightClip, wanted: Bool[Tensor, "H W"] | None = None
+    ) -> Layer:
+        buffers = frozenset({RGB, ALPHA, EXPECTED_DEPTH})
+        return as_layer(camera, self.draw(camera, clip, buffers, wanted))
+
+
+@dataclass(frozen=True, eq=False)
+class FloodedImage:
+    """rgb [H, W, 3]: with sky and water, not clamped. scene: buffers of the scene's own surfaces,
+    through the water where there is some: those asked for, with alpha, if any besides colour and
+    alpha are. water [H, W]: where a ray meets water first. is_hidden: whether what stands before
+    the water hides all of it, so that only the front was drawn.
+    """
+
+    rgb: Float[Tensor, "H W 3"]
+    scene: RenderOutput
+    water: Bool[Tensor, "H W"]
+    is_hidden: bool = False
+
+
+def as_layer(camera: Camera, raster: RenderOutput) -> Layer:
+    assert raster.rgb is not None and raster.alpha is not None
+    assert raster.expected_depth is not None
+    return Layer(camera, raster.rgb, raster.alpha, raster.expected_depth)
+
+
+def render_flooded(
+    painter: Painter, camera: Camera, medium: FloodMedium, buffers: frozenset[str]
+) -> FloodedImage | None:
+    """The picture of a camera whose image the water's plane may reach; None where it cannot.
+
+    buffers: of the scene's surfaces, as for `rasterize`.
+    """
+    window = plane_window(camera, medium.level_z_m)
+    if float(camera.centre[2]) <= medium.level_z_m:
+        return _from_below(painter, camera, medium, buffers)
+    if window is None:
+        return None
+    return _from_above(painter, camera, medium, buffers, window)
+
+
+def _from_above(
+    painter: Painter,
+    camera: Camera,
+    medium: FloodMedium,
+    buffers: frozenset[str],
+    window: Window,
+) -> FloodedImage:
+    above = HeightClip(medium.level_z_m, ABOVE)
+    wanted = buffers | {RGB, ALPHA}
+    if medium.reflection == "screen_space":
+        wanted = wanted | {EXPECTED_DEPTH}
+    with lap("rasterise"):
+        front = painter.draw(camera, above, wanted)
+    assert front.rgb is not None and front.alpha is not None
+    sky, smog = painter.sky, painter.medium
+    backend = _follows(painter.backend, front.alpha)
+    with lap("flood: where it is seen"):
+        water, most_shown = find_water(front.alpha, camera, backend=backend)
+    if most_shown < 1 - HIDDEN_COVER:
+        with lap("sky"):
+            image = composite_sky(front.rgb, front.alpha, camera, sky, smog=smog, backend=backend)
+        return FloodedImage(image, front, water, is_hidden=True)
+
+    crop = window.of(camera)
+    cover = window.cut(front.alpha)
+    seen = cover <= HIDDEN_COVER
+    with lap("flood: waves"):
+        field = wave_field(medium.waves, crop, medium.level_z_m, backend=backend)
+    margins = _bed_margins(camera, medium)
+    bed_window = window.grown(margins)
+    bed_camera = bed_window.of(camera)
+    with lap("flood: bed"):
+        bed = _draw_bed(painter, bed_camera, medium, buffers - {RGB, ALPHA}, margins, seen)
+    with lap("flood: mirrored view"):
+        mirror = _mirror_layer(painter, camera, medium, window, seen)
+    with lap("flood: screen march"):
+        screen = _screen_reflection(camera, medium, crop, field, front, backend)
+    with lap("flood: colours of the water"):
+        color = shade_water(
+            crop,
+            cover,
+            medium,
+            field,
+            as_layer(bed_camera, bed),
+            mirror=mirror,
+            screen=screen,
+            sky=sky,
+            smog=smog,
+            backend=backend,
+        )
+    with lap("flood: layers joined"):
+        image = pour(front, camera, window, color, sky, smog, backend=backend)
+        scene = both_sides(front, bed, bed_window, buffers, backend=backend)
+    return FloodedImage(image, scene, water)
+
+
+def _follows(backend: str, image: Tensor) -> str:
+    """The backend of passes without an image of their own: where layers lie on a GPU, theirs."""
+    follows = backend == AUTO and image.device.type != "cpu"
+    return CUDA if follows else backend
+
+
+def _draw_bed(
+    painter: Painter,
+    camera: Camera,
+    medium: FloodMedium,
+    scene_buffers: frozenset[str],
+    margins: Margins,
+    seen: Bool[Tensor, "h w"],
+) -> RenderOutput:
+    """What lies below the surface, but for what the front hides, and, where only a picture is
+    needed, what the water does.
+    """
+    reach = math.inf if scene_buffers else visible_depth_m(medium)
+    below = HeightClip(medium.level_z_m, BELOW, reach, overlaps=True)
+    wanted = scene_buffers | {RGB, ALPHA, EXPECTED_DEPTH}
+    return painter.draw(camera, below, wanted, margins.around(seen, margins))
+
+
+def visible_depth_m(medium: FloodMedium) -> float:
+    """Depth below the surface from which less than 1/512 of any colour comes up."""
+    least = min(medium.extinction_per_m)
+    return math.log(512) / least if least > 0 else math.inf
+
+
+def _mirror_layer(
+    painter: Painter,
+    camera: Camera,
+    medium: FloodMedium,
+    window: Window,
+    seen: Bool[Tensor, "h w"],
+) -> Layer | None:
+    if medium.reflection == "sky":
+        return None
+    margins = _mirror_margins(camera, medium)
+    place = mirrored_window(window, camera).grown(margins)
+    view = place.of(mirrored_camera(camera, medium.level_z_m))
+    # Within the window tilted waves look as far down as up.
+    wanted = margins.around(seen.flip(0), replace(margins, bottom=margins.top))
+    if medium.reflection == "screen_space":
+        view = view.scaled(COARSE)
+        wanted = resized(wanted, view)
+    above = HeightClip(medium.level_z_m, ABOVE, overlaps=True)
+    return painter.layer(view, above, wanted)
+
+
+def _screen_reflection(
+    camera: Camera,
+    medium: FloodMedium,
+    crop: Camera,
+    field: WaveField,
+    front: RenderOutput,
+    backend: str,
+) -> ScreenReflection | None:
+    if medium.reflection != "screen_space":
+        return None
+    needed = is_smooth(field, crop)  # rough water takes the mirrored view alone
+    layer = as_layer(camera, front)
+    return trace_screen(layer, crop, medium.level_z_m, needed=needed, backend=backend)
+
+
+def _mirror_margins(camera: Camera, medium: FloodMedium) -> Margins:
+    """What tilted waves look at beyond the flat reflection.
+
+    A slope turns the reflected ray by twice its angle, mostly up or down, where the reflections are
+    drawn out. The side below the reflections is the horizon, beyond which no reflection looks.
+    """
+    waves = medium.waves
+    slopes = waves.wavenumbers * waves.amplitudes_m
+    tilt = 2 * REACH_SIGMAS * math.sqrt(float((slopes**2).sum()) / 2)
+    most = MOST_MARGIN * max(camera.width, camera.height)
+    upwards = int(min(camera.fy * tilt, most)) + 4
+    sideways = int(min(0.5 * camera.fx * tilt, most)) + 4
+    return Margins(sideways, upwards, sideways, 4)
+
+
+def _bed_margins(camera: Camera, medium: FloodMedium) -> Margins:
+    """By how much refraction may move the bed in the image.
+
+    Seen from a height h, a ray that falls by c per metre meets a bed of depth D, bent to fall by 1
+    per t metres, where a straight ray falls by c (h + D) / (h + c D t). So the image moves, down in
+    an upright camera's, by c D (1 - c t) / (h + c D t) in tangents, most for c near STEEPEST.
+    """
+    height = float(camera.centre[2]) - medium.level_z_m
+    depth = min(medium.waves.depth_m, visible_depth_m(medium))
+    fall = min(max((camera.height - camera.cy) / camera.fy, 0.1), STEEPEST)
+    sine = 1 / (medium.refraction_index * math.hypot(1, fall))
+    bent = sine / math.sqrt(1 - sine**2)
+    shift = fall * depth * (1 - fall * bent) / (height + fall * depth * bent)
+    return Margins(8, 8, 8, int(min(camera.fy * shift, MOST_SHIFT * camera.height)) + 8)
+
+
+def _from_below(
+    painter: Painter, camera: Camera, medium: FloodMedium, buffers: frozenset[str]
+) -> FloodedImage:
+    """From under the water, or exactly at its surface."""
+    wanted = buffers | {RGB, ALPHA, EXPECTED_DEPTH}
+    in_air = replace(painter, smog=None, smog_on_buffers=None)
+    with lap("rasterise"):
+        front = in_air.draw(camera, HeightClip(medium.level_z_m, BELOW), wanted)
+        above = HeightClip(medium.level_z_m, ABOVE, overlaps=True)
+        air = painter.draw(camera, above, wanted)
+    image = view_from_below(
+        as_layer(camera, front), as_layer(camera, air), medium, painter.sky, painter.medium
+    )
+    size = (camera.height, camera.width)
+    water = torch.ones(size, dtype=torch.bool, device=image.device)
+    whole = Window(0, 0, camera.width, camera.height)
+    scene = both_sides(front, air, whole, buffers, backend=painter.backend)
+    return FloodedImage(image, scene, water)

@@ -1,0 +1,740 @@
+"""Numba kernels that march mirrored rays, eight at a time, through a pyramid of the nearest depth.
+
+The letters are those of `screen_space`, which defines the result. The pyramid holds inverse depths,
+which are linear along a ray's image: a cell of level l is the largest of 4^l x 4^l pixels, 0 where
+nothing stands. A ray whose own inverse depth stays above a cell's, all the way across it, is in
+front of everything there and passes the cell at once.
+
+The levels lie in one array: level 0, padded to whole cells of the highest level, [R, C]; to the
+right of it the others, level l from row R (1 - 4 / 4^l) on. view: the vertical in the camera (3),
+its image N (3), fx, fy, cx, cy, the eye's height over the water, and the image's width and height.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+from llvmlite import ir
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+from augment.render.cpu import simd as v8
+from augment.render.cpu.jit import inner, kernel
+
+# ---- Numba kernel for the water's normals at every pixel of a camera -----------------------------
+# Along a row of the image everything is rational in the column. With d the ray (unit z in the
+# camera), a and b its change per column and row, eye at height h and s = -h / d_z, the plane
+# point n
+# columns right of an anchor pixel (index 0) lies at
+#
+#     p = p0 + s n A,   A = a - (a_z / d0_z) d0      (horizontal parts)
+#
+# and one pixel right and one pixel down move it by
+#
+#     (s / d_z) d0_z A   and   (s / d_z) (b d0_z - b_z d0 + n (b a_z - b_z a))
+#
+# So float64 is needed once per wave and chunk of a row; float32 counts turns from the anchor.
+
+# pyright: reportCallIssue=false
+# (of numba's intrinsics it sees the compiler's first argument as well)
+
+
+CHUNK = 64  # columns that share an anchor; few enough for float32 turns good to 1e-6
+KEPT, FADING = 7, 10  # float32 numbers that are laid out per wave
+_ZERO, _HALF, _ONE, _THREE = (np.float32(x) for x in (0, 0.5, 1, 3))
+TINY = np.float32(1e-24)  # square of a normal's length, before it is made 1, at a cusp
+# sin(pi r) / r and cos(pi r) in powers of r^2 for |r| <= 1/2, least maximal error (3e-9, 5e-8).
+SINE = (3.14159258, -5.16770688, 2.55003138, -0.598045173, 0.0772201257)
+COSINE = (0.999999953, -4.93479286, 4.05841191, -1.33188016, 0.219696799)
+_S0, _S1, _S2, _S3, _S4 = (np.float32(c) for c in SINE)
+_C0, _C1, _C2, _C3, _C4 = (np.float32(c) for c in COSINE)
+
+
+@inner()
+def _sin_cos(turns):
+    """sin and cos of 2 pi turns, off by less than 4e-7 beside what turns is off."""
+    r = turns - v8.floor(turns + v8.splat(_HALF))
+    z = r * r
+    s = v8.fmuladd(v8.splat(_S4), z, v8.splat(_S3))
+    s = v8.fmuladd(s, z, v8.splat(_S2))
+    s = v8.fmuladd(s, z, v8.splat(_S1))
+    s = v8.fmuladd(s, z, v8.splat(_S0)) * r
+    c = v8.fmuladd(v8.splat(_C4), z, v8.splat(_C3))
+    c = v8.fmuladd(c, z, v8.splat(_C2))
+    c = v8.fmuladd(c, z, v8.splat(_C1))
+    c = v8.fmuladd(c, z, v8.splat(_C0))
+    twice = s + s
+    return twice * c, v8.fmuladd(v8.negate(twice), s, v8.splat(_ONE))
+
+
+@inner()
+def _ray_z(column, row_z, rotation, lens):
+    """World z of a pixel's ray, by the same roundings as Camera.ray_directions."""
+    return (column + 0.5 - lens[2]) / lens[0] * rotation[2, 0] + row_z + rotation[2, 2]
+
+
+@inner()
+def _meets(column, row_z, rotation, lens, height, farthest):
+    away = -height / _ray_z(column, row_z, rotation, lens)
+    return away > 0.0 and away <= farthest
+
+
+@inner()
+def _columns_that_meet(width, row_z, rotation, lens, height, farthest):
+    """First and one past the last column whose rays meet the plane, which are an interval."""
+    first, last = 0, width - 1
+    meets_first = _meets(first, row_z, rotation, lens, height, farthest)
+    meets_last = _meets(last, row_z, rotation, lens, height, farthest)
+    if meets_first == meets_last:
+        return 0, width if meets_first else 0
+    while last - first > 1:
+        middle = (first + last) // 2
+        if _meets(middle, row_z, rotation, lens, height, farthest) == meets_first:
+            first = middle
+        else:
+            last = middle
+    return (0, last) if meets_first else (last, width)
+
+
+@inner()
+def _sort_waves(waves, terms, place, step, z, drop, bend, columns, spacing, kept, fading, faded):
+    """Sort the waves of one chunk by whether all, some or none of its pixels resolve them.
+
+    place: p0. step: A. z: of the anchor's ray. drop, bend: the constant and the linear part of the
+    step down. columns: the chunk's first and last, from the anchor. spacing: the least of
+    (s / d_z)^2 times the square of the length in pixels at which a wave is gone, and the greatest
+    times that of its full height. kept, fading: filled with what `_add_kept` and `_add_fading` want
+    of a wave; how many there are is returned. faded [3]: slope variance of the rest, xx, xy, yy.
+    """
+    many = some = np.uint64(0)
+    faded[:] = _ZERO
+    for i in range(len(waves)):
+        kx, ky = waves[i, 0], waves[i, 1]
+        along = kx * step[0] + ky * step[1]
+        side = (along * z) ** 2
+        down = kx * drop[0] + ky * drop[1]
+        down_more = kx * bend[0] + ky * bend[1]
+        left, right = down + columns[0] * down_more, down + columns[1] * down_more
+        nearest = 0.0 if left * right < 0.0 else min(left * left, right * right)
+        if spacing[0] * (side + nearest) >= 1.0:
+            gx, gy = terms[i, 3], terms[i, 4]
+            faded[0] += _HALF * gx * gx
+            faded[1] += _HALF * gx * gy
+            faded[2] += _HALF * gy * gy
+            continue
+        turns = kx * place[0] + ky * place[1] + waves[i, 2]
+        turns -= np.floor(turns)
+        if spacing[1] * (side + max(left * left, right * right)) <= 1.0:
+            at = many * np.uint64(KEPT)
+            _put(kept, at, turns, along, terms, i)
+            many += np.uint64(1)
+        else:
+            at = some * np.uint64(FADING)
+            _put(fading, at, turns, along, terms, i)
+            fading[at + np.uint64(7)] = np.float32(side)
+            fading[at + np.uint64(8)] = np.float32(down)
+            fading[at + np.uint64(9)] = np.float32(down_more)
+            some += np.uint64(1)
+    return many, some
+
+
+@inner()
+def _put(values, at, turns, along, terms, i):
+    values[at] = np.float32(turns)
+    values[at + np.uint64(1)] = np.float32(along)
+    for k in range(5):
+        values[at + np.uint64(2 + k)] = terms[i, k]
+
+
+@inner()
+def _term(values, at, k):
+    return v8.splat(values[at + np.uint64(k)])
+
+
+@inner()
+def _add_kept(kept, count, way):
+    """The sums over waves of the tangents' five terms; way: s n of eight pixels."""
+    xx = xy = yy = gx = gy = v8.splat(_ZERO)
+    for i in range(count):
+        at = i * np.uint64(KEPT)
+        sine, cosine = _sin_cos(v8.fmuladd(_term(kept, at, 1), way, _term(kept, at, 0)))
+        xx = v8.fmuladd(_term(kept, at, 2), sine, xx)
+        xy = v8.fmuladd(_term(kept, at, 3), sine, xy)
+        yy = v8.fmuladd(_term(kept, at, 4), sine, yy)
+        gx = v8.fmuladd(_term(kept, at, 5), cosine, gx)
+        gy = v8.fmuladd(_term(kept, at, 6), cosine, gy)
+    return xx, xy, yy, gx, gy
+
+
+@inner()
+def _add_fading(fading, count, way, n, spacing, limits, vx, vy, lost, xx, xy, yy, gx, gy):
+    """As `_add_kept` with weights; what they leave out goes to the variance `lost`."""
+    gone, rise = limits[1], _ONE / (limits[2] - limits[1])
+    for i in range(count):
+        at = i * np.uint64(FADING)
+        down = v8.fmuladd(_term(fading, at, 9), n, _term(fading, at, 8))
+        per_pixel = spacing * v8.sqrt(v8.fmuladd(down, down, _term(fading, at, 7)))
+        t = (v8.splat(_ONE) / per_pixel - v8.splat(gone)) * v8.splat(rise)
+        t = v8.minimum(v8.maximum(t, v8.splat(_ZERO)), v8.splat(_ONE))
+        weight = t * t * (v8.splat(_THREE) - t - t)
+        sine, cosine = _sin_cos(v8.fmuladd(_term(fading, at, 1), way, _term(fading, at, 0)))
+        sine, cosine = weight * sine, weight * cosine
+        xx = v8.fmuladd(_term(fading, at, 2), sine, xx)
+        xy = v8.fmuladd(_term(fading, at, 3), sine, xy)
+        yy = v8.fmuladd(_term(fading, at, 4), sine, yy)
+        slope_x, slope_y = _term(fading, at, 5), _term(fading, at, 6)
+        gx = v8.fmuladd(slope_x, cosine, gx)
+        gy = v8.fmuladd(slope_y, cosine, gy)
+        slope = slope_x * vx + slope_y * vy
+        share = v8.splat(_HALF) * (v8.splat(_ONE) - weight * weight)
+        lost = v8.fmuladd(share * slope, slope, lost)
+    return lost, xx, xy, yy, gx, gy
+
+
+@inner()
+def _shade_chunk(kept, many, fading, some, faded, ray, height, limits, begin, end, out):
+    """out [3 * CHUNK]: normal x, normal y and variance of columns begin to end from the anchor.
+
+    ray: d0 and a, their x, y and z. limits [3]: of `fill_field`.
+    """
+    zero, one = v8.splat(_ZERO), v8.splat(_ONE)
+    x0, y0, z0, ax, ay, az = ray
+    for block in range((end - begin + 7) // 8):
+        n = v8.splat(np.float32(begin + 8 * block)) + v8.lane_numbers()
+        inverse = one / v8.fmuladd(v8.splat(az), n, v8.splat(z0))
+        away = v8.splat(-height) * inverse
+        spacing = v8.absolute(away * inverse)
+        dx = v8.fmuladd(v8.splat(ax), n, v8.splat(x0))
+        dy = v8.fmuladd(v8.splat(ay), n, v8.splat(y0))
+        length = v8.sqrt(v8.fmuladd(dx, dx, dy * dy))
+        slanted = v8.at_least(length, v8.splat(limits[0]))
+        vx, vy = v8.select(slanted, dx / length, one), v8.select(slanted, dy / length, zero)
+        lost = v8.splat(faded[0]) * vx * vx
+        lost = v8.fmuladd(v8.splat(faded[1] + faded[1]) * vx, vy, lost)
+        lost = v8.fmuladd(v8.splat(faded[2]) * vy, vy, lost)
+        way = away * n
+        xx, xy, yy, gx, gy = _add_kept(kept, many, way)
+        lost, xx, xy, yy, gx, gy = _add_fading(
+            fading, some, way, n, spacing, limits, vx, vy, lost, xx, xy, yy, gx, gy
+        )
+        wide, deep = one - xx, one - yy
+        nx = v8.negate(v8.fmuladd(xy, gy, deep * gx))
+        ny = v8.negate(v8.fmuladd(xy, gx, wide * gy))
+        nz = v8.maximum(wide * deep - xy * xy, zero)
+        square = v8.fmuladd(nx, nx, v8.fmuladd(ny, ny, nz * nz))
+        scale = one / v8.sqrt(v8.maximum(square, v8.splat(TINY)))
+        at = np.uint64(8 * block)
+        v8.store(out, at, nx * scale)
+        v8.store(out, at + np.uint64(CHUNK), ny * scale)
+        v8.store(out, at + np.uint64(2 * CHUNK), v8.maximum(lost, zero))
+
+
+@inner()
+def _anchor(begin, end, row_z, rotation, lens):
+    """A column near the middle, or the end with the nearer plane where distances differ much.
+
+    Turns counted from a point near the horizon would be lost in float32.
+    """
+    middle, last = (begin + end) // 2, end - 1
+    z = abs(_ray_z(middle, row_z, rotation, lens))
+    z_begin = abs(_ray_z(begin, row_z, rotation, lens))
+    z_last = abs(_ray_z(last, row_z, rotation, lens))
+    if 2 * z >= max(z_begin, z_last):
+        return middle
+    return begin if z_begin > z_last else last
+
+
+@kernel
+def fill_field(
+    rotation, eye, height, lens, farthest, limits, waves, terms, normal_x, normal_y, slope_variance
+):
+    """Normals and slope variance where a pixel's ray meets the plane; other pixels are left alone.
+
+    rotation [3, 3]: world_from_camera. eye [2]: its x and y. height: of the eye over the plane.
+    lens: fx, fy, cx, cy. farthest: depth at which the plane is still met. waves [N, 3]: turns per
+    metre of x and of y, turns at the origin. All float64. limits [3]: horizontal part of a ray, at
+    unit z, below which it is vertical; lengths in pixels at which a wave is gone, and at full
+    height. terms [N, 5]: S Dx Dx, S Dx Dy, S Dy Dy, k A Dx, k A Dy. Both float32, as the outputs
+    [H, W].
+    """
+    rows, width = normal_x.shape
+    ax, ay, az = rotation[0, 0] / lens[0], rotation[1, 0] / lens[0], rotation[2, 0] / lens[0]
+    bx, by, bz = rotation[0, 1] / lens[1], rotation[1, 1] / lens[1], rotation[2, 1] / lens[1]
+    for i in numba.prange(rows):
+        v = (i + 0.5 - lens[3]) / lens[1]
+        row_z = v * rotation[2, 1]
+        first, end = _columns_that_meet(width, row_z, rotation, lens, height, farthest)
+        if first == end:
+            continue
+        kept = np.empty(len(waves) * KEPT, np.float32)
+        fading = np.empty(len(waves) * FADING, np.float32)
+        faded = np.empty(3, np.float32)
+        out = np.empty(3 * CHUNK, np.float32)
+        for begin in range(first, end, CHUNK):
+            stop = min(begin + CHUNK, end)
+            at = _anchor(begin, stop, row_z, rotation, lens)
+            u = (at + 0.5 - lens[2]) / lens[0]
+            x = u * rotation[0, 0] + v * rotation[0, 1] + rotation[0, 2]
+            y = u * rotation[1, 0] + v * rotation[1, 1] + rotation[1, 2]
+            z = _ray_z(at, row_z, rotation, lens)
+            z_begin = _ray_z(begin, row_z, rotation, lens)
+            z_last = _ray_z(stop - 1, row_z, rotation, lens)
+            s = -height / z
+            place = eye[0] + s * x, eye[1] + s * y
+            step = ax - az / z * x, ay - az / z * y
+            drop = bx * z - bz * x, by * z - bz * y
+            bend = bx * az - bz * ax, by * az - bz * ay
+            near, far = max(abs(z_begin), abs(z_last)), min(abs(z_begin), abs(z_last))
+            sparse = (limits[1] * height / (near * near)) ** 2
+            dense = (limits[2] * height / (far * far)) ** 2
+            columns = float(begin - at), float(stop - 1 - at)
+            spacing = sparse, dense
+            many, some = _sort_waves(
+                waves, terms, place, step, z, drop, bend, columns, spacing, kept, fading, faded
+            )
+            start = np.float32(x), np.float32(y), np.float32(z)
+            ray = (*start, np.float32(ax), np.float32(ay), np.float32(az))
+            chunk = begin - at, stop - at
+            _shade_chunk(
+                kept, many, fading, some, faded, ray, np.float32(height), limits, *chunk, out
+            )
+            for j in range(stop - begin):
+                normal_x[i, begin + j] = out[j]
+                normal_y[i, begin + j] = out[CHUNK + j]
+                slope_variance[i, begin + j] = out[2 * CHUNK + j]
+
+
+# ---- screen space kernels ------------------------------------------------------------------------
+
+# pyright: reportCallIssue=false, reportGeneralTypeIssues=false
+# (of numba's intrinsics it sees the compiler's first argument as well, and no result)
+
+
+COVERED = np.float32(1 - 1 / 512)  # an alpha through which the water does not show
+THICKNESS_M = np.float32(0.25)  # how thick anything is taken to be, at least,
+THICKNESS = np.float32(0.02)  # and as a share of its depth
+HIDDEN_PX = np.float32(64)  # a ray may run behind something for so long
+NEAR_M = np.float32(0.05)  # rays coming back end so far from the camera's plane
+AGREEING = np.float32(0.05)  # neighbours of one surface: relative difference of inverse depths
+EDGE = np.float32(0.04)  # share of the image over which the weight falls to 0
+
+LEVELS = 3  # above the pixels
+BLOCK = 4**LEVELS  # pixels along a cell of the highest one
+
+MOST_STEPS = 1024  # cells a ray may look at; streets need 20 on average
+NUDGE = np.float32(1e-3)  # pixels past a cell's border, against rounding
+_SCREEN_SPACE_KERNELS_ZERO, _SCREEN_SPACE_KERNELS_HALF, _SCREEN_SPACE_KERNELS_ONE = (
+    np.float32(0),
+    np.float32(0.5),
+    np.float32(1),
+)
+_INFINITE = np.float32(math.inf)
+FARTHEST = np.float32(1e-9)  # inverse depth; nothing is seen beyond
+# Ways (in |x|) that one bilinear patch may hold: those of one surface.
+_SMOOTH, _SMOOTH_WAY = np.float32(0.2), np.float32(0.05)
+
+
+@kernel
+def build_pyramid(alpha, depth, pyramid):
+    """Largest inverse depths of the front's solid pixels, in pyramid [R, C + C / 4]."""
+    height, width = alpha.shape
+    rows = pyramid.shape[0]
+    columns = pyramid.shape[1] // 5 * 4
+    for block in numba.prange(rows // BLOCK):
+        for i in range(block * BLOCK, (block + 1) * BLOCK):
+            out = pyramid[i]
+            if i < height:
+                seen, z = alpha[i], depth[i]
+                for j in range(width):
+                    out[j] = (
+                        _SCREEN_SPACE_KERNELS_ONE / z[j]
+                        if seen[j] >= _SCREEN_SPACE_KERNELS_HALF
+                        else _SCREEN_SPACE_KERNELS_ZERO
+                    )
+                out[width:columns] = _SCREEN_SPACE_KERNELS_ZERO
+            else:
+                out[:columns] = _SCREEN_SPACE_KERNELS_ZERO
+        fine, size = pyramid[block * BLOCK : (block + 1) * BLOCK, :columns], 4
+        for _ in range(LEVELS):
+            first = rows - rows * 4 // size + block * (BLOCK // size)
+            coarse = pyramid[first : first + BLOCK // size, columns : columns + columns // size]
+            for i in range(coarse.shape[0]):
+                a, b, c, d = fine[4 * i], fine[4 * i + 1], fine[4 * i + 2], fine[4 * i + 3]
+                for j in range(coarse.shape[1]):
+                    largest = _SCREEN_SPACE_KERNELS_ZERO
+                    for k in range(4 * j, 4 * j + 4):
+                        largest = max(largest, max(max(a[k], b[k]), max(c[k], d[k])))
+                    coarse[i, j] = largest
+            fine, size = coarse, size * 4
+
+
+@intrinsic
+def _fetch(typingctx, array, row, column):
+    """array[row, column] for eight pairs of whole numbers >= -1, of a contiguous 2-D array."""
+
+    def codegen(context, builder, sig, args):
+        whole, wide = ir.VectorType(ir.IntType(32), v8.LANES), ir.IntType(64)
+        held = context.make_array(sig.args[0])(context, builder, args[0])
+        rows, columns = (
+            builder.trunc(n, ir.IntType(32)) for n in cgutils.unpack_tuple(builder, held.shape)
+        )
+        undefined = ir.Constant(whole, ir.Undefined)
+        pitch, last = undefined, undefined
+        size = builder.sub(builder.mul(rows, columns), ir.IntType(32)(1))
+        for lane in range(v8.LANES):
+            pitch = builder.insert_element(pitch, columns, ir.IntType(32)(lane))
+            last = builder.insert_element(last, size, ir.IntType(32)(lane))
+        index = builder.mul(builder.fptosi(args[1], whole), pitch)
+        index = builder.add(index, builder.fptosi(args[2], whole))
+        zero = ir.Constant(whole, [0] * v8.LANES)
+        index = builder.select(builder.icmp_signed("<", index, zero), zero, index)
+        index = builder.select(builder.icmp_signed(">", index, last), last, index)
+        value = ir.Constant(ir.VectorType(ir.FloatType(), v8.LANES), ir.Undefined)
+        for lane in range(v8.LANES):
+            number = ir.IntType(32)(lane)
+            at = builder.zext(builder.extract_element(index, number), wide)
+            element = builder.load(builder.gep(held.data, [at]))
+            value = builder.insert_element(value, element, number)
+        return value
+
+    return v8.float8(array, v8.float8, v8.float8), codegen
+
+
+@inner()
+def _difference(before, here, after, has_before, has_after):
+    """Change of the inverse depth per pixel, from those neighbours that belong to the surface."""
+    total, count = _SCREEN_SPACE_KERNELS_ZERO, _SCREEN_SPACE_KERNELS_ZERO
+    if has_after and abs(after - here) < AGREEING * here:
+        total += after - here
+        count += _SCREEN_SPACE_KERNELS_ONE
+    if has_before and abs(here - before) < AGREEING * here:
+        total += here - before
+        count += _SCREEN_SPACE_KERNELS_ONE
+    return total / max(count, _SCREEN_SPACE_KERNELS_ONE)
+
+
+@inner()
+def _edge_weight(x, y, width, height):
+    fx = min(
+        max(min(x, width - x) / (EDGE * width), _SCREEN_SPACE_KERNELS_ZERO),
+        _SCREEN_SPACE_KERNELS_ONE,
+    )
+    fy = min(
+        max(min(y, height - y) / (EDGE * height), _SCREEN_SPACE_KERNELS_ZERO),
+        _SCREEN_SPACE_KERNELS_ONE,
+    )
+    two, three = np.float32(2), np.float32(3)
+    return fx * fx * (three - two * fx) * fy * fy * (three - two * fy)
+
+
+@inner()
+def _set_up(view, xs, ys, first):
+    """Numbers of eight mirrored rays, those of the definition's record, and where they begin."""
+    width, height = view[11], view[12]
+    x0, y0 = v8.load(xs, first), v8.load(ys, first)
+    one, zero = v8.splat(_SCREEN_SPACE_KERNELS_ONE), v8.splat(_SCREEN_SPACE_KERNELS_ZERO)
+    nx, ny, nz = v8.splat(view[0]), v8.splat(view[1]), v8.splat(view[2])
+    u = (x0 - v8.splat(view[8])) / v8.splat(view[6])
+    v = (y0 - v8.splat(view[9])) / v8.splat(view[7])
+    slope = u * nx + v * ny + nz
+    gx, gy = v8.splat(view[3]) - x0 * nz, v8.splat(view[4]) - y0 * nz
+    g = v8.maximum(v8.maximum(v8.absolute(gx), v8.absolute(gy)), v8.splat(np.float32(1e-9)))
+    rise = slope * v8.splat(np.float32(-2))
+    scale = rise * g
+    bend = (one + rise * nz) / scale
+    near = v8.negate(slope) / v8.splat(view[10])
+    dx, dy = gx / g, gy / g
+    # A ray along an axis never gets to the other axis's next border.
+    tiny = v8.splat(np.float32(1e-30))
+    inverse_x = one / v8.select(v8.greater(v8.absolute(dx), tiny), dx, tiny)
+    inverse_y = one / v8.select(v8.greater(v8.absolute(dy), tiny), dy, tiny)
+    ahead_x = v8.select(v8.at_least(inverse_x, zero), one, zero)
+    ahead_y = v8.select(v8.at_least(inverse_y, zero), one, zero)
+    end = v8.minimum(
+        (ahead_x * v8.splat(width) - x0) * inverse_x, (ahead_y * v8.splat(height) - y0) * inverse_y
+    )
+    back = (one - one / (near * v8.splat(NEAR_M))) / bend
+    returns = v8.greater(zero, bend)
+    end = v8.select(returns, v8.minimum(end, back), end)
+    far = v8.at_least(bend * end, one)
+    end = v8.select(far, one / bend, end)
+    to_sky = v8.select(far, one, zero)
+    ray = (x0, y0, dx, dy, inverse_x, inverse_y, ahead_x, ahead_y, near, bend * near, end)
+    # Nothing is met in the pixel that the ray starts from.
+    t = v8.splat(_SCREEN_SPACE_KERNELS_HALF) * v8.minimum(
+        v8.absolute(inverse_x), v8.absolute(inverse_y)
+    )
+    size = v8.splat(np.float32(4))
+    state = (t + v8.splat(NUDGE), end, size, one / size, zero, one, zero)
+    return ray, state, to_sky, scale
+
+
+@inner()
+def _step(pyramid, ray, state):
+    """Eight rays look into one cell each, and pass it or go into its parts.
+
+    state: t, the t to stop at, the cell's size and its inverse, pixels spent behind something
+    without a break, 1 if there were none ever, 1 where something is met.
+    """
+    x0, y0, dx, dy, inverse_x, inverse_y, ahead_x, ahead_y, near, change, end = ray
+    t, stop, size, inverse, hidden, clean, met = state
+    zero, half, one = (
+        v8.splat(_SCREEN_SPACE_KERNELS_ZERO),
+        v8.splat(_SCREEN_SPACE_KERNELS_HALF),
+        v8.splat(_SCREEN_SPACE_KERNELS_ONE),
+    )
+    four, quarter = v8.splat(np.float32(4)), v8.splat(np.float32(0.25))
+    rows = v8.splat(np.float32(pyramid.shape[0]))
+    columns = v8.splat(np.float32(pyramid.shape[1] // 5 * 4))
+    going = v8.greater(stop, t)
+    cell_x = v8.floor(v8.fmuladd(t, dx, x0) * inverse)
+    cell_y = v8.floor(v8.fmuladd(t, dy, y0) * inverse)
+    level_row = v8.maximum(rows - rows * four * inverse, zero)
+    level_column = v8.select(v8.greater(size, one), columns, zero)
+    surface = _fetch(pyramid, cell_y + level_row, cell_x + level_column)
+    leave_x = ((cell_x + ahead_x) * size - x0) * inverse_x
+    leave_y = ((cell_y + ahead_y) * size - y0) * inverse_y
+    leave = v8.maximum(v8.minimum(v8.minimum(leave_x, leave_y), end), t)
+    beyond = leave + v8.splat(NUDGE)
+    # Up only out of the parent, which has been looked into already.
+    above = inverse * quarter
+    other_x = v8.floor(v8.fmuladd(beyond, dx, x0) * above) - v8.floor(cell_x * quarter)
+    other_y = v8.floor(v8.fmuladd(beyond, dy, y0) * above) - v8.floor(cell_y * quarter)
+    climbs = v8.both(
+        v8.greater(v8.splat(np.float32(BLOCK)), size),
+        v8.greater(v8.absolute(other_x) + v8.absolute(other_y), half),
+    )
+    k0, k1 = near - change * t, near - change * leave
+    nearest = v8.maximum(v8.minimum(k0, k1), v8.splat(FARTHEST))
+    reached = v8.both(going, v8.at_least(surface, nearest))
+    thick = v8.maximum(v8.splat(THICKNESS), v8.splat(THICKNESS_M) * surface)
+    entered = v8.at_least(v8.maximum(k0, k1) * (one + thick), surface)
+    pixel = v8.both(reached, v8.at_least(one, size))
+    hit = v8.both(pixel, entered)
+    met = v8.select(hit, one, met)
+    clean = v8.select(pixel, v8.select(entered, clean, zero), clean)
+    hidden = v8.select(pixel, hidden + (leave - t), v8.select(reached, hidden, zero))
+    stop = v8.select(hit, v8.negate(one), stop)
+    stop = v8.select(v8.greater(hidden, v8.splat(HIDDEN_PX)), v8.negate(one), stop)
+    moved = v8.select(pixel, beyond, v8.select(reached, t, beyond))
+    t = v8.select(hit, t, v8.select(going, moved, t))
+    up = v8.select(climbs, four, one)
+    size = v8.select(reached, v8.maximum(size * quarter, one), size * up)
+    up = v8.select(climbs, above, inverse)
+    inverse = v8.select(reached, v8.minimum(inverse * four, one), up)
+    return t, stop, size, inverse, hidden, clean, met
+
+
+@inner()
+def _march(pyramid, view, lanes, xs, ys, first, ways, trusts):
+    """(way / |x|, weight) of eight mirrored rays of pixels of the image that see the water.
+
+    xs, ys: pixel centres, read from `first` on; the results go to the same places. lanes: scratch.
+    """
+    ray, state, to_sky, scale = _set_up(view, xs, ys, first)
+    for _ in range(MOST_STEPS):
+        # The sign is clear where a ray goes on; one that has ended just here does no harm.
+        if not v8.any_not_negative(state[1] - state[0]):
+            break
+        state = _step(pyramid, ray, state)
+    _finish(pyramid, view, lanes, ray, state, to_sky, scale, first, ways, trusts)
+
+
+@inner()
+def _finish(pyramid, view, lanes, ray, state, to_sky, scale, first, ways, trusts):
+    """Results of eight rays that have ended."""
+    x0, y0, dx, dy, _, _, _, _, near, change, end = ray
+    t, stop, _, _, _, clean, met = state
+    half, zero = v8.splat(_SCREEN_SPACE_KERNELS_HALF), v8.splat(_SCREEN_SPACE_KERNELS_ZERO)
+    sky = v8.select(v8.at_least(t, stop), clean * to_sky, zero)
+    t = v8.select(v8.greater(met, half), t, end)
+    v8.store(lanes, np.uint64(0), met)
+    v8.store(lanes, np.uint64(8), sky)
+    v8.store(lanes, np.uint64(16), t)
+    v8.store(lanes, np.uint64(24), dx)
+    v8.store(lanes, np.uint64(32), dy)
+    v8.store(lanes, np.uint64(40), change)
+    v8.store(lanes, np.uint64(48), near)
+    v8.store(lanes, np.uint64(56), end)
+    v8.store(lanes, np.uint64(64), scale)
+    v8.store(lanes, np.uint64(72), x0)
+    v8.store(lanes, np.uint64(80), y0)
+    width, height = view[11], view[12]
+    for lane in range(8):
+        way, trust, t_last = _INFINITE, _SCREEN_SPACE_KERNELS_ZERO, lanes[16 + lane]
+        x, y = lanes[72 + lane], lanes[80 + lane]
+        step_x, step_y = lanes[24 + lane], lanes[32 + lane]
+        if lanes[lane] > _SCREEN_SPACE_KERNELS_HALF:
+            change_, near_ = lanes[40 + lane], lanes[48 + lane]
+            way, t_last = _meet(
+                pyramid, width, height, x, y, step_x, step_y, t_last, change_, near_
+            )
+            t_last = min(t_last, lanes[56 + lane])
+            way = way * near_ / lanes[64 + lane]
+        if lanes[lane] > _SCREEN_SPACE_KERNELS_HALF or lanes[8 + lane] > _SCREEN_SPACE_KERNELS_HALF:
+            trust = _edge_weight(x + t_last * step_x, y + t_last * step_y, width, height)
+        ways[first + np.uint64(lane)] = way
+        trusts[first + np.uint64(lane)] = trust
+
+
+@inner()
+def _meet(pyramid, width, height, x0, y0, dx, dy, t, change, near):
+    """t / k and t where the ray, of inverse depth k, meets the plane through the pixel found at t.
+
+    At most 1 px off that pixel.
+    """
+    cx = min(max(int(x0 + t * dx), 0), int(width) - 1)
+    cy = min(max(int(y0 + t * dy), 0), int(height) - 1)
+    here = pyramid[cy, cx]
+    left, above = max(cx - 1, 0), max(cy - 1, 0)  # a pixel is its own neighbour at the border
+    right, below = min(cx + 1, int(width) - 1), min(cy + 1, int(height) - 1)
+    across = _difference(pyramid[cy, left], here, pyramid[cy, right], cx > left, right > cx)
+    down = _difference(pyramid[above, cx], here, pyramid[below, cx], cy > above, below > cy)
+    off_x, off_y = (
+        np.float32(cx) + _SCREEN_SPACE_KERNELS_HALF - x0,
+        np.float32(cy) + _SCREEN_SPACE_KERNELS_HALF - y0,
+    )
+    closing = -change - across * dx - down * dy
+    middle = off_x * dx if abs(dx) >= abs(dy) else off_y * dy
+    meet = middle
+    if closing != _SCREEN_SPACE_KERNELS_ZERO:
+        meet = (here - across * off_x - down * off_y - near) / closing
+    reach = np.float32(1.5)
+    meet = max(min(max(meet, middle - reach), middle + reach), _SCREEN_SPACE_KERNELS_ZERO)
+    # Not farther than what was met, however the ray grazes it.
+    back = here / (_SCREEN_SPACE_KERNELS_ONE + max(THICKNESS, THICKNESS_M * here))
+    return meet / max(near - change * meet, back), meet
+
+
+@inner()
+def _run(pyramid, view, lanes, xs, ys, count, ways, trusts):
+    """`_march` of the first `count` pixels of a list, which has room for eight more."""
+    for first in range(0, count, 8):
+        for spare in range(count, first + 8):
+            xs[spare], ys[spare] = xs[count - 1], ys[count - 1]
+        _march(pyramid, view, lanes, xs, ys, np.uint64(first), ways, trusts)
+
+
+@inner()
+def _sees_water(view, alpha, column, row):
+    """Whether the pixel's ray falls and the front leaves something of the water to see."""
+    if 0 <= row < alpha.shape[0] and 0 <= column < alpha.shape[1] and alpha[row, column] >= COVERED:
+        return False
+    u = (np.float32(column) + _SCREEN_SPACE_KERNELS_HALF - view[8]) / view[6]
+    v = (np.float32(row) + _SCREEN_SPACE_KERNELS_HALF - view[9]) / view[7]
+    return u * view[0] + v * view[1] + view[2] < _SCREEN_SPACE_KERNELS_ZERO
+
+
+@inner()
+def _inside(alpha, column, row):
+    return 0 <= row < alpha.shape[0] and 0 <= column < alpha.shape[1]
+
+
+@kernel
+def trace(pyramid, view, alpha, needed, left, top, stride, ways, weights):
+    """Ways (in |x|) and weights of every `stride`-th pixel; weight -1 where none is needed."""
+    columns = ways.shape[1]
+    for i in numba.prange(ways.shape[0]):
+        lanes = np.empty(88, np.float32)
+        lists = np.empty((4, columns + 8), np.float32)
+        row, count = top + i * stride, 0
+        for j in range(columns):
+            column = left + j * stride
+            ways[i, j] = _INFINITE
+            weights[i, j] = _SCREEN_SPACE_KERNELS_ZERO
+            if not (needed[i * stride, j * stride] and _sees_water(view, alpha, column, row)):
+                weights[i, j] = -_SCREEN_SPACE_KERNELS_ONE
+            elif _inside(alpha, column, row):
+                lists[0, count] = np.float32(column) + _SCREEN_SPACE_KERNELS_HALF
+                lists[1, count] = np.float32(row) + _SCREEN_SPACE_KERNELS_HALF
+                count += 1
+        _run(pyramid, view, lanes, lists[0], lists[1], count, lists[2], lists[3])
+        for n in range(count):
+            j = (int(lists[0, n]) - left) // stride
+            ways[i, j] = lists[2, n]
+            weights[i, j] = lists[3, n]
+
+
+@inner()
+def _to_metres(view, alpha, needed, column, row, distance, weight):
+    """A row of ways (in |x|) becomes metres; only needed pixels that show water get a weight."""
+    v = (np.float32(row) + _SCREEN_SPACE_KERNELS_HALF - view[9]) / view[7]
+    vv, slope_v = _SCREEN_SPACE_KERNELS_ONE + v * v, v * view[1] + view[2]
+    inside = 0 <= row < alpha.shape[0]
+    for j in range(distance.shape[0]):
+        u = (np.float32(column + j) + _SCREEN_SPACE_KERNELS_HALF - view[8]) / view[6]
+        slope = u * view[0] + slope_v
+        covered = inside and 0 <= column + j < alpha.shape[1] and alpha[row, column + j] >= COVERED
+        hidden = (
+            slope >= _SCREEN_SPACE_KERNELS_ZERO
+            or covered
+            or not needed[j]
+            or weight[j] < _SCREEN_SPACE_KERNELS_ZERO
+        )
+        r = math.sqrt(vv + u * u) * view[10] / -slope
+        distance[j] = _INFINITE if hidden else distance[j] * r
+        weight[j] = _SCREEN_SPACE_KERNELS_ZERO if hidden else weight[j]
+
+
+@kernel
+def spread(pyramid, view, alpha, needed, left, top, stride, ways, weights, distance, weight):
+    """Metres and weights of all pixels; the four traced around a pixel speak for it if they agree.
+
+    Where they do not, at silhouettes and beside covered pixels, the pixel is traced itself.
+    """
+    height, width = distance.shape
+    rows, columns = ways.shape
+    part = _SCREEN_SPACE_KERNELS_ONE / np.float32(stride)
+    for i in numba.prange(rows):
+        lanes = np.empty(88, np.float32)
+        lists = np.empty((4, stride * (width + stride) + 8), np.float32)
+        count = 0
+        below, deep = min(i + 1, rows - 1), min(stride, height - i * stride)
+        y0 = i * stride
+        for j in range(columns):
+            right, wide = min(j + 1, columns - 1), min(stride, width - j * stride)
+            x0 = j * stride
+            w00, w01, w10, w11 = ways[i, j], ways[i, right], ways[below, j], ways[below, right]
+            t00, t01 = weights[i, j], weights[i, right]
+            t10, t11 = weights[below, j], weights[below, right]
+            least, most = min(min(w00, w01), min(w10, w11)), max(max(w00, w01), max(w10, w11))
+            sure = min(min(t00, t01), min(t10, t11))
+            doubt = max(max(t00, t01), max(t10, t11))
+            same = sure > _SCREEN_SPACE_KERNELS_ZERO or (
+                sure == _SCREEN_SPACE_KERNELS_ZERO and doubt == _SCREEN_SPACE_KERNELS_ZERO
+            )
+            if same and least < _INFINITE:
+                same = most - least <= _SMOOTH * least + _SMOOTH_WAY
+            if same or doubt < _SCREEN_SPACE_KERNELS_ZERO:
+                for di in range(deep):
+                    fy = np.float32(di) * part
+                    w0, w1 = w00 + (w10 - w00) * fy, w01 + (w11 - w01) * fy
+                    t0, t1 = t00 + (t10 - t00) * fy, t01 + (t11 - t01) * fy
+                    for dj in range(wide):
+                        fx = np.float32(dj) * part
+                        way = w0 + (w1 - w0) * fx if least < _INFINITE else _INFINITE
+                        distance[y0 + di, x0 + dj] = way
+                        weight[y0 + di, x0 + dj] = t0 + (t1 - t0) * fx
+                continue
+            for di in range(deep):
+                for dj in range(wide):
+                    way, trust = w00, t00
+                    column, row = left + x0 + dj, top + y0 + di
+                    if di > 0 or dj > 0:
+                        way, trust = _INFINITE, _SCREEN_SPACE_KERNELS_ZERO
+                        asked = needed[y0 + di, x0 + dj] and _inside(alpha, column, row)
+                        if asked and _sees_water(view, alpha, column, row):
+                            lists[0, count] = np.float32(column) + _SCREEN_SPACE_KERNELS_HALF
+                            lists[1, count] = np.float32(row) + _SCREEN_SPACE_KERNELS_HALF
+                            count += 1
+                    distance[y0 + di, x0 + dj] = way
+                    weight[y0 + di, x0 + dj] = trust
+        _run(pyramid, view, lanes, lists[0], lists[1], count, lists[2], lists[3])
+        for n in range(count):
+            x, y = int(lists[0, n]) - left, int(lists[1, n]) - top
+            distance[y, x] = lists[2, n]
+            weight[y, x] = lists[3, n]
+        for y in range(y0, y0 + deep):
+            _to_metres(view, alpha, needed[y], left, top + y, distance[y], weight[y])

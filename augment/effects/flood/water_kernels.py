@@ -1,0 +1,952 @@
+"""Numba kernels for a water surface: what `water.shade_water` defines.
+
+The pixels of a row that show water are collected in two lists, smooth and rough ones, and worked on
+eight at a time: what a list's pixels need differs (rough ones: three slopes and averages over
+squares of pixels; smooth ones: the image itself), and what none of the eight needs is left out.
+Coordinates and colours are vectors of eight; looking pixels up is done one by one, through scratch
+memory, which holds lines of eight numbers. All is float32 but the rays' directions, whose sign
+decides where there is water and whose small downward part the distance to it is divided by.
+Indices are unsigned, so that nothing wraps.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from llvmlite import ir
+from numba import prange
+from numba.core import types
+from numba.extending import intrinsic
+
+from augment.render.cpu import simd as v8
+from augment.render.cpu.jit import inner, kernel
+from augment.render.cpu.simd import LOG2_E, exp2_fine, log2
+from augment.render.layout import U
+
+# ---- Numba kernels for averages over ever larger squares of pixels: images are halved ------------
+
+
+@kernel
+def pack(rgb, alpha, out):
+    """rgb [H, W, 3] and alpha [H, W] side by side in out [H, W, 4]."""
+    for i in numba.prange(out.shape[0]):
+        for j in range(np.uint64(out.shape[1])):
+            for c in range(np.uint64(3)):
+                out[i, j, c] = rgb[i, j, c]
+            out[i, j, 3] = alpha[i, j]
+
+
+@kernel
+def halve_mip(image, out):
+    """Averages over 2 x 2 pixels of image [H, W, 4] into out [h, w, 4]."""
+    height, width, _ = image.shape
+    quarter = np.float32(0.25)
+    for i in numba.prange(out.shape[0]):
+        top, bottom = np.uint64(2 * i), np.uint64(min(2 * i + 1, height - 1))
+        for j in range(np.uint64(out.shape[1])):
+            c0 = np.uint64(2) * j
+            c1 = min(c0 + np.uint64(1), np.uint64(width - 1))
+            for c in range(np.uint64(4)):
+                total = (image[top, c0, c] + image[bottom, c0, c]) + (
+                    image[top, c1, c] + image[bottom, c1, c]
+                )
+                out[i, j, c] = quarter * total
+
+
+# ---- Numba kernels that put the layers of a flooded view together --------------------------------
+
+
+@inner()
+def _falls(u, v, rise):
+    """Vertical part of a pixel's ray, summed in the order of Camera.ray_directions."""
+    return (u * rise[0] + v * rise[1]) + rise[2]
+
+
+@kernel
+def find_water(u, v, rise, alpha, shown, water):
+    """water [H, W] uint8: 1 where a ray falls and alpha leaves more than half of it, else 0.
+
+    u [W], v [H]: image coordinates at unit depth, float64. rise [3]: world z along the camera's
+    axes. shown [H]: the largest share of a falling ray that alpha leaves in each row, 0 where none
+    falls.
+    """
+    for i in prange(alpha.shape[0]):
+        most = np.float32(0)
+        for j in range(alpha.shape[1]):
+            share = np.float32(1) - alpha[i, j]
+            share = share if _falls(u[j], v[i], rise) < 0.0 else np.float32(0)
+            most = max(most, share)
+            water[i, j] = np.uint8(share > np.float32(0.5))
+        shown[i] = most
+
+
+@kernel
+def pour(u, v, rise, top, left, alpha, color, rgb):
+    """rgb += (1 - alpha) color where rays fall. color: [h, w, 3], its corner at row top, column
+    left of rgb [H, W, 3]; u, v: of its own columns and rows.
+    """
+    for i in prange(color.shape[0]):
+        row = U(top + i)
+        for j in range(color.shape[1]):
+            if _falls(u[j], v[i], rise) < 0.0:
+                column = U(left + j)
+                through = np.float32(1) - alpha[row, column]
+                for c in range(U(3)):
+                    rgb[row, column, c] += through * color[U(i), U(j), c]
+
+
+@kernel
+def join_depth(alpha, behind_alpha, depth, behind_depth, least):
+    """Expected depth of two layers as one: means by weight, into depth [h, w]."""
+    for i in prange(alpha.shape[0]):
+        for j in range(alpha.shape[1]):
+            a = alpha[i, j]
+            share = (np.float32(1) - a) * behind_alpha[i, j]
+            total = a * depth[i, j] + share * behind_depth[i, j]
+            depth[i, j] = total / max(a + share, least)
+
+
+@kernel
+def join_heavier(alpha, behind_alpha, values, behind):
+    """Values of the layer that covers more of a pixel, into values [h, w]."""
+    for i in prange(alpha.shape[0]):
+        for j in range(alpha.shape[1]):
+            a = alpha[i, j]
+            if (np.float32(1) - a) * behind_alpha[i, j] > a:
+                values[i, j] = behind[i, j]
+
+
+@kernel
+def join_alpha(alpha, behind_alpha):
+    """alpha [h, w] += (1 - alpha) of the layer behind."""
+    for i in prange(alpha.shape[0]):
+        for j in range(alpha.shape[1]):
+            a = alpha[i, j]
+            alpha[i, j] = a + (np.float32(1) - a) * behind_alpha[i, j]
+
+
+# ---- water kernels -------------------------------------------------------------------------------
+
+# pyright: reportCallIssue=false, reportGeneralTypeIssues=false, reportAttributeAccessIssue=false
+# (of numba's intrinsics it sees the compiler's first argument as well, and no result)
+
+
+F = np.float32
+WATER_KERNELS_U = np.uint64
+ZERO, HALF, ONE = F(0), F(0.5), F(1)
+TINY = F(1e-7)
+STRIP = 64  # pixels of a list that are worked on at a time
+LANES = WATER_KERNELS_U(8)
+EIGHTS = ~WATER_KERNELS_U(7)  # a number's multiple of eight
+
+# Lines of a list, one number a pixel: the ray and how far the water is along it, the surface's
+# normal and slope variance, the depth of the bed straight behind (-1: none), the screen-space ray's
+# length and weight.
+DX, DY, DZ, ALONG, NX, NY, ROUGH, OWN_DEPTH, DISTANCE, TRUST = (
+    WATER_KERNELS_U(STRIP * k) for k in range(10)
+)
+LIST = WATER_KERNELS_U(STRIP * 10)
+
+# Lines of the scratch memory. Look-ups: pixel, way from it, colour; was the bed found and how deep;
+# two levels of averages; for each of three slopes the mirrored ray, its share of the light
+# and its place in the mirror.
+C0, R0, FC, FR, R, G, B, A, FOUND, DEPTH, SHARE_ABOVE = (WATER_KERNELS_U(8 * k) for k in range(11))
+LOW, WIDE, HIGH, SCALE = (WATER_KERNELS_U(88 + 16 * k) for k in range(4))
+RX, RY, RZ, SHARE, MIRROR_C, MIRROR_R = (WATER_KERNELS_U(152 + 24 * k) for k in range(6))
+SCRATCH = 152 + 24 * 6
+
+
+class View(NamedTuple):
+    """A layer's camera. Tuples hold numbers alone: counting references to arrays would take longer
+    than the arithmetic.
+
+    project: focal length times the camera's right, down (fx, fy) and forward axes. rays:
+    coefficients of column, row and 1 in the x, y, z of a pixel's ray. columns, rows: the image's
+    sides as real numbers. Kernels take it as one array and build it with `_view`.
+    """
+
+    project: tuple[np.float32, ...]
+    rays: tuple[np.float32, ...]
+    cx: np.float32
+    cy: np.float32
+    columns: np.float32
+    rows: np.float32
+    width: np.uint64
+    height: np.uint64
+
+
+class Medium(NamedTuple):
+    """The water, and the smog over it, as the kernel needs them.
+
+    height: of the eye over the water. smog_per_m: optical depth between eye and water per metre of
+    the ray, 0 without smog. smog_above: from the water straight up, < 0 where the sky is seen
+    clearly (or replaced by the airlight already). least_extinction: of the three.
+    """
+
+    height: np.float32
+    index: np.float32
+    schlick: bool
+    extinction: tuple[np.float32, ...]
+    rgb: tuple[np.float32, ...]
+    smog_per_m: np.float32
+    smog_above: np.float32
+    airlight: tuple[np.float32, ...]
+    least_extinction: np.float32
+
+
+class Limits(NamedTuple):
+    """The definition's constants."""
+
+    cover: np.float32
+    farthest: np.float32
+    least_cosine: np.float32
+    smooth_variance: np.float32
+    steepest: np.float32
+    least_depth: np.float32
+    solid_alpha: np.float32
+    bed_steps: int
+    edge: np.float32
+    match_m: np.float32
+    match_share: np.float32
+    settled_m: np.float32
+    opaque: np.float32
+    faint: np.float32
+
+
+@inner()
+def _view(n):
+    project = (n[0], n[1], n[2], n[3], n[4], n[5], n[6], n[7], n[8])
+    rays = (n[9], n[10], n[11], n[12], n[13], n[14], n[15], n[16], n[17])
+    width, height = WATER_KERNELS_U(np.int32(n[20])), WATER_KERNELS_U(np.int32(n[21]))
+    return View(project, rays, n[18], n[19], n[20], n[21], width, height)
+
+
+@inner()
+def _medium(n):
+    extinction, rgb, airlight = (n[3], n[4], n[5]), (n[6], n[7], n[8]), (n[11], n[12], n[13])
+    least = min(n[3], min(n[4], n[5]))
+    return Medium(n[0], n[1], n[2] > ZERO, extinction, rgb, n[9], n[10], airlight, least)
+
+
+@inner()
+def _limits(n):
+    return Limits(
+        n[0], n[1], n[2], n[3], n[4], n[5], n[6], np.int64(n[7]), n[8], n[9], n[10], n[11], n[12],
+        n[13],
+    )  # fmt: skip
+
+
+@intrinsic
+def _mix(typingctx, image, a, b, c, d, wa, wb, wc, wd):
+    """Sums of four pixels of a flat image of three channels times four weights."""
+
+    def codegen(context, builder, sig, args):
+        data = context.make_array(sig.args[0])(context, builder, args[0]).data
+        number, real, wide = ir.IntType(32), ir.FloatType(), ir.IntType(64)
+        two, four = ir.VectorType(real, 2), ir.VectorType(real, 4)
+        order = ir.Constant(ir.VectorType(number, 4), [0, 1, 0, 1])
+        spread = ir.Constant(ir.VectorType(number, 4), [0, 0, 0, 0])
+        nothing = ir.Constant(four, ir.Undefined)
+        parts = []
+        for index, weight in zip(args[1:5], args[5:], strict=True):
+            at = builder.gep(data, [builder.mul(index, wide(3))])
+            # Not four numbers at once: the fourth may lie beyond the last pixel.
+            pair = builder.load(builder.bitcast(at, two.as_pointer()), align=4)
+            pixel = builder.shuffle_vector(pair, pair, order)
+            third = builder.load(builder.gep(at, [wide(2)]))
+            pixel = builder.insert_element(pixel, third, number(2))
+            weights = builder.insert_element(nothing, weight, number(0))
+            weights = builder.shuffle_vector(weights, nothing, spread)
+            parts.append(builder.fmul(pixel, weights))
+        total = builder.fadd(builder.fadd(*parts[:2]), builder.fadd(*parts[2:]))
+        values = [builder.extract_element(total, number(k)) for k in range(3)]
+        return context.make_tuple(builder, sig.return_type, values)
+
+    result = types.UniTuple(types.float32, 3)
+    return result(image, *[types.uint64] * 4, *[types.float32] * 4), codegen
+
+
+@intrinsic
+def _between(typingctx, image, a, b, fc, fr):
+    """Bilinear from a flat image of four channels: pixels a, a + 1 and below them b, b + 1."""
+
+    def codegen(context, builder, sig, args):
+        number, real, wide = ir.IntType(32), ir.FloatType(), ir.IntType(64)
+        eight, one = ir.VectorType(real, 8), real(1)
+        nothing = ir.Constant(eight, ir.Undefined)
+        data = context.make_array(sig.args[0])(context, builder, args[0]).data
+
+        def splat(*values):
+            vector = nothing
+            for k, value in enumerate(values):
+                vector = builder.insert_element(vector, value, number(k))
+            count = 8 // len(values)
+            order = [k for k in range(len(values)) for _ in range(count)]
+            order = ir.Constant(ir.VectorType(number, 8), order)
+            return builder.shuffle_vector(vector, nothing, order)
+
+        def pair(index):
+            at = builder.gep(data, [builder.mul(index, wide(4))])
+            return builder.load(builder.bitcast(at, eight.as_pointer()), align=4)
+
+        top = builder.fmul(pair(args[1]), splat(builder.fsub(one, args[4])))
+        bottom = builder.fmul(pair(args[2]), splat(args[4]))
+        across = splat(builder.fsub(one, args[3]), args[3])
+        both = builder.fmul(builder.fadd(top, bottom), across)
+        values = [
+            builder.fadd(*(builder.extract_element(both, number(k + side)) for side in (0, 4)))
+            for k in range(4)
+        ]
+        return context.make_tuple(builder, sig.return_type, values)
+
+    result = types.UniTuple(types.float32, 4)
+    return result(image, types.uint64, types.uint64, types.float32, types.float32), codegen
+
+
+@intrinsic
+def _pixels(typingctx, alpha, depth, row, column, width):
+    """Two flat images at eight whole rows and columns inside them."""
+
+    def codegen(context, builder, sig, args):
+        number, wide = ir.IntType(32), ir.IntType(64)
+        whole = ir.VectorType(number, v8.LANES)
+        rows, columns = (builder.fptosi(arg, whole) for arg in args[2:4])
+        found = [ir.Constant(ir.VectorType(ir.FloatType(), v8.LANES), ir.Undefined)] * 2
+        arrays = [
+            context.make_array(kind)(context, builder, array).data
+            for kind, array in zip(sig.args[:2], args[:2], strict=True)
+        ]
+        for lane in range(v8.LANES):
+            r, c = (builder.extract_element(part, number(lane)) for part in (rows, columns))
+            at = builder.add(builder.mul(builder.zext(r, wide), args[4]), builder.zext(c, wide))
+            for k, array in enumerate(arrays):
+                value = builder.load(builder.gep(array, [at]))
+                found[k] = builder.insert_element(found[k], value, number(lane))
+        return context.make_tuple(builder, sig.return_type, found)
+
+    result = types.UniTuple(v8.float8, 2)
+    return result(alpha, depth, v8.float8, v8.float8, types.uint64), codegen
+
+
+@inner()
+def _clamp(x, low, high):
+    return v8.minimum(v8.maximum(x, v8.splat(low)), v8.splat(high))
+
+
+@inner()
+def _dot(m, first, x, y, z):
+    return v8.splat(m[first]) * x + v8.splat(m[first + 1]) * y + v8.splat(m[first + 2]) * z
+
+
+@inner()
+def _project(view, x, y, z, limits):
+    m = view.project
+    depth = v8.maximum(_dot(m, 6, x, y, z), v8.splat(limits.least_depth))
+    inverse = v8.splat(ONE) / depth
+    column = _dot(m, 0, x, y, z) * inverse + v8.splat(view.cx)
+    return column, _dot(m, 3, x, y, z) * inverse + v8.splat(view.cy)
+
+
+@inner()
+def _clamp_to(view, column, row):
+    column = _clamp(column, HALF, view.columns - HALF)
+    return column, _clamp(row, HALF, view.rows - HALF)
+
+
+@inner()
+def _is_inside(view, column, row):
+    zero = v8.splat(ZERO)
+    across = v8.both(v8.at_least(column, zero), v8.greater(v8.splat(view.columns), column))
+    down = v8.both(v8.at_least(row, zero), v8.greater(v8.splat(view.rows), row))
+    return v8.both(across, down)
+
+
+@inner()
+def _look(alpha, depth, view, column, row):
+    """Alpha and depth of the nearest pixels inside, and their centres."""
+    column = v8.floor(_clamp(column, ZERO, view.columns - ONE))
+    row = v8.floor(_clamp(row, ZERO, view.rows - ONE))
+    a, z = _pixels(alpha, depth, row, column, view.width)
+    half = v8.splat(HALF)
+    return a, z, column + half, row + half
+
+
+@inner()
+def _ray_part(view, first, column, row):
+    m = view.rays
+    return v8.splat(m[first]) * column + v8.splat(m[first + 1]) * row + v8.splat(m[first + 2])
+
+
+@inner()
+def _way(view, z, column, row, x0, y0, z0):
+    """How far the points that pixels show (relative to the layer's eye) are from others."""
+    x = z * _ray_part(view, 0, column, row) - x0
+    y = z * _ray_part(view, 3, column, row) - y0
+    z = z * _ray_part(view, 6, column, row) - z0
+    return v8.sqrt(x * x + y * y + z * z)
+
+
+@inner()
+def _end(px, py, pz, distance, rx, ry, rz):
+    """Where rays end, and their directions where that is nowhere (a distance < 0)."""
+    met = v8.at_least(distance, v8.splat(ZERO))
+    x, y = v8.select(met, px + distance * rx, rx), v8.select(met, py + distance * ry, ry)
+    return x, y, v8.select(met, pz + distance * rz, rz)
+
+
+@inner()
+def _any(mask):
+    return v8.any_not_negative(v8.select(mask, v8.splat(ONE), v8.splat(-ONE)))
+
+
+@inner()
+def _exponential(x):
+    """exp(-x) for x >= 0."""
+    return exp2_fine(v8.maximum(x * v8.splat(-LOG2_E), v8.splat(F(-126))))
+
+
+@inner()
+def _place(s, column, row, columns, rows):
+    """The first of the four pixels round coordinates (C0, R0), and the way from it (FC, FR).
+
+    columns, rows: the image's sides, vectors. On the last pixels the way is 1, from those before.
+    """
+    half, one, two, zero = v8.splat(HALF), v8.splat(ONE), v8.splat(F(2)), v8.splat(ZERO)
+    x = v8.minimum(v8.maximum(column - half, zero), columns - one)
+    y = v8.minimum(v8.maximum(row - half, zero), rows - one)
+    c0 = v8.maximum(v8.minimum(v8.floor(x), columns - two), zero)
+    r0 = v8.maximum(v8.minimum(v8.floor(y), rows - two), zero)
+    v8.store(s, C0, c0)
+    v8.store(s, R0, r0)
+    v8.store(s, FC, x - c0)
+    v8.store(s, FR, y - r0)
+
+
+@inner()
+def _fetched(s):
+    return v8.load(s, R), v8.load(s, G), v8.load(s, B), v8.load(s, A)
+
+
+@inner()
+def _pixel(x):
+    return WATER_KERNELS_U(np.int32(x))
+
+
+@inner()
+def _bilinear(s, k, rgb, alpha, width, right, below):
+    """Colour and alpha at the place of a lane."""
+    a = _pixel(s[R0 + k]) * width + _pixel(s[C0 + k])
+    b, c, d = a + right, a + below, a + right + below
+    fc, fr = s[FC + k], s[FR + k]
+    gc, gr = ONE - fc, ONE - fr
+    wa, wb, wc, wd = gc * gr, fc * gr, gc * fr, fc * fr
+    opaque = (alpha[a] * wa + alpha[b] * wb) + (alpha[c] * wc + alpha[d] * wd)
+    red, green, blue = _mix(rgb, a, b, c, d, wa, wb, wc, wd)
+    return red, green, blue, opaque
+
+
+@inner()
+def _fetch(s, column, row, rgb, alpha, view):
+    _place(s, column, row, v8.splat(view.columns), v8.splat(view.rows))
+    right = min(view.width - WATER_KERNELS_U(1), WATER_KERNELS_U(1))
+    below = min(view.height - WATER_KERNELS_U(1), WATER_KERNELS_U(1)) * view.width
+    for k in range(LANES):
+        r, g, b, a = _bilinear(s, k, rgb, alpha, view.width, right, below)
+        s[R + k], s[G + k], s[B + k], s[A + k] = r, g, b, a
+    return _fetched(s)
+
+
+@inner()
+def _choose_levels(s, starts, level, sizes):
+    """The two levels of averages round real ones: first pixels, sizes, scales of coordinates."""
+    low, top = v8.floor(level), v8.splat(F(np.int32(sizes.shape[0] - 1)))
+    v8.store(s, SHARE_ABOVE, level - low)
+    v8.store(s, LOW, low)
+    v8.store(s, LOW + LANES, v8.minimum(low + v8.splat(ONE), top))
+    for k in range(WATER_KERNELS_U(2) * LANES):
+        n = _pixel(s[LOW + k])
+        starts[k] = sizes[n, 0]
+        s[WIDE + k], s[HIGH + k] = F(np.int32(sizes[n, 1])), F(np.int32(sizes[n, 2]))
+        s[SCALE + k] = ONE / F(np.int32(1) << np.int32(n))
+
+
+@inner()
+def _fetch_level(s, starts, second, column, row, mips):
+    """Colours and alphas from one of the levels chosen; second: LANES for the upper one."""
+    scale = v8.load(s, SCALE + second)
+    wide, high = v8.load(s, WIDE + second), v8.load(s, HIGH + second)
+    _place(s, column * scale, row * scale, wide, high)
+    for k in range(LANES):
+        width = _pixel(s[WIDE + second + k])
+        at = WATER_KERNELS_U(starts[second + k]) + _pixel(s[R0 + k]) * width + _pixel(s[C0 + k])
+        r, g, b, a = _between(mips, at, at + width, s[FC + k], s[FR + k])
+        s[R + k], s[G + k], s[B + k], s[A + k] = r, g, b, a
+    return _fetched(s)
+
+
+@inner()
+def _fetch_blurred(s, starts, column, row, mips):
+    """Colours and alphas between the two levels chosen."""
+    r, g, b, a = _fetch_level(s, starts, WATER_KERNELS_U(0), column, row, mips)
+    r1, g1, b1, a1 = _fetch_level(s, starts, LANES, column, row, mips)
+    share = v8.load(s, SHARE_ABOVE)
+    keep = v8.splat(ONE) - share
+    r, g, b = keep * r + share * r1, keep * g + share * g1, keep * b + share * b1
+    return r, g, b, keep * a + share * a1
+
+
+@inner()
+def _sky(s, faces, size, x, y, z, near, medium):
+    """Colours of a cube map with a border, flat, in directions that climb, behind smog."""
+    zero = v8.splat(ZERO)
+    ax, ay = v8.absolute(x), v8.absolute(y)
+    by_x = v8.both(v8.at_least(ax, ay), v8.at_least(ax, z))
+    by_y = v8.at_least(ay, z)
+    major = v8.select(by_x, ax, v8.select(by_y, ay, z))
+    right, ahead = v8.at_least(x, zero), v8.at_least(y, zero)
+    across = v8.select(by_x, v8.select(right, v8.negate(z), z), x)
+    turned = v8.select(v8.both(by_y, ahead), z, v8.select(by_y, v8.negate(z), v8.negate(y)))
+    down = v8.select(by_x, v8.negate(y), turned)
+    face = v8.select(by_y, v8.select(ahead, v8.splat(F(2)), v8.splat(F(3))), v8.splat(F(4)))
+    face = v8.select(by_x, v8.select(right, zero, v8.splat(ONE)), face)
+    side = v8.splat(F(np.int32(size)))
+    middle = v8.splat(HALF) * side
+    inverse = (middle - v8.splat(ONE)) / major
+    _place(s, across * inverse + middle, down * inverse + middle, side, side)
+    v8.store(s, R0, v8.load(s, R0) + face * side)
+    for k in range(LANES):
+        at = _pixel(s[R0 + k]) * size + _pixel(s[C0 + k])
+        r, g, b, _ = _between(faces, at, at + size, s[FC + k], s[FR + k])
+        s[R + k], s[G + k], s[B + k] = r, g, b
+    r, g, b = v8.load(s, R), v8.load(s, G), v8.load(s, B)
+    if medium.smog_above >= ZERO:
+        t = _exponential(near + v8.splat(medium.smog_above) / z)
+        rest, fog = v8.splat(ONE) - t, medium.airlight
+        r = t * r + rest * v8.splat(fog[0])
+        g = t * g + rest * v8.splat(fog[1])
+        b = t * b + rest * v8.splat(fog[2])
+    return r, g, b
+
+
+@inner()
+def _reflectance(c, inside, medium):
+    """Share of reflected light. c, inside: cosines in the air and in the water."""
+    one, n = v8.splat(ONE), v8.splat(medium.index)
+    if medium.schlick:
+        base = (n - one) / (n + one)
+        base = base * base
+        x = one - c
+        return base + (one - base) * ((x * x) * (x * x) * x)
+    a, b = c - n * inside, c + n * inside
+    d, e = n * c - inside, n * c + inside
+    quotient = one / (b * e)
+    rs, rp = a * e * quotient, d * b * quotient
+    return v8.splat(HALF) * (rs * rs + rp * rp)
+
+
+@inner()
+def _facet(sx, sy, vx, vy, vz, medium, limits):
+    """Of facets with these slopes: normals, cosines in air and water, reflected share, rays."""
+    one, least = v8.splat(ONE), v8.splat(limits.least_cosine)
+    nz = one / v8.sqrt(sx * sx + sy * sy + one)
+    nx, ny = sx * nz, sy * nz
+    cosine = nx * vx + ny * vy + nz * vz
+    c = v8.minimum(v8.maximum(cosine, least), one)
+    inverse = v8.splat(ONE / medium.index)
+    inside = v8.sqrt(v8.maximum(one - (one - c * c) * inverse * inverse, v8.splat(ZERO)))
+    twice = cosine + cosine
+    x, y = twice * nx - vx, twice * ny - vy
+    z = v8.maximum(twice * nz - vz, least)
+    unit = one / v8.sqrt(x * x + y * y + z * z)
+    share = _reflectance(c, inside, medium)
+    return nx, ny, nz, c, inside, share, x * unit, y * unit, z * unit
+
+
+@inner()
+def _refract(nx, ny, nz, c, inside, vx, vy, vz, medium, limits):
+    """Refracted rays per metre of depth, and their length per metre."""
+    one, ratio = v8.splat(ONE), v8.splat(ONE / medium.index)
+    bend = c * ratio - inside
+    x, y = bend * nx - vx * ratio, bend * ny - vy * ratio
+    z = v8.maximum(vz * ratio - bend * nz, v8.splat(limits.least_cosine))
+    steep = one / z
+    return x * steep, y * steep, v8.sqrt(x * x + y * y + z * z) * steep
+
+
+@inner()
+def _place_on_bed(px, py, tx, ty, depth, bed, medium, limits):
+    x, y = px + depth * tx, py + depth * ty
+    column, row = _project(bed, x, y, v8.splat(-medium.height) - depth, limits)
+    return column, row, _is_inside(bed, column, row)
+
+
+@inner()
+def _search_bed(s, found, depth, px, py, tx, ty, alpha, depths, bed, medium, limits):
+    """The bed's depth along the refracted rays; C0 to FR, FOUND (1 or 0): where they meet it."""
+    zero, one = v8.splat(ZERO), v8.splat(ONE)
+    solid = v8.splat(limits.solid_alpha)
+    going = found
+    for _ in range(limits.bed_steps):
+        goes = v8.greater(going, zero)
+        if not _any(goes):
+            break
+        column, row, inside = _place_on_bed(px, py, tx, ty, depth, bed, medium, limits)
+        a, z, column, row = _look(alpha, depths, bed, column, row)
+        met = v8.select(v8.both(inside, v8.at_least(a, solid)), one, zero)
+        found = v8.select(goes, v8.minimum(found, met), found)
+        going = v8.minimum(going, met)
+        better = v8.splat(-medium.height) - z * _ray_part(bed, 6, column, row)
+        better = v8.select(v8.greater(going, zero), v8.maximum(better, zero), depth)
+        moved = v8.greater(v8.absolute(better - depth), v8.splat(limits.settled_m))
+        going = v8.select(moved, going, zero)
+        depth = better
+    column, row, inside = _place_on_bed(px, py, tx, ty, depth, bed, medium, limits)
+    _place(s, column, row, v8.splat(bed.columns), v8.splat(bed.rows))
+    v8.store(s, FOUND, v8.select(inside, found, zero))
+    return depth
+
+
+@inner()
+def _fetch_bed(s, q, own, place, at, depth, rgb, alpha, bed, limits):
+    """The bed's colour where it was found, straight behind the pixel elsewhere; its depth."""
+    v8.store(s, DEPTH, depth)
+    right = min(bed.width - WATER_KERNELS_U(1), WATER_KERNELS_U(1))
+    below = min(bed.height - WATER_KERNELS_U(1), WATER_KERNELS_U(1)) * bed.width
+    for k in range(LANES):
+        r = g = b = a = ZERO
+        if s[FOUND + k] > ZERO:
+            r, g, b, a = _bilinear(s, k, rgb, alpha, bed.width, right, below)
+        if a < limits.solid_alpha:
+            pixel = WATER_KERNELS_U(own[place + k])
+            r, g, b = (
+                rgb[WATER_KERNELS_U(3) * pixel],
+                rgb[WATER_KERNELS_U(3) * pixel + WATER_KERNELS_U(1)],
+                rgb[WATER_KERNELS_U(3) * pixel + WATER_KERNELS_U(2)],
+            )
+            a, s[DEPTH + k] = alpha[pixel], q[OWN_DEPTH + at + k]
+        s[R + k], s[G + k], s[B + k], s[A + k] = r, g, b, a
+    return v8.load(s, DEPTH)
+
+
+@inner()
+def _absorb(seen, alpha, water, length, extinction):
+    one = v8.splat(ONE)
+    t = _exponential(length * v8.splat(extinction))
+    return t * (seen + (one - alpha) * water) + (one - t) * water
+
+
+@inner()
+def _mirror_distance(alpha, depth, mirror, column, row, px, py, medium, limits):
+    """From the surface to what the mirrored layer shows, -1 where that is nothing."""
+    a, z, column, row = _look(alpha, depth, mirror, column, row)
+    way = _way(mirror, z, column, row, px, py, v8.splat(medium.height))
+    return v8.select(v8.at_least(a, v8.splat(limits.solid_alpha)), way, v8.splat(-ONE))
+
+
+@inner()
+def _find_in_mirror(s, count, dx, dy, dz, px, py, alpha, depth, mirror, medium, limits):
+    """MIRROR_C, MIRROR_R: where the reflected rays end in the mirrored layer."""
+    pz = v8.splat(medium.height)
+    column, row = _project(mirror, dx, dy, v8.negate(dz), limits)
+    column, row = _clamp_to(mirror, column, row)
+    d = _mirror_distance(alpha, depth, mirror, column, row, px, py, medium, limits)
+    rx, ry, rz = v8.load(s, RX), v8.load(s, RY), v8.load(s, RZ)
+    x, y, z = _end(px, py, pz, d, rx, ry, rz)
+    column, row = _project(mirror, x, y, z, limits)
+    column, row = _clamp_to(mirror, column, row)
+    d = _mirror_distance(alpha, depth, mirror, column, row, px, py, medium, limits)
+    for tap in range(count):
+        t = tap * LANES
+        rx, ry, rz = v8.load(s, RX + t), v8.load(s, RY + t), v8.load(s, RZ + t)
+        x, y, z = _end(px, py, pz, d, rx, ry, rz)
+        column, row = _project(mirror, x, y, z, limits)
+        column, row = _clamp_to(mirror, column, row)
+        v8.store(s, MIRROR_C + t, column)
+        v8.store(s, MIRROR_R + t, row)
+
+
+@inner()
+def _level(s, sizes):
+    """Level of averages whose pixels are as wide as a pixel's three places lie apart."""
+    c, r = v8.load(s, MIRROR_C), v8.load(s, MIRROR_R)
+    x1, y1 = (
+        v8.load(s, MIRROR_C + WATER_KERNELS_U(8)) - c,
+        v8.load(s, MIRROR_R + WATER_KERNELS_U(8)) - r,
+    )
+    x2, y2 = (
+        v8.load(s, MIRROR_C + WATER_KERNELS_U(16)) - c,
+        v8.load(s, MIRROR_R + WATER_KERNELS_U(16)) - r,
+    )
+    apart = v8.sqrt(x1 * x1 + y1 * y1) + v8.sqrt(x2 * x2 + y2 * y2)
+    spacing = v8.maximum(v8.splat(HALF) * apart, v8.splat(ONE))
+    top = F(np.int32(sizes.shape[0] - 1))
+    return v8.maximum(v8.minimum(log2(spacing), v8.splat(top)), v8.splat(ZERO))
+
+
+@inner()
+def _match_in_image(px, py, pz, d, rx, ry, rz, alpha, depth, front, limits):
+    """(column, row, alpha, depth, distance along the optical axis of the ray's end)."""
+    x, y, z = _end(px, py, pz, d, rx, ry, rz)
+    column, row = _project(front, x, y, z, limits)
+    a, z_seen, c, r = _look(alpha, depth, front, column, row)
+    return column, row, a, z_seen, c, r, _dot(front.project, 6, x, y, z)
+
+
+@inner()
+def _find_in_image(s, d, trust, px, py, alpha, depth, front, medium, limits):
+    """(column, row, weight) of the image's pixels in which the first ray ends."""
+    zero, one = v8.splat(ZERO), v8.splat(ONE)
+    pz, solid = v8.splat(-medium.height), v8.splat(limits.solid_alpha)
+    rx, ry, rz = v8.load(s, RX), v8.load(s, RY), v8.load(s, RZ)
+    _, _, a, z, c, r, _ = _match_in_image(px, py, pz, d, rx, ry, rz, alpha, depth, front, limits)
+    better = v8.select(v8.at_least(a, solid), _way(front, z, c, r, px, py, pz), d)
+    finite = v8.at_least(d, zero)
+    d = v8.select(finite, better, d)
+    column, row, a, z, _, _, ahead = _match_in_image(
+        px, py, pz, d, rx, ry, rz, alpha, depth, front, limits
+    )
+    allowed = v8.maximum(v8.splat(limits.match_share) * ahead, v8.splat(limits.match_m))
+    near = v8.both(v8.at_least(a, solid), v8.greater(allowed, v8.absolute(z - ahead)))
+    on_sky = v8.select(v8.at_least(a, solid), zero, one)
+    seen = v8.select(finite, v8.select(near, one, zero), on_sky)
+    columns, rows = v8.splat(front.columns), v8.splat(front.rows)
+    across = v8.minimum(column, columns - column) / columns
+    border = v8.minimum(across, v8.minimum(row, rows - row) / rows)
+    fade = _clamp(border / v8.splat(limits.edge), ZERO, ONE)
+    weight = trust * (fade * fade * (v8.splat(F(3)) - (fade + fade)))
+    column, row = _clamp_to(front, column, row)
+    return column, row, seen * weight
+
+
+@kernel
+def shade(
+    u, v, axes, cover, normal_x, normal_y, variance, bed_view, bed_rgb, bed_alpha, bed_depth,
+    offset, mirror_view, mirror_rgb, mirror_alpha, mirror_depth, mirror_mips, mirror_sizes,
+    has_mirror, front_view, front_rgb, front_alpha, front_depth, has_front, front_distance,
+    front_weight, faces, size, medium_numbers, limit_numbers, out,
+):  # fmt: skip
+    """Water of the pixels of a camera into out [H, W, 3].
+
+    u [W], v [H]: image coordinates at unit depth. axes [3, 3]: world_from_camera, float64. offset:
+    (left, top) of the camera's window in the bed's. front: the layer of the screen-space reflection
+    whose rays run front_distance. faces: flat cube map with its border, `size` squared texels a
+    face, each four numbers. mirror_mips: the mirrored layer and its averages, four numbers a pixel.
+    mirror_sizes [levels, 3]: their first pixels, widths, heights. Both arrays go on a row and a
+    pixel beyond.
+    """
+    height, width = cover.shape
+    left, top = offset
+    for i in numba.prange(height):
+        bed, mirror, front = _view(bed_view), _view(mirror_view), _view(front_view)
+        medium, limits = _medium(medium_numbers), _limits(limit_numbers)
+        q, s = np.zeros(2 * STRIP * 10, np.float32), np.zeros(SCRATCH, np.float32)
+        pixels, own = np.zeros(2 * STRIP, np.int64), np.zeros(2 * STRIP, np.int64)
+        starts = np.zeros(16, np.int64)
+        smooth_count, rough_count, j = WATER_KERNELS_U(0), WATER_KERNELS_U(0), 0
+        bx, by, bz = v[i] * axes[0, 1], v[i] * axes[1, 1], v[i] * axes[2, 1]
+        own_row = i + top
+        row_inside = own_row >= 0 and own_row < np.int64(bed.height)
+        far = np.float64(limits.farthest)
+        while True:
+            while (
+                j < width
+                and smooth_count < WATER_KERNELS_U(STRIP)
+                and rough_count < WATER_KERNELS_U(STRIP)
+            ):
+                # The order of these sums is that of Camera.ray_directions: the sign has to agree.
+                fall = (u[j] * axes[2, 0] + bz) + axes[2, 2]
+                if not (fall < 0.0 and cover[i, j] <= limits.cover):
+                    plain = medium.airlight if medium.smog_per_m > ZERO else medium.rgb
+                    met = ONE if fall < 0.0 else ZERO
+                    for c in range(3):
+                        out[i, j, c] = met * plain[c]
+                    j += 1
+                    continue
+                spread = variance[i, j]
+                if spread >= limits.smooth_variance:
+                    n, p = LIST + rough_count, WATER_KERNELS_U(STRIP) + rough_count
+                    rough_count += WATER_KERNELS_U(1)
+                else:
+                    n = p = smooth_count
+                    smooth_count += WATER_KERNELS_U(1)
+                q[DX + n] = F((u[j] * axes[0, 0] + bx) + axes[0, 2])
+                q[DY + n] = F((u[j] * axes[1, 0] + by) + axes[1, 2])
+                q[DZ + n] = F(fall)
+                q[ALONG + n] = F(min(np.float64(medium.height) / -fall, far))
+                q[NX + n], q[NY + n], q[ROUGH + n] = normal_x[i, j], normal_y[i, j], spread
+                q[OWN_DEPTH + n] = -ONE
+                own[p] = 0
+                column = j + left
+                if row_inside and column >= 0 and column < np.int64(bed.width):
+                    pixel = WATER_KERNELS_U(own_row) * bed.width + WATER_KERNELS_U(column)
+                    if bed_alpha[pixel] >= limits.solid_alpha:
+                        own[p] = np.int64(pixel)
+                        q[OWN_DEPTH + n] = max(-bed_depth[pixel] * F(fall) - medium.height, ZERO)
+                if has_front:
+                    d = front_distance[i, j]
+                    q[DISTANCE + n] = d if d < F(np.inf) else -ONE
+                    q[TRUST + n] = front_weight[i, j]
+                pixels[p] = j
+                j += 1
+            # The fuller list first, so that lists are short at a row's end only.
+            rough = rough_count > smooth_count
+            n = rough_count if rough else smooth_count
+            if n == WATER_KERNELS_U(0):
+                break
+            base, start, taps = WATER_KERNELS_U(0), WATER_KERNELS_U(0), WATER_KERNELS_U(1)
+            if rough:
+                base, start, taps = LIST, WATER_KERNELS_U(STRIP), WATER_KERNELS_U(3)
+                rough_count = WATER_KERNELS_U(0)
+            else:
+                smooth_count = WATER_KERNELS_U(0)
+            for last in range(
+                n, (n + WATER_KERNELS_U(7)) & EIGHTS
+            ):  # the last pixel again in lanes left over
+                own[start + last] = own[start + n - WATER_KERNELS_U(1)]
+                for line in range(WATER_KERNELS_U(10)):
+                    at = base + line * WATER_KERNELS_U(STRIP)
+                    q[at + last] = q[at + n - WATER_KERNELS_U(1)]
+            for first in range(WATER_KERNELS_U(0), n, LANES):
+                at = base + first
+                one, zero = v8.splat(ONE), v8.splat(ZERO)
+                dx, dy, dz = v8.load(q, DX + at), v8.load(q, DY + at), v8.load(q, DZ + at)
+                along = v8.load(q, ALONG + at)
+                px, py = along * dx, along * dy
+                length = v8.sqrt(dx * dx + dy * dy + dz * dz)
+                inverse = one / length
+                vx, vy, vz = (
+                    v8.negate(dx) * inverse,
+                    v8.negate(dy) * inverse,
+                    v8.negate(dz) * inverse,
+                )
+                near = v8.splat(medium.smog_per_m) * along * length
+                nx, ny = v8.load(q, NX + at), v8.load(q, NY + at)
+                upright = v8.maximum(one - nx * nx - ny * ny, v8.splat(limits.steepest))
+                upright = one / v8.sqrt(upright)
+                sx, sy = nx * upright, ny * upright
+                nx, ny, nz, c, inside, share, rx, ry, rz = _facet(
+                    sx, sy, vx, vy, vz, medium, limits
+                )
+                # Through the surface.
+                wr, wg, wb = (
+                    v8.splat(medium.rgb[0]), v8.splat(medium.rgb[1]), v8.splat(medium.rgb[2])
+                )  # fmt: skip
+                if medium.smog_per_m > ZERO:
+                    t = _exponential(near)
+                    rest, fog = one - t, medium.airlight
+                    wr, wg = t * wr + rest * v8.splat(fog[0]), t * wg + rest * v8.splat(fog[1])
+                    wb = t * wb + rest * v8.splat(fog[2])
+                below_r, below_g, below_b = wr, wg, wb
+                own_depth = v8.load(q, OWN_DEPTH + at)
+                bends = medium.index != ONE
+                tx, ty, steep = zero, zero, one / vz
+                if bends:
+                    tx, ty, steep = _refract(nx, ny, nz, c, inside, vx, vy, vz, medium, limits)
+                thick = own_depth * steep * v8.splat(medium.least_extinction)
+                clear = v8.both(
+                    v8.at_least(own_depth, zero), v8.greater(v8.splat(limits.opaque), thick)
+                )
+                if _any(clear):
+                    found = v8.select(clear, one, zero)
+                    v8.store(s, FOUND, zero)
+                    depth = own_depth
+                    if bends:
+                        depth = _search_bed(
+                            s, found, own_depth, px, py, tx, ty, bed_alpha, bed_depth, bed, medium,
+                            limits,
+                        )  # fmt: skip
+                    depth = _fetch_bed(
+                        s, q, own, start + first, at, depth, bed_rgb, bed_alpha, bed, limits
+                    )  # fmt: skip
+                    r, g, b, a = _fetched(s)
+                    way = depth * steep
+                    r = _absorb(r, a, wr, way, medium.extinction[0])
+                    g = _absorb(g, a, wg, way, medium.extinction[1])
+                    b = _absorb(b, a, wb, way, medium.extinction[2])
+                    below_r = v8.select(clear, r, wr)
+                    below_g = v8.select(clear, g, wg)
+                    below_b = v8.select(clear, b, wb)
+                sum_r, sum_g, sum_b = below_r, below_g, below_b
+                if bends:
+                    # Mirrored rays and shares of the slopes.
+                    if rough:
+                        share = v8.splat(F(2 / 3)) * share
+                    v8.store(s, RX, rx)
+                    v8.store(s, RY, ry)
+                    v8.store(s, RZ, rz)
+                    v8.store(s, SHARE, share)
+                    if rough:
+                        flat = v8.maximum(v8.sqrt(vx * vx + vy * vy), v8.splat(F(1e-12)))
+                        spread8 = v8.sqrt(v8.splat(F(3)) * v8.load(q, ROUGH + at)) / flat
+                        for tap in range(WATER_KERNELS_U(1), WATER_KERNELS_U(3)):
+                            t8 = tap * LANES
+                            sign = ONE if tap == WATER_KERNELS_U(1) else -ONE
+                            offset8 = v8.splat(sign) * spread8
+                            _, _, _, _, _, share, rx, ry, rz = _facet(
+                                sx + offset8 * vx, sy + offset8 * vy, vx, vy, vz, medium, limits
+                            )
+                            v8.store(s, RX + t8, rx)
+                            v8.store(s, RY + t8, ry)
+                            v8.store(s, RZ + t8, rz)
+                            v8.store(s, SHARE + t8, v8.splat(F(1 / 6)) * share)
+                    # What stands above the water, where the image shows it.
+                    image_r, image_g, image_b, image_a, weight = zero, zero, zero, zero, zero
+                    needs_mirror = has_mirror
+                    if has_front and not rough:
+                        column, row, weight = _find_in_image(
+                            s, v8.load(q, DISTANCE + at), v8.load(q, TRUST + at), px, py,
+                            front_alpha, front_depth, front, medium, limits,
+                        )  # fmt: skip
+                        if _any(v8.greater(weight, zero)):
+                            image_r, image_g, image_b, image_a = _fetch(
+                                s, column, row, front_rgb, front_alpha, front
+                            )
+                        rest = _any(v8.greater(one - weight, v8.splat(TINY)))
+                        needs_mirror = has_mirror and rest
+                    if needs_mirror:
+                        _find_in_mirror(
+                            s, taps, dx, dy, dz, px, py, mirror_alpha, mirror_depth, mirror,
+                            medium, limits,
+                        )  # fmt: skip
+                    if needs_mirror and rough:
+                        _choose_levels(s, starts, _level(s, mirror_sizes), mirror_sizes)
+                    for tap in range(taps):
+                        t8 = tap * LANES
+                        r, g, b, a = zero, zero, zero, zero
+                        if needs_mirror:
+                            column, row = v8.load(s, MIRROR_C + t8), v8.load(s, MIRROR_R + t8)
+                            if rough:
+                                r, g, b, a = _fetch_blurred(s, starts, column, row, mirror_mips)
+                            else:
+                                r, g, b, a = _fetch(
+                                    s, column, row, mirror_rgb, mirror_alpha, mirror
+                                )
+                        if has_front:
+                            rest = one - weight
+                            r, g = weight * image_r + rest * r, weight * image_g + rest * g
+                            b, a = weight * image_b + rest * b, weight * image_a + rest * a
+                        through = one - a
+                        shines = v8.greater(through, v8.splat(limits.faint))
+                        whole = one / v8.maximum(a, v8.splat(HALF))
+                        own_r, own_g, own_b = r * whole, g * whole, b * whole
+                        if _any(shines):
+                            rx, ry, rz = (
+                                v8.load(s, RX + t8), v8.load(s, RY + t8), v8.load(s, RZ + t8)
+                            )  # fmt: skip
+                            sky_r, sky_g, sky_b = _sky(s, faces, size, rx, ry, rz, near, medium)
+                            own_r = v8.select(shines, r + through * sky_r, own_r)
+                            own_g = v8.select(shines, g + through * sky_g, own_g)
+                            own_b = v8.select(shines, b + through * sky_b, own_b)
+                        share = v8.load(s, SHARE + t8)
+                        sum_r = sum_r + share * (own_r - below_r)
+                        sum_g = sum_g + share * (own_g - below_g)
+                        sum_b = sum_b + share * (own_b - below_b)
+                v8.store(s, R, sum_r)
+                v8.store(s, G, sum_g)
+                v8.store(s, B, sum_b)
+                for k in range(min(LANES, n - first)):
+                    pixel = pixels[start + first + k]
+                    out[i, pixel, 0], out[i, pixel, 1] = s[R + k], s[G + k]
+                    out[i, pixel, 2] = s[B + k]

@@ -1,0 +1,257 @@
+"""Where a camera sees a level plane, and the camera mirrored in it."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int32, Int64
+from torch import Tensor
+
+from augment.cameras import Camera
+from augment.geometry import any_in_squares, rigid
+
+# ---- Which pixels of an image's rows see the water's plane, by float64 once a row ----------------
+# Whether a ray falls is the sign of a sum that float64 has to decide, and near the horizon the
+# small
+# fall is what distances are divided by. Along a row the fall is linear in the column, and so the
+# rays
+# that fall are an interval of columns. Kernels that know it and the fall at its end nearest to the
+# horizon need no float64: from there the fall only grows, and nothing cancels.
+
+BEGIN, END, ANCHOR, FALL = range(4)  # of a row's numbers
+ROW = 4
+
+Holds = Callable[[Int64[np.ndarray, " n"], Int64[np.ndarray, " n"]], Bool[np.ndarray, " n"]]
+
+
+def falling_rows(camera: Camera) -> Int32[np.ndarray, "H 4"]:
+    """Of each row: the first and one past the last column whose rays fall, a column of these, and
+    the bits of float32 world z of its ray, the one nearest to zero.
+
+    The signs are those of `Camera.ray_directions` in float64.
+    """
+    u, v = image_coordinates(camera)
+    rise = camera.world_from_camera[2, :3].numpy()
+
+    def fall(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        return (u[columns] * rise[0] + v[rows] * rise[1]) + rise[2]
+
+    begin, end = column_intervals(camera, lambda rows, columns: fall(rows, columns) < 0)
+    anchor = np.where(rise[0] > 0, np.maximum(end - 1, 0), np.minimum(begin, camera.width - 1))
+    out = np.empty((camera.height, ROW), np.int32)
+    out[:, BEGIN], out[:, END], out[:, ANCHOR] = begin, end, anchor
+    out[:, FALL] = fall(np.arange(camera.height), anchor).astype(np.float32).view(np.int32)
+    return out
+
+
+def image_coordinates(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Of columns [W] and rows [H] at unit depth, float64, rounded as in `ray_directions`."""
+    u = (np.arange(camera.width, dtype=np.float64) + 0.5 - camera.cx) / camera.fx
+    v = (np.arange(camera.height, dtype=np.float64) + 0.5 - camera.cy) / camera.fy
+    return u, v
+
+
+def column_intervals(
+    camera: Camera, holds: Holds
+) -> tuple[Int64[np.ndarray, " H"], Int64[np.ndarray, " H"]]:
+    """First and one past the last column of each row in which something holds; equal where it holds
+    in none. holds(rows, columns): in every row true up to some column or from some column on.
+    """
+    rows, last = np.arange(camera.height), camera.width - 1
+    left, right = holds(rows, np.zeros_like(rows)), holds(rows, np.full_like(rows, last))
+    begin, end = np.zeros_like(rows), np.where(left & right, camera.width, 0)
+    mixed = np.nonzero(left != right)[0]
+    if len(mixed):
+        low, high = np.zeros_like(mixed), np.full_like(mixed, last)
+        for _ in range(last.bit_length()):
+            middle = (low + high) // 2
+            is_left = holds(mixed, middle) == left[mixed]
+            low, high = np.where(is_left, middle, low), np.where(is_left, high, middle)
+        begin[mixed] = np.where(left[mixed], 0, high)
+        end[mixed] = np.where(left[mixed], high, camera.width)
+    return begin, end
+
+
+# ---- water plane ---------------------------------------------------------------------------------
+
+GRAIN = 16  # pixels a side of the squares that masks are grown in
+
+
+@dataclass(frozen=True)
+class Margins:
+    """Pixels on each side."""
+
+    left: int
+    top: int
+    right: int
+    bottom: int
+
+    def around(self, mask: Bool[Tensor, "h w"], reach: Margins) -> Bool[Tensor, "H W"]:
+        """A window's mask as one of the grown window, grown by the reach: in whole squares, so that
+        nothing is missed.
+        """
+        if mask.device.type != "cpu":
+            return self._around_by_torch(mask, reach)
+        height, width = mask.shape
+        inside = np.zeros((height + self.top + self.bottom, width + self.left + self.right), bool)
+        inside[self.top : self.top + height, self.left : self.left + width] = mask.numpy()
+        coarse = any_in_squares(inside, GRAIN)
+        left, up, right, down = reach.in_squares()
+        square = np.ones((up + down + 1, left + right + 1), np.uint8)
+        # OpenCV grows towards what lies before the anchor in the kernel's own direction.
+        grown = cv2.dilate(coarse.astype(np.uint8), square, anchor=(right, down))
+        fine = grown.repeat(GRAIN, 0).repeat(GRAIN, 1)[: inside.shape[0], : inside.shape[1]]
+        return torch.from_numpy(np.ascontiguousarray(fine)).view(torch.bool)
+
+    def in_squares(self) -> tuple[int, int, int, int]:
+        return (
+            math.ceil(self.left / GRAIN),
+            math.ceil(self.top / GRAIN),
+            math.ceil(self.right / GRAIN),
+            math.ceil(self.bottom / GRAIN),
+        )
+
+    def _around_by_torch(self, mask: Tensor, reach: Margins) -> Tensor:
+        """`around` of a mask on a GPU: the same squares."""
+        pad, pool = torch.nn.functional.pad, torch.nn.functional.max_pool2d
+        inside = pad(mask.float()[None, None], (self.left, self.right, self.top, self.bottom))
+        coarse = pool(inside, GRAIN, ceil_mode=True)
+        left, up, right, down = reach.in_squares()
+        grown = pool(pad(coarse, (right, left, down, up)), (up + down + 1, left + right + 1), 1)
+        fine = grown[0, 0].repeat_interleave(GRAIN, 0).repeat_interleave(GRAIN, 1)
+        return (fine[: inside.shape[2], : inside.shape[3]] > 0).contiguous()
+
+
+@dataclass(frozen=True)
+class Window:
+    """Columns left to right - 1 and rows top to bottom - 1 of an image; may reach beyond it."""
+
+    left: int
+    top: int
+    right: int
+    bottom: int
+
+    def of(self, camera: Camera) -> Camera:
+        """The camera's view through this window."""
+        return camera.cropped(self.left, self.top, self.right - self.left, self.bottom - self.top)
+
+    def grown(self, margins: Margins) -> Window:
+        """The window with margins around it."""
+        return Window(
+            self.left - margins.left,
+            self.top - margins.top,
+            self.right + margins.right,
+            self.bottom + margins.bottom,
+        )
+
+    def overlap(self, image: Tensor) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
+        """(rows, columns) of what the window shares with an image [H, W, ...]: in it, in itself."""
+        height, width = image.shape[:2]
+        rows = slice(max(self.top, 0), min(self.bottom, height))
+        columns = slice(max(self.left, 0), min(self.right, width))
+        own_rows = slice(rows.start - self.top, rows.stop - self.top)
+        own_columns = slice(columns.start - self.left, columns.stop - self.left)
+        return (rows, columns), (own_rows, own_columns)
+
+    def paste(self, into: Tensor, values: Tensor) -> None:
+        """Write those of the window's pixels [h, w, ...] that lie in the image [H, W, ...]."""
+        here, there = self.overlap(into)
+        into[here] = values[there]
+
+    def cut(self, image: Tensor) -> Tensor:
+        """The window's pixels of an image [H, W, ...] that contains it."""
+        return image[self.top : self.bottom, self.left : self.right]
+
+
+def plane_window(camera: Camera, level_z_m: float) -> Window | None:
+    """The least window with all pixels whose rays meet the plane; None where no ray does.
+
+    A ray meets the plane where it falls, from an eye above it, or rises, from an eye below it. From
+    an eye in the plane rays are taken to meet it where they rise.
+    """
+    side = -1.0 if float(camera.centre[2]) > level_z_m else 1.0
+    # World z along the camera's axes: of a ray it is linear in column and row.
+    right, down, ahead = (side * v for v in camera.camera_from_world[:3, 2].tolist())
+    from_columns = _most(right / camera.fx, camera.width, camera.cx)
+    from_rows = _most(down / camera.fy, camera.height, camera.cy)
+    columns = _span(right / camera.fx, from_rows + ahead, camera.width, camera.cx)
+    rows = _span(down / camera.fy, from_columns + ahead, camera.height, camera.cy)
+    if columns is None or rows is None:
+        return None
+    return Window(columns[0], rows[0], columns[1], rows[1])
+
+
+def _most(slope: float, size: int, centre: float) -> float:
+    """The largest slope (i + 0.5 - centre) over the pixels i."""
+    return max(slope * (0.5 - centre), slope * (size - 0.5 - centre))
+
+
+def _span(slope: float, best: float, size: int, centre: float) -> tuple[int, int] | None:
+    """First and one past the last i with slope (i + 0.5 - centre) + best > 0 in [0, size)."""
+    first, last = 0, size
+    if slope == 0:
+        return (0, size) if best > 0 else None
+    edge = centre - 0.5 - best / slope  # where the sum is zero
+    if slope > 0:
+        first = max(first, math.floor(max(min(edge, size), -1.0)) + 1)
+    else:
+        last = min(last, math.ceil(max(min(edge, size), -1.0)))
+    return (first, last) if first < last else None
+
+
+def falling(camera: Camera) -> Bool[Tensor, "H W"]:
+    """Whose rays meet a level plane somewhere below the eye."""
+    return camera.ray_directions(torch.float64)[..., 2] < 0
+
+
+def plane_depth(
+    camera: Camera, level_z_m: float, device: torch.device | None = None
+) -> Float[Tensor, "H W"]:
+    """z in metres, float64, at which pixels' rays meet the plane before the eye; else infinite."""
+    height = float(camera.centre[2]) - level_z_m
+    fall = -camera.ray_directions(torch.float64, device)[..., 2]
+    meets = fall > 0 if height > 0 else fall < 0
+    depth = height / torch.where(meets, fall, torch.ones_like(fall))
+    return torch.where(meets, depth, torch.full_like(depth, math.inf))
+
+
+def mirrored_camera(camera: Camera, level_z_m: float) -> Camera:
+    """The camera whose pictures are the reflections that `camera` sees in the plane.
+
+    It stands at the eye's mirror image. Mirroring turns left and right hands round, so the image
+    is turned upside down too, which makes it an ordinary camera again: its pixel (column, row) is
+    the reflection in the pixel (column, height - 1 - row).
+    """
+    mirror = torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64)
+    flip = torch.tensor([1.0, -1.0, 1.0], dtype=torch.float64)
+    rotation = flip[:, None] * camera.camera_from_world[:3, :3] * mirror
+    eye = camera.centre * mirror
+    eye[2] += 2 * level_z_m
+    return dataclasses.replace(
+        camera,
+        camera_from_world=rigid(rotation, -rotation @ eye),
+        cy=camera.height - camera.cy,
+    )
+
+
+def resized(mask: Bool[Tensor, "H W"], camera: Camera) -> Bool[Tensor, "h w"]:
+    """The mask at a camera's smaller size: true where any of a pixel is."""
+    if mask.device.type != "cpu":
+        wide = mask.float()[None, None]
+        size = (camera.height, camera.width)
+        return torch.nn.functional.adaptive_max_pool2d(wide, size)[0, 0] > 0
+    size = (camera.width, camera.height)
+    share = cv2.resize(mask.float().numpy(), size, interpolation=cv2.INTER_AREA)
+    return torch.from_numpy(share > 0).reshape(camera.height, camera.width)
+
+
+def mirrored_window(window: Window, camera: Camera) -> Window:
+    """Where the reflections of a window's pixels stand in the mirrored camera's image."""
+    top, bottom = camera.height - window.bottom, camera.height - window.top
+    return Window(window.left, top, window.right, bottom)

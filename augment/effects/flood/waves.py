@@ -1,0 +1,386 @@
+"""Gerstner waves: their records, the surface they make and its normals, in float64.
+
+The parameter point x of the still plane goes, with phase theta = k D.x - omega t + phi, to
+
+    x + sum (S / k) D cos(theta),   level + sum A sin(theta)
+
+k = 2 pi / wavelength, omega^2 = g k tanh(k h) for water of depth h, A the amplitude and S = Q k A
+the steepness (Q as in Finch, GPU Gems 1, chapter 1). The surface folds over itself where sum S
+exceeds 1. The normal is the cross product of the tangents d/dx and d/dy of the whole sum. The usual
+closed form (-sum k A D cos(theta), 1 - sum S sin(theta)) is exact for one wave only, and right for
+many to first order.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float32, Float64
+from torch import Tensor
+
+from augment.cameras import Camera
+from augment.effects.flood import kernels as waves_kernels
+from augment.render.buffers import CPU, CUDA, REFERENCE, kernels_for
+from augment.render.cuda.runtime import gpu_device
+from augment.render.threads import kernel_threads
+from augment.rng import rng_for
+from recipes.weather import Wave, Waves
+
+# ---- waves ---------------------------------------------------------------------------------------
+
+GRAVITY_MPS2 = 9.80665
+UNIT_ERROR = 1e-6  # of a direction's length, which scales a wavelength no more than this
+CUSP = 1e-12  # area that is left of a unit of the plane where the surface counts as a point
+STEEPNESS_ROUNDING = 1e-9  # sums of decimal fractions that make 1 on paper
+
+
+@dataclass(frozen=True, eq=False)
+class WaveSet:
+    """N Gerstner waves, float64; N may be 0: still water.
+
+    directions [N, 2]: unit, world x and y, where each runs to. amplitudes_m, wavelengths_m,
+    steepness (Q k A of each wave; their sum is <= 1), phases_rad [N]. depth_m: of the water, for
+    the dispersion; > 0, may be infinite.
+    """
+
+    directions: np.ndarray
+    amplitudes_m: np.ndarray
+    wavelengths_m: np.ndarray
+    steepness: np.ndarray
+    phases_rad: np.ndarray
+    depth_m: float
+
+    def __post_init__(self) -> None:
+        count = len(self.wavelengths_m)
+        for name in ("directions", "amplitudes_m", "wavelengths_m", "steepness", "phases_rad"):
+            values, shape = getattr(self, name), [count, 2] if name == "directions" else [count]
+            if values.dtype != np.float64 or list(values.shape) != shape:
+                raise ValueError(
+                    f"{name} must be float64 {shape} (N={count} from wavelengths_m); "
+                    f"got {values.dtype} {list(values.shape)}"
+                )
+            if not np.isfinite(values).all():
+                raise ValueError(f"{name} must be finite; got {values[~np.isfinite(values)][0]}")
+        if (self.wavelengths_m <= 0).any():
+            raise ValueError(f"wavelengths_m must be > 0; got {self.wavelengths_m.min()}")
+        for name in ("amplitudes_m", "steepness"):
+            if (getattr(self, name) < 0).any():
+                raise ValueError(f"{name} must be >= 0; got {getattr(self, name).min()}")
+        lengths = np.hypot(self.directions[:, 0], self.directions[:, 1])
+        if (np.abs(lengths - 1) > UNIT_ERROR).any():
+            worst = lengths[np.abs(lengths - 1).argmax()]
+            raise ValueError(f"directions must be of unit length; got one of length {worst}")
+        if self.steepness.sum() > 1 + STEEPNESS_ROUNDING:
+            raise ValueError(
+                "the waves' steepness must sum to at most 1, or the surface folds over itself; "
+                f"got {self.steepness.sum():.6g} from {count} waves: lower their steepness"
+            )
+        if not self.depth_m > 0:  # also catches NaN
+            raise ValueError(f"depth_m must be > 0; got {self.depth_m}")
+
+    @property
+    def is_flat(self) -> bool:
+        """No wave lifts the surface, so its normal points up everywhere."""
+        return not self.amplitudes_m.any()
+
+    @property
+    def wavenumbers(self) -> np.ndarray:
+        """k [N], radians per metre."""
+        return 2 * math.pi / self.wavelengths_m
+
+    @property
+    def frequencies_hz(self) -> np.ndarray:
+        """omega / 2 pi [N] by the dispersion of gravity waves over a flat bed.
+
+        Surface tension, which rules below 2 cm, is left out.
+        """
+        k = self.wavenumbers
+        return np.sqrt(GRAVITY_MPS2 * k * np.tanh(k * self.depth_m)) / (2 * math.pi)
+
+
+@dataclass(frozen=True, eq=False)
+class WaveField:
+    """The surface at every pixel of a camera: what its waves are to the one that sees them.
+
+    normal_x, normal_y: the unit normal's world x and y; its z is positive. slope_variance: of the
+    slopes too fine for the image, along the ray's horizontal direction. All 0 where the ray does
+    not meet the plane in front of the eye.
+    """
+
+    normal_x: Float32[Tensor, "H W"]
+    normal_y: Float32[Tensor, "H W"]
+    slope_variance: Float32[Tensor, "H W"]
+
+
+def turns_at(waves: WaveSet, timestamp_ns: int) -> np.ndarray:
+    """(phi - omega t) / 2 pi of each wave, in [-1, 1], float64 [N].
+
+    The frequency's float64 times the time is reduced in whole numbers, rounded once: in float64
+    alone a phase at 1.7e18 ns would be off by 1e-5 rad and would jump from frame to frame.
+    """
+    passed = [_fraction_of_turns(float(f), timestamp_ns) for f in waves.frequencies_hz]
+    return np.remainder(waves.phases_rad / (2 * math.pi), 1.0) - np.asarray(passed, np.float64)
+
+
+def _fraction_of_turns(frequency_hz: float, timestamp_ns: int) -> float:
+    numerator, denominator = frequency_hz.as_integer_ratio()
+    denominator *= 10**9
+    return (numerator * timestamp_ns % denominator) / denominator
+
+
+def displaced_surface(
+    waves: WaveSet, points_xy: Float64[Tensor, "*B 2"], timestamp_ns: int
+) -> Float64[Tensor, "*B 3"]:
+    """Where the parameter points of the plane are at that time; z counts from the still level."""
+    surface = torch.cat([points_xy, torch.zeros_like(points_xy[..., :1])], dim=-1)
+    turns = turns_at(waves, timestamp_ns)
+    for i, (dx, dy) in enumerate(waves.directions.tolist()):
+        theta = phase_of(waves, i, turns, points_xy)
+        reach = float(waves.steepness[i] / waves.wavenumbers[i])
+        lift = float(waves.amplitudes_m[i]) * theta.sin()
+        across = reach * theta.cos()
+        surface = surface + torch.stack([dx * across, dy * across, lift], dim=-1)
+    return surface
+
+
+def wave_normals(
+    waves: WaveSet, points_xy: Float64[Tensor, "*B 2"], timestamp_ns: int
+) -> Float64[Tensor, "*B 3"]:
+    """Unit normals, upward, of the surface over parameter points, with every wave at full height.
+
+    A cusp, which a total steepness of 1 can have, counts as level.
+    """
+    tangents = torch.zeros((*points_xy.shape[:-1], 5), dtype=torch.float64)
+    turns = turns_at(waves, timestamp_ns)
+    for i in range(len(turns)):
+        tangents += tangent_terms(waves, i, phase_of(waves, i, turns, points_xy))
+    return normals_from_tangents(tangents)
+
+
+def phase_of(
+    waves: WaveSet, index: int, turns: np.ndarray, points_xy: Float64[Tensor, "*B 2"]
+) -> Float64[Tensor, "*B"]:
+    """theta of one wave over parameter points, radians, not reduced. turns: of `turns_at`."""
+    dx, dy = waves.directions[index].tolist()
+    way = points_xy[..., 0] * dx + points_xy[..., 1] * dy
+    return float(waves.wavenumbers[index]) * way + 2 * math.pi * float(turns[index])
+
+
+def tangent_terms(
+    waves: WaveSet, index: int, theta: Float64[Tensor, "*B"]
+) -> Float64[Tensor, "*B 5"]:
+    """What one wave adds to the tangents: S sin(theta) (Dx Dx, Dx Dy, Dy Dy), k A cos(theta) D.
+
+    The tangents are (1 - xx, -xy, gx) and (-xy, 1 - yy, gy) with the sums over the waves.
+    """
+    dx, dy = waves.directions[index].tolist()
+    squeeze = float(waves.steepness[index]) * theta.sin()
+    slope = float(waves.wavenumbers[index] * waves.amplitudes_m[index]) * theta.cos()
+    terms = [dx * dx * squeeze, dx * dy * squeeze, dy * dy * squeeze, dx * slope, dy * slope]
+    return torch.stack(terms, dim=-1)
+
+
+def normals_from_tangents(tangents: Float64[Tensor, "*B 5"]) -> Float64[Tensor, "*B 3"]:
+    """The unit cross product of the two tangents; straight up where both vanish."""
+    xx, xy, yy, gx, gy = tangents.unbind(-1)
+    # Rounding must not turn the normal over where the surface is about to fold.
+    up = ((1 - xx) * (1 - yy) - xy * xy).clamp_min(0)
+    normals = torch.stack([-xy * gy - (1 - yy) * gx, -xy * gx - (1 - xx) * gy, up], dim=-1)
+    length = normals.norm(dim=-1, keepdim=True)
+    level = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    return torch.where(length > CUSP, normals / length.clamp_min(CUSP), level)
+
+
+# ---- Waves drawn from what a recipe says of them -------------------------------------------------
+# A preset is a spectrum for a flooded street: a fetch of tens of metres between houses, so short
+# waves only, all running within some angle of the wind. Every wave has the same slope (the mean
+# square slope per octave of a wind sea is nearly constant: Phillips 1958), so amplitudes grow with
+# wavelength.
+#
+# Cox and Munk 1954 give the mean square slope of the open sea as 0.003 + 0.00512 U for a wind of U
+# m/s (0.008 + 0.00156 U without waves shorter than about 0.3 m): an rms slope of 0.09 at 1 m/s,
+# 0.17
+# at 5 m/s. Water between houses is sheltered and has no long fetch, so the presets lie below that.
+
+MOST_STEEPNESS = 0.8  # of all waves together, so that no crest of a preset comes near a cusp
+_WIDEST_RAD = math.radians(85)  # no wave runs against the wind that raised it
+
+
+@dataclass(frozen=True)
+class _Spectrum:
+    """Wavelengths, rms slope of all waves together, deviation of their directions."""
+
+    shortest_m: float
+    longest_m: float
+    rms_slope: float
+    spread_deg: float
+
+
+_SPECTRA = {
+    "calm": _Spectrum(0.06, 1.2, 0.012, 50.0),
+    "breeze": _Spectrum(0.08, 2.5, 0.04, 35.0),
+    "wind": _Spectrum(0.12, 6.0, 0.09, 28.0),
+}
+
+
+def make_waves(recipe: Waves, *, seed: int, depth_m: float) -> WaveSet:
+    """The recipe's waves, the same bits for the same recipe, seed and depth.
+
+    seed: taken where the recipe has none of its own. depth_m: of the water, metres, > 0. The draw
+    depends on no scene, frame or camera, so all views of all times see one surface.
+
+    Raises:
+        ValueError: the components' steepness sums to more than 1, or depth_m is not > 0.
+    """
+    if recipe.components is not None:
+        return _from_components(recipe.components, depth_m)
+    if recipe.preset == "still":
+        return _from_components((), depth_m)
+    seed = seed if recipe.seed is None else recipe.seed
+    rng = rng_for(seed=seed, scene="", effect="flood waves")
+    return _draw(_SPECTRA[recipe.preset], recipe, rng, depth_m)
+
+
+def _from_components(components: tuple[Wave, ...], depth_m: float) -> WaveSet:
+    angles = np.radians([wave.direction_deg for wave in components])
+    return WaveSet(
+        directions=np.stack([np.cos(angles), np.sin(angles)], axis=1),
+        amplitudes_m=np.array([wave.amplitude_m for wave in components], np.float64),
+        wavelengths_m=np.array([wave.wavelength_m for wave in components], np.float64),
+        steepness=np.array([wave.steepness for wave in components], np.float64),
+        phases_rad=np.radians([wave.phase_deg for wave in components]),
+        depth_m=depth_m,
+    )
+
+
+def _draw(spectrum: _Spectrum, recipe: Waves, rng: np.random.Generator, depth_m: float) -> WaveSet:
+    count = recipe.count
+    # One wave in each of `count` equal parts of the octaves, so that none is left empty.
+    part = (np.arange(count) + rng.random(count)) / count
+    wavelengths = spectrum.shortest_m * (spectrum.longest_m / spectrum.shortest_m) ** part
+    spread = math.radians(spectrum.spread_deg) * rng.standard_normal(count)
+    angles = math.radians(recipe.direction_deg) + np.clip(spread, -_WIDEST_RAD, _WIDEST_RAD)
+    slope = spectrum.rms_slope * math.sqrt(2 / count) * recipe.height  # k A of each wave
+    return WaveSet(
+        directions=np.stack([np.cos(angles), np.sin(angles)], axis=1),
+        amplitudes_m=slope * wavelengths / (2 * math.pi),
+        wavelengths_m=wavelengths,
+        # Q = 1, the circular orbits of deep water (Gerstner's trochoid), where that leaves room.
+        steepness=np.full(count, min(slope, MOST_STEEPNESS / count)),
+        phases_rad=rng.uniform(0, 2 * math.pi, count),
+        depth_m=depth_m,
+    )
+
+
+# ------------------------------------------------------------------------------------------------
+# What a camera sees of waves: normals per pixel, and roughness where waves are too fine for it
+# The footprint of a pixel on the plane is J = d(plane point)/d(pixel), metres per pixel, 2x2. A
+# wave
+# advances by k |J^T D| radians per pixel, so it is 2 pi / that pixels long there; shorter than two
+# pixels it cannot be drawn, and its normals would glitter. Its terms are faded out between four
+# pixels and two by a smoothstep w, and the slope it loses becomes slope variance along the view:
+# (k A)^2 (1 - w^2) (D.v)^2 / 2, v the ray's horizontal direction (Bruneton et al. 2010 split a sea
+# into normals and a variance in the same way).
+
+FADED_PX, FULL_PX = 2.0, 4.0  # lengths in pixels at which a wave is gone, and at full height
+FARTHEST_M = 1e7  # depth beyond which a ray counts as running beside the plane
+TOUCHING_M = 1e-9  # an eye closer to the plane than this lies in it and sees nothing of it
+UPRIGHT = 1e-6  # horizontal part of a ray, at unit z, below which its direction is world x
+ROWS = 8  # image rows a thread takes at a time
+
+
+def wave_field(
+    waves: WaveSet, camera: Camera, level_z_m: float, *, backend: str = CPU
+) -> WaveField:
+    """The waves at every pixel of a camera, at its own time. level_z_m: the plane, scene world.
+
+    backend: with kernels by them, equal to the definition in float64 within 1e-5 of a normal's
+    components (for surfaces that keep clear of cusps). "cuda" leaves the field on the GPU.
+
+    Raises:
+        ValueError: level_z_m is not finite.
+    """
+    if not math.isfinite(level_z_m):
+        raise ValueError(f"level_z_m must be finite; got {level_z_m}")
+    height = float(camera.centre[2]) - level_z_m
+    kernels = kernels_for(backend)
+    is_still = waves.is_flat or abs(height) < TOUCHING_M
+    if is_still:
+        device = gpu_device() if kernels == CUDA else None
+        still = torch.zeros(camera.height, camera.width, device=device)
+        return WaveField(still, still, still)
+    if kernels == CUDA:
+        from augment.effects.flood import cuda_screen as cuda_waves
+
+        limits = (UPRIGHT, FADED_PX, FULL_PX)
+        return cuda_waves.fill_field(waves, camera, height, farthest=FARTHEST_M, limits=limits)
+    return (_define if kernels == REFERENCE else _run_kernel)(waves, camera, height)
+
+
+def _define(waves: WaveSet, camera: Camera, height: float) -> WaveField:
+    rays = camera.ray_directions(torch.float64)
+    away = -height / rays[..., 2]
+    meets = (away > 0) & (away <= FARTHEST_M)
+    away, z = away.where(meets, 0.0), rays[..., 2].where(meets, 1.0)
+    points = camera.centre[:2] + away[..., None] * rays[..., :2]
+    per_column, per_row = _footprint(camera, rays, away, z)
+    level = rays[..., :2].norm(dim=-1, keepdim=True)
+    east = torch.tensor([1.0, 0.0], dtype=torch.float64)
+    view = torch.where(level >= UPRIGHT, rays[..., :2] / level.clamp_min(UPRIGHT), east)
+
+    tangents = torch.zeros((*away.shape, 5), dtype=torch.float64)
+    variance = torch.zeros_like(away)
+    turns = turns_at(waves, camera.timestamp_ns)
+    for i, direction in enumerate(torch.from_numpy(waves.directions)):
+        rate = torch.hypot(per_column @ direction, per_row @ direction)  # metres per pixel
+        length_px = float(waves.wavelengths_m[i]) / rate.clamp_min(1e-300)
+        t = ((length_px - FADED_PX) / (FULL_PX - FADED_PX)).clamp(0, 1)
+        weight = t * t * (3 - 2 * t)
+        terms = tangent_terms(waves, i, phase_of(waves, i, turns, points))
+        tangents += weight[..., None] * terms
+        slope = float(waves.wavenumbers[i] * waves.amplitudes_m[i]) * (view @ direction)
+        variance += 0.5 * (1 - weight**2) * slope**2
+    normals = normals_from_tangents(tangents)
+    fields = (normals[..., 0], normals[..., 1], variance)
+    return WaveField(*(field.where(meets, 0.0).float() for field in fields))
+
+
+def _footprint(camera: Camera, rays: Tensor, away: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
+    """Metres of world x and y, [H, W, 2] each, that the plane point moves per column and row."""
+    rotation = camera.world_from_camera[:3, :3]
+    steps = []
+    for turn in (rotation[:, 0] / camera.fx, rotation[:, 1] / camera.fy):
+        slide = turn[:2] - (turn[2] / z)[..., None] * rays[..., :2]
+        steps.append(away[..., None] * slide)
+    return steps[0], steps[1]
+
+
+def _run_kernel(waves: WaveSet, camera: Camera, height: float) -> WaveField:
+    # Zeros cost nothing until they are touched: rows above the horizon never are.
+    fields = [np.zeros((camera.height, camera.width), np.float32) for _ in range(3)]
+    dx, dy = waves.directions.T
+    slopes = waves.wavenumbers * waves.amplitudes_m
+    bends = waves.steepness
+    terms = [bends * dx * dx, bends * dx * dy, bends * dy * dy, slopes * dx, slopes * dy]
+    phases = [
+        dx / waves.wavelengths_m,
+        dy / waves.wavelengths_m,
+        turns_at(waves, camera.timestamp_ns),
+    ]
+    pose = camera.world_from_camera
+    with kernel_threads(ROWS):
+        waves_kernels.fill_field(
+            pose[:3, :3].contiguous().numpy(),
+            pose[:2, 3].contiguous().numpy(),
+            height,
+            np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float64),
+            FARTHEST_M,
+            np.array([UPRIGHT, FADED_PX, FULL_PX], np.float32),
+            np.stack(phases, axis=1),
+            np.stack(terms, axis=1).astype(np.float32),
+            *fields,
+        )
+    return WaveField(*(torch.from_numpy(field) for field in fields))

@@ -1,0 +1,5 @@
+"""A recipe's weather on LiDAR sweeps: fog and smog, lying snow, standing water."""
+
+from augment.effects.lidar.codes import ATTENUATED, LOST, MOVED, SCATTERED, UNCHANGED, drop_lost
+
+__all__ = ["ATTENUATED", "LOST", "MOVED", "SCATTERED", "UNCHANGED", "drop_lost"]

@@ -1,0 +1,626 @@
+"""A recipe's weather on a LiDAR sweep: the order of effects in plain sight.
+
+A beam meets the weather in this order, and so is it worked out, once for all returns:
+
+1. Snow ends it where it comes to the layer first: the echo is the snow's.
+2. Water bends it, swallows it, or sends it away; snow under water has melted.
+3. Smog dims the echo along the way through the air, there and back, and adds its own.
+4. The sensor reports the strongest echo, if that is above its noise.
+
+Every return is a row of the source and stays one; `codes` says what became of it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from augment.effects.flood.flood import FloodMedium, reflectance
+from augment.effects.lidar.codes import (
+    ATTENUATED,
+    CODE_COLUMN,
+    INDEX_COLUMN,
+    LOST,
+    MOVED,
+    SCATTERED,
+    UNCHANGED,
+)
+from augment.effects.lidar.snow import meet_snow, snow_in
+from augment.effects.smog import MAX_EXPONENT, SmogMedium
+from augment.labels import KnowsLidarOrigins, LidarSweep
+from augment.plan import Plan, make_plan
+from augment.rng import rng_for
+from augment.scene import Scene
+from recipes.schema import KOSCHMIEDER, schema_Recipe
+from recipes.weather import PURE_WATER_PER_M
+
+# ---- What is known of a LiDAR: its optics as assumed, its intensities, where its beams start -----
+
+LIGHT_MPS = 299_792_458.0
+INTENSITY_COLUMNS = ("intensity", "i", "reflectance", "reflectivity")
+UNKNOWN_REFLECTANCE = 0.10  # of a surface, where the sweep has no intensities
+FAINTEST = 0.005  # reflectance that an intensity of 0 stands for: half a step of 8 bits
+EGO_SENSOR_M = (0.0, 0.0, 1.8)  # forward, left, up of the ego origin, where nothing else is known
+
+
+@dataclass(frozen=True)
+class LidarModel:
+    """A spinning 905 nm LiDAR as its makers describe such; datasets do not publish their own.
+
+    reach_m: where a surface of 10 % reflectance is just seen in clear air; it stands for the
+    noise. pulse_fwhm_s: half-power width of the emitted pulse, which is as sin^2 and twice as long
+    at its foot. overlap_from_m, overlap_full_m: from where the receiver sees the beam, and from
+    where all of it (Hahner et al. 2021, section 3). near_gain: share of a signal from the first
+    metres, relative to one from far, that the receiver makes use of. Makers suppress it, and do not
+    say by how much: the default makes fog of 40 m visibility cost a surface of 50 % reflectance at
+    25 m, which is as far as Bijelic, Gruber and Ritter (2018, "A Benchmark for Lidar Sensors in
+    Fog") found LiDARs to see in it.
+    """
+
+    wavelength_um: float = 0.905
+    reach_m: float = 150.0
+    pulse_fwhm_s: float = 10e-9
+    overlap_from_m: float = 0.9
+    overlap_full_m: float = 1.0
+    near_gain: float = 0.01
+
+    @property
+    def pulse_m(self) -> float:
+        """Half the emitted pulse's length as ranges count, c tau / 2."""
+        return LIGHT_MPS * self.pulse_fwhm_s / 2
+
+    def noise_reflectance(self, ranges_m: np.ndarray) -> np.ndarray:
+        """The reflectance that is just seen at a range in clear air: 0.1 (R / reach)^2."""
+        return 0.1 * (ranges_m / self.reach_m) ** 2
+
+
+def intensity_column(sweep: LidarSweep) -> str | None:
+    """The name of the column that holds intensities; None where there is none."""
+    for name in INTENSITY_COLUMNS:
+        column = sweep.columns.get(name)
+        if column is not None and np.asarray(column).dtype.kind in "fiu":
+            return name
+    return None
+
+
+def white_level(intensity: np.ndarray) -> float:
+    """The intensity of a white, diffuse surface that is met head on.
+
+    Fractions up to 1 are taken for reflectances. Of other scales, 8 bits, 100 is taken for 100 %,
+    as Velodyne and Hesai document theirs; what is above comes from retroreflectors.
+    """
+    values = np.asarray(intensity)
+    if values.dtype.kind == "f":
+        finite = values[np.isfinite(values)]
+        if finite.size == 0 or finite.max() <= 1:
+            return 1.0
+    return 100.0
+
+
+def reflectances(sweep: LidarSweep) -> np.ndarray:
+    """What share of the light each return's surface gave back, float64 [N], FAINTEST at least;
+    incidence included, as sensors do not take it out.
+    """
+    name = intensity_column(sweep)
+    if name is None:
+        return np.full(len(sweep), UNKNOWN_REFLECTANCE)
+    values = np.asarray(sweep.columns[name], np.float64)
+    return np.maximum(np.nan_to_num(values / white_level(sweep.columns[name])), FAINTEST)
+
+
+def origins_of(scene: Scene, frame_index: int, sweep: LidarSweep) -> np.ndarray:
+    """Where each return's beam started, float64 [N, 3], dataset world.
+
+    From the labels where they know. Else 1.8 m above the ego's origin at the frame's time, which is
+    wrong by the sensor's place on its car and by what the car drove within the sweep.
+
+    Raises:
+        ValueError: what the labels gave is not one origin a return.
+    """
+    labels = scene.labels
+    if isinstance(labels, KnowsLidarOrigins):
+        known = labels.lidar_origins(frame_index, sweep)
+        if known is not None:
+            known = np.asarray(known, np.float64)
+            if known.shape != (len(sweep), 3):
+                raise ValueError(
+                    f"lidar_origins of {type(labels).__name__} must be [{len(sweep)}, 3], one for "
+                    f"each return of frame {frame_index}; got {list(known.shape)}"
+                )
+            return known
+    pose = scene.frame(frame_index).world_from_ego.numpy()
+    origin = pose[:3, :3] @ np.array(EGO_SENSOR_M) + pose[:3, 3]
+    return np.broadcast_to(origin + np.asarray(scene.world_origin_m), (len(sweep), 3))
+
+
+def lambertian(reflectance: float, cosine: np.ndarray) -> np.ndarray:
+    """What a diffuse surface gives back at an angle, relative to a white one met head on."""
+    return reflectance * np.clip(cosine, 0.0, 1.0)
+
+
+def signal(reflectance: np.ndarray, ranges_m: np.ndarray) -> np.ndarray:
+    """Power of an echo, in the units of `smog.soft_response`: reflectance / (pi R^2), 1/m^2/sr."""
+    return reflectance / (math.pi * ranges_m**2)
+
+
+# ------------------------------------------------------------------------------------------------
+# The strongest echo of every beam of a sweep, as the effects change it one after the other
+
+_LEAST_M = 1e-3  # nearer returns have no direction
+
+
+@dataclass(eq=False)
+class Echoes:
+    """The echoes of a sweep of N returns; arrays are changed in place.
+
+    origins, directions [N, 3]: scene world; directions are unit. ranges_m [N]: as the sensor
+    reports them, 0 where the source has no point: such rows are never touched. air_m [N]: how much
+    of the way leads through the air. reflectance [N]: of what gives the echo, incidence included,
+    relative to a white surface met head on. gain [N]: what the weather leaves of the echo. codes
+    [N]: see `codes`. is_new [N]: the echo is not the source's, so its intensity follows from
+    reflectance.
+    """
+
+    source: LidarSweep
+    dataset_origins: np.ndarray
+    origins: np.ndarray
+    directions: np.ndarray
+    ranges_m: np.ndarray
+    air_m: np.ndarray
+    reflectance: np.ndarray
+    gain: np.ndarray
+    codes: np.ndarray
+    is_new: np.ndarray
+
+    @staticmethod
+    def of(
+        sweep: LidarSweep, origins: np.ndarray, world_origin_m: np.ndarray, model: LidarModel
+    ) -> Echoes:
+        """As recorded in clear air. origins: float64 [N, 3], dataset world.
+
+        What was recorded was above the sensor's noise, however dark: it counts as just so bright.
+        """
+        count = len(sweep)
+        offsets = sweep.points_m - origins
+        ranges = np.sqrt((offsets * offsets).sum(1))
+        ranges[~(np.isfinite(ranges) & (ranges > _LEAST_M))] = 0
+        directions = offsets / np.where(ranges > 0, ranges, 1.0)[:, None]
+        directions[ranges == 0] = 0
+        starts = np.where((ranges > 0)[:, None], origins - world_origin_m, 0.0)
+        return Echoes(
+            source=sweep,
+            dataset_origins=origins,
+            origins=starts,
+            directions=directions,
+            ranges_m=ranges,
+            air_m=ranges.copy(),
+            reflectance=np.maximum(reflectances(sweep), model.noise_reflectance(ranges)),
+            gain=np.ones(count),
+            codes=np.full(count, UNCHANGED, np.uint8),
+            is_new=np.zeros(count, bool),
+        )
+
+    def replace(
+        self, rows: np.ndarray, ranges_m: np.ndarray, reflectance: np.ndarray, code: int
+    ) -> None:
+        """Echoes [M] of something else, met in the air, for the returns in rows [M]."""
+        self.ranges_m[rows] = self.air_m[rows] = ranges_m
+        self.reflectance[rows], self.gain[rows] = reflectance, 1.0
+        self.codes[rows], self.is_new[rows] = code, True
+
+    def see_through(
+        self, rows: np.ndarray, ranges_m: np.ndarray, air_m: np.ndarray, kept: np.ndarray
+    ) -> None:
+        """Move the returns in rows [M] along their beams, and dim them to kept [M]."""
+        moves = np.abs(ranges_m - self.ranges_m[rows]) > _LEAST_M
+        self.codes[rows[moves]] = MOVED
+        self.ranges_m[rows[moves]] = ranges_m[moves]
+        self.air_m[rows] = air_m
+        self.gain[rows] *= kept
+
+    def lose(self, rows: np.ndarray) -> None:
+        """Nothing comes back of the returns in rows, numbers or bool [N]."""
+        self.codes[rows] = LOST
+
+    def lose_what_is_too_faint(self, model: LidarModel) -> None:
+        """Lose what is below the sensor's noise."""
+        faint = self.reflectance * self.gain < model.noise_reflectance(self.ranges_m)
+        self.lose(faint & (self.ranges_m > 0))
+
+    def sweep(self) -> LidarSweep:
+        """As `apply.weathered_sweep` returns it."""
+        columns = {name: np.asarray(column) for name, column in self.source.columns.items()}
+        columns |= self._coordinates(columns)
+        name = intensity_column(self.source)
+        if name is not None:
+            columns[name] = self._intensity(columns[name])
+        columns[INDEX_COLUMN] = np.arange(len(self.codes), dtype=np.int32)
+        columns[CODE_COLUMN] = self.codes
+        return LidarSweep(columns)
+
+    def _coordinates(self, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        rows = np.flatnonzero((self.codes == MOVED) | (self.codes == SCATTERED))
+        lost = self.codes == LOST
+        if not len(rows) and not lost.any():
+            return {}
+        moved = self.dataset_origins[rows] + self.ranges_m[rows, None] * self.directions[rows]
+        out = {}
+        for axis, name in enumerate("xyz"):
+            floats = columns[name].dtype.kind == "f"
+            out[name] = columns[name].astype(columns[name].dtype if floats else np.float64)
+            out[name][rows] = moved[:, axis]
+            out[name][lost] = np.nan
+        return out
+
+    def _intensity(self, column: np.ndarray) -> np.ndarray:
+        """The intensities; rows that were unchanged so far are attenuated where theirs change."""
+        rows = np.flatnonzero((self.gain != 1) | self.is_new | (self.codes == LOST))
+        if not len(rows):
+            return column
+        old = column[rows]
+        values = (
+            np.where(self.is_new[rows], white_level(column) * self.reflectance[rows], old)
+            * self.gain[rows]
+        )
+        values[self.codes[rows] == LOST] = 0
+        if column.dtype.kind in "iu":
+            limits = np.iinfo(column.dtype)
+            values = np.clip(np.rint(values), limits.min, limits.max)
+        values = values.astype(column.dtype)
+        changed = (values != old) & (old == old)  # NaN was no intensity and is none
+        self.codes[rows[changed & (self.codes[rows] == UNCHANGED)]] = ATTENUATED
+        out = column.copy()
+        out[rows] = values
+        return out
+
+
+# ------------------------------------------------------------------------------------------------
+# Fog, haze and smog as a LiDAR meets them (Hahner et al. 2021, "Fog Simulation on Real LiDAR
+# Point
+# Clouds in Adverse Weather", ICCV), from the equations of the paper.
+#
+# The echo of a pulse P(t) = P0 sin^2(pi t / (2 tau)), 0 <= t <= 2 tau, whose half-power width is
+# tau:
+#
+#     hard, from a surface at R0   (rho / pi) exp(-2 T(R0)) / R0^2
+#     soft, of droplets, at R      beta int_0^{2w} sin^2(pi x / (2w)) exp(-2 alpha r) xi(r) / r^2 dx
+#                                  r = R - x, w = c tau / 2
+#
+# T is the optical depth, alpha the extinction, beta = 0.046 / MOR the backscatter and MOR =
+# ln(20) /
+# alpha the meteorological optical range; xi rises from 0 at overlap_from_m to 1 at overlap_full_m.
+# Ranges count from the pulse's middle, so that a surface at R0 is reported at R0 and not at R0 + w.
+#
+# The smog is that of the images, thinned to the LiDAR's wavelength (`wavelength_factor`).
+
+VISIBLE_UM = 0.55
+BACKSCATTER_MOR = 0.046  # beta x MOR, 1/sr
+MOR_OPTICAL_DEPTH = math.log(20)
+# Fog is clumpy: the backscatter of what a pulse fills varies about its mean as a gamma variate of
+# this shape, by half of it.
+CLUMPS = 4.0
+_STEP_M, _FAR_M = 0.02, 15.0  # of the soft echo, tabulated
+_PULSE_STEPS = 150
+_DENSITY_STEP = 0.02  # of log alpha, within which the soft echo is one
+
+# q(V) of Kim, McArthur and Korevaar (2001), V in km: sigma ~ wavelength^-q. Least V, slope, offset.
+_KIM = ((50.0, 0.0, 1.6), (6.0, 0.0, 1.3), (1.0, 0.16, 0.34), (0.5, 1.0, -0.5), (0.0, 0.0, 0.0))
+
+
+def wavelength_factor(extinction_per_m: float, wavelength_um: float = 0.905) -> float:
+    """Extinction at the LiDAR's wavelength over that of visible light (0.55 um).
+
+    (wavelength / 0.55 um)^-q with q by the visibility: 0 below 500 m, as fog's droplets are larger
+    than either wavelength, up to 1.6 in clear air. At 905 nm: 1 in fog, 0.78 at 1 km, 0.52 at 6 km.
+    Kim et al. fitted it to models of fog and haze; single measurements differ by some 20 %, and
+    dry city smog of fine particles may have less in the infrared than fog of its visibility.
+    """
+    if extinction_per_m <= 0:
+        return 1.0
+    visibility_km = KOSCHMIEDER / extinction_per_m / 1000
+    _, slope, offset = next(row for row in _KIM if visibility_km > row[0] or row[0] == 0)
+    return (wavelength_um / VISIBLE_UM) ** -(slope * visibility_km + offset)
+
+
+def medium_for(medium: SmogMedium, model: LidarModel) -> SmogMedium:
+    """The images' smog as the LiDAR's light meets it."""
+    factor = wavelength_factor(medium.sigma_per_m, model.wavelength_um)
+    return dataclasses.replace(medium, sigma_per_m=factor * medium.sigma_per_m)
+
+
+def optical_depth(
+    medium: SmogMedium, ranges_m: np.ndarray, eyes_z_m: np.ndarray, points_z_m: np.ndarray
+) -> np.ndarray:
+    """tau [N] of beams from eyes to points, scene world: `augment.effects.smog.optical_depth`, with
+    an eye for each point.
+    """
+    uniform = medium.sigma_per_m * ranges_m
+    if medium.scale_height_m is None:
+        return uniform
+    a = (eyes_z_m - medium.base_z_m) / medium.scale_height_m
+    b = (points_z_m - medium.base_z_m) / medium.scale_height_m
+    difference = np.abs(b - a)
+    small = difference < 1e-4
+    safe = np.where(small, 1.0, difference)
+    mean = np.where(small, 1 - difference / 2, -np.expm1(-safe) / safe)
+    return uniform * np.exp(np.minimum(-np.minimum(a, b), MAX_EXPONENT)) * mean
+
+
+def extinction_at(medium: SmogMedium, z_m: np.ndarray) -> np.ndarray:
+    """alpha [N] at heights, 1/metre."""
+    if medium.scale_height_m is None:
+        return np.full(len(z_m), medium.sigma_per_m)
+    height = (z_m - medium.base_z_m) / medium.scale_height_m
+    return medium.sigma_per_m * np.exp(np.minimum(-height, MAX_EXPONENT))
+
+
+@dataclass(frozen=True, eq=False)
+class SoftEcho:
+    """What droplets give back, by reported range. ranges_m [K]: rising. signal [K]: as
+    `sensors.signal`, near_gain included. strongest [K]: the greatest signal up to each range.
+    share [K]: of the whole echo, that comes from up to each range.
+    """
+
+    ranges_m: np.ndarray
+    signal: np.ndarray
+    strongest: np.ndarray
+    share: np.ndarray
+
+
+def soft_response(alpha_per_m: float, echoes_m: np.ndarray, model: LidarModel) -> np.ndarray:
+    """The soft integral, without near_gain, at reported ranges [K]; midpoint rule over the pulse.
+
+    An echo at R is reported at R - w. Droplets nearer than overlap_from_m are not seen.
+    """
+    w = model.pulse_m
+    x = (np.arange(_PULSE_STEPS) + 0.5) * (2 * w / _PULSE_STEPS)
+    r = echoes_m[:, None] + w - x
+    seen = np.clip(
+        (r - model.overlap_from_m) / (model.overlap_full_m - model.overlap_from_m), 0.0, 1.0
+    )
+    r = np.maximum(r, model.overlap_from_m)
+    echo = np.sin(math.pi * x / (2 * w)) ** 2 * np.exp(-2 * alpha_per_m * r) * seen / r**2
+    beta = BACKSCATTER_MOR * alpha_per_m / MOR_OPTICAL_DEPTH
+    return beta * echo.sum(1) * (2 * w / _PULSE_STEPS)
+
+
+@functools.lru_cache(maxsize=256)
+def soft_echo(alpha_per_m: float, model: LidarModel) -> SoftEcho:
+    """The soft echo tabulated; what comes from beyond _FAR_M is too weak to count."""
+    ranges = np.arange(model.overlap_from_m, _FAR_M, _STEP_M)
+    response = model.near_gain * soft_response(alpha_per_m, ranges, model)
+    total = np.cumsum(response)
+    return SoftEcho(
+        ranges, response, np.maximum.accumulate(response), total / max(total[-1], 1e-300)
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Scatter:
+    """The strongest echo of the droplets before each return. signal [N]: as `sensors.signal`, 0
+    where none can be. ranges_m [N]: where it is reported."""
+
+    signal: np.ndarray
+    ranges_m: np.ndarray
+
+
+def scatter_before(
+    medium: SmogMedium,
+    eyes_z_m: np.ndarray,
+    ends_m: np.ndarray,
+    model: LidarModel,
+    rng: np.random.Generator,
+) -> Scatter:
+    """What comes back from the smog before surfaces at ends_m [N].
+
+    Its strength varies with the clumps that a beam meets (CLUMPS), and where along the echo the
+    strongest of them is, is drawn from the echo's own shape. N numbers of each are drawn whatever
+    the density, so that denser smog differs by nothing else.
+    """
+    count = len(ends_m)
+    clump = rng.standard_gamma(CLUMPS, count) / CLUMPS
+    where = rng.random(count)
+    alpha = extinction_at(medium, eyes_z_m)
+    out = Scatter(np.zeros(count), np.zeros(count))
+    usable = (alpha > 0) & (ends_m > model.overlap_from_m) & np.isfinite(alpha)
+    group = np.rint(np.log(np.where(usable, alpha, 1.0)) / _DENSITY_STEP).astype(np.int64)
+    low, high = (group[usable].min(), group[usable].max()) if usable.any() else (0, -1)
+    for number in range(low, high + 1):
+        rows = np.flatnonzero(usable & (group == number)) if high > low else np.flatnonzero(usable)
+        if not len(rows):
+            continue
+        mean = medium.sigma_per_m if medium.scale_height_m is None else _alpha_of(number)
+        echo = soft_echo(float(mean), model)
+        last = np.clip(
+            ((ends_m[rows] - echo.ranges_m[0]) / _STEP_M).astype(np.int64),
+            0,
+            len(echo.ranges_m) - 1,
+        )
+        out.signal[rows] = echo.strongest[last] * clump[rows]
+        at = np.interp(where[rows] * echo.share[last], echo.share, echo.ranges_m)
+        out.ranges_m[rows] = np.minimum(at, ends_m[rows])
+    return out
+
+
+def _alpha_of(group: int) -> float:
+    return math.exp(group * _DENSITY_STEP)
+
+
+def apparent_reflectance(power: np.ndarray, ranges_m: np.ndarray) -> np.ndarray:
+    """The reflectance of a surface whose echo from that range is as strong: inverse of `signal`."""
+    return power / signal(np.ones_like(power), np.maximum(ranges_m, 1e-3))
+
+
+# ------------------------------------------------------------------------------------------------
+# Standing water as a LiDAR meets it: a flat mirror that swallows 905 nm within centimetres
+# A beam that meets the surface at a slant leaves it by reflection, away from the sensor, or enters.
+# What comes back is the stronger of
+#
+#     bed     rho (1 - F)^2 exp(-2 c l)     from the bed, l metres along the refracted way
+#     water   (1 - F)^2 R_w cos(theta)      from grains in muddy water, within a hand of its surface
+#
+# with Fresnel's F and theta the angle of incidence. The waves' slopes are left out: their mean
+# surface is this plane, and no facet of theirs faces a sensor on a car but right beside it. Objects
+# that a beam would meet by way of the mirror are left out, too: such returns, of mirror images
+# below
+# the street, are few and weak.
+
+# Absorption of pure water at 905 nm. Kou, Labrie and Chylek (1993, "Refractive indices of water and
+# ice in the 0.65- to 2.5-um spectral region") have 6.8/m at 900 nm and 14/m at 925 nm; warm water
+# has a tenth more. Visible light's 0.06 to 0.3/m does not count against it.
+ABSORPTION_905_PER_M = 7.5
+# Of the light that grains deflect, what goes backwards (Petzold 1972, harbour: 0.019).
+BACKWARD = 0.019
+# Diffuse reflectance of water over b_b / (a + b_b) (Morel and Prieur 1977: 0.33).
+MOREL = 0.33
+
+
+@dataclass(frozen=True, eq=False)
+class WaterEcho:
+    """What becomes of beams [M] that meet the water; the others are not in it.
+
+    rows [M]: their numbers. surface_m [M]: range of the surface, where the air ends. range_m [M]:
+    as the sensor reports it, light being slower in water. kept [M]: of the bed's echo. is_bed [M]:
+    the bed's echo is the stronger. reflectance [M]: of the water, where it is not.
+    """
+
+    rows: np.ndarray
+    surface_m: np.ndarray
+    range_m: np.ndarray
+    kept: np.ndarray
+    is_bed: np.ndarray
+    reflectance: np.ndarray
+
+
+def grains_per_m(medium: FloodMedium) -> float:
+    """Extinction by grains, which is grey: that of red, less what pure water takes of it."""
+    return max(medium.extinction_per_m[0] - PURE_WATER_PER_M[0], 0.0)
+
+
+def water_reflectance(medium: FloodMedium) -> float:
+    """R_w of the muddy water itself at 905 nm; 0 of clear water, 0.33 at most."""
+    backward = BACKWARD * min(grains_per_m(medium), 1e9)
+    return MOREL * backward / (ABSORPTION_905_PER_M + backward)
+
+
+def meet_water(
+    medium: FloodMedium,
+    origins: np.ndarray,
+    directions: np.ndarray,
+    ends_m: np.ndarray,
+    reflectances: np.ndarray,
+) -> WaterEcho:
+    """The echoes of beams [N] that would reach a surface at ends_m, of a reflectance, under water.
+
+    origins, directions: [N, 3], scene world. Beams that start under water are not in it.
+    The bed is taken to be level about the return, so that its depth is the same where the bent beam
+    comes down: a wheel's side under water is reported too near by about the bend.
+    """
+    drop = origins[:, 2] - medium.level_z_m
+    fall = -directions[:, 2]
+    rows = np.flatnonzero((drop > 0) & (fall * ends_m > drop))
+    fall, ends = fall[rows], ends_m[rows]
+    surface = drop[rows] / fall
+    index = medium.refraction_index
+    passed = 1 - reflectance(torch.from_numpy(np.minimum(fall, 1.0)), index, medium.fresnel).numpy()
+    below = np.sqrt(1 - (1 - np.minimum(fall, 1.0) ** 2) / index**2)  # cosine of the bent beam
+    way = np.maximum(ends - surface, 0) * fall / np.maximum(below, 1e-9)
+    extinction = ABSORPTION_905_PER_M + grains_per_m(medium)
+    thin = np.where(way > 0, np.exp(-2 * np.minimum(extinction * way, 400.0)), 1.0)
+    kept = passed**2 * thin
+    mud = passed**2 * water_reflectance(medium) * fall
+    ranges = surface + index * way
+    # Echoes of equal reflectance fall with the range squared.
+    is_bed = reflectances[rows] * kept / np.maximum(ranges, 1e-9) ** 2 >= mud / surface**2
+    return WaterEcho(rows, surface, np.where(is_bed, ranges, surface), kept, is_bed, mud)
+
+
+# ---- apply ---------------------------------------------------------------------------------------
+
+DEFAULT_MODEL = LidarModel()
+LEAST_FACING = 0.02  # cosine
+
+
+def weathered_sweep(
+    scene: Scene,
+    recipe: schema_Recipe,
+    frame_index: int,
+    sweep: LidarSweep,
+    *,
+    model: LidarModel = DEFAULT_MODEL,
+) -> LidarSweep:
+    """The sweep of a frame as the recipe's weather would have let the sensor take it.
+
+    All columns of the source with their names, types and order, of which x, y, z and the intensity
+    change where the weather changed them, and two more: `source_index` int32, `weather_code` uint8
+    (see codes). Other columns say what they said: the class of a return that moved onto the snow is
+    still that of what lies beneath. Coordinates of whole numbers become float64, since lost returns
+    have none.
+
+    Depends on the recipe, the scene and the frame only. Safe to call from several threads.
+
+    Raises:
+        SceneError: the weather cannot be placed in this scene. ValueError: the sweep has a column
+            of one of the new names, or its labels' origins do not fit it.
+    """
+    for name in (CODE_COLUMN, INDEX_COLUMN):
+        if name in sweep.columns:
+            raise ValueError(
+                f"the sweep of frame {frame_index} has a column {name!r} already: it is weathered, "
+                f"or the dataset's own column must be renamed"
+            )
+    plan = make_plan(recipe, scene)
+    echoes = Echoes.of(
+        sweep, origins_of(scene, frame_index, sweep), np.asarray(scene.world_origin_m), model
+    )
+    if plan.snow is not None:
+        _meet_snow(echoes, scene, plan, sweep, scene.frame(frame_index).timestamp_ns)
+    if plan.flood is not None:
+        _meet_water(echoes, plan.flood)
+    if plan.smog is not None:
+        rng = rng_for(seed=recipe.seed, scene=scene.name, frame=frame_index, effect="lidar.smog")
+        _meet_smog(echoes, medium_for(plan.smog, model), model, rng)
+    echoes.lose_what_is_too_faint(model)
+    return echoes.sweep()
+
+
+def _meet_snow(echoes: Echoes, scene: Scene, plan: Plan, sweep: LidarSweep, frame_ns: int) -> None:
+    assert plan.snow is not None
+    snow = snow_in(scene, plan.snow)
+    ranges = echoes.ranges_m
+    hits = meet_snow(snow, scene, sweep, frame_ns, echoes.origins, echoes.directions, ranges)
+    rows = np.flatnonzero(hits < ranges)
+    # The layer counts as level, but its grains stand out: no beam slides over it unreflected.
+    facing = np.maximum(np.abs(echoes.directions[rows, 2]), LEAST_FACING)
+    echoes.replace(rows, hits[rows], lambertian(snow.reflectance, facing), MOVED)
+
+
+def _meet_water(echoes: Echoes, medium: FloodMedium) -> None:
+    """A sensor under water sees nothing: its light ends within centimetres."""
+    drowned = echoes.origins[:, 2] <= medium.level_z_m
+    echoes.lose(drowned & (echoes.ranges_m > 0))
+    ends = np.where(drowned, 0.0, echoes.ranges_m)
+    water = meet_water(medium, echoes.origins, echoes.directions, ends, echoes.reflectance)
+    bed, mud = water.is_bed, ~water.is_bed
+    echoes.see_through(water.rows[bed], water.range_m[bed], water.surface_m[bed], water.kept[bed])
+    echoes.replace(water.rows[mud], water.surface_m[mud], water.reflectance[mud], SCATTERED)
+
+
+def _meet_smog(
+    echoes: Echoes, medium: SmogMedium, model: LidarModel, rng: np.random.Generator
+) -> None:
+    eyes_z, air = echoes.origins[:, 2], echoes.air_m
+    tau = optical_depth(medium, air, eyes_z, eyes_z + air * echoes.directions[:, 2])
+    echoes.gain *= np.exp(-2 * tau)
+    scatter = scatter_before(medium, eyes_z, air, model, rng)
+    echo = signal(echoes.reflectance * echoes.gain, np.maximum(echoes.ranges_m, 1e-3))
+    wins = (scatter.signal > echo) & (echoes.ranges_m > 0) & (echoes.codes != LOST)
+    rows = np.flatnonzero(wins)
+    ranges = scatter.ranges_m[rows]
+    apparent = apparent_reflectance(scatter.signal[rows], ranges)
+    echoes.replace(rows, ranges, apparent, SCATTERED)

@@ -1,0 +1,216 @@
+"""Lying snow as a LiDAR meets it: beams end on its surface, which is bright at 905 nm.
+
+The layer is that of the images: the same bed, profile and seed, so that drifts, patches and wheel
+tracks are where the pictures have them. It is less smooth by what the images' layer evens out of
+the ground beneath, and its grid has cells of GRID_M. Snow on moving things moves with them.
+
+Snow that is falling is not in a recipe, and not here.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections import OrderedDict
+from collections.abc import Mapping
+from dataclasses import dataclass
+from weakref import WeakKeyDictionary
+
+import numpy as np
+
+from augment.effects.lidar import snow_kernels
+from augment.effects.snow.cells import SnowBed, SnowCells
+from augment.effects.snow.layer import find_depths
+from augment.effects.snow.profile import profile_of
+from augment.effects.snow.snow import PlacedSnow, placement_settings
+from augment.effects.snow.support import bed_of
+from augment.labels import LidarSweep
+from augment.rng import rng_for
+from augment.scene import Scene
+
+# Fresh snow gives back 0.95 of visible light and 0.90 at 0.9 um; old, coarse snow 0.9 and 0.7
+# (Wiscombe and Warren 1980, figure 8): the recipe's albedo times this.
+ALBEDO_AT_905 = 0.93
+GRID_M = 0.1
+_MOST_CELLS = 8_000_000  # of a grid; larger scenes get coarser ones
+_GROUND_SLACK_M, _ACTOR_SLACK_M = 0.15, 0.05
+_MOST_LAYERS = 2  # of a scene, that are kept
+_REACH_M = 200.0  # actors farther away are not asked
+_ABOUT_M, _EVERY = 3.0, 8  # returns that tell when the sensor looked at an actor
+_SAME_DRIVE_NS = 10**9  # a sweep's times are within this of its frame's
+
+
+@dataclass(frozen=True, eq=False)
+class Layer:
+    """Snow on one part, in the part's frame: see snow_kernels.meet_layer. radius_m: of the circle
+    about the part's origin that holds it, seen from above."""
+
+    corner: np.ndarray
+    cell_m: float
+    base: np.ndarray
+    top: np.ndarray
+    highest: np.ndarray
+    radius_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class LidarSnow:
+    """The snow in a scene. actors: by track_id. reflectance: of it, met head on."""
+
+    ground: Layer | None
+    actors: Mapping[str, Layer]
+    reflectance: float
+
+
+def layer_of(cells: SnowCells, depths_m: np.ndarray, *, grid_m: float = GRID_M) -> Layer | None:
+    """Snow of depths [C] on cells; None where there is none."""
+    centers, sizes = cells.centers_m.numpy(), cells.sizes_m.numpy()
+    covered = depths_m > 0
+    if not covered.any():
+        return None
+    half = sizes[covered, None] / 2
+    low = (centers[covered, :2] - half).min(0).astype(np.float64)
+    extent = (centers[covered, :2] + half).max(0) - low
+    cell = float(max(grid_m, math.sqrt(float(extent.prod()) / _MOST_CELLS)))
+    columns, rows = (int(n) for n in np.ceil(extent / cell) + 1)
+    base, top = np.full((2, rows, columns), -np.inf, np.float32)
+    depths = np.ascontiguousarray(depths_m, np.float32)
+    snow_kernels.fill_layer(centers, sizes, depths, low, cell, base, top)
+    radius = float(np.hypot(*(centers[covered, :2] + np.sign(centers[covered, :2]) * half).T).max())
+    return Layer(low, cell, base, top, _highest(top), radius)
+
+
+def snow_in(scene: Scene, placed: PlacedSnow) -> LidarSnow:
+    """The snow of a recipe in a scene; remembered for as long as the scene lives and no third is
+    asked for. Safe to call from several threads.
+
+    Raises:
+        SceneError: snow cannot be placed in this scene.
+    """
+    with _lock:
+        layers = _layers.setdefault(scene, OrderedDict())
+        bed = bed_of(scene, placement_settings(placed.snow))
+        laid_on, snow = layers.get(placed, (None, None))
+        if snow is None or laid_on is not bed:
+            snow = _lay(bed, scene, placed)
+            layers[placed] = (bed, snow)
+        layers.move_to_end(placed)
+        while len(layers) > _MOST_LAYERS:
+            layers.popitem(last=False)
+        return snow
+
+
+_lock = threading.Lock()
+_Layers = OrderedDict[PlacedSnow, tuple[SnowBed, LidarSnow]]
+_layers: WeakKeyDictionary[Scene, _Layers] = WeakKeyDictionary()
+
+
+def meet_snow(
+    snow: LidarSnow,
+    scene: Scene,
+    sweep: LidarSweep,
+    frame_ns: int,
+    origins: np.ndarray,
+    directions: np.ndarray,
+    ends_m: np.ndarray,
+) -> np.ndarray:
+    """Where beams [N] end, ends_m at most, float64 [N]. origins, directions: [N, 3], scene world.
+
+    An actor stands where it was when the sensor looked at it, by the times of the returns about it,
+    as far as the sweep has them; else where it is at the frame's time.
+    """
+    hits = ends_m.copy()
+    if snow.ground is not None:
+        _meet(snow.ground, np.eye(4), math.inf, origins, directions, hits, _GROUND_SLACK_M)
+    every = np.flatnonzero(ends_m > 0)[::_EVERY]
+    if not snow.actors or not len(every):
+        return hits
+    ends = origins[every] + ends_m[every, None] * directions[every]
+    times = _times(sweep, frame_ns)
+    eye = np.median(origins[every], axis=0)
+    for actor in scene.actors:
+        layer = snow.actors.get(actor.track_id)
+        pose = actor.track.pose_at(frame_ns)
+        if layer is None or pose is None:
+            continue
+        place = pose[:2, 3].numpy()
+        if np.hypot(*(place - eye[:2])) > _REACH_M:
+            continue
+        if times is not None:
+            about = np.hypot(*(ends[:, :2] - place).T) < layer.radius_m + _ABOUT_M
+            if about.any():
+                pose = actor.track.pose_at(int(np.sort(times[every][about])[about.sum() // 2]))
+        if pose is not None:
+            world = pose.double().numpy()
+            _meet(layer, world, layer.radius_m, origins, directions, hits, _ACTOR_SLACK_M)
+    return hits
+
+
+def _meet(
+    layer: Layer,
+    world_from_part: np.ndarray,
+    radius_m: float,
+    origins: np.ndarray,
+    directions: np.ndarray,
+    hits: np.ndarray,
+    slack_m: float,
+) -> None:
+    part_from_world = np.eye(4)
+    part_from_world[:3, :3] = world_from_part[:3, :3].T
+    part_from_world[:3, 3] = -world_from_part[:3, :3].T @ world_from_part[:3, 3]
+    snow_kernels.meet_layer(
+        origins,
+        directions,
+        hits,
+        part_from_world[:3].copy(),
+        np.array([world_from_part[0, 3], world_from_part[1, 3], radius_m]),
+        layer.corner,
+        layer.cell_m,
+        layer.base,
+        layer.top,
+        layer.highest,
+        slack_m,
+    )
+
+
+def _lay(bed: SnowBed, scene: Scene, placed: PlacedSnow) -> LidarSnow:
+    def layer(cells: SnowCells, track_id: str | None) -> Layer | None:
+        # As augment.effects.snow.layer draws them: another key would be another layer.
+        part = "ground" if track_id is None else f"actor {track_id}"
+        rng = rng_for(seed=placed.seed, scene=scene.name, effect=f"snow.layer of {part}")
+        profile = profile_of(
+            placed.snow, rng, on_ground=track_id is None, water_level_z_m=placed.water_level_z_m
+        )
+        seed = rng.integers(0, 2**64, dtype=np.uint64)
+        grid_m = GRID_M if track_id is None else min(GRID_M, placed.snow.cell_m)
+        return layer_of(cells, find_depths(cells, profile, seed).heights, grid_m=grid_m)
+
+    actors = {track_id: layer(cells, track_id) for track_id, cells in bed.actors.items()}
+    return LidarSnow(
+        ground=layer(bed.ground, None),
+        actors={track_id: laid for track_id, laid in actors.items() if laid is not None},
+        reflectance=ALBEDO_AT_905 * placed.snow.albedo,
+    )
+
+
+def _highest(top: np.ndarray) -> np.ndarray:
+    """The greatest of every block of the grid, float32."""
+    block = snow_kernels.BLOCK
+    rows, columns = (-(-n // block) for n in top.shape)
+    padded = np.full((rows * block, columns * block), -np.inf, np.float32)
+    padded[: top.shape[0], : top.shape[1]] = top
+    return padded.reshape(rows, block, columns, block).max((1, 3))
+
+
+def _times(sweep: LidarSweep, frame_ns: int) -> np.ndarray | None:
+    """int64 [N] of timestamp_ns, or t in seconds, where they are on the frames' clock."""
+    column = sweep.columns.get("timestamp_ns")
+    if column is not None and np.asarray(column).dtype.kind in "iu":
+        times = np.asarray(column).astype(np.int64)
+    else:
+        column = sweep.columns.get("t")
+        if column is None or np.asarray(column).dtype.kind != "f" or not np.isfinite(column).all():
+            return None
+        times = np.round(np.clip(column, -9e9, 9e9) * 1e9).astype(np.int64)
+    near = len(times) > 0 and abs(int(np.median(times)) - frame_ns) <= _SAME_DRIVE_NS
+    return times if near else None

@@ -1,0 +1,456 @@
+"""A part of a scene as seen from straight above: heights, colours, classes."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from queue import SimpleQueue
+from typing import Literal, TypeVar
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from augment.cameras import Camera
+from augment.effects.snow import surface_kernels as visibility_kernels
+from augment.effects.snow.visibility_layout import CENTRE, PARALLEL, VIEW
+from augment.render.buffers import (
+    ALPHA,
+    AUTO,
+    BUFFERS,
+    CUDA,
+    DEPTH_ESTIMATORS,
+    EXPECTED_DEPTH,
+    MEDIAN_DEPTH,
+    MODE_DEPTH,
+    RGB,
+    SPLAT_IDS,
+)
+from augment.render.constants import ALPHA_MIN, MAX_EXTENT_SIGMAS, RasterSettings
+from augment.render.cuda import runtime as gpu
+from augment.render.layout import UNCUT
+from augment.render.rasterize import rasterize
+from augment.render.threads import kernel_threads, thread_count
+from augment.scene import Gaussians, PosedGaussians
+from augment.semantics import SemanticClass
+
+# ------------------------------------------------------------------------------------------------
+# Work of placing snow on several threads, with the GPU left to the thread that waits for them
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+_MOST_AT_ONCE = 8  # a square of cells takes up to some 300 MB while it is worked on
+_ROWS = 8192  # of arrays, in one part: what is made from them stays in a core's caches
+
+
+class _Worker(threading.local):
+    """What a thread that works for `in_order` asks its caller to do."""
+
+    calls: SimpleQueue[Callable[[], object]] | None = None
+
+
+_worker = _Worker()
+
+
+def in_order(
+    function: Callable[[Item], Result],
+    items: Iterable[Item],
+    *,
+    after_each: Callable[[], object] = lambda: None,
+) -> list[Result]:
+    """The function's results for each item, in the items' order, found by as many threads as
+    kernels use: numpy, cv2 and kernels let other threads go on.
+
+    after_each: called in this thread, for one item after another.
+    """
+    items = list(items)
+    threads = min(thread_count(), len(items), _MOST_AT_ONCE)
+    results = []
+    if threads <= 1 or _worker.calls is not None:
+        for item in items:
+            results.append(function(item))
+            after_each()
+        return results
+    calls: SimpleQueue[Callable[[], object]] = SimpleQueue()
+
+    def work(item: Item) -> Result:
+        _worker.calls = calls
+        return function(item)
+
+    with ThreadPoolExecutor(threads, thread_name_prefix="placing snow") as pool:
+        found = [pool.submit(work, item) for item in items]
+        for one in found:
+            one.add_done_callback(lambda _: calls.put(lambda: None))  # wakes the caller
+        try:
+            for one in found:
+                _answer_until(one, calls)
+                results.append(one.result())
+                after_each()
+        finally:
+            for one in found:
+                one.cancel()  # where one failed, the others are not begun
+            for one in found:
+                _answer_until(one, calls)
+    return results
+
+
+def on_device(function: Callable[[], Result], backend: str) -> Result:
+    """The function's result. Work on a GPU is done by the caller of `in_order`, one call after
+    another: its thread has the device and the stream that are meant. That on the CPU is done here.
+    """
+    calls = _worker.calls
+    if calls is None or backend != CUDA:
+        return function()
+    result: Future[Result] = Future()
+
+    def call() -> None:
+        try:
+            result.set_result(function())
+        except BaseException as error:  # for the thread that asked
+            result.set_exception(error)
+
+    calls.put(call)
+    return result.result()
+
+
+def slices_of(count: int) -> list[slice]:
+    """Parts of `count` rows, for `in_order`."""
+    return [slice(start, min(count, start + _ROWS)) for start in range(0, count, _ROWS)]
+
+
+def _answer_until(one: Future[Result], calls: SimpleQueue[Callable[[], object]]) -> None:
+    """Do what threads ask for until one result is there."""
+    while not one.done():
+        calls.get()()
+
+
+# ---- height map ----------------------------------------------------------------------------------
+
+Estimator = Literal["mode", "expected", "median"]
+
+COVERED = 0.5  # of a pixel must be opaque, for something to lie there
+_EYE_ABOVE_M = 100.0
+_HANGS_M = 1.0  # over a surface: where half of what falls lands so high up, it is sheltered
+_SHELTER_M = 1.0  # what stands less far above a cell hides no sky from it
+_SHELTER_CELLS = 2  # narrower things hide too little of it
+_TRUE_M = 1.0  # in coarser cells, splats that together cover one are too faint one by one
+_FINE_M = 0.3  # in coarser cells, what is blurred to their width is no measure
+
+
+@dataclass(frozen=True, eq=False)
+class HeightMap:
+    """What is highest at each cell of a grid. Arrays [H, W, ...], rows towards +y.
+
+    left_m, bottom_m: the grid's corner; cell_m: its step. alpha: float32. height_m: float32, z of
+    the surface; 0 where not covered. rgb: float32 [H, W, 3], of what is there, light from all sides
+    alike. ids: int32, heaviest Gaussian, counted through the parts, -1 where none. is_thin: bool,
+    what is there is narrower than a cell (a wall on edge, a fence, twigs): it keeps snow off what
+    is below and carries none itself.
+    """
+
+    left_m: float
+    bottom_m: float
+    cell_m: float
+    alpha: np.ndarray
+    height_m: np.ndarray
+    rgb: np.ndarray
+    ids: np.ndarray
+    is_thin: np.ndarray
+
+    @property
+    def covered(self) -> np.ndarray:
+        """bool [H, W]: something lies there that can carry snow."""
+        return self.alpha >= COVERED
+
+    def centers(self) -> tuple[np.ndarray, np.ndarray]:
+        """x [W] and y [H] of the cells' middles, float64."""
+        rows, columns = self.alpha.shape
+        return (
+            self.left_m + (np.arange(columns) + 0.5) * self.cell_m,
+            self.bottom_m + (np.arange(rows) + 0.5) * self.cell_m,
+        )
+
+
+def plain_gaussians(gaussians: Gaussians) -> Gaussians:
+    """float32, with the colour that all directions share, without gradients."""
+    return Gaussians(
+        means=_plain(gaussians.means),
+        quats=_plain(gaussians.quats),
+        scales=_plain(gaussians.scales),
+        opacities=_plain(gaussians.opacities),
+        sh=_plain(gaussians.sh[:, :1]),
+        semantic=gaussians.semantic,
+    )
+
+
+def classes_of(gaussians: Gaussians) -> np.ndarray:
+    """int16 [N]: UNKNOWN throughout where classes are not known."""
+    if gaussians.semantic is None:
+        return np.full(len(gaussians), SemanticClass.UNKNOWN, np.int16)
+    return gaussians.semantic.numpy()
+
+
+class Footprints:
+    """What Gaussians may cover, seen from above: rectangles (x, y) of those that are not too faint,
+    and the heights of all.
+    """
+
+    def __init__(self, gaussians: Gaussians) -> None:
+        means, reach = gaussians.means.numpy(), gaussians.scales.numpy().max(1, initial=0)
+        reach = reach * np.float32(MAX_EXTENT_SIGMAS)
+        self._shown = np.flatnonzero(gaussians.opacities.numpy() >= np.float32(ALPHA_MIN))
+        middles, reach = means[self._shown, :2].T, reach[self._shown]
+        self._least, self._most = middles - reach, middles + reach  # [2, N]
+        self._z_m = np.ascontiguousarray(means[:, 2])
+
+    def in_box(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        """int64: numbers of the Gaussians that may be seen between two corners (x, y)."""
+        inside = np.ones(len(self._shown), bool)
+        for axis in range(2):
+            inside &= self._most[axis] >= low[axis]
+            inside &= self._least[axis] <= high[axis]
+        return self._shown[inside]
+
+    def top_m(self, chosen: np.ndarray | None = None) -> float:
+        """z of the highest centre, of those chosen by number; -inf where there is none."""
+        z_m = self._z_m if chosen is None else self._z_m[chosen]
+        return float(z_m.max(initial=-np.inf))
+
+
+def in_box(gaussians: Gaussians, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """int64: numbers of the Gaussians that may be seen, from above, between two corners (x, y)."""
+    return Footprints(gaussians).in_box(low, high)
+
+
+def top_of(parts: Sequence[PosedGaussians]) -> float:
+    """z that no centre of the parts exceeds, world; -inf where there is none."""
+    return max((_top_m(part) for part in parts if len(part.gaussians)), default=-math.inf)
+
+
+def draw_from_above(
+    parts: Sequence[PosedGaussians],
+    *,
+    corner_m: tuple[float, float],
+    cell_m: float,
+    shape: tuple[int, int],
+    estimator: Estimator,
+    wanted: np.ndarray | None = None,
+    with_thin: bool = True,
+    top_m: float | None = None,
+    backend: str = AUTO,
+) -> HeightMap:
+    """Draw parts of plain Gaussians from above. corner_m: least x and y. shape: rows and columns of
+    cells. wanted: bool of that shape; the others may be left empty. with_thin: what is thin is
+    looked for. top_m: as `top_of` finds it, where that is known. backend: that draws.
+
+    A pixel of the drawing is opaque for the share that is truly covered; a second drawing, in which
+    whatever is thin is blurred to a pixel's width, shows what is thin.
+    """
+    rows, columns = shape
+    if top_m is None:
+        top_m = top_of(parts)
+    top = top_m if math.isfinite(top_m) else 0.0
+    middle = (corner_m[0] + columns * cell_m / 2, corner_m[1] + rows * cell_m / 2)
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[1, 1] = pose[2, 2] = -1.0  # x to +x, rows towards -y, depth downwards
+    eye = torch.tensor([*middle, top + _EYE_ABOVE_M], dtype=torch.float64)
+    pose[:3, 3] = -pose[:3, :3] @ eye
+    camera = Camera(
+        "from above",
+        columns,
+        rows,
+        1 / cell_m,
+        1 / cell_m,
+        columns / 2,
+        rows / 2,
+        pose,
+        is_orthographic=True,
+    )
+    shown = None if wanted is None else torch.from_numpy(np.ascontiguousarray(wanted[::-1]))
+    names = (ALPHA, DEPTH_ESTIMATORS[estimator], MEDIAN_DEPTH, RGB, SPLAT_IDS)
+    alpha, depths, medians, rgb, ids = _draw(
+        parts, camera, names, shown, antialiased=cell_m <= _TRUE_M, backend=backend
+    )
+    covered, height = _heights(alpha, depths, float(eye[2]))
+    alpha = np.where(covered, alpha, np.minimum(alpha, np.float32(COVERED / 2)))
+    is_thin = np.zeros(shape, bool)
+    if with_thin and cell_m <= _FINE_M:
+        alpha_wide, depths = _draw(
+            parts, camera, names[:2], shown, antialiased=False, backend=backend
+        )
+        covered_wide, height_wide = _heights(alpha_wide, depths, float(eye[2]))
+        shelters = covered & covered_wide & (height_wide - height > _SHELTER_M)
+        wide = np.ones((_SHELTER_CELLS, _SHELTER_CELLS), np.uint8)
+        shelters = cv2.morphologyEx(shelters.astype(np.uint8), cv2.MORPH_OPEN, wide) > 0
+        is_thin = shelters | (covered_wide & ~covered)
+        height[is_thin], alpha[is_thin] = height_wide[is_thin], alpha_wide[is_thin]
+    above = np.where(medians > 0, eye[2].item() - medians.astype(np.float64), 0).astype(np.float32)
+    hangs = (alpha >= COVERED) & (medians > 0) & (above - height > _HANGS_M)
+    height[hangs], is_thin = above[hangs], is_thin | hangs
+    return HeightMap(
+        left_m=corner_m[0],
+        bottom_m=corner_m[1],
+        cell_m=cell_m,
+        alpha=alpha,
+        height_m=height,
+        rgb=rgb / np.maximum(alpha, np.float32(COVERED / 2))[..., None],
+        ids=np.where(alpha > 0, ids, -1),
+        is_thin=is_thin,
+    )
+
+
+def _draw(
+    parts: Sequence[PosedGaussians],
+    camera: Camera,
+    names: tuple[str, ...],
+    wanted: torch.Tensor | None,
+    *,
+    antialiased: bool,
+    backend: str,
+) -> list[np.ndarray]:
+    """Buffers of a view from above, rows towards +y."""
+    # Other depths than the mode's are for comparing them: rather slower with all buffers, which
+    # takes a kernel of the CPU that there is, than at once after one has been compiled for each.
+    asked = names if MODE_DEPTH in names else BUFFERS
+
+    def draw() -> list[np.ndarray]:
+        out = rasterize(
+            parts,
+            camera,
+            buffers=asked,
+            settings=RasterSettings(sh_degree=0, antialiased=antialiased),
+            clip=UNCUT,
+            wanted=gpu.upload(wanted) if wanted is not None and backend == CUDA else wanted,
+            backend=backend,
+        )
+        return [getattr(out, name).cpu().numpy() for name in names]
+
+    return [np.ascontiguousarray(image[::-1]) for image in on_device(draw, backend)]
+
+
+def _heights(alpha: np.ndarray, depths: np.ndarray, eye_z_m: float) -> tuple[np.ndarray, ...]:
+    """Where something lies, bool [H, W], and its z, float32, 0 elsewhere."""
+    covered = (alpha >= COVERED) & (depths > 0) & np.isfinite(depths)
+    height = np.where(covered, eye_z_m - depths.astype(np.float64), 0.0)
+    return covered, height.astype(np.float32)
+
+
+def _plain(tensor: torch.Tensor) -> torch.Tensor:
+    return tensor.detach().to(torch.float32).contiguous()
+
+
+def _top_m(part: PosedGaussians) -> float:
+    """A height that no centre of the part exceeds, world."""
+    means = part.gaussians.means
+    if part.world_from_part is None:
+        return float(means[:, 2].max())
+    pose = part.world_from_part
+    return float(pose[2, 3]) + math.sqrt(float((means * means).sum(1).max()))
+
+
+# ---- What the cameras of a drive can see of what lies on the ground ------------------------------
+
+WIDTH_PX = 200  # of the depth images: they tell houses apart, not posts
+LIFTS_M = (0.0, 0.3, 1.0)  # depths of snow at which a cell may be seen
+_FAR_SHARE, _FAR_M = 1.05, 0.3  # of the depth there, and beyond it: what blurred images hide
+_BELOW_SHARE = 1.02  # of the depth there: snow on top of what shows its underside
+_GRAZING = math.sin(math.radians(3))  # how far normals may be off
+_MARGIN_PX = 3.0
+_VISIBILITY_ROWS = 256  # points a thread takes at a time
+
+
+@dataclass(frozen=True, eq=False)
+class Views:
+    """Cameras with the depth that they see. See visibility_kernels.find_seen.
+
+    on_gpu: depths lie there, and that is where points are looked at.
+    """
+
+    views: np.ndarray
+    sizes: np.ndarray
+    depths: Tensor
+    on_gpu: bool = False
+
+    @property
+    def lowest_m(self) -> float:
+        """z of the lowest of them; infinite where there are none."""
+        return float(self.views[:, CENTRE + 2].min(initial=np.inf))
+
+    def near(self, low: np.ndarray, high: np.ndarray, reach_m: float) -> Views:
+        """Those whose centre is within reach_m of the rectangle between two corners (x, y)."""
+        centres = self.views[:, CENTRE : CENTRE + 2]
+        gap = np.maximum(np.maximum(low - centres, centres - high), 0)
+        chosen = (np.hypot(gap[:, 0], gap[:, 1]) <= reach_m) | (self.views[:, PARALLEL] == 1)
+        return replace(self, views=self.views[chosen], sizes=self.sizes[chosen])
+
+    def see(self, points: np.ndarray, normals: np.ndarray, is_sure: np.ndarray) -> np.ndarray:
+        """bool [C]: points float64 [C, 3], of surfaces with unit normals [C, 3], that one sees.
+
+        What most views look through, where they should show it, is not there for any of them, but
+        where is_sure, bool [C].
+        """
+        points, normals = np.asarray(points, np.float64), np.asarray(normals, np.float64)
+        lifts = np.array(LIFTS_M)
+        tolerances = np.array([_FAR_SHARE, _FAR_M, _BELOW_SHARE, _GRAZING, _MARGIN_PX])
+        if self.on_gpu:
+            from augment.effects.snow import cuda_visibility
+
+            given = (self.views, self.sizes, self.depths, lifts, tolerances)
+            return on_device(
+                lambda: cuda_visibility.find_seen(points, normals, is_sure, *given), CUDA
+            )
+        seen = np.empty(len(points), bool)
+        with kernel_threads(_VISIBILITY_ROWS):
+            visibility_kernels.find_seen(
+                np.ascontiguousarray(points),
+                np.ascontiguousarray(normals),
+                np.ascontiguousarray(is_sure),
+                self.views,
+                self.sizes,
+                self.depths.numpy(),
+                lifts,
+                tolerances,
+                seen,
+            )
+        return seen
+
+
+def draw_views(
+    cameras: Sequence[Camera],
+    parts: Sequence[PosedGaussians],
+    *,
+    backend: str = AUTO,
+    after_each: Callable[[], object] = lambda: None,
+) -> Views:
+    """The depth that each camera sees of the parts, in small images; drawn by `backend`."""
+    views, sizes, start = [], [], 0
+    depths: list[Tensor] = []
+    for camera in cameras:
+        small = camera.scaled(min(1.0, WIDTH_PX / max(camera.width, camera.height)))
+        out = rasterize(parts, small, buffers=(ALPHA, EXPECTED_DEPTH), clip=UNCUT, backend=backend)
+        assert out.alpha is not None and out.expected_depth is not None
+        depths.append(torch.where(out.alpha >= COVERED, out.expected_depth, math.inf).flatten())
+        views.append(_numbers(small))
+        sizes.append((small.width, small.height, start))
+        start += small.width * small.height
+        after_each()
+    return Views(
+        np.array(views, np.float64).reshape(-1, VIEW),
+        np.array(sizes, np.int64).reshape(-1, 3),
+        torch.cat(depths) if depths else torch.zeros(0),
+        on_gpu=backend == CUDA and len(depths) > 0,
+    )
+
+
+def _numbers(camera: Camera) -> np.ndarray:
+    out = np.empty(VIEW)
+    out[:9] = camera.camera_from_world[:3, :3].numpy().ravel()
+    out[9:12] = camera.fx, camera.cx, camera.fy
+    out[CENTRE : CENTRE + 3] = camera.centre.numpy()
+    out[PARALLEL:] = float(camera.is_orthographic), camera.cy
+    return out

@@ -1,0 +1,523 @@
+"""Numba kernels that turn depths of snow on cells into Gaussians; `augment.effects.snow.layer`
+launches.
+
+Every covered cell gets a disc on the snow's surface. Where the surface drops by more than a disc
+can lean, over the cell's border, upright discs close the wall below it.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import prange
+
+from augment.effects.snow.cells import OPEN_EDGE
+from augment.effects.snow.profile import (
+    BARE_M,
+    CRUMBLED,
+    DEVIATION,
+    FILM_M,
+    MIX_A,
+    MIX_B,
+    PILED,
+    SCOURED,
+    SHELTER,
+    STEEPEST,
+    STEP_X,
+    STEP_Y,
+    WATER_RIM_M,
+)
+from augment.render.cpu.jit import inner, kernel
+from augment.render.sh import SH_C0
+
+# ---- splat kernels -------------------------------------------------------------------------------
+
+MOST_WALLS = 8  # discs one above the other that close a wall
+LEAN = 1.5  # steepest slope that a cell's own disc follows
+SETTLED = 0.5  # of the depth: by this much at most does snow even out what lies beneath it
+SPREAD = 0.78  # standard deviation of a disc, in cells
+STEEP_SPREAD = 0.64  # of one on a slope of 45 degrees, which is stretched as well
+RIM_SPREAD = 0.58  # of one beside what is bare, so that the snow's edge is sharp
+RIM_STRETCH = 1.2  # most that such a disc is stretched down a slope
+DRAWN_IN = 0.2  # by how much of a cell it keeps away from what is bare
+SHIFT = 0.2  # farthest that a disc is moved from its cell's middle, in cells
+THICK = 0.2  # most that a disc's thickness measures, in cells
+WALL_SPREAD = 0.7  # of a wall's discs upwards, in heights of one
+WALL_LIFT = 0.25  # by which its lowest keeps clear of the wall's foot, in heights of one
+INSET = 0.12  # by which a wall stands behind the cell's border, in cells
+SUNK = 0.5  # by which a disc's middle lies below the surface, in its thickness
+ROUGH, ROUGH_GRAIN = 0.03, 0.15  # tilt of a disc's normal for its light, and more with grain
+PALE, PALE_GRAIN = 0.01, 0.035  # of its brightness
+MOTTLED = 0.010  # of the brightness per deviation of the mottling noise
+SHADED_HOLLOW, LARGEST_BEND = 0.9, 0.12  # a hollow's loss of brightness per bend, and most bend
+THIN_M, THIN_LOSS = 0.005, 0.42  # depth through which the ground darkens snow, and how much
+PACKED_SHARE = 0.6  # brightness of packed snow, of fresh snow's
+DARKEST, BRIGHTEST = 0.35, 0.8  # light on the bare surface where the sun is out of sight, and full
+_UNIT = 2.0**-53
+_STEP = np.uint64(0x9E3779B97F4A7C15)
+_A, _B = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
+_S11, _S27, _S30, _S31 = (np.uint64(s) for s in (11, 27, 30, 31))
+
+
+@inner()
+def _uniform(bits, number):
+    """The number-th random number of these bits, in [-1, 1)."""
+    bits = bits + np.uint64(number + 1) * _STEP
+    bits = (bits ^ (bits >> _S30)) * _A
+    bits = (bits ^ (bits >> _S27)) * _B
+    bits = bits ^ (bits >> _S31)
+    return np.float64(np.int64(bits >> _S11)) * _UNIT * 2.0 - 1.0
+
+
+@kernel
+def settle(neighbours, z, settled_z):
+    """One step of evening out the surface beneath the snow, all [C].
+
+    Towards the mean of opposite neighbours: slopes stay as they are. Whatever snow lies there, or
+    deeper snow would stand lower where it evens out more.
+    """
+    for i in prange(len(z)):
+        dz = 0.0
+        for axis in range(2):
+            a, b = neighbours[i, 2 * axis], neighbours[i, 2 * axis + 1]
+            if a >= 0 and b >= 0:
+                dz += 0.5 * (np.float64(z[a]) + z[b]) - z[i]
+        settled_z[i] = np.float32(z[i] + 0.25 * dz)
+
+
+@kernel
+def soften(neighbours, heights, light, softened):
+    """One step of evening out the light on the snow, as `settle` does, where both carry snow."""
+    for i in prange(len(heights)):
+        dl = 0.0
+        if heights[i] > 0:
+            for axis in range(2):
+                a, b = neighbours[i, 2 * axis], neighbours[i, 2 * axis + 1]
+                if a >= 0 and b >= 0 and heights[a] > 0 and heights[b] > 0:
+                    dl += 0.5 * (np.float64(light[a]) + light[b]) - light[i]
+        softened[i] = np.float32(light[i] + 0.25 * dl)
+
+
+@kernel
+def find_tops(centers, heights, settled_z, tops):
+    """Height of the surface, snow included, of every cell, float64 [C]."""
+    for i in prange(len(heights)):
+        h, z = np.float64(heights[i]), np.float64(centers[i, 2])
+        eased = min(max(np.float64(settled_z[i]) - z, -SETTLED * h), SETTLED * h)
+        tops[i] = z + h + (eased if h > 0 else 0.0)
+
+
+@inner()
+def _beyond(i, side, neighbours, size, centers, tops):
+    """Height of the surface on one side of a covered cell, and the level distance to there.
+
+    Half a cell where the layer ends: at an open edge, and above what even the neighbour's snow does
+    not reach up from. 0 where it ends against something higher.
+    """
+    n, z = neighbours[i, side], np.float64(centers[i, 2])
+    if n < 0:
+        return z, (0.5 * size if n == OPEN_EDGE else 0.0)
+    if tops[n] < z - LEAN * size:
+        return z, 0.5 * size
+    if centers[n, 2] > tops[i] + LEAN * size:
+        return z, 0.0
+    return tops[n], size
+
+
+@inner()
+def _walls(i, side, neighbours, sizes, centers, tops):
+    """Discs that close the wall on one side of a covered cell, and how far down it reaches."""
+    size = np.float64(sizes[i])
+    low, run = _beyond(i, side, neighbours, size, centers, tops)
+    drop = tops[i] - low
+    if run == 0.0 or drop <= LEAN * size:
+        return 0, drop
+    return min(math.ceil(drop / size), MOST_WALLS), drop
+
+
+@kernel
+def count_splats(neighbours, sizes, centers, heights, tops, counts):
+    """Gaussians that each cell's snow is made of, [C]."""
+    for i in prange(len(heights)):
+        count = 0
+        if heights[i] > 0:
+            count = 1
+            for side in range(4):
+                count += _walls(i, side, neighbours, sizes, centers, tops)[0]
+        counts[i] = count
+
+
+@inner()
+def _slope(i, axis, neighbours, size, bed_slope, centers, tops):
+    """Rise of the surface per metre along x (axis 0) or y (1)."""
+    before, run_before = _beyond(i, 2 * axis, neighbours, size, centers, tops)
+    after, run_after = _beyond(i, 2 * axis + 1, neighbours, size, centers, tops)
+    if run_before < size:  # the bed's own height where the layer ends, not its middle's
+        before -= run_before * bed_slope
+    if run_after < size:
+        after += run_after * bed_slope
+    if run_before == 0.0 and run_after == 0.0:
+        return bed_slope
+    if run_before == 0.0:
+        return (after - tops[i]) / run_after
+    if run_after == 0.0:
+        return (tops[i] - before) / run_before
+    return (after - before) / (run_before + run_after)
+
+
+@inner()
+def _hollow(i, neighbours, size, tops):
+    """How much the surface bends upwards around a cell, 0 where level: slope over a cell."""
+    bend, count = 0.0, 0
+    for side in range(4):
+        n = neighbours[i, side]
+        if n >= 0:
+            bend += tops[n] - tops[i]
+            count += 1
+    return bend / size if count == 4 else 0.0
+
+
+@inner()
+def _inwards(i, axis, neighbours, heights):
+    """-1, 0 or 1 along x (axis 0) or y (1), away from what is bare; 2 if both sides are."""
+    a, b = neighbours[i, 2 * axis], neighbours[i, 2 * axis + 1]
+    before = a == OPEN_EDGE or (a >= 0 and heights[a] == 0)
+    after = b == OPEN_EDGE or (b >= 0 and heights[b] == 0)
+    if before and after:
+        return 2
+    return 1 if before else (-1 if after else 0)
+
+
+@inner()
+def _turn(nx, ny, nz, s, quats):
+    """wxyz that turns z to the unit normal (nz >= 0) and x to the fall line."""
+    level = math.sqrt(nx * nx + ny * ny)
+    cos = nx / level if level > 1e-9 else 1.0
+    half_cos = math.sqrt(max(0.5 * (1.0 + cos), 0.0))
+    half_sin = math.copysign(math.sqrt(max(0.5 * (1.0 - cos), 0.0)), ny)
+    tilt_cos = math.sqrt(max(0.5 * (1.0 + nz), 0.0))
+    tilt_sin = math.sqrt(max(0.5 * (1.0 - nz), 0.0))
+    quats[s, 0] = half_cos * tilt_cos
+    quats[s, 1] = -half_sin * tilt_sin
+    quats[s, 2] = half_cos * tilt_sin
+    quats[s, 3] = half_sin * tilt_cos
+
+
+@inner()
+def _shade(s, normal, tints, packed, seen, lights, look, sh, normals, slopes):
+    """Colour of Gaussian s: by its normal, or what the light's share is added to.
+
+    tints: of red, green and blue. packed: 0 to 1, darker. seen: share of the sun.
+    """
+    share = normal[0] * lights[0, 0] + normal[1] * lights[0, 1] + normal[2] * lights[0, 2]
+    share = min(max((share + look.wrap) / (1.0 + look.wrap), 0.0), 1.0)
+    # Packed snow gives back less of every colour alike: what is grey has the tint of the light.
+    left = 1.0 - packed * (1.0 - PACKED_SHARE)
+    for c in range(3):
+        shadow = tints[c] * left * lights[2, c]
+        rise = tints[c] * left * (lights[1, c] - lights[2, c]) * seen
+        baked = share if look.is_baked else 0.0
+        sh[s, 0, c] = np.float32((shadow + rise * baked - 0.5) / SH_C0)
+        if len(slopes) > 0:
+            slopes[s, c] = np.float32(rise)
+        if len(normals) > 0:
+            normals[s, c] = np.float32(normal[c])
+
+
+@inner()
+def _rough(normal, amount, draw, number):
+    """The normal, tilted at random by about `amount` radians."""
+    x = normal[0] + amount * _uniform(draw, number)
+    y = normal[1] + amount * _uniform(draw, number + 1)
+    z = normal[2] + amount * _uniform(draw, number + 2)
+    length = math.sqrt(x * x + y * y + z * z)
+    return x / length, y / length, z / length
+
+
+@kernel
+def fill(
+    centers, bed_normals, sizes, neighbours, tracks, light, heights, mottle, draws, tops, firsts,
+    lights, look, means, quats, scales, sh, normals, slopes,
+):  # fmt: skip
+    """The Gaussians of every covered cell, from index firsts[i] on.
+
+    lights [3, 3]: direction of the sun, colours of lit and of shaded snow. normals, slopes: [S, 3],
+    or empty where they are not asked for.
+    """
+    for i in prange(len(heights)):
+        if heights[i] == 0:
+            continue
+        size, draw, h = np.float64(sizes[i]), draws[i], np.float64(heights[i])
+        x, y = np.float64(centers[i, 0]), np.float64(centers[i, 1])
+        up = np.float64(bed_normals[i, 2])
+        gx = _slope(i, 0, neighbours, size, -bed_normals[i, 0] / up, centers, tops)
+        gy = _slope(i, 1, neighbours, size, -bed_normals[i, 1] / up, centers, tops)
+        steep = math.sqrt(gx * gx + gy * gy)
+        if steep > LEAN:
+            gx, gy, steep = gx * LEAN / steep, gy * LEAN / steep, LEAN
+        stretch = math.sqrt(1.0 + steep * steep)
+        normal = (-gx / stretch, -gy / stretch, 1.0 / stretch)
+
+        in_x, in_y = _inwards(i, 0, neighbours, heights), _inwards(i, 1, neighbours, heights)
+        at_rim = in_x != 0 or in_y != 0
+        spread = RIM_SPREAD if at_rim else SPREAD + (STEEP_SPREAD - SPREAD) * min(steep, 1.0)
+        spread *= size
+        spread *= 1.0 + 0.2 * look.grain * abs(_uniform(draw, 0))
+        # On steep sides discs are long, and scattered ones would look like fur.
+        shift = (0.5 if at_rim else max(1.0 - 1.2 * steep, 0.1)) * SHIFT * size
+        dx, dy = shift * _uniform(draw, 1), shift * _uniform(draw, 2)
+        dx += DRAWN_IN * size * in_x if in_x < 2 else 0.0
+        dy += DRAWN_IN * size * in_y if in_y < 2 else 0.0
+        thick = min(THICK * size, 0.006 + 0.25 * h)
+        s = firsts[i]
+        means[s, 0] = np.float32(x + dx)
+        means[s, 1] = np.float32(y + dy)
+        means[s, 2] = np.float32(tops[i] + gx * dx + gy * dy - SUNK * thick)
+        _turn(normal[0], normal[1], normal[2], s, quats)
+        longer = min(stretch, RIM_STRETCH) if at_rim else stretch
+        scales[s, 0], scales[s, 1], scales[s, 2] = spread * longer, spread, thick
+
+        bend = min(max(_hollow(i, neighbours, size, tops), -LARGEST_BEND), LARGEST_BEND)
+        pale = 1.0 + (PALE + PALE_GRAIN * look.grain) * _uniform(draw, 3) + MOTTLED * mottle[i]
+        pale *= 1.0 - THIN_LOSS * math.exp(-h / THIN_M)
+        loss = SHADED_HOLLOW * bend
+        tints = (pale * (1.0 - loss), pale * (1.0 - 0.8 * loss), pale * (1.0 - 0.55 * loss))
+        dirt = min(max(0.8 + 0.2 * mottle[i] + 0.15 * _uniform(draw, 4), 0.3), 1.0)
+        packed = look.packed * tracks[i] * tracks[i] * dirt
+        seen = min(max((light[i] - DARKEST) / (BRIGHTEST - DARKEST), 0.0), 1.0)
+        seen = seen * seen * (3.0 - 2.0 * seen)
+        rough = (ROUGH + ROUGH_GRAIN * look.grain) / stretch
+        facing = _rough(normal, rough, draw, 5)
+        _shade(s, facing, tints, packed, seen, lights, look, sh, normals, slopes)
+
+        for side in range(4):
+            count, drop = _walls(i, side, neighbours, sizes, centers, tops)
+            out_x = (1.0 if side == 1 else -1.0) if side < 2 else 0.0
+            out_y = (1.0 if side == 3 else -1.0) if side >= 2 else 0.0
+            for k in range(count):
+                s += 1
+                means[s, 0] = np.float32(x + (0.5 - INSET) * size * out_x)
+                means[s, 1] = np.float32(y + (0.5 - INSET) * size * out_y)
+                step = drop / (count + WALL_LIFT)
+                means[s, 2] = np.float32(tops[i] - step * (k + 0.5))
+                normal = (0.96 * out_x, 0.96 * out_y, 0.28)
+                _turn(normal[0], normal[1], normal[2], s, quats)
+                scales[s, 0], scales[s, 1] = WALL_SPREAD * step, SPREAD * size
+                scales[s, 2] = thick
+                normal = (0.8 * out_x, 0.8 * out_y, 0.6)  # of a rounded side, for its light
+                facing = _rough(normal, rough, draw, 8 + 12 * side + 3 * (k % 4))
+                _shade(s, facing, tints, packed, seen, lights, look, sh, normals, slopes)
+
+
+@kernel
+def bury(buried, buried_by, heights, opacities):
+    """Opacity 0 for every Gaussian buried[b] whose cells buried_by[b] all carry snow."""
+    for b in prange(len(buried)):
+        hidden = True
+        for k in range(buried_by.shape[1]):
+            n = buried_by[b, k]
+            hidden &= n >= 0 and heights[n] > 0
+        if hidden:
+            opacities[buried[b]] = 0
+
+
+# ------------------------------------------------------------------------------------------------
+# Numba kernels that split near discs of snow into finer ones; `augment.effects.snow.near_camera`
+# launches
+
+REACH = 1.4  # cells that a disc's parts cover: discs lie scattered, up to so far apart
+FARTHEST_M = 10.0  # from the camera: discs farther away stay whole
+MOST_SPLITS = 3  # of a disc, along each of its sides
+MARGIN = 0.15  # of the image's half width or height: discs so far outside are split as well
+TEXEL_M = 0.01  # of the table of noise that the grain follows
+COARSER = 0.37  # how fast the table is read a second time, turned: for clods
+CRUMB, CLOD = 0.6, 0.4  # shares of the two
+
+
+@kernel
+def count_splits(means, scales, pose, limits, finest, splits):
+    """Into how many discs along each side every disc is split, uint8 [S]; 0 where it stays whole.
+
+    pose: camera_from_part, float64 [3, 4]. limits: lowest and highest x / z, then y / z. finest:
+    standard deviation of a disc over its distance, that splitting stops at.
+    """
+    for i in prange(len(splits)):
+        x, y, z = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
+        right = pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3]
+        down = pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3]
+        away = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
+        distance = math.sqrt(right * right + down * down + away * away)
+        splits[i] = 0
+        if away <= 0.0 or distance >= FARTHEST_M:
+            continue
+        if not (limits[0] * away <= right <= limits[1] * away):
+            continue
+        if not (limits[2] * away <= down <= limits[3] * away):
+            continue
+        side = REACH * np.float64(max(scales[i, 0], scales[i, 1]))
+        count = min(math.floor(side / (finest * distance) + 0.5), MOST_SPLITS)
+        splits[i] = count if count > 1 else 0
+
+
+@inner()
+def _grain(x, y, z, shift, noise):
+    """The noise that the grain follows, at a place in metres: two scales of one table."""
+    mask, texel = noise.shape[0] - 1, 1.0 / TEXEL_M
+    u, v = x + 0.7 * z + shift[0], y + 0.7 * z + shift[1]
+    crumb = noise[np.int64(math.floor(u * texel)) & mask, np.int64(math.floor(v * texel)) & mask]
+    u, v = (0.8 * u - 0.6 * v) * COARSER * texel, (0.6 * u + 0.8 * v) * COARSER * texel
+    clod = noise[np.int64(math.floor(u)) & mask, np.int64(math.floor(v)) & mask]
+    return CRUMB * crumb + CLOD * clod
+
+
+@kernel
+def split(
+    chosen, splits, firsts, eye, sun, shift, noise, relief, mottle, finest,
+    means, quats, scales, sh, slopes, fine_means, fine_quats, fine_scales, fine_sh, fine_slopes,
+):  # fmt: skip
+    """The finer discs of the chosen ones, splits[c]^2 of each from index firsts[c] on.
+
+    eye: the camera's centre; sun: its level direction times half a step in metres, in the part's
+    frame. shift, noise: see `_grain`. relief: brightness per fall of the noise towards the sun;
+    mottle: per noise. finest: as for count_splits. slopes, fine_slopes: [., 3] or empty. The arrays
+    are a part's Gaussians, sh [S, 1, 3].
+    """
+    for c in prange(len(chosen)):
+        i, n = chosen[c], np.int64(splits[c])
+        w, x = np.float64(quats[i, 0]), np.float64(quats[i, 1])
+        y, z = np.float64(quats[i, 2]), np.float64(quats[i, 3])
+        ux, uy, uz = 1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)
+        vx, vy, vz = 2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x)
+        mx, my, mz = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
+        far = math.sqrt((mx - eye[0]) ** 2 + (my - eye[1]) ** 2 + (mz - eye[2]) ** 2)
+        fade = min(max(2.0 * (1.0 - far / FARTHEST_M), 0.0), 1.0)
+        side = REACH * np.float64(max(scales[i, 0], scales[i, 1]))
+        fade *= min(
+            max(2.0 * side / (finest * far) - 3.0, 0.0), 1.0
+        )  # 0 where discs grow whole again
+        wide, deep = REACH * np.float64(scales[i, 0]), REACH * np.float64(scales[i, 1])
+        along, across = wide / SPREAD, deep / SPREAD
+        s = firsts[c]
+        for j in range(n):
+            p = ((j + 0.5) / n - 0.5) * along
+            for k in range(n):
+                q = ((k + 0.5) / n - 0.5) * across
+                px, py, pz = mx + p * ux + q * vx, my + p * uy + q * vy, mz + p * uz + q * vz
+                fine_means[s, 0], fine_means[s, 1] = np.float32(px), np.float32(py)
+                fine_means[s, 2] = np.float32(pz)
+                for axis in range(4):
+                    fine_quats[s, axis] = quats[i, axis]
+                fine_scales[s, 0], fine_scales[s, 1] = np.float32(wide / n), np.float32(deep / n)
+                fine_scales[s, 2] = scales[i, 2]
+                behind = _grain(px - sun[0], py - sun[1], pz, shift, noise)
+                sunward = _grain(px + sun[0], py + sun[1], pz, shift, noise)
+                bright = relief * (behind - sunward) + 0.5 * mottle * (behind + sunward)
+                factor = 1.0 + fade * bright
+                for channel in range(3):
+                    color = 0.5 + SH_C0 * np.float64(sh[i, 0, channel])
+                    fine_sh[s, 0, channel] = np.float32((factor * color - 0.5) / SH_C0)
+                    if len(slopes) > 0:
+                        fine_slopes[s, channel] = np.float32(factor * slopes[i, channel])
+                s += 1
+
+
+# ------------------------------------------------------------------------------------------------
+# Numba kernel of the snow's depth; `augment.effects.snow.profile` and `noise` define what it
+# computes
+
+_NOISE_KERNELS_A, _NOISE_KERNELS_B, _X, _Y = (np.uint64(c) for c in (MIX_A, MIX_B, STEP_X, STEP_Y))
+_LOW = np.uint64(0xFFFFFFFF)
+_NOISE_KERNELS_S27, _NOISE_KERNELS_S30, _NOISE_KERNELS_S31, _S32 = (
+    np.uint64(s) for s in (27, 30, 31, 32)
+)
+
+
+@inner()
+def _mix(bits):
+    bits = (bits ^ (bits >> _NOISE_KERNELS_S30)) * _NOISE_KERNELS_A
+    bits = (bits ^ (bits >> _NOISE_KERNELS_S27)) * _NOISE_KERNELS_B
+    return bits ^ (bits >> _NOISE_KERNELS_S31)
+
+
+@inner()
+def _corner(across, down, seed, x, y):
+    bits = _mix((across + down) ^ seed)
+    gx = np.float64(np.int64(bits >> _S32)) * 2.0**-31 - 1.0
+    gy = np.float64(np.int64(bits & _LOW)) * 2.0**-31 - 1.0
+    return gx * x + gy * y
+
+
+@inner()
+def _noise(u, v, seed):
+    column, row = math.floor(u), math.floor(v)
+    x, y = u - column, v - row
+    fade_x = x * x * x * (x * (x * 6.0 - 15.0) + 10.0)
+    fade_y = y * y * y * (y * (y * 6.0 - 15.0) + 10.0)
+    across, down = np.uint64(np.int64(column)) * _X, np.uint64(np.int64(row)) * _Y
+    near = _corner(across, down, seed, x, y)
+    near += fade_x * (_corner(across + _X, down, seed, x - 1.0, y) - near)
+    far = _corner(across, down + _Y, seed, x, y - 1.0)
+    far += fade_x * (_corner(across + _X, down + _Y, seed, x - 1.0, y - 1.0) - far)
+    return (near + fade_y * (far - near)) / DEVIATION
+
+
+@inner()
+def _field(x, y, size, turns, amplitudes, lengths, seeds):
+    total = 0.0
+    for k in range(len(amplitudes)):
+        shown = min(max(2.0 - 4.0 * size / lengths[k], 0.0), 1.0)
+        if shown > 0.0:
+            u = turns[k, 0, 0] * x + turns[k, 0, 1] * y
+            v = turns[k, 1, 0] * x + turns[k, 1, 1] * y
+            total += amplitudes[k] * shown * _noise(u, v, seeds[k])
+    return total
+
+
+@inner()
+def _pillow(t):
+    t = min(max(t, 0.0), 1.0)
+    return math.sqrt(t * (2.0 - t))
+
+
+@kernel
+def lay(
+    centers, sizes, edges, tracks, banks, numbers, drifts, patches, mottling, seed, heights, mottle,
+    draws,
+):  # fmt: skip
+    """Depth of the snow, what mottles its colour, and random bits, all [C], of every cell.
+
+    drifts, patches, mottling: octaves as (turns, amplitudes, lengths, seeds). draws: uint64 that
+    hang on the cell's place and the seed. Where nothing of the layer is patchy, the patches' noise
+    is not worked out.
+    """
+    everywhere = numbers.threshold <= -1e9
+    for i in prange(len(sizes)):
+        x, y = np.float64(centers[i, 0]), np.float64(centers[i, 1])
+        size = np.float64(sizes[i])
+        column = np.uint64(np.int64(math.floor(x / size))) * _X
+        row = np.uint64(np.int64(math.floor(y / size))) * _Y
+        draws[i] = _mix((column + row) ^ seed)
+        heights[i] = mottle[i] = np.float32(0)
+        room = np.float64(centers[i, 2]) - numbers.floor_z_m
+        above = 1e9
+        if not everywhere:
+            bx, by = np.float64(banks[i, 0]), np.float64(banks[i, 1])
+            above = _field(x, y, 0.0, patches[0], patches[1], patches[2], patches[3])
+            above += SHELTER * math.sqrt(bx * bx + by * by) - numbers.threshold
+        if not (room > 0.0 and above > 0.0):
+            continue
+        at_wind = banks[i, 0] * numbers.wind_x + banks[i, 1] * numbers.wind_y
+        piled = 1.0 + numbers.drift * (PILED if at_wind > 0.0 else SCOURED) * at_wind
+        drift = _field(x, y, size, drifts[0], drifts[1], drifts[2], drifts[3])
+        drift = math.exp(min(max(drift, -STEEPEST), STEEPEST)) * piled
+        full = numbers.depth_m * drift * _pillow(edges[i] / numbers.radius_m)
+        h = BARE_M + max(full - BARE_M, 0.0) * min(above / numbers.rim, 1.0)
+        mottled = _field(x, y, size, mottling[0], mottling[1], mottling[2], mottling[3])
+        track = np.float64(tracks[i])
+        track += CRUMBLED * mottled * track * (1.0 - track)
+        track = min(max(track, 0.0), 1.0)
+        h = max(h * (1.0 - numbers.pressed * track), min(h, FILM_M))
+        h = BARE_M + (h - BARE_M) * min(room / WATER_RIM_M, 1.0)
+        heights[i] = np.float32(h)
+        mottle[i] = np.float32(mottled)

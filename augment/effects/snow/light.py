@@ -1,0 +1,327 @@
+"""The light that snow in a scene would stand in: where the sun is, how bright it is, what colour.
+
+A recording rarely shows its sun, and its pictures hold no physical unit. The scene itself is the
+evidence: the sky for the direction and for how much of the light is the sun's, and the road, whose
+albedo is roughly known, for what a surface of a given albedo looks like at this exposure.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass
+from weakref import WeakKeyDictionary
+
+import numpy as np
+import torch
+from scipy.spatial import KDTree
+
+from augment.geometry import rotmat_from_quat
+from augment.render.sh import SH_C0
+from augment.scene import Gaussians, Scene
+from augment.semantics import SemanticClass
+from augment.sky import Sky
+from recipes.weather import Snow
+
+FRESH_ALBEDO = 0.85  # `light.brightness` is of this snow; fresh snow has 0.8 to 0.95 (Oke 1987)
+
+# Class, albedo, and whether it is grey, so that its tint is the light's; the best witness first.
+# Oke 1987 lists asphalt 0.05 to 0.20, concrete 0.10 to 0.35, grass 0.16 to 0.26; with the road's a
+# little below the middle, snow comes out about as bright as white cars do. None: any class.
+_WITNESSES: tuple[tuple[SemanticClass | None, float, bool], ...] = (
+    (SemanticClass.ROAD, 0.10, True),
+    (SemanticClass.SIDEWALK, 0.22, True),
+    (SemanticClass.TERRAIN, 0.18, False),
+    (None, 0.12, False),
+)
+_FEWEST_SPLATS = 20
+_SOLID_OPACITY = 0.5
+_LEVEL_COSINE = 0.9  # of a splat that may be ground where no class says so
+
+_SKY_SAMPLES = 16_384  # over the upper half, one in 1.1 degrees
+_SMOOTH_OVER = 40  # of them: a disc 8 degrees wide, so that no single texel wins
+_BRIGHTEST = 0.01  # share of the samples that may be the sun's region
+_REGION_COSINE = math.cos(math.radians(15.0))
+_LOWEST_SINE = math.sin(math.radians(3.0))  # below are skylines
+
+# Contrast: brightest region over the sky's mean. A grey sky that is three times as bright at the
+# zenith as at the horizon (Moon and Spencer 1942) has 1.5. Pictures clip at white, so that the sun
+# in a sky of bright clouds has little more; a blue sky has the sun at less contrast.
+# Blueness: blue over red of the mean, about 1 overcast and 1.8 clear.
+_UNIFORM_CONTRAST = 1.2
+_GREY_CONTRASTS, _BLUE_CONTRASTS = (1.5, 3.0), (1.2, 1.9)  # overcast below, clear above
+_GREY_BLUENESS, _CLEAR_BLUENESS = 1.15, 1.8
+_OVERCAST_SHARE, _CLEAR_SHARE = 0.1, 0.9
+_LOW_SUN_SHARE, _HIGH_SUN_DEG = 0.5, 30.0  # of that share; the air takes its part of a low sun
+_UNKNOWN_SUN_DEG = (135.0, 45.0)  # azimuth, elevation, where the sky shows none
+
+# Light on snow in shadow over light on snow that faces the sun, at no sun and at nothing but sun.
+_SHADE_OVERCAST, _SHADE_CLEAR = 0.95, 0.50
+_WRAP_OVERCAST, _WRAP_CLEAR = 0.9, 0.5
+_SUN_TINT = (1.02, 1.0, 0.96)
+_TINT_RANGE = (0.8, 1.25)
+_KNEE, _CEILING = 0.45, 0.86  # linear; the ceiling is 0.93 display-encoded
+_LUMINANCE = (0.2126, 0.7152, 0.0722)
+
+
+@dataclass(frozen=True)
+class Illumination:
+    """The light on snow. sun: unit, towards the sun, scene world. lit_rgb: display-encoded colour
+    of snow that faces the sun, albedo included. shadow_rgb: of snow that the sun does not reach;
+    no channel is brighter than lit_rgb's. wrap: how far light reaches around (see SplatShading).
+    """
+
+    sun: tuple[float, float, float]
+    lit_rgb: tuple[float, float, float]
+    shadow_rgb: tuple[float, float, float]
+    wrap: float
+
+
+@dataclass(frozen=True)
+class SceneLight:
+    """What a scene shows of its light.
+
+    azimuth_deg, elevation_deg: of the sun, 0 degrees azimuth is world +x. sun_share: 0 to 1, of the
+    light. contrast: of the sky's brightest region over its mean. sky_rgb_linear: mean of the upper
+    half by solid angle. ground_albedo: what the ground is taken to give back, None where no ground
+    was found. ground_rgb_linear: its median colour; the sky's mean without ground. ground_is_grey:
+    whether its tint is the light's.
+    """
+
+    azimuth_deg: float
+    elevation_deg: float
+    sun_share: float
+    contrast: float
+    sky_rgb_linear: tuple[float, float, float]
+    ground_albedo: float | None
+    ground_rgb_linear: tuple[float, float, float]
+    ground_is_grey: bool
+
+
+def illumination_of(scene: Scene, snow: Snow) -> Illumination:
+    """The light on a recipe's snow in a scene: what the recipe leaves open, the scene answers.
+
+    Level snow that sees the sun gets the light of the scene's ground: radiance = albedo x ground /
+    ground's albedo, in linear light. Snow that faces the sun is brighter by what the wrapped cosine
+    says, then bent below white by a soft shoulder; shadows keep their ratio to it. Wrapped lighting
+    (Green 2004, "Real-time approximations to subsurface scattering") stands for light that
+    travels inside the snow. Without ground, snow in shadow gets the mean light of the sky.
+    """
+    found = light_of(scene)
+    light = snow.light
+    azimuth_deg = found.azimuth_deg if light.sun_azimuth_deg is None else light.sun_azimuth_deg
+    elevation_deg = (
+        found.elevation_deg if light.sun_elevation_deg is None else light.sun_elevation_deg
+    )
+    share = found.sun_share if light.sun is None else light.sun
+    sun = _direction(azimuth_deg, elevation_deg)
+    wrap = _mix(_WRAP_OVERCAST, _WRAP_CLEAR, share)
+    shade = _mix(_SHADE_OVERCAST, _SHADE_CLEAR, share)
+    if light.brightness is None:
+        facing_level = max(0.0, sun[2] + wrap) / (1 + wrap)
+        lit = _shoulder(snow.albedo * _facing_light(found, shade, facing_level))
+    else:
+        given = float(linear_from_display(np.array(light.brightness)))
+        lit = min(1.0, given * snow.albedo / FRESH_ALBEDO)
+    # A grey road shows the light's colour, but its own and its shadows' as well: a part is taken.
+    cast = _tint(found.ground_rgb_linear, 0.25) if found.ground_is_grey else np.ones(3)
+    lit_linear = lit * _even(cast * np.asarray(_SUN_TINT) ** share)
+    sky_linear = lit * _even(cast * _tint(found.sky_rgb_linear, 0.2 + 0.4 * share))
+    shadow_linear = _shadow(lit_linear, sky_linear, shade)
+    return Illumination(sun, _display(lit_linear), _display(shadow_linear), wrap)
+
+
+def light_of(scene: Scene) -> SceneLight:
+    """What the scene shows of its light; worked out once per scene object."""
+    if scene not in _LIGHTS:
+        _LIGHTS[scene] = _look(scene)
+    return _LIGHTS[scene]
+
+
+_LIGHTS: WeakKeyDictionary[Scene, SceneLight] = WeakKeyDictionary()
+
+
+def linear_from_display(rgb: np.ndarray) -> np.ndarray:
+    """Linear light of sRGB values in [0, 1] (IEC 61966-2-1)."""
+    return np.where(rgb <= 0.04045, rgb / 12.92, ((np.maximum(rgb, 0) + 0.055) / 1.055) ** 2.4)
+
+
+def display_from_linear(linear: np.ndarray) -> np.ndarray:
+    """sRGB values in [0, 1] of linear light in [0, 1]: the inverse of `linear_from_display`."""
+    high = 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055
+    return np.where(linear <= 0.0031308, linear * 12.92, high)
+
+
+def _facing_light(found: SceneLight, shade: float, facing_level: float) -> float:
+    """Luminance of a white surface that faces the sun."""
+    ground = _luminance(np.asarray(found.ground_rgb_linear))
+    if found.ground_albedo is None:
+        return ground / shade  # it is the sky's, which is all that shadows get
+    return ground / found.ground_albedo / _mix(shade, 1.0, facing_level)
+
+
+def _shadow(lit: np.ndarray, tinted: np.ndarray, shade: float) -> np.ndarray:
+    """Linear colour [3] of shadow, `shade` times as bright as lit and of the tint of `tinted`,
+    which is as bright as lit; of less tint where a channel would come out above lit's.
+    """
+    excess = np.maximum(tinted - lit, 1e-12)
+    strength = np.minimum(1.0, lit * (1 / shade - 1) / excess).min()
+    return np.minimum(shade * (lit + strength * (tinted - lit)), lit)
+
+
+def _look(scene: Scene) -> SceneLight:
+    sun_deg, contrast, sky_rgb = _look_at_sky(scene.sky)
+    red, _, blue = _triple(sky_rgb)
+    is_blue = _ramp(blue / red, _GREY_BLUENESS, _CLEAR_BLUENESS) if red > 1e-6 else 0.0
+    overcast_at, clear_at = (
+        _mix(grey, blue, is_blue)
+        for grey, blue in zip(_GREY_CONTRASTS, _BLUE_CONTRASTS, strict=True)
+    )
+    clear = _ramp(contrast, overcast_at, clear_at)
+    rgb, albedo, is_grey = _look_at_ground(scene) or (sky_rgb, None, False)
+    azimuth_deg, elevation_deg = sun_deg
+    clear *= _mix(_LOW_SUN_SHARE, 1.0, _ramp(elevation_deg, 0.0, _HIGH_SUN_DEG))
+    return SceneLight(
+        azimuth_deg=azimuth_deg,
+        elevation_deg=elevation_deg,
+        sun_share=_mix(_OVERCAST_SHARE, _CLEAR_SHARE, clear),
+        contrast=contrast,
+        sky_rgb_linear=_triple(sky_rgb),
+        ground_albedo=albedo,
+        ground_rgb_linear=_triple(rgb),
+        ground_is_grey=is_grey,
+    )
+
+
+def _look_at_sky(sky: Sky) -> tuple[tuple[float, float], float, np.ndarray]:
+    """The sun's azimuth and elevation in degrees, the contrast, and the mean linear colour [3]."""
+    directions, near = _sky_samples()
+    rgb = sky.sample(torch.from_numpy(directions.astype(np.float32))).double().numpy()
+    linear = linear_from_display(np.clip(np.nan_to_num(rgb), 0, 1))
+    mean_rgb = linear.mean(0)
+    smooth = (linear * np.asarray(_LUMINANCE)).sum(1)[near].mean(1)
+    peak, mean = float(smooth.max()), float(smooth.mean())
+    contrast = peak / mean if mean > 1e-6 else 1.0
+    if contrast < _UNIFORM_CONTRAST:
+        return _UNKNOWN_SUN_DEG, contrast, mean_rgb
+    floor = np.quantile(smooth, 1 - _BRIGHTEST)
+    in_region = (directions * directions[smooth.argmax()]).sum(1) >= _REGION_COSINE
+    weights = np.where(in_region, np.maximum(smooth - floor, 0), 0)
+    if weights.sum() <= 0:  # a plateau wider than the share: its middle
+        weights = np.where(in_region, smooth, 0)
+    x, y, z = (weights[:, None] * directions).sum(0)
+    azimuth_deg, elevation_deg = math.atan2(y, x), math.atan2(z, math.hypot(x, y))
+    return (math.degrees(azimuth_deg), math.degrees(elevation_deg)), contrast, mean_rgb
+
+
+@functools.cache
+def _sky_samples() -> tuple[np.ndarray, np.ndarray]:
+    """Unit vectors above the skyline, evenly spread on a golden spiral, float64 [_SKY_SAMPLES, 3],
+    and the numbers of those around each, [_SKY_SAMPLES, _SMOOTH_OVER].
+    """
+    index = np.arange(_SKY_SAMPLES)
+    z = _LOWEST_SINE + (1 - _LOWEST_SINE) * (index + 0.5) / _SKY_SAMPLES
+    angle = index * (math.pi * (3 - math.sqrt(5)))
+    flat = np.sqrt(1 - z * z)
+    directions = np.stack([flat * np.cos(angle), flat * np.sin(angle), z], 1)
+    return directions, np.asarray(KDTree(directions).query(directions, _SMOOTH_OVER)[1])
+
+
+def _look_at_ground(scene: Scene) -> tuple[np.ndarray, float, bool] | None:
+    """The ground's median linear colour [3], its albedo, and whether it is grey; None without any.
+
+    By area: layers beneath a surface, which nothing sees, are of fewer and smaller splats.
+    """
+    g = scene.background
+    solid = (g.opacities > _SOLID_OPACITY).numpy()
+    for semantic, albedo, is_grey in _WITNESSES:
+        if semantic is None:
+            chosen = solid & _is_low_and_level(g, scene)
+        elif g.semantic is None:
+            continue
+        else:
+            chosen = solid & (g.semantic == semantic).numpy()
+        if chosen.sum() < _FEWEST_SPLATS:
+            continue
+        sizes = g.scales.double().numpy()[chosen]
+        areas = sizes.prod(1) / np.maximum(sizes.min(1), 1e-12)
+        rgb = 0.5 + SH_C0 * g.sh[:, 0].double().numpy()[chosen]
+        linear = linear_from_display(np.clip(np.nan_to_num(rgb), 0, 1))
+        return _median(linear, areas), albedo, is_grey
+    return None
+
+
+def _is_low_and_level(g: Gaussians, scene: Scene) -> np.ndarray:
+    """Splats that may be ground: flat, and below the cameras, or in the scene's lower half."""
+    if len(g) == 0:
+        return np.zeros(0, bool)
+    up = rotmat_from_quat(g.quats)[:, 2].double().numpy()  # the world's z along each splat's axes
+    thinnest = g.scales.argmin(1).numpy()
+    is_level = np.abs(up[np.arange(len(g)), thinnest]) > _LEVEL_COSINE
+    z = g.means[:, 2].double().numpy()
+    eyes = [
+        float(-(pose[:3, :3].T @ pose[:3, 3])[2])
+        for frame in scene.frames
+        for pose in (camera.camera_from_world for camera in frame.cameras.values())
+    ]
+    return is_level & (z < (min(eyes) if eyes else float(np.median(z))))
+
+
+def _median(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """The weighted median of each column of values [N, C], by weights [N] of which one is > 0."""
+    medians = []
+    for column in values.T:
+        order = np.argsort(column, kind="stable")
+        sums = np.cumsum(weights[order])
+        medians.append(column[order][np.searchsorted(sums, sums[-1] / 2)])
+    return np.array(medians)
+
+
+def _direction(azimuth_deg: float, elevation_deg: float) -> tuple[float, float, float]:
+    azimuth, elevation = math.radians(azimuth_deg), math.radians(elevation_deg)
+    flat = math.cos(elevation)
+    return (flat * math.cos(azimuth), flat * math.sin(azimuth), math.sin(elevation))
+
+
+def _shoulder(luminance: float) -> float:
+    """The same up to the knee, then ever slower towards the ceiling, without a kink."""
+    if luminance <= _KNEE:
+        return luminance
+    room = _CEILING - _KNEE
+    return _KNEE + room * -math.expm1(-(luminance - _KNEE) / room)
+
+
+def _tint(rgb_linear: tuple[float, float, float], strength: float) -> np.ndarray:
+    """The colour's hue at luminance 1, [3]: 0 strength is white, 1 all of it, within limits."""
+    rgb = np.asarray(rgb_linear)
+    luminance = _luminance(rgb)
+    if luminance < 1e-6:
+        return np.ones(3)
+    return _even(np.clip((rgb / luminance) ** strength, *_TINT_RANGE))
+
+
+def _even(rgb: np.ndarray) -> np.ndarray:
+    """Scaled to luminance 1."""
+    return rgb / _luminance(rgb)
+
+
+def _luminance(rgb_linear: np.ndarray) -> float:
+    return float((rgb_linear * np.asarray(_LUMINANCE)).sum())
+
+
+def _display(linear: np.ndarray) -> tuple[float, float, float]:
+    return _triple(display_from_linear(np.clip(linear, 0, 1)))
+
+
+def _triple(values: np.ndarray) -> tuple[float, float, float]:
+    red, green, blue = (float(value) for value in values)
+    return (red, green, blue)
+
+
+def _mix(low: float, high: float, share: float) -> float:
+    return low + share * (high - low)
+
+
+def _ramp(value: float, low: float, high: float) -> float:
+    """0 below low, 1 above high, straight between."""
+    return min(1.0, max(0.0, (value - low) / (high - low)))

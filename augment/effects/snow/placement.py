@@ -1,0 +1,764 @@
+"""Where snow can lie in a scene: cells of the surfaces that are open to the sky and seen.
+
+plan      square tiles about the cameras' path, finer near it             (tiles)
+views     what each of some cameras along the drive sees                  (visibility)
+then for squares of tiles, each with a margin of its surroundings:
+  above   heights, colours and classes from straight above                (height_map, holes)
+  surface where snow stays, and where its edges are                       (surface)
+  ground  light, wheel tracks, banks                                      (ground_light, ...)
+actors    the same in each vehicle's own frame                            (actor_cells)
+join      neighbours across squares, and what the cells bury              (cell_lists, buried)
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from augment.cameras import Camera
+from augment.effects.snow import surface_kernels as hole_kernels
+from augment.effects.snow.cells import EDGE_CAP_M, FLUSH, SnowBed, SnowCells
+from augment.effects.snow.height_map import (
+    Estimator,
+    Footprints,
+    HeightMap,
+    Views,
+    classes_of,
+    draw_from_above,
+    draw_views,
+    in_order,
+    plain_gaussians,
+    top_of,
+)
+from augment.effects.snow.surface import (
+    CellList,
+    Surface,
+    banks_of,
+    cells_at,
+    find_actor_cells,
+    find_surface,
+    is_vehicle,
+    make_cells,
+    moves,
+    narrow_things,
+    normals_of,
+)
+from augment.effects.snow.surface_kernels import LINK, RISES
+from augment.effects.snow.tiles import (
+    RINGS_M,
+    CellNumbers,
+    TilePlan,
+    Window,
+    path_points,
+    plan_tiles,
+    views_along,
+)
+from augment.errors import SceneError
+from augment.ground import check_metric_and_level
+from augment.labels import EGO_VEHICLE
+from augment.render.buffers import AUTO, CUDA
+from augment.scene import Gaussians, PosedGaussians, Scene
+from augment.semantics import SemanticClass
+
+# ---- How bright the bare ground is for what it is made of: shadows that the recording holds ------
+
+DARKEST, BRIGHTEST = 0.25, 1.5
+_SPREAD_M = 0.2  # standard deviation of the blur: shadows have soft edges, gravel is not one
+_PAINT_M = 0.1  # so far beyond its own splats a marking may show
+_LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)  # linear sRGB
+_SHARP_CELLS = 0.3  # a narrower blur leaves cells as they are
+_LEAST_WEIGHT = 0.02
+_FEWEST = 50  # cells of a class, for its median to mean anything
+# What differs in colour as much as in light: their brightness says half as much.
+_MOTLEY = (SemanticClass.UNKNOWN, SemanticClass.VEGETATION, SemanticClass.OTHER)
+_MARKING, _ROAD = int(SemanticClass.LANE_MARKING), int(SemanticClass.ROAD)
+
+
+def ground_luminance(
+    height_map: HeightMap, classes: np.ndarray, can_carry: np.ndarray
+) -> np.ndarray:
+    """Blurred linear luminance float32 [H, W] of what carries snow, NaN where it cannot be told.
+
+    classes: int16 [H, W]. Each class is blurred by itself; under lane markings, the road about them
+    shows how bright it is.
+    """
+    rgb = np.clip(height_map.rgb[can_carry], 0, 1)
+    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** np.float32(2.4))
+    luminance = np.zeros(can_carry.shape, np.float32)
+    luminance[can_carry] = (linear.astype(np.float32) * _LUMINANCE).sum(-1)
+    out = np.full(luminance.shape, np.nan, np.float32)
+    marking = classes == _MARKING
+    around = 2 * max(1, round(_PAINT_M / height_map.cell_m)) + 1
+    painted = cv2.dilate(marking.astype(np.uint8), np.ones((around, around), np.uint8)).astype(bool)
+    surfaces = np.where(marking, np.int16(_ROAD), classes)
+    sigma = _SPREAD_M / height_map.cell_m
+    for surface in np.unique(surfaces[can_carry]):
+        here = can_carry & (surfaces == surface)
+        told = here & ~painted
+        weights = told.astype(np.float32)
+        sums = luminance * weights
+        for spread in (sigma, 4 * sigma):
+            missing = here & np.isnan(out)
+            if not missing.any():
+                break
+            weight, total = _blur(weights, spread), _blur(sums, spread)
+            known = missing & (weight > _LEAST_WEIGHT)
+            out[known] = total[known] / weight[known]
+    return out
+
+
+def relative_light(luminance: np.ndarray, classes: np.ndarray) -> np.ndarray:
+    """float32 [C]: luminance [C] over the median of its class, see SnowCells.light; 1 where it is
+    NaN.
+    """
+    out = np.ones(len(luminance), np.float32)
+    surfaces = np.where(classes == _MARKING, np.int16(_ROAD), classes)
+    known = np.isfinite(luminance)
+    for surface in np.unique(surfaces):
+        here = known & (surfaces == surface)
+        usual = float(np.median(luminance[here])) if here.sum() >= _FEWEST else 0.0
+        if usual <= 1e-4:
+            continue
+        ratio = luminance[here] / np.float32(usual)
+        if surface in _MOTLEY:
+            ratio = np.sqrt(np.maximum(ratio, 0))
+        out[here] = ratio
+    return np.clip(out, DARKEST, BRIGHTEST)
+
+
+def _blur(values: np.ndarray, sigma: float) -> np.ndarray:
+    if sigma < _SHARP_CELLS:
+        return values
+    return cv2.GaussianBlur(values, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
+
+
+# ------------------------------------------------------------------------------------------------
+# Ground that a recording does not hold, though it shows: closed where it is plain what is there
+# A car's lidar does not see the ground beneath the car, and a fit of a drive that begins or ends
+# with
+# the car standing still has no Gaussians there. What lies around such a hole, and that the car
+# stood
+# on it, tell how high the ground in it is.
+
+LEAST_M2, MOST_M2 = 0.1, 7.0  # what is smaller is left to `surface`
+MOST_OVER_M2 = 0.6  # of that, under narrow things: lamps, not eaves
+MOST_ON_PATH_M2 = 80.0  # where the path of the cameras leads over it
+_PATH_M = 1.0  # on both sides of it
+_RIM_CELLS = 3
+_ALIKE_M, _FIRST_M = 0.12, 0.5  # off the plane of what lies around; and off its middle, at first
+_FEWEST_CELLS = 8
+_FEWEST_ALIKE, _OCTANTS, _OCTANTS_ON_PATH = 0.6, 7, 5
+_STEEPEST = math.tan(math.radians(20))
+_MOST_SAMPLES = 160  # of a rim that heights are taken from
+_CLEAR_M = 0.3  # over the plane, of thin things that stand in a hole
+
+
+def fill_holes(
+    height_map: HeightMap,
+    classes: np.ndarray,
+    lies: np.ndarray,
+    narrow: np.ndarray,
+    wanted: np.ndarray,
+    path_xy: np.ndarray,
+) -> tuple[HeightMap, np.ndarray]:
+    """The map with the holes closed that one smooth surface surrounds, and where, bool [H, W].
+
+    classes: int16 [H, W], which get those of what is around. lies: bool, where the map shows
+    something that may carry snow. narrow: bool, what stands high and hides nothing below it.
+    wanted: bool, what was drawn. path_xy [P, 2]: places of the cameras.
+    """
+    filled = np.zeros(lies.shape, bool)
+    covered = height_map.covered
+    empty = wanted & (~covered | height_map.is_thin | narrow)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(
+        empty.astype(np.uint8), connectivity=4
+    )
+    cell_m2 = height_map.cell_m**2
+    sizes = stats[:, cv2.CC_STAT_AREA] * cell_m2
+    possible = np.flatnonzero((sizes >= LEAST_M2) & (sizes <= MOST_ON_PATH_M2))
+    possible = possible[possible > 0]
+    if count <= 1 or len(possible) == 0:
+        return height_map, filled
+    near = labels[_near_path(height_map, path_xy)].astype(np.int64)
+    on_path = np.bincount(near, minlength=count) > 0
+    over = np.bincount(labels[narrow].astype(np.int64), minlength=count) * cell_m2
+    possible = possible[over[possible] <= MOST_OVER_M2]
+    new = {name: getattr(height_map, name).copy() for name in ("height_m", "rgb", "alpha")}
+    is_thin = height_map.is_thin.copy()
+    for hole in possible[(sizes[possible] <= MOST_M2) | on_path[possible]]:
+        left, bottom, width, height = stats[hole, :4]
+        window = (
+            slice(max(0, bottom - _RIM_CELLS), bottom + height + _RIM_CELLS),
+            slice(max(0, left - _RIM_CELLS), left + width + _RIM_CELLS),
+        )
+        inside = labels[window] == hole
+        around = np.ones((2 * _RIM_CELLS + 1, 2 * _RIM_CELLS + 1), np.uint8)
+        rim = (cv2.dilate(inside.astype(np.uint8), around) > 0) & ~inside
+        if not on_path[hole] and bool((rim & ~wanted[window]).any()):
+            continue  # it goes on where nothing was drawn
+        known = rim & covered[window] & ~height_map.is_thin[window] & ~narrow[window]
+        plane, alike = _plane_around(
+            known, lies[window], height_map.height_m[window], height_map.cell_m
+        )
+        octants = _OCTANTS_ON_PATH if on_path[hole] else _OCTANTS
+        if plane is None or not _surrounds(inside, alike, octants):
+            continue
+        rows, columns = np.nonzero(inside)
+        level = plane[0] + plane[1] * columns + plane[2] * rows
+        tall = height_map.is_thin[window][rows, columns]
+        tall &= height_map.height_m[window][rows, columns] > level + _CLEAR_M
+        rows, columns, level = rows[~tall], columns[~tall], level[~tall]
+        at_row, at_column = (part[:: 1 + len(part) // _MOST_SAMPLES] for part in np.nonzero(alike))
+        weights = np.hypot(rows[:, None] - at_row, columns[:, None] - at_column) ** -3.0
+        weights /= weights.sum(1, keepdims=True)
+        off = height_map.height_m[window][at_row, at_column]
+        off = off - (plane[0] + plane[1] * at_column + plane[2] * at_row)
+        new["height_m"][window][rows, columns] = level + weights @ off
+        new["rgb"][window][rows, columns] = weights @ height_map.rgb[window][at_row, at_column]
+        new["alpha"][window][rows, columns] = 1
+        is_thin[window][rows, columns] = False
+        usual = np.bincount(classes[window][alike].astype(np.int64)).argmax()
+        classes[window][rows, columns] = usual
+        filled[window][rows, columns] = True
+    return dataclasses.replace(height_map, **new, is_thin=is_thin), filled
+
+
+def _near_path(grid: HeightMap, path_xy: np.ndarray) -> np.ndarray:
+    """bool [H, W]: cells near the path's places."""
+    rows, columns = grid.alpha.shape
+    reach = max(1, round(_PATH_M / grid.cell_m))
+    place = np.floor((path_xy - (grid.left_m, grid.bottom_m)) / grid.cell_m).astype(np.int64)
+    near = np.zeros((rows, columns), np.uint8)
+    place = place[((place >= 0) & (place < (columns, rows))).all(1)]
+    near[place[:, 1], place[:, 0]] = 1
+    return cv2.dilate(near, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) > 0
+
+
+def _plane_around(
+    known: np.ndarray, lies: np.ndarray, height: np.ndarray, cell: float
+) -> tuple[np.ndarray | None, np.ndarray]:
+    """Height at the corner, and rises per column and row, of the plane of most known cells; None
+    where there is none. bool [H, W]: the cells that lie in it.
+    """
+    rows, columns = np.nonzero(known)
+    alike = np.zeros_like(known)
+    if len(rows) < _FEWEST_CELLS:
+        return None, alike
+    z = height[rows, columns].astype(np.float64)
+    used, fits = np.empty(len(z), bool), np.empty(len(z), bool)
+    slopes = hole_kernels.find_plane(
+        rows, columns, z, _FIRST_M, _ALIKE_M, _FEWEST_CELLS, used, fits
+    )
+    fits &= lies[rows, columns]
+    if not (fits.mean() >= _FEWEST_ALIKE and math.hypot(*slopes) <= _STEEPEST * cell):
+        return None, alike
+    alike[rows[fits], columns[fits]] = True
+    terms = np.stack([np.ones(len(z)), columns, rows], 1)
+    return np.linalg.lstsq(terms[used], z[used], rcond=None)[0], alike
+
+
+def _surrounds(inside: np.ndarray, alike: np.ndarray, fewest: int) -> bool:
+    """Whether cells lie in enough of the eight directions from the middle of a hole."""
+    middle = [part.mean() for part in np.nonzero(inside)]
+    rows, columns = np.nonzero(alike)
+    angles = np.arctan2(rows - middle[0], columns - middle[1])
+    octants = np.floor((angles + math.pi) * (4 / math.pi)).astype(np.int64) % 8
+    return len(np.unique(octants)) >= fewest
+
+
+# ------------------------------------------------------------------------------------------------
+# Wheel tracks: where the ego and the scene's vehicles drive, drawn on the cells of the ground
+
+EGO_WIDTH_M = 1.9
+WHEEL_SHARE = 0.42  # of a vehicle's width, from its middle to its wheels
+RUT_M, _RIM_M = 0.25, 0.05  # width of a rut, and standard deviation of its rim
+EGO_BEYOND_M, ACTOR_BEYOND_M = 40.0, 15.0  # straight on before the first and after the last pose
+_ROAD_CLASSES = (SemanticClass.ROAD, SemanticClass.LANE_MARKING)
+_OFF_ROAD_M = 0.3  # height over or under the wheels beyond which a cell is no road
+_OFF_KNOWN_ROAD_M = 0.8  # where classes say that it is one
+_STEP_M = 0.5  # poses closer than this say nothing of the direction
+_HEADING_M = 3.0  # stretch of a path that gives the direction of what is added to it
+_AROUND_M = 5.0  # of a grid: so far a path is followed
+_SHIFT = 4  # binary places of cv2's coordinates
+
+
+@dataclass(frozen=True, eq=False)
+class WheelPath:
+    """points_m: float64 [P, 3], where a vehicle's middle passes, on the ground. width_m: its."""
+
+    points_m: np.ndarray
+    width_m: float
+
+
+def wheel_paths(scene: Scene) -> tuple[WheelPath, ...]:
+    """Paths of the ego and of the vehicles that move, each longer than what was recorded."""
+    paths = []
+    if scene.frames:
+        poses = np.stack([frame.world_from_ego.numpy() for frame in scene.frames])
+        ego = _path(poses, EGO_BEYOND_M)
+        ego[:, 2] += _ground_below(scene.background, poses[:, :3, 3])
+        paths.append(WheelPath(ego, EGO_WIDTH_M))
+    for actor in scene.actors:
+        if is_vehicle(actor) and moves(actor):
+            path = _path(actor.track.world_from_actor.numpy(), ACTOR_BEYOND_M)
+            path[:, 2] -= actor.size_m[2] / 2
+            paths.append(WheelPath(path, actor.size_m[1]))
+    return tuple(paths)
+
+
+def draw_tracks(paths: Iterable[WheelPath], surface: Surface, classes: np.ndarray) -> np.ndarray:
+    """float32 [H, W]: 0 to 1, how much of a wheel track each cell of the surface is.
+
+    classes: int16 [H, W], UNKNOWN throughout where the scene has none.
+    """
+    grid, shape = surface.map, surface.can_carry.shape
+    corner = np.array([grid.left_m, grid.bottom_m])
+    size = np.array(shape[::-1]) * grid.cell_m
+    ruts, wheels_m = np.zeros(shape, np.uint8), np.full(shape, np.nan, np.float32)
+    thickness = max(1, round(RUT_M / grid.cell_m))
+    drawn = False
+    for path in paths:
+        low, high = corner - _AROUND_M, corner + size + _AROUND_M
+        for wheels in _wheel_lines(path):
+            for line in _within(wheels, low, high):
+                pixels = _pixels(line, corner, grid.cell_m)
+                cv2.polylines(ruts, [pixels], False, 255, thickness, cv2.LINE_AA, _SHIFT)
+                drawn = True
+        wide = max(1, round((path.width_m + 2 * RUT_M) / grid.cell_m))
+        for line in _within(path.points_m, low, high):
+            pixels = _pixels(line, corner, grid.cell_m)
+            for start in range(len(line) - 1):
+                height = float(line[start : start + 2, 2].mean())
+                ends = [pixels[start : start + 2]]
+                cv2.polylines(wheels_m, ends, False, height, wide, cv2.LINE_8, _SHIFT)
+    if not drawn:
+        return np.zeros(shape, np.float32)
+    strength = ruts.astype(np.float32) * np.float32(min(1.0, RUT_M / grid.cell_m) / 255)
+    if _RIM_M / grid.cell_m > 0.3:
+        strength = cv2.GaussianBlur(strength, (0, 0), _RIM_M / grid.cell_m)
+    known = bool((classes != SemanticClass.UNKNOWN).any())
+    off = _OFF_KNOWN_ROAD_M if known else _OFF_ROAD_M
+    on_road = np.abs(surface.height_m - wheels_m) < off  # false where NaN
+    if known:
+        on_road &= np.isin(classes, _ROAD_CLASSES)
+    return np.where(on_road & surface.can_carry, np.clip(strength, 0, 1), np.float32(0))
+
+
+def _path(poses: np.ndarray, beyond_m: float) -> np.ndarray:
+    """[P, 3]: places of poses [T, 4, 4] at least _STEP_M apart, gone on with at both ends."""
+    points = [poses[0, :3, 3]]
+    for place in poses[1:, :3, 3]:
+        if np.linalg.norm(place - points[-1]) >= _STEP_M:
+            points.append(place)
+    path = np.stack(points)
+    if len(path) == 1:
+        ahead = poses[0, :3, 0]  # stands still: along its own axis
+        back = -ahead
+    else:
+        back, ahead = _heading(path[::-1]), _heading(path)
+    steps = np.arange(1.0, beyond_m + 1)[:, None]
+    return np.concatenate([(path[0] + steps * back)[::-1], path, path[-1] + steps * ahead])
+
+
+def _heading(path: np.ndarray) -> np.ndarray:
+    """Unit direction in which a path leaves its last point."""
+    gaps = np.linalg.norm(path - path[-1], axis=1)
+    far = np.flatnonzero(gaps >= _HEADING_M)
+    direction = path[-1] - path[far[-1] if len(far) else 0]
+    return direction / max(float(np.linalg.norm(direction)), 1e-9)
+
+
+def _ground_below(gaussians: Gaussians, positions: np.ndarray) -> float:
+    """How far under the positions [P, 3] the ground lies (negative), by what is solid near them."""
+    means = gaussians.means.numpy()
+    solid = gaussians.opacities.numpy() > 0.3
+    samples = positions[:: 1 + len(positions) // 32]
+    low, high = samples.min(0) - np.array([1, 1, 3]), samples.max(0) + 1
+    near = means[solid & (means >= low).all(1) & (means <= high).all(1)].astype(np.float64)
+    gaps = []
+    for place in samples:
+        below = near[np.hypot(near[:, 0] - place[0], near[:, 1] - place[1]) < 1.0, 2] - place[2]
+        below = below[(below > -2.5) & (below < 0.5)]
+        if len(below) >= 3:
+            gaps.append(np.median(below))
+    return float(np.median(gaps)) if gaps else 0.0
+
+
+def _wheel_lines(path: WheelPath) -> tuple[np.ndarray, np.ndarray]:
+    """The path moved to the left and to the right wheels."""
+    points = path.points_m
+    along = np.gradient(points[:, :2], axis=0)
+    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
+    aside = np.stack([-along[:, 1], along[:, 0], np.zeros(len(points))], -1)
+    aside *= WHEEL_SHARE * path.width_m
+    return points + aside, points - aside
+
+
+def _within(line: np.ndarray, low: np.ndarray, high: np.ndarray) -> Sequence[np.ndarray]:
+    """Stretches of two points and more between two corners."""
+    inside = np.all((line[:, :2] >= low) & (line[:, :2] <= high), axis=1).reshape(-1)
+    breaks = np.flatnonzero(np.diff(inside.astype(np.int8))) + 1
+    parts = np.split(np.arange(len(line)), breaks)
+    return [line[part] for part in parts if len(part) > 1 and inside[part].all()]
+
+
+def _pixels(line: np.ndarray, corner: np.ndarray, cell_m: float) -> np.ndarray:
+    """int32 [P, 1, 2]: as cv2 draws them, which counts from pixel centres."""
+    pixels = (line[:, :2] - corner) / cell_m - 0.5
+    return np.round(pixels * 2**_SHIFT).astype(np.int32)[:, None]
+
+
+# ---- placement -----------------------------------------------------------------------------------
+
+_SQUARE_CELLS = 1024  # on a side of what is drawn at once, about
+_MARGIN_M, _MARGIN_CELLS = EDGE_CAP_M + 0.2, 4  # drawn about it
+_SEEN_GROWS_CELLS = 2
+_SURELY_BELOW_M = 0.5  # the cameras: there is ground behind what lies there, not sky
+
+
+@dataclass(frozen=True)
+class PlacementSettings:
+    """How a bed is found. cell_m: side of the cells near the path, metres; they double with the
+    distance from it. max_slope_deg: nothing steeper carries snow. estimator: the depth buffer that
+    heights from above are taken from.
+    """
+
+    cell_m: float = 0.05
+    max_slope_deg: float = 50.0
+    estimator: Estimator = "mode"
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.cell_m) and self.cell_m > 0):
+            raise ValueError(f"cell_m must be finite and > 0 (metres); got {self.cell_m}")
+        if not 0 <= self.max_slope_deg < 90:
+            raise ValueError(f"max_slope_deg must be 0 to below 90; got {self.max_slope_deg}")
+        if self.estimator not in ("mode", "expected", "median"):
+            raise ValueError(
+                f"estimator must be 'mode', 'expected' or 'median'; got {self.estimator!r}"
+            )
+
+
+def place_snow_bed(
+    scene: Scene,
+    cameras: Sequence[Camera],
+    settings: PlacementSettings = PlacementSettings(),
+    *,
+    backend: str = AUTO,
+    progress: bool = False,
+) -> SnowBed:
+    """The cells of a scene that snow can lie on and that some of the cameras can see.
+
+    Several threads work on squares of the ground, and any number gives the same bits.
+    Without cameras, or where nothing open is seen, the bed is empty. backend: "cuda" draws and
+    looks on the GPU; any other on the CPU, since the torch definition would take hours. progress:
+    shows a bar.
+
+    Raises:
+        SceneError: metres or gravity are not known, or the cells would take too much memory.
+    """
+    check_metric_and_level(scene)
+    if backend != CUDA:
+        backend = AUTO
+    clock = _Clock()
+    views = views_along(cameras)
+    background = plain_gaussians(scene.background)
+    plan = plan_tiles(views, settings.cell_m, _heights(scene))
+    plan.check_size()
+    clock.lap("plan")
+    vehicles = [actor for actor in scene.actors if is_vehicle(actor)]
+    squares = [
+        (level, window)
+        for level in range(int(plan.levels.max()) + 1)
+        for window in plan.squares(level, _SQUARE_CELLS)
+    ]
+    if not squares:
+        return SnowBed(_no_cells(), {}, clock.seconds)
+    parked = tuple(_parked(scene))
+    with tqdm(
+        total=len(views) + len(squares) + len(vehicles),
+        desc="placing snow",
+        disable=not progress,
+        unit="step",
+    ) as bar:
+        seen_from = draw_views(
+            views,
+            [PosedGaussians(background), *parked],
+            backend=backend,
+            after_each=lambda: bar.update(),
+        )
+        clock.lap("views")
+        paths = wheel_paths(scene)
+        work = _Ground(background, parked, plan, views, seen_from, paths, settings, backend)
+        clock.lap("plan")
+        found = in_order(work.find, squares, after_each=bar.update)
+        clock.share_lap([square.seconds for square in found])
+        on_vehicles = in_order(
+            lambda actor: find_actor_cells(
+                actor,
+                cell_m=settings.cell_m,
+                max_slope_deg=settings.max_slope_deg,
+                estimator=settings.estimator,
+                backend=backend,
+            ),
+            vehicles,
+            after_each=bar.update,
+        )
+        actors = {
+            actor.track_id: cells
+            for actor, cells in zip(vehicles, on_vehicles, strict=True)
+            if cells is not None
+        }
+        clock.lap("actors")
+    ground = work.joined(found)
+    clock.lap("join")
+    return SnowBed(ground, actors, clock.seconds)
+
+
+class _Clock:
+    """Adds up the seconds between laps by name."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._last = time.perf_counter()
+
+    def lap(self, name: str) -> None:
+        now = time.perf_counter()
+        self.seconds[name] = self.seconds.get(name, 0.0) + now - self._last
+        self._last = now
+
+    def share_lap(self, stages: Sequence[Mapping[str, float]]) -> None:
+        """End a lap of several threads: its seconds go to stages as those of the threads did."""
+        sums: dict[str, float] = {}
+        for each in stages:
+            for name, seconds in each.items():
+                sums[name] = sums.get(name, 0.0) + seconds
+        now = time.perf_counter()
+        share = (now - self._last) / max(sum(sums.values()), 1e-9)
+        self.seconds |= {name: share * seconds for name, seconds in sums.items()}
+        self._last = now
+
+
+@dataclass(frozen=True, eq=False)
+class _Square:
+    """A level's window with its margin. window: with it. inner: bool, cells of the window itself in
+    tiles of the level. own: bool, cells of the level's tiles, margin included.
+    """
+
+    level: int
+    window: Window
+    inner: np.ndarray
+    own: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """Cells of a level's window; None where it has none. columns, rows: int64 [C], counted from the
+    plan's origin. seconds: what finding them took, by stage.
+    """
+
+    level: int
+    columns: np.ndarray
+    rows: np.ndarray
+    cells: CellList | None
+    seconds: Mapping[str, float]
+
+
+class _Ground:
+    """Finds the background's cells, square by square: several at once, as each is by itself."""
+
+    def __init__(
+        self,
+        background: Gaussians,
+        parked: tuple[PosedGaussians, ...],
+        plan: TilePlan,
+        cameras: Sequence[Camera],
+        views: Views,
+        paths: tuple[WheelPath, ...],
+        settings: PlacementSettings,
+        backend: str,
+    ) -> None:
+        self._background, self._parked, self._plan = background, parked, plan
+        self._views, self._paths, self._settings = views, paths, settings
+        self._backend = backend
+        self._classes = classes_of(background)
+        self._footprints, self._parked_top_m = Footprints(background), top_of(parked)
+        self._path = path_points(cameras)
+
+    def find(self, level_and_window: tuple[int, Window]) -> _Found:
+        """The cells of one window of a level."""
+        clock = _Clock()
+        square = _with_margin(self._plan, *level_and_window)
+        view, classes, lies, filled = self._draw(square)
+        clock.lap("above")
+        surface = find_surface(view, lies, max_slope_deg=self._settings.max_slope_deg)
+        clock.lap("surface")
+        seen = self._seen(surface, square, filled)
+        clock.lap("seen")
+        rows, columns = np.nonzero(surface.can_carry & seen & square.inner)
+        cells = None
+        if len(rows):
+            cells = cells_at(
+                surface,
+                rows,
+                columns,
+                sides=_sides(surface, seen & square.own),
+                luminance=ground_luminance(view, classes, surface.can_carry),
+                tracks=draw_tracks(self._paths, surface, classes),
+                banks=banks_of(surface),
+                classes=classes,
+            )
+        clock.lap("ground")
+        return _Found(
+            square.level,
+            columns.astype(np.int64) + square.window.left,
+            rows.astype(np.int64) + square.window.bottom,
+            cells,
+            clock.seconds,
+        )
+
+    def joined(self, found: Sequence[_Found]) -> SnowCells:
+        """All those cells, one square's after another's, linked across squares."""
+        numbers, lists, count = CellNumbers(self._plan), [], 0
+        for square in found:
+            if square.cells is None:
+                continue
+            to = count + np.arange(len(square.cells), dtype=np.int32)
+            numbers.put(square.level, square.columns, square.rows, to)
+            lists.append(square.cells)
+            count += len(square.cells)
+        if not lists:
+            return _no_cells()
+        cells = CellList.joined(lists)
+        light = relative_light(cells.luminance, cells.semantic)
+        return make_cells(cells, light, numbers, self._background)
+
+    def _draw(self, square: _Square) -> tuple[HeightMap, np.ndarray, np.ndarray, np.ndarray]:
+        """The square from above, its classes, where what is seen is of the background and no
+        wall on edge, and where it closes a hole.
+        """
+        plan, window = self._plan, square.window
+        cell = plan.size_m(square.level)
+        corner = (
+            plan.origin_m[0] + window.left * cell,
+            plan.origin_m[1] + window.bottom * cell,
+        )
+        shape = (window.height, window.width)
+        far = (corner[0] + window.width * cell, corner[1] + window.height * cell)
+        near, chosen = self._background, None
+        if self._backend != CUDA:  # where all of them lie already
+            chosen = self._footprints.in_box(np.array(corner), np.array(far))
+            if 2 * len(chosen) < len(near):
+                near = near.select(torch.from_numpy(chosen))
+            else:  # a copy would take longer than what lies outside
+                chosen = None
+        margin = _margin(cell)
+        around = np.ones((2 * margin + 1, 2 * margin + 1), np.uint8)
+        wanted = cv2.dilate(square.inner.astype(np.uint8), around).astype(bool)
+        view = draw_from_above(
+            [PosedGaussians(near), *self._parked],
+            corner_m=corner,
+            cell_m=cell,
+            shape=shape,
+            estimator=self._settings.estimator,
+            wanted=wanted,
+            top_m=max(self._footprints.top_m(chosen), self._parked_top_m),
+            backend=self._backend,
+        )
+        is_ground = (view.ids >= 0) & (view.ids < len(near))
+        classes = np.full(shape, SemanticClass.UNKNOWN, np.int16)
+        ids = view.ids[is_ground]
+        classes[is_ground] = self._classes[ids if chosen is None else chosen[ids]]
+        lies = is_ground & ~view.is_thin
+        narrow = narrow_things(view, lies)
+        view, filled = fill_holes(view, classes, lies, narrow, wanted, self._path[:, :2])
+        return view, classes, lies | filled, filled
+
+    def _seen(self, surface: Surface, square: _Square, filled: np.ndarray) -> np.ndarray:
+        """bool [H, W]: cells that can carry snow which some camera sees, and those next to them.
+
+        filled: bool [H, W], cells of closed holes, which no camera can show.
+        """
+        rows, columns = np.nonzero(surface.can_carry)
+        x, y = surface.map.centers()
+        points = np.stack([x[columns], y[rows], surface.height_m[rows, columns]], 1)
+        normals = normals_of(surface.slopes[rows, columns])
+        low, high = np.array([x[0], y[0]]), np.array([x[-1], y[-1]])
+        views = self._views.near(low, high, RINGS_M[-1])
+        seen = np.zeros(surface.can_carry.shape, np.uint8)
+        is_low = points[:, 2] < views.lowest_m - _SURELY_BELOW_M
+        seen[rows, columns] = views.see(points, normals, filled[rows, columns] | is_low)
+        side = 2 * _SEEN_GROWS_CELLS + 1
+        return cv2.dilate(seen, np.ones((side, side), np.uint8)).astype(bool)
+
+
+def _with_margin(plan: TilePlan, level: int, window: Window) -> _Square:
+    margin = _margin(plan.size_m(level))
+    wide = Window(
+        window.left - margin,
+        window.bottom - margin,
+        window.width + 2 * margin,
+        window.height + 2 * margin,
+    )
+    own = plan.is_level(level, wide)
+    inner = np.zeros_like(own)
+    inner[margin:-margin, margin:-margin] = own[margin:-margin, margin:-margin]
+    return _Square(level, wide, inner, own)
+
+
+def _margin(cell_m: float) -> int:
+    return max(_MARGIN_CELLS, math.ceil(_MARGIN_M / cell_m))
+
+
+def _sides(surface: Surface, has_cells: np.ndarray) -> np.ndarray:
+    """int8 [H, W, 4]: as SnowCells.neighbours, with LINK where a cell follows. The same surface
+    that has no cells there, for want of a camera that sees it or because others cover it, is FLUSH.
+    """
+    sides = np.where(surface.sides == RISES, np.int8(FLUSH), surface.sides)
+    has = np.pad(has_cells & surface.can_carry, 1)
+    following = np.stack([has[1:-1, :-2], has[1:-1, 2:], has[:-2, 1:-1], has[2:, 1:-1]], -1)
+    return np.where((sides == LINK) & ~following, np.int8(FLUSH), sides)
+
+
+def _parked(scene: Scene) -> list[PosedGaussians]:
+    """Actors that stand still, where they stand halfway through their track; the background's
+    snow lies beside them.
+    """
+    parts = []
+    for number, actor in enumerate(scene.actors, start=1):
+        if actor.label == EGO_VEHICLE or moves(actor) or len(actor.gaussians) == 0:
+            continue
+        poses = actor.track.world_from_actor
+        parts.append(
+            PosedGaussians(plain_gaussians(actor.gaussians), poses[len(poses) // 2], number)
+        )
+    return parts
+
+
+def _heights(scene: Scene) -> tuple[float, float]:
+    """Lowest and highest z of anything in the background."""
+    z = scene.background.means[:, 2]
+    if len(z) == 0:
+        return 0.0, 0.0
+    return float(z.min()), float(z.max())
+
+
+def _no_cells() -> SnowCells:
+    return make_cells(
+        CellList.empty(),
+        np.zeros(0, np.float32),
+        CellNumbers(plan_tiles([], 1.0, (0.0, 0.0))),
+        _NOBODY,
+    )
+
+
+_NOBODY = Gaussians.empty()
+
+__all__ = ["PlacementSettings", "SceneError", "place_snow_bed"]

@@ -1,0 +1,242 @@
+"""Beds found once: remembered for as long as the scene lives, and kept in a folder."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+from weakref import WeakKeyDictionary
+
+import numpy as np
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+from augment.cameras import Camera
+from augment.effects.snow.cells import FLUSH, SnowBed, SnowCells
+from augment.effects.snow.placement import PlacementSettings, place_snow_bed
+from augment.errors import SceneError
+from augment.jobs.atomic import write_atomic
+from augment.render.buffers import AUTO, CUDA
+from augment.scene import Gaussians, Scene
+
+# ---- Beds as files: what was found once is found again by the content it was found from ----------
+
+# Raised whenever the same scene would give another bed, or a file hold it otherwise.
+FORMAT = "climategs-snow-bed-5"
+_ABOUT = "snow_bed"
+_DTYPES = {
+    "neighbours": torch.int32,
+    "semantic": torch.int16,
+    "buried": torch.int32,
+    "buried_by": torch.int32,
+}
+_COLUMNS = {"centers_m": 3, "normals": 3, "neighbours": 4, "banks": 2, "buried_by": 5}
+
+
+def bed_key(
+    scene: Scene,
+    cameras: Sequence[Camera],
+    settings: PlacementSettings,
+    *,
+    backend: str = AUTO,
+) -> str:
+    """Hex digest of all that a bed depends on: Gaussians, tracks, cameras, poses, settings, what
+    places it (the GPU rounds otherwise than the CPU), and the version of this code. Of colours,
+    what all directions share. Order of the cameras counts.
+    """
+    digest = hashlib.blake2b(FORMAT.encode(), digest_size=20)
+    if backend == CUDA:
+        digest.update(CUDA.encode())
+    digest.update(repr((settings.cell_m, settings.max_slope_deg, settings.estimator)).encode())
+    _add_gaussians(digest, scene.background)
+    for actor in scene.actors:
+        digest.update(repr((actor.track_id, actor.label, actor.size_m)).encode())
+        _add_gaussians(digest, actor.gaussians)
+        _add(digest, actor.track.timestamps_ns)
+        _add(digest, actor.track.world_from_actor)
+    for camera in cameras:
+        numbers = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+        about = (camera.name, *numbers, camera.timestamp_ns, camera.is_orthographic)
+        digest.update(repr(about).encode())
+        _add(digest, camera.camera_from_world)
+    for frame in scene.frames:
+        _add(digest, frame.world_from_ego)
+    return digest.hexdigest()
+
+
+def save_bed(path: Path, bed: SnowBed, key: str) -> None:
+    """Write a bed, as a whole or not at all; its bytes are those of its content. Seconds are not
+    kept.
+
+    Raises:
+        OutputError: the system refused (disk full, no permission ...); `path` is then as it was.
+    """
+    tensors = _named("ground", bed.ground)
+    for number, cells in enumerate(bed.actors.values()):
+        tensors |= _named(f"actors.{number}", cells)
+    about = {"format": FORMAT, "key": key, "track_ids": list(bed.actors)}
+    # A single entry: several are written in any order.
+    write_atomic(path, save(tensors, metadata={_ABOUT: json.dumps(about, sort_keys=True)}))
+
+
+def load_bed(path: Path, key: str) -> SnowBed:
+    """The bed of a file.
+
+    Raises:
+        SceneError: there is no such file, it is damaged or no bed's, or it was made from something
+            else than `key` says.
+    """
+    try:
+        with safe_open(path, framework="pt") as file:
+            about = json.loads((file.metadata() or {}).get(_ABOUT, "{}"))
+            _check_about(path, about, key)
+            track_ids = about["track_ids"]
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        actors = {
+            track_id: _cells(path, tensors, f"actors.{number}")
+            for number, track_id in enumerate(track_ids)
+        }
+        return SnowBed(_cells(path, tensors, "ground"), actors)
+    except FileNotFoundError as error:
+        raise SceneError(f"{path}: no such file, so no snow bed to read") from error
+    except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
+        raise SceneError(
+            f"{path} is damaged or no snow bed ({type(error).__name__}: {error}); delete it, and "
+            f"it is made anew"
+        ) from error
+
+
+def _check_about(path: Path, about: Any, key: str) -> None:
+    if not isinstance(about, dict):
+        about = {}
+    if about.get("format") != FORMAT:
+        raise SceneError(
+            f"{path} is no snow bed of this version: its format is {about.get('format')!r}, "
+            f"expected {FORMAT!r}; delete it, and it is made anew"
+        )
+    if about.get("key") != key:
+        raise SceneError(
+            f"{path} is the snow bed of something else: its key is {about.get('key')!r}, expected "
+            f"{key!r}; the scene, the cameras or the settings have changed since"
+        )
+
+
+def _named(part: str, cells: SnowCells) -> dict[str, Tensor]:
+    return {
+        f"{part}.{field.name}": getattr(cells, field.name).contiguous().clone()
+        for field in fields(SnowCells)
+    }
+
+
+def _cells(path: Path, tensors: Mapping[str, Tensor], part: str) -> SnowCells:
+    """The cells of one part, after a look at every shape and at every number that is an index."""
+    found = {field.name: tensors[f"{part}.{field.name}"] for field in fields(SnowCells)}
+    counts = {"cell": len(found["sizes_m"]), "buried": len(found["buried"])}
+    for name, tensor in found.items():
+        rows = counts["buried" if name.startswith("buried") else "cell"]
+        shape = (rows, _COLUMNS[name]) if name in _COLUMNS else (rows,)
+        dtype = _DTYPES.get(name, torch.float32)
+        if tuple(tensor.shape) != shape or tensor.dtype != dtype:
+            raise ValueError(
+                f"{part}.{name} must be {dtype} {list(shape)}; got {tensor.dtype} "
+                f"{list(tensor.shape)}"
+            )
+    limits = {"neighbours": FLUSH, "buried_by": -1}
+    for name, least in limits.items():
+        values = found[name]
+        if values.numel() and not least <= int(values.min()) <= int(values.max()) < counts["cell"]:
+            raise ValueError(f"{part}.{name} names cells that are not there")
+    if counts["buried"] and int(found["buried"].min()) < 0:
+        raise ValueError(f"{part}.buried names Gaussians that are not there")
+    return SnowCells(**found)
+
+
+def _add_gaussians(digest: hashlib.blake2b, gaussians: Gaussians) -> None:
+    for name in ("means", "quats", "scales", "opacities"):
+        _add(digest, getattr(gaussians, name))
+    _add(digest, gaussians.sh[:, 0])
+    if gaussians.semantic is not None:
+        _add(digest, gaussians.semantic)
+
+
+def _add(digest: hashlib.blake2b, tensor: Tensor) -> None:
+    array = np.ascontiguousarray(tensor.detach().numpy())
+    digest.update(repr((array.shape, array.dtype.str)).encode())
+    digest.update(array.view(np.uint8).data if array.size else b"")
+
+
+# ---- beds ----------------------------------------------------------------------------------------
+
+logger = logging.getLogger(__name__)
+
+_remembered: WeakKeyDictionary[Scene, dict[PlacementSettings, SnowBed]] = WeakKeyDictionary()
+
+
+def bed_of(
+    scene: Scene,
+    settings: PlacementSettings,
+    *,
+    cameras: Sequence[Camera] | None = None,
+    folder: Path | None = None,
+    backend: str = AUTO,
+    progress: bool = False,
+) -> SnowBed:
+    """The bed of a scene: remembered, else read from the folder, else placed and written there.
+
+    cameras: those that must see the snow; None for all of the scene's. Only the bed of all cameras
+    is remembered under the settings alone; `remember_bed` gives that place to another.
+    folder: beds are kept there as snow-<key>.safetensors. A file that cannot be used is replaced,
+    with a warning. backend: that places what is not remembered yet, see place_snow_bed; a scene has
+    one bed, so that its pictures, sweeps and labels agree.
+
+    Raises:
+        SceneError: as place_snow_bed.
+        OutputError: the folder cannot be written.
+    """
+    found = _remembered.get(scene, {}).get(settings)
+    if found is not None:
+        return found
+    seeing = cameras
+    if seeing is None:
+        seeing = [camera for frame in scene.frames for camera in frame.cameras.values()]
+    bed = _kept(scene, seeing, settings, folder, backend, progress)
+    remember_bed(scene, settings, bed)
+    return bed
+
+
+def remember_bed(scene: Scene, settings: PlacementSettings, bed: SnowBed) -> None:
+    """Make `bed_of` give this bed for the scene and the settings from now on."""
+    _remembered.setdefault(scene, {})[settings] = bed
+
+
+def bed_path(folder: Path, key: str) -> Path:
+    """Where the bed of a key is kept in a folder."""
+    return folder / f"snow-{key}.safetensors"
+
+
+def _kept(
+    scene: Scene,
+    cameras: Sequence[Camera],
+    settings: PlacementSettings,
+    folder: Path | None,
+    backend: str,
+    progress: bool,
+) -> SnowBed:
+    if folder is None:
+        return place_snow_bed(scene, cameras, settings, backend=backend, progress=progress)
+    key = bed_key(scene, cameras, settings, backend=backend)
+    path = bed_path(folder, key)
+    if path.exists():
+        try:
+            return load_bed(path, key)
+        except SceneError as error:
+            logger.warning("the snow of %s is placed anew: %s", scene.name, error)
+    bed = place_snow_bed(scene, cameras, settings, backend=backend, progress=progress)
+    save_bed(path, bed, key)
+    return bed

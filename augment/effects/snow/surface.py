@@ -1,0 +1,607 @@
+"""Where on a height map snow can lie: slopes, what hangs together, edges, obstacles beside."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Protocol, runtime_checkable
+
+import cv2
+import numpy as np
+import torch
+
+from augment.effects.snow import surface_kernels
+from augment.effects.snow.cells import EDGE_CAP_M, FLUSH, SnowCells
+from augment.effects.snow.height_map import (
+    Estimator,
+    HeightMap,
+    classes_of,
+    draw_from_above,
+    in_box,
+    in_order,
+    plain_gaussians,
+    slices_of,
+)
+from augment.effects.snow.surface_kernels import LINK, RISES
+from augment.geometry import rotmat_from_quat
+from augment.labels import EGO_VEHICLE
+from augment.render.buffers import AUTO
+from augment.render.threads import kernel_threads
+from augment.scene import Actor, Gaussians, PosedGaussians
+from augment.semantics import SemanticClass, class_of_label
+
+# ---- surface -------------------------------------------------------------------------------------
+
+STEP_M = 0.25  # lower steps do not break a layer: kerbs
+_AROUND_M = 0.4  # of a cell: steps are told by the heights within
+_NARROW_M, _HIGH_M = 0.4, 1.5  # what is so narrow and so high carries nothing: wires, arms of lamps
+_HIGH_M2 = 0.6  # smaller patches so high up are ledges, and what floats before walls
+_GAP_M = 0.6  # wider gaps may be deep
+_STANDS_OUT_M = 0.1  # of a surface, so that it is not bridged
+LEAST_AREA_M2, LEAST_CELLS = 0.05, 4  # smaller patches are specks
+POCKET_M2, _POCKET_STEP_M, _POCKET_CELLS = 0.1, 0.3, 1.5  # gaps that are closed
+OBSTACLE_M, _BANK_REACH_M, _BANK_SPREAD_M = 0.4, 1.0, 0.35
+_MEDIAN_M, _SMOOTH_M = 0.1, 0.15  # scales of smoothing; one cell at least
+_SLACK_M, _SMOOTHED_BY_M = 0.05, 0.02
+_STEEPER_RAD, _STEEPEST_RAD = math.radians(8), math.radians(80)
+_ROWS = 8  # grid rows a thread takes at a time
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """What lies highest, on the grid of a height map [H, W].
+
+    height_m: float32, without the noise of single cells. slopes: float32 [H, W, 2], dz/dx, dz/dy.
+    can_carry: bool, snow stays there. sides: int8 [H, W, 4], see surface_kernels.compare_sides.
+    edge_m: float32, see SnowCells.
+    """
+
+    map: HeightMap
+    height_m: np.ndarray
+    slopes: np.ndarray
+    can_carry: np.ndarray
+    sides: np.ndarray
+    edge_m: np.ndarray
+
+
+def find_surface(
+    height_map: HeightMap,
+    may_carry: np.ndarray,
+    *,
+    max_slope_deg: float,
+    least_area_m2: float = LEAST_AREA_M2,
+    floor_m: float | None = None,
+) -> Surface:
+    """The surface of a map, and where snow stays on it.
+
+    may_carry: bool [H, W]; where it is false nothing is put, whatever lies there. Patches that end
+    within the map and are smaller than least_area_m2 or LEAST_CELLS carry nothing. floor_m: how
+    high that lies which the map does not show; None for deep but in small gaps.
+    """
+    cell, covered = height_map.cell_m, height_map.covered.copy()
+    shape = covered.shape
+    smooth, fitted = np.empty(shape, np.float32), np.empty(shape, np.float32)
+    slopes, good = np.empty((*shape, 2), np.float32), np.empty(shape, bool)
+    limit = math.radians(max_slope_deg)
+    with kernel_threads(_ROWS):
+        surface_kernels.median_heights(
+            height_map.height_m, covered, int(np.clip(round(_MEDIAN_M / cell), 1, 3)), smooth
+        )
+        surface_kernels.fit_planes(
+            smooth,
+            covered,
+            int(np.clip(round(_SMOOTH_M / cell), 1, 5)),
+            cell,
+            _SLACK_M,
+            math.tan(min(limit + _STEEPER_RAD, _STEEPEST_RAD)),
+            _SMOOTHED_BY_M,
+            fitted,
+            slopes,
+            good,
+        )
+    floor = _floor(fitted, covered & may_carry, cell) if floor_m is None else np.float32(floor_m)
+    lowest, rises = _rises(fitted, covered, floor, cell)
+    steep = np.hypot(slopes[..., 0], slopes[..., 1]) > math.tan(limit)
+    can_carry = good & may_carry & ~_is_narrow(fitted, covered & may_carry, floor, cell)
+    can_carry &= ~(steep & (rises > _highest_step(limit, cell)))
+    step = max(STEP_M, math.tan(limit) * cell)
+    sides = _compare(fitted, lowest, covered, can_carry, step)
+    least = max(LEAST_CELLS, math.ceil(least_area_m2 / cell**2))
+    is_high = fitted - lowest > _HIGH_M
+    can_carry &= ~_specks(can_carry, sides, is_high, least, max(least, round(_HIGH_M2 / cell**2)))
+    filled = _fill_pockets(fitted, slopes, can_carry, covered, cell)
+    can_carry |= filled
+    covered |= filled
+    sides = _compare(fitted, lowest, covered, can_carry, step)
+    edges = np.empty(shape, np.float32)
+    with kernel_threads(_ROWS):
+        surface_kernels.edge_distances(can_carry, sides, max(EDGE_CAP_M / cell, 0.5), edges)
+    return Surface(height_map, fitted, slopes, can_carry, sides, edges * np.float32(cell))
+
+
+def narrow_things(height_map: HeightMap, may_carry: np.ndarray) -> np.ndarray:
+    """bool [H, W]: what stands high and is so narrow that snow falls past it: lamps, wires."""
+    solid = height_map.covered & may_carry
+    floor = _floor(height_map.height_m, solid, height_map.cell_m)
+    return _is_narrow(height_map.height_m, solid, floor, height_map.cell_m)
+
+
+def banks_of(surface: Surface) -> np.ndarray:
+    """float32 [H, W, 2]: see SnowCells.banks. 0 on what is itself an obstacle."""
+    cell, covered = surface.map.cell_m, surface.map.covered
+    low = np.where(covered, surface.height_m, np.float32(np.inf))
+    reach = max(1, round(_BANK_REACH_M / cell))
+    lowest = cv2.erode(low, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8))
+    obstacle = covered & (surface.height_m - lowest > OBSTACLE_M)
+    if not obstacle.any():
+        return np.zeros((*covered.shape, 2), np.float32)
+    sigma = max(_BANK_SPREAD_M / cell, 0.5)
+    blurred = cv2.GaussianBlur(
+        obstacle.astype(np.float32), (0, 0), sigma, borderType=cv2.BORDER_REPLICATE
+    )
+    banks = np.stack(_gradient(blurred), -1) * np.float32(sigma * math.sqrt(2 * math.pi))
+    length = np.hypot(banks[..., 0], banks[..., 1])
+    banks /= np.maximum(length, 1)[..., None]
+    banks[obstacle | ~surface.can_carry] = 0
+    return banks
+
+
+def normals_of(slopes: np.ndarray) -> np.ndarray:
+    """Upward unit normals [..., 3] of slopes [..., 2]."""
+    normals = np.concatenate([-slopes, np.ones_like(slopes[..., :1])], -1)
+    return normals / np.sqrt((normals * normals).sum(-1, keepdims=True))
+
+
+def _floor(height: np.ndarray, solid: np.ndarray, cell: float) -> np.ndarray:
+    """How high what is not known may lie, [H, W]: in gaps up to _GAP_M wide as high as the lowest
+    about them, else deep.
+    """
+    size = 2 * max(1, round(_GAP_M / 2 / cell)) + 1
+    around = np.ones((size, size), np.uint8)
+    gaps = cv2.morphologyEx(solid.astype(np.uint8), cv2.MORPH_CLOSE, around) > 0
+    lowest = cv2.erode(np.where(solid, height, np.float32(1e6)), around)
+    return np.where(gaps & (lowest < 1e6), lowest, np.float32(-1e6))
+
+
+def _rises(
+    height: np.ndarray, covered: np.ndarray, floor: np.ndarray | np.float32, cell: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Least height within _AROUND_M of each cell, and range of the heights that are known, [H, W];
+    the latter means nothing where none is.
+    """
+    reach = max(1, round(_AROUND_M / cell))
+    around = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
+    lowest_known = cv2.erode(np.where(covered, height, np.float32(1e6)), around)
+    highest_known = cv2.dilate(np.where(covered, height, np.float32(-1e6)), around)
+    lowest = cv2.erode(np.where(covered, height, floor), around)
+    return lowest, highest_known - lowest_known
+
+
+def _is_narrow(
+    height: np.ndarray, solid: np.ndarray, floor: np.ndarray | np.float32, cell: float
+) -> np.ndarray:
+    """bool [H, W]: what stands higher than _HIGH_M above what is on both sides of it, _NARROW_M or
+    three cells apart.
+    """
+    size = max(3, round(_NARROW_M / cell))  # a wall between two cells shows in both
+    around = np.ones((size, size), np.uint8)
+    before, after = (size - 1) // 2, size - 1 - (size - 1) // 2  # an even square has no middle
+    known = np.where(solid, height, floor)
+    lowest = cv2.erode(known, around, anchor=(before, before), borderType=cv2.BORDER_REPLICATE)
+    opened = cv2.dilate(lowest, around, anchor=(after, after), borderType=cv2.BORDER_REPLICATE)
+    return solid & (height - opened > _HIGH_M)
+
+
+def _highest_step(limit: float, cell: float) -> float:
+    """What is steeper than the limit is a low step, not a slope, where heights around it differ by
+    no more than this, metres. A slope as steep as the limit may differ by less.
+    """
+    return min(STEP_M, 2 * max(_AROUND_M, cell) * math.tan(limit))
+
+
+def _compare(
+    height: np.ndarray,
+    lowest: np.ndarray,
+    covered: np.ndarray,
+    can_carry: np.ndarray,
+    step: float,
+) -> np.ndarray:
+    sides = np.empty((*height.shape, 4), np.int8)
+    with kernel_threads(_ROWS):
+        surface_kernels.compare_sides(height, lowest, covered, can_carry, step, sides)
+    return sides
+
+
+def _specks(
+    can_carry: np.ndarray, sides: np.ndarray, is_high: np.ndarray, least: int, least_high: int
+) -> np.ndarray:
+    """bool [H, W]: cells in patches of fewer than `least` linked cells that end within the grid;
+    of fewer than `least_high` where all of them are high above something beside.
+
+    cv2 finds patches of pixels; links become pixels between those of the cells.
+    """
+    rows, columns = can_carry.shape
+    pixels = np.zeros((2 * rows - 1, 2 * columns - 1), np.uint8)
+    pixels[::2, ::2] = can_carry
+    right, up = sides[..., 1] == LINK, sides[..., 3] == LINK
+    pixels[::2, 1::2] = can_carry[:, :-1] & right[:, :-1] & can_carry[:, 1:]
+    pixels[1::2, ::2] = can_carry[:-1] & up[:-1] & can_carry[1:]
+    count, labels = cv2.connectedComponents(pixels, connectivity=4)
+    labels = labels[::2, ::2]
+    labels = labels.astype(np.int64)
+    sizes = np.bincount(labels.ravel(), minlength=count)
+    low = np.bincount(labels[can_carry & ~is_high], minlength=count)
+    for border in (labels[0], labels[-1], labels[:, 0], labels[:, -1]):
+        sizes[border] = least_high  # it may go on outside
+    return sizes[labels] < np.where(low > 0, least, least_high)[labels]
+
+
+def _fill_pockets(
+    height: np.ndarray, slopes: np.ndarray, can_carry: np.ndarray, covered: np.ndarray, cell: float
+) -> np.ndarray:
+    """bool [H, W]: small gaps in a surface, which snow bridges; their heights and slopes are put
+    in as those around. What stands out of the surface, or lies between two levels, is no gap.
+    """
+    count, labels = cv2.connectedComponents((~can_carry).astype(np.uint8), connectivity=4)
+    labels = labels.astype(np.int64)
+    is_pocket = np.bincount(labels.ravel(), minlength=count) <= max(1, POCKET_M2 / cell**2)
+    for border in (labels[0], labels[-1], labels[:, 0], labels[:, -1]):
+        is_pocket[border] = False  # it may go on outside
+    is_pocket[labels[can_carry]] = False
+    around = np.ones((7, 7), np.uint8)
+    highest = cv2.dilate(np.where(can_carry, height, np.float32(-np.inf)), around)
+    lowest = cv2.erode(np.where(can_carry, height, np.float32(np.inf)), around)
+    inside = is_pocket[labels]
+    with np.errstate(invalid="ignore", over="ignore"):  # far from any surface both are infinite
+        broken = inside & ~(highest - lowest < _POCKET_STEP_M)
+    broken |= inside & covered & (height - highest > _STANDS_OUT_M)
+    is_pocket[labels[broken]] = False
+    filled = is_pocket[labels]
+    if not filled.any():
+        return filled
+    weights = can_carry.astype(np.float32)
+    total = cv2.GaussianBlur(weights, (0, 0), _POCKET_CELLS)
+    for values in (height, slopes[..., 0], slopes[..., 1]):
+        mean = cv2.GaussianBlur(values * weights, (0, 0), _POCKET_CELLS)
+        values[filled] = mean[filled] / total[filled]
+    return filled
+
+
+def _gradient(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Differences to +x and +y, a cell; 0 beyond the borders."""
+    padded = np.pad(values, 1, mode="edge")
+    half = np.float32(0.5)
+    return (
+        (padded[1:-1, 2:] - padded[1:-1, :-2]) * half,
+        (padded[2:, 1:-1] - padded[:-2, 1:-1]) * half,
+    )
+
+
+# ---- Which Gaussians are the surface that snow lies on: it hides them where it is deep enough ----
+
+BELOW_M, ABOVE_M = 0.5, 0.08  # of the bed; above, half a cell at least
+FACING_RAD = math.radians(40)  # between a flat Gaussian's normal and the bed's
+_FLAT = 0.5  # shortest axis over the next, of a flat Gaussian
+_SMALL_M, _SMALL_BELOW_M = 0.06, 0.15  # what is small and just beneath goes whichever way it faces
+_INLAND_M = 0.15  # but not near an open edge, where it may be a wall's top
+_SIGMAS = 1.5
+
+
+@runtime_checkable
+class NumbersCells(Protocol):
+    """Tells which cell is under a point."""
+
+    def at(self, xy: np.ndarray) -> np.ndarray:
+        """int32 [P]: numbers of the cells under points float64 [P, 2], -1 where there is none."""
+        ...
+
+
+def find_buried(
+    gaussians: Gaussians,
+    numbers: NumbersCells,
+    *,
+    centers_m: np.ndarray,
+    normals: np.ndarray,
+    sizes_m: np.ndarray,
+    edge_m: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """buried int32 [B] and buried_by int32 [B, 5], see SnowCells; only such as can be hidden.
+
+    centers_m float64 [C, 3], normals [C, 3], sizes_m [C], edge_m [C]: of the cells.
+    """
+    found = []
+    if len(centers_m):
+        cells = (centers_m, normals, sizes_m, edge_m)
+        parts = slices_of(len(gaussians))
+        found = in_order(lambda part: _find_part(gaussians, numbers, part, *cells), parts)
+    return (
+        np.concatenate([np.zeros(0, np.int32), *(buried for buried, _ in found)]),
+        np.concatenate([np.zeros((0, 5), np.int32), *(by for _, by in found)]),
+    )
+
+
+def _find_part(
+    gaussians: Gaussians,
+    numbers: NumbersCells,
+    part: slice,
+    centers_m: np.ndarray,
+    normals: np.ndarray,
+    sizes_m: np.ndarray,
+    edge_m: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """As find_buried, of part of the Gaussians: of so few that what is found lies in the caches."""
+    means = gaussians.means[part].numpy().astype(np.float64)
+    under = numbers.at(means[:, :2])
+    index = np.flatnonzero(under >= 0)
+    cell = under[index]
+    offset = means[index] - centers_m[cell]
+    rise = (offset * normals[cell]).sum(1) / normals[cell, 2]  # above the cell's plane, along z
+    near = (rise > -BELOW_M) & (rise < np.maximum(ABOVE_M, sizes_m[cell] / 2))
+    index, cell, rise = index[near], cell[near], rise[near]
+    rows = torch.from_numpy(index)
+    axes = rotmat_from_quat(gaussians.quats[part][rows]).numpy()  # columns: the axes
+    scales = gaussians.scales[part][rows].numpy()
+    order = np.argsort(scales, axis=1, kind="stable")
+    axes = np.take_along_axis(axes, order[:, None, :], 2)
+    scales = np.take_along_axis(scales, order, 1)
+    facing = np.abs((axes[..., 0] * normals[cell]).sum(1)) >= math.cos(FACING_RAD)
+    flat = scales[:, 0] <= _FLAT * scales[:, 1]
+    small = (scales[:, 2] < _SMALL_M) & (rise > -_SMALL_BELOW_M) & (edge_m[cell] >= _INLAND_M)
+    lies = (flat & facing) | small
+    index, cell, axes, scales = index[lies], cell[lies], axes[lies], scales[lies]
+    over = [cell]
+    for axis in (2, 1):
+        for sign in (1, -1):
+            reach = sign * _SIGMAS * scales[:, axis, None] * axes[:, :2, axis]
+            over.append(numbers.at(means[index, :2] + reach))
+    buried_by = np.stack(over, 1)
+    whole = (buried_by >= 0).all(1)
+    return (part.start + index[whole]).astype(np.int32), buried_by[whole].astype(np.int32)
+
+
+# ---- Cells taken from grids, one list after another, and made into the record of a bed -----------
+
+
+@dataclass(frozen=True, eq=False)
+class CellList:
+    """Cells of some grid: arrays of C rows, as SnowCells has them but for
+
+    sides: int8 [C, 4], LINK where a cell of the same size is expected, else OPEN_EDGE or FLUSH.
+    luminance: of the bare ground (see ground_light), NaN where not known.
+    """
+
+    centers_m: np.ndarray
+    normals: np.ndarray
+    sizes_m: np.ndarray
+    edge_m: np.ndarray
+    sides: np.ndarray
+    luminance: np.ndarray
+    tracks: np.ndarray
+    banks: np.ndarray
+    semantic: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.sizes_m)
+
+    @staticmethod
+    def joined(lists: Sequence[CellList]) -> CellList:
+        """All of them, in order."""
+        return CellList(
+            **{
+                field.name: np.concatenate([getattr(one, field.name) for one in lists])
+                for field in fields(CellList)
+            }
+        )
+
+    @staticmethod
+    def empty() -> CellList:
+        none = np.zeros(0, np.float32)
+        return CellList(
+            centers_m=np.zeros((0, 3)),
+            normals=np.zeros((0, 3), np.float32),
+            sizes_m=none,
+            edge_m=none,
+            sides=np.zeros((0, 4), np.int8),
+            luminance=none,
+            tracks=none,
+            banks=np.zeros((0, 2), np.float32),
+            semantic=np.zeros(0, np.int16),
+        )
+
+
+def cells_at(
+    surface: Surface,
+    rows: np.ndarray,
+    columns: np.ndarray,
+    *,
+    sides: np.ndarray,
+    luminance: np.ndarray | None = None,
+    tracks: np.ndarray | None = None,
+    banks: np.ndarray | None = None,
+    classes: np.ndarray,
+) -> CellList:
+    """The cells of a surface at rows and columns [C]; the other arrays are the grid's."""
+    x, y = surface.map.centers()
+    count = len(rows)
+    at = (rows, columns)
+    height = surface.height_m[at].astype(np.float64)
+    return CellList(
+        centers_m=np.stack([x[columns], y[rows], height], 1),
+        normals=normals_of(surface.slopes[at]).astype(np.float32),
+        sizes_m=np.full(count, surface.map.cell_m, np.float32),
+        edge_m=surface.edge_m[at],
+        sides=sides[at],
+        luminance=np.full(count, np.nan, np.float32) if luminance is None else luminance[at],
+        tracks=np.zeros(count, np.float32) if tracks is None else tracks[at],
+        banks=np.zeros((count, 2), np.float32) if banks is None else banks[at],
+        semantic=classes[at],
+    )
+
+
+def _link(cells: CellList, numbers: NumbersCells, part: slice, neighbours: np.ndarray) -> None:
+    """Put the numbers of the cells that part of the cells are linked to into int32 [P, 4]."""
+    centers_m, sizes_m, sides = cells.centers_m[part, :2], cells.sizes_m[part], cells.sides[part]
+    for side, step in enumerate(((-1, 0), (1, 0), (0, -1), (0, 1))):
+        linked = np.flatnonzero(sides[:, side] == LINK)
+        to = numbers.at(centers_m[linked] + np.array(step) * sizes_m[linked, None])
+        same = (to >= 0) & (cells.sizes_m[to] == sizes_m[linked])
+        neighbours[linked, side] = np.where(same, to, FLUSH)
+
+
+def make_cells(
+    cells: CellList, light: np.ndarray, numbers: NumbersCells, gaussians: Gaussians
+) -> SnowCells:
+    """The record: neighbours found by their places, and the Gaussians that the cells bury."""
+    neighbours = cells.sides.astype(np.int32)
+    in_order(lambda part: _link(cells, numbers, part, neighbours[part]), slices_of(len(cells)))
+    buried, buried_by = find_buried(
+        gaussians,
+        numbers,
+        centers_m=cells.centers_m,
+        normals=cells.normals,
+        sizes_m=cells.sizes_m,
+        edge_m=cells.edge_m,
+    )
+    return SnowCells(
+        centers_m=torch.from_numpy(cells.centers_m.astype(np.float32)),
+        normals=torch.from_numpy(cells.normals),
+        sizes_m=torch.from_numpy(cells.sizes_m),
+        edge_m=torch.from_numpy(cells.edge_m),
+        neighbours=torch.from_numpy(neighbours),
+        light=torch.from_numpy(light),
+        tracks=torch.from_numpy(cells.tracks),
+        banks=torch.from_numpy(cells.banks),
+        semantic=torch.from_numpy(cells.semantic),
+        buried=torch.from_numpy(buried),
+        buried_by=torch.from_numpy(buried_by),
+    )
+
+
+# ---- Where snow lies on vehicles: cells in their own frames, carried along as they drive ---------
+
+LARGEST_CELL_M = 0.05
+ACTOR_CELLS_LEAST_AREA_M2 = 0.3  # of all cells of a vehicle: less is not worth a layer
+MOVES_M = 0.5  # an actor that goes less far is parked
+DRIVEN_MAX_SLOPE_DEG = 25.0  # drivers clear their windows, and what is steeper slides off
+_BOTTOM_M = 0.25  # of the box: there are wheels, and the shadow on the road
+_MARGIN_M = 0.3  # beyond the box: mirrors, and boxes that are too small
+_PATCH_M2 = 0.02
+_GROUND = (
+    SemanticClass.ROAD,
+    SemanticClass.LANE_MARKING,
+    SemanticClass.SIDEWALK,
+    SemanticClass.TERRAIN,
+)
+
+
+def is_vehicle(actor: Actor) -> bool:
+    """Whether most of its Gaussians, the ground's excepted, are a vehicle's; by its label where
+    none has a class. The recording car is none.
+    """
+    if actor.label == EGO_VEHICLE or len(actor.gaussians) == 0:
+        return False
+    classes = classes_of(actor.gaussians)
+    own = classes[~np.isin(classes, (*_GROUND, SemanticClass.UNKNOWN))]
+    if len(own):
+        return int(np.bincount(own).argmax()) == SemanticClass.VEHICLE
+    return class_of_label(actor.label) == SemanticClass.VEHICLE
+
+
+def moves(actor: Actor) -> bool:
+    """Whether it goes anywhere during the drive."""
+    places = actor.track.world_from_actor[:, :3, 3]
+    return bool(((places - places[0]).norm(dim=1) > MOVES_M).any())
+
+
+def find_actor_cells(
+    actor: Actor,
+    *,
+    cell_m: float,
+    max_slope_deg: float,
+    estimator: Estimator,
+    backend: str = AUTO,
+) -> SnowCells | None:
+    """Cells on a vehicle, in its own frame; None where it has too few to carry snow. backend: that
+    draws it.
+
+    Its open edges are all round: what does not rise beside a cell falls away.
+    """
+    cell = min(cell_m, LARGEST_CELL_M)
+    gaussians = plain_gaussians(actor.gaussians)
+    half = np.array(actor.size_m[:2]) / 2 + _MARGIN_M
+    if not (np.isfinite(half).all() and (half < 100).all()):
+        return None
+    classes = classes_of(gaussians)
+    own = ~np.isin(classes, _GROUND)
+    own &= gaussians.means.numpy()[:, 2] > _BOTTOM_M - actor.size_m[2] / 2
+    chosen = np.intersect1d(in_box(gaussians, -half, half), np.flatnonzero(own))
+    if len(chosen) == 0:
+        return None
+    cells_half = np.ceil(half / cell).astype(int)
+    shape = (2 * int(cells_half[1]), 2 * int(cells_half[0]))
+    body = gaussians.select(_index(chosen))
+    view = draw_from_above(
+        [PosedGaussians(body)],
+        corner_m=(-cell * float(cells_half[0]), -cell * float(cells_half[1])),
+        cell_m=cell,
+        shape=shape,
+        estimator=estimator,
+        with_thin=False,
+        backend=backend,
+    )
+    bottom = np.float32(_BOTTOM_M - actor.size_m[2] / 2)
+    limit = min(max_slope_deg, DRIVEN_MAX_SLOPE_DEG) if moves(actor) else max_slope_deg
+    body_only = view.height_m > bottom
+    body_only[[0, -1]] = body_only[:, [0, -1]] = False  # an edge all round, even of what is cut off
+    view = dataclasses.replace(view, alpha=np.where(body_only, view.alpha, np.float32(0)))
+    surface = find_surface(
+        view, body_only, max_slope_deg=limit, least_area_m2=_PATCH_M2, floor_m=float(bottom)
+    )
+    rows, columns = np.nonzero(surface.can_carry)
+    if len(rows) * cell**2 < ACTOR_CELLS_LEAST_AREA_M2:
+        return None
+    return _record(surface, rows, columns, classes[chosen], body, chosen)
+
+
+def _record(
+    surface: Surface,
+    rows: np.ndarray,
+    columns: np.ndarray,
+    classes: np.ndarray,
+    body: Gaussians,
+    chosen: np.ndarray,
+) -> SnowCells:
+    grid = surface.map
+    seen = np.where(grid.ids >= 0, classes[np.maximum(grid.ids, 0)], SemanticClass.VEHICLE)
+    numbers = GridNumbers(grid, rows, columns)
+    sides = np.where(surface.sides == RISES, FLUSH, surface.sides)
+    cells = cells_at(surface, rows, columns, sides=sides, classes=seen.astype(np.int16))
+    found = make_cells(cells, np.ones(len(rows), np.float32), numbers, body)
+    found.buried.copy_(_index(chosen)[found.buried.long()])
+    return found
+
+
+def _index(numbers: np.ndarray) -> torch.Tensor:
+    return torch.from_numpy(np.ascontiguousarray(numbers))
+
+
+class GridNumbers:
+    """Numbers of the cells of a single grid, see buried.NumbersCells."""
+
+    def __init__(self, grid: HeightMap, rows: np.ndarray, columns: np.ndarray) -> None:
+        self._corner = np.array([grid.left_m, grid.bottom_m])
+        self._cell_m = grid.cell_m
+        self._numbers: np.ndarray = np.full(grid.alpha.shape, -1, np.int32)
+        self._numbers[rows, columns] = np.arange(len(rows), dtype=np.int32)
+
+    def at(self, xy: np.ndarray) -> np.ndarray:
+        """int32 [P]: numbers of the cells under points float64 [P, 2], -1 where there is none."""
+        high, wide = self._numbers.shape[:2]
+        place = np.floor((xy - self._corner) / self._cell_m)
+        inside = ((place >= 0) & (place < (wide, high))).all(1)
+        out = np.full(len(xy), -1, np.int32)
+        cell = place[inside].astype(np.int64)
+        out[inside] = self._numbers[cell[:, 1], cell[:, 0]]
+        return out

@@ -1,0 +1,313 @@
+"""The colours of a scene as its cameras show them: what a style is mapped from.
+
+A few views, small, spread evenly over the scene's frames and cameras, in the scene's own colours.
+Of a scene that no camera sees, the Gaussians' own colours, weighted by how much they could cover.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+from weakref import WeakKeyDictionary
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from augment.cameras import Camera
+from augment.effects.style.color_maps import CLASSES
+from augment.effects.style.statistics import (
+    LAND,
+    REGION_OF_CLASS,
+    REST,
+    ROAD,
+    SKY,
+    VEGETATION,
+    WHOLE,
+    ColorStatistics,
+    Statistics,
+    statistics_of,
+)
+from augment.render.composite import composite_sky
+from augment.render.rasterize import rasterize
+from augment.render.sh import SH_C0
+from augment.scene import Gaussians, Scene
+from augment.semantics import SemanticClass
+from augment.sky import ConstantSky, Sky, is_stand_in
+
+VIEWS = 12
+VIEW_PIXELS = 200 * 130  # of each, about
+PICTURES = 4  # that a network looks at
+PICTURE_SIZE = 256  # pixels, what networks take
+# Splats never cover a pixel altogether; what glimmers through in sum is no sky.
+LEAST_SKY = 0.005
+MOST_REMEMBERED = 8  # results of a scene
+
+_CHANNELS = (ROAD, VEGETATION, REST)  # of the picture that says what a pixel shows
+_CLASS_CHANNEL = {
+    cls: _CHANNELS.index(region)
+    for cls in SemanticClass
+    if (region := REGION_OF_CLASS.get(cls, REST)) in _CHANNELS
+}
+
+_T = TypeVar("_T")
+_remembered: WeakKeyDictionary[Scene, dict[tuple, object]] = WeakKeyDictionary()
+
+
+def content_statistics(
+    scene: Scene, cameras: Sequence[Camera] | None = None, *, per_region: bool
+) -> Statistics:
+    """Colour statistics of the scene: WHOLE always, LAND and SKY where they are seen.
+
+    A grey that stands in for a sky counts as SKY alone.
+
+    cameras: those that the scene will be seen by; None for all of its own. per_region: also ROAD,
+    VEGETATION and REST where they are seen, of a scene whose Gaussians know at least one of the
+    first two. Remembered for as long as the scene lives.
+    """
+    views = select_views(scene, cameras, VIEWS)
+    key = (per_region, content_key(scene, cameras))
+    return _remember(scene, key, lambda: _statistics(scene, views, per_region))
+
+
+def content_pictures(
+    scene: Scene, cameras: Sequence[Camera] | None = None
+) -> Float[Tensor, "B 3 256 256"]:
+    """Whole pictures of the scene with its sky, in [0, 1], squeezed to a square: for a network.
+
+    cameras: as content_statistics. A scene that no camera sees gives one picture, of its
+    Gaussians' colours in no order. Remembered for as long as the scene lives.
+    """
+    views = select_views(scene, select_views(scene, cameras, VIEWS), PICTURES)
+    key = ("pictures", content_key(scene, cameras))
+    return _remember(scene, key, lambda: _pictures(scene, views))
+
+
+def content_key(scene: Scene, cameras: Sequence[Camera] | None = None) -> Hashable:
+    """What of the cameras the scene's content depends on."""
+    return tuple(map(_camera_key, select_views(scene, cameras, VIEWS)))
+
+
+def select_views(scene: Scene, cameras: Sequence[Camera] | None, count: int) -> tuple[Camera, ...]:
+    """At most `count` of the cameras (None: of the scene's own), spread evenly over their names and
+    over time; orthographic ones are left out. Which depends on nothing that is rendered.
+    """
+    if cameras is None:
+        cameras = [camera for frame in scene.frames for camera in frame.cameras.values()]
+    by_name: dict[str, list[Camera]] = {}
+    for camera in cameras:
+        if not camera.is_orthographic:
+            by_name.setdefault(camera.name, []).append(camera)
+    names = list(by_name)
+    if not names:
+        return ()
+    if sum(map(len, by_name.values())) <= count:
+        return tuple(camera for group in by_name.values() for camera in group)
+    chosen = []
+    for view in range(count):
+        spread = (2 * view + 1) / (2 * count)
+        few = len(names) <= count
+        group = by_name[names[view % len(names) if few else int(spread * len(names))]]
+        chosen.append(group[int(spread * len(group))])
+    return tuple({id(camera): camera for camera in chosen}.values())
+
+
+def knows_regions(scene: Scene) -> bool:
+    """Whether any of the scene's Gaussians is known to be road or vegetation."""
+    regions = [REGION_OF_CLASS.get(cls) in (ROAD, VEGETATION) for cls in SemanticClass]
+    table = np.zeros(CLASSES, bool)
+    table[list(SemanticClass)] = regions
+    classes = [part.semantic for part in scene.all_gaussians]
+    return any(c is not None and bool(table[c.numpy()].any()) for c in classes)
+
+
+def gaussian_statistics(scene: Scene, *, per_region: bool) -> Statistics:
+    """Statistics of the Gaussians' constant colours, weighted by opacity times mean extent.
+
+    They stand for the whole picture: how much sky would be seen is not known.
+    """
+    parts = scene.all_gaussians
+    rgb = np.concatenate([_constant_colors(part) for part in parts])
+    weights = np.concatenate([_extents(part) for part in parts])
+    if not weights.sum() > 0:
+        weights = np.ones_like(weights)
+    whole = statistics_of(rgb, weights)
+    assert whole is not None
+    found = {WHOLE: whole, LAND: whole}
+    if per_region:
+        channels = np.concatenate([_channels(part) for part in parts])
+        for number, region in enumerate(_CHANNELS):
+            own = np.where(channels == number, weights, 0)
+            _add(found, region, rgb, own, float(weights.sum()))
+    return found
+
+
+def _statistics(scene: Scene, views: Sequence[Camera], per_region: bool) -> Statistics:
+    per_region = per_region and knows_regions(scene)
+    marked = _marked_scene(scene) if per_region else None
+    seen = [_see(scene, marked, _small(camera)) for camera in views]
+    if not any((view.alpha > 0).any() for view in seen):
+        return gaussian_statistics(scene, per_region=per_region)
+    alpha = np.concatenate([view.alpha for view in seen])
+    land = np.concatenate([view.land for view in seen])
+    total = float(alpha.size)
+    found: dict[str, ColorStatistics] = {}
+    if is_stand_in(scene.sky):  # a grey that nobody saw has no part in the scene's mood
+        _add(found, WHOLE, land, alpha, float(alpha.sum(dtype=np.float64)))
+    else:
+        picture = np.concatenate([view.picture for view in seen])
+        _add(found, WHOLE, picture, np.ones_like(alpha), total)
+    _add(found, LAND, land, alpha, total)
+    open_share = np.clip(1 - alpha, 0, 1)
+    if open_share.sum(dtype=np.float64) >= LEAST_SKY * total:
+        _add(found, SKY, np.concatenate([view.sky for view in seen]), open_share, total)
+    if per_region:
+        marks = np.concatenate([view.marks for view in seen])
+        for number, region in enumerate(_CHANNELS):
+            _add(found, region, land, marks[:, number], total)
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """Of a view's P pixels, float32 in [0, 1]: picture, land (the splats alone) and sky (alone)
+    [P, 3]; alpha [P]; marks [P, 3], weights of _CHANNELS, or [0, 3].
+    """
+
+    picture: np.ndarray
+    land: np.ndarray
+    sky: np.ndarray
+    alpha: np.ndarray
+    marks: np.ndarray
+
+
+def _see(scene: Scene, marked: Scene | None, camera: Camera) -> _Seen:
+    rgb_image, alpha_image = _render(scene, camera)
+    nothing = torch.from_numpy(np.zeros((camera.height, camera.width, 3), np.float32))
+    sky_image = composite_sky(nothing, nothing[..., 0].contiguous(), camera, scene.sky)
+    # By NumPy from here: on arrays this small torch's threads cost more than they give.
+    rgb, sky = (image.numpy().reshape(-1, 3) for image in (rgb_image, sky_image))
+    alpha = np.clip(alpha_image.numpy().reshape(-1), 0, 1)
+    marks = np.empty((0, 3), np.float32)
+    if marked is not None:
+        marks = np.clip(_render(marked, camera)[0].numpy().reshape(-1, 3), 0, 1)
+    return _Seen(
+        picture=np.clip(rgb + (1 - alpha)[:, None] * sky, 0, 1),
+        land=np.clip(rgb / np.maximum(alpha, np.float32(1e-6))[:, None], 0, 1),
+        sky=np.clip(sky, 0, 1),
+        alpha=alpha,
+        marks=marks,
+    )
+
+
+def _add(
+    found: dict[str, ColorStatistics],
+    region: str,
+    rgb: np.ndarray,
+    weights: np.ndarray,
+    total: float,
+) -> None:
+    one = statistics_of(rgb, weights, total=total)
+    # Float rounding of the marks leaves traces of regions that are nowhere.
+    if one is not None and one.share > 1e-6:
+        found[region] = one
+
+
+def _pictures(scene: Scene, views: Sequence[Camera]) -> Float[Tensor, "B 3 256 256"]:
+    images = []
+    for camera in views:
+        view = camera.resized(PICTURE_SIZE, PICTURE_SIZE)
+        rgb, alpha = _render(scene, view)
+        if bool((alpha > 0).any()):
+            image = composite_sky(rgb, alpha, view, _sky_of_pictures(scene, rgb, alpha))
+            images.append(image.clamp(0, 1).permute(2, 0, 1))
+    if not images:
+        images = [_palette(scene)]
+    return torch.stack(images).float().contiguous()
+
+
+def _sky_of_pictures(scene: Scene, rgb: Tensor, alpha: Tensor) -> Sky:
+    """The scene's; where that is a stand-in, one of the mean colour of what else is seen."""
+    if not is_stand_in(scene.sky):
+        return scene.sky
+    return ConstantSky((rgb.sum((0, 1)) / alpha.sum()).clamp(0, 1))
+
+
+def _palette(scene: Scene) -> Float[Tensor, "3 256 256"]:
+    """Colours of Gaussians, each as often as its weight says, in no order that means aught."""
+    parts = scene.all_gaussians
+    rgb = np.concatenate([_constant_colors(part) for part in parts])
+    weights = np.concatenate([_extents(part) for part in parts])
+    if not weights.sum() > 0:
+        weights = np.ones_like(weights)
+    reached = np.cumsum(weights)
+    pixels = PICTURE_SIZE**2
+    at = np.searchsorted(reached, (np.arange(pixels) + 0.5) / pixels * reached[-1])
+    picture = rgb[np.minimum(at, len(rgb) - 1)].reshape(PICTURE_SIZE, PICTURE_SIZE, 3)
+    return torch.from_numpy(np.ascontiguousarray(picture.transpose(2, 0, 1))).float()
+
+
+def _render(scene: Scene, camera: Camera) -> tuple[Tensor, Tensor]:
+    with torch.no_grad():
+        seen = rasterize(scene.parts_for(camera), camera)
+    assert seen.rgb is not None and seen.alpha is not None
+    return seen.rgb.float(), seen.alpha.float()
+
+
+def _marked_scene(scene: Scene) -> Scene:
+    """The scene with Gaussians of the colours (1, 0, 0) on roads, (0, 1, 0) on vegetation,
+    (0, 0, 1) on the rest, so that a picture of it holds every pixel's weights of the three.
+    """
+    return scene.with_gaussians(_marked)
+
+
+def _marked(gaussians: Gaussians) -> Gaussians:
+    table = torch.full((len(_CHANNELS) + 1, 1, 3), -0.5 / SH_C0, dtype=gaussians.sh.dtype)
+    for number in range(len(_CHANNELS)):
+        table[number, 0, number] = 0.5 / SH_C0
+    channels = torch.from_numpy(_channels(gaussians))
+    return dataclasses.replace(gaussians, sh=table[channels])
+
+
+def _channels(gaussians: Gaussians) -> np.ndarray:
+    """int64 [N]: the channel that marks each Gaussian; one past the last where none does."""
+    table = np.full(CLASSES, len(_CHANNELS), np.int64)
+    for cls, channel in _CLASS_CHANNEL.items():
+        table[cls] = channel
+    if gaussians.semantic is None:
+        return np.full(len(gaussians), table[SemanticClass.UNKNOWN])
+    return table[gaussians.semantic.numpy()]
+
+
+def _constant_colors(gaussians: Gaussians) -> np.ndarray:
+    return np.clip(0.5 + SH_C0 * gaussians.sh[:, 0].detach().double().numpy(), 0, 1)
+
+
+def _extents(gaussians: Gaussians) -> np.ndarray:
+    """float64 [N]: opacity times the mean over three sides of what is seen of an ellipsoid, m^2."""
+    a, b, c = gaussians.scales.detach().double().numpy().T
+    sides = (a * b + b * c + c * a) / 3
+    return gaussians.opacities.detach().double().numpy() * sides
+
+
+def _small(camera: Camera) -> Camera:
+    return camera.scaled(min(1.0, math.sqrt(VIEW_PIXELS / (camera.width * camera.height))))
+
+
+def _camera_key(camera: Camera) -> tuple:
+    lens = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+    return (*lens, camera.camera_from_world.numpy().tobytes(), camera.timestamp_ns)
+
+
+def _remember(scene: Scene, key: tuple, found: Callable[[], _T]) -> _T:
+    known = _remembered.setdefault(scene, {})
+    if key not in known:
+        value = found()
+        while len(known) >= MOST_REMEMBERED:
+            del known[next(iter(known))]
+        known[key] = value
+    return known[key]  # type: ignore[return-value]

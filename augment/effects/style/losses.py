@@ -1,0 +1,303 @@
+"""What the colour mapping network learns from (ClimateGS, "Joint Training Strategy").
+
+Of a content scene or photograph Y_o, seen as the picture I_o, and a style image I_s:
+
+    Z_c = N(f_c(I_o)) Y_o          Y_o in content space (nGSCM)
+    Y_s = S(f_s(I_s)) Z_c          the transferred colours (sGSCM)
+    Z_s = N(f_c(R(Y_s))) Y_s       what is transferred, taken back to content space
+    Y_c = S(f_s(I_o)) Z_c          what is to be Y_o again
+
+    L_con = |Z_c - Z_s| + |R(Z_c) - R(Z_s)|                                   eq. consistency
+    L_cyc = |Y_c - Y_o| + |R(Y_c) - I_o|                                      eq. cycle
+    L_s   = sum_i |mean phi_i(R(Y_s)) - mean phi_i(I_s)| + |deviation - deviation|   eq. style
+    L     = L_s + lambda_con L_con + lambda_cyc L_cyc                         eq. total
+
+The paper does not say which code takes Y_s back: that of its own render is taken here, since with
+that of I_s L_con would be L_cyc again, of the style image. Norms are means over colours and pixels,
+and over a layer's channels in L_s, so that no loss grows with the number of Gaussians, pixels or
+channels. A map acts on Gaussians through their lowest band's colour; on the higher bands, which
+hold differences of colours, with its linear part alone.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple, Protocol, runtime_checkable
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from augment.errors import StyleError
+from augment.files.checkpoints import read_state_dict
+
+# ---- Features of pictures whose means and deviations say what a picture's style is ---------------
+# The paper takes layers of VGG-19, trained on ImageNet (Simonyan & Zisserman 2015); a user who has
+# the weights names their file. Where there is none, a bank of fixed filters is the stand-in: it
+# knows
+# colours and contrasts at several scales, and nothing of what things are.
+
+Features = tuple[Tensor, ...]  # [B, C, h, w] of every layer
+
+
+@runtime_checkable
+class FeatureExtractor(Protocol):
+    """Pictures [B, 3, H, W], display-encoded RGB about [0, 1], become layers of features.
+
+    name: for reports.
+    """
+
+    name: str
+
+    def __call__(self, pictures: Float[Tensor, "B 3 H W"]) -> Features: ...
+
+    def to(self, device: str) -> FeatureExtractor: ...
+
+
+def open_features(weights: Path | None) -> FeatureExtractor:
+    """VGG-19 with weights from a file, or the bank of filters where None is given.
+
+    Raises:
+        StyleError: the file cannot be used; see `load_vgg19`.
+    """
+    return FilterBank() if weights is None else load_vgg19(weights)
+
+
+# ---- VGG-19 -----------------------------------------------------------------------------------
+
+# Channels of the convolutions up to relu4_1, blocks parted by pooling; and the relus whose outputs
+# are taken, by the numbers that torchvision gives them.
+_BLOCKS = ((64, 64), (128, 128), (256, 256, 256, 256), (512,))
+_TAKEN = {1: "relu1_1", 6: "relu2_1", 11: "relu3_1", 20: "relu4_1"}
+_MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet, in training
+LEAST_SIDE_PX = 8  # three poolings leave one pixel of it
+
+
+class Vgg19(nn.Module):
+    """VGG-19 up to relu4_1, as a feature extractor without gradients of its own.
+
+    width: of its channels, relative to VGG-19's; other than 1 is for tests.
+    """
+
+    name = "VGG-19 relu1_1 to relu4_1"
+
+    def __init__(self, *, width: float = 1.0) -> None:
+        super().__init__()
+        layers: list[nn.Module] = []
+        channels = 3
+        for number, block in enumerate(_BLOCKS):
+            if number:
+                layers.append(nn.MaxPool2d(2))
+            for wanted in block:
+                out = max(1, round(wanted * width))
+                layers += [nn.Conv2d(channels, out, 3, padding=1), nn.ReLU()]
+                channels = out
+        self.features = nn.Sequential(*layers)
+        self.mean: Tensor
+        self.deviation: Tensor
+        self.register_buffer("mean", torch.tensor(_MEAN)[:, None, None], persistent=False)
+        self.register_buffer("deviation", torch.tensor(_DEVIATION)[:, None, None], persistent=False)
+        self.requires_grad_(False)
+
+    def forward(self, pictures: Tensor) -> Features:
+        if min(pictures.shape[2:]) < LEAST_SIDE_PX:
+            raise ValueError(
+                f"VGG-19 needs pictures of at least {LEAST_SIDE_PX} px a side; "
+                f"got {list(pictures.shape)}"
+            )
+        x = (pictures - self.mean) / self.deviation
+        taken = []
+        for number, layer in enumerate(self.features):
+            x = layer(x)
+            if number in _TAKEN:
+                taken.append(x)
+        return tuple(taken)
+
+
+def load_vgg19(path: Path, *, width: float = 1.0) -> Vgg19:
+    """VGG-19 with the weights of a .safetensors or .pth file that names them as torchvision does.
+
+    Layers beyond relu4_1, which such files hold too, are left out. A .pth file is read without
+    running what it may hold.
+
+    Raises:
+        StyleError: no such file, not one of these kinds, or tensors that are missing, of another
+            shape or dtype, or not finite; says which.
+    """
+    found = read_state_dict(path, StyleError)
+    network = Vgg19(width=width)
+    wanted = network.state_dict()
+    lacking = [name for name in wanted if name not in found]
+    if lacking:
+        raise StyleError(
+            f"{path} lacks {', '.join(lacking[:4])}{' ...' if len(lacking) > 4 else ''}: expected "
+            f"torchvision's names of VGG-19 (features.0.weight ...); it holds "
+            f"{', '.join(list(found)[:4]) or 'nothing'}"
+        )
+    for name, ours in wanted.items():
+        theirs = found[name]
+        if theirs.shape != ours.shape or not theirs.dtype.is_floating_point:
+            raise StyleError(
+                f"{path}: {name} must be floats {list(ours.shape)} for VGG-19 (without batch "
+                f"normalisation); got {theirs.dtype} {list(theirs.shape)}"
+            )
+        if not bool(torch.isfinite(theirs).all()):
+            raise StyleError(f"{path}: {name} holds NaN or infinite values")
+    network.load_state_dict({name: found[name].float() for name in wanted})
+    return network
+
+
+# ---- a bank of filters ------------------------------------------------------------------------
+
+# Directions of RGB space. Deviations along six of them in general position determine a covariance:
+# luminance, red against green and blue against yellow; then the channels and their differences.
+_OPPONENT = (
+    (1 / math.sqrt(3), 1 / math.sqrt(3), 1 / math.sqrt(3)),
+    (1 / math.sqrt(2), -1 / math.sqrt(2), 0.0),
+    (1 / math.sqrt(6), 1 / math.sqrt(6), -2 / math.sqrt(6)),
+)
+_DIRECTIONS = (
+    *_OPPONENT,
+    (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0),
+    (0.0, 1 / math.sqrt(2), -1 / math.sqrt(2)), (1 / math.sqrt(2), 0.0, -1 / math.sqrt(2)),
+)  # fmt: skip
+_BINOMIAL = (1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16)  # about a Gaussian of 1 px
+_CONTRAST_GAIN = 2.0  # of edges, which vary less than colours do: about as much deviation
+
+
+class FilterBank:
+    """A feature extractor that needs no weights: the levels of a Gaussian pyramid (Burt & Adelson
+    1983) from half the picture's size on, and at each a layer of colours and a layer of edges.
+
+    Colours: the picture along eight directions of RGB space, three of them opponent colours. Edges:
+    first derivatives along x, y and both diagonals (of the steerable family, Freeman & Adelson
+    1991) of the opponent colours, their rises and falls apart, so that their means say how much
+    contrast there is. A level after the first is left out where it has less than 4 px a side.
+    """
+
+    name = "bank of colour and edge filters"
+
+    def __init__(self, levels: int = 3) -> None:
+        self.levels = levels
+        self._directions = torch.tensor(_DIRECTIONS)
+        self._blur = torch.tensor(_BINOMIAL)
+
+    def to(self, device: str) -> FilterBank:
+        self._directions = self._directions.to(device)
+        self._blur = self._blur.to(device)
+        return self
+
+    def __call__(self, pictures: Float[Tensor, "B 3 H W"]) -> Features:
+        taken: list[Tensor] = []
+        level = pictures
+        for number in range(self.levels):
+            level = self._halved(level)
+            if number and min(level.shape[2:]) < 4:
+                break
+            colors = torch.einsum("kc,bchw->bkhw", self._directions.to(level.dtype), level)
+            taken.append(colors)
+            if min(level.shape[2:]) >= 2:
+                taken.append(_edges(colors[:, :3]))
+        return tuple(taken)
+
+    def _halved(self, x: Tensor) -> Tensor:
+        """Blurred, every second pixel; borders are repeated."""
+        channels = x.shape[1]
+        kernel = self._blur.to(x.dtype)
+        across = kernel.expand(channels, 1, 1, 5)
+        x = F.conv2d(F.pad(x, (2, 2, 0, 0), "replicate"), across, stride=(1, 2), groups=channels)
+        x = F.pad(x, (0, 0, 2, 2), "replicate")
+        return F.conv2d(x, across.mT, stride=(2, 1), groups=channels)
+
+
+def _edges(x: Tensor) -> Tensor:
+    """Rises and falls [B, 8 C, H - 1, W - 1] along four directions, over the same length each."""
+    a, b, c, d = x[..., :-1, :-1], x[..., :-1, 1:], x[..., 1:, :-1], x[..., 1:, 1:]
+    slopes = torch.cat(
+        [(b + d - a - c) / 2, (c + d - a - b) / 2, (d - a) / math.sqrt(2), (c - b) / math.sqrt(2)],
+        1,
+    )
+    return _CONTRAST_GAIN * torch.cat([slopes.relu(), (-slopes).relu()], 1)
+
+
+# ---- losses --------------------------------------------------------------------------------------
+
+LEAST_VARIANCE = 1e-6  # under the root: a constant feature has a deviation with a gradient
+
+
+@dataclass(frozen=True, eq=False)
+class GaussianColors:
+    """Colours of Gaussians. base [B, N, 3]: of the lowest band, display-encoded, 0.5 where it is 0.
+    bands [B, N, K - 1, 3]: what the higher bands add, in the same unit at their basis functions'
+    value of the lowest one's.
+    """
+
+    base: Float[Tensor, "B N 3"]
+    bands: Float[Tensor, "B N L 3"]
+
+    def mapped(self, maps: Float[Tensor, "B 3 4"]) -> GaussianColors:
+        """The colours that maps, one an item, make of these."""
+        linear = maps[:, :, :3].mT  # rows of colours are mapped from the right
+        bands = self.bands @ linear[:, None] if self.bands.shape[2] else self.bands
+        return GaussianColors(self.base @ linear + maps[:, None, :, 3], bands)
+
+
+class Transfer(NamedTuple):
+    """The maps of one training step, [B, 3, 4] each, in the module's letters: all are of Y_o."""
+
+    content: Tensor  # Z_c
+    styled: Tensor  # Y_s
+    returned: Tensor  # Z_s
+    cycled: Tensor  # Y_c
+
+
+def color_distance(first: GaussianColors, second: GaussianColors) -> Float[Tensor, ""]:
+    """Mean absolute difference of the base colours, plus that of the higher bands."""
+    distance = (first.base - second.base).abs().mean()
+    if first.bands.shape[2]:
+        distance = distance + (first.bands - second.bands).abs().mean()
+    return distance
+
+
+def picture_distance(
+    first: Float[Tensor, "B 3 H W"], second: Float[Tensor, "B 3 H W"]
+) -> Float[Tensor, ""]:
+    """Mean absolute difference."""
+    return (first - second).abs().mean()
+
+
+def style_loss(rendered: Features, style: Features) -> Float[Tensor, ""]:
+    """L_s of two lists of features [B, C, h, w], layer by layer; pictures may differ in size.
+
+    A layer counts with the root mean square over its channels, averaged over B.
+    """
+    total = rendered[0].new_zeros(())
+    for ours, theirs in zip(rendered, style, strict=True):
+        for a, b in zip(moments(ours), moments(theirs), strict=True):
+            total = total + ((a - b).square().mean(1) + LEAST_VARIANCE**2).sqrt().mean()
+    return total
+
+
+def moments(feature: Float[Tensor, "B C H W"]) -> tuple[Tensor, Tensor]:
+    """Mean and deviation [B, C] over the pixels."""
+    mean = feature.mean((2, 3))
+    variance = (feature - mean[:, :, None, None]).square().mean((2, 3))
+    return mean, (variance + LEAST_VARIANCE).sqrt()
+
+
+def weighted_sum(terms: dict[str, Tensor], weights: dict[str, float]) -> Tensor:
+    """Of the terms that weigh something; the others may be anything.
+
+    Raises:
+        ValueError: there are none.
+    """
+    parts: Sequence[Tensor] = [
+        weights[name] * term for name, term in terms.items() if weights.get(name)
+    ]
+    if not parts:
+        raise ValueError(f"none of the losses {', '.join(terms)} weighs anything: {weights}")
+    return torch.stack(list(parts)).sum()

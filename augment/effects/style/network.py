@@ -1,0 +1,590 @@
+"""GSCM: the style network, two linear colour maps whose middle matrix an encoder predicts.
+
+Ke et al. 2023 and ClimateGS, "3D Gaussian Color Mapping". A colour c (a row) becomes c P T Q, with
+P and Q trained and T = E(picture), k x k. The content stage (nGSCM, T = f_c of the content) takes
+colours to a common space, the style stage (sGSCM, T = f_s of the style) from there to the style's.
+Nothing in between is nonlinear, so each stage folds to a 3x4 map and both to one.
+
+Two departures, both to switch off. offset: c carries a homogeneous 1, so that maps move the mean
+(False: the paper's 3x3). moments: T starts at the transport between the picture's colour moments
+and a mean photo's, and the encoder predicts what to multiply it with (False: T starts at the
+identity).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor, nn
+from torch.nn import functional
+
+from augment.errors import StyleError
+from augment.files.checkpoints import read_state_dict
+from augment.jobs.atomic import write_atomic
+from recipes.files import open_file
+
+# ---- Encoders: a picture to a vector of features, from which GSCM's matrices T are predicted -----
+# Every encoder takes display-encoded pictures [B, 3, S, S] and small copies of them [B, 3, R, R]
+# whose colour moments were carried to a mean photo's, and returns [B, .width].
+
+ENCODERS = ("small", "b0")
+LOOKED_AT_PX = 32  # by the small encoder: the arrangement of colours, not the detail
+SMALL_CHANNELS = (16, 32, 64, 96, 96)
+IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+B0_WIDTH = 1280
+
+
+def build_encoder(name: str) -> SmallEncoder | B0Encoder:
+    """By name.
+
+    Raises:
+        ValueError: there is no such encoder.
+        StyleError: its library is not installed.
+    """
+    if name == "small":
+        return SmallEncoder()
+    if name == "b0":
+        return B0Encoder()
+    raise ValueError(f"encoder must be one of {', '.join(ENCODERS)}; got {name!r}")
+
+
+class SmallEncoder(nn.Module):
+    """Five convolutions of stride 2 and a pooling of means and deviations; for the CPU."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        layers: list[nn.Module] = []
+        channels = 6
+        for index, out in enumerate(SMALL_CHANNELS):
+            stride = 1 if index == len(SMALL_CHANNELS) - 1 else 2
+            layers += [nn.Conv2d(channels, out, 3, stride, 1), nn.GroupNorm(8, out), nn.SiLU()]
+            channels = out
+        self.layers = nn.Sequential(*layers)
+        self.width = 2 * channels
+
+    def forward(
+        self, images: Float[Tensor, "B 3 S S"], normal: Float[Tensor, "B 3 R R"]
+    ) -> Float[Tensor, "B W"]:
+        pictures = (functional.adaptive_avg_pool2d(p, LOOKED_AT_PX) for p in (images, normal))
+        features = self.layers(4 * (torch.cat(tuple(pictures), dim=1) - 0.43))
+        deviations = (features.var((2, 3), correction=0) + 1e-6).sqrt()
+        return torch.cat([features.mean((2, 3)), deviations], dim=1)
+
+
+class B0Encoder(nn.Module):
+    """EfficientNet-B0 (Tan and Le 2019), MONAI's; random weights until some are loaded."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        try:
+            from monai.networks.nets.efficientnet import EfficientNetBN
+        except ImportError as error:
+            raise StyleError(
+                "the encoder b0 is MONAI's EfficientNet, which is not installed: "
+                "`pip install 'climategs[efficientnet]'`, or choose the encoder small"
+            ) from error
+        net = EfficientNetBN("efficientnet-b0", pretrained=False, num_classes=1)
+        for classifier in ("_fc", "_dropout"):
+            setattr(net, classifier, nn.Identity())
+        self.net = net
+        self.width = B0_WIDTH
+        self.mean = nn.Buffer(torch.tensor(IMAGENET_MEAN)[:, None, None], persistent=False)
+        self.std = nn.Buffer(torch.tensor(IMAGENET_STD)[:, None, None], persistent=False)
+
+    def forward(
+        self, images: Float[Tensor, "B 3 S S"], normal: Float[Tensor, "B 3 R R"]
+    ) -> Float[Tensor, "B W"]:
+        return self.net((images - self.mean) / self.std)
+
+
+def load_imagenet_weights(encoder: B0Encoder, path: Path) -> None:
+    """Fill EfficientNet-B0 with weights trained on ImageNet, from a file the user has.
+
+    path: .safetensors, or a state dict that torch saved. Names are
+    torchvision's (`efficientnet_b0`), lukemelas' (`efficientnet-b0`) or MONAI's; what belongs to
+    the classifier is left out.
+
+    Raises:
+        StyleError: the file cannot be read, or is not of this network.
+    """
+    found = read_state_dict(path, StyleError, wrapped_in=("state_dict", "model"))
+    weights = {name.removeprefix("module."): value for name, value in found.items()}
+    own = encoder.net.state_dict()
+    names = _names_in_file(own, weights)
+    filled: dict[str, Tensor] = {}
+    for name, value in own.items():
+        given = weights.get(names[name])
+        if given is None and name.endswith("num_batches_tracked"):
+            given = value
+        if given is None or given.shape != value.shape:
+            received = "nothing" if given is None else f"a tensor {list(given.shape)}"
+            raise StyleError(
+                f"{path}: weights of EfficientNet-B0 hold {names[name]!r} as a tensor "
+                f"{list(value.shape)}; got {received}. Give torchvision's efficientnet_b0 or "
+                f"lukemelas' efficientnet-b0"
+            )
+        if not bool(torch.isfinite(given).all()):
+            raise StyleError(f"{path}: {names[name]!r} holds values that are not finite")
+        filled[name] = given.to(value.dtype)
+    encoder.net.load_state_dict(filled)
+
+
+def _names_in_file(own: Mapping[str, Tensor], weights: Mapping[str, Tensor]) -> dict[str, str]:
+    """Each of MONAI's names to the file's, whichever of the three schemes that has.
+
+    MONAI numbers a block by its stack and over all (`_blocks.1.2`: the second stack's second),
+    lukemelas over all (`_blocks.2`), torchvision within its stack (`features.2.1`).
+    """
+    if "_blocks.0.0._depthwise_conv.weight" in weights:
+        return {name: name for name in own}
+    luke = "_conv_stem.weight" in weights
+    names: dict[str, str] = {}
+    first_of: dict[str, int] = {}
+    for name in own:
+        parts = name.split(".")
+        if parts[0] != "_blocks":
+            names[name] = name if luke else f"{_TORCHVISION_ENDS[parts[0]]}.{parts[1]}"
+            continue
+        _, stack, number, part, end = parts
+        if luke:
+            names[name] = f"_blocks.{number}.{part}.{end}"
+            continue
+        place = int(number) - first_of.setdefault(stack, int(number))
+        inner = _TORCHVISION_FIRST if stack == "0" else _TORCHVISION_PARTS
+        names[name] = f"features.{int(stack) + 1}.{place}.block.{inner[part]}.{end}"
+    return names
+
+
+_TORCHVISION_ENDS = {
+    "_conv_stem": "features.0.0",
+    "_bn0": "features.0.1",
+    "_conv_head": "features.8.0",
+    "_bn1": "features.8.1",
+}
+_TORCHVISION_PARTS = {
+    "_expand_conv": "0.0",
+    "_bn0": "0.1",
+    "_depthwise_conv": "1.0",
+    "_bn1": "1.1",
+    "_se_reduce": "2.fc1",
+    "_se_expand": "2.fc2",
+    "_project_conv": "3.0",
+    "_bn2": "3.1",
+}
+_TORCHVISION_FIRST = {  # the first stack expands nothing
+    "_depthwise_conv": "0.0",
+    "_bn1": "0.1",
+    "_se_reduce": "1.fc1",
+    "_se_expand": "1.fc2",
+    "_project_conv": "2.0",
+    "_bn2": "2.1",
+}
+
+
+# ---- A picture's colour moments, and the linear maps between them and a mean photo's -------------
+# What a global linear map can do depends mostly on the mean and the covariance of the colours,
+# which
+# no stack of convolutions gives exactly. So the encoders get them computed, and the maps that they
+# predict start at the transport of the picture's moments to a mean photo's (content stage) and back
+# (style stage). Both are symmetric and depend on one picture only, as the two stages of GSCM do.
+
+# Of 87 photos (kodak and open, 128 x 128): mean over photos of their colours' mean and covariance.
+REFERENCE_MEAN = (0.43, 0.43, 0.42)
+REFERENCE_COVARIANCE = ((0.046, 0.039, 0.033), (0.039, 0.041, 0.036), (0.033, 0.036, 0.038))
+FLOOR_STD = 0.012  # added to every direction of colour: bounds the gain of grey pictures
+SMALL_PX = 64  # side of the copy that moments are taken of: noise and detail are no colour
+LEVELS = (0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99)  # quantiles of the channels
+_PAIRED_LEVELS = (0, 1)  # of LEVELS, each with the one as far from the other end
+MOMENT_FEATURES = 18 + 3 * len(LEVELS) + 6 * len(_PAIRED_LEVELS)
+
+
+@dataclass(frozen=True, eq=False)
+class Moments:
+    """Of B pictures. features: float32 [B, MOMENT_FEATURES], about -3 to 3.
+
+    normal: float32 [B, 3, R, R], the small copies with the mean photo's moments.
+    normalise, restore: float32 [B, N, N] matrices of colours as columns: from the picture's moments
+    to the mean photo's and the inverse; N = 4 (a homogeneous 1 last), or 3 without offset.
+    """
+
+    features: Float[Tensor, "B F"]
+    normal: Float[Tensor, "B 3 R R"]
+    normalise: Float[Tensor, "B N N"]
+    restore: Float[Tensor, "B N N"]
+
+
+def image_moments(images: Float[Tensor, "B 3 H W"], *, offset: bool) -> Moments:
+    """Of display-encoded pictures. No gradient passes: pictures are given, not trained.
+
+    The maps are optimal transports between Gaussian distributions of colours (Olkin and Pukelsheim
+    1982): A = S^-1/2 (S^1/2 R S^1/2)^1/2 S^-1/2 for covariances S (of the picture) and R (of the
+    mean photo). Without offset S and R are second moments about black, so that no mean is moved.
+    """
+    with torch.no_grad():
+        small = functional.adaptive_avg_pool2d(images, SMALL_PX)
+        pixels = small.flatten(2)  # [B, 3, N]
+        mean = pixels.mean(2)
+        centred = pixels - mean[..., None]  # in float32 a difference of moments would be noise
+        spread = (centred @ centred.transpose(1, 2)).double() / pixels.shape[2]
+        mean = mean.double()
+        covariance = spread + FLOOR_STD**2 * torch.eye(3).to(mean)
+        reference_mean = torch.tensor(REFERENCE_MEAN).to(mean)
+        reference = torch.tensor(REFERENCE_COVARIANCE).to(mean)
+        if not offset:
+            about_black = reference + reference_mean[:, None] * reference_mean
+            own = covariance + mean[:, :, None] * mean[:, None, :]
+            normalise, restore = _transports(own, about_black)
+        else:
+            forth, back = _transports(covariance, reference)
+            normalise = _affine(forth, reference_mean - (forth @ mean[..., None])[..., 0])
+            restore = _affine(back, mean - back @ reference_mean)
+        matrix = normalise[:, :3, :3].float()
+        normal = torch.einsum("bij,bjhw->bihw", matrix, small)
+        if offset:
+            normal = normal + normalise[:, :3, 3, None, None].float()
+        features = torch.cat([_own(mean, covariance), _of_shape(normal), _levels(normal)], dim=1)
+        return Moments(features, normal, normalise.float(), restore.float())
+
+
+def _transports(
+    of: Float[Tensor, "B 3 3"], to: Float[Tensor, "3 3"]
+) -> tuple[Float[Tensor, "B 3 3"], Float[Tensor, "B 3 3"]]:
+    """The optimal transport between the covariances, and its inverse."""
+    root, inverse_root = _roots(of)
+    middle, inverse_middle = _roots(root @ to @ root)
+    return inverse_root @ middle @ inverse_root, root @ inverse_middle @ root
+
+
+def _roots(
+    matrices: Float[Tensor, "B 3 3"],
+) -> tuple[Float[Tensor, "B 3 3"], Float[Tensor, "B 3 3"]]:
+    """The square roots of positive definite matrices, and their inverses."""
+    values, vectors = torch.linalg.eigh(matrices)
+    root = values.clamp_min(1e-12).sqrt()[:, None, :]
+    return (vectors * root) @ vectors.transpose(1, 2), (vectors / root) @ vectors.transpose(1, 2)
+
+
+def _affine(matrix: Float[Tensor, "B 3 3"], offset: Float[Tensor, "B 3"]) -> Float[Tensor, "B 4 4"]:
+    top = torch.cat([matrix, offset[..., None]], dim=2)
+    last = torch.tensor([0.0, 0.0, 0.0, 1.0]).to(top).expand(len(top), 1, 4)
+    return torch.cat([top, last], dim=1)
+
+
+def _own(mean: Float[Tensor, "B 3"], covariance: Float[Tensor, "B 3 3"]) -> Float[Tensor, "B 9"]:
+    """The picture's own mean (3) and root of the covariance (6)."""
+    root, _ = _roots(covariance)
+    upper = torch.triu_indices(3, 3, device=root.device)
+    return torch.cat([4 * mean - 1.7, 8 * root[:, upper[0], upper[1]] - 0.7], dim=1).float()
+
+
+def _of_shape(normal: Float[Tensor, "B 3 R R"]) -> Float[Tensor, "B 9"]:
+    """Of the normalised picture, which a change of light hardly moves: what the upper half has
+    above the lower (3), skewness (3), kurtosis (3)."""
+    centred = normal - normal.mean((2, 3), keepdim=True)
+    scaled = centred / centred.flatten(2).std(2).clamp_min(0.05)[..., None, None]
+    half = scaled.shape[2] // 2
+    upper_half = scaled[:, :, :half].mean((2, 3)) - scaled[:, :, half:].mean((2, 3))
+    square = scaled * scaled
+    skewness = (square * scaled).mean((2, 3)).clamp(-6, 6) / 2
+    kurtosis = (square * square).mean((2, 3)).clamp(0, 40).log1p() - 1.4
+    return torch.cat([upper_half, skewness, kurtosis], dim=1)
+
+
+def _levels(normal: Float[Tensor, "B 3 R R"]) -> Float[Tensor, "B F"]:
+    """Quantiles of the normalised channels (21), and for two pairs of them, near black and white,
+    the gain and the offset that would spread them over what is displayed (12): most photos fill
+    that range, so levels tell how far light or a camera moved a picture."""
+    sample = normal[:, :, ::2, ::2].flatten(2).sort(dim=2).values
+    places = [round(level * (sample.shape[2] - 1)) for level in LEVELS]
+    # One by one: a list of places would be copied to a GPU, and waited for.
+    levels = torch.stack([sample[:, :, place] for place in places], 2).clamp(-1, 2)  # [B, 3, L]
+    found = [3 * (levels - 0.43).flatten(1)]
+    for index in _PAIRED_LEVELS:
+        low, high = levels[:, :, index], levels[:, :, -1 - index]
+        gain = 1 / (high - low).clamp_min(0.25)
+        found += [gain - 1.2, -gain * low]
+    return torch.cat(found, dim=1)
+
+
+# ---- network -------------------------------------------------------------------------------------
+
+SIZE_PX = 256  # of the pictures that the encoder is given
+LATENT = 16  # the paper's k
+HIDDEN = 96  # of the layer between features and T
+HEAD_SCALE = 0.1  # of T, so that a step of the optimiser is a small step of the map
+
+
+class Gscm(nn.Module):
+    """The network. encoder: "small" or "b0". k: width of T. offset, moments: see above."""
+
+    def __init__(
+        self, encoder: str = "small", k: int = LATENT, offset: bool = True, moments: bool = True
+    ) -> None:
+        super().__init__()
+        rows = 4 if offset else 3
+        if k < rows:
+            raise ValueError(f"k must be at least {rows}, the width of a colour; got {k}")
+        self.encoder_name, self.k, self.offset, self.moments = encoder, k, offset, moments
+        self.size = SIZE_PX
+        self.encoder = build_encoder(encoder)
+        self.hidden = nn.Linear(self.encoder.width + MOMENT_FEATURES, HIDDEN)
+        self.head = nn.Linear(HIDDEN, 2 * k * k)
+        self.direct = nn.Linear(MOMENT_FEATURES, 2 * k * k, bias=False)
+        for value in (self.head.weight, self.head.bias, self.direct.weight):
+            nn.init.zeros_(value)
+        basis = _basis(rows, k)
+        self.basis = nn.Buffer(basis)  # [rows, k], orthonormal: how T holds a map of colours
+        self.content_p, self.style_p = nn.Parameter(basis.clone()), nn.Parameter(basis.clone())
+        self.content_q = nn.Parameter(basis[:3].T.clone())
+        self.style_q = nn.Parameter(basis[:3].T.clone())
+
+    def encode(
+        self, images: Float[Tensor, "B 3 S S"]
+    ) -> tuple[Float[Tensor, "B k k"], Float[Tensor, "B k k"]]:
+        """f_c and f_s: the content stage's T and the style stage's. images: in [0, 1]."""
+        found = image_moments(images, offset=self.offset)
+        features = torch.cat([self.encoder(images, found.normal), found.features], dim=1)
+        predicted = self.head(nn.functional.silu(self.hidden(features)))
+        predicted = HEAD_SCALE * (predicted + self.direct(found.features))
+        content, style = predicted.unflatten(1, (2, self.k, self.k)).unbind(1)
+        eye = torch.eye(self.k, device=images.device)
+        if not self.moments:
+            return eye + content, eye + style
+        normalise, restore = self._lifted(found)
+        # Rows: the moments act first on the content and last on the style.
+        return normalise @ (eye + content), (eye + style) @ restore
+
+    def content_map(self, f_c: Float[Tensor, "B k k"]) -> Float[Tensor, "B 3 4"]:
+        """nGSCM, folded."""
+        return self._fold(self.content_p, f_c, self.content_q)
+
+    def style_map(self, f_s: Float[Tensor, "B k k"]) -> Float[Tensor, "B 3 4"]:
+        """sGSCM, folded."""
+        return self._fold(self.style_p, f_s, self.style_q)
+
+    def apply_factors(
+        self,
+        f_c: Float[Tensor, "B k k"],
+        f_s: Float[Tensor, "B k k"],
+        colors: Float[Tensor, "B N 3"],
+    ) -> Float[Tensor, "B N 3"]:
+        """Both stages factor by factor: what the folded maps must agree with."""
+        content = self._homogeneous(colors) @ self.content_p @ f_c @ self.content_q
+        return self._homogeneous(content) @ self.style_p @ f_s @ self.style_q
+
+    def _homogeneous(self, colors: Float[Tensor, "B N 3"]) -> Float[Tensor, "B N rows"]:
+        return nn.functional.pad(colors, (0, 1), value=1.0) if self.offset else colors
+
+    def _fold(
+        self, p: Float[Tensor, "rows k"], t: Float[Tensor, "B k k"], q: Float[Tensor, "k 3"]
+    ) -> Float[Tensor, "B 3 4"]:
+        folded = (p @ t @ q).transpose(1, 2)  # [B, 3, rows]
+        return folded if self.offset else nn.functional.pad(folded, (0, 1))
+
+    def _lifted(self, found: Moments) -> tuple[Float[Tensor, "B k k"], Float[Tensor, "B k k"]]:
+        """The moments' maps of colours, as T's that leave the rest of the space alone."""
+        eye = torch.eye(self.k, device=self.basis.device)
+        small = torch.eye(len(self.basis), device=self.basis.device)
+        lift = self.basis.T  # [k, rows]
+        maps = (found.normalise, found.restore)
+        first, second = (eye + lift @ (m.transpose(1, 2) - small) @ lift.T for m in maps)
+        return first, second
+
+
+def compose(
+    second: Float[Tensor, "*B 3 4"], first: Float[Tensor, "*B 3 4"]
+) -> Float[Tensor, "*B 3 4"]:
+    """The map that does `first`, then `second`."""
+    matrix = second[..., :3] @ first[..., :3]
+    offset = second[..., :3] @ first[..., 3:] + second[..., 3:]
+    return torch.cat([matrix, offset], dim=-1)
+
+
+def apply_map(
+    maps: Float[Tensor, "B 3 4"], colors: Float[Tensor, "B *N 3"]
+) -> Float[Tensor, "B *N 3"]:
+    """Colours under their own map each, not clamped."""
+    flat = colors.flatten(1, -2) @ maps[:, :, :3].transpose(1, 2) + maps[:, None, :, 3]
+    return flat.view(colors.shape)
+
+
+def gscm_map(
+    net: Gscm, content: Float[Tensor, "B 3 S S"], style: Float[Tensor, "1 3 S S"]
+) -> Float[Tensor, "3 4"]:
+    """The one map of a scene and a style picture."""
+    return compose(style_side(net, style), content_side(net, content))
+
+
+def content_side(net: Gscm, content: Float[Tensor, "B 3 S S"]) -> Float[Tensor, "3 4"]:
+    """nGSCM of a scene, the same for every style; f_c is the mean over the scene's pictures."""
+    with _one_thread(net):
+        f_c, _ = net.encode(content)
+        return net.content_map(f_c.mean(0, keepdim=True))[0]
+
+
+def style_side(net: Gscm, style: Float[Tensor, "1 3 S S"]) -> Float[Tensor, "3 4"]:
+    """sGSCM of a style picture, the same for every scene."""
+    with _one_thread(net):
+        _, f_s = net.encode(style)
+        return net.style_map(f_s)[0]
+
+
+@contextmanager
+def _one_thread(net: Gscm) -> Iterator[None]:
+    """Without gradients, and so that bits do not depend on how many threads there are."""
+    threads, training = torch.get_num_threads(), net.training
+    try:
+        torch.set_num_threads(1)
+        net.eval()
+        with torch.no_grad():
+            yield
+    finally:
+        torch.set_num_threads(threads)
+        net.train(training)
+
+
+def _basis(rows: int, k: int) -> Float[Tensor, "rows k"]:
+    """Orthonormal rows of cosines (the DCT-II's first): a fixed start that mixes all of k."""
+    place = (torch.arange(k, dtype=torch.float64) + 0.5) * torch.pi / k
+    basis = torch.stack([torch.cos(row * place) for row in range(rows)])
+    return (basis / basis.norm(dim=1, keepdim=True)).float()
+
+
+# ------------------------------------------------------------------------------------------------
+# Style networks in files: safetensors, with what the network is and where it comes from as JSON
+# The file's metadata hold one entry, `climategs.gscm`, a JSON object: format (1), encoder, k,
+# offset,
+# moments, size (px of the pictures) and about (training facts, free). Tensors may be stored in half
+# precision; they are float32 in memory.
+
+FORMAT = 1
+METADATA_KEY = "climategs.gscm"
+SHIPPED = Path(__file__).parent / "checkpoints" / "gscm-small.safetensors"
+MAX_K = 256  # of a file that is read: what a hostile header can make us reserve
+_FIELDS = {"format": int, "encoder": str, "k": int, "offset": bool, "moments": bool, "size": int}
+_WHAT_TO_DO = "give a file that `climategs style train` wrote, or none for the shipped network"
+
+
+def save_network(
+    path: Path, net: Gscm, about: Mapping[str, Any], *, half_precision: bool = False
+) -> None:
+    """Write the network whole or not at all. about: training facts, anything JSON can hold.
+
+    Raises:
+        StyleError: a weight is not finite. OutputError: the system refused.
+    """
+    header = {
+        "format": FORMAT,
+        "encoder": net.encoder_name,
+        "k": net.k,
+        "offset": net.offset,
+        "moments": net.moments,
+        "size": net.size,
+        "about": dict(about),
+    }
+    tensors: dict[str, Tensor] = {}
+    for name, value in net.state_dict().items():
+        half = half_precision and value.dtype == torch.float32
+        stored = value.detach().cpu().to(torch.float16 if half else value.dtype).contiguous()
+        if not bool(torch.isfinite(stored).all()):
+            raise StyleError(f"{path}: {name!r} is not finite, so the network was not written")
+        tensors[name] = stored
+    text = json.dumps(header, sort_keys=True, allow_nan=False)
+    write_atomic(path, save(tensors, {METADATA_KEY: text}))
+
+
+def load_network(path: Path | None = None) -> Gscm:
+    """Read a network, ready to use (`eval`); the shipped one by default.
+
+    Raises:
+        StyleError: there is no such file, or it is no network of this format.
+    """
+    path = SHIPPED if path is None else path
+    header, tensors = _read(path)
+    net = Gscm(header["encoder"], header["k"], header["offset"], header["moments"])
+    own = net.state_dict()
+    missing, extra = sorted(own.keys() - tensors.keys()), sorted(tensors.keys() - own.keys())
+    if missing or extra:
+        raise StyleError(
+            f"{path}: the tensors are not those of its network: missing {missing[:3]}, "
+            f"unknown {extra[:3]}; {_WHAT_TO_DO}"
+        )
+    for name, value in own.items():
+        given = tensors[name]
+        if given.shape != value.shape or given.is_floating_point() != value.is_floating_point():
+            raise StyleError(
+                f"{path}: {name!r} must be {value.dtype} {list(value.shape)}; got {given.dtype} "
+                f"{list(given.shape)}; {_WHAT_TO_DO}"
+            )
+        if not bool(torch.isfinite(given).all()):
+            raise StyleError(f"{path}: {name!r} holds values that are not finite; {_WHAT_TO_DO}")
+    net.load_state_dict({name: tensors[name].to(own[name].dtype) for name in own})
+    return net.eval().requires_grad_(False)
+
+
+def network_facts(path: Path | None = None) -> dict[str, Any]:
+    """The header of a network's file: format, encoder, k, offset, moments, size, about.
+
+    Raises:
+        StyleError: as load_network, but for the tensors, which are not looked at.
+    """
+    path = SHIPPED if path is None else path
+    try:
+        open_file(path).close()  # to open a pipe would wait for ever
+        with safe_open(path, framework="pt") as file:
+            return _header(path, file.metadata())
+    except (OSError, SafetensorError) as error:
+        raise _unreadable(path, error) from error
+
+
+def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    try:
+        open_file(path).close()  # to open a pipe would wait for ever
+        with safe_open(path, framework="pt") as file:
+            header = _header(path, file.metadata())
+            return header, {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except (OSError, SafetensorError) as error:
+        raise _unreadable(path, error) from error
+
+
+def _unreadable(path: Path, error: Exception) -> StyleError:
+    return StyleError(f"{path}: the style network cannot be read: {error}; {_WHAT_TO_DO}")
+
+
+def _header(path: Path, metadata: Mapping[str, str] | None) -> dict[str, Any]:
+    text = (metadata or {}).get(METADATA_KEY)
+    if text is None:
+        raise StyleError(f"{path}: no {METADATA_KEY!r} in the file's metadata; {_WHAT_TO_DO}")
+    try:
+        header = json.loads(text)
+    except ValueError as error:
+        raise StyleError(f"{path}: {METADATA_KEY!r} is not JSON: {error}; {_WHAT_TO_DO}") from error
+    if not isinstance(header, dict):
+        raise StyleError(f"{path}: {METADATA_KEY!r} must be an object; got {text[:60]}")
+    if header.get("format") != FORMAT:
+        raise StyleError(
+            f"{path}: format must be {FORMAT}; got {header.get('format')!r}: the file is of "
+            f"another version of climategs; {_WHAT_TO_DO}"
+        )
+    for name, kind in _FIELDS.items():
+        if type(header.get(name)) is not kind:
+            raise StyleError(
+                f"{path}: {name!r} must be of type {kind.__name__}; got {header.get(name)!r}"
+            )
+    if header["encoder"] not in ENCODERS:
+        raise StyleError(f"{path}: encoder must be one of {ENCODERS}; got {header['encoder']!r}")
+    if not 4 <= header["k"] <= MAX_K or header["size"] != SIZE_PX:
+        raise StyleError(
+            f"{path}: k must be 4 to {MAX_K} and size {SIZE_PX}; got {header['k']} and "
+            f"{header['size']}"
+        )
+    return header

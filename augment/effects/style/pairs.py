@@ -1,0 +1,284 @@
+"""Pairs to train a style network on, made of photographs: a photo and a recoloured copy of it.
+
+A recolouring is a change of colours that a camera, a light or a weather makes: exposure, white
+balance, contrast, saturation, hue, tint, gamma, a curve, an arbitrary linear part; some reach grey
+and night. Put on a photo it gives a style whose perfect result is known; put on two photos, a look
+that both share.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional
+
+from augment.effects.style.network import Gscm, apply_map, compose
+
+# ---- pairs ---------------------------------------------------------------------------------------
+
+GREY = (0.2126, 0.7152, 0.0722)  # luma of sRGB's primaries (ITU-R BT.709)
+
+MIXED_SHARE = 0.5  # of a batch's photos that share their square with another
+VARIED = 0.3  # of a recolouring's settings: by how much photos are recoloured before all else
+
+
+@dataclass(frozen=True)
+class RecolorSettings:
+    """How far recolourings go: standard deviations, but for the shares.
+
+    exposure, balance: log2 of the gains of all channels, of each. contrast, gamma: log. lift: of
+    each channel. saturation: log. hue_rad: about the grey axis. mix: of the entries of a matrix.
+    curve: of a tone curve's strength. grey_share, night_share: of the recolourings that take nearly
+    all colour, or light, away.
+    """
+
+    exposure: float = 0.22
+    balance: float = 0.20
+    contrast: float = 0.18
+    gamma: float = 0.42
+    lift: float = 0.07
+    saturation: float = 0.38
+    hue_rad: float = 0.30
+    mix: float = 0.17
+    curve: float = 0.90
+    grey_share: float = 0.05
+    night_share: float = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class Recoloring:
+    """B recolourings: clamp(curve(M c^gamma + b)) with curve(c) = c + s (3 c^2 - 2 c^3 - c).
+
+    maps: float32 [B, 3, 4], (M, b). gamma: float32 [B, 3], above 0. curve: float32 [B], s in
+    (-1, 1).
+    """
+
+    maps: Float[Tensor, "B 3 4"]
+    gamma: Float[Tensor, "B 3"]
+    curve: Float[Tensor, "B"]
+
+    def __call__(self, images: Float[Tensor, "B 3 H W"]) -> Float[Tensor, "B 3 H W"]:
+        """Pictures in [0, 1], each under its recolouring, on the device where they lie."""
+        maps, gamma, curve = (v.to(images.device) for v in (self.maps, self.gamma, self.curve))
+        bent = images.clamp_min(1e-6) ** gamma[:, :, None, None]
+        mapped = torch.einsum("bij,bjhw->bihw", maps[:, :, :3], bent)
+        mapped = (mapped + maps[:, :, 3, None, None]).clamp(0, 1)
+        smooth = mapped * mapped * (3 - 2 * mapped)
+        return torch.lerp(mapped, smooth, curve[:, None, None, None])
+
+
+@dataclass(frozen=True, eq=False)
+class PairBatch:
+    """B photos, B others, and both under the same recolourings; float32 [B, 3, S, S] in [0, 1]."""
+
+    photos: Float[Tensor, "B 3 S S"]
+    recolored: Float[Tensor, "B 3 S S"]
+    others: Float[Tensor, "B 3 S S"]
+    others_recolored: Float[Tensor, "B 3 S S"]
+
+
+def sample_recolorings(
+    count: int, generator: torch.Generator, settings: RecolorSettings | None = None
+) -> Recoloring:
+    """The same for the same state of the generator."""
+    s = RecolorSettings() if settings is None else settings
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn((count, *shape), generator=generator).clamp(-2.5, 2.5)
+
+    def uniform(low: float, high: float) -> Tensor:
+        return low + (high - low) * torch.rand(count, generator=generator)
+
+    exposure = s.exposure * normal()
+    saturation = (s.saturation * normal()).exp()
+    kind = torch.rand(count, generator=generator)
+    grey = kind < s.grey_share
+    night = (kind >= s.grey_share) & (kind < s.grey_share + s.night_share)
+    saturation = torch.where(grey, uniform(0.0, 0.3), saturation)
+    exposure = torch.where(night, uniform(-3.0, -1.5), exposure)
+    gains = 2 ** (exposure[:, None] + s.balance * normal(3))
+    gains = gains * torch.where(night[:, None], torch.tensor([0.8, 0.95, 1.25]), torch.ones(3))
+    contrast = (s.contrast * normal()).exp()[:, None]
+    # Contrast about the middle grey that the exposure makes, so that night stays night.
+    middle = 0.43 * gains
+    maps = torch.eye(3) + s.mix * normal(3, 3)
+    maps = _about_grey(saturation, s.hue_rad * normal()) @ maps
+    maps = (contrast * gains)[:, :, None] * maps
+    lift = torch.where(night, 0.2, 1.0)[:, None] * s.lift * normal(3)
+    offset = middle * (1 - contrast) + lift
+    return Recoloring(
+        torch.cat([maps, offset[..., None]], dim=2),
+        (s.gamma * normal())[:, None].exp() * (0.3 * s.gamma * normal(3)).exp(),
+        (s.curve * normal()).clamp(-0.9, 0.9),
+    )
+
+
+def recolor(
+    images: Float[Tensor, "B 3 H W"], generator: torch.Generator
+) -> Float[Tensor, "B 3 H W"]:
+    """Every picture under a recolouring of its own."""
+    return sample_recolorings(len(images), generator)(images)
+
+
+def sample_pairs(
+    photos: Float[Tensor, "P 3 H W"],
+    generator: torch.Generator,
+    batch: int,
+    *,
+    size_px: int = 128,
+    settings: RecolorSettings | None = None,
+) -> PairBatch:
+    """A batch from photos in [0, 1], on the device where they lie; the same for the same state of
+    the generator, which is the CPU's.
+
+    Photos are cut (half to all of each side), mirrored at random, and squeezed to size_px squares;
+    every second one shares its square with another, and each is recoloured a little before all
+    else. A hundred photos would be learnt by heart otherwise.
+
+    Raises:
+        ValueError: fewer than two photos, of which one could not be the other.
+    """
+    count = len(photos)
+    if count < 2:
+        raise ValueError(f"pairs need at least 2 photos; got {count}")
+    first = torch.randint(count, (batch,), generator=generator)
+    second = (first + torch.randint(1, count, (batch,), generator=generator)) % count
+    recoloring = sample_recolorings(batch, generator, settings)
+    first, second = first.to(photos.device), second.to(photos.device)
+    one = _varied(_cut(photos[first], generator, size_px), generator, settings)
+    two = _varied(_cut(photos[second], generator, size_px), generator, settings)
+    return PairBatch(one, recoloring(one), two, recoloring(two))
+
+
+def _varied(
+    photos: Float[Tensor, "B 3 S S"], generator: torch.Generator, settings: RecolorSettings | None
+) -> Float[Tensor, "B 3 S S"]:
+    """Half of the photos take a part, on the right or below, from the one before in the batch;
+    then each is recoloured a little."""
+    count, _, _, size = photos.shape
+    place = torch.arange(size) + 0.5
+    start = size * (0.3 + 0.4 * torch.rand((count, 1), generator=generator))
+    beyond = (place > start)[:, None]  # [B, 1, S]
+    below = (torch.rand((count, 1, 1), generator=generator) < 0.5).expand(-1, size, size)
+    foreign = torch.where(below, beyond.transpose(1, 2), beyond)
+    foreign = foreign & (torch.rand((count, 1, 1), generator=generator) < MIXED_SHARE)
+    mixed = torch.where(foreign[:, None].to(photos.device), photos.roll(1, 0), photos)
+    own = settings or RecolorSettings()
+    little = RecolorSettings(*(0.0 if "share" in n else VARIED * v for n, v in vars(own).items()))
+    return sample_recolorings(count, generator, little)(mixed)
+
+
+def _about_grey(
+    saturation: Float[Tensor, "B"], hue_rad: Float[Tensor, "B"]
+) -> Float[Tensor, "B 3 3"]:
+    """Turn colours about the grey axis, and scale their distance from it; grey stays as it is."""
+    third = torch.full((3, 3), 1 / 3)
+    cross = torch.tensor([[0.0, -1.0, 1.0], [1.0, 0.0, -1.0], [-1.0, 1.0, 0.0]]) / 3**0.5
+    cos, sin = hue_rad.cos()[:, None, None], hue_rad.sin()[:, None, None]
+    turned = third + cos * (torch.eye(3) - third) + sin * cross  # Rodrigues' formula
+    luma = torch.tensor(GREY).expand(3, 3)
+    return torch.lerp(luma.expand(len(saturation), 3, 3), turned, saturation[:, None, None])
+
+
+def _cut(
+    photos: Float[Tensor, "B 3 H W"], generator: torch.Generator, size_px: int
+) -> Float[Tensor, "B 3 S S"]:
+    count = len(photos)
+    sides = 0.5 + 0.5 * torch.rand((count, 2), generator=generator)
+    centres = (1 - sides) * (2 * torch.rand((count, 2), generator=generator) - 1)
+    mirrored = torch.where(torch.rand(count, generator=generator) < 0.5, -1.0, 1.0)
+    theta = torch.zeros(count, 2, 3)
+    theta[:, 0, 0], theta[:, 1, 1] = sides[:, 0] * mirrored, sides[:, 1]
+    theta[:, :, 2] = centres
+    theta = theta.to(photos.device)
+    grid = functional.affine_grid(theta, [count, 3, size_px, size_px], align_corners=False)
+    return functional.grid_sample(photos, grid, padding_mode="border", align_corners=False)
+
+
+# ---- What a style network learns from photographs alone (see augment.effects.style.pairs)
+# ----------------
+# Errors of colours are logarithms of mean squares, as their figures are (dB): a pair that is nearly
+# right goes on counting. With N and S the folded stages of GSCM, x a photo, p its recolouring:
+#
+#     same         S(p x) N(x) x = p x, and back
+#     half         the same, with the style from one half of the picture and the colours of the
+# other
+#     look         S(p y) N(x) x = p x with y another photo, and back
+#     consistency  N(x) x = N(p x) p x: the paper's L_con
+#     cycle        S(x) N(x) x = x: the paper's L_cyc
+#     range        colours of photo x in the style of photo y that are not displayable
+
+_ERROR_FLOOR = 1e-4  # mean square: nothing is gained beyond 40 dB
+_STRIDE_PX = 2  # of the pixels whose colours are compared
+
+
+@dataclass(frozen=True)
+class PairWeights:
+    """Of the losses in their sum."""
+
+    same: float = 1.0
+    half: float = 0.5
+    look: float = 1.0
+    consistency: float = 1.0
+    cycle: float = 1.0
+    range: float = 4.0
+
+
+def pair_losses(net: Gscm, batch: PairBatch) -> dict[str, Float[Tensor, ""]]:
+    """Each loss, by name, unweighted."""
+    count, _, _, size = batch.photos.shape
+    pictures = {
+        "x": batch.photos,
+        "px": batch.recolored,
+        "y": batch.others,
+        "py": batch.others_recolored,
+    }
+    # The left half's style on the right half's colours.
+    halves = {
+        f"{side}{name}": functional.interpolate(part, (size, size), mode="bilinear")
+        for name in ("x", "px")
+        for side, part in zip(
+            "lr", pictures[name].split([size // 2, size - size // 2], 3), strict=True
+        )
+    }
+    names = [*pictures, *halves]
+    f_c, f_s = net.encode(torch.cat([*pictures.values(), *halves.values()]))
+    normal = dict(zip(names, net.content_map(f_c).split(count), strict=True))
+    style = dict(zip(names, net.style_map(f_s).split(count), strict=True))
+    colors = {name: _colors(picture) for name, picture in pictures.items()}
+    colors |= {name: _colors(halves[name]) for name in ("rx", "rpx")}
+
+    def styled(content: str, by: str) -> Tensor:
+        return apply_map(compose(style[by], normal[content]), colors[content])
+
+    def error(content: str, by: str, target: str) -> Tensor:
+        return _log_error(styled(content, by), colors[target])
+
+    in_content_space = [apply_map(normal[name], colors[name]) for name in ("x", "px")]
+    mixed = torch.cat([styled("x", "y"), styled("px", "y"), styled("x", "py")])
+    return {
+        "same": (error("x", "px", "px") + error("px", "x", "x")) / 2,
+        "half": (error("rx", "lpx", "rpx") + error("rpx", "lx", "rx")) / 2,
+        "look": (error("x", "py", "px") + error("px", "y", "x")) / 2,
+        "consistency": (in_content_space[0] - in_content_space[1]).abs().mean(),
+        "cycle": (styled("x", "x") - colors["x"]).abs().mean(),
+        "range": ((mixed - 1).relu() + (-mixed).relu()).mean(),
+    }
+
+
+def weighted(losses: dict[str, Tensor], weights: PairWeights) -> Float[Tensor, ""]:
+    """Their sum."""
+    return torch.stack([getattr(weights, name) * loss for name, loss in losses.items()]).sum()
+
+
+def _colors(pictures: Float[Tensor, "B 3 S S"]) -> Float[Tensor, "B N 3"]:
+    return pictures[:, :, ::_STRIDE_PX, ::_STRIDE_PX].flatten(2).transpose(1, 2)
+
+
+def _log_error(got: Float[Tensor, "B N 3"], wanted: Float[Tensor, "B N 3"]) -> Float[Tensor, ""]:
+    """Mean log of the mean square, of what a display would show."""
+    square = (got.clamp(0, 1) - wanted).square().mean((1, 2))
+    return (square + _ERROR_FLOOR).log().mean()

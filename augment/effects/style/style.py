@@ -1,0 +1,375 @@
+"""A scene in a style, as pictures need it: mapped parts and sky, and what lights the snow."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections import OrderedDict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from weakref import WeakKeyDictionary
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float, Int16
+from torch import Tensor
+
+from augment.cameras import Camera
+from augment.effects.style.color_maps import (
+    StyleMaps,
+    identity_map,
+    level_maps,
+    map_rows,
+    sky_levels,
+    style_gaussians,
+    style_sky,
+    with_strength,
+)
+from augment.effects.style.content import (
+    PICTURE_SIZE,
+    content_key,
+    content_pictures,
+    content_statistics,
+)
+from augment.effects.style.images import StyleImage, image_statistics, read_style_image
+from augment.effects.style.statistics import (
+    LAND,
+    LAND_LIMITS,
+    SKY,
+    WHOLE,
+    ColorStatistics,
+    Statistics,
+    closed_maps,
+)
+from augment.errors import StyleError
+from augment.render.buffers import AUTO, CUDA
+from augment.scene import PosedGaussians, Scene
+from augment.sky import Sky
+from recipes.errors import RecipeError
+from recipes.weather import Style, style_preset_text
+from recipes.yaml_tree import read_plain
+
+# ---- From a recipe's style to the maps of a scene: the one place that knows all the methods ------
+
+if TYPE_CHECKING:
+    from augment.effects.style.network import Gscm
+
+MOST_REMEMBERED = 8  # styles of a scene
+
+_remembered: WeakKeyDictionary[Scene, dict[tuple, StyleMaps]] = WeakKeyDictionary()
+_given: WeakKeyDictionary[Scene, dict[Style, StyleMaps]] = WeakKeyDictionary()
+
+
+def style_maps(scene: Scene, style: Style, *, cameras: Sequence[Camera] | None = None) -> StyleMaps:
+    """The maps that give the scene the style's colours, float32; identities at strength 0.
+
+    style: image, mask and checkpoint are paths that can be opened as they are. Its applied_to says
+    which of the maps are wanted, and changes none. cameras: those that the scene will be seen by;
+    None for all of its own. The last few are remembered for as long as the scene lives, with what
+    their files held when they were first read. `remember_maps` overrides all of this.
+
+    Raises:
+        StyleError: an image, a preset or a checkpoint cannot be used.
+    """
+    if not style.changes:
+        return identity_maps()
+    given = _given.get(scene, {}).get(style)
+    if given is not None:
+        return given
+    key = (style, content_key(scene, cameras))
+    known = _remembered.setdefault(scene, {})
+    if key not in known:
+        maps = _find_maps(scene, style, cameras)
+        while len(known) >= MOST_REMEMBERED:
+            del known[next(iter(known))]
+        known[key] = maps
+    return known[key]
+
+
+def remember_maps(scene: Scene, style: Style, maps: StyleMaps) -> None:
+    """Make `style_maps` give these maps for the scene and the style from now on, whatever the
+    cameras.
+    """
+    given = _given.setdefault(scene, {})
+    while len(given) >= MOST_REMEMBERED:
+        del given[next(iter(given))]
+    given[style] = maps
+
+
+def identity_maps() -> StyleMaps:
+    """One map for all, which changes nothing."""
+    return StyleMaps(identity_map()[None], identity_map(), identity_map())
+
+
+def _find_maps(scene: Scene, style: Style, cameras: Sequence[Camera] | None) -> StyleMaps:
+    if style.method == "gscm":
+        found = _network_map(scene, style, cameras)
+        return StyleMaps(found[None], found, found)
+    return closed_maps(
+        content_statistics(scene, cameras, per_region=style.per_region),
+        _style_statistics(style),
+        method=style.method,
+        strength=style.strength,
+        per_region=style.per_region,
+    )
+
+
+def _style_statistics(style: Style) -> Statistics:
+    if style.preset is not None:
+        return preset_statistics(style.preset)
+    return image_statistics(_style_image(style))
+
+
+def _style_image(style: Style) -> StyleImage:
+    assert style.image is not None
+    mask = None if style.mask is None else Path(style.mask)
+    return read_style_image(Path(style.image), mask)
+
+
+def _network_map(
+    scene: Scene, style: Style, cameras: Sequence[Camera] | None
+) -> Float[Tensor, "3 4"]:
+    from augment.effects.style.network import compose, style_side
+
+    picture = _style_picture(_style_image(style))
+    net = _network(style.checkpoint, _stamp(style.checkpoint))
+    content = content_pictures(scene, cameras)
+    found = compose(style_side(net, picture), _content_side(scene, net, content)).double()
+    if not bool(torch.isfinite(found).all()):
+        raise StyleError(
+            f"the network gives no finite map for style image {style.image}: {found.tolist()}; "
+            f"use another checkpoint, or method mkl"
+        )
+    mean = content.double().mean((0, 2, 3))
+    full = _limited(found, mean)
+    return _limited(with_strength(full, style.strength), mean).float()
+
+
+def _content_side(
+    scene: Scene, net: Gscm, content: Float[Tensor, "B 3 256 256"]
+) -> Float[Tensor, "3 4"]:
+    """The scene's half of its maps, remembered with the pictures and the network it is of."""
+    from augment.effects.style.network import content_side
+
+    known = _content_sides.get(scene)
+    if known is None or known[0] is not net or known[1] is not content:
+        known = _content_sides[scene] = (net, content, content_side(net, content))
+    return known[2]
+
+
+_content_sides: WeakKeyDictionary[Scene, tuple[Gscm, Tensor, Tensor]] = WeakKeyDictionary()
+
+
+@functools.lru_cache(maxsize=2)
+def _network(path: str | None, _stamp: tuple[int, int]) -> Gscm:
+    """The network of a file, read once for all styles for as long as the file stays as it is."""
+    from augment.effects.style.network import load_network
+
+    return load_network(None if path is None else Path(path))
+
+
+def _stamp(path: str | None) -> tuple[int, int]:
+    """What changes with a file; of one that is not there, nothing: reading it says so."""
+    if path is None or not Path(path).is_file():
+        return (0, 0)
+    found = Path(path).stat()
+    return (found.st_mtime_ns, found.st_size)
+
+
+def _style_picture(image: StyleImage) -> Float[Tensor, "1 3 256 256"]:
+    """The style image squeezed to a square; what does not count has the others' mean colour."""
+    # By NumPy and OpenCV: on pictures this small torch's threads cost more than they give.
+    weights = image.weights[..., None]
+    mean = np.average(image.rgb.reshape(-1, 3), axis=0, weights=image.weights.reshape(-1))
+    filled = image.rgb * weights + mean.astype(np.float32) * (1 - weights)
+    square = cv2.resize(filled, (PICTURE_SIZE, PICTURE_SIZE), interpolation=cv2.INTER_AREA)
+    square = np.clip(square, 0, 1).transpose(2, 0, 1)[None]
+    return torch.from_numpy(np.ascontiguousarray(square))
+
+
+def _limited(color_map: Float[Tensor, "3 4"], mean: Float[Tensor, "3"]) -> Float[Tensor, "3 4"]:
+    """The map with no gain above that of the closed forms; the mean colour goes where it went."""
+    matrix, offset = color_map[:, :3], color_map[:, 3]
+    u, gains, v = torch.linalg.svd(matrix)
+    if float(gains.max()) <= LAND_LIMITS.most_gain:
+        return color_map
+    tamed = u @ torch.diag(gains.clamp(max=LAND_LIMITS.most_gain)) @ v
+    return torch.cat([tamed, (offset + (matrix - tamed) @ mean)[:, None]], 1)
+
+
+# ---- Styles that come with the package: colour statistics of a mood, in place of an image --------
+
+# Of a street's picture; they only matter where a map of the whole stands in for land and sky.
+SHARES: Mapping[str, float] = {LAND: 0.75, SKY: 0.25}
+_FIELDS = {"mean": (3,), "covariance": (3, 3)}
+
+
+def preset_statistics(name: str) -> Statistics:
+    """Of LAND, SKY and, put together from SHARES of both, WHOLE.
+
+    Raises:
+        StyleError: there is no style of that name, or its file is not as it should be.
+    """
+    try:
+        text = style_preset_text(name)
+    except RecipeError as error:
+        raise StyleError(str(error)) from None
+    return parse_statistics(text, source=f"style {name}")
+
+
+def parse_statistics(text: str, *, source: str) -> Statistics:
+    """The statistics in a preset's YAML: mean and covariance (display-encoded) of land and of sky.
+
+    Raises:
+        StyleError: keys are missing or unknown, numbers are not finite or of another count, a mean
+            is outside [0, 1], a covariance is not symmetric or is negative definite.
+    """
+    try:
+        document = read_plain(text, source=source)
+    except RecipeError as error:
+        raise StyleError(str(error)) from None
+    regions = _fields(document, tuple(SHARES), source)
+    found = {
+        region: _statistics(regions[region], share, f"{source}: {region}")
+        for region, share in SHARES.items()
+    }
+    return {WHOLE: together(tuple(found.values())), **found}
+
+
+def together(parts: tuple[ColorStatistics, ...]) -> ColorStatistics:
+    """The statistics of disjoint parts as one, each by its share."""
+    share = sum(part.share for part in parts)
+    mean = sum((part.share / share * part.mean for part in parts), np.zeros(3))
+    second = sum(
+        (
+            part.share / share * (part.covariance + np.outer(part.mean - mean, part.mean - mean))
+            for part in parts
+        ),
+        np.zeros((3, 3)),
+    )
+    return ColorStatistics(mean, second, share)
+
+
+def _fields(value: Any, expected: tuple[str, ...], where: str) -> dict[str, Any]:
+    if not isinstance(value, dict) or set(value) != set(expected):
+        got = sorted(map(str, value)) if isinstance(value, dict) else type(value).__name__
+        raise StyleError(f"{where}: expected the keys {', '.join(expected)}; got {got}")
+    return value
+
+
+def _statistics(value: Any, share: float, where: str) -> ColorStatistics:
+    fields = _fields(value, tuple(_FIELDS), where)
+    mean, covariance = (_numbers(fields[key], shape, f"{where}.{key}") for key, shape in
+                        _FIELDS.items())  # fmt: skip
+    if not ((mean >= 0) & (mean <= 1)).all():
+        raise StyleError(f"{where}.mean: must be in [0, 1]; got {mean.tolist()}")
+    if not np.array_equal(covariance, covariance.T):
+        raise StyleError(f"{where}.covariance: must be symmetric; got {covariance.tolist()}")
+    least = float(np.linalg.eigvalsh(covariance)[0])
+    if least < -1e-9:
+        raise StyleError(
+            f"{where}.covariance: must have no variance below zero; got {covariance.tolist()}, "
+            f"with {least:g} along one direction"
+        )
+    return ColorStatistics(mean, covariance, share)
+
+
+def _numbers(value: Any, shape: tuple[int, ...], where: str) -> np.ndarray:
+    try:
+        array = np.asarray(value)
+    except ValueError:  # rows of different lengths
+        array = np.empty(0)
+    if array.shape != shape or array.dtype.kind not in "if" or not np.isfinite(array).all():
+        size = " x ".join(map(str, shape))
+        raise StyleError(f"{where}: expected {size} finite numbers; got {value}")
+    return array.astype(np.float64)
+
+
+# ---- looks ---------------------------------------------------------------------------------------
+
+_MOST_LOOKS = 4  # of a scene, that are kept: a job goes through its variants frame by frame
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """The maps of a style in a scene, and the scene's sky under them. levels [N]: how much of each
+    background splat is sky; None where none is any.
+
+    folds: the background's SH are mapped once and kept, as much memory as they take themselves (of
+    the GPU where that draws), in place of the colours that they evaluate to, which a map does not
+    commute with where the clamp to >= 0 acts (augment.effects.style.color_maps). Actors' colours
+    are mapped either way: their SH are turned and changed from frame to frame, and they are few.
+    """
+
+    maps: StyleMaps
+    sky: Sky
+    bare: Scene
+    levels: Int16[Tensor, "N"] | None = None
+    folds: bool = False
+
+    def on(
+        self, parts: Sequence[PosedGaussians], *, backend: str = AUTO
+    ) -> tuple[PosedGaussians, ...]:
+        """The parts under the maps; snow among them keeps its colours. backend: that draws them."""
+        return tuple(part if part.is_snow else self._mapped(part, backend) for part in parts)
+
+    @cached_property
+    def witness(self) -> Scene:
+        """A scene of the styled background's mean colours and sky, to read the light from."""
+        flat = dataclasses.replace(self.bare.background, sh=self.bare.background.sh[:, :1])
+        flat = style_gaussians(flat, self.maps, levels=self.levels)
+        return dataclasses.replace(self.bare, background=flat, sky=self.sky)
+
+    def _mapped(self, part: PosedGaussians, backend: str) -> PosedGaussians:
+        if self.folds and part.gaussians.sh is self.bare.background.sh:
+            sh = self._folded_on_gpu if backend == CUDA else self._folded
+            return dataclasses.replace(part, gaussians=dataclasses.replace(part.gaussians, sh=sh))
+        if self.levels is None or part.instance_id > 0:
+            return dataclasses.replace(part, color_maps=self.maps.splats)
+        return dataclasses.replace(part, color_maps=self._level_maps, color_rows=self._rows)
+
+    @cached_property
+    def _folded(self) -> Float[Tensor, "N K 3"]:
+        return style_gaussians(self.bare.background, self.maps, levels=self.levels).sh
+
+    @cached_property
+    def _folded_on_gpu(self) -> Float[Tensor, "N K 3"]:
+        background = self.bare.background
+        return style_gaussians(background, self.maps, levels=self.levels, backend=CUDA).sh
+
+    @cached_property
+    def _level_maps(self) -> Float[Tensor, "R 3 4"]:
+        return level_maps(self.maps)
+
+    @cached_property
+    def _rows(self) -> Int16[Tensor, "N"]:
+        assert self.levels is not None
+        return map_rows(self.levels, self.bare.background.semantic, len(self.maps.splats))
+
+
+def look_of(scene: Scene, style: Style) -> Look:
+    """The style in the scene; remembered for as long as the scene lives and few others are asked
+    for.
+
+    Raises:
+        StyleError: the style cannot be read.
+    """
+    looks = _looks.setdefault(scene, OrderedDict())
+    maps = style_maps(scene, style)
+    look = looks.get(style)
+    if look is None or look.maps is not maps:
+        # The scene itself would be kept alive by what is remembered for as long as it lives.
+        bare = dataclasses.replace(scene)
+        sky, levels = style_sky(scene.sky, maps.sky), sky_levels(scene, maps)
+        look = looks[style] = Look(maps, sky, bare, levels, folds=style.evaluated == "sh")
+    looks.move_to_end(style)
+    while len(looks) > _MOST_LOOKS:
+        looks.popitem(last=False)
+    return look
+
+
+_looks: WeakKeyDictionary[Scene, OrderedDict[Style, Look]] = WeakKeyDictionary()

@@ -1,0 +1,397 @@
+"""Scenes as plain splat files: baked at a moment, or part by part; with cameras for viewers.
+
+`augment.files.export` says what such files cannot keep. Scales and opacities are stored as
+logs and logits, so that they read back to rounding, not to the bit.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from augment.cameras import Camera
+from augment.errors import OutputError, SceneError
+from augment.files.atomic_folder import replaced_folder
+from augment.files.ply import write_ply, write_splat
+from augment.files.scene_file import document_text, track_entry
+from augment.geometry import multiply_quats, quat_from_rotmat
+from augment.jobs.atomic import output_error, write_atomic
+from augment.jobs.layout import folder_name
+from augment.render.sh import rotate_sh
+from augment.scene import SH_COUNTS, Gaussians, Scene, SemanticClass
+
+# ---- What of a scene an exported file cannot keep, a sentence each, for people -------------------
+
+_SEEN_PX = 0.1
+ExportKind = Literal["scene", "file", "ply", "ply-parts", "splat"]
+
+
+def export_losses(
+    scene: Scene, kind: ExportKind, timestamp_ns: int | None = None, *, half: bool = False
+) -> tuple[str, ...]:
+    """What is lost, or has to be known, of a scene in a file of that kind.
+
+    timestamp_ns: the moment at which ply and splat are baked.
+    """
+    if kind in ("scene", "file"):
+        return tuple(_of_saved(scene, kind, half=half))
+    found = [*_of_places(scene, kind, timestamp_ns), *_of_colours(scene, kind)]
+    return (*found, *_of_facts(scene))
+
+
+def _of_saved(scene: Scene, kind: ExportKind, *, half: bool) -> Iterator[str]:
+    has_images = any(frame.image_paths for frame in scene.frames)
+    if scene.labels is not None or scene.recorded_source is not None or has_images:
+        yield (
+            f"boxes, LiDAR and recorded images are not in it: they are read from "
+            f"{scene.recorded_source or scene.source}; where that has moved, open it with ?data=URI"
+        )
+    if kind == "file":
+        yield "it names folders of this machine: the working folder, the recording's, the images'"
+    if half:
+        yield (
+            "rotations, opacities and colours are rounded to float16: colours by up to 0.1/255, "
+            "rotations by up to 0.05 degrees, opacities by up to 0.00025"
+        )
+
+
+def _of_places(scene: Scene, kind: ExportKind, timestamp_ns: int | None) -> Iterator[str]:
+    if kind == "ply-parts":
+        if any(len(part) == 0 for part in scene.all_gaussians):
+            yield "parts without Gaussians have no file"
+    elif scene.actors:
+        assert timestamp_ns is not None
+        there = sum(actor.track.pose_at(timestamp_ns) is not None for actor in scene.actors)
+        yield f"actors ({there}) stand still where they are {_moment(scene, timestamp_ns)}"
+        if there < len(scene.actors):
+            yield f"actors ({len(scene.actors) - there}) that are not there then are left out"
+        if off_ns := _greatest_delay_ns(scene, timestamp_ns):
+            yield (
+                f"the frame's cameras took their images up to {off_ns / 1e6:.0f} ms from that "
+                f"moment, so that moving actors are a little off in them"
+            )
+    if kind == "splat" and scene.world_origin_m.any():
+        place = ", ".join(f"{v:.3f}" for v in scene.world_origin_m)
+        yield f"where the scene lies in the dataset's world ({place}) is left out"
+    if kind == "splat":
+        yield "which way is up and how long a unit is are left out: open it with ?up=+z&scale=1"
+
+
+def _of_colours(scene: Scene, kind: ExportKind) -> Iterator[str]:
+    yield "the sky is left out"
+    if scene.mapped_cameras:
+        yield (
+            f"how the recorded colours of {', '.join(scene.mapped_cameras)} differ from the "
+            f"scene's (colour maps) is left out"
+        )
+    waves = sum(actor.color_waves is not None for actor in scene.actors)
+    if waves:
+        which = "their constant part" if kind == "ply-parts" else "those of that moment"
+        yield f"colours of actors ({waves}) that change over time are {which}"
+    if kind == "ply-parts" and any(actor.colors_in_world for actor in scene.actors):
+        yield (
+            "colours of actors by direction are for directions of the world, and viewers turn them "
+            "with the actor"
+        )
+    if kind == "splat":
+        yield "colours, opacities and rotations have 8 bits; colours below 0 or above 1 are cut off"
+        if any(part.sh_degree > 0 for part in scene.all_gaussians):
+            yield "colours do not depend on the direction of view: SH bands above 0 are left out"
+        if any(part.semantic is not None for part in scene.all_gaussians):
+            yield "semantic classes are left out"
+
+
+def _of_facts(scene: Scene) -> Iterator[str]:
+    if scene.labels is not None:
+        yield f"boxes and LiDAR stay with {scene.recorded_source or scene.source}"
+    if scene.ground_z_m is not None:
+        yield f"the road's height is left out: open it with ?ground_z={scene.ground_z_m:.3f}"
+    cameras = [camera for frame in scene.frames for camera in frame.cameras.values()]
+    if cameras:
+        off = max(
+            max(abs(camera.cx - camera.width / 2), abs(camera.cy - camera.height / 2))
+            for camera in cameras
+        )
+        yield "times of images are left out of cameras.json"
+        if off >= _SEEN_PX:
+            yield (
+                f"viewers take the principal points of cameras.json to be in the middle of the "
+                f"image; they lie up to {off:.1f} px off"
+            )
+    if any(camera.is_orthographic for camera in cameras):
+        yield "orthographic cameras are left out"
+    if scene.made_by:
+        yield "how the scene was made (made_by) is left out"
+
+
+def _moment(scene: Scene, timestamp_ns: int) -> str:
+    number = next((f.index for f in scene.frames if f.timestamp_ns == timestamp_ns), None)
+    return f"at {timestamp_ns} ns" if number is None else f"in frame {number}"
+
+
+def _greatest_delay_ns(scene: Scene, timestamp_ns: int) -> int:
+    """How far from a frame's own time its cameras took their images; 0 of another time."""
+    delays = [
+        abs(camera.timestamp_ns - timestamp_ns)
+        for frame in scene.frames
+        if frame.timestamp_ns == timestamp_ns
+        for camera in frame.cameras.values()
+    ]
+    return max(delays, default=0)
+
+
+# ---- Gaussians moved into another frame, and a whole scene in one set of them at a moment --------
+
+_PIECE = 65536  # Gaussians whose colours are turned together
+
+
+def moved_gaussians(
+    gaussians: Gaussians,
+    rotation: Float[Tensor, "3 3"],
+    shift: Float[Tensor, "3"],
+    scale: float = 1.0,
+) -> Gaussians:
+    """The Gaussians at scale * rotation @ mean + shift: quaternions and SH are turned with them.
+
+    rotation, shift: float64; places are computed in float64 and rounded once.
+    """
+    means = scale * (gaussians.means.double() @ rotation.T) + shift
+    moved = dataclasses.replace(
+        gaussians,
+        means=means.to(gaussians.means.dtype),
+        scales=gaussians.scales if scale == 1.0 else gaussians.scales * scale,
+    )
+    if torch.equal(rotation, torch.eye(3, dtype=rotation.dtype)):
+        return moved
+    quat = quat_from_rotmat(rotation).to(gaussians.quats.dtype).expand_as(gaussians.quats)
+    sh = gaussians.sh if gaussians.sh_degree == 0 else _turned_sh(gaussians.sh, rotation)
+    return dataclasses.replace(moved, quats=multiply_quats(quat, gaussians.quats), sh=sh)
+
+
+def baked(scene: Scene, timestamp_ns: int) -> Gaussians:
+    """Background and the actors that are there at a moment as Gaussians of the scene's world, in
+    the colours they have then; in the order of `Scene.parts_at`.
+
+    Colours of a lower degree are filled up with zero bands, unknown classes with UNKNOWN.
+    """
+    placed = []
+    for part in scene.parts_at(timestamp_ns):
+        gaussians, pose = part.gaussians, part.world_from_part
+        if pose is not None:
+            gaussians = moved_gaussians(gaussians, pose[:3, :3], pose[:3, 3])
+        placed.append(gaussians)
+    return _joined(placed)
+
+
+def _joined(parts: Sequence[Gaussians]) -> Gaussians:
+    if len(parts) == 1:
+        return parts[0]
+    names = ("means", "quats", "scales", "opacities")
+    columns = {name: torch.cat([getattr(part, name) for part in parts]) for name in names}
+    count = sum(map(len, parts))
+    bands = SH_COUNTS[max(part.sh_degree for part in parts if len(part) or count == 0)]
+    sh = torch.zeros(count, bands, 3, dtype=parts[0].sh.dtype)
+    has_classes = any(part.semantic is not None for part in parts)
+    semantic = torch.full((count,), int(SemanticClass.UNKNOWN), dtype=torch.int16)
+    start = 0
+    for part in parts:
+        rows = slice(start, start + len(part))
+        sh[rows, : part.sh.shape[1]] = part.sh[:, :bands]
+        if part.semantic is not None:
+            semantic[rows] = part.semantic
+        start = rows.stop
+    return Gaussians(**columns, sh=sh, semantic=semantic if has_classes else None)
+
+
+def _turned_sh(sh: Float[Tensor, "N K 3"], rotation: Float[Tensor, "3 3"]) -> Tensor:
+    """rotate_sh without temporaries as large as the coefficients of a large scene."""
+    turned = torch.empty_like(sh)
+    for start in range(0, len(sh), _PIECE):
+        turned[start : start + _PIECE] = rotate_sh(sh[start : start + _PIECE], rotation)
+    return turned
+
+
+# ---- gaussian export -----------------------------------------------------------------------------
+
+BACKGROUND, CAMERAS, PARTS, ACTORS = "background.ply", "cameras.json", "parts.json", "actors"
+_FORMAT = "climategs-parts"
+_MARK = re.compile(rb'\s*\{\s*"format"\s*:\s*"' + _FORMAT.encode() + rb'"')
+
+
+def export_ply(scene: Scene, path: str | Path, timestamp_ns: int) -> None:
+    """Write the scene as it is at a moment into an INRIA .ply.
+
+    Its comments say `up: +z` where gravity is known, `unit: metre` where the scale is.
+
+    Raises:
+        SceneError: nothing is there at that moment. OutputError: as write_ply.
+    """
+    write_ply(path, _something(scene, timestamp_ns), notes=_notes(scene))
+
+
+def export_splat(scene: Scene, path: str | Path, timestamp_ns: int) -> None:
+    """Write the scene as it is at a moment into a .splat.
+
+    Raises:
+        SceneError: nothing is there at that moment. OutputError: as write_splat.
+    """
+    gaussians = _something(scene, timestamp_ns)
+    write_splat(path, replace(gaussians, sh=gaussians.sh[:, :1]))  # export_losses says so
+
+
+def export_cameras(scene: Scene, folder: str | Path) -> bool:
+    """Write `cameras.json` beside splat files; a file that is there already stays as it is.
+
+    Returns whether the folder's cameras.json is now this scene's; without frames there is none.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    path, text = Path(folder) / CAMERAS, inria_cameras(scene)
+    if text is None:
+        return not path.exists()
+    if path.exists():
+        try:
+            return path.read_bytes() == text
+        except OSError:  # a folder, or what may not be read
+            return False
+    write_atomic(path, text)
+    return True
+
+
+def inria_cameras(scene: Scene) -> bytes | None:
+    """All images' cameras in the form of INRIA's cameras.json, named CAMERA/FRAME; None without.
+
+    Principal points, which the form does not know, stand beside it as cx and cy.
+    """
+    views = [
+        _view(camera, frame.index)
+        for frame in scene.frames
+        for camera in frame.cameras.values()
+        if not camera.is_orthographic
+    ]
+    if not views:
+        return None
+    rows = ",\n".join(json.dumps({"id": number} | view) for number, view in enumerate(views))
+    return f"[\n{rows}\n]\n".encode()
+
+
+def export_ply_parts(scene: Scene, folder: str | Path) -> None:
+    """Write background.ply, actors/NAME.ply in each actor's own frame, cameras.json, and parts.json
+    with tracks, labels and sizes; as a whole or not at all. Colours that change over time are
+    written as their constant part. Parts without Gaussians have no file.
+
+    An earlier export in the folder is replaced.
+
+    Raises:
+        OutputError: the folder holds something else, or the system refused; what was there is then
+            as it was.
+    """
+    folder = Path(folder).resolve()
+    try:
+        is_free = not folder.exists() or is_parts_folder(folder)
+    except OSError as error:
+        raise output_error(folder, error) from error
+    if not is_free:
+        raise OutputError(
+            f"{folder} holds something else than exported parts, so it is not replaced; choose "
+            f"another folder"
+        )
+    with replaced_folder(folder, (BACKGROUND, CAMERAS, PARTS, ACTORS)) as new:
+        _write_parts(scene, new)
+
+
+def is_parts_folder(folder: Path) -> bool:
+    """Whether a folder is empty or holds what `export_ply_parts` writes and nothing else."""
+    if not folder.is_dir():
+        return False
+    names = {entry.name for entry in folder.iterdir()}
+    if not names:
+        return True
+    if PARTS not in names or not names <= {BACKGROUND, CAMERAS, PARTS, ACTORS}:
+        return False
+    with (folder / PARTS).open("rb") as file:
+        is_ours = _MARK.match(file.read(200)) is not None
+    actors = folder / ACTORS
+    return is_ours and (
+        not actors.is_dir() or all(file.suffix == ".ply" for file in actors.iterdir())
+    )
+
+
+def _write_parts(scene: Scene, folder: Path) -> None:
+    notes = _notes(scene)
+
+    def write(gaussians: Gaussians, name: str) -> str | None:
+        if len(gaussians) == 0:
+            return None
+        write_ply(folder / name, gaussians, notes=notes)
+        return name
+
+    facts: dict[str, Any] = {
+        "format": _FORMAT,
+        "version": 1,
+        "name": scene.name,
+        "world_origin_m": [float(v) for v in scene.world_origin_m],
+        "has_metric_scale": bool(scene.has_metric_scale),
+        "has_known_gravity": bool(scene.has_known_gravity),
+        "background": {
+            "file": write(scene.background, BACKGROUND),
+            "count": len(scene.background),
+        },
+        "actors": [
+            {
+                "file": write(actor.gaussians, f"{ACTORS}/{folder_name(actor.track_id)}.ply"),
+                "track_id": actor.track_id,
+                "label": actor.label,
+                "size_m": [float(v) for v in actor.size_m],
+                "count": len(actor.gaussians),
+                "track": track_entry(actor.track, f"actor {actor.track_id!r}"),
+            }
+            for actor in scene.actors
+        ],
+    }
+    if (cameras := inria_cameras(scene)) is not None:
+        write_atomic(folder / CAMERAS, cameras)
+    write_atomic(folder / PARTS, document_text(facts).encode())
+
+
+def _something(scene: Scene, timestamp_ns: int) -> Gaussians:
+    gaussians = baked(scene, timestamp_ns)
+    if len(gaussians) == 0:
+        raise SceneError(f"scene {scene.name!r} shows no Gaussians at {timestamp_ns} ns")
+    return gaussians
+
+
+def _notes(scene: Scene) -> dict[str, str]:
+    notes = {}
+    if scene.has_known_gravity:
+        notes["up"] = "+z"
+    if scene.has_metric_scale:
+        notes["unit"] = "metre"
+    if scene.world_origin_m.any():
+        notes["world_origin_m"] = " ".join(str(float(v)) for v in scene.world_origin_m)
+    return notes
+
+
+def _view(camera: Camera, frame: int) -> dict[str, Any]:
+    pose = camera.world_from_camera
+    return {
+        "img_name": f"{folder_name(camera.name)}/{frame:06d}",
+        "width": camera.width,
+        "height": camera.height,
+        "position": pose[:3, 3].tolist(),
+        "rotation": pose[:3, :3].tolist(),
+        "fx": camera.fx,
+        "fy": camera.fy,
+        "cx": camera.cx,
+        "cy": camera.cy,
+    }

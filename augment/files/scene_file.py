@@ -1,0 +1,493 @@
+"""Scenes in files of our own, opened in an instant: a folder, or a single file to share.
+
+A folder holds
+
+    scene.json              what it is, cameras over time, tracks, colour maps (scene_document)
+    gaussians.safetensors   background.means, ..., actors.0.means, ... (scene_tensors)
+    sky.safetensors         rgb, image or faces
+
+and NAME.climategs is one safetensors file with the arrays of both (the sky's as sky.rgb, ...) and
+the metadata `format`, `version` and `document`, the text of scene.json.
+
+Arrays hold activated values, as `Gaussians` does, and are mapped into memory, so that opening costs
+no copy; every number is looked at once, since the files may come from anywhere.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO, NamedTuple
+
+import numpy as np
+import torch
+from safetensors import safe_open
+from torch import Tensor
+
+from augment.cameras import Camera, Frame
+from augment.errors import OutputError, SceneError
+from augment.files.atomic_folder import replaced_folder
+from augment.files.scene_schema import (
+    FORMAT,
+    READABLE,
+    SKY_KINDS,
+    VERSION,
+    ActorEntry,
+    FrameEntry,
+    Precision,
+    SavedPart,
+    SceneDocument,
+    check_format,
+    checked_document,
+    parsed_document,
+    part_arrays,
+    read_document,
+    sky_arrays,
+    take_parts,
+    take_sky,
+)
+from augment.ground_heights import Ground
+from augment.jobs.atomic import replaced_file
+from augment.scene import Actor, ColorWaves, Scene, Track
+from augment.sky import Sky
+from recipes.files import open_file
+
+# ------------------------------------------------------------------------------------------------
+# scene.json: everything of a saved scene but its arrays, in numbers that read back to the bit
+
+_LISTS = ("actors", "frames", "problems", "image_color_maps")  # with a line an item
+_ROTATION_TOLERANCE = 1e-3  # cameras are held to 1e-4 by their own class
+
+
+def scene_document(scene: Scene, precision: Precision = "float32") -> dict[str, Any]:
+    """The contents of scene.json. Where precision is not float32, made_by says so for good.
+
+    Raises:
+        SceneError: the scene has something that the file could not give back.
+    """
+    kind = SKY_KINDS.get(type(scene.sky))
+    if kind is None:
+        raise SceneError(
+            f"scene {scene.name!r}: a sky of class {type(scene.sky).__name__} cannot be saved; "
+            f"only {', '.join(t.__name__ for t in SKY_KINDS)} can"
+        )
+    document = {
+        "format": FORMAT,
+        "version": VERSION,
+        "precision": precision,
+        "name": scene.name,
+        "recorded_source": scene.recorded_source or scene.source,
+        "working_folder": os.getcwd(),
+        "world_origin_m": np.asarray(scene.world_origin_m, np.float64).tolist(),
+        "ground_z_m": None if scene.ground_z_m is None else float(scene.ground_z_m),
+        "has_metric_scale": bool(scene.has_metric_scale),
+        "ground": None if scene.ground is None else dataclasses.asdict(scene.ground),
+        "has_known_gravity": bool(scene.has_known_gravity),
+        "sky": kind,
+        "background_gaussians": len(scene.background),
+        "color_maps": {name: matrix.tolist() for name, matrix in scene.color_maps.items()},
+        "image_color_maps": [
+            {"camera": name, "timestamp_ns": int(timestamp_ns), "rows": matrix.tolist()}
+            for (name, timestamp_ns), matrix in scene.image_color_maps.items()
+        ],
+        "made_by": _json_facts(scene)
+        | ({} if precision == "float32" else {"precision": precision}),
+        "problems": list(scene.problems),
+        "actors": [_actor_entry(actor) for actor in scene.actors],
+        "frames": [_frame_entry(frame) for frame in scene.frames],
+    }
+    checked_document(document, f"scene {scene.name!r}")
+    return document
+
+
+def document_text(document: dict[str, Any]) -> str:
+    """JSON with a line a key, and a line an actor, frame, problem or image's colour map."""
+
+    def text(value: Any) -> str:
+        return json.dumps(value, ensure_ascii=False, allow_nan=False)
+
+    lines = []
+    for key, value in document.items():
+        if key in _LISTS and value:
+            rows = ",\n".join(f"  {text(item)}" for item in value)
+            lines.append(f"{text(key)}: [\n{rows}\n]")
+        else:
+            lines.append(f"{text(key)}: {text(value)}")
+    return "{\n" + ",\n".join(lines) + "\n}\n"
+
+
+def scene_of(
+    document: SceneDocument, parts: list[SavedPart], sky: Sky, *, source: str, where: str
+) -> Scene:
+    """The scene of a document; parts: background first, then its actors. It has no labels.
+
+    Raises:
+        SceneError: poses that are not rigid, times that do not increase, repeated names.
+    """
+    try:
+        actors = tuple(
+            _actor(entry, part) for entry, part in zip(document.actors, parts[1:], strict=True)
+        )
+        frames = tuple(_frame(entry) for entry in document.frames)
+        repeated = len(frames) - len({frame.index for frame in frames})
+        if repeated:
+            raise ValueError(f"{repeated} frame numbers are given twice")
+        image_color_maps = {
+            (entry.camera, entry.timestamp_ns): torch.tensor(entry.rows, dtype=torch.float32)
+            for entry in document.image_color_maps
+        }
+        repeated = len(document.image_color_maps) - len(image_color_maps)
+        if repeated:
+            raise ValueError(f"{repeated} images' colour maps are given twice")
+        return Scene(
+            name=document.name,
+            source=source,
+            background=parts[0].gaussians,
+            actors=actors,
+            sky=sky,
+            frames=frames,
+            world_origin_m=np.array(document.world_origin_m, np.float64),
+            ground_z_m=document.ground_z_m,
+            has_metric_scale=document.has_metric_scale,
+            ground=None if document.ground is None else Ground(**document.ground.model_dump()),
+            has_known_gravity=document.has_known_gravity,
+            problems=tuple(document.problems),
+            color_maps={
+                name: torch.tensor(rows, dtype=torch.float32)
+                for name, rows in document.color_maps.items()
+            },
+            image_color_maps=image_color_maps,
+            recorded_source=document.recorded_source,
+            made_by=document.made_by,
+        )
+    except ValueError as error:
+        raise SceneError(f"{where}: {error}") from error
+
+
+def track_entry(track: Track, where: str) -> dict[str, Any]:
+    """A track as JSON holds it.
+
+    Raises:
+        SceneError: poses that are not float64, or not rigid.
+    """
+    return {
+        "hold_ns": int(track.hold_ns),
+        "max_gap_ns": None if track.max_gap_ns is None else int(track.max_gap_ns),
+        "timestamps_ns": track.timestamps_ns.tolist(),
+        "world_from_actor": _rigid_rows(track.world_from_actor, where),
+    }
+
+
+def _actor_entry(actor: Actor) -> dict[str, Any]:
+    waves = actor.color_waves
+    return {
+        "track_id": actor.track_id,
+        "label": actor.label,
+        "size_m": [float(v) for v in actor.size_m],
+        "gaussians": len(actor.gaussians),
+        "track": track_entry(actor.track, f"actor {actor.track_id!r}"),
+        "color_waves": None
+        if waves is None
+        else {"timestamps_ns": waves.timestamps_ns.tolist(), "phases": waves.phases.tolist()},
+        "colors_in_world": bool(actor.colors_in_world),
+    }
+
+
+def _actor(entry: ActorEntry, part: SavedPart) -> Actor:
+    where = f"actor {entry.track_id!r}"
+    poses = torch.tensor(entry.track.world_from_actor, dtype=torch.float64).reshape(-1, 4, 4)
+    _check_rigid(poses, where)
+    length, width, height = entry.size_m
+    try:
+        times = torch.tensor(entry.track.timestamps_ns, dtype=torch.int64)
+        track = Track(times, poses, entry.track.hold_ns, entry.track.max_gap_ns)
+        waves = None
+        if entry.color_waves is not None:
+            assert part.waves is not None
+            times = torch.tensor(entry.color_waves.timestamps_ns, dtype=torch.int64)
+            phases = torch.tensor(entry.color_waves.phases, dtype=torch.float64)
+            waves = ColorWaves(part.waves, times, phases)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from error
+    size_m = (length, width, height)
+    return Actor(
+        entry.track_id, entry.label, part.gaussians, track, size_m, waves, entry.colors_in_world
+    )
+
+
+def _frame_entry(frame: Frame) -> dict[str, Any]:
+    where = f"frame {frame.index}"
+    wrong = [name for name, camera in frame.cameras.items() if camera.name != name]
+    if wrong:
+        raise SceneError(f"{where}: cameras must stand under their own names; {wrong} do not")
+    return {
+        "index": int(frame.index),
+        "timestamp_ns": int(frame.timestamp_ns),
+        "world_from_ego": _rigid_rows(frame.world_from_ego, where),
+        "cameras": {name: _camera_entry(camera) for name, camera in frame.cameras.items()},
+        "image_paths": {name: os.path.abspath(path) for name, path in frame.image_paths.items()},
+    }
+
+
+def _camera_entry(camera: Camera) -> dict[str, Any]:
+    return {
+        "width": int(camera.width),
+        "height": int(camera.height),
+        **{name: float(getattr(camera, name)) for name in ("fx", "fy", "cx", "cy")},
+        "timestamp_ns": int(camera.timestamp_ns),
+        "camera_from_world": _rigid_rows(camera.camera_from_world, f"camera {camera.name!r}"),
+        **({"is_orthographic": True} if camera.is_orthographic else {}),
+    }
+
+
+def _frame(entry: FrameEntry) -> Frame:
+    where = f"frame {entry.index}"
+    world_from_ego = torch.tensor(entry.world_from_ego, dtype=torch.float64)
+    _check_rigid(world_from_ego, where)
+    cameras = {}
+    for name, camera in entry.cameras.items():
+        pose = torch.tensor(camera.camera_from_world, dtype=torch.float64)
+        _check_rigid(pose, f"{where}, camera {name!r}")
+        numbers = camera.model_dump(exclude={"camera_from_world"})
+        cameras[name] = Camera(name=name, camera_from_world=pose, **numbers)
+    return Frame(entry.index, entry.timestamp_ns, world_from_ego, cameras, entry.image_paths)
+
+
+def _rigid_rows(transforms: Tensor, where: str) -> list:
+    if transforms.dtype != torch.float64:
+        raise SceneError(f"{where}: poses must be float64; got {transforms.dtype}")
+    try:
+        _check_rigid(transforms, where)
+    except ValueError as error:
+        raise SceneError(str(error)) from error
+    return transforms.tolist()
+
+
+def _check_rigid(transforms: Tensor, where: str) -> None:
+    """ValueError unless [.., 4, 4] are rotations and translations."""
+    poses = transforms.detach().numpy()  # torch would wake its threads for a few numbers
+    rotation = poses[..., :3, :3]
+    with np.errstate(all="ignore"):  # of numbers so large that their products overflow
+        error = np.abs(rotation @ np.swapaxes(rotation, -1, -2) - np.eye(3))
+        determinant = np.linalg.det(rotation)
+    is_rotation = (error < _ROTATION_TOLERANCE).all() and (determinant > 0).all()
+    has_last_row = (poses[..., 3, :] == np.eye(4)[3]).all()
+    if not (np.isfinite(poses).all() and is_rotation and has_last_row):
+        raise ValueError(
+            f"{where}: a pose must be a rotation and a translation with 0 0 0 1 in its last row"
+        )
+
+
+def _json_facts(scene: Scene) -> dict[str, Any]:
+    try:
+        text = json.dumps(dict(scene.made_by), allow_nan=False, ensure_ascii=False)
+        return json.loads(text.encode())  # unpaired surrogates cannot be written
+    except (TypeError, ValueError) as error:
+        raise SceneError(
+            f"scene {scene.name!r}: made_by must hold JSON's own types and finite numbers: {error}"
+        ) from error
+
+
+# ---- Safetensors files: written without a copy of the arrays, read mapped into memory ------------
+
+MOST_HEADER_BYTES = 100_000_000  # the format's own limit
+_TYPES = {"<f4": "F32", "<f2": "F16", "<i2": "I16"}
+_ALIGNMENT = 64  # bytes: a cache line, and any vector register
+
+
+def write_tensors(
+    file: BinaryIO, arrays: Mapping[str, np.ndarray], metadata: Mapping[str, str] | None = None
+) -> None:
+    """Write contiguous arrays, the widest types first, so that every one is aligned.
+
+    Raises:
+        SceneError: names, shapes and metadata are more than a header may hold. OSError.
+    """
+    header: dict[str, object] = {} if metadata is None else {"__metadata__": dict(metadata)}
+    order = sorted(arrays, key=lambda name: (-arrays[name].itemsize, name))
+    end = 0
+    for name in order:
+        array = arrays[name]
+        begin, end = end, end + array.nbytes
+        code = _TYPES[array.dtype.newbyteorder("<").str]
+        header[name] = {"dtype": code, "shape": array.shape, "data_offsets": [begin, end]}
+    text = json.dumps(header, ensure_ascii=False, separators=(",", ":")).encode()
+    text += b" " * (-(len(text) + 8) % _ALIGNMENT)
+    if len(text) > MOST_HEADER_BYTES:
+        raise SceneError(
+            f"{file.name}: cameras, tracks and facts take {len(text)} bytes of text; a single file "
+            f"may hold {MOST_HEADER_BYTES}. Write a scene folder instead, which has no such limit"
+        )
+    file.write(len(text).to_bytes(8, "little"))
+    file.write(text)
+    for name in order:
+        little = arrays[name].astype(arrays[name].dtype.newbyteorder("<"), copy=False)
+        file.write(little.reshape(-1).view(np.uint8).data)
+
+
+def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """The arrays of a file, mapped: writes to them stay in memory; and its metadata.
+
+    Raises:
+        SceneError: unreadable, damaged, or no safetensors file.
+    """
+    try:
+        open_file(path).close()  # to open a pipe would wait for ever
+        with safe_open(path, framework="pt") as file:
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            return tensors, file.metadata() or {}
+    except OSError as error:
+        raise SceneError(f"{path} cannot be read: {error}") from error
+    except Exception as error:  # whatever a damaged header leads to, in safetensors or in torch
+        raise SceneError(f"{path} is damaged or no safetensors file: {error}") from error
+
+
+# ---- scene files ---------------------------------------------------------------------------------
+
+DOCUMENT, GAUSSIANS, SKY = "scene.json", "gaussians.safetensors", "sky.safetensors"
+FILES = (DOCUMENT, GAUSSIANS, SKY)
+SCENE_SUFFIX = ".climategs"
+_SKY_PREFIX = "sky."
+_MARK = re.compile(rb'\s*\{\s*"format"\s*:\s*"' + FORMAT.encode() + rb'"')
+
+
+def is_scene_folder(folder: Path) -> bool:
+    """Whether a folder says that it is a scene folder; it may be damaged all the same."""
+    try:
+        with open_file(folder / DOCUMENT) as file:
+            return _MARK.match(file.read(200)) is not None
+    except OSError:
+        return False
+
+
+def is_scene_file(path: Path) -> bool:
+    """Whether a file is named as a scene in one file is; it may be damaged all the same."""
+    return path.suffix.lower() == SCENE_SUFFIX
+
+
+def save_scene(scene: Scene, folder: str | Path) -> None:
+    """Write a scene folder, as a whole or not at all; what `load_scene_parts` gives back is equal
+    to the bit, the labels excepted, which stay with the recording.
+
+    A scene folder that is there already is replaced in one step; other files in it are kept.
+
+    Raises:
+        SceneError: the scene has something the files cannot hold (a sky of another class, Gaussians
+            that are not float32).
+        OutputError: the folder holds something else than a scene, or the system refused (disk full,
+            no permission ...); what was there before is then as it was.
+    """
+    folder = Path(folder)
+    document = scene_document(scene)
+    arrays = {GAUSSIANS: part_arrays(scene, "float32"), SKY: sky_arrays(scene, "float32")}
+    if folder.is_dir() and any(folder.iterdir()) and not is_scene_folder(folder):
+        raise OutputError(
+            f"{folder} holds other files and no scene, so it is not replaced; choose another folder"
+        )
+    with replaced_folder(folder, FILES) as new:
+        (new / DOCUMENT).write_text(document_text(document), encoding="utf-8")
+        for name, tensors in arrays.items():
+            with (new / name).open("wb") as file:
+                write_tensors(file, tensors)
+
+
+def save_scene_file(scene: Scene, path: str | Path, *, half: bool = False) -> None:
+    """Write a scene into one file named *.climategs, as a whole or not at all; what was there is
+    replaced. What `load_scene_parts` gives back is equal to the bit, the labels excepted.
+
+    half: quaternions, opacities, colours, their waves and the sky as float16, for about half the
+    size (55 % at SH degree 3). Measured: colours move by up to 0.09/255 at degree 3 and 0.04/255 at
+    degree 0 (of colours from 0 to 1), rotations by up to 0.05 degrees, opacities by up to 0.00024;
+    99.9 % of a street's pixels by less than 0.1/255. That it was done is in made_by for good.
+
+    Raises:
+        SceneError: the scene has something the file cannot hold: as for save_scene, text beyond
+            100 MB, or, with half, numbers beyond 65504.
+        OutputError: another name, or the system refused; what was there before is as it was.
+    """
+    path = Path(path)
+    if not is_scene_file(path):
+        raise OutputError(f"{path}: a scene file must be named *{SCENE_SUFFIX}")
+    precision = "float16" if half else "float32"
+    document = document_text(scene_document(scene, precision))
+    sky = {_SKY_PREFIX + name: array for name, array in sky_arrays(scene, precision).items()}
+    metadata = {"format": FORMAT, "version": str(VERSION), "document": document}
+    arrays = part_arrays(scene, precision) | sky
+    with replaced_file(path) as file:
+        write_tensors(file, arrays, metadata)
+
+
+@dataclass(frozen=True, eq=False)
+class SavedScene:
+    """What a scene folder or file held. scene: without labels. working_folder: where relative paths
+    in scene.recorded_source start from.
+    """
+
+    scene: Scene
+    working_folder: Path
+
+
+def load_scene_parts(path: str | Path) -> Scene:
+    """The scene of `read_saved_scene` alone."""
+    return read_saved_scene(path).scene
+
+
+def read_saved_scene(path: str | Path) -> SavedScene:
+    """Open a scene folder or a scene file. Its arrays are mapped: writes to them stay in memory.
+
+    Gaussians that no rasteriser can draw are left out with a sentence in `problems`.
+
+    Raises:
+        SceneError: a file is missing, damaged, of another version or format, or they do not belong
+            together.
+    """
+    path = Path(path)
+    opened = _open_file(path) if path.is_file() else _open_folder(path)
+    document, (in_document, in_parts, in_sky) = opened.document, opened.places
+    parts, problems = take_parts(opened.parts, document, in_parts)
+    if problems:
+        found = [*document.problems, *problems]
+        document = document.model_copy(update={"problems": found})
+    sky = take_sky(opened.sky, document.sky, document.precision, in_sky)
+    scene = scene_of(document, parts, sky, source=f"scene:{path}", where=in_document)
+    return SavedScene(scene, Path(document.working_folder))
+
+
+class _Opened(NamedTuple):
+    """places: where document, parts and sky stand, for messages."""
+
+    document: SceneDocument
+    parts: dict[str, Tensor]
+    sky: dict[str, Tensor]
+    places: tuple[str, str, str]
+
+
+def _open_folder(folder: Path) -> _Opened:
+    for name in FILES:
+        if not (folder / name).is_file():
+            raise SceneError(f"{folder} is no scene folder: it has no {name}")
+    places = [folder / name for name in FILES]
+    document = read_document(places[0])
+    parts, sky = (read_tensors(place)[0] for place in places[1:])
+    return _Opened(document, parts, sky, (str(places[0]), str(places[1]), str(places[2])))
+
+
+def _open_file(path: Path) -> _Opened:
+    tensors, metadata = read_tensors(path)
+    known = {str(number): number for number in READABLE}
+    version = metadata.get("version", "none")
+    check_format(metadata.get("format"), known.get(version, version), str(path))
+    if "document" not in metadata:
+        raise SceneError(f"{path} is damaged: its metadata has no 'document'")
+    document = parsed_document(metadata["document"], f"{path}, document")
+    sky = {
+        name.removeprefix(_SKY_PREFIX): tensors.pop(name)
+        for name in list(tensors)
+        if name.startswith(_SKY_PREFIX)
+    }
+    return _Opened(document, tensors, sky, (str(path), str(path), str(path)))

@@ -1,0 +1,475 @@
+"""What a worker does, wherever it runs: open scenes, render blocks, publish them.
+
+A worker keeps one scene and no more: the last that it opened.
+"""
+
+from __future__ import annotations
+
+import gc
+import json
+import logging
+import shutil
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
+
+import pyarrow as pa
+
+from augment.errors import ClimateGSError, GpuLost, OutputError, SceneError, StyleError
+from augment.jobs.atomic import remove_temporaries
+from augment.jobs.blocks import Block, SceneRecord
+from augment.jobs.claims import CLAIMS_FOLDER, hold, try_claim
+from augment.jobs.journal import Identity
+from augment.jobs.layout import PATH_KINDS, STATE_FOLDER, folder_name, item_paths, variant_folder
+from augment.jobs.manifest import OK, PARTS, Part, list_parts, publish_part, read_manifest
+from augment.jobs.processes import file_lock
+from augment.jobs.quality_record import FOLDER as QUALITY
+from augment.jobs.render_job import RenderJob, SceneLoader, run_job
+from augment.jobs.store import LocalStore, Store, StoredFileMissing, open_store
+from augment.jobs.times import WorkTimes
+from augment.jobs.worker import Outcome, Renderer, describe
+from augment.scene import Scene
+from recipes.schema import schema_Recipe
+
+# ---- Takes a block from the folder it was rendered in to the output, where it appears at once ----
+# Its files go there first, to an object store those of an image as soon as it is finished; nobody
+# sees them before the block's rows follow in one step. What belongs to several images lies by
+# blocks,
+# for no two blocks ever write the same file: `labels/boxes/000016-3fc0a1b2d4e5.parquet`.
+
+_OF_BLOCK = ("labels", "box_2d", "box_smog", "box_water", "box_snow", "calibration")
+_OF_IMAGE = tuple(kind for kind in PATH_KINDS if kind not in _OF_BLOCK)
+REMOTE_UPLOADS = 8  # at a time: most of the time of one is waiting
+
+
+class Publisher:
+    """Publishes one block. folder: where `run_job` renders it. Use as a context manager."""
+
+    def __init__(self, store: Store, folder: Path, block: Block) -> None:
+        self._store, self._folder, self._block = store, folder, block
+        self._pool = ThreadPoolExecutor(REMOTE_UPLOADS, thread_name_prefix="publish")
+        self._sent: dict[str, Future[None]] = {}
+
+    def __enter__(self) -> Publisher:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._pool.shutdown(wait=True, cancel_futures=True)
+
+    def image_done(self, outcome: Outcome) -> None:
+        """Send the files of a finished image on their way; on this disk they only get a name."""
+        if outcome.status != OK or isinstance(self._store, LocalStore):
+            return
+        recipe = self._block.recipe
+        paths = item_paths(self._block.scene, recipe, outcome.camera, outcome.frame).columns()
+        for kind in _OF_IMAGE:
+            path = paths[f"{kind}_path"]
+            if path is None or path in self._sent:  # cameras of a frame share its sweep
+                continue
+            if kind != "lidar" or outcome.lidar:
+                self._send(path, path)
+
+    def finish(self) -> Part:
+        """Send what is left, then make the block visible.
+
+        Raises:
+            OutputError: a file could not be written; the block is invisible then.
+        """
+        rows = read_manifest(self._folder)
+        new = _renamed(rows, self._block.file_stem)
+        left = {path: path for path in self._of_variant()}
+        for kind in PATH_KINDS:
+            there, here = new[f"{kind}_path"].to_pylist(), rows[f"{kind}_path"].to_pylist()
+            left |= {t: h for t, h in zip(there, here, strict=True) if h is not None}
+        if isinstance(self._store, LocalStore):
+            self._store.put_files({target: self._folder / left[target] for target in left})
+        else:
+            for target in left.keys() - self._sent.keys():
+                self._send(left[target], target)
+            for future in self._sent.values():
+                future.result()
+        return publish_part(self._store, self._block.key, new)
+
+    def _send(self, source: str, target: str) -> None:
+        self._sent[target] = self._pool.submit(self._store.put_file, target, self._folder / source)
+
+    def _of_variant(self) -> Iterator[str]:
+        """The recipe, and the files of its style: every block of a variant has the same."""
+        for path in sorted(self._folder.glob("*/*/recipe.yaml")):
+            yield path.relative_to(self._folder).as_posix()
+        for path in sorted(self._folder.glob("*/*/style/*")):
+            yield path.relative_to(self._folder).as_posix()
+
+
+def staging_folder(store: Store, scratch: Path | None, block: Block) -> Path:
+    """Where a block is rendered: on the output's own disk, else in `scratch`.
+
+    There a killed job finds again what it had finished of the block.
+    """
+    if store.local_dir is not None:
+        return store.local_dir / STATE_FOLDER / "blocks" / block.claim
+    assert scratch is not None, "a store elsewhere needs a folder to render in"
+    return scratch / "blocks" / block.claim
+
+
+def _renamed(rows: pa.Table, stem: str) -> pa.Table:
+    for kind in _OF_BLOCK:
+        name = f"{kind}_path"
+        paths = [None if p is None else _of_block(p, stem) for p in rows[name].to_pylist()]
+        place = rows.column_names.index(name)
+        rows = rows.set_column(place, rows.schema.field(place), pa.array(paths, pa.string()))
+    return rows.combine_chunks()
+
+
+def _of_block(path: str, stem: str) -> str:
+    """`labels/boxes.parquet` -> `labels/boxes/<stem>.parquet`."""
+    whole = PurePosixPath(path)
+    return str(whole.with_suffix("") / f"{stem}{whole.suffix}")
+
+
+# ---- What the images of a variant are made from, kept in the output before the first of them -----
+# Two jobs that call different recipes the same can start at one moment, when neither sees images of
+# the other. Whoever comes second is refused here.
+
+VARIANTS = f"{STATE_FOLDER}/variants"
+
+
+def enter_variant(store: Store, scene: str, variant: str, identity: Identity) -> None:
+    """Make sure that the variant's images are all made from the same.
+
+    Raises:
+        OutputError: the output has the variant made from something else.
+    """
+    folder = variant_folder(scene, variant)
+    path = f"{VARIANTS}/{folder}.json"
+    try:
+        found = store.read(path)
+    except StoredFileMissing:
+        with hold(store, folder_name(f"variant.{folder.replace('/', '.')}")):
+            if not store.exists(path):
+                store.write(path, json.dumps(vars(identity), sort_keys=True).encode())
+            found = store.read(path)
+    try:
+        other = Identity(**json.loads(found))
+    except (ValueError, TypeError, RecursionError) as error:
+        raise OutputError(
+            f"{store.uri}/{path} is damaged: {error}. Delete it and start the job again"
+        ) from error
+    identity.check(other, f"{store.uri}/{folder}")
+
+
+# ------------------------------------------------------------------------------------------------
+# Clears away what killed processes have left in an output: nobody reads it, but it takes room
+# Temporary files of processes that have ended, the folders that published blocks were rendered in,
+# and the claims' files of the dead. What live processes hold stays; should one on another machine
+# lose a temporary file all the same, because locks do not reach there, its store writes it again.
+
+
+def clear_leftovers(store: Store, scratch: Path | None, published: Iterable[Block]) -> None:
+    """published: blocks that need no further work.
+
+    Raises:
+        OutputError: the system refused.
+    """
+    for block in published:
+        if staging_folder(store, scratch, block).is_dir():
+            claim = try_claim(store, block.claim)
+            if claim is not None:
+                with claim:
+                    clear_block(store, scratch, block)
+    if store.local_dir is None:
+        return
+    state = store.local_dir / STATE_FOLDER
+    remove_temporaries(store.local_dir, recursive=False)
+    for folder in (state / "jobs", state / "scenes"):
+        remove_temporaries(folder)
+    for kept in (PARTS, VARIANTS, QUALITY):
+        remove_temporaries(store.local_dir / kept)
+    for path in store.list(CLAIMS_FOLDER):
+        claim = try_claim(store, path.removeprefix(f"{CLAIMS_FOLDER}/").removesuffix(".lock"))
+        if claim is not None:
+            claim.release()
+
+
+def clear_block(store: Store, scratch: Path | None, block: Block) -> None:
+    """Delete the folder that a block was rendered in; who calls holds its claim."""
+    folder = staging_folder(store, scratch, block)
+    clear_files_of(store, block)
+    try:
+        shutil.rmtree(folder)
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        raise OutputError(f"cannot delete {folder}: {error.strerror}") from error
+
+
+def clear_files_of(store: Store, block: Block) -> None:
+    """Delete what was half-way into the output when a worker at this block was killed."""
+    if store.local_dir is not None:
+        remove_temporaries(store.local_dir / variant_folder(block.scene, block.variant))
+
+
+# ---- workshop ------------------------------------------------------------------------------------
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class WorkSetup:
+    """What all workers of a job share; picklable.
+
+    store_uri: the output. scratch: where blocks are rendered on their way to an output that is not
+    on this machine. open_scene, renderer: importable functions; None renders with the library's.
+    """
+
+    store_uri: str
+    scratch: Path | None
+    backend: str
+    open_scene: SceneLoader
+    renderer: Renderer | None = None
+
+
+@dataclass(frozen=True)
+class IndexTask:
+    """Open a scene and say what is in it. name: to be called so, or None for its own name."""
+
+    uri: str
+    name: str | None
+
+
+@dataclass(frozen=True)
+class BlockTask:
+    """Render a block. is_trial: its worker died before, so each image is rendered in a process of
+    its own, and one that ends it is the only one lost.
+    """
+
+    block: Block
+    name: str | None
+    is_trial: bool = False
+
+
+@dataclass(frozen=True)
+class SettleTask:
+    """Let the qualities of recipes choose their settings in a scene, or find what they have chosen.
+
+    name: as of an IndexTask. keep: whether a new choice is kept in the output.
+    """
+
+    uri: str
+    name: str | None
+    recipes: tuple[schema_Recipe, ...]
+    keep: bool = True
+
+
+Task = IndexTask | SettleTask | BlockTask
+
+
+@dataclass(frozen=True)
+class BlockDone:
+    """What became of a block. skipped: images that were finished before, here or elsewhere.
+
+    is_elsewhere: another process is at it; nothing was done. seconds: by kind of work, as of
+    `batch.times`.
+    """
+
+    written: int = 0
+    skipped: int = 0
+    failed: int = 0
+    failures: tuple[str, ...] = ()
+    is_elsewhere: bool = False
+    seconds: dict[str, float] | None = None
+
+
+@dataclass(frozen=True)
+class SettledRecipes:
+    """The recipes of a SettleTask, in its order."""
+
+    recipes: tuple[schema_Recipe, ...]
+
+
+@dataclass(frozen=True)
+class TaskFailed:
+    """The task could not be done. is_output: nothing can be written, so that all others would fail.
+
+    of_scene: the scene could not be opened, so that its other blocks would fail too. of_memory: it
+    may succeed while no other worker takes any.
+    """
+
+    text: str
+    is_output: bool = False
+    of_scene: bool = False
+    of_memory: bool = False
+
+
+Result = SceneRecord | SettledRecipes | BlockDone | TaskFailed
+Tell = Callable[[Outcome], None]
+
+
+class Workshop:
+    """Does one task after the other. tell: hears of every image, from several threads."""
+
+    def __init__(self, setup: WorkSetup, tell: Tell) -> None:
+        self._setup, self._tell = setup, tell
+        self._store: Store = open_store(setup.store_uri)
+        self._scene: Scene | None = None
+        self._opened: tuple[str, str | None] | None = None
+        self._entered: set[tuple[str, str]] = set()
+
+    def do(self, task: Task) -> Result:
+        """The task's result; errors that concern the task alone are results too.
+
+        Raises:
+            GpuLost: this process can do no other task either.
+        """
+        try:
+            if isinstance(task, IndexTask):
+                return self._index(task)
+            if isinstance(task, SettleTask):
+                return SettledRecipes(tuple(self._settle(task, recipe) for recipe in task.recipes))
+            return self._render(task)
+        except OutputError as error:
+            return TaskFailed(str(error), is_output=True)
+        except GpuLost:
+            raise
+        except _SceneFailed as error:
+            of_memory = isinstance(error.__cause__, MemoryError)
+            return TaskFailed(str(error), of_scene=True, of_memory=of_memory)
+        except Exception as error:
+            _log.debug("task failed", exc_info=True)
+            return TaskFailed(_said(error), of_memory=isinstance(error, MemoryError))
+
+    def _index(self, task: IndexTask) -> SceneRecord:
+        started = time.perf_counter()
+        scene = self._scene_of(task.uri, task.name)
+        return SceneRecord.of(scene, task.uri, time.perf_counter() - started)
+
+    def _settle(self, task: SettleTask, recipe: schema_Recipe) -> schema_Recipe:
+        from augment.jobs.quality_record import settle_for
+
+        scene, setup = self._scene_of(task.uri, task.name), self._setup
+        try:
+            return settle_for(
+                self._store,
+                recipe,
+                scene,
+                backend=setup.backend,
+                renderer=setup.renderer,
+                keep=task.keep,
+            )
+        except (SceneError, StyleError) as error:
+            raise ClimateGSError(
+                f"recipe {recipe.name}, variant {recipe.variant}: quality {recipe.quality.words} "
+                f"cannot choose its settings: {error}"
+            ) from error
+
+    def _scene_of(self, uri: str, name: str | None) -> Scene:
+        if self._opened != (uri, name) or self._scene is None:
+            self._forget()
+            try:
+                scene = self._setup.open_scene(uri)
+            except OutputError:
+                raise
+            except Exception as error:
+                _log.debug("%s", uri, exc_info=True)
+                raise _SceneFailed(_said(error)) from error
+            self._scene = scene if name is None else replace(scene, name=name)
+            self._opened = (uri, name)
+        return self._scene
+
+    def _forget(self) -> None:
+        """Let go of the scene before another one is opened: never two at a time."""
+        self._scene = self._opened = None
+        gc.collect()
+
+    def _render(self, task: BlockTask) -> BlockDone:
+        block = task.block
+        claim = try_claim(self._store, block.claim)
+        if claim is None:
+            return BlockDone(is_elsewhere=True)
+        with claim:
+            part = list_parts(self._store, folder_name(block.scene)).get(block.key)
+            if part is not None and not part.has_failures:
+                clear_block(self._store, self._setup.scratch, block)  # killed just before it did
+                return BlockDone(skipped=block.images)
+            return self._render_claimed(task)
+
+    def _render_claimed(self, task: BlockTask) -> BlockDone:
+        block, times = task.block, WorkTimes()
+        if task.is_trial:  # its processes share a scene of their own: not two at a time
+            self._forget()
+        else:
+            with times.spent("open"):
+                scene = self._scene_of(block.uri, task.name)
+            with times.spent("place"):
+                self._lay_bed(block, scene)
+        self._enter(block)
+        folder = staging_folder(self._store, self._setup.scratch, block)
+        if folder.is_dir():
+            clear_files_of(self._store, block)
+        job = RenderJob(
+            scene_uri=block.uri,
+            recipes=[block.recipe],
+            out_dir=folder,
+            frames=block.frames,
+            cameras=block.cameras,
+            backend=self._setup.backend,
+            workers=2 if task.is_trial else 1,
+            beds_dir=self._beds_dir(),
+        )
+        with Publisher(self._store, folder, block) as publisher:
+
+            def tell(outcome: Outcome) -> None:
+                publisher.image_done(outcome)
+                self._tell(outcome)
+
+            result = run_job(
+                job,
+                scene_loader=lambda uri: self._scene_of(uri, task.name),
+                renderer=self._setup.renderer,
+                progress=False,
+                tell=tell,
+            )
+            with times.spent("publish"):
+                publisher.finish()
+            if not result.failed:
+                clear_block(self._store, self._setup.scratch, block)
+        seconds = Counter(result.timings)
+        seconds.update(times.so_far())
+        return BlockDone(
+            result.written, result.skipped, result.failed, result.failures, seconds=dict(seconds)
+        )
+
+    def _enter(self, block: Block) -> None:
+        variant = (block.scene, block.variant)
+        if variant not in self._entered:
+            enter_variant(self._store, *variant, block.identity(self._setup.backend))
+            self._entered.add(variant)
+
+    def _beds_dir(self) -> Path:
+        if self._store.local_dir is not None:
+            return self._store.local_dir / STATE_FOLDER
+        assert self._setup.scratch is not None
+        return self._setup.scratch
+
+    def _lay_bed(self, block: Block, scene: Scene) -> None:
+        """Let one process look where the snow can lie, and the others on this disk wait for it."""
+        from augment.jobs.prepare import snow_to_lay, store_beds
+
+        if snow_to_lay(block.recipe) is not None:
+            folder = self._beds_dir()
+            with file_lock(folder / f"beds-{folder_name(block.scene)}.lock"):
+                store_beds(scene, [block.recipe], folder, backend=self._setup.backend)
+
+
+class _SceneFailed(ClimateGSError):
+    """A scene could not be opened."""
+
+
+def _said(error: Exception) -> str:
+    """Our own errors say what to do; of others the kind matters too."""
+    if isinstance(error, MemoryError):
+        return f"memory ran out ({error}); use fewer workers, or a machine with more"
+    return str(error) if isinstance(error, ClimateGSError) else describe(error, "in a worker")

@@ -1,0 +1,430 @@
+"""A job resolved: every scene's recipes in numbers, cut into blocks; as data and as a file.
+
+The plan lies in the output as `.climategs/jobs/<name>.json`, so that progress can be read from the
+output alone.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
+
+import augment
+from augment.cameras import scaled_size
+from augment.errors import ClimateGSError, OutputError, SceneError
+from augment.jobs.files import RECORDED, SceneIndex, has_lidar, select_frames
+from augment.jobs.journal import Identity
+from augment.jobs.layout import STATE_FOLDER, folder_name, variant_name
+from augment.jobs.manifest import Pictured
+from augment.jobs.store import Store
+from augment.scene import Scene
+from recipes.job import JobRecipes, JobScene
+from recipes.schema import parse_frames, schema_Recipe
+
+# ------------------------------------------------------------------------------------------------
+# What a job knows of a scene without keeping it open, and the blocks of images it is cut into
+
+_FORMAT = 1
+
+
+@dataclass(frozen=True)
+class FrameRecord:
+    """cameras: by name, width and height in pixels and the time of the image."""
+
+    number: int
+    timestamp_ns: int
+    cameras: dict[str, tuple[int, int, int]]
+
+
+@dataclass(frozen=True)
+class SceneRecord:
+    """A scene's frames and cameras. uri: as the job names it. source: as the scene does itself.
+
+    has_labels: whether boxes can pass through. has_lidar: whether a frame has a sweep. open_s: how
+    long opening it took. gaussians_bytes: of its splats.
+    """
+
+    uri: str
+    name: str
+    source: str
+    has_labels: bool
+    open_s: float
+    gaussian_bytes: int
+    frames: tuple[FrameRecord, ...]
+    has_lidar: bool = True  # in records of before it was asked
+
+    @staticmethod
+    def of(scene: Scene, uri: str, open_s: float) -> SceneRecord:
+        select_frames(SceneIndex.of(scene), None, None)  # or it holds no image at all
+        return SceneRecord(
+            uri=uri,
+            name=scene.name,
+            source=scene.source,
+            has_labels=scene.labels is not None,
+            has_lidar=has_lidar(scene, [frame.index for frame in scene.frames]),
+            open_s=open_s,
+            gaussian_bytes=scene.gaussian_bytes,
+            frames=tuple(
+                FrameRecord(
+                    frame.index,
+                    frame.timestamp_ns,
+                    {
+                        name: (camera.width, camera.height, camera.timestamp_ns)
+                        for name, camera in sorted(frame.cameras.items())
+                    },
+                )
+                for frame in sorted(scene.frames, key=lambda frame: frame.index)
+            ),
+        )
+
+    def to_json(self) -> bytes:
+        frames = [[f.number, f.timestamp_ns, f.cameras] for f in self.frames]
+        facts = {**vars(self), "format": _FORMAT, "frames": frames}
+        return json.dumps(facts, separators=(",", ":")).encode()
+
+    @staticmethod
+    def from_json(data: bytes, where: str) -> SceneRecord:
+        """What `to_json` made bytes of.
+
+        Raises:
+            OutputError: the bytes are something else.
+        """
+        try:
+            facts: dict[str, Any] = json.loads(data)
+            if facts.pop("format") != _FORMAT:
+                raise ValueError("it is of another version")
+            frames = tuple(
+                FrameRecord(number, time, {n: (w, h, t) for n, (w, h, t) in cameras.items()})
+                for number, time, cameras in facts.pop("frames")
+            )
+            return SceneRecord(**facts, frames=frames)
+        except (ValueError, TypeError, KeyError, AttributeError) as error:
+            raise OutputError(
+                f"{where} is damaged: {error}. Delete it; the scene is opened again"
+            ) from error
+
+
+@dataclass(frozen=True)
+class Block:
+    """Images that one worker renders in a row and that appear in the output at once.
+
+    key: `<scene>/<variant>-<first frame>-<digest>`; the digest is of all that decides the block's
+    images, so it stays the same whatever else is in the job. uri: what opens the scene. source:
+    the scene's own word for that. scene: its name in the output. frames, cameras: in order.
+    images: how many it has.
+    """
+
+    key: str
+    uri: str
+    source: str
+    scene: str
+    recipe: schema_Recipe
+    frames: tuple[int, ...]
+    cameras: tuple[str, ...]
+    images: int
+
+    @property
+    def variant(self) -> str:
+        return variant_name(self.recipe)
+
+    @property
+    def claim(self) -> str:
+        """Its name among the claims, and that of the folder it is rendered in."""
+        return claim_name(self.key)
+
+    @property
+    def file_stem(self) -> str:
+        """What its files are called that belong to several images: `000016-3fc0a1b2`."""
+        return self.key.rsplit("/", 1)[-1].removeprefix(folder_name(self.variant) + "-")
+
+    def identity(self, backend: str) -> Identity:
+        """What its images are made from. backend: as named, or as chosen where that is known."""
+        return Identity(self.source, self.recipe.hash, RECORDED, augment.__version__, backend)
+
+    def pictured(self, record: SceneRecord) -> list[Pictured]:
+        """All images of the block, by frame and camera."""
+        wanted, cameras, scale = set(self.frames), set(self.cameras), self.recipe.render.scale
+        return [
+            Pictured(frame.number, name, time, *scaled_size(width, height, scale))
+            for frame in record.frames
+            if frame.number in wanted
+            for name, (width, height, time) in frame.cameras.items()
+            if name in cameras
+        ]
+
+
+def claim_name(key: str) -> str:
+    """A block's key as a name that is a single part of a path."""
+    return folder_name(key.replace("/", "."))
+
+
+def cut_into_blocks(
+    record: SceneRecord,
+    recipes: Sequence[schema_Recipe],
+    *,
+    frames: str = "all",
+    cameras: Sequence[str] | None = None,
+    block_images: int = 64,
+    backend: str = "auto",
+) -> list[Block]:
+    """The scene's blocks, variant by variant, in the order of the frames.
+
+    frames: as `recipes.schema` reads them; ranges end with the scene. block_images: about how many
+    images one has. Blocks begin at fixed frames of the scene, whatever the selection, so that most
+    stay the same when it grows.
+
+    Raises:
+        SceneError: an unknown frame or camera, or no image is left.
+    """
+    known = {name for frame in record.frames for name in frame.cameras}
+    if cameras is not None and (unknown := sorted(set(cameras) - known)):
+        raise SceneError(
+            f"scene {record.name!r} has no camera {', '.join(unknown)}; it has "
+            f"{', '.join(sorted(known))}"
+        )
+    wanted_cameras = known if cameras is None else set(cameras)
+    numbers = [frame.number for frame in record.frames]
+    chosen = parse_frames(frames).select(numbers, clip=True)
+    wanted = set(numbers if chosen is None else chosen)
+    if unknown_frames := sorted(wanted - set(numbers)):
+        raise SceneError(
+            f"scene {record.name!r} has no frame {', '.join(map(str, unknown_frames))}; its frames "
+            f"are {numbers[0]} to {numbers[-1]}"
+        )
+    span = max(1, block_images // max(len(wanted_cameras), 1))
+    blocks: list[Block] = []
+    for recipe in recipes:
+        for start in range(0, len(record.frames), span):
+            run = [f for f in record.frames[start : start + span] if f.number in wanted]
+            counts = [len(wanted_cameras & f.cameras.keys()) for f in run]
+            held = tuple(f.number for f, count in zip(run, counts, strict=True) if count)
+            if held:
+                names = tuple(sorted(wanted_cameras & {n for f in run for n in f.cameras}))
+                key = _key(record, recipe, run[0].number, held, names, backend)
+                blocks.append(
+                    Block(
+                        key,
+                        record.uri,
+                        record.source,
+                        record.name,
+                        recipe,
+                        held,
+                        names,
+                        sum(counts),
+                    )
+                )
+    if not blocks:
+        raise SceneError(
+            f"scene {record.name!r} ({record.uri}): frames {frames!r} and cameras "
+            f"{'all' if cameras is None else ', '.join(cameras)} hold no image"
+        )
+    return blocks
+
+
+def _key(
+    record: SceneRecord,
+    recipe: schema_Recipe,
+    first: int,
+    frames: tuple[int, ...],
+    cameras: tuple[str, ...],
+    backend: str,
+) -> str:
+    decides = [record.source, recipe.hash, frames, cameras, augment.__version__, backend]
+    digest = hashlib.sha256(json.dumps(decides).encode()).hexdigest()[:12]
+    variant = folder_name(variant_name(recipe))
+    return f"{folder_name(record.name)}/{variant}-{first:06d}-{digest}"
+
+
+# ---- plan ----------------------------------------------------------------------------------------
+
+JOBS = f"{STATE_FOLDER}/jobs"
+
+
+@dataclass(frozen=True)
+class Plan:
+    """blocks: in order, scene by scene. records: by scene. names: what a scene is called where the
+    job says so. unusable: URI -> why the scene cannot be opened, or not as the job wants it.
+    """
+
+    job: str
+    backend: str
+    blocks: tuple[Block, ...]
+    records: Mapping[str, SceneRecord]
+    names: Mapping[str, str | None]
+    unusable: Mapping[str, str]
+
+    @property
+    def images(self) -> int:
+        return sum(block.images for block in self.blocks)
+
+
+def make_plan(
+    recipes: JobRecipes,
+    scenes: Sequence[JobScene],
+    found: Mapping[tuple[str, str | None], SceneRecord | str],
+    backend: str,
+    settled: Mapping[tuple[str, str], schema_Recipe | str] = MappingProxyType({}),
+) -> Plan:
+    """The plan of a job. scenes: without patterns. found: the scene of every URI and name, or why
+    it cannot be opened. settled: by scene and variant, those recipes whose quality had to choose
+    its settings in the scene, or why it could not: no recipe of that scene is rendered then.
+
+    Raises:
+        ClimateGSError: two scenes would share a folder, or none of them can be used.
+        RecipeError: a draw breaks a rule.
+    """
+    blocks: list[Block] = []
+    records: dict[str, SceneRecord] = {}
+    unusable: dict[str, str] = {}
+    for entry in scenes:
+        record = found[entry.uri, entry.name]
+        if isinstance(record, str):
+            unusable[entry.uri] = record
+            continue
+        _check_folder(records, record)
+        drawn = recipes.of_scene(entry, record.name)
+        chosen = [settled.get((record.name, variant_name(recipe)), recipe) for recipe in drawn]
+        if failed := [why for why in chosen if isinstance(why, str)]:
+            unusable[entry.uri] = failed[0]
+            continue
+        try:
+            cut = cut_into_blocks(
+                record,
+                [recipe for recipe in chosen if isinstance(recipe, schema_Recipe)],
+                frames=entry.frames,
+                cameras=entry.cameras,
+                block_images=recipes.job.block_images,
+                backend=backend,
+            )
+        except SceneError as error:
+            unusable[entry.uri] = str(error)
+            continue
+        records[record.name] = record
+        blocks += cut
+    if not records:
+        reasons = "".join(f"\n  {uri}: {why}" for uri, why in list(unusable.items())[:5])
+        raise ClimateGSError(f"job {recipes.job.name}: none of its scenes can be used:{reasons}")
+    names = {record.name: entry.name for entry, record in _pairs(scenes, found)}
+    return Plan(recipes.job.name, backend, tuple(blocks), records, names, unusable)
+
+
+def shard_of(blocks: Sequence[Block], number: int, count: int) -> list[Block]:
+    """The blocks of shard `number` (counted from 1) of `count`: a run of about as many images as
+    every other's, so that most scenes are opened by one shard only.
+    """
+    total, before = sum(block.images for block in blocks), 0
+    mine = []
+    for block in blocks:
+        if (before + block.images / 2) * count // max(total, 1) == number - 1:
+            mine.append(block)
+        before += block.images
+    return mine
+
+
+@dataclass(frozen=True)
+class PlannedBlock:
+    """A block as the plan's file has it. key: of the block. images: how many."""
+
+    key: str
+    scene: str
+    variant: str
+    recipe: str
+    images: int
+
+    @property
+    def claim(self) -> str:
+        """As `Block.claim`."""
+        return claim_name(self.key)
+
+
+@dataclass(frozen=True)
+class StoredPlan:
+    """What the output says of a job."""
+
+    job: str
+    version: str
+    blocks: tuple[PlannedBlock, ...]
+    unusable: Mapping[str, str]
+
+
+def store_plan(store: Store, plan: Plan) -> None:
+    """Write the plan's file; the same for every shard and every time.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    data = _to_json(plan)
+    path = f"{JOBS}/{plan.job}.json"
+    if not (store.exists(path) and store.read(path) == data):
+        store.write(path, data)
+
+
+def stored_plans(store: Store) -> list[StoredPlan]:
+    """The plans of all jobs in the output, by name.
+
+    Raises:
+        OutputError: one is damaged.
+    """
+    paths = [path for path in store.list(JOBS) if path.endswith(".json")]
+    return [_from_json(store.read(path), f"{store.uri}/{path}") for path in sorted(paths)]
+
+
+def _pairs(
+    scenes: Sequence[JobScene], found: Mapping[tuple[str, str | None], SceneRecord | str]
+) -> list[tuple[JobScene, SceneRecord]]:
+    pairs = [(entry, found[entry.uri, entry.name]) for entry in scenes]
+    return [(entry, record) for entry, record in pairs if isinstance(record, SceneRecord)]
+
+
+def _check_folder(records: Mapping[str, SceneRecord], record: SceneRecord) -> None:
+    for other in records.values():
+        if folder_name(other.name).casefold() == folder_name(record.name).casefold():
+            raise ClimateGSError(
+                f"the scenes {other.uri} and {record.uri} are both called {record.name!r}, so they "
+                f"would share a folder; give one of them a name in the job: "
+                f"{{uri: {record.uri!r}, name: ...}}"
+            )
+
+
+def _to_json(plan: Plan) -> bytes:
+    blocks = [[b.key, b.scene, b.variant, b.recipe.name, b.images] for b in plan.blocks]
+    facts = {
+        "format": _FORMAT,
+        "job": plan.job,
+        "version": augment.__version__,
+        "images": plan.images,
+        "scenes": len(plan.records),
+        "unusable": dict(plan.unusable),
+        "blocks": blocks,
+    }
+    return json.dumps(facts, separators=(",", ":")).encode()
+
+
+def _from_json(data: bytes, where: str) -> StoredPlan:
+    try:
+        facts = json.loads(data)
+        if facts["format"] != _FORMAT:
+            raise ValueError("it is of another version")
+        blocks = tuple(PlannedBlock(*block) for block in facts["blocks"])
+        plan = StoredPlan(facts["job"], facts["version"], blocks, facts["unusable"])
+        _check_types(plan)
+        return plan
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        raise OutputError(f"{where} is damaged: {error}. Delete it and start the job again") from (
+            error
+        )
+
+
+def _check_types(plan: StoredPlan) -> None:
+    texts = [plan.job, plan.version, *plan.unusable.keys(), *plan.unusable.values()]
+    for block in plan.blocks:
+        texts += [block.key, block.scene, block.variant, block.recipe]
+        if type(block.images) is not int or block.images < 1:
+            raise ValueError(f"a block of {block.images!r} images")
+    for text in texts:
+        if not isinstance(text, str):
+            raise ValueError(f"{text!r} in place of a text")

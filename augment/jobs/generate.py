@@ -1,0 +1,587 @@
+"""A dataset job: many scenes under many recipes into one output, by any number of workers.
+
+What is finished shows in the output alone, so a job that was killed, wherever and however, goes on
+when it is started again, and any number of processes on any number of machines can be at the same
+job: blocks of images are claimed, rendered, and published one by one. The files do not depend on
+who rendered what, nor on how often that was interrupted.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import logging
+import os
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import pyarrow as pa
+from tqdm import tqdm
+
+import augment
+from augment.errors import OutputError
+from augment.jobs.atomic import output_error
+from augment.jobs.backends import renders_on_gpu
+from augment.jobs.block_pools import SerialPool, Tick, WorkerPool
+from augment.jobs.block_worker import (
+    IndexTask,
+    SettledRecipes,
+    SettleTask,
+    WorkSetup,
+    clear_leftovers,
+)
+from augment.jobs.blocks import Block, Plan, SceneRecord, make_plan, shard_of, store_plan
+from augment.jobs.claims import try_claim
+from augment.jobs.files import RECORDED
+from augment.jobs.journal import Identity
+from augment.jobs.layout import MANIFEST, PATH_KINDS, STATE_FOLDER, variant_name
+from augment.jobs.manifest import (
+    FAILED,
+    OK,
+    compact,
+    image_row,
+    lidar_notes,
+    list_parts,
+    parts_to_merge,
+    publish_part,
+    read_finished,
+    rows_to_table,
+)
+from augment.jobs.render_job import RenderJob, SceneLoader, run_job
+from augment.jobs.scheduler import Driver
+from augment.jobs.store import Store, StoredFileMissing, open_store
+from augment.jobs.times import WORKERS
+from augment.render.buffers import AUTO, CUDA
+from augment.scene import Scene
+from recipes.job import JobRecipes, JobScene
+from recipes.schema import schema_Recipe
+
+# ---- What the qualities of a job's recipes choose in its scenes, before there is a plan ----------
+# A choice is kept in the output: the scenes in which everything was chosen are not opened again.
+
+_READS = 16  # at a time: most of the time of one is waiting
+
+Found = Mapping[tuple[str, str | None], SceneRecord | str]
+Choices = dict[tuple[str, str], schema_Recipe | str]
+
+
+def settle_recipes(
+    job: GenerateJob, store: Store, driver: Driver, found: Found, *, progress: bool, keep: bool
+) -> Choices:
+    """By scene and variant: the recipes that had to choose, settled, or why they could not.
+
+    found: the scene of every URI and name. keep: whether new choices are kept in the output.
+
+    Raises:
+        OutputError: a record in the output is damaged, or cannot be read or written.
+    """
+    wanted = _wanted(job, found)
+    if not wanted:
+        return {}
+    choices, left = _recorded(store, wanted, job.setup.backend)
+    tasks = {
+        SettleTask(record.uri, name, tuple(recipes), keep): record for record, name, recipes in left
+    }
+    bar = tqdm(
+        total=len(tasks),
+        unit="scene",
+        desc="choosing settings",
+        disable=not progress or not tasks,
+    )
+
+    def each(task: SettleTask, settled: SettledRecipes | str) -> None:
+        for number, recipe in enumerate(task.recipes):
+            outcome = settled if isinstance(settled, str) else settled.recipes[number]
+            choices[tasks[task].name, variant_name(recipe)] = outcome
+        bar.update()
+
+    with bar:
+        timed = any(r.quality.budget_ms is not None for task in tasks for r in task.recipes)
+        driver.settle(_turned(list(tasks), *job.shard), each, one_by_one=timed)
+    return choices
+
+
+_Wanted = list[tuple[SceneRecord, str | None, list[schema_Recipe]]]
+
+
+def _wanted(job: GenerateJob, found: Found) -> _Wanted:
+    """Scenes with their names in the job and the recipes that have to choose there."""
+    wanted: _Wanted = []
+    for entry in job.scenes:
+        record = found[entry.uri, entry.name]
+        if isinstance(record, SceneRecord):
+            drawn = job.recipes.of_scene(entry, record.name)
+            if unsettled := [recipe for recipe in drawn if recipe.quality.is_open]:
+                wanted.append((record, entry.name, unsettled))
+    return wanted
+
+
+def _recorded(store: Store, wanted: _Wanted, backend: str) -> tuple[Choices, _Wanted]:
+    """What the output knows already, and what is left to choose."""
+    from augment.jobs.quality_record import Question, recorded
+
+    questions = [
+        Question(recipe, record.name, record.source, RECORDED, backend)
+        for record, _, recipes in wanted
+        for recipe in recipes
+    ]
+    with ThreadPoolExecutor(_READS, thread_name_prefix="choices") as pool:
+        answers = list(pool.map(lambda question: recorded(store, question), questions))
+    choices: Choices = {
+        (question.scene, variant_name(question.recipe)): answer
+        for question, answer in zip(questions, answers, strict=True)
+        if answer is not None
+    }
+    left: _Wanted = []
+    for record, name, recipes in wanted:
+        rest = [r for r in recipes if (record.name, variant_name(r)) not in choices]
+        if rest:
+            left.append((record, name, rest))
+    return choices, left
+
+
+def _turned(tasks: Sequence[SettleTask], number: int, count: int) -> list[SettleTask]:
+    """Each shard begins elsewhere, so that those that start together do not wait for each other."""
+    start = (number - 1) * len(tasks) // count
+    return [*tasks[start:], *tasks[:start]]
+
+
+# ---- How long a job will take and how large its output gets, from a few pictures -----------------
+
+MOST_SAMPLED = 8  # recipes whose pictures are made; the others take their mean
+
+
+@dataclass(frozen=True)
+class Sample:
+    """What a recipe's images cost. per megapixel: seconds of rendering and writing, and bytes."""
+
+    seconds_per_mpx: float
+    bytes_per_mpx: float
+    prepare_s: float
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """samples: by recipe. seconds: of one worker alone, its scenes' opening included. bytes: of
+    all files. unsampled: recipes that were not tried.
+    """
+
+    samples: dict[str, Sample]
+    seconds: float
+    bytes: float
+    unsampled: tuple[str, ...]
+
+
+def estimate(
+    plan: Plan, open_scene: SceneLoader, *, each: Callable[[str], None] = lambda name: None
+) -> Estimate:
+    """Render a frame under each recipe, and scale what it takes by the pixels of the job.
+
+    The pictures are the middle frame of the recipe's first scene in one camera, twice: what the
+    first takes beyond the second (where snow can lie, what a style maps, compiling) counts once a
+    scene. Scenes and weather differ, so this is right to within a factor of two or so.
+
+    each: told of every recipe before it is tried.
+    """
+    firsts: dict[str, Block] = {}
+    for block in plan.blocks:
+        firsts.setdefault(block.recipe.name, block)
+    tried = dict(list(firsts.items())[:MOST_SAMPLED])
+    samples: dict[str, Sample] = {}
+    opened: dict[str, Scene] = {}  # never more than one
+    for name, block in tried.items():
+        each(name)
+        if block.uri not in opened:
+            opened.clear()
+            opened[block.uri] = open_scene(block.uri)
+        samples[name] = _sample(block, opened.__getitem__, plan)
+    mean = Sample(
+        *(
+            sum(getattr(s, field) for s in samples.values()) / len(samples)
+            for field in Sample.__dataclass_fields__
+        )
+    )
+    pixels, scenes = _megapixels(plan)
+    costs = {name: samples.get(name, mean) for name in firsts}
+    opening = sum(record.open_s for record in plan.records.values())
+    seconds = sum(pixels[n] * c.seconds_per_mpx + scenes[n] * c.prepare_s for n, c in costs.items())
+    size = sum(pixels[name] * cost.bytes_per_mpx for name, cost in costs.items())
+    return Estimate(samples, opening + seconds, size, tuple(sorted(firsts.keys() - tried.keys())))
+
+
+def _megapixels(plan: Plan) -> tuple[dict[str, float], dict[str, int]]:
+    """By recipe: pixels of all its images, in millions, and how many scenes have it."""
+    pixels: defaultdict[str, float] = defaultdict(float)
+    scenes: defaultdict[str, set[str]] = defaultdict(set)
+    for block in plan.blocks:
+        pictured = block.pictured(plan.records[block.scene])
+        pixels[block.recipe.name] += sum(p.width * p.height for p in pictured) / 1e6
+        scenes[block.recipe.name].add(block.scene)
+    return dict(pixels), {name: len(held) for name, held in scenes.items()}
+
+
+def _sample(block: Block, loader: SceneLoader, plan: Plan) -> Sample:
+    record = plan.records[block.scene]
+    camera = block.cameras[0]
+    having = [f.number for f in record.frames if camera in f.cameras]
+    middle = having[len(having) // 2 :][:1] * 2
+    pictures = next(p for p in block.pictured(record) if p.camera == camera)
+    mpx = pictures.width * pictures.height / 1e6
+    took, size = [], 0
+    with tempfile.TemporaryDirectory(prefix="climategs-estimate-") as folder:
+        for run, frame in enumerate(middle):
+            out = Path(folder) / str(run)
+            job = RenderJob(
+                block.uri,
+                [block.recipe],
+                out,
+                frames=[frame],
+                cameras=[camera],
+                backend=plan.backend,
+                beds_dir=Path(folder) / "beds",
+            )
+            started = time.perf_counter()
+            run_job(job, scene_loader=loader, progress=False)
+            took.append(time.perf_counter() - started)
+            files = [p for p in out.rglob("*") if p.is_file()]
+            size = sum(p.stat().st_size for p in files if STATE_FOLDER not in p.parts)
+    return Sample(took[1] / mpx, size / mpx, max(0.0, took[0] - took[1]))
+
+
+# ---- job -----------------------------------------------------------------------------------------
+
+SCENES = f"{STATE_FOLDER}/scenes"
+EXECUTORS = ("serial", "processes", "ray")
+_COMPACT_S = 60.0
+_CLAIM_S = 30.0
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class GenerateJob:
+    """recipes: of the job, loaded. scenes: the job's, without patterns. executor: who renders:
+    `serial` this process, `processes` several of this machine, `ray` actors on a cluster. workers:
+    how many, None for the executor's own choice: where a GPU renders one process, or an actor for
+    each GPU of the cluster; else one for every core. shard: which part of the job is done here,
+    from 1, and how many there are. rescan: open all scenes anew, in case they have changed.
+    """
+
+    recipes: JobRecipes
+    scenes: Sequence[JobScene]
+    setup: WorkSetup
+    executor: str = "processes"
+    workers: int | None = None
+    shard: tuple[int, int] = (1, 1)
+    rescan: bool = False
+
+    def __post_init__(self) -> None:
+        if self.executor not in EXECUTORS:
+            raise ValueError(f"executor must be one of {EXECUTORS}; got {self.executor!r}")
+        if self.workers is not None and self.workers < 1:
+            raise ValueError(f"workers must be >= 1; got {self.workers}")
+        number, count = self.shard
+        if not 1 <= number <= count:
+            raise ValueError(f"shard must be i/n with 1 <= i <= n; got {number}/{count}")
+
+
+@dataclass(frozen=True)
+class GenerateResult:
+    """Images of this shard. skipped: finished before, here or elsewhere. unusable: scenes by URI.
+
+    timings: seconds by kind of work, summed over threads and workers, of which
+    `batch.times.shares_of` says what the job was bound by; and by the clock: `plan`, with the
+    scenes' opening, `scan` of what is finished, and `render_wall`, all else.
+    """
+
+    written: int
+    skipped: int
+    failed: int
+    unusable: dict[str, str]
+    failures: tuple[str, ...]
+    seconds: float
+    timings: dict[str, float] = field(default_factory=dict)
+
+
+def run_generate(
+    job: GenerateJob,
+    *,
+    progress: bool = True,
+    prepare: Callable[[list[schema_Recipe]], None] = lambda recipes: None,
+    on_image: Callable[[int, int], None] = lambda done, failed: None,
+) -> GenerateResult:
+    """Render and publish what of the job is not finished yet.
+
+    progress: bars on stderr. prepare: called before the first image is rendered, if any has to be,
+    with one recipe of each name; to compile kernels once and not in every worker, say. on_image: is
+    told how many images are done and how many of them failed, from several threads.
+
+    A KeyboardInterrupt lets workers finish the images they have at hand, merges what is published
+    into the manifest, and is raised again.
+
+    Raises:
+        OutputError: the output cannot be written, or holds images of another kind under the same
+            names; none of its images was written then. ClimateGSError: no scene can be used.
+        RecipeError: a recipe cannot be used.
+    """
+    return _Generation(_with_backend(job), progress, prepare, on_image).go()
+
+
+def plan_job(job: GenerateJob, *, progress: bool = True) -> Plan:
+    """The job's plan, for which its scenes are opened that have not been; writes nothing."""
+    job = _with_backend(job)
+    store = open_store(job.setup.store_uri)
+    driver = Driver(lambda tick: make_pool(job, tick))
+    with contextlib.closing(driver):
+        return _plan(job, store, driver, progress, keep=False)
+
+
+def make_pool(job: GenerateJob, tick: Tick) -> WorkerPool:
+    """The workers that the job asks for."""
+    if job.executor == "serial":
+        return SerialPool(job.setup, tick)
+    if job.executor == "ray":
+        from augment.jobs.ray_pool import RayPool
+
+        return RayPool(job.setup, tick, job.workers)
+    from augment.jobs.block_pools import ProcessPool
+    from augment.jobs.processes import available_cores
+
+    # Several processes would share one GPU, and each have a copy of its scene there.
+    default = 1 if renders_on_gpu(job.setup.backend) else available_cores()
+    return ProcessPool(job.setup, tick, job.workers or default)
+
+
+def _with_backend(job: GenerateJob) -> GenerateJob:
+    """`auto` gets its name where this machine's GPU renders, so that others which share the work or
+    go on with it cannot add pictures of a CPU. Ray's machines differ: there `auto` is a CPU.
+    """
+    setup = job.setup
+    is_open = setup.backend == AUTO and setup.renderer is None and job.executor != "ray"
+    if not (is_open and renders_on_gpu(AUTO)):
+        return job
+    return replace(job, setup=replace(setup, backend=CUDA))
+
+
+def default_scratch(store_uri: str) -> Path | None:
+    """A folder of this user's for blocks on their way to that output; None for a local one.
+
+    Raises:
+        OutputError: the folder belongs to somebody else.
+    """
+    store = open_store(store_uri)
+    if store.local_dir is not None:
+        return None
+    digest = hashlib.sha256(store.uri.encode()).hexdigest()[:16]
+    root = Path(tempfile.gettempdir()) / f"climategs-{os.getuid()}"
+    try:
+        root.mkdir(mode=0o700, exist_ok=True)
+        if root.stat().st_uid != os.getuid() or root.is_symlink():
+            raise OutputError(f"{root} belongs to somebody else; name another folder (--scratch)")
+        return root / digest
+    except OSError as error:
+        raise output_error(root, error) from error
+
+
+class _Generation:
+    """One call of run_generate."""
+
+    def __init__(
+        self,
+        job: GenerateJob,
+        progress: bool,
+        prepare: Callable[[list[schema_Recipe]], None],
+        on_image: Callable[[int, int], None],
+    ) -> None:
+        self._job, self._progress = job, progress
+        self._prepare, self._on_image = prepare, on_image
+        self._store = open_store(job.setup.store_uri)
+        self._merged_at, self._merge_s = time.monotonic(), 0.0
+        self._timings: dict[str, float] = {}
+        self._rendering_s = 0.0
+
+    def go(self) -> GenerateResult:
+        started = time.perf_counter()
+        self._driver = Driver(
+            lambda tick: make_pool(self._job, tick), on_image=self._show, idle=self._merge_at_times
+        )
+        with contextlib.closing(self._driver):
+            self._plan = plan = _plan(
+                self._job, self._store, self._driver, self._progress, keep=True
+            )
+            self._timings["plan"] = time.perf_counter() - started
+            blocks = shard_of(plan.blocks, *self._job.shard)
+            pending = self._pending(blocks)
+            self._timings["scan"] = time.perf_counter() - started - self._timings["plan"]
+            done = sum(b.images for b in blocks) - sum(b.images for b in pending)
+            self._driver.tally.skipped = done
+            begun = time.perf_counter()
+            self._render(pending, total=sum(block.images for block in blocks))
+            self._timings["render_wall"] = time.perf_counter() - begun
+            self._timings[WORKERS] = self._rendering_s * self._driver.slots
+        self._merge(wait=True)
+        tally = self._driver.tally
+        return GenerateResult(
+            tally.written,
+            tally.skipped,
+            tally.failed,
+            dict(plan.unusable),
+            tuple(tally.failures),
+            time.perf_counter() - started,
+            {**tally.seconds, **self._timings},
+        )
+
+    def _pending(self, blocks: Sequence[Block]) -> list[Block]:
+        """What is not published, or with failures that are tried again; refuses a mixed output."""
+        parts = list_parts(self._store)
+        pending = [b for b in blocks if b.key not in parts or parts[b.key].has_failures]
+        new = [block for block in pending if block.key not in parts]
+        if new:
+            _check_not_mixed(self._store, self._plan, new)
+        store_plan(self._store, self._plan)
+        left = {block.key for block in pending}
+        published = [block for block in blocks if block.key not in left]
+        clear_leftovers(self._store, self._job.setup.scratch, published)
+        return pending
+
+    def _render(self, pending: Sequence[Block], total: int) -> None:
+        if pending:
+            records = self._plan.records
+            with_lidar = [block for block in pending if records[block.scene].has_lidar]
+            for note in lidar_notes({b.variant: b.recipe for b in with_lidar}.values()):
+                _log.warning("note: %s", note)
+            self._prepare(list({block.recipe.name: block.recipe for block in pending}.values()))
+        self._bar = tqdm(
+            total=total,
+            initial=self._driver.tally.skipped,
+            unit="image",
+            disable=not self._progress,
+        )
+        with self._bar:
+            try:
+                if pending:
+                    started = time.perf_counter()
+                    self._driver.render(pending, dict(self._plan.names), self._fail)
+                    self._rendering_s = time.perf_counter() - started
+            except KeyboardInterrupt:
+                self._driver.close()
+                self._merge(wait=True)
+                raise KeyboardInterrupt(
+                    "stopped; start the same job again to go on from there"
+                ) from None
+
+    def _show(self, done: int, failed: int) -> None:
+        if failed:
+            self._bar.set_postfix(failed=failed, refresh=False)
+        self._bar.update(done - self._bar.n)
+        self._on_image(done, failed)
+
+    def _fail(self, block: Block, message: str) -> None:
+        """Publish a block whose images have all failed, unless others have finished it."""
+        record = self._plan.records[block.scene]
+        identity = block.identity(self._plan.backend)
+        nowhere = {f"{kind}_path": None for kind in PATH_KINDS}
+        rows = [
+            image_row(
+                block.scene,
+                block.recipe,
+                identity,
+                pictured,
+                paths=nowhere,
+                status=FAILED,
+                message=message,
+            )
+            for pictured in block.pictured(record)
+        ]
+        claim = try_claim(self._store, block.claim)
+        if claim is not None:  # else another process is at it, and will say
+            with claim:
+                publish_part(self._store, block.key, rows_to_table(rows))
+
+    def _merge_at_times(self) -> None:
+        """Keep the manifest fresh, for at most a twentieth of the time."""
+        if time.monotonic() - self._merged_at > max(_COMPACT_S, 20 * self._merge_s):
+            self._merge(wait=False)
+
+    def _merge(self, *, wait: bool) -> None:
+        """Merge the parts into the manifest; left to others where they are just doing so."""
+        started = time.monotonic()
+        while parts_to_merge(self._store):
+            claim = try_claim(self._store, "manifest")
+            if claim is not None:
+                with claim:
+                    compact(self._store)
+                break
+            if not wait or time.monotonic() - started > _CLAIM_S:
+                _log.info("%s is being written by another process", MANIFEST)
+                break
+            time.sleep(0.2)
+        self._merged_at = time.monotonic()
+        self._merge_s = self._merged_at - started
+
+
+def _plan(job: GenerateJob, store: Store, driver: Driver, progress: bool, *, keep: bool) -> Plan:
+    found: dict[tuple[str, str | None], SceneRecord | str] = {}
+    for entry in job.scenes:
+        record = None if job.rescan else _known(store, entry)
+        if record is not None:
+            found[entry.uri, entry.name] = record
+    tasks = [IndexTask(e.uri, e.name) for e in job.scenes if (e.uri, e.name) not in found]
+    with tqdm(
+        total=len(tasks), unit="scene", desc="opening", disable=not progress or not tasks
+    ) as bar:
+
+        def each(task: IndexTask, record: SceneRecord | str) -> None:
+            found[task.uri, task.name] = record
+            if keep and isinstance(record, SceneRecord):
+                store.write(_record_path(task.uri, task.name), record.to_json())
+            bar.update()
+
+        driver.index(list(dict.fromkeys(tasks)), each)
+    settled = settle_recipes(job, store, driver, found, progress=progress, keep=keep)
+    return make_plan(job.recipes, job.scenes, found, job.setup.backend, settled)
+
+
+def _known(store: Store, entry: JobScene) -> SceneRecord | None:
+    path = _record_path(entry.uri, entry.name)
+    try:
+        return SceneRecord.from_json(store.read(path), f"{store.uri}/{path}")
+    except StoredFileMissing:
+        return None
+    except OutputError as error:
+        _log.warning("%s", error)
+        return None
+
+
+def _record_path(uri: str, name: str | None) -> str:
+    digest = hashlib.sha256(f"{augment.__version__}\n{uri}\n{name or ''}".encode()).hexdigest()
+    return f"{SCENES}/{digest[:20]}.json"
+
+
+def _check_not_mixed(store: Store, plan: Plan, blocks: Sequence[Block]) -> None:
+    """Refuse to put images beside others of the same name that were made otherwise."""
+    try:
+        table = read_finished(store)
+    except OutputError:
+        if store.exists(MANIFEST):
+            raise
+        return
+    planned = {(block.scene, block.variant): block for block in blocks}
+    for scene, variant, identity in _identities(table):
+        block = planned.get((scene, variant))
+        if block is not None:
+            is_chosen = plan.backend == AUTO and identity.backend != CUDA
+            backend = identity.backend if is_chosen else plan.backend
+            block.identity(backend).check(identity, f"{store.uri}/{scene}/{variant}")
+
+
+def _identities(table: pa.Table) -> list[tuple[str, str, Identity]]:
+    """The kinds of finished images there are, each once."""
+    names = ["scene", "variant", *Identity.__dataclass_fields__]
+    kinds = table.filter(pa.array([status == OK for status in table["status"].to_pylist()]))
+    rows = kinds.select(names).group_by(names, use_threads=False).aggregate([]).to_pylist()
+    return [(row["scene"], row["variant"], Identity.of_row(row)) for row in rows]

@@ -1,0 +1,630 @@
+"""A dataset's folder once more, with a variant's images and weathered sweeps in place of its own.
+
+    <out>/source/<variant>/<dataset's folder>/...                   what the dataset's tools read
+    <out>/source/<variant>/climategs-mirror-<dataset's folder>.json what it is; once it is complete
+
+All that is not replaced is the source's own file under a second name (a hard link), or a copy of it
+where links cannot be had. Building again goes on after a kill, and brings an older copy up to date.
+A dataset of many scenes has one copy, to which each scene adds its images.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from tqdm import tqdm
+
+from augment.cameras import Frame
+from augment.effects.lidar.codes import drop_lost
+from augment.errors import AdapterError, OutputError
+from augment.files.image_size import read_image_header
+from augment.jobs.atomic import flush_folder, output_error, write_atomic
+from augment.jobs.files import decode_image, encode_image
+from augment.jobs.layout import folder_name, resolve_inside
+from augment.jobs.manifest import OK
+from augment.jobs.mirror_files import (
+    COPIED,
+    LINKED,
+    SourceFile,
+    SourceFolder,
+    SourceTree,
+    Survey,
+    copy_file,
+    found_as,
+    link_file,
+    others_in,
+    own_folder,
+    put_link,
+    walk,
+    write_file,
+)
+from augment.jobs.tables import read_lidar
+from augment.jobs.view_files import WritePump
+from augment.labels import LabelSource, StoresLidar
+from recipes.schema import Output
+
+# ---- Where the copy of a dataset lies, and the file beside it that says what stands in it --------
+
+MIRROR_FOLDER = "source"
+_IMAGE, _SWEEP = ("scene", "image", "sha256"), ("scene", "sweep")
+
+
+@dataclass(frozen=True)
+class MirrorRecord:
+    """scenes: facts by name. replaced: by place in the dataset, the image that stands there: its
+    scene, its path relative to the output folder and its SHA-256. sweeps: likewise, scene and path
+    of the weathered sweep in a file of returns; none in older records.
+    """
+
+    scenes: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    replaced: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    sweeps: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+
+
+def mirror_folder(out_dir: Path, variant: str) -> Path:
+    """Where the copies of datasets in a variant's weather lie."""
+    return out_dir / MIRROR_FOLDER / folder_name(variant)
+
+
+def record_names(tree: SourceTree, folder: Path) -> tuple[Path, Path]:
+    """The record of a complete copy, and its name while the copy is being changed."""
+    record = folder / f"climategs-mirror-{tree.root.name}.json"
+    return record, record.with_name(record.name + ".begun")
+
+
+def read_record(tree: SourceTree, folder: Path) -> MirrorRecord:
+    """What is known of the dataset's copy in a folder, also of one that was stopped while it was
+    being changed; empty where there is none.
+
+    Raises:
+        OutputError: the record is damaged, or the copy is that of another dataset.
+    """
+    path = next((path for path in record_names(tree, folder) if path.is_file()), None)
+    if path is None:
+        return MirrorRecord()
+    try:
+        content = json.loads(path.read_bytes())
+        root = os.path.realpath(content["folder"])
+        record = MirrorRecord(
+            {name: dict(facts) for name, facts in content["scenes"].items()},
+            _entries(content["replaced"], _IMAGE),
+            _entries(content.get("replaced_sweeps", {}), _SWEEP),
+        )
+    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+        raise OutputError(
+            f"{path} is damaged ({error!r}). Delete it and build the copy again, once for each "
+            f"scene whose images are in it"
+        ) from error
+    if root != os.path.realpath(tree.root):
+        raise OutputError(
+            f"{folder / tree.root.name} is the copy of {root}, not of {tree.root}: choose another "
+            f"output folder, or delete that copy"
+        )
+    return record
+
+
+def _entries(content: Any, keys: tuple[str, ...]) -> dict[str, dict[str, str]]:
+    return {place: {key: str(entry[key]) for key in keys} for place, entry in content.items()}
+
+
+# ---- Weathered LiDAR sweeps in the place and form of a dataset's own -----------------------------
+
+
+@dataclass(frozen=True)
+class WeatheredSweep:
+    """One of the dataset's files of a frame's returns, and the weathered sweep that is to be in it.
+
+    scene: whose sweep it is. path: of our sweep. name: the same, relative to the output folder.
+    content: makes the file's bytes; None where only another scene's labels could.
+    """
+
+    scene: str
+    path: Path
+    name: str
+    content: Callable[[], bytes] | None
+
+    @staticmethod
+    def of_row(
+        out_dir: Path, row: Mapping[str, Any], content: Callable[[], bytes] | None = None
+    ) -> WeatheredSweep:
+        """The sweep of a manifest's row.
+
+        Raises:
+            OutputError: the row names a file outside the output folder.
+        """
+        name = row["lidar_path"]
+        return WeatheredSweep(row["scene"], resolve_inside(out_dir, name), name, content)
+
+
+def weathered_sweeps(
+    out_dir: Path,
+    rows: Iterable[Mapping[str, Any]],
+    labels: LabelSource | None,
+    tree: SourceTree,
+) -> tuple[dict[str, WeatheredSweep], list[str]]:
+    """The dataset's files that a variant's weathered sweeps change, by their place in it, and a
+    sentence for the sweeps that change none. Lost returns are left out of the files.
+
+    Raises:
+        OutputError: a row names a file outside the output folder.
+    """
+    frames = {row["frame"]: row for row in rows if row["status"] == OK and is_weathered(row)}
+    found: dict[str, WeatheredSweep] = {}
+    unplaced = []
+    for frame, row in sorted(frames.items()):
+        files = labels.lidar_files(frame) if isinstance(labels, StoresLidar) else ()
+        places = [tree.relative(file) for file in files]
+        if not files or None in places:
+            unplaced.append(frame)
+            continue
+        assert isinstance(labels, StoresLidar)
+        for file, place in zip(files, places, strict=True):
+            content = _content(labels, frame, file, resolve_inside(out_dir, row["lidar_path"]))
+            found[str(place)] = WeatheredSweep.of_row(out_dir, row, content)
+    if not unplaced:
+        return found, []
+    return found, [
+        f"{len(unplaced)} weathered LiDAR sweeps, the first of frame {unplaced[0]}, have no file "
+        f"of their own in the dataset: its copy keeps the recorded ones, and {out_dir} has these"
+    ]
+
+
+def is_weathered(row: Mapping[str, Any]) -> bool:
+    """Whether the row of an image names a sweep that has met the weather."""
+    return row["lidar"] == "weather" and row["lidar_path"] is not None
+
+
+def _content(labels: StoresLidar, frame: int, file: Path, sweep: Path) -> Callable[[], bytes]:
+    return lambda: labels.lidar_content(frame, file, drop_lost(read_lidar(sweep)))
+
+
+# ---- Weathered images in the form of a dataset's recorded ones: file format, size, channels ------
+
+FORMATS = {"PNG": "png", "JPEG": "jpg"}  # of ImageHeader, and of recipes
+
+
+@dataclass(frozen=True)
+class ImageForm:
+    """format: png or jpg. width, height: pixels. is_grey: one channel (told of PNG only)."""
+
+    format: str
+    width: int
+    height: int
+    is_grey: bool = False
+
+
+@dataclass(frozen=True)
+class Weathered:
+    """A finished image of ours and where the dataset has the recorded one.
+
+    scene: whose image it is. path: of our file. name: the same, relative to the output folder.
+    form: what our file is. checksum: its SHA-256. jpeg_quality: for writing it anew.
+    """
+
+    scene: str
+    path: Path
+    name: str
+    form: ImageForm
+    checksum: str
+    jpeg_quality: int
+
+    @staticmethod
+    def of_row(out_dir: Path, row: Mapping[str, Any], jpeg_quality: int) -> Weathered:
+        """The image of a manifest's row.
+
+        Raises:
+            OutputError: the row names a file outside the output folder.
+        """
+        name = row["image_path"]
+        form = ImageForm("jpg" if name.endswith(".jpg") else "png", row["width"], row["height"])
+        path = resolve_inside(out_dir, name)
+        return Weathered(row["scene"], path, name, form, row["checksum"], jpeg_quality)
+
+
+def image_form(path: str | Path) -> ImageForm | None:
+    """Of an image file by its first bytes; None where it is neither PNG nor JPEG."""
+    header = read_image_header(path)
+    if header is None or header.format not in FORMATS:
+        return None
+    return ImageForm(FORMATS[header.format], header.width, header.height, header.is_grey)
+
+
+def dataset_format(frames: Iterable[Frame]) -> str:
+    """The format in which to render so that the dataset's images are of it: that of the recorded
+    ones, png where they are of several.
+
+    Raises:
+        AdapterError: no frame has a recorded image that is PNG or JPEG.
+    """
+    suffixes = {Path(path).suffix.lower() for f in frames for path in f.image_paths.values()}
+    formats = {{".png": "png", ".jpg": "jpg", ".jpeg": "jpg"}.get(suffix) for suffix in suffixes}
+    formats.discard(None)
+    if not formats:
+        raise AdapterError(
+            f"the scene knows no recorded image in PNG or JPEG (found: {sorted(suffixes) or 'none'}"
+            f"); a dataset's copy replaces those"
+        )
+    return "jpg" if formats == {"jpg"} else "png"
+
+
+def weathered_images(
+    out_dir: Path,
+    rows: Sequence[Mapping[str, Any]],
+    frames: Sequence[Frame],
+    tree: SourceTree,
+    jpeg_quality: int,
+) -> tuple[dict[str, Weathered], list[str]]:
+    """The finished images of a variant's rows by their place in the dataset, and a sentence for
+    those that have none.
+
+    Raises:
+        OutputError: a row names a file outside the output folder.
+    """
+    recorded = {frame.index: frame.image_paths for frame in frames}
+    found: dict[str, Weathered] = {}
+    unplaced, doubled = [], []
+    for row in rows:
+        if row["status"] != OK:
+            continue
+        path = recorded.get(row["frame"], {}).get(row["camera"])
+        place = None if path is None else tree.relative(path)
+        if place is None:
+            unplaced.append(f"frame {row['frame']}, camera {row['camera']}")
+            continue
+        if place in found:
+            doubled.append(place)
+        found[place] = Weathered.of_row(out_dir, row, jpeg_quality)
+    notes = []
+    if unplaced:
+        notes.append(
+            f"{len(unplaced)} rendered images, such as {unplaced[0]}, have no recorded image in "
+            f"the dataset: they are not in its copy"
+        )
+    if doubled:
+        notes.append(
+            f"{len(doubled)} recorded images, such as {doubled[0]}, belong to several frames: the "
+            f"copy shows the last of them"
+        )
+    return found, notes
+
+
+def fits(image: Weathered, recorded: ImageForm) -> bool:
+    """Whether our file can stand for the recorded one as it is."""
+    return image.form == recorded
+
+
+def fitted(image: Weathered, recorded: ImageForm) -> bytes:
+    """Our image as a file of the recorded one's form: smaller by area, larger by cubic splines.
+
+    Raises:
+        OutputError: our file is missing or damaged.
+    """
+    try:
+        rgb = decode_image(image.path.read_bytes())
+    except OSError as error:
+        raise output_error(image.path, error) from error
+    except ValueError as error:
+        raise OutputError(
+            f"{image.path} is damaged ({error}); delete it and render again"
+        ) from error
+    size = (recorded.width, recorded.height)
+    if (rgb.shape[1], rgb.shape[0]) != size:
+        is_smaller = size[0] < rgb.shape[1] and size[1] < rgb.shape[0]
+        method = cv2.INTER_AREA if is_smaller else cv2.INTER_CUBIC
+        rgb = np.asarray(cv2.resize(rgb, size, interpolation=method), np.uint8)
+    if recorded.is_grey:
+        return _encode_grey(rgb)
+    settings = {"image": recorded.format, "jpeg_quality": image.jpeg_quality}
+    return encode_image(rgb, Output.model_validate(settings))
+
+
+def _encode_grey(rgb: np.ndarray) -> bytes:
+    """uint8 [H, W, 3] as a PNG of its luma."""
+    done, data = cv2.imencode(".png", cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY))
+    assert done
+    return data.tobytes()
+
+
+# ---- mirror --------------------------------------------------------------------------------------
+
+Links = Literal["hard", "copy"]
+
+
+@dataclass
+class Mirrored:
+    """What a copy of a dataset is made of. Sizes in bytes.
+
+    linked, copied: files of the source. replaced: weathered images that stand for recorded ones;
+    of these, new are files of their own, the others are one with the rendered ones. resized: the
+    sizes rendered and recorded of those that differ. unusable: recorded images that are neither
+    PNG nor JPEG, which stay. sweeps: LiDAR sweeps of the source; weathered: files of returns, and
+    of labels of returns, that stand for its own. outdated: files of such that another scene has
+    rendered anew, where the source's own stand. missing: recorded images that the source has no
+    longer. others: files in the copy that the source does not have. changed: how many files and
+    links this call has put in place.
+    """
+
+    folder: Path
+    linked: int = 0
+    linked_size: int = 0
+    copied: int = 0
+    copied_size: int = 0
+    links: int = 0
+    images: int = 0
+    replaced: dict[str, dict[str, Any]] = field(default_factory=dict)
+    new: int = 0
+    new_size: int = 0
+    resized: list[tuple[tuple[int, int], tuple[int, int]]] = field(default_factory=list)
+    unusable: list[str] = field(default_factory=list)
+    sweeps: int = 0
+    weathered: dict[str, dict[str, str]] = field(default_factory=dict)
+    outdated: list[str] = field(default_factory=list)
+    missing: list[str] = field(default_factory=list)
+    others: list[str] = field(default_factory=list)
+    changed: int = 0
+
+
+def check_apart(tree: SourceTree, out_dir: Path) -> None:
+    """Raise OutputError where the output folder lies in the dataset: copies would hold copies."""
+    if tree.relative(out_dir) is not None:
+        raise OutputError(
+            f"{out_dir} lies in the dataset's own folder {tree.root}; a copy of the dataset cannot "
+            f"be made there, choose an output folder elsewhere"
+        )
+
+
+def mirror_dataset(
+    tree: SourceTree,
+    folder: Path,
+    images: Mapping[str, Weathered],
+    scenes: Mapping[str, Any],
+    *,
+    extent: Survey,
+    sweeps: Mapping[str, WeatheredSweep] | None = None,
+    links: Links = "hard",
+    progress: bool = True,
+) -> Mirrored:
+    """Build the copy of a dataset in a folder, or bring it up to date.
+
+    images: by place in the dataset, all that shall stand in the copy. scenes: facts of those that
+    the images are of, in JSON's types, for the record. extent: `survey(tree)`. sweeps: as images.
+    links: hard, or copy for a copy that shares nothing with source and images. Needs the lock of
+    the output folder.
+
+    Raises:
+        AdapterError: a file of the source cannot be read, or a link leads out of it.
+        OutputError: the system refused, or a link is in the way. No file is left half-written.
+    """
+    check_apart(tree, folder)
+    run = _Mirroring(tree, folder, images, sweeps or {}, links)
+    with tqdm(total=extent.files, unit="file", desc="copy", disable=not progress) as bar:
+        run.go(bar)
+    run.finish(scenes)
+    return run.done
+
+
+class _Mirroring:
+    """One call of mirror_dataset."""
+
+    def __init__(
+        self,
+        tree: SourceTree,
+        folder: Path,
+        images: Mapping[str, Weathered],
+        sweeps: Mapping[str, WeatheredSweep],
+        links: Links,
+    ) -> None:
+        self.tree, self.folder, self.images, self.sweeps = tree, folder, images, sweeps
+        self.may_link, self.links = links == "hard", links
+        self.root = str(folder / tree.root.name)
+        self.record, self.begun_record = record_names(tree, folder)
+        self.done = Mirrored(folder / tree.root.name)
+        self.changed_folders: set[str] = set()
+        self.fitted: list[str] = []
+        self.is_begun = False
+
+    def go(self, bar: tqdm) -> None:
+        for folder in (self.folder.parent, self.folder, self.root):
+            self._own(str(folder))
+        self.pump = WritePump()
+        try:
+            for folder in walk(self.tree):
+                self._fill(folder)
+                bar.update(len(folder.files))
+        finally:
+            self.pump.close()
+        done = self.done
+        done.new += len(self.fitted)
+        done.new_size += sum(os.lstat(path).st_size for path in self.fitted)
+        done.missing = sorted(self.images.keys() - done.replaced.keys() - set(done.unusable))
+
+    def finish(self, scenes: Mapping[str, Any]) -> None:
+        """Make the names durable, then say that the copy is complete."""
+        try:
+            for folder in sorted(self.changed_folders):
+                flush_folder(Path(folder))
+        except OSError as error:
+            raise output_error(self.folder, error) from error
+        text = json.dumps(self._described(scenes), indent=1) + "\n"
+        if not (self.record.is_file() and self.record.read_bytes() == text.encode()):
+            write_atomic(self.record, text.encode())
+        try:
+            self.begun_record.unlink(missing_ok=True)
+        except OSError as error:
+            raise output_error(self.begun_record, error) from error
+
+    def _fill(self, folder: SourceFolder) -> None:
+        path = self._target(folder.relative)
+        names = [file.relative for file in folder.files] + [name for name, _ in folder.links]
+        expected = {os.path.basename(name) for name in [*names, *folder.folders]}
+        others = others_in(path, expected)
+        if not folder.relative:  # other drives, which the copy has from other scenes
+            others = [name for name in others if not os.path.lexists(self.tree.root / name)]
+        self.done.others += [f"{folder.relative}/{name}".lstrip("/") for name in others]
+        for inner in folder.folders:
+            self._own(self._target(inner))
+        for file in folder.files:
+            self.done.images += self.tree.is_image(file.relative)
+            self.done.sweeps += self.tree.is_sweep(file.relative)
+            image, sweep = self.images.get(file.relative), self.sweeps.get(file.relative)
+            is_put = image is not None and self._replace(file, image)
+            if not is_put and (sweep is None or not self._put_sweep(file, sweep)):
+                self._keep(file)
+        for name, text in folder.links:
+            self.done.links += 1
+            if put_link(text, self._target(name)):
+                self._begin()
+                self._changed(path)
+
+    def _keep(self, file: SourceFile) -> None:
+        """Put the source's own file in place."""
+        how = self._place(file.path, file.facts, self._target(file.relative))
+        if how == LINKED:
+            self.done.linked += 1
+            self.done.linked_size += file.facts.st_size
+        else:
+            self.done.copied += 1
+            self.done.copied_size += file.facts.st_size
+
+    def _replace(self, file: SourceFile, image: Weathered) -> bool:
+        """Put a weathered image in place; False where the recorded one is none that we write."""
+        try:
+            recorded = image_form(file.path)
+        except OSError as error:
+            raise AdapterError(f"{file.path} cannot be read: {error.strerror}") from error
+        if recorded is None:
+            self.done.unusable.append(file.relative)
+            return False
+        rendered = _facts_of(image.path)
+        target = self._target(file.relative)
+        if not fits(image, recorded):
+            self._fit(image, recorded, target, rendered.st_mtime_ns)
+        elif self._place(str(image.path), rendered, target) == COPIED:
+            self.done.new += 1
+            self.done.new_size += rendered.st_size
+        self.done.replaced[file.relative] = {
+            "scene": image.scene,
+            "image": image.name,
+            "sha256": image.checksum,
+        }
+        sizes = (image.form.width, image.form.height), (recorded.width, recorded.height)
+        if sizes[0] != sizes[1]:
+            self.done.resized.append(sizes)
+        return True
+
+    def _put_sweep(self, file: SourceFile, sweep: WeatheredSweep) -> bool:
+        """Write the file of a weathered sweep, where the one there is not: its time would be ours.
+        False where only another scene could write it.
+        """
+        mtime_ns, target = _facts_of(sweep.path).st_mtime_ns, self._target(file.relative)
+        content = sweep.content
+        if not _is_written(target, mtime_ns):
+            if content is None:
+                self.done.outdated.append(file.relative)
+                return False
+            self._begin()
+            self.pump.submit(lambda: write_file(content(), target, mtime_ns))
+            self._changed(os.path.dirname(target))
+        self.done.weathered[file.relative] = {"scene": sweep.scene, "sweep": sweep.name}
+        return True
+
+    def _place(self, original: str, facts: os.stat_result, target: str) -> str:
+        """Link or copy, where that has not been done; says which."""
+        found = found_as(target, facts)
+        if found == COPIED or (found == LINKED and self.may_link):
+            return found
+        self._begin()
+        if self.may_link and link_file(original, target):
+            self._changed(os.path.dirname(target))
+            return LINKED
+        self.pump.submit(lambda: copy_file(original, target))
+        self._changed(os.path.dirname(target))
+        return COPIED
+
+    def _fit(self, image: Weathered, recorded: ImageForm, target: str, mtime_ns: int) -> None:
+        """Encode anew, where the file there is not this image's: its time and form would be."""
+        self.fitted.append(target)
+        if _is_fitted(target, recorded, mtime_ns):
+            return
+        self._begin()
+        self.pump.submit(lambda: write_file(fitted(image, recorded), target, mtime_ns))
+        self._changed(os.path.dirname(target))
+
+    def _begin(self) -> None:
+        """Take back that the copy is complete, before its first change."""
+        if self.is_begun:
+            return
+        self.is_begun = True
+        try:
+            if self.record.exists():
+                os.replace(self.record, self.begun_record)
+                flush_folder(self.folder)
+        except OSError as error:
+            raise output_error(self.record, error) from error
+
+    def _own(self, folder: str) -> None:
+        if own_folder(folder):
+            self._begin()
+            self.changed_folders.add(os.path.dirname(folder))
+
+    def _changed(self, folder: str) -> None:
+        self.done.changed += 1
+        self.changed_folders.add(folder)
+
+    def _target(self, relative: str) -> str:
+        return os.path.join(self.root, relative) if relative else self.root
+
+    def _described(self, scenes: Mapping[str, Any]) -> dict[str, Any]:
+        done = self.done
+        return {
+            "folder": str(self.tree.root),
+            "links": self.links,
+            "scenes": scenes,
+            "files": {
+                "linked": done.linked,
+                "copied": done.copied,
+                "symbolic_links": done.links,
+                "camera_images": done.images,
+                "replaced_images": len(done.replaced),
+                "lidar_sweeps": done.sweeps,
+                "replaced_lidar_files": len(done.weathered),
+            },
+            "bytes": {
+                "linked": done.linked_size,
+                "copied": done.copied_size,
+                "new_images": done.new_size,
+            },
+            "replaced": done.replaced,
+            "replaced_sweeps": done.weathered,
+        }
+
+
+def _facts_of(path: Path) -> os.stat_result:
+    try:
+        return os.stat(path)
+    except OSError as error:
+        raise OutputError(
+            f"{path}, which the manifest names, cannot be read ({error.strerror}); render again"
+        ) from error
+
+
+def _is_written(target: str, mtime_ns: int) -> bool:
+    try:
+        return os.lstat(target).st_mtime_ns == mtime_ns
+    except OSError:
+        return False
+
+
+def _is_fitted(target: str, recorded: ImageForm, mtime_ns: int) -> bool:
+    try:
+        facts = os.lstat(target)
+        return facts.st_mtime_ns == mtime_ns and image_form(target) == recorded
+    except OSError:
+        return False

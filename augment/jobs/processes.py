@@ -1,0 +1,322 @@
+"""What worker processes need from the one that starts them."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import functools
+import io
+import os
+import pickle
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from multiprocessing import reduction, resource_tracker
+from multiprocessing.connection import Connection
+from multiprocessing.reduction import ForkingPickler
+from pathlib import Path
+from typing import Any, BinaryIO, TypeVar
+
+import numpy as np
+import torch
+
+from augment.errors import OutputError
+from augment.jobs.atomic import make_folder, output_error, temporary_beside
+from augment.jobs.layout import STATE_FOLDER
+from augment.scene import Scene
+
+# ---- processes -----------------------------------------------------------------------------------
+
+Result = TypeVar("Result")
+_TURN_S = 0.0005
+
+
+def process_mark(process: int) -> str:
+    """The number of a living process and when it began, else "": numbers return, in containers
+    with every run.
+    """
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return ""
+    except PermissionError:  # it lives, and belongs to another user
+        pass
+    try:
+        facts = Path(f"/proc/{process}/stat").read_text(errors="replace")
+    except OSError:  # no Linux
+        return str(process)
+    return f"{process} {facts.rpartition(')')[2].split()[19]}"  # proc(5): starttime
+
+
+def available_cores() -> int:
+    """Cores this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def describe_exit(code: int | None) -> str:
+    if code is not None and code < 0:
+        return f"was killed by {signal.Signals(-code).name}"
+    return f"ended with exit code {code}"
+
+
+@contextlib.contextmanager
+def thread_limits(threads: int) -> Iterator[None]:
+    """Environment that makes a child's libraries share the cores; they read it when loaded."""
+    names = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+    before = {name: os.environ.get(name) for name in names}
+    for name, value in before.items():
+        limit = min(threads, int(value)) if value and value.isdigit() else threads
+        os.environ[name] = str(max(1, limit))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+@contextlib.contextmanager
+def quick_turns(wanted: bool) -> Iterator[None]:
+    """Within it, if it is wanted, a thread waits half a millisecond for its turn at Python and not
+    five. One that launches kernels gives its turn away with each of them, and between two launches
+    the GPU would wait for whoever encodes.
+    """
+    before = sys.getswitchinterval()
+    if wanted:
+        sys.setswitchinterval(min(before, _TURN_S))
+    try:
+        yield
+    finally:
+        sys.setswitchinterval(before)
+
+
+@contextlib.contextmanager
+def interrupts_blocked() -> Iterator[None]:
+    """A child started inside never sees Ctrl-C: the parent tells it to stop instead."""
+    resource_tracker.ensure_running()  # starting it later, with the child, would lift the block
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def uninterrupted(call: Callable[[], Result]) -> Result:
+    """Run where no signal's exception can come between two steps, and wait for the end.
+
+    Python runs the handlers of signals in the main thread only.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        return call()
+    with ThreadPoolExecutor(1) as pool:
+        return pool.submit(call).result()
+
+
+def sender(connection: Connection) -> Callable[[Any], None]:
+    """In a worker: a send that several threads may call; ends the process if nobody listens."""
+    lock = threading.Lock()
+
+    def send(message: Any) -> None:
+        with lock:
+            try:
+                connection.send(message)
+            except OSError:
+                os._exit(1)
+
+    return send
+
+
+# ---- One job at a time in an output folder -------------------------------------------------------
+# The lock is the kernel's (flock on `.climategs/lock`), so it ends with the processes that hold it,
+# however they end. Worker processes inherit it: after a job is killed, the folder stays locked
+# until
+# its last worker has gone. flock does not reach across machines on every network file system.
+
+ORPHANS_S = 30.0  # how long to wait for the workers of a killed job to notice
+
+
+@contextlib.contextmanager
+def file_lock(path: Path) -> Iterator[None]:
+    """Be the only process of this machine inside; waits for the one that is, however it ends.
+
+    Raises:
+        OutputError: the file cannot be made.
+    """
+    try:
+        make_folder(path.parent)
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+    except OSError as error:
+        raise output_error(path, error) from error
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+class OutputLock:
+    """Holds an output folder for this process while entered.
+
+    Raises:
+        OutputError: another job holds it, or the folder cannot be written.
+    """
+
+    def __init__(self, out_dir: Path) -> None:
+        self._path = out_dir / STATE_FOLDER / "lock"
+        self._descriptor = -1
+
+    def __enter__(self) -> OutputLock:
+        try:
+            make_folder(self._path.parent)
+            self._descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT, 0o666)
+        except OSError as error:
+            raise output_error(self._path, error) from error
+        try:
+            self._acquire()
+        except BaseException:
+            os.close(self._descriptor)
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        os.ftruncate(self._descriptor, 0)
+        os.close(self._descriptor)  # not unlocked: a child that still lives keeps its share
+
+    def inherited(self) -> InheritedLock:
+        """A share of the lock for a child process started with `multiprocessing`."""
+        return InheritedLock(self._descriptor)
+
+    def _acquire(self) -> None:
+        deadline = time.monotonic() + ORPHANS_S
+        while True:
+            try:
+                fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError:
+                holder = os.pread(self._descriptor, 32, 0).decode("ascii", "replace").strip()
+                if _is_held_by(holder) or time.monotonic() > deadline:
+                    raise OutputError(
+                        f"{self._path.parent.parent} is being written by another job"
+                        + (f" (process {holder.split()[0]})" if holder else "")
+                        + "; wait for it to end, or choose another output folder"
+                    ) from None
+                time.sleep(0.05)
+        os.ftruncate(self._descriptor, 0)
+        os.pwrite(self._descriptor, process_mark(os.getpid()).encode(), 0)
+
+
+class InheritedLock:
+    """Keeps the lock's file open in a child process for as long as the child lives."""
+
+    def __init__(self, descriptor: int) -> None:
+        self._descriptor = descriptor
+
+    def __reduce__(self) -> tuple:
+        return (_inherit, (reduction.DupFd(self._descriptor),))
+
+
+def _inherit(duplicate: Any) -> InheritedLock:
+    return InheritedLock(duplicate.detach())
+
+
+def _is_held_by(holder: str) -> bool:
+    """Whether the process that took the lock lives; False while its number is being written."""
+    number = holder.partition(" ")[0]
+    return number.isdigit() and process_mark(int(number)) == holder
+
+
+# ------------------------------------------------------------------------------------------------
+# Hands an open scene to worker processes without opening it again, and holds it in memory once
+# Opening a scene may take minutes, and a scene may take gigabytes. All its tensors are laid into
+# one
+# temporary file, which workers map into their memory: the system keeps a single copy for all. The
+# rest of the scene is small, and travels through the pipe that starts the process.
+
+ALIGNMENT = 64  # bytes: a cache line, and any vector register
+
+
+@dataclass(frozen=True)
+class SharedScene:
+    """A scene whose tensors lie in a file. Valid until `remove`."""
+
+    path: str
+    skeleton: bytes
+
+    def open(self) -> Scene:
+        """The scene, its tensors mapped from the file; writes to them stay in this process.
+
+        The skeleton is a pickle, as everything that multiprocessing sends: it comes from the
+        parent through the pipe, never from a file.
+        """
+        load = ForkingPickler.loads  # pyright: ignore[reportAttributeAccessIssue]
+        return load(self.skeleton)
+
+    def remove(self) -> None:
+        """Delete the file. Processes that have opened the scene keep their mapping."""
+        Path(self.path).unlink(missing_ok=True)
+
+
+def share_scene(scene: Scene, folder: Path) -> SharedScene:
+    """Lay the scene's tensors into a temporary file of `folder`, which a later job clears away
+    once it holds the folder.
+
+    Raises:
+        OutputError: the file cannot be written. ValueError: a part of the scene, such as its label
+            source, cannot be sent to another process.
+    """
+    path = temporary_beside(folder / "scene")
+    try:
+        make_folder(folder)
+        with path.open("xb") as file:
+            skeleton = io.BytesIO()
+            try:
+                _ScenePickler(skeleton, file, str(path)).dump(scene)
+            except (AttributeError, TypeError, pickle.PicklingError) as error:
+                raise ValueError(
+                    f"scene {scene.name!r} cannot be sent to worker processes: {error}; its label "
+                    f"source and sky must be of importable classes that hold no open files. "
+                    f"workers=1 works with any scene"
+                ) from error
+            file.write(b"\0" * ALIGNMENT)  # an empty file cannot be mapped
+    except OSError as error:
+        path.unlink(missing_ok=True)
+        raise output_error(path, error) from error
+    except BaseException:
+        path.unlink(missing_ok=True)
+        raise
+    return SharedScene(str(path), skeleton.getvalue())
+
+
+class _ScenePickler(pickle.Pickler):
+    """Writes tensors to a file and keeps only where they lie."""
+
+    def __init__(self, skeleton: io.BytesIO, file: BinaryIO, path: str) -> None:
+        super().__init__(skeleton, protocol=pickle.HIGHEST_PROTOCOL)
+        self._file, self._path = file, path
+
+    def reducer_override(self, obj: Any) -> Any:
+        if not isinstance(obj, torch.Tensor):
+            return NotImplemented
+        array = obj.detach().contiguous().numpy()
+        self._file.write(b"\0" * (-self._file.tell() % ALIGNMENT))
+        offset = self._file.tell()
+        self._file.write(array.data)
+        return _map_tensor, (self._path, offset, array.dtype.str, array.shape)
+
+
+def _map_tensor(path: str, offset: int, dtype: str, shape: tuple[int, ...]) -> torch.Tensor:
+    array = np.ndarray(shape, dtype, buffer=_mapping(path), offset=offset)
+    return torch.from_numpy(array)
+
+
+@functools.lru_cache(maxsize=1)
+def _mapping(path: str) -> np.memmap:
+    return np.memmap(path, np.uint8, mode="c")  # copy on write

@@ -1,0 +1,669 @@
+"""Lets a recipe's quality choose its settings in view of a scene."""
+
+from __future__ import annotations
+
+import copy
+import logging
+import math
+import statistics
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from tqdm import tqdm
+
+from augment.cameras import Camera, Frame
+from augment.errors import SceneError
+from augment.jobs.prepare import snow_to_lay, style_to_apply
+from augment.jobs.worker import Renderer, default_renderer
+from augment.metrics.image import flip
+from augment.scene import Scene
+from recipes.schema import Value, free_knobs, schema_Recipe, with_settings
+
+# ------------------------------------------------------------------------------------------------
+# One picture for the sake of its time and its errors, at the size of those it is compared with
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """A rendered view. picture: uint8 [H, W, 3], display-encoded. depth: float32 [H, W], metres,
+    0 = none; None where the recipe writes none. Both at the size of the reference, however small
+    they were rendered. seconds: of rendering alone, without the enlarging.
+    """
+
+    picture: np.ndarray
+    depth: np.ndarray | None
+    seconds: float
+
+
+def render_trial(
+    scene: Scene,
+    camera: Camera,
+    recipe: schema_Recipe,
+    backend: str = "auto",
+    *,
+    size: tuple[int, int] | None = None,
+    renderer: Renderer | None = None,
+    clock: Callable[[], float] = time.perf_counter,
+) -> Trial:
+    """The view of `camera` (before recipe.render.scale) under the recipe, in 8 bits as in files.
+
+    size: width and height of the reference, pixels; None for the camera's own, which is that of
+    render.scale 1. renderer: `augment.views.render_view` if None. clock: in seconds.
+
+    The first picture of a scene in some snow or style also takes what finding the places of the one
+    and the colours of the other does.
+
+    Raises:
+        SceneError: the scene cannot be rendered so. RecipeError: the recipe is not settled.
+    """
+    render = renderer or default_renderer()
+    started = clock()
+    view = render(scene, camera, recipe, backend=backend)
+    seconds = clock() - started
+    width, height = size or (camera.width, camera.height)
+    depth = view.depth_m
+    if depth is not None and depth.shape != (height, width):
+        # Nearest: a mean of near and far would be a surface that is in neither.
+        depth = cv2.resize(depth, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
+    return Trial(upsampled(view.rgb, width, height), depth, seconds)
+
+
+def upsampled(picture: np.ndarray, width: int, height: int) -> np.ndarray:
+    """The picture [H, W, 3] at another size, in its own type, as a viewer would show it.
+
+    Bilinear where it grows, means over areas where it shrinks, else the same array.
+    """
+    if picture.shape[:2] == (height, width):
+        return picture
+    shrinks = picture.shape[0] > height or picture.shape[1] > width
+    how = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+    return cv2.resize(picture, (width, height), interpolation=how)
+
+
+# ---- Which images of a scene its settings are chosen by ------------------------------------------
+
+COUNT = 3
+
+
+class View(NamedTuple):
+    """An image that is rendered to find out what settings cost. frame: its number."""
+
+    frame: int
+    name: str
+    camera: Camera
+
+
+def calibration_views(frames: Sequence[Frame], count: int = COUNT) -> tuple[View, ...]:
+    """Images spread over the frames and over each frame's cameras; at most `count`, at least one.
+
+    frames: all that the scene or the camera path has, never a selection, so that what is rendered
+    beside an image does not change it.
+
+    Raises:
+        ValueError: no frame has a camera, or count is below 1.
+    """
+    if count < 1:
+        raise ValueError(f"count must be >= 1; got {count}")
+    pictured = sorted((f for f in frames if f.cameras), key=lambda frame: frame.index)
+    if not pictured:
+        raise ValueError(f"none of the {len(frames)} frames has a camera")
+    views: dict[tuple[int, str], View] = {}
+    for number in range(count):
+        frame = pictured[(2 * number + 1) * len(pictured) // (2 * count)]
+        names = sorted(frame.cameras)
+        name = names[number * len(names) // count]
+        views.setdefault((frame.index, name), View(frame.index, name, frame.cameras[name]))
+    return tuple(views.values())
+
+
+# ---- Renders a recipe's settings in a few views: how long they take, and how far off they are ----
+
+WINDOW = 96  # pixels; FLIP's filters reach about ten
+WINDOWS = 4  # across and down
+DOUBT = 1.25  # how far beyond the bound an estimate must be to stand for the whole picture
+
+
+class Bench:
+    """Tries settings of a recipe on a scene.
+
+    recipe: its knobs at reference. scene, cameras: where snow can lie and what a style maps is
+    found for these cameras, the scene's own if None. clock: in seconds. each: is told before every
+    picture.
+
+    Errors of single knobs are estimated from windows of the picture where that is much larger:
+    FLIP takes longer than rendering. `flip` and, near the bound, `exceeds` look at all of it.
+    """
+
+    def __init__(
+        self,
+        recipe: schema_Recipe,
+        scene: Scene,
+        views: Sequence[View],
+        *,
+        backend: str,
+        cameras: Sequence[Camera] | None = None,
+        renderer: Renderer | None = None,
+        clock: Callable[[], float] = time.perf_counter,
+        each: Callable[[], None] = lambda: None,
+    ) -> None:
+        self._recipe, self._views, self._backend = recipe, tuple(views), backend
+        # An object of its own, which takes along what is found of settings that are not chosen.
+        self._scene, self._cameras = copy.copy(scene), cameras
+        self._renderer, self._clock, self._each = renderer, clock, each
+        self._truth: list[np.ndarray] = []
+        self._estimates: dict[tuple, float] = {}
+        self._errors: dict[tuple, tuple[float, ...]] = {}
+        self._ms: dict[tuple, float] = {}
+
+    def start(self) -> None:
+        """Render the reference.
+
+        Raises:
+            SceneError: the scene cannot be rendered so.
+        """
+        self._truth = [self._picture(view, {}) for view in self._views]
+
+    def estimate(self, settings: Mapping[str, Value], enough: float = 1.0) -> float:
+        """Mean FLIP in the worst view, from windows of it; of errors beyond `enough` a part."""
+        key = _key(settings)
+        if key not in self._estimates:
+            worst = 0.0
+            for number, view in enumerate(self._views):
+                picture = self._picture(view, settings)
+                worst = max(worst, _windows_flip(picture, self._truth[number]))
+                if worst > enough:
+                    break
+            self._estimates[key] = worst
+        return self._estimates[key]
+
+    def exceeds(self, settings: Mapping[str, Value], bound: float) -> bool:
+        """Whether the error in some view is beyond the bound."""
+        errors = []
+        for number, view in enumerate(self._views):
+            picture, truth = self._picture(view, settings), self._truth[number]
+            if _windows_flip(picture, truth) > DOUBT * bound:
+                return True
+            errors.append(_flip(picture, truth))
+            if errors[-1] > bound:
+                return True
+        self._errors[_key(settings)] = tuple(errors)
+        return False
+
+    def flip(self, settings: Mapping[str, Value]) -> tuple[float, ...]:
+        """Mean FLIP of each view."""
+        key = _key(settings)
+        if key not in self._errors:
+            pairs = zip(self._views, self._truth, strict=True)
+            errors = (_flip(self._picture(view, settings), truth) for view, truth in pairs)
+            self._errors[key] = tuple(errors)
+        return self._errors[key]
+
+    def ms(self, settings: Mapping[str, Value]) -> float:
+        """Median of the views' frame times, milliseconds, after a first picture that counts not."""
+        key = _key(settings)
+        if key not in self._ms:
+            self._picture(self._views[0], settings)
+            trials = [self._trial(view, settings) for view in self._views]
+            self._ms[key] = 1000 * statistics.median(trial.seconds for trial in trials)
+            pairs = zip(trials, self._truth, strict=True)
+            self._estimates[key] = max(_windows_flip(t.picture, truth) for t, truth in pairs)
+        return self._ms[key]
+
+    def hand_over(self, settings: Mapping[str, Value], scene: Scene) -> None:
+        """Let the scene know where snow of these settings can lie, if that was found here."""
+        snow = snow_to_lay(with_settings(self._recipe, settings))
+        if snow is not None and self._cameras is None:
+            from augment.jobs.prepare import find_bed, remember
+
+            remember(scene, snow, find_bed(self._scene, snow, backend=self._backend))
+
+    def _picture(self, view: View, settings: Mapping[str, Value]) -> np.ndarray:
+        return self._trial(view, settings).picture
+
+    def _trial(self, view: View, settings: Mapping[str, Value]) -> Trial:
+        recipe = with_settings(self._recipe, settings)
+        self._prepare(recipe)
+        self._each()
+        reference = view.camera.scaled(self._recipe.render.scale)
+        return render_trial(
+            self._scene,
+            view.camera,
+            recipe,
+            self._backend,
+            size=(reference.width, reference.height),
+            renderer=self._renderer,
+            clock=self._clock,
+        )
+
+    def _prepare(self, recipe: schema_Recipe) -> None:
+        """Find for a camera path what pictures would else find for the scene's own cameras."""
+        if self._cameras is None or self._renderer is not None:
+            return
+        snow, style = snow_to_lay(recipe), style_to_apply(recipe)
+        if snow is not None:
+            from augment.effects.snow.snow import placement_settings
+            from augment.effects.snow.support import bed_of
+
+            settings = placement_settings(snow)
+            bed_of(self._scene, settings, cameras=self._cameras, backend=self._backend)
+        if style is not None:
+            from augment.effects.style.style import remember_maps, style_maps
+
+            remember_maps(self._scene, style, style_maps(self._scene, style, cameras=self._cameras))
+
+
+def _key(settings: Mapping[str, Value]) -> tuple:
+    return tuple(sorted(settings.items()))
+
+
+def _flip(picture: np.ndarray, truth: np.ndarray) -> float:
+    return 0.0 if np.array_equal(picture, truth) else flip(picture, truth)
+
+
+def _windows_flip(picture: np.ndarray, truth: np.ndarray) -> float:
+    """FLIP of a grid of windows, or of a picture that is not much larger."""
+    height, width = truth.shape[:2]
+    if height * width <= 2 * (WINDOWS * WINDOW) ** 2 or min(height, width) < WINDOW:
+        return _flip(picture, truth)
+    total = 0.0
+    for y in _starts(height):
+        for x in _starts(width):
+            at = np.s_[y : y + WINDOW, x : x + WINDOW]
+            total += _flip(picture[at], truth[at])
+    return total / WINDOWS**2
+
+
+def _starts(length: int) -> list[int]:
+    """Where windows begin that lie evenly along a side; they may overlap on a short one."""
+    cell = length / WINDOWS
+    centres = [(number + 0.5) * cell for number in range(WINDOWS)]
+    return [min(max(0, int(c - WINDOW / 2)), length - WINDOW) for c in centres]
+
+
+# ------------------------------------------------------------------------------------------------
+# From what the values of each knob cost and save to a setting of all of them; renders nothing
+# `options` are the values that a choice is made from, by the knobs' paths: from the fastest to the
+# most accurate, which is the reference. What is not measured yet is asked for when it is needed.
+
+Settings = dict[str, Value]
+Options = Mapping[str, Sequence[Value]]
+
+LEAST_SAVED = 0.02  # of the reference's time: less is noise of a few pictures
+
+
+@dataclass(frozen=True)
+class Cost:
+    """One knob at one value, all others at reference. ms: of a frame. flip: against reference."""
+
+    value: Value
+    ms: float
+    flip: float
+
+
+@dataclass(frozen=True)
+class Budgeted:
+    """ms: the frame time of the settings together. is_met: whether it is within the budget."""
+
+    settings: Settings
+    ms: float
+    is_met: bool
+
+
+def reference_settings(options: Options) -> Settings:
+    return {path: values[-1] for path, values in options.items()}
+
+
+def within_flip(
+    options: Options,
+    bound: float,
+    own_flip: Callable[[str, Value], float],
+    exceeds: Callable[[Settings], bool],
+) -> Settings:
+    """Fast settings whose pictures together are within the bound.
+
+    Knob after knob, in the order of `options`, takes the fastest value with which all that are
+    chosen so far stay within the bound, the rest at reference. So the first ones, which should be
+    those that save most, have most of the room.
+
+    own_flip: error of one knob at one value, all others at reference; of a value that is beyond the
+    bound any number beyond it will do. exceeds: whether settings together are beyond the bound; not
+    asked of the reference, whose error is 0.
+    """
+    settings = reference_settings(options)
+    for path, values in options.items():
+        for value in values[:-1]:
+            tried = settings | {path: value}
+            if own_flip(path, value) <= bound and not exceeds(tried):
+                settings = tried
+                break
+    return settings
+
+
+def within_budget(
+    options: Options,
+    budget_ms: float,
+    costs: Mapping[str, Sequence[Cost]],
+    ms_of: Callable[[Settings], float],
+) -> Budgeted:
+    """Accurate settings whose frames together take no longer than the budget.
+
+    From reference on, the knob goes a step on that saves the most time for the error that it adds,
+    by what each costs alone, and the time of all together is measured again, until it is within
+    the budget or no step is left that saves anything.
+
+    costs: of every value of every knob, its reference included. ms_of: time of settings together.
+    """
+    ladders = {path: useful(costs[path]) for path in options}
+    places = dict.fromkeys(options, 0)
+    while True:
+        settings = {path: ladder[places[path]].value for path, ladder in ladders.items()}
+        ms = ms_of(settings)
+        if ms <= budget_ms:
+            return _given_back(ladders, places, budget_ms, ms, ms_of)
+        left = [path for path, ladder in ladders.items() if places[path] < len(ladder) - 1]
+        if not left:
+            return Budgeted(settings, ms, is_met=False)
+        best = max(left, key=lambda path: _worth(ladders[path][places[path] :]))
+        places[best] += 1
+
+
+def _given_back(
+    ladders: Mapping[str, Sequence[Cost]],
+    places: dict[str, int],
+    budget_ms: float,
+    ms: float,
+    ms_of: Callable[[Settings], float],
+) -> Budgeted:
+    """Settings within a budget, each knob as close to reference as the others leave time for."""
+
+    def settings() -> Settings:
+        return {path: ladder[places[path]].value for path, ladder in ladders.items()}
+
+    def error(path: str) -> float:
+        return ladders[path][places[path]].flip
+
+    for path in sorted(ladders, key=error, reverse=True):
+        while places[path] > 0:
+            places[path] -= 1
+            tried_ms = ms_of(settings())
+            if tried_ms > budget_ms:
+                places[path] += 1
+                break
+            ms = tried_ms
+    return Budgeted(settings(), ms, is_met=True)
+
+
+def useful(costs: Sequence[Cost]) -> list[Cost]:
+    """Of a knob's values, from the fastest to reference, those worth a step: from reference on,
+    each faster than all that are as accurate or more so.
+    """
+    reference = costs[-1]
+    least_ms = LEAST_SAVED * reference.ms
+    kept = [reference]
+    # Of values with equal errors the fastest comes first, and the others save nothing then.
+    for cost in sorted(costs[:-1], key=lambda cost: (cost.flip, cost.ms)):
+        if kept[-1].ms - cost.ms > least_ms:
+            kept.append(cost)
+    return kept
+
+
+def _worth(ladder: Sequence[Cost]) -> tuple[float, float]:
+    """Time saved for the error added, then time saved, of the best of the steps down a ladder.
+
+    Where a step is poor and the one behind it good, it is the way there.
+    """
+    before, *after = ladder
+    saved = [(before.ms - cost.ms, cost.flip - before.flip) for cost in after]
+    return max((ms / error if error > 0 else math.inf, ms) for ms, error in saved)
+
+
+# ---- settle --------------------------------------------------------------------------------------
+
+_CELL = "weather.snow.cell_m"  # the one knob whose finest value a scene may be too large for
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Measured:
+    """One knob at one value, all others at reference. flip: mean FLIP against reference in the
+    worst view, as estimated. ms: of a frame; None where the choice does not depend on it.
+    """
+
+    path: str
+    value: Value
+    flip: float
+    ms: float | None
+
+
+@dataclass(frozen=True)
+class Report:
+    """settings: what was chosen, of the knobs that the recipe leaves free. is_met: whether they
+    keep what the recipe asks for; an error can always be kept, a budget cannot. flip: mean FLIP
+    against reference in the worst of the views. views: frame numbers and cameras.
+
+    The same for the same scene, recipe and backend on every machine, where the recipe gives
+    max_flip. Not so the rest: ms, the settings' frame time; reference_ms; seconds, what choosing
+    took. Only a recipe with budget_ms has the first two.
+    """
+
+    settings: Settings
+    is_met: bool
+    flip: float
+    views: tuple[tuple[int, str], ...]
+    measured: tuple[Measured, ...]
+    ms: float | None = None
+    reference_ms: float | None = None
+    seconds: float = 0.0
+
+
+@dataclass(frozen=True)
+class Settled:
+    """recipe: with its settings in numbers. report: None where nothing had to be chosen."""
+
+    recipe: schema_Recipe
+    report: Report | None = None
+
+
+def settle(
+    recipe: schema_Recipe,
+    scene: Scene,
+    *,
+    views: Sequence[View] | None = None,
+    cameras: Sequence[Camera] | None = None,
+    backend: str = "auto",
+    renderer: Renderer | None = None,
+    clock: Callable[[], float] = time.perf_counter,
+    progress: bool = False,
+) -> Settled:
+    """The recipe with the settings that its max_flip or budget_ms chooses in this scene.
+
+    views: what is rendered to find out, `calibration_views` of the scene's frames if None. cameras:
+    all of a camera path, where one is to be rendered; None for the scene's. renderer:
+    `augment.views.render_view` if None. clock: in seconds. progress: a bar on stderr.
+
+    With max_flip the choice is the same every time; with budget_ms it is this machine's. A budget
+    that cannot be kept is logged as a warning, and the fastest settings are taken.
+
+    Raises:
+        SceneError: the scene cannot be rendered under the recipe.
+    """
+    if not recipe.quality.is_open:
+        return Settled(recipe)
+    started = time.perf_counter()
+    views = calibration_views(scene.frames) if views is None else tuple(views)
+    bar = tqdm(unit="picture", desc=f"choosing settings of {recipe.name}", disable=not progress)
+    with bar:
+
+        def each() -> None:
+            bar.update()
+
+        def bench_of(reference: schema_Recipe) -> Bench:
+            return Bench(
+                reference,
+                scene,
+                views,
+                backend=backend,
+                cameras=cameras,
+                renderer=renderer,
+                clock=clock,
+                each=each,
+            )
+
+        chosen = _chosen(recipe, bench_of)
+    chosen.bench.hand_over(chosen.settings, scene)
+    report = Report(
+        settings=chosen.settings,
+        is_met=chosen.is_met,
+        flip=max(chosen.flips),
+        views=tuple((view.frame, view.name) for view in views),
+        measured=tuple(chosen.measured),
+        ms=chosen.ms,
+        reference_ms=chosen.reference_ms,
+        seconds=time.perf_counter() - started,
+    )
+    if not chosen.is_met:
+        _log.warning(
+            "recipe %s, scene %s: its frames take %.0f ms with the fastest settings, more than "
+            "quality.budget_ms %g; give a larger budget, or fields that save more",
+            recipe.name,
+            scene.name,
+            chosen.ms,
+            recipe.quality.budget_ms,
+        )
+    return Settled(settled_recipe(recipe, chosen.settings), report)
+
+
+def settled_recipe(recipe: schema_Recipe, settings: Settings) -> schema_Recipe:
+    """The recipe with a choice made for it.
+
+    Raises:
+        ValueError: these are not settings for the recipe's free knobs.
+    """
+    free = {knob.path for knob in free_knobs(recipe)}
+    if settings.keys() != free:
+        raise ValueError(
+            f"the settings are of {', '.join(sorted(settings)) or 'no knob'}; the recipe leaves "
+            f"free {', '.join(sorted(free)) or 'none'}"
+        )
+    return with_settings(recipe, {**settings, "quality.settled": True})
+
+
+def recipes_to_try(recipe: schema_Recipe) -> list[schema_Recipe]:
+    """The recipe with each knob at each value that `settle` may try alone; to compile kernels for.
+
+    The recipe itself where there is nothing to choose.
+    """
+    if not recipe.quality.is_open:
+        return [recipe]
+    options = _options(recipe)
+    settled = settled_recipe(recipe, reference_settings(options))
+    tried = [settled]
+    for path, values in options.items():
+        tried += [with_settings(settled, {path: value}) for value in values[:-1]]
+    return tried
+
+
+@dataclass
+class _Chosen:
+    bench: Bench
+    settings: Settings
+    is_met: bool = True
+    flips: tuple[float, ...] = ()
+    measured: list[Measured] = field(default_factory=list)
+    ms: float | None = None
+    reference_ms: float | None = None
+
+
+def _chosen(recipe: schema_Recipe, bench_of: Callable[[schema_Recipe], Bench]) -> _Chosen:
+    options = _options(recipe)
+    bench = _started(recipe, options, bench_of)
+    if recipe.quality.max_flip is not None:
+        chosen = _for_flip(bench, options, recipe.quality.max_flip)
+    else:
+        assert recipe.quality.budget_ms is not None
+        chosen = _for_budget(bench, options, recipe.quality.budget_ms)
+    chosen.flips = bench.flip(chosen.settings)
+    return chosen
+
+
+def _started(
+    recipe: schema_Recipe,
+    options: dict[str, tuple[Value, ...]],
+    bench_of: Callable[[schema_Recipe], Bench],
+) -> Bench:
+    """A bench that has rendered the reference; leaves out of `options` what the scene cannot have.
+
+    Raises:
+        SceneError: the scene cannot be rendered, whatever the settings.
+    """
+    while True:
+        bench = bench_of(settled_recipe(recipe, reference_settings(options)))
+        try:
+            bench.start()
+            return bench
+        except SceneError:
+            if len(options.get(_CELL, ())) < 2:
+                raise
+            options[_CELL] = options[_CELL][:-1]
+
+
+def _for_flip(bench: Bench, options: Options, bound: float) -> _Chosen:
+    measured: dict[tuple[str, Value], Measured] = {}
+
+    def own_flip(path: str, value: Value) -> float:
+        error = bench.estimate({path: value}, enough=bound)
+        measured[path, value] = Measured(path, value, error, None)
+        return error
+
+    settings = within_flip(options, bound, own_flip, lambda s: bench.exceeds(s, bound))
+    return _Chosen(bench, settings, measured=list(measured.values()))
+
+
+def _for_budget(bench: Bench, options: Options, budget_ms: float) -> _Chosen:
+    reference_ms = bench.ms({})
+    costs: dict[str, list[Cost]] = {path: [] for path in options}
+    measured = []
+    if reference_ms > budget_ms:  # else nothing has to be given up
+        for path, values in options.items():
+            for value in values[:-1]:
+                ms, error = bench.ms({path: value}), bench.estimate({path: value})
+                costs[path].append(Cost(value, ms, error))
+                measured.append(Measured(path, value, error, ms))
+    for path, values in options.items():
+        costs[path].append(Cost(values[-1], reference_ms, 0.0))
+    reference = reference_settings(options)
+
+    def ms_of(settings: Settings) -> float:
+        return bench.ms({p: value for p, value in settings.items() if value != reference[p]})
+
+    found = within_budget(options, budget_ms, costs, ms_of)
+    return _Chosen(
+        bench,
+        found.settings,
+        found.is_met,
+        measured=measured,
+        ms=found.ms,
+        reference_ms=reference_ms,
+    )
+
+
+def _options(recipe: schema_Recipe) -> dict[str, tuple[Value, ...]]:
+    """The values of its free knobs that the recipe's rules allow, reference always."""
+    knobs = free_knobs(recipe)
+    reference = with_settings(recipe, {knob.path: knob.reference for knob in knobs})
+    return {
+        knob.path: tuple(value for value in knob.values if _is_allowed(reference, knob.path, value))
+        for knob in knobs
+    }
+
+
+def _is_allowed(recipe: schema_Recipe, path: str, value: Value) -> bool:
+    try:
+        with_settings(recipe, {path: value})
+    except ValueError:
+        return False
+    return True

@@ -1,0 +1,126 @@
+"""Kernels of the records themselves: boxes against depth images, and colours over time."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+# ---- Numba kernel for splats whose colours change with time or stand still while they turn -------
+
+BLOCK = 2048  # splats a thread takes at a time
+
+
+@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
+def colors_at(sh, coefficients, weights, turn, out):
+    """out [N, K, 3]: sh with sum_t weights[t] coefficients[:, t] added to its first row, and bands
+    turned by the blocks of turn [K, K]; an empty turn leaves them.
+
+    coefficients [N, T, 3]. weights [T]. All float32.
+    """
+    count, rows, _ = sh.shape
+    zero = np.float32(0)
+    for block in numba.prange((count + BLOCK - 1) // BLOCK):
+        for i in range(block * BLOCK, min((block + 1) * BLOCK, count)):
+            for c in range(3):
+                value = sh[i, 0, c]
+                for term in range(len(weights)):
+                    value += weights[term] * coefficients[i, term, c]
+                out[i, 0, c] = value
+            if len(turn) == 0:
+                for k in range(1, rows):
+                    for c in range(3):
+                        out[i, k, c] = sh[i, k, c]
+                continue
+            first = 1
+            while first < rows:
+                after = first + 3 if first == 1 else first + 5 if first == 4 else first + 7
+                for row in range(first, after):
+                    red = green = blue = zero
+                    for k in range(first, after):
+                        share = turn[row, k]
+                        red += share * sh[i, k, 0]
+                        green += share * sh[i, k, 1]
+                        blue += share * sh[i, k, 2]
+                    out[i, row, 0], out[i, row, 1], out[i, row, 2] = red, green, blue
+                first = after
+
+
+# ---- box kernels ---------------------------------------------------------------------------------
+
+
+# Of one thread: it runs beside the renderer, on those that write files.
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def count_occlusion(
+    depth, instance, actors, windows, across, down, axes, eyes, owned, labelled, near_m, found
+):
+    """found [B, 6]: pixels that show each box, pixels that show what stands before it, and left,
+    top, right, bottom of the former, right and bottom excluded.
+
+    depth [H, W]: z, 0 = none. instance [H, W]: actors' numbers, or [0, 0] where they are not known.
+    actors [B]: of the boxes, 0 = none. windows [B, 4]: left, top, right, bottom of where a box can
+    be. across [W], down [H]: x / z and y / z of the pixels' rays. axes [B, 3, 3]: columns, the
+    camera's axes in the box. eyes [B, 3]: the camera's centre there. owned, labelled [B, 2, 3]:
+    lowest and highest of the part that owns surfaces, and of the labelled box. near_m: what of a
+    box is nearer is not seen.
+    """
+    knows_actors = instance.size > 0
+    boxes_of = np.full(65536, -1, np.int64)  # the first box of each actor
+    for box in range(len(found)):
+        found[box, 2], found[box, 3] = depth.shape[1], depth.shape[0]
+        if actors[box] > 0 and boxes_of[actors[box]] < 0:
+            boxes_of[actors[box]] = box
+    if knows_actors:
+        for row in range(instance.shape[0]):
+            for column in range(instance.shape[1]):
+                if instance[row, column] > 0:
+                    box = boxes_of[instance[row, column]]
+                    if box >= 0:
+                        _add(found[box], row, column)
+        for box in range(len(found)):  # a second box of an actor shows what the first one does
+            if actors[box] > 0:
+                found[box] = found[boxes_of[actors[box]]]
+    for box in range(len(found)):
+        left, top, right, bottom = windows[box]
+        own = actors[box]
+        for row in range(top, bottom):
+            for column in range(left, right):
+                z = depth[row, column]
+                if not z > 0:
+                    continue
+                number = np.int64(0)
+                if knows_actors:
+                    number = np.int64(instance[row, column])
+                    if own > 0 and number == own:
+                        continue  # counted above
+                enter, leave = near_m, np.inf  # of the labelled box, by depth
+                nearest, farthest = near_m, np.inf  # of what owns surfaces
+                for axis in range(3):
+                    slope = (
+                        axes[box, axis, 0] * across[column]
+                        + axes[box, axis, 1] * down[row]
+                        + axes[box, axis, 2]
+                    )
+                    eye = eyes[box, axis]
+                    a = (labelled[box, 0, axis] - eye) / slope
+                    b = (labelled[box, 1, axis] - eye) / slope
+                    enter, leave = max(enter, min(a, b)), min(leave, max(a, b))
+                    a = (owned[box, 0, axis] - eye) / slope
+                    b = (owned[box, 1, axis] - eye) / slope
+                    nearest, farthest = max(nearest, min(a, b)), min(farthest, max(a, b))
+                if nearest <= z and z <= farthest:
+                    if own == 0 and number == 0:
+                        _add(found[box], row, column)
+                    elif number > 0 and enter <= leave:
+                        found[box, 1] += 1  # another actor, in this box
+                elif z < nearest and enter <= leave:
+                    found[box, 1] += 1
+    for box in range(len(found)):
+        if found[box, 0] == 0:
+            found[box, 2:] = 0
+
+
+@numba.njit(nogil=True, error_model="numpy")
+def _add(found, row, column):
+    found[0] += 1
+    found[2], found[3] = min(found[2], column), min(found[3], row)
+    found[4], found[5] = max(found[4], column + 1), max(found[5], row + 1)

@@ -1,0 +1,321 @@
+"""Gradients on the CPU: a render that remembers how it was made, and the way back.
+
+    tape = record(inputs, camera, settings, scratch, with_depth=…)   rgb, alpha, expected_depth
+    grads = tape.backward(d_rgb, d_alpha, d_expected_depth)          a row a touched Gaussian
+
+The forward pass is `cpu.rasterize_cpu` in a single slice of z, so that every list entry is still
+there when the way back needs it. Bits do not depend on the number of threads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from augment.cameras import Camera
+from augment.render.buffers import ALPHA, EXPECTED_DEPTH, RGB, RenderOutput
+from augment.render.constants import DEPTH_EPS, RasterSettings
+from augment.render.cpu import backward_kernels as cpu_blend_backward
+from augment.render.cpu import backward_kernels as cpu_project_backward
+from augment.render.cpu import backward_kernels as rows
+from augment.render.cpu.driver import (
+    Clock,
+    Inputs,
+    Scratch,
+    Tiles,
+    gather_inputs,
+    image_arrays,
+    project,
+    rank,
+    sort,
+)
+from augment.render.layout import BLOCK, V_EYE
+from augment.render.sh import sh_basis
+from augment.render.threads import kernel_threads
+from augment.scene import Gaussians, PosedGaussians
+
+# ---- cpu backward --------------------------------------------------------------------------------
+
+_RANGES = 8  # pieces of work in adding up shares
+
+
+@dataclass(frozen=True, eq=False)
+class SplatGradients:
+    """dL of every Gaussian that the image shows, block by block (Inputs.blocks).
+
+    Block b has counts[b] rows, from row b BLOCK on. rows: float32 [B BLOCK, GRAD], columns as
+    cpu_project_backward names them. ids: int32 [B BLOCK], index of the Gaussian in its part.
+    Both live in the tape's scratch: they are overwritten by its next use.
+    """
+
+    rows: np.ndarray
+    ids: np.ndarray
+    counts: np.ndarray
+    blocks: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Tape:
+    """A finished render of one camera and what its gradients take.
+
+    rgb [H, W, 3], alpha [H, W], expected_depth [H, W] or None: float32, as RenderOutput's. All
+    arrays live in the scratch that `record` was given.
+    """
+
+    inputs: Inputs
+    camera: Camera
+    rgb: np.ndarray
+    alpha: np.ndarray
+    expected_depth: np.ndarray | None
+    records: np.ndarray
+    found: np.ndarray
+    members: np.ndarray
+    starts: np.ndarray
+    size: np.ndarray
+    limits: np.ndarray
+    scratch: Scratch
+
+    def backward(
+        self,
+        d_rgb: np.ndarray,
+        d_alpha: np.ndarray,
+        d_expected_depth: np.ndarray | None = None,
+        *,
+        clock: Clock | None = None,
+    ) -> SplatGradients:
+        """Gradients of a loss with these derivatives by the images, all float32, contiguous."""
+        clock = Clock(None) if clock is None else clock
+        depth = d_depth = None
+        if self.expected_depth is not None and d_expected_depth is not None:
+            weight = np.maximum(self.alpha, np.float32(DEPTH_EPS))
+            depth = self.expected_depth * weight
+            d_depth = d_expected_depth / weight
+            inside = self.alpha > np.float32(DEPTH_EPS)
+            d_alpha = d_alpha - np.where(inside, d_depth * self.expected_depth, np.float32(0))
+        scratch, inputs = self.scratch, self.inputs
+        entries, slots, blocks = len(self.members), inputs.slots, len(inputs.blocks)
+        shares = scratch.array("shares", (entries * cpu_blend_backward.SHARE,), np.float32)
+        reached = scratch.array("reached", (len(self.starts) - 1,), np.int64)
+        sums = scratch.array("sums", (slots * cpu_blend_backward.SHARE,), np.float32)
+        touched = scratch.array("touched", (slots,), np.uint8)
+        rows = scratch.array("grads", (slots, cpu_project_backward.GRAD), np.float32)
+        ids = scratch.array("grad_ids", (slots,), np.int32)
+        counts = scratch.array("grad_counts", (blocks,), np.int64)
+        with kernel_threads():
+            cpu_blend_backward.blend_backward(
+                self.records,
+                self.members,
+                self.starts,
+                self.size,
+                self.limits,
+                self.rgb.reshape(-1),
+                self.alpha.reshape(-1),
+                None if depth is None else depth.reshape(-1),
+                d_rgb.reshape(-1),
+                d_alpha.reshape(-1),
+                None if d_depth is None else d_depth.reshape(-1),
+                shares,
+                reached,
+            )
+            clock.lap("raster backward")
+            cpu_blend_backward.sum_shares(
+                self.members, self.starts, reached, shares, _RANGES, sums, touched
+            )
+            clock.lap("sum backward")
+            cpu_project_backward.project_backward(
+                inputs.addresses,
+                inputs.sizes,
+                inputs.views,
+                inputs.blocks,
+                inputs.first_ids,
+                self.found,
+                touched,
+                inputs.modes,
+                self.records,
+                sums,
+                rows.reshape(-1),
+                ids,
+                counts,
+            )
+            clock.lap("project backward")
+        return SplatGradients(rows, ids, counts, inputs.blocks)
+
+
+def record(
+    inputs: Inputs,
+    camera: Camera,
+    settings: RasterSettings,
+    scratch: Scratch,
+    *,
+    with_depth: bool,
+    clock: Clock | None = None,
+) -> Tape:
+    """Render colour, alpha and, if asked for, expected depth, and keep what `backward` needs.
+
+    Raises:
+        ValueError: the camera is orthographic; the way back knows pinhole cameras only.
+    """
+    if camera.is_orthographic:
+        raise ValueError(
+            f"camera {camera.name!r} is orthographic; the kernels' gradients are of pinhole "
+            f"cameras only: use `rasterize` with backend 'auto' or 'reference'"
+        )
+    clock = Clock(None) if clock is None else clock
+    buffers = frozenset({RGB, ALPHA, EXPECTED_DEPTH} if with_depth else {RGB, ALPHA})
+    images = image_arrays(camera, buffers)
+    with kernel_threads():
+        tiles = Tiles(camera, images, settings, scratch)
+        depths, edges = rank(inputs, camera, scratch)
+        bins = (edges[0], edges[-1])
+        splats = project(inputs, depths, bins, tiles, scratch)
+        clock.lap("project")
+        slots, rects = sort(splats, bins[0], scratch)
+        clock.lap("sort")
+        members, starts = tiles.list_all(slots, rects)
+        clock.lap("bin")
+        clock.count("visible", len(slots))
+        clock.count("pairs", len(members))
+        tiles.blend_members(splats, members, starts, is_last=True)
+        clock.lap("raster")
+    return Tape(
+        inputs=inputs,
+        camera=camera,
+        rgb=images[RGB],
+        alpha=images[ALPHA],
+        expected_depth=images.get(EXPECTED_DEPTH),
+        records=splats.records,
+        found=splats.found,
+        members=members,
+        starts=starts,
+        size=tiles.size,
+        limits=tiles.limits,
+        scratch=scratch,
+    )
+
+
+# ---- The CPU rasteriser as a torch operation: forward and backward through the kernels -----------
+# Gradients reach means, quats, scales, opacities and sh of every part from rgb, alpha and expected
+# depth. Camera and part poses get none: they are constants of the operation.
+
+_FIELDS = ("means", "quats", "scales", "opacities", "sh")
+
+
+def rasterize_with_gradients(
+    parts: Sequence[PosedGaussians],
+    camera: Camera,
+    buffers: frozenset[str],
+    settings: RasterSettings,
+) -> RenderOutput:
+    """As `cpu.rasterize_cpu` without smog, recorded by autograd. buffers: some of DIFFERENTIABLE.
+
+    All splats are listed at once instead of slice by slice, so this takes more memory than a plain
+    render: 48 bytes for every pair of a splat and a tile, kept until backward.
+    """
+    tensors = [getattr(part.gaussians, name) for part in parts for name in _FIELDS]
+    setting = _Setting(tuple(parts), camera, settings, EXPECTED_DEPTH in buffers)
+    rgb, alpha, depth = _Rasterize.apply(setting, *tensors)
+    images = {RGB: rgb, ALPHA: alpha, EXPECTED_DEPTH: depth}
+    return RenderOutput(**{name: images[name] for name in buffers})
+
+
+class _Setting:
+    """What an operation is told besides its tensors."""
+
+    def __init__(
+        self,
+        parts: tuple[PosedGaussians, ...],
+        camera: Camera,
+        settings: RasterSettings,
+        with_depth: bool,
+    ) -> None:
+        self.parts = parts
+        self.camera = camera
+        self.settings = settings
+        self.with_depth = with_depth
+
+
+class _Rasterize(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, setting: _Setting, *tensors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        parts = [
+            PosedGaussians(
+                Gaussians(**{n: t.detach() for n, t in zip(_FIELDS, own, strict=True)}),
+                part.world_from_part,
+                part.instance_id,
+            )
+            for part, own in zip(setting.parts, _groups(tensors), strict=True)
+        ]
+        inputs = gather_inputs(parts, setting.camera, setting.settings, None, with_color=True)
+        tape = record(
+            inputs, setting.camera, setting.settings, Scratch(), with_depth=setting.with_depth
+        )
+        ctx.tape, ctx.setting = tape, setting
+        ctx.save_for_backward(*tensors)  # so that a change in place is noticed
+        depth = np.zeros_like(tape.alpha) if tape.expected_depth is None else tape.expected_depth
+        # Copies: the tape keeps its own images, whatever is done to these.
+        return (
+            torch.from_numpy(tape.rgb.copy()),
+            torch.from_numpy(tape.alpha.copy()),
+            torch.from_numpy(depth.copy()),
+        )
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(  # pyright: ignore[reportIncompatibleMethodOverride] - torch's own way
+        ctx: Any, d_rgb: Tensor, d_alpha: Tensor, d_depth: Tensor
+    ) -> tuple[Any, ...]:
+        tape: Tape = ctx.tape
+        grads = tape.backward(
+            d_rgb.contiguous().numpy(),
+            d_alpha.contiguous().numpy(),
+            d_depth.contiguous().numpy() if ctx.setting.with_depth else None,
+        )
+        out: list[Tensor | None] = [None]
+        for number, own in enumerate(_groups(ctx.saved_tensors)):
+            out += _part_gradients(grads, number, own, tape.inputs.views[number], ctx.setting)
+        return tuple(out)
+
+
+def _groups(tensors: Sequence[Tensor]) -> list[Sequence[Tensor]]:
+    return [tensors[i : i + len(_FIELDS)] for i in range(0, len(tensors), len(_FIELDS))]
+
+
+def _part_gradients(
+    grads: SplatGradients,
+    number: int,
+    tensors: Sequence[Tensor],
+    view: np.ndarray,
+    setting: _Setting,
+) -> list[Tensor]:
+    """Dense gradients of one part's five tensors; zero where the image shows nothing of a splat."""
+    blocks = np.flatnonzero(grads.blocks[:, 0] == number)
+    used = [np.arange(b * BLOCK, b * BLOCK + grads.counts[b]) for b in blocks]
+    at = np.concatenate(used) if used else np.zeros(0, np.int64)
+    index = torch.from_numpy(grads.ids[at].astype(np.int64))
+    own = torch.from_numpy(grads.rows[at].copy())
+    means, quats, scales, opacities, sh = (t.detach() for t in tensors)
+    d_sh = torch.zeros_like(sh)
+    degree = int(sh.shape[1] ** 0.5) - 1
+    if setting.settings.sh_degree is not None:
+        degree = min(degree, setting.settings.sh_degree)
+    eye = torch.from_numpy(view[V_EYE : V_EYE + 3].copy())
+    rest = torch.from_numpy(view[V_EYE + 3 : V_EYE + 6].copy())
+    directions = torch.nn.functional.normalize(means[index] - eye - rest, dim=-1)
+    basis = sh_basis(directions, degree)  # [M, K']
+    color = own[:, rows.G_COLOR : rows.G_COLOR + 3]
+    d_sh[index, : basis.shape[1]] = basis[:, :, None] * color[:, None, :]
+    d_quats = own[:, rows.G_QUAT : rows.G_QUAT + 4]
+    d_scales = own[:, rows.G_SCALE : rows.G_SCALE + 3] / scales[index]
+    d_opacities = own[:, rows.G_OPACITY] / opacities[index]
+    return [
+        torch.zeros_like(means).index_copy(0, index, own[:, rows.G_MEAN : rows.G_MEAN + 3]),
+        torch.zeros_like(quats).index_copy(0, index, d_quats),
+        torch.zeros_like(scales).index_copy(0, index, d_scales),
+        torch.zeros_like(opacities).index_copy(0, index, d_opacities),
+        d_sh,
+    ]

@@ -1,0 +1,546 @@
+"""Numba kernel: from gradients of the image to gradients of every splat of every tile's list.
+
+The forward blend is repeated front to back. With q_i = dL/dw_i, the same for all that a weight
+w_i = alpha_i T_i is multiplied with, and rest_i = sum of w_j q_j behind splat i,
+
+    dL/dalpha_i = T_i q_i - rest_i / (1 - alpha_i),
+
+where rest starts as the sum over the whole pixel, known from the finished image, and loses w_i q_i
+at every splat: no transmittance is ever divided by.
+
+A splat's share of a tile is kept as sums over its pixels of g = dL/de (e: log2 of alpha, see
+augment.render.layout) times powers of `off` (sharp pixels off the ridge) and `dy`, from which
+cpu_project_backward derives everything geometric. Each list entry has its own place for them, so
+nothing is added in an order that depends on threads.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import prange
+
+from augment.render.cpu import simd as v8
+from augment.render.cpu.blend import alpha_of, is_closed, light_left, shrink
+from augment.render.cpu.geometry import (
+    BATCH,
+    ITEMS,
+    dot,
+    find_spans,
+    from_eye,
+    list_items,
+    rotation_row,
+    semi_axes,
+    stage,
+    to_camera,
+)
+from augment.render.cpu.jit import inner, kernel
+from augment.render.cpu.project import add_direction_slopes
+from augment.render.cpu.simd import LOG2_E, floats_at
+from augment.render.layout import (
+    BLOCK,
+    BLUE,
+    DEPTH,
+    FALL_Y,
+    GREEN,
+    LANES,
+    LEAN_X,
+    M_ANTIALIASED,
+    M_FUNCTIONS,
+    MEAN_Y,
+    PIXELS,
+    RECORD,
+    RED,
+    SHARP_X,
+    SPLAT_ID,
+    STRIP,
+    STRIPS,
+    TILE_H,
+    TILE_W,
+    V_BLUR,
+    V_FOCAL,
+    V_HIGH,
+    V_LOW,
+    U,
+)
+
+# ---- cpu blend backward --------------------------------------------------------------------------
+
+# Of a list entry, one cache line: sums of g, g off, g off^2, g dy, g off dy, g dy^2, and of
+# |dL/d mean| along x (over 2 sharp) and y (over 2); then dL/d colour (3) and z.
+SHARE = 16
+S_0, S_X, S_XX, S_Y, S_XY, S_YY, S_ABS_X, S_ABS_Y, S_RED, S_GREEN, S_BLUE, S_DEPTH = range(12)
+
+# Planes of a tile: transmittance as in cpu_blend, what lies behind, and the pixel's gradients.
+THROUGH, REST, G_RED, G_GREEN, G_BLUE, G_ALPHA, G_DEPTH = (U(i * PIXELS) for i in range(7))
+PLANES = 7 * PIXELS
+GROUP = 4  # tiles a thread takes at a time
+_LN2 = np.float32(math.log(2))
+
+
+@kernel
+def blend_backward(
+    records,
+    members,
+    starts,
+    size,
+    limits,
+    rgb,
+    alpha,
+    depth,
+    d_rgb,
+    d_alpha,
+    d_depth,
+    shares,
+    reached,
+):
+    """dL of every list entry that the forward blend came to.
+
+    records, members, starts, size, limits: as for cpu_blend.blend_tiles, in one slice. rgb, alpha:
+    flat images as rendered. depth: sum of weights times z. d_rgb, d_alpha, d_depth: the loss's
+    derivatives by them; depth and d_depth may be None. shares: float32 [entries * SHARE], filled
+    up to reached[tile] (int64, tiles) entries of each list.
+    """
+    columns = (size[0] + TILE_W - 1) // TILE_W
+    for group in prange((reached.size + GROUP - 1) // GROUP):
+        state = np.empty(PLANES, np.float32)
+        staged = np.empty(RECORD * BATCH, np.float32)
+        spans = np.empty(2 * BATCH, np.int32)
+        values = np.empty(2 * ITEMS, np.float32)
+        places = np.empty(2 * ITEMS, np.int32)
+        rows = np.empty(2 * STRIPS, np.int64)
+        for tile in range(group * GROUP, min((group + 1) * GROUP, reached.size)):
+            first, last = starts[tile], starts[tile + 1]
+            left, top = tile % columns * TILE_W, tile // columns * TILE_H
+            if first < last:
+                _load_tile(state, left, top, size, rgb, alpha, depth, d_rgb, d_alpha, d_depth)
+            reached[tile] = _replay_list(
+                records, members, first, last, np.float32(left), np.float32(top), limits,
+                state, staged, spans, values, places, rows, d_depth, shares,
+            )  # fmt: skip
+
+
+@inner()
+def _load_tile(state, left, top, size, rgb, alpha, depth, d_rgb, d_alpha, d_depth):
+    for pixel in range(U(PIXELS)):
+        x = left + np.int64(pixel // U(STRIP) * U(LANES) + pixel % U(LANES))
+        y = top + np.int64(pixel % U(STRIP) // U(LANES))
+        if x >= size[0] or y >= size[1]:
+            state[pixel] = np.float32(-1)
+            for plane in range(U(1), U(7)):
+                state[plane * U(PIXELS) + pixel] = np.float32(0)
+            continue
+        at = U(y * size[0] + x)
+        first = U(3) * at
+        red, green, blue = d_rgb[first], d_rgb[first + U(1)], d_rgb[first + U(2)]
+        rest = red * rgb[first] + green * rgb[first + U(1)] + blue * rgb[first + U(2)]
+        rest += d_alpha[at] * alpha[at]
+        state[pixel] = np.float32(1)
+        state[G_RED + pixel] = red
+        state[G_GREEN + pixel] = green
+        state[G_BLUE + pixel] = blue
+        state[G_ALPHA + pixel] = d_alpha[at]
+        if d_depth is not None:
+            state[G_DEPTH + pixel] = d_depth[at]
+            rest += d_depth[at] * depth[at]
+        state[REST + pixel] = rest
+
+
+@inner()
+def _replay_list(
+    records,
+    members,
+    first,
+    last,
+    left,
+    top,
+    limits,
+    state,
+    staged,
+    spans,
+    values,
+    places,
+    rows,
+    d_depth,
+    shares,
+):
+    """Fill the shares of a tile's list as far as light reaches; returns how far that is."""
+    for strip in range(STRIPS):
+        rows[2 * strip], rows[2 * strip + 1] = 0, TILE_H
+        if first < last:
+            shrink(state, strip, rows)
+    for at in range(first, last, BATCH):
+        if is_closed(rows):
+            return at - first
+        count = min(BATCH, last - at)
+        for k in range(U(at + count), U(min(at + 2 * BATCH, last))):
+            v8.prefetch(records, U(members[k]) * U(RECORD))
+        stage(
+            records,
+            members,
+            U(at),
+            U(count),
+            left,
+            top,
+            shares,
+            d_depth,
+            None,
+            None,
+            None,
+            None,
+            staged,
+        )
+        for i in range(U(at) * U(SHARE), U(at + count) * U(SHARE)):
+            shares[i] = np.float32(0)
+        for strip in range(STRIPS):
+            if rows[2 * strip] >= rows[2 * strip + 1]:
+                continue
+            find_spans(staged, U(count), strip, rows, limits[1], spans)
+            items = list_items(staged, U(count), strip, spans, values, places)
+            if items == U(0):
+                continue
+            places[items] = 0
+            item = U(0)
+            for k in range(U(count)):
+                end = item + U(spans[U(BATCH) + k] - spans[k])
+                if end > item:
+                    _add_share(
+                        state, staged, values, places, k, item, end, limits, d_depth,
+                        shares, (U(at) + k) * U(SHARE),
+                    )  # fmt: skip
+                item = end
+            shrink(state, strip, rows)
+    return last - first
+
+
+@inner()
+def _add_share(state, staged, values, places, k, item, end, limits, d_depth, shares, share):
+    """Blend one splat into its rows of a strip, adding what each pixel says of it."""
+    n = U(BATCH)
+    alpha_max, log_cut = v8.splat(limits[0]), v8.splat(limits[1])
+    least, end_light = v8.splat(limits[2]), v8.splat(limits[7])
+    zero, one = v8.splat(np.float32(0)), v8.splat(np.float32(1))
+    sharp = staged[U(SHARP_X) * n + k]
+    fall = v8.splat(staged[U(FALL_Y) * n + k])
+    tilt = v8.splat(-sharp * staged[U(LEAN_X) * n + k])
+    steps, ln2 = v8.splat(sharp), v8.splat(_LN2)
+    red, green = v8.splat(staged[U(RED) * n + k]), v8.splat(staged[U(GREEN) * n + k])
+    blue, z = v8.splat(staged[U(BLUE) * n + k]), zero
+    if d_depth is not None:
+        z = v8.splat(staged[U(DEPTH) * n + k])
+    s0, sx, sxx, sy, sxy, syy = zero, zero, zero, zero, zero, zero
+    sr, sg, sb, sz, ax, ay = zero, zero, zero, zero, zero, zero
+    for i in range(item, end):
+        at = U(places[i + U(ITEMS)])
+        row = np.float32(at % U(STRIP) // U(LANES)) + np.float32(0.5)
+        dy = v8.splat(row - staged[U(MEAN_Y) * n + k])
+        off = v8.fmuladd(steps, v8.lane_numbers(), v8.splat(values[i + U(ITEMS)]))
+        e = v8.fmuladd(v8.negate(off), off, v8.splat(values[i]))
+        alpha = alpha_of(staged, values, k, i, alpha_max, log_cut)
+        through = v8.load(state, at)
+        weight = alpha * through
+        after = through - weight
+        kept = v8.greater(after, least)
+        weight = v8.select(kept, weight, zero)
+        v8.store(state, at, light_left(through, after, kept, end_light))
+        g_red, g_green = v8.load(state, at + G_RED), v8.load(state, at + G_GREEN)
+        g_blue = v8.load(state, at + G_BLUE)
+        q = v8.fmuladd(g_red, red, v8.load(state, at + G_ALPHA))
+        q = v8.fmuladd(g_green, green, q)
+        q = v8.fmuladd(g_blue, blue, q)
+        if d_depth is not None:
+            g_depth = v8.load(state, at + G_DEPTH)
+            q = v8.fmuladd(g_depth, z, q)
+            sz = v8.fmuladd(weight, g_depth, sz)
+        rest = v8.fmuladd(v8.negate(weight), q, v8.load(state, at + REST))
+        v8.store(state, at + REST, rest)
+        by_alpha = through * q - rest / (one - alpha)
+        # Nothing moves an alpha that is cut off, clamped or behind the stop.
+        free = v8.both(v8.both(v8.at_least(e, log_cut), kept), v8.greater(alpha_max, alpha))
+        g = v8.select(free, by_alpha * alpha * ln2, zero)
+        g_off = g * off
+        sr = v8.fmuladd(weight, g_red, sr)
+        sg = v8.fmuladd(weight, g_green, sg)
+        sb = v8.fmuladd(weight, g_blue, sb)
+        s0 = s0 + g
+        sx = sx + g_off
+        sxx = v8.fmuladd(g_off, off, sxx)
+        sy = v8.fmuladd(g, dy, sy)
+        sxy = v8.fmuladd(g_off, dy, sxy)
+        syy = v8.fmuladd(g * dy, dy, syy)
+        ax = ax + v8.absolute(g_off)
+        ay = ay + v8.absolute(v8.fmuladd(tilt, g_off, fall * (g * dy)))
+    shape = v8.totals(s0, sx, sxx, sy, sxy, syy, ax, ay)
+    v8.store(shares, share, v8.load(shares, share) + shape)
+    color = v8.totals(sr, sg, sb, sz, zero, zero, zero, zero)
+    v8.store(shares, share + U(8), v8.load(shares, share + U(8)) + color)
+
+
+@kernel
+def sum_shares(members, starts, reached, shares, ranges, sums, touched):
+    """Every slot's shares of all tiles, added in the order of the tiles.
+
+    Each of `ranges` runs of slots looks at all entries and takes its own, so the order of addition
+    depends on nothing. sums: float32 [slots * SHARE]; touched: uint8 [slots], 1 where any entry
+    was reached; both are filled.
+    """
+    slots = touched.size
+    for run in prange(ranges):
+        low, high = U(slots * run // ranges), U(slots * (run + 1) // ranges)
+        for slot in range(low, high):
+            touched[slot] = 0
+        for tile in range(reached.size):
+            for entry in range(U(starts[tile]), U(starts[tile] + reached[tile])):
+                slot = U(members[entry])
+                if slot < low or slot >= high:
+                    continue
+                at, share = slot * U(SHARE), entry * U(SHARE)
+                if touched[slot] == 0:
+                    touched[slot] = 1
+                    for i in range(U(0), U(SHARE), U(LANES)):
+                        v8.store(sums, at + i, v8.load(shares, share + i))
+                else:
+                    for i in range(U(0), U(SHARE), U(LANES)):
+                        total = v8.load(sums, at + i) + v8.load(shares, share + i)
+                        v8.store(sums, at + i, total)
+
+
+# ------------------------------------------------------------------------------------------------
+# Numba kernel: from gradients of a splat's ellipse, depth and colour to those of its Gaussian
+# Eight splats at a time the projection of cpu_geometry is repeated and its chain rule followed
+# backwards. Names: g_a is dL/da.
+
+# A row of gradients, one cache line: by mean (3, metres, in the part's axes), unit quaternion (4,
+# tangential), logarithms of scales (3) and opacity, colour before its clamp at 0 (3). Between them
+# what densification looks at: the sum of |dL/d mean| over pixels (1/px), and the largest sigma, px.
+GRAD = 16
+G_MEAN, G_QUAT, G_ABS, G_SCALE, G_OPACITY, G_COLOR, G_RADIUS = 0, 3, 7, 8, 11, 12, 15
+
+_INVERSE_LN2 = np.float32(1 / math.log(2))
+_SLOPES = 16  # rows of eight: gradients of the SH functions, weighted
+
+
+@kernel
+def project_backward(
+    addresses,
+    sizes,
+    views,
+    blocks,
+    first_ids,
+    found,
+    touched,
+    modes,
+    records,
+    sums,
+    grads,
+    ids,
+    counts,
+):
+    """A row of `grads` for every touched splat, block by block in the order of its Gaussians.
+
+    addresses to first_ids, found, modes, records: as in cpu_project. touched, sums: what
+    cpu_blend_backward.sum_shares wrote. Block b fills rows b BLOCK to b BLOCK + counts[b] of grads
+    (float32 [B BLOCK * GRAD]) and of ids (int32, index of the Gaussian in its part).
+    """
+    for block in prange(blocks.shape[0]):
+        part = blocks[block, 0]
+        slots = np.empty(BLOCK + LANES, np.int32)
+        picked = np.empty(BLOCK + LANES, np.int32)
+        rows = np.empty((_SLOPES + GRAD) * LANES, np.float32)
+        base = block * BLOCK
+        taken = U(0)
+        for slot in range(base, base + found[block]):
+            if touched[slot] != 0:
+                number = np.float32(records[slot * RECORD + SPLAT_ID]).view(np.int32)
+                slots[taken] = np.int32(slot)
+                picked[taken] = number - np.int32(first_ids[part])
+                ids[U(base) + taken] = picked[taken]
+                taken += U(1)
+        counts[block] = taken
+        if taken == U(0):
+            continue
+        for lane in range(U(LANES)):
+            slots[taken + lane] = slots[taken - U(1)]
+            picked[taken + lane] = picked[taken - U(1)]
+        count, functions = sizes[part]
+        means = floats_at(addresses[part, 0], count * 3)
+        quats = floats_at(addresses[part, 1], count * 4)
+        scales = floats_at(addresses[part, 2], count * 3)
+        sh = floats_at(addresses[part, 4], count * functions * 3)
+        used = min(modes[M_FUNCTIONS], functions)
+        for at in range(U(0), taken, U(LANES)):
+            _color_backward(
+                sh, U(functions), U(used), means, views[part], slots, picked, at, records, sums,
+                rows,
+            )  # fmt: skip
+            _geometry_backward(
+                means, quats, scales, views[part], slots, picked, at, modes, records, sums, rows
+            )
+            for lane in range(min(U(LANES), taken - at)):
+                row = (U(base) + at + lane) * U(GRAD)
+                for field in range(U(GRAD)):
+                    grads[row + field] = rows[(U(_SLOPES) + field) * U(LANES) + lane]
+
+
+@inner()
+def _write(rows, field, value):
+    v8.store(rows, U(_SLOPES + field) * U(LANES), value)
+
+
+@inner()
+def _color_backward(
+    sh, functions, used, means, view, slots, picked, at, records, sums, rows
+):  # fmt: skip
+    """Rows of colour, and of the mean as far as the viewing direction changes the colour."""
+    for lane in range(U(LANES)):
+        slot, splat = U(slots[at + lane]), U(picked[at + lane])
+        share, record = slot * U(SHARE), slot * U(RECORD)
+        zero = np.float32(0)
+        red = sums[share + U(S_RED)] if records[record + U(RED)] > zero else zero
+        green = sums[share + U(S_GREEN)] if records[record + U(GREEN)] > zero else zero
+        blue = sums[share + U(S_BLUE)] if records[record + U(BLUE)] > zero else zero
+        rows[U(_SLOPES + G_COLOR) * U(LANES) + lane] = red
+        rows[U(_SLOPES + G_COLOR + 1) * U(LANES) + lane] = green
+        rows[U(_SLOPES + G_COLOR + 2) * U(LANES) + lane] = blue
+        first = splat * functions * U(3)
+        for k in range(U(1), used):
+            c = first + k * U(3)
+            rows[k * U(LANES) + lane] = red * sh[c] + green * sh[c + U(1)] + blue * sh[c + U(2)]
+    zero = v8.splat(np.float32(0))
+    if used == U(1):
+        for axis in range(3):
+            _write(rows, G_MEAN + axis, zero)
+        return
+    dx, dy, dz = from_eye(means, picked, at, view)
+    inverse = v8.splat(np.float32(1)) / v8.sqrt(dot(dx, dy, dz, dx, dy, dz))
+    x, y, z = dx * inverse, dy * inverse, dz * inverse
+    gx, gy, gz = add_direction_slopes(x, y, z, used, rows)
+    radial = dot(gx, gy, gz, x, y, z)
+    _write(rows, G_MEAN, (gx - radial * x) * inverse)
+    _write(rows, G_MEAN + 1, (gy - radial * y) * inverse)
+    _write(rows, G_MEAN + 2, (gz - radial * z) * inverse)
+
+
+@inner()
+def _share(sums, slots, at, field):
+    return v8.gather(sums, slots, at, U(SHARE), U(field))
+
+
+@inner()
+def _geometry_backward(
+    means, quats, scales, view, slots, picked, at, modes, records, sums, rows
+):  # fmt: skip
+    one, two = v8.splat(np.float32(1)), v8.splat(np.float32(2))
+    k = v8.splat(np.float32(0.5) * LOG2_E)
+    x, y, z = to_camera(from_eye(means, picked, at, view), view)
+    inverse = one / z
+    right, down, sizes, jx, jy, m = semi_axes(quats, scales, picked, at, x, y, inverse, view)
+    x0, x1, x2 = right
+    y0, y1, y2 = down
+    s0, s1, s2 = sizes
+    blur = v8.splat(view[V_BLUR])
+    xx, yy = dot(x0, x1, x2, x0, x1, x2), dot(y0, y1, y2, y0, y1, y2)
+    cxx, cyy = xx + blur, yy + blur
+    sharp = v8.gather(records, slots, at, U(RECORD), U(SHARP_X))
+    lean = v8.gather(records, slots, at, U(RECORD), U(LEAN_X))
+    along = k / (sharp * sharp)
+
+    # The conic: e = ... - sharp^2 (dx - lean dy)^2 - k / cyy dy^2, sharp^2 = k / along.
+    sum_0, sum_x = _share(sums, slots, at, S_0), _share(sums, slots, at, S_X)
+    inverse_cyy = one / cyy
+    g_along = _share(sums, slots, at, S_XX) / along
+    g_lean = two * sharp * _share(sums, slots, at, S_XY) * inverse_cyy
+    g_fall = k * inverse_cyy * inverse_cyy * _share(sums, slots, at, S_YY)
+    g_xx = g_along
+    g_xy = g_lean - two * lean * g_along
+    g_yy = lean * lean * g_along - lean * g_lean + g_fall
+    if modes[M_ANTIALIASED]:
+        # log2 of opacity holds half of log2(det / det_blurred), det = |x cross y|^2.
+        half = v8.splat(np.float32(0.5) * _INVERSE_LN2) * sum_0
+        c0, c1, c2 = x1 * y2 - x2 * y1, x2 * y0 - x0 * y2, x0 * y1 - x1 * y0
+        tiny = v8.splat(np.float32(1e-30))
+        inverse_det = half / v8.maximum(dot(c0, c1, c2, c0, c1, c2), tiny)
+        inverse_blurred = half / v8.maximum(along * cyy, tiny)
+        xy = lean * cyy
+        g_xx = g_xx + yy * inverse_det - cyy * inverse_blurred
+        g_yy = g_yy + xx * inverse_det - cxx * inverse_blurred
+        g_xy = g_xy + two * xy * (inverse_blurred - inverse_det)
+
+    g_px = two * sharp * sum_x
+    fall = k * inverse_cyy
+    g_py = two * (fall * _share(sums, slots, at, S_Y) - sharp * lean * sum_x)
+    abs_x = two * sharp * _share(sums, slots, at, S_ABS_X)
+    abs_y = two * _share(sums, slots, at, S_ABS_Y)
+    _write(rows, G_ABS, v8.sqrt(v8.fmuladd(abs_x, abs_x, abs_y * abs_y)))
+    _write(rows, G_RADIUS, v8.sqrt(v8.maximum(cxx, cyy)))
+    _write(rows, G_OPACITY, v8.splat(_INVERSE_LN2) * sum_0)
+
+    # Semi-axes: xx = sum x_j^2, xy = sum x_j y_j, yy = sum y_j^2.
+    two_xx, two_yy = two * g_xx, two * g_yy
+    a0, b0 = two_xx * x0 + g_xy * y0, g_xy * x0 + two_yy * y0
+    a1, b1 = two_xx * x1 + g_xy * y1, g_xy * x1 + two_yy * y1
+    a2, b2 = two_xx * x2 + g_xy * y2, g_xy * x2 + two_yy * y2
+    _write(rows, G_SCALE, a0 * x0 + b0 * y0)
+    _write(rows, G_SCALE + 1, a1 * x1 + b1 * y1)
+    _write(rows, G_SCALE + 2, a2 * x2 + b2 * y2)
+    a0, a1, a2, b0, b1, b2 = s0 * a0, s1 * a1, s2 * a2, s0 * b0, s1 * b1, s2 * b2
+    _write_quats(
+        quats, picked, at, rows,
+        (a0 * jx[0] + b0 * jy[0], a1 * jx[0] + b1 * jy[0], a2 * jx[0] + b2 * jy[0],
+         a0 * jx[1] + b0 * jy[1], a1 * jx[1] + b1 * jy[1], a2 * jx[1] + b2 * jy[1],
+         a0 * jx[2] + b0 * jy[2], a1 * jx[2] + b1 * jy[2], a2 * jx[2] + b2 * jy[2]),
+    )  # fmt: skip
+
+    # The Jacobian's rows jx = fx (r - u t) / z, jy = fy (s - v t) / z.
+    p0, p1, p2 = (
+        dot(a0, a1, a2, m[0], m[1], m[2]),
+        dot(a0, a1, a2, m[3], m[4], m[5]),
+        dot(a0, a1, a2, m[6], m[7], m[8]),
+    )
+    q0, q1, q2 = (
+        dot(b0, b1, b2, m[0], m[1], m[2]),
+        dot(b0, b1, b2, m[3], m[4], m[5]),
+        dot(b0, b1, b2, m[6], m[7], m[8]),
+    )
+    zero, t = v8.splat(np.float32(0)), rotation_row(view, U(2))
+    fx, fy = v8.splat(view[V_FOCAL]) * inverse, v8.splat(view[V_FOCAL + 1]) * inverse
+    u_low, u_high = v8.splat(view[V_LOW]), v8.splat(view[V_HIGH])
+    v_low, v_high = v8.splat(view[V_LOW + 1]), v8.splat(view[V_HIGH + 1])
+    raw_u, raw_v = x * inverse, y * inverse
+    free_u = v8.both(v8.at_least(raw_u, u_low), v8.at_least(u_high, raw_u))
+    free_v = v8.both(v8.at_least(raw_v, v_low), v8.at_least(v_high, raw_v))
+    g_u = v8.select(free_u, zero - fx * dot(p0, p1, p2, t[0], t[1], t[2]), zero)
+    g_v = v8.select(free_v, zero - fy * dot(q0, q1, q2, t[0], t[1], t[2]), zero)
+    g_x = (g_u + g_px * v8.splat(view[V_FOCAL])) * inverse
+    g_y = (g_v + g_py * v8.splat(view[V_FOCAL + 1])) * inverse
+    g_z = dot(p0, p1, p2, jx[0], jx[1], jx[2]) + dot(q0, q1, q2, jy[0], jy[1], jy[2])
+    g_z = _share(sums, slots, at, S_DEPTH) - g_z * inverse - g_x * raw_u - g_y * raw_v
+    for axis in range(3):
+        at_axis = U(_SLOPES + G_MEAN + axis) * U(LANES)
+        from_color = v8.load(rows, at_axis)
+        g = g_x * v8.splat(view[axis]) + g_y * v8.splat(view[3 + axis])
+        v8.store(rows, at_axis, from_color + v8.fmuladd(g_z, v8.splat(view[6 + axis]), g))
+
+
+@inner()
+def _write_quats(quats, picked, at, rows, g):
+    """dL by the unit quaternion from dL by its rotation matrix, row by row; radial part removed."""
+    two = v8.splat(np.float32(2))
+    w, x = v8.gather(quats, picked, at, U(4), U(0)), v8.gather(quats, picked, at, U(4), U(1))
+    y, z = v8.gather(quats, picked, at, U(4), U(2)), v8.gather(quats, picked, at, U(4), U(3))
+    g_w = two * (x * (g[7] - g[5]) + y * (g[2] - g[6]) + z * (g[3] - g[1]))
+    g_x = two * (
+        w * (g[7] - g[5]) + y * (g[1] + g[3]) + z * (g[2] + g[6]) - two * x * (g[4] + g[8])
+    )
+    g_y = two * (
+        w * (g[2] - g[6]) + x * (g[1] + g[3]) + z * (g[5] + g[7]) - two * y * (g[0] + g[8])
+    )
+    g_z = two * (
+        w * (g[3] - g[1]) + x * (g[2] + g[6]) + y * (g[5] + g[7]) - two * z * (g[0] + g[4])
+    )
+    radial = v8.fmuladd(g_w, w, dot(g_x, g_y, g_z, x, y, z))
+    _write(rows, G_QUAT, g_w - radial * w)
+    _write(rows, G_QUAT + 1, g_x - radial * x)
+    _write(rows, G_QUAT + 2, g_y - radial * y)
+    _write(rows, G_QUAT + 3, g_z - radial * z)

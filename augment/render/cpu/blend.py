@@ -1,0 +1,622 @@
+"""Numba kernels: blend every tile's splats front to back.
+
+Batch by batch of a tile's list, strip by strip, the items of cpu_items are blended in turn. Strips
+shrink to the rows in which a pixel still lets light through, and a tile ends where none does.
+
+Images that are not asked for are None, which the compiler turns into no code at all.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import prange
+
+from augment.render.constants import DEPTH_EPS
+from augment.render.cpu import simd as v8
+from augment.render.cpu.geometry import (
+    BATCH,
+    ITEMS,
+    L_BLUE,
+    L_GREEN,
+    L_RED,
+    LINES,
+    LIT,
+    SHARE,
+    SURFACE,
+    find_spans,
+    is_lit,
+    kept_share,
+    light_share,
+    list_items,
+    list_lines,
+    stage,
+    stage_cuts,
+    stage_lights,
+    surface_depth,
+)
+from augment.render.cpu.jit import inner, kernel
+from augment.render.cpu.simd import exp2
+from augment.render.layout import (
+    BIN_SHIFT,
+    BLOCK,
+    BLUE,
+    DEPTH,
+    GREEN,
+    IS_SNOW,
+    LANES,
+    PIXELS,
+    RECORD,
+    RED,
+    SHARP_X,
+    SPLAT_ID,
+    STRIP,
+    STRIPS,
+    TILE_H,
+    TILE_W,
+    U,
+)
+from augment.render.mode_depth import BETA_PER_SIGMA, FARTHER, GAMMA, NEARER
+
+# ---- Numba kernels: order splats by depth, and list them tile by tile in that order --------------
+# The projection has counted each block's splats by bins of z. Sorting moves them to their bins,
+# block
+# after block, then sorts every bin within the cache; both keep equal depths in index order.
+
+_DIGIT_BITS = BIN_SHIFT // 2  # what z bins leave to sort, in two passes
+_DIGITS = 1 << _DIGIT_BITS
+_FEW = 32  # splats sorted faster by insertion
+
+
+@kernel
+def scatter_to_bins(keys, found, first_bin, heads, binned_keys, binned_slots):
+    """Copy every block's keys, and the slots they stand for, to their bins.
+
+    keys: uint32 [B BLOCK], bits of z. found: int64 [B], how many each block has. heads: int64
+    [B, Z], where each block writes its splats of each bin; used up.
+    """
+    for block in prange(found.size):
+        for i in range(found[block]):
+            slot = block * BLOCK + i
+            key = keys[slot]
+            z_bin = np.int64(key >> np.uint32(BIN_SHIFT)) - first_bin
+            at = heads[block, z_bin]
+            heads[block, z_bin] = at + 1
+            binned_keys[at] = key
+            binned_slots[at] = slot
+
+
+@kernel
+def sort_bins(bin_starts, keys, slots, rects, spare_keys, spare_slots, sorted_rects):
+    """Sort every bin [bin_starts[z], bin_starts[z + 1]) by key; gather the splats' tiles alike."""
+    for z_bin in prange(bin_starts.size - 1):
+        first, last = bin_starts[z_bin], bin_starts[z_bin + 1]
+        if last - first <= _FEW:
+            _sort_few(keys, slots, first, last)
+        else:
+            heads = np.empty(_DIGITS, np.int64)
+            _sort_digit(keys, slots, spare_keys, spare_slots, first, last, 0, heads)
+            _sort_digit(spare_keys, spare_slots, keys, slots, first, last, _DIGIT_BITS, heads)
+        for i in range(U(first), U(last)):
+            sorted_rects[i] = rects[U(slots[i])]
+
+
+@inner()
+def _sort_few(keys, slots, first, last):
+    for i in range(first + 1, last):
+        key, slot = keys[i], slots[i]
+        j = i
+        while j > first and keys[j - 1] > key:
+            keys[j], slots[j] = keys[j - 1], slots[j - 1]
+            j -= 1
+        keys[j], slots[j] = key, slot
+
+
+@inner()
+def _sort_digit(keys, slots, to_keys, to_slots, first, last, shift, heads):
+    """One stable counting sort by a digit of the key."""
+    mask = U(_DIGITS - 1)
+    for digit in range(_DIGITS):
+        heads[digit] = 0
+    for i in range(U(first), U(last)):
+        heads[(U(keys[i]) >> U(shift)) & mask] += 1
+    at = first
+    for digit in range(_DIGITS):
+        count = heads[digit]
+        heads[digit] = at
+        at += count
+    for i in range(U(first), U(last)):
+        digit = (U(keys[i]) >> U(shift)) & mask
+        at = heads[digit]
+        heads[digit] = at + 1
+        to_keys[U(at)] = keys[i]
+        to_slots[U(at)] = slots[i]
+
+
+@inner()
+def _unpack(rect):
+    """First column and row, last column and row of a splat's tiles."""
+    mask = U(0xFFFF)
+    return rect & mask, (rect >> U(16)) & mask, (rect >> U(32)) & mask, rect >> U(48)
+
+
+@kernel
+def count_corners(sorted_rects, first, last, columns, corners):
+    """Where rectangles of tiles begin and end: +1 and -1 at the corners of each.
+
+    corners: int32 [C, (rows + 1) (columns + 1)], each of C runs of splats its own; summed over
+    itself from the top left it says how many splats touch each tile.
+    """
+    runs = corners.shape[0]
+    width = U(columns + 1)
+    for run in prange(runs):
+        for i in range(corners.shape[1]):
+            corners[run, i] = 0
+        own = corners[run]
+        start = first + (last - first) * run // runs
+        for i in range(U(start), U(first + (last - first) * (run + 1) // runs)):
+            c0, r0, c1, r1 = _unpack(sorted_rects[i])
+            top, bottom = r0 * width, (r1 + U(1)) * width
+            own[top + c0] += 1
+            own[top + c1 + U(1)] -= 1
+            own[bottom + c0] -= 1
+            own[bottom + c1 + U(1)] += 1
+
+
+@kernel
+def fill_lists(slots, sorted_rects, first, last, columns, heads, members, bands):
+    """Slots of every open tile's splats, nearest first. Bands of rows share the work.
+
+    heads: int64 [tiles], where each tile's list begins; negative where it has none; used up.
+    A thread looks at every splat but writes its own tiles only, so lists stay in order and in its
+    cache.
+    """
+    rows = heads.size // columns
+    for band in prange(bands):
+        top, bottom = rows * band // bands, rows * (band + 1) // bands - 1
+        for i in range(U(first), U(last)):
+            c0, r0, c1, r1 = _unpack(sorted_rects[i])
+            for row in range(max(r0, U(top)), min(r1, U(bottom)) + U(1)):
+                base = row * U(columns)
+                for tile in range(base + c0, base + c1 + U(1)):
+                    at = heads[tile]
+                    if at >= 0:
+                        members[U(at)] = slots[i]
+                        heads[tile] = at + 1
+
+
+# ---- Numba functions: mode depth, eight pixels at a time (see augment.render.mode_depth) ---------
+# Sums are kept times the cluster's weight, so that a sample that joins costs no division and no
+# root.
+
+# Planes of a tile, from where the caller says: of the running cluster the depth it began with and
+# the sums of w, w (z - first), w (z - first)^2; of the heaviest one its weight and mode.
+FIRST, MASS, MOMENT, SQUARE, HEAVIEST, MODE = (U(i * PIXELS) for i in range(6))
+MODE_PLANES = 6
+
+_FARTHER, _NEARER = np.float32(FARTHER), np.float32(NEARER)
+_FARTHER_2 = np.float32((FARTHER * BETA_PER_SIGMA) ** 2)
+_NEARER_2 = np.float32((NEARER * BETA_PER_SIGMA) ** 2)
+_BACK = np.float32(GAMMA * BETA_PER_SIGMA)
+# What rounding may add to a sum of weights; far more than it does.
+_SLACK = np.float32(1e-4)
+
+
+@inner()
+def add_sample(state, at, depth, weight, floor):
+    """Eight pixels' next samples. state, at: their place in the plane FIRST."""
+    zero, none = v8.splat(np.float32(0)), v8.splat(np.float32(-1))
+    first, mass = v8.load(state, at + FIRST), v8.load(state, at + MASS)
+    moment, square = v8.load(state, at + MOMENT), v8.load(state, at + SQUARE)
+    off = depth - first
+    aside = v8.fmuladd(off, mass, v8.negate(moment))  # mass (z - mean)
+    spread = _spread(mass, moment, square)
+    is_farther = v8.at_least(aside, zero)
+    reach = v8.select(is_farther, v8.splat(_FARTHER), v8.splat(_NEARER))
+    reach_2 = v8.select(is_farther, v8.splat(_FARTHER_2), v8.splat(_NEARER_2))
+    by_floor = v8.splat(floor) * reach * mass - v8.absolute(aside)
+    by_spread = v8.fmuladd(reach_2, spread, v8.negate(aside * aside))
+    joins = v8.greater(v8.maximum(by_floor, by_spread), zero)
+    begins = v8.select(joins, none, v8.select(v8.greater(weight, zero), zero, none))
+    if v8.any_not_negative(begins):
+        is_new = v8.at_least(begins, zero)
+        best = v8.load(state, at + HEAVIEST)
+        heavier = v8.both(is_new, v8.greater(mass, best))
+        mode = v8.select(heavier, _mode(first, mass, moment, spread), v8.load(state, at + MODE))
+        v8.store(state, at + HEAVIEST, v8.select(heavier, mass, best))
+        v8.store(state, at + MODE, mode)
+        v8.store(state, at + FIRST, v8.select(is_new, depth, first))
+        off, mass = v8.select(is_new, zero, off), v8.select(is_new, zero, mass)
+        moment, square = v8.select(is_new, zero, moment), v8.select(is_new, zero, square)
+    weighted = weight * off
+    v8.store(state, at + MASS, mass + weight)
+    v8.store(state, at + MOMENT, moment + weighted)
+    v8.store(state, at + SQUARE, v8.fmuladd(weighted, off, square))
+
+
+@inner()
+def can_grow(state, at, through):
+    """Not negative where the running cluster may still become the heaviest, or is it.
+
+    through: what light is left, negative where blending has stopped.
+    """
+    none = v8.splat(np.float32(-1))
+    mass, best = v8.load(state, at + MASS), v8.load(state, at + HEAVIEST)
+    most = mass + through + v8.splat(_SLACK) - best
+    return v8.select(v8.greater(through, v8.splat(np.float32(0))), most, none)
+
+
+@inner()
+def close_clusters(state, start):
+    """The last cluster is compared too: leaves the result in the plane MODE."""
+    for i in range(U(0), U(PIXELS), U(LANES)):
+        at = U(start) + i
+        first, mass = v8.load(state, at + FIRST), v8.load(state, at + MASS)
+        moment, square = v8.load(state, at + MOMENT), v8.load(state, at + SQUARE)
+        mode = _mode(first, mass, moment, _spread(mass, moment, square))
+        heavier = v8.greater(mass, v8.load(state, at + HEAVIEST))
+        v8.store(state, at + MODE, v8.select(heavier, mode, v8.load(state, at + MODE)))
+
+
+@inner()
+def _spread(mass, moment, square):
+    """mass^2 times the variance."""
+    spread = v8.fmuladd(mass, square, v8.negate(moment * moment))
+    return v8.maximum(spread, v8.splat(np.float32(0)))
+
+
+@inner()
+def _mode(first, mass, moment, spread):
+    return first + (moment - v8.splat(_BACK) * v8.sqrt(spread)) / mass
+
+
+# ---- cpu blend -----------------------------------------------------------------------------------
+
+GROUP = 8  # tiles a thread takes at a time
+
+# Planes of a tile's state, PIXELS float32 each, strip after strip, row after row. The transmittance
+# is negative where blending has stopped; its size is then the final one. An image needs its plane
+# and all before, so those that cost most come last.
+THROUGH, P_RED, P_GREEN, P_BLUE, P_SNOW = (U(i * PIXELS) for i in range(5))
+P_DEPTH, P_MEDIAN, P_BEST, P_ID, P_MODE = (U(i * PIXELS) for i in range(5, 10))
+COLOR_STATE, SNOW_STATE, MODELESS_STATE = 4 * PIXELS, 5 * PIXELS, 9 * PIXELS
+STATE = MODELESS_STATE + MODE_PLANES * PIXELS
+
+CLOSED, OPEN, FRESH = 0, 1, 2  # a tile: finished, begun, not begun
+
+
+@kernel
+def blend_tiles(
+    records,
+    members,
+    starts,
+    tiles,
+    states,
+    is_last,
+    size,
+    limits,
+    rgb,
+    alpha,
+    expected,
+    median,
+    ids,
+    mode,
+    snow,
+    cuts,
+    lights,
+):
+    """Blend one slice of z into every open tile; write the pixels of those that end.
+
+    records: flat float32. members, starts: lists of slots. tiles: uint8 [tiles], CLOSED, OPEN or
+    FRESH, updated. states: float32 [tiles * used part of STATE], where open tiles wait for the
+    next slice. size: image width and height. limits: float32, alpha_max, log2(ALPHA_MIN), what a
+    splat must leave more of than this to be blended, 1 where rays are parallel, mode depth's floor,
+    1/fx^2, 1/fy^2, the transmittance at which a pixel is finished. rgb to snow: flat images; all
+    but alpha may be None. cuts, lights: flat, of each slot as cpu_clip and cpu_shading have them,
+    or None.
+    """
+    columns = (size[0] + TILE_W - 1) // TILE_W
+    used = states.size // tiles.size
+    for group in prange((tiles.size + GROUP - 1) // GROUP):
+        state = np.empty(STATE, np.float32)
+        staged = np.empty(RECORD * BATCH, np.float32)
+        spans = np.empty(2 * BATCH, np.int32)
+        values = np.empty(2 * ITEMS, np.float32)
+        places = np.empty(2 * ITEMS, np.int32)
+        lines = np.empty(LINES, np.float32)
+        edges = np.empty(ITEMS, np.float32)
+        surfaces = np.empty(ITEMS, np.float32)
+        lit = np.empty(LIT, np.float32)
+        rows = np.empty(2 * STRIPS, np.int64)
+        for tile in range(group * GROUP, min((group + 1) * GROUP, tiles.size)):
+            first, last = starts[tile], starts[tile + 1]
+            if tiles[tile] == CLOSED or (first == last and not is_last):
+                continue
+            left, top = tile % columns * TILE_W, tile // columns * TILE_H
+            if tiles[tile] == FRESH:
+                _clear(state, used, size[0] - left, size[1] - top)
+            else:
+                _copy(states, U(tile * used), state, U(0), U(used))
+            is_open = _blend_list(
+                records, members, first, last, np.float32(left), np.float32(top), limits,
+                state, staged, spans, values, places, rows, rgb, expected, median, ids, mode, snow,
+                cuts, lines, edges, surfaces, lights, lit,
+            )  # fmt: skip
+            if is_open and not is_last:
+                _copy(state, U(0), states, U(tile * used), U(used))
+                tiles[tile] = OPEN
+            else:
+                if mode is not None:
+                    close_clusters(state, P_MODE)
+                _write_pixels(state, left, top, size, rgb, alpha, expected, median, ids, mode, snow)
+                tiles[tile] = CLOSED
+
+
+@inner()
+def _copy(source, source_at, target, target_at, count):
+    for i in range(U(0), count, U(LANES)):
+        v8.store(target, target_at + i, v8.load(source, source_at + i))
+
+
+@inner()
+def _clear(state, used, width, height):
+    """A tile before the first splat; pixels beyond the image count as finished."""
+    nobody = np.int32(-1).view(np.float32)
+    for i in range(U(0), U(used), U(LANES)):
+        value = np.float32(1) if i < P_RED else np.float32(0)
+        value = nobody if P_ID <= i < P_MODE else value
+        v8.store(state, i, v8.splat(value))
+    if width < TILE_W or height < TILE_H:
+        for pixel in range(PIXELS):
+            x = pixel // STRIP * LANES + pixel % LANES
+            y = pixel % STRIP // LANES
+            if x >= width or y >= height:
+                state[pixel] = np.float32(-1)
+
+
+@inner()
+def _blend_list(
+    records,
+    members,
+    first,
+    last,
+    left,
+    top,
+    limits,
+    state,
+    staged,
+    spans,
+    values,
+    places,
+    rows,
+    rgb,
+    expected,
+    median,
+    ids,
+    mode,
+    snow,
+    cuts,
+    lines,
+    edges,
+    surfaces,
+    lights,
+    lit,
+):
+    """Blend a tile's list into its state. Returns whether any pixel still lets light through."""
+    for strip in range(STRIPS):
+        rows[2 * strip], rows[2 * strip + 1] = 0, TILE_H
+        shrink(state, strip, rows)
+    for at in range(first, last, BATCH):
+        if is_closed(rows):
+            return False
+        count = min(BATCH, last - at)
+        for k in range(U(at + count), U(min(at + 2 * BATCH, last))):
+            v8.prefetch(records, U(members[k]) * U(RECORD))
+        stage(
+            records, members, U(at), U(count), left, top, rgb, expected, median, ids, mode, snow,
+            staged,
+        )  # fmt: skip
+        if lights is not None and rgb is not None:
+            stage_lights(lights, members, U(at), U(count), lit)
+        any_cut = False
+        if cuts is not None:
+            any_cut = stage_cuts(cuts, members, U(at), U(count), staged, expected, mode, lines)
+        for strip in range(STRIPS):
+            if rows[2 * strip] >= rows[2 * strip + 1]:
+                continue
+            find_spans(staged, U(count), strip, rows, limits[1], spans)
+            items = list_items(staged, U(count), strip, spans, values, places)
+            if items == U(0):
+                continue
+            if cuts is not None and (expected is not None or mode is not None):
+                list_lines(lines, SURFACE, U(count), strip, spans, surfaces)
+            if cuts is not None and any_cut:
+                list_lines(lines, SHARE, U(count), strip, spans, edges)
+                _blend_items(
+                    state, staged, values, places, items, limits, rgb, expected, median, ids, mode,
+                    snow, cuts, lines, edges, surfaces, lights, lit,
+                )  # fmt: skip
+            elif (median is not None or ids is not None or mode is not None) and _can_change(
+                state, strip, rows, median, ids, mode
+            ):
+                _blend_items(
+                    state, staged, values, places, items, limits, rgb, expected, median, ids, mode,
+                    snow, cuts, lines, None, surfaces, lights, lit,
+                )  # fmt: skip
+            else:
+                _blend_items(
+                    state, staged, values, places, items, limits, rgb, expected, None, None, None,
+                    snow, cuts, lines, None, surfaces, lights, lit,
+                )  # fmt: skip
+            shrink(state, strip, rows)
+    return not is_closed(rows)
+
+
+@inner()
+def _can_change(state, strip, rows, median, ids, mode):
+    """Whether a pixel of the strip may still find its median depth or a heavier splat or cluster.
+
+    It finds none once its transmittance has fallen below one half and the best weight so far,
+    which most pixels reach early: the rest of the list costs them no more than colour does.
+    """
+    most = v8.splat(np.float32(-1))
+    for row in range(rows[2 * strip], rows[2 * strip + 1]):
+        at = U(strip * STRIP + row * LANES)
+        through = v8.load(state, at)
+        if median is not None:
+            most = v8.maximum(most, through - v8.splat(np.float32(0.5)))
+        if ids is not None:
+            most = v8.maximum(most, through - v8.load(state, at + P_BEST))
+        if mode is not None:
+            most = v8.maximum(most, can_grow(state, at + P_MODE, through))
+    return v8.any_not_negative(most)
+
+
+@inner()
+def is_closed(rows):
+    closed = True
+    for strip in range(STRIPS):
+        closed = closed and rows[2 * strip] >= rows[2 * strip + 1]
+    return closed
+
+
+@inner()
+def shrink(state, strip, rows):
+    """Leave out a strip's first and last rows while no pixel of them is open."""
+    low, high = rows[2 * strip], rows[2 * strip + 1]
+    base = strip * STRIP
+    while low < high and not v8.any_not_negative(v8.load(state, U(base + low * LANES))):
+        low += 1
+    while low < high and not v8.any_not_negative(v8.load(state, U(base + (high - 1) * LANES))):
+        high -= 1
+    rows[2 * strip], rows[2 * strip + 1] = low, high
+
+
+@inner()
+def _blend_items(
+    state,
+    staged,
+    values,
+    places,
+    items,
+    limits,
+    rgb,
+    expected,
+    median,
+    ids,
+    mode,
+    snow,
+    cuts,
+    lines,
+    edges,
+    surfaces,
+    lights,
+    lit,
+):
+    """Blend all items in turn. The next one's alpha is begun before this one is blended.
+
+    edges: None where no splat is cut.
+    """
+    alpha_max, log_cut = v8.splat(limits[0]), v8.splat(limits[1])
+    least, end = v8.splat(limits[2]), v8.splat(limits[7])
+    zero, half = v8.splat(np.float32(0)), v8.splat(np.float32(0.5))
+    n = U(BATCH)
+    places[items] = 0  # one item is read beyond the last
+    splat = U(places[0])
+    alpha = alpha_of(staged, values, splat, U(0), alpha_max, log_cut)
+    if edges is not None:
+        alpha = alpha * kept_share(lines, edges, splat, U(0))
+    for item in range(items):
+        following = U(places[item + U(1)])
+        next_alpha = alpha_of(staged, values, following, item + U(1), alpha_max, log_cut)
+        if edges is not None:
+            next_alpha = next_alpha * kept_share(lines, edges, following, item + U(1))
+        at = U(places[item + U(ITEMS)])
+        through = v8.load(state, at)
+        weight = alpha * through
+        after = through - weight
+        kept = v8.greater(after, least)
+        weight = v8.select(kept, weight, zero)
+        v8.store(state, at, light_left(through, after, kept, end))
+        if rgb is not None:
+            _add(state, at + P_RED, weight, staged[U(RED) * n + splat])
+            _add(state, at + P_GREEN, weight, staged[U(GREEN) * n + splat])
+            _add(state, at + P_BLUE, weight, staged[U(BLUE) * n + splat])
+        if rgb is not None and lights is not None and is_lit(lit, splat):
+            share = weight * light_share(lit, staged, values, splat, item, at, limits)
+            _add(state, at + P_RED, share, lit[U(L_RED) * n + splat])
+            _add(state, at + P_GREEN, share, lit[U(L_GREEN) * n + splat])
+            _add(state, at + P_BLUE, share, lit[U(L_BLUE) * n + splat])
+        if snow is not None:
+            _add(state, at + P_SNOW, weight, staged[U(IS_SNOW) * n + splat])
+        if expected is not None or mode is not None:
+            centre = staged[U(DEPTH) * n + splat]
+            depth = v8.splat(centre)
+            if cuts is not None:
+                depth = surface_depth(lines, surfaces, splat, item, centre, limits[3])
+            if expected is not None:
+                sums = v8.fmuladd(weight, depth, v8.load(state, at + P_DEPTH))
+                v8.store(state, at + P_DEPTH, sums)
+            if mode is not None:
+                add_sample(state, at + P_MODE, depth, weight, limits[4])
+        if median is not None:
+            crossed = v8.both(v8.at_least(through, half), v8.greater(half, after))
+            depth = v8.splat(staged[U(DEPTH) * n + splat])
+            before = v8.load(state, at + P_MEDIAN)
+            v8.store(state, at + P_MEDIAN, v8.select(v8.both(crossed, kept), depth, before))
+        if ids is not None:
+            best = v8.load(state, at + P_BEST)
+            heavier = v8.greater(weight, best)
+            v8.store(state, at + P_BEST, v8.select(heavier, weight, best))
+            number = v8.splat(staged[U(SPLAT_ID) * n + splat])
+            v8.store(state, at + P_ID, v8.select(heavier, number, v8.load(state, at + P_ID)))
+        alpha, splat = next_alpha, following
+
+
+@inner()
+def alpha_of(staged, values, splat, item, alpha_max, log_cut):
+    sharp = v8.splat(staged[U(SHARP_X) * U(BATCH) + splat])
+    off = v8.fmuladd(sharp, v8.lane_numbers(), v8.splat(values[item + U(ITEMS)]))
+    e = v8.fmuladd(v8.negate(off), off, v8.splat(values[item]))
+    alpha = v8.minimum(exp2(e), alpha_max)
+    return v8.select(v8.at_least(e, log_cut), alpha, v8.splat(np.float32(0)))
+
+
+@inner()
+def light_left(through, after, kept, end):
+    """Transmittance behind a splat, negative where the pixel is finished. kept: it is blended."""
+    final = v8.minus_abs(v8.select(kept, after, through))
+    return v8.select(v8.greater(after, end), after, final)
+
+
+@inner()
+def _add(state, at, weight, value):
+    v8.store(state, at, v8.fmuladd(weight, v8.splat(value), v8.load(state, at)))
+
+
+@inner()
+def _write_pixels(state, left, top, size, rgb, alpha, expected, median, ids, mode, snow):
+    """Pixels of a finished tile to the images, which are flat."""
+    for y in range(U(min(TILE_H, size[1] - top))):
+        for strip in range(U(STRIPS)):
+            at = strip * U(STRIP) + y * U(LANES)
+            column = left + np.int64(strip) * LANES
+            pixel = U((top + np.int64(y)) * size[0] + column)
+            for lane in range(U(max(min(LANES, size[0] - column), 0))):
+                opacity = np.float32(1) - abs(state[at + lane])
+                alpha[pixel + lane] = opacity
+                if rgb is not None:
+                    first = U(3) * (pixel + lane)
+                    rgb[first] = state[at + lane + P_RED]
+                    rgb[first + U(1)] = state[at + lane + P_GREEN]
+                    rgb[first + U(2)] = state[at + lane + P_BLUE]
+                if expected is not None:
+                    weighted = state[at + lane + P_DEPTH]
+                    expected[pixel + lane] = weighted / max(opacity, np.float32(DEPTH_EPS))
+                if median is not None:
+                    median[pixel + lane] = state[at + lane + P_MEDIAN]
+                if ids is not None:
+                    ids[pixel + lane] = np.float32(state[at + lane + P_ID]).view(np.int32)
+                if mode is not None:
+                    mode[pixel + lane] = state[at + lane + P_MODE + MODE]
+                if snow is not None:
+                    snow[pixel + lane] = state[at + lane + P_SNOW]

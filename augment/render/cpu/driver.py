@@ -1,0 +1,519 @@
+"""The CPU rasteriser: arrays for the numba kernels, and the order in which they run.
+
+    rank      z and a generous box of every Gaussian                      (cpu_project)
+    then slice by slice along z, until no tile is open:
+      project   record, tiles and colour of the slice's splats            (cpu_project, cpu_color)
+      sort      by z, ties by index
+      bin       splats of every open tile, in that order                  (cpu_bin)
+      raster    blend them; close the tiles that nothing shines through   (cpu_blend)
+
+Slices change no bit of the image: what they leave out lies behind closed tiles.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import time
+from collections import deque
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from augment.cameras import Camera
+from augment.effects.smog import SmogMedium
+from augment.geometry import any_in_squares
+from augment.render import layout
+from augment.render.buffers import (
+    ALPHA,
+    BUFFERS,
+    MEDIAN_DEPTH,
+    MODE_DEPTH,
+    RGB,
+    SNOW,
+    SPLAT_IDS,
+    RenderOutput,
+)
+from augment.render.constants import ALPHA_MIN, TRANSMITTANCE_STOP, RasterSettings
+from augment.render.cpu import blend as cpu_bin
+from augment.render.cpu import blend as cpu_blend
+from augment.render.cpu import geometry as cpu_clip
+from augment.render.cpu import geometry as cpu_shading
+from augment.render.cpu import project as cpu_project
+from augment.render.layout import HeightClip
+from augment.render.part_views import raster_modes, views_of
+from augment.render.threads import kernel_threads, thread_count
+from augment.scene import Gaussians, PosedGaussians
+
+# ---- What the CPU kernels read: scene parts by address, and the numbers of a view ----------------
+
+
+@dataclass(frozen=True, eq=False)
+class Inputs:
+    """All parts for one launch: nothing is concatenated, and actors cost no launch of their own.
+
+    addresses, sizes, first_ids, views, blocks: see cpu_project. modes: see layout. arrays: what the
+    addresses point to, kept alive by this.
+    """
+
+    addresses: np.ndarray
+    sizes: np.ndarray
+    first_ids: np.ndarray
+    views: np.ndarray
+    blocks: np.ndarray
+    modes: np.ndarray
+    arrays: list[np.ndarray]
+
+    @property
+    def slots(self) -> int:
+        """Room for every Gaussian, block by block."""
+        return len(self.blocks) * layout.BLOCK
+
+
+def gather_inputs(
+    parts: Sequence[PosedGaussians],
+    camera: Camera,
+    settings: RasterSettings,
+    smog: SmogMedium | None,
+    clip: HeightClip | None = None,
+    *,
+    with_color: bool,
+) -> Inputs:
+    """Addresses and numbers of all parts; their tensors are not copied if they are contiguous."""
+    arrays, addresses, sizes, blocks = [], [], [], []
+    for number, part in enumerate(parts):
+        g, count = part.gaussians, len(part.gaussians)
+        tensors = (g.means, g.quats, g.scales, g.opacities, g.sh)
+        own = [t.detach().to(torch.float32).contiguous().numpy() for t in tensors]
+        own += [_slopes(part), *_color_maps(part)]
+        arrays += own
+        addresses.append([array.ctypes.data for array in own])
+        sizes.append([count, g.sh.shape[1]])
+        starts = range(0, count, layout.BLOCK)
+        blocks += [(number, start, min(start + layout.BLOCK, count)) for start in starts]
+    counts = [size[0] for size in sizes]
+    modes = raster_modes(settings, smog, clip, with_color=with_color)
+    modes[layout.M_LIGHT] = with_color and any(part.shading is not None for part in parts)
+    return Inputs(
+        addresses=np.array(addresses, np.uint64).reshape(-1, layout.ADDRESSES),
+        sizes=np.array(sizes, np.int64).reshape(-1, 2),
+        first_ids=np.cumsum([0, *counts[:-1]], dtype=np.int64),
+        views=views_of(parts, camera, settings, smog, clip),
+        blocks=np.array(blocks, np.int64).reshape(-1, 3),
+        modes=modes,
+        arrays=arrays,
+    )
+
+
+def _slopes(part: PosedGaussians) -> np.ndarray:
+    """float32 [N, 3], or [1] for parts of splats of one colour."""
+    if part.shading is None:
+        return np.zeros(1, np.float32)
+    return part.shading.slopes.detach().to(torch.float32).contiguous().numpy()
+
+
+def _color_maps(part: PosedGaussians) -> tuple[np.ndarray, np.ndarray]:
+    """Float32 [C, 3, 4] and int16 [N], or [1] of what is not read."""
+    maps, rows = np.zeros(1, np.float32), np.zeros(1, np.int16)
+    if part.color_maps is not None:
+        maps = part.color_maps.detach().to(torch.float32).contiguous().numpy()
+    if part.map_rows is not None:
+        rows = part.map_rows.contiguous().numpy()
+    return maps, rows
+
+
+# ------------------------------------------------------------------------------------------------
+# Work space of the CPU rasteriser, kept between frames: fresh pages cost as much as the work
+# Every render takes a space of its own, so threads that render at once never share one.
+
+_LINE = 64  # bytes of a cache line
+_KEPT = 2  # spaces kept for later renders; a process rarely renders in more threads
+_SPACES: deque[Scratch] = deque(maxlen=_KEPT)  # append and pop are atomic
+
+
+class Scratch:
+    """Named arrays that keep their memory; each grows to the largest size asked for."""
+
+    def __init__(self) -> None:
+        self._buffers: dict[str, np.ndarray] = {}
+
+    def array(self, name: str, shape: tuple[int, ...], dtype: type) -> np.ndarray:
+        """An array that starts at a cache line, with whatever the last render left in it."""
+        count = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
+        buffer = self._buffers.get(name)
+        if buffer is None or buffer.nbytes < count:
+            raw = np.empty(count + count // 8 + _LINE, np.uint8)  # some room for the next frame
+            start = -raw.ctypes.data % _LINE
+            buffer = self._buffers[name] = raw[start:]
+        return buffer[:count].view(dtype).reshape(shape)
+
+    @property
+    def nbytes(self) -> int:
+        return sum(buffer.nbytes for buffer in self._buffers.values())
+
+
+@contextmanager
+def borrowed_scratch() -> Iterator[Scratch]:
+    """A space for one render, handed back afterwards."""
+    try:
+        scratch = _SPACES.pop()
+    except IndexError:
+        scratch = Scratch()
+    try:
+        yield scratch
+    finally:
+        _SPACES.append(scratch)
+
+
+def release_scratch() -> None:
+    """Give all kept memory back; the next render takes it anew."""
+    _SPACES.clear()
+
+
+# ---- cpu -----------------------------------------------------------------------------------------
+
+_RANK_RUNS = 8  # pieces of work in ranking, each with its own histogram
+# A slice ends where the splats before it would cover every pixel this many times over with opacity
+# 1: by then, and each time that doubles, most tiles of a dense scene have closed.
+_SLICE_COVER = 10.0
+_SLICE_GROWTH = 1.4
+_SMALLEST_SLICE = 20_000  # fewer splats cost less than another slice does
+_MAX_PAIRS = 1 << 24  # (splat, tile) pairs listed at once: 64 MB
+
+
+def rasterize_cpu(
+    parts: Sequence[PosedGaussians],
+    camera: Camera,
+    buffers: frozenset[str],
+    settings: RasterSettings,
+    smog: SmogMedium | None,
+    clip: HeightClip | None = None,
+    wanted: np.ndarray | None = None,
+    *,
+    stage_times: dict[str, float] | None = None,
+) -> RenderOutput:
+    """The image of the parts in float32, without gradients. Arguments are checked by `rasterize`.
+
+    wanted: bool [H, W]; tiles without a wanted pixel are left out and hold zeros.
+
+    The same bits on any number of threads, whichever buffers are asked for. stage_times: seconds of
+    "project", "sort", "bin" and "raster" and the counts "visible" (splats that touch a tile which
+    nearer ones have not closed) and "pairs" (of splats and such tiles) are added to it.
+    """
+    clock = Clock(stage_times)
+    inputs = gather_inputs(parts, camera, settings, smog, clip, with_color=RGB in buffers)
+    images = image_arrays(camera, buffers)
+    with borrowed_scratch() as scratch, kernel_threads():
+        tiles = Tiles(camera, images, settings, scratch)
+        if wanted is not None:
+            tiles.leave_out(wanted)
+        depths, edges = rank(inputs, camera, scratch)
+        for bins in itertools.pairwise(edges):
+            splats = project(inputs, depths, bins, tiles, scratch)
+            clock.lap("project")
+            slots, rects = sort(splats, bins[0], scratch)
+            clock.lap("sort")
+            clock.count("visible", len(slots))
+            tiles.blend(splats, slots, rects, is_last=bins[1] == edges[-1], clock=clock)
+            if not tiles.open.any():
+                break
+    return RenderOutput(**{name: torch.from_numpy(image) for name, image in images.items()})
+
+
+class Clock:
+    """Adds the time between laps, and counts, to the caller's dictionary."""
+
+    def __init__(self, times: dict[str, float] | None) -> None:
+        self._times = {} if times is None else times
+        for name in ("project", "sort", "bin", "raster", "visible", "pairs"):
+            self._times.setdefault(name, 0.0)
+        self._last = time.perf_counter()
+
+    def lap(self, name: str) -> None:
+        now = time.perf_counter()
+        self._times[name] = self._times.get(name, 0.0) + now - self._last
+        self._last = now
+
+    def count(self, name: str, number: int) -> None:
+        self._times[name] += number
+
+
+def image_arrays(camera: Camera, buffers: frozenset[str]) -> dict[str, np.ndarray]:
+    size = (camera.height, camera.width)
+    shapes = {RGB: (*size, 3)}
+    dtypes = {SPLAT_IDS: np.int32}
+    return {
+        name: np.empty(shapes.get(name, size), dtypes.get(name, np.float32)) for name in buffers
+    }
+
+
+def rank(inputs: Inputs, camera: Camera, scratch: Scratch) -> tuple[np.ndarray, list[int]]:
+    """z of all Gaussians (0: cannot be seen), and where the slices begin and end, in bins of z."""
+    depths = scratch.array("depths", (inputs.slots,), np.float32)
+    histograms = scratch.array("histograms", (_RANK_RUNS, 2, layout.BINS), np.float64)
+    cpu_project.rank_splats(
+        inputs.addresses, inputs.sizes, inputs.views, inputs.blocks, depths, histograms
+    )
+    cover, counts = histograms.sum(0)
+    return depths, _slice_edges(cover / (camera.width * camera.height), counts)
+
+
+def _slice_edges(cover: np.ndarray, counts: np.ndarray) -> list[int]:
+    """First bin of every slice, and the end of the last. cover, counts: of each bin of z.
+
+    Bin 0 is not among them: there stand the Gaussians that cannot be seen.
+    """
+    filled = np.flatnonzero(counts[1:]) + 1
+    if len(filled) == 0:
+        return [1, 2]
+    edges, end = [int(filled[0])], int(filled[-1]) + 1
+    cover, counts = cover.cumsum(), counts.cumsum()
+    target, taken = _SLICE_COVER, 0.0
+    while target < cover[-1]:
+        edge = int(np.searchsorted(cover, target)) + 1
+        if counts[-1] - counts[edge - 1] < _SMALLEST_SLICE:
+            break
+        if counts[edge - 1] - taken >= _SMALLEST_SLICE:
+            edges.append(edge)
+            taken = counts[edge - 1]
+        target *= _SLICE_GROWTH
+    return [*edges, end]
+
+
+@dataclass(frozen=True, eq=False)
+class Splats:
+    """What project_slice wrote."""
+
+    records: np.ndarray
+    rects: np.ndarray
+    keys: np.ndarray
+    found: np.ndarray
+    counts: np.ndarray
+    cuts: np.ndarray | None
+    lights: np.ndarray | None
+
+
+def project(
+    inputs: Inputs,
+    depths: np.ndarray,
+    bins: tuple[int, int],
+    tiles: Tiles,
+    scratch: Scratch,
+) -> Splats:
+    blocks = len(inputs.blocks)
+    is_cut = bool(inputs.modes[layout.M_CLIP])
+    cuts = scratch.array("cuts", (cpu_clip.CUT * (inputs.slots if is_cut else 1),), np.float32)
+    is_lit = bool(inputs.modes[layout.M_LIGHT])
+    lights = (cpu_shading.CPU_SHADING_LINES * (inputs.slots if is_lit else 1),)
+    lights = scratch.array("lights", lights, np.float32)
+    splats = Splats(
+        scratch.array("records", (inputs.slots * layout.RECORD,), np.float32),
+        scratch.array("rects", (inputs.slots,), np.uint64),
+        scratch.array("keys", (inputs.slots,), np.uint32),
+        scratch.array("found", (blocks,), np.int64),
+        scratch.array("bin_counts", (blocks, bins[1] - bins[0]), np.int32),
+        cuts if is_cut else None,
+        lights if is_lit else None,
+    )
+    cpu_project.project_slice(
+        inputs.addresses,
+        inputs.sizes,
+        inputs.views,
+        inputs.blocks,
+        inputs.first_ids,
+        depths.view(np.uint32),
+        np.array(bins, np.int64),
+        tiles.open_sums(),
+        inputs.modes,
+        splats.records,
+        splats.rects,
+        splats.keys,
+        splats.found,
+        splats.counts,
+        cuts,
+        lights,
+    )
+    return splats
+
+
+def sort(splats: Splats, first_bin: int, scratch: Scratch) -> tuple[np.ndarray, np.ndarray]:
+    """Slots nearest first (ties in index order), and their tiles in that order."""
+    # Bin after bin, and in each of them block after block.
+    starts = np.append(0, splats.counts.sum(0, dtype=np.int64).cumsum())
+    heads = starts[:-1] + splats.counts.cumsum(0, dtype=np.int64) - splats.counts
+    count = int(starts[-1])
+    keys, spare_keys = (scratch.array(f"sorted_keys{i}", (count,), np.uint32) for i in range(2))
+    slots, spare_slots = (scratch.array(f"sorted_slots{i}", (count,), np.int32) for i in range(2))
+    rects = scratch.array("sorted_rects", (count,), np.uint64)
+    cpu_bin.scatter_to_bins(splats.keys, splats.found, first_bin, heads, keys, slots)
+    cpu_bin.sort_bins(starts, keys, slots, splats.rects, spare_keys, spare_slots, rects)
+    return slots, rects
+
+
+class Tiles:
+    """The image's tiles while it is rendered: which are open, and what they hold."""
+
+    def __init__(
+        self,
+        camera: Camera,
+        images: dict[str, np.ndarray],
+        settings: RasterSettings,
+        scratch: Scratch,
+    ) -> None:
+        self._columns = -(-camera.width // layout.TILE_W)
+        self._rows = -(-camera.height // layout.TILE_H)
+        count = self._columns * self._rows
+        self.size = np.array([camera.width, camera.height], np.int64)
+        self.limits = np.array(
+            [
+                settings.alpha_max,
+                math.log2(ALPHA_MIN),
+                min(settings.transmittance_stop, TRANSMITTANCE_STOP),
+                camera.is_orthographic,
+                settings.mode_depth_floor_m,
+                camera.fx**-2,
+                camera.fy**-2,
+                settings.transmittance_stop,
+            ],
+            np.float32,
+        )
+        # Alpha is always written, so that kernels come in fewer variants.
+        spare = {ALPHA: scratch.array("alpha", (camera.height, camera.width), np.float32)}
+        flat = {name: image.reshape(-1) for name, image in (spare | images).items()}
+        self._images = [flat.get(name) for name in BUFFERS]
+        used = _state_size(images)
+        self._scratch = scratch
+        self._states = scratch.array("states", (count * used,), np.float32)
+        self.open = scratch.array("open", (count,), np.uint8)
+        self.open[:] = cpu_blend.FRESH
+
+    def leave_out(self, wanted: np.ndarray) -> None:
+        """Close the tiles without a wanted pixel [H, W]; their part of the images becomes 0."""
+        drawn = any_in_squares(wanted, layout.TILE_W)
+        self.open[~drawn.reshape(-1)] = cpu_blend.CLOSED
+        for image in self._images:
+            if image is not None:
+                image.fill(0)
+
+    def open_sums(self) -> np.ndarray:
+        """int32 [rows + 1, columns + 1]: open tiles above and to the left."""
+        sums = np.zeros((self._rows + 1, self._columns + 1), np.int32)
+        is_open = (self.open != cpu_blend.CLOSED).reshape(self._rows, self._columns)
+        sums[1:, 1:] = is_open.cumsum(0, dtype=np.int32).cumsum(1, dtype=np.int32)
+        return sums
+
+    def blend(
+        self,
+        splats: Splats,
+        slots: np.ndarray,
+        rects: np.ndarray,
+        *,
+        is_last: bool,
+        clock: Clock,
+    ) -> None:
+        """Blend splats, nearest first, into the open tiles; is_last closes them all."""
+        first, count = 0, len(slots)
+        while True:
+            end, members, starts = self.list_members(slots, rects, first)
+            clock.lap("bin")
+            clock.count("pairs", len(members))
+            self.blend_members(splats, members, starts, is_last=is_last and end == count)
+            clock.lap("raster")
+            first = end
+            if first == count or not self.open.any():
+                return
+
+    def blend_members(
+        self, splats: Splats, members: np.ndarray, starts: np.ndarray, *, is_last: bool
+    ) -> None:
+        """Blend every open tile's list; is_last closes them all."""
+        cpu_blend.blend_tiles(
+            splats.records,
+            members,
+            starts,
+            self.open,
+            self._states,
+            is_last,
+            self.size,
+            self.limits,
+            *self._images,
+            splats.cuts,
+            splats.lights,
+        )
+
+    def list_all(self, slots: np.ndarray, rects: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The lists of all splats and where each begins, however long they are."""
+        _, members, starts = self.list_members(slots, rects, 0, limit=None)
+        return members, starts
+
+    def list_members(
+        self,
+        slots: np.ndarray,
+        rects: np.ndarray,
+        first: int,
+        limit: int | None = _MAX_PAIRS,
+    ) -> tuple[int, np.ndarray, np.ndarray]:
+        """Lists of every open tile's splats, nearest first, from the splat `first` on.
+
+        Returns where they stop, which is before the end where they would be too long, the lists
+        one after the other, and where each begins.
+        """
+        end = len(slots)
+        counts = self._count(rects, first, end)
+        if limit is not None and counts.sum() > limit:
+            end = first + _splats_in(rects[first:], limit)
+            counts = self._count(rects, first, end)
+        starts = np.append(0, np.cumsum(counts))
+        heads = np.where(self.open != cpu_blend.CLOSED, starts[:-1], -1)
+        members = self._scratch.array("members", (int(starts[-1]),), np.int32)
+        bands = min(self._rows, 2 * thread_count())
+        cpu_bin.fill_lists(slots, rects, first, end, self._columns, heads, members, bands)
+        return end, members, starts
+
+    def _count(self, rects: np.ndarray, first: int, end: int) -> np.ndarray:
+        """int64 [tiles]: splats [first, end) in each; none in closed tiles."""
+        shape = (self._rows + 1, self._columns + 1)
+        corners = self._scratch.array("corners", (thread_count(), shape[0] * shape[1]), np.int32)
+        cpu_bin.count_corners(rects, first, end, self._columns, corners)
+        totals = corners.sum(0, dtype=np.int64).reshape(shape).cumsum(0).cumsum(1)
+        return np.where(self.open != cpu_blend.CLOSED, totals[:-1, :-1].reshape(-1), 0)
+
+
+def _state_size(images: dict[str, np.ndarray]) -> int:
+    """float32 numbers that a tile keeps between slices for these images."""
+    names = set(images) - {RGB, ALPHA}
+    if MODE_DEPTH in names:
+        return cpu_blend.STATE
+    if names - {SNOW}:
+        return cpu_blend.MODELESS_STATE
+    return cpu_blend.SNOW_STATE if names else cpu_blend.COLOR_STATE
+
+
+def _splats_in(rects: np.ndarray, limit: int) -> int:
+    """How many splats in turn touch no more than `limit` tiles; at least one."""
+    corners = rects.view(np.uint16).reshape(-1, 4).astype(np.int64)  # as cpu_bin unpacks them
+    tiles = (corners[:, 2] - corners[:, 0] + 1) * (corners[:, 3] - corners[:, 1] + 1)
+    return max(1, int(np.searchsorted(tiles.cumsum(), limit, side="right")))
+
+
+def warm_up() -> float:
+    """Compile every kernel that colour, alpha and median depth need; seconds it took.
+
+    Later processes read the compiled kernels from numba's cache beside the sources.
+    """
+    start = time.perf_counter()
+    gaussians = Gaussians(
+        means=torch.tensor([[0.0, 0.0, 2.0]]),
+        quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+        scales=torch.full((1, 3), 0.1),
+        opacities=torch.tensor([0.5]),
+        sh=torch.zeros(1, 1, 3),
+    )
+    camera = Camera("warm-up", 16, 16, 16.0, 16.0, 8.0, 8.0, torch.eye(4, dtype=torch.float64))
+    parts = [PosedGaussians(gaussians)]
+    for buffers in ({RGB, ALPHA}, {RGB, ALPHA, MEDIAN_DEPTH}):
+        rasterize_cpu(parts, camera, frozenset(buffers), RasterSettings(), None)
+    return time.perf_counter() - start

@@ -1,0 +1,476 @@
+"""Eight float32 in one register: a numba type, so that kernels say what the processor does.
+
+A compiler's own vectoriser gives up on pixel loops for reasons that are hard to see and change with
+every release. `Float8` values are LLVM vectors instead: `+ - * /` work lane by lane, the rest are
+the functions below. No fast-math anywhere, and `fmuladd` is the only fused operation (where the
+processor has it), so the bits of a result do not depend on the code around it.
+Indices are uint64 into flat contiguous arrays; nothing checks them.
+"""
+
+from __future__ import annotations
+
+import math
+import operator
+
+import numba
+import numpy as np
+from llvmlite import ir
+from numba.core import types
+from numba.core.typing.templates import ConcreteTemplate, infer_global, signature
+from numba.extending import intrinsic, lower_builtin, models, register_model
+
+from augment.render.cpu.jit import inner
+
+# ---- cpu simd ------------------------------------------------------------------------------------
+
+LANES = 8
+
+_INT = ir.IntType(32)
+_F8 = ir.VectorType(ir.FloatType(), LANES)
+_I8 = ir.VectorType(_INT, LANES)
+_B8 = ir.VectorType(ir.IntType(1), LANES)
+_SQRT_HALF = 0x3F3504F3  # bits of the float32 nearest sqrt(1/2)
+
+
+class _Float8(types.Type):
+    def __init__(self) -> None:
+        super().__init__(name="float32x8")
+
+
+class _Mask8(types.Type):
+    def __init__(self) -> None:
+        super().__init__(name="boolx8")
+
+
+float8, mask8 = _Float8(), _Mask8()
+
+
+@register_model(_Float8)
+class _Float8Model(models.PrimitiveModel):
+    def __init__(self, manager, kind) -> None:
+        super().__init__(manager, kind, _F8)
+
+
+@register_model(_Mask8)
+class _Mask8Model(models.PrimitiveModel):
+    def __init__(self, manager, kind) -> None:
+        super().__init__(manager, kind, _B8)
+
+
+def _add_operator(op, method: str) -> None:
+    """Let kernels write `float8 op float8` for one instruction of the LLVM builder."""
+
+    @infer_global(op)
+    class _Typing(ConcreteTemplate):
+        cases = [signature(float8, float8, float8)]  # noqa: RUF012 - numba's way
+
+    @lower_builtin(op, float8, float8)
+    def _lower(context, builder, sig, args):
+        return getattr(builder, method)(*args)
+
+
+for _op, _method in (
+    (operator.add, "fadd"),
+    (operator.sub, "fsub"),
+    (operator.mul, "fmul"),
+    (operator.truediv, "fdiv"),
+):
+    _add_operator(_op, _method)
+
+
+def _pointer(context, builder, array_type, array, index):
+    data = context.make_array(array_type)(context, builder, array).data
+    return builder.gep(data, [index])
+
+
+def _all(value):
+    return ir.Constant(_I8, [value] * LANES)
+
+
+def _broadcast(builder, value, kind):
+    undefined = ir.Constant(kind, ir.Undefined)
+    first = builder.insert_element(undefined, value, _INT(0))
+    return builder.shuffle_vector(first, undefined, _all(0))
+
+
+def _call(builder, name: str, args):
+    kind = ir.FunctionType(_F8, [_F8] * len(args))
+    function = builder.module.declare_intrinsic(f"llvm.{name}.v8f32", (), kind)
+    return builder.call(function, args)
+
+
+@intrinsic
+def load(typingctx, array, index):
+    """array[index : index + 8]."""
+
+    def codegen(context, builder, sig, args):
+        at = _pointer(context, builder, sig.args[0], *args)
+        return builder.load(builder.bitcast(at, _F8.as_pointer()), align=4)
+
+    return float8(array, types.uint64), codegen
+
+
+@intrinsic
+def store(typingctx, array, index, value):
+    """array[index : index + 8] = value."""
+
+    def codegen(context, builder, sig, args):
+        at = _pointer(context, builder, sig.args[0], *args[:2])
+        builder.store(args[2], builder.bitcast(at, _F8.as_pointer()), align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, types.uint64, float8), codegen
+
+
+@intrinsic
+def store_ramp(typingctx, array, index, start, step):
+    """array[index : index + 8] = start + step * (0 ... 7), for an int32 array."""
+
+    def codegen(context, builder, sig, args):
+        at = _pointer(context, builder, sig.args[0], *args[:2])
+        start, step = (_broadcast(builder, value, _I8) for value in args[2:])
+        ramp = builder.mul(step, ir.Constant(_I8, list(range(LANES))))
+        builder.store(builder.add(start, ramp), builder.bitcast(at, _I8.as_pointer()), align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, types.uint64, types.int32, types.int32), codegen
+
+
+@intrinsic
+def gather(typingctx, array, rows, first, stride, column):
+    """array[rows[first + lane] * stride + column]; rows is an int32 array."""
+
+    def codegen(context, builder, sig, args):
+        wide = ir.IntType(64)
+        value = ir.Constant(_F8, ir.Undefined)
+        for lane in range(LANES):
+            at = builder.add(args[2], wide(lane))
+            row = builder.load(_pointer(context, builder, sig.args[1], args[1], at))
+            index = builder.add(builder.mul(builder.zext(row, wide), args[3]), args[4])
+            element = builder.load(_pointer(context, builder, sig.args[0], args[0], index))
+            value = builder.insert_element(value, element, _INT(lane))
+        return value
+
+    return float8(array, rows, types.uint64, types.uint64, types.uint64), codegen
+
+
+@intrinsic
+def splat(typingctx, value):
+    """The same number in all lanes."""
+
+    def codegen(context, builder, sig, args):
+        return _broadcast(builder, args[0], _F8)
+
+    return float8(types.float32), codegen
+
+
+@intrinsic
+def lane_numbers(typingctx):
+    """0, 1, ... 7."""
+
+    def codegen(context, builder, sig, args):
+        return ir.Constant(_F8, [float(lane) for lane in range(LANES)])
+
+    return float8(), codegen
+
+
+@intrinsic
+def fmuladd(typingctx, a, b, c):
+    """a b + c, rounded once."""
+
+    def codegen(context, builder, sig, args):
+        return _call(builder, "fmuladd", args)
+
+    return float8(float8, float8, float8), codegen
+
+
+@intrinsic
+def sqrt(typingctx, a):
+    def codegen(context, builder, sig, args):
+        return _call(builder, "sqrt", args)
+
+    return float8(float8), codegen
+
+
+@intrinsic
+def floor(typingctx, a):
+    def codegen(context, builder, sig, args):
+        return _call(builder, "floor", args)
+
+    return float8(float8), codegen
+
+
+@intrinsic
+def negate(typingctx, a):
+    def codegen(context, builder, sig, args):
+        return builder.fneg(args[0])
+
+    return float8(float8), codegen
+
+
+@intrinsic
+def minus_abs(typingctx, a):
+    """-|a|: a with its sign bit set."""
+
+    def codegen(context, builder, sig, args):
+        bits = builder.or_(builder.bitcast(args[0], _I8), _all(-(2**31)))
+        return builder.bitcast(bits, _F8)
+
+    return float8(float8), codegen
+
+
+@intrinsic
+def absolute(typingctx, a):
+    """|a|: a with its sign bit clear."""
+
+    def codegen(context, builder, sig, args):
+        bits = builder.and_(builder.bitcast(args[0], _I8), _all(2**31 - 1))
+        return builder.bitcast(bits, _F8)
+
+    return float8(float8), codegen
+
+
+@intrinsic
+def totals(typingctx, a, b, c, d, e, f, g, h):
+    """The sums of the eight lanes of a to h, as lanes 0 to 7; always added in the same order."""
+
+    def codegen(context, builder, sig, args):
+        def fold(left, right, low, high):
+            low, high = (
+                builder.shuffle_vector(left, right, ir.Constant(_I8, picked))
+                for picked in (low, high)
+            )
+            return builder.fadd(low, high)
+
+        pairs = [
+            fold(args[i], args[i + 1], [0, 8, 2, 10, 4, 12, 6, 14], [1, 9, 3, 11, 5, 13, 7, 15])
+            for i in range(0, LANES, 2)
+        ]
+        fours = [
+            fold(*pairs[i : i + 2], [0, 1, 8, 9, 4, 5, 12, 13], [2, 3, 10, 11, 6, 7, 14, 15])
+            for i in (0, 2)
+        ]
+        return fold(*fours, [0, 1, 2, 3, 8, 9, 10, 11], [4, 5, 6, 7, 12, 13, 14, 15])
+
+    return float8(*[float8] * LANES), codegen
+
+
+@intrinsic
+def minimum(typingctx, a, b):
+    """a where a < b, else b (so b where a is NaN)."""
+
+    def codegen(context, builder, sig, args):
+        return builder.select(builder.fcmp_ordered("<", *args), *args)
+
+    return float8(float8, float8), codegen
+
+
+@intrinsic
+def maximum(typingctx, a, b):
+    """a where a > b, else b (so b where a is NaN)."""
+
+    def codegen(context, builder, sig, args):
+        return builder.select(builder.fcmp_ordered(">", *args), *args)
+
+    return float8(float8, float8), codegen
+
+
+@intrinsic
+def greater(typingctx, a, b):
+    """Lanes where a > b."""
+
+    def codegen(context, builder, sig, args):
+        return builder.fcmp_ordered(">", *args)
+
+    return mask8(float8, float8), codegen
+
+
+@intrinsic
+def at_least(typingctx, a, b):
+    """Lanes where a >= b; never where either is NaN."""
+
+    def codegen(context, builder, sig, args):
+        return builder.fcmp_ordered(">=", *args)
+
+    return mask8(float8, float8), codegen
+
+
+@intrinsic
+def both(typingctx, a, b):
+    """Lanes that are in both masks."""
+
+    def codegen(context, builder, sig, args):
+        return builder.and_(*args)
+
+    return mask8(mask8, mask8), codegen
+
+
+@intrinsic
+def select(typingctx, mask, a, b):
+    """a in the lanes of the mask, b in the others."""
+
+    def codegen(context, builder, sig, args):
+        return builder.select(*args)
+
+    return float8(mask8, float8, float8), codegen
+
+
+@intrinsic
+def any_not_negative(typingctx, a):
+    """Whether the sign bit of any lane is clear."""
+
+    def codegen(context, builder, sig, args):
+        clear = builder.icmp_signed(">=", builder.bitcast(args[0], _I8), _all(0))
+        return builder.icmp_unsigned("!=", builder.bitcast(clear, ir.IntType(8)), ir.IntType(8)(0))
+
+    return types.boolean(float8), codegen
+
+
+@intrinsic
+def add_exponent(typingctx, a, n):
+    """a 2**k, where k stands in the low bits of n's bit pattern; overflow is not looked for."""
+
+    def codegen(context, builder, sig, args):
+        bits, power = (builder.bitcast(arg, _I8) for arg in args)
+        return builder.bitcast(builder.add(bits, builder.shl(power, _all(23))), _F8)
+
+    return float8(float8, float8), codegen
+
+
+def _exponent_bits(builder, value):
+    above = builder.sub(builder.bitcast(value, _I8), _all(_SQRT_HALF))
+    return builder.ashr(above, _all(23))
+
+
+@intrinsic
+def exponent(typingctx, a):
+    """The k for which a / 2**k lies in [sqrt(1/2), sqrt(2)); a > 0 and normal."""
+
+    def codegen(context, builder, sig, args):
+        return builder.sitofp(_exponent_bits(builder, args[0]), _F8)
+
+    return float8(float8), codegen
+
+
+@intrinsic
+def mantissa(typingctx, a):
+    """a / 2**exponent(a)."""
+
+    def codegen(context, builder, sig, args):
+        power = builder.shl(_exponent_bits(builder, args[0]), _all(23))
+        return builder.bitcast(builder.sub(builder.bitcast(args[0], _I8), power), _F8)
+
+    return float8(float8), codegen
+
+
+@intrinsic
+def prefetch(typingctx, array, index):
+    """Ask for the cache line of array[index] before it is needed."""
+
+    def codegen(context, builder, sig, args):
+        at = _pointer(context, builder, sig.args[0], *args)
+        kind = ir.FunctionType(ir.VoidType(), [at.type, _INT, _INT, _INT])
+        function = builder.module.declare_intrinsic("llvm.prefetch", [at.type], kind)
+        builder.call(function, [at, _INT(0), _INT(3), _INT(1)])  # to read, to keep, data
+        return context.get_dummy_value()
+
+    return types.void(array, types.uint64), codegen
+
+
+# ---- What the CPU kernels need beyond arithmetic: exponentials, logarithms, arrays by address ----
+
+LOG2_E = np.float32(math.log2(math.e))
+_ROUND = np.float32(1.5 * 2**23)  # adding it leaves the nearest integer in the low bits
+# 2**x on [-0.5, 0.5], least maximal relative error (2.6e-6), lowest power first.
+_EXP0 = np.float32(0.999999261)
+_EXP1 = np.float32(0.693121815)
+_EXP2 = np.float32(0.240247448)
+_EXP3 = np.float32(0.0559178609)
+_EXP4 = np.float32(0.00957010198)
+# 2**x likewise with 2**0 exactly 1 (9e-8).
+_FINE = tuple(
+    np.float32(c) for c in (0.693146978, 0.240222421, 0.0555073374, 0.00967151266, 0.00132647272)
+)
+# log2((1 + s) / (1 - s)) = 2 / ln 2 (s + s^3 / 3 + s^5 / 5 + ...)
+_LOG1, _LOG3, _LOG5, _LOG7 = (np.float32(2 / math.log(2) / n) for n in (1, 3, 5, 7))
+
+
+@inner()
+def exp2(x):
+    """2**x, eight at once, for |x| <= 126; any bits at all elsewhere. Relative error 3e-6."""
+    shifted = x + splat(_ROUND)
+    f = x - (shifted - splat(_ROUND))
+    p = fmuladd(splat(_EXP4), f, splat(_EXP3))
+    p = fmuladd(p, f, splat(_EXP2))
+    p = fmuladd(p, f, splat(_EXP1))
+    p = fmuladd(p, f, splat(_EXP0))
+    return add_exponent(p, shifted)
+
+
+@inner()
+def exp2_fine(x):
+    """2**x as `exp2`, to float32's precision and exact at 0."""
+    shifted = x + splat(_ROUND)
+    f = x - (shifted - splat(_ROUND))
+    p = fmuladd(splat(_FINE[4]), f, splat(_FINE[3]))
+    p = fmuladd(p, f, splat(_FINE[2]))
+    p = fmuladd(p, f, splat(_FINE[1]))
+    p = fmuladd(p, f, splat(_FINE[0]))
+    p = fmuladd(p, f, splat(np.float32(1)))
+    return add_exponent(p, shifted)
+
+
+@inner()
+def log2(x):
+    """Base-2 logarithm, eight at once, for normal x > 0; error below 2e-7 (1 + |result|)."""
+    one = splat(np.float32(1))
+    m = mantissa(x)
+    s = (m - one) / (m + one)
+    ss = s * s
+    p = fmuladd(splat(_LOG7), ss, splat(_LOG5))
+    p = fmuladd(p, ss, splat(_LOG3))
+    p = fmuladd(p, ss, splat(_LOG1))
+    return fmuladd(p, s, exponent(x))
+
+
+@intrinsic
+def cpu_math_fmuladd(typingctx, a, b, c):
+    """a b + c of scalars, rounded once where the processor has fused multiply-add."""
+
+    def codegen(context, builder, sig, args):
+        single = ir.FloatType()
+        kind = ir.FunctionType(single, [single] * 3)
+        return builder.call(builder.module.declare_intrinsic("llvm.fmuladd.f32", (), kind), args)
+
+    return types.float32(types.float32, types.float32, types.float32), codegen
+
+
+@intrinsic
+def _float_pointer(typingctx, address):
+    def codegen(context, builder, sig, args):
+        return builder.inttoptr(args[0], ir.FloatType().as_pointer())
+
+    return types.CPointer(types.float32)(types.uint64), codegen
+
+
+@intrinsic
+def _short_pointer(typingctx, address):
+    def codegen(context, builder, sig, args):
+        return builder.inttoptr(args[0], ir.IntType(16).as_pointer())
+
+    return types.CPointer(types.int16)(types.uint64), codegen
+
+
+@inner()
+def shorts_at(address, count):
+    """The int16 array of `count` numbers at a memory address; the caller keeps it alive."""
+    return numba.carray(_short_pointer(address), (count,))
+
+
+@inner()
+def floats_at(address, count):
+    """The float32 array of `count` numbers at a memory address; the caller keeps it alive.
+
+    One launch can then serve any number of scene parts, whose arrays differ in shape.
+    """
+    return numba.carray(_float_pointer(address), (count,))

@@ -1,0 +1,207 @@
+"""The GPU rasteriser as a torch operation.
+
+Colours' gradients, which are all that training a style network takes, are our own kernels': dL by
+sh of every part from rgb, whatever other buffers are made beside it, since colours move none of
+them. Gradients of means, quats, scales and opacities, from rgb, alpha and expected depth, are
+gsplat's (augment.render.gsplat_backend), which is an extra. Camera and part poses get none.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from jaxtyping import Float32
+from torch import Tensor
+
+from augment.cameras import Camera
+from augment.render.buffers import RGB, RenderOutput
+from augment.render.constants import ALPHA_MIN, TRANSMITTANCE_STOP, RasterSettings
+from augment.render.cuda import backward_kernels as kernels
+from augment.render.cuda.driver import blend, list_tiles, project
+from augment.render.cuda.runtime import launch, resident
+from augment.render.cuda.splats import CudaSplats, CudaTiles, gather_inputs
+from augment.render.gsplat_backend import rasterize_gsplat, tracked_geometry
+from augment.render.layout import M_FUNCTIONS, VIEW
+from augment.scene import PosedGaussians
+
+# ---- Gradients of colours on the GPU: the transposed blend, then the spherical harmonics ---------
+#     color_gradients(splats, tiles, camera, settings, d_rgb)   dL by every splat's colour
+#     sh_gradients(means, view, d_colors, functions, used)      dL by one part's sh
+#
+# Only colours move: order, alpha and transmittance are constants of the image, so nothing of the
+# forward blend is kept but its lists. The same bits come out every time.
+
+# All pixels of a tile times BATCH entries in the registers of two warps: more entries do not fit,
+# more warps wait for each other.
+_BATCH, _TILE_WARPS = 8, 2
+# Most splats are in few tiles; one that is in all must not take long either.
+_SPLATS, _LANES = 8, 16
+_SH_SPLATS = 32
+
+
+def color_gradients(
+    splats: CudaSplats,
+    tiles: CudaTiles,
+    camera: Camera,
+    settings: RasterSettings,
+    d_rgb: Float32[Tensor, "H W 3"],
+) -> Float32[Tensor, "N 3"]:
+    """dL by the colours that spherical harmonics make, 0 where the clamp at 0 holds them.
+
+    d_rgb: dL by the image that `blend` makes of the splats, without cuts and light per pixel.
+    """
+    entries, count = len(tiles.members), len(splats.keys)
+    device = splats.keys.device
+    d_colors = torch.zeros(count, 3, device=device)
+    if entries == 0:
+        return d_colors
+    shares = torch.zeros(3, entries, device=device)
+    launch(
+        kernels.share_colors,
+        (tiles.columns * tiles.rows,),
+        splats.records,
+        tiles.members,
+        tiles.starts,
+        d_rgb.contiguous(),
+        shares,
+        camera.width,
+        camera.height,
+        tiles.columns,
+        settings.alpha_max,
+        math.log2(ALPHA_MIN),
+        min(settings.transmittance_stop, TRANSMITTANCE_STOP),
+        settings.transmittance_stop,
+        BATCH=_BATCH,
+        num_warps=_TILE_WARPS,
+    )
+    owners, order = torch.sort(tiles.members, stable=True)  # lists are tile after tile
+    bounds = torch.arange(count + 1, dtype=owners.dtype, device=device)
+    launch(
+        kernels.sum_shares,
+        (-(-count // _SPLATS),),
+        shares,
+        order,
+        torch.searchsorted(owners, bounds),
+        splats.records,
+        d_colors,
+        count,
+        entries,
+        SPLATS=_SPLATS,
+        LANES=_LANES,
+        num_warps=1,
+    )
+    return d_colors
+
+
+def sh_gradients(
+    means: Float32[Tensor, "M 3"],
+    view: Float32[Tensor, "V"],
+    d_colors: Float32[Tensor, "M 3"],
+    functions: int,
+    used: int,
+) -> Float32[Tensor, "M K 3"]:
+    """dL by sh [M, K = functions, 3] of a part, of which the camera's view is `view` (layout's
+    V_*); 0 in functions from `used` on.
+    """
+    values = 3 * functions
+    d_sh = torch.empty(len(means), functions, 3, device=means.device)
+    launch(
+        kernels.spread_to_sh,
+        (-(-len(means) // _SH_SPLATS),),
+        means,
+        view,
+        d_colors,
+        d_sh,
+        len(means),
+        used,
+        SPLATS=_SH_SPLATS,
+        VALUES=values,
+        COLUMNS=1 << (values - 1).bit_length(),
+    )
+    return d_sh
+
+
+# ---- cuda autograd -------------------------------------------------------------------------------
+
+
+def rasterize_with_gradients(
+    parts: Sequence[PosedGaussians],
+    camera: Camera,
+    buffers: frozenset[str],
+    settings: RasterSettings,
+) -> RenderOutput:
+    """As `cuda.rasterize_cuda` without smog and clip, recorded by autograd; no part has light per
+    pixel or colour maps. buffers: some of DIFFERENTIABLE where geometry asks for gradients.
+
+    The splats' records and the tiles' lists are kept until backward.
+
+    Raises:
+        BackendUnavailable: geometry asks for gradients, and gsplat is not installed.
+    """
+    if tracked_geometry(parts):
+        return rasterize_gsplat(parts, camera, buffers, settings)
+    names = tuple(sorted(buffers))
+    setting = _Setting(tuple(_detached(part) for part in parts), camera, settings, names)
+    images = _Rasterize.apply(setting, *[part.gaussians.sh for part in parts])
+    return RenderOutput(**dict(zip(names, images, strict=True)))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Setting:
+    """What an operation is told besides its tensors."""
+
+    parts: tuple[PosedGaussians, ...]
+    camera: Camera
+    settings: RasterSettings
+    buffers: tuple[str, ...]
+
+
+class _Rasterize(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, setting: _Setting, *shs: Tensor) -> tuple[Tensor, ...]:
+        parts, camera, settings = setting.parts, setting.camera, setting.settings
+        names = frozenset(setting.buffers)
+        inputs = gather_inputs(parts, camera, settings, None, None, with_color=RGB in names)
+        splats = project(inputs)
+        tiles = list_tiles(splats, camera, None)
+        images = blend(splats, tiles, camera, names, settings)
+        ctx.setting, ctx.splats, ctx.tiles = setting, splats, tiles
+        ctx.views, ctx.most = inputs.views.reshape(-1, VIEW), int(inputs.modes[M_FUNCTIONS])
+        ctx.likenesses = [(sh.device, sh.shape[1]) for sh in shs]
+        # Kept by autograd, so that a change in place before backward is noticed.
+        ctx.save_for_backward(*[resident(part.gaussians.means) for part in parts])
+        ctx.mark_non_differentiable(*[images[n] for n in setting.buffers if n != RGB])
+        return tuple(images[name] for name in setting.buffers)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(  # pyright: ignore[reportIncompatibleMethodOverride] - torch's own way
+        ctx: Any, *d_images: Tensor
+    ) -> tuple[Any, ...]:
+        setting: _Setting = ctx.setting
+        if RGB not in setting.buffers:
+            return (None,) * (1 + len(setting.parts))
+        d_rgb = d_images[setting.buffers.index(RGB)]
+        d_colors = color_gradients(ctx.splats, ctx.tiles, setting.camera, setting.settings, d_rgb)
+        out: list[Tensor | None] = [None]
+        first = 0
+        for number, means in enumerate(ctx.saved_tensors):
+            device, functions = ctx.likenesses[number]
+            own = d_colors[first : first + len(means)]
+            first += len(means)
+            if not ctx.needs_input_grad[1 + number]:
+                out.append(None)
+                continue
+            used = min(ctx.most, functions)
+            d_sh = sh_gradients(means, ctx.views[number], own, functions, used)
+            out.append(d_sh.to(device))
+        return tuple(out)
+
+
+def _detached(part: PosedGaussians) -> PosedGaussians:
+    sh = part.gaussians.sh.detach()
+    return dataclasses.replace(part, gaussians=dataclasses.replace(part.gaussians, sh=sh))

@@ -1,0 +1,439 @@
+"""Triton kernel: blend every tile's splats front to back.
+
+A program is one warp and blends a block of a tile's pixels, several for each of its threads, so
+that nothing ever waits for another warp. It takes its tile's list in batches of one splat a thread:
+each thread finds out whether its splat's ellipse meets the block, and the warp blends those that
+do, one after the other. Looking also brings the records into the nearest cache, where the blending
+finds them. A block ends where nothing shines through any of its pixels.
+"""
+
+from __future__ import annotations
+
+import triton
+import triton.language as tl
+
+from augment.render import constants, layout, mode_depth
+from augment.render.cpu import geometry as cpu_shading
+from augment.render.cuda import splats as cuda_splats
+
+# ---- Triton kernels: the tiles of splats that are in order of depth, pair by pair ----------------
+
+
+@triton.jit(do_not_specialize=["count", "columns"])
+def count_tiles(
+    order,
+    counts,
+    rects,
+    sums,
+    sorted_counts,
+    count,
+    columns,
+    IS_PARTIAL: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """How many tiles each splat is listed in, nearest splat first.
+
+    order: int64 [count], rows of CudaSplats. counts, rects: as there. sums: int32 [rows + 1,
+    columns + 1], wanted tiles above and to the left; read where IS_PARTIAL: splats without a wanted
+    tile count none. sorted_counts: int32 [count], written.
+    """
+    at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    is_there = at < count
+    row = tl.load(order + at, mask=is_there, other=0)
+    tiles = tl.load(counts + row, mask=is_there, other=0)
+    if IS_PARTIAL:
+        is_drawn = is_there & (tiles > 0)
+        first = tl.load(rects + 2 * row, mask=is_drawn, other=0)
+        last = tl.load(rects + 2 * row + 1, mask=is_drawn, other=0)
+        left, right = first & 0xFFFF, (last & 0xFFFF) + 1
+        top, bottom = (first >> 16) * (columns + 1), ((last >> 16) + 1) * (columns + 1)
+        wanted = (
+            tl.load(sums + bottom + right, mask=is_drawn, other=0)
+            - tl.load(sums + top + right, mask=is_drawn, other=0)
+            - tl.load(sums + bottom + left, mask=is_drawn, other=0)
+            + tl.load(sums + top + left, mask=is_drawn, other=0)
+        )
+        tiles = tl.where(wanted > 0, tiles, 0)
+    tl.store(sorted_counts + at, tiles, mask=is_there)
+
+
+@triton.jit(do_not_specialize=["pairs", "count", "steps", "columns", "none"])
+def list_pairs(
+    order,
+    ends,
+    rects,
+    wanted,
+    tiles,
+    owners,
+    pairs,
+    count,
+    steps,
+    columns,
+    none,
+    IS_PARTIAL: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """Every pair of a splat and a tile, nearest splat first, the tiles of each row by row.
+
+    order: as above. ends: int64 [count], how many pairs there are up to each splat, itself
+    included. steps: halvings that leave one of `count` splats. wanted: bool [tiles], read where
+    IS_PARTIAL. tiles, owners: [pairs], written: the tile, `none` where it is not wanted, and the
+    row of CudaSplats.
+    """
+    pair = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    is_there = pair < pairs
+    # The first splat whose pairs end behind this one, between low and high. Neighbours take the
+    # same way, so that a warp's loads are mostly of one place.
+    low = tl.zeros([BLOCK], tl.int32)
+    high = tl.zeros([BLOCK], tl.int32) + count
+    for _ in range(steps):
+        middle = (low + high) >> 1  # count where the search is over
+        end = tl.load(ends + middle, mask=middle < count, other=0x7FFFFFFFFFFFFFFF)
+        is_behind = end > pair
+        high = tl.where(is_behind, middle, high)
+        low = tl.where(is_behind, low, middle + 1)
+    is_there = is_there & (low < count)
+    row = tl.load(order + low, mask=is_there, other=0)
+    begin = tl.load(ends + low - 1, mask=is_there & (low > 0), other=0)
+    first = tl.load(rects + 2 * row, mask=is_there, other=0)
+    last = tl.load(rects + 2 * row + 1, mask=is_there, other=0)
+    width = (last & 0xFFFF) - (first & 0xFFFF) + 1
+    within = (pair - begin).to(tl.int32)
+    down = within // width
+    tile = ((first >> 16) + down) * columns + (first & 0xFFFF) + within - down * width
+    if IS_PARTIAL:
+        is_wanted = tl.load(wanted + tile, mask=is_there, other=0)
+        tile = tl.where(is_wanted != 0, tile, none)
+    tl.store(tiles + pair, tile.to(tiles.dtype.element_ty), mask=is_there)
+    tl.store(owners + pair, row.to(tl.int32), mask=is_there)
+
+
+# ------------------------------------------------------------------------------------------------
+# Triton functions: mode depth (augment.render.mode_depth), one sample of every pixel at a time
+# Sums are kept times the cluster's weight, so that a sample that joins costs no division and no
+# root.
+
+FARTHER = tl.constexpr(mode_depth.FARTHER)
+NEARER = tl.constexpr(mode_depth.NEARER)
+FARTHER_2 = tl.constexpr((mode_depth.FARTHER * mode_depth.BETA_PER_SIGMA) ** 2)
+NEARER_2 = tl.constexpr((mode_depth.NEARER * mode_depth.BETA_PER_SIGMA) ** 2)
+BACK = tl.constexpr(mode_depth.GAMMA * mode_depth.BETA_PER_SIGMA)
+SLACK = tl.constexpr(1e-4)  # what rounding may add to a sum of weights; far more than it does
+
+
+@triton.jit
+def add_sample(depth, weight, floor, first, mass, moment, square, best, best_mode):
+    """The clusters with every pixel's next sample; those of weight 0 change nothing.
+
+    Of the running cluster: first, the depth it began with, and the sums of w, w (z - first) and
+    w (z - first)^2. Of the heaviest closed one: its weight and its mode.
+    """
+    off = depth - first
+    aside = off * mass - moment  # mass (z - mean)
+    spread = _spread(mass, moment, square)
+    is_farther = aside >= 0
+    reach = tl.where(is_farther, FARTHER, NEARER)
+    reach_2 = tl.where(is_farther, FARTHER_2, NEARER_2)
+    by_floor = floor * reach * mass - tl.abs(aside)
+    by_spread = reach_2 * spread - aside * aside
+    begins = (weight > 0) & (tl.maximum(by_floor, by_spread) <= 0)
+    if tl.max(tl.max(begins.to(tl.int32), 0), 0) > 0:
+        is_best = begins & (mass > best)
+        best_mode = tl.where(is_best, _mode(first, mass, moment, spread), best_mode)
+        best = tl.where(is_best, mass, best)
+        first = tl.where(begins, depth, first)
+        off = tl.where(begins, 0.0, off)
+        mass = tl.where(begins, 0.0, mass)
+        moment = tl.where(begins, 0.0, moment)
+        square = tl.where(begins, 0.0, square)
+    weighted = weight * off
+    return first, mass + weight, moment + weighted, square + weighted * off, best, best_mode
+
+
+@triton.jit
+def can_grow(through, mass, best):
+    """Whether a pixel's running cluster may still become the heaviest, or is it.
+
+    through: the light left, negative where blending has stopped.
+    """
+    return (through > 0) & (mass + through + SLACK >= best)
+
+
+@triton.jit
+def heaviest_mode(first, mass, moment, square, best, best_mode):
+    """Mode of the heaviest cluster, the running one included; 0 where there is none."""
+    last = _mode(first, mass, moment, _spread(mass, moment, square))
+    return tl.where(mass > best, last, best_mode)
+
+
+@triton.jit
+def _spread(mass, moment, square):
+    """mass^2 times the variance."""
+    return tl.maximum(mass * square - moment * moment, 0.0)
+
+
+@triton.jit
+def _mode(first, mass, moment, spread):
+    return first + (moment - BACK * tl.sqrt(spread)) / tl.where(mass > 0, mass, 1.0)
+
+
+# ---- cuda blend kernels --------------------------------------------------------------------------
+
+# Records and cuts are read four numbers at a time, in their order (the launch module checks it).
+TILE = tl.constexpr(cuda_splats.TILE)
+DEPTH_EPS = tl.constexpr(constants.DEPTH_EPS)
+RECORD, CUT, LINES = (
+    tl.constexpr(layout.RECORD),
+    tl.constexpr(layout.CUT),
+    tl.constexpr(cpu_shading.CPU_SHADING_LINES),
+)
+L_FACING, L_X, L_Y, L_WRAP = (
+    tl.constexpr(cpu_shading.L_FACING),
+    tl.constexpr(cpu_shading.L_X),
+    tl.constexpr(cpu_shading.L_Y),
+    tl.constexpr(cpu_shading.L_WRAP),
+)
+L_LEAN_X, L_LEAN_Y = tl.constexpr(cpu_shading.L_LEAN_X), tl.constexpr(cpu_shading.L_LEAN_Y)
+L_RED, L_GREEN, L_BLUE = (
+    tl.constexpr(cpu_shading.L_RED),
+    tl.constexpr(cpu_shading.L_GREEN),
+    tl.constexpr(cpu_shading.L_BLUE),
+)
+TINY = tl.constexpr(1e-20)  # augment.render.shading.TINY
+LANES = tl.constexpr(32)  # threads of a warp, splats looked at together, bits of an int32
+# Rounding must not lose a pixel: splats that stay this far below the cut (log2 of alpha) anywhere
+# in a block are left out, others tried.
+MARGIN = tl.constexpr(0.0625)
+
+
+@triton.jit(do_not_specialize=["width", "height", "columns"])
+def blend_blocks(
+    records,
+    members,
+    starts,
+    cuts,
+    lights,
+    rgb,
+    alpha,
+    expected,
+    median,
+    ids,
+    mode,
+    snow,
+    width,
+    height,
+    columns,
+    alpha_max,
+    log_cut,
+    least,
+    end,
+    parallel,
+    floor,
+    inverse_fx2,
+    inverse_fy2,
+    HAS_CUTS: tl.constexpr,
+    HAS_LIGHTS: tl.constexpr,
+    HAS_RGB: tl.constexpr,
+    HAS_EXPECTED: tl.constexpr,
+    HAS_MEDIAN: tl.constexpr,
+    HAS_IDS: tl.constexpr,
+    HAS_MODE: tl.constexpr,
+    HAS_SNOW: tl.constexpr,
+    IS_COARSE: tl.constexpr,
+    BLOCK_W: tl.constexpr,
+    BLOCK_H: tl.constexpr,
+):
+    """Blend one block of BLOCK_W x BLOCK_H pixels of a tile; a tile's blocks are neighbours.
+
+    records, cuts, lights: as in CudaSplats. members, starts: as in CudaTiles. rgb to snow: images;
+    of those that are not asked for, and of cuts and lights that are not there, nothing is read or
+    written. width, height: of the image; columns: of its tiles. least: what a splat must leave more
+    of than this to be blended. end: the transmittance at which a pixel is finished; IS_COARSE
+    where it is not `least`. parallel: 1 where rays are parallel, else 0. floor: mode depth's.
+    """
+    across = TILE // BLOCK_W
+    blocks = across * (TILE // BLOCK_H)
+    tile, block = tl.program_id(0) // blocks, tl.program_id(0) % blocks
+    left = tile % columns * TILE + block % across * BLOCK_W
+    top = tile // columns * TILE + block // across * BLOCK_H
+
+    # Axis 1 runs over the warp's threads. The pixels of each, axis 0, lie in one row, in even
+    # steps: what a splat is in a row is found once a thread, and the steps are constants.
+    STEP: tl.constexpr = LANES // BLOCK_H
+    EACH: tl.constexpr = BLOCK_W // STEP
+    lanes = tl.arange(0, LANES)
+    steps = (tl.arange(0, EACH) * STEP)[:, None]
+    first_x, y = left + lanes % STEP, top + lanes // STEP
+    is_inside = (first_x[None, :] + steps < width) & (y < height)[None, :]
+    west, north = first_x.to(tl.float32) + 0.5, y.to(tl.float32) + 0.5  # the first pixel's centre
+    ahead = steps.to(tl.float32)
+    nothing = tl.zeros([EACH, LANES], tl.float32)
+    # Negative where the pixel is finished; its size is then the final transmittance.
+    through = tl.where(is_inside, 1.0, -1.0)
+    red, green, blue, white = nothing, nothing, nothing, nothing
+    weighted_depth, middle, heaviest = nothing, nothing, nothing
+    number = tl.full([EACH, LANES], -1, tl.int32)
+    first, mass, moment, square = nothing, nothing, nothing, nothing
+    best, best_mode = nothing, nothing
+
+    at = tl.load(starts + tile)
+    last = tl.load(starts + tile + 1)
+    row = tl.load(members + at + lanes, mask=at + lanes < last, other=0)
+    is_open = at < last
+    while is_open:
+        is_listed = at + lanes < last
+        # The next batch's, which is there by then.
+        following = tl.load(members + at + LANES + lanes, mask=at + LANES + lanes < last, other=0)
+        reaches = is_listed & _reaches(
+            records + row.to(tl.int64) * RECORD, left, top, BLOCK_W - 1, BLOCK_H - 1, log_cut
+        )
+        left_over = tl.sum(tl.where(reaches, 1 << lanes, 0), 0)  # one bit a splat
+        # Behind what outweighs all that is left, samples cannot change the mode.
+        grows = HAS_MODE
+        if HAS_MODE:
+            grows = tl.max(tl.max(can_grow(through, mass, best).to(tl.int32), 0), 0) > 0
+        while left_over != 0:
+            lowest = (left_over & -left_over).to(tl.uint32, bitcast=True)
+            left_over = left_over & (left_over - 1)
+            # The exponent of a power of two says which it is.
+            k = (lowest.to(tl.float32).to(tl.int32, bitcast=True) >> 23) - 127
+            slot = tl.load(members + at + k).to(tl.int64)
+            # Every thread reads the whole record, which costs a warp no more than one of them.
+            record = (records + slot * RECORD) + tl.zeros([LANES], tl.int32)
+            mean_x, mean_y, lean_x, sharp_x = _quarter(record, 0)
+            fall_y, log_opacity, _, _ = _quarter(record, 1)
+
+            # log2 of alpha: e = peak - off^2, peak and where off begins being one a row.
+            dx, dy = west - mean_x, north - mean_y
+            peak = log_opacity - fall_y * dy * dy
+            off = (sharp_x * dx - sharp_x * lean_x * dy)[None, :] + sharp_x[None, :] * ahead
+            e = peak[None, :] - off * off
+            a = tl.where(e >= log_cut, tl.minimum(tl.exp2(e), alpha_max), 0.0)
+            if HAS_CUTS:
+                cut = (cuts + slot * CUT) + tl.zeros([LANES], tl.int32)
+                kept, slope_x, slope_y, right = _quarter(cut, 0)
+                share = (kept + slope_x * dx + slope_y * dy)[None, :] + slope_x[None, :] * ahead
+                a *= tl.minimum(tl.maximum(share, 0.0), 1.0)
+            weight = a * through
+            after = through - weight
+            is_kept = after > least
+            weight = tl.where(is_kept, weight, 0.0)
+
+            if HAS_RGB or HAS_SNOW:
+                splat_red, splat_green, splat_blue, is_snow = _quarter(record, 3)
+            if HAS_RGB:
+                red += weight * splat_red[None, :]
+                green += weight * splat_green[None, :]
+                blue += weight * splat_blue[None, :]
+            if HAS_SNOW:
+                white += weight * is_snow[None, :]
+            if HAS_EXPECTED or HAS_MEDIAN or HAS_MODE or HAS_IDS:
+                _, _, depth, own_id = _quarter(record, 2)
+            if HAS_EXPECTED or HAS_MODE:
+                if HAS_CUTS:
+                    down, most, _, _ = _quarter(cut, 1)
+                    growth = (right * dx + down * dy)[None, :] + right[None, :] * ahead
+                    growth = tl.minimum(tl.maximum(growth, -most[None, :]), most[None, :])
+                    z = depth[None, :] + parallel * growth
+                    z = z / (1.0 - (1.0 - parallel) * growth)
+                else:
+                    z = nothing + depth[None, :]
+                if HAS_EXPECTED:
+                    weighted_depth += weight * z
+                if grows:
+                    first, mass, moment, square, best, best_mode = add_sample(
+                        z, weight, floor, first, mass, moment, square, best, best_mode
+                    )
+            if HAS_MEDIAN:
+                is_crossed = is_kept & (through >= 0.5) & (after < 0.5)
+                middle = tl.where(is_crossed, depth[None, :], middle)
+            if HAS_IDS:
+                is_heavier = weight > heaviest
+                heaviest = tl.where(is_heavier, weight, heaviest)
+                number = tl.where(is_heavier, own_id.to(tl.int32, bitcast=True)[None, :], number)
+            if HAS_LIGHTS:  # last, when most of what is above need not be kept
+                lines = lights + slot * LINES
+                more_red, more_green = tl.load(lines + L_RED), tl.load(lines + L_GREEN)
+                more_blue = tl.load(lines + L_BLUE)
+                if tl.abs(more_red) + tl.abs(more_green) + tl.abs(more_blue) > 0:
+                    reach = tl.maximum(log_opacity - log_cut, TINY)[None, :]
+                    rim = (log_opacity[None, :] - e) / reach
+                    aside = dx[None, :] + ahead
+                    share = _light_share(lines, aside, dy[None, :], rim, inverse_fx2, inverse_fy2)
+                    red += weight * share * more_red
+                    green += weight * share * more_green
+                    blue += weight * share * more_blue
+            if IS_COARSE:
+                final = -tl.abs(tl.where(is_kept, after, through))
+                through = tl.where(after > end, after, final)
+            else:
+                through = tl.where(is_kept, after, -tl.abs(through))
+        row = following
+        at += LANES
+        # Of float32 numbers that are positive the bits are in the same order, which integers
+        # compare in one step.
+        is_open = (at < last) & (tl.max(tl.max(through.to(tl.int32, bitcast=True), 0), 0) > 0)
+
+    pixel = (y * width + first_x)[None, :] + steps
+    covered = 1.0 - tl.abs(through)
+    tl.store(alpha + pixel, covered, mask=is_inside)
+    if HAS_RGB:
+        tl.store(rgb + 3 * pixel, red, mask=is_inside)
+        tl.store(rgb + 3 * pixel + 1, green, mask=is_inside)
+        tl.store(rgb + 3 * pixel + 2, blue, mask=is_inside)
+    if HAS_EXPECTED:
+        tl.store(expected + pixel, weighted_depth / tl.maximum(covered, DEPTH_EPS), mask=is_inside)
+    if HAS_MEDIAN:
+        tl.store(median + pixel, middle, mask=is_inside)
+    if HAS_IDS:
+        tl.store(ids + pixel, number, mask=is_inside)
+    if HAS_MODE:
+        z = heaviest_mode(first, mass, moment, square, best, best_mode)
+        tl.store(mode + pixel, z, mask=is_inside)
+    if HAS_SNOW:
+        tl.store(snow + pixel, white, mask=is_inside)
+
+
+@triton.jit
+def _quarter(pointers, which: tl.constexpr):
+    """Numbers 4 which to 4 which + 3 of every row, in one read each. Rows begin at 16 bytes."""
+    places = pointers[:, None] + (4 * which + tl.arange(0, 4))[None, :]
+    numbers = tl.load(tl.multiple_of(places, (16, 16)))
+    even, odd = tl.split(tl.reshape(numbers, (LANES, 2, 2)))
+    first, third = tl.split(even)
+    second, fourth = tl.split(odd)
+    return first, second, third, fourth
+
+
+@triton.jit
+def _reaches(record, left, top, wide, high, log_cut):
+    """Whether alpha may reach the cut at a pixel of the block at (left, top), wide + 1 x high + 1.
+
+    Where the mean lies outside, alpha is largest on the side that faces it, in x or in y: there,
+    where the ellipse's ridge crosses that side, or as near to it as the block goes.
+    """
+    mean_x, mean_y, lean_x, sharp_x = _quarter(record, 0)
+    fall_y, log_opacity, _, _ = _quarter(record, 1)
+    lean_y, _, _, _ = _quarter(record, 2)
+    west, north = left.to(tl.float32) + 0.5 - mean_x, top.to(tl.float32) + 0.5 - mean_y
+    east, south = west + wide, north + high
+    x = tl.minimum(tl.maximum(0.0, west), east)
+    y = tl.minimum(tl.maximum(0.0, north), south)
+    y_there = tl.minimum(tl.maximum(lean_y * x, north), south)
+    x_there = tl.minimum(tl.maximum(lean_x * y, west), east)
+    off_x, off_y = sharp_x * (x - lean_x * y_there), sharp_x * (x_there - lean_x * y)
+    by_x = off_x * off_x + fall_y * y_there * y_there
+    by_y = off_y * off_y + fall_y * y * y
+    return tl.minimum(by_x, by_y) <= log_opacity - log_cut + MARGIN
+
+
+@triton.jit
+def _light_share(lines, dx, dy, rim, inverse_fx2, inverse_fy2):
+    """The share of the light (augment.render.shading). dx, dy: pixels from the mean; rim: D^2."""
+    rim = tl.minimum(tl.maximum(rim, 0.0), 1.0)
+    lean = tl.load(lines + L_LEAN_X) * dx + tl.load(lines + L_LEAN_Y) * dy
+    away = inverse_fx2 * dx * dx + (lean * lean + (inverse_fy2 * dy * dy + TINY))
+    tilt = tl.load(lines + L_X) * dx + tl.load(lines + L_Y) * dy
+    share = tl.sqrt(rim / away) * tilt + tl.load(lines + L_WRAP)
+    share = tl.sqrt(1.0 - rim) * tl.load(lines + L_FACING) + share
+    return tl.minimum(tl.maximum(share, 0.0), 1.0)

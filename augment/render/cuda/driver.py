@@ -1,0 +1,290 @@
+"""The GPU rasteriser: stages in Triton, and the order in which they run.
+
+    project   record, tiles and colour of every Gaussian                  (cuda_project)
+    list      by z, ties by index; then the splats of every tile          (cuda_tiles)
+    blend     every tile's, front to back, into the images asked for      (cuda_blend)
+
+No sum depends on the order in which programs run, so the same bits come out every time.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Bool, Int32
+from torch import Tensor
+
+from augment.cameras import Camera
+from augment.effects.smog import SmogMedium
+from augment.render import layout, shading
+from augment.render.buffers import (
+    ALPHA,
+    BUFFERS,
+    EXPECTED_DEPTH,
+    MEDIAN_DEPTH,
+    MODE_DEPTH,
+    RGB,
+    SNOW,
+    SPLAT_IDS,
+    RenderOutput,
+)
+from augment.render.constants import ALPHA_MIN, TRANSMITTANCE_STOP, RasterSettings
+from augment.render.cuda import runtime as gpu
+from augment.render.cuda.blend_kernels import blend_blocks, count_tiles, list_pairs
+from augment.render.cuda.project_kernels import project_gaussians
+from augment.render.cuda.runtime import launch
+from augment.render.cuda.splats import (
+    BLOCK,
+    TILE,
+    CudaInputs,
+    CudaSplats,
+    CudaTiles,
+    StageClock,
+    gather_inputs,
+)
+from augment.render.layout import HeightClip
+from augment.scene import PosedGaussians
+
+# ---- The GPU's projection: splats of all Gaussians of all parts, in one launch -------------------
+
+
+def project(inputs: CudaInputs) -> CudaSplats:
+    """Records, keys, tiles, and, where the modes ask for them, cuts and lights."""
+    count, device, modes = inputs.count, inputs.device, [int(mode) for mode in inputs.modes]
+
+    def floats(columns: int) -> torch.Tensor:
+        return torch.empty((count, columns), dtype=torch.float32, device=device)
+
+    def ints(*shape: int) -> torch.Tensor:
+        return torch.empty(shape, dtype=torch.int32, device=device)
+
+    splats = CudaSplats(
+        records=floats(layout.RECORD),
+        keys=ints(count),
+        rects=ints(count, 2),
+        counts=ints(count),
+        cuts=floats(layout.CUT) if modes[layout.M_CLIP] else None,
+        lights=floats(shading.LINES) if modes[layout.M_LIGHT] else None,
+    )
+    launch(
+        project_gaussians,
+        (len(inputs.block_parts),),
+        inputs.table,
+        inputs.views,
+        inputs.block_parts,
+        splats.records,
+        splats.keys,
+        splats.rects,
+        splats.counts,
+        splats.cuts,
+        splats.lights,
+        COLOR=modes[layout.M_COLOR],
+        FUNCTIONS=modes[layout.M_FUNCTIONS],
+        ANTIALIASED=modes[layout.M_ANTIALIASED],
+        SMOG=modes[layout.M_SMOG],
+        CLIP=modes[layout.M_CLIP],
+        LIGHT=modes[layout.M_LIGHT],
+        BLOCK=BLOCK,
+        num_warps=BLOCK // 32,
+    )
+    return splats
+
+
+# ---- Tile lists on the GPU: which splats every tile blends, nearest first, ties by index ---------
+#     order    of the Gaussians by the bits of z                                stable sort
+#     expand   every splat to its pairs with tiles, in that order               list_pairs
+#     group    the pairs by tile, which leaves each tile's in order of depth    stable sort
+#
+# Both sorts are torch's, radix sorts on a GPU. Pairs are spread evenly over programs, however many
+# tiles a splat touches.
+
+_SPLATS, _PAIRS = 256, 512  # of a program; a thread looks for the owners of four pairs at once
+_MOST_PAIRS = 2**31 - 1024  # tiles' lists begin at an int32, and are read some way beyond
+
+
+def list_tiles(splats: CudaSplats, camera: Camera, wanted: Tensor | None) -> CudaTiles:
+    """The lists of all tiles. wanted: bool [H, W]; tiles without a wanted pixel get none.
+
+    Waits for the GPU once, to learn how many pairs there are.
+
+    Raises:
+        ValueError: there are more pairs than an int32 can count.
+    """
+    columns, rows = -(-camera.width // TILE), -(-camera.height // TILE)
+    count, tiles, device = len(splats.keys), columns * rows, splats.keys.device
+    none = torch.empty(0, dtype=torch.int32, device=device)
+    is_wanted = None if wanted is None else _wanted_tiles(wanted.to(device), columns, rows)
+
+    order = torch.sort(splats.keys, stable=True).indices
+    counts = torch.empty(count, dtype=torch.int32, device=device)
+    gpu.launch(
+        count_tiles,
+        (-(-count // _SPLATS),),
+        order,
+        splats.counts,
+        splats.rects,
+        none if is_wanted is None else _sums_from_corner(is_wanted),
+        counts,
+        count,
+        columns,
+        IS_PARTIAL=is_wanted is not None,
+        BLOCK=_SPLATS,
+    )
+    ends = torch.cumsum(counts, 0, dtype=torch.int64)
+    pairs = int(ends[-1]) if count else 0
+    if pairs > _MOST_PAIRS:
+        raise ValueError(
+            f"the {count} Gaussians touch {pairs} tiles of a {camera.width} x {camera.height} "
+            f"image together, which is more than {_MOST_PAIRS}; render a smaller image, or fewer "
+            f"or smaller Gaussians"
+        )
+
+    # One number more than there are tiles stands for those that are not wanted, behind all others.
+    numbers = torch.int16 if tiles <= torch.iinfo(torch.int16).max else torch.int32
+    tile_of = torch.empty(pairs, dtype=numbers, device=device)
+    owners = torch.empty(pairs, dtype=torch.int32, device=device)
+    gpu.launch(
+        list_pairs,
+        (-(-pairs // _PAIRS),),
+        order,
+        ends,
+        splats.rects,
+        none if is_wanted is None else is_wanted,
+        tile_of,
+        owners,
+        pairs,
+        count,
+        count.bit_length(),
+        columns,
+        tiles,
+        IS_PARTIAL=is_wanted is not None,
+        BLOCK=_PAIRS,
+    )
+    grouped, index = torch.sort(tile_of, stable=True)
+    edges = torch.arange(tiles + 1, dtype=numbers, device=device)
+    starts = torch.searchsorted(grouped, edges, out_int32=True)
+    return CudaTiles(owners[index], starts, columns, rows)
+
+
+def _wanted_tiles(wanted: Bool[Tensor, "H W"], columns: int, rows: int) -> Bool[Tensor, "R C"]:
+    """Tiles with a wanted pixel."""
+    height, width = wanted.shape
+    padded = wanted.new_zeros(rows * TILE, columns * TILE)
+    padded[:height, :width] = wanted
+    return padded.reshape(rows, TILE, columns, TILE).any(3).any(1).contiguous()
+
+
+def _sums_from_corner(is_wanted: Bool[Tensor, "R C"]) -> Int32[Tensor, "R1 C1"]:
+    """Wanted tiles above and to the left of each corner."""
+    sums = is_wanted.cumsum(0, dtype=torch.int32).cumsum(1, dtype=torch.int32)
+    return torch.nn.functional.pad(sums, (1, 0, 1, 0))
+
+
+# ---- Blending on the GPU: images from tiles' lists, in one launch --------------------------------
+
+# Pixels of a program, which is one warp. Larger blocks spend less on reading their lists, smaller
+# ones less on pixels that a splat does not cover. Powers of 2; the warp's threads must fit into it.
+_BLOCK_W, _BLOCK_H = 16, 8
+
+# The kernel reads records and cuts four numbers at a time and names them in this order.
+assert (layout.MEAN_X, layout.MEAN_Y, layout.LEAN_X, layout.SHARP_X) == (0, 1, 2, 3)
+assert (layout.FALL_Y, layout.LOG_OPACITY, layout.LEAN_Y) == (4, 5, 8)
+assert (layout.DEPTH, layout.SPLAT_ID) == (10, 11)
+assert (layout.RED, layout.GREEN, layout.BLUE, layout.IS_SNOW) == (12, 13, 14, 15)
+assert (layout.C_AT, layout.C_X, layout.C_Y, layout.C_RIGHT) == (0, 1, 2, 3)
+assert (layout.C_DOWN, layout.C_REACH) == (4, 5)
+
+
+def blend(
+    splats: CudaSplats,
+    tiles: CudaTiles,
+    camera: Camera,
+    buffers: frozenset[str],
+    settings: RasterSettings,
+) -> dict[str, Tensor]:
+    """The images asked for, [H, W] each, rgb [H, W, 3], on the GPU."""
+    images = {name: _empty(name, camera, splats) for name in buffers | {ALPHA}}
+    least = min(settings.transmittance_stop, TRANSMITTANCE_STOP)
+    per_tile = (TILE // _BLOCK_W) * (TILE // _BLOCK_H)
+    none = images[ALPHA]  # stands for what is not there; nothing is read or written
+    gpu.launch(
+        blend_blocks,
+        (tiles.columns * tiles.rows * per_tile,),
+        splats.records,
+        tiles.members,
+        tiles.starts,
+        none if splats.cuts is None else splats.cuts,
+        none if splats.lights is None else splats.lights,
+        *(images.get(name, none) for name in BUFFERS),
+        camera.width,
+        camera.height,
+        tiles.columns,
+        settings.alpha_max,
+        math.log2(ALPHA_MIN),
+        least,
+        settings.transmittance_stop,
+        float(camera.is_orthographic),
+        settings.mode_depth_floor_m,
+        camera.fx**-2,
+        camera.fy**-2,
+        HAS_CUTS=splats.cuts is not None,
+        HAS_LIGHTS=splats.lights is not None and RGB in images,
+        HAS_RGB=RGB in images,
+        HAS_EXPECTED=EXPECTED_DEPTH in images,
+        HAS_MEDIAN=MEDIAN_DEPTH in images,
+        HAS_IDS=SPLAT_IDS in images,
+        HAS_MODE=MODE_DEPTH in images,
+        HAS_SNOW=SNOW in images,
+        IS_COARSE=settings.transmittance_stop > least,
+        BLOCK_W=_BLOCK_W,
+        BLOCK_H=_BLOCK_H,
+        num_warps=1,
+    )
+    return {name: images[name] for name in buffers}
+
+
+def _empty(name: str, camera: Camera, splats: CudaSplats) -> Tensor:
+    size = (camera.height, camera.width)
+    return torch.empty(
+        (*size, 3) if name == RGB else size,
+        dtype=torch.int32 if name == SPLAT_IDS else torch.float32,
+        device=splats.records.device,
+    )
+
+
+# ---- cuda ----------------------------------------------------------------------------------------
+
+
+def rasterize_cuda(
+    parts: Sequence[PosedGaussians],
+    camera: Camera,
+    buffers: frozenset[str],
+    settings: RasterSettings,
+    smog: SmogMedium | None,
+    clip: HeightClip | None = None,
+    wanted: torch.Tensor | None = None,
+    *,
+    clock: StageClock | None = None,
+) -> RenderOutput:
+    """The image of the parts in float32, on the GPU, without gradients. Arguments are checked by
+    `rasterize`.
+
+    wanted: bool [H, W]; tiles without a wanted pixel are left out and hold zeros. clock: told of
+    "project", "list" and "blend", and of the counts "visible" (splats that touch a tile) and
+    "pairs" (of splats and tiles).
+    """
+    inputs = gather_inputs(parts, camera, settings, smog, clip, with_color=RGB in buffers)
+    splats = project(inputs)
+    if clock is not None:
+        clock.lap("project")
+    tiles = list_tiles(splats, camera, wanted)
+    if clock is not None:
+        clock.lap("list")
+        clock.counts["visible"] = int((splats.counts > 0).sum())
+        clock.counts["pairs"] = len(tiles.members)
+    images = blend(splats, tiles, camera, buffers, settings)
+    if clock is not None:
+        clock.lap("blend")
+    return RenderOutput(**images)

@@ -1,5 +1,0 @@
-"""What the kernels that find seen points are given of a view, on CPU and GPU."""
-
-VIEW = 17  # rotation camera_from_world by rows, fx, cx, fy, centre, 1 where orthographic, cy
-CENTRE = 12  # 3 numbers
-PARALLEL = 15
