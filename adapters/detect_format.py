@@ -121,7 +121,7 @@ _TREES: dict[str, Callable[[Path, dict[str, str]], _Found]] = {
 
 # ---- signatures ----------------------------------------------------------------------------------
 
-_MOST_ENTRIES = 1000  # of a folder that are looked at below the one given
+_MAX_ENTRIES = 1000  # of a folder that are looked at below the one given
 _MAX_LISTED = 1_000_000  # names of a folder: some tenths of a second
 _MULTI_PART = b"element vertex_"  # how a Street Gaussians .ply names its parts
 
@@ -161,7 +161,7 @@ def looked_for(path: Path) -> str:
 
 def _scenes_below(folder: Path) -> Iterator[Path]:
     for level in ("*", "*/*"):
-        for entry in sorted(itertools.islice(folder.glob(level), _MOST_ENTRIES)):
+        for entry in sorted(itertools.islice(folder.glob(level), _MAX_ENTRIES)):
             with contextlib.suppress(OSError, AdapterError):  # another user's
                 if entry.is_dir() and recognised(entry) is not None:
                     yield entry

@@ -158,9 +158,9 @@ _SAME_WAY = math.cos(math.radians(25.0))  # of surface and plane
 _OTHER_WAY = math.cos(math.radians(30.0))  # of planes that would make another up
 _MUCH_BELOW = 0.05  # of the surface under a plane: it is not the ground
 _COUNTERPART = 1.25  # above 1: of two facades that face each other one has more gaps
-_LEAST_SHARE, _LEAST_LEAD = 0.05, 4.0
+_MIN_SHARE, _MIN_LEAD = 0.05, 4.0
 _SNAP_DEG = 3.0  # a road's slope; a world that is turned at random rarely comes this close
-_FEWEST_POINTS = 100
+_MIN_POINTS = 100
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,7 +178,7 @@ class GroundFound:
 
     @property
     def is_clear(self) -> bool:
-        return self.share - self.above >= _LEAST_SHARE and self.lead >= _LEAST_LEAD
+        return self.share - self.above >= _MIN_SHARE and self.lead >= _MIN_LEAD
 
     @property
     def sentence(self) -> str:
@@ -199,7 +199,7 @@ def find_ground(gaussians: Gaussians, *, near: np.ndarray | None = None) -> Grou
     """
     points = solid_points(gaussians)
     points = points[in_bulk(points, 3.0)]
-    if len(points) < _FEWEST_POINTS:
+    if len(points) < _MIN_POINTS:
         return None
     surface = _Surface.of(points - points.mean(axis=0))
     if surface is None:
@@ -356,7 +356,7 @@ _UP_TOLERANCE_DEG = 30.0
 _LEVEL_TOLERANCE_DEG = 15.0  # cameras on a car lean less; this vouches for an axis, not for degrees
 _ITERATION = re.compile(r"iteration_(\d+)")
 _SAMPLED_VIEWS, _SAMPLED_POINTS = 16, 20_000
-_LEAST_SEEN = 0.001
+_MIN_SEEN = 0.001
 
 
 def open_gaussians(path: str | Path, query: dict[str, str]) -> Scene:
@@ -606,7 +606,7 @@ def _check_views_see(points: np.ndarray, frames: tuple[Frame, ...]) -> list[str]
         v = camera.fy * y[ahead] / z[ahead] + camera.cy
         seen = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
         shares.append(seen.sum() / len(points))
-    if np.median(shares) >= _LEAST_SEEN:
+    if np.median(shares) >= _MIN_SEEN:
         return []
     return [
         f"the cameras see {np.median(shares):.2%} of the Gaussians (median): camera file and splat "

@@ -10,7 +10,7 @@ from recipes.files import open_file
 _ENDS = ((b"\x89PNG\r\n\x1a\n", b"IEND"), (b"\xff\xd8", b"\xff\xd9"))
 
 
-def look_at_image(path: Path) -> tuple[int, int] | str:
+def read_image_size(path: Path) -> tuple[int, int] | str:
     """Width and height of a PNG or JPEG, decoded once to be sure of it, or what is wrong with it as
     the end of a sentence."""
     try:

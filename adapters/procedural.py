@@ -38,7 +38,7 @@ from augment.scene import Actor, Scene
 logger = logging.getLogger(__name__)
 
 EYE_STEP_M = 2.0
-MOST_EYES = 40
+MAX_EYES = 40
 
 
 def open_procedural(query: Mapping[str, str]) -> Scene:
@@ -101,7 +101,7 @@ def _eyes(parameters: StreetParameters) -> tuple[np.ndarray, np.ndarray]:
     """Places [E, 3] of the cameras along the drive, and the times [E] they are there."""
     first, last = frame_time_ns(0), frame_time_ns(parameters.frames - 1)
     length = parameters.speed_mps * (last - first) * 1e-9
-    count = int(np.clip(np.ceil(length / EYE_STEP_M) + 1, 1, MOST_EYES))
+    count = int(np.clip(np.ceil(length / EYE_STEP_M) + 1, 1, MAX_EYES))
     times = np.linspace(0, last - first, count).round().astype(np.int64) + first
     return camera_path(parameters, times), times
 

@@ -32,7 +32,7 @@ NOT_COUNTED = -1  # in place of a number of pixels
 # recorded drive that makes 1.2 % road, where all of the box has 6.1 % and 4 cm less have 3.5 %, and
 # costs 0.3 % of the vehicles'. A low box keeps three quarters.
 BOTTOM_M = 0.08
-MOST_OF_HEIGHT = 0.25
+MAX_OF_HEIGHT = 0.25
 # On the other five sides boxes are drawn tight (mirrors and bumpers reach beyond them), and splats
 # blur a surface by a few centimetres.
 SIDES_M = 0.10
@@ -132,7 +132,7 @@ class PlacedBoxes:
         centres = np.where(finite[:, None], boxes.centers_m - world_origin_m, 0.0)
         sizes = np.where(finite[:, None], boxes.sizes_m, 0.0)
         low, high = -sizes / 2 - SIDES_M, sizes / 2 + SIDES_M
-        low[:, 2] = -sizes[:, 2] / 2 + np.minimum(BOTTOM_M, MOST_OF_HEIGHT * sizes[:, 2])
+        low[:, 2] = -sizes[:, 2] / 2 + np.minimum(BOTTOM_M, MAX_OF_HEIGHT * sizes[:, 2])
         corners = _to_world(centres, rotations, CORNERS * sizes[:, None, :])
         return PlacedBoxes(finite, centres, sizes, rotations, low, high, corners)
 

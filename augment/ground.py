@@ -49,7 +49,7 @@ _REACHES_M = (6.0, 16.0, math.inf)  # beside the path; beyond its ends, at least
 _BEYOND_M = 20.0
 _CELL_M, _CELLS_A_SIDE = 0.5, 200
 _LOW_QUANTILE = 0.1  # in a cell; LiDAR has stray returns below the ground, splats even more
-_FEWEST, _LEAST_SHARE = 30, 0.25  # of the low points, on a plane that is believed
+_FEWEST, _MIN_SHARE = 30, 0.25  # of the low points, on a plane that is believed
 _ITERATIONS, _TRIES = 500, 3  # a quarter of the points on a plane: missed once in 2600 times
 _SEED = 20260101
 
@@ -118,7 +118,7 @@ def _low_points(points: np.ndarray) -> np.ndarray:
 def _level_plane(o3d: Any, points: np.ndarray) -> np.ndarray | None:
     """Unit normal and offset [4] of the nearly level plane with the most points; None if no such
     plane has enough of them."""
-    fewest = max(_FEWEST, math.ceil(_LEAST_SHARE * len(points)))
+    fewest = max(_FEWEST, math.ceil(_MIN_SHARE * len(points)))
     for _ in range(_TRIES):
         if len(points) < fewest:
             return None
@@ -144,9 +144,9 @@ ROAD_CLASSES = (SemanticClass.ROAD, SemanticClass.LANE_MARKING)
 CAMERA_HEIGHT_M = 1.5  # a guess: on a car, cameras are 1.2 m to 2 m above the road
 # Cameras this far above the ego origin stand on a car whose origin is on the road, or near it.
 _EGO_ON_ROAD_M = 0.8
-_SWEEP_EVERY_M, _FEWEST_SWEEPS, _MOST_SWEEPS = 20.0, 3, 24
+_SWEEP_EVERY_M, _MIN_SWEEPS, _MAX_SWEEPS = 20.0, 3, 24
 _SOLID_OPACITY = 0.3  # fainter Gaussians are haze and leftovers of training
-_MOST_POINTS = 600_000
+_MAX_POINTS = 600_000
 
 _measured: WeakKeyDictionary[Scene, Ground] = WeakKeyDictionary()
 
@@ -275,7 +275,7 @@ def _lidar(scene: Scene, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 def _spread_frames(scene: Scene, positions: np.ndarray) -> Iterator[int]:
     """Numbers of frames spread over the drive, enough that their sweeps overlap."""
     length = float(np.hypot(*np.diff(positions[:, :2], axis=0).T).sum())
-    count = min(_MOST_SWEEPS, _FEWEST_SWEEPS + int(length / _SWEEP_EVERY_M), len(scene.frames))
+    count = min(_MAX_SWEEPS, _MIN_SWEEPS + int(length / _SWEEP_EVERY_M), len(scene.frames))
     for place in np.unique(np.linspace(0, len(scene.frames) - 1, count).round().astype(int)):
         yield scene.frames[place].index
 
@@ -297,7 +297,7 @@ def _below_cameras(scene: Scene) -> np.ndarray:
     tops = [float(c.centre[2]) for frame in scene.frames for c in frame.cameras.values()]
     if tops:
         keep = keep[means[keep, 2] < max(tops)]
-    return means[keep[:: 1 + len(keep) // _MOST_POINTS]].astype(np.float64)
+    return means[keep[:: 1 + len(keep) // _MAX_POINTS]].astype(np.float64)
 
 
 def _from_planes(
@@ -307,7 +307,7 @@ def _from_planes(
     if len(points) == 0:
         return None
     try:
-        found = ground_points(points[:: 1 + len(points) // _MOST_POINTS], positions)
+        found = ground_points(points[:: 1 + len(points) // _MAX_POINTS], positions)
     except BackendUnavailable as error:
         logger.warning("the road is not looked for among unlabelled points: %s", error)
         return None

@@ -21,9 +21,9 @@ LEVEL_M = 6.0  # a road this far above or below the car is another one
 # Half widths of the corridor across and along the path. A LiDAR sees no road right below itself,
 # so that beside a short path the road must be sought further away.
 _REACHES_M = ((2.5, STRETCH_M / 2), (4.0, 4.0), (8.0, 8.0), (16.0, 16.0), (math.inf, math.inf))
-_FEWEST_IN_STRETCH = 20
-_FEWEST_IN_ALL = 200  # some returns near a sensor are mislabelled: a few are not enough
-_MOST_POINTS = 400_000
+_MIN_IN_STRETCH = 20
+_MIN_IN_ALL = 200  # some returns near a sensor are mislabelled: a few are not enough
+_MAX_POINTS = 400_000
 _STANDING_M = 0.5  # positions nearer to each other are noise of a car that stands
 _STEEPEST = 0.15  # rise over run; no road is steeper over a stretch
 
@@ -113,8 +113,8 @@ def measure_ground(
     level_m: points further above or below the path are another road's.
     """
     stretches = Stretches.of(positions)
-    points = np.asarray(points[:: 1 + len(points) // _MOST_POINTS], np.float64)
-    if len(points) < _FEWEST_IN_ALL:
+    points = np.asarray(points[:: 1 + len(points) // _MAX_POINTS], np.float64)
+    if len(points) < _MIN_IN_ALL:
         return None
     located = stretches.locate(points)
     level = np.abs(points[:, 2] - stretches.middles[located.stretch, 2]) <= level_m
@@ -145,7 +145,7 @@ def _widest_known(located: LocatedPoints, level: np.ndarray, count: int) -> dict
     best: dict[int, np.ndarray] = {}
     for across_m, along_m in _REACHES_M:
         groups = _by_stretch(located, level & located.within(across_m, along_m))
-        if len(groups) > len(best) and sum(map(len, groups.values())) >= _FEWEST_IN_ALL:
+        if len(groups) > len(best) and sum(map(len, groups.values())) >= _MIN_IN_ALL:
             best = groups
         if 2 * len(best) >= count:
             break
@@ -160,7 +160,7 @@ def _by_stretch(located: LocatedPoints, chosen: np.ndarray) -> dict[int, np.ndar
     return {
         int(number): part
         for number, part in zip(numbers, parts, strict=False)  # no numbers still have one part
-        if len(part) >= _FEWEST_IN_STRETCH
+        if len(part) >= _MIN_IN_STRETCH
     }
 
 

@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from augment.cameras import Camera
 from augment.effects.flood.flood import FloodMedium
-from augment.effects.flood.flood_view import COARSE, MOST_MARGIN, MOST_SHIFT
+from augment.effects.flood.flood_view import COARSE, MAX_MARGIN, MAX_SHIFT
 from augment.effects.flood.water_plane import mirrored_camera, plane_window
 from augment.effects.flood.waves import make_waves
 from augment.effects.smog import SmogMedium
@@ -39,16 +39,16 @@ from augment.render.buffers import (
 from augment.render.constants import ALPHA_MIN, MAX_EXTENT_SIGMAS, TAN_FOV_MARGIN, RasterSettings
 from augment.scene import Actor, Gaussians, Scene
 from recipes.errors import RecipeError
-from recipes.schema import schema_Recipe
+from recipes.schema import Recipe
 from recipes.weather import Style
 
 # ------------------------------------------------------------------------------------------------
 # A recipe's weather put into a scene: heights and reasons become numbers that kernels take
 
-LEAST_DEPTH_M = 0.05  # waves run in at least this much water
+MIN_DEPTH_M = 0.05  # waves run in at least this much water
 
 
-def place_style(recipe: schema_Recipe) -> tuple[Style | None, str]:
+def place_style(recipe: Recipe) -> tuple[Style | None, str]:
     """The recipe's style, or None where it would change nothing; and why."""
     style = recipe.style
     if style is None:
@@ -59,7 +59,7 @@ def place_style(recipe: schema_Recipe) -> tuple[Style | None, str]:
     return style, f"{style.method} from {source} at strength {style.strength:g}"
 
 
-def place_smog(recipe: schema_Recipe, scene: Scene) -> tuple[SmogMedium | None, str]:
+def place_smog(recipe: Recipe, scene: Scene) -> tuple[SmogMedium | None, str]:
     """The recipe's smog in the scene's heights, or None where it would change nothing; and why."""
     smog = recipe.weather.smog
     if smog is None:
@@ -82,7 +82,7 @@ def place_smog(recipe: schema_Recipe, scene: Scene) -> tuple[SmogMedium | None, 
     return SmogMedium(smog.sigma_per_m, smog.color, smog.scale_height_m, base_z_m), reason
 
 
-def place_flood(recipe: schema_Recipe, scene: Scene) -> tuple[FloodMedium | None, str]:
+def place_flood(recipe: Recipe, scene: Scene) -> tuple[FloodMedium | None, str]:
     """The recipe's flood at its height in the scene, or None without one; and why.
 
     Raises:
@@ -94,7 +94,7 @@ def place_flood(recipe: schema_Recipe, scene: Scene) -> tuple[FloodMedium | None
     ground = ground_of(scene)
     bases = {"lowest": ground.lowest_z_m, "median": ground.median_z_m, "absolute": 0.0}
     level_z_m = bases[flood.reference] + flood.level_m
-    depth_m = max(level_z_m - ground.lowest_z_m, LEAST_DEPTH_M)
+    depth_m = max(level_z_m - ground.lowest_z_m, MIN_DEPTH_M)
     seed = recipe.seed if flood.waves.seed is None else flood.waves.seed
     medium = FloodMedium(
         level_z_m=level_z_m,
@@ -114,7 +114,7 @@ def place_flood(recipe: schema_Recipe, scene: Scene) -> tuple[FloodMedium | None
 
 
 def place_snow(
-    recipe: schema_Recipe, scene: Scene, water_level_z_m: float | None
+    recipe: Recipe, scene: Scene, water_level_z_m: float | None
 ) -> tuple[PlacedSnow | None, str]:
     """The recipe's snow in the scene, or None where it would change nothing; and why.
 
@@ -238,7 +238,7 @@ class Plan:
         }
 
 
-def make_plan(recipe: schema_Recipe, scene: Scene) -> Plan:
+def make_plan(recipe: Recipe, scene: Scene) -> Plan:
     """The passes that `recipe` requires of `scene`.
 
     Raises:
@@ -268,12 +268,12 @@ def make_plan(recipe: schema_Recipe, scene: Scene) -> Plan:
         for_images |= {ALPHA, SPLAT_IDS}
     if recipe.output.instance and finds_boxes and not depth_buffer:
         for_images.add(EXPECTED_DEPTH)
-    snowless, bare_buffers = {RGB, ALPHA} | for_images, set[str]()
+    without_snow, bare_buffers = {RGB, ALPHA} | for_images, set[str]()
     if snow is not None and recipe.output.surface == "scene":
-        snowless, bare_buffers = {RGB, ALPHA}, for_images
-    if (smog and not per_gaussian) or (finds_boxes and depth_buffer not in snowless):
-        snowless.add(EXPECTED_DEPTH)
-    buffers = snowless | {SNOW} if snow is not None else set(snowless)
+        without_snow, bare_buffers = {RGB, ALPHA}, for_images
+    if (smog and not per_gaussian) or (finds_boxes and depth_buffer not in without_snow):
+        without_snow.add(EXPECTED_DEPTH)
+    buffers = without_snow | {SNOW} if snow is not None else set(without_snow)
     settings = RasterSettings(
         near_m=recipe.render.near_m,
         alpha_max=recipe.render.alpha_max,
@@ -287,7 +287,7 @@ def make_plan(recipe: schema_Recipe, scene: Scene) -> Plan:
     return Plan(
         settings=settings,
         buffers=frozenset(buffers),
-        snowless_buffers=frozenset(snowless),
+        snowless_buffers=frozenset(without_snow),
         smog_in_splats=smog if per_gaussian else None,
         smog_on_buffers=None if per_gaussian else smog,
         depth_buffer=depth_buffer,
@@ -390,7 +390,7 @@ def _snow_steps(snow: PlacedSnow | None, reason: str, bare_buffers: set[str]) ->
     )
 
 
-def _exposure_step(recipe: schema_Recipe, scene: Scene) -> Step:
+def _exposure_step(recipe: Recipe, scene: Scene) -> Step:
     name = "camera colour map"
     mapped = scene.mapped_cameras
     if not mapped:
@@ -401,7 +401,7 @@ def _exposure_step(recipe: schema_Recipe, scene: Scene) -> Step:
     return Step(name, True, why)
 
 
-def _asked(name: str, recipe: schema_Recipe) -> str:
+def _asked(name: str, recipe: Recipe) -> str:
     return f"output.{name} is {str(getattr(recipe.output, name)).lower()}"
 
 
@@ -619,8 +619,8 @@ def cover_for(plan: Plan, scene: Scene, *, backend: str = AUTO) -> SnowCover | N
     """The plan's snow as it lies in the scene; None without one. backend: see cover_of."""
     if plan.snow is None:
         return None
-    worn = None if plan.style is None or plan.styles_picture else look_of(scene, plan.style)
-    return cover_of(scene, plan.snow, worn, backend=backend)
+    style_parts = None if plan.style is None or plan.styles_picture else look_of(scene, plan.style)
+    return cover_of(scene, plan.snow, style_parts, backend=backend)
 
 
 def _water(plan: Plan, camera: Camera) -> tuple[bool, str | None]:
@@ -637,10 +637,10 @@ def _water(plan: Plan, camera: Camera) -> tuple[bool, str | None]:
 def _lookers(plan: Plan, camera: Camera) -> tuple[Camera, ...]:
     """Cameras that see, between them, what the layers of a view with water can show."""
     assert plan.flood is not None
-    wide = _grown(camera, MOST_SHIFT * camera.height + _SPARE_PX)
+    wide = _grown(camera, MAX_SHIFT * camera.height + _SPARE_PX)
     if plan.flood.reflection == "sky" or float(camera.centre[2]) <= plan.flood.level_z_m:
         return (wide,)
-    margin = MOST_MARGIN * max(camera.width, camera.height) + _SPARE_PX / COARSE
+    margin = MAX_MARGIN * max(camera.width, camera.height) + _SPARE_PX / COARSE
     return wide, _grown(mirrored_camera(camera, plan.flood.level_z_m), margin)
 
 

@@ -16,7 +16,7 @@ from types import TracebackType
 import torch
 
 
-class Laps:
+class StageTimer:
     """seconds: by name, without what laps inside a lap took."""
 
     def __init__(self) -> None:
@@ -43,21 +43,21 @@ class Laps:
         self._since = now
 
 
-_listening: ContextVar[Laps | None] = ContextVar("laps", default=None)
+_listening: ContextVar[StageTimer | None] = ContextVar("laps", default=None)
 
 
-class lap:
+class timed:
     """Counts what runs inside under a name, where somebody listens."""
 
-    __slots__ = ("_laps", "_name")
+    __slots__ = ("_name", "_timer")
 
     def __init__(self, name: str) -> None:
         self._name = name
-        self._laps = _listening.get()
+        self._timer = _listening.get()
 
     def __enter__(self) -> None:
-        if self._laps is not None:
-            self._laps.start(self._name)
+        if self._timer is not None:
+            self._timer.start(self._name)
 
     def __exit__(
         self,
@@ -65,14 +65,14 @@ class lap:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        if self._laps is not None:
-            self._laps.stop()
+        if self._timer is not None:
+            self._timer.stop()
 
 
 @contextmanager
 def stopwatch() -> Iterator[dict[str, float]]:
     """Seconds of the laps that run inside, in this thread or task, by name."""
-    laps = Laps()
+    laps = StageTimer()
     before = _listening.set(laps)
     try:
         yield laps.seconds

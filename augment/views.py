@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from augment.cameras import Camera
-from augment.effects.flood.flood_view import Painter, render_flooded
+from augment.effects.flood.flood_view import LayerRenderer, render_flooded
 from augment.effects.flood.water_plane import plane_depth
 from augment.effects.smog import SmogMedium, fog_raster
 from augment.effects.style.style import look_of
@@ -23,8 +23,8 @@ from augment.render.rasterize import rasterize
 from augment.scene import PosedGaussians, Scene
 from augment.semantics import SemanticClass
 from augment.sky import Sky
-from augment.timing import lap
-from recipes.schema import schema_Recipe
+from augment.timing import timed
+from recipes.schema import Recipe
 
 # ---- views ---------------------------------------------------------------------------------------
 
@@ -32,7 +32,7 @@ SURFACE_ALPHA = 0.5  # a pixel less covered than this shows more sky than surfac
 
 
 @dataclass(frozen=True, eq=False)
-class BareBuffers:
+class SnowFreeBuffers:
     """What images show of a scene without its snow: see the same fields of WeatheredBuffers."""
 
     raster: RenderOutput
@@ -60,7 +60,7 @@ class WeatheredBuffers:
     view: ViewPlan
     water: Bool[Tensor, "H W"] | None = None
     snow: Bool[Tensor, "H W"] | None = None
-    bare: BareBuffers | None = None
+    bare: SnowFreeBuffers | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,7 +187,7 @@ class ViewImages:
 
 
 @dataclass(frozen=True, eq=False)
-class Wanted:
+class RequestedImages:
     """What of a view's buffers becomes images.
 
     shown: the surfaces that depth, semantic and instance images show, and the parts that its
@@ -217,19 +217,19 @@ def begin_images(view: WeatheredBuffers, plan: Plan, *, backend: str) -> Callabl
     if kernels_for(backend, wanted.rgb.detach()) == CUDA:
         from augment.render.cuda.images import begin_cuda_images
 
-        with lap("images"):
+        with timed("images"):
             return begin_cuda_images(wanted, view.camera)
     images = _images(wanted, view)
     return lambda: images
 
 
-def _wanted(view: WeatheredBuffers, plan: Plan) -> Wanted:
+def _wanted(view: WeatheredBuffers, plan: Plan) -> RequestedImages:
     shown = view.bare or view  # the scene's surfaces that the other images show
     first = view.water if plan.shows_water else None
     in_air = plan.flood is not None and float(view.camera.centre[2]) > plan.flood.level_z_m
     paints_boxes = plan.instance and plan.finds_boxes  # by depth and class of what is shown
     shows_depth = plan.depth_buffer is not None or (paints_boxes and view.bare is not None)
-    return Wanted(
+    return RequestedImages(
         rgb=view.rgb,
         shown=shown.raster,
         parts=shown.parts,
@@ -244,30 +244,30 @@ def _wanted(view: WeatheredBuffers, plan: Plan) -> Wanted:
     )
 
 
-def _images(wanted: Wanted, view: WeatheredBuffers) -> ViewImages:
+def _images(wanted: RequestedImages, view: WeatheredBuffers) -> ViewImages:
     """The definition, on the CPU."""
     semantic = instance = depth = None
     first, parts = wanted.first, wanted.parts
     if wanted.semantic:
-        with lap("semantic image"):
+        with timed("semantic image"):
             table = semantic_table(parts)
             semantic = _look_up(wanted.shown, table, int(SemanticClass.SKY), np.uint8)
             if first is not None:
                 semantic[first.numpy()] = int(SemanticClass.WATER)
     if wanted.instance:
-        with lap("instance image"):
+        with timed("instance image"):
             instance = _look_up(wanted.shown, instance_table(parts), 0, np.uint16)
             if first is not None:
                 instance[first.numpy()] = 0
     if wanted.depth_m is not None:
         depth = wanted.depth_m
         if first is not None:
-            with lap("depth image"):
+            with timed("depth image"):
                 surface = torch.zeros_like(depth)
                 if wanted.plane_z_m is not None:
                     surface = plane_depth(view.camera, wanted.plane_z_m).to(depth.dtype)
                 depth = torch.where(first, surface, depth)
-    with lap("8 bits"):
+    with timed("8 bits"):
         rgb = quantise(wanted.rgb)
     return ViewImages(
         rgb=rgb,
@@ -318,7 +318,7 @@ def _look_up(raster: RenderOutput, table: np.ndarray, none: int, dtype: type) ->
 
 
 def render_view(
-    scene: Scene, camera: Camera, recipe: schema_Recipe, *, backend: str = AUTO
+    scene: Scene, camera: Camera, recipe: Recipe, *, backend: str = AUTO
 ) -> WeatheredView:
     """The view of `camera` (before recipe.render.scale) under the recipe's weather, in 8 bits.
 
@@ -327,15 +327,13 @@ def render_view(
     return begin_view(scene, camera, recipe, backend=backend).result()
 
 
-def begin_view(
-    scene: Scene, camera: Camera, recipe: schema_Recipe, *, backend: str = AUTO
-) -> PendingView:
+def begin_view(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str = AUTO) -> PendingView:
     """The view of `render_view`, begun: its `result` waits for what the GPU has still to do. In the
     meantime another view can be begun.
     """
     if backend == AUTO:
         backend = choose_backend(backend, scene)
-    with lap("plan"):
+    with timed("plan"):
         plan = make_plan(recipe, scene)
     buffers = render_buffers(scene, camera.scaled(recipe.render.scale), plan, backend=backend)
     images = begin_images(buffers, plan, backend=backend)
@@ -347,22 +345,22 @@ def render_buffers(
     scene: Scene, camera: Camera, plan: Plan, *, backend: str = "auto"
 ) -> WeatheredBuffers:
     """The view of `camera` at its own resolution, as floats."""
-    with lap("view plan"):
+    with timed("view plan"):
         view = plan_view(plan, scene, camera, backend=backend)
-    with lap("parts"):
+    with timed("parts"):
         look = None if plan.style is None else look_of(scene, plan.style)
-        worn = None if plan.styles_picture else look
+        style_parts = None if plan.styles_picture else look
         parts = bare_parts = scene.parts_for(camera, view.actors)
     cover = cover_for(plan, scene, backend=backend) if view.snow else None
     if cover is not None:
-        with lap("snow: placement and layer"):
+        with timed("snow: placement and layer"):
             parts = cover.parts_for(scene, camera, parts, view.snowy, backend=backend)
     sky = scene.sky
-    if worn is not None:
-        parts, sky = worn.on(parts, backend=backend), worn.sky
+    if style_parts is not None:
+        parts, sky = style_parts.on(parts, backend=backend), style_parts.sky
     flooded = None
     if plan.flood is not None and view.water:
-        painter = Painter(
+        painter = LayerRenderer(
             parts, sky, plan.settings, plan.smog_in_splats, plan.smog_on_buffers, backend
         )
         flooded = render_flooded(painter, camera, plan.flood, view.buffers)
@@ -373,14 +371,14 @@ def render_buffers(
     else:
         rgb, raster = _without_water(sky, parts, camera, plan, view.buffers, backend)
     if look is not None and plan.styles_picture:
-        with lap("style on the picture"):
+        with timed("style on the picture"):
             rgb = map_colors(rgb, look.maps.picture, backend=backend)
     color_map = scene.color_map(camera) if plan.recorded_exposure else None
     if color_map is not None:  # a camera exposes what the weather has left, so this comes last
-        with lap("camera colour map"):
+        with timed("camera colour map"):
             rgb = map_colors(rgb, color_map, backend=backend)
     water = None if flooded is None else flooded.water
-    with lap("depth of surfaces"):
+    with timed("depth of surfaces"):
         depth_m = _surface_depth(raster, plan, plan.buffers)
     return WeatheredBuffers(
         camera,
@@ -421,18 +419,18 @@ def _bare(
     plan: Plan,
     view: ViewPlan,
     backend: str,
-) -> BareBuffers | None:
+) -> SnowFreeBuffers | None:
     """What images show of the scene without its snow. raster: of the picture, which is that scene
     where the view has no pass for it.
     """
     if not plan.bare_buffers:
         return None
     if view.bare_buffers:
-        with lap("snow: bare surface"):
+        with timed("snow: bare surface"):
             raster = rasterize(
                 parts, camera, buffers=view.bare_buffers, settings=plan.settings, backend=backend
             )
-    return BareBuffers(raster, _surface_depth(raster, plan, plan.bare_buffers), parts)
+    return SnowFreeBuffers(raster, _surface_depth(raster, plan, plan.bare_buffers), parts)
 
 
 def _without_water(
@@ -443,7 +441,7 @@ def _without_water(
     buffers: frozenset[str],
     backend: str,
 ) -> tuple[Tensor, RenderOutput]:
-    with lap("rasterise"):
+    with timed("rasterise"):
         raster = rasterize(
             parts,
             camera,
@@ -455,17 +453,15 @@ def _without_water(
     assert raster.rgb is not None and raster.alpha is not None
     rgb = raster.rgb
     if plan.smog_on_buffers is not None:
-        with lap("smog on buffers"):
+        with timed("smog on buffers"):
             rgb = fog_raster(raster, camera, plan.smog_on_buffers, backend=backend)
     uniform = plan.smog is not None and plan.smog.scale_height_m is None  # hides the sky
-    with lap("airlight behind the splats" if uniform else "sky"):
+    with timed("airlight behind the splats" if uniform else "sky"):
         rgb = composite_sky(rgb, raster.alpha, camera, sky, smog=plan.smog, backend=backend)
     return rgb, raster
 
 
-def _weathered(
-    images: ViewImages, camera: Camera, plan: Plan, recipe: schema_Recipe
-) -> WeatheredView:
+def _weathered(images: ViewImages, camera: Camera, plan: Plan, recipe: Recipe) -> WeatheredView:
     """The images with what labels are measured from."""
     weather, depth = recipe.weather, images.scene_depth_m
     flood = snowy = smoggy = None

@@ -16,14 +16,14 @@ from io import BufferedReader
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from recipes.errors import RecipeError, nearest_word, short
-from recipes.schema import schema_Recipe
+from recipes.schema import Recipe
 from recipes.weather import FILES, Style
 
 MAX_MIB = 512  # of one file
-MOST_NAMES = 1000  # of files in a folder, to guess a misspelt one from
+MAX_NAMES = 1000  # of files in a folder, to guess a misspelt one from
 
 
-def with_digest(recipe: schema_Recipe) -> schema_Recipe:
+def with_digest(recipe: Recipe) -> Recipe:
     """The recipe with the digest of its style's files; the same object where there is none.
 
     Raises:
@@ -175,7 +175,7 @@ def _near(path: Path) -> str | None:
     """What of the folder may have been meant."""
     try:
         with os.scandir(path.parent) as entries:
-            names = [entry.name for entry, _ in zip(entries, range(MOST_NAMES), strict=False)]
+            names = [entry.name for entry, _ in zip(entries, range(MAX_NAMES), strict=False)]
     except OSError:
         return None
     near = nearest_word(path.name, tuple(sorted(names)))

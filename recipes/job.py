@@ -26,7 +26,7 @@ from recipes.change import changed
 from recipes.errors import Problems, RecipeError, nearest_word, short
 from recipes.files import open_file
 from recipes.load import load_recipe, preset_names
-from recipes.schema import parse_frames, schema_Recipe
+from recipes.schema import Recipe, parse_frames
 from recipes.template import RecipeTemplate
 from recipes.weather import Closed, Number, Whole
 from recipes.yaml_tree import ListNode, MapNode, Node, ScalarNode, plain, read_tree
@@ -132,7 +132,7 @@ class JobRecipes:
     job: Job
     templates: dict[str, RecipeTemplate]
 
-    def of_scene(self, entry: JobScene, scene_name: str) -> list[schema_Recipe]:
+    def of_scene(self, entry: JobScene, scene_name: str) -> list[Recipe]:
         """The recipes in numbers that a scene is rendered under.
 
         Raises:
@@ -236,7 +236,7 @@ def seed_for_scene(seed: int, scene_name: str) -> int:
     return int.from_bytes(digest[:8], "big") >> 1
 
 
-def scaled_recipe(recipe: schema_Recipe, scale: float) -> schema_Recipe:
+def scaled_recipe(recipe: Recipe, scale: float) -> Recipe:
     """The recipe at another resolution, recorded as its render.scale.
 
     Raises:

@@ -11,7 +11,7 @@ import yaml
 from recipes.errors import RecipeError, nearest_word
 from recipes.files import open_file
 from recipes.parse import parse_recipe
-from recipes.schema import free_knobs, schema_Recipe
+from recipes.schema import Recipe, free_knobs
 from recipes.template import RecipeTemplate, is_number
 
 # ---- A recipe in numbers -> the YAML that reads back as the same recipe --------------------------
@@ -32,7 +32,7 @@ def _sequence(dumper: _Dumper, data: tuple[object, ...]) -> yaml.Node:
 _Dumper.add_representer(tuple, _sequence)
 
 
-def dump_recipe(recipe: schema_Recipe) -> str:
+def dump_recipe(recipe: Recipe) -> str:
     """YAML with every field written out, defaults included, and the hash in a comment.
 
     `parse_recipe(dump_recipe(r), ...).resolve(0)` equals r: floats keep all their bits, and the

@@ -107,9 +107,9 @@ TIERS = MappingProxyType(
 # The knobs that trade speed for accuracy: every field of a recipe that does, with its values
 # What each value costs and saves is measured by `climategs bench trade`; docs/trade.md has figures.
 
-Recipe = TypeVar(
-    "Recipe", bound=BaseModel
-)  # recipes.schema.schema_Recipe, which is made with this table
+RecipeT = TypeVar(
+    "RecipeT", bound=BaseModel
+)  # recipes.schema.Recipe, which is made with this table
 Value = float | int | str | bool | None
 
 
@@ -230,7 +230,7 @@ def settings_of(recipe: BaseModel) -> dict[str, Value]:
     return {knob.path: found(recipe, knob.path) for knob in knobs_of(recipe)}
 
 
-def with_settings(recipe: Recipe, settings: Mapping[str, Value]) -> Recipe:
+def with_settings(recipe: RecipeT, settings: Mapping[str, Value]) -> RecipeT:
     """The recipe with some knobs set, which count as given from then on.
 
     Raises:
@@ -245,7 +245,7 @@ def tier_settings(recipe: BaseModel, tier: str) -> dict[str, Value]:
     return {knob.path: chosen.get(knob.path, knob.reference) for knob in free_knobs(recipe)}
 
 
-def as_reference(recipe: Recipe) -> Recipe:
+def as_reference(recipe: RecipeT) -> RecipeT:
     """The recipe with all its knobs that a tier may set at reference, given or not."""
     return with_settings(recipe, {k.path: k.reference for k in knobs_of(recipe) if k.chosen})
 
@@ -500,7 +500,7 @@ class Output(Closed):
     labels: Flag = Field(default=True, description="Pass 3D boxes through.")
 
 
-class schema_Recipe(Closed):
+class Recipe(Closed):
     """A recipe in numbers: together with the package version it determines every pixel."""
 
     version: Literal[1] = Field(default=VERSION, description="Version of the recipe format.")
@@ -525,7 +525,7 @@ class schema_Recipe(Closed):
     output: Output = Output()
 
     @model_validator(mode="after")
-    def _settings_of_tier(self) -> schema_Recipe:
+    def _settings_of_tier(self) -> Recipe:
         """A tier stands for numbers: it is resolved once, here, and stays as a word beside them."""
         if self.quality.tier is not None:
             for path, value in tier_settings(self, self.quality.tier).items():

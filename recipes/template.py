@@ -22,10 +22,10 @@ from pydantic.fields import FieldInfo
 
 from recipes.errors import RecipeError
 from recipes.files import file_below, with_digest
-from recipes.schema import VERSION, schema_Recipe
+from recipes.schema import VERSION, Recipe
 from recipes.weather import (
     FILES,
-    MOST_PER_M,
+    MAX_PER_M,
     Colour,
     Digest,
     FilePath,
@@ -579,7 +579,7 @@ RATE = FieldSpec(
     kind=Kind.NUMBER,
     description="One channel of three rates.",
     annotation=PerMetre,
-    limits=((">=", 0.0), ("<=", MOST_PER_M)),
+    limits=((">=", 0.0), ("<=", MAX_PER_M)),
 )
 ANY_NUMBER = FieldSpec("number", Kind.NUMBER, "", Annotated[Number, Field(allow_inf_nan=False)])
 VARIANTS = FieldSpec(
@@ -594,7 +594,7 @@ VARIANTS = FieldSpec(
 
 
 def _root() -> SectionSpec:
-    root = _section("", schema_Recipe)
+    root = _section("", Recipe)
     root.extra["variants"] = VARIANTS
     assert root.fields["version"].words == (str(VERSION),)
     return root
@@ -629,7 +629,7 @@ class RecipeTemplate:
     lists: tuple[tuple[str, int], ...] = ()
     folder: Path | None = None
 
-    def resolve(self, variant: int) -> schema_Recipe:
+    def resolve(self, variant: int) -> Recipe:
         """The recipe number `variant`, counted from 0.
 
         Its numbers depend on the seed, on first_variant + variant and on each field's own path
@@ -667,7 +667,7 @@ class RecipeTemplate:
         where = f"{self.source}: variant {number}"
         self._find_files(data.get("style"), where)
         try:
-            return with_digest(schema_Recipe.model_validate(data))
+            return with_digest(Recipe.model_validate(data))
         except ValidationError as error:
             raise RecipeError(*(f"{where}: {text}" for text in readable(error))) from None
         except RecipeError as error:

@@ -16,14 +16,14 @@ from recipes.errors import RecipeError, nearest_word
 
 # ---- The types of a recipe's fields, shared by its models ----------------------------------------
 
-MOST_PER_M = 1e6  # a micrometre of it is opaque
+MAX_PER_M = 1e6  # a micrometre of it is opaque
 
 Number = Annotated[float, Strict()]
 Whole = Annotated[int, Strict()]
 Flag = Annotated[bool, Strict()]
 Unit = Annotated[float, Strict(), Field(ge=0.0, le=1.0)]
 Colour = tuple[Unit, Unit, Unit]
-PerMetre = Annotated[float, Strict(), Field(ge=0.0, le=MOST_PER_M)]
+PerMetre = Annotated[float, Strict(), Field(ge=0.0, le=MAX_PER_M)]
 Rates = tuple[PerMetre, PerMetre, PerMetre]
 # In a recipe file a path below its folder; in a recipe in numbers any path.
 FilePath = Annotated[str, Strict(), Field(min_length=1, max_length=4096)]
@@ -270,7 +270,7 @@ class Style(Closed):
 
 # ---- flood ---------------------------------------------------------------------------------------
 
-MOST_WAVES = 64
+MAX_WAVES = 64
 
 # Absorption of pure water at 650, 550 and 450 nm, 1/metre (Pope and Fry 1997).
 PURE_WATER_PER_M = (0.340, 0.0565, 0.00922)
@@ -335,7 +335,7 @@ class Waves(Closed):
         default="calm", description="Spectrum to draw waves from; of no effect beside components."
     )
     count: Whole = Field(
-        default=24, ge=1, le=MOST_WAVES, description="How many waves are drawn from the spectrum."
+        default=24, ge=1, le=MAX_WAVES, description="How many waves are drawn from the spectrum."
     )
     direction_deg: Number = Field(
         default=30.0,
@@ -354,7 +354,7 @@ class Waves(Closed):
     )
     components: tuple[Wave, ...] | None = Field(
         default=None,
-        max_length=MOST_WAVES,
+        max_length=MAX_WAVES,
         description="Waves one by one, in place of a preset's; an empty list is still water.",
     )
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from augment.labels import Boxes, LidarSweep
 from augment.scene import Scene
-from recipes.schema import Output, Smog, Weather, schema_Recipe
+from recipes.schema import Output, Recipe, Smog, Weather
 from recipes.weather import Flood, Snow
 from tests.snow_scenes import drive, sheet
 
@@ -70,7 +70,7 @@ def some_points(count: int = 400, *, seed: int = 0) -> np.ndarray:
     return np.stack([reach * np.cos(angle), reach * np.sin(angle), height], 1)
 
 
-def recipe(smog=None, flood=None, snow=None, **options) -> schema_Recipe:
+def recipe(smog=None, flood=None, snow=None, **options) -> Recipe:
     """A recipe that weathers its LiDAR; visibility_m of the smog, level_m, depth_m, or models."""
     if isinstance(smog, (int, float)):
         smog = Smog(visibility_m=float(smog))
@@ -79,7 +79,7 @@ def recipe(smog=None, flood=None, snow=None, **options) -> schema_Recipe:
     if isinstance(snow, (int, float)):
         snow = Snow(depth_m=float(snow))
     weather = Weather(smog=smog, flood=flood, snow=snow)
-    return schema_Recipe(weather=weather, output=Output(lidar="weather"), **options)
+    return Recipe(weather=weather, output=Output(lidar="weather"), **options)
 
 
 def ranges_of(sweep: LidarSweep) -> np.ndarray:

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from augment.cameras import Camera
-from augment.effects.snow.cells import EDGE_CAP_M, FLUSH, OPEN_EDGE, SnowBed, SnowCells
+from augment.effects.snow.cells import EDGE_CAP_M, FLUSH, OPEN_EDGE, SnowCells, SnowSupport
 from augment.geometry import rigid
 from augment.scene import Actor, Gaussians, Scene
 from augment.semantics import SemanticClass
@@ -80,11 +80,11 @@ def _tensor(values: np.ndarray) -> torch.Tensor:
     return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
 
 
-def bed_of_cells(ground: SnowCells, **actors: SnowCells) -> SnowBed:
-    return SnowBed(ground, actors)
+def bed_of_cells(ground: SnowCells, **actors: SnowCells) -> SnowSupport:
+    return SnowSupport(ground, actors)
 
 
-def level_bed(size_m: float = 10.0, cell_m: float = 0.05, **options) -> SnowBed:
+def level_bed(size_m: float = 10.0, cell_m: float = 0.05, **options) -> SnowSupport:
     """Level ground at z = 0, from (0, 0) to (size_m, size_m)."""
     count = max(1, round(size_m / cell_m))
     return bed_of_cells(cells_on_grid(np.zeros((count, count)), cell_m, **options))

@@ -31,7 +31,7 @@ def raster(
         return gpu(repeats, quick, sections=("raster",), json_file=json_file)
     from tools.bench import bench_raster, bench_text
 
-    return _say(bench_raster(repeats=repeats, quick=quick), bench_text, json_file)
+    return _print_result(bench_raster(repeats=repeats, quick=quick), bench_text, json_file)
 
 
 def gpu(
@@ -76,7 +76,7 @@ def gpu(
     )
     if table is not None:
         write_table(table, result)
-    _say(result, gpu_text, json_file, () if table is None else (table,))
+    _print_result(result, gpu_text, json_file, () if table is None else (table,))
     return int(any("failed" in found for found in result.values() if isinstance(found, dict)))
 
 
@@ -90,7 +90,7 @@ def smog(quick: bool = False, json_file: JsonFile = None) -> int:
     from tools.bench_smog import bench_smog, smog_text
 
     result = bench_smog(cameras=("front",), frames=(5,)) if quick else bench_smog()
-    return _say(result, smog_text, json_file)
+    return _print_result(result, smog_text, json_file)
 
 
 def flood(
@@ -118,7 +118,7 @@ def flood(
         from tools.flood_pictures import draw_flood_pictures
 
         drawn = draw_flood_pictures(pictures)
-    return _say(result, flood_text, json_file, drawn)
+    return _print_result(result, flood_text, json_file, drawn)
 
 
 def snow(
@@ -147,7 +147,7 @@ def snow(
         from tools.snow_pictures import draw_snow_pictures
 
         drawn = draw_snow_pictures(pictures)
-    return _say(result, snow_text, json_file, drawn)
+    return _print_result(result, snow_text, json_file, drawn)
 
 
 def style(
@@ -178,7 +178,7 @@ def style(
         from tools.style_pictures import draw_style_pictures
 
         drawn = draw_style_pictures(pictures, photos=photos)
-    return _say(result, style_text, json_file, drawn)
+    return _print_result(result, style_text, json_file, drawn)
 
 
 def fit(scene: str | None = None, quick: bool = False, json_file: JsonFile = None) -> int:
@@ -191,7 +191,7 @@ def fit(scene: str | None = None, quick: bool = False, json_file: JsonFile = Non
     """
     from tools.bench_fit import bench_fit, fit_text
 
-    return _say(bench_fit(scene, quick=quick), fit_text, json_file)
+    return _print_result(bench_fit(scene, quick=quick), fit_text, json_file)
 
 
 def open_(repeats: int = 7, quick: bool = False, json_file: JsonFile = None) -> int:
@@ -204,7 +204,7 @@ def open_(repeats: int = 7, quick: bool = False, json_file: JsonFile = None) -> 
     """
     from tools.bench_open import bench_open, open_text
 
-    return _say(bench_open(quick=quick, repeats=repeats), open_text, json_file)
+    return _print_result(bench_open(quick=quick, repeats=repeats), open_text, json_file)
 
 
 def trade(
@@ -246,7 +246,7 @@ def trade(
         from tools.trade_plots import draw_trade
 
         drawn += draw_trade(pictures, found.figures, found.pictures)
-    return _say(found.figures, trade_text, json_file, drawn)
+    return _print_result(found.figures, trade_text, json_file, drawn)
 
 
 def generate(repeats: int = 3, quick: bool = False, json_file: JsonFile = None) -> int:
@@ -260,7 +260,7 @@ def generate(repeats: int = 3, quick: bool = False, json_file: JsonFile = None) 
     from tools.bench_generate import QUICK, WHOLE, bench_generate, generate_text
 
     result = bench_generate(QUICK if quick else WHOLE, repeats=repeats)
-    return _say(result, generate_text, json_file)
+    return _print_result(result, generate_text, json_file)
 
 
 def dataset(
@@ -280,7 +280,7 @@ def dataset(
     from tools.bench_dataset import QUICK, WHOLE, bench_dataset, dataset_text
 
     result = bench_dataset(QUICK if quick else WHOLE, folder=folder, repeats=repeats)
-    return _say(result, dataset_text, json_file)
+    return _print_result(result, dataset_text, json_file)
 
 
 def training(
@@ -309,10 +309,10 @@ def training(
         from tools.training_pictures import draw_training_pictures
 
         drawn = list(draw_training_pictures(pictures, trained))
-    return _say(trained.figures, training_text, json_file, drawn)
+    return _print_result(trained.figures, training_text, json_file, drawn)
 
 
-def _say(
+def _print_result(
     result: dict[str, Any],
     text: Callable[[dict[str, Any]], str],
     json_file: Path | None,

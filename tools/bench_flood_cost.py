@@ -22,7 +22,7 @@ from augment.effects.flood.flood import FresnelModel, ReflectionTier
 from augment.plan import Plan, make_plan
 from augment.render.layout import BELOW, HeightClip
 from augment.scene import Scene
-from recipes.schema import Output, schema_Recipe
+from recipes.schema import Output, Recipe
 from tools.bench_flood_error import PICTURE_ONLY, draw, flood_recipe
 from tools.bench_flood_masks import FAR_BELOW_M, looking_up
 from tools.bench_pairs import spread_ms, spread_ratio, time_frame, time_in_turns
@@ -39,7 +39,7 @@ STAGES = {
     "shade_water": "shading",
     "pour": "water and sky behind the front",
     "composite_sky": "sky alone",
-    "both_sides": "buffers of both sides",
+    "merge_depths": "buffers of both sides",
 }
 FRONT, BED, MIRROR, REST = "front layer", "bed layer", "mirror layer", "the rest"
 
@@ -50,8 +50,8 @@ class CostCase:
 
     name: str
     camera: Camera
-    recipe: schema_Recipe
-    clean: schema_Recipe
+    recipe: Recipe
+    clean: Recipe
 
 
 def cost_cases(camera: Camera) -> list[CostCase]:
@@ -60,22 +60,20 @@ def cost_cases(camera: Camera) -> list[CostCase]:
     """
     none, default = PICTURE_ONLY, Output()
     cases = [
-        CostCase(f"{tier}, {waves}", camera, flood_recipe(tier, waves), schema_Recipe(output=none))
+        CostCase(f"{tier}, {waves}", camera, flood_recipe(tier, waves), Recipe(output=none))
         for tier in TIERS
         for waves in ("still", "calm")
     ]
     schlick = flood_recipe("mirrored", "calm", fresnel="schlick")
-    cases.append(CostCase("mirrored, calm, schlick", camera, schlick, schema_Recipe(output=none)))
+    cases.append(CostCase("mirrored, calm, schlick", camera, schlick, Recipe(output=none)))
     for tier in TIERS:
         recipe = flood_recipe(tier, "calm", output=default)
         cases.append(
-            CostCase(
-                f"{tier}, calm, depth and labels", camera, recipe, schema_Recipe(output=default)
-            )
+            CostCase(f"{tier}, calm, depth and labels", camera, recipe, Recipe(output=default))
         )
     up, low = flood_recipe(waves="calm"), flood_recipe(level_m=FAR_BELOW_M)
-    cases.append(CostCase("looking up", looking_up(camera), up, schema_Recipe(output=none)))
-    cases.append(CostCase("level below everything", camera, low, schema_Recipe(output=none)))
+    cases.append(CostCase("looking up", looking_up(camera), up, Recipe(output=none)))
+    cases.append(CostCase("level below everything", camera, low, Recipe(output=none)))
     return cases
 
 
@@ -106,9 +104,7 @@ def bench_camera(scene: Scene, width: int, height: int, backend: str = "auto") -
     return min(choice, key=lambda entry: entry[0])[1]
 
 
-def water_share(
-    scene: Scene, camera: Camera, recipe: schema_Recipe, backend: str = "auto"
-) -> float:
+def water_share(scene: Scene, camera: Camera, recipe: Recipe, backend: str = "auto") -> float:
     return float(draw(scene, camera, recipe, backend).water.mean())
 
 
@@ -154,7 +150,7 @@ def _time_case(scene: Scene, case: CostCase, repeats: int) -> dict[str, Any]:
 
 def _stage_case(scene: Scene, camera: Camera, tier: ReflectionTier, repeats: int) -> dict[str, Any]:
     """Milliseconds of each stage with waves, and over those of the clean frame before it."""
-    clean = make_plan(schema_Recipe(output=PICTURE_ONLY), scene)
+    clean = make_plan(Recipe(output=PICTURE_ONLY), scene)
     flooded = make_plan(flood_recipe(tier, "calm"), scene)
     times: dict[str, list[float]] = defaultdict(list)
     for _ in range(repeats):

@@ -20,7 +20,7 @@ from augment.metrics.image import psnr
 from augment.plan import make_plan
 from augment.scene import Scene
 from augment.views import render_buffers
-from recipes.schema import Output, Weather, schema_Recipe
+from recipes.schema import Output, Recipe, Weather
 from recipes.weather import Flood, Waves
 from tools.bench_flood_mirror import mirrored_picture
 
@@ -50,7 +50,7 @@ def flood_recipe(
     opaque: bool = False,
     fresnel: FresnelModel = "exact",
     output: Output | None = None,
-) -> schema_Recipe:
+) -> Recipe:
     """Water level_m above the median road, the middle one of a drive that may have a slope."""
     flood = Flood(
         level_m=level_m,
@@ -60,10 +60,10 @@ def flood_recipe(
         fresnel=fresnel,
         reflection=reflection,
     )
-    return schema_Recipe(weather=Weather(flood=flood), output=output or PICTURE_ONLY)
+    return Recipe(weather=Weather(flood=flood), output=output or PICTURE_ONLY)
 
 
-def draw(scene: Scene, camera: Camera, recipe: schema_Recipe, backend: str = "auto") -> Picture:
+def draw(scene: Scene, camera: Camera, recipe: Recipe, backend: str = "auto") -> Picture:
     buffers = render_buffers(scene, camera, make_plan(recipe, scene), backend=backend)
     water = buffers.water
     if water is None:

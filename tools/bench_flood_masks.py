@@ -24,7 +24,7 @@ from augment.geometry import rigid
 from augment.plan import make_plan
 from augment.scene import Scene
 from augment.views import render_buffers
-from recipes.schema import schema_Recipe
+from recipes.schema import Recipe
 from tools.bench_flood_error import PICTURE_ONLY, draw, flood_recipe, inside
 
 SILHOUETTE_PX = 3  # splats stand up to this far out beyond the true surface
@@ -44,9 +44,7 @@ class WaterView:
     depth: np.ndarray
 
 
-def water_view(
-    scene: Scene, truth: StreetTruth, camera: Camera, recipe: schema_Recipe
-) -> WaterView:
+def water_view(scene: Scene, truth: StreetTruth, camera: Camera, recipe: Recipe) -> WaterView:
     medium = make_plan(recipe, scene).flood
     assert medium is not None
     depth = plane_depth(camera, medium.level_z_m).numpy()
@@ -164,7 +162,7 @@ def dry_views(scene: Scene, camera: Camera) -> dict[str, bool]:
         "looking up": (looking_up(camera), flood_recipe(waves="calm")),
         "level below everything": (camera, flood_recipe(level_m=FAR_BELOW_M)),
     }
-    clean = make_plan(schema_Recipe(output=PICTURE_ONLY), scene)
+    clean = make_plan(Recipe(output=PICTURE_ONLY), scene)
     return {
         name: torch.equal(
             render_buffers(scene, view, make_plan(recipe, scene)).rgb,

@@ -32,13 +32,13 @@ def _render_once(uri: str, width: int, height: int, tier: Any) -> float:
     from adapters.base import open_scene
     from augment.plan import make_plan
     from augment.views import render_buffers
-    from recipes.schema import schema_Recipe
+    from recipes.schema import Recipe
     from tools.bench_flood_cost import bench_camera
     from tools.bench_flood_error import PICTURE_ONLY, flood_recipe
 
     scene = open_scene(uri)
     camera = bench_camera(scene, width, height)
-    recipe = schema_Recipe(output=PICTURE_ONLY) if tier is None else flood_recipe(tier, "calm")
+    recipe = Recipe(output=PICTURE_ONLY) if tier is None else flood_recipe(tier, "calm")
     plan = make_plan(recipe, scene)
     render_buffers(scene, camera.scaled(SMALL), plan)
     return extra_mib(lambda: render_buffers(scene, camera, plan))

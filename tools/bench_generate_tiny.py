@@ -14,7 +14,7 @@ from augment.cameras import Camera, Frame
 from augment.effects.smog import SmogMedium
 from augment.scene import Gaussians, Scene
 from augment.sky import ConstantSky
-from recipes.schema import schema_Recipe
+from recipes.schema import Recipe
 
 CAMERAS = ("front", "rear")
 WIDTH, HEIGHT = 32, 18
@@ -52,7 +52,7 @@ def open_tiny(uri: str) -> Scene:
     return Scene(uri, uri, splat, (), ConstantSky(one[0]), tuple(map(_frame, range(count))))
 
 
-def render_tiny(scene: Scene, camera: Camera, recipe: schema_Recipe, *, backend: str) -> _View:
+def render_tiny(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str) -> _View:
     """An image of one colour, another for every time."""
     shade = camera.timestamp_ns // _PERIOD_NS % 256
     rgb = np.full((camera.height, camera.width, 3), shade, np.uint8)

@@ -13,7 +13,7 @@ from augment.cameras import Camera
 from augment.plan import Plan, make_plan
 from augment.scene import Scene
 from augment.views import WeatheredBuffers, begin_view, render_buffers, render_view
-from recipes.schema import TIERS, Smog, Value, Weather, knobs_of, schema_Recipe, with_settings
+from recipes.schema import TIERS, Recipe, Smog, Value, Weather, knobs_of, with_settings
 from recipes.weather import Style
 from tools.bench_flood_error import PICTURE_ONLY, flood_recipe
 from tools.bench_gpu_ceilings import Ceilings
@@ -30,7 +30,7 @@ SNOW, SNOW_PIXELS, STYLE = "snow fast tier", "snow per pixel", "style"
 ALL = "all at once, balanced"
 
 
-def frame_recipes(cell_m: float = 0.05) -> dict[str, schema_Recipe]:
+def frame_recipes(cell_m: float = 0.05) -> dict[str, Recipe]:
     """What is timed, by name: pictures only, at default settings or those of a tier.
 
     The balanced flood is the reference's, mirrored reflection and all, but for what the tier takes
@@ -39,18 +39,18 @@ def frame_recipes(cell_m: float = 0.05) -> dict[str, schema_Recipe]:
     flood = flood_recipe("mirrored", "calm")
     everything = trade_recipe("all").model_copy(update={"output": PICTURE_ONLY})
     return {
-        CLEAN: schema_Recipe(output=PICTURE_ONLY),
-        SMOG: schema_Recipe(weather=Weather(smog=Smog(visibility_m=200)), output=PICTURE_ONLY),
+        CLEAN: Recipe(output=PICTURE_ONLY),
+        SMOG: Recipe(weather=Weather(smog=Smog(visibility_m=200)), output=PICTURE_ONLY),
         FLOOD: balanced(flood),
         SCREEN: balanced(flood, {"weather.flood.reflection": "screen_space"}),
         SNOW: snow_recipe("per_splat", cell_m=cell_m),
         SNOW_PIXELS: snow_recipe("per_pixel", cell_m=cell_m),
-        STYLE: schema_Recipe(style=Style(preset="overcast"), output=PICTURE_ONLY),
+        STYLE: Recipe(style=Style(preset="overcast"), output=PICTURE_ONLY),
         ALL: balanced(everything),
     }
 
 
-def balanced(recipe: schema_Recipe, given: Mapping[str, Value] | None = None) -> schema_Recipe:
+def balanced(recipe: Recipe, given: Mapping[str, Value] | None = None) -> Recipe:
     """The recipe as `quality: balanced` would set it, all it gives itself too, but for `given`."""
     tier = TIERS["balanced"]
     chosen = {k.path: tier.get(k.path, k.reference) for k in knobs_of(recipe) if k.chosen}
@@ -60,7 +60,7 @@ def balanced(recipe: schema_Recipe, given: Mapping[str, Value] | None = None) ->
 def bench_frames(
     scene: Scene,
     camera: Camera,
-    recipes: Mapping[str, schema_Recipe],
+    recipes: Mapping[str, Recipe],
     timing: Timing,
     ceilings: Ceilings,
 ) -> dict[str, Any]:
@@ -109,7 +109,7 @@ def bench_frames(
 
 
 def frame_agreement(
-    scene: Scene, camera: Camera, recipes: Mapping[str, schema_Recipe]
+    scene: Scene, camera: Camera, recipes: Mapping[str, Recipe]
 ) -> dict[str, dict[str, float]]:
     """How far the GPU's colours are from the CPU backend's, by recipe; snow lies where one of them
     found a place for it.
@@ -132,9 +132,7 @@ def _floor(scene: Scene, camera: Camera, plan: Plan, ceilings: Ceilings) -> dict
     return frame_floor(passes, moved).as_dict(ceilings)
 
 
-def delivered(
-    scene: Scene, camera: Camera, recipe: schema_Recipe, timing: Timing
-) -> dict[str, Any]:
+def delivered(scene: Scene, camera: Camera, recipe: Recipe, timing: Timing) -> dict[str, Any]:
     """Milliseconds of the host's clock to pictures in 8 bits that lie there: of a view alone, and
     of each of a row of them in which the next is begun before the last is waited for.
     """

@@ -15,7 +15,7 @@ from augment.cameras import Camera
 from augment.effects.smog import SmogMedium
 from augment.render.buffers import ALPHA, RGB, RenderOutput
 from augment.render.constants import RasterSettings
-from augment.render.cuda.splats import StageClock
+from augment.render.cuda.splats import GpuStageTimer
 from augment.scene import Gaussians, PosedGaussians
 from tools.bench_gpu_ceilings import Ceilings
 from tools.bench_gpu_gsplat import gsplat_draws
@@ -66,7 +66,7 @@ def draw(
     parts: list[PosedGaussians],
     camera: Camera,
     smog: SmogMedium | None = None,
-    clock: StageClock | None = None,
+    clock: GpuStageTimer | None = None,
 ) -> RenderOutput:
     from augment.render.cuda import driver as cuda
 
@@ -79,7 +79,7 @@ def stage_times(
     """Milliseconds of the rasteriser's stages, in frames of their own."""
     times: dict[str, list[float]] = defaultdict(list)
     for turn in range(timing.warm_up + timing.repeats):
-        clock = StageClock()
+        clock = GpuStageTimer()
         draw(parts, camera, clock=clock)
         if turn >= timing.warm_up:
             for name, ms in clock.milliseconds().items():

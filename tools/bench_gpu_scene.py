@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from augment.effects.snow.placement import place_snow_bed
+from augment.effects.snow.placement import place_snow_support
 from augment.effects.snow.snow import placement_settings
 from augment.effects.style.color_maps import style_gaussians
 from augment.render.cuda.runtime import gpu_device
@@ -61,13 +61,13 @@ def bench_gpu_placement(scene: Scene, uri: str, *, cell_m: float = 0.05) -> dict
     cameras = [camera for frame in scene.frames for camera in frame.cameras.values()]
     settings = placement_settings(Snow(depth_m=0, cell_m=cell_m))
     wholes, stages = [], []
-    bed = place_snow_bed(scene, cameras, settings, backend=BACKEND)
+    bed = place_snow_support(scene, cameras, settings, backend=BACKEND)
     for _ in range(PLACEMENTS):
         start = time.perf_counter()
-        bed = place_snow_bed(scene, cameras, settings, backend=BACKEND)
+        bed = place_snow_support(scene, cameras, settings, backend=BACKEND)
         wholes.append(time.perf_counter() - start)
         stages.append(bed.seconds)
-    memory = peak_gpu_mib(lambda: place_snow_bed(scene, cameras, settings, backend=BACKEND))
+    memory = peak_gpu_mib(lambda: place_snow_support(scene, cameras, settings, backend=BACKEND))
     return {
         "scene": scene.name,
         "uri": uri,

@@ -25,7 +25,7 @@ from augment.plan import make_plan
 from augment.scene import Scene
 from augment.semantics import SemanticClass
 from augment.views import render_buffers
-from recipes.schema import Output, Smog, Weather, schema_Recipe
+from recipes.schema import Output, Recipe, Smog, Weather
 
 REGIONS = {
     "road": (SemanticClass.ROAD, SemanticClass.LANE_MARKING),
@@ -95,7 +95,7 @@ def truth_view(scene: Scene, truth: StreetTruth, camera: Camera) -> TruthView:
     Regions: `smooth` is all pixels away from silhouettes, `silhouette` the other surface pixels;
     the classes are parts of `smooth`.
     """
-    recipe = schema_Recipe(output=Output(depth="none"))
+    recipe = Recipe(output=Output(depth="none"))
     clean = render_buffers(scene, camera, make_plan(recipe, scene)).rgb
     exact = truth.render(camera)
     surface = np.isfinite(exact.depth)
@@ -108,7 +108,7 @@ def truth_view(scene: Scene, truth: StreetTruth, camera: Camera) -> TruthView:
 
 def smog_error(smog: Smog, scene: Scene, view: TruthView) -> np.ndarray:
     """Largest channel error [H, W] of the fogged splats against exact smog, in 1/255."""
-    recipe = schema_Recipe(weather=Weather(smog=smog), output=Output(depth="none"))
+    recipe = Recipe(weather=Weather(smog=smog), output=Output(depth="none"))
     plan = make_plan(recipe, scene)
     assert plan.smog is not None
     fogged = render_buffers(scene, view.camera, plan).rgb

@@ -15,12 +15,12 @@ import torch
 
 from adapters.street.labels import StreetTruth
 from augment.cameras import Camera
-from augment.effects.snow.cells import SnowBed
+from augment.effects.snow.cells import SnowSupport
 from augment.effects.snow.height_map import Estimator
-from augment.effects.snow.layer import lay_snow
+from augment.effects.snow.layer import build_snow_layer
 from augment.effects.snow.light import illumination_of
 from augment.effects.snow.near_camera import SnowCover
-from augment.effects.snow.placement import PlacementSettings, place_snow_bed
+from augment.effects.snow.placement import PlacementSettings, place_snow_support
 from augment.render.buffers import BUFFERS
 from augment.render.constants import RasterSettings
 from augment.render.layout import UNCUT
@@ -84,7 +84,7 @@ def bench_accuracy(
     scene_bias = scene_bias_m(scene, truth, flat, above)
     for estimator in estimators:
         settings = PlacementSettings(cell_m=cell_m, estimator=estimator)
-        bed = place_snow_bed(scene, cameras, settings)
+        bed = place_snow_support(scene, cameras, settings)
         figures.append(
             {
                 "estimator": estimator,
@@ -124,7 +124,7 @@ def scene_bias_m(scene: Scene, truth: StreetTruth, points: TruePoints, above: Ca
 
 def drawn_figures(
     scene: Scene,
-    bed: SnowBed,
+    bed: SnowSupport,
     truth: StreetTruth,
     flat: TruePoints,
     above: Camera,
@@ -136,7 +136,7 @@ def drawn_figures(
     with the scene's own offset.
     """
     snow = Snow(depth_m=depth_m)
-    cover = lay_snow(bed, scene, snow, illumination_of(scene, snow), seed=0)
+    cover = build_snow_layer(bed, scene, snow, illumination_of(scene, snow), seed=0)
     height, shown = draw_snow(scene, cover, above)
     rows, columns = _pixels(above, flat.xy)
     z, there = height[rows, columns], shown[rows, columns]

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from adapters.street.labels import StreetTruth
-from augment.effects.snow.cells import SnowBed, SnowCells
+from augment.effects.snow.cells import SnowCells, SnowSupport
 from augment.effects.snow.surface import DRIVEN_MAX_SLOPE_DEG, moves
 from augment.scene import Scene
 from augment.semantics import SemanticClass
@@ -122,7 +122,7 @@ def sheltered_share(cells: SnowCells, truth: StreetTruth, points: TruePoints) ->
     }
 
 
-def vehicle_shares(bed: SnowBed, scene: Scene, truth: StreetTruth) -> dict[str, Any]:
+def vehicle_shares(bed: SnowSupport, scene: Scene, truth: StreetTruth) -> dict[str, Any]:
     """Of the cars that drive: share of their tops, less steep than what drivers keep clear, that
     has a cell; and how far those are from the true body.
     """

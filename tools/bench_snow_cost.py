@@ -13,7 +13,7 @@ from augment.effects.snow.snow import cover_of
 from augment.plan import Plan, make_plan
 from augment.render.cpu.driver import rasterize_cpu
 from augment.scene import Scene
-from recipes.schema import Output, Smog, Weather, schema_Recipe
+from recipes.schema import Output, Recipe, Smog, Weather
 from recipes.weather import Flood, Snow
 from tools.bench_flood_error import PICTURE_ONLY
 from tools.bench_pairs import spread_ms, spread_ratio, time_frame, time_in_turns, turns
@@ -30,33 +30,33 @@ def snow_recipe(
     cell_m: float = 0.05,
     output: Output | None = None,
     **weather: Any,
-) -> schema_Recipe:
+) -> Recipe:
     """Snow as the cost is measured of; weather: what else the recipe has."""
     snow = Snow.model_validate({"depth_m": DEPTH_M, "shading": shading, "cell_m": cell_m})
-    return schema_Recipe(weather=Weather(snow=snow, **weather), output=output or PICTURE_ONLY)
+    return Recipe(weather=Weather(snow=snow, **weather), output=output or PICTURE_ONLY)
 
 
-def cost_cases(cell_m: float = 0.05) -> dict[str, tuple[schema_Recipe, schema_Recipe]]:
+def cost_cases(cell_m: float = 0.05) -> dict[str, tuple[Recipe, Recipe]]:
     """The recipe with snow and that without, of every case."""
     smog = Smog(visibility_m=200)
     flood = Flood(level_m=0.15, reference="median")
     default = Output()
     cases = {}
     for shading in SHADINGS:
-        cases[shading] = snow_recipe(shading, cell_m=cell_m), schema_Recipe(output=PICTURE_ONLY)
+        cases[shading] = snow_recipe(shading, cell_m=cell_m), Recipe(output=PICTURE_ONLY)
     for shading in SHADINGS:
         cases[f"{shading}, depth and labels"] = (
             snow_recipe(shading, cell_m=cell_m, output=default),
-            schema_Recipe(output=default),
+            Recipe(output=default),
         )
     for shading in SHADINGS:
         cases[f"{shading}, smog"] = (
             snow_recipe(shading, cell_m=cell_m, smog=smog),
-            schema_Recipe(weather=Weather(smog=smog), output=PICTURE_ONLY),
+            Recipe(weather=Weather(smog=smog), output=PICTURE_ONLY),
         )
     cases["per_splat, flood"] = (
         snow_recipe(cell_m=cell_m, flood=flood),
-        schema_Recipe(weather=Weather(flood=flood), output=PICTURE_ONLY),
+        Recipe(weather=Weather(flood=flood), output=PICTURE_ONLY),
     )
     return cases
 
@@ -103,7 +103,7 @@ def _stages(
 ) -> dict[str, Any]:
     """Milliseconds of each stage of a clean and of a snowy picture, and what they draw."""
     plans = {
-        "clean": make_plan(schema_Recipe(output=PICTURE_ONLY), scene),
+        "clean": make_plan(Recipe(output=PICTURE_ONLY), scene),
         "snowy": make_plan(snow_recipe(shading, cell_m=cell_m), scene),
     }
     times: dict[str, dict[str, list[float]]] = {name: defaultdict(list) for name in plans}

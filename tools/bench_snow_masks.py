@@ -18,7 +18,7 @@ from augment.cameras import Camera
 from augment.plan import make_plan
 from augment.scene import Scene
 from augment.views import render_buffers
-from recipes.schema import Output, schema_Recipe
+from recipes.schema import Output, Recipe
 from tools.bench_flood_masks import neighbours
 from tools.bench_snow_cost import SHADINGS, snow_recipe
 
@@ -38,7 +38,7 @@ class SnowView:
     depth: np.ndarray
 
 
-def snow_view(scene: Scene, camera: Camera, recipe: schema_Recipe) -> SnowView:
+def snow_view(scene: Scene, camera: Camera, recipe: Recipe) -> SnowView:
     buffers = render_buffers(scene, camera, make_plan(recipe, scene))
     assert buffers.snow is not None and buffers.depth_m is not None
     return SnowView(
@@ -108,7 +108,7 @@ def bench_masks(
     return figures
 
 
-def _views(scene: Scene, cameras: Any, recipe: schema_Recipe, scale: float) -> dict[str, SnowView]:
+def _views(scene: Scene, cameras: Any, recipe: Recipe, scale: float) -> dict[str, SnowView]:
     return {
         name: snow_view(scene, camera.scaled(scale), recipe) for name, camera in cameras.items()
     }

@@ -9,12 +9,12 @@ import time
 from pathlib import Path
 from typing import Any
 
-from augment.effects.snow.cells import SnowBed
-from augment.effects.snow.layer import lay_snow
+from augment.effects.snow.cells import SnowSupport
+from augment.effects.snow.layer import build_snow_layer
 from augment.effects.snow.light import illumination_of
-from augment.effects.snow.placement import place_snow_bed
+from augment.effects.snow.placement import place_snow_support
 from augment.effects.snow.snow import placement_settings
-from augment.effects.snow.support import bed_key, load_bed, remember_bed, save_bed
+from augment.effects.snow.support import bed_key, load_bed, remember_support, save_bed
 from augment.render.buffers import AUTO
 from augment.scene import Scene
 from recipes.weather import Snow
@@ -34,13 +34,13 @@ def bench_placement(
     cameras = [camera for frame in scene.frames for camera in frame.cameras.values()]
     settings = placement_settings(Snow(depth_m=0, cell_m=cell_m))
     wholes, stages = [], []
-    bed = place_snow_bed(scene, cameras, settings, backend=backend)
+    bed = place_snow_support(scene, cameras, settings, backend=backend)
     for _ in range(min(repeats, PLACEMENTS)):
         start = time.perf_counter()
-        bed = place_snow_bed(scene, cameras, settings, backend=backend)
+        bed = place_snow_support(scene, cameras, settings, backend=backend)
         wholes.append(time.perf_counter() - start)
         stages.append(bed.seconds)
-    remember_bed(scene, settings, bed)
+    remember_support(scene, settings, bed)
     return {
         "cameras": len(cameras),
         "cell_m": cell_m,
@@ -59,14 +59,14 @@ def bench_placement(
 SHADINGS = ("per_splat", "per_pixel")
 
 
-def _lay(scene: Scene, bed: SnowBed, shading: Any, repeats: int) -> dict[str, Any]:
+def _lay(scene: Scene, bed: SnowSupport, shading: Any, repeats: int) -> dict[str, Any]:
     """Snow of depths in turns on a bed that snow was laid on before."""
     seconds, gaussians = [], 0
     for repeat in range(repeats + 1):
         snow = Snow(depth_m=DEPTHS_M[repeat % len(DEPTHS_M)], shading=shading)
         start = time.perf_counter()
         light = illumination_of(scene, snow)
-        cover = lay_snow(bed, scene, snow, light, seed=0)
+        cover = build_snow_layer(bed, scene, snow, light, seed=0)
         seconds.append(time.perf_counter() - start)
         gaussians = len(cover.ground.gaussians) + sum(
             len(layer.gaussians) for layer in cover.actors.values()
@@ -74,7 +74,7 @@ def _lay(scene: Scene, bed: SnowBed, shading: Any, repeats: int) -> dict[str, An
     return {"seconds": spread(seconds[1:]), "gaussians": gaussians}
 
 
-def _file(scene: Scene, bed: SnowBed, cameras: Any, settings: Any) -> dict[str, float]:
+def _file(scene: Scene, bed: SnowSupport, cameras: Any, settings: Any) -> dict[str, float]:
     start = time.perf_counter()
     key = bed_key(scene, cameras, settings)
     keyed = time.perf_counter()
@@ -112,9 +112,9 @@ def _place_once(uri: str, cell_m: float) -> float:
     scene = open_scene(uri)
     cameras = [camera for frame in scene.frames for camera in frame.cameras.values()]
     coarse = placement_settings(Snow(depth_m=0, cell_m=10 * cell_m))
-    place_snow_bed(scene, cameras[:1], coarse)  # loads the kernels
+    place_snow_support(scene, cameras[:1], coarse)  # loads the kernels
     settings = placement_settings(Snow(depth_m=0, cell_m=cell_m))
-    return extra_mib(lambda: place_snow_bed(scene, cameras, settings))
+    return extra_mib(lambda: place_snow_support(scene, cameras, settings))
 
 
 if __name__ == "__main__":

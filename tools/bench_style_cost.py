@@ -13,7 +13,7 @@ from augment.effects.style.color_maps import CLASSES, StyleMaps, style_gaussians
 from augment.plan import make_plan
 from augment.scene import Gaussians, Scene
 from augment.semantics import SemanticClass
-from recipes.schema import schema_Recipe
+from recipes.schema import Recipe
 from recipes.weather import Style
 from tools.bench_flood_error import PICTURE_ONLY
 from tools.bench_pairs import spread, spread_ms, spread_ratio, time_in_turns
@@ -79,13 +79,11 @@ def bench_frames(
     if scene.background.sh.shape[1] == 1:
         kinds["SH 3"] = with_directions(scene)
     recipes = {
-        "clean": schema_Recipe(output=PICTURE_ONLY),
-        "one map": schema_Recipe(style=Style(preset=preset), output=PICTURE_ONLY),
+        "clean": Recipe(output=PICTURE_ONLY),
+        "one map": Recipe(style=Style(preset=preset), output=PICTURE_ONLY),
         # A preset knows land and sky only; its maps by class are the same, and cost the same.
-        "per region": schema_Recipe(
-            style=Style(preset=preset, per_region=True), output=PICTURE_ONLY
-        ),
-        "on the picture": schema_Recipe(
+        "per region": Recipe(style=Style(preset=preset, per_region=True), output=PICTURE_ONLY),
+        "on the picture": Recipe(
             style=Style(preset=preset, applied_to="picture"), output=PICTURE_ONLY
         ),
     }

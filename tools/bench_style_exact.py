@@ -24,7 +24,7 @@ from augment.render.rasterize import rasterize
 from augment.render.sh import SH_C0, evaluate_sh
 from augment.scene import Gaussians, PosedGaussians, Scene
 from augment.views import render_buffers
-from recipes.schema import schema_Recipe
+from recipes.schema import Recipe
 from recipes.weather import Style
 from tools.bench_flood_error import PICTURE_ONLY
 from tools.bench_style_network import random_network
@@ -77,8 +77,8 @@ def bench_exact(scene: Scene, camera: Camera, presets: Sequence[str]) -> list[di
 
 def _compare(scene: Scene, camera: Camera, preset: str, touched: np.ndarray) -> dict[str, Any]:
     style = Style(preset=preset)
-    fused = make_plan(schema_Recipe(style=style, output=PICTURE_ONLY), scene)
-    clean = make_plan(schema_Recipe(output=PICTURE_ONLY), scene)
+    fused = make_plan(Recipe(style=style, output=PICTURE_ONLY), scene)
+    clean = make_plan(Recipe(output=PICTURE_ONLY), scene)
     in_colors = render_buffers(scene, camera, fused).rgb.numpy()
     in_sh = render_buffers(styled_scene(scene, style_maps(scene, style)), camera, clean).rgb.numpy()
     difference = np.abs(in_colors - in_sh).max(2)

@@ -21,7 +21,7 @@ from augment.plan import make_plan
 from augment.render.composite import quantise
 from augment.scene import Scene
 from augment.views import render_buffers
-from recipes.schema import schema_Recipe
+from recipes.schema import Recipe
 from tools.bench_flood_error import PICTURE_ONLY
 from tools.bench_pairs import spread_ms
 from tools.bench_style_cost import front_camera
@@ -114,6 +114,6 @@ def _first_photo(photos: Sequence[Path]) -> Path | None:
 
 def _drawn(scene: Scene, path: Path) -> Path:
     camera = front_camera(scene, DRAWN_WIDTH)
-    rgb = render_buffers(scene, camera, make_plan(schema_Recipe(output=PICTURE_ONLY), scene)).rgb
+    rgb = render_buffers(scene, camera, make_plan(Recipe(output=PICTURE_ONLY), scene)).rgb
     write_jpeg(path, quantise(rgb * torch.tensor([1.0, 0.8, 0.6])))
     return path

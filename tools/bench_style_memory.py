@@ -56,7 +56,7 @@ def _render_once(uri: str, width: int, preset: Any) -> float:
     from adapters.base import open_scene
     from augment.plan import make_plan
     from augment.views import render_buffers
-    from recipes.schema import schema_Recipe
+    from recipes.schema import Recipe
     from recipes.weather import Style
     from tools.bench_flood_error import PICTURE_ONLY
     from tools.bench_style_cost import front_camera
@@ -64,7 +64,7 @@ def _render_once(uri: str, width: int, preset: Any) -> float:
     scene = open_scene(uri)
     camera = front_camera(scene, width)
     style = None if preset is None else Style(preset=preset)
-    plan = make_plan(schema_Recipe(style=style, output=PICTURE_ONLY), scene)
+    plan = make_plan(Recipe(style=style, output=PICTURE_ONLY), scene)
     render_buffers(scene, camera.scaled(SMALL), plan)
     return extra_mib(lambda: render_buffers(scene, camera, plan))
 

@@ -27,7 +27,7 @@ from augment.effects.style.train import read_photos
 from tools.bench_style_network import BenchNetwork
 
 HOLDOUT = 8  # as `climategs style train` holds photos out by default
-LEAST_PHOTOS = 2
+MIN_PHOTOS = 2
 
 
 @dataclass(frozen=True)
@@ -53,8 +53,8 @@ def bench_scores(
     if not photos:
         return {"skipped": "no photos were given"}
     held_out = held_out_photos(photos, network.held_out, case.size_px, holdout)
-    if len(held_out) < LEAST_PHOTOS:
-        return {"skipped": f"{len(held_out)} photos are held out; {LEAST_PHOTOS} are needed"}
+    if len(held_out) < MIN_PHOTOS:
+        return {"skipped": f"{len(held_out)} photos are held out; {MIN_PHOTOS} are needed"}
     pictures = held_out.float() / 255
     methods: dict[str, Method] = {
         "none": identity_method,

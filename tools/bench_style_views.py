@@ -16,7 +16,7 @@ from augment.metrics.consistency import Consistency, DepthView, warped_consisten
 from augment.plan import Plan, make_plan
 from augment.scene import Scene
 from augment.views import render_buffers
-from recipes.schema import Output, Render, schema_Recipe
+from recipes.schema import Output, Recipe, Render
 from recipes.weather import Style
 from tools.bench_flood_masks import neighbours
 
@@ -24,7 +24,7 @@ NEAR, FAR = 1, 7  # frames apart, as Lai et al. 2018 and its successors take the
 KINDS = (f"{NEAR} frame apart", f"{FAR} frames apart", "neighbouring cameras")
 _DEPTH = Output(depth="expected", labels=False)
 _NEUTRAL = Render(exposure="neutral")
-_LEAST_SHARE = 0.01  # of a view that another shows; of less there is nothing to say
+_MIN_SHARE = 0.01  # of a view that another shows; of less there is nothing to say
 
 
 def bench_views(
@@ -43,7 +43,7 @@ def bench_views(
     pairs = {kind: _pairs(scene, frames, kind, width) for kind in KINDS}
     rows: list[dict[str, Any]] = []
     for name, style in styles.items():
-        plan = make_plan(schema_Recipe(style=style, output=_DEPTH, render=_NEUTRAL), scene)
+        plan = make_plan(Recipe(style=style, output=_DEPTH, render=_NEUTRAL), scene)
         found = {kind: _pooled(scene, plan, pairs[kind]) for kind in KINDS}
         for kind, each in found.items():
             clean = rows[0][kind] if rows else each
@@ -85,7 +85,7 @@ def _pooled(
     seen: list[Consistency] = []
     for one, other in pairs:
         each = warped_consistency(_view(scene, one, plan), _view(scene, other, plan))
-        if each.share >= _LEAST_SHARE:
+        if each.share >= _MIN_SHARE:
             seen.append(each)
     total = sum(each.share for each in seen)
     if not total > 0:

@@ -15,7 +15,7 @@ from adapters.base import open_scene
 from augment.ground import ground_of
 from augment.render.buffers import CPU
 from augment.scene import Scene
-from recipes.schema import Value, schema_Recipe
+from recipes.schema import Recipe, Value
 from tools.gpu_clock import gpu_facts
 from tools.machine import load_average, machine_facts
 from tools.trade_cases import (
@@ -115,7 +115,7 @@ def _rows(figures: Mapping[str, Any]) -> Iterator[Row]:
             yield {"scene": figures["scene"], "recipe": entry["recipe"], **row}
 
 
-def _opened(uri: str, recipes: Sequence[schema_Recipe]) -> Scene:
+def _opened(uri: str, recipes: Sequence[Recipe]) -> Scene:
     scene = open_scene(uri)
     if any(recipe.weather.flood is not None for recipe in recipes):
         scene = dataclasses.replace(scene, ground=ground_of(scene))  # looked for once

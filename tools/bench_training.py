@@ -51,12 +51,12 @@ def bench_training(
     machine = machine_facts()
     clock = _Clock()
     generated = generate(case, folder, scene_loader=scene_loader, progress=progress)
-    clock.lap("generate")
+    clock.timed("generate")
     views = read_views(folder, case.train_scenes)
     test = read_views(folder, case.test_scenes)
-    clock.lap("read")
+    clock.timed("read")
     runs = _train_all(case, views, test, at_once or machine.cores, progress)
-    clock.lap("train and test")
+    clock.timed("train and test")
     scores = {regime: [runs[regime, seed].scores for seed in case.seeds] for regime in REGIMES}
     first = {regime: runs[regime, case.seeds[0]].network for regime in REGIMES}
     figures = {
@@ -144,7 +144,7 @@ class _Clock:
         self.cpu_seconds: dict[str, float] = {}
         self._last = self._now()
 
-    def lap(self, part: str) -> None:
+    def timed(self, part: str) -> None:
         now = self._now()
         self.seconds[part] = now[0] - self._last[0]
         self.cpu_seconds[part] = now[1] - self._last[1]

@@ -21,7 +21,7 @@ from augment.metrics.consistency import Warp, carry, consistency_of, find_warp
 from augment.metrics.lpips import Lpips, load_lpips, picture_lpips
 from tools.evaluate_views import KINDS, Drive, Pair, View, Views, pairs_of
 
-LEAST_SHARE = 0.01  # of a picture's pixels; of fewer there is nothing to say
+MIN_SHARE = 0.01  # of a picture's pixels; of fewer there is nothing to say
 ALL, DRY, WATER = "all", "dry", "water"
 _NUMBERS = ("rmse", "relative", "share")
 
@@ -142,7 +142,7 @@ def _record(views: Views, drive: Drive, pair: Pair, network: Lpips | None) -> di
     }
     for name, part in parts.items():
         each = consistency_of(seen.a.depth_view, seen.warped, part)
-        enough = each.share >= LEAST_SHARE
+        enough = each.share >= MIN_SHARE
         record[name] = {
             "share": each.share,
             "rmse": each.rmse if enough else None,

@@ -26,7 +26,7 @@ from tools.report_pick import evenly
 
 SHORT, LONG, CAMERAS = "short", "long", "cameras"
 KINDS = (SHORT, LONG, CAMERAS)
-LARGEST_ANGLE_DEG = 90.0  # between the optical axes of neighbouring cameras
+MAX_ANGLE_DEG = 90.0  # between the optical axes of neighbouring cameras
 _BUFFERS = ("image", "depth", "water", "instance")
 _KEPT = 12  # decoded views; a pair of frames needs 2, the cameras of a frame mostly 6 or 7
 
@@ -196,7 +196,7 @@ def pairs_of(views: Views, drive: Drive, short: int, long: int, most: int | None
 
 def _neighbours(views: Views, rows: Sequence[int]) -> Iterator[tuple[int, int]]:
     axes = {row: views.camera(row).world_from_camera[:3, 2].numpy() for row in rows}
-    least = math.cos(math.radians(LARGEST_ANGLE_DEG))
+    least = math.cos(math.radians(MAX_ANGLE_DEG))
     for place, a in enumerate(rows):
         for b in rows[place + 1 :]:
             if float(axes[a] @ axes[b]) >= least - 1e-9:

@@ -20,7 +20,7 @@ def explain_recipe(
     without, the plan is that of reference.
     """
     from adapters.base import open_scene
-    from augment.jobs.quality import settle, settled_recipe
+    from augment.jobs.quality import resolve_quality, resolved_recipe
     from augment.plan import make_plan
     from recipes.load import load_recipe
     from recipes.schema import free_knobs, settings_of
@@ -30,10 +30,10 @@ def explain_recipe(
     scene = open_scene(scene_uri)
     is_open = resolved.quality.is_open
     if is_open and times:
-        resolved = settle(resolved, scene, progress=True).recipe
+        resolved = resolve_quality(resolved, scene, progress=True).recipe
     elif is_open:
         reference = {knob.path: knob.reference for knob in free_knobs(resolved)}
-        resolved = settled_recipe(resolved, reference)
+        resolved = resolved_recipe(resolved, reference)
     plan = make_plan(resolved, scene)
     facts = {
         "recipe": resolved.model_dump(mode="json"),

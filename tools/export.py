@@ -59,7 +59,7 @@ def export_scene(
     _check_out(out, kind, overwrite)
     scene = open_scene(uri)
     for problem in scene.problems:
-        _say(f"note: {problem}")
+        _print_result(f"note: {problem}")
     moment = _moment(scene, frame)
     written = _write(storable(scene), out, kind, moment, half)
     for path in written:
@@ -86,7 +86,7 @@ def _write(scene: Scene, out: Path, kind: ExportKind, moment: int, half: bool) -
     cameras = out.parent / CAMERAS
     if export_cameras(scene, out.parent):
         return [out, cameras] if cameras.exists() else [out]
-    _say(
+    _print_result(
         f"note: {cameras} is there already and not this scene's; it is left as it is. Viewers that "
         f"look for cameras there find its cameras: export into a folder of its own"
     )
@@ -134,5 +134,5 @@ def _check_out(out: Path, kind: ExportKind, overwrite: bool) -> None:
         raise OutputError(f"{out} is there already: choose another --out, or add --overwrite")
 
 
-def _say(text: str) -> None:
+def _print_result(text: str) -> None:
     print(text, file=sys.stderr)

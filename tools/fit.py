@@ -109,9 +109,9 @@ def _prepare(options: FitOptions, parts: FitParts, folder: Path, before: Checkpo
     source, notes = checked.source, (*notes, *checked.problems)
     scene = parts.start(checked.scene, source)
     for problem in _problems(scene, source, notes):
-        _say(f"note: {problem}")
+        _print_result(f"note: {problem}")
     facts = data_facts(scene, source)
-    _say(
+    _print_result(
         f"{len(source.train)} images to learn from, {len(source.test)} held out; "
         f"{facts['Gaussians to start from']} Gaussians and {len(scene.actors)} actors to start from"
     )
@@ -132,7 +132,7 @@ def _prepare(options: FitOptions, parts: FitParts, folder: Path, before: Checkpo
     trainer = parts.trainer(scene, source, options.config(plan.steps))
     if plan.arrays:
         trainer.load_state(plan.arrays, plan.facts)
-        _say(f"going on after step {plan.step} of {plan.steps}")
+        _print_result(f"going on after step {plan.step} of {plan.steps}")
     history = History(plan.history, plan.sums, plan.seconds)
     plan = dataclasses.replace(plan, arrays={}, facts={})  # the trainer has them: free the memory
     return _Run(options, parts, folder, scene, source, notes, checked.facts, trainer, plan, history)
@@ -144,11 +144,11 @@ def _estimate(options: FitOptions, parts: FitParts, scene: Scene, source: Views)
     def throw_away(steps: int) -> Fitter:
         return parts.trainer(scene, source, options.config(steps))
 
-    _say("timing a few steps (kernels are compiled first where they are not yet) ...")
+    _print_result("timing a few steps (kernels are compiled first where they are not yet) ...")
     estimate = estimate_steps(
         throw_away, options.budget_s, views=len(source.train), grows=options.densify != "none"
     )
-    _say(
+    _print_result(
         f"{1e3 * estimate.step_s:.0f} ms a step at the start: {estimate.steps} steps make about "
         f"{options.budget_s / 60:g} minutes. --steps {estimate.steps} gives the same scene again"
     )
@@ -177,13 +177,15 @@ def _run(run: _Run, checkpoint_s: float, progress: bool) -> FitOutcome:
             progress=progress,
         )
         complete = loop.run()
-        _say(f"writing {run.options.out} and evaluating all views")
+        _print_result(f"writing {run.options.out} and evaluating all views")
         report = _write(run, complete, time.perf_counter() - begun)
     if complete:
         mark_finished(run.folder)
         return FitOutcome(0, report)
     again = "the same command without --overwrite" if run.options.overwrite else "the same command"
-    _say(f"stopped after step {run.trainer.step} of {run.plan.steps}; {again} goes on from there")
+    _print_result(
+        f"stopped after step {run.trainer.step} of {run.plan.steps}; {again} goes on from there"
+    )
     return FitOutcome(130, report)
 
 
@@ -227,7 +229,7 @@ def _write(run: _Run, complete: bool, seconds: float) -> dict[str, Any]:
         )
     if options.truth is not None:
         facts["truth"] = truth_facts(options.truth, scene, run.source)
-        _say(_truth_line(facts["truth"]))
+        _print_result(_truth_line(facts["truth"]))
     folder = report_folder(run.folder)
     report = run.parts.report(folder, scene, source, run.history.rows, facts)
     _show_end(options.out, folder)
@@ -298,5 +300,5 @@ def _show_end(out: Path, folder: Path) -> None:
     print(f"render it: climategs render dense-fog --scene 'scene:{out}' --out out/fog")
 
 
-def _say(text: str) -> None:
+def _print_result(text: str) -> None:
     print(text, file=sys.stderr)

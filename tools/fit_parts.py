@@ -15,7 +15,7 @@ from augment.reconstruct.view import ViewKey, ViewSource
 from augment.scene import Scene
 from tools.fit_options import FitOptions, parse_depth
 
-LEAST_OFFSET_S = 0.005  # of clocks: less moves a camera by centimetres at most, if it is real
+MIN_OFFSET_S = 0.005  # of clocks: less moves a camera by centimetres at most, if it is real
 SCORES = ("psnr", "ssim", "depth_median_m")  # of a row of the history
 
 
@@ -115,7 +115,7 @@ def _checked(scene: Scene, source: Any, options: FitOptions) -> Checked:
 
     checks = check_views(scene, source)
     late_s = checks.time_offset_s
-    if late_s is None or abs(late_s) < LEAST_OFFSET_S:
+    if late_s is None or abs(late_s) < MIN_OFFSET_S:
         return Checked(scene, source, checks.problems, checks.facts)
     timed = with_camera_times(scene, late_s)
     sentence = (

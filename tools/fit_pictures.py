@@ -14,8 +14,8 @@ from augment.scene import Scene
 from tools.drawing import Color, color_bar, color_mapped, log_ticks, short_number, write
 from tools.fit_scores import ViewScore, found_camera, render_recorded
 
-MOST_ROWS = 12
-MOST_OF_A_CAMERA = 3
+MAX_ROWS = 12
+MAX_OF_A_CAMERA = 3
 CELL_WIDTH = 480  # px of one image
 _GAP, _EDGE = 6, 16
 _HEAD, _TITLE = 70, 34  # px above the first row, and above each row's images
@@ -38,12 +38,12 @@ class _Row:
 
 
 def choose_views(scores: Sequence[ViewScore]) -> list[ViewScore]:
-    """A few views of every camera, evenly spread over the drive, at most MOST_ROWS in all.
+    """A few views of every camera, evenly spread over the drive, at most MAX_ROWS in all.
 
     Of more cameras than that, the first ones.
     """
-    cameras = list(dict.fromkeys(score.key.camera for score in scores))[:MOST_ROWS]
-    each = max(1, min(MOST_OF_A_CAMERA, MOST_ROWS // max(1, len(cameras))))
+    cameras = list(dict.fromkeys(score.key.camera for score in scores))[:MAX_ROWS]
+    each = max(1, min(MAX_OF_A_CAMERA, MAX_ROWS // max(1, len(cameras))))
     chosen: list[ViewScore] = []
     for camera in cameras:
         own = [score for score in scores if score.key.camera == camera]

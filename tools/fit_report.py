@@ -17,7 +17,7 @@ from tools.fit_pictures import choose_views, draw_views
 from tools.fit_scores import ViewScore, evaluate_views, mean_scores, means_by_camera
 from tools.sheet import write_rgb
 
-MOST_TRAINING_VIEWS = 60  # where nothing is held out
+MAX_TRAINING_VIEWS = 60  # where nothing is held out
 TRAINING_SAMPLE = 12  # beside the held-out views, to see what was learnt by heart
 CURVES, PICTURES = "curves.png", "held_out.jpg"
 TRAINING_PICTURES = "training_views.jpg"
@@ -59,7 +59,7 @@ def write_report(
 ) -> dict[str, Any]:
     """Evaluate all held-out views and write report.json, report.md, curves.png and held_out.jpg.
 
-    Without held-out views, training views are scored, at most MOST_TRAINING_VIEWS of them, and the
+    Without held-out views, training views are scored, at most MAX_TRAINING_VIEWS of them, and the
     report says so; the pictures are then training_views.jpg. history: as `draw_curves` takes it.
     facts: what else is to stand in report.json, in JSON's types. Returns report.json's content.
 
@@ -100,7 +100,7 @@ class _Scored:
 def _choose_split(source: ViewSource) -> _Scored:
     if source.test:
         return _Scored("test", source.test, "")
-    keys = _spread(source.train, MOST_TRAINING_VIEWS)
+    keys = _spread(source.train, MAX_TRAINING_VIEWS)
     part = "all of them" if len(keys) == len(source.train) else f"{len(keys)} of them"
     return _Scored(
         "train",

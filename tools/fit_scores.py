@@ -20,7 +20,7 @@ from augment.render.composite import quantise
 from augment.scene import Scene
 from augment.views import SURFACE_ALPHA, render_buffers
 from recipes.load import load_recipe
-from recipes.schema import schema_Recipe
+from recipes.schema import Recipe
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +141,7 @@ def found_camera(scene: Scene, key: ViewKey, camera: Camera) -> Camera:
 
 
 @cache
-def _clear() -> schema_Recipe:
+def _clear() -> Recipe:
     return load_recipe("clear").resolve(0)
 
 

@@ -11,9 +11,9 @@ from tools.fit_parts import Fitter
 
 NOMINAL_STEPS = 5000  # the run that the throw-away trainer believes to be the beginning of
 UNTIMED = 3  # steps that compile kernels and touch new memory
-LEAST, MOST, MOST_S = 8, 40, 10.0
+LEAST, MOST, MAX_S = 8, 40, 10.0
 RESERVE = 0.05  # of the time, for evaluations and checkpoints
-LEAST_PART = 0.2  # of the time, for steps, however long reading takes
+MIN_PART = 0.2  # of the time, for steps, however long reading takes
 # A step's time over a whole run, as a multiple of its first steps' where splats are added.
 GROWTH = 1.25
 
@@ -45,12 +45,12 @@ def estimate_steps(
     loads: list[float] = []
     others: list[float] = []
     begun = clock()
-    while len(others) < LEAST or (len(others) < MOST and clock() - begun < MOST_S):
+    while len(others) < LEAST or (len(others) < MOST and clock() - begun < MAX_S):
         before = clock()
         load_s = fitter.run_step().stage_s.get("load", 0.0)
         loads.append(load_s)
         others.append(clock() - before - load_s)
     step_s = max(statistics.median(others), 1e-6)
-    left_s = max(budget_s * (1 - RESERVE) - views * statistics.median(loads), LEAST_PART * budget_s)
+    left_s = max(budget_s * (1 - RESERVE) - views * statistics.median(loads), MIN_PART * budget_s)
     steps = int(left_s / (step_s * (GROWTH if grows else 1.0)))
     return StepEstimate(max(1, steps if steps < 100 else steps // 50 * 50), step_s)

@@ -21,7 +21,7 @@ from augment.scene import Scene
 from augment.semantics import SemanticClass
 from tools.fit_scores import RenderedView, render_recorded
 
-MOST_VIEWS = 24
+MAX_VIEWS = 24
 
 
 class Truth(Protocol):
@@ -82,7 +82,7 @@ def true_depth_errors(scene: Scene, truth: Truth, cameras: Sequence[Camera]) -> 
 def truth_facts(uri: str, scene: Scene, source: ViewSource) -> dict[str, Any]:
     """For reports: a fitted scene's depth against the street it was recorded from, JSON-able.
 
-    uri: that street, procedural:street?...; at most MOST_VIEWS held-out views (training views
+    uri: that street, procedural:street?...; at most MAX_VIEWS held-out views (training views
     where none is held out) at their recorded cameras.
 
     Raises:
@@ -90,7 +90,7 @@ def truth_facts(uri: str, scene: Scene, source: ViewSource) -> dict[str, Any]:
     """
     truth = open_street(uri)
     keys = source.test or source.train
-    chosen = keys[:: max(1, -(-len(keys) // MOST_VIEWS))]
+    chosen = keys[:: max(1, -(-len(keys) // MAX_VIEWS))]
     errors = true_depth_errors(scene, truth, [source.camera(key) for key in chosen])
     facts = dataclasses.asdict(errors)
     return {"street": uri, **facts}

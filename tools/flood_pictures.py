@@ -14,7 +14,7 @@ from augment.plan import make_plan
 from augment.render.composite import quantise
 from augment.scene import Scene
 from augment.views import WeatheredBuffers, render_buffers
-from recipes.schema import Output, Weather, schema_Recipe
+from recipes.schema import Output, Recipe, Weather
 from recipes.weather import Flood, Waves
 from tools.bench_flood_error import inside
 from tools.drawing import captioned, strip, write_jpeg
@@ -68,7 +68,7 @@ def _panel(scene: Scene, camera: Camera, title: str, flood: Flood) -> np.ndarray
 
 def _timed(scene: Scene, camera: Camera, flood: Flood | None) -> tuple[float, WeatheredBuffers]:
     """Least seconds of a few frames after one that is not counted, and the frame."""
-    recipe = schema_Recipe(weather=Weather(flood=flood), output=Output(depth="none", labels=False))
+    recipe = Recipe(weather=Weather(flood=flood), output=Output(depth="none", labels=False))
     plan = make_plan(recipe, scene)
     frame = render_buffers(scene, camera, plan)
     seconds = []

@@ -30,10 +30,10 @@ from augment.jobs.times import shares_of
 from recipes.job import load_job, load_job_recipes
 
 if TYPE_CHECKING:
-    from recipes.schema import schema_Recipe
+    from recipes.schema import Recipe
 
 Executor = Literal["serial", "processes", "ray"]
-_MOST_LINES = 20
+_MAX_LINES = 20
 
 
 def generate_dataset(
@@ -118,7 +118,7 @@ def _dry_run(job: GenerateJob) -> int:
     plan = plan_job(job)
     blocks = shard_of(plan.blocks, *job.shard)
     _print_plan(plan, len(blocks), job)
-    guess = estimate(plan, open_scene, each=lambda name: _say(f"trying {name}"))
+    guess = estimate(plan, open_scene, each=lambda name: _print_result(f"trying {name}"))
     for name, sample in guess.samples.items():
         print(
             f"  {name}: {sample.seconds_per_mpx:.2f} s and {_size(sample.bytes_per_mpx)} a "
@@ -144,11 +144,11 @@ def _print_plan(plan: Plan, blocks: int, job: GenerateJob) -> None:
     if count > 1:
         images = sum(block.images for block in shard_of(plan.blocks, number, count))
         print(f"shard {number}/{count}: {images} images in {blocks} blocks")
-    for name, record in list(plan.records.items())[:_MOST_LINES]:
+    for name, record in list(plan.records.items())[:_MAX_LINES]:
         images = sum(block.images for block in plan.blocks if block.scene == name)
         print(f"  {name}: {images} images, opened in {record.open_s:.1f} s")
-    if len(plan.records) > _MOST_LINES:
-        print(f"  ... and {len(plan.records) - _MOST_LINES} more")
+    if len(plan.records) > _MAX_LINES:
+        print(f"  ... and {len(plan.records) - _MAX_LINES} more")
     for uri, why in plan.unusable.items():
         print(f"  cannot be used: {uri}: {why}")
 
@@ -161,13 +161,13 @@ def _report(result: GenerateResult, out: str) -> None:
     )
     if shares := shares_of(result.timings):
         print(shares.sentence)
-    for failure in result.failures[:_MOST_LINES]:
-        _say(f"failed: {failure}")
-    if len(result.failures) > _MOST_LINES:
-        more = len(result.failures) - _MOST_LINES
-        _say(f"... and {more} more; the manifest has them all")
+    for failure in result.failures[:_MAX_LINES]:
+        _print_result(f"failed: {failure}")
+    if len(result.failures) > _MAX_LINES:
+        more = len(result.failures) - _MAX_LINES
+        _print_result(f"... and {more} more; the manifest has them all")
     for uri, why in result.unusable.items():
-        _say(f"cannot be used: {uri}: {why}")
+        _print_result(f"cannot be used: {uri}: {why}")
     print(f"output: {out}   (climategs report {shlex.quote(out)} shows it)")
 
 
@@ -186,10 +186,10 @@ def _print_status(status: JobStatus) -> None:
         print(f"  {status.images_per_s:.1f} images/s; about {_duration(status.left_s)} left")
     for kind, groups in (("scene", status.by_scene), ("recipe", status.by_recipe)):
         open_ones = {n: g for n, g in groups.items() if g.published < g.planned}
-        for name, group in list(open_ones.items())[:_MOST_LINES]:
+        for name, group in list(open_ones.items())[:_MAX_LINES]:
             print(f"  {kind} {name}: {group.published} of {group.planned}")
-        if len(open_ones) > _MOST_LINES:
-            print(f"  ... and {len(open_ones) - _MOST_LINES} more {kind}s")
+        if len(open_ones) > _MAX_LINES:
+            print(f"  ... and {len(open_ones) - _MAX_LINES} more {kind}s")
     if total.in_failed_blocks:
         print(
             f"  with failures: blocks of {total.in_failed_blocks} images; start it again to retry"
@@ -203,12 +203,12 @@ def _is_done(status: JobStatus) -> bool:
     return total.published == total.planned and not total.in_failed_blocks and not status.unusable
 
 
-def _warm_up(recipes: list[schema_Recipe], backend: str) -> None:
+def _warm_up(recipes: list[Recipe], backend: str) -> None:
     from tools.warm_up import warm_up_for_workers
 
     seconds = warm_up_for_workers(recipes, backend)
     if seconds > 1:
-        _say(f"compiled the kernels in {seconds:.1f} s (kept for the next run)")
+        _print_result(f"compiled the kernels in {seconds:.1f} s (kept for the next run)")
 
 
 @contextlib.contextmanager
@@ -239,5 +239,5 @@ def _size(count: float) -> str:
     return f"{count / 1000**step:.1f} {steps[step]}"
 
 
-def _say(text: str) -> None:
+def _print_result(text: str) -> None:
     print(text, file=sys.stderr)

@@ -23,7 +23,7 @@ from augment.scene import Actor, Gaussians, PosedGaussians, Scene, Track
 from augment.semantics import SemanticClass
 from augment.sky import CubemapSky
 from augment.views import render_view
-from recipes.schema import Output, Render, Smog, Weather, schema_Recipe
+from recipes.schema import Output, Recipe, Render, Smog, Weather
 from recipes.weather import Flood, Snow, Style, Waves
 
 WIDTH, HEIGHT = 20, 12
@@ -31,20 +31,20 @@ _DENSE = 20.0  # metres of visibility: there is smog to see even here
 _PLAIN = Output(depth="none", labels=False)
 
 RECIPES = {
-    "clean": schema_Recipe(output=Output(semantic=True, instance=True)),
-    "antialiased, stopped early": schema_Recipe(
+    "clean": Recipe(output=Output(semantic=True, instance=True)),
+    "antialiased, stopped early": Recipe(
         render=Render(antialiased=True, transmittance_stop=0.2),
         output=Output(depth="expected", labels=False),
     ),
-    "mode depth": schema_Recipe(output=Output(depth="mode", labels=False)),
-    "uniform smog": schema_Recipe(weather=Weather(smog=Smog(visibility_m=_DENSE)), output=_PLAIN),
-    "layered smog": schema_Recipe(
+    "mode depth": Recipe(output=Output(depth="mode", labels=False)),
+    "uniform smog": Recipe(weather=Weather(smog=Smog(visibility_m=_DENSE)), output=_PLAIN),
+    "layered smog": Recipe(
         weather=Weather(smog=Smog(visibility_m=_DENSE, scale_height_m=9.0)), output=_PLAIN
     ),
-    "smog on buffers": schema_Recipe(
+    "smog on buffers": Recipe(
         weather=Weather(smog=Smog(visibility_m=_DENSE, model="deferred")), output=_PLAIN
     ),
-    "flood": schema_Recipe(
+    "flood": Recipe(
         weather=Weather(
             flood=Flood(
                 level_m=0.2, reflection="screen_space", waves=Waves(preset="breeze", seed=1)
@@ -52,27 +52,25 @@ RECIPES = {
         ),
         output=Output(depth="expected", labels=False),
     ),
-    "flood, mirrored": schema_Recipe(
+    "flood, mirrored": Recipe(
         weather=Weather(flood=Flood(level_m=0.2, reflection="mirrored")), output=_PLAIN
     ),
-    "flood, sky": schema_Recipe(
+    "flood, sky": Recipe(
         weather=Weather(flood=Flood(level_m=0.2, reflection="sky", fresnel="schlick")),
         output=_PLAIN,
     ),
-    "snow, lit per pixel": schema_Recipe(
+    "snow, lit per pixel": Recipe(
         weather=Weather(snow=Snow(depth_m=0.1, cell_m=0.8, tracks="never", shading="per_pixel")),
         output=_PLAIN,
     ),
-    "snow, close and glinting": schema_Recipe(
+    "snow, close and glinting": Recipe(
         weather=Weather(
             snow=Snow(depth_m=0.1, cell_m=0.8, tracks="never", shading="per_splat", sparkle=1.0)
         ),
         output=_PLAIN,
     ),
-    "style": schema_Recipe(style=Style(preset="dusk", per_region=True), output=_PLAIN),
-    "style folded into SH": schema_Recipe(
-        style=Style(preset="dusk", evaluated="sh"), output=_PLAIN
-    ),
+    "style": Recipe(style=Style(preset="dusk", per_region=True), output=_PLAIN),
+    "style folded into SH": Recipe(style=Style(preset="dusk", evaluated="sh"), output=_PLAIN),
 }
 
 
@@ -81,7 +79,7 @@ def views(scene: Scene | None = None) -> dict[str, Callable[[], object]]:
     scene = small_scene() if scene is None else scene
     camera = scene.frames[0].cameras["ahead"]
 
-    def render(recipe: schema_Recipe) -> Callable[[], object]:
+    def render(recipe: Recipe) -> Callable[[], object]:
         return lambda: render_view(scene, camera, recipe, backend="cuda")
 
     out: dict[str, Callable[[], object]] = {n: render(r) for n, r in RECIPES.items()}

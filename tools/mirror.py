@@ -19,7 +19,7 @@ from augment.jobs.mirror import (
     Mirrored,
     Weathered,
     WeatheredSweep,
-    check_apart,
+    check_disjoint,
     dataset_format,
     is_weathered,
     mirror_dataset,
@@ -32,12 +32,12 @@ from augment.jobs.mirror_files import SourceTree, Survey, survey
 from augment.jobs.processes import OutputLock
 from augment.scene import Scene
 from recipes.load import load_recipe
-from recipes.schema import schema_Recipe
+from recipes.schema import Recipe
 
 
 def recipes_for_source(
-    scene: Scene, out: Path, recipes: Sequence[schema_Recipe], *, overwrite: bool = False
-) -> list[schema_Recipe]:
+    scene: Scene, out: Path, recipes: Sequence[Recipe], *, overwrite: bool = False
+) -> list[Recipe]:
     """The recipes with images in the dataset's format, or PNG where they are of another size, after
     a look at whether the dataset can be copied and images that are there go on or are overwritten.
 
@@ -52,7 +52,7 @@ def recipes_for_source(
         # What is resized afterwards is compressed once, then.
         written_as = recorded_as if recipe.render.scale == 1 else "png"
         for folder in (variant_folder(scene.name, variant_name(recipe)), MIRROR_FOLDER):
-            check_apart(tree, out / folder)
+            check_disjoint(tree, out / folder)
         read_record(tree, mirror_folder(out, variant_name(recipe)))
         if not overwrite:
             _check_format(scene, out, recipe, written_as)
@@ -268,7 +268,7 @@ def _has_all(scene: Scene, rows: list[dict[str, Any]]) -> bool:
     return all(times.get((row["frame"], row["camera"])) == row["timestamp_ns"] for row in rows)
 
 
-def _check_format(scene: Scene, out: Path, recipe: schema_Recipe, written_as: str) -> None:
+def _check_format(scene: Scene, out: Path, recipe: Recipe, written_as: str) -> None:
     """Images of the same recipe in another format are not rendered twice beside each other."""
     if not (out / MANIFEST).is_file() or recipe.output.image == written_as:
         return
@@ -282,7 +282,7 @@ def _check_format(scene: Scene, out: Path, recipe: schema_Recipe, written_as: st
         )
 
 
-def _with_format(recipe: schema_Recipe, written_as: str) -> schema_Recipe:
+def _with_format(recipe: Recipe, written_as: str) -> Recipe:
     output = recipe.output.model_copy(update={"image": written_as})
     return recipe.model_copy(update={"output": output})
 

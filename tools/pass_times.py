@@ -12,7 +12,7 @@ from augment.plan import cover_for, make_plan
 from augment.scene import Scene
 from augment.timing import stopwatch
 from augment.views import render_view
-from recipes.schema import schema_Recipe
+from recipes.schema import Recipe
 
 DRAWING = ("rasterise", "flood: bed", "flood: mirrored view")  # laps that run the rasteriser
 FRAME = "frame"  # the whole view
@@ -52,7 +52,7 @@ class PassTimes:
         }
 
 
-def measure_passes(recipe: schema_Recipe, scene: Scene, views: int = VIEWS) -> PassTimes:
+def measure_passes(recipe: Recipe, scene: Scene, views: int = VIEWS) -> PassTimes:
     """Renders a few views with a stopwatch. The recipe's scale and outputs count; files do not."""
     from augment.render.threads import thread_count
 
@@ -101,10 +101,10 @@ def sample_views(scene: Scene, count: int) -> list[Camera]:
     return picked
 
 
-def without_folded(recipe: schema_Recipe, scene: Scene) -> dict[str, schema_Recipe]:
+def without_folded(recipe: Recipe, scene: Scene) -> dict[str, Recipe]:
     """The recipe without each of the passes that run inside the rasteriser, by the pass's name."""
     runs = {step.name for step in make_plan(recipe, scene).steps if step.runs}
-    weather, found = recipe.weather, dict[str, schema_Recipe]()
+    weather, found = recipe.weather, dict[str, Recipe]()
     if "style on the scene" in runs:
         found["style on the scene"] = recipe.model_copy(update={"style": None})
     if "smog per Gaussian" in runs:
@@ -117,13 +117,11 @@ def without_folded(recipe: schema_Recipe, scene: Scene) -> dict[str, schema_Reci
     return found
 
 
-def _with_weather(recipe: schema_Recipe, **changes: Any) -> schema_Recipe:
+def _with_weather(recipe: Recipe, **changes: Any) -> Recipe:
     return recipe.model_copy(update={"weather": recipe.weather.model_copy(update=changes)})
 
 
-def _runs(
-    scene: Scene, cameras: Sequence[Camera], recipe: schema_Recipe
-) -> list[list[dict[str, float]]]:
+def _runs(scene: Scene, cameras: Sequence[Camera], recipe: Recipe) -> list[list[dict[str, float]]]:
     """The laps of every run of each view. A recipe's runs stand side by side, since a scene keeps
     the snow of two recipes at most.
     """
@@ -137,7 +135,7 @@ def _fastest(runs: Sequence[dict[str, float]]) -> dict[str, float]:
     return min(runs, key=lambda run: run[FRAME])
 
 
-def _timed(scene: Scene, camera: Camera, recipe: schema_Recipe) -> dict[str, float]:
+def _timed(scene: Scene, camera: Camera, recipe: Recipe) -> dict[str, float]:
     """Seconds of the view's passes, and of the whole as FRAME."""
     start = time.perf_counter()
     with stopwatch() as seconds:

@@ -12,7 +12,7 @@ from augment.jobs.layout import folder_name, resolve_inside
 from tools import sheet
 
 VIDEO_WIDTH = 1440
-MOST_SHOWN = 12  # scenes and variants in one picture
+MAX_SHOWN = 12  # scenes and variants in one picture
 
 
 def read_rows(out: Path) -> list[dict[str, Any]]:
@@ -33,7 +33,7 @@ def read_rows(out: Path) -> list[dict[str, Any]]:
 def draw_sheet(out: Path, frame: int | None = None) -> Path:
     """Writes OUT/contact_sheet.png: a row per scene and variant, a column per camera.
 
-    Of more than MOST_SHOWN variants, as many are shown, evenly spread.
+    Of more than MAX_SHOWN variants, as many are shown, evenly spread.
     """
     rows = read_rows(out)
     frames = sorted({row["frame"] for row in rows})
@@ -86,7 +86,7 @@ def _read(out: Path, row: dict[str, Any]) -> np.ndarray:
 
 
 def _shown(groups: list[tuple[str, str]]) -> list[tuple[str, str]]:
-    step = -(-len(groups) // MOST_SHOWN)
+    step = -(-len(groups) // MAX_SHOWN)
     return groups[::step]
 
 

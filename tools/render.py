@@ -18,7 +18,7 @@ from augment.jobs.layout import variant_name
 from augment.jobs.manifest import lidar_notes
 from augment.jobs.mirror import Links
 from augment.jobs.quality import recipes_to_try
-from augment.jobs.quality_record import settle_for
+from augment.jobs.quality_record import resolve_quality_for
 from augment.jobs.render_job import JobResult, RenderJob, run_job
 from augment.jobs.store import open_store
 from augment.jobs.times import shares_of
@@ -27,7 +27,7 @@ from augment.scene import Scene
 from recipes.change import found
 from recipes.job import scaled_recipe
 from recipes.load import load_recipe
-from recipes.schema import FramePattern, free_knobs, parse_frames, schema_Recipe
+from recipes.schema import FramePattern, Recipe, free_knobs, parse_frames
 from tools.mirror import mirror_outputs, recipes_for_source
 
 Layout = Literal["standard", "source"]
@@ -61,12 +61,12 @@ def render_recipe(
     tried = [each for resolved in recipes for each in recipes_to_try(resolved)]
     seconds = warm_up(tried, backend)
     if seconds > 1:
-        _say(f"compiled the kernels in {seconds:.1f} s (kept for the next run)")
+        _print_result(f"compiled the kernels in {seconds:.1f} s (kept for the next run)")
     scene = open_scene(scene_uri)
     if camera_path is None:
         check_frames(scene)
     for problem in scene.problems:
-        _say(f"note: {problem}")
+        _print_result(f"note: {problem}")
     if layout == "source":
         _check_no_path(camera_path)
         recipes = recipes_for_source(scene, out, recipes, overwrite=overwrite)
@@ -84,7 +84,7 @@ def render_recipe(
     asked = labelled if chosen is None else labelled.intersection(chosen)
     if notes and has_lidar(scene, asked):
         for note in notes:
-            _say(f"note: {note}")
+            _print_result(f"note: {note}")
     job = RenderJob(
         scene_uri=scene_uri,
         recipes=recipes,
@@ -109,9 +109,7 @@ def render_recipe(
     return 1 if result.failed else 0
 
 
-def resolve_variants(
-    recipe: str, variants: int | None = None, scale: float = 1.0
-) -> list[schema_Recipe]:
+def resolve_variants(recipe: str, variants: int | None = None, scale: float = 1.0) -> list[Recipe]:
     """The recipe's variants in numbers, at `scale` times the recipe's resolution.
 
     Raises:
@@ -126,18 +124,18 @@ def resolve_variants(
 
 
 def _settled(
-    recipe: schema_Recipe,
+    recipe: Recipe,
     scene: Scene,
     out: Path,
     path: Sequence[Frame] | None,
     backend: str,
     *,
     overwrite: bool,
-) -> schema_Recipe:
+) -> Recipe:
     """The recipe with the settings of its quality, which are told where it had to choose them."""
     if not recipe.quality.is_open:
         return recipe
-    settled = settle_for(
+    settled = resolve_quality_for(
         open_store(out),
         recipe,
         scene,
@@ -147,7 +145,9 @@ def _settled(
         progress=True,
     )
     settings = [f"{k.path} {found(settled, k.path)}" for k in free_knobs(recipe)]
-    _say(f"{variant_name(recipe)}: quality {recipe.quality.words} chose {', '.join(settings)}")
+    _print_result(
+        f"{variant_name(recipe)}: quality {recipe.quality.words} chose {', '.join(settings)}"
+    )
     return settled
 
 
@@ -187,11 +187,11 @@ def _report(result: JobResult, workers: int) -> None:
     if shares := shares_of(result.timings, held_up=workers):
         print(shares.sentence)
     for failure in result.failures[:20]:
-        _say(f"failed: {failure}")
+        _print_result(f"failed: {failure}")
     if len(result.failures) > 20:
-        _say(f"... and {len(result.failures) - 20} more; the manifest has them all")
+        _print_result(f"... and {len(result.failures) - 20} more; the manifest has them all")
     print(f"manifest: {result.manifest}")
 
 
-def _say(text: str) -> None:
+def _print_result(text: str) -> None:
     print(text, file=sys.stderr)

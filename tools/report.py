@@ -23,15 +23,15 @@ from augment.jobs.manifest import OK, read_finished
 from augment.jobs.store import Store, open_store
 from tools import report_label_page, report_labels, report_page, report_summary, report_tables
 from tools.report_files import ReportFiles
-from tools.report_gallery import MOST_IMAGES, Gallery, Shares
+from tools.report_gallery import MAX_IMAGES, Gallery, Shares
 from tools.report_html import Html, joined, tag
 from tools.report_numbers import count
 from tools.report_weather import find_draws, spreads, weather_of_recipes
 
 REPORT = "report.html"
 IMAGES = 48
-LARGEST_PAGE = 5_000_000  # bytes
-MOST_RECIPES = 12  # whose labels and sweeps are looked at
+MAX_PAGE = 5_000_000  # bytes
+MAX_RECIPES = 12  # whose labels and sweeps are looked at
 # Of a million rows they take some hundred megabytes, over and over.
 _UNUSED = [
     "timestamp_ns",
@@ -67,14 +67,14 @@ def write_report(out: str | Path, html: Path | None = None, images: int = IMAGES
     """Write the page about an output folder, here or in an object store.
 
     html: where; by default OUT/report.html, or NAME-report.html in the working folder where OUT is
-    not on this machine. images: how many pictures the page has at most, 0 to MOST_IMAGES.
+    not on this machine. images: how many pictures the page has at most, 0 to MAX_IMAGES.
 
     Raises:
         OutputError: nothing is finished there yet, the manifest is damaged, the page cannot be
             written, or `images` is out of its range.
     """
-    if not 0 <= images <= MOST_IMAGES:
-        raise OutputError(f"a report has 0 to {MOST_IMAGES} images; got {images}")
+    if not 0 <= images <= MAX_IMAGES:
+        raise OutputError(f"a report has 0 to {MAX_IMAGES} images; got {images}")
     store = open_store(out)
     if html is None:
         name = f"{folder_name(_name_of(store))}-{REPORT}"
@@ -84,7 +84,7 @@ def write_report(out: str | Path, html: Path | None = None, images: int = IMAGES
     for fewer in (images, images // 2, images // 4, 0):
         page, problems = make_page(store, Path(html), fewer)
         data = page.encode()
-        if len(data) <= LARGEST_PAGE:
+        if len(data) <= MAX_PAGE:
             break
     write_atomic(Path(html).absolute(), data)
     return Written(Path(html), len(data), problems)
@@ -104,7 +104,7 @@ def make_page(store: Store, html: Path, images: int) -> tuple[str, int]:
     with_images = [group.name for group in recipes if group.finished]
     gallery = Gallery(finished, draws, files, Shares.of(images), beside)
     shown = [group.name for group in report_page.listed(recipes)]
-    some = report_labels.evenly(with_images, MOST_RECIPES)
+    some = report_labels.evenly(with_images, MAX_RECIPES)
 
     whole = report_summary.overall(table)
     parts = {

@@ -16,9 +16,9 @@ from tools.report_numbers import count, percent, short, with_unit
 
 WIDTH, HEIGHT = 340, 148  # of a histogram, in SVG units; about CSS pixels
 _LEFT, _RIGHT, _TOP, _FLOOR = 6, 6, 14, 104
-MOST_BINS = 24
+MAX_BINS = 24
 LOG_RATIO = 10  # largest over smallest value from which an axis is logarithmic
-MOST_MARKS = 300
+MAX_MARKS = 300
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ def histogram(values: np.ndarray, weights: np.ndarray, *, linear: bool = False) 
     """
     low, high = float(values.min()), float(values.max())
     log = not linear and low > 0 and high / low > LOG_RATIO
-    bins = int(min(MOST_BINS, max(6, 2 * math.ceil(math.sqrt(len(values))))))
+    bins = int(min(MAX_BINS, max(6, 2 * math.ceil(math.sqrt(len(values))))))
     edges = np.geomspace(low, high, bins + 1) if log else np.linspace(low, high, bins + 1)
     edges[0], edges[-1] = min(edges[0], low), max(edges[-1], high)
     counts, _ = np.histogram(values, edges, weights=weights)
@@ -49,7 +49,7 @@ def histogram(values: np.ndarray, weights: np.ndarray, *, linear: bool = False) 
 def histogram_svg(shape: Histogram, unit: str, noun: str, marks: np.ndarray, title: str) -> Html:
     """Bars, an axis of three to five numbers, and a tick for each of `marks` beneath.
 
-    noun: what is counted. marks: [m] values, drawn as far as MOST_MARKS of them, evenly chosen.
+    noun: what is counted. marks: [m] values, drawn as far as MAX_MARKS of them, evenly chosen.
     """
     edges = np.log(shape.edges) if shape.log else shape.edges
     span = float(edges[-1] - edges[0]) or 1.0
@@ -66,7 +66,7 @@ def histogram_svg(shape: Histogram, unit: str, noun: str, marks: np.ndarray, tit
         for label in [f"{with_unit(a, unit)} to {with_unit(b, unit)}: {count(int(n), noun)}"]
     ]
     line = _line(_LEFT, _FLOOR, WIDTH - _RIGHT, _FLOOR, "axis")
-    shown = marks[np.linspace(0, len(marks) - 1, min(len(marks), MOST_MARKS)).astype(int)]
+    shown = marks[np.linspace(0, len(marks) - 1, min(len(marks), MAX_MARKS)).astype(int)]
     stems = "".join(f"M{x:.1f} {_FLOOR + 4}v8" for x in sorted({x_of(float(v)) for v in shown}))
     rug = tag("path", d=Html(stems), class_="mark")
     most = tag("text", count(int(tallest)), x=_LEFT, y=_TOP - 4, class_="faint")

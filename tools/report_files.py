@@ -11,8 +11,8 @@ from augment.errors import OutputError
 from augment.jobs.store import StoredFileMissing
 from augment.jobs.tables import read_table
 
-LARGEST_FILE = 1 << 28  # bytes; a report needs no larger one
-MOST_PROBLEMS = 50  # that the page lists
+MAX_FILE = 1 << 28  # bytes; a report needs no larger one
+MAX_PROBLEMS = 50  # that the page lists
 
 
 class Readable(Protocol):
@@ -45,8 +45,8 @@ class ReportFiles:
     def read(self, path: str) -> bytes | None:
         """The file's content; None, and noted, where there is none that can be used."""
         stored = self._listing.get(path)
-        if stored is not None and stored.size > LARGEST_FILE:
-            return self.note(path, f"larger than {LARGEST_FILE >> 20} MiB: not looked at")
+        if stored is not None and stored.size > MAX_FILE:
+            return self.note(path, f"larger than {MAX_FILE >> 20} MiB: not looked at")
         try:
             return self._store.read(path)
         except StoredFileMissing:
@@ -69,7 +69,7 @@ class ReportFiles:
         """Remember that a file is damaged."""
         if path in self.problems:
             return
-        if len(self.problems) < MOST_PROBLEMS:
+        if len(self.problems) < MAX_PROBLEMS:
             self.problems[path] = why
         else:
             self.unlisted += 1

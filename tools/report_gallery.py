@@ -26,7 +26,7 @@ from tools.report_pictures import (
 from tools.report_weather import Draws, weather_text
 
 BUDGET = 3_100_000  # bytes of all pictures; a third more as text of the page
-MOST_IMAGES = 400  # more of them could not be told apart within the budget
+MAX_IMAGES = 400  # more of them could not be told apart within the budget
 _VARIANTS = 6  # of one comparison
 _SAMPLE = 4  # pictures: an image, its depth, its classes, and a mask
 # Pixels across, and bytes at most of one picture.

@@ -6,7 +6,7 @@ import html
 import re
 from typing import Any
 
-LONGEST_TEXT = 300  # characters of one name or message
+MAX_TEXT = 300  # characters of one name or message
 _VOID = {"br", "img", "input", "meta"}
 # Control characters and lone surrogates have no place in HTML; others could turn the line's
 # direction and so show a name as what it is not.
@@ -20,10 +20,10 @@ class Html(str):
 
 
 def text(value: object) -> Html:
-    """Any value as text of a page: escaped, cut to LONGEST_TEXT, invisible characters shown."""
+    """Any value as text of a page: escaped, cut to MAX_TEXT, invisible characters shown."""
     said = str(value)
-    if len(said) > LONGEST_TEXT:
-        said = said[: LONGEST_TEXT - 1] + "…"
+    if len(said) > MAX_TEXT:
+        said = said[: MAX_TEXT - 1] + "…"
     return Html(html.escape(_INVISIBLE.sub("\ufffd", said), quote=True))
 
 

@@ -10,7 +10,7 @@ from tools.report_charts import amount_bar, legend, share_bar
 from tools.report_html import Html, joined, tag
 from tools.report_labels import VISIBILITY_STEPS, Classes, Sample, Shares
 from tools.report_numbers import count
-from tools.report_tables import MOST_ROWS, folded_table, number_cell, table
+from tools.report_tables import MAX_ROWS, folded_table, number_cell, table
 
 _STEP_CLASSES = ("s0", "s1", "s2", "s3", "s4", "s5")
 _CODE_CLASSES = ("c0", "c1", "c2", "c3", "c4", "c5", "c6", "c7")
@@ -32,9 +32,9 @@ def class_table(classes: Classes) -> Html:
             tag("td", count(boxes), amount_bar(boxes, most), class_="n"),
             number_cell(count(tracks)),
         ]
-        for label, boxes, tracks in classes.rows[:MOST_ROWS]
+        for label, boxes, tracks in classes.rows[:MAX_ROWS]
     ]
-    rest = len(classes.rows) - MOST_ROWS
+    rest = len(classes.rows) - MAX_ROWS
     note = f"and {count(rest, 'more class')}" if rest > 0 else None
     said = "Boxes of each scene's frames, once for all of its variants" + _sampled(classes.sample)
     return joined(
@@ -85,9 +85,9 @@ def _share_rows(shares: Shares, names: Sequence[str], classes: Sequence[str], no
             tag("td", share_bar(counts, names, classes), class_="wide"),
             number_cell(count(sum(counts), noun)),
         ]
-        for name, counts in shares.rows[:MOST_ROWS]
+        for name, counts in shares.rows[:MAX_ROWS]
     ]
-    rest = len(shares.rows) - MOST_ROWS
+    rest = len(shares.rows) - MAX_ROWS
     note = f"and {count(rest, 'more recipe')}" if rest > 0 else None
     return table(None, rows, note, 1)
 

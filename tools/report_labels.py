@@ -13,9 +13,9 @@ import pyarrow.compute as pc
 from tools.report_files import ReportFiles
 from tools.report_pick import evenly, first_of_each
 
-MOST_BOX_FILES = 40
-MOST_TABLES = 6  # of each recipe
-MOST_SWEEPS = 3  # of each recipe
+MAX_BOX_FILES = 40
+MAX_TABLES = 6  # of each recipe
+MAX_SWEEPS = 3  # of each recipe
 VISIBILITY_STEPS = (0.0, 0.05, 0.2, 0.5, 0.8, 0.95)  # lower bounds of the bins; the last is open
 # What of a box an effect leaves, from its column, by the manifest's kind of path.
 _LEFT: dict[str, tuple[str, Callable[[np.ndarray], np.ndarray]]] = {
@@ -63,7 +63,7 @@ def count_classes(table: pa.Table, files: ReportFiles) -> Classes | None:
         )
     )
     rows = first_of_each(of_first, "labels_path")
-    chosen = evenly(rows, MOST_BOX_FILES)
+    chosen = evenly(rows, MAX_BOX_FILES)
     boxes: Counter[str] = Counter()
     tracks: dict[str, set[tuple[str, str]]] = {}
     read = 0
@@ -97,7 +97,7 @@ def share_visible(table: pa.Table, recipes: list[str], files: ReportFiles) -> Sh
         sets = [paths for paths in sets if any(paths)]
         there += len(sets)
         counts = np.zeros(len(VISIBILITY_STEPS), np.int64)
-        for paths in evenly(sets, MOST_TABLES):
+        for paths in evenly(sets, MAX_TABLES):
             visible = _visible(dict(zip(columns, paths, strict=True)), files)
             if visible is None:
                 continue
@@ -122,7 +122,7 @@ def share_codes(
         own = table.filter(pc.equal(table["recipe"], recipe))
         paths = sorted(path for path in pc.unique(own["lidar_path"]).to_pylist() if path)
         codes: Counter[int] = Counter()
-        for path in evenly(paths, MOST_SWEEPS):
+        for path in evenly(paths, MAX_SWEEPS):
             sweep = files.read_columns(path, ("weather_code",))
             if sweep is None or not sweep.num_columns:
                 break  # a recipe's sweeps all have the column, or none has it

@@ -10,11 +10,11 @@ from tools.report_charts import amount_bar, histogram, histogram_svg
 from tools.report_html import Html, joined, tag
 from tools.report_numbers import byte_size, count, percent, plural_of, short, with_unit
 from tools.report_summary import Failure, Files, Group
-from tools.report_tables import MOST_ROWS, facts, folded_table, number_cell, table
+from tools.report_tables import MAX_ROWS, facts, folded_table, number_cell, table
 from tools.report_weather import RecipeWeather, Spread
 
-MOST_CHARTS = 24
-MOST_FAILURES = 20
+MAX_CHARTS = 24
+MAX_FAILURES = 20
 
 
 def tiles(whole: Group, recipes: int, files: Sequence[Files]) -> Html:
@@ -45,13 +45,13 @@ def weather_charts(found: Sequence[Spread]) -> Html:
         if spread.is_constant
     ]
     note = "Bars count images. Each tick beneath is one variant of a scene."
-    if len(drawn) > MOST_CHARTS:
-        note += f" {len(drawn) - MOST_CHARTS} further numbers are not drawn."
+    if len(drawn) > MAX_CHARTS:
+        note += f" {len(drawn) - MAX_CHARTS} further numbers are not drawn."
     charts = [
         tag("p", note, class_="note"),
-        tag("div", [_chart(spread) for spread in drawn[:MOST_CHARTS]], class_="cards"),
+        tag("div", [_chart(spread) for spread in drawn[:MAX_CHARTS]], class_="cards"),
     ]
-    return joined([charts if drawn else None, facts(constant[:MOST_CHARTS]) if constant else None])
+    return joined([charts if drawn else None, facts(constant[:MAX_CHARTS]) if constant else None])
 
 
 def _chart(spread: Spread) -> Html:
@@ -83,9 +83,9 @@ def _where_text(spread: Spread) -> str:
 
 def listed(groups: Sequence[Group]) -> list[Group]:
     """Those that a table has room for: by name or, where not all fit, with failures first."""
-    if len(groups) <= MOST_ROWS:
+    if len(groups) <= MAX_ROWS:
         return list(groups)
-    return sorted(groups, key=lambda group: (-group.failed, group.name))[:MOST_ROWS]
+    return sorted(groups, key=lambda group: (-group.failed, group.name))[:MAX_ROWS]
 
 
 def recipe_table(groups: Sequence[Group], weather: Mapping[str, RecipeWeather]) -> Html:
@@ -147,9 +147,9 @@ def failure_table(failures: Sequence[Failure]) -> Html:
             tag("td", tag("code", failure.message, class_="message"),
                 tag("small", "such as ", "; ".join(failure.examples)), class_="text"),
         ]
-        for failure in failures[:MOST_FAILURES]
+        for failure in failures[:MAX_FAILURES]
     ]  # fmt: skip
-    rest = failures[MOST_FAILURES:]
+    rest = failures[MAX_FAILURES:]
     images = count(sum(failure.images for failure in rest), "image")
     note = f"and {images} with {count(len(rest), 'other message')}" if rest else None
     said = (

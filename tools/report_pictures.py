@@ -17,7 +17,7 @@ from augment.semantics import SemanticClass
 from tools.report_files import ReportFiles
 from tools.report_html import Html
 
-MOST_PIXELS = 1 << 26  # of one image: what an untrusted file may make the decoder allocate
+MAX_PIXELS = 1 << 26  # of one image: what an untrusted file may make the decoder allocate
 _QUALITIES = (82, 74, 64, 52, 40)
 _NO_DEPTH = (128, 128, 128)
 _NEAREST_M = 0.5
@@ -183,7 +183,7 @@ def _small_enough(path: str, files: ReportFiles) -> bytes | None:
     header = image_header(data)
     if header is None:
         return files.note(path, f"no readable image ({len(data)} bytes)")
-    if header.width * header.height > MOST_PIXELS:
+    if header.width * header.height > MAX_PIXELS:
         return files.note(path, f"{header.width}x{header.height} pixels: not looked at")
     return data
 

@@ -15,7 +15,7 @@ import pyarrow.compute as pc
 from augment.jobs.layout import STATE_FOLDER
 from augment.jobs.manifest import OK
 
-MOST_EXAMPLES = 3
+MAX_EXAMPLES = 3
 _DIGITS = re.compile(r"\d+")
 # Of a variant's folder; what else lies there, such as its recipe, is small.
 _KINDS = (
@@ -109,7 +109,7 @@ def group_failures(table: pa.Table) -> list[Failure]:
     for message, *place in zip(*(failed[name].to_pylist() for name in names), strict=True):
         key = _DIGITS.sub("#", message or "")
         first, examples, number = found.get(key, (message or "no message", [], 0))
-        if number < MOST_EXAMPLES:
+        if number < MAX_EXAMPLES:
             examples.append(place_text(*place))
         found[key] = (first, examples, number + 1)
     failures = [Failure(first, n, tuple(examples)) for first, examples, n in found.values()]

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from tools.report_html import Html, joined, tag
 
-MOST_ROWS = 40  # of a table
+MAX_ROWS = 40  # of a table
 OPEN_ROWS = 12  # tables of more are folded
 
 

@@ -15,16 +15,16 @@ from adapters.base import open_scene, parse_uri
 from adapters.street.labels import StreetTruth, open_truth
 from augment.cameras import Camera
 from augment.effects.snow.height_map import Estimator
-from augment.effects.snow.layer import lay_snow
+from augment.effects.snow.layer import build_snow_layer
 from augment.effects.snow.light import illumination_of
-from augment.effects.snow.placement import PlacementSettings, place_snow_bed
+from augment.effects.snow.placement import PlacementSettings, place_snow_support
 from augment.effects.snow.snow import placement_settings
-from augment.effects.snow.support import remember_bed
+from augment.effects.snow.support import remember_support
 from augment.plan import make_plan
 from augment.render.composite import quantise
 from augment.scene import Scene
 from augment.views import WeatheredBuffers, render_buffers
-from recipes.schema import Output, Weather, schema_Recipe
+from recipes.schema import Output, Recipe, Weather
 from recipes.weather import Snow
 from tools.bench_snow_accuracy import draw_snow
 from tools.bench_snow_truth import camera_from_above, pixel_places, still, surface_below
@@ -122,8 +122,10 @@ def draw_estimators(scene: Scene, truth: StreetTruth) -> np.ndarray:
     view = _window(view, EDGES_AT, EDGES_ZOOM)
     columns = []
     for estimator in ESTIMATORS:
-        bed = place_snow_bed(scene, cameras, PlacementSettings(cell_m=CELL_M, estimator=estimator))
-        cover = lay_snow(bed, scene, snow, illumination_of(scene, snow), seed=0)
+        bed = place_snow_support(
+            scene, cameras, PlacementSettings(cell_m=CELL_M, estimator=estimator)
+        )
+        cover = build_snow_layer(bed, scene, snow, illumination_of(scene, snow), seed=0)
         height, shown = draw_snow(scene, cover, above)
         error = height - top - snow.depth_m
         map_rgb = color_mapped(0.5 + error / (2 * ERROR_RANGE_M), cv2.COLORMAP_TWILIGHT_SHIFTED)
@@ -134,7 +136,7 @@ def draw_estimators(scene: Scene, truth: StreetTruth) -> np.ndarray:
             f"by more than 10 cm"
         )
         with_bed = dataclasses.replace(scene)  # beds and covers are remembered by scene
-        remember_bed(with_bed, placement_settings(snow), bed)
+        remember_support(with_bed, placement_settings(snow), bed)
         picture = quantise(_frame(with_bed, view, snow).rgb)
         width = map_rgb.shape[1]
         part = cv2.resize(picture, (width, round(width * view.height / view.width)))
@@ -155,7 +157,7 @@ def _window(camera: Camera, at: tuple[float, float, float, float], zoom: float) 
 
 
 def _frame(scene: Scene, camera: Camera, snow: Snow | None) -> WeatheredBuffers:
-    recipe = schema_Recipe(weather=Weather(snow=snow), output=Output(depth="none", labels=False))
+    recipe = Recipe(weather=Weather(snow=snow), output=Output(depth="none", labels=False))
     return render_buffers(scene, camera, make_plan(recipe, scene))
 
 

@@ -22,7 +22,7 @@ from pydantic import ValidationError
 from augment.cameras import Camera
 from augment.effects.style.color_maps import StyleMaps, sky_levels, style_gaussians, styled_scene
 from augment.effects.style.content import content_pictures, content_statistics, select_views
-from augment.effects.style.style import Look, style_maps
+from augment.effects.style.style import SceneStyle, style_maps
 from augment.errors import ClimateGSError, OutputError, StyleError
 from augment.files.scene_file import is_scene_folder, save_scene
 from augment.jobs.atomic import write_atomic
@@ -106,7 +106,7 @@ def _open(uri: str) -> Scene:
 
     scene = open_scene(uri)
     for problem in scene.problems:
-        _say(f"note: {problem}")
+        _print_result(f"note: {problem}")
     return storable(scene)
 
 
@@ -249,9 +249,9 @@ def _clamp_facts(scene: Scene, styled: Scene, maps: StyleMaps) -> dict[str, Any]
     facts["pixels"] = _outside(
         [torch.cat([p.reshape(-1, 3) for p in group]) for group in (before, after)]
     )
-    worn = Look(maps, styled.sky, scene, sky_levels(scene, maps))
+    style_parts = SceneStyle(maps, styled.sky, scene, sky_levels(scene, maps))
     errors = [
-        (_render(scene, camera, worn) - new).abs().amax(-1).flatten()
+        (_render(scene, camera, style_parts) - new).abs().amax(-1).flatten()
         for camera, new in zip(_views(scene), after, strict=True)
     ]
     off = torch.cat(errors) > VISIBLE
@@ -276,11 +276,11 @@ def _views(scene: Scene) -> list[Camera]:
     return [camera.scaled(min(1.0, VIEW_WIDTH / camera.width)) for camera in cameras]
 
 
-def _render(scene: Scene, camera: Camera, worn: Look | None = None) -> torch.Tensor:
+def _render(scene: Scene, camera: Camera, style_parts: SceneStyle | None = None) -> torch.Tensor:
     """The picture with its sky, not clamped. worn: a style to render it under."""
     parts, sky = scene.parts_for(camera), scene.sky
-    if worn is not None:
-        parts, sky = worn.on(parts), worn.sky
+    if style_parts is not None:
+        parts, sky = style_parts.on(parts), style_parts.sky
     seen = rasterize(parts, camera)
     assert seen.rgb is not None and seen.alpha is not None
     return composite_sky(seen.rgb, seen.alpha, camera, sky)
@@ -336,5 +336,5 @@ def _warm_up() -> None:
     style_gaussians(Gaussians.empty(), StyleMaps(color_map[None], color_map, color_map))
 
 
-def _say(text: str) -> None:
+def _print_result(text: str) -> None:
     print(text, file=sys.stderr)

@@ -23,7 +23,7 @@ from augment.plan import make_plan
 from augment.render.composite import quantise
 from augment.scene import Scene
 from augment.views import render_buffers
-from recipes.schema import Output, Smog, Weather, schema_Recipe
+from recipes.schema import Output, Recipe, Smog, Weather
 from recipes.weather import Snow, Style, style_preset_names
 from tools.drawing import GAP_PX, captioned, strip, write_jpeg
 
@@ -100,9 +100,7 @@ class Stage:
 
     def panel(self, title: str, text: str = "", **recipe: Any) -> np.ndarray:
         """The scene under a recipe, with two lines below."""
-        plan = make_plan(
-            schema_Recipe(output=Output(depth="none", labels=False), **recipe), self.scene
-        )
+        plan = make_plan(Recipe(output=Output(depth="none", labels=False), **recipe), self.scene)
         picture = quantise(render_buffers(self.scene, self.camera, plan).rgb)
         return captioned(self._small(picture), title, text)
 

@@ -145,16 +145,18 @@ def _prepare(options: StyleTrainOptions, folder: Path, before: Checkpoint | None
     _take_device(options.device)
     data = _open_data(options)
     for problem in data.problems:
-        _say(f"note: {problem}")
+        _print_result(f"note: {problem}")
     views, photos = len(data.pool.views), len(data.pool.photos)
-    _say(f"{photos} photos and {views} views of {len(options.scenes)} scenes to learn from")
+    _print_result(
+        f"{photos} photos and {views} views of {len(options.scenes)} scenes to learn from"
+    )
     features = open_features(options.vgg)
     if before is None:
         plan = Checkpoint(options.settings(), options.length(), options.steps or 0, data.facts)
         if options.budget_s is not None:
             steps, step_s = _estimate(options, data, features)
             plan = dataclasses.replace(plan, steps=steps)
-            _say(
+            _print_result(
                 f"{1e3 * step_s:.0f} ms a step: {steps} steps make about "
                 f"{options.budget_s / 60:g} minutes. --steps {steps} gives the same network again"
             )
@@ -170,7 +172,7 @@ def _prepare(options: StyleTrainOptions, folder: Path, before: Checkpoint | None
     trainer = _trainer(options, plan.steps, data.pool, features)
     if plan.arrays:
         trainer.load_state(plan.arrays, plan.facts)
-        _say(f"going on after step {plan.step} of {plan.steps}")
+        _print_result(f"going on after step {plan.step} of {plan.steps}")
     rows, sums = list(plan.history), dict(plan.sums)
     plan = dataclasses.replace(plan, arrays={}, facts={})
     return _Run(
@@ -295,7 +297,9 @@ def _train(run: _Run, progress: bool, checkpoint_s: float) -> StyleTrainOutcome:
         _show_end(run.options.out, report)
         return StyleTrainOutcome(0, report)
     again = "the same command without --overwrite" if run.options.overwrite else "the same command"
-    _say(f"stopped after step {run.trainer.step} of {run.plan.steps}; {again} goes on from there")
+    _print_result(
+        f"stopped after step {run.trainer.step} of {run.plan.steps}; {again} goes on from there"
+    )
     return StyleTrainOutcome(130, report)
 
 
@@ -424,5 +428,5 @@ def _is_finite(value: Any) -> bool:
     return isinstance(value, int | float) and math.isfinite(value)
 
 
-def _say(text: str) -> None:
+def _print_result(text: str) -> None:
     print(text, file=sys.stderr)

@@ -16,12 +16,12 @@ from recipes.schema import (
     KNOBS,
     TIERS,
     Quality,
+    Recipe,
     Smog,
     Value,
     Weather,
     as_reference,
     knobs_of,
-    schema_Recipe,
     with_settings,
 )
 from recipes.weather import Flood, Snow, Style
@@ -69,7 +69,7 @@ class Setting:
 
     knob: str
     value: Value
-    recipe: schema_Recipe
+    recipe: Recipe
     given: Mapping[str, Value] = field(default_factory=dict)
 
     @property
@@ -77,12 +77,12 @@ class Setting:
         return (self.knob, self.value) == (WHOLE, REFERENCE)
 
 
-def trade_recipe(name: str) -> schema_Recipe:
+def trade_recipe(name: str) -> Recipe:
     """One of RECIPES, a preset or a file: its first variant, without any wish for quality."""
     if name == CLEAN:
-        recipe = schema_Recipe(name=CLEAN)
+        recipe = Recipe(name=CLEAN)
     elif name == "all":
-        recipe = schema_Recipe(
+        recipe = Recipe(
             name="all",
             weather=Weather(
                 smog=Smog(visibility_m=400.0, scale_height_m=120.0),
@@ -97,13 +97,13 @@ def trade_recipe(name: str) -> schema_Recipe:
     return recipe.model_copy(update={"quality": Quality()})
 
 
-def clean_recipe(recipe: schema_Recipe) -> schema_Recipe:
+def clean_recipe(recipe: Recipe) -> Recipe:
     """The reference without effects: the same files of the same scene."""
     return as_reference(recipe.model_copy(update={"weather": Weather(), "style": None}))
 
 
 def settings_of_trade(
-    recipe: schema_Recipe, case: TradeCase, wholes: Mapping[str, Mapping[str, Value]] | None = None
+    recipe: Recipe, case: TradeCase, wholes: Mapping[str, Mapping[str, Value]] | None = None
 ) -> list[Setting]:
     """Reference first, each knob's other values alone, then wholes: by default the tiers and the
     recipe with its own settings.

@@ -26,7 +26,7 @@ from augment.plan import make_plan
 from augment.scene import Scene
 from augment.views import SURFACE_ALPHA, render_buffers
 from recipes.change import changed
-from recipes.schema import schema_Recipe
+from recipes.schema import Recipe
 from tools.trade_cases import DEPTH, View
 
 
@@ -55,7 +55,7 @@ class Standard:
 
 
 def standard_of(
-    scene: Scene, view: View, recipe: schema_Recipe, true_m: np.ndarray | None = None
+    scene: Scene, view: View, recipe: Recipe, true_m: np.ndarray | None = None
 ) -> Standard:
     """recipe: at reference. true_m: as Standard's."""
     if recipe.output.depth == "none":

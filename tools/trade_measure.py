@@ -19,14 +19,14 @@ import numpy as np
 from tqdm import tqdm
 
 from augment.effects.snow.snow import placement_settings
-from augment.effects.snow.support import bed_of, remember_bed
+from augment.effects.snow.support import bed_of, remember_support
 from augment.effects.style.style import remember_maps, style_maps
 from augment.jobs.files import decode_image, encode_image
 from augment.jobs.quality import Trial, render_trial
 from augment.render.buffers import CPU, CUDA
 from augment.render.cpu.driver import release_scratch
 from augment.scene import Scene
-from recipes.schema import BY_PATH, Output, Value, schema_Recipe
+from recipes.schema import BY_PATH, Output, Recipe, Value
 from tools.bench_memory import RESET_PEAK, extra_mib, return_free_memory, status_mib
 from tools.bench_pairs import spread_ms, turns
 from tools.gpu_clock import gpu_mib, peak_gpu_mib
@@ -77,7 +77,7 @@ class Stage:
         self._dressed: dict[str, Scene] = {}
         self.kept_mib: dict[str, float | None] = {}
 
-    def scene_for(self, recipe: schema_Recipe) -> Scene:
+    def scene_for(self, recipe: Recipe) -> Scene:
         key = _dress(recipe)
         if key not in self._dressed:
             if not self._dressed:  # kernels and tables that are loaded once belong to no scene
@@ -86,18 +86,18 @@ class Stage:
             self.kept_mib[key] = self._kept(scene, recipe)
         return self._dressed[key]
 
-    def kept_of(self, recipe: schema_Recipe) -> float | None:
+    def kept_of(self, recipe: Recipe) -> float | None:
         """MiB that stay with the scene after the first frame: the snow's splats, styled colours."""
         return self.kept_mib[_dress(recipe)]
 
-    def _kept(self, scene: Scene, recipe: schema_Recipe) -> float | None:
+    def _kept(self, scene: Scene, recipe: Recipe) -> float | None:
         before = _resident_mib(self.backend)
         render_trial(scene, self._view.camera.scaled(SMALL), recipe, self.backend)
         after = _resident_mib(self.backend)
         return None if before is None or after is None else max(0.0, after - before)
 
 
-def dressed(bare: Scene, recipe: schema_Recipe, backend: str) -> Scene:
+def dressed(bare: Scene, recipe: Recipe, backend: str) -> Scene:
     """A scene of the same arrays for one recipe's snow and style to stay with. Where snow can lie
     and what a style maps colours to is looked for in the bare scene, once.
     """
@@ -105,7 +105,7 @@ def dressed(bare: Scene, recipe: schema_Recipe, backend: str) -> Scene:
     snow, style = recipe.weather.snow, recipe.style
     if snow is not None:
         settings = placement_settings(snow)
-        remember_bed(scene, settings, bed_of(bare, settings, backend=backend))
+        remember_support(scene, settings, bed_of(bare, settings, backend=backend))
     if style is not None:
         usual = style.model_copy(update={"evaluated": "color"})
         remember_maps(scene, style, style_maps(bare, usual))
@@ -115,7 +115,7 @@ def dressed(bare: Scene, recipe: schema_Recipe, backend: str) -> Scene:
 def measure_recipe(
     scene: Scene,
     views: Sequence[View],
-    recipe: schema_Recipe,
+    recipe: Recipe,
     case: TradeCase,
     *,
     wholes: Mapping[str, Mapping[str, Value]] | None = None,
@@ -299,7 +299,7 @@ def _name(setting: Setting) -> str:
     return f"{setting.knob}={setting.value}"
 
 
-def _dress(recipe: schema_Recipe) -> str:
+def _dress(recipe: Recipe) -> str:
     """What of a recipe stays with the scene from frame to frame."""
     snow, style, flood = recipe.weather.snow, recipe.style, recipe.weather.flood
     level = None if flood is None else flood.level_m

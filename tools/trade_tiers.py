@@ -1,7 +1,7 @@
 """What `draft` and `balanced` set, by a rule, from the tables that `climategs bench trade` makes.
 
 1. Of each knob the values that save time: those faster than every more accurate one by at least
-   LEAST_SAVED of the reference's time. A value's time is the geometric mean of its ratios to the
+   MIN_SAVED of the reference's time. A value's time is the geometric mean of its ratios to the
    reference, over all recipes and scenes in which it changes the picture.
 2. Knob after knob, that which saves most first, takes the fastest of them with which the worst FLIP
    of all that are chosen so far, rendered together, is within the bound: over all recipes, scenes

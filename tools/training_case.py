@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 from adapters.street.layout import StreetParameters
 from recipes.parse import parse_recipe
-from recipes.schema import schema_Recipe
+from recipes.schema import Recipe
 
 # Labels show the scene without its weather, whatever hides it: road under snow or water is road.
 _HEAD = "output: {depth: none, semantic: true, surface: scene, lidar: false, labels: false}\n"
@@ -90,7 +90,7 @@ class TrainingCase:
         """What is tested on, in order."""
         return tuple(name for names in self.test_weather.values() for name in names)
 
-    def recipes_of(self, uri: str) -> list[schema_Recipe]:
+    def recipes_of(self, uri: str) -> list[Recipe]:
         """What is rendered of a scene. No two scenes, and no training and test, share a draw."""
         if uri in self.train_scenes:
             place, counts = self.train_scenes.index(uri), {CLEAN: 1, **self.train_weather}
@@ -108,7 +108,7 @@ class TrainingCase:
         ]
 
 
-def draw(name: str, variant: int) -> schema_Recipe:
+def draw(name: str, variant: int) -> Recipe:
     """One recipe in numbers."""
     return parse_recipe(_HEAD + RECIPES[name], source=name, name=name).resolve(variant)
 

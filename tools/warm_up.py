@@ -25,13 +25,13 @@ from augment.render.threads import thread_count
 from augment.scene import Gaussians, Scene
 from augment.sky import CubemapSky
 from augment.views import render_view
-from recipes.schema import schema_Recipe
+from recipes.schema import Recipe
 
 SIZE = 32  # pixels a side
 ACROSS, SPACING_M = 10, 0.1  # splats of the road to each side, and between them
 
 
-def warm_up(recipes: Sequence[schema_Recipe], backend: str = CPU) -> float:
+def warm_up(recipes: Sequence[Recipe], backend: str = CPU) -> float:
     """Compile the kernels that the recipes take, or load them; seconds it took."""
     if not renders_on_gpu(backend):
         seconds = cpu.warm_up()
@@ -45,7 +45,7 @@ def warm_up(recipes: Sequence[schema_Recipe], backend: str = CPU) -> float:
     return time.perf_counter() - started
 
 
-def warm_up_for_workers(recipes: Sequence[schema_Recipe], backend: str) -> float:
+def warm_up_for_workers(recipes: Sequence[Recipe], backend: str) -> float:
     """As `warm_up`, for other processes, which find what was compiled in the caches on the disk.
 
     A GPU is used in a process of its own: this one would hold a part of its memory until it ends.
@@ -60,7 +60,7 @@ def warm_up_for_workers(recipes: Sequence[schema_Recipe], backend: str) -> float
 
 
 @contextmanager
-def warming_up_beside(recipes: Sequence[schema_Recipe]) -> Iterator[None]:
+def warming_up_beside(recipes: Sequence[Recipe]) -> Iterator[None]:
     """Meanwhile a second process compiles for the last recipes first, where there is a core for it.
 
     numba compiles one kernel at a time in a process, and finds in its cache what another process
@@ -79,7 +79,7 @@ def warming_up_beside(recipes: Sequence[schema_Recipe]) -> Iterator[None]:
         beside.kill()
 
 
-def _warm_recipes(recipes: Sequence[schema_Recipe], backend: str = CPU) -> None:
+def _warm_recipes(recipes: Sequence[Recipe], backend: str = CPU) -> None:
     seen = set()
     if any(uses_boxes(recipe) for recipe in recipes):
         nothing = PlacedBoxes.of(Boxes.empty(), np.zeros(3))
@@ -93,19 +93,19 @@ def _warm_recipes(recipes: Sequence[schema_Recipe], backend: str = CPU) -> None:
             continue
         ids = output.semantic or output.instance
         water, light = flood and flood.reflection, snow and snow.shading
-        worn = style and (style.applied_to, style.method)
+        style_parts = style and (style.applied_to, style.method)
         shown = (output.depth, ids, output.surface, for_boxes)
-        kernels = (water, light, *shown, worn, recipe.lidar)
+        kernels = (water, light, *shown, style_parts, recipe.lidar)
         if kernels not in seen:
             seen.add(kernels)
             level_z_m = 0.0 if flood is None else flood.level_m
-            scene = _yard(level_z_m, with_labels=output.labels)
+            scene = _warm_up_scene(level_z_m, with_labels=output.labels)
             render_view(scene, scene.frames[0].cameras["warm-up"], recipe, backend=backend)
             if recipe.lidar == "weather":
                 weathered_sweep(scene, recipe, 0, _one_return(level_z_m))
 
 
-def _yard(level_z_m: float, *, with_labels: bool) -> Scene:
+def _warm_up_scene(level_z_m: float, *, with_labels: bool) -> Scene:
     """A level road above a flood's surface, and a splat below it; the level counts from z = 0."""
     across = torch.arange(-ACROSS, ACROSS + 1) * SPACING_M
     x, y = torch.meshgrid(across + 4, across, indexing="ij")

@@ -39,11 +39,11 @@ SOLID_OPACITY = 0.3  # fainter Gaussians are haze and leftovers of training
 BULK_REACH = 8.0  # in median distances: of a drive that is dense in the middle, all
 _LOW_QUANTILE = 0.1
 _ROAD_REACH_M, _ROAD_LAYER_M, _ROAD_ABOVE_LOW_M = 2.5, 0.2, 0.7
-_FEWEST_POINTS = 12
-_MOST_POINTS = 300_000
-_MOST_PLACES = 128
+_MIN_POINTS = 12
+_MAX_POINTS = 300_000
+_MAX_PLACES = 128
 _CELLS_A_SIDE = 200
-_FEWEST_KNOWN = 6  # of 25 cells: ground is not spread beyond the content's edge
+_MIN_KNOWN = 6  # of 25 cells: ground is not spread beyond the content's edge
 
 
 def solid_points(gaussians: Gaussians) -> np.ndarray:
@@ -69,9 +69,9 @@ def solid_points_and_areas(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray
 
 def _solid(gaussians: Gaussians) -> Tensor:
     solid = torch.nonzero(gaussians.opacities > SOLID_OPACITY)[:, 0]
-    if len(solid) < _FEWEST_POINTS:
+    if len(solid) < _MIN_POINTS:
         solid = torch.arange(len(gaussians))
-    return solid[:: 1 + len(solid) // _MOST_POINTS]
+    return solid[:: 1 + len(solid) // _MAX_POINTS]
 
 
 def in_bulk(points: np.ndarray, reach: float) -> np.ndarray:
@@ -94,11 +94,11 @@ def ground_under(
     them are left out; long paths are thinned evenly.
     """
     kept, heights = [], []
-    for position in positions[:: 1 + len(positions) // _MOST_PLACES]:
+    for position in positions[:: 1 + len(positions) // _MAX_PLACES]:
         offset = points[:, :2] - position[:2]
         near = (offset * offset).sum(1) < radius * radius
         below = points[near & (points[:, 2] < position[2]), 2]
-        if len(below) >= _FEWEST_POINTS:
+        if len(below) >= _MIN_POINTS:
             kept.append(position)
             heights.append(np.quantile(below, _LOW_QUANTILE))
     return np.array(heights), np.array(kept).reshape(-1, 3)
@@ -187,7 +187,7 @@ def _smooth(height: np.ndarray) -> np.ndarray:
     known = np.isfinite(ordered).sum(-1)
     pick = (0.3 * known).astype(int).clip(0, 24)
     smooth = np.take_along_axis(ordered, pick[..., None], -1)[..., 0]
-    return np.where(known >= _FEWEST_KNOWN, smooth, np.nan)
+    return np.where(known >= _MIN_KNOWN, smooth, np.nan)
 
 
 # ---- Camera paths for scenes that come without cameras: a drive along the street, or an orbit ----
@@ -206,10 +206,10 @@ DRIVE_CAMERAS_DEG = {"front": 0.0, "left": 60.0, "right": -60.0}  # yaw; 75° wi
 _FIELD_OF_VIEW_DEG = {"drive": 75.0, "orbit": 55.0}
 _STEP_M = 0.5  # 5 m/s at 10 Hz
 _MAX_CELLS = 1010  # a side: up to half a kilometre every step is looked at, beyond that every nth
-_MOST_FRAMES = 100
-_LONGEST_DRIVE_M = 1000.0  # what lies between frames farther apart no image shows
+_MAX_FRAMES = 100
+_MAX_DRIVE_M = 1000.0  # what lies between frames farther apart no image shows
 _ORBIT_FRAMES = 48
-_SHORTEST_DRIVE_M = 8.0
+_MIN_DRIVE_M = 8.0
 _WIDE_M, _FLATNESS = 20.0, 0.5
 _CAR_M = (0.5, 2.5)  # above the ground: what lies between is in the way
 _HALF_WIDTH_M = 1.25
@@ -242,7 +242,7 @@ def make_default_path(
         return _orbit(points, is_metric=is_metric, asked=kind == "orbit")
     grid = ground_grid(points, cell=1.0)
     start, end = _longest_free_line(points, areas, grid)
-    if np.linalg.norm(end - start) < _SHORTEST_DRIVE_M and kind == "auto":
+    if np.linalg.norm(end - start) < _MIN_DRIVE_M and kind == "auto":
         return _orbit(points, is_metric=is_metric, asked=False)
     return _drive(points, areas, grid, start, end)
 
@@ -360,9 +360,9 @@ def _drive(
         start, end, forward = end, start, -forward
     start, length = (
         start + _BEHIND_SHARE * whole * forward,
-        min((1 - _BEHIND_SHARE - _AHEAD_SHARE) * whole, _LONGEST_DRIVE_M),
+        min((1 - _BEHIND_SHARE - _AHEAD_SHARE) * whole, _MAX_DRIVE_M),
     )
-    count = max(2, min(_MOST_FRAMES, round(length / _STEP_M) + 1))
+    count = max(2, min(_MAX_FRAMES, round(length / _STEP_M) + 1))
     places = start + np.linspace(0, length, count)[:, None] * forward
     heights = road_heights(points, areas, places, grid.at(places))
     ground = _smooth_profile(heights, fallback=float(np.quantile(points[:, 2], 0.1)))
@@ -463,8 +463,8 @@ SINGLE_CAMERA = "camera"
 _IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".exr"}
 _FRAME_THEN_CAMERA = re.compile(r"(\d+)[_-](\d{1,2}|\w*[A-Za-z]\w*)")
 _CAMERA_THEN_FRAME = re.compile(r"(\w*[A-Za-z]\w*?)[_-]?(\d+)")
-_MOST_CAMERAS = 32
-_LARGEST_FRAME_NUMBER = 10**9  # beyond it the digits are a time or a hash
+_MAX_CAMERAS = 32
+_MAX_FRAME_NUMBER = 10**9  # beyond it the digits are a time or a hash
 
 
 def frames_from_views(
@@ -531,7 +531,7 @@ def _is_rig(pairs: Sequence[tuple[str, str]]) -> bool:
     """Whether at least half of the frames have two cameras or more, of not too many in all."""
     per_frame = Counter(frame for _, frame in pairs)
     shared = sum(count > 1 for count in per_frame.values())
-    return 2 * shared >= len(per_frame) and len({c for c, _ in pairs}) <= _MOST_CAMERAS
+    return 2 * shared >= len(per_frame) and len({c for c, _ in pairs}) <= _MAX_CAMERAS
 
 
 def ego_from_front_camera(cameras: dict[str, Camera]) -> torch.Tensor:
@@ -583,7 +583,7 @@ def _frame_numbers(order: Sequence[str]) -> list[int]:
     found = [re.search(r"(\d{1,10})$", key) for key in order]
     numbers = [int(match[1]) for match in found if match]
     growing = all(a < b for a, b in itertools.pairwise(numbers))
-    if len(numbers) == len(order) and growing and max(numbers) < _LARGEST_FRAME_NUMBER:
+    if len(numbers) == len(order) and growing and max(numbers) < _MAX_FRAME_NUMBER:
         return numbers
     return list(range(len(order)))
 

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from adapters.image_checks import look_at_image
+from adapters.image_checks import read_image_size
 from adapters.kitti.layout import (
     LIDAR_TOP_DEG,
     RectifiedCamera,
@@ -72,7 +72,7 @@ def find_images(
     problems = [f"camera {camera}: {some(missing)} without an image"] if missing else []
     paths = {number: file_in(root, names[number]) for number in wanted}
     with ThreadPoolExecutor(_READERS) as pool:
-        looked_at = dict(zip(wanted, pool.map(look_at_image, paths.values()), strict=True))
+        looked_at = dict(zip(wanted, pool.map(read_image_size, paths.values()), strict=True))
     sizes = Counter(seen for seen in looked_at.values() if not isinstance(seen, str))
     if not sizes:
         faults = [f"{paths[n]} {looked_at[n]}" for n in wanted[:3]] or problems

@@ -31,7 +31,7 @@ ATTRIBUTES = (
     "amt_border_l", "amt_border_r", "amt_border_kf",
 )  # fmt: skip
 _POSE = ("tx", "ty", "tz", "rx", "ry", "rz")
-_MOST_BYTES, _MOST_ELEMENTS, _DEEPEST = 64 * 2**20, 4_000_000, 8
+_MAX_BYTES, _MAX_ELEMENTS, _DEEPEST = 64 * 2**20, 4_000_000, 8
 _OWN_DOCTYPE = re.compile(r"<!DOCTYPE\s+boost_serialization\s*>")  # declares nothing
 _LAST_FRAME = 10**9
 
@@ -115,10 +115,10 @@ class _BoundedBuilder(ET.TreeBuilder):
 
     def start(self, tag: str, attrs: dict[str, str], /) -> ET.Element:
         self._depth, self._count = self._depth + 1, self._count + 1
-        if self._depth > _DEEPEST or self._count > _MOST_ELEMENTS:
+        if self._depth > _DEEPEST or self._count > _MAX_ELEMENTS:
             raise AdapterError(
                 f"{self._path} is nested deeper than {_DEEPEST} elements, or has more than "
-                f"{_MOST_ELEMENTS} of them; no drive has that"
+                f"{_MAX_ELEMENTS} of them; no drive has that"
             )
         return super().start(tag, attrs)
 
@@ -129,8 +129,8 @@ class _BoundedBuilder(ET.TreeBuilder):
 
 def _parsed(path: Path) -> ET.Element:
     """The file's root element; nothing in it is expanded or fetched, and it is of bounded size."""
-    if path.stat().st_size > _MOST_BYTES:
-        raise AdapterError(f"{path} is larger than {_MOST_BYTES // 2**20} MiB; no drive has that")
+    if path.stat().st_size > _MAX_BYTES:
+        raise AdapterError(f"{path} is larger than {_MAX_BYTES // 2**20} MiB; no drive has that")
     text = _OWN_DOCTYPE.sub("", read_text(path), count=1)
     # A parser takes text with NUL characters for UTF-16, in which declarations look otherwise.
     if "\0" in text or "<!DOCTYPE" in text or "<!ENTITY" in text:

@@ -35,7 +35,7 @@ COLOUR_CAMERAS, GREY_CAMERAS = ("image_02", "image_03"), ("image_00", "image_01"
 OBJECT_CAMERAS = ("image_2", "image_3")
 IMAGE_SUFFIXES = (".jpg", ".png")  # the later wins where a frame has both
 RAW_DIGITS, OBJECT_DIGITS = 10, 6
-_MOST_NAMED = 3
+_MAX_NAMED = 3
 
 
 def kitti_root(path: str | Path) -> tuple[Path, Path]:
@@ -84,8 +84,8 @@ def _is_kitti(root: Path) -> bool:
 
 
 def _few(drives: Sequence[Path]) -> str:
-    rest = len(drives) - _MOST_NAMED
-    named = ", ".join(map(str, drives[:_MOST_NAMED]))
+    rest = len(drives) - _MAX_NAMED
+    named = ", ".join(map(str, drives[:_MAX_NAMED]))
     return named + (f" and {rest} more" if rest > 0 else "")
 
 
@@ -113,8 +113,8 @@ def file_in(root: Path, name: str) -> Path:
 
 def some(numbers: Sequence[int]) -> str:
     """How many frames and the first of them, for messages."""
-    named = ", ".join(map(str, numbers[:_MOST_NAMED]))
-    more = ", ..." if len(numbers) > _MOST_NAMED else ""
+    named = ", ".join(map(str, numbers[:_MAX_NAMED]))
+    more = ", ..." if len(numbers) > _MAX_NAMED else ""
     return f"{len(numbers)} frame{'' if len(numbers) == 1 else 's'} ({named}{more})"
 
 
@@ -369,7 +369,7 @@ LIDAR_TOP_DEG = 2.0  # the HDL-64E's uppermost channel
 # neighbour made.
 _EGO_LOW_M, _EGO_HIGH_M = np.array([-2.0, -1.35, -1.5]), np.array([2.6, 1.35, 0.5])
 _RETURN_BYTES = 16
-_MOST_BYTES = 512 * 2**20  # a turn of the sensor is 2 MB
+_MAX_BYTES = 512 * 2**20  # a turn of the sensor is 2 MB
 
 
 def read_returns(root: Path, name: str) -> np.ndarray:
@@ -381,7 +381,7 @@ def read_returns(root: Path, name: str) -> np.ndarray:
     path = file_in(root, name)
     try:
         size = path.stat().st_size
-        if size == 0 or size % _RETURN_BYTES or size > _MOST_BYTES:
+        if size == 0 or size % _RETURN_BYTES or size > _MAX_BYTES:
             raise AdapterError(
                 f"{path} must be returns of 16 bytes (x y z reflectance, float32); it has {size} "
                 f"bytes. Copy it again"

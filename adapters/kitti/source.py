@@ -200,7 +200,7 @@ def object_label_file(root: Path, frame: int) -> Path:
 
 EARTH_RADIUS_M = 6378137.0
 _OXTS_NUMBERS = 30
-_MOST_LATITUDE_DEG = 85.0  # Mercator's scale goes to infinity at the poles
+_MAX_LATITUDE_DEG = 85.0  # Mercator's scale goes to infinity at the poles
 # Rows: a z-up world's x (camera's forward), y (its left), z (its up) in a camera's axes.
 _UP_FROM_CAMERA = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 
@@ -284,7 +284,7 @@ def _read_packet(path: Path) -> np.ndarray:
     pitch and yaw (radians), and 24 that are not used."""
     values = read_numbers(path, (_OXTS_NUMBERS,))
     latitude, longitude, altitude = values[:3]
-    if abs(latitude) > _MOST_LATITUDE_DEG or abs(longitude) > 180 or abs(altitude) > 1e4:
+    if abs(latitude) > _MAX_LATITUDE_DEG or abs(longitude) > 180 or abs(altitude) > 1e4:
         raise AdapterError(
             f"{path} must begin with latitude, longitude (degrees) and altitude (metres); got "
             f"{latitude:g} {longitude:g} {altitude:g}"

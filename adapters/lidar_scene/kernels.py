@@ -162,7 +162,7 @@ def _gather(
 
 KEPT = 12  # observations remembered of each surfel
 _NEAR_M = 0.3
-_KERNELS_FEATHER = 0.1  # scores fall to zero over this part of the image towards its border
+_SCORE_FEATHER = 0.1  # scores fall to zero over this part of the image towards its border
 
 
 @numba.njit(cache=True, nogil=True)
@@ -262,7 +262,7 @@ def observe(
             continue
         score = max(facing, 0.03) * fx / z
         border = min(min(u, width - u) / width, min(v, height - v) / height)
-        score *= min(border / _KERNELS_FEATHER, 1.0)
+        score *= min(border / _SCORE_FEATHER, 1.0)
         # Beside a nearer edge the image may show that edge: calibration is good to a pixel or two.
         for yy in range(y - 1, y + 2):
             for xx in range(x - 1, x + 2):

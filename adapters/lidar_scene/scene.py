@@ -44,7 +44,7 @@ _BORROW_GROUND_M = 5.0
 _FEWEST = 8  # points that surfaces are sought in
 _TRIAL = 3.0  # voxels of the trial in units of those asked for
 _REACHES_M = (8.0, 16.0)
-_FEWEST_RETURNS = 200
+_MIN_RETURNS = 200
 _LOW_QUANTILE = 0.02  # a low height that a single stray return does not decide
 
 
@@ -135,7 +135,7 @@ def low_height(points: PointSet, path: np.ndarray) -> float | None:
         distance2 = ((near[:, :2] - position[:2]) ** 2).sum(1)
         for reach in _REACHES_M:
             z = near[distance2 < reach**2, 2]
-            if len(z) >= _FEWEST_RETURNS:
+            if len(z) >= _MIN_RETURNS:
                 heights.append(float(np.quantile(z, _LOW_QUANTILE)))
                 break
     return min(heights) if heights else None

@@ -118,7 +118,7 @@ _LIDAR_TOP_DEG = 10.67  # the sensor's uppermost channel
 # 854 of 900.
 _ROWS_ABOVE_CAR = {"CAM_BACK": 0.945}
 _CHECK_SCALE = 0.125
-_MOST_FAULTS = 3  # sentences about one camera's images; more become one
+_MAX_FAULTS = 3  # sentences about one camera's images; more become one
 
 
 def open_nuscenes(path: str, query: dict[str, str]) -> Scene:
@@ -213,7 +213,7 @@ def _usable_images(
                 f"{tables.root / tables.version}, scene {tables.name}: none of the {len(faults)} "
                 f"images of {channel} can be used; {faults[0]}; unpack them again"
             )
-        if len(faults) > _MOST_FAULTS:
+        if len(faults) > _MAX_FAULTS:
             faults = [f"{faults[0]}; so are {len(faults) - 1} more of {len(of_camera)}: left out"]
         problems += faults
     return paths, tuple(problems)

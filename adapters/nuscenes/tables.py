@@ -34,7 +34,7 @@ from recipes.files import open_file
 # gigabyte, of which one scene needs a thousandth, so a table is never in memory as a whole.
 
 _CHUNK = 1 << 22  # characters read at a time
-_LONGEST_ROW = 1 << 24  # no published row has a ten-thousandth of it
+_MAX_ROW = 1 << 24  # no published row has a ten-thousandth of it
 _BETWEEN = re.compile(r"[\s,]*")
 _UNIT_TOLERANCE = 1e-3
 
@@ -203,7 +203,7 @@ def _rows(path: Path, file: Any) -> Iterator[Row]:
         try:
             fields, position = decoder.raw_decode(text, position)
         except (ValueError, RecursionError) as error:
-            if ended or len(text) - position > _LONGEST_ROW or isinstance(error, RecursionError):
+            if ended or len(text) - position > _MAX_ROW or isinstance(error, RecursionError):
                 reason = "it is cut short" if ended and position >= len(text) else str(error)
                 raise AdapterError(
                     f"{path} is not readable JSON after its first {number} rows ({reason}); copy "
@@ -244,7 +244,7 @@ TURN_NS = 50_000_000
 _TWO_PI = 2 * np.pi
 # Images of one keyframe published agree to 4 degrees; other data in nuScenes's form need not turn
 # like this at all.
-_MOST_SPREAD_RAD = np.radians(20)
+_MAX_SPREAD_RAD = np.radians(20)
 
 
 @dataclass(frozen=True)
@@ -258,13 +258,13 @@ class Turn:
     def of_images(bearings_rad: np.ndarray, before_ns: np.ndarray) -> Turn:
         """The turn told by images: where their cameras look, and how long before their keyframe's
         sweep they were taken; both [N]."""
-        looks_apart = len(bearings_rad) > 1 and np.ptp(bearings_rad) > _MOST_SPREAD_RAD
+        looks_apart = len(bearings_rad) > 1 and np.ptp(bearings_rad) > _MAX_SPREAD_RAD
         if not looks_apart:
             return Turn(None)
         ends = bearings_rad - _TWO_PI * before_ns / TURN_NS
         end = float(np.angle(np.exp(1j * ends).mean()))
         spread = np.abs(np.angle(np.exp(1j * (ends - end))))
-        return Turn(end if np.quantile(spread, 0.9) < _MOST_SPREAD_RAD else None)
+        return Turn(end if np.quantile(spread, 0.9) < _MAX_SPREAD_RAD else None)
 
     def before_ns(self, directions: np.ndarray) -> np.ndarray:
         """How long before the sweep's time the LiDAR looked there, int64 [N].
@@ -314,7 +314,7 @@ class NuScenesOptions:
 # ---- tables --------------------------------------------------------------------------------------
 
 LIDAR = "LIDAR_TOP"
-_MOST_NAMES = 10  # that a message lists
+_MAX_NAMES = 10  # that a message lists
 
 
 @dataclass(frozen=True, eq=False)
@@ -477,8 +477,8 @@ def _choose_scene(folder: Path, scene: str | None) -> Row:
 
 
 def _listed(names: list[str]) -> str:
-    rest = len(names) - _MOST_NAMES
-    return ", ".join(names[:_MOST_NAMES]) + (f" and {rest} more" if rest > 0 else "")
+    rest = len(names) - _MAX_NAMES
+    return ", ".join(names[:_MAX_NAMES]) + (f" and {rest} more" if rest > 0 else "")
 
 
 def _read_files(root: Path, folder: Path, samples: Mapping[str, Row]) -> tuple[SensorFile, ...]:

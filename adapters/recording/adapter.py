@@ -140,14 +140,14 @@ def _is_straight(before: np.ndarray, here: np.ndarray, after: np.ndarray) -> np.
 # cameras,
 # among which optimisation chooses.
 
-MOST_GAUSSIANS = 60_000
+MAX_GAUSSIANS = 60_000
 SHELL_SHARE = 2 / 3  # of them; the rest are ground and boxes
 VOXEL_M = 0.15  # finer ground would only be a finer guess
 SHELLS_M = 4.0 * 20.0 ** (np.arange(6) / 5)  # 4 m to 80 m, a factor of 1.8 apart
 _GROUND_REACH_M = 40.0
 _GROUND_STEP_M = 0.5
 _BOX_STEP_M = 0.15
-_MOST_VIEWS = 48
+_MAX_VIEWS = 48
 _DRIVEN_M = 1.6  # the car went through here: nothing stands there
 _LOWEST_CAMERA_M = 0.1
 _ABOVE_GROUND_M = 0.2  # a ray that is lower at a shell has met the ground before
@@ -196,7 +196,7 @@ def guess_shells(views: Sequence[View], road: np.ndarray, count: int) -> Gaussia
     Each ray gets one of the distances, its neighbours others. Nothing where the car drove, under
     the ground, or where an image cannot be decoded.
     """
-    chosen = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, _MOST_VIEWS).astype(int))]
+    chosen = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, _MAX_VIEWS).astype(int))]
     tree = cKDTree(road[:, :2])
     parts = []
     for number, view in enumerate(chosen):
@@ -300,7 +300,7 @@ def _facing(
 
 # ---- adapter -------------------------------------------------------------------------------------
 
-_FEWEST_RETURNS = 100  # no surface is found among fewer
+_MIN_RETURNS = 100  # no surface is found among fewer
 _DEPTH_TOP_DEG = 90.0  # what a depth image leaves open has no surface, however high it is
 _SKY_ABOVE_DEG = 15.0  # with nothing but a flat ground drawn, every column's top is sky
 
@@ -372,7 +372,7 @@ class _Start:
     def build(self) -> tuple[LidarScene, tuple[str, ...]]:
         """The scene from the best there is, and what was missing, one sentence each."""
         lidar = read_lidar_drive(self.root, self.calibration, self.used)
-        if len(lidar) >= _FEWEST_RETURNS:
+        if len(lidar) >= _MIN_RETURNS:
             return self._surfaces(lidar.sweeps, lidar.top_deg), lidar.problems
         sweeps, problems = depth_sweeps(self.root, self.used)
         problems = lidar.problems + problems
@@ -396,7 +396,7 @@ class _Start:
     def _guess(self) -> LidarScene:
         road = ground_heights(self.frames, self.calibration.ego_above_ground_m)
         check_cameras_above(self.root / CALIBRATION, self.frames, road)
-        most = min(MOST_GAUSSIANS, self.options.max_gaussians)
+        most = min(MAX_GAUSSIANS, self.options.max_gaussians)
         shells = guess_shells(views_of(self.used), road, round(most * SHELL_SHARE))
         coarse = dataclasses.replace(
             self.options.scene_options(lidar_top_deg=_SKY_ABOVE_DEG),

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from adapters.image_checks import look_at_image
+from adapters.image_checks import read_image_size
 from adapters.lidar_scene.scene import drive_origin
 from adapters.plain_files import LARGEST, array_of, number_of, read_json
 from augment.cameras import Camera, Frame
@@ -148,7 +148,7 @@ def _fault(path: Path | None, camera: Camera) -> str:
     """What is wrong with an image, or nothing."""
     if path is None:
         return "its image is missing"
-    seen = look_at_image(path)
+    seen = read_image_size(path)
     if isinstance(seen, str):
         return f"image {path} {seen}"
     if seen != (camera.width, camera.height):

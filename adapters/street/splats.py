@@ -23,11 +23,11 @@ from augment.semantics import SemanticClass
 
 SPLIT_M = (1.6, 4.0)  # panels are never cut shorter than half the first; walls not left longer
 STEEPEST = 0.42  # sine of the steepest ray of a level camera, up or down
-MOST_STRETCH = 2.6
+MAX_STRETCH = 2.6
 HIDDEN_STRETCH = 3.5  # of surfaces that no camera sees
 # From which eyes sight is tried, by how near they are, and at how many places from each.
 LOOKS, PLACES = (0, 1, 2, 3, 5, 8, 13, 21, 34), 3
-LEAST_M = 0.02
+MIN_M = 0.02
 # Blending takes nearer splats first, which puts the weighted mean this many spacings too near,
 # along the surface: measured against the truth, for one layer of splats and for two (see `splats`).
 BLEND_LEAD = 0.62
@@ -79,7 +79,7 @@ def plan_spacing(shapes: Shapes, tree: Tree, eyes: np.ndarray) -> Spacing:
     distance, view = _sightings(shapes, eyes)
     unit = shapes.axes[:, :2] / np.linalg.norm(shapes.axes[:, :2], axis=2, keepdims=True)
     cosine = np.einsum("epk,pak->epa", view, unit)
-    stretch = 1 / np.sqrt(np.maximum(1 - cosine**2, 1 / MOST_STRETCH**2))
+    stretch = 1 / np.sqrt(np.maximum(1 - cosine**2, 1 / MAX_STRETCH**2))
     along = (distance[..., None] * stretch).min(0)
     flat = shapes.kind <= Kind.DISC
     slant = np.abs(np.einsum("epk,pk->ep", view, shapes.axes[:, 2]))
@@ -172,12 +172,12 @@ def _sink(
 
 # Where rows along a crisp edge end, in cells, by how many rows are added there: 0, 1 or 2.
 NARROWING = np.array([[0, 0, 0], [0, 0.3, 0], [0, 0.16, 0.46]])
-LEAST_ROUND = 8  # cells around a tube
-LEAST_BLOB = 30  # cells on an ellipsoid
+MIN_ROUND = 8  # cells around a tube
+MIN_BLOB = 30  # cells on an ellipsoid
 # Hidden panels: cells by which splats keep clear of crisp edges, and the side below which a panel
 # gets no splat at all; for tubes the girth.
 INSET = 0.5
-LEAST_HIDDEN_M = 0.4
+MIN_HIDDEN_M = 0.4
 HIDDEN_TUFTS_DROPPED = 0.6
 FINE_FROM = 7  # cells along a side from which its crisp edges get two more rows, not one
 
@@ -215,17 +215,17 @@ def cell_counts(shapes: Shapes, spacing: np.ndarray, hidden: np.ndarray) -> np.n
     disc, tube, blob = (kind == k for k in (Kind.DISC, Kind.CYLINDER, Kind.ELLIPSOID))
     round_length = 2 * np.pi * length[:, 0]
     counts[disc, 1] = np.ceil(round_length / spacing.min(1))[disc]
-    counts[tube, 0] = np.maximum(LEAST_ROUND, np.ceil(round_length / spacing.min(1)))[tube]
+    counts[tube, 0] = np.maximum(MIN_ROUND, np.ceil(round_length / spacing.min(1)))[tube]
     counts[tube, 1] = np.maximum(2, np.ceil(2 * length[:, 2] / spacing.max(1)))[tube]
-    counts[blob, 0] = np.maximum(LEAST_BLOB, np.ceil(_area(length) / spacing.min(1) ** 2))[blob]
+    counts[blob, 0] = np.maximum(MIN_BLOB, np.ceil(_area(length) / spacing.min(1) ** 2))[blob]
     counts[blob, 1] = 1
     tuft = shapes.material == Material.LEAF
     counts[tuft] = 1
     counts = np.maximum(counts, 1)
     panel = shapes.kind == Kind.PARALLELOGRAM
-    counts[hidden & panel & (length[:, :2].max(1) < LEAST_HIDDEN_M)] = 0
+    counts[hidden & panel & (length[:, :2].max(1) < MIN_HIDDEN_M)] = 0
     counts[hidden & tuft & (shapes.variation < HIDDEN_TUFTS_DROPPED)] = 0
-    counts[hidden & tube & (length[:, 0] < LEAST_HIDDEN_M / 4)] = 0
+    counts[hidden & tube & (length[:, 0] < MIN_HIDDEN_M / 4)] = 0
     return counts.astype(np.int64)
 
 
@@ -389,7 +389,7 @@ def _area(length: np.ndarray) -> np.ndarray:
 
 CELL_M = 0.06
 MARGIN_M = 2.0
-MOST_COVER = 0.5  # never more: what lies below must stay the heaviest thing in its pixels
+MAX_COVER = 0.5  # never more: what lies below must stay the heaviest thing in its pixels
 GROUND_BAND_M = 0.25  # surfaces this near the ground's plane receive the shadow
 SHADOW_RGB = np.array([0.03, 0.032, 0.04])
 
@@ -398,7 +398,7 @@ SHADOW_RGB = np.array([0.03, 0.032, 0.04])
 class ContactShadow:
     """Share of SHADOW_RGB mixed into the ground, on a grid in the mover's frame.
 
-    values [X, Y]: cover in [0, MOST_COVER], zero at the rim. origin: x, y of values[0, 0], metres.
+    values [X, Y]: cover in [0, MAX_COVER], zero at the rim. origin: x, y of values[0, 0], metres.
     """
 
     values: np.ndarray
@@ -446,7 +446,7 @@ def contact_shadow(mover: MovingBody) -> ContactShadow:
     lit = full_sun + SKY_RGB.mean() * 0.75
     cover = 1 - ((sun + sky) / lit) ** 0.45  # the display's encoding of that ratio, nearly
     rim = np.min(np.minimum(grid - origin, -origin - grid), axis=1)  # fade out before the grid ends
-    cover = np.minimum(cover, MOST_COVER) * np.clip(rim / 0.3, 0, 1)
+    cover = np.minimum(cover, MAX_COVER) * np.clip(rim / 0.3, 0, 1)
     return ContactShadow(cover.reshape(counts), origin, mover.ground_z)
 
 
@@ -481,7 +481,7 @@ class SplatPlan:
 
     def counts(self, coarseness: float) -> np.ndarray:
         """Cells of the first layer along both axes, [P, 2]."""
-        along = np.maximum(self.spacing.along * coarseness, LEAST_M)
+        along = np.maximum(self.spacing.along * coarseness, MIN_M)
         return cell_counts(self.shapes, along, self.spacing.hidden)
 
     def backing(self, counts: np.ndarray) -> np.ndarray:

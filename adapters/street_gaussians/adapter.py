@@ -86,7 +86,7 @@ from augment.sky import ConstantSky, CubemapSky, Sky
 
 # ---- A model's actors: Gaussians, tracks at the moments of the images, colours over time ---------
 
-_LONGEST_HOLD_NS = 100_000_000
+_MAX_HOLD_NS = 100_000_000
 _SAME_MOMENT_M = 0.01
 
 
@@ -173,7 +173,7 @@ def _hold_ns(knots: np.ndarray, data: StreetData) -> int:
     away = np.concatenate(
         [knots[0] - stamps[stamps < knots[0]], stamps[stamps > knots[-1]] - knots[-1]]
     )
-    return int(min([_LONGEST_HOLD_NS, *(away - 1)]))
+    return int(min([_MAX_HOLD_NS, *(away - 1)]))
 
 
 def _waves(

@@ -36,7 +36,7 @@ from augment.geometry import quat_from_rotmat, rotmat_from_quat, slerp
 
 TIMES = "timestamps.json"
 _FRAME_POSE = re.compile(r"([0-9]{1,9})\.txt")
-_MOST_GAPS = 1000  # numbers between the first frame and the last that nothing is known of
+_MAX_GAPS = 1000  # numbers between the first frame and the last that nothing is known of
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +129,7 @@ def read_ego_path(root: Path) -> EgoPath:
             f"{untimed[0]:06d}.txt; both must be of one conversion"
         )
     numbers = range(min(timed), max(timed) + 1)
-    if len(numbers) - len(timed) > _MOST_GAPS:
+    if len(numbers) - len(timed) > _MAX_GAPS:
         raise AdapterError(
             f"{root / TIMES}: FRAME must hold consecutive frames; it holds {len(timed)} from "
             f"{numbers[0]} to {numbers[-1]}"

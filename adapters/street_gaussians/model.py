@@ -731,7 +731,7 @@ def read_point_cloud(path: Path, config: ModelConfig) -> TrainedModel:
             problems.append(f"{path} also holds {', '.join(others[:8])}, which is not used")
         parts: dict[str, Part] = {}
         for name, element in elements.items():
-            part, found = _model_ply_read_part(header, element, name)
+            part, found = _read_ply_part(header, element, name)
             problems += found
             if part is not None:
                 parts[name] = part
@@ -783,7 +783,7 @@ def _lacks(path: Path, config: ModelConfig) -> str:
     return f"{text}; left out: {', '.join(names)}. They are in trained_model/iteration_N.pth"
 
 
-def _model_ply_read_part(
+def _read_ply_part(
     header: PlyHeader, element: PlyElement, name: str
 ) -> tuple[Part | None, list[str]]:
     """A part, None for an actor without usable Gaussians, and sentences."""

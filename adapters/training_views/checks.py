@@ -39,8 +39,8 @@ _WIDTH = 480  # columns of the images compared, at most
 _REACH_DEG = 1.2
 _NEAR_M = 8.0  # nearer returns shift with the camera's position and time, not only its rotation
 _BINS = 16
-_MOST_POINTS = 60_000
-_FEWEST_POINTS = 3000
+_MAX_POINTS = 60_000
+_MIN_POINTS = 3000
 _CONTRAST = 0.1  # how much the best shift must stand out
 _AGREE_PX = 0.75  # between the measurement in every other frame and the rest
 _ALONE_PX = 2.0  # a single frame says less, and less exactly
@@ -96,7 +96,7 @@ def measure_offset(
         for key, camera in cameras.items()
         if key.frame in returns
     ]  # fmt: skip
-    if sum(len(points.rows) for points in seen) < _FEWEST_POINTS:
+    if sum(len(points.rows) for points in seen) < _MIN_POINTS:
         return None
     camera = _compared(next(iter(cameras.values())))
     reach = _reach_px(camera)
@@ -190,7 +190,7 @@ def project_returns(
 def shared_information(seen: Sequence[Points], reach: int) -> np.ndarray:
     """Mutual information of intensity and grey value over their joint entropy for each shift,
     float64 [2 reach + 1, 2 reach + 1], rows of downward shifts."""
-    stride = max(1, -(-sum(len(points.rows) for points in seen) // _MOST_POINTS))
+    stride = max(1, -(-sum(len(points.rows) for points in seen) // _MAX_POINTS))
     columns, rows, images, intensity = (
         np.concatenate(parts)
         for parts in zip(
@@ -247,10 +247,10 @@ def _vertex(before: float, here: float, after: float) -> float:
 # moment an image shows. A car at 15 m/s moves 30 cm in 20 ms.
 
 _STEPS_S = np.arange(-5, 6) * 0.010
-_CAMERA_TIMING_NEAR_M = 3.0  # near returns shift most with time
-_LEAST_SPEED_MPS = 1.0
+_TIMING_NEAR_M = 3.0  # near returns shift most with time
+_MIN_SPEED_MPS = 1.0
 _EVERY = 3  # return is enough
-_CAMERA_TIMING_CONTRAST = 0.02  # how much the best time must stand out from the range's mean
+_TIMING_CONTRAST = 0.02  # how much the best time must stand out from the range's mean
 
 
 def with_camera_times(scene: Scene, offset_s: float) -> Scene:
@@ -324,7 +324,7 @@ def measure_time_offset(
     for name, own in keys.items():
         path = _path(scene, name)
         own = [key for key in own if key.frame in returns]
-        moving = [key for key in own if _speed_mps(path, scene, key) > _LEAST_SPEED_MPS]
+        moving = [key for key in own if _speed_mps(path, scene, key) > _MIN_SPEED_MPS]
         scores = [_fit(scene, returns, views, path, moving, float(offset)) for offset in _STEPS_S]
         known = np.array([score for score in scores if score is not None])
         if len(known) == len(_STEPS_S) and known.mean() > 0:
@@ -334,7 +334,7 @@ def measure_time_offset(
     if (
         cameras == 0
         or not 0 < i < len(total) - 1
-        or total[i] < (1 + _CAMERA_TIMING_CONTRAST) * total.mean()
+        or total[i] < (1 + _TIMING_CONTRAST) * total.mean()
     ):
         return None
     bend = total[i - 1] - 2 * total[i] + total[i + 1]
@@ -355,9 +355,7 @@ def _fit(
     for key in keys:
         camera = camera_at(path, scene.frame(key.frame).cameras[key.camera], offset_s)
         seen.append(
-            project_returns(
-                returns[key.frame], views, key, camera, reach=0, near_m=_CAMERA_TIMING_NEAR_M
-            )
+            project_returns(returns[key.frame], views, key, camera, reach=0, near_m=_TIMING_NEAR_M)
         )
     return float(shared_information(seen, 0)[0, 0]) if seen else None
 

@@ -215,8 +215,8 @@ def join_priors(priors: Sequence[PriorPixels]) -> PriorPixels:
 
 _FEWEST = 30  # known distances that two numbers may be fitted to
 _ROUNDS = 30
-_LEAST_SPREAD_PER_M = 1e-4  # residuals below this are as good as none
-_LEAST_CORRELATION = 0.5
+_MIN_SPREAD_PER_M = 1e-4  # residuals below this are as good as none
+_MIN_CORRELATION = 0.5
 _NEAREST_M, _FURTHEST_M = 0.5, 120.0
 
 
@@ -258,7 +258,7 @@ def align(relative: np.ndarray, depth_m: np.ndarray) -> Alignment | None:
     weight = np.ones_like(x)
     for _ in range(_ROUNDS):
         residual = y - (scale * x + shift)
-        spread = max(1.4826 * float(np.median(np.abs(residual))), _LEAST_SPREAD_PER_M)
+        spread = max(1.4826 * float(np.median(np.abs(residual))), _MIN_SPREAD_PER_M)
         weight = 1.0 / (1.0 + (residual / (2.385 * spread)) ** 2)
         weight /= weight.sum()
         mean_x, mean_y = float(weight @ x), float(weight @ y)
@@ -270,14 +270,14 @@ def align(relative: np.ndarray, depth_m: np.ndarray) -> Alignment | None:
         shift = mean_y - scale * mean_x
     spread_y = float(weight @ (y - mean_y) ** 2)
     correlation = covariance / max((variance * spread_y) ** 0.5, 1e-12)
-    if correlation < _LEAST_CORRELATION:
+    if correlation < _MIN_CORRELATION:
         return None
     return Alignment(scale / unit, shift - scale * middle / unit, correlation)
 
 
 # ---- Depth maps from files as prior pixels of a training camera ----------------------------------
 
-_MAP_PRIORS_NEAREST_M, _MAP_PRIORS_FURTHEST_M = 0.1, 1000.0  # what a file may call a depth
+_NEAREST_IN_FILE_M, _FURTHEST_IN_FILE_M = 0.1, 1000.0  # what a file may call a depth
 
 
 def sparse_prior(path: Path, camera: Camera) -> PriorPixels:
@@ -292,7 +292,7 @@ def sparse_prior(path: Path, camera: Camera) -> PriorPixels:
     rows = (rows + 0.5) * camera.height / mask.shape[0]
     columns = (columns + 0.5) * camera.width / mask.shape[1]
     pixels = rows.astype(np.int64) * camera.width + columns.astype(np.int64)
-    usable = (value > _MAP_PRIORS_NEAREST_M) & (value < _MAP_PRIORS_FURTHEST_M)  # NaN is neither
+    usable = (value > _NEAREST_IN_FILE_M) & (value < _FURTHEST_IN_FILE_M)  # NaN is neither
     return PriorPixels.of(pixels[usable], value[usable])
 
 
@@ -307,9 +307,7 @@ def metric_prior(path: Path, camera: Camera, sky: np.ndarray, grid_px: int) -> P
     rows, columns = _grid(camera, grid_px)
     # No interpolation: between a car and the wall behind it there is no surface.
     at = _at_centres(depth, camera, rows, columns)
-    usable = (
-        (at > _MAP_PRIORS_NEAREST_M) & (at < _MAP_PRIORS_FURTHEST_M) & ~sky[np.ix_(rows, columns)]
-    )
+    usable = (at > _NEAREST_IN_FILE_M) & (at < _FURTHEST_IN_FILE_M) & ~sky[np.ix_(rows, columns)]
     return _of_grid(at, usable, rows, columns, camera)
 
 

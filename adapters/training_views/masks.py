@@ -38,7 +38,7 @@ _BORDER_PART = 0.008  # of the image's width, that surfaces are grown by: splats
 _SMOOTH_LEVELS = 6.0  # of 255: standard deviation within a small window
 _WINDOW_PART = 0.01  # of the image's width
 _DARK_LEVELS = 70.0  # of 255: this much darker than the image's bright sky is none
-_LEAST_LUMA = 90.0
+_MIN_LUMA = 90.0
 
 
 def lidar_top_rad(scene: Scene, frames: Sequence[int]) -> float | None:
@@ -117,19 +117,19 @@ def looks_like_sky(rgb: np.ndarray, candidates: np.ndarray) -> np.ndarray:
     variance = cv2.blur(luma * luma, (side, side)) - mean * mean
     smooth = variance < _SMOOTH_LEVELS**2
     bright = float(np.quantile(luma[candidates], 0.9))
-    return smooth & (mean > max(bright - _DARK_LEVELS, _LEAST_LUMA))
+    return smooth & (mean > max(bright - _DARK_LEVELS, _MIN_LUMA))
 
 
 # ---- ego masks -----------------------------------------------------------------------------------
 
 WORK_WIDTH = 320  # columns of the images that are compared, at most
-MOST_IMAGES = 24
-_FEWEST_IMAGES = 6
+MAX_IMAGES = 24
+_MIN_IMAGES = 6
 _STEP_M = 0.25  # images are compared that were taken this far apart
 _CAMERA_HEIGHT_M = 1.6  # above the road, about
 _REACH_M = 10.0  # nobody follows another car this closely for a whole drive
 _FLOW_WIDTH = 80
-_LEAST_MOTION_PX = 0.25  # of an image as wide as that
+_MIN_MOTION_PX = 0.25  # of an image as wide as that
 _CONTRAST = 2.0  # of 255 a pixel: what counts fully
 _LEAK = 0.06  # of the energy at right angles to the motion that may appear along it
 _STAYS = 0.4  # part of the contrast that stays: less speaks against, more for the car
@@ -138,13 +138,13 @@ _OVERREACH = 2
 _AGAINST = 0.2
 _STEP_COST = 0.1  # evidence that a step by a row between two columns must be worth
 _JUMP_PART = 0.05  # of the height: what any step costs at most
-_LEAST_PART = 0.004  # of the height: mean evidence of a column without which there is no car
-_LEAST_WIDTH = 0.15  # of the image's width
+_MIN_PART = 0.004  # of the height: mean evidence of a column without which there is no car
+_MIN_WIDTH = 0.15  # of the image's width
 _WHITE = 128
 
 
 def moving_frames(cameras: Sequence[Camera]) -> list[int]:
-    """Positions of at most MOST_IMAGES images of a drive, in order, between which it moved."""
+    """Positions of at most MAX_IMAGES images of a drive, in order, between which it moved."""
     chosen: list[int] = []
     last = None
     for i, camera in enumerate(cameras):
@@ -152,8 +152,8 @@ def moving_frames(cameras: Sequence[Camera]) -> list[int]:
         if last is None or np.linalg.norm(centre - last) >= _STEP_M:
             chosen.append(i)
             last = centre
-    if len(chosen) > MOST_IMAGES:
-        spread = np.linspace(0, len(chosen) - 1, MOST_IMAGES).round().astype(int)
+    if len(chosen) > MAX_IMAGES:
+        spread = np.linspace(0, len(chosen) - 1, MAX_IMAGES).round().astype(int)
         chosen = [chosen[i] for i in spread]
     return chosen
 
@@ -166,7 +166,7 @@ def find_ego_mask(cameras: Sequence[Camera], images: Sequence[np.ndarray]) -> np
     no edge across the direction of motion.
     """
     height, width = images[0].shape[:2] if images else (0, 0)
-    if len(images) < _FEWEST_IMAGES:
+    if len(images) < _MIN_IMAGES:
         return np.zeros((height, width), np.bool_)
     across = min(WORK_WIDTH, width)
     size = (across, max(1, round(height * across / width)))
@@ -199,7 +199,7 @@ def _road_flow(cameras: Sequence[Camera]) -> np.ndarray:
     mean = np.mean(flows, axis=0)
     length = np.linalg.norm(mean, axis=-1, keepdims=True)
     with np.errstate(invalid="ignore"):
-        return np.where(length >= _LEAST_MOTION_PX, mean / length, np.nan).astype(np.float32)
+        return np.where(length >= _MIN_MOTION_PX, mean / length, np.nan).astype(np.float32)
 
 
 def _evidence(images: Sequence[np.ndarray], size: tuple[int, int], flow: np.ndarray) -> np.ndarray:
@@ -261,7 +261,7 @@ def _car_tops(evidence: np.ndarray, unknown: np.ndarray) -> np.ndarray:
     # The window the evidence was averaged in reaches over the edge.
     top = np.minimum(top + _OVERREACH, rows_left)
     gain = score[top, np.arange(width)]
-    enough = (top < rows_left).mean() >= _LEAST_WIDTH and gain.mean() >= _LEAST_PART * height
+    enough = (top < rows_left).mean() >= _MIN_WIDTH and gain.mean() >= _MIN_PART * height
     return first + top if enough else np.full(width, height)
 
 

@@ -35,12 +35,12 @@ logger = logging.getLogger(__name__)
 
 _PX_PER_SPLAT = 8  # pixels of the recorded image from splat to splat: two at a quarter of its size
 _COLUMNS = (160, 320)  # fewest and most splats across a whole image
-_MOST_IMAGES = 48  # that the median is taken over
-_LEAST_SPLATS = 16  # a smaller mask is a speck, not a car
+_MAX_IMAGES = 48  # that the median is taken over
+_MIN_SPLATS = 16  # a smaller mask is a speck, not a car
 _COVERED = 0.5  # part of a splat's cell that must lie in the mask
 _FAR_M, _NEAR_M = 1.6, 0.4  # along the optical axis
 _HALF_WIDTH_M = 0.95  # half a car's width: the body does not reach aside into other cameras' views
-_LEAST_SLOPE = 0.05  # a roof below the camera is seen at no flatter angle than this
+_MIN_SLOPE = 0.05  # a roof below the camera is seen at no flatter angle than this
 _MARGIN_M = 0.01
 _SHAPE = SplatShape(sigma_per_spacing=0.6, opacity=0.95)
 
@@ -78,7 +78,7 @@ def ego_body(
     size = (grid.width, grid.height)
     part = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA)
     rows, columns = np.nonzero(part >= _COVERED)
-    if len(rows) < _LEAST_SPLATS:
+    if len(rows) < _MIN_SPLATS:
         return None
     colours = _median_colours(camera_name, source, size, rows, columns)
     if colours is None:
@@ -117,7 +117,7 @@ def _median_colours(
 ) -> np.ndarray | None:
     """Median over the images, float32 [N, 3] in [0, 1], or None without any."""
     own = [k for k in source.train if k.camera == camera_name]
-    every = max(1, math.ceil(len(own) / _MOST_IMAGES))
+    every = max(1, math.ceil(len(own) / _MAX_IMAGES))
     samples = []
     for key in own[::every]:
         rgb = cv2.resize(source.load(key).rgb, size, interpolation=cv2.INTER_AREA)
@@ -137,7 +137,7 @@ def _place(grid: Camera, rows: np.ndarray, columns: np.ndarray) -> tuple[np.ndar
     x = (columns + 0.5 - grid.cx) / grid.fx
     y = (rows + 0.5 - grid.cy) / grid.fy
     far_m = float(np.clip(_HALF_WIDTH_M / max(np.abs(x).max(), 1e-6), _NEAR_M, _FAR_M))
-    down = np.maximum(y, _LEAST_SLOPE)
+    down = np.maximum(y, _MIN_SLOPE)
     depth = np.clip(far_m * down.min() / down, _NEAR_M, far_m)
     rays = np.stack([x, y, np.ones_like(x)], axis=1)
     return rays * depth[:, None], depth / min(grid.fx, grid.fy)

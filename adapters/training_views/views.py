@@ -178,7 +178,7 @@ logger = logging.getLogger(__name__)
 
 CACHE_BYTES = 1 << 30
 _FARTHEST_M = 1e6  # float32 has a resolution of 6 cm there
-_LEAST_FOCAL, _MOST_FOCAL = 0.05, 50.0  # focal length over width: a view of 169 or of 1.1 degrees
+_MIN_FOCAL, _MAX_FOCAL = 0.05, 50.0  # focal length over width: a view of 169 or of 1.1 degrees
 _TOP_FRAMES = 5  # frames that the LiDAR's highest view is measured in
 
 
@@ -444,7 +444,7 @@ def _check_camera(key: ViewKey, camera: Camera) -> None:
             f"{where}: its position in the scene must be finite and within {_FARTHEST_M:.0f} m of "
             f"the origin; got {position}. Check the pose in the dataset"
         )
-    if not _LEAST_FOCAL < camera.fx / camera.width < _MOST_FOCAL:
+    if not _MIN_FOCAL < camera.fx / camera.width < _MAX_FOCAL:
         raise AdapterError(
             f"{where}: a focal length of {camera.fx:g} px is impossible for an image of "
             f"{camera.width} columns; check the intrinsics and their unit (pixels)"

@@ -347,7 +347,7 @@ logger = logging.getLogger(__name__)
 MAX_VIEWS = 300  # as many are looked at, evenly over the drive: what is coarse needs no more
 VOXEL_M = 0.08
 _RIM_MARGIN_RAD = math.radians(3.0)
-_MOST_GAUSSIANS = 40_000
+_MAX_GAUSSIANS = 40_000
 _HEIGHT_M = 30.0  # above the lowest camera
 _SHAPE = SplatShape(opacity=0.6)  # hides most of the sky, yet gives way while it is learnt
 
@@ -376,9 +376,9 @@ def wall_tops(
         keep, colours = vote(pieces, columns, views, looks, math.radians(lidar_top_deg))
         kept = int(keep.sum())
         logger.info("%d of %d pieces of walls kept at %.3f m", kept, len(keep), voxel_m)
-        if kept <= _MOST_GAUSSIANS:
+        if kept <= _MAX_GAUSSIANS:
             break
-        voxel_m *= max(1.05, math.sqrt(kept / _MOST_GAUSSIANS))
+        voxel_m *= max(1.05, math.sqrt(kept / _MAX_GAUSSIANS))
     return _gaussians(pieces, columns, keep, colours)
 
 

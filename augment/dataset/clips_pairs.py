@@ -205,7 +205,7 @@ def _keys(one: Rows, other: Rows) -> tuple[np.ndarray, np.ndarray]:
 
 # ---- clips ---------------------------------------------------------------------------------------
 
-MOST_LATE = 1.5  # a frame later than this many usual intervals comes after a gap
+MAX_LATE = 1.5  # a frame later than this many usual intervals comes after a gap
 _PER_FRAME = ("sizes_m", "labels", "track_ids", "attributes", "frame")
 _PLACED = ("centers_m", "quats")
 
@@ -398,5 +398,5 @@ def _late(clock_ns: np.ndarray) -> np.ndarray:
     """bool [F - 1]: where any camera's next image comes late. clock_ns: int64 [F, C]."""
     waits = np.diff(clock_ns, axis=0)
     usual = np.median(waits, axis=0) if len(waits) else np.zeros(clock_ns.shape[1])
-    late = (waits > MOST_LATE * usual) | (waits < 0)
+    late = (waits > MAX_LATE * usual) | (waits < 0)
     return np.logical_or.reduce(late, axis=1)

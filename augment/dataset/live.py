@@ -32,13 +32,13 @@ from augment.jobs.files import (
 )
 from augment.jobs.layout import PATH_KINDS, variant_name
 from augment.jobs.prepare import find_bed, remember, snow_to_lay, store_maps
-from augment.jobs.quality import settle
+from augment.jobs.quality import resolve_quality
 from augment.jobs.view_files import View, check_view, label_view, uses_boxes
 from augment.jobs.worker import Renderer, default_renderer
 from augment.render.buffers import CUDA
 from augment.scene import Scene
 from recipes.files import with_digest
-from recipes.schema import schema_Recipe
+from recipes.schema import Recipe
 
 _FORKED = (
     "backend 'cuda' cannot render in a forked process, which the GPU does not answer: give the "
@@ -72,7 +72,7 @@ class SceneDataset(Dataset):
     def __init__(
         self,
         scene: Scene,
-        recipe: schema_Recipe,
+        recipe: Recipe,
         *,
         frames: Sequence[int] | None = None,
         cameras: Sequence[str] | None = None,
@@ -95,7 +95,9 @@ class SceneDataset(Dataset):
             self._backend = choose_backend(backend, scene, gpu=False)
         self._process = os.getpid()
         recipe = with_digest(recipe)
-        self.recipe = settle(recipe, scene, backend=self._backend, renderer=renderer).recipe
+        self.recipe = resolve_quality(
+            recipe, scene, backend=self._backend, renderer=renderer
+        ).recipe
         self._renderer = renderer or default_renderer()
         self._index = SceneIndex.of(scene)
         selection = select_frames(self._index, frames, cameras)

@@ -50,7 +50,7 @@ from augment.labels import LidarSweep
 # forked workers share them.
 
 _PATH = r"(?s)^(?P<folder>.*/)?(?P<name>[^/]*)$"  # the folder with its slash
-_MOST_CODES = 1 << 16  # numbers of more distinct values are kept as they are
+_MAX_CODES = 1 << 16  # numbers of more distinct values are kept as they are
 _DIGEST_LENGTH = 64  # hexadecimal digits of a SHA-256
 _HEX_DIGITS = np.frombuffer(b"0123456789abcdef", np.uint8)
 
@@ -290,7 +290,7 @@ def _packed(name: str, column: pa.ChunkedArray) -> Column:
         return Digests(digests)
     coded = _coded(column)
     is_number = pa.types.is_integer(column.type) or _is_float(column.type)
-    if is_number and len(coded.values) > _MOST_CODES and column.null_count == 0:
+    if is_number and len(coded.values) > _MAX_CODES and column.null_count == 0:
         return Numbers(column.to_numpy())
     return coded
 

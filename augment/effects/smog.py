@@ -208,7 +208,7 @@ class _SmogFromEye:
     def transmittance(self, distance_m: np.ndarray, point_z_m: np.ndarray) -> np.ndarray:
         """Of the ways to points at a distance from the eye (float64, any shape)."""
         through = np.exp(
-            -smog_labels_optical_depth(self.medium, distance_m, self.eye_m[2], point_z_m)
+            -optical_depth_of_arrays(self.medium, distance_m, self.eye_m[2], point_z_m)
         )
         level = self.water_level_z_m
         if level is None or self.eye_m[2] > level:
@@ -216,7 +216,7 @@ class _SmogFromEye:
         return np.where(point_z_m <= level, 1.0, through)
 
 
-def smog_labels_optical_depth(
+def optical_depth_of_arrays(
     medium: SmogMedium, distance_m: np.ndarray, eye_z_m: float, point_z_m: np.ndarray
 ) -> np.ndarray:
     """`smog.optical_depth` of NumPy arrays."""

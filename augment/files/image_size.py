@@ -11,7 +11,7 @@ from recipes.files import open_file
 FORMATS = "JPEG, PNG, WebP, TIFF or BMP"
 
 _FIRST_BYTES = 4096  # hold the header of nearly any image
-_MOST_BYTES = 1 << 22  # of a JPEG whose previews and profiles lie before its size
+_MAX_BYTES = 1 << 22  # of a JPEG whose previews and profiles lie before its size
 _PNG_GREY = (b"\0", b"\4")  # colour types without and with alpha
 _JPEG_ALONE = {0x01, *range(0xD0, 0xD9)}  # markers without a length
 _JPEG_FRAMES = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # SOF0-15 less DHT, JPG, DAC
@@ -37,7 +37,7 @@ def read_image_header(path: str | Path) -> ImageHeader | None:
     """
     with open_file(path) as file:
         data = file.read(_FIRST_BYTES)
-        return image_header(data) or image_header(data + file.read(_MOST_BYTES))
+        return image_header(data) or image_header(data + file.read(_MAX_BYTES))
 
 
 def image_header(data: bytes) -> ImageHeader | None:

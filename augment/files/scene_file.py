@@ -295,7 +295,7 @@ def _json_facts(scene: Scene) -> dict[str, Any]:
 
 # ---- Safetensors files: written without a copy of the arrays, read mapped into memory ------------
 
-MOST_HEADER_BYTES = 100_000_000  # the format's own limit
+MAX_HEADER_BYTES = 100_000_000  # the format's own limit
 _TYPES = {"<f4": "F32", "<f2": "F16", "<i2": "I16"}
 _ALIGNMENT = 64  # bytes: a cache line, and any vector register
 
@@ -318,10 +318,10 @@ def write_tensors(
         header[name] = {"dtype": code, "shape": array.shape, "data_offsets": [begin, end]}
     text = json.dumps(header, ensure_ascii=False, separators=(",", ":")).encode()
     text += b" " * (-(len(text) + 8) % _ALIGNMENT)
-    if len(text) > MOST_HEADER_BYTES:
+    if len(text) > MAX_HEADER_BYTES:
         raise SceneError(
             f"{file.name}: cameras, tracks and facts take {len(text)} bytes of text; a single file "
-            f"may hold {MOST_HEADER_BYTES}. Write a scene folder instead, which has no such limit"
+            f"may hold {MAX_HEADER_BYTES}. Write a scene folder instead, which has no such limit"
         )
     file.write(len(text).to_bytes(8, "little"))
     file.write(text)

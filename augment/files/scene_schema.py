@@ -39,7 +39,7 @@ from recipes.files import open_file
 # At precision float16, quats, opacities, sh, waves and the sky are float16.
 
 SKY_KINDS: dict[type, str] = {ConstantSky: "constant", LatLongSky: "latlong", CubemapSky: "cubemap"}
-MOST_WAVES = 1000  # terms; what is summed for every image must not take for ever
+MAX_WAVES = 1000  # terms; what is summed for every image must not take for ever
 _SKY_ARRAYS = {"constant": "rgb", "latlong": "image", "cubemap": "faces"}
 _ARRAYS = ("means", "quats", "scales", "opacities", "sh")
 _HALVED = ("quats", "opacities", "sh", "waves")
@@ -68,10 +68,10 @@ def part_arrays(scene: Scene, precision: Precision) -> dict[str, np.ndarray]:
         tensors = {name: getattr(gaussians, name) for name in _ARRAYS}
         if (colours := waves[number]) is not None:
             tensors["waves"] = colours.coefficients
-            if colours.coefficients.shape[1] > MOST_WAVES:
+            if colours.coefficients.shape[1] > MAX_WAVES:
                 raise SceneError(
                     f"scene {scene.name!r}: {part} has colour waves of "
-                    f"{colours.coefficients.shape[1]} terms; saved scenes hold {MOST_WAVES}"
+                    f"{colours.coefficients.shape[1]} terms; saved scenes hold {MAX_WAVES}"
                 )
         for name, tensor in tensors.items():
             where = f"scene {scene.name!r}: {part}.{name}"
@@ -210,9 +210,9 @@ def _check_array(tensor: Tensor, name: str, count: int, *, is_halved: bool, wher
     is_colour = len(shape) == 3 and shape[2] == 3
     if name == "sh" and not (is_colour and shape[1] in SH_COUNTS):
         raise SceneError(f"{where} must be [N, K, 3] with K in {SH_COUNTS}; got {list(shape)}")
-    if name == "waves" and not (is_colour and shape[1] <= MOST_WAVES):
+    if name == "waves" and not (is_colour and shape[1] <= MAX_WAVES):
         raise SceneError(
-            f"{where} must be [N, terms, 3], at most {MOST_WAVES} terms; got {list(shape)}"
+            f"{where} must be [N, terms, 3], at most {MAX_WAVES} terms; got {list(shape)}"
         )
 
 
@@ -265,8 +265,8 @@ def _range(values: Tensor) -> tuple[float, float]:
 FORMAT = "climategs-scene"
 VERSION = 2  # of what is written
 READABLE = (1, 2)
-MOST_BYTES = 256 << 20  # of a scene.json; a drive of an hour has about 30 MB
-_MOST_PROBLEMS_SHOWN = 5
+MAX_BYTES = 256 << 20  # of a scene.json; a drive of an hour has about 30 MB
+_MAX_PROBLEMS_SHOWN = 5
 
 
 def _plain_text(text: str) -> str:
@@ -406,9 +406,9 @@ def read_document(path: Path) -> SceneDocument:
     """
     try:
         with open_file(path) as file:
-            text = file.read(MOST_BYTES + 1)
-        if len(text) > MOST_BYTES:
-            raise SceneError(f"{path}: a scene.json has at most {MOST_BYTES} bytes")
+            text = file.read(MAX_BYTES + 1)
+        if len(text) > MAX_BYTES:
+            raise SceneError(f"{path}: a scene.json has at most {MAX_BYTES} bytes")
         return parsed_document(text, str(path))
     except OSError as error:
         raise SceneError(f"{path} cannot be read: {error.strerror}") from error
@@ -463,7 +463,7 @@ def checked_document(raw: dict[str, Any], where: str) -> SceneDocument:
         problems = error.errors(include_url=False, include_context=False)
     shown = [
         f"{'.'.join(map(str, p['loc']))}: {p['msg']}; got {p['input']!r:.60}"
-        for p in problems[:_MOST_PROBLEMS_SHOWN]
+        for p in problems[:_MAX_PROBLEMS_SHOWN]
     ]
     more = len(problems) - len(shown)
     raise SceneError(f"{where}: " + "; ".join(shown) + (f"; and {more} more" if more else ""))

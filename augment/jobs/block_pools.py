@@ -16,7 +16,7 @@ from queue import SimpleQueue
 from typing import Protocol, runtime_checkable
 
 from augment.errors import ClimateGSError
-from augment.jobs.block_worker import Result, Task, WorkSetup, Workshop
+from augment.jobs.block_worker import BlockWorker, Result, Task, WorkSetup
 from augment.jobs.processes import (
     available_cores,
     describe_exit,
@@ -79,7 +79,7 @@ class SerialPool:
     slots = 1
 
     def __init__(self, setup: WorkSetup, tick: Tick) -> None:
-        self._workshop = Workshop(setup, lambda outcome: tick(0, outcome))
+        self._worker_state = BlockWorker(setup, lambda outcome: tick(0, outcome))
         self._task: Task | None = None
 
     def give(self, slot: int, task: Task) -> None:
@@ -87,7 +87,7 @@ class SerialPool:
 
     def wait(self, timeout_s: float) -> list[Event]:
         task, self._task = self._task, None
-        return [] if task is None else [Finished(0, self._workshop.do(task))]
+        return [] if task is None else [Finished(0, self._worker_state.do(task))]
 
     def close(self) -> None:
         self._task = None
@@ -156,7 +156,7 @@ class ProcessPool:
         try:
             message = worker.connection.recv()
         except (EOFError, OSError):
-            return self._bury(slot, worker)
+            return self._reap_worker(slot, worker)
         if message == _READY:
             worker.is_ready = self._has_started = True
         elif isinstance(message, Outcome):
@@ -166,7 +166,7 @@ class ProcessPool:
             return Finished(slot, message)
         return None
 
-    def _bury(self, slot: int, worker: _Worker) -> Event | None:
+    def _reap_worker(self, slot: int, worker: _Worker) -> Event | None:
         """What becomes of the task of a worker that died; of one that had none nothing is lost."""
         worker.process.join()
         worker.connection.close()
@@ -217,7 +217,7 @@ def _main(connection: Connection, setup: WorkSetup, threads: int) -> None:
     send = sender(connection)
     # A shell's background job ignores Ctrl-C, and so would `interrupt_main`.
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    workshop = Workshop(setup, send)
+    workshop = BlockWorker(setup, send)
     inbox: SimpleQueue[Task | None] = SimpleQueue()
     working = threading.Event()
     threading.Thread(target=_listen, args=(connection, inbox, working), daemon=True).start()

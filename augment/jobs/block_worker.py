@@ -22,17 +22,17 @@ from augment.errors import ClimateGSError, GpuLost, OutputError, SceneError, Sty
 from augment.jobs.atomic import remove_temporaries
 from augment.jobs.blocks import Block, SceneRecord
 from augment.jobs.claims import CLAIMS_FOLDER, hold, try_claim
-from augment.jobs.journal import Identity
 from augment.jobs.layout import PATH_KINDS, STATE_FOLDER, folder_name, item_paths, variant_folder
 from augment.jobs.manifest import OK, PARTS, Part, list_parts, publish_part, read_manifest
 from augment.jobs.processes import file_lock
+from augment.jobs.progress_log import Identity
 from augment.jobs.quality_record import FOLDER as QUALITY
 from augment.jobs.render_job import RenderJob, SceneLoader, run_job
 from augment.jobs.store import LocalStore, Store, StoredFileMissing, open_store
 from augment.jobs.times import WorkTimes
 from augment.jobs.worker import Outcome, Renderer, describe
 from augment.scene import Scene
-from recipes.schema import schema_Recipe
+from recipes.schema import Recipe
 
 # ---- Takes a block from the folder it was rendered in to the output, where it appears at once ----
 # Its files go there first, to an object store those of an image as soon as it is finished; nobody
@@ -252,7 +252,7 @@ class BlockTask:
 
 
 @dataclass(frozen=True)
-class SettleTask:
+class ResolveTask:
     """Let the qualities of recipes choose their settings in a scene, or find what they have chosen.
 
     name: as of an IndexTask. keep: whether a new choice is kept in the output.
@@ -260,11 +260,11 @@ class SettleTask:
 
     uri: str
     name: str | None
-    recipes: tuple[schema_Recipe, ...]
+    recipes: tuple[Recipe, ...]
     keep: bool = True
 
 
-Task = IndexTask | SettleTask | BlockTask
+Task = IndexTask | ResolveTask | BlockTask
 
 
 @dataclass(frozen=True)
@@ -285,9 +285,9 @@ class BlockDone:
 
 @dataclass(frozen=True)
 class SettledRecipes:
-    """The recipes of a SettleTask, in its order."""
+    """The recipes of a ResolveTask, in its order."""
 
-    recipes: tuple[schema_Recipe, ...]
+    recipes: tuple[Recipe, ...]
 
 
 @dataclass(frozen=True)
@@ -308,7 +308,7 @@ Result = SceneRecord | SettledRecipes | BlockDone | TaskFailed
 Tell = Callable[[Outcome], None]
 
 
-class Workshop:
+class BlockWorker:
     """Does one task after the other. tell: hears of every image, from several threads."""
 
     def __init__(self, setup: WorkSetup, tell: Tell) -> None:
@@ -327,7 +327,7 @@ class Workshop:
         try:
             if isinstance(task, IndexTask):
                 return self._index(task)
-            if isinstance(task, SettleTask):
+            if isinstance(task, ResolveTask):
                 return SettledRecipes(tuple(self._settle(task, recipe) for recipe in task.recipes))
             return self._render(task)
         except OutputError as error:
@@ -346,12 +346,12 @@ class Workshop:
         scene = self._scene_of(task.uri, task.name)
         return SceneRecord.of(scene, task.uri, time.perf_counter() - started)
 
-    def _settle(self, task: SettleTask, recipe: schema_Recipe) -> schema_Recipe:
-        from augment.jobs.quality_record import settle_for
+    def _settle(self, task: ResolveTask, recipe: Recipe) -> Recipe:
+        from augment.jobs.quality_record import resolve_quality_for
 
         scene, setup = self._scene_of(task.uri, task.name), self._setup
         try:
-            return settle_for(
+            return resolve_quality_for(
                 self._store,
                 recipe,
                 scene,

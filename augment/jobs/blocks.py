@@ -17,13 +17,13 @@ import augment
 from augment.cameras import scaled_size
 from augment.errors import ClimateGSError, OutputError, SceneError
 from augment.jobs.files import RECORDED, SceneIndex, has_lidar, select_frames
-from augment.jobs.journal import Identity
 from augment.jobs.layout import STATE_FOLDER, folder_name, variant_name
 from augment.jobs.manifest import Pictured
+from augment.jobs.progress_log import Identity
 from augment.jobs.store import Store
 from augment.scene import Scene
 from recipes.job import JobRecipes, JobScene
-from recipes.schema import parse_frames, schema_Recipe
+from recipes.schema import Recipe, parse_frames
 
 # ------------------------------------------------------------------------------------------------
 # What a job knows of a scene without keeping it open, and the blocks of images it is cut into
@@ -122,7 +122,7 @@ class Block:
     uri: str
     source: str
     scene: str
-    recipe: schema_Recipe
+    recipe: Recipe
     frames: tuple[int, ...]
     cameras: tuple[str, ...]
     images: int
@@ -164,7 +164,7 @@ def claim_name(key: str) -> str:
 
 def cut_into_blocks(
     record: SceneRecord,
-    recipes: Sequence[schema_Recipe],
+    recipes: Sequence[Recipe],
     *,
     frames: str = "all",
     cameras: Sequence[str] | None = None,
@@ -227,7 +227,7 @@ def cut_into_blocks(
 
 def _key(
     record: SceneRecord,
-    recipe: schema_Recipe,
+    recipe: Recipe,
     first: int,
     frames: tuple[int, ...],
     cameras: tuple[str, ...],
@@ -267,7 +267,7 @@ def make_plan(
     scenes: Sequence[JobScene],
     found: Mapping[tuple[str, str | None], SceneRecord | str],
     backend: str,
-    settled: Mapping[tuple[str, str], schema_Recipe | str] = MappingProxyType({}),
+    settled: Mapping[tuple[str, str], Recipe | str] = MappingProxyType({}),
 ) -> Plan:
     """The plan of a job. scenes: without patterns. found: the scene of every URI and name, or why
     it cannot be opened. settled: by scene and variant, those recipes whose quality had to choose
@@ -294,7 +294,7 @@ def make_plan(
         try:
             cut = cut_into_blocks(
                 record,
-                [recipe for recipe in chosen if isinstance(recipe, schema_Recipe)],
+                [recipe for recipe in chosen if isinstance(recipe, Recipe)],
                 frames=entry.frames,
                 cameras=entry.cameras,
                 block_images=recipes.job.block_images,

@@ -35,7 +35,7 @@ from augment.jobs.store import Store
 # ------------------------------------------------------------------------------------------------
 # Claims among the processes of one machine: the kernel's lock of a file that comes and goes
 
-_MOST_RACES = 1000  # times that the file is deleted by its holder while it is being opened
+_MAX_RACES = 1000  # times that the file is deleted by its holder while it is being opened
 
 
 class FileClaim:
@@ -84,7 +84,7 @@ def try_lock(path: Path) -> FileClaim | None:
         OutputError: the system refused.
     """
     try:
-        for _ in range(_MOST_RACES):
+        for _ in range(_MAX_RACES):
             make_folder(path.parent)
             try:
                 descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)

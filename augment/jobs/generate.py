@@ -30,15 +30,14 @@ from augment.jobs.backends import renders_on_gpu
 from augment.jobs.block_pools import SerialPool, Tick, WorkerPool
 from augment.jobs.block_worker import (
     IndexTask,
+    ResolveTask,
     SettledRecipes,
-    SettleTask,
     WorkSetup,
     clear_leftovers,
 )
 from augment.jobs.blocks import Block, Plan, SceneRecord, make_plan, shard_of, store_plan
 from augment.jobs.claims import try_claim
 from augment.jobs.files import RECORDED
-from augment.jobs.journal import Identity
 from augment.jobs.layout import MANIFEST, PATH_KINDS, STATE_FOLDER, variant_name
 from augment.jobs.manifest import (
     FAILED,
@@ -52,14 +51,15 @@ from augment.jobs.manifest import (
     read_finished,
     rows_to_table,
 )
+from augment.jobs.progress_log import Identity
 from augment.jobs.render_job import RenderJob, SceneLoader, run_job
-from augment.jobs.scheduler import Driver
+from augment.jobs.scheduler import Scheduler
 from augment.jobs.store import Store, StoredFileMissing, open_store
 from augment.jobs.times import WORKERS
 from augment.render.buffers import AUTO, CUDA
 from augment.scene import Scene
 from recipes.job import JobRecipes, JobScene
-from recipes.schema import schema_Recipe
+from recipes.schema import Recipe
 
 # ---- What the qualities of a job's recipes choose in its scenes, before there is a plan ----------
 # A choice is kept in the output: the scenes in which everything was chosen are not opened again.
@@ -67,11 +67,11 @@ from recipes.schema import schema_Recipe
 _READS = 16  # at a time: most of the time of one is waiting
 
 Found = Mapping[tuple[str, str | None], SceneRecord | str]
-Choices = dict[tuple[str, str], schema_Recipe | str]
+Choices = dict[tuple[str, str], Recipe | str]
 
 
-def settle_recipes(
-    job: GenerateJob, store: Store, driver: Driver, found: Found, *, progress: bool, keep: bool
+def resolve_recipes(
+    job: GenerateJob, store: Store, driver: Scheduler, found: Found, *, progress: bool, keep: bool
 ) -> Choices:
     """By scene and variant: the recipes that had to choose, settled, or why they could not.
 
@@ -85,7 +85,8 @@ def settle_recipes(
         return {}
     choices, left = _recorded(store, wanted, job.setup.backend)
     tasks = {
-        SettleTask(record.uri, name, tuple(recipes), keep): record for record, name, recipes in left
+        ResolveTask(record.uri, name, tuple(recipes), keep): record
+        for record, name, recipes in left
     }
     bar = tqdm(
         total=len(tasks),
@@ -94,7 +95,7 @@ def settle_recipes(
         disable=not progress or not tasks,
     )
 
-    def each(task: SettleTask, settled: SettledRecipes | str) -> None:
+    def each(task: ResolveTask, settled: SettledRecipes | str) -> None:
         for number, recipe in enumerate(task.recipes):
             outcome = settled if isinstance(settled, str) else settled.recipes[number]
             choices[tasks[task].name, variant_name(recipe)] = outcome
@@ -102,11 +103,11 @@ def settle_recipes(
 
     with bar:
         timed = any(r.quality.budget_ms is not None for task in tasks for r in task.recipes)
-        driver.settle(_turned(list(tasks), *job.shard), each, one_by_one=timed)
+        driver.resolve_quality(_turned(list(tasks), *job.shard), each, one_by_one=timed)
     return choices
 
 
-_Wanted = list[tuple[SceneRecord, str | None, list[schema_Recipe]]]
+_Wanted = list[tuple[SceneRecord, str | None, list[Recipe]]]
 
 
 def _wanted(job: GenerateJob, found: Found) -> _Wanted:
@@ -145,7 +146,7 @@ def _recorded(store: Store, wanted: _Wanted, backend: str) -> tuple[Choices, _Wa
     return choices, left
 
 
-def _turned(tasks: Sequence[SettleTask], number: int, count: int) -> list[SettleTask]:
+def _turned(tasks: Sequence[ResolveTask], number: int, count: int) -> list[ResolveTask]:
     """Each shard begins elsewhere, so that those that start together do not wait for each other."""
     start = (number - 1) * len(tasks) // count
     return [*tasks[start:], *tasks[:start]]
@@ -153,7 +154,7 @@ def _turned(tasks: Sequence[SettleTask], number: int, count: int) -> list[Settle
 
 # ---- How long a job will take and how large its output gets, from a few pictures -----------------
 
-MOST_SAMPLED = 8  # recipes whose pictures are made; the others take their mean
+MAX_SAMPLED = 8  # recipes whose pictures are made; the others take their mean
 
 
 @dataclass(frozen=True)
@@ -191,7 +192,7 @@ def estimate(
     firsts: dict[str, Block] = {}
     for block in plan.blocks:
         firsts.setdefault(block.recipe.name, block)
-    tried = dict(list(firsts.items())[:MOST_SAMPLED])
+    tried = dict(list(firsts.items())[:MAX_SAMPLED])
     samples: dict[str, Sample] = {}
     opened: dict[str, Scene] = {}  # never more than one
     for name, block in tried.items():
@@ -311,7 +312,7 @@ def run_generate(
     job: GenerateJob,
     *,
     progress: bool = True,
-    prepare: Callable[[list[schema_Recipe]], None] = lambda recipes: None,
+    prepare: Callable[[list[Recipe]], None] = lambda recipes: None,
     on_image: Callable[[int, int], None] = lambda done, failed: None,
 ) -> GenerateResult:
     """Render and publish what of the job is not finished yet.
@@ -335,7 +336,7 @@ def plan_job(job: GenerateJob, *, progress: bool = True) -> Plan:
     """The job's plan, for which its scenes are opened that have not been; writes nothing."""
     job = _with_backend(job)
     store = open_store(job.setup.store_uri)
-    driver = Driver(lambda tick: make_pool(job, tick))
+    driver = Scheduler(lambda tick: make_pool(job, tick))
     with contextlib.closing(driver):
         return _plan(job, store, driver, progress, keep=False)
 
@@ -394,7 +395,7 @@ class _Generation:
         self,
         job: GenerateJob,
         progress: bool,
-        prepare: Callable[[list[schema_Recipe]], None],
+        prepare: Callable[[list[Recipe]], None],
         on_image: Callable[[int, int], None],
     ) -> None:
         self._job, self._progress = job, progress
@@ -406,7 +407,7 @@ class _Generation:
 
     def go(self) -> GenerateResult:
         started = time.perf_counter()
-        self._driver = Driver(
+        self._driver = Scheduler(
             lambda tick: make_pool(self._job, tick), on_image=self._show, idle=self._merge_at_times
         )
         with contextlib.closing(self._driver):
@@ -524,7 +525,7 @@ class _Generation:
         self._merge_s = self._merged_at - started
 
 
-def _plan(job: GenerateJob, store: Store, driver: Driver, progress: bool, *, keep: bool) -> Plan:
+def _plan(job: GenerateJob, store: Store, driver: Scheduler, progress: bool, *, keep: bool) -> Plan:
     found: dict[tuple[str, str | None], SceneRecord | str] = {}
     for entry in job.scenes:
         record = None if job.rescan else _known(store, entry)
@@ -542,7 +543,7 @@ def _plan(job: GenerateJob, store: Store, driver: Driver, progress: bool, *, kee
             bar.update()
 
         driver.index(list(dict.fromkeys(tasks)), each)
-    settled = settle_recipes(job, store, driver, found, progress=progress, keep=keep)
+    settled = resolve_recipes(job, store, driver, found, progress=progress, keep=keep)
     return make_plan(job.recipes, job.scenes, found, job.setup.backend, settled)
 
 

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path, PurePosixPath
 
 from augment.errors import OutputError
-from recipes.schema import schema_Recipe
+from recipes.schema import Recipe
 
 MANIFEST = "manifest.parquet"
 STATE_FOLDER = ".climategs"
@@ -41,7 +41,7 @@ def folder_name(name: str) -> str:
     return f"{readable or 'unnamed'}-{digest}"
 
 
-def variant_name(recipe: schema_Recipe) -> str:
+def variant_name(recipe: Recipe) -> str:
     """The folder of a recipe's draw: `fog-003`."""
     return f"{recipe.name}-{recipe.variant:03d}"
 
@@ -77,7 +77,7 @@ def variant_folder(scene: str, variant: str) -> str:
     return f"{folder_name(scene)}/{folder_name(variant)}"
 
 
-def box_weather_files(recipe: schema_Recipe) -> dict[str, str]:
+def box_weather_files(recipe: Recipe) -> dict[str, str]:
     """Files inside the variant's folder that say what is seen of the boxes, and what the weather
     does to them, by kind.
     """
@@ -90,7 +90,7 @@ def box_weather_files(recipe: schema_Recipe) -> dict[str, str]:
     return {k: _BOX_WEATHER[k] for k, there in present.items() if there and recipe.output.labels}
 
 
-def item_paths(scene: str, recipe: schema_Recipe, camera: str, frame: int) -> ItemPaths:
+def item_paths(scene: str, recipe: Recipe, camera: str, frame: int) -> ItemPaths:
     """Where the image of one camera in one frame lies, and what else the recipe asks for."""
     if frame < 0:
         raise ValueError(f"frame numbers in an output folder are >= 0; got {frame}")

@@ -22,12 +22,12 @@ import pyarrow.parquet as pq
 
 from augment.errors import OutputError
 from augment.jobs.atomic import write_atomic
-from augment.jobs.journal import Identity
 from augment.jobs.layout import MANIFEST, PATH_KINDS, STATE_FOLDER, variant_name
+from augment.jobs.progress_log import Identity
 from augment.jobs.store import Store, StoredFileMissing
 from augment.jobs.tables import read_table
 from recipes.change import found
-from recipes.schema import knobs_of, schema_Recipe
+from recipes.schema import Recipe, knobs_of
 
 # ---- manifest ------------------------------------------------------------------------------------
 
@@ -322,7 +322,7 @@ PARTS = f"{STATE_FOLDER}/parts"
 _SUFFIX = ".parquet"
 _FAILED = ".failed"
 _LISTED = b"climategs.parts"
-_MOST_RACES = 100  # times that a part is replaced just before it is read
+_MAX_RACES = 100  # times that a part is replaced just before it is read
 
 
 @dataclass(frozen=True)
@@ -426,14 +426,14 @@ def _merged(store: Store) -> tuple[pa.Table | None, bytes | None, list[Part]]:
 
     A part may be replaced between being listed and being read: then all is looked at again.
     """
-    for attempt in range(_MOST_RACES):
+    for attempt in range(_MAX_RACES):
         parts = sorted(list_parts(store).values(), key=lambda part: part.name)
         table, data = _manifest(store)
         listed = _listed(table)
         try:
             read = [_read_part(store, part) for part in parts if part.name not in listed]
         except StoredFileMissing:
-            if attempt == _MOST_RACES - 1:
+            if attempt == _MAX_RACES - 1:
                 raise
             continue
         table = None if table is None else table.replace_schema_metadata(None)
@@ -496,7 +496,7 @@ class Pictured(NamedTuple):
 
 def image_row(
     scene: str,
-    recipe: schema_Recipe,
+    recipe: Recipe,
     identity: Identity,
     pictured: Pictured,
     *,
@@ -526,7 +526,7 @@ def image_row(
     }
 
 
-def shown_words(recipe: schema_Recipe) -> dict[str, str | float | None]:
+def shown_words(recipe: Recipe) -> dict[str, str | float | None]:
     """What a recipe says of its images beside the weather's numbers, by columns.
 
     settings: JSON of the values of the knobs that a quality may set (recipes.schema) and that have
@@ -545,7 +545,7 @@ def shown_words(recipe: schema_Recipe) -> dict[str, str | float | None]:
     }
 
 
-def lidar_notes(recipes: Iterable[schema_Recipe]) -> list[str]:
+def lidar_notes(recipes: Iterable[Recipe]) -> list[str]:
     """Where LiDAR sweeps show another world than images or depth: a line for each recipe of which
     they do, about its first such variant."""
     noted: dict[str, list[str]] = {}

@@ -371,7 +371,7 @@ class Mirrored:
     changed: int = 0
 
 
-def check_apart(tree: SourceTree, out_dir: Path) -> None:
+def check_disjoint(tree: SourceTree, out_dir: Path) -> None:
     """Raise OutputError where the output folder lies in the dataset: copies would hold copies."""
     if tree.relative(out_dir) is not None:
         raise OutputError(
@@ -402,7 +402,7 @@ def mirror_dataset(
         AdapterError: a file of the source cannot be read, or a link leads out of it.
         OutputError: the system refused, or a link is in the way. No file is left half-written.
     """
-    check_apart(tree, folder)
+    check_disjoint(tree, folder)
     run = _Mirroring(tree, folder, images, sweeps or {}, links)
     with tqdm(total=extent.files, unit="file", desc="copy", disable=not progress) as bar:
         run.go(bar)

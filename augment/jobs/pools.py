@@ -278,7 +278,7 @@ class _Pool:
         try:
             message = worker.connection.recv()
         except (EOFError, OSError):
-            self._bury(worker)
+            self._reap_worker(worker)
             return
         if isinstance(message, Ready):
             worker.is_ready = True
@@ -290,7 +290,7 @@ class _Pool:
             worker.take(message)
             self.deliver(message)
 
-    def _bury(self, worker: _Worker) -> None:
+    def _reap_worker(self, worker: _Worker) -> None:
         """Take a worker that ended out of the pool, and decide about what it had in hand."""
         worker.process.join()
         worker.connection.close()

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from augment.cameras import Camera
-from augment.effects.snow.cells import SnowBed
+from augment.effects.snow.cells import SnowSupport
 from augment.scene import Scene
-from recipes.schema import schema_Recipe
+from recipes.schema import Recipe
 from recipes.weather import Snow, Style
 
 # ---- Where snow can lie, found once for all images and processes of a job ------------------------
@@ -45,21 +45,21 @@ class StoredBed:
         remember(scene, self.snow, load_bed(Path(self.path), self.key))
 
 
-def snow_to_lay(recipe: schema_Recipe) -> Snow | None:
+def snow_to_lay(recipe: Recipe) -> Snow | None:
     """The recipe's snow; None where there is none to be laid."""
     snow = recipe.weather.snow
     return snow if snow is not None and snow.lies else None
 
 
-def remember(scene: Scene, snow: Snow, bed: SnowBed) -> None:
+def remember(scene: Scene, snow: Snow, bed: SnowSupport) -> None:
     """Make it the bed that pictures of the scene in such snow use in this process."""
     from augment.effects.snow.snow import placement_settings
-    from augment.effects.snow.support import remember_bed
+    from augment.effects.snow.support import remember_support
 
-    remember_bed(scene, placement_settings(snow), bed)
+    remember_support(scene, placement_settings(snow), bed)
 
 
-def find_bed(scene: Scene, snow: Snow, *, backend: str = "auto") -> SnowBed:
+def find_bed(scene: Scene, snow: Snow, *, backend: str = "auto") -> SnowSupport:
     """The bed of a snow for all of the scene's cameras, remembered for this scene object. backend:
     that renders the pictures.
 
@@ -74,7 +74,7 @@ def find_bed(scene: Scene, snow: Snow, *, backend: str = "auto") -> SnowBed:
 
 def store_beds(
     scene: Scene,
-    recipes: Iterable[schema_Recipe],
+    recipes: Iterable[Recipe],
     folder: Path,
     *,
     cameras: Sequence[Camera] | None = None,
@@ -148,14 +148,14 @@ class StoredMaps:
         return StyleMaps(splats, sky, picture, seen)
 
 
-def style_to_apply(recipe: schema_Recipe) -> Style | None:
+def style_to_apply(recipe: Recipe) -> Style | None:
     """The recipe's style; None where there is none that changes anything."""
     style = recipe.style
     return style if style is not None and style.changes else None
 
 
 def store_maps(
-    scene: Scene, recipes: Iterable[schema_Recipe], *, cameras: Sequence[Camera] | None = None
+    scene: Scene, recipes: Iterable[Recipe], *, cameras: Sequence[Camera] | None = None
 ) -> tuple[StoredMaps, ...]:
     """The maps of all styles in the recipes.
 

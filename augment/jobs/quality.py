@@ -21,7 +21,7 @@ from augment.jobs.prepare import snow_to_lay, style_to_apply
 from augment.jobs.worker import Renderer, default_renderer
 from augment.metrics.image import flip
 from augment.scene import Scene
-from recipes.schema import Value, free_knobs, schema_Recipe, with_settings
+from recipes.schema import Recipe, Value, free_knobs, with_settings
 
 # ------------------------------------------------------------------------------------------------
 # One picture for the sake of its time and its errors, at the size of those it is compared with
@@ -42,7 +42,7 @@ class Trial:
 def render_trial(
     scene: Scene,
     camera: Camera,
-    recipe: schema_Recipe,
+    recipe: Recipe,
     backend: str = "auto",
     *,
     size: tuple[int, int] | None = None,
@@ -140,7 +140,7 @@ class Bench:
 
     def __init__(
         self,
-        recipe: schema_Recipe,
+        recipe: Recipe,
         scene: Scene,
         views: Sequence[View],
         *,
@@ -239,7 +239,7 @@ class Bench:
             clock=self._clock,
         )
 
-    def _prepare(self, recipe: schema_Recipe) -> None:
+    def _prepare(self, recipe: Recipe) -> None:
         """Find for a camera path what pictures would else find for the scene's own cameras."""
         if self._cameras is None or self._renderer is not None:
             return
@@ -292,7 +292,7 @@ def _starts(length: int) -> list[int]:
 Settings = dict[str, Value]
 Options = Mapping[str, Sequence[Value]]
 
-LEAST_SAVED = 0.02  # of the reference's time: less is noise of a few pictures
+MIN_SAVED = 0.02  # of the reference's time: less is noise of a few pictures
 
 
 @dataclass(frozen=True)
@@ -402,7 +402,7 @@ def useful(costs: Sequence[Cost]) -> list[Cost]:
     each faster than all that are as accurate or more so.
     """
     reference = costs[-1]
-    least_ms = LEAST_SAVED * reference.ms
+    least_ms = MIN_SAVED * reference.ms
     kept = [reference]
     # Of values with equal errors the fastest comes first, and the others save nothing then.
     for cost in sorted(costs[:-1], key=lambda cost: (cost.flip, cost.ms)):
@@ -464,12 +464,12 @@ class Report:
 class Settled:
     """recipe: with its settings in numbers. report: None where nothing had to be chosen."""
 
-    recipe: schema_Recipe
+    recipe: Recipe
     report: Report | None = None
 
 
-def settle(
-    recipe: schema_Recipe,
+def resolve_quality(
+    recipe: Recipe,
     scene: Scene,
     *,
     views: Sequence[View] | None = None,
@@ -501,7 +501,7 @@ def settle(
         def each() -> None:
             bar.update()
 
-        def bench_of(reference: schema_Recipe) -> Bench:
+        def bench_of(reference: Recipe) -> Bench:
             return Bench(
                 reference,
                 scene,
@@ -534,10 +534,10 @@ def settle(
             chosen.ms,
             recipe.quality.budget_ms,
         )
-    return Settled(settled_recipe(recipe, chosen.settings), report)
+    return Settled(resolved_recipe(recipe, chosen.settings), report)
 
 
-def settled_recipe(recipe: schema_Recipe, settings: Settings) -> schema_Recipe:
+def resolved_recipe(recipe: Recipe, settings: Settings) -> Recipe:
     """The recipe with a choice made for it.
 
     Raises:
@@ -552,7 +552,7 @@ def settled_recipe(recipe: schema_Recipe, settings: Settings) -> schema_Recipe:
     return with_settings(recipe, {**settings, "quality.settled": True})
 
 
-def recipes_to_try(recipe: schema_Recipe) -> list[schema_Recipe]:
+def recipes_to_try(recipe: Recipe) -> list[Recipe]:
     """The recipe with each knob at each value that `settle` may try alone; to compile kernels for.
 
     The recipe itself where there is nothing to choose.
@@ -560,7 +560,7 @@ def recipes_to_try(recipe: schema_Recipe) -> list[schema_Recipe]:
     if not recipe.quality.is_open:
         return [recipe]
     options = _options(recipe)
-    settled = settled_recipe(recipe, reference_settings(options))
+    settled = resolved_recipe(recipe, reference_settings(options))
     tried = [settled]
     for path, values in options.items():
         tried += [with_settings(settled, {path: value}) for value in values[:-1]]
@@ -578,7 +578,7 @@ class _Chosen:
     reference_ms: float | None = None
 
 
-def _chosen(recipe: schema_Recipe, bench_of: Callable[[schema_Recipe], Bench]) -> _Chosen:
+def _chosen(recipe: Recipe, bench_of: Callable[[Recipe], Bench]) -> _Chosen:
     options = _options(recipe)
     bench = _started(recipe, options, bench_of)
     if recipe.quality.max_flip is not None:
@@ -591,9 +591,9 @@ def _chosen(recipe: schema_Recipe, bench_of: Callable[[schema_Recipe], Bench]) -
 
 
 def _started(
-    recipe: schema_Recipe,
+    recipe: Recipe,
     options: dict[str, tuple[Value, ...]],
-    bench_of: Callable[[schema_Recipe], Bench],
+    bench_of: Callable[[Recipe], Bench],
 ) -> Bench:
     """A bench that has rendered the reference; leaves out of `options` what the scene cannot have.
 
@@ -601,7 +601,7 @@ def _started(
         SceneError: the scene cannot be rendered, whatever the settings.
     """
     while True:
-        bench = bench_of(settled_recipe(recipe, reference_settings(options)))
+        bench = bench_of(resolved_recipe(recipe, reference_settings(options)))
         try:
             bench.start()
             return bench
@@ -651,7 +651,7 @@ def _for_budget(bench: Bench, options: Options, budget_ms: float) -> _Chosen:
     )
 
 
-def _options(recipe: schema_Recipe) -> dict[str, tuple[Value, ...]]:
+def _options(recipe: Recipe) -> dict[str, tuple[Value, ...]]:
     """The values of its free knobs that the recipe's rules allow, reference always."""
     knobs = free_knobs(recipe)
     reference = with_settings(recipe, {knob.path: knob.reference for knob in knobs})
@@ -661,7 +661,7 @@ def _options(recipe: schema_Recipe) -> dict[str, tuple[Value, ...]]:
     }
 
 
-def _is_allowed(recipe: schema_Recipe, path: str, value: Value) -> bool:
+def _is_allowed(recipe: Recipe, path: str, value: Value) -> bool:
     try:
         with_settings(recipe, {path: value})
     except ValueError:

@@ -21,15 +21,21 @@ from augment.errors import OutputError
 from augment.jobs.claims import Claim, try_claim
 from augment.jobs.files import trajectory_id
 from augment.jobs.layout import STATE_FOLDER
-from augment.jobs.quality import Report, Settled, calibration_views, settle, settled_recipe
+from augment.jobs.quality import (
+    Report,
+    Settled,
+    calibration_views,
+    resolve_quality,
+    resolved_recipe,
+)
 from augment.jobs.store import Store, StoredFileMissing
 from augment.jobs.worker import Renderer
 from augment.scene import Scene
-from recipes.schema import BY_PATH, free_knobs, schema_Recipe
+from recipes.schema import BY_PATH, Recipe, free_knobs
 
 FOLDER = f"{STATE_FOLDER}/quality"
 _FORMAT = 1
-_LONGEST_WAIT_S = 1.0  # between looks at what another process is choosing
+_MAX_WAIT_S = 1.0  # between looks at what another process is choosing
 
 
 @dataclass(frozen=True)
@@ -38,7 +44,7 @@ class Question:
     trajectory: of the camera path, as in the manifest.
     """
 
-    recipe: schema_Recipe
+    recipe: Recipe
     scene: str
     source: str
     trajectory: str
@@ -66,9 +72,9 @@ class Question:
         return f"{FOLDER}/{self.digest}.json"
 
 
-def settle_for(
+def resolve_quality_for(
     store: Store,
-    recipe: schema_Recipe,
+    recipe: Recipe,
     scene: Scene,
     *,
     backend: str,
@@ -77,15 +83,17 @@ def settle_for(
     anew: bool = False,
     keep: bool = True,
     progress: bool = False,
-) -> schema_Recipe:
+) -> Recipe:
     """The recipe with the settings that the output has for it in this scene, or that are chosen
     now; the same recipe where its quality has nothing to choose.
 
-    camera_path: frames that are rendered in place of the scene's own. anew: as in `settle_once`.
+    camera_path: frames that are rendered in place of the scene's own. anew: as in
+    `resolve_quality_once`.
     keep: whether a new choice is kept in the output. The others: as in `settle`.
 
     Raises:
-        SceneError: the scene cannot be rendered under the recipe. OutputError: as settle_once.
+        SceneError: the scene cannot be rendered under the recipe. OutputError: as
+        resolve_quality_once.
     """
     if not recipe.quality.is_open:
         return recipe
@@ -96,7 +104,7 @@ def settle_for(
         cameras = [camera for frame in camera_path for camera in frame.cameras.values()]
 
     def choose() -> Settled:
-        return settle(
+        return resolve_quality(
             recipe,
             scene,
             views=calibration_views(frames),
@@ -107,12 +115,12 @@ def settle_for(
         )
 
     if keep:
-        return settle_once(store, question, choose, anew=anew)
+        return resolve_quality_once(store, question, choose, anew=anew)
     found = None if anew else recorded(store, question)
     return found or choose().recipe
 
 
-def recorded(store: Store, question: Question) -> schema_Recipe | None:
+def recorded(store: Store, question: Question) -> Recipe | None:
     """The recipe settled as the output has it; None where nothing was chosen yet.
 
     Raises:
@@ -132,7 +140,7 @@ def recorded(store: Store, question: Question) -> schema_Recipe | None:
         if not isinstance(settings, dict):
             raise TypeError(f"its settings are {settings!r}")
         _check_values(settings)
-        return settled_recipe(question.recipe, settings)
+        return resolved_recipe(question.recipe, settings)
     except (ValueError, TypeError, KeyError, RecursionError) as error:
         said = f"{error} is missing" if isinstance(error, KeyError) else str(error)
         raise OutputError(
@@ -142,9 +150,9 @@ def recorded(store: Store, question: Question) -> schema_Recipe | None:
         ) from error
 
 
-def settle_once(
+def resolve_quality_once(
     store: Store, question: Question, choose: Callable[[], Settled], *, anew: bool = False
-) -> schema_Recipe:
+) -> Recipe:
     """The recipe settled as the output has it; where it has nothing, `choose` chooses, and the
     choice is kept before anyone sees it. Waits for another process that is choosing.
 
@@ -181,7 +189,7 @@ def _claimed(store: Store, question: Question) -> Claim:
     wait_s = 0.05
     while (claim := try_claim(store, f"quality.{question.digest}")) is None:
         time.sleep(wait_s)
-        wait_s = min(2 * wait_s, _LONGEST_WAIT_S)
+        wait_s = min(2 * wait_s, _MAX_WAIT_S)
     return claim
 
 

@@ -22,7 +22,7 @@ from typing import Any
 import augment
 from augment.errors import ClimateGSError
 from augment.jobs.block_pools import Event, Finished, Lost, Tick
-from augment.jobs.block_worker import Result, Task, WorkSetup, Workshop
+from augment.jobs.block_worker import BlockWorker, Result, Task, WorkSetup
 from augment.jobs.processes import available_cores
 from augment.jobs.store import open_store
 from augment.jobs.worker import Outcome
@@ -151,12 +151,12 @@ class RayPool:
         self._given[slot] = task
         if self._workers[slot] is None:
             self._workers[slot] = self._start()
-        self._hand_out()
+        self._dispatch()
 
     def wait(self, timeout_s: float) -> list[Event]:
         deadline = time.monotonic() + timeout_s
         while True:
-            self._hand_out()
+            self._dispatch()
             sources = {w.source: slot for slot, w in enumerate(self._workers) if w and w.source}
             if not sources:
                 return []
@@ -199,7 +199,7 @@ class RayPool:
         limits: dict[str, str] = dict.fromkeys(_THREADS, str(self._cpus))
         return limits if self._gpus else {**limits, "CUDA_VISIBLE_DEVICES": ""}
 
-    def _hand_out(self) -> None:
+    def _dispatch(self) -> None:
         """Send tasks to workers that are ready; a slot whose own is not swaps with an idle one."""
         for slot, task in list(self._given.items()):
             if not self._is_idle(slot):
@@ -328,7 +328,7 @@ class _Actor:
         cv2.setNumThreads(1)
         self._inbox: SimpleQueue[Task] = SimpleQueue()
         self._outbox: SimpleQueue[Outcome | Result | None] = SimpleQueue()
-        self._workshop = Workshop(setup, self._outbox.put)
+        self._worker_state = BlockWorker(setup, self._outbox.put)
         self._thread = threading.Thread(target=self._work, daemon=True)
         self._thread.start()
 
@@ -351,7 +351,7 @@ class _Actor:
     def _work(self) -> None:
         try:
             while True:
-                self._outbox.put(self._workshop.do(self._inbox.get()))
+                self._outbox.put(self._worker_state.do(self._inbox.get()))
         except KeyboardInterrupt:
             pass
         finally:

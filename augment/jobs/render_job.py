@@ -23,9 +23,8 @@ from augment.errors import OutputError
 from augment.jobs.atomic import write_atomic
 from augment.jobs.backends import choose_backend
 from augment.jobs.files import SceneIndex, frames_to_json, select_frames, trajectory_id
-from augment.jobs.journal import Identity
+from augment.jobs.job_state import BoxCache, JobState, finish, needs_finish
 from augment.jobs.layout import MANIFEST, STATE_FOLDER, folder_name, variant_name
-from augment.jobs.ledger import BoxCache, Ledger, finish, needs_finish
 from augment.jobs.manifest import FAILED, OK
 from augment.jobs.pools import run_in_processes, run_serially
 from augment.jobs.prepare import (
@@ -37,6 +36,7 @@ from augment.jobs.prepare import (
     style_to_apply,
 )
 from augment.jobs.processes import OutputLock, share_scene
+from augment.jobs.progress_log import Identity
 from augment.jobs.store import open_store
 from augment.jobs.times import WORKERS
 from augment.jobs.view_files import uses_boxes
@@ -44,7 +44,7 @@ from augment.jobs.worker import Chunk, Outcome, Renderer, Setup
 from augment.scene import Scene
 from recipes.files import read_files, with_digest
 from recipes.load import dump_recipe
-from recipes.schema import schema_Recipe
+from recipes.schema import Recipe
 from recipes.weather import Style
 
 # ------------------------------------------------------------------------------------------------
@@ -70,7 +70,7 @@ def stored_names(style: Style) -> dict[str, str]:
     return {key: f"{STYLE_FOLDER}/{name}" for key, name in names.items()}
 
 
-def portable_recipe(recipe: schema_Recipe) -> schema_Recipe:
+def portable_recipe(recipe: Recipe) -> Recipe:
     """The recipe with its style's files named from the variant's folder; its hash is the same."""
     style = recipe.style
     if style is None or not style.files:
@@ -78,7 +78,7 @@ def portable_recipe(recipe: schema_Recipe) -> schema_Recipe:
     return recipe.model_copy(update={"style": style.model_copy(update=stored_names(style))})
 
 
-def check_kept(recipe: schema_Recipe, folders: Collection[Path]) -> None:
+def check_kept(recipe: Recipe, folders: Collection[Path]) -> None:
     """Refuse to overwrite the files that the recipe is about to need. folders: to be overwritten.
 
     Raises:
@@ -95,7 +95,7 @@ def check_kept(recipe: schema_Recipe, folders: Collection[Path]) -> None:
                 )
 
 
-def copy_style_files(recipe: schema_Recipe, folder: Path) -> None:
+def copy_style_files(recipe: Recipe, folder: Path) -> None:
     """Put the style's files where `portable_recipe` names them. folder: the variant's.
 
     Raises:
@@ -140,7 +140,7 @@ class RenderJob:
     """
 
     scene_uri: str
-    recipes: Sequence[schema_Recipe]
+    recipes: Sequence[Recipe]
     out_dir: Path | str
     frames: Sequence[int] | None = None
     cameras: Sequence[str] | None = None
@@ -243,7 +243,7 @@ class _Run:
         self.out_dir = Path(job.out_dir).absolute()
         self.trajectory = trajectory_id(job.camera_path)
         self.recipes = tuple(self._settled(with_digest(r), progress) for r in job.recipes)
-        self.ledger = Ledger(self.out_dir, self.index, self.recipes, self._identities())
+        self.job_state = JobState(self.out_dir, self.index, self.recipes, self._identities())
         self.boxes = BoxCache(self.index)
         self.beds: tuple[StoredBed, ...] = ()
         self.maps: tuple[StoredMaps, ...] = ()
@@ -257,8 +257,8 @@ class _Run:
             if self.job.overwrite:  # this may fail, so it comes before anything is given up
                 self._check_kept()
                 self._prepare(self.recipes, progress)
-            self.ledger.open(overwrite=self.job.overwrite)
-            chunks = list(self.ledger.pending(self.selection))
+            self.job_state.open(overwrite=self.job.overwrite)
+            chunks = list(self.job_state.pending(self.selection))
             self.skipped = self.total - sum(len(chunk.cameras) for chunk in chunks)
             try:
                 if not self.job.overwrite:
@@ -269,7 +269,7 @@ class _Run:
                 )
                 with self.bar:
                     self._render(chunks, lock)
-                    if self.counts or needs_finish(self.ledger):
+                    if self.counts or needs_finish(self.job_state):
                         self._finish()
             except KeyboardInterrupt:
                 self._finish()
@@ -278,7 +278,7 @@ class _Run:
                     f"finished; run the same command again to go on from there"
                 ) from None
             finally:
-                self.ledger.close()
+                self.job_state.close()
 
     def _render(self, chunks: list[Chunk], lock: OutputLock) -> None:
         if chunks:
@@ -320,15 +320,15 @@ class _Run:
             shared.remove()
         self.timings.update(spent)
 
-    def _settled(self, recipe: schema_Recipe, progress: bool) -> schema_Recipe:
+    def _settled(self, recipe: Recipe, progress: bool) -> Recipe:
         """The recipe with the settings that its quality chooses here, or has chosen before."""
         if not recipe.quality.is_open:
             return recipe
-        from augment.jobs.quality_record import settle_for
+        from augment.jobs.quality_record import resolve_quality_for
 
         started = time.perf_counter()
         assert self.scene is not None
-        settled = settle_for(
+        settled = resolve_quality_for(
             open_store(self.out_dir),
             recipe,
             self.scene,
@@ -354,11 +354,11 @@ class _Run:
         ]
 
     def _check_kept(self) -> None:
-        folders = [self.out_dir / variant.folder for variant in self.ledger.variants]
+        folders = [self.out_dir / variant.folder for variant in self.job_state.variants]
         for recipe in self.recipes:
             check_kept(recipe, folders)
 
-    def _prepare(self, recipes: Collection[schema_Recipe], progress: bool) -> None:
+    def _prepare(self, recipes: Collection[Recipe], progress: bool) -> None:
         """Find what images of these recipes share, for all cameras of the scene or the path.
 
         Where their snow can lie, and the colour maps of their styles.
@@ -391,8 +391,8 @@ class _Run:
     def _begin(self, chunks: Sequence[Chunk]) -> None:
         """Announce the variants that will be written, before their first file."""
         for number in sorted({chunk.variant for chunk in chunks}):
-            variant = self.ledger.variants[number]
-            variant.journal.begin(variant.identity)
+            variant = self.job_state.variants[number]
+            variant.progress_log.begin(variant.identity)
             folder = self.out_dir / variant.folder
             copy_style_files(variant.recipe, folder)
             text = dump_recipe(portable_recipe(variant.recipe)).encode()
@@ -417,12 +417,12 @@ class _Run:
         return rest
 
     def _deliver(self, outcome: Outcome) -> None:
-        self.ledger.record(outcome, self.index.frames_by_number[outcome.frame])
+        self.job_state.record(outcome, self.index.frames_by_number[outcome.frame])
         with self.counting:
             self.counts[outcome.status] += 1
             if outcome.status == FAILED:
                 where = f"frame {outcome.frame}, camera {outcome.camera}"
-                folder = self.ledger.variants[outcome.variant].folder
+                folder = self.job_state.variants[outcome.variant].folder
                 self.failures.append(f"{folder}, {where}: {outcome.message}")
                 self.bar.set_postfix(failed=self.counts[FAILED], refresh=False)
             self.bar.update()
@@ -431,5 +431,5 @@ class _Run:
 
     def _finish(self) -> None:
         started = time.perf_counter()
-        finish(self.ledger, self.trajectory, self.boxes)
+        finish(self.job_state, self.trajectory, self.boxes)
         self.timings["finish"] += time.perf_counter() - started

@@ -15,9 +15,9 @@ from augment.jobs.block_worker import (
     BlockDone,
     BlockTask,
     IndexTask,
+    ResolveTask,
     Result,
     SettledRecipes,
-    SettleTask,
     TaskFailed,
 )
 from augment.jobs.blocks import Block, SceneRecord
@@ -71,13 +71,13 @@ class BlockQueue:
 # ---- drive ---------------------------------------------------------------------------------------
 
 WAIT_S = 1.0
-MOST_LOST = 3  # blocks of a scene whose workers die even alone, before the scene is given up
+MAX_LOST = 3  # blocks of a scene whose workers die even alone, before the scene is given up
 ELSEWHERE_S = 2.0  # how long to leave a block alone that another process is at
 _SETTLING = "choosing the settings of its recipes"
 _log = logging.getLogger(__name__)
 
 MakePool = Callable[[Callable[[int, Outcome], None]], WorkerPool]
-_First = TypeVar("_First", IndexTask, SettleTask)
+_First = TypeVar("_First", IndexTask, ResolveTask)
 FailBlock = Callable[[Block, str], None]
 
 
@@ -92,7 +92,7 @@ class Tally:
     seconds: defaultdict[str, float] = field(default_factory=lambda: defaultdict(float))
 
 
-class Driver:
+class Scheduler:
     """Runs tasks in a pool. on_image: told how many images are done, and how many of them failed.
 
     idle: called now and then between events.
@@ -133,10 +133,10 @@ class Driver:
 
         self._do_first(tasks, take, self._pool.slots)
 
-    def settle(
+    def resolve_quality(
         self,
-        tasks: Sequence[SettleTask],
-        each: Callable[[SettleTask, SettledRecipes | str], None],
+        tasks: Sequence[ResolveTask],
+        each: Callable[[ResolveTask, SettledRecipes | str], None],
         *,
         one_by_one: bool,
     ) -> None:
@@ -145,7 +145,7 @@ class Driver:
         one_by_one: no two at a time, so that none is in the way of another's frame times.
         """
 
-        def take(task: SettleTask, result: Result | str) -> None:
+        def take(task: ResolveTask, result: Result | str) -> None:
             assert isinstance(result, (SettledRecipes, str))
             each(task, result)
 
@@ -194,9 +194,9 @@ class Driver:
             OutputError: nothing can be written any more.
         """
         run = _Rendering(self, BlockQueue(blocks), names, fail)
-        while run.hand_out():
+        while run.dispatch():
             for event in self._pool.wait(WAIT_S):
-                run.take_in(event)
+                run.collect(event)
             self._idle()
 
     def _tick(self, slot: int, outcome: Outcome) -> None:
@@ -215,7 +215,7 @@ class _Rendering:
     """The blocks of one run, and who is at which."""
 
     def __init__(
-        self, driver: Driver, queue: BlockQueue, names: dict[str, str | None], fail: FailBlock
+        self, driver: Scheduler, queue: BlockQueue, names: dict[str, str | None], fail: FailBlock
     ) -> None:
         self._driver, self._pool = driver, driver._pool
         self._queue, self._names, self._fail = queue, names, fail
@@ -224,7 +224,7 @@ class _Rendering:
         self._lost_alone: Counter[str] = Counter()  # blocks of a scene that nobody survived
         self._later: list[tuple[float, Block]] = []  # another process is at them
 
-    def hand_out(self) -> bool:
+    def dispatch(self) -> bool:
         """Give work to idle workers; False when there is none left, in hand or waiting."""
         now = time.monotonic()
         for when, block in list(self._later):
@@ -253,7 +253,7 @@ class _Rendering:
         self._driver._open[slot] = block.scene
         self._pool.give(slot, task)
 
-    def take_in(self, event: Event) -> None:
+    def collect(self, event: Event) -> None:
         task = self._busy.pop(event.slot)
         self._driver._partial.pop(event.slot, None)
         block = task.block
@@ -265,7 +265,7 @@ class _Rendering:
         elif isinstance(event, Lost):
             self._give_up(block, _lost_twice(event))
             self._lost_alone[block.scene] += 1
-            if self._lost_alone[block.scene] == MOST_LOST:
+            if self._lost_alone[block.scene] == MAX_LOST:
                 for other in self._queue.take_all(block.scene):
                     self._give_up(other, _lost_twice(event))
         elif isinstance(event.result, TaskFailed):

@@ -120,8 +120,8 @@ def _staged(store: Store) -> dict[str, int]:
     counts: dict[str, int] = {}
     for folder in (store.local_dir / STATE_FOLDER / "blocks").glob("*"):
         with contextlib.suppress(OSError, OutputError):  # published meanwhile
-            journals = list(folder.glob(f"{STATE_FOLDER}/journal/*/*.jsonl"))
-            finished = sum(j.read_bytes().count(b'"status":"ok"') for j in journals)
+            progress_logs = list(folder.glob(f"{STATE_FOLDER}/journal/*/*.jsonl"))
+            finished = sum(j.read_bytes().count(b'"status":"ok"') for j in progress_logs)
             if (folder / MANIFEST).is_file():  # a run that was stopped, or had failures
                 finished += read_manifest(folder)["status"].to_pylist().count(OK)
             counts[folder.name] = finished

@@ -127,7 +127,7 @@ def stored_path(path: str, uri: str) -> str:
 
 # ---- An output folder on this machine, or on a file system that it has mounted -------------------
 
-_MOST_RACES = 100  # times that others delete a folder in which a file is just being made
+_MAX_RACES = 100  # times that others delete a folder in which a file is just being made
 
 
 @dataclass(frozen=True)
@@ -242,11 +242,11 @@ def _scan(folder: Path | str, prefix: str, found: dict[str, StoredFile]) -> None
 
 def _with_folder(write: Callable[[], None]) -> None:
     """Write again where the file's folder, empty until then, was deleted by others meanwhile."""
-    for attempt in range(_MOST_RACES):
+    for attempt in range(_MAX_RACES):
         try:
             return write()
         except OutputError as error:
-            if not isinstance(error.__cause__, FileNotFoundError) or attempt == _MOST_RACES - 1:
+            if not isinstance(error.__cause__, FileNotFoundError) or attempt == _MAX_RACES - 1:
                 raise
 
 

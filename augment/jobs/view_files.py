@@ -43,7 +43,7 @@ from augment.jobs.files import encode_depth, encode_ids, encode_image, encode_ma
 from augment.jobs.layout import ItemPaths
 from augment.jobs.processes import uninterrupted
 from augment.labels import Boxes
-from recipes.schema import schema_Recipe
+from recipes.schema import Recipe
 
 # ---- writer --------------------------------------------------------------------------------------
 
@@ -76,7 +76,7 @@ class Written:
     write_s: float
 
 
-def check_view(view: View, camera: Camera, recipe: schema_Recipe) -> None:
+def check_view(view: View, camera: Camera, recipe: Recipe) -> None:
     """Raise ValueError unless the view has the camera's size and the buffers the recipe asks for.
 
     camera: at the written resolution.
@@ -116,7 +116,7 @@ def _check_fact(fact: str, is_given: bool, effect: str, is_wanted: bool) -> None
         )
 
 
-def write_view(out_dir: Path, paths: ItemPaths, view: View, recipe: schema_Recipe) -> Written:
+def write_view(out_dir: Path, paths: ItemPaths, view: View, recipe: Recipe) -> Written:
     """Encode and write all files of a view that `check_view` has passed.
 
     Raises:
@@ -230,7 +230,7 @@ TABLES: Mapping[str, BoxTable[Any]] = {
 }
 
 
-def uses_boxes(recipe: schema_Recipe) -> bool:
+def uses_boxes(recipe: Recipe) -> bool:
     """Whether images of the recipe take the boxes of their frame."""
     return recipe.output.labels or recipe.output.instance
 
@@ -241,7 +241,7 @@ def label_view(
     world_origin_m: np.ndarray,
     camera: Camera,
     view: View,
-    recipe: schema_Recipe,
+    recipe: Recipe,
 ) -> tuple[View, BoxWeather]:
     """One of a frame's images with the frame's boxes: in the instance image those that have no
     actor, too; and what is measured of them, where labels are written.

@@ -50,7 +50,7 @@ from augment.jobs.view_files import (
 )
 from augment.labels import Boxes, LidarSweep
 from augment.scene import Scene
-from recipes.schema import schema_Recipe
+from recipes.schema import Recipe
 
 MESSAGE_LENGTH = 500
 _log = logging.getLogger(__name__)
@@ -63,9 +63,7 @@ class Renderer(Protocol):
     Returns a `writer.View`, or a `Pending` one: a job then begins the next view before it waits.
     """
 
-    def __call__(
-        self, scene: Scene, camera: Camera, recipe: schema_Recipe, *, backend: str
-    ) -> Any: ...
+    def __call__(self, scene: Scene, camera: Camera, recipe: Recipe, *, backend: str) -> Any: ...
 
 
 @runtime_checkable
@@ -87,7 +85,7 @@ class Setup:
     """
 
     out_dir: str
-    recipes: tuple[schema_Recipe, ...]
+    recipes: tuple[Recipe, ...]
     backend: str
     camera_path: str | None
     labelled: frozenset[int]
@@ -162,7 +160,7 @@ class _Drawn:
     """
 
     chunk: Chunk
-    recipe: schema_Recipe
+    recipe: Recipe
     camera: Camera
     lidar: Future
 
@@ -241,7 +239,7 @@ class FrameRunner:
         self._times.add(WRITERS, seconds * self._pump.threads)
         return self._times.so_far()
 
-    def _render(self, chunk: Chunk, recipe: schema_Recipe, name: str, lidar: Future) -> None:
+    def _render(self, chunk: Chunk, recipe: Recipe, name: str, lidar: Future) -> None:
         camera = self._cameras[chunk.frame][name]
         try:
             with self._times.spent(RENDER):
@@ -315,7 +313,7 @@ class FrameRunner:
             self._deliver(done)
 
     def _label(
-        self, frame: int, recipe: schema_Recipe, camera: Camera, view: View
+        self, frame: int, recipe: Recipe, camera: Camera, view: View
     ) -> tuple[View, BoxWeather]:
         """The view with the frame's boxes, and what is measured of them, where they are wanted."""
         if not uses_boxes(recipe) or frame not in self._setup.labelled:
@@ -327,7 +325,7 @@ class FrameRunner:
         boxes = self._boxes[frame]
         return label_view(boxes, self._setup.instances, origin, camera, view, recipe)
 
-    def _pass_lidar(self, chunk: Chunk, recipe: schema_Recipe) -> PassedLidar | str:
+    def _pass_lidar(self, chunk: Chunk, recipe: Recipe) -> PassedLidar | str:
         """Write the frame's sweep, in the weather or as it is, unless it is there already.
 
         Returns what became of it, or a message where it cannot be read.
@@ -353,7 +351,7 @@ class FrameRunner:
             return _passed(recipe, fault)
 
     def _weathered(
-        self, sweep: LidarSweep, frame: int, recipe: schema_Recipe
+        self, sweep: LidarSweep, frame: int, recipe: Recipe
     ) -> tuple[LidarSweep, str | None]:
         """The sweep as the recipe wants it. Where only `auto` asks for weather, one that cannot
         have it is passed through, with the reason."""
@@ -374,7 +372,7 @@ class FrameRunner:
             return sweep, fault
 
 
-def _passed(recipe: schema_Recipe, fault: str | None) -> PassedLidar:
+def _passed(recipe: Recipe, fault: str | None) -> PassedLidar:
     """What the manifest says of a sweep. fault: why it has no weather, where it should have."""
     if fault is None:
         return PassedLidar(recipe.lidar, recipe.lidar_note(recipe.lidar))

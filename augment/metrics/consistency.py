@@ -1,6 +1,6 @@
 """How well two views of one scene agree: the error of one warped into the other.
 
-Protocol. Every pixel of view A that the scene fills (alpha >= LEAST_ALPHA) is a point of the world,
+Protocol. Every pixel of view A that the scene fills (alpha >= MIN_ALPHA) is a point of the world,
 by A's depth along the ray through the pixel's centre. The point is projected into view B. The
 pixel counts if all four pixels of B around that place are filled and have the point's depth within
 a tolerance: where they have not, something else stands before it, or the place lies on an edge,
@@ -37,7 +37,7 @@ from augment.scene import Track
 
 # ---- consistency ---------------------------------------------------------------------------------
 
-LEAST_ALPHA = 0.95
+MIN_ALPHA = 0.95
 RELATIVE_TOLERANCE, TOLERANCE_M = 0.01, 0.05  # of depth; the sum of both is allowed
 _NEIGHBOURS = ((0, 0), (0, 1), (1, 0), (1, 1))
 
@@ -143,7 +143,7 @@ def find_warp(a: DepthView, b: DepthView, points_m: np.ndarray | None = None) ->
     """
     points = world_points(a) if points_m is None else points_m
     column, row, depth_m = _places(points, b.camera)
-    filled = (a.alpha >= LEAST_ALPHA) & np.isfinite(a.depth_m) & (a.depth_m > 0)
+    filled = (a.alpha >= MIN_ALPHA) & np.isfinite(a.depth_m) & (a.depth_m > 0)
     inside = filled & (depth_m > 0)  # false for NaN
     # All four neighbours are in the picture.
     inside &= (column >= 0) & (column < b.camera.width - 1)
@@ -154,7 +154,7 @@ def find_warp(a: DepthView, b: DepthView, points_m: np.ndarray | None = None) ->
     tolerance = RELATIVE_TOLERANCE * z + TOLERANCE_M
     for dr, dc in _NEIGHBOURS:
         at = r0 + dr, c0 + dc
-        agrees &= b.alpha[at] >= LEAST_ALPHA
+        agrees &= b.alpha[at] >= MIN_ALPHA
         agrees &= np.abs(b.depth_m[at] - z) <= tolerance
     counts = np.zeros(a.depth_m.shape, bool)
     counts[inside] = agrees

@@ -25,7 +25,7 @@ from augment.files.checkpoints import read_state_dict
 
 # Applied to pictures in [-1, 1]: about ImageNet's means and deviations.
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
-_LEAST_LENGTH = 1e-10  # of a feature vector: one of zeros stays zeros
+_MIN_LENGTH = 1e-10  # of a feature vector: one of zeros stays zeros
 
 
 @dataclass(frozen=True)
@@ -205,7 +205,7 @@ def _torchvision_name(name: str) -> str:
 
 
 def _normalised(features: Tensor) -> Tensor:
-    return features / (features.square().sum(1, keepdim=True).sqrt() + _LEAST_LENGTH)
+    return features / (features.square().sum(1, keepdim=True).sqrt() + _MIN_LENGTH)
 
 
 def _recognised(found: Mapping[str, Tensor], path: Path) -> Architecture:

@@ -166,25 +166,25 @@ def _split(splats: Splats, first: np.ndarray, split: str, rng: np.random.Generat
 # Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo": splats as samples of
 # what explains the images, so that none is cloned or removed by a rule of thumb.
 
-MOST_COPIES = 51  # of one splat after a round, as in the authors' code
+MAX_COPIES = 51  # of one splat after a round, as in the authors' code
 OPAQUE = 1 - 1e-6  # no root of a transmittance of 0 spreads it over several splats
 NOISE_STEEPNESS = 100.0
 NOISE_KNEE = 0.005  # the opacity at which half of the noise is left, theirs
 NOISE_REACH = 0.1  # of opacity above the knee: beyond, less than 1/20000 of the noise is left
 
-_ORDERS = np.arange(1, MOST_COPIES + 1)
+_ORDERS = np.arange(1, MAX_COPIES + 1)
 _TERMS = np.array(
     [
         [math.comb(n, k) * (-1) ** (k + 1) / math.sqrt(k) for k in _ORDERS.tolist()]
-        for n in range(MOST_COPIES + 1)
+        for n in range(MAX_COPIES + 1)
     ]
-)  # [MOST_COPIES + 1, MOST_COPIES]; comb is 0 where k > n
+)  # [MAX_COPIES + 1, MAX_COPIES]; comb is 0 where k > n
 
 
 def relocated(opacities: np.ndarray, copies: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Opacity and factor on all scales of each of `copies` equal splats in place of one, float64.
 
-    opacities: [T] in (0, 1]. copies: integer [T], 1 to MOST_COPIES. Equation 9: together the
+    opacities: [T] in (0, 1]. copies: integer [T], 1 to MAX_COPIES. Equation 9: together the
     copies hide at their centre what the one hid, 1 - (1 - o')^n = o, and hide as much along a line
     through it. Its double sum over i <= n of binomials (i - 1 over k) is one sum of (n over k + 1).
     """
@@ -276,11 +276,11 @@ def _draw(
 def _most_copies(opacities: np.ndarray, prune_opacity: float) -> np.ndarray:
     """int64: how many equal splats one can become before they are as faint as dead ones."""
     if prune_opacity <= 0:
-        return np.full(len(opacities), MOST_COPIES, np.int64)
+        return np.full(len(opacities), MAX_COPIES, np.int64)
     opacity = np.minimum(opacities.astype(np.float64), OPAQUE)
     most = np.log1p(-opacity) / math.log1p(-min(prune_opacity, OPAQUE))
     # A hair below the whole number, so that float32 does not round a copy to the dead side.
-    return np.clip(most - 1e-4, 1, MOST_COPIES).astype(np.int64)
+    return np.clip(most - 1e-4, 1, MAX_COPIES).astype(np.int64)
 
 
 def add_noise(

@@ -12,8 +12,8 @@ Departures, all shared by the reference:
 - Where a pixel's weight is 0, both pictures hold the prediction there, as a constant: it neither
   disturbs the windows of its neighbours nor gets a gradient from them. (Depth and sky have masks
   of their own and do not ask for the weight.)
-- The sky is not looked up where 1 - alpha < LEAST_SKY; it counts as black, and has no gradient.
-- A depth prior counts only where alpha > LEAST_ALPHA, for the expected depth of next to nothing is
+- The sky is not looked up where 1 - alpha < MIN_SKY; it counts as black, and has no gradient.
+- A depth prior counts only where alpha > MIN_ALPHA, for the expected depth of next to nothing is
   noise; it gives no gradient elsewhere, but the mean is always over all of the view's priors, so
   that uncovered pixels do not make the others count more.
 """
@@ -29,7 +29,7 @@ from augment.reconstruct import loss_kernels
 from augment.reconstruct import loss_kernels as depth_kernels
 from augment.reconstruct import loss_kernels as sky_kernels
 from augment.reconstruct.config import LossWeights
-from augment.reconstruct.loss_reference import LEAST_ALPHA, LEAST_SKY
+from augment.reconstruct.loss_reference import MIN_ALPHA, MIN_SKY
 from augment.reconstruct.view import RecordedView
 from augment.render.threads import kernel_threads
 
@@ -210,7 +210,7 @@ def view_loss(
     scratch = scratch or LossScratch()
     buffers = scratch.image(camera.height, camera.width)
     with kernel_threads():
-        _sample_sky(alpha, camera, sky_faces, np.float32(LEAST_SKY), buffers)
+        _sample_sky(alpha, camera, sky_faces, np.float32(MIN_SKY), buffers)
         l1, ssim, sky, d_color_map = _compare(rgb, alpha, view, color_map, weights, buffers)
         depth = _compare_depth(expected_depth, alpha, view, weights, buffers)
         surface = _compare_surface(alpha, view, weights, buffers)
@@ -345,7 +345,7 @@ def _compare_depth(
         _writeable(view.depth_m),
         _writeable(view.depth_weight),
         np.float32(weights.depth / weight_sum),
-        np.float32(LEAST_ALPHA),
+        np.float32(MIN_ALPHA),
         buffers.d_expected_depth.reshape(-1),
         sums,
     )

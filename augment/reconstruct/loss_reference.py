@@ -48,8 +48,8 @@ def paint_below_horizon(faces: np.ndarray) -> np.ndarray:
 
 RADIUS, SIGMA = 5, 1.5
 C1, C2 = 0.01**2, 0.03**2
-LEAST_SKY = 1e-3  # less of the sky shows at most a quarter of an 8-bit step
-LEAST_ALPHA = 0.05
+MIN_SKY = 1e-3  # less of the sky shows at most a quarter of an 8-bit step
+MIN_ALPHA = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +108,7 @@ def reference_loss(
 ) -> ReferenceLoss:
     """The loss of a render of `view.camera` against the view; the dtype is rgb's."""
     dtype = rgb.dtype
-    x = reference_picture(rgb, alpha, view.camera, sky_faces, color_map, least_sky=LEAST_SKY)
+    x = reference_picture(rgb, alpha, view.camera, sky_faces, color_map, least_sky=MIN_SKY)
     weight = torch.from_numpy(view.weight).to(dtype)[..., None].expand_as(x)
     fixed = x.detach()
     x = torch.where(weight > 0, x, fixed)
@@ -136,14 +136,14 @@ def _transparency(alpha: Tensor, view: RecordedView) -> Tensor:
 
 
 def _depth_error(expected_depth: Tensor, alpha: Tensor, view: RecordedView) -> Tensor:
-    """Mean |1/ED - 1/z| over the view's priors, 0 where alpha <= LEAST_ALPHA."""
+    """Mean |1/ED - 1/z| over the view's priors, 0 where alpha <= MIN_ALPHA."""
     pixels = torch.from_numpy(view.depth_pixels).long()
     weight = torch.from_numpy(view.depth_weight).to(expected_depth.dtype)
     if float(weight.sum()) <= 0:
         return expected_depth.new_zeros(())
     expected = expected_depth.reshape(-1)[pixels]
     prior = torch.from_numpy(view.depth_m).to(expected.dtype)
-    counts = (alpha.reshape(-1)[pixels] > LEAST_ALPHA) & (expected > 0) & (prior > 0)
+    counts = (alpha.reshape(-1)[pixels] > MIN_ALPHA) & (expected > 0) & (prior > 0)
     difference = torch.where(counts, 1 / torch.where(counts, expected, 1), 0) - torch.where(
         counts, 1 / torch.where(counts, prior, 1), 0
     )

@@ -15,7 +15,7 @@ from augment.render.threads import kernel_threads
 
 BETA1, BETA2 = 0.9, 0.999
 CORRECTIONS = kernels.bias_corrections(BETA1, BETA2)
-_SMALLEST_M = 1e-3  # no splat gets thinner along any axis
+_MIN_M = 1e-3  # no splat gets thinner along any axis
 
 
 def splat_rates(config: FitConfig, step: int, camera: Camera, extent_m: float) -> np.ndarray:
@@ -36,7 +36,7 @@ def splat_rates(config: FitConfig, step: int, camera: Camera, extent_m: float) -
     values[kernels.R_BETA1], values[kernels.R_BETA2] = BETA1, BETA2
     values[kernels.R_OPACITY_DECAY] = config.loss.opacity_decay
     values[kernels.R_SCALE_DECAY] = config.loss.scale_decay
-    values[kernels.R_SMALLEST], values[kernels.R_LARGEST] = _SMALLEST_M, extent_m
+    values[kernels.R_SMALLEST], values[kernels.R_LARGEST] = _MIN_M, extent_m
     side = max(camera.width, camera.height)
     values[kernels.R_ABS_UNIT], values[kernels.R_RADIUS_UNIT] = 0.5 * side, 1 / side
     return values

@@ -28,7 +28,7 @@ from augment.scene import Gaussians, PosedGaussians
 # in no fixed order, so a fit's bits do not repeat.
 
 _FIELDS = ("means", "quats", "scales", "opacities", "sh")
-_LEAST_DET = 1e-30  # of a conic, px^-4
+_MIN_DET = 1e-30  # of a conic, px^-4
 
 
 class GsplatRenderer:
@@ -163,7 +163,7 @@ class GsplatTape:
         radial = (slopes["quats"] * quats).sum(1, keepdim=True)
         absolute = self.images.means2d.absgrad[order]
         a, b, c = self.images.conics.detach()[order].unbind(1)
-        widest = torch.maximum(a, c) / (a * c - b * b).clamp_min(_LEAST_DET)
+        widest = torch.maximum(a, c) / (a * c - b * b).clamp_min(_MIN_DET)
         rows = {
             columns.G_MEAN: slopes["means"],
             columns.G_QUAT: slopes["quats"] - radial * quats,

@@ -110,7 +110,7 @@ class Splats:
 
 ABSURD_RADIUS = 0.25  # one sigma, of the image's larger side: such a splat fills the image
 ABSURD_SCALE = 0.1  # of the scene's extent, for splats that also look absurdly large
-SMALLEST_QUATERNION = 1e-6  # a shorter one has no direction in float32
+MIN_QUATERNION = 1e-6  # a shorter one has no direction in float32
 
 
 def rebuild(splats: Splats, source: np.ndarray, part: np.ndarray | None = None) -> Splats:
@@ -176,7 +176,7 @@ def usable(splats: Splats, extent_m: float) -> np.ndarray:
         & (splats.opacities >= 0)
         & (splats.opacities <= 1)
         & (splats.scales > 0).all(1)
-        & (np.abs(splats.quats).max(1, initial=0) > SMALLEST_QUATERNION)
+        & (np.abs(splats.quats).max(1, initial=0) > MIN_QUATERNION)
     )
     fog = (splats.grads[:, 2] > ABSURD_RADIUS) & (largest > ABSURD_SCALE * extent_m)
     return sound & ~fog & (largest <= extent_m)

@@ -164,7 +164,7 @@ class Trainer:
         self.step += 1
         with _timed(stages, "densify"):
             if self.config.densify.method == "mcmc" and self.config.densify.noise > 0:
-                self._shake(tape.inputs, grads)
+                self._add_noise(tape.inputs, grads)
             self._densify()
         return StepRecord(
             step=self.step,
@@ -357,7 +357,7 @@ class Trainer:
                 pull=self.config.pose_pull,
             )
 
-    def _shake(self, inputs: Inputs, grads: SplatGradients) -> None:
+    def _add_noise(self, inputs: Inputs, grads: SplatGradients) -> None:
         """Noise on the means of faint splats that the view shows."""
         config = self.config
         firsts = inputs.first_ids[inputs.blocks[:, 0]]

@@ -13,7 +13,7 @@ RUN = 4096  # pixels of a piece of work
 
 
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
-def share_remainder(alpha, rgb, snow, least):
+def renormalise_alpha(alpha, rgb, snow, least):
     """alpha, snow: float32 [P]. rgb: [3 P]. rgb and snow may be empty. least: alpha of finished."""
     one = np.float32(1)
     for run in numba.prange((alpha.size + RUN - 1) // RUN):

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 ALPHA_MIN = 1.0 / 255.0  # a splat's contribution below this is skipped
 TRANSMITTANCE_STOP = 1e-4  # blending stops before the splat that would reach this
 # Median depth is where transmittance falls below one half, so blending must not stop sooner.
-MOST_TRANSMITTANCE_STOP = 0.25
+MAX_TRANSMITTANCE_STOP = 0.25
 COV2D_BLUR = 0.3  # px^2 added to the diagonal of the projected covariance
 MAX_EXTENT_SIGMAS = 3.33
 TAN_FOV_MARGIN = 0.3  # the Jacobian's x/z, y/z are clamped to the image plus this part of it

@@ -30,7 +30,7 @@ from augment.render.buffers import (
     import_cuda,
     kernels_for,
 )
-from augment.render.constants import MOST_TRANSMITTANCE_STOP, TRANSMITTANCE_STOP, RasterSettings
+from augment.render.constants import MAX_TRANSMITTANCE_STOP, TRANSMITTANCE_STOP, RasterSettings
 from augment.render.gsplat_backend import tracked_geometry
 from augment.render.layout import HeightClip
 from augment.render.reference import rasterize_reference
@@ -50,7 +50,7 @@ def needs_remainder(stop: float) -> bool:
     return stop > TRANSMITTANCE_STOP
 
 
-def share_remainder(output: RenderOutput, stop: float, *, backend: str = CPU) -> RenderOutput:
+def renormalise_alpha(output: RenderOutput, stop: float, *, backend: str = CPU) -> RenderOutput:
     """Pixels of alpha >= 1 - stop become opaque. output: with alpha; written to by kernels.
 
     backend: with kernels, float32 without gradients goes through them, equal within float rounding.
@@ -66,7 +66,7 @@ def share_remainder(output: RenderOutput, stop: float, *, backend: str = CPU) ->
     if kernels == CUDA:
         from augment.render.cuda import images as cuda_composite
 
-        cuda_composite.share_remainder(alpha, images.get("rgb"), images.get("snow"), stop)
+        cuda_composite.renormalise_alpha(alpha, images.get("rgb"), images.get("snow"), stop)
         return output
     finished = alpha >= 1 - stop
     scale = torch.where(finished, 1 / alpha.clamp_min(1 - stop), torch.ones_like(alpha))
@@ -85,7 +85,7 @@ def _by_kernel(alpha: Tensor, images: dict[str, Tensor], stop: float) -> None:
     flat = {name: image.numpy().reshape(-1) for name, image in images.items()}
     none = np.empty(0, np.float32)
     with kernel_threads():
-        remainder_kernels.share_remainder(
+        remainder_kernels.renormalise_alpha(
             alpha.numpy().reshape(-1),
             flat.get("rgb", none),
             flat.get("snow", none),
@@ -146,7 +146,7 @@ def rasterize(
     if not needs_remainder(stop):
         return _rasterize(parts, camera, names, settings, smog, clip, wanted, chosen)
     drawn = _rasterize(parts, camera, names | {ALPHA}, settings, smog, clip, wanted, chosen)
-    shared = share_remainder(drawn, stop, backend=chosen)
+    shared = renormalise_alpha(drawn, stop, backend=chosen)
     return shared if ALPHA in names else dataclasses.replace(shared, alpha=None)
 
 
@@ -394,9 +394,9 @@ def _check_settings(settings: RasterSettings) -> None:
             f"settings.mode_depth_floor_m must be finite and > 0 (metres); "
             f"got {settings.mode_depth_floor_m}"
         )
-    if not 0 < settings.transmittance_stop <= MOST_TRANSMITTANCE_STOP:
+    if not 0 < settings.transmittance_stop <= MAX_TRANSMITTANCE_STOP:
         raise ValueError(
-            f"settings.transmittance_stop must be > 0 and at most {MOST_TRANSMITTANCE_STOP}, "
+            f"settings.transmittance_stop must be > 0 and at most {MAX_TRANSMITTANCE_STOP}, "
             f"since median depth is where less than half the light is left; "
             f"got {settings.transmittance_stop}"
         )

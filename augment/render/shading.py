@@ -33,7 +33,7 @@ from torch import Tensor
 from augment.cameras import Camera
 
 LINES = 9
-LEAST_FACING = 0.05  # of n1 . n2: the planes of splats seen edge-on are taken to be tilted this far
+MIN_FACING = 0.05  # of n1 . n2: the planes of splats seen edge-on are taken to be tilted this far
 TINY = 1e-20  # keeps |d'|^2 off 0 at a splat's centre; pixels' are 1e-9 and more
 
 
@@ -52,7 +52,7 @@ def shading_lines(
     """
     is_back = (normals * towards).sum(1, keepdim=True) > 0
     normals = torch.where(is_back, -normals, normals)
-    ax, ay = (normals[:, :2] / (-normals[:, 2:]).clamp_min(LEAST_FACING)).unbind(1)
+    ax, ay = (normals[:, :2] / (-normals[:, 2:]).clamp_min(MIN_FACING)).unbind(1)
     ones = torch.ones_like(ax)
     lit = torch.stack(
         [

@@ -19,7 +19,7 @@ from augment.render.rasterize import rasterize
 from augment.scene import Gaussians, PosedGaussians
 from augment.sky import CubemapSky, directions_of_cubemap
 from augment.views import render_buffers
-from recipes.schema import schema_Recipe
+from recipes.schema import Recipe
 
 FRAME_NS = 100_000_000
 C0 = 0.28209479177387814
@@ -156,9 +156,7 @@ def own_image(numbers: files.Numbers, at: int, position: int) -> tuple[np.ndarra
 def test_images_are_those_composed_from_the_checkpoint(run, at, position):
     numbers, scene = run
     camera = list(scene.frame(START + at).cameras.values())[position]
-    shown = render_buffers(
-        scene, camera, make_plan(schema_Recipe(), scene), backend="reference"
-    ).rgb
+    shown = render_buffers(scene, camera, make_plan(Recipe(), scene), backend="reference").rgb
     own, inside = own_image(numbers, at, position)
     assert tuple(shown.shape) == own.shape
     assert inside.mean() > 0.5
@@ -189,9 +187,7 @@ def test_colours_without_spherical_harmonics_are_sigmoids(tmp_path):
     assert scene.background.sh.shape[1] == 1
     assert torch.allclose(scene.background.sh[:, 0] * C0 + 0.5, torch.sigmoid(raw), atol=1e-6)
     camera = next(iter(scene.frames[1].cameras.values()))
-    shown = render_buffers(
-        scene, camera, make_plan(schema_Recipe(), scene), backend="reference"
-    ).rgb
+    shown = render_buffers(scene, camera, make_plan(Recipe(), scene), backend="reference").rgb
     own, inside = own_image(numbers, 1, 0)
     assert np.quantile(np.abs(shown.double().numpy() - own)[inside], 0.99) < 2e-5
 

@@ -20,7 +20,7 @@ from augment.files.ply import write_ply, write_splat
 from augment.jobs.files import check_frames
 from augment.scene import Gaussians
 from augment.views import render_view
-from recipes.schema import Weather, schema_Recipe
+from recipes.schema import Recipe, Weather
 from recipes.weather import Flood, Snow
 
 TO_Y_DOWN = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # z-up world to COLMAP's usual y-down
@@ -315,9 +315,7 @@ def test_a_grey_file_stays_grey_under_the_overcast_sky(tmp_path: Path) -> None:
     assert max(np.ptp(light.lit_rgb), np.ptp(light.shadow_rgb)) < 1 / 255
     flood = Flood(level_m=0.3, color=(0.3, 0.3, 0.3), absorption_per_m=(1.0, 1.0, 1.0))
     clear, snowy, flooded = (
-        render_view(
-            scene, scene.frames[0].cameras["front"].scaled(0.15), schema_Recipe(weather=weather)
-        )
+        render_view(scene, scene.frames[0].cameras["front"].scaled(0.15), Recipe(weather=weather))
         for weather in (Weather(), Weather(snow=Snow(depth_m=0.1)), Weather(flood=flood))
     )
     clear, snowy, flooded = (view.rgb.astype(int) for view in (clear, snowy, flooded))

@@ -458,10 +458,10 @@ def test_tracklets_in_another_encoding_hide_nothing(drive):
 
 
 def test_tracklets_of_no_drives_size_are_refused(drive, monkeypatch):
-    monkeypatch.setattr(tracklets, "_MOST_ELEMENTS", 20)
+    monkeypatch.setattr(tracklets, "_MAX_ELEMENTS", 20)
     with pytest.raises(AdapterError, match="more than 20 of them"):
         kitti_labels(str(drive), {})
-    monkeypatch.setattr(tracklets, "_MOST_BYTES", 1000)
+    monkeypatch.setattr(tracklets, "_MAX_BYTES", 1000)
     with pytest.raises(AdapterError, match="is larger than"):
         kitti_labels(str(drive), {})
 

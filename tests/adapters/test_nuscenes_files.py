@@ -388,7 +388,7 @@ def test_rows_are_the_same_however_the_file_is_cut(monkeypatch, tmp_path, chunk)
 def test_a_broken_table_is_not_read_to_its_end(monkeypatch, tmp_path):
     """What is no JSON is noticed after the longest row that there may be."""
     monkeypatch.setattr(rows, "_CHUNK", 1000)
-    monkeypatch.setattr(rows, "_LONGEST_ROW", 5000)
+    monkeypatch.setattr(rows, "_MAX_ROW", 5000)
     file = io.StringIO('[{"token": ' + "x" * 100_000)
     with pytest.raises(AdapterError, match="is not readable JSON after its first 0 rows"):
         list(rows._rows(tmp_path, file))

@@ -13,7 +13,7 @@ import pytest
 from adapters.base import open_scene
 from adapters.camera_files.camera_files import read_views
 from adapters.drivestudio.run import read_config as drivestudio_config
-from adapters.image_checks import look_at_image
+from adapters.image_checks import read_image_size
 from adapters.lidar_scene.image_views import read_image
 from adapters.nuscenes.tables import read_rows
 from adapters.plain_files import decode_image, inside, read_json, read_numbers, read_pose
@@ -199,7 +199,7 @@ def test_pipes_inside_datasets_are_faults_of_theirs(tmp_path, ends_soon):
             read(path)
     picture = tmp_path / "pipe.png"
     assert read_image(picture, 1.0) is None
-    assert look_at_image(picture) == "cannot be read (a pipe or device, not a regular file)"
+    assert read_image_size(picture) == "cannot be read (a pipe or device, not a regular file)"
 
 
 def test_pictures_are_decoded_as_opencv_does(tmp_path):

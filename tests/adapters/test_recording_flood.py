@@ -11,7 +11,7 @@ import torch
 from adapters.base import open_scene, recognise
 from augment.jobs.render_job import RenderJob, run_job
 from augment.scene import Scene
-from recipes.schema import Output, Weather, schema_Recipe
+from recipes.schema import Output, Recipe, Weather
 from recipes.weather import Flood
 from tests.streets import LABELLED_STREET, open_street
 
@@ -52,7 +52,7 @@ def _render(scene, camera, recipe, *, backend) -> _View:
 
 def _written(source: Scene, out: Path, flood: Flood | None) -> Path:
     output = Output(surface="first", lidar=True)  # the sweeps as they were
-    recipe = schema_Recipe(name="any", weather=Weather(flood=flood), output=output)
+    recipe = Recipe(name="any", weather=Weather(flood=flood), output=output)
     job = RenderJob(LABELLED_STREET, [recipe], out)
     result = run_job(job, scene_loader=lambda _: source, renderer=_render, progress=False)
     assert result.failures == ()

@@ -27,7 +27,7 @@ from augment.files.scene_file import save_scene
 from augment.jobs.mirror_files import survey
 from augment.jobs.render_job import RenderJob, run_job
 from augment.scene import Scene
-from recipes.schema import schema_Recipe
+from recipes.schema import Recipe
 from tests.augment.batch_scenes import fake_render, make_recipe, open_fake
 from tests.augment.mirror_trees import contents, listing, snapshot
 from tools.mirror import mirror_outputs, recipes_for_source
@@ -369,7 +369,7 @@ def test_scenes_without_a_tree_are_refused(source, message):
 def test_a_dataset_without_images_is_refused(tmp_path):
     (tmp_path / "model").mkdir()
     scene = street_scene(tmp_path, source=f"street_gaussians:{tmp_path / 'model'}")
-    recipe: schema_Recipe = make_recipe()
+    recipe: Recipe = make_recipe()
     with pytest.raises(AdapterError, match=r"model, which .* names, holds no camera images"):
         recipes_for_source(scene, tmp_path / "out", [recipe])
 

@@ -26,7 +26,7 @@ from augment.render.rasterize import rasterize
 from augment.scene import Gaussians, PosedGaussians, Scene
 from augment.sky import ConstantSky
 from augment.views import render_buffers
-from recipes.schema import schema_Recipe
+from recipes.schema import Recipe
 from tests.assertions import assert_images_close
 
 C0, C1 = 0.28209479177387814, 0.4886025119029199
@@ -103,7 +103,7 @@ def opened(path: Path, **query: str) -> Scene:
 
 
 def render(scene: Scene, camera: Camera) -> torch.Tensor:
-    return render_buffers(scene, camera, make_plan(schema_Recipe(), scene), backend="reference").rgb
+    return render_buffers(scene, camera, make_plan(Recipe(), scene), backend="reference").rgb
 
 
 # --- the picture, from the raw numbers alone ---

@@ -27,10 +27,10 @@ from augment.ground import ground_of
 from augment.scene import Scene
 from augment.semantics import SemanticClass
 from augment.views import render_view
-from recipes.schema import schema_Recipe
+from recipes.schema import Recipe
 from tests.streets import open_street
 
-LEAST_DB = 55.0
+MIN_DB = 55.0
 FLIPS = 0.002  # share of pixels on the other side of a threshold of the rasteriser
 
 
@@ -52,7 +52,7 @@ def drivestudio(tmp_path_factory, street) -> tuple[DrivestudioRun, Scene]:
 
 
 def shown(scene: Scene, frame: int, name: str) -> np.ndarray:
-    return render_view(scene, scene.frame(frame).cameras[name], schema_Recipe()).rgb
+    return render_view(scene, scene.frame(frame).cameras[name], Recipe()).rgb
 
 
 def decibels(actual: np.ndarray, expected: np.ndarray) -> float:
@@ -71,14 +71,14 @@ VIEWS = [(1, 0), (4, 1), (2, 3), (3, 2), (6, 0)]
 def test_street_gaussians(street_gaussians, street, frame, cam) -> None:
     run, scene = street_gaussians
     expected = picture(street, run.shot(frame, cam), cam)
-    assert decibels(shown(scene, frame, NAMES[cam]), expected) > LEAST_DB
+    assert decibels(shown(scene, frame, NAMES[cam]), expected) > MIN_DB
 
 
 @pytest.mark.parametrize(("frame", "cam"), VIEWS)
 def test_drivestudio(drivestudio, frame, cam) -> None:
     run, scene = drivestudio
     expected = picture(run.street, run.shot(frame, cam), cam)
-    assert decibels(shown(scene, frame, WAYMO_NAMES[cam]), expected) > LEAST_DB
+    assert decibels(shown(scene, frame, WAYMO_NAMES[cam]), expected) > MIN_DB
 
 
 def test_a_point_cloud_shows_the_poses_of_the_track_file(street_gaussians, street) -> None:
@@ -86,7 +86,7 @@ def test_a_point_cloud_shows_the_poses_of_the_track_file(street_gaussians, stree
     scene = open_scene(f"street_gaussians:{run.model}?weights=ply")
     dark = dataclasses.replace(street, sky=np.zeros_like)
     expected = picture(dark, run.shot(2, 0, corrected=False), 0)
-    assert decibels(shown(scene, 2, "FRONT"), expected) > LEAST_DB
+    assert decibels(shown(scene, 2, "FRONT"), expected) > MIN_DB
 
 
 def test_pictures_tell_what_would_be_wrong(street_gaussians, street) -> None:
@@ -110,7 +110,7 @@ def test_pictures_tell_what_would_be_wrong(street_gaussians, street) -> None:
         (street, dataclasses.replace(shot, affine=None)),
         (dataclasses.replace(street, sky=lambda d: street.sky(d * [1, 1, -1])), shot),
     ):
-        assert decibels(rgb, picture(other, wrong, 0)) < LEAST_DB - 10
+        assert decibels(rgb, picture(other, wrong, 0)) < MIN_DB - 10
 
 
 def test_the_world_is_as_level_as_the_dataset_says(street_gaussians, drivestudio) -> None:

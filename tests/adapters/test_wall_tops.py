@@ -136,7 +136,7 @@ def test_budget_repetition_and_no_views(monkeypatch):
     assert len(one) > 0
     source.train = ()
     assert len(wall_tops(scene, source)) == 0
-    monkeypatch.setattr("adapters.training_views.walls._MOST_GAUSSIANS", len(full) // 3)
+    monkeypatch.setattr("adapters.training_views.walls._MAX_GAUSSIANS", len(full) // 3)
     few = wall_tops(scene, Images(scene, 6.5))
     assert 0 < len(few) <= len(full) // 3
     assert few.means[:, 2].max() == pytest.approx(6.5, abs=0.5)

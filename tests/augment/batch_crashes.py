@@ -24,8 +24,8 @@ from fork_server import keep_in_forks, start_fork_server
 
 from augment.effects.snow import support as beds
 from augment.jobs.atomic import TEMPORARY_SUFFIX
-from augment.jobs.journal import Journal
 from augment.jobs.layout import STATE_FOLDER
+from augment.jobs.progress_log import ProgressLog
 from augment.jobs.render_job import RenderJob, run_job
 from recipes.weather import Flood, Snow
 
@@ -36,7 +36,7 @@ SYNC_POINTS = ("fsync", "replace", "unlink", "rename", "rmdir")
 def main(folder: Path) -> None:
     start_fork_server("batch_scenes", "augment.jobs.pools")
     keep_in_forks()
-    beds.place_snow_bed = lambda *_, **__: make_bed(1.0)
+    beds.place_snow_support = lambda *_, **__: make_bed(1.0)
     for warm in (job(folder / "warm"), snowy_job(folder / "warm-snow")):
         render(warm)()  # imports before the forks what is imported late
     gc.collect()
@@ -109,13 +109,13 @@ def run_forked(work: Callable[[], None], kill_at: int | None = None) -> Ended:
 
 
 def _tell_of_finished(pipe: int) -> None:
-    append = Journal.append
+    append = ProgressLog.append
 
-    def told(journal: Journal, row: dict) -> None:
-        append(journal, row)
+    def told(progress_log: ProgressLog, row: dict) -> None:
+        append(progress_log, row)
         os.write(pipe, b"." if row["status"] == "ok" else b"")
 
-    Journal.append = told
+    ProgressLog.append = told
 
 
 def _count_sync_points(kill_at: int | None) -> Callable[[], int]:
@@ -295,8 +295,8 @@ def resume_and_compare(
 
 def count_finished(out: Path) -> int:
     """Images that a journal lists, read without the code under test."""
-    journals = list((out / STATE_FOLDER).rglob("*.jsonl"))
-    return sum(journal.read_bytes().count(b"\n") - 1 for journal in journals)
+    progress_logs = list((out / STATE_FOLDER).rglob("*.jsonl"))
+    return sum(progress_log.read_bytes().count(b"\n") - 1 for progress_log in progress_logs)
 
 
 def require(holds: bool, message: str) -> None:

@@ -17,7 +17,7 @@ import torch
 
 from augment.cameras import Camera, Frame
 from augment.effects.smog import SmogMedium
-from augment.effects.snow.cells import OPEN_EDGE, SnowBed, SnowCells
+from augment.effects.snow.cells import OPEN_EDGE, SnowCells, SnowSupport
 from augment.effects.snow.placement import PlacementSettings
 from augment.effects.snow.support import bed_of
 from augment.effects.style.color_maps import StyleMaps
@@ -27,7 +27,7 @@ from augment.scene import Gaussians, Scene
 from augment.semantics import SemanticClass
 from augment.sky import ConstantSky
 from augment.views import SurfaceView
-from recipes.schema import Output, Smog, Weather, schema_Recipe
+from recipes.schema import Output, Recipe, Smog, Weather
 from recipes.weather import Flood, Snow, Style
 
 ORIGIN_M = np.array([448_262.123456789, 4_421_337.987654321, 41.5])
@@ -166,15 +166,15 @@ def make_recipe(
     snow: Snow | None = None,
     style: Style | None = None,
     **output,
-) -> schema_Recipe:
+) -> Recipe:
     smog = Smog(visibility_m=50.0 + variant)
     weather = Weather(smog=smog if name == "fog" else None, flood=flood, snow=snow)
     settings = {"semantic": True, "instance": True, **output}
     numbers = {"name": name, "variant": variant, "seed": 7}
-    return schema_Recipe(**numbers, weather=weather, style=style, output=Output(**settings))
+    return Recipe(**numbers, weather=weather, style=style, output=Output(**settings))
 
 
-def fake_render(scene: Scene, camera: Camera, recipe: schema_Recipe, *, backend: str) -> FakeView:
+def fake_render(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str) -> FakeView:
     """Noise that depends on scene, camera, time and recipe: nothing else, and on nothing less."""
     camera = camera.scaled(recipe.render.scale)
     key = f"{scene.name} {camera.name} {camera.timestamp_ns} {recipe.hash}"
@@ -232,7 +232,7 @@ def fake_smog(camera: Camera, rng: np.random.Generator, smog: Smog) -> dict:
     return {"smoggy": FakeSmoggy(medium, depth, None)}
 
 
-def make_bed(x_m: float) -> SnowBed:
+def make_bed(x_m: float) -> SnowSupport:
     """One cell at x_m, without anything under it."""
     cells = SnowCells(
         centers_m=torch.tensor([[x_m, 0.0, 0.0]]),
@@ -247,10 +247,10 @@ def make_bed(x_m: float) -> SnowBed:
         buried=torch.zeros(0, dtype=torch.int32),
         buried_by=torch.zeros(0, 5, dtype=torch.int32),
     )
-    return SnowBed(cells, {})
+    return SnowSupport(cells, {})
 
 
-def bed_render(scene: Scene, camera: Camera, recipe: schema_Recipe, *, backend: str) -> FakeView:
+def bed_render(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str) -> FakeView:
     """As `style_render`, with the number that `make_bed` was given in the first pixel's red."""
     snow = recipe.weather.snow
     assert snow is not None
@@ -266,7 +266,7 @@ def make_maps(red: float) -> StyleMaps:
     return StyleMaps(one[None], one, one)
 
 
-def style_render(scene: Scene, camera: Camera, recipe: schema_Recipe, *, backend: str) -> FakeView:
+def style_render(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str) -> FakeView:
     """As `fake_render`, with the number that `make_maps` was given, times 100, in the second
     pixel's red.
     """
@@ -279,19 +279,17 @@ def style_render(scene: Scene, camera: Camera, recipe: schema_Recipe, *, backend
     return view
 
 
-def slow_render(scene: Scene, camera: Camera, recipe: schema_Recipe, *, backend: str) -> FakeView:
+def slow_render(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str) -> FakeView:
     time.sleep(0.02)
     return fake_render(scene, camera, recipe, backend=backend)
 
 
-def must_not_render(
-    scene: Scene, camera: Camera, recipe: schema_Recipe, *, backend: str
-) -> FakeView:
+def must_not_render(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str) -> FakeView:
     raise AssertionError(f"rendered camera {camera.name} again")
 
 
 def render_dying_at_frame_2(
-    scene: Scene, camera: Camera, recipe: schema_Recipe, *, backend: str
+    scene: Scene, camera: Camera, recipe: Recipe, *, backend: str
 ) -> FakeView:
     """Kills its process, as the kernel does when memory runs out, at one image."""
     if camera.name == "front" and camera.timestamp_ns == make_frame(2).timestamp_ns:

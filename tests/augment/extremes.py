@@ -20,7 +20,7 @@ from pydantic import ValidationError
 
 from augment.cameras import Camera
 from augment.effects.snow.snow import placement_settings
-from augment.effects.snow.support import bed_of, remember_bed
+from augment.effects.snow.support import bed_of, remember_support
 from augment.geometry import rigid
 from augment.ground_heights import Ground
 from augment.plan import make_plan
@@ -29,7 +29,7 @@ from augment.scene import Actor, Gaussians, Scene, Track
 from augment.semantics import SemanticClass
 from augment.sky import ConstantSky, CubemapSky, LatLongSky, Sky
 from augment.views import WeatheredBuffers, WeatheredView, render_buffers, render_view
-from recipes.schema import schema_Recipe
+from recipes.schema import Recipe
 from recipes.template import ROOT, FieldSpec, Kind, SectionSpec
 from tests.augment.examples import examples
 from tests.snow_scenes import box_car, drive, sheet, side_wall, wall
@@ -173,14 +173,14 @@ class Place:
         )
         for slope in SLOPES_DEG:
             settings = placement_settings(snow_model(max_slope_deg=slope))
-            remember_bed(scene, settings, bed_of(base, settings))
+            remember_support(scene, settings, bed_of(base, settings))
         return scene
 
 
 def snow_model(**fields: Any) -> Any:
     """The recipe's snow on the street's cells."""
     snow = {"depth_m": 0.1, "cell_m": CELL_M, **fields}
-    return schema_Recipe.model_validate({"weather": {"snow": snow}}).weather.snow
+    return Recipe.model_validate({"weather": {"snow": snow}}).weather.snow
 
 
 @st.composite
@@ -408,7 +408,7 @@ PAIRS = [frozenset(pair) for pair in itertools.combinations(EFFECTS, 2)]
 
 
 @st.composite
-def recipes(draw: st.DrawFn, effects: frozenset[str] | None = None) -> schema_Recipe:
+def recipes(draw: st.DrawFn, effects: frozenset[str] | None = None) -> Recipe:
     """A valid recipe of extreme numbers, with the given effects, or some of them."""
     if effects is None:
         effects = draw(st.frozensets(st.sampled_from(EFFECTS)))
@@ -427,7 +427,7 @@ def recipes(draw: st.DrawFn, effects: frozenset[str] | None = None) -> schema_Re
             data["style"]["per_region"] = False
     data["output"] = draw(outputs(data))
     try:
-        return schema_Recipe.model_validate(data)
+        return Recipe.model_validate(data)
     except ValidationError:  # a rule between fields that is younger than this file
         assume(False)
         raise
@@ -474,7 +474,7 @@ def outputs(draw: st.DrawFn, data: dict[str, Any]) -> dict[str, Any]:
     return {"depth": depth, "semantic": classes, "instance": classes, "surface": surface}
 
 
-def rendered(scene: Scene, camera: Camera, recipe: schema_Recipe) -> WeatheredView:
+def rendered(scene: Scene, camera: Camera, recipe: Recipe) -> WeatheredView:
     """The view, after checking all that is promised of every frame."""
     view = render_view(scene, camera, recipe)
     plan = make_plan(recipe, scene)
@@ -485,7 +485,7 @@ def rendered(scene: Scene, camera: Camera, recipe: schema_Recipe) -> WeatheredVi
     return view
 
 
-def check_buffers(buffers: WeatheredBuffers, recipe: schema_Recipe) -> None:
+def check_buffers(buffers: WeatheredBuffers, recipe: Recipe) -> None:
     """Finite colours; alpha and snow in [0, 1]; depth of what is seen positive, else 0."""
     size = (buffers.camera.height, buffers.camera.width)
     assert tuple(buffers.rgb.shape) == (*size, 3)
@@ -512,7 +512,7 @@ def check_buffers(buffers: WeatheredBuffers, recipe: schema_Recipe) -> None:
         assert bool(torch.isfinite(buffers.depth_m).all()) and bool((buffers.depth_m >= 0).all())
 
 
-def check_view(view: WeatheredView, scene: Scene, recipe: schema_Recipe) -> None:
+def check_view(view: WeatheredView, scene: Scene, recipe: Recipe) -> None:
     """Images of one size; depth finite and >= 0; masks of 0 and 255 that agree with the classes."""
     size = (view.camera.height, view.camera.width)
     assert view.rgb.dtype == np.uint8 and view.rgb.shape == (*size, 3)

@@ -21,14 +21,14 @@ from augment.cameras import Camera
 from augment.errors import OutputError
 from augment.jobs.block_worker import WorkSetup
 from augment.jobs.generate import GenerateJob
-from augment.jobs.journal import Journal
 from augment.jobs.layout import STATE_FOLDER
 from augment.jobs.manifest import read_finished
+from augment.jobs.progress_log import ProgressLog
 from augment.jobs.store import open_store
 from augment.scene import Scene
 from recipes.job import Job, JobRecipes, JobScene
 from recipes.parse import parse_recipe
-from recipes.schema import schema_Recipe
+from recipes.schema import Recipe
 
 NOTES = "CLIMATEGS_TEST_NOTES"
 CHAOS = "CLIMATEGS_TEST_CHAOS"  # how likely a worker dies at an image
@@ -75,7 +75,7 @@ def make_job(
     return GenerateJob(recipes or make_recipes(), entries, setup, executor=executor, **options)
 
 
-def image_name(scene: Scene, camera: Camera, recipe: schema_Recipe) -> str:
+def image_name(scene: Scene, camera: Camera, recipe: Recipe) -> str:
     frame = round((camera.timestamp_ns - 10**18) / 1e8)
     return f"{scene.name}/{recipe.name}-{recipe.variant:03d}/{frame}/{camera.name}"
 
@@ -90,27 +90,25 @@ def note(kind: str, name: str) -> None:
             os.close(descriptor)
 
 
-def noting_render(scene: Scene, camera: Camera, recipe: schema_Recipe, *, backend: str) -> FakeView:
+def noting_render(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str) -> FakeView:
     note("R", image_name(scene, camera, recipe))
     return fake_render(scene, camera, recipe, backend=backend)
 
 
-def slow_noting_render(
-    scene: Scene, camera: Camera, recipe: schema_Recipe, *, backend: str
-) -> FakeView:
+def slow_noting_render(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str) -> FakeView:
     time.sleep(0.02)
     return noting_render(scene, camera, recipe, backend=backend)
 
 
 def very_slow_noting_render(
-    scene: Scene, camera: Camera, recipe: schema_Recipe, *, backend: str
+    scene: Scene, camera: Camera, recipe: Recipe, *, backend: str
 ) -> FakeView:
     """So slow that a job is still at it when a busy machine comes to stop it."""
     time.sleep(0.1)
     return noting_render(scene, camera, recipe, backend=backend)
 
 
-def dying_render(scene: Scene, camera: Camera, recipe: schema_Recipe, *, backend: str) -> FakeView:
+def dying_render(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str) -> FakeView:
     """Kills its process at one image: frame 1 of the front camera of scene a in fog."""
     name = image_name(scene, camera, recipe)
     note("R", name)
@@ -119,9 +117,7 @@ def dying_render(scene: Scene, camera: Camera, recipe: schema_Recipe, *, backend
     return fake_render(scene, camera, recipe, backend=backend)
 
 
-def raising_render(
-    scene: Scene, camera: Camera, recipe: schema_Recipe, *, backend: str
-) -> FakeView:
+def raising_render(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str) -> FakeView:
     """As an input frame that is damaged."""
     name = image_name(scene, camera, recipe)
     note("R", name)
@@ -166,17 +162,17 @@ def read_notes(path: Path) -> tuple[list[str], Counter[str]]:
 
 def _note_entries() -> None:
     """Wrap Journal.append once, to note what it was told of and has returned from."""
-    append = Journal.append
+    append = ProgressLog.append
     if getattr(append, "notes", False):
         return
 
-    def noted(journal: Journal, row: dict) -> None:
-        append(journal, row)
+    def noted(progress_log: ProgressLog, row: dict) -> None:
+        append(progress_log, row)
         if row["status"] == "ok":
             note("A", f"{row['scene']}/{row['variant']}/{row['frame']}/{row['camera']}")
 
     noted.notes = True
-    Journal.append = noted
+    ProgressLog.append = noted
 
 
 if os.environ.get(NOTES):  # a worker of a process that takes notes

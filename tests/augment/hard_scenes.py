@@ -19,7 +19,7 @@ from augment.render.constants import ALPHA_MIN
 from augment.render.sh import SH_C0
 from augment.scene import Gaussians, PosedGaussians, SplatShading
 
-LEAST_SCALE, MOST_SCALE = 1e-8, 1e4  # metres
+MIN_SCALE, MAX_SCALE = 1e-8, 1e4  # metres
 EDGE = np.float32(ALPHA_MIN)
 # Opacities at which something begins or ends: nothing, the least that is drawn and its neighbours,
 # the stop of one splat, all.
@@ -75,7 +75,7 @@ def hard_gaussians(
     means = np.stack([x, y, z], 1) @ rotation + centre
     span = 0.3 * max(camera.width, camera.height) / camera.fx * z
     scales = span[:, None] * np.exp(rng.uniform(math.log(0.02), 0, (count, 3)))
-    low, high = math.log(LEAST_SCALE), math.log(MOST_SCALE)
+    low, high = math.log(MIN_SCALE), math.log(MAX_SCALE)
     if kind == "round":
         scales = np.exp(rng.uniform(low, high, (count, 1))).repeat(3, 1)
     elif kind == "mixed":

@@ -12,7 +12,7 @@ from batch_scenes import FakeView, fake_render
 
 from augment.cameras import Camera
 from augment.scene import Scene
-from recipes.schema import schema_Recipe
+from recipes.schema import Recipe
 
 
 @dataclass
@@ -30,7 +30,7 @@ class Gpu:
     notes: list[tuple[str, int]] = field(default_factory=list)
     count: int = 0
 
-    def __call__(self, scene: Scene, camera: Camera, recipe: schema_Recipe, *, backend: str):
+    def __call__(self, scene: Scene, camera: Camera, recipe: Recipe, *, backend: str):
         number, self.count = self.count, self.count + 1
         self.began(number)
 
@@ -47,5 +47,5 @@ class Gpu:
         self.notes.append(("await", number))
 
 
-def begin_fake(scene: Scene, camera: Camera, recipe: schema_Recipe, *, backend: str) -> FakePending:
+def begin_fake(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str) -> FakePending:
     return FakePending(lambda: fake_render(scene, camera, recipe, backend=backend))

@@ -14,7 +14,7 @@ from augment.scene import Actor, Gaussians, Scene, Track
 from augment.semantics import SemanticClass
 from augment.sky import ConstantSky, CubemapSky
 from augment.views import render_buffers, render_view
-from recipes.schema import Output, Render, Smog, Weather, schema_Recipe
+from recipes.schema import Output, Recipe, Render, Smog, Weather
 
 C0 = 0.28209479177387814  # Y_00
 SKY = (0.3, 0.5, 0.9)
@@ -76,7 +76,7 @@ BUILDING, CAR, NOTHING = (10, 4), (24, 20), (24, 60)  # row, column
 
 
 def view_of(scene: Scene, smog: Smog | None = None, **output):
-    recipe = schema_Recipe(weather=Weather(smog=smog), output=Output(**output))
+    recipe = Recipe(weather=Weather(smog=smog), output=Output(**output))
     return render_view(scene, camera(), recipe)
 
 
@@ -161,7 +161,7 @@ def test_thin_haze_shows_the_zenith_and_hides_the_horizon(scene):
 
 
 def test_both_backends_show_the_same_picture(scene):
-    recipe = schema_Recipe(weather=Weather(smog=Smog(visibility_m=30)))
+    recipe = Recipe(weather=Weather(smog=Smog(visibility_m=30)))
     plan = make_plan(recipe, scene)
     fast = render_buffers(scene, camera(), plan, backend="cpu")
     slow = render_buffers(scene, camera(), plan, backend="reference")
@@ -172,7 +172,7 @@ def test_both_backends_show_the_same_picture(scene):
 
 
 def test_the_recipe_scales_the_image(scene):
-    view = render_view(scene, camera(), schema_Recipe(render=Render(scale=0.5)))
+    view = render_view(scene, camera(), Recipe(render=Render(scale=0.5)))
     assert view.rgb.shape == (24, 32, 3)
     assert view.camera.fx == 30.0
 
@@ -182,7 +182,7 @@ def test_a_camera_exposes_what_the_weather_left(scene):
     matrix = torch.tensor([[0.5, 0.0, 0.0, 0.1], [0.0, 0.8, 0.1, 0.0], [0.0, 0.0, 0.6, 0.2]])
     mapped = dataclasses.replace(scene, color_maps={"front": matrix})
     for smog in (None, Smog(visibility_m=30)):
-        recipe = schema_Recipe(weather=Weather(smog=smog))
+        recipe = Recipe(weather=Weather(smog=smog))
         plain = render_buffers(scene, camera(), make_plan(recipe, scene))
         expected = plain.rgb @ matrix[:, :3].T + matrix[:, 3]
         plan = make_plan(recipe, mapped)
@@ -200,7 +200,7 @@ def test_without_a_map_of_its_own_a_camera_keeps_every_bit(scene):
     dark = torch.eye(3, 4) * 0.5
     others = dataclasses.replace(scene, color_maps={"rear": dark, "front": torch.eye(3, 4)})
     assert np.array_equal(view_of(others).rgb, clean.rgb)
-    neutral = schema_Recipe(render=Render(exposure="neutral"))
+    neutral = Recipe(render=Render(exposure="neutral"))
     mapped = dataclasses.replace(scene, color_maps={"front": dark})
     assert np.array_equal(render_view(mapped, camera(), neutral).rgb, clean.rgb)
     assert not np.array_equal(view_of(mapped).rgb, clean.rgb)

@@ -102,9 +102,9 @@ def test_half_a_line_in_a_journal_is_not_believed(tmp_path: Path) -> None:
     (out / "manifest.parquet").unlink()
     lines = [{name: rows[0][name] for name in IDENTITY}, *rows]
     text = "".join(json.dumps(line) + "\n" for line in lines)
-    journal = out / ".climategs" / "journal" / "street" / "clear-000.jsonl"
-    journal.parent.mkdir(parents=True)
-    journal.write_text(text[:-20])
+    progress_log = out / ".climategs" / "journal" / "street" / "clear-000.jsonl"
+    progress_log.parent.mkdir(parents=True)
+    progress_log.write_text(text[:-20])
     assert run(RenderJob("fake:street", recipes, out)).skipped == 3
     assert tree_digest(out) == tree_digest(tmp_path / "whole")
 
@@ -138,9 +138,9 @@ def test_another_recipe_under_the_same_name_is_refused(tmp_path: Path, ended: bo
     if not ended:  # as a kill leaves it: a journal and no manifest
         identity = read_manifest(tmp_path).to_pylist()[0]
         (tmp_path / "manifest.parquet").unlink()
-        journal = tmp_path / ".climategs" / "journal" / "street" / "fog-000.jsonl"
-        journal.parent.mkdir(parents=True)
-        journal.write_text(json.dumps({name: identity[name] for name in IDENTITY}) + "\n")
+        progress_log = tmp_path / ".climategs" / "journal" / "street" / "fog-000.jsonl"
+        progress_log.parent.mkdir(parents=True)
+        progress_log.write_text(json.dumps({name: identity[name] for name in IDENTITY}) + "\n")
     before = tree_digest(tmp_path)
     changed = make_recipe(depth="none")
     pattern = f"fog-000 already holds.*recipe hash there '{make_recipe().hash}'.*overwrite"

@@ -27,7 +27,7 @@ from augment.jobs.layout import box_weather_files
 from augment.jobs.manifest import read_manifest
 from augment.jobs.render_job import JobResult, RenderJob, run_job
 from augment.jobs.view_files import TABLES, visibility
-from recipes.schema import Smog, Weather, schema_Recipe
+from recipes.schema import Recipe, Smog, Weather
 from recipes.weather import Flood, Snow
 
 FOLDER = Path("street") / "fog-000"
@@ -202,7 +202,7 @@ def test_visibility_is_what_all_effects_leave() -> None:
 
 
 def test_visibility_of_a_variant_with_all_effects(tmp_path: Path) -> None:
-    recipe: schema_Recipe = make_recipe(flood=Flood(level_m=0.3), snow=Snow(depth_m=0))
+    recipe: Recipe = make_recipe(flood=Flood(level_m=0.3), snow=Snow(depth_m=0))
     run(RenderJob("fake:street", [recipe], tmp_path, frames=[3]))
     files = box_weather_files(recipe)
     tables = {kind: TABLES[kind].read(tmp_path / FOLDER / files[kind]) for kind in files}

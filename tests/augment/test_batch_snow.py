@@ -29,7 +29,7 @@ from augment.errors import OutputError
 from augment.jobs.box_tables import SNOW_TABLE, BoxSnow, read_snow
 from augment.jobs.manifest import read_manifest
 from augment.jobs.render_job import JobResult, RenderJob, run_job
-from recipes.schema import schema_Recipe
+from recipes.schema import Recipe
 from recipes.weather import Flood, Snow
 
 # Snow of no depth is not laid, so no place is looked for; the stand-in draws some all the same.
@@ -44,7 +44,7 @@ def run(job: RenderJob, renderer=fake_render, **options) -> JobResult:
 
 
 @pytest.fixture(scope="module")
-def recipe() -> schema_Recipe:
+def recipe() -> Recipe:
     """Snow and a flood: neither may get into the other's files."""
     return make_recipe(snow=SNOW, flood=FLOOD)
 
@@ -57,13 +57,13 @@ def whole(recipe, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def view_of(row: dict, recipe: schema_Recipe) -> FakeView:
+def view_of(row: dict, recipe: Recipe) -> FakeView:
     scene = open_fake("fake:street")
     camera = scene.frame(row["frame"]).cameras[row["camera"]]
     return fake_render(scene, camera, recipe, backend="auto")
 
 
-def test_masks_hold_what_was_rendered(whole: Path, recipe: schema_Recipe) -> None:
+def test_masks_hold_what_was_rendered(whole: Path, recipe: Recipe) -> None:
     rows = read_manifest(whole).to_pylist()
     assert {row["snow_path"] for row in rows} == {
         f"street/fog-000/snow/{camera}/00000{frame}.png"
@@ -77,7 +77,7 @@ def test_masks_hold_what_was_rendered(whole: Path, recipe: schema_Recipe) -> Non
         assert (row["snow_depth_m"], row["snow_coverage"]) == (0.0, 1.0)
 
 
-def test_boxes_have_their_numbers_beside_the_labels(whole: Path, recipe: schema_Recipe) -> None:
+def test_boxes_have_their_numbers_beside_the_labels(whole: Path, recipe: Recipe) -> None:
     path = whole / FOLDER / "labels" / "snow.parquet"
     table = pq.read_table(path)
     assert table.column_names == [
@@ -215,7 +215,7 @@ def test_folders_from_before_there_was_snow_are_gone_on_with(tmp_path: Path) -> 
     assert tree_digest(old) == tree_digest(whole)
 
 
-def test_samples_hold_the_snow(whole: Path, recipe: schema_Recipe) -> None:
+def test_samples_hold_the_snow(whole: Path, recipe: Recipe) -> None:
     files = WeatherDataset(whole, cameras=["front"], frames=[2])
     (row,) = files.table.to_pylist()
     sample, view = files[0], view_of(row, recipe)

@@ -27,7 +27,7 @@ from augment.effects.snow.placement import PlacementSettings
 from augment.errors import OutputError, SceneError
 from augment.jobs.prepare import snow_to_lay, store_beds
 from augment.jobs.render_job import JobResult, RenderJob, run_job
-from recipes.schema import schema_Recipe
+from recipes.schema import Recipe
 from recipes.weather import Snow
 
 FILES = ("*.png", "*.jsonl", "*.yaml", "*.json", "*.parquet")
@@ -50,11 +50,11 @@ class Placements(list):
 @pytest.fixture
 def placements(monkeypatch: pytest.MonkeyPatch) -> Placements:
     found = Placements()
-    monkeypatch.setattr(beds, "place_snow_bed", found)
+    monkeypatch.setattr(beds, "place_snow_support", found)
     return found
 
 
-def snowy(depth_m: float = 0.1, variant: int = 0, **snow) -> schema_Recipe:
+def snowy(depth_m: float = 0.1, variant: int = 0, **snow) -> Recipe:
     return make_recipe(variant=variant, snow=Snow(depth_m=depth_m, **snow))
 
 

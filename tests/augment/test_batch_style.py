@@ -32,7 +32,7 @@ from augment.jobs.render_job import JobResult, RenderJob, portable_recipe, run_j
 from recipes.errors import RecipeError
 from recipes.files import with_digest
 from recipes.load import load_recipe
-from recipes.schema import schema_Recipe
+from recipes.schema import Recipe
 from recipes.weather import Style
 
 
@@ -57,7 +57,7 @@ def searches(monkeypatch: pytest.MonkeyPatch) -> Searches:
     return found
 
 
-def styled(strength: float = 1.0, variant: int = 0, **style) -> schema_Recipe:
+def styled(strength: float = 1.0, variant: int = 0, **style) -> Recipe:
     source = {} if "image" in style else {"preset": "dusk"}
     return make_recipe(variant=variant, style=Style(strength=strength, **source, **style))
 
@@ -124,7 +124,7 @@ def test_a_camera_path_has_maps_of_its_own_however_many_styles(searches, tmp_pat
     scene, recorded = open_fake("fake:street"), make_frame(1)
     cameras = {"front": make_camera("front", recorded.timestamp_ns, 0.5)}
     path = [Frame(1, recorded.timestamp_ns, recorded.world_from_ego, cameras)]
-    count = scene_maps.MOST_REMEMBERED + 3
+    count = scene_maps.MAX_REMEMBERED + 3
     recipes = [styled(0.1 * (k + 1), k) for k in range(count)]
     load = {"scene_loader": lambda _uri: scene}
     run(RenderJob("fake:street", recipes, tmp_path / "path", camera_path=path), **load)

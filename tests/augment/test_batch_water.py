@@ -32,7 +32,7 @@ from augment.effects.flood.flood import hidden_pixels, submerged_fraction
 from augment.jobs.box_tables import WATER_TABLE, BoxWater, read_water
 from augment.jobs.manifest import LATER, read_manifest
 from augment.jobs.render_job import JobResult, RenderJob, run_job
-from recipes.schema import schema_Recipe
+from recipes.schema import Recipe
 from recipes.weather import Flood
 
 FLOOD = Flood(level_m=0.3)
@@ -45,7 +45,7 @@ def run(job: RenderJob, renderer=fake_render, **options) -> JobResult:
 
 
 @pytest.fixture(scope="module")
-def recipe() -> schema_Recipe:
+def recipe() -> Recipe:
     return make_recipe(flood=FLOOD)
 
 
@@ -57,7 +57,7 @@ def whole(recipe, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_masks_hold_what_was_rendered(whole: Path, recipe: schema_Recipe) -> None:
+def test_masks_hold_what_was_rendered(whole: Path, recipe: Recipe) -> None:
     scene = open_fake("fake:street")
     rows = read_manifest(whole).to_pylist()
     assert {row["water_path"] for row in rows} == {
@@ -74,7 +74,7 @@ def test_masks_hold_what_was_rendered(whole: Path, recipe: schema_Recipe) -> Non
     assert {row["surface"] for row in rows} == {"solid"}
 
 
-def test_boxes_have_their_numbers_beside_the_labels(whole: Path, recipe: schema_Recipe) -> None:
+def test_boxes_have_their_numbers_beside_the_labels(whole: Path, recipe: Recipe) -> None:
     """Read with any Parquet reader, a row per frame, camera and box."""
     path = whole / FOLDER / "labels" / "water.parquet"
     rows = pq.read_table(path).to_pylist()
@@ -150,7 +150,7 @@ def test_without_labels_there_is_only_the_mask(tmp_path: Path, uri: str, output:
     assert run(again, must_not_render).skipped == 8
 
 
-def test_a_camera_path_has_them_where_it_has_labels(tmp_path: Path, recipe: schema_Recipe) -> None:
+def test_a_camera_path_has_them_where_it_has_labels(tmp_path: Path, recipe: Recipe) -> None:
     recorded = make_frame(1)
     path = [
         Frame(1, recorded.timestamp_ns, recorded.world_from_ego,
@@ -334,9 +334,9 @@ def test_journals_of_older_versions_are_gone_on_with(tmp_path: Path) -> None:
     identity = ("source", "recipe_hash", "trajectory", "version", "backend")
     lines = [{name: rows[0][name] for name in identity}]
     lines += [{name: row[name] for name in row if name not in LATER} for row in rows]
-    journal = out / ".climategs" / "journal" / "street" / "clear-000.jsonl"
-    journal.parent.mkdir(parents=True)
-    journal.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    progress_log = out / ".climategs" / "journal" / "street" / "clear-000.jsonl"
+    progress_log.parent.mkdir(parents=True)
+    progress_log.write_text("".join(json.dumps(line) + "\n" for line in lines))
     assert run(RenderJob("fake:street", [make_recipe("clear")], out)).skipped == 4
     assert digest_without_2d(out) == digest_without_2d(tmp_path / "whole")
     assert rows_without_2d(out) == rows_without_2d(tmp_path / "whole")

@@ -41,7 +41,7 @@ def test_a_dying_worker_costs_one_image_and_workers_change_no_file(
     start_fork_server("batch_scenes", "augment.jobs.pools")
     monkeypatch.setattr("multiprocessing.get_context", quick_context)
     monkeypatch.setattr(
-        "augment.effects.snow.support.place_snow_bed", lambda *_, **__: make_bed(3.0)
+        "augment.effects.snow.support.place_snow_support", lambda *_, **__: make_bed(3.0)
     )
     monkeypatch.setattr("augment.effects.style.style._find_maps", lambda *_: make_maps(0.4))
     style = Style(preset="dusk")

@@ -24,14 +24,14 @@ from augment.labels import Boxes
 from augment.scene import Gaussians, Scene
 from augment.semantics import SemanticClass
 from augment.views import render_view
-from recipes.schema import Output, Render, Weather, schema_Recipe
+from recipes.schema import Output, Recipe, Render, Weather
 from recipes.weather import Snow
 
 PARKED = np.array([14.0, 0.0, 0.75])
 SIZE = np.array([4.0, 1.8, 1.5])
 STEP_M = 0.06  # between splats
 ORIGIN = np.array([1000.0, -2000.0, 50.0])
-RECIPE = schema_Recipe(name="clear", output=Output(semantic=True, instance=True))
+RECIPE = Recipe(name="clear", output=Output(semantic=True, instance=True))
 FOLDER = Path("sheets") / "clear-000"
 
 
@@ -128,9 +128,7 @@ def run(out: Path, opened=open_street, **options) -> JobResult:
     return run_job(job, scene_loader=opened, progress=False)
 
 
-def measure(
-    scene: Scene, camera: Camera, recipe: schema_Recipe = RECIPE
-) -> tuple[Box2d, np.ndarray]:
+def measure(scene: Scene, camera: Camera, recipe: Recipe = RECIPE) -> tuple[Box2d, np.ndarray]:
     """What is measured of frame 0's boxes, and the instance image as it is written."""
     boxes, view = scene.boxes(0), render_view(scene, camera, recipe, backend="cpu")
     instances = instances_of(scene)
@@ -156,7 +154,7 @@ def seen_by_rays(camera: Camera, hidden_to_y: float) -> tuple[np.ndarray, np.nda
 def test_fractions_and_bounds_are_those_of_rays(hidden_to_y: float, instance: bool) -> None:
     scene = street(hidden_to_y=hidden_to_y)
     camera = scene.frames[0].cameras["ahead"]
-    recipe = schema_Recipe(output=Output(instance=instance, depth="median"))
+    recipe = Recipe(output=Output(instance=instance, depth="median"))
     boxes, view = scene.boxes(0), render_view(scene, camera, recipe, backend="cpu")
     numbers = measure_2d(boxes, instances_of(scene), ORIGIN, camera, view.surface)
     whole, left = seen_by_rays(camera, hidden_to_y)
@@ -202,7 +200,7 @@ def test_parked_cars_have_an_instance_and_the_road_in_their_box_has_none() -> No
     np.testing.assert_array_equal(image == 1, plain.instance == 1)  # as it was rendered
     assert not image[np.isin(plain.semantic, [SemanticClass.ROAD, SemanticClass.SKY])].any()
     # Nothing that one image shows depends on what else is written.
-    other = schema_Recipe(output=Output(semantic=False, instance=True, depth="none", labels=False))
+    other = Recipe(output=Output(semantic=False, instance=True, depth="none", labels=False))
     instance_only = render_view(scene, camera, other, backend="cpu")
     assert instance_only.semantic is None and instance_only.depth_m is None
 
@@ -231,7 +229,7 @@ def test_snow_on_a_parked_car_is_the_car(surface: str) -> None:
     camera = scene.frames[0].cameras["ahead"]
     clear, bare = measure(scene, camera)
     output = Output(semantic=True, instance=True, surface=surface)
-    snowy = schema_Recipe(weather=Weather(snow=Snow(depth_m=0.3)), output=output)
+    snowy = Recipe(weather=Weather(snow=Snow(depth_m=0.3)), output=output)
     numbers, image = measure(scene, camera, snowy)
     assert numbers.visible_fraction[0] == pytest.approx(clear.visible_fraction[0], abs=0.05)
     covered = render_view(scene, camera, snowy, backend="cpu").snow == 255
@@ -359,7 +357,7 @@ def test_parked_cars_of_a_recorded_drive_have_an_instance(shared_dir) -> None:
         pytest.skip(f"no PandaSet sequence at {root}")
     query = "frames=10:12&voxel_m=0.15&image_scale=0.25&sky_size=128"
     scene = open_scene(f"pandaset:{root}?{query}")
-    recipe = schema_Recipe(output=Output(instance=True), render=Render(scale=0.5))
+    recipe = Recipe(output=Output(instance=True), render=Render(scale=0.5))
     numbers = instances_of(scene)
     cars = 0
     for sample in SceneDataset(scene, recipe, cameras=["front_camera", "left_camera"]):

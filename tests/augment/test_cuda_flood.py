@@ -11,7 +11,12 @@ import torch
 from augment.cameras import Camera
 from augment.effects.flood import flood_view
 from augment.effects.flood.flood import FloodMedium
-from augment.effects.flood.flood_view import FloodedImage, Painter, both_sides, render_flooded
+from augment.effects.flood.flood_view import (
+    FloodedImage,
+    LayerRenderer,
+    merge_depths,
+    render_flooded,
+)
 from augment.effects.flood.water_plane import (
     ANCHOR,
     BEGIN,
@@ -122,7 +127,7 @@ def flooded(
     faces = torch.rand(6, 4, 4, 3, generator=torch.Generator().manual_seed(3))
     smogs = (None, smog) if deferred else (smog, None)
     seen = parts() if hidden_by is None else [PosedGaussians(hidden_by)]
-    painter = Painter(seen, CubemapSky(faces), RasterSettings(), *smogs, backend)
+    painter = LayerRenderer(seen, CubemapSky(faces), RasterSettings(), *smogs, backend)
     image = render_flooded(painter, view, water, frozenset({EXPECTED_DEPTH, SPLAT_IDS}))
     assert image is not None
     return image
@@ -210,8 +215,8 @@ def test_layers_are_joined_as_defined(window):
     front = layer(21, 33)
     behind = layer(window.bottom - window.top, window.right - window.left)
     names = frozenset({RGB, ALPHA, EXPECTED_DEPTH, MEDIAN_DEPTH, SPLAT_IDS})
-    expected = both_sides(front, behind, window, names, backend="reference")
-    joined = both_sides(front, behind, window, names, backend="cuda")
+    expected = merge_depths(front, behind, window, names, backend="reference")
+    joined = merge_depths(front, behind, window, names, backend="cuda")
     for name in names - {RGB}:
         torch.testing.assert_close(getattr(joined, name).cpu(), getattr(expected, name))
 

@@ -21,13 +21,13 @@ from augment.labels import Boxes
 from augment.render.buffers import RenderOutput
 from augment.render.composite import composite_sky, map_colors, quantise
 from augment.render.cuda.runtime import upload
-from augment.render.rasterize import share_remainder
+from augment.render.rasterize import renormalise_alpha
 from augment.scene import Scene
 from augment.semantics import SemanticClass
 from augment.sky import ConstantSky, CubemapSky, LatLongSky, Sky
-from augment.timing import lap, stopwatch
+from augment.timing import stopwatch, timed
 from augment.views import WeatheredView, begin_view, render_view
-from recipes.schema import Output, Render, Smog, Weather, schema_Recipe
+from recipes.schema import Output, Recipe, Render, Smog, Weather
 from recipes.weather import Snow, Style
 from tests import snow_scenes
 from tests.augment import pretend_gpu
@@ -130,8 +130,8 @@ def test_colour_maps(away):
 @pytest.mark.parametrize("without", [(), ("rgb",), ("snow",)], ids=["all", "no colour", "no snow"])
 def test_finished_pixels_become_opaque(away, without):
     seen = dataclasses.replace(images(), **dict.fromkeys(without))
-    expected = share_remainder(seen, 0.3, backend="reference")
-    got = share_remainder(on_gpu(seen), 0.3, backend="cuda")
+    expected = renormalise_alpha(seen, 0.3, backend="reference")
+    got = renormalise_alpha(on_gpu(seen), 0.3, backend="cuda")
     for name in {"rgb", "alpha", "snow"} - set(without):
         value = getattr(got, name).cpu()
         torch.testing.assert_close(value, getattr(expected, name), atol=1e-6, rtol=0)
@@ -178,31 +178,31 @@ def scene() -> Scene:
     )
 
 
-EVERYTHING = schema_Recipe(output=Output(semantic=True, instance=True))
+EVERYTHING = Recipe(output=Output(semantic=True, instance=True))
 SNOW = Snow(depth_m=0.1, cell_m=1.0, tracks="never", shading="per_splat")
 LOW = Smog(visibility_m=20, scale_height_m=9.0, model="deferred")
 RECIPES = {
-    "smog, style on the picture": schema_Recipe(
+    "smog, style on the picture": Recipe(
         weather=Weather(smog=Smog(visibility_m=20)),
         style=Style(preset="dusk", applied_to="picture"),
         output=Output(depth="none"),
     ),
-    "layered smog on buffers, early stop": schema_Recipe(
+    "layered smog on buffers, early stop": Recipe(
         weather=Weather(smog=LOW),
         render=Render(transmittance_stop=0.2),
         output=Output(depth="expected", instance=True),
     ),
-    "snow, bare images": schema_Recipe(
+    "snow, bare images": Recipe(
         weather=Weather(snow=SNOW), output=Output(semantic=True, surface="scene")
     ),
 }
 
 
-def scaled(recipe: schema_Recipe) -> schema_Recipe:
+def scaled(recipe: Recipe) -> Recipe:
     return recipe.model_copy(update={"render": recipe.render.model_copy(update={"scale": 0.1})})
 
 
-def view_of(scene: Scene, recipe: schema_Recipe, backend: str) -> WeatheredView:
+def view_of(scene: Scene, recipe: Recipe, backend: str) -> WeatheredView:
     return render_view(scene, scene.frames[0].cameras["ahead"], scaled(recipe), backend=backend)
 
 
@@ -260,7 +260,7 @@ def test_a_view_is_begun_without_waiting_for_it(scene, away, monkeypatch):
 
 
 def test_two_views_under_way_do_not_mix(scene, away):
-    recipe = scaled(schema_Recipe(output=Output(depth="none", labels=False)))
+    recipe = scaled(Recipe(output=Output(depth="none", labels=False)))
     cameras = [frame.cameras["ahead"] for frame in scene.frames]
     begun = [begin_view(scene, camera, recipe, backend="cuda") for camera in cameras]
     alone = [render_view(scene, camera, recipe, backend="cpu") for camera in cameras]
@@ -273,9 +273,9 @@ def test_laps_wait_for_the_gpu_only_while_somebody_listens(monkeypatch):
     waits = []
     monkeypatch.setattr(torch.cuda, "is_initialized", lambda: True)
     monkeypatch.setattr(torch.cuda, "synchronize", lambda: waits.append(None))
-    with lap("unheard"):
+    with timed("unheard"):
         pass
     assert not waits
-    with stopwatch(), lap("heard"):
+    with stopwatch(), timed("heard"):
         pass
     assert len(waits) == 2  # where it begins and where it ends

@@ -29,7 +29,7 @@ from augment.render.constants import RasterSettings
 from augment.render.cuda import driver as cuda_blend
 from augment.render.cuda import runtime as gpu
 from augment.render.cuda.driver import blend, list_tiles, rasterize_cuda
-from augment.render.cuda.splats import HIDDEN, TILE, CudaSplats, CudaTiles, StageClock
+from augment.render.cuda.splats import HIDDEN, TILE, CudaSplats, CudaTiles, GpuStageTimer
 from augment.render.layout import UNCUT, HeightClip
 from augment.render.rasterize import rasterize
 from augment.render.reference import rasterize_reference
@@ -431,7 +431,7 @@ def test_everything_lies_on_the_gpu(monkeypatch):
 
 
 def test_a_clock_is_told_of_the_stages():
-    clock = StageClock()
+    clock = GpuStageTimer()
     parts = [PosedGaussians(stack(one_gaussian(), one_gaussian((-3.0, 0, 0))))]
     rasterize_cuda(parts, camera_ahead(16, 16, 8.0), COLOR, DEFAULT, None, clock=clock)
     assert clock.counts == {"visible": 1, "pairs": 1}

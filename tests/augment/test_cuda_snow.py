@@ -11,7 +11,7 @@ import torch
 from augment.cameras import Camera
 from augment.effects.snow import placement
 from augment.effects.snow.height_map import Views, draw_views, plain_gaussians
-from augment.effects.snow.placement import PlacementSettings, place_snow_bed
+from augment.effects.snow.placement import PlacementSettings, place_snow_support
 from augment.render.cuda import runtime as gpu
 from augment.scene import PosedGaussians
 from tests.augment.pretend_gpu import AwayTensor, pretended_gpu
@@ -78,10 +78,10 @@ def test_a_bed_placed_on_the_gpu_is_the_cpus(monkeypatch):
     cameras = [camera.scaled(0.12) for camera in cameras_of(scene)]
     settings = PlacementSettings(cell_m=8.0)
     monkeypatch.setattr(placement, "_SQUARE_CELLS", 16)  # several, which threads work on
-    expected = place_snow_bed(scene, cameras, settings)
+    expected = place_snow_support(scene, cameras, settings)
     assert len(expected.ground) > 5
     with pretended_gpu(monkeypatch):
-        found = place_snow_bed(scene, cameras, settings, backend="cuda")
+        found = place_snow_support(scene, cameras, settings, backend="cuda")
     assert_alike(found.ground, expected.ground)
 
 
@@ -89,8 +89,10 @@ def test_a_bed_placed_on_the_gpu_is_the_cpus(monkeypatch):
 def test_a_larger_bed_with_a_vehicle_is_the_cpus():
     car = box_car(start=(6.0, 0.0))
     scene = drive(sheet((-6.0, 20.0), (-8.0, 8.0)), actors=[car])
-    expected = place_snow_bed(scene, cameras_of(scene), PlacementSettings(cell_m=0.1))
-    found = place_snow_bed(scene, cameras_of(scene), PlacementSettings(cell_m=0.1), backend="cuda")
+    expected = place_snow_support(scene, cameras_of(scene), PlacementSettings(cell_m=0.1))
+    found = place_snow_support(
+        scene, cameras_of(scene), PlacementSettings(cell_m=0.1), backend="cuda"
+    )
     assert found.actors.keys() == expected.actors.keys() == {"car"}
     for a, b in ((found.ground, expected.ground), (found.actors["car"], expected.actors["car"])):
         assert len(a) == pytest.approx(len(b), rel=1e-3)  # cells at a threshold

@@ -14,7 +14,7 @@ from augment.effects.snow import blocks as blocks_module
 from augment.effects.snow import cuda_close, glint_layout
 from augment.effects.snow.blocks import blocks_of
 from augment.effects.snow.cuda_cover import pose_layers
-from augment.effects.snow.kernels import MOST_SPLITS
+from augment.effects.snow.kernels import MAX_SPLITS
 from augment.effects.snow.near_camera import Crystals, Grain, Layer, SnowCover, split_near
 from augment.geometry import rigid
 from augment.render.cuda import runtime as gpu
@@ -165,7 +165,7 @@ def test_no_block_near_the_eye_is_left_out_and_few_others_are_looked_at():
         gone = (near.whole.opacities == 0).numpy()
         parts = near.fine.opacities.shape[0]
         assert (reserved[gone] > 0).all() and reserved[gone].sum() >= parts
-        assert split.total == reserved.sum() <= len(snow) * MOST_SPLITS**2
+        assert split.total == reserved.sum() <= len(snow) * MAX_SPLITS**2
         ends = rows[:, 3] + rows[:, 1] * rows[:, 2] ** 2
         assert (rows[1:, 3] == ends[:-1]).all() and ends[-1] == split.total
 

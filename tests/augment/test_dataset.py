@@ -38,7 +38,7 @@ from augment.effects.flood.flood import hidden_pixels, submerged_fraction
 from augment.errors import BackendUnavailable, OutputError, SceneError
 from augment.jobs.box_tables import WATER_TABLE, BoxWater
 from augment.jobs.render_job import RenderJob, run_job
-from recipes.schema import schema_Recipe
+from recipes.schema import Recipe
 from recipes.weather import Flood
 
 FLOODED = make_recipe("clear", variant=9, flood=Flood(level_m=0.3), surface="first")
@@ -68,7 +68,7 @@ def one_image(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("recipe", RECIPES, ids=["png", "jpg", "no depth", "flood"])
-def test_live_samples_equal_written_ones(written: Path, recipe: schema_Recipe) -> None:
+def test_live_samples_equal_written_ones(written: Path, recipe: Recipe) -> None:
     scene = open_fake("fake:street")
     live = SceneDataset(scene, recipe, renderer=fake_render)
     files = WeatherDataset(written, variants=[f"{recipe.name}-{recipe.variant:03d}"])

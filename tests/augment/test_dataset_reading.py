@@ -213,7 +213,7 @@ def test_companions_beyond_the_limit_are_read_again(written: Path, monkeypatch) 
 def test_packed_rows_are_the_manifests(written: Path, monkeypatch) -> None:
     table = pq.read_table(written / MANIFEST)
     for most in (2, 1 << 16):  # numbers packed as such, or by their distinct values
-        monkeypatch.setattr(rows, "_MOST_CODES", most)
+        monkeypatch.setattr(rows, "_MAX_CODES", most)
         packed = Rows.of(table)
         assert same_tables(packed.to_arrow(), table) and len(packed) == 24
         chosen = packed.take(np.array([5, 3, 3]))

@@ -11,7 +11,7 @@ from augment.errors import SceneError
 from augment.geometry import rotmat_from_quat
 from augment.reconstruct.config import DensifyConfig
 from augment.reconstruct.densify import (
-    MOST_COPIES,
+    MAX_COPIES,
     add_noise,
     densify,
     densify_due,
@@ -392,7 +392,7 @@ def test_rounds_are_due_every_so_many_steps_while_splats_are_added() -> None:
 
 
 @pytest.mark.parametrize("opacity", [0.02, 0.3, 0.9, 0.999, 1.0])
-@pytest.mark.parametrize("copies", [1, 2, 7, MOST_COPIES])
+@pytest.mark.parametrize("copies", [1, 2, 7, MAX_COPIES])
 def test_copies_hide_what_the_one_hid(opacity: float, copies: int) -> None:
     """At the centre, and along a line: the two conditions that equation 9 is derived from."""
     share, factor = relocated(np.array([opacity]), np.array([copies]))

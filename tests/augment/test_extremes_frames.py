@@ -17,7 +17,7 @@ from augment.errors import SceneError
 from augment.scene import Actor, Gaussians, Scene, Track, check_gaussians
 from augment.semantics import SemanticClass
 from augment.views import render_view
-from recipes.schema import schema_Recipe
+from recipes.schema import Recipe
 from tests.augment.examples import drawing
 from tests.augment.extremes import (
     PAIRS,
@@ -40,17 +40,15 @@ EVERYTHING = {
 }
 
 
-def weather(depth: str = "expected", **effects) -> schema_Recipe:
+def weather(depth: str = "expected", **effects) -> Recipe:
     style = effects.pop("style", None)
     output = {"depth": depth}
-    return schema_Recipe.model_validate({"weather": effects, "style": style, "output": output})
+    return Recipe.model_validate({"weather": effects, "style": style, "output": output})
 
 
 @drawing(24)
 @given(places(), cameras(levels_m=(0.2,)), recipes())
-def test_any_scene_from_anywhere_in_any_weather(
-    place: Place, camera: Camera, recipe: schema_Recipe
-):
+def test_any_scene_from_anywhere_in_any_weather(place: Place, camera: Camera, recipe: Recipe):
     rendered(place.scene(), camera, recipe)
 
 
@@ -64,12 +62,12 @@ def test_every_pair_of_effects(pair: frozenset[str], data: st.DataObject):
 
 @drawing(8)
 @given(cameras(levels_m=(0.2,)), recipes(frozenset({"flood"})))
-def test_the_eye_at_below_and_above_the_water(camera: Camera, recipe: schema_Recipe):
+def test_the_eye_at_below_and_above_the_water(camera: Camera, recipe: Recipe):
     """The eye at the recipe's level, the next number beside it, or a little away from it."""
     data = recipe.model_dump(exclude_none=True)
     data["weather"]["flood"] |= {"level_m": 0.2, "reference": "absolute"}
     view = rendered(
-        Place(nothing(), 3, on_street=True).scene(), camera, schema_Recipe.model_validate(data)
+        Place(nothing(), 3, on_street=True).scene(), camera, Recipe.model_validate(data)
     )
     assert view.water is not None
     if float(camera.centre[2]) <= 0.2:
@@ -131,7 +129,7 @@ def test_actors_that_are_all_gone_leave_the_sky():
     scene = Place(nothing(), 0, on_street=False, actor=actor).scene()
     output = {"depth": "expected", "semantic": True, "instance": True}
     camera = camera_at((0.0, 0.0, 0.0), timestamp_ns=2**40)
-    view = render_view(scene, camera, schema_Recipe.model_validate({"output": output}))
+    view = render_view(scene, camera, Recipe.model_validate({"output": output}))
     assert view.semantic is not None and (view.semantic == SemanticClass.SKY).all()
     assert view.instance is not None and not view.instance.any()
     assert view.depth_m is not None and not view.depth_m.any()

@@ -28,7 +28,7 @@ from augment.effects.snow.support import bed_of
 from augment.plan import make_plan
 from augment.rng import rng_for
 from augment.views import render_buffers, render_view
-from recipes.schema import schema_Recipe
+from recipes.schema import Recipe
 from recipes.weather import Snow
 from tests.augment.examples import drawing
 from tests.augment.extremes import (
@@ -48,7 +48,7 @@ ROUNDING = 4e-6  # of the brightest colour: a dozen roundings of float32
 
 def deviation(place: Place, camera: Camera, smog: dict[str, Any]) -> torch.Tensor:
     """|colour - airlight| of every pixel and channel, float64."""
-    recipe = schema_Recipe.model_validate({"weather": {"smog": smog}, "output": {"depth": "none"}})
+    recipe = Recipe.model_validate({"weather": {"smog": smog}, "output": {"depth": "none"}})
     scene = place.scene()
     rgb = render_buffers(scene, camera, make_plan(recipe, scene)).rgb
     return (rgb.double() - torch.tensor(smog["color"], dtype=torch.float64)).abs()
@@ -107,7 +107,7 @@ def test_higher_water_never_uncovers(place: Place, camera: Camera, levels: list[
             break
         flood = {"level_m": level, "reference": "absolute", "reflection": "sky"}
         data = {"weather": {"flood": flood}, "output": {"depth": "none"}}
-        view = render_view(scene, camera, schema_Recipe.model_validate(data))
+        view = render_view(scene, camera, Recipe.model_validate(data))
         assert view.water is not None
         masks.append(view.water == 255)
     for low, high in itertools.pairwise(masks):
@@ -167,7 +167,7 @@ def test_deeper_snow_comes_nearer_to_a_camera_above_it(shading: str):
     for depth_m in (0.0, 0.05, 0.2, 0.5, 1.0, 5.0):
         snow = {"depth_m": depth_m, "cell_m": 0.2, "shading": shading, "tracks": "never"}
         data = {"weather": {"snow": snow}, "output": {"depth": "median"}}
-        view = render_view(scene, camera, schema_Recipe.model_validate(data))
+        view = render_view(scene, camera, Recipe.model_validate(data))
         assert view.depth_m is not None and (view.depth_m > 0).all()
         if before is not None:
             assert (view.depth_m <= before + 0.01).all()

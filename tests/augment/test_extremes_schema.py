@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from recipes.errors import RecipeError
 from recipes.parse import parse_recipe
-from recipes.schema import schema_Recipe
+from recipes.schema import Recipe
 from recipes.template import FieldSpec, Kind
 from tests.augment.extremes import (
     CELL_M,
@@ -78,7 +78,7 @@ def test_numbers_beyond_their_limits_are_refused_by_name(field: FieldSpec):
     for number in numbers:
         data = recipe_data(field, filled(field, number))
         with pytest.raises(ValidationError, match=field.name):
-            schema_Recipe.model_validate(_tuples(data))
+            Recipe.model_validate(_tuples(data))
         with pytest.raises(RecipeError, match=field.name):
             parse_recipe(_yaml(data), source="beyond.yaml")
 
@@ -108,7 +108,7 @@ def test_each_number_at_its_ends_makes_a_frame_or_is_refused_in_words(field: Fie
     for number in ends_of(field.channel or field):
         data = _tuples(recipe_data(field, filled(field, number)))
         try:
-            recipe = schema_Recipe.model_validate(data)
+            recipe = Recipe.model_validate(data)
         except ValidationError as error:
             # A rule between fields: each number is allowed for itself.
             assert field.accepts(_tuples(filled(field, number)))
@@ -134,7 +134,7 @@ def test_all_numbers_at_their_lowest_and_all_at_their_highest_make_frames():
                 here = here.setdefault(part, {})
             here[name] = filled(field, numbers_of(field.channel or field)[end])
         data["weather"]["snow"]["cell_m"] = CELL_M
-        recipe = schema_Recipe.model_validate(_tuples(data))
+        recipe = Recipe.model_validate(_tuples(data))
         rendered(scene, camera_at((0.0, 0.0, 1.2), pitch_deg=-20, size=(6, 4)), recipe)
 
 
@@ -142,5 +142,5 @@ def test_all_numbers_at_their_lowest_and_all_at_their_highest_make_frames():
 @pytest.mark.parametrize("max_slope_deg", [0.0, 85.0])
 def test_snow_is_placed_at_extreme_settings(cell_m: float, max_slope_deg: float):
     snow = {"depth_m": 0.1, "cell_m": cell_m, "max_slope_deg": max_slope_deg}
-    recipe = schema_Recipe.model_validate({"weather": {"snow": snow}})
+    recipe = Recipe.model_validate({"weather": {"snow": snow}})
     rendered(street(), camera_at((0.0, 0.0, 1.2), pitch_deg=-20), recipe)

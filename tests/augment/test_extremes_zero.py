@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from augment.cameras import Camera
 from augment.views import WeatheredView, render_view
-from recipes.schema import schema_Recipe
+from recipes.schema import Recipe
 from tests.augment.examples import drawing
 from tests.augment.extremes import (
     CELL_M,
@@ -59,13 +59,13 @@ ZEROS: dict[str, st.SearchStrategy[dict[str, Any]]] = {
 }
 
 
-def with_effects(clean: schema_Recipe, effects: dict[str, dict[str, Any]]) -> schema_Recipe:
+def with_effects(clean: Recipe, effects: dict[str, dict[str, Any]]) -> Recipe:
     """The recipe with these effects besides its own."""
     data = clean.model_dump(exclude_none=True)
     for name, effect in effects.items():
         holder = data if name == "style" else data["weather"]
         holder[name] = effect
-    return schema_Recipe.model_validate(data)
+    return Recipe.model_validate(data)
 
 
 def assert_same_bits(view: WeatheredView, clean: WeatheredView) -> None:
@@ -78,7 +78,7 @@ def assert_same_bits(view: WeatheredView, clean: WeatheredView) -> None:
 @drawing(15)
 @given(places(), cameras(), recipes(frozenset()), st.data())
 def test_effects_without_strength_change_no_bit(
-    place: Place, camera: Camera, recipe: schema_Recipe, data: st.DataObject
+    place: Place, camera: Camera, recipe: Recipe, data: st.DataObject
 ):
     scene = place.scene()
     names = data.draw(st.sets(st.sampled_from(sorted(ZEROS)), min_size=1))
@@ -103,7 +103,7 @@ def test_effects_without_strength_change_no_bit_of_another_effect(effect: str, d
 
 @drawing(8)
 @given(cameras(), recipes(frozenset({"smog"})), st.sampled_from(("sky", "mirrored")))
-def test_water_below_everything_changes_no_bit(camera: Camera, recipe: schema_Recipe, tier: str):
+def test_water_below_everything_changes_no_bit(camera: Camera, recipe: Recipe, tier: str):
     scene = Place(nothing(), sky=3, on_street=True).scene()
     flood = {"level_m": -10.0, "reference": "absolute", "reflection": tier}
     flooded = render_view(scene, camera, with_effects(recipe, {"flood": flood}))
@@ -113,9 +113,7 @@ def test_water_below_everything_changes_no_bit(camera: Camera, recipe: schema_Re
 
 @drawing(8)
 @given(places(), recipes(frozenset()), st.sampled_from((0.05, 1.0)))
-def test_water_behind_the_camera_changes_no_bit(
-    place: Place, recipe: schema_Recipe, level_m: float
-):
+def test_water_behind_the_camera_changes_no_bit(place: Place, recipe: Recipe, level_m: float):
     """Above the water and looking up, no ray meets it."""
     camera = camera_at((2.0, 0.0, 1.2), pitch_deg=60, fov_deg=80)
     flood = {"level_m": level_m, "reference": "absolute"}
@@ -132,7 +130,7 @@ def test_waves_without_height_are_still_water(tier: str):
     flat = {"direction_deg": 20.0, "amplitude_m": 0.0, "wavelength_m": 0.5, "steepness": 0.0}
     waves = ({"preset": "still"}, {"preset": "wind", "height": 0.0}, {"components": (flat,)})
     views = [
-        render_view(scene, camera, with_effects(schema_Recipe(), {"flood": {**flood, "waves": w}}))
+        render_view(scene, camera, with_effects(Recipe(), {"flood": {**flood, "waves": w}}))
         for w in waves
     ]
     assert views[0].water is not None and views[0].water.any()
@@ -149,5 +147,5 @@ def test_a_style_and_snow_without_strength_keep_a_recorded_exposure():
     scene = dataclasses.replace(scene, color_maps={"extreme": exposure})
     camera = camera_at((0.0, 0.0, 1.2))
     zero = {"snow": {"depth_m": 0.0}, "style": {"preset": "dusk", "strength": 0.0}}
-    view = render_view(scene, camera, with_effects(schema_Recipe(), zero))
-    assert_same_bits(view, render_view(scene, camera, schema_Recipe()))
+    view = render_view(scene, camera, with_effects(Recipe(), zero))
+    assert_same_bits(view, render_view(scene, camera, Recipe()))

@@ -14,7 +14,7 @@ from augment.ground_heights import Ground
 from augment.render.sh import evaluate_sh
 from augment.scene import Gaussians, Scene
 from augment.sky import ConstantSky
-from recipes.schema import Output, schema_Recipe
+from recipes.schema import Output, Recipe
 from tests.scenes import camera_ahead, random_gaussians
 from tools import bench_flood_mirror
 from tools.bench_flood_error import (
@@ -240,5 +240,5 @@ def test_views_without_water_are_the_clean_ones_to_the_bit(street):
         same = dry_views(street, view_of(street, 0, name))
         assert same == {"looking up": True, "level below everything": True}
     wet = draw(street, view_of(street, 0, "front"), flood_recipe())
-    clean = draw(street, view_of(street, 0, "front"), schema_Recipe(output=Output(depth="none")))
+    clean = draw(street, view_of(street, 0, "front"), Recipe(output=Output(depth="none")))
     assert wet.water.any() and not clean.water.any()

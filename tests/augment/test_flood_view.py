@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from augment.cameras import Camera, Frame
-from augment.effects.flood.flood_view import Painter, render_flooded
+from augment.effects.flood.flood_view import LayerRenderer, render_flooded
 from augment.geometry import rigid
 from augment.ground_heights import Ground
 from augment.labels import Boxes
@@ -19,7 +19,7 @@ from augment.scene import Actor, Gaussians, Scene, Track
 from augment.semantics import SemanticClass
 from augment.sky import ConstantSky, CubemapSky, Sky
 from augment.views import render_buffers, render_view
-from recipes.schema import Output, Smog, Weather, schema_Recipe
+from recipes.schema import Output, Recipe, Smog, Weather
 from recipes.weather import Flood, Wave, Waves
 from tests.scenes import sh_of
 
@@ -96,8 +96,8 @@ def scene() -> Scene:
     return make_scene()
 
 
-def recipe_of(flood: Flood | None, smog: Smog | None = None, **output) -> schema_Recipe:
-    return schema_Recipe(weather=Weather(flood=flood, smog=smog), output=Output(**output))
+def recipe_of(flood: Flood | None, smog: Smog | None = None, **output) -> Recipe:
+    return Recipe(weather=Weather(flood=flood, smog=smog), output=Output(**output))
 
 
 def view_of(scene, flood, view=None, *, smog=None, backend="auto", **output):
@@ -430,7 +430,7 @@ def test_infinite_extinction_shows_water_alone(scene, level_m):
     plan = make_plan(recipe_of(flood(level_m, refraction_index=1.0)), scene)
     medium = dataclasses.replace(plan.flood, extinction_per_m=(np.inf, np.inf, np.inf))
     view = camera()
-    painter = Painter(scene.parts_for(view), scene.sky, plan.settings, None, None, "auto")
+    painter = LayerRenderer(scene.parts_for(view), scene.sky, plan.settings, None, None, "auto")
     got = render_flooded(painter, view, medium, plan.buffers)
     assert got is not None and bool(torch.isfinite(got.rgb).all())
     rgb = quantise(got.rgb)[got.water.numpy()]

@@ -19,7 +19,7 @@ from augment.errors import ClimateGSError
 from augment.jobs.generate import run_generate
 from augment.jobs.ray_pool import _cpus_of_a_gpu
 from augment.scene import Scene
-from recipes.schema import schema_Recipe
+from recipes.schema import Recipe
 
 HERE = Path(__file__).parent
 PATHS = os.pathsep.join([str(HERE), str(HERE.parents[1])])
@@ -55,7 +55,7 @@ def whole(tmp_path_factory) -> dict[str, str]:
 
 
 def dying_once(
-    scene: Scene, camera: Camera, recipe: schema_Recipe, *, backend: str, marker: Path
+    scene: Scene, camera: Camera, recipe: Recipe, *, backend: str, marker: Path
 ) -> FakeView:
     """Kills its process at the second frame, the first time that any process comes to it."""
     if camera.timestamp_ns == scene.frames[1].timestamp_ns:
@@ -103,7 +103,7 @@ def test_interrupt_lets_actors_finish_their_images(whole, tmp_path):
 
 
 def noting_gpus(
-    scene: Scene, camera: Camera, recipe: schema_Recipe, *, backend: str, notes: Path
+    scene: Scene, camera: Camera, recipe: Recipe, *, backend: str, notes: Path
 ) -> FakeView:
     names = ("CUDA_VISIBLE_DEVICES", "NUMBA_NUM_THREADS")
     notes.write_text(" ".join([backend, *(os.environ.get(name, "-") for name in names)]))

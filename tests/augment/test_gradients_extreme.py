@@ -26,7 +26,7 @@ from augment.geometry import rigid
 from augment.reconstruct import kernels as adam
 from augment.reconstruct.config import FitConfig, LossWeights
 from augment.reconstruct.loss import IDENTITY_MAP, ViewLoss, view_loss
-from augment.reconstruct.loss_reference import LEAST_ALPHA, LEAST_SKY, reference_loss
+from augment.reconstruct.loss_reference import MIN_ALPHA, MIN_SKY, reference_loss
 from augment.reconstruct.optimiser import CORRECTIONS, ColorAdam, DenseAdam, splat_rates
 from augment.reconstruct.poses import Knots, part_forces
 from augment.reconstruct.splats import Splats
@@ -124,7 +124,7 @@ def test_of_a_view_of_nothing(kind, backend):
 # ---- reconstruction ------------------------------------------------------------------------------
 
 # Values at which the loss changes its mind, on both sides, and the ends of what a render holds.
-ALPHAS = (0.0, 1e-7, LEAST_ALPHA, LEAST_ALPHA + 1e-6, 0.5, 1 - LEAST_SKY, 1 - 1e-6, 1.0)
+ALPHAS = (0.0, 1e-7, MIN_ALPHA, MIN_ALPHA + 1e-6, 0.5, 1 - MIN_SKY, 1 - 1e-6, 1.0)
 DEPTHS = (0.0, 0.01, 1.0, 1e6)
 COLOURS = (0.0, 1e-40, 0.5, 1.0, 1e4)
 WEIGHTS = LossWeights(d_ssim=0.3, depth=0.7, sky=0.2, surface=0.1)

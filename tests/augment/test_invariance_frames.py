@@ -12,7 +12,7 @@ from augment.render.threads import limit_threads
 from augment.scene import Gaussians, Scene
 from augment.sky import ConstantSky
 from augment.views import render_view
-from recipes.schema import Flood, Output, Smog, Weather, schema_Recipe
+from recipes.schema import Flood, Output, Recipe, Smog, Weather
 from tests.augment.hard_scenes import hard_gaussians, untied, wide_camera
 
 
@@ -30,7 +30,7 @@ def test_weathered_frames_do_not_depend_on_order_and_threads(effect):
     """Through every pass, down to the 8 bits of the picture. (Of snow see test_snow_layer.)"""
     smog = Smog(visibility_m=60.0, scale_height_m=5.0) if effect != "flood" else None
     flood = Flood(level_m=0.8) if effect != "smog" else None
-    recipe = schema_Recipe(weather=Weather(smog=smog, flood=flood), output=Output(depth="median"))
+    recipe = Recipe(weather=Weather(smog=smog, flood=flood), output=Output(depth="median"))
     camera = wide_camera(70.0, (70, 53))
     gaussians = untied(hard_gaussians("plain", camera, 40, seed=2), camera)
     order = torch.randperm(len(gaussians), generator=torch.Generator().manual_seed(0))

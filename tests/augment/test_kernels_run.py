@@ -20,7 +20,7 @@ from augment.render.cpu import driver as cpu
 from augment.scene import Scene
 from augment.sky import CubemapSky
 from augment.views import render_view
-from recipes.schema import Output, Render, Smog, Weather, schema_Recipe
+from recipes.schema import Output, Recipe, Render, Smog, Weather
 from recipes.weather import Flood, Snow, Style, Waves
 from tests.augment.kernel_counts import CountingKernel, counted_kernels, launch_sites
 from tests.snow_scenes import box_car, drive, sheet, side_wall
@@ -77,7 +77,7 @@ def scene() -> Scene:
 
 def run(
     scene: Scene,
-    recipe: schema_Recipe,
+    recipe: Recipe,
     monkeypatch: pytest.MonkeyPatch,
     camera: Camera | None = None,
 ) -> Ran:
@@ -105,8 +105,8 @@ def kernels(layers: int = 1, *names: str, sky: int = 1, **counts: int) -> dict[s
     return found | ({"composite_cubemap": sky} if sky else {})
 
 
-def recipe_of(style: Style | None = None, output: Output = PICTURE, **weather) -> schema_Recipe:
-    return schema_Recipe(style=style, weather=Weather(**weather), output=output)
+def recipe_of(style: Style | None = None, output: Output = PICTURE, **weather) -> Recipe:
+    return Recipe(style=style, weather=Weather(**weather), output=output)
 
 
 def test_every_way_to_a_kernel_is_counted_and_given_back():

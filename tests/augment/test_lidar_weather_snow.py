@@ -14,9 +14,9 @@ from augment.effects.lidar import MOVED, UNCHANGED
 from augment.effects.lidar import snow as lidar_snow
 from augment.effects.lidar.beam import weathered_sweep
 from augment.effects.lidar.snow import LidarSnow, layer_of, meet_snow, snow_in
-from augment.effects.snow.cells import SnowBed, SnowCells
+from augment.effects.snow.cells import SnowCells, SnowSupport
 from augment.effects.snow.snow import PlacedSnow, cover_of, placement_settings
-from augment.effects.snow.support import remember_bed
+from augment.effects.snow.support import remember_support
 from recipes.weather import Snow
 from tests.lidar_sweeps import (
     SENSOR_M,
@@ -40,7 +40,9 @@ def scene():
     car = box_car(start=(4.0, 3.0), moved_m=3.0)
     opened = street(actors=(car,))
     roof = cells_on_grid(np.full((40, 18), 0.75), 0.1, corner_m=(-2.0, -0.9))
-    remember_bed(opened, placement_settings(SNOW), SnowBed(ground=FLAT, actors={"car": roof}))
+    remember_support(
+        opened, placement_settings(SNOW), SnowSupport(ground=FLAT, actors={"car": roof})
+    )
     return opened
 
 

@@ -22,7 +22,7 @@ from augment.jobs.tables import lidar_bytes, read_lidar
 from augment.labels import LidarSweep
 from augment.scene import Scene
 from augment.views import WeatheredView, render_view
-from recipes.schema import Output, Smog, Weather, schema_Recipe
+from recipes.schema import Output, Recipe, Smog, Weather
 from recipes.weather import Flood, Snow
 from tests.lidar_sweeps import WORLD_ORIGIN_M, SensorLabels, recipe, some_points, street, sweep_of
 from tests.streets import LABELLED_STREET, open_street
@@ -138,7 +138,7 @@ def test_origins_by_default_and_wrong_ones() -> None:
 
 def test_a_job_writes_weathered_sweeps(tmp_path: Path) -> None:
     weather = Weather(smog=Smog(visibility_m=0.5))
-    wanted = schema_Recipe(name="fog", weather=weather, output=Output(lidar="weather"))
+    wanted = Recipe(name="fog", weather=weather, output=Output(lidar="weather"))
     job = RenderJob("fake:street", [wanted], tmp_path / "one")
     assert run_job(job, scene_loader=open_fake, renderer=fake_render, progress=False).failed == 0
     rows = read_manifest(tmp_path / "one").to_pylist()
@@ -172,7 +172,7 @@ def _depth_gaps(scene: Scene, camera: Camera, view: WeatheredView, sweep: LidarS
 
 def test_lidar_agrees_with_depth_under_snow_by_default() -> None:
     scene = open_street(LABELLED_STREET)
-    deep = schema_Recipe(weather=Weather(snow=Snow(depth_m=0.2)))
+    deep = Recipe(weather=Weather(snow=Snow(depth_m=0.2)))
     gaps: dict[bool, list[np.ndarray]] = {True: [], False: []}
     source = scene.lidar(1)
     sweep = drop_lost(weathered_sweep(scene, deep, 1, source))
@@ -200,7 +200,7 @@ def test_auto_weathers_what_it_can_and_tells_of_the_rest(tmp_path: Path) -> None
     wet = make_recipe("wet", flood=Flood(level_m=40, reference="absolute"), depth="none")
     strict = wet.model_copy(update={"output": wet.output.model_copy(update={"lidar": "weather"})})
 
-    def outcome(recipe: schema_Recipe, out: Path, **options) -> tuple[int, dict[int, tuple]]:
+    def outcome(recipe: Recipe, out: Path, **options) -> tuple[int, dict[int, tuple]]:
         job = RenderJob("fake:street", [recipe], out, cameras=["front"], **options)
         done = run_job(job, scene_loader=lambda _: scene, renderer=fake_render, progress=False)
         rows = read_manifest(out).to_pylist()
@@ -245,6 +245,6 @@ def test_the_notes_of_a_job_are_one_line_a_recipe() -> None:
 
 
 def test_recipes_hashes_stay() -> None:
-    assert schema_Recipe().hash == "8553a2737c7b8e42"
-    hashes = {schema_Recipe(output=Output(lidar=kind)).hash for kind in (True, False, "weather")}
+    assert Recipe().hash == "8553a2737c7b8e42"
+    hashes = {Recipe(output=Output(lidar=kind)).hash for kind in (True, False, "weather")}
     assert len(hashes) == 3

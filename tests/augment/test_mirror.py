@@ -455,10 +455,10 @@ def test_only_what_belongs_to_the_dataset(source, out):
 @pytest.mark.parametrize("place", [".", "out", "lidar/out"])
 def test_an_output_folder_in_the_dataset_is_refused(source, place):
     with pytest.raises(OutputError, match="lies in the dataset's own folder"):
-        mirror_module.check_apart(trees.tree_of(source), source / place)
+        mirror_module.check_disjoint(trees.tree_of(source), source / place)
     tree = trees.tree_of(source, entries=("camera",))
     if place == "out":  # beside what belongs to it
-        mirror_module.check_apart(tree, source / place)
+        mirror_module.check_disjoint(tree, source / place)
 
 
 @pytest.mark.parametrize(

@@ -286,9 +286,9 @@ def test_bits_do_not_depend_on_the_buffers_asked_for(clip):
 
 def test_bits_do_not_depend_on_slices_and_lists(monkeypatch):
     scene, camera = open_scene(6000), camera_ahead(150, 111, 130.0)
-    monkeypatch.setattr(cpu, "_SMALLEST_SLICE", 1_000_000)
+    monkeypatch.setattr(cpu, "_MIN_SLICE", 1_000_000)
     whole = render(scene, camera).mode_depth
-    monkeypatch.setattr(cpu, "_SMALLEST_SLICE", 100)
+    monkeypatch.setattr(cpu, "_MIN_SLICE", 100)
     monkeypatch.setattr(cpu, "_SLICE_COVER", 1.0)
     monkeypatch.setattr(cpu, "_SLICE_GROWTH", 1.5)
     assert torch.equal(render(scene, camera).mode_depth, whole)

@@ -14,7 +14,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from augment.errors import OutputError
-from augment.jobs.journal import Identity
 from augment.jobs.layout import PATH_KINDS
 from augment.jobs.manifest import (
     FAILED,
@@ -30,6 +29,7 @@ from augment.jobs.manifest import (
     read_finished,
     rows_to_table,
 )
+from augment.jobs.progress_log import Identity
 from augment.jobs.store import Store, open_store
 
 RECIPE = make_recipe()

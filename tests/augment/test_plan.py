@@ -9,7 +9,7 @@ from augment.labels import Boxes, LidarSweep
 from augment.plan import Plan, make_plan
 from augment.scene import Gaussians, Scene
 from augment.sky import ConstantSky
-from recipes.schema import Output, Render, Smog, Weather, schema_Recipe
+from recipes.schema import Output, Recipe, Render, Smog, Weather
 
 
 def scene(**changes) -> Scene:
@@ -26,7 +26,7 @@ def scene(**changes) -> Scene:
 
 def plan_of(smog: Smog | None = None, **output) -> Plan:
     output.setdefault("depth", "none")
-    return make_plan(schema_Recipe(weather=Weather(smog=smog), output=Output(**output)), scene())
+    return make_plan(Recipe(weather=Weather(smog=smog), output=Output(**output)), scene())
 
 
 def running(plan: Plan) -> set[str]:
@@ -82,7 +82,7 @@ class Labels:
 )
 def test_boxes_need_a_depth_and_any_will_do(depth, labels, extinction_per_m, buffers):
     weather = Weather(smog=Smog(extinction_per_m=extinction_per_m))
-    recipe = schema_Recipe(weather=weather, output=Output(depth=depth, labels=labels))
+    recipe = Recipe(weather=weather, output=Output(depth=depth, labels=labels))
     plan = make_plan(recipe, scene(labels=Labels()))
     assert plan.buffers == buffers
     assert plan.finds_boxes == labels
@@ -90,7 +90,7 @@ def test_boxes_need_a_depth_and_any_will_do(depth, labels, extinction_per_m, buf
 
 
 def test_instance_images_need_the_depth_and_class_of_boxes_without_an_actor():
-    recipe = schema_Recipe(output=Output(depth="none", instance=True, labels=False))
+    recipe = Recipe(output=Output(depth="none", instance=True, labels=False))
     plan = make_plan(recipe, scene(labels=Labels()))
     assert plan.buffers == {"rgb", "alpha", "splat_ids", "expected_depth"}
     assert plan.finds_boxes and not plan.semantic
@@ -111,14 +111,14 @@ def test_outputs_ask_for_their_buffer():
 
 
 def test_a_scale_height_over_an_unknown_road_is_an_error_that_says_what_to_do():
-    recipe = schema_Recipe(weather=Weather(smog=Smog(visibility_m=100, scale_height_m=30)))
+    recipe = Recipe(weather=Weather(smog=Smog(visibility_m=100, scale_height_m=30)))
     with pytest.raises(SceneError, match="ground_z=HEIGHT"):
         make_plan(recipe, scene(ground_z_m=None))
 
 
 def test_an_unknown_unit_is_said():
     plan = make_plan(
-        schema_Recipe(weather=Weather(smog=Smog(visibility_m=100))), scene(has_metric_scale=False)
+        Recipe(weather=Weather(smog=Smog(visibility_m=100))), scene(has_metric_scale=False)
     )
     assert any("not known to be a metre" in step.why for step in plan.steps)
 
@@ -134,16 +134,16 @@ def test_colour_maps_apply_where_cameras_have_them_and_the_recipe_lets_them():
     cameras = {name: Camera(name, 4, 3, 5.0, 5.0, 2.0, 1.5, pose) for name in ("front", "back")}
     frames = (Frame(0, 0, pose, cameras),)
 
-    def step(recipe: schema_Recipe, **color_maps):
+    def step(recipe: Recipe, **color_maps):
         plan = make_plan(recipe, scene(frames=frames, color_maps=color_maps))
         [found] = [s for s in plan.steps if s.name == "camera colour map"]
         assert found.runs == plan.recorded_exposure
         return found
 
     dark = torch.eye(3, 4) * 0.5
-    assert not step(schema_Recipe()).runs
-    assert not step(schema_Recipe(), front=torch.eye(3, 4), elsewhere=dark).runs
-    used = step(schema_Recipe(), front=dark, back=torch.eye(3, 4))
+    assert not step(Recipe()).runs
+    assert not step(Recipe(), front=torch.eye(3, 4), elsewhere=dark).runs
+    used = step(Recipe(), front=dark, back=torch.eye(3, 4))
     assert used.runs and used.why.startswith("1 of 2 cameras")
-    neutral = step(schema_Recipe(render=Render(exposure="neutral")), front=dark)
+    neutral = step(Recipe(render=Render(exposure="neutral")), front=dark)
     assert not neutral.runs and "neutral" in neutral.why

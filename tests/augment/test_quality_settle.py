@@ -25,11 +25,11 @@ from augment.jobs.quality import (
     calibration_views,
     recipes_to_try,
     render_trial,
-    settle,
-    settled_recipe,
+    resolve_quality,
+    resolved_recipe,
     upsampled,
 )
-from augment.jobs.quality_record import Question, recorded, settle_once
+from augment.jobs.quality_record import Question, recorded, resolve_quality_once
 from augment.jobs.render_job import RenderJob, run_job
 from augment.jobs.store import open_store
 from augment.metrics.image import flip
@@ -39,12 +39,12 @@ from recipes.change import found
 from recipes.errors import RecipeError
 from recipes.load import load_recipe
 from recipes.parse import parse_recipe
-from recipes.schema import as_reference, free_knobs, schema_Recipe
+from recipes.schema import Recipe, as_reference, free_knobs
 
 PLAIN = "output: {depth: none, labels: false, lidar: false}\n"
 
 
-def open_recipe(quality: str, text: str = "", name: str = "fog") -> schema_Recipe:
+def open_recipe(quality: str, text: str = "", name: str = "fog") -> Recipe:
     text = f"name: {name}\nquality: {{{quality}}}\n{text}{PLAIN}"
     return parse_recipe(text, source="test").resolve(0)
 
@@ -58,7 +58,7 @@ class Workbench:
     def clock(self) -> float:
         return self.now_s
 
-    def render(self, scene, camera, recipe: schema_Recipe, *, backend: str) -> FakeView:
+    def render(self, scene, camera, recipe: Recipe, *, backend: str) -> FakeView:
         make_plan(recipe, scene)  # as the real one, refuses what is not settled
         self.rendered += 1
         settings = recipe.render
@@ -82,14 +82,14 @@ def bench(monkeypatch: pytest.MonkeyPatch) -> Workbench:
     """
     bench = Workbench()
     monkeypatch.setattr("augment.jobs.quality.flip", _mean_error)
-    monkeypatch.setattr(record, "settle", functools.partial(settle, clock=bench.clock))
+    monkeypatch.setattr(record, "settle", functools.partial(resolve_quality, clock=bench.clock))
     return bench
 
 
 def test_a_choice_by_error_is_within_the_bound_and_the_same_again() -> None:
     recipe, scene = open_recipe("max_flip: 0.06"), open_fake("fake:street")
-    settled = settle(recipe, scene)
-    assert settle(recipe, scene).recipe == settled.recipe
+    settled = resolve_quality(recipe, scene)
+    assert resolve_quality(recipe, scene).recipe == settled.recipe
     report = settled.report
     assert report is not None and report.is_met and report.ms is None
     assert settled.recipe.quality.settled and not settled.recipe.quality.is_open
@@ -106,7 +106,7 @@ def test_a_choice_by_error_is_within_the_bound_and_the_same_again() -> None:
 
 def test_given_fields_stay_and_are_the_references_too(bench: Workbench) -> None:
     recipe = open_recipe("max_flip: 0.9", "render: {scale: 0.5, transmittance_stop: 0.2}\n")
-    settled = settle(recipe, open_fake("fake:street"), renderer=bench.render)
+    settled = resolve_quality(recipe, open_fake("fake:street"), renderer=bench.render)
     assert settled.recipe.render.scale == 0.5 and settled.recipe.render.transmittance_stop == 0.2
     assert settled.recipe.render.sh_degree == 0
     assert settled.report is not None
@@ -125,7 +125,7 @@ def test_a_budget_takes_as_little_as_it_needs(bench: Workbench) -> None:
 
     def chosen(budget_ms: float):
         recipe = open_recipe(f"budget_ms: {budget_ms}")
-        settled = settle(recipe, scene, renderer=bench.render, clock=bench.clock)
+        settled = resolve_quality(recipe, scene, renderer=bench.render, clock=bench.clock)
         assert settled.report is not None
         return settled.recipe.render, settled.report
 
@@ -141,25 +141,25 @@ def test_a_budget_takes_as_little_as_it_needs(bench: Workbench) -> None:
 
 def test_a_budget_beyond_reach_says_so(bench: Workbench, caplog: pytest.LogCaptureFixture) -> None:
     recipe = open_recipe("budget_ms: 1")
-    settled = settle(recipe, open_fake("fake:a"), renderer=bench.render, clock=bench.clock)
+    settled = resolve_quality(recipe, open_fake("fake:a"), renderer=bench.render, clock=bench.clock)
     assert settled.report is not None and not settled.report.is_met
     assert settled.recipe.render.scale == 0.25
     assert "its frames take 6 ms with the fastest settings" in caplog.text
 
 
 def test_snow_that_a_scene_cannot_have_so_fine_is_coarser() -> None:
-    def render(scene, camera, recipe: schema_Recipe, *, backend: str) -> FakeView:
+    def render(scene, camera, recipe: Recipe, *, backend: str) -> FakeView:
         assert recipe.weather.snow is not None
         if recipe.weather.snow.cell_m < 0.1:
             raise SceneError("too many cells")
         return FakeView(np.full((16, 24, 3), 99, np.uint8), None, None, None)
 
     recipe = open_recipe("budget_ms: 1e6", "weather: {snow: {depth_m: 0}}\nrender: {scale: 1}\n")
-    settled = settle(recipe, open_fake("fake:a"), renderer=render)
+    settled = resolve_quality(recipe, open_fake("fake:a"), renderer=render)
     assert found(settled.recipe, "weather.snow.cell_m") == 0.1
     given = open_recipe("max_flip: 0.1", "weather: {snow: {depth_m: 0, cell_m: 0.05}}\n")
     with pytest.raises(SceneError, match="too many cells"):
-        settle(given, open_fake("fake:a"), renderer=render)
+        resolve_quality(given, open_fake("fake:a"), renderer=render)
 
 
 def test_what_has_not_chosen_is_not_rendered() -> None:
@@ -168,9 +168,11 @@ def test_what_has_not_chosen_is_not_rendered() -> None:
         render_view(scene, make_camera("front", 0, 0.0), recipe)
     tried = recipes_to_try(recipe)
     assert len(tried) > 8 and not any(r.quality.is_open for r in tried)
-    assert recipes_to_try(tried[0]) == [tried[0]] and settle(tried[0], scene).report is None
+    assert (
+        recipes_to_try(tried[0]) == [tried[0]] and resolve_quality(tried[0], scene).report is None
+    )
     with pytest.raises(ValueError, match="leaves free render"):
-        settled_recipe(recipe, {"render.near_m": 1.0})
+        resolved_recipe(recipe, {"render.near_m": 1.0})
 
 
 def pictures(folder: Path) -> dict[str, bytes]:
@@ -223,7 +225,9 @@ def test_a_changed_choice_is_told(bench: Workbench, tmp_path: Path) -> None:
     store, recipe = open_store(tmp_path), open_recipe("max_flip: 0.5")
     question = Question(recipe, "a", "fake:a", "recorded", "cpu")
     scene = open_fake("fake:a")
-    settle_once(store, question, lambda: settle(recipe, scene, renderer=bench.render))
+    resolve_quality_once(
+        store, question, lambda: resolve_quality(recipe, scene, renderer=bench.render)
+    )
     document = json.loads(store.read(question.path))
     for path, value in (("render.scale", "1"), ("render.near_m", 1.0), ("render.scale", 77.0)):
         changed = json.loads(json.dumps(document))
@@ -252,10 +256,10 @@ def _choose_slowly(folder: str, scale: float, answers) -> None:
         time.sleep(0.2)
         settings: Settings = {knob.path: knob.reference for knob in free_knobs(recipe)}
         settings["render.scale"] = scale
-        return Settled(settled_recipe(recipe, settings), Report(settings, True, 0.0, (), ()))
+        return Settled(resolved_recipe(recipe, settings), Report(settings, True, 0.0, (), ()))
 
     question = Question(recipe, "a", "fake:a", "recorded", "cpu")
-    answers.put(settle_once(open_store(folder), question, choose).render.scale)
+    answers.put(resolve_quality_once(open_store(folder), question, choose).render.scale)
 
 
 def test_two_processes_agree(tmp_path: Path) -> None:
@@ -349,6 +353,6 @@ def test_small_pictures_are_enlarged_and_depths_are_not_mixed() -> None:
         return FakeView(picture, np.array([[1, 9], [1, 9]], np.float32), None, None)
 
     trial = render_trial(
-        scene, make_camera("front", 0, 0.0), schema_Recipe(), renderer=render, size=(4, 4)
+        scene, make_camera("front", 0, 0.0), Recipe(), renderer=render, size=(4, 4)
     )
     assert trial.depth is not None and trial.depth[3].tolist() == [1, 1, 9, 9]

@@ -11,7 +11,7 @@ from augment.render import buffers as backends
 from augment.render import rasterize as module
 from augment.render.buffers import BUFFERS, RenderOutput
 from augment.render.constants import RasterSettings
-from augment.render.rasterize import rasterize, share_remainder
+from augment.render.rasterize import rasterize, renormalise_alpha
 from augment.scene import Gaussians, PosedGaussians
 from tests.assertions import assert_images_close
 from tests.scenes import camera_ahead, random_gaussians, slight_pose
@@ -101,8 +101,8 @@ def test_kernel_and_definition_share_the_rest_alike():
     images = {"rgb": (9, 7, 3), "alpha": (9, 7), "snow": (9, 7)}
     images = {name: torch.rand(shape, generator=rng) for name, shape in images.items()}
     images["alpha"][0, :3] = torch.tensor([0.75, 1.0, 0.0])
-    slow = share_remainder(RenderOutput(**images), 0.25, backend="reference")
-    fast = share_remainder(RenderOutput(**{n: i.clone() for n, i in images.items()}), 0.25)
+    slow = renormalise_alpha(RenderOutput(**images), 0.25, backend="reference")
+    fast = renormalise_alpha(RenderOutput(**{n: i.clone() for n, i in images.items()}), 0.25)
     for name in images:
         torch.testing.assert_close(getattr(fast, name), getattr(slow, name), rtol=3e-7, atol=0)
     assert slow.alpha[0, 0] == 1 and slow.alpha[0, 2] == 0

@@ -10,7 +10,7 @@ from augment.reconstruct import loss_kernels as sky_kernels
 from augment.reconstruct.config import LossWeights
 from augment.reconstruct.loss import IDENTITY_MAP, LossScratch, ViewLoss, picture, view_loss
 from augment.reconstruct.loss_reference import (
-    LEAST_SKY,
+    MIN_SKY,
     reference_loss,
     reference_picture,
     ssim_map,
@@ -414,7 +414,7 @@ def test_depth_pixels_outside_or_out_of_order_are_refused(pixels):
 def test_the_picture_is_that_of_the_renderer_and_of_the_reference():
     arguments = case(37, 61, seed=1)
     camera, alpha = arguments["view"].camera, arguments["alpha"]
-    alpha[0] = 1 - LEAST_SKY / 2  # looked up all the same
+    alpha[0] = 1 - MIN_SKY / 2  # looked up all the same
     faces = torch.from_numpy(arguments["sky_faces"])
     rgb, color_map = torch.from_numpy(arguments["rgb"]), torch.from_numpy(arguments["color_map"])
     plain = picture(arguments["rgb"], alpha, camera, arguments["sky_faces"])

@@ -20,7 +20,7 @@ from augment.render.threads import limit_threads
 from augment.scene import Gaussians, PosedGaussians, Scene
 from augment.sky import CubemapSky
 from augment.views import render_buffers
-from recipes.schema import Output, schema_Recipe
+from recipes.schema import Output, Recipe
 from tests.scenes import (
     camera_ahead,
     one_gaussian,
@@ -588,9 +588,7 @@ def test_gradients_through_a_planned_picture():
     frame = Frame(0, 0, torch.eye(4, dtype=torch.float64), {"ahead": camera})
     maps = {"ahead": torch.eye(3, 4) * 0.9}
     scene = Scene("s", "test:s", gaussians, (), sky(), (frame,), color_maps=maps)
-    plan = make_plan(
-        schema_Recipe(output=Output(depth="expected", semantic=False, instance=False)), scene
-    )
+    plan = make_plan(Recipe(output=Output(depth="expected", semantic=False, instance=False)), scene)
     view = render_buffers(scene, camera, plan, backend="cpu")
     view.rgb.sum().backward()
     assert bool(gaussians.means.grad.any())

@@ -342,10 +342,10 @@ def test_bits_do_not_depend_on_the_buffers_asked_for(crowd, buffers):
 
 
 def test_bits_do_not_depend_on_slices_and_lists(crowd, monkeypatch):
-    monkeypatch.setattr(cpu, "_SMALLEST_SLICE", 1_000_000)
+    monkeypatch.setattr(cpu, "_MIN_SLICE", 1_000_000)
     times: dict[str, float] = {}
     whole = rasterize_cpu(*crowd, ALL, DEFAULT, None, stage_times=times)
-    monkeypatch.setattr(cpu, "_SMALLEST_SLICE", 100)
+    monkeypatch.setattr(cpu, "_MIN_SLICE", 100)
     monkeypatch.setattr(cpu, "_SLICE_COVER", 1.0)
     monkeypatch.setattr(cpu, "_SLICE_GROWTH", 1.5)
     sliced_times: dict[str, float] = {}
@@ -359,7 +359,7 @@ def test_bits_do_not_depend_on_slices_and_lists(crowd, monkeypatch):
 def test_hidden_splats_are_not_projected(crowd, monkeypatch):
     """A wall before almost everything closes all tiles in the first slices."""
     parts, camera = crowd
-    monkeypatch.setattr(cpu, "_SMALLEST_SLICE", 1)
+    monkeypatch.setattr(cpu, "_MIN_SLICE", 1)
     monkeypatch.setattr(cpu, "_SLICE_COVER", 2.0)
     wall = stack(*[one_gaussian(mean=(0.2, 0, 0), scale=5.0, opacity=0.99)] * 4)
     open_view: dict[str, float] = {}
@@ -373,7 +373,7 @@ def test_hidden_splats_are_not_projected(crowd, monkeypatch):
 
 def test_pixels_beyond_the_image_keep_no_tile_open(monkeypatch):
     """The screen covers the image of 3x3 pixels and not its one tile; what is behind is hidden."""
-    monkeypatch.setattr(cpu, "_SMALLEST_SLICE", 1)
+    monkeypatch.setattr(cpu, "_MIN_SLICE", 1)
     monkeypatch.setattr(cpu, "_SLICE_COVER", 20.0)
     screen = stack(*[one_gaussian(mean=(1.0, 0, 0), scale=2 / 30, opacity=0.99)] * 20)
     behind = stack(*[one_gaussian(mean=(5.0, 0, 0), scale=1.0)] * 50)

@@ -13,7 +13,7 @@ from augment.geometry import (
 )
 from augment.render import reference
 from augment.render.buffers import ALPHA, BUFFERS, EXPECTED_DEPTH, MEDIAN_DEPTH, RGB
-from augment.render.constants import MOST_TRANSMITTANCE_STOP, RasterSettings
+from augment.render.constants import MAX_TRANSMITTANCE_STOP, RasterSettings
 from augment.render.reference import order_by_depth, project_parts, rasterize_reference
 from augment.render.sh import rotate_sh
 from augment.scene import Gaussians, PosedGaussians
@@ -263,7 +263,7 @@ def test_a_greater_stop_blends_the_splat_that_reaches_it():
     assert float(output.alpha.max()) == pytest.approx(0.999, abs=1e-5)
 
 
-@pytest.mark.parametrize("stop", [1e-6, 0.01, MOST_TRANSMITTANCE_STOP])
+@pytest.mark.parametrize("stop", [1e-6, 0.01, MAX_TRANSMITTANCE_STOP])
 def test_no_stop_moves_the_median_depth(stop):
     gaussians, camera = random_gaussians(400, dtype=torch.float64, size=0.7), camera_ahead(19, 13)
     settings = RasterSettings(transmittance_stop=stop)

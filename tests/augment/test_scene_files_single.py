@@ -174,7 +174,7 @@ def test_names_and_failures(tmp_path, file, monkeypatch):
     with pytest.raises(OutputError, match="cannot write"):
         save_scene_file(fitted_scene(), tmp_path / "folder.climategs")
     before = file.read_bytes()
-    monkeypatch.setattr(tensor_files, "MOST_HEADER_BYTES", 1000)
+    monkeypatch.setattr(tensor_files, "MAX_HEADER_BYTES", 1000)
     with pytest.raises(SceneError, match="Write a scene folder instead"):
         save_scene_file(fitted_scene(name="new"), file)
     assert file.read_bytes() == before

@@ -22,7 +22,7 @@ from box_views import (
 
 from augment.boxes import BOTTOM_M, NOT_COUNTED, SIDES_M
 from augment.effects import smog
-from augment.effects.smog import SmogMedium, box_transmittance, smog_labels_optical_depth
+from augment.effects.smog import SmogMedium, box_transmittance, optical_depth_of_arrays
 from augment.geometry import rotmat_from_quat
 from augment.labels import Boxes
 
@@ -112,7 +112,7 @@ def test_the_optical_depth_is_that_of_the_image(medium: SmogMedium) -> None:
     rng = np.random.default_rng(1)
     distance, z = rng.uniform(0, 300, 500), rng.uniform(-20, 80, 500)
     z[:3] = EYE_Z_M, EYE_Z_M + 1e-9, EYE_Z_M - 3e-5
-    got = smog_labels_optical_depth(medium, distance, EYE_Z_M, z)
+    got = optical_depth_of_arrays(medium, distance, EYE_Z_M, z)
     tensors = torch.from_numpy(distance), torch.from_numpy(z)
     expected = smog.optical_depth(medium, tensors[0], EYE_Z_M, tensors[1]).numpy()
     # The image's takes a straight line below 1e-4, which float32 does not tell from the curve.

@@ -14,7 +14,7 @@ import torch
 
 from adapters.base import open_scene, parse_uri
 from adapters.street.labels import open_truth
-from augment.effects.snow.placement import PlacementSettings, place_snow_bed
+from augment.effects.snow.placement import PlacementSettings, place_snow_support
 from augment.scene import Gaussians
 from augment.semantics import SemanticClass
 from tools.bench_snow_accuracy import AccuracyCase, bench_accuracy
@@ -71,7 +71,7 @@ def all_cameras(scene):
 
 
 def covered_by(scene, points, **settings):
-    bed = place_snow_bed(scene, all_cameras(scene), PlacementSettings(cell_m=0.2, **settings))
+    bed = place_snow_support(scene, all_cameras(scene), PlacementSettings(cell_m=0.2, **settings))
     flat = points.chosen(points.is_seen & (points.slope < math.radians(30)))
     return bed.ground, flat
 

@@ -15,9 +15,16 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from augment.effects.snow import support as beds
-from augment.effects.snow.cells import SnowBed, SnowCells
-from augment.effects.snow.placement import PlacementSettings, place_snow_bed
-from augment.effects.snow.support import FORMAT, bed_key, bed_of, load_bed, remember_bed, save_bed
+from augment.effects.snow.cells import SnowCells, SnowSupport
+from augment.effects.snow.placement import PlacementSettings, place_snow_support
+from augment.effects.snow.support import (
+    FORMAT,
+    bed_key,
+    bed_of,
+    load_bed,
+    remember_support,
+    save_bed,
+)
 from augment.errors import OutputError, SceneError
 from augment.scene import Gaussians, Scene, Track
 from tests.scenes import random_gaussians
@@ -33,13 +40,13 @@ def scene() -> Scene:
 
 
 @pytest.fixture(scope="module")
-def bed(scene: Scene) -> SnowBed:
-    found = place_snow_bed(scene, cameras_of(scene), SETTINGS)
+def bed(scene: Scene) -> SnowSupport:
+    found = place_snow_support(scene, cameras_of(scene), SETTINGS)
     assert len(found.ground) > 500 and set(found.actors) == {"car", "täxi/2"}
     return found
 
 
-def assert_equal(a: SnowBed, b: SnowBed) -> None:
+def assert_equal(a: SnowSupport, b: SnowSupport) -> None:
     assert list(a.actors) == list(b.actors)
     for one, other in ((a.ground, b.ground), *((a.actors[k], b.actors[k]) for k in a.actors)):
         for field in dataclasses.fields(SnowCells):
@@ -47,7 +54,7 @@ def assert_equal(a: SnowBed, b: SnowBed) -> None:
             assert x.dtype == y.dtype and torch.equal(x, y), field.name
 
 
-def test_a_file_gives_back_the_bed_to_the_bit(bed: SnowBed, tmp_path: Path) -> None:
+def test_a_file_gives_back_the_bed_to_the_bit(bed: SnowSupport, tmp_path: Path) -> None:
     path = tmp_path / "new" / "snow.safetensors"
     save_bed(path, bed, "a key")
     assert_equal(load_bed(path, "a key"), bed)
@@ -56,7 +63,7 @@ def test_a_file_gives_back_the_bed_to_the_bit(bed: SnowBed, tmp_path: Path) -> N
     assert load_bed(path, "another").actors == {}
 
 
-def test_the_same_bed_is_the_same_bytes(bed: SnowBed, tmp_path: Path) -> None:
+def test_the_same_bed_is_the_same_bytes(bed: SnowSupport, tmp_path: Path) -> None:
     slower = dataclasses.replace(bed, seconds={"views": 1e3})
     for name, one in (("a", bed), ("b", bed), ("c", slower)):
         save_bed(tmp_path / name, one, "k")
@@ -64,15 +71,15 @@ def test_the_same_bed_is_the_same_bytes(bed: SnowBed, tmp_path: Path) -> None:
     assert len(contents) == 1
 
 
-def test_tensors_that_share_memory_are_kept(bed: SnowBed, tmp_path: Path) -> None:
+def test_tensors_that_share_memory_are_kept(bed: SnowSupport, tmp_path: Path) -> None:
     ground = dataclasses.replace(bed.ground, light=bed.ground.tracks)
-    shared = SnowBed(ground, {"a": bed.actors["car"], "b": bed.actors["car"]})
+    shared = SnowSupport(ground, {"a": bed.actors["car"], "b": bed.actors["car"]})
     save_bed(tmp_path / "bed", shared, "k")
     assert_equal(load_bed(tmp_path / "bed", "k"), shared)
 
 
 def test_an_empty_bed_is_kept_too(scene: Scene, tmp_path: Path) -> None:
-    empty = place_snow_bed(scene, [], SETTINGS)
+    empty = place_snow_support(scene, [], SETTINGS)
     save_bed(tmp_path / "b", empty, "k")
     assert_equal(load_bed(tmp_path / "b", "k"), empty)
 
@@ -149,7 +156,7 @@ def test_a_key_is_found_quickly() -> None:
     assert time.process_time() - start < 1.0  # about 0.1 s
 
 
-def test_files_of_something_else_are_refused(bed: SnowBed, tmp_path: Path) -> None:
+def test_files_of_something_else_are_refused(bed: SnowSupport, tmp_path: Path) -> None:
     path = tmp_path / "snow.safetensors"
     with pytest.raises(SceneError, match="no such file"):
         load_bed(path, "k")
@@ -167,7 +174,7 @@ def test_files_of_something_else_are_refused(bed: SnowBed, tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("keep", [0, 1, 7, 100, 0.5, 0.99])
-def test_cut_files_are_refused(bed: SnowBed, tmp_path: Path, keep: float) -> None:
+def test_cut_files_are_refused(bed: SnowSupport, tmp_path: Path, keep: float) -> None:
     path = tmp_path / "snow.safetensors"
     save_bed(path, bed, "k")
     data = path.read_bytes()
@@ -179,7 +186,7 @@ def test_cut_files_are_refused(bed: SnowBed, tmp_path: Path, keep: float) -> Non
 @pytest.mark.parametrize(
     "how", ["shape", "missing", "type", "neighbour", "cell", "gaussian", "ids"]
 )
-def test_contents_that_do_not_fit_are_refused(bed: SnowBed, tmp_path: Path, how: str) -> None:
+def test_contents_that_do_not_fit_are_refused(bed: SnowSupport, tmp_path: Path, how: str) -> None:
     path = tmp_path / "snow.safetensors"
     save_bed(path, bed, "k")
     tensors = load_file(path)
@@ -206,11 +213,11 @@ def test_contents_that_do_not_fit_are_refused(bed: SnowBed, tmp_path: Path, how:
 def test_a_bed_is_found_once(scene: Scene, monkeypatch, tmp_path: Path, caplog) -> None:
     calls = []
 
-    def counted(*arguments, **options) -> SnowBed:
+    def counted(*arguments, **options) -> SnowSupport:
         calls.append(arguments)
-        return place_snow_bed(*arguments, **options)
+        return place_snow_support(*arguments, **options)
 
-    monkeypatch.setattr(beds, "place_snow_bed", counted)
+    monkeypatch.setattr(beds, "place_snow_support", counted)
     own = dataclasses.replace(scene)
     first = bed_of(own, SETTINGS, folder=tmp_path)
     assert bed_of(own, SETTINGS, folder=tmp_path) is first
@@ -232,9 +239,9 @@ def test_a_bed_is_found_once(scene: Scene, monkeypatch, tmp_path: Path, caplog) 
     assert len(calls) == 3
 
 
-def test_what_is_remembered_is_what_is_given(scene: Scene, bed: SnowBed) -> None:
+def test_what_is_remembered_is_what_is_given(scene: Scene, bed: SnowSupport) -> None:
     own = dataclasses.replace(scene)
-    remember_bed(own, SETTINGS, bed)
+    remember_support(own, SETTINGS, bed)
     assert bed_of(own, SETTINGS) is bed
     gone = weakref.ref(own)
     del own
@@ -250,7 +257,7 @@ def test_a_folder_that_cannot_be_written_is_an_error(scene: Scene, tmp_path: Pat
 
 
 def test_progress_is_shown_where_asked_for(scene: Scene, capsys) -> None:
-    place_snow_bed(scene, cameras_of(scene), SETTINGS)
+    place_snow_support(scene, cameras_of(scene), SETTINGS)
     assert capsys.readouterr().err == ""
-    place_snow_bed(scene, cameras_of(scene), SETTINGS, progress=True)
+    place_snow_support(scene, cameras_of(scene), SETTINGS, progress=True)
     assert "placing snow: 100%" in capsys.readouterr().err

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from augment.cameras import Camera
-from augment.effects.snow.kernels import FARTHEST_M, MOST_SPLITS, REACH, SPREAD
+from augment.effects.snow.kernels import FARTHEST_M, MAX_SPLITS, REACH, SPREAD
 from augment.effects.snow.near_camera import Grain, split_near
 from augment.geometry import rigid
 from augment.render.buffers import ALPHA, RGB
@@ -94,7 +94,7 @@ def test_near_discs_are_split_most_and_far_ones_not_at_all():
     distance = (near.fine.means - view.centre.float()).norm(dim=1)
     parts = REACH * SPREAD * CELL_M / near.fine.scales[:, 0]  # into how many, along a side
     assert float(distance.max()) < FARTHEST_M + CELL_M
-    assert set(parts.round().int().tolist()) <= set(range(2, MOST_SPLITS + 1))
+    assert set(parts.round().int().tolist()) <= set(range(2, MAX_SPLITS + 1))
     close, far = parts[distance < 2.5], parts[distance > 5]
     assert float(close.mean()) > float(far.mean()) + 0.5
     wide = camera(f=60.0, width=64, height=48)  # whose pixels are coarser than the discs

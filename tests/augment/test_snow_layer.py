@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from augment.effects.snow.cells import FLUSH, OPEN_EDGE
-from augment.effects.snow.layer import OPACITY, find_depths, lay_snow
+from augment.effects.snow.layer import OPACITY, build_snow_layer, find_depths
 from augment.effects.snow.light import Illumination
 from augment.effects.snow.near_camera import SnowCover
 from augment.effects.snow.profile import BARE_M, FILM_M, PRESSED, profile_of, share_covered
@@ -32,7 +32,7 @@ FAR_AWAY = scene_of(grid_surface(np.zeros((1, 1)), CELL_M, corner_m=(-90.0, -90.
 
 
 def _lay(bed, scene=FAR_AWAY, *, seed=3, water=None, light=LIGHT, **options) -> SnowCover:
-    return lay_snow(bed, scene, Snow(**options), light, seed=seed, water_level_z_m=water)
+    return build_snow_layer(bed, scene, Snow(**options), light, seed=seed, water_level_z_m=water)
 
 
 def _depths(cells, *, seed=3, water=None, **options) -> np.ndarray:

@@ -12,12 +12,12 @@ import torch
 
 from augment.cameras import Camera
 from augment.effects.snow import placement, surface_kernels
-from augment.effects.snow.cells import EDGE_CAP_M, FLUSH, OPEN_EDGE, SnowBed, SnowCells
+from augment.effects.snow.cells import EDGE_CAP_M, FLUSH, OPEN_EDGE, SnowCells, SnowSupport
 from augment.effects.snow.placement import (
     EGO_WIDTH_M,
     WHEEL_SHARE,
     PlacementSettings,
-    place_snow_bed,
+    place_snow_support,
 )
 from augment.effects.snow.surface import DRIVEN_MAX_SLOPE_DEG, is_vehicle
 from augment.effects.snow.surface_kernels import LINK, OPEN
@@ -36,8 +36,8 @@ GROUND = sheet((-6, 20), (-8, 8))
 LEFT, RIGHT, BACK, FRONT = range(4)
 
 
-def place(scene: Scene, settings: PlacementSettings = COARSE) -> SnowBed:
-    bed = place_snow_bed(scene, cameras_of(scene), settings)
+def place(scene: Scene, settings: PlacementSettings = COARSE) -> SnowSupport:
+    bed = place_snow_support(scene, cameras_of(scene), settings)
     check_cells(bed.ground, len(scene.background))
     for actor in scene.actors:
         if actor.track_id in bed.actors:
@@ -97,7 +97,7 @@ def within(cells: SnowCells, x: tuple[float, float], y: tuple[float, float]) -> 
 
 
 @pytest.fixture(scope="module")
-def flat_ground() -> tuple[Scene, SnowBed]:
+def flat_ground() -> tuple[Scene, SnowSupport]:
     scene = drive(GROUND)
     return scene, place(scene)
 
@@ -155,7 +155,7 @@ def test_only_what_a_camera_sees_has_cells(flat_ground) -> None:
 
 
 def test_without_cameras_the_bed_is_empty(flat_ground) -> None:
-    bed = place_snow_bed(flat_ground[0], [], COARSE)
+    bed = place_snow_support(flat_ground[0], [], COARSE)
     check_cells(bed.ground, 0)
     assert len(bed.ground) == 0 and bed.actors == {}
 
@@ -164,7 +164,7 @@ def test_bits_do_not_depend_on_threads(flat_ground) -> None:
     scene, bed = flat_ground
     limit_threads(1)
     try:
-        alone = place_snow_bed(scene, cameras_of(scene), COARSE)
+        alone = place_snow_support(scene, cameras_of(scene), COARSE)
     finally:
         limit_threads(None)
     assert_equal_cells(alone.ground, bed.ground)
@@ -279,7 +279,7 @@ def test_cells_that_would_take_too_much_memory_are_refused_at_once() -> None:
     scene = drive(GROUND)
     start = time.process_time()
     with pytest.raises(SceneError, match=r"0\.001 m would take [\d,]+ million cells.* GB.*cell_m"):
-        place_snow_bed(scene, cameras_of(scene), PlacementSettings(cell_m=0.001))
+        place_snow_support(scene, cameras_of(scene), PlacementSettings(cell_m=0.001))
     assert time.process_time() - start < 1.0
 
 
@@ -297,7 +297,7 @@ def test_far_from_the_origin_nothing_breaks() -> None:
 def test_metres_and_gravity_are_needed(unknown: str) -> None:
     scene = drive(GROUND, **{unknown: False})
     with pytest.raises(SceneError, match="not known"):
-        place_snow_bed(scene, cameras_of(scene), COARSE)
+        place_snow_support(scene, cameras_of(scene), COARSE)
 
 
 @pytest.mark.parametrize(
@@ -671,7 +671,7 @@ def test_a_map_camera_sees_what_is_below_it() -> None:
     pose[1, 1] = pose[2, 2] = -1.0
     pose[2, 3] = 30.0
     above = Camera("map", 60, 40, 10.0, 10.0, 30.0, 20.0, pose, is_orthographic=True)
-    cells = place_snow_bed(scene, [above], PlacementSettings(cell_m=0.2)).ground
+    cells = place_snow_support(scene, [above], PlacementSettings(cell_m=0.2)).ground
     check_cells(cells, len(scene.background))
     area = float((cells.sizes_m**2).sum())
     assert area == pytest.approx(7.4 * 5.4, rel=0.15)  # 6 m x 4 m, and what is grown at its border

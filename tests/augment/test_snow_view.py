@@ -14,7 +14,7 @@ from augment.render.buffers import EXPECTED_DEPTH, MODE_DEPTH, SNOW, SPLAT_IDS
 from augment.scene import Scene
 from augment.semantics import SemanticClass
 from augment.views import render_buffers, render_view
-from recipes.schema import Output, Smog, Weather, schema_Recipe
+from recipes.schema import Output, Recipe, Smog, Weather
 from recipes.weather import Flood, Snow, Waves
 from tests.snow_scenes import box_car, drive, sheet, side_wall
 
@@ -47,11 +47,9 @@ def snow(**options) -> Snow:
     return Snow(**({"depth_m": DEPTH_M, "cell_m": CELL_M, "tracks": "never"} | options))
 
 
-def recipe_of(
-    weather_snow: Snow | None = None, *, smog=None, flood=None, **output
-) -> schema_Recipe:
+def recipe_of(weather_snow: Snow | None = None, *, smog=None, flood=None, **output) -> Recipe:
     weather = Weather(snow=weather_snow, smog=smog, flood=flood)
-    return schema_Recipe(weather=weather, output=Output(**({"semantic": True} | output)))
+    return Recipe(weather=weather, output=Output(**({"semantic": True} | output)))
 
 
 def view_of(scene: Scene, weather_snow: Snow | None = None, frame=0, backend="auto", **options):

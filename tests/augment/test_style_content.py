@@ -199,9 +199,9 @@ def test_remembered_by_what_cameras_are_and_as_long_as_the_scene_lives(monkeypat
             other = [dataclasses.replace(again[0], **change), *again[1:]]
             with pytest.raises(TypeError):
                 content_statistics(scene, other, per_region=False)
-    for number in range(2 * content.MOST_REMEMBERED):
+    for number in range(2 * content.MAX_REMEMBERED):
         content_statistics(scene, [camera_ahead(timestamp_ns=number)], per_region=False)
-    assert len(content._remembered[scene]) == content.MOST_REMEMBERED
+    assert len(content._remembered[scene]) == content.MAX_REMEMBERED
     gone = weakref.ref(scene)
     del scene
     gc.collect()

@@ -179,12 +179,12 @@ def test_a_network_without_a_finite_map_says_so(photo, network, monkeypatch):
 
 def test_few_styles_are_remembered(photo):
     scene = colourful()
-    for number in range(2 * scene_maps.MOST_REMEMBERED):
+    for number in range(2 * scene_maps.MAX_REMEMBERED):
         style = Style(image=str(photo), strength=1 - number / 100)
         style_maps(scene, style)
         remember_maps(scene, style, identity_maps())
-    assert len(scene_maps._remembered[scene]) == scene_maps.MOST_REMEMBERED
-    assert len(scene_maps._given[scene]) == scene_maps.MOST_REMEMBERED
+    assert len(scene_maps._remembered[scene]) == scene_maps.MAX_REMEMBERED
+    assert len(scene_maps._given[scene]) == scene_maps.MAX_REMEMBERED
     assert len(content._remembered[scene]) == 1
 
 

@@ -20,7 +20,7 @@ from augment.effects.style.style import look_of, remember_maps
 from augment.scene import Gaussians, Scene
 from augment.sky import ConstantSky
 from augment.views import render_view
-from recipes.schema import schema_Recipe
+from recipes.schema import Recipe
 from recipes.weather import Style
 from tests.scenes import one_gaussian, stack
 from tests.snow_scenes import drive, sheet
@@ -108,12 +108,12 @@ def test_the_halo_changes_with_the_sky_in_pictures_and_in_styled_scenes():
     look = look_of(scene, STYLE)
     rows = look.on(scene.parts_for(camera))[0].color_rows
     assert rows is not None and rows[-2:].tolist() == [LEVELS, 0] and not rows[:-2].any()
-    fused = render_view(scene, camera, schema_Recipe(style=STYLE))
-    folded = render_view(styled_scene(scene, maps()), camera, schema_Recipe())
+    fused = render_view(scene, camera, Recipe(style=STYLE))
+    folded = render_view(styled_scene(scene, maps()), camera, Recipe())
     assert np.abs(fused.rgb.astype(int) - folded.rgb).max() <= 1
     colors = (styled_scene(scene, maps()).background.sh[-2:, 0] * 0.28209479 + 0.5).tolist()
     np.testing.assert_allclose(colors, [[0.9, 0.1, 0.1], [0.1, 0.9, 0.1]], atol=1e-5)
-    assert torch.equal(look.witness.background.sh[-1], look.witness.background.sh[0])
+    assert torch.equal(look.lighting_scene.background.sh[-1], look.lighting_scene.background.sh[0])
 
 
 def test_folding_by_levels_is_the_definitions():

@@ -12,14 +12,14 @@ from augment.dataset import SceneDataset
 from augment.effects.snow.snow import cover_of
 from augment.effects.style import style as scene_maps
 from augment.effects.style.color_maps import CLASSES, StyleMaps
-from augment.effects.style.style import Look, look_of, remember_maps, style_maps
+from augment.effects.style.style import SceneStyle, look_of, remember_maps, style_maps
 from augment.plan import make_plan
 from augment.render.cuda import runtime as gpu
 from augment.render.rasterize import rasterize
 from augment.scene import PosedGaussians, Scene
 from augment.semantics import SemanticClass
 from augment.views import render_buffers, render_view
-from recipes.schema import Output, Smog, Weather, schema_Recipe
+from recipes.schema import Output, Recipe, Smog, Weather
 from recipes.weather import Flood, Snow, Style, Waves
 from tests.augment.pretend_gpu import pretended_gpu
 from tests.snow_scenes import box_car, drive, sheet, side_wall
@@ -58,12 +58,12 @@ def camera_of(scene: Scene, frame: int = 0):
     return scene.frames[frame].cameras["ahead"]
 
 
-def recipe_of(style: Style | None = STYLE, *, classes: bool = True, **weather) -> schema_Recipe:
+def recipe_of(style: Style | None = STYLE, *, classes: bool = True, **weather) -> Recipe:
     output = Output(semantic=classes, instance=classes)
-    return schema_Recipe(style=style, weather=Weather(**weather), output=output)
+    return Recipe(style=style, weather=Weather(**weather), output=output)
 
 
-def buffers_of(scene: Scene, recipe: schema_Recipe, backend: str = "auto"):
+def buffers_of(scene: Scene, recipe: Recipe, backend: str = "auto"):
     return render_buffers(scene, camera_of(scene), make_plan(recipe, scene), backend=backend)
 
 
@@ -71,7 +71,7 @@ def mapped(rgb: torch.Tensor, color_map: torch.Tensor) -> torch.Tensor:
     return rgb @ color_map[:, :3].T + color_map[:, 3]
 
 
-def ran(scene: Scene, recipe: schema_Recipe) -> dict[str, bool]:
+def ran(scene: Scene, recipe: Recipe) -> dict[str, bool]:
     return {step.name: step.runs for step in make_plan(recipe, scene).steps}
 
 
@@ -151,7 +151,7 @@ def test_snow_keeps_its_colour_and_takes_the_styles_light(scene):
             for name, cover in (("styled", styled), ("plain", plain))}  # fmt: skip
     assert (mean["styled"] - mean["plain"]).abs().max() > 0.02
     ground = scene.background.sh[0, 0] * 0.28209479 + 0.5
-    seen = look.witness.background.sh[0, 0] * 0.28209479 + 0.5
+    seen = look.lighting_scene.background.sh[0, 0] * 0.28209479 + 0.5
     torch.testing.assert_close(seen, mapped(ground, maps.splats[0]), rtol=0, atol=1e-5)
     assert torch.equal(styled.ground.gaussians.means, plain.ground.gaussians.means)
     drawn = rasterize([p for p in parts if p.is_snow], camera_of(scene))
@@ -234,7 +234,9 @@ def test_folded_maps_know_the_splats_that_paint_sky(scene):
     levels[::3] = 5
     maps = StyleMaps(gentle(1)[None], gentle(2), gentle(3))
     by_color, by_sh = (
-        Look(maps, scene.sky, scene, levels, folds=folds).on(scene.parts_for(camera_of(scene)))
+        SceneStyle(maps, scene.sky, scene, levels, folds=folds).on(
+            scene.parts_for(camera_of(scene))
+        )
         for folds in (False, True)
     )
     images = [rasterize(parts, camera_of(scene)).rgb for parts in (by_color, by_sh)]
@@ -243,7 +245,7 @@ def test_folded_maps_know_the_splats_that_paint_sky(scene):
 
 def test_a_view_drawn_on_the_gpu_gets_sh_that_are_folded_there(scene, monkeypatch):
     parts = scene.parts_for(camera_of(scene))
-    look = Look(known_maps(scene), scene.sky, scene, folds=True)
+    look = SceneStyle(known_maps(scene), scene.sky, scene, folds=True)
     expected = look.on(parts, backend="cpu")[0].gaussians.sh
     with pretended_gpu(monkeypatch):
         folded = look.on(parts, backend="cuda")[0].gaussians
@@ -253,7 +255,7 @@ def test_a_view_drawn_on_the_gpu_gets_sh_that_are_folded_there(scene, monkeypatc
 
 
 def test_a_background_of_other_splats_is_mapped_by_colour(scene):
-    look = Look(known_maps(scene), scene.sky, scene, folds=True)
+    look = SceneStyle(known_maps(scene), scene.sky, scene, folds=True)
     some = scene.background.select(torch.arange(10))
     [part] = look.on([PosedGaussians(some)])
     assert part.color_maps is not None and part.gaussians is some

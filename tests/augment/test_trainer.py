@@ -25,7 +25,7 @@ from augment.render.threads import limit_threads
 from augment.scene import Actor, Gaussians, Scene, Track
 from augment.sky import ConstantSky, CubemapSky, cubemap_coordinates
 from augment.views import render_buffers
-from recipes.schema import Output, schema_Recipe
+from recipes.schema import Output, Recipe
 from tests.scenes import camera_ahead, random_gaussians
 
 WIDTH, HEIGHT = 41, 29
@@ -33,7 +33,7 @@ FRAME_NS = 100_000_000
 FRAMES = 4
 HELD_OUT = 2
 GAIN = {"left": 1.0, "right": 0.9}  # the right camera records everything darker
-PLAN = schema_Recipe(output=Output(depth="expected"))
+PLAN = Recipe(output=Output(depth="expected"))
 ARRAYS = ("means", "quats", "scales", "opacities", "sh")
 QUICK = FitConfig(
     steps=120,

@@ -17,9 +17,9 @@ from augment.plan import Bounds, ViewPlan, bound, bound_chunks, make_plan, may_s
 from augment.render.constants import RasterSettings
 from augment.render.reference import half_extents, project_parts
 from augment.scene import Actor, Gaussians, PosedGaussians, Scene, Track
-from augment.timing import lap, stopwatch
+from augment.timing import stopwatch, timed
 from augment.views import render_buffers, render_view
-from recipes.schema import Output, Weather, schema_Recipe
+from recipes.schema import Output, Recipe, Weather
 from recipes.weather import Flood, Snow, Waves
 from tests.scenes import camera_ahead, one_gaussian, random_gaussians, random_pose
 from tests.snow_scenes import box_car, cameras_of, drive, sheet, side_wall
@@ -77,7 +77,7 @@ WEATHERS = {
 def test_what_is_left_out_changes_no_bit(scene, monkeypatch, name):
     surface = "scene" if name == "snow" else "solid"
     output = IMAGES.model_copy(update={"surface": surface})
-    recipe = schema_Recipe(weather=WEATHERS[name], output=output)
+    recipe = Recipe(weather=WEATHERS[name], output=output)
     plan = make_plan(recipe, scene)
     cameras = around(scene.frames[0].cameras["ahead"])
     left_out = 0
@@ -96,7 +96,7 @@ def test_what_is_left_out_changes_no_bit(scene, monkeypatch, name):
 
 def test_actors_keep_their_numbers(scene):
     """The car ahead is the first; looking back, the second is seen and the first is not."""
-    plan = make_plan(schema_Recipe(output=Output(depth="none")), scene)
+    plan = make_plan(Recipe(output=Output(depth="none")), scene)
     front, back = (camera_ahead(80, 46, 40.0, position=(0, 0, 1.5), yaw=yaw) for yaw in (0, np.pi))
     assert plan_view(plan, scene, front).actors == (1,)
     view = render_buffers(scene, back, plan)
@@ -106,14 +106,14 @@ def test_actors_keep_their_numbers(scene):
 
 
 def test_an_actor_that_is_not_there_yet_is_not_drawn(scene):
-    plan = make_plan(schema_Recipe(), scene)
+    plan = make_plan(Recipe(), scene)
     late = dataclasses.replace(cameras_of(scene)[0], timestamp_ns=10**12)
     view = plan_view(plan, scene, late)
     assert view.actors == () and any("4 absent" in step.why for step in view.steps)
 
 
 def test_reasons_are_the_cameras(scene):
-    recipe = schema_Recipe(weather=WEATHERS["both"], output=IMAGES)
+    recipe = Recipe(weather=WEATHERS["both"], output=IMAGES)
     plan = make_plan(recipe, scene)
     up = around(cameras_of(scene)[0])
     views = [plan_view(plan, scene, camera) for camera in up]
@@ -133,7 +133,7 @@ def test_what_the_front_hides_is_recorded(scene):
     wall = side_wall(0.6, (-3.0, 5.0), (-0.5, 3.0))
     near = drive(wall, sheet((-3.0, 5.0), (-4.0, 0.6)), yaw=np.pi / 2)
     near = dataclasses.replace(near, ground=scene.ground, ground_z_m=0.0)
-    plan = make_plan(schema_Recipe(weather=WEATHERS["flood"], output=Output(depth="none")), near)
+    plan = make_plan(Recipe(weather=WEATHERS["flood"], output=Output(depth="none")), near)
     camera = cameras_of(near)[0]
     before, after = plan_view(plan, near, camera), render_buffers(near, camera, plan).view
     assert before.water and {s.name for s in before.steps if s.runs} > {"flood: bed"}
@@ -144,7 +144,7 @@ def test_what_the_front_hides_is_recorded(scene):
 def test_margins_of_the_water_are_within_those_that_views_are_planned_with(scene):
     from augment.plan import _lookers
 
-    plan = make_plan(schema_Recipe(weather=WEATHERS["flood"]), scene)
+    plan = make_plan(Recipe(weather=WEATHERS["flood"]), scene)
     assert plan.flood is not None
     for camera in around(cameras_of(scene)[0]):
         wide, mirror = _lookers(plan, camera)
@@ -221,21 +221,21 @@ def test_an_actor_without_an_opaque_splat_is_never_drawn(scene):
     pose[0, 0, 3] = 5.0
     actor = Actor("ghost", "Car", ghost, Track(torch.tensor([0]), pose), (1.0, 1.0, 1.0))
     haunted = dataclasses.replace(scene, actors=(*scene.actors, actor))
-    view = plan_view(make_plan(schema_Recipe(), haunted), haunted, cameras_of(scene)[0])
+    view = plan_view(make_plan(Recipe(), haunted), haunted, cameras_of(scene)[0])
     assert 5 not in view.actors and 1 in view.actors
 
 
 def test_a_stopwatch_gives_time_to_the_innermost_lap_and_to_nobody_else(monkeypatch):
     now = iter(range(100))
     monkeypatch.setattr("augment.timing.time.perf_counter", lambda: float(next(now)))
-    with lap("before"):
+    with timed("before"):
         pass
     with stopwatch() as seconds:  # 0
-        with lap("outer"):  # 1  # noqa: SIM117 - the inner one is nested
-            with lap("inner"):  # 2
+        with timed("outer"):  # 1  # noqa: SIM117 - the inner one is nested
+            with timed("inner"):  # 2
                 pass  # 3
-        with pytest.raises(ZeroDivisionError), lap("fails"):  # 5
+        with pytest.raises(ZeroDivisionError), timed("fails"):  # 5
             raise ZeroDivisionError  # 6
-    with lap("after"):
+    with timed("after"):
         pass
     assert seconds == {"outer": 2.0, "inner": 1.0, "fails": 1.0}

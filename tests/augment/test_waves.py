@@ -11,7 +11,7 @@ from augment.effects.flood import kernels as waves_kernels
 from augment.effects.flood.waves import (
     FARTHEST_M,
     GRAVITY_MPS2,
-    MOST_STEEPNESS,
+    MAX_STEEPNESS,
     WaveSet,
     displaced_surface,
     make_waves,
@@ -159,9 +159,9 @@ def test_height_scales_amplitudes_and_keeps_the_surface_from_folding(preset, cou
     low = make_waves(Waves(preset=preset, count=count), seed=3, depth_m=0.5)
     high = make_waves(Waves(preset=preset, count=count, height=height), seed=3, depth_m=0.5)
     assert np.allclose(high.amplitudes_m, height * low.amplitudes_m, rtol=1e-14, atol=0)
-    assert high.steepness.sum() <= MOST_STEEPNESS + 1e-12
+    assert high.steepness.sum() <= MAX_STEEPNESS + 1e-12
     natural = high.wavenumbers * high.amplitudes_m  # circular orbits, Q = 1
-    capped = min(1.0, MOST_STEEPNESS / natural.sum())
+    capped = min(1.0, MAX_STEEPNESS / natural.sum())
     assert np.allclose(high.steepness, capped * natural, rtol=1e-12, atol=0)
 
 

@@ -13,7 +13,7 @@ from recipes.errors import RecipeError
 from recipes.files import digest_of, read_files, with_digest
 from recipes.load import dump_recipe, load_recipe
 from recipes.parse import parse_recipe
-from recipes.schema import schema_Recipe
+from recipes.schema import Recipe
 from recipes.weather import Style
 
 
@@ -185,14 +185,14 @@ def test_the_hash_is_of_what_the_files_hold(folder: Path, tmp_path: Path) -> Non
 
 def test_recipes_made_in_python_get_their_digest(folder: Path) -> None:
     image, net = str(folder / "sunset.jpg"), str(folder / "net.safetensors")
-    bare = schema_Recipe(style=Style(image=image, method="gscm", checkpoint=net))
+    bare = Recipe(style=Style(image=image, method="gscm", checkpoint=net))
     full = with_digest(bare)
     assert full.style is not None and bare.style is not None
     expected = digest_of({"checkpoint": sha(b"a network"), "image": sha(b"an image")})
     assert full.style.digest == expected and full.style.image == image
     assert full.hash != bare.hash and with_digest(full) == full
     assert read_files(full.style) == {"image": b"an image", "checkpoint": b"a network"}
-    for plain in (schema_Recipe(), schema_Recipe(style=Style(preset="dusk"))):
+    for plain in (Recipe(), Recipe(style=Style(preset="dusk"))):
         assert with_digest(plain) is plain
     (folder / "net.safetensors").write_bytes(b"another")
     with pytest.raises(RecipeError, match="one of the files has changed since"):
@@ -210,4 +210,4 @@ def test_what_is_written_from_the_folder_reads_back(folder: Path) -> None:
         dump_recipe(recipe.model_copy(update={"style": named})), encoding="utf-8"
     )
     assert load_recipe(folder / "numbers.yaml").resolve(0) == recipe
-    assert schema_Recipe.model_validate(recipe.model_dump()) == recipe
+    assert Recipe.model_validate(recipe.model_dump()) == recipe

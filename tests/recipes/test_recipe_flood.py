@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from recipes.errors import RecipeError
 from recipes.parse import parse_recipe
 from recipes.template import Channels, Choice, Fixed, TripleLine, Uniform
-from recipes.weather import MOST_WAVES, PURE_WATER_PER_M, Flood, Wave, Waves
+from recipes.weather import MAX_WAVES, PURE_WATER_PER_M, Flood, Wave, Waves
 
 
 def problems(text: str) -> tuple[str, ...]:
@@ -79,7 +79,7 @@ def test_a_level_is_enough() -> None:
         ("waves: {components: [3]}", "components[0] = 3: must be a mapping, with direction_deg"),
         ("waves: {components: [null]}", "components[0] = null: must be a mapping, with direction"),
         (
-            f"waves: {{components: [{', '.join(['{}'] * (MOST_WAVES + 1))}]}}",
+            f"waves: {{components: [{', '.join(['{}'] * (MAX_WAVES + 1))}]}}",
             "components = a list of 65: must be a list of up to 64 mappings",
         ),
     ],
@@ -201,7 +201,7 @@ def test_steepness_may_add_up_to_one() -> None:
         (Flood, {"level_m": 1, "reference": "highest"}),
         (Waves, {"count": 2.0}),
         (Waves, {"components": ({"amplitude_m": 0.1},)}),
-        (Waves, {"components": (Wave(amplitude_m=0, wavelength_m=1),) * (MOST_WAVES + 1)}),
+        (Waves, {"components": (Wave(amplitude_m=0, wavelength_m=1),) * (MAX_WAVES + 1)}),
         (Wave, {"amplitude_m": -0.1, "wavelength_m": 1}),
         (Wave, {"amplitude_m": 0.1, "wavelength_m": 0}),
     ],

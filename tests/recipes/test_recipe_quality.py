@@ -11,14 +11,14 @@ from recipes.errors import RecipeError
 from recipes.job import scaled_recipe
 from recipes.load import dump_recipe
 from recipes.parse import parse_recipe
-from recipes.schema import TIERS, Quality, Render, Weather, schema_Recipe
+from recipes.schema import TIERS, Quality, Recipe, Render, Weather
 from recipes.template import ROOT
 from recipes.weather import Flood, Style, Wave, Waves
 
 SNOW_AND_FLOOD = "weather: {snow: {depth_m: 0.1}, flood: {level_m: 0.2}}\n"
 
 
-def resolved(text: str) -> schema_Recipe:
+def resolved(text: str) -> Recipe:
     return parse_recipe(text, source="test", name="test").resolve(0)
 
 
@@ -39,9 +39,9 @@ def test_tiers_set_knobs_to_values_of_the_table() -> None:
 
 
 def test_without_a_wish_nothing_changes() -> None:
-    assert resolved("quality:\n") == resolved("{}") == schema_Recipe(name="test")
-    assert schema_Recipe().quality.words is None
-    assert '"quality"' not in schema_Recipe().canonical_json()
+    assert resolved("quality:\n") == resolved("{}") == Recipe(name="test")
+    assert Recipe().quality.words is None
+    assert '"quality"' not in Recipe().canonical_json()
 
 
 def test_a_word_is_short_for_its_mapping() -> None:
@@ -71,7 +71,7 @@ def test_a_tier_is_numbers_once_resolved(tier: str) -> None:
     recipe = resolved(f"quality: {tier}\n{SNOW_AND_FLOOD}")
     again = resolved(dump_recipe(recipe))
     assert again == recipe and again.hash == recipe.hash
-    built = schema_Recipe(name="test", quality=Quality(tier=tier), weather=recipe.weather)
+    built = Recipe(name="test", quality=Quality(tier=tier), weather=recipe.weather)
     assert knobs.settings_of(built) == knobs.settings_of(recipe)
 
 
@@ -110,7 +110,7 @@ def test_another_scale_leaves_the_rest_free() -> None:
 
 def test_knobs_of_what_is_not_there_have_no_effect() -> None:
     def paths(flood: Flood) -> set[str]:
-        return {knob.path for knob in knobs.knobs_of(schema_Recipe(weather=Weather(flood=flood)))}
+        return {knob.path for knob in knobs.knobs_of(Recipe(weather=Weather(flood=flood)))}
 
     count = "weather.flood.waves.count"
     assert count in paths(Flood(level_m=0.2))
@@ -120,9 +120,9 @@ def test_knobs_of_what_is_not_there_have_no_effect() -> None:
     assert count not in paths(Flood(level_m=0.2, waves=listed))
     for place, has_effect in (("scene", True), ("picture", False)):
         style = Style(preset="dusk", applied_to=place)
-        known = {knob.path for knob in knobs.knobs_of(schema_Recipe(style=style))}
+        known = {knob.path for knob in knobs.knobs_of(Recipe(style=style))}
         assert ("style.evaluated" in known) is has_effect
-    assert "output.jpeg_quality" not in {knob.path for knob in knobs.knobs_of(schema_Recipe())}
+    assert "output.jpeg_quality" not in {knob.path for knob in knobs.knobs_of(Recipe())}
 
 
 @pytest.mark.parametrize(
@@ -146,7 +146,7 @@ def test_bad_wishes_are_refused(text: str, message: str) -> None:
 
 
 def test_fields_are_changed_in_a_copy() -> None:
-    recipe = schema_Recipe(render=Render(near_m=0.5))
+    recipe = Recipe(render=Render(near_m=0.5))
     other = changed(recipe, {"render.scale": 2.0})
     assert (recipe.render.scale, other.render.scale, other.render.near_m) == (1.0, 2.0, 0.5)
     assert is_given(other, "render.near_m") and is_given(other, "render.scale")

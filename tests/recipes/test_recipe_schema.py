@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from recipes.load import load_recipe
 from recipes.parse import parse_recipe
-from recipes.schema import KOSCHMIEDER, Output, Quality, Render, Smog, Weather, schema_Recipe
+from recipes.schema import KOSCHMIEDER, Output, Quality, Recipe, Render, Smog, Weather
 from recipes.template import CHANNEL, RATE, ROOT, FieldSpec, Kind
 from recipes.weather import Flood, Snow, Style, Wave, Waves
 
@@ -21,8 +21,8 @@ FIELDS = [spec for section in ROOT.walk() for spec in section.fields.values()]
 NUMBERS = [spec for spec in FIELDS if spec.kind in (Kind.NUMBER, Kind.WHOLE)] + [CHANNEL, RATE]
 
 
-def smoggy(**smog: Any) -> schema_Recipe:
-    return schema_Recipe(weather=Weather(smog=Smog(**smog)))
+def smoggy(**smog: Any) -> Recipe:
+    return Recipe(weather=Weather(smog=Smog(**smog)))
 
 
 @pytest.mark.parametrize(
@@ -44,14 +44,14 @@ def smoggy(**smog: Any) -> schema_Recipe:
         (Output, {"jpeg_quality": True}),
         (Output, {"image": "gif"}),
         (Output, {"surface": "water"}),
-        (schema_Recipe, {"seed": -1}),
-        (schema_Recipe, {"seed": 2**63}),
-        (schema_Recipe, {"name": "../escape"}),
-        (schema_Recipe, {"name": "a/b"}),
-        (schema_Recipe, {"name": ""}),
-        (schema_Recipe, {"name": "a\n"}),
-        (schema_Recipe, {"version": 2}),
-        (schema_Recipe, {"wether": {}}),
+        (Recipe, {"seed": -1}),
+        (Recipe, {"seed": 2**63}),
+        (Recipe, {"name": "../escape"}),
+        (Recipe, {"name": "a/b"}),
+        (Recipe, {"name": ""}),
+        (Recipe, {"name": "a\n"}),
+        (Recipe, {"version": 2}),
+        (Recipe, {"wether": {}}),
     ],
 )
 def test_the_models_are_strict_and_closed(model: type, data: dict) -> None:
@@ -93,12 +93,12 @@ def test_models_are_immutable() -> None:
 def test_the_hash_is_pinned() -> None:
     """Output folders are resumed by it: it changes only with the format."""
     assert smoggy(visibility_m=300).hash == "272920d93c3e113c"
-    assert schema_Recipe().hash == "8553a2737c7b8e42"
+    assert Recipe().hash == "8553a2737c7b8e42"
     clean = Output(lidar=True)
     flooded, snowy = Weather(flood=Flood(level_m=0.2)), Weather(snow=Snow(depth_m=0.1))
-    assert schema_Recipe(weather=flooded, output=clean).hash == "efb12819c12b5307"
-    assert schema_Recipe(weather=snowy, output=clean).hash == "0b005b8e06d7eedd"
-    assert schema_Recipe(style=Style(preset="dusk")).hash == "535470ef48aaa9f4"
+    assert Recipe(weather=flooded, output=clean).hash == "efb12819c12b5307"
+    assert Recipe(weather=snowy, output=clean).hash == "0b005b8e06d7eedd"
+    assert Recipe(style=Style(preset="dusk")).hash == "535470ef48aaa9f4"
 
 
 def test_recipes_from_before_floods_keep_their_hashes() -> None:
@@ -135,7 +135,7 @@ def test_recipes_from_before_snow_keep_their_hashes() -> None:
     recipes = {name: load_recipe(name).resolve(0).model_copy(update=old) for name in before}
     assert {name: recipe.hash for name, recipe in recipes.items()} == before
     first = Output(surface="first", lidar=True)
-    flooded = schema_Recipe(weather=Weather(flood=Flood(level_m=0.2)), output=first)
+    flooded = Recipe(weather=Weather(flood=Flood(level_m=0.2)), output=first)
     assert flooded.hash == "cac7905aab0116ca"
 
 
@@ -155,22 +155,22 @@ def test_auto_weathers_lidar_where_the_depth_images_show_a_surface_of_the_weathe
         (Weather(flood=flood), "first", "weather", None),
         (Weather(flood=flood), "scene", "clean", "water in images, not in depth or sweeps"),
     ):
-        recipe = schema_Recipe(weather=weather, output=Output(surface=surface))
+        recipe = Recipe(weather=weather, output=Output(surface=surface))
         said = recipe.lidar_note(recipe.lidar)
         expected = note and f"{note} (output: {{lidar: auto, surface: {surface}}})"
         assert (recipe.lidar, said) == (lidar, expected), (weather, surface)
-        plain = schema_Recipe(weather=weather, output=Output(surface=surface, lidar=True))
+        plain = Recipe(weather=weather, output=Output(surface=surface, lidar=True))
         assert (recipe.hash == plain.hash) == (lidar == "clean")
         for kind in (False, "weather"):
-            other = schema_Recipe(weather=weather, output=Output(surface=surface, lidar=kind))
+            other = Recipe(weather=weather, output=Output(surface=surface, lidar=kind))
             assert other.lidar == (kind or None) and other.hash not in (recipe.hash, plain.hash)
-    clean = schema_Recipe(weather=Weather(flood=flood, snow=snow), output=Output(lidar=True))
+    clean = Recipe(weather=Weather(flood=flood, snow=snow), output=Output(lidar=True))
     assert clean.lidar_note("clean") == (
         f"{snow_depth} depth, not in sweeps; water in images, not in depth or sweeps "
         "(output: {lidar: true, surface: solid})"
     )
     assert clean.lidar_note(None) is None
-    forced = schema_Recipe(
+    forced = Recipe(
         weather=Weather(snow=snow), output=Output(lidar="weather", surface="scene", depth="none")
     )
     assert forced.lidar_note("weather") is None  # there is no depth to disagree
@@ -264,14 +264,12 @@ def test_every_field_changes_the_hash() -> None:
     flood = Flood(level_m=0.2, waves=Waves(components=(wave,)))
     smog, snow = Smog(visibility_m=300), Snow(depth_m=0.1)
     weather = Weather(smog=smog, flood=flood, snow=snow)
-    base = schema_Recipe(weather=weather, style=Style(image="a.png", digest="0" * 64))
+    base = Recipe(weather=weather, style=Style(image="a.png", digest="0" * 64))
     cleared = flood.model_copy(update={"absorption_per_m": (1.0, 1.0, 1.0)})
     hashes = {base.hash, smoggy(extinction_per_m=0.01).hash}
-    hashes.add(schema_Recipe(weather=Weather(smog=smog, flood=cleared, snow=snow)).hash)
+    hashes.add(Recipe(weather=Weather(smog=smog, flood=cleared, snow=snow)).hash)
     hashes.add(base.model_copy(update={"quality": Quality(max_flip=0.1, settled=True)}).hash)
-    hashes |= {
-        schema_Recipe(weather=weather, style=style).hash for style in (None, Style(preset="dusk"))
-    }
+    hashes |= {Recipe(weather=weather, style=style).hash for style in (None, Style(preset="dusk"))}
     changes = {path: value for path, value in OTHER.items() if value is not None}
     for path, value in changes.items():
         data = base.model_dump()
@@ -281,26 +279,23 @@ def test_every_field_changes_the_hash() -> None:
             key = section.removesuffix("[]")
             inner = inner[key] if key == section else inner[key][0]
         inner[name] = value
-        hashes.add(schema_Recipe.model_validate(data).hash)
+        hashes.add(Recipe.model_validate(data).hash)
     assert len(hashes) == len(changes) + 6
-    scene = schema_Recipe(output=Output(surface="scene"))
-    assert (
-        len({scene.hash, schema_Recipe().hash, schema_Recipe(output=Output(surface="first")).hash})
-        == 3
-    )
+    scene = Recipe(output=Output(surface="scene"))
+    assert len({scene.hash, Recipe().hash, Recipe(output=Output(surface="first")).hash}) == 3
 
 
 def test_numbers_for_the_manifest() -> None:
-    clear = schema_Recipe().weather_numbers()
+    clear = Recipe().weather_numbers()
     assert clear["smog_extinction_per_m"] == 0 and math.isnan(clear["smog_scale_height_m"])
     thick = smoggy(extinction_per_m=0.02, scale_height_m=50).weather_numbers()
     assert (thick["smog_extinction_per_m"], thick["smog_scale_height_m"]) == (0.02, 50.0)
-    flooded = schema_Recipe(weather=Weather(flood=Flood(level_m=0.2))).weather_numbers()
+    flooded = Recipe(weather=Weather(flood=Flood(level_m=0.2))).weather_numbers()
     assert clear.keys() == thick.keys() == flooded.keys()
     names = ("flood_level_m", "flood_turbidity_ntu", "flood_wave_height")
     assert all(math.isnan(clear[name]) and math.isnan(thick[name]) for name in names)
     assert [flooded[name] for name in names] == [0.2, 50.0, 1.0]
-    snowy = schema_Recipe(weather=Weather(snow=Snow(depth_m=0.1, coverage=0.7))).weather_numbers()
+    snowy = Recipe(weather=Weather(snow=Snow(depth_m=0.1, coverage=0.7))).weather_numbers()
     assert snowy.keys() == clear.keys() and all(math.isnan(snowy[name]) for name in names)
     assert (snowy["snow_depth_m"], snowy["snow_coverage"]) == (0.1, 0.7)
     absent = [
@@ -310,25 +305,21 @@ def test_numbers_for_the_manifest() -> None:
 
 
 def test_a_style_for_the_manifest() -> None:
-    assert schema_Recipe().weather_numbers()["style_strength"] == 0
-    assert schema_Recipe().style_words() == {"style": None, "style_method": None}
-    dusk = schema_Recipe(style=Style(preset="dusk", strength=0.5))
+    assert Recipe().weather_numbers()["style_strength"] == 0
+    assert Recipe().style_words() == {"style": None, "style_method": None}
+    dusk = Recipe(style=Style(preset="dusk", strength=0.5))
     assert dusk.weather_numbers()["style_strength"] == 0.5
     assert dusk.style_words() == {"style": "dusk", "style_method": "mkl"}
-    photo = schema_Recipe(style=Style(image="/photos/sunset 3.jpg", method="reinhard"))
+    photo = Recipe(style=Style(image="/photos/sunset 3.jpg", method="reinhard"))
     assert photo.style_words() == {"style": "sunset 3.jpg", "style_method": "reinhard"}
 
 
 def test_numbers_of_a_flood_that_says_more() -> None:
     listed = Waves(components=(Wave(amplitude_m=0.1, wavelength_m=2),), height=2)
-    one = schema_Recipe(
-        weather=Weather(flood=Flood(level_m=0, absorption_per_m=(1, 2, 3), waves=listed))
-    )
+    one = Recipe(weather=Weather(flood=Flood(level_m=0, absorption_per_m=(1, 2, 3), waves=listed)))
     assert math.isnan(one.weather_numbers()["flood_turbidity_ntu"])
     assert math.isnan(one.weather_numbers()["flood_wave_height"]), "no factor applies"
-    two = schema_Recipe(
-        weather=Weather(flood=Flood(level_m=0, turbidity_ntu=0, waves=Waves(height=0.5)))
-    )
+    two = Recipe(weather=Weather(flood=Flood(level_m=0, turbidity_ntu=0, waves=Waves(height=0.5))))
     assert two.weather_numbers()["flood_turbidity_ntu"] == 0
     assert two.weather_numbers()["flood_wave_height"] == 0.5
 

@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from recipes.errors import RecipeError
 from recipes.load import dump_recipe
 from recipes.parse import parse_recipe
-from recipes.schema import schema_Recipe
+from recipes.schema import Recipe
 from recipes.template import Choice, Fixed, RecipeTemplate, Uniform
 from recipes.weather import Style, style_preset_names, style_preset_text
 
@@ -207,7 +207,7 @@ def test_a_preset_reads_back_equal() -> None:
     assert "\nstyle:\n  image: null\n  preset: dusk\n" in text
     again = template(text).resolve(0)
     assert again == recipe and again.hash == recipe.hash
-    assert template(dump_recipe(schema_Recipe())).resolve(0) == schema_Recipe()
+    assert template(dump_recipe(Recipe())).resolve(0) == Recipe()
 
 
 def test_the_presets_hold_statistics_of_land_and_of_sky() -> None:

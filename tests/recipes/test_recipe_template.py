@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from recipes.errors import RecipeError
 from recipes.load import dump_recipe
 from recipes.parse import parse_recipe
-from recipes.schema import Output, Render, Smog, Weather, schema_Recipe
+from recipes.schema import Output, Recipe, Render, Smog, Weather
 from recipes.template import Draws, Fixed, RecipeTemplate
 from recipes.weather import Flood, Snow, SnowLight, SnowWind, Wave, Waves
 
@@ -36,7 +36,7 @@ def template(text: str = TEXT) -> RecipeTemplate:
     return parse_recipe(text, source="foggy.yaml")
 
 
-def smog_of(recipe: schema_Recipe) -> Smog:
+def smog_of(recipe: Recipe) -> Smog:
     assert recipe.weather.smog is not None
     return recipe.weather.smog
 
@@ -160,7 +160,7 @@ def test_templates_and_errors_survive_pickling() -> None:
     assert str(error) == "a:1: x\na:2: y" and error.problems == ("a:1: x", "a:2: y")
 
 
-def read_back(recipe: schema_Recipe) -> schema_Recipe:
+def read_back(recipe: Recipe) -> Recipe:
     again = parse_recipe(dump_recipe(recipe), source="dump", name="not-this")
     assert again.variants == 1
     return again.resolve(0)
@@ -198,7 +198,7 @@ PINNED_FLOOD = (0.1369834527, (1.79031723, 3.580634461, 5.370951691))
 PINNED_WAVES = (0.01428204438, 0.1, 0.01068017609)
 
 
-def flood_of(recipe: schema_Recipe) -> Flood:
+def flood_of(recipe: Recipe) -> Flood:
     assert recipe.weather.flood is not None
     return recipe.weather.flood
 
@@ -300,7 +300,7 @@ smogs = st.builds(
     model=st.sampled_from(["per_gaussian", "deferred"]),
 )
 recipes = st.builds(
-    schema_Recipe,
+    Recipe,
     name=st.from_regex(r"\A[A-Za-z0-9][A-Za-z0-9._-]{0,63}\Z"),
     seed=st.integers(0, 2**63 - 1),
     variant=st.integers(0, 2**31 - 1),
@@ -321,6 +321,6 @@ recipes = st.builds(
 
 @settings(max_examples=100, deadline=None, derandomize=True)
 @given(recipes)
-def test_any_recipe_reads_back_equal(recipe: schema_Recipe) -> None:
+def test_any_recipe_reads_back_equal(recipe: Recipe) -> None:
     again = read_back(recipe)
     assert again == recipe and again.hash == recipe.hash

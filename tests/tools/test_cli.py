@@ -261,10 +261,10 @@ def test_help_loads_neither_torch_nor_the_kernels():
 
 
 def test_a_picture_of_many_variants_shows_some_from_end_to_end():
-    from tools.pictures import MOST_SHOWN, _shown
+    from tools.pictures import MAX_SHOWN, _shown
 
-    few = [("s", f"{i:03d}") for i in range(MOST_SHOWN)]
+    few = [("s", f"{i:03d}") for i in range(MAX_SHOWN)]
     assert _shown(few) == few
     many = [("s", f"{i:03d}") for i in range(100)]
-    assert len(_shown(many)) <= MOST_SHOWN and _shown(many)[0] == many[0]
+    assert len(_shown(many)) <= MAX_SHOWN and _shown(many)[0] == many[0]
     assert int(_shown(many)[-1][1]) >= 90

@@ -7,7 +7,7 @@ import dataclasses
 import pytest
 
 from augment.scene import Scene
-from recipes.schema import Output, Smog, Weather, schema_Recipe
+from recipes.schema import Output, Recipe, Smog, Weather
 from recipes.weather import Snow, Style
 from tests.snow_scenes import box_car, drive, sheet
 from tools import pass_times
@@ -30,7 +30,7 @@ def explained(monkeypatch, tmp_path, scene: Scene, recipe: str, **options):
 
 
 def test_shares_of_a_frame_add_up(scene):
-    times = measure_passes(schema_Recipe(output=Output(depth="none", labels=False)), scene)
+    times = measure_passes(Recipe(output=Output(depth="none", labels=False)), scene)
     assert times.views == 2 and times.frame_ms > 0 and times.folded == {} and times.once_s == {}
     assert sum(times.share.values()) == pytest.approx(1)
     assert {"rasterise", "sky", "view plan", "8 bits", "everything else"} <= set(times.share)
@@ -41,7 +41,7 @@ def test_what_runs_inside_the_rasteriser_is_measured_against_the_view_without_it
     weather = Weather(
         smog=Smog(visibility_m=50), snow=Snow(depth_m=0.1, cell_m=0.2, shading="per_pixel")
     )
-    recipe = schema_Recipe(style=Style(preset="dusk"), weather=weather)
+    recipe = Recipe(style=Style(preset="dusk"), weather=weather)
     others = without_folded(recipe, scene)
     assert set(others) == {
         "style on the scene",
@@ -53,7 +53,7 @@ def test_what_runs_inside_the_rasteriser_is_measured_against_the_view_without_it
     assert others["smog per Gaussian"].weather == weather.model_copy(update={"smog": None})
     plain = others["snow: light per pixel"].weather.snow
     assert plain is not None and plain.shading == "per_splat" and plain.depth_m == 0.1
-    deferred = schema_Recipe(weather=Weather(smog=Smog(visibility_m=50, model="deferred")))
+    deferred = Recipe(weather=Weather(smog=Smog(visibility_m=50, model="deferred")))
     assert without_folded(deferred, scene) == {}
 
 

@@ -21,7 +21,7 @@ from augment.sky import ConstantSky
 from tests.scenes import camera_ahead, one_gaussian
 from tools.drawing import linear_ticks, log_ticks, short_number
 from tools.fit_curves import HEIGHT, WIDTH, draw_curves
-from tools.fit_pictures import CELL_WIDTH, MOST_ROWS, choose_views, draw_views
+from tools.fit_pictures import CELL_WIDTH, MAX_ROWS, choose_views, draw_views
 from tools.fit_report import CURVES, PICTURES, TRAINING_PICTURES, evaluate_views, write_report
 from tools.fit_scores import ViewScore, mean_scores, means_by_camera, render_recorded
 
@@ -262,7 +262,7 @@ def fake_scores(cameras: int, each: int) -> list[ViewScore]:
 )
 def test_chosen_views_are_few_and_spread(cameras, each, frames):
     chosen = choose_views(fake_scores(cameras, each))
-    assert len(chosen) == min(MOST_ROWS, cameras * len(frames))
+    assert len(chosen) == min(MAX_ROWS, cameras * len(frames))
     assert [s.key.frame for s in chosen if s.key.camera == "camera 0"] == frames
 
 

@@ -240,7 +240,7 @@ def test_an_output_of_any_size_has_a_small_page(tmp_path) -> None:
     written = write_report(
         write_output(tmp_path, [r | {"image_path": "missing.png"} for r in rows])
     )
-    assert written.size + BUDGET * 4 / 3 < report.LARGEST_PAGE
+    assert written.size + BUDGET * 4 / 3 < report.MAX_PAGE
     page = Page(written.path.read_text(encoding="utf-8"))
     assert "and 160 more scenes with 60 images, 160 failed" in page.text
     assert page.tags["tr"] < 150 and page.tags["svg"] == 24
@@ -248,7 +248,7 @@ def test_an_output_of_any_size_has_a_small_page(tmp_path) -> None:
 
 def test_pictures_give_way_where_a_page_grows_too_large(street, monkeypatch) -> None:
     whole = write_report(street).size
-    monkeypatch.setattr(report, "LARGEST_PAGE", whole - 1)
+    monkeypatch.setattr(report, "MAX_PAGE", whole - 1)
     smaller = write_report(street)
     assert smaller.size < whole
     assert 12 < Page(smaller.path.read_text(encoding="utf-8")).tags["img"] <= 24

@@ -15,7 +15,7 @@ from tests.tools.report_outputs import make_row, street_rows, write_output
 from tools import report_charts, report_html, report_labels, report_pick, report_pictures
 from tools import report_summary as summary
 from tools.report_files import ReportFiles
-from tools.report_gallery import BUDGET, MOST_IMAGES, Shares
+from tools.report_gallery import BUDGET, MAX_IMAGES, Shares
 from tools.report_numbers import byte_size, count, percent, quantity_of, short
 from tools.report_weather import find_draws, spreads, weather_text
 
@@ -53,7 +53,7 @@ def test_all_that_was_not_made_here_is_escaped() -> None:
     made = report_html.tag("p", "<b>", report_html.tag("i", 3), title='"x"', hidden=True, id=None)
     assert made == '<p title="&quot;x&quot;" hidden>&lt;b&gt;<i>3</i></p>'
     assert report_html.text("a\0\u202eb\udc80") == "a\ufffd\ufffdb\ufffd"
-    assert len(report_html.text("x" * 10_000)) == report_html.LONGEST_TEXT
+    assert len(report_html.text("x" * 10_000)) == report_html.MAX_TEXT
 
 
 def test_a_histogram_counts_every_image_once() -> None:
@@ -61,7 +61,7 @@ def test_a_histogram_counts_every_image_once() -> None:
     values, images = rng.lognormal(0, 2, 200), rng.integers(1, 9, 200)
     shape = report_charts.histogram(values, images)
     assert shape.log and shape.counts.sum() == images.sum()
-    assert (np.diff(shape.edges) > 0).all() and len(shape.counts) <= report_charts.MOST_BINS
+    assert (np.diff(shape.edges) > 0).all() and len(shape.counts) <= report_charts.MAX_BINS
     assert not report_charts.histogram(values, images, linear=True).log
 
 
@@ -163,14 +163,14 @@ def test_pictures_stay_within_their_bytes() -> None:
 
 
 def test_any_number_of_pictures_fits_the_budget() -> None:
-    for images in range(MOST_IMAGES + 1):
+    for images in range(MAX_IMAGES + 1):
         shares = Shares.of(images)
         large, buffers = shares.places * shares.variants, 4 * shares.samples
         assert large + buffers + shares.thumbnails == images
         assert large != 1 and shares.thumbnails >= 0
         total = large * shares.large_bytes + buffers * shares.buffer_bytes
         assert total + shares.thumbnails * shares.small_bytes <= BUDGET
-    assert Shares.of(MOST_IMAGES).small_bytes > 2000
+    assert Shares.of(MAX_IMAGES).small_bytes > 2000
 
 
 def test_depth_goes_from_near_to_far_and_none_is_grey() -> None:

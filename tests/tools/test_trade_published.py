@@ -7,7 +7,7 @@ from tools.trade_docs import DOCS, PAGE, SCENES, START, document, read_tables
 from tools.trade_text import trade_markdown
 from tools.trade_tiers import INVISIBLE_FLIP, invisible_evidence, tiers_from
 
-MOST_BYTES = 150_000
+MAX_BYTES = 150_000
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +29,7 @@ def test_the_document_agrees_with_the_tables(tables):
     assert PAGE.read_text() == document(PAGE.read_text(), tables)
     for name, one in zip(SCENES, tables, strict=True):
         assert (DOCS / "trade" / f"{name}.md").read_text() == trade_markdown(one)
-        assert (DOCS / "trade" / f"{name}.json").stat().st_size < MOST_BYTES
+        assert (DOCS / "trade" / f"{name}.json").stat().st_size < MAX_BYTES
         assert (DOCS / "images" / f"trade_{name}.png").is_file()
 
 

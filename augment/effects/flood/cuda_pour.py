@@ -40,7 +40,7 @@ def _known_of(camera: Camera) -> tuple[Tensor, int]:
 # ---- cuda pour -----------------------------------------------------------------------------------
 
 LANES = 512  # pixels of a program
-MOST_OTHERS = 4  # buffers that the kernel joins beside alpha and expected depth
+MAX_OTHERS = 4  # buffers that the kernel joins beside alpha and expected depth
 
 
 def find_water(
@@ -65,7 +65,7 @@ def find_water(
     return water.view(torch.bool), shown.max()
 
 
-def pour(
+def composite_water(
     rgb: Float[Tensor, "H W 3"],
     alpha: Float[Tensor, "H W"],
     camera: Camera,
@@ -76,7 +76,7 @@ def pour(
 ) -> None:
     """Water into rgb, and the first `dry` rows of `sky`, finished, where rays do not fall."""
     launch(
-        kernels.pour,
+        kernels.composite_water,
         (-(-alpha.numel() // LANES),),
         rows_on_gpu(camera),
         alpha,
@@ -104,14 +104,14 @@ def join(
     """Buffers of two layers as one scene's, in place: alpha, the pair of expected depths, and pairs
     of which those of the layer that covers more of a pixel are kept.
     """
-    assert len(others) <= MOST_OTHERS
+    assert len(others) <= MAX_OTHERS
     (rows, columns), (own_rows, own_columns) = window.overlap(alpha)
     wide, count = columns.stop - columns.start, 0
     if wide > 0:
         count = wide * max(rows.stop - rows.start, 0)
     pairs = [tuple(part.view(torch.int32) for part in pair) for pair in others]
     nothing = (alpha, behind_alpha)  # stands where no pointer is looked at
-    pairs += [nothing] * (MOST_OTHERS - len(others))
+    pairs += [nothing] * (MAX_OTHERS - len(others))
     launch(
         kernels.join,
         (-(-count // LANES),),

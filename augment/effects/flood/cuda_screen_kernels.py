@@ -135,11 +135,11 @@ def fill_field(
 # ------------------------------------------------------------------------------------------------
 # What Triton kernels read of the rows of an image that sees the water's plane (`plane_rows`)
 
-_CUDA_ROWS_KERNELS_BEGIN, _CUDA_ROWS_KERNELS_END = (
+_ROW_BEGIN, _ROW_END = (
     tl.constexpr(plane_rows.BEGIN),
     tl.constexpr(plane_rows.END),
 )
-_CUDA_ROWS_KERNELS_ANCHOR, _FALL = tl.constexpr(plane_rows.ANCHOR), tl.constexpr(plane_rows.FALL)
+_ROW_ANCHOR, _FALL = tl.constexpr(plane_rows.ANCHOR), tl.constexpr(plane_rows.FALL)
 _ROW = tl.constexpr(plane_rows.ROW)
 
 
@@ -147,12 +147,8 @@ _ROW = tl.constexpr(plane_rows.ROW)
 def falls(rows, row, column, mask):
     """Whether the rays of pixels fall, of an image with these rows [H, 4]."""
     line = rows + row * _ROW
-    begin = tl.load(line + _CUDA_ROWS_KERNELS_BEGIN, mask=mask, other=0)
-    return (
-        mask
-        & (column >= begin)
-        & (column < tl.load(line + _CUDA_ROWS_KERNELS_END, mask=mask, other=0))
-    )
+    begin = tl.load(line + _ROW_BEGIN, mask=mask, other=0)
+    return mask & (column >= begin) & (column < tl.load(line + _ROW_END, mask=mask, other=0))
 
 
 @triton.jit
@@ -160,7 +156,7 @@ def fall_of(rows, row, column, per_column, mask):
     """World z of falling rays, unit z in the camera. per_column: its change; -1 outside mask."""
     line = rows + row * _ROW
     nearest = tl.load(line + _FALL, mask=mask, other=0).to(tl.float32, bitcast=True)
-    away = column - tl.load(line + _CUDA_ROWS_KERNELS_ANCHOR, mask=mask, other=0)
+    away = column - tl.load(line + _ROW_ANCHOR, mask=mask, other=0)
     return tl.where(mask, nearest + away.to(tl.float32) * per_column, -1.0)
 
 
@@ -186,7 +182,7 @@ def find_water(rows, alpha, width, count, shown, water, LANES: tl.constexpr):
 
 
 @triton.jit(do_not_specialize=["dry", "left", "top", "right", "bottom"])
-def pour(
+def composite_water(
     rows, alpha, color, sky, dry, left, top, right, bottom, width, count, rgb, LANES: tl.constexpr
 ):
     """rgb [H, W, 3] += (1 - alpha) color where rays fall; elsewhere it becomes that of `sky`.
@@ -260,7 +256,7 @@ _COVERED, _THICKNESS_M = tl.constexpr(float(cpu.COVERED)), tl.constexpr(float(cp
 _THICKNESS, _HIDDEN_PX = tl.constexpr(float(cpu.THICKNESS)), tl.constexpr(float(cpu.HIDDEN_PX))
 _NEAR_M, _AGREEING = tl.constexpr(float(cpu.NEAR_M)), tl.constexpr(float(cpu.AGREEING))
 _EDGE, _NUDGE = tl.constexpr(float(cpu.EDGE)), tl.constexpr(float(cpu.NUDGE))
-_FARTHEST, _MOST_STEPS = tl.constexpr(float(cpu.FARTHEST)), tl.constexpr(cpu.MOST_STEPS)
+_FARTHEST, _MAX_STEPS = tl.constexpr(float(cpu.FARTHEST)), tl.constexpr(cpu.MAX_STEPS)
 _AT_ONCE = tl.constexpr(4)  # steps before a program asks whether any of its rays still goes on
 _INFINITE = tl.constexpr(float("inf"))
 
@@ -436,7 +432,7 @@ def trace(
     clean, met = shown, shown & (t < 0.0)
     cells, cells_across = pyramid_rows.to(tl.float32), pyramid_columns.to(tl.float32)
     steps = 0
-    while (tl.max((t < stop).to(tl.int32), 0) > 0) & (steps < _MOST_STEPS):
+    while (tl.max((t < stop).to(tl.int32), 0) > 0) & (steps < _MAX_STEPS):
         for _ in tl.static_range(_AT_ONCE):
             t, stop, size, hidden, clean, met = _step(
                 pyramid, cells, cells_across, x0, y0, dx, dy, inverse_x, inverse_y, near, change,

@@ -24,7 +24,7 @@ from augment.effects.flood.cuda_screen_kernels import fall_of, falls
 # load nothing and get zeros.
 
 LEVELS = tl.constexpr(layer_lookup.MIP_LEVELS)
-_LEAST_DEPTH = tl.constexpr(layer_lookup.LEAST_DEPTH)
+_MIN_DEPTH = tl.constexpr(layer_lookup.MIN_DEPTH)
 _CX, _CY, _WIDTH, _HEIGHT = (tl.constexpr(k) for k in (18, 19, 20, 21))
 
 
@@ -42,7 +42,7 @@ def dot(numbers, x, y, z):
 @triton.jit
 def project(view, x, y, z):
     """Column and row; huge for what is behind the camera."""
-    inverse = 1.0 / tl.maximum(dot(view + 6, x, y, z), _LEAST_DEPTH)
+    inverse = 1.0 / tl.maximum(dot(view + 6, x, y, z), _MIN_DEPTH)
     column = dot(view, x, y, z) * inverse + tl.load(view + _CX)
     return column, dot(view + 3, x, y, z) * inverse + tl.load(view + _CY)
 
@@ -211,18 +211,16 @@ AXES, LENS, BED, MIRROR, FRONT, MEDIUM, LIMITS = 0, 9, 14, 36, 58, 80, 94
 
 _AXES, _LENS, _BED = tl.constexpr(AXES), tl.constexpr(LENS), tl.constexpr(BED)
 _MIRROR, _FRONT = tl.constexpr(MIRROR), tl.constexpr(FRONT)
-_CUDA_WATER_KERNELS_HEIGHT, _INDEX, _EXTINCTION, _RGB = (
-    tl.constexpr(MEDIUM + k) for k in (0, 1, 3, 6)
-)
+_PLANE_HEIGHT, _INDEX, _EXTINCTION, _RGB = (tl.constexpr(MEDIUM + k) for k in (0, 1, 3, 6))
 _SMOG, _SMOG_ABOVE, _AIRLIGHT = (tl.constexpr(MEDIUM + k) for k in (9, 10, 11))
 _COVER, _SMOOTH = tl.constexpr(LIMITS), tl.constexpr(LIMITS + 1)
 
 _FARTHEST = tl.constexpr(water_surface.FARTHEST)
-_LEAST_COSINE = tl.constexpr(water_surface.LEAST_COSINE)
+_MIN_COSINE = tl.constexpr(water_surface.MIN_COSINE)
 _STEEPEST = tl.constexpr(water_surface.STEEPEST)
 _SOLID = tl.constexpr(layer_lookup.SOLID_ALPHA)
 _BED_STEPS, _SETTLED = tl.constexpr(refraction.BED_STEPS), tl.constexpr(refraction.SETTLED_M)
-_OPAQUE = tl.constexpr(refraction.MOST_OPTICAL_DEPTH)
+_OPAQUE = tl.constexpr(refraction.MAX_OPTICAL_DEPTH)
 _EDGE, _FAINT = tl.constexpr(reflection_lookup.EDGE), tl.constexpr(reflection_lookup.FAINT)
 _MATCH_M = tl.constexpr(reflection_lookup.MATCH_M)
 _MATCH_SHARE = tl.constexpr(reflection_lookup.MATCH_SHARE)
@@ -250,12 +248,12 @@ def _facet(sx, sy, vx, vy, vz, index, SCHLICK: tl.constexpr):
     nz = tl.rsqrt(sx * sx + sy * sy + 1.0)
     nx, ny = sx * nz, sy * nz
     cosine = nx * vx + ny * vy + nz * vz
-    c = clamp(cosine, _LEAST_COSINE, 1.0)
+    c = clamp(cosine, _MIN_COSINE, 1.0)
     ratio = 1.0 / index
     inside = tl.sqrt(tl.maximum(1.0 - (1.0 - c * c) * ratio * ratio, 0.0))
     twice = cosine + cosine
     x, y = twice * nx - vx, twice * ny - vy
-    z = tl.maximum(twice * nz - vz, _LEAST_COSINE)
+    z = tl.maximum(twice * nz - vz, _MIN_COSINE)
     unit = tl.rsqrt(x * x + y * y + z * z)
     share = _reflectance(c, inside, index, SCHLICK)
     return nx, ny, nz, c, inside, share, x * unit, y * unit, z * unit
@@ -267,7 +265,7 @@ def _refract(nx, ny, nz, c, inside, vx, vy, vz, index):
     ratio = 1.0 / index
     bend = c * ratio - inside
     x, y = bend * nx - vx * ratio, bend * ny - vy * ratio
-    z = tl.maximum(vz * ratio - bend * nz, _LEAST_COSINE)
+    z = tl.maximum(vz * ratio - bend * nz, _MIN_COSINE)
     steep = 1.0 / z
     return x * steep, y * steep, tl.sqrt(x * x + y * y + z * z) * steep
 
@@ -403,7 +401,7 @@ def shade(
     sum_g = tl.where(meets, tl.where(smog > 0.0, fog_g, green), 0.0)
     sum_b = tl.where(meets, tl.where(smog > 0.0, fog_b, blue), 0.0)
     if tl.max(shown.to(tl.int32), 0) > 0:
-        eye = tl.load(numbers + _CUDA_WATER_KERNELS_HEIGHT)
+        eye = tl.load(numbers + _PLANE_HEIGHT)
         index = tl.load(numbers + _INDEX)
         # The ray, and where it meets the plane.
         dz = fall_of(rows, i, j, tl.load(numbers + _LENS + 4), shown)

@@ -61,7 +61,7 @@ from augment.render.rasterize import rasterize
 from augment.render.threads import kernel_threads
 from augment.scene import PosedGaussians
 from augment.sky import Sky, sample_at
-from augment.timing import lap
+from augment.timing import timed
 
 # ------------------------------------------------------------------------------------------------
 # Putting the layers of a flooded view together: the torch definition, and the way to kernels
@@ -92,7 +92,7 @@ def find_water(
     return share > 0.5, float(share.max())
 
 
-def pour(
+def composite_water(
     front: RenderOutput,
     camera: Camera,
     window: Window,
@@ -124,7 +124,7 @@ def pour(
         if dry:
             above = camera.cropped(0, 0, camera.width, dry)
             part = composite_sky(rgb[:dry], alpha[:dry], above, sky, smog=smog, backend=backend)
-        cuda_pour.pour(rgb, alpha, camera, window, color, part, dry)
+        cuda_pour.composite_water(rgb, alpha, camera, window, color, part, dry)
         return rgb
     dry = _dry_rows(camera)
     if dry:
@@ -138,7 +138,7 @@ def pour(
             wet = falling(camera.cropped(0, window.top, camera.width, dry - window.top))
             rgb[window.top : dry][wet] = shared[wet]
     with kernel_threads(ROWS):
-        pour_kernels.pour(
+        pour_kernels.composite_water(
             *_rays(window.of(camera)),
             window.top,
             window.left,
@@ -162,7 +162,7 @@ def _rays(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return u, v, np.ascontiguousarray(camera.world_from_camera[2, :3].numpy())
 
 
-def both_sides(
+def merge_depths(
     front: RenderOutput,
     behind: RenderOutput,
     window: Window,
@@ -275,13 +275,13 @@ def _into_air(directions: Float[Tensor, "*B 3"], index: float) -> Float[Tensor, 
 
 COARSE = 0.25  # resolution of the mirrored view that fills what the screen does not show
 REACH_SIGMAS = 3.0  # slopes of the waves that the margins allow for
-MOST_MARGIN = 0.25  # of the image's longer side
+MAX_MARGIN = 0.25  # of the image's longer side
 STEEPEST = 0.65  # fall of the ray whose bed refraction moves the most in the image
-MOST_SHIFT = 0.12  # of the image's height
+MAX_SHIFT = 0.12  # of the image's height
 
 
 @dataclass(frozen=True, eq=False)
-class Painter:
+class LayerRenderer:
     """Draws the parts of a scene on one side of a level plane.
 
     smog: blended per Gaussian. smog_on_buffers: applied to finished layers; at most one is set.
@@ -350,7 +350,7 @@ def as_layer(camera: Camera, raster: RenderOutput) -> Layer:
 
 
 def render_flooded(
-    painter: Painter, camera: Camera, medium: FloodMedium, buffers: frozenset[str]
+    painter: LayerRenderer, camera: Camera, medium: FloodMedium, buffers: frozenset[str]
 ) -> FloodedImage | None:
     """The picture of a camera whose image the water's plane may reach; None where it cannot.
 
@@ -365,7 +365,7 @@ def render_flooded(
 
 
 def _from_above(
-    painter: Painter,
+    painter: LayerRenderer,
     camera: Camera,
     medium: FloodMedium,
     buffers: frozenset[str],
@@ -375,33 +375,33 @@ def _from_above(
     wanted = buffers | {RGB, ALPHA}
     if medium.reflection == "screen_space":
         wanted = wanted | {EXPECTED_DEPTH}
-    with lap("rasterise"):
+    with timed("rasterise"):
         front = painter.draw(camera, above, wanted)
     assert front.rgb is not None and front.alpha is not None
     sky, smog = painter.sky, painter.medium
     backend = _follows(painter.backend, front.alpha)
-    with lap("flood: where it is seen"):
+    with timed("flood: where it is seen"):
         water, most_shown = find_water(front.alpha, camera, backend=backend)
     if most_shown < 1 - HIDDEN_COVER:
-        with lap("sky"):
+        with timed("sky"):
             image = composite_sky(front.rgb, front.alpha, camera, sky, smog=smog, backend=backend)
         return FloodedImage(image, front, water, is_hidden=True)
 
     crop = window.of(camera)
     cover = window.cut(front.alpha)
     seen = cover <= HIDDEN_COVER
-    with lap("flood: waves"):
+    with timed("flood: waves"):
         field = wave_field(medium.waves, crop, medium.level_z_m, backend=backend)
     margins = _bed_margins(camera, medium)
     bed_window = window.grown(margins)
     bed_camera = bed_window.of(camera)
-    with lap("flood: bed"):
+    with timed("flood: bed"):
         bed = _draw_bed(painter, bed_camera, medium, buffers - {RGB, ALPHA}, margins, seen)
-    with lap("flood: mirrored view"):
+    with timed("flood: mirrored view"):
         mirror = _mirror_layer(painter, camera, medium, window, seen)
-    with lap("flood: screen march"):
+    with timed("flood: screen march"):
         screen = _screen_reflection(camera, medium, crop, field, front, backend)
-    with lap("flood: colours of the water"):
+    with timed("flood: colours of the water"):
         color = shade_water(
             crop,
             cover,
@@ -414,9 +414,9 @@ def _from_above(
             smog=smog,
             backend=backend,
         )
-    with lap("flood: layers joined"):
-        image = pour(front, camera, window, color, sky, smog, backend=backend)
-        scene = both_sides(front, bed, bed_window, buffers, backend=backend)
+    with timed("flood: layers joined"):
+        image = composite_water(front, camera, window, color, sky, smog, backend=backend)
+        scene = merge_depths(front, bed, bed_window, buffers, backend=backend)
     return FloodedImage(image, scene, water)
 
 
@@ -427,7 +427,7 @@ def _follows(backend: str, image: Tensor) -> str:
 
 
 def _draw_bed(
-    painter: Painter,
+    painter: LayerRenderer,
     camera: Camera,
     medium: FloodMedium,
     scene_buffers: frozenset[str],
@@ -450,7 +450,7 @@ def visible_depth_m(medium: FloodMedium) -> float:
 
 
 def _mirror_layer(
-    painter: Painter,
+    painter: LayerRenderer,
     camera: Camera,
     medium: FloodMedium,
     window: Window,
@@ -494,7 +494,7 @@ def _mirror_margins(camera: Camera, medium: FloodMedium) -> Margins:
     waves = medium.waves
     slopes = waves.wavenumbers * waves.amplitudes_m
     tilt = 2 * REACH_SIGMAS * math.sqrt(float((slopes**2).sum()) / 2)
-    most = MOST_MARGIN * max(camera.width, camera.height)
+    most = MAX_MARGIN * max(camera.width, camera.height)
     upwards = int(min(camera.fy * tilt, most)) + 4
     sideways = int(min(0.5 * camera.fx * tilt, most)) + 4
     return Margins(sideways, upwards, sideways, 4)
@@ -513,16 +513,16 @@ def _bed_margins(camera: Camera, medium: FloodMedium) -> Margins:
     sine = 1 / (medium.refraction_index * math.hypot(1, fall))
     bent = sine / math.sqrt(1 - sine**2)
     shift = fall * depth * (1 - fall * bent) / (height + fall * depth * bent)
-    return Margins(8, 8, 8, int(min(camera.fy * shift, MOST_SHIFT * camera.height)) + 8)
+    return Margins(8, 8, 8, int(min(camera.fy * shift, MAX_SHIFT * camera.height)) + 8)
 
 
 def _from_below(
-    painter: Painter, camera: Camera, medium: FloodMedium, buffers: frozenset[str]
+    painter: LayerRenderer, camera: Camera, medium: FloodMedium, buffers: frozenset[str]
 ) -> FloodedImage:
     """From under the water, or exactly at its surface."""
     wanted = buffers | {RGB, ALPHA, EXPECTED_DEPTH}
     in_air = replace(painter, smog=None, smog_on_buffers=None)
-    with lap("rasterise"):
+    with timed("rasterise"):
         front = in_air.draw(camera, HeightClip(medium.level_z_m, BELOW), wanted)
         above = HeightClip(medium.level_z_m, ABOVE, overlaps=True)
         air = painter.draw(camera, above, wanted)
@@ -532,5 +532,5 @@ def _from_below(
     size = (camera.height, camera.width)
     water = torch.ones(size, dtype=torch.bool, device=image.device)
     whole = Window(0, 0, camera.width, camera.height)
-    scene = both_sides(front, air, whole, buffers, backend=painter.backend)
+    scene = merge_depths(front, air, whole, buffers, backend=painter.backend)
     return FloodedImage(image, scene, water)

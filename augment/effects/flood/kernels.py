@@ -323,13 +323,8 @@ EDGE = np.float32(0.04)  # share of the image over which the weight falls to 0
 LEVELS = 3  # above the pixels
 BLOCK = 4**LEVELS  # pixels along a cell of the highest one
 
-MOST_STEPS = 1024  # cells a ray may look at; streets need 20 on average
+MAX_STEPS = 1024  # cells a ray may look at; streets need 20 on average
 NUDGE = np.float32(1e-3)  # pixels past a cell's border, against rounding
-_SCREEN_SPACE_KERNELS_ZERO, _SCREEN_SPACE_KERNELS_HALF, _SCREEN_SPACE_KERNELS_ONE = (
-    np.float32(0),
-    np.float32(0.5),
-    np.float32(1),
-)
 _INFINITE = np.float32(math.inf)
 FARTHEST = np.float32(1e-9)  # inverse depth; nothing is seen beyond
 # Ways (in |x|) that one bilinear patch may hold: those of one surface.
@@ -348,14 +343,10 @@ def build_pyramid(alpha, depth, pyramid):
             if i < height:
                 seen, z = alpha[i], depth[i]
                 for j in range(width):
-                    out[j] = (
-                        _SCREEN_SPACE_KERNELS_ONE / z[j]
-                        if seen[j] >= _SCREEN_SPACE_KERNELS_HALF
-                        else _SCREEN_SPACE_KERNELS_ZERO
-                    )
-                out[width:columns] = _SCREEN_SPACE_KERNELS_ZERO
+                    out[j] = _ONE / z[j] if seen[j] >= _HALF else _ZERO
+                out[width:columns] = _ZERO
             else:
-                out[:columns] = _SCREEN_SPACE_KERNELS_ZERO
+                out[:columns] = _ZERO
         fine, size = pyramid[block * BLOCK : (block + 1) * BLOCK, :columns], 4
         for _ in range(LEVELS):
             first = rows - rows * 4 // size + block * (BLOCK // size)
@@ -363,7 +354,7 @@ def build_pyramid(alpha, depth, pyramid):
             for i in range(coarse.shape[0]):
                 a, b, c, d = fine[4 * i], fine[4 * i + 1], fine[4 * i + 2], fine[4 * i + 3]
                 for j in range(coarse.shape[1]):
-                    largest = _SCREEN_SPACE_KERNELS_ZERO
+                    largest = _ZERO
                     for k in range(4 * j, 4 * j + 4):
                         largest = max(largest, max(max(a[k], b[k]), max(c[k], d[k])))
                     coarse[i, j] = largest
@@ -405,25 +396,25 @@ def _fetch(typingctx, array, row, column):
 @inner()
 def _difference(before, here, after, has_before, has_after):
     """Change of the inverse depth per pixel, from those neighbours that belong to the surface."""
-    total, count = _SCREEN_SPACE_KERNELS_ZERO, _SCREEN_SPACE_KERNELS_ZERO
+    total, count = _ZERO, _ZERO
     if has_after and abs(after - here) < AGREEING * here:
         total += after - here
-        count += _SCREEN_SPACE_KERNELS_ONE
+        count += _ONE
     if has_before and abs(here - before) < AGREEING * here:
         total += here - before
-        count += _SCREEN_SPACE_KERNELS_ONE
-    return total / max(count, _SCREEN_SPACE_KERNELS_ONE)
+        count += _ONE
+    return total / max(count, _ONE)
 
 
 @inner()
 def _edge_weight(x, y, width, height):
     fx = min(
-        max(min(x, width - x) / (EDGE * width), _SCREEN_SPACE_KERNELS_ZERO),
-        _SCREEN_SPACE_KERNELS_ONE,
+        max(min(x, width - x) / (EDGE * width), _ZERO),
+        _ONE,
     )
     fy = min(
-        max(min(y, height - y) / (EDGE * height), _SCREEN_SPACE_KERNELS_ZERO),
-        _SCREEN_SPACE_KERNELS_ONE,
+        max(min(y, height - y) / (EDGE * height), _ZERO),
+        _ONE,
     )
     two, three = np.float32(2), np.float32(3)
     return fx * fx * (three - two * fx) * fy * fy * (three - two * fy)
@@ -434,7 +425,7 @@ def _set_up(view, xs, ys, first):
     """Numbers of eight mirrored rays, those of the definition's record, and where they begin."""
     width, height = view[11], view[12]
     x0, y0 = v8.load(xs, first), v8.load(ys, first)
-    one, zero = v8.splat(_SCREEN_SPACE_KERNELS_ONE), v8.splat(_SCREEN_SPACE_KERNELS_ZERO)
+    one, zero = v8.splat(_ONE), v8.splat(_ZERO)
     nx, ny, nz = v8.splat(view[0]), v8.splat(view[1]), v8.splat(view[2])
     u = (x0 - v8.splat(view[8])) / v8.splat(view[6])
     v = (y0 - v8.splat(view[9])) / v8.splat(view[7])
@@ -463,9 +454,7 @@ def _set_up(view, xs, ys, first):
     to_sky = v8.select(far, one, zero)
     ray = (x0, y0, dx, dy, inverse_x, inverse_y, ahead_x, ahead_y, near, bend * near, end)
     # Nothing is met in the pixel that the ray starts from.
-    t = v8.splat(_SCREEN_SPACE_KERNELS_HALF) * v8.minimum(
-        v8.absolute(inverse_x), v8.absolute(inverse_y)
-    )
+    t = v8.splat(_HALF) * v8.minimum(v8.absolute(inverse_x), v8.absolute(inverse_y))
     size = v8.splat(np.float32(4))
     state = (t + v8.splat(NUDGE), end, size, one / size, zero, one, zero)
     return ray, state, to_sky, scale
@@ -481,9 +470,9 @@ def _step(pyramid, ray, state):
     x0, y0, dx, dy, inverse_x, inverse_y, ahead_x, ahead_y, near, change, end = ray
     t, stop, size, inverse, hidden, clean, met = state
     zero, half, one = (
-        v8.splat(_SCREEN_SPACE_KERNELS_ZERO),
-        v8.splat(_SCREEN_SPACE_KERNELS_HALF),
-        v8.splat(_SCREEN_SPACE_KERNELS_ONE),
+        v8.splat(_ZERO),
+        v8.splat(_HALF),
+        v8.splat(_ONE),
     )
     four, quarter = v8.splat(np.float32(4)), v8.splat(np.float32(0.25))
     rows = v8.splat(np.float32(pyramid.shape[0]))
@@ -534,7 +523,7 @@ def _march(pyramid, view, lanes, xs, ys, first, ways, trusts):
     xs, ys: pixel centres, read from `first` on; the results go to the same places. lanes: scratch.
     """
     ray, state, to_sky, scale = _set_up(view, xs, ys, first)
-    for _ in range(MOST_STEPS):
+    for _ in range(MAX_STEPS):
         # The sign is clear where a ray goes on; one that has ended just here does no harm.
         if not v8.any_not_negative(state[1] - state[0]):
             break
@@ -547,7 +536,7 @@ def _finish(pyramid, view, lanes, ray, state, to_sky, scale, first, ways, trusts
     """Results of eight rays that have ended."""
     x0, y0, dx, dy, _, _, _, _, near, change, end = ray
     t, stop, _, _, _, clean, met = state
-    half, zero = v8.splat(_SCREEN_SPACE_KERNELS_HALF), v8.splat(_SCREEN_SPACE_KERNELS_ZERO)
+    half, zero = v8.splat(_HALF), v8.splat(_ZERO)
     sky = v8.select(v8.at_least(t, stop), clean * to_sky, zero)
     t = v8.select(v8.greater(met, half), t, end)
     v8.store(lanes, np.uint64(0), met)
@@ -563,17 +552,17 @@ def _finish(pyramid, view, lanes, ray, state, to_sky, scale, first, ways, trusts
     v8.store(lanes, np.uint64(80), y0)
     width, height = view[11], view[12]
     for lane in range(8):
-        way, trust, t_last = _INFINITE, _SCREEN_SPACE_KERNELS_ZERO, lanes[16 + lane]
+        way, trust, t_last = _INFINITE, _ZERO, lanes[16 + lane]
         x, y = lanes[72 + lane], lanes[80 + lane]
         step_x, step_y = lanes[24 + lane], lanes[32 + lane]
-        if lanes[lane] > _SCREEN_SPACE_KERNELS_HALF:
+        if lanes[lane] > _HALF:
             change_, near_ = lanes[40 + lane], lanes[48 + lane]
             way, t_last = _meet(
                 pyramid, width, height, x, y, step_x, step_y, t_last, change_, near_
             )
             t_last = min(t_last, lanes[56 + lane])
             way = way * near_ / lanes[64 + lane]
-        if lanes[lane] > _SCREEN_SPACE_KERNELS_HALF or lanes[8 + lane] > _SCREEN_SPACE_KERNELS_HALF:
+        if lanes[lane] > _HALF or lanes[8 + lane] > _HALF:
             trust = _edge_weight(x + t_last * step_x, y + t_last * step_y, width, height)
         ways[first + np.uint64(lane)] = way
         trusts[first + np.uint64(lane)] = trust
@@ -593,18 +582,18 @@ def _meet(pyramid, width, height, x0, y0, dx, dy, t, change, near):
     across = _difference(pyramid[cy, left], here, pyramid[cy, right], cx > left, right > cx)
     down = _difference(pyramid[above, cx], here, pyramid[below, cx], cy > above, below > cy)
     off_x, off_y = (
-        np.float32(cx) + _SCREEN_SPACE_KERNELS_HALF - x0,
-        np.float32(cy) + _SCREEN_SPACE_KERNELS_HALF - y0,
+        np.float32(cx) + _HALF - x0,
+        np.float32(cy) + _HALF - y0,
     )
     closing = -change - across * dx - down * dy
     middle = off_x * dx if abs(dx) >= abs(dy) else off_y * dy
     meet = middle
-    if closing != _SCREEN_SPACE_KERNELS_ZERO:
+    if closing != _ZERO:
         meet = (here - across * off_x - down * off_y - near) / closing
     reach = np.float32(1.5)
-    meet = max(min(max(meet, middle - reach), middle + reach), _SCREEN_SPACE_KERNELS_ZERO)
+    meet = max(min(max(meet, middle - reach), middle + reach), _ZERO)
     # Not farther than what was met, however the ray grazes it.
-    back = here / (_SCREEN_SPACE_KERNELS_ONE + max(THICKNESS, THICKNESS_M * here))
+    back = here / (_ONE + max(THICKNESS, THICKNESS_M * here))
     return meet / max(near - change * meet, back), meet
 
 
@@ -622,9 +611,9 @@ def _sees_water(view, alpha, column, row):
     """Whether the pixel's ray falls and the front leaves something of the water to see."""
     if 0 <= row < alpha.shape[0] and 0 <= column < alpha.shape[1] and alpha[row, column] >= COVERED:
         return False
-    u = (np.float32(column) + _SCREEN_SPACE_KERNELS_HALF - view[8]) / view[6]
-    v = (np.float32(row) + _SCREEN_SPACE_KERNELS_HALF - view[9]) / view[7]
-    return u * view[0] + v * view[1] + view[2] < _SCREEN_SPACE_KERNELS_ZERO
+    u = (np.float32(column) + _HALF - view[8]) / view[6]
+    v = (np.float32(row) + _HALF - view[9]) / view[7]
+    return u * view[0] + v * view[1] + view[2] < _ZERO
 
 
 @inner()
@@ -643,12 +632,12 @@ def trace(pyramid, view, alpha, needed, left, top, stride, ways, weights):
         for j in range(columns):
             column = left + j * stride
             ways[i, j] = _INFINITE
-            weights[i, j] = _SCREEN_SPACE_KERNELS_ZERO
+            weights[i, j] = _ZERO
             if not (needed[i * stride, j * stride] and _sees_water(view, alpha, column, row)):
-                weights[i, j] = -_SCREEN_SPACE_KERNELS_ONE
+                weights[i, j] = -_ONE
             elif _inside(alpha, column, row):
-                lists[0, count] = np.float32(column) + _SCREEN_SPACE_KERNELS_HALF
-                lists[1, count] = np.float32(row) + _SCREEN_SPACE_KERNELS_HALF
+                lists[0, count] = np.float32(column) + _HALF
+                lists[1, count] = np.float32(row) + _HALF
                 count += 1
         _run(pyramid, view, lanes, lists[0], lists[1], count, lists[2], lists[3])
         for n in range(count):
@@ -660,22 +649,17 @@ def trace(pyramid, view, alpha, needed, left, top, stride, ways, weights):
 @inner()
 def _to_metres(view, alpha, needed, column, row, distance, weight):
     """A row of ways (in |x|) becomes metres; only needed pixels that show water get a weight."""
-    v = (np.float32(row) + _SCREEN_SPACE_KERNELS_HALF - view[9]) / view[7]
-    vv, slope_v = _SCREEN_SPACE_KERNELS_ONE + v * v, v * view[1] + view[2]
+    v = (np.float32(row) + _HALF - view[9]) / view[7]
+    vv, slope_v = _ONE + v * v, v * view[1] + view[2]
     inside = 0 <= row < alpha.shape[0]
     for j in range(distance.shape[0]):
-        u = (np.float32(column + j) + _SCREEN_SPACE_KERNELS_HALF - view[8]) / view[6]
+        u = (np.float32(column + j) + _HALF - view[8]) / view[6]
         slope = u * view[0] + slope_v
         covered = inside and 0 <= column + j < alpha.shape[1] and alpha[row, column + j] >= COVERED
-        hidden = (
-            slope >= _SCREEN_SPACE_KERNELS_ZERO
-            or covered
-            or not needed[j]
-            or weight[j] < _SCREEN_SPACE_KERNELS_ZERO
-        )
+        hidden = slope >= _ZERO or covered or not needed[j] or weight[j] < _ZERO
         r = math.sqrt(vv + u * u) * view[10] / -slope
         distance[j] = _INFINITE if hidden else distance[j] * r
-        weight[j] = _SCREEN_SPACE_KERNELS_ZERO if hidden else weight[j]
+        weight[j] = _ZERO if hidden else weight[j]
 
 
 @kernel
@@ -686,7 +670,7 @@ def spread(pyramid, view, alpha, needed, left, top, stride, ways, weights, dista
     """
     height, width = distance.shape
     rows, columns = ways.shape
-    part = _SCREEN_SPACE_KERNELS_ONE / np.float32(stride)
+    part = _ONE / np.float32(stride)
     for i in numba.prange(rows):
         lanes = np.empty(88, np.float32)
         lists = np.empty((4, stride * (width + stride) + 8), np.float32)
@@ -702,12 +686,10 @@ def spread(pyramid, view, alpha, needed, left, top, stride, ways, weights, dista
             least, most = min(min(w00, w01), min(w10, w11)), max(max(w00, w01), max(w10, w11))
             sure = min(min(t00, t01), min(t10, t11))
             doubt = max(max(t00, t01), max(t10, t11))
-            same = sure > _SCREEN_SPACE_KERNELS_ZERO or (
-                sure == _SCREEN_SPACE_KERNELS_ZERO and doubt == _SCREEN_SPACE_KERNELS_ZERO
-            )
+            same = sure > _ZERO or (sure == _ZERO and doubt == _ZERO)
             if same and least < _INFINITE:
                 same = most - least <= _SMOOTH * least + _SMOOTH_WAY
-            if same or doubt < _SCREEN_SPACE_KERNELS_ZERO:
+            if same or doubt < _ZERO:
                 for di in range(deep):
                     fy = np.float32(di) * part
                     w0, w1 = w00 + (w10 - w00) * fy, w01 + (w11 - w01) * fy
@@ -723,11 +705,11 @@ def spread(pyramid, view, alpha, needed, left, top, stride, ways, weights, dista
                     way, trust = w00, t00
                     column, row = left + x0 + dj, top + y0 + di
                     if di > 0 or dj > 0:
-                        way, trust = _INFINITE, _SCREEN_SPACE_KERNELS_ZERO
+                        way, trust = _INFINITE, _ZERO
                         asked = needed[y0 + di, x0 + dj] and _inside(alpha, column, row)
                         if asked and _sees_water(view, alpha, column, row):
-                            lists[0, count] = np.float32(column) + _SCREEN_SPACE_KERNELS_HALF
-                            lists[1, count] = np.float32(row) + _SCREEN_SPACE_KERNELS_HALF
+                            lists[0, count] = np.float32(column) + _HALF
+                            lists[1, count] = np.float32(row) + _HALF
                             count += 1
                     distance[y0 + di, x0 + dj] = way
                     weight[y0 + di, x0 + dj] = trust

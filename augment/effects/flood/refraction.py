@@ -23,7 +23,7 @@ from augment.sky import Sky
 # layer's optical centre; their length plays no part, which makes directions of points of them.
 
 SOLID_ALPHA = 0.5  # a pixel at least this opaque shows a surface at its depth
-LEAST_DEPTH = 1e-20  # of what is projected: things behind a camera land far outside its image
+MIN_DEPTH = 1e-20  # of what is projected: things behind a camera land far outside its image
 MIP_LEVELS = 7  # blurs up to 64 pixels: three taps are seldom farther apart
 
 
@@ -31,7 +31,7 @@ def project(camera: Camera, vectors: Float[Tensor, "*B 3"]) -> tuple[Tensor, Ten
     """Column and row of vectors that start at the optical centre; huge for those behind it."""
     local = vectors @ camera.camera_from_world[:3, :3].T.to(vectors.dtype)
     x, y, z = local.unbind(-1)
-    z = z.clamp_min(LEAST_DEPTH)
+    z = z.clamp_min(MIN_DEPTH)
     return camera.fx * (x / z) + camera.cx, camera.fy * (y / z) + camera.cy
 
 
@@ -105,7 +105,7 @@ def blurred(
 # kilometres away from the world's origin.
 
 FARTHEST = 1e12  # times the eye's distance from the image plane: rays along the water end here
-LEAST_COSINE = 1e-3  # of rays against the surface, and of reflected ones against the horizon
+MIN_COSINE = 1e-3  # of rays against the surface, and of reflected ones against the horizon
 SMOOTH_PX = 2.0  # reflections that a pixel's slopes spread over less are as good as sharp
 STEEPEST = 1e-6  # least square of a normal's z
 
@@ -209,13 +209,13 @@ def refracted(
 
     t = -v / n + (c / n - sqrt(1 - (1 - c^2) / n^2)) normal
     """
-    c = (normal * to_eye).sum(-1, keepdim=True).clamp_min(LEAST_COSINE)
+    c = (normal * to_eye).sum(-1, keepdim=True).clamp_min(MIN_COSINE)
     inside = torch.sqrt((1 - (1 - c * c) / index**2).clamp_min(0))
     return -_at_least_upward(to_eye / index - (c / index - inside) * normal)
 
 
 def _at_least_upward(ray: Tensor) -> Tensor:
-    upward = ray[..., 2:].clamp_min(LEAST_COSINE)
+    upward = ray[..., 2:].clamp_min(MIN_COSINE)
     return torch.nn.functional.normalize(torch.cat((ray[..., :2], upward), -1), dim=-1)
 
 
@@ -225,8 +225,8 @@ BED_STEPS = 2  # corrections of the bed's depth where a refracted ray meets it,
 SETTLED_M = 0.01  # unless the last one was smaller
 # Where less of any colour comes up from the depth of the bed straight behind a pixel, no bed is
 # looked for: a quarter of an 8-bit step at most, but for beds that rise before the pixel's own.
-LEAST_TRANSMITTANCE = 1 / 1024
-MOST_OPTICAL_DEPTH = -math.log(LEAST_TRANSMITTANCE)
+MIN_TRANSMITTANCE = 1 / 1024
+MAX_OPTICAL_DEPTH = -math.log(MIN_TRANSMITTANCE)
 
 
 def window_offset(outer: Camera, inner: Camera) -> tuple[int, int]:
@@ -276,7 +276,7 @@ def through_the_surface(
     if bends:
         ray = refracted(surface.to_eye, normal, medium.refraction_index)
     opaque = _optical_depth(own_depth / -ray[..., 2], extinction.min())
-    own_solid = own_solid & (opaque < MOST_OPTICAL_DEPTH)
+    own_solid = own_solid & (opaque < MAX_OPTICAL_DEPTH)
     image = stacked(bed)
     own_colors = bilinear(image, own_column, own_row)
     found, depth, colors = own_solid, own_depth, own_colors

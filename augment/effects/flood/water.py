@@ -26,7 +26,7 @@ from augment.effects.flood import water_kernels as kernels
 from augment.effects.flood import water_kernels as mip_kernels
 from augment.effects.flood.flood import FloodMedium, Layer, reflectance
 from augment.effects.flood.refraction import (
-    LEAST_COSINE,
+    MIN_COSINE,
     Surface,
     before_sky,
     is_smooth,
@@ -210,10 +210,10 @@ def medium_numbers(
 def _limits(hidden_cover: float, smooth_variance: float) -> np.ndarray:
     """`kernels.Limits`."""
     surface, lookup, reflection = water_surface, layer_lookup, reflection_lookup
-    numbers = [hidden_cover, surface.FARTHEST, surface.LEAST_COSINE, smooth_variance]
-    numbers += [surface.STEEPEST, lookup.LEAST_DEPTH, lookup.SOLID_ALPHA, refraction.BED_STEPS]
+    numbers = [hidden_cover, surface.FARTHEST, surface.MIN_COSINE, smooth_variance]
+    numbers += [surface.STEEPEST, lookup.MIN_DEPTH, lookup.SOLID_ALPHA, refraction.BED_STEPS]
     numbers += [reflection.EDGE, reflection.MATCH_M, reflection.MATCH_SHARE, refraction.SETTLED_M]
-    numbers += [refraction.MOST_OPTICAL_DEPTH, reflection.FAINT]
+    numbers += [refraction.MAX_OPTICAL_DEPTH, reflection.FAINT]
     return np.asarray(numbers, np.float32)
 
 
@@ -295,7 +295,7 @@ def reflected_share(
     surface: Surface, normal: Float[Tensor, "h w 3"], medium: FloodMedium
 ) -> Float[Tensor, "h w"]:
     """F at a normal; facets that look away from the eye count as seen edge-on."""
-    cosine = (normal * surface.to_eye).sum(-1).clamp(LEAST_COSINE, 1)
+    cosine = (normal * surface.to_eye).sum(-1).clamp(MIN_COSINE, 1)
     return reflectance(cosine, medium.refraction_index, medium.fresnel)
 
 

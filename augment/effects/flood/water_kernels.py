@@ -83,7 +83,7 @@ def find_water(u, v, rise, alpha, shown, water):
 
 
 @kernel
-def pour(u, v, rise, top, left, alpha, color, rgb):
+def composite_water(u, v, rise, top, left, alpha, color, rgb):
     """rgb += (1 - alpha) color where rays fall. color: [h, w, 3], its corner at row top, column
     left of rgb [H, W, 3]; u, v: of its own columns and rows.
     """
@@ -134,27 +134,24 @@ def join_alpha(alpha, behind_alpha):
 
 
 F = np.float32
-WATER_KERNELS_U = np.uint64
 ZERO, HALF, ONE = F(0), F(0.5), F(1)
 TINY = F(1e-7)
 STRIP = 64  # pixels of a list that are worked on at a time
-LANES = WATER_KERNELS_U(8)
-EIGHTS = ~WATER_KERNELS_U(7)  # a number's multiple of eight
+LANES = U(8)
+EIGHTS = ~U(7)  # a number's multiple of eight
 
 # Lines of a list, one number a pixel: the ray and how far the water is along it, the surface's
 # normal and slope variance, the depth of the bed straight behind (-1: none), the screen-space ray's
 # length and weight.
-DX, DY, DZ, ALONG, NX, NY, ROUGH, OWN_DEPTH, DISTANCE, TRUST = (
-    WATER_KERNELS_U(STRIP * k) for k in range(10)
-)
-LIST = WATER_KERNELS_U(STRIP * 10)
+DX, DY, DZ, ALONG, NX, NY, ROUGH, OWN_DEPTH, DISTANCE, TRUST = (U(STRIP * k) for k in range(10))
+LIST = U(STRIP * 10)
 
 # Lines of the scratch memory. Look-ups: pixel, way from it, colour; was the bed found and how deep;
 # two levels of averages; for each of three slopes the mirrored ray, its share of the light
 # and its place in the mirror.
-C0, R0, FC, FR, R, G, B, A, FOUND, DEPTH, SHARE_ABOVE = (WATER_KERNELS_U(8 * k) for k in range(11))
-LOW, WIDE, HIGH, SCALE = (WATER_KERNELS_U(88 + 16 * k) for k in range(4))
-RX, RY, RZ, SHARE, MIRROR_C, MIRROR_R = (WATER_KERNELS_U(152 + 24 * k) for k in range(6))
+C0, R0, FC, FR, R, G, B, A, FOUND, DEPTH, SHARE_ABOVE = (U(8 * k) for k in range(11))
+LOW, WIDE, HIGH, SCALE = (U(88 + 16 * k) for k in range(4))
+RX, RY, RZ, SHARE, MIRROR_C, MIRROR_R = (U(152 + 24 * k) for k in range(6))
 SCRATCH = 152 + 24 * 6
 
 
@@ -219,7 +216,7 @@ class Limits(NamedTuple):
 def _view(n):
     project = (n[0], n[1], n[2], n[3], n[4], n[5], n[6], n[7], n[8])
     rays = (n[9], n[10], n[11], n[12], n[13], n[14], n[15], n[16], n[17])
-    width, height = WATER_KERNELS_U(np.int32(n[20])), WATER_KERNELS_U(np.int32(n[21]))
+    width, height = U(np.int32(n[20])), U(np.int32(n[21]))
     return View(project, rays, n[18], n[19], n[20], n[21], width, height)
 
 
@@ -431,7 +428,7 @@ def _fetched(s):
 
 @inner()
 def _pixel(x):
-    return WATER_KERNELS_U(np.int32(x))
+    return U(np.int32(x))
 
 
 @inner()
@@ -450,8 +447,8 @@ def _bilinear(s, k, rgb, alpha, width, right, below):
 @inner()
 def _fetch(s, column, row, rgb, alpha, view):
     _place(s, column, row, v8.splat(view.columns), v8.splat(view.rows))
-    right = min(view.width - WATER_KERNELS_U(1), WATER_KERNELS_U(1))
-    below = min(view.height - WATER_KERNELS_U(1), WATER_KERNELS_U(1)) * view.width
+    right = min(view.width - U(1), U(1))
+    below = min(view.height - U(1), U(1)) * view.width
     for k in range(LANES):
         r, g, b, a = _bilinear(s, k, rgb, alpha, view.width, right, below)
         s[R + k], s[G + k], s[B + k], s[A + k] = r, g, b, a
@@ -465,7 +462,7 @@ def _choose_levels(s, starts, level, sizes):
     v8.store(s, SHARE_ABOVE, level - low)
     v8.store(s, LOW, low)
     v8.store(s, LOW + LANES, v8.minimum(low + v8.splat(ONE), top))
-    for k in range(WATER_KERNELS_U(2) * LANES):
+    for k in range(U(2) * LANES):
         n = _pixel(s[LOW + k])
         starts[k] = sizes[n, 0]
         s[WIDE + k], s[HIGH + k] = F(np.int32(sizes[n, 1])), F(np.int32(sizes[n, 2]))
@@ -480,7 +477,7 @@ def _fetch_level(s, starts, second, column, row, mips):
     _place(s, column * scale, row * scale, wide, high)
     for k in range(LANES):
         width = _pixel(s[WIDE + second + k])
-        at = WATER_KERNELS_U(starts[second + k]) + _pixel(s[R0 + k]) * width + _pixel(s[C0 + k])
+        at = U(starts[second + k]) + _pixel(s[R0 + k]) * width + _pixel(s[C0 + k])
         r, g, b, a = _between(mips, at, at + width, s[FC + k], s[FR + k])
         s[R + k], s[G + k], s[B + k], s[A + k] = r, g, b, a
     return _fetched(s)
@@ -489,7 +486,7 @@ def _fetch_level(s, starts, second, column, row, mips):
 @inner()
 def _fetch_blurred(s, starts, column, row, mips):
     """Colours and alphas between the two levels chosen."""
-    r, g, b, a = _fetch_level(s, starts, WATER_KERNELS_U(0), column, row, mips)
+    r, g, b, a = _fetch_level(s, starts, U(0), column, row, mips)
     r1, g1, b1, a1 = _fetch_level(s, starts, LANES, column, row, mips)
     share = v8.load(s, SHARE_ABOVE)
     keep = v8.splat(ONE) - share
@@ -612,18 +609,18 @@ def _search_bed(s, found, depth, px, py, tx, ty, alpha, depths, bed, medium, lim
 def _fetch_bed(s, q, own, place, at, depth, rgb, alpha, bed, limits):
     """The bed's colour where it was found, straight behind the pixel elsewhere; its depth."""
     v8.store(s, DEPTH, depth)
-    right = min(bed.width - WATER_KERNELS_U(1), WATER_KERNELS_U(1))
-    below = min(bed.height - WATER_KERNELS_U(1), WATER_KERNELS_U(1)) * bed.width
+    right = min(bed.width - U(1), U(1))
+    below = min(bed.height - U(1), U(1)) * bed.width
     for k in range(LANES):
         r = g = b = a = ZERO
         if s[FOUND + k] > ZERO:
             r, g, b, a = _bilinear(s, k, rgb, alpha, bed.width, right, below)
         if a < limits.solid_alpha:
-            pixel = WATER_KERNELS_U(own[place + k])
+            pixel = U(own[place + k])
             r, g, b = (
-                rgb[WATER_KERNELS_U(3) * pixel],
-                rgb[WATER_KERNELS_U(3) * pixel + WATER_KERNELS_U(1)],
-                rgb[WATER_KERNELS_U(3) * pixel + WATER_KERNELS_U(2)],
+                rgb[U(3) * pixel],
+                rgb[U(3) * pixel + U(1)],
+                rgb[U(3) * pixel + U(2)],
             )
             a, s[DEPTH + k] = alpha[pixel], q[OWN_DEPTH + at + k]
         s[R + k], s[G + k], s[B + k], s[A + k] = r, g, b, a
@@ -672,12 +669,12 @@ def _level(s, sizes):
     """Level of averages whose pixels are as wide as a pixel's three places lie apart."""
     c, r = v8.load(s, MIRROR_C), v8.load(s, MIRROR_R)
     x1, y1 = (
-        v8.load(s, MIRROR_C + WATER_KERNELS_U(8)) - c,
-        v8.load(s, MIRROR_R + WATER_KERNELS_U(8)) - r,
+        v8.load(s, MIRROR_C + U(8)) - c,
+        v8.load(s, MIRROR_R + U(8)) - r,
     )
     x2, y2 = (
-        v8.load(s, MIRROR_C + WATER_KERNELS_U(16)) - c,
-        v8.load(s, MIRROR_R + WATER_KERNELS_U(16)) - r,
+        v8.load(s, MIRROR_C + U(16)) - c,
+        v8.load(s, MIRROR_R + U(16)) - r,
     )
     apart = v8.sqrt(x1 * x1 + y1 * y1) + v8.sqrt(x2 * x2 + y2 * y2)
     spacing = v8.maximum(v8.splat(HALF) * apart, v8.splat(ONE))
@@ -744,17 +741,13 @@ def shade(
         q, s = np.zeros(2 * STRIP * 10, np.float32), np.zeros(SCRATCH, np.float32)
         pixels, own = np.zeros(2 * STRIP, np.int64), np.zeros(2 * STRIP, np.int64)
         starts = np.zeros(16, np.int64)
-        smooth_count, rough_count, j = WATER_KERNELS_U(0), WATER_KERNELS_U(0), 0
+        smooth_count, rough_count, j = U(0), U(0), 0
         bx, by, bz = v[i] * axes[0, 1], v[i] * axes[1, 1], v[i] * axes[2, 1]
         own_row = i + top
         row_inside = own_row >= 0 and own_row < np.int64(bed.height)
         far = np.float64(limits.farthest)
         while True:
-            while (
-                j < width
-                and smooth_count < WATER_KERNELS_U(STRIP)
-                and rough_count < WATER_KERNELS_U(STRIP)
-            ):
+            while j < width and smooth_count < U(STRIP) and rough_count < U(STRIP):
                 # The order of these sums is that of Camera.ray_directions: the sign has to agree.
                 fall = (u[j] * axes[2, 0] + bz) + axes[2, 2]
                 if not (fall < 0.0 and cover[i, j] <= limits.cover):
@@ -766,11 +759,11 @@ def shade(
                     continue
                 spread = variance[i, j]
                 if spread >= limits.smooth_variance:
-                    n, p = LIST + rough_count, WATER_KERNELS_U(STRIP) + rough_count
-                    rough_count += WATER_KERNELS_U(1)
+                    n, p = LIST + rough_count, U(STRIP) + rough_count
+                    rough_count += U(1)
                 else:
                     n = p = smooth_count
-                    smooth_count += WATER_KERNELS_U(1)
+                    smooth_count += U(1)
                 q[DX + n] = F((u[j] * axes[0, 0] + bx) + axes[0, 2])
                 q[DY + n] = F((u[j] * axes[1, 0] + by) + axes[1, 2])
                 q[DZ + n] = F(fall)
@@ -780,7 +773,7 @@ def shade(
                 own[p] = 0
                 column = j + left
                 if row_inside and column >= 0 and column < np.int64(bed.width):
-                    pixel = WATER_KERNELS_U(own_row) * bed.width + WATER_KERNELS_U(column)
+                    pixel = U(own_row) * bed.width + U(column)
                     if bed_alpha[pixel] >= limits.solid_alpha:
                         own[p] = np.int64(pixel)
                         q[OWN_DEPTH + n] = max(-bed_depth[pixel] * F(fall) - medium.height, ZERO)
@@ -793,22 +786,20 @@ def shade(
             # The fuller list first, so that lists are short at a row's end only.
             rough = rough_count > smooth_count
             n = rough_count if rough else smooth_count
-            if n == WATER_KERNELS_U(0):
+            if n == U(0):
                 break
-            base, start, taps = WATER_KERNELS_U(0), WATER_KERNELS_U(0), WATER_KERNELS_U(1)
+            base, start, taps = U(0), U(0), U(1)
             if rough:
-                base, start, taps = LIST, WATER_KERNELS_U(STRIP), WATER_KERNELS_U(3)
-                rough_count = WATER_KERNELS_U(0)
+                base, start, taps = LIST, U(STRIP), U(3)
+                rough_count = U(0)
             else:
-                smooth_count = WATER_KERNELS_U(0)
-            for last in range(
-                n, (n + WATER_KERNELS_U(7)) & EIGHTS
-            ):  # the last pixel again in lanes left over
-                own[start + last] = own[start + n - WATER_KERNELS_U(1)]
-                for line in range(WATER_KERNELS_U(10)):
-                    at = base + line * WATER_KERNELS_U(STRIP)
-                    q[at + last] = q[at + n - WATER_KERNELS_U(1)]
-            for first in range(WATER_KERNELS_U(0), n, LANES):
+                smooth_count = U(0)
+            for last in range(n, (n + U(7)) & EIGHTS):  # the last pixel again in lanes left over
+                own[start + last] = own[start + n - U(1)]
+                for line in range(U(10)):
+                    at = base + line * U(STRIP)
+                    q[at + last] = q[at + n - U(1)]
+            for first in range(U(0), n, LANES):
                 at = base + first
                 one, zero = v8.splat(ONE), v8.splat(ZERO)
                 dx, dy, dz = v8.load(q, DX + at), v8.load(q, DY + at), v8.load(q, DZ + at)
@@ -880,9 +871,9 @@ def shade(
                     if rough:
                         flat = v8.maximum(v8.sqrt(vx * vx + vy * vy), v8.splat(F(1e-12)))
                         spread8 = v8.sqrt(v8.splat(F(3)) * v8.load(q, ROUGH + at)) / flat
-                        for tap in range(WATER_KERNELS_U(1), WATER_KERNELS_U(3)):
+                        for tap in range(U(1), U(3)):
                             t8 = tap * LANES
-                            sign = ONE if tap == WATER_KERNELS_U(1) else -ONE
+                            sign = ONE if tap == U(1) else -ONE
                             offset8 = v8.splat(sign) * spread8
                             _, _, _, _, _, share, rx, ry, rz = _facet(
                                 sx + offset8 * vx, sy + offset8 * vy, vx, vy, vz, medium, limits

@@ -205,7 +205,7 @@ def normals_from_tangents(tangents: Float64[Tensor, "*B 5"]) -> Float64[Tensor, 
 # 0.17
 # at 5 m/s. Water between houses is sheltered and has no long fetch, so the presets lie below that.
 
-MOST_STEEPNESS = 0.8  # of all waves together, so that no crest of a preset comes near a cusp
+MAX_STEEPNESS = 0.8  # of all waves together, so that no crest of a preset comes near a cusp
 _WIDEST_RAD = math.radians(85)  # no wave runs against the wind that raised it
 
 
@@ -269,7 +269,7 @@ def _draw(spectrum: _Spectrum, recipe: Waves, rng: np.random.Generator, depth_m:
         amplitudes_m=slope * wavelengths / (2 * math.pi),
         wavelengths_m=wavelengths,
         # Q = 1, the circular orbits of deep water (Gerstner's trochoid), where that leaves room.
-        steepness=np.full(count, min(slope, MOST_STEEPNESS / count)),
+        steepness=np.full(count, min(slope, MAX_STEEPNESS / count)),
         phases_rad=rng.uniform(0, 2 * math.pi, count),
         depth_m=depth_m,
     )

@@ -36,7 +36,7 @@ from augment.labels import KnowsLidarOrigins, LidarSweep
 from augment.plan import Plan, make_plan
 from augment.rng import rng_for
 from augment.scene import Scene
-from recipes.schema import KOSCHMIEDER, schema_Recipe
+from recipes.schema import KOSCHMIEDER, Recipe
 from recipes.weather import PURE_WATER_PER_M
 
 # ---- What is known of a LiDAR: its optics as assumed, its intensities, where its beams start -----
@@ -151,7 +151,7 @@ def signal(reflectance: np.ndarray, ranges_m: np.ndarray) -> np.ndarray:
 # ------------------------------------------------------------------------------------------------
 # The strongest echo of every beam of a sweep, as the effects change it one after the other
 
-_LEAST_M = 1e-3  # nearer returns have no direction
+_MIN_M = 1e-3  # nearer returns have no direction
 
 
 @dataclass(eq=False)
@@ -188,7 +188,7 @@ class Echoes:
         count = len(sweep)
         offsets = sweep.points_m - origins
         ranges = np.sqrt((offsets * offsets).sum(1))
-        ranges[~(np.isfinite(ranges) & (ranges > _LEAST_M))] = 0
+        ranges[~(np.isfinite(ranges) & (ranges > _MIN_M))] = 0
         directions = offsets / np.where(ranges > 0, ranges, 1.0)[:, None]
         directions[ranges == 0] = 0
         starts = np.where((ranges > 0)[:, None], origins - world_origin_m, 0.0)
@@ -217,7 +217,7 @@ class Echoes:
         self, rows: np.ndarray, ranges_m: np.ndarray, air_m: np.ndarray, kept: np.ndarray
     ) -> None:
         """Move the returns in rows [M] along their beams, and dim them to kept [M]."""
-        moves = np.abs(ranges_m - self.ranges_m[rows]) > _LEAST_M
+        moves = np.abs(ranges_m - self.ranges_m[rows]) > _MIN_M
         self.codes[rows[moves]] = MOVED
         self.ranges_m[rows[moves]] = ranges_m[moves]
         self.air_m[rows] = air_m
@@ -543,12 +543,12 @@ def meet_water(
 # ---- apply ---------------------------------------------------------------------------------------
 
 DEFAULT_MODEL = LidarModel()
-LEAST_FACING = 0.02  # cosine
+MIN_FACING = 0.02  # cosine
 
 
 def weathered_sweep(
     scene: Scene,
-    recipe: schema_Recipe,
+    recipe: Recipe,
     frame_index: int,
     sweep: LidarSweep,
     *,
@@ -596,7 +596,7 @@ def _meet_snow(echoes: Echoes, scene: Scene, plan: Plan, sweep: LidarSweep, fram
     hits = meet_snow(snow, scene, sweep, frame_ns, echoes.origins, echoes.directions, ranges)
     rows = np.flatnonzero(hits < ranges)
     # The layer counts as level, but its grains stand out: no beam slides over it unreflected.
-    facing = np.maximum(np.abs(echoes.directions[rows, 2]), LEAST_FACING)
+    facing = np.maximum(np.abs(echoes.directions[rows, 2]), MIN_FACING)
     echoes.replace(rows, hits[rows], lambertian(snow.reflectance, facing), MOVED)
 
 

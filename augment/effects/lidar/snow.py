@@ -19,7 +19,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from augment.effects.lidar import snow_kernels
-from augment.effects.snow.cells import SnowBed, SnowCells
+from augment.effects.snow.cells import SnowCells, SnowSupport
 from augment.effects.snow.layer import find_depths
 from augment.effects.snow.profile import profile_of
 from augment.effects.snow.snow import PlacedSnow, placement_settings
@@ -32,9 +32,9 @@ from augment.scene import Scene
 # (Wiscombe and Warren 1980, figure 8): the recipe's albedo times this.
 ALBEDO_AT_905 = 0.93
 GRID_M = 0.1
-_MOST_CELLS = 8_000_000  # of a grid; larger scenes get coarser ones
+_MAX_CELLS = 8_000_000  # of a grid; larger scenes get coarser ones
 _GROUND_SLACK_M, _ACTOR_SLACK_M = 0.15, 0.05
-_MOST_LAYERS = 2  # of a scene, that are kept
+_MAX_LAYERS = 2  # of a scene, that are kept
 _REACH_M = 200.0  # actors farther away are not asked
 _ABOUT_M, _EVERY = 3.0, 8  # returns that tell when the sensor looked at an actor
 _SAME_DRIVE_NS = 10**9  # a sweep's times are within this of its frame's
@@ -71,7 +71,7 @@ def layer_of(cells: SnowCells, depths_m: np.ndarray, *, grid_m: float = GRID_M) 
     half = sizes[covered, None] / 2
     low = (centers[covered, :2] - half).min(0).astype(np.float64)
     extent = (centers[covered, :2] + half).max(0) - low
-    cell = float(max(grid_m, math.sqrt(float(extent.prod()) / _MOST_CELLS)))
+    cell = float(max(grid_m, math.sqrt(float(extent.prod()) / _MAX_CELLS)))
     columns, rows = (int(n) for n in np.ceil(extent / cell) + 1)
     base, top = np.full((2, rows, columns), -np.inf, np.float32)
     depths = np.ascontiguousarray(depths_m, np.float32)
@@ -95,13 +95,13 @@ def snow_in(scene: Scene, placed: PlacedSnow) -> LidarSnow:
             snow = _lay(bed, scene, placed)
             layers[placed] = (bed, snow)
         layers.move_to_end(placed)
-        while len(layers) > _MOST_LAYERS:
+        while len(layers) > _MAX_LAYERS:
             layers.popitem(last=False)
         return snow
 
 
 _lock = threading.Lock()
-_Layers = OrderedDict[PlacedSnow, tuple[SnowBed, LidarSnow]]
+_Layers = OrderedDict[PlacedSnow, tuple[SnowSupport, LidarSnow]]
 _layers: WeakKeyDictionary[Scene, _Layers] = WeakKeyDictionary()
 
 
@@ -173,7 +173,7 @@ def _meet(
     )
 
 
-def _lay(bed: SnowBed, scene: Scene, placed: PlacedSnow) -> LidarSnow:
+def _lay(bed: SnowSupport, scene: Scene, placed: PlacedSnow) -> LidarSnow:
     def layer(cells: SnowCells, track_id: str | None) -> Layer | None:
         # As augment.effects.snow.layer draws them: another key would be another layer.
         part = "ground" if track_id is None else f"actor {track_id}"

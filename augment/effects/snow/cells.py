@@ -57,7 +57,7 @@ class SnowCells:
 
 
 @dataclass(frozen=True, eq=False)
-class SnowBed:
+class SnowSupport:
     """The cells of a whole scene. ground: of the background. actors: by track_id, of those that
     carry snow. seconds: how long each stage of finding them took, for reports.
     """

@@ -19,7 +19,7 @@ from augment.cameras import Camera
 from augment.effects.snow import close_layout as layout
 from augment.effects.snow.blocks import Blocks, blocks_of
 from augment.effects.snow.cuda_constants import snow_classes
-from augment.effects.snow.kernels import COARSER, FARTHEST_M, MOST_SPLITS, REACH, TEXEL_M
+from augment.effects.snow.kernels import COARSER, FARTHEST_M, MAX_SPLITS, REACH, TEXEL_M
 from augment.effects.snow.near_camera import (
     MOTTLE,
     RELIEF,
@@ -72,7 +72,7 @@ class Split:
         fine_slopes = None if slopes is None else new(3)
         gpu.launch(
             kernels.split_discs,
-            (len(self.rows), MOST_SPLITS**2),
+            (len(self.rows), MAX_SPLITS**2),
             *(rows, numbers, gpu.resident(self.order), gpu.resident(_noise())),
             *(means, quats, scales, opacities, sh, slopes, left),
             *(fine.means, fine.quats, fine.scales, fine.opacities, fine.sh, fine_slopes),
@@ -100,7 +100,7 @@ def plan_split(
     blocks = discs.blocks
     near, distances = blocks.near(eye, FARTHEST_M * (1 + _ROUNDING))
     distances = np.maximum(distances * (1 - _ROUNDING), 1e-9)
-    most = np.minimum(np.floor(discs.widest[near] / (finest * distances) + 0.5), MOST_SPLITS)
+    most = np.minimum(np.floor(discs.widest[near] / (finest * distances) + 0.5), MAX_SPLITS)
     chosen, splits = near[most > 1], most[most > 1].astype(int)
     seen = blocks.may_lie_in(chosen, _sides(camera))
     chosen, splits = chosen[seen], splits[seen]

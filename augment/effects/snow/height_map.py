@@ -44,7 +44,7 @@ from augment.semantics import SemanticClass
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-_MOST_AT_ONCE = 8  # a square of cells takes up to some 300 MB while it is worked on
+_MAX_AT_ONCE = 8  # a square of cells takes up to some 300 MB while it is worked on
 _ROWS = 8192  # of arrays, in one part: what is made from them stays in a core's caches
 
 
@@ -69,7 +69,7 @@ def in_order(
     after_each: called in this thread, for one item after another.
     """
     items = list(items)
-    threads = min(thread_count(), len(items), _MOST_AT_ONCE)
+    threads = min(thread_count(), len(items), _MAX_AT_ONCE)
     results = []
     if threads <= 1 or _worker.calls is not None:
         for item in items:
@@ -361,7 +361,7 @@ _FAR_SHARE, _FAR_M = 1.05, 0.3  # of the depth there, and beyond it: what blurre
 _BELOW_SHARE = 1.02  # of the depth there: snow on top of what shows its underside
 _GRAZING = math.sin(math.radians(3))  # how far normals may be off
 _MARGIN_PX = 3.0
-_VISIBILITY_ROWS = 256  # points a thread takes at a time
+_VIEW_ROWS = 256  # points a thread takes at a time
 
 
 @dataclass(frozen=True, eq=False)
@@ -405,7 +405,7 @@ class Views:
                 lambda: cuda_visibility.find_seen(points, normals, is_sure, *given), CUDA
             )
         seen = np.empty(len(points), bool)
-        with kernel_threads(_VISIBILITY_ROWS):
+        with kernel_threads(_VIEW_ROWS):
             visibility_kernels.find_seen(
                 np.ascontiguousarray(points),
                 np.ascontiguousarray(normals),

@@ -33,7 +33,7 @@ from augment.render.sh import SH_C0
 
 # ---- splat kernels -------------------------------------------------------------------------------
 
-MOST_WALLS = 8  # discs one above the other that close a wall
+MAX_WALLS = 8  # discs one above the other that close a wall
 LEAN = 1.5  # steepest slope that a cell's own disc follows
 SETTLED = 0.5  # of the depth: by this much at most does snow even out what lies beneath it
 SPREAD = 0.78  # standard deviation of a disc, in cells
@@ -50,7 +50,7 @@ SUNK = 0.5  # by which a disc's middle lies below the surface, in its thickness
 ROUGH, ROUGH_GRAIN = 0.03, 0.15  # tilt of a disc's normal for its light, and more with grain
 PALE, PALE_GRAIN = 0.01, 0.035  # of its brightness
 MOTTLED = 0.010  # of the brightness per deviation of the mottling noise
-SHADED_HOLLOW, LARGEST_BEND = 0.9, 0.12  # a hollow's loss of brightness per bend, and most bend
+SHADED_HOLLOW, MAX_BEND = 0.9, 0.12  # a hollow's loss of brightness per bend, and most bend
 THIN_M, THIN_LOSS = 0.005, 0.42  # depth through which the ground darkens snow, and how much
 PACKED_SHARE = 0.6  # brightness of packed snow, of fresh snow's
 DARKEST, BRIGHTEST = 0.35, 0.8  # light on the bare surface where the sun is out of sight, and full
@@ -71,7 +71,7 @@ def _uniform(bits, number):
 
 
 @kernel
-def settle(neighbours, z, settled_z):
+def relax_heights(neighbours, z, settled_z):
     """One step of evening out the surface beneath the snow, all [C].
 
     Towards the mean of opposite neighbours: slopes stay as they are. Whatever snow lies there, or
@@ -133,7 +133,7 @@ def _walls(i, side, neighbours, sizes, centers, tops):
     drop = tops[i] - low
     if run == 0.0 or drop <= LEAN * size:
         return 0, drop
-    return min(math.ceil(drop / size), MOST_WALLS), drop
+    return min(math.ceil(drop / size), MAX_WALLS), drop
 
 
 @kernel
@@ -278,7 +278,7 @@ def fill(
         longer = min(stretch, RIM_STRETCH) if at_rim else stretch
         scales[s, 0], scales[s, 1], scales[s, 2] = spread * longer, spread, thick
 
-        bend = min(max(_hollow(i, neighbours, size, tops), -LARGEST_BEND), LARGEST_BEND)
+        bend = min(max(_hollow(i, neighbours, size, tops), -MAX_BEND), MAX_BEND)
         pale = 1.0 + (PALE + PALE_GRAIN * look.grain) * _uniform(draw, 3) + MOTTLED * mottle[i]
         pale *= 1.0 - THIN_LOSS * math.exp(-h / THIN_M)
         loss = SHADED_HOLLOW * bend
@@ -328,7 +328,7 @@ def bury(buried, buried_by, heights, opacities):
 
 REACH = 1.4  # cells that a disc's parts cover: discs lie scattered, up to so far apart
 FARTHEST_M = 10.0  # from the camera: discs farther away stay whole
-MOST_SPLITS = 3  # of a disc, along each of its sides
+MAX_SPLITS = 3  # of a disc, along each of its sides
 MARGIN = 0.15  # of the image's half width or height: discs so far outside are split as well
 TEXEL_M = 0.01  # of the table of noise that the grain follows
 COARSER = 0.37  # how fast the table is read a second time, turned: for clods
@@ -356,7 +356,7 @@ def count_splits(means, scales, pose, limits, finest, splits):
         if not (limits[2] * away <= down <= limits[3] * away):
             continue
         side = REACH * np.float64(max(scales[i, 0], scales[i, 1]))
-        count = min(math.floor(side / (finest * distance) + 0.5), MOST_SPLITS)
+        count = min(math.floor(side / (finest * distance) + 0.5), MAX_SPLITS)
         splits[i] = count if count > 1 else 0
 
 
@@ -426,18 +426,16 @@ def split(
 # Numba kernel of the snow's depth; `augment.effects.snow.profile` and `noise` define what it
 # computes
 
-_NOISE_KERNELS_A, _NOISE_KERNELS_B, _X, _Y = (np.uint64(c) for c in (MIX_A, MIX_B, STEP_X, STEP_Y))
+_A, _B, _X, _Y = (np.uint64(c) for c in (MIX_A, MIX_B, STEP_X, STEP_Y))
 _LOW = np.uint64(0xFFFFFFFF)
-_NOISE_KERNELS_S27, _NOISE_KERNELS_S30, _NOISE_KERNELS_S31, _S32 = (
-    np.uint64(s) for s in (27, 30, 31, 32)
-)
+_S27, _S30, _S31, _S32 = (np.uint64(s) for s in (27, 30, 31, 32))
 
 
 @inner()
 def _mix(bits):
-    bits = (bits ^ (bits >> _NOISE_KERNELS_S30)) * _NOISE_KERNELS_A
-    bits = (bits ^ (bits >> _NOISE_KERNELS_S27)) * _NOISE_KERNELS_B
-    return bits ^ (bits >> _NOISE_KERNELS_S31)
+    bits = (bits ^ (bits >> _S30)) * _A
+    bits = (bits ^ (bits >> _S27)) * _B
+    return bits ^ (bits >> _S31)
 
 
 @inner()

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from augment.effects.snow import kernels as noise_kernels
 from augment.effects.snow import kernels as splat_kernels
-from augment.effects.snow.cells import SnowBed, SnowCells
+from augment.effects.snow.cells import SnowCells, SnowSupport
 from augment.effects.snow.light import Illumination
 from augment.effects.snow.near_camera import Grain, Layer, SnowCover, crystals_of
 from augment.effects.snow.profile import Octaves, Profile, profile_of
@@ -29,10 +29,10 @@ CELLS = 2048  # that a thread takes at a time
 # A rasteriser stops before the splat that would leave 1e-4 of the light behind it. With opaque
 # discs up to a tenth may still shine through then; with these, no more than a two-hundredth.
 OPACITY = 0.98
-LEAST_STEPS, MOST_STEPS = 6, 10  # of evening out the light; the surface beneath takes the most
+MIN_STEPS, MAX_STEPS = 6, 10  # of evening out the light; the surface beneath takes the most
 
 
-class Look(NamedTuple):
+class LayerColors(NamedTuple):
     """What colours are made from besides the cells; a tuple, as kernels take it.
 
     wrap: see augment.effects.snow.light. grain: the recipe's. packed: 1 where tracks show, else 0.
@@ -45,8 +45,8 @@ class Look(NamedTuple):
     is_baked: bool
 
 
-def lay_snow(
-    bed: SnowBed,
+def build_snow_layer(
+    bed: SnowSupport,
     scene: Scene,
     snow: Snow,
     light: Illumination,
@@ -102,7 +102,7 @@ def _lay(
 ) -> Layer:
     """The snow on one part. own: the part's Gaussians."""
     per_pixel = snow.shading == "per_pixel"
-    look = Look(
+    look = LayerColors(
         wrap=float(light.wrap),
         grain=float(snow.grain),
         packed=1.0 if profile.numbers.pressed > 0 else 0.0,
@@ -169,7 +169,7 @@ def _splats(
     depths: Depths,
     depth_m: float,
     lights: np.ndarray,
-    look: Look,
+    look: LayerColors,
     *,
     keep_normals: bool,
     keep_slopes: bool,
@@ -225,9 +225,9 @@ def surface_heights(cells: SnowCells, heights: np.ndarray) -> np.ndarray:
     centers, neighbours = _arrays(cells.centers_m, cells.neighbours)
     z, tops = np.ascontiguousarray(centers[:, 2]), np.empty(len(cells), np.float64)
     with kernel_threads(CELLS):
-        for _ in range(MOST_STEPS):
+        for _ in range(MAX_STEPS):
             next_z = np.empty(len(z), np.float32)
-            splat_kernels.settle(neighbours, z, next_z)
+            splat_kernels.relax_heights(neighbours, z, next_z)
             z = next_z
         splat_kernels.find_tops(centers, heights, z, tops)
     return tops
@@ -239,7 +239,7 @@ def _softened_light(cells: SnowCells, heights: np.ndarray, depth_m: float) -> np
     """
     sizes, neighbours, light = _arrays(cells.sizes_m, cells.neighbours, cells.light)
     finest = float(sizes.min()) if len(sizes) else 1.0
-    steps = min(max(math.ceil(2 * depth_m / finest), LEAST_STEPS), MOST_STEPS)
+    steps = min(max(math.ceil(2 * depth_m / finest), MIN_STEPS), MAX_STEPS)
     with kernel_threads(CELLS):
         for _ in range(steps):
             next_light = np.empty(len(light), np.float32)

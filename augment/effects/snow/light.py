@@ -34,7 +34,7 @@ _WITNESSES: tuple[tuple[SemanticClass | None, float, bool], ...] = (
     (SemanticClass.TERRAIN, 0.18, False),
     (None, 0.12, False),
 )
-_FEWEST_SPLATS = 20
+_MIN_SPLATS = 20
 _SOLID_OPACITY = 0.5
 _LEVEL_COSINE = 0.9  # of a splat that may be ground where no class says so
 
@@ -241,7 +241,7 @@ def _look_at_ground(scene: Scene) -> tuple[np.ndarray, float, bool] | None:
             continue
         else:
             chosen = solid & (g.semantic == semantic).numpy()
-        if chosen.sum() < _FEWEST_SPLATS:
+        if chosen.sum() < _MIN_SPLATS:
             continue
         sizes = g.scales.double().numpy()[chosen]
         areas = sizes.prod(1) / np.maximum(sizes.min(1), 1e-12)

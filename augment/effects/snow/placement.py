@@ -25,7 +25,7 @@ from tqdm import tqdm
 
 from augment.cameras import Camera
 from augment.effects.snow import surface_kernels as hole_kernels
-from augment.effects.snow.cells import EDGE_CAP_M, FLUSH, SnowBed, SnowCells
+from augment.effects.snow.cells import EDGE_CAP_M, FLUSH, SnowCells, SnowSupport
 from augment.effects.snow.height_map import (
     Estimator,
     Footprints,
@@ -75,7 +75,7 @@ _SPREAD_M = 0.2  # standard deviation of the blur: shadows have soft edges, grav
 _PAINT_M = 0.1  # so far beyond its own splats a marking may show
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)  # linear sRGB
 _SHARP_CELLS = 0.3  # a narrower blur leaves cells as they are
-_LEAST_WEIGHT = 0.02
+_MIN_WEIGHT = 0.02
 _FEWEST = 50  # cells of a class, for its median to mean anything
 # What differs in colour as much as in light: their brightness says half as much.
 _MOTLEY = (SemanticClass.UNKNOWN, SemanticClass.VEGETATION, SemanticClass.OTHER)
@@ -110,7 +110,7 @@ def ground_luminance(
             if not missing.any():
                 break
             weight, total = _blur(weights, spread), _blur(sums, spread)
-            known = missing & (weight > _LEAST_WEIGHT)
+            known = missing & (weight > _MIN_WEIGHT)
             out[known] = total[known] / weight[known]
     return out
 
@@ -148,16 +148,16 @@ def _blur(values: np.ndarray, sigma: float) -> np.ndarray:
 # stood
 # on it, tell how high the ground in it is.
 
-LEAST_M2, MOST_M2 = 0.1, 7.0  # what is smaller is left to `surface`
-MOST_OVER_M2 = 0.6  # of that, under narrow things: lamps, not eaves
-MOST_ON_PATH_M2 = 80.0  # where the path of the cameras leads over it
+MIN_M2, MAX_M2 = 0.1, 7.0  # what is smaller is left to `surface`
+MAX_OVER_M2 = 0.6  # of that, under narrow things: lamps, not eaves
+MAX_ON_PATH_M2 = 80.0  # where the path of the cameras leads over it
 _PATH_M = 1.0  # on both sides of it
 _RIM_CELLS = 3
 _ALIKE_M, _FIRST_M = 0.12, 0.5  # off the plane of what lies around; and off its middle, at first
-_FEWEST_CELLS = 8
-_FEWEST_ALIKE, _OCTANTS, _OCTANTS_ON_PATH = 0.6, 7, 5
+_MIN_CELLS = 8
+_MIN_ALIKE, _OCTANTS, _OCTANTS_ON_PATH = 0.6, 7, 5
 _STEEPEST = math.tan(math.radians(20))
-_MOST_SAMPLES = 160  # of a rim that heights are taken from
+_MAX_SAMPLES = 160  # of a rim that heights are taken from
 _CLEAR_M = 0.3  # over the plane, of thin things that stand in a hole
 
 
@@ -183,17 +183,17 @@ def fill_holes(
     )
     cell_m2 = height_map.cell_m**2
     sizes = stats[:, cv2.CC_STAT_AREA] * cell_m2
-    possible = np.flatnonzero((sizes >= LEAST_M2) & (sizes <= MOST_ON_PATH_M2))
+    possible = np.flatnonzero((sizes >= MIN_M2) & (sizes <= MAX_ON_PATH_M2))
     possible = possible[possible > 0]
     if count <= 1 or len(possible) == 0:
         return height_map, filled
     near = labels[_near_path(height_map, path_xy)].astype(np.int64)
     on_path = np.bincount(near, minlength=count) > 0
     over = np.bincount(labels[narrow].astype(np.int64), minlength=count) * cell_m2
-    possible = possible[over[possible] <= MOST_OVER_M2]
+    possible = possible[over[possible] <= MAX_OVER_M2]
     new = {name: getattr(height_map, name).copy() for name in ("height_m", "rgb", "alpha")}
     is_thin = height_map.is_thin.copy()
-    for hole in possible[(sizes[possible] <= MOST_M2) | on_path[possible]]:
+    for hole in possible[(sizes[possible] <= MAX_M2) | on_path[possible]]:
         left, bottom, width, height = stats[hole, :4]
         window = (
             slice(max(0, bottom - _RIM_CELLS), bottom + height + _RIM_CELLS),
@@ -216,7 +216,7 @@ def fill_holes(
         tall = height_map.is_thin[window][rows, columns]
         tall &= height_map.height_m[window][rows, columns] > level + _CLEAR_M
         rows, columns, level = rows[~tall], columns[~tall], level[~tall]
-        at_row, at_column = (part[:: 1 + len(part) // _MOST_SAMPLES] for part in np.nonzero(alike))
+        at_row, at_column = (part[:: 1 + len(part) // _MAX_SAMPLES] for part in np.nonzero(alike))
         weights = np.hypot(rows[:, None] - at_row, columns[:, None] - at_column) ** -3.0
         weights /= weights.sum(1, keepdims=True)
         off = height_map.height_m[window][at_row, at_column]
@@ -250,15 +250,13 @@ def _plane_around(
     """
     rows, columns = np.nonzero(known)
     alike = np.zeros_like(known)
-    if len(rows) < _FEWEST_CELLS:
+    if len(rows) < _MIN_CELLS:
         return None, alike
     z = height[rows, columns].astype(np.float64)
     used, fits = np.empty(len(z), bool), np.empty(len(z), bool)
-    slopes = hole_kernels.find_plane(
-        rows, columns, z, _FIRST_M, _ALIKE_M, _FEWEST_CELLS, used, fits
-    )
+    slopes = hole_kernels.find_plane(rows, columns, z, _FIRST_M, _ALIKE_M, _MIN_CELLS, used, fits)
     fits &= lies[rows, columns]
-    if not (fits.mean() >= _FEWEST_ALIKE and math.hypot(*slopes) <= _STEEPEST * cell):
+    if not (fits.mean() >= _MIN_ALIKE and math.hypot(*slopes) <= _STEEPEST * cell):
         return None, alike
     alike[rows[fits], columns[fits]] = True
     terms = np.stack([np.ones(len(z)), columns, rows], 1)
@@ -446,14 +444,14 @@ class PlacementSettings:
             )
 
 
-def place_snow_bed(
+def place_snow_support(
     scene: Scene,
     cameras: Sequence[Camera],
     settings: PlacementSettings = PlacementSettings(),
     *,
     backend: str = AUTO,
     progress: bool = False,
-) -> SnowBed:
+) -> SnowSupport:
     """The cells of a scene that snow can lie on and that some of the cameras can see.
 
     Several threads work on squares of the ground, and any number gives the same bits.
@@ -467,12 +465,12 @@ def place_snow_bed(
     check_metric_and_level(scene)
     if backend != CUDA:
         backend = AUTO
-    clock = _Clock()
+    clock = _StageTimer()
     views = views_along(cameras)
     background = plain_gaussians(scene.background)
     plan = plan_tiles(views, settings.cell_m, _heights(scene))
     plan.check_size()
-    clock.lap("plan")
+    clock.timed("plan")
     vehicles = [actor for actor in scene.actors if is_vehicle(actor)]
     squares = [
         (level, window)
@@ -480,7 +478,7 @@ def place_snow_bed(
         for window in plan.squares(level, _SQUARE_CELLS)
     ]
     if not squares:
-        return SnowBed(_no_cells(), {}, clock.seconds)
+        return SnowSupport(_no_cells(), {}, clock.seconds)
     parked = tuple(_parked(scene))
     with tqdm(
         total=len(views) + len(squares) + len(vehicles),
@@ -494,10 +492,10 @@ def place_snow_bed(
             backend=backend,
             after_each=lambda: bar.update(),
         )
-        clock.lap("views")
+        clock.timed("views")
         paths = wheel_paths(scene)
         work = _Ground(background, parked, plan, views, seen_from, paths, settings, backend)
-        clock.lap("plan")
+        clock.timed("plan")
         found = in_order(work.find, squares, after_each=bar.update)
         clock.share_lap([square.seconds for square in found])
         on_vehicles = in_order(
@@ -516,20 +514,20 @@ def place_snow_bed(
             for actor, cells in zip(vehicles, on_vehicles, strict=True)
             if cells is not None
         }
-        clock.lap("actors")
+        clock.timed("actors")
     ground = work.joined(found)
-    clock.lap("join")
-    return SnowBed(ground, actors, clock.seconds)
+    clock.timed("join")
+    return SnowSupport(ground, actors, clock.seconds)
 
 
-class _Clock:
+class _StageTimer:
     """Adds up the seconds between laps by name."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
         self._last = time.perf_counter()
 
-    def lap(self, name: str) -> None:
+    def timed(self, name: str) -> None:
         now = time.perf_counter()
         self.seconds[name] = self.seconds.get(name, 0.0) + now - self._last
         self._last = now
@@ -594,14 +592,14 @@ class _Ground:
 
     def find(self, level_and_window: tuple[int, Window]) -> _Found:
         """The cells of one window of a level."""
-        clock = _Clock()
+        clock = _StageTimer()
         square = _with_margin(self._plan, *level_and_window)
         view, classes, lies, filled = self._draw(square)
-        clock.lap("above")
+        clock.timed("above")
         surface = find_surface(view, lies, max_slope_deg=self._settings.max_slope_deg)
-        clock.lap("surface")
+        clock.timed("surface")
         seen = self._seen(surface, square, filled)
-        clock.lap("seen")
+        clock.timed("seen")
         rows, columns = np.nonzero(surface.can_carry & seen & square.inner)
         cells = None
         if len(rows):
@@ -615,7 +613,7 @@ class _Ground:
                 banks=banks_of(surface),
                 classes=classes,
             )
-        clock.lap("ground")
+        clock.timed("ground")
         return _Found(
             square.level,
             columns.astype(np.int64) + square.window.left,
@@ -761,4 +759,4 @@ def _no_cells() -> SnowCells:
 
 _NOBODY = Gaussians.empty()
 
-__all__ = ["PlacementSettings", "SceneError", "place_snow_bed"]
+__all__ = ["PlacementSettings", "SceneError", "place_snow_support"]

@@ -12,13 +12,13 @@ from jaxtyping import Float32, Float64, UInt8
 
 from augment.boxes import SIDES_M, BoxPixels, PlacedBoxes, count_pixels
 from augment.cameras import Camera
-from augment.effects.snow.cells import SnowBed
-from augment.effects.snow.layer import lay_snow
+from augment.effects.snow.cells import SnowSupport
+from augment.effects.snow.layer import build_snow_layer
 from augment.effects.snow.light import illumination_of
 from augment.effects.snow.near_camera import SnowCover
 from augment.effects.snow.placement import PlacementSettings
 from augment.effects.snow.support import bed_of
-from augment.effects.style.style import Look
+from augment.effects.style.style import SceneStyle
 from augment.labels import Boxes
 from augment.render.buffers import AUTO
 from augment.scene import Scene
@@ -81,7 +81,7 @@ def placed_in_snow(placed: PlacedBoxes, thickness_m: float) -> PlacedBoxes:
 
 # ---- covers --------------------------------------------------------------------------------------
 
-_MOST_COVERS = 2  # of a scene, that are kept: a job goes through its variants frame by frame
+_MAX_COVERS = 2  # of a scene, that are kept: a job goes through its variants frame by frame
 
 
 def placement_settings(snow: Snow) -> PlacementSettings:
@@ -90,7 +90,7 @@ def placement_settings(snow: Snow) -> PlacementSettings:
 
 
 def cover_of(
-    scene: Scene, placed: PlacedSnow, look: Look | None = None, *, backend: str = AUTO
+    scene: Scene, placed: PlacedSnow, look: SceneStyle | None = None, *, backend: str = AUTO
 ) -> SnowCover:
     """The snow in the scene; remembered for as long as the scene lives and no third is asked for.
 
@@ -106,20 +106,20 @@ def cover_of(
     bed = bed_of(scene, placement_settings(placed.snow), backend=backend)
     laid_on, cover = covers.get((placed, look), (None, None))
     if cover is None or laid_on is not bed:
-        cover = lay_snow(
+        cover = build_snow_layer(
             bed,
             scene,
             placed.snow,
-            illumination_of(scene if look is None else look.witness, placed.snow),
+            illumination_of(scene if look is None else look.lighting_scene, placed.snow),
             seed=placed.seed,
             water_level_z_m=placed.water_level_z_m,
         )
         covers[placed, look] = (bed, cover)
     covers.move_to_end((placed, look))
-    while len(covers) > _MOST_COVERS:
+    while len(covers) > _MAX_COVERS:
         covers.popitem(last=False)
     return cover
 
 
-_Covers = OrderedDict[tuple[PlacedSnow, Look | None], tuple[SnowBed, SnowCover]]
+_Covers = OrderedDict[tuple[PlacedSnow, SceneStyle | None], tuple[SnowSupport, SnowCover]]
 _covers: WeakKeyDictionary[Scene, _Covers] = WeakKeyDictionary()

@@ -18,8 +18,8 @@ from safetensors.torch import save
 from torch import Tensor
 
 from augment.cameras import Camera
-from augment.effects.snow.cells import FLUSH, SnowBed, SnowCells
-from augment.effects.snow.placement import PlacementSettings, place_snow_bed
+from augment.effects.snow.cells import FLUSH, SnowCells, SnowSupport
+from augment.effects.snow.placement import PlacementSettings, place_snow_support
 from augment.errors import SceneError
 from augment.jobs.atomic import write_atomic
 from augment.render.buffers import AUTO, CUDA
@@ -70,7 +70,7 @@ def bed_key(
     return digest.hexdigest()
 
 
-def save_bed(path: Path, bed: SnowBed, key: str) -> None:
+def save_bed(path: Path, bed: SnowSupport, key: str) -> None:
     """Write a bed, as a whole or not at all; its bytes are those of its content. Seconds are not
     kept.
 
@@ -85,7 +85,7 @@ def save_bed(path: Path, bed: SnowBed, key: str) -> None:
     write_atomic(path, save(tensors, metadata={_ABOUT: json.dumps(about, sort_keys=True)}))
 
 
-def load_bed(path: Path, key: str) -> SnowBed:
+def load_bed(path: Path, key: str) -> SnowSupport:
     """The bed of a file.
 
     Raises:
@@ -102,7 +102,7 @@ def load_bed(path: Path, key: str) -> SnowBed:
             track_id: _cells(path, tensors, f"actors.{number}")
             for number, track_id in enumerate(track_ids)
         }
-        return SnowBed(_cells(path, tensors, "ground"), actors)
+        return SnowSupport(_cells(path, tensors, "ground"), actors)
     except FileNotFoundError as error:
         raise SceneError(f"{path}: no such file, so no snow bed to read") from error
     except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
@@ -175,7 +175,7 @@ def _add(digest: hashlib.blake2b, tensor: Tensor) -> None:
 
 logger = logging.getLogger(__name__)
 
-_remembered: WeakKeyDictionary[Scene, dict[PlacementSettings, SnowBed]] = WeakKeyDictionary()
+_remembered: WeakKeyDictionary[Scene, dict[PlacementSettings, SnowSupport]] = WeakKeyDictionary()
 
 
 def bed_of(
@@ -186,17 +186,17 @@ def bed_of(
     folder: Path | None = None,
     backend: str = AUTO,
     progress: bool = False,
-) -> SnowBed:
+) -> SnowSupport:
     """The bed of a scene: remembered, else read from the folder, else placed and written there.
 
     cameras: those that must see the snow; None for all of the scene's. Only the bed of all cameras
-    is remembered under the settings alone; `remember_bed` gives that place to another.
+    is remembered under the settings alone; `remember_support` gives that place to another.
     folder: beds are kept there as snow-<key>.safetensors. A file that cannot be used is replaced,
-    with a warning. backend: that places what is not remembered yet, see place_snow_bed; a scene has
-    one bed, so that its pictures, sweeps and labels agree.
+    with a warning. backend: that places what is not remembered yet, see place_snow_support; a
+    scene has one bed, so that its pictures, sweeps and labels agree.
 
     Raises:
-        SceneError: as place_snow_bed.
+        SceneError: as place_snow_support.
         OutputError: the folder cannot be written.
     """
     found = _remembered.get(scene, {}).get(settings)
@@ -206,11 +206,11 @@ def bed_of(
     if seeing is None:
         seeing = [camera for frame in scene.frames for camera in frame.cameras.values()]
     bed = _kept(scene, seeing, settings, folder, backend, progress)
-    remember_bed(scene, settings, bed)
+    remember_support(scene, settings, bed)
     return bed
 
 
-def remember_bed(scene: Scene, settings: PlacementSettings, bed: SnowBed) -> None:
+def remember_support(scene: Scene, settings: PlacementSettings, bed: SnowSupport) -> None:
     """Make `bed_of` give this bed for the scene and the settings from now on."""
     _remembered.setdefault(scene, {})[settings] = bed
 
@@ -227,9 +227,9 @@ def _kept(
     folder: Path | None,
     backend: str,
     progress: bool,
-) -> SnowBed:
+) -> SnowSupport:
     if folder is None:
-        return place_snow_bed(scene, cameras, settings, backend=backend, progress=progress)
+        return place_snow_support(scene, cameras, settings, backend=backend, progress=progress)
     key = bed_key(scene, cameras, settings, backend=backend)
     path = bed_path(folder, key)
     if path.exists():
@@ -237,6 +237,6 @@ def _kept(
             return load_bed(path, key)
         except SceneError as error:
             logger.warning("the snow of %s is placed anew: %s", scene.name, error)
-    bed = place_snow_bed(scene, cameras, settings, backend=backend, progress=progress)
+    bed = place_snow_support(scene, cameras, settings, backend=backend, progress=progress)
     save_bed(path, bed, key)
     return bed

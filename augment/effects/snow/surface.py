@@ -40,7 +40,7 @@ _NARROW_M, _HIGH_M = 0.4, 1.5  # what is so narrow and so high carries nothing: 
 _HIGH_M2 = 0.6  # smaller patches so high up are ledges, and what floats before walls
 _GAP_M = 0.6  # wider gaps may be deep
 _STANDS_OUT_M = 0.1  # of a surface, so that it is not bridged
-LEAST_AREA_M2, LEAST_CELLS = 0.05, 4  # smaller patches are specks
+MIN_AREA_M2, MIN_CELLS = 0.05, 4  # smaller patches are specks
 POCKET_M2, _POCKET_STEP_M, _POCKET_CELLS = 0.1, 0.3, 1.5  # gaps that are closed
 OBSTACLE_M, _BANK_REACH_M, _BANK_SPREAD_M = 0.4, 1.0, 0.35
 _MEDIAN_M, _SMOOTH_M = 0.1, 0.15  # scales of smoothing; one cell at least
@@ -71,13 +71,13 @@ def find_surface(
     may_carry: np.ndarray,
     *,
     max_slope_deg: float,
-    least_area_m2: float = LEAST_AREA_M2,
+    least_area_m2: float = MIN_AREA_M2,
     floor_m: float | None = None,
 ) -> Surface:
     """The surface of a map, and where snow stays on it.
 
     may_carry: bool [H, W]; where it is false nothing is put, whatever lies there. Patches that end
-    within the map and are smaller than least_area_m2 or LEAST_CELLS carry nothing. floor_m: how
+    within the map and are smaller than least_area_m2 or MIN_CELLS carry nothing. floor_m: how
     high that lies which the map does not show; None for deep but in small gaps.
     """
     cell, covered = height_map.cell_m, height_map.covered.copy()
@@ -108,7 +108,7 @@ def find_surface(
     can_carry &= ~(steep & (rises > _highest_step(limit, cell)))
     step = max(STEP_M, math.tan(limit) * cell)
     sides = _compare(fitted, lowest, covered, can_carry, step)
-    least = max(LEAST_CELLS, math.ceil(least_area_m2 / cell**2))
+    least = max(MIN_CELLS, math.ceil(least_area_m2 / cell**2))
     is_high = fitted - lowest > _HIGH_M
     can_carry &= ~_specks(can_carry, sides, is_high, least, max(least, round(_HIGH_M2 / cell**2)))
     filled = _fill_pockets(fitted, slopes, can_carry, covered, cell)
@@ -481,8 +481,8 @@ def make_cells(
 
 # ---- Where snow lies on vehicles: cells in their own frames, carried along as they drive ---------
 
-LARGEST_CELL_M = 0.05
-ACTOR_CELLS_LEAST_AREA_M2 = 0.3  # of all cells of a vehicle: less is not worth a layer
+MAX_CELL_M = 0.05
+MIN_ACTOR_AREA_M2 = 0.3  # of all cells of a vehicle: less is not worth a layer
 MOVES_M = 0.5  # an actor that goes less far is parked
 DRIVEN_MAX_SLOPE_DEG = 25.0  # drivers clear their windows, and what is steeper slides off
 _BOTTOM_M = 0.25  # of the box: there are wheels, and the shadow on the road
@@ -528,7 +528,7 @@ def find_actor_cells(
 
     Its open edges are all round: what does not rise beside a cell falls away.
     """
-    cell = min(cell_m, LARGEST_CELL_M)
+    cell = min(cell_m, MAX_CELL_M)
     gaussians = plain_gaussians(actor.gaussians)
     half = np.array(actor.size_m[:2]) / 2 + _MARGIN_M
     if not (np.isfinite(half).all() and (half < 100).all()):
@@ -560,7 +560,7 @@ def find_actor_cells(
         view, body_only, max_slope_deg=limit, least_area_m2=_PATCH_M2, floor_m=float(bottom)
     )
     rows, columns = np.nonzero(surface.can_carry)
-    if len(rows) * cell**2 < ACTOR_CELLS_LEAST_AREA_M2:
+    if len(rows) * cell**2 < MIN_ACTOR_AREA_M2:
         return None
     return _record(surface, rows, columns, classes[chosen], body, chosen)
 

@@ -18,11 +18,11 @@ from augment.errors import SceneError
 RINGS_M = (8.0, 32.0, 48.0, 80.0, 120.0)
 COARSEST_M = 1.0  # cells double up to about this size; a coarser cell_m does not double at all
 BYTES_PER_CELL = 70  # of a bed
-MOST_BYTES = 4 << 30
+MAX_BYTES = 4 << 30
 _SIDE_M = 3.2  # of a tile, about
 _PATH_STEP_M = 1.0  # camera centres closer than this are one place of the path
 _PATH_GAP_M = 25.0  # those farther apart are not joined
-_MOST_TILES = 30_000_000  # of the rectangle about the path
+_MAX_TILES = 30_000_000  # of the rectangle about the path
 
 
 @dataclass(frozen=True)
@@ -64,14 +64,14 @@ class TilePlan:
         return sum(int(n) * self.cells_per_side(k) ** 2 for k, n in enumerate(counts))
 
     def check_size(self) -> None:
-        """Raises SceneError where a bed of these tiles would take more than MOST_BYTES."""
-        if self.cells * BYTES_PER_CELL <= MOST_BYTES:
+        """Raises SceneError where a bed of these tiles would take more than MAX_BYTES."""
+        if self.cells * BYTES_PER_CELL <= MAX_BYTES:
             return
-        fits = self.cell_m * math.sqrt(self.cells * BYTES_PER_CELL / MOST_BYTES)
+        fits = self.cell_m * math.sqrt(self.cells * BYTES_PER_CELL / MAX_BYTES)
         raise SceneError(
             f"snow in cells of {self.cell_m:g} m would take {self.cells / 1e6:,.0f} million cells "
             f"along this path, about {self.cells * BYTES_PER_CELL / 1e9:,.1f} GB; at most "
-            f"{MOST_BYTES / 1e9:.1f} GB are used. Take cells of {_round_up(fits):g} m or more "
+            f"{MAX_BYTES / 1e9:.1f} GB are used. Take cells of {_round_up(fits):g} m or more "
             f"(weather.snow.cell_m), or fewer frames"
         )
 
@@ -164,7 +164,7 @@ def plan_tiles(
     path = path_points(cameras)[:, :2]
     first = np.floor((path.min(0) - RINGS_M[-1]) / side).astype(np.int64)
     size = np.floor((path.max(0) + RINGS_M[-1]) / side).astype(np.int64) + 1 - first
-    if float(size[0]) * float(size[1]) > _MOST_TILES:
+    if float(size[0]) * float(size[1]) > _MAX_TILES:
         extent = path.max(0) - path.min(0)
         raise SceneError(
             f"the cameras' path covers {extent[0] / 1e3:,.1f} km x {extent[1] / 1e3:,.1f} km, more "

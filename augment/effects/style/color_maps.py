@@ -99,7 +99,7 @@ _NEAR, _FAR = 0.06, 0.16  # greatest difference of a channel: sky up to here, no
 _LIKELY, _UNLIKELY = 7.0, 14.0  # squared Mahalanobis distance from the colours of the seen sky
 _LOW_DEG, _HIGH_DEG = 0.5, 3.0  # elevation: none up to here, all from there
 _FLOOR = 0.01  # standard deviation added to the seen sky's, so that a plain one is not a point
-_MOST_PLACES = 64  # that the sky is looked at from
+_MAX_PLACES = 64  # that the sky is looked at from
 
 
 def sky_levels(scene: Scene, maps: StyleMaps) -> Int16[Tensor, "N"] | None:
@@ -165,7 +165,7 @@ def map_rows(
 def _places(scene: Scene) -> np.ndarray:
     """Centres of the scene's cameras, float64 [P, 3], a few spread over its frames."""
     centres = [c.centre.numpy() for f in scene.frames for c in f.cameras.values()]
-    step = max(1, -(-len(centres) // _MOST_PLACES))
+    step = max(1, -(-len(centres) // _MAX_PLACES))
     return np.asarray(centres[::step], np.float64).reshape(-1, 3)
 
 

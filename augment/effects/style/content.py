@@ -44,8 +44,8 @@ VIEW_PIXELS = 200 * 130  # of each, about
 PICTURES = 4  # that a network looks at
 PICTURE_SIZE = 256  # pixels, what networks take
 # Splats never cover a pixel altogether; what glimmers through in sum is no sky.
-LEAST_SKY = 0.005
-MOST_REMEMBERED = 8  # results of a scene
+MIN_SKY = 0.005
+MAX_REMEMBERED = 8  # results of a scene
 
 _CHANNELS = (ROAD, VEGETATION, REST)  # of the picture that says what a pixel shows
 _CLASS_CHANNEL = {
@@ -163,7 +163,7 @@ def _statistics(scene: Scene, views: Sequence[Camera], per_region: bool) -> Stat
         _add(found, WHOLE, picture, np.ones_like(alpha), total)
     _add(found, LAND, land, alpha, total)
     open_share = np.clip(1 - alpha, 0, 1)
-    if open_share.sum(dtype=np.float64) >= LEAST_SKY * total:
+    if open_share.sum(dtype=np.float64) >= MIN_SKY * total:
         _add(found, SKY, np.concatenate([view.sky for view in seen]), open_share, total)
     if per_region:
         marks = np.concatenate([view.marks for view in seen])
@@ -307,7 +307,7 @@ def _remember(scene: Scene, key: tuple, found: Callable[[], _T]) -> _T:
     known = _remembered.setdefault(scene, {})
     if key not in known:
         value = found()
-        while len(known) >= MOST_REMEMBERED:
+        while len(known) >= MAX_REMEMBERED:
             del known[next(iter(known))]
         known[key] = value
     return known[key]  # type: ignore[return-value]

@@ -30,9 +30,9 @@ from recipes.files import open_file
 
 _SIDE_PX = 128  # the longer side of the picture in which regions are found
 _STEPS = np.geomspace(0.015, 0.2, 20)  # of colour, that may end a sky; the best of them is taken
-_LEAST_SHARE = 0.04  # of the picture, or the statistics are of a handful of pixels
-_LEAST_COLUMNS = 0.6  # of the picture's columns that begin with sky
-_LEAST_SIDE_PX = 16  # of a picture that shows anything
+_MIN_SHARE = 0.04  # of the picture, or the statistics are of a handful of pixels
+_MIN_COLUMNS = 0.6  # of the picture's columns that begin with sky
+_MIN_SIDE_PX = 16  # of a picture that shows anything
 
 
 def find_sky(rgb: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -45,7 +45,7 @@ def find_sky(rgb: np.ndarray, weights: np.ndarray) -> np.ndarray:
     region detection in a single image", eq. 4). It is kept where it is wide, smoother than the
     land, and brighter or bluer: see `_is_sky`.
     """
-    if min(weights.shape) < _LEAST_SIDE_PX:
+    if min(weights.shape) < _MIN_SIDE_PX:
         return np.zeros(weights.shape, bool)
     small, small_weights = _small(rgb), _small(weights)
     steps = _color_steps(small)
@@ -65,13 +65,13 @@ def region_masks(rgb: np.ndarray, weights: np.ndarray, sky: np.ndarray) -> dict[
     the bottom edge; only below a sky, for indoors the same is a table. REST is what remains, where
     either was found. None is smaller than 4 % of the picture.
     """
-    enough = _LEAST_SHARE * sky.size
+    enough = _MIN_SHARE * sky.size
     masks: dict[str, np.ndarray] = {}
     outdoors = sky.sum() >= enough
     land = ~sky & (weights > 0)
     if outdoors and land.sum() >= enough:
         masks |= {SKY: sky, LAND: land}
-    if min(sky.shape) < _LEAST_SIDE_PX:
+    if min(sky.shape) < _MIN_SIDE_PX:
         return masks
     green = _green(rgb) & land
     grey = _road(rgb) & land & ~green if outdoors else np.zeros_like(land)
@@ -126,7 +126,7 @@ def _energies(small: np.ndarray, weights: np.ndarray, borders: np.ndarray) -> np
     sky = sums[borders, np.arange(borders.shape[1])].sum(1)  # [S, 4, 4]
     ground = sums[-1].sum(0) - sky
     share = sky[:, 0, 0] / max(sums[-1, :, 0, 0].sum(), 1e-9)
-    usable = (share >= _LEAST_SHARE) & (share <= 1 - _LEAST_SHARE)
+    usable = (share >= _MIN_SHARE) & (share <= 1 - _MIN_SHARE)
     cost = sum(weight * term for weight, side in ((2, sky), (1, ground)) for term in _spread(side))
     return np.where(usable, 1 / np.maximum(cost, 1e-9), 0.0)
 
@@ -146,7 +146,7 @@ def _is_sky(small: np.ndarray, sky: np.ndarray, steps: np.ndarray) -> bool:
     Numbers chosen by eye on photographs of skies and of walls, water, leaves and rooms.
     """
     share, columns = sky.mean(), (sky.sum(0) > len(sky) // 25).mean()
-    if not _LEAST_SHARE <= share <= 1 - _LEAST_SHARE or columns < _LEAST_COLUMNS:
+    if not _MIN_SHARE <= share <= 1 - _MIN_SHARE or columns < _MIN_COLUMNS:
         return False
     red, green, blue = small[sky].mean(0).tolist()
     land = small[~sky].mean(0).tolist()

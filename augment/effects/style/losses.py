@@ -74,7 +74,7 @@ def open_features(weights: Path | None) -> FeatureExtractor:
 _BLOCKS = ((64, 64), (128, 128), (256, 256, 256, 256), (512,))
 _TAKEN = {1: "relu1_1", 6: "relu2_1", 11: "relu3_1", 20: "relu4_1"}
 _MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet, in training
-LEAST_SIDE_PX = 8  # three poolings leave one pixel of it
+MIN_SIDE_PX = 8  # three poolings leave one pixel of it
 
 
 class Vgg19(nn.Module):
@@ -104,9 +104,9 @@ class Vgg19(nn.Module):
         self.requires_grad_(False)
 
     def forward(self, pictures: Tensor) -> Features:
-        if min(pictures.shape[2:]) < LEAST_SIDE_PX:
+        if min(pictures.shape[2:]) < MIN_SIDE_PX:
             raise ValueError(
-                f"VGG-19 needs pictures of at least {LEAST_SIDE_PX} px a side; "
+                f"VGG-19 needs pictures of at least {MIN_SIDE_PX} px a side; "
                 f"got {list(pictures.shape)}"
             )
         x = (pictures - self.mean) / self.deviation
@@ -226,7 +226,7 @@ def _edges(x: Tensor) -> Tensor:
 
 # ---- losses --------------------------------------------------------------------------------------
 
-LEAST_VARIANCE = 1e-6  # under the root: a constant feature has a deviation with a gradient
+MIN_VARIANCE = 1e-6  # under the root: a constant feature has a deviation with a gradient
 
 
 @dataclass(frozen=True, eq=False)
@@ -278,7 +278,7 @@ def style_loss(rendered: Features, style: Features) -> Float[Tensor, ""]:
     total = rendered[0].new_zeros(())
     for ours, theirs in zip(rendered, style, strict=True):
         for a, b in zip(moments(ours), moments(theirs), strict=True):
-            total = total + ((a - b).square().mean(1) + LEAST_VARIANCE**2).sqrt().mean()
+            total = total + ((a - b).square().mean(1) + MIN_VARIANCE**2).sqrt().mean()
     return total
 
 
@@ -286,7 +286,7 @@ def moments(feature: Float[Tensor, "B C H W"]) -> tuple[Tensor, Tensor]:
     """Mean and deviation [B, C] over the pixels."""
     mean = feature.mean((2, 3))
     variance = (feature - mean[:, :, None, None]).square().mean((2, 3))
-    return mean, (variance + LEAST_VARIANCE).sqrt()
+    return mean, (variance + MIN_VARIANCE).sqrt()
 
 
 def weighted_sum(terms: dict[str, Tensor], weights: dict[str, float]) -> Tensor:

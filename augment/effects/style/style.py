@@ -58,7 +58,7 @@ from recipes.yaml_tree import read_plain
 if TYPE_CHECKING:
     from augment.effects.style.network import Gscm
 
-MOST_REMEMBERED = 8  # styles of a scene
+MAX_REMEMBERED = 8  # styles of a scene
 
 _remembered: WeakKeyDictionary[Scene, dict[tuple, StyleMaps]] = WeakKeyDictionary()
 _given: WeakKeyDictionary[Scene, dict[Style, StyleMaps]] = WeakKeyDictionary()
@@ -84,7 +84,7 @@ def style_maps(scene: Scene, style: Style, *, cameras: Sequence[Camera] | None =
     known = _remembered.setdefault(scene, {})
     if key not in known:
         maps = _find_maps(scene, style, cameras)
-        while len(known) >= MOST_REMEMBERED:
+        while len(known) >= MAX_REMEMBERED:
             del known[next(iter(known))]
         known[key] = maps
     return known[key]
@@ -95,7 +95,7 @@ def remember_maps(scene: Scene, style: Style, maps: StyleMaps) -> None:
     cameras.
     """
     given = _given.setdefault(scene, {})
-    while len(given) >= MOST_REMEMBERED:
+    while len(given) >= MAX_REMEMBERED:
         del given[next(iter(given))]
     given[style] = maps
 
@@ -291,11 +291,11 @@ def _numbers(value: Any, shape: tuple[int, ...], where: str) -> np.ndarray:
 
 # ---- looks ---------------------------------------------------------------------------------------
 
-_MOST_LOOKS = 4  # of a scene, that are kept: a job goes through its variants frame by frame
+_MAX_LOOKS = 4  # of a scene, that are kept: a job goes through its variants frame by frame
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
+class SceneStyle:
     """The maps of a style in a scene, and the scene's sky under them. levels [N]: how much of each
     background splat is sky; None where none is any.
 
@@ -318,7 +318,7 @@ class Look:
         return tuple(part if part.is_snow else self._mapped(part, backend) for part in parts)
 
     @cached_property
-    def witness(self) -> Scene:
+    def lighting_scene(self) -> Scene:
         """A scene of the styled background's mean colours and sky, to read the light from."""
         flat = dataclasses.replace(self.bare.background, sh=self.bare.background.sh[:, :1])
         flat = style_gaussians(flat, self.maps, levels=self.levels)
@@ -351,7 +351,7 @@ class Look:
         return map_rows(self.levels, self.bare.background.semantic, len(self.maps.splats))
 
 
-def look_of(scene: Scene, style: Style) -> Look:
+def look_of(scene: Scene, style: Style) -> SceneStyle:
     """The style in the scene; remembered for as long as the scene lives and few others are asked
     for.
 
@@ -365,11 +365,11 @@ def look_of(scene: Scene, style: Style) -> Look:
         # The scene itself would be kept alive by what is remembered for as long as it lives.
         bare = dataclasses.replace(scene)
         sky, levels = style_sky(scene.sky, maps.sky), sky_levels(scene, maps)
-        look = looks[style] = Look(maps, sky, bare, levels, folds=style.evaluated == "sh")
+        look = looks[style] = SceneStyle(maps, sky, bare, levels, folds=style.evaluated == "sh")
     looks.move_to_end(style)
-    while len(looks) > _MOST_LOOKS:
+    while len(looks) > _MAX_LOOKS:
         looks.popitem(last=False)
     return look
 
 
-_looks: WeakKeyDictionary[Scene, OrderedDict[Style, Look]] = WeakKeyDictionary()
+_looks: WeakKeyDictionary[Scene, OrderedDict[Style, SceneStyle]] = WeakKeyDictionary()

@@ -554,7 +554,7 @@ def pair_loss_of(pool: TrainingPool, weights: PairWeights) -> PairLoss | None:
 # ---- Photographs to train the style network on, and to score it with -----------------------------
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
-LEAST_TO_HOLD_OUT = 5  # of fewer photos none is spared
+MIN_TO_HOLD_OUT = 5  # of fewer photos none is spared
 
 
 @dataclass(frozen=True, eq=False)
@@ -596,7 +596,7 @@ def read_photos(paths: Sequence[Path], size_px: int, *, holdout: int) -> Photos:
         return Photos(empty, empty)
     pixels = torch.from_numpy(np.stack(squares))
     apart = torch.zeros(len(pixels), dtype=torch.bool)
-    if holdout and len(pixels) >= LEAST_TO_HOLD_OUT:
+    if holdout and len(pixels) >= MIN_TO_HOLD_OUT:
         apart[holdout - 1 :: holdout] = True
     return Photos(pixels[~apart], pixels[apart], tuple(problems))
 

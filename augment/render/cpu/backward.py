@@ -24,9 +24,9 @@ from augment.render.cpu import backward_kernels as cpu_blend_backward
 from augment.render.cpu import backward_kernels as cpu_project_backward
 from augment.render.cpu import backward_kernels as rows
 from augment.render.cpu.driver import (
-    Clock,
     Inputs,
     Scratch,
+    StageTimer,
     Tiles,
     gather_inputs,
     image_arrays,
@@ -86,10 +86,10 @@ class Tape:
         d_alpha: np.ndarray,
         d_expected_depth: np.ndarray | None = None,
         *,
-        clock: Clock | None = None,
+        clock: StageTimer | None = None,
     ) -> SplatGradients:
         """Gradients of a loss with these derivatives by the images, all float32, contiguous."""
-        clock = Clock(None) if clock is None else clock
+        clock = StageTimer(None) if clock is None else clock
         depth = d_depth = None
         if self.expected_depth is not None and d_expected_depth is not None:
             weight = np.maximum(self.alpha, np.float32(DEPTH_EPS))
@@ -122,11 +122,11 @@ class Tape:
                 shares,
                 reached,
             )
-            clock.lap("raster backward")
+            clock.timed("raster backward")
             cpu_blend_backward.sum_shares(
                 self.members, self.starts, reached, shares, _RANGES, sums, touched
             )
-            clock.lap("sum backward")
+            clock.timed("sum backward")
             cpu_project_backward.project_backward(
                 inputs.addresses,
                 inputs.sizes,
@@ -142,7 +142,7 @@ class Tape:
                 ids,
                 counts,
             )
-            clock.lap("project backward")
+            clock.timed("project backward")
         return SplatGradients(rows, ids, counts, inputs.blocks)
 
 
@@ -153,7 +153,7 @@ def record(
     scratch: Scratch,
     *,
     with_depth: bool,
-    clock: Clock | None = None,
+    clock: StageTimer | None = None,
 ) -> Tape:
     """Render colour, alpha and, if asked for, expected depth, and keep what `backward` needs.
 
@@ -165,7 +165,7 @@ def record(
             f"camera {camera.name!r} is orthographic; the kernels' gradients are of pinhole "
             f"cameras only: use `rasterize` with backend 'auto' or 'reference'"
         )
-    clock = Clock(None) if clock is None else clock
+    clock = StageTimer(None) if clock is None else clock
     buffers = frozenset({RGB, ALPHA, EXPECTED_DEPTH} if with_depth else {RGB, ALPHA})
     images = image_arrays(camera, buffers)
     with kernel_threads():
@@ -173,15 +173,15 @@ def record(
         depths, edges = rank(inputs, camera, scratch)
         bins = (edges[0], edges[-1])
         splats = project(inputs, depths, bins, tiles, scratch)
-        clock.lap("project")
+        clock.timed("project")
         slots, rects = sort(splats, bins[0], scratch)
-        clock.lap("sort")
+        clock.timed("sort")
         members, starts = tiles.list_all(slots, rects)
-        clock.lap("bin")
+        clock.timed("bin")
         clock.count("visible", len(slots))
         clock.count("pairs", len(members))
         tiles.blend_members(splats, members, starts, is_last=True)
-        clock.lap("raster")
+        clock.timed("raster")
     return Tape(
         inputs=inputs,
         camera=camera,

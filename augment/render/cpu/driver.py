@@ -180,7 +180,7 @@ _RANK_RUNS = 8  # pieces of work in ranking, each with its own histogram
 # 1: by then, and each time that doubles, most tiles of a dense scene have closed.
 _SLICE_COVER = 10.0
 _SLICE_GROWTH = 1.4
-_SMALLEST_SLICE = 20_000  # fewer splats cost less than another slice does
+_MIN_SLICE = 20_000  # fewer splats cost less than another slice does
 _MAX_PAIRS = 1 << 24  # (splat, tile) pairs listed at once: 64 MB
 
 
@@ -203,7 +203,7 @@ def rasterize_cpu(
     "project", "sort", "bin" and "raster" and the counts "visible" (splats that touch a tile which
     nearer ones have not closed) and "pairs" (of splats and such tiles) are added to it.
     """
-    clock = Clock(stage_times)
+    clock = StageTimer(stage_times)
     inputs = gather_inputs(parts, camera, settings, smog, clip, with_color=RGB in buffers)
     images = image_arrays(camera, buffers)
     with borrowed_scratch() as scratch, kernel_threads():
@@ -213,9 +213,9 @@ def rasterize_cpu(
         depths, edges = rank(inputs, camera, scratch)
         for bins in itertools.pairwise(edges):
             splats = project(inputs, depths, bins, tiles, scratch)
-            clock.lap("project")
+            clock.timed("project")
             slots, rects = sort(splats, bins[0], scratch)
-            clock.lap("sort")
+            clock.timed("sort")
             clock.count("visible", len(slots))
             tiles.blend(splats, slots, rects, is_last=bins[1] == edges[-1], clock=clock)
             if not tiles.open.any():
@@ -223,7 +223,7 @@ def rasterize_cpu(
     return RenderOutput(**{name: torch.from_numpy(image) for name, image in images.items()})
 
 
-class Clock:
+class StageTimer:
     """Adds the time between laps, and counts, to the caller's dictionary."""
 
     def __init__(self, times: dict[str, float] | None) -> None:
@@ -232,7 +232,7 @@ class Clock:
             self._times.setdefault(name, 0.0)
         self._last = time.perf_counter()
 
-    def lap(self, name: str) -> None:
+    def timed(self, name: str) -> None:
         now = time.perf_counter()
         self._times[name] = self._times.get(name, 0.0) + now - self._last
         self._last = now
@@ -274,9 +274,9 @@ def _slice_edges(cover: np.ndarray, counts: np.ndarray) -> list[int]:
     target, taken = _SLICE_COVER, 0.0
     while target < cover[-1]:
         edge = int(np.searchsorted(cover, target)) + 1
-        if counts[-1] - counts[edge - 1] < _SMALLEST_SLICE:
+        if counts[-1] - counts[edge - 1] < _MIN_SLICE:
             break
-        if counts[edge - 1] - taken >= _SMALLEST_SLICE:
+        if counts[edge - 1] - taken >= _MIN_SLICE:
             edges.append(edge)
             taken = counts[edge - 1]
         target *= _SLICE_GROWTH
@@ -307,7 +307,7 @@ def project(
     is_cut = bool(inputs.modes[layout.M_CLIP])
     cuts = scratch.array("cuts", (cpu_clip.CUT * (inputs.slots if is_cut else 1),), np.float32)
     is_lit = bool(inputs.modes[layout.M_LIGHT])
-    lights = (cpu_shading.CPU_SHADING_LINES * (inputs.slots if is_lit else 1),)
+    lights = (cpu_shading.SHADING_LINES * (inputs.slots if is_lit else 1),)
     lights = scratch.array("lights", lights, np.float32)
     splats = Splats(
         scratch.array("records", (inputs.slots * layout.RECORD,), np.float32),
@@ -412,16 +412,16 @@ class Tiles:
         rects: np.ndarray,
         *,
         is_last: bool,
-        clock: Clock,
+        clock: StageTimer,
     ) -> None:
         """Blend splats, nearest first, into the open tiles; is_last closes them all."""
         first, count = 0, len(slots)
         while True:
             end, members, starts = self.list_members(slots, rects, first)
-            clock.lap("bin")
+            clock.timed("bin")
             clock.count("pairs", len(members))
             self.blend_members(splats, members, starts, is_last=is_last and end == count)
-            clock.lap("raster")
+            clock.timed("raster")
             first = end
             if first == count or not self.open.any():
                 return

@@ -8,7 +8,7 @@ import numpy as np
 
 from augment.render.cpu import simd as v8
 from augment.render.cpu.jit import inner
-from augment.render.cpu.simd import cpu_math_fmuladd
+from augment.render.cpu.simd import scalar_fmuladd
 from augment.render.layout import (
     BLUE,
     BLUNT_Y,
@@ -108,14 +108,14 @@ def find_spans(staged, count, strip, rows, log_cut, spans):
         fall, lean = staged[U(FALL_X) * n + k], staged[U(LEAN_Y) * n + k]
         blunt = staged[U(BLUNT_Y) * n + k]
         d = min(max(top, west - mean_x), east - mean_x)
-        left_over = cpu_math_fmuladd(-fall * d, d, budget)
+        left_over = scalar_fmuladd(-fall * d, d, budget)
         reach = math.sqrt(max(left_over, zero)) * blunt
-        end = cpu_math_fmuladd(lean, d, mean_y) + reach + half
+        end = scalar_fmuladd(lean, d, mean_y) + reach + half
         end = end if left_over >= zero else zero
         d = min(max(-top, west - mean_x), east - mean_x)
-        left_over = cpu_math_fmuladd(-fall * d, d, budget)
+        left_over = scalar_fmuladd(-fall * d, d, budget)
         reach = math.sqrt(max(left_over, zero)) * blunt
-        begin = min(max(cpu_math_fmuladd(lean, d, mean_y) - reach + half, low), high)
+        begin = min(max(scalar_fmuladd(lean, d, mean_y) - reach + half, low), high)
         spans[k] = np.int32(begin)
         spans[n + k] = np.int32(max(min(end, high), begin))
 
@@ -446,10 +446,10 @@ def kept_share(lines, values, splat, item):
 # Numba functions: light by the normal of every pixel of a splat (see augment.render.shading)
 # A splat's lights are LINES float32, as there; all 0 for a splat of one colour.
 
-CPU_SHADING_LINES = 9
-L_FACING, L_X, L_Y, L_WRAP, L_LEAN_X, L_LEAN_Y, L_RED, L_GREEN, L_BLUE = range(CPU_SHADING_LINES)
-LIT = (CPU_SHADING_LINES + 1) * BATCH  # of a batch: one row a line, then whether a splat has any
-_LEAST_FACING = np.float32(0.05)  # augment.render.shading.LEAST_FACING
+SHADING_LINES = 9
+L_FACING, L_X, L_Y, L_WRAP, L_LEAN_X, L_LEAN_Y, L_RED, L_GREEN, L_BLUE = range(SHADING_LINES)
+LIT = (SHADING_LINES + 1) * BATCH  # of a batch: one row a line, then whether a splat has any
+_MIN_FACING = np.float32(0.05)  # augment.render.shading.MIN_FACING
 
 
 @inner()
@@ -465,7 +465,7 @@ def light_eight(m, towards, view):
     ny = v8.select(is_back, v8.negate(ny), ny)
     nz = v8.select(is_back, v8.negate(nz), nz)
     sx, sy, sz = v8.splat(view[V_SUN]), v8.splat(view[V_SUN + 1]), v8.splat(view[V_SUN + 2])
-    inverse = one / v8.maximum(v8.negate(nz), v8.splat(_LEAST_FACING))
+    inverse = one / v8.maximum(v8.negate(nz), v8.splat(_MIN_FACING))
     ax, ay = nx * inverse, ny * inverse
     fx, fy = v8.splat(view[V_FOCAL]), v8.splat(view[V_FOCAL + 1])
     scale = one / (one + v8.splat(view[V_WRAP]))
@@ -484,17 +484,17 @@ def stage_lights(lights, members, at, count, lit):
     """Lines of a batch, turned to one row a number."""
     n = U(BATCH)
     for k in range(count):
-        first, most = U(members[at + k]) * U(CPU_SHADING_LINES), np.float32(0)
-        for line in range(U(CPU_SHADING_LINES)):
+        first, most = U(members[at + k]) * U(SHADING_LINES), np.float32(0)
+        for line in range(U(SHADING_LINES)):
             lit[line * n + k] = lights[first + line]
-        for line in range(U(L_RED), U(CPU_SHADING_LINES)):
+        for line in range(U(L_RED), U(SHADING_LINES)):
             most = max(most, abs(lights[first + line]))
-        lit[U(CPU_SHADING_LINES) * n + k] = most
+        lit[U(SHADING_LINES) * n + k] = most
 
 
 @inner()
 def is_lit(lit, splat):
-    return lit[U(CPU_SHADING_LINES * BATCH) + splat] > np.float32(0)
+    return lit[U(SHADING_LINES * BATCH) + splat] > np.float32(0)
 
 
 @inner()

@@ -21,7 +21,6 @@ from augment.render.cpu.geometry import (
     C_RIGHT,
     C_X,
     C_Y,
-    CPU_SHADING_LINES,
     CUT,
     L_FACING,
     L_LEAN_X,
@@ -30,6 +29,7 @@ from augment.render.cpu.geometry import (
     L_WRAP,
     L_X,
     L_Y,
+    SHADING_LINES,
     cut_eight,
     from_eye,
     gather3,
@@ -43,7 +43,7 @@ from augment.render.cpu.geometry import (
     to_image,
 )
 from augment.render.cpu.jit import inner, kernel
-from augment.render.cpu.simd import LOG2_E, cpu_math_fmuladd, exp2_fine, floats_at, log2, shorts_at
+from augment.render.cpu.simd import LOG2_E, exp2_fine, floats_at, log2, scalar_fmuladd, shorts_at
 from augment.render.layout import (
     A_MAPS,
     A_MEANS,
@@ -205,9 +205,9 @@ def write_color(sh, at, functions, maps, at_map, view, smog, rows, lane, records
     r = g = b = np.float32(0.5)
     for k in range(U(functions)):
         value = rows[k * U(LANES) + lane]
-        r = cpu_math_fmuladd(value, sh[at], r)
-        g = cpu_math_fmuladd(value, sh[at + U(1)], g)
-        b = cpu_math_fmuladd(value, sh[at + U(2)], b)
+        r = scalar_fmuladd(value, sh[at], r)
+        g = scalar_fmuladd(value, sh[at + U(1)], g)
+        b = scalar_fmuladd(value, sh[at + U(2)], b)
         at += U(3)
     zero = np.float32(0)
     r, g, b = max(r, zero), max(g, zero), max(b, zero)
@@ -219,9 +219,9 @@ def write_color(sh, at, functions, maps, at_map, view, smog, rows, lane, records
     if smog != NO_SMOG:
         t = rows[U(THROUGH * LANES) + lane]
         hidden = np.float32(1) - t
-        r = cpu_math_fmuladd(t, r, hidden * view[V_AIRLIGHT])
-        g = cpu_math_fmuladd(t, g, hidden * view[V_AIRLIGHT + 1])
-        b = cpu_math_fmuladd(t, b, hidden * view[V_AIRLIGHT + 2])
+        r = scalar_fmuladd(t, r, hidden * view[V_AIRLIGHT])
+        g = scalar_fmuladd(t, g, hidden * view[V_AIRLIGHT + 1])
+        b = scalar_fmuladd(t, b, hidden * view[V_AIRLIGHT + 2])
     records[slot + U(RED)] = r
     records[slot + U(GREEN)] = g
     records[slot + U(BLUE)] = b
@@ -230,9 +230,9 @@ def write_color(sh, at, functions, maps, at_map, view, smog, rows, lane, records
 @inner()
 def _map_channel(maps, at, r, g, b):
     """One row of a colour map, at four numbers from `at`, applied to a colour; not below 0."""
-    value = cpu_math_fmuladd(maps[at], r, maps[at + U(3)])
-    value = cpu_math_fmuladd(maps[at + U(1)], g, value)
-    return max(cpu_math_fmuladd(maps[at + U(2)], b, value), np.float32(0))
+    value = scalar_fmuladd(maps[at], r, maps[at + U(3)])
+    value = scalar_fmuladd(maps[at + U(1)], g, value)
+    return max(scalar_fmuladd(maps[at + U(2)], b, value), np.float32(0))
 
 
 @inner()
@@ -283,7 +283,7 @@ _X_LO, _X_HI, _Y_LO, _Y_HI = (COLOR_ROWS + i for i in range(4))
 _FIELDS = COLOR_ROWS + 4
 _CUTS = _FIELDS + DEPTH + 1
 _LIGHTS = _CUTS + CUT
-_ROWS = _LIGHTS + CPU_SHADING_LINES
+_ROWS = _LIGHTS + SHADING_LINES
 _HUGE = np.float32(1e37)  # px^2; beyond it float32 overflows, and no pixel could tell
 
 
@@ -505,9 +505,9 @@ def _write_record(rows, lane, number, records, record):
 
 @inner()
 def _write_lights(slopes, splat, smog, view, rows, lane, lights, slot):
-    first = slot * U(CPU_SHADING_LINES)
+    first = slot * U(SHADING_LINES)
     if not view[V_LIT] > np.float32(0):
-        for line in range(U(CPU_SHADING_LINES)):
+        for line in range(U(SHADING_LINES)):
             lights[first + line] = np.float32(0)
         return
     for line in range(U(L_RED)):

@@ -434,7 +434,7 @@ def log2(x):
 
 
 @intrinsic
-def cpu_math_fmuladd(typingctx, a, b, c):
+def scalar_fmuladd(typingctx, a, b, c):
     """a b + c of scalars, rounded once where the processor has fused multiply-add."""
 
     def codegen(context, builder, sig, args):

@@ -185,7 +185,7 @@ DEPTH_EPS = tl.constexpr(constants.DEPTH_EPS)
 RECORD, CUT, LINES = (
     tl.constexpr(layout.RECORD),
     tl.constexpr(layout.CUT),
-    tl.constexpr(cpu_shading.CPU_SHADING_LINES),
+    tl.constexpr(cpu_shading.SHADING_LINES),
 )
 L_FACING, L_X, L_Y, L_WRAP = (
     tl.constexpr(cpu_shading.L_FACING),

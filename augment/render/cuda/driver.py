@@ -41,7 +41,7 @@ from augment.render.cuda.splats import (
     CudaInputs,
     CudaSplats,
     CudaTiles,
-    StageClock,
+    GpuStageTimer,
     gather_inputs,
 )
 from augment.render.layout import HeightClip
@@ -101,7 +101,7 @@ def project(inputs: CudaInputs) -> CudaSplats:
 # tiles a splat touches.
 
 _SPLATS, _PAIRS = 256, 512  # of a program; a thread looks for the owners of four pairs at once
-_MOST_PAIRS = 2**31 - 1024  # tiles' lists begin at an int32, and are read some way beyond
+_MAX_PAIRS = 2**31 - 1024  # tiles' lists begin at an int32, and are read some way beyond
 
 
 def list_tiles(splats: CudaSplats, camera: Camera, wanted: Tensor | None) -> CudaTiles:
@@ -134,10 +134,10 @@ def list_tiles(splats: CudaSplats, camera: Camera, wanted: Tensor | None) -> Cud
     )
     ends = torch.cumsum(counts, 0, dtype=torch.int64)
     pairs = int(ends[-1]) if count else 0
-    if pairs > _MOST_PAIRS:
+    if pairs > _MAX_PAIRS:
         raise ValueError(
             f"the {count} Gaussians touch {pairs} tiles of a {camera.width} x {camera.height} "
-            f"image together, which is more than {_MOST_PAIRS}; render a smaller image, or fewer "
+            f"image together, which is more than {_MAX_PAIRS}; render a smaller image, or fewer "
             f"or smaller Gaussians"
         )
 
@@ -266,7 +266,7 @@ def rasterize_cuda(
     clip: HeightClip | None = None,
     wanted: torch.Tensor | None = None,
     *,
-    clock: StageClock | None = None,
+    clock: GpuStageTimer | None = None,
 ) -> RenderOutput:
     """The image of the parts in float32, on the GPU, without gradients. Arguments are checked by
     `rasterize`.
@@ -278,13 +278,13 @@ def rasterize_cuda(
     inputs = gather_inputs(parts, camera, settings, smog, clip, with_color=RGB in buffers)
     splats = project(inputs)
     if clock is not None:
-        clock.lap("project")
+        clock.timed("project")
     tiles = list_tiles(splats, camera, wanted)
     if clock is not None:
-        clock.lap("list")
+        clock.timed("list")
         clock.counts["visible"] = int((splats.counts > 0).sum())
         clock.counts["pairs"] = len(tiles.members)
     images = blend(splats, tiles, camera, buffers, settings)
     if clock is not None:
-        clock.lap("blend")
+        clock.timed("blend")
     return RenderOutput(**images)

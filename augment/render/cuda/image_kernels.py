@@ -19,13 +19,13 @@ from augment.effects import smog
 LOG2_E = tl.constexpr(math.log2(math.e))
 MAX_EXPONENT = tl.constexpr(smog.MAX_EXPONENT)
 # exp(-tau) from there on is below the least normal float32.
-MOST_DEPTH = tl.constexpr(126.0)
+MAX_DEPTH = tl.constexpr(126.0)
 
 
 @triton.jit
 def transmittance(tau):
     """exp(-tau) for tau >= 0, which may be infinite; exactly 1 at 0."""
-    return tl.exp2(tl.maximum(tau * -LOG2_E, -MOST_DEPTH))
+    return tl.exp2(tl.maximum(tau * -LOG2_E, -MAX_DEPTH))
 
 
 @triton.jit
@@ -45,7 +45,7 @@ def mean_density(eye_height, up):
     mean = tl.where(short, series, (1.0 - transmittance(x)) / tl.where(short, 1.0, x))
     lowest = eye_height + tl.minimum(up, 0.0)
     power = tl.minimum(-lowest, MAX_EXPONENT) * LOG2_E
-    return tl.exp2(tl.maximum(power, -MOST_DEPTH)) * mean
+    return tl.exp2(tl.maximum(power, -MAX_DEPTH)) * mean
 
 
 @triton.jit
@@ -211,7 +211,7 @@ def map_colors(
 
 
 @triton.jit(do_not_specialize=["count"])
-def share_remainder(alpha, rgb, snow, count, least, BLOCK: tl.constexpr):
+def renormalise_alpha(alpha, rgb, snow, count, least, BLOCK: tl.constexpr):
     """Pixels of alpha >= least become opaque, and what they hold grows with it, in place.
 
     rgb, snow: None where there is no such image.

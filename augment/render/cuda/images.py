@@ -17,14 +17,14 @@ from augment.render.cuda import image_kernels as kernels
 from augment.render.cuda.runtime import Download, address_of, gpu_device, launch, resident, upload
 from augment.scene import PosedGaussians
 from augment.semantics import SemanticClass
-from augment.views import SURFACE_ALPHA, ViewImages, Wanted
+from augment.views import SURFACE_ALPHA, RequestedImages, ViewImages
 
 # ------------------------------------------------------------------------------------------------
 # Launches of the passes over finished images on the GPU. Images are float32, without gradients
 # Definitions: augment.render.composite, augment.effects.smog, augment.render.rasterize.
 
 BLOCK = 128  # pixels of a program: one a thread, which needs few registers and no exchange
-MOST_STRENGTH = 1e30  # of smog before the sky: finite in float32, and nothing is seen through it
+MAX_STRENGTH = 1e30  # of smog before the sky: finite in float32, and nothing is seen through it
 
 
 def composite_color(
@@ -54,7 +54,7 @@ def composite_cubemap(
     strength, airlight = 0.0, (0.0, 0.0, 0.0)
     if smog is not None:
         vertical = vertical_optical_depth(smog, float(camera.centre[2]))
-        strength, airlight = min(vertical, MOST_STRENGTH), smog.rgb
+        strength, airlight = min(vertical, MAX_STRENGTH), smog.rgb
     launch(
         kernels.composite_cubemap,
         _grid(alpha.numel()),
@@ -102,11 +102,11 @@ def map_colors(rgb: Float[Tensor, "H W 3"], color_map: Float[Tensor, "3 4"]) -> 
     launch(kernels.map_colors, _grid(count), rgb.detach(), count, *numbers, BLOCK=BLOCK)
 
 
-def share_remainder(alpha: Tensor, rgb: Tensor | None, snow: Tensor | None, stop: float) -> None:
+def renormalise_alpha(alpha: Tensor, rgb: Tensor | None, snow: Tensor | None, stop: float) -> None:
     """Finished pixels become opaque, in place; all contiguous."""
     count = alpha.numel()
     launch(
-        kernels.share_remainder,
+        kernels.renormalise_alpha,
         _grid(count),
         *(alpha, rgb, snow, count, 1 - stop),
         BLOCK=BLOCK,
@@ -124,7 +124,7 @@ def _rays(camera: Camera) -> tuple[float, float, float, float]:
 
 # ---- cuda images ---------------------------------------------------------------------------------
 
-CUDA_IMAGES_BLOCK = 512  # pixels of a program: four a thread, whose bytes are written as words
+QUANTIZE_BLOCK = 512  # pixels of a program: four a thread, whose bytes are written as words
 ALIGNMENT = 16  # bytes, of every image in the memory that is copied
 # What the kernel writes. torch computes with no uint16, so instances are written as int16.
 KINDS = {
@@ -158,7 +158,7 @@ class _Place:
         return memory[self.start : self.end].view(self.on_cpu).reshape(self.shape)
 
 
-def begin_cuda_images(wanted: Wanted, camera: Camera) -> Callable[[], ViewImages]:
+def begin_cuda_images(wanted: RequestedImages, camera: Camera) -> Callable[[], ViewImages]:
     """Launches the kernel and the copy. What is returned waits for them."""
     shares_depth = wanted.scene_depth_m is wanted.depth_m and wanted.first is None
     asked = {
@@ -198,7 +198,7 @@ def _places(names: Sequence[str], camera: Camera) -> dict[str, _Place]:
     return places
 
 
-def _make(images: dict[str, Tensor], wanted: Wanted, camera: Camera) -> None:
+def _make(images: dict[str, Tensor], wanted: RequestedImages, camera: Camera) -> None:
     looked_up = wanted.semantic or wanted.instance
     parts = wanted.parts if looked_up else ()
     classes = [_resident_classes(part) for part in parts]  # kept until the launch
@@ -209,7 +209,7 @@ def _make(images: dict[str, Tensor], wanted: Wanted, camera: Camera) -> None:
     count = camera.height * camera.width
     launch(
         kernels.make_images,
-        (-(-count // CUDA_IMAGES_BLOCK),),
+        (-(-count // QUANTIZE_BLOCK),),
         wanted.rgb.detach().contiguous(),
         _plain(wanted.depth_m),
         _plain(wanted.scene_depth_m if "scene_depth_m" in images else None),
@@ -226,7 +226,7 @@ def _make(images: dict[str, Tensor], wanted: Wanted, camera: Camera) -> None:
         *(SURFACE_ALPHA, int(SemanticClass.SKY), int(SemanticClass.WATER)),
         SHOWS_WATER=wanted.first is not None,
         IN_AIR=wanted.plane_z_m is not None,
-        BLOCK=CUDA_IMAGES_BLOCK,
+        BLOCK=QUANTIZE_BLOCK,
     )
 
 

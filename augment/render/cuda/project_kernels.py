@@ -316,7 +316,7 @@ def in_smog(color, through, view):
 FAR = tl.constexpr(clip.FAR_PX)
 SHARP = tl.constexpr(clip.SHARP_PX2)
 TINY = tl.constexpr(1e-20)
-V_EXTENT, CUDA_CLIP_KERNELS_V_FOCAL = tl.constexpr(layout.V_EXTENT), tl.constexpr(layout.V_FOCAL)
+V_EXTENT = tl.constexpr(layout.V_EXTENT)
 V_CLIP_EYE = tl.constexpr(layout.V_CLIP_EYE)
 V_CLIP_PART = tl.constexpr(layout.V_CLIP_PART)
 V_CLIP_CAMERA = tl.constexpr(layout.V_CLIP_CAMERA)
@@ -338,12 +338,8 @@ def cut_of(d, right, down, columns, sizes, inverse, view):
     gx, gy = _depth_slope(right, down, away)
 
     fall = tl.load(view + V_CLIP_FALL) * inverse * inverse
-    lx = tl.fma(
-        -fall, gx, tl.load(view + V_CLIP_CAMERA) / tl.load(view + CUDA_CLIP_KERNELS_V_FOCAL)
-    )
-    ly = tl.fma(
-        -fall, gy, tl.load(view + V_CLIP_CAMERA + 1) / tl.load(view + CUDA_CLIP_KERNELS_V_FOCAL + 1)
-    )
+    lx = tl.fma(-fall, gx, tl.load(view + V_CLIP_CAMERA) / tl.load(view + V_FOCAL))
+    ly = tl.fma(-fall, gy, tl.load(view + V_CLIP_CAMERA + 1) / tl.load(view + V_FOCAL + 1))
     scale = 1.0 / tl.maximum(tl.sqrt(tl.fma(lx, lx, ly * ly)), TINY)
     offset = tl.maximum(tl.minimum(height * inverse * scale, FAR), -FAR)
     whole = height >= reach
@@ -377,11 +373,7 @@ def _depth_slope(x, y, z):
 # ------------------------------------------------------------------------------------------------
 # Triton functions: lines of splats that are lit pixel by pixel (see augment.render.shading)
 
-LEAST_FACING = tl.constexpr(shading.LEAST_FACING)
-CUDA_LIGHT_KERNELS_V_FOCAL, CUDA_LIGHT_KERNELS_V_PARALLEL = (
-    tl.constexpr(layout.V_FOCAL),
-    tl.constexpr(layout.V_PARALLEL),
-)
+MIN_FACING = tl.constexpr(shading.MIN_FACING)
 V_SUN, V_WRAP = tl.constexpr(layout.V_SUN), tl.constexpr(layout.V_WRAP)
 
 
@@ -394,16 +386,16 @@ def store_lights(lines, normals, points, slopes, through, lit, mask, view):
     """
     r, s, t = rotation_rows(view)
     nx, ny, nz = dot(r, normals), dot(s, normals), dot(t, normals)
-    parallel = tl.load(view + CUDA_LIGHT_KERNELS_V_PARALLEL) > 0.0
+    parallel = tl.load(view + V_PARALLEL) > 0.0
     facing = tl.where(parallel, nz, dot((nx, ny, nz), points))
     nx, ny = tl.where(facing > 0.0, -nx, nx), tl.where(facing > 0.0, -ny, ny)
     nz = tl.where(facing > 0.0, -nz, nz)
     sun, wrap = three(view + V_SUN), tl.load(view + V_WRAP)
-    inverse = 1.0 / tl.maximum(-nz, LEAST_FACING)
+    inverse = 1.0 / tl.maximum(-nz, MIN_FACING)
     ax, ay = nx * inverse, ny * inverse
     fx, fy = (
-        tl.load(view + CUDA_LIGHT_KERNELS_V_FOCAL),
-        tl.load(view + CUDA_LIGHT_KERNELS_V_FOCAL + 1),
+        tl.load(view + V_FOCAL),
+        tl.load(view + V_FOCAL + 1),
     )
     scale = 1.0 / (1.0 + wrap)
     tl.store(lines, tl.where(lit, dot((nx, ny, nz), sun) * scale, 0.0), mask)
@@ -430,10 +422,7 @@ VIEW = tl.constexpr(layout.VIEW)
 V_SIZE, V_NEAR = tl.constexpr(layout.V_SIZE), tl.constexpr(layout.V_NEAR)
 V_BLUR, V_ALPHA_MIN = tl.constexpr(layout.V_BLUR), tl.constexpr(layout.V_ALPHA_MIN)
 V_LOG_CUT, V_RADIUS_CLIP = tl.constexpr(layout.V_LOG_CUT), tl.constexpr(layout.V_RADIUS_CLIP)
-CUDA_PROJECT_KERNELS_V_PARALLEL, V_SNOW = (
-    tl.constexpr(layout.V_PARALLEL),
-    tl.constexpr(layout.V_SNOW),
-)
+V_SNOW = tl.constexpr(layout.V_SNOW)
 V_LIT, V_MAPS = tl.constexpr(layout.V_LIT), tl.constexpr(layout.V_MAPS)
 NO_SMOG = tl.constexpr(layout.NO_SMOG)
 HIDDEN, TILE = tl.constexpr(cuda_splats.HIDDEN), tl.constexpr(cuda_splats.TILE)
@@ -516,7 +505,7 @@ def project_gaussians(
     color, through = (zero, zero, zero), zero + 1.0
     if COLOR:
         towards = d
-        if tl.load(view + CUDA_PROJECT_KERNELS_V_PARALLEL) > 0.0:
+        if tl.load(view + V_PARALLEL) > 0.0:
             towards = (t[0] + zero, t[1] + zero, t[2] + zero)
         distance = tl.sqrt(dot(towards, towards))
         functions = tl.load(row + T_FUNCTIONS).to(tl.int32)

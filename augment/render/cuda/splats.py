@@ -176,7 +176,7 @@ class CudaTiles:
     rows: int
 
 
-class StageClock:
+class GpuStageTimer:
     """Times of a frame's stages on the GPU, by events, so that nothing waits until they are read.
 
     Where kernels are interpreted there is no GPU to time, and all are 0.
@@ -188,7 +188,7 @@ class StageClock:
         self.counts: dict[str, int] = {}
         self._mark()
 
-    def lap(self, name: str) -> None:
+    def timed(self, name: str) -> None:
         """The time since the lap before belongs to `name`."""
         self._names.append(name)
         self._mark()

@@ -26,7 +26,6 @@ from augment.jobs.atomic import (
 from augment.jobs.box_tables import BoxNumbers, Item
 from augment.jobs.claims import hold
 from augment.jobs.files import SceneIndex, calibration_bytes, frame_entry, read_entries
-from augment.jobs.journal import Identity, Journal, journalled_variants
 from augment.jobs.layout import (
     MANIFEST,
     PATH_KINDS,
@@ -47,11 +46,12 @@ from augment.jobs.manifest import (
     shown_words,
     write_manifest,
 )
+from augment.jobs.progress_log import Identity, ProgressLog, logged_variants
 from augment.jobs.store import open_store
 from augment.jobs.tables import FrameBoxes, boxes_bytes, read_boxes
 from augment.jobs.view_files import TABLES
 from augment.jobs.worker import Chunk, Outcome, describe
-from recipes.schema import schema_Recipe
+from recipes.schema import Recipe
 
 # ---- ledger --------------------------------------------------------------------------------------
 
@@ -67,16 +67,16 @@ class VariantState:
     box_weather: what is measured of the boxes of those images, by kind (see TABLES).
     """
 
-    recipe: schema_Recipe
+    recipe: Recipe
     name: str
     folder: str
     identity: Identity
-    journal: Journal
+    progress_log: ProgressLog
     rows: dict[Item, dict[str, Any]] = field(default_factory=dict)
     box_weather: dict[str, dict[Item, BoxNumbers]] = field(
         default_factory=lambda: {kind: {} for kind in TABLES}
     )
-    is_journalled: bool = False
+    is_logged: bool = False
 
     def is_finished(self, out_dir: Path, item: Item, instances: Instances) -> bool:
         """Whether the image's row says ok, and all its files and its boxes' numbers are there; and
@@ -96,14 +96,14 @@ class VariantState:
         return all((out_dir / path).is_file() for path in paths if path is not None)
 
 
-class Ledger:
+class JobState:
     """The state of a job in its output folder. Needs the folder's lock."""
 
     def __init__(
         self,
         out_dir: Path,
         index: SceneIndex,
-        recipes: Sequence[schema_Recipe],
+        recipes: Sequence[Recipe],
         identities: Sequence[Identity],
     ) -> None:
         self.out_dir, self.index = out_dir, index
@@ -112,9 +112,9 @@ class Ledger:
         self.variants = []
         for recipe, identity in zip(recipes, identities, strict=True):
             name = variant_name(recipe)
-            journal = Journal(out_dir, index.name, name)
+            progress_log = ProgressLog(out_dir, index.name, name)
             folder = variant_folder(index.name, name)
-            self.variants.append(VariantState(recipe, name, folder, identity, journal))
+            self.variants.append(VariantState(recipe, name, folder, identity, progress_log))
 
     @property
     def keys(self) -> set[tuple[str, str]]:
@@ -153,7 +153,7 @@ class Ledger:
         variant = self.variants[outcome.variant]
         row = self._row(variant, outcome, frame)
         measured = {k: TABLES[k].to_json(numbers) for k, numbers in outcome.box_weather.items()}
-        variant.journal.append({**row, **measured})
+        variant.progress_log.append({**row, **measured})
         with self._lock:
             variant.rows[frame.index, outcome.camera] = row
             for kind, numbers in outcome.box_weather.items():
@@ -167,11 +167,11 @@ class Ledger:
 
     def close(self) -> None:
         for variant in self.variants:
-            variant.journal.close()
+            variant.progress_log.close()
 
     def _load(self, variant: VariantState, overwrite: bool) -> bool:
         """Read the variant's rows; true where there are any that have to be given up."""
-        begun, journalled = variant.journal.load()
+        begun, logged = variant.progress_log.load()
         rows: list[dict[str, Any]] = []
         if self._table is not None:
             rows = rows_of(self._table, {(self.index.name, variant.name)})
@@ -180,18 +180,18 @@ class Ledger:
             return True
         if found is not None:
             variant.identity.check(found, str(self.out_dir / variant.folder))
-        variant.is_journalled = begun is not None
+        variant.is_logged = begun is not None
         for kind, file in box_weather_files(variant.recipe).items():
             if any(row.get(f"{kind}_path") for row in rows):
                 variant.box_weather[kind] = _read_table(kind, self.out_dir / variant.folder / file)
-        for row in journalled:  # which have the boxes' numbers beyond the manifest's columns
+        for row in logged:  # which have the boxes' numbers beyond the manifest's columns
             for kind, table in TABLES.items():
                 if (numbers := row.pop(kind, None)) is not None:
                     item = row["frame"], row["camera"]
                     variant.box_weather[kind][item] = table.from_json(numbers)
         # The recipe's hash agrees, so the rows show what it says, whatever their version called it.
         shown = shown_words(variant.recipe)
-        known = [{**LATER, **row, **shown} for row in [*rows, *journalled]]
+        known = [{**LATER, **row, **shown} for row in [*rows, *logged]]
         variant.rows = {(row["frame"], row["camera"]): row for row in known}
         return False
 
@@ -215,7 +215,7 @@ class Ledger:
             keys = {(self.index.name, variant.name) for variant in variants}
             self._replace_rows([], keys)
         for variant in variants:
-            variant.journal.remove()
+            variant.progress_log.remove()
         _remove_tree(trash)
 
     def _replace_rows(self, rows: Sequence[dict[str, Any]], keys: set[tuple[str, str]]) -> Path:
@@ -232,7 +232,7 @@ class Ledger:
         remove_temporaries(state / "journal")
         _remove_tree(state / "trash")
         mine = {variant.folder for variant in self.variants}
-        for folder in sorted(mine | set(journalled_variants(self.out_dir))):
+        for folder in sorted(mine | set(logged_variants(self.out_dir))):
             remove_temporaries(self.out_dir / folder)
 
     def _row(self, variant: VariantState, outcome: Outcome, frame: Frame) -> dict[str, Any]:
@@ -309,7 +309,7 @@ class BoxCache:
             self.read[number] = boxes
 
 
-def finish(ledger: Ledger, trajectory: str, boxes: BoxCache) -> None:
+def finish(job_state: JobState, trajectory: str, boxes: BoxCache) -> None:
     """Write labels, calibration and manifest of the job's variants that have rows.
 
     Safe to repeat: a kill at any point leaves the journals, and the next run does it again.
@@ -317,35 +317,35 @@ def finish(ledger: Ledger, trajectory: str, boxes: BoxCache) -> None:
     Raises:
         OutputError: the system refused.
     """
-    variants = [variant for variant in ledger.variants if variant.rows]
+    variants = [variant for variant in job_state.variants if variant.rows]
     for variant in variants:
-        if variant.recipe.output.labels and ledger.index.labels is not None:
-            _write_boxes(ledger, variant, boxes)
+        if variant.recipe.output.labels and job_state.index.labels is not None:
+            _write_boxes(job_state, variant, boxes)
             for kind in _tables(variant):
-                _write_box_weather(ledger, variant, kind)
-        _write_calibration(ledger, variant, trajectory)
+                _write_box_weather(job_state, variant, kind)
+        _write_calibration(job_state, variant, trajectory)
     if variants:
-        ledger.write_manifest(variants)
+        job_state.write_manifest(variants)
     for variant in variants:
-        variant.journal.remove()
+        variant.progress_log.remove()
 
 
-def needs_finish(ledger: Ledger) -> bool:
+def needs_finish(job_state: JobState) -> bool:
     """Whether anything that `finish` writes is not there, or a journal is still open."""
-    return not (ledger.out_dir / MANIFEST).is_file() or any(
-        variant.is_journalled or not _is_whole(ledger, variant) for variant in ledger.variants
+    return not (job_state.out_dir / MANIFEST).is_file() or any(
+        variant.is_logged or not _is_whole(job_state, variant) for variant in job_state.variants
     )
 
 
-def _is_whole(ledger: Ledger, variant: VariantState) -> bool:
-    paths = _companions(ledger, variant)
+def _is_whole(job_state: JobState, variant: VariantState) -> bool:
+    paths = _companions(job_state, variant)
     return all(path.is_file() for path in paths.values())
 
 
-def _companions(ledger: Ledger, variant: VariantState) -> dict[str, Path]:
-    folder = ledger.out_dir / variant.folder
+def _companions(job_state: JobState, variant: VariantState) -> dict[str, Path]:
+    folder = job_state.out_dir / variant.folder
     paths = {"calibration": folder / "calibration.json"}
-    if variant.recipe.output.labels and ledger.index.labels is not None:
+    if variant.recipe.output.labels and job_state.index.labels is not None:
         paths["labels"] = folder / "labels" / "boxes.parquet"
         paths |= {kind: folder / file for kind, file in _tables(variant).items()}
     return paths
@@ -363,21 +363,21 @@ def _tables(variant: VariantState) -> dict[str, str]:
     }
 
 
-def _write_boxes(ledger: Ledger, variant: VariantState, cache: BoxCache) -> None:
-    path = _companions(ledger, variant)["labels"]
+def _write_boxes(job_state: JobState, variant: VariantState, cache: BoxCache) -> None:
+    path = _companions(job_state, variant)["labels"]
     frames = sorted({frame for frame, _ in variant.rows})
     known: Mapping[int, FrameBoxes] = {}
     if path.is_file():
         known = {n: b for n, b in _read_or_drop(path).items() if n in set(frames)}
     new = cache.get([number for number in frames if number not in known])
     found = {**known, **new}
-    number_of = ledger.index.instances.of
+    number_of = job_state.index.instances.of
     numbered = {n: replace(b, instances=number_of(b.boxes.track_ids)) for n, b in found.items()}
     write_atomic(path, boxes_bytes(numbered))
 
 
-def _write_box_weather(ledger: Ledger, variant: VariantState, kind: str) -> None:
-    path = _companions(ledger, variant)[kind]
+def _write_box_weather(job_state: JobState, variant: VariantState, kind: str) -> None:
+    path = _companions(job_state, variant)[kind]
     # Not of an image that was measured once and has failed since.
     listed = {item for item, row in variant.rows.items() if row[f"{kind}_path"] is not None}
     known = variant.box_weather[kind]
@@ -392,9 +392,9 @@ def _read_or_drop(path: Path) -> dict[int, FrameBoxes]:
         return {}
 
 
-def _write_calibration(ledger: Ledger, variant: VariantState, trajectory: str) -> None:
-    path = _companions(ledger, variant)["calibration"]
-    index = ledger.index
+def _write_calibration(job_state: JobState, variant: VariantState, trajectory: str) -> None:
+    path = _companions(job_state, variant)["calibration"]
+    index = job_state.index
     names: dict[int, list[str]] = {}
     for frame, camera in variant.rows:
         names.setdefault(frame, []).append(camera)

@@ -57,7 +57,7 @@ class Identity:
             )
 
 
-class Journal:
+class ProgressLog:
     """The journal of one variant. `append` may be called from several threads."""
 
     def __init__(self, out_dir: Path, scene: str, variant: str) -> None:
@@ -120,7 +120,7 @@ class Journal:
             raise output_error(self.path, error) from error
 
 
-def journalled_variants(out_dir: Path) -> list[str]:
+def logged_variants(out_dir: Path) -> list[str]:
     """Folders (`<scene>/<variant>`) of the variants that some job has begun and not ended."""
     root = out_dir / STATE_FOLDER / "journal"
     return sorted(str(p.relative_to(root).with_suffix("")) for p in root.glob("*/*.jsonl"))
