@@ -567,10 +567,7 @@ def _mean_up(views: tuple[PosedView, ...]) -> np.ndarray | None:
 
 
 def _frames_and_ground(
-    gaussians: Gaussians,
-    views: tuple[PosedView, ...],
-    world: _World,
-    options: GaussianOptions,
+    gaussians: Gaussians, views: tuple[PosedView, ...], world: _World, options: GaussianOptions
 ) -> tuple[tuple[Frame, ...], float | None, list[str]]:
     change, is_metric = world.change, world.is_metric
     if not views:

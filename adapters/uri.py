@@ -44,10 +44,7 @@ SCHEMES = {
         labels="procedural_labels",
     ),
     "pandaset": Scheme(
-        "adapters.pandaset",
-        "open_pandaset",
-        "pandaset:data/pandaset/002",
-        labels="pandaset_labels",
+        "adapters.pandaset", "open_pandaset", "pandaset:data/pandaset/002", labels="pandaset_labels"
     ),
     "nuscenes": Scheme(
         "adapters.nuscenes",

@@ -313,9 +313,7 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
             _style_step("on the picture", style, styles_picture, style_reason),
             exposure,
             Step(
-                "depth image",
-                depth_buffer is not None,
-                f"output.depth is {recipe.output.depth!r}",
+                "depth image", depth_buffer is not None, f"output.depth is {recipe.output.depth!r}"
             ),
             Step("semantic image", recipe.output.semantic, _asked("semantic", recipe)),
             Step("instance image", recipe.output.instance, _asked("instance", recipe)),
@@ -490,10 +488,7 @@ def _boxes(means: np.ndarray, longest: np.ndarray, numbers: np.ndarray) -> Bound
 
 
 def may_show(
-    bounds: Bounds,
-    world_from_part: np.ndarray | None,
-    camera: Camera,
-    near_m: float,
+    bounds: Bounds, world_from_part: np.ndarray | None, camera: Camera, near_m: float
 ) -> np.ndarray:
     """Whether a Gaussian of each box can touch the image, bool [B]; True where it is not known.
 

@@ -54,10 +54,7 @@ DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
 _LIMITS = {">": "exclusiveMinimum", ">=": "minimum", "<": "exclusiveMaximum", "<=": "maximum"}
 
-_PATTERNS = {
-    Kind.PATH: {"pattern": r"^[^/\\][^\\]*$"},
-    Kind.DIGEST: {"pattern": "^[0-9a-f]{64}$"},
-}
+_PATTERNS = {Kind.PATH: {"pattern": r"^[^/\\][^\\]*$"}, Kind.DIGEST: {"pattern": "^[0-9a-f]{64}$"}}
 
 Schema = dict[str, Any]
 

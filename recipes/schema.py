@@ -135,11 +135,7 @@ class Knob:
 
 # Those that save most come first: they have first call on an error that is allowed.
 KNOBS = (
-    Knob(
-        "render.scale",
-        (0.25, 0.5, 0.75, 1.0),
-        "resolution, enlarged again for the comparison",
-    ),
+    Knob("render.scale", (0.25, 0.5, 0.75, 1.0), "resolution, enlarged again for the comparison"),
     Knob(
         "weather.flood.reflection",
         ("sky", "screen_space", "mirrored"),
@@ -158,21 +154,9 @@ KNOBS = (
         "light on the snow",
         effect="weather.snow",
     ),
-    Knob(
-        "render.radius_clip_px",
-        (3.0, 2.0, 1.0, 0.0),
-        "splats no larger are left out",
-    ),
-    Knob(
-        "render.transmittance_stop",
-        (0.05, 0.01, 1e-3, 1e-4),
-        "light behind it is given up",
-    ),
-    Knob(
-        "render.sh_degree",
-        (0, 1, 2, None),
-        "bands of the colours' spherical harmonics",
-    ),
+    Knob("render.radius_clip_px", (3.0, 2.0, 1.0, 0.0), "splats no larger are left out"),
+    Knob("render.transmittance_stop", (0.05, 0.01, 1e-3, 1e-4), "light behind it is given up"),
+    Knob("render.sh_degree", (0, 1, 2, None), "bands of the colours' spherical harmonics"),
     Knob(
         "weather.flood.waves.count",
         (6, 12, 24),
@@ -199,18 +183,8 @@ KNOBS = (
         effect="weather.smog",
         chosen=False,
     ),
-    Knob(
-        "output.depth",
-        ("none", "expected", "median", "mode"),
-        "depth estimator",
-        chosen=False,
-    ),
-    Knob(
-        "output.jpeg_quality",
-        (60, 75, 92, 100),
-        "size and error of jpg files",
-        chosen=False,
-    ),
+    Knob("output.depth", ("none", "expected", "median", "mode"), "depth estimator", chosen=False),
+    Knob("output.jpeg_quality", (60, 75, 92, 100), "size and error of jpg files", chosen=False),
 )
 BY_PATH = {knob.path: knob for knob in KNOBS}
 

@@ -48,11 +48,7 @@ def sh_of(rgb, dtype=torch.float32) -> torch.Tensor:
 
 
 def one_gaussian(
-    mean=(4.0, 0.0, 0.0),
-    scale=0.3,
-    opacity: float = 0.8,
-    rgb=(0.9, 0.5, 0.1),
-    dtype=torch.float32,
+    mean=(4.0, 0.0, 0.0), scale=0.3, opacity: float = 0.8, rgb=(0.9, 0.5, 0.1), dtype=torch.float32
 ) -> Gaussians:
     """A ball (or, with three scales, an ellipsoid along the axes) of one colour."""
     return Gaussians(

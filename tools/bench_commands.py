@@ -14,10 +14,7 @@ Device = Literal["cpu", "cuda"]
 
 
 def raster(
-    repeats: int = 7,
-    quick: bool = False,
-    device: Device = "cpu",
-    json_file: JsonFile = None,
+    repeats: int = 7, quick: bool = False, device: Device = "cpu", json_file: JsonFile = None
 ) -> int:
     """The rasteriser on random scenes: each stage's time, memory, the torch reference beside it.
 
@@ -264,10 +261,7 @@ def generate(repeats: int = 3, quick: bool = False, json_file: JsonFile = None) 
 
 
 def dataset(
-    folder: Path | None = None,
-    repeats: int = 3,
-    quick: bool = False,
-    json_file: JsonFile = None,
+    folder: Path | None = None, repeats: int = 3, quick: bool = False, json_file: JsonFile = None
 ) -> int:
     """Images a second out of an output folder, beside decoding alone; memory of a long manifest.
 

@@ -135,10 +135,7 @@ def bench_cost(
 
 
 def _time_case(scene: Scene, case: CostCase, repeats: int) -> dict[str, Any]:
-    plans = {
-        "clean": make_plan(case.clean, scene),
-        "flooded": make_plan(case.recipe, scene),
-    }
+    plans = {"clean": make_plan(case.clean, scene), "flooded": make_plan(case.recipe, scene)}
     seconds = time_in_turns(scene, case.camera, plans, repeats)
     return {
         "case": case.name,
@@ -161,11 +158,7 @@ def _stage_case(scene: Scene, camera: Camera, tier: ReflectionTier, repeats: int
     return {
         "tier": tier,
         "stages": [
-            {
-                "stage": name,
-                "ms": spread_ms(seconds),
-                "over_clean": spread_ratio(seconds, before),
-            }
+            {"stage": name, "ms": spread_ms(seconds), "over_clean": spread_ratio(seconds, before)}
             for name, seconds in times.items()
         ],
     }

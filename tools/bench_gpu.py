@@ -46,10 +46,7 @@ class GpuCase:
 
 WHOLE = GpuCase()
 QUICK = GpuCase(
-    raster=DEFAULT_CASES[0],
-    street="procedural:street?seed=3&frames=1",
-    width=640,
-    height=426,
+    raster=DEFAULT_CASES[0], street="procedural:street?seed=3&frames=1", width=640, height=426
 )
 
 

@@ -58,11 +58,7 @@ def balanced(recipe: Recipe, given: Mapping[str, Value] | None = None) -> Recipe
 
 
 def bench_frames(
-    scene: Scene,
-    camera: Camera,
-    recipes: Mapping[str, Recipe],
-    timing: Timing,
-    ceilings: Ceilings,
+    scene: Scene, camera: Camera, recipes: Mapping[str, Recipe], timing: Timing, ceilings: Ceilings
 ) -> dict[str, Any]:
     """Times of every recipe's frame, in turns. ms: on the GPU, to finished floats there.
     over_clean: turn by turn. delivered: as `render` takes them, 8 bits on the host.

@@ -36,10 +36,7 @@ def bench_gpu_case(case: RasterCase, timing: Timing, ceilings: Ceilings) -> dict
     """
     gaussians, camera = random_scene(case)
     parts = [PosedGaussians(gaussians)]
-    frames = {
-        CLEAN: lambda: draw(parts, camera),
-        WITH_SMOG: lambda: draw(parts, camera, SMOG),
-    }
+    frames = {CLEAN: lambda: draw(parts, camera), WITH_SMOG: lambda: draw(parts, camera, SMOG)}
     start = time.perf_counter()
     for frame in frames.values():
         frame()

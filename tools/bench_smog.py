@@ -55,8 +55,7 @@ class TruthView:
 
 
 def bench_smog(
-    cameras: Sequence[str] = ("front", "left", "back"),
-    frames: Sequence[int] = (0, 5),
+    cameras: Sequence[str] = ("front", "left", "back"), frames: Sequence[int] = (0, 5)
 ) -> dict[str, Any]:
     """Errors of both smog models in 1/255, by smog and region: median, p99, share above 4/255."""
     scene, truth = open_scene(STREET), open_truth(parse_uri(STREET)[2])

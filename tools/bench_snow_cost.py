@@ -62,12 +62,7 @@ def cost_cases(cell_m: float = 0.05) -> dict[str, tuple[Recipe, Recipe]]:
 
 
 def bench_cost(
-    scene: Scene,
-    camera: Camera,
-    *,
-    cell_m: float = 0.05,
-    repeats: int,
-    progress: bool = True,
+    scene: Scene, camera: Camera, *, cell_m: float = 0.05, repeats: int, progress: bool = True
 ) -> dict[str, Any]:
     """Times of all cases and of their stages. repeats: pairs of frames that count."""
     cases, results, stages = cost_cases(cell_m), [], []

@@ -71,11 +71,7 @@ def main(arguments: list[str] | None = None) -> int:
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
     try:
         return tyro.extras.subcommand_cli_from_dict(
-            table,
-            args=arguments,
-            prog=prog,
-            description=description,
-            sort_subcommands=False,
+            table, args=arguments, prog=prog, description=description, sort_subcommands=False
         )
     except KeyboardInterrupt as interruption:
         print(str(interruption) or "interrupted", file=sys.stderr)

@@ -155,9 +155,7 @@ def _record(views: Views, drive: Drive, pair: Pair, network: Lpips | None) -> di
 
 
 def _summaries(
-    records: Iterable[dict[str, Any]],
-    key: Callable[[dict[str, Any]], tuple],
-    named: Sequence[str],
+    records: Iterable[dict[str, Any]], key: Callable[[dict[str, Any]], tuple], named: Sequence[str]
 ) -> list[dict[str, Any]]:
     """Means over pairs with equal keys. named: what of a record its summary repeats."""
     grouped: dict[tuple, list[dict[str, Any]]] = {}

@@ -94,10 +94,7 @@ def _known(value: Any) -> bool:
 
 
 def draw_panel(
-    panel_image: np.ndarray,
-    panel: Panel,
-    last_step: float,
-    clock: Sequence[tuple[float, float]],
+    panel_image: np.ndarray, panel: Panel, last_step: float, clock: Sequence[tuple[float, float]]
 ) -> None:
     """Into a view of the sheet, [HEIGHT, WIDTH, 3]."""
     image = np.full((HEIGHT, WIDTH, 3), 255, np.uint8)  # contiguous, as OpenCV wants it

@@ -93,11 +93,7 @@ def _shown(groups: list[tuple[str, str]]) -> list[tuple[str, str]]:
 def _groups(rows: list[dict[str, Any]]) -> list[tuple[str, str]]:
     """Scene and variant of every row, each once: a scene's clearest, driest and barest first."""
     weather = {
-        (row["scene"], row["variant"]): (
-            _extinction(row),
-            _water_level(row),
-            _snow_depth(row),
-        )
+        (row["scene"], row["variant"]): (_extinction(row), _water_level(row), _snow_depth(row))
         for row in rows
     }
     return sorted(weather, key=lambda group: (group[0], *weather[group], group[1]))

@@ -122,12 +122,7 @@ def make_page(store: Store, html: Path, images: int) -> tuple[str, int]:
     }  # in this order files are read, and noted where they are damaged
     parts["damaged"] = [report_page.problem_table(files.problems, files.unlisted)]
     sections = {k: report_tables.section(k, t, *parts[k]) for k, t in _SECTIONS.items()}
-    head = joined(
-        [
-            report_page.tiles(whole, len(recipes), kinds),
-            _facts(table),
-        ]
-    )
+    head = joined([report_page.tiles(whole, len(recipes), kinds), _facts(table)])
     return _page(_name_of(store), head, sections), len(files.problems) + files.unlisted
 
 

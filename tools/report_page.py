@@ -155,12 +155,7 @@ def failure_table(failures: Sequence[Failure]) -> Html:
     said = (
         "Messages that differ in numbers only are counted together. The same command tries again."
     )
-    return joined(
-        [
-            tag("p", said, class_="note"),
-            table(("Images", "Message"), rows, note, 0),
-        ]
-    )
+    return joined([tag("p", said, class_="note"), table(("Images", "Message"), rows, note, 0)])
 
 
 def problem_table(problems: Mapping[str, str], unlisted: int) -> Html:

@@ -15,11 +15,7 @@ from tools.report_summary import as_floats
 
 _MOST = 1e99  # greater numbers are as little a weather's as infinity is
 # What a caption says of an image's weather.
-_MAIN = {
-    "smog_extinction_per_m": "visibility",
-    "flood_level_m": "water at",
-    "snow_depth_m": "snow",
-}
+_MAIN = {"smog_extinction_per_m": "visibility", "flood_level_m": "water at", "snow_depth_m": "snow"}
 
 
 @dataclass(frozen=True, eq=False)

@@ -109,11 +109,6 @@ def write_rgb(path: Path, image: np.ndarray) -> None:
 
 
 def _write(
-    image: np.ndarray,
-    text: str,
-    x: int,
-    y: int,
-    size: float,
-    color: tuple[int, int, int],
+    image: np.ndarray, text: str, x: int, y: int, size: float, color: tuple[int, int, int]
 ) -> None:
     cv2.putText(image, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, size, color, 1, cv2.LINE_AA)

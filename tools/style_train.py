@@ -208,11 +208,7 @@ def _open_data(options: StyleTrainOptions) -> _Data:
     for uri in options.scenes:
         scene = open_scene(uri)
         views += scene_contents(
-            scene,
-            options.views,
-            size,
-            with_parts=options.through == "renderer",
-            seed=options.seed,
+            scene, options.views, size, with_parts=options.through == "renderer", seed=options.seed
         )
         problems += scene.problems
     photos = read_photos(options.photos, size, holdout=options.holdout)

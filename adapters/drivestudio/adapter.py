@@ -265,10 +265,7 @@ def make_actors(
 
 
 def identify(
-    poses: RigidPoses,
-    instances: Sequence[Instance],
-    model_from_dataset: np.ndarray,
-    frames: range,
+    poses: RigidPoses, instances: Sequence[Instance], model_from_dataset: np.ndarray, frames: range
 ) -> list[Instance | None]:
     """Which of the data's objects each of the model's is; None where that is not clear.
 

@@ -105,11 +105,7 @@ class FrameReturns:
 
 
 def lidar_depth(
-    scene: Scene,
-    frame_index: int,
-    camera: Camera,
-    *,
-    without_semantic: Collection[int] = (),
+    scene: Scene, frame_index: int, camera: Camera, *, without_semantic: Collection[int] = ()
 ) -> SparseDepth:
     """The frame's sweep as the camera would see it, the nearest return of each pixel.
 

@@ -62,11 +62,7 @@ class Seen:
 
 
 def observe_views(
-    bodies: Sequence[Body],
-    views: Sequence[View],
-    sky: SkyGatherer,
-    *,
-    image_scale: float = 0.5,
+    bodies: Sequence[Body], views: Sequence[View], sky: SkyGatherer, *, image_scale: float = 0.5
 ) -> tuple[tuple[Seen, ...], tuple[str, ...]]:
     """The colour of every body's surfels, and a sentence for each image that cannot be decoded.
 

@@ -127,12 +127,7 @@ SKIN_M = 0.1
 # Without classes, returns this near the bottom of a box may be road or tyre: neither gets them.
 FLOOR_M = 0.15
 _FLAT = np.array(
-    [
-        SemanticClass.ROAD,
-        SemanticClass.LANE_MARKING,
-        SemanticClass.SIDEWALK,
-        SemanticClass.TERRAIN,
-    ],
+    [SemanticClass.ROAD, SemanticClass.LANE_MARKING, SemanticClass.SIDEWALK, SemanticClass.TERRAIN],
     dtype=np.int16,
 )
 

@@ -172,10 +172,7 @@ class Surfels:
 
 
 def surfels_from_points(
-    points: np.ndarray,
-    edge_m: np.ndarray,
-    *,
-    semantic: np.ndarray | None = None,
+    points: np.ndarray, edge_m: np.ndarray, *, semantic: np.ndarray | None = None
 ) -> Surfels:
     """A surfel for every point.
 

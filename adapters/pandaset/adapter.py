@@ -117,12 +117,7 @@ class _RawSweep:
     unlabelled: bool
 
     @staticmethod
-    def of(
-        sequence: Sequence,
-        frame: int,
-        lidar: pd.DataFrame,
-        table: np.ndarray,
-    ) -> _RawSweep:
+    def of(sequence: Sequence, frame: int, lidar: pd.DataFrame, table: np.ndarray) -> _RawSweep:
         world = lidar[["x", "y", "z"]].to_numpy(dtype=np.float64) - sequence.world_origin_m
         pose = sequence.world_from_ego[frame]
         ego = (world - pose[:3, 3]) @ pose[:3, :3]

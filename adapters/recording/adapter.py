@@ -114,11 +114,7 @@ def back_project(depth_m: np.ndarray, camera: Camera) -> Sweep:
     rows, columns = rows * step + step // 2, columns * step + step // 2
     z = depth_m[rows, columns].astype(np.float64)
     local = np.stack(
-        [
-            (columns + 0.5 - camera.cx) / camera.fx * z,
-            (rows + 0.5 - camera.cy) / camera.fy * z,
-            z,
-        ],
+        [(columns + 0.5 - camera.cx) / camera.fx * z, (rows + 0.5 - camera.cy) / camera.fy * z, z],
         axis=1,
     )
     pose = camera.world_from_camera.numpy()

@@ -294,12 +294,7 @@ def disc(centre: Sequence[float], normal: Sequence[float], radius_m: float, look
 
 
 def tube(
-    start: Sequence[float],
-    end: Sequence[float],
-    radius_m: float,
-    look: Look,
-    *,
-    caps: bool = False,
+    start: Sequence[float], end: Sequence[float], radius_m: float, look: Look, *, caps: bool = False
 ) -> Shapes:
     """A round tube between two points, with flat ends if asked."""
     a, b = np.asarray(start, np.float64), np.asarray(end, np.float64)

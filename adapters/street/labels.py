@@ -297,10 +297,7 @@ class StreetLabels:
             centers_m=np.array(centres, np.float64),
             sizes_m=np.array(sizes, np.float64),
             quats=np.stack([np.cos(half), zero, zero, np.sin(half)], 1),
-            attributes={
-                "is_parked": np.array(parked),
-                "instance": np.array(instances, np.uint16),
-            },
+            attributes={"is_parked": np.array(parked), "instance": np.array(instances, np.uint16)},
         )
 
     def lidar(self, frame_index: int) -> LidarSweep:

@@ -69,11 +69,7 @@ class Lighting:
 
 
 def sun_share(
-    shapes: Shapes,
-    tree: Tree,
-    lighting: Lighting,
-    shape: np.ndarray,
-    places: np.ndarray,
+    shapes: Shapes, tree: Tree, lighting: Lighting, shape: np.ndarray, places: np.ndarray
 ) -> np.ndarray:
     """Share of the sun's disc that is seen from a shape's places, [N].
 

@@ -340,11 +340,7 @@ def _disc_cells(shapes: Shapes, index: np.ndarray, counts: np.ndarray, hidden: n
     depth = np.where(whole, 1.1, 1 / rings[owner])
     width = np.where(whole, 1.1, 2 * np.pi * radius / around[owner])
     sides = np.stack(
-        [
-            np.stack([c * depth, s * depth, zero], 1),
-            np.stack([-s * width, c * width, zero], 1),
-        ],
-        1,
+        [np.stack([c * depth, s * depth, zero], 1), np.stack([-s * width, c * width, zero], 1)], 1
     )
     return index[ring_owner[owner]], np.stack([radius * c, radius * s, zero], 1), sides
 

@@ -366,11 +366,7 @@ def _at_centres(
 
 
 def _of_grid(
-    depth_m: np.ndarray,
-    usable: np.ndarray,
-    rows: np.ndarray,
-    columns: np.ndarray,
-    camera: Camera,
+    depth_m: np.ndarray, usable: np.ndarray, rows: np.ndarray, columns: np.ndarray, camera: Camera
 ) -> PriorPixels:
     pixels = rows[:, None] * camera.width + columns[None]
     return PriorPixels.of(pixels[usable], depth_m[usable])
@@ -572,10 +568,7 @@ class DepthSource:
 
 
 def _find_all(
-    scene: Scene,
-    cameras: Mapping[ViewKey, Camera],
-    options: DepthPriors,
-    problems: list[str],
+    scene: Scene, cameras: Mapping[ViewKey, Camera], options: DepthPriors, problems: list[str]
 ) -> dict[str, dict[ViewKey, Path]]:
     stems = {key: Path(scene.frame(key.frame).image_paths[key.camera]).stem for key in cameras}
     folders = {

@@ -63,11 +63,7 @@ def lidar_top_rad(scene: Scene, frames: Sequence[int]) -> float | None:
 
 
 def sky_mask(
-    scene: Scene,
-    camera: Camera,
-    rgb: np.ndarray,
-    returns: np.ndarray,
-    lidar_top_rad: float | None,
+    scene: Scene, camera: Camera, rgb: np.ndarray, returns: np.ndarray, lidar_top_rad: float | None
 ) -> np.ndarray:
     """Pixels of the view that surely show sky, bool [H, W]; none where nothing can be known.
 

@@ -48,12 +48,7 @@ _SHAPE = SplatShape(sigma_per_spacing=0.6, opacity=0.95)
 _ACTOR_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
-def ego_body(
-    scene: Scene,
-    camera_name: str,
-    mask: np.ndarray,
-    source: ViewSource,
-) -> Actor | None:
+def ego_body(scene: Scene, camera_name: str, mask: np.ndarray, source: ViewSource) -> Actor | None:
     """The part of the recording car that a camera sees; None without a mask or images.
 
     mask: bool [H, W] of that camera's images at any scale, True where they show the car. source:

@@ -256,11 +256,7 @@ class RecordedViews:
         self._test = tuple(k for k, t in zip(self._cameras, is_test, strict=True) if t)
         self._check_split(holdout)
         self._depth = DepthSource(
-            scene,
-            self._cameras,
-            depth,
-            cache_bytes=cache_bytes // 2,
-            reference=reference_depth,
+            scene, self._cameras, depth, cache_bytes=cache_bytes // 2, reference=reference_depth
         )
         self._lidar_top_rad = self._measure_lidar_top()
         self._skies: dict[ViewKey, np.ndarray] = {}  # one bit a pixel

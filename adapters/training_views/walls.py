@@ -352,12 +352,7 @@ _HEIGHT_M = 30.0  # above the lowest camera
 _SHAPE = SplatShape(opacity=0.6)  # hides most of the sky, yet gives way while it is learnt
 
 
-def wall_tops(
-    scene: Scene,
-    source: ViewSource,
-    *,
-    lidar_top_deg: float = 15.0,
-) -> Gaussians:
+def wall_tops(scene: Scene, source: ViewSource, *, lidar_top_deg: float = 15.0) -> Gaussians:
     """Degree-0 Gaussians that continue the background above the LiDAR's view; perhaps none.
 
     scene: as initialised from LiDAR. source: recorded views whose `sky` masks tell what sky looks

@@ -343,10 +343,7 @@ def _write_parts(scene: Scene, folder: Path) -> None:
         "world_origin_m": [float(v) for v in scene.world_origin_m],
         "has_metric_scale": bool(scene.has_metric_scale),
         "has_known_gravity": bool(scene.has_known_gravity),
-        "background": {
-            "file": write(scene.background, BACKGROUND),
-            "count": len(scene.background),
-        },
+        "background": {"file": write(scene.background, BACKGROUND), "count": len(scene.background)},
         "actors": [
             {
                 "file": write(actor.gaussians, f"{ACTORS}/{folder_name(actor.track_id)}.ply"),

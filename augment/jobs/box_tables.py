@@ -293,12 +293,7 @@ def measure_smog(
 ) -> BoxSmog:
     """The boxes of a frame in one of its images. camera: at the written resolution."""
     measured = box_transmittance(
-        boxes,
-        world_origin_m,
-        camera,
-        smoggy.medium,
-        smoggy.surface_depth_m,
-        smoggy.water_level_z_m,
+        boxes, world_origin_m, camera, smoggy.medium, smoggy.surface_depth_m, smoggy.water_level_z_m
     )
     return BoxSmog(tuple(boxes.track_ids), measured.transmittance, measured.pixels)
 

@@ -89,10 +89,7 @@ def resolve_recipes(
         for record, name, recipes in left
     }
     bar = tqdm(
-        total=len(tasks),
-        unit="scene",
-        desc="choosing settings",
-        disable=not progress or not tasks,
+        total=len(tasks), unit="scene", desc="choosing settings", disable=not progress or not tasks
     )
 
     def each(task: ResolveTask, settled: SettledRecipes | str) -> None:

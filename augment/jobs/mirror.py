@@ -144,10 +144,7 @@ class WeatheredSweep:
 
 
 def weathered_sweeps(
-    out_dir: Path,
-    rows: Iterable[Mapping[str, Any]],
-    labels: LabelSource | None,
-    tree: SourceTree,
+    out_dir: Path, rows: Iterable[Mapping[str, Any]], labels: LabelSource | None, tree: SourceTree
 ) -> tuple[dict[str, WeatheredSweep], list[str]]:
     """The dataset's files that a variant's weathered sweeps change, by their place in it, and a
     sentence for the sweeps that change none. Lost returns are left out of the files.

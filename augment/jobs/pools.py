@@ -136,11 +136,7 @@ Deliver = Callable[[Outcome], None]
 
 
 def run_serially(
-    scene: Scene,
-    setup: Setup,
-    chunks: Sequence[Chunk],
-    renderer: Renderer | None,
-    deliver: Deliver,
+    scene: Scene, setup: Setup, chunks: Sequence[Chunk], renderer: Renderer | None, deliver: Deliver
 ) -> dict[str, float]:
     """Render in this thread, encode and write in others. An interrupt ends cleanly.
 

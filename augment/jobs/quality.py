@@ -591,9 +591,7 @@ def _chosen(recipe: Recipe, bench_of: Callable[[Recipe], Bench]) -> _Chosen:
 
 
 def _started(
-    recipe: Recipe,
-    options: dict[str, tuple[Value, ...]],
-    bench_of: Callable[[Recipe], Bench],
+    recipe: Recipe, options: dict[str, tuple[Value, ...]], bench_of: Callable[[Recipe], Bench]
 ) -> Bench:
     """A bench that has rendered the reference; leaves out of `options` what the scene cannot have.
 

@@ -379,12 +379,7 @@ class _Run:
             started = time.perf_counter()
             folder = self.job.beds_dir or self.out_dir / STATE_FOLDER
             self.beds = store_beds(
-                self.scene,
-                snowy,
-                folder,
-                cameras=cameras,
-                backend=self.backend,
-                progress=progress,
+                self.scene, snowy, folder, cameras=cameras, backend=self.backend, progress=progress
             )
             self.timings["place"] += time.perf_counter() - started
 

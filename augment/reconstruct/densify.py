@@ -283,12 +283,7 @@ def _most_copies(opacities: np.ndarray, prune_opacity: float) -> np.ndarray:
     return np.clip(most - 1e-4, 1, MAX_COPIES).astype(np.int64)
 
 
-def add_noise(
-    splats: Splats,
-    rows: np.ndarray | None,
-    lr: float,
-    rng: np.random.Generator,
-) -> None:
+def add_noise(splats: Splats, rows: np.ndarray | None, lr: float, rng: np.random.Generator) -> None:
     """Shakes the means of faint splats within their own shape, in place (section 4.2 there).
 
     step = lr sigmoid(-100 (opacity - NOISE_KNEE)) covariance normal(0, 1). rows: int64, without

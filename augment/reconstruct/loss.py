@@ -360,11 +360,7 @@ def _compare_depth(
 
 
 def _checked(
-    rgb: np.ndarray,
-    alpha: np.ndarray,
-    camera: Camera,
-    sky_faces: np.ndarray,
-    color_map: np.ndarray,
+    rgb: np.ndarray, alpha: np.ndarray, camera: Camera, sky_faces: np.ndarray, color_map: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     size = (camera.height, camera.width)
     faces = sky_faces.shape[1] if sky_faces.ndim == 4 and sky_faces.shape[1] else 1

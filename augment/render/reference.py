@@ -331,9 +331,7 @@ def _colors(
 
 
 def _mapped(
-    colors: Float[Tensor, "M 3"],
-    maps: Float[Tensor, "C 3 4"],
-    rows: Int16[Tensor, "M"] | None,
+    colors: Float[Tensor, "M 3"], maps: Float[Tensor, "C 3 4"], rows: Int16[Tensor, "M"] | None
 ) -> Float[Tensor, "M 3"]:
     """Every colour under its map, the first where there is no such row; not below 0."""
     if rows is None:
@@ -577,10 +575,7 @@ def blend_weights(
 
 
 def _shaded(
-    splats: Splats,
-    pixels: Float[Tensor, "2 P"],
-    weights: Float[Tensor, "S P"],
-    camera: Camera,
+    splats: Splats, pixels: Float[Tensor, "2 P"], weights: Float[Tensor, "S P"], camera: Camera
 ) -> Float[Tensor, "P 3"]:
     """What the light adds to the colours of splats that are lit pixel by pixel."""
     assert splats.lights is not None

@@ -297,11 +297,7 @@ def _write_objects(data: Path, rigid: dict, dataset_from_model: np.ndarray) -> N
 
 
 def _object(name: str, label: str, frames, poses: list, size: list) -> dict:
-    notes = {
-        "frame_idx": list(frames),
-        "obj_to_world": poses,
-        "box_size": [size] * len(poses),
-    }
+    notes = {"frame_idx": list(frames), "obj_to_world": poses, "box_size": [size] * len(poses)}
     return {"id": name, "class_name": label, "frame_annotations": notes}
 
 

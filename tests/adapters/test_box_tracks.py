@@ -127,9 +127,7 @@ def test_indices_between_is_strict():
 
 def sweep_of(points, times_ms, classes) -> Sweep:
     return Sweep(
-        np.array(points, np.float32),
-        np.array(times_ms, np.int64) * MS,
-        np.array(classes, np.int16),
+        np.array(points, np.float32), np.array(times_ms, np.int64) * MS, np.array(classes, np.int16)
     )
 
 

@@ -173,8 +173,7 @@ def test_nothing_to_show(scene):
 def test_images_of_one_time_make_one_pose(scene):
     frames = tuple(
         dataclasses.replace(
-            f,
-            cameras={n: dataclasses.replace(c, timestamp_ns=7) for n, c in f.cameras.items()},
+            f, cameras={n: dataclasses.replace(c, timestamp_ns=7) for n, c in f.cameras.items()}
         )
         for f in scene.frames
     )

@@ -99,9 +99,7 @@ def rasterization(
         camera_from_world=viewmats[0].double(),
     )
     settings = RasterSettings(
-        near_m=near_plane,
-        radius_clip_px=radius_clip,
-        antialiased=rasterize_mode == "antialiased",
+        near_m=near_plane, radius_clip_px=radius_clip, antialiased=rasterize_mode == "antialiased"
     )
     sh = (colors - 0.5)[:, None] / SH_C0
     part = PosedGaussians(Gaussians(means, quats, scales, opacities, sh))

@@ -8,13 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from batch_scenes import (
-    fake_render,
-    make_recipe,
-    must_not_render,
-    open_fake,
-    tree_digest,
-)
+from batch_scenes import fake_render, make_recipe, must_not_render, open_fake, tree_digest
 
 from augment.errors import OutputError
 from augment.jobs.manifest import read_manifest

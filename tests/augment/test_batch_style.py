@@ -174,11 +174,7 @@ def test_a_style_that_cannot_be_used_leaves_all_as_it_was(searches, tmp_path: Pa
 
 def test_the_manifest_says_the_style(searches, tmp_path: Path) -> None:
     image = image_at(tmp_path / "sunset.png")
-    recipes = [
-        make_recipe(),
-        styled(0.5, 1),
-        styled(2, 2, image=image, method="reinhard"),
-    ]
+    recipes = [make_recipe(), styled(0.5, 1), styled(2, 2, image=image, method="reinhard")]
     run(RenderJob("fake:street", recipes, tmp_path / "out", frames=[0], cameras=["front"]))
     table = read_manifest(tmp_path / "out")
     names = ("style", "style_method", "style_strength")

@@ -31,14 +31,7 @@ from augment.effects.flood.water_plane import (
 from augment.effects.flood.waves import make_waves
 from augment.effects.smog import SmogMedium
 from augment.geometry import rigid
-from augment.render.buffers import (
-    ALPHA,
-    EXPECTED_DEPTH,
-    MEDIAN_DEPTH,
-    RGB,
-    SPLAT_IDS,
-    RenderOutput,
-)
+from augment.render.buffers import ALPHA, EXPECTED_DEPTH, MEDIAN_DEPTH, RGB, SPLAT_IDS, RenderOutput
 from augment.render.constants import RasterSettings
 from augment.render.cuda import runtime as gpu
 from augment.render.rasterize import rasterize

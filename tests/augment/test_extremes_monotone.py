@@ -31,15 +31,7 @@ from augment.views import render_buffers, render_view
 from recipes.schema import Recipe
 from recipes.weather import Snow
 from tests.augment.examples import drawing
-from tests.augment.extremes import (
-    Place,
-    camera_at,
-    cameras,
-    nothing,
-    places,
-    snow_model,
-    street,
-)
+from tests.augment.extremes import Place, camera_at, cameras, nothing, places, snow_model, street
 from tests.snow_beds import cells_on_grid
 
 DENSITIES_PER_M = (0.0, 1e-8, 1e-3, 0.02, 0.1, 0.5, 3.0, 100.0)

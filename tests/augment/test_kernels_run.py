@@ -76,10 +76,7 @@ def scene() -> Scene:
 
 
 def run(
-    scene: Scene,
-    recipe: Recipe,
-    monkeypatch: pytest.MonkeyPatch,
-    camera: Camera | None = None,
+    scene: Scene, recipe: Recipe, monkeypatch: pytest.MonkeyPatch, camera: Camera | None = None
 ) -> Ran:
     """One image, once what is kept for later ones is there."""
     camera = scene.frames[0].cameras["ahead"] if camera is None else camera

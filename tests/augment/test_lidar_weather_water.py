@@ -19,14 +19,7 @@ from augment.effects.lidar.beam import (
     weathered_sweep,
 )
 from recipes.weather import Flood, Waves
-from tests.lidar_sweeps import (
-    SENSOR_M,
-    ground_points,
-    recipe,
-    some_points,
-    street,
-    sweep_of,
-)
+from tests.lidar_sweeps import SENSOR_M, ground_points, recipe, some_points, street, sweep_of
 
 CLEAR = Flood(level_m=0.02, reference="absolute", turbidity_ntu=0)
 

@@ -179,11 +179,7 @@ def test_a_failing_import_names_the_reason_and_the_way_out(monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "error", "message"),
     [
-        (
-            {"buffers": ["rgb", "depth"]},
-            ValueError,
-            "unknown buffers 'depth' asked for; known: ",
-        ),
+        ({"buffers": ["rgb", "depth"]}, ValueError, "unknown buffers 'depth' asked for; known: "),
         ({"buffers": []}, ValueError, "no buffers asked for; known: rgb, alpha"),
         ({"buffers": "rgb"}, TypeError, "collection of names; got the string 'rgb'"),
         ({"backend": "gpu"}, ValueError, "one of auto, reference, cpu, cuda; got 'gpu'"),

@@ -9,12 +9,7 @@ from augment.geometry import rigid, rotmat_from_quat
 from augment.reconstruct import loss_kernels as sky_kernels
 from augment.reconstruct.config import LossWeights
 from augment.reconstruct.loss import IDENTITY_MAP, LossScratch, ViewLoss, picture, view_loss
-from augment.reconstruct.loss_reference import (
-    MIN_SKY,
-    reference_loss,
-    reference_picture,
-    ssim_map,
-)
+from augment.reconstruct.loss_reference import MIN_SKY, reference_loss, reference_picture, ssim_map
 from augment.reconstruct.view import RecordedView
 from augment.render.composite import composite_sky
 from augment.render.threads import limit_threads

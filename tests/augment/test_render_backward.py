@@ -21,14 +21,7 @@ from augment.scene import Gaussians, PosedGaussians, Scene
 from augment.sky import CubemapSky
 from augment.views import render_buffers
 from recipes.schema import Output, Recipe
-from tests.scenes import (
-    camera_ahead,
-    one_gaussian,
-    random_gaussians,
-    sh_of,
-    slight_pose,
-    stack,
-)
+from tests.scenes import camera_ahead, one_gaussian, random_gaussians, sh_of, slight_pose, stack
 
 FIELDS = ("means", "quats", "scales", "opacities", "sh")
 DEFAULT = RasterSettings()

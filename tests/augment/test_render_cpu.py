@@ -14,14 +14,7 @@ import torch
 from augment.cameras import Camera
 from augment.effects.smog import SmogMedium
 from augment.geometry import multiply_quats, quat_from_rotmat, rigid, transform_points
-from augment.render.buffers import (
-    ALPHA,
-    BUFFERS,
-    EXPECTED_DEPTH,
-    MEDIAN_DEPTH,
-    RGB,
-    SPLAT_IDS,
-)
+from augment.render.buffers import ALPHA, BUFFERS, EXPECTED_DEPTH, MEDIAN_DEPTH, RGB, SPLAT_IDS
 from augment.render.constants import RasterSettings
 from augment.render.cpu import driver as cpu
 from augment.render.cpu import driver as cpu_scratch
@@ -65,8 +58,7 @@ def in_float64(parts):
     names = ("means", "quats", "scales", "opacities", "sh")
     return [
         dataclasses.replace(
-            part,
-            gaussians=Gaussians(**{n: getattr(part.gaussians, n).double() for n in names}),
+            part, gaussians=Gaussians(**{n: getattr(part.gaussians, n).double() for n in names})
         )
         for part in parts
     ]

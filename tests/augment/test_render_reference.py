@@ -6,11 +6,7 @@ import pytest
 import torch
 
 from augment.effects.smog import SmogMedium
-from augment.geometry import (
-    multiply_quats,
-    quat_from_rotmat,
-    transform_points,
-)
+from augment.geometry import multiply_quats, quat_from_rotmat, transform_points
 from augment.render import reference
 from augment.render.buffers import ALPHA, BUFFERS, EXPECTED_DEPTH, MEDIAN_DEPTH, RGB
 from augment.render.constants import MAX_TRANSMITTANCE_STOP, RasterSettings
@@ -18,13 +14,7 @@ from augment.render.reference import order_by_depth, project_parts, rasterize_re
 from augment.render.sh import rotate_sh
 from augment.scene import Gaussians, PosedGaussians
 from tests.assertions import assert_images_close, assert_labels_equal
-from tests.scenes import (
-    camera_ahead,
-    one_gaussian,
-    random_gaussians,
-    random_pose,
-    stack,
-)
+from tests.scenes import camera_ahead, one_gaussian, random_gaussians, random_pose, stack
 
 ALL = frozenset(BUFFERS)
 DEFAULT = RasterSettings()

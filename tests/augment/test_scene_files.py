@@ -326,11 +326,7 @@ def change_document(folder: Path, change) -> None:
         (("actors", 0, "track", "world_from_actor", 1, 0, 0), 1e300, "'car/1': a pose must be"),
         (("actors", 0, "track", "max_gap_ns"), 0.5, "max_gap_ns: .*valid integer"),
         (("actors", 0, "color_waves"), None, r"does not know: \['actors\.0\.waves'\]"),
-        (
-            ("actors", 1, "color_waves"),
-            {"timestamps_ns": [0], "phases": [0.0]},
-            "lacks actors.1",
-        ),
+        (("actors", 1, "color_waves"), {"timestamps_ns": [0], "phases": [0.0]}, "lacks actors.1"),
         (("actors", 0, "color_waves", "timestamps_ns"), [3, 2, 1], "'car/1': timestamps of colour"),
         (("actors", 0, "color_waves", "phases"), [0.0], "color_waves: .*as many phases as times"),
         (("actors", 0, "color_waves", "phases", 0), 1e300, "less than or equal to"),

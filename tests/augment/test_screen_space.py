@@ -266,8 +266,7 @@ def test_the_kernel_matches_the_definition(backend, pitch, roll):
 
 
 @pytest.mark.parametrize(
-    ("backend", "stride"),
-    [("reference", 1), ("cpu", 1), ("cpu", 2), ("cpu", 4), ("cuda", 1)],
+    ("backend", "stride"), [("reference", 1), ("cpu", 1), ("cpu", 2), ("cpu", 4), ("cuda", 1)]
 )
 def test_only_needed_pixels_are_traced(backend, stride):
     camera = looking(6, 10)

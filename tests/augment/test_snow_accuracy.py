@@ -20,12 +20,7 @@ from augment.semantics import SemanticClass
 from tools.bench_snow_accuracy import AccuracyCase, bench_accuracy
 from tools.bench_snow_cells import bed_heights, cells_over
 from tools.bench_snow_masks import bench_masks
-from tools.bench_snow_truth import (
-    camera_from_above,
-    pixel_places,
-    still,
-    true_points,
-)
+from tools.bench_snow_truth import camera_from_above, pixel_places, still, true_points
 
 STREET = "procedural:street?seed=3&frames=2&gaussians=110000&parked=4&moving=1&pedestrians=1"
 CELL_M, REACH_M = 0.1, 10.0

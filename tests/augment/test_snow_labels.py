@@ -60,9 +60,7 @@ def test_boxes_without_snow_own_what_they_own_in_a_flood() -> None:
 
 
 @pytest.mark.parametrize("thickness_m", [0.02, 0.1, 0.3])
-def test_snow_on_the_roof_is_the_cars_and_snow_around_its_wheels_is_not(
-    thickness_m: float,
-) -> None:
+def test_snow_on_the_roof_is_the_cars_and_snow_around_its_wheels_is_not(thickness_m: float) -> None:
     boxes = make_boxes(((8, 0, 0.75), CAR_M, UPRIGHT))  # from the road to 1.5 m
     high = dataclasses.replace(make_camera(pitch=0.5), camera_from_world=raised(4.0, 0.5))
     roof = plane_depth(high, 1.5 + thickness_m)

@@ -301,8 +301,7 @@ def test_metres_and_gravity_are_needed(unknown: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong",
-    [{"cell_m": 0.0}, {"cell_m": math.nan}, {"max_slope_deg": 90.0}, {"estimator": "mean"}],
+    "wrong", [{"cell_m": 0.0}, {"cell_m": math.nan}, {"max_slope_deg": 90.0}, {"estimator": "mean"}]
 )
 def test_settings_are_checked(wrong: dict, unchecked) -> None:
     with pytest.raises(ValueError, match=next(iter(wrong))):

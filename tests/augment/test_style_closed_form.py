@@ -248,10 +248,7 @@ def test_sky_and_land_have_their_own_maps_where_both_sides_show_them():
 
 @pytest.mark.parametrize("one_sided", [(), (SKY, LAND)])
 def test_one_map_for_all_where_a_side_shows_no_sky(one_sided):
-    for content, style in (
-        (scene(0), scene(20, *one_sided)),
-        (scene(0, *one_sided), scene(20)),
-    ):
+    for content, style in ((scene(0), scene(20, *one_sided)), (scene(0, *one_sided), scene(20))):
         found = maps(content, style)
         assert torch.equal(found.sky, found.picture) and torch.equal(found.splats[0], found.picture)
 

@@ -81,10 +81,7 @@ def test_gradients_through_the_renderer_are_finite_differences():
     camera = camera_ahead(7, 5, 9.0)
     view = open_view(scene_of(light_gaussians(3)), camera)
     view = dataclasses.replace(
-        view,
-        alpha=view.alpha.double(),
-        sky=view.sky.double(),
-        parts=scene.parts_for(camera),
+        view, alpha=view.alpha.double(), sky=view.sky.double(), parts=scene.parts_for(camera)
     )
     color_map = MILD.double().requires_grad_(True)
     weights = torch.rand(view.picture.shape, dtype=torch.float64)

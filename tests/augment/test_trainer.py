@@ -119,9 +119,7 @@ def car(**changes) -> Actor:
     body = random_gaussians(60, seed=5, sh_degree=0, size=0.2)
     box = torch.from_numpy(np.random.default_rng(6).uniform(-1, 1, (60, 3)).astype(np.float32))
     body = dataclasses.replace(
-        body,
-        means=box * torch.tensor([0.8, 0.35, 0.35]),
-        opacities=body.opacities.clamp(0.5, 0.95),
+        body, means=box * torch.tensor([0.8, 0.35, 0.35]), opacities=body.opacities.clamp(0.5, 0.95)
     )
     return Actor("car", "Car", body, track(**changes), (1.6, 0.7, 0.7))
 

@@ -49,11 +49,7 @@ def camera_at(
 ) -> Camera:
     """A camera that looks down_deg below the horizon; yaw 0 is world +x."""
     yaw, down, roll = (math.radians(a) for a in (yaw_deg, down_deg, roll_deg))
-    forward = [
-        math.cos(yaw) * math.cos(down),
-        math.sin(yaw) * math.cos(down),
-        -math.sin(down),
-    ]
+    forward = [math.cos(yaw) * math.cos(down), math.sin(yaw) * math.cos(down), -math.sin(down)]
     forward = torch.tensor(forward, dtype=torch.float64)
     right = torch.tensor([math.sin(yaw), -math.cos(yaw), 0.0], dtype=torch.float64)
     below = torch.linalg.cross(forward, right)

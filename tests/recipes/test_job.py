@@ -9,14 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from recipes.errors import RecipeError
-from recipes.job import (
-    MAX_BYTES,
-    Job,
-    load_job,
-    load_job_recipes,
-    parse_job,
-    seed_for_scene,
-)
+from recipes.job import MAX_BYTES, Job, load_job, load_job_recipes, parse_job, seed_for_scene
 
 WHOLE = """\
 name: winter

@@ -101,10 +101,7 @@ output: {image: png, jpeg_quality: {uniform: [60, 95]}}
 """
 # Without derandomize, one run in a thousand would test something that no other run repeats.
 FUZZ = settings(
-    max_examples=150,
-    deadline=None,
-    derandomize=True,
-    suppress_health_check=[HealthCheck.too_slow],
+    max_examples=150, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow]
 )
 
 

@@ -65,10 +65,7 @@ S = "r.yaml:4: weather.smog."
         ),
         ("qqq: 1", "qqq: unknown field; known here: visibility_m, extinction_per_m, color, scale_"),
         ('"a\\nb": 1', "a\\nb: unknown field"),
-        (
-            "model: defered",
-            "= 'defered': must be one of per_gaussian, deferred; did you mean def",
-        ),
+        ("model: defered", "= 'defered': must be one of per_gaussian, deferred; did you mean def"),
         ("model: {uniform: [a, b]}", "uniform is for numbers; a range here is choice"),
         ("color: grey", "color = 'grey': must be [red, green, blue], each a number >= 0 and <= 1"),
         ("color: [0.1, 0.2]", "color = [0.1, 0.2]: must be [red, green, blue], each a number"),
@@ -155,10 +152,7 @@ def test_a_wrong_field_is_named_with_its_line_and_what_is_allowed(field: str, me
         ("[1, 2]", "r.yaml:1: a recipe is a mapping of fields; got [1, 2]"),
         ("just text", "r.yaml:1: a recipe is a mapping of fields; got 'just text'"),
         ("null", "r.yaml:1: the file is empty"),
-        (
-            "seed: 1.0",
-            "r.yaml:1: seed = 1.0: must be a whole number >= 0 and < 922337203",
-        ),
+        ("seed: 1.0", "r.yaml:1: seed = 1.0: must be a whole number >= 0 and < 922337203"),
         ("seed: -1", "r.yaml:1: seed = -1: must be >= 0 and < 9223372036854775808"),
         ("seed: 9223372036854775808", "must be >= 0 and < 9223372036854775808"),
         ("seed: {choice: [1]}", "seed = {choice: ...}: must be a whole number >= 0 and < 92"),
@@ -247,17 +241,11 @@ def test_values_are_shown_shortened() -> None:
         ("base_height_m: {uniform: [0, 2]}", Uniform(0.0, 2.0)),
         ("base_height_m: {uniform: [2, 2]}", Uniform(2.0, 2.0)),
         ("base_height_m: {log_uniform: [1, 2]}", LogUniform(1.0, 2.0)),
-        (
-            "base_height_m: {normal: {mean: 1, std: 2, min: 0, max: 3}}",
-            Normal(1.0, 2.0, 0.0, 3.0),
-        ),
+        ("base_height_m: {normal: {mean: 1, std: 2, min: 0, max: 3}}", Normal(1.0, 2.0, 0.0, 3.0)),
         ("scale_height_m: {choice: [null, 5]}", Choice((Fixed(None), Fixed(5.0)), (1.0, 1.0))),
         ("model: {choice: [deferred], weights: [2]}", Choice((Fixed("deferred"),), (2.0,))),
         ("color: {uniform: [[0, 0, 0], [1, 1, 1]]}", TripleLine((0.0,) * 3, (1.0,) * 3)),
-        (
-            "color: [0, {uniform: [0, 1]}, 1]",
-            Channels((Fixed(0.0), Uniform(0.0, 1.0), Fixed(1.0))),
-        ),
+        ("color: [0, {uniform: [0, 1]}, 1]", Channels((Fixed(0.0), Uniform(0.0, 1.0), Fixed(1.0)))),
         ("color: {choice: [[0, 0, 0]]}", Choice((Fixed((0.0, 0.0, 0.0)),), (1.0,))),
     ],
 )

@@ -162,12 +162,7 @@ def test_views_agree_with_themselves_and_not_with_what_is_elsewhere(cameras):
     snow[size[0] // 2 :] = True
     view = SnowView(camera, rgb, snow, depth)
     same = pair_agreement(view, view)
-    assert same == {
-        "points": snow.size,
-        "agreeing": 1.0,
-        "both": int(snow.sum()),
-        "color_rms": 0.0,
-    }
+    assert same == {"points": snow.size, "agreeing": 1.0, "both": int(snow.sum()), "color_rms": 0.0}
     none = pair_agreement(view, SnowView(camera, rgb + 0.1, ~snow, depth))
     assert (none["agreeing"], none["both"], none["color_rms"]) == (0.0, 0, None)
     brighter = pair_agreement(view, SnowView(camera, rgb + 0.1, snow, depth))

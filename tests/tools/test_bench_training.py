@@ -45,8 +45,7 @@ def corridor(uri: str) -> Scene:
     scene = drive(road, dataclasses.replace(far, semantic=classes), ground_z_m=0.0)
     frames = tuple(
         dataclasses.replace(
-            frame,
-            cameras={"ahead": camera_ahead(32, 16, 16.0, position=(0.2 * n, 0.0, 1.5))},
+            frame, cameras={"ahead": camera_ahead(32, 16, 16.0, position=(0.2 * n, 0.0, 1.5))}
         )
         for n, frame in enumerate(scene.frames)
     )

@@ -66,8 +66,7 @@ def test_a_histogram_counts_every_image_once() -> None:
 
 
 @pytest.mark.parametrize(
-    "values",
-    [[-1e99, 1e99], [1e-99, 1e99], [0.0, 1e-250], [1.0, 1.0000001], [-3.0, 0.0, 7.0]],
+    "values", [[-1e99, 1e99], [1e-99, 1e99], [0.0, 1e-250], [1.0, 1.0000001], [-3.0, 0.0, 7.0]]
 )
 def test_any_range_can_be_drawn(values) -> None:
     shape = report_charts.histogram(np.array(values), np.ones(len(values), int))

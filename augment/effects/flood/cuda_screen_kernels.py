@@ -135,10 +135,7 @@ def fill_field(
 # ------------------------------------------------------------------------------------------------
 # What Triton kernels read of the rows of an image that sees the water's plane (`plane_rows`)
 
-_ROW_BEGIN, _ROW_END = (
-    tl.constexpr(plane_rows.BEGIN),
-    tl.constexpr(plane_rows.END),
-)
+_ROW_BEGIN, _ROW_END = (tl.constexpr(plane_rows.BEGIN), tl.constexpr(plane_rows.END))
 _ROW_ANCHOR, _FALL = tl.constexpr(plane_rows.ANCHOR), tl.constexpr(plane_rows.FALL)
 _ROW = tl.constexpr(plane_rows.ROW)
 

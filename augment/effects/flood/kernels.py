@@ -408,14 +408,8 @@ def _difference(before, here, after, has_before, has_after):
 
 @inner()
 def _edge_weight(x, y, width, height):
-    fx = min(
-        max(min(x, width - x) / (EDGE * width), _ZERO),
-        _ONE,
-    )
-    fy = min(
-        max(min(y, height - y) / (EDGE * height), _ZERO),
-        _ONE,
-    )
+    fx = min(max(min(x, width - x) / (EDGE * width), _ZERO), _ONE)
+    fy = min(max(min(y, height - y) / (EDGE * height), _ZERO), _ONE)
     two, three = np.float32(2), np.float32(3)
     return fx * fx * (three - two * fx) * fy * fy * (three - two * fy)
 
@@ -469,11 +463,7 @@ def _step(pyramid, ray, state):
     """
     x0, y0, dx, dy, inverse_x, inverse_y, ahead_x, ahead_y, near, change, end = ray
     t, stop, size, inverse, hidden, clean, met = state
-    zero, half, one = (
-        v8.splat(_ZERO),
-        v8.splat(_HALF),
-        v8.splat(_ONE),
-    )
+    zero, half, one = (v8.splat(_ZERO), v8.splat(_HALF), v8.splat(_ONE))
     four, quarter = v8.splat(np.float32(4)), v8.splat(np.float32(0.25))
     rows = v8.splat(np.float32(pyramid.shape[0]))
     columns = v8.splat(np.float32(pyramid.shape[1] // 5 * 4))
@@ -581,10 +571,7 @@ def _meet(pyramid, width, height, x0, y0, dx, dy, t, change, near):
     right, below = min(cx + 1, int(width) - 1), min(cy + 1, int(height) - 1)
     across = _difference(pyramid[cy, left], here, pyramid[cy, right], cx > left, right > cx)
     down = _difference(pyramid[above, cx], here, pyramid[below, cx], cy > above, below > cy)
-    off_x, off_y = (
-        np.float32(cx) + _HALF - x0,
-        np.float32(cy) + _HALF - y0,
-    )
+    off_x, off_y = (np.float32(cx) + _HALF - x0, np.float32(cy) + _HALF - y0)
     closing = -change - across * dx - down * dy
     middle = off_x * dx if abs(dx) >= abs(dy) else off_y * dy
     meet = middle

@@ -123,11 +123,7 @@ def _window_origin(whole: Camera, window: Camera) -> tuple[int, int]:
 def _vertical(camera: Camera, level_z_m: float) -> tuple[list[float], list[float], float]:
     """The vertical in the camera, its image N in homogeneous pixels, and the eye's height."""
     up = camera.camera_from_world[:3, 2].tolist()
-    image = [
-        camera.fx * up[0] + camera.cx * up[2],
-        camera.fy * up[1] + camera.cy * up[2],
-        up[2],
-    ]
+    image = [camera.fx * up[0] + camera.cx * up[2], camera.fy * up[1] + camera.cy * up[2], up[2]]
     return up, image, float(camera.centre[2]) - level_z_m
 
 

@@ -617,11 +617,7 @@ def _fetch_bed(s, q, own, place, at, depth, rgb, alpha, bed, limits):
             r, g, b, a = _bilinear(s, k, rgb, alpha, bed.width, right, below)
         if a < limits.solid_alpha:
             pixel = U(own[place + k])
-            r, g, b = (
-                rgb[U(3) * pixel],
-                rgb[U(3) * pixel + U(1)],
-                rgb[U(3) * pixel + U(2)],
-            )
+            r, g, b = (rgb[U(3) * pixel], rgb[U(3) * pixel + U(1)], rgb[U(3) * pixel + U(2)])
             a, s[DEPTH + k] = alpha[pixel], q[OWN_DEPTH + at + k]
         s[R + k], s[G + k], s[B + k], s[A + k] = r, g, b, a
     return v8.load(s, DEPTH)
@@ -668,14 +664,8 @@ def _find_in_mirror(s, count, dx, dy, dz, px, py, alpha, depth, mirror, medium, 
 def _level(s, sizes):
     """Level of averages whose pixels are as wide as a pixel's three places lie apart."""
     c, r = v8.load(s, MIRROR_C), v8.load(s, MIRROR_R)
-    x1, y1 = (
-        v8.load(s, MIRROR_C + U(8)) - c,
-        v8.load(s, MIRROR_R + U(8)) - r,
-    )
-    x2, y2 = (
-        v8.load(s, MIRROR_C + U(16)) - c,
-        v8.load(s, MIRROR_R + U(16)) - r,
-    )
+    x1, y1 = (v8.load(s, MIRROR_C + U(8)) - c, v8.load(s, MIRROR_R + U(8)) - r)
+    x2, y2 = (v8.load(s, MIRROR_C + U(16)) - c, v8.load(s, MIRROR_R + U(16)) - r)
     apart = v8.sqrt(x1 * x1 + y1 * y1) + v8.sqrt(x2 * x2 + y2 * y2)
     spacing = v8.maximum(v8.splat(HALF) * apart, v8.splat(ONE))
     top = F(np.int32(sizes.shape[0] - 1))

@@ -234,9 +234,7 @@ def mirrored_camera(camera: Camera, level_z_m: float) -> Camera:
     eye = camera.centre * mirror
     eye[2] += 2 * level_z_m
     return dataclasses.replace(
-        camera,
-        camera_from_world=rigid(rotation, -rotation @ eye),
-        cy=camera.height - camera.cy,
+        camera, camera_from_world=rigid(rotation, -rotation @ eye), cy=camera.height - camera.cy
     )
 
 

@@ -330,11 +330,7 @@ class SnowCover:
         return tuple(parts)
 
     def _posed(
-        self,
-        layer: Layer,
-        part: PosedGaussians,
-        camera: Camera,
-        eye_m: Float[Tensor, "3"],
+        self, layer: Layer, part: PosedGaussians, camera: Camera, eye_m: Float[Tensor, "3"]
     ) -> tuple[PosedGaussians, ...]:
         """The layer where its part stands, the ground's finer where it is near, and its glints."""
         pose, number = part.world_from_part, part.instance_id

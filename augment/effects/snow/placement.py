@@ -644,10 +644,7 @@ class _Ground:
         """
         plan, window = self._plan, square.window
         cell = plan.size_m(square.level)
-        corner = (
-            plan.origin_m[0] + window.left * cell,
-            plan.origin_m[1] + window.bottom * cell,
-        )
+        corner = (plan.origin_m[0] + window.left * cell, plan.origin_m[1] + window.bottom * cell)
         shape = (window.height, window.width)
         far = (corner[0] + window.width * cell, corner[1] + window.height * cell)
         near, chosen = self._background, None

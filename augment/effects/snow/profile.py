@@ -209,11 +209,7 @@ def share_covered(snow: Snow) -> float:
 
 
 def profile_of(
-    snow: Snow,
-    rng: np.random.Generator,
-    *,
-    on_ground: bool,
-    water_level_z_m: float | None = None,
+    snow: Snow, rng: np.random.Generator, *, on_ground: bool, water_level_z_m: float | None = None
 ) -> Profile:
     """The profile of the recipe's snow. on_ground: of what does not move, so that wind, tracks and
     water count; what moves has met many winds.

@@ -40,11 +40,7 @@ _COLUMNS = {"centers_m": 3, "normals": 3, "neighbours": 4, "banks": 2, "buried_b
 
 
 def bed_key(
-    scene: Scene,
-    cameras: Sequence[Camera],
-    settings: PlacementSettings,
-    *,
-    backend: str = AUTO,
+    scene: Scene, cameras: Sequence[Camera], settings: PlacementSettings, *, backend: str = AUTO
 ) -> str:
     """Hex digest of all that a bed depends on: Gaussians, tracks, cameras, poses, settings, what
     places it (the GPU rounds otherwise than the CPU), and the version of this code. Of colours,

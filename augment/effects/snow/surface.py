@@ -202,11 +202,7 @@ def _highest_step(limit: float, cell: float) -> float:
 
 
 def _compare(
-    height: np.ndarray,
-    lowest: np.ndarray,
-    covered: np.ndarray,
-    can_carry: np.ndarray,
-    step: float,
+    height: np.ndarray, lowest: np.ndarray, covered: np.ndarray, can_carry: np.ndarray, step: float
 ) -> np.ndarray:
     sides = np.empty((*height.shape, 4), np.int8)
     with kernel_threads(_ROWS):
@@ -516,12 +512,7 @@ def moves(actor: Actor) -> bool:
 
 
 def find_actor_cells(
-    actor: Actor,
-    *,
-    cell_m: float,
-    max_slope_deg: float,
-    estimator: Estimator,
-    backend: str = AUTO,
+    actor: Actor, *, cell_m: float, max_slope_deg: float, estimator: Estimator, backend: str = AUTO
 ) -> SnowCells | None:
     """Cells on a vehicle, in its own frame; None where it has too few to carry snow. backend: that
     draws it.

@@ -100,19 +100,7 @@ def find_seen(points, normals, is_sure, views, sizes, depths, lifts, tolerances,
             if not is_sure[i]:
                 there += _is_there(views[view], depths, start, width, height, x, y, z, tolerances)
             if not found and _is_seen(
-                views[view],
-                depths,
-                start,
-                width,
-                height,
-                x,
-                y,
-                z,
-                nx,
-                ny,
-                nz,
-                lifts,
-                tolerances,
+                views[view], depths, start, width, height, x, y, z, nx, ny, nz, lifts, tolerances
             ):
                 found = True
             if found and is_sure[i]:

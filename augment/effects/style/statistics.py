@@ -222,11 +222,7 @@ class _Form:
 
 
 def _mapped(
-    content: ColorStatistics,
-    style: ColorStatistics,
-    limits: Limits,
-    strength: float,
-    form: _Form,
+    content: ColorStatistics, style: ColorStatistics, limits: Limits, strength: float, form: _Form
 ) -> Tensor:
     floor = limits.floor**2 * np.eye(3)
     full = form.limited(form.gain(content.covariance + floor, style.covariance + floor), limits)

@@ -297,11 +297,7 @@ class Splats:
 
 
 def project(
-    inputs: Inputs,
-    depths: np.ndarray,
-    bins: tuple[int, int],
-    tiles: Tiles,
-    scratch: Scratch,
+    inputs: Inputs, depths: np.ndarray, bins: tuple[int, int], tiles: Tiles, scratch: Scratch
 ) -> Splats:
     blocks = len(inputs.blocks)
     is_cut = bool(inputs.modes[layout.M_CLIP])
@@ -450,11 +446,7 @@ class Tiles:
         return members, starts
 
     def list_members(
-        self,
-        slots: np.ndarray,
-        rects: np.ndarray,
-        first: int,
-        limit: int | None = _MAX_PAIRS,
+        self, slots: np.ndarray, rects: np.ndarray, first: int, limit: int | None = _MAX_PAIRS
     ) -> tuple[int, np.ndarray, np.ndarray]:
         """Lists of every open tile's splats, nearest first, from the splat `first` on.
 

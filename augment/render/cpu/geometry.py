@@ -334,8 +334,7 @@ def cut_eight(quats, scales, picked, at, d, x, y, inverse, view):
     deep = v8.sqrt(dot(away0, away1, away2, away0, away1, away2)) * inverse
     deep = v8.minimum(v8.splat(view[V_EXTENT]) * deep, v8.splat(view[V_CLIP_LONGEST]))
     partly = v8.both(
-        v8.at_least(height + reach, zero),
-        v8.at_least(v8.splat(view[V_CLIP_REACH]), height - reach),
+        v8.at_least(height + reach, zero), v8.at_least(v8.splat(view[V_CLIP_REACH]), height - reach)
     )
     return partly, offset + v8.splat(view[V_CLIP_EDGE]), lx, ly, gx * inverse, gy * inverse, deep
 
@@ -363,14 +362,10 @@ def _depth_slope(x, y, z):
         by_blur, dot(x[0], x[1], x[2], x[0], x[1], x[2]), blur
     )
     gx = v8.fmuladd(
-        by_blur,
-        dot(x[0], x[1], x[2], z[0], z[1], z[2]),
-        dot(c0, c1, c2, right0, right1, right2),
+        by_blur, dot(x[0], x[1], x[2], z[0], z[1], z[2]), dot(c0, c1, c2, right0, right1, right2)
     )
     gy = v8.fmuladd(
-        by_blur,
-        dot(y[0], y[1], y[2], z[0], z[1], z[2]),
-        dot(c0, c1, c2, down0, down1, down2),
+        by_blur, dot(y[0], y[1], y[2], z[0], z[1], z[2]), dot(c0, c1, c2, down0, down1, down2)
     )
     return gx / det, gy / det
 

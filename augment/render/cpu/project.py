@@ -338,8 +338,7 @@ def _rank_eight(means, scales, opacities, view, picked, depths, at, areas):
     far_x = v8.fmuladd(v8.splat(view[V_GAIN]), reach, two)
     far_y = v8.fmuladd(v8.splat(view[V_GAIN + 1]), reach, two)
     seen = v8.both(
-        v8.at_least(z, v8.splat(view[V_NEAR])),
-        v8.at_least(opacity, v8.splat(view[V_ALPHA_MIN])),
+        v8.at_least(z, v8.splat(view[V_NEAR])), v8.at_least(opacity, v8.splat(view[V_ALPHA_MIN]))
     )
     seen = v8.both(seen, v8.at_least(x + far_x, zero))
     seen = v8.both(seen, v8.at_least(v8.splat(view[V_SIZE]) - x + far_x, zero))

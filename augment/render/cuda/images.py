@@ -106,10 +106,7 @@ def renormalise_alpha(alpha: Tensor, rgb: Tensor | None, snow: Tensor | None, st
     """Finished pixels become opaque, in place; all contiguous."""
     count = alpha.numel()
     launch(
-        kernels.renormalise_alpha,
-        _grid(count),
-        *(alpha, rgb, snow, count, 1 - stop),
-        BLOCK=BLOCK,
+        kernels.renormalise_alpha, _grid(count), *(alpha, rgb, snow, count, 1 - stop), BLOCK=BLOCK
     )
 
 

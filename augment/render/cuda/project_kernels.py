@@ -151,16 +151,8 @@ def image_axes(x, y, inverse, columns, sizes, view):
     u = tl.minimum(tl.maximum(x * inverse, tl.load(view + V_LOW)), tl.load(view + V_HIGH))
     v = tl.minimum(tl.maximum(y * inverse, tl.load(view + V_LOW + 1)), tl.load(view + V_HIGH + 1))
     fx, fy = tl.load(view + V_FOCAL) * inverse, tl.load(view + V_FOCAL + 1) * inverse
-    right = (
-        fx * tl.fma(-u, t[0], r[0]),
-        fx * tl.fma(-u, t[1], r[1]),
-        fx * tl.fma(-u, t[2], r[2]),
-    )
-    down = (
-        fy * tl.fma(-v, t[0], s[0]),
-        fy * tl.fma(-v, t[1], s[1]),
-        fy * tl.fma(-v, t[2], s[2]),
-    )
+    right = (fx * tl.fma(-u, t[0], r[0]), fx * tl.fma(-u, t[1], r[1]), fx * tl.fma(-u, t[2], r[2]))
+    down = (fy * tl.fma(-v, t[0], s[0]), fy * tl.fma(-v, t[1], s[1]), fy * tl.fma(-v, t[2], s[2]))
     return along_axes(right, columns, sizes), along_axes(down, columns, sizes)
 
 
@@ -393,10 +385,7 @@ def store_lights(lines, normals, points, slopes, through, lit, mask, view):
     sun, wrap = three(view + V_SUN), tl.load(view + V_WRAP)
     inverse = 1.0 / tl.maximum(-nz, MIN_FACING)
     ax, ay = nx * inverse, ny * inverse
-    fx, fy = (
-        tl.load(view + V_FOCAL),
-        tl.load(view + V_FOCAL + 1),
-    )
+    fx, fy = (tl.load(view + V_FOCAL), tl.load(view + V_FOCAL + 1))
     scale = 1.0 / (1.0 + wrap)
     tl.store(lines, tl.where(lit, dot((nx, ny, nz), sun) * scale, 0.0), mask)
     tl.store(lines + 1, tl.where(lit, tl.fma(ax, sun[2], sun[0]) / fx * scale, 0.0), mask)
