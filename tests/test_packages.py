@@ -9,6 +9,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 LAYERS = ("recipes", "augment", "adapters", "tools")  # each may import those before it
+NOT_INSTALLED = {"tools.bench"}  # measures, from a source checkout
 
 
 def modules(package: str) -> list[Path]:
@@ -69,7 +70,7 @@ def test_all_packages_are_installed():
         for path in modules(package)
         if path.name == "__init__.py"
     }
-    assert set(listed) == there
+    assert there >= NOT_INSTALLED and set(listed) == there - NOT_INSTALLED
     for package in LAYERS:
         for path in modules(package):
             assert (path.parent / "__init__.py").exists(), f"{path.parent} has no __init__.py"

@@ -26,7 +26,7 @@ def raster(
     """
     if device == "cuda":
         return gpu(repeats, quick, sections=("raster",), json_file=json_file)
-    from tools.bench import bench_raster, bench_text
+    from tools.bench.raster import bench_raster, bench_text
 
     return _print_result(bench_raster(repeats=repeats, quick=quick), bench_text, json_file)
 

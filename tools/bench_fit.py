@@ -29,7 +29,7 @@ from augment.reconstruct.view import ViewSource
 from augment.render.cpu.driver import warm_up
 from augment.scene import Scene
 from recipes.load import load_recipe
-from tools.bench import Spread
+from tools.bench.raster import Spread
 from tools.bench_memory import RESET_PEAK, return_free_memory, status_mib
 from tools.fit_data import can_hold_out, check_recorded, splat_count
 from tools.fit_options import resolved_uri, without_growth

@@ -8,7 +8,7 @@ import torch
 
 from augment.render.constants import ALPHA_MIN, RasterSettings
 from augment.render.cuda.runtime import gpu_device, launch
-from tools.bench import Spread
+from tools.bench.raster import Spread
 from tools.gpu_clock import Timing, times_in_turns
 
 LANES = 256  # pixels of a program

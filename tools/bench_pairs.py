@@ -10,7 +10,7 @@ from augment.cameras import Camera
 from augment.plan import Plan
 from augment.scene import Scene
 from augment.views import render_buffers
-from tools.bench import Spread
+from tools.bench.raster import Spread
 
 
 def spread(values: Sequence[float]) -> dict[str, float]:

@@ -10,8 +10,8 @@ import torch
 
 from augment.render.reference import project_parts
 from augment.scene import PosedGaussians
-from tools import bench
-from tools.bench import STAGES, Spread, bench_raster, bench_text
+from tools.bench import raster as bench
+from tools.bench.raster import STAGES, Spread, bench_raster, bench_text
 from tools.bench_memory import peak_extra_mib
 from tools.bench_scene import DEFAULT_CASES, RasterCase, random_scene
 from tools.machine import machine_facts
