@@ -71,7 +71,7 @@ def composite_cubemap(rgb, alpha, faces, rotation, ifx, ify, cx, cy, strength, a
             c0, r0 = int(column), int(row)
             c1, r1 = c0 + 1, r0 + 1
             fc, fr = column - np.float32(c0), row - np.float32(r0)
-            through = one - alpha[i, j]
+            transmittance = one - alpha[i, j]
             visible = one
             if strength >= 0:
                 visible = np.float32(0)
@@ -83,7 +83,7 @@ def composite_cubemap(rgb, alpha, faces, rotation, ifx, ify, cx, cy, strength, a
                 bottom = faces[face, r1, c0, c] * (one - fc) + faces[face, r1, c1, c] * fc
                 color = top * (one - fr) + bottom * fr
                 color = visible * color + (one - visible) * airlight[c]
-                out[i, j, c] = rgb[i, j, c] + through * color
+                out[i, j, c] = rgb[i, j, c] + transmittance * color
 
 
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")

@@ -106,7 +106,7 @@ def rasterize(
     settings: RasterSettings = RasterSettings(),  # noqa: B008 - frozen, so sharing it is safe
     smog: SmogMedium | None = None,
     clip: HeightClip | None = None,
-    wanted: torch.Tensor | None = None,
+    pixel_mask: torch.Tensor | None = None,
     backend: str = AUTO,
 ) -> RenderOutput:
     """Image buffers of the parts seen by the camera; the sky is not part of them.
@@ -115,7 +115,7 @@ def rasterize(
     through the parts in the order given. smog: fades every splat's colour towards the airlight by
     its own distance. clip: only what lies above, or below, a height is drawn
     (augment.render.layout).
-    wanted: bool [H, W], the pixels that will be looked at; a backend may leave the others 0.
+    pixel_mask: bool [H, W], the pixels that will be looked at; a backend may leave the others 0.
     backend: "cpu" (numba, float32; gradients of rgb, alpha and expected_depth, of pinhole cameras,
     without smog, clip, light per pixel or colour maps and where no other buffer is asked for),
     "cuda" (Triton, float32; parts may lie on either side, and are kept on the GPU as long as their
@@ -134,18 +134,18 @@ def rasterize(
             f"camera {camera.name!r} is orthographic: there is no eye from which to measure how "
             f"far the smog is looked through; render it without smog, or with a pinhole camera"
         )
-    if wanted is not None and (
-        wanted.dtype != torch.bool or tuple(wanted.shape) != (camera.height, camera.width)
+    if pixel_mask is not None and (
+        pixel_mask.dtype != torch.bool or tuple(pixel_mask.shape) != (camera.height, camera.width)
     ):
         raise ValueError(
-            f"wanted must be bool [{camera.height}, {camera.width}] (the camera's size); got "
-            f"{wanted.dtype} {list(wanted.shape)}"
+            f"pixel_mask must be bool [{camera.height}, {camera.width}] (the camera's size); got "
+            f"{pixel_mask.dtype} {list(pixel_mask.shape)}"
         )
     names, stop = frozenset(buffers), settings.transmittance_stop
     chosen = _choose(parts, camera, backend, names, smog, clip)
     if not needs_remainder(stop):
-        return _rasterize(parts, camera, names, settings, smog, clip, wanted, chosen)
-    drawn = _rasterize(parts, camera, names | {ALPHA}, settings, smog, clip, wanted, chosen)
+        return _rasterize(parts, camera, names, settings, smog, clip, pixel_mask, chosen)
+    drawn = _rasterize(parts, camera, names | {ALPHA}, settings, smog, clip, pixel_mask, chosen)
     shared = renormalise_alpha(drawn, stop, backend=chosen)
     return shared if ALPHA in names else dataclasses.replace(shared, alpha=None)
 
@@ -157,13 +157,13 @@ def _rasterize(
     settings: RasterSettings,
     smog: SmogMedium | None,
     clip: HeightClip | None,
-    wanted: torch.Tensor | None,
+    pixel_mask: torch.Tensor | None,
     backend: str,
 ) -> RenderOutput:
     if backend == REFERENCE:
         return rasterize_reference(parts, camera, names, settings, smog, clip)
     if backend == CUDA:
-        return _rasterize_cuda(parts, camera, names, settings, smog, clip, wanted)
+        return _rasterize_cuda(parts, camera, names, settings, smog, clip, pixel_mask)
     cpu = import_cpu()
     if _tracked(parts):
         from augment.render.cpu.backward import rasterize_with_gradients
@@ -176,7 +176,7 @@ def _rasterize(
         settings,
         smog,
         clip,
-        None if wanted is None else wanted.numpy(),
+        None if pixel_mask is None else pixel_mask.numpy(),
     )
 
 
@@ -187,7 +187,7 @@ def _rasterize_cuda(
     settings: RasterSettings,
     smog: SmogMedium | None,
     clip: HeightClip | None,
-    wanted: torch.Tensor | None,
+    pixel_mask: torch.Tensor | None,
 ) -> RenderOutput:
     cuda = import_cuda()
     if _tracked(parts):
@@ -195,7 +195,7 @@ def _rasterize_cuda(
 
         return rasterize_with_gradients(parts, camera, names, settings)
     return cuda.rasterize_cuda(
-        [_detached(p) for p in parts], camera, names, settings, smog, clip, wanted
+        [_detached(p) for p in parts], camera, names, settings, smog, clip, pixel_mask
     )
 
 

@@ -393,12 +393,12 @@ MEDIAN = 0.5  # median depth is where transmittance falls below this
 
 @dataclass(frozen=True, eq=False)
 class TileLists:
-    """Which splats each tile blends. members [E]: splat indices, tile after tile, each in the order
-    of the splats. starts [tiles + 1]: tile i (row by row) owns members[starts[i]:starts[i + 1]].
+    """Which splats each tile blends. tile_splat_ids [E]: splat indices, tile after tile, each in
+    the order of the splats. tile_offsets [tiles + 1]: where in it tile i (row by row) begins.
     """
 
-    members: Int64[Tensor, "E"]
-    starts: Int64[Tensor, "L"]
+    tile_splat_ids: Int64[Tensor, "E"]
+    tile_offsets: Int64[Tensor, "L"]
     columns: int
     rows: int
 
@@ -434,8 +434,8 @@ def bin_to_tiles(splats: Splats, camera: Camera) -> TileLists:
     within = torch.arange(len(owners)) - (counts.cumsum(0) - counts)[owners]
     tiles = (y0[owners] + within // widths[owners]) * columns + x0[owners] + within % widths[owners]
     order = torch.argsort(tiles, stable=True)
-    starts = torch.searchsorted(tiles[order], torch.arange(columns * rows + 1))
-    return TileLists(owners[order], starts, columns, rows)
+    tile_offsets = torch.searchsorted(tiles[order], torch.arange(columns * rows + 1))
+    return TileLists(owners[order], tile_offsets, columns, rows)
 
 
 def _tile_span(splats: Splats, axis: int, tiles: int) -> tuple[Tensor, Tensor]:
@@ -459,20 +459,20 @@ def blend(
     recompute = torch.is_grad_enabled() and any(
         value.requires_grad for value in splats.columns().values()
     )
-    sizes = lists.starts.diff().tolist()
+    sizes = lists.tile_offsets.diff().tolist()
     tiles = []
     # Gathered once: taking each tile's splats from all of them would make every backward step of a
     # tile as long as the scene.
-    for tile, members in enumerate(splats.select(lists.members).split(sizes)):
-        args = (members, divmod(tile, lists.columns), buffers, settings, camera)
-        if recompute and len(members):  # a backward pass would else keep every splat x pixel
+    for tile, tile_splat_ids in enumerate(splats.select(lists.tile_splat_ids).split(sizes)):
+        args = (tile_splat_ids, divmod(tile, lists.columns), buffers, settings, camera)
+        if recompute and len(tile_splat_ids):  # a backward pass would else keep every splat x pixel
             tiles.append(
                 checkpoint(blend_tile, *args, use_reentrant=False, preserve_rng_state=False)
             )
         else:
             tiles.append(blend_tile(*args))
     images = {name: _assemble([getattr(t, name) for t in tiles], lists, camera) for name in buffers}
-    if recompute and len(lists.members) == 0:
+    if recompute and len(lists.tile_splat_ids) == 0:
         # A view of nothing is a function of the splats too: its gradients are 0, not an error.
         floats = [value for value in splats.columns().values() if value.is_floating_point()]
         nothing = torch.stack([value[:0].sum() for value in floats]).sum()

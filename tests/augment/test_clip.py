@@ -221,7 +221,7 @@ def test_unwanted_tiles_are_left_out():
     gaussians, camera = random_gaussians(2000, seed=5), camera_ahead(100, 70, 90.0)
     wanted = torch.zeros(70, 100, dtype=torch.bool)
     wanted[20, 40] = wanted[65, 99] = True  # in two tiles, one at the image's corner
-    part = rasterize([PosedGaussians(gaussians)], camera, buffers=ALL, wanted=wanted)
+    part = rasterize([PosedGaussians(gaussians)], camera, buffers=ALL, pixel_mask=wanted)
     plain = render(gaussians, camera)
     for rows, columns in ((slice(16, 32), slice(32, 48)), (slice(64, 70), slice(96, 100))):
         for name in ALL:
@@ -229,4 +229,4 @@ def test_unwanted_tiles_are_left_out():
             assert torch.equal(piece, getattr(plain, name)[rows, columns]), name
     assert int((part.alpha > 0).sum()) <= 16 * 16 + 6 * 4 and bool((part.splat_ids[:16] == 0).all())
     with pytest.raises(ValueError, match="wanted must be bool"):
-        rasterize([PosedGaussians(gaussians)], camera, wanted=wanted[1:])
+        rasterize([PosedGaussians(gaussians)], camera, pixel_mask=wanted[1:])

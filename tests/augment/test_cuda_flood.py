@@ -98,7 +98,7 @@ def drawn_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
     def rasterize_here(parts, camera, *, wanted, backend, **settings):
         assert backend == "cuda"
         asked = None if wanted is None else wanted.cpu()
-        drawn = rasterize(parts, camera, wanted=asked, backend="cpu", **settings)
+        drawn = rasterize(parts, camera, pixel_mask=asked, backend="cpu", **settings)
         images = {f.name: getattr(drawn, f.name) for f in dataclasses.fields(drawn)}
         device = gpu.gpu_device()
         moved = {name: part.to(device) for name, part in images.items() if part is not None}

@@ -184,8 +184,8 @@ def reference_splats(parts, camera, settings=DEFAULT) -> tuple[CudaSplats, CudaT
         CudaSplats(records.to(device), keys.to(device), none.to(device), none[:, 0].to(device),
                    None, None),
         CudaTiles(
-            splats.ids[lists.members].int().to(device),
-            lists.starts.int().to(device),
+            splats.ids[lists.tile_splat_ids].int().to(device),
+            lists.tile_offsets.int().to(device),
             lists.columns,
             lists.rows,
         ),
@@ -225,7 +225,7 @@ def test_every_tile_adds_its_share():
 def test_an_image_of_nothing_moves_nothing():
     camera = camera_ahead(9, 9, 9.0)
     splats, tiles = reference_splats([PosedGaussians(one_gaussian((-3.0, 0.0, 0.0)))], camera)
-    assert len(tiles.members) == 0
+    assert len(tiles.tile_splat_ids) == 0
     d_rgb = weights_of(camera).to(gpu.gpu_device())
     assert not color_gradients(splats, tiles, camera, DEFAULT, d_rgb).any()
 

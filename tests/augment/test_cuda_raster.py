@@ -138,8 +138,11 @@ def brute_force_lists(splats: CudaSplats, columns: int, rows: int) -> list[list[
 
 
 def listed(tiles: CudaTiles) -> list[list[int]]:
-    members, starts = tiles.members.cpu().tolist(), tiles.starts.cpu().tolist()
-    return [members[a:b] for a, b in itertools.pairwise(starts)]
+    tile_splat_ids, tile_offsets = (
+        tiles.tile_splat_ids.cpu().tolist(),
+        tiles.tile_offsets.cpu().tolist(),
+    )
+    return [tile_splat_ids[a:b] for a, b in itertools.pairwise(tile_offsets)]
 
 
 def random_splats(count: int, columns: int, rows: int, seed: int = 0) -> CudaSplats:
@@ -172,7 +175,7 @@ def test_lists_hold_every_pair_once_in_order_of_depth(count, columns, rows):
     camera = camera_ahead(columns * TILE - 3, rows * TILE)
     tiles = list_tiles(on_gpu(splats), camera, None)
     assert (tiles.columns, tiles.rows) == (columns, rows)
-    assert tiles.members.dtype == tiles.starts.dtype == torch.int32
+    assert tiles.tile_splat_ids.dtype == tiles.tile_offsets.dtype == torch.int32
     assert listed(tiles) == brute_force_lists(splats, columns, rows)
 
 
@@ -401,7 +404,7 @@ def test_wanted_pixels_have_the_bits_of_the_whole_image():
     wanted = torch.zeros(19, 35, dtype=torch.bool)
     wanted[17, 30:34] = True
     whole = render(parts, camera)
-    partly = render(parts, camera, wanted=wanted)
+    partly = render(parts, camera, pixel_mask=wanted)
     for name in ALL:
         assert torch.equal(getattr(partly, name)[wanted], getattr(whole, name)[wanted]), name
     assert torch.count_nonzero(partly.alpha[:16]) == 0
@@ -424,7 +427,7 @@ def test_everything_lies_on_the_gpu(monkeypatch):
     wanted = torch.ones(camera.height, camera.width, dtype=torch.bool)
     expected = rasterize([street, snow], camera, **arguments)
     with pretended_gpu(monkeypatch):
-        output = rasterize([street, snow], camera, wanted=wanted, **arguments)
+        output = rasterize([street, snow], camera, pixel_mask=wanted, **arguments)
         assert all(isinstance(getattr(output, name), AwayTensor) for name in ALL)
         held = on_cpu(output)
     assert_same_bits(held, on_cpu(expected))
@@ -433,7 +436,7 @@ def test_everything_lies_on_the_gpu(monkeypatch):
 def test_a_clock_is_told_of_the_stages():
     clock = GpuStageTimer()
     parts = [PosedGaussians(stack(one_gaussian(), one_gaussian((-3.0, 0, 0))))]
-    rasterize_cuda(parts, camera_ahead(16, 16, 8.0), COLOR, DEFAULT, None, clock=clock)
+    rasterize_cuda(parts, camera_ahead(16, 16, 8.0), COLOR, DEFAULT, None, timer=clock)
     assert clock.counts == {"visible": 1, "pairs": 1}
     assert set(clock.milliseconds()) == {"project", "list", "blend"}
 

@@ -83,7 +83,7 @@ def run(
     render_view(scene, camera, recipe)
     layers, real = [], cpu.rasterize_cpu
 
-    def spy(parts, camera, buffers, settings, smog, clip=None, wanted=None):
+    def spy(parts, camera, buffers, settings, smog, clip=None, pixel_mask=None):
         light = any(part.shading is not None for part in parts)
         maps = any(part.color_maps is not None for part in parts)
         names = " ".join(sorted(buffers))

@@ -315,7 +315,7 @@ class LayerRenderer:
             settings=self.settings,
             smog=self.smog,
             clip=clip,
-            wanted=wanted,
+            pixel_mask=wanted,
             backend=self.backend,
         )
         if self.smog_on_buffers is None:

@@ -325,7 +325,7 @@ def _draw(
             buffers=asked,
             settings=RasterSettings(sh_degree=0, antialiased=antialiased),
             clip=UNCUT,
-            wanted=gpu.upload(wanted) if wanted is not None and backend == CUDA else wanted,
+            pixel_mask=gpu.upload(wanted) if wanted is not None and backend == CUDA else wanted,
             backend=backend,
         )
         return [getattr(out, name).cpu().numpy() for name in names]

@@ -74,8 +74,8 @@ class Tape:
     expected_depth: np.ndarray | None
     records: np.ndarray
     found: np.ndarray
-    members: np.ndarray
-    starts: np.ndarray
+    tile_splat_ids: np.ndarray
+    tile_offsets: np.ndarray
     size: np.ndarray
     limits: np.ndarray
     scratch: Scratch
@@ -86,10 +86,10 @@ class Tape:
         d_alpha: np.ndarray,
         d_expected_depth: np.ndarray | None = None,
         *,
-        clock: StageTimer | None = None,
+        timer: StageTimer | None = None,
     ) -> SplatGradients:
         """Gradients of a loss with these derivatives by the images, all float32, contiguous."""
-        clock = StageTimer(None) if clock is None else clock
+        timer = StageTimer(None) if timer is None else timer
         depth = d_depth = None
         if self.expected_depth is not None and d_expected_depth is not None:
             weight = np.maximum(self.alpha, np.float32(DEPTH_EPS))
@@ -98,9 +98,9 @@ class Tape:
             inside = self.alpha > np.float32(DEPTH_EPS)
             d_alpha = d_alpha - np.where(inside, d_depth * self.expected_depth, np.float32(0))
         scratch, inputs = self.scratch, self.inputs
-        entries, slots, blocks = len(self.members), inputs.slots, len(inputs.blocks)
+        entries, slots, blocks = len(self.tile_splat_ids), inputs.slots, len(inputs.blocks)
         shares = scratch.array("shares", (entries * cpu_blend_backward.SHARE,), np.float32)
-        reached = scratch.array("reached", (len(self.starts) - 1,), np.int64)
+        reached = scratch.array("reached", (len(self.tile_offsets) - 1,), np.int64)
         sums = scratch.array("sums", (slots * cpu_blend_backward.SHARE,), np.float32)
         touched = scratch.array("touched", (slots,), np.uint8)
         rows = scratch.array("grads", (slots, cpu_project_backward.GRAD), np.float32)
@@ -109,8 +109,8 @@ class Tape:
         with kernel_threads():
             cpu_blend_backward.blend_backward(
                 self.records,
-                self.members,
-                self.starts,
+                self.tile_splat_ids,
+                self.tile_offsets,
                 self.size,
                 self.limits,
                 self.rgb.reshape(-1),
@@ -122,11 +122,11 @@ class Tape:
                 shares,
                 reached,
             )
-            clock.timed("raster backward")
+            timer.end_stage("raster backward")
             cpu_blend_backward.sum_shares(
-                self.members, self.starts, reached, shares, _RANGES, sums, touched
+                self.tile_splat_ids, self.tile_offsets, reached, shares, _RANGES, sums, touched
             )
-            clock.timed("sum backward")
+            timer.end_stage("sum backward")
             cpu_project_backward.project_backward(
                 inputs.addresses,
                 inputs.sizes,
@@ -142,7 +142,7 @@ class Tape:
                 ids,
                 counts,
             )
-            clock.timed("project backward")
+            timer.end_stage("project backward")
         return SplatGradients(rows, ids, counts, inputs.blocks)
 
 
@@ -153,7 +153,7 @@ def record(
     scratch: Scratch,
     *,
     with_depth: bool,
-    clock: StageTimer | None = None,
+    timer: StageTimer | None = None,
 ) -> Tape:
     """Render colour, alpha and, if asked for, expected depth, and keep what `backward` needs.
 
@@ -165,7 +165,7 @@ def record(
             f"camera {camera.name!r} is orthographic; the kernels' gradients are of pinhole "
             f"cameras only: use `rasterize` with backend 'auto' or 'reference'"
         )
-    clock = StageTimer(None) if clock is None else clock
+    timer = StageTimer(None) if timer is None else timer
     buffers = frozenset({RGB, ALPHA, EXPECTED_DEPTH} if with_depth else {RGB, ALPHA})
     images = image_arrays(camera, buffers)
     with kernel_threads():
@@ -173,15 +173,15 @@ def record(
         depths, edges = rank(inputs, camera, scratch)
         bins = (edges[0], edges[-1])
         splats = project(inputs, depths, bins, tiles, scratch)
-        clock.timed("project")
+        timer.end_stage("project")
         slots, rects = sort(splats, bins[0], scratch)
-        clock.timed("sort")
-        members, starts = tiles.list_all(slots, rects)
-        clock.timed("bin")
-        clock.count("visible", len(slots))
-        clock.count("pairs", len(members))
-        tiles.blend_members(splats, members, starts, is_last=True)
-        clock.timed("raster")
+        timer.end_stage("sort")
+        tile_splat_ids, tile_offsets = tiles.list_all(slots, rects)
+        timer.end_stage("bin")
+        timer.count("visible", len(slots))
+        timer.count("pairs", len(tile_splat_ids))
+        tiles.blend_lists(splats, tile_splat_ids, tile_offsets, is_last=True)
+        timer.end_stage("raster")
     return Tape(
         inputs=inputs,
         camera=camera,
@@ -190,8 +190,8 @@ def record(
         expected_depth=images.get(EXPECTED_DEPTH),
         records=splats.records,
         found=splats.found,
-        members=members,
-        starts=starts,
+        tile_splat_ids=tile_splat_ids,
+        tile_offsets=tile_offsets,
         size=tiles.size,
         limits=tiles.limits,
         scratch=scratch,

@@ -22,7 +22,7 @@ import numpy as np
 from numba import prange
 
 from augment.render.cpu import simd as v8
-from augment.render.cpu.blend import alpha_of, is_closed, light_left, shrink
+from augment.render.cpu.blend import alpha_of, is_closed, remaining_transmittance, shrink
 from augment.render.cpu.geometry import (
     BATCH,
     ITEMS,
@@ -82,8 +82,8 @@ _LN2 = np.float32(math.log(2))
 @kernel
 def blend_backward(
     records,
-    members,
-    starts,
+    tile_splat_ids,
+    tile_offsets,
     size,
     limits,
     rgb,
@@ -97,10 +97,10 @@ def blend_backward(
 ):
     """dL of every list entry that the forward blend came to.
 
-    records, members, starts, size, limits: as for cpu_blend.blend_tiles, in one slice. rgb, alpha:
-    flat images as rendered. depth: sum of weights times z. d_rgb, d_alpha, d_depth: the loss's
-    derivatives by them; depth and d_depth may be None. shares: float32 [entries * SHARE], filled
-    up to reached[tile] (int64, tiles) entries of each list.
+    records, tile_splat_ids, tile_offsets, size, limits: as for cpu_blend.blend_tiles, in one slice.
+    rgb, alpha: flat images as rendered. depth: sum of weights times z. d_rgb, d_alpha, d_depth: the
+    loss's derivatives by them; depth and d_depth may be None. shares: float32 [entries * SHARE],
+    filled up to reached[tile] (int64, tiles) entries of each list.
     """
     columns = (size[0] + TILE_W - 1) // TILE_W
     for group in prange((reached.size + GROUP - 1) // GROUP):
@@ -111,12 +111,12 @@ def blend_backward(
         places = np.empty(2 * ITEMS, np.int32)
         rows = np.empty(2 * STRIPS, np.int64)
         for tile in range(group * GROUP, min((group + 1) * GROUP, reached.size)):
-            first, last = starts[tile], starts[tile + 1]
+            first, last = tile_offsets[tile], tile_offsets[tile + 1]
             left, top = tile % columns * TILE_W, tile // columns * TILE_H
             if first < last:
                 _load_tile(state, left, top, size, rgb, alpha, depth, d_rgb, d_alpha, d_depth)
             reached[tile] = _replay_list(
-                records, members, first, last, np.float32(left), np.float32(top), limits,
+                records, tile_splat_ids, first, last, np.float32(left), np.float32(top), limits,
                 state, staged, spans, values, places, rows, d_depth, shares,
             )  # fmt: skip
 
@@ -150,7 +150,7 @@ def _load_tile(state, left, top, size, rgb, alpha, depth, d_rgb, d_alpha, d_dept
 @inner()
 def _replay_list(
     records,
-    members,
+    tile_splat_ids,
     first,
     last,
     left,
@@ -175,10 +175,10 @@ def _replay_list(
             return at - first
         count = min(BATCH, last - at)
         for k in range(U(at + count), U(min(at + 2 * BATCH, last))):
-            v8.prefetch(records, U(members[k]) * U(RECORD))
+            v8.prefetch(records, U(tile_splat_ids[k]) * U(RECORD))
         stage(
             records,
-            members,
+            tile_splat_ids,
             U(at),
             U(count),
             left,
@@ -238,12 +238,12 @@ def _add_share(state, staged, values, places, k, item, end, limits, d_depth, sha
         off = v8.fmuladd(steps, v8.lane_numbers(), v8.splat(values[i + U(ITEMS)]))
         e = v8.fmuladd(v8.negate(off), off, v8.splat(values[i]))
         alpha = alpha_of(staged, values, k, i, alpha_max, log_cut)
-        through = v8.load(state, at)
-        weight = alpha * through
-        after = through - weight
+        transmittance = v8.load(state, at)
+        weight = alpha * transmittance
+        after = transmittance - weight
         kept = v8.greater(after, least)
         weight = v8.select(kept, weight, zero)
-        v8.store(state, at, light_left(through, after, kept, end_light))
+        v8.store(state, at, remaining_transmittance(transmittance, after, kept, end_light))
         g_red, g_green = v8.load(state, at + G_RED), v8.load(state, at + G_GREEN)
         g_blue = v8.load(state, at + G_BLUE)
         q = v8.fmuladd(g_red, red, v8.load(state, at + G_ALPHA))
@@ -255,7 +255,7 @@ def _add_share(state, staged, values, places, k, item, end, limits, d_depth, sha
             sz = v8.fmuladd(weight, g_depth, sz)
         rest = v8.fmuladd(v8.negate(weight), q, v8.load(state, at + REST))
         v8.store(state, at + REST, rest)
-        by_alpha = through * q - rest / (one - alpha)
+        by_alpha = transmittance * q - rest / (one - alpha)
         # Nothing moves an alpha that is cut off, clamped or behind the stop.
         free = v8.both(v8.both(v8.at_least(e, log_cut), kept), v8.greater(alpha_max, alpha))
         g = v8.select(free, by_alpha * alpha * ln2, zero)
@@ -278,7 +278,7 @@ def _add_share(state, staged, values, places, k, item, end, limits, d_depth, sha
 
 
 @kernel
-def sum_shares(members, starts, reached, shares, ranges, sums, touched):
+def sum_shares(tile_splat_ids, tile_offsets, reached, shares, ranges, sums, touched):
     """Every slot's shares of all tiles, added in the order of the tiles.
 
     Each of `ranges` runs of slots looks at all entries and takes its own, so the order of addition
@@ -291,8 +291,8 @@ def sum_shares(members, starts, reached, shares, ranges, sums, touched):
         for slot in range(low, high):
             touched[slot] = 0
         for tile in range(reached.size):
-            for entry in range(U(starts[tile]), U(starts[tile] + reached[tile])):
-                slot = U(members[entry])
+            for entry in range(U(tile_offsets[tile]), U(tile_offsets[tile] + reached[tile])):
+                slot = U(tile_splat_ids[entry])
                 if slot < low or slot >= high:
                     continue
                 at, share = slot * U(SHARE), entry * U(SHARE)

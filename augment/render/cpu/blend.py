@@ -163,7 +163,7 @@ def count_corners(sorted_rects, first, last, columns, corners):
 
 
 @kernel
-def fill_lists(slots, sorted_rects, first, last, columns, heads, members, bands):
+def fill_lists(slots, sorted_rects, first, last, columns, heads, tile_splat_ids, bands):
     """Slots of every open tile's splats, nearest first. Bands of rows share the work.
 
     heads: int64 [tiles], where each tile's list begins; negative where it has none; used up.
@@ -180,7 +180,7 @@ def fill_lists(slots, sorted_rects, first, last, columns, heads, members, bands)
                 for tile in range(base + c0, base + c1 + U(1)):
                     at = heads[tile]
                     if at >= 0:
-                        members[U(at)] = slots[i]
+                        tile_splat_ids[U(at)] = slots[i]
                         heads[tile] = at + 1
 
 
@@ -234,15 +234,15 @@ def add_sample(state, at, depth, weight, floor):
 
 
 @inner()
-def can_grow(state, at, through):
+def can_grow(state, at, transmittance):
     """Not negative where the running cluster may still become the heaviest, or is it.
 
-    through: what light is left, negative where blending has stopped.
+    transmittance: what light is left, negative where blending has stopped.
     """
     none = v8.splat(np.float32(-1))
     mass, best = v8.load(state, at + MASS), v8.load(state, at + HEAVIEST)
-    most = mass + through + v8.splat(_SLACK) - best
-    return v8.select(v8.greater(through, v8.splat(np.float32(0))), most, none)
+    most = mass + transmittance + v8.splat(_SLACK) - best
+    return v8.select(v8.greater(transmittance, v8.splat(np.float32(0))), most, none)
 
 
 @inner()
@@ -287,8 +287,8 @@ CLOSED, OPEN, FRESH = 0, 1, 2  # a tile: finished, begun, not begun
 @kernel
 def blend_tiles(
     records,
-    members,
-    starts,
+    tile_splat_ids,
+    tile_offsets,
     tiles,
     states,
     is_last,
@@ -306,13 +306,13 @@ def blend_tiles(
 ):
     """Blend one slice of z into every open tile; write the pixels of those that end.
 
-    records: flat float32. members, starts: lists of slots. tiles: uint8 [tiles], CLOSED, OPEN or
-    FRESH, updated. states: float32 [tiles * used part of STATE], where open tiles wait for the
-    next slice. size: image width and height. limits: float32, alpha_max, log2(ALPHA_MIN), what a
-    splat must leave more of than this to be blended, 1 where rays are parallel, mode depth's floor,
-    1/fx^2, 1/fy^2, the transmittance at which a pixel is finished. rgb to snow: flat images; all
-    but alpha may be None. cuts, lights: flat, of each slot as cpu_clip and cpu_shading have them,
-    or None.
+    records: flat float32. tile_splat_ids, tile_offsets: lists of slots. tiles: uint8 [tiles],
+    CLOSED, OPEN or FRESH, updated. states: float32 [tiles * used part of STATE], where open tiles
+    wait for the next slice. size: image width and height. limits: float32, alpha_max,
+    log2(ALPHA_MIN), what a splat must leave more of than this to be blended, 1 where rays are
+    parallel, mode depth's floor, 1/fx^2, 1/fy^2, the transmittance at which a pixel is finished.
+    rgb to snow: flat images; all but alpha may be None. cuts, lights: flat, of each slot as
+    cpu_clip and cpu_shading have them, or None.
     """
     columns = (size[0] + TILE_W - 1) // TILE_W
     used = states.size // tiles.size
@@ -328,7 +328,7 @@ def blend_tiles(
         lit = np.empty(LIT, np.float32)
         rows = np.empty(2 * STRIPS, np.int64)
         for tile in range(group * GROUP, min((group + 1) * GROUP, tiles.size)):
-            first, last = starts[tile], starts[tile + 1]
+            first, last = tile_offsets[tile], tile_offsets[tile + 1]
             if tiles[tile] == CLOSED or (first == last and not is_last):
                 continue
             left, top = tile % columns * TILE_W, tile // columns * TILE_H
@@ -337,7 +337,7 @@ def blend_tiles(
             else:
                 _copy(states, U(tile * used), state, U(0), U(used))
             is_open = _blend_list(
-                records, members, first, last, np.float32(left), np.float32(top), limits,
+                records, tile_splat_ids, first, last, np.float32(left), np.float32(top), limits,
                 state, staged, spans, values, places, rows, rgb, expected, median, ids, mode, snow,
                 cuts, lines, edges, surfaces, lights, lit,
             )  # fmt: skip
@@ -376,7 +376,7 @@ def _clear(state, used, width, height):
 @inner()
 def _blend_list(
     records,
-    members,
+    tile_splat_ids,
     first,
     last,
     left,
@@ -410,16 +410,18 @@ def _blend_list(
             return False
         count = min(BATCH, last - at)
         for k in range(U(at + count), U(min(at + 2 * BATCH, last))):
-            v8.prefetch(records, U(members[k]) * U(RECORD))
+            v8.prefetch(records, U(tile_splat_ids[k]) * U(RECORD))
         stage(
-            records, members, U(at), U(count), left, top, rgb, expected, median, ids, mode, snow,
-            staged,
+            records, tile_splat_ids, U(at), U(count), left, top,
+            rgb, expected, median, ids, mode, snow, staged,
         )  # fmt: skip
         if lights is not None and rgb is not None:
-            stage_lights(lights, members, U(at), U(count), lit)
+            stage_lights(lights, tile_splat_ids, U(at), U(count), lit)
         any_cut = False
         if cuts is not None:
-            any_cut = stage_cuts(cuts, members, U(at), U(count), staged, expected, mode, lines)
+            any_cut = stage_cuts(
+                cuts, tile_splat_ids, U(at), U(count), staged, expected, mode, lines
+            )
         for strip in range(STRIPS):
             if rows[2 * strip] >= rows[2 * strip + 1]:
                 continue
@@ -461,13 +463,13 @@ def _can_change(state, strip, rows, median, ids, mode):
     most = v8.splat(np.float32(-1))
     for row in range(rows[2 * strip], rows[2 * strip + 1]):
         at = U(strip * STRIP + row * LANES)
-        through = v8.load(state, at)
+        transmittance = v8.load(state, at)
         if median is not None:
-            most = v8.maximum(most, through - v8.splat(np.float32(0.5)))
+            most = v8.maximum(most, transmittance - v8.splat(np.float32(0.5)))
         if ids is not None:
-            most = v8.maximum(most, through - v8.load(state, at + P_BEST))
+            most = v8.maximum(most, transmittance - v8.load(state, at + P_BEST))
         if mode is not None:
-            most = v8.maximum(most, can_grow(state, at + P_MODE, through))
+            most = v8.maximum(most, can_grow(state, at + P_MODE, transmittance))
     return v8.any_not_negative(most)
 
 
@@ -531,12 +533,12 @@ def _blend_items(
         if edges is not None:
             next_alpha = next_alpha * kept_share(lines, edges, following, item + U(1))
         at = U(places[item + U(ITEMS)])
-        through = v8.load(state, at)
-        weight = alpha * through
-        after = through - weight
+        transmittance = v8.load(state, at)
+        weight = alpha * transmittance
+        after = transmittance - weight
         kept = v8.greater(after, least)
         weight = v8.select(kept, weight, zero)
-        v8.store(state, at, light_left(through, after, kept, end))
+        v8.store(state, at, remaining_transmittance(transmittance, after, kept, end))
         if rgb is not None:
             _add(state, at + P_RED, weight, staged[U(RED) * n + splat])
             _add(state, at + P_GREEN, weight, staged[U(GREEN) * n + splat])
@@ -559,7 +561,7 @@ def _blend_items(
             if mode is not None:
                 add_sample(state, at + P_MODE, depth, weight, limits[4])
         if median is not None:
-            crossed = v8.both(v8.at_least(through, half), v8.greater(half, after))
+            crossed = v8.both(v8.at_least(transmittance, half), v8.greater(half, after))
             depth = v8.splat(staged[U(DEPTH) * n + splat])
             before = v8.load(state, at + P_MEDIAN)
             v8.store(state, at + P_MEDIAN, v8.select(v8.both(crossed, kept), depth, before))
@@ -582,9 +584,9 @@ def alpha_of(staged, values, splat, item, alpha_max, log_cut):
 
 
 @inner()
-def light_left(through, after, kept, end):
+def remaining_transmittance(transmittance, after, kept, end):
     """Transmittance behind a splat, negative where the pixel is finished. kept: it is blended."""
-    final = v8.minus_abs(v8.select(kept, after, through))
+    final = v8.minus_abs(v8.select(kept, after, transmittance))
     return v8.select(v8.greater(after, end), after, final)
 
 

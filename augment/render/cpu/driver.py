@@ -92,8 +92,8 @@ def gather_inputs(
         arrays += own
         addresses.append([array.ctypes.data for array in own])
         sizes.append([count, g.sh.shape[1]])
-        starts = range(0, count, layout.BLOCK)
-        blocks += [(number, start, min(start + layout.BLOCK, count)) for start in starts]
+        firsts = range(0, count, layout.BLOCK)
+        blocks += [(number, first, min(first + layout.BLOCK, count)) for first in firsts]
     counts = [size[0] for size in sizes]
     modes = raster_modes(settings, smog, clip, with_color=with_color)
     modes[layout.M_LIGHT] = with_color and any(part.shading is not None for part in parts)
@@ -191,40 +191,40 @@ def rasterize_cpu(
     settings: RasterSettings,
     smog: SmogMedium | None,
     clip: HeightClip | None = None,
-    wanted: np.ndarray | None = None,
+    pixel_mask: np.ndarray | None = None,
     *,
     stage_times: dict[str, float] | None = None,
 ) -> RenderOutput:
     """The image of the parts in float32, without gradients. Arguments are checked by `rasterize`.
 
-    wanted: bool [H, W]; tiles without a wanted pixel are left out and hold zeros.
+    pixel_mask: bool [H, W]; tiles without a pixel of the mask are left out and hold zeros.
 
     The same bits on any number of threads, whichever buffers are asked for. stage_times: seconds of
     "project", "sort", "bin" and "raster" and the counts "visible" (splats that touch a tile which
     nearer ones have not closed) and "pairs" (of splats and such tiles) are added to it.
     """
-    clock = StageTimer(stage_times)
+    timer = StageTimer(stage_times)
     inputs = gather_inputs(parts, camera, settings, smog, clip, with_color=RGB in buffers)
     images = image_arrays(camera, buffers)
     with borrowed_scratch() as scratch, kernel_threads():
         tiles = Tiles(camera, images, settings, scratch)
-        if wanted is not None:
-            tiles.leave_out(wanted)
+        if pixel_mask is not None:
+            tiles.leave_out(pixel_mask)
         depths, edges = rank(inputs, camera, scratch)
         for bins in itertools.pairwise(edges):
             splats = project(inputs, depths, bins, tiles, scratch)
-            clock.timed("project")
+            timer.end_stage("project")
             slots, rects = sort(splats, bins[0], scratch)
-            clock.timed("sort")
-            clock.count("visible", len(slots))
-            tiles.blend(splats, slots, rects, is_last=bins[1] == edges[-1], clock=clock)
+            timer.end_stage("sort")
+            timer.count("visible", len(slots))
+            tiles.blend(splats, slots, rects, is_last=bins[1] == edges[-1], timer=timer)
             if not tiles.open.any():
                 break
     return RenderOutput(**{name: torch.from_numpy(image) for name, image in images.items()})
 
 
 class StageTimer:
-    """Adds the time between laps, and counts, to the caller's dictionary."""
+    """Adds the time between stage ends, and counts, to the caller's dictionary."""
 
     def __init__(self, times: dict[str, float] | None) -> None:
         self._times = {} if times is None else times
@@ -232,7 +232,7 @@ class StageTimer:
             self._times.setdefault(name, 0.0)
         self._last = time.perf_counter()
 
-    def timed(self, name: str) -> None:
+    def end_stage(self, name: str) -> None:
         now = time.perf_counter()
         self._times[name] = self._times.get(name, 0.0) + now - self._last
         self._last = now
@@ -338,14 +338,14 @@ def project(
 def sort(splats: Splats, first_bin: int, scratch: Scratch) -> tuple[np.ndarray, np.ndarray]:
     """Slots nearest first (ties in index order), and their tiles in that order."""
     # Bin after bin, and in each of them block after block.
-    starts = np.append(0, splats.counts.sum(0, dtype=np.int64).cumsum())
-    heads = starts[:-1] + splats.counts.cumsum(0, dtype=np.int64) - splats.counts
-    count = int(starts[-1])
+    bin_offsets = np.append(0, splats.counts.sum(0, dtype=np.int64).cumsum())
+    heads = bin_offsets[:-1] + splats.counts.cumsum(0, dtype=np.int64) - splats.counts
+    count = int(bin_offsets[-1])
     keys, spare_keys = (scratch.array(f"sorted_keys{i}", (count,), np.uint32) for i in range(2))
     slots, spare_slots = (scratch.array(f"sorted_slots{i}", (count,), np.int32) for i in range(2))
     rects = scratch.array("sorted_rects", (count,), np.uint64)
     cpu_bin.scatter_to_bins(splats.keys, splats.found, first_bin, heads, keys, slots)
-    cpu_bin.sort_bins(starts, keys, slots, splats.rects, spare_keys, spare_slots, rects)
+    cpu_bin.sort_bins(bin_offsets, keys, slots, splats.rects, spare_keys, spare_slots, rects)
     return slots, rects
 
 
@@ -386,9 +386,9 @@ class Tiles:
         self.open = scratch.array("open", (count,), np.uint8)
         self.open[:] = cpu_blend.FRESH
 
-    def leave_out(self, wanted: np.ndarray) -> None:
-        """Close the tiles without a wanted pixel [H, W]; their part of the images becomes 0."""
-        drawn = any_in_squares(wanted, layout.TILE_W)
+    def leave_out(self, pixel_mask: np.ndarray) -> None:
+        """Close the tiles without a pixel of the mask [H, W]; their pixels become 0."""
+        drawn = any_in_squares(pixel_mask, layout.TILE_W)
         self.open[~drawn.reshape(-1)] = cpu_blend.CLOSED
         for image in self._images:
             if image is not None:
@@ -408,28 +408,28 @@ class Tiles:
         rects: np.ndarray,
         *,
         is_last: bool,
-        clock: StageTimer,
+        timer: StageTimer,
     ) -> None:
         """Blend splats, nearest first, into the open tiles; is_last closes them all."""
         first, count = 0, len(slots)
         while True:
-            end, members, starts = self.list_members(slots, rects, first)
-            clock.timed("bin")
-            clock.count("pairs", len(members))
-            self.blend_members(splats, members, starts, is_last=is_last and end == count)
-            clock.timed("raster")
+            end, tile_splat_ids, tile_offsets = self.list_tile_splats(slots, rects, first)
+            timer.end_stage("bin")
+            timer.count("pairs", len(tile_splat_ids))
+            self.blend_lists(splats, tile_splat_ids, tile_offsets, is_last=is_last and end == count)
+            timer.end_stage("raster")
             first = end
             if first == count or not self.open.any():
                 return
 
-    def blend_members(
-        self, splats: Splats, members: np.ndarray, starts: np.ndarray, *, is_last: bool
+    def blend_lists(
+        self, splats: Splats, tile_splat_ids: np.ndarray, tile_offsets: np.ndarray, *, is_last: bool
     ) -> None:
         """Blend every open tile's list; is_last closes them all."""
         cpu_blend.blend_tiles(
             splats.records,
-            members,
-            starts,
+            tile_splat_ids,
+            tile_offsets,
             self.open,
             self._states,
             is_last,
@@ -442,10 +442,10 @@ class Tiles:
 
     def list_all(self, slots: np.ndarray, rects: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The lists of all splats and where each begins, however long they are."""
-        _, members, starts = self.list_members(slots, rects, 0, limit=None)
-        return members, starts
+        _, tile_splat_ids, tile_offsets = self.list_tile_splats(slots, rects, 0, limit=None)
+        return tile_splat_ids, tile_offsets
 
-    def list_members(
+    def list_tile_splats(
         self, slots: np.ndarray, rects: np.ndarray, first: int, limit: int | None = _MAX_PAIRS
     ) -> tuple[int, np.ndarray, np.ndarray]:
         """Lists of every open tile's splats, nearest first, from the splat `first` on.
@@ -458,12 +458,12 @@ class Tiles:
         if limit is not None and counts.sum() > limit:
             end = first + _splats_in(rects[first:], limit)
             counts = self._count(rects, first, end)
-        starts = np.append(0, np.cumsum(counts))
-        heads = np.where(self.open != cpu_blend.CLOSED, starts[:-1], -1)
-        members = self._scratch.array("members", (int(starts[-1]),), np.int32)
+        tile_offsets = np.append(0, np.cumsum(counts))
+        heads = np.where(self.open != cpu_blend.CLOSED, tile_offsets[:-1], -1)
+        tile_splat_ids = self._scratch.array("members", (int(tile_offsets[-1]),), np.int32)
         bands = min(self._rows, 2 * thread_count())
-        cpu_bin.fill_lists(slots, rects, first, end, self._columns, heads, members, bands)
-        return end, members, starts
+        cpu_bin.fill_lists(slots, rects, first, end, self._columns, heads, tile_splat_ids, bands)
+        return end, tile_splat_ids, tile_offsets
 
     def _count(self, rects: np.ndarray, first: int, end: int) -> np.ndarray:
         """int64 [tiles]: splats [first, end) in each; none in closed tiles."""

@@ -68,11 +68,13 @@ ITEMS = BATCH * TILE_H + TILE_H  # a batch's items at most, and room for the sur
 
 
 @inner()
-def stage(records, members, at, count, left, top, rgb, expected, median, ids, mode, snow, staged):
+def stage(
+    records, tile_splat_ids, at, count, left, top, rgb, expected, median, ids, mode, snow, staged
+):
     """Records of a batch, turned to one row a field, relative to the tile's corner."""
     n = U(BATCH)
     for k in range(count):
-        record = U(members[at + k]) * U(RECORD)
+        record = U(tile_splat_ids[at + k]) * U(RECORD)
         staged[U(MEAN_X) * n + k] = records[record + U(MEAN_X)] - left
         staged[U(MEAN_Y) * n + k] = records[record + U(MEAN_Y)] - top
         for field in range(U(LEAN_X), U(BLUNT_Y + 1)):
@@ -371,7 +373,7 @@ def _depth_slope(x, y, z):
 
 
 @inner()
-def stage_cuts(cuts, members, at, count, staged, expected, mode, lines):
+def stage_cuts(cuts, tile_splat_ids, at, count, staged, expected, mode, lines):
     """Cuts of a batch, turned to one row a number, about the tile's corner. staged: cpu_items'.
 
     expected, mode: None where the lines of the surfaces are not wanted. Returns whether any splat
@@ -379,7 +381,7 @@ def stage_cuts(cuts, members, at, count, staged, expected, mode, lines):
     """
     n, any_cut = U(BATCH), False
     for k in range(count):
-        cut = U(members[at + k]) * U(CUT)
+        cut = U(tile_splat_ids[at + k]) * U(CUT)
         x, y = staged[U(MEAN_X) * n + k], staged[U(MEAN_Y) * n + k]
         lx, ly = cuts[cut + U(C_X)], cuts[cut + U(C_Y)]
         lines[k] = cuts[cut + U(C_AT)] - lx * x - ly * y
@@ -475,11 +477,11 @@ def light_eight(m, towards, view):
 
 
 @inner()
-def stage_lights(lights, members, at, count, lit):
+def stage_lights(lights, tile_splat_ids, at, count, lit):
     """Lines of a batch, turned to one row a number."""
     n = U(BATCH)
     for k in range(count):
-        first, most = U(members[at + k]) * U(SHADING_LINES), np.float32(0)
+        first, most = U(tile_splat_ids[at + k]) * U(SHADING_LINES), np.float32(0)
         for line in range(U(SHADING_LINES)):
             lit[line * n + k] = lights[first + line]
         for line in range(U(L_RED), U(SHADING_LINES)):

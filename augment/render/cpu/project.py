@@ -140,8 +140,8 @@ def prepare_colors(dx, dy, dz, view, functions, smog, rows):
         if smog == LAYERED_SMOG:
             tau = tau * _layered_density(dx, dy, dz, view)
         lowest = v8.splat(np.float32(-126))  # 1e-38: nothing is seen through it
-        through = exp2_fine(v8.maximum(tau * v8.splat(-LOG2_E), lowest))
-        v8.store(rows, U(THROUGH * LANES), through)
+        transmittance = exp2_fine(v8.maximum(tau * v8.splat(-LOG2_E), lowest))
+        v8.store(rows, U(THROUGH * LANES), transmittance)
 
 
 @inner()
@@ -511,12 +511,12 @@ def _write_lights(slopes, splat, smog, view, rows, lane, lights, slot):
         return
     for line in range(U(L_RED)):
         lights[first + line] = rows[(U(_LIGHTS) + line) * U(LANES) + lane]
-    through = np.float32(1)
+    transmittance = np.float32(1)
     if smog != NO_SMOG:
-        through = rows[U(THROUGH * LANES) + lane]
+        transmittance = rows[U(THROUGH * LANES) + lane]
     for channel in range(U(3)):
         slope = slopes[U(splat) * U(3) + channel]
-        lights[first + U(L_RED) + channel] = through * slope
+        lights[first + U(L_RED) + channel] = transmittance * slope
 
 
 @inner()

@@ -54,7 +54,7 @@ def color_gradients(
 
     d_rgb: dL by the image that `blend` makes of the splats, without cuts and light per pixel.
     """
-    entries, count = len(tiles.members), len(splats.keys)
+    entries, count = len(tiles.tile_splat_ids), len(splats.keys)
     device = splats.keys.device
     d_colors = torch.zeros(count, 3, device=device)
     if entries == 0:
@@ -64,8 +64,8 @@ def color_gradients(
         kernels.share_colors,
         (tiles.columns * tiles.rows,),
         splats.records,
-        tiles.members,
-        tiles.starts,
+        tiles.tile_splat_ids,
+        tiles.tile_offsets,
         d_rgb.contiguous(),
         shares,
         camera.width,
@@ -78,7 +78,7 @@ def color_gradients(
         BATCH=_BATCH,
         num_warps=_TILE_WARPS,
     )
-    owners, order = torch.sort(tiles.members, stable=True)  # lists are tile after tile
+    owners, order = torch.sort(tiles.tile_splat_ids, stable=True)  # lists are tile after tile
     bounds = torch.arange(count + 1, dtype=owners.dtype, device=device)
     launch(
         kernels.sum_shares,

@@ -30,7 +30,7 @@ _C3_ZZ, _C3_ZZZ = tl.constexpr(sh._C3_ZZ), tl.constexpr(sh._C3_ZZZ)
 
 @triton.jit(do_not_specialize=["width", "height", "columns"])
 def share_colors(
-    records, members, starts, d_rgb, shares,
+    records, tile_splat_ids, tile_offsets, d_rgb, shares,
     width, height, columns, alpha_max, log_cut, least, end,
     BATCH: tl.constexpr,
 ):  # fmt: skip
@@ -43,9 +43,9 @@ def share_colors(
     transmittances as the only chain.
     """
     tile = tl.program_id(0)
-    entries = tl.load(starts + tl.num_programs(0)).to(tl.int64)  # three times as many places
-    at = tl.load(starts + tile)
-    last = tl.load(starts + tile + 1)
+    entries = tl.load(tile_offsets + tl.num_programs(0)).to(tl.int64)  # three times as many places
+    at = tl.load(tile_offsets + tile)
+    last = tl.load(tile_offsets + tile + 1)
     pixel = tl.arange(0, _PIXELS)
     column = tile % columns * _TILE + pixel % _TILE
     row = tile // columns * _TILE + pixel // _TILE
@@ -56,11 +56,13 @@ def share_colors(
     blue = tl.load(d_rgb + first + 2, mask=inside, other=0.0)[None, :]
     x = (column.to(tl.float32) + 0.5)[None, :]
     y = (row.to(tl.float32) + 0.5)[None, :]
-    through = tl.where(inside, 1.0, 0.0)
-    while (at < last) & (tl.max(through, 0) > end):
+    transmittance = tl.where(inside, 1.0, 0.0)
+    while (at < last) & (tl.max(transmittance, 0) > end):
         entry = at + tl.arange(0, BATCH)
         listed = entry < last
-        record = records + tl.load(members + entry, mask=listed, other=0).to(tl.int64) * _RECORD
+        record = (
+            records + tl.load(tile_splat_ids + entry, mask=listed, other=0).to(tl.int64) * _RECORD
+        )
         log_opacity = tl.load(record + _LOG_OPACITY, mask=listed, other=float("-inf"))[:, None]
         mean_x = tl.load(record + _MEAN_X, mask=listed, other=0.0)[:, None]
         mean_y = tl.load(record + _MEAN_Y, mask=listed, other=0.0)[:, None]
@@ -72,14 +74,14 @@ def share_colors(
         e = log_opacity - off * off - fall * dy * dy
         alpha = tl.where(e >= log_cut, tl.minimum(tl.exp2(e), alpha_max), 0.0)
         passed = 1 - alpha
-        after = through[None, :] * tl.cumprod(passed, 0)
+        after = transmittance[None, :] * tl.cumprod(passed, 0)
         before = after / passed  # what is not kept may be 0 / 0
         kept = (after > least) & (before > end)
         weight = tl.where(kept, alpha * before, 0.0)
         tl.store(shares + entry, tl.sum(weight * red, 1), mask=listed)
         tl.store(shares + entries + entry, tl.sum(weight * green, 1), mask=listed)
         tl.store(shares + 2 * entries + entry, tl.sum(weight * blue, 1), mask=listed)
-        through = tl.min(after, 0)
+        transmittance = tl.min(after, 0)
         at += BATCH
 
 

@@ -151,12 +151,12 @@ def add_sample(depth, weight, floor, first, mass, moment, square, best, best_mod
 
 
 @triton.jit
-def can_grow(through, mass, best):
+def can_grow(transmittance, mass, best):
     """Whether a pixel's running cluster may still become the heaviest, or is it.
 
-    through: the light left, negative where blending has stopped.
+    transmittance: the light left, negative where blending has stopped.
     """
-    return (through > 0) & (mass + through + SLACK >= best)
+    return (transmittance > 0) & (mass + transmittance + SLACK >= best)
 
 
 @triton.jit
@@ -209,8 +209,8 @@ MARGIN = tl.constexpr(0.0625)
 @triton.jit(do_not_specialize=["width", "height", "columns"])
 def blend_blocks(
     records,
-    members,
-    starts,
+    tile_splat_ids,
+    tile_offsets,
     cuts,
     lights,
     rgb,
@@ -245,11 +245,12 @@ def blend_blocks(
 ):
     """Blend one block of BLOCK_W x BLOCK_H pixels of a tile; a tile's blocks are neighbours.
 
-    records, cuts, lights: as in CudaSplats. members, starts: as in CudaTiles. rgb to snow: images;
-    of those that are not asked for, and of cuts and lights that are not there, nothing is read or
-    written. width, height: of the image; columns: of its tiles. least: what a splat must leave more
-    of than this to be blended. end: the transmittance at which a pixel is finished; IS_COARSE
-    where it is not `least`. parallel: 1 where rays are parallel, else 0. floor: mode depth's.
+    records, cuts, lights: as in CudaSplats. tile_splat_ids, tile_offsets: as in CudaTiles. rgb to
+    snow: images; of those that are not asked for, and of cuts and lights that are not there,
+    nothing is read or written. width, height: of the image; columns: of its tiles. least: what a
+    splat must leave more of than this to be blended. end: the transmittance at which a pixel is
+    finished; IS_COARSE where it is not `least`. parallel: 1 where rays are parallel, else 0. floor:
+    mode depth's.
     """
     across = TILE // BLOCK_W
     blocks = across * (TILE // BLOCK_H)
@@ -269,21 +270,23 @@ def blend_blocks(
     ahead = steps.to(tl.float32)
     nothing = tl.zeros([EACH, LANES], tl.float32)
     # Negative where the pixel is finished; its size is then the final transmittance.
-    through = tl.where(is_inside, 1.0, -1.0)
+    transmittance = tl.where(is_inside, 1.0, -1.0)
     red, green, blue, white = nothing, nothing, nothing, nothing
     weighted_depth, middle, heaviest = nothing, nothing, nothing
     number = tl.full([EACH, LANES], -1, tl.int32)
     first, mass, moment, square = nothing, nothing, nothing, nothing
     best, best_mode = nothing, nothing
 
-    at = tl.load(starts + tile)
-    last = tl.load(starts + tile + 1)
-    row = tl.load(members + at + lanes, mask=at + lanes < last, other=0)
+    at = tl.load(tile_offsets + tile)
+    last = tl.load(tile_offsets + tile + 1)
+    row = tl.load(tile_splat_ids + at + lanes, mask=at + lanes < last, other=0)
     is_open = at < last
     while is_open:
         is_listed = at + lanes < last
         # The next batch's, which is there by then.
-        following = tl.load(members + at + LANES + lanes, mask=at + LANES + lanes < last, other=0)
+        following = tl.load(
+            tile_splat_ids + at + LANES + lanes, mask=at + LANES + lanes < last, other=0
+        )
         reaches = is_listed & _reaches(
             records + row.to(tl.int64) * RECORD, left, top, BLOCK_W - 1, BLOCK_H - 1, log_cut
         )
@@ -291,13 +294,13 @@ def blend_blocks(
         # Behind what outweighs all that is left, samples cannot change the mode.
         grows = HAS_MODE
         if HAS_MODE:
-            grows = tl.max(tl.max(can_grow(through, mass, best).to(tl.int32), 0), 0) > 0
+            grows = tl.max(tl.max(can_grow(transmittance, mass, best).to(tl.int32), 0), 0) > 0
         while left_over != 0:
             lowest = (left_over & -left_over).to(tl.uint32, bitcast=True)
             left_over = left_over & (left_over - 1)
             # The exponent of a power of two says which it is.
             k = (lowest.to(tl.float32).to(tl.int32, bitcast=True) >> 23) - 127
-            slot = tl.load(members + at + k).to(tl.int64)
+            slot = tl.load(tile_splat_ids + at + k).to(tl.int64)
             # Every thread reads the whole record, which costs a warp no more than one of them.
             record = (records + slot * RECORD) + tl.zeros([LANES], tl.int32)
             mean_x, mean_y, lean_x, sharp_x = _quarter(record, 0)
@@ -314,8 +317,8 @@ def blend_blocks(
                 kept, slope_x, slope_y, right = _quarter(cut, 0)
                 share = (kept + slope_x * dx + slope_y * dy)[None, :] + slope_x[None, :] * ahead
                 a *= tl.minimum(tl.maximum(share, 0.0), 1.0)
-            weight = a * through
-            after = through - weight
+            weight = a * transmittance
+            after = transmittance - weight
             is_kept = after > least
             weight = tl.where(is_kept, weight, 0.0)
 
@@ -345,7 +348,7 @@ def blend_blocks(
                         z, weight, floor, first, mass, moment, square, best, best_mode
                     )
             if HAS_MEDIAN:
-                is_crossed = is_kept & (through >= 0.5) & (after < 0.5)
+                is_crossed = is_kept & (transmittance >= 0.5) & (after < 0.5)
                 middle = tl.where(is_crossed, depth[None, :], middle)
             if HAS_IDS:
                 is_heavier = weight > heaviest
@@ -364,18 +367,18 @@ def blend_blocks(
                     green += weight * share * more_green
                     blue += weight * share * more_blue
             if IS_COARSE:
-                final = -tl.abs(tl.where(is_kept, after, through))
-                through = tl.where(after > end, after, final)
+                final = -tl.abs(tl.where(is_kept, after, transmittance))
+                transmittance = tl.where(after > end, after, final)
             else:
-                through = tl.where(is_kept, after, -tl.abs(through))
+                transmittance = tl.where(is_kept, after, -tl.abs(transmittance))
         row = following
         at += LANES
         # Of float32 numbers that are positive the bits are in the same order, which integers
         # compare in one step.
-        is_open = (at < last) & (tl.max(tl.max(through.to(tl.int32, bitcast=True), 0), 0) > 0)
+        is_open = (at < last) & (tl.max(tl.max(transmittance.to(tl.int32, bitcast=True), 0), 0) > 0)
 
     pixel = (y * width + first_x)[None, :] + steps
-    covered = 1.0 - tl.abs(through)
+    covered = 1.0 - tl.abs(transmittance)
     tl.store(alpha + pixel, covered, mask=is_inside)
     if HAS_RGB:
         tl.store(rgb + 3 * pixel, red, mask=is_inside)

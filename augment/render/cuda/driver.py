@@ -104,8 +104,8 @@ _SPLATS, _PAIRS = 256, 512  # of a program; a thread looks for the owners of fou
 _MAX_PAIRS = 2**31 - 1024  # tiles' lists begin at an int32, and are read some way beyond
 
 
-def list_tiles(splats: CudaSplats, camera: Camera, wanted: Tensor | None) -> CudaTiles:
-    """The lists of all tiles. wanted: bool [H, W]; tiles without a wanted pixel get none.
+def list_tiles(splats: CudaSplats, camera: Camera, pixel_mask: Tensor | None) -> CudaTiles:
+    """The lists of all tiles. wanted: bool [H, W]; tiles without a pixel of the mask get none.
 
     Waits for the GPU once, to learn how many pairs there are.
 
@@ -115,7 +115,9 @@ def list_tiles(splats: CudaSplats, camera: Camera, wanted: Tensor | None) -> Cud
     columns, rows = -(-camera.width // TILE), -(-camera.height // TILE)
     count, tiles, device = len(splats.keys), columns * rows, splats.keys.device
     none = torch.empty(0, dtype=torch.int32, device=device)
-    is_wanted = None if wanted is None else _wanted_tiles(wanted.to(device), columns, rows)
+    is_drawn = (
+        None if pixel_mask is None else _tiles_with_pixels(pixel_mask.to(device), columns, rows)
+    )
 
     order = torch.sort(splats.keys, stable=True).indices
     counts = torch.empty(count, dtype=torch.int32, device=device)
@@ -125,11 +127,11 @@ def list_tiles(splats: CudaSplats, camera: Camera, wanted: Tensor | None) -> Cud
         order,
         splats.counts,
         splats.rects,
-        none if is_wanted is None else _sums_from_corner(is_wanted),
+        none if is_drawn is None else _sums_from_corner(is_drawn),
         counts,
         count,
         columns,
-        IS_PARTIAL=is_wanted is not None,
+        IS_PARTIAL=is_drawn is not None,
         BLOCK=_SPLATS,
     )
     ends = torch.cumsum(counts, 0, dtype=torch.int64)
@@ -151,7 +153,7 @@ def list_tiles(splats: CudaSplats, camera: Camera, wanted: Tensor | None) -> Cud
         order,
         ends,
         splats.rects,
-        none if is_wanted is None else is_wanted,
+        none if is_drawn is None else is_drawn,
         tile_of,
         owners,
         pairs,
@@ -159,26 +161,28 @@ def list_tiles(splats: CudaSplats, camera: Camera, wanted: Tensor | None) -> Cud
         count.bit_length(),
         columns,
         tiles,
-        IS_PARTIAL=is_wanted is not None,
+        IS_PARTIAL=is_drawn is not None,
         BLOCK=_PAIRS,
     )
     grouped, index = torch.sort(tile_of, stable=True)
     edges = torch.arange(tiles + 1, dtype=numbers, device=device)
-    starts = torch.searchsorted(grouped, edges, out_int32=True)
-    return CudaTiles(owners[index], starts, columns, rows)
+    tile_offsets = torch.searchsorted(grouped, edges, out_int32=True)
+    return CudaTiles(owners[index], tile_offsets, columns, rows)
 
 
-def _wanted_tiles(wanted: Bool[Tensor, "H W"], columns: int, rows: int) -> Bool[Tensor, "R C"]:
-    """Tiles with a wanted pixel."""
-    height, width = wanted.shape
-    padded = wanted.new_zeros(rows * TILE, columns * TILE)
-    padded[:height, :width] = wanted
+def _tiles_with_pixels(
+    pixel_mask: Bool[Tensor, "H W"], columns: int, rows: int
+) -> Bool[Tensor, "R C"]:
+    """Tiles with a pixel of the mask."""
+    height, width = pixel_mask.shape
+    padded = pixel_mask.new_zeros(rows * TILE, columns * TILE)
+    padded[:height, :width] = pixel_mask
     return padded.reshape(rows, TILE, columns, TILE).any(3).any(1).contiguous()
 
 
-def _sums_from_corner(is_wanted: Bool[Tensor, "R C"]) -> Int32[Tensor, "R1 C1"]:
+def _sums_from_corner(is_drawn: Bool[Tensor, "R C"]) -> Int32[Tensor, "R1 C1"]:
     """Wanted tiles above and to the left of each corner."""
-    sums = is_wanted.cumsum(0, dtype=torch.int32).cumsum(1, dtype=torch.int32)
+    sums = is_drawn.cumsum(0, dtype=torch.int32).cumsum(1, dtype=torch.int32)
     return torch.nn.functional.pad(sums, (1, 0, 1, 0))
 
 
@@ -213,8 +217,8 @@ def blend(
         blend_blocks,
         (tiles.columns * tiles.rows * per_tile,),
         splats.records,
-        tiles.members,
-        tiles.starts,
+        tiles.tile_splat_ids,
+        tiles.tile_offsets,
         none if splats.cuts is None else splats.cuts,
         none if splats.lights is None else splats.lights,
         *(images.get(name, none) for name in BUFFERS),
@@ -264,27 +268,27 @@ def rasterize_cuda(
     settings: RasterSettings,
     smog: SmogMedium | None,
     clip: HeightClip | None = None,
-    wanted: torch.Tensor | None = None,
+    pixel_mask: torch.Tensor | None = None,
     *,
-    clock: GpuStageTimer | None = None,
+    timer: GpuStageTimer | None = None,
 ) -> RenderOutput:
     """The image of the parts in float32, on the GPU, without gradients. Arguments are checked by
     `rasterize`.
 
-    wanted: bool [H, W]; tiles without a wanted pixel are left out and hold zeros. clock: told of
-    "project", "list" and "blend", and of the counts "visible" (splats that touch a tile) and
-    "pairs" (of splats and tiles).
+    pixel_mask: bool [H, W]; tiles without a pixel of the mask are left out and hold zeros. timer:
+    told of "project", "list" and "blend", and of the counts "visible" (splats that touch a tile)
+    and "pairs" (of splats and tiles).
     """
     inputs = gather_inputs(parts, camera, settings, smog, clip, with_color=RGB in buffers)
     splats = project(inputs)
-    if clock is not None:
-        clock.timed("project")
-    tiles = list_tiles(splats, camera, wanted)
-    if clock is not None:
-        clock.timed("list")
-        clock.counts["visible"] = int((splats.counts > 0).sum())
-        clock.counts["pairs"] = len(tiles.members)
+    if timer is not None:
+        timer.end_stage("project")
+    tiles = list_tiles(splats, camera, pixel_mask)
+    if timer is not None:
+        timer.end_stage("list")
+        timer.counts["visible"] = int((splats.counts > 0).sum())
+        timer.counts["pairs"] = len(tiles.tile_splat_ids)
     images = blend(splats, tiles, camera, buffers, settings)
-    if clock is not None:
-        clock.timed("blend")
+    if timer is not None:
+        timer.end_stage("blend")
     return RenderOutput(**images)

@@ -131,8 +131,12 @@ def composite_color(rgb, alpha, out, count, red, green, blue, BLOCK: tl.constexp
     pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     here = pixel < count
     r, g, b = _load_color(rgb, pixel, here)
-    through = 1.0 - tl.load(alpha + pixel, here, 1.0)
-    r, g, b = tl.fma(through, red, r), tl.fma(through, green, g), tl.fma(through, blue, b)
+    transmittance = 1.0 - tl.load(alpha + pixel, here, 1.0)
+    r, g, b = (
+        tl.fma(transmittance, red, r),
+        tl.fma(transmittance, green, g),
+        tl.fma(transmittance, blue, b),
+    )
     _store_color(out, pixel, r, g, b, here)
 
 
@@ -161,8 +165,12 @@ def composite_cubemap(
         sky_g = tl.fma(visible, sky_g, hidden * green)
         sky_b = tl.fma(visible, sky_b, hidden * blue)
     r, g, b = _load_color(rgb, pixel, here)
-    through = 1.0 - tl.load(alpha + pixel, here, 1.0)
-    r, g, b = tl.fma(through, sky_r, r), tl.fma(through, sky_g, g), tl.fma(through, sky_b, b)
+    transmittance = 1.0 - tl.load(alpha + pixel, here, 1.0)
+    r, g, b = (
+        tl.fma(transmittance, sky_r, r),
+        tl.fma(transmittance, sky_g, g),
+        tl.fma(transmittance, sky_b, b),
+    )
     _store_color(out, pixel, r, g, b, here)
 
 

@@ -155,23 +155,23 @@ class _Place:
         return memory[self.start : self.end].view(self.on_cpu).reshape(self.shape)
 
 
-def begin_cuda_images(wanted: RequestedImages, camera: Camera) -> Callable[[], ViewImages]:
+def begin_cuda_images(requested: RequestedImages, camera: Camera) -> Callable[[], ViewImages]:
     """Launches the kernel and the copy. What is returned waits for them."""
-    shares_depth = wanted.scene_depth_m is wanted.depth_m and wanted.first is None
+    shares_depth = requested.scene_depth_m is requested.depth_m and requested.first is None
     asked = {
         "rgb": True,
-        "depth_m": wanted.depth_m is not None,
-        "scene_depth_m": wanted.scene_depth_m is not None and not shares_depth,
-        "water": wanted.water is not None,
-        "snow": wanted.snow is not None,
-        "semantic": wanted.semantic,
-        "instance": wanted.instance,
+        "depth_m": requested.depth_m is not None,
+        "scene_depth_m": requested.scene_depth_m is not None and not shares_depth,
+        "water": requested.water is not None,
+        "snow": requested.snow is not None,
+        "semantic": requested.semantic,
+        "instance": requested.instance,
     }
     places = _places([name for name in KINDS if asked[name]], camera)
     packed = torch.empty(
         max(place.end for place in places.values()), dtype=torch.uint8, device=gpu_device()
     )
-    _make({name: place.of(packed) for name, place in places.items()}, wanted, camera)
+    _make({name: place.of(packed) for name, place in places.items()}, requested, camera)
     copy = Download(packed)
 
     def finish() -> ViewImages:
@@ -195,34 +195,34 @@ def _places(names: Sequence[str], camera: Camera) -> dict[str, _Place]:
     return places
 
 
-def _make(images: dict[str, Tensor], wanted: RequestedImages, camera: Camera) -> None:
-    looked_up = wanted.semantic or wanted.instance
-    parts = wanted.parts if looked_up else ()
+def _make(images: dict[str, Tensor], requested: RequestedImages, camera: Camera) -> None:
+    looked_up = requested.semantic or requested.instance
+    parts = requested.parts if looked_up else ()
     classes = [_resident_classes(part) for part in parts]  # kept until the launch
     table = upload(_table_of(parts, classes)) if looked_up else None
-    shown = wanted.shown
+    shown = requested.shown
     pose = camera.world_from_camera
-    eye_m = 0.0 if wanted.plane_z_m is None else float(pose[2, 3]) - wanted.plane_z_m
+    eye_m = 0.0 if requested.plane_z_m is None else float(pose[2, 3]) - requested.plane_z_m
     count = camera.height * camera.width
     launch(
         kernels.make_images,
         (-(-count // QUANTIZE_BLOCK),),
-        wanted.rgb.detach().contiguous(),
-        _plain(wanted.depth_m),
-        _plain(wanted.scene_depth_m if "scene_depth_m" in images else None),
-        _plain(wanted.water),
-        _plain(wanted.snow),
+        requested.rgb.detach().contiguous(),
+        _plain(requested.depth_m),
+        _plain(requested.scene_depth_m if "scene_depth_m" in images else None),
+        _plain(requested.water),
+        _plain(requested.snow),
         _plain(shown.alpha if looked_up else None),
         _plain(shown.splat_ids if looked_up else None),
         table,
         *(images.get(name) for name in KINDS),
-        *(count, camera.width, len(wanted.parts), (len(wanted.parts) - 1).bit_length()),
+        *(count, camera.width, len(requested.parts), (len(requested.parts) - 1).bit_length()),
         *(camera.cx, camera.cy, 1 / camera.fx, 1 / camera.fy),
         *(-pose[2, :3]).tolist(),
         eye_m,
         *(SURFACE_ALPHA, int(SemanticClass.SKY), int(SemanticClass.WATER)),
-        SHOWS_WATER=wanted.first is not None,
-        IN_AIR=wanted.plane_z_m is not None,
+        SHOWS_WATER=requested.first is not None,
+        IN_AIR=requested.plane_z_m is not None,
         BLOCK=QUANTIZE_BLOCK,
     )
 

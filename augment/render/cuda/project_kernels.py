@@ -292,13 +292,13 @@ def _map_channel(at, color, mask):
 
 
 @triton.jit
-def in_smog(color, through, view):
+def in_smog(color, transmittance, view):
     """Colours seen through the smog; where all comes through, the same bits."""
-    air, hidden = three(view + V_AIRLIGHT), 1.0 - through
+    air, hidden = three(view + V_AIRLIGHT), 1.0 - transmittance
     return (
-        tl.fma(through, color[0], hidden * air[0]),
-        tl.fma(through, color[1], hidden * air[1]),
-        tl.fma(through, color[2], hidden * air[2]),
+        tl.fma(transmittance, color[0], hidden * air[0]),
+        tl.fma(transmittance, color[1], hidden * air[1]),
+        tl.fma(transmittance, color[2], hidden * air[2]),
     )
 
 
@@ -370,11 +370,11 @@ V_SUN, V_WRAP = tl.constexpr(layout.V_SUN), tl.constexpr(layout.V_WRAP)
 
 
 @triton.jit
-def store_lights(lines, normals, points, slopes, through, lit, mask, view):
+def store_lights(lines, normals, points, slopes, transmittance, lit, mask, view):
     """Write the lines of splats, all 0 where they are not lit.
 
     lines: pointers to every splat's. normals: unit, in the part's axes; points: in the camera.
-    slopes: 0 where not lit; through: the smog's transmittance before them.
+    slopes: 0 where not lit; transmittance: of the smog before them.
     """
     r, s, t = rotation_rows(view)
     nx, ny, nz = dot(r, normals), dot(s, normals), dot(t, normals)
@@ -393,9 +393,9 @@ def store_lights(lines, normals, points, slopes, through, lit, mask, view):
     tl.store(lines + 3, tl.where(lit, wrap * scale, 0.0), mask)
     tl.store(lines + 4, tl.where(lit, ax / fx, 0.0), mask)
     tl.store(lines + 5, tl.where(lit, ay / fy, 0.0), mask)
-    tl.store(lines + 6, through * slopes[0], mask)
-    tl.store(lines + 7, through * slopes[1], mask)
-    tl.store(lines + 8, through * slopes[2], mask)
+    tl.store(lines + 6, transmittance * slopes[0], mask)
+    tl.store(lines + 7, transmittance * slopes[1], mask)
+    tl.store(lines + 8, transmittance * slopes[2], mask)
 
 
 # ---- cuda project kernels ------------------------------------------------------------------------
@@ -491,7 +491,7 @@ def project_gaussians(
     _store_rows(rects + out * 2, tl.join(c0 + (r0 << 16), c1 + (r1 << 16)), drawn, BLOCK, 2)
 
     zero = tl.zeros_like(z)
-    color, through = (zero, zero, zero), zero + 1.0
+    color, transmittance = (zero, zero, zero), zero + 1.0
     if COLOR:
         towards = d
         if tl.load(view + V_PARALLEL) > 0.0:
@@ -506,8 +506,8 @@ def project_gaussians(
             map_rows = tl.load(row + A_ROWS).to(tl.pointer_type(tl.int16)) + first + lane
             color = mapped(color, maps, map_rows, map_count, drawn)
         if SMOG != NO_SMOG:
-            through = through_smog(towards, distance, view, SMOG)
-            color = in_smog(color, through, view)
+            transmittance = through_smog(towards, distance, view, SMOG)
+            color = in_smog(color, transmittance, view)
 
     number = (out.to(tl.int32) + lane).to(tl.float32, bitcast=True)
     snow = zero + tl.load(view + V_SNOW)
@@ -527,7 +527,7 @@ def project_gaussians(
         lit = tl.where(drawn, tl.load(view + V_LIT), 0.0) > 0.0
         slopes = three_where(floats_at(tl.load(row + A_SLOPES)) + first * 3 + lane * 3, lit)
         lines = lights + out * LINES + lane * LINES
-        store_lights(lines, columns[2], (x, y, z), slopes, through, lit, drawn, view)
+        store_lights(lines, columns[2], (x, y, z), slopes, transmittance, lit, drawn, view)
 
 
 @triton.jit

@@ -166,12 +166,13 @@ class CudaSplats:
 class CudaTiles:
     """Which splats each tile blends, nearest first, ties by index.
 
-    members: rows of CudaSplats, tile after tile. starts: int32 [tiles + 1]: tile i (row by row)
-    owns members[starts[i]:starts[i + 1]]. Tiles without a wanted pixel own none.
+    tile_splat_ids: rows of CudaSplats, tile after tile. tile_offsets: int32 [tiles + 1]: tile i
+    (row by row) owns tile_splat_ids[tile_offsets[i]:tile_offsets[i + 1]]. Tiles without a wanted
+    pixel own none.
     """
 
-    members: Int32[Tensor, "E"]
-    starts: Int32[Tensor, "T"]
+    tile_splat_ids: Int32[Tensor, "E"]
+    tile_offsets: Int32[Tensor, "T"]
     columns: int
     rows: int
 
@@ -188,7 +189,7 @@ class GpuStageTimer:
         self.counts: dict[str, int] = {}
         self._mark()
 
-    def timed(self, name: str) -> None:
+    def end_stage(self, name: str) -> None:
         """The time since the lap before belongs to `name`."""
         self._names.append(name)
         self._mark()
