@@ -1,8 +1,6 @@
-"""docs/trade.md's tables and charts, from the kept figures of docs/trade/*.json.
+"""docs/trade.md's tables, from the kept figures of docs/trade/*.json.
 
-    python -m tools.trade_docs
-
-rewrites what lies between the document's markers, a page of every scene's figures, and its chart.
+`python -m tools.trade_docs` rewrites what lies between the document's markers.
 """
 
 from __future__ import annotations
@@ -13,16 +11,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
-
 from recipes.schema import KNOBS, TIERS, Knob, Value
 from tools.bench_trade import table_of
 from tools.machine import machine_line
 from tools.tables import markdown
 from tools.trade_cases import DEFAULTS, DEPTH, JPEG, REFERENCE, WHOLE
 from tools.trade_measure import Row
-from tools.trade_plots import draw_chart
-from tools.trade_text import number, percent, trade_markdown, value_text, views_line
+from tools.trade_text import number, percent, value_text, views_line
 from tools.trade_tiers import BOUNDS
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
@@ -59,7 +54,6 @@ def _sections(tables: Sequence[Mapping[str, Any]]) -> dict[str, list[str]]:
         "tiers": list(_tier_table()),
         "wholes": list(_whole_table(tables)),
         "knobs": list(_knob_table(tables)),
-        "files": list(_file_table(tables)),
     }
 
 
@@ -74,34 +68,25 @@ def _tier_table() -> Iterator[str]:
 
 
 def _whole_table(tables: Sequence[Mapping[str, Any]]) -> Iterator[str]:
-    header = ("scene", "recipe", "settings", "ms", "x reference", "x clean", "FLIP", "worst FLIP",
-              "PSNR", "flicker", "MiB", "kept")  # fmt: skip
-    rows = [
-        (
-            row["scene"],
-            row["recipe"],
-            row["value"],
-            number(row["ms"], ".0f"),
-            number(row["over_reference"], ".2f"),
-            number(row["over_clean"], ".2f"),
-            number(row["flip"], ".4f"),
-            number(row["worst_flip"], ".4f"),
-            "same" if row["psnr"] is None else number(row["psnr"], ".1f"),
-            number(row["flicker"], ".4f"),
-            number(row.get("mib"), ".0f"),
-            number(row.get("kept_mib"), ".0f"),
-        )
-        for row in _all_rows(tables)
-        if row["knob"] == WHOLE and row["value"] in (*BOUNDS, DEFAULTS, REFERENCE)
-    ]
+    """Settings as a whole, a row a recipe: time over the reference's, and the worst view's FLIP."""
+    settings = (DEFAULTS, *BOUNDS)
+    header = ("scene", "recipe", "reference ms", *(f"{name}: x, FLIP" for name in settings))
+    rows = []
+    for table in tables:
+        found = {(r["recipe"], r["value"]): r for r in table_of(table) if r["knob"] == WHOLE}
+        for recipe in dict.fromkeys(recipe for recipe, _ in found):
+            cells = [
+                f"{number(row['over_reference'], '.2f')}, {number(row['worst_flip'], '.3f')}"
+                for row in (found[recipe, name] for name in settings)
+            ]
+            milliseconds = number(found[recipe, REFERENCE]["ms"], ".0f")
+            rows.append((table["scene"], recipe, milliseconds, *cells))
     yield from markdown(header, rows)
 
 
 def _knob_table(tables: Sequence[Mapping[str, Any]]) -> Iterator[str]:
-    """Over all recipes that a knob has an effect on: mean ratio of times with least and most, and
-    the worst errors; the scenes beside each other.
-    """
-    each = ("x reference (least-most)", "worst FLIP", "flicker", "depth off")
+    """Over all recipes that a knob has an effect on: mean ratio of times and the worst errors."""
+    each = ("x reference", "worst FLIP", "depth off")
     header = ("knob", "value", *(f"{t['scene']}: {name}" for t in tables for name in each))
     rows = []
     for knob in KNOBS:
@@ -113,41 +98,17 @@ def _knob_table(tables: Sequence[Mapping[str, Any]]) -> Iterator[str]:
     yield from markdown(header, rows)
 
 
-def _knob_cells(table: Mapping[str, Any], knob: Knob, value: Value) -> tuple[str, str, str, str]:
+def _knob_cells(table: Mapping[str, Any], knob: Knob, value: Value) -> tuple[str, str, str]:
     rows = [r for r in table_of(table) if r["knob"] == knob.path and r["value"] == value]
     if not rows:
-        return "-", "-", "-", "-"
+        return "-", "-", "-"
     ratios = [row["over_reference"] for row in rows]
     mean = math.exp(sum(map(math.log, ratios)) / len(ratios))
     return (
         f"{mean:.2f} ({min(ratios):.2f}-{max(ratios):.2f})",
-        number(max(row["worst_flip"] for row in rows), ".4f"),
-        number(_most(rows, "flicker"), ".4f"),
+        number(max(row["worst_flip"] for row in rows), ".3f"),
         percent(_most(rows, "off_5cm")),
     )
-
-
-def _file_table(tables: Sequence[Mapping[str, Any]]) -> Iterator[str]:
-    header = ("scene", "quality", "ms", "kB", "FLIP, least", "FLIP, most", "SSIM, least")
-    rows = []
-    for table in tables:
-        own = [row for row in table_of(table) if row["knob"] == JPEG]
-        for quality in dict.fromkeys(row["value"] for row in own):
-            of = [row for row in own if row["value"] == quality]
-            rows.append((
-                table["scene"],
-                value_text(quality),
-                number(sum(row["ms"] for row in of) / len(of), ".1f"),
-                number(sum(row["kilobytes"] for row in of) / len(of), ".0f"),
-                number(min(row["flip"] for row in of), ".4f"),
-                number(max(row["flip"] for row in of), ".4f"),
-                number(min(row["ssim"] for row in of), ".4f"),
-            ))  # fmt: skip
-    yield from markdown(header, rows)
-
-
-def _all_rows(tables: Sequence[Mapping[str, Any]]) -> list[Row]:
-    return [row for table in tables for row in table_of(table)]
 
 
 def _most(rows: Sequence[Row], name: str) -> float | None:
@@ -156,12 +117,7 @@ def _most(rows: Sequence[Row], name: str) -> float | None:
 
 
 def main() -> None:
-    tables = read_tables()
-    PAGE.write_text(document(PAGE.read_text(), tables))
-    for name, table in zip(SCENES, tables, strict=True):
-        (DOCS / "trade" / f"{name}.md").write_text(trade_markdown(table))
-        chart = str(DOCS / "images" / f"trade_{name}.png")
-        cv2.imwrite(chart, draw_chart(table)[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])
+    PAGE.write_text(document(PAGE.read_text(), read_tables()))
 
 
 if __name__ == "__main__":
