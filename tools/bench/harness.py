@@ -1,0 +1,381 @@
+"""What every subject of `climategs bench` measures with: paired rounds, memory, figures.
+
+Cases run in turns, every other round in the opposite order, so that what the machine does meanwhile
+falls on all; ratios are taken round by round. All figures of a subject have one JSON form.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import dataclasses
+import gc
+import importlib.metadata
+import math
+import multiprocessing
+import os
+import platform
+import re
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from tqdm import tqdm
+
+Cell = str | float | int | None
+Action = Callable[[], object]
+Figures = dict[str, Any]
+PACKAGES = ("climategs", "numpy", "torch", "triton", "numba", "llvmlite", "tbb", "gsplat")
+
+
+@dataclass(frozen=True)
+class Table:
+    """Figures as people read them. rows: as long as columns; None is an empty cell."""
+
+    title: str
+    columns: Sequence[str]
+    rows: Sequence[Sequence[Cell]]
+    note: str = ""
+
+
+def figures(
+    name: str, tables: Sequence[Table], *, machine: Mapping[str, Any] | None = None, **facts: Any
+) -> Figures:
+    """The JSON form of what a subject measured. machine: `machine_facts()` of before it began."""
+    return {
+        "bench": name,
+        "machine": dict(machine or machine_facts()),
+        "load_after": load_average(),
+        "tables": [
+            {**dataclasses.asdict(t), "columns": [*t.columns], "rows": [[*row] for row in t.rows]}
+            for t in tables
+        ],
+        "facts": facts,
+    }
+
+
+def print_figures(result: Figures) -> None:
+    """Tables in columns: words to the left, numbers to the right, to 3 significant digits."""
+    print(f"{result['bench']}: {machine_line(result)}")
+    for table in result["tables"]:
+        print(f"\n{table['title']}")
+        lines = [table["columns"], *([format_cell(c) for c in row] for row in table["rows"])]
+        widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+        numeric = _numeric_columns(table)
+        for line in lines:
+            cells = zip(line, widths, numeric, strict=True)
+            print("  ".join(c.rjust(w) if n else c.ljust(w) for c, w, n in cells).rstrip())
+        if table["note"]:
+            print(f"  {table['note']}")
+
+
+def markdown(result: Figures) -> str:
+    """The machine and all tables, each under its title."""
+    lines = [f"{machine_line(result)}."]
+    for table in result["tables"]:
+        lines += ["", f"**{table['title']}**", "", *markdown_table(table)]
+        lines += ["", table["note"]] if table["note"] else []
+    return "\n".join(lines) + "\n"
+
+
+def markdown_table(table: Mapping[str, Any]) -> list[str]:
+    """Lines of one of a result's tables."""
+    rows = [[format_cell(cell) for cell in row] for row in table["rows"]]
+    marks = ["---:" if numeric else "---" for numeric in _numeric_columns(table)]
+    return [f"| {' | '.join(line)} |" for line in (table["columns"], marks, *rows)]
+
+
+def replace_marked(text: str, start: str, end: str, content: str) -> str:
+    """A document whose lines between two markers are content.
+
+    Raises:
+        ValueError: it lacks a marker.
+    """
+    before, found, rest = text.partition(start)
+    _, closed, after = rest.partition(end)
+    if not (found and closed):
+        raise ValueError(f"the document has no '{start}' with '{end}' after it")
+    return f"{before}{start}\n\n{content.strip()}\n\n{end}{after}"
+
+
+def format_cell(cell: Cell) -> str:
+    """3 significant digits, no exponent between 0.001 and 10^15; None is empty."""
+    if cell is None:
+        return ""
+    if isinstance(cell, bool):
+        return "yes" if cell else "NO"
+    if not isinstance(cell, float):
+        return cell if isinstance(cell, str) else f"{cell:,}"
+    if cell == 0 or not math.isfinite(cell):
+        return f"{cell:g}"
+    if abs(cell) < 1e-3:
+        return f"{cell:.1e}"
+    return f"{cell:,.{max(0, 2 - math.floor(math.log10(abs(cell))))}f}"
+
+
+def _numeric_columns(table: Mapping[str, Any]) -> list[bool]:
+    columns = zip(*table["rows"], strict=True) if table["rows"] else [()] * len(table["columns"])
+    return [not any(isinstance(cell, str) for cell in column) for column in columns]
+
+
+# ---- time ---------------------------------------------------------------------------------------
+
+
+class Clock(Protocol):
+    """mark: the moment when what was asked for until now is done."""
+
+    def mark(self) -> Any: ...
+
+    def wait(self) -> None: ...
+
+    def seconds(self, first: Any, then: Any) -> float: ...
+
+
+class WallClock:
+    """The host's, for work that is done when its call returns."""
+
+    def mark(self) -> float:
+        return time.perf_counter()
+
+    def wait(self) -> None:
+        pass
+
+    def seconds(self, first: float, then: float) -> float:
+        return then - first
+
+
+def rounds(
+    cases: Mapping[str, Action],
+    repeats: int,
+    *,
+    warm_up: int = 1,
+    clock: Clock | None = None,
+    progress: bool = True,
+) -> dict[str, list[float]]:
+    """Seconds of each case, one number a round. warm_up: rounds before the first that counts."""
+    if repeats < 1 or not cases:
+        raise ValueError(f"need repeats >= 1 and a case; got {repeats} and {list(cases)}")
+    clock = clock or WallClock()
+    marks: dict[str, list[tuple[Any, Any]]] = {name: [] for name in cases}
+    for repeat in tqdm(range(warm_up + repeats), unit="round", leave=False, disable=not progress):
+        if repeat == warm_up:
+            clock.wait()
+        for name in in_turns(cases, repeat):
+            start = clock.mark()
+            cases[name]()
+            marks[name].append((start, clock.mark()))
+    clock.wait()
+    return {name: [clock.seconds(*p) for p in each[warm_up:]] for name, each in marks.items()}
+
+
+def in_turns(names: Mapping[str, Any] | Sequence[str], repeat: int) -> list[str]:
+    """The names in order, and every other time in the opposite one."""
+    return [*names] if repeat % 2 else [*names][::-1]
+
+
+def spread(values: Sequence[float]) -> dict[str, float]:
+    """What nine of ten measurements stay below, beside the median and the least."""
+    low, middle, high = np.quantile(values, [0, 0.5, 0.9])
+    return {"min": float(low), "median": float(middle), "p90": float(high)}
+
+
+def spread_ms(seconds: Sequence[float]) -> dict[str, float]:
+    """Of seconds, in milliseconds."""
+    return spread([1e3 * s for s in seconds])
+
+
+def spread_ratio(over: Sequence[float], under: Sequence[float]) -> dict[str, float]:
+    """Of ratios, pair by pair."""
+    return spread([o / u for o, u in zip(over, under, strict=True)])
+
+
+def median_ms(seconds: Sequence[float]) -> float:
+    return 1e3 * float(np.median(seconds))
+
+
+# ---- memory and processes -----------------------------------------------------------------------
+
+_STATUS, RESET_PEAK = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+_SAMPLE_EVERY_S = 0.1
+
+
+def status_mib(field: str) -> float:
+    """MiB of this process by /proc, such as VmRSS."""
+    match = re.search(rf"^{field}:\s*(\d+)", _STATUS.read_text(), re.MULTILINE)
+    if match is None:
+        raise RuntimeError(f"{_STATUS} has no {field}")
+    return int(match[1]) / 1024
+
+
+def return_free_memory() -> None:
+    """Give freed heap back, which would hide what is taken next; glibc keeps up to 64 MiB."""
+    gc.collect()
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim is not None:
+        trim(0)
+
+
+def extra_mib(action: Action) -> float:
+    """MiB that this process takes at the highest moment of an action, what it returns included,
+    above what it holds before.
+    """
+    return_free_memory()
+    before = status_mib("VmRSS")
+    RESET_PEAK.write_text("5")
+    kept = action()
+    highest = status_mib("VmHWM")
+    del kept  # alive until the mark was read
+    return highest - before
+
+
+def peak_mib_in_subprocess(
+    work: Callable[..., Action], arguments: tuple[Any, ...], within_s: float = 600
+) -> float | None:
+    """`extra_mib` of the action that work returns, in a fresh process: one that has rendered before
+    holds scratch memory. None where the system cannot tell.
+
+    Raises:
+        RuntimeError: the process failed or took too long.
+    """
+    if not RESET_PEAK.is_file():
+        return None
+    found = run_in_subprocess(_extra_mib_of, (work, arguments), within_s)
+    if "mib" not in found:
+        raise RuntimeError(f"measuring the memory of {work.__name__}{arguments} failed: {found}")
+    return found["mib"]
+
+
+def _extra_mib_of(work: Callable[..., Action], arguments: tuple[Any, ...]) -> Figures:
+    return {"mib": extra_mib(work(*arguments))}
+
+
+def guarded(work: Callable[..., Figures], arguments: tuple[Any, ...]) -> Figures:
+    """What the work gives and the `seconds` it took; or what it `failed` with."""
+    start = time.perf_counter()
+    try:
+        found = work(*arguments)
+    except Exception as error:  # others wait their turn
+        traceback.print_exc(file=sys.stderr)
+        return {"failed": f"{type(error).__name__}: {error}"}
+    return {**found, "seconds": round(time.perf_counter() - start, 2)}
+
+
+def run_in_subprocess(
+    work: Callable[..., Figures], arguments: tuple[Any, ...], within_s: float
+) -> Figures:
+    """As `guarded`, in a fresh process; `left_out` where no time is left or it takes longer.
+
+    work: of a module, so that the other process finds it.
+    """
+    if within_s <= 0:
+        return {"left_out": "no time was left"}
+    context = multiprocessing.get_context("spawn")
+    receiving, sending = context.Pipe(duplex=False)
+    process = context.Process(target=_send_result, args=(sending, work, arguments))
+    process.start()
+    sending.close()
+    try:
+        if not receiving.poll(within_s):
+            return {"left_out": f"it was stopped after {within_s:.0f} s"}
+        return receiving.recv()
+    except EOFError:
+        process.join()
+        return {"failed": f"its process ended with code {process.exitcode}"}
+    finally:
+        process.kill()
+        process.join()
+
+
+def _send_result(
+    sending: Connection, work: Callable[..., Figures], arguments: tuple[Any, ...]
+) -> None:
+    sending.send(guarded(work, arguments))
+
+
+class MemorySampler:
+    """Resident MiB of this process while entered, on a thread of its own; Linux only."""
+
+    def __init__(self) -> None:
+        self.mib: list[float] = []
+
+    def _run(self, stop: threading.Event) -> None:
+        while not stop.wait(_SAMPLE_EVERY_S):
+            self.mib.append(status_mib("VmRSS"))
+
+    @contextlib.contextmanager
+    def sampling(self) -> Iterator[MemorySampler]:
+        stop = threading.Event()
+        thread = threading.Thread(target=self._run, args=(stop,), daemon=True)
+        thread.start()
+        try:
+            yield self
+        finally:
+            stop.set()
+            thread.join()
+
+    def at_share(self, share: float) -> float:
+        """MiB when that share of the time had passed, smoothed over a twentieth of it."""
+        middle, reach = share * len(self.mib), max(1, len(self.mib) // 20)
+        near = self.mib[max(0, int(middle) - reach) : int(middle) + reach] or self.mib[-1:]
+        return sum(near) / len(near)
+
+
+# ---- the machine --------------------------------------------------------------------------------
+
+
+def machine_facts() -> Figures:
+    """Of this machine and process; starts numba's thread pool if nobody has yet.
+
+    load: processes that ran or waited over the minute before; more than a few tenths disturb.
+    """
+    from augment.render.threads import select_thread_pool, thread_count
+
+    flags = (_proc_field("/proc/cpuinfo", "flags") or "").split()
+    total = _proc_field("/proc/meminfo", "MemTotal")
+    return {
+        "processor": _proc_field("/proc/cpuinfo", "model name") or platform.processor(),
+        "cores": len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count(),
+        "simd": [name for name in ("sse4_2", "avx", "avx2", "fma", "avx512f") if name in flags],
+        "memory_gib": None if total is None else round(int(total.split()[0]) / 2**20, 1),
+        "thread_pool": select_thread_pool(),  # before anything starts a pool of numba's choice
+        "threads": thread_count(),
+        "torch_threads": torch.get_num_threads(),
+        "load": load_average(),
+        "platform": platform.platform(),
+        "python": platform.python_version(),
+        "versions": {name: found for name in PACKAGES if (found := version_of(name))},
+    }
+
+
+def load_average() -> float | None:
+    """Processes that ran or waited over the last minute; None where the system does not say."""
+    return round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None
+
+
+def version_of(package: str) -> str | None:
+    """Of an installed package."""
+    with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+        return importlib.metadata.version(package)
+
+
+def machine_line(result: Mapping[str, Any]) -> str:
+    """What figures were measured on; facts may hold a `gpu`."""
+    machine, gpu = result["machine"], result.get("facts", result).get("gpu")
+    return (f"{gpu['name']}; " if gpu else "") + (
+        f"{machine['processor']}, {machine['cores']} cores, {machine['threads']} threads; "
+        f"load {machine['load']} before, {result['load_after']} after"
+    )
+
+
+def _proc_field(path: str, name: str) -> str | None:
+    with contextlib.suppress(OSError):
+        found = re.search(rf"^{name}\s*:\s*(.*)$", Path(path).read_text(), re.MULTILINE)
+        return found[1] if found else None
