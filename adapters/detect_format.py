@@ -99,7 +99,7 @@ def _street_gaussians(folder: Path, _query: dict[str, str]) -> _Found:
 
 def _drivestudio(path: Path, query: dict[str, str]) -> _Found:
     """The processed data that a run was trained on."""
-    from adapters.drivestudio.run import RunOptions, find_run
+    from adapters.drivestudio.drive import RunOptions, find_run
 
     data = find_run(path, RunOptions.from_query(query)).data
     return _Found(Path(os.path.abspath(data)), r"images/\d+_\d+\.jpg", r"lidar/\d+\.bin")

@@ -146,6 +146,24 @@ def decode_image(path: Path, flags: int) -> np.ndarray | None:
     return cv2.imdecode(data, flags) if len(data) else None
 
 
+_IMAGE_ENDS = ((b"\x89PNG\r\n\x1a\n", b"IEND"), (b"\xff\xd8", b"\xff\xd9"))
+
+
+def read_image_size(path: Path) -> tuple[int, int] | str:
+    """Width and height of a PNG or JPEG, decoded once to be sure of it, or what is wrong with it as
+    the end of a sentence."""
+    try:
+        with open_file(path) as file:
+            data = file.read()
+    except OSError as error:
+        return f"cannot be read ({error.strerror})"
+    # Decoders fill what is cut off with grey.
+    if not any(data.startswith(start) and end in data[-64:] for start, end in _IMAGE_ENDS):
+        return "is cut short, or neither PNG nor JPEG"
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    return "cannot be decoded" if image is None else (image.shape[1], image.shape[0])
+
+
 def read_numbers(path: Path, shape: Sequence[int] | None = None) -> np.ndarray:
     """The finite numbers of a text file, float64 in that shape, or flat.
 

@@ -1,7 +1,7 @@
 """A street made from a seed: the embedded default scene, and the tests' ground truth.
 
 `procedural:street?seed=3&frames=20` is a drive down a street with houses, trees, parked and moving
-cars and people, six cameras and a LiDAR. `adapters.street.labels.open_truth` answers exactly, for
+cars and people, six cameras and a LiDAR. `adapters.procedural.open_truth` answers exactly, for
 the same query, what any ray through it meets.
 """
 
@@ -10,11 +10,14 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
+import torch
 
-from adapters.street.labels import StreetLabels
 from adapters.street.layout import (
+    FRAME_NS,
     StreetParameters,
     build_frames,
     camera_path,
@@ -24,6 +27,8 @@ from adapters.street.layout import (
 )
 from adapters.street.light import build_sky
 from adapters.street.splats import (
+    SHADOW_RGB,
+    ContactShadow,
     SplatPlan,
     coarseness_for,
     contact_shadow,
@@ -31,9 +36,315 @@ from adapters.street.splats import (
     shadow_gaussians,
     splat,
 )
-from adapters.street.world import MovingBody, Street, build_street
+from adapters.street.world import Body, MovingBody, Street, build_street
 from adapters.world import join_gaussians
+from augment.cameras import Camera
+from augment.errors import SceneError
+from augment.labels import Boxes, LidarSweep
 from augment.scene import Actor, Scene
+from augment.semantics import SemanticClass
+from augment.sky import Sky
+
+# ---- Boxes and LiDAR sweeps of a street, worked out when asked -----------------------------------
+
+# ---- What the street's surfaces really are: distance, normal, class and colour along any ray -----
+
+
+@dataclass(frozen=True, eq=False)
+class RayHits:
+    """What N rays see. distance [N]: metres, infinite for sky. normal [N, 3]: world, unit, towards
+    the ray's origin; zero for sky. semantic [N] int16, instance [N] int32: 0 or 1 + the actor's
+    index. rgb [N, 3]: display-encoded surface colour with baked light, zero for sky; None unless
+    asked for. shape [N]: of the body that was hit, -1 for sky.
+    """
+
+    distance: np.ndarray
+    normal: np.ndarray
+    semantic: np.ndarray
+    instance: np.ndarray
+    shape: np.ndarray
+    rgb: np.ndarray | None
+
+
+@dataclass(frozen=True, eq=False)
+class TrueView:
+    """A camera's image as it should be. rgb float32 [H, W, 3] with sky; depth float64 [H, W]: z,
+    infinite for sky; normal [H, W, 3]; semantic int16 [H, W]; instance int32 [H, W].
+    """
+
+    rgb: np.ndarray
+    depth: np.ndarray
+    normal: np.ndarray
+    semantic: np.ndarray
+    instance: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class StreetTruth:
+    """Exact answers about a street, by ray casting."""
+
+    street: Street
+
+    @cached_property
+    def sky(self) -> Sky:
+        """As the scene's."""
+        return build_sky(self.street.parameters.seed, self.street.to_sun)
+
+    @cached_property
+    def _shadows(self) -> tuple[ContactShadow, ...]:
+        return tuple(contact_shadow(mover) for mover in self.street.movers)
+
+    def cast(
+        self,
+        origins: np.ndarray,
+        directions: np.ndarray,
+        timestamp_ns: int | np.ndarray,
+        *,
+        with_rgb: bool = True,
+    ) -> RayHits:
+        """Follow rays [N, 3] (origins may be [3]) at a time, or at each ray's own time [N]."""
+        rays = len(directions)
+        unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+        origins = np.ascontiguousarray(np.broadcast_to(origins, unit.shape), np.float64)
+        times = np.broadcast_to(np.asarray(timestamp_ns, np.int64), (rays,))
+        hits = self.street.static.tree.cast(origins, unit)
+        distance, shape, local = hits.distance, hits.shape, hits.local
+        instance = np.zeros(rays, np.int32)
+        for number, mover in enumerate(self.street.movers, start=1):
+            centres, present = mover.motion.at(times)
+            relative = origins - centres
+            reach = np.linalg.norm(mover.size_m) / 2
+            along = -(relative * unit).sum(1)
+            passing = (relative**2).sum(1) - along**2 < reach**2
+            index = np.flatnonzero(present & passing)
+            turn = _turn(mover.motion.yaw)
+            met = mover.body.tree.cast(relative[index] @ turn, unit[index] @ turn)
+            nearer = met.distance < distance[index]
+            index = index[nearer]
+            distance[index], shape[index] = met.distance[nearer], met.shape[nearer]
+            local[index], instance[index] = met.local[nearer], number
+        return self._describe(origins, unit, times, distance, shape, local, instance, with_rgb)
+
+    def render(self, camera: Camera) -> TrueView:
+        """Cast a ray through every pixel centre."""
+        size = (camera.height, camera.width)
+        rays = camera.ray_directions(torch.float64)
+        flat = rays.reshape(-1, 3).numpy()
+        hits = self.cast(camera.centre.numpy(), flat, camera.timestamp_ns)
+        assert hits.rgb is not None
+        sky = self.sky.sample(rays.float()).numpy()
+        is_sky = np.isinf(hits.distance).reshape(size)
+        rgb = np.where(is_sky[..., None], sky, hits.rgb.reshape(*size, 3)).astype(np.float32)
+        return TrueView(
+            rgb=rgb,
+            depth=(hits.distance / np.linalg.norm(flat, axis=1)).reshape(size),
+            normal=hits.normal.reshape(*size, 3),
+            semantic=hits.semantic.reshape(size),
+            instance=hits.instance.reshape(size),
+        )
+
+    def _describe(
+        self,
+        origins: np.ndarray,
+        unit: np.ndarray,
+        times: np.ndarray,
+        distance: np.ndarray,
+        shape: np.ndarray,
+        local: np.ndarray,
+        instance: np.ndarray,
+        with_rgb: bool,
+    ) -> RayHits:
+        rays = len(unit)
+        normal = np.zeros((rays, 3))
+        semantic = np.full(rays, SemanticClass.SKY, np.int16)
+        rgb = np.zeros((rays, 3)) if with_rgb else None
+        for number in np.unique(instance):
+            index = np.flatnonzero((instance == number) & (shape >= 0))
+            body, turn = self._body(int(number))
+            chosen = shape[index]
+            normal[index] = body.shapes.normals(chosen, local[index]) @ turn.T
+            semantic[index] = body.shapes.semantic[chosen]
+            if rgb is not None:
+                rgb[index] = body.colors(chosen, local[index][None])
+        normal[(normal * unit).sum(1) > 0] *= -1
+        if rgb is not None:
+            seen = np.flatnonzero((instance == 0) & (shape >= 0))
+            points = origins[seen] + distance[seen, None] * unit[seen]
+            for mover, shadow in zip(self.street.movers, self._shadows, strict=True):
+                centres, present = mover.motion.at(times[seen])
+                relative = (points - centres) @ _turn(mover.motion.yaw)
+                cover = shadow.cover(relative) * present
+                rgb[seen] += cover[:, None] * (SHADOW_RGB - rgb[seen])
+        return RayHits(distance, normal, semantic, instance, shape, rgb)
+
+    def _body(self, instance: int) -> tuple[Body, np.ndarray]:
+        if instance == 0:
+            return self.street.static, np.eye(3)
+        mover = self.street.movers[instance - 1]
+        return mover.body, _turn(mover.motion.yaw)
+
+
+def _turn(yaw: float) -> np.ndarray:
+    """world_from_actor rotation; `world @ turn` takes row vectors into the actor's frame."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def open_truth(query: Mapping[str, str]) -> StreetTruth:
+    """Truth of the street that `open_procedural` opens for the same query.
+
+    Raises:
+        AdapterError: as open_procedural.
+    """
+    return StreetTruth(build_street(parse_parameters(query)))
+
+
+# ------------------------------------------------------------------------------------------------
+# A spinning LiDAR on the ego car's roof, by exact ray casting; moving things stand where they are
+# at each ray's own time.
+
+SENSOR_M = (0.6, 0.0, 1.95)  # forward, left, up from the ego origin
+LOWEST_DEG, HIGHEST_DEG = -24.0, 14.0
+REACH_M = (1.5, 120.0)
+# Share of the beam that comes back from a surface met head on.
+REFLECTIVITY = {
+    SemanticClass.ROAD: 0.14,
+    SemanticClass.LANE_MARKING: 0.62,
+    SemanticClass.SIDEWALK: 0.30,
+    SemanticClass.TERRAIN: 0.38,
+    SemanticClass.VEGETATION: 0.42,
+    SemanticClass.BUILDING: 0.40,
+    SemanticClass.BARRIER: 0.36,
+    SemanticClass.POLE: 0.45,
+    SemanticClass.SIGN: 0.95,
+    SemanticClass.VEHICLE: 0.34,
+    SemanticClass.PEDESTRIAN: 0.30,
+    SemanticClass.OTHER: 0.30,
+}
+
+
+def lidar_rays(street: Street, frame_index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Origins [C, 3], unit directions [C, R, 3] and times [C] of a sweep of C columns, R rings.
+
+    The beam starts behind the car half a frame early, turns clockwise, and looks ahead at the
+    frame's time. Ring 0 is the lowest.
+    """
+    parameters = street.parameters
+    columns, rings = parameters.lidar_columns, parameters.lidar_rings
+    turn = (np.arange(columns) + 0.5) / columns - 0.5
+    times = frame_time_ns(frame_index) + np.round(turn * FRAME_NS).astype(np.int64)
+    pose = ego_pose(parameters, times)
+    azimuth = (pose.yaws - 2 * np.pi * turn)[:, None]
+    elevation = np.radians(np.linspace(LOWEST_DEG, HIGHEST_DEG, rings))[None, :]
+    directions = np.stack(
+        [
+            np.cos(elevation) * np.cos(azimuth),
+            np.cos(elevation) * np.sin(azimuth),
+            np.sin(elevation) + 0 * azimuth,
+        ],
+        -1,
+    )
+    return sensor_origins(parameters, times), directions, times
+
+
+def sensor_origins(parameters: StreetParameters, timestamps_ns: np.ndarray) -> np.ndarray:
+    """Where the sensor is at times [N], float64 [N, 3]."""
+    pose = ego_pose(parameters, timestamps_ns)
+    forward, left, up = SENSOR_M
+    c, s = np.cos(pose.yaws), np.sin(pose.yaws)
+    offset = np.stack([c * forward - s * left, s * forward + c * left, np.full(len(c), up)], 1)
+    return pose.positions + offset
+
+
+def sweep(truth: StreetTruth, frame_index: int) -> LidarSweep:
+    """One turn's returns. Columns: x, y, z float64 metres; intensity float32 in [0, 1];
+    timestamp_ns int64; ring uint8; semantic uint8 (SemanticClass); instance uint16 (as images').
+    """
+    origins, directions, times = lidar_rays(truth.street, frame_index)
+    rings = directions.shape[1]
+    origin, time = np.repeat(origins, rings, axis=0), np.repeat(times, rings)
+    direction = directions.reshape(-1, 3)
+    hits = truth.cast(origin, direction, time, with_rgb=False)
+    kept = np.flatnonzero((hits.distance > REACH_M[0]) & (hits.distance < REACH_M[1]))
+    distance, semantic = hits.distance[kept], hits.semantic[kept]
+    points = origin[kept] + distance[:, None] * direction[kept]
+    table = np.zeros(len(SemanticClass))
+    for value, share in REFLECTIVITY.items():
+        table[value] = share
+    incidence = np.abs((hits.normal[kept] * direction[kept]).sum(1))
+    intensity = table[semantic] * (0.25 + 0.75 * incidence) * np.exp(-distance / 150)
+    return LidarSweep(
+        {
+            "x": points[:, 0],
+            "y": points[:, 1],
+            "z": points[:, 2],
+            "intensity": intensity.astype(np.float32),
+            "timestamp_ns": time[kept],
+            "ring": np.tile(np.arange(rings), len(times))[kept].astype(np.uint8),
+            "semantic": semantic.astype(np.uint8),
+            "instance": hits.instance[kept].astype(np.uint16),
+        }
+    )
+
+
+# ---- labels --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class StreetLabels:
+    """Labels of a street; holds only its parameters, so it is cheap to pickle."""
+
+    parameters: StreetParameters
+
+    def boxes(self, frame_index: int) -> Boxes:
+        """Moving things first, in the order of the scene's actors, then parked cars."""
+        time = np.array([self._time_ns(frame_index)])
+        street = build_street(self.parameters)
+        rows = []
+        for number, mover in enumerate(street.movers, start=1):
+            centres, present = mover.motion.at(time)
+            if present[0]:
+                yaw = mover.motion.yaw
+                rows.append((mover.name, mover.label, centres[0], mover.size_m, yaw, False, number))
+        for car in street.parked:
+            rows.append((car.name, "Car", car.centre, car.size_m, car.yaw, True, 0))
+        if not rows:
+            return Boxes.empty()
+        names, labels, centres, sizes, yaws, parked, instances = zip(*rows, strict=True)
+        half = np.array(yaws) / 2
+        zero = np.zeros_like(half)
+        return Boxes(
+            track_ids=names,
+            labels=labels,
+            centers_m=np.array(centres, np.float64),
+            sizes_m=np.array(sizes, np.float64),
+            quats=np.stack([np.cos(half), zero, zero, np.sin(half)], 1),
+            attributes={"is_parked": np.array(parked), "instance": np.array(instances, np.uint16)},
+        )
+
+    def lidar(self, frame_index: int) -> LidarSweep:
+        self._time_ns(frame_index)
+        return sweep(StreetTruth(build_street(self.parameters)), frame_index)
+
+    def lidar_classes(self, sweep: LidarSweep) -> np.ndarray:
+        """The SemanticClass of each return: the sweeps' own numbers."""
+        return np.asarray(sweep.columns["semantic"], np.int16)
+
+    def lidar_origins(self, frame_index: int, sweep: LidarSweep) -> np.ndarray:
+        """Where the sensor was at each return's own time, exactly."""
+        self._time_ns(frame_index)
+        return sensor_origins(self.parameters, np.asarray(sweep.columns["timestamp_ns"], np.int64))
+
+    def _time_ns(self, frame_index: int) -> int:
+        if not 0 <= frame_index < self.parameters.frames:
+            raise SceneError(
+                f"{self.parameters.uri} has frames 0 to {self.parameters.frames - 1}; "
+                f"got {frame_index}"
+            )
+        return frame_time_ns(frame_index)
+
+
+# ---- procedural ----------------------------------------------------------------------------------
 
 logger = logging.getLogger(__name__)
 

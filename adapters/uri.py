@@ -59,13 +59,13 @@ SCHEMES = {
         labels="kitti_labels",
     ),
     "street_gaussians": Scheme(
-        "adapters.street_gaussians",
+        "adapters.street_gaussians.adapter",
         "open_street_gaussians",
         "street_gaussians:output/waymo/002?data=data/waymo/002",
         labels="street_gaussians_labels",
     ),
     "drivestudio": Scheme(
-        "adapters.drivestudio",
+        "adapters.drivestudio.adapter",
         "open_drivestudio",
         "drivestudio:output/omnire/run?data=data/waymo/processed/training/023",
         labels="drivestudio_labels",

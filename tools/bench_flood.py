@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from adapters.base import open_scene, parse_uri
-from adapters.street.labels import open_truth
+from adapters.procedural import open_truth
 from tools.bench_flood_cost import bench_camera, bench_cost
 from tools.bench_flood_error import bench_error, fresnel_table
 from tools.bench_flood_masks import bench_masks, dry_views

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from adapters.street.labels import StreetTruth
+from adapters.procedural import StreetTruth
 from augment.cameras import Camera
 from augment.effects.flood.water_plane import plane_depth
 from augment.geometry import rigid

@@ -17,7 +17,7 @@ import torch
 from tqdm import tqdm
 
 from adapters.base import open_scene
-from adapters.street.labels import StreetTruth, TrueView, open_truth
+from adapters.procedural import StreetTruth, TrueView, open_truth
 from adapters.uri import parse_uri
 from augment.cameras import Camera
 from augment.effects.smog import SmogMedium, blend_airlight, optical_depth

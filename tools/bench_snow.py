@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from adapters.base import open_scene, parse_uri
-from adapters.street.labels import open_truth
+from adapters.procedural import open_truth
 from augment.scene import Scene
 from tools.bench_flood_cost import bench_camera
 from tools.bench_snow_accuracy import AccuracyCase, bench_accuracy

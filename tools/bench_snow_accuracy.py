@@ -13,7 +13,7 @@ from typing import Any, get_args
 import numpy as np
 import torch
 
-from adapters.street.labels import StreetTruth
+from adapters.procedural import StreetTruth
 from augment.cameras import Camera
 from augment.effects.snow.cells import SnowSupport
 from augment.effects.snow.height_map import Estimator

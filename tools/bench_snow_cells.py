@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from adapters.street.labels import StreetTruth
+from adapters.procedural import StreetTruth
 from augment.effects.snow.cells import SnowCells, SnowSupport
 from augment.effects.snow.surface import DRIVEN_MAX_SLOPE_DEG, moves
 from augment.scene import Scene

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from adapters.lidar_scene.depth import lidar_depth
-from adapters.street.labels import StreetTruth
+from adapters.procedural import StreetTruth
 from augment.cameras import Camera
 from augment.render.buffers import BUFFERS as EVERY_BUFFER
 from augment.render.buffers import EXPECTED_DEPTH, MEDIAN_DEPTH, MODE_DEPTH

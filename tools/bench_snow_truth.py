@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from adapters.street.labels import RayHits, StreetTruth
+from adapters.procedural import RayHits, StreetTruth
 from adapters.street.world import Body
 from augment.cameras import Camera
 from augment.geometry import rigid

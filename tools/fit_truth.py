@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 
-from adapters.street.labels import StreetTruth, TrueView, open_truth
+from adapters.procedural import StreetTruth, TrueView, open_truth
 from adapters.uri import parse_uri
 from augment.cameras import Camera
 from augment.errors import AdapterError

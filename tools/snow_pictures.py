@@ -12,7 +12,7 @@ import numpy as np
 from tqdm import tqdm
 
 from adapters.base import open_scene, parse_uri
-from adapters.street.labels import StreetTruth, open_truth
+from adapters.procedural import StreetTruth, open_truth
 from augment.cameras import Camera
 from augment.effects.snow.height_map import Estimator
 from augment.effects.snow.layer import build_snow_layer

@@ -168,7 +168,7 @@ def true_depths(uri: str, cameras: Sequence[Camera]) -> list[np.ndarray] | None:
     other scenes.
     """
     from adapters.base import parse_uri
-    from adapters.street.labels import open_truth
+    from adapters.procedural import open_truth
 
     scheme, _, query = parse_uri(uri)
     if scheme != "procedural":

@@ -28,13 +28,15 @@ from adapters.drivestudio.drive import (
     FRAME_NS,
     DriveStudioLabels,
     Instance,
+    Run,
+    RunOptions,
+    find_run,
     model_from_dataset,
     read_corrections,
     read_drive,
     read_instances,
     scene_from_model,
 )
-from adapters.drivestudio.run import Run, RunOptions, find_run
 from adapters.uri import format_uri
 from adapters.world import WorldChange, with_class_of
 from augment.cameras import Camera
@@ -515,6 +517,15 @@ def open_drivestudio(path: str, query: dict[str, str]) -> Scene:
             "config": str(run.config_file),
         },
     )
+
+
+def drivestudio_labels(path: str, query: dict[str, str]) -> DriveStudioLabels:
+    """The labels of a run's data; whatever frames the query asks for, they are those of all.
+
+    Raises:
+        AdapterError: as for open_drivestudio, as far as config and data are concerned.
+    """
+    return DriveStudioLabels(find_run(Path(path), RunOptions.from_query(query)))
 
 
 def _actors(

@@ -20,7 +20,6 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from adapters.image_checks import read_image_size
 from adapters.kitti.layout import (
     LIDAR_TOP_DEG,
     RectifiedCamera,
@@ -32,6 +31,7 @@ from adapters.kitti.layout import (
 from adapters.kitti.source import ObjectLabels, RawLabels, Source, find_source
 from adapters.lidar_scene.scene import build_lidar_scene, path_of, scene_of, views_of
 from adapters.lidar_scene.split import BoxSample, Sweep, join_tracks
+from adapters.plain_files import read_image_size
 from adapters.recording.labels import TimedBoxes, read_objects
 from adapters.uri import format_uri
 from augment.cameras import Camera, Frame

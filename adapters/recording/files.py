@@ -23,9 +23,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from adapters.image_checks import read_image_size
 from adapters.lidar_scene.scene import drive_origin
-from adapters.plain_files import LARGEST, array_of, number_of, read_json
+from adapters.plain_files import LARGEST, array_of, number_of, read_image_size, read_json
 from augment.cameras import Camera, Frame
 from augment.errors import AdapterError
 from augment.geometry import invert_rigid

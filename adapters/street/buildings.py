@@ -12,6 +12,7 @@ from adapters.street.forms import (
     U1,
     V1,
     Look,
+    Material,
     Rectangle,
     Shapes,
     boxes,
@@ -22,7 +23,6 @@ from adapters.street.forms import (
     tube,
 )
 from adapters.street.layout import CROSS_STREET_M, FACADE_M, Layout, Plot, pavement_z
-from adapters.street.materials import Material
 from augment.semantics import SemanticClass as Class
 
 # ---- Parts of a house front, built in its own frame: x along the wall, y into the house, z up ----

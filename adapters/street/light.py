@@ -12,8 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from adapters.street.forms import Shapes
-from adapters.street.materials import Material, fractal_noise, value_noise
+from adapters.street.forms import Material, Shapes, fractal_noise, value_noise
 from adapters.street.raycast import Tree
 from augment.sky import CubemapSky, directions_of_cubemap
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from adapters.street.forms import (
     Look,
+    Material,
     Shapes,
     ball,
     boxes,
@@ -20,7 +21,6 @@ from adapters.street.forms import (
     tube,
 )
 from adapters.street.layout import ROAD_HALF_M, Layout, pavement_z
-from adapters.street.materials import Material
 from augment.semantics import SemanticClass as Class
 
 # ---- A person in mid-stride: tubes and ellipsoids, one rigid body --------------------------------

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from adapters.street.forms import OPEN_DIAGONAL, U0, U1, V0, V1, Kind, Shapes, join
+from adapters.street.forms import OPEN_DIAGONAL, U0, U1, V0, V1, Kind, Material, Shapes, join
 from adapters.street.light import SKY_RGB, SUN_RGB
-from adapters.street.materials import Material
 from adapters.street.raycast import Tree
 from adapters.street.world import Body, MovingBody
 from adapters.world import join_gaussians

@@ -14,8 +14,10 @@ from adapters.street.forms import (
     V0,
     V1,
     Look,
+    Material,
     Rectangle,
     Shapes,
+    albedo,
     cut,
     join,
     parallelograms,
@@ -45,7 +47,6 @@ from adapters.street.layout import (
     stream,
 )
 from adapters.street.light import Lighting, shade, sun_share
-from adapters.street.materials import Material, albedo
 from adapters.street.objects import SIZE_M, build_furniture, build_vegetation, draw_car, draw_person
 from adapters.street.raycast import Tree, build_tree
 from augment.semantics import SemanticClass as Class

@@ -11,8 +11,7 @@ import torch
 from drivestudio_files import COUNT, START, STRIDE, hamilton, quat_of, rotation_of, write_run
 
 from adapters.base import open_scene
-from adapters.drivestudio import drivestudio_labels
-from adapters.drivestudio.adapter import read_sky, turned_faces
+from adapters.drivestudio.adapter import drivestudio_labels, read_sky, turned_faces
 from augment.cameras import Camera
 from augment.plan import make_plan
 from augment.render.rasterize import rasterize

@@ -14,8 +14,8 @@ import torch
 
 from adapters.base import open_scene
 from adapters.detect_format import recognised
-from adapters.drivestudio import drivestudio_labels, open_drivestudio
-from adapters.drivestudio.run import convention_of
+from adapters.drivestudio.adapter import drivestudio_labels, open_drivestudio
+from adapters.drivestudio.drive import convention_of
 from augment.errors import AdapterError
 from augment.sky import ConstantSky
 

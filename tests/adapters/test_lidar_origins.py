@@ -19,7 +19,7 @@ from adapters.nuscenes.labels import nuscenes_labels
 from adapters.pandaset.files import read_lidar
 from adapters.pandaset.labels import SENSORS_M, PandaSetLabels, places_at
 from adapters.recording.labels import RecordingLabels
-from adapters.street.labels import LOWEST_DEG, StreetLabels, lidar_rays
+from adapters.procedural import LOWEST_DEG, StreetLabels, lidar_rays
 from adapters.street.layout import StreetParameters
 from adapters.street_gaussians.labels import ROOF_SENSOR_M, StreetGaussiansLabels
 from augment.labels import KnowsLidarOrigins, LidarSweep

@@ -12,11 +12,17 @@ import pytest
 
 from adapters.base import open_scene
 from adapters.camera_files.camera_files import read_views
-from adapters.drivestudio.run import read_config as drivestudio_config
-from adapters.image_checks import read_image_size
+from adapters.drivestudio.drive import read_config as drivestudio_config
 from adapters.lidar_scene.image_views import read_image
 from adapters.nuscenes.tables import read_rows
-from adapters.plain_files import decode_image, inside, read_json, read_numbers, read_pose
+from adapters.plain_files import (
+    decode_image,
+    inside,
+    read_image_size,
+    read_json,
+    read_numbers,
+    read_pose,
+)
 from adapters.recording.labels import read_sweep
 from adapters.safe_pickle import read_array, read_frame
 from adapters.street_gaussians.model import read_config as street_gaussians_config

@@ -10,8 +10,7 @@ import pytest
 import torch
 
 from adapters.base import open_scene
-from adapters.procedural import open_procedural
-from adapters.street.labels import StreetTruth, TrueView, open_truth
+from adapters.procedural import StreetTruth, TrueView, open_procedural, open_truth
 from adapters.street.layout import (
     ROAD_HALF_M,
     StreetParameters,

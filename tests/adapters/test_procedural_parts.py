@@ -18,14 +18,16 @@ from adapters.street.forms import (
     boxes,
     cut,
     disc,
+    fractal_noise,
+    hashed,
     join,
     parallelograms,
     quads,
     triangle,
     tube,
+    value_noise,
 )
 from adapters.street.layout import MOUNTS, START_NS, StreetParameters, camera_offset_ns, motion_of
-from adapters.street.materials import fractal_noise, hashed, value_noise
 from adapters.street.raycast import build_tree
 from adapters.street.splats import cell_counts, make_cells, total_cells
 from adapters.street.world import build_street

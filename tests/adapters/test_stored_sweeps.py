@@ -22,7 +22,7 @@ from adapters.kitti.source import LocatedSweeps, ObjectLabels, RawLabels
 from adapters.nuscenes.labels import nuscenes_labels
 from adapters.pandaset.labels import PandaSetLabels
 from adapters.recording.labels import RecordingLabels
-from adapters.street.labels import StreetLabels
+from adapters.procedural import StreetLabels
 from adapters.street_gaussians.labels import StreetGaussiansLabels
 from augment.effects.lidar import ATTENUATED, LOST, MOVED, SCATTERED, UNCHANGED, drop_lost
 from augment.effects.lidar.beam import intensity_column

@@ -18,7 +18,7 @@ from street_gaussians_models import RawModel, RawPart, config_tree, random_part,
 
 from adapters.base import open_scene
 from adapters.detect_format import recognised
-from adapters.street_gaussians import open_street_gaussians, street_gaussians_labels
+from adapters.street_gaussians.adapter import open_street_gaussians, street_gaussians_labels
 from augment.cameras import Camera
 from augment.errors import AdapterError
 from augment.plan import make_plan

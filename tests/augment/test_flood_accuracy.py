@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from adapters.base import open_scene
-from adapters.street.labels import open_truth
+from adapters.procedural import open_truth
 from augment.ground_heights import Ground
 from augment.render.sh import evaluate_sh
 from augment.scene import Gaussians, Scene

@@ -1,7 +1,7 @@
 """Snow on a street whose true surface is known: what it covers, what it must not, and how high.
 
 Bounds are a little looser than what was measured on this street. Of few Gaussians and in coarse
-cells it is worse than the one that docs/snow.md has figures of: its own surface lies 3 cm beneath
+cells it is worse than the one that docs/effects.md has figures of: its own surface lies 3 cm beneath
 the true one, and points at edges are a larger share.
 """
 
@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from adapters.base import open_scene, parse_uri
-from adapters.street.labels import open_truth
+from adapters.procedural import open_truth
 from augment.effects.snow.placement import PlacementSettings, place_snow_support
 from augment.scene import Gaussians
 from augment.semantics import SemanticClass

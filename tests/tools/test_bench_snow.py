@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from adapters.base import parse_uri
-from adapters.street.labels import open_truth
+from adapters.procedural import open_truth
 from augment.effects.snow.cells import FLUSH, SnowCells
 from augment.semantics import SemanticClass
 from tests.streets import SMALL_STREET, open_street

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from adapters.procedural import open_procedural
-from adapters.street.labels import StreetTruth, TrueView, open_truth
+from adapters.procedural import StreetTruth, TrueView, open_truth
 from augment.cameras import Camera, Frame
 from augment.geometry import rigid
 from augment.scene import Scene

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from adapters.street.labels import open_truth
+from adapters.procedural import open_truth
 from adapters.uri import parse_uri
 from recipes.schema import Smog
 from tests.streets import open_street

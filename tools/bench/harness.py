@@ -33,6 +33,7 @@ from tqdm import tqdm
 Cell = str | float | int | None
 Action = Callable[[], object]
 Figures = dict[str, Any]
+FLIP = 1e-3  # a pixel off by more lies on the other side of a cut-off
 PACKAGES = ("climategs", "numpy", "torch", "triton", "numba", "llvmlite", "tbb", "gsplat")
 
 
@@ -197,8 +198,26 @@ def spread_ratio(over: Sequence[float], under: Sequence[float]) -> dict[str, flo
     return spread([o / u for o, u in zip(over, under, strict=True)])
 
 
+def spread_row(spread: Mapping[str, float]) -> tuple[float, float, float]:
+    """Median, least and 90 %, as tables list them."""
+    return spread["median"], spread["min"], spread["p90"]
+
+
 def median_ms(seconds: Sequence[float]) -> float:
     return 1e3 * float(np.median(seconds))
+
+
+def image_difference(own: torch.Tensor, expected: torch.Tensor) -> dict[str, float]:
+    """Of rgb [H, W, 3], the channel of each pixel that is farthest off: what 99.9 % stay below, the
+    most, and how many pixels are off by more than FLIP.
+    """
+    error = (own.detach().cpu() - expected.detach().cpu()).abs().amax(-1).numpy()
+    return {
+        "p999": float(np.quantile(error, 0.999)),
+        "max": float(error.max()),
+        "flipped": int((error > FLIP).sum()),
+        "pixels": int(error.size),
+    }
 
 
 # ---- memory and processes -----------------------------------------------------------------------
