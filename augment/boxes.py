@@ -23,8 +23,6 @@ from augment.labels import Boxes, LabelSource
 from augment.scene import Scene
 from augment.semantics import SemanticClass
 
-# ---- box pixels ----------------------------------------------------------------------------------
-
 NOT_COUNTED = -1  # in place of a number of pixels
 
 # Which surfaces a box owns. Its lowest 8 cm are left out, for the road under a car is inside the
@@ -216,10 +214,9 @@ def _inside(
     return near[kept]
 
 
-# ------------------------------------------------------------------------------------------------
-# Labelled boxes as an image shows them: outlines of the projected boxes, and what hides them
-# A box's own axes: x along its length, y its width, z its height. Pixels count from the image's
-# upper
+# --------------------------------------------------------------------------------------------------
+# Labelled boxes as an image shows them: outlines of the projected boxes, and what hides them. A
+# box's own axes: x along its length, y its width, z its height. Pixels count from the image's upper
 # left corner: the first one's centre is at 0.5.
 
 

@@ -29,9 +29,6 @@ def any_in_squares(mask: np.ndarray, side: int) -> np.ndarray:
     return padded.reshape(len(strips), -1, side).max(2).astype(bool)
 
 
-# ---- geometry ------------------------------------------------------------------------------------
-
-
 def rotmat_from_quat(quats: Float[Tensor, "*B 4"]) -> Float[Tensor, "*B 3 3"]:
     """Rotation matrices of wxyz quaternions, which need not be normalised (but not zero)."""
     w, x, y, z = torch.nn.functional.normalize(quats, dim=-1, eps=0.0).unbind(-1)

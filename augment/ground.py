@@ -36,9 +36,9 @@ from augment.render.threads import select_thread_pool
 from augment.scene import Gaussians, Scene
 from augment.semantics import SemanticClass
 
-# ------------------------------------------------------------------------------------------------
-# Which points lie on the ground, where nothing is labelled: planes through low points (RANSAC)
-# One plane does not fit a road that bends and climbs, so each WINDOW_M of the path has its own. The
+# --------------------------------------------------------------------------------------------------
+# Which points lie on the ground, where nothing is labelled: planes through low points (RANSAC). One
+# plane does not fit a road that bends and climbs, so each WINDOW_M of the path has its own. The
 # planes are open3d's; open3d is imported when they are wanted.
 
 WINDOW_M = 40.0
@@ -135,8 +135,6 @@ def _level_plane(o3d: Any, points: np.ndarray) -> np.ndarray | None:
         points = np.delete(points, inliers, axis=0)
     return None
 
-
-# ---- ground --------------------------------------------------------------------------------------
 
 logger = logging.getLogger(__name__)
 

@@ -45,9 +45,6 @@ def colors_at(sh, coefficients, weights, turn, out):
                 first = after
 
 
-# ---- box kernels ---------------------------------------------------------------------------------
-
-
 # Of one thread: it runs beside the renderer, on those that write files.
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def count_occlusion(

@@ -42,8 +42,7 @@ from recipes.errors import RecipeError
 from recipes.schema import Recipe
 from recipes.weather import Style
 
-# ------------------------------------------------------------------------------------------------
-# A recipe's weather put into a scene: heights and reasons become numbers that kernels take
+# ---- A recipe's weather put into a scene: heights and reasons become numbers that kernels take ---
 
 MIN_DEPTH_M = 0.05  # waves run in at least this much water
 
@@ -172,9 +171,6 @@ def _lowest_of_actor(actor: Actor) -> float:
 def gaussians_below(scene: Scene, level_z_m: float) -> bool:
     """Whether any splat of the scene reaches below a height: else no water stands anywhere."""
     return lowest_z_m(scene) < level_z_m
-
-
-# ---- plan ----------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

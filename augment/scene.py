@@ -236,8 +236,6 @@ def _colors_by_kernel(
     return torch.from_numpy(out)
 
 
-# ---- scene ---------------------------------------------------------------------------------------
-
 MAX_EXTENT_M = 1e7  # float32 tells metres apart there, and squares and cells are still numbers
 SH_COUNTS = (1, 4, 9, 16)  # K = (degree + 1)^2 for degrees 0 to 3
 

@@ -26,8 +26,6 @@ from augment.sky import Sky
 from augment.timing import timed
 from recipes.schema import Recipe
 
-# ---- views ---------------------------------------------------------------------------------------
-
 SURFACE_ALPHA = 0.5  # a pixel less covered than this shows more sky than surface: it has no depth
 
 
@@ -164,9 +162,9 @@ class PendingView:
         return self._view
 
 
-# ------------------------------------------------------------------------------------------------
-# The images of a finished view as files hold them: 8 bits, depth, classes, instances and masks
-# On the CPU they are made here, image by image. On a GPU one kernel makes all of them, and one copy
+# --------------------------------------------------------------------------------------------------
+# The images of a finished view as files hold them: 8 bits, depth, classes, instances and masks. On
+# the CPU they are made here, image by image. On a GPU one kernel makes all of them, and one copy
 # brings them back (augment.render.cuda.images).
 
 

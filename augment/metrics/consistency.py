@@ -35,8 +35,6 @@ from augment.jobs.tables import FrameBoxes
 from augment.labels import Boxes
 from augment.scene import Track
 
-# ---- consistency ---------------------------------------------------------------------------------
-
 MIN_ALPHA = 0.95
 RELATIVE_TOLERANCE, TOLERANCE_M = 0.01, 0.05  # of depth; the sum of both is allowed
 _NEIGHBOURS = ((0, 0), (0, 1), (1, 0), (1, 1))
@@ -185,19 +183,15 @@ def _places(world: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray, 
 
 # ---- Where things inside labelled boxes go from the time of one picture to that of another -------
 # A box is a rigid body. Its pose at a picture's own time is linear in position and slerp in
-# rotation
-# between the labels before and after, as the renderer poses actors. A pixel shows a box by the rule
-# of `augment.boxes`. From picture A to picture B a pixel of a box that moves goes along with
-# it.
-# Left out are: pixels of a moving box whose pose is not known at one of the two times; pixels that
-# show two of them; and, in both pictures, what else lies within MARGIN_M of a moving box: the road
-# under a car, which has its shadow, its own parts that reach beyond the label, blurred edges.
-#
-# Boxes that move less than STILL_M between the two times stand, and what they hold is the world's.
-#
-# A pose is known from HOLD_NS before a track's first label to as long after its last, and not
-# within
-# gaps of more than MAX_GAP_NS. A box whose nearest label is further away than that is not there.
+# rotation between the labels before and after, as the renderer poses actors. A pixel shows a box by
+# the rule of `augment.boxes`. From picture A to picture B a pixel of a box that moves goes along
+# with it. Left out are: pixels of a moving box whose pose is not known at one of the two times;
+# pixels that show two of them; and, in both pictures, what else lies within MARGIN_M of a moving
+# box: the road under a car, which has its shadow, its own parts that reach beyond the label,
+# blurred edges. Boxes that move less than STILL_M between the two times stand, and what they hold
+# is the world's. A pose is known from HOLD_NS before a track's first label to as long after its
+# last, and not within gaps of more than MAX_GAP_NS. A box whose nearest label is further away than
+# that is not there.
 
 MARGIN_M = 0.5
 STILL_M = 0.03  # of any corner; labels of parked cars tremble, and depths may differ by more

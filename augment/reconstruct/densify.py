@@ -36,8 +36,7 @@ class DensifyReport:
 # gradient but a large absolute one. Departures: growth has a budget (the best of each round, as in
 # Rota Bulò et al. 2024) instead of a threshold alone, opacity is corrected, and opacities are never
 # reset: that is a cure for clutter from a random start, while these splats start on measured
-# surfaces
-# and lose more by being made transparent than clutter costs.
+# surfaces and lose more by being made transparent than clutter costs.
 
 GRADIENT_FLOOR = 1e-4  # an eighth of gsplat's threshold for the same measure: the budget decides
 SPLIT_RADIUS = 0.004  # one sigma, of the image's larger side: two pixels of 480
@@ -302,8 +301,6 @@ def add_noise(splats: Splats, rows: np.ndarray | None, lr: float, rng: np.random
     local = sigma * rng.standard_normal((len(rows), 3), dtype=np.float32)
     splats.means[rows] += rotate(splats.quats[rows], local)
 
-
-# ---- densify -------------------------------------------------------------------------------------
 
 __all__ = ["DensifyReport", "add_noise", "densify", "densify_due", "grows", "rebuild"]
 

@@ -30,8 +30,7 @@ from augment.render.cpu.project import write_basis
 from augment.render.cpu.simd import LOG2_E, exp2_fine, floats_at
 from augment.render.layout import BLOCK, LANES, V_FOCAL, V_ROTATION, U
 
-# ------------------------------------------------------------------------------------------------
-# Numba kernel: how the loss pulls at whole parts, from the gradients of their splats' means
+# ---- Numba kernel: how the loss pulls at whole parts, from the gradients of their splats' means --
 
 # Of a block, with g = dL/d mean and p the mean: sums of g (3) and p x g (3), to which is added what
 # turning the splats themselves does.
@@ -76,8 +75,6 @@ def sum_forces(addresses, sizes, blocks, rows, ids, counts, moments):
 def _three(array, at):
     return np.float64(array[at]), np.float64(array[at + U(1)]), np.float64(array[at + U(2)])
 
-
-# ---- adam kernels --------------------------------------------------------------------------------
 
 # Numbers of an update, float32: step sizes of a row's first 16 columns as GRAD lists them (negative
 # for opacity, whose odds are divided), of the SH, and the rest.

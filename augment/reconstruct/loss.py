@@ -121,8 +121,6 @@ class LossScratch:
         return self._skies[size]
 
 
-# ---- loss ----------------------------------------------------------------------------------------
-
 IDENTITY_MAP = np.eye(3, 4, dtype=np.float32)
 
 

@@ -27,8 +27,8 @@ from numba import prange
 from augment.render.cpu import simd as v8
 from augment.render.cpu.jit import inner, kernel
 
-# ------------------------------------------------------------------------------------------------
-# Numba kernels for a sky that is learnt: a cube map's colours behind a view, and their gradient
+# --------------------------------------------------------------------------------------------------
+# Numba kernels for a sky that is learnt: a cube map's colours behind a view, and their gradient.
 # The lookup is `augment.sky.sample_within_faces`, bilinear and clamped at the edge of a face. What
 # it found is kept (texel, fractions), so that the way back computes no direction again.
 
@@ -199,8 +199,6 @@ def compare_depth(expected, alpha, pixels, depth, weight, factor, least_alpha, d
             d_expected[pixel] = -slope if error > zero else slope if error < zero else zero
         sums[chunk] = total
 
-
-# ---- loss kernels --------------------------------------------------------------------------------
 
 U = np.uint64
 LANES = v8.LANES

@@ -44,8 +44,6 @@ def paint_below_horizon(faces: np.ndarray) -> np.ndarray:
     return z >= _BELOW
 
 
-# ---- loss reference ------------------------------------------------------------------------------
-
 RADIUS, SIGMA = 5, 1.5
 C1, C2 = 0.01**2, 0.03**2
 MIN_SKY = 1e-3  # less of the sky shows at most a quarter of an 8-bit step

@@ -47,8 +47,6 @@ def decayed(start: float, end: float, done: float) -> float:
     return start ** (1 - done) * end**done if start and end else 0.0
 
 
-# ---- dense adam ----------------------------------------------------------------------------------
-
 _EPS = 1e-15
 
 

@@ -90,7 +90,7 @@ class Knots:
         self.values[row] -= rates * first / (np.sqrt(second) + _EPS)
 
 
-# ------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # How the loss of a view pulls at rigid things: at every part of the scene, and at the camera
 
 
@@ -137,8 +137,6 @@ def part_forces(inputs: Inputs, grads: SplatGradients) -> Forces:
     seen = np.bincount(inputs.blocks[:, 0], grads.counts, minlength=parts) > 0
     return Forces(seen, totals[:, :3], totals[:, 3:])
 
-
-# ---- poses ---------------------------------------------------------------------------------------
 
 KNOT_EVERY = 4  # track samples between an actor's knots
 _REACH_M = 2.0  # a turn moves an actor's points about this far from its origin as a shift does

@@ -24,8 +24,7 @@ from augment.scene import Gaussians, PosedGaussians
 # ---- Views of a fit rendered, and their gradients found, by gsplat on a GPU ----------------------
 # The GPU holds a copy of all splats; what a step changed on the CPU, it is sent: the rows of the
 # splats that the view showed. Back come the image and those splats' gradients. gsplat adds shares
-# up
-# in no fixed order, so a fit's bits do not repeat.
+# up in no fixed order, so a fit's bits do not repeat.
 
 _FIELDS = ("means", "quats", "scales", "opacities", "sh")
 _MIN_DET = 1e-30  # of a conic, px^-4
@@ -183,8 +182,6 @@ def _slope(tensor: Tensor) -> Tensor:
 def _array(tensor: Tensor) -> np.ndarray:
     return np.ascontiguousarray(tensor.detach().cpu().numpy())
 
-
-# ---- renderers -----------------------------------------------------------------------------------
 
 DEVICES = ("cpu", "cuda")
 

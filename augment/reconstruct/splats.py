@@ -11,8 +11,6 @@ import torch
 from augment.errors import SceneError
 from augment.scene import SH_COUNTS, Gaussians
 
-# ---- splats --------------------------------------------------------------------------------------
-
 # Columns of the geometry's moments, two registers: means 3, quats 4, one unused, logarithms of
 # scales 3, logit of opacity 1, four unused.
 GEOMETRY = 16

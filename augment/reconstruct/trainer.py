@@ -41,8 +41,7 @@ from augment.rng import rng_for
 from augment.scene import Scene
 from augment.sky import CubemapSky
 
-# ------------------------------------------------------------------------------------------------
-# The splats of a view as the CPU kernels take them: addresses into the arrays being fitted
+# ---- The splats of a view as the CPU kernels take them: addresses into the arrays being fitted ---
 
 _FIELDS = ("means", "quats", "scales", "opacities", "sh")
 
@@ -90,8 +89,6 @@ def _blocks(counts: np.ndarray) -> np.ndarray:
     last = np.minimum(first + layout.BLOCK, counts[part])
     return np.stack([part, first, last], 1).astype(np.int64)
 
-
-# ---- trainer -------------------------------------------------------------------------------------
 
 _IDENTITY = np.eye(3, 4, dtype=np.float32)
 

@@ -72,8 +72,6 @@ def _obstacle(importing: object) -> str | None:
     return None
 
 
-# ---- buffers -------------------------------------------------------------------------------------
-
 RGB, ALPHA, EXPECTED_DEPTH, MEDIAN_DEPTH, SPLAT_IDS, MODE_DEPTH, SNOW = (
     "rgb",
     "alpha",

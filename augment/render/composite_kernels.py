@@ -29,9 +29,6 @@ def renormalise_alpha(alpha, rgb, snow, least):
                     snow[pixel] *= scale
 
 
-# ---- composite kernels ---------------------------------------------------------------------------
-
-
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
 def composite_cubemap(rgb, alpha, faces, rotation, ifx, ify, cx, cy, strength, airlight, out):
     """out = rgb + (1 - alpha) sky of a cube map, through smog where strength >= 0.

@@ -83,8 +83,6 @@ class HeightClip:
 UNCUT = HeightClip(z_m=-1e9, keep="above")
 
 
-# ---- layout --------------------------------------------------------------------------------------
-
 U = np.uint64
 LANES = 8  # pixels or splats in one register
 

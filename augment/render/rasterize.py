@@ -37,13 +37,11 @@ from augment.render.reference import rasterize_reference
 from augment.render.sh import MAX_DEGREE
 from augment.scene import Gaussians, PosedGaussians
 
-# ------------------------------------------------------------------------------------------------
-# What shines through pixels that a raised transmittance stop has finished: more of the same
+# ---- What shines through pixels that a raised transmittance stop has finished: more of the same --
 # Behind the stop nothing has been blended, so at most this share of a pixel is unknown. Left
 # transparent it would show the sky through every wall; instead, what the pixel has blended stands
-# for
-# it: rgb and snow are divided by alpha, which becomes 1. At the default stop and below nothing is
-# done: 1e-4 is less than 8 bits show, and gsplat leaves it transparent, too.
+# for it: rgb and snow are divided by alpha, which becomes 1. At the default stop and below nothing
+# is done: 1e-4 is less than 8 bits show, and gsplat leaves it transparent, too.
 
 
 def needs_remainder(stop: float) -> bool:
@@ -92,8 +90,6 @@ def _by_kernel(alpha: Tensor, images: dict[str, Tensor], stop: float) -> None:
             np.float32(1 - stop),
         )
 
-
-# ---- rasterize -----------------------------------------------------------------------------------
 
 logger = logging.getLogger(__name__)
 

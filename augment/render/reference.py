@@ -379,8 +379,6 @@ def order_by_depth(splats: Splats) -> Splats:
     return splats.select(torch.argsort(splats.depths.detach().float(), stable=True))
 
 
-# ---- reference -----------------------------------------------------------------------------------
-
 TILE = 16  # pixels a side
 # Splats of a tile that are blended at once. 256 pixels x 96 splats stay in a core's cache, and
 # torch keeps so few values on one thread; handing them to others would cost more than the work,

@@ -15,8 +15,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-# ---- sh ------------------------------------------------------------------------------------------
-
 MAX_DEGREE = 3
 SH_C0 = 0.5 * math.sqrt(1 / math.pi)  # the constant function of band 0
 
@@ -115,8 +113,7 @@ def _sphere_samples(count: int) -> Float[Tensor, "S 3"]:
     return torch.stack([radius * torch.cos(angle), radius * torch.sin(angle), z], -1)
 
 
-# ------------------------------------------------------------------------------------------------
-# What the kernels that fold colour maps into spherical harmonics are given, on CPU and GPU
+# ---- What the kernels that fold colour maps into spherical harmonics are given, on CPU and GPU ---
 
 FOLDED = 13  # numbers of a folded map: 9 of M row by row, 3 that the first function gets, changes
 BLACK = np.float32(-0.5 / SH_C0)  # sh_00 of a colour of 0

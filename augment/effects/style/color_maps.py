@@ -83,16 +83,13 @@ def with_strength(color_map: Float[Tensor, "*B 3 4"], strength: float) -> Float[
     return torch.lerp(torch.eye(3, 4, dtype=color_map.dtype), color_map, strength)
 
 
-# ------------------------------------------------------------------------------------------------
-# Splats that paint sky: what of a fitted scene has to change with the sky and not with the land
-# A fit fills gaps at the skyline, between wires, branches and roofs, with splats of the sky's
-# colour.
+# --------------------------------------------------------------------------------------------------
+# Splats that paint sky: what of a fitted scene has to change with the sky and not with the land. A
+# fit fills gaps at the skyline, between wires, branches and roofs, with splats of the sky's colour.
 # Under the land's map they would stay behind as halos when the sky's map is another. What paints
-# sky
-# stands above the horizon and has the colour of the sky behind it, where that is what the cameras
-# see
-# as sky: a cube map behind a wall holds whatever the fit left there, and a wall that is as pale as
-# the clouds beside it may still differ from the sky behind it.
+# sky stands above the horizon and has the colour of the sky behind it, where that is what the
+# cameras see as sky: a cube map behind a wall holds whatever the fit left there, and a wall that is
+# as pale as the clouds beside it may still differ from the sky behind it.
 
 LEVELS = 8  # steps from a splat of the land to one of the sky
 _NEAR, _FAR = 0.06, 0.16  # greatest difference of a channel: sky up to here, none from there
@@ -181,8 +178,6 @@ def _ramp(value: np.ndarray, none: float, full: float) -> np.ndarray:
     """0 at `none` and beyond, 1 at `full` and beyond, straight between."""
     return np.clip((value - none) / (full - none), 0, 1)
 
-
-# ---- apply ---------------------------------------------------------------------------------------
 
 BLOCKS = 4  # pieces of work that a thread takes at a time
 

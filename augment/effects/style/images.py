@@ -22,9 +22,9 @@ from augment.errors import StyleError
 from augment.files.image_size import FORMATS, ImageHeader, image_header
 from recipes.files import open_file
 
-# ------------------------------------------------------------------------------------------------
-# Where a picture shows sky, vegetation and road: by colour and place, and only where it is clear
-# A region that is missed costs little: the map of the whole picture, or of all the land, stands in
+# --------------------------------------------------------------------------------------------------
+# Where a picture shows sky, vegetation and road: by colour and place, and only where it is clear. A
+# region that is missed costs little: the map of the whole picture, or of all the land, stands in
 # for it. One that is wrong gives a sky the colours of a wall. So every rule here leans towards
 # none.
 
@@ -192,8 +192,6 @@ def _road(rgb: np.ndarray) -> np.ndarray:
     touching = np.unique(parts[-1])
     return _full(np.isin(parts, touching[touching > 0]), rgb.shape)
 
-
-# ---- images --------------------------------------------------------------------------------------
 
 SIDE_PX = 512  # colours need no more, and everything after the reading costs the same for any file
 MAX_BYTES = 256 * 1024**2

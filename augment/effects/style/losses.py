@@ -38,8 +38,7 @@ from augment.files.checkpoints import read_state_dict
 # ---- Features of pictures whose means and deviations say what a picture's style is ---------------
 # The paper takes layers of VGG-19, trained on ImageNet (Simonyan & Zisserman 2015); a user who has
 # the weights names their file. Where there is none, a bank of fixed filters is the stand-in: it
-# knows
-# colours and contrasts at several scales, and nothing of what things are.
+# knows colours and contrasts at several scales, and nothing of what things are.
 
 Features = tuple[Tensor, ...]  # [B, C, h, w] of every layer
 
@@ -67,7 +66,7 @@ def open_features(weights: Path | None) -> FeatureExtractor:
     return FilterBank() if weights is None else load_vgg19(weights)
 
 
-# ---- VGG-19 -----------------------------------------------------------------------------------
+# ---- VGG-19 --------------------------------------------------------------------------------------
 
 # Channels of the convolutions up to relu4_1, blocks parted by pooling; and the relus whose outputs
 # are taken, by the numbers that torchvision gives them.
@@ -151,8 +150,6 @@ def load_vgg19(path: Path, *, width: float = 1.0) -> Vgg19:
     return network
 
 
-# ---- a bank of filters ------------------------------------------------------------------------
-
 # Directions of RGB space. Deviations along six of them in general position determine a covariance:
 # luminance, red against green and blue against yellow; then the channels and their differences.
 _OPPONENT = (
@@ -223,8 +220,6 @@ def _edges(x: Tensor) -> Tensor:
     )
     return _CONTRAST_GAIN * torch.cat([slopes.relu(), (-slopes).relu()], 1)
 
-
-# ---- losses --------------------------------------------------------------------------------------
 
 MIN_VARIANCE = 1e-6  # under the root: a constant feature has a deviation with a gradient
 

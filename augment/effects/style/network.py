@@ -192,10 +192,10 @@ _TORCHVISION_FIRST = {  # the first stack expands nothing
 
 # ---- A picture's colour moments, and the linear maps between them and a mean photo's -------------
 # What a global linear map can do depends mostly on the mean and the covariance of the colours,
-# which
-# no stack of convolutions gives exactly. So the encoders get them computed, and the maps that they
-# predict start at the transport of the picture's moments to a mean photo's (content stage) and back
-# (style stage). Both are symmetric and depend on one picture only, as the two stages of GSCM do.
+# which no stack of convolutions gives exactly. So the encoders get them computed, and the maps that
+# they predict start at the transport of the picture's moments to a mean photo's (content stage) and
+# back (style stage). Both are symmetric and depend on one picture only, as the two stages of GSCM
+# do.
 
 # Of 87 photos (kodak and open, 128 x 128): mean over photos of their colours' mean and covariance.
 REFERENCE_MEAN = (0.43, 0.43, 0.42)
@@ -314,8 +314,6 @@ def _levels(normal: Float[Tensor, "B 3 R R"]) -> Float[Tensor, "B F"]:
         found += [gain - 1.2, -gain * low]
     return torch.cat(found, dim=1)
 
-
-# ---- network -------------------------------------------------------------------------------------
 
 SIZE_PX = 256  # of the pictures that the encoder is given
 LATENT = 16  # the paper's k
@@ -459,12 +457,11 @@ def _basis(rows: int, k: int) -> Float[Tensor, "rows k"]:
     return (basis / basis.norm(dim=1, keepdim=True)).float()
 
 
-# ------------------------------------------------------------------------------------------------
-# Style networks in files: safetensors, with what the network is and where it comes from as JSON
+# --------------------------------------------------------------------------------------------------
+# Style networks in files: safetensors, with what the network is and where it comes from as JSON.
 # The file's metadata hold one entry, `climategs.gscm`, a JSON object: format (1), encoder, k,
-# offset,
-# moments, size (px of the pictures) and about (training facts, free). Tensors may be stored in half
-# precision; they are float32 in memory.
+# offset, moments, size (px of the pictures) and about (training facts, free). Tensors may be stored
+# in half precision; they are float32 in memory.
 
 FORMAT = 1
 METADATA_KEY = "climategs.gscm"

@@ -17,8 +17,6 @@ from torch.nn import functional
 
 from augment.effects.style.network import Gscm, apply_map, compose
 
-# ---- pairs ---------------------------------------------------------------------------------------
-
 GREY = (0.2126, 0.7152, 0.0722)  # luma of sRGB's primaries (ITU-R BT.709)
 
 MIXED_SHARE = 0.5  # of a batch's photos that share their square with another

@@ -35,8 +35,6 @@ from augment.effects.style.statistics import ColorStatistics, mkl_map, reinhard_
 from augment.effects.style.train import Draw, transfer_maps
 from augment.metrics.image import ssim
 
-# ---- scores --------------------------------------------------------------------------------------
-
 OVERSATURATED = 0.2  # of the pixels
 SATURATED = 254.5 / 255  # of a channel: displayed as full
 
@@ -206,8 +204,8 @@ def _gradient(picture: Float[Tensor, "3 H W"]) -> np.ndarray:
     return torch.hypot(across, down)[..., None].expand(-1, -1, 3).numpy()
 
 
-# ------------------------------------------------------------------------------------------------
-# What the style network's training is worth, by the losses' own measures: for curves, ablations
+# --------------------------------------------------------------------------------------------------
+# What the style network's training is worth, by the losses' own measures: for curves, ablations.
 # They are defined on one fixed draw of contents and styles, so that networks can be compared.
 
 DEFINITIONS = {

@@ -17,8 +17,6 @@ from torch import Tensor
 from augment.effects.style.color_maps import CLASSES, StyleMaps
 from augment.semantics import SemanticClass
 
-# ---- statistics ----------------------------------------------------------------------------------
-
 WHOLE, SKY, LAND = "whole", "sky", "land"  # land: all but the sky
 VEGETATION, ROAD, REST = "vegetation", "road", "rest"  # of the land
 REGIONS = (WHOLE, SKY, LAND, VEGETATION, ROAD, REST)

@@ -289,8 +289,6 @@ def _numbers(value: Any, shape: tuple[int, ...], where: str) -> np.ndarray:
     return array.astype(np.float64)
 
 
-# ---- looks ---------------------------------------------------------------------------------------
-
 _MAX_LOOKS = 4  # of a scene, that are kept: a job goes through its variants frame by frame
 
 

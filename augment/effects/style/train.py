@@ -47,8 +47,7 @@ from augment.effects.style.scene_views import (
 from augment.errors import StyleError
 from augment.scene import Scene
 
-# ------------------------------------------------------------------------------------------------
-# How the style network is trained: lengths, weights and schedule, the paper's where it says
+# ---- How the style network is trained: lengths, weights and schedule, the paper's where it says --
 
 Through = Literal["picture", "renderer"]
 LEARNING_RATES = {"small": 1e-3, "b0": 1e-4}  # the paper's is B0's, which starts from ImageNet
@@ -123,8 +122,7 @@ class StyleTrainConfig:
             raise ValueError(f"{name} must be {wanted}; got {getattr(self, name)!r}")
 
 
-# ------------------------------------------------------------------------------------------------
-# What the style network is trained on: views of scenes and photographs, drawn step by step
+# ---- What the style network is trained on: views of scenes and photographs, drawn step by step ---
 # A photograph is taken for a scene of one Gaussian a pixel, so that the same losses hold for it.
 
 Recolor = Callable[[Tensor, torch.Generator], Tensor]  # [B, 3, H, W] in [0, 1] to the same
@@ -277,8 +275,6 @@ def _sample(colors: GaussianColors, count: int, generator: torch.Generator) -> G
 def _integer(below: int, generator: torch.Generator) -> int:
     return int(torch.randint(below, (1,), generator=generator))
 
-
-# ---- trainer -------------------------------------------------------------------------------------
 
 THREADS = 1
 CYCLE, CONSISTENCY, STYLE, PAIRS = "cycle", "consistency", "style", "pairs"

@@ -39,8 +39,6 @@ from augment.render.sh import sh_basis
 from augment.render.threads import kernel_threads
 from augment.scene import Gaussians, PosedGaussians
 
-# ---- cpu backward --------------------------------------------------------------------------------
-
 _RANGES = 8  # pieces of work in adding up shares
 
 

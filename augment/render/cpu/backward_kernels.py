@@ -65,8 +65,6 @@ from augment.render.layout import (
     U,
 )
 
-# ---- cpu blend backward --------------------------------------------------------------------------
-
 # Of a list entry, one cache line: sums of g, g off, g off^2, g dy, g off dy, g dy^2, and of
 # |dL/d mean| along x (over 2 sharp) and y (over 2); then dL/d colour (3) and z.
 SHARE = 16
@@ -306,8 +304,8 @@ def sum_shares(tile_splat_ids, tile_offsets, reached, shares, ranges, sums, touc
                         v8.store(sums, at + i, total)
 
 
-# ------------------------------------------------------------------------------------------------
-# Numba kernel: from gradients of a splat's ellipse, depth and colour to those of its Gaussian
+# --------------------------------------------------------------------------------------------------
+# Numba kernel: from gradients of a splat's ellipse, depth and colour to those of its Gaussian.
 # Eight splats at a time the projection of cpu_geometry is repeated and its chain rule followed
 # backwards. Names: g_a is dL/da.
 

@@ -59,8 +59,7 @@ from augment.render.mode_depth import BETA_PER_SIGMA, FARTHER, GAMMA, NEARER
 
 # ---- Numba kernels: order splats by depth, and list them tile by tile in that order --------------
 # The projection has counted each block's splats by bins of z. Sorting moves them to their bins,
-# block
-# after block, then sorts every bin within the cache; both keep equal depths in index order.
+# block after block, then sorts every bin within the cache; both keep equal depths in index order.
 
 _DIGIT_BITS = BIN_SHIFT // 2  # what z bins leave to sort, in two passes
 _DIGITS = 1 << _DIGIT_BITS
@@ -268,8 +267,6 @@ def _spread(mass, moment, square):
 def _mode(first, mass, moment, spread):
     return first + (moment - v8.splat(_BACK) * v8.sqrt(spread)) / mass
 
-
-# ---- cpu blend -----------------------------------------------------------------------------------
 
 GROUP = 8  # tiles a thread takes at a time
 

@@ -125,9 +125,9 @@ def _color_maps(part: PosedGaussians) -> tuple[np.ndarray, np.ndarray]:
     return maps, rows
 
 
-# ------------------------------------------------------------------------------------------------
-# Work space of the CPU rasteriser, kept between frames: fresh pages cost as much as the work
-# Every render takes a space of its own, so threads that render at once never share one.
+# --------------------------------------------------------------------------------------------------
+# Work space of the CPU rasteriser, kept between frames: fresh pages cost as much as the work. Every
+# render takes a space of its own, so threads that render at once never share one.
 
 _LINE = 64  # bytes of a cache line
 _KEPT = 2  # spaces kept for later renders; a process rarely renders in more threads
@@ -172,8 +172,6 @@ def release_scratch() -> None:
     """Give all kept memory back; the next render takes it anew."""
     _SPACES.clear()
 
-
-# ---- cpu -----------------------------------------------------------------------------------------
 
 _RANK_RUNS = 8  # pieces of work in ranking, each with its own histogram
 # A slice ends where the splats before it would cover every pixel this many times over with opacity

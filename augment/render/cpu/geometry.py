@@ -153,9 +153,6 @@ def list_items(staged, count, strip, spans, values, places):
     return items
 
 
-# ---- cpu geometry --------------------------------------------------------------------------------
-
-
 @inner()
 def gather3(array, picked, at):
     """Rows of a [N, 3] array."""
@@ -279,7 +276,7 @@ def rotation_from_quats(quats, picked, at):
     )
 
 
-# ------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Numba functions: splats cut at a height (see augment.render.layout for the geometry, layout for
 # what is stored of it).
 
@@ -439,9 +436,9 @@ def kept_share(lines, values, splat, item):
     return v8.maximum(v8.minimum(value, one), zero)
 
 
-# ------------------------------------------------------------------------------------------------
-# Numba functions: light by the normal of every pixel of a splat (see augment.render.shading)
-# A splat's lights are LINES float32, as there; all 0 for a splat of one colour.
+# --------------------------------------------------------------------------------------------------
+# Numba functions: light by the normal of every pixel of a splat (see augment.render.shading). A
+# splat's lights are LINES float32, as there; all 0 for a splat of one colour.
 
 SHADING_LINES = 9
 L_FACING, L_X, L_Y, L_WRAP, L_LEAN_X, L_LEAN_Y, L_RED, L_GREEN, L_BLUE = range(SHADING_LINES)

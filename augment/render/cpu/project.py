@@ -107,8 +107,7 @@ from augment.render.layout import (
 
 # ---- Numba kernels: what colour a splat shows to the camera. SH of degrees 0 to 3, then smog -----
 # Eight splats at a time for what depends on the direction alone (`prepare_colors`), one at a time
-# for
-# the sum over its coefficients (`write_color`), which are read where they lie in the scene.
+# for the sum over its coefficients (`write_color`), which are read where they lie in the scene.
 
 MAX_FUNCTIONS = 16
 THROUGH = MAX_FUNCTIONS  # row of the smog's transmittance, after those of the SH functions
@@ -274,8 +273,6 @@ def add_direction_slopes(x, y, z, functions, rows):
         gz = gz - two * four * a13 * x * z + a14 * (xx - yy)
     return gx, gy, gz
 
-
-# ---- cpu project ---------------------------------------------------------------------------------
 
 # Rows of eight that the projection leaves for writing: a record, the pixels a splat covers, colour.
 _COLOR = 0

@@ -21,8 +21,6 @@ from numba.extending import intrinsic, lower_builtin, models, register_model
 
 from augment.render.cpu.jit import inner
 
-# ---- cpu simd ------------------------------------------------------------------------------------
-
 LANES = 8
 
 _INT = ir.IntType(32)

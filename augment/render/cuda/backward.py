@@ -125,9 +125,6 @@ def sh_gradients(
     return d_sh
 
 
-# ---- cuda autograd -------------------------------------------------------------------------------
-
-
 def rasterize_with_gradients(
     parts: Sequence[PosedGaussians],
     camera: Camera,

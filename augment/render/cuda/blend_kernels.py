@@ -108,8 +108,8 @@ def list_pairs(
     tl.store(owners + pair, row.to(tl.int32), mask=is_there)
 
 
-# ------------------------------------------------------------------------------------------------
-# Triton functions: mode depth (augment.render.mode_depth), one sample of every pixel at a time
+# --------------------------------------------------------------------------------------------------
+# Triton functions: mode depth (augment.render.mode_depth), one sample of every pixel at a time.
 # Sums are kept times the cluster's weight, so that a sample that joins costs no division and no
 # root.
 
@@ -176,8 +176,6 @@ def _spread(mass, moment, square):
 def _mode(first, mass, moment, spread):
     return first + (moment - BACK * tl.sqrt(spread)) / tl.where(mass > 0, mass, 1.0)
 
-
-# ---- cuda blend kernels --------------------------------------------------------------------------
 
 # Records and cuts are read four numbers at a time, in their order (the launch module checks it).
 TILE = tl.constexpr(cuda_splats.TILE)

@@ -258,9 +258,6 @@ def _empty(name: str, camera: Camera, splats: CudaSplats) -> Tensor:
     )
 
 
-# ---- cuda ----------------------------------------------------------------------------------------
-
-
 def rasterize_cuda(
     parts: Sequence[PosedGaussians],
     camera: Camera,

@@ -12,8 +12,8 @@ import triton.language as tl
 
 from augment.effects import smog
 
-# ------------------------------------------------------------------------------------------------
-# Triton functions: the sky in a direction, and what is seen of it and of surfaces through smog
+# --------------------------------------------------------------------------------------------------
+# Triton functions: the sky in a direction, and what is seen of it and of surfaces through smog.
 # Definitions: augment.sky, augment.effects.smog.
 
 LOG2_E = tl.constexpr(math.log2(math.e))
@@ -96,8 +96,8 @@ def _bilinear(first, side, fc, fr, mask):
     return top * (1.0 - fr) + bottom * fr
 
 
-# ------------------------------------------------------------------------------------------------
-# Triton kernels: the sky behind the splats, smog on finished images, colour maps, finished pixels
+# --------------------------------------------------------------------------------------------------
+# Triton kernels: the sky behind the splats, smog on finished images, colour maps, finished pixels.
 # Images are flat: pixel p is column p % width of row p // width.
 
 
@@ -236,8 +236,6 @@ def renormalise_alpha(alpha, rgb, snow, count, least, BLOCK: tl.constexpr):
         value = tl.load(snow + pixel, done, 0.0)
         tl.store(snow + pixel, value * scale, done)
 
-
-# ---- cuda images kernels -------------------------------------------------------------------------
 
 # Columns of the table of parts, int64 [parts, 3].
 FIRST, CLASSES, INSTANCE = tl.constexpr(0), tl.constexpr(1), tl.constexpr(2)

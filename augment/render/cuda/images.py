@@ -19,8 +19,8 @@ from augment.scene import PosedGaussians
 from augment.semantics import SemanticClass
 from augment.views import SURFACE_ALPHA, RequestedImages, ViewImages
 
-# ------------------------------------------------------------------------------------------------
-# Launches of the passes over finished images on the GPU. Images are float32, without gradients
+# --------------------------------------------------------------------------------------------------
+# Launches of the passes over finished images on the GPU. Images are float32, without gradients.
 # Definitions: augment.render.composite, augment.effects.smog, augment.render.rasterize.
 
 BLOCK = 128  # pixels of a program: one a thread, which needs few registers and no exchange
@@ -118,8 +118,6 @@ def _rays(camera: Camera) -> tuple[float, float, float, float]:
     """cx, cy, 1 / fx, 1 / fy."""
     return camera.cx, camera.cy, 1 / camera.fx, 1 / camera.fy
 
-
-# ---- cuda images ---------------------------------------------------------------------------------
 
 QUANTIZE_BLOCK = 512  # pixels of a program: four a thread, whose bytes are written as words
 ALIGNMENT = 16  # bytes, of every image in the memory that is copied

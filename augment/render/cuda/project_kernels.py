@@ -156,8 +156,7 @@ def image_axes(x, y, inverse, columns, sizes, view):
     return along_axes(right, columns, sizes), along_axes(down, columns, sizes)
 
 
-# ------------------------------------------------------------------------------------------------
-# Triton functions: what colour a splat shows to the camera. SH of degrees 0 to 3, then smog
+# ---- Triton functions: what colour a splat shows to the camera. SH of degrees 0 to 3, then smog --
 
 LAYERED_SMOG = tl.constexpr(layout.LAYERED_SMOG)
 MAP = tl.constexpr(layout.MAP)
@@ -302,7 +301,7 @@ def in_smog(color, transmittance, view):
     )
 
 
-# ---- Triton functions: splats cut at a height (see augment.render.layout)
+# ---- Triton functions: splats cut at a height (see augment.render.layout) ------------------------
 # --------------------------
 
 FAR = tl.constexpr(clip.FAR_PX)
@@ -362,8 +361,7 @@ def _depth_slope(x, y, z):
     return gx / det, gy / det
 
 
-# ------------------------------------------------------------------------------------------------
-# Triton functions: lines of splats that are lit pixel by pixel (see augment.render.shading)
+# ---- Triton functions: lines of splats that are lit pixel by pixel (see augment.render.shading) --
 
 MIN_FACING = tl.constexpr(shading.MIN_FACING)
 V_SUN, V_WRAP = tl.constexpr(layout.V_SUN), tl.constexpr(layout.V_WRAP)
@@ -397,8 +395,6 @@ def store_lights(lines, normals, points, slopes, transmittance, lit, mask, view)
     tl.store(lines + 7, transmittance * slopes[1], mask)
     tl.store(lines + 8, transmittance * slopes[2], mask)
 
-
-# ---- cuda project kernels ------------------------------------------------------------------------
 
 COLUMNS = tl.constexpr(cuda_inputs.COLUMNS)
 T_COUNT, T_FUNCTIONS = tl.constexpr(cuda_inputs.T_COUNT), tl.constexpr(cuda_inputs.T_FUNCTIONS)

@@ -18,8 +18,6 @@ from torch import Tensor
 
 from augment.errors import BackendUnavailable
 
-# ---- gpu -----------------------------------------------------------------------------------------
-
 
 def check_can_run() -> None:
     """Raises BackendUnavailable, which says why Triton's kernels cannot run here."""

@@ -137,8 +137,6 @@ def _readable(tensor: Tensor) -> Tensor:
     return resident(tensor)
 
 
-# ---- cuda splats ---------------------------------------------------------------------------------
-
 HIDDEN = 0x7F800000  # key of Gaussians that are not drawn: infinity's bits, behind all others
 TILE = 16  # pixels a side
 
