@@ -26,9 +26,13 @@ def raster(
     """
     if device == "cuda":
         return gpu(repeats, quick, sections=("raster",), json_file=json_file)
-    from tools.bench.raster import bench_raster, bench_text
+    from tools.bench.harness import print_figures
+    from tools.bench.raster import bench_raster
 
-    return _print_result(bench_raster(repeats=repeats, quick=quick), bench_text, json_file)
+    result = bench_raster(repeats=repeats, quick=quick)
+    print_figures(result)
+    write_json(json_file, result)
+    return 0
 
 
 def gpu(

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import statistics
 from dataclasses import dataclass
 
 import torch
 
 from augment.render.constants import ALPHA_MIN, RasterSettings
 from augment.render.cuda.runtime import gpu_device, launch
-from tools.bench.raster import Spread
 from tools.gpu_clock import Timing, times_in_turns
 
 LANES = 256  # pixels of a program
@@ -51,7 +51,7 @@ def measure_ceilings(timing: Timing, load: Load = Load()) -> Ceilings:
         launch(blend_only, grid, out, load.steps, alpha_max, ALPHA_MIN, LANES=LANES, num_warps=8)
 
     ms = times_in_turns({"copy": lambda: target.copy_(source), "blend": blend}, timing)
-    best = {name: Spread.of(values).median / 1e3 for name, values in ms.items()}
+    best = {name: statistics.median(values) / 1e3 for name, values in ms.items()}
     return Ceilings(
         bytes_per_s=2 * 4 * count / best["copy"],
         blends_per_s=load.programs * LANES * load.steps / best["blend"],

@@ -2,30 +2,16 @@
 
 from __future__ import annotations
 
-import dataclasses
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 
 from augment.cameras import Camera
 from augment.plan import Plan
 from augment.scene import Scene
 from augment.views import render_buffers
-from tools.bench.raster import Spread
+from tools.bench.harness import spread, spread_ms, spread_ratio
 
-
-def spread(values: Sequence[float]) -> dict[str, float]:
-    """Least, median and 90 %, as plain numbers."""
-    return dataclasses.asdict(Spread.of(values))
-
-
-def spread_ms(seconds: Sequence[float]) -> dict[str, float]:
-    """The same of seconds, in milliseconds."""
-    return spread([1e3 * s for s in seconds])
-
-
-def spread_ratio(over: Sequence[float], under: Sequence[float]) -> dict[str, float]:
-    """Of ratios taken pair by pair."""
-    return spread([o / u for o, u in zip(over, under, strict=True)])
+__all__ = ["spread", "spread_ms", "spread_ratio", "time_frame", "time_in_turns", "turns"]
 
 
 def time_frame(scene: Scene, camera: Camera, plan: Plan) -> float:

@@ -1,37 +1,143 @@
+"""The benches: how the harness measures, and one small run of each subject."""
+
 import json
 import math
-import shutil
-import sys
-from pathlib import Path
+import os
+import time
 
 import numpy as np
 import pytest
 import torch
 
+from augment.render.constants import RasterSettings
 from augment.render.reference import project_parts
 from augment.scene import PosedGaussians
-from tools.bench import raster as bench
-from tools.bench.raster import STAGES, Spread, bench_raster, bench_text
-from tools.bench_memory import peak_extra_mib
-from tools.bench_scene import DEFAULT_CASES, RasterCase, random_scene
-from tools.machine import machine_facts
+from tools.bench.harness import (
+    Table,
+    figures,
+    format_cell,
+    machine_facts,
+    markdown,
+    peak_mib_in_subprocess,
+    print_figures,
+    replace_marked,
+    rounds,
+    run_in_subprocess,
+    spread,
+    spread_ms,
+    spread_ratio,
+)
+from tools.bench.raster import _frame_of, bench_raster
+from tools.bench.scenes import RasterCase, random_scene
 
-TINY, OBLONG = RasterCase(400, 48, 32), RasterCase(900, 33, 70)
+TINY = RasterCase(400, 48, 32)
 
 
-@pytest.fixture(autouse=True, scope="module")
-def small_reference():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(bench, "SMALL", RasterCase(300, 64, 48))
-        yield
+class TickingClock:
+    """Every mark is a second after the last."""
+
+    def __init__(self):
+        self.now, self.waits = 0.0, 0
+
+    def mark(self):
+        self.now += 1.0
+        return self.now
+
+    def wait(self):
+        self.waits += 1
+
+    def seconds(self, first, then):
+        return then - first
 
 
-@pytest.fixture(scope="module")
-def figures(small_reference):
-    return bench_raster([TINY, OBLONG], repeats=3, memory=False, progress=False)
+def check_figures(result):
+    """The JSON form that every subject gives."""
+    assert json.loads(json.dumps(result, allow_nan=False)) == result
+    assert result.keys() == {"bench", "machine", "load_after", "tables", "facts"}
+    for table in result["tables"]:
+        assert table["rows"] and {len(row) for row in table["rows"]} == {len(table["columns"])}
+    return {table["title"]: table["rows"] for table in result["tables"]}
 
 
-# ---- the scene --------------------------------------------------------------------------------
+# ---- the harness --------------------------------------------------------------------------------
+
+
+def test_cases_take_turns_and_the_first_round_does_not_count():
+    clock, calls = TickingClock(), []
+    cases = {name: lambda name=name: calls.append(name) for name in "ab"}
+    seconds = rounds(cases, 2, warm_up=1, clock=clock, progress=False)
+    assert "".join(calls) == "baabba" and clock.waits == 2
+    assert seconds == {"a": [1.0, 1.0], "b": [1.0, 1.0]}
+    with pytest.raises(ValueError, match="repeats >= 1 and a case"):
+        rounds(cases, 0)
+
+
+def test_spreads_are_quantiles_and_ratios_are_taken_pair_by_pair():
+    found = spread([5.0, 1.0, 2.0, 3.0, 4.0])
+    assert (found["min"], found["median"]) == (1.0, 3.0)
+    assert found["p90"] == pytest.approx(np.quantile([1, 2, 3, 4, 5], 0.9))
+    assert spread_ms([0.002])["median"] == pytest.approx(2.0)
+    assert spread_ratio([2.0, 9.0, 8.0], [1.0, 3.0, 8.0])["median"] == 2.0
+
+
+def test_numbers_are_shown_to_three_digits():
+    cells = [None, 0.0, 0.123456, 12.345, 1234.5, 1.234e-5, 1234567, True, "x", math.inf]
+    shown = ["", "0", "0.123", "12.3", "1,234", "1.2e-05", "1,234,567", "yes", "x", "inf"]
+    assert [format_cell(cell) for cell in cells] == shown
+
+
+def test_figures_print_and_become_markdown(capsys):
+    table = Table("Frames", ("scene", "ms"), [("small", 1.234), ("large", None)], "a note")
+    result = figures("raster", [table], warm_up_s=2.0)
+    check_figures(result)
+    print_figures(result)
+    shown = capsys.readouterr().out
+    assert "scene    ms\nsmall  1.23\nlarge\n  a note\n" in shown
+    assert result["machine"]["processor"] in shown and result["facts"] == {"warm_up_s": 2.0}
+    lines = markdown(result).splitlines()
+    assert [line for line in lines[1:7] if line] == [
+        "**Frames**",
+        "| scene | ms |",
+        "| --- | ---: |",
+        "| small | 1.23 |",
+    ]
+
+
+def test_a_document_keeps_all_but_what_is_between_its_markers():
+    page = "# Speed\n\n<a>\nof another day\n<b>\n\nEnd.\n"
+    written = replace_marked(page, "<a>", "<b>", "new\n")
+    assert written == "# Speed\n\n<a>\n\nnew\n\n<b>\n\nEnd.\n"
+    assert replace_marked(written, "<a>", "<b>", "new") == written
+    with pytest.raises(ValueError, match="no '<c>'"):
+        replace_marked(page, "<c>", "<b>", "new")
+
+
+def test_work_in_a_subprocess_ends_in_a_record_whatever_its_end(capfd):
+    assert run_in_subprocess(dict, ({"a": 1},), 60)["a"] == 1
+    assert run_in_subprocess(os._exit, (3,), 60) == {"failed": "its process ended with code 3"}
+    assert run_in_subprocess(int, ("x",), 60)["failed"].startswith("ValueError")
+    assert "stopped after 0" in run_in_subprocess(time.sleep, (60,), 0.1)["left_out"]
+    assert run_in_subprocess(dict, (), 0) == {"left_out": "no time was left"}
+
+
+def test_machine_facts_name_processor_threads_and_versions():
+    facts = machine_facts()
+    assert facts["cores"] >= 1 and facts["threads"] >= 1 and facts["processor"]
+    assert facts["thread_pool"] in ("tbb", "omp", "workqueue")
+    assert {"torch", "numpy", "numba"} <= facts["versions"].keys()
+
+
+def test_peak_memory_holds_the_images_and_little_more():
+    extra = peak_mib_in_subprocess(_frame_of, (RasterCase(2_000, 1600, 1200),))
+    if extra is None:
+        pytest.skip("/proc does not tell resident memory here")
+    images = 1600 * 1200 * 4 * 4 / 2**20  # rgb and alpha, float32: 29 MiB, and as much again
+    assert 0.95 * images < extra < 4 * images  # for the state of the tiles and scratch
+    with pytest.raises(RuntimeError, match=r"memory of int.*failed"):
+        peak_mib_in_subprocess(int, ("x",))
+
+
+# ---- scenes -------------------------------------------------------------------------------------
 
 
 def test_the_random_scene_is_as_described():
@@ -45,126 +151,42 @@ def test_the_random_scene_is_as_described():
         assert 1.09 * half < float(reach) <= 1.1 * half * (1 + 1e-6)  # float32 means
     scales = gaussians.scales
     assert 0.004 <= float(scales.min()) < 0.00401 and 0.0599 < float(scales.max()) <= 0.06 + 1e-8
-    # the logarithm is uniform: its mean is the middle, within 4 standard errors of 60 000 draws
-    middle = math.log(0.004 * 0.06) / 2
-    spread = math.log(0.06 / 0.004) / math.sqrt(12 * 60_000)
-    assert float(scales.double().log().mean()) == pytest.approx(middle, abs=4 * spread)
-    torch.testing.assert_close(gaussians.quats.norm(dim=1), torch.ones(20_000))
     assert float(gaussians.opacities.min()) == pytest.approx(0.005)
-    assert 0.9 / 2.1 - 0.01 < float(gaussians.opacities.mean()) < 0.9 / 2.1 + 0.01
-    splats = project_parts([PosedGaussians(gaussians)], camera, bench.SETTINGS)
+    splats = project_parts([PosedGaussians(gaussians)], camera, RasterSettings())
     inside = ((splats.means2d > 0) & (splats.means2d < torch.tensor([640, 480]))).all(1)
     assert float(inside.double().mean()) == pytest.approx(1 / 1.1**2, abs=0.01)
+    assert torch.equal(random_scene(TINY)[0].sh, random_scene(TINY)[0].sh)
+    assert not torch.equal(random_scene(TINY)[0].sh, random_scene(TINY, seed=1)[0].sh)
 
 
-def test_the_scene_follows_from_its_seed():
-    again, other = random_scene(TINY)[0], random_scene(TINY, seed=1)[0]
-    assert torch.equal(random_scene(TINY)[0].sh, again.sh)
-    assert not torch.equal(again.means, other.means)
+# ---- subjects -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("text", ["100k@640x480", "1M@1600x1066", "1500@64x48", "12k@1x1"])
-def test_names_of_cases_read_back(text):
-    assert RasterCase.parse(text).name == text
+def test_raster_measures_stages_work_and_the_reference():
+    small = RasterCase(300, 64, 48)
+    result = bench_raster([TINY], repeats=3, memory=False, reference_case=small, progress=False)
+    tables = check_figures(result)
+    rows = {name: ms for _, name, *ms in tables["Frames"]}
+    assert [*rows] == ["project", "sort", "bin", "raster", "frame", "with smog"]
+    # every stage lies within its frame, so even their least times must fit into the slowest
+    assert 0 < sum(low for _, low, _ in [*rows.values()][:4]) <= rows["frame"][2]
+    (case,), beside = result["facts"]["cases"], result["facts"]["reference"]
+    assert 0 < case["visible"] <= 400 and case["listed_pairs"] <= case["pairs"]
+    assert case["pairs"] == pytest.approx(_pairs_by_a_loop(TINY), rel=0.01)  # boxes are widened
+    assert beside["pixels"] == 64 * 48 and beside["flipped"] <= 3
+    assert beside["p999"] <= 1e-4  # the agreement that backends promise
 
 
-def test_default_cases():
-    assert [case.name for case in DEFAULT_CASES] == ["100k@640x480", "1M@1600x1066"]
-
-
-@pytest.mark.parametrize("text", ["100k", "k@640x480", "1G@640x480", "5@640*480", "0@640x480"])
-def test_cases_that_are_refused(text):
-    with pytest.raises(ValueError, match=r"COUNT@WIDTHxHEIGHT|must be >= 1"):
-        RasterCase.parse(text)
-
-
-# ---- figures ----------------------------------------------------------------------------------
-
-
-def test_spread():
-    spread = Spread.of([5.0, 1.0, 2.0, 3.0, 4.0])
-    assert (spread.min, spread.median) == (1.0, 3.0)
-    assert spread.p90 == pytest.approx(np.quantile([1, 2, 3, 4, 5], 0.9))
-
-
-def test_figures_are_json_and_hang_together(figures):
-    assert json.loads(json.dumps(figures))["cases"] == list(figures["cases"])
-    assert [case["case"] for case in figures["cases"]] == [TINY.name, OBLONG.name]
-    for case in figures["cases"]:
-        assert set(case["stages_ms"]) == set(STAGES)
-        for spread in (*case["stages_ms"].values(), case["frame_ms"], case["smog_frame_ms"]):
-            assert 0 <= spread["min"] <= spread["median"] <= spread["p90"]
-        # every stage lies within its frame, so even their least times must fit into the slowest
-        stages = sum(spread["min"] for spread in case["stages_ms"].values())
-        assert 0 < stages <= case["frame_ms"]["p90"]
-        seconds = case["frame_ms"]["median"] / 1e3
-        assert case["pairs_per_s"] == pytest.approx(case["pairs"] / seconds)
-        assert 0 < case["visible"] <= 900
-    assert figures["warm_up_s"] > 0
-    reference = figures["reference"]
-    assert reference["pixels"] == 64 * 48
-    assert reference["p999_difference"] <= 1e-4  # the agreement that backends promise
-    assert reference["flipped_pixels"] <= 3
-    assert reference["max_difference"] >= reference["p999_difference"]
-
-
-def test_pairs_are_counted_by_boxes_and_tiles():
-    """Against a loop over splats: tiles that the box of each one touches."""
-    gaussians, camera = random_scene(TINY)
-    splats = project_parts([PosedGaussians(gaussians)], camera, bench.SETTINGS)
-    pairs = 0
+def _pairs_by_a_loop(case):
+    """Tiles that the box of each splat touches."""
+    gaussians, camera = random_scene(case)
+    splats, pairs = project_parts([PosedGaussians(gaussians)], camera, RasterSettings()), 0
     for centre, cov, opacity in zip(splats.means2d, splats.covs2d, splats.opacities, strict=True):
         sigmas = min(3.33, math.sqrt(2 * math.log(max(1.0, 255 * float(opacity)))))
         spans = []
-        for axis, size in ((0, 48), (1, 32)):
+        for axis, size in ((0, case.width), (1, case.height)):
             half = sigmas * math.sqrt(float(cov[2 * axis]))
             low, high = float(centre[axis]) - half, float(centre[axis]) + half
             spans.append(sum(low <= t * 16 + 16 and high >= t * 16 for t in range(size // 16)))
         pairs += spans[0] * spans[1]
-    counted = bench_raster([TINY], repeats=1, memory=False, progress=False)["cases"][0]["pairs"]
-    assert counted == pytest.approx(pairs, rel=0.01)  # boxes are widened a little for rounding
-
-
-def test_text_shows_every_case_and_the_machine(figures):
-    text = bench_text(figures)
-    for words in (TINY.name, OBLONG.name, "raster", "whole frame", "with smog", "torch reference"):
-        assert words in text
-    assert f"{figures['cases'][0]['frame_ms']['median']:.2f}" in text
-    assert text.count("memory of a frame: not measured") == 2
-    assert figures["machine"]["versions"]["numba"] in text
-
-
-def test_quick_measures_the_first_case_only():
-    case_figures = bench_raster(
-        [TINY, OBLONG], repeats=1, quick=True, memory=False, progress=False
-    )["cases"]
-    assert [case["case"] for case in case_figures] == [TINY.name]
-
-
-@pytest.mark.parametrize("arguments", [{"repeats": 0}, {"cases": []}])
-def test_nothing_to_measure_is_refused(arguments):
-    with pytest.raises(ValueError, match="need repeats >= 1 and a case"):
-        bench_raster(**arguments, progress=False)
-
-
-def test_machine_facts():
-    facts = machine_facts()
-    assert facts.cores >= 1 and facts.threads >= 1 and facts.processor
-    assert facts.thread_pool in ("tbb", "omp", "workqueue")
-    assert {"torch", "numpy", "numba"} <= set(facts.versions)
-
-
-def test_peak_memory_holds_the_images_and_little_more():
-    extra = peak_extra_mib(RasterCase(2_000, 1600, 1200))
-    if extra is None:
-        pytest.skip("/proc does not tell resident memory here")
-    images = 1600 * 1200 * 4 * 4 / 2**20  # rgb and alpha, float32: 29 MiB, and as much again
-    assert 0.95 * images < extra < 4 * images  # for the state of the tiles and scratch
-
-
-def test_a_failing_probe_is_reported(monkeypatch):
-    if not Path("/proc/self/clear_refs").is_file():
-        pytest.skip("/proc does not tell resident memory here")
-    monkeypatch.setattr(sys, "executable", shutil.which("false"))
-    with pytest.raises(RuntimeError, match=f"measuring the memory of {TINY.name} failed"):
-        peak_extra_mib(TINY)
+    return pairs
