@@ -165,23 +165,27 @@ def read_image_size(path: Path) -> tuple[int, int] | str:
 
 
 def read_numbers(path: Path, shape: Sequence[int] | None = None) -> np.ndarray:
-    """The finite numbers of a text file, float64 in that shape, or flat.
+    """The finite numbers of a text file, float64 in that shape, or flat; see `parse_numbers`."""
+    return parse_numbers(read_text(path).replace(",", " "), str(path), shape)
+
+
+def parse_numbers(text: str, where: str, shape: Sequence[int] | None = None) -> np.ndarray:
+    """The finite numbers of a text, float64 in that shape, or flat.
 
     Raises:
-        AdapterError: missing, something that is no finite number, or another count.
+        AdapterError: something that is no finite number, or another count.
     """
-    words = read_text(path).replace(",", " ").split()
     try:
-        values = np.array([float(word) for word in words], np.float64)
+        values = np.array([float(word) for word in text.split()], np.float64)
     except ValueError as error:
-        raise AdapterError(f"{path} must hold numbers only ({error})") from None
+        raise AdapterError(f"{where} must hold numbers only ({error})") from None
     if not np.isfinite(values).all():
-        raise AdapterError(f"{path} holds NaN or infinite numbers")
+        raise AdapterError(f"{where} holds NaN or infinite numbers")
     if shape is None:
         return values
     if values.size != int(np.prod(shape)):
         expected = " x ".join(map(str, shape))
-        raise AdapterError(f"{path} must hold {expected} numbers; it holds {values.size}")
+        raise AdapterError(f"{where} must hold {expected} numbers; it holds {values.size}")
     return values.reshape(shape)
 
 
