@@ -22,7 +22,7 @@ from augment.jobs.manifest import OK, read_finished
 from augment.jobs.store import Store
 from augment.jobs.tables import read_boxes
 from augment.metrics.consistency import ActorPaths, DepthView
-from tools.report_pick import evenly
+from tools.report_pictures import evenly
 
 SHORT, LONG, CAMERAS = "short", "long", "cameras"
 KINDS = (SHORT, LONG, CAMERAS)

@@ -1,14 +1,25 @@
-"""Numbers as people read them: counts, bytes, and weather with its units."""
+"""An output's weather in numbers: quantities with their units, how they are spread, histograms."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from markupsafe import Markup
 
+from augment.jobs.manifest import weather_columns
 from recipes.schema import KOSCHMIEDER
 
+MAX_BINS = 24
+LOG_RATIO = 10  # largest over smallest value from which an axis is logarithmic
+MAX_MARKS = 300
+_WIDTH, _LEFT, _RIGHT, _TOP, _FLOOR = 340, 6, 6, 14, 104  # of a histogram, in SVG units
+_MAX_NUMBER = 1e99  # greater numbers are as little a weather's as infinity is
 _BYTES = ("B", "kB", "MB", "GB", "TB", "PB")
 # By ending of a column's name, the longest first.
 _UNITS = {
@@ -19,6 +30,8 @@ _UNITS = {
     "_deg": "°",
     "_m": "m",
 }
+# What a caption says of an image's weather.
+_MAIN = {"smog_extinction_per_m": "visibility", "flood_level_m": "water at", "snow_depth_m": "snow"}
 
 
 @dataclass(frozen=True)
@@ -43,6 +56,19 @@ class Quantity:
         """How it comes from the manifest."""
         return f"{KOSCHMIEDER} / {self.column}" if self.inverted else self.column
 
+    def shown(self, values: np.ndarray) -> np.ndarray:
+        """The manifest's numbers in the quantity's unit."""
+        return KOSCHMIEDER / values if self.inverted else self.factor * values
+
+    def is_there(self, numbers: np.ndarray) -> np.ndarray:
+        """bool [n]: which of the manifest's numbers say that the effect is there."""
+        there = np.abs(numbers) < _MAX_NUMBER  # false for NaN
+        if self.zero_is_absent:
+            there &= numbers != 0
+        if self.inverted:  # a visibility of infinity or below 0 is none
+            there &= numbers > 1 / _MAX_NUMBER
+        return there
+
 
 _KNOWN = {
     q.column: q
@@ -59,25 +85,233 @@ _KNOWN = {
 }
 
 
-def known_order(column: str) -> tuple[int, str]:
-    """A key that sorts columns: those known here first."""
-    names = list(_KNOWN)
-    return (names.index(column) if column in _KNOWN else len(names), column)
-
-
 def quantity_of(column: str) -> Quantity:
     """What a weather column of the manifest means; one not known here by its name's ending."""
     if column in _KNOWN:
         return _KNOWN[column]
-    for ending, unit in _UNITS.items():
-        if column.endswith(ending):
-            return Quantity(column, _words(column.removesuffix(ending)), unit)
-    return Quantity(column, _words(column), "")
+    ending = next((e for e in _UNITS if column.endswith(e)), "")
+    name = column.removesuffix(ending).replace("_", " ").strip()
+    return Quantity(column, name[:1].upper() + name[1:], _UNITS.get(ending, ""))
 
 
-def shown_values(quantity: Quantity, values: np.ndarray) -> np.ndarray:
-    """The numbers in the quantity's unit."""
-    return KOSCHMIEDER / values if quantity.inverted else quantity.factor * values
+@dataclass(frozen=True, eq=False)
+class Draws:
+    """Each scene and variant once, sorted by the column `draw` [d].
+
+    first: int64 [d], the row of its first image. images: int64 [d]. clear: bool [d], without
+    weather and style.
+    """
+
+    draw: np.ndarray
+    first: np.ndarray
+    images: np.ndarray
+    clear: np.ndarray
+
+
+def find_draws(table: pa.Table) -> Draws:
+    """Of a table of finished images with the column `draw`."""
+    draw, first, images = np.unique(table["draw"].to_numpy(), return_index=True, return_counts=True)
+    return Draws(draw, first, images, _is_clear(table.take(pa.array(first))))
+
+
+@dataclass(frozen=True, eq=False)
+class Spread:
+    """One number of the weather over the finished images.
+
+    values: [v] of each variant that has it, in the unit shown. images: [v] int64, how many images
+    each of them has. absent_images: those without the effect.
+    """
+
+    quantity: Quantity
+    values: np.ndarray
+    images: np.ndarray
+    absent_images: int
+
+    @property
+    def is_constant(self) -> bool:
+        """All values are one, but for rounding."""
+        low, high = float(self.values.min()), float(self.values.max())
+        return not high - low > 1e-9 * max(abs(low), abs(high))
+
+    @property
+    def range_text(self) -> str:
+        low, high = float(self.values.min()), float(self.values.max())
+        first = "" if self.is_constant else f"{short(low)} to "
+        return first + with_unit(low if self.is_constant else high, self.quantity.unit)
+
+    @property
+    def where_text(self) -> str:
+        text = f"{count(int(self.images.sum()), 'image')}, {count(len(self.values), 'variant')}"
+        return f"{text}; absent in {self.absent_images:,}" if self.absent_images else text
+
+
+def spreads(table: pa.Table, draws: Draws) -> list[Spread]:
+    """Of every weather column that some image has a number in; a variant's images all have its."""
+    rows = table.take(pa.array(draws.first))
+    found = []
+    for column in _number_columns(table):
+        quantity, numbers = quantity_of(column), _as_floats(rows, column)
+        there = quantity.is_there(numbers)
+        if there.any():
+            values, images = quantity.shown(numbers[there]), draws.images[there]
+            found.append(Spread(quantity, values, images, int(draws.images[~there].sum())))
+    return found
+
+
+def weather_of_recipes(table: pa.Table, draws: Draws, names: Collection[str]) -> dict[str, str]:
+    """What the variants of each of these recipes drew, in words; "" without weather."""
+    rows = table.take(pa.array(draws.first))
+    recipes = np.array(rows["recipe"].to_pylist(), object)
+    styles = rows["style"].to_pylist()
+    numbers = [(quantity_of(name), _as_floats(rows, name)) for name in _number_columns(table)]
+    numbers = [(q, q.shown(np.where(q.is_there(v), v, np.nan))) for q, v in numbers]
+    found = {}
+    for recipe in names:
+        own = np.flatnonzero(recipes == recipe)
+        if not len(own):
+            continue
+        named = sorted({s for k in own if (s := styles[k]) is not None})
+        texts = [f"Style: {', '.join(named[:4])}"] if named else []
+        known = [(q, there) for q, v in numbers if len(there := v[own][~np.isnan(v[own])])]
+        for quantity, there in known[:10]:
+            low, high = float(there.min()), float(there.max())
+            span = short(low) if low == high else f"{short(low)} to {short(high)}"
+            texts.append(f"{quantity.title} {span} {quantity.unit}".rstrip())
+        found[recipe] = "; ".join(texts)
+    return found
+
+
+def weather_text(row: Mapping[str, Any]) -> str:
+    """A row's weather in a few words."""
+    texts = [f"style {style}"] if (style := row.get("style")) is not None else []
+    for column, label in _MAIN.items():
+        quantity, number = quantity_of(column), row.get(column)
+        if number is not None and quantity.is_there(np.array([number], float))[0]:
+            shown = float(quantity.shown(np.array([number], float))[0])
+            texts.append(f"{label} {with_unit(shown, quantity.unit)}")
+    return ", ".join(texts) or "no weather"
+
+
+def _number_columns(table: pa.Table) -> list[str]:
+    """The weather's columns that hold numbers, those known here first."""
+    order = {column: number for number, column in enumerate(_KNOWN)}
+    columns = [
+        c for c in weather_columns(table) if pa.types.is_floating(table.schema.field(c).type)
+    ]
+    return sorted(columns, key=lambda column: (order.get(column, len(order)), column))
+
+
+def _as_floats(table: pa.Table, column: str) -> np.ndarray:
+    """float64 [rows]; null is NaN."""
+    return np.asarray(pc.fill_null(table[column], np.nan).to_numpy(), np.float64)
+
+
+def _is_clear(rows: pa.Table) -> np.ndarray:
+    """bool [rows]. Snow of no depth is none, whatever its coverage; water at level 0 is water."""
+    clear = np.array([style is None for style in rows["style"].to_pylist()], bool)
+    no_snow = np.zeros(rows.num_rows, bool)
+    for column in ("snow_depth_m", "snow_coverage"):
+        if column in rows.column_names:
+            no_snow |= _as_floats(rows, column) == 0
+    for column in _number_columns(rows):
+        numbers = _as_floats(rows, column)
+        none = np.isnan(numbers)
+        if column != "flood_level_m":
+            none |= numbers == 0
+        if column.startswith("snow_"):
+            none |= no_snow
+        clear &= none
+    return clear
+
+
+@dataclass(frozen=True)
+class Histogram:
+    """Counts [n] of values between edges [n + 1], spaced evenly or in the logarithm."""
+
+    edges: np.ndarray
+    counts: np.ndarray
+    log: bool
+
+
+def histogram(values: np.ndarray, weights: np.ndarray, *, linear: bool = False) -> Histogram:
+    """Of finite values [n], two of them unlike, each counted as often as its whole weight says.
+
+    linear: not logarithmic, however far the values are spread.
+    """
+    low, high = float(values.min()), float(values.max())
+    log = not linear and low > 0 and high / low > LOG_RATIO
+    bins = int(min(MAX_BINS, max(6, 2 * math.ceil(math.sqrt(len(values))))))
+    edges = np.geomspace(low, high, bins + 1) if log else np.linspace(low, high, bins + 1)
+    edges[0], edges[-1] = min(edges[0], low), max(edges[-1], high)
+    counts, _ = np.histogram(values, edges, weights=weights)
+    return Histogram(edges, counts, log)
+
+
+class Chart(NamedTuple):
+    """A histogram as the template draws it, places in SVG units.
+
+    bars: (x, y, width, height, what it counts). marks: the path of a tick for each variant beneath.
+    labels: (x, anchor, number) of the axis. scale: its unit. most: the tallest bar's count.
+    """
+
+    spread: Spread
+    bars: list[tuple[str, str, str, str, str]]
+    marks: Markup
+    labels: list[tuple[str, str, str]]
+    scale: str
+    most: str
+
+
+def chart(spread: Spread) -> Chart:
+    """Bars count images; of the ticks beneath MAX_MARKS are drawn at most, evenly chosen."""
+    shape = histogram(spread.values, spread.images, linear=spread.quantity.linear)
+    unit = spread.quantity.unit
+    edges = np.log(shape.edges) if shape.log else shape.edges
+    span = float(edges[-1] - edges[0]) or 1.0
+    right = _WIDTH - _RIGHT
+
+    def x_of(value: float) -> float:
+        place = math.log(value) if shape.log else value
+        return _LEFT + (right - _LEFT) * min(1.0, max(0.0, (place - edges[0]) / span))
+
+    tallest = max(float(shape.counts.max()), 1.0)
+    bars = []
+    for a, b, n in zip(shape.edges[:-1], shape.edges[1:], shape.counts, strict=True):
+        if n > 0:
+            # One of a million still shows.
+            y, x, end = min(_FLOOR - (_FLOOR - _TOP) * n / tallest, _FLOOR - 1.5), x_of(a), x_of(b)
+            places = (x + 0.5, y, max(end - x - 1, 1), _FLOOR - y)
+            title = f"{with_unit(a, unit)} to {with_unit(b, unit)}: {count(int(n), 'image')}"
+            bars.append((*(f"{place:.1f}" for place in places), title))
+    marks = np.sort(spread.values)
+    marks = marks[np.linspace(0, len(marks) - 1, min(len(marks), MAX_MARKS)).astype(int)]
+    stems = "".join(f"M{x:.1f} {_FLOOR + 4}v8" for x in sorted({x_of(float(v)) for v in marks}))
+    labels = []
+    for value in ticks(float(shape.edges[0]), float(shape.edges[-1]), shape.log):
+        x = x_of(value)
+        anchor = "start" if x < _LEFT + 16 else "end" if x > right - 16 else "middle"
+        labels.append((f"{x:.1f}", anchor, short(value)))
+    scale = f"{unit}{', log scale' if shape.log else ''}".lstrip(", ")
+    return Chart(spread, bars, Markup(stems), labels, scale, count(int(tallest)))
+
+
+def ticks(low: float, high: float, log: bool) -> list[float]:
+    """Round numbers within [low, high]: 1, 2 or 5 times powers of ten."""
+    if log:
+        powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
+        every = [m * 10.0**p for p in powers for m in (1, 2, 5)]
+        inside = [v for v in every if low <= v <= high]
+        tens = [v for v in inside if math.log10(v) % 1 < 1e-9]
+        shown = inside if len(inside) <= 5 or len(tens) < 2 else tens
+        return shown[:: -(-len(shown) // 5)]
+    rough = (high - low) / 6
+    if rough < 1e-300:
+        return [low]
+    unit = 10.0 ** math.floor(math.log10(rough))
+    step = next(m * unit for m in (1, 2, 5, 10) if m * unit >= rough * 0.999)
+    first = math.ceil(low / step - 1e-9)
+    found = [(first + k) * step for k in range(8)]
+    return [v for v in found if low - 1e-9 * step <= v <= high + 1e-9 * step]
 
 
 def with_unit(number: float, unit: str) -> str:
@@ -95,9 +329,9 @@ def short(number: float) -> str:
     if size >= 1e7 or size < 1e-4:
         return f"{number:.2e}".replace("-", "−")
     digits = max(0, 2 - math.floor(math.log10(size)))
-    said = f"{round(number, digits):,.{digits}f}"
-    said = said.rstrip("0").rstrip(".") if "." in said else said
-    return said.replace("-", "−")
+    text = f"{round(number, digits):,.{digits}f}"
+    text = text.rstrip("0").rstrip(".") if "." in text else text
+    return text.replace("-", "−")
 
 
 def count(number: int, noun: str = "") -> str:
@@ -128,8 +362,3 @@ def percent(part: float, whole: float) -> str:
     if 0 < share < 1:
         return "< 1 %"
     return "> 99 %" if 99 < share < 100 else f"{share:.0f} %"
-
-
-def _words(name: str) -> str:
-    said = name.replace("_", " ").strip()
-    return said[:1].upper() + said[1:]

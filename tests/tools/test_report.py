@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import tomllib
 from collections import Counter
 from html.parser import HTMLParser
 from pathlib import Path
@@ -19,7 +20,7 @@ from tests.tools.report_outputs import make_row, street_rows, write_output
 from tools import report
 from tools.cli import main
 from tools.report import write_report
-from tools.report_gallery import BUDGET
+from tools.report_pictures import BUDGET
 
 EVIL = "\"><script>alert(1)</script><img src=x onerror='alert(2)'>\u202e"
 
@@ -261,3 +262,10 @@ def test_the_command_says_what_it_wrote(street, tmp_path, capsys) -> None:
     assert main(["report", str(tmp_path / "nowhere")]) == 2
     with pytest.raises(OutputError, match="0 to 400 images; got -1"):
         write_report(street, images=-1)
+
+
+def test_the_template_and_what_it_includes_are_installed() -> None:
+    root = Path(report.__file__).parent
+    patterns = tomllib.loads((root.parent / "pyproject.toml").read_text())["tool"]["setuptools"]
+    found = {path for glob in patterns["package-data"]["tools"] for path in root.glob(glob)}
+    assert found == {*(root / "templates").iterdir()} and len(found) == 3
