@@ -275,10 +275,13 @@ def dataset(
         quick: Few small images.
         json_file: Also write the figures to this file.
     """
-    from tools.bench_dataset import QUICK, WHOLE, bench_dataset, dataset_text
+    from tools.bench.dataset import QUICK, WHOLE, bench_dataset
+    from tools.bench.harness import print_figures
 
     result = bench_dataset(QUICK if quick else WHOLE, folder=folder, repeats=repeats)
-    return _print_result(result, dataset_text, json_file)
+    print_figures(result)
+    write_json(json_file, result)
+    return 0
 
 
 def training(

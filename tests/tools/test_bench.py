@@ -12,6 +12,7 @@ import torch
 from augment.render.constants import RasterSettings
 from augment.render.reference import project_parts
 from augment.scene import PosedGaussians
+from tools.bench.dataset import DECODING, DatasetCase, bench_dataset
 from tools.bench.harness import (
     Table,
     figures,
@@ -190,3 +191,15 @@ def _pairs_by_a_loop(case):
             spans.append(sum(low <= t * 16 + 16 and high >= t * 16 for t in range(size // 16)))
         pairs += spans[0] * spans[1]
     return pairs
+
+
+def test_dataset_measures_reading_rendering_and_a_large_manifest():
+    case = DatasetCase(images=5, scale=0.05, rows=700, live=2, workers=(1,))
+    readings = ("image, depth, boxes, float32, verified",)
+    result = bench_dataset(case, repeats=1, readings=readings, memory=False, progress=False)
+    reading, live, [(rows, held, _)] = check_figures(result).values()
+    assert [row[0] for row in reading] == [DECODING, *readings]
+    assert [row[3] for row in (*reading, *live)][::2] == [1, 1]
+    assert all(rate > 0 for *_, rate, _ in (*reading, *live))
+    # Some eighty bytes a row, where the Arrow table has 440.
+    assert rows == 700 and 700 * 32 < held * 2**20 < 700 * 200

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,6 +15,8 @@ import torch
 from adapters.base import open_scene
 from augment.cameras import Camera
 from augment.geometry import rigid
+from augment.jobs.layout import folder_name, variant_name
+from augment.jobs.render_job import RenderJob, run_job
 from augment.plan import make_plan
 from augment.render.sh import SH_C0
 from augment.scene import Gaussians, Scene
@@ -157,3 +161,19 @@ def smog_recipe(visibility_m: float = 200) -> Recipe:
 
 def style_recipe(preset: str = "overcast", **style: Any) -> Recipe:
     return Recipe(style=Style.model_validate({"preset": preset, **style}), output=PICTURE_ONLY)
+
+
+def record_street(
+    folder: Path,
+    recipe: Recipe,
+    *,
+    scale: float = 1.0,
+    cameras: Sequence[str] | None = None,
+    **street: int,
+) -> tuple[Scene, Path]:
+    """The procedural street, and the folder of one variant of it that a job has written."""
+    scene = street_scene(**street)
+    recipe = recipe.model_copy(update={"render": recipe.render.model_copy(update={"scale": scale})})
+    job = RenderJob(scene.source, [recipe], folder, cameras=cameras)
+    run_job(job, scene_loader=lambda _: scene)
+    return scene, folder / folder_name(scene.name) / variant_name(recipe)
