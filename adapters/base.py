@@ -185,8 +185,7 @@ def _expanded(entry: JobScene, folder: Path) -> list[JobScene]:
 
 def _matches(top: Path, parts: tuple[str, ...], what: str) -> list[str]:
     """Paths that match, in order. parts: of the pattern below `top`. As glob.glob, but that `**`
-    follows no links, which may lead round in circles, and that there is an end to it.
-    """
+    follows no links, which may lead round in circles, and that there is an end to it."""
     looked_at = itertools.count()
 
     def names(folder: str) -> Iterator[os.DirEntry[str]]:

@@ -95,11 +95,7 @@ def read_array_dict(path: Path, *, max_bytes: int = MAX_BYTES) -> dict[str, np.n
 
 
 def check_holds_object(file: BufferedIOBase) -> None:
-    """Read the header of a .npy file that must hold one pickled object.
-
-    Raises:
-        PickleError: it holds an array, or is no .npy file.
-    """
+    """Read the header of a .npy file that must hold one pickled object."""
     header = read_npy_header(file)
     if header.dtype is not None or header.shape != ():
         raise PickleError(

@@ -83,8 +83,7 @@ def open_scene_folder(path: str, query: dict[str, str]) -> Scene:
 def storable(scene: Scene) -> Scene:
     """An opened scene with what belongs into another saved scene: where the recording of a saved
     scene is not found today, that is no fact about the scene, and a relative path to it stays one
-    to the same place.
-    """
+    to the same place."""
     scheme, path, _ = parse_uri(scene.source)
     if scheme != "scene" or scene.labels is not None or scene.recorded_source is None:
         return scene
@@ -113,11 +112,7 @@ def recorded_labels(recording: Recording) -> LabelSource | None:
 
 
 def _given(uri: str) -> Recording:
-    """The recording of the `data` key.
-
-    Raises:
-        AdapterError: nothing there, or nothing that is known.
-    """
+    """The recording of the `data` key."""
     from adapters.base import recognise
 
     recording = _recording(uri, Path.cwd())

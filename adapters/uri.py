@@ -7,7 +7,7 @@ that exists as written is taken as written. `+` stands for itself.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import quote, unquote
@@ -25,8 +25,7 @@ class Scheme:
     Scene whose `source` is `format_uri(scheme, path, query)`, with an AdapterError for keys that it
     does not know. builtin: the names that the path may be where it is no file; the function takes
     the query alone then. labels: the module's function from path and query to the labels alone (a
-    LabelSource or None), which a scene fitted to such data needs.
-    """
+    LabelSource or None), which a scene fitted to such data needs."""
 
     module: str
     function: str
@@ -121,10 +120,38 @@ def known_schemes() -> str:
     return ", ".join(f"{name} ({entry.example})" for name, entry in SCHEMES.items())
 
 
+def check_query(scheme: str, query: Mapping[str, str], known: Mapping[str, str]) -> None:
+    """Refuse options that are not among the known ones, which are given with their meaning."""
+    if unknown := sorted(set(query) - set(known)):
+        meanings = "; ".join(f"{key}: {meaning}" for key, meaning in known.items())
+        raise AdapterError(f"{scheme}: unknown option {unknown[0]!r}; known are {meanings}")
+
+
+def whole_number_of(
+    scheme: str, query: Mapping[str, str], key: str, default: int | None = None
+) -> int | None:
+    """The whole number >= 0 of an option, the default without it."""
+    text = query.get(key)
+    if text is None:
+        return default
+    if not (text.isascii() and text.isdigit() and len(text) < 10):
+        raise AdapterError(f"{scheme}: {key} must be a whole number; got {text!r}")
+    return int(text)
+
+
+def choice_of(
+    scheme: str, query: Mapping[str, str], key: str, allowed: Collection[str]
+) -> str | None:
+    """The value of an option that must be one of a few; None without it."""
+    text = query.get(key)
+    if text is not None and text not in allowed:
+        raise AdapterError(f"{scheme}: {key} must be {' or '.join(allowed)}; got {text!r}")
+    return text
+
+
 def _split_query(text: str, uri: str) -> tuple[str, dict[str, str]]:
     """Path and query. A path may hold '?': the shortest beginning that exists is the path, and
-    where none does, all before the first '?'.
-    """
+    where none does, all before the first '?'."""
     marks = [i for i, character in enumerate(text) if character == "?"]
     if not marks or Path(text).exists():
         return text, {}

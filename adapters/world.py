@@ -108,6 +108,14 @@ def rotation_to_z_up(up: np.ndarray) -> np.ndarray:
     return np.round(rotation) if np.abs(rotation - np.round(rotation)).max() < 1e-15 else rotation
 
 
+def invert_pose(pose: np.ndarray) -> np.ndarray:
+    """The inverse of a rigid transform, float64 [4, 4]."""
+    out = np.eye(4)
+    out[:3, :3] = pose[:3, :3].T
+    out[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
+    return out
+
+
 def nearest_axis(vector: np.ndarray) -> str:
     """The name of the axis closest to a vector: +x, -x, … -z."""
     index = int(np.abs(vector).argmax())

@@ -1,4 +1,14 @@
-"""A dataset directory as a trained model sees it, and its frames."""
+"""A Street Gaussians dataset directory as a trained model sees it, and its frames.
+
+    intrinsics/<cam>.txt          fx fy cx cy and distortion, which is not used
+    extrinsics/<cam>.txt          ego_from_camera, OpenCV axes
+    ego_pose/<frame>.txt          world_from_ego at the frame's time
+    ego_pose/<frame>_<cam>.txt    the same at the camera's
+    timestamps.json               seconds by FRAME or camera name, then by frame
+
+World: the dataset's, minus the mean position of the car over all its frames, as the models are
+trained. Vehicle frame: x forward, y left, z up. Times are seconds as the dataset has them.
+"""
 
 from __future__ import annotations
 
@@ -13,36 +23,133 @@ import numpy as np
 import torch
 
 from adapters.plain_files import read_json, read_numbers, read_pose, read_text
-from adapters.street_gaussians.records import (
-    CAMERA_NAMES,
-    ModelConfig,
-    StreetData,
-    StreetImage,
-    TrackedObject,
-    Tracklets,
-)
+from adapters.world import invert_pose
 from augment.cameras import Camera, Frame
 from augment.errors import AdapterError
 from augment.files.image_size import read_image_header
 from augment.geometry import quat_from_rotmat, rotmat_from_quat, slerp
 
-# ------------------------------------------------------------------------------------------------
-# Cameras, poses and times of a drive in Street Gaussians' layout, and which images there are
-# intrinsics/<cam>.txt             fx fy cx cy and distortion, which is not used
-# extrinsics/<cam>.txt             ego_from_camera, OpenCV axes
-# ego_pose/<frame>.txt             world_from_ego at the frame's time
-# ego_pose/<frame>_<cam>.txt       the same at the camera's
-# timestamps.json                  seconds by FRAME or camera name, then by frame
+CAMERA_NAMES = ("FRONT", "FRONT_LEFT", "FRONT_RIGHT", "SIDE_LEFT", "SIDE_RIGHT")
 
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """What of a model's configuration decides how it is read; the defaults are the project's own.
+
+    cameras: numbers in CAMERA_NAMES. selected_frames: first and last, both included; None for all.
+    split_test, split_train: every how manyeth frame is held out or trained on; -1 where unused.
+    """
+
+    source_path: str = ""
+    cameras: tuple[int, ...] = (0, 1, 2)
+    selected_frames: tuple[int, int] | None = None
+    use_tracker: bool = False
+    split_test: int = -1
+    split_train: int = -1
+    fourier_scale: float = 1.0
+    include_sky: bool = False
+    white_background: bool = False
+    opt_track: bool = True
+    use_color_correction: bool = False
+    color_correction_mode: str = "image"
+    color_correction_mlp: bool = False
+    use_pose_correction: bool = False
+    pose_correction_mode: str = "image"
+
+
+@dataclass(frozen=True, eq=False)
+class StreetImage:
+    """One image, or a camera without its image. cam: number in CAMERA_NAMES.
+
+    world_from_ego: float64 [4, 4], at the moment of the image. camera_from_ego: float64 [4, 4],
+    OpenCV axes. is_held_out: not trained on. number: its position among all images of the selected
+    frames and cameras, by frame, then camera, left out or not: the index of per-image corrections.
+    """
+
+    frame: int
+    cam: int
+    path: Path | None
+    timestamp_s: float
+    world_from_ego: np.ndarray
+    camera_from_ego: np.ndarray
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    is_held_out: bool
+    number: int
+
+    @property
+    def name(self) -> str:
+        return CAMERA_NAMES[self.cam]
+
+    @property
+    def timestamp_ns(self) -> int:
+        return round(self.timestamp_s * 1e9)
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedObject:
+    """A moving object of the model: `obj_{track_id:03d}`.
+
+    size_m: length, width, height; training kept splats in a box that was wider and longer by
+    data.box_scale. start_frame, end_frame: of its track. start_s, end_s: when it is drawn.
+    """
+
+    track_id: int
+    label: str
+    size_m: tuple[float, float, float]
+    start_frame: int
+    end_frame: int
+    start_s: float
+    end_s: float
+
+
+@dataclass(frozen=True, eq=False)
+class Tracklets:
+    """Where objects are in each of F selected frames, in the columns that the model has them in.
+
+    ids: int64 [F, M], -1 for none. positions: float64 [F, M, 3], metres, vehicle frame at the
+    frame's time. quats: float64 [F, M, 4] wxyz.
+    """
+
+    ids: np.ndarray
+    positions: np.ndarray
+    quats: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class StreetData:
+    """A dataset directory as a model sees it.
+
+    frames: selected numbers, ascending. world_from_ego: float64 [F, 4, 4]; between its neighbours'
+    where the file is missing, so that the rows stay those of the model, but such a frame has no
+    images. images: by frame, then camera. objects: moving ones, in the track file's order.
+    """
+
+    root: Path
+    world_origin_m: np.ndarray
+    frames: tuple[int, ...]
+    frame_times_s: np.ndarray
+    world_from_ego: np.ndarray
+    images: tuple[StreetImage, ...]
+    objects: tuple[TrackedObject, ...]
+    tracklets: Tracklets
+    problems: tuple[str, ...] = ()
+
+
+# ---- Cameras, poses and times --------------------------------------------------------------------
 TIMES = "timestamps.json"
+_NUMBER = re.compile(r"[0-9]{1,9}")
 _FRAME_POSE = re.compile(r"([0-9]{1,9})\.txt")
 _MAX_GAPS = 1000  # numbers between the first frame and the last that nothing is known of
 
 
 @dataclass(frozen=True, eq=False)
 class Lens:
-    """fx, fy, cx, cy: pixels. camera_from_ego: float64 [4, 4], OpenCV axes. path: of the
-    intrinsics, for messages."""
+    """camera_from_ego: float64 [4, 4], OpenCV axes. path: of the intrinsics, for messages."""
 
     path: Path
     fx: float
@@ -54,11 +161,10 @@ class Lens:
 
 @dataclass(frozen=True, eq=False)
 class EgoPath:
-    """The car at every frame of the drive, in the dataset's world.
+    """The car at every frame of the drive (numbers: consecutive), in the dataset's world.
 
-    numbers: consecutive. times_s: float64 [N]. world_from_ego: float64 [N, 4, 4]. is_known: bool
-    [N], False where the pose is missing and was put between its neighbours. camera_times_s: by
-    camera name, then frame number. problems: one sentence each.
+    world_from_ego: float64 [N, 4, 4]. is_known: bool [N], False where the pose is missing and was
+    put between its neighbours. camera_times_s: by camera name, then frame number.
     """
 
     numbers: range
@@ -80,11 +186,7 @@ def calibrated_cameras(root: Path) -> tuple[int, ...]:
 
 
 def read_lens(root: Path, cam: int) -> Lens:
-    """A camera's calibration.
-
-    Raises:
-        AdapterError: a file is missing, or holds no focal lengths or no pose.
-    """
+    """A camera's calibration."""
     path = root / "intrinsics" / f"{cam}.txt"
     values = read_numbers(path)
     if values.size < 4 or min(values[:2]) <= 0:
@@ -93,24 +195,11 @@ def read_lens(root: Path, cam: int) -> Lens:
         )
     fx, fy, cx, cy = values[:4].tolist()
     ego_from_camera = read_pose(root / "extrinsics" / f"{cam}.txt")
-    return Lens(path, fx, fy, cx, cy, inverse(ego_from_camera))
-
-
-def inverse(pose: np.ndarray) -> np.ndarray:
-    """Of a rigid transform, float64 [4, 4]."""
-    out = np.eye(4)
-    out[:3, :3] = pose[:3, :3].T
-    out[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
-    return out
+    return Lens(path, fx, fy, cx, cy, invert_pose(ego_from_camera))
 
 
 def read_ego_path(root: Path) -> EgoPath:
-    """Every frame's pose and time.
-
-    Raises:
-        AdapterError: the folder is missing, holds no pose or a damaged one; times are missing, not
-            numbers, or do not increase.
-    """
+    """Every frame's pose and time."""
     folder = root / "ego_pose"
     if not folder.is_dir():
         raise AdapterError(
@@ -140,26 +229,19 @@ def read_ego_path(root: Path) -> EgoPath:
     if not (np.diff(times_s) > 0).all():
         raise AdapterError(f"{root / TIMES}: the seconds of FRAME must increase with the frames")
     poses = _fill(times_s, known, np.stack([read_pose(found[n]) for n in sorted(found)]))
-    return EgoPath(numbers, times_s, poses, known, times, tuple(_said(folder, numbers, known)))
-
-
-def _said(folder: Path, numbers: range, known: np.ndarray) -> list[str]:
-    missing = [number for number, is_known in zip(numbers, known, strict=True) if not is_known]
-    if not missing:
-        return []
-    return [
-        f"{folder} lacks the poses of {len(missing)} of {len(numbers)} frames, such as "
-        f"{missing[0]:06d}: these frames are left out, and the middle of the drive, on which the "
-        f"world of trained models is centred, is had with guesses from the frames beside them"
-    ]
+    problems = ()
+    if missing := [numbers[i] for i in np.flatnonzero(~known)]:
+        problems = (
+            f"{folder} lacks the poses of {len(missing)} of {len(numbers)} frames, such as "
+            f"{missing[0]:06d}: these frames are left out, and the middle of the drive, on which "
+            f"the world of trained models is centred, is had with guesses from the frames beside "
+            f"them",
+        )
+    return EgoPath(numbers, times_s, poses, known, times, problems)
 
 
 def read_times(path: Path) -> dict[str, dict[int, float]]:
-    """Seconds by FRAME or camera name, then frame number.
-
-    Raises:
-        AdapterError: missing, without FRAME, or something else in it.
-    """
+    """Seconds by FRAME or camera name, then frame number."""
     content = read_json(path)
     times: dict[str, dict[int, float]] = {}
     for name, entries in content.items():
@@ -170,7 +252,7 @@ def read_times(path: Path) -> dict[str, dict[int, float]]:
         times[name] = {}
         for key, value in entries.items():
             is_time = isinstance(value, int | float) and not isinstance(value, bool)
-            if not (is_time and 0 <= value < 9e9 and re.fullmatch(r"[0-9]{1,9}", key)):
+            if not (is_time and 0 <= value < 9e9 and _NUMBER.fullmatch(key)):
                 raise AdapterError(
                     f"{path}: {name} must hold seconds by frame, such as "
                     f'"000000": 1550083467.3; got {key!r}: {value!r:.80}'
@@ -195,33 +277,17 @@ def _fill(times_s: np.ndarray, known: np.ndarray, poses: np.ndarray) -> np.ndarr
         a, b = poses[after - 1], poses[after]
         part = (times_s[i] - known_s[after - 1]) / (known_s[after] - known_s[after - 1])
         filled[i] = a + part * (b - a)
-        filled[i, :3, :3] = _turned(a[:3, :3], b[:3, :3], min(max(part, 0.0), 1.0))
+        quats = quat_from_rotmat(torch.from_numpy(np.stack([a[:3, :3], b[:3, :3]])))
+        part = torch.tensor(min(max(part, 0.0), 1.0), dtype=torch.float64)
+        filled[i, :3, :3] = rotmat_from_quat(slerp(quats[0], quats[1], part)).numpy()
     return filled
-
-
-def _turned(a: np.ndarray, b: np.ndarray, part: float) -> np.ndarray:
-    quats = quat_from_rotmat(torch.from_numpy(np.stack([a, b])))
-    turned = slerp(quats[0], quats[1], torch.tensor(part, dtype=torch.float64))
-    return rotmat_from_quat(turned).numpy()
-
-
-@dataclass(frozen=True, eq=False)
-class CameraMoment:
-    """When a camera took its image of a frame, and where the car was, dataset world."""
-
-    timestamp_s: float
-    world_from_ego: np.ndarray
 
 
 def read_camera_moments(
     root: Path, path: EgoPath, frames: Sequence[int], cams: Sequence[int]
-) -> tuple[dict[tuple[int, int], CameraMoment], tuple[str, ...]]:
-    """The moments by frame and camera, and a sentence where poses are missing.
-
-    Raises:
-        AdapterError: a pose is damaged, has no time, or is missing everywhere.
-    """
-    moments: dict[tuple[int, int], CameraMoment] = {}
+) -> tuple[dict[tuple[int, int], tuple[float, np.ndarray]], tuple[str, ...]]:
+    """Seconds and dataset_from_ego by frame and camera, and a sentence on missing ones."""
+    moments: dict[tuple[int, int], tuple[float, np.ndarray]] = {}
     missing: list[Path] = []
     for frame in frames:
         if not path.is_known[path.numbers.index(frame)]:
@@ -237,7 +303,7 @@ def read_camera_moments(
                     f"{root / TIMES}: {CAMERA_NAMES[cam]} lacks frame {frame:06d}, of which there "
                     f"is {file}; both must be of one conversion"
                 )
-            moments[frame, cam] = CameraMoment(seconds, read_pose(file))
+            moments[frame, cam] = seconds, read_pose(file)
     if not moments:
         raise AdapterError(
             f"{root / 'ego_pose'} lacks poses NNNNNN_{cams[0]}.txt at the cameras' times for all "
@@ -245,54 +311,63 @@ def read_camera_moments(
         )
     if not missing:
         return moments, ()
-    said = (
+    return moments, (
         f"{len(missing)} images are left out for want of the car's pose at their time, such as "
-        f"{missing[0]}"
+        f"{missing[0]}",
     )
-    return moments, (said,)
 
 
-# ------------------------------------------------------------------------------------------------
-# The images of a drive in Street Gaussians' layout and their sizes, told by their first bytes
+# ---- Images and their sizes, told by their first bytes -------------------------------------------
 
 _NAME = re.compile(r"([0-9]{1,9})_([0-9])\.(png|jpg|jpeg)", re.IGNORECASE)
-_FULL_SIZE = (1920, 1280)  # of Waymo's front cameras, and of its side cameras:
-_SIDE_SIZE = (1920, 886)
+_FULL_SIZE, _SIDE_SIZE = (1920, 1280), (1920, 886)  # of Waymo's front cameras and side cameras
 
 
-@dataclass(frozen=True, eq=False)
-class Images:
-    """paths: of usable images by frame and camera. sizes: width and height by camera. problems: one
-    sentence each."""
+def find_images(
+    root: Path, frames: range, lenses: Mapping[int, Lens]
+) -> tuple[dict[tuple[int, int], Path], dict[int, tuple[int, int]], list[str]]:
+    """Usable images by frame and camera, each camera's image size, and sentences on the rest.
 
-    paths: Mapping[tuple[int, int], Path]
-    sizes: Mapping[int, tuple[int, int]]
-    problems: tuple[str, ...]
-
-
-def find_images(root: Path, frames: range, lenses: Mapping[int, Lens]) -> Images:
-    """The images of these frames and cameras. Where a camera has none, its size is Waymo's.
-
-    Raises:
-        AdapterError: two files of one image, or a principal point outside the images.
+    Where a camera has no image, its size is Waymo's.
     """
     listed = _listed(root / "images")
-    wanted = {key: p for key, p in listed.items() if key[0] in frames and key[1] in lenses}
     paths: dict[tuple[int, int], Path] = {}
     sizes: dict[int, tuple[int, int]] = {}
     problems: list[str] = []
+    without_images = []
     for cam, lens in lenses.items():
-        seen = {key: _size(path) for key, path in sorted(wanted.items()) if key[1] == cam}
+        seen = {
+            key: _size(listed[key]) for key in sorted(listed) if key[0] in frames and key[1] == cam
+        }
         counts = Counter(size for size in seen.values() if size is not None)
-        sizes[cam] = counts.most_common(1)[0][0] if counts else _waymo_size(cam)
+        waymo_size = _SIDE_SIZE if CAMERA_NAMES[cam].startswith("SIDE") else _FULL_SIZE
+        sizes[cam] = width, height = counts.most_common(1)[0][0] if counts else waymo_size
+        if not counts:
+            without_images.append(f"{width}x{height} for {CAMERA_NAMES[cam]}")
         for key, size in seen.items():
-            if size == sizes[cam]:
-                paths[key] = wanted[key]
+            if size is None:
+                problems.append(f"{listed[key]} is no image, or a damaged one; left out")
+            elif size != sizes[cam]:
+                problems.append(
+                    f"{listed[key]} is {size[0]}x{size[1]} pixels, most images of "
+                    f"{CAMERA_NAMES[cam]} are {width}x{height}; left out"
+                )
             else:
-                problems.append(_fault(wanted[key], size, sizes[cam], cam))
-        _check_centre(lens, cam, sizes[cam], is_assumed=not counts)
-    problems += _none(root, lenses, paths, sizes)
-    return Images(paths, sizes, tuple(problems))
+                paths[key] = listed[key]
+        if not (0 < lens.cx < width and 0 < lens.cy < height):
+            whose = "as its images are" if counts else "assumed for want of images"
+            raise AdapterError(
+                f"{lens.path}: cx, cy (its third and fourth number) must lie in the "
+                f"{width}x{height} pixels of {CAMERA_NAMES[cam]}, {whose}; got {lens.cx:g}, "
+                f"{lens.cy:g}. If the images were resized, scale fx fy cx cy with them"
+            )
+    if without_images:
+        problems.append(
+            f"{root / 'images'} holds no usable image NNNNNN_C.png or .jpg of "
+            f"{len(without_images)} cameras: their size is taken to be Waymo's, "
+            f"{', '.join(without_images)}"
+        )
+    return paths, sizes, problems
 
 
 def _listed(folder: Path) -> dict[tuple[int, int], Path]:
@@ -317,53 +392,10 @@ def _size(path: Path) -> tuple[int, int] | None:
     return None if header is None else (header.width, header.height)
 
 
-def _waymo_size(cam: int) -> tuple[int, int]:
-    return _SIDE_SIZE if CAMERA_NAMES[cam].startswith("SIDE") else _FULL_SIZE
-
-
-def _fault(path: Path, size: tuple[int, int] | None, expected: tuple[int, int], cam: int) -> str:
-    if size is None:
-        return f"{path} is no image, or a damaged one; left out"
-    return (
-        f"{path} is {size[0]}x{size[1]} pixels, most images of {CAMERA_NAMES[cam]} are "
-        f"{expected[0]}x{expected[1]}; left out"
-    )
-
-
-def _check_centre(lens: Lens, cam: int, size: tuple[int, int], *, is_assumed: bool) -> None:
-    width, height = size
-    if 0 < lens.cx < width and 0 < lens.cy < height:
-        return
-    whose = "assumed for want of images" if is_assumed else "as its images are"
-    raise AdapterError(
-        f"{lens.path}: cx, cy (its third and fourth number) must lie in the {width}x{height} "
-        f"pixels of {CAMERA_NAMES[cam]}, {whose}; got {lens.cx:g}, {lens.cy:g}. If the images were "
-        f"resized, scale fx fy cx cy with them"
-    )
-
-
-def _none(
-    root: Path,
-    lenses: Mapping[int, Lens],
-    paths: Mapping[tuple[int, int], Path],
-    sizes: Mapping[int, tuple[int, int]],
-) -> list[str]:
-    """A sentence for the cameras without images."""
-    bare = sorted(set(lenses) - {cam for _, cam in paths})
-    if not bare:
-        return []
-    taken = ", ".join(f"{sizes[c][0]}x{sizes[c][1]} for {CAMERA_NAMES[c]}" for c in bare)
-    return [
-        f"{root / 'images'} holds no usable image NNNNNN_C.png or .jpg of {len(bare)} cameras: "
-        f"their size is taken to be Waymo's, {taken}"
-    ]
-
-
 # ---- The tracked objects of a drive, in the columns in which a trained model has them ------------
 # Nothing in a model says which column of its actors' poses is whose. The columns are had again by
-# going over the track file as it was gone over for training: rows in the file's order, each into
-# the
-# first free column of its frame; objects that hardly move are then taken out.
+# going over the track file as training did: rows in the file's order, each into the first free
+# column of its frame; objects that hardly move are then taken out.
 
 NOT_TRACKED = ("sign", "misc")  # classes
 _COLUMNS = (
@@ -380,10 +412,9 @@ _HOLD_S = 0.1  # an object is drawn so long before its first frame and after its
 class TrackTable:
     """A track file of N rows in its order. All in the vehicle's frame at the frame's time.
 
-    lines: int64 [N], for messages. frames, ids: int64 [N]. labels: N. alphas: float64 [N].
-    sizes_m: float64 [N, 3], length, width, height. centers_m: float64 [N, 3]. headings: float64
-    [N], about z. speeds_mps: float64 [N], or None where the file has none. problems: one sentence
-    each.
+    lines: int64 [N], for messages. frames, ids: int64 [N]. sizes_m: float64 [N, 3], length, width,
+    height. centers_m: float64 [N, 3]. headings: float64 [N], about z. speeds_mps: None where the
+    file has none.
     """
 
     path: Path
@@ -405,33 +436,38 @@ class TrackTable:
 def track_files(root: Path, *, use_tracker: bool) -> tuple[Path, Path]:
     """The track file and the one that says which cameras see its objects."""
     suffix = "_castrack" if use_tracker else ""
-    folder = root / "track"
-    return folder / f"track_info{suffix}.txt", folder / f"track_camera_vis{suffix}.json"
+    return root / f"track/track_info{suffix}.txt", root / f"track/track_camera_vis{suffix}.json"
 
 
 def read_track_table(path: Path) -> TrackTable:
-    """A track file.
-
-    Raises:
-        AdapterError: missing; a row is too short, holds something that is no finite number, or is
-            the second one of its object and frame. The message names the line.
-    """
+    """A track file, of which the first line names the columns and is not read."""
     texts = read_text(path).splitlines()
-    rows, words_of = [], []
+    rows, widths = [], []
+    first_lines: dict[tuple[int, int], int] = {}
     for line, text in enumerate(texts[1:], start=2):
-        words = text.split()
-        if words:
+        if words := text.split():
             rows.append((line, *_row(path, line, words)))
-            words_of.append(len(words) > _WORDS)
-    if len(set(words_of)) > 1:
-        odd = rows[words_of.index(not words_of[0])][0]
+            widths.append(min(len(words), _WORDS + 1))
+            _, frame, track_id, *_ = rows[-1]
+            before = first_lines.setdefault((frame, track_id), line)
+            if before != line:
+                raise AdapterError(
+                    f"{path}, line {line}: object {track_id} is already in frame {frame} by line "
+                    f"{before}; delete one of them"
+                )
+    if odd := [row[0] for row, width in zip(rows, widths, strict=True) if width != widths[0]]:
         raise AdapterError(
-            f"{path}, line {odd}: all rows must hold a speed in column {_WORDS + 1}, or none; it "
-            f"differs from the first row"
+            f"{path}, line {odd[0]}: all rows must hold a speed in column {_WORDS + 1}, or none; "
+            f"it differs from the first row"
         )
-    _check_single(path, rows)
-    has_speed = bool(words_of and words_of[0])
+    has_speed = bool(rows) and widths[0] > _WORDS
     numbers = np.array([row[4] for row in rows], np.float64).reshape(len(rows), 8 + has_speed)
+    header = texts[0].split() if texts else []
+    problems = ()
+    if len(header) >= _WORDS and header[0].isdigit():
+        problems = (
+            f"{path}: line 1, which is not read, should name the columns; it holds an object",
+        )
     return TrackTable(
         path=path,
         lines=np.array([row[0] for row in rows], np.int64),
@@ -443,7 +479,7 @@ def read_track_table(path: Path) -> TrackTable:
         centers_m=numbers[:, 4:7],
         headings=numbers[:, 7],
         speeds_mps=numbers[:, 8] if has_speed else None,
-        problems=_headless(path, texts),
+        problems=problems,
     )
 
 
@@ -455,7 +491,7 @@ def _row(path: Path, line: int, words: Sequence[str]) -> tuple[int, int, str, li
             f"{where}: a row must hold the {_WORDS} columns {_COLUMNS}; it holds {len(words)}"
         )
     frame, track_id = words[0], words[1]
-    if not all(re.fullmatch(r"[0-9]{1,9}", word) for word in (frame, track_id)):
+    if not (_NUMBER.fullmatch(frame) and _NUMBER.fullmatch(track_id)):
         raise AdapterError(
             f"{where}: frame_id and track_id must be whole numbers >= 0; got {frame!r}, "
             f"{track_id!r}"
@@ -475,40 +511,17 @@ def _row(path: Path, line: int, words: Sequence[str]) -> tuple[int, int, str, li
     return int(frame), int(track_id), words[2], values
 
 
-def _check_single(path: Path, rows: Sequence[tuple]) -> None:
-    first: dict[tuple[int, int], int] = {}
-    for line, frame, track_id, *_ in rows:
-        before = first.setdefault((frame, track_id), line)
-        if before != line:
-            raise AdapterError(
-                f"{path}, line {line}: object {track_id} is already in frame {frame} by line "
-                f"{before}; delete one of them"
-            )
-
-
-def _headless(path: Path, texts: Sequence[str]) -> tuple[str, ...]:
-    """A sentence where the first line, which is never read, holds an object."""
-    words = texts[0].split() if texts else []
-    if len(words) < _WORDS or not words[0].isdigit():
-        return ()
-    return (f"{path}: line 1, which is not read, should name the columns; it holds an object",)
-
-
 Visibility = Mapping[tuple[int, int], frozenset[int]]
 
 
 def read_visibility(path: Path) -> Visibility:
-    """The cameras that see an object, by object and frame.
-
-    Raises:
-        AdapterError: missing, or something else in it than cameras by object and frame.
-    """
+    """The cameras that see an object, by object and frame."""
     visible: dict[tuple[int, int], frozenset[int]] = {}
     for track_id, frames in read_json(path).items():
         entries = frames.items() if isinstance(frames, dict) else [("?", frames)]
         for frame, cams in entries:
             is_list = isinstance(cams, list) and all(type(cam) is int for cam in cams)
-            if not (is_list and _is_number(track_id) and _is_number(frame)):
+            if not (is_list and _NUMBER.fullmatch(track_id) and _NUMBER.fullmatch(frame)):
                 raise AdapterError(
                     f"{path}: object {track_id!r}, frame {frame!r} must be whole numbers with a "
                     f"list of camera numbers; got {cams!r:.80}"
@@ -517,20 +530,12 @@ def read_visibility(path: Path) -> Visibility:
     return visible
 
 
-def _is_number(text: str) -> bool:
-    return re.fullmatch(r"[0-9]{1,9}", text) is not None
-
-
 def seen_rows(
     table: TrackTable, visible: Visibility, visible_path: Path, cams: Sequence[int]
 ) -> np.ndarray:
-    """Indices of the rows of tracked classes that one of the cameras sees, int64 [R].
-
-    Raises:
-        AdapterError: of such a row it is not said who sees it.
-    """
+    """Indices of the rows of tracked classes that one of the cameras sees, int64 [R]."""
     kept = []
-    wanted = frozenset(cams)
+    used = frozenset(cams)
     for row, label in enumerate(table.labels):
         if label in NOT_TRACKED:
             continue
@@ -540,7 +545,7 @@ def seen_rows(
                 f"{table.path}, line {table.lines[row]}: {visible_path} does not say which cameras "
                 f"see object {track_id} in frame {frame}; both must be of one conversion"
             )
-        if visible[track_id, frame] & wanted:
+        if visible[track_id, frame] & used:
             kept.append(row)
     return np.array(kept, np.int64)
 
@@ -563,8 +568,11 @@ def place_rows(
         used[step] += 1
     placed = np.where(_moves(table, placed, world_from_ego), placed, -1)
     most = int((placed >= 0).sum(1).max()) if columns else 0
-    if most < columns:
-        placed = _compacted(placed, most)
+    if most < columns:  # every frame's rows in its first columns, in the same order
+        moving, placed = placed, np.full((len(frames), most), -1, np.int64)
+        for step, row in enumerate(moving):
+            kept = row[row >= 0]
+            placed[step, : len(kept)] = kept
     return placed if placed.shape[1] else np.full((len(frames), 1), -1, np.int64)
 
 
@@ -582,15 +590,6 @@ def _moves(table: TrackTable, placed: np.ndarray, world_from_ego: np.ndarray) ->
         travel = np.linalg.norm(places[-1] - places[0])
         moving[steps[own], columns[own]] = spread > _SPREAD_M or travel > _TRAVEL_M
     return moving
-
-
-def _compacted(placed: np.ndarray, columns: int) -> np.ndarray:
-    """Every frame's rows in its first columns, in the same order, int64 [F, columns]."""
-    compact = np.full((len(placed), columns), -1, np.int64)
-    for step, row in enumerate(placed):
-        kept = row[row >= 0]
-        compact[step, : len(kept)] = kept
-    return compact
 
 
 def tracklets_of(table: TrackTable, placed: np.ndarray) -> Tracklets:
@@ -643,17 +642,13 @@ def tracked_objects(
     return tuple(objects)
 
 
-# ---- data ----------------------------------------------------------------------------------------
+# ---- The whole -----------------------------------------------------------------------------------
 
 
 def read_data(root: Path, config: ModelConfig) -> StreetData:
     """The frames, cameras and moving objects that the configuration selects.
 
     Images may be missing: what a camera sees is then told by its calibration and Waymo's sizes.
-
-    Raises:
-        AdapterError: no such folder; a missing or damaged file of calibration, poses, times or
-            tracks; a selection of cameras or frames that the dataset has not.
     """
     if not root.is_dir():
         raise AdapterError(f"{root} is not a folder; expected a drive in Street Gaussians' layout")
@@ -708,7 +703,7 @@ def frames_of(data: StreetData) -> tuple[Frame, ...]:
 
 def camera_of(image: StreetImage) -> Camera:
     """The camera at the moment of the image, of the recorded size."""
-    camera_from_world = image.camera_from_ego @ inverse(image.world_from_ego)
+    camera_from_world = image.camera_from_ego @ invert_pose(image.world_from_ego)
     return Camera(
         name=image.name,
         width=image.width,
@@ -762,11 +757,10 @@ def _selected(root: Path, path: EgoPath, config: ModelConfig) -> tuple[range, tu
         )
     if (frames[0], frames[-1]) == (first, last):
         return frames, ()
-    said = (
+    return frames, (
         f"{root} has frames {there[0]} to {there[-1]} of the {first} to {last} that the "
-        f"configuration selects"
+        f"configuration selects",
     )
-    return frames, (said,)
 
 
 def _centred(poses: np.ndarray, origin: np.ndarray) -> np.ndarray:
@@ -784,22 +778,22 @@ def _images(
     origin: np.ndarray,
 ) -> tuple[tuple[StreetImage, ...], tuple[str, ...]]:
     lenses = {cam: read_lens(root, cam) for cam in cams}
-    found = find_images(root, frames, lenses)
+    paths, sizes, size_problems = find_images(root, frames, lenses)
     moments, problems = read_camera_moments(root, path, frames, cams)
     held_out = held_out_steps(len(frames), config)
     images = []
     for number, (frame, cam) in enumerate((frame, cam) for frame in frames for cam in cams):
-        moment, lens = moments.get((frame, cam)), lenses[cam]
-        if moment is None:
+        if (frame, cam) not in moments:
             continue
-        width, height = found.sizes[cam]
+        (timestamp_s, world_from_ego), lens = moments[frame, cam], lenses[cam]
+        width, height = sizes[cam]
         images.append(
             StreetImage(
                 frame=frame,
                 cam=cam,
-                path=found.paths.get((frame, cam)),
-                timestamp_s=moment.timestamp_s,
-                world_from_ego=_centred(moment.world_from_ego, origin),
+                path=paths.get((frame, cam)),
+                timestamp_s=timestamp_s,
+                world_from_ego=_centred(world_from_ego, origin),
                 camera_from_ego=lens.camera_from_ego,
                 width=width,
                 height=height,
@@ -811,4 +805,4 @@ def _images(
                 number=number,
             )
         )
-    return tuple(images), (*found.problems, *problems)
+    return tuple(images), (*size_problems, *problems)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import threading
 import zipfile
 import zlib
-from collections.abc import Generator, Iterator
+from collections.abc import Collection, Generator, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -15,20 +16,30 @@ from typing import BinaryIO
 import numpy as np
 import torch
 
+from adapters.lidar_scene.scene import DriveOptions, build_lidar_scene, views_of, without_points
+from adapters.lidar_scene.split import BoxSample, Sweep, join_tracks
 from adapters.plain_files import read_pose
 from adapters.safe_pickle import check_holds_object, stream_arrays
 from adapters.street_gaussians.data import (
     TIMES,
+    ModelConfig,
     TrackTable,
+    calibrated_cameras,
+    frames_of,
+    read_data,
     read_times,
     read_track_table,
     track_files,
 )
 from adapters.training_views.byte_cache import ByteCache
+from adapters.uri import format_uri
+from augment.cameras import Frame
 from augment.errors import AdapterError
 from augment.files.pickles import PickleError
 from augment.geometry import quat_from_rotmat
 from augment.labels import Boxes, LidarSweep
+from augment.scene import Scene
+from augment.semantics import SemanticClass
 
 # ------------------------------------------------------------------------------------------------
 # LiDAR of a drive in Street Gaussians' layout: pointcloud.npz, a ZIP of pickled dictionaries
@@ -58,11 +69,7 @@ class PointCloud:
 
 
 def read_point_cloud(root: Path, frame: int) -> PointCloud | None:
-    """The returns of a frame; None where there is no file, or no such frame in it.
-
-    Raises:
-        AdapterError: the file is damaged, asks for anything but arrays, or holds others.
-    """
+    """The returns of a frame; None where there is no file, or no such frame in it."""
     path = root / FILE
     if not path.exists():
         return None
@@ -71,11 +78,7 @@ def read_point_cloud(root: Path, frame: int) -> PointCloud | None:
 
 
 def iterate_point_clouds(root: Path) -> Iterator[tuple[int, PointCloud]]:
-    """Frame number and returns of every frame, in the file's order; nothing without the file.
-
-    Raises:
-        AdapterError: as for read_point_cloud.
-    """
+    """Frame number and returns of every frame, in the file's order; nothing without the file."""
     path = root / FILE
     if path.exists():
         yield from _clouds(path)
@@ -244,8 +247,7 @@ class StreetGaussiansLabels:
     def lidar_origins(self, frame_index: int, sweep: LidarSweep) -> np.ndarray | None:
         """Waymo's roof sensor in the car's pose of the frame. The files join the returns of five
         sensors and do not tell them apart: those of the four at the bumpers and sides, which see
-        20 m far, are taken for the roof's, too.
-        """
+        20 m far, are taken for the roof's, too."""
         pose = self._world_from_ego(frame_index)
         if pose is None:
             return None
@@ -302,3 +304,123 @@ def sweep_of(cloud: PointCloud, world_from_ego: np.ndarray, timestamp_ns: int) -
 def _table(path: Path, mtime_ns: int, size: int) -> TrackTable:
     """A track file; mtime_ns and size tell whether it is still the one that was read."""
     return read_track_table(path)
+
+
+# ------------------------------------------------------------------------------------------------
+# A drive in Street Gaussians' layout without a trained model: Gaussians from coloured LiDAR
+# The world is the one that a model trained on it has. Returns are where they were at their frame's
+# time, as the converter has it, and so are the boxes.
+
+# Waymo's uppermost LiDAR looks up by 2.4 degrees; those at the sides see further up, but not far.
+_LIDAR_TOP_DEG = 2.4
+# The recording car in its own frame, whose origin is below its rear axle, on the ground.
+_EGO_LOW_M = np.array([-1.4, -1.15, 0.1])
+_EGO_HIGH_M = np.array([4.2, 1.15, 2.4])
+_MOVED_M = 1.0  # an object whose boxes lie further apart than this moves
+_STANDING = ("sign",)  # classes that never move
+
+
+def open_raw(root: Path, query: dict[str, str]) -> Scene:
+    """The scene of a dataset directory alone.
+
+    query: frames, voxel_m, max_gaussians, image_scale, sky_size, held_out; see DriveOptions.
+    Opening is deterministic: the same files and options give the same bits.
+    """
+    options = DriveOptions.from_query("street_gaussians", query)
+    cams = calibrated_cameras(root)
+    if not cams:
+        raise AdapterError(
+            f"{root / 'extrinsics'} holds no calibration 0.txt to 4.txt; copy it from the dataset"
+        )
+    data = read_data(root, ModelConfig(cameras=cams))
+    frames = frames_of(data)
+    chosen = options.select([f.index for f in frames], where=f"street_gaussians:{root}")
+    frames = tuple(frame for frame in frames if frame.index in set(chosen.numbers))
+    used = [frame for frame in frames if frame.index not in chosen.held_out]
+    if not any(frame.image_paths for frame in used):
+        raise AdapterError(
+            f"{root / 'images'} holds no usable image of the frames that are not held out "
+            f"({used[0].index} to {used[-1].index}); colours cannot be had without them"
+        )
+    sweeps, sweep_problems = _sweeps(root, used)
+    problems = data.problems + chosen.problems + sweep_problems
+    table = read_track_table(track_files(root, use_tracker=False)[0])
+    tracks = join_tracks(_moving_samples(table, frames))
+    scene = build_lidar_scene(
+        sweeps,
+        tracks,
+        views_of(used),
+        options,
+        lidar_top_deg=_LIDAR_TOP_DEG,
+        name=root.absolute().name,
+        source=format_uri("street_gaussians", root, query),
+        frames=frames,
+        labels=StreetGaussiansLabels(root),
+        world_origin_m=data.world_origin_m,
+        problems=problems,
+    )
+    faults = scene.problems[len(problems) :]
+    problems += without_points(tracks, scene) + faults
+    return dataclasses.replace(scene, problems=problems)
+
+
+def _sweeps(root: Path, used: Sequence[Frame]) -> tuple[list[Sweep], tuple[str, ...]]:
+    """The usable returns of the frames in the scene's world, without the recording car's own, and a
+    sentence where frames have none."""
+    by_number = {frame.index: frame for frame in used}
+    sweeps = {}
+    for number, cloud in iterate_point_clouds(root):
+        frame = by_number.get(number)
+        if frame is None:
+            continue
+        own = ((cloud.points > _EGO_LOW_M) & (cloud.points < _EGO_HIGH_M)).all(axis=1)
+        points = cloud.points[~own & np.isfinite(cloud.points).all(axis=1)]
+        pose = frame.world_from_ego.numpy()
+        sweeps[number] = Sweep(
+            (points @ pose[:3, :3].T + pose[:3, 3]).astype(np.float32),
+            np.full(len(points), frame.timestamp_ns, np.int64),
+            np.full(len(points), SemanticClass.UNKNOWN, np.int16),
+        )
+    if not any(len(sweep) for sweep in sweeps.values()):
+        raise AdapterError(
+            f"{root / FILE} holds no returns of frames {used[0].index} to {used[-1].index}, or is "
+            f"missing; a scene cannot be built without them. Make it with the converter's LiDAR "
+            f"step, or give a trained model's folder"
+        )
+    missing = sorted(set(by_number) - set(sweeps))
+    found = [sweeps[number] for number in sorted(sweeps)]
+    if not missing:
+        return found, ()
+    said = f"{root / FILE} lacks {len(missing)} frames, such as {missing[0]}: their points too"
+    return found, (said,)
+
+
+def _moving_samples(table: TrackTable, frames: Sequence[Frame]) -> list[BoxSample]:
+    """The boxes of the objects that move within the frames, by frame."""
+    samples: list[BoxSample] = []
+    for frame in frames:
+        rows = np.flatnonzero(table.frames == frame.index)
+        poses = frame.world_from_ego.numpy() @ ego_from_boxes(table, rows)
+        samples += [
+            BoxSample(
+                object_id=str(int(table.ids[row])),
+                sibling_id=None,
+                label=table.labels[row],
+                frame=frame.index,
+                timestamp_ns=frame.timestamp_ns,
+                world_from_box=pose,
+                size_m=table.sizes_m[row],
+            )
+            for row, pose in zip(rows, poses, strict=True)
+            if table.labels[row] not in _STANDING
+        ]
+    moving = _moving_ids(samples)
+    return [sample for sample in samples if sample.object_id in moving]
+
+
+def _moving_ids(samples: Sequence[BoxSample]) -> Collection[str]:
+    places: dict[str, list[np.ndarray]] = {}
+    for sample in samples:
+        places.setdefault(sample.object_id, []).append(sample.world_from_box[:2, 3])
+    extents = {name: np.ptp(np.array(xy), axis=0) for name, xy in places.items()}
+    return {name for name, extent in extents.items() if np.hypot(*extent) > _MOVED_M}

@@ -1,10 +1,10 @@
-"""What a trained model holds, read from trained_model/iteration_N.pth."""
+"""A trained model: its options, configuration and files, and what they hold."""
 
 from __future__ import annotations
 
-import contextlib
+import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,8 @@ from torch import Tensor
 
 from adapters.lidar_scene.scene import DriveOptions
 from adapters.plain_files import read_yaml
-from adapters.street_gaussians.records import CAMERA_NAMES, ModelConfig, PoseChanges, rotations_of
+from adapters.street_gaussians.data import CAMERA_NAMES, ModelConfig
+from adapters.uri import check_query, choice_of, whole_number_of
 from augment.errors import AdapterError, SceneError
 from augment.files.checkpoints import load_checkpoint, release, section, taken, tensor
 from augment.files.ply import (
@@ -27,8 +28,7 @@ from augment.files.ply import (
 )
 from augment.scene import SH_COUNTS, Gaussians, check_gaussians, drawable_rows, is_drawable
 
-# ------------------------------------------------------------------------------------------------
-# What the URI of a trained model may ask for, as in `street_gaussians:<path>?data=…&width=800`
+# ---- What the URI of a trained model may ask for -----------------------------------------------
 
 SCHEME = "street_gaussians"
 DEFAULT_WIDTH = 1600
@@ -55,54 +55,41 @@ class ModelOptions:
 
     @staticmethod
     def from_query(query: dict[str, str]) -> ModelOptions:
-        """Raises:
-        AdapterError: an unknown key (lists the known ones), or a value of the wrong kind.
-        """
-        unknown = sorted(set(query) - set(_KEYS))
-        if unknown:
-            known = "; ".join(f"{key}: {meaning}" for key, meaning in _KEYS.items())
-            raise AdapterError(
-                f"{SCHEME}: unknown option {unknown[0]!r}; for a trained model allowed are {known}"
-            )
+        check_query(SCHEME, query, _KEYS)
         frames = {"frames": query["frames"]} if "frames" in query else {}
         return ModelOptions(
             data=Path(query["data"]).expanduser() if "data" in query else None,
-            iteration=_number(query, "iteration", None),
-            weights=_choice(query, "weights", ("pth", "ply")),
-            width=_number(query, "width", DEFAULT_WIDTH) or 0,
+            iteration=whole_number_of(SCHEME, query, "iteration"),
+            weights=choice_of(SCHEME, query, "weights", ("pth", "ply")),
+            width=whole_number_of(SCHEME, query, "width", DEFAULT_WIDTH),
             frames=DriveOptions.from_query(SCHEME, frames),
-            rotation_bug=_choice(query, "rotation_bug", ("0", "1")) == "1",
+            rotation_bug=choice_of(SCHEME, query, "rotation_bug", ("0", "1")) == "1",
         )
-
-
-def _number(query: dict[str, str], key: str, default: int | None) -> int | None:
-    text = query.get(key)
-    if text is None:
-        return default
-    if not (text.isascii() and text.isdigit() and len(text) < 10):
-        raise AdapterError(f"{SCHEME}: {key} must be a whole number, {_KEYS[key]}; got {text!r}")
-    return int(text)
-
-
-def _choice(query: dict[str, str], key: str, allowed: tuple[str, ...]) -> str | None:
-    text = query.get(key)
-    if text is not None and text not in allowed:
-        raise AdapterError(f"{SCHEME}: {key} must be {' or '.join(allowed)}; got {text!r}")
-    return text
 
 
 # ---- The configuration that a model was trained with: configs/config_{iteration:06d}.yaml --------
 
 _NAME = re.compile(r"config_(\d+)\.yaml")
-_MODES = {"color_correction": ("image", "sensor"), "pose_correction": ("image", "frame")}
+_CONFIG_KEYS = {
+    "source_path": "source_path",
+    "use_tracker": "data.use_tracker",
+    "split_test": "data.split_test",
+    "split_train": "data.split_train",
+    "white_background": "data.white_background",
+    "fourier_scale": "model.gaussian.fourier_scale",
+    "include_sky": "model.nsg.include_sky",
+    "opt_track": "model.nsg.opt_track",
+    "use_color_correction": "model.use_color_correction",
+    "color_correction_mode": "model.color_correction.mode",
+    "color_correction_mlp": "model.color_correction.use_mlp",
+    "use_pose_correction": "model.use_pose_correction",
+    "pose_correction_mode": "model.pose_correction.mode",
+}
+_MODES = {"color_correction_mode": ("image", "sensor"), "pose_correction_mode": ("image", "frame")}
 
 
 def newest_config(model: Path) -> Path:
-    """The configuration of a model's folder; of several the one of the latest iteration.
-
-    Raises:
-        AdapterError: there is none.
-    """
+    """The configuration of a model's folder; of several the one of the latest iteration."""
     found = {}
     for path in (model / "configs").glob("config_*.yaml"):
         if match := _NAME.fullmatch(path.name):
@@ -117,98 +104,48 @@ def newest_config(model: Path) -> Path:
 
 
 def read_config(path: Path) -> ModelConfig:
-    """What of a configuration decides how its model is read; keys it lacks have the project's
-    defaults.
+    """What of a configuration decides how its model is read; keys that it lacks or has as null
+    have the project's defaults."""
+    tree, values, numbers = read_yaml(path), {}, range(len(CAMERA_NAMES))
 
-    Raises:
-        AdapterError: no YAML, or a value of another kind; names the key.
-    """
-    values = _Values(read_yaml(path), path)
-    default = ModelConfig()
-    return ModelConfig(
-        source_path=values.of("source_path", str, default.source_path),
-        cameras=values.cameras(default.cameras),
-        selected_frames=values.selected_frames(),
-        use_tracker=values.of("data.use_tracker", bool, default.use_tracker),
-        split_test=values.of("data.split_test", int, default.split_test),
-        split_train=values.of("data.split_train", int, default.split_train),
-        white_background=values.of("data.white_background", bool, default.white_background),
-        sh_degree=values.of("model.gaussian.sh_degree", int, default.sh_degree),
-        fourier_dim=values.of("model.gaussian.fourier_dim", int, default.fourier_dim),
-        fourier_scale=values.of("model.gaussian.fourier_scale", float, default.fourier_scale),
-        include_sky=values.of("model.nsg.include_sky", bool, default.include_sky),
-        opt_track=values.of("model.nsg.opt_track", bool, default.opt_track),
-        use_color_correction=values.of(
-            "model.use_color_correction", bool, default.use_color_correction
-        ),
-        color_correction_mode=values.mode("color_correction", default.color_correction_mode),
-        color_correction_mlp=values.of(
-            "model.color_correction.use_mlp", bool, default.color_correction_mlp
-        ),
-        use_pose_correction=values.of(
-            "model.use_pose_correction", bool, default.use_pose_correction
-        ),
-        pose_correction_mode=values.mode("pose_correction", default.pose_correction_mode),
-    )
+    def wrong(key: str, expected: str, found: Any) -> AdapterError:
+        return AdapterError(f"{path}: {key} must be {expected}; got {str(found)[:80]!r}")
 
-
-class _Values:
-    """Values of a configuration by keys such as data.cameras, checked."""
-
-    def __init__(self, tree: Mapping[str, Any], path: Path) -> None:
-        self._tree, self._path = tree, path
-
-    def _find(self, key: str) -> Any:
-        """The value; None where it is absent or null."""
-        found: Any = self._tree
+    def value_of(key: str) -> Any:
+        found: Any = tree
         for name in key.split("."):
-            if found is None:
-                return None
-            if not isinstance(found, Mapping):
-                raise self._wrong(key, "a key inside a section", found)
-            found = found.get(name)
+            if found is not None and not isinstance(found, Mapping):
+                raise wrong(key, "a key inside a section", found)
+            found = None if found is None else found.get(name)
         return found
 
-    def of(self, key: str, kind: type, default: Any) -> Any:
-        found = self._find(key)
+    for name, key in _CONFIG_KEYS.items():
+        found, kind = value_of(key), type(getattr(ModelConfig, name))
         if found is None:
-            return default
+            continue
         if kind is float and type(found) is int:
             found = float(found)
         if type(found) is not kind:
-            raise self._wrong(key, f"a value of type {kind.__name__}", found)
-        if kind is float and not abs(found) < float("inf"):
-            raise self._wrong(key, "a finite number", found)
-        return found
-
-    def mode(self, section: str, default: str) -> str:
-        found = self.of(f"model.{section}.mode", str, default)
-        if found not in _MODES[section]:
-            raise self._wrong(f"model.{section}.mode", " or ".join(_MODES[section]), found)
-        return found
-
-    def cameras(self, default: tuple[int, ...]) -> tuple[int, ...]:
-        found = self._find("data.cameras")
-        if found is None:
-            return default
-        numbers = range(len(CAMERA_NAMES))
-        is_list = isinstance(found, list) and all(type(n) is int and n in numbers for n in found)
-        if not is_list or not found or len(set(found)) != len(found):
+            raise wrong(key, f"a value of type {kind.__name__}", found)
+        if kind is float and not math.isfinite(found):
+            raise wrong(key, "a finite number", found)
+        if found not in _MODES.get(name, (found,)):
+            raise wrong(key, " or ".join(_MODES[name]), found)
+        values[name] = found
+    if (cameras := value_of("data.cameras")) is not None:
+        is_list = isinstance(cameras, list) and all(
+            type(n) is int and n in numbers for n in cameras
+        )
+        if not is_list or not cameras or len(set(cameras)) != len(cameras):
             expected = f"different camera numbers from 0 to {numbers[-1]}, such as [0, 1, 2]"
-            raise self._wrong("data.cameras", expected, found)
-        return tuple(found)
-
-    def selected_frames(self) -> tuple[int, int] | None:
-        found = self._find("data.selected_frames")
-        if found is None:
-            return None
-        is_pair = isinstance(found, list) and [type(n) for n in found] == [int, int]
-        if not is_pair or not 0 <= found[0] <= found[1]:
-            raise self._wrong("data.selected_frames", "[first, last] or null", found)
-        return found[0], found[1]
-
-    def _wrong(self, key: str, expected: str, found: Any) -> AdapterError:
-        return AdapterError(f"{self._path}: {key} must be {expected}; got {str(found)[:80]!r}")
+            raise wrong("data.cameras", expected, cameras)
+        values["cameras"] = tuple(cameras)
+    if (pair := value_of("data.selected_frames")) is not None:
+        is_pair = isinstance(pair, list) and [type(n) for n in pair] == [int, int]
+        if not is_pair or not 0 <= pair[0] <= pair[1]:
+            raise wrong("data.selected_frames", "[first, last] or null", pair)
+        values["selected_frames"] = tuple(pair)
+    return ModelConfig(**values)
 
 
 # ---- Where the files of a trained model are ------------------------------------------------------
@@ -235,32 +172,38 @@ def is_dataset(path: Path) -> bool:
 
 
 def find_model(path: Path, options: ModelOptions) -> ModelFiles:
-    """The files of a model, given its folder or its weights.
-
-    Raises:
-        AdapterError: no weights, no such iteration, no configuration, or no dataset.
-    """
+    """The files of a model, given its folder or its weights."""
     folder, weights, iteration = _weights(path, options)
     config_file = newest_config(folder)
     config = read_config(config_file)
-    return ModelFiles(
-        folder, weights, iteration, config_file, config, _data(config, config_file, options)
-    )
-
-
-def find_data(path: Path, options: ModelOptions) -> Path:
-    """The dataset of a model.
-
-    Raises:
-        AdapterError: as find_model.
-    """
-    return find_model(path, options).data
+    data = options.data
+    if data is not None and not data.is_dir():
+        raise AdapterError(f"data={data}: no such folder; expected the model's dataset")
+    if data is None:
+        data = Path(config.source_path)
+        if not config.source_path or not data.is_dir():
+            raise AdapterError(
+                f"{config_file}: source_path {config.source_path!r} is not here; the model needs "
+                f"poses, tracks and cameras of its dataset. Give its folder as data=DIR"
+            )
+    return ModelFiles(folder, weights, iteration, config_file, config, data)
 
 
 def _weights(path: Path, options: ModelOptions) -> tuple[Path, Path, int | None]:
     """The model's folder, its weights and their iteration, where their name says it."""
     if path.is_file():
-        return _given_file(path, options)
+        if options.iteration is not None or options.weights is not None:
+            raise AdapterError(
+                f"{path} is one file, so iteration= and weights= say nothing; give the model's "
+                f"folder or leave them out"
+            )
+        if path.suffix.lower() not in (".pth", ".ply"):
+            raise AdapterError(f"{path}: expected a model's folder, .pth or .ply")
+        is_pth = path.suffix.lower() == ".pth"
+        match = _PTH.fullmatch(path.name) if is_pth else _PLY.fullmatch(path.parent.name)
+        folders = path.absolute().parents[:3]
+        folder = next((folder for folder in folders if (folder / "configs").is_dir()), folders[-1])
+        return folder, path, int(match[1]) if match else None
     saved = _saved(path)
     if not saved:
         raise AdapterError(
@@ -279,21 +222,6 @@ def _weights(path: Path, options: ModelOptions) -> tuple[Path, Path, int | None]
     return path, of_kind[iteration], iteration
 
 
-def _given_file(path: Path, options: ModelOptions) -> tuple[Path, Path, int | None]:
-    if options.iteration is not None or options.weights is not None:
-        raise AdapterError(
-            f"{path} is one file, so iteration= and weights= say nothing; give the model's folder "
-            f"or leave them out"
-        )
-    if path.suffix.lower() not in (".pth", ".ply"):
-        raise AdapterError(f"{path}: expected a model's folder, .pth or .ply")
-    is_pth = path.suffix.lower() == ".pth"
-    match = _PTH.fullmatch(path.name) if is_pth else _PLY.fullmatch(path.parent.name)
-    folders = path.absolute().parents[:3]
-    folder = next((folder for folder in folders if (folder / "configs").is_dir()), folders[-1])
-    return folder, path, int(match[1]) if match else None
-
-
 def _saved(folder: Path) -> dict[tuple[str, int], Path]:
     """Weights by kind and iteration."""
     found = {}
@@ -304,19 +232,6 @@ def _saved(folder: Path) -> dict[tuple[str, int], Path]:
         if match := _PLY.fullmatch(file.parent.name):
             found["ply", int(match[1])] = file
     return found
-
-
-def _data(config: ModelConfig, config_file: Path, options: ModelOptions) -> Path:
-    if options.data is not None:
-        if not options.data.is_dir():
-            raise AdapterError(f"data={options.data}: no such folder; expected the model's dataset")
-        return options.data
-    if config.source_path and Path(config.source_path).is_dir():
-        return Path(config.source_path)
-    raise AdapterError(
-        f"{config_file}: source_path {config.source_path!r} is not here; the model needs poses, "
-        f"tracks and cameras of its dataset. Give its folder as data=DIR"
-    )
 
 
 # ---- Tables of a trained model beside its Gaussians: poses, sky, colour and pose correction ------
@@ -337,19 +252,11 @@ class Parameters:
     def __init__(self, content: Mapping[str, Any], path: Path, problems: list[str]) -> None:
         self.path, self.problems = path, problems
         self._content = content
-        self._seen = {"background", "iter"}
-
-    def skip(self, name: str) -> None:
-        """Say that an entry is known."""
-        self._seen.add(name)
+        self.seen = {"background", "iter"}
 
     def of(self, name: str, key: str, is_used: bool) -> Mapping[str, Any] | None:
-        """The table `params` of an entry. key: what in the configuration says that it is used.
-
-        Raises:
-            AdapterError: it is used but not there.
-        """
-        self._seen.add(name)
+        """The table `params` of an entry. key: what in the configuration says that it is used."""
+        self.seen.add(name)
         if not is_used:
             if self._content.get(name):
                 self.problems.append(
@@ -368,11 +275,7 @@ class Parameters:
     def numbers(
         self, params: Mapping[str, Any], name: str, key: str, shape: Sequence[int | None]
     ) -> np.ndarray:
-        """A small table, float64.
-
-        Raises:
-            AdapterError: missing, of another shape, or not finite.
-        """
+        """A small table, float64."""
         where = f"{self.path}, {name}.params"
         found = tensor(params, key, shape, where).double().numpy()
         if not np.isfinite(found).all():
@@ -380,7 +283,7 @@ class Parameters:
         return found
 
     def report_unknown(self) -> None:
-        names = [name for name in self._content if name not in self._seen]
+        names = [name for name in self._content if name not in self.seen]
         names = [str(name) for name in names if actor_id(str(name)) is None]
         if names:
             self.problems.append(
@@ -390,16 +293,35 @@ class Parameters:
             )
 
 
+@dataclass(frozen=True, eq=False)
+class PoseChanges:
+    """What training added to the poses of each frame and column of the tracklets.
+
+    positions: float64 [F, M, 3], metres, vehicle frame. half_turns: float64 [F, M], radians about
+    the object's z; it turns by twice as much.
+    """
+
+    positions: np.ndarray
+    half_turns: np.ndarray
+
+
+def rotations_of(quats: np.ndarray) -> np.ndarray:
+    """Rotation matrices [T, 3, 3] of wxyz quaternions [T, 4] of any length but zero."""
+    w, x, y, z = (quats / np.linalg.norm(quats, axis=1, keepdims=True)).T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows), -1, 0)
+
+
 def read_pose_changes(
     parameters: Parameters, config: ModelConfig, *, has_actors: bool
 ) -> PoseChanges | None:
-    """What training added to the actors' poses; None where it left them.
-
-    Raises:
-        AdapterError: as Parameters.
-    """
+    """What training added to the actors' poses; None where it left them."""
     if not has_actors:
-        parameters.skip("actor_pose")
+        parameters.seen.add("actor_pose")
         return None
     params = parameters.of("actor_pose", "model.nsg.opt_track", config.opt_track)
     if params is None:
@@ -415,9 +337,6 @@ def read_sky(parameters: Parameters, config: ModelConfig) -> Tensor | None:
 
     The project clamps what it looks up; clamped texels are the same but between texels of which
     only some are out of range.
-
-    Raises:
-        AdapterError: as Parameters.
     """
     params = parameters.of("sky_cubemap", "model.nsg.include_sky", config.include_sky)
     if params is None:
@@ -444,11 +363,7 @@ def read_sky(parameters: Parameters, config: ModelConfig) -> Tensor | None:
 
 
 def read_color_maps(parameters: Parameters, config: ModelConfig) -> Tensor | None:
-    """Colour maps float32 [n, 3, 4]; None where there are none that can be used.
-
-    Raises:
-        AdapterError: as Parameters.
-    """
+    """Colour maps float32 [n, 3, 4]; None where there are none that can be used."""
     name = "color_correction"
     params = parameters.of(name, "model.use_color_correction", config.use_color_correction)
     if params is None:
@@ -465,11 +380,7 @@ def read_color_maps(parameters: Parameters, config: ModelConfig) -> Tensor | Non
 
 
 def read_camera_changes(parameters: Parameters, config: ModelConfig) -> np.ndarray | None:
-    """What the background is moved by before an image is taken, float64 [n, 4, 4].
-
-    Raises:
-        AdapterError: as Parameters.
-    """
+    """What the background is moved by before an image is taken, float64 [n, 4, 4]."""
     name = "pose_correction"
     params = parameters.of(name, "model.use_pose_correction", config.use_pose_correction)
     if params is None:
@@ -498,16 +409,10 @@ class Part:
     gaussians: Gaussians
     terms: Tensor | None
 
-    @property
-    def term_count(self) -> int:
-        """F."""
-        return 1 if self.terms is None else 1 + self.terms.shape[1]
-
 
 def allocate(count: int, sh_count: int, term_count: int) -> tuple[dict[str, Tensor], Tensor | None]:
     """Memory of a part's numbers, to be filled as they stand in a file: log scales, opacity logits,
-    quaternions of any length. Named as in Gaussians; the second are the terms.
-    """
+    quaternions of any length. Named as in Gaussians; the second are the terms."""
     arrays = {
         "means": torch.empty(count, 3),
         "quats": torch.empty(count, 4),
@@ -519,11 +424,7 @@ def allocate(count: int, sh_count: int, term_count: int) -> tuple[dict[str, Tens
 
 
 def check_counts(where: str, rest: int, terms: int, *, is_background: bool) -> None:
-    """rest: SH coefficients above the constant one. terms: F.
-
-    Raises:
-        AdapterError: no such spherical harmonics, or a background whose colours change.
-    """
+    """rest: SH coefficients above the constant one. terms: F."""
     if rest + 1 not in SH_COUNTS:
         known = ", ".join(str(count - 1) for count in SH_COUNTS)
         raise AdapterError(
@@ -536,12 +437,11 @@ def check_counts(where: str, rest: int, terms: int, *, is_background: bool) -> N
 
 
 def finish_part(
-    arrays: Mapping[str, Tensor], terms: Tensor | None, where: str
-) -> tuple[Part, tuple[str, ...]]:
-    """Activate the numbers where they lie and leave out what cannot be drawn, with a sentence each.
+    arrays: Mapping[str, Tensor], terms: Tensor | None, where: str, *, is_background: bool
+) -> tuple[Part | None, tuple[str, ...]]:
+    """Activate the numbers in place and leave out what cannot be drawn, with a sentence each.
 
-    Raises:
-        AdapterError: nothing usable remains.
+    None for an actor of which nothing usable remains; of a background that is an error.
     """
     _activate(arrays)
     if terms is not None:
@@ -552,7 +452,9 @@ def finish_part(
     try:
         kept, problems = check_gaussians(gaussians, where=where)
     except SceneError as error:
-        raise AdapterError(str(error)) from None
+        if is_background:
+            raise AdapterError(str(error)) from None
+        return None, (f"{error} It is left out",)
     return Part(kept, None if terms is None else terms[drawable_rows(gaussians)]), problems
 
 
@@ -607,11 +509,7 @@ class TrainedModel:
 
 
 def read_checkpoint(path: Path, config: ModelConfig) -> TrainedModel:
-    """Read a .pth. Nothing in it is run; the optimiser's state is not looked at.
-
-    Raises:
-        AdapterError: not such a file, damaged, or lacking what the configuration says was trained.
-    """
+    """Read a .pth. Nothing in it is run; the optimiser's state is not looked at."""
     content = load_checkpoint(path)
     if "background" not in content:
         keys = ", ".join(map(str, list(content)[:12])) or "nothing"
@@ -654,39 +552,27 @@ def _read_part(content: Mapping[str, Any], path: Path, name: str) -> tuple[Part 
     count = len(means)
     colours = tensor(content, "feature_dc", (count, None, 3), where)
     rest = tensor(content, "feature_rest", (count, None, 3), where)
-    sources = {"means": means}
-    for key, own, columns in (("scaling", "scales", 3), ("rotation", "quats", 4)):
-        sources[own] = tensor(content, key, (count, columns), where)
+    scales = tensor(content, "scaling", (count, 3), where)
+    quats = tensor(content, "rotation", (count, 4), where)
     logits = tensor(content, "opacity", (count, 1), where)
     is_background = name == "background"
     check_counts(where, rest.shape[1], colours.shape[1], is_background=is_background)
-    problems = _doubts(content, where)
+    problems = []
+    semantic = content.get("semantic")
+    if isinstance(semantic, Tensor) and semantic.dim() == 2 and semantic.shape[1] > 0:
+        problems.append(f"{where}: its semantic features are not used")
+    if unknown := [str(key) for key in content if key not in (*_TENSORS, *_TRAINING)]:
+        problems.append(f"{where}: it also holds {', '.join(unknown[:8])}, which is not used")
     if count == 0 and not is_background:
         return None, [*problems, f"{where}: it has no Gaussians and is left out"]
     arrays, terms = allocate(count, 1 + rest.shape[1], colours.shape[1])
-    for own, source in sources.items():
-        taken(source, arrays[own])
+    for name, source in (("means", means), ("scales", scales), ("quats", quats)):
+        taken(source, arrays[name])
     taken(logits, arrays["opacities"][:, None])
     _split(colours, arrays["sh"][:, :1], terms)
     _split(rest, arrays["sh"][:, 1:], None)
-    try:
-        part, found = finish_part(arrays, terms, where)
-    except AdapterError as error:
-        if is_background:
-            raise
-        return None, [*problems, f"{error} It is left out"]
+    part, found = finish_part(arrays, terms, where, is_background=is_background)
     return part, [*problems, *found]
-
-
-def _doubts(content: Mapping[str, Any], where: str) -> list[str]:
-    semantic = content.get("semantic")
-    problems = []
-    if isinstance(semantic, Tensor) and semantic.dim() == 2 and semantic.shape[1] > 0:
-        problems.append(f"{where}: its semantic features are not used")
-    unknown = [str(key) for key in content if key not in (*_TENSORS, *_TRAINING)]
-    if unknown:
-        problems.append(f"{where}: it also holds {', '.join(unknown[:8])}, which is not used")
-    return problems
 
 
 def _split(source: Tensor, first: Tensor, further: Tensor | None) -> None:
@@ -715,17 +601,31 @@ _NUMBERED = re.compile(r"(f_dc|f_rest|semantic)_(0|[1-9]\d{0,6})")
 
 
 def read_point_cloud(path: Path, config: ModelConfig) -> TrainedModel:
-    """Read a .ply in pieces.
-
-    Raises:
-        AdapterError: not such a file, truncated, or columns missing or wrong in number.
-    """
-    with _as_adapter_errors():
+    """Read a .ply in pieces."""
+    try:
         header = read_ply_header(path)
         elements = {e.name.removeprefix(_PREFIX): e for e in header.elements if _is_part(e)}
         if "background" not in elements:
-            raise AdapterError(_not_a_model(header))
-        problems = [_lacks(path, config)]
+            names = [element.name for element in header.elements]
+            hint = ""
+            if "vertex" in names:
+                hint = f". A .ply with one element 'vertex' opens as gaussians:{path}"
+            raise AdapterError(
+                f"{path} is no Street Gaussians model: expected an element vertex_background and "
+                f"one such as vertex_obj_003 for each actor; found "
+                f"{', '.join(names[:12]) or 'none'}{hint}"
+            )
+        lost = {
+            "the actors' learnt poses": config.opt_track,
+            "the sky": config.include_sky,
+            "the colour correction": config.use_color_correction,
+            "the pose correction": config.use_pose_correction,
+        }
+        text = f"{path}: a .ply holds Gaussians only"
+        if any(lost.values()):
+            names = ", ".join(name for name, was_trained in lost.items() if was_trained)
+            text += f"; left out: {names}. They are in trained_model/iteration_N.pth"
+        problems = [text]
         others = [e.name for e in header.elements if not _is_part(e)]
         if others:
             problems.append(f"{path} also holds {', '.join(others[:8])}, which is not used")
@@ -735,6 +635,10 @@ def read_point_cloud(path: Path, config: ModelConfig) -> TrainedModel:
             problems += found
             if part is not None:
                 parts[name] = part
+    except AdapterError:
+        raise
+    except SceneError as error:
+        raise AdapterError(str(error)) from None
     surplus = count_surplus_bytes(header)
     if surplus:
         problems.append(f"{path}: {surplus} bytes follow its rows and were ignored")
@@ -743,44 +647,9 @@ def read_point_cloud(path: Path, config: ModelConfig) -> TrainedModel:
     return TrainedModel(path, background, actors, problems=problems)
 
 
-@contextlib.contextmanager
-def _as_adapter_errors() -> Iterator[None]:
-    try:
-        yield
-    except AdapterError:
-        raise
-    except SceneError as error:
-        raise AdapterError(str(error)) from None
-
-
 def _is_part(element: PlyElement) -> bool:
     name = element.name.removeprefix(_PREFIX)
     return element.name.startswith(_PREFIX) and (name == "background" or actor_id(name) is not None)
-
-
-def _not_a_model(header: PlyHeader) -> str:
-    found = [element.name for element in header.elements]
-    hint = ""
-    if "vertex" in found:
-        hint = f". A .ply with one element 'vertex' opens as gaussians:{header.path}"
-    return (
-        f"{header.path} is no Street Gaussians model: expected an element vertex_background and "
-        f"one such as vertex_obj_003 for each actor; found {', '.join(found[:12]) or 'none'}{hint}"
-    )
-
-
-def _lacks(path: Path, config: ModelConfig) -> str:
-    lost = {
-        "the actors' learnt poses": config.opt_track,
-        "the sky": config.include_sky,
-        "the colour correction": config.use_color_correction,
-        "the pose correction": config.use_pose_correction,
-    }
-    names = [name for name, was_trained in lost.items() if was_trained]
-    text = f"{path}: a .ply holds Gaussians only"
-    if not names:
-        return text
-    return f"{text}; left out: {', '.join(names)}. They are in trained_model/iteration_N.pth"
 
 
 def _read_ply_part(
@@ -803,12 +672,7 @@ def _read_ply_part(
         done += len(rows)
     if not arrays:
         arrays, terms = allocate(0, 1 + rest, colours)
-    try:
-        part, found = finish_part(arrays, terms, where)
-    except AdapterError as error:
-        if is_background:
-            raise
-        return None, [*problems, f"{error} It is left out"]
+    part, found = finish_part(arrays, terms, where, is_background=is_background)
     return part, [*problems, *found]
 
 
@@ -820,8 +684,9 @@ def _count_columns(element: PlyElement, where: str) -> tuple[int, int, int]:
         if match := _NUMBERED.fullmatch(name):
             numbers[match[1]].append(int(match[2]))
     if missing or not numbers["f_dc"]:
+        lost = [*missing[:8], *([] if numbers["f_dc"] else ["f_dc_0"])]
         raise AdapterError(
-            f"{where}: not the Gaussians of a model: {', '.join([*missing[:8], *_no_dc(numbers)])} "
+            f"{where}: not the Gaussians of a model: {', '.join(lost)} "
             f"missing; it has {', '.join(element.names[:12]) or 'no properties'}"
         )
     for name in ("f_dc", "f_rest"):
@@ -832,10 +697,6 @@ def _count_columns(element: PlyElement, where: str) -> tuple[int, int, int]:
                 f"values after the other's) and without gaps; got {len(found)}"
             )
     return len(numbers["f_dc"]) // 3, len(numbers["f_rest"]) // 3, len(numbers["semantic"])
-
-
-def _no_dc(numbers: dict[str, list[int]]) -> list[str]:
-    return [] if numbers["f_dc"] else ["f_dc_0"]
 
 
 def _scatter(

@@ -14,10 +14,8 @@ import pytest
 import torch
 from street_gaussians_files import NAMES, ROAD_RGB, Facts, write_dataset
 
-from adapters.street_gaussians.adapter import open_raw
-from adapters.street_gaussians.data import frames_of, held_out_steps, read_data
-from adapters.street_gaussians.labels import StreetGaussiansLabels, labels_of
-from adapters.street_gaussians.records import ModelConfig
+from adapters.street_gaussians.data import ModelConfig, frames_of, held_out_steps, read_data
+from adapters.street_gaussians.labels import StreetGaussiansLabels, labels_of, open_raw
 from adapters.uri import format_uri
 from augment.errors import AdapterError
 from augment.geometry import rotmat_from_quat

@@ -22,6 +22,7 @@ from street_gaussians_models import (
     write_model,
 )
 
+from adapters.street_gaussians.data import ModelConfig
 from adapters.street_gaussians.model import (
     Part,
     TrainedModel,
@@ -30,10 +31,9 @@ from adapters.street_gaussians.model import (
     read_config,
     read_point_cloud,
 )
-from adapters.street_gaussians.records import ModelConfig
 from augment.errors import AdapterError
 
-PLAIN = ModelConfig(sh_degree=1, fourier_dim=5)
+PLAIN = ModelConfig()
 
 
 def raw_model(**changes) -> RawModel:
@@ -387,7 +387,7 @@ def test_configurations(tmp_path: Path) -> None:
     path.write_text(yaml.safe_dump(tree))
     assert read_config(path) == ModelConfig(
         source_path="data/002", cameras=(0, 3), selected_frames=(5, 90), split_test=4,
-        split_train=1, sh_degree=1, fourier_dim=5, fourier_scale=2.0,
+        split_train=1, fourier_scale=2.0,
         include_sky=True, use_pose_correction=True, pose_correction_mode="frame",
         color_correction_mode="sensor",
     )  # fmt: skip

@@ -12,22 +12,23 @@ import torch
 from scipy.spatial.transform import Rotation
 from street_gaussians_models import random_part
 
-from adapters.street_gaussians.adapter import ActorSettings, make_actor
-from adapters.street_gaussians.model import Part
-from adapters.street_gaussians.records import (
+from adapters.street_gaussians.adapter import (
     CameraChanges,
-    ModelConfig,
-    PoseChanges,
-    StreetData,
-    StreetImage,
-    TrackedObject,
-    Tracklets,
     camera_changes,
     check_changes,
     color_maps,
     image_poses,
+    make_actor,
     vehicle_poses,
 )
+from adapters.street_gaussians.data import (
+    ModelConfig,
+    StreetData,
+    StreetImage,
+    TrackedObject,
+    Tracklets,
+)
+from adapters.street_gaussians.model import Part, PoseChanges
 from augment.errors import AdapterError
 from augment.scene import Gaussians
 
@@ -199,7 +200,7 @@ def part_of(terms: int, degree: int = 0) -> Part:
     return Part(gaussians, torch.from_numpy(raw.dc[:, 1:].copy()) if terms > 1 else None)
 
 
-PLAIN = ActorSettings(fourier_scale=2.0, opt_track=True, rotation_bug=False)
+PLAIN = ModelConfig(fourier_scale=2.0)
 
 
 def test_an_actor_is_where_and_when_its_images_are() -> None:

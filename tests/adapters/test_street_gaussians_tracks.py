@@ -11,8 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from street_gaussians_files import HEADER, OBJECTS, StreetObject, pose_about_z, write_dataset
 
-from adapters.street_gaussians.data import place_rows, read_data, read_track_table, tracklets_of
-from adapters.street_gaussians.records import ModelConfig
+from adapters.street_gaussians.data import (
+    ModelConfig,
+    place_rows,
+    read_data,
+    read_track_table,
+    tracklets_of,
+)
 from augment.errors import AdapterError
 
 FRONT = ModelConfig(cameras=(0, 1, 2))
