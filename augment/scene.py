@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool, Float, Int16, Int64
 from torch import Tensor
 
-from augment import kernels as color_kernels
+from augment import kernels
 from augment.cameras import Camera, Frame
 from augment.errors import SceneError
 from augment.geometry import quat_from_rotmat
@@ -226,7 +226,7 @@ def _colors_by_kernel(
         matrix = sh_turn(turn, math.isqrt(sh.shape[1]) - 1).numpy().astype(np.float32)
     out = np.empty(tuple(sh.shape), np.float32)
     with kernel_threads(1):
-        color_kernels.colors_at(
+        kernels.colors_at(
             sh.detach().contiguous().numpy(),
             coefficients,
             np.asarray(weights, np.float32),

@@ -26,8 +26,6 @@ import numpy as np
 
 from augment.cameras import Camera
 from augment.reconstruct import loss_kernels
-from augment.reconstruct import loss_kernels as depth_kernels
-from augment.reconstruct import loss_kernels as sky_kernels
 from augment.reconstruct.config import LossWeights
 from augment.reconstruct.loss_reference import MIN_ALPHA, MIN_SKY
 from augment.reconstruct.view import RecordedView
@@ -77,8 +75,8 @@ class SkyBuffers:
         self.size = size
         texels = 6 * size * size
         slots = -(-texels // 8) * 8
-        self.parts = np.zeros((sky_kernels.PARTS, texels, 3), np.float32)
-        self.touched = np.zeros((sky_kernels.PARTS, slots), np.uint8)
+        self.parts = np.zeros((loss_kernels.PARTS, texels, 3), np.float32)
+        self.touched = np.zeros((loss_kernels.PARTS, slots), np.uint8)
         self.texels = np.empty(texels, np.int32)
         self.grads = np.empty((texels, 3), np.float32)
         self.is_clean = True
@@ -90,11 +88,11 @@ class SkyBuffers:
             self.parts.fill(0)
             self.touched.fill(0)
         self.is_clean = False
-        sky_kernels.scatter_sky(
+        loss_kernels.scatter_sky(
             d_rgb, alpha, image.texels, image.fractions, self.size, self.parts, self.touched
         )
         words = self.touched.view(np.uint64)
-        count = sky_kernels.gather_sky(self.parts, self.touched, words, self.texels, self.grads)
+        count = loss_kernels.gather_sky(self.parts, self.touched, words, self.texels, self.grads)
         self.is_clean = True
         return SkyGradient(self.texels[:count], self.grads[:count]) if count else None
 
@@ -239,7 +237,7 @@ def _sample_sky(
 ) -> None:
     rotation = camera.camera_from_world[:3, :3].numpy().T.astype(np.float32, order="C")
     intrinsics = np.array([1 / camera.fx, 1 / camera.fy, camera.cx, camera.cy], np.float32)
-    sky_kernels.sample_sky(
+    loss_kernels.sample_sky(
         alpha,
         sky_faces,
         rotation,
@@ -335,8 +333,8 @@ def _compare_depth(
     weight_sum = float(view.depth_weight.sum(dtype=np.float64))
     if expected_depth is None or weight_sum <= 0 or weights.depth == 0:
         return 0.0
-    sums = np.empty(-(-len(view.depth_pixels) // depth_kernels.CHUNK))
-    depth_kernels.compare_depth(
+    sums = np.empty(-(-len(view.depth_pixels) // loss_kernels.CHUNK))
+    loss_kernels.compare_depth(
         expected_depth.reshape(-1),
         alpha.reshape(-1),
         _writeable(view.depth_pixels),

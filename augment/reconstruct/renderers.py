@@ -13,10 +13,10 @@ from augment.cameras import Camera
 from augment.reconstruct.splats import Splats
 from augment.render.constants import RasterSettings
 from augment.render.cpu import backward as cpu_backward
-from augment.render.cpu import backward_kernels as columns
+from augment.render.cpu import backward_kernels
 from augment.render.cpu.backward import SplatGradients
 from augment.render.cpu.driver import Inputs, Scratch
-from augment.render.cuda import runtime as gpu
+from augment.render.cuda import runtime
 from augment.render.gsplat_backend import GsplatImages, draw_with_gsplat, import_gsplat
 from augment.render.layout import BLOCK, M_FUNCTIONS
 from augment.scene import Gaussians, PosedGaussians
@@ -38,7 +38,7 @@ class GsplatRenderer:
     """
 
     def __init__(self) -> None:
-        gpu.check_can_run()
+        runtime.check_can_run()
         import_gsplat()
         self._splats: Splats | None = None
         self._copies: dict[str, Tensor] = {}
@@ -83,14 +83,14 @@ class GsplatRenderer:
         """The copy on the GPU as the splats are now."""
         if splats is not self._splats:
             self._copies = {
-                name: gpu.upload(torch.from_numpy(getattr(splats, name))) for name in _FIELDS
+                name: runtime.upload(torch.from_numpy(getattr(splats, name))) for name in _FIELDS
             }
-            if gpu.gpu_device().type == "cpu":  # interpreted: a copy of its own all the same
+            if runtime.gpu_device().type == "cpu":  # interpreted: a copy of its own all the same
                 self._copies = {name: copy.clone() for name, copy in self._copies.items()}
         elif len(rows := self._changed):
             flat = [getattr(splats, name)[rows].reshape(len(rows), -1) for name in _FIELDS]
-            sent = gpu.upload(np.concatenate(flat, 1))
-            index = gpu.upload(rows)
+            sent = runtime.upload(np.concatenate(flat, 1))
+            index = runtime.upload(rows)
             widths = [part.shape[1] for part in flat]
             for name, part in zip(_FIELDS, sent.split(widths, 1), strict=True):
                 copy = self._copies[name]
@@ -111,7 +111,7 @@ class GsplatRenderer:
         total = len(inputs.blocks)
         found = np.bincount(block, minlength=total)
         at = block * BLOCK + np.arange(len(seen)) - (np.cumsum(found) - found)[block]
-        all_rows = self._scratch.array("rows", (total * BLOCK, columns.GRAD), np.float32)
+        all_rows = self._scratch.array("rows", (total * BLOCK, backward_kernels.GRAD), np.float32)
         all_ids = self._scratch.array("ids", (total * BLOCK,), np.int32)
         all_rows[at], all_ids[at] = rows, ids
         return SplatGradients(all_rows, all_ids, found.astype(np.int64), inputs.blocks)
@@ -134,10 +134,10 @@ class GsplatTape:
     ) -> SplatGradients:
         """Of the splats that a pixel shows; each once, in order."""
         images = [self.images.rgb, self.images.alpha]
-        slopes = [gpu.upload(d_rgb), gpu.upload(d_alpha)]
+        slopes = [runtime.upload(d_rgb), runtime.upload(d_alpha)]
         if self.images.expected_depth is not None and d_expected_depth is not None:
             images.append(self.images.expected_depth)
-            slopes.append(gpu.upload(d_expected_depth))
+            slopes.append(runtime.upload(d_expected_depth))
         ids = self.images.ids
         if len(ids) == 0:
             none = np.zeros(0, np.int64)
@@ -146,15 +146,15 @@ class GsplatTape:
         with torch.no_grad():
             ids, order = torch.sort(ids.long())
             rows = self._rows(ids, order)
-            shown = torch.nonzero((rows[:, : columns.G_RADIUS] != 0).any(1))[:, 0]  # waits
+            shown = torch.nonzero((rows[:, : backward_kernels.G_RADIUS] != 0).any(1))[:, 0]  # waits
             return self.renderer.rows_of(self.inputs, _array(ids[shown]), _array(rows[shown]))
 
     def _rows(self, ids: Tensor, order: Tensor) -> Tensor:
         """Rows as augment.render.cpu.backward_kernels lists them, [M, GRAD], of splats drawn."""
         counts = self.inputs.sizes[:, 0]
         ends = np.cumsum(counts)
-        shifts = gpu.upload(self.inputs.first_ids - (ends - counts))
-        part = torch.searchsorted(gpu.upload(ends), ids, right=True)
+        shifts = runtime.upload(self.inputs.first_ids - (ends - counts))
+        part = torch.searchsorted(runtime.upload(ends), ids, right=True)
         own = ids + shifts[part]  # in the arrays of all splats
         slopes = {name: _slope(leaf)[own] for name, leaf in self.leaves.items() if name != "sh"}
         values = {name: self.leaves[name].detach()[own] for name in slopes}
@@ -164,13 +164,13 @@ class GsplatTape:
         a, b, c = self.images.conics.detach()[order].unbind(1)
         widest = torch.maximum(a, c) / (a * c - b * b).clamp_min(_MIN_DET)
         rows = {
-            columns.G_MEAN: slopes["means"],
-            columns.G_QUAT: slopes["quats"] - radial * quats,
-            columns.G_ABS: absolute.norm(dim=1, keepdim=True),
-            columns.G_SCALE: slopes["scales"] * values["scales"],
-            columns.G_OPACITY: (slopes["opacities"] * values["opacities"])[:, None],
-            columns.G_COLOR: _slope(self.images.colors)[ids],
-            columns.G_RADIUS: torch.sqrt(widest)[:, None],
+            backward_kernels.G_MEAN: slopes["means"],
+            backward_kernels.G_QUAT: slopes["quats"] - radial * quats,
+            backward_kernels.G_ABS: absolute.norm(dim=1, keepdim=True),
+            backward_kernels.G_SCALE: slopes["scales"] * values["scales"],
+            backward_kernels.G_OPACITY: (slopes["opacities"] * values["opacities"])[:, None],
+            backward_kernels.G_COLOR: _slope(self.images.colors)[ids],
+            backward_kernels.G_RADIUS: torch.sqrt(widest)[:, None],
         }
         return torch.cat([rows[column] for column in sorted(rows)], 1)
 

@@ -36,9 +36,9 @@ def import_cpu() -> ModuleType:
 
 def import_cuda() -> ModuleType:
     """The Triton backend. Raises BackendUnavailable, which says what is missing."""
-    from augment.render.cuda import runtime as gpu
+    from augment.render.cuda import runtime
 
-    gpu.check_can_run()
+    runtime.check_can_run()
     from augment.render.cuda import driver as cuda
 
     return cuda

@@ -57,9 +57,9 @@ def composite_sky(
     kernels = kernels_for(backend, rgb, alpha)
     if isinstance(sky, ConstantSky) and smog is None:  # no direction matters
         if kernels == CUDA:
-            from augment.render.cuda import images as cuda_composite
+            from augment.render.cuda import images as cuda_images
 
-            return cuda_composite.composite_color(rgb, alpha, sky.rgb)
+            return cuda_images.composite_color(rgb, alpha, sky.rgb)
         return rgb + (1 - alpha)[..., None] * sky.rgb.to(rgb.dtype)
     if camera.is_orthographic:
         raise ValueError(
@@ -69,9 +69,9 @@ def composite_sky(
     if isinstance(sky, CubemapSky) and kernels == CPU:
         return _composite_cubemap(rgb, alpha, camera, bordered_faces(sky), smog)
     if isinstance(sky, CubemapSky) and kernels == CUDA:
-        from augment.render.cuda import images as cuda_composite
+        from augment.render.cuda import images as cuda_images
 
-        return cuda_composite.composite_cubemap(rgb, alpha, camera, bordered_faces(sky), smog)
+        return cuda_images.composite_cubemap(rgb, alpha, camera, bordered_faces(sky), smog)
     directions = camera.ray_directions(rgb.dtype, rgb.device)
     color = sample_at(sky, directions)
     if smog is not None:
@@ -120,9 +120,9 @@ def map_colors(
         color_map = color_map.to(rgb.device, rgb.dtype)
         return rgb @ color_map[:, :3].T + color_map[:, 3]
     if kernels == CUDA:
-        from augment.render.cuda import images as cuda_composite
+        from augment.render.cuda import images as cuda_images
 
-        cuda_composite.map_colors(rgb, color_map)
+        cuda_images.map_colors(rgb, color_map)
         return rgb
     with kernel_threads(ROWS):
         composite_kernels.map_colors(rgb.detach().numpy(), color_map.detach().contiguous().numpy())

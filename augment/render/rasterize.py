@@ -62,9 +62,9 @@ def renormalise_alpha(output: RenderOutput, stop: float, *, backend: str = CPU) 
         _by_kernel(alpha, images, stop)
         return output
     if kernels == CUDA:
-        from augment.render.cuda import images as cuda_composite
+        from augment.render.cuda import images as cuda_images
 
-        cuda_composite.renormalise_alpha(alpha, images.get("rgb"), images.get("snow"), stop)
+        cuda_images.renormalise_alpha(alpha, images.get("rgb"), images.get("snow"), stop)
         return output
     finished = alpha >= 1 - stop
     scale = torch.where(finished, 1 / alpha.clamp_min(1 - stop), torch.ones_like(alpha))
@@ -77,13 +77,13 @@ def renormalise_alpha(output: RenderOutput, stop: float, *, backend: str = CPU) 
 
 
 def _by_kernel(alpha: Tensor, images: dict[str, Tensor], stop: float) -> None:
-    from augment.render import composite_kernels as remainder_kernels
+    from augment.render import composite_kernels
     from augment.render.threads import kernel_threads
 
     flat = {name: image.numpy().reshape(-1) for name, image in images.items()}
     none = np.empty(0, np.float32)
     with kernel_threads():
-        remainder_kernels.renormalise_alpha(
+        composite_kernels.renormalise_alpha(
             alpha.numpy().reshape(-1),
             flat.get("rgb", none),
             flat.get("snow", none),

@@ -228,5 +228,5 @@ def test_unwanted_tiles_are_left_out():
             piece = getattr(part, name)[rows, columns]
             assert torch.equal(piece, getattr(plain, name)[rows, columns]), name
     assert int((part.alpha > 0).sum()) <= 16 * 16 + 6 * 4 and bool((part.splat_ids[:16] == 0).all())
-    with pytest.raises(ValueError, match="wanted must be bool"):
+    with pytest.raises(ValueError, match="pixel_mask must be bool"):
         rasterize([PosedGaussians(gaussians)], camera, pixel_mask=wanted[1:])

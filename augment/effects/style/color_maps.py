@@ -24,7 +24,7 @@ from torch import Tensor
 from augment.effects.style import sh_kernels
 from augment.render import sh as sh_layout
 from augment.render.buffers import AUTO, CUDA, REFERENCE, kernels_for
-from augment.render.cuda import runtime as gpu
+from augment.render.cuda import runtime
 from augment.render.sh import SH_C0
 from augment.render.threads import kernel_threads
 from augment.scene import Actor, Gaussians, Scene
@@ -247,7 +247,7 @@ def _on_gpu(
 ) -> Float[Tensor, "N K 3"]:
     from augment.effects.style import cuda_sh
 
-    source = gpu.resident(sh)
+    source = runtime.resident(sh)
     target = torch.empty_like(source) if out is None else out
     if target.device != source.device:
         raise ValueError(f"out must lie on {source.device}, as what is mapped; got {target.device}")

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from augment.effects.style import cuda_sh_kernels
 from augment.render import sh as sh_layout
-from augment.render.cuda import runtime as gpu
+from augment.render.cuda import runtime
 
 _QUADS = 256  # of four colours, a program
 
@@ -24,14 +24,14 @@ def map_sh(
     on either side.
     """
     numbers, functions = sh.numel(), sh.shape[1]
-    gpu.launch(
+    runtime.launch(
         cuda_sh_kernels.map_sh,
         (-(-numbers // (12 * _QUADS)),),
         sh,
         target,
         numbers,
-        None if classes is None else gpu.resident(classes),
-        gpu.upload(folded),
+        None if classes is None else runtime.resident(classes),
+        runtime.upload(folded),
         float(sh_layout.BLACK),
         FUNCTIONS=functions,
         BY_CLASS=classes is not None,

@@ -20,9 +20,7 @@ from torch import Tensor
 from augment.cameras import Camera
 from augment.render.buffers import ALPHA, EXPECTED_DEPTH, RGB, RenderOutput
 from augment.render.constants import DEPTH_EPS, RasterSettings
-from augment.render.cpu import backward_kernels as cpu_blend_backward
-from augment.render.cpu import backward_kernels as cpu_project_backward
-from augment.render.cpu import backward_kernels as rows
+from augment.render.cpu import backward_kernels
 from augment.render.cpu.driver import (
     Inputs,
     Scratch,
@@ -47,7 +45,7 @@ class SplatGradients:
     """dL of every Gaussian that the image shows, block by block (Inputs.blocks).
 
     Block b has counts[b] rows, from row b BLOCK on. rows: float32 [B BLOCK, GRAD], columns as
-    cpu_project_backward names them. ids: int32 [B BLOCK], index of the Gaussian in its part.
+    backward_kernels names them. ids: int32 [B BLOCK], index of the Gaussian in its part.
     Both live in the tape's scratch: they are overwritten by its next use.
     """
 
@@ -97,15 +95,15 @@ class Tape:
             d_alpha = d_alpha - np.where(inside, d_depth * self.expected_depth, np.float32(0))
         scratch, inputs = self.scratch, self.inputs
         entries, slots, blocks = len(self.tile_splat_ids), inputs.slots, len(inputs.blocks)
-        shares = scratch.array("shares", (entries * cpu_blend_backward.SHARE,), np.float32)
+        shares = scratch.array("shares", (entries * backward_kernels.SHARE,), np.float32)
         reached = scratch.array("reached", (len(self.tile_offsets) - 1,), np.int64)
-        sums = scratch.array("sums", (slots * cpu_blend_backward.SHARE,), np.float32)
+        sums = scratch.array("sums", (slots * backward_kernels.SHARE,), np.float32)
         touched = scratch.array("touched", (slots,), np.uint8)
-        rows = scratch.array("grads", (slots, cpu_project_backward.GRAD), np.float32)
+        rows = scratch.array("grads", (slots, backward_kernels.GRAD), np.float32)
         ids = scratch.array("grad_ids", (slots,), np.int32)
         counts = scratch.array("grad_counts", (blocks,), np.int64)
         with kernel_threads():
-            cpu_blend_backward.blend_backward(
+            backward_kernels.blend_backward(
                 self.records,
                 self.tile_splat_ids,
                 self.tile_offsets,
@@ -121,11 +119,11 @@ class Tape:
                 reached,
             )
             timer.end_stage("raster backward")
-            cpu_blend_backward.sum_shares(
+            backward_kernels.sum_shares(
                 self.tile_splat_ids, self.tile_offsets, reached, shares, _RANGES, sums, touched
             )
             timer.end_stage("sum backward")
-            cpu_project_backward.project_backward(
+            backward_kernels.project_backward(
                 inputs.addresses,
                 inputs.sizes,
                 inputs.views,
@@ -305,13 +303,14 @@ def _part_gradients(
     rest = torch.from_numpy(view[V_EYE + 3 : V_EYE + 6].copy())
     directions = torch.nn.functional.normalize(means[index] - eye - rest, dim=-1)
     basis = sh_basis(directions, degree)  # [M, K']
-    color = own[:, rows.G_COLOR : rows.G_COLOR + 3]
+    color = own[:, backward_kernels.G_COLOR : backward_kernels.G_COLOR + 3]
     d_sh[index, : basis.shape[1]] = basis[:, :, None] * color[:, None, :]
-    d_quats = own[:, rows.G_QUAT : rows.G_QUAT + 4]
-    d_scales = own[:, rows.G_SCALE : rows.G_SCALE + 3] / scales[index]
-    d_opacities = own[:, rows.G_OPACITY] / opacities[index]
+    d_quats = own[:, backward_kernels.G_QUAT : backward_kernels.G_QUAT + 4]
+    d_scales = own[:, backward_kernels.G_SCALE : backward_kernels.G_SCALE + 3] / scales[index]
+    d_opacities = own[:, backward_kernels.G_OPACITY] / opacities[index]
+    at_mean = backward_kernels.G_MEAN
     return [
-        torch.zeros_like(means).index_copy(0, index, own[:, rows.G_MEAN : rows.G_MEAN + 3]),
+        torch.zeros_like(means).index_copy(0, index, own[:, at_mean : at_mean + 3]),
         torch.zeros_like(quats).index_copy(0, index, d_quats),
         torch.zeros_like(scales).index_copy(0, index, d_scales),
         torch.zeros_like(opacities).index_copy(0, index, d_opacities),

@@ -10,7 +10,7 @@ at every splat: no transmittance is ever divided by.
 
 A splat's share of a tile is kept as sums over its pixels of g = dL/de (e: log2 of alpha, see
 augment.render.layout) times powers of `off` (sharp pixels off the ridge) and `dy`, from which
-cpu_project_backward derives everything geometric. Each list entry has its own place for them, so
+project_backward derives everything geometric. Each list entry has its own place for them, so
 nothing is added in an order that depends on threads.
 """
 
@@ -70,7 +70,7 @@ from augment.render.layout import (
 SHARE = 16
 S_0, S_X, S_XX, S_Y, S_XY, S_YY, S_ABS_X, S_ABS_Y, S_RED, S_GREEN, S_BLUE, S_DEPTH = range(12)
 
-# Planes of a tile: transmittance as in cpu_blend, what lies behind, and the pixel's gradients.
+# Planes of a tile: transmittance as in blend, what lies behind, and the pixel's gradients.
 THROUGH, REST, G_RED, G_GREEN, G_BLUE, G_ALPHA, G_DEPTH = (U(i * PIXELS) for i in range(7))
 PLANES = 7 * PIXELS
 GROUP = 4  # tiles a thread takes at a time
@@ -95,7 +95,7 @@ def blend_backward(
 ):
     """dL of every list entry that the forward blend came to.
 
-    records, tile_splat_ids, tile_offsets, size, limits: as for cpu_blend.blend_tiles, in one slice.
+    records, tile_splat_ids, tile_offsets, size, limits: as for blend.blend_tiles, in one slice.
     rgb, alpha: flat images as rendered. depth: sum of weights times z. d_rgb, d_alpha, d_depth: the
     loss's derivatives by them; depth and d_depth may be None. shares: float32 [entries * SHARE],
     filled up to reached[tile] (int64, tiles) entries of each list.
@@ -306,7 +306,7 @@ def sum_shares(tile_splat_ids, tile_offsets, reached, shares, ranges, sums, touc
 
 # --------------------------------------------------------------------------------------------------
 # Numba kernel: from gradients of a splat's ellipse, depth and colour to those of its Gaussian.
-# Eight splats at a time the projection of cpu_geometry is repeated and its chain rule followed
+# Eight splats at a time the projection of geometry is repeated and its chain rule followed
 # backwards. Names: g_a is dL/da.
 
 # A row of gradients, one cache line: by mean (3, metres, in the part's axes), unit quaternion (4,
@@ -337,8 +337,8 @@ def project_backward(
 ):
     """A row of `grads` for every touched splat, block by block in the order of its Gaussians.
 
-    addresses to first_ids, found, modes, records: as in cpu_project. touched, sums: what
-    cpu_blend_backward.sum_shares wrote. Block b fills rows b BLOCK to b BLOCK + counts[b] of grads
+    addresses to first_ids, found, modes, records: as in project. touched, sums: what
+    sum_shares wrote. Block b fills rows b BLOCK to b BLOCK + counts[b] of grads
     (float32 [B BLOCK * GRAD]) and of ids (int32, index of the Gaussian in its part).
     """
     for block in prange(blocks.shape[0]):

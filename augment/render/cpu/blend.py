@@ -1,7 +1,8 @@
 """Numba kernels: blend every tile's splats front to back.
 
-Batch by batch of a tile's list, strip by strip, the items of cpu_items are blended in turn. Strips
-shrink to the rows in which a pixel still lets light through, and a tile ends where none does.
+Batch by batch of a tile's list, strip by strip, the items (geometry.list_items) are blended in
+turn. Strips shrink to the rows in which a pixel still lets light through, and a tile ends where
+none does.
 
 Images that are not asked for are None, which the compiler turns into no code at all.
 """
@@ -309,7 +310,7 @@ def blend_tiles(
     log2(ALPHA_MIN), what a splat must leave more of than this to be blended, 1 where rays are
     parallel, mode depth's floor, 1/fx^2, 1/fy^2, the transmittance at which a pixel is finished.
     rgb to snow: flat images; all but alpha may be None. cuts, lights: flat, of each slot as
-    cpu_clip and cpu_shading have them, or None.
+    geometry has them, or None.
     """
     columns = (size[0] + TILE_W - 1) // TILE_W
     used = states.size // tiles.size

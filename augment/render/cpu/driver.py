@@ -1,11 +1,11 @@
 """The CPU rasteriser: arrays for the numba kernels, and the order in which they run.
 
-    rank      z and a generous box of every Gaussian                      (cpu_project)
+    rank      z and a generous box of every Gaussian                      (project)
     then slice by slice along z, until no tile is open:
-      project   record, tiles and colour of the slice's splats            (cpu_project, cpu_color)
+      project   record, tiles and colour of the slice's splats            (project)
       sort      by z, ties by index
-      bin       splats of every open tile, in that order                  (cpu_bin)
-      raster    blend them; close the tiles that nothing shines through   (cpu_blend)
+      bin       splats of every open tile, in that order                  (blend)
+      raster    blend them; close the tiles that nothing shines through   (blend)
 
 Slices change no bit of the image: what they leave out lies behind closed tiles.
 """
@@ -38,11 +38,9 @@ from augment.render.buffers import (
     RenderOutput,
 )
 from augment.render.constants import ALPHA_MIN, TRANSMITTANCE_STOP, RasterSettings
-from augment.render.cpu import blend as cpu_bin
-from augment.render.cpu import blend as cpu_blend
-from augment.render.cpu import geometry as cpu_clip
-from augment.render.cpu import geometry as cpu_shading
-from augment.render.cpu import project as cpu_project
+from augment.render.cpu import blend as blend_kernels
+from augment.render.cpu import geometry
+from augment.render.cpu import project as project_kernels
 from augment.render.layout import HeightClip
 from augment.render.part_views import raster_modes, views_of
 from augment.render.threads import kernel_threads, thread_count
@@ -55,7 +53,7 @@ from augment.scene import Gaussians, PosedGaussians
 class Inputs:
     """All parts for one launch: nothing is concatenated, and actors cost no launch of their own.
 
-    addresses, sizes, first_ids, views, blocks: see cpu_project. modes: see layout. arrays: what the
+    addresses, sizes, first_ids, views, blocks: see project. modes: see layout. arrays: what the
     addresses point to, kept alive by this.
     """
 
@@ -252,7 +250,7 @@ def rank(inputs: Inputs, camera: Camera, scratch: Scratch) -> tuple[np.ndarray, 
     """z of all Gaussians (0: cannot be seen), and where the slices begin and end, in bins of z."""
     depths = scratch.array("depths", (inputs.slots,), np.float32)
     histograms = scratch.array("histograms", (_RANK_RUNS, 2, layout.BINS), np.float64)
-    cpu_project.rank_splats(
+    project_kernels.rank_splats(
         inputs.addresses, inputs.sizes, inputs.views, inputs.blocks, depths, histograms
     )
     cover, counts = histograms.sum(0)
@@ -299,9 +297,9 @@ def project(
 ) -> Splats:
     blocks = len(inputs.blocks)
     is_cut = bool(inputs.modes[layout.M_CLIP])
-    cuts = scratch.array("cuts", (cpu_clip.CUT * (inputs.slots if is_cut else 1),), np.float32)
+    cuts = scratch.array("cuts", (geometry.CUT * (inputs.slots if is_cut else 1),), np.float32)
     is_lit = bool(inputs.modes[layout.M_LIGHT])
-    lights = (cpu_shading.SHADING_LINES * (inputs.slots if is_lit else 1),)
+    lights = (geometry.SHADING_LINES * (inputs.slots if is_lit else 1),)
     lights = scratch.array("lights", lights, np.float32)
     splats = Splats(
         scratch.array("records", (inputs.slots * layout.RECORD,), np.float32),
@@ -312,7 +310,7 @@ def project(
         cuts if is_cut else None,
         lights if is_lit else None,
     )
-    cpu_project.project_slice(
+    project_kernels.project_slice(
         inputs.addresses,
         inputs.sizes,
         inputs.views,
@@ -342,8 +340,8 @@ def sort(splats: Splats, first_bin: int, scratch: Scratch) -> tuple[np.ndarray, 
     keys, spare_keys = (scratch.array(f"sorted_keys{i}", (count,), np.uint32) for i in range(2))
     slots, spare_slots = (scratch.array(f"sorted_slots{i}", (count,), np.int32) for i in range(2))
     rects = scratch.array("sorted_rects", (count,), np.uint64)
-    cpu_bin.scatter_to_bins(splats.keys, splats.found, first_bin, heads, keys, slots)
-    cpu_bin.sort_bins(bin_offsets, keys, slots, splats.rects, spare_keys, spare_slots, rects)
+    blend_kernels.scatter_to_bins(splats.keys, splats.found, first_bin, heads, keys, slots)
+    blend_kernels.sort_bins(bin_offsets, keys, slots, splats.rects, spare_keys, spare_slots, rects)
     return slots, rects
 
 
@@ -382,12 +380,12 @@ class Tiles:
         self._scratch = scratch
         self._states = scratch.array("states", (count * used,), np.float32)
         self.open = scratch.array("open", (count,), np.uint8)
-        self.open[:] = cpu_blend.FRESH
+        self.open[:] = blend_kernels.FRESH
 
     def leave_out(self, pixel_mask: np.ndarray) -> None:
         """Close the tiles without a pixel of the mask [H, W]; their pixels become 0."""
         drawn = any_in_squares(pixel_mask, layout.TILE_W)
-        self.open[~drawn.reshape(-1)] = cpu_blend.CLOSED
+        self.open[~drawn.reshape(-1)] = blend_kernels.CLOSED
         for image in self._images:
             if image is not None:
                 image.fill(0)
@@ -395,7 +393,7 @@ class Tiles:
     def open_sums(self) -> np.ndarray:
         """int32 [rows + 1, columns + 1]: open tiles above and to the left."""
         sums = np.zeros((self._rows + 1, self._columns + 1), np.int32)
-        is_open = (self.open != cpu_blend.CLOSED).reshape(self._rows, self._columns)
+        is_open = (self.open != blend_kernels.CLOSED).reshape(self._rows, self._columns)
         sums[1:, 1:] = is_open.cumsum(0, dtype=np.int32).cumsum(1, dtype=np.int32)
         return sums
 
@@ -424,7 +422,7 @@ class Tiles:
         self, splats: Splats, tile_splat_ids: np.ndarray, tile_offsets: np.ndarray, *, is_last: bool
     ) -> None:
         """Blend every open tile's list; is_last closes them all."""
-        cpu_blend.blend_tiles(
+        blend_kernels.blend_tiles(
             splats.records,
             tile_splat_ids,
             tile_offsets,
@@ -457,34 +455,36 @@ class Tiles:
             end = first + _splats_in(rects[first:], limit)
             counts = self._count(rects, first, end)
         tile_offsets = np.append(0, np.cumsum(counts))
-        heads = np.where(self.open != cpu_blend.CLOSED, tile_offsets[:-1], -1)
+        heads = np.where(self.open != blend_kernels.CLOSED, tile_offsets[:-1], -1)
         tile_splat_ids = self._scratch.array("members", (int(tile_offsets[-1]),), np.int32)
         bands = min(self._rows, 2 * thread_count())
-        cpu_bin.fill_lists(slots, rects, first, end, self._columns, heads, tile_splat_ids, bands)
+        blend_kernels.fill_lists(
+            slots, rects, first, end, self._columns, heads, tile_splat_ids, bands
+        )
         return end, tile_splat_ids, tile_offsets
 
     def _count(self, rects: np.ndarray, first: int, end: int) -> np.ndarray:
         """int64 [tiles]: splats [first, end) in each; none in closed tiles."""
         shape = (self._rows + 1, self._columns + 1)
         corners = self._scratch.array("corners", (thread_count(), shape[0] * shape[1]), np.int32)
-        cpu_bin.count_corners(rects, first, end, self._columns, corners)
+        blend_kernels.count_corners(rects, first, end, self._columns, corners)
         totals = corners.sum(0, dtype=np.int64).reshape(shape).cumsum(0).cumsum(1)
-        return np.where(self.open != cpu_blend.CLOSED, totals[:-1, :-1].reshape(-1), 0)
+        return np.where(self.open != blend_kernels.CLOSED, totals[:-1, :-1].reshape(-1), 0)
 
 
 def _state_size(images: dict[str, np.ndarray]) -> int:
     """float32 numbers that a tile keeps between slices for these images."""
     names = set(images) - {RGB, ALPHA}
     if MODE_DEPTH in names:
-        return cpu_blend.STATE
+        return blend_kernels.STATE
     if names - {SNOW}:
-        return cpu_blend.MODELESS_STATE
-    return cpu_blend.SNOW_STATE if names else cpu_blend.COLOR_STATE
+        return blend_kernels.MODELESS_STATE
+    return blend_kernels.SNOW_STATE if names else blend_kernels.COLOR_STATE
 
 
 def _splats_in(rects: np.ndarray, limit: int) -> int:
     """How many splats in turn touch no more than `limit` tiles; at least one."""
-    corners = rects.view(np.uint16).reshape(-1, 4).astype(np.int64)  # as cpu_bin unpacks them
+    corners = rects.view(np.uint16).reshape(-1, 4).astype(np.int64)  # as in blend
     tiles = (corners[:, 2] - corners[:, 0] + 1) * (corners[:, 3] - corners[:, 1] + 1)
     return max(1, int(np.searchsorted(tiles.cumsum(), limit, side="right")))
 

@@ -371,7 +371,7 @@ def _depth_slope(x, y, z):
 
 @inner()
 def stage_cuts(cuts, tile_splat_ids, at, count, staged, expected, mode, lines):
-    """Cuts of a batch, turned to one row a number, about the tile's corner. staged: cpu_items'.
+    """Cuts of a batch, turned to one row a number, about the tile's corner. staged: list_items'.
 
     expected, mode: None where the lines of the surfaces are not wanted. Returns whether any splat
     is cut: the others lie wholly on the kept side.
@@ -396,7 +396,7 @@ def stage_cuts(cuts, tile_splat_ids, at, count, staged, expected, mode, lines):
 
 @inner()
 def list_lines(lines, kind, count, strip, spans, values):
-    """A line's value at the first pixel of every item of cpu_items.list_items, in its order."""
+    """A line's value at the first pixel of every item of list_items, in its order."""
     n, items = U(BATCH), U(0)
     half = np.float32(0.5)
     first_x = np.float32(strip * LANES) + half
@@ -495,8 +495,8 @@ def is_lit(lit, splat):
 def light_share(lit, staged, values, splat, item, at, limits):
     """The share of the light at eight pixels of a splat.
 
-    staged, values: cpu_items', of the item. at: its place in the tile's state. limits: of
-    cpu_blend; the second is log2(ALPHA_MIN), the last two 1/fx^2 and 1/fy^2.
+    staged, values: list_items', of the item. at: its place in the tile's state. limits: of
+    blend; the second is log2(ALPHA_MIN), the last two 1/fx^2 and 1/fy^2.
     """
     n, zero, one = U(BATCH), v8.splat(np.float32(0)), v8.splat(np.float32(1))
     half = np.float32(0.5)

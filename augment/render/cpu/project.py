@@ -393,7 +393,7 @@ def project_slice(
     """Splats of the Gaussians in bins[0] <= bin of z < bins[1] that touch an open tile.
 
     Block b owns slots [b BLOCK, (b + 1) BLOCK) and fills found[b] of them in the order of its
-    Gaussians: records, RECORD float32 each; rects, uint64, the tiles touched as cpu_bin unpacks
+    Gaussians: records, RECORD float32 each; rects, uint64, the tiles touched as blend unpacks
     them; keys, uint32, the bits of z. counts: int32 [B, Z], of those in each bin of the slice.
     depth_bits: uint32, what rank_splats wrote. first_ids: int64 [P]. open_sums: int32 [rows + 1,
     columns + 1], number of open tiles above and left. modes: int64 [MODES]. cuts: CUT float32 each,

@@ -13,8 +13,8 @@ import triton
 import triton.language as tl
 
 from augment.render import constants, layout, mode_depth
-from augment.render.cpu import geometry as cpu_shading
-from augment.render.cuda import splats as cuda_splats
+from augment.render.cpu import geometry as cpu_geometry
+from augment.render.cuda import splats
 
 # ---- Triton kernels: the tiles of splats that are in order of depth, pair by pair ----------------
 
@@ -178,24 +178,24 @@ def _mode(first, mass, moment, spread):
 
 
 # Records and cuts are read four numbers at a time, in their order (the launch module checks it).
-TILE = tl.constexpr(cuda_splats.TILE)
+TILE = tl.constexpr(splats.TILE)
 DEPTH_EPS = tl.constexpr(constants.DEPTH_EPS)
 RECORD, CUT, LINES = (
     tl.constexpr(layout.RECORD),
     tl.constexpr(layout.CUT),
-    tl.constexpr(cpu_shading.SHADING_LINES),
+    tl.constexpr(cpu_geometry.SHADING_LINES),
 )
 L_FACING, L_X, L_Y, L_WRAP = (
-    tl.constexpr(cpu_shading.L_FACING),
-    tl.constexpr(cpu_shading.L_X),
-    tl.constexpr(cpu_shading.L_Y),
-    tl.constexpr(cpu_shading.L_WRAP),
+    tl.constexpr(cpu_geometry.L_FACING),
+    tl.constexpr(cpu_geometry.L_X),
+    tl.constexpr(cpu_geometry.L_Y),
+    tl.constexpr(cpu_geometry.L_WRAP),
 )
-L_LEAN_X, L_LEAN_Y = tl.constexpr(cpu_shading.L_LEAN_X), tl.constexpr(cpu_shading.L_LEAN_Y)
+L_LEAN_X, L_LEAN_Y = tl.constexpr(cpu_geometry.L_LEAN_X), tl.constexpr(cpu_geometry.L_LEAN_Y)
 L_RED, L_GREEN, L_BLUE = (
-    tl.constexpr(cpu_shading.L_RED),
-    tl.constexpr(cpu_shading.L_GREEN),
-    tl.constexpr(cpu_shading.L_BLUE),
+    tl.constexpr(cpu_geometry.L_RED),
+    tl.constexpr(cpu_geometry.L_GREEN),
+    tl.constexpr(cpu_geometry.L_BLUE),
 )
 TINY = tl.constexpr(1e-20)  # augment.render.shading.TINY
 LANES = tl.constexpr(32)  # threads of a warp, splats looked at together, bits of an int32

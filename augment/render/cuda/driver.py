@@ -1,8 +1,8 @@
 """The GPU rasteriser: stages in Triton, and the order in which they run.
 
-    project   record, tiles and colour of every Gaussian                  (cuda_project)
-    list      by z, ties by index; then the splats of every tile          (cuda_tiles)
-    blend     every tile's, front to back, into the images asked for      (cuda_blend)
+    project   record, tiles and colour of every Gaussian                  (project_kernels)
+    list      by z, ties by index; then the splats of every tile          (blend_kernels)
+    blend     every tile's, front to back, into the images asked for      (blend_kernels)
 
 No sum depends on the order in which programs run, so the same bits come out every time.
 """
@@ -31,7 +31,7 @@ from augment.render.buffers import (
     RenderOutput,
 )
 from augment.render.constants import ALPHA_MIN, TRANSMITTANCE_STOP, RasterSettings
-from augment.render.cuda import runtime as gpu
+from augment.render.cuda import runtime
 from augment.render.cuda.blend_kernels import blend_blocks, count_tiles, list_pairs
 from augment.render.cuda.project_kernels import project_gaussians
 from augment.render.cuda.runtime import launch
@@ -121,7 +121,7 @@ def list_tiles(splats: CudaSplats, camera: Camera, pixel_mask: Tensor | None) ->
 
     order = torch.sort(splats.keys, stable=True).indices
     counts = torch.empty(count, dtype=torch.int32, device=device)
-    gpu.launch(
+    runtime.launch(
         count_tiles,
         (-(-count // _SPLATS),),
         order,
@@ -147,7 +147,7 @@ def list_tiles(splats: CudaSplats, camera: Camera, pixel_mask: Tensor | None) ->
     numbers = torch.int16 if tiles <= torch.iinfo(torch.int16).max else torch.int32
     tile_of = torch.empty(pairs, dtype=numbers, device=device)
     owners = torch.empty(pairs, dtype=torch.int32, device=device)
-    gpu.launch(
+    runtime.launch(
         list_pairs,
         (-(-pairs // _PAIRS),),
         order,
@@ -213,7 +213,7 @@ def blend(
     least = min(settings.transmittance_stop, TRANSMITTANCE_STOP)
     per_tile = (TILE // _BLOCK_W) * (TILE // _BLOCK_H)
     none = images[ALPHA]  # stands for what is not there; nothing is read or written
-    gpu.launch(
+    runtime.launch(
         blend_blocks,
         (tiles.columns * tiles.rows * per_tile,),
         splats.records,

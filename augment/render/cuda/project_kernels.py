@@ -8,9 +8,7 @@ import triton
 import triton.language as tl
 
 from augment.render import layout, shading
-from augment.render import layout as clip
-from augment.render.cuda import splats as cuda_inputs
-from augment.render.cuda import splats as cuda_splats
+from augment.render.cuda import splats
 from augment.render.cuda.image_kernels import mean_density, transmittance
 
 # ---- Triton functions: where Gaussians stand in the camera, and which ellipses they become -------
@@ -304,8 +302,8 @@ def in_smog(color, transmittance, view):
 # ---- Triton functions: splats cut at a height (see augment.render.layout) ------------------------
 # --------------------------
 
-FAR = tl.constexpr(clip.FAR_PX)
-SHARP = tl.constexpr(clip.SHARP_PX2)
+FAR = tl.constexpr(layout.FAR_PX)
+SHARP = tl.constexpr(layout.SHARP_PX2)
 TINY = tl.constexpr(1e-20)
 V_EXTENT = tl.constexpr(layout.V_EXTENT)
 V_CLIP_EYE = tl.constexpr(layout.V_CLIP_EYE)
@@ -348,8 +346,8 @@ def cut_of(d, right, down, columns, sizes, inverse, view):
 def _depth_slope(x, y, z):
     """g = S2^-1 c of semi-axes right, down and away (see augment.render.layout), per px.
 
-    As cpu_clip's: determinants as products of cross products, all divided by y.y + b, so that no
-    digits cancel and nothing overflows.
+    As render.cpu.geometry's: determinants as products of cross products, all divided by y.y + b, so
+    that no digits cancel and nothing overflows.
     """
     inverse = 1.0 / (dot(y, y) + SHARP)
     root = tl.sqrt(inverse)
@@ -396,9 +394,9 @@ def store_lights(lines, normals, points, slopes, transmittance, lit, mask, view)
     tl.store(lines + 8, transmittance * slopes[2], mask)
 
 
-COLUMNS = tl.constexpr(cuda_inputs.COLUMNS)
-T_COUNT, T_FUNCTIONS = tl.constexpr(cuda_inputs.T_COUNT), tl.constexpr(cuda_inputs.T_FUNCTIONS)
-T_FIRST, T_BLOCK = tl.constexpr(cuda_inputs.T_FIRST), tl.constexpr(cuda_inputs.T_BLOCK)
+COLUMNS = tl.constexpr(splats.COLUMNS)
+T_COUNT, T_FUNCTIONS = tl.constexpr(splats.T_COUNT), tl.constexpr(splats.T_FUNCTIONS)
+T_FIRST, T_BLOCK = tl.constexpr(splats.T_FIRST), tl.constexpr(splats.T_BLOCK)
 A_MEANS, A_QUATS = tl.constexpr(layout.A_MEANS), tl.constexpr(layout.A_QUATS)
 A_SCALES, A_OPACITIES = tl.constexpr(layout.A_SCALES), tl.constexpr(layout.A_OPACITIES)
 A_SH, A_SLOPES = tl.constexpr(layout.A_SH), tl.constexpr(layout.A_SLOPES)
@@ -410,7 +408,7 @@ V_LOG_CUT, V_RADIUS_CLIP = tl.constexpr(layout.V_LOG_CUT), tl.constexpr(layout.V
 V_SNOW = tl.constexpr(layout.V_SNOW)
 V_LIT, V_MAPS = tl.constexpr(layout.V_LIT), tl.constexpr(layout.V_MAPS)
 NO_SMOG = tl.constexpr(layout.NO_SMOG)
-HIDDEN, TILE = tl.constexpr(cuda_splats.HIDDEN), tl.constexpr(cuda_splats.TILE)
+HIDDEN, TILE = tl.constexpr(splats.HIDDEN), tl.constexpr(splats.TILE)
 K = tl.constexpr(0.5 * math.log2(math.e))  # exponents of alpha are of 2
 HUGE = tl.constexpr(1e37)  # px^2; beyond it float32 overflows, and no pixel could tell
 CUT, LINES = tl.constexpr(layout.CUT), tl.constexpr(shading.LINES)
@@ -438,7 +436,7 @@ def project_gaussians(
 ):
     """Splats of the Gaussians of every part; each program takes BLOCK of one part.
 
-    table, views, block_parts: see cuda_inputs. The rest: of cuda_splats, and written; cuts and
+    table, views, block_parts: see splats. The rest: of splats, and written; cuts and
     lights where CLIP and LIGHT ask for them. In capitals: the modes (see layout).
     """
     program = tl.program_id(0)
