@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from recipes.schema import VERSION
-from recipes.template import CHANNEL, RANGE_KINDS, RATE, ROOT, FieldSpec, Kind, SectionSpec, words
+from recipes.template import CHANNEL, RATE, ROOT, FieldSpec, Kind, SectionSpec, words
 
 # ---- The table of fields in the documentation, made from the schema ------------------------------
 
@@ -31,21 +31,12 @@ def field_table() -> str:
 
 
 def _row(spec: FieldSpec) -> str:
-    allowed = spec.allowed()
-    if spec.rangeable:
-        allowed += f"; {_ranges(spec)}"
     default = "" if spec.default is None else f"`{words(spec.default)}`"
     if spec.nullable:
         default = "`null`"
     if spec.required:
         default = "required"
-    return f"| `{spec.path}` | {allowed} | {default} | {spec.description} |\n"
-
-
-def _ranges(spec: FieldSpec) -> str:
-    if spec.kind in (Kind.NUMBER, Kind.WHOLE):
-        return f"ranges: {', '.join(RANGE_KINDS)}"
-    return "ranges: choice" if spec.channel is None else "ranges: uniform, choice"
+    return f"| `{spec.path}` | {spec.allowed()} | {default} | {spec.description} |\n"
 
 
 # ---- json schema ---------------------------------------------------------------------------------

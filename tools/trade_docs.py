@@ -22,7 +22,7 @@ from tools.trade_tiers import BOUNDS
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 PAGE = DOCS / "trade.md"
-SCENES = {"street": "procedural street", "pandaset": "PandaSet mini 002, fitted"}
+SCENES = {"street": "street", "pandaset": "PandaSet 002"}
 START, END = "<!-- {name}: made by python -m tools.trade_docs -->", "<!-- end of {name} -->"
 
 
