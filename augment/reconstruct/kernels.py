@@ -1,14 +1,12 @@
-"""Numba kernel: Adam on the splats that a view touched, in the arrays that the rasteriser reads.
-
-Values are kept activated: a step on the logarithm of a scale multiplies it, a step on the logit of
-an opacity divides its odds, quaternions are turned along the sphere and normalised. Kingma & Ba
-2015, with the bias correction counted per splat, since a view touches a few of them only.
+"""Numba kernels of a fit: the image and depth loss with its derivatives, the sky's gradient, Adam
+on the splats that a view touched, and the forces on whole parts.
 """
 
 from __future__ import annotations
 
 import math
 
+import numba
 import numpy as np
 from numba import prange
 
@@ -29,6 +27,532 @@ from augment.render.cpu.jit import inner, kernel
 from augment.render.cpu.project import write_basis
 from augment.render.cpu.simd import LOG2_E, exp2_fine, floats_at
 from augment.render.layout import BLOCK, LANES, V_FOCAL, V_ROTATION, U
+
+# ------------------------------------------------------------------------------------------------
+# Numba kernels of the image loss: L1 and SSIM against a recorded picture, and their gradients
+# With x the picture, y the recorded one, G the window's blur, P = G(x + y) and N = G(x - y):
+#
+#     A1 = (P^2 - N^2)/2 + C1 = 2 mu_x mu_y + C1        A2 = 2 sigma_xy + C2, from G((x + y)^2)
+#     B1 = (P^2 + N^2)/2 + C1 = mu_x^2 + mu_y^2 + C1    B2 = sigma_x^2 + sigma_y^2 + C2, G((x -
+# y)^2)
+#     SSIM = A1 A2 / (B1 B2)
+#
+# so that four blurs do instead of five, and the gradient takes three: with a, b, c the derivatives
+# by P plus N, by G((x + y)^2) and by G((x - y)^2), each times the pixel's weight,
+#
+#     d/dx = G(a) + (x + y) G(2 b) + (x - y) G(2 c)
+#
+# Planes are rows of `stride` float32, a multiple of LANES; those that are blurred have PAD rows of
+# zeros above and below, and zeros from the image's width to the stride. Sums are left as LANES sums
+# of every row, to be added up in float64.
+
+# --------------------------------------------------------------------------------------------------
+# Numba kernels for a sky that is learnt: a cube map's colours behind a view, and their gradient..
+# The lookup is `augment.sky.sample_within_faces`, bilinear and clamped at the edge of a face. What
+# it found is kept (texel, fractions), so that the way back computes no direction again.
+
+PARTS = 4  # gradients are summed in as many copies of the cube map, whatever the threads
+BAND = 8  # image rows at a time; part p sums bands p, p + PARTS, ... so that all see as much sky
+UNSEEN = -1  # texel of a pixel whose sky was not looked up
+
+
+@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
+def sample_sky(alpha, faces, rotation, intrinsics, least, colors, texels, fractions):
+    """The sky's colour at every pixel through which at least `least` of it is seen, else black.
+
+    alpha [H, W]. faces [6, R, R, 3]. rotation: world_from_camera [3, 3]. intrinsics: 1 / fx,
+    1 / fy, cx, cy. All float32. Written: colors [3, H, >= W], texels int32 [H, W] (flat index of
+    the upper left of four texels, or UNSEEN), fractions [2, H, W] (column, row).
+    """
+    height, width = alpha.shape
+    size = faces.shape[1]
+    half, one, zero = np.float32(0.5), np.float32(1), np.float32(0)
+    last = np.float32(size - 1)
+    scale = np.float32(size) * half
+    ifx, ify, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
+    for band in numba.prange((height + BAND - 1) // BAND):
+        for i in range(band * BAND, min((band + 1) * BAND, height)):
+            v = (np.float32(i) + half - cy) * ify
+            bx = rotation[0, 1] * v + rotation[0, 2]
+            by = rotation[1, 1] * v + rotation[1, 2]
+            bz = rotation[2, 1] * v + rotation[2, 2]
+            for j in range(width):
+                if one - alpha[i, j] < least:
+                    texels[i, j] = UNSEEN
+                    for c in range(3):
+                        colors[c, i, j] = zero
+                    continue
+                u = (np.float32(j) + half - cx) * ifx
+                x = rotation[0, 0] * u + bx
+                y = rotation[1, 0] * u + by
+                z = rotation[2, 0] * u + bz
+                ax, ay, az = abs(x), abs(y), abs(z)
+                if ax >= ay and ax >= az:
+                    major, t = ax, -y
+                    face = 0 if x >= 0 else 1
+                    s = -z if x >= 0 else z
+                elif ay >= az:
+                    major, s = ay, x
+                    face = 2 if y >= 0 else 3
+                    t = z if y >= 0 else -z
+                else:
+                    major, t = az, -y
+                    face = 4 if z >= 0 else 5
+                    s = x if z >= 0 else -x
+                inverse = scale / major
+                column = min(max(s * inverse + scale - half, zero), last)
+                row = min(max(t * inverse + scale - half, zero), last)
+                c0, r0 = int(column), int(row)
+                c1, r1 = min(c0 + 1, size - 1), min(r0 + 1, size - 1)
+                fc, fr = column - np.float32(c0), row - np.float32(r0)
+                texels[i, j] = (face * size + r0) * size + c0
+                fractions[0, i, j] = fc
+                fractions[1, i, j] = fr
+                for c in range(3):
+                    top = faces[face, r0, c0, c] * (one - fc) + faces[face, r0, c1, c] * fc
+                    bottom = faces[face, r1, c0, c] * (one - fc) + faces[face, r1, c1, c] * fc
+                    colors[c, i, j] = top * (one - fr) + bottom * fr
+
+
+@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
+def scatter_sky(d_rgb, alpha, texels, fractions, size, parts, touched):
+    """Add the gradient of every texel seen to the parts' sums.
+
+    d_rgb [H, W, 3]: gradient of the composited picture before the colour map. size: R. parts
+    float32 [PARTS, texels, 3] and touched uint8 [PARTS, >= texels]: zero before the first call.
+    """
+    height, width = alpha.shape
+    one, zero = np.float32(1), np.float32(0)
+    bands = (height + BAND - 1) // BAND
+    for part in numba.prange(PARTS):
+        for band in range(part, bands, PARTS):
+            for i in range(band * BAND, min((band + 1) * BAND, height)):
+                for j in range(width):
+                    texel = texels[i, j]
+                    if texel == UNSEEN:
+                        continue
+                    through = one - alpha[i, j]
+                    red = through * d_rgb[i, j, 0]
+                    green = through * d_rgb[i, j, 1]
+                    blue = through * d_rgb[i, j, 2]
+                    if red == zero and green == zero and blue == zero:
+                        continue
+                    fc, fr = fractions[0, i, j], fractions[1, i, j]
+                    for corner in range(4):
+                        right, below = corner & 1, corner >> 1
+                        weight = (fc if right else one - fc) * (fr if below else one - fr)
+                        if weight == zero:  # also where the neighbour lies beyond the face
+                            continue
+                        at = texel + right + below * size
+                        touched[part, at] = 1
+                        parts[part, at, 0] += weight * red
+                        parts[part, at, 1] += weight * green
+                        parts[part, at, 2] += weight * blue
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def gather_sky(parts, touched, words, texels, grads):
+    """Sum the parts, in order, into a list of the touched texels; clear what was touched.
+
+    words: `touched` seen as uint64 [PARTS, ...], to pass over what was not. Returns the count of
+    entries written to texels (increasing) and grads [..., 3].
+    """
+    count = 0
+    for word in range(words.shape[1]):
+        anything = np.uint64(0)
+        for part in range(PARTS):
+            anything |= words[part, word]
+        if anything == np.uint64(0):
+            continue
+        for texel in range(word * 8, word * 8 + 8):
+            is_touched = False
+            red = green = blue = np.float32(0)
+            for part in range(PARTS):
+                if touched[part, texel]:
+                    is_touched = True
+                    red += parts[part, texel, 0]
+                    green += parts[part, texel, 1]
+                    blue += parts[part, texel, 2]
+                    for c in range(3):
+                        parts[part, texel, c] = np.float32(0)
+            if is_touched:
+                texels[count] = texel
+                grads[count, 0], grads[count, 1], grads[count, 2] = red, green, blue
+                count += 1
+        for part in range(PARTS):
+            words[part, word] = np.uint64(0)
+    return count
+
+
+# ---- Numba kernel of the loss against depth priors -----------------------------------------------
+
+CHUNK = 4096  # priors summed at a time
+
+
+@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
+def compare_depth(expected, alpha, pixels, depth, weight, factor, least_alpha, d_expected, sums):
+    """Sum of weight |1/expected - 1/depth| over the priors, and its derivative.
+
+    expected, alpha, d_expected: flat [H, W]; d_expected must be 0 and gets factor times the
+    derivative. pixels, depth, weight: the priors. Pixels with alpha <= least_alpha count nothing.
+    sums: float64, one per CHUNK of priors; -1 where a pixel lies outside of the image or the order
+    does not increase.
+    """
+    one, zero = np.float32(1), np.float32(0)
+    for chunk in numba.prange(sums.size):
+        total = 0.0
+        before = pixels[chunk * CHUNK - 1] if chunk else np.int32(-1)
+        for k in range(chunk * CHUNK, min((chunk + 1) * CHUNK, pixels.size)):
+            pixel = pixels[k]
+            if pixel <= before or pixel >= expected.size:
+                total = -1.0
+                break
+            before = pixel
+            value = expected[pixel]
+            if not (alpha[pixel] > least_alpha and value > zero and depth[k] > zero):
+                continue
+            inverse = one / value
+            error = inverse - one / depth[k]
+            total += weight[k] * abs(error)
+            slope = factor * weight[k] * inverse * inverse
+            d_expected[pixel] = -slope if error > zero else slope if error < zero else zero
+        sums[chunk] = total
+
+
+PAD = 5  # the window's radius
+MARGIN = 8  # zeros on either side of a row that is blurred, >= PAD
+SIGMA = 1.5
+C1, C2 = np.float32(0.01**2), np.float32(0.03**2)
+
+_BELL = [math.exp(-(k**2) / (2 * SIGMA**2)) for k in range(PAD + 1)]
+_AREA = _BELL[0] + 2 * sum(_BELL[1:])
+W0, W1, W2, W3, W4, W5 = (np.float32(value / _AREA) for value in _BELL)
+
+
+@inner()
+def _blur_row(row, at):
+    """Eight blurred values of a row with margins; at: index of the first in the row."""
+    value = v8.load(row, at) * v8.splat(W0)
+    pair = v8.load(row, at - U(1)) + v8.load(row, at + U(1))
+    value = v8.fmuladd(pair, v8.splat(W1), value)
+    pair = v8.load(row, at - U(2)) + v8.load(row, at + U(2))
+    value = v8.fmuladd(pair, v8.splat(W2), value)
+    pair = v8.load(row, at - U(3)) + v8.load(row, at + U(3))
+    value = v8.fmuladd(pair, v8.splat(W3), value)
+    pair = v8.load(row, at - U(4)) + v8.load(row, at + U(4))
+    value = v8.fmuladd(pair, v8.splat(W4), value)
+    pair = v8.load(row, at - U(5)) + v8.load(row, at + U(5))
+    return v8.fmuladd(pair, v8.splat(W5), value)
+
+
+@inner()
+def _blur_column(plane, at, stride):
+    """Eight values blurred over the rows; at: index of the first, PAD rows above the centre."""
+    value = v8.load(plane, at + U(5) * stride) * v8.splat(W0)
+    pair = v8.load(plane, at + U(4) * stride) + v8.load(plane, at + U(6) * stride)
+    value = v8.fmuladd(pair, v8.splat(W1), value)
+    pair = v8.load(plane, at + U(3) * stride) + v8.load(plane, at + U(7) * stride)
+    value = v8.fmuladd(pair, v8.splat(W2), value)
+    pair = v8.load(plane, at + U(2) * stride) + v8.load(plane, at + U(8) * stride)
+    value = v8.fmuladd(pair, v8.splat(W3), value)
+    pair = v8.load(plane, at + stride) + v8.load(plane, at + U(9) * stride)
+    value = v8.fmuladd(pair, v8.splat(W4), value)
+    pair = v8.load(plane, at) + v8.load(plane, at + U(10) * stride)
+    return v8.fmuladd(pair, v8.splat(W5), value)
+
+
+@inner()
+def _pair_of_moments(plane, upper, lower, weight, first, second):
+    """first + weight (a + b) and second + weight (a^2 + b^2), a and b from two rows."""
+    a, b = v8.load(plane, upper), v8.load(plane, lower)
+    first = v8.fmuladd(a + b, weight, first)
+    return first, v8.fmuladd(v8.fmuladd(a, a, b * b), weight, second)
+
+
+@inner()
+def _column_moments(plane, at, stride, rows, first_at, second_at):
+    """As `_blur_column`, of the values and of their squares, into two rows."""
+    a = v8.load(plane, at + U(5) * stride)
+    first = a * v8.splat(W0)
+    second = a * first
+    first, second = _pair_of_moments(
+        plane, at + U(4) * stride, at + U(6) * stride, v8.splat(W1), first, second
+    )
+    first, second = _pair_of_moments(
+        plane, at + U(3) * stride, at + U(7) * stride, v8.splat(W2), first, second
+    )
+    first, second = _pair_of_moments(
+        plane, at + U(2) * stride, at + U(8) * stride, v8.splat(W3), first, second
+    )
+    first, second = _pair_of_moments(
+        plane, at + stride, at + U(9) * stride, v8.splat(W4), first, second
+    )
+    first, second = _pair_of_moments(plane, at, at + U(10) * stride, v8.splat(W5), first, second)
+    v8.store(rows, first_at, first)
+    v8.store(rows, second_at, second)
+
+
+@inner()
+def _composite_row(rgb, alpha, sky, row, size, rows, out, first, plane):
+    """rgb + (1 - alpha) sky of one image row, into three planes of `out` from `first` on.
+
+    rows: work space of four rows, zero beyond the image's width.
+    """
+    height, width, stride = (U(size[0]), U(size[1]), U(size[2]))
+    for j in range(U(0), width):
+        at = row * width + j
+        rows[j] = rgb[at * U(3)]
+        rows[stride + j] = rgb[at * U(3) + U(1)]
+        rows[U(2) * stride + j] = rgb[at * U(3) + U(2)]
+        rows[U(3) * stride + j] = alpha[at]
+    one = v8.splat(np.float32(1))
+    for j in range(U(0), stride, U(LANES)):
+        through = one - v8.load(rows, U(3) * stride + j)
+        for c in range(U(0), U(3)):
+            behind = v8.load(sky, (c * height + row) * stride + j)
+            value = v8.fmuladd(through, behind, v8.load(rows, c * stride + j))
+            v8.store(out, first + c * plane + j, value)
+
+
+@inner()
+def _mapped(planes, at, plane, color_map, channel):
+    """One channel of the colour map, of three planes of composited colour."""
+    entry = U(4) * channel
+    value = v8.fmuladd(
+        v8.load(planes, at), v8.splat(color_map[entry]), v8.splat(color_map[entry + U(3)])
+    )
+    value = v8.fmuladd(v8.load(planes, at + plane), v8.splat(color_map[entry + U(1)]), value)
+    return v8.fmuladd(v8.load(planes, at + plane + plane), v8.splat(color_map[entry + U(2)]), value)
+
+
+@kernel
+def finish_picture(rgb, alpha, sky, color_map, size, out):
+    """The picture as the camera shows it: the sky behind, then the camera's colours.
+
+    rgb, out: flat [H, W, 3]. alpha: flat [H, W]. sky: flat planes [3, H, stride]. color_map: flat
+    [3, 4]. size: height, width, stride.
+    """
+    width, stride = U(size[1]), U(size[2])
+    for band in prange((size[0] + BAND - 1) // BAND):
+        rows = np.zeros(7 * size[2], np.float32)
+        for i in range(band * BAND, min((band + 1) * BAND, size[0])):
+            _composite_row(rgb, alpha, sky, U(i), size, rows, rows, U(4) * stride, stride)
+            for j in range(U(0), stride, U(LANES)):
+                for c in range(U(0), U(3)):
+                    value = _mapped(rows, U(4) * stride + j, stride, color_map, c)
+                    v8.store(rows, c * stride + j, value)
+            for j in range(U(0), width):
+                for c in range(U(0), U(3)):
+                    out[(U(i) * width + j) * U(3) + c] = rows[c * stride + j]
+
+
+@kernel
+def compare(
+    rgb,
+    alpha,
+    sky,
+    color_map,
+    recorded,
+    weight,
+    is_sky,
+    size,
+    behind,
+    pairs,
+    weights,
+    sums,
+    covered,
+):
+    """x + y and x - y of the finished and the recorded picture, and the sums of the L1 loss.
+
+    recorded: flat uint8 [H, W, 3]. weight, is_sky: flat [H, W]; the rest as `finish_picture`.
+    Written: behind, the composited colour, flat planes [3, H, stride]; pairs, six flat planes
+    [H + 2 PAD, stride], red, green, blue of x + y, then of x - y; weights, a flat plane [H,
+    stride]; sums, flat [H, 2, LANES]: of weight |x - y| and of weight; covered, float64 [H]: of
+    alpha in the sky. Where the weight is 0, y is x.
+    """
+    height, width, stride = (U(size[0]), U(size[1]), U(size[2]))
+    plane = U(size[0] + 2 * PAD) * stride
+    to_unit = v8.splat(np.float32(1 / 255))
+    for band in prange((size[0] + BAND - 1) // BAND):
+        rows = np.zeros(U(4) * stride, np.float32)
+        for i in range(band * BAND, min((band + 1) * BAND, size[0])):
+            row = U(i)
+            own = row * stride
+            _composite_row(rgb, alpha, sky, row, size, rows, behind, own, height * stride)
+            opacity = 0.0
+            for j in range(U(0), width):
+                at = row * width + j
+                weights[own + j] = weight[at]
+                if is_sky[at]:
+                    opacity += alpha[at]
+                rows[j] = np.float32(recorded[at * U(3)])
+                rows[stride + j] = np.float32(recorded[at * U(3) + U(1)])
+                rows[U(2) * stride + j] = np.float32(recorded[at * U(3) + U(2)])
+            for j in range(width, stride):
+                weights[own + j] = np.float32(0)
+            zero = v8.splat(np.float32(0))
+            error, weight_sum = zero, zero
+            first = (row + U(PAD)) * stride
+            for j in range(U(0), stride, U(LANES)):
+                w = v8.load(weights, own + j)
+                is_used = v8.greater(w, zero)
+                weight_sum = weight_sum + w
+                for c in range(U(0), U(3)):
+                    x = _mapped(behind, own + j, height * stride, color_map, c)
+                    y = v8.select(is_used, v8.load(rows, c * stride + j) * to_unit, x)
+                    v8.store(pairs, c * plane + first + j, x + y)
+                    v8.store(pairs, (U(3) + c) * plane + first + j, x - y)
+                    error = v8.fmuladd(v8.absolute(x - y), w, error)
+            # Beyond the image both are zero, as the window's padding is.
+            for c in range(U(0), U(6)):
+                for j in range(width, stride):
+                    pairs[c * plane + first + j] = np.float32(0)
+            v8.store(sums, row * U(2 * LANES), error)
+            v8.store(sums, row * U(2 * LANES) + U(LANES), weight_sum)
+            covered[i] = opacity
+
+
+@kernel
+def compare_windows(pairs, weights, size, slopes, sums):
+    """SSIM's sum with the weights, and the three planes that its gradient is blurred from.
+
+    pairs, weights: from `compare`. Written: slopes, nine flat planes [H + 2 PAD, stride], a, 2 b,
+    2 c (see above) for red, then green, then blue; sums, flat [H, LANES].
+    """
+    stride = U(size[2])
+    plane = U(size[0] + 2 * PAD) * stride
+    length = stride + U(2 * MARGIN)
+    for band in prange((size[0] + BAND - 1) // BAND):
+        rows = np.zeros(U(4) * length, np.float32)
+        for i in range(band * BAND, min((band + 1) * BAND, size[0])):
+            row = U(i)
+            half, one = v8.splat(np.float32(0.5)), v8.splat(np.float32(1))
+            ssim_sum = v8.splat(np.float32(0))
+            for c in range(U(0), U(3)):
+                for j in range(U(0), stride, U(LANES)):
+                    top, at = c * plane + row * stride + j, j + U(MARGIN)
+                    _column_moments(pairs, top, stride, rows, at, at + U(2) * length)
+                    _column_moments(
+                        pairs, top + U(3) * plane, stride, rows, at + length, at + U(3) * length
+                    )
+                centre = U(3) * c * plane + (row + U(PAD)) * stride
+                for j in range(U(0), stride, U(LANES)):
+                    at = j + U(MARGIN)
+                    p, n = _blur_row(rows, at), _blur_row(rows, at + length)
+                    pp, nn = p * p, n * n
+                    over_p = _blur_row(rows, at + U(2) * length) - pp
+                    over_n = _blur_row(rows, at + U(3) * length) - nn
+                    a1 = v8.fmuladd(pp - nn, half, v8.splat(C1))
+                    b1 = v8.fmuladd(pp + nn, half, v8.splat(C1))
+                    a2 = v8.fmuladd(over_p - over_n, half, v8.splat(C2))
+                    b2 = v8.fmuladd(over_p + over_n, half, v8.splat(C2))
+                    b2 = v8.maximum(b2, v8.splat(C2))  # a variance; rounding may make it negative
+                    w = v8.load(weights, row * stride + j)
+                    inverse = one / (b1 * b2)
+                    ssim = a1 * a2 * inverse
+                    ssim_sum = v8.fmuladd(ssim, w, ssim_sum)
+                    w = w * inverse  # the derivatives by A1, A2, B1 and B2, times the weight
+                    by_a1, by_a2 = a2 * w, a1 * w
+                    by_b1, by_b2 = v8.negate(ssim * b2 * w), v8.negate(ssim * b1 * w)
+                    along = by_a1 - by_a2
+                    across = by_b1 - by_b2
+                    a = v8.fmuladd(p, along + across, n * (across - along))
+                    v8.store(slopes, centre + j, a)
+                    v8.store(slopes, centre + plane + j, by_b2 + by_a2)
+                    v8.store(slopes, centre + plane + plane + j, by_b2 - by_a2)
+            v8.store(sums, row * U(LANES), ssim_sum)
+
+
+@inner()
+def _picture_slopes(pairs, slopes, weights, row, size, factors, work, rows):
+    """The loss's derivatives by the finished picture, one image row, into three rows."""
+    stride = U(size[2])
+    plane = U(size[0] + 2 * PAD) * stride
+    length = stride + U(2 * MARGIN)
+    zero, one = v8.splat(np.float32(0)), v8.splat(np.float32(1))
+    for c in range(U(0), U(3)):
+        top = U(3) * c * plane + row * stride
+        for k in range(U(0), U(3)):
+            for j in range(U(0), stride, U(LANES)):
+                value = _blur_column(slopes, top + k * plane + j, stride)
+                v8.store(work, k * length + U(MARGIN) + j, value)
+        centre = c * plane + (row + U(PAD)) * stride
+        for j in range(U(0), stride, U(LANES)):
+            at = j + U(MARGIN)
+            w = v8.load(weights, row * stride + j)
+            plus, minus = (v8.load(pairs, centre + j), v8.load(pairs, centre + U(3) * plane + j))
+            slope = v8.fmuladd(_blur_row(work, at + length), plus, _blur_row(work, at))
+            slope = v8.fmuladd(_blur_row(work, at + length + length), minus, slope)
+            sign = v8.select(v8.greater(minus, zero), one, zero)
+            sign = v8.select(v8.greater(zero, minus), v8.negate(one), sign)
+            slope = v8.fmuladd(slope, v8.splat(factors[1]), sign * w * v8.splat(factors[0]))
+            v8.store(rows, c * stride + j, v8.select(v8.greater(w, zero), slope, zero))
+
+
+@inner()
+def _map_slopes(rows, channel, behind, own, plane, stride, sums, first):
+    """The row's part of the derivative by one channel of the colour map, LANES sums an entry."""
+    zero = v8.splat(np.float32(0))
+    red, green, blue, offset = zero, zero, zero, zero
+    for j in range(U(0), stride, U(LANES)):
+        slope = v8.load(rows, channel * stride + j)
+        at = own + j
+        red = v8.fmuladd(slope, v8.load(behind, at), red)
+        green = v8.fmuladd(slope, v8.load(behind, at + plane), green)
+        blue = v8.fmuladd(slope, v8.load(behind, at + plane + plane), blue)
+        offset = offset + slope
+    v8.store(sums, first, red)
+    v8.store(sums, first + U(LANES), green)
+    v8.store(sums, first + U(2 * LANES), blue)
+    v8.store(sums, first + U(3 * LANES), offset)
+
+
+@inner()
+def _times_transposed(rows, at, stride, color_map, k):
+    """Derivative by channel k of the composited colour, from three rows of those by the picture."""
+    value = v8.load(rows, at) * v8.splat(color_map[k])
+    value = v8.fmuladd(v8.load(rows, at + stride), v8.splat(color_map[U(4) + k]), value)
+    return v8.fmuladd(v8.load(rows, at + stride + stride), v8.splat(color_map[U(8) + k]), value)
+
+
+@kernel
+def differentiate(
+    sky, color_map, is_sky, behind, pairs, slopes, weights, size, factors, d_rgb, d_alpha, sums
+):
+    """The loss's derivatives by rgb, alpha and the colour map.
+
+    factors: float32, of the L1 loss and of SSIM per unit of weight, and of alpha in the sky; the
+    rest as in the kernels above. Written: d_rgb flat [H, W, 3], d_alpha flat [H, W]; sums, flat
+    [H, 3, 4, LANES]: the row's part of the map's derivative.
+    """
+    height, width, stride = (U(size[0]), U(size[1]), U(size[2]))
+    length = stride + U(2 * MARGIN)
+    plane = height * stride
+    for band in prange((size[0] + BAND - 1) // BAND):
+        rows = np.zeros(U(7) * stride, np.float32)
+        work = np.zeros(U(3) * length, np.float32)
+        for i in range(band * BAND, min((band + 1) * BAND, size[0])):
+            row = U(i)
+            own = row * stride
+            _picture_slopes(pairs, slopes, weights, row, size, factors, work, rows)
+            for c in range(U(0), U(3)):
+                first = (row * U(3) + c) * U(4 * LANES)
+                _map_slopes(rows, c, behind, own, plane, stride, sums, first)
+            for j in range(U(0), stride, U(LANES)):
+                toward_sky = v8.splat(np.float32(0))
+                for k in range(U(0), U(3)):
+                    slope = _times_transposed(rows, j, stride, color_map, k)
+                    v8.store(rows, (U(3) + k) * stride + j, slope)
+                    toward_sky = v8.fmuladd(slope, v8.load(sky, k * plane + own + j), toward_sky)
+                v8.store(rows, U(6) * stride + j, v8.negate(toward_sky))
+            for j in range(U(0), width):
+                at = row * width + j
+                d_rgb[at * U(3)] = rows[U(3) * stride + j]
+                d_rgb[at * U(3) + U(1)] = rows[U(4) * stride + j]
+                d_rgb[at * U(3) + U(2)] = rows[U(5) * stride + j]
+                slope = rows[U(6) * stride + j]
+                d_alpha[at] = slope + factors[2] if is_sky[at] else slope
+
 
 # ---- Numba kernel: how the loss pulls at whole parts, from the gradients of their splats' means --
 
@@ -75,6 +599,11 @@ def sum_forces(addresses, sizes, blocks, rows, ids, counts, moments):
 def _three(array, at):
     return np.float64(array[at]), np.float64(array[at + U(1)]), np.float64(array[at + U(2)])
 
+
+# ---- Adam on the splats that a view touched, in the arrays that the rasteriser reads -------------
+# Values are kept activated: a step on the logarithm of a scale multiplies it, a step on the logit
+# of an opacity divides its odds, quaternions are turned along the sphere and normalised. Kingma &
+# Ba 2015, with the bias correction counted per splat, since a view touches a few of them only.
 
 # Numbers of an update, float32: step sizes of a row's first 16 columns as GRAD lists them (negative
 # for opacity, whose odds are divided), of the SH, and the rest.

@@ -25,7 +25,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from augment.cameras import Camera
-from augment.reconstruct import loss_kernels
+from augment.reconstruct import kernels
 from augment.reconstruct.config import LossWeights
 from augment.reconstruct.loss_reference import MIN_ALPHA, MIN_SKY
 from augment.reconstruct.view import RecordedView
@@ -48,7 +48,7 @@ class ImageBuffers:
     """What depends on the image's size; see the kernels for each buffer's meaning."""
 
     def __init__(self, height: int, width: int) -> None:
-        lanes, pad = loss_kernels.LANES, loss_kernels.PAD
+        lanes, pad = kernels.LANES, kernels.PAD
         stride = -(-width // lanes) * lanes
         padded = (height + 2 * pad) * stride
         self.size = (height, width, stride)
@@ -75,8 +75,8 @@ class SkyBuffers:
         self.size = size
         texels = 6 * size * size
         slots = -(-texels // 8) * 8
-        self.parts = np.zeros((loss_kernels.PARTS, texels, 3), np.float32)
-        self.touched = np.zeros((loss_kernels.PARTS, slots), np.uint8)
+        self.parts = np.zeros((kernels.PARTS, texels, 3), np.float32)
+        self.touched = np.zeros((kernels.PARTS, slots), np.uint8)
         self.texels = np.empty(texels, np.int32)
         self.grads = np.empty((texels, 3), np.float32)
         self.is_clean = True
@@ -88,11 +88,11 @@ class SkyBuffers:
             self.parts.fill(0)
             self.touched.fill(0)
         self.is_clean = False
-        loss_kernels.scatter_sky(
+        kernels.scatter_sky(
             d_rgb, alpha, image.texels, image.fractions, self.size, self.parts, self.touched
         )
         words = self.touched.view(np.uint64)
-        count = loss_kernels.gather_sky(self.parts, self.touched, words, self.texels, self.grads)
+        count = kernels.gather_sky(self.parts, self.touched, words, self.texels, self.grads)
         self.is_clean = True
         return SkyGradient(self.texels[:count], self.grads[:count]) if count else None
 
@@ -165,7 +165,7 @@ def picture(
     out = np.empty_like(rgb)
     with kernel_threads():
         _sample_sky(alpha, camera, sky_faces, np.float32(0), buffers)
-        loss_kernels.finish_picture(
+        kernels.finish_picture(
             rgb.reshape(-1),
             alpha.reshape(-1),
             buffers.sky_colors.reshape(-1),
@@ -237,7 +237,7 @@ def _sample_sky(
 ) -> None:
     rotation = camera.camera_from_world[:3, :3].numpy().T.astype(np.float32, order="C")
     intrinsics = np.array([1 / camera.fx, 1 / camera.fy, camera.cx, camera.cy], np.float32)
-    loss_kernels.sample_sky(
+    kernels.sample_sky(
         alpha,
         sky_faces,
         rotation,
@@ -264,7 +264,7 @@ def _compare(
     recorded = _writeable(view.rgb).reshape(-1)
     weight, is_sky = _writeable(view.weight).reshape(-1), _writeable(view.sky).reshape(-1)
     pairs, slopes, kept = buffers.pairs, buffers.slopes, buffers.weights
-    loss_kernels.compare(
+    kernels.compare(
         rgb.reshape(-1),
         alpha.reshape(-1),
         sky,
@@ -284,12 +284,12 @@ def _compare(
     count = 3 * weight_sum
     ssim, ssim_factor = 1.0, 0.0
     if count > 0 and weights.d_ssim != 0:
-        loss_kernels.compare_windows(pairs, kept, size, slopes, buffers.ssim_sums.reshape(-1))
+        kernels.compare_windows(pairs, kept, size, slopes, buffers.ssim_sums.reshape(-1))
         ssim = float(buffers.ssim_sums.sum(dtype=np.float64)) / count
         ssim_factor = -weights.d_ssim / 2 / count
     per_weight = 1 / count if count > 0 else 0.0
     factors = ((1 - weights.d_ssim) * per_weight, ssim_factor, weights.sky / pixels)
-    loss_kernels.differentiate(
+    kernels.differentiate(
         sky,
         mapping,
         is_sky,
@@ -333,8 +333,8 @@ def _compare_depth(
     weight_sum = float(view.depth_weight.sum(dtype=np.float64))
     if expected_depth is None or weight_sum <= 0 or weights.depth == 0:
         return 0.0
-    sums = np.empty(-(-len(view.depth_pixels) // loss_kernels.CHUNK))
-    loss_kernels.compare_depth(
+    sums = np.empty(-(-len(view.depth_pixels) // kernels.CHUNK))
+    kernels.compare_depth(
         expected_depth.reshape(-1),
         alpha.reshape(-1),
         _writeable(view.depth_pixels),

@@ -11,16 +11,16 @@ import torch
 from augment.geometry import rigid, rotmat_from_quat
 from augment.reconstruct import kernels
 from augment.reconstruct.config import FitConfig, LearningRates, LossWeights
-from augment.reconstruct.optimiser import (
+from augment.reconstruct.splats import Splats
+from augment.reconstruct.trainer import (
     BETA1,
     BETA2,
     CORRECTIONS,
     ColorAdam,
     DenseAdam,
+    splat_inputs,
     splat_rates,
 )
-from augment.reconstruct.splats import Splats
-from augment.reconstruct.trainer import splat_inputs
 from augment.render.constants import RasterSettings
 from augment.render.cpu.backward_kernels import (
     G_ABS,

@@ -27,10 +27,9 @@ from augment.reconstruct import kernels as adam
 from augment.reconstruct.config import FitConfig, LossWeights
 from augment.reconstruct.loss import IDENTITY_MAP, ViewLoss, view_loss
 from augment.reconstruct.loss_reference import MIN_ALPHA, MIN_SKY, reference_loss
-from augment.reconstruct.optimiser import CORRECTIONS, ColorAdam, DenseAdam, splat_rates
 from augment.reconstruct.poses import Knots, part_forces
 from augment.reconstruct.splats import Splats
-from augment.reconstruct.trainer import splat_inputs
+from augment.reconstruct.trainer import CORRECTIONS, ColorAdam, DenseAdam, splat_inputs, splat_rates
 from augment.reconstruct.view import RecordedView
 from augment.render.buffers import ALPHA, EXPECTED_DEPTH, RGB
 from augment.render.constants import RasterSettings

@@ -6,7 +6,7 @@ import torch
 
 from augment.cameras import Camera
 from augment.geometry import rigid, rotmat_from_quat
-from augment.reconstruct import loss_kernels as sky_kernels
+from augment.reconstruct import kernels as sky_kernels
 from augment.reconstruct.config import LossWeights
 from augment.reconstruct.loss import IDENTITY_MAP, LossScratch, ViewLoss, picture, view_loss
 from augment.reconstruct.loss_reference import MIN_SKY, reference_loss, reference_picture, ssim_map

@@ -20,7 +20,7 @@ from torch import Tensor
 from augment.cameras import Camera
 from augment.render.buffers import RGB, RenderOutput
 from augment.render.constants import ALPHA_MIN, TRANSMITTANCE_STOP, RasterSettings
-from augment.render.cuda import backward_kernels as kernels
+from augment.render.cuda import blend_kernels as kernels
 from augment.render.cuda.driver import blend, list_tiles, project
 from augment.render.cuda.runtime import launch, resident
 from augment.render.cuda.splats import CudaSplats, CudaTiles, gather_inputs
