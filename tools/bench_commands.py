@@ -195,19 +195,6 @@ def fit(scene: str | None = None, quick: bool = False, json_file: JsonFile = Non
     return _print_result(bench_fit(scene, quick=quick), fit_text, json_file)
 
 
-def open_(repeats: int = 7, quick: bool = False, json_file: JsonFile = None) -> int:
-    """Time and memory of opening a trained scene of a million Gaussians, and the same saved.
-
-    Args:
-        repeats: How often each is opened.
-        quick: A smaller scene.
-        json_file: Also write the figures to this file.
-    """
-    from tools.bench_open import bench_open, open_text
-
-    return _print_result(bench_open(quick=quick, repeats=repeats), open_text, json_file)
-
-
 def trade(
     scene: str = "procedural:street?seed=3&frames=6",
     recipe: Annotated[tuple[str, ...], UseAppendAction] = (),
@@ -258,10 +245,19 @@ def generate(repeats: int = 3, quick: bool = False, json_file: JsonFile = None) 
         quick: A few tiny images, and a job of 500.
         json_file: Also write the figures to this file.
     """
-    from tools.bench_generate import QUICK, WHOLE, bench_generate, generate_text
+    return jobs(repeats, quick, None, json_file)
 
-    result = bench_generate(QUICK if quick else WHOLE, repeats=repeats)
-    return _print_result(result, generate_text, json_file)
+
+def jobs(
+    repeats: int = 3, quick: bool = False, scene: str | None = None, json_file: JsonFile = None
+) -> int:
+    from tools.bench.harness import print_figures
+    from tools.bench.jobs import QUICK, WHOLE, bench_jobs
+
+    result = bench_jobs(QUICK if quick else WHOLE, scene_uri=scene, repeats=repeats)
+    print_figures(result)
+    write_json(json_file, result)
+    return 0
 
 
 def dataset(
