@@ -51,7 +51,7 @@ from augment.sky import ConstantSky, CubemapSky, Sky, cubemap_coordinates, direc
 # ---- The Gaussians of a run's models: tensors of a checkpoint, activated -------------------------
 
 BACKGROUND, RIGID = "Background", "RigidNodes"
-OTHERS = frozenset({"Sky", "Affine", "CamPose", "CamPosePerturb"})  # models without Gaussians
+OTHERS = ("Sky", "Affine", "CamPose", "CamPosePerturb")  # models without Gaussians
 RIGID_KEYS = ("points_ids", "instances_size", "instances_fv", "instances_quats", "instances_trans")
 _KEYS = ("_means", "_scales", "_quats", "_opacities", "_features_dc", "_features_rest")
 _REASONS = {
@@ -69,9 +69,6 @@ def read_gaussians(
     Of spherical harmonics those degrees are kept that training had switched on: one for each
     sh_interval steps. Models without any have colours sigmoid(c), here the degree 0 that gives
     them.
-
-    Raises:
-        AdapterError: a tensor is missing, of another shape, or more than the project's own layout.
     """
     more = sorted(set(map(str, content)) - {*_KEYS, *RIGID_KEYS})
     if more:
@@ -113,15 +110,14 @@ def left_out(models: Mapping[str, Any], where: str) -> tuple[str, ...]:
     """A sentence for each model that is not drawn, with the number of its Gaussians."""
     sentences = []
     for name in models:
-        if name in (BACKGROUND, RIGID) or name in OTHERS:
+        if name in (BACKGROUND, RIGID, *OTHERS):
             continue
-        content = section(models, name, where)
-        means = content.get("_means")
+        means = section(models, name, where).get("_means")
+        what = (
+            f"{len(means)} Gaussians of {name} are" if isinstance(means, Tensor) else name + " is"
+        )
         reason = _REASONS.get(name, "models of this kind are not known here")
-        if isinstance(means, Tensor):
-            sentences.append(f"{where}: {len(means)} Gaussians of {name} are left out: {reason}")
-        else:
-            sentences.append(f"{where}: the model {name} is left out: {reason}")
+        sentences.append(f"{where}: {what} left out: {reason}")
     return tuple(sentences)
 
 
@@ -177,9 +173,6 @@ def read_poses(content: Mapping[str, Any], run: Run, where: str) -> RigidPoses:
     where both are and the first and last frames are not among them. (The project turns the
     Gaussians themselves, but not their places, by such a frame's own untrained pose. Here one pose
     does both.)
-
-    Raises:
-        AdapterError: a tensor is missing, of another shape, or not finite where it is used.
     """
     visible = tensor(content, "instances_fv", (None, None), where, dtype=torch.bool)
     frames, count = visible.shape
@@ -237,7 +230,7 @@ def make_actors(
         if len(own) == 0 or len(seen) == 0:
             absent.append(track_id)
             continue
-        rotations = poses.rotations[seen, index]
+        rotations, places = poses.rotations[seen, index] @ axes, poses.positions[seen, index]
         try:
             usable, about = check_gaussians(
                 gaussians.select(torch.from_numpy(own)), where=f"{where} object {index}"
@@ -253,7 +246,12 @@ def make_actors(
                 track_id=track_id,
                 label=label,
                 gaussians=with_class_of(label, turned),
-                track=_track(poses.positions[seen, index], rotations @ axes, seen, run, turn),
+                track=Track(
+                    torch.from_numpy((run.frames.start + seen).astype(np.int64) * FRAME_NS),
+                    rigid(torch.from_numpy(turn @ rotations), torch.from_numpy(places @ turn.T)),
+                    hold_ns=FRAME_NS // 2 - 1,  # the frame before and after are without it
+                    max_gap_ns=FRAME_NS,
+                ),
                 size_m=tuple((poses.sizes_m[index] @ np.abs(axes)).tolist()),
                 colors_in_world=True,
             )
@@ -303,24 +301,10 @@ def identify(
     ]
 
 
-def _track(
-    positions: np.ndarray, rotations: np.ndarray, seen: np.ndarray, run: Run, turn: np.ndarray
-) -> Track:
-    poses = rigid(torch.from_numpy(turn @ rotations), torch.from_numpy(positions @ turn.T))
-    times = (run.frames.start + seen).astype(np.int64) * FRAME_NS
-    return Track(
-        torch.from_numpy(times),
-        poses,
-        hold_ns=FRAME_NS // 2 - 1,  # the frame before and after are without it
-        max_gap_ns=FRAME_NS,
-    )
-
-
 # ---- The sky of a run as a cube map of the scene's world -----------------------------------------
 # drivestudio looks a direction (x, y, z) of its world up at (x, z, -y), in nvdiffrast's faces.
-# Where
-# the scene's world differs from it by a permutation of axes, both turns together take texels to
-# texels, and no colour is interpolated.
+# Where the scene's world differs from it by a permutation of axes, both turns together take texels
+# to texels, and no colour is interpolated.
 
 _LOOKUP_FROM_MODEL = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 _BAKED_SIZE = 256
@@ -335,9 +319,6 @@ def read_sky(
     not as it was trained.
 
     scene_from_model: [3, 3], a rotation.
-
-    Raises:
-        AdapterError: tensors of another shape than the project's.
     """
     black = ConstantSky(torch.zeros(3))
     if "Sky" not in models:
@@ -391,8 +372,7 @@ def _drawn_faces(sky: CubemapSky, source_from_target: np.ndarray) -> Tensor:
 
 def _turns_of_faces(source_from_target: np.ndarray) -> list[tuple[int, int]]:
     """For each face, the one that it shows and by how many quarter turns, found on a cube map of
-    two texels an edge: where four texels go, all do.
-    """
+    two texels an edge: where four texels go, all do."""
     turn = torch.from_numpy(source_from_target).float()
     face, s, t = cubemap_coordinates(directions_of_cubemap(2) @ turn.T)
     shown = face * 4 + (t > 0) * 2 + (s > 0)
@@ -479,7 +459,7 @@ def open_drivestudio(path: str, query: dict[str, str]) -> Scene:
         raise AdapterError(f"{where}: step must be a number of training steps; got {step!r}")
     models = section(content, "models", where)
     corrections = read_corrections(models, run, where)
-    drive = read_drive(run, numbers, corrections)
+    frames, about_frames = read_drive(run, numbers, corrections)
     sky, about_sky = read_sky(models, scene_from_model(run), where)
     background, about_background = read_gaussians(
         section(models, BACKGROUND, where),
@@ -490,16 +470,21 @@ def open_drivestudio(path: str, query: dict[str, str]) -> Scene:
     background, unusable = check_gaussians(background, where=f"{where} {BACKGROUND}")
     change = WorldChange(rotation=scene_from_model(run))
     actors, about_actors = _actors(models, run, step, where)
+    about_renderer = (
+        f"{run.config_file}: the run was trained with trainer.render.antialiased, which draws "
+        f"small splats fainter than they are drawn here; a recipe's render: {{antialiased: true}} "
+        f"does the same",
+    )
     return Scene(
         name=run.folder.absolute().name,
         source=format_uri("drivestudio", path, query),
         background=change.gaussians(background, np.zeros(3)),
         actors=actors,
         sky=sky,
-        frames=drive.frames,
+        frames=frames,
         labels=DriveStudioLabels(run),
         color_maps=corrections.camera_maps(run),
-        image_color_maps=corrections.image_maps(run, drive.frames),
+        image_color_maps=corrections.image_maps(run, frames),
         problems=(
             *left_out(models, where),
             *about_background,
@@ -507,8 +492,8 @@ def open_drivestudio(path: str, query: dict[str, str]) -> Scene:
             *about_actors,
             *about_sky,
             *corrections.problems,
-            *drive.problems,
-            *_about_renderer(run),
+            *about_frames,
+            *(about_renderer if run.antialiased else ()),
         ),
         made_by={
             "method": "drivestudio",
@@ -557,13 +542,3 @@ def _actors(
         )
     actors, about = make_actors(gaussians, owners, poses, identities, run, where)
     return actors, problems + about
-
-
-def _about_renderer(run: Run) -> tuple[str, ...]:
-    if not run.antialiased:
-        return ()
-    return (
-        f"{run.config_file}: the run was trained with trainer.render.antialiased, which draws "
-        f"small splats fainter than they are drawn here; a recipe's render: {{antialiased: true}} "
-        f"does the same",
-    )

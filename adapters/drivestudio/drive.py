@@ -12,7 +12,7 @@ import dataclasses
 import functools
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,8 +20,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from adapters.lidar_scene.scene import stored_records
 from adapters.plain_files import array_of, inside, read_json, read_numbers, read_pose, read_yaml
+from adapters.raw_drive import stored_records
+from adapters.uri import check_query
 from adapters.world import rotation_to_z_up
 from augment.cameras import Camera, Frame
 from augment.errors import AdapterError
@@ -30,27 +31,17 @@ from augment.files.image_size import read_image_header
 from augment.geometry import invert_rigid, quat_from_rotmat
 from augment.labels import Boxes, LidarSweep
 
-# ---- A run's folder: its checkpoint, what of its config.yaml decides how it is read, its data ----
-
 # ---- A run's config.yaml, and values of it by dotted keys such as `data.scene_idx` ---------------
 
 
 def read_config(path: Path) -> Mapping[str, Any]:
-    """The whole of it.
-
-    Raises:
-        AdapterError: missing, no YAML, or no mapping.
-    """
+    """The whole of it."""
     what = "a drivestudio run is a folder with config.yaml and checkpoint_*.pth"
     return read_yaml(path, if_missing=what)
 
 
 def lookup(config: Mapping[str, Any], key: str) -> Any:
-    """The value of a dotted key; None where there is none.
-
-    Raises:
-        AdapterError: it still refers to something else, as in ${data.root}.
-    """
+    """The value of a dotted key; None where there is none."""
     value: Any = config
     for name in key.split("."):
         value = value.get(name) if isinstance(value, Mapping) else None
@@ -63,30 +54,24 @@ def lookup(config: Mapping[str, Any], key: str) -> Any:
     return value
 
 
-def needed(config: Mapping[str, Any], key: str, where: str) -> Any:
+def needed(
+    config: Mapping[str, Any], key: str, where: str, expected: str, fits: Callable[[Any], bool]
+) -> Any:
+    """The value of a dotted key that must be there and fit; expected: what, for the message."""
     value = lookup(config, key)
     if value is None:
         raise AdapterError(f"{where} lacks {key}; expected the config that drivestudio saved")
+    if not fits(value):
+        raise AdapterError(f"{where}: {key} must be {expected}; got {value!r}")
     return value
 
 
-def text_of(config: Mapping[str, Any], key: str, where: str) -> str:
-    value = needed(config, key, where)
-    if not isinstance(value, str):
-        raise AdapterError(f"{where}: {key} must be a text; got {value!r}")
-    return value
+def _is_text(value: Any) -> bool:
+    return isinstance(value, str)
 
 
-def integer_of(
-    config: Mapping[str, Any], key: str, where: str, *, otherwise: int | None = None
-) -> int:
-    value = lookup(config, key)
-    if value is None and otherwise is not None:
-        return otherwise
-    value = needed(config, key, where)
-    if type(value) is not int:
-        raise AdapterError(f"{where}: {key} must be a whole number; got {value!r}")
-    return value
+def _is_integer(value: Any) -> bool:
+    return type(value) is int
 
 
 # ---- What a drivestudio URI may ask for, as in `drivestudio:<run>?data=DIR&frames=0:50` ----------
@@ -110,15 +95,7 @@ class RunOptions:
 
     @staticmethod
     def from_query(query: dict[str, str]) -> RunOptions:
-        """The options of a URI's query.
-
-        Raises:
-            AdapterError: an unknown key, or a value that cannot be used.
-        """
-        unknown = sorted(set(query) - set(_KEYS))
-        if unknown:
-            known = "; ".join(f"{key}: {kind}" for key, kind in _KEYS.items())
-            raise AdapterError(f"drivestudio: unknown option {unknown[0]!r}; known are {known}")
+        check_query("drivestudio", query, _KEYS)
         for key in ("data", "checkpoint"):
             if query.get(key) == "":
                 raise AdapterError(f"drivestudio: {key} must be {_KEYS[key]}; got ''")
@@ -134,11 +111,7 @@ class RunOptions:
         return RunOptions(query.get("data"), query.get("checkpoint"), first, stop)
 
     def select(self, numbers: range, where: str) -> tuple[int, ...]:
-        """Those of the run's frames that the scene has.
-
-        Raises:
-            AdapterError: none is left.
-        """
+        """Those of the run's frames that the scene has."""
         stop = numbers.stop if self.stop_frame is None else self.stop_frame
         kept = tuple(number for number in numbers if self.first_frame <= number < stop)
         if not kept:
@@ -195,11 +168,7 @@ class Convention:
 
 
 def convention_of(dataset: str, where: str) -> Convention:
-    """The convention of `data.dataset`; where: the file that says so, for messages.
-
-    Raises:
-        AdapterError: a dataset that is not known here.
-    """
+    """The convention of `data.dataset`; where: the file that says so, for messages."""
     found = _CONVENTIONS.get(dataset.lower())
     if found is None:
         raise AdapterError(
@@ -266,11 +235,12 @@ _CONVENTIONS = {
 }
 
 
-# ---- run -----------------------------------------------------------------------------------------
+# ---- A run's folder: its checkpoint, config and data ---------------------------------------------
 
 _CHECKPOINT = re.compile(r"checkpoint_(\d+)\.pth", re.ASCII)
 _FINAL = "checkpoint_final.pth"
 _POSE = re.compile(r"\d{3,}\.txt", re.ASCII)
+_STRIDE = "data.pixel_source.test_image_stride"
 _SH_INTERVAL = 1000  # steps after which the project adds a degree, unless a config says otherwise
 
 
@@ -317,32 +287,50 @@ class Run:
 
 
 def find_run(path: Path, options: RunOptions) -> Run:
-    """The run of a folder or of a checkpoint in one.
-
-    Raises:
-        AdapterError: no config or checkpoint, a config that lacks something, or no data.
-    """
+    """The run of a folder or of a checkpoint in one."""
     folder = path if path.is_dir() else path.parent
     config_file = folder / "config.yaml"
     config = read_config(config_file)
     where = str(config_file)
-    convention = convention_of(text_of(config, "data.dataset", where), where)
-    cameras = _camera_numbers(config, convention, where)
+    convention = convention_of(needed(config, "data.dataset", where, "a text", _is_text), where)
     checkpoint = _find_checkpoint(path, folder, options)
     data = _find_data(config, folder, options, where)
-    stride = integer_of(config, "data.pixel_source.test_image_stride", where, otherwise=0)
-    if stride < 0:
-        raise AdapterError(
-            f"{where}: data.pixel_source.test_image_stride must be >= 0; got {stride}"
+    stride = 0
+    if lookup(config, _STRIDE) is not None:
+        stride = needed(
+            config, _STRIDE, where, "a whole number >= 0", lambda n: _is_integer(n) and n >= 0
         )
+    known = range(len(convention.cameras))
+    cameras = needed(
+        config,
+        "data.pixel_source.cameras",
+        where,
+        f"a list of camera numbers, 0 to {known[-1]}, each once",
+        lambda numbers: (
+            isinstance(numbers, list)
+            and all(_is_integer(n) and n in known for n in numbers)
+            and 0 < len(numbers) == len(set(numbers))
+        ),
+    )
+    factors = needed(
+        config,
+        "data.pixel_source.downscale_when_loading",
+        where,
+        f"a list of a factor > 0 for each of the {len(cameras)} cameras",
+        lambda factors: (
+            isinstance(factors, list)
+            and len(factors) >= len(cameras)
+            and all(type(f) in (int, float) and math.isfinite(f) and f > 0 for f in factors)
+        ),
+    )
     return Run(
         folder=folder,
         checkpoint=checkpoint,
         data=data,
         convention=convention,
         frames=_frames(config, data, where),
-        cameras=cameras,
-        downscale=_downscale(config, len(cameras), where),
+        cameras=tuple(cameras),
+        downscale=tuple(float(factor) for factor in factors[: len(cameras)]),
         undistort=lookup(config, "data.pixel_source.undistort") is True,
         test_stride=stride,
         config=config,
@@ -404,8 +392,10 @@ def _find_data(config: Mapping[str, Any], folder: Path, options: RunOptions, whe
 
 def _frames(config: Mapping[str, Any], data: Path, where: str) -> range:
     """start_timestep to end_timestep, both included; -1 stands for the data's last."""
-    start = integer_of(config, "data.start_timestep", where)
-    end = integer_of(config, "data.end_timestep", where)
+    start, end = (
+        needed(config, f"data.{name}_timestep", where, "a whole number", _is_integer)
+        for name in ("start", "end")
+    )
     if end == -1:
         folders = [data / name for name in ("ego_pose", "lidar_pose") if (data / name).is_dir()]
         if not folders:
@@ -422,42 +412,6 @@ def _frames(config: Mapping[str, Any], data: Path, where: str) -> range:
     return range(start, end + 1)
 
 
-def _camera_numbers(
-    config: Mapping[str, Any], convention: Convention, where: str
-) -> tuple[int, ...]:
-    key = "data.pixel_source.cameras"
-    numbers = needed(config, key, where)
-    known = range(len(convention.cameras))
-    is_list = isinstance(numbers, list) and len(numbers) > 0
-    if (
-        not is_list
-        or len({*map(str, numbers)}) != len(numbers)
-        or not all(type(number) is int and number in known for number in numbers)
-    ):
-        raise AdapterError(
-            f"{where}: {key} must list numbers of cameras, 0 to {known[-1]}, each once; "
-            f"got {numbers!r}"
-        )
-    return tuple(numbers)
-
-
-def _downscale(config: Mapping[str, Any], cameras: int, where: str) -> tuple[float, ...]:
-    key = "data.pixel_source.downscale_when_loading"
-    factors = needed(config, key, where)
-    if (
-        not isinstance(factors, list)
-        or len(factors) < cameras
-        or not all(type(f) in (int, float) and math.isfinite(f) and f > 0 for f in factors)
-    ):
-        raise AdapterError(
-            f"{where}: {key} must list a factor > 0 for each of the {cameras} cameras; "
-            f"got {factors!r}"
-        )
-    return tuple(float(factor) for factor in factors[:cameras])
-
-
-# ---- drive ---------------------------------------------------------------------------------------
-
 # ---- What a run learnt for each image: its colours' affine map and its camera's pose -------------
 # Image i of a run is frame * cameras + camera, both counted from 0 as the run has them.
 
@@ -468,8 +422,7 @@ _POSES = ("CamPosePerturb", "CamPose")  # in the order in which they apply
 class ImageCorrections:
     """color_maps: float32 [n, 3, 4] of each image, mean_color_map: [3, 4] of images that were not
     trained on; both None without any. pose_changes: float64 [n, 4, 4], what world_from_camera is
-    multiplied by on its right; None for no change.
-    """
+    multiplied by on its right; None for no change."""
 
     color_maps: np.ndarray | None
     mean_color_map: np.ndarray | None
@@ -505,11 +458,7 @@ class ImageCorrections:
 
 
 def read_corrections(models: Mapping[str, Any], run: Run, where: str) -> ImageCorrections:
-    """The corrections of a checkpoint's models.
-
-    Raises:
-        AdapterError: a tensor is missing, of another shape, or not finite.
-    """
+    """The corrections of a checkpoint's models."""
     count = len(run.frames) * len(run.cameras)
     maps, mean, problems = None, None, ()
     if "Affine" in models:
@@ -530,7 +479,8 @@ def _affine(
     width, inputs = hidden.shape
     if inputs == embedding.shape[1] + 2:
         return (
-            *(None, None),
+            None,
+            None,
             (
                 f"{where}: the colour corrections differ over the image (pixel_affine); they are "
                 f"left out, so images have the model's own colours",
@@ -589,32 +539,16 @@ _LEVEL = 1e-4  # slope that is none: a centimetre in 100 m
 _STEEPEST_UP = 0.9  # cosine of a slope that no road has
 
 
-@dataclass(frozen=True, eq=False)
-class Drive:
-    """frames: those asked for. problems: one sentence for each kind of thing gone on without."""
-
-    frames: tuple[Frame, ...]
-    problems: tuple[str, ...]
-
-
 def model_from_dataset(run: Run) -> np.ndarray:
-    """The rigid transform from the dataset's world to the model's, float64 [4, 4].
-
-    Raises:
-        AdapterError: the first frame's pose is missing or none.
-    """
+    """The rigid transform from the dataset's world to the model's, float64 [4, 4]."""
     return np.linalg.inv(_world_pose(run, run.frames.start))
 
 
 def scene_from_model(run: Run) -> np.ndarray:
     """The rotation from the model's world to the scene's, float64 [3, 3]: a permutation of axes
-    where that leaves z as good as up, or where the dataset's z cannot be what is up.
-
-    Raises:
-        AdapterError: as model_from_dataset.
-    """
+    where that leaves z as good as up, or where the dataset's z cannot be what is up."""
     axes, up = run.convention.scene_from_model, _up(run)
-    if _is_steep(up) or np.hypot(up[0], up[1]) < _LEVEL:
+    if _is_steep(run) or np.hypot(up[0], up[1]) < _LEVEL:
         return axes
     return rotation_to_z_up(up / np.linalg.norm(up)) @ axes
 
@@ -624,28 +558,24 @@ def _up(run: Run) -> np.ndarray:
     return run.convention.scene_from_model @ model_from_dataset(run)[:3, 2]
 
 
-def _is_steep(up: np.ndarray) -> bool:
+def _is_steep(run: Run) -> bool:
+    up = _up(run)
     return up[2] < _STEEPEST_UP * np.linalg.norm(up)
 
 
 def scene_from_dataset(run: Run) -> np.ndarray:
-    """The rigid transform from the dataset's world to the scene's, float64 [4, 4].
-
-    Raises:
-        AdapterError: as model_from_dataset.
-    """
+    """The rigid transform from the dataset's world to the scene's, float64 [4, 4]."""
     return _rigid(scene_from_model(run)) @ model_from_dataset(run)
 
 
-def read_drive(run: Run, numbers: tuple[int, ...], corrections: ImageCorrections) -> Drive:
-    """Frames of the given numbers, their cameras as the model corrects them.
-
-    Raises:
-        AdapterError: a pose or calibration is missing or none. Missing images are problems.
-    """
+def read_drive(
+    run: Run, numbers: tuple[int, ...], corrections: ImageCorrections
+) -> tuple[tuple[Frame, ...], tuple[str, ...]]:
+    """Frames of the given numbers, their cameras as the model corrects them, and a sentence for
+    each kind of thing gone on without."""
     scene = scene_from_dataset(run)
     problems: list[str] = []
-    if _is_steep(_up(run)):
+    if _is_steep(run):
         problems.append(
             f"{run.data}: z of its world is not what is up for the first frame's car, which is "
             f"therefore taken to stand level"
@@ -673,7 +603,7 @@ def read_drive(run: Run, numbers: tuple[int, ...], corrections: ImageCorrections
             f"{run.data / 'images'}: {len(missing)} of {len(numbers) * len(cameras)} images are "
             f"missing, the first {missing[0]}; their cameras are there without them"
         )
-    return Drive(tuple(frames), tuple(problems))
+    return tuple(frames), tuple(problems)
 
 
 def dataset_from_lidar(run: Run, number: int) -> np.ndarray:
@@ -776,11 +706,7 @@ class Instance:
 
 
 def read_instances(data: Path) -> tuple[Instance, ...] | None:
-    """All objects, by their numbers; None without the file.
-
-    Raises:
-        AdapterError: the file is damaged, or an entry is no object.
-    """
+    """All objects, by their numbers; None without the file."""
     path = data / "instances" / "instances_info.json"
     if not path.is_file():
         return None
@@ -906,8 +832,7 @@ class DriveStudioLabels:
 
     def lidar_origins(self, frame_index: int, sweep: LidarSweep) -> np.ndarray | None:
         """Waymo's own origins, return by return; nuScenes' sensor in lidar_pose. The other
-        datasets' files have returns in the car's frame and do not say where the sensor is on it.
-        """
+        datasets' files have returns in the car's frame and do not say where the sensor is on it."""
         names = _MOVED[1]
         if all(name in sweep.columns for name in names):
             return np.stack([np.asarray(sweep.columns[name], np.float64) for name in names], axis=1)

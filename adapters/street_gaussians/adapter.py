@@ -159,21 +159,17 @@ def _with_model_cameras(
 ) -> tuple[Frame, ...]:
     """Frames with the cameras that the model renders in place of those that recorded."""
     images = {(image.frame, image.name): image for image in data.images}
-    return tuple(
-        dataclasses.replace(
-            frame,
-            cameras={
-                name: dataclasses.replace(
-                    _capped(camera, width),
-                    camera_from_world=moved_camera(
-                        camera.camera_from_world, changes.of(images[frame.index, name])
-                    ),
-                )
-                for name, camera in frame.cameras.items()
-            },
-        )
-        for frame in frames
-    )
+    shown = []
+    for frame in frames:
+        cameras = {}
+        for name, camera in frame.cameras.items():
+            change = np.ascontiguousarray(changes.of(images[frame.index, name]))
+            camera_from_world = camera.camera_from_world @ torch.from_numpy(change)
+            cameras[name] = dataclasses.replace(
+                _capped(camera, width), camera_from_world=camera_from_world
+            )
+        shown.append(dataclasses.replace(frame, cameras=cameras))
+    return tuple(shown)
 
 
 def _capped(camera: Camera, width: int) -> Camera:
@@ -242,48 +238,28 @@ def make_actor(
         )
     if part.terms is not None and tracked.start_frame == tracked.end_frame:
         problems.append(f"{name} is tracked in one frame only; its colours do not change over time")
+    stamps = np.array([image.timestamp_ns for image in data.images])
+    before, after = knots[0] - stamps[stamps < knots[0]], stamps[stamps > knots[-1]] - knots[-1]
+    hold_ns = int(min([_MAX_HOLD_NS, *(before - 1), *(after - 1)]))  # into no other image
+    waves = None
+    if part.terms is not None:  # all images of a frame have the phase of its number
+        span = tracked.end_frame - tracked.start_frame
+        numbers = np.array([data.images[i].frame for i in shown[first]], np.float64)
+        phases = np.zeros(len(first))
+        if span:
+            phases = config.fourier_scale * (numbers - tracked.start_frame) / span
+        waves = ColorWaves(part.terms, torch.from_numpy(knots), torch.from_numpy(phases))
+    poses_of_track = torch.from_numpy(world_from_actor[first])
     actor = Actor(
         track_id=str(tracked.track_id),
         label=tracked.label,
         gaussians=with_class_of(tracked.label, part.gaussians),
-        track=Track(
-            torch.from_numpy(knots),
-            torch.from_numpy(world_from_actor[first]),
-            hold_ns=_hold_ns(knots, data),
-        ),
+        track=Track(torch.from_numpy(knots), poses_of_track, hold_ns=hold_ns),
         size_m=tracked.size_m,
-        color_waves=_waves(data, tracked, part, shown[first], knots, config.fourier_scale),
+        color_waves=waves,
         colors_in_world=True,
     )
     return actor, tuple(problems)
-
-
-def _hold_ns(knots: np.ndarray, data: StreetData) -> int:
-    """How long the actor stays before and after its knots without getting into other images."""
-    stamps = np.array([image.timestamp_ns for image in data.images])
-    away = np.concatenate(
-        [knots[0] - stamps[stamps < knots[0]], stamps[stamps > knots[-1]] - knots[-1]]
-    )
-    return int(min([_MAX_HOLD_NS, *(away - 1)]))
-
-
-def _waves(
-    data: StreetData,
-    tracked: TrackedObject,
-    part: Part,
-    images: np.ndarray,
-    knots: np.ndarray,
-    fourier_scale: float,
-) -> ColorWaves | None:
-    """Colours over time; all images of a frame have the phase of its number."""
-    if part.terms is None:
-        return None
-    span = tracked.end_frame - tracked.start_frame
-    frames = np.array([data.images[i].frame for i in images], np.float64)
-    phases = (
-        fourier_scale * (frames - tracked.start_frame) / span if span else np.zeros(len(images))
-    )
-    return ColorWaves(part.terms, torch.from_numpy(knots), torch.from_numpy(phases))
 
 
 # ---- Poses of actors: tracklets, moved by training, interpolated in the vehicle frame ------------
@@ -385,15 +361,8 @@ def _nearest_trained(
     data: StreetData, tracked: TrackedObject, cam: int, time_s: float
 ) -> np.ndarray | None:
     """Times of a camera's two images nearest to a time that were trained on and show the object."""
-    times = np.array(
-        [
-            image.timestamp_s
-            for image in data.images
-            if image.cam == cam
-            and not image.is_held_out
-            and tracked.start_s <= image.timestamp_s <= tracked.end_s
-        ]
-    )
+    trained = (i.timestamp_s for i in data.images if i.cam == cam and not i.is_held_out)
+    times = np.array([t for t in trained if tracked.start_s <= t <= tracked.end_s])
     if len(times) < 2:
         return None
     return times[np.argsort(np.abs(times - time_s), kind="stable")[:2]]
@@ -466,7 +435,7 @@ def camera_changes(
         (image.frame, image.cam): image.number if by_image else frames[image.frame]
         for image in data.images
     }
-    expected = _image_count(data, config) if by_image else len(data.frames)
+    expected = len(data.frames) * len(config.cameras) if by_image else len(data.frames)
     _check_count(
         len(changes), expected, f"{where}, pose_correction", config.pose_correction_mode, data
     )
@@ -496,7 +465,7 @@ def color_maps(maps: Tensor | None, data: StreetData, config: ModelConfig, where
                 f"configuration's data.cameras has {list(config.cameras)}"
             )
         return ColorMaps({CAMERA_NAMES[cam]: maps[cam].clone() for cam in cams})
-    _check_count(len(maps), _image_count(data, config), where, mode, data)
+    _check_count(len(maps), len(data.frames) * len(config.cameras), where, mode, data)
     by_camera = {}
     for name in dict.fromkeys(image.name for image in data.images):
         own = [image for image in data.images if image.name == name]
@@ -507,10 +476,6 @@ def color_maps(maps: Tensor | None, data: StreetData, config: ModelConfig, where
     return ColorMaps(by_camera, by_image)
 
 
-def _image_count(data: StreetData, config: ModelConfig) -> int:
-    return len(data.frames) * len(config.cameras)
-
-
 def _check_count(found: int, expected: int, where: str, mode: str, data: StreetData) -> None:
     if found != expected:
         raise AdapterError(
@@ -518,8 +483,3 @@ def _check_count(found: int, expected: int, where: str, mode: str, data: StreetD
             f"have {expected}. The number follows from data.cameras and data.selected_frames of "
             f"the configuration: give the data and the configs/ that the model was trained with"
         )
-
-
-def moved_camera(camera_from_world: Tensor, change: np.ndarray) -> Tensor:
-    """camera_from_world of a camera that sees the background where the change moves it."""
-    return camera_from_world @ torch.from_numpy(np.ascontiguousarray(change))

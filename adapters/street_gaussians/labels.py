@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import os
 import threading
 import zipfile
 import zlib
-from collections.abc import Collection, Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -16,9 +17,10 @@ from typing import BinaryIO
 import numpy as np
 import torch
 
-from adapters.lidar_scene.scene import DriveOptions, build_lidar_scene, views_of, without_points
-from adapters.lidar_scene.split import BoxSample, Sweep, join_tracks
+from adapters.lidar_scene.scene import build_lidar_scene, views_of, without_points
+from adapters.lidar_scene.split import join_tracks
 from adapters.plain_files import read_pose
+from adapters.raw_drive import BoxSample, DriveOptions, Sweep
 from adapters.safe_pickle import check_holds_object, stream_arrays
 from adapters.street_gaussians.data import (
     TIMES,
@@ -41,14 +43,13 @@ from augment.labels import Boxes, LidarSweep
 from augment.scene import Scene
 from augment.semantics import SemanticClass
 
-# ------------------------------------------------------------------------------------------------
-# LiDAR of a drive in Street Gaussians' layout: pointcloud.npz, a ZIP of pickled dictionaries
+# ---- LiDAR: pointcloud.npz, a ZIP of pickled dictionaries ----------------------------------------
 #     pointcloud[frame]           float [N, 3], vehicle frame at the frame's time
 #     camera_projection[frame]    int16 [N, 6]: camera, x, y of the first camera that sees the point
 #                                 and of the second; camera -1 for none
 #
-# The file holds the whole drive, compressed, in no way to get at one frame. It is therefore read
-# forward, and where reading stopped is kept: frames asked for in their order cost one pass.
+# The file holds the whole drive, compressed, with no way to get at one frame. It is read forward,
+# and where reading stopped is kept: frames asked for in their order cost one pass.
 
 FILE = "pointcloud.npz"
 _POINTS, _PROJECTIONS = "pointcloud.npy", "camera_projection.npy"
@@ -57,8 +58,7 @@ _KEPT_BYTES = 64 << 20
 
 @dataclass(frozen=True, eq=False)
 class PointCloud:
-    """points: float64 [N, 3], vehicle frame. projections: int16 [N, 6], or None where the file has
-    none."""
+    """points: float64 [N, 3], vehicle frame. projections: int16 [N, 6], if the file has any."""
 
     points: np.ndarray
     projections: np.ndarray | None
@@ -141,23 +141,21 @@ def _reader_of(path: Path) -> _Reader:
 def _clouds(path: Path) -> Generator[tuple[int, PointCloud]]:
     """Every frame of the file."""
     try:
-        with zipfile.ZipFile(path) as archive:
+        with zipfile.ZipFile(path) as archive, contextlib.ExitStack() as members:
             names = archive.namelist()
             if _POINTS not in names:
                 raise AdapterError(
                     f"{path} must hold the arrays pointcloud and camera_projection; it holds "
                     f"{names[:5]}"
                 )
-            with archive.open(_POINTS) as points:
-                if _PROJECTIONS not in names:
-                    yield from _checked(path, _entries(path, _POINTS, points), None)
-                    return
-                with archive.open(_PROJECTIONS) as projections:
-                    yield from _checked(
-                        path,
-                        _entries(path, _POINTS, points),
-                        _entries(path, _PROJECTIONS, projections),
-                    )
+            points, projections = (
+                _entries(path, name, members.enter_context(archive.open(name)))
+                if name in names
+                else None
+                for name in (_POINTS, _PROJECTIONS)
+            )
+            assert points is not None
+            yield from _checked(path, points, projections)
     except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
         raise AdapterError(
             f"{path} is no whole .npz file of dictionaries ({error}); copy it again"
@@ -167,14 +165,13 @@ def _clouds(path: Path) -> Generator[tuple[int, PointCloud]]:
 
 
 def _entries(path: Path, member: str, file: BinaryIO) -> Iterator[tuple[int, np.ndarray]]:
-    where = f"{path}, {member}"
     try:
         check_holds_object(file)
         yield from stream_arrays(file)
     except PickleError as error:
         raise AdapterError(
-            f"{where} was not read: {error}. Only a dictionary of arrays of numbers by frame is "
-            f"accepted"
+            f"{path}, {member} was not read: {error}. Only a dictionary of arrays of numbers by "
+            f"frame is accepted"
         ) from None
 
 
@@ -232,7 +229,20 @@ class StreetGaussiansLabels:
         if pose is None or not path.exists():
             return Boxes.empty()
         stat = path.stat()
-        return boxes_of_rows(_table(path, stat.st_mtime_ns, stat.st_size), frame_index, pose)
+        table = _table(path, stat.st_mtime_ns, stat.st_size)
+        rows = np.flatnonzero(table.frames == frame_index)
+        world_from_box = pose @ ego_from_boxes(table, rows)
+        attributes = {"alpha": table.alphas[rows]}
+        if table.speeds_mps is not None:
+            attributes["speed"] = table.speeds_mps[rows]
+        return Boxes(
+            track_ids=tuple(str(track_id) for track_id in table.ids[rows].tolist()),
+            labels=tuple(table.labels[row] for row in rows),
+            centers_m=world_from_box[:, :3, 3],
+            sizes_m=table.sizes_m[rows],
+            quats=quat_from_rotmat(torch.from_numpy(world_from_box[:, :3, :3])).numpy(),
+            attributes=attributes,
+        )
 
     def lidar(self, frame_index: int) -> LidarSweep | None:
         pose = self._world_from_ego(frame_index)
@@ -242,7 +252,13 @@ class StreetGaussiansLabels:
         times = read_times(self.root / TIMES)["FRAME"]
         if frame_index not in times:
             raise AdapterError(f"{self.root / TIMES}: FRAME lacks frame {frame_index:06d}")
-        return sweep_of(cloud, pose, round(times[frame_index] * 1e9))
+        world = cloud.points @ pose[:3, :3].T + pose[:3, 3]
+        columns: dict[str, np.ndarray] = {axis: world[:, i].copy() for i, axis in enumerate("xyz")}
+        columns["timestamp_ns"] = np.full(len(world), round(times[frame_index] * 1e9), np.int64)
+        if cloud.projections is not None:
+            for i, name in enumerate(("camera", "u", "v")):
+                columns[name] = cloud.projections[:, i].copy()
+        return LidarSweep(columns)
 
     def lidar_origins(self, frame_index: int, sweep: LidarSweep) -> np.ndarray | None:
         """Waymo's roof sensor in the car's pose of the frame. The files join the returns of five
@@ -263,23 +279,6 @@ def labels_of(root: Path) -> StreetGaussiansLabels | None:
     return StreetGaussiansLabels(root) if (root / "ego_pose").is_dir() else None
 
 
-def boxes_of_rows(table: TrackTable, frame: int, world_from_ego: np.ndarray) -> Boxes:
-    """The table's rows of a frame as boxes in the world of the pose, float64 [4, 4]."""
-    rows = np.flatnonzero(table.frames == frame)
-    world_from_box = world_from_ego @ ego_from_boxes(table, rows)
-    attributes = {"alpha": table.alphas[rows]}
-    if table.speeds_mps is not None:
-        attributes["speed"] = table.speeds_mps[rows]
-    return Boxes(
-        track_ids=tuple(str(track_id) for track_id in table.ids[rows].tolist()),
-        labels=tuple(table.labels[row] for row in rows),
-        centers_m=world_from_box[:, :3, 3],
-        sizes_m=table.sizes_m[rows],
-        quats=quat_from_rotmat(torch.from_numpy(world_from_box[:, :3, :3])).numpy(),
-        attributes=attributes,
-    )
-
-
 def ego_from_boxes(table: TrackTable, rows: np.ndarray) -> np.ndarray:
     """Poses of the rows' boxes in the vehicle's frame, float64 [R, 4, 4]."""
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
@@ -289,25 +288,13 @@ def ego_from_boxes(table: TrackTable, rows: np.ndarray) -> np.ndarray:
     return poses
 
 
-def sweep_of(cloud: PointCloud, world_from_ego: np.ndarray, timestamp_ns: int) -> LidarSweep:
-    """The returns in the world of the pose, in the file's order."""
-    world = cloud.points @ world_from_ego[:3, :3].T + world_from_ego[:3, 3]
-    columns: dict[str, np.ndarray] = {axis: world[:, i].copy() for i, axis in enumerate("xyz")}
-    columns["timestamp_ns"] = np.full(len(world), timestamp_ns, np.int64)
-    if cloud.projections is not None:
-        for i, name in enumerate(("camera", "u", "v")):
-            columns[name] = cloud.projections[:, i].copy()
-    return LidarSweep(columns)
-
-
 @lru_cache(maxsize=2)
 def _table(path: Path, mtime_ns: int, size: int) -> TrackTable:
     """A track file; mtime_ns and size tell whether it is still the one that was read."""
     return read_track_table(path)
 
 
-# ------------------------------------------------------------------------------------------------
-# A drive in Street Gaussians' layout without a trained model: Gaussians from coloured LiDAR
+# ---- A drive without a trained model: Gaussians from coloured LiDAR ------------------------------
 # The world is the one that a model trained on it has. Returns are where they were at their frame's
 # time, as the converter has it, and so are the boxes.
 
@@ -359,9 +346,9 @@ def open_raw(root: Path, query: dict[str, str]) -> Scene:
         world_origin_m=data.world_origin_m,
         problems=problems,
     )
+    missing = without_points(tracks, scene)
     faults = scene.problems[len(problems) :]
-    problems += without_points(tracks, scene) + faults
-    return dataclasses.replace(scene, problems=problems)
+    return dataclasses.replace(scene, problems=problems + missing + faults)
 
 
 def _sweeps(root: Path, used: Sequence[Frame]) -> tuple[list[Sweep], tuple[str, ...]]:
@@ -391,8 +378,9 @@ def _sweeps(root: Path, used: Sequence[Frame]) -> tuple[list[Sweep], tuple[str, 
     found = [sweeps[number] for number in sorted(sweeps)]
     if not missing:
         return found, ()
-    said = f"{root / FILE} lacks {len(missing)} frames, such as {missing[0]}: their points too"
-    return found, (said,)
+    return found, (
+        f"{root / FILE} lacks {len(missing)} frames, such as {missing[0]}: their points too",
+    )
 
 
 def _moving_samples(table: TrackTable, frames: Sequence[Frame]) -> list[BoxSample]:
@@ -414,13 +402,8 @@ def _moving_samples(table: TrackTable, frames: Sequence[Frame]) -> list[BoxSampl
             for row, pose in zip(rows, poses, strict=True)
             if table.labels[row] not in _STANDING
         ]
-    moving = _moving_ids(samples)
-    return [sample for sample in samples if sample.object_id in moving]
-
-
-def _moving_ids(samples: Sequence[BoxSample]) -> Collection[str]:
     places: dict[str, list[np.ndarray]] = {}
     for sample in samples:
         places.setdefault(sample.object_id, []).append(sample.world_from_box[:2, 3])
     extents = {name: np.ptp(np.array(xy), axis=0) for name, xy in places.items()}
-    return {name for name, extent in extents.items() if np.hypot(*extent) > _MOVED_M}
+    return [sample for sample in samples if np.hypot(*extents[sample.object_id]) > _MOVED_M]

@@ -13,8 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from adapters.lidar_scene.scene import DriveOptions
 from adapters.plain_files import read_yaml
+from adapters.raw_drive import DriveOptions
 from adapters.street_gaussians.data import CAMERA_NAMES, ModelConfig
 from adapters.uri import check_query, choice_of, whole_number_of
 from augment.errors import AdapterError, SceneError
