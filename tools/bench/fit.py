@@ -1,0 +1,184 @@
+"""A reconstruction: the time of each stage of a step, memory, and how good a fit becomes.
+
+Steps are timed at a fixed number of splats, so that every step is alike: none are added or removed.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from tqdm import tqdm
+
+from adapters.base import open_scene
+from adapters.training_views.views import recorded_views
+from augment.errors import ClimateGSError
+from augment.reconstruct.config import DensifyConfig, FitConfig
+from augment.reconstruct.trainer import Trainer
+from augment.reconstruct.view import ViewSource
+from augment.render.cpu.driver import warm_up
+from augment.scene import Scene
+from recipes.load import load_recipe
+from tools.bench.harness import (
+    RESET_PEAK,
+    Figures,
+    Table,
+    figures,
+    machine_facts,
+    return_free_memory,
+    spread_ms,
+    spread_row,
+    status_mib,
+)
+from tools.bench.scenes import record_street
+from tools.fit import fit_scene
+from tools.fit_options import FitOptions
+
+UNTIMED = 6  # first steps: compiling, and every view of a short recording decoded once
+NO_GROWTH = DensifyConfig(start=1.0, stop=0.0)  # its part of the run ends before it starts
+
+
+@dataclass(frozen=True)
+class FitCase:
+    """splats, steps: of the timed steps. frames, gaussians, cameras, render_scale: of the street's
+    recording. fit_steps: of the fit that is compared with the street's exact depth, 0 for none.
+    scale: of recorded images; street_scale: of those of the street.
+    """
+
+    splats: int = 200_000
+    steps: int = 150
+    frames: int = 16
+    gaussians: int = 400_000
+    cameras: tuple[str, ...] | None = None
+    render_scale: float = 1.0
+    fit_steps: int = 3000
+    scale: float = 0.25
+    street_scale: float = 0.5
+
+
+WHOLE = FitCase()
+QUICK = FitCase(steps=20, frames=4, cameras=("front", "left", "back"), fit_steps=0)
+
+
+def bench_fit(
+    case: FitCase = WHOLE, *, scene_uri: str | None = None, progress: bool = True
+) -> Figures:
+    """scene_uri: raw data to time steps on; by default a drive down the procedural street is
+    recorded, and also fitted to every other frame.
+
+    Raises:
+        ClimateGSError: the scene cannot be opened or has no recorded images.
+    """
+    machine = machine_facts()
+    with tempfile.TemporaryDirectory(prefix="climategs-bench-") as name:
+        if scene_uri is not None:
+            steps, facts = time_steps(scene_uri, case.scale, case, progress)
+            return figures("fit", [steps], machine=machine, scene=scene_uri, **facts)
+        street, recording = record_street(
+            Path(name) / "raw",
+            load_recipe("clear").resolve(0),
+            scale=case.render_scale,
+            cameras=case.cameras,
+            frames=case.frames,
+            gaussians=case.gaussians,
+        )
+        uri, tables = f"recording:{recording}", []
+        steps, facts = time_steps(uri, case.street_scale, case, progress)
+        if case.fit_steps:
+            options = FitOptions(
+                scene=uri,
+                out=Path(name) / "fitted",
+                steps=case.fit_steps,
+                scale=case.street_scale,
+                truth=street.source,
+            )
+            tables = [fit_table({"procedural street": options}, progress=progress)]
+    return figures("fit", [steps, *tables], machine=machine, scene=street.source, **facts)
+
+
+def fit_table(fits: Mapping[str, FitOptions], *, progress: bool = True) -> Table:
+    """Fits, and how their held-out views are: the table of docs/reconstruction.md. Where the street
+    that was recorded is known, depth is also compared with its surfaces.
+    """
+    rows = []
+    for name, options in fits.items():
+        report = fit_scene(options, progress=progress).report
+        mean, truth = report["mean"], (report.get("truth") or {}).get("median", {})
+        scores = ("psnr", "ssim", "flip", "depth_median_m", "depth_p90_m")
+        rows.append(
+            (
+                name,
+                report["step"],
+                *(mean.get(score) for score in scores),
+                truth.get("median_m"),
+                truth.get("p90_m"),
+                report["seconds"] / 60,
+            )
+        )
+    columns = ("fit", "steps", "PSNR dB", "SSIM", "FLIP", "depth median m", "90 % m",
+               "true depth median m", "90 % m", "minutes")  # fmt: skip
+    return Table("Held-out views", columns, rows)
+
+
+def time_steps(
+    uri: str, scale: float, case: FitCase, progress: bool = True
+) -> tuple[Table, Figures]:
+    """Of `case.steps` steps after the first; where the scene makes more than `case.splats`
+    Gaussians, so many are kept.
+    """
+    scene = open_scene(uri)
+    if not any(frame.image_paths for frame in scene.frames):
+        raise ClimateGSError(
+            f"{scene.source} has no recorded images, so there is nothing to fit to"
+        )
+    scene = _thinned(scene, case.splats)
+    source: ViewSource = recorded_views(scene, scale=scale)
+    for key in source.train:
+        source.load(key)  # as in a long run, where images come from memory
+    return_free_memory()
+    before = status_mib("VmRSS") if RESET_PEAK.is_file() else None
+    if before is not None:
+        RESET_PEAK.write_text("5")
+    started = time.perf_counter()
+    warm_up()
+    trainer = Trainer(scene, source, FitConfig(sh_every=1, densify=NO_GROWTH))
+    for _ in range(UNTIMED):
+        trainer.run_step()
+    warm_up_s, seconds = time.perf_counter() - started, defaultdict(list)
+    for _ in tqdm(range(case.steps), unit="step", disable=not progress):
+        started = time.perf_counter()
+        record = trainer.run_step()
+        seconds["whole step"].append(time.perf_counter() - started)
+        for stage, each in record.stage_s.items():
+            seconds[stage].append(each)
+    peak = None if before is None else status_mib("VmHWM")
+    sizes = sorted({(c.width, c.height) for c in map(source.camera, source.train)})
+    title = f"A step of {len(trainer.splats):,} splats, {len(source.train)} views of " + ", ".join(
+        f"{width}x{height}" for width, height in sizes
+    )
+    rows = [(stage, *spread_row(spread_ms(each))) for stage, each in seconds.items()]
+    note = "" if peak is None else f"resident at most {peak:.0f} MiB, {before:.0f} before training"
+    facts = {
+        "splats": len(trainer.splats),
+        "actors": len(scene.actors),
+        "steps": case.steps,
+        "warm_up_s": warm_up_s,
+        "memory_mib": None if peak is None else {"before": before, "peak": peak},
+    }
+    return Table(title, ("stage", "ms", "min", "p90"), rows, note), facts
+
+
+def _thinned(scene: Scene, splats: int) -> Scene:
+    """The scene with so many splats where it has more, left out evenly from the background."""
+    count = len(scene.background) + sum(len(actor.gaussians) for actor in scene.actors)
+    left = len(scene.background) - max(0, count - splats)
+    if not 0 < left < len(scene.background):
+        return scene
+    kept = torch.linspace(0, len(scene.background) - 1, left, dtype=torch.float64).long()
+    return dataclasses.replace(scene, background=scene.background.select(kept))
