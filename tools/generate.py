@@ -26,7 +26,7 @@ from augment.jobs.generate import (
 from augment.jobs.layout import STATE_FOLDER
 from augment.jobs.status import JobStatus, read_status
 from augment.jobs.store import Store, open_store
-from augment.jobs.times import shares_of
+from augment.jobs.worker import shares_of
 from recipes.job import load_job, load_job_recipes
 
 if TYPE_CHECKING:

@@ -18,10 +18,10 @@ from augment.jobs.layout import variant_name
 from augment.jobs.manifest import lidar_notes
 from augment.jobs.mirror import Links
 from augment.jobs.quality import recipes_to_try
-from augment.jobs.quality_record import resolve_quality_for
+from augment.jobs.quality import resolve_quality_for
 from augment.jobs.render_job import JobResult, RenderJob, run_job
 from augment.jobs.store import open_store
-from augment.jobs.times import shares_of
+from augment.jobs.worker import shares_of
 from augment.plan import make_plan
 from augment.scene import Scene
 from recipes.change import found

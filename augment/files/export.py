@@ -20,11 +20,10 @@ from torch import Tensor
 
 from augment.cameras import Camera
 from augment.errors import OutputError, SceneError
-from augment.files.atomic_folder import replaced_folder
 from augment.files.ply import write_ply, write_splat
 from augment.files.scene_file import document_text, track_entry
 from augment.geometry import multiply_quats, quat_from_rotmat
-from augment.jobs.atomic import output_error, write_atomic
+from augment.jobs.atomic import output_error, replaced_folder, write_atomic
 from augment.jobs.layout import folder_name
 from augment.render.sh import rotate_sh
 from augment.scene import SH_COUNTS, Gaussians, Scene, SemanticClass

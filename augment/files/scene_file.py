@@ -31,7 +31,6 @@ from torch import Tensor
 
 from augment.cameras import Camera, Frame
 from augment.errors import OutputError, SceneError
-from augment.files.atomic_folder import replaced_folder
 from augment.files.scene_schema import (
     FORMAT,
     READABLE,
@@ -52,7 +51,7 @@ from augment.files.scene_schema import (
     take_sky,
 )
 from augment.ground_heights import Ground
-from augment.jobs.atomic import replaced_file
+from augment.jobs.atomic import replaced_file, replaced_folder
 from augment.scene import Actor, ColorWaves, Scene, Track
 from augment.sky import Sky
 from recipes.files import open_file

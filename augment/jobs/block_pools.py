@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import _thread
 import contextlib
+import ctypes
+import logging
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from queue import SimpleQueue
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
+import augment
 from augment.errors import ClimateGSError
 from augment.jobs.block_worker import BlockWorker, Result, Task, WorkSetup
 from augment.jobs.processes import (
@@ -24,7 +28,11 @@ from augment.jobs.processes import (
     sender,
     thread_limits,
 )
+from augment.jobs.store import open_store
 from augment.jobs.worker import Outcome
+from augment.render.buffers import CUDA
+
+# ---- block pools ---------------------------------------------------------------------------------
 
 # ---- pools ---------------------------------------------------------------------------------------
 
@@ -242,3 +250,359 @@ def _listen(connection: Connection, inbox: SimpleQueue, working: threading.Event
         inbox.put(task)
         if task is None and working.is_set():
             _thread.interrupt_main()
+
+
+# ---- A pool of actors on a Ray cluster, each with a scene of its own -----------------------------
+# What is rendered goes straight from the actors to the output; through Ray pass the tasks, and word
+# of every image. Ray is an optional extra, imported only here and only when a pool is made.
+
+# ---- Ray itself, an optional extra, and the cluster: the one there is, or one of this machine ----
+# Imported only here, when a job asks for it.
+
+_OBJECTS_BYTES = 100 << 20  # for objects of Ray's; tasks and results are far smaller
+
+
+def import_ray() -> Any:
+    try:
+        import ray
+        import ray.exceptions
+    except ImportError as error:
+        raise ClimateGSError(
+            f'the executor "ray" needs Ray ({error}): pip install "climategs[ray]"'
+        ) from error
+    return ray
+
+
+def connect(ray: Any, slots: int | None) -> bool:
+    """Connect to a cluster unless this process is. Returns whether it was started here."""
+    if ray.is_initialized():
+        return False
+    address = os.environ.get("RAY_ADDRESS", "")
+    if address.startswith("ray://"):
+        raise ClimateGSError(
+            f"RAY_ADDRESS is {address}: Ray's client protocol is not supported; start the job on a "
+            f"machine of the cluster (`ray job submit`, or RAY_ADDRESS=auto there)"
+        )
+    options: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR}
+    is_ours = address in ("", "local")
+    if is_ours:
+        options |= {
+            "address": "local",
+            "num_cpus": slots or available_cores(),
+            "include_dashboard": False,
+            "object_store_memory": _OBJECTS_BYTES,
+            # Workers import from where this process does, as those of other executors.
+            "runtime_env": {
+                "env_vars": {"PYTHONPATH": os.pathsep.join(p or "." for p in sys.path)}
+            },
+        }
+    with _own_sigterm(), _no_usage_statistics():
+        try:
+            ray.init(**options)
+        except (ConnectionError, RuntimeError, ValueError) as error:
+            where = "start Ray here" if is_ours else f"reach the Ray cluster at {address}"
+            raise ClimateGSError(f"cannot {where}: {last_line(error)}") from error
+    return is_ours
+
+
+@contextlib.contextmanager
+def _own_sigterm() -> Iterator[None]:
+    """Ray sets a handler for SIGTERM when it connects: put back the one there was."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.getsignal(signal.SIGTERM)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+@contextlib.contextmanager
+def _no_usage_statistics() -> Iterator[None]:
+    """What Ray starts inside sends nothing home, unless the user has said that it may."""
+    name = "RAY_USAGE_STATS_ENABLED"
+    was_set = name in os.environ
+    os.environ.setdefault(name, "0")
+    try:
+        yield
+    finally:
+        if not was_set:
+            del os.environ[name]
+
+
+def last_line(error: Exception) -> str:
+    """The end of an error's text, where a remote traceback says what happened."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return lines[-1][:300] if lines else type(error).__name__
+
+
+# ---- ray pool ------------------------------------------------------------------------------------
+
+_STARTS = 3  # in a row that may be lost, with their machines say, before the job ends
+_PATIENCE_S = 60.0  # without a worker, before the log says so
+_THREADS = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+_log = logging.getLogger(__name__)
+
+
+class RayPool:
+    """`slots` actors of one CPU each, as many as the cluster has CPUs if None.
+
+    Where the backend is `cuda` they have a GPU each, and as many CPUs as there are to a GPU, and
+    None is as many as the cluster has GPUs. The others see no GPU.
+
+    They run on the cluster that this process is connected to, else on the one that RAY_ADDRESS
+    names, else on one that is started here and ends with the pool. One that dies is replaced. Where
+    the cluster has no room for all of them, or no longer, those that run do the work of the others.
+
+    Raises:
+        ClimateGSError: Ray is missing, or the cluster cannot be reached. From wait: actors cannot
+            start, or no machine of the cluster has a GPU.
+    """
+
+    def __init__(self, setup: WorkSetup, tick: Tick, slots: int | None) -> None:
+        self._ray = import_ray()
+        self._setup, self._tick = setup, tick
+        on_gpu = setup.backend == CUDA
+        self._is_ours = connect(self._ray, None if on_gpu else slots)
+        self._cpus, self._gpus = (_cpus_of_a_gpu(self._ray), 1) if on_gpu else (1, 0)
+        of_all = self._ray.cluster_resources().get("GPU" if on_gpu else "CPU", 1)
+        self.slots = slots or max(1, int(of_all))
+        self._workers: list[_ActorHandle | None] = [None] * self.slots
+        self._given: dict[int, Task] = {}  # by slot, for want of a worker that is ready
+        self._lost_starts = 0
+        self._quiet_since = time.monotonic()
+        self._warn_of_local_output()
+
+    def give(self, slot: int, task: Task) -> None:
+        self._given[slot] = task
+        if self._workers[slot] is None:
+            self._workers[slot] = self._start()
+        self._dispatch()
+
+    def wait(self, timeout_s: float) -> list[Event]:
+        deadline = time.monotonic() + timeout_s
+        while True:
+            self._dispatch()
+            sources = {w.source: slot for slot, w in enumerate(self._workers) if w and w.source}
+            if not sources:
+                return []
+            left = deadline - time.monotonic()
+            for source in self._ray.wait(list(sources), timeout=max(0.0, left))[0]:
+                event = self._read(sources[source])
+                if event is not None:
+                    return [event]
+            if left <= 0:
+                self._complain()
+                return []
+
+    def close(self) -> None:
+        workers = [worker for worker in self._workers if worker is not None]
+        self._workers, self._given = [None] * self.slots, {}
+        if not self._ray.is_initialized():
+            return
+        try:
+            self._finish([worker for worker in workers if worker.stream is not None])
+        finally:
+            for worker in workers:
+                self._ray.kill(worker.actor)
+            if self._is_ours:
+                self._ray.shutdown()
+
+    def _start(self) -> _ActorHandle:
+        options = {
+            "num_cpus": self._cpus,
+            "num_gpus": self._gpus,
+            "max_restarts": 0,  # the pool sees every death, and the block is tried alone
+            "max_task_retries": 0,
+            "max_concurrency": 2,  # a stop comes in beside the work
+            "scheduling_strategy": "SPREAD",
+            "runtime_env": {"env_vars": self._environment()},
+        }
+        actor = self._ray.remote(_Actor).options(**options).remote(self._setup, self._cpus)
+        return _ActorHandle(actor, actor.version.remote())
+
+    def _environment(self) -> dict[str, str]:
+        limits: dict[str, str] = dict.fromkeys(_THREADS, str(self._cpus))
+        return limits if self._gpus else {**limits, "CUDA_VISIBLE_DEVICES": ""}
+
+    def _dispatch(self) -> None:
+        """Send tasks to workers that are ready; a slot whose own is not swaps with an idle one."""
+        for slot, task in list(self._given.items()):
+            if not self._is_idle(slot):
+                others = (s for s in range(self.slots) if s not in self._given and self._is_idle(s))
+                other = next(others, None)
+                if other is None:
+                    continue
+                workers = self._workers
+                workers[slot], workers[other] = workers[other], workers[slot]
+            worker = self._workers[slot]
+            assert worker is not None
+            worker.stream = worker.actor.do.remote(task)
+            del self._given[slot]
+
+    def _is_idle(self, slot: int) -> bool:
+        worker = self._workers[slot]
+        return worker is not None and worker.starting is None and worker.stream is None
+
+    def _read(self, slot: int) -> Event | None:
+        worker = self._workers[slot]
+        assert worker is not None
+        try:
+            if worker.starting is not None:
+                self._welcome(worker, self._ray.get(worker.starting))
+                return None
+            said = self._ray.get(next(worker.stream))
+        except StopIteration:
+            said = None
+        except self._ray.exceptions.RayError as error:
+            self._ray.kill(worker.actor)
+            self._workers[slot] = None
+            if worker.starting is None:
+                return Lost(slot, _ending(error))
+            self._failed_start(error)
+            self._workers[slot] = self._start()
+            return None
+        if isinstance(said, Outcome):
+            self._tick(slot, said)
+            return None
+        worker.stream = None
+        if said is None:
+            self._ray.kill(worker.actor)
+            self._workers[slot] = None
+            return Lost(slot, "ended in the midst of its work")
+        return Finished(slot, said)
+
+    def _welcome(self, worker: _ActorHandle, version: str) -> None:
+        if version != augment.__version__:
+            raise ClimateGSError(
+                f"a machine of the Ray cluster has climategs {version}, this one "
+                f"{augment.__version__}: install the same everywhere"
+            )
+        worker.starting = None
+        self._lost_starts = 0
+
+    def _failed_start(self, error: Exception) -> None:
+        """Raise, unless it may be that only a machine was lost."""
+        self._lost_starts += 1
+        failed = getattr(error, "actor_init_failed", False)
+        failed = failed or isinstance(error, self._ray.exceptions.RuntimeEnvSetupError)
+        if failed or self._lost_starts >= _STARTS:
+            raise ClimateGSError(
+                f"a Ray actor failed while starting: {last_line(error)}. Every machine of the "
+                f"cluster needs climategs, and whatever opens the scenes, installed in the same "
+                f"version; if memory ran out, use fewer workers"
+            ) from error
+
+    def _finish(self, busy: list[_ActorHandle]) -> None:
+        """Let actors finish the images at hand."""
+        for worker in busy:
+            worker.actor.stop.remote()
+        deadline = time.monotonic() + STOP_S
+        for worker in busy:
+            with contextlib.suppress(self._ray.exceptions.RayError, StopIteration):
+                while (left := deadline - time.monotonic()) > 0:
+                    if self._ray.wait([worker.stream], timeout=left)[0]:
+                        self._ray.get(next(worker.stream))
+
+    def _complain(self) -> None:
+        """Say so when nobody has been at work for long."""
+        now = time.monotonic()
+        if not self._given or any(worker and worker.stream for worker in self._workers):
+            self._quiet_since = now
+        elif now - self._quiet_since > _PATIENCE_S:
+            self._quiet_since = now
+            _log.warning("no CPU of the Ray cluster is free for a worker; waiting for one")
+
+    def _warn_of_local_output(self) -> None:
+        nodes = [node for node in self._ray.nodes() if node["Alive"]]
+        if len(nodes) > 1 and open_store(self._setup.store_uri).local_dir is not None:
+            _log.warning(
+                "the Ray cluster has %d machines and the output is a folder, %s: it has to be a "
+                "shared one, the same on all of them; else write to an object store (s3://...)",
+                len(nodes),
+                self._setup.store_uri,
+            )
+
+
+@dataclass
+class _ActorHandle:
+    """An actor as the pool sees it. starting: its first answer, until that has come. stream: what
+    it says about the task that it is at.
+    """
+
+    actor: Any
+    starting: Any
+    stream: Any = None
+
+    @property
+    def source(self) -> Any:
+        """What to wait for, if anything."""
+        return self.stream if self.starting is None else self.starting
+
+
+class _Actor:
+    """The worker's own side, in a process somewhere on the cluster.
+
+    Tasks are done in a thread of its own, which can be interrupted: Ray's main thread cannot.
+    """
+
+    def __init__(self, setup: WorkSetup, threads: int) -> None:
+        import cv2
+        import torch
+
+        torch.set_num_threads(threads)
+        cv2.setNumThreads(1)
+        self._inbox: SimpleQueue[Task] = SimpleQueue()
+        self._outbox: SimpleQueue[Outcome | Result | None] = SimpleQueue()
+        self._worker_state = BlockWorker(setup, self._outbox.put)
+        self._thread = threading.Thread(target=self._work, daemon=True)
+        self._thread.start()
+
+    def version(self) -> str:
+        return augment.__version__
+
+    def do(self, task: Task) -> Iterator[Outcome | Result]:
+        """Images as they are finished, then the result; that is missing where it was stopped."""
+        self._inbox.put(task)
+        while (said := self._outbox.get()) is not None:
+            yield said
+            if not isinstance(said, Outcome):
+                return
+
+    def stop(self) -> None:
+        """As Ctrl-C: finish the images at hand, let go of the block, and do no more."""
+        thread = ctypes.c_ulong(self._thread.ident or 0)
+        ctypes.pythonapi.PyThreadState_SetAsyncExc(thread, ctypes.py_object(KeyboardInterrupt))
+
+    def _work(self) -> None:
+        try:
+            while True:
+                self._outbox.put(self._worker_state.do(self._inbox.get()))
+        except KeyboardInterrupt:
+            pass
+        finally:
+            self._outbox.put(None)
+
+
+def _cpus_of_a_gpu(ray: Any) -> int:
+    """How many CPUs come to a GPU on the machine that has the fewest."""
+    machines = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+    shares = [int(m.get("CPU", 0) / m["GPU"]) for m in machines if m.get("GPU", 0)]
+    if not shares:
+        raise ClimateGSError(
+            "backend 'cuda' on Ray: no machine of the cluster has a GPU that Ray knows of"
+        )
+    return max(1, min(shares))
+
+
+def _ending(error: Exception) -> str:
+    """How an actor ended, after "the worker ..."; Ray's account is long, and guesses."""
+    text = str(error)
+    if "OutOfMemoryError" in type(error).__name__ or "low on memory" in text:
+        return "was ended by Ray because memory ran out"
+    if "worker process has died" in text:
+        return "was killed or crashed, or memory ran out"
+    if "Unavailable" in type(error).__name__ or ("node" in text and "died" in text):
+        return "was lost, perhaps with its machine"
+    return f"was lost ({type(error).__name__}: {last_line(error)})"

@@ -23,14 +23,12 @@ from augment.jobs.atomic import remove_temporaries
 from augment.jobs.blocks import Block, SceneRecord
 from augment.jobs.claims import CLAIMS_FOLDER, hold, try_claim
 from augment.jobs.layout import PATH_KINDS, STATE_FOLDER, folder_name, item_paths, variant_folder
-from augment.jobs.manifest import OK, PARTS, Part, list_parts, publish_part, read_manifest
+from augment.jobs.manifest import OK, PARTS, Identity, Part, list_parts, publish_part, read_manifest
 from augment.jobs.processes import file_lock
-from augment.jobs.progress_log import Identity
-from augment.jobs.quality_record import FOLDER as QUALITY
+from augment.jobs.quality import FOLDER as QUALITY
 from augment.jobs.render_job import RenderJob, SceneLoader, run_job
 from augment.jobs.store import LocalStore, Store, StoredFileMissing, open_store
-from augment.jobs.times import WorkTimes
-from augment.jobs.worker import Outcome, Renderer, describe
+from augment.jobs.worker import Outcome, Renderer, WorkTimes, describe
 from augment.scene import Scene
 from recipes.schema import Recipe
 
@@ -347,7 +345,7 @@ class BlockWorker:
         return SceneRecord.of(scene, task.uri, time.perf_counter() - started)
 
     def _settle(self, task: ResolveTask, recipe: Recipe) -> Recipe:
-        from augment.jobs.quality_record import resolve_quality_for
+        from augment.jobs.quality import resolve_quality_for
 
         scene, setup = self._scene_of(task.uri, task.name), self._setup
         try:

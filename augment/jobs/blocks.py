@@ -18,8 +18,7 @@ from augment.cameras import scaled_size
 from augment.errors import ClimateGSError, OutputError, SceneError
 from augment.jobs.files import RECORDED, SceneIndex, has_lidar, select_frames
 from augment.jobs.layout import STATE_FOLDER, folder_name, variant_name
-from augment.jobs.manifest import Pictured
-from augment.jobs.progress_log import Identity
+from augment.jobs.manifest import Identity, Pictured
 from augment.jobs.store import Store
 from augment.scene import Scene
 from recipes.job import JobRecipes, JobScene

@@ -42,6 +42,7 @@ from augment.jobs.layout import MANIFEST, PATH_KINDS, STATE_FOLDER, variant_name
 from augment.jobs.manifest import (
     FAILED,
     OK,
+    Identity,
     compact,
     image_row,
     lidar_notes,
@@ -51,11 +52,10 @@ from augment.jobs.manifest import (
     read_finished,
     rows_to_table,
 )
-from augment.jobs.progress_log import Identity
 from augment.jobs.render_job import RenderJob, SceneLoader, run_job
 from augment.jobs.scheduler import Scheduler
 from augment.jobs.store import Store, StoredFileMissing, open_store
-from augment.jobs.times import WORKERS
+from augment.jobs.worker import WORKERS
 from augment.render.buffers import AUTO, CUDA
 from augment.scene import Scene
 from recipes.job import JobRecipes, JobScene
@@ -121,7 +121,7 @@ def _wanted(job: GenerateJob, found: Found) -> _Wanted:
 
 def _recorded(store: Store, wanted: _Wanted, backend: str) -> tuple[Choices, _Wanted]:
     """What the output knows already, and what is left to choose."""
-    from augment.jobs.quality_record import Question, recorded
+    from augment.jobs.quality import Question, recorded
 
     questions = [
         Question(recipe, record.name, record.source, RECORDED, backend)
@@ -343,7 +343,7 @@ def make_pool(job: GenerateJob, tick: Tick) -> WorkerPool:
     if job.executor == "serial":
         return SerialPool(job.setup, tick)
     if job.executor == "ray":
-        from augment.jobs.ray_pool import RayPool
+        from augment.jobs.block_pools import RayPool
 
         return RayPool(job.setup, tick, job.workers)
     from augment.jobs.block_pools import ProcessPool

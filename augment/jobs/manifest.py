@@ -11,7 +11,7 @@ import json
 import math
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,7 +23,6 @@ import pyarrow.parquet as pq
 from augment.errors import OutputError
 from augment.jobs.atomic import write_atomic
 from augment.jobs.layout import MANIFEST, PATH_KINDS, STATE_FOLDER, variant_name
-from augment.jobs.progress_log import Identity
 from augment.jobs.store import Store, StoredFileMissing
 from augment.jobs.tables import read_table
 from recipes.change import found
@@ -482,6 +481,43 @@ def _worth(part: Part) -> tuple[bool, float, str]:
 
 
 # ---- A row of the manifest: one image, finished or failed ----------------------------------------
+
+
+@dataclass(frozen=True)
+class Identity:
+    """What must agree for two runs to write into the same variant folder."""
+
+    source: str
+    recipe_hash: str
+    trajectory: str
+    version: str
+    backend: str
+
+    @staticmethod
+    def of_row(row: dict[str, Any]) -> Identity:
+        return Identity(**{name: row[name] for name in Identity.__dataclass_fields__})
+
+    def check(self, found: Identity, where: str) -> None:
+        """Raise OutputError where the folder was written by something else."""
+        names = {
+            "source": "scene",
+            "recipe_hash": "recipe hash",
+            "trajectory": "camera path",
+            "version": "package version",
+            "backend": "backend",
+        }
+        mine, theirs = asdict(self), asdict(found)
+        different = [
+            f"{label} there {theirs[name]!r}, here {mine[name]!r}"
+            for name, label in names.items()
+            if mine[name] != theirs[name]
+        ]
+        if different:
+            raise OutputError(
+                f"{where} already holds images of another kind: {'; '.join(different)}. Give the "
+                f"recipe another name, choose another output folder, or ask for the variant to be "
+                f"overwritten (render --overwrite, overwrite=True)"
+            )
 
 
 class Pictured(NamedTuple):

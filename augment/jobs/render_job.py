@@ -25,8 +25,7 @@ from augment.jobs.backends import choose_backend
 from augment.jobs.files import SceneIndex, frames_to_json, select_frames, trajectory_id
 from augment.jobs.job_state import BoxCache, JobState, finish, needs_finish
 from augment.jobs.layout import MANIFEST, STATE_FOLDER, folder_name, variant_name
-from augment.jobs.manifest import FAILED, OK
-from augment.jobs.pools import run_in_processes, run_serially
+from augment.jobs.manifest import FAILED, OK, Identity
 from augment.jobs.prepare import (
     StoredBed,
     StoredMaps,
@@ -36,11 +35,17 @@ from augment.jobs.prepare import (
     style_to_apply,
 )
 from augment.jobs.processes import OutputLock, share_scene
-from augment.jobs.progress_log import Identity
 from augment.jobs.store import open_store
-from augment.jobs.times import WORKERS
 from augment.jobs.view_files import uses_boxes
-from augment.jobs.worker import Chunk, Outcome, Renderer, Setup
+from augment.jobs.worker import (
+    WORKERS,
+    Chunk,
+    Outcome,
+    Renderer,
+    Setup,
+    run_in_processes,
+    run_serially,
+)
 from augment.scene import Scene
 from recipes.files import read_files, with_digest
 from recipes.load import dump_recipe
@@ -324,7 +329,7 @@ class _Run:
         """The recipe with the settings that its quality chooses here, or has chosen before."""
         if not recipe.quality.is_open:
             return recipe
-        from augment.jobs.quality_record import resolve_quality_for
+        from augment.jobs.quality import resolve_quality_for
 
         started = time.perf_counter()
         assert self.scene is not None

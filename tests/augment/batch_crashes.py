@@ -25,7 +25,7 @@ from fork_server import keep_in_forks, start_fork_server
 from augment.effects.snow import support as beds
 from augment.jobs.atomic import TEMPORARY_SUFFIX
 from augment.jobs.layout import STATE_FOLDER
-from augment.jobs.progress_log import ProgressLog
+from augment.jobs.job_state import ProgressLog
 from augment.jobs.render_job import RenderJob, run_job
 from recipes.weather import Flood, Snow
 
@@ -34,7 +34,7 @@ SYNC_POINTS = ("fsync", "replace", "unlink", "rename", "rmdir")
 
 
 def main(folder: Path) -> None:
-    start_fork_server("batch_scenes", "augment.jobs.pools")
+    start_fork_server("batch_scenes", "augment.jobs.worker")
     keep_in_forks()
     beds.place_snow_support = lambda *_, **__: make_bed(1.0)
     for warm in (job(folder / "warm"), snowy_job(folder / "warm-snow")):

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from augment.files.atomic_folder import replaced_folder
+from augment.jobs.atomic import replaced_folder
 from augment.jobs import atomic
 from augment.jobs.atomic import TEMPORARY_SUFFIX, remove_temporaries, replaced_file, write_atomic
 from augment.jobs.mirror_files import copy_file

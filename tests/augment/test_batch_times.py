@@ -11,7 +11,7 @@ from pending_views import Gpu
 
 from augment.jobs.files import encode_image
 from augment.jobs.render_job import RenderJob, run_job
-from augment.jobs.times import Shares, WorkTimes, shares_of
+from augment.jobs.worker import Shares, WorkTimes, shares_of
 
 # 10 s of one worker with two writing threads.
 SECONDS = {"workers": 10.0, "renderers": 10.0, "writers": 20.0, "render": 9.0, "held": 0.5}

@@ -19,7 +19,7 @@ from s3_server import s3_server
 from augment.errors import OutputError
 from augment.jobs import claims as remote_claims
 from augment.jobs.claims import CLAIMS_FOLDER, ClaimTimes, try_claim, try_lock
-from augment.jobs.remote_store import Patience, RemoteStore
+from augment.jobs.store import Patience, RemoteStore
 from augment.jobs.store import open_store
 
 OFTEN = ClaimTimes(renewal_s=0.05, lifetime_s=60.0)

@@ -12,7 +12,7 @@ from augment.errors import GpuLost, OutputError
 from augment.jobs.backends import renders_on_gpu
 from augment.jobs.generate import GenerateJob, make_pool, plan_job, run_generate
 from augment.jobs.processes import available_cores
-from augment.jobs.times import shares_of
+from augment.jobs.worker import shares_of
 
 SCENES = ["fake:a?frames=2"]
 

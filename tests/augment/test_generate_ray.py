@@ -17,7 +17,7 @@ from generate_jobs import leftovers, make_job, outputs
 from augment.cameras import Camera
 from augment.errors import ClimateGSError
 from augment.jobs.generate import run_generate
-from augment.jobs.ray_pool import _cpus_of_a_gpu
+from augment.jobs.block_pools import _cpus_of_a_gpu
 from augment.scene import Scene
 from recipes.schema import Recipe
 

@@ -8,7 +8,7 @@ import pytest
 
 from augment.errors import OutputError
 from augment.jobs.block_worker import VARIANTS, enter_variant
-from augment.jobs.progress_log import Identity
+from augment.jobs.manifest import Identity
 from augment.jobs.store import open_store
 
 FOG = Identity("fake:street", "0123456789abcdef", "recorded", "0.1.0", "auto")

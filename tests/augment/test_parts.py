@@ -29,7 +29,7 @@ from augment.jobs.manifest import (
     read_finished,
     rows_to_table,
 )
-from augment.jobs.progress_log import Identity
+from augment.jobs.manifest import Identity
 from augment.jobs.store import Store, open_store
 
 RECIPE = make_recipe()

@@ -15,7 +15,7 @@ from batch_scenes import FakeView, make_camera, open_fake
 from generate_jobs import make_job, make_recipes
 
 from augment.errors import OutputError, SceneError
-from augment.jobs import quality_record as record
+from augment.jobs import quality as record
 from augment.jobs.generate import plan_job, run_generate
 from augment.jobs.manifest import read_manifest
 from augment.jobs.quality import (
@@ -29,7 +29,7 @@ from augment.jobs.quality import (
     resolved_recipe,
     upsampled,
 )
-from augment.jobs.quality_record import Question, recorded, resolve_quality_once
+from augment.jobs.quality import Question, recorded, resolve_quality_once
 from augment.jobs.render_job import RenderJob, run_job
 from augment.jobs.store import open_store
 from augment.metrics.image import flip

@@ -10,7 +10,7 @@ import pytest
 from s3_server import s3_server
 
 from augment.errors import OutputError
-from augment.jobs.remote_store import Patience, RemoteStore, advice, is_permanent
+from augment.jobs.store import Patience, RemoteStore, advice, is_permanent
 from augment.jobs.store import StoredFileMissing, open_store
 
 BIG = b"0123456789" * 1_100_000  # two parts of an upload
