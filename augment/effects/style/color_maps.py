@@ -180,6 +180,7 @@ def _ramp(value: np.ndarray, none: float, full: float) -> np.ndarray:
 
 
 BLOCKS = 4  # pieces of work that a thread takes at a time
+_QUADS = 256  # of four colours, a program on a GPU
 
 
 def style_gaussians(
@@ -245,13 +246,26 @@ def _on_gpu(
     classes: Tensor | None,
     folded: Float[Tensor, "C 13"],
 ) -> Float[Tensor, "N K 3"]:
-    from augment.effects.style import cuda_sh
+    from augment.effects.style import cuda_sh_kernels
 
     source = runtime.resident(sh)
     target = torch.empty_like(source) if out is None else out
     if target.device != source.device:
         raise ValueError(f"out must lie on {source.device}, as what is mapped; got {target.device}")
-    cuda_sh.map_sh(source, target.detach(), classes, folded)
+    runtime.launch(
+        cuda_sh_kernels.map_sh,
+        (-(-sh.numel() // (12 * _QUADS)),),
+        source,
+        target.detach(),
+        sh.numel(),
+        None if classes is None else runtime.resident(classes),
+        runtime.upload(folded),
+        float(sh_layout.BLACK),
+        FUNCTIONS=sh.shape[1],
+        BY_CLASS=classes is not None,
+        BLOCK=_QUADS,
+        num_warps=4,
+    )
     return target
 
 
