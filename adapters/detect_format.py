@@ -79,7 +79,7 @@ def _nuscenes(folder: Path, _query: dict[str, str]) -> _Found:
 
 def _kitti(folder: Path, _query: dict[str, str]) -> _Found:
     """A drive with the calibration beside it, in the folder of its date; or the folder itself."""
-    from adapters.kitti.layout import VELODYNE, kitti_root
+    from adapters.kitti.files import VELODYNE, kitti_root
 
     if not (folder / VELODYNE).is_dir():
         within = r"((training|testing)/)?"
@@ -136,11 +136,7 @@ class Signature:
 
 
 def recognised(path: Path) -> str | None:
-    """The scheme of what lies at a path; None for what is not known.
-
-    Raises:
-        AdapterError: it cannot be read.
-    """
+    """The scheme of what lies at a path; None for what is not known."""
     signatures = FILES if path.is_file() else FOLDERS
     try:
         return next((s.scheme for s in signatures if s.is_here(path)), None)

@@ -28,8 +28,7 @@ _UPRIGHT = 0.4  # largest upward part of an upright surface's unit normal
 def fill_walls(points: PointSet, edge_m: np.ndarray, surfels: Surfels) -> PointSet:
     """The new points only, on walls, fences and boards, or without classes on any upright surface.
 
-    edge_m: float32 [N], distance that the points were thinned to. surfels: of the points.
-    """
+    edge_m: float32 [N], distance that the points were thinned to. surfels: of the points."""
     wall = np.isin(points.semantic, (Class.BUILDING, Class.BARRIER, Class.SIGN, Class.UNKNOWN))
     wall &= np.abs(surfels.normals[:, 2]) < _UPRIGHT
     some, edges, classes = points.points[wall], edge_m[wall], points.semantic[wall]
@@ -94,8 +93,7 @@ _WIDEST_OTHERWISE_M = 0.25
 def bridge_gaps(points: PointSet, edge_m: np.ndarray, surfels: Surfels) -> PointSet:
     """The new points only.
 
-    edge_m: float32 [N], distance that the points were thinned to. surfels: of the points.
-    """
+    edge_m: float32 [N], distance that the points were thinned to. surfels: of the points."""
     widest = np.full(64, _WIDEST_OTHERWISE_M, np.float32)
     for semantic, width in _WIDEST_M.items():
         widest[semantic] = width

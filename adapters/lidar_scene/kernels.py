@@ -231,8 +231,7 @@ def observe(
     depth [h, w]: z-buffer of all surfaces. cover [h, w]: z of moving boxes, in front of which lies
     nothing of them; surfels behind are hidden. levels [L, H, W, 3] uint8: the image halved again
     and again, level_sizes [L, 2] their rows and columns. fx.. are of the z-buffer. Updated are
-    scores [N, KEPT], colours [N, KEPT, 3] and cameras [N, KEPT].
-    """
+    scores [N, KEPT], colours [N, KEPT, 3] and cameras [N, KEPT]."""
     height, width = depth.shape
     p, n = np.empty(3), np.empty(3)
     for i in range(len(centres)):
@@ -301,8 +300,7 @@ def blended_colours(scores, colours, cameras, keep, power):  # pragma: no cover 
     """Per surfel and camera the median, channel by channel, of observations whose score is at least
     `keep` of that camera's best; cameras are averaged with weights (best score)^power.
 
-    Returns float32 [N, 3] in [0, 1] and seen, bool [N].
-    """
+    Returns float32 [N, 3] in [0, 1] and seen, bool [N]."""
     count, slots = scores.shape
     out = np.zeros((count, 3), np.float32)
     seen = np.zeros(count, np.bool_)

@@ -6,44 +6,108 @@ from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 import torch
 
-from adapters.lidar_scene.actor_motion import Motion, indices_between, inside_box
+from adapters.raw_drive import BoxSample, Sweep
 from augment.geometry import quat_from_rotmat, rigid, rotmat_from_quat
 from augment.scene import Track
 from augment.semantics import SemanticClass
 
-# ---- Boxes of moving objects over time, joined into tracks ---------------------------------------
-
 _MERGE_NS = 1_000_000  # two boxes of one object this close in time are one sample
+# A moving object's returns stray from its box by timing and labelling: within this of the box a
+# return is not static world, and within the smaller margin it is the object's own surface.
+HALO_M = 0.35
+SKIN_M = 0.1
+# Without classes, returns this near the bottom of a box may be road or tyre: neither gets them.
+FLOOR_M = 0.15
+_FLAT = np.array(
+    [SemanticClass.ROAD, SemanticClass.LANE_MARKING, SemanticClass.SIDEWALK, SemanticClass.TERRAIN],
+    dtype=np.int16,
+)
 
 
 @dataclass(frozen=True, eq=False)
-class BoxSample:
-    """One box of a moving object: where it stood at one moment.
+class Motion:
+    """A track as arrays, for points carried along it, each at its own time: `Track.pose_at`,
+    compiled. knots_ns: int64 [T]. quats: float64 [T, 4] wxyz. centres: float64 [T, 3]."""
 
-    object_id: the dataset's name of the object. sibling_id: the name that another sensor's box of
-    the same object goes by, or None. frame: the dataset's frame number. world_from_box: float64
-    [4, 4] in the scene's world, box x forward. size_m: length, width, height.
-    """
+    knots_ns: np.ndarray
+    quats: np.ndarray
+    centres: np.ndarray
+    hold_ns: int
 
-    object_id: str
-    sibling_id: str | None
-    label: str
-    frame: int
-    timestamp_ns: int
-    world_from_box: np.ndarray
-    size_m: np.ndarray
+    @staticmethod
+    def of(track: Track) -> Motion:
+        poses = track.world_from_actor
+        return Motion(
+            knots_ns=track.timestamps_ns.numpy(),
+            quats=quat_from_rotmat(poses[:, :3, :3]).numpy(),
+            centres=np.ascontiguousarray(poses[:, :3, 3].numpy()),
+            hold_ns=track.hold_ns,
+        )
+
+    def exists_at(self, timestamps_ns: np.ndarray) -> np.ndarray:
+        """Whether the actor is there at each time, bool [N]."""
+        first, last = self.knots_ns[0] - self.hold_ns, self.knots_ns[-1] + self.hold_ns
+        return (timestamps_ns >= first) & (timestamps_ns <= last)
+
+    def pose_at(self, timestamp_ns: int) -> np.ndarray | None:
+        """world_from_actor, float64 [4, 4], or None where the actor does not exist."""
+        if not self.exists_at(np.array([timestamp_ns]))[0]:
+            return None
+        pose = np.eye(4)
+        _pose(self.knots_ns, self.quats, self.centres, timestamp_ns, pose)
+        return pose
+
+    def into_actor(self, points: np.ndarray, timestamps_ns: np.ndarray) -> np.ndarray:
+        """World points [N, 3], each seen at its own time, in the actor's frame; float64 [N, 3].
+
+        Callers leave out times at which the actor does not exist.
+        """
+        out = np.empty((len(points), 3))
+        _into(self.knots_ns, self.quats, self.centres, points, timestamps_ns, out)
+        return out
+
+    def near(self, points: np.ndarray, timestamps_ns: np.ndarray, size_m: np.ndarray) -> np.ndarray:
+        """Indices of the world points [N, 3] that could lie in the actor's box of that size, or
+        within HALO_M of it, at their own times; int64, ascending."""
+        if len(points) == 0:
+            return np.zeros(0, dtype=np.int64)
+        low, high = self.span(int(timestamps_ns.min()), int(timestamps_ns.max()))
+        reach = float(np.linalg.norm(size_m)) / 2 + HALO_M
+        found = indices_between(points, low - reach, high + reach)
+        return found[self.exists_at(timestamps_ns[found])]
+
+    def span(self, first_ns: int, last_ns: int) -> tuple[np.ndarray, np.ndarray]:
+        """Lowest and highest coordinates of the centre over a time span, two float64 [3]."""
+        # Every pose in the span lies between the knots just before and just after it.
+        low = max(0, int(np.searchsorted(self.knots_ns, first_ns, side="right")) - 1)
+        high = min(len(self.knots_ns) - 1, int(np.searchsorted(self.knots_ns, last_ns)))
+        centres = self.centres[low : high + 1]
+        return centres.min(axis=0), centres.max(axis=0)
+
+
+def inside_box(local: np.ndarray, size_m: np.ndarray, margin_m: float) -> np.ndarray:
+    """Whether points in the box's frame lie in the box grown by a margin on all sides, bool [N]."""
+    return (np.abs(local) <= size_m / 2 + margin_m).all(axis=1)
+
+
+def indices_between(points: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Indices of the points [N, 3] strictly inside an axis-aligned box, int64, ascending."""
+    # One column first: it leaves few points for the rest, and this runs once a box and sweep.
+    x = points[:, 0]
+    index = np.flatnonzero((x > low[0]) & (x < high[0]))
+    rest = points[index, 1:]
+    return index[((rest > low[1:]) & (rest < high[1:])).all(axis=1)]
 
 
 @dataclass(frozen=True, eq=False)
 class ObjectTrack:
-    """One moving object. member_ids: every name its boxes go by, its track_id first. motion: the
-    track again, for moving points."""
+    """One moving object. motion: the track again, for moving points."""
 
     track_id: str
-    member_ids: tuple[str, ...]
     label: str
     track: Track
     motion: Motion
@@ -55,8 +119,7 @@ def join_tracks(samples: Sequence[BoxSample]) -> tuple[ObjectTrack, ...]:
 
     The boxes that one frame holds of an object (one a sensor, each at its sensor's own moment)
     become one sample at the mean time with the mean pose: on a straight path at constant speed
-    that lies on the path, and it keeps centimetres of disagreement from becoming jerks.
-    """
+    that lies on the path, and it keeps centimetres of disagreement from becoming jerks."""
     names = _unite(samples)
     groups: dict[str, list[BoxSample]] = defaultdict(list)
     for sample in samples:
@@ -87,26 +150,17 @@ def _join(name: str, group: list[BoxSample]) -> ObjectTrack:
     by_frame: dict[int, list[BoxSample]] = defaultdict(list)
     for sample in group:
         by_frame[sample.frame].append(sample)
-    merged = sorted(
-        (_mean_pose(boxes) for boxes in by_frame.values()), key=lambda sample: sample[0]
-    )
+    merged = sorted(map(_mean_pose, by_frame.values()), key=lambda sample: sample[0])
     kept = [merged[0]]
     for time, pose in merged[1:]:
         if time - kept[-1][0] >= _MERGE_NS:
             kept.append((time, pose))
-    members = dict.fromkeys([name, *(s.object_id for s in group)])
     track = Track(
         torch.tensor([time for time, _ in kept], dtype=torch.int64),
         torch.stack([pose for _, pose in kept]),
     )
-    return ObjectTrack(
-        track_id=name,
-        member_ids=tuple(members),
-        label=group[0].label,
-        track=track,
-        motion=Motion.of(track),
-        size_m=np.mean([s.size_m for s in group], axis=0),
-    )
+    size_m = np.mean([s.size_m for s in group], axis=0)
+    return ObjectTrack(name, group[0].label, track, Motion.of(track), size_m)
 
 
 def _mean_pose(boxes: list[BoxSample]) -> tuple[int, torch.Tensor]:
@@ -116,35 +170,6 @@ def _mean_pose(boxes: list[BoxSample]) -> tuple[int, torch.Tensor]:
     quats = quats * torch.where((quats * quats[:1]).sum(1, keepdim=True) < 0, -1.0, 1.0)
     rotation = rotmat_from_quat(quats.mean(0))
     return time + boxes[0].timestamp_ns, rigid(rotation, poses[:, :3, 3].mean(0))
-
-
-# ---- split ---------------------------------------------------------------------------------------
-
-# A moving object's returns stray from its box by timing and labelling: within this of the box a
-# return is not static world, and within the smaller margin it is the object's own surface.
-HALO_M = 0.35
-SKIN_M = 0.1
-# Without classes, returns this near the bottom of a box may be road or tyre: neither gets them.
-FLOOR_M = 0.15
-_FLAT = np.array(
-    [SemanticClass.ROAD, SemanticClass.LANE_MARKING, SemanticClass.SIDEWALK, SemanticClass.TERRAIN],
-    dtype=np.int16,
-)
-
-
-@dataclass(frozen=True, eq=False)
-class Sweep:
-    """The usable returns of one frame in the scene's world.
-
-    points: float32 [N, 3]. timestamps_ns: int64 [N]. semantic: int16 [N], SemanticClass values.
-    """
-
-    points: np.ndarray
-    timestamps_ns: np.ndarray
-    semantic: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.points)
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,6 +184,8 @@ class PointSet:
 
     @staticmethod
     def join(parts: Sequence[PointSet]) -> PointSet:
+        if not parts:
+            return PointSet(np.zeros((0, 3), np.float32), np.zeros(0, np.int16))
         return PointSet(
             np.concatenate([p.points for p in parts]), np.concatenate([p.semantic for p in parts])
         )
@@ -175,14 +202,13 @@ def split_sweeps(
     """The static world, and one set a track in the actor's frame.
 
     Each return is compared with every box as it stood at the return's own time. Ground inside a
-    box is ground; where classes are unknown the lowest FLOOR_M of a box is given to nobody.
-    """
-    static_points, static_semantic = [], []
-    actors: list[tuple[list[np.ndarray], list[np.ndarray]]] = [([], []) for _ in tracks]
+    box is ground; where classes are unknown the lowest FLOOR_M of a box is given to nobody."""
+    static: list[PointSet] = []
+    actors: list[list[PointSet]] = [[] for _ in tracks]
     for sweep in sweeps:
-        static = np.ones(len(sweep), dtype=bool)
-        for track, (points, semantic) in zip(tracks, actors, strict=True):
-            near = _candidates(sweep, track)
+        is_static = np.ones(len(sweep), dtype=bool)
+        for track, parts in zip(tracks, actors, strict=True):
+            near = track.motion.near(sweep.points, sweep.timestamps_ns, track.size_m)
             local = track.motion.into_actor(sweep.points[near], sweep.timestamps_ns[near])
             classes = sweep.semantic[near]
             ground = is_flat(classes)
@@ -190,27 +216,64 @@ def split_sweeps(
             low = local[:, 2] < FLOOR_M - track.size_m[2] / 2
             own = inside_box(local, track.size_m, SKIN_M) & ~ground
             own &= ~(low & (classes == SemanticClass.UNKNOWN))
-            static[near[halo]] = False
-            points.append(local[own].astype(np.float32))
-            semantic.append(classes[own])
-        static_points.append(sweep.points[static])
-        static_semantic.append(sweep.semantic[static])
-    background = _concatenate(static_points, static_semantic)
-    return background, tuple(_concatenate(p, s) for p, s in actors)
+            is_static[near[halo]] = False
+            parts.append(PointSet(local[own].astype(np.float32), classes[own]))
+        static.append(PointSet(sweep.points[is_static], sweep.semantic[is_static]))
+    return PointSet.join(static), tuple(map(PointSet.join, actors))
 
 
-def _candidates(sweep: Sweep, track: ObjectTrack) -> np.ndarray:
-    """Indices of the returns that could lie in the object's box at their own time."""
-    if len(sweep) == 0:
-        return np.zeros(0, dtype=np.int64)
-    times = sweep.timestamps_ns
-    low, high = track.motion.span(int(times.min()), int(times.max()))
-    reach = float(np.linalg.norm(track.size_m)) / 2 + HALO_M
-    near = indices_between(sweep.points, low - reach, high + reach)
-    return near[track.motion.exists_at(times[near])]
+@numba.njit(cache=True)
+def _pose(knots, quats, centres, time, out):  # pragma: no cover - compiled
+    """Linear in position, slerp in rotation, held before the first and after the last knot."""
+    last = len(knots) - 1
+    i = min(max(np.searchsorted(knots, time, side="right") - 1, 0), max(last - 1, 0))
+    f = 0.0
+    j = min(i + 1, last)
+    if j > i:
+        f = min(max((time - knots[i]) / (knots[j] - knots[i]), 0.0), 1.0)
+    a, b = quats[i], quats[j]
+    dot = a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]
+    sign = -1.0 if dot < 0 else 1.0
+    angle = np.arccos(min(abs(dot), 1.0))
+    wa, wb = 1.0 - f, f
+    if angle > 1e-6:  # below, sin loses its digits and the straight line is exact
+        wa, wb = np.sin(wa * angle) / np.sin(angle), np.sin(wb * angle) / np.sin(angle)
+    wb *= sign
+    w, x, y, z = (
+        wa * a[0] + wb * b[0],
+        wa * a[1] + wb * b[1],
+        wa * a[2] + wb * b[2],
+        wa * a[3] + wb * b[3],
+    )
+    n = 1.0 / np.sqrt(w * w + x * x + y * y + z * z)
+    w, x, y, z = w * n, x * n, y * n, z * n
+    out[0, 0], out[0, 1], out[0, 2] = (
+        1 - 2 * (y * y + z * z),
+        2 * (x * y - w * z),
+        2 * (x * z + w * y),
+    )
+    out[1, 0], out[1, 1], out[1, 2] = (
+        2 * (x * y + w * z),
+        1 - 2 * (x * x + z * z),
+        2 * (y * z - w * x),
+    )
+    out[2, 0], out[2, 1], out[2, 2] = (
+        2 * (x * z - w * y),
+        2 * (y * z + w * x),
+        1 - 2 * (x * x + y * y),
+    )
+    for k in range(3):
+        out[k, 3] = (1.0 - f) * centres[i, k] + f * centres[j, k]
 
 
-def _concatenate(points: list[np.ndarray], semantic: list[np.ndarray]) -> PointSet:
-    if not points:
-        return PointSet(np.zeros((0, 3), np.float32), np.zeros(0, np.int16))
-    return PointSet(np.concatenate(points), np.concatenate(semantic))
+@numba.njit(cache=True)
+def _into(knots, quats, centres, points, times, out):  # pragma: no cover - compiled
+    pose = np.eye(4)
+    for i in range(len(points)):
+        if i == 0 or times[i] != times[i - 1]:
+            _pose(knots, quats, centres, times[i], pose)
+        dx = points[i, 0] - pose[0, 3]
+        dy = points[i, 1] - pose[1, 3]
+        dz = points[i, 2] - pose[2, 3]
+        for k in range(3):
+            out[i, k] = pose[0, k] * dx + pose[1, k] * dy + pose[2, k] * dz

@@ -37,8 +37,7 @@ def thin_points(
     """The mean point and commonest class of every occupied voxel, and the voxels' edges in metres.
 
     path: float [P, 3], positions in the frame of the points. The edge is voxel_m within NEAR_M of
-    the path and grows with the power GROWTH of the distance beyond.
-    """
+    the path and grows with the power GROWTH of the distance beyond."""
     if len(points) == 0:
         return points, np.zeros(0, np.float32)
     level = _levels(
@@ -153,8 +152,7 @@ class Surfels:
     """N discs. centres, normals, major: float32 [N, 3]; normals and major are unit and orthogonal,
     major is the first tangent axis and normals x major the second. spacing: float32 [N, 2], metres
     to the neighbours along the tangent axes. isolated: bool [N], too few neighbours for a surface.
-    neighbours: int [N, K], see `find_neighbours`.
-    """
+    neighbours: int [N, K], see `find_neighbours`."""
 
     centres: np.ndarray
     normals: np.ndarray
@@ -179,8 +177,7 @@ def surfels_from_points(
     points: float32 [N, 3]. edge_m: float32 [N], distance that the points were thinned to there.
     semantic: int16 [N], SemanticClass: says how wide a gap may be closed, that ground has no rim,
     and which way a lone ring faces: up on the ground, sideways on a building. Normals come from the
-    principal axes of the nearest points.
-    """
+    principal axes of the nearest points."""
     count = len(points)
     if count < 4:
         frame = np.broadcast_to(np.eye(3, dtype=np.float32), (count, 3, 3))
@@ -312,8 +309,7 @@ class SplatShape:
 
     sigma_per_spacing: standard deviation along a tangent axis over the spacing there; 0.4 leaves
     a lattice visible, 0.6 blurs. opacity: of every splat; high, so that a surface hides
-    what lies behind it.
-    """
+    what lies behind it."""
 
     sigma_per_spacing: float = 0.5
     opacity: float = 0.95
@@ -327,8 +323,7 @@ def gaussians_from_surfels(
 ) -> Gaussians:
     """Degree-0 Gaussians flattened along the surfels' normals.
 
-    colours: float32 [N, 3] in [0, 1]. semantic: int16 [N] or None.
-    """
+    colours: float32 [N, 3] in [0, 1]. semantic: int16 [N] or None."""
     second = np.cross(surfels.normals, surfels.major)
     axes = np.stack([surfels.major, second, surfels.normals], axis=2)  # columns
     sigma = np.full(len(surfels), shape.sigma_per_spacing, np.float32)
@@ -352,8 +347,7 @@ def borrow_colours(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Colours for unseen points from the nearest seen one within reach, and who has a colour now.
 
-    points: float32 [N, 3]. colours: float32 [N, 3]. seen: bool [N]. reach_m: float32 [N].
-    """
+    points: float32 [N, 3]. colours: float32 [N, 3]. seen: bool [N]. reach_m: float32 [N]."""
     if seen.all() or not seen.any():
         return colours, seen
     unseen = np.flatnonzero(~seen)

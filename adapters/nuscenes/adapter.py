@@ -3,14 +3,13 @@
 World: nuScenes' global one, less whole metres where the drive is further than a kilometre from its
 origin. Ego: nuScenes' (x forward, y left, z up, origin on the ground below the rear axle), as it
 stood at the frame's LiDAR time. Images are undistorted as published. Cameras stand where the ego
-pose of their own image puts them, and moving objects where the LiDAR met them (see turning.py).
+pose of their own image puts them, and moving objects where the LiDAR met them (see tables.Turn).
 Frame numbers count the LiDAR's files, or keyframes, from 0 in order of time; `frame_tokens` says
 which rows of sample_data they are.
 """
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -18,20 +17,19 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from adapters.lidar_scene.scene import build_lidar_scene, drive_origin, path_of, scene_of, views_of
-from adapters.lidar_scene.split import BoxSample, ObjectTrack, join_tracks
+from adapters.lidar_scene.scene import build_lidar_scene, views_of
+from adapters.lidar_scene.split import ObjectTrack, join_tracks
 from adapters.nuscenes.labels import NuScenesLabels, read_sweeps
 from adapters.nuscenes.tables import (
-    Annotation,
     FrameFiles,
     NuScenesOptions,
-    Sample,
     SceneTables,
     SensorFile,
     read_tables,
     scene_frames,
 )
 from adapters.plain_files import inside
+from adapters.raw_drive import BoxSample, drive_origin, objects_that_travel
 from adapters.training_views.views import ImageFault, read_scaled
 from adapters.uri import format_uri
 from augment.cameras import Camera, Frame
@@ -39,80 +37,7 @@ from augment.errors import AdapterError
 from augment.geometry import invert_rigid
 from augment.scene import Scene
 
-# ---- Tracks of what moves in a nuScenes scene, from the boxes of its keyframes -------------------
-
 _MOVING = ("vehicle.moving", "pedestrian.moving", "cycle.with_rider")
-_MOVED_M = 1.0  # an object that travels further than this moves whatever it is labelled
-
-
-def read_tracks(
-    tables: SceneTables, frames: Sequence[FrameFiles], world_origin_m: np.ndarray
-) -> tuple[ObjectTrack, ...]:
-    """The moving objects around the given frames, in the scene's world.
-
-    An object moves if any of its boxes in the whole scene says so, or if it travels. Boxes are
-    those of the keyframes among the frames' times and of the next on either side, each at the time
-    that the LiDAR met it; between them the Track interpolates.
-    """
-    moving = _moving(tables.samples)
-    first, last = frames[0].sweep.timestamp_ns, frames[-1].sweep.timestamp_ns
-    times = [sample.timestamp_ns for sample in tables.samples]
-    start = max((i for i, time in enumerate(times) if time <= first), default=0)
-    stop = min((i for i, time in enumerate(times) if time >= last), default=len(times) - 1)
-    sweeps = {file.sample_token: file for file in tables.lidar if file.is_key_frame}
-    return join_tracks(
-        [
-            _box_sample(
-                box,
-                number,
-                _time_met(tables, box, sample, sweeps.get(sample.token)),
-                world_origin_m,
-            )
-            for number, sample in enumerate(tables.samples)
-            if start <= number <= stop
-            for box in sample.annotations
-            if box.instance in moving
-        ]
-    )
-
-
-def _box_sample(
-    box: Annotation, number: int, time_ns: int, world_origin_m: np.ndarray
-) -> BoxSample:
-    w, x, y, z = box.quat
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix()
-    pose[:3, 3] = box.center_m - world_origin_m
-    return BoxSample(box.instance, None, box.category, number, time_ns, pose, box.size_m)
-
-
-def _time_met(
-    tables: SceneTables, box: Annotation, sample: Sample, sweep: SensorFile | None
-) -> int:
-    if sweep is None:
-        return sample.timestamp_ns
-    direction = (box.center_m - sweep.world_from_sensor[:3, 3]) @ sweep.world_from_ego[:3, :3]
-    return sample.timestamp_ns - int(tables.turn.before_ns(direction[None])[0])
-
-
-def _moving(samples: Sequence[Sample]) -> set[str]:
-    positions: dict[str, list[np.ndarray]] = defaultdict(list)
-    moving = set()
-    for sample in samples:
-        for box in sample.annotations:
-            positions[box.instance].append(box.center_m[:2])
-            if any(name in _MOVING for name in box.attributes):
-                moving.add(box.instance)
-    travelled = {
-        instance
-        for instance, places in positions.items()
-        if np.hypot(*np.ptp(np.array(places), axis=0)) > _MOVED_M
-    }
-    return moving | travelled
-
-
-# ---- adapter -------------------------------------------------------------------------------------
-
 _LIDAR_TOP_DEG = 10.67  # the sensor's uppermost channel
 # The back camera looks over the recording car's own edge, which on a published image begins at row
 # 854 of 900.
@@ -158,15 +83,12 @@ def open_nuscenes(path: str, query: dict[str, str]) -> Scene:
             f"{where}: no usable image in {_span(used)}{but}, and colours come from images; choose "
             f"more frames, or unpack samples/CAM_* and sweeps/CAM_*" + _first(image_problems)
         )
-    built = build_lidar_scene(
+    return build_lidar_scene(
         sweeps,
         read_tracks(tables, used, origin),
         views,
-        path_of(frames),
-        options.drive.scene_options(lidar_top_deg=_LIDAR_TOP_DEG),
-    )
-    return scene_of(
-        built,
+        options.drive,
+        lidar_top_deg=_LIDAR_TOP_DEG,
         name=tables.name,
         source=format_uri("nuscenes", path, query),
         frames=frames,
@@ -174,6 +96,44 @@ def open_nuscenes(path: str, query: dict[str, str]) -> Scene:
         world_origin_m=origin,
         problems=unused + chosen.problems + lidar_problems + image_problems,
     )
+
+
+def read_tracks(
+    tables: SceneTables, frames: Sequence[FrameFiles], world_origin_m: np.ndarray
+) -> tuple[ObjectTrack, ...]:
+    """The moving objects around the given frames, in the scene's world.
+
+    An object moves if any of its boxes in the whole scene says so, or if it travels. Boxes are
+    those of the keyframes among the frames' times and of the next on either side, each at the time
+    that the LiDAR met it; between them the Track interpolates."""
+    annotations = [box for sample in tables.samples for box in sample.annotations]
+    moving = {b.instance for b in annotations if any(name in _MOVING for name in b.attributes)}
+    moving |= objects_that_travel((box.instance, box.center_m) for box in annotations)
+    first, last = frames[0].sweep.timestamp_ns, frames[-1].sweep.timestamp_ns
+    times = [sample.timestamp_ns for sample in tables.samples]
+    start = max((i for i, time in enumerate(times) if time <= first), default=0)
+    stop = min((i for i, time in enumerate(times) if time >= last), default=len(times) - 1)
+    sweeps = {file.sample_token: file for file in tables.lidar if file.is_key_frame}
+    samples = []
+    for number in range(start, stop + 1):
+        sample = tables.samples[number]
+        sweep = sweeps.get(sample.token)
+        for box in sample.annotations:
+            if box.instance not in moving:
+                continue
+            w, x, y, z = box.quat
+            pose = np.eye(4)
+            pose[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix()
+            pose[:3, 3] = box.center_m - world_origin_m
+            time_ns = sample.timestamp_ns
+            if sweep is not None:  # when it met the box
+                offset = box.center_m - sweep.world_from_sensor[:3, 3]
+                direction = offset @ sweep.world_from_ego[:3, :3]
+                time_ns -= int(tables.turn.before_ns(direction[None])[0])
+            samples.append(
+                BoxSample(box.instance, None, box.category, number, time_ns, pose, box.size_m)
+            )
+    return join_tracks(samples)
 
 
 def _span(frames: Sequence[FrameFiles]) -> str:
@@ -188,11 +148,7 @@ def _first(problems: Sequence[str]) -> str:
 def _usable_images(
     tables: SceneTables, frames: Sequence[FrameFiles]
 ) -> tuple[dict[str, Path], tuple[str, ...]]:
-    """The images that can be used, by token; what is wrong with others, one sentence each.
-
-    Raises:
-        AdapterError: a camera has images, but none is usable.
-    """
+    """The images that can be used, by token; what is wrong with others, one sentence each."""
     paths: dict[str, Path] = {}
     problems: list[str] = []
     for channel in tables.images:

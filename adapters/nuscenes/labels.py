@@ -1,4 +1,10 @@
-"""nuScenes' boxes and sweeps by frame, passed through in its global world."""
+"""nuScenes' sweeps and boxes by frame, in its global world.
+
+A LiDAR file holds records of five float32: x, y, z (metres, sensor's axes), intensity (0 to 255),
+ring. The published files are taken as they are described: compensated for the car's motion during
+the turn of 50 ms, so that one pose, that of the file's own time, carries all of its returns. When
+each was measured is not stored; its bearing tells (see tables.Turn).
+"""
 
 from __future__ import annotations
 
@@ -6,7 +12,7 @@ import dataclasses
 import io
 import zipfile
 import zlib
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,8 +20,6 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from adapters.lidar_scene.scene import stored_records
-from adapters.lidar_scene.split import Sweep
 from adapters.nuscenes.tables import (
     Annotation,
     FrameFiles,
@@ -26,6 +30,7 @@ from adapters.nuscenes.tables import (
     scene_frames,
 )
 from adapters.plain_files import inside
+from adapters.raw_drive import NO_SURFACE, Sweep, class_table, classes_of, is_in_box, stored_records
 from augment.effects.lidar.codes import INDEX_COLUMN
 from augment.errors import AdapterError
 from augment.files.pickles import read_npy
@@ -33,12 +38,16 @@ from augment.labels import Boxes, LidarSweep
 from augment.semantics import SemanticClass
 from recipes.files import open_file
 
-# ---- What lidarseg's 32 classes mean here --------------------------------------------------------
-
-NO_SURFACE = -1  # stands for returns that no surface made, where a SemanticClass is expected
-EGO_CLASS = 31
-
-# As published, numbered from 0.
+RECORD_BYTES = 20
+_RECORD = ("x", "y", "z", "intensity", "ring")
+_STRAIGHT = 1e-9  # of the cosine: between nearly equal rotations a straight line is exact
+# The recording car with its sensors in its own frame (x forward, y left, z up, origin on the ground
+# below the rear axle). Measured on a published sweep: its returns on the car, a quarter of all, lie
+# in x -0.2..2.8, y -0.7..0.7, z 0.8..1.9; the car, 4.1 m by 1.8 m, reaches from -0.7 to 3.5.
+EGO_LOW_M = np.array([-0.8, -1.0, -0.5])
+EGO_HIGH_M = np.array([3.6, 1.0, 2.3])
+_EGO_CLASS = 31
+# lidarseg's classes as published, numbered from 0, and what they mean here.
 _S = SemanticClass
 _CLASSES: tuple[tuple[str, int], ...] = (
     ("noise", NO_SURFACE), ("animal", _S.OTHER), ("human.pedestrian.adult", _S.PEDESTRIAN),
@@ -60,37 +69,6 @@ _CLASSES: tuple[tuple[str, int], ...] = (
     ("static.manmade", _S.BUILDING), ("static.other", _S.OTHER),
     ("static.vegetation", _S.VEGETATION), ("vehicle.ego", _S.VEHICLE),
 )  # fmt: skip
-
-
-def class_table(names: Mapping[int, str]) -> np.ndarray:
-    """SemanticClass, or NO_SURFACE, by the number of a class, int16 [256].
-
-    names: category.json's, by number; where it numbers none, the published ones. Other names are
-    UNKNOWN.
-    """
-    meaning = dict(_CLASSES)
-    numbered = names or {number: name for number, (name, _) in enumerate(_CLASSES)}
-    table = np.full(256, SemanticClass.UNKNOWN, np.int16)
-    for number, name in numbered.items():
-        if number < len(table):
-            table[number] = meaning.get(name, SemanticClass.UNKNOWN)
-    return table
-
-
-# ------------------------------------------------------------------------------------------------
-# nuScenes' LiDAR files: returns in the global world, and sweeps of usable ones for a scene
-# A file holds records of five float32: x, y, z (metres, sensor's axes), intensity (0 to 255), ring.
-# The published files are taken as they are described: compensated for the car's motion during the
-# turn of 50 ms, so that one pose, that of the file's own time, carries all of its returns. When
-# each
-# was measured is not stored; its bearing tells (see turning.py).
-
-RECORD_BYTES = 20
-# The recording car with its sensors in its own frame (x forward, y left, z up, origin on the ground
-# below the rear axle). Measured on a published sweep: its returns on the car, a quarter of all, lie
-# in x -0.2..2.8, y -0.7..0.7, z 0.8..1.9; the car, 4.1 m by 1.8 m, reaches from -0.7 to 3.5.
-EGO_LOW_M = np.array([-0.8, -1.0, -0.5])
-EGO_HIGH_M = np.array([3.6, 1.0, 2.3])
 
 
 class SweepFault(Exception):
@@ -143,96 +121,6 @@ def read_returns(tables: SceneTables, sweep: SensorFile) -> Returns:
     )
 
 
-def read_sweeps(
-    tables: SceneTables,
-    frames: Sequence[FrameFiles],
-    world_origin_m: np.ndarray,
-    *,
-    held_out: Collection[int] = frozenset(),
-) -> tuple[tuple[Sweep, ...], tuple[str, ...]]:
-    """The usable returns of every frame that has a file and is not held out, in the scene's world,
-    and what was missing, one sentence each.
-
-    Left out: returns of the recording car itself, of no surface (lidarseg's noise), not finite.
-    """
-    sweeps, problems, missing = [], [], []
-    used = [frame for frame in frames if frame.index not in held_out]
-    table = class_table(tables.class_names)
-    for frame in tqdm(used, desc="LiDAR", unit="sweep", disable=None):
-        try:
-            returns = read_returns(tables, frame.sweep)
-        except FileNotFoundError:
-            missing.append(frame)
-            continue
-        except SweepFault as fault:
-            problems.append(
-                f"frame {frame.index}: {frame.sweep.filename} {fault}; its points are left out"
-            )
-            continue
-        if returns.problem:
-            problems.append(f"frame {frame.index}: {returns.problem}")
-        sweeps.append(_usable(returns, frame.sweep, world_origin_m, table))
-    if missing:
-        problems.append(
-            f"{len(missing)} of {len(used)} LiDAR files are missing, their points too (the first: "
-            f"frame {missing[0].index}, {missing[0].sweep.filename})"
-        )
-    return tuple(sweeps), tuple(problems)
-
-
-def _usable(
-    returns: Returns, sweep: SensorFile, world_origin_m: np.ndarray, table: np.ndarray
-) -> Sweep:
-    pose = sweep.world_from_ego
-    keep = np.isfinite(returns.points_m).all(axis=1)
-    with np.errstate(all="ignore"):
-        ego = (returns.points_m - pose[:3, 3]) @ pose[:3, :3]
-    keep &= ~((ego > EGO_LOW_M) & (ego < EGO_HIGH_M)).all(axis=1)
-    semantic = np.full(len(returns), SemanticClass.UNKNOWN, np.int16)
-    if returns.classes is not None:
-        semantic = table[returns.classes]
-        keep &= (semantic != NO_SURFACE) & (returns.classes != EGO_CLASS)
-    points = (returns.points_m[keep] - world_origin_m).astype(np.float32)
-    return Sweep(points, returns.timestamps_ns[keep], semantic[keep])
-
-
-def _bytes(path: Path) -> bytes:
-    try:
-        with open_file(path) as file:
-            return file.read()
-    except FileNotFoundError:
-        raise
-    except OSError as error:
-        raise SweepFault(f"cannot be read ({error.strerror or error})") from None
-
-
-def _read_classes(
-    tables: SceneTables, sweep: SensorFile, count: int
-) -> tuple[np.ndarray | None, str]:
-    """The class of each return, and why there is none where there should be."""
-    name = tables.semantic_files.get(sweep.token)
-    if name is None:
-        return None, ""
-    path = inside(tables.root, name, f"lidarseg of sample_data {sweep.token!r}")
-    try:
-        classes = np.frombuffer(_bytes(path), np.uint8)
-    except FileNotFoundError:
-        return None, f"{name} is missing; its points have no class"
-    except SweepFault as fault:
-        return None, f"{name} {fault}; its points have no class"
-    if len(classes) != count:
-        return None, (
-            f"{name} has {len(classes)} classes for {count} returns; its points have no class"
-        )
-    return classes, ""
-
-
-# ---- labels --------------------------------------------------------------------------------------
-
-_RECORD = ("x", "y", "z", "intensity", "ring")  # of a sweep's file
-_STRAIGHT = 1e-9  # of the cosine: between nearly equal rotations a straight line is exact
-
-
 @dataclass(frozen=True, eq=False)
 class NuScenesLabels:
     """Labels of one scene: boxes from memory, sweeps read when asked.
@@ -247,9 +135,8 @@ class NuScenesLabels:
 
     Sweeps: columns x y z (metres, float64, nuScenes' global world), intensity (0 to 255) and ring
     (both float32 as in the file), timestamp_ns (not published: the file's time less how long before
-    it the LiDAR looked there, see turning.py), and semantic (lidarseg's numbers, uint8) where the
-    sweep has them. Returns of the recording car are among them.
-    """
+    it the LiDAR looked there, see tables.Turn), and semantic (lidarseg's numbers, uint8) where the
+    sweep has them. Returns of the recording car are among them."""
 
     tables: SceneTables
     frames: tuple[FrameFiles, ...]
@@ -273,24 +160,12 @@ class NuScenesLabels:
             columns["semantic"] = returns.classes
         return LidarSweep(columns)
 
-    @property
-    def no_surface_classes(self) -> tuple[int, ...]:
-        """The sweeps' class numbers of returns that no surface made: noise."""
-        table = class_table(self.tables.class_names)
-        return tuple(int(n) for n in np.flatnonzero(table == NO_SURFACE))
-
     def lidar_classes(self, sweep: LidarSweep) -> np.ndarray | None:
-        """The SemanticClass of each return, or NO_SURFACE; None for a sweep without classes."""
-        classes = sweep.columns.get("semantic")
-        if classes is None:
-            return None
-        table = class_table(self.tables.class_names)
-        return table[np.clip(classes.astype(np.int64), 0, len(table) - 1)]
+        return classes_of(sweep, _class_table(self.tables))
 
     def lidar_origins(self, frame_index: int, sweep: LidarSweep) -> np.ndarray | None:
         """The sensor's place at the time of the file, to which its returns are compensated: within
-        the turn of 50 ms it was up to half of the way elsewhere that the car drives in it.
-        """
+        the turn of 50 ms it was up to half of the way elsewhere that the car drives in it."""
         frame = self._frame(frame_index)
         if frame is None:
             return None
@@ -327,12 +202,97 @@ class NuScenesLabels:
         return self.frames[index] if 0 <= index < len(self.frames) else None
 
 
-def _panoptic_of(file: Path, rows: np.ndarray) -> bytes:
-    """The numbers of those returns in a file of nuScenes' panoptic labels.
+def read_sweeps(
+    tables: SceneTables,
+    frames: Sequence[FrameFiles],
+    world_origin_m: np.ndarray,
+    *,
+    held_out: Collection[int] = frozenset(),
+) -> tuple[tuple[Sweep, ...], tuple[str, ...]]:
+    """The usable returns of every frame that has a file and is not held out, in the scene's world,
+    and what was missing, one sentence each.
 
-    Raises:
-        AdapterError: the file is damaged, or has no number for one of them.
-    """
+    Left out: returns of the recording car itself, of no surface (lidarseg's noise), not finite."""
+    sweeps, problems, missing = [], [], []
+    used = [frame for frame in frames if frame.index not in held_out]
+    table = _class_table(tables)
+    for frame in tqdm(used, desc="LiDAR", unit="sweep", disable=None):
+        try:
+            returns = read_returns(tables, frame.sweep)
+        except FileNotFoundError:
+            missing.append(frame)
+            continue
+        except SweepFault as fault:
+            problems.append(
+                f"frame {frame.index}: {frame.sweep.filename} {fault}; its points are left out"
+            )
+            continue
+        if returns.problem:
+            problems.append(f"frame {frame.index}: {returns.problem}")
+        sweeps.append(_usable(returns, frame.sweep, world_origin_m, table))
+    if missing:
+        problems.append(
+            f"{len(missing)} of {len(used)} LiDAR files are missing, their points too (the first: "
+            f"frame {missing[0].index}, {missing[0].sweep.filename})"
+        )
+    return tuple(sweeps), tuple(problems)
+
+
+def _usable(
+    returns: Returns, sweep: SensorFile, world_origin_m: np.ndarray, table: np.ndarray
+) -> Sweep:
+    pose = sweep.world_from_ego
+    keep = np.isfinite(returns.points_m).all(axis=1)
+    with np.errstate(all="ignore"):
+        ego = (returns.points_m - pose[:3, 3]) @ pose[:3, :3]
+    keep &= ~is_in_box(ego, EGO_LOW_M, EGO_HIGH_M)
+    semantic = np.full(len(returns), SemanticClass.UNKNOWN, np.int16)
+    if returns.classes is not None:
+        semantic = table[returns.classes]
+        keep &= (semantic != NO_SURFACE) & (returns.classes != _EGO_CLASS)
+    points = (returns.points_m[keep] - world_origin_m).astype(np.float32)
+    return Sweep(points, returns.timestamps_ns[keep], semantic[keep])
+
+
+def _bytes(path: Path) -> bytes:
+    try:
+        with open_file(path) as file:
+            return file.read()
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise SweepFault(f"cannot be read ({error.strerror or error})") from None
+
+
+def _read_classes(
+    tables: SceneTables, sweep: SensorFile, count: int
+) -> tuple[np.ndarray | None, str]:
+    """The class of each return, and why there is none where there should be."""
+    name = tables.semantic_files.get(sweep.token)
+    if name is None:
+        return None, ""
+    path = inside(tables.root, name, f"lidarseg of sample_data {sweep.token!r}")
+    try:
+        classes = np.frombuffer(_bytes(path), np.uint8)
+    except FileNotFoundError:
+        return None, f"{name} is missing; its points have no class"
+    except SweepFault as fault:
+        return None, f"{name} {fault}; its points have no class"
+    if len(classes) != count:
+        return None, (
+            f"{name} has {len(classes)} classes for {count} returns; its points have no class"
+        )
+    return classes, ""
+
+
+def _class_table(tables: SceneTables) -> np.ndarray:
+    """As class_table; where category.json numbers none, by the published numbers."""
+    numbered = tables.class_names or {n: name for n, (name, _) in enumerate(_CLASSES)}
+    return class_table(numbered, dict(_CLASSES))
+
+
+def _panoptic_of(file: Path, rows: np.ndarray) -> bytes:
+    """The numbers of those returns in a file of nuScenes' panoptic labels."""
     try:
         with zipfile.ZipFile(file) as archive, archive.open("data.npy") as member:
             opened: Any = member

@@ -5,10 +5,17 @@
     lidarseg/v1.0-*/<token>_lidarseg.bin     class of each return of keyframes, where published
     panoptic/v1.0-*/<token>_panoptic.npz     class and object of each, likewise
 
-Each table is read once, row by row, and only what belongs to the scene is kept. Of mini that takes
-a second; of trainval, whose tables have 2 GB, about half a minute. Rows are taken in order
-of time; prev and next links are not needed. Coordinates are nuScenes' global ones in metres, times
-are nanoseconds.
+A table is a JSON list of objects. It is read once, row by row, never in memory as a whole, and only
+what belongs to the scene is kept: of mini that takes a second; of trainval, whose tables have 2 GB,
+about half a minute. Rows are taken in order of time; prev and next links are not needed.
+Coordinates are nuScenes' global ones in metres, times are nanoseconds. Errors are AdapterErrors
+that name table, row and field.
+
+nuScenes publishes one time a sweep, that of the end of its turn, and no times of returns. But the
+sensor turns clockwise in 50 ms, and each camera is triggered as the LiDAR sweeps across the middle
+of its view. So the keyframes' images tell the bearing at which a turn ends (to the left, a little
+behind), and that tells the time of everything. It matters for what moves: its boxes stand where the
+LiDAR met it, up to 50 ms before the sweep's time, as do the images.
 """
 
 from __future__ import annotations
@@ -24,19 +31,29 @@ from typing import Any, TypeGuard
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from adapters.lidar_scene.scene import DriveOptions
 from adapters.plain_files import LARGEST, array_of, inside
+from adapters.raw_drive import DriveOptions
 from augment.errors import AdapterError
 from recipes.files import open_file
-
-# ---- Rows of a nuScenes table, read one after another and checked field by field -----------------
-# A table is a JSON list of objects. The largest of trainval hold millions of rows and more than a
-# gigabyte, of which one scene needs a thousandth, so a table is never in memory as a whole.
 
 _CHUNK = 1 << 22  # characters read at a time
 _MAX_ROW = 1 << 24  # no published row has a ten-thousandth of it
 _BETWEEN = re.compile(r"[\s,]*")
 _UNIT_TOLERANCE = 1e-3
+TURN_NS = 50_000_000
+_TWO_PI = 2 * np.pi
+# Images of one keyframe published agree to 4 degrees; other data in nuScenes's form need not turn
+# like this at all.
+_MAX_SPREAD_RAD = np.radians(20)
+# The LiDAR turns in 50 ms; further from a sweep than two turns an image belongs to none.
+_NEAR_NS = 100_000_000
+_OWN = {
+    "version": "a folder of tables such as v1.0-mini",
+    "scene": "a scene's name or token",
+    "sweeps": "1 for keyframes and the sweeps between them, 0 for keyframes only",
+}
+LIDAR = "LIDAR_TOP"
+_MAX_NAMES = 10  # that a message lists
 
 
 @dataclass(frozen=True)
@@ -133,11 +150,7 @@ class Row:
 
 
 def read_rows(path: Path) -> Iterator[Row]:
-    """The rows of a table, in its order.
-
-    Raises:
-        AdapterError: missing, unreadable, no JSON, cut short, or no list of objects.
-    """
+    """The rows of a table, in its order."""
     try:
         with io.TextIOWrapper(open_file(path), encoding="utf-8") as file:
             yield from _rows(path, file)
@@ -147,24 +160,21 @@ def read_rows(path: Path) -> Iterator[Row]:
         raise AdapterError(f"{path} cannot be read as text: {error}") from None
 
 
-def read_where(path: Path, field: str, wanted: Container[str]) -> dict[str, Row]:
-    """The rows whose text `field` is among those wanted, by their token, in the table's order.
-
-    Raises:
-        AdapterError: as read_rows; a row without the field; two of these rows with one token.
-    """
+def read_table(
+    path: Path, field: str = "token", values: Container[str] | None = None
+) -> dict[str, Row]:
+    """The rows by their token, in the table's order; only those whose text `field` is among the
+    values, where these are given."""
     kept: dict[str, Row] = {}
     for row in read_rows(path):
-        if row.text(field) in wanted:
-            _add(kept, row)
-    return kept
-
-
-def read_all(path: Path) -> dict[str, Row]:
-    """All rows of a table by their token, as read_where."""
-    kept: dict[str, Row] = {}
-    for row in read_rows(path):
-        _add(kept, row)
+        if values is not None and row.text(field) not in values:
+            continue
+        if row.token in kept:
+            raise AdapterError(
+                f"{row}: the token of an earlier row too (row number {kept[row.token].number}); "
+                f"tokens must be unique, copy the table again"
+            )
+        kept[row.token] = row
     return kept
 
 
@@ -174,15 +184,6 @@ def referred(row: Row, field: str, table: dict[str, Row], name: str) -> Row:
     if found is None:
         raise row.fault(field, f"the token of a row of {name}.json, which has no such row")
     return found
-
-
-def _add(kept: dict[str, Row], row: Row) -> None:
-    if row.token in kept:
-        raise AdapterError(
-            f"{row}: the token of an earlier row too (row number {kept[row.token].number}); "
-            f"tokens must be unique, copy the table again"
-        )
-    kept[row.token] = row
 
 
 def _rows(path: Path, file: Any) -> Iterator[Row]:
@@ -231,22 +232,6 @@ def _is_text(value: object) -> TypeGuard[str]:
     return value.isascii() or not any("\ud800" <= letter <= "\udfff" for letter in value)
 
 
-# ---- When the LiDAR looked where: the moment of a return from its bearing ------------------------
-# nuScenes publishes one time a sweep, that of the end of its turn, and no times of returns. But the
-# sensor turns clockwise in 50 ms, and each camera is triggered as the LiDAR sweeps across the
-# middle
-# of its view. So the keyframes' images tell the bearing at which a turn ends (to the left, a little
-# behind), and that tells the time of everything. It matters for what moves: its boxes stand where
-# the
-# LiDAR met it, up to 50 ms before the sweep's time, as do the images.
-
-TURN_NS = 50_000_000
-_TWO_PI = 2 * np.pi
-# Images of one keyframe published agree to 4 degrees; other data in nuScenes's form need not turn
-# like this at all.
-_MAX_SPREAD_RAD = np.radians(20)
-
-
 @dataclass(frozen=True)
 class Turn:
     """end_rad: bearing of the end of a turn, from the car's forward axis to the left; None where it
@@ -278,15 +263,6 @@ class Turn:
         return np.round(past * TURN_NS).astype(np.int64)
 
 
-# ---- What the URI of a nuScenes scene may ask for ------------------------------------------------
-
-_OWN = {
-    "version": "a folder of tables such as v1.0-mini",
-    "scene": "a scene's name or token",
-    "sweeps": "1 for keyframes and the sweeps between them, 0 for keyframes only",
-}
-
-
 @dataclass(frozen=True)
 class NuScenesOptions:
     """version, scene: None for the only one there is. sweeps: whether the LiDAR's sweeps between
@@ -311,20 +287,13 @@ class NuScenesOptions:
         return NuScenesOptions(query.get("version"), query.get("scene"), sweeps == "1", drive)
 
 
-# ---- tables --------------------------------------------------------------------------------------
-
-LIDAR = "LIDAR_TOP"
-_MAX_NAMES = 10  # that a message lists
-
-
 @dataclass(frozen=True, eq=False)
 class SensorFile:
     """One image or sweep: a row of sample_data and what it refers to.
 
     filename: relative to the dataset's folder, inside it. world_from_ego, ego_from_sensor: float64
     [4, 4], at the file's own time. intrinsic: fx, fy, cx, cy, pixels; None of a LiDAR. width,
-    height: pixels; 0 of a LiDAR.
-    """
+    height: pixels; 0 of a LiDAR."""
 
     token: str
     sample_token: str
@@ -375,8 +344,7 @@ class SceneTables:
 
     lidar: sweeps of LIDAR_TOP. images: by camera. semantic_files, panoptic_files: the lidarseg and
     panoptic file of a sweep by its token. class_names: by the numbers in those files. turn: how
-    the LiDAR turns.
-    """
+    the LiDAR turns."""
 
     root: Path
     version: str
@@ -393,15 +361,10 @@ class SceneTables:
 def read_tables(root: Path, version: str | None, scene: str | None) -> SceneTables:
     """The tables of the scene of that name or token.
 
-    version, scene: None for the only one.
-
-    Raises:
-        AdapterError: no nuScenes dataset, no such version or scene, several to choose from, or a
-            table that is missing, damaged or contradicts another; names table, row and field.
-    """
+    version, scene: None for the only one."""
     folder = root / _choose_version(root, version)
     row = _choose_scene(folder, scene)
-    samples = read_where(folder / "sample.json", "scene_token", {row.token})
+    samples = read_table(folder / "sample.json", "scene_token", {row.token})
     if not samples:
         raise AdapterError(f"{row}: {folder / 'sample.json'} has no keyframe of this scene")
     files = _read_files(root, folder, samples)
@@ -413,7 +376,7 @@ def read_tables(root: Path, version: str | None, scene: str | None) -> SceneTabl
         )
     cameras = sorted({file.channel for file in files if file.intrinsic is not None})
     images = {name: tuple(f for f in files if f.channel == name) for name in cameras}
-    categories = read_all(folder / "category.json")
+    categories = read_table(folder / "category.json")
     return SceneTables(
         root=root,
         version=folder.name,
@@ -459,7 +422,7 @@ def _choose_version(root: Path, version: str | None) -> str:
 
 
 def _choose_scene(folder: Path, scene: str | None) -> Row:
-    rows = list(read_all(folder / "scene.json").values())
+    rows = list(read_table(folder / "scene.json").values())
     chosen = [row for row in rows if scene in (None, row.token, row.text("name"))]
     names = _listed([row.text("name") for row in rows])
     if len(chosen) == 1:
@@ -482,20 +445,20 @@ def _listed(names: list[str]) -> str:
 
 
 def _read_files(root: Path, folder: Path, samples: Mapping[str, Row]) -> tuple[SensorFile, ...]:
-    sensors = read_all(folder / "sensor.json")
-    calibrations = read_all(folder / "calibrated_sensor.json")
+    sensors = read_table(folder / "sensor.json")
+    calibrations = read_table(folder / "calibrated_sensor.json")
     channels: dict[str, Row] = {}
     for token, row in calibrations.items():
         sensor = referred(row, "sensor_token", sensors, "sensor")
         if sensor.text("channel") == LIDAR or sensor.text("modality") == "camera":
             channels[token] = sensor
     rows: dict[str, Row] = {}
-    for token, row in read_where(folder / "sample_data.json", "sample_token", samples).items():
+    for token, row in read_table(folder / "sample_data.json", "sample_token", samples).items():
         referred(row, "calibrated_sensor_token", calibrations, "calibrated_sensor")
         if row.text("calibrated_sensor_token") in channels:  # not a radar's
             rows[token] = row
-    wanted = {row.text("ego_pose_token") for row in rows.values()}
-    poses = read_where(folder / "ego_pose.json", "token", wanted)
+    pose_tokens = {row.text("ego_pose_token") for row in rows.values()}
+    poses = read_table(folder / "ego_pose.json", "token", pose_tokens)
     files = []
     for row in rows.values():
         calibration = calibrations[row.text("calibrated_sensor_token")]
@@ -538,11 +501,11 @@ def _intrinsic(row: Row) -> tuple[float, float, float, float]:
 def _read_samples(
     folder: Path, samples: Mapping[str, Row], categories: dict[str, Row]
 ) -> tuple[Sample, ...]:
-    rows = read_where(folder / "sample_annotation.json", "sample_token", samples)
-    wanted = {row.text("instance_token") for row in rows.values()}
-    instances = read_where(folder / "instance.json", "token", wanted)
-    attributes = read_all(folder / "attribute.json")
-    visibilities = read_all(folder / "visibility.json")
+    rows = read_table(folder / "sample_annotation.json", "sample_token", samples)
+    instance_tokens = {row.text("instance_token") for row in rows.values()}
+    instances = read_table(folder / "instance.json", "token", instance_tokens)
+    attributes = read_table(folder / "attribute.json")
+    visibilities = read_table(folder / "visibility.json")
     by_sample: dict[str, list[Annotation]] = {token: [] for token in samples}
     for row in rows.values():
         instance = referred(row, "instance_token", instances, "instance")
@@ -599,12 +562,6 @@ def _class_names(categories: Mapping[str, Row]) -> dict[int, str]:
     return {row.integer("index"): row.text("name") for row in numbered}
 
 
-# ---- Which images and which sweep make a frame, and what the frames' files are in the tables -----
-
-# The LiDAR turns in 50 ms; further from a sweep than two turns an image belongs to none.
-_NEAR_NS = 100_000_000
-
-
 @dataclass(frozen=True, eq=False)
 class FrameFiles:
     """One frame. sweep: its LiDAR file, whose time is the frame's. images: by camera, those taken
@@ -634,8 +591,7 @@ def scene_frames(
     sweeps: one frame a LiDAR file, of keyframes and between them (20 a second; cameras take 12
     images a second, so most frames lack some); else one a keyframe. A keyframe has its own images,
     those of its sample; each other image goes to the nearest frame in time that has none of its
-    camera yet, nearest pairs first, and to no second one.
-    """
+    camera yet, nearest pairs first, and to no second one."""
     chosen = [file for file in tables.lidar if sweeps or file.is_key_frame]
     images: list[dict[str, SensorFile]] = [{} for _ in chosen]
     problems = []
@@ -659,11 +615,7 @@ def scene_frames(
 def frame_tokens(path: str, query: dict[str, str]) -> dict[int, dict[str, FrameToken]]:
     """What every frame of a scene is in the dataset's tables: frame number (Frame.index) to channel
     (LIDAR_TOP among them) to row of sample_data. Frames that frames= leaves out are there too, and
-    so are files that the tables name but that are missing.
-
-    Raises:
-        AdapterError: as open_nuscenes for the tables.
-    """
+    so are files that the tables name but that are missing."""
     options = NuScenesOptions.from_query(query)
     tables = read_tables(Path(path), options.version, options.scene)
     frames, _ = scene_frames(tables, sweeps=options.sweeps)

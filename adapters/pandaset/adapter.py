@@ -18,9 +18,8 @@ import pandas as pd
 import torch
 from tqdm import tqdm
 
-from adapters.lidar_scene.actor_motion import indices_between, inside_box
-from adapters.lidar_scene.scene import DriveOptions, build_lidar_scene, path_of, scene_of, views_of
-from adapters.lidar_scene.split import BoxSample, Sweep, join_tracks
+from adapters.lidar_scene.scene import build_lidar_scene, views_of
+from adapters.lidar_scene.split import indices_between, inside_box, join_tracks
 from adapters.pandaset.files import (
     CameraTrack,
     Sequence,
@@ -30,13 +29,20 @@ from adapters.pandaset.files import (
     read_sequence,
 )
 from adapters.pandaset.labels import (
-    NO_SURFACE,
     Objects,
     PandaSetLabels,
     boxes_of_cuboids,
     read_objects,
     semantic_table,
     sensors_of,
+)
+from adapters.raw_drive import (
+    NO_SURFACE,
+    BoxSample,
+    DriveOptions,
+    Sweep,
+    is_in_box,
+    objects_that_travel,
 )
 from adapters.uri import format_uri
 from augment.cameras import Camera, Frame
@@ -45,13 +51,75 @@ from augment.geometry import invert_rigid, rotmat_from_quat
 from augment.scene import Scene
 from augment.semantics import SemanticClass
 
-# ---- PandaSet's LiDAR files into sweeps of usable returns, and its boxes into timed samples ------
-
 # The recording car in its own frame (x forward, y left, z up): no other surface can be in there.
 EGO_LOW_M = np.array([-3.0, -1.05, -1.0])
 EGO_HIGH_M = np.array([3.0, 1.05, 2.2])
 _TIMING_MARGIN_M = 0.25  # returns this near a box tell when its sensor saw the object
-_MOVED_M = 1.0  # a box labelled stationary that travels further than this is not
+_LIDAR_TOP_DEG = 15.0  # the spinning sensor's uppermost channel
+# The back camera looks over the recording car's own roof, the same in every PandaSet sequence:
+# from this part of its rows downwards.
+_ROWS_ABOVE_CAR = {"back_camera": 0.745}
+
+
+def open_pandaset(path: str, query: dict[str, str]) -> Scene:
+    """The scene of one PandaSet sequence folder, such as `pandaset/002`.
+
+    query: frames, voxel_m, max_gaussians, image_scale, sky_size, held_out; see DriveOptions.
+    Opening is deterministic: the same files and options give the same bits.
+
+    Raises:
+        AdapterError: a wrong option, missing or damaged calibration, a damaged table, or no LiDAR.
+            Missing LiDAR or annotation files and images of single frames are Scene.problems.
+    """
+    options = DriveOptions.from_query("pandaset", query)
+    sequence = read_sequence(Path(path))
+    chosen = options.select(range(len(sequence)), where=f"pandaset:{path}")
+    drive = read_drive(sequence, chosen.numbers, held_out=chosen.held_out)
+    if sum(len(sweep) for sweep in drive.sweeps) == 0:
+        raise AdapterError(
+            f"{Path(path) / 'lidar'} holds no returns for frames {chosen.used[0]} to "
+            f"{chosen.used[-1]}; a scene cannot be built without them, unpack the sequence again"
+        )
+    frames = tuple(_frame(sequence, number) for number in chosen.numbers)
+    return build_lidar_scene(
+        drive.sweeps,
+        join_tracks(drive.samples),
+        views_of((f for f in frames if f.index not in chosen.held_out), _ROWS_ABOVE_CAR),
+        options,
+        lidar_top_deg=_LIDAR_TOP_DEG,
+        name=Path(path).name,
+        source=format_uri("pandaset", path, query),
+        frames=frames,
+        labels=PandaSetLabels(Path(path)),
+        world_origin_m=sequence.world_origin_m,
+        problems=sequence.problems + chosen.problems + drive.problems,
+    )
+
+
+def _frame(sequence: Sequence, number: int) -> Frame:
+    cameras = {track.name: _camera(track, number) for track in sequence.cameras}
+    paths = {track.name: track.images[number] for track in sequence.cameras}
+    return Frame(
+        index=number,
+        timestamp_ns=int(sequence.timestamps_ns[number]),
+        world_from_ego=torch.from_numpy(sequence.world_from_ego[number].copy()),
+        cameras=cameras,
+        image_paths={name: str(path) for name, path in paths.items() if path is not None},
+    )
+
+
+def _camera(track: CameraTrack, number: int) -> Camera:
+    return Camera(
+        name=track.name,
+        width=track.width,
+        height=track.height,
+        fx=track.fx,
+        fy=track.fy,
+        cx=track.cx,
+        cy=track.cy,
+        camera_from_world=invert_rigid(torch.from_numpy(track.world_from_camera[number])),
+        timestamp_ns=int(track.timestamps_ns[number]),
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,8 +127,7 @@ class Drive:
     """What the sensors and annotators saw, in the scene's world.
 
     sweeps: one a frame that has a file and is not held out. samples: the boxes of moving objects,
-    in order of frames.
-    """
+    in order of frames."""
 
     sweeps: tuple[Sweep, ...]
     samples: tuple[BoxSample, ...]
@@ -75,8 +142,7 @@ def read_drive(
     held_out: frames whose sweeps only tell at what moment their boxes were seen, so that the tracks
     are those of the whole drive.
     Left out: returns of smoke, exhaust, spray and mirror images, and of the recording car itself.
-    Missing files of single frames are problems, not errors.
-    """
+    Missing files of single frames are problems, not errors."""
     table = semantic_table(sequence.root)
     sweeps, samples, problems = [], [], []
     cuboids = {frame: read_cuboids(sequence.root, frame) for frame in frames}
@@ -131,7 +197,7 @@ class _RawSweep:
             timestamps_ns=np.round(lidar["t"].to_numpy(dtype=np.float64) * 1e9).astype(np.int64),
             semantic=semantic,
             sensor=lidar["d"].to_numpy(),
-            of_ego=((ego > EGO_LOW_M) & (ego < EGO_HIGH_M)).all(axis=1),
+            of_ego=is_in_box(ego, EGO_LOW_M, EGO_HIGH_M),
             unlabelled=classes is None,
         )
 
@@ -142,16 +208,14 @@ class _RawSweep:
 
 def _moving_objects(tables: Seq[pd.DataFrame], objects: Objects) -> set[str]:
     """Names of objects that are labelled moving, or that travel although labelled stationary."""
-    if not tables:
-        return set()
-    table = pd.concat(tables, ignore_index=True)
-    uuid = table["uuid"].astype(str)
-    position = table[["position.x", "position.y"]].astype(np.float64)
-    extent = (position.groupby(uuid).max() - position.groupby(uuid).min()).to_numpy()
-    travelled = np.hypot(extent[:, 0], extent[:, 1]) > _MOVED_M
-    labelled = ~table["stationary"].astype(bool)
-    uuids = position.groupby(uuid).max().index.to_numpy()
-    return {objects.names[u] for u in (*uuid[labelled], *uuids[travelled])}
+    moving: set[str] = set()
+    places: list[tuple[str, np.ndarray]] = []
+    for table in tables:
+        uuids = table["uuid"].astype(str)
+        moving |= set(uuids[~table["stationary"].astype(bool)])
+        xy = table[["position.x", "position.y"]].to_numpy(dtype=np.float64)
+        places += zip(uuids, xy, strict=True)
+    return {objects.names[uuid] for uuid in moving | objects_that_travel(places)}
 
 
 def _samples(
@@ -193,8 +257,7 @@ def _time_seen(
     """When the box's sensor saw it: boxes were drawn around returns that took 0.1 s to collect.
 
     The median time of its returns in the box; without any, the time of the return whose bearing
-    from the car is nearest to the box's.
-    """
+    from the car is nearest to the box's."""
     reach = float(np.linalg.norm(size_m))
     near = indices_between(sweep.points, pose[:3, 3] - reach, pose[:3, 3] + reach)
     if sensor >= 0:
@@ -212,75 +275,3 @@ def _time_seen(
     to_box = pose[:2, 3] - origin
     cosine = (to_points @ to_box) / np.maximum(np.linalg.norm(to_points, axis=1), 1e-6)
     return int(sweep.timestamps_ns[ofs][np.argmax(cosine)])
-
-
-# ---- adapter -------------------------------------------------------------------------------------
-
-_LIDAR_TOP_DEG = 15.0  # the spinning sensor's uppermost channel
-# The back camera looks over the recording car's own roof, the same in every PandaSet sequence:
-# from this part of its rows downwards.
-_ROWS_ABOVE_CAR = {"back_camera": 0.745}
-
-
-def open_pandaset(path: str, query: dict[str, str]) -> Scene:
-    """The scene of one PandaSet sequence folder, such as `pandaset/002`.
-
-    query: frames, voxel_m, max_gaussians, image_scale, sky_size, held_out; see DriveOptions.
-    Opening is deterministic: the same files and options give the same bits.
-
-    Raises:
-        AdapterError: a wrong option, missing or damaged calibration, a damaged table, or no LiDAR.
-            Missing LiDAR or annotation files and images of single frames are Scene.problems.
-    """
-    options = DriveOptions.from_query("pandaset", query)
-    sequence = read_sequence(Path(path))
-    chosen = options.select(range(len(sequence)), where=f"pandaset:{path}")
-    drive = read_drive(sequence, chosen.numbers, held_out=chosen.held_out)
-    if sum(len(sweep) for sweep in drive.sweeps) == 0:
-        raise AdapterError(
-            f"{Path(path) / 'lidar'} holds no returns for frames {chosen.used[0]} to "
-            f"{chosen.used[-1]}; a scene cannot be built without them, unpack the sequence again"
-        )
-    frames = tuple(_frame(sequence, number) for number in chosen.numbers)
-    built = build_lidar_scene(
-        drive.sweeps,
-        join_tracks(drive.samples),
-        views_of((f for f in frames if f.index not in chosen.held_out), _ROWS_ABOVE_CAR),
-        path_of(frames),
-        options.scene_options(lidar_top_deg=_LIDAR_TOP_DEG),
-    )
-    return scene_of(
-        built,
-        name=Path(path).name,
-        source=format_uri("pandaset", path, query),
-        frames=frames,
-        labels=PandaSetLabels(Path(path)),
-        world_origin_m=sequence.world_origin_m,
-        problems=sequence.problems + chosen.problems + drive.problems,
-    )
-
-
-def _frame(sequence: Sequence, number: int) -> Frame:
-    cameras = {track.name: _camera(track, number) for track in sequence.cameras}
-    paths = {track.name: track.images[number] for track in sequence.cameras}
-    return Frame(
-        index=number,
-        timestamp_ns=int(sequence.timestamps_ns[number]),
-        world_from_ego=torch.from_numpy(sequence.world_from_ego[number].copy()),
-        cameras=cameras,
-        image_paths={name: str(path) for name, path in paths.items() if path is not None},
-    )
-
-
-def _camera(track: CameraTrack, number: int) -> Camera:
-    return Camera(
-        name=track.name,
-        width=track.width,
-        height=track.height,
-        fx=track.fx,
-        fy=track.fy,
-        cx=track.cx,
-        cy=track.cy,
-        camera_from_world=invert_rigid(torch.from_numpy(track.world_from_camera[number])),
-        timestamp_ns=int(track.timestamps_ns[number]),
-    )

@@ -7,7 +7,8 @@
 
 The world is the sequence's own: metres, z up. Camera poses are world_from_camera with OpenCV axes.
 A LiDAR pose is the car's: x right, y forward, z up, so world_from_ego is that pose turned by a
-quarter about z. Times are seconds, stored here as integer nanoseconds.
+quarter about z. Times are seconds, stored here as integer nanoseconds. Errors are AdapterErrors
+that name the file.
 """
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ import numpy as np
 import pandas as pd
 import torch
 
-from adapters.lidar_scene.scene import drive_origin
 from adapters.plain_files import decode_image, number_of, read_json
+from adapters.raw_drive import drive_origin
 from adapters.safe_pickle import read_frame
 from augment.errors import AdapterError
 from augment.geometry import rigid, rotmat_from_quat
@@ -42,8 +43,7 @@ class CameraTrack:
     """One camera over the sequence.
 
     world_from_camera: float64 [F, 4, 4]; timestamps_ns: int64 [F]; images: one path a frame, None
-    where the image is missing or damaged.
-    """
+    where the image is missing or damaged."""
 
     name: str
     width: int
@@ -64,8 +64,7 @@ class Sequence:
     world_origin_m: float64 [3], what was subtracted from the files' coordinates to give the scene's
     world, in which all poses here are. world_from_ego: float64 [F, 4, 4], ego x forward, y left,
     z up. timestamps_ns: int64 [F], the ends of the sweeps. problems: what was missing and gone on
-    without, one sentence each.
-    """
+    without, one sentence each."""
 
     root: Path
     world_origin_m: np.ndarray
@@ -79,17 +78,15 @@ class Sequence:
 
 
 def read_sequence(root: Path) -> Sequence:
-    """The calibration, poses and times of the sequence in a folder.
-
-    Raises:
-        AdapterError: the folder is no PandaSet sequence, or calibration is missing or contradicts
-            itself; the message names the file.
-    """
+    """The calibration, poses and times of the sequence in a folder."""
     if not root.is_dir():
         raise AdapterError(f"{root} is not a folder; expected a PandaSet sequence such as .../002")
-    poses = _read_poses(root / "lidar" / "poses.json")
-    times = _read_times(root / "lidar" / "timestamps.json", expected=len(poses))
-    folders = sorted(p for p in _folder(root / "camera").iterdir() if p.is_dir())
+    poses, times = _read_lidar_track(root)
+    if not (root / "camera").is_dir():
+        raise AdapterError(
+            f"{root / 'camera'} does not exist; expected a PandaSet sequence's camera/"
+        )
+    folders = sorted(p for p in (root / "camera").iterdir() if p.is_dir())
     if not folders:
         raise AdapterError(f"{root / 'camera'} holds no camera folder; unpack the sequence again")
     problems: list[str] = []
@@ -105,11 +102,7 @@ def read_sequence(root: Path) -> Sequence:
 def read_ego_track(root: Path) -> tuple[np.ndarray, np.ndarray]:
     """world_from_ego [F, 4, 4] in the dataset's own world, and the times [F] of the sweeps' ends.
 
-    Remembered as long as the files stay as they are.
-
-    Raises:
-        AdapterError: as for read_sequence.
-    """
+    Remembered as long as the files stay as they are."""
     files = [root / "lidar" / name for name in ("poses.json", "timestamps.json")]
     state = tuple((f.stat().st_mtime_ns, f.stat().st_size) if f.exists() else None for f in files)
     return _ego_track(root, state)
@@ -117,9 +110,14 @@ def read_ego_track(root: Path) -> tuple[np.ndarray, np.ndarray]:
 
 @lru_cache(maxsize=2)
 def _ego_track(root: Path, state: object) -> tuple[np.ndarray, np.ndarray]:
-    poses = _read_poses(root / "lidar" / "poses.json")
-    times = _read_times(root / "lidar" / "timestamps.json", expected=len(poses))
+    poses, times = _read_lidar_track(root)
     return poses @ LIDAR_POSE_FROM_EGO, times
+
+
+def _read_lidar_track(root: Path) -> tuple[np.ndarray, np.ndarray]:
+    """The LiDAR's poses [F, 4, 4] in the dataset's own world, and the times [F]."""
+    poses = _read_poses(root / "lidar" / "poses.json")
+    return poses, _read_times(root / "lidar" / "timestamps.json", expected=len(poses))
 
 
 def frame_file(root: Path, folder: str, frame: int) -> Path:
@@ -128,21 +126,13 @@ def frame_file(root: Path, folder: str, frame: int) -> Path:
 
 
 def read_lidar(root: Path, frame: int) -> pd.DataFrame | None:
-    """The returns of a frame, columns x y z i t d as in the file, or None without a file.
-
-    Raises:
-        AdapterError: the file is damaged or lacks a column.
-    """
+    """The returns of a frame, columns x y z i t d as in the file, or None without a file."""
     path = frame_file(root, "lidar", frame)
     return _read_table(path, LIDAR_COLUMNS) if path.exists() else None
 
 
 def read_semantics(root: Path, frame: int, rows: int) -> np.ndarray | None:
-    """The class number of each return of the frame, int64 [rows], or None without a file.
-
-    Raises:
-        AdapterError: the file is damaged or does not have one row a return.
-    """
+    """The class number of each return of the frame, int64 [rows], or None without a file."""
     path = frame_file(root, "annotations/semseg", frame)
     if not path.exists():
         return None
@@ -156,11 +146,7 @@ def read_semantics(root: Path, frame: int, rows: int) -> np.ndarray | None:
 
 
 def read_cuboids(root: Path, frame: int) -> pd.DataFrame | None:
-    """The boxes of a frame with all their columns, or None without a file.
-
-    Raises:
-        AdapterError: the file is damaged or lacks a column that a box needs.
-    """
+    """The boxes of a frame with all their columns, or None without a file."""
     path = frame_file(root, "annotations/cuboids", frame)
     needed = ("uuid", "label", "yaw", "stationary")
     needed += tuple(f"{group}.{axis}" for group in ("position", "dimensions") for axis in "xyz")
@@ -246,12 +232,6 @@ def _image_size(folder: Path, paths: list[Path]) -> tuple[int, int]:
         if image is not None:
             return image.shape[0], image.shape[1]
     raise AdapterError(f"{folder} holds no image that can be decoded; unpack the sequence again")
-
-
-def _folder(path: Path) -> Path:
-    if not path.is_dir():
-        raise AdapterError(f"{path} does not exist; expected a PandaSet sequence's {path.name}/")
-    return path
 
 
 def _read_times(path: Path, *, expected: int) -> np.ndarray:

@@ -1,4 +1,10 @@
-"""PandaSet's boxes and sweeps, passed through with every column, and what its classes mean here."""
+"""PandaSet's boxes and sweeps, passed through with every column, and what its classes mean here.
+
+PandaSet labels a moving object once a sensor, up to 0.1 s apart, with a uuid for each of both
+(`cuboids.sensor_id`: 0 the spinning sensor, 1 the forward one, -1 a box of both) and each other's
+uuid in `cuboids.sibling_id`. Published links are not all whole: some go one way only, are cut
+short, or name their own box. Here both boxes are one object.
+"""
 
 from __future__ import annotations
 
@@ -24,24 +30,46 @@ from adapters.pandaset.files import (
     read_semantics,
 )
 from adapters.plain_files import read_json
+from adapters.raw_drive import NO_SURFACE, class_table, classes_of
 from adapters.safe_pickle import read_frame
 from augment.effects.lidar.codes import INDEX_COLUMN
 from augment.errors import AdapterError
 from augment.labels import Boxes, LidarSweep
 from augment.semantics import SemanticClass, class_of_label
 
-# ------------------------------------------------------------------------------------------------
-# Which cuboids of a sequence are one object: the two LiDARs' boxes of what moves are one vehicle
-# PandaSet labels a moving object once a sensor, up to 0.1 s apart, with a uuid for each of both
-# (`cuboids.sensor_id`: 0 the spinning sensor, 1 the forward one, -1 a box of both) and each other's
-# uuid in `cuboids.sibling_id`. Published links are not all whole: some go one way only, are cut
-# short, or name their own box.
-
 # The area that two boxes share, of that which either covers. In sequence 002 boxes tied by links
 # share 0.31 to 0.98 of it on average over their frames, others of one class 0.01 at most.
 MIN_OVERLAP = 0.25
 _Rectangle = tuple[list[float], list[float], float]  # centre, sides, degrees
-_EACH_ALONE = -1  # the sensor of a box that was drawn around both sensors' returns
+_NO_SENSOR = -1  # the sensor of a box that was drawn around both sensors' returns
+
+# The sensors on the car: forward, left, up of the ego origin. The spinning one is where all six
+# cameras' poses put it by the published extrinsics, within 2 cm. Those of the forward one put it at
+# (1.41, 0.00, 1.55); from (1.35, 0.04, 1.65) its returns hide each other least, within about 5 cm.
+SENSORS_M = np.array([[0.81, 0.0, 1.85], [1.35, 0.04, 1.65]])
+
+# The published classes.json, numbered from 1.
+_S = SemanticClass
+_CLASSES: tuple[tuple[str, int], ...] = (
+    ("Smoke", NO_SURFACE), ("Exhaust", NO_SURFACE), ("Spray or rain", NO_SURFACE),
+    ("Reflection", NO_SURFACE), ("Vegetation", _S.VEGETATION), ("Ground", _S.TERRAIN),
+    ("Road", _S.ROAD), ("Lane Line Marking", _S.LANE_MARKING),
+    ("Stop Line Marking", _S.LANE_MARKING), ("Other Road Marking", _S.LANE_MARKING),
+    ("Sidewalk", _S.SIDEWALK), ("Driveway", _S.SIDEWALK), ("Car", _S.VEHICLE),
+    ("Pickup Truck", _S.VEHICLE), ("Medium-sized Truck", _S.VEHICLE), ("Semi-truck", _S.VEHICLE),
+    ("Towed Object", _S.VEHICLE), ("Motorcycle", _S.TWO_WHEELER),
+    ("Other Vehicle - Construction Vehicle", _S.VEHICLE),
+    ("Other Vehicle - Uncommon", _S.VEHICLE), ("Other Vehicle - Pedicab", _S.TWO_WHEELER),
+    ("Emergency Vehicle", _S.VEHICLE), ("Bus", _S.VEHICLE),
+    ("Personal Mobility Device", _S.TWO_WHEELER), ("Motorized Scooter", _S.TWO_WHEELER),
+    ("Bicycle", _S.TWO_WHEELER), ("Train", _S.VEHICLE), ("Trolley", _S.VEHICLE),
+    ("Tram / Subway", _S.VEHICLE), ("Pedestrian", _S.PEDESTRIAN),
+    ("Pedestrian with Object", _S.PEDESTRIAN), ("Animals - Bird", _S.OTHER),
+    ("Animals - Other", _S.OTHER), ("Pylons", _S.BARRIER), ("Road Barriers", _S.BARRIER),
+    ("Signs", _S.SIGN), ("Cones", _S.OTHER), ("Construction Signs", _S.SIGN),
+    ("Temporary Construction Barriers", _S.BARRIER), ("Rolling Containers", _S.OTHER),
+    ("Building", _S.BUILDING), ("Other Static Object", _S.OTHER),
+)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,8 +78,7 @@ class Objects:
     uuid, which of an object's boxes to keep of those that a frame has: the lowest.
 
     The best is the one with boxes in most frames, so that a track keeps to one sensor; then the
-    spinning sensor's, which sees all around; then the first in the files.
-    """
+    spinning sensor's, which sees all around; then the first in the files."""
 
     names: Mapping[str, str]
     ranks: Mapping[str, int]
@@ -67,15 +94,14 @@ class Objects:
 
 def sensors_of(table: pd.DataFrame) -> list[int]:
     """Each box's sensor: 0, 1, or -1 where it has none or the table does not say."""
-    column = table.get("cuboids.sensor_id", pd.Series([_EACH_ALONE] * len(table)))
-    return [int(value) if value in (0, 1) else _EACH_ALONE for value in column]
+    column = table.get("cuboids.sensor_id", pd.Series([_NO_SENSOR] * len(table)))
+    return [int(value) if value in (0, 1) else _NO_SENSOR for value in column]
 
 
 def read_objects(root: Path) -> Objects:
     """The objects of all frames of a sequence; remembered as long as its files stay as they are.
 
-    A table that cannot be read says nothing here: it is an error of its own frame.
-    """
+    A table that cannot be read says nothing here: it is an error of its own frame."""
     paths = sorted((root / "annotations" / "cuboids").glob("*.pkl.gz"))
     frames = [(int(path.name[:-7]), path.stat()) for path in paths if path.name[:-7].isdecimal()]
     return _read_objects(root, tuple((n, s.st_mtime_ns, s.st_size) for n, s in frames))
@@ -100,8 +126,7 @@ def find_objects(tables: Mapping[int, pd.DataFrame]) -> Objects:
     By links in both directions, then by those in one, then, of boxes without a partner, by overlap:
     of one class, of both sensors where the tables name these, and MIN_OVERLAP at least on average
     over the frames that have both. A tie is refused where it would make two boxes of one sensor in
-    one frame the same object.
-    """
+    one frame the same object."""
     boxes = _Boxes.of(tables)
     group = {uuid: [uuid] for uuid in boxes.frames}
     for a, b in [*_links(tables, boxes), *_overlapping(tables, boxes)]:
@@ -145,7 +170,7 @@ class _Boxes:
         )
 
     def same_sensor(self, a: str, b: str) -> bool:
-        return self.sensors[a] == self.sensors[b] != _EACH_ALONE
+        return self.sensors[a] == self.sensors[b] != _NO_SENSOR
 
 
 def _links(tables: Mapping[int, pd.DataFrame], boxes: _Boxes) -> list[tuple[str, str]]:
@@ -176,7 +201,7 @@ def _overlaps(table: pd.DataFrame, boxes: _Boxes) -> Iterator[tuple[tuple[str, s
     places, sizes, yaws = values[:, :3], values[:, 3:6], np.degrees(values[:, 6])
     usable = np.isfinite(values).all(axis=1) & (sizes > 0).all(axis=1)
     if "cuboids.sensor_id" in table:
-        usable &= np.array(sensors_of(table)) != _EACH_ALONE
+        usable &= np.array(sensors_of(table)) != _NO_SENSOR
     chosen = np.flatnonzero(usable)
     for place, i in enumerate(chosen):
         others = chosen[place + 1 :]
@@ -197,46 +222,9 @@ def _intersection_over_union(a: _Rectangle, b: _Rectangle) -> float:
     return shared / (np.prod(a[1]) + np.prod(b[1]) - shared)
 
 
-# ---- labels --------------------------------------------------------------------------------------
-
-NO_SURFACE = -1  # stands for returns that no surface made, where a SemanticClass is expected
-
-# The sensors on the car: forward, left, up of the ego origin. The spinning one is where all six
-# cameras' poses put it by the published extrinsics, within 2 cm. Those of the forward one put it at
-# (1.41, 0.00, 1.55); from (1.35, 0.04, 1.65) its returns hide each other least, within about 5 cm.
-SENSORS_M = np.array([[0.81, 0.0, 1.85], [1.35, 0.04, 1.65]])
-
-# The published classes.json, numbered from 1.
-_S = SemanticClass
-_CLASSES: tuple[tuple[str, int], ...] = (
-    ("Smoke", NO_SURFACE), ("Exhaust", NO_SURFACE), ("Spray or rain", NO_SURFACE),
-    ("Reflection", NO_SURFACE), ("Vegetation", _S.VEGETATION), ("Ground", _S.TERRAIN),
-    ("Road", _S.ROAD), ("Lane Line Marking", _S.LANE_MARKING),
-    ("Stop Line Marking", _S.LANE_MARKING), ("Other Road Marking", _S.LANE_MARKING),
-    ("Sidewalk", _S.SIDEWALK), ("Driveway", _S.SIDEWALK), ("Car", _S.VEHICLE),
-    ("Pickup Truck", _S.VEHICLE), ("Medium-sized Truck", _S.VEHICLE), ("Semi-truck", _S.VEHICLE),
-    ("Towed Object", _S.VEHICLE), ("Motorcycle", _S.TWO_WHEELER),
-    ("Other Vehicle - Construction Vehicle", _S.VEHICLE),
-    ("Other Vehicle - Uncommon", _S.VEHICLE), ("Other Vehicle - Pedicab", _S.TWO_WHEELER),
-    ("Emergency Vehicle", _S.VEHICLE), ("Bus", _S.VEHICLE),
-    ("Personal Mobility Device", _S.TWO_WHEELER), ("Motorized Scooter", _S.TWO_WHEELER),
-    ("Bicycle", _S.TWO_WHEELER), ("Train", _S.VEHICLE), ("Trolley", _S.VEHICLE),
-    ("Tram / Subway", _S.VEHICLE), ("Pedestrian", _S.PEDESTRIAN),
-    ("Pedestrian with Object", _S.PEDESTRIAN), ("Animals - Bird", _S.OTHER),
-    ("Animals - Other", _S.OTHER), ("Pylons", _S.BARRIER), ("Road Barriers", _S.BARRIER),
-    ("Signs", _S.SIGN), ("Cones", _S.OTHER), ("Construction Signs", _S.SIGN),
-    ("Temporary Construction Barriers", _S.BARRIER), ("Rolling Containers", _S.OTHER),
-    ("Building", _S.BUILDING), ("Other Static Object", _S.OTHER),
-)  # fmt: skip
-
-
 def semantic_table(root: Path) -> np.ndarray:
     """SemanticClass (or NO_SURFACE) by the sequence's class number, int16 [256]; unknown names
-    are UNKNOWN. Numbers are those of annotations/semseg/classes.json, or of the published list.
-
-    Raises:
-        AdapterError: classes.json is there but is no table of numbers and names.
-    """
+    are UNKNOWN. Numbers are those of annotations/semseg/classes.json, or of the published list."""
     names = {number: name for number, (name, _) in enumerate(_CLASSES, start=1)}
     path = root / "annotations" / "semseg" / "classes.json"
     if path.exists():
@@ -247,13 +235,9 @@ def semantic_table(root: Path) -> np.ndarray:
                     f"{path} must map class numbers to names; got {key!r:.80}: {name!r:.80}"
                 )
         names = {int(key): name for key, name in found.items()}
-    meaning = dict(_CLASSES)
-    table = np.full(256, SemanticClass.UNKNOWN, dtype=np.int16)
-    for number, name in names.items():
-        if not 0 <= number < len(table):
-            raise AdapterError(f"{path}: class numbers must lie in 0 to 255; got {number}")
-        table[number] = meaning.get(name, SemanticClass.UNKNOWN)
-    return table
+        if max(names, default=0) > 255:
+            raise AdapterError(f"{path}: class numbers must lie in 0 to 255; got {max(names)}")
+    return class_table(names, dict(_CLASSES))
 
 
 @dataclass(frozen=True)
@@ -265,8 +249,7 @@ class PandaSetLabels:
     frames; attributes hold every column of the file under its own name (None where a text is
     missing), the box's own uuid, yaw and sibling included. Sweeps: columns x y z (metres), i
     (intensity 0 to 255), t (seconds), d (0: the spinning sensor, 1: the forward one) exactly as in
-    the file, and semantic (the dataset's own class numbers) where the frame has them.
-    """
+    the file, and semantic (the dataset's own class numbers) where the frame has them."""
 
     root: Path
 
@@ -285,16 +268,11 @@ class PandaSetLabels:
 
     def lidar_classes(self, sweep: LidarSweep) -> np.ndarray | None:
         """The SemanticClass of each return, or NO_SURFACE; None for a sweep without classes."""
-        classes = sweep.columns.get("semantic")
-        if classes is None:
-            return None
-        table = semantic_table(self.root)
-        return table[np.clip(classes, 0, len(table) - 1)]
+        return classes_of(sweep, semantic_table(self.root))
 
     def lidar_origins(self, frame_index: int, sweep: LidarSweep) -> np.ndarray | None:
         """Where each return's own sensor was at its own time: the car on a straight line between
-        its poses at the ends of the sweeps, and turned as at the end of this one.
-        """
+        its poses at the ends of the sweeps, and turned as at the end of this one."""
         world_from_ego, times_ns = read_ego_track(self.root)
         if not 0 <= frame_index < len(times_ns):
             return None
@@ -332,8 +310,7 @@ class PandaSetLabels:
 
 def places_at(places_m: np.ndarray, times_s: np.ndarray, wanted_s: np.ndarray) -> np.ndarray:
     """Positions [N, 3] at times [N] on the straight lines through places [F, 3] at rising times
-    [F], the first of which goes on to before it and the last to after it.
-    """
+    [F], the first of which goes on to before it and the last to after it."""
     if len(times_s) == 1:
         return np.broadcast_to(places_m[0], (len(wanted_s), 3))
     after = np.clip(np.searchsorted(times_s, wanted_s), 1, len(times_s) - 1)
@@ -346,8 +323,7 @@ def boxes_of_cuboids(table: pd.DataFrame) -> Boxes:
     """A frame's cuboids as boxes.
 
     PandaSet's box has its length along y and its width along x, turned by yaw from world axes;
-    here x is forward, so the heading is a quarter turn more and the first two sizes swap.
-    """
+    here x is forward, so the heading is a quarter turn more and the first two sizes swap."""
     half = (table["yaw"].to_numpy(dtype=np.float64) + np.pi / 2) / 2
     zero = np.zeros_like(half)
     dimensions = [table[f"dimensions.{axis}"].to_numpy(dtype=np.float64) for axis in "yxz"]

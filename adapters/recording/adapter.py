@@ -13,8 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import cv2
@@ -22,18 +21,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from adapters.lidar_scene.image_views import View, read_image
-from adapters.lidar_scene.scene import (
-    DriveOptions,
-    LidarScene,
-    LidarSceneOptions,
-    build_lidar_scene,
-    path_of,
-    scene_of,
-    views_of,
-    without_points,
-)
-from adapters.lidar_scene.split import BoxSample, Sweep, join_tracks
+from adapters.lidar_scene.scene import build_lidar_scene, views_of, without_points
+from adapters.lidar_scene.split import join_tracks
 from adapters.lidar_scene.surfels import SplatShape, Surfels, gaussians_from_surfels
+from adapters.raw_drive import BoxSample, DriveOptions, RecordedObjects, Sweep, read_objects
 from adapters.recording.files import (
     CALIBRATION,
     Calibration,
@@ -42,13 +33,7 @@ from adapters.recording.files import (
     read_calibration,
     unlisted_images,
 )
-from adapters.recording.labels import (
-    RecordedObjects,
-    RecordingLabels,
-    all_boxes,
-    read_lidar_drive,
-    read_objects,
-)
+from adapters.recording.labels import RecordingLabels, all_boxes, read_lidar_drive
 from adapters.uri import format_uri
 from adapters.world import join_gaussians
 from augment.cameras import Camera, Frame
@@ -60,23 +45,152 @@ from augment.scene import Gaussians, Scene
 from augment.semantics import SemanticClass
 from recipes.files import open_file
 
-# ---- Depth images of a recording back-projected: sweeps for a drive without LiDAR ----------------
-# depth/<camera>/<frame>.png: 16 bits, metres x 256 along the optical axis, 0 = none.
+_MIN_RETURNS = 100  # no surface is found among fewer
+_DEPTH_TOP_DEG = 90.0  # what a depth image leaves open has no surface, however high it is
+_SKY_ABOVE_DEG = 15.0  # with nothing but a flat ground drawn, every column's top is sky
 
-POINTS_PER_IMAGE = 40_000  # more than the voxels near the path need of each image of a drive
-_FARTHEST_M = 200.0  # beyond, one step of the file's may be less than the depth's own error
+# Depth images back-projected: sweeps for a drive without LiDAR.
+_POINTS_PER_IMAGE = 40_000  # more than the voxels near the path need of each image of a drive
+_MAX_DEPTH_M = 200.0  # beyond, one step of the file's may be less than the depth's own error
 # A pixel whose inverse depth is off the line through its neighbours by more than this part lies on
 # an edge, where renderers and estimators mix two depths. A plane's inverse depth is linear.
 _BENT = 0.05
 
+# Surfaces for a drive of which no distance is known: a start for reconstruction, no more. The road
+# is taken to lie under the ego origin, objects fill their boxes, and what the images show elsewhere
+# may be at any distance: nearly transparent splats on shells around the cameras, among which
+# optimisation chooses.
+_MAX_GAUSSIANS = 60_000
+_SHELL_SHARE = 2 / 3  # of them; the rest are ground and boxes
+_VOXEL_M = 0.15  # finer ground would only be a finer guess
+_SHELLS_M = 4.0 * 20.0 ** (np.arange(6) / 5)  # 4 m to 80 m, a factor of 1.8 apart
+_GROUND_REACH_M, _GROUND_STEP_M, _BOX_STEP_M = 40.0, 0.5, 0.15
+_MAX_VIEWS = 48
+_DRIVEN_M = 1.6  # the car went through here: nothing stands there
+_MIN_CAMERA_HEIGHT_M = 0.1
+_ABOVE_GROUND_M = 0.2  # a ray that is lower at a shell has met the ground before
+_SHAPE = SplatShape(sigma_per_spacing=0.5, opacity=0.1)
+_IMAGE_SCALE, _SMALL_PX = 0.125, 64  # smaller images are read as they are
+_NEVER_NS = -(2**62)  # a time at which no object exists: these points belong to the static world
+
+
+def open_recording(path: str, query: dict[str, str]) -> Scene:
+    """The scene of a recording's folder, such as `out/street-seed3/clear-000`.
+
+    query: frames, voxel_m, max_gaussians, image_scale, sky_size, held_out; see DriveOptions.
+    Opening is deterministic: the same files and options give the same bits. Without LiDAR the
+    scene starts from depth images, or else from guesses; Scene.problems says which.
+
+    Raises:
+        AdapterError: a wrong option; calibration that is missing, damaged or not finite; no usable
+            image; a damaged LiDAR file or table of boxes; a file outside the folder.
+    """
+    options = DriveOptions.from_query("recording", query)
+    root = Path(path)
+    if not root.is_dir():
+        raise AdapterError(f"{root} is not a folder; expected one with calibration.json in it")
+    calibration = read_calibration(root)
+    numbers = [frame.index for frame in calibration.frames]
+    chosen = options.select(numbers, where=f"recording:{path}")
+    listed = [frame for frame in calibration.frames if frame.index in set(chosen.numbers)]
+    frames, image_problems = find_images(root, listed)
+    used = [frame for frame in frames if frame.index not in chosen.held_out]
+    if not any(frame.image_paths for frame in used):
+        raise AdapterError(
+            f"{root / 'images'} holds no usable image of the frames that are not held out "
+            f"({used[0].index} to {used[-1].index}); colours cannot be had without them"
+        )
+    objects = read_objects(frames, all_boxes(root), calibration.world_origin_m)
+    tracks = join_tracks(objects.moving)
+    found = (
+        *unlisted_images(root, calibration.frames),
+        *image_problems,
+        *chosen.problems,
+        *objects.problems,
+    )
+
+    def build(
+        sweeps: Sequence[Sweep], options: DriveOptions, top_deg: float, problems: Sequence[str]
+    ) -> Scene:
+        scene = build_lidar_scene(
+            sweeps,
+            tracks,
+            views_of(used),
+            options,
+            lidar_top_deg=top_deg,
+            name=calibration.name,
+            source=format_uri("recording", path, query),
+            frames=frames,
+            labels=RecordingLabels(root),
+            world_origin_m=calibration.world_origin_m,
+            problems=(*found, *problems),
+            has_metric_scale=calibration.has_metric_scale,
+        )
+        problems = scene.problems + without_points(tracks, scene)
+        return dataclasses.replace(scene, problems=problems)
+
+    scene = _best_scene(root, calibration, options, frames, used, objects, build)
+    if len(scene.background) + len(scene.actors) == 0:
+        raise AdapterError(
+            f"{root}: none of the points that were measured is in any image; check in "
+            f"calibration.json that camera axes are x right, y down, z forward, and that LiDAR "
+            f"and poses are in one world with z up"
+        )
+    return scene
+
+
+def _best_scene(
+    root: Path,
+    calibration: Calibration,
+    options: DriveOptions,
+    frames: Sequence[Frame],
+    used: Sequence[Frame],
+    objects: RecordedObjects,
+    build: Callable[[Sequence[Sweep], DriveOptions, float, Sequence[str]], Scene],
+) -> Scene:
+    """The scene from LiDAR, else from depth images, else from guesses.
+
+    used: the frames that are not held out. build: from sweeps, options, the highest elevation in
+    degrees that the sensor looks at, and what was missing."""
+    lidar = read_lidar_drive(root, calibration, used)
+    if len(lidar) >= _MIN_RETURNS:
+        return build(lidar.sweeps, options, lidar.top_deg, lidar.problems)
+    sweeps, problems = depth_sweeps(root, used)
+    problems = lidar.problems + problems
+    if any(len(sweep) for sweep in sweeps):
+        start = (
+            f"{root / 'lidar'} holds {len(lidar) or 'no'} returns: the scene starts from the "
+            f"points of {len(sweeps)} depth images"
+        )
+        return build(sweeps, options, _DEPTH_TOP_DEG, (*problems, start))
+    start = (
+        f"{root / 'lidar'} holds {len(lidar) or 'no'} returns and {root / 'depth'} no depth: the "
+        f"scene starts from a flat ground {calibration.ego_above_ground_m:g} m below the ego "
+        f"origin, the labelled boxes, and splats guessed along the cameras' rays; reconstruct it "
+        f"before rendering it"
+    )
+    road = ground_heights(frames, calibration.ego_above_ground_m)
+    check_cameras_above(root / CALIBRATION, frames, road)
+    budget = min(_MAX_GAUSSIANS, options.max_gaussians)
+    shells = guess_shells(views_of(used), road, round(budget * _SHELL_SHARE))
+    coarse = dataclasses.replace(
+        options, voxel_m=max(_VOXEL_M, options.voxel_m), max_gaussians=budget - len(shells)
+    )
+    sweeps = guess_surfaces(road, objects.moving, objects.still)
+    scene = build(sweeps, coarse, _SKY_ABOVE_DEG, (*problems, start))
+    # Whatever was found in the guessed surfaces is the height they were given.
+    assumed = Ground(float(road[:, 2].min()), float(np.median(road[:, 2])), "ego path")
+    return dataclasses.replace(
+        scene,
+        background=join_gaussians([scene.background, shells]),
+        ground_z_m=assumed.lowest_z_m,
+        ground=assumed,
+    )
+
 
 def depth_sweeps(root: Path, frames: Sequence[Frame]) -> tuple[tuple[Sweep, ...], tuple[str, ...]]:
     """One sweep for each depth image of the frames' cameras, and a sentence for each image that
-    cannot be used. Each point has its camera's time.
-
-    Raises:
-        AdapterError: a file lies outside the folder.
-    """
+    cannot be used. Each point has its camera's time."""
     sweeps, problems = [], []
     names = dict.fromkeys(name for frame in frames for name in frame.cameras)
     files = {n: numbered_files(root, f"depth/{folder_name(n)}", (".png",)) for n in names}
@@ -101,15 +215,14 @@ def depth_sweeps(root: Path, frames: Sequence[Frame]) -> tuple[tuple[Sweep, ...]
 
 
 def back_project(depth_m: np.ndarray, camera: Camera) -> Sweep:
-    """Points of a depth image [H, W], at most about POINTS_PER_IMAGE, on a regular grid of pixels.
+    """Points of a depth image [H, W], at most about _POINTS_PER_IMAGE, on a regular grid of pixels.
 
-    Left out: no depth, far depth, and pixels on edges between near and far.
-    """
+    Left out: no depth, far depth, and pixels on edges between near and far."""
     inverse = np.where(depth_m > 0, 1 / np.maximum(depth_m, 1e-3), 0).astype(np.float32)
-    usable = (depth_m > 0) & (depth_m < _FARTHEST_M)
+    usable = (depth_m > 0) & (depth_m < _MAX_DEPTH_M)
     usable[1:-1] &= _is_straight(inverse[:-2], inverse[1:-1], inverse[2:])
     usable[:, 1:-1] &= _is_straight(inverse[:, :-2], inverse[:, 1:-1], inverse[:, 2:])
-    step = max(1, math.ceil(math.sqrt(depth_m.size / POINTS_PER_IMAGE)))
+    step = max(1, math.ceil(math.sqrt(depth_m.size / _POINTS_PER_IMAGE)))
     rows, columns = np.nonzero(usable[step // 2 :: step, step // 2 :: step])
     rows, columns = rows * step + step // 2, columns * step + step // 2
     z = depth_m[rows, columns].astype(np.float64)
@@ -118,38 +231,11 @@ def back_project(depth_m: np.ndarray, camera: Camera) -> Sweep:
         axis=1,
     )
     pose = camera.world_from_camera.numpy()
-    points = (local @ pose[:3, :3].T + pose[:3, 3]).astype(np.float32)
-    return Sweep(
-        points,
-        np.full(len(points), camera.timestamp_ns),
-        np.full(len(points), SemanticClass.UNKNOWN, np.int16),
-    )
+    return Sweep.of_unknown_class(local @ pose[:3, :3].T + pose[:3, 3], camera.timestamp_ns)
 
 
 def _is_straight(before: np.ndarray, here: np.ndarray, after: np.ndarray) -> np.ndarray:
     return np.abs(before + after - 2 * here) <= _BENT * here
-
-
-# ---- Surfaces for a drive of which no distance is known: a start for reconstruction, no more -----
-# The road is taken to lie under the ego origin, objects fill their boxes, and what the images show
-# elsewhere may be at any distance: coloured, nearly transparent splats on shells around the
-# cameras,
-# among which optimisation chooses.
-
-MAX_GAUSSIANS = 60_000
-SHELL_SHARE = 2 / 3  # of them; the rest are ground and boxes
-VOXEL_M = 0.15  # finer ground would only be a finer guess
-SHELLS_M = 4.0 * 20.0 ** (np.arange(6) / 5)  # 4 m to 80 m, a factor of 1.8 apart
-_GROUND_REACH_M = 40.0
-_GROUND_STEP_M = 0.5
-_BOX_STEP_M = 0.15
-_MAX_VIEWS = 48
-_DRIVEN_M = 1.6  # the car went through here: nothing stands there
-_LOWEST_CAMERA_M = 0.1
-_ABOVE_GROUND_M = 0.2  # a ray that is lower at a shell has met the ground before
-_SHAPE = SplatShape(sigma_per_spacing=0.5, opacity=0.1)
-_IMAGE_SCALE, _SMALL_PX = 0.125, 64  # smaller images are read as they are
-_NEVER_NS = -(2**62)  # a time at which no object exists: these points belong to the static world
 
 
 def ground_heights(frames: Sequence[Frame], ego_above_ground_m: float) -> np.ndarray:
@@ -163,7 +249,7 @@ def check_cameras_above(path: Path, frames: Sequence[Frame], road: np.ndarray) -
     for frame, ground in zip(frames, road, strict=True):
         for name, camera in frame.cameras.items():
             height_m = float(camera.centre[2]) - ground[2]
-            if height_m < _LOWEST_CAMERA_M:
+            if height_m < _MIN_CAMERA_HEIGHT_M:
                 raise AdapterError(
                     f"{path}, frame {frame.index}, camera {name!r}: it is {height_m:.2f} m above "
                     f"the ground that is taken to lie under the ego origin; without LiDAR or depth "
@@ -177,21 +263,19 @@ def guess_surfaces(
     """Points on the ground around the path and on the sides and tops of all boxes.
 
     road: float64 [F, 3], see `ground_heights`. Where the ground is between poses is the nearest
-    pose's height.
-    """
-    sweeps = [_sweep(_ground(road), _NEVER_NS)]
-    sweeps += [_sweep(_box_surface(box), _NEVER_NS) for box in still]
+    pose's height."""
     once = {box.object_id: box for box in reversed(moving)}
-    sweeps += [_sweep(_box_surface(box), box.timestamp_ns) for box in once.values()]
-    return tuple(sweeps)
+    things = [(_ground(road), _NEVER_NS)]
+    things += [(_box_surface(box), _NEVER_NS) for box in still]
+    things += [(_box_surface(box), box.timestamp_ns) for box in once.values()]
+    return tuple(Sweep.of_unknown_class(*thing) for thing in things)
 
 
 def guess_shells(views: Sequence[View], road: np.ndarray, count: int) -> Gaussians:
-    """At most about `count` Gaussians at the distances SHELLS_M along rays of the images.
+    """At most about `count` Gaussians at the distances _SHELLS_M along rays of the images.
 
     Each ray gets one of the distances, its neighbours others. Nothing where the car drove, under
-    the ground, or where an image cannot be decoded.
-    """
+    the ground, or where an image cannot be decoded."""
     chosen = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, _MAX_VIEWS).astype(int))]
     tree = cKDTree(road[:, :2])
     parts = []
@@ -224,30 +308,18 @@ def _box_surface(box: BoxSample) -> np.ndarray:
     faces = []
     for axis, sign in ((0, -1), (0, 1), (1, -1), (1, 1), (2, 1)):
         others = [other for other in range(3) if other != axis]
-        steps = [max(2, int(np.ceil(2 * half[o] / _BOX_STEP_M)) + 1) for o in others]
-        a, b = np.meshgrid(
-            *(
-                np.linspace(-half[o], half[o], min(n, 200))
-                for o, n in zip(others, steps, strict=True)
-            )
-        )
+        counts = [max(2, int(np.ceil(2 * half[o] / _BOX_STEP_M)) + 1) for o in others]
+        ticks = [
+            np.linspace(-half[o], half[o], min(count, 200))
+            for o, count in zip(others, counts, strict=True)
+        ]
+        a, b = np.meshgrid(*ticks)
         face = np.empty((a.size, 3))
-        face[:, axis], face[:, others[0]], face[:, others[1]] = (
-            sign * half[axis],
-            a.ravel(),
-            b.ravel(),
-        )
+        face[:, axis] = sign * half[axis]
+        face[:, others[0]], face[:, others[1]] = a.ravel(), b.ravel()
         faces.append(face)
     local = np.concatenate(faces)
     return local @ box.world_from_box[:3, :3].T + box.world_from_box[:3, 3]
-
-
-def _sweep(points: np.ndarray, timestamp_ns: int) -> Sweep:
-    return Sweep(
-        points.astype(np.float32),
-        np.full(len(points), timestamp_ns, np.int64),
-        np.full(len(points), SemanticClass.UNKNOWN, np.int16),
-    )
 
 
 def _shell_points(
@@ -267,9 +339,9 @@ def _shell_points(
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     j, i = np.divmod(np.arange(rows * columns), columns)
     # Neighbours in a row get all distances in turn; rows and images begin elsewhere.
-    distance = SHELLS_M[(i + 2 * j + number) % len(SHELLS_M)]
+    distance = _SHELLS_M[(i + 2 * j + number) % len(_SHELLS_M)]
     # The points of one shell are sqrt(shells) rays apart.
-    spacing = distance / grid.fx * len(SHELLS_M) ** 0.5
+    spacing = distance / grid.fx * len(_SHELLS_M) ** 0.5
     points = camera.centre.numpy() + distance[:, None] * rays
     return points, -rays, spacing, colours.reshape(-1, 3).astype(np.float32) / 255
 
@@ -292,128 +364,3 @@ def _facing(
     )
     unknown = np.full(len(points), SemanticClass.UNKNOWN, np.int16)
     return gaussians_from_surfels(surfels, colours.astype(np.float32), unknown, _SHAPE)
-
-
-# ---- adapter -------------------------------------------------------------------------------------
-
-_MIN_RETURNS = 100  # no surface is found among fewer
-_DEPTH_TOP_DEG = 90.0  # what a depth image leaves open has no surface, however high it is
-_SKY_ABOVE_DEG = 15.0  # with nothing but a flat ground drawn, every column's top is sky
-
-
-def open_recording(path: str, query: dict[str, str]) -> Scene:
-    """The scene of a recording's folder, such as `out/street-seed3/clear-000`.
-
-    query: frames, voxel_m, max_gaussians, image_scale, sky_size, held_out; see DriveOptions.
-    Opening is deterministic: the same files and options give the same bits. Without LiDAR the
-    scene starts from depth images, or else from guesses; Scene.problems says which.
-
-    Raises:
-        AdapterError: a wrong option; calibration that is missing, damaged or not finite; no usable
-            image; a damaged LiDAR file or table of boxes; a file outside the folder.
-    """
-    options = DriveOptions.from_query("recording", query)
-    root = Path(path)
-    if not root.is_dir():
-        raise AdapterError(f"{root} is not a folder; expected one with calibration.json in it")
-    calibration = read_calibration(root)
-    numbers = [frame.index for frame in calibration.frames]
-    chosen = options.select(numbers, where=f"recording:{path}")
-    listed = [frame for frame in calibration.frames if frame.index in set(chosen.numbers)]
-    frames, image_problems = find_images(root, listed)
-    used = [frame for frame in frames if frame.index not in chosen.held_out]
-    if not any(frame.image_paths for frame in used):
-        raise AdapterError(
-            f"{root / 'images'} holds no usable image of the frames that are not held out "
-            f"({used[0].index} to {used[-1].index}); colours cannot be had without them"
-        )
-    objects = read_objects(frames, all_boxes(root), calibration.world_origin_m)
-    start = _Start(root, calibration, options, frames, used, objects)
-    built, problems = start.build()
-    if len(built.background) + len(built.actors) == 0:
-        raise AdapterError(
-            f"{root}: none of the points that were measured is in any image; check in "
-            f"calibration.json that camera axes are x right, y down, z forward, and that LiDAR "
-            f"and poses are in one world with z up"
-        )
-    return scene_of(
-        built,
-        name=calibration.name,
-        source=format_uri("recording", path, query),
-        frames=frames,
-        labels=RecordingLabels(root),
-        world_origin_m=calibration.world_origin_m,
-        has_metric_scale=calibration.has_metric_scale,
-        problems=(
-            *unlisted_images(root, calibration.frames),
-            *image_problems,
-            *chosen.problems,
-            *objects.problems,
-            *problems,
-        ),
-    )
-
-
-@dataclass(frozen=True, eq=False)
-class _Start:
-    """What a scene is built from. frames: all; used: those that are not held out."""
-
-    root: Path
-    calibration: Calibration
-    options: DriveOptions
-    frames: Sequence[Frame]
-    used: Sequence[Frame]
-    objects: RecordedObjects
-
-    def build(self) -> tuple[LidarScene, tuple[str, ...]]:
-        """The scene from the best there is, and what was missing, one sentence each."""
-        lidar = read_lidar_drive(self.root, self.calibration, self.used)
-        if len(lidar) >= _MIN_RETURNS:
-            return self._surfaces(lidar.sweeps, lidar.top_deg), lidar.problems
-        sweeps, problems = depth_sweeps(self.root, self.used)
-        problems = lidar.problems + problems
-        if any(len(sweep) for sweep in sweeps):
-            said = (
-                f"{self.root / 'lidar'} holds {len(lidar) or 'no'} returns: the scene starts from "
-                f"the points of {len(sweeps)} depth images"
-            )
-            return self._surfaces(sweeps, _DEPTH_TOP_DEG), (*problems, said)
-        said = (
-            f"{self.root / 'lidar'} holds {len(lidar) or 'no'} returns and {self.root / 'depth'} "
-            f"no depth: the scene starts from a flat ground "
-            f"{self.calibration.ego_above_ground_m:g} m below the ego origin, the labelled boxes, "
-            f"and splats guessed along the cameras' rays; reconstruct it before rendering it"
-        )
-        return self._guess(), (*problems, said)
-
-    def _surfaces(self, sweeps: Sequence[Sweep], top_deg: float) -> LidarScene:
-        return self._built(sweeps, self.options.scene_options(lidar_top_deg=top_deg))
-
-    def _guess(self) -> LidarScene:
-        road = ground_heights(self.frames, self.calibration.ego_above_ground_m)
-        check_cameras_above(self.root / CALIBRATION, self.frames, road)
-        most = min(MAX_GAUSSIANS, self.options.max_gaussians)
-        shells = guess_shells(views_of(self.used), road, round(most * SHELL_SHARE))
-        coarse = dataclasses.replace(
-            self.options.scene_options(lidar_top_deg=_SKY_ABOVE_DEG),
-            voxel_m=max(VOXEL_M, self.options.voxel_m),
-            max_gaussians=most - len(shells),
-        )
-        sweeps = guess_surfaces(road, self.objects.moving, self.objects.still)
-        built = self._built(sweeps, coarse)
-        # Whatever was found in the guessed surfaces is the height they were given.
-        assumed = Ground(float(road[:, 2].min()), float(np.median(road[:, 2])), "ego path")
-        return dataclasses.replace(
-            built,
-            background=join_gaussians([built.background, shells]),
-            ground_z_m=assumed.lowest_z_m,
-            ground=assumed,
-        )
-
-    def _built(self, sweeps: Sequence[Sweep], options: LidarSceneOptions) -> LidarScene:
-        tracks = join_tracks(self.objects.moving)
-        views, path = views_of(self.used), path_of(self.frames)
-        built = build_lidar_scene(sweeps, tracks, views, path, options)
-        return dataclasses.replace(
-            built, problems=(*built.problems, *without_points(tracks, built))
-        )

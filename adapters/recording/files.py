@@ -3,10 +3,22 @@
     images/<camera>/<frame>.png|jpg   depth/<camera>/<frame>.png   lidar/<frame>.parquet
     labels/boxes.parquet              calibration.json
 
-What a `generate` job wrote has labels/boxes/*.parquet and calibration/*.json in their place.
+What a `generate` job wrote has labels/boxes/*.parquet and calibration/*.json in their place, each
+of some frames and cameras; they are taken together. Frame numbers may have leading zeros or not. A
+camera's folder is its name, or, for a name that is no safe folder name, what
+`augment.jobs.layout.folder_name` makes of it.
 
-Frame numbers may have leading zeros or not. A camera's folder is its name, or, for a name that is
-no safe folder name, what `augment.jobs.layout.folder_name` makes of it.
+Of calibration.json, the file that a render job writes, only `frames` is required, and in each frame
+`frame`, `timestamp_ns`, `world_from_ego` and `cameras`; a camera's timestamp_ns is the frame's
+where it has none. Further keys, all optional:
+
+    ego_above_ground_m   height of the ego origin above the road, 0 by default
+    ego_box_m            [[x, y, z], [x, y, z]], lowest and highest corner of the recording car in
+                         ego axes: LiDAR returns in it are left out
+    lidar_classes        the LiDAR's class numbers by name of SemanticClass: {"7": "road"}; "none"
+                         for returns that no surface made
+
+Errors are AdapterErrors that name the file, the frame and the camera.
 """
 
 from __future__ import annotations
@@ -23,28 +35,24 @@ from typing import Any
 import numpy as np
 import torch
 
-from adapters.lidar_scene.scene import drive_origin
 from adapters.plain_files import LARGEST, array_of, number_of, read_image_size, read_json
+from adapters.raw_drive import NO_SURFACE, drive_origin
 from augment.cameras import Camera, Frame
 from augment.errors import AdapterError
 from augment.geometry import invert_rigid
-from augment.jobs.files import read_camera
 from augment.jobs.layout import folder_name
 from augment.jobs.manifest import MAX_SIDE_PX
 from augment.semantics import SemanticClass
 
-# ---- files ---------------------------------------------------------------------------------------
-
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 _READERS = 4  # threads that decode images to check them; decoding releases the interpreter
+CALIBRATION = "calibration.json"
+_IF_MISSING = "a recording needs it, docs/scenes.md shows what is in it"
+_RIGID = 1e-4  # rotations written with six digits are off by a few millionths
 
 
 def numbered_files(root: Path, folder: str, suffixes: Sequence[str]) -> dict[int, Path]:
-    """The files of a folder that are named by a number, by that number; none without the folder.
-
-    Raises:
-        AdapterError: two files have one number, or a file lies outside `root` through a link.
-    """
+    """The files of a folder that are named by a number, by that number; none without the folder."""
     where = root / folder
     if not where.is_dir():
         return {}
@@ -62,21 +70,13 @@ def numbered_files(root: Path, folder: str, suffixes: Sequence[str]) -> dict[int
 
 
 def block_files(root: Path, folder: str, suffix: str) -> list[Path]:
-    """The files of a folder by blocks of frames, as a `generate` job writes them, in order.
-
-    Raises:
-        AdapterError: a file lies outside `root` through a link.
-    """
+    """The files of a folder by blocks of frames, as a `generate` job writes them, in order."""
     return [inside(root, path) for path in sorted((root / folder).glob(f"*{suffix}"))]
 
 
 def inside(root: Path, path: Path) -> Path:
-    """The path itself.
-
-    Raises:
-        AdapterError: a link leads out of `root`: a folder from elsewhere must not make this
-            machine read its other files.
-    """
+    """The path itself, refused where a link leads out of `root`: a folder from elsewhere must not
+    make this machine read its other files."""
     real, real_root = path.resolve(), root.resolve()
     if not real.is_relative_to(real_root):
         raise AdapterError(
@@ -88,11 +88,7 @@ def inside(root: Path, path: Path) -> Path:
 
 def find_images(root: Path, frames: Sequence[Frame]) -> tuple[tuple[Frame, ...], tuple[str, ...]]:
     """The frames with the paths of their usable images, and a sentence for what is missing,
-    damaged, or not of the size that the calibration says.
-
-    Raises:
-        AdapterError: no image is usable, or a file lies outside the folder.
-    """
+    damaged, or not of the size that the calibration says."""
     names = list(dict.fromkeys(name for frame in frames for name in frame.cameras))
     files = {n: numbered_files(root, f"images/{folder_name(n)}", IMAGE_SUFFIXES) for n in names}
     problems = [
@@ -100,13 +96,11 @@ def find_images(root: Path, frames: Sequence[Frame]) -> tuple[tuple[Frame, ...],
         for name in names
         if not files[name]
     ]
-    wanted = [(frame, name) for frame in frames for name in frame.cameras if files[name]]
+    views = [(frame, name) for frame in frames for name in frame.cameras if files[name]]
     with ThreadPoolExecutor(_READERS) as pool:
-        faults = list(
-            pool.map(lambda w: _fault(files[w[1]].get(w[0].index), w[0].cameras[w[1]]), wanted)
-        )
+        faults = pool.map(lambda v: _fault(files[v[1]].get(v[0].index), v[0].cameras[v[1]]), views)
     usable: dict[int, dict[str, str]] = {frame.index: {} for frame in frames}
-    for (frame, name), fault in zip(wanted, faults, strict=True):
+    for (frame, name), fault in zip(views, faults, strict=True):
         if fault:
             problems.append(f"camera {name}, frame {frame.index}: {fault}")
         else:
@@ -158,35 +152,13 @@ def _fault(path: Path | None, camera: Camera) -> str:
     return ""
 
 
-# ---- `calibration.json` of a recording: frames and cameras, checked one by one -------------------
-# It is the file that a render job writes (augment.jobs.files); where there is none, those of
-# a `generate` job, `calibration/*.json`, each of some frames and cameras, are taken together.
-#
-# Only `frames` is required, and in each frame `frame`, `timestamp_ns`, `world_from_ego` and
-# `cameras`; a camera's timestamp_ns is the frame's where it has none. Further keys that
-# only a recording has, all optional:
-#
-#     ego_above_ground_m   height of the ego origin above the road, 0 by default
-#     ego_box_m            [[x, y, z], [x, y, z]], lowest and highest corner of the recording car in
-#                          ego axes: LiDAR returns in it are left out
-#     lidar_classes        the LiDAR's class numbers by name of SemanticClass: {"7": "road"}; "none"
-#                          for returns that no surface made
-
-CALIBRATION = "calibration.json"
-_IF_MISSING = "a recording needs it, docs/scenes.md shows what is in it"
-NO_SURFACE = -1  # stands for returns that no surface made, where a SemanticClass is expected
-# Rotations written with six digits are off by a few millionths.
-_RIGID = 1e-4
-
-
 @dataclass(frozen=True, eq=False)
 class Calibration:
     """A recording's cameras over time, in the scene's world: the file's minus world_origin_m.
 
     frames: in order of number and time, without image paths. lidar_classes: SemanticClass, or
     NO_SURFACE, by the LiDAR's own number; None where numbers are those of SemanticClass. ego_box_m:
-    float64 [2, 3] or None.
-    """
+    float64 [2, 3] or None."""
 
     name: str
     frames: tuple[Frame, ...]
@@ -198,12 +170,7 @@ class Calibration:
 
 
 def read_calibration(root: Path) -> Calibration:
-    """The calibration of the recording in a folder.
-
-    Raises:
-        AdapterError: missing, damaged, or a pose that is not finite and rigid; the message names
-            the file, the frame and the camera.
-    """
+    """The calibration of the recording in a folder."""
     path, content = _content(root)
     entries = content.get("frames")
     if not isinstance(entries, list) or not entries:
@@ -297,33 +264,22 @@ def _camera(where: str, name: str, camera: Any, frame_ns: int) -> Camera:
     if not isinstance(camera, dict):
         raise AdapterError(f"{where}: must be an object with width, height, fx ...; got {camera!r}")
     pose = _rigid(where, "world_from_camera", camera.get("world_from_camera"))
-    camera = {"timestamp_ns": frame_ns} | camera
-    _time(where, camera["timestamp_ns"])
+    time_ns = _time(where, camera.get("timestamp_ns", frame_ns))
     size = [camera.get(side) for side in ("width", "height")]
     if any(type(side) is not int or not 1 <= side <= MAX_SIDE_PX for side in size):
         raise AdapterError(
             f"{where}: width and height must be whole pixels, 1 to {MAX_SIDE_PX}; got {size!r:.80}"
         )
+    lens = {}
     for key in ("fx", "fy", "cx", "cy"):
-        if key in camera:
-            number_of(camera[key], f"{where}: {key} (pixels)")
+        if key not in camera:
+            raise AdapterError(f"{where}: {key!r} is missing")
+        lens[key] = number_of(camera[key], f"{where}: {key} (pixels)")
     try:
-        record = read_camera({"cameras": {name: camera}}, name)
-        k = record.K
         return Camera(
-            name=name,
-            width=record.width,
-            height=record.height,
-            fx=float(k[0, 0]),
-            fy=float(k[1, 1]),
-            cx=float(k[0, 2]),
-            cy=float(k[1, 2]),
-            camera_from_world=invert_rigid(pose),
-            timestamp_ns=record.timestamp_ns,
+            name, *size, **lens, camera_from_world=invert_rigid(pose), timestamp_ns=time_ns
         )
-    except KeyError as error:
-        raise AdapterError(f"{where}: {error} is missing") from None
-    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+    except ValueError as error:
         raise AdapterError(f"{where}: {error}") from None
 
 

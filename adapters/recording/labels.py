@@ -1,8 +1,9 @@
-"""Boxes and sweeps of a recording, passed through with every column."""
+"""A recording's boxes and sweeps: Parquet files of a job, read back to the bit by
+augment.jobs.tables, or plain ones of any other program, passed through with every column.
+"""
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -12,14 +13,12 @@ from typing import TypeVar
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-import torch
 from tqdm import tqdm
 
 from adapters.lidar_scene.depth import sweep_times, whole_numbers
-from adapters.lidar_scene.split import BoxSample, Sweep
 from adapters.plain_files import LARGEST
+from adapters.raw_drive import NO_SURFACE, Sweep, TimedBoxes, is_in_box
 from adapters.recording.files import (
-    NO_SURFACE,
     Calibration,
     block_files,
     inside,
@@ -30,64 +29,10 @@ from augment.cameras import Frame
 from augment.effects.lidar.beam import intensity_column
 from augment.effects.lidar.codes import INDEX_COLUMN
 from augment.errors import AdapterError, OutputError
-from augment.geometry import rotmat_from_quat
 from augment.jobs.tables import ATTRIBUTE_PREFIX, is_ours, read_boxes, read_lidar, read_table
 from augment.labels import Boxes, LidarSweep
 from augment.semantics import SemanticClass
 from recipes.files import open_file
-
-# ---- What the class numbers in a recording's LiDAR files mean ------------------------------------
-
-
-def class_numbers(path: Path, column: np.ndarray) -> np.ndarray:
-    """The column `semantic` as int64 [N]. path: its file or folder, for messages.
-
-    Raises:
-        AdapterError: it holds something else than whole numbers.
-    """
-    try:
-        return whole_numbers(column, "semantic")
-    except ValueError as error:
-        raise AdapterError(f"{path}: {error}") from None
-
-
-def class_table(
-    root: Path, numbers: np.ndarray, lidar_classes: Mapping[int, int] | None
-) -> tuple[np.ndarray | None, tuple[str, ...]]:
-    """SemanticClass (or NO_SURFACE) by the files' class number, int16, None where their meaning is
-    not known; and a sentence where that is so. numbers: those that occur.
-
-    Raises:
-        AdapterError: numbers out of range.
-    """
-    if len(numbers) == 0:
-        return None, ()
-    if lidar_classes is None:
-        known = (numbers >= 0) & (numbers < SemanticClass.SKY)
-        if not known.all():
-            return None, (
-                f"lidar/: the column semantic holds {int(numbers[~known][0])}, which is no "
-                f"SemanticClass (0 to {SemanticClass.SKY - 1}): classes are ignored. Say what the "
-                f'numbers mean in calibration.json: "lidar_classes": {{"7": "road", ...}}',
-            )
-        return np.arange(SemanticClass.SKY, dtype=np.int16), ()
-    size = max(0, int(numbers.max()), *lidar_classes) + 1
-    if numbers.min() < 0 or min(lidar_classes, default=0) < 0 or size > 2**16:
-        raise AdapterError(
-            f"{root / 'lidar'}: class numbers must lie in 0 to 65535; the files hold "
-            f"{int(numbers.min())} to {int(numbers.max())}, lidar_classes names "
-            f"{sorted(lidar_classes)}"
-        )
-    table = np.full(size, SemanticClass.UNKNOWN, np.int16)
-    for number, meaning in lidar_classes.items():
-        table[number] = meaning
-    return table, ()
-
-
-# ------------------------------------------------------------------------------------------------
-# Parquet files of a recording: those that a job wrote, and plain ones of any other program
-# A job's files carry NumPy's dtypes in their metadata and are read back to the bit by
-# augment.jobs.tables. Plain files are read as Arrow gives them.
 
 _VECTORS = {
     "centers_m": ("center_x_m", "center_y_m", "center_z_m"),
@@ -98,22 +43,76 @@ _REQUIRED = ("frame", "track_id", "label", *(name for names in _VECTORS.values()
 _CACHED_FILES = 4  # box files kept: every frame asks for its own part of one
 _DAMAGED = (OutputError, OSError, pa.ArrowException, KeyError, IndexError, TypeError, ValueError)
 Value = TypeVar("Value")
+_FAR_M = 1000.0  # no LiDAR on the ground sees this far
+_OWN_M, _OWN_PART = 1.5, 1e-3  # a car's own returns are some hundreds a sweep
+_TOP_QUANTILE = 0.999
+_TOP_BEYOND_M = 5.0  # nearer, a camera's height says little of the sensor's
+_TOP_DEG = (2.0, 60.0)
 
 
-@dataclass(frozen=True, eq=False)
-class TimedBoxes:
-    """Boxes of one frame. timestamps_ns: int64 [B], when each stood there; None: the frame's."""
+@dataclass(frozen=True)
+class RecordingLabels:
+    """Labels of one recording, read when asked, in the recording's own world."""
 
-    boxes: Boxes
-    timestamps_ns: np.ndarray | None
+    root: Path
+
+    def boxes(self, frame_index: int) -> Boxes:
+        timed = all_boxes(self.root).get(frame_index)
+        return Boxes.empty() if timed is None else timed.boxes
+
+    def lidar(self, frame_index: int) -> LidarSweep | None:
+        files = self.lidar_files(frame_index)
+        return read_sweep(files[0]) if files else None
+
+    def lidar_files(self, frame_index: int) -> tuple[Path, ...]:
+        path = lidar_files(self.root).get(frame_index)
+        return () if path is None else (path,)
+
+    def lidar_content(self, frame_index: int, file: Path, sweep: LidarSweep) -> bytes:
+        return sweep_content(file, sweep)
+
+    def lidar_classes(self, sweep: LidarSweep) -> np.ndarray | None:
+        """The SemanticClass of each return, or NO_SURFACE; None where the numbers are not known to
+        mean anything."""
+        column = sweep.columns.get("semantic")
+        if column is None:
+            return None
+        numbers = class_numbers(self.root / "lidar", column)
+        table, _ = class_table(self.root, np.unique(numbers), read_lidar_classes(self.root))
+        return None if table is None else table[numbers]
+
+    def lidar_origins(self, frame_index: int, sweep: LidarSweep) -> np.ndarray | None:
+        """The columns origin_x, origin_y, origin_z, in the world of the returns, where all three
+        hold numbers."""
+        columns = [sweep.columns.get(f"origin_{axis}") for axis in "xyz"]
+        if any(c is None or np.asarray(c).dtype.kind not in "fiu" for c in columns):
+            return None
+        return np.stack([np.asarray(column, np.float64) for column in columns], axis=1)
+
+
+def recording_labels(path: str, query: dict[str, str]) -> RecordingLabels:
+    """The labels of a folder; whatever the query, they are those of all its frames."""
+    return RecordingLabels(Path(path))
+
+
+def lidar_files(root: Path) -> dict[int, Path]:
+    """The sweeps' files by frame number."""
+    return numbered_files(root, "lidar", (".parquet",))
+
+
+def all_boxes(root: Path) -> dict[int, TimedBoxes]:
+    """The boxes of every frame that has any: of labels/boxes.parquet, or of a job's blocks, each of
+    which has all boxes of its frames."""
+    path = root / "labels" / "boxes.parquet"
+    one = [inside(root, path)] if path.exists() else None
+    found: dict[int, TimedBoxes] = {}
+    for path in one or block_files(root, "labels/boxes", ".parquet"):
+        found = read_frame_boxes(path) | found
+    return found
 
 
 def read_sweep(path: Path) -> LidarSweep:
-    """The sweep in a file, every column under its own name.
-
-    Raises:
-        AdapterError: damaged, or without numbers x, y, z; the message names the file.
-    """
+    """The sweep in a file, every column under its own name."""
 
     def read() -> LidarSweep:
         if is_ours(path):
@@ -128,11 +127,8 @@ def read_sweep(path: Path) -> LidarSweep:
 
 
 def sweep_content(path: Path, sweep: LidarSweep) -> bytes:
-    """The LiDAR file with a weathered sweep in place of its own: the same columns, types and notes.
-
-    Raises:
-        AdapterError: damaged; the message names the file.
-    """
+    """The LiDAR file with a weathered sweep in place of its own: the same columns, types and
+    notes."""
 
     def content() -> bytes:
         table = read_table(path, str(path)).take(pa.array(sweep.columns[INDEX_COLUMN]))
@@ -150,11 +146,7 @@ def sweep_content(path: Path, sweep: LidarSweep) -> bytes:
 
 
 def read_frame_boxes(path: Path) -> dict[int, TimedBoxes]:
-    """The boxes of every frame that has any.
-
-    Raises:
-        AdapterError: damaged, or without a column that a box needs; the message names the file.
-    """
+    """The boxes of every frame that has any."""
 
     def read() -> dict[int, TimedBoxes]:
         state = path.stat()
@@ -217,85 +209,41 @@ def _reading(path: Path, expected: str, read: Callable[[], Value]) -> Value:
         raise AdapterError(f"{path} is not {expected}: {error}") from error
 
 
-# ---- labels --------------------------------------------------------------------------------------
+def class_numbers(path: Path, column: np.ndarray) -> np.ndarray:
+    """The column `semantic` as int64 [N]. path: its file or folder, for messages."""
+    try:
+        return whole_numbers(column, "semantic")
+    except ValueError as error:
+        raise AdapterError(f"{path}: {error}") from None
 
 
-def boxes_files(root: Path) -> list[Path]:
-    """labels/boxes.parquet where there is one, else those of a job's blocks."""
-    path = root / "labels" / "boxes.parquet"
-    return [inside(root, path)] if path.exists() else block_files(root, "labels/boxes", ".parquet")
-
-
-def lidar_files(root: Path) -> dict[int, Path]:
-    """The sweeps' files by frame number."""
-    return numbered_files(root, "lidar", (".parquet",))
-
-
-def all_boxes(root: Path) -> dict[int, TimedBoxes]:
-    """The boxes of every frame that has any; none without a file. Blocks that share a frame have
-    all of its boxes each.
-    """
-    found: dict[int, TimedBoxes] = {}
-    for path in boxes_files(root):
-        found = read_frame_boxes(path) | found
-    return found
-
-
-@dataclass(frozen=True)
-class RecordingLabels:
-    """Labels of one recording, read when asked, in the recording's own world."""
-
-    root: Path
-
-    def boxes(self, frame_index: int) -> Boxes:
-        timed = all_boxes(self.root).get(frame_index)
-        return Boxes.empty() if timed is None else timed.boxes
-
-    def lidar(self, frame_index: int) -> LidarSweep | None:
-        path = lidar_files(self.root).get(frame_index)
-        return None if path is None else read_sweep(path)
-
-    def lidar_files(self, frame_index: int) -> tuple[Path, ...]:
-        path = lidar_files(self.root).get(frame_index)
-        return () if path is None else (path,)
-
-    def lidar_content(self, frame_index: int, file: Path, sweep: LidarSweep) -> bytes:
-        return sweep_content(file, sweep)
-
-    def lidar_classes(self, sweep: LidarSweep) -> np.ndarray | None:
-        """The SemanticClass of each return, or NO_SURFACE; None where the numbers are not known to
-        mean anything.
-        """
-        column = sweep.columns.get("semantic")
-        if column is None:
-            return None
-        numbers = class_numbers(self.root / "lidar", column)
-        meanings = read_lidar_classes(self.root)
-        table, _ = class_table(self.root, np.unique(numbers), meanings)
-        return None if table is None else table[numbers]
-
-    def lidar_origins(self, frame_index: int, sweep: LidarSweep) -> np.ndarray | None:
-        """The columns origin_x, origin_y, origin_z, in the world of the returns, where all three
-        hold numbers.
-        """
-        columns = [sweep.columns.get(f"origin_{axis}") for axis in "xyz"]
-        if any(c is None or np.asarray(c).dtype.kind not in "fiu" for c in columns):
-            return None
-        return np.stack([np.asarray(column, np.float64) for column in columns], axis=1)
-
-
-def recording_labels(path: str, query: dict[str, str]) -> RecordingLabels:
-    """The labels of a folder; whatever the query, they are those of all its frames."""
-    return RecordingLabels(Path(path))
-
-
-# ---- A recording's LiDAR files into sweeps of usable returns -------------------------------------
-
-_FAR_M = 1000.0  # no LiDAR on the ground sees this far
-_OWN_M, _OWN_PART = 1.5, 1e-3  # a car's own returns are some hundreds a sweep
-_TOP_QUANTILE = 0.999
-_TOP_BEYOND_M = 5.0  # nearer, a camera's height says little of the sensor's
-_TOP_DEG = (2.0, 60.0)
+def class_table(
+    root: Path, numbers: np.ndarray, lidar_classes: Mapping[int, int] | None
+) -> tuple[np.ndarray | None, tuple[str, ...]]:
+    """SemanticClass (or NO_SURFACE) by the files' class number, int16, None where their meaning is
+    not known; and a sentence where that is so. numbers: those that occur."""
+    if len(numbers) == 0:
+        return None, ()
+    if lidar_classes is None:
+        known = (numbers >= 0) & (numbers < SemanticClass.SKY)
+        if not known.all():
+            return None, (
+                f"lidar/: the column semantic holds {int(numbers[~known][0])}, which is no "
+                f"SemanticClass (0 to {SemanticClass.SKY - 1}): classes are ignored. Say what the "
+                f'numbers mean in calibration.json: "lidar_classes": {{"7": "road", ...}}',
+            )
+        return np.arange(SemanticClass.SKY, dtype=np.int16), ()
+    size = max(0, int(numbers.max()), *lidar_classes) + 1
+    if numbers.min() < 0 or min(lidar_classes, default=0) < 0 or size > 2**16:
+        raise AdapterError(
+            f"{root / 'lidar'}: class numbers must lie in 0 to 65535; the files hold "
+            f"{int(numbers.min())} to {int(numbers.max())}, lidar_classes names "
+            f"{sorted(lidar_classes)}"
+        )
+    table = np.full(size, SemanticClass.UNKNOWN, np.int16)
+    for number, meaning in lidar_classes.items():
+        table[number] = meaning
+    return table, ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -312,13 +260,8 @@ class LidarDrive:
 
 
 def read_lidar_drive(root: Path, calibration: Calibration, frames: Sequence[Frame]) -> LidarDrive:
-    """The sweeps of the given frames.
-
-    Left out: returns that are not finite, of no surface, or of the recording car (ego_box_m).
-
-    Raises:
-        AdapterError: a damaged file, or returns that cannot be in the calibration's world.
-    """
+    """The sweeps of the given frames, without returns that are not finite, of no surface, or of the
+    recording car (ego_box_m)."""
     files = lidar_files(root)
     problems = []
     if files:
@@ -338,7 +281,9 @@ def read_lidar_drive(root: Path, calibration: Calibration, frames: Sequence[Fram
             f"{len(timeless)} sweeps (the first of frame {timeless[0]}); their frames' times are "
             f"used, fast objects are smeared"
         )
-    table, more = _class_table(root, raws, calibration)
+    present = [np.unique(raw.classes) for raw in raws if raw.classes is not None]
+    numbers = np.unique(np.concatenate(present)) if present else np.zeros(0, np.int64)
+    table, more = class_table(root, numbers, calibration.lidar_classes)
     sweeps = tuple(raw.usable(table) for raw in raws)
     if calibration.ego_box_m is None:
         problems += _own_returns(sweeps, known)
@@ -367,9 +312,11 @@ class _Raw:
                 f"world of its poses, not in the sensor's"
             )
         if calibration.ego_box_m is not None:
-            low, high = calibration.ego_box_m
-            keep &= ~((ego > low) & (ego < high)).all(axis=1)
-        times = _times(path, sweep, frame.timestamp_ns)
+            keep &= ~is_in_box(ego, *calibration.ego_box_m)
+        try:
+            times = sweep_times(sweep, frame.timestamp_ns)
+        except ValueError as error:
+            raise AdapterError(f"{path}: {error}") from None
         classes = sweep.columns.get("semantic")
         if classes is not None:
             classes = class_numbers(path, classes)[keep]
@@ -388,23 +335,6 @@ class _Raw:
         semantic = table[np.clip(self.classes, 0, len(table) - 1)]
         keep = semantic != NO_SURFACE
         return Sweep(self.points[keep], self.timestamps_ns[keep], semantic[keep])
-
-
-def _times(path: Path, sweep: LidarSweep, frame_ns: int) -> np.ndarray | None:
-    try:
-        return sweep_times(sweep, frame_ns)
-    except ValueError as error:
-        raise AdapterError(f"{path}: {error}") from None
-
-
-def _class_table(
-    root: Path, raws: Sequence[_Raw], calibration: Calibration
-) -> tuple[np.ndarray | None, tuple[str, ...]]:
-    """As `class_table`, for the classes of all sweeps."""
-    present = [np.unique(raw.classes) for raw in raws if raw.classes is not None]
-    if not present:
-        return None, ()
-    return class_table(root, np.unique(np.concatenate(present)), calibration.lidar_classes)
 
 
 def _own_returns(sweeps: Sequence[Sweep], known: Sequence[tuple[Frame, Path]]) -> list[str]:
@@ -443,104 +373,3 @@ def _top_deg(sweeps: Sequence[Sweep], known: Sequence[tuple[Frame, Path]]) -> fl
     joined = np.concatenate(rises) if rises else np.zeros(0)
     top = float(np.quantile(joined, _TOP_QUANTILE)) if len(joined) else 0.0
     return float(np.clip(top, *_TOP_DEG))
-
-
-# ---- A recording's boxes into timed samples of the objects that move -----------------------------
-
-MOVED_M = 1.0  # an object whose boxes lie further apart than this moves
-# Attributes that say so themselves, as PandaSet's and the street's boxes do.
-STATIONARY = ("stationary", "is_parked")
-SIBLING = ("sibling_id", "cuboids.sibling_id")  # another sensor's box of the same object
-
-
-@dataclass(frozen=True, eq=False)
-class RecordedObjects:
-    """moving: samples of the objects that move, in order of frames. still: one sample of each
-    object that does not. problems: one sentence each."""
-
-    moving: tuple[BoxSample, ...]
-    still: tuple[BoxSample, ...]
-    problems: tuple[str, ...]
-
-
-def read_objects(
-    frames: Sequence[Frame], boxes: Mapping[int, TimedBoxes], world_origin_m: np.ndarray
-) -> RecordedObjects:
-    """The objects of the frames. An object moves if an attribute says that it is not stationary or
-    if its boxes lie further apart than MOVED_M; others stay part of the static world."""
-    samples: list[BoxSample] = []
-    labelled: set[str] = set()
-    bad, twice = [], []
-    for frame in frames:
-        timed = boxes.get(frame.index)
-        seen: set[str] = set()
-        for sample, moves in [] if timed is None else _samples(frame, timed, world_origin_m):
-            if sample is None:
-                bad.append(frame.index)
-            elif sample.object_id in seen:
-                twice.append((sample.object_id, frame.index))
-            else:
-                seen.add(sample.object_id)
-                samples.append(sample)
-                labelled |= {sample.object_id} if moves else set()
-    moving = _moving_ids(samples, labelled)
-    still = {s.object_id: s for s in reversed(samples) if s.object_id not in moving}
-    problems = []
-    if bad:
-        problems.append(
-            f"labels/boxes.parquet: {len(bad)} boxes, the first in frame {bad[0]}, have a centre, "
-            f"size or rotation that is not finite or zero; objects are built without them"
-        )
-    if twice:
-        name, frame = twice[0]
-        problems.append(
-            f"labels/boxes.parquet: {len(twice)} boxes share track_id and frame with another, such "
-            f"as {name!r} in frame {frame}; the first one counts"
-        )
-    return RecordedObjects(
-        tuple(s for s in samples if s.object_id in moving),
-        tuple(reversed(still.values())),
-        tuple(problems),
-    )
-
-
-def _samples(frame: Frame, timed: TimedBoxes, world_origin_m: np.ndarray):
-    """Each box as a sample, None where it is unusable, and whether it is labelled as moving."""
-    boxes = timed.boxes
-    times = timed.timestamps_ns
-    values = np.concatenate([boxes.centers_m, boxes.sizes_m, boxes.quats], axis=1)
-    good = np.isfinite(values).all(1) & (boxes.sizes_m > 0).all(1)
-    good &= np.linalg.norm(boxes.quats, axis=1) > 1e-6
-    stationary = next((boxes.attributes[n] for n in STATIONARY if n in boxes.attributes), None)
-    siblings = next((boxes.attributes[n] for n in SIBLING if n in boxes.attributes), None)
-    for i in range(len(boxes)):
-        if not good[i]:
-            yield None, False
-            continue
-        pose = np.eye(4)
-        pose[:3, :3] = rotmat_from_quat(torch.from_numpy(boxes.quats[i])).numpy()
-        pose[:3, 3] = boxes.centers_m[i] - world_origin_m
-        sibling = None if siblings is None else siblings[i]
-        sample = BoxSample(
-            boxes.track_ids[i],
-            sibling if isinstance(sibling, str) and sibling not in ("", "-") else None,
-            boxes.labels[i],
-            frame.index,
-            frame.timestamp_ns if times is None else int(times[i]),
-            pose,
-            boxes.sizes_m[i],
-        )
-        yield sample, stationary is not None and _is_false(stationary[i])
-
-
-def _is_false(value: object) -> bool:
-    """False or 0; a missing value says nothing."""
-    return isinstance(value, bool | int | np.bool_ | np.integer) and not value
-
-
-def _moving_ids(samples: Sequence[BoxSample], labelled: set[str]) -> set[str]:
-    places: dict[str, list[np.ndarray]] = defaultdict(list)
-    for sample in samples:
-        places[sample.object_id].append(sample.world_from_box[:2, 3])
-    extents = {name: np.ptp(np.array(xy), axis=0) for name, xy in places.items()}
-    return labelled | {name for name, extent in extents.items() if np.hypot(*extent) > MOVED_M}

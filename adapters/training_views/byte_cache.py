@@ -12,8 +12,7 @@ T = TypeVar("T")
 class ByteCache(Generic[T]):
     """Results by key; the ones unused for longest are forgotten when `limit_bytes` is exceeded.
 
-    What is larger than the limit is never kept. Not safe for several threads at once.
-    """
+    What is larger than the limit is never kept. Not safe for several threads at once."""
 
     def __init__(self, limit_bytes: int) -> None:
         if limit_bytes < 0:

@@ -52,8 +52,7 @@ class CameraOffset:
     """Where a camera's images lie beside the LiDAR's returns, pixels at `width_px` columns.
 
     angle_deg: the same as an angle. is_sure: the shift stands out, lies within the range searched,
-    and two halves of the frames agree on it.
-    """
+    and two halves of the frames agree on it."""
 
     camera: str
     right_px: float
@@ -86,8 +85,7 @@ def measure_offset(
 ) -> CameraOffset | None:
     """The shift of one camera's images; None if fewer than 3000 returns are seen.
 
-    returns: by frame. cameras: the views to compare, at any resolution.
-    """
+    returns: by frame. cameras: the views to compare, at any resolution."""
     seen = [
         project_returns(
             returns[key.frame], views, key, camera,
@@ -256,8 +254,7 @@ _TIMING_CONTRAST = 0.02  # how much the best time must stand out from the range'
 def with_camera_times(scene: Scene, offset_s: float) -> Scene:
     """The scene with every image taken offset_s later than stamped: poses and times of cameras.
 
-    Positions and rotations follow the camera's own path, straight on at its ends.
-    """
+    Positions and rotations follow the camera's own path, straight on at its ends."""
     paths = {name: _path(scene, name) for name in scene.camera_names}
     frames = tuple(
         dataclasses.replace(
@@ -279,8 +276,7 @@ def _path(scene: Scene, name: str) -> list[Camera]:
 def camera_at(path: Sequence[Camera], camera: Camera, offset_s: float) -> Camera:
     """The camera offset_s later, moving as its neighbours in the path say.
 
-    path: the same camera over time, in order, this one among them.
-    """
+    path: the same camera over time, in order, this one among them."""
     times = [other.timestamp_ns for other in path]
     place = times.index(camera.timestamp_ns)
     before, after = path[max(place - 1, 0)], path[min(place + 1, len(path) - 1)]
@@ -313,8 +309,7 @@ def measure_time_offset(
 
     returns: by frame. keys: views by camera, in order of time. Cameras count by how clearly they
     show a time: those that look sideways do. None where the car hardly moves, sweeps have no
-    intensity, or no time within 50 ms stands out.
-    """
+    intensity, or no time within 50 ms stands out."""
     returns = {
         frame: Returns(found.points[::_EVERY], found.intensity[::_EVERY])
         for frame, found in returns.items()
@@ -382,8 +377,7 @@ _NAMED = 3  # jumps of a camera that are named one by one
 class Checks:
     """problems: one sentence each. time_offset_s: how much later than stamped the images fit the
     LiDAR best, None where unknown. offsets: how images and LiDAR are shifted, a camera each, once
-    that is taken into account.
-    """
+    that is taken into account."""
 
     problems: tuple[str, ...]
     time_offset_s: float | None
@@ -410,8 +404,7 @@ class Checks:
 def check_views(scene: Scene, views: RecordedViews) -> Checks:
     """Compare LiDAR with images and images with each other; takes some seconds.
 
-    The calibration is not checked where sweeps have no intensity.
-    """
+    The calibration is not checked where sweeps have no intensity."""
     keys = sorted((*views.train, *views.test), key=lambda key: key.frame)
     own = {name: [k for k in keys if k.camera == name] for name in scene.camera_names}
     own = {name: found for name, found in own.items() if found}
@@ -460,8 +453,7 @@ def exposure_jumps(views: RecordedViews, keys: Sequence[ViewKey]) -> list[str]:
     """A sentence for each sudden change of brightness between neighbouring images of a camera.
 
     The change is the median, over blocks of the image, of the logarithm of their ratio, so that
-    what moves through the image hardly counts.
-    """
+    what moves through the image hardly counts."""
     if len(keys) < 3:
         return []
     levels = [_block_stops(views.image(key)) for key in keys]

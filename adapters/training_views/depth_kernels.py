@@ -16,8 +16,7 @@ def hidden_returns(
     The square window around a return grows until it holds `enough` others or has the radius
     `most_radius` (pixels). The return is hidden if at least three of the window's four quadrants
     hold a return nearer than z / ratio - margin_m: in front of it passes a surface, not just an
-    edge beside it.
-    """
+    edge beside it."""
     height, width = grid.shape
     out = np.zeros(len(pixels), np.bool_)
     for i in numba.prange(len(pixels)):

@@ -241,8 +241,7 @@ def align(relative: np.ndarray, depth_m: np.ndarray) -> Alignment | None:
 
     Iteratively reweighted with Cauchy's weights, whose spread follows the median residual (Holland
     and Welsch 1977), from a line through the quartiles. It fails with fewer than 30 known pixels,
-    without contrast, or where larger values are not clearly nearer.
-    """
+    without contrast, or where larger values are not clearly nearer."""
     x, y = relative.astype(np.float64), 1.0 / depth_m.astype(np.float64)
     known = np.isfinite(x) & np.isfinite(y)
     x, y = x[known], y[known]
@@ -422,8 +421,7 @@ def visible(seen: SparseDepth, camera: Camera) -> np.ndarray:
 
     The LiDAR stands elsewhere and looks past objects that hide what is behind them from the camera.
     A return counts as hidden if clearly nearer ones are among its neighbours on three sides. Those
-    hidden just behind an edge are not found.
-    """
+    hidden just behind an edge are not found."""
     if len(seen) == 0:
         return np.zeros(0, np.bool_)
     pixels = seen.uv[:, 1] * np.int32(camera.width) + seen.uv[:, 0]
@@ -458,8 +456,7 @@ class DepthPriors:
     depth in metres, DIR/<camera>/<frame>.png of uint16 metres x 256, 0 where unknown, as `climategs
     render` writes. relative_dir: dense inverse depth up to scale and shift, as monocular networks
     give, DIR/<camera>/<frame>.npy or .png. grid_px: dense maps are used at every grid_px-th pixel
-    of every grid_px-th row. relative_weight: how much those maps count beside LiDAR, which is 1.
-    """
+    of every grid_px-th row. relative_weight: how much those maps count beside LiDAR, which is 1."""
 
     lidar: bool = True
     sparse_dir: Path | None = None

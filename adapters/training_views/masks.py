@@ -44,8 +44,7 @@ _MIN_LUMA = 90.0
 def lidar_top_rad(scene: Scene, frames: Sequence[int]) -> float | None:
     """Highest elevation that the LiDAR looks at, as cameras see it; None without enough returns.
 
-    Measured from the returns of the given frames: it is too low where nothing tall stood near.
-    """
+    Measured from the returns of the given frames: it is too low where nothing tall stood near."""
     tops = []
     for index in frames:
         frame = scene.frame(index)
@@ -69,8 +68,7 @@ def sky_mask(
 
     scene: as initialised from LiDAR. rgb: uint8 [H, W, 3], the recorded image. returns:
     int [M], flat indices of pixels with a LiDAR return. lidar_top_rad: see the function of that
-    name.
-    """
+    name."""
     none = np.zeros((camera.height, camera.width), np.bool_)
     if lidar_top_rad is None:
         return none
@@ -103,8 +101,7 @@ def _above_surfaces(camera: Camera, drawn: np.ndarray, lidar_top_rad: float) -> 
 def looks_like_sky(rgb: np.ndarray, candidates: np.ndarray) -> np.ndarray:
     """Pixels that are smooth and about as bright as the bright part of the candidates, bool [H, W].
 
-    Clouds pass; walls, foliage and wires do not, unless they are as bright and as smooth.
-    """
+    Clouds pass; walls, foliage and wires do not, unless they are as bright and as smooth."""
     if not candidates.any():
         return np.zeros_like(candidates)
     luma = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
@@ -159,8 +156,7 @@ def find_ego_mask(cameras: Sequence[Camera], images: Sequence[np.ndarray]) -> np
 
     cameras, images: as the car moved, in order (see `moving_frames`), of one size; uint8
     [H, W, 3]. Nothing is found in fewer than six images, above the horizon, or where the car shows
-    no edge across the direction of motion.
-    """
+    no edge across the direction of motion."""
     height, width = images[0].shape[:2] if images else (0, 0)
     if len(images) < _MIN_IMAGES:
         return np.zeros((height, width), np.bool_)
@@ -230,8 +226,7 @@ def _car_tops(evidence: np.ndarray, unknown: np.ndarray) -> np.ndarray:
     """The first row of the car in each column, int [W]; the height where there is none.
 
     A column's score is the sum of the evidence from the bottom up to there; of all lines through
-    the columns the one of most score and fewest steps is found (Viterbi).
-    """
+    the columns the one of most score and fewest steps is found (Viterbi)."""
     height, width = evidence.shape
     first = int((~unknown).any(axis=1).argmax())  # the rows above cannot be the car
     evidence, unknown = evidence[first:], unknown[first:]

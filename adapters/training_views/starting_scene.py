@@ -127,8 +127,7 @@ def _place(grid: Camera, rows: np.ndarray, columns: np.ndarray) -> tuple[np.ndar
     distance from one to the next, float64 [N].
 
     They lie on a level surface below the camera, such as a roof, as far away as a car's width
-    allows; where a ray does not go down, on an upright one.
-    """
+    allows; where a ray does not go down, on an upright one."""
     x = (columns + 0.5 - grid.cx) / grid.fx
     y = (rows + 0.5 - grid.cy) / grid.fy
     far_m = float(np.clip(_HALF_WIDTH_M / max(np.abs(x).max(), 1e-6), _NEAR_M, _FAR_M))
@@ -180,8 +179,7 @@ def _track(cameras: Sequence[Camera], centre: np.ndarray) -> Track:
 
 def starting_scene(scene: Scene, views: RecordedViews) -> Scene:
     """The scene with upper walls in its background and a body of the recording car for every
-    camera that sees it, both from training views alone.
-    """
+    camera that sees it, both from training views alone."""
     top_deg = views.facts["lidar_top_deg"]
     background = scene.background
     if top_deg is not None:  # without LiDAR nothing ends at its highest view

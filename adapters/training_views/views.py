@@ -229,8 +229,7 @@ class RecordedViews:
     """A `ViewSource`; made by `recorded_views`. `load` may be called from several threads.
 
     ego_masks: for each camera that sees the recording car, where, bool [H, W] at the training
-    resolution. No depth priors are given there: the LiDAR looks past the car at the road behind.
-    """
+    resolution. No depth priors are given there: the LiDAR looks past the car at the road behind."""
 
     def __init__(
         self,

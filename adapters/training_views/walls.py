@@ -65,8 +65,7 @@ class WallView:
 
     rgb: uint8 [H, W, 3]. depth_m: float32 [H, W]: z of the surface drawn; above a surface that
     probably goes on, minus the z of its vertical continuation; infinite where nothing is.
-    used: bool [H, W]. sky_counts: float32 [_SIDE^3], how often each coarse colour is sure sky.
-    """
+    used: bool [H, W]. sky_counts: float32 [_SIDE^3], how often each coarse colour is sure sky."""
 
     camera: Camera
     rgb: np.ndarray
@@ -99,8 +98,7 @@ def sky_colours(own: np.ndarray, others: np.ndarray) -> np.ndarray:
     """Which coarse colours look like sky in an image, bool [_SIDE^3].
 
     own: counts of the image's sure sky; others: of all images of its camera, for an image that
-    shows too little sky. Without any sky only white is taken for it.
-    """
+    shows too little sky. Without any sky only white is taken for it."""
     counts = own if own.sum() >= _ENOUGH_SKY else others
     if counts.sum() < _ENOUGH_SKY:
         luma = np.indices((_SIDE,) * 3).reshape(3, -1).min(axis=0)
@@ -357,8 +355,7 @@ def wall_tops(scene: Scene, source: ViewSource, *, lidar_top_deg: float = 15.0) 
 
     scene: as initialised from LiDAR. source: recorded views whose `sky` masks tell what sky looks
     like and whose `weight` masks out the recording car. lidar_top_deg: highest elevation that the
-    LiDAR looks at. Deterministic.
-    """
+    LiDAR looks at. Deterministic."""
     views = _load_views(scene, source, lidar_top_deg)
     path = np.array([frame.world_from_ego[:3, 3].numpy() for frame in scene.frames])
     if not any(len(view.rims.points) for view in views) or len(path) == 0:

@@ -12,8 +12,9 @@ import torch
 
 from adapters.lidar_scene.image_views import Body, View, observe_views, read_image
 from adapters.lidar_scene.kernels import SkyGatherer
-from adapters.lidar_scene.split import BoxSample, join_tracks
+from adapters.lidar_scene.split import join_tracks
 from adapters.lidar_scene.surfels import Surfels
+from adapters.raw_drive import BoxSample
 from augment.cameras import Camera
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 32.0

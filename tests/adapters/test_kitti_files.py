@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 import torch
 
-from adapters.kitti import boxes as tracklets
 from adapters.kitti import kitti_labels, kitti_root, open_kitti
-from adapters.kitti.boxes import boxes_at
-from adapters.kitti.source import find_source, oxts_poses, registered_poses
+from adapters.kitti import labels as tracklets
+from adapters.kitti.adapter import find_source
+from adapters.kitti.files import oxts_poses, registered_poses
+from adapters.kitti.labels import boxes_at
 from augment.errors import AdapterError
 from augment.geometry import rotmat_from_quat
 
@@ -44,7 +45,7 @@ def problems_of(path: Path, **query: str) -> str:
 
 
 def poses_of(path: Path, **query: str):
-    return find_source(str(path), query)[0].sweeps.world_from_velodyne
+    return find_source(str(path), query)[0].labels.world_from_velodyne
 
 
 def replace(path: Path, pattern: str, text: str) -> None:
@@ -141,7 +142,7 @@ def test_a_linked_folder_of_images_is_followed(drive, tmp_path):
         ("cam_to_cam", "^P_rect_02:.*", "", r"calib_cam_to_cam\.txt has no 'P_rect_02'"),
         ("cam_to_cam", "^R_rect_00:.*", "", r"calib_cam_to_cam\.txt has no 'R_rect_00'"),
         ("cam_to_cam", "^(P_rect_02: \\S+).*", r"\1", r"P_rect_02 must hold 3 x 4 numbers.* 1$"),
-        ("cam_to_cam", "^P_rect_02: \\S+", "P_rect_02: nan", r"P_rect_02 must be finite"),
+        ("cam_to_cam", "^P_rect_02: \\S+", "P_rect_02: nan", r"P_rect_02 holds NaN or infinite"),
         ("cam_to_cam", "^P_rect_02: \\S+", "P_rect_02: wide", r"P_rect_02 must hold numbers"),
         ("cam_to_cam", "^P_rect_02: \\S+", "P_rect_02: -90", r"must be a rectified pinhole"),
         ("cam_to_cam", "^R_rect_00: \\S+", "R_rect_00: 2", r"R_rect_00 must be a rotation"),
@@ -183,7 +184,7 @@ def test_times_are_exact_and_their_gaps_are_said(drive):
     path.write_text("2011-09-26 13:02:25.964389445\n\n2011-09-26 13:02:26.17\n")
     source = find_source(str(drive), {})[0]
     start = street.START_NS + 964_389_445
-    assert source.sweeps.timestamps_ns == {
+    assert source.labels.timestamps_ns == {
         0: start,
         1: start + 100_000_000,
         2: street.START_NS + 1_170_000_000,
@@ -196,14 +197,14 @@ def test_without_times_ten_frames_a_second_are_assumed(drive):
     for path in drive.glob("*/timestamps.txt"):
         path.unlink()
     source = find_source(str(drive), {})[0]
-    assert source.sweeps.timestamps_ns == {0: 0, 1: 100_000_000, 2: 200_000_000}
+    assert source.labels.timestamps_ns == {0: 0, 1: 100_000_000, 2: 200_000_000}
     assert "its timestamps.txt has no times for 3 frames (0, 1, 2)" in "".join(source.problems)
 
 
 def test_the_cameras_times_serve_where_the_velodyne_has_none(drive):
     (drive / "velodyne_points/timestamps.txt").unlink()
     source = find_source(str(drive), {})[0]
-    assert source.sweeps.timestamps_ns[1] - street.START_NS == 103_000_001
+    assert source.labels.timestamps_ns[1] - street.START_NS == 103_000_001
     assert source.problems == ()
 
 
@@ -318,13 +319,13 @@ def test_a_file_of_poses_that_is_missing(drive):
 
 def test_registration_finds_the_motion(drive):
     source = find_source(str(drive), {"poses": "icp"})[0]
-    found = relative(source.sweeps.world_from_velodyne)
+    found = relative(source.labels.world_from_velodyne)
     # Made of other points every frame, and with a car in it that drives away.
     np.testing.assert_allclose(found, relative(poses_of(drive)), atol=0.03)
     assert "registering 3 sweeps" in source.problems[0] and "inlier RMSE 0.0" in source.problems[0]
-    again = find_source(str(drive), {"poses": "icp"})[0].sweeps.world_from_velodyne
+    again = find_source(str(drive), {"poses": "icp"})[0].labels.world_from_velodyne
     for number in range(3):
-        np.testing.assert_array_equal(source.sweeps.world_from_velodyne[number], again[number])
+        np.testing.assert_array_equal(source.labels.world_from_velodyne[number], again[number])
 
 
 def test_registration_recovers_turns_and_long_steps():
@@ -520,8 +521,8 @@ def test_an_object_frame_without_image_calibration_or_labels(objects):
     ("line", "message"),
     [
         ("Car 0 0 0 1 2 3 4 1.5 1.6 3.9 1 1 9", "line 1: expected a type and 14 numbers.*14 words"),
-        ("Car 0 0 0 1 2 3 4 1.5 1.6 3.9 1 1 9 x", "line 1: expected numbers after the type"),
-        ("Car 0 0 0 1 2 3 4 1.5 1.6 3.9 1 1 nan 0", "line 1: numbers must be finite"),
+        ("Car 0 0 0 1 2 3 4 1.5 1.6 3.9 1 1 9 x", "line 1 must hold numbers only"),
+        ("Car 0 0 0 1 2 3 4 1.5 1.6 3.9 1 1 nan 0", "line 1 holds NaN"),
         ("Car 0 0 0 1 2 3 4 1.5 -1 3.9 1 1 9 0", "line 1: h, w, l must be metres > 0"),
     ],
 )

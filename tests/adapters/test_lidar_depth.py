@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from adapters.lidar_scene.depth import lidar_depth
-from augment.cameras import Camera
+from adapters.lidar_scene.depth import lidar_depth, read_returns
+from augment.cameras import Camera, Frame
 from augment.errors import AdapterError
 from augment.labels import Boxes, LidarSweep
 from augment.scene import Actor, Gaussians, Scene, Track
@@ -51,7 +51,8 @@ def made(columns, actors=()) -> Scene:
         torch.zeros(1, 1, 3),
     )  # fmt: skip
     sky = ConstantSky(torch.ones(3))
-    return Scene("s", "test:", one, actors, sky, (), OneSweep(columns), world_origin_m=ORIGIN)
+    frame = Frame(0, 10 * SECOND, torch.eye(4, dtype=torch.float64), {}, {})
+    return Scene("s", "test:", one, actors, sky, (frame,), OneSweep(columns), world_origin_m=ORIGIN)
 
 
 def driving_actor(speed_mps: float) -> Actor:
@@ -112,15 +113,17 @@ def test_classes_can_be_left_out():
     points, semantic = [[10, 0, 0], [5, 0, 1]], np.array([7, 4])
     one = scene(points, [10, 10], semantic=semantic)
     assert len(lidar_depth(one, 0, camera())) == 2
-    np.testing.assert_allclose(lidar_depth(one, 0, camera(), without_semantic=(4,)).depth_m, [10])
+    kept = read_returns(one, 0, without_semantic=(4,))
+    np.testing.assert_allclose(kept.points, [[10, 0, 0]])
 
 
 def test_integer_times_and_missing_ones():
     columns = {c: np.full(1, v) for c, v in zip("xyz", ORIGIN + np.array([8, 0, 0]), strict=True)}
     timed = made(columns | {"timestamp_ns": np.array([7])})
     assert lidar_depth(timed, 0, camera()).timestamp_ns.tolist() == [7]
-    with pytest.raises(AdapterError, match=r"frame 3: .* column timestamp_ns or t"):
-        lidar_depth(made(columns), 3, camera())
+    assert lidar_depth(made(columns), 0, camera()).timestamp_ns.tolist() == [10 * SECOND]
+    with pytest.raises(AdapterError, match=r"frame 0: its sweep's column timestamp_ns must hold"):
+        lidar_depth(made(columns | {"timestamp_ns": np.array([7.5])}), 0, camera())
 
 
 def test_no_sweep_gives_no_depth():

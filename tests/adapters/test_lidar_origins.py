@@ -13,13 +13,13 @@ import pyarrow.parquet as pq
 import pytest
 from drivestudio_files import write_run
 
-from adapters.drivestudio.drive import drivestudio_labels
-from adapters.kitti.source import LocatedSweeps, RawLabels
+from adapters.drivestudio.adapter import drivestudio_labels
+from adapters.kitti.labels import KittiLabels
 from adapters.nuscenes.labels import nuscenes_labels
 from adapters.pandaset.files import read_lidar
 from adapters.pandaset.labels import SENSORS_M, PandaSetLabels, places_at
-from adapters.recording.labels import RecordingLabels
 from adapters.procedural import LOWEST_DEG, StreetLabels, lidar_rays
+from adapters.recording.labels import RecordingLabels
 from adapters.street.layout import StreetParameters
 from adapters.street_gaussians.labels import ROOF_SENSOR_M, StreetGaussiansLabels
 from augment.labels import KnowsLidarOrigins, LidarSweep
@@ -105,7 +105,7 @@ def test_nuscenes_sensor_at_the_files_time(tmp_path: Path) -> None:
 def test_kittis_velodyne(tmp_path: Path) -> None:
     pose = np.eye(4)
     pose[:3, 3] = 5.0, 6.0, 7.0
-    labels = RawLabels(LocatedSweeps(tmp_path, {}, {}, {2: pose}), ())
+    labels = KittiLabels(tmp_path, {}, {}, {2: pose})
     sweep = LidarSweep({name: np.zeros(3) for name in "xyz"})
     np.testing.assert_array_equal(labels.lidar_origins(2, sweep), np.tile([5.0, 6.0, 7.0], (3, 1)))
     assert labels.lidar_origins(3, sweep) is None

@@ -131,7 +131,6 @@ def test_points_take_their_class(scene):
     }  # fmt: skip
     np.testing.assert_array_equal(classes == SemanticClass.ROAD, sweep.columns["semantic"] == 24)
     assert scene.labels.lidar_classes(scene.lidar(4)) is None
-    assert scene.labels.no_surface_classes == (0,)
     semantic = scene.background.semantic.numpy()
     means = into_street(scene.background.means.numpy().astype(np.float64))
     known = semantic != SemanticClass.UNKNOWN

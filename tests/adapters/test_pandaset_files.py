@@ -10,10 +10,10 @@ import pandaset_folder as street
 import pytest
 import torch
 
-from adapters.lidar_scene.scene import DriveOptions, HeldOut
 from adapters.pandaset.adapter import read_drive
 from adapters.pandaset.files import read_lidar, read_semantics, read_sequence
 from adapters.pandaset.labels import NO_SURFACE, PandaSetLabels, semantic_table
+from adapters.raw_drive import DriveOptions, FrameRange
 from augment.errors import AdapterError
 from augment.geometry import rotmat_from_quat
 from augment.semantics import SemanticClass
@@ -213,8 +213,8 @@ def test_a_box_called_stationary_that_travels_is_an_actor(folder):
 def test_options_are_typed():
     query = {"frames": "2:9", "voxel_m": "0.08", "max_gaussians": "5000", "image_scale": "0.25"}
     options = DriveOptions.from_query("pandaset", query | {"sky_size": "16"})
-    assert options == DriveOptions(2, 9, 0.08, 5000, 0.25, 16)
-    assert DriveOptions.from_query("pandaset", {"frames": "4:"}) == DriveOptions(first_frame=4)
+    assert options == DriveOptions(FrameRange(2, 9), 0.08, 5000, 0.25, 16)
+    assert DriveOptions.from_query("pandaset", {"frames": "4:"}) == DriveOptions(FrameRange(4))
     assert DriveOptions.from_query("pandaset", {}) == DriveOptions()
 
 
@@ -266,6 +266,6 @@ def test_held_out_counts_frame_numbers(text, held):
 
 
 def test_holding_out_nothing_is_said():
-    options = DriveOptions(held_out=HeldOut(30))
+    options = DriveOptions(held_out=FrameRange(30))
     problems = options.select(range(20), where="here").problems
     assert problems == ("held_out=30::1 holds out none of frames 0 to 19",)

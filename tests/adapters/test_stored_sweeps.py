@@ -17,12 +17,12 @@ import pytest
 from drivestudio_files import write_run
 from recording_folder import write_recording
 
-from adapters.drivestudio.drive import drivestudio_labels
-from adapters.kitti.source import LocatedSweeps, ObjectLabels, RawLabels
+from adapters.drivestudio.adapter import drivestudio_labels
+from adapters.kitti.labels import KittiLabels
 from adapters.nuscenes.labels import nuscenes_labels
 from adapters.pandaset.labels import PandaSetLabels
-from adapters.recording.labels import RecordingLabels
 from adapters.procedural import StreetLabels
+from adapters.recording.labels import RecordingLabels
 from adapters.street_gaussians.labels import StreetGaussiansLabels
 from augment.effects.lidar import ATTENUATED, LOST, MOVED, SCATTERED, UNCHANGED, drop_lost
 from augment.effects.lidar.beam import intensity_column
@@ -49,12 +49,11 @@ def _nuscenes(root: Path):
     return labels
 
 
-def _kitti(root: Path, kind=RawLabels):
+def _kitti(root: Path, velodyne_from_rectified: np.ndarray | None = None):
     drive = kitti_files.write_raw(root / "2011_09_26")
     pose = kitti_files.world_from_street() @ kitti_files.street_from_velo(0)
     (name,) = (p.relative_to(drive) for p in drive.glob("velodyne_points/data/*0.bin"))
-    sweeps = LocatedSweeps(drive, {0: str(name)}, {0: 10**18}, {0: pose})
-    return kind(sweeps, ()) if kind is RawLabels else kind(sweeps, 0, np.eye(4))
+    return KittiLabels(drive, {0: str(name)}, {0: 10**18}, {0: pose}, (), velodyne_from_rectified)
 
 
 def _ours(root: Path) -> RecordingLabels:
@@ -70,7 +69,7 @@ DATASETS: dict[str, Callable[[Path], StoresLidar]] = {
     "pandaset": _pandaset,
     "nuscenes": _nuscenes,
     "kitti": _kitti,
-    "kitti-object": lambda root: _kitti(root, ObjectLabels),
+    "kitti-object": lambda root: _kitti(root, np.eye(4)),
     "recording": lambda root: RecordingLabels(write_recording(root, frames=1)),
     "recording-of-ours": _ours,
     "waymo": lambda root: drivestudio_labels(str(write_run(root, dataset="waymo").folder), {}),
