@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from tqdm import tqdm
 
 from adapters.base import open_scene, parse_uri
 from adapters.procedural import StreetTruth, open_truth
@@ -82,22 +83,17 @@ QUICK = EffectCase(
 
 
 def cost_tables(
-    case: EffectCase,
-    cases: Cases,
-    staged: Sequence[str],
-    *,
-    repeats: int = 7,
-    memory: bool = True,
-    progress: bool = True,
+    case: EffectCase, cases: Cases, staged: Sequence[str], *, repeats: int = 7, memory: bool = True
 ) -> list[Table]:
-    """Frames of every case in turns with clean ones. staged: cases whose stages are shown, and whose
-    memory is measured if `memory` is true.
+    """Frames of every case in turns with clean ones. staged: cases whose stages are shown, and of
+    which memory is measured if `memory` is true.
     """
     scene = open_scene(case.scene)
     camera = water_camera(scene, case.width, case.height)
     rows, stages = [], {}
-    for name, pair in cases.items():
-        seconds, laps = time_frames(scene, camera, dict(zip(("effect", "clean"), pair)), repeats)
+    for name, (recipe, clean) in tqdm(cases.items(), "frames", leave=False):
+        both = {"effect": recipe, "clean": clean}
+        seconds, laps = time_frames(scene, camera, both, repeats)
         ratio = spread_ratio(seconds["effect"], seconds["clean"])
         ms = {which: median_ms(each) for which, each in seconds.items()}
         rows.append([name, ms["clean"], ms["effect"], ratio["median"], ratio["min"], ratio["p90"]])
@@ -179,8 +175,8 @@ def view_pairs(
     ahead: Sequence[int] = (1,),
     names: Sequence[str] | None = None,
 ) -> Iterator[tuple[str, Camera, Camera]]:
-    """Kind and cameras of pairs at one time: each camera and the next one clockwise; each of `names`
-    (all, by default) and itself where it stands so many frames ahead.
+    """Kind and cameras of pairs at one time: each camera and the next one clockwise; those of
+    `names` (all, by default) and itself where it stands so many frames ahead.
     """
     for index in frames:
         frame = scene.frame(index)

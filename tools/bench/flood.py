@@ -22,7 +22,6 @@ from torch import Tensor
 from adapters.procedural import StreetTruth
 from augment.cameras import Camera
 from augment.effects.flood.water_plane import plane_depth
-from augment.geometry import rigid
 from augment.metrics.image import psnr
 from augment.plan import Plan, make_plan
 from augment.render.buffers import ALPHA, RGB
@@ -63,15 +62,12 @@ def bench_flood(
     scene_uri: str | None = None,
     repeats: int = 7,
     memory: bool = True,
-    progress: bool = True,
 ) -> Figures:
     """scene_uri: another scene for the cost."""
     machine, case = machine_facts(), case or (QUICK if quick else WHOLE)
     costs = dataclasses.replace(case, scene=scene_uri or case.scene)
     staged = [f"{tier}, calm" for tier in TIERS]
-    tables = cost_tables(
-        costs, cost_cases(), staged, repeats=repeats, memory=memory, progress=progress
-    )
+    tables = cost_tables(costs, cost_cases(), staged, repeats=repeats, memory=memory)
     street, truth = case.open_street()
     views = case.views(street)
     rows: list[Any] = []
@@ -92,9 +88,7 @@ def bench_flood(
     title = f"Errors inside the water, channels in 1/255: {case.street}"
     tables.append(Table(title, columns, rows))
     masks = water_masks(street, truth, case.frames, scale=case.scale / 2)
-    dry = [[name, same] for name, same in dry_views(street, views[0]).items()]
-    dry_table = Table("Views without water", ("case", "the clean frame to the bit"), dry)
-    return figures("flood", [*tables, *masks, dry_table], machine=machine)
+    return figures("flood", [*tables, *masks], machine=machine)
 
 
 def cost_cases() -> Cases:
@@ -327,27 +321,3 @@ def water_masks(
             agreement,
         ),
     ]
-
-
-def looking_up(camera: Camera) -> Camera:
-    """The camera turned until no ray of it falls: straight up."""
-    right = camera.world_from_camera[:3, 0].clone()
-    right[2] = 0
-    right /= right.norm()
-    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-    rotation = torch.stack([right, torch.linalg.cross(up, right), up])
-    return dataclasses.replace(camera, camera_from_world=rigid(rotation, -rotation @ camera.centre))
-
-
-def dry_views(scene: Scene, camera: Camera) -> dict[str, bool]:
-    """Whether a view that no water is in is the clean one to the bit: of a camera that looks up,
-    and of water below everything.
-    """
-    cases = {
-        "looking up": (looking_up(camera), flood_recipe(waves="calm")),
-        "level below everything": (camera, flood_recipe(level_m=FAR_BELOW_M)),
-    }
-    return {
-        name: np.array_equal(draw(scene, view, recipe).rgb, draw(scene, view, CLEAN).rgb)
-        for name, (view, recipe) in cases.items()
-    }

@@ -1,8 +1,8 @@
 """Smog: what it costs, and how far each model is from exact per-pixel smog.
 
 The street's surfaces are known, and so is the distance d of every pixel. The exact picture is
-t(d) c + (1 - t(d)) airlight, with c the clean splat render: what is compared is the smog and not the
-splats' colour. Silhouettes, where a pixel shows two distances, count separately.
+t(d) c + (1 - t(d)) airlight, with c the clean splat render: what is compared is the smog and not
+the splats' colour. Silhouettes, where a pixel shows two distances, count separately.
 """
 
 from __future__ import annotations
@@ -43,12 +43,7 @@ SMOOTH_DEPTH = 0.1  # largest relative change of depth within that square
 
 
 def bench_smog(
-    quick: bool = False,
-    *,
-    case: EffectCase | None = None,
-    repeats: int = 7,
-    memory: bool = True,
-    progress: bool = True,
+    quick: bool = False, *, case: EffectCase | None = None, repeats: int = 7, memory: bool = True
 ) -> Figures:
     machine, case = machine_facts(), case or (QUICK if quick else WHOLE)
     costs = {
@@ -57,7 +52,7 @@ def bench_smog(
         for model in MODELS
     }
     staged = [name for name in costs if name.startswith("uniform, visibility 80 m")]
-    tables = cost_tables(case, costs, staged, repeats=repeats, memory=memory, progress=progress)
+    tables = cost_tables(case, costs, staged, repeats=repeats, memory=memory)
     scene, truth = case.open_street()
     views = [truth_view(scene, truth, camera) for camera in case.views(scene, 0.5)]
     rows = []
@@ -83,9 +78,9 @@ def smog_recipe(smog: Smog, model: str) -> Recipe:
 
 @dataclass(frozen=True, eq=False)
 class TruthView:
-    """A camera's clean splat render and the exact picture of the same surfaces. regions bool [H, W]:
-    `smooth` is all pixels away from silhouettes, with the classes as its parts; `silhouette` the
-    other surface pixels.
+    """A camera's clean splat render and the exact picture of the same surfaces. regions: bool
+    [H, W]; `smooth` is all pixels away from silhouettes, with the classes as its parts;
+    `silhouette` the other surface pixels.
     """
 
     camera: Camera
