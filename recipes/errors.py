@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import difflib
 
-# ---- Guesses which of some words was meant -------------------------------------------------------
-
 
 def nearest_word(word: str, words: tuple[str, ...]) -> str | None:
     """The option that is most like `word`, if any is."""
@@ -13,7 +11,11 @@ def nearest_word(word: str, words: tuple[str, ...]) -> str | None:
     return close[0] if close else None
 
 
-# ---- errors --------------------------------------------------------------------------------------
+def did_you_mean(word: str, words: tuple[str, ...]) -> str:
+    """The guess as a part of a message, with a space after it; '' without one."""
+    near = nearest_word(word, words)
+    return f"did you mean {near}? " if near else ""
+
 
 MAX_SHOWN = 40  # beyond this many lines the first cause is elsewhere
 

@@ -23,7 +23,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, ValidationError, field_validator, model_validator
 
 from recipes.change import changed
-from recipes.errors import Problems, RecipeError, nearest_word, short
+from recipes.errors import Problems, RecipeError, did_you_mean, nearest_word, short
 from recipes.files import open_file
 from recipes.load import load_recipe, preset_names
 from recipes.schema import Recipe, parse_frames
@@ -45,20 +45,16 @@ def _in_full(key: str) -> BeforeValidator:
 class JobScene(Closed):
     """A scene of the job, or with `*` in its path all that match."""
 
-    uri: Text = Field(description="What opens the scene; a relative path starts at the job file.")
-    name: Name | None = Field(
-        default=None, description="Its folder in the output, where the scene's own will not do."
-    )
-    frames: Text = Field(
-        default="all",
-        description="Frame numbers: all, 4, 0,5,9, 0:20:2 or ::5; ranges end with the scene.",
-    )
-    cameras: tuple[Text, ...] | None = Field(
-        default=None, min_length=1, description="Names of cameras; null for all."
-    )
-    recipes: tuple[Text, ...] | None = Field(
-        default=None, min_length=1, description="Names of the job's recipes; null for all."
-    )
+    uri: Text
+    """What opens the scene; a relative path starts at the job file."""
+    name: Name | None = None
+    """Its folder in the output, where the scene's own will not do."""
+    frames: Text = "all"
+    """Frame numbers: all, 4, 0,5,9, 0:20:2 or ::5; ranges end with the scene."""
+    cameras: tuple[Text, ...] | None = Field(default=None, min_length=1)
+    """Names of cameras; null for all."""
+    recipes: tuple[Text, ...] | None = Field(default=None, min_length=1)
+    """Names of the job's recipes; null for all."""
 
     @field_validator("frames")
     @classmethod
@@ -70,40 +66,32 @@ class JobScene(Closed):
 class JobRecipe(Closed):
     """A recipe of the job."""
 
-    recipe: Text = Field(description="A preset's name, or a file relative to the job file.")
-    name: Name | None = Field(
-        default=None, description="Its name in this job and the output; its own if absent."
-    )
-    variants: Whole | None = Field(
-        default=None, ge=1, le=100_000, description="How many to draw; as many as it says if null."
-    )
+    recipe: Text
+    """A preset's name, or a file relative to the job file."""
+    name: Name | None = None
+    """Its name in this job and the output; its own if absent."""
+    variants: Whole | None = Field(default=None, ge=1, le=100_000)
+    """How many to draw; as many as it says if null."""
 
 
 class Job(Closed):
     """What a job file says."""
 
-    version: Literal[1] = Field(default=1, description="Version of the format.")
-    name: Name = Field(default="job", description="The file's name if absent.")
-    scenes: tuple[Annotated[JobScene, _in_full("uri")], ...] = Field(
-        min_length=1, description="URIs, or mappings with a uri."
-    )
-    recipes: tuple[Annotated[JobRecipe, _in_full("recipe")], ...] = Field(
-        min_length=1, description="Presets and files, or mappings with a recipe."
-    )
-    draws: Literal["per_scene", "shared"] = Field(
-        default="per_scene",
-        description="per_scene draws a recipe's ranges anew for every scene; shared gives variant "
-        "k of a recipe the same numbers in every scene.",
-    )
-    scale: Number = Field(
-        default=1.0, gt=0, le=4, description="Resolution, times the recipes' own render.scale."
-    )
-    block_images: Whole = Field(
-        default=64,
-        ge=1,
-        le=10_000,
-        description="About how many images are published at once: what is lost with a machine.",
-    )
+    version: Literal[1] = 1
+    """Version of the format."""
+    name: Name = "job"
+    """The file's name if absent."""
+    scenes: tuple[Annotated[JobScene, _in_full("uri")], ...] = Field(min_length=1)
+    """URIs, or mappings with a uri."""
+    recipes: tuple[Annotated[JobRecipe, _in_full("recipe")], ...] = Field(min_length=1)
+    """Presets and files, or mappings with a recipe."""
+    draws: Literal["per_scene", "shared"] = "per_scene"
+    """per_scene draws a recipe's ranges anew for every scene; shared gives variant k of a recipe
+    the same numbers in every scene."""
+    scale: Number = Field(default=1.0, gt=0, le=4)
+    """Resolution, times the recipes' own render.scale."""
+    block_images: Whole = Field(default=64, ge=1, le=10_000)
+    """About how many images are published at once: what is lost with a machine."""
 
     @model_validator(mode="after")
     def _names_known_recipes(self) -> Job:
@@ -116,8 +104,7 @@ class Job(Closed):
         for scene in self.scenes:
             for name in scene.recipes or ():
                 if name not in known:
-                    near = nearest_word(name, tuple(known))
-                    guess = f"did you mean {near}? " if near else ""
+                    guess = did_you_mean(name, tuple(known))
                     raise ValueError(
                         f"scene {scene.uri!r} names the recipe {name!r}, which the job has not; "
                         f"{guess}it has {', '.join(known)}"

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from importlib import resources
-from importlib.resources.abc import Traversable
 from pathlib import Path
 
 import yaml
 
-from recipes.errors import RecipeError, nearest_word
+from recipes.errors import RecipeError, did_you_mean
 from recipes.files import open_file
 from recipes.parse import parse_recipe
 from recipes.schema import Recipe, free_knobs
 from recipes.template import RecipeTemplate, is_number
+from recipes.weather import packaged, packaged_text
 
 # ---- A recipe in numbers -> the YAML that reads back as the same recipe --------------------------
 
@@ -51,8 +50,6 @@ def dump_recipe(recipe: Recipe) -> str:
     return f"# A recipe in numbers, hash {recipe.hash}.\n{body}"
 
 
-# ---- load ----------------------------------------------------------------------------------------
-
 MAX_BYTES = 65_536  # a recipe is a page of text; a bigger file is something else
 
 
@@ -68,7 +65,8 @@ def load_recipe(path_or_preset_name: str | Path) -> RecipeTemplate:
             file that cannot be read.
     """
     if isinstance(path_or_preset_name, str) and path_or_preset_name in preset_names():
-        return _load_preset(path_or_preset_name)
+        name = path_or_preset_name
+        return parse_recipe(preset_text(name), source=f"preset {name}", name=name)
     path = Path(path_or_preset_name)
     source = str(path_or_preset_name)
     text = _decode(_read(path, source), source)
@@ -77,8 +75,7 @@ def load_recipe(path_or_preset_name: str | Path) -> RecipeTemplate:
 
 def preset_names() -> tuple[str, ...]:
     """The recipes that come with the package, in alphabetical order."""
-    stems = (Path(entry.name) for entry in _presets().iterdir())
-    return tuple(sorted(path.stem for path in stems if path.suffix == ".yaml"))
+    return packaged("presets")
 
 
 def preset_text(name: str) -> str:
@@ -89,15 +86,7 @@ def preset_text(name: str) -> str:
     """
     if name not in preset_names():
         raise RecipeError(f"{name}: {_missing(name)}")
-    return _presets().joinpath(f"{name}.yaml").read_text(encoding="utf-8")
-
-
-def _presets() -> Traversable:
-    return resources.files("recipes").joinpath("presets")
-
-
-def _load_preset(name: str) -> RecipeTemplate:
-    return parse_recipe(preset_text(name), source=f"preset {name}", name=name)
+    return packaged_text("presets", name)
 
 
 def _read(path: Path, source: str) -> bytes:
@@ -116,10 +105,8 @@ def _read(path: Path, source: str) -> bytes:
 
 
 def _missing(source: str) -> str:
-    presets = preset_names()
-    near = nearest_word(source, presets)
-    guess = f"did you mean {near}? " if near else ""
-    return f"no such file, and no such preset; {guess}presets are {', '.join(presets)}"
+    names, guess = preset_names(), did_you_mean(source, preset_names())
+    return f"no such file, and no such preset; {guess}presets are {', '.join(names)}"
 
 
 def _decode(data: bytes, source: str) -> str:

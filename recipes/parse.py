@@ -180,10 +180,10 @@ class ValueParser:
             return self._bad(node, path, which_range(node, spec))
         kind = kinds[0]
         allowed = {kind, "weights"} if kind == "choice" else {kind}
-        for key in node.entries.keys() - allowed:
-            line = node.entries[key][0]
-            self._problems.add(line, f"{path}.{short(key)}: no part of a range {kind!r}")
-            return None
+        for key, (line, _) in node.entries.items():
+            if key not in allowed:
+                self._problems.add(line, f"{path}.{short(key)}: no part of a range {kind!r}")
+                return None
         body, below = node.entries[kind][1], f"{path}.{kind}"
         if kind == "choice":
             return self._choice(node, spec, path)
@@ -279,55 +279,33 @@ _UNIT = re.compile(
     r"_(per_)?(k|c|m)?(m|metres?|meters?|ft|feet|mi|miles?|yards?|mps|kmh|kph|mph|deg|rad|ntu|fnu)$"
 )
 # What a key may have been meant to be, where the section has it.
-_SYNONYMS: dict[str, tuple[str, ...]] = {
-    "fog": ("smog",),
-    "haze": ("smog",),
-    "mist": ("smog",),
-    "beta": ("extinction_per_m",),
-    "density": ("extinction_per_m",),
-    "sigma": ("extinction_per_m",),
-    "airlight": ("color",),
-    "water": ("flood",),
-    "puddle": ("flood",),
-    "puddles": ("flood",),
-    "depth": ("level_m",),
-    "depth_m": ("level_m",),
-    "clarity": ("turbidity_ntu",),
-    "ior": ("refraction_index",),
-    "refraction": ("refraction_index",),
-    "wind": ("waves",),
-    "ripples": ("waves",),
-    "level": ("depth_m",),
-    "level_m": ("depth_m",),
-    "height": ("depth_m",),
-    "height_m": ("depth_m",),
-    "thickness": ("depth_m",),
-    "thickness_m": ("depth_m",),
-    "cover": ("coverage",),
-    "slope_deg": ("max_slope_deg",),
-    "glitter": ("sparkle",),
-    "reflectance": ("albedo",),
-    "azimuth": ("sun_azimuth_deg",),
-    "azimuth_deg": ("sun_azimuth_deg",),
-    "elevation": ("sun_elevation_deg",),
-    "elevation_deg": ("sun_elevation_deg",),
-    "drifts": ("drift",),
-    "mood": ("style",),
-    "look": ("style",),
-    "photo": ("image",),
-    "picture": ("image",),
-    "file": ("image",),
-    "path": ("image",),
-    "sky_mask": ("mask",),
-    "algorithm": ("method",),
-    "weight": ("strength",),
-    "amount": ("strength",),
-    "intensity": ("strength",),
-    "regions": ("per_region",),
-    "network": ("checkpoint",),
-    "weights": ("checkpoint",),
-    "sha256": ("digest",),
+_MEANT_BY = {
+    "smog": "fog haze mist",
+    "extinction_per_m": "beta density sigma",
+    "color": "airlight",
+    "flood": "water puddle puddles",
+    "level_m": "depth depth_m",
+    "turbidity_ntu": "clarity",
+    "refraction_index": "ior refraction",
+    "waves": "wind ripples",
+    "depth_m": "level level_m height height_m thickness thickness_m",
+    "coverage": "cover",
+    "max_slope_deg": "slope_deg",
+    "sparkle": "glitter",
+    "albedo": "reflectance",
+    "sun_azimuth_deg": "azimuth azimuth_deg",
+    "sun_elevation_deg": "elevation elevation_deg",
+    "drift": "drifts",
+    "style": "mood look",
+    "image": "photo picture file path",
+    "mask": "sky_mask",
+    "method": "algorithm",
+    "strength": "weight amount intensity",
+    "per_region": "regions",
+    "checkpoint": "network weights",
+    "digest": "sha256",
 }
+_SYNONYMS = {word: meant for meant, words in _MEANT_BY.items() for word in words.split()}
 
 
 def unknown_key(key: str, section: SectionSpec) -> str:
@@ -341,7 +319,7 @@ def unknown_key(key: str, section: SectionSpec) -> str:
         return f"unknown field; did you mean {nearest}{unit}?"
     elsewhere = [
         (other, name)
-        for name in (key, *_SYNONYMS.get(key, ()))
+        for name in dict.fromkeys((key, _SYNONYMS.get(key, key)))
         for other in ROOT.walk()
         if name in other.known and other is not section
     ]
@@ -360,7 +338,7 @@ def _nearest(key: str, section: SectionSpec) -> str | None:
     bases = {_base(name): name for name in known}
     if _base(low) in bases:  # visibility_km, visibility: the unit is what was wrong
         return bases[_base(low)]
-    for meant in (*_SYNONYMS.get(low, ()), *_SYNONYMS.get(_base(low), ())):
+    for meant in (_SYNONYMS.get(low), _SYNONYMS.get(_base(low))):
         if meant in known:
             return meant
     if any(low in other.known for other in ROOT.walk()):

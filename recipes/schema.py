@@ -15,13 +15,23 @@ from types import MappingProxyType
 from typing import Any, ClassVar, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
-from pydantic.config import JsonDict
 
 from recipes.change import changed, found, is_given, replaced
-from recipes.weather import FILES, Closed, Colour, Flag, Flood, Number, Snow, Style, Whole
+from recipes.weather import (
+    FILES,
+    Closed,
+    Colour,
+    Flag,
+    Flood,
+    Number,
+    Seed,
+    Snow,
+    Style,
+    Whole,
+    one_of,
+)
 
-# ------------------------------------------------------------------------------------------------
-# What a recipe may say of speed against accuracy: a tier, or what an error or a frame may cost
+# ---- Speed against accuracy: a tier, or what an error or a frame may cost ------------------------
 
 Tier = Literal["draft", "balanced", "reference"]
 TARGETS = ("max_flip", "budget_ms")
@@ -34,30 +44,18 @@ class Quality(Closed):
 
     SHORTHAND: ClassVar[str] = "tier"
 
-    tier: Literal["draft", "balanced", "reference"] | None = Field(
-        default=None,
-        description="draft is for a first look, balanced differs from reference by less than a "
-        "person sees, reference takes no shortcut; null leaves every setting at its default.",
-    )
-    max_flip: Number | None = Field(
-        default=None,
-        gt=0,
-        le=1,
-        description="The fastest settings whose pictures of this scene differ from reference by "
-        "no more than this: mean FLIP, the worst of a few views.",
-    )
-    budget_ms: Number | None = Field(
-        default=None,
-        gt=0,
-        le=1e7,
-        description="The most accurate settings whose frames of this scene take no longer than "
-        "this on the machine that starts the job: the median of a few views, writing left out.",
-    )
-    settled: Flag = Field(
-        default=False,
-        description="Whether max_flip or budget_ms has made its choice, which the recipe then "
-        "holds: so it is in the recipes that a job leaves, and nothing is chosen again.",
-    )
+    tier: Tier | None = None
+    """draft is for a first look, balanced differs from reference by less than a person sees,
+    reference takes no shortcut; null leaves every setting at its default."""
+    max_flip: Number | None = Field(default=None, gt=0, le=1)
+    """The fastest settings whose pictures of this scene differ from reference by no more than this:
+    mean FLIP, the worst of a few views."""
+    budget_ms: Number | None = Field(default=None, gt=0, le=1e7)
+    """The most accurate settings whose frames of this scene take no longer than this on the machine
+    that starts the job: the median of a few views, writing left out."""
+    settled: Flag = False
+    """Whether max_flip or budget_ms has made its choice, which the recipe then holds: so it is in
+    the recipes that a job leaves, and nothing is chosen again."""
 
     @model_validator(mode="after")
     def _one_wish(self) -> Quality:
@@ -86,103 +84,61 @@ class Quality(Closed):
         return self.tier
 
 
-# What each tier sets, by the fields' dotted paths, but for those that a recipe gives and those of
-# effects that it has not; the rest are at reference, the last value of every knob (recipes.schema).
-# By the rule of docs/trade.md from the tables there.
-TIERS = MappingProxyType(
-    {
-        "draft": MappingProxyType(
-            {
-                "render.scale": 0.75,
-                "render.transmittance_stop": 0.01,
-                "weather.snow.shading": "per_splat",
-            }
-        ),
-        "balanced": MappingProxyType({"render.transmittance_stop": 0.01}),
-    }
-)
+# What each tier sets, by dotted path, of the fields that a recipe does not give; the rest are at
+# reference, the last value of every knob. By the rule of docs/trade.md from docs/trade/*.json.
+TIERS: Mapping[str, Mapping[str, float | str]] = MappingProxyType({
+    "draft": MappingProxyType({
+        "render.scale": 0.75,
+        "render.transmittance_stop": 0.01,
+        "weather.snow.shading": "per_splat",
+    }),
+    "balanced": MappingProxyType({"render.transmittance_stop": 0.01}),
+})  # fmt: skip
 
 
-# ------------------------------------------------------------------------------------------------
-# The knobs that trade speed for accuracy: every field of a recipe that does, with its values
-# What each value costs and saves is measured by `climategs bench trade`; docs/trade.md has figures.
+# ---- The knobs that trade speed for accuracy; `climategs bench trade` measures each value --------
 
-RecipeT = TypeVar(
-    "RecipeT", bound=BaseModel
-)  # recipes.schema.Recipe, which is made with this table
+RecipeT = TypeVar("RecipeT", bound=BaseModel)  # Recipe, which is made with this table
 Value = float | int | str | bool | None
 
 
 @dataclass(frozen=True)
 class Knob:
     """One field. path: dotted. values: from the fastest to the most accurate, which is reference.
-    effect: dotted path of the section without which it is of no effect; '' for none. chosen:
-    whether a tier or a target may set it; else it is only measured: it says what is written, which
-    is the user's to say, or has no value that saves time. what: of which error and which time, in
-    a few words.
+    what: of which error and which time, in a few words. chosen: whether a tier or a target may set
+    it; else it is only measured: it says what is written, or has no value that saves time.
     """
 
     path: str
     values: tuple[Value, ...]
     what: str
-    effect: str = ""
     chosen: bool = True
 
     @property
     def reference(self) -> Value:
         return self.values[-1]
 
+    @property
+    def effect(self) -> str:
+        """Dotted path of the section without which it has no effect; '' for none."""
+        section, name, *_ = self.path.split(".")
+        return {"weather": f"weather.{name}", "style": "style"}.get(section, "")
+
 
 # Those that save most come first: they have first call on an error that is allowed.
 KNOBS = (
     Knob("render.scale", (0.25, 0.5, 0.75, 1.0), "resolution, enlarged again for the comparison"),
-    Knob(
-        "weather.flood.reflection",
-        ("sky", "screen_space", "mirrored"),
-        "what water reflects",
-        effect="weather.flood",
-    ),
-    Knob(
-        "weather.snow.cell_m",
-        (0.2, 0.1, 0.05),
-        "size of the snow's splats near the path",
-        effect="weather.snow",
-    ),
-    Knob(
-        "weather.snow.shading",
-        ("per_splat", "per_pixel"),
-        "light on the snow",
-        effect="weather.snow",
-    ),
+    Knob("weather.flood.reflection", ("sky", "screen_space", "mirrored"), "what water reflects"),
+    Knob("weather.snow.cell_m", (0.2, 0.1, 0.05), "size of the snow's splats near the path"),
+    Knob("weather.snow.shading", ("per_splat", "per_pixel"), "light on the snow"),
     Knob("render.radius_clip_px", (3.0, 2.0, 1.0, 0.0), "splats no larger are left out"),
     Knob("render.transmittance_stop", (0.05, 0.01, 1e-3, 1e-4), "light behind it is given up"),
     Knob("render.sh_degree", (0, 1, 2, None), "bands of the colours' spherical harmonics"),
-    Knob(
-        "weather.flood.waves.count",
-        (6, 12, 24),
-        "waves that make up the surface",
-        effect="weather.flood",
-    ),
-    Knob(
-        "weather.flood.fresnel",
-        ("schlick", "exact"),
-        "share of reflected light",
-        effect="weather.flood",
-    ),
-    Knob(
-        "style.evaluated",
-        ("sh", "color"),
-        "map folded into the scene or put on each colour",
-        effect="style",
-    ),
+    Knob("weather.flood.waves.count", (6, 12, 24), "waves that make up the surface"),
+    Knob("weather.flood.fresnel", ("schlick", "exact"), "share of reflected light"),
+    Knob("style.evaluated", ("sh", "color"), "map folded into the scene or put on each colour"),
     # Smog on buffers saves nothing here, whatever it costs.
-    Knob(
-        "weather.smog.model",
-        ("deferred", "per_gaussian"),
-        "smog on buffers or on splats",
-        effect="weather.smog",
-        chosen=False,
-    ),
+    Knob("weather.smog.model", ("deferred", "per_gaussian"), "smog on buffers or on splats", False),
     Knob("output.depth", ("none", "expected", "median", "mode"), "depth estimator", chosen=False),
     Knob("output.jpeg_quality", (60, 75, 92, 100), "size and error of jpg files", chosen=False),
 )
@@ -215,7 +171,7 @@ def with_settings(recipe: RecipeT, settings: Mapping[str, Value]) -> RecipeT:
 
 def tier_settings(recipe: BaseModel, tier: str) -> dict[str, Value]:
     """What a tier sets of this recipe: of its free knobs."""
-    chosen: Mapping[str, Value] = TIERS.get(tier, {})
+    chosen = TIERS.get(tier, {})
     return {knob.path: chosen.get(knob.path, knob.reference) for knob in free_knobs(recipe)}
 
 
@@ -251,7 +207,7 @@ class FramePattern:
     pieces: tuple[int | slice, ...] | None
 
     def select(self, numbers: Sequence[int], *, clip: bool = False) -> tuple[int, ...] | None:
-        """The wanted numbers, each once, in the order written; None for all.
+        """The selected numbers, each once, in the order written; None for all.
 
         numbers: those there are, to which an open range goes. clip: leave out what of a range is
         not among them; a number on its own is kept even so, for whoever looks it up to refuse.
@@ -259,17 +215,17 @@ class FramePattern:
         if self.pieces is None:
             return None
         there, end = set(numbers), max(numbers, default=-1) + 1
-        wanted: list[int] = []
+        selected: list[int] = []
         for piece in self.pieces:
             if isinstance(piece, int):
-                wanted.append(piece)
+                selected.append(piece)
                 continue
             start = 0 if piece.start is None else piece.start
             stop = end if piece.stop is None else piece.stop
             is_open = piece.start is None or piece.stop is None
             run = range(start, min(stop, end) if clip else stop, piece.step or 1)
-            wanted += [n for n in run if n in there] if clip or is_open else run
-        return tuple(dict.fromkeys(wanted))
+            selected += [n for n in run if n in there] if clip or is_open else run
+        return tuple(dict.fromkeys(selected))
 
 
 def parse_frames(text: str) -> FramePattern:
@@ -304,7 +260,7 @@ def _number(text: str) -> int:
     return int(text)
 
 
-# ---- schema --------------------------------------------------------------------------------------
+# ---- The recipe ------------------------------------------------------------------------------------
 
 VERSION = 1
 KOSCHMIEDER = 3.912  # -ln(0.02): visibility is where contrast falls to 2 %
@@ -321,54 +277,24 @@ _LATER_FIELDS = (
 )
 MAX_EXTINCTION_PER_M = 100.0  # nothing is seen through 10 cm of it
 
-# In words of JSON Schema: one of the two is present and not null.
-_ONE_DENSITY: JsonDict = {
-    "oneOf": [
-        {"required": [name], "properties": {name: {"not": {"type": "null"}}}}
-        for name in ("visibility_m", "extinction_per_m")
-    ]
-}
-
 
 class Smog(Closed):
     """Fog, haze or smog: Beer-Lambert extinction towards one airlight colour."""
 
-    model_config = ConfigDict(json_schema_extra=_ONE_DENSITY)
+    model_config = ConfigDict(json_schema_extra=one_of("visibility_m", "extinction_per_m"))
 
-    visibility_m: Number | None = Field(
-        default=None,
-        gt=0,
-        le=1e6,
-        description="Meteorological visibility at the base height: 3.912 / extinction.",
-    )
-    extinction_per_m: Number | None = Field(
-        default=None,
-        ge=0,
-        le=MAX_EXTINCTION_PER_M,
-        description="Extinction coefficient at the base height.",
-    )
-    color: Colour = Field(
-        default=(0.76, 0.78, 0.80),
-        description="Airlight colour: red, green, blue, display-encoded sRGB.",
-    )
-    scale_height_m: Number | None = Field(
-        default=None,
-        ge=0.1,
-        le=1e5,
-        description="Height over which the density falls by e; null for uniform smog.",
-    )
-    base_height_m: Number = Field(
-        default=0.0,
-        ge=-1e4,
-        le=1e4,
-        description="Height above the road where the density is the one given; "
-        "of no effect on uniform smog.",
-    )
-    model: Literal["per_gaussian", "deferred"] = Field(
-        default="per_gaussian",
-        description="per_gaussian fogs every splat before blending; "
-        "deferred fogs the finished buffers.",
-    )
+    visibility_m: Number | None = Field(default=None, gt=0, le=1e6)
+    """Meteorological visibility at the base height: 3.912 / extinction."""
+    extinction_per_m: Number | None = Field(default=None, ge=0, le=MAX_EXTINCTION_PER_M)
+    """Extinction coefficient at the base height."""
+    color: Colour = (0.76, 0.78, 0.80)
+    """Airlight colour: red, green, blue, display-encoded sRGB."""
+    scale_height_m: Number | None = Field(default=None, ge=0.1, le=1e5)
+    """Height over which the density falls by e; null for uniform smog."""
+    base_height_m: Number = Field(default=0.0, ge=-1e4, le=1e4)
+    """Height above the road where the density is the one given; of no effect on uniform smog."""
+    model: Literal["per_gaussian", "deferred"] = "per_gaussian"
+    """per_gaussian fogs every splat before blending; deferred fogs the finished buffers."""
 
     @model_validator(mode="after")
     def _one_density(self) -> Smog:
@@ -407,91 +333,65 @@ class Weather(Closed):
 class Render(Closed):
     """How the scene is drawn."""
 
-    scale: Number = Field(
-        default=1.0, gt=0, le=4, description="Resolution relative to the cameras'."
-    )
-    near_m: Number = Field(
-        default=0.01, gt=0, le=100, description="Splats nearer to the camera's plane are dropped."
-    )
-    alpha_max: Number = Field(
-        default=0.999,
-        gt=0,
-        le=0.9999,
-        description="Cap of one splat's alpha: 0.999, or the original 3DGS's 0.99.",
-    )
-    antialiased: Flag = Field(default=False, description="Opacity compensated for the screen blur.")
-    sh_degree: Whole | None = Field(
-        default=None, ge=0, le=3, description="Highest spherical-harmonics band; null for all."
-    )
-    exposure: Literal["recorded", "neutral"] = Field(
-        default="recorded",
-        description="recorded gives each camera's picture the colours of its recording, where the "
-        "scene knows them; neutral leaves the scene's own.",
-    )
-    transmittance_stop: Number = Field(
-        default=1e-4,
-        ge=1e-6,
-        le=0.25,
-        description="A pixel is finished once no more than this share of the light behind shines "
-        "through; what it shows by then stands for the rest. 1e-6 blends what no picture in 8 bits "
-        "shows; 0.5 would leave no median depth, hence the limit.",
-    )
-    radius_clip_px: Number = Field(
-        default=0.0,
-        ge=0,
-        le=64,
-        description="Splats that reach no farther than this from their centre along x or y, pixels "
-        "of the rendered picture, are left out; 0 leaves out none.",
-    )
+    scale: Number = Field(default=1.0, gt=0, le=4)
+    """Resolution relative to the cameras'."""
+    near_m: Number = Field(default=0.01, gt=0, le=100)
+    """Splats nearer to the camera's plane are dropped."""
+    alpha_max: Number = Field(default=0.999, gt=0, le=0.9999)
+    """Cap of one splat's alpha: 0.999, or the original 3DGS's 0.99."""
+    antialiased: Flag = False
+    """Opacity compensated for the screen blur."""
+    sh_degree: Whole | None = Field(default=None, ge=0, le=3)
+    """Highest spherical-harmonics band; null for all."""
+    exposure: Literal["recorded", "neutral"] = "recorded"
+    """recorded gives each camera's picture the colours of its recording, where the scene knows
+    them; neutral leaves the scene's own."""
+    transmittance_stop: Number = Field(default=1e-4, ge=1e-6, le=0.25)
+    """A pixel is finished once no more than this share of the light behind shines through; what it
+    shows by then stands for the rest. 1e-6 blends what no picture in 8 bits shows; 0.5 would leave
+    no median depth, hence the limit."""
+    radius_clip_px: Number = Field(default=0.0, ge=0, le=64)
+    """Splats that reach no farther than this from their centre along x or y, pixels of the rendered
+    picture, are left out; 0 leaves out none."""
 
 
 class Output(Closed):
     """What is written for each image."""
 
-    image: Literal["png", "jpg"] = Field(default="png", description="Image format.")
-    jpeg_quality: Whole = Field(default=92, ge=1, le=100, description="Quality of jpg images.")
-    depth: Literal["median", "expected", "mode", "none"] = Field(
-        default="median", description="Depth estimator written as 16-bit PNG, metres x 256."
-    )
-    surface: Literal["solid", "scene", "first"] = Field(
-        default="solid",
-        description="What depth, semantic and instance images show of the weather: solid counts "
-        "snow as a surface and water not; scene shows the scene without either; first shows "
-        "whatever a ray meets first, water too.",
-    )
-    semantic: Flag = Field(default=False, description="Write the class of the heaviest splat.")
-    instance: Flag = Field(
-        default=False,
-        description="Write which object each pixel shows: an actor's heaviest splat, or the "
-        "labelled box that its surface lies in.",
-    )
-    lidar: Flag | Literal["auto", "weather"] = Field(
-        default="auto",
-        description="LiDAR sweeps: true passes them through as recorded, weather writes them as "
-        "the recipe's smog, flood and snow would have them, false writes none; auto is weather "
-        "where the recipe has snow or a flood and surface is not scene, else true.",
-    )
-    labels: Flag = Field(default=True, description="Pass 3D boxes through.")
+    image: Literal["png", "jpg"] = "png"
+    """Image format."""
+    jpeg_quality: Whole = Field(default=92, ge=1, le=100)
+    """Quality of jpg images."""
+    depth: Literal["median", "expected", "mode", "none"] = "median"
+    """Depth estimator written as 16-bit PNG, metres x 256."""
+    surface: Literal["solid", "scene", "first"] = "solid"
+    """What depth, semantic and instance images show of the weather: solid counts snow as a surface
+    and water not; scene shows the scene without either; first shows whatever a ray meets first,
+    water too."""
+    semantic: Flag = False
+    """Write the class of the heaviest splat."""
+    instance: Flag = False
+    """Write which object each pixel shows: an actor's heaviest splat, or the labelled box that its
+    surface lies in."""
+    lidar: Flag | Literal["auto", "weather"] = "auto"
+    """LiDAR sweeps: true passes them through as recorded, weather writes them as the recipe's smog,
+    flood and snow would have them, false writes none; auto is weather where the recipe has snow or
+    a flood and surface is not scene, else true."""
+    labels: Flag = True
+    """Pass 3D boxes through."""
 
 
 class Recipe(Closed):
     """A recipe in numbers: together with the package version it determines every pixel."""
 
-    version: Literal[1] = Field(default=VERSION, description="Version of the recipe format.")
-    name: str = Field(
-        default="recipe",
-        pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$",
-        description="Used for folders and in the manifest; the file's name if absent.",
-    )
-    seed: Whole = Field(
-        default=0, ge=0, lt=2**63, description="What all random numbers are made from."
-    )
-    variant: Whole = Field(
-        default=0,
-        ge=0,
-        lt=2**31,
-        description="Which draw from the ranges this is; in a file with ranges, the first one.",
-    )
+    version: Literal[1] = VERSION
+    """Version of the recipe format."""
+    name: str = Field(default="recipe", pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")
+    """Used for folders and in the manifest; the file's name if absent."""
+    seed: Seed = 0
+    """What all random numbers are made from."""
+    variant: Whole = Field(default=0, ge=0, lt=2**31)
+    """Which draw from the ranges this is; in a file with ranges, the first one."""
     weather: Weather = Weather()
     style: Style | None = None
     quality: Quality = Quality()

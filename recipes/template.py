@@ -461,15 +461,14 @@ def join(path: str, name: str) -> str:
 def _section(
     path: str, model: type[BaseModel], *, effect: bool = False, items: ListSpec | None = None
 ) -> SectionSpec:
-    description = " ".join((model.__doc__ or "").split())
     shorthand: str | None = getattr(model, "SHORTHAND", None)
-    spec = SectionSpec(path, model, description, effect, items, shorthand)
+    spec = SectionSpec(path, model, _one_line(model.__doc__), effect, items, shorthand)
     for name, info in model.model_fields.items():
         below = join(path, name)
         inner, nullable = _without_none(info.annotation)
         item = _item(inner)
         if item is not None:
-            items = ListSpec(_most(info), info.description or "")
+            items = ListSpec(_most(info), _one_line(info.description))
             spec.sections[name] = _section(f"{below}[]", item, items=items)
         elif isinstance(inner, type) and issubclass(inner, BaseModel):
             spec.sections[name] = _section(below, inner, effect=nullable)
@@ -488,6 +487,10 @@ def _section(
     return spec
 
 
+def _one_line(text: str | None) -> str:
+    return " ".join((text or "").split())
+
+
 def _field(path: str, info: FieldInfo, *, rangeable: bool) -> FieldSpec:
     inner, nullable = _without_none(info.annotation)
     bounds = [
@@ -500,7 +503,7 @@ def _field(path: str, info: FieldInfo, *, rangeable: bool) -> FieldSpec:
     return FieldSpec(
         path=path,
         kind=kind,
-        description=info.description or "",
+        description=_one_line(info.description),
         annotation=Annotated[info.annotation, info],
         nullable=nullable,
         default=None if required else info.default,

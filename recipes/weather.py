@@ -1,18 +1,17 @@
-"""What a recipe may say of a flood, and how clear its water is."""
+"""What a recipe may say of snow, style and flood, and the types of its fields."""
 
 from __future__ import annotations
 
 import functools
 import math
 from importlib import resources
-from importlib.resources.abc import Traversable
 from pathlib import Path, PurePath
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, Strict, model_validator
 from pydantic.config import JsonDict
 
-from recipes.errors import RecipeError, nearest_word
+from recipes.errors import RecipeError, did_you_mean
 
 # ---- The types of a recipe's fields, shared by its models ----------------------------------------
 
@@ -25,15 +24,28 @@ Unit = Annotated[float, Strict(), Field(ge=0.0, le=1.0)]
 Colour = tuple[Unit, Unit, Unit]
 PerMetre = Annotated[float, Strict(), Field(ge=0.0, le=MAX_PER_M)]
 Rates = tuple[PerMetre, PerMetre, PerMetre]
+Angle = Annotated[float, Strict(), Field(ge=-360, le=360)]
+Seed = Annotated[int, Strict(), Field(ge=0, lt=2**63)]
 # In a recipe file a path below its folder; in a recipe in numbers any path.
 FilePath = Annotated[str, Strict(), Field(min_length=1, max_length=4096)]
 Digest = Annotated[str, Strict(), Field(pattern=r"^[0-9a-f]{64}$")]
 
 
 class Closed(BaseModel):
-    """Frozen, and an unknown key is an error: what every section of a recipe derives from."""
+    """Frozen, and an unknown key is an error: what every section of a recipe derives from.
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    The text below a field is its description.
+    """
+
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True
+    )
+
+
+def one_of(*names: str) -> JsonDict:
+    """In words of JSON Schema: exactly one of the fields is present and not null."""
+    present: JsonDict = {"not": {"type": "null"}}
+    return {"oneOf": [{"required": [name], "properties": {name: present}} for name in names]}
 
 
 # ---- What a recipe may say of snow that lies on the ground ---------------------------------------
@@ -42,86 +54,54 @@ class Closed(BaseModel):
 class SnowLight(Closed):
     """The light on the snow; null leaves a field to what the scene's sky and ground show."""
 
-    sun_azimuth_deg: Number | None = Field(
-        default=None,
-        ge=-360,
-        le=360,
-        description="Where the sun stands: 0 is world +x, 90 is +y; null for the brightest part "
-        "of the sky.",
-    )
-    sun_elevation_deg: Number | None = Field(
-        default=None,
-        ge=0,
-        le=90,
-        description="The sun's height above the horizon; null for the brightest part of the sky.",
-    )
-    sun: Number | None = Field(
-        default=None,
-        ge=0,
-        le=1,
-        description="How much of the light comes from the sun: 0 overcast, 1 a clear day; null "
-        "for what the sky's contrast suggests.",
-    )
-    brightness: Number | None = Field(
-        default=None,
-        ge=0,
-        le=1,
-        description="Display-encoded brightness of snow of albedo 0.85 that faces the light; null "
-        "for what the scene's ground suggests.",
-    )
+    sun_azimuth_deg: Number | None = Field(default=None, ge=-360, le=360)
+    """Where the sun stands: 0 is world +x, 90 is +y; null for the brightest part of the sky."""
+    sun_elevation_deg: Number | None = Field(default=None, ge=0, le=90)
+    """The sun's height above the horizon; null for the brightest part of the sky."""
+    sun: Number | None = Field(default=None, ge=0, le=1)
+    """How much of the light comes from the sun: 0 overcast, 1 a clear day; null for what the sky's
+    contrast suggests."""
+    brightness: Number | None = Field(default=None, ge=0, le=1)
+    """Display-encoded brightness of snow of albedo 0.85 that faces the light; null for what the
+    scene's ground suggests."""
 
 
 class SnowWind(Closed):
     """The wind that the snow fell with."""
 
-    direction_deg: Number = Field(
-        default=0.0, ge=-360, le=360, description="Where it blows to: 0 is world +x, 90 is +y."
-    )
-    drift: Unit = Field(
-        default=0.3,
-        description="How uneven the wind left the layer: 0 is level but for its grain, 1 has "
-        "ridges across the wind and banks before obstacles.",
-    )
+    direction_deg: Angle = 0.0
+    """Where it blows to: 0 is world +x, 90 is +y."""
+    drift: Unit = 0.3
+    """How uneven the wind left the layer: 0 is level but for its grain, 1 has ridges across the
+    wind and banks before obstacles."""
 
 
 class Snow(Closed):
     """Snow lying on what is open to the sky: ground, roofs, vehicles."""
 
-    depth_m: Number = Field(ge=0, le=10, description="Depth of the layer on level ground.")
-    coverage: Unit = Field(
-        default=1.0, description="Share of the open surface that is covered; below 1 in patches."
-    )
-    max_slope_deg: Number = Field(
-        default=50.0, ge=0, le=85, description="Snow lies on no surface steeper than this."
-    )
-    albedo: Unit = Field(default=0.85, description="Share of the light that the snow gives back.")
-    grain: Unit = Field(
-        default=0.5, description="Unevenness of the size of the splats: 0 smooth, 1 coarse."
-    )
-    sparkle: Unit = Field(default=0.0, description="How many crystals glint at the sun; 0 is none.")
-    tracks: Literal["auto", "always", "never"] = Field(
-        default="auto",
-        description="Packed grey wheel tracks where the ego and the scene's vehicles drive; auto "
-        "up to a depth of 0.3 m.",
-    )
+    depth_m: Number = Field(ge=0, le=10)
+    """Depth of the layer on level ground."""
+    coverage: Unit = 1.0
+    """Share of the open surface that is covered; below 1 in patches."""
+    max_slope_deg: Number = Field(default=50.0, ge=0, le=85)
+    """Snow lies on no surface steeper than this."""
+    albedo: Unit = 0.85
+    """Share of the light that the snow gives back."""
+    grain: Unit = 0.5
+    """Unevenness of the size of the splats: 0 smooth, 1 coarse."""
+    sparkle: Unit = 0.0
+    """How many crystals glint at the sun; 0 is none."""
+    tracks: Literal["auto", "always", "never"] = "auto"
+    """Packed grey wheel tracks where the ego and the scene's vehicles drive; auto up to a depth of
+    0.3 m."""
     light: SnowLight = SnowLight()
     wind: SnowWind = SnowWind()
-    shading: Literal["per_splat", "per_pixel"] = Field(
-        default="per_splat",
-        description="Lit by one normal a splat, or by one a pixel of every splat.",
-    )
-    cell_m: Number = Field(
-        default=0.05,
-        ge=0.001,
-        le=10,
-        description="Size of the splats near the path; they grow with the distance from it.",
-    )
-    seed: Whole | None = Field(
-        default=None,
-        ge=0,
-        lt=2**63,
-        description="What drifts, patches and grain are drawn from; null for the recipe's seed.",
-    )
+    shading: Literal["per_splat", "per_pixel"] = "per_splat"
+    """Lit by one normal a splat, or by one a pixel of every splat."""
+    cell_m: Number = Field(default=0.05, ge=0.001, le=10)
+    """Size of the splats near the path; they grow with the distance from it."""
+    seed: Whole | None = Field(default=None, ge=0, lt=2**63)
+    """What drifts, patches and grain are drawn from; null for the recipe's seed."""
 
     @property
     def lies(self) -> bool:
@@ -133,10 +113,21 @@ class Snow(Closed):
 
 
 @functools.cache
+def packaged(folder: str) -> tuple[str, ...]:
+    """The stems of the YAML files in a folder of this package, in alphabetical order."""
+    names = (Path(entry.name) for entry in resources.files("recipes").joinpath(folder).iterdir())
+    return tuple(sorted(path.stem for path in names if path.suffix == ".yaml"))
+
+
+def packaged_text(folder: str, name: str) -> str:
+    """One of these files."""
+    file = resources.files("recipes").joinpath(folder, f"{name}.yaml")
+    return file.read_text(encoding="utf-8")
+
+
 def style_preset_names() -> tuple[str, ...]:
     """Their names, in alphabetical order."""
-    stems = (Path(entry.name) for entry in _styles().iterdir())
-    return tuple(sorted(path.stem for path in stems if path.suffix == ".yaml"))
+    return packaged("styles")
 
 
 def style_preset_text(name: str) -> str:
@@ -147,30 +138,17 @@ def style_preset_text(name: str) -> str:
     """
     if name not in style_preset_names():
         raise RecipeError(f"style {name!r}: {no_such_style(name)}")
-    return _styles().joinpath(f"{name}.yaml").read_text(encoding="utf-8")
+    return packaged_text("styles", name)
 
 
 def no_such_style(name: str) -> str:
     """What to say of a name that no style has."""
     names = style_preset_names()
-    near = nearest_word(name, names)
-    guess = f"did you mean {near}? " if near else ""
-    return f"no such style; {guess}styles are {', '.join(names)}"
-
-
-def _styles() -> Traversable:
-    return resources.files("recipes").joinpath("styles")
+    return f"no such style; {did_you_mean(name, names)}styles are {', '.join(names)}"
 
 
 # ---- What a recipe may say of style: the colour mood of a photograph, or of a preset -------------
 
-# In words of JSON Schema: one of the two is present and not null.
-_ONE_SOURCE: JsonDict = {
-    "oneOf": [
-        {"required": [name], "properties": {name: {"not": {"type": "null"}}}}
-        for name in ("image", "preset")
-    ]
-}
 FILES = ("image", "mask", "checkpoint")  # the fields that name one
 
 
@@ -186,51 +164,32 @@ StyleName = Annotated[str, Strict(), AfterValidator(_known)]
 class Style(Closed):
     """The colours of the scene, turned into those of an image or of a preset."""
 
-    model_config = ConfigDict(json_schema_extra=_ONE_SOURCE)
+    model_config = ConfigDict(json_schema_extra=one_of("image", "preset"))
 
-    image: FilePath | None = Field(
-        default=None, description="The picture whose colours the scene takes on."
-    )
-    preset: StyleName | None = Field(
-        default=None, description="A style that comes with the package, in place of an image."
-    )
-    mask: FilePath | None = Field(
-        default=None,
-        description="An image of the style image's shape, white where that shows sky; null to "
-        "look for the sky at its top.",
-    )
-    method: Literal["mkl", "reinhard", "gscm"] = Field(
-        default="mkl",
-        description="mkl maps mean and covariance of the colours (Monge-Kantorovich), reinhard "
-        "mean and spread of each channel; gscm is the network.",
-    )
-    strength: Number = Field(
-        default=1.0, ge=0, le=2, description="0 leaves the scene's colours, 1 takes on the style's."
-    )
-    per_region: Flag = Field(
-        default=False,
-        description="Maps of their own for road, vegetation and the rest, where the scene knows "
-        "its classes.",
-    )
-    applied_to: Literal["scene", "picture"] = Field(
-        default="scene",
-        description="scene styles what stands in the weather, picture also the weather itself.",
-    )
-    evaluated: Literal["color", "sh"] = Field(
-        default="color",
-        description="color maps every colour as it is seen; sh maps the background's spherical "
-        "harmonics once, which frames pay nothing for and which differs where colours that change "
-        "with the direction reach below 0. Of applied_to scene.",
-    )
-    checkpoint: FilePath | None = Field(
-        default=None,
-        description="A trained network for gscm; null for the one that comes with the package.",
-    )
-    digest: Digest | None = Field(
-        default=None,
-        description="SHA-256 over what the files above hold; checked where given, worked out "
-        "where null.",
-    )
+    image: FilePath | None = None
+    """The picture whose colours the scene takes on."""
+    preset: StyleName | None = None
+    """A style that comes with the package, in place of an image."""
+    mask: FilePath | None = None
+    """An image of the style image's shape, white where that shows sky; null to look for the sky at
+    its top."""
+    method: Literal["mkl", "reinhard", "gscm"] = "mkl"
+    """mkl maps mean and covariance of the colours (Monge-Kantorovich), reinhard mean and spread of
+    each channel; gscm is the network."""
+    strength: Number = Field(default=1.0, ge=0, le=2)
+    """0 leaves the scene's colours, 1 takes on the style's."""
+    per_region: Flag = False
+    """Maps of their own for road, vegetation and the rest, where the scene knows its classes."""
+    applied_to: Literal["scene", "picture"] = "scene"
+    """scene styles what stands in the weather, picture also the weather itself."""
+    evaluated: Literal["color", "sh"] = "color"
+    """color maps every colour as it is seen; sh maps the background's spherical harmonics once,
+    which frames pay nothing for and which differs where colours that change with the direction
+    reach below 0. Of applied_to scene."""
+    checkpoint: FilePath | None = None
+    """A trained network for gscm; null for the one that comes with the package."""
+    digest: Digest | None = None
+    """SHA-256 over what the files above hold; checked where given, worked out where null."""
 
     @model_validator(mode="after")
     def _one_source(self) -> Style:
@@ -296,25 +255,17 @@ _ONE_CLARITY: JsonDict = {
 class Wave(Closed):
     """One Gerstner wave."""
 
-    direction_deg: Number = Field(
-        default=0.0, ge=-360, le=360, description="Where it runs to: 0 is world +x, 90 is +y."
-    )
-    amplitude_m: Number = Field(
-        ge=0,
-        le=100,
-        description="Half its height from trough to crest; at most its wavelength / 2 pi.",
-    )
-    wavelength_m: Number = Field(ge=1e-3, le=1e4, description="From crest to crest.")
-    steepness: Number = Field(
-        default=0.0,
-        ge=0,
-        le=1,
-        description="0 is a sine, 1 the sharpest crest it can have without looping; "
-        "at most 1 over all waves together.",
-    )
-    phase_deg: Number = Field(
-        default=0.0, ge=-360, le=360, description="At the world's origin at time 0."
-    )
+    direction_deg: Angle = 0.0
+    """Where it runs to: 0 is world +x, 90 is +y."""
+    amplitude_m: Number = Field(ge=0, le=100)
+    """Half its height from trough to crest; at most its wavelength / 2 pi."""
+    wavelength_m: Number = Field(ge=1e-3, le=1e4)
+    """From crest to crest."""
+    steepness: Number = Field(default=0.0, ge=0, le=1)
+    """0 is a sine, 1 the sharpest crest it can have without looping; at most 1 over all waves
+    together."""
+    phase_deg: Angle = 0.0
+    """At the world's origin at time 0."""
 
     @model_validator(mode="after")
     def _not_breaking(self) -> Wave:
@@ -331,32 +282,18 @@ class Wave(Closed):
 class Waves(Closed):
     """The water's surface: a preset's spectrum, drawn from a seed, or waves one by one."""
 
-    preset: Literal["still", "calm", "breeze", "wind"] = Field(
-        default="calm", description="Spectrum to draw waves from; of no effect beside components."
-    )
-    count: Whole = Field(
-        default=24, ge=1, le=MAX_WAVES, description="How many waves are drawn from the spectrum."
-    )
-    direction_deg: Number = Field(
-        default=30.0,
-        ge=-360,
-        le=360,
-        description="Where the preset's wind blows to: 0 is world +x, 90 is +y.",
-    )
-    height: Number = Field(
-        default=1.0, ge=0, le=10, description="Factor on the amplitudes of the preset's waves."
-    )
-    seed: Whole | None = Field(
-        default=None,
-        ge=0,
-        lt=2**63,
-        description="What the preset's waves are drawn from; null for the recipe's seed.",
-    )
-    components: tuple[Wave, ...] | None = Field(
-        default=None,
-        max_length=MAX_WAVES,
-        description="Waves one by one, in place of a preset's; an empty list is still water.",
-    )
+    preset: Literal["still", "calm", "breeze", "wind"] = "calm"
+    """Spectrum to draw waves from; of no effect beside components."""
+    count: Whole = Field(default=24, ge=1, le=MAX_WAVES)
+    """How many waves are drawn from the spectrum."""
+    direction_deg: Angle = 30.0
+    """Where the preset's wind blows to: 0 is world +x, 90 is +y."""
+    height: Number = Field(default=1.0, ge=0, le=10)
+    """Factor on the amplitudes of the preset's waves."""
+    seed: Whole | None = Field(default=None, ge=0, lt=2**63)
+    """What the preset's waves are drawn from; null for the recipe's seed."""
+    components: tuple[Wave, ...] | None = Field(default=None, max_length=MAX_WAVES)
+    """Waves one by one, in place of a preset's; an empty list is still water."""
 
     @model_validator(mode="after")
     def _no_loops(self) -> Waves:
@@ -375,14 +312,11 @@ class Flood(Closed):
 
     model_config = ConfigDict(json_schema_extra=_ONE_CLARITY)
 
-    level_m: Number = Field(
-        ge=-1e4, le=1e4, description="Height of the water's surface above the reference."
-    )
-    reference: Literal["lowest", "median", "absolute"] = Field(
-        default="lowest",
-        description="What level_m counts from: the lowest or the median height of the road along "
-        "the drive, or z = 0 of the scene's world.",
-    )
+    level_m: Number = Field(ge=-1e4, le=1e4)
+    """Height of the water's surface above the reference."""
+    reference: Literal["lowest", "median", "absolute"] = "lowest"
+    """What level_m counts from: the lowest or the median height of the road along the drive, or z =
+    0 of the scene's world."""
     turbidity_ntu: Number | None = Field(
         default=None,
         ge=0,
@@ -390,27 +324,18 @@ class Flood(Closed):
         description="How cloudy the water is; 0 is pure water. "
         f"{DEFAULT_TURBIDITY_NTU:g} where neither it nor absorption_per_m is given.",
     )
-    absorption_per_m: Rates | None = Field(
-        default=None,
-        description="Extinction along the way through the water, in place of turbidity_ntu.",
-    )
-    color: Colour = Field(
-        default=(0.42, 0.38, 0.30),
-        description="Colour of deep water seen from above, without reflections, "
-        "display-encoded sRGB.",
-    )
-    refraction_index: Number = Field(
-        default=1.333, ge=1, le=3, description="Of the water; 1 neither reflects nor bends."
-    )
+    absorption_per_m: Rates | None = None
+    """Extinction along the way through the water, in place of turbidity_ntu."""
+    color: Colour = (0.42, 0.38, 0.30)
+    """Colour of deep water seen from above, without reflections, display-encoded sRGB."""
+    refraction_index: Number = Field(default=1.333, ge=1, le=3)
+    """Of the water; 1 neither reflects nor bends."""
     waves: Waves = Waves()
-    fresnel: Literal["exact", "schlick"] = Field(
-        default="exact", description="How the share of reflected light follows from the angle."
-    )
-    reflection: Literal["sky", "screen_space", "mirrored"] = Field(
-        default="mirrored",
-        description="What is reflected: the sky alone; what the image shows, the rest from a "
-        "coarse mirrored view; or a second view from the camera mirrored in the water.",
-    )
+    fresnel: Literal["exact", "schlick"] = "exact"
+    """How the share of reflected light follows from the angle."""
+    reflection: Literal["sky", "screen_space", "mirrored"] = "mirrored"
+    """What is reflected: the sky alone; what the image shows, the rest from a coarse mirrored view;
+    or a second view from the camera mirrored in the water."""
 
     @model_validator(mode="after")
     def _one_clarity(self) -> Flood:
