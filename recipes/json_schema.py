@@ -22,10 +22,10 @@ def field_table() -> str:
     """A Markdown table of every key of a recipe file, one row each, sections in their order."""
     rows = []
     for section in ROOT.walk():
-        if section.items is not None:
+        if section.max_items is not None:
             path = section.path.removesuffix("[]")
-            allowed = f"a list of up to {section.items.most} mappings, or null"
-            rows.append(f"| `{path}` | {allowed} | `null` | {section.items.description} |\n")
+            allowed = f"a list of up to {section.max_items} mappings, or null"
+            rows.append(f"| `{path}` | {allowed} | `null` | {section.list_description} |\n")
         rows += [_row(spec) for spec in (*section.fields.values(), *section.extra.values())]
     return _HEADER + "".join(rows)
 
@@ -80,9 +80,13 @@ def _section(section: SectionSpec, definitions: Schema) -> Schema:
         properties[name] = _field(spec, definitions)
     for name, below in section.sections.items():
         schema = _section(below, definitions)
-        if below.items is not None:
-            said = {"description": below.items.description, "maxItems": below.items.most}
-            schema = {"type": "array", "items": schema, **said}
+        if below.max_items is not None:
+            schema = {
+                "type": "array",
+                "items": schema,
+                "description": below.list_description,
+                "maxItems": below.max_items,
+            }
         # 'weather:' with nothing after it is null
         ways = [schema, {"type": "null"}]
         if below.shorthand is not None:

@@ -20,8 +20,6 @@ from recipes.template import (
     Fixed,
     Items,
     Kind,
-    ListSpec,
-    LogUniform,
     Normal,
     RecipeTemplate,
     SectionSpec,
@@ -209,7 +207,7 @@ class ValueParser:
         if log and low <= 0:
             return self._bad(body.items[0], f"{path}[0]", "must be > 0: its logarithm is taken")
         whole = spec.kind is Kind.WHOLE
-        return LogUniform(low, high, whole) if log else Uniform(low, high, whole)
+        return Uniform(low, high, whole, log)
 
     def _normal(self, body: Node, spec: FieldSpec, path: str) -> Value | None:
         if not isinstance(body, MapNode) or set(body.entries) != set(NORMAL_KEYS):
@@ -458,7 +456,7 @@ class _Compiler:
         path: the section's, with numbers in place of the [] of lists. line: the one of its key.
         """
         given: dict[str, Value | Items] = {}
-        if isinstance(node, ScalarNode) and node.value is None and spec.items is None:
+        if isinstance(node, ScalarNode) and node.value is None and spec.max_items is None:
             return given  # 'weather:' with nothing below it: it is empty, an effect absent
         if isinstance(node, ScalarNode) and spec.shorthand is not None:
             value = self._parser.literal(node, spec.fields[spec.shorthand].without_null, path)
@@ -490,8 +488,8 @@ class _Compiler:
     ) -> Value | Items | None:
         """Read what stands under a key; None where the section's rules do not ask for it."""
         below = spec.sections.get(key)
-        if below is not None and below.items is not None:
-            return self._list(node, below, below.items, path)
+        if below is not None and below.max_items is not None:
+            return self._list(node, below, below.max_items, path)
         if below is not None:
             self._section(node, below, path, line)
         elif key in spec.fields:
@@ -508,12 +506,12 @@ class _Compiler:
             self._problems.add(line, f"{shown}: {unknown_key(key, spec)}")
         return None
 
-    def _list(self, node: Node, spec: SectionSpec, items: ListSpec, path: str) -> Items | None:
+    def _list(self, node: Node, spec: SectionSpec, most: int, path: str) -> Items | None:
         if isinstance(node, ScalarNode) and node.value is None:
             return None
-        if not isinstance(node, ListNode) or len(node.items) > items.most:
+        if not isinstance(node, ListNode) or len(node.items) > most:
             known = ", ".join(spec.known)
-            allowed = f"a list of up to {items.most} mappings, each with {known}; or null"
+            allowed = f"a list of up to {most} mappings, each with {known}; or null"
             self._problems.add(node.line, f"{path} = {show(node)}: must be {allowed}")
             return None
         self._lists[path] = len(node.items)

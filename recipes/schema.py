@@ -260,7 +260,7 @@ def _number(text: str) -> int:
     return int(text)
 
 
-# ---- The recipe ------------------------------------------------------------------------------------
+# ---- The recipe ---------------------------------------------------------------------------------
 
 VERSION = 1
 KOSCHMIEDER = 3.912  # -ln(0.02): visibility is where contrast falls to 2 %

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import enum
+import functools
 import hashlib
 import itertools
 import json
 import math
+import operator
 import re
 import types
 from collections.abc import Iterable, Iterator, Mapping
@@ -16,7 +18,7 @@ from pathlib import Path
 from statistics import NormalDist
 from typing import Annotated, Any, Literal, Protocol, TypeGuard, Union, get_args, get_origin
 
-import annotated_types
+from annotated_types import Ge, Gt, Le, Lt, MaxLen
 from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 from pydantic.fields import FieldInfo
 
@@ -25,7 +27,6 @@ from recipes.files import file_below, with_digest
 from recipes.schema import VERSION, Recipe
 from recipes.weather import (
     FILES,
-    MAX_PER_M,
     Colour,
     Digest,
     FilePath,
@@ -39,10 +40,8 @@ from recipes.weather import (
     style_preset_names,
 )
 
-# ------------------------------------------------------------------------------------------------
-# The random numbers of a recipe: each a pure function of (seed, variant, name of the field)
-# There is no generator whose state one draw could hand to the next, so a new field or a new variant
-# leaves every other number as it was, in any process and in any order.
+# ---- The random numbers of a recipe: each a pure function of (seed, variant, name of the field) --
+# No generator hands its state from draw to draw: a new field or variant leaves all others alone.
 
 _DOMAIN = "climategs recipe draw 1"  # a change of the scheme changes this, never silently a number
 
@@ -62,8 +61,7 @@ class Draws:
 
 
 # ---- How one field of a recipe gets its value: a fixed one, or a draw from a range ---------------
-# Draws of floats are rounded to 10 significant digits, then kept inside the ends: exp, log and erf
-# may differ in the last bit between platforms, and a recipe's numbers should not.
+# Drawn floats have 10 significant digits: exp, log and erf differ in the last bit by platform.
 
 Triple = tuple[float, float, float]  # a colour, or three rates
 RANGE_KINDS = ("uniform", "log_uniform", "normal", "choice")
@@ -71,24 +69,18 @@ Plain = bool | int | float | str | Triple | None
 
 
 class Value(Protocol):
-    """What a template holds for a field."""
+    """What a template holds for a field.
+
+    is_range: False where every variant gets the same. draw: the value of one variant, `path` naming
+    its random number. probes: the extreme values of the range and every option of a choice, all of
+    which must be allowed. describe: the range in words, without its unit.
+    """
 
     @property
-    def is_range(self) -> bool:
-        """False where every variant gets the same."""
-        ...
-
-    def draw(self, draws: Draws, path: str) -> Plain:
-        """The value of one variant; `path` names its random number."""
-        ...
-
-    def probes(self) -> tuple[Plain, ...]:
-        """The extreme values of the range, and every option of a choice: all must be allowed."""
-        ...
-
-    def describe(self) -> str:
-        """The range in words, without its unit."""
-        ...
+    def is_range(self) -> bool: ...
+    def draw(self, draws: Draws, path: str) -> Plain: ...
+    def probes(self) -> tuple[Plain, ...]: ...
+    def describe(self) -> str: ...
 
 
 @dataclass(frozen=True)
@@ -108,49 +100,35 @@ class Fixed:
 
 @dataclass(frozen=True)
 class Uniform:
-    """Every value from low to high alike; both ends included where whole."""
+    """Every value from low to high alike; both ends included where whole.
+
+    log: of the logarithm, as often between 10 and 20 as between 100 and 200; 0 < low.
+    """
 
     low: float
     high: float
     whole: bool = False
+    log: bool = False
     is_range = True
 
     def draw(self, draws: Draws, path: str) -> float:
-        unit = draws.unit(path)
-        if self.whole:
-            low, high = int(self.low), int(self.high)
-            return min(low + math.floor(unit * (high - low + 1)), high)
-        return _rounded(self.low + unit * (self.high - self.low), self.low, self.high)
+        unit, low, high = draws.unit(path), self.low, self.high
+        if self.log:
+            top = high + 1 if self.whole else high  # k stands for the reals in [k, k + 1)
+            start, end = math.log(low), math.log(top)
+            drawn = math.exp(start + unit * (end - start))
+        elif self.whole:
+            drawn = low + unit * (high - low + 1)
+        else:
+            drawn = low + unit * (high - low)
+        return _whole(drawn, low, high) if self.whole else _rounded(drawn, low, high)
 
     def probes(self) -> tuple[float, ...]:
         return (self.low, self.high)
 
     def describe(self) -> str:
-        return f"uniform from {words(self.low)} to {words(self.high)}"
-
-
-@dataclass(frozen=True)
-class LogUniform:
-    """The logarithm is uniform: as often between 10 and 20 as between 100 and 200. 0 < low."""
-
-    low: float
-    high: float
-    whole: bool = False
-    is_range = True
-
-    def draw(self, draws: Draws, path: str) -> float:
-        top = self.high + 1 if self.whole else self.high  # k stands for the reals in [k, k + 1)
-        start, end = math.log(self.low), math.log(top)
-        drawn = math.exp(start + draws.unit(path) * (end - start))
-        if self.whole:
-            return min(max(math.floor(drawn), int(self.low)), int(self.high))
-        return _rounded(drawn, self.low, self.high)
-
-    def probes(self) -> tuple[float, ...]:
-        return (self.low, self.high)
-
-    def describe(self) -> str:
-        return f"log-uniform from {words(self.low)} to {words(self.high)}"
+        kind = "log-uniform" if self.log else "uniform"
+        return f"{kind} from {words(self.low)} to {words(self.high)}"
 
 
 @dataclass(frozen=True)
@@ -173,7 +151,7 @@ class Normal:
         probability = min(max(below + draws.unit(path) * inside, 1e-300), 1 - 2.0**-53)
         drawn = normal.inv_cdf(probability)
         if self.whole:
-            return min(max(math.floor(drawn + 0.5), int(self.low)), int(self.high))
+            return _whole(drawn + 0.5, self.low, self.high)
         return _rounded(drawn, self.low, self.high)
 
     def probes(self) -> tuple[float, ...]:
@@ -260,6 +238,10 @@ def _rounded(drawn: float, low: float, high: float) -> float:
     return min(max(float(f"{drawn:.10g}"), low), high)
 
 
+def _whole(drawn: float, low: float, high: float) -> int:
+    return min(max(math.floor(drawn), int(low)), int(high))
+
+
 def is_number(value: object) -> TypeGuard[int | float]:
     """Whether this is a number; True and False are none."""
     return isinstance(value, int | float) and not isinstance(value, bool)
@@ -288,8 +270,7 @@ def words(value: Plain) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-# ------------------------------------------------------------------------------------------------
-# The fields of a recipe as a table, read off the models of `schema`: nothing is stated twice
+# ---- The fields of a recipe as a table, read off the models of `schema`: nothing is stated twice -
 # The loader, its messages, the JSON Schema and the documentation all walk `ROOT`.
 
 # the end of a field's name says its unit
@@ -300,12 +281,7 @@ UNITS = {
     "_ntu": "nephelometric turbidity units",
 }
 
-_LIMITS = {
-    annotated_types.Gt: (">", "gt"),
-    annotated_types.Ge: (">=", "ge"),
-    annotated_types.Lt: ("<", "lt"),
-    annotated_types.Le: ("<=", "le"),
-}
+_LIMITS = {Gt: (">", "gt"), Ge: (">=", "ge"), Lt: ("<", "lt"), Le: ("<=", "le")}
 
 
 class Kind(enum.Enum):
@@ -327,7 +303,14 @@ class Kind(enum.Enum):
         return self in (Kind.TEXT, Kind.PATH, Kind.DIGEST)
 
 
-_TEXTS = ((StyleName, Kind.WORD), (FilePath, Kind.PATH), (Digest, Kind.DIGEST))
+_KINDS = (
+    (StyleName, Kind.WORD),
+    (FilePath, Kind.PATH),
+    (Digest, Kind.DIGEST),
+    (Colour, Kind.COLOUR),
+    (Rates, Kind.RATES),
+    *((float, Kind.NUMBER), (int, Kind.WHOLE), (bool, Kind.FLAG), (str, Kind.TEXT)),
+)
 
 
 @dataclass(frozen=True)
@@ -410,26 +393,20 @@ class FieldSpec:
 
 
 @dataclass(frozen=True)
-class ListSpec:
-    """A list of mappings, which may be absent. most: how many. description: of all of them."""
-
-    most: int
-    description: str
-
-
-@dataclass(frozen=True)
 class SectionSpec:
     """A mapping of fields. effect: it may be absent, and then has a probability of being there.
 
-    items: set where not one such mapping stands but a list of them; the path then ends in [].
-    shorthand: name of the field whose value may stand in place of the mapping.
+    max_items: set where a list of up to so many such mappings stands, which `list_description`
+    describes; the path then ends in []. shorthand: name of the field whose value may stand in place
+    of the mapping.
     """
 
     path: str
     model: type[BaseModel]
     description: str
     effect: bool = False
-    items: ListSpec | None = None
+    max_items: int | None = None
+    list_description: str = ""
     shorthand: str | None = None
     fields: dict[str, FieldSpec] = field(default_factory=dict)
     sections: dict[str, SectionSpec] = field(default_factory=dict)
@@ -459,36 +436,41 @@ def join(path: str, name: str) -> str:
 
 
 def _section(
-    path: str, model: type[BaseModel], *, effect: bool = False, items: ListSpec | None = None
+    path: str, model: type[BaseModel], *, effect: bool = False, of_list: FieldInfo | None = None
 ) -> SectionSpec:
-    shorthand: str | None = getattr(model, "SHORTHAND", None)
-    spec = SectionSpec(path, model, _one_line(model.__doc__), effect, items, shorthand)
+    most = [m.max_length for m in of_list.metadata if isinstance(m, MaxLen)] if of_list else [None]
+    spec = SectionSpec(
+        path,
+        model,
+        _one_line(model.__doc__),
+        effect,
+        max_items=most[0],
+        list_description=_one_line(of_list.description if of_list else None),
+        shorthand=getattr(model, "SHORTHAND", None),
+    )
     for name, info in model.model_fields.items():
         below = join(path, name)
         inner, nullable = _without_none(info.annotation)
-        item = _item(inner)
-        if item is not None:
-            items = ListSpec(_most(info), _one_line(info.description))
-            spec.sections[name] = _section(f"{below}[]", item, items=items)
+        arguments = get_args(inner)
+        if get_origin(inner) is tuple and arguments[1:] == (...,):
+            spec.sections[name] = _section(f"{below}[]", arguments[0], of_list=info)
         elif isinstance(inner, type) and issubclass(inner, BaseModel):
             spec.sections[name] = _section(below, inner, effect=nullable)
         else:
             spec.fields[name] = _field(below, info, rangeable=bool(path))
     if effect:
-        spec.extra["probability"] = FieldSpec(
-            path=join(path, "probability"),
-            kind=Kind.NUMBER,
-            description="Share of the variants that have this effect.",
-            annotation=Unit,
-            default=1.0,
-            limits=((">=", 0.0), ("<=", 1.0)),
-            rangeable=False,
-        )
+        share = Field(default=1.0, description="Share of the variants that have this effect.")
+        spec.extra["probability"] = _spec(join(path, "probability"), Unit, share, rangeable=False)
     return spec
 
 
 def _one_line(text: str | None) -> str:
     return " ".join((text or "").split())
+
+
+def _spec(path: str, annotation: Any, info: Any, *, rangeable: bool = True) -> FieldSpec:
+    """A field that no model of the schema has."""
+    return _field(path, FieldInfo.from_annotated_attribute(annotation, info), rangeable=rangeable)
 
 
 def _field(path: str, info: FieldInfo, *, rangeable: bool) -> FieldSpec:
@@ -499,7 +481,7 @@ def _field(path: str, info: FieldInfo, *, rangeable: bool) -> FieldSpec:
         for kind, (sign, attribute) in _LIMITS.items()
         if isinstance(rule, kind)
     ]
-    required, kind = info.is_required(), _kind(inner)
+    required, (kind, labels) = info.is_required(), _kind(inner)
     return FieldSpec(
         path=path,
         kind=kind,
@@ -508,105 +490,50 @@ def _field(path: str, info: FieldInfo, *, rangeable: bool) -> FieldSpec:
         nullable=nullable,
         default=None if required else info.default,
         limits=tuple(bounds),
-        words=_words(inner),
+        words=labels,
         rangeable=rangeable and kind is not Kind.DIGEST,
         required=required,
-        channel={Kind.COLOUR: CHANNEL, Kind.RATES: RATE}.get(kind),
+        channel=CHANNEL if kind is Kind.COLOUR else RATE if kind is Kind.RATES else None,
     )
 
 
-def _item(annotation: Any) -> type[BaseModel] | None:
-    """The model of a list's items; None for what is no list of models."""
-    arguments = get_args(annotation)
-    if get_origin(annotation) is not tuple or arguments[1:] != (...,):
-        return None
-    item: type[BaseModel] = arguments[0]
-    return item
-
-
-def _most(info: FieldInfo) -> int:
-    (most,) = (r.max_length for r in info.metadata if isinstance(r, annotated_types.MaxLen))
-    return most
-
-
 def _without_none(annotation: Any) -> tuple[Any, bool]:
-    """The annotation without `| None` and `Annotated`, and whether None was there.
-
-    The kinds of text stay as they are annotated: nothing else tells them apart.
-    """
-    nullable = False
-    if get_origin(annotation) in (Union, types.UnionType):
-        members = [member for member in get_args(annotation) if member is not type(None)]
-        nullable = len(members) < len(get_args(annotation))
-        if len(members) == 2 and members[0] == Flag and get_origin(members[1]) is Literal:
-            return members[0] | members[1], nullable
-        assert len(members) == 1, f"a field is of one type or null, or a flag or a word; {members}"
-        annotation = members[0]
-    if get_origin(annotation) is Annotated and all(annotation != text for text, _ in _TEXTS):
-        annotation = get_args(annotation)[0]
-    return annotation, nullable
+    """The annotation without `| None`, and whether None was there."""
+    if get_origin(annotation) not in (Union, types.UnionType):
+        return annotation, False
+    members = [member for member in get_args(annotation) if member is not type(None)]
+    nullable = len(members) < len(get_args(annotation))
+    return functools.reduce(operator.or_, members), nullable
 
 
-def _words(annotation: Any) -> tuple[str, ...]:
-    if annotation == StyleName:
-        return style_preset_names()
-    if get_origin(annotation) in (Union, types.UnionType):  # true, false, or a word
-        annotation = get_args(annotation)[1]
-    return tuple(map(str, get_args(annotation))) if get_origin(annotation) is Literal else ()
-
-
-def _kind(annotation: Any) -> Kind:
-    for text, kind in _TEXTS:
-        if annotation == text:
-            return kind
-    if annotation == Colour:
-        return Kind.COLOUR
-    if annotation == Rates:
-        return Kind.RATES
+def _kind(annotation: Any) -> tuple[Kind, tuple[str, ...]]:
+    """What a field of this type holds, and the words that it may be."""
+    for known, kind in _KINDS:
+        if annotation == known:
+            return kind, style_preset_names() if annotation == StyleName else ()
     if get_origin(annotation) is Literal:
-        return Kind.WORD
-    if get_origin(annotation) in (Union, types.UnionType):
-        return Kind.FLAG
-    return {float: Kind.NUMBER, int: Kind.WHOLE, bool: Kind.FLAG, str: Kind.TEXT}[annotation]
+        return Kind.WORD, tuple(map(str, get_args(annotation)))
+    if get_origin(annotation) is Annotated:  # Number and its like
+        return _kind(get_args(annotation)[0])
+    flag, choices = get_args(annotation)  # true, false, or a word
+    assert flag == Flag, annotation
+    return Kind.FLAG, _kind(choices)[1]
 
 
-CHANNEL = FieldSpec(
-    path="channel",
-    kind=Kind.NUMBER,
-    description="One channel of a colour.",
-    annotation=Unit,
-    limits=((">=", 0.0), ("<=", 1.0)),
-)
-RATE = FieldSpec(
-    path="rate_per_m",
-    kind=Kind.NUMBER,
-    description="One channel of three rates.",
-    annotation=PerMetre,
-    limits=((">=", 0.0), ("<=", MAX_PER_M)),
-)
-ANY_NUMBER = FieldSpec("number", Kind.NUMBER, "", Annotated[Number, Field(allow_inf_nan=False)])
-VARIANTS = FieldSpec(
-    path="variants",
-    kind=Kind.WHOLE,
-    description="How many recipes are drawn from this file.",
-    annotation=Annotated[Whole, Field(ge=1, le=1_000_000)],
-    default=1,
-    limits=((">=", 1), ("<=", 1_000_000)),
+CHANNEL = _spec("channel", Unit, Field(description="One channel of a colour."))
+RATE = _spec("rate_per_m", PerMetre, Field(description="One channel of three rates."))
+ANY_NUMBER = _spec("number", Number, Field(allow_inf_nan=False))
+VARIANTS = _spec(
+    "variants",
+    Whole,
+    Field(default=1, ge=1, le=1_000_000, description="How many recipes are drawn from this file."),
     rangeable=False,
 )
+ROOT = _section("", Recipe)
+ROOT.extra["variants"] = VARIANTS
 
 
-def _root() -> SectionSpec:
-    root = _section("", Recipe)
-    root.extra["variants"] = VARIANTS
-    assert root.fields["version"].words == (str(VERSION),)
-    return root
-
-
-ROOT = _root()
-
-
-# ---- template ------------------------------------------------------------------------------------
+# ---- What a file says, and the recipes that it stands for ----------------------------------------
 
 _INDEX = re.compile(r"\[[0-9]+\]")
 
