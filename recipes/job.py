@@ -24,8 +24,7 @@ from pydantic import BeforeValidator, Field, ValidationError, field_validator, m
 
 from recipes.change import changed
 from recipes.errors import Problems, RecipeError, did_you_mean, nearest_word, short
-from recipes.files import open_file
-from recipes.load import load_recipe, preset_names
+from recipes.load import load_recipe, preset_names, read_text
 from recipes.schema import Recipe, parse_frames
 from recipes.template import RecipeTemplate
 from recipes.weather import Closed, Number, Whole
@@ -143,21 +142,9 @@ def load_job(path: Path) -> Job:
     Raises:
         RecipeError: there is no such file, or it is no valid job; one line for each problem.
     """
-    source = str(path)
-    try:
-        with open_file(path) as file:
-            data = file.read(MAX_BYTES + 1)
-    except FileNotFoundError:
-        raise RecipeError(f"{source}: no such file; a job is a YAML file") from None
-    except OSError as error:
-        raise RecipeError(f"{source}: cannot be read: {error.strerror}") from None
-    if len(data) > MAX_BYTES:
-        raise RecipeError(f"{source}: larger than {MAX_BYTES} bytes; name scenes by a pattern (*)")
-    try:
-        text = data.decode("utf-8")
-    except UnicodeDecodeError as error:
-        raise RecipeError(f"{source}: not UTF-8 text at byte {error.start}") from None
-    return parse_job(text, source=source, name=path.stem)
+    missing, too_large = "no such file; a job is a YAML file", "name scenes by a pattern (*)"
+    text = read_text(path, MAX_BYTES, missing=missing, too_large=too_large)
+    return parse_job(text, source=str(path), name=path.stem)
 
 
 def parse_job(text: str, *, source: str, name: str = "job") -> Job:

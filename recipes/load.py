@@ -69,7 +69,7 @@ def load_recipe(path_or_preset_name: str | Path) -> RecipeTemplate:
         return parse_recipe(preset_text(name), source=f"preset {name}", name=name)
     path = Path(path_or_preset_name)
     source = str(path_or_preset_name)
-    text = _decode(_read(path, source), source)
+    text = read_text(path, MAX_BYTES, missing=_missing(source), too_large="this is no recipe")
     return parse_recipe(text, source=source, name=path.stem, folder=path.parent)
 
 
@@ -89,32 +89,32 @@ def preset_text(name: str) -> str:
     return packaged_text("presets", name)
 
 
-def _read(path: Path, source: str) -> bytes:
-    try:
-        with open_file(path) as file:
-            data = file.read(MAX_BYTES + 1)
-    except (FileNotFoundError, NotADirectoryError):
-        raise RecipeError(f"{source}: {_missing(source)}") from None
-    except IsADirectoryError:
-        raise RecipeError(f"{source}: is a folder; a recipe is a YAML file") from None
-    except (OSError, ValueError) as error:  # ValueError: a null character in the path
-        raise RecipeError(f"{source!a}: cannot be read: {error}") from None
-    if len(data) > MAX_BYTES:
-        raise RecipeError(f"{source}: larger than {MAX_BYTES} bytes: this is no recipe")
-    return data
-
-
 def _missing(source: str) -> str:
     names, guess = preset_names(), did_you_mean(source, preset_names())
     return f"no such file, and no such preset; {guess}presets are {', '.join(names)}"
 
 
-def _decode(data: bytes, source: str) -> str:
+def read_text(path: Path, max_bytes: int, *, missing: str, too_large: str) -> str:
+    """A file's text. missing, too_large: what to say then.
+
+    Raises:
+        RecipeError: there is none, or it cannot be read as text.
+    """
+    source = str(path)
+    try:
+        with open_file(path) as file:
+            data = file.read(max_bytes + 1)
+    except (FileNotFoundError, NotADirectoryError):
+        raise RecipeError(f"{source}: {missing}") from None
+    except IsADirectoryError:
+        raise RecipeError(f"{source}: is a folder, not a YAML file") from None
+    except (OSError, ValueError) as error:  # ValueError: a null character in the path
+        raise RecipeError(f"{source!a}: cannot be read: {error}") from None
+    if len(data) > max_bytes:
+        raise RecipeError(f"{source}: larger than {max_bytes} bytes: {too_large}")
     try:
         return data.decode("utf-8")
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1
-        raise RecipeError(
-            f"{source}:{line}: not UTF-8 text (byte 0x{data[error.start]:02x}): "
-            "save the file as UTF-8"
-        ) from None
+        text = f"not UTF-8 text (byte 0x{data[error.start]:02x}): save the file as UTF-8"
+        raise RecipeError(f"{source}:{line}: {text}") from None

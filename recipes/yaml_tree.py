@@ -46,24 +46,24 @@ class ScalarNode:
     height: int = 1
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class ListNode:
     """size: how many nodes it has, aliases expanded. height: how many levels."""
 
     line: int
-    items: tuple[Node, ...]
-    size: int
-    height: int
+    items: list[Node] = field(default_factory=list)
+    size: int = 1
+    height: int = 1
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class MapNode:
     """entries: key -> (line of the key, value), in the order of the file."""
 
     line: int
-    entries: dict[str, tuple[int, Node]]
-    size: int
-    height: int
+    entries: dict[str, tuple[int, Node]] = field(default_factory=dict)
+    size: int = 1
+    height: int = 1
 
 
 Node = ScalarNode | ListNode | MapNode
@@ -71,21 +71,11 @@ Node = ScalarNode | ListNode | MapNode
 
 @dataclass
 class _Open:
-    """A list or mapping whose end has not been read."""
+    """A list or mapping whose end has not been read. key: line and text of the one before."""
 
-    line: int
-    is_map: bool
+    node: ListNode | MapNode
     anchor: str | None
-    items: list[Node] = field(default_factory=list)
-    entries: dict[str, tuple[int, Node]] = field(default_factory=dict)
     key: tuple[int, str] | None = None
-    size: int = 1
-    height: int = 1
-
-    def close(self) -> Node:
-        if self.is_map:
-            return MapNode(self.line, self.entries, self.size, self.height)
-        return ListNode(self.line, tuple(self.items), self.size, self.height)
 
 
 def read_tree(text: str, problems: Problems, *, empty: str = EMPTY) -> Node:
@@ -155,10 +145,9 @@ class _Builder:
                 self._attach(line, self._look_up(line, event.anchor))
             elif isinstance(event, yaml.CollectionEndEvent):
                 done = self._open.pop()
-                node = done.close()
                 if done.anchor is not None:
-                    self._anchors[done.anchor] = node
-                self._attach(done.line, node)
+                    self._anchors[done.anchor] = done.node
+                self._attach(done.node.line, done.node)
             elif isinstance(event, yaml.ScalarEvent | yaml.CollectionStartEvent):
                 self._start(line, event)
         return self._root
@@ -179,8 +168,8 @@ class _Builder:
             self._anchors[event.anchor] = None
         if len(self._open) >= MAX_DEPTH:
             raise self._problems.fail(line, f"nested more than {MAX_DEPTH} levels deep")
-        is_map = isinstance(event, yaml.MappingStartEvent)
-        self._open.append(_Open(line, is_map, event.anchor))
+        kind = MapNode if isinstance(event, yaml.MappingStartEvent) else ListNode
+        self._open.append(_Open(kind(line), event.anchor))
 
     def _look_up(self, line: int, anchor: str) -> Node:
         if anchor not in self._anchors:
@@ -194,19 +183,19 @@ class _Builder:
         if not self._open:
             self._root = node
             return
-        parent = self._open[-1]
+        level, parent = self._open[-1], self._open[-1].node
         parent.size += node.size
         parent.height = max(parent.height, 1 + node.height)
         if parent.size > MAX_NODES:
             raise self._problems.fail(line, f"more than {MAX_NODES} values, aliases expanded")
         if parent.height > MAX_DEPTH:
             raise self._problems.fail(line, f"nested more than {MAX_DEPTH} levels deep")
-        if not parent.is_map:
+        if isinstance(parent, ListNode):
             parent.items.append(node)
-        elif parent.key is None:
-            parent.key = (line, self._key_text(line, node))
+        elif level.key is None:
+            level.key = (line, self._key_text(line, node))
         else:
-            (key_line, key), parent.key = parent.key, None
+            (key_line, key), level.key = level.key, None
             self._insert(parent, key_line, key, node)
 
     def _key_text(self, line: int, node: Node) -> str:
@@ -218,7 +207,7 @@ class _Builder:
             )
         return node.text
 
-    def _insert(self, parent: _Open, line: int, key: str, node: Node) -> None:
+    def _insert(self, parent: MapNode, line: int, key: str, node: Node) -> None:
         if key in parent.entries:
             first = parent.entries[key][0]
             above = [level.key[1] for level in self._open if level.key is not None]
