@@ -22,6 +22,7 @@ from augment.dataset.samples import (
 )
 from augment.errors import BackendUnavailable
 from augment.jobs.backends import choose_backend
+from augment.jobs.box_tables import View
 from augment.jobs.files import (
     SceneIndex,
     camera_record,
@@ -33,7 +34,7 @@ from augment.jobs.files import (
 from augment.jobs.layout import PATH_KINDS, variant_name
 from augment.jobs.prepare import find_bed, remember, snow_to_lay, store_maps
 from augment.jobs.quality import resolve_quality
-from augment.jobs.view_files import View, check_view, label_view, uses_boxes
+from augment.jobs.view_files import check_view, label_view, uses_boxes
 from augment.jobs.worker import Renderer, default_renderer
 from augment.render.buffers import CUDA
 from augment.scene import Scene

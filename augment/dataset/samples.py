@@ -38,8 +38,8 @@ from torch.utils.data import get_worker_info
 
 from augment.boxes import outline_boxes
 from augment.geometry import rotmat_from_quat
+from augment.jobs.box_tables import TABLES, BoxWeather, visibility
 from augment.jobs.files import CameraRecord, depth_in_metres
-from augment.jobs.view_files import TABLES, BoxWeather, visibility
 from augment.labels import Boxes, LidarSweep
 
 # ---- Boxes for training: in the frame of the world, the car or the camera, and as 2D boxes -------
@@ -83,7 +83,7 @@ def box_tensors(
     snow_fraction: float64 [B], how much of its pixels is snow (as above); None without snow.
     transmittance: float64 [B], of the smog before the box, 0 to 1; None without smog.
     visibility: float64 [B], what all of that leaves of the box, 0 to 1
-    (`augment.jobs.view_files.visibility`).
+    (`augment.jobs.box_tables.visibility`).
 
     world_from_frame: float64 [4, 4]; unused where the frame is the world, whose numbers keep their
     bits.
@@ -93,7 +93,7 @@ def box_tensors(
         centers_m = moved_points(centers_m, world_from_frame)
         quats = _turned(quats, world_from_frame)
     fractions = {
-        name: torch.from_numpy(getattr(weather[kind], name).copy()) if kind in weather else None
+        name: torch.from_numpy(weather[kind][name].copy()) if kind in weather else None
         for kind, table in TABLES.items()
         for name in table.sampled
     }

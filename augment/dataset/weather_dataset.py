@@ -33,13 +33,12 @@ from augment.dataset.samples import (
     make_sample,
 )
 from augment.errors import OutputError
-from augment.jobs.box_tables import BoxNumbers
+from augment.jobs.box_tables import TABLES, BoxNumbers
 from augment.jobs.files import CameraRecord, decode_image, decode_png, read_camera, read_entries
 from augment.jobs.layout import PATH_KINDS, resolve_inside
 from augment.jobs.manifest import OK, concat_rows, read_finished, weather_columns
 from augment.jobs.store import Store, StoredFileMissing, open_store
 from augment.jobs.tables import FrameBoxes, read_boxes, read_lidar
-from augment.jobs.view_files import TABLES
 from augment.labels import LidarSweep
 
 # ---- A manifest's rows in a fifth of its memory, with random access to single ones ---------------
@@ -379,11 +378,7 @@ class StoredFiles:
         return f"{self._before}{folder}{name}{self._after}"
 
     def read(self, folder: str, name: str) -> bytes:
-        """The bytes of a file. folder: with its slash, or empty.
-
-        Raises:
-            OutputError: there is no such file, it cannot be read, or it lies outside the folder.
-        """
+        """The bytes of a file. folder: with its slash, or empty."""
         try:
             if self.store.local_dir is None:
                 return self.store.read(folder + name)
@@ -394,11 +389,7 @@ class StoredFiles:
             raise _unreadable(self.name(folder, name), error.strerror or str(error)) from error
 
     def parse(self, folder: str, name: str, read: Callable[[Path], Value]) -> Value:
-        """What `read` makes of a file.
-
-        Raises:
-            OutputError: as `read` raises it, or as from `read` of this class.
-        """
+        """What `read` makes of a file."""
         if self.store.local_dir is not None:
             return read(resolve_inside(self.store.local_dir, folder + name))
         data = self.read(folder, name)

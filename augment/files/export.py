@@ -23,7 +23,7 @@ from augment.errors import OutputError, SceneError
 from augment.files.ply import write_ply, write_splat
 from augment.files.scene_file import document_text, track_entry
 from augment.geometry import multiply_quats, quat_from_rotmat
-from augment.jobs.atomic import output_error, replaced_folder, write_atomic
+from augment.jobs.atomic import refusals_of, replaced_folder, write_atomic
 from augment.jobs.layout import folder_name
 from augment.render.sh import rotate_sh
 from augment.scene import SH_COUNTS, Gaussians, Scene, SemanticClass
@@ -230,19 +230,12 @@ def export_ply(scene: Scene, path: str | Path, timestamp_ns: int) -> None:
     """Write the scene as it is at a moment into an INRIA .ply.
 
     Its comments say `up: +z` where gravity is known, `unit: metre` where the scale is.
-
-    Raises:
-        SceneError: nothing is there at that moment. OutputError: as write_ply.
     """
     write_ply(path, _something(scene, timestamp_ns), notes=_notes(scene))
 
 
 def export_splat(scene: Scene, path: str | Path, timestamp_ns: int) -> None:
-    """Write the scene as it is at a moment into a .splat.
-
-    Raises:
-        SceneError: nothing is there at that moment. OutputError: as write_splat.
-    """
+    """Write the scene as it is at a moment into a .splat."""
     gaussians = _something(scene, timestamp_ns)
     write_splat(path, replace(gaussians, sh=gaussians.sh[:, :1]))  # export_losses says so
 
@@ -251,9 +244,6 @@ def export_cameras(scene: Scene, folder: str | Path) -> bool:
     """Write `cameras.json` beside splat files; a file that is there already stays as it is.
 
     Returns whether the folder's cameras.json is now this scene's; without frames there is none.
-
-    Raises:
-        OutputError: the file cannot be written.
     """
     path, text = Path(folder) / CAMERAS, inria_cameras(scene)
     if text is None:
@@ -290,16 +280,10 @@ def export_ply_parts(scene: Scene, folder: str | Path) -> None:
     written as their constant part. Parts without Gaussians have no file.
 
     An earlier export in the folder is replaced.
-
-    Raises:
-        OutputError: the folder holds something else, or the system refused; what was there is then
-            as it was.
     """
     folder = Path(folder).resolve()
-    try:
+    with refusals_of(folder):
         is_free = not folder.exists() or is_parts_folder(folder)
-    except OSError as error:
-        raise output_error(folder, error) from error
     if not is_free:
         raise OutputError(
             f"{folder} holds something else than exported parts, so it is not replaced; choose "

@@ -77,11 +77,7 @@ class Pickle:
         self.stack: list[Any] = []
 
     def read(self, file: BufferedIOBase) -> Any:
-        """The value of the pickle that starts at the file's position; reads to its end and not on.
-
-        Raises:
-            PickleError: it names what it may not, is damaged, cut short or too long.
-        """
+        """The value of the pickle that starts at the file's position; reads no further."""
         for _ in self.steps(file):
             pass
         return self.stack[-1]
@@ -354,11 +350,7 @@ class ArrayRecord(Record):
             self.values = numbers(sides, dtype.numpy, order, content)
 
     def take(self) -> np.ndarray:
-        """The array, once: a few bytes that refer to it often cannot fill the memory.
-
-        Raises:
-            PickleError: it was not filled, or taken before.
-        """
+        """The array, once: a few bytes that refer to it often cannot fill the memory."""
         if self.values is None:
             raise PickleError("it holds one array twice, or one without values")
         values, self.values = self.values, None
@@ -366,11 +358,7 @@ class ArrayRecord(Record):
 
 
 def numbers(shape: tuple[int, ...], dtype: np.dtype, order: str, content: Any) -> np.ndarray:
-    """An array of its own memory, in the machine's byte order.
-
-    Raises:
-        PickleError: the content has not the bytes that the shape takes.
-    """
+    """An array of its own memory, in the machine's byte order."""
     if type(content) is not bytes or math.prod(shape) * dtype.itemsize != len(content):
         held = f"{len(content)} bytes" if type(content) is bytes else "no bytes"
         raise PickleError(f"it holds {held} for an array {list(shape)} of {dtype}")
@@ -448,11 +436,7 @@ class NpyHeader:
 
 
 def read_npy_header(file: BufferedIOBase) -> NpyHeader:
-    """The header as `np.save` writes it; numpy's own reader would evaluate it as Python.
-
-    Raises:
-        PickleError: the file is no .npy file, or of records, texts or dates.
-    """
+    """The header as `np.save` writes it; numpy's own reader would evaluate it as Python."""
     start = file.read(8)
     if len(start) < 8 or start[:6] != b"\x93NUMPY" or start[6] not in (1, 2, 3):
         raise PickleError("it does not start as a .npy file does")
@@ -469,11 +453,7 @@ def read_npy_header(file: BufferedIOBase) -> NpyHeader:
 
 
 def read_npy(file: BufferedIOBase) -> np.ndarray:
-    """The numbers of a .npy file.
-
-    Raises:
-        PickleError: as for `read_npy_header`; or there are fewer bytes than the header says.
-    """
+    """The numbers of a .npy file."""
     header = read_npy_header(file)
     if header.dtype is None:
         raise PickleError("it holds objects where numbers are expected")

@@ -69,11 +69,7 @@ class PlyHeader:
     body_offset: int
 
     def element(self, name: str) -> PlyElement:
-        """The element of that name.
-
-        Raises:
-            SceneError: there is none; lists those there are.
-        """
+        """The element of that name."""
         for element in self.elements:
             if element.name == name:
                 return element
@@ -82,11 +78,7 @@ class PlyHeader:
 
 
 def read_ply_header(path: str | Path) -> PlyHeader:
-    """Read the header of a .ply file.
-
-    Raises:
-        SceneError: not a .ply, or a header that does not parse; names the line.
-    """
+    """Read the header of a .ply file."""
     path = Path(path)
     if not path.is_file():
         raise SceneError(f"{path}: no such file; expected a .ply file")
@@ -130,10 +122,6 @@ def iterate_rows(header: PlyHeader, name: str) -> Iterator[np.ndarray]:
     """Structured arrays of at most ROWS_PER_CHUNK rows of one element, in order.
 
     Ascii values arrive as float64, binary ones in the file's own types.
-
-    Raises:
-        SceneError: fewer rows than announced, a value that is no number, or rows of varying size
-            in or before the element. The size is checked before the first chunk.
     """
     position = [e.name for e in header.elements].index(header.element(name).name)
     before, element = header.elements[:position], header.elements[position]
@@ -291,9 +279,6 @@ def read_columns(header: PlyHeader, table: PlyElement) -> dict[str, np.ndarray]:
 
     means [N, 3] (float64 where the file is wider than float32), quats [N, 4], scales [N, 3] (log),
     opacities [N] (logit), sh [N, K, 3], and semantic_class [N] where the file has it.
-
-    Raises:
-        SceneError: columns are missing (lists them), wrong in number, or fewer rows than announced.
     """
     sh_count = _check_columns(header, table)
     mean_type = np.float64 if has_wide_means(header, table) else np.float32
@@ -487,11 +472,7 @@ def read_ply(path: str | Path, element: str = "vertex") -> SplatFile:
 
 
 def read_splat(path: str | Path) -> SplatFile:
-    """Read a .splat file: colour without view dependence (SH degree 0), linear scales.
-
-    Raises:
-        SceneError: the size is no multiple of 32 bytes, no records, or not this format at all.
-    """
+    """Read a .splat file: colour without view dependence (SH degree 0), linear scales."""
     path = Path(path)
     size = path.stat().st_size
     if size == 0 or size % _SPLAT_RECORD.itemsize:
@@ -525,9 +506,6 @@ def write_ply(
 
     notes: written as `comment key: value` lines and given back by `read_ply`. A `semantic_class`
     column is added where the Gaussians have classes; other readers ignore it.
-
-    Raises:
-        OutputError: the system refused (disk full, no permission ...); `path` is then as it was.
     """
     columns = column_types(gaussians)
     lines = ["ply", "format binary_little_endian 1.0"]
@@ -549,9 +527,6 @@ def write_splat(path: str | Path, gaussians: Gaussians) -> None:
     """Write a .splat file, atomically. The format keeps 8 bits of colour, opacity and rotation.
 
     SH bands above degree 0 cannot be kept; that they are dropped is logged as a warning.
-
-    Raises:
-        OutputError: as for write_ply.
     """
     if gaussians.sh_degree > 0:
         _log.warning("%s: .splat holds no view dependence; SH bands above 0 are dropped", path)

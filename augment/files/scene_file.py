@@ -64,11 +64,7 @@ _ROTATION_TOLERANCE = 1e-3  # cameras are held to 1e-4 by their own class
 
 
 def scene_document(scene: Scene, precision: Precision = "float32") -> dict[str, Any]:
-    """The contents of scene.json. Where precision is not float32, made_by says so for good.
-
-    Raises:
-        SceneError: the scene has something that the file could not give back.
-    """
+    """The contents of scene.json. Where precision is not float32, made_by says so for good."""
     kind = SKY_KINDS.get(type(scene.sky))
     if kind is None:
         raise SceneError(
@@ -123,11 +119,7 @@ def document_text(document: dict[str, Any]) -> str:
 def scene_of(
     document: SceneDocument, parts: list[SavedPart], sky: Sky, *, source: str, where: str
 ) -> Scene:
-    """The scene of a document; parts: background first, then its actors. It has no labels.
-
-    Raises:
-        SceneError: poses that are not rigid, times that do not increase, repeated names.
-    """
+    """The scene of a document; parts: background first, then its actors. It has no labels."""
     try:
         actors = tuple(
             _actor(entry, part) for entry, part in zip(document.actors, parts[1:], strict=True)
@@ -169,11 +161,7 @@ def scene_of(
 
 
 def track_entry(track: Track, where: str) -> dict[str, Any]:
-    """A track as JSON holds it.
-
-    Raises:
-        SceneError: poses that are not float64, or not rigid.
-    """
+    """A track as JSON holds it."""
     return {
         "hold_ns": int(track.hold_ns),
         "max_gap_ns": None if track.max_gap_ns is None else int(track.max_gap_ns),
@@ -302,11 +290,7 @@ _ALIGNMENT = 64  # bytes: a cache line, and any vector register
 def write_tensors(
     file: BinaryIO, arrays: Mapping[str, np.ndarray], metadata: Mapping[str, str] | None = None
 ) -> None:
-    """Write contiguous arrays, the widest types first, so that every one is aligned.
-
-    Raises:
-        SceneError: names, shapes and metadata are more than a header may hold. OSError.
-    """
+    """Write contiguous arrays, the widest types first, so that every one is aligned."""
     header: dict[str, object] = {} if metadata is None else {"__metadata__": dict(metadata)}
     order = sorted(arrays, key=lambda name: (-arrays[name].itemsize, name))
     end = 0
@@ -330,11 +314,7 @@ def write_tensors(
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """The arrays of a file, mapped: writes to them stay in memory; and its metadata.
-
-    Raises:
-        SceneError: unreadable, damaged, or no safetensors file.
-    """
+    """The arrays of a file, mapped: writes to them stay in memory; and its metadata."""
     try:
         open_file(path).close()  # to open a pipe would wait for ever
         with safe_open(path, framework="pt") as file:

@@ -56,11 +56,7 @@ class SavedPart:
 
 
 def part_arrays(scene: Scene, precision: Precision) -> dict[str, np.ndarray]:
-    """The arrays of the scene's Gaussians.
-
-    Raises:
-        SceneError: they are not float32, or hold numbers beyond float16 where that is asked for.
-    """
+    """The arrays of the scene's Gaussians."""
     arrays = {}
     waves = [None, *(actor.color_waves for actor in scene.actors)]
     for number, gaussians in enumerate(scene.all_gaussians):
@@ -85,11 +81,7 @@ def part_arrays(scene: Scene, precision: Precision) -> dict[str, np.ndarray]:
 
 
 def sky_arrays(scene: Scene, precision: Precision) -> dict[str, np.ndarray]:
-    """The one array of the scene's sky, whose class is among SKY_KINDS.
-
-    Raises:
-        SceneError: it holds numbers beyond float16 where that is asked for.
-    """
+    """The one array of the scene's sky, whose class is among SKY_KINDS."""
     name = _SKY_ARRAYS[SKY_KINDS[type(scene.sky)]]
     values = getattr(scene.sky, name)
     is_halved = precision == "float16"
@@ -99,11 +91,7 @@ def sky_arrays(scene: Scene, precision: Precision) -> dict[str, np.ndarray]:
 def take_parts(
     tensors: dict[str, Tensor], document: SceneDocument, where: str
 ) -> tuple[list[SavedPart], list[str]]:
-    """Background and actors, whose arrays are taken out of `tensors`, and what was left out.
-
-    Raises:
-        SceneError: arrays are missing, too many, or of other types or shapes than documented.
-    """
+    """Background and actors, whose arrays are taken out of `tensors`, and what was left out."""
     counts = [document.background_gaussians, *(actor.gaussians for actor in document.actors)]
     has_waves = [False, *(actor.color_waves is not None for actor in document.actors)]
     parts, problems = [], []
@@ -122,11 +110,7 @@ def take_parts(
 
 
 def take_sky(tensors: dict[str, Tensor], kind: str, precision: Precision, where: str) -> Sky:
-    """The sky of its one array.
-
-    Raises:
-        SceneError: another array, or another type or shape.
-    """
+    """The sky of its one array."""
     sky_class = next(cls for cls, name in SKY_KINDS.items() if name == kind)
     name = _SKY_ARRAYS[kind]
     if list(tensors) != [name]:
@@ -399,11 +383,7 @@ class SceneDocument(_Closed):
 
 
 def read_document(path: Path) -> SceneDocument:
-    """The checked contents of a scene.json.
-
-    Raises:
-        SceneError: unreadable, no JSON, another format or version, or wrong contents; says where.
-    """
+    """The checked contents of a scene.json."""
     try:
         with open_file(path) as file:
             text = file.read(MAX_BYTES + 1)
@@ -415,11 +395,7 @@ def read_document(path: Path) -> SceneDocument:
 
 
 def parsed_document(text: bytes | str, where: str) -> SceneDocument:
-    """The checked contents of a scene's JSON text.
-
-    Raises:
-        SceneError: no JSON, another format or version, or wrong contents.
-    """
+    """The checked contents of a scene's JSON text."""
     try:
         text = text.decode("utf-8") if isinstance(text, bytes) else text
         raw = json.loads(text, parse_constant=_no_constant)
@@ -432,11 +408,7 @@ def parsed_document(text: bytes | str, where: str) -> SceneDocument:
 
 
 def check_format(found: object, version: object, where: str) -> None:
-    """That this is a scene, and of a version that is known.
-
-    Raises:
-        SceneError: it is not.
-    """
+    """That this is a scene, and of a version that is known."""
     if found != FORMAT:
         raise SceneError(
             f'{where} describes no scene: its "format" must be {FORMAT!r}; got {found!r:.80}'
@@ -450,11 +422,7 @@ def check_format(found: object, version: object, where: str) -> None:
 
 
 def checked_document(raw: dict[str, Any], where: str) -> SceneDocument:
-    """The document as a record.
-
-    Raises:
-        SceneError: names the fields that are wrong, and what was expected.
-    """
+    """The document as a record."""
     try:
         return SceneDocument.model_validate(raw)
     except (ValidationError, RecursionError, OverflowError) as error:

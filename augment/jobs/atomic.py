@@ -66,7 +66,7 @@ def replaced_file(
     Raises:
         OutputError: the system refused (disk full, no permission ...); `path` is then as it was.
     """
-    try:
+    with refusals_of(path):
         make_folder(path.parent)
         if clear:
             remove_temporaries(path.parent, name=path.name, recursive=False)
@@ -82,8 +82,6 @@ def replaced_file(
                 raise
         if flush:
             flush_folder(path.parent)
-    except OSError as error:
-        raise output_error(path, error) from error
 
 
 def temporary_beside(path: Path) -> Path:
@@ -150,10 +148,8 @@ def remove_temporaries(folder: Path, *, name: str = "", recursive: bool = True) 
     for place, _, names in os.walk(folder):  # passes over folders that vanish meanwhile
         for found in temporary_names(names, name):
             path = Path(place) / found
-            try:
+            with refusals_of(path):
                 _remove_if_abandoned(path)
-            except OSError as error:
-                raise output_error(path, error) from error
         if not recursive:
             return
 
@@ -163,6 +159,15 @@ def temporary_names(names: Iterable[str], name: str = "") -> list[str]:
     middle = rf"{re.escape(_shown(name))}\.[^.]+(\.old)?" if name else ".*"
     pattern = re.compile(rf"\.{middle}{re.escape(TEMPORARY_SUFFIX)}(\.[^.]+)?", re.DOTALL)
     return [found for found in names if pattern.fullmatch(found)]
+
+
+@contextlib.contextmanager
+def refusals_of(path: Path) -> Iterator[None]:
+    """What the system refuses inside is raised as an OutputError that names the path."""
+    try:
+        yield
+    except OSError as error:
+        raise output_error(path, error) from error
 
 
 def output_error(path: Path, error: OSError) -> OutputError:
@@ -225,7 +230,7 @@ def replaced_folder(target: Path, own: Collection[str]) -> Iterator[Path]:
         OutputError: the system refused (disk full, no permission ...); `target` is then as it was.
     """
     target = target.resolve()  # a link to a folder stays a link
-    try:
+    with refusals_of(target):
         make_folder(target.parent)
         new, descriptor = _locked_folder(target)
         try:
@@ -238,8 +243,6 @@ def replaced_folder(target: Path, own: Collection[str]) -> Iterator[Path]:
         finally:
             _clear(new, target, own)
             os.close(descriptor)
-    except OSError as error:
-        raise output_error(target, error) from error
 
 
 def _locked_folder(target: Path) -> tuple[Path, int]:

@@ -6,7 +6,6 @@ import _thread
 import contextlib
 import ctypes
 import logging
-import multiprocessing
 import os
 import signal
 import sys
@@ -22,19 +21,15 @@ import augment
 from augment.errors import ClimateGSError
 from augment.jobs.block_worker import BlockWorker, Result, Task, WorkSetup
 from augment.jobs.processes import (
+    ChildProcess,
     available_cores,
-    describe_exit,
-    interrupts_blocked,
+    failed_start,
+    limit_threads,
     sender,
-    thread_limits,
 )
 from augment.jobs.store import open_store
 from augment.jobs.worker import Outcome
 from augment.render.buffers import CUDA
-
-# ---- block pools ---------------------------------------------------------------------------------
-
-# ---- pools ---------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -61,8 +56,8 @@ Tick = Callable[[int, Outcome], None]  # the slot, and an image that its worker 
 class WorkerPool(Protocol):
     """Workers are numbered 0 to slots - 1; every one has at most one task.
 
-    A pool tells of images as they are finished through the `tick` that it was made with, called in
-    the thread that waits, or, where the work is done in this process, in several threads.
+    A pool tells of finished images through the `tick` that it was made with, called in the thread
+    that waits, or, where the work is done in this process, in several threads.
     """
 
     @property
@@ -102,7 +97,7 @@ class SerialPool:
 
 
 # ---- A pool of worker processes on this machine, each with a scene of its own --------------------
-# They are started afresh (`spawn`). One that dies is replaced; all end when this process does.
+# One that dies is replaced; all end when this process does.
 
 STOP_S = 60.0  # how long a worker may take to finish the images it has at hand
 _READY = "ready"
@@ -125,10 +120,12 @@ class ProcessPool:
     def give(self, slot: int, task: Task) -> None:
         worker = self._workers[slot]
         if worker is None:
-            worker = self._workers[slot] = _Worker(self._setup, self._threads)
+            # No daemon: on trial it has processes of its own. It ends when the connection does.
+            arguments = (self._setup, self._threads)
+            worker = _Worker(_main, *arguments, threads=self._threads, daemon=False)
+            self._workers[slot] = worker
         worker.has_task = True
-        with contextlib.suppress(OSError):  # one that has just died shows when it is waited for
-            worker.connection.send(task)
+        worker.send(task)
 
     def wait(self, timeout_s: float) -> list[Event]:
         deadline = time.monotonic() + timeout_s
@@ -150,7 +147,7 @@ class ProcessPool:
         self._workers = [None] * self.slots
         try:
             for worker in workers:
-                worker.stop()
+                worker.send(None)
             deadline = time.monotonic() + STOP_S
             for worker in workers:
                 worker.drain(deadline)
@@ -176,56 +173,29 @@ class ProcessPool:
 
     def _reap_worker(self, slot: int, worker: _Worker) -> Event | None:
         """What becomes of the task of a worker that died; of one that had none nothing is lost."""
-        worker.process.join()
-        worker.connection.close()
+        ending = worker.reap()
         self._workers[slot] = None
-        ending = describe_exit(worker.process.exitcode)
         if not worker.is_ready and not self._has_started:
-            raise ClimateGSError(
-                f"a worker process {ending} while starting; what it printed says more. A script "
-                f"that generates with processes needs `if __name__ == '__main__':` around it; if "
-                f"memory ran out, use fewer workers"
-            )
+            raise failed_start(ending)
         return Lost(slot, ending) if worker.has_task else None
 
 
-class _Worker:
-    def __init__(self, setup: WorkSetup, threads: int) -> None:
-        context = multiprocessing.get_context("spawn")
-        self.connection, child = context.Pipe()
-        # No daemon: on trial it has processes of its own. It ends when the connection does.
-        self.process = context.Process(target=_main, args=(child, setup, threads))
-        with thread_limits(threads), interrupts_blocked():
-            self.process.start()
-        child.close()
-        self.is_ready = self.has_task = False
-
-    def stop(self) -> None:
-        with contextlib.suppress(OSError):
-            self.connection.send(None)
+class _Worker(ChildProcess):
+    has_task = False
 
     def drain(self, deadline: float) -> None:
-        """Take in what the worker still says until it ends, or it would block on saying it."""
+        """Take in what the worker still sends until it ends, or it would block on sending it."""
         with contextlib.suppress(EOFError, OSError):
             while (left := deadline - time.monotonic()) > 0 and self.connection.poll(left):
                 self.connection.recv()
 
-    def kill(self) -> None:
-        self.process.kill()
-        self.process.join()
-        self.connection.close()
-
 
 def _main(connection: Connection, setup: WorkSetup, threads: int) -> None:
-    import cv2
-    import torch
-
-    torch.set_num_threads(threads)
-    cv2.setNumThreads(1)
+    limit_threads(threads)
     send = sender(connection)
     # A shell's background job ignores Ctrl-C, and so would `interrupt_main`.
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    workshop = BlockWorker(setup, send)
+    worker = BlockWorker(setup, send)
     inbox: SimpleQueue[Task | None] = SimpleQueue()
     working = threading.Event()
     threading.Thread(target=_listen, args=(connection, inbox, working), daemon=True).start()
@@ -234,7 +204,7 @@ def _main(connection: Connection, setup: WorkSetup, threads: int) -> None:
         while (task := inbox.get()) is not None:
             working.set()
             try:
-                result = workshop.do(task)
+                result = worker.do(task)
             finally:
                 working.clear()
             send(result)
@@ -254,12 +224,13 @@ def _listen(connection: Connection, inbox: SimpleQueue, working: threading.Event
 
 # ---- A pool of actors on a Ray cluster, each with a scene of its own -----------------------------
 # What is rendered goes straight from the actors to the output; through Ray pass the tasks, and word
-# of every image. Ray is an optional extra, imported only here and only when a pool is made.
-
-# ---- Ray itself, an optional extra, and the cluster: the one there is, or one of this machine ----
-# Imported only here, when a job asks for it.
+# of every image. Ray is an optional extra, imported only when such a pool is made.
 
 _OBJECTS_BYTES = 100 << 20  # for objects of Ray's; tasks and results are far smaller
+_STARTS = 3  # in a row that may be lost, with their machines say, before the job ends
+_PATIENCE_S = 60.0  # without a worker, before the log says so
+_THREADS = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+_log = logging.getLogger(__name__)
 
 
 def import_ray() -> Any:
@@ -337,23 +308,13 @@ def last_line(error: Exception) -> str:
     return lines[-1][:300] if lines else type(error).__name__
 
 
-# ---- ray pool ------------------------------------------------------------------------------------
-
-_STARTS = 3  # in a row that may be lost, with their machines say, before the job ends
-_PATIENCE_S = 60.0  # without a worker, before the log says so
-_THREADS = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-_log = logging.getLogger(__name__)
-
-
 class RayPool:
-    """`slots` actors of one CPU each, as many as the cluster has CPUs if None.
-
-    Where the backend is `cuda` they have a GPU each, and as many CPUs as there are to a GPU, and
-    None is as many as the cluster has GPUs. The others see no GPU.
+    """`slots` actors of one CPU each, as many as the cluster has CPUs if None. Where the backend is
+    `cuda` they have a GPU each and its share of the CPUs, and None is as many as there are GPUs.
 
     They run on the cluster that this process is connected to, else on the one that RAY_ADDRESS
     names, else on one that is started here and ends with the pool. One that dies is replaced. Where
-    the cluster has no room for all of them, or no longer, those that run do the work of the others.
+    the cluster has no room for all of them, those that run do the work of the others.
 
     Raises:
         ClimateGSError: Ray is missing, or the cluster cannot be reached. From wait: actors cannot
@@ -452,9 +413,9 @@ class RayPool:
             if worker.starting is not None:
                 self._welcome(worker, self._ray.get(worker.starting))
                 return None
-            said = self._ray.get(next(worker.stream))
+            message = self._ray.get(next(worker.stream))
         except StopIteration:
-            said = None
+            message = None
         except self._ray.exceptions.RayError as error:
             self._ray.kill(worker.actor)
             self._workers[slot] = None
@@ -463,15 +424,15 @@ class RayPool:
             self._failed_start(error)
             self._workers[slot] = self._start()
             return None
-        if isinstance(said, Outcome):
-            self._tick(slot, said)
+        if isinstance(message, Outcome):
+            self._tick(slot, message)
             return None
         worker.stream = None
-        if said is None:
+        if message is None:
             self._ray.kill(worker.actor)
             self._workers[slot] = None
             return Lost(slot, "ended in the midst of its work")
-        return Finished(slot, said)
+        return Finished(slot, message)
 
     def _welcome(self, worker: _ActorHandle, version: str) -> None:
         if version != augment.__version__:
@@ -527,8 +488,8 @@ class RayPool:
 
 @dataclass
 class _ActorHandle:
-    """An actor as the pool sees it. starting: its first answer, until that has come. stream: what
-    it says about the task that it is at.
+    """An actor as the pool sees it. starting: its first answer, until that has come. stream: of
+    the messages about the task that it is at.
     """
 
     actor: Any
@@ -548,11 +509,7 @@ class _Actor:
     """
 
     def __init__(self, setup: WorkSetup, threads: int) -> None:
-        import cv2
-        import torch
-
-        torch.set_num_threads(threads)
-        cv2.setNumThreads(1)
+        limit_threads(threads)
         self._inbox: SimpleQueue[Task] = SimpleQueue()
         self._outbox: SimpleQueue[Outcome | Result | None] = SimpleQueue()
         self._worker_state = BlockWorker(setup, self._outbox.put)
@@ -565,9 +522,9 @@ class _Actor:
     def do(self, task: Task) -> Iterator[Outcome | Result]:
         """Images as they are finished, then the result; that is missing where it was stopped."""
         self._inbox.put(task)
-        while (said := self._outbox.get()) is not None:
-            yield said
-            if not isinstance(said, Outcome):
+        while (message := self._outbox.get()) is not None:
+            yield message
+            if not isinstance(message, Outcome):
                 return
 
     def stop(self) -> None:

@@ -71,11 +71,7 @@ class Publisher:
                 self._send(path, path)
 
     def finish(self) -> Part:
-        """Send what is left, then make the block visible.
-
-        Raises:
-            OutputError: a file could not be written; the block is invisible then.
-        """
+        """Send what is left, then make the block visible."""
         rows = read_manifest(self._folder)
         new = _renamed(rows, self._block.file_stem)
         left = {path: path for path in self._of_variant()}
@@ -136,11 +132,7 @@ VARIANTS = f"{STATE_FOLDER}/variants"
 
 
 def enter_variant(store: Store, scene: str, variant: str, identity: Identity) -> None:
-    """Make sure that the variant's images are all made from the same.
-
-    Raises:
-        OutputError: the output has the variant made from something else.
-    """
+    """Make sure that the variant's images are all made from the same."""
     folder = variant_folder(scene, variant)
     path = f"{VARIANTS}/{folder}.json"
     try:
@@ -167,11 +159,7 @@ def enter_variant(store: Store, scene: str, variant: str, identity: Identity) ->
 
 
 def clear_leftovers(store: Store, scratch: Path | None, published: Iterable[Block]) -> None:
-    """published: blocks that need no further work.
-
-    Raises:
-        OutputError: the system refused.
-    """
+    """published: blocks that need no further work."""
     for block in published:
         if staging_folder(store, scratch, block).is_dir():
             claim = try_claim(store, block.claim)
@@ -270,7 +258,7 @@ class BlockDone:
     """What became of a block. skipped: images that were finished before, here or elsewhere.
 
     is_elsewhere: another process is at it; nothing was done. seconds: by kind of work, as of
-    `batch.times`.
+    `worker.WorkTimes`.
     """
 
     written: int = 0

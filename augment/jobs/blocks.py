@@ -87,11 +87,7 @@ class SceneRecord:
 
     @staticmethod
     def from_json(data: bytes, where: str) -> SceneRecord:
-        """What `to_json` made bytes of.
-
-        Raises:
-            OutputError: the bytes are something else.
-        """
+        """What `to_json` made bytes of."""
         try:
             facts: dict[str, Any] = json.loads(data)
             if facts.pop("format") != _FORMAT:
@@ -175,9 +171,6 @@ def cut_into_blocks(
     frames: as `recipes.schema` reads them; ranges end with the scene. block_images: about how many
     images one has. Blocks begin at fixed frames of the scene, whatever the selection, so that most
     stay the same when it grows.
-
-    Raises:
-        SceneError: an unknown frame or camera, or no image is left.
     """
     known = {name for frame in record.frames for name in frame.cameras}
     if cameras is not None and (unknown := sorted(set(cameras) - known)):
@@ -351,11 +344,7 @@ class StoredPlan:
 
 
 def store_plan(store: Store, plan: Plan) -> None:
-    """Write the plan's file; the same for every shard and every time.
-
-    Raises:
-        OutputError: it cannot be written.
-    """
+    """Write the plan's file; the same for every shard and every time."""
     data = _to_json(plan)
     path = f"{JOBS}/{plan.job}.json"
     if not (store.exists(path) and store.read(path) == data):
@@ -363,11 +352,7 @@ def store_plan(store: Store, plan: Plan) -> None:
 
 
 def stored_plans(store: Store) -> list[StoredPlan]:
-    """The plans of all jobs in the output, by name.
-
-    Raises:
-        OutputError: one is damaged.
-    """
+    """The plans of all jobs in the output, by name."""
     paths = [path for path in store.list(JOBS) if path.endswith(".json")]
     return [_from_json(store.read(path), f"{store.uri}/{path}") for path in sorted(paths)]
 

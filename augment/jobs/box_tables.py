@@ -1,19 +1,20 @@
-"""What weather does to the boxes, beside their labels: a table of every variant and effect.
+"""What an image shows of its frame's boxes, and what its weather does to them: a table a kind.
 
-A row per box and image. The numbers are measured where the image is rendered, travel in its
-journal's line, and go to the variant's file when the job ends.
+A row per box and image. The numbers are measured where the image is rendered, travel in the line of
+its progress log, and go to the variant's files (`labels/boxes_2d.parquet` ...) when the job ends.
+Files that are missing, damaged or of another kind raise OutputError.
 """
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import pyarrow as pa
+from jaxtyping import Float64
 
 from augment.boxes import (
     NOT_COUNTED,
@@ -25,7 +26,7 @@ from augment.boxes import (
 )
 from augment.cameras import Camera
 from augment.effects.flood.flood import hidden_pixels, submerged_fraction
-from augment.effects.smog import SmogMedium, box_transmittance
+from augment.effects.smog import box_transmittance
 from augment.effects.snow.snow import placed_in_snow, snow_pixels
 from augment.errors import OutputError
 from augment.jobs.tables import (
@@ -38,60 +39,74 @@ from augment.jobs.tables import (
 )
 from augment.labels import Boxes
 
-# ---- box tables ----------------------------------------------------------------------------------
-
 Item = tuple[int, str]  # frame number and camera name
 
 
 @runtime_checkable
-class BoxNumbers(Protocol):
-    """A dataclass: what one effect does to a frame's boxes in one image, in the labels' order.
+class View(Protocol):
+    """What a renderer returns, a dataclass; `augment.views.WeatheredView` is one."""
 
-    Its fields are track_ids and then arrays of [B], named as their columns.
-    """
+    rgb: np.ndarray  # uint8 [H, W, 3]
+    depth_m: np.ndarray | None  # float32 [H, W], 0 = none
+    semantic: np.ndarray | None  # uint8 [H, W]
+    instance: np.ndarray | None  # uint16 [H, W]
+    water: np.ndarray | None  # uint8 [H, W], 0 or 255
+    snow: np.ndarray | None  # uint8 [H, W], 0 or 255
+    # What labels are measured from, as in augment.views: None without the effect, or without boxes.
+    flood: Any  # FloodedView
+    snowy: Any  # SnowyView
+    smoggy: Any  # SmoggyView
+    surface: Any  # SurfaceView
 
-    @property
-    def track_ids(self) -> tuple[str, ...]: ...
+
+@dataclass(frozen=True, eq=False)
+class BoxNumbers:
+    """A frame's boxes in one image, in the labels' order. columns: [B] each, by name."""
+
+    track_ids: tuple[str, ...]
+    columns: Mapping[str, np.ndarray]
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        return self.columns[name]
 
 
-Numbers = TypeVar("Numbers", bound=BoxNumbers)
+# By the manifest's kind of path: what is seen of a view's boxes, and what each effect does to them.
+BoxWeather = Mapping[str, BoxNumbers]
 
 
 @dataclass(frozen=True)
-class BoxTable(Generic[Numbers]):
-    """How the numbers of one effect are stored. kind: what the file says that it holds.
+class BoxTable:
+    """How the numbers of one kind are stored. kind: what the file says that it holds.
 
-    record: the type of an image's numbers. columns: the file's, with their types; those that are no
-    field of the record are its properties, there for other readers. sampled: columns that samples
-    of the datasets have.
+    columns: the file's, with their types. derived: what follows from the others; those that are
+    columns are there for other readers. sampled: those that samples of the datasets have.
     """
 
     kind: str
-    record: Callable[..., Numbers]
     columns: Mapping[str, type]
     sampled: tuple[str, ...]
+    derived: Mapping[str, Callable[[Mapping[str, Any]], np.ndarray]] = field(default_factory=dict)
 
     @property
     def stored(self) -> tuple[str, ...]:
-        """The record's arrays."""
-        fields: Any = self.record
-        return tuple(f.name for f in dataclasses.fields(fields) if f.name != "track_ids")
+        return tuple(name for name in self.columns if name not in self.derived)
 
-    def to_json(self, numbers: Numbers) -> list[list[Any]]:
-        """For the journal; floats keep all their digits."""
-        arrays = [getattr(numbers, name).tolist() for name in self.stored]
-        return [list(numbers.track_ids), *arrays]
+    def numbers(self, track_ids: Sequence[str], **stored: np.ndarray) -> BoxNumbers:
+        """The numbers of an image, with what follows from them."""
+        derived = {name: derive(stored) for name, derive in self.derived.items()}
+        return BoxNumbers(tuple(track_ids), stored | derived)
 
-    def from_json(self, columns: Sequence[Sequence[Any]]) -> Numbers:
+    def to_json(self, numbers: BoxNumbers) -> list[list[Any]]:
+        """For the progress log; floats keep all their digits."""
+        return [list(numbers.track_ids), *(numbers[name].tolist() for name in self.stored)]
+
+    def from_json(self, columns: Sequence[Sequence[Any]]) -> BoxNumbers:
         """What `to_json` made a list of."""
         track_ids, *arrays = columns
-        values = {
-            name: np.array(array, self.columns[name])
-            for name, array in zip(self.stored, arrays, strict=True)
-        }
-        return self.record(track_ids=tuple(track_ids), **values)
+        pairs = zip(self.stored, arrays, strict=True)
+        return self.numbers(track_ids, **{n: np.array(a, self.columns[n]) for n, a in pairs})
 
-    def to_bytes(self, items: Mapping[Item, Numbers]) -> bytes:
+    def to_bytes(self, items: Mapping[Item, BoxNumbers]) -> bytes:
         """All images' boxes as one Parquet file, ordered by frame, camera and place in the labels.
 
         A note in the metadata lists every image, so that one without boxes differs from one that
@@ -108,18 +123,14 @@ class BoxTable(Generic[Numbers]):
             "box": _joined([np.arange(n) for n in counts], np.int64),
         }
         for name, kind in self.columns.items():
-            joined = _joined([getattr(numbers, name) for numbers in listed], kind)
+            joined = _joined([numbers[name] for numbers in listed], kind)
             is_count = kind is np.int64
             columns[name] = pa.array(joined, mask=joined == NOT_COUNTED) if is_count else joined
         images = [[*item, count] for item, count in zip(order, counts, strict=True)]
         return parquet_bytes(pa.table(columns), {"kind": self.kind, "images": images})
 
-    def read(self, path: Path) -> dict[Item, Numbers]:
-        """The file's numbers by frame and camera.
-
-        Raises:
-            OutputError: the file is missing, damaged, or holds something else.
-        """
+    def read(self, path: Path) -> dict[Item, BoxNumbers]:
+        """The file's numbers by frame and camera."""
         table, note = read_parquet(path)
         if note.get("kind") != self.kind:
             raise OutputError(f"{path} holds {note.get('kind')!r} data; expected {self.kind!r}")
@@ -131,9 +142,7 @@ class BoxTable(Generic[Numbers]):
                 rows = slice(start, start + count)
                 # Copies: Arrow's own memory is read-only, which torch.from_numpy warns about.
                 values = {name: column[rows].copy() for name, column in columns.items()}
-                items[whole(frame), camera] = self.record(
-                    track_ids=tuple(track_ids[rows]), **values
-                )
+                items[whole(frame), camera] = self.numbers(track_ids[rows], **values)
                 start += count
             check_count(table, start)
         return items
@@ -148,288 +157,145 @@ def _joined(arrays: list[np.ndarray], dtype: type) -> np.ndarray:
     return np.concatenate([np.zeros(0, dtype), *arrays])
 
 
-# ---- The boxes of one image in 2D, and what of each it shows: `labels/boxes_2d.parquet` ----------
+def _visible_fraction(columns: Mapping[str, np.ndarray]) -> np.ndarray:
+    """float64 [B]: the box's pixels of those and of what hides it; NaN where there are neither."""
+    both = columns["pixels"] + columns["hidden_pixels"]
+    return np.where(both == 0, np.nan, columns["pixels"] / np.maximum(both, 1))
 
 
-@runtime_checkable
-class Surfaces(Protocol):
-    """What a view's boxes are found by; `augment.views.SurfaceView` is one."""
-
-    depth_m: np.ndarray  # float32 [H, W], of the first solid surface, snow included; 0 = none
-    snow_m: float  # the snow's depth; 0 where none is in view
-    actors: np.ndarray | None  # uint16 [H, W], actors' numbers there; None where not known
-    # Of the surfaces that the instance image shows, None without one: float32, uint8 [H, W]
-    shown_depth_m: np.ndarray | None
-    shown_classes: np.ndarray | None
-    shown_snow_m: float
-
-
-@dataclass(frozen=True, eq=False)
-class Box2d:
-    """A frame's boxes in one image, in the labels' order; entries are [B], floats float64.
-
-    instance: int64, the object's number (`augment.boxes`). x0, y0, x1, y1: bounds of the part
-    inside the image, in pixels, hidden or not; zeros out of view. modal_x0 ... modal_y1: bounds of
-    the pixels that show the box; NaN where none does. pixels, hidden_pixels: int64, those, and
-    those inside its outline that show what stands before it. truncated_fraction: of the outline's
-    area, outside the image.
-    """
-
-    track_ids: tuple[str, ...]
-    instance: np.ndarray
-    x0: np.ndarray
-    y0: np.ndarray
-    x1: np.ndarray
-    y1: np.ndarray
-    modal_x0: np.ndarray
-    modal_y0: np.ndarray
-    modal_x1: np.ndarray
-    modal_y1: np.ndarray
-    pixels: np.ndarray
-    hidden_pixels: np.ndarray
-    truncated_fraction: np.ndarray
-
-    @property
-    def visible_fraction(self) -> np.ndarray:
-        """float64 [B]: pixels of these and the hidden ones; NaN where there are neither."""
-        both = self.pixels + self.hidden_pixels
-        return np.where(both == 0, np.nan, self.pixels / np.maximum(both, 1))
-
-    @property
-    def modal_xyxy(self) -> np.ndarray:
-        """float32 [B, 4]."""
-        sides = (self.modal_x0, self.modal_y0, self.modal_x1, self.modal_y1)
-        return np.stack(sides, axis=1).astype(np.float32)
+def _fraction(name: str) -> Callable[[Mapping[str, np.ndarray]], np.ndarray]:
+    """float64 [B]: that part of the box's pixels; 0 where they were not counted, NaN of none."""
+    return lambda columns: fraction_of(columns[name], columns["pixels"])
 
 
 _SIDES = ("x0", "y0", "x1", "y1")
 _MODAL = ("modal_x0", "modal_y0", "modal_x1", "modal_y1")
-BOX_2D_TABLE = BoxTable(
-    kind="boxes 2d",
-    record=Box2d,
-    columns={
-        "instance": np.int64,
-        **dict.fromkeys((*_SIDES, *_MODAL), np.float64),
-        "pixels": np.int64,
-        "hidden_pixels": np.int64,
-        "visible_fraction": np.float64,
-        "truncated_fraction": np.float64,
-    },
-    sampled=("modal_xyxy", "visible_fraction", "truncated_fraction"),
-)
+TABLES: Mapping[str, BoxTable] = {
+    # The boxes in 2D. instance: the object's number (`augment.boxes`). x0 ... y1: pixels, bounds of
+    # the part inside the image, hidden or not; zeros out of view. modal_x0 ... modal_y1: bounds of
+    # the pixels that show the box; NaN where none does. pixels, hidden_pixels: those, and those
+    # inside its outline that show what stands before it. truncated_fraction: of the outline's area,
+    # outside the image. modal_xyxy: float32 [B, 4].
+    "box_2d": BoxTable(
+        kind="boxes 2d",
+        columns={
+            "instance": np.int64,
+            **dict.fromkeys((*_SIDES, *_MODAL), np.float64),
+            "pixels": np.int64,
+            "hidden_pixels": np.int64,
+            "visible_fraction": np.float64,
+            "truncated_fraction": np.float64,
+        },
+        sampled=("modal_xyxy", "visible_fraction", "truncated_fraction"),
+        derived={
+            "visible_fraction": _visible_fraction,
+            "modal_xyxy": lambda c: np.stack([c[n] for n in _MODAL], axis=1).astype(np.float32),
+        },
+    ),
+    # submerged_fraction: of the box's height. pixels: that show the box, or NOT_COUNTED in an image
+    # without water in view. hidden_pixels: those behind water.
+    "box_water": BoxTable(
+        kind="box water",
+        columns={
+            "submerged_fraction": np.float64,
+            "pixels": np.int64,
+            "hidden_pixels": np.int64,
+            "hidden_fraction": np.float64,
+        },
+        sampled=("submerged_fraction", "hidden_fraction"),
+        derived={"hidden_fraction": _fraction("hidden_pixels")},
+    ),
+    # pixels: that show the box or the snow on it, or NOT_COUNTED in an image without snow in view.
+    # snow_pixels: those that show snow.
+    "box_snow": BoxTable(
+        kind="box snow",
+        columns={"pixels": np.int64, "snow_pixels": np.int64, "snow_fraction": np.float64},
+        sampled=("snow_fraction",),
+        derived={"snow_fraction": _fraction("snow_pixels")},
+    ),
+    # transmittance: 0 to 1, of the smog between camera and box; NaN of a box whose numbers are not
+    # finite. pixels: those it is the mean of; it is an estimate of none, or where NOT_COUNTED.
+    "box_smog": BoxTable(
+        kind="box smog",
+        columns={"transmittance": np.float64, "pixels": np.int64},
+        sampled=("transmittance",),
+    ),
+}
 
 
-def measure_2d(
-    boxes: Boxes,
-    instances: Instances,
-    world_origin_m: np.ndarray,
-    camera: Camera,
-    surfaces: Surfaces,
-) -> Box2d:
+def measure_boxes(
+    boxes: Boxes, instances: Instances, world_origin_m: np.ndarray, camera: Camera, view: View
+) -> BoxWeather:
     """The boxes of a frame in one of its images. camera: at the written resolution."""
+    measured: dict[str, dict[str, np.ndarray]] = {}
+    if view.surface is not None:
+        measured["box_2d"] = _measure_2d(boxes, instances, world_origin_m, camera, view.surface)
+    if (flood := view.flood) is not None:
+        depth_m, mask = flood.scene_depth_m, view.water
+        measured["box_water"] = {
+            "submerged_fraction": submerged_fraction(boxes, world_origin_m, flood.level_z_m),
+            **_counted(
+                boxes,
+                "hidden_pixels",
+                depth_m is not None and hidden_pixels(boxes, world_origin_m, camera, depth_m, mask),
+            ),
+        }
+    if (snow := view.snowy) is not None:
+        depth_m, mask = snow.surface_depth_m, view.snow
+        measured["box_snow"] = _counted(
+            boxes,
+            "snow_pixels",
+            depth_m is not None
+            and snow_pixels(boxes, world_origin_m, camera, depth_m, mask, snow.thickness_m),
+        )
+    if (smog := view.smoggy) is not None:
+        found = box_transmittance(
+            boxes, world_origin_m, camera, smog.medium, smog.surface_depth_m, smog.water_level_z_m
+        )
+        measured["box_smog"] = {"transmittance": found.transmittance, "pixels": found.pixels}
+    return {k: TABLES[k].numbers(boxes.track_ids, **columns) for k, columns in measured.items()}
+
+
+def _counted(boxes: Boxes, name: str, counted: Any) -> dict[str, np.ndarray]:
+    """The pixels of each box and those marked, under that name; counted: False, where not."""
+    if counted is False:
+        return {"pixels": np.full(len(boxes), NOT_COUNTED), name: np.zeros(len(boxes), np.int64)}
+    return {"pixels": counted.pixels, name: counted.marked}
+
+
+def _measure_2d(
+    boxes: Boxes, instances: Instances, world_origin_m: np.ndarray, camera: Camera, surface: Any
+) -> dict[str, np.ndarray]:
     placed = PlacedBoxes.of(boxes, world_origin_m)
     outlines = outline_placed(placed, camera)
-    if surfaces.snow_m:
-        placed = placed_in_snow(placed, surfaces.snow_m)
+    if surface.snow_m:
+        placed = placed_in_snow(placed, surface.snow_m)
     instance = instances.of(boxes.track_ids)
     actors = np.where(instance <= len(instances.actors), instance, 0)
-    occlusion = find_occlusion(placed, camera, surfaces.depth_m, surfaces.actors, actors)
-    return Box2d(
-        track_ids=tuple(boxes.track_ids),
-        instance=instance.astype(np.int64),
+    occlusion = find_occlusion(placed, camera, surface.depth_m, surface.actors, actors)
+    return {
+        "instance": instance.astype(np.int64),
         **dict(zip(_SIDES, outlines.xyxy.T.copy(), strict=True)),
         **dict(zip(_MODAL, occlusion.xyxy.T.copy(), strict=True)),
-        pixels=occlusion.shown,
-        hidden_pixels=occlusion.hidden,
-        truncated_fraction=outlines.truncated_fraction,
-    )
+        "pixels": occlusion.shown,
+        "hidden_pixels": occlusion.hidden,
+        "truncated_fraction": outlines.truncated_fraction,
+    }
 
 
-def read_boxes_2d(path: Path) -> dict[Item, Box2d]:
-    """The numbers of a `labels/boxes_2d.parquet` by frame and camera.
+def visibility(weather: BoxWeather, count: int) -> Float64[np.ndarray, " B"]:
+    """What the weather leaves of each box: transmittance of the smog, times the part of its pixels
+    that no water hides, times the part that no snow covers; [count], 0 to 1.
 
-    Raises:
-        OutputError: the file is missing, damaged, or holds something else.
+    An effect that there is not, or that says nothing of a box (NaN: no pixel shows it, or its own
+    numbers are not finite), takes nothing from it. So this is no answer to whether a box is in
+    view, or behind another: `pixels` of the tables is.
     """
-    return BOX_2D_TABLE.read(path)
-
-
-# ---- What smog leaves of the boxes of one image: `labels/smog.parquet` ---------------------------
-
-
-@runtime_checkable
-class Smoggy(Protocol):
-    """The smog in a view; `augment.views.SmoggyView` is one."""
-
-    medium: SmogMedium | None  # None where the recipe's has no density
-    surface_depth_m: np.ndarray | None  # float32 [H, W]; None where boxes need not be measured
-    water_level_z_m: float | None  # scene world; None where no water is drawn
-
-
-@dataclass(frozen=True, eq=False)
-class BoxSmog:
-    """A frame's boxes in one image, in the labels' order; entries are [B].
-
-    transmittance: float64, 0 to 1, of the smog between the camera and the box; NaN of a box whose
-    numbers are not finite. pixels: int64, those it is the mean of; it is an estimate where none
-    shows the box, or they are NOT_COUNTED.
-    """
-
-    track_ids: tuple[str, ...]
-    transmittance: np.ndarray
-    pixels: np.ndarray
-
-
-SMOG_TABLE = BoxTable(
-    kind="box smog",
-    record=BoxSmog,
-    columns={"transmittance": np.float64, "pixels": np.int64},
-    sampled=("transmittance",),
-)
-
-
-def measure_smog(
-    boxes: Boxes, world_origin_m: np.ndarray, camera: Camera, smoggy: Smoggy
-) -> BoxSmog:
-    """The boxes of a frame in one of its images. camera: at the written resolution."""
-    measured = box_transmittance(
-        boxes, world_origin_m, camera, smoggy.medium, smoggy.surface_depth_m, smoggy.water_level_z_m
-    )
-    return BoxSmog(tuple(boxes.track_ids), measured.transmittance, measured.pixels)
-
-
-def read_smog(path: Path) -> dict[Item, BoxSmog]:
-    """The numbers of a `labels/smog.parquet` by frame and camera.
-
-    Raises:
-        OutputError: the file is missing, damaged, or holds something else.
-    """
-    return SMOG_TABLE.read(path)
-
-
-# ---- What snow does to the boxes of one image: `labels/snow.parquet` -----------------------------
-
-
-@runtime_checkable
-class Snowy(Protocol):
-    """How the snow lies in a view; `augment.views.SnowyView` is one."""
-
-    surface_depth_m: np.ndarray | None  # float32 [H, W]; None where boxes need not be measured
-    thickness_m: float
-
-
-@dataclass(frozen=True, eq=False)
-class BoxSnow:
-    """A frame's boxes in one image, in the labels' order; entries are [B].
-
-    pixels: int64, that show the box or the snow on it, or NOT_COUNTED in an image without snow in
-    view. snow_pixels: int64, those that show snow.
-    """
-
-    track_ids: tuple[str, ...]
-    pixels: np.ndarray
-    snow_pixels: np.ndarray
-
-    @property
-    def snow_fraction(self) -> np.ndarray:
-        """float64 [B]: snow of all its pixels; 0 where they were not counted, NaN of none."""
-        return fraction_of(self.snow_pixels, self.pixels)
-
-
-SNOW_TABLE = BoxTable(
-    kind="box snow",
-    record=BoxSnow,
-    columns={"pixels": np.int64, "snow_pixels": np.int64, "snow_fraction": np.float64},
-    sampled=("snow_fraction",),
-)
-
-
-def measure_snow(
-    boxes: Boxes, world_origin_m: np.ndarray, camera: Camera, snow: np.ndarray, snowy: Snowy
-) -> BoxSnow:
-    """The boxes of a frame in one of its images.
-
-    camera: at the written resolution. snow: uint8 [H, W], 255 where the pixel shows snow.
-    """
-    pixels, covered = np.full(len(boxes), NOT_COUNTED), np.zeros(len(boxes), np.int64)
-    depth = snowy.surface_depth_m
-    if depth is not None:
-        counted = snow_pixels(boxes, world_origin_m, camera, depth, snow, snowy.thickness_m)
-        pixels, covered = counted.pixels, counted.marked
-    return BoxSnow(tuple(boxes.track_ids), pixels, covered)
-
-
-def read_snow(path: Path) -> dict[Item, BoxSnow]:
-    """The numbers of a `labels/snow.parquet` by frame and camera.
-
-    Raises:
-        OutputError: the file is missing, damaged, or holds something else.
-    """
-    return SNOW_TABLE.read(path)
-
-
-# ---- What a flood does to the boxes of one image: `labels/water.parquet` -------------------------
-
-
-@runtime_checkable
-class Flooded(Protocol):
-    """Where the water stands in a view; `augment.views.FloodedView` is one."""
-
-    level_z_m: float  # scene world
-    scene_depth_m: np.ndarray | None  # float32 [H, W]; None where no water is in view
-
-
-@dataclass(frozen=True, eq=False)
-class BoxWater:
-    """A frame's boxes in one image, in the labels' order; entries are [B].
-
-    submerged_fraction: float64, 0 to 1 of the box's height. pixels: int64, that show the box, or
-    NOT_COUNTED in an image without water in view. hidden_pixels: int64, those behind water.
-    """
-
-    track_ids: tuple[str, ...]
-    submerged_fraction: np.ndarray
-    pixels: np.ndarray
-    hidden_pixels: np.ndarray
-
-    @property
-    def hidden_fraction(self) -> np.ndarray:
-        """float64 [B]: hidden of all its pixels; 0 where they were not counted, NaN of none."""
-        return fraction_of(self.hidden_pixels, self.pixels)
-
-
-WATER_TABLE = BoxTable(
-    kind="box water",
-    record=BoxWater,
-    columns={
-        "submerged_fraction": np.float64,
-        "pixels": np.int64,
-        "hidden_pixels": np.int64,
-        "hidden_fraction": np.float64,
-    },
-    sampled=("submerged_fraction", "hidden_fraction"),
-)
-
-
-def measure_water(
-    boxes: Boxes, world_origin_m: np.ndarray, camera: Camera, water: np.ndarray, flood: Flooded
-) -> BoxWater:
-    """The boxes of a frame in one of its images.
-
-    camera: at the written resolution. water: uint8 [H, W], 255 where it is the first surface.
-    """
-    submerged = submerged_fraction(boxes, world_origin_m, flood.level_z_m)
-    pixels, hidden = np.full(len(boxes), NOT_COUNTED), np.zeros(len(boxes), np.int64)
-    if flood.scene_depth_m is not None:
-        counted = hidden_pixels(boxes, world_origin_m, camera, flood.scene_depth_m, water)
-        pixels, hidden = counted.pixels, counted.marked
-    return BoxWater(tuple(boxes.track_ids), submerged, pixels, hidden)
-
-
-def read_water(path: Path) -> dict[Item, BoxWater]:
-    """The numbers of a `labels/water.parquet` by frame and camera.
-
-    Raises:
-        OutputError: the file is missing, damaged, or holds something else.
-    """
-    return WATER_TABLE.read(path)
+    factors = [np.ones(count)]
+    if "box_smog" in weather:
+        factors.append(weather["box_smog"]["transmittance"])
+    if "box_water" in weather:
+        factors.append(1 - weather["box_water"]["hidden_fraction"])
+    if "box_snow" in weather:
+        factors.append(1 - weather["box_snow"]["snow_fraction"])
+    return np.prod([np.where(np.isnan(factor), 1.0, factor) for factor in factors], axis=0)

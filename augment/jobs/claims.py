@@ -28,7 +28,7 @@ from random import SystemRandom
 from typing import Protocol, runtime_checkable
 
 from augment.errors import OutputError
-from augment.jobs.atomic import is_named, make_folder, output_error
+from augment.jobs.atomic import is_named, make_folder, output_error, refusals_of
 from augment.jobs.layout import STATE_FOLDER, folder_name
 from augment.jobs.store import Store
 
@@ -78,12 +78,8 @@ class FileClaim:
 
 
 def try_lock(path: Path) -> FileClaim | None:
-    """Lock the file, which is made if missing; None where another process holds it.
-
-    Raises:
-        OutputError: the system refused.
-    """
-    try:
+    """Lock the file, which is made if missing; None where another process holds it."""
+    with refusals_of(path):
         for _ in range(_MAX_RACES):
             make_folder(path.parent)
             try:
@@ -101,8 +97,6 @@ def try_lock(path: Path) -> FileClaim | None:
                 os.close(descriptor)
                 raise
             os.close(descriptor)  # a holder has deleted it since: lock the next one
-    except OSError as error:
-        raise output_error(path, error) from error
     return None
 
 
@@ -133,11 +127,7 @@ class Claim(Protocol):
     """Held by this process until released; leaving its `with` block releases it."""
 
     def check(self) -> None:
-        """Make sure that it is still held.
-
-        Raises:
-            OutputError: it was lost; others may hold it now.
-        """
+        """Make sure that it is still held."""
         ...
 
     def release(self) -> None:
@@ -170,11 +160,7 @@ def try_claim(store: Store, name: str, times: ClaimTimes | None = None) -> Claim
 
 @contextlib.contextmanager
 def hold(store: Store, name: str, patience_s: float = 120.0) -> Iterator[None]:
-    """Be inside with the claim; waits for others that are.
-
-    Raises:
-        OutputError: they took longer than that.
-    """
+    """Be inside with the claim; waits for others that are."""
     deadline = time.monotonic() + patience_s
     while (claim := try_claim(store, name)) is None:
         if time.monotonic() > deadline:
@@ -270,11 +256,7 @@ class ObjectClaim:
 
 
 def contend(store: Store, folder: str, times: ClaimTimes) -> ObjectClaim | None:
-    """Try to become the holder; None where another one lives, or too many contend at once.
-
-    Raises:
-        OutputError: the store cannot be read or written.
-    """
+    """Try to become the holder; None where another one lives, or too many contend at once."""
     for attempt in range(times.attempts):
         path = f"{folder}/{secrets.token_hex(8)}"
         started_s = _clock_s()

@@ -85,10 +85,6 @@ def select_frames(
     """The wanted frames in order of number, each with its wanted cameras in order of name.
 
     None wants all. A frame without any of the cameras is left out.
-
-    Raises:
-        SceneError: a frame or camera is unknown (the message lists those there are), a number is
-            used twice, or nothing remains.
     """
     known = index.frames_by_number
     if len(known) != len(index.frames):
@@ -228,11 +224,7 @@ def calibration_bytes(
 
 
 def read_entries(path: Path) -> dict[int, dict[str, Any]]:
-    """The frame entries of a calibration file by frame number.
-
-    Raises:
-        OutputError: the file is missing or damaged.
-    """
+    """The frame entries of a calibration file by frame number."""
     try:
         frames = json.loads(Path(path).read_bytes())["frames"]
         return {entry["frame"]: entry for entry in frames}

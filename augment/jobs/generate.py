@@ -25,7 +25,7 @@ from tqdm import tqdm
 
 import augment
 from augment.errors import OutputError
-from augment.jobs.atomic import output_error
+from augment.jobs.atomic import refusals_of
 from augment.jobs.backends import renders_on_gpu
 from augment.jobs.block_pools import SerialPool, Tick, WorkerPool
 from augment.jobs.block_worker import (
@@ -76,9 +76,6 @@ def resolve_recipes(
     """By scene and variant: the recipes that had to choose, settled, or why they could not.
 
     found: the scene of every URI and name. keep: whether new choices are kept in the output.
-
-    Raises:
-        OutputError: a record in the output is damaged, or cannot be read or written.
     """
     wanted = _wanted(job, found)
     if not wanted:
@@ -292,7 +289,7 @@ class GenerateResult:
     """Images of this shard. skipped: finished before, here or elsewhere. unusable: scenes by URI.
 
     timings: seconds by kind of work, summed over threads and workers, of which
-    `batch.times.shares_of` says what the job was bound by; and by the clock: `plan`, with the
+    `worker.shares_of` says what the job was bound by; and by the clock: `plan`, with the
     scenes' opening, `scan` of what is finished, and `render_wall`, all else.
     """
 
@@ -366,23 +363,17 @@ def _with_backend(job: GenerateJob) -> GenerateJob:
 
 
 def default_scratch(store_uri: str) -> Path | None:
-    """A folder of this user's for blocks on their way to that output; None for a local one.
-
-    Raises:
-        OutputError: the folder belongs to somebody else.
-    """
+    """A folder of this user's for blocks on their way to that output; None for a local one."""
     store = open_store(store_uri)
     if store.local_dir is not None:
         return None
     digest = hashlib.sha256(store.uri.encode()).hexdigest()[:16]
     root = Path(tempfile.gettempdir()) / f"climategs-{os.getuid()}"
-    try:
+    with refusals_of(root):
         root.mkdir(mode=0o700, exist_ok=True)
         if root.stat().st_uid != os.getuid() or root.is_symlink():
             raise OutputError(f"{root} belongs to somebody else; name another folder (--scratch)")
         return root / digest
-    except OSError as error:
-        raise output_error(root, error) from error
 
 
 class _Generation:

@@ -22,10 +22,11 @@ from augment.jobs.atomic import (
     flush_folder,
     make_folder,
     output_error,
+    refusals_of,
     remove_temporaries,
     write_atomic,
 )
-from augment.jobs.box_tables import BoxNumbers, Item
+from augment.jobs.box_tables import TABLES, BoxNumbers, Item
 from augment.jobs.claims import hold
 from augment.jobs.files import SceneIndex, calibration_bytes, frame_entry, read_entries
 from augment.jobs.layout import (
@@ -52,7 +53,6 @@ from augment.jobs.manifest import (
 )
 from augment.jobs.store import open_store
 from augment.jobs.tables import FrameBoxes, boxes_bytes, read_boxes
-from augment.jobs.view_files import TABLES
 from augment.jobs.worker import Chunk, Outcome, describe
 from recipes.schema import Recipe
 
@@ -89,13 +89,11 @@ class ProgressLog:
 
     def begin(self, identity: Identity) -> None:
         """Open for appending; starts with the identity, or goes on after the last whole line."""
-        try:
+        with refusals_of(self.path):
             whole = self.path.read_bytes() if self.path.exists() else b""
             whole = whole[: whole.rfind(b"\n") + 1]
             write_atomic(self.path, whole or _line(asdict(identity)))
             self._file = os.open(self.path, os.O_WRONLY | os.O_APPEND)
-        except OSError as error:
-            raise output_error(self.path, error) from error
 
     def append(self, row: dict[str, Any]) -> None:
         """Add a finished image. Returns when the line is on the disk."""
@@ -117,14 +115,12 @@ class ProgressLog:
     def remove(self) -> None:
         """Delete the journal and the folders it leaves empty."""
         self.close()
-        try:
+        with refusals_of(self.path):
             self.path.unlink(missing_ok=True)
             for folder in (self.path.parent, self.path.parent.parent):
                 if folder.is_dir() and not any(folder.iterdir()):
                     folder.rmdir()
                     flush_folder(folder.parent)
-        except OSError as error:
-            raise output_error(self.path, error) from error
 
 
 def logged_variants(out_dir: Path) -> list[str]:
@@ -180,8 +176,8 @@ class VariantState:
         if any(item not in self.box_weather[kind] for kind in measured):
             return False
         if "box_2d" in measured:
-            numbers: Any = self.box_weather["box_2d"][item]
-            if not instances.agree(numbers.track_ids, numbers.instance):
+            numbers = self.box_weather["box_2d"][item]
+            if not instances.agree(numbers.track_ids, numbers["instance"]):
                 return False
         paths = [row[f"{kind}_path"] for kind in PATH_KINDS if kind not in _OF_VARIANT]
         return all((out_dir / path).is_file() for path in paths if path is not None)
@@ -212,12 +208,7 @@ class JobState:
         return {(self.index.name, variant.name) for variant in self.variants}
 
     def open(self, *, overwrite: bool) -> None:
-        """Clear away what a killed run left, and read what it finished.
-
-        Raises:
-            OutputError: a variant's folder holds images of another recipe, scene or version, and
-                `overwrite` is false; nothing was changed then.
-        """
+        """Clear away what a killed run left, and read what it finished."""
         if (self.out_dir / MANIFEST).is_file():
             self._table = read_manifest(self.out_dir)
         replaced = [variant for variant in self.variants if self._load(variant, overwrite)]
@@ -296,12 +287,10 @@ class JobState:
         for number, variant in enumerate(variants):
             folder = self.out_dir / variant.folder
             if folder.is_dir():
-                try:
+                with refusals_of(folder):
                     make_folder(trash)
                     folder.rename(trash / str(number))
                     flush_folder(folder.parent)
-                except OSError as error:
-                    raise output_error(folder, error) from error
         if self._table is not None:
             keys = {(self.index.name, variant.name) for variant in variants}
             self._replace_rows([], keys)
@@ -360,11 +349,8 @@ def _read_table(kind: str, path: Path) -> dict[Item, BoxNumbers]:
 
 
 def _remove_tree(folder: Path) -> None:
-    try:
-        with contextlib.suppress(FileNotFoundError):
-            shutil.rmtree(folder)
-    except OSError as error:
-        raise output_error(folder, error) from error
+    with refusals_of(folder), contextlib.suppress(FileNotFoundError):
+        shutil.rmtree(folder)
 
 
 # ------------------------------------------------------------------------------------------------
@@ -404,9 +390,6 @@ def finish(job_state: JobState, trajectory: str, boxes: BoxCache) -> None:
     """Write labels, calibration and manifest of the job's variants that have rows.
 
     Safe to repeat: a kill at any point leaves the journals, and the next run does it again.
-
-    Raises:
-        OutputError: the system refused.
     """
     variants = [variant for variant in job_state.variants if variant.rows]
     for variant in variants:

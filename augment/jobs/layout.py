@@ -124,11 +124,7 @@ def relative_parts(path: str) -> tuple[str, ...] | None:
 
 
 def resolve_inside(root: Path, relative: str) -> Path:
-    """The file that a manifest's path names.
-
-    Raises:
-        OutputError: the path is absolute, climbs with `..`, or leaves `root` through a link.
-    """
+    """The file that a manifest's path names."""
     parts = relative_parts(relative)
     if parts is None:
         raise OutputError(
@@ -140,11 +136,7 @@ def resolve_inside(root: Path, relative: str) -> Path:
 
 
 def path_below(root: Path, parts: tuple[str, ...]) -> Path:
-    """The path of these components, which no link leads out of the root.
-
-    Raises:
-        OutputError: it does.
-    """
+    """The path of these components, which no link leads out of the root."""
     path = root.joinpath(*parts)
     real_root = root.resolve()
     if not path.resolve().is_relative_to(real_root):

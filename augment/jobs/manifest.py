@@ -116,11 +116,7 @@ def rows_to_table(rows: Iterable[Row]) -> pa.Table:
 
 
 def read_manifest(out_dir: Path) -> pa.Table:
-    """The manifest of an output folder; one of an older version gains the columns it lacks.
-
-    Raises:
-        OutputError: there is none, or as parse_manifest raises it.
-    """
+    """The manifest of an output folder; one of an older version gains the columns it lacks."""
     path = Path(out_dir) / MANIFEST
     if not path.is_file():
         raise OutputError(
@@ -135,12 +131,7 @@ def read_manifest(out_dir: Path) -> pa.Table:
 
 
 def parse_manifest(data: bytes, where: str) -> pa.Table:
-    """The table in a manifest's bytes, with the columns that an older version lacks.
-
-    Raises:
-        OutputError: the bytes are damaged, or a column is missing, of another type, or holds what
-            no job writes; `where` they were read.
-    """
+    """The table in a manifest's bytes, with the columns that an older version lacks."""
     table = _with_later_columns(read_table(data, where))
     _check_types(table, where)
     for name in weather_columns(table):
@@ -252,11 +243,7 @@ def rows_of(table: pa.Table, variants: set[tuple[str, str]]) -> list[dict[str, A
 
 
 def write_manifest(out_dir: Path, table: pa.Table) -> Path:
-    """Replace the manifest in one step; untouched where it already says the same.
-
-    Raises:
-        OutputError: the system refused; the old manifest then still stands.
-    """
+    """Replace the manifest in one step; untouched where it already says the same."""
     path = Path(out_dir) / MANIFEST
     data = manifest_bytes(table)
     if not (path.is_file() and path.read_bytes() == data):

@@ -25,7 +25,7 @@ from augment.cameras import Frame
 from augment.effects.lidar.codes import drop_lost
 from augment.errors import AdapterError, OutputError
 from augment.files.image_size import read_image_header
-from augment.jobs.atomic import flush_folder, output_error, write_atomic
+from augment.jobs.atomic import flush_folder, output_error, refusals_of, write_atomic
 from augment.jobs.files import decode_image, encode_image
 from augment.jobs.layout import folder_name, resolve_inside
 from augment.jobs.manifest import OK
@@ -82,9 +82,6 @@ def record_names(tree: SourceTree, folder: Path) -> tuple[Path, Path]:
 def read_record(tree: SourceTree, folder: Path) -> MirrorRecord:
     """What is known of the dataset's copy in a folder, also of one that was stopped while it was
     being changed; empty where there is none.
-
-    Raises:
-        OutputError: the record is damaged, or the copy is that of another dataset.
     """
     path = next((path for path in record_names(tree, folder) if path.is_file()), None)
     if path is None:
@@ -134,11 +131,7 @@ class WeatheredSweep:
     def of_row(
         out_dir: Path, row: Mapping[str, Any], content: Callable[[], bytes] | None = None
     ) -> WeatheredSweep:
-        """The sweep of a manifest's row.
-
-        Raises:
-            OutputError: the row names a file outside the output folder.
-        """
+        """The sweep of a manifest's row."""
         name = row["lidar_path"]
         return WeatheredSweep(row["scene"], resolve_inside(out_dir, name), name, content)
 
@@ -148,9 +141,6 @@ def weathered_sweeps(
 ) -> tuple[dict[str, WeatheredSweep], list[str]]:
     """The dataset's files that a variant's weathered sweeps change, by their place in it, and a
     sentence for the sweeps that change none. Lost returns are left out of the files.
-
-    Raises:
-        OutputError: a row names a file outside the output folder.
     """
     frames = {row["frame"]: row for row in rows if row["status"] == OK and is_weathered(row)}
     found: dict[str, WeatheredSweep] = {}
@@ -214,11 +204,7 @@ class Weathered:
 
     @staticmethod
     def of_row(out_dir: Path, row: Mapping[str, Any], jpeg_quality: int) -> Weathered:
-        """The image of a manifest's row.
-
-        Raises:
-            OutputError: the row names a file outside the output folder.
-        """
+        """The image of a manifest's row."""
         name = row["image_path"]
         form = ImageForm("jpg" if name.endswith(".jpg") else "png", row["width"], row["height"])
         path = resolve_inside(out_dir, name)
@@ -236,9 +222,6 @@ def image_form(path: str | Path) -> ImageForm | None:
 def dataset_format(frames: Iterable[Frame]) -> str:
     """The format in which to render so that the dataset's images are of it: that of the recorded
     ones, png where they are of several.
-
-    Raises:
-        AdapterError: no frame has a recorded image that is PNG or JPEG.
     """
     suffixes = {Path(path).suffix.lower() for f in frames for path in f.image_paths.values()}
     formats = {{".png": "png", ".jpg": "jpg", ".jpeg": "jpg"}.get(suffix) for suffix in suffixes}
@@ -260,9 +243,6 @@ def weathered_images(
 ) -> tuple[dict[str, Weathered], list[str]]:
     """The finished images of a variant's rows by their place in the dataset, and a sentence for
     those that have none.
-
-    Raises:
-        OutputError: a row names a file outside the output folder.
     """
     recorded = {frame.index: frame.image_paths for frame in frames}
     found: dict[str, Weathered] = {}
@@ -298,11 +278,7 @@ def fits(image: Weathered, recorded: ImageForm) -> bool:
 
 
 def fitted(image: Weathered, recorded: ImageForm) -> bytes:
-    """Our image as a file of the recorded one's form: smaller by area, larger by cubic splines.
-
-    Raises:
-        OutputError: our file is missing or damaged.
-    """
+    """Our image as a file of the recorded one's form: smaller by area, larger by cubic splines."""
     try:
         rgb = decode_image(image.path.read_bytes())
     except OSError as error:
@@ -444,18 +420,14 @@ class _Mirroring:
 
     def finish(self, scenes: Mapping[str, Any]) -> None:
         """Make the names durable, then say that the copy is complete."""
-        try:
+        with refusals_of(self.folder):
             for folder in sorted(self.changed_folders):
                 flush_folder(Path(folder))
-        except OSError as error:
-            raise output_error(self.folder, error) from error
         text = json.dumps(self._described(scenes), indent=1) + "\n"
         if not (self.record.is_file() and self.record.read_bytes() == text.encode()):
             write_atomic(self.record, text.encode())
-        try:
+        with refusals_of(self.begun_record):
             self.begun_record.unlink(missing_ok=True)
-        except OSError as error:
-            raise output_error(self.begun_record, error) from error
 
     def _fill(self, folder: SourceFolder) -> None:
         path = self._target(folder.relative)
@@ -559,12 +531,10 @@ class _Mirroring:
         if self.is_begun:
             return
         self.is_begun = True
-        try:
+        with refusals_of(self.record):
             if self.record.exists():
                 os.replace(self.record, self.begun_record)
                 flush_folder(self.folder)
-        except OSError as error:
-            raise output_error(self.record, error) from error
 
     def _own(self, folder: str) -> None:
         if own_folder(folder):

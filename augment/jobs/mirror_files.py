@@ -16,7 +16,13 @@ from functools import cached_property
 from pathlib import Path
 
 from augment.errors import AdapterError, OutputError
-from augment.jobs.atomic import output_error, replaced_file, temporary_beside, temporary_names
+from augment.jobs.atomic import (
+    output_error,
+    refusals_of,
+    replaced_file,
+    temporary_beside,
+    temporary_names,
+)
 
 # ---- The files of a dataset, as a copy of it in another place has to have them -------------------
 # A dataset's own entries (`samples`, `camera` ...) may be links to other disks: what they lead to
@@ -43,10 +49,6 @@ class SourceTree:
     def bases(self) -> tuple[tuple[str, str], ...]:
         """Real paths of the folders and files that make up the dataset, and where each belongs
         relative to root: root itself, then what its own entries lead to elsewhere.
-
-        Raises:
-            AdapterError: root is no folder, or one of its entries leads to nothing or to a folder
-                that holds the dataset itself.
         """
         real_root = os.path.realpath(self.root)
         try:
@@ -129,11 +131,7 @@ class Survey:
 
 
 def survey(tree: SourceTree) -> Survey:
-    """Look at all that belongs to a dataset, reading no file.
-
-    Raises:
-        AdapterError: as for walk.
-    """
+    """Look at all that belongs to a dataset, reading no file."""
     files = size = images = 0
     for folder in walk(tree):
         files += len(folder.files)
@@ -143,12 +141,7 @@ def survey(tree: SourceTree) -> Survey:
 
 
 def walk(tree: SourceTree) -> Iterator[SourceFolder]:
-    """The folders of a dataset, each before those in it, in order of name.
-
-    Raises:
-        AdapterError: a folder cannot be read, a link leads out of the dataset, or there is
-            something that is neither file nor folder nor link.
-    """
+    """The folders of a dataset, each before those in it, in order of name."""
     elsewhere = {name: real for real, name in tree.bases if name}
     waiting = [("", os.path.realpath(tree.root))]
     while waiting:
@@ -232,11 +225,7 @@ def found_as(target: str, original: os.stat_result) -> str | None:
 
 
 def link_file(original: str, target: str) -> bool:
-    """Give the original a second name; False where the system cannot, and nothing has changed.
-
-    Raises:
-        OutputError: the system refused otherwise.
-    """
+    """Give the original a second name; False where the system cannot, and nothing has changed."""
     try:
         try:
             os.link(original, target, follow_symlinks=False)
@@ -252,11 +241,7 @@ def link_file(original: str, target: str) -> bool:
 
 
 def copy_file(original: str, target: str) -> None:
-    """Copy bytes and time of change.
-
-    Raises:
-        OutputError: the system refused; `target` is then as it was.
-    """
+    """Copy bytes and time of change."""
     with replaced_file(Path(target), clear=False, flush=False) as file:
         source = os.open(original, os.O_RDONLY)
         try:
@@ -270,11 +255,7 @@ def copy_file(original: str, target: str) -> None:
 
 
 def write_file(data: bytes, target: str, mtime_ns: int) -> None:
-    """Write a file with that time of change.
-
-    Raises:
-        OutputError: the system refused; `target` is then as it was.
-    """
+    """Write a file with that time of change."""
     with replaced_file(Path(target), clear=False, flush=False) as file:
         file.write(data)
         file.flush()
@@ -282,34 +263,22 @@ def write_file(data: bytes, target: str, mtime_ns: int) -> None:
 
 
 def put_link(text: str, target: str) -> bool:
-    """A symbolic link that says `text`; False where it is there already.
-
-    Raises:
-        OutputError: the system refused.
-    """
-    try:
+    """A symbolic link that says `text`; False where it is there already."""
+    with refusals_of(Path(target)):
         if os.path.islink(target) and os.readlink(target) == text:
             return False
         temporary = temporary_beside(Path(target))
         os.symlink(text, temporary)
         _move(temporary, target)
-    except OSError as error:
-        raise output_error(Path(target), error) from error
     return True
 
 
 def own_folder(folder: str) -> bool:
-    """Make sure that a folder of the copy is a real one; True where it had to be made.
-
-    Raises:
-        OutputError: a link or file has its name, or the system refused.
-    """
+    """Make sure that a folder of the copy is a real one; True where it had to be made."""
     facts = _facts(folder)
     if facts is None:
-        try:
+        with refusals_of(Path(folder)):
             os.mkdir(folder)
-        except OSError as error:
-            raise output_error(Path(folder), error) from error
         return True
     if not stat.S_ISDIR(facts.st_mode):
         kind = "a link" if stat.S_ISLNK(facts.st_mode) else "a file"
@@ -323,14 +292,12 @@ def own_folder(folder: str) -> bool:
 def others_in(folder: str, expected: set[str]) -> list[str]:
     """Names in a folder of the copy that are not expected; what a killed run left is deleted."""
     others = []
-    try:
+    with refusals_of(Path(folder)):
         found = set(os.listdir(folder)) - expected
         left = set(temporary_names(found))
         for name in left:
             os.unlink(os.path.join(folder, name))
         others += sorted(found - left)
-    except OSError as error:
-        raise output_error(Path(folder), error) from error
     return others
 
 

@@ -35,11 +35,7 @@ class StoredBed:
     key: str
 
     def take_over(self, scene: Scene) -> None:
-        """Read the bed into this process, for whoever renders the scene here.
-
-        Raises:
-            SceneError: the file is lost or damaged.
-        """
+        """Read the bed into this process, for whoever renders the scene here."""
         from augment.effects.snow.support import load_bed
 
         remember(scene, self.snow, load_bed(Path(self.path), self.key))
@@ -62,9 +58,6 @@ def remember(scene: Scene, snow: Snow, bed: SnowSupport) -> None:
 def find_bed(scene: Scene, snow: Snow, *, backend: str = "auto") -> SnowSupport:
     """The bed of a snow for all of the scene's cameras, remembered for this scene object. backend:
     that renders the pictures.
-
-    Raises:
-        SceneError: it cannot be placed.
     """
     from augment.effects.snow.snow import placement_settings
     from augment.effects.snow.support import bed_of
@@ -86,9 +79,6 @@ def store_beds(
     cameras: all that a camera path has, or None for the scene's: never a selection, so that no
     image depends on what else is rendered. backend: that renders the images, which places their
     snow, too. progress: a bar on stderr for each bed that is placed.
-
-    Raises:
-        SceneError: a bed cannot be placed. OutputError: it cannot be written.
     """
     from augment.effects.snow.snow import placement_settings
     from augment.effects.snow.support import bed_key, bed_of, bed_path, save_bed

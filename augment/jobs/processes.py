@@ -6,6 +6,7 @@ import contextlib
 import fcntl
 import functools
 import io
+import multiprocessing
 import os
 import pickle
 import signal
@@ -24,12 +25,10 @@ from typing import Any, BinaryIO, TypeVar
 import numpy as np
 import torch
 
-from augment.errors import OutputError
-from augment.jobs.atomic import make_folder, output_error, temporary_beside
+from augment.errors import ClimateGSError, OutputError
+from augment.jobs.atomic import make_folder, output_error, refusals_of, temporary_beside
 from augment.jobs.layout import STATE_FOLDER
 from augment.scene import Scene
-
-# ---- processes -----------------------------------------------------------------------------------
 
 Result = TypeVar("Result")
 _TURN_S = 0.0005
@@ -59,10 +58,56 @@ def available_cores() -> int:
     return os.cpu_count() or 1
 
 
-def describe_exit(code: int | None) -> str:
-    if code is not None and code < 0:
-        return f"was killed by {signal.Signals(-code).name}"
-    return f"ended with exit code {code}"
+class ChildProcess:
+    """A process that is started afresh (`spawn`), at the other end of a connection."""
+
+    def __init__(
+        self, target: Callable[..., None], *arguments: Any, threads: int, daemon: bool
+    ) -> None:
+        """target: called with the child's connection and the arguments. threads: it may use."""
+        context = multiprocessing.get_context("spawn")
+        self.connection, child = context.Pipe()
+        self._process = context.Process(target=target, args=(child, *arguments), daemon=daemon)
+        with thread_limits(threads), interrupts_blocked():
+            self._process.start()
+        child.close()
+        self.is_ready = False
+
+    def send(self, message: Any) -> None:
+        """One that has just died shows itself when its connection is read."""
+        with contextlib.suppress(OSError):
+            self.connection.send(message)
+
+    def reap(self) -> str:
+        """Wait for its end and say how it ended: "was killed by SIGKILL", say."""
+        self._process.join()
+        self.connection.close()
+        code = self._process.exitcode
+        if code is not None and code < 0:
+            return f"was killed by {signal.Signals(-code).name}"
+        return f"ended with exit code {code}"
+
+    def kill(self) -> None:
+        self._process.kill()
+        self._process.join()
+        self.connection.close()
+
+
+def failed_start(ending: str) -> ClimateGSError:
+    """The error of a worker that ended before it was ready."""
+    return ClimateGSError(
+        f"a worker process {ending} while starting; what it printed says more. A script that "
+        f"starts workers needs `if __name__ == '__main__':` around its jobs; if memory ran out, "
+        f"use fewer workers"
+    )
+
+
+def limit_threads(threads: int) -> None:
+    """In a worker: what it may use, OpenCV none beside this one."""
+    import cv2
+
+    torch.set_num_threads(threads)
+    cv2.setNumThreads(1)
 
 
 @contextlib.contextmanager
@@ -85,9 +130,8 @@ def thread_limits(threads: int) -> Iterator[None]:
 
 @contextlib.contextmanager
 def quick_turns(wanted: bool) -> Iterator[None]:
-    """Within it, if it is wanted, a thread waits half a millisecond for its turn at Python and not
-    five. One that launches kernels gives its turn away with each of them, and between two launches
-    the GPU would wait for whoever encodes.
+    """If wanted, a thread waits half a millisecond for its turn at Python and not five: one that
+    launches kernels gives its turn away with each, and the GPU would wait for whoever encodes.
     """
     before = sys.getswitchinterval()
     if wanted:
@@ -110,10 +154,7 @@ def interrupts_blocked() -> Iterator[None]:
 
 
 def uninterrupted(call: Callable[[], Result]) -> Result:
-    """Run where no signal's exception can come between two steps, and wait for the end.
-
-    Python runs the handlers of signals in the main thread only.
-    """
+    """Run where no signal's exception can come between two steps: not in the main thread."""
     if threading.current_thread() is not threading.main_thread():
         return call()
     with ThreadPoolExecutor(1) as pool:
@@ -136,25 +177,18 @@ def sender(connection: Connection) -> Callable[[Any], None]:
 
 # ---- One job at a time in an output folder -------------------------------------------------------
 # The lock is the kernel's (flock on `.climategs/lock`), so it ends with the processes that hold it,
-# however they end. Worker processes inherit it: after a job is killed, the folder stays locked
-# until
-# its last worker has gone. flock does not reach across machines on every network file system.
+# however they end. Workers inherit it: after a job is killed, the folder stays locked until the
+# last of them has gone. flock does not reach across machines on every network file system.
 
 ORPHANS_S = 30.0  # how long to wait for the workers of a killed job to notice
 
 
 @contextlib.contextmanager
 def file_lock(path: Path) -> Iterator[None]:
-    """Be the only process of this machine inside; waits for the one that is, however it ends.
-
-    Raises:
-        OutputError: the file cannot be made.
-    """
-    try:
+    """Be the only process of this machine inside; waits for the one that is, however it ends."""
+    with refusals_of(path):
         make_folder(path.parent)
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
-    except OSError as error:
-        raise output_error(path, error) from error
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX)
         yield
@@ -163,22 +197,16 @@ def file_lock(path: Path) -> Iterator[None]:
 
 
 class OutputLock:
-    """Holds an output folder for this process while entered.
-
-    Raises:
-        OutputError: another job holds it, or the folder cannot be written.
-    """
+    """Holds an output folder for this process while entered."""
 
     def __init__(self, out_dir: Path) -> None:
         self._path = out_dir / STATE_FOLDER / "lock"
         self._descriptor = -1
 
     def __enter__(self) -> OutputLock:
-        try:
+        with refusals_of(self._path):
             make_folder(self._path.parent)
             self._descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT, 0o666)
-        except OSError as error:
-            raise output_error(self._path, error) from error
         try:
             self._acquire()
         except BaseException:
@@ -233,12 +261,9 @@ def _is_held_by(holder: str) -> bool:
     return number.isdigit() and process_mark(int(number)) == holder
 
 
-# ------------------------------------------------------------------------------------------------
-# Hands an open scene to worker processes without opening it again, and holds it in memory once
-# Opening a scene may take minutes, and a scene may take gigabytes. All its tensors are laid into
-# one
-# temporary file, which workers map into their memory: the system keeps a single copy for all. The
-# rest of the scene is small, and travels through the pipe that starts the process.
+# ---- An open scene in worker processes, neither opened again nor held in memory twice ------------
+# All its tensors are laid into one temporary file, which workers map into their memory. The rest of
+# the scene is small, and travels through the pipe that starts the process.
 
 ALIGNMENT = 64  # bytes: a cache line, and any vector register
 
@@ -253,8 +278,7 @@ class SharedScene:
     def open(self) -> Scene:
         """The scene, its tensors mapped from the file; writes to them stay in this process.
 
-        The skeleton is a pickle, as everything that multiprocessing sends: it comes from the
-        parent through the pipe, never from a file.
+        The skeleton is a pickle that comes from the parent through the pipe, never from a file.
         """
         load = ForkingPickler.loads  # pyright: ignore[reportAttributeAccessIssue]
         return load(self.skeleton)

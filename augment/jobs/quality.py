@@ -169,11 +169,7 @@ class Bench:
         self._ms: dict[tuple, float] = {}
 
     def start(self) -> None:
-        """Render the reference.
-
-        Raises:
-            SceneError: the scene cannot be rendered so.
-        """
+        """Render the reference."""
         self._truth = [self._picture(view, {}) for view in self._views]
 
     def estimate(self, settings: Mapping[str, Value], enough: float = 1.0) -> float:
@@ -602,11 +598,7 @@ def _chosen(recipe: Recipe, bench_of: Callable[[Recipe], Bench]) -> _Chosen:
 def _started(
     recipe: Recipe, options: dict[str, tuple[Value, ...]], bench_of: Callable[[Recipe], Bench]
 ) -> Bench:
-    """A bench that has rendered the reference; leaves out of `options` what the scene cannot have.
-
-    Raises:
-        SceneError: the scene cannot be rendered, whatever the settings.
-    """
+    """A bench that has rendered the reference; leaves out of `options` what the scene cannot have."""
     while True:
         bench = bench_of(resolved_recipe(recipe, reference_settings(options)))
         try:
@@ -771,11 +763,7 @@ def resolve_quality_for(
 
 
 def recorded(store: Store, question: Question) -> Recipe | None:
-    """The recipe settled as the output has it; None where nothing was chosen yet.
-
-    Raises:
-        OutputError: the record is damaged, or the output cannot be read.
-    """
+    """The recipe settled as the output has it; None where nothing was chosen yet."""
     try:
         data = store.read(question.path)
     except StoredFileMissing:
@@ -807,9 +795,6 @@ def resolve_quality_once(
     choice is kept before anyone sees it. Waits for another process that is choosing.
 
     anew: choose whatever there is, and keep that in its place.
-
-    Raises:
-        OutputError: the record is damaged, or cannot be written; and what `choose` raises.
     """
     found = None if anew else recorded(store, question)
     if found is not None:

@@ -84,11 +84,7 @@ def portable_recipe(recipe: Recipe) -> Recipe:
 
 
 def check_kept(recipe: Recipe, folders: Collection[Path]) -> None:
-    """Refuse to overwrite the files that the recipe is about to need. folders: to be overwritten.
-
-    Raises:
-        OutputError: one of the style's files lies in such a folder.
-    """
+    """Refuse to overwrite the files that the recipe is about to need. folders: to be overwritten."""
     files = {} if recipe.style is None else recipe.style.files
     for key, path in files.items():
         real = Path(path).resolve()

@@ -189,9 +189,6 @@ class Scheduler:
 
         fail: records all images of a block as failed. A block whose worker dies is tried once more
         while no other worker is busy, each of its images in a process of its own.
-
-        Raises:
-            OutputError: nothing can be written any more.
         """
         run = _Rendering(self, BlockQueue(blocks), names, fail)
         while run.dispatch():

@@ -55,11 +55,7 @@ class JobStatus:
 
 
 def read_status(store: Store) -> list[JobStatus]:
-    """The status of every job in the output, by name; empty where none was ever started.
-
-    Raises:
-        OutputError: a plan is damaged, or the output cannot be read.
-    """
+    """The status of every job in the output, by name; empty where none was ever started."""
     plans = stored_plans(store)
     if not plans:
         return []

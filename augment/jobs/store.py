@@ -25,7 +25,7 @@ from augment.jobs.atomic import (
     TEMPORARY_SUFFIX,
     flush_folder,
     make_folder,
-    output_error,
+    refusals_of,
     write_atomic,
 )
 from augment.jobs.layout import path_below, relative_parts
@@ -118,11 +118,7 @@ def open_store(uri: str | Path) -> Store:
 
 
 def stored_path(path: str, uri: str) -> str:
-    """The path with single slashes between its components.
-
-    Raises:
-        OutputError: it is absolute, empty, climbs with `..`, or holds control characters.
-    """
+    """The path with single slashes between its components."""
     parts = relative_parts(path)
     if parts is None or _UNSAFE.search(path):
         raise OutputError(
@@ -188,10 +184,8 @@ class LocalStore:
         for file, source in placed.items():
             _with_folder(lambda file=file, source=source: _link_or_copy(source, file, flush=False))
         for folder in sorted({file.parent for file in placed}):
-            try:
+            with refusals_of(folder):
                 flush_folder(folder)
-            except OSError as error:
-                raise output_error(folder, error) from error
 
     def list(self, folder: str) -> dict[str, StoredFile]:
         top = self.root if folder == "" else self._file(folder)
@@ -259,14 +253,12 @@ def _with_folder(write: Callable[[], None]) -> None:
 
 
 def _link_or_copy(original: Path, file: Path, *, flush: bool = True) -> None:
-    try:
+    with refusals_of(file):
         make_folder(file.parent)
         if not link_file(str(original), str(file)):
             copy_file(str(original), str(file))
         if flush:
             flush_folder(file.parent)
-    except OSError as error:
-        raise output_error(file, error) from error
 
 
 def _read_error(path: Path, error: OSError) -> OutputError:
@@ -312,11 +304,7 @@ class RemoteUri:
 
     @classmethod
     def parse(cls, uri: str) -> RemoteUri:
-        """Take a URI apart.
-
-        Raises:
-            OutputError: its kind or options are unknown, or its folder climbs with `..`.
-        """
+        """Take a URI apart."""
         try:
             parsed = urllib.parse.urlsplit(uri)
             query = urllib.parse.parse_qsl(parsed.query, strict_parsing=bool(parsed.query))
@@ -503,11 +491,7 @@ PATIENCE = Patience()
 
 
 class RemoteStore:
-    """Files below a place that a URI names; see Store.
-
-    Raises:
-        OutputError: no such kind of store, or options that it does not know.
-    """
+    """Files below a place that a URI names; see Store."""
 
     local_dir = None
 

@@ -141,10 +141,6 @@ def read_table(source: Path | bytes, where: str, columns: Sequence[str] | None =
     """The table in a Parquet file from anybody: columns of Arrow's own types, valid throughout.
 
     where: the file, for errors. columns: only those of these that it has.
-
-    Raises:
-        OutputError: the file is missing or damaged (texts that are not UTF-8 included), two of its
-            columns have one name, or a column has an extension type.
     """
     with _opened(source, where) as file:
         there = Counter(file.schema_arrow.names)
@@ -158,32 +154,20 @@ def read_table(source: Path | bytes, where: str, columns: Sequence[str] | None =
 
 
 def read_parquet(path: Path) -> tuple[pa.Table, dict[str, Any]]:
-    """A table and the metadata that `parquet_bytes` put beside it.
-
-    Raises:
-        OutputError: as read_table, or the file is without that metadata.
-    """
+    """A table and the metadata that `parquet_bytes` put beside it."""
     table = read_table(path, str(path))
     return table, _note(table.schema, path)
 
 
 def read_note(path: Path) -> dict[str, Any]:
-    """The metadata alone, without reading a column.
-
-    Raises:
-        OutputError: as read_parquet.
-    """
+    """The metadata alone, without reading a column."""
     with _opened(path, str(path)) as file:
         schema = file.schema_arrow
     return _note(schema, path)
 
 
 def is_ours(path: Path) -> bool:
-    """Whether a Parquet file has metadata as `parquet_bytes` writes it.
-
-    Raises:
-        OutputError: as read_table.
-    """
+    """Whether a Parquet file has metadata as `parquet_bytes` writes it."""
     with _opened(path, str(path)) as file:
         return METADATA_KEY in (file.schema_arrow.metadata or {})
 
@@ -341,11 +325,7 @@ def lidar_bytes(sweep: LidarSweep, *, note: str | None = None) -> bytes:
 
 
 def read_lidar(path: Path) -> LidarSweep:
-    """The sweep that was written, dtypes included.
-
-    Raises:
-        OutputError: the file is missing, damaged, or holds something else.
-    """
+    """The sweep that was written, dtypes included."""
     table, note = _read(Path(path), "lidar")
     with as_described(path):
         kinds = note["columns"]
@@ -353,11 +333,7 @@ def read_lidar(path: Path) -> LidarSweep:
 
 
 def read_lidar_note(path: Path) -> str | None:
-    """The note that a sweep was written with; its returns are not read.
-
-    Raises:
-        OutputError: as for read_lidar.
-    """
+    """The note that a sweep was written with; its returns are not read."""
     note = read_note(path)
     if note.get("kind") != "lidar":
         raise OutputError(f"{path} holds {note.get('kind')!r} data; expected 'lidar'")
@@ -399,11 +375,7 @@ def boxes_bytes(frames: Mapping[int, FrameBoxes]) -> bytes:
 
 
 def read_boxes(path: Path) -> dict[int, FrameBoxes]:
-    """The boxes of every frame in the file, dtypes of the attributes included.
-
-    Raises:
-        OutputError: the file is missing, damaged, or holds something else.
-    """
+    """The boxes of every frame in the file, dtypes of the attributes included."""
     table, note = _read(Path(path), "boxes")
     with as_described(path):
         track_ids, labels = texts_of(table["track_id"]), texts_of(table["label"])

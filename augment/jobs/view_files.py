@@ -6,62 +6,25 @@ import dataclasses
 import hashlib
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
 
 from augment.boxes import Instances, PlacedBoxes, with_boxes
 from augment.cameras import Camera
 from augment.effects.snow.snow import placed_in_snow
 from augment.jobs.atomic import write_atomic
 from augment.jobs.backends import renders_on_gpu
-from augment.jobs.box_tables import (
-    BOX_2D_TABLE,
-    SMOG_TABLE,
-    SNOW_TABLE,
-    WATER_TABLE,
-    BoxNumbers,
-    BoxSmog,
-    BoxSnow,
-    BoxTable,
-    BoxWater,
-    Flooded,
-    Smoggy,
-    Snowy,
-    Surfaces,
-    measure_2d,
-    measure_smog,
-    measure_snow,
-    measure_water,
-)
+from augment.jobs.box_tables import BoxWeather, View, measure_boxes
 from augment.jobs.files import encode_depth, encode_ids, encode_image, encode_mask
 from augment.jobs.layout import ItemPaths
 from augment.jobs.processes import uninterrupted
 from augment.labels import Boxes
 from recipes.schema import Recipe
-
-# ---- writer --------------------------------------------------------------------------------------
-
-
-@runtime_checkable
-class View(Protocol):
-    """What a renderer returns, a dataclass; `augment.views.WeatheredView` is one."""
-
-    rgb: np.ndarray  # uint8 [H, W, 3]
-    depth_m: np.ndarray | None  # float32 [H, W], 0 = none
-    semantic: np.ndarray | None  # uint8 [H, W]
-    instance: np.ndarray | None  # uint16 [H, W]
-    water: np.ndarray | None  # uint8 [H, W], 0 or 255
-    flood: Flooded | None
-    snow: np.ndarray | None  # uint8 [H, W], 0 or 255
-    snowy: Snowy | None
-    smoggy: Smoggy | None
-    surface: Surfaces | None  # None where no boxes are found in the view
 
 
 @dataclass(frozen=True)
@@ -216,20 +179,6 @@ class WritePump:
         self._slots.release()
 
 
-# ------------------------------------------------------------------------------------------------
-# All that is measured of the boxes of an image, by the manifest's kind of path: what of each it
-# shows, and what the weather does to them.
-
-# What is seen of the boxes in a view, and what each effect there does to them, by kind.
-BoxWeather = Mapping[str, BoxNumbers]
-TABLES: Mapping[str, BoxTable[Any]] = {
-    "box_2d": BOX_2D_TABLE,
-    "box_water": WATER_TABLE,
-    "box_snow": SNOW_TABLE,
-    "box_smog": SMOG_TABLE,
-}
-
-
 def uses_boxes(recipe: Recipe) -> bool:
     """Whether images of the recipe take the boxes of their frame."""
     return recipe.output.labels or recipe.output.instance
@@ -246,7 +195,7 @@ def label_view(
     """One of a frame's images with the frame's boxes: in the instance image those that have no
     actor, too; and what is measured of them, where labels are written.
 
-    camera: at the written resolution. view: one that `writer.check_view` has passed.
+    camera: at the written resolution. view: one that `check_view` has passed.
     """
     measured: BoxWeather = {}
     if recipe.output.labels:
@@ -269,42 +218,3 @@ def label_view(
     )
     changed: Any = view
     return dataclasses.replace(changed, instance=painted), measured
-
-
-def measure_boxes(
-    boxes: Boxes, instances: Instances, world_origin_m: np.ndarray, camera: Camera, view: View
-) -> BoxWeather:
-    """The boxes of a frame in one of its images; camera and view as for `label_view`."""
-    measured: dict[str, BoxNumbers] = {}
-    if view.surface is not None:
-        measured["box_2d"] = measure_2d(boxes, instances, world_origin_m, camera, view.surface)
-    if view.flood is not None:
-        assert view.water is not None
-        measured["box_water"] = measure_water(boxes, world_origin_m, camera, view.water, view.flood)
-    if view.snowy is not None:
-        assert view.snow is not None
-        measured["box_snow"] = measure_snow(boxes, world_origin_m, camera, view.snow, view.snowy)
-    if view.smoggy is not None:
-        measured["box_smog"] = measure_smog(boxes, world_origin_m, camera, view.smoggy)
-    return measured
-
-
-def visibility(weather: BoxWeather, count: int) -> Float64[np.ndarray, " B"]:
-    """What the weather leaves of each box: transmittance of the smog, times the part of its pixels
-    that no water hides, times the part that no snow covers; [count], 0 to 1.
-
-    An effect that there is not, or that says nothing of a box (NaN: no pixel shows it, or its own
-    numbers are not finite), takes nothing from it. So this is no answer to whether a box is in
-    view, or behind another: `pixels` of the tables is.
-    """
-    factors = [np.ones(count)]
-    if (smog := weather.get("box_smog")) is not None:
-        assert isinstance(smog, BoxSmog)
-        factors.append(smog.transmittance)
-    if (water := weather.get("box_water")) is not None:
-        assert isinstance(water, BoxWater)
-        factors.append(1 - water.hidden_fraction)
-    if (snow := weather.get("box_snow")) is not None:
-        assert isinstance(snow, BoxSnow)
-        factors.append(1 - snow.snow_fraction)
-    return np.prod([np.where(np.isnan(factor), 1.0, factor) for factor in factors], axis=0)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import multiprocessing
 import os
 import pickle
 import threading
@@ -30,37 +29,29 @@ from augment.cameras import Camera
 from augment.errors import ClimateGSError, GpuLost, OutputError
 from augment.jobs.atomic import write_atomic
 from augment.jobs.backends import gpu_is_lost, renders_on_gpu
+from augment.jobs.box_tables import BoxWeather, View
 from augment.jobs.files import frames_from_json
 from augment.jobs.layout import item_paths, variant_name
 from augment.jobs.manifest import FAILED, OK
 from augment.jobs.prepare import StoredBed, StoredMaps
 from augment.jobs.processes import (
+    ChildProcess,
     InheritedLock,
     OutputLock,
     SharedScene,
     available_cores,
-    describe_exit,
-    interrupts_blocked,
+    failed_start,
+    limit_threads,
     quick_turns,
     sender,
-    thread_limits,
 )
 from augment.jobs.tables import lidar_bytes, read_lidar_note
-from augment.jobs.view_files import (
-    BoxWeather,
-    View,
-    WritePump,
-    check_view,
-    label_view,
-    uses_boxes,
-    write_view,
-)
+from augment.jobs.view_files import WritePump, check_view, label_view, uses_boxes, write_view
 from augment.labels import Boxes, LidarSweep
 from augment.scene import Scene
 from recipes.schema import Recipe
 
-# ------------------------------------------------------------------------------------------------
-# Where a job's time goes: seconds by kind of work, and from them what the job was bound by
+# ---- Where a job's time goes: seconds by kind of work, and what the job was bound by -------------
 # In every worker one thread renders and hands finished views to threads that encode and write them.
 # The rendering thread waits (is *held*) when these have too much in hand, and at the end for what
 # they still have. Whoever is busiest bounds the job: what others do beside it costs nothing.
@@ -114,9 +105,8 @@ class WorkTimes:
 class Shares:
     """Parts of a job's time, 0 to 1.
 
-    Of the workers' time: rendering; awaiting, the part of rendering that is waiting for views
-    in flight; held, waiting for files; beside, all else, and the greatest part of that in words.
-    Of the writing threads' time: writing, by kind of work, in words.
+    Of the workers' time: rendering; awaiting, of that, views in flight; held, waiting for files;
+    beside, all else, and the greatest part of it. Of the writing threads' time: writing, by kind.
     """
 
     rendering: float
@@ -128,7 +118,6 @@ class Shares:
 
     @property
     def bound_by(self) -> str:
-        """What the job would have to do faster to end earlier."""
         if sum(self.writing.values()) > self.rendering + self.beside:
             return max(self.writing, key=self.writing.__getitem__)
         return "rendering" if self.rendering >= self.beside else self.beside_by
@@ -158,7 +147,7 @@ def shares_of(seconds: Mapping[str, float], held_up: int = 1) -> Shares | None:
     writers *= whole / seconds[RENDERERS]
     rendering, held = seconds[RENDER] / whole, seconds.get(HELD, 0.0) / whole
     rest = max(0.0, 1 - rendering - held)
-    beside = {words: held_up * seconds.get(k, 0.0) / whole for k, words in _BESIDE.items()}
+    beside = {label: held_up * seconds.get(k, 0.0) / whole for k, label in _BESIDE.items()}
     beside["workers that start or have nothing to do"] = rest - sum(beside.values())
     return Shares(
         rendering=rendering,
@@ -166,7 +155,7 @@ def shares_of(seconds: Mapping[str, float], held_up: int = 1) -> Shares | None:
         held=held,
         beside=rest,
         beside_by=max(beside, key=beside.__getitem__),
-        writing={words: seconds.get(kind, 0.0) / writers for kind, words in _WRITING.items()},
+        writing={label: seconds.get(kind, 0.0) / writers for kind, label in _WRITING.items()},
     )
 
 
@@ -174,7 +163,7 @@ def _percent(share: float) -> str:
     return f"{100 * share:.0f} %"
 
 
-# ---- worker --------------------------------------------------------------------------------------
+# ---- Frames rendered, labelled and written -------------------------------------------------------
 
 MESSAGE_LENGTH = 500
 _log = logging.getLogger(__name__)
@@ -182,9 +171,8 @@ _log = logging.getLogger(__name__)
 
 @runtime_checkable
 class Renderer(Protocol):
-    """`augment.views.render_view`, `begin_view`, or a stand-in.
-
-    Returns a `writer.View`, or a `Pending` one: a job then begins the next view before it waits.
+    """`augment.views.render_view`, `begin_view`, or a stand-in: makes a View, or a Pending one; a
+    job then begins the next before it waits.
     """
 
     def __call__(self, scene: Scene, camera: Camera, recipe: Recipe, *, backend: str) -> Any: ...
@@ -194,9 +182,7 @@ class Renderer(Protocol):
 class Pending(Protocol):
     """A view that is begun; `augment.views.PendingView` is one."""
 
-    def result(self) -> Any:
-        """The `writer.View`, once it is there."""
-        ...
+    def result(self) -> Any: ...
 
 
 @dataclass(frozen=True)
@@ -229,11 +215,7 @@ class Chunk:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one image.
-
-    lidar, lidar_note: as of PassedLidar. box_weather: what is seen of its boxes, and what each
-    effect of the recipe does to them, where there are labels.
-    """
+    """What became of one image. lidar, lidar_note: as of PassedLidar. box_weather: of its boxes."""
 
     variant: int
     frame: int
@@ -278,10 +260,7 @@ def job_renderer(backend: str) -> Renderer:
 
 @dataclass(frozen=True, eq=False)
 class _Drawn:
-    """An image that the renderer has drawn, or begun. camera: at the written resolution.
-
-    lidar: what `_pass_lidar` says of its frame.
-    """
+    """An image that is drawn, or begun. camera: as written. lidar: of `_pass_lidar`."""
 
     chunk: Chunk
     recipe: Recipe
@@ -292,12 +271,10 @@ class _Drawn:
 class FrameRunner:
     """Renders chunks in this thread, writes on others, and tells `deliver` of each image.
 
-    Where the renderer returns pending views one of them is in flight: the next is begun before the
-    last one is waited for, so that a GPU has work while its pictures come back and are handed over.
-
-    deliver: called from the writing threads, after all files of the image are on the disk.
-    An error of the scene or the renderer concerns one image. An OutputError ends the run, since the
-    next write would fail too, and so does GpuLost.
+    Where the renderer returns pending views, the next is begun before the last is waited for, so
+    that a GPU has work while its pictures come back. deliver: called from the writing threads, once
+    the image's files are on the disk. An error of the scene or the renderer concerns one image; an
+    OutputError or GpuLost ends the run, since the next image would fail too.
     """
 
     def __init__(
@@ -323,9 +300,8 @@ class FrameRunner:
         self._times, self._started = WorkTimes(), time.perf_counter()
 
     def run(self, chunk: Chunk, stopped: Callable[[], bool] = lambda: False) -> None:
-        """Render the chunk's images; those not begun when `stopped()` turns true are left.
-
-        The last of them may still be in flight afterwards, until `land` or the next one.
+        """Render the chunk's images; those not begun when `stopped()` turns true are left. The last
+        may stay in flight until `land` or the next one.
         """
         recipe = self._setup.recipes[chunk.variant]
         if recipe.style in self._maps:  # one at a time: a scene remembers few
@@ -450,9 +426,8 @@ class FrameRunner:
         return label_view(boxes, self._setup.instances, origin, camera, view, recipe)
 
     def _pass_lidar(self, chunk: Chunk, recipe: Recipe) -> PassedLidar | str:
-        """Write the frame's sweep, in the weather or as it is, unless it is there already.
-
-        Returns what became of it, or a message where it cannot be read.
+        """Write the frame's sweep, in the weather or as it is, unless it is there already; what
+        became of it, or a message where it cannot be read.
         """
         if recipe.lidar is None or chunk.frame not in self._setup.labelled:
             return PassedLidar()
@@ -504,18 +479,14 @@ def _passed(recipe: Recipe, fault: str | None) -> PassedLidar:
 
 
 # ---- Two ways to run a job's chunks: in this process, or in several worker processes -------------
-# Workers are started afresh (`spawn`): nothing of the parent's threads, locks or random state leaks
-# into them. The parent hands them its open scene (`shared_scene`); it alone decides what runs
-# where,
-# and writes the journals.
+# The parent hands workers its open scene (`SharedScene`); it alone decides what runs where, and
+# writes the progress logs. A worker sends _READY, an Outcome for each image, and, once it is told
+# to stop, its seconds by kind of work.
 
-# ------------------------------------------------------------------------------------------------
-# What a worker process runs: take the scene, render the chunks it is sent, report each image
-
-
-@dataclass(frozen=True)
-class Ready:
-    """The scene is there; rendering can begin."""
+_READY = "ready"  # the scene is there
+STOP_S = 120.0  # how long a worker may take to finish its image when the job stops
+CHUNKS_AHEAD = 2  # one being rendered and one waiting, so that no worker idles
+Deliver = Callable[[Outcome], None]
 
 
 @dataclass(frozen=True)
@@ -524,13 +495,6 @@ class Failure:
 
     is_output: bool
     text: str
-
-
-@dataclass(frozen=True)
-class Spent:
-    """The worker has ended as it was told to. seconds: by the kinds of `times`."""
-
-    seconds: dict[str, float]
 
 
 def worker_main(
@@ -542,11 +506,7 @@ def worker_main(
     lock: InheritedLock,
 ) -> None:
     """Serve chunks until told to stop. `lock` is only held: the folder stays ours until we end."""
-    import cv2
-    import torch
-
-    torch.set_num_threads(threads)
-    cv2.setNumThreads(1)
+    limit_threads(threads)
     inbox: SimpleQueue[Chunk | None] = SimpleQueue()
     stopped = threading.Event()
     threading.Thread(target=_listen, args=(connection, inbox, stopped), daemon=True).start()
@@ -558,7 +518,7 @@ def worker_main(
     except Exception as error:
         send(Failure(False, describe(error, "taking over the scene in a worker process")))
         return
-    send(Ready())
+    send(_READY)
     if renders_on_gpu(setup.backend):
         pump = WritePump.beside(setup.backend, threads)
     else:  # one thread and little waiting: the memory of a view counts once per worker
@@ -575,7 +535,7 @@ def worker_main(
                     runner.run(chunk, stopped.is_set)
             finally:
                 seconds = runner.close()
-        send(Spent(seconds))
+        send(seconds)
     except OutputError as error:
         send(Failure(True, str(error)))
     except GpuLost:  # as any death of a worker: another one tries what this has in hand
@@ -596,21 +556,10 @@ def _listen(connection: Connection, inbox: SimpleQueue, stopped: threading.Event
         inbox.put(chunk)
 
 
-# ---- executors -----------------------------------------------------------------------------------
-
-STOP_S = 120.0  # how long a worker may take to finish its image when the job stops
-CHUNKS_AHEAD = 2  # one being rendered and one waiting, so that no worker idles
-
-Deliver = Callable[[Outcome], None]
-
-
 def run_serially(
     scene: Scene, setup: Setup, chunks: Sequence[Chunk], renderer: Renderer | None, deliver: Deliver
 ) -> dict[str, float]:
-    """Render in this thread, encode and write in others. An interrupt ends cleanly.
-
-    Returns seconds by the kinds of `times`.
-    """
+    """Render in this thread, encode and write in others; seconds by kind of work."""
     pump = WritePump.beside(setup.backend, available_cores())
     runner = FrameRunner(scene, setup, renderer, deliver, pump)
     with quick_turns(renders_on_gpu(setup.backend)):
@@ -632,9 +581,8 @@ def run_in_processes(
     deliver: Deliver,
     lock: OutputLock,
 ) -> dict[str, float]:
-    """Render in `workers` processes; `deliver` is called in this thread.
-
-    Returns seconds by the kinds of `times`, without those of workers that died.
+    """Render in `workers` processes; `deliver` is called in this thread. Returns seconds by kind of
+    work, without those of workers that died.
 
     What a dead worker had in hand is tried once more, each image alone; if its process dies again
     the image is recorded as failed.
@@ -650,34 +598,30 @@ def run_in_processes(
             f"renderer {renderer!r} cannot be sent to worker processes: {error}; use a function "
             f"defined at the top of a module, or workers=1"
         ) from error
-    pool = _Pool(setup, shared, renderer, deliver, lock, chunks)
-    pool.run(min(workers, len(chunks)))
+    count = min(workers, len(chunks))
+    threads = max(1, available_cores() // count)
+
+    def start() -> _Worker:
+        arguments = (setup, shared, renderer, threads, lock.inherited())
+        return _Worker(worker_main, *arguments, threads=threads, daemon=True)
+
+    pool = _Pool(start, deliver, deque(chunks))
+    pool.run(count)
     return dict(pool.seconds)
 
 
-class _Worker:
-    """A worker process as its parent sees it."""
+class _Worker(ChildProcess):
+    """A worker process as its parent sees it. on_trial: at one image whose worker died before."""
 
-    def __init__(self, pool: _Pool) -> None:
-        context = multiprocessing.get_context("spawn")
-        self.connection, child = context.Pipe()
-        arguments = (child, pool.setup, pool.shared, pool.renderer, pool.threads)
-        self.process = context.Process(
-            target=worker_main, args=(*arguments, pool.lock.inherited()), daemon=True
-        )
-        with thread_limits(pool.threads), interrupts_blocked():
-            self.process.start()
-        child.close()
-        self.is_ready = False
-        self.is_stopping = False
-        self.on_trial = False  # busy with one image whose worker died before
+    is_stopping = on_trial = False
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
         self.in_hand: list[Chunk] = []
 
     def give(self, chunk: Chunk) -> None:
         self.in_hand.append(chunk)
-        # A worker that has just died shows itself when its connection is read.
-        with contextlib.suppress(OSError):
-            self.connection.send(chunk)
+        self.send(chunk)
 
     def take(self, outcome: Outcome) -> None:
         """Strike a finished image off what the worker has in hand."""
@@ -692,33 +636,22 @@ class _Worker:
 
     def stop(self) -> None:
         self.is_stopping = True
-        with contextlib.suppress(OSError):
-            self.connection.send(None)
+        self.send(None)
 
 
+@dataclass
 class _Pool:
-    def __init__(
-        self,
-        setup: Setup,
-        shared: SharedScene,
-        renderer: Renderer | None,
-        deliver: Deliver,
-        lock: OutputLock,
-        chunks: Sequence[Chunk],
-    ) -> None:
-        self.setup, self.shared, self.renderer = setup, shared, renderer
-        self.deliver, self.lock = deliver, lock
-        self.waiting = deque(chunks)
-        self.retries: deque[Chunk] = deque()
-        self.workers: list[_Worker] = []
-        self.threads = 1
-        self.seconds: Counter[str] = Counter()
+    start: Callable[[], _Worker]
+    deliver: Deliver
+    waiting: deque[Chunk]
+    retries: deque[Chunk] = field(default_factory=deque)
+    workers: list[_Worker] = field(default_factory=list)
+    seconds: Counter[str] = field(default_factory=Counter)
 
     def run(self, count: int) -> None:
-        self.threads = max(1, available_cores() // count)
         try:
             for _ in range(count):
-                self.workers.append(_Worker(self))
+                self.workers.append(self.start())
             while self._feed():
                 for worker in self._readable(None):
                     self._read(worker)
@@ -745,30 +678,24 @@ class _Pool:
         except (EOFError, OSError):
             self._reap_worker(worker)
             return
-        if isinstance(message, Ready):
+        if message == _READY:
             worker.is_ready = True
         elif isinstance(message, Failure):
             raise (OutputError if message.is_output else ClimateGSError)(message.text)
-        elif isinstance(message, Spent):
-            self.seconds.update(message.seconds)
+        elif isinstance(message, dict):
+            self.seconds.update(message)
         else:
             worker.take(message)
             self.deliver(message)
 
     def _reap_worker(self, worker: _Worker) -> None:
         """Take a worker that ended out of the pool, and decide about what it had in hand."""
-        worker.process.join()
-        worker.connection.close()
+        ending = worker.reap()
         self.workers.remove(worker)
         if worker.is_stopping:
             return
-        ending = describe_exit(worker.process.exitcode)
         if not worker.is_ready:
-            raise ClimateGSError(
-                f"a worker process {ending} while starting; what it printed says more. A script "
-                f"that starts workers needs `if __name__ == '__main__':` around its jobs; if "
-                f"memory ran out, use fewer workers"
-            )
+            raise failed_start(ending)
         _log.warning("a worker process %s; its images are tried once more", ending)
         for chunk in worker.in_hand:
             for name in chunk.cameras:
@@ -781,7 +708,7 @@ class _Pool:
                 else:
                     self.retries.append(Chunk(chunk.variant, chunk.frame, (name,)))
         if self.waiting or self.retries:
-            self.workers.append(_Worker(self))
+            self.workers.append(self.start())
 
     def _stop(self) -> None:
         """Let every worker finish the image it is at, and take it in; kill what does not end."""
@@ -795,7 +722,5 @@ class _Pool:
                         self._read(worker)
         finally:
             for worker in self.workers:
-                worker.process.kill()
-                worker.process.join()
-                worker.connection.close()
+                worker.kill()
             self.workers = []

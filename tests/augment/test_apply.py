@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from augment.cameras import Camera, Frame
-from augment.jobs.box_tables import measure_smog
+from augment.jobs.box_tables import measure_boxes
 from augment.labels import Boxes
 from augment.plan import make_plan
 from augment.scene import Actor, Gaussians, Scene, Track
@@ -133,12 +133,12 @@ def test_boxes_are_measured_by_the_surfaces_in_the_smog(scene):
     labelled = dataclasses.replace(scene, labels=CarLabels())
     view, clean = view_of(labelled, smog, depth="none"), view_of(scene)
     assert view.depth_m is None and view.smoggy.water_level_z_m is None
-    measured = measure_smog(CarLabels().boxes(0), np.zeros(3), camera(), view.smoggy)
-    assert measured.pixels[0] > 100 and measured.pixels[1] == 0
+    measured = measure_boxes(CarLabels().boxes(0), np.zeros(3), camera(), view)["box_smog"]
+    assert measured["pixels"][0] > 100 and measured["pixels"][1] == 0
     t = (view.rgb[CAR] - 255 * AIRLIGHT[0]) / (clean.rgb[CAR] - 255 * AIRLIGHT[0])
-    assert measured.transmittance[0] == pytest.approx(t.mean(), abs=0.01)  # of 8-bit colours
+    assert measured["transmittance"][0] == pytest.approx(t.mean(), abs=0.01)  # of 8-bit colours
     # Behind the wall that the camera sees.
-    assert measured.transmittance[1] == pytest.approx(np.exp(-0.1 * np.hypot(3, 20)), rel=0.01)
+    assert measured["transmittance"][1] == pytest.approx(np.exp(-0.1 * np.hypot(3, 20)), rel=0.01)
 
 
 def test_smog_is_named_wherever_there_is_some_and_measured_for_labels_alone(scene):

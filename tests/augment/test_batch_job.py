@@ -357,7 +357,7 @@ FULL_DISK = """
 import resource, sys
 sys.path.insert(0, sys.argv[2])
 from batch_scenes import fake_render, make_recipe, open_fake
-from augment.batch.job import RenderJob, run_job
+from augment.jobs.render_job import RenderJob, run_job
 from augment.errors import OutputError
 resource.setrlimit(resource.RLIMIT_FSIZE, (1500, 1500))  # the LiDAR fits not, images do
 job = RenderJob("fake:street", [make_recipe(semantic=False)], sys.argv[1])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import shutil
 from pathlib import Path
@@ -26,7 +25,7 @@ from batch_scenes import (
 from augment.dataset import SceneDataset, WeatherDataset, collate_frames
 from augment.effects.snow.snow import snow_pixels
 from augment.errors import OutputError
-from augment.jobs.box_tables import SNOW_TABLE, BoxSnow, read_snow
+from augment.jobs.box_tables import TABLES
 from augment.jobs.manifest import read_manifest
 from augment.jobs.render_job import JobResult, RenderJob, run_job
 from recipes.schema import Recipe
@@ -127,13 +126,6 @@ def test_a_flood_and_snow_do_not_change_each_others_numbers(whole: Path, tmp_pat
     assert all(np.isnan(row["snow_depth_m"]) and np.isnan(row["snow_coverage"]) for row in rows)
 
 
-def test_the_numbers_survive_the_file_to_the_bit() -> None:
-    numbers = BoxSnow(("a", "b", "c"), np.array([7, 0, -1]), np.array([3, 0, 0]))
-    again = SNOW_TABLE.from_json(json.loads(json.dumps(SNOW_TABLE.to_json(numbers))))
-    assert SNOW_TABLE.to_bytes({(2, "x"): again}) == SNOW_TABLE.to_bytes({(2, "x"): numbers})
-    np.testing.assert_array_equal(again.snow_fraction, [3 / 7, np.nan, 0.0])
-
-
 @pytest.mark.parametrize(
     ("uri", "output"), [("fake:street?unlabelled=1", {}), ("fake:street", {"labels": False})]
 )
@@ -164,7 +156,7 @@ def test_a_view_that_breaks_its_promise_is_recorded(tmp_path, recipe, change, me
     result = run(job, render)
     assert result.failed == 1
     assert re.search(message, result.failures[0])
-    assert not read_snow(tmp_path / "s" / "fog-000" / "labels" / "snow.parquet")
+    assert not TABLES["box_snow"].read(tmp_path / "s" / "fog-000" / "labels" / "snow.parquet")
 
 
 def test_snow_under_a_recipe_without_is_recorded(tmp_path: Path) -> None:
@@ -177,7 +169,7 @@ def test_snow_under_a_recipe_without_is_recorded(tmp_path: Path) -> None:
 
 def test_parts_in_any_order_give_the_files_of_one_run(whole: Path, recipe, tmp_path: Path) -> None:
     run(RenderJob("fake:street", [recipe], tmp_path, frames=[3, 1], cameras=["rear/left"]))
-    assert len(read_snow(tmp_path / FOLDER / "labels" / "snow.parquet")) == 2
+    assert len(TABLES["box_snow"].read(tmp_path / FOLDER / "labels" / "snow.parquet")) == 2
     run(RenderJob("fake:street", [recipe], tmp_path, cameras=["front"]))
     assert run(RenderJob("fake:street", [recipe], tmp_path)).skipped == 6
     assert tree_digest(tmp_path) == tree_digest(whole)
@@ -220,14 +212,14 @@ def test_samples_hold_the_snow(whole: Path, recipe: Recipe) -> None:
     (row,) = files.table.to_pylist()
     sample, view = files[0], view_of(row, recipe)
     np.testing.assert_array_equal(sample["snow"].numpy(), view.snow > 0)
-    numbers = read_snow(whole / FOLDER / "labels" / "snow.parquet")[2, "front"]
-    np.testing.assert_array_equal(sample["boxes"]["snow_fraction"], numbers.snow_fraction)
+    numbers = TABLES["box_snow"].read(whole / FOLDER / "labels" / "snow.parquet")[2, "front"]
+    np.testing.assert_array_equal(sample["boxes"]["snow_fraction"], numbers["snow_fraction"])
     assert sample["paths"]["snow"].endswith("snow/front/000002.png")
     assert sample["weather"]["snow_depth_m"] == 0.0
     live = SceneDataset(open_fake("fake:street"), recipe, renderer=fake_render)[4]
     assert (live["frame"], live["camera"]["name"]) == (2, "front")
     np.testing.assert_array_equal(live["snow"], sample["snow"])
-    np.testing.assert_array_equal(live["boxes"]["snow_fraction"], numbers.snow_fraction)
+    np.testing.assert_array_equal(live["boxes"]["snow_fraction"], numbers["snow_fraction"])
     batch = collate_frames([sample, live])
     assert batch["snow"].shape == (2, 16, 24)
 

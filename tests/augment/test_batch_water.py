@@ -29,7 +29,7 @@ from batch_scenes import (
 from augment.cameras import Frame
 from augment.dataset import WeatherDataset
 from augment.effects.flood.flood import hidden_pixels, submerged_fraction
-from augment.jobs.box_tables import WATER_TABLE, BoxWater, read_water
+from augment.jobs.box_tables import TABLES
 from augment.jobs.manifest import LATER, read_manifest
 from augment.jobs.render_job import JobResult, RenderJob, run_job
 from recipes.schema import Recipe
@@ -115,20 +115,8 @@ def test_boxes_have_their_numbers_beside_the_labels(whole: Path, recipe: Recipe)
     assert not (dry / "water.parquet").exists() and not (dry.parent / "water").exists()
 
 
-def test_the_numbers_survive_the_file_to_the_bit() -> None:
-    numbers = BoxWater(
-        ("a", "b", "c"),
-        np.array([0.1 + 0.2, np.nan, 1.0]),
-        np.array([7, 0, -1]),
-        np.array([3, 0, 0]),
-    )
-    again = WATER_TABLE.from_json(json.loads(json.dumps(WATER_TABLE.to_json(numbers))))
-    assert WATER_TABLE.to_bytes({(2, "x"): again}) == WATER_TABLE.to_bytes({(2, "x"): numbers})
-    np.testing.assert_array_equal(again.hidden_fraction, [3 / 7, np.nan, 0.0])
-
-
 def test_images_without_boxes_are_listed(whole: Path) -> None:
-    water = read_water(whole / FOLDER / "labels" / "water.parquet")
+    water = TABLES["box_water"].read(whole / FOLDER / "labels" / "water.parquet")
     assert {(f, len(numbers.track_ids)) for (f, _), numbers in water.items()} == {
         (0, 0),
         (1, 1),
@@ -161,7 +149,9 @@ def test_a_camera_path_has_them_where_it_has_labels(tmp_path: Path, recipe: Reci
     assert run(job).written == 2
     rows = read_manifest(tmp_path).to_pylist()
     assert [row["box_water_path"] is None for row in rows] == [False, True]
-    assert list(read_water(tmp_path / FOLDER / "labels" / "water.parquet")) == [(1, "front")]
+    assert list(TABLES["box_water"].read(tmp_path / FOLDER / "labels" / "water.parquet")) == [
+        (1, "front")
+    ]
     assert run(job, must_not_render).skipped == 2
 
 
@@ -191,7 +181,7 @@ def test_a_renderer_that_breaks_its_contract_is_recorded(
     result = run(job, render)
     assert result.failed == 1
     assert re.search(message, result.failures[0])
-    assert not read_water(tmp_path / "s" / "fog-000" / "labels" / "water.parquet")
+    assert not TABLES["box_water"].read(tmp_path / "s" / "fog-000" / "labels" / "water.parquet")
 
 
 def test_a_view_of_water_under_a_recipe_without_is_recorded(tmp_path: Path) -> None:
@@ -205,7 +195,7 @@ def test_a_view_of_water_under_a_recipe_without_is_recorded(tmp_path: Path) -> N
 
 def test_parts_in_any_order_give_the_files_of_one_run(whole: Path, recipe, tmp_path: Path) -> None:
     run(RenderJob("fake:street", [recipe], tmp_path, frames=[3, 1], cameras=["rear/left"]))
-    assert len(read_water(tmp_path / FOLDER / "labels" / "water.parquet")) == 2
+    assert len(TABLES["box_water"].read(tmp_path / FOLDER / "labels" / "water.parquet")) == 2
     run(RenderJob("fake:street", [recipe], tmp_path, cameras=["front"]))
     assert run(RenderJob("fake:street", [recipe], tmp_path)).skipped == 6
     assert tree_digest(tmp_path) == tree_digest(whole)
@@ -261,7 +251,7 @@ def test_an_image_that_fails_later_loses_its_rows(whole: Path, recipe, tmp_path:
         raise RuntimeError("no such luck")
 
     assert run(RenderJob("fake:street", [recipe], out), fails).failed == 1
-    assert (3, "front") not in read_water(out / FOLDER / "labels" / "water.parquet")
+    assert (3, "front") not in TABLES["box_water"].read(out / FOLDER / "labels" / "water.parquet")
     assert run(RenderJob("fake:street", [recipe], out)).written == 1
     assert tree_digest(out) == tree_digest(whole)
 

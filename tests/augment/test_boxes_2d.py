@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from pathlib import Path
 
 import cv2
@@ -15,7 +16,7 @@ from augment.boxes import MAX_INSTANCE, Instances, instances_of
 from augment.cameras import Camera
 from augment.dataset import SceneDataset, WeatherDataset, boxes_2d, torchvision_sample
 from augment.errors import AdapterError
-from augment.jobs.box_tables import BOX_2D_TABLE, Box2d, measure_2d, read_boxes_2d
+from augment.jobs.box_tables import TABLES, BoxNumbers, measure_boxes
 from augment.jobs.manifest import read_manifest
 from augment.jobs.render_job import JobResult, RenderJob, run_job
 from augment.jobs.tables import read_boxes
@@ -128,11 +129,11 @@ def run(out: Path, opened=open_street, **options) -> JobResult:
     return run_job(job, scene_loader=opened, progress=False)
 
 
-def measure(scene: Scene, camera: Camera, recipe: Recipe = RECIPE) -> tuple[Box2d, np.ndarray]:
+def measure(scene: Scene, camera: Camera, recipe: Recipe = RECIPE) -> tuple[BoxNumbers, np.ndarray]:
     """What is measured of frame 0's boxes, and the instance image as it is written."""
     boxes, view = scene.boxes(0), render_view(scene, camera, recipe, backend="cpu")
     instances = instances_of(scene)
-    numbers = measure_2d(boxes, instances, ORIGIN, camera, view.surface)
+    numbers = measure_boxes(boxes, instances, ORIGIN, camera, view)["box_2d"]
     return numbers, label_view(boxes, instances, ORIGIN, camera, view, recipe)[0].instance
 
 
@@ -156,21 +157,21 @@ def test_fractions_and_bounds_are_those_of_rays(hidden_to_y: float, instance: bo
     camera = scene.frames[0].cameras["ahead"]
     recipe = Recipe(output=Output(instance=instance, depth="median"))
     boxes, view = scene.boxes(0), render_view(scene, camera, recipe, backend="cpu")
-    numbers = measure_2d(boxes, instances_of(scene), ORIGIN, camera, view.surface)
+    numbers = measure_boxes(boxes, instances_of(scene), ORIGIN, camera, view)["box_2d"]
     whole, left = seen_by_rays(camera, hidden_to_y)
     # Splats blur edges by a pixel, and the box's lowest 8 cm own no surface.
-    assert numbers.visible_fraction[0] == pytest.approx(left.sum() / whole.sum(), abs=0.04)
-    assert numbers.pixels[0] == pytest.approx(left.sum(), abs=0.1 * whole.sum())
-    assert numbers.truncated_fraction.tolist()[0::2] == [0, 1]
+    assert numbers["visible_fraction"][0] == pytest.approx(left.sum() / whole.sum(), abs=0.04)
+    assert numbers["pixels"][0] == pytest.approx(left.sum(), abs=0.1 * whole.sum())
+    assert numbers["truncated_fraction"].tolist()[0::2] == [0, 1]
     if not left.any():
-        assert np.isnan(numbers.modal_xyxy[0]).all()
+        assert np.isnan(numbers["modal_xyxy"][0]).all()
         return
     rows, columns = np.nonzero(left)
     bounds = [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]
-    np.testing.assert_allclose(numbers.modal_xyxy[0], bounds, atol=2)
+    np.testing.assert_allclose(numbers["modal_xyxy"][0], bounds, atol=2)
     rows, columns = np.nonzero(whole)
     bounds = [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]
-    amodal = [getattr(numbers, side)[0] for side in ("x0", "y0", "x1", "y1")]
+    amodal = [numbers[side][0] for side in ("x0", "y0", "x1", "y1")]
     np.testing.assert_allclose(amodal, bounds, atol=1)
 
 
@@ -181,10 +182,10 @@ def test_a_box_across_the_border_is_truncated_by_its_share_of_the_outline() -> N
     middle = round((x0 + x1) / 2)
     cut = whole.cropped(middle, 0, 480 - middle, 270)  # symmetric: the car stands straight ahead
     numbers, _ = measure(scene, cut)
-    assert numbers.truncated_fraction[0] == pytest.approx(0.5, abs=0.03)
-    assert numbers.x0[0] == 0 and numbers.x1[0] == pytest.approx(x1 - middle)
+    assert numbers["truncated_fraction"][0] == pytest.approx(0.5, abs=0.03)
+    assert numbers["x0"][0] == 0 and numbers["x1"][0] == pytest.approx(x1 - middle)
     assert (
-        numbers.visible_fraction[2] != numbers.visible_fraction[2]
+        numbers["visible_fraction"][2] != numbers["visible_fraction"][2]
     )  # behind the camera: not known
 
 
@@ -193,7 +194,7 @@ def test_parked_cars_have_an_instance_and_the_road_in_their_box_has_none() -> No
     camera = scene.frames[0].cameras["ahead"]
     plain = render_view(scene, camera, RECIPE, backend="cpu")
     numbers, image = measure(scene, camera)
-    assert numbers.instance.tolist() == [2, 1, 3]  # the driving car is the only actor
+    assert numbers["instance"].tolist() == [2, 1, 3]  # the driving car is the only actor
     _, left = seen_by_rays(camera, 0.0)
     # 5 % are the lowest 8 cm, and edges are blurred by a pixel.
     assert (image == 2)[left].mean() > 0.85 and (image == 2)[~left].mean() < 0.01
@@ -231,7 +232,7 @@ def test_snow_on_a_parked_car_is_the_car(surface: str) -> None:
     output = Output(semantic=True, instance=True, surface=surface)
     snowy = Recipe(weather=Weather(snow=Snow(depth_m=0.3)), output=output)
     numbers, image = measure(scene, camera, snowy)
-    assert numbers.visible_fraction[0] == pytest.approx(clear.visible_fraction[0], abs=0.05)
+    assert numbers["visible_fraction"][0] == pytest.approx(clear["visible_fraction"][0], abs=0.05)
     covered = render_view(scene, camera, snowy, backend="cpu").snow == 255
     eye, rays = camera.centre.numpy(), camera.ray_directions(torch.float64).numpy()
     on_top = np.abs(eye + (1.5 - eye[2]) / rays[..., 2:] * rays - PARKED) < SIZE / 2 - 0.3
@@ -251,7 +252,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_files_agree_over_frames_and_with_a_live_scene(whole: Path) -> None:
     boxes = read_boxes(whole / FOLDER / "labels" / "boxes.parquet")
-    measured = read_boxes_2d(whole / FOLDER / "labels" / "boxes_2d.parquet")
+    measured = TABLES["box_2d"].read(whole / FOLDER / "labels" / "boxes_2d.parquet")
     ids = {
         t: int(n)
         for f in boxes.values()
@@ -274,7 +275,7 @@ def test_files_agree_over_frames_and_with_a_live_scene(whole: Path) -> None:
         for key in ("instance", "modal_xyxy", "visible_fraction", "truncated_fraction"):
             np.testing.assert_array_equal(sample["boxes"][key], other["boxes"][key])
         numbers = measured[sample["frame"], "ahead"]
-        amodal = np.stack([numbers.x0, numbers.y0, numbers.x1, numbers.y1], axis=1)
+        amodal = np.stack([numbers["x0"], numbers["y0"], numbers["x1"], numbers["y1"]], axis=1)
         np.testing.assert_allclose(boxes_2d(sample).xyxy, amodal, atol=1e-4)
 
 
@@ -315,10 +316,29 @@ def test_objects_beyond_sixteen_bits_have_no_instance(caplog) -> None:
     assert "instance images number 65535 of them" in caplog.text
 
 
-def test_numbers_survive_the_journal_and_the_file_to_the_bit() -> None:
-    numbers, _ = measure(street(), street().frames[0].cameras["ahead"])
-    again = BOX_2D_TABLE.from_json(BOX_2D_TABLE.to_json(numbers))
-    assert BOX_2D_TABLE.to_bytes({(2, "x"): again}) == BOX_2D_TABLE.to_bytes({(2, "x"): numbers})
+@pytest.mark.parametrize(
+    ("kind", "stored"),
+    [
+        ("box_smog", [["a", "b"], [0.1 + 0.2, np.nan], [7, -1]]),
+        ("box_snow", [["a", "b", "c"], [7, 0, -1], [3, 0, 0]]),
+        ("box_water", [["a", "b", "c"], [0.1 + 0.2, np.nan, 1.0], [7, 0, -1], [3, 0, 0]]),
+        ("box_2d", None),
+    ],
+)
+def test_numbers_survive_progress_log_and_file_to_the_bit(kind, stored, tmp_path: Path) -> None:
+    table = TABLES[kind]
+    if stored is None:
+        stored = table.to_json(measure(street(), street().frames[0].cameras["ahead"])[0])
+    numbers = table.from_json(json.loads(json.dumps(stored)))
+    (tmp_path / "table").write_bytes(table.to_bytes({(2, "x"): numbers}))
+    again = table.read(tmp_path / "table")[2, "x"]
+    assert again.track_ids == numbers.track_ids and again.columns.keys() == numbers.columns.keys()
+    for name in numbers.columns:
+        np.testing.assert_array_equal(again[name], numbers[name])
+    if fractions := [
+        name for name in ("snow_fraction", "hidden_fraction") if name in again.columns
+    ]:
+        np.testing.assert_array_equal(again[fractions[0]], [3 / 7, np.nan, 0.0])
 
 
 def test_targets_of_what_is_seen(whole: Path) -> None:

@@ -36,7 +36,7 @@ from augment.dataset import (
 )
 from augment.effects.flood.flood import hidden_pixels, submerged_fraction
 from augment.errors import BackendUnavailable, OutputError, SceneError
-from augment.jobs.box_tables import WATER_TABLE, BoxWater
+from augment.jobs.box_tables import TABLES
 from augment.jobs.render_job import RenderJob, run_job
 from recipes.schema import Recipe
 from recipes.weather import Flood
@@ -320,9 +320,9 @@ def test_damaged_files_of_a_flood_are_named(one_flooded_image, name, damage, mes
     ],
 )
 def test_numbers_of_other_boxes_are_refused(one_flooded_image: Path, item, message) -> None:
-    none = BoxWater((), np.zeros(0), np.zeros(0, np.int64), np.zeros(0, np.int64))
+    none = TABLES["box_water"].from_json([(), (), (), ()])
     path = one_flooded_image / "street" / "clear-009" / "labels" / "water.parquet"
-    path.write_bytes(WATER_TABLE.to_bytes({item: none}))
+    path.write_bytes(TABLES["box_water"].to_bytes({item: none}))
     with pytest.raises(OutputError, match=message):
         WeatherDataset(one_flooded_image)[0]
     path.write_bytes((path.parent / "boxes.parquet").read_bytes())

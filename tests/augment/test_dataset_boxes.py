@@ -12,8 +12,7 @@ import torch
 from augment.dataset import box_masks, boxes_2d, torchvision_sample
 from augment.dataset.samples import BOX_FRAMES, box_tensors
 from augment.geometry import multiply_quats, quat_from_rotmat, rigid, rotmat_from_quat
-from augment.jobs.box_tables import BoxSmog
-from augment.jobs.view_files import BoxWeather
+from augment.jobs.box_tables import TABLES, BoxWeather
 from augment.labels import Boxes
 from augment.semantics import SemanticClass
 
@@ -163,7 +162,7 @@ TWO = boxes_at([[0, 0, 5], [0, 0, 9], [0, 0, -5]], [[1, 1, 1], [6, 1, 3], [1, 1,
 def smog_of(*transmittance: float) -> BoxWeather:
     values = np.array(transmittance)
     names = tuple(map(str, range(len(values))))
-    return {"box_smog": BoxSmog(names, values, np.ones(len(values), np.int64))}
+    return {"box_smog": TABLES["box_smog"].from_json([names, values, [1] * len(values)])}
 
 
 def depth_of_two() -> torch.Tensor:

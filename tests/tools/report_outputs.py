@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from augment.jobs.box_tables import SMOG_TABLE, SNOW_TABLE, WATER_TABLE, BoxSmog, BoxSnow, BoxWater
+from augment.jobs.box_tables import TABLES
 from augment.jobs.files import encode_depth, encode_ids, encode_image
 from augment.jobs.layout import PATH_KINDS
 from augment.jobs.manifest import rows_to_table, write_manifest
@@ -99,16 +99,16 @@ def _boxes(frame: int) -> bytes:
 
 def _box_weather(row: dict[str, Any], base: str) -> dict[str, tuple[str, bytes]]:
     """Of one image: the last to be written stands for its variant."""
-    item, ids = (row["frame"], row["camera"]), ("a", "b", "c")
-    shown = np.array([100, 50, 0])
-    files = {}
+    item, ids, shown = (row["frame"], row["camera"]), ("a", "b", "c"), [100, 50, 0]
+    stored: dict[str, list] = {}
     if row["smog_extinction_per_m"]:
-        smog = BoxSmog(ids, np.array([0.9, 0.1, 0.3]), shown)
-        files["box_smog"] = (f"{base}/labels/smog.parquet", SMOG_TABLE.to_bytes({item: smog}))
+        stored["smog"] = [ids, [0.9, 0.1, 0.3], shown]
     if not math.isnan(row["flood_level_m"]):
-        water = BoxWater(ids, np.array([0.5, 0.0, 0.0]), shown, np.array([50, 0, 0]))
-        files["box_water"] = (f"{base}/labels/water.parquet", WATER_TABLE.to_bytes({item: water}))
+        stored["water"] = [ids, [0.5, 0.0, 0.0], shown, [50, 0, 0]]
     if not math.isnan(row["snow_depth_m"]):
-        snow = BoxSnow(ids, shown, np.array([50, 50, 0]))
-        files["box_snow"] = (f"{base}/labels/snow.parquet", SNOW_TABLE.to_bytes({item: snow}))
-    return files
+        stored["snow"] = [ids, shown, [50, 50, 0]]
+    tables = {name: TABLES[f"box_{name}"] for name in stored}
+    return {
+        f"box_{n}": (f"{base}/labels/{n}.parquet", t.to_bytes({item: t.from_json(stored[n])}))
+        for n, t in tables.items()
+    }
