@@ -146,6 +146,31 @@ def decode_image(path: Path, flags: int) -> np.ndarray | None:
     return cv2.imdecode(data, flags) if len(data) else None
 
 
+class ImageFault(Exception):
+    """What is wrong with an image file, as the end of a sentence that starts with its path."""
+
+
+def is_whole_jpeg(path: Path) -> bool:
+    """Whether the file is a JPEG by its ends; no other kind is looked at further.
+
+    Raises:
+        ImageFault: missing, unreadable, or a JPEG that is cut short: decoders fill that with grey.
+    """
+    try:
+        with open_file(path) as file:
+            head = file.read(2)
+            size = file.seek(0, 2)
+            file.seek(max(0, size - 64))  # some cameras pad the file behind the end marker
+            tail = file.read()
+    except FileNotFoundError:
+        raise ImageFault("does not exist") from None
+    except OSError as error:
+        raise ImageFault(f"cannot be read ({error.strerror or error})") from None
+    if head == b"\xff\xd8" and b"\xff\xd9" not in tail:
+        raise ImageFault("is cut short")
+    return head == b"\xff\xd8"
+
+
 _IMAGE_ENDS = ((b"\x89PNG\r\n\x1a\n", b"IEND"), (b"\xff\xd8", b"\xff\xd9"))
 
 

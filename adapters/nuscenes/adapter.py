@@ -28,9 +28,9 @@ from adapters.nuscenes.tables import (
     read_tables,
     scene_frames,
 )
-from adapters.plain_files import inside
+from adapters.plain_files import ImageFault, inside
 from adapters.raw_drive import BoxSample, drive_origin, objects_that_travel
-from adapters.training_views.views import ImageFault, read_scaled
+from adapters.training_views.views import read_scaled
 from adapters.uri import format_uri
 from augment.cameras import Camera, Frame
 from augment.errors import AdapterError

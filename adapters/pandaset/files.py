@@ -24,12 +24,11 @@ import numpy as np
 import pandas as pd
 import torch
 
-from adapters.plain_files import decode_image, number_of, read_json
+from adapters.plain_files import ImageFault, decode_image, is_whole_jpeg, number_of, read_json
 from adapters.raw_drive import drive_origin
 from adapters.safe_pickle import read_frame
 from augment.errors import AdapterError
 from augment.geometry import rigid, rotmat_from_quat
-from recipes.files import open_file
 
 _INTRINSICS = ("fx", "fy", "cx", "cy")
 _LATEST_S = 9e9  # int64 nanoseconds reach 9.2e9 s
@@ -202,17 +201,10 @@ def _find_images(
 
 
 def _file_fault(path: Path) -> str:
-    """What is wrong with a JPEG file by its ends: decoders fill what is missing with grey."""
-    if not path.exists():
-        return "does not exist"
-    with open_file(path) as file:
-        head = file.read(2)
-        size = file.seek(0, 2)
-        file.seek(max(0, size - 64))
-        tail = file.read()
-    if head != b"\xff\xd8":
-        return "is not a JPEG file"
-    return "" if b"\xff\xd9" in tail else "is cut short"
+    try:
+        return "" if is_whole_jpeg(path) else "is not a JPEG file"
+    except ImageFault as fault:
+        return str(fault)
 
 
 def _picture_fault(path: Path, size: tuple[int, int]) -> str:

@@ -1,4 +1,11 @@
-"""What to know of a drive before learning from it: does the calibration fit, is exposure steady."""
+"""What to know of a drive before learning from it: does the calibration fit, is exposure steady.
+
+Paint, signs and edges differ in reflectance as they do in brightness. Over a range of shifts of the
+projected returns the information that intensity and grey value share is measured; it is highest
+where they lie on each other (Pandey et al. 2012, here with shifts for rotations). Rolling shutters,
+exposure and transport leave time stamps some tens of milliseconds beside the moment that an image
+shows, and a car at 15 m/s moves 30 cm in 20 ms: the same measure tells which time fits best.
+"""
 
 from __future__ import annotations
 
@@ -7,14 +14,15 @@ import itertools
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 import torch
 
-from adapters.lidar_scene.depth import SparseDepth
+from adapters.lidar_scene.depth import SparseDepth, nearest_of_each, project_points
 from adapters.training_views.depth_priors import visible
+from adapters.training_views.masks import spread
 from adapters.training_views.views import RecordedViews
 from augment.cameras import Camera
 from augment.geometry import (
@@ -29,12 +37,6 @@ from augment.labels import LidarSweep
 from augment.reconstruct.view import ViewKey
 from augment.scene import Scene
 
-# ---- How far a camera's images are shifted against the LiDAR, from what both see of surfaces -----
-# Paint, signs and edges differ in reflectance as they do in brightness. Over a range of shifts of
-# the
-# projected returns the information that intensity and grey value share is measured; it is highest
-# where they lie on each other (Pandey et al. 2012, here with shifts for rotations).
-
 _WIDTH = 480  # columns of the images compared, at most
 _REACH_DEG = 1.2
 _NEAR_M = 8.0  # nearer returns shift with the camera's position and time, not only its rotation
@@ -44,6 +46,19 @@ _MIN_POINTS = 3000
 _CONTRAST = 0.1  # how much the best shift must stand out
 _AGREE_PX = 0.75  # between the measurement in every other frame and the rest
 _ALONE_PX = 2.0  # a single frame says less, and less exactly
+_STEPS_S = np.arange(-5, 6) * 0.010
+_TIMING_NEAR_M = 3.0  # near returns shift most with time
+_MIN_SPEED_MPS = 1.0
+_EVERY = 3  # return is enough
+_TIMING_CONTRAST = 0.02  # how much the best time must stand out from the range's mean
+_MAX_TIME_OFFSET_S = 0.030  # rolling shutters alone make 10 to 20 ms
+_MAX_SHIFT_DEG = 0.35  # a pixel at 480 columns is up to 0.25
+_MAX_SHIFT_PX = 1.2
+_NUM_FRAMES = 7  # that the calibration is measured in
+_JUMP_STOPS = 0.4  # a third more or less light
+_JUMP_TIMES = 5.0  # this many times the camera's usual change
+_BLOCKS = (32, 18)  # columns and rows of the means that are compared
+_MAX_NAMED = 3  # jumps of a camera that are named one by one
 _INTENSITY, _SENSOR = ("intensity", "i"), ("sensor", "d")
 
 
@@ -62,16 +77,14 @@ class CameraOffset:
     is_sure: bool
 
 
-@dataclass(frozen=True, eq=False)
-class Returns:
+class Returns(NamedTuple):
     """A sweep's returns with intensity. points: float64 [N, 3], scene world. intensity: [N]."""
 
     points: np.ndarray
     intensity: np.ndarray
 
 
-@dataclass(frozen=True, eq=False)
-class Points:
+class Points(NamedTuple):
     """Returns in one image: columns, rows int64 [M], intensity [M]; grey uint8 [H, W]."""
 
     columns: np.ndarray
@@ -167,39 +180,22 @@ def project_returns(
     camera = _compared(camera)
     grey = cv2.cvtColor(views.image(key), cv2.COLOR_RGB2GRAY)
     grey = cv2.resize(grey, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-    pose = camera.camera_from_world.numpy()
-    local = returns.points @ pose[:3, :3].T + pose[:3, 3]
-    ahead = local[:, 2] > near_m
-    local, intensity = local[ahead], returns.intensity[ahead]
-    u = np.floor(camera.fx * local[:, 0] / local[:, 2] + camera.cx).astype(np.int64)
-    v = np.floor(camera.fy * local[:, 1] / local[:, 2] + camera.cy).astype(np.int64)
-    inside = (u >= reach) & (u < camera.width - reach) & (v >= reach) & (v < camera.height - reach)
-    u, v, z, intensity = u[inside], v[inside], local[inside, 2], intensity[inside]
-    order = np.lexsort((z, v * camera.width + u))
-    first = np.ones(len(order), np.bool_)
-    first[1:] = np.diff((v * camera.width + u)[order]) > 0
-    chosen = order[first]
+    seen, u, v, z = project_points(returns.points, camera, near_m=near_m, margin_px=reach)
+    chosen = nearest_of_each(v * camera.width + u, z)
     uv = np.stack([u, v], 1)[chosen].astype(np.int32)
     front = visible(SparseDepth(uv, z[chosen].astype(np.float32), chosen), camera)
     kept = chosen[front]
-    return Points(u[kept], v[kept], intensity[kept], grey)
+    return Points(u[kept], v[kept], returns.intensity[seen[kept]], grey)
 
 
 def shared_information(seen: Sequence[Points], reach: int) -> np.ndarray:
     """Mutual information of intensity and grey value over their joint entropy for each shift,
     float64 [2 reach + 1, 2 reach + 1], rows of downward shifts."""
     stride = max(1, -(-sum(len(points.rows) for points in seen) // _MAX_POINTS))
-    columns, rows, images, intensity = (
-        np.concatenate(parts)
-        for parts in zip(
-            *(
-                (p.columns[::stride], p.rows[::stride], np.full(len(p.rows[::stride]), i),
-                 p.intensity[::stride])
-                for i, p in enumerate(seen)
-            ),
-            strict=True,
-        )
-    )  # fmt: skip
+    columns = np.concatenate([p.columns[::stride] for p in seen])
+    rows = np.concatenate([p.rows[::stride] for p in seen])
+    intensity = np.concatenate([p.intensity[::stride] for p in seen])
+    images = np.repeat(np.arange(len(seen)), [len(p.rows[::stride]) for p in seen])
     grey = np.stack([points.grey for points in seen])
     ranks = np.linspace(0, 1, _BINS + 1)[1:-1]
     a = np.searchsorted(np.quantile(intensity, ranks), intensity) * _BINS
@@ -239,34 +235,16 @@ def _vertex(before: float, here: float, after: float) -> float:
     return 0.0 if bend == 0 else float(0.5 * (before - after) / bend)
 
 
-# ------------------------------------------------------------------------------------------------
-# Cameras at other times than stamped: where they were then, and which time fits the LiDAR best
-# Rolling shutters, exposure and transport leave time stamps some tens of milliseconds beside the
-# moment an image shows. A car at 15 m/s moves 30 cm in 20 ms.
-
-_STEPS_S = np.arange(-5, 6) * 0.010
-_TIMING_NEAR_M = 3.0  # near returns shift most with time
-_MIN_SPEED_MPS = 1.0
-_EVERY = 3  # return is enough
-_TIMING_CONTRAST = 0.02  # how much the best time must stand out from the range's mean
-
-
 def with_camera_times(scene: Scene, offset_s: float) -> Scene:
     """The scene with every image taken offset_s later than stamped: poses and times of cameras.
 
     Positions and rotations follow the camera's own path, straight on at its ends."""
     paths = {name: _path(scene, name) for name in scene.camera_names}
-    frames = tuple(
-        dataclasses.replace(
-            frame,
-            cameras={
-                name: camera_at(paths[name], camera, offset_s)
-                for name, camera in frame.cameras.items()
-            },
-        )
-        for frame in scene.frames
-    )
-    return dataclasses.replace(scene, frames=frames)
+    frames = []
+    for frame in scene.frames:
+        cameras = {n: camera_at(paths[n], c, offset_s) for n, c in frame.cameras.items()}
+        frames.append(dataclasses.replace(frame, cameras=cameras))
+    return dataclasses.replace(scene, frames=tuple(frames))
 
 
 def _path(scene: Scene, name: str) -> list[Camera]:
@@ -326,14 +304,10 @@ def measure_time_offset(
             total += known / known.mean()
             cameras += 1
     i = int(total.argmax())
-    if (
-        cameras == 0
-        or not 0 < i < len(total) - 1
-        or total[i] < (1 + _TIMING_CONTRAST) * total.mean()
-    ):
+    stands_out = total[i] >= (1 + _TIMING_CONTRAST) * total.mean()
+    if cameras == 0 or not 0 < i < len(total) - 1 or not stands_out:
         return None
-    bend = total[i - 1] - 2 * total[i] + total[i + 1]
-    step = 0.0 if bend == 0 else 0.5 * (total[i - 1] - total[i + 1]) / bend
+    step = _vertex(*total[i - 1 : i + 2])
     return float(_STEPS_S[i] + step * (_STEPS_S[1] - _STEPS_S[0]))
 
 
@@ -346,12 +320,17 @@ def _fit(
     offset_s: float,
 ) -> float | None:
     """How much images and returns tell of each other if images were taken later by offset_s."""
-    seen: list[Points] = []
-    for key in keys:
-        camera = camera_at(path, scene.frame(key.frame).cameras[key.camera], offset_s)
-        seen.append(
-            project_returns(returns[key.frame], views, key, camera, reach=0, near_m=_TIMING_NEAR_M)
+    seen = [
+        project_returns(
+            returns[key.frame],
+            views,
+            key,
+            camera_at(path, scene.frame(key.frame).cameras[key.camera], offset_s),
+            reach=0,
+            near_m=_TIMING_NEAR_M,
         )
+        for key in keys
+    ]
     return float(shared_information(seen, 0)[0, 0]) if seen else None
 
 
@@ -359,18 +338,6 @@ def _speed_mps(path: Sequence[Camera], scene: Scene, key: ViewKey) -> float:
     camera = scene.frame(key.frame).cameras[key.camera]
     later = camera_at(path, camera, 0.01)
     return float((later.centre - camera.centre).norm()) / 0.01
-
-
-# ---- checks --------------------------------------------------------------------------------------
-
-_WORST_TIME_S = 0.030  # rolling shutters alone make 10 to 20 ms
-_WORST_DEG = 0.35  # a pixel at 480 columns is up to 0.25
-_WORST_PX = 1.2
-_FRAMES = 7  # that the calibration is measured in
-_JUMP_STOPS = 0.4  # a third more or less light
-_JUMP_TIMES = 5.0  # this many times the camera's usual change
-_BLOCKS = (32, 18)  # columns and rows of the means that are compared
-_NAMED = 3  # jumps of a camera that are named one by one
 
 
 @dataclass(frozen=True)
@@ -391,10 +358,8 @@ class Checks:
             "camera_time_offset_ms": None if late is None else 1e3 * late,
             "calibration_offsets": {
                 o.camera: {
-                    "right_px": o.right_px,
-                    "down_px": o.down_px,
-                    "angle_deg": o.angle_deg,
-                    "is_sure": o.is_sure,
+                    name: getattr(o, name)
+                    for name in ("right_px", "down_px", "angle_deg", "is_sure")
                 }
                 for o in self.offsets
             },
@@ -413,10 +378,10 @@ def check_views(scene: Scene, views: RecordedViews) -> Checks:
         problems += exposure_jumps(views, found)
     # What is measured changes the cameras, so held-out images have no part in it.
     learnt = {name: [k for k in found if k in set(views.train)] for name, found in own.items()}
-    own = {name: _spread(found, _FRAMES) for name, found in learnt.items() if found}
+    own = {name: spread(found, _NUM_FRAMES) for name, found in learnt.items() if found}
     returns = read_intensities(scene, (key.frame for found in own.values() for key in found))
     late = measure_time_offset(scene, returns, views, own)
-    if late is not None and abs(late) > _WORST_TIME_S:
+    if late is not None and abs(late) > _MAX_TIME_OFFSET_S:
         problems.append(
             f"images fit the LiDAR best if they were taken {abs(late) * 1e3:.0f} ms "
             f"{'after' if late > 0 else 'before'} their time stamps: one of the clocks is wrong"
@@ -432,14 +397,9 @@ def check_views(scene: Scene, views: RecordedViews) -> Checks:
     return Checks(tuple(problems), late, tuple(offsets))
 
 
-def _spread(keys: Sequence[ViewKey], count: int) -> list[ViewKey]:
-    places = np.linspace(0, len(keys) - 1, min(count, len(keys))).round().astype(int)
-    return [keys[i] for i in places]
-
-
 def _offset_problem(offset: CameraOffset) -> list[str]:
     shift_px = float(np.hypot(offset.right_px, offset.down_px))
-    if not offset.is_sure or offset.angle_deg < _WORST_DEG or shift_px < _WORST_PX:
+    if not offset.is_sure or offset.angle_deg < _MAX_SHIFT_DEG or shift_px < _MAX_SHIFT_PX:
         return []
     return [
         f"camera {offset.camera}: its images lie {offset.angle_deg:.2f} degrees beside the LiDAR "
@@ -465,11 +425,11 @@ def exposure_jumps(views: RecordedViews, keys: Sequence[ViewKey]) -> list[str]:
         f"camera {keys[i].camera}: brightness changes by a factor of {2 ** change[i]:.2f} between "
         f"frames {keys[i].frame} and {keys[i + 1].frame}; one exposure for the whole drive will "
         f"not fit both"
-        for i in found[:_NAMED]
+        for i in found[:_MAX_NAMED]
     ]
-    if len(found) > _NAMED:
+    if len(found) > _MAX_NAMED:
         out.append(
-            f"camera {keys[0].camera}: brightness jumps {len(found) - _NAMED} more times, last "
+            f"camera {keys[0].camera}: brightness jumps {len(found) - _MAX_NAMED} more times, last "
             f"after frame {keys[found[-1]].frame}"
         )
     return out

@@ -1,4 +1,7 @@
-"""Depth priors of every view from whatever is there: LiDAR sweeps, and folders of depth maps."""
+"""Depth priors of every view from whatever is there: LiDAR sweeps, and folders of depth maps.
+
+Files that are not what they should be are AdapterErrors that name them; the view goes without.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from adapters.lidar_scene.depth import SparseDepth, depth_seen, read_returns
+from adapters.lidar_scene.depth import SparseDepth, depth_seen, nearest_of_each, read_returns
 from adapters.pandaset.labels import PandaSetLabels
 from adapters.plain_files import decode_image
 from adapters.safe_pickle import read_array, read_array_dict
@@ -23,23 +26,31 @@ from augment.reconstruct.view import ViewKey
 from augment.render.threads import kernel_threads
 from augment.scene import Scene
 
-# ---- Depth maps in folders: where each view's file is, and what is in it -------------------------
+logger = logging.getLogger(__name__)
 
 METRIC_PER_M = 256.0  # levels per metre of 16-bit depth images
 _NUMBER = re.compile(r"\d{1,12}")
 _SPARSE_NAME = re.compile(r"(\d{1,12})_(.+)")
 _ASPECT_TOLERANCE = 0.02  # maps are often rounded to a multiple of 14 or 32 pixels
+_MIN_KNOWN = 30  # known distances that two numbers may be fitted to
+_ROUNDS = 30
+_MIN_SPREAD_PER_M = 1e-4  # residuals below this are as good as none
+_MIN_CORRELATION = 0.5
+_NEAREST_M, _FURTHEST_M = 0.5, 120.0
+_NEAREST_IN_FILE_M, _FURTHEST_IN_FILE_M = 0.1, 1000.0  # what a file may call a depth
+# A return is clearly behind another from this ratio of depths and this many metres more.
+_BEHIND_RATIO, _BEHIND_M = 1.05, 0.5
+_NEIGHBOURS = 16  # returns around one that say whether it is surrounded
+_WIDEST_PART = 0.02  # of the image's width: what is further away says nothing
+# Depth of a view at its training camera, float32 [H, W] metres, 0 where unknown.
+ReferenceDepth = Callable[[ViewKey, Camera], np.ndarray]
 
 
 def find_maps(
     folder: Path, keys: Collection[ViewKey], image_stems: Mapping[ViewKey, str], suffixes: set[str]
 ) -> dict[ViewKey, Path]:
     """The file of each view that has one: DIR/<camera>/<name>, named as the recorded image is or,
-    where no file of the camera is, with the frame's number.
-
-    Raises:
-        AdapterError: the folder does not exist.
-    """
+    where no file of the camera is, with the frame's number."""
     _check_folder(folder)
     found: dict[ViewKey, Path] = {}
     for camera in dict.fromkeys(key.camera for key in keys):
@@ -56,13 +67,9 @@ def find_sparse(
     folder: Path, keys: Collection[ViewKey], camera_names: Sequence[str]
 ) -> dict[ViewKey, Path]:
     """The file DIR/<frame>_<camera>.npy of each view that has one. <camera> is a camera's name, or
-    its number in the scene's order as Street Gaussians counts them.
-
-    Raises:
-        AdapterError: the folder does not exist.
-    """
+    its number in the scene's order as Street Gaussians counts them."""
     _check_folder(folder)
-    wanted = set(keys)
+    requested = set(keys)
     found: dict[ViewKey, Path] = {}
     for path in sorted(folder.glob("*.npy")):
         match = _SPARSE_NAME.fullmatch(path.stem)
@@ -72,7 +79,7 @@ def find_sparse(
         if name not in camera_names and _NUMBER.fullmatch(name) and int(name) < len(camera_names):
             name = camera_names[int(name)]
         key = ViewKey(int(match[1]), name)
-        if key in wanted:
+        if key in requested:
             found[key] = path
     return found
 
@@ -144,9 +151,6 @@ def _check_folder(folder: Path) -> None:
         raise AdapterError(f"{folder}: no such folder; depth maps were to be read from it")
 
 
-# ---- Depth at some pixels of one image: the common form of all depth priors ----------------------
-
-
 @dataclass(frozen=True, eq=False)
 class PriorPixels:
     """pixels: int32 [M], flat indices, increasing. depth_m: float32 [M]. weight: float32 [M]."""
@@ -170,10 +174,7 @@ class PriorPixels:
     def of(pixels: np.ndarray, depth_m: np.ndarray) -> PriorPixels:
         """Of weight 1. Pixels come in any order, some of them several times: the nearest depth of
         each remains."""
-        order = np.lexsort((depth_m, pixels))
-        first = np.ones(len(order), np.bool_)
-        first[1:] = np.diff(pixels[order]) > 0
-        chosen = order[first]
+        chosen = nearest_of_each(pixels, depth_m)
         return PriorPixels(
             pixels[chosen].astype(np.int32),
             depth_m[chosen].astype(np.float32),
@@ -196,28 +197,11 @@ class PriorPixels:
 
 def join_priors(priors: Sequence[PriorPixels]) -> PriorPixels:
     """All of them; where several know a pixel, the first in the sequence is believed."""
-    priors = [prior for prior in priors if len(prior)]
-    if not priors:
-        return PriorPixels.empty()
-    if len(priors) == 1:
-        return priors[0]
-    pixels = np.concatenate([prior.pixels for prior in priors])
-    _, first = np.unique(pixels, return_index=True)  # the first occurrence, in order of pixels
-    return PriorPixels(
-        pixels[first],
-        np.concatenate([prior.depth_m for prior in priors])[first],
-        np.concatenate([prior.weight for prior in priors])[first],
-    )
-
-
-# ------------------------------------------------------------------------------------------------
-# Inverse depth up to scale and shift, brought to metres by the few distances that are known
-
-_FEWEST = 30  # known distances that two numbers may be fitted to
-_ROUNDS = 30
-_MIN_SPREAD_PER_M = 1e-4  # residuals below this are as good as none
-_MIN_CORRELATION = 0.5
-_NEAREST_M, _FURTHEST_M = 0.5, 120.0
+    names = ("pixels", "depth_m", "weight")
+    empty = PriorPixels.empty()
+    parts = {name: np.concatenate([getattr(p, name) for p in (empty, *priors)]) for name in names}
+    _, first = np.unique(parts["pixels"], return_index=True)  # the first occurrence, in order
+    return PriorPixels(*(parts[name][first] for name in names))
 
 
 @dataclass(frozen=True)
@@ -245,7 +229,7 @@ def align(relative: np.ndarray, depth_m: np.ndarray) -> Alignment | None:
     x, y = relative.astype(np.float64), 1.0 / depth_m.astype(np.float64)
     known = np.isfinite(x) & np.isfinite(y)
     x, y = x[known], y[known]
-    if len(x) < _FEWEST:
+    if len(x) < _MIN_KNOWN:
         return None
     low, middle, high = np.quantile(x, [0.1, 0.5, 0.9])
     unit = high - low
@@ -274,17 +258,8 @@ def align(relative: np.ndarray, depth_m: np.ndarray) -> Alignment | None:
     return Alignment(scale / unit, shift - scale * middle / unit, correlation)
 
 
-# ---- Depth maps from files as prior pixels of a training camera ----------------------------------
-
-_NEAREST_IN_FILE_M, _FURTHEST_IN_FILE_M = 0.1, 1000.0  # what a file may call a depth
-
-
 def sparse_prior(path: Path, camera: Camera) -> PriorPixels:
-    """Street Gaussians' depth, of a larger image, at the pixels it falls on.
-
-    Raises:
-        AdapterError: the file is damaged, or of an image of another shape.
-    """
+    """Street Gaussians' depth, of a larger image, at the pixels it falls on."""
     mask, value = read_sparse(path)
     check_aspect(path, mask.shape, camera)
     rows, columns = np.nonzero(mask)
@@ -296,29 +271,23 @@ def sparse_prior(path: Path, camera: Camera) -> PriorPixels:
 
 
 def metric_prior(path: Path, camera: Camera, sky: np.ndarray, grid_px: int) -> PriorPixels:
-    """A dense map in metres at the pixels of a grid, 0 and sky left out.
-
-    Raises:
-        AdapterError: the file is no such map, or of an image of another shape.
-    """
+    """A dense map in metres at the pixels of a grid, 0 and sky left out."""
     depth = read_metric(path)
     check_aspect(path, depth.shape, camera)
     rows, columns = _grid(camera, grid_px)
-    # No interpolation: between a car and the wall behind it there is no surface.
-    at = _at_centres(depth, camera, rows, columns)
-    usable = (at > _NEAREST_IN_FILE_M) & (at < _FURTHEST_IN_FILE_M) & ~sky[np.ix_(rows, columns)]
-    return _of_grid(at, usable, rows, columns, camera)
+    # The nearest pixel: between a car and the wall behind it there is no surface.
+    y = ((rows + 0.5) * depth.shape[0] / camera.height).astype(np.int64)
+    x = ((columns + 0.5) * depth.shape[1] / camera.width).astype(np.int64)
+    at = depth[y, x]
+    usable = (at > _NEAREST_IN_FILE_M) & (at < _FURTHEST_IN_FILE_M) & ~sky[rows, columns]
+    return PriorPixels.of((rows * camera.width + columns)[usable], at[usable])
 
 
 def relative_prior(
     path: Path, camera: Camera, reference: np.ndarray, sky: np.ndarray, grid_px: int
 ) -> PriorPixels:
     """A dense inverse depth map, aligned to the reference depth [H, W] (0 where unknown), at the
-    pixels of a grid.
-
-    Raises:
-        AdapterError: the file is no such map, or it does not agree with the reference.
-    """
+    pixels of a grid."""
     relative = read_relative(path)
     check_aspect(path, relative.shape, camera)
     size = (camera.width, camera.height)
@@ -333,8 +302,9 @@ def relative_prior(
             f"some, and larger values must be nearer (inverse depth, not depth)"
         )
     rows, columns = _grid(camera, grid_px)
-    at = found.depth_m(relative[np.ix_(rows, columns)])
-    return _of_grid(at, np.isfinite(at) & ~sky[np.ix_(rows, columns)], rows, columns, camera)
+    at = found.depth_m(relative[rows, columns])
+    usable = np.isfinite(at) & ~sky[rows, columns]
+    return PriorPixels.of((rows * camera.width + columns)[usable], at[usable])
 
 
 def beside(dense: PriorPixels, known: PriorPixels, camera: Camera, grid_px: int) -> PriorPixels:
@@ -351,69 +321,10 @@ def beside(dense: PriorPixels, known: PriorPixels, camera: Camera, grid_px: int)
 
 
 def _grid(camera: Camera, grid_px: int) -> tuple[np.ndarray, np.ndarray]:
-    """Rows and columns in the middles of the grid's cells."""
+    """Rows [R, 1] and columns [1, C] in the middles of the grid's cells."""
     rows = np.arange(min(grid_px // 2, camera.height - 1), camera.height, grid_px)
-    return rows, np.arange(min(grid_px // 2, camera.width - 1), camera.width, grid_px)
-
-
-def _at_centres(
-    image: np.ndarray, camera: Camera, rows: np.ndarray, columns: np.ndarray
-) -> np.ndarray:
-    y = ((rows + 0.5) * image.shape[0] / camera.height).astype(np.int64)
-    x = ((columns + 0.5) * image.shape[1] / camera.width).astype(np.int64)
-    return image[np.ix_(y, x)]
-
-
-def _of_grid(
-    depth_m: np.ndarray, usable: np.ndarray, rows: np.ndarray, columns: np.ndarray, camera: Camera
-) -> PriorPixels:
-    pixels = rows[:, None] * camera.width + columns[None]
-    return PriorPixels.of(pixels[usable], depth_m[usable])
-
-
-# ---- Depth priors from the LiDAR sweep of an image's own frame -----------------------------------
-
-# A return is clearly behind another from this ratio of depths and this many metres more.
-_BEHIND_RATIO, _BEHIND_M = 1.05, 0.5
-_NEIGHBOURS = 16  # returns around one that say whether it is surrounded
-_WIDEST_PART = 0.02  # of the image's width: what is further away says nothing
-
-
-class LidarPriors:
-    """What the sweeps say of every view. A sweep is read once for all cameras of its frame."""
-
-    def __init__(
-        self,
-        scene: Scene,
-        cameras: Mapping[ViewKey, Camera],
-        *,
-        without_semantic: Collection[int],
-        cache_bytes: int,
-    ) -> None:
-        """cameras: every view that may be asked for, at the training resolution."""
-        self._scene = scene
-        self._without = tuple(without_semantic)
-        self._frames: dict[int, dict[ViewKey, Camera]] = {}
-        for key, camera in cameras.items():
-            self._frames.setdefault(key.frame, {})[key] = camera
-        self._cache: ByteCache[PriorPixels] = ByteCache(cache_bytes)
-
-    def load(self, key: ViewKey) -> PriorPixels:
-        """Empty where the frame has no sweep."""
-        found = self._cache.get(key)
-        if found is not None:
-            return found
-        returns = read_returns(self._scene, key.frame, without_semantic=self._without)
-        wanted = PriorPixels.empty()
-        for other, camera in self._frames[key.frame].items():
-            prior = PriorPixels.empty()
-            if returns is not None:
-                seen = depth_seen(returns, camera)
-                prior = _as_prior(seen, visible(seen, camera), camera)
-            self._cache.put(other, prior, prior.nbytes)
-            if other == key:
-                wanted = prior
-        return wanted
+    columns = np.arange(min(grid_px // 2, camera.width - 1), camera.width, grid_px)
+    return rows[:, None], columns[None]
 
 
 def visible(seen: SparseDepth, camera: Camera) -> np.ndarray:
@@ -433,19 +344,6 @@ def visible(seen: SparseDepth, camera: Camera) -> np.ndarray:
             np.float32(_BEHIND_RATIO), np.float32(_BEHIND_M),
         )  # fmt: skip
     return ~hidden
-
-
-def _as_prior(seen: SparseDepth, keep: np.ndarray, camera: Camera) -> PriorPixels:
-    pixels = seen.uv[keep, 1] * np.int32(camera.width) + seen.uv[keep, 0]
-    return PriorPixels(pixels, seen.depth_m[keep], np.ones(len(pixels), np.float32))
-
-
-# ---- depth priors --------------------------------------------------------------------------------
-
-logger = logging.getLogger(__name__)
-
-# Depth of a view at its training camera, float32 [H, W] metres, 0 where unknown.
-ReferenceDepth = Callable[[ViewKey, Camera], np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -487,16 +385,11 @@ class DepthSource:
         """cameras: every view, at the training resolution. reference: distances that relative
         maps are brought to metres by where the frame has no LiDAR."""
         self.problems: list[str] = []
-        self._options, self._cameras, self._reference = options, cameras, reference
-        self._lidar: LidarPriors | None = None
-        if options.lidar and has_sweeps(scene, cameras):
-            self._lidar = LidarPriors(
-                scene,
-                cameras,
-                without_semantic=no_surface_classes(scene),
-                cache_bytes=cache_bytes // 2,
-            )
+        self._scene, self._cameras, self._options = scene, cameras, options
+        self._reference = reference
+        self._has_sweeps = options.lidar and _has_sweeps(scene, cameras)
         self._maps = _find_all(scene, cameras, options, self.problems)
+        self._sweeps: ByteCache[PriorPixels] = ByteCache(cache_bytes // 2)
         self._cache: ByteCache[PriorPixels] = ByteCache(cache_bytes - cache_bytes // 2)
         if not self.kinds:
             self.problems.append(
@@ -508,11 +401,31 @@ class DepthSource:
     def kinds(self) -> tuple[str, ...]:
         """Which priors there are: lidar, sparse, metric, relative."""
         found = tuple(kind for kind, maps in self._maps.items() if maps)
-        return found if self._lidar is None else ("lidar", *found)
+        return ("lidar", *found) if self._has_sweeps else found
 
     def lidar(self, key: ViewKey) -> PriorPixels:
-        """What the sweep of the view's frame says."""
-        return PriorPixels.empty() if self._lidar is None else self._lidar.load(key)
+        """What the sweep of the view's frame says; it is read once for all cameras of the frame."""
+        if not self._has_sweeps:
+            return PriorPixels.empty()
+        found = self._sweeps.get(key)
+        if found is not None:
+            return found
+        labels = self._scene.labels
+        without = labels.no_surface_classes if isinstance(labels, PandaSetLabels) else ()
+        returns = read_returns(self._scene, key.frame, without_semantic=without)
+        priors = {}
+        for other, camera in self._cameras.items():
+            if other.frame != key.frame:
+                continue
+            priors[other] = PriorPixels.empty()
+            if returns is not None:
+                seen = depth_seen(returns, camera)
+                keep = visible(seen, camera)
+                pixels = seen.uv[keep, 1] * np.int32(camera.width) + seen.uv[keep, 0]
+                weight = np.ones(len(pixels), np.float32)
+                priors[other] = PriorPixels(pixels, seen.depth_m[keep], weight)
+            self._sweeps.put(other, priors[other], priors[other].nbytes)
+        return priors[key]
 
     def load(self, key: ViewKey, sky: np.ndarray) -> PriorPixels:
         """All that is known of the view. sky: bool [H, W], where dense maps are not believed."""
@@ -525,67 +438,51 @@ class DepthSource:
         return found
 
     def _combine(self, key: ViewKey, sky: np.ndarray) -> PriorPixels:
-        camera, options = self._cameras[key], self._options
-        priors = [self.lidar(key)]
-        for kind in ("sparse", "metric"):
-            priors.append(self._read(kind, key, sky))
-        known = join_priors(priors)
-        if key in self._maps["relative"]:
-            path = self._maps["relative"][key]
+        camera, grid_px = self._cameras[key], self._options.grid_px
+        paths = {kind: maps.get(key) for kind, maps in self._maps.items()}
+        known = self.lidar(key)
+        for kind, path in paths.items():  # in the order in which they are believed
+            if path is None:
+                continue
             try:
-                reference = known.image(camera)
-                if len(known) == 0 and self._reference is not None:
-                    reference = self._reference(key, camera)
-                relative = relative_prior(path, camera, reference, sky, options.grid_px)
+                if kind == "sparse":
+                    found = sparse_prior(path, camera)
+                elif kind == "metric":
+                    found = metric_prior(path, camera, sky, grid_px)
+                else:
+                    reference = known.image(camera)
+                    if len(known) == 0 and self._reference is not None:
+                        reference = self._reference(key, camera)
+                    found = relative_prior(path, camera, reference, sky, grid_px)
+                    found = found.weighing(self._options.relative_weight)
+                    found = beside(found, known, camera, grid_px)
             except AdapterError as error:
-                self._left_out(key, error)
+                sentence = f"camera {key.camera}, frame {key.frame}: {error}; its depth is left out"
+                logger.warning("%s", sentence)
+                if sentence not in self.problems:
+                    self.problems.append(sentence)
             else:
-                weighed = relative.weighing(options.relative_weight)
-                known = join_priors([known, beside(weighed, known, camera, options.grid_px)])
+                known = join_priors([known, found])
         return known
-
-    def _read(self, kind: str, key: ViewKey, sky: np.ndarray) -> PriorPixels:
-        path = self._maps[kind].get(key)
-        if path is None:
-            return PriorPixels.empty()
-        camera = self._cameras[key]
-        try:
-            if kind == "sparse":
-                return sparse_prior(path, camera)
-            return metric_prior(path, camera, sky, self._options.grid_px)
-        except AdapterError as error:
-            self._left_out(key, error)
-            return PriorPixels.empty()
-
-    def _left_out(self, key: ViewKey, error: AdapterError) -> None:
-        sentence = f"camera {key.camera}, frame {key.frame}: {error}; its depth is left out"
-        logger.warning("%s", sentence)
-        if sentence not in self.problems:
-            self.problems.append(sentence)
 
 
 def _find_all(
     scene: Scene, cameras: Mapping[ViewKey, Camera], options: DepthPriors, problems: list[str]
 ) -> dict[str, dict[ViewKey, Path]]:
     stems = {key: Path(scene.frame(key.frame).image_paths[key.camera]).stem for key in cameras}
-    folders = {
-        "sparse": options.sparse_dir,
-        "metric": options.metric_dir,
-        "relative": options.relative_dir,
+    finds = {
+        "sparse": (options.sparse_dir, lambda d: find_sparse(d, cameras, scene.camera_names)),
+        "metric": (options.metric_dir, lambda d: find_maps(d, cameras, {}, {".png"})),
+        "relative": (
+            options.relative_dir,
+            lambda d: find_maps(d, cameras, stems, {".npy", ".png"}),
+        ),
     }
     out: dict[str, dict[ViewKey, Path]] = {}
-    for kind, folder in folders.items():
-        if folder is None:
-            out[kind] = {}
-            continue
-        if kind == "sparse":
-            out[kind] = find_sparse(folder, cameras, scene.camera_names)
-        elif kind == "metric":
-            out[kind] = find_maps(folder, cameras, {}, {".png"})
-        else:
-            out[kind] = find_maps(folder, cameras, stems, {".npy", ".png"})
+    for kind, (folder, find) in finds.items():
+        out[kind] = {} if folder is None else find(folder)
         missing = [key for key in cameras if key not in out[kind]]
-        if missing:
+        if missing and folder is not None:
             problems.append(
                 f"{folder} holds no {kind} depth for {len(missing)} of {len(cameras)} images, "
                 f"first camera {missing[0].camera}, frame {missing[0].frame}"
@@ -593,14 +490,9 @@ def _find_all(
     return out
 
 
-def has_sweeps(scene: Scene, keys: Mapping[ViewKey, Camera]) -> bool:
+def _has_sweeps(scene: Scene, keys: Mapping[ViewKey, Camera]) -> bool:
     """Whether any of the views' frames has a LiDAR sweep."""
     if scene.labels is None:
         return False
     frames = dict.fromkeys(key.frame for key in keys)
     return any(read_returns(scene, frame) is not None for frame in frames)
-
-
-def no_surface_classes(scene: Scene) -> tuple[int, ...]:
-    """The dataset's class numbers of returns that no surface made, such as mirror images."""
-    return scene.labels.no_surface_classes if isinstance(scene.labels, PandaSetLabels) else ()

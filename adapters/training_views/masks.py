@@ -1,8 +1,13 @@
-"""Where an image shows the recording car itself: what stays as it is while the road moves by.
+"""Which pixels of a recorded image surely show sky, and which show the recording car itself.
 
-Looked for from the image's bottom upwards, where the road would be less than ten metres away. Only
-contrast along the road's apparent motion counts: kerbs and lane lines that run with it stay as they
-are too. Smooth paint says nothing by itself; it belongs to the edge above it.
+Sky: a column of the image is known where the surfaces drawn in it end below the LiDAR's highest
+view: the LiDAR looked over them and met nothing. Where they reach that view, a wall may go on
+above. The image then has to agree: sky is smooth and as bright as the rest of it.
+
+The recording car stays as it is while the road moves by. It is looked for from the image's bottom
+upwards, where the road would be less than ten metres away. Only contrast along the road's apparent
+motion counts: kerbs and lane lines that run with it stay as they are too. Smooth paint says nothing
+by itself; it belongs to the edge above it.
 """
 
 from __future__ import annotations
@@ -11,6 +16,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -23,10 +29,7 @@ from augment.render.buffers import ALPHA
 from augment.render.rasterize import rasterize
 from augment.scene import Scene
 
-# ---- Pixels that surely show sky, from what the LiDAR saw and what the image looks like ----------
-# A column of the image is known where the surfaces drawn in it end below the LiDAR's highest view:
-# the LiDAR looked over them and met nothing. Where they reach that view, a wall may go on above.
-# The image then has to agree: sky is smooth and as bright as the rest of it.
+T = TypeVar("T")
 
 _TOP_MARGIN_RAD = math.radians(4.0)  # the camera is not where the LiDAR is
 _FAR_M = 10.0  # from here on LiDAR and cameras see a return at nearly the same elevation
@@ -39,6 +42,26 @@ _SMOOTH_LEVELS = 6.0  # of 255: standard deviation within a small window
 _WINDOW_PART = 0.01  # of the image's width
 _DARK_LEVELS = 70.0  # of 255: this much darker than the image's bright sky is none
 _MIN_LUMA = 90.0
+
+WORK_WIDTH = 320  # columns of the images that are compared, at most
+MAX_IMAGES = 24
+_MIN_IMAGES = 6
+_STEP_M = 0.25  # images are compared that were taken this far apart
+_CAMERA_HEIGHT_M = 1.6  # above the road, about
+_REACH_M = 10.0  # nobody follows another car this closely for a whole drive
+_FLOW_WIDTH = 80
+_MIN_MOTION_PX = 0.25  # of an image as wide as that
+_CONTRAST = 2.0  # of 255 a pixel: what counts fully
+_LEAK = 0.06  # of the energy at right angles to the motion that may appear along it
+_STAYS = 0.4  # part of the contrast that stays: less speaks against, more for the car
+_WINDOW = 7
+_OVERREACH = 2
+_AGAINST = 0.2
+_STEP_COST = 0.1  # evidence that a step by a row between two columns must be worth
+_JUMP_PART = 0.05  # of the height: what any step costs at most
+_MIN_PART = 0.004  # of the height: mean evidence of a column without which there is no car
+_MIN_WIDTH = 0.15  # of the image's width
+_WHITE = 128
 
 
 def lidar_top_rad(scene: Scene, frames: Sequence[int]) -> float | None:
@@ -67,8 +90,7 @@ def sky_mask(
     """Pixels of the view that surely show sky, bool [H, W]; none where nothing can be known.
 
     scene: as initialised from LiDAR. rgb: uint8 [H, W, 3], the recorded image. returns:
-    int [M], flat indices of pixels with a LiDAR return. lidar_top_rad: see the function of that
-    name."""
+    int [M], flat indices of pixels with a LiDAR return."""
     none = np.zeros((camera.height, camera.width), np.bool_)
     if lidar_top_rad is None:
         return none
@@ -113,29 +135,6 @@ def looks_like_sky(rgb: np.ndarray, candidates: np.ndarray) -> np.ndarray:
     return smooth & (mean > max(bright - _DARK_LEVELS, _MIN_LUMA))
 
 
-# ---- ego masks -----------------------------------------------------------------------------------
-
-WORK_WIDTH = 320  # columns of the images that are compared, at most
-MAX_IMAGES = 24
-_MIN_IMAGES = 6
-_STEP_M = 0.25  # images are compared that were taken this far apart
-_CAMERA_HEIGHT_M = 1.6  # above the road, about
-_REACH_M = 10.0  # nobody follows another car this closely for a whole drive
-_FLOW_WIDTH = 80
-_MIN_MOTION_PX = 0.25  # of an image as wide as that
-_CONTRAST = 2.0  # of 255 a pixel: what counts fully
-_LEAK = 0.06  # of the energy at right angles to the motion that may appear along it
-_STAYS = 0.4  # part of the contrast that stays: less speaks against, more for the car
-_WINDOW = 7
-_OVERREACH = 2
-_AGAINST = 0.2
-_STEP_COST = 0.1  # evidence that a step by a row between two columns must be worth
-_JUMP_PART = 0.05  # of the height: what any step costs at most
-_MIN_PART = 0.004  # of the height: mean evidence of a column without which there is no car
-_MIN_WIDTH = 0.15  # of the image's width
-_WHITE = 128
-
-
 def moving_frames(cameras: Sequence[Camera]) -> list[int]:
     """Positions of at most MAX_IMAGES images of a drive, in order, between which it moved."""
     chosen: list[int] = []
@@ -145,10 +144,13 @@ def moving_frames(cameras: Sequence[Camera]) -> list[int]:
         if last is None or np.linalg.norm(centre - last) >= _STEP_M:
             chosen.append(i)
             last = centre
-    if len(chosen) > MAX_IMAGES:
-        spread = np.linspace(0, len(chosen) - 1, MAX_IMAGES).round().astype(int)
-        chosen = [chosen[i] for i in spread]
-    return chosen
+    return spread(chosen, MAX_IMAGES)
+
+
+def spread(items: Sequence[T], count: int) -> list[T]:
+    """At most so many of the items, evenly spread, the first and the last among them."""
+    places = np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int)
+    return [items[i] for i in places]
 
 
 def find_ego_mask(cameras: Sequence[Camera], images: Sequence[np.ndarray]) -> np.ndarray:
@@ -242,9 +244,9 @@ def _car_tops(evidence: np.ndarray, unknown: np.ndarray) -> np.ndarray:
     best = score[:, 0]
     came_from = np.zeros((width, rows_left + 1), np.int64)
     for x in range(1, width):
-        through = best[None] - step
-        came_from[x] = through.argmax(axis=1)
-        best = through[rows, came_from[x]] + score[:, x]
+        scores = best[None] - step
+        came_from[x] = scores.argmax(axis=1)
+        best = scores[rows, came_from[x]] + score[:, x]
     top = np.empty(width, np.int64)
     top[-1] = best.argmax()
     for x in range(width - 1, 0, -1):
@@ -257,11 +259,7 @@ def _car_tops(evidence: np.ndarray, unknown: np.ndarray) -> np.ndarray:
 
 
 def read_ego_mask(path: Path, camera: Camera) -> np.ndarray:
-    """A mask image, white where the camera sees the recording car, at the camera's size.
-
-    Raises:
-        AdapterError: not decodable, or of another shape than the camera's images.
-    """
+    """A mask image, white where the camera sees the recording car, at the camera's size."""
     image = decode_image(path, cv2.IMREAD_GRAYSCALE)
     if image is None:
         raise AdapterError(f"{path} cannot be decoded; expected an image, white on the own car")

@@ -1,6 +1,10 @@
 """What reconstruction starts from: the scene of a recording, and what its sensors leave out.
 
-Walls go on above the LiDAR's view, and the recording car's own body stands before some cameras.
+Walls go on above the LiDAR's view, and the recording car's own bonnet or roof stands before some
+cameras. It becomes an actor that travels with the camera: else it would be learnt into the road
+below, anew in every frame. It stands still in the image, so its true distance cannot be told from
+the images, and need not be: it is put near the camera, where nothing else is and other cameras do
+not look.
 """
 
 from __future__ import annotations
@@ -24,13 +28,6 @@ from augment.reconstruct.view import ViewSource
 from augment.scene import Actor, Gaussians, Scene, Track
 from augment.semantics import SemanticClass
 
-# ------------------------------------------------------------------------------------------------
-# The recording car's own bonnet or roof as an actor that travels with the camera that sees it
-# Without it the body would be learnt into the road below, anew in every frame. It stands still in
-# the
-# image, so its true distance cannot be told from the images, and need not be: it is put near the
-# camera, where nothing else is and other cameras do not look.
-
 logger = logging.getLogger(__name__)
 
 _PX_PER_SPLAT = 8  # pixels of the recorded image from splat to splat: two at a quarter of its size
@@ -46,6 +43,35 @@ _SHAPE = SplatShape(sigma_per_spacing=0.6, opacity=0.95)
 
 # Camera axes (x right, y down, z forward) to an actor's (x forward, y left, z up).
 _ACTOR_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+
+
+def starting_scene(scene: Scene, views: RecordedViews) -> Scene:
+    """The scene with upper walls in its background and a body of the recording car for every
+    camera that sees it, both from training views alone."""
+    top_deg = views.facts["lidar_top_deg"]
+    background = scene.background
+    if top_deg is not None:  # without LiDAR nothing ends at its highest view
+        background = _joined(background, wall_tops(scene, views, lidar_top_deg=top_deg))
+    bodies = [ego_body(scene, name, mask, views) for name, mask in views.ego_masks.items()]
+    actors = (*scene.actors, *(body for body in bodies if body is not None))
+    return dataclasses.replace(scene, background=background, actors=actors)
+
+
+def _joined(first: Gaussians, second: Gaussians) -> Gaussians:
+    """Both, at the first one's SH degree, which is not lower than the second's."""
+    if len(second) == 0:
+        return first
+    sh = torch.zeros(len(second), first.sh.shape[1], 3)
+    sh[:, : second.sh.shape[1]] = second.sh
+    if first.semantic is None or second.semantic is None:
+        first, second = (dataclasses.replace(g, semantic=None) for g in (first, second))
+    parts = (first, dataclasses.replace(second, sh=sh))
+    joined = {
+        field.name: torch.cat([getattr(part, field.name) for part in parts])
+        for field in dataclasses.fields(Gaussians)
+        if getattr(first, field.name) is not None
+    }
+    return Gaussians(**joined)
 
 
 def ego_body(scene: Scene, camera_name: str, mask: np.ndarray, source: ViewSource) -> Actor | None:
@@ -171,38 +197,4 @@ def _track(cameras: Sequence[Camera], centre: np.ndarray) -> Track:
     times = sorted(poses)
     return Track(
         torch.tensor(times, dtype=torch.int64), torch.stack([poses[time] for time in times])
-    )
-
-
-# ---- starting scene ------------------------------------------------------------------------------
-
-
-def starting_scene(scene: Scene, views: RecordedViews) -> Scene:
-    """The scene with upper walls in its background and a body of the recording car for every
-    camera that sees it, both from training views alone."""
-    top_deg = views.facts["lidar_top_deg"]
-    background = scene.background
-    if top_deg is not None:  # without LiDAR nothing ends at its highest view
-        background = _joined(background, wall_tops(scene, views, lidar_top_deg=top_deg))
-    bodies = [ego_body(scene, name, mask, views) for name, mask in views.ego_masks.items()]
-    actors = (*scene.actors, *(body for body in bodies if body is not None))
-    return dataclasses.replace(scene, background=background, actors=actors)
-
-
-def _joined(first: Gaussians, second: Gaussians) -> Gaussians:
-    """Both, at the first one's SH degree, which is not lower than the second's."""
-    if len(second) == 0:
-        return first
-    sh = torch.zeros(len(second), first.sh.shape[1], 3)
-    sh[:, : second.sh.shape[1]] = second.sh
-    semantic = None
-    if first.semantic is not None and second.semantic is not None:
-        semantic = torch.cat([first.semantic, second.semantic])
-    return Gaussians(
-        means=torch.cat([first.means, second.means]),
-        quats=torch.cat([first.quats, second.quats]),
-        scales=torch.cat([first.scales, second.scales]),
-        opacities=torch.cat([first.opacities, second.opacities]),
-        sh=torch.cat([first.sh, sh]),
-        semantic=semantic,
     )

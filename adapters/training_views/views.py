@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 import re
 import threading
@@ -15,7 +14,7 @@ import cv2
 import numpy as np
 from tqdm import tqdm
 
-from adapters.plain_files import decode_image
+from adapters.plain_files import ImageFault, decode_image, is_whole_jpeg
 from adapters.training_views.byte_cache import ByteCache
 from adapters.training_views.depth_priors import DepthPriors, DepthSource, ReferenceDepth
 from adapters.training_views.masks import (
@@ -29,10 +28,13 @@ from augment.cameras import Camera
 from augment.errors import AdapterError
 from augment.reconstruct.view import RecordedView, ViewKey
 from augment.scene import Scene
-from recipes.files import open_file
 
-# ---- Recorded images at the training resolution, read on demand ----------------------------------
-
+NONE = "none"
+_EVERY = re.compile(r"every-(\d{1,6})(?:st|nd|rd|th)")
+CACHE_BYTES = 1 << 30
+_MAX_POSITION_M = 1e6  # float32 has a resolution of 6 cm there
+_MIN_FOCAL, _MAX_FOCAL = 0.05, 50.0  # focal length over width: a view of 169 or of 1.1 degrees
+_TOP_FRAMES = 5  # frames that the LiDAR's highest view is measured in
 # JPEG decoders can leave out the finest parts of each 8x8 block, which costs far less.
 _REDUCED = {
     8: cv2.IMREAD_REDUCED_COLOR_8,
@@ -40,12 +42,6 @@ _REDUCED = {
     2: cv2.IMREAD_REDUCED_COLOR_2,
     1: cv2.IMREAD_COLOR,
 }
-_JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
-_TAIL_BYTES = 64  # some cameras pad the file behind the end marker
-
-
-class ImageFault(Exception):
-    """What is wrong with an image file, as the end of a sentence that starts with its path."""
 
 
 def read_scaled(path: Path, full: Camera, scaled: Camera) -> np.ndarray:
@@ -57,8 +53,10 @@ def read_scaled(path: Path, full: Camera, scaled: Camera) -> np.ndarray:
     Raises:
         ImageFault: missing, cut short, not decodable, or not of the camera's size.
     """
-    is_jpeg = _check_file(path)
-    step = _reduction(full, scaled) if is_jpeg else 1
+    is_jpeg = is_whole_jpeg(path)
+    step = 1
+    while is_jpeg and step < 8 and _can_be_reduced(full, scaled, 2 * step):
+        step *= 2
     image = decode_image(path, _REDUCED[step])
     if image is None:
         raise ImageFault("cannot be decoded")
@@ -74,33 +72,11 @@ def read_scaled(path: Path, full: Camera, scaled: Camera) -> np.ndarray:
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
-def _reduction(full: Camera, scaled: Camera) -> int:
-    """The most that a JPEG can be reduced while it is decoded: not below the size wanted, and only
-    if it divides both sides, since an odd remainder would shift pixels."""
-    for step in (8, 4, 2):
-        divides = full.width % step == 0 and full.height % step == 0
-        if divides and full.width // step >= scaled.width and full.height // step >= scaled.height:
-            return step
-    return 1
-
-
-def _check_file(path: Path) -> bool:
-    """Whether the file is a JPEG; its ends are looked at since decoders fill what is missing."""
-    try:
-        with open_file(path) as file:
-            head = file.read(2)
-            size = file.seek(0, 2)
-            file.seek(max(0, size - _TAIL_BYTES))
-            tail = file.read()
-    except FileNotFoundError:
-        raise ImageFault("does not exist") from None
-    except OSError as error:
-        raise ImageFault(f"cannot be read ({error.strerror or error})") from None
-    if head != _JPEG_START:
-        return False
-    if _JPEG_END not in tail:
-        raise ImageFault("is cut short")
-    return True
+def _can_be_reduced(full: Camera, scaled: Camera, step: int) -> bool:
+    """Whether 1/step of the size is not below the size asked for, and divides both sides: an odd
+    remainder would shift pixels."""
+    divides = full.width % step == 0 and full.height % step == 0
+    return divides and full.width // step >= scaled.width and full.height // step >= scaled.height
 
 
 class Images:
@@ -143,12 +119,6 @@ class Images:
         return image
 
 
-# ---- Which frames are held out of training, by their position in the drive -----------------------
-
-NONE = "none"
-_EVERY = re.compile(r"every-(\d{1,6})(?:st|nd|rd|th)")
-
-
 def holdout_step(holdout: str) -> int | None:
     """N of "every-Nth", None of "none".
 
@@ -167,67 +137,11 @@ def holdout_step(holdout: str) -> int | None:
     return step
 
 
-def is_held_out(position: int, step: int | None) -> bool:
-    """Of the frame at this position of the drive, counted from 0: the last of every `step`."""
-    return step is not None and position % step == step - 1
-
-
-# ---- views ---------------------------------------------------------------------------------------
-
-logger = logging.getLogger(__name__)
-
-CACHE_BYTES = 1 << 30
-_FARTHEST_M = 1e6  # float32 has a resolution of 6 cm there
-_MIN_FOCAL, _MAX_FOCAL = 0.05, 50.0  # focal length over width: a view of 169 or of 1.1 degrees
-_TOP_FRAMES = 5  # frames that the LiDAR's highest view is measured in
-
-
-def recorded_views(
-    scene: Scene,
-    *,
-    scale: float,
-    cameras: Sequence[str] | None = None,
-    holdout: str = "none",
-    cache_bytes: int = CACHE_BYTES,
-    depth: DepthPriors = DepthPriors(),  # noqa: B008 - frozen, so sharing it is safe
-    reference_depth: ReferenceDepth | None = None,
-    masks_dir: Path | None = None,
-    mask_ego: bool = False,
-) -> RecordedViews:
-    """The views of a scene that was opened from recordings.
-
-    scene: as initialised, before any optimisation; its Gaussians tell where sky must be. scale:
-    training resolution over recorded resolution, in (0, 1]. cameras: names, all by default.
-    holdout: "none" or "every-Nth": of the scene's frames the last of every N is held out.
-    cache_bytes: memory for decoded images, and half as much for depth priors; what does not fit is
-    read again. reference_depth: what relative depth maps are brought to metres by where there is no
-    LiDAR. masks_dir: DIR/<camera>.png, white where the image shows the recording car; a camera
-    without a file does not see it. By default such pixels are found by their standing still.
-    mask_ego: do not learn from them.
-
-    Every image is decoded once here. Unusable ones are left out and named in `problems`.
-
-    Raises:
-        AdapterError: an unknown camera or holdout, or no usable image.
-    """
-    if not 0 < scale <= 1:
-        raise ValueError(f"scale must be > 0 and <= 1; got {scale}")
-    return RecordedViews(
-        scene,
-        scale=scale,
-        names=_camera_names(scene, cameras),
-        holdout=holdout,
-        cache_bytes=cache_bytes,
-        depth=depth,
-        reference_depth=reference_depth,
-        masks_dir=masks_dir,
-        mask_ego=mask_ego,
-    )
-
-
 class RecordedViews:
-    """A `ViewSource`; made by `recorded_views`. `load` may be called from several threads.
+    """A `ViewSource`: the views of a scene that was opened from recordings. `load` may be called
+    from several threads.
 
+    Every image is decoded once at the start. Unusable ones are left out and named in `problems`.
     ego_masks: for each camera that sees the recording car, where, bool [H, W] at the training
     resolution. No depth priors are given there: the LiDAR looks past the car at the road behind."""
 
@@ -236,23 +150,37 @@ class RecordedViews:
         scene: Scene,
         *,
         scale: float,
-        names: Sequence[str],
-        holdout: str,
-        cache_bytes: int,
-        depth: DepthPriors,
-        reference_depth: ReferenceDepth | None,
-        masks_dir: Path | None,
-        mask_ego: bool,
+        cameras: Sequence[str] | None = None,
+        holdout: str = "none",
+        cache_bytes: int = CACHE_BYTES,
+        depth: DepthPriors = DepthPriors(),  # noqa: B008 - frozen, so sharing it is safe
+        reference_depth: ReferenceDepth | None = None,
+        masks_dir: Path | None = None,
+        mask_ego: bool = False,
     ) -> None:
+        """scene: as initialised, before any optimisation; its Gaussians tell where sky must be.
+        scale: training resolution over recorded resolution, in (0, 1]. cameras: names, all by
+        default. holdout: "none" or "every-Nth": of the scene's frames the last of every N is held
+        out. cache_bytes: memory for decoded images, and half as much for depth priors; what does
+        not fit is read again. reference_depth: what relative depth maps are brought to metres by
+        where there is no LiDAR. masks_dir: DIR/<camera>.png, white where the image shows the
+        recording car; a camera without a file does not see it. By default such pixels are found by
+        their standing still. mask_ego: do not learn from them.
+
+        Raises:
+            AdapterError: an unknown camera or holdout, or no usable image.
+        """
+        if not 0 < scale <= 1:
+            raise ValueError(f"scale must be > 0 and <= 1; got {scale}")
+        names = _camera_names(scene, cameras)
         step = holdout_step(holdout)
         self._scene = scene
         self._images = Images(cache_bytes)
         self._problems: list[str] = []
         self._cameras = self._read_all(scene, names, scale)
-        positions = {frame.index: i for i, frame in enumerate(scene.frames)}
-        is_test = [is_held_out(positions[key.frame], step) for key in self._cameras]
-        self._train = tuple(k for k, t in zip(self._cameras, is_test, strict=True) if not t)
-        self._test = tuple(k for k, t in zip(self._cameras, is_test, strict=True) if t)
+        held_out = {f.index for f in scene.frames[step - 1 :: step]} if step else set()
+        self._train = tuple(key for key in self._cameras if key.frame not in held_out)
+        self._test = tuple(key for key in self._cameras if key.frame in held_out)
         self._check_split(holdout)
         self._depth = DepthSource(
             scene, self._cameras, depth, cache_bytes=cache_bytes // 2, reference=reference_depth
@@ -434,10 +362,10 @@ def _check_camera(key: ViewKey, camera: Camera) -> None:
     """Refuse what a Camera may be but a recording cannot."""
     where = f"camera {key.camera}, frame {key.frame}"
     position = camera.centre.tolist()
-    if not all(math.isfinite(x) and abs(x) < _FARTHEST_M for x in position):
+    if not all(math.isfinite(x) and abs(x) < _MAX_POSITION_M for x in position):
         raise AdapterError(
-            f"{where}: its position in the scene must be finite and within {_FARTHEST_M:.0f} m of "
-            f"the origin; got {position}. Check the pose in the dataset"
+            f"{where}: its position in the scene must be finite and within {_MAX_POSITION_M:.0f} m "
+            f"of the origin; got {position}. Check the pose in the dataset"
         )
     if not _MIN_FOCAL < camera.fx / camera.width < _MAX_FOCAL:
         raise AdapterError(

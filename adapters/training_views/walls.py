@@ -27,7 +27,7 @@ from augment.render.rasterize import rasterize
 from augment.scene import Gaussians, Scene
 from augment.semantics import SemanticClass as Class
 
-# ---- What one recorded view says of surfaces that go on above the LiDAR's view -------------------
+logger = logging.getLogger(__name__)
 
 LIDAR_REACH_M = 60.0  # the LiDAR meets a wall this far away, if nothing hides it
 LIDAR_MARGIN_RAD = math.radians(4.0)  # the camera is not where the LiDAR is
@@ -45,6 +45,19 @@ _NO_WALL = np.array(
         Class.VEHICLE, Class.TWO_WHEELER, Class.PEDESTRIAN,
     ]
 )  # fmt: skip
+MIN_VIEWS = 3  # that must show a place where a wall goes on, and a piece of it
+_SKY_PART, _SEEN_PAST_PART = 0.3, 0.3  # of the views of a piece, that end the wall
+_SPREAD_LEVELS = 28.0  # of 255: median deviation from the median colour of one surface
+_GAP_M = 0.8  # of pieces in a row that fail end a column; a window that mirrors the sky is lower
+_NEARER, _NEARER_M = 0.03, 0.3  # tolerance of depth comparisons, relative and in metres
+_KEEP_SCORE, _CAMERA_POWER = 0.5, 2.0  # as for the colours of LiDAR's surfaces
+_FEATHER = 0.1  # scores fall over this part of the image towards its border
+MAX_VIEWS = 300  # as many are looked at, evenly over the drive: what is coarse needs no more
+VOXEL_M = 0.08
+_RIM_MARGIN_RAD = math.radians(3.0)
+_MAX_GAUSSIANS = 40_000
+_HEIGHT_M = 30.0  # above the lowest camera
+_SHAPE = SplatShape(opacity=0.6)  # hides most of the sky, yet gives way while it is learnt
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,17 +203,6 @@ def elevation_rad(offsets: np.ndarray) -> np.ndarray:
     return np.arctan2(offsets[:, 2], np.hypot(offsets[:, 0], offsets[:, 1]))
 
 
-# ---- Which pieces of continued walls the recorded views agree on, and in what colour -------------
-
-FEW_VIEWS = 3  # that must show a place where a wall goes on, and a piece of it
-_SKY_PART, _SEEN_THROUGH_PART = 0.3, 0.3  # of the views of a piece, that end the wall
-_SPREAD_LEVELS = 28.0  # of 255: median deviation from the median colour of one surface
-_GAP_M = 0.8  # of pieces in a row that fail end a column; a window that mirrors the sky is lower
-_NEARER, _NEARER_M = 0.03, 0.3  # tolerance of depth comparisons, relative and in metres
-_KEEP_SCORE, _CAMERA_POWER = 0.5, 2.0  # as for the colours of LiDAR's surfaces
-_FEATHER = 0.1  # scores fall over this part of the image towards its border
-
-
 @dataclass(frozen=True, eq=False)
 class Columns:
     """Places in plan where a surface goes on. xy: float64 [C, 2]. low_z_m, high_z_m: float64 [C],
@@ -243,7 +245,7 @@ def vote(
     pieces: Pieces,
     columns: Columns,
     views: Sequence[WallView],
-    looks: Sequence[np.ndarray],
+    sky_tables: Sequence[np.ndarray],
     lidar_top_rad: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Which pieces are surface, bool [N], and their colours, float32 [N, 3]."""
@@ -251,12 +253,12 @@ def vote(
     scores = np.zeros((count, kernels.KEPT), np.float32)
     colours = np.zeros((count, kernels.KEPT, 3), np.uint8)
     cameras = np.zeros((count, kernels.KEPT), np.uint8)
-    shown, sky, through = (np.zeros(count, np.int64) for _ in range(3))
+    shown, sky, seen_past = (np.zeros(count, np.int64) for _ in range(3))
     names = list(dict.fromkeys(view.camera.name for view in views))
-    for view, look in zip(views, looks, strict=True):
-        seen, rgb, score, empty = _look(pieces.centres, view, lidar_top_rad)
-        is_sky = look[colour_cells(rgb)]
-        through[seen[empty]] += 1
+    for view, sky_table in zip(views, sky_tables, strict=True):
+        seen, rgb, score, empty = _observe(pieces.centres, view, lidar_top_rad)
+        is_sky = sky_table[colour_cells(rgb)]
+        seen_past[seen[empty]] += 1
         sky[seen[is_sky & ~empty]] += 1
         shown[seen[~is_sky & ~empty]] += 1
         worst = scores[seen].argmin(axis=1)
@@ -266,15 +268,15 @@ def vote(
         colours[index, worst] = rgb[better]
         cameras[index, worst] = names.index(view.camera.name)
     blended, _ = kernels.blended_colours(scores, colours, cameras, _KEEP_SCORE, _CAMERA_POWER)
-    total = shown + sky + through
-    good = shown >= min(FEW_VIEWS, len(views))
-    good &= (sky <= _SKY_PART * total) & (through <= _SEEN_THROUGH_PART * total)
+    total = shown + sky + seen_past
+    good = shown >= min(MIN_VIEWS, len(views))
+    good &= (sky <= _SKY_PART * total) & (seen_past <= _SEEN_PAST_PART * total)
     good &= _spread(scores, colours, blended) <= _SPREAD_LEVELS
-    empty = (through > _SEEN_THROUGH_PART * total) | (total == 0)
+    empty = (seen_past > _SEEN_PAST_PART * total) | (total == 0)
     return _without_holes(good, empty, pieces, columns), blended
 
 
-def _look(
+def _observe(
     centres: np.ndarray, view: WallView, lidar_top_rad: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Indices of the pieces that nothing hides, their pixels' colours uint8 [M, 3], scores float32
@@ -296,10 +298,10 @@ def _look(
     slack = _NEARER * z + _NEARER_M
     hidden = z > np.abs(depth) + slack
     offsets = centres[seen] - camera.centre.numpy()
-    looked = elevation_rad(offsets) < lidar_top_rad - LIDAR_MARGIN_RAD
-    looked &= np.hypot(offsets[:, 0], offsets[:, 1]) < LIDAR_REACH_M
+    scanned = elevation_rad(offsets) < lidar_top_rad - LIDAR_MARGIN_RAD
+    scanned &= np.hypot(offsets[:, 0], offsets[:, 1]) < LIDAR_REACH_M
     empty = np.where(depth > 0, np.isfinite(depth) & (z < depth - slack), False)
-    empty |= looked & np.isinf(depth)
+    empty |= scanned & np.isinf(depth)
     border = np.minimum(
         np.minimum(u[seen], camera.width - u[seen]) / camera.width,
         np.minimum(v[seen], camera.height - v[seen]) / camera.height,
@@ -338,18 +340,6 @@ def _without_holes(
     return (good | ~empty) & (pieces.step <= last[pieces.column])
 
 
-# ---- wall tops -----------------------------------------------------------------------------------
-
-logger = logging.getLogger(__name__)
-
-MAX_VIEWS = 300  # as many are looked at, evenly over the drive: what is coarse needs no more
-VOXEL_M = 0.08
-_RIM_MARGIN_RAD = math.radians(3.0)
-_MAX_GAUSSIANS = 40_000
-_HEIGHT_M = 30.0  # above the lowest camera
-_SHAPE = SplatShape(opacity=0.6)  # hides most of the sky, yet gives way while it is learnt
-
-
 def wall_tops(scene: Scene, source: ViewSource, *, lidar_top_deg: float = 15.0) -> Gaussians:
     """Degree-0 Gaussians that continue the background above the LiDAR's view; perhaps none.
 
@@ -360,12 +350,12 @@ def wall_tops(scene: Scene, source: ViewSource, *, lidar_top_deg: float = 15.0) 
     path = np.array([frame.world_from_ego[:3, 3].numpy() for frame in scene.frames])
     if not any(len(view.rims.points) for view in views) or len(path) == 0:
         return Gaussians.empty()
-    looks = _sky_looks(views)
+    sky_tables = _sky_tables(views)
     voxel_m = VOXEL_M
     while True:
         columns = _columns(views, path, voxel_m)
         pieces = Pieces.of(columns)
-        keep, colours = vote(pieces, columns, views, looks, math.radians(lidar_top_deg))
+        keep, colours = vote(pieces, columns, views, sky_tables, math.radians(lidar_top_deg))
         kept = int(keep.sum())
         logger.info("%d of %d pieces of walls kept at %.3f m", kept, len(keep), voxel_m)
         if kept <= _MAX_GAUSSIANS:
@@ -384,7 +374,7 @@ def _load_views(scene: Scene, source: ViewSource, lidar_top_deg: float) -> list[
     return [WallView.of(scene, source.load(key), lowest) for key in chosen]
 
 
-def _sky_looks(views: Sequence[WallView]) -> list[np.ndarray]:
+def _sky_tables(views: Sequence[WallView]) -> list[np.ndarray]:
     """For each view, which coarse colours are sky."""
     totals: dict[str, np.ndarray] = {}
     for view in views:
@@ -404,7 +394,7 @@ def _columns(views: Sequence[WallView], path: np.ndarray, voxel_m: float) -> Col
     _, column = np.unique((level << 48) | (cell[:, 0] << 24) | cell[:, 1], return_inverse=True)
     count = int(column.max()) + 1
     seen_by = np.unique(column * len(views) + owner) // len(views)
-    enough = np.bincount(seen_by, minlength=count) >= min(FEW_VIEWS, len(views))
+    enough = np.bincount(seen_by, minlength=count) >= min(MIN_VIEWS, len(views))
     order = np.lexsort((points[:, 2], column))
     sizes = np.bincount(column, minlength=count)
     starts = np.cumsum(sizes) - sizes

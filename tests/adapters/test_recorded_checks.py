@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from adapters.training_views.checks import check_views, with_camera_times
-from adapters.training_views.views import recorded_views
+from adapters.training_views.views import RecordedViews
 from augment.errors import AdapterError
 
 SPEED_MPS = 5.0
@@ -80,7 +80,7 @@ def pitched(camera, degrees: float):
 
 
 def test_a_right_calibration_is_quiet(scene):
-    checks = check_views(scene, recorded_views(scene, scale=1.0))
+    checks = check_views(scene, RecordedViews(scene, scale=1.0))
     assert checks.problems == ()
     (offset,) = checks.offsets
     # A tenth of a pixel would be perfect; the paint's cells are 1.3 pixels wide.
@@ -91,7 +91,7 @@ def test_a_right_calibration_is_quiet(scene):
 
 def test_a_rotated_camera_is_found(scene):
     turned = with_cameras(scene, lambda camera: pitched(camera, 0.5))
-    checks = check_views(turned, recorded_views(turned, scale=1.0))
+    checks = check_views(turned, RecordedViews(turned, scale=1.0))
     (offset,) = checks.offsets
     # 150 tan(0.5 degrees) = 1.3 px, whatever the sign of the fit's rounding.
     assert abs(offset.down_px) == pytest.approx(1.31, abs=0.3) and abs(offset.right_px) < 0.5
@@ -101,7 +101,7 @@ def test_a_rotated_camera_is_found(scene):
 def test_a_late_clock_is_found_and_can_be_set_right(scene):
     # The stamps say 40 ms later, and the poses are those of the stamps.
     late = with_camera_times(scene, 0.040)
-    views = recorded_views(late, scale=1.0)
+    views = RecordedViews(late, scale=1.0)
     checks = check_views(late, views)
     assert checks.time_offset_s == pytest.approx(-0.040, abs=0.006)
     assert any("40 ms before" in p or "39 ms" in p or "41 ms" in p for p in checks.problems)
@@ -138,10 +138,10 @@ def test_a_turning_camera_turns_on(scene):
 
 def test_without_intensity_nothing_is_measured(tmp_path):
     plain = drives.drive(tmp_path, 4, sweeps={f: wall_returns()[:, :3] for f in range(4)})
-    checks = check_views(plain, recorded_views(plain, scale=1.0))
+    checks = check_views(plain, RecordedViews(plain, scale=1.0))
     assert checks.offsets == () and checks.time_offset_s is None
     bare = drives.drive(tmp_path / "bare", 1)
-    assert check_views(bare, recorded_views(bare, scale=1.0)).problems == ()
+    assert check_views(bare, RecordedViews(bare, scale=1.0)).problems == ()
 
 
 def test_jumps_of_exposure_are_named(tmp_path):
@@ -150,7 +150,7 @@ def test_jumps_of_exposure_are_named(tmp_path):
         return (picture(camera, frame) * gain).astype(np.uint8)
 
     scene = drives.drive(tmp_path, 9, cameras=rig, picture=shot, speed_mps=SPEED_MPS)
-    (said,) = check_views(scene, recorded_views(scene, scale=0.5)).problems
+    (said,) = check_views(scene, RecordedViews(scene, scale=0.5)).problems
     assert said.startswith("camera left: brightness changes by a factor of 0.6")
     assert "between frames 4 and 5" in said
 
@@ -158,7 +158,7 @@ def test_jumps_of_exposure_are_named(tmp_path):
         return (picture(camera, frame) * (0.5 if frame in (3, 9, 15) else 1)).astype(np.uint8)
 
     scene = drives.drive(tmp_path / "b", 20, cameras=rig, picture=flicker, speed_mps=SPEED_MPS)
-    said = check_views(scene, recorded_views(scene, scale=0.5)).problems
+    said = check_views(scene, RecordedViews(scene, scale=0.5)).problems
     assert len(said) == 4 and "jumps 3 more times, last after frame 15" in said[-1]
 
 
@@ -175,4 +175,4 @@ def test_impossible_cameras_are_errors_that_say_where(scene, change):
 
     match = {"position": "position in the scene", "focal": "focal length of 0.15 px"}[change]
     with pytest.raises(AdapterError, match=rf"camera left, frame 3: .*{match}"):
-        recorded_views(with_cameras(scene, broken), scale=1.0)
+        RecordedViews(with_cameras(scene, broken), scale=1.0)

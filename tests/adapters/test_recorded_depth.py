@@ -23,7 +23,7 @@ from adapters.training_views.depth_priors import (
     read_relative,
     visible,
 )
-from adapters.training_views.views import recorded_views
+from adapters.training_views.views import RecordedViews
 from augment.errors import AdapterError
 from augment.reconstruct.view import ViewKey
 
@@ -150,7 +150,7 @@ def test_relative_depth_is_aligned_to_the_lidar(scene, tmp_path, kind):
     else:
         cv2.imwrite(str(folder / "000.png"), relative.astype(np.uint16))
     options = DepthPriors(relative_dir=folder.parent, grid_px=4)
-    views = recorded_views(scene, scale=1.0, depth=options)
+    views = RecordedViews(scene, scale=1.0, depth=options)
     view = views.load(KEY)
     mono = view.depth_weight < 1
     assert mono.sum() > 10 and (view.depth_weight[mono] == np.float32(0.1)).all()
@@ -170,13 +170,13 @@ def test_relative_depth_without_lidar_takes_given_distances(tmp_path):
     folder.mkdir(parents=True)
     np.save(folder / "0.npy", np.where(depth > 0, 7 / np.maximum(depth, 1e-6), 0))
     options = DepthPriors(relative_dir=folder.parent)
-    view = recorded_views(
+    view = RecordedViews(
         scene, scale=1.0, depth=options, reference_depth=lambda key, camera: depth
     ).load(KEY)
     truth = depth.ravel()[view.depth_pixels]
     assert len(truth) > 50
     np.testing.assert_allclose(view.depth_m, truth, rtol=1e-3)  # exact but for float32
-    views = recorded_views(scene, scale=1.0, depth=options)
+    views = RecordedViews(scene, scale=1.0, depth=options)
     assert len(views.load(KEY).depth_pixels) == 0
     assert any("0 known distances" in p and "frame 0" in p for p in views.problems)
 
@@ -188,7 +188,7 @@ def test_metric_depth_is_read_as_climategs_writes_it(tmp_path):
     depth = floor_depth(drives.camera())
     cv2.imwrite(str(folder / "000000.png"), np.round(depth * 256).astype(np.uint16))
     options = DepthPriors(metric_dir=folder.parent, grid_px=2)
-    view = recorded_views(scene, scale=0.5, depth=options).load(KEY)
+    view = RecordedViews(scene, scale=0.5, depth=options).load(KEY)
     rows, columns = view.depth_pixels // 32, view.depth_pixels % 32
     assert sorted(set(columns % 2)) == [1] and (view.depth_weight == 1).all()
     truth = depth[2 * rows + 1, 2 * columns + 1]
@@ -205,7 +205,7 @@ def test_sparse_depth_of_street_gaussians(tmp_path):
     value = np.array([9.0, 8.0, 7.0, 3.0], np.float32)
     np.save(folder / "000000_0.npy", {"mask": mask, "value": value})
     np.save(folder / "000001_front.npy", {"mask": mask, "value": value})
-    views = recorded_views(scene, scale=0.5, depth=DepthPriors(sparse_dir=folder))
+    views = RecordedViews(scene, scale=0.5, depth=DepthPriors(sparse_dir=folder))
     assert views.facts["depth_priors"] == ["sparse"] and len(views.problems) == 1
     for frame in (0, 1):
         view = views.load(ViewKey(frame, "front"))
@@ -227,7 +227,7 @@ def test_hostile_and_damaged_depth_files_are_refused_and_named(tmp_path):
     mask = np.ones((48, 64), bool)
     np.save(folder / "000002_0.npy", {"mask": mask, "value": np.ones(5)})
     np.save(folder / "000003_0.npy", {"mask": mask.T, "value": np.ones(mask.size)})
-    views = recorded_views(scene, scale=0.5, depth=DepthPriors(sparse_dir=folder))
+    views = RecordedViews(scene, scale=0.5, depth=DepthPriors(sparse_dir=folder))
     for key in views.train:
         assert len(views.load(key).depth_pixels) == 0
     said = [p for p in views.problems if "its depth is left out" in p]

@@ -15,7 +15,7 @@ from adapters.training_views.masks import (
     read_ego_mask,
     sky_mask,
 )
-from adapters.training_views.views import recorded_views
+from adapters.training_views.views import RecordedViews
 from augment.errors import AdapterError
 from augment.reconstruct.view import ViewKey
 
@@ -62,7 +62,7 @@ def test_sky_lies_above_walls_that_end_below_the_lidars_view(tmp_path):
 def test_without_a_lidar_no_sky_is_sure(tmp_path):
     scene = wall_scene(tmp_path, top_m=8.0)
     assert lidar_top_rad(scene, [0]) is None
-    view = recorded_views(scene, scale=1.0).load(ViewKey(0, "front"))
+    view = RecordedViews(scene, scale=1.0).load(ViewKey(0, "front"))
     assert not view.sky.any()
 
 
@@ -200,7 +200,7 @@ def bonnet_drive(tmp_path):
 
 
 def test_views_know_the_own_car(bonnet_drive):
-    views = recorded_views(bonnet_drive, scale=1.0)
+    views = RecordedViews(bonnet_drive, scale=1.0)
     mask = views.ego_masks["front"]
     assert mask[100:].all() and not mask[:92].any()
     assert 0.15 < views.facts["ego_mask_parts"]["front"] < 0.25
@@ -208,7 +208,7 @@ def test_views_know_the_own_car(bonnet_drive):
     assert (view.weight == 1).all() and len(view.depth_pixels) > 100
     # The floor behind the bonnet is not seen.
     assert not mask.reshape(-1)[view.depth_pixels].any()
-    masked = recorded_views(bonnet_drive, scale=0.5, mask_ego=True)
+    masked = RecordedViews(bonnet_drive, scale=0.5, mask_ego=True)
     weight = masked.load(views.train[0]).weight
     assert (weight[52:] == 0).all() and (weight[:44] == 1).all()
 
@@ -217,11 +217,11 @@ def test_masks_from_files(bonnet_drive, tmp_path):
     folder = tmp_path / "masks"
     folder.mkdir()
     with pytest.raises(AdapterError, match=r"no mask front\.png"):
-        recorded_views(bonnet_drive, scale=0.5, masks_dir=folder)
+        RecordedViews(bonnet_drive, scale=0.5, masks_dir=folder)
     mask = np.zeros((240, 320), np.uint8)
     mask[200:, :160] = 255
     cv2.imwrite(str(folder / "front.png"), mask)
-    views = recorded_views(bonnet_drive, scale=0.5, masks_dir=folder)
+    views = RecordedViews(bonnet_drive, scale=0.5, masks_dir=folder)
     wanted = np.zeros((60, 80), bool)
     wanted[50:, :40] = True
     np.testing.assert_array_equal(views.ego_masks["front"], wanted)
@@ -230,4 +230,4 @@ def test_masks_from_files(bonnet_drive, tmp_path):
         read_ego_mask(folder / "front.png", bonnet_drive.frame(0).cameras["front"])
     (folder / "front.png").write_bytes(b"?")
     with pytest.raises(AdapterError, match="cannot be decoded"):
-        recorded_views(bonnet_drive, scale=0.5, masks_dir=folder)
+        RecordedViews(bonnet_drive, scale=0.5, masks_dir=folder)

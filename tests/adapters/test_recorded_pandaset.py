@@ -13,7 +13,7 @@ from adapters.pandaset.adapter import _frame
 from adapters.pandaset.files import read_sequence
 from adapters.pandaset.labels import PandaSetLabels
 from adapters.training_views.checks import check_views
-from adapters.training_views.views import recorded_views
+from adapters.training_views.views import RecordedViews
 from augment.scene import Scene
 from augment.sky import ConstantSky
 
@@ -30,7 +30,7 @@ def scene(shared_dir) -> Scene:
 
 
 def test_only_the_back_camera_sees_the_own_car(scene):
-    views = recorded_views(scene, scale=0.25)
+    views = RecordedViews(scene, scale=0.25)
     assert list(views.ego_masks) == ["back_camera"]
     mask = views.ego_masks["back_camera"]
     # The roof's highest point was read off the images: 0.745 of the height.
@@ -42,7 +42,7 @@ def test_only_the_back_camera_sees_the_own_car(scene):
 def test_its_calibration_is_right_and_a_turned_camera_is_noticed(scene):
     few = dataclasses.replace(scene, frames=scene.frames[::2])
     cameras = ["front_camera", "right_camera", "left_camera"]
-    checks = check_views(few, recorded_views(few, scale=0.25, cameras=cameras))
+    checks = check_views(few, RecordedViews(few, scale=0.25, cameras=cameras))
     assert checks.problems == () and len(checks.offsets) == 3
     # Images show the world some 20 ms before their stamps: half a rolling shutter, it seems.
     assert -0.03 < checks.time_offset_s < -0.01
@@ -62,6 +62,6 @@ def test_its_calibration_is_right_and_a_turned_camera_is_noticed(scene):
         for frame in few.frames
     )
     wrong = dataclasses.replace(few, frames=frames)
-    said = check_views(wrong, recorded_views(wrong, scale=0.25, cameras=cameras[:2])).problems
+    said = check_views(wrong, RecordedViews(wrong, scale=0.25, cameras=cameras[:2])).problems
     assert len(said) == 1, said
     assert said[0].startswith("camera front_camera: its images lie 0.")

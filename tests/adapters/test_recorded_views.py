@@ -11,15 +11,10 @@ import drives
 import numpy as np
 import pytest
 
+from adapters.plain_files import ImageFault
 from adapters.training_views.byte_cache import ByteCache
 from adapters.training_views.depth_priors import DepthPriors
-from adapters.training_views.views import (
-    ImageFault,
-    holdout_step,
-    is_held_out,
-    read_scaled,
-    recorded_views,
-)
+from adapters.training_views.views import RecordedViews, holdout_step, read_scaled
 from augment.errors import AdapterError
 from augment.reconstruct.view import ViewKey
 
@@ -45,7 +40,7 @@ def scene(tmp_path):
 
 
 def test_a_view_holds_image_camera_and_depth(scene):
-    views = recorded_views(scene, scale=0.5)
+    views = RecordedViews(scene, scale=0.5)
     assert [(k.frame, k.camera) for k in views.train[:3]] == [
         (0, "front"),
         (0, "left"),
@@ -71,7 +66,7 @@ def test_a_view_holds_image_camera_and_depth(scene):
 
 
 def test_two_sources_give_the_same_bits_whatever_the_memory(scene):
-    big, small = (recorded_views(scene, scale=0.4, cache_bytes=size) for size in (1 << 30, 0))
+    big, small = (RecordedViews(scene, scale=0.4, cache_bytes=size) for size in (1 << 30, 0))
     for key in (*big.train, *reversed(big.train)):
         a, b = big.load(key), small.load(key)
         for name in ("rgb", "weight", "sky", "depth_pixels", "depth_m", "depth_weight"):
@@ -79,24 +74,23 @@ def test_two_sources_give_the_same_bits_whatever_the_memory(scene):
 
 
 def test_facts_are_plain(scene):
-    facts = recorded_views(scene, scale=0.5).facts
+    facts = RecordedViews(scene, scale=0.5).facts
     assert json.loads(json.dumps(facts)) == facts
     assert facts["images"] == {"front": 4, "left": 4} and facts["depth_priors"] == ["lidar"]
     assert facts["sizes_px"]["front"] == [32, 24]
 
 
 def test_frames_are_held_out_by_position(scene):
-    views = recorded_views(scene, scale=0.5, holdout="every-2nd", cameras=["left"])
+    views = RecordedViews(scene, scale=0.5, holdout="every-2nd", cameras=["left"])
     assert [k.frame for k in views.train] == [0, 2] and [k.frame for k in views.test] == [1, 3]
     assert {k.camera for k in views.test} == {"left"}
-    views = recorded_views(scene, scale=0.5, holdout="every-3rd")
+    views = RecordedViews(scene, scale=0.5, holdout="every-3rd")
     assert sorted({k.frame for k in views.test}) == [2]
     assert not any("held out" in p for p in views.problems)
 
 
 def test_holdout_words():
     assert holdout_step("none") is None and holdout_step("every-8th") == 8
-    assert [is_held_out(p, 3) for p in range(4)] == [False, False, True, False]
     for bad in ("every-1st", "every-0th", "every", "every-2", "2", "", "every-2nd "):
         with pytest.raises(AdapterError, match="every-Nth"):
             holdout_step(bad)
@@ -104,7 +98,7 @@ def test_holdout_words():
 
 def test_one_camera_and_one_frame_work(tmp_path):
     one = drives.drive(tmp_path, 1)
-    views = recorded_views(one, scale=1.0, holdout="every-2nd")
+    views = RecordedViews(one, scale=1.0, holdout="every-2nd")
     assert views.train == (ViewKey(0, "front"),) and views.test == ()
     text = " ".join(views.problems)
     assert "nothing is held out" in text and "no depth priors" in text and "no sky masks" in text
@@ -118,7 +112,7 @@ def test_unusable_images_are_left_out_and_named(scene):
     Path(paths[0]).unlink()
     Path(paths[1]).write_bytes(b"no picture")
     drives.paint(Path(paths[2]), np.zeros((48, 60, 3), np.uint8))
-    views = recorded_views(scene, scale=0.5)
+    views = RecordedViews(scene, scale=0.5)
     assert [k.frame for k in views.train if k.camera == "left"] == [3]
     assert len(views.train) == 5
     said = views.problems
@@ -137,11 +131,11 @@ def test_no_usable_image_says_what_to_do(scene):
         for path in frame.image_paths.values():
             os.truncate(path, 10)
     with pytest.raises(AdapterError, match=r"no usable recorded image.*First: camera front"):
-        recorded_views(scene, scale=0.5)
+        RecordedViews(scene, scale=0.5)
 
 
 def test_an_image_that_vanishes_later_is_an_error_that_names_it(scene):
-    views = recorded_views(scene, scale=0.5, cache_bytes=0)
+    views = RecordedViews(scene, scale=0.5, cache_bytes=0)
     Path(scene.frame(1).image_paths["front"]).unlink()
     with pytest.raises(AdapterError, match=r"camera front, frame 1: .* does not exist; it could"):
         views.load(ViewKey(1, "front"))
@@ -149,12 +143,12 @@ def test_an_image_that_vanishes_later_is_an_error_that_names_it(scene):
 
 def test_wrong_arguments(scene):
     with pytest.raises(AdapterError, match=r"no camera 'rear'; it has front, left"):
-        recorded_views(scene, scale=0.5, cameras=["front", "rear"])
+        RecordedViews(scene, scale=0.5, cameras=["front", "rear"])
     with pytest.raises(AdapterError, match="has no camera named"):
-        recorded_views(scene, scale=0.5, cameras=[])
+        RecordedViews(scene, scale=0.5, cameras=[])
     for scale in (0, 1.5, float("nan")):
         with pytest.raises(ValueError, match="scale"):
-            recorded_views(scene, scale=scale)
+            RecordedViews(scene, scale=scale)
     with pytest.raises(ValueError, match="grid_px"):
         DepthPriors(grid_px=0)
 

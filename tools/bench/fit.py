@@ -17,7 +17,7 @@ import torch
 from tqdm import tqdm
 
 from adapters.base import open_scene
-from adapters.training_views.views import recorded_views
+from adapters.training_views.views import RecordedViews
 from augment.errors import ClimateGSError
 from augment.reconstruct.config import DensifyConfig, FitConfig
 from augment.reconstruct.trainer import Trainer
@@ -138,7 +138,7 @@ def time_steps(
             f"{scene.source} has no recorded images, so there is nothing to fit to"
         )
     scene = _thinned(scene, case.splats)
-    source: ViewSource = recorded_views(scene, scale=scale)
+    source: ViewSource = RecordedViews(scene, scale=scale)
     for key in source.train:
         source.load(key)  # as in a long run, where images come from memory
     return_free_memory()
