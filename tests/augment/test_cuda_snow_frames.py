@@ -10,15 +10,12 @@ import pytest
 import torch
 
 from augment.cameras import Camera
-from augment.effects.snow import blocks as blocks_module
-from augment.effects.snow import cuda_close, glint_layout
-from augment.effects.snow.blocks import blocks_of
-from augment.effects.snow.cuda_cover import pose_layers
+from augment.effects.snow import cuda
+from augment.effects.snow.cuda import MAX_GLINTS, blocks_of, plan_split, pose_layers
 from augment.effects.snow.kernels import MAX_SPLITS
 from augment.effects.snow.near_camera import Crystals, Grain, Layer, SnowCover, split_near
 from augment.geometry import rigid
 from augment.render.cuda import runtime as gpu
-from augment.render.cuda import runtime as gpu_packets
 from augment.render.cuda.runtime import upload_together
 from augment.render.sh import SH_C0
 from augment.scene import Actor, Gaussians, PosedGaussians, Track
@@ -156,9 +153,9 @@ def test_no_block_near_the_eye_is_left_out_and_few_others_are_looked_at():
     for f, place in ((900.0, (0.0, 0, 0)), (2500.0, (3.0, 1, -1)), (300.0, (8.0, 0, 0.5))):
         view = camera(place, f)
         near = split_near(snow, None, view, torch.from_numpy(SUN), GRAIN)
-        split = cuda_close.plan_split(snow, None, view, SUN, GRAIN)
+        split = plan_split(snow, None, view, SUN, GRAIN)
         assert near is not None and split is not None
-        rows, order = split.rows, split.order.numpy()
+        rows, order = split.arrays[0], split.order.numpy()
         reserved = np.zeros(len(snow), int)
         for first, count, most, _ in rows.tolist():
             reserved[order[first : first + count]] = most**2
@@ -182,7 +179,7 @@ def test_no_block_near_the_eye_is_left_out_and_few_others_are_looked_at():
 )
 def test_snow_that_nothing_splits_stays_as_it_is(snow, view):
     assert split_near(snow, None, view, torch.from_numpy(SUN), GRAIN) is None
-    assert cuda_close.plan_split(snow, None, view, SUN, GRAIN) is None
+    assert plan_split(snow, None, view, SUN, GRAIN) is None
 
 
 def yawed(angle: float, x: float, y: float) -> torch.Tensor:
@@ -245,7 +242,7 @@ def test_a_street_full_of_snow_is_the_cpus(street, monkeypatch):
                for a, b, c in zip(found[:3], expected[:3], again[:3], strict=True))  # fmt: skip
     glints = found[4].gaussians
     assert 0 < int((held_by(glints.opacities) > 0).sum()) < 60
-    assert len(glints) <= 2 * glint_layout.MOST
+    assert len(glints) <= 2 * MAX_GLINTS
 
 
 def test_a_picture_of_close_and_glinting_snow_is_the_cpus(monkeypatch):
@@ -284,8 +281,7 @@ def test_a_frame_sends_one_small_array_and_waits_for_nothing(street, monkeypatch
             return out
 
         monkeypatch.setattr(pretend_gpu, "_run", watched)
-        monkeypatch.setattr(gpu_packets, "upload", lambda a: sent.append(a.nbytes) or upload(a))
-        monkeypatch.setattr(gpu, "upload", lambda a: pytest.fail("another upload"))
+        monkeypatch.setattr(gpu, "upload", lambda a: sent.append(a.nbytes) or upload(a))
         known = dict(gpu._copies)
         cover.parts_for(scene, camera(shift=(0.1, 0.0, 0.0)), backend="cuda")
         assert dict(gpu._copies).keys() == known.keys()
@@ -302,9 +298,9 @@ def test_crystals_that_all_face_alike_leave_no_block_its_bounds(monkeypatch):
     snow = moved(discs(5, 1), (30.0, 0.0, 0.0))
     cover = cover_of(layer(snow, crystals=bright))
     found = posed_on_gpu(cover, [(cover.ground, PosedGaussians(snow))], camera(), monkeypatch)[-1]
-    assert len(found.gaussians) == 2 * glint_layout.MOST
+    assert len(found.gaussians) == 2 * MAX_GLINTS
     opacities = held_by(found.gaussians.opacities)
-    assert int((opacities > 0.02).sum()) > glint_layout.MOST
+    assert int((opacities > 0.02).sum()) > MAX_GLINTS
     assert torch.isfinite(held_by(found.gaussians.means)).all() and float(opacities.max()) <= 1
 
 
@@ -331,7 +327,7 @@ def test_much_snow_on_a_gpu_is_the_cpus_and_the_same_every_time():
 
 @pytest.mark.parametrize("many", [0, 1024], ids=["groups first", "all blocks"])
 def test_blocks_hold_every_point_once_and_are_compact(many, monkeypatch):
-    monkeypatch.setattr(blocks_module, "_MANY", many)
+    monkeypatch.setattr(cuda, "_MANY", many)
     rng = np.random.default_rng(0)
     points = rng.uniform((-30, 5, -1), (30, 40, 2), (5000, 3)).astype(np.float32)
     blocks = blocks_of(points, 128)

@@ -17,7 +17,6 @@ from torch import Tensor
 
 from augment.cameras import Camera
 from augment.effects.snow import surface_kernels as visibility_kernels
-from augment.effects.snow.visibility_layout import CENTRE, PARALLEL, VIEW
 from augment.render.buffers import (
     ALPHA,
     AUTO,
@@ -379,13 +378,13 @@ class Views:
     @property
     def lowest_m(self) -> float:
         """z of the lowest of them; infinite where there are none."""
-        return float(self.views[:, CENTRE + 2].min(initial=np.inf))
+        return float(self.views[:, 14].min(initial=np.inf))
 
     def near(self, low: np.ndarray, high: np.ndarray, reach_m: float) -> Views:
         """Those whose centre is within reach_m of the rectangle between two corners (x, y)."""
-        centres = self.views[:, CENTRE : CENTRE + 2]
+        centres = self.views[:, 12:14]
         gap = np.maximum(np.maximum(low - centres, centres - high), 0)
-        chosen = (np.hypot(gap[:, 0], gap[:, 1]) <= reach_m) | (self.views[:, PARALLEL] == 1)
+        chosen = (np.hypot(gap[:, 0], gap[:, 1]) <= reach_m) | (self.views[:, 15] == 1)
         return replace(self, views=self.views[chosen], sizes=self.sizes[chosen])
 
     def see(self, points: np.ndarray, normals: np.ndarray, is_sure: np.ndarray) -> np.ndarray:
@@ -398,12 +397,10 @@ class Views:
         lifts = np.array(LIFTS_M)
         tolerances = np.array([_FAR_SHARE, _FAR_M, _BELOW_SHARE, _GRAZING, _MARGIN_PX])
         if self.on_gpu:
-            from augment.effects.snow import cuda_visibility
+            from augment.effects.snow import cuda
 
             given = (self.views, self.sizes, self.depths, lifts, tolerances)
-            return on_device(
-                lambda: cuda_visibility.find_seen(points, normals, is_sure, *given), CUDA
-            )
+            return on_device(lambda: cuda.find_seen(points, normals, is_sure, *given), CUDA)
         seen = np.empty(len(points), bool)
         with kernel_threads(_VIEW_ROWS):
             visibility_kernels.find_seen(
@@ -440,7 +437,7 @@ def draw_views(
         start += small.width * small.height
         after_each()
     return Views(
-        np.array(views, np.float64).reshape(-1, VIEW),
+        np.array(views, np.float64).reshape(-1, 17),
         np.array(sizes, np.int64).reshape(-1, 3),
         torch.cat(depths) if depths else torch.zeros(0),
         on_gpu=backend == CUDA and len(depths) > 0,
@@ -448,9 +445,8 @@ def draw_views(
 
 
 def _numbers(camera: Camera) -> np.ndarray:
-    out = np.empty(VIEW)
-    out[:9] = camera.camera_from_world[:3, :3].numpy().ravel()
-    out[9:12] = camera.fx, camera.cx, camera.fy
-    out[CENTRE : CENTRE + 3] = camera.centre.numpy()
-    out[PARALLEL:] = float(camera.is_orthographic), camera.cy
-    return out
+    """A row of `Views.views`."""
+    rotation = camera.camera_from_world[:3, :3].numpy().ravel()
+    lens = (camera.fx, camera.cx, camera.fy)
+    parallel = float(camera.is_orthographic)
+    return np.array([*rotation, *lens, *camera.centre.numpy(), parallel, camera.cy])

@@ -321,7 +321,7 @@ class SnowCover:
             if len(layer.gaussians):
                 covered.append((layer, part))
         if backend == CUDA:
-            from augment.effects.snow.cuda_cover import pose_layers
+            from augment.effects.snow.cuda import pose_layers
 
             return (*parts, *pose_layers(self, covered, camera))
         eye_m = camera.centre
