@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import UseAppendAction
 
-from tools.json_files import JsonFile, write_json
+from tools.output import JsonFile, write_json
 
 Device = Literal["cpu", "cuda"]
 

@@ -23,7 +23,7 @@ from tools.apart import apart, guarded
 from tools.bench_gpu_ceilings import Ceilings, Load, measure_ceilings
 from tools.bench_scene import DEFAULT_CASES, RasterCase
 from tools.gpu_clock import Timing, gpu_facts
-from tools.json_files import write_json
+from tools.output import write_json
 from tools.machine import load_average, machine_facts
 
 

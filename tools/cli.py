@@ -1,60 +1,429 @@
-"""The `climategs` command: its table of subcommands, and how errors leave it."""
+"""The `climategs` command: typed functions and options, whose docstrings are the help, and how
+errors leave it. Heavy imports stay inside the functions, so that `--help` answers at once.
+"""
 
 from __future__ import annotations
 
+import importlib.util
 import logging
 import os
 import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
 
 import tyro
+from tyro.conf import Positional
 
-from tools import (
-    bench_commands,
-    commands,
-    evaluate_command,
-    export_commands,
-    generate_commands,
-    report_command,
-    style_commands,
-)
+from tools.fit_options import FitOptions
+from tools.output import JsonFile, check_local, write_json
+from tools.style_train_options import StyleTrainOptions
+
+if TYPE_CHECKING:
+    from augment.scene import Scene
+
+Backend = Literal["auto", "reference", "cpu", "cuda"]
+Links = Literal["hard", "copy"]
+
+
+@dataclass(frozen=True)
+class RenderOptions:
+    """Render a scene under a recipe into images, depth, labels and a manifest.
+
+    Run it again to go on after an interruption: what is finished is not rendered twice.
+
+    Args:
+        recipe: A recipe file (.yaml), or the name of a preset; `climategs recipes` lists them.
+        scene: procedural:street?seed=3, pandaset:PATH/002, gaussians:PATH/point_cloud.ply, and
+            others (docs/scenes.md), or a bare path, which is recognised by what it holds.
+        out: The output folder. Further recipes and scenes may go into the same one.
+        frames: Frame numbers: all, 4, 0,5,9, or 0:20:2 (start:stop:step, stop excluded).
+        cameras: Camera names separated by commas, or all.
+        scale: Resolution relative to the recipe's.
+        variants: How many draws from the recipe's ranges. The recipe's own number by default.
+        workers: Processes. The bits do not depend on it. One is best where a GPU draws.
+        backend: Which rasteriser draws. auto: on the GPU (cuda) where there is one, else the CPU.
+        camera_path: A JSON file of camera poses to render instead of the scene's own.
+        overwrite: Replace what this scene and recipe wrote before.
+        sheet: Also write a contact sheet of the result.
+        layout: source: also lay the images into a copy of the scene's dataset, in the place, format
+            and size of the recorded ones, for the dataset's own loader.
+        links: Of that copy: hard: unchanged files share the dataset's disk space. copy: nothing is
+            shared.
+    """
+
+    recipe: Positional[str]
+    scene: str
+    out: Path
+    frames: str = "all"
+    cameras: str = "all"
+    scale: float = 1.0
+    variants: int | None = None
+    workers: int = 1
+    backend: Backend = "auto"
+    camera_path: Path | None = None
+    overwrite: bool = False
+    sheet: bool = True
+    layout: Literal["standard", "source"] = "standard"
+    links: Links = "hard"
+
+    def run(self) -> int:
+        """The command. Returns its exit code."""
+        from tools.render import render_recipe
+
+        check_local(self.out, "`climategs generate` writes to object stores")
+        return render_recipe(self)
+
+
+@dataclass(frozen=True)
+class GenerateOptions:
+    """Make a dataset: many scenes under many recipes, as a job file says (docs/generate.md).
+
+    Run it again to go on after an interruption, on this machine or another; what is published is
+    not rendered twice. Several at the same output share the work.
+
+    Args:
+        job: The job file (.yaml): scenes, recipes, variants.
+        out: The output: a folder, or s3://bucket/path, gs://bucket/path.
+        executor: Who renders: this process, processes of this machine, or actors of a Ray cluster.
+        workers: How many; a process for every core by default, one where a GPU draws, on Ray an
+            actor for every GPU then.
+        shard: i/n: do only the i-th of n parts, for schedulers such as SLURM.
+        dry_run: Open the scenes, say what would be rendered, and about how long it takes and how
+            large it gets. Nothing is written.
+        status: Say how far the jobs of the output have come; needs no job file. The exit code is 0
+            if all is done.
+        rescan: Open all scenes again, in case they have got frames since.
+        scratch: Where images are kept until their block is uploaded, for outputs elsewhere.
+        backend: Which rasteriser draws. auto: on the GPU (cuda) where there is one, else the CPU;
+            on Ray the CPU.
+    """
+
+    job: Positional[Path | None] = None
+    out: str = ""
+    executor: Literal["serial", "processes", "ray"] = "processes"
+    workers: int | None = None
+    shard: str = "1/1"
+    dry_run: bool = False
+    status: bool = False
+    rescan: bool = False
+    scratch: Path | None = None
+    backend: Backend = "auto"
+
+    def run(self) -> int:
+        """The command. Returns its exit code."""
+        from augment.errors import ClimateGSError
+
+        if not self.out:
+            raise ClimateGSError("--out is missing: a folder, or s3://bucket/path")
+        if self.job is None and not self.status:
+            raise ClimateGSError("no job file is named: climategs generate JOB.yaml --out OUT")
+        from tools.generate import generate_dataset, show_status
+
+        return show_status(self.out) if self.status else generate_dataset(self)
+
+
+def inspect(
+    uri: Positional[str], camera_path: Path | None = None, json_file: JsonFile = None
+) -> int:
+    """Show what is in a scene: Gaussians, actors, cameras, frames, LiDAR, labels, problems.
+
+    Args:
+        uri: The scene, as for render.
+        camera_path: A JSON file of camera poses to look at instead of the scene's own.
+        json_file: Also write the facts to this file.
+    """
+    from tools.scene_report import describe_scene, scene_text
+
+    facts = describe_scene(open_with_path(uri, camera_path))
+    print(scene_text(facts))
+    write_json(json_file, facts)
+    return 0
+
+
+def explain(
+    recipe: Positional[str],
+    scene: str,
+    variant: int = 0,
+    times: bool = True,
+    json_file: JsonFile = None,
+) -> int:
+    """Show the plan: which passes and buffers a recipe takes on a scene, why, and what they cost.
+
+    Args:
+        recipe: A recipe file or the name of a preset.
+        scene: The scene, as for render.
+        variant: Which draw from the recipe's ranges.
+        times: Render a few views to measure each pass's share of the time.
+        json_file: Also write the plan to this file.
+    """
+    from tools.explain import explain_recipe, explanation_text
+
+    facts = explain_recipe(recipe, scene, variant, times=times)
+    print(explanation_text(facts))
+    write_json(json_file, facts)
+    return 0
+
+
+def recipes(name: Positional[str | None] = None, schema: Path | None = None) -> int:
+    """List the presets, print one of them, or write the JSON Schema that editors check against.
+
+    Args:
+        name: A preset to print.
+        schema: Write the JSON Schema of recipes to this file.
+    """
+    from recipes.json_schema import write_schema
+    from recipes.load import preset_names, preset_text
+
+    if schema is not None:
+        write_schema(schema)
+        print(f"wrote {schema}")
+    elif name is not None:
+        print(preset_text(name), end="")
+    else:
+        print("\n".join(preset_names()))
+    return 0
+
+
+def sheet(
+    out: Positional[Path],
+    frame: int | None = None,
+    video_camera: str | None = None,
+    fps: float = 10.0,
+) -> int:
+    """Draw pictures of an output folder: a contact sheet, and a video of one camera.
+
+    Args:
+        out: A folder that `climategs render` or `generate` wrote.
+        frame: Which frame the contact sheet shows. The middle one by default.
+        video_camera: Also write an MP4 of this camera, all variants side by side.
+        fps: Frames per second of the video.
+    """
+    from tools.sheet import draw_sheet, draw_video
+
+    check_local(out, "`climategs report` reads object stores; or copy the output here")
+    print(draw_sheet(out, frame))
+    if video_camera is not None:
+        print(draw_video(out, video_camera, fps))
+    return 0
+
+
+def report(out: Positional[str], html: Path | None = None, images: int = 48) -> int:
+    """Write one HTML page about an output: contents, weather, pictures, sliders, failures.
+
+    It needs no network, may be sent to others as it is, and is written also while jobs are running.
+
+    Args:
+        out: A folder that `climategs render` or `generate` wrote, or its URI (s3://bucket/path).
+        html: The page to write. By default OUT/report.html; NAME-report.html in the working folder
+            where OUT is not on this machine.
+        images: How many pictures the page has at most. It stays below 5 MB with any number.
+    """
+    from tools.report import text_of, write_report
+
+    print(text_of(write_report(out, html, images)))
+    return 0
+
+
+def evaluate(
+    out: Positional[str],
+    short: int = 1,
+    long: int = 7,
+    scenes: str = "all",
+    recipes: str = "all",
+    pairs: int | None = None,
+    lpips: Path | None = None,
+    lpips_heads: Path | None = None,
+    pictures: Path | None = None,
+    json_file: JsonFile = None,
+) -> int:
+    """Measure how consistent an output's images are: between frames, and between cameras.
+
+    One image is warped into the other by the depth that was written with them, and compared where
+    both show the same (docs/evaluation.md). Finished images are taken while jobs are running, too.
+
+    Args:
+        out: A folder that `climategs render` or `generate` wrote, or its URI (s3://bucket/path).
+        short: How many frames are apart over short range.
+        long: How many frames are apart over long range.
+        scenes: Scene names separated by commas, or all.
+        recipes: Recipe names separated by commas, or all.
+        pairs: At most so many pairs of each kind from each variant of a scene, evenly chosen.
+        lpips: Weights for LPIPS, .pth or .safetensors: of lpips.LPIPS (alex or vgg), or of
+            torchvision's alexnet or vgg16 with lpips-heads. Nothing is downloaded.
+        lpips_heads: The file of LPIPS's linear heads, where lpips has none.
+        pictures: A folder for a picture of each recipe's worst pair of each kind.
+        json_file: Also write all figures to this file, those of every pair included.
+    """
+    from tools.evaluate import evaluate_output, evaluation_text
+
+    facts = evaluate_output(
+        out,
+        short=short,
+        long=long,
+        scenes=None if scenes == "all" else scenes.split(","),
+        recipes=None if recipes == "all" else recipes.split(","),
+        pairs=pairs,
+        lpips=lpips,
+        lpips_heads=lpips_heads,
+        pictures=pictures,
+    )
+    print(evaluation_text(facts))
+    write_json(json_file, facts)
+    return 0
+
+
+def demo(out: Path = Path("out/demo"), frames: int = 10) -> int:
+    """Render the embedded street under five recipes, with a contact sheet and a video.
+
+    Args:
+        out: The output folder.
+        frames: How many frames of the drive.
+    """
+    from tools.render import run_demo
+
+    return run_demo(out, frames)
+
+
+def export(
+    scene: Positional[str],
+    out: Path,
+    kind: Literal["file", "scene", "ply", "ply-parts", "splat"] = "file",
+    frame: int | None = None,
+    half: bool = False,
+    overwrite: bool = False,
+) -> int:
+    """Write a scene as one file to share, or for other programs: .ply, .splat.
+
+    What the kind of file cannot keep is said.
+
+    Args:
+        scene: The scene, as for render.
+        out: The file or folder; a file's suffix is added where it lacks.
+        kind: file: everything in one .climategs file. scene: the same as a folder. ply, splat:
+            Gaussians as they are at one frame. ply-parts: background and every actor apart.
+        frame: At which ply and splat are baked. The first by default.
+        half: A file of about half the size, at a small loss.
+        overwrite: Replace what is there.
+    """
+    from tools.export import export_scene
+
+    return export_scene(scene, out, kind=kind, frame=frame, half=half, overwrite=overwrite)
+
+
+def mirror(out: Positional[Path], scene: str | None = None, links: Links = "hard") -> int:
+    """Lay rendered images into copies of their dataset, as `render --layout source` does.
+
+    Args:
+        out: A folder that `climategs render` or `generate` wrote.
+        scene: Only of this scene. By default of all that the manifest names.
+        links: hard: unchanged files share the dataset's disk space. copy: nothing is shared.
+    """
+    from tools.mirror import mirror_again
+
+    check_local(out, "copy the output here")
+    return mirror_again(out, scene, links=links)
+
+
+def apply(
+    scene: Positional[str],
+    style: Positional[str],
+    out: Path,
+    method: Literal["mkl", "reinhard", "gscm"] = "mkl",
+    strength: float = 1.0,
+    per_region: bool = False,
+    mask: Path | None = None,
+    checkpoint: Path | None = None,
+    overwrite: bool = False,
+    json_file: JsonFile = None,
+) -> int:
+    """Write a scene in the colours of a photograph or a preset, with a picture of both beside it.
+
+    Args:
+        scene: The scene, as for render.
+        style: An image file, or the name of a style preset; `climategs style presets` lists them.
+        out: The styled scene's folder; open it as scene:OUT.
+        method: mkl maps mean and covariance of the colours, reinhard mean and spread of each
+            channel, gscm is the network.
+        strength: 0 leaves the colours, 1 takes on the style's, up to 2 goes beyond.
+        per_region: Maps of their own for road, vegetation and the rest.
+        mask: An image, white where the style image shows sky.
+        checkpoint: A trained network for gscm, in place of the one that comes with the package.
+        overwrite: Replace the scene that is there.
+        json_file: Also write the maps and figures to this file.
+    """
+    from tools.style_apply import apply_style
+
+    facts = apply_style(
+        scene,
+        style,
+        out,
+        method=method,
+        strength=strength,
+        per_region=per_region,
+        mask=mask,
+        checkpoint=checkpoint,
+        overwrite=overwrite,
+    )
+    write_json(json_file, facts)
+    return 0
+
+
+def presets(name: Positional[str | None] = None) -> int:
+    """List the style presets, or print one of them.
+
+    Args:
+        name: A preset to print.
+    """
+    from recipes.weather import style_preset_names, style_preset_text
+
+    print("\n".join(style_preset_names()) if name is None else style_preset_text(name), end="")
+    if name is None:
+        print()
+    return 0
+
+
+def bench() -> None:
+    """Measure speed and error on this machine, one thing at a time."""
+    # A line in the list of commands; the words after it go to a table of their own (tools.cli).
+
+
+def style() -> None:
+    """Colour moods: apply one to a scene, train the network behind them, list the presets."""
+    # A line in the list of commands; the words after it go to a table of their own (tools.cli).
+
+
+def open_with_path(uri: str, camera_path: Path | None) -> Scene:
+    """The scene of a URI, with the cameras of a path file, if given, in place of its own."""
+    from adapters.base import open_scene
+
+    scene = open_scene(uri)
+    if camera_path is None:
+        return scene
+    from adapters.camera_files.paths import with_camera_path
+
+    return with_camera_path(scene, camera_path)
+
 
 COMMANDS = {
-    "render": commands.render,
-    "generate": generate_commands.generate,
-    "fit": commands.fit,
-    "inspect": commands.inspect,
-    "explain": commands.explain,
-    "recipes": commands.recipes,
-    "sheet": commands.sheet,
-    "report": report_command.report,
-    "evaluate": evaluate_command.evaluate,
-    "bench": commands.bench,
-    "demo": commands.demo,
-    "style": commands.style,
-    "export": export_commands.export,
-    "mirror": export_commands.mirror,
+    "render": RenderOptions,
+    "generate": GenerateOptions,
+    "fit": FitOptions,
+    "inspect": inspect,
+    "explain": explain,
+    "recipes": recipes,
+    "sheet": sheet,
+    "report": report,
+    "evaluate": evaluate,
+    "bench": bench,
+    "demo": demo,
+    "style": style,
+    "export": export,
+    "mirror": mirror,
 }
 # Commands of commands, which take over where the first word names one.
-GROUPS = {
-    "bench": {
-        "raster": bench_commands.raster,
-        "gpu": bench_commands.gpu,
-        "smog": bench_commands.smog,
-        "flood": bench_commands.flood,
-        "snow": bench_commands.snow,
-        "style": bench_commands.style,
-        "fit": bench_commands.fit,
-        "trade": bench_commands.trade,
-        "jobs": bench_commands.jobs,
-        "dataset": bench_commands.dataset,
-        "training": bench_commands.training,
-    },
-    "style": {
-        "apply": style_commands.apply,
-        "train": style_commands.train,
-        "presets": style_commands.presets,
-    },
-}
+GROUPS = {"style": {"apply": apply, "train": StyleTrainOptions, "presets": presets}}
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -64,14 +433,16 @@ def main(arguments: list[str] | None = None) -> int:
     arguments = sys.argv[1:] if arguments is None else arguments
     table, prog = COMMANDS, "climategs"
     description = "Weather for driving scenes made of 3D Gaussians."
-    if arguments and arguments[0] in GROUPS:
-        group, *arguments = arguments
-        table, prog, description = GROUPS[group], f"climategs {group}", COMMANDS[group].__doc__
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
     try:
-        return tyro.extras.subcommand_cli_from_dict(
+        if arguments and arguments[0] in ("bench", *GROUPS):
+            group, *arguments = arguments
+            table = _bench_commands() if group == "bench" else GROUPS[group]
+            prog, description = f"climategs {group}", COMMANDS[group].__doc__
+        result = tyro.extras.subcommand_cli_from_dict(
             table, args=arguments, prog=prog, description=description, sort_subcommands=False
         )
+        return result if isinstance(result, int | None) else result.run()
     except KeyboardInterrupt as interruption:
         print(str(interruption) or "interrupted", file=sys.stderr)
         return 130
@@ -80,6 +451,20 @@ def main(arguments: list[str] | None = None) -> int:
             raise
         print(f"error: {error}", file=sys.stderr)
         return 2
+
+
+def _bench_commands() -> dict[str, Callable[..., int]]:
+    """Those of `climategs bench`, which the installed package leaves out."""
+    if importlib.util.find_spec("tools.bench") is None:
+        from augment.errors import ClimateGSError
+
+        raise ClimateGSError(
+            "`climategs bench` is part of the source checkout, not of the installed package: clone "
+            "the repository and run it there (pip install --editable ., or python -m tools.cli)"
+        )
+    from tools.bench.commands import COMMANDS
+
+    return COMMANDS
 
 
 def _is_ours(error: Exception) -> bool:

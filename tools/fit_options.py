@@ -1,5 +1,5 @@
-"""What `climategs fit` was asked for: checked, turned into a FitConfig, and comparable with what an
-earlier run of the same folder was asked for.
+"""What `climategs fit` can be asked for, and what training commands share of it: ranges, the length
+of a run, URIs. Imports stay inside functions, so that `--help` answers at once.
 """
 
 from __future__ import annotations
@@ -9,73 +9,92 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args
 
-from adapters.base import recognise
-from adapters.training_views.depth_priors import DepthPriors
-from adapters.training_views.views import holdout_step
-from adapters.uri import format_uri, parse_uri
-from augment.errors import ClimateGSError
-from augment.reconstruct.config import DensifyConfig, FitConfig
-from augment.reconstruct.renderers import DEVICES
-from tools.fit_truth import open_street
+from tyro.conf import Positional
+
+from tools.output import JsonFile, write_json
+
+if TYPE_CHECKING:
+    from adapters.training_views.depth_priors import DepthPriors
+    from augment.reconstruct.config import DensifyConfig, FitConfig
 
 DEFAULT_MINUTES = 10.0
-DENSIFY = ("absgrad", "mcmc", "none")
 DEPTH_KINDS = ("sparse", "metric", "relative")
-
-_Number = TypeVar("_Number", int, float)
+Densify = Literal["absgrad", "mcmc", "none"]
+Device = Literal["cpu", "cuda"]
+_Value = TypeVar("_Value")
 
 
 @dataclass(frozen=True)
 class FitOptions:
-    """The options of one reconstruction; see `climategs fit --help`.
+    """Reconstruct a scene of Gaussians from recorded images, LiDAR and boxes.
 
-    scene: URI of the raw data. minutes, steps: one of them or neither (10 minutes). cameras: names,
-    None for all. depth_weight, sh_degree, max_splats: None for FitConfig's. depth: see parse_depth.
-    device: where views are rendered, cpu, or cuda by gsplat.
-    truth: URI of the street a recording shows, for the report alone.
+    Run it again to go on after an interruption; the result is the same to the bit. Ctrl-C stops
+    after the current step, and the scene as far as it is fitted is written.
 
-    Raises:
-        ClimateGSError: a value outside its range, or two that exclude each other.
+    Args:
+        scene: Raw data: pandaset:PATH/002, recording:PATH, or a path that is recognised.
+        out: The scene's folder; OUT.fit beside it holds the checkpoint and the report.
+        minutes: How long to optimise, 10 by default. Opening and the report come on top.
+        steps: How many steps instead. The same steps and seed give the same bytes.
+        scale: Resolution of the images that are learnt from, relative to the recorded.
+        cameras: Camera names separated by commas, or all.
+        holdout: Which frames are kept for the report: every-2nd, every-8th, ..., or none.
+        seed: Of everything random.
+        depth_weight: How much depth priors count. 0 switches them off.
+        sh_degree: Highest band of spherical harmonics, 0 to 3.
+        max_splats: Splats are not added beyond this number.
+        densify: How splats are added.
+        image_cache_mb: Memory for decoded images. The result does not depend on it.
+        depth: Depth priors: none, or kinds separated by commas: lidar, metric:DIR (depth maps as
+            render writes them), relative:DIR (monocular networks), sparse:DIR (lidar_depth).
+        ego_masks: A folder of CAMERA.png, white where the image shows the recording car.
+        truth: The procedural street that a recording was rendered from: the report then holds
+            the error against its exact depth.
+        device: Where views are rendered: cpu, or cuda by gsplat (an extra), of which no two runs
+            give the same bytes.
+        overwrite: Begin anew and replace what is there.
+        json_file: Also write the report to this file.
     """
 
-    scene: str
+    scene: Positional[str]
     out: Path
     minutes: float | None = None
     steps: int | None = None
     scale: float = 0.25
-    cameras: tuple[str, ...] | None = None
+    cameras: str = "all"
     holdout: str = "every-2nd"
     seed: int = 0
     depth_weight: float | None = None
     sh_degree: int | None = None
     max_splats: int | None = None
-    densify: str = "absgrad"
+    densify: Densify = "absgrad"
     image_cache_mb: int = 1024
     depth: str = "lidar"
     ego_masks: Path | None = None
     truth: str | None = None
-    device: str = "cpu"
+    device: Device = "cpu"
     overwrite: bool = False
+    json_file: JsonFile = None
 
     def __post_init__(self) -> None:
-        if self.minutes is not None and self.steps is not None:
-            raise ClimateGSError("give --minutes or --steps, not both")
+        from adapters.training_views.views import holdout_step
+        from augment.errors import ClimateGSError
+        from tools.fit_report import open_street
+
+        check_length(self)
         holdout_step(self.holdout)
-        self._check("--minutes", self.minutes, 0, math.inf, "a number of minutes > 0", above=True)
-        self._check("--steps", self.steps, 1, math.inf, "a number of steps >= 1")
-        self._check("--scale", self.scale, 0, 1, "above 0 and at most 1", above=True)
-        self._check("--seed", self.seed, 0, math.inf, ">= 0")
-        self._check("--depth-weight", self.depth_weight, 0, math.inf, ">= 0 (0 switches it off)")
-        self._check("--sh-degree", self.sh_degree, 0, 3, "0, 1, 2 or 3")
-        self._check("--max-splats", self.max_splats, 1, math.inf, "a number of splats >= 1")
-        self._check("--image-cache-mb", self.image_cache_mb, 0, math.inf, "megabytes, >= 0")
-        if self.densify not in DENSIFY:
-            raise ClimateGSError(f"--densify is one of {', '.join(DENSIFY)}; got {self.densify!r}")
-        if self.device not in DEVICES:
-            raise ClimateGSError(f"--device is one of {', '.join(DEVICES)}; got {self.device!r}")
-        if self.cameras is not None and not all(self.cameras):
+        check_range(self, "steps", "a number of steps >= 1", 1)
+        check_range(self, "scale", "above 0 and at most 1", 0, 1, above=True)
+        check_range(self, "seed", ">= 0", 0)
+        check_range(self, "depth_weight", ">= 0 (0 switches it off)", 0)
+        check_range(self, "sh_degree", "0, 1, 2 or 3", 0, 3)
+        check_range(self, "max_splats", "a number of splats >= 1", 1)
+        check_range(self, "image_cache_mb", "megabytes, >= 0", 0)
+        check_choice(self, "densify", get_args(Densify))
+        check_choice(self, "device", get_args(Device))
+        if not all(self.cameras.split(",")):
             raise ClimateGSError("--cameras is names separated by commas, or all")
         parse_depth(self.depth)
         if self.truth is not None:
@@ -83,28 +102,27 @@ class FitOptions:
         if self.ego_masks is not None and not self.ego_masks.is_dir():
             raise ClimateGSError(f"--ego-masks: there is no folder {self.ego_masks}")
 
-    @staticmethod
-    def _check(
-        name: str, value: float | None, low: float, high: float, wanted: str, above: bool = False
-    ) -> None:
-        if value is None:
-            return
-        inside = low < value <= high if above else low <= value <= high
-        if not inside or value == math.inf:  # NaN is not inside either
-            raise ClimateGSError(f"{name} must be {wanted}; got {value}")
+    def run(self) -> int:
+        """The command. Returns its exit code."""
+        from tools.fit import fit_scene
+
+        outcome = fit_scene(self)
+        write_json(self.json_file, outcome.report)
+        return outcome.code
 
     @property
-    def budget_s(self) -> float | None:
-        """Seconds to optimise for; None where the number of steps is given."""
-        if self.steps is not None:
-            return None
-        return 60 * (DEFAULT_MINUTES if self.minutes is None else self.minutes)
+    def camera_names(self) -> tuple[str, ...] | None:
+        """None for all."""
+        return None if self.cameras == "all" else tuple(self.cameras.split(","))
 
     def config(self, steps: int) -> FitConfig:
         """The optimiser's configuration for this many steps."""
+        from augment.reconstruct.config import FitConfig
+
         default = FitConfig()
+        growth = default.densify
         growth = dataclasses.replace(
-            default.densify, max_splats=_or(self.max_splats, default.densify.max_splats)
+            growth, max_splats=value_or(self.max_splats, growth.max_splats)
         )
         if self.densify == "none":
             growth = without_growth(growth)
@@ -114,20 +132,22 @@ class FitOptions:
             default,
             steps=steps,
             seed=self.seed,
-            sh_degree=_or(self.sh_degree, default.sh_degree),
+            sh_degree=value_or(self.sh_degree, default.sh_degree),
             loss=dataclasses.replace(
-                default.loss, depth=_or(self.depth_weight, default.loss.depth)
+                default.loss, depth=value_or(self.depth_weight, default.loss.depth)
             ),
             densify=growth,
         )
 
     def settings(self) -> dict[str, Any]:
         """All that decides the result, flat and as JSON keeps it; not how long it is fitted."""
+        from adapters.uri import format_uri
+
         config = dataclasses.asdict(self.config(1))
         del config["steps"]
         return {
             "scene": format_uri(*resolved_uri(self.scene)),
-            "cameras": "all" if self.cameras is None else ",".join(self.cameras),
+            "cameras": self.cameras,
             "scale": self.scale,
             "holdout": self.holdout,
             "densify": self.densify,
@@ -137,16 +157,65 @@ class FitOptions:
             **_flat(config),
         }
 
-    def length(self) -> dict[str, float]:
-        """How long it was asked to be fitted: {"steps": N} or {"minutes": M}."""
-        if self.steps is not None:
-            return {"steps": self.steps}
-        return {"minutes": DEFAULT_MINUTES if self.minutes is None else self.minutes}
-
 
 def without_growth(config: DensifyConfig) -> DensifyConfig:
     """No splats are added or removed: the part of the run for it ends before it starts."""
     return dataclasses.replace(config, start=1.0, stop=0.0)
+
+
+def check_range(
+    options: Any, name: str, text: str, low: float, high: float = math.inf, above: bool = False
+) -> None:
+    """Refuse an option outside [low, high], or (low, high] where it is to be above; None is none.
+
+    Raises:
+        ClimateGSError: it is outside, infinite or no number; text says what it must be.
+    """
+    from augment.errors import ClimateGSError
+
+    value = getattr(options, name)
+    if value is None:
+        return
+    inside = low < value <= high if above else low <= value <= high
+    if not inside or value == math.inf:  # NaN is not inside either
+        raise ClimateGSError(f"--{name.replace('_', '-')} must be {text}; got {value}")
+
+
+def check_choice(options: Any, name: str, choices: tuple[str, ...]) -> None:
+    """Refuse an option that is none of the choices.
+
+    Raises:
+        ClimateGSError: it is none.
+    """
+    from augment.errors import ClimateGSError
+
+    if (value := getattr(options, name)) not in choices:
+        raise ClimateGSError(f"--{name} is one of {', '.join(choices)}; got {value!r}")
+
+
+def check_length(options: Any) -> None:
+    """Refuse minutes beside steps, and minutes that are no time.
+
+    Raises:
+        ClimateGSError: they are.
+    """
+    from augment.errors import ClimateGSError
+
+    if options.minutes is not None and options.steps is not None:
+        raise ClimateGSError("give --minutes or --steps, not both")
+    check_range(options, "minutes", "a number of minutes > 0", 0, above=True)
+
+
+def length_of(options: Any) -> dict[str, float]:
+    """How long a training was asked to take: {"steps": N} or {"minutes": M}."""
+    if options.steps is not None:
+        return {"steps": options.steps}
+    return {"minutes": value_or(options.minutes, DEFAULT_MINUTES)}
+
+
+def budget_s(options: Any) -> float | None:
+    """Seconds to train for; None where the number of steps is given."""
+    return None if options.steps is not None else 60 * length_of(options)["minutes"]
 
 
 def parse_depth(text: str) -> DepthPriors:
@@ -156,6 +225,9 @@ def parse_depth(text: str) -> DepthPriors:
     Raises:
         ClimateGSError: another kind, one given twice, or no such folder.
     """
+    from adapters.training_views.depth_priors import DepthPriors
+    from augment.errors import ClimateGSError
+
     if text == "none":
         return DepthPriors(lidar=False)
     found: dict[str, Path | bool] = {}
@@ -185,31 +257,21 @@ def resolved_uri(uri: str) -> tuple[str, str, dict[str, str]]:
     Raises:
         AdapterError: no such path, or a path that is recognised as no scene.
     """
+    from adapters.base import recognise
+    from adapters.uri import parse_uri
+
     scheme, path, query = parse_uri(uri)
     if scheme is None:
         scheme = recognise(Path(path))
-    if Path(path).exists():
-        path = str(_absolute(Path(path)))
+    place = Path(path)
+    if place.exists():
+        # Without `..`, but with the last name as given, even of a link: it names the scene.
+        whole = place.name in ("", "..")
+        path = str(place.resolve() if whole else place.parent.resolve() / place.name)
     return scheme, path, query
 
 
-def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    """Every setting that is not the same: `scale was 0.25, now 0.5`."""
-    return [
-        f"{name} was {before.get(name)}, now {now.get(name)}"
-        for name in dict.fromkeys([*before, *now])
-        if before.get(name) != now.get(name)
-    ]
-
-
-def _absolute(path: Path) -> Path:
-    """Without `..`, but with the last name as given, even of a link: it names the scene."""
-    if path.name in ("", ".."):
-        return path.resolve()
-    return path.parent.resolve() / path.name
-
-
-def _or(value: _Number | None, default: _Number) -> _Number:
+def value_or(value: _Value | None, default: _Value) -> _Value:
     return default if value is None else value
 
 
@@ -217,7 +279,7 @@ def _flat(nested: Mapping[str, Any], above: str = "") -> dict[str, Any]:
     flat: dict[str, Any] = {}
     for name, value in nested.items():
         if isinstance(value, Mapping):
-            flat.update(_flat(value, f"{above}{name}."))
+            flat |= _flat(value, f"{above}{name}.")
         else:
             flat[f"{above}{name}"] = value
     return flat

@@ -1,24 +1,48 @@
-"""What a reconstruction is worth: figures as JSON and Markdown, curves, pictures."""
+"""What a reconstruction is worth: recorded views against their renders, as figures in JSON and
+Markdown, curves, and pictures; and against the exact depth of a procedural street.
+"""
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+import cv2
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from adapters.uri import parse_uri
+from augment.cameras import Camera
+from augment.errors import AdapterError
+from augment.geometry import rigid
 from augment.jobs.atomic import make_folder, output_error, write_atomic
-from augment.reconstruct.view import ViewKey, ViewSource
+from augment.metrics.image import DepthErrors, depth_errors, flip, flip_map, psnr, ssim
+from augment.plan import make_plan
+from augment.reconstruct.view import RecordedView, ViewKey, ViewSource
+from augment.render.buffers import EXPECTED_DEPTH, MEDIAN_DEPTH
+from augment.render.composite import quantise
 from augment.scene import Scene
-from tools.fit_curves import draw_curves
-from tools.fit_pictures import choose_views, draw_views
-from tools.fit_scores import ViewScore, evaluate_views, mean_scores, means_by_camera
+from augment.semantics import SemanticClass
+from augment.views import SURFACE_ALPHA, render_buffers
+from recipes.load import load_recipe
+from recipes.schema import Recipe
+from tools.drawing import color_bar, color_mapped, log_ticks, short_number, write
+from tools.plots import FIT_PANELS, write_curves
 from tools.sheet import write_rgb
+
+if TYPE_CHECKING:
+    from adapters.procedural import StreetTruth
 
 MAX_TRAINING_VIEWS = 60  # where nothing is held out
 TRAINING_SAMPLE = 12  # beside the held-out views, to see what was learnt by heart
+MAX_TRUE_VIEWS = 24
 CURVES, PICTURES = "curves.png", "held_out.jpg"
 TRAINING_PICTURES = "training_views.jpg"
 
@@ -60,54 +84,47 @@ def write_report(
     """Evaluate all held-out views and write report.json, report.md, curves.png and held_out.jpg.
 
     Without held-out views, training views are scored, at most MAX_TRAINING_VIEWS of them, and the
-    report says so; the pictures are then training_views.jpg. history: as `draw_curves` takes it.
-    facts: what else is to stand in report.json, in JSON's types. Returns report.json's content.
+    report says so; the pictures are then training_views.jpg. history: rows of averages {"step",
+    "seconds", "loss", "splats", ...} and of evaluations with "split" (test or train), "psnr",
+    "depth_median_m". facts: what else is to stand in report.json, in JSON's types. Returns
+    report.json's content.
 
     Raises:
         OutputError: the folder cannot be written.
     """
-    scored = _choose_split(source)
-    scores = evaluate_views(scene, source, scored.keys, progress=progress)
+    split, keys, note = _choose_split(source)
+    scores = evaluate_views(scene, source, keys, progress=progress)
     report = {
         **(facts or {}),
-        "gaussians": len(scene.background) + sum(len(a.gaussians) for a in scene.actors),
+        "gaussians": sum(map(len, scene.all_gaussians)),
         "actors": len(scene.actors),
-        "scored": {"split": scored.split, "views": len(scores), "note": scored.note},
+        "scored": {"split": split, "views": len(scores), "note": note},
         "mean": mean_scores(scores),
         "cameras": means_by_camera(scores),
-        "training_sample": _training_sample(scene, source) if scored.split == "test" else None,
+        "training_sample": _training_sample(scene, source) if split == "test" else None,
         "views": [{"frame": s.key.frame, "camera": s.key.camera, **s.numbers()} for s in scores],
         "history": list(history),
         "definitions": DEFINITIONS,
     }
     report = _plain(report)
-    pictures = _write_pictures(folder, scene, source, scores, history, scored.split)
+    pictures = _write_pictures(folder, scene, source, scores, history, split)
     write_atomic(folder / "report.md", _markdown(scene, report, pictures).encode())
     data = json.dumps(report, indent=1, ensure_ascii=False, allow_nan=False)
     write_atomic(folder / "report.json", data.encode())  # last: it says that all else is there
     return report
 
 
-@dataclass(frozen=True)
-class _Scored:
-    """Which views are scored. split: "test" or "train". note: empty, or what a reader must know."""
-
-    split: str
-    keys: tuple[ViewKey, ...]
-    note: str
-
-
-def _choose_split(source: ViewSource) -> _Scored:
+def _choose_split(source: ViewSource) -> tuple[str, tuple[ViewKey, ...], str]:
+    """Which views are scored: test or train, the views, and what a reader must know."""
     if source.test:
-        return _Scored("test", source.test, "")
+        return "test", source.test, ""
     keys = _spread(source.train, MAX_TRAINING_VIEWS)
     part = "all of them" if len(keys) == len(source.train) else f"{len(keys)} of them"
-    return _Scored(
-        "train",
-        keys,
+    note = (
         f"No view was held out: these are training views ({part}), which the scene was fitted to, "
-        f"so the figures say less than those of views it has never seen.",
+        f"so the figures say less than those of views it has never seen."
     )
+    return "train", keys, note
 
 
 def _training_sample(scene: Scene, source: ViewSource) -> dict[str, float]:
@@ -120,18 +137,20 @@ def _spread(keys: Sequence[ViewKey], most: int) -> tuple[ViewKey, ...]:
     """At most so many of the views, of all cameras alike, evenly spread over each one's."""
     if len(keys) <= most:
         return tuple(keys)
-    by_camera = [
-        [key for key in keys if key.camera == name]
-        for name in dict.fromkeys(k.camera for k in keys)
-    ]
-    each = max(1, most // len(by_camera))
+    cameras = dict.fromkeys(key.camera for key in keys)
+    each = max(1, most // len(cameras))
     chosen = {
-        own[int((i + 0.5) / count * len(own))]
-        for own in by_camera
-        for count in [min(each, len(own))]
-        for i in range(count)
+        key
+        for name in cameras
+        for key in _evenly_spaced([key for key in keys if key.camera == name], each)
     }
     return tuple(key for key in keys if key in chosen)
+
+
+def _evenly_spaced(values: Sequence[Any], most: int) -> list[Any]:
+    """At most so many of them, from the middles of as many equal parts."""
+    count = min(most, len(values))
+    return [values[int((i + 0.5) / count * len(values))] for i in range(count)]
 
 
 def _write_pictures(
@@ -154,9 +173,7 @@ def _write_pictures(
         name = PICTURES if split == "test" else TRAINING_PICTURES
         write_rgb(folder / name, draw_views(scene, source, choose_views(scores)))
         titles[name] = "recorded, rendered, error, depth"
-    curves = draw_curves(history)
-    if curves is not None:
-        write_rgb(folder / CURVES, curves)
+    if write_curves(folder / CURVES, history, FIT_PANELS):
         titles[CURVES] = "loss, PSNR, depth error and Gaussians over the steps"
     return titles
 
@@ -196,21 +213,18 @@ def _table(report: Mapping[str, Any], unit: str) -> list[str]:
     """A row per camera and one of the means over all views; columns nothing is known of are out."""
     known = [name for name in _COLUMNS if name == "views" or name in report["mean"]]
     total = {"views": report["scored"]["views"], **report["mean"]}
-    rows = [*report["cameras"].items(), ("**all**", total)]
 
     def cell(row: Mapping[str, float], name: str) -> str:
         _, text, factor = _COLUMNS[name]
         return text.format(row[name] * factor, unit=unit) if name in row else "-"
 
-    head = ["camera", *(_COLUMNS[name][0] for name in known)]
-    return [
-        f"| {' | '.join(head)} |",
-        f"|---|{'---:|' * len(known)}",
-        *(
-            f"| {' | '.join([camera.replace('|', '/'), *(cell(row, n) for n in known)])} |"
-            for camera, row in rows
-        ),
+    lines = [f"|---|{'---:|' * len(known)}"]
+    rows = [("camera", [_COLUMNS[name][0] for name in known])] + [
+        (camera, [cell(row, name) for name in known])
+        for camera, row in (*report["cameras"].items(), ("**all**", total))
     ]
+    texts = [f"| {' | '.join([name.replace('|', '/'), *cells])} |" for name, cells in rows]
+    return [texts[0], *lines, *texts[1:]]
 
 
 def _training_line(report: Mapping[str, Any]) -> list[str]:
@@ -235,4 +249,414 @@ def _plain(value: Any) -> Any:
     return value
 
 
-__all__ = ["ViewScore", "evaluate_views", "mean_scores", "write_report"]
+# ---- Scores: how far renders of recorded views are from what was recorded ------------------------
+
+
+class RenderedView(NamedTuple):
+    """What a user gets of a camera without weather. rgb: uint8 [H, W, 3], clamped to [0, 1] and
+    rounded to 8 bits. alpha, median_depth_m, expected_depth_m: float32 [H, W]. has_surface: bool
+    [H, W], where a depth is written to files.
+    """
+
+    rgb: np.ndarray
+    alpha: np.ndarray
+    median_depth_m: np.ndarray
+    expected_depth_m: np.ndarray
+    has_surface: np.ndarray
+
+
+@dataclass(frozen=True)
+class ViewScore:
+    """One view's render against its recording.
+
+    psnr (dB), ssim, flip over the pixels of weight > 0, which are the part `scored` of all; NaN
+    where there are none, and flip also where it was not asked for. median, expected: errors of
+    both depths over the pixels with a depth prior and a surface (alpha >= SURFACE_ALPHA), weighted
+    as the priors. no_surface: the part of the pixels with a prior that have none; NaN without
+    priors.
+    """
+
+    key: ViewKey
+    psnr: float
+    ssim: float
+    flip: float
+    scored: float
+    median: DepthErrors
+    expected: DepthErrors
+    no_surface: float
+
+    def numbers(self) -> dict[str, float]:
+        """By the names that reports use; depth_* are those of the median depth, as in files."""
+        return {
+            "psnr": self.psnr,
+            "ssim": self.ssim,
+            "flip": self.flip,
+            "scored": self.scored,
+            "depth_median_m": self.median.median_m,
+            "depth_p90_m": self.median.p90_m,
+            "depth_abs_rel": self.median.abs_rel,
+            "depth_within_5cm": self.median.within_5cm,
+            "expected_depth_median_m": self.expected.median_m,
+            "expected_depth_p90_m": self.expected.p90_m,
+            "depth_pixels": float(self.median.pixels),
+            "no_surface": self.no_surface,
+        }
+
+
+def evaluate_views(
+    scene: Scene,
+    source: ViewSource,
+    keys: Sequence[ViewKey],
+    *,
+    with_flip: bool = True,
+    progress: bool = False,
+) -> list[ViewScore]:
+    """The score of every view, at the source's resolution and with recorded exposure.
+
+    Only weights of 0 leave a pixel out: a scene is judged on the whole picture, not where learning
+    was easy. with_flip: FLIP takes most of the time, 0.2 s for 480x270 pixels on one core.
+    """
+    shown = tqdm(keys, desc="evaluate", unit="view", disable=None if progress else True)
+    return [_score(key, scene, source.load(key), with_flip) for key in shown]
+
+
+def mean_scores(scores: Iterable[ViewScore]) -> dict[str, float]:
+    """Means over the views by the names of `ViewScore.numbers`, each over the views that have a
+    number; names that no view has one for are left out, as are infinite means (equal pictures).
+    """
+    rows = [score.numbers() for score in scores]
+    means: dict[str, float] = {}
+    for name in rows[0] if rows else ():
+        known = [row[name] for row in rows if not math.isnan(row[name])]
+        if known and math.isfinite(mean := float(np.mean(known))):
+            means[name] = mean
+    return means
+
+
+def means_by_camera(scores: Sequence[ViewScore]) -> dict[str, dict[str, float]]:
+    """`mean_scores` of every camera, with the number of its views."""
+    cameras = dict.fromkeys(score.key.camera for score in scores)
+    return {
+        name: {"views": len(own), **mean_scores(own)}
+        for name in cameras
+        for own in [[score for score in scores if score.key.camera == name]]
+    }
+
+
+def render_recorded(scene: Scene, camera: Camera) -> RenderedView:
+    """The view at the camera's own resolution under no weather, as its camera records it."""
+    plan = make_plan(_clear(), scene)
+    plan = dataclasses.replace(plan, buffers=plan.buffers | {EXPECTED_DEPTH, MEDIAN_DEPTH})
+    buffers = render_buffers(scene, camera, plan)
+    raster = buffers.raster
+    assert raster.alpha is not None
+    assert raster.median_depth is not None and raster.expected_depth is not None
+    alpha = raster.alpha.numpy()
+    return RenderedView(
+        rgb=quantise(buffers.rgb),
+        alpha=alpha,
+        median_depth_m=raster.median_depth.numpy(),
+        expected_depth_m=raster.expected_depth.numpy(),
+        has_surface=alpha >= SURFACE_ALPHA,
+    )
+
+
+@cache
+def _clear() -> Recipe:
+    return load_recipe("clear").resolve(0)
+
+
+def _found_camera(scene: Scene, key: ViewKey, camera: Camera) -> Camera:
+    """`camera` where the fitted scene says that it stood: a fit refines recorded poses."""
+    pose = scene.frame(key.frame).cameras[key.camera].camera_from_world
+    return dataclasses.replace(camera, camera_from_world=pose)
+
+
+def _score(key: ViewKey, scene: Scene, view: RecordedView, with_flip: bool) -> ViewScore:
+    rendered = render_recorded(scene, _found_camera(scene, key, view.camera))
+    counts = view.weight > 0
+    scored = float(counts.mean())
+    numbers = {"psnr": math.nan, "ssim": math.nan, "flip": math.nan}
+    if scored > 0:
+        metrics = {"psnr": psnr, "ssim": ssim, **({"flip": flip} if with_flip else {})}
+        weight = None if scored == 1 else counts
+        numbers |= {name: m(rendered.rgb, view.rgb, weight) for name, m in metrics.items()}
+    at = view.depth_pixels
+    surface = rendered.has_surface.reshape(-1)[at]
+
+    def errors(depth_m: np.ndarray) -> DepthErrors:
+        true_m, weight = view.depth_m[surface], view.depth_weight[surface]
+        return depth_errors(depth_m.reshape(-1)[at[surface]], true_m, weight)
+
+    return ViewScore(
+        key=key,
+        **numbers,
+        scored=scored,
+        median=errors(rendered.median_depth_m),
+        expected=errors(rendered.expected_depth_m),
+        no_surface=float(1 - surface.mean()) if len(at) else math.nan,
+    )
+
+
+# ---- Pictures: recorded views beside their renders, where they differ, and the depth -------------
+
+MAX_ROWS = 12
+MAX_OF_A_CAMERA = 3
+CELL_WIDTH = 480  # px of one image
+_GAP, _EDGE = 6, 16
+_HEAD, _TITLE = 70, 34  # px above the first row, and above each row's images
+_BACKGROUND, _INK, _SOFT, _NOTHING = (250, 250, 250), (30, 30, 30), (110, 110, 110), (90, 90, 90)
+_BAR = (200, 10)
+_FLIP_COLORS, _DEPTH_COLORS = cv2.COLORMAP_MAGMA, cv2.COLORMAP_TURBO
+
+
+class _Row(NamedTuple):
+    """Images at the size they are drawn; depth_m [H, W], 0 where there is no surface; counts [H, W]
+    bool, False where a pixel is left out of the scores."""
+
+    score: ViewScore
+    recorded: np.ndarray
+    rendered: np.ndarray
+    error: np.ndarray
+    depth_m: np.ndarray
+    counts: np.ndarray
+
+
+def choose_views(scores: Sequence[ViewScore]) -> list[ViewScore]:
+    """A few views of every camera, evenly spread over the drive, at most MAX_ROWS in all.
+
+    Of more cameras than that, the first ones.
+    """
+    cameras = list(dict.fromkeys(score.key.camera for score in scores))[:MAX_ROWS]
+    each = max(1, min(MAX_OF_A_CAMERA, MAX_ROWS // max(1, len(cameras))))
+    return [
+        score
+        for camera in cameras
+        for score in _evenly_spaced([s for s in scores if s.key.camera == camera], each)
+    ]
+
+
+def draw_views(scene: Scene, source: ViewSource, scores: Sequence[ViewScore]) -> np.ndarray:
+    """uint8 RGB: a row for every view, recorded | rendered | FLIP | depth, with its figures."""
+    rows = [_row(scene, source, score) for score in scores]
+    nearest, farthest = _depth_range(rows)
+    heights = [_TITLE + row.recorded.shape[0] + _GAP for row in rows]
+    width = 2 * _EDGE + 4 * CELL_WIDTH + 3 * _GAP
+    sheet = np.full((_HEAD + sum(heights) + _EDGE, width, 3), _BACKGROUND, np.uint8)
+    unit = " m" if scene.has_metric_scale else ""
+    _draw_head(sheet, nearest, farthest, unit)
+    top = _HEAD
+    for row, height in zip(rows, heights, strict=True):
+        key, seen = row.score.key, row.depth_m > 0
+        write(sheet, f"{key.camera}, frame {key.frame}", _EDGE, top + 24, size=0.6, color=_INK)
+        write(sheet, _figures(row.score, unit), _column(1), top + 24, size=0.5, color=_INK)
+        # Near is red, far is blue.
+        part = np.log(np.where(seen, row.depth_m, nearest) / nearest) / np.log(farthest / nearest)
+        images = (
+            row.recorded,
+            row.rendered,
+            _masked(color_mapped(row.error, _FLIP_COLORS), row.counts),
+            _masked(color_mapped(1 - part, _DEPTH_COLORS), seen),
+        )
+        for i, image in enumerate(images):
+            y, x = top + _TITLE, _column(i)
+            sheet[y : y + image.shape[0], x : x + CELL_WIDTH] = image
+        top += height
+    return sheet
+
+
+def _row(scene: Scene, source: ViewSource, score: ViewScore) -> _Row:
+    view = source.load(score.key)
+    rendered = render_recorded(scene, _found_camera(scene, score.key, view.camera))
+    counts = view.weight > 0
+    if counts.any():
+        error = flip_map(rendered.rgb, view.rgb, counts)
+    else:
+        error = np.zeros(counts.shape, np.float32)
+    depth = np.where(rendered.has_surface, rendered.median_depth_m, np.float32(0))
+    return _Row(
+        score=score,
+        recorded=_fitted(view.rgb),
+        rendered=_fitted(rendered.rgb),
+        error=_fitted(error),
+        # Depths and masks do not average: between two surfaces there is none.
+        depth_m=_fitted(depth, cv2.INTER_NEAREST),
+        counts=_fitted(counts.astype(np.uint8), cv2.INTER_NEAREST) > 0,
+    )
+
+
+def _fitted(image: np.ndarray, how: int | None = None) -> np.ndarray:
+    """The image at CELL_WIDTH."""
+    height = max(1, round(image.shape[0] * CELL_WIDTH / image.shape[1]))
+    shrinks = image.shape[1] > CELL_WIDTH
+    how = how if how is not None else cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+    return cv2.resize(image, (CELL_WIDTH, height), interpolation=how)
+
+
+def _depth_range(rows: Sequence[_Row]) -> tuple[float, float]:
+    """Nearest and farthest depth of the colour scale: all but 1 % at both ends, 2 digits."""
+    depths = np.concatenate([row.depth_m[row.depth_m > 0] for row in rows] or [np.zeros(0)])
+    if not len(depths):
+        return 1.0, 100.0
+    low, high = (float(f"{v:.1g}") for v in np.quantile(depths, (0.01, 0.99)))
+    return low, max(high, 2 * low)
+
+
+def _masked(image: np.ndarray, shown: np.ndarray) -> np.ndarray:
+    return np.where(shown[..., None], image, np.array(_NOTHING, np.uint8))
+
+
+def _draw_head(sheet: np.ndarray, nearest: float, farthest: float, unit: str) -> None:
+    for i, name in enumerate(("recorded", "rendered", "FLIP error", "depth")):
+        write(sheet, name, _column(i), 34, size=0.8, color=_INK, thickness=2)
+    flip_ticks = {f"{v:g}": v for v in (0.0, 0.5, 1.0)}
+    _draw_scale(sheet, 2, color_bar(*_BAR, _FLIP_COLORS), flip_ticks, "left out")
+    span = np.log(farthest / nearest)
+    ticks = log_ticks(nearest, farthest)
+    ticks = ticks[:: -(-len(ticks) // 4)]  # at most four, so that their texts do not meet
+    depths = {f"{short_number(v)}{unit}": float(np.log(v / nearest) / span) for v in ticks}
+    bar = color_bar(*_BAR, _DEPTH_COLORS)[:, ::-1]
+    _draw_scale(sheet, 3, bar, depths, "no surface")
+
+
+def _draw_scale(
+    sheet: np.ndarray, column: int, bar: np.ndarray, ticks: dict[str, float], nothing: str
+) -> None:
+    """A colour bar at the right end of a column's head, and what grey means to its left."""
+    height, width = bar.shape[:2]
+    x, y = _column(column) + CELL_WIDTH - width - 20, 22
+    sheet[y : y + height, x : x + width] = bar
+    for text, part in ticks.items():
+        at = x + part * width
+        cv2.line(sheet, (round(at), y + height), (round(at), y + height + 4), _SOFT, 1)
+        write(sheet, text, at, y + height + 20, size=0.45, color=_INK, align="centre")
+    left = x - 106
+    sheet[y : y + height, left : left + height] = _NOTHING
+    write(sheet, nothing, left + height + 5, y + height, size=0.45, color=_INK)
+
+
+def _column(number: int) -> int:
+    return _EDGE + number * (CELL_WIDTH + _GAP)
+
+
+def _figures(score: ViewScore, unit: str) -> str:
+    """The row's figures that are known, in one line."""
+    numbers = score.numbers()
+    texts = {
+        "psnr": "PSNR {:.2f} dB",
+        "ssim": "SSIM {:.3f}",
+        "flip": "FLIP {:.3f}",
+        "depth_median_m": f"depth error {{:.3f}}{unit} (median)",
+        "depth_p90_m": f"{{:.2f}}{unit} (90 %)",
+    }
+    return "     ".join(
+        text.format(numbers[name]) for name, text in texts.items() if not np.isnan(numbers[name])
+    )
+
+
+# ---- A scene fitted to renders of the procedural street, against the street's exact depth --------
+
+
+@dataclass(frozen=True)
+class TruthErrors:
+    """Depth errors over all pixels of a number of views whose true depth is known.
+
+    median, expected: of both depths, over the pixels that truly show a surface and are rendered
+    with one. by_class: the median depth's, by the true class's name. no_surface: the part of the
+    true surface pixels that are rendered without one. sky_covered: the part of the true sky pixels
+    that are rendered with a surface; sky_alpha: their mean opacity. NaN where no pixel is meant.
+    """
+
+    views: int
+    median: DepthErrors
+    expected: DepthErrors
+    by_class: dict[str, DepthErrors]
+    no_surface: float
+    sky_covered: float
+    sky_alpha: float
+
+
+def true_depth_errors(scene: Scene, truth: StreetTruth, cameras: Sequence[Camera]) -> TruthErrors:
+    """Compare a scene's depth with the street's, through cameras of the scene's own world.
+
+    The scene may have moved the origin (`world_origin_m`), as an adapter of recordings does.
+    """
+    origin = torch.from_numpy(np.asarray(scene.world_origin_m, np.float64))
+    scene_from_dataset = rigid(torch.eye(3, dtype=torch.float64), -origin)
+    views = []
+    for camera in cameras:
+        pose = camera.camera_from_world @ scene_from_dataset
+        true = truth.render(dataclasses.replace(camera, camera_from_world=pose))
+        views.append((render_recorded(scene, camera), true))
+
+    def joined(images: Iterable[np.ndarray]) -> np.ndarray:
+        return np.concatenate([image.reshape(-1) for image in images] or [np.zeros(0)])
+
+    surface = joined(seen.has_surface for seen, _ in views).astype(bool)
+    median_m = joined(seen.median_depth_m for seen, _ in views)
+    expected_m = joined(seen.expected_depth_m for seen, _ in views)
+    alpha = joined(seen.alpha for seen, _ in views)
+    true_m = joined(true.depth for _, true in views)
+    semantic = joined(true.semantic for _, true in views)
+    is_sky = np.isinf(true_m)
+    used = surface & ~is_sky
+    return TruthErrors(
+        views=len(views),
+        median=depth_errors(median_m[used], true_m[used]),
+        expected=depth_errors(expected_m[used], true_m[used]),
+        by_class={
+            SemanticClass(int(c)).name.lower(): depth_errors(median_m[own], true_m[own])
+            for c in np.unique(semantic[~is_sky])
+            for own in [used & (semantic == c)]
+        },
+        no_surface=_part(~surface[~is_sky]),
+        sky_covered=_part(surface[is_sky]),
+        sky_alpha=_part(alpha[is_sky]),
+    )
+
+
+def truth_facts(uri: str, scene: Scene, source: ViewSource) -> dict[str, Any]:
+    """For reports: a fitted scene's depth against the street it was recorded from, JSON-able.
+
+    uri: that street, procedural:street?...; at most MAX_TRUE_VIEWS held-out views (training views
+    where none is held out) at their recorded cameras.
+
+    Raises:
+        AdapterError: the URI is no procedural street.
+    """
+    truth = open_street(uri)
+    keys = source.test or source.train
+    chosen = keys[:: max(1, -(-len(keys) // MAX_TRUE_VIEWS))]
+    errors = true_depth_errors(scene, truth, [source.camera(key) for key in chosen])
+    return {"street": uri, **dataclasses.asdict(errors)}
+
+
+def truth_line(truth: Mapping[str, Any]) -> str:
+    """The facts in one sentence."""
+    depth = truth["median"]
+    return (
+        f"depth against the street's own: median {100 * depth['median_m']:.1f} cm, 90 % within "
+        f"{100 * depth['p90_m']:.1f} cm; {100 * truth['no_surface']:.2f} % of surfaces missing, "
+        f"{100 * truth['sky_covered']:.2f} % of the sky covered"
+    )
+
+
+def open_street(uri: str) -> StreetTruth:
+    """The exact street of a URI.
+
+    Raises:
+        AdapterError: the URI names something else, or an option that streets do not have.
+    """
+    from adapters.procedural import open_truth
+
+    scheme, path, query = parse_uri(uri)
+    if scheme != "procedural" or path != "street":
+        raise AdapterError(
+            f"--truth {uri!r}: exact depth is known of procedural streets alone, such as "
+            f"procedural:street?seed=3, with the options that the recording was rendered with"
+        )
+    return open_truth(query)
+
+
+def _part(values: np.ndarray) -> float:
+    return float(np.mean(values)) if len(values) else float("nan")

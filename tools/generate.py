@@ -6,11 +6,9 @@ import contextlib
 import math
 import shlex
 import signal
-import sys
 import uuid
 from collections.abc import Iterator
-from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 from adapters.base import open_scene, scenes_of
 from augment.errors import ClimateGSError
@@ -28,51 +26,43 @@ from augment.jobs.status import JobStatus, read_status
 from augment.jobs.store import Store, open_store
 from augment.jobs.worker import shares_of
 from recipes.job import load_job, load_job_recipes
+from tools.output import print_note
 
 if TYPE_CHECKING:
     from recipes.schema import Recipe
+    from tools.cli import GenerateOptions
 
-Executor = Literal["serial", "processes", "ray"]
 _MAX_LINES = 20
 
 
-def generate_dataset(
-    job: Path,
-    out: str,
-    *,
-    executor: Executor = "processes",
-    workers: int | None = None,
-    shard: str = "1/1",
-    backend: str = "auto",
-    scratch: Path | None = None,
-    rescan: bool = False,
-    dry_run: bool = False,
-) -> int:
+def generate_dataset(options: GenerateOptions) -> int:
     """Runs the job and prints what became of it. Returns the exit code: 1 where images failed."""
-    if workers is not None and workers < 1:
-        raise ClimateGSError(f"--workers must be 1 or more; got {workers}")
-    wanted = load_job(job)
-    recipes = load_job_recipes(wanted, job.parent)
+    job, out, backend = options.job, options.out, options.backend
+    assert job is not None
+    if options.workers is not None and options.workers < 1:
+        raise ClimateGSError(f"--workers must be 1 or more; got {options.workers}")
+    requested = load_job(job)
+    recipes = load_job_recipes(requested, job.parent)
     store = open_store(out)
     setup = WorkSetup(
         store_uri=out if store.local_dir is None else store.uri,
-        scratch=scratch or default_scratch(out),
+        scratch=options.scratch or default_scratch(out),
         backend=backend,
         open_scene=open_scene,
     )
     task = GenerateJob(
         recipes,
-        scenes_of(wanted.scenes, job.parent),
+        scenes_of(requested.scenes, job.parent),
         setup,
-        executor=executor,
-        workers=workers,
-        shard=parse_shard(shard),
-        rescan=rescan,
+        executor=options.executor,
+        workers=options.workers,
+        shard=parse_shard(options.shard),
+        rescan=options.rescan,
     )
-    if dry_run:
+    if options.dry_run:
         return _dry_run(task)
-    _check_writable(open_store(out))
-    with _ended_by_sigterm():
+    _check_writable(store)
+    with ended_by_sigterm():
         result = run_generate(task, prepare=lambda recipes: _warm_up(recipes, backend))
     _report(result, out)
     return 1 if result.failed or result.unusable else 0
@@ -118,7 +108,7 @@ def _dry_run(job: GenerateJob) -> int:
     plan = plan_job(job)
     blocks = shard_of(plan.blocks, *job.shard)
     _print_plan(plan, len(blocks), job)
-    guess = estimate(plan, open_scene, each=lambda name: _print_result(f"trying {name}"))
+    guess = estimate(plan, open_scene, each=lambda name: print_note(f"trying {name}"))
     for name, sample in guess.samples.items():
         print(
             f"  {name}: {sample.seconds_per_mpx:.2f} s and {_size(sample.bytes_per_mpx)} a "
@@ -162,12 +152,12 @@ def _report(result: GenerateResult, out: str) -> None:
     if shares := shares_of(result.timings):
         print(shares.sentence)
     for failure in result.failures[:_MAX_LINES]:
-        _print_result(f"failed: {failure}")
+        print_note(f"failed: {failure}")
     if len(result.failures) > _MAX_LINES:
         more = len(result.failures) - _MAX_LINES
-        _print_result(f"... and {more} more; the manifest has them all")
+        print_note(f"... and {more} more; the manifest has them all")
     for uri, why in result.unusable.items():
-        _print_result(f"cannot be used: {uri}: {why}")
+        print_note(f"cannot be used: {uri}: {why}")
     print(f"output: {out}   (climategs report {shlex.quote(out)} shows it)")
 
 
@@ -208,11 +198,11 @@ def _warm_up(recipes: list[Recipe], backend: str) -> None:
 
     seconds = warm_up_for_workers(recipes, backend)
     if seconds > 1:
-        _print_result(f"compiled the kernels in {seconds:.1f} s (kept for the next run)")
+        print_note(f"compiled the kernels in {seconds:.1f} s (kept for the next run)")
 
 
 @contextlib.contextmanager
-def _ended_by_sigterm() -> Iterator[None]:
+def ended_by_sigterm() -> Iterator[None]:
     """Let a scheduler's SIGTERM end the job as Ctrl-C does."""
 
     def interrupt(*_: object) -> None:
@@ -237,7 +227,3 @@ def _size(count: float) -> str:
     steps = ("B", "kB", "MB", "GB", "TB")
     step = min(int(math.log(max(count, 1), 1000)), len(steps) - 1)
     return f"{count / 1000**step:.1f} {steps[step]}"
-
-
-def _print_result(text: str) -> None:
-    print(text, file=sys.stderr)

@@ -12,8 +12,10 @@ from typing import Any
 
 from augment.effects.style.scores import DEFINITIONS
 from augment.jobs.atomic import write_atomic
-from tools.style_train import StyleTrainOutcome, train_style
+from tools.fit_options import length_of
+from tools.style_train import train_style
 from tools.style_train_options import StyleTrainOptions
+from tools.training import Outcome
 
 TABLE_FILE, TEXT_FILE = "ablations.json", "ablations.txt"
 FULL = "all losses, 3x4"
@@ -34,7 +36,7 @@ _COLUMNS = {
 }
 
 
-def train_ablations(options: StyleTrainOptions, *, progress: bool = True) -> StyleTrainOutcome:
+def train_ablations(options: StyleTrainOptions, *, progress: bool = True) -> Outcome:
     """Trains every variant into a folder of its own below `options.out`, and compares them there.
 
     All take the same seed and steps; minutes are shared among them. A variant that is finished is
@@ -44,7 +46,8 @@ def train_ablations(options: StyleTrainOptions, *, progress: bool = True) -> Sty
         ClimateGSError: as `train_style`.
     """
     steps = options.steps
-    minutes = None if options.budget_s is None else options.budget_s / 60 / len(VARIANTS)
+    minutes = length_of(options).get("minutes")
+    minutes = None if minutes is None else minutes / len(VARIANTS)
     rows: dict[str, dict[str, Any]] = {}
     for folder, (name, changes) in VARIANTS.items():
         changed = dict(changes)
@@ -65,7 +68,7 @@ def train_ablations(options: StyleTrainOptions, *, progress: bool = True) -> Sty
         rows[name] = outcome.report["scores"]
     report = {"steps": steps, "seed": options.seed, "definitions": DEFINITIONS, "rows": rows}
     _write(options.out, report)
-    return StyleTrainOutcome(0, report)
+    return Outcome(0, report)
 
 
 def ablation_table(rows: Mapping[str, Mapping[str, float]]) -> str:

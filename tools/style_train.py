@@ -6,21 +6,17 @@ from. The network's bytes depend on the data, the settings and the number of ste
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import hashlib
 import json
 import math
-import shutil
-import sys
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
-from tqdm import tqdm
 
 from adapters.base import open_scene
 from augment.effects.style.losses import FeatureExtractor, open_features
@@ -30,7 +26,6 @@ from augment.effects.style.scores import DEFINITIONS, score_photos, score_traini
 from augment.effects.style.train import (
     Content,
     Draw,
-    Photos,
     StepRecord,
     StyleTrainer,
     TrainingPool,
@@ -43,20 +38,26 @@ from augment.effects.style.train import (
 )
 from augment.errors import ClimateGSError, OutputError
 from augment.jobs.atomic import write_atomic
-from augment.jobs.layout import STATE_FOLDER
 from augment.jobs.processes import OutputLock
-from tools.fit_checkpoint import (
+from tools.fit_options import budget_s, length_of
+from tools.output import print_note
+from tools.plots import STYLE_PANELS, write_curves
+from tools.style_train_options import StyleTrainOptions, uri_text
+from tools.training import (
+    CHECKPOINT_S,
     Checkpoint,
+    Outcome,
+    StopRequest,
     check_same,
+    differences,
     load_checkpoint,
     mark_finished,
+    note_stop,
+    remove_unused,
+    rounded_steps,
+    run_steps,
     save_checkpoint,
 )
-from tools.fit_loop import CHECKPOINT_S, StopRequest, evaluation_steps
-from tools.fit_options import differences
-from tools.sheet import write_rgb
-from tools.style_curves import draw_style_curves
-from tools.style_train_options import StyleTrainOptions, uri_text
 
 NETWORK_FILE, REPORT_FILE, CURVES_FILE = "network.safetensors", "report.json", "curves.png"
 ROWS, ROW_STEPS = 40, 50  # of the history; steps averaged into one, at most
@@ -65,17 +66,9 @@ TIMED, UNTIMED = 8, 2  # steps from which the number of them is estimated
 RESERVE = 0.05  # of the time, for scores and checkpoints
 
 
-@dataclass(frozen=True)
-class StyleTrainOutcome:
-    """code: the command's exit code, 130 where it was interrupted. report: as in report.json."""
-
-    code: int
-    report: dict[str, Any]
-
-
 def train_style(
     options: StyleTrainOptions, *, progress: bool = True, checkpoint_s: float = CHECKPOINT_S
-) -> StyleTrainOutcome:
+) -> Outcome:
     """Trains, or goes on training, into `options.out`; with the ablations where they are asked for.
 
     Raises:
@@ -96,13 +89,14 @@ def train_style(
                 f"--out, or replace it with --overwrite"
             )
         if before is not None:
-            check_same(options.out, options.settings(), options.length(), before)
+            check_same(options.out, options.settings(), length_of(options), before)
             if before.finished and (done := _finished(options, before)) is not None:
                 return done
         try:
             run = _prepare(options, folder, before)
         except BaseException:
-            _remove_unused(options.out)
+            if not folder.exists():
+                remove_unused(options.out)
             raise
         return _train(run, progress, checkpoint_s)
 
@@ -110,6 +104,16 @@ def train_style(
 def checkpoint_folder(out: Path) -> Path:
     """What a training in this folder goes on from."""
     return out / "checkpoint"
+
+
+class _Data(NamedTuple):
+    """scored: what networks are scored by. held_out: photos."""
+
+    pool: TrainingPool
+    scored: Draw
+    held_out: torch.Tensor
+    facts: dict[str, Any]
+    problems: tuple[str, ...]
 
 
 @dataclass(eq=False)
@@ -121,9 +125,7 @@ class _Run:
     trainer: StyleTrainer
     features: FeatureExtractor
     plan: Checkpoint
-    scored: Draw
-    held_out: torch.Tensor
-    problems: tuple[str, ...]
+    data: _Data
     rows: list[dict[str, Any]]
     sums: dict[str, float]
     begun: float = field(default_factory=time.perf_counter)
@@ -131,34 +133,60 @@ class _Run:
     def seconds(self) -> float:
         return self.plan.seconds + time.perf_counter() - self.begun
 
+    def score(self) -> None:
+        """One more row of the history, with what the network is worth now."""
+        scores = score_training(self.trainer.net, self.data.scored, self.features)
+        self.rows.append({"step": self.trainer.step, "seconds": self.seconds(), **scores})
 
-@dataclass(frozen=True, eq=False)
-class _Data:
-    pool: TrainingPool
-    scored: Draw
-    held_out: torch.Tensor
-    facts: dict[str, Any]
-    problems: tuple[str, ...]
+    def add(self, record: StepRecord) -> None:
+        """One more step; a row of the history where it completes one."""
+        for name, value in {"steps": 1.0, "loss": record.loss}.items():
+            self.sums[name] = self.sums.get(name, 0.0) + value
+        for name, value in record.terms.items():  # of a part of the steps, where the warm-up ends
+            self.sums[f"sum.{name}"] = self.sums.get(f"sum.{name}", 0.0) + value
+            self.sums[f"count.{name}"] = self.sums.get(f"count.{name}", 0.0) + 1
+        length = min(max(self.plan.steps // ROWS, 1), ROW_STEPS)
+        if record.step % length and record.step != self.plan.steps:
+            return
+        sums, self.sums = self.sums, {}
+        names = [name.removeprefix("sum.") for name in sums if name.startswith("sum.")]
+        self.rows.append({
+            "step": record.step,
+            "seconds": self.seconds(),
+            "loss": sums["loss"] / sums["steps"],
+            **{name: sums[f"sum.{name}"] / sums[f"count.{name}"] for name in names},
+        })  # fmt: skip
+
+    def save(self) -> None:
+        arrays, facts = self.trainer.state()
+        checkpoint = dataclasses.replace(
+            self.plan,
+            step=self.trainer.step,
+            seconds=self.seconds(),
+            history=self.rows,
+            sums=self.sums,
+            facts=facts,
+            arrays=arrays,
+        )
+        save_checkpoint(self.folder, checkpoint)
 
 
 def _prepare(options: StyleTrainOptions, folder: Path, before: Checkpoint | None) -> _Run:
     _take_device(options.device)
     data = _open_data(options)
     for problem in data.problems:
-        _print_result(f"note: {problem}")
+        print_note(f"note: {problem}")
     views, photos = len(data.pool.views), len(data.pool.photos)
-    _print_result(
-        f"{photos} photos and {views} views of {len(options.scenes)} scenes to learn from"
-    )
+    print_note(f"{photos} photos and {views} views of {len(options.scenes)} scenes to learn from")
     features = open_features(options.vgg)
     if before is None:
-        plan = Checkpoint(options.settings(), options.length(), options.steps or 0, data.facts)
-        if options.budget_s is not None:
-            steps, step_s = _estimate(options, data, features)
+        plan = Checkpoint(options.settings(), length_of(options), options.steps or 0, data.facts)
+        if (budget := budget_s(options)) is not None:
+            steps, step_s = _estimate(options, budget, data.pool, features)
             plan = dataclasses.replace(plan, steps=steps)
-            _print_result(
-                f"{1e3 * step_s:.0f} ms a step: {steps} steps make about "
-                f"{options.budget_s / 60:g} minutes. --steps {steps} gives the same network again"
+            print_note(
+                f"{1e3 * step_s:.0f} ms a step: {steps} steps make about {budget / 60:g} minutes. "
+                f"--steps {steps} gives the same network again"
             )
         save_checkpoint(folder, plan)
     else:
@@ -172,21 +200,10 @@ def _prepare(options: StyleTrainOptions, folder: Path, before: Checkpoint | None
     trainer = _trainer(options, plan.steps, data.pool, features)
     if plan.arrays:
         trainer.load_state(plan.arrays, plan.facts)
-        _print_result(f"going on after step {plan.step} of {plan.steps}")
+        print_note(f"going on after step {plan.step} of {plan.steps}")
     rows, sums = list(plan.history), dict(plan.sums)
     plan = dataclasses.replace(plan, arrays={}, facts={})
-    return _Run(
-        options=options,
-        folder=folder,
-        trainer=trainer,
-        features=features,
-        plan=plan,
-        scored=data.scored,
-        held_out=data.held_out,
-        problems=data.problems,
-        rows=rows,
-        sums=sums,
-    )
+    return _Run(options, folder, trainer, features, plan, data, rows, sums)
 
 
 def _take_device(device: str) -> None:
@@ -212,7 +229,6 @@ def _open_data(options: StyleTrainOptions) -> _Data:
         )
         problems += scene.problems
     photos = read_photos(options.photos, size, holdout=options.holdout)
-    pool = TrainingPool(tuple(views), photos.train)
     facts = {
         "views": len(views),
         "views_sha256": _digest(view.picture for view in views),
@@ -221,16 +237,11 @@ def _open_data(options: StyleTrainOptions) -> _Data:
         "held_out_photos": len(photos.held_out),
         "held_out_sha256": _digest([photos.held_out]),
     }
-    pool = pool.to(options.device)  # once, for all trainers
-    scored = _scored(pool, photos, options)
-    return _Data(pool, scored, photos.held_out, facts, (*problems, *photos.problems))
-
-
-def _scored(pool: TrainingPool, photos: Photos, options: StyleTrainOptions) -> Draw:
-    """What networks are scored by: held-out photos where there are any, and the scenes' views."""
+    pool = TrainingPool(tuple(views), photos.train).to(options.device)  # once, for all trainers
+    # Networks are scored by held-out photos where there are any, and the scenes' views.
     held_out = photos.held_out.to(options.device)
     apart = TrainingPool(pool.views, held_out) if len(held_out) else pool
-    return apart.draw(
+    scored = apart.draw(
         generator_for(0, 0, "scores"),  # whatever the seed: trainings are compared by them
         SCORED,
         scene_share=options.scene_share,
@@ -238,6 +249,7 @@ def _scored(pool: TrainingPool, photos: Photos, options: StyleTrainOptions) -> D
         colors=1,
         recolor=recolor,
     )
+    return _Data(pool, scored, photos.held_out, facts, (*problems, *photos.problems))
 
 
 def _digest(pictures: Iterable[torch.Tensor]) -> str:
@@ -254,111 +266,60 @@ def _trainer(
     if options.encoder_weights is not None:
         assert isinstance(net.encoder, B0Encoder)
         load_imagenet_weights(net.encoder, options.encoder_weights)
+    config = options.config(steps)
     return StyleTrainer(
         net,
         pool,
-        options.config(steps),
+        config,
         features,
         recolor=recolor,
-        pairs=pair_loss_of(pool, options.config(steps).pair_weights) if options.pairs > 0 else None,
+        pairs=pair_loss_of(pool, config.pair_weights) if options.pairs > 0 else None,
         frozen_norm=options.encoder_weights is not None,
         device=options.device,
     )
 
 
 def _estimate(
-    options: StyleTrainOptions, data: _Data, features: FeatureExtractor
+    options: StyleTrainOptions, budget_s: float, pool: TrainingPool, features: FeatureExtractor
 ) -> tuple[int, float]:
     """Steps that fill the time, and seconds of one with all losses, by a trainer thrown away."""
-    assert options.budget_s is not None
-    timed = dataclasses.replace(options, warm_up=0.0)
-    trainer = _trainer(timed, 1000, data.pool, features)
+    trainer = _trainer(dataclasses.replace(options, warm_up=0.0), 1000, pool, features)
     seconds: list[float] = []
     for _ in range(UNTIMED + TIMED):
         begun = time.perf_counter()
         trainer.run_step()
         seconds.append(time.perf_counter() - begun)
     step_s = sorted(seconds[UNTIMED:])[TIMED // 2]
-    steps = int(options.budget_s * (1 - RESERVE) / step_s)
-    return max(1, steps if steps < 100 else steps // 50 * 50), step_s
+    return rounded_steps(int(budget_s * (1 - RESERVE) / step_s)), step_s
 
 
-def _train(run: _Run, progress: bool, checkpoint_s: float) -> StyleTrainOutcome:
+def _train(run: _Run, progress: bool, checkpoint_s: float) -> Outcome:
+    def after_step(record: StepRecord, is_evaluated: bool) -> dict[str, str]:
+        run.add(record)
+        if is_evaluated:
+            run.score()
+        return {"loss": f"{run.sums['loss'] / run.sums['steps']:.4f}"} if run.sums else {}
+
     with StopRequest() as stop, fixed_threads():
-        _steps(run, stop, progress, checkpoint_s)
-        complete = run.trainer.step >= run.plan.steps
+        if run.trainer.step == 0 and not run.rows:
+            run.score()
+        complete = run_steps(
+            run.trainer,
+            run.plan.steps,
+            after_step=after_step,
+            save=run.save,
+            stop=stop,
+            name="train",
+            checkpoint_s=checkpoint_s,
+            progress=progress,
+        )
         report = _write(run, complete)
     if complete:
         mark_finished(run.folder)
         _show_end(run.options.out, report)
-        return StyleTrainOutcome(0, report)
-    again = "the same command without --overwrite" if run.options.overwrite else "the same command"
-    _print_result(
-        f"stopped after step {run.trainer.step} of {run.plan.steps}; {again} goes on from there"
-    )
-    return StyleTrainOutcome(130, report)
-
-
-def _steps(run: _Run, stop: StopRequest, progress: bool, checkpoint_s: float) -> None:
-    trainer, steps = run.trainer, run.plan.steps
-    marks, saved = evaluation_steps(steps), time.monotonic()
-    with tqdm(
-        total=steps, initial=trainer.step, desc="train", unit="step", disable=not progress
-    ) as bar:
-        if trainer.step == 0 and not run.rows:
-            _score(run)
-        while trainer.step < steps and not stop.requested:
-            record = trainer.run_step()
-            _add(run, record)
-            if record.step in marks:
-                _score(run)
-            if run.sums:
-                mean = run.sums["loss"] / run.sums["steps"]
-                bar.set_postfix({"loss": f"{mean:.4f}"}, refresh=False)
-            bar.update()
-            if time.monotonic() - saved > checkpoint_s and record.step < steps:
-                _save(run)
-                saved = time.monotonic()
-    _save(run)
-
-
-def _add(run: _Run, record: StepRecord) -> None:
-    """One more step; a row of the history where it completes one."""
-    for name, value in {"steps": 1.0, "loss": record.loss}.items():
-        run.sums[name] = run.sums.get(name, 0.0) + value
-    for name, value in record.terms.items():  # of a part of the steps, where the warm-up ends
-        run.sums[f"sum.{name}"] = run.sums.get(f"sum.{name}", 0.0) + value
-        run.sums[f"count.{name}"] = run.sums.get(f"count.{name}", 0.0) + 1
-    length = min(max(run.plan.steps // ROWS, 1), ROW_STEPS)
-    if record.step % length and record.step != run.plan.steps:
-        return
-    sums, run.sums = run.sums, {}
-    names = [name.removeprefix("sum.") for name in sums if name.startswith("sum.")]
-    run.rows.append({
-        "step": record.step,
-        "seconds": run.seconds(),
-        "loss": sums["loss"] / sums["steps"],
-        **{name: sums[f"sum.{name}"] / sums[f"count.{name}"] for name in names},
-    })  # fmt: skip
-
-
-def _score(run: _Run) -> None:
-    scores = score_training(run.trainer.net, run.scored, run.features)
-    run.rows.append({"step": run.trainer.step, "seconds": run.seconds(), **scores})
-
-
-def _save(run: _Run) -> None:
-    arrays, facts = run.trainer.state()
-    checkpoint = dataclasses.replace(
-        run.plan,
-        step=run.trainer.step,
-        seconds=run.seconds(),
-        history=run.rows,
-        sums=run.sums,
-        facts=facts,
-        arrays=arrays,
-    )
-    save_checkpoint(run.folder, checkpoint)
+        return Outcome(0, report)
+    note_stop(run.trainer.step, run.plan.steps, overwrite=run.options.overwrite)
+    return Outcome(130, report)
 
 
 def _write(run: _Run, complete: bool) -> dict[str, Any]:
@@ -372,7 +333,7 @@ def _write(run: _Run, complete: bool) -> dict[str, Any]:
         "data": run.plan.data,
     }
     save_network(options.out / NETWORK_FILE, net, about, half_precision=options.half_precision)
-    scores = score_training(net, run.scored, run.features) | score_photos(net, run.held_out)
+    scores = score_training(net, run.data.scored, run.features)
     report = {
         **about,
         "complete": complete,
@@ -380,27 +341,17 @@ def _write(run: _Run, complete: bool) -> dict[str, Any]:
         "parameters": sum(parameter.numel() for parameter in net.parameters()),
         "seconds": run.seconds(),
         "scenes": [uri_text(uri) for uri in options.scenes],
-        "problems": list(run.problems),
+        "problems": list(run.data.problems),
         "definitions": DEFINITIONS,
-        "scores": scores,
+        "scores": scores | score_photos(net, run.data.held_out),
         "history": run.rows,
     }
     write_atomic(options.out / REPORT_FILE, (json.dumps(report, indent=1) + "\n").encode())
-    curves = draw_style_curves(run.rows)
-    if curves is not None:
-        write_rgb(options.out / CURVES_FILE, curves)
+    write_curves(options.out / CURVES_FILE, run.rows, STYLE_PANELS)
     return report
 
 
-def _remove_unused(out: Path) -> None:
-    """Leave no trace of a training that never began: its lock, and the folder if that was all."""
-    if not checkpoint_folder(out).exists():
-        shutil.rmtree(out / STATE_FOLDER, ignore_errors=True)
-        with contextlib.suppress(OSError):  # not empty
-            out.rmdir()
-
-
-def _finished(options: StyleTrainOptions, before: Checkpoint) -> StyleTrainOutcome | None:
+def _finished(options: StyleTrainOptions, before: Checkpoint) -> Outcome | None:
     """The outcome where network and report stand; None where one of them was lost since."""
     try:
         report = json.loads((options.out / REPORT_FILE).read_bytes())
@@ -410,19 +361,12 @@ def _finished(options: StyleTrainOptions, before: Checkpoint) -> StyleTrainOutco
         return None
     print(f"{options.out} is finished already ({before.steps} steps); nothing was done")
     _show_end(options.out, report)
-    return StyleTrainOutcome(0, report)
+    return Outcome(0, report)
 
 
 def _show_end(out: Path, report: dict[str, Any]) -> None:
-    scores = report["scores"]
-    print(", ".join(f"{name} {value:.4g}" for name, value in scores.items() if _is_finite(value)))
-    print(f"curves: {out / CURVES_FILE}")
+    known = {n: v for n, v in report["scores"].items() if isinstance(v, int | float)}
+    print(", ".join(f"{name} {v:.4g}" for name, v in known.items() if math.isfinite(v)))
+    if (out / CURVES_FILE).is_file():
+        print(f"curves: {out / CURVES_FILE}")
     print(f"network: {out / NETWORK_FILE}")
-
-
-def _is_finite(value: Any) -> bool:
-    return isinstance(value, int | float) and math.isfinite(value)
-
-
-def _print_result(text: str) -> None:
-    print(text, file=sys.stderr)

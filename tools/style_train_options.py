@@ -1,47 +1,74 @@
-"""What `climategs style train` was asked for: checked, and comparable with an earlier run's."""
+"""What `climategs style train` can be asked for. Imports stay inside functions, so that `--help`
+answers at once.
+"""
 
 from __future__ import annotations
 
 import dataclasses
-import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from augment.effects.style.network import ENCODERS
-from augment.effects.style.pairs import PairWeights
-from augment.effects.style.train import LEARNING_RATES, StyleTrainConfig
-from augment.errors import ClimateGSError
-from tools.fit_options import resolved_uri
+from tyro.conf import arg
 
-DEFAULT_MINUTES = 10.0
+from tools.fit_options import check_choice, check_length, check_range, resolved_uri, value_or
+from tools.output import JsonFile, write_json
+
+if TYPE_CHECKING:
+    from augment.effects.style.pairs import PairWeights
+    from augment.effects.style.train import StyleTrainConfig
+
 SIZES_PX = {"small": 128, "b0": 256}  # the small encoder looks at 64 px, whatever it is given
-_FILES = ("encoder_weights", "vgg")
+_Files = Annotated[tuple[Path, ...], arg(metavar="PATH [PATH ...]")]
+_Scenes = Annotated[tuple[str, ...], arg(name="scene", metavar="URI [URI ...]")]
 
 
 @dataclass(frozen=True)
 class StyleTrainOptions:
-    """The options of one training; see `climategs style train --help`.
+    """Train the network that turns a style image into a colour map, on photos and scenes.
 
-    out: the folder to write. scenes: URIs. photos: files and folders; one of the two at least.
-    minutes, steps: one of them or neither (10 minutes). matrix: 3x4, or 3x3 as in the paper.
-    encoder_weights: of B0, trained on ImageNet. vgg: weights of VGG-19 for L_s; None for the bank
-    of filters. size_px: of the square pictures; None for the encoder's usual one. views: most of a
-    scene. learning_rate: None for the encoder's usual one. pair_weights: of the losses of pairs, as
-    same=1,look=2; what is not named keeps its weight. holdout: every so many photos are kept for
-    scores; 0 for none. half_precision: of the file, not of the training. ablations: train without
-    each loss, and 3x3, too. The rest is as augment.effects.style.train.StyleTrainConfig has it.
+    Run it again to go on after an interruption; the result is the same to the bit. Ctrl-C stops
+    after the current step and keeps what is there.
 
-    Raises:
-        ClimateGSError: a value outside its range, or two that exclude each other.
+    Args:
+        out: The folder for the network, its checkpoint, curves and report.
+        photos: Image files, and folders of them.
+        scenes: Scenes whose views are learnt from, as for render.
+        minutes: How long to train, 10 by default.
+        steps: How many steps instead. The same steps and seed give the same bytes.
+        encoder: The small one for a CPU, or EfficientNet-B0.
+        matrix: 3x4 maps with an offset, or 3x3 as in the paper.
+        encoder_weights: EfficientNet-B0's weights, trained on ImageNet.
+        vgg: Weights of VGG-19 for the style loss; without them a bank of filters stands in.
+        size_px: Of the square pictures; the encoder's usual one by default.
+        views: Most views of a scene.
+        seed: Of everything random.
+        learning_rate: Adam's; the encoder's usual one by default.
+        decay: What the learning rate is multiplied by after each third of the steps.
+        warm_up: Share of the steps that learn the cycle alone.
+        style: Weight of the style loss.
+        consistency: Weight of the loss in content space.
+        cycle: Weight of the cycle's loss.
+        pairs: Weight of recoloured pairs of photos, whose perfect result is known.
+        pair_weights: Of the losses of pairs, as same=1,look=2; the others keep theirs.
+        batch: Transfers a step.
+        pair_batch: Pairs a step.
+        scene_share: Share of the transfers whose content is a view of a scene.
+        holdout: Every so many photos are kept for scores; 0 for none.
+        half_precision: Write the network's numbers in 16 bits.
+        through: Render mapped Gaussians for every step, or map pictures rendered once.
+        device: Where torch trains: cpu, or cuda, where through renderer renders on the GPU, too.
+        ablations: Train without each loss, and 3x3 maps, too, and write a table.
+        overwrite: Begin anew and replace what is there.
+        json_file: Also write the report to this file.
     """
 
     out: Path
-    scenes: tuple[str, ...] = ()
-    photos: tuple[Path, ...] = ()
+    photos: _Files = ()
+    scenes: _Scenes = ()
     minutes: float | None = None
     steps: int | None = None
-    encoder: str = "small"
+    encoder: Literal["small", "b0"] = "small"
     matrix: Literal["3x4", "3x3"] = "3x4"
     encoder_weights: Path | None = None
     vgg: Path | None = None
@@ -49,54 +76,43 @@ class StyleTrainOptions:
     views: int = 24
     seed: int = 0
     learning_rate: float | None = None
-    decay: float = StyleTrainConfig.decay
-    warm_up: float = StyleTrainConfig.warm_up
-    style: float = StyleTrainConfig.style
-    consistency: float = StyleTrainConfig.consistency
-    cycle: float = StyleTrainConfig.cycle
-    pairs: float = StyleTrainConfig.pairs
+    decay: float = 0.1
+    warm_up: float = 0.1
+    style: float = 1.0
+    consistency: float = 10.0
+    cycle: float = 10.0
+    pairs: float = 1.0
     pair_weights: str = ""
-    batch: int = StyleTrainConfig.batch
-    pair_batch: int = StyleTrainConfig.pair_batch
-    scene_share: float = StyleTrainConfig.scene_share
-    through: Literal["picture", "renderer"] = "picture"
+    batch: int = 2
+    pair_batch: int = 4
+    scene_share: float = 0.5
     holdout: int = 8
-    device: str = "cpu"
     half_precision: bool = False
+    through: Literal["picture", "renderer"] = "picture"
+    device: str = "cpu"
     ablations: bool = False
     overwrite: bool = False
+    json_file: JsonFile = None
 
     def __post_init__(self) -> None:
+        from augment.errors import ClimateGSError
+
         if not self.scenes and not self.photos:
             raise ClimateGSError(
                 "there is nothing to learn from: give --photos FOLDER, --scene URI, or both"
             )
-        if self.minutes is not None and self.steps is not None:
-            raise ClimateGSError("give --minutes or --steps, not both")
-        if self.encoder not in ENCODERS:
-            raise ClimateGSError(f"--encoder is one of {', '.join(ENCODERS)}; got {self.encoder!r}")
+        check_length(self)
+        check_choice(self, "encoder", tuple(SIZES_PX))
         if self.encoder_weights is not None and self.encoder != "b0":
             raise ClimateGSError("--encoder-weights are EfficientNet-B0's: add --encoder b0")
-        for name in _FILES:
+        for name in ("encoder_weights", "vgg"):
             path = getattr(self, name)
             if path is not None and not path.is_file():
                 raise ClimateGSError(f"--{name.replace('_', '-')}: there is no file {path}")
-        if self.matrix not in ("3x4", "3x3"):
-            raise ClimateGSError(f"--matrix is 3x4 or 3x3; got {self.matrix!r}")
-        if self.minutes is not None and not (self.minutes > 0 and math.isfinite(self.minutes)):
-            raise ClimateGSError(f"--minutes must be a number of minutes > 0; got {self.minutes}")
-        for name, least in (
-            ("steps", 1),
-            ("size_px", 16),
-            ("views", 1),
-            ("holdout", 0),
-            ("seed", 0),
-        ):
-            value = getattr(self, name)
-            if value is not None and value < least:
-                raise ClimateGSError(
-                    f"--{name.replace('_', '-')} must be at least {least}; got {value}"
-                )
+        check_choice(self, "matrix", ("3x4", "3x3"))
+        least = {"steps": 1, "size_px": 16, "views": 1, "holdout": 0, "seed": 0}
+        for name, low in least.items():
+            check_range(self, name, f"at least {low}", low)
         if self.through == "renderer" and not self.scenes:
             raise ClimateGSError("--through renderer is for scenes: add --scene URI")
         try:
@@ -104,37 +120,29 @@ class StyleTrainOptions:
         except ValueError as error:
             raise ClimateGSError(f"--{error}") from error
 
+    def run(self) -> int:
+        """The command. Returns its exit code."""
+        from tools.style_train import train_style
+
+        outcome = train_style(self)
+        write_json(self.json_file, outcome.report)
+        return outcome.code
+
     @property
     def picture_px(self) -> int:
         return self.size_px or SIZES_PX[self.encoder]
 
-    @property
-    def budget_s(self) -> float | None:
-        """Seconds to train for; None where the number of steps is given."""
-        if self.steps is not None:
-            return None
-        return 60 * (DEFAULT_MINUTES if self.minutes is None else self.minutes)
-
     def config(self, steps: int) -> StyleTrainConfig:
         """The trainer's configuration for this many steps."""
-        return StyleTrainConfig(
-            steps=steps,
-            seed=self.seed,
-            learning_rate=LEARNING_RATES[self.encoder]
-            if self.learning_rate is None
-            else self.learning_rate,
-            decay=self.decay,
-            warm_up=self.warm_up,
-            style=self.style,
-            consistency=self.consistency,
-            cycle=self.cycle,
-            pairs=self.pairs,
-            pair_weights=parse_pair_weights(self.pair_weights),
-            batch=self.batch,
-            pair_batch=self.pair_batch,
-            scene_share=self.scene_share,
-            through=self.through,
-        )
+
+        from augment.effects.style.train import LEARNING_RATES, StyleTrainConfig
+
+        known = {field.name for field in dataclasses.fields(StyleTrainConfig)}
+        own = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name in known}
+        rate = value_or(self.learning_rate, LEARNING_RATES[self.encoder])
+        weights = parse_pair_weights(self.pair_weights)
+        own |= {"steps": steps, "learning_rate": rate, "pair_weights": weights}
+        return StyleTrainConfig(**own)
 
     def settings(self) -> dict[str, Any]:
         """All that decides the result, flat and as JSON keeps it; not how long it is trained."""
@@ -156,12 +164,6 @@ class StyleTrainOptions:
             **config,
         }
 
-    def length(self) -> dict[str, float]:
-        """How long it was asked to be trained: {"steps": N} or {"minutes": M}."""
-        if self.steps is not None:
-            return {"steps": self.steps}
-        return {"minutes": DEFAULT_MINUTES if self.minutes is None else self.minutes}
-
 
 def parse_pair_weights(text: str) -> PairWeights:
     """`same=1,look=2`: the default weights but for those.
@@ -169,6 +171,9 @@ def parse_pair_weights(text: str) -> PairWeights:
     Raises:
         ClimateGSError: not of this form, or a loss of another name.
     """
+    from augment.effects.style.pairs import PairWeights
+    from augment.errors import ClimateGSError
+
     weights: dict[str, float] = {}
     known = [field.name for field in dataclasses.fields(PairWeights)]
     for item in filter(None, text.split(",")):

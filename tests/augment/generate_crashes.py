@@ -376,14 +376,14 @@ def kill_an_idle_worker(folder: Path) -> dict:
 @scenario
 def stop_a_job_with_workers(folder: Path) -> dict:
     """Ctrl-C and SIGTERM let workers finish their images, and a second run goes on."""
-    from tools.generate import _ended_by_sigterm
+    from tools.generate import ended_by_sigterm
 
     whole = whole_of(folder, lambda out: make_job(out))
     out, stops = folder / "stopped", []
     job = make_job(out, renderer=very_slow_noting_render, executor="processes", workers=2)
 
     def work() -> None:
-        with _ended_by_sigterm():
+        with ended_by_sigterm():
             generate(job)
 
     for how in (signal.SIGINT, signal.SIGTERM):

@@ -18,7 +18,7 @@ from augment.reconstruct.config import FitConfig
 from augment.reconstruct.view import RecordedView, ViewKey
 from augment.scene import Gaussians, Scene
 from augment.sky import ConstantSky
-from tools.fit_parts import FitParts
+from tools.fit import FitParts
 
 SIZE = (6, 8)
 

@@ -13,8 +13,7 @@ from augment.dataset import WeatherDataset
 from augment.files.ply import write_ply
 from augment.scene import Gaussians
 from recipes.schema import parse_frames
-from tools.cli import main
-from tools.commands import open_with_path
+from tools.cli import main, open_with_path
 from tools.render import resolve_variants
 
 FOG = """
@@ -258,13 +257,3 @@ def test_help_loads_neither_torch_nor_the_kernels():
     )
     assert result.returncode == 0, result.stderr
     assert "render" in result.stdout
-
-
-def test_a_picture_of_many_variants_shows_some_from_end_to_end():
-    from tools.pictures import MAX_SHOWN, _shown
-
-    few = [("s", f"{i:03d}") for i in range(MAX_SHOWN)]
-    assert _shown(few) == few
-    many = [("s", f"{i:03d}") for i in range(100)]
-    assert len(_shown(many)) <= MAX_SHOWN and _shown(many)[0] == many[0]
-    assert int(_shown(many)[-1][1]) >= 90

@@ -20,8 +20,8 @@ from augment.jobs.tables import boxes_bytes
 from augment.metrics.lpips import ALEX, expected_shapes
 from recipes.schema import Output
 from tools.evaluate import evaluate_output
-from tools.evaluate_command import evaluate
-from tools.json_files import write_json
+from tools.cli import evaluate
+from tools.output import write_json
 
 FRAMES = 8
 CAMERAS = {"ahead": 0.0, "left": 0.5, "behind": math.pi}  # name: yaw, radians

@@ -20,10 +20,22 @@ from augment.scene import Scene
 from augment.sky import ConstantSky
 from tests.scenes import camera_ahead, one_gaussian
 from tools.drawing import linear_ticks, log_ticks, short_number
-from tools.fit_curves import HEIGHT, WIDTH, draw_curves
-from tools.fit_pictures import CELL_WIDTH, MAX_ROWS, choose_views, draw_views
-from tools.fit_report import CURVES, PICTURES, TRAINING_PICTURES, evaluate_views, write_report
-from tools.fit_scores import ViewScore, mean_scores, means_by_camera, render_recorded
+from tools.fit_report import (
+    CELL_WIDTH,
+    CURVES,
+    MAX_ROWS,
+    PICTURES,
+    TRAINING_PICTURES,
+    ViewScore,
+    choose_views,
+    draw_views,
+    evaluate_views,
+    mean_scores,
+    means_by_camera,
+    render_recorded,
+    write_report,
+)
+from tools.plots import FIT_PANELS, STYLE_PANELS, write_curves
 
 KEYS = tuple(ViewKey(frame, name) for frame in range(4) for name in ("left", "right"))
 FIGURES = ("psnr", "ssim", "flip")
@@ -279,20 +291,36 @@ def test_pictures_of_views_show_what_is_left_out(tmp_path):
     assert (error[:, CELL_WIDTH // 2 + 20 :] == 90).all() and not (error[:, :200] == 90).all()
 
 
-def test_curves_have_a_panel_for_each_known_quantity():
-    assert draw_curves([]) is None
-    assert draw_curves([{"step": 50, "seconds": 1.0, "loss": math.nan}]) is None
-    image = draw_curves(history())
-    assert image is not None and image.shape == (2 * HEIGHT, 2 * WIDTH, 3)
+def drawn(folder, history, panels=FIT_PANELS) -> np.ndarray | None:
+    path = folder / "curves.png"
+    return cv2.imread(str(path)) if write_curves(path, history, panels) else None
+
+
+def test_curves_have_a_panel_for_each_known_quantity(tmp_path):
+    assert drawn(tmp_path, []) is None
+    assert drawn(tmp_path, [{"step": 50, "seconds": 1.0, "loss": math.nan}]) is None
+    image = drawn(tmp_path, history())
     assert (image != 255).any(axis=2).mean() > 0.01
-    one = draw_curves([{"step": 0, "seconds": 0.0, "split": "train", "psnr": 20.0}])
-    assert one is not None and one.shape == (HEIGHT, WIDTH, 3)
+    one = drawn(tmp_path, [{"step": 0, "seconds": 0.0, "split": "train", "psnr": 20.0}])
+    assert image.shape[0] == 2 * one.shape[0] and image.shape[1] == 2 * one.shape[1]
+    rows = [{"step": s, "seconds": s / 2, "loss": -s, "cycle": 1 / s} for s in (1, 2, 3)]
+    style = drawn(tmp_path, rows, STYLE_PANELS)
+    assert style.shape == (one.shape[0], image.shape[1], 3)
 
 
 @pytest.mark.parametrize("loss", [0.0, -1.0, 1e-30, 1e30])
-def test_curves_take_any_number(loss):
+def test_curves_take_any_number(loss, tmp_path):
     rows = [{"step": s, "seconds": s, "loss": v, "splats": 0} for s, v in ((50, loss), (100, 0.1))]
-    assert draw_curves(rows) is not None
+    assert drawn(tmp_path, rows) is not None
+
+
+def test_without_matplotlib_the_report_lacks_its_curves_and_says_so(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    scene = small_scene()
+    report = write_report(tmp_path, scene, Views(scene, change=noisy), history())
+    assert {p.name for p in tmp_path.iterdir()} == {"report.json", "report.md", PICTURES}
+    assert CURVES not in (tmp_path / "report.md").read_text() and report["history"]
+    assert "pip install 'climategs[plots]'" in capsys.readouterr().err
 
 
 def test_ticks_are_round_and_inside():

@@ -9,15 +9,13 @@ import numpy as np
 import pytest
 import torch
 
-from adapters.procedural import open_procedural
-from adapters.procedural import StreetTruth, TrueView, open_truth
+from adapters.procedural import StreetTruth, TrueView, open_procedural, open_truth
 from augment.cameras import Camera, Frame
 from augment.geometry import rigid
 from augment.scene import Scene
 from augment.semantics import SemanticClass
 from tests.scenes import one_gaussian
-from tools.fit_scores import render_recorded
-from tools.fit_truth import true_depth_errors
+from tools.fit_report import render_recorded, true_depth_errors
 
 QUERY = {"seed": "3", "gaussians": "60000", "frames": "2", "width": "96", "height": "54"}
 

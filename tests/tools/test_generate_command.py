@@ -9,8 +9,8 @@ import pytest
 
 from augment.errors import ClimateGSError
 from augment.jobs.atomic import write_atomic
-from tools.cli import main
-from tools.generate import _ended_by_sigterm, generate_dataset, parse_shard
+from tools.cli import GenerateOptions, main
+from tools.generate import ended_by_sigterm, generate_dataset, parse_shard
 
 
 def test_shards() -> None:
@@ -49,7 +49,7 @@ def test_arguments_that_cannot_be(
 
 def test_sigterm_is_as_ctrl_c() -> None:
     before = signal.getsignal(signal.SIGTERM)
-    with pytest.raises(KeyboardInterrupt), _ended_by_sigterm():
+    with pytest.raises(KeyboardInterrupt), ended_by_sigterm():
         signal.raise_signal(signal.SIGTERM)
     assert signal.getsignal(signal.SIGTERM) is before
 
@@ -61,7 +61,7 @@ def test_a_job_whose_scenes_cannot_be_opened(tmp_path: Path, capsys: pytest.Capt
     said = capsys.readouterr().err
     assert "none of its scenes can be used" in said and str(tmp_path / "missing") in said
     with pytest.raises(ClimateGSError, match="none of its scenes"):
-        generate_dataset(job, str(out), executor="serial", dry_run=True)
+        generate_dataset(GenerateOptions(job, str(out), executor="serial", dry_run=True))
 
 
 def test_a_damaged_plan_is_told(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

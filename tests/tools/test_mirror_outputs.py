@@ -22,6 +22,7 @@ from recipes.weather import Flood
 from tests.augment.batch_scenes import SIZE, FakeLabels, fake_render, make_recipe, open_fake
 from tests.augment.mirror_trees import contents
 from tools import render as render_tools
+from tools.cli import RenderOptions
 from tools.mirror import mirror_again, mirror_outputs, recipes_for_source
 
 CAMERAS = {"front": "front", "rear/left": "left"}
@@ -455,10 +456,10 @@ def test_render_takes_the_layout(root, tmp_path, monkeypatch, capsys):
 
     monkeypatch.setattr(render_tools, "open_scene", lambda _: scene)
     monkeypatch.setattr(render_tools, "run_job", job)
-    monkeypatch.setattr("tools.warm_up.warm_up", lambda *_: 0.0)
-    options = {"sheet": False, "layout": "source"}
-    done = render_tools.render_recipe(str(fog), "", out, scale=0.5, frames="1:3", **options)
-    assert done == 0
+    monkeypatch.setattr(render_tools, "warm_up", lambda *_: 0.0)
+    options = RenderOptions(str(fog), "", out, sheet=False, layout="source")
+    half = dataclasses.replace(options, scale=0.5, frames="1:3")
+    assert render_tools.render_recipe(half) == 0
     said = capsys.readouterr().out
     assert f"dataset: {out / 'source/fog-000/002'}" in said
     assert "  4 were rendered at another size and resized, such as 12x8 to 24x16 pixels" in said
@@ -466,7 +467,7 @@ def test_render_takes_the_layout(root, tmp_path, monkeypatch, capsys):
     assert sorted(path.suffix for path in (out / "street").rglob("00000?.*")) == [".png"] * 4
     path = tmp_path / "path.json"
     with pytest.raises(ClimateGSError, match=r"--camera-path .*path\.json shows frames that"):
-        render_tools.render_recipe(str(fog), "", out, camera_path=path, **options)
+        render_tools.render_recipe(dataclasses.replace(options, camera_path=path))
     monkeypatch.setattr(render_tools, "open_scene", lambda _: open_fake("fake:street"))
     with pytest.raises(AdapterError, match="has no dataset's folder"):
-        render_tools.render_recipe(str(fog), "", out, **options)
+        render_tools.render_recipe(options)

@@ -14,7 +14,7 @@ import pytest
 
 from augment.jobs.layout import MANIFEST, PATH_KINDS
 from augment.jobs.manifest import LATER, rows_to_table, write_manifest
-from tools import pictures, sheet
+from tools import sheet
 
 DRY, THIN, DEEP = ("clear-000", 0.0, math.nan), ("wet-000", 0.0, -0.05), ("wet-001", 0.0, 0.5)
 MURKY, WHITE = ("fog-000", 0.0978, 0.3), ("white-000", 0.0, math.nan, 0.125)
@@ -53,7 +53,7 @@ def titles(folder: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
     original = sheet.contact_sheet
     monkeypatch.setattr(sheet, "contact_sheet", contact_sheet)
-    assert pictures.draw_sheet(folder).is_file()
+    assert sheet.draw_sheet(folder).is_file()
     return drawn
 
 
@@ -85,3 +85,12 @@ def test_a_row_says_its_style(folder, monkeypatch) -> None:
     table = table.append_column("style_strength", pa.array([0.75] * len(table)))
     pq.write_table(table, folder / MANIFEST)
     assert titles(folder, monkeypatch)[0] == "street, frame 4: clear-000 (dusk x 0.75)"
+
+
+def test_a_picture_of_many_variants_shows_some_from_end_to_end() -> None:
+    few, many = (
+        [make_row(f"{i:03d}", 0.0, math.nan) for i in range(n)] for n in (sheet.MAX_SHOWN, 100)
+    )
+    assert [name for _, name in sheet.shown_groups(few)] == [row["variant"] for row in few]
+    names = [name for _, name in sheet.shown_groups(many)]
+    assert len(names) <= sheet.MAX_SHOWN and names[0] == "000" and int(names[-1]) >= 90

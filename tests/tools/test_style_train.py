@@ -21,9 +21,9 @@ from augment.scene import Gaussians, Scene
 from augment.sky import ConstantSky
 from tools import style_ablations, style_train
 from tools.style_ablations import VARIANTS, ablation_table
-from tools.style_curves import draw_style_curves
 from tools.style_train import checkpoint_folder, train_style
 from tools.style_train_options import StyleTrainOptions, parse_pair_weights
+from tools.training import Outcome
 
 STREET = "procedural:street?seed=3"
 
@@ -223,7 +223,7 @@ def test_pair_weights_keep_what_is_not_named():
     assert (weights.same, weights.look, weights.half) == (2.0, 0.0, parse_pair_weights("").half)
 
 
-# ---- ablations and curves ---------------------------------------------------------------------
+# ---- ablations --------------------------------------------------------------------------------
 
 
 def test_ablations_differ_in_one_part_each(tmp_path, photos, monkeypatch, capsys):
@@ -231,7 +231,7 @@ def test_ablations_differ_in_one_part_each(tmp_path, photos, monkeypatch, capsys
 
     def pretend(options, **_):
         asked.append(options)
-        return style_train.StyleTrainOutcome(
+        return Outcome(
             0, {"steps": 70, "scores": {"content_rmse": 0.1 * len(asked), "style_loss": 1.0}}
         )
 
@@ -264,14 +264,3 @@ def test_a_table_leaves_out_what_no_training_knows():
         "| a | 0.500 | 30.00 |",
         "| b | 0.250 | - |",
     ]
-
-
-def test_curves_have_a_panel_for_what_is_known():
-    rows = [
-        {"step": s, "seconds": s / 2, "loss": -s, "cycle": 1 / s, "style": 0.1} for s in (1, 2, 3)
-    ]
-    two = draw_style_curves(rows)
-    more = draw_style_curves([*rows, {"step": 3, "seconds": 2.0, "restoration_psnr": 30.0}])
-    assert two is not None and more is not None and len(more) == 2 * len(two)
-    assert two.min() < 100  # something is drawn
-    assert draw_style_curves([]) is None

@@ -1,0 +1,53 @@
+"""What commands write besides their result: notes on stderr, facts as JSON; and where they may."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+from tyro.conf import arg
+
+JsonFile = Annotated[Path | None, arg(name="json", metavar="FILE")]
+
+
+def print_note(text: str) -> None:
+    """On stderr, beside the result on stdout."""
+    print(text, file=sys.stderr)
+
+
+def write_json(path: Path | None, facts: dict[str, Any], *, say: bool = True) -> None:
+    """Write facts to a file, if one is named, and by default say so.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    if path is None:
+        return
+    from augment.errors import OutputError
+
+    try:
+        path.write_text(json.dumps(facts, indent=2) + "\n")
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {error.strerror}") from error
+    if say:
+        print_note(f"wrote {path}")
+
+
+def check_local(out: Path, instead: str) -> None:
+    """Refuse `s3://bucket/path` where a folder is meant: as a path it would be a folder `s3:` here.
+
+    instead: what to do, for the message.
+
+    Raises:
+        OutputError: the path begins with a scheme.
+    """
+    from augment.errors import OutputError
+
+    # Path makes one slash of two.
+    if re.match(r"[A-Za-z][A-Za-z0-9+.-]+:/", str(out)):
+        raise OutputError(
+            f"{out} is not on this machine, and this command needs a folder that is; {instead}"
+        )

@@ -1,0 +1,301 @@
+"""What `fit` and `style train` share: steps until the end or a signal, and checkpoints on disk from
+which a training goes on to the same bits.
+
+A checkpoint's `fit.json` says all there is to say and names the arrays' file with its checksum; it
+is written last and replaced in one step, so a kill at any moment leaves a whole checkpoint: this
+one or the one before.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import shutil
+import signal
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import numpy as np
+from safetensors import SafetensorError
+from safetensors.numpy import load_file, save_file
+from tqdm import tqdm
+
+from augment.errors import OutputError
+from augment.jobs.atomic import (
+    flush_folder,
+    make_folder,
+    output_error,
+    remove_temporaries,
+    temporary_beside,
+    write_atomic,
+)
+from augment.jobs.layout import STATE_FOLDER
+from tools.output import print_note
+
+EVALUATIONS = 10
+CHECKPOINT_S = 120.0
+VERSION = 1
+PLAN_FILE = "fit.json"
+_STATES = "state-*.safetensors"
+_STOPPING = b"\nstopping after this step; interrupt again to stop at once\n"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """code: the command's exit code, 130 where it was interrupted. report: as in report.json."""
+
+    code: int
+    report: dict[str, Any]
+
+
+class StopRequest:
+    """While entered, the first Ctrl-C or SIGTERM only sets `requested`; the second interrupts.
+
+    Signals are Python's main thread's; elsewhere nothing is caught.
+    """
+
+    def __init__(self) -> None:
+        self.requested = False
+        self._before: dict[signal.Signals, Any] = {}
+
+    def __enter__(self) -> StopRequest:
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM):
+                if signal.getsignal(number) != signal.SIG_IGN:  # `nohup`, or a script's background
+                    self._before[number] = signal.signal(number, self._catch)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _catch(self, _number: int, _frame: FrameType | None) -> None:
+        if self.requested:
+            raise KeyboardInterrupt("stopped at once; what the last checkpoint holds is kept")
+        self.requested = True
+        os.write(2, _STOPPING)  # print could meet a half-written line of its own
+
+
+def run_steps(
+    trainer: Any,
+    steps: int,
+    *,
+    after_step: Callable[[Any, bool], Mapping[str, str]],
+    save: Callable[[], None],
+    stop: StopRequest,
+    name: str,
+    checkpoint_s: float = CHECKPOINT_S,
+    progress: bool = True,
+) -> bool:
+    """From the trainer's step to `steps` (True), or until asked to stop (False); saves at the end.
+
+    after_step(record, is_evaluated): what the progress bar shows. save(): a checkpoint, every
+    checkpoint_s seconds; it does not change what is learnt.
+    """
+    evaluated, saved = evaluation_steps(steps), time.monotonic()
+    with tqdm(
+        total=steps, initial=trainer.step, desc=name, unit="step", disable=not progress
+    ) as bar:
+        while trainer.step < steps and not stop.requested:
+            record = trainer.run_step()
+            bar.set_postfix(after_step(record, record.step in evaluated), refresh=False)
+            bar.update(record.step - bar.n)
+            if time.monotonic() - saved > checkpoint_s and record.step < steps:
+                save()
+                saved = time.monotonic()
+    save()
+    return trainer.step >= steps
+
+
+def evaluation_steps(steps: int) -> frozenset[int]:
+    """About EVALUATIONS even points of a run, the last step among them."""
+    return frozenset(max(1, round(steps * i / EVALUATIONS)) for i in range(1, EVALUATIONS + 1))
+
+
+def rounded_steps(steps: int) -> int:
+    """At least 1; of hundreds, whole fifties."""
+    return max(1, steps if steps < 100 else steps // 50 * 50)
+
+
+def note_stop(step: int, steps: int, *, overwrite: bool) -> None:
+    """Say how to go on."""
+    again = "the same command without --overwrite" if overwrite else "the same command"
+    print_note(f"stopped after step {step} of {steps}; {again} goes on from there")
+
+
+def remove_unused(folder: Path) -> None:
+    """Leave no trace of a run that never began: its lock, and the folder if that was all."""
+    shutil.rmtree(folder / STATE_FOLDER, ignore_errors=True)
+    with contextlib.suppress(OSError):  # not empty
+        folder.rmdir()
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A training after `step` of `steps` steps.
+
+    settings, length: what was asked for. data: what was found in the recorded data. history: rows
+    so far; sums: of the steps since the last row; seconds: spent so far. facts, arrays: the
+    trainer's state; no arrays before the first step. finished: the result and its report stand.
+    """
+
+    settings: dict[str, Any]
+    length: dict[str, float]
+    steps: int
+    data: dict[str, Any]
+    step: int = 0
+    finished: bool = False
+    seconds: float = 0.0
+    history: list[dict[str, Any]] = field(default_factory=list)
+    sums: dict[str, float] = field(default_factory=dict)
+    facts: dict[str, Any] = field(default_factory=dict)
+    arrays: dict[str, np.ndarray] = field(default_factory=dict)
+
+
+def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
+    """Replace the folder's checkpoint.
+
+    Raises:
+        OutputError: the system refused; the checkpoint before is then as it was.
+    """
+    names = [field.name for field in fields(Checkpoint) if field.name != "arrays"]
+    plan = {**{n: getattr(checkpoint, n) for n in names}, "version": VERSION, "state": None}
+    name = None
+    if checkpoint.arrays:
+        name = f"state-{checkpoint.step:07d}.safetensors"
+        plan["state"] = {"file": name, "sha256": _write_state(folder / name, checkpoint.arrays)}
+    _write_plan(folder, plan)
+    remove_temporaries(folder, recursive=False)
+    # What killed runs left half-written, too; safetensors has temporary names of its own.
+    for path in (*folder.glob(_STATES), *folder.glob(".tmp*")):
+        if path.name != name:
+            try:
+                path.unlink(missing_ok=True)
+            except OSError as error:
+                raise output_error(path, error) from error
+
+
+def mark_finished(folder: Path) -> None:
+    """Note that the result and the report of the folder's checkpoint are written."""
+    _write_plan(folder, {**_read_plan(folder), "finished": True})
+
+
+def check_same(
+    out: Path, settings: Mapping[str, Any], length: Mapping[str, float], before: Checkpoint
+) -> None:
+    """Refuse to go on with what was begun with other settings or another length.
+
+    Raises:
+        OutputError: it was; every difference is named.
+    """
+    changed = differences(before.settings, settings)
+    if length != before.length and length.get("steps") != before.steps:
+        was, now = (" ".join(f"--{n} {v:g}" for n, v in a.items()) for a in (before.length, length))
+        changed.append(f"its length was {was} ({before.steps} steps), now {now}")
+    if changed:
+        raise OutputError(
+            f"{out} was begun with other settings: {'; '.join(changed)}. Choose another --out, or "
+            f"begin anew with --overwrite"
+        )
+
+
+def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+    """Every setting that is not the same: `scale was 0.25, now 0.5`."""
+    return [
+        f"{name} was {before.get(name)}, now {now.get(name)}"
+        for name in dict.fromkeys([*before, *now])
+        if before.get(name) != now.get(name)
+    ]
+
+
+def load_checkpoint(folder: Path, *, arrays: bool = True) -> Checkpoint | None:
+    """The folder's checkpoint; None where there is none. arrays: False leaves them on disk.
+
+    Raises:
+        OutputError: a file of it is missing, damaged, or of another version.
+    """
+    if not (folder / PLAN_FILE).is_file():
+        return None
+    plan = _read_plan(folder)
+    state = plan.pop("state")
+    del plan["version"]
+    return Checkpoint(**plan, arrays=_read_state(folder, state) if state and arrays else {})
+
+
+def _write_plan(folder: Path, plan: Mapping[str, Any]) -> None:
+    write_atomic(folder / PLAN_FILE, (json.dumps(plan, indent=1) + "\n").encode())
+
+
+def _read_plan(folder: Path) -> dict[str, Any]:
+    path = folder / PLAN_FILE
+    try:
+        plan = json.loads(path.read_bytes())
+    except OSError as error:
+        raise OutputError(f"{path} cannot be read: {error.strerror}") from error
+    except ValueError as error:
+        raise _damaged(path, str(error)) from error
+    version = plan.get("version") if isinstance(plan, dict) else None
+    if version != VERSION:
+        raise OutputError(
+            f"{path} is of version {version}, this program writes {VERSION}: fit to another --out, "
+            f"or begin anew with --overwrite"
+        )
+    names = {field.name for field in fields(Checkpoint)} - {"arrays"} | {"version", "state"}
+    if wrong := names ^ plan.keys():
+        raise _damaged(path, f"it lacks, or should not have, {', '.join(sorted(wrong))}")
+    step, steps = plan["step"], plan["steps"]
+    if not (isinstance(step, int) and isinstance(steps, int) and 0 <= step <= steps):
+        raise _damaged(path, f"it is at step {step!r} of {steps!r}")
+    return plan
+
+
+def _read_state(folder: Path, state: dict[str, str]) -> dict[str, np.ndarray]:
+    try:
+        path = folder / Path(state["file"]).name  # a name: nothing outside the folder is read
+        checksum = state["sha256"]
+    except (KeyError, TypeError) as error:
+        raise _damaged(folder / PLAN_FILE, "it does not name its state's file") from error
+    try:
+        with path.open("rb") as file:
+            if hashlib.file_digest(file, "sha256").hexdigest() != checksum:
+                raise _damaged(path, f"its SHA-256 is not the one in {PLAN_FILE}")
+        return {name: np.array(array) for name, array in load_file(path).items()}  # ours to change
+    except OSError as error:
+        raise _damaged(path, f"it cannot be read ({error.strerror})") from error
+    except SafetensorError as error:
+        raise _damaged(path, str(error)) from error
+
+
+def _write_state(path: Path, arrays: dict[str, np.ndarray]) -> str:
+    """Write arrays under their final name in one step, without a copy in memory. Returns SHA-256.
+
+    Raises:
+        OutputError: the system refused.
+    """
+    temporary = temporary_beside(path)
+    try:
+        make_folder(path.parent)
+        save_file({name: np.asarray(a, order="C") for name, a in arrays.items()}, temporary)
+        with temporary.open("rb") as file:
+            checksum = hashlib.file_digest(file, "sha256").hexdigest()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+        flush_folder(path.parent)
+    except OSError as error:
+        raise output_error(path, error) from error
+    except SafetensorError as error:  # how it reports a full disk
+        raise OutputError(f"cannot write {path}: {error}; see whether the disk is full") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+    return checksum
+
+
+def _damaged(path: Path, what: str) -> OutputError:
+    return OutputError(f"{path} is damaged: {what}. Begin anew with --overwrite")
