@@ -520,9 +520,9 @@ def open_to_fit(
             f"--holdout says which frames are held out, of the scene and of the views alike"
         )
     step = holdout_step(options.holdout)
-    if step is None or not can_hold_out(scheme, path):
+    if step is None or not _can_hold_out(scheme, path):
         scene = open_scene(format_uri(scheme, path, query))
-        check_recorded(scene)
+        _check_recorded(scene)
         warning = f"{scheme} scenes cannot be built without them"
         return scene, () if step is None else (_seen(options.holdout, warning),)
     first = query.get("frames", "").partition(":")[0]
@@ -531,7 +531,7 @@ def open_to_fit(
         scene = open_scene(format_uri(scheme, path, {**query, HELD_OUT_KEY: guess}))
     except AdapterError:  # the guess may have held out all frames; another reason comes again
         scene, guess = open_scene(format_uri(scheme, path, query)), None
-    check_recorded(scene)
+    _check_recorded(scene)
     numbers = [frame.index for frame in scene.frames]
     better = held_out_range(numbers, step)
     if better is None and len(numbers) >= step:
@@ -542,7 +542,7 @@ def open_to_fit(
     return scene, ()
 
 
-def can_hold_out(scheme: str, path: str) -> bool:
+def _can_hold_out(scheme: str, path: str) -> bool:
     """Whether such a scene can be built without some of its frames."""
     if scheme == "street_gaussians":
         from adapters.street_gaussians.model import is_dataset
@@ -551,7 +551,7 @@ def can_hold_out(scheme: str, path: str) -> bool:
     return scheme in _HELD_OUT_SCHEMES
 
 
-def check_recorded(scene: Scene) -> None:
+def _check_recorded(scene: Scene) -> None:
     """Refuse a scene that no camera has recorded, and say how to record it.
 
     Raises:
@@ -601,15 +601,10 @@ def _data_facts(scene: Scene, source: ViewSource) -> dict[str, Any]:
         "frames": len(scene.frames),
         "train views": len(source.train),
         "held-out views": len(source.test),
-        "Gaussians to start from": splat_count(scene),
+        "Gaussians to start from": sum(map(len, scene.all_gaussians)),
         "actors": len(scene.actors),
         "cameras' poses (SHA-256)": digest.hexdigest(),
     }
-
-
-def splat_count(scene: Scene) -> int:
-    """Gaussians of the background and of all actors."""
-    return sum(map(len, scene.all_gaussians))
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from tools.output import JsonFile, write_json
 
 if TYPE_CHECKING:
     from adapters.training_views.depth_priors import DepthPriors
-    from augment.reconstruct.config import DensifyConfig, FitConfig
+    from augment.reconstruct.config import FitConfig
 
 DEFAULT_MINUTES = 10.0
 DEPTH_KINDS = ("sparse", "metric", "relative")
@@ -120,22 +120,20 @@ class FitOptions:
         from augment.reconstruct.config import FitConfig
 
         default = FitConfig()
-        growth = default.densify
-        growth = dataclasses.replace(
-            growth, max_splats=value_or(self.max_splats, growth.max_splats)
-        )
+        most = value_or(self.max_splats, default.densify.max_splats)
+        growth = dataclasses.replace(default.densify, max_splats=most)
         if self.densify == "none":
-            growth = without_growth(growth)
+            # Its part of the run ends before it starts.
+            growth = dataclasses.replace(growth, start=1.0, stop=0.0)
         else:
             growth = dataclasses.replace(growth, method=self.densify)
+        depth = value_or(self.depth_weight, default.loss.depth)
         return dataclasses.replace(
             default,
             steps=steps,
             seed=self.seed,
             sh_degree=value_or(self.sh_degree, default.sh_degree),
-            loss=dataclasses.replace(
-                default.loss, depth=value_or(self.depth_weight, default.loss.depth)
-            ),
+            loss=dataclasses.replace(default.loss, depth=depth),
             densify=growth,
         )
 
@@ -156,11 +154,6 @@ class FitOptions:
             **({} if self.device == "cpu" else {"device": self.device}),
             **_flat(config),
         }
-
-
-def without_growth(config: DensifyConfig) -> DensifyConfig:
-    """No splats are added or removed: the part of the run for it ends before it starts."""
-    return dataclasses.replace(config, start=1.0, stop=0.0)
 
 
 def check_range(

@@ -1,4 +1,4 @@
-"""`climategs render`: a recipe and a scene's URI become a job; and `climategs demo`, one of them."""
+"""`climategs render`: a recipe and a scene's URI become a job; `climategs demo` is one of them."""
 
 from __future__ import annotations
 
@@ -163,9 +163,7 @@ def _report(result: JobResult, workers: int) -> None:
 
 
 def run_demo(out: Path, frames: int) -> int:
-    """`climategs demo`: the embedded street under five recipes, and pictures of it. Returns the exit
-    code.
-    """
+    """The embedded street under five recipes, and pictures of it. Returns the exit code."""
     started = time.perf_counter()
     uri = f"procedural:street?seed=3&frames={frames}"
     print_note(f"building {uri} and compiling the kernels (kept for the next run)")

@@ -1,4 +1,4 @@
-"""Pictures of an output folder for people: a contact sheet, and a video of variants side by side."""
+"""Pictures of an output folder: a contact sheet, and a video of variants side by side."""
 
 from __future__ import annotations
 
