@@ -14,6 +14,9 @@ import torch
 
 from adapters.base import open_scene
 from augment.cameras import Camera
+from augment.effects.snow.snow import placement_settings
+from augment.effects.snow.support import bed_of, remember_support
+from augment.effects.style.style import remember_maps, style_maps
 from augment.geometry import rigid
 from augment.jobs.layout import folder_name, variant_name
 from augment.jobs.render_job import RenderJob, run_job
@@ -177,3 +180,18 @@ def record_street(
     job = RenderJob(scene.source, [recipe], folder, cameras=cameras)
     run_job(job, scene_loader=lambda _: scene)
     return scene, folder / folder_name(scene.name) / variant_name(recipe)
+
+
+def scene_of_recipe(scene: Scene, recipe: Recipe, backend: str = "auto") -> Scene:
+    """A scene of the same arrays that remembers a recipe's snow and style maps, as long as it
+    lives: only a few are kept at a time, and none may be found anew between two timed frames.
+    """
+    own = dataclasses.replace(scene)
+    snow, style = recipe.weather.snow, recipe.style
+    if snow is not None:
+        settings = placement_settings(snow)
+        remember_support(own, settings, bed_of(scene, settings, backend=backend))
+    if style is not None:
+        usual = style.model_copy(update={"evaluated": "color"})
+        remember_maps(own, style, style_maps(scene, usual))
+    return own
