@@ -45,7 +45,83 @@ from augment.scene import Actor, Scene
 from augment.semantics import SemanticClass
 from augment.sky import Sky
 
-# ---- Boxes and LiDAR sweeps of a street, worked out when asked -----------------------------------
+logger = logging.getLogger(__name__)
+
+EYE_STEP_M = 2.0
+MAX_EYES = 40
+
+
+def open_procedural(query: Mapping[str, str]) -> Scene:
+    """The scene of a procedural street's query (keys as StreetParameters' fields).
+
+    Raises:
+        AdapterError: unknown keys or values outside their limits.
+    """
+    return build_scene(parse_parameters(query))
+
+
+def procedural_labels(path: str, query: Mapping[str, str]) -> StreetLabels:
+    """The labels of a street's query.
+
+    Raises:
+        AdapterError: unknown keys or values outside their limits.
+    """
+    return StreetLabels(parse_parameters(query))
+
+
+def build_scene(parameters: StreetParameters) -> Scene:
+    """A street as Gaussians, actors, sky, cameras and labels. Equal parameters, equal bits."""
+    begun = time.perf_counter()
+    street = build_street(parameters)
+    eyes, times = _eyes(parameters)
+    static = plan_splats(street.static, eyes)
+    moving = [plan_splats(m.body, _eyes_from(m, eyes, times)) for m in street.movers]
+    coarseness = coarseness_for([static, *moving], parameters.gaussians)
+    actors = tuple(
+        _actor(mover, plan, coarseness) for mover, plan in zip(street.movers, moving, strict=True)
+    )
+    times_ns = np.array([frame_time_ns(i) for i in range(parameters.frames)])
+    scene = Scene(
+        name=parameters.name,
+        source=parameters.uri,
+        background=splat(static, coarseness),
+        actors=actors,
+        sky=build_sky(parameters.seed, street.to_sun),
+        frames=build_frames(parameters),
+        labels=StreetLabels(parameters),
+        ground_z_m=float(ego_pose(parameters, times_ns)[0][:, 2].min()),  # lowest under the path
+    )
+    count = len(scene.background) + sum(len(a.gaussians) for a in actors)
+    seconds = time.perf_counter() - begun
+    logger.info("%s: %d Gaussians in %.1f s", parameters.name, count, seconds)
+    return scene
+
+
+def _actor(mover: MovingBody, plan: SplatPlan, coarseness: float) -> Actor:
+    gaussians = [splat(plan, coarseness), shadow_gaussians(contact_shadow(mover))]
+    return Actor(
+        track_id=mover.name,
+        label=mover.label,
+        gaussians=join_gaussians(gaussians),
+        track=mover.motion.track,
+        size_m=mover.size_m,
+    )
+
+
+def _eyes(parameters: StreetParameters) -> tuple[np.ndarray, np.ndarray]:
+    """Places [E, 3] of the cameras along the drive, and the times [E] they are there."""
+    first, last = frame_time_ns(0), frame_time_ns(parameters.frames - 1)
+    length = parameters.speed_mps * (last - first) * 1e-9
+    count = int(np.clip(np.ceil(length / EYE_STEP_M) + 1, 1, MAX_EYES))
+    times = np.linspace(0, last - first, count).round().astype(np.int64) + first
+    return camera_path(parameters, times), times
+
+
+def _eyes_from(mover: MovingBody, eyes: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """The same places as a mover sees them."""
+    turn = np.cos(mover.motion.yaw)  # its heading is along +x or -x
+    return (eyes - mover.motion.at(times)[0]) * np.array([turn, turn, 1.0])
+
 
 # ---- What the street's surfaces really are: distance, normal, class and colour along any ray -----
 
@@ -54,8 +130,8 @@ from augment.sky import Sky
 class RayHits:
     """What N rays see. distance [N]: metres, infinite for sky. normal [N, 3]: world, unit, towards
     the ray's origin; zero for sky. semantic [N] int16, instance [N] int32: 0 or 1 + the actor's
-    index. rgb [N, 3]: display-encoded surface colour with baked light, zero for sky; None unless
-    asked for. shape [N]: of the body that was hit, -1 for sky.
+    index. rgb [N, 3]: display-encoded, with baked light, zero for sky; None unless asked for.
+    shape [N]: of the body that was hit, -1 for sky.
     """
 
     distance: np.ndarray
@@ -69,8 +145,7 @@ class RayHits:
 @dataclass(frozen=True, eq=False)
 class TrueView:
     """A camera's image as it should be. rgb float32 [H, W, 3] with sky; depth float64 [H, W]: z,
-    infinite for sky; normal [H, W, 3]; semantic int16 [H, W]; instance int32 [H, W].
-    """
+    infinite for sky; normal [H, W, 3]; semantic int16 [H, W]; instance int32 [H, W]."""
 
     rgb: np.ndarray
     depth: np.ndarray
@@ -87,7 +162,6 @@ class StreetTruth:
 
     @cached_property
     def sky(self) -> Sky:
-        """As the scene's."""
         return build_sky(self.street.parameters.seed, self.street.to_sun)
 
     @cached_property
@@ -123,38 +197,6 @@ class StreetTruth:
             index = index[nearer]
             distance[index], shape[index] = met.distance[nearer], met.shape[nearer]
             local[index], instance[index] = met.local[nearer], number
-        return self._describe(origins, unit, times, distance, shape, local, instance, with_rgb)
-
-    def render(self, camera: Camera) -> TrueView:
-        """Cast a ray through every pixel centre."""
-        size = (camera.height, camera.width)
-        rays = camera.ray_directions(torch.float64)
-        flat = rays.reshape(-1, 3).numpy()
-        hits = self.cast(camera.centre.numpy(), flat, camera.timestamp_ns)
-        assert hits.rgb is not None
-        sky = self.sky.sample(rays.float()).numpy()
-        is_sky = np.isinf(hits.distance).reshape(size)
-        rgb = np.where(is_sky[..., None], sky, hits.rgb.reshape(*size, 3)).astype(np.float32)
-        return TrueView(
-            rgb=rgb,
-            depth=(hits.distance / np.linalg.norm(flat, axis=1)).reshape(size),
-            normal=hits.normal.reshape(*size, 3),
-            semantic=hits.semantic.reshape(size),
-            instance=hits.instance.reshape(size),
-        )
-
-    def _describe(
-        self,
-        origins: np.ndarray,
-        unit: np.ndarray,
-        times: np.ndarray,
-        distance: np.ndarray,
-        shape: np.ndarray,
-        local: np.ndarray,
-        instance: np.ndarray,
-        with_rgb: bool,
-    ) -> RayHits:
-        rays = len(unit)
         normal = np.zeros((rays, 3))
         semantic = np.full(rays, SemanticClass.SKY, np.int16)
         rgb = np.zeros((rays, 3)) if with_rgb else None
@@ -176,6 +218,24 @@ class StreetTruth:
                 cover = shadow.cover(relative) * present
                 rgb[seen] += cover[:, None] * (SHADOW_RGB - rgb[seen])
         return RayHits(distance, normal, semantic, instance, shape, rgb)
+
+    def render(self, camera: Camera) -> TrueView:
+        """Cast a ray through every pixel centre."""
+        size = (camera.height, camera.width)
+        rays = camera.ray_directions(torch.float64)
+        flat = rays.reshape(-1, 3).numpy()
+        hits = self.cast(camera.centre.numpy(), flat, camera.timestamp_ns)
+        assert hits.rgb is not None
+        sky = self.sky.sample(rays.float()).numpy()
+        is_sky = np.isinf(hits.distance).reshape(size)
+        rgb = np.where(is_sky[..., None], sky, hits.rgb.reshape(*size, 3)).astype(np.float32)
+        return TrueView(
+            rgb=rgb,
+            depth=(hits.distance / np.linalg.norm(flat, axis=1)).reshape(size),
+            normal=hits.normal.reshape(*size, 3),
+            semantic=hits.semantic.reshape(size),
+            instance=hits.instance.reshape(size),
+        )
 
     def _body(self, instance: int) -> tuple[Body, np.ndarray]:
         if instance == 0:
@@ -199,9 +259,7 @@ def open_truth(query: Mapping[str, str]) -> StreetTruth:
     return StreetTruth(build_street(parse_parameters(query)))
 
 
-# ------------------------------------------------------------------------------------------------
-# A spinning LiDAR on the ego car's roof, by exact ray casting; moving things stand where they are
-# at each ray's own time.
+# ---- A spinning LiDAR on the ego car's roof; things stand where they are at each ray's own time --
 
 SENSOR_M = (0.6, 0.0, 1.95)  # forward, left, up from the ego origin
 LOWEST_DEG, HIGHEST_DEG = -24.0, 14.0
@@ -233,8 +291,7 @@ def lidar_rays(street: Street, frame_index: int) -> tuple[np.ndarray, np.ndarray
     columns, rings = parameters.lidar_columns, parameters.lidar_rings
     turn = (np.arange(columns) + 0.5) / columns - 0.5
     times = frame_time_ns(frame_index) + np.round(turn * FRAME_NS).astype(np.int64)
-    pose = ego_pose(parameters, times)
-    azimuth = (pose.yaws - 2 * np.pi * turn)[:, None]
+    azimuth = (ego_pose(parameters, times)[1] - 2 * np.pi * turn)[:, None]
     elevation = np.radians(np.linspace(LOWEST_DEG, HIGHEST_DEG, rings))[None, :]
     directions = np.stack(
         [
@@ -249,17 +306,16 @@ def lidar_rays(street: Street, frame_index: int) -> tuple[np.ndarray, np.ndarray
 
 def sensor_origins(parameters: StreetParameters, timestamps_ns: np.ndarray) -> np.ndarray:
     """Where the sensor is at times [N], float64 [N, 3]."""
-    pose = ego_pose(parameters, timestamps_ns)
+    positions, yaws = ego_pose(parameters, timestamps_ns)
     forward, left, up = SENSOR_M
-    c, s = np.cos(pose.yaws), np.sin(pose.yaws)
+    c, s = np.cos(yaws), np.sin(yaws)
     offset = np.stack([c * forward - s * left, s * forward + c * left, np.full(len(c), up)], 1)
-    return pose.positions + offset
+    return positions + offset
 
 
 def sweep(truth: StreetTruth, frame_index: int) -> LidarSweep:
     """One turn's returns. Columns: x, y, z float64 metres; intensity float32 in [0, 1];
-    timestamp_ns int64; ring uint8; semantic uint8 (SemanticClass); instance uint16 (as images').
-    """
+    timestamp_ns int64; ring uint8; semantic uint8 (SemanticClass); instance uint16 (as images')."""
     origins, directions, times = lidar_rays(truth.street, frame_index)
     rings = directions.shape[1]
     origin, time = np.repeat(origins, rings, axis=0), np.repeat(times, rings)
@@ -287,9 +343,6 @@ def sweep(truth: StreetTruth, frame_index: int) -> LidarSweep:
     )
 
 
-# ---- labels --------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class StreetLabels:
     """Labels of a street; holds only its parameters, so it is cheap to pickle."""
@@ -304,8 +357,8 @@ class StreetLabels:
         for number, mover in enumerate(street.movers, start=1):
             centres, present = mover.motion.at(time)
             if present[0]:
-                yaw = mover.motion.yaw
-                rows.append((mover.name, mover.label, centres[0], mover.size_m, yaw, False, number))
+                box = (centres[0], mover.size_m, mover.motion.yaw)
+                rows.append((mover.name, mover.label, *box, False, number))
         for car in street.parked:
             rows.append((car.name, "Car", car.centre, car.size_m, car.yaw, True, 0))
         if not rows:
@@ -342,89 +395,3 @@ class StreetLabels:
                 f"got {frame_index}"
             )
         return frame_time_ns(frame_index)
-
-
-# ---- procedural ----------------------------------------------------------------------------------
-
-logger = logging.getLogger(__name__)
-
-EYE_STEP_M = 2.0
-MAX_EYES = 40
-
-
-def open_procedural(query: Mapping[str, str]) -> Scene:
-    """The scene of a procedural street's query (keys as StreetParameters' fields).
-
-    Raises:
-        AdapterError: unknown keys or values outside their limits.
-    """
-    return build_scene(parse_parameters(query))
-
-
-def procedural_labels(path: str, query: Mapping[str, str]) -> StreetLabels:
-    """The labels of a street's query.
-
-    Raises:
-        AdapterError: unknown keys or values outside their limits.
-    """
-    return StreetLabels(parse_parameters(query))
-
-
-def build_scene(parameters: StreetParameters) -> Scene:
-    """A street as Gaussians, actors, sky, cameras and labels. Equal parameters, equal bits."""
-    begun = time.perf_counter()
-    street = build_street(parameters)
-    eyes, times = _eyes(parameters)
-    static = plan_splats(street.static, eyes)
-    moving = [plan_splats(m.body, _eyes_from(m, eyes, times)) for m in street.movers]
-    coarseness = coarseness_for([static, *moving], parameters.gaussians)
-    actors = tuple(
-        _actor(mover, plan, coarseness) for mover, plan in zip(street.movers, moving, strict=True)
-    )
-    scene = Scene(
-        name=parameters.name,
-        source=parameters.uri,
-        background=splat(static, coarseness),
-        actors=actors,
-        sky=build_sky(parameters.seed, street.to_sun),
-        frames=build_frames(parameters),
-        labels=StreetLabels(parameters),
-        ground_z_m=_ground_z(street),
-    )
-    count = len(scene.background) + sum(len(a.gaussians) for a in actors)
-    seconds = time.perf_counter() - begun
-    logger.info("%s: %d Gaussians in %.1f s", parameters.name, count, seconds)
-    return scene
-
-
-def _actor(mover: MovingBody, plan: SplatPlan, coarseness: float) -> Actor:
-    gaussians = [splat(plan, coarseness), shadow_gaussians(contact_shadow(mover))]
-    return Actor(
-        track_id=mover.name,
-        label=mover.label,
-        gaussians=join_gaussians(gaussians),
-        track=mover.motion.track,
-        size_m=mover.size_m,
-    )
-
-
-def _eyes(parameters: StreetParameters) -> tuple[np.ndarray, np.ndarray]:
-    """Places [E, 3] of the cameras along the drive, and the times [E] they are there."""
-    first, last = frame_time_ns(0), frame_time_ns(parameters.frames - 1)
-    length = parameters.speed_mps * (last - first) * 1e-9
-    count = int(np.clip(np.ceil(length / EYE_STEP_M) + 1, 1, MAX_EYES))
-    times = np.linspace(0, last - first, count).round().astype(np.int64) + first
-    return camera_path(parameters, times), times
-
-
-def _eyes_from(mover: MovingBody, eyes: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """The same places as a mover sees them."""
-    turn = np.cos(mover.motion.yaw)  # its heading is along +x or -x
-    return (eyes - mover.motion.at(times)[0]) * np.array([turn, turn, 1.0])
-
-
-def _ground_z(street: Street) -> float:
-    """Lowest road height under the ego path."""
-    parameters = street.parameters
-    times = np.array([frame_time_ns(i) for i in range(parameters.frames)])
-    return float(ego_pose(parameters, times).positions[:, 2].min())

@@ -22,11 +22,11 @@ from adapters.street.forms import (
     triangle,
     tube,
 )
-from adapters.street.layout import CROSS_STREET_M, FACADE_M, Layout, Plot, pavement_z
+from adapters.street.layout import CROSS_STREET_M, FACADE_M, Layout, pavement_z
 from augment.semantics import SemanticClass as Class
 
-# ---- Parts of a house front, built in its own frame: x along the wall, y into the house, z up ----
-# The wall's outer face is the plane y = 0, seen from y < 0.
+# A front has its own frame: x along the wall, y into the house, z up; its outer face is the plane
+# y = 0, seen from y < 0.
 
 REVEAL_M = 0.14  # how deep windows stand in the wall
 GLASS = Look((0.022, 0.026, 0.03), Class.BUILDING, Material.GLASS, backed=True)
@@ -34,8 +34,6 @@ GLASS = Look((0.022, 0.026, 0.03), Class.BUILDING, Material.GLASS, backed=True)
 
 @dataclass(frozen=True)
 class Style:
-    """The looks and measures of one house."""
-
     wall: Look
     base: Look
     trim: Look
@@ -51,17 +49,15 @@ class Style:
 SHOP_GLASS = replace(GLASS, material=Material.SHOP)
 
 
-def panels(rectangles: np.ndarray, depth_m: float, look: Look, edges: np.ndarray | int) -> Shapes:
+def panels(
+    rectangles: np.ndarray, depth_m: float, look: Look, edges: np.ndarray | int = ALL_EDGES
+) -> Shapes:
     """Upright panels over (x, z) rectangles [R, 4] at y = depth_m, seen from the street."""
     x0, z0, x1, z1 = np.asarray(rectangles, np.float64).reshape(-1, 4).T
     zero = np.zeros_like(x0)
-    return parallelograms(
-        np.stack([x0, zero + depth_m, z0], 1),
-        np.stack([x1 - x0, zero, zero], 1),
-        np.stack([zero, zero, z1 - z0], 1),
-        look,
-        edges=edges,
-    )
+    corner = np.stack([x0, zero + depth_m, z0], 1)
+    u, v = np.stack([x1 - x0, zero, zero], 1), np.stack([zero, zero, z1 - z0], 1)
+    return parallelograms(corner, u, v, look, edges=edges)
 
 
 def reveals(opening: Rectangle, depth_m: float, look: Look) -> Shapes:
@@ -69,12 +65,9 @@ def reveals(opening: Rectangle, depth_m: float, look: Look) -> Shapes:
     x0, z0, x1, z1 = opening
     into, up, along = (0, depth_m, 0), (0, 0, z1 - z0), (x1 - x0, 0, 0)
     shaded = Look(look.rgb, look.semantic, look.material, ambient=0.75)
-    return parallelograms(
-        [(x0, 0, z0), (x1, 0, z0), (x0, 0, z0), (x0, 0, z1)],
-        [into, up, along, into],
-        [up, into, into, along],
-        shaded,
-    )
+    corners = [(x0, 0, z0), (x1, 0, z0), (x0, 0, z0), (x0, 0, z1)]
+    us, vs = [into, up, along, into], [up, into, into, along]
+    return parallelograms(corners, us, vs, shaded)
 
 
 def glazing(
@@ -99,7 +92,7 @@ def glazing(
         for j in range(rows)
     ]
     bars, edges = cut(opening, panes)
-    glass = panels(np.array(panes), depth_m, pane, ALL_EDGES)
+    glass = panels(np.array(panes), depth_m, pane)
     glass.variation[:] = 0.37  # one window, one curtain
     return join([panels(bars, depth_m - 0.02, frame, edges), glass])
 
@@ -141,21 +134,18 @@ def door(opening: Rectangle, style: Style) -> Shapes:
     """A panelled door with a fanlight and a step."""
     x0, z0, x1, z1 = opening
     split = z1 - 0.55
-    leaf = (x0 + 0.06, z0, x1 - 0.06, split)
-    fields = [
-        (leaf[0] + 0.14, z0 + 0.25, leaf[2] - 0.14, z0 + 0.95),
-        (leaf[0] + 0.14, z0 + 1.1, leaf[2] - 0.14, split - 0.16),
-    ]
-    frames, edges = cut(opening, [leaf, (x0 + 0.06, split + 0.06, x1 - 0.06, z1 - 0.06)])
+    leaf, light = (x0 + 0.06, z0, x1 - 0.06, split), (x0 + 0.06, split + 0.06, x1 - 0.06, z1 - 0.06)
+    low, high = leaf[0] + 0.14, leaf[2] - 0.14
+    fields = [(low, z0 + 0.25, high, z0 + 0.95), (low, z0 + 1.1, high, split - 0.16)]
+    frames, edges = cut(opening, [leaf, light])
     stiles, stile_edges = cut(leaf, fields)
     dark = style.accent.tinted(np.array(style.accent.rgb) * 0.7)
-    light = np.array([(x0 + 0.06, split + 0.06, x1 - 0.06, z1 - 0.06)])
     return join(
         [
             panels(frames, REVEAL_M - 0.02, style.frame, edges),
             panels(stiles, REVEAL_M, style.accent, stile_edges),
-            panels(np.array(fields), REVEAL_M + 0.015, dark, ALL_EDGES),
-            panels(light, REVEAL_M, GLASS, ALL_EDGES),
+            panels(np.array(fields), REVEAL_M + 0.015, dark),
+            panels(np.array([light]), REVEAL_M, GLASS),
             reveals(opening, REVEAL_M, style.wall),
             boxes((x0 - 0.1, -0.35, -0.3), (x1 + 0.1, REVEAL_M, z0), style.base),
         ]
@@ -167,18 +157,16 @@ def shop_front(opening: Rectangle, style: Style, awning: bool) -> Shapes:
     x0, z0, x1, z1 = opening
     depth = 0.18
     door_x = x1 - 1.25
-    plinth = (x0, z0, door_x, z0 + 0.5)
+    plinth, entry = (x0, z0, door_x, z0 + 0.5), (door_x, z0, x1, z1)
     show = (x0, z0 + 0.5, door_x, z1)
-    entry = (door_x, z0, x1, z1)
-    sign_z = z1 + 0.08
+    sign_z, columns = z1 + 0.08, max(1, round((door_x - x0) / 1.7))
+    low, high = (x0 - 0.1, -0.12, sign_z), (x1 + 0.1, 0.02, sign_z + 0.62)
     parts = [
-        panels(np.array([plinth]), depth - 0.04, style.accent, ALL_EDGES),
-        glazing(show, max(1, round((door_x - x0) / 1.7)), 1, depth, style.accent, 0.09, SHOP_GLASS),
+        panels(np.array([plinth]), depth - 0.04, style.accent),
+        glazing(show, columns, 1, depth, style.accent, 0.09, SHOP_GLASS),
         glazing(entry, 1, 2, depth, style.accent, 0.11),
         reveals(opening, depth, style.accent),
-        boxes(
-            (x0 - 0.1, -0.12, sign_z), (x1 + 0.1, 0.02, sign_z + 0.62), style.accent, faces=_FRONT
-        ),
+        boxes(low, high, style.accent, faces=_FRONT),
         _lettering(x0, x1, sign_z, style),
     ]
     if awning:
@@ -192,10 +180,9 @@ def _lettering(x0: float, x1: float, z: float, style: Style) -> Shapes:
     count = int(min(12, (x1 - x0 - 0.8) / pitch))
     starts = middle + (np.arange(count) - count / 2) * pitch
     tall = 0.18 + 0.10 * ((np.arange(count) * 5) % 3 == 0)
-    rectangles = np.stack([starts, np.full(count, z + 0.17), starts + 0.2, z + 0.17 + tall], 1)[
-        (np.arange(count) % 5) != 3
-    ]
-    return panels(rectangles, -0.135, style.trim, ALL_EDGES)
+    low = np.full(count, z + 0.17)
+    rectangles = np.stack([starts, low, starts + 0.2, z + 0.17 + tall], 1)
+    return panels(rectangles[(np.arange(count) % 5) != 3], -0.135, style.trim)
 
 
 def _awning(x0: float, x1: float, z: float, style: Style) -> Shapes:
@@ -216,23 +203,18 @@ def _awning(x0: float, x1: float, z: float, style: Style) -> Shapes:
     return join(parts)
 
 
-# ---- buildings -----------------------------------------------------------------------------------
+# ---- Houses and gardens --------------------------------------------------------------------------
 
 DEPTH_M = 10.5
 BASE_M = -0.25  # walls reach below the pavement
 # Nobody sees it: it stops what little shines through the front's splats from showing the back wall.
 INNER_WALL_M = 0.45
 WALLS = (
-    ((0.72, 0.66, 0.54), Material.PLASTER),
-    ((0.66, 0.50, 0.36), Material.PLASTER),
-    ((0.58, 0.57, 0.54), Material.PLASTER),
-    ((0.70, 0.56, 0.50), Material.PLASTER),
-    ((0.50, 0.58, 0.56), Material.PLASTER),
-    ((0.78, 0.76, 0.71), Material.PLASTER),
-    ((0.36, 0.16, 0.11), Material.BRICK),
-    ((0.42, 0.22, 0.14), Material.BRICK),
-    ((0.30, 0.19, 0.15), Material.BRICK),
-    ((0.55, 0.49, 0.39), Material.STONE),
+    *[((0.72, 0.66, 0.54), Material.PLASTER), ((0.66, 0.50, 0.36), Material.PLASTER)],
+    *[((0.58, 0.57, 0.54), Material.PLASTER), ((0.70, 0.56, 0.50), Material.PLASTER)],
+    *[((0.50, 0.58, 0.56), Material.PLASTER), ((0.78, 0.76, 0.71), Material.PLASTER)],
+    *[((0.36, 0.16, 0.11), Material.BRICK), ((0.42, 0.22, 0.14), Material.BRICK)],
+    *[((0.30, 0.19, 0.15), Material.BRICK), ((0.55, 0.49, 0.39), Material.STONE)],
 )
 ACCENTS = (
     (0.05, 0.13, 0.10),
@@ -247,20 +229,17 @@ ROOFS = ((0.24, 0.10, 0.065), (0.13, 0.12, 0.125), (0.19, 0.09, 0.06))
 
 def build_buildings(layout: Layout) -> Shapes:
     """Both rows of houses, those that close the street's ends, and some behind."""
-    middle = layout.path_length_m / 2
+    middle = layout.parameters.path_length_m / 2
     parts = []
     for plot in layout.plots:
         yaw = 0.0 if plot.side > 0 else np.pi
         corner = (plot.x0 if plot.side > 0 else plot.x1, plot.side * FACADE_M, 0.0)
         reach = abs((plot.x0 + plot.x1) / 2 - middle) - middle
-        built = (
-            _garden(plot) if plot.is_garden else _house(plot.seed, plot.x1 - plot.x0, reach < 32)
-        )
+        width = plot.x1 - plot.x0
+        built = _garden(width) if plot.is_garden else _house(plot.seed, width, reach < 32)
         parts.append(built.moved(corner, yaw))
-    ends = (
-        (layout.x1 + CROSS_STREET_M + 4.6, -np.pi / 2),
-        (layout.x0 - CROSS_STREET_M - 4.6, np.pi / 2),
-    )
+    reach = CROSS_STREET_M + 4.6
+    ends = ((layout.x1 + reach, -np.pi / 2), (layout.x0 - reach, np.pi / 2))
     for number, (x, yaw) in enumerate(ends):
         rng = np.random.default_rng([layout.parameters.seed, 20, number])
         start = -56.0
@@ -317,11 +296,12 @@ def _house(seed: int, width: float, fine: bool) -> Shapes:
     places = np.array([(x, 0.0, z) for x, z in corners])
     parts.append(window(style.window_m, style, fine).repeated(places))
 
-    ledges = [(0.0, style.ground_m + 0.12, width, style.ground_m + 0.3, 0.09)]
-    ledges.append((0.0, eaves - 0.32, width, eaves, 0.28))
-    for x0, z0, x1, z1, reach in ledges:
-        holes.append((x0, z0, x1, z1))
-        parts.append(boxes((x0, -reach, z0), (x1, 0.0, z1), style.trim, faces=_LEDGE))
+    for z0, z1, reach in (
+        (style.ground_m + 0.12, style.ground_m + 0.3, 0.09),
+        (eaves - 0.32, eaves, 0.28),
+    ):
+        holes.append((0.0, z0, width, z1))
+        parts.append(boxes((0.0, -reach, z0), (width, 0.0, z1), style.trim, faces=_LEDGE))
     holes.append((0.0, BASE_M, width, 0.5))
     base, edges = cut((0.0, BASE_M, width, 0.5), [h for h in holes[:-1] if h[1] < 0.5])
     parts.append(panels(base, -0.0, style.base, edges))
@@ -329,8 +309,9 @@ def _house(seed: int, width: float, fine: bool) -> Shapes:
     parts.append(panels(wall, 0.0, style.wall, edges))
     parts += [_back(style, width, eaves), _roof(rng, style, width, eaves)]
     inner = Look(style.wall.rgb, Class.BUILDING)
-    parts.append(panels(np.array([(0.0, BASE_M, width, eaves)]), INNER_WALL_M, inner, ALL_EDGES))
-    parts.append(_rainpipe(eaves))
+    parts.append(panels(np.array([(0.0, BASE_M, width, eaves)]), INNER_WALL_M, inner))
+    zinc = Look((0.22, 0.22, 0.215), Class.BUILDING)
+    parts.append(tube((0.12, -0.09, 0.0), (0.12, -0.09, eaves - 0.2), 0.05, zinc))  # a rainpipe
     return join(parts)
 
 
@@ -338,12 +319,7 @@ _LEDGE = ("-y", "+z", "-z", "+x", "-x")
 
 
 def _ground_floor(
-    rng: np.random.Generator,
-    style: Style,
-    width: float,
-    count: int,
-    holes: list[Rectangle],
-    fine: bool,
+    rng: np.random.Generator, style: Style, width: float, count: int, holes: list, fine: bool
 ) -> Shapes:
     """Shop, or a door between windows; adds its holes to the wall's."""
     floor = float(pavement_z(FACADE_M)) + 0.02
@@ -386,26 +362,20 @@ def _roof(rng: np.random.Generator, style: Style, width: float, eaves: float) ->
     rise, half = (DEPTH_M / 2) * float(np.tan(np.radians(rng.uniform(30, 40)))), DEPTH_M / 2
     over = 0.35
     drop = over * rise / half
-    front, back = (0.0, -over, eaves - drop + 0.12), (width, DEPTH_M + over, eaves - drop + 0.12)
+    edge_z = eaves - drop + 0.12
     slope = np.array([0.0, half + over, rise + drop])
+    low, high = (0.0, -over - 0.12, edge_z - 0.14), (width, -over + 0.02, edge_z + 0.0)
+    gutter = style.trim.tinted((0.25, 0.24, 0.23))
+    under = (0, -over, edge_z - 0.02)
     parts = [
-        parallelograms(front, (width, 0, 0), slope, tiles),
-        parallelograms(back, (-width, 0, 0), slope * [1, -1, 1], tiles),
-        boxes(
-            (0.0, -over - 0.12, front[2] - 0.14),
-            (width, -over + 0.02, front[2] + 0.0),
-            style.trim.tinted((0.25, 0.24, 0.23)),
-            faces=_LEDGE,
-            edges=0,
-        ),
-        parallelograms(
-            (0, -over, front[2] - 0.02), (0, over, 0), (width, 0, 0), style.trim, edges=0
-        ),
+        parallelograms((0.0, -over, edge_z), (width, 0, 0), slope, tiles),
+        parallelograms((width, DEPTH_M + over, edge_z), (-width, 0, 0), slope * [1, -1, 1], tiles),
+        boxes(low, high, gutter, faces=_LEDGE, edges=0),
+        parallelograms(under, (0, over, 0), (width, 0, 0), style.trim, edges=0),
     ]
     gable = Look(style.wall.rgb, Class.BUILDING, style.wall.material, spacing=0.8)
-    peak = (half, eaves + rise + 0.1)
     for x, flip in ((0.0, True), (width, False)):
-        a, b, c = (x, 0.0, eaves), (x, DEPTH_M, eaves), (x, *peak)
+        a, b, c = (x, 0.0, eaves), (x, DEPTH_M, eaves), (x, half, eaves + rise + 0.1)
         parts.append(triangle(np.array([a, c, b] if flip else [a, b, c]), gable))
     brick = Look((0.33, 0.16, 0.11), Class.BUILDING, Material.BRICK)
     for x in (0.7, width - 1.5)[: int(rng.integers(1, 3))]:
@@ -428,14 +398,8 @@ def _flat_roof(style: Style, width: float, eaves: float) -> Shapes:
     )
 
 
-def _rainpipe(eaves: float) -> Shapes:
-    zinc = Look((0.22, 0.22, 0.215), Class.BUILDING)
-    return tube((0.12, -0.09, 0.0), (0.12, -0.09, eaves - 0.2), 0.05, zinc)
-
-
-def _garden(plot: Plot) -> Shapes:
+def _garden(width: float) -> Shapes:
     """A low wall with a hedge behind it, across a gap between two houses."""
-    width = plot.x1 - plot.x0
     brick = Look((0.34, 0.17, 0.12), Class.BARRIER, Material.BRICK)
     hedge = Look((0.075, 0.13, 0.03), Class.VEGETATION, Material.LEAVES)
     stone = Look((0.52, 0.50, 0.46), Class.BARRIER)
@@ -459,13 +423,13 @@ def _second_row(layout: Layout) -> Shapes:
             style = draw_style(rng)
             y = side * rng.uniform(36, 44)
             wall = Look(style.wall.rgb, Class.BUILDING, style.wall.material)
-            rows = [(w, z) for z in (1.2, 4.2) for w in np.arange(1.2, width - 1.6, 2.6)]
-            holes = [(w, z, w + 1.2, z + 1.5) for w, z in rows]
+            columns = np.arange(1.2, width - 1.6, 2.6)
+            holes = [(w, z, w + 1.2, z + 1.5) for z in (1.2, 4.2) for w in columns]
             front, edges = cut((0.0, BASE_M, width, height), holes)
             built = join(
                 [
                     panels(front, 0.0, wall, edges & np.uint8(U0 | U1 | V1)),
-                    panels(np.array(holes), 0.1, _PANE, ALL_EDGES),
+                    panels(np.array(holes), 0.1, _PANE),
                     *[reveals(h, 0.1, wall) for h in holes],
                     _back(style, width, height),
                     _roof(rng, style, width, height),

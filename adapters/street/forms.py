@@ -1,4 +1,4 @@
-"""Builders of simple forms: rectangles, boxes, discs, tubes, blobs and meshes."""
+"""The surfaces that a street is made of: their materials, shapes, and builders of simple forms."""
 
 from __future__ import annotations
 
@@ -12,10 +12,6 @@ from functools import lru_cache
 import numpy as np
 
 from augment.semantics import SemanticClass
-
-# ---- Surface colour before light: a base albedo with each material's own grain -------------------
-# Every rule is a function of place alone (and of a shape's variation), in linear albedo. Grain is
-# kept as coarse as the splats can carry: finer detail would only be lost between them.
 
 # ---- Smooth noise from hashed lattices: the same value for the same place, whoever asks ----------
 # Nothing here holds state, so a splat and a ray that meet a surface at one point see one colour.
@@ -77,7 +73,9 @@ def fractal_noise(points: np.ndarray, octaves: int, seed: int = 0) -> np.ndarray
     return total / np.float32(norm)
 
 
-# ---- materials -----------------------------------------------------------------------------------
+# ---- Materials: albedo before light --------------------------------------------------------------
+# Every rule is a function of place alone (and of a shape's variation), in linear albedo. Grain is
+# kept as coarse as the splats can carry: finer detail would only be lost between them.
 
 
 class Material(IntEnum):
@@ -116,6 +114,9 @@ def albedo(
     return np.clip(out, 0.0, 1.0)
 
 
+_Rule = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+
+
 def _asphalt(rgb: np.ndarray, variation: np.ndarray, local: np.ndarray, points: np.ndarray):
     flat = points[:, :2]
     tracks = value_noise(flat * [0.05, 1.1], 3)  # the long streaks that wheels leave
@@ -147,27 +148,17 @@ def _plaster(rgb: np.ndarray, variation: np.ndarray, local: np.ndarray, points: 
     return rgb * (1 + patches + streaks - dirt)[:, None]
 
 
-def _courses(
-    rgb: np.ndarray, points: np.ndarray, size_m: tuple[float, float], spread: float, seed: int
-) -> np.ndarray:
+def _courses(size_m: tuple[float, float], spread: float, seed: int) -> _Rule:
     """Blocks in running bond, each with its own tone."""
-    wall = _wall_plane(points)
-    row = np.floor(wall[:, 1] / size_m[1])
-    column = np.floor(wall[:, 0] / size_m[0] + 0.5 * (row % 2))
-    tone = spread * (hashed(np.stack([column, row], 1).astype(np.int32), seed) - 0.5)
-    return rgb * (1 + tone + 0.05 * value_noise(wall * 0.8, seed + 1))[:, None]
 
+    def rule(rgb: np.ndarray, variation: np.ndarray, local: np.ndarray, points: np.ndarray):
+        wall = _wall_plane(points)
+        row = np.floor(wall[:, 1] / size_m[1])
+        column = np.floor(wall[:, 0] / size_m[0] + 0.5 * (row % 2))
+        tone = spread * (hashed(np.stack([column, row], 1).astype(np.int32), seed) - 0.5)
+        return rgb * (1 + tone + 0.05 * value_noise(wall * 0.8, seed + 1))[:, None]
 
-def _brick(rgb: np.ndarray, variation: np.ndarray, local: np.ndarray, points: np.ndarray):
-    return _courses(rgb, points, (0.5, 0.16), 0.30, 31)
-
-
-def _stone(rgb: np.ndarray, variation: np.ndarray, local: np.ndarray, points: np.ndarray):
-    return _courses(rgb, points, (0.8, 0.4), 0.16, 41)
-
-
-def _tiles(rgb: np.ndarray, variation: np.ndarray, local: np.ndarray, points: np.ndarray):
-    return _courses(rgb, points, (0.4, 0.25), 0.24, 51)
+    return rule
 
 
 def _grass(rgb: np.ndarray, variation: np.ndarray, local: np.ndarray, points: np.ndarray):
@@ -218,15 +209,14 @@ def _rim(rgb: np.ndarray, variation: np.ndarray, local: np.ndarray, points: np.n
     return rgb * np.where(radius > 0.88, 1.0, bright)[:, None]
 
 
-_Rule = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 _RULES: dict[Material, _Rule] = {
     Material.ASPHALT: _asphalt,
     Material.MARKING: _marking,
     Material.PAVING: _paving,
     Material.PLASTER: _plaster,
-    Material.BRICK: _brick,
-    Material.STONE: _stone,
-    Material.TILES: _tiles,
+    Material.BRICK: _courses((0.5, 0.16), 0.30, 31),
+    Material.STONE: _courses((0.8, 0.4), 0.16, 41),
+    Material.TILES: _courses((0.4, 0.25), 0.24, 51),
     Material.GRASS: _grass,
     Material.LEAVES: _leaves,
     Material.LEAF: _leaf,
@@ -237,10 +227,7 @@ _RULES: dict[Material, _Rule] = {
 }
 
 
-# ---- forms ---------------------------------------------------------------------------------------
-
-# ------------------------------------------------------------------------------------------------
-# The surfaces a street is made of, as arrays: every shape is a unit shape in its own affine frame
+# ---- Shapes: arrays of unit shapes, each in its own affine frame ---------------------------------
 # A point has local coordinates q with `point = origin + q @ axes`, and the kinds are
 #
 #     PARALLELOGRAM  0 <= u, v <= 1, w = 0        DISC       u^2 + v^2 <= 1, w = 0
@@ -269,8 +256,7 @@ OPEN_DIAGONAL = 16
 class Look:
     """What a surface looks like. rgb: linear albedo. ambient: share of sky light that reaches it.
     spacing: its splats' distance relative to other surfaces as far away. backed: whether half a
-    metre of nothing lies behind it, where a second layer of splats may stand.
-    """
+    metre of nothing lies behind it, where a second layer of splats may stand."""
 
     rgb: tuple[float, float, float]
     semantic: SemanticClass
@@ -288,10 +274,7 @@ class Shapes:
     """P shapes. origin [P, 3], axes [P, 3, 3] (rows u, v, w), metres.
 
     shading: [P, 3, 3], of flat kinds and leaves: what light takes for the normal is
-    shading[0] + u shading[1] + v shading[2].
-    rgb [P, 3] linear albedo; material, semantic, kind, edges [P]; ambient, spacing,
-    backed [P] as in Look.
-    variation [P]: a number in [0, 1) that tells equal shapes apart.
+    shading[0] + u shading[1] + v shading[2]. variation [P]: in [0, 1), tells equal shapes apart.
     """
 
     kind: np.ndarray
@@ -397,8 +380,7 @@ def make_shapes(
     )
 
 
-# ------------------------------------------------------------------------------------------------
-# Cutting rectangles around holes, so that splats line up with every edge between two colours
+# ---- Cutting rectangles around holes, so that splats line up with every edge between colours -----
 
 Rectangle = tuple[float, float, float, float]  # x0, y0, x1, y1 with x0 < x1 and y0 < y1
 
@@ -461,7 +443,7 @@ def _edge_bits(
     return bits
 
 
-# ---- forms ---------------------------------------------------------------------------------------
+# ---- Builders ------------------------------------------------------------------------------------
 
 
 def _rows(values: Sequence[float] | np.ndarray) -> np.ndarray:
@@ -557,41 +539,31 @@ def quads(
         whole[:] = False
     parts = []
     if whole.any():
-        c = corners[whole]
-        parts.append(
-            parallelograms(c[:, 0], c[:, 1] - c[:, 0], c[:, 3] - c[:, 0], look, edges=edges)
-        )
+        a, b, _, d = corners[whole].transpose(1, 0, 2)
+        parts.append(parallelograms(a, b - a, d - a, look, edges=edges))
     if not whole.all():
         c = corners[~whole]
         for (i, j, k), flag in (((0, 1, 3), 0), ((2, 3, 1), OPEN_DIAGONAL)):
-            parts.append(_triangles(c[:, i], c[:, j], c[:, k], look, flag, normals, (i, j, k)))
+            shading = None
+            if normals is not None:
+                n0, n1, n2 = normals[:, i], normals[:, j], normals[:, k]
+                shading = np.stack([n0, n1 - n0, n2 - n0], 1)
+            parts.append(_triangles(c[:, i], c[:, j], c[:, k], look, flag, shading))
     return join(parts)
 
 
 def triangle(corners: np.ndarray, look: Look) -> Shapes:
     """One triangle [3, 3], facing (c1 - c0) x (c2 - c0)."""
-    a, b, c = (np.asarray(corner, np.float64)[None] for corner in corners)
-    return _triangles(a, b, c, look, 0, None, (0, 1, 2))
+    return _triangles(*np.asarray(corners, np.float64)[:, None], look)
 
 
 def _triangles(
-    a: np.ndarray,
-    b: np.ndarray,
-    c: np.ndarray,
-    look: Look,
-    flag: int,
-    normals: np.ndarray | None,
-    corner: tuple[int, int, int],
+    a: np.ndarray, b: np.ndarray, c: np.ndarray, look: Look, edges: int = 0, shading=None
 ) -> Shapes:
     u, v = b - a, c - a
     w = np.cross(u, v)
-    w = w / np.linalg.norm(w, axis=1, keepdims=True)
-    shading = None
-    if normals is not None:
-        n0, n1, n2 = (normals[:, i] for i in corner)
-        shading = np.stack([n0, n1 - n0, n2 - n0], 1)
-    axes = np.stack([u, v, w], 1)
-    return make_shapes(Kind.TRIANGLE, a, axes, look, edges=flag, shading=shading)
+    axes = np.stack([u, v, w / np.linalg.norm(w, axis=1, keepdims=True)], 1)
+    return make_shapes(Kind.TRIANGLE, a, axes, look, edges=edges, shading=shading)
 
 
 def _frame(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

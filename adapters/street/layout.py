@@ -13,11 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from adapters.world import invert_pose
 from augment.cameras import Camera, Frame
 from augment.errors import AdapterError
 from augment.scene import Track
-
-# ---- What a procedural street may be asked for, and the URI that says so -------------------------
 
 # Smallest and largest value of each parameter; both are allowed.
 LIMITS: dict[str, tuple[float, float]] = {
@@ -37,12 +36,11 @@ LIMITS: dict[str, tuple[float, float]] = {
 
 @dataclass(frozen=True)
 class StreetParameters:
-    """Everything that decides a street: equal parameters give equal bits.
+    """What a URI may ask for, all that decides a street: equal parameters give equal bits.
 
     seed: layout, colours, sky. frames: at 10 Hz. width, height: of every camera's image, pixels.
-    speed_mps: of the ego car. gaussians: how many to aim for, actors included (met within a few
-    per cent). parked, moving: cars beside and on the road. pedestrians: walking on the pavements.
-    lidar_columns, lidar_rings: rays per turn and per column.
+    gaussians: how many to aim for, actors included (met within a few per cent). parked, moving:
+    cars beside and on the road. lidar_columns, lidar_rings: rays per turn and per column.
     """
 
     seed: int = 0
@@ -62,6 +60,11 @@ class StreetParameters:
         return f"street-seed{self.seed}"
 
     @property
+    def path_length_m(self) -> float:
+        """How far the ego car drives."""
+        return self.speed_mps * (self.frames - 1) * FRAME_NS * 1e-9
+
+    @property
     def uri(self) -> str:
         """Canonical: the seed, then whatever differs from its default, in the order above."""
         shown = [
@@ -73,34 +76,26 @@ class StreetParameters:
 
 
 def parse_parameters(query: Mapping[str, str]) -> StreetParameters:
-    """Parameters of a URI's query.
-
-    Raises:
-        AdapterError: an unknown key, a value that is no number, or one outside its limits.
-    """
-    fields = {field.name: type(field.default) for field in dataclasses.fields(StreetParameters)}
-    unknown = sorted(set(query) - set(fields))
-    if unknown:
+    """Parameters of a URI's query."""
+    if unknown := sorted(set(query) - set(LIMITS)):
         raise AdapterError(
             f"procedural:street does not know {', '.join(map(repr, unknown))}; "
-            f"it takes {', '.join(fields)}"
+            f"it takes {', '.join(LIMITS)}"
         )
-    return StreetParameters(**{k: _number(k, text, fields[k]) for k, text in query.items()})
+    return StreetParameters(**{key: _number(key, text) for key, text in query.items()})
 
 
-def _number(key: str, text: str, kind: type) -> int | float:
-    low, high = LIMITS[key]
-    expected = f"{'a whole number' if kind is int else 'a number'} from {low} to {high}"
+def _number(key: str, text: str) -> int | float:
+    kind, (low, high) = type(getattr(StreetParameters, key)), LIMITS[key]
     try:
         value = kind(text)
-    except ValueError as error:
-        raise AdapterError(f"procedural:street: {key} must be {expected}; got {text!r}") from error
-    if not (math.isfinite(value) and low <= value <= high):
+    except ValueError:
+        value = math.nan
+    if not low <= value <= high:  # NaN included
+        expected = f"{'a whole number' if kind is int else 'a number'} from {low} to {high}"
         raise AdapterError(f"procedural:street: {key} must be {expected}; got {text!r}")
     return value
 
-
-# ---- layout --------------------------------------------------------------------------------------
 
 FRAME_NS = 100_000_000
 START_NS = 1_700_000_000_000_000_000
@@ -157,15 +152,6 @@ class Layout:
     zebra_x: float
     movers: tuple[Mover, ...]
 
-    @property
-    def path_length_m(self) -> float:
-        return path_length(self.parameters)
-
-
-def path_length(parameters: StreetParameters) -> float:
-    """How far the ego car drives, metres."""
-    return parameters.speed_mps * (parameters.frames - 1) * FRAME_NS * 1e-9
-
 
 def road_z(y: np.ndarray | float) -> np.ndarray | float:
     """Height of the carriageway: 0 at its crown, falling to both kerbs."""
@@ -185,7 +171,7 @@ def stream(parameters: StreetParameters, *key: int) -> np.random.Generator:
 
 def draw_layout(parameters: StreetParameters) -> Layout:
     """The plan of a street."""
-    length = path_length(parameters)
+    length = parameters.path_length_m
     x0, x1 = -62.0, length + 86.0
     zebra_x = length + 15.0
     lamps = _lamps(x0, x1)
@@ -199,7 +185,7 @@ def draw_layout(parameters: StreetParameters) -> Layout:
         signs=_signs(stream(parameters, 3), zebra_x, length),
         parked=_parked(stream(parameters, 4), parameters.parked, length, zebra_x),
         zebra_x=zebra_x,
-        movers=tuple(_movers(stream(parameters, 5), parameters, length)),
+        movers=tuple(_movers(stream(parameters, 5), parameters)),
     )
 
 
@@ -220,12 +206,9 @@ def _plots(rng: np.random.Generator, x0: float, x1: float) -> list[Plot]:
 
 
 def _lamps(x0: float, x1: float) -> np.ndarray:
-    left = np.arange(x0 + 10.0, x1 - 4.0, 26.0)
-    right = np.arange(x0 + 23.0, x1 - 4.0, 26.0)
     y = ROAD_HALF_M + 0.55
-    return np.concatenate(
-        [np.stack([left, np.full_like(left, y)], 1), np.stack([right, np.full_like(right, -y)], 1)]
-    )
+    rows = (np.arange(x0 + 10.0, x1 - 4.0, 26.0), y), (np.arange(x0 + 23.0, x1 - 4.0, 26.0), -y)
+    return np.concatenate([np.stack([x, np.full_like(x, side)], 1) for x, side in rows])
 
 
 def _trees(
@@ -260,9 +243,8 @@ def _parked(rng: np.random.Generator, count: int, length: float, zebra_x: float)
     return np.array([slots[i] for i in sorted(chosen)]).reshape(-1, 2)
 
 
-def _movers(rng: np.random.Generator, parameters: StreetParameters, length: float) -> list[Mover]:
-    ego = parameters.speed_mps
-    lane = LANE_M / 2
+def _movers(rng: np.random.Generator, parameters: StreetParameters) -> list[Mover]:
+    ego, lane = parameters.speed_mps, LANE_M / 2
     cars = [
         (17.0, -lane, ego + 0.6),
         (34.0, lane, -9.0),
@@ -277,17 +259,10 @@ def _movers(rng: np.random.Generator, parameters: StreetParameters, length: floa
     ]
     for i in range(parameters.pedestrians):
         side, direction = (-1, 1)[i % 2], (1, -1)[(i // 2 + i) % 2]
-        place = rng.uniform(7, 10) + 4.5 * i + length * 0.25
-        movers.append(
-            Mover(
-                f"pedestrian-{i}",
-                "pedestrian",
-                place,
-                side * rng.uniform(7.7, 8.5),
-                direction * rng.uniform(1.2, 1.6),
-                int(rng.integers(2**31)),
-            )
-        )
+        x = rng.uniform(7, 10) + 4.5 * i + parameters.path_length_m * 0.25
+        y, speed = side * rng.uniform(7.7, 8.5), direction * rng.uniform(1.2, 1.6)
+        seed = int(rng.integers(2**31))
+        movers.append(Mover(f"pedestrian-{i}", "pedestrian", x, y, speed, seed))
     return movers
 
 
@@ -308,33 +283,28 @@ MOUNTS = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class EgoPose:
-    """Where the ego car is at each of N times: positions [N, 3] of its ground point, yaws [N]."""
-
-    positions: np.ndarray
-    yaws: np.ndarray
-
-
-def ego_pose(parameters: StreetParameters, timestamps_ns: np.ndarray) -> EgoPose:
-    """The ego car on its lane, swaying gently about the lane's middle."""
+def ego_pose(
+    parameters: StreetParameters, timestamps_ns: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The ego car, swaying about its lane's middle, at times [N]: positions [N, 3] of its ground
+    point and yaws [N]."""
     seconds = (np.asarray(timestamps_ns, np.int64) - START_NS) * 1e-9
     x = parameters.speed_mps * seconds
     phase = 2 * np.pi * x / SWAY_LENGTH_M
     y = EGO_Y_M + SWAY_M * np.sin(phase)
     yaw = np.arctan(SWAY_M * 2 * np.pi / SWAY_LENGTH_M * np.cos(phase))
-    return EgoPose(np.stack([x, y, road_z(y)], -1), yaw)
+    return np.stack([x, y, road_z(y)], -1), yaw
 
 
 def camera_path(parameters: StreetParameters, timestamps_ns: np.ndarray) -> np.ndarray:
     """Where the cameras are at times [N], taken together: above the ego car's middle, [N, 3]."""
-    return ego_pose(parameters, timestamps_ns).positions + np.array([0.0, 0.0, CAMERA_Z_M])
+    return ego_pose(parameters, timestamps_ns)[0] + np.array([0.0, 0.0, CAMERA_Z_M])
 
 
 def world_from_ego(parameters: StreetParameters, timestamp_ns: int) -> np.ndarray:
     """float64 [4, 4]: ego x forward, y left, z up, origin on the road."""
-    pose = ego_pose(parameters, np.array([timestamp_ns]))
-    return _rigid(pose.positions[0], float(pose.yaws[0]))
+    positions, yaws = ego_pose(parameters, np.array([timestamp_ns]))
+    return _rigid(positions[0], float(yaws[0]))
 
 
 def frame_time_ns(index: int) -> int:
@@ -352,10 +322,6 @@ def build_frames(parameters: StreetParameters) -> tuple[Frame, ...]:
     return tuple(frames)
 
 
-def focal_px(parameters: StreetParameters) -> float:
-    return parameters.width / 2 / math.tan(math.radians(FIELD_OF_VIEW_DEG) / 2)
-
-
 def camera_offset_ns(name: str) -> int:
     """How long after the frame's time a camera fires."""
     return round(-MOUNTS[name][2] / 360 * FRAME_NS) % FRAME_NS - (
@@ -369,19 +335,16 @@ def _camera(parameters: StreetParameters, name: str, frame_ns: int) -> Camera:
     mount = _rigid(np.array([forward, left, CAMERA_Z_M]), math.radians(yaw_deg))
     mount[:3, :3] = mount[:3, :3] @ np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], np.float64)
     world_from_camera = world_from_ego(parameters, time) @ mount
-    rotation = world_from_camera[:3, :3].T
-    camera_from_world = np.eye(4)
-    camera_from_world[:3, :3] = rotation
-    camera_from_world[:3, 3] = -rotation @ world_from_camera[:3, 3]
+    focal_px = parameters.width / 2 / math.tan(math.radians(FIELD_OF_VIEW_DEG) / 2)
     return Camera(
         name=name,
         width=parameters.width,
         height=parameters.height,
-        fx=focal_px(parameters),
-        fy=focal_px(parameters),
+        fx=focal_px,
+        fy=focal_px,
         cx=parameters.width / 2,
         cy=parameters.height / 2,
-        camera_from_world=torch.from_numpy(camera_from_world),
+        camera_from_world=torch.from_numpy(invert_pose(world_from_camera)),
         timestamp_ns=time,
     )
 

@@ -16,8 +16,6 @@ from adapters.street.forms import Material, Shapes, fractal_noise, value_noise
 from adapters.street.raycast import Tree
 from augment.sky import CubemapSky, directions_of_cubemap
 
-# ---- lighting ------------------------------------------------------------------------------------
-
 SUN_RGB = np.array([1.0, 0.91, 0.76]) * 2.75
 SKY_RGB = np.array([0.66, 0.77, 0.98]) * 1.0
 BOUNCE_RGB = np.array([0.55, 0.50, 0.44]) * 0.50
@@ -34,9 +32,9 @@ MIRROR_LOW_RGB, MIRROR_HIGH_RGB = np.array([0.75, 0.86, 1.0]), np.array([0.28, 0
 class Lighting:
     """Light in one body's frame. to_sun [3]: unit. eye_path [2, 3]: segment the cameras move along.
 
-    canyon: y of the street's right and left walls, and z of their tops, metres. ground_z: of the
-    ground, metres. sunlit: share of its way that the body spends in the sun. footprints [C, 4]:
-    x, y and half sizes of parked cars, which keep sky light off the ground.
+    canyon: y of the street's right and left walls, z of their tops. sunlit: share of its way that
+    the body spends in the sun. footprints [C, 4]: x, y and half sizes of parked cars, which keep
+    sky light off the ground.
     """
 
     to_sun: np.ndarray
@@ -162,8 +160,7 @@ def _under_cars(points: np.ndarray, footprints: np.ndarray) -> np.ndarray:
     for x, y, half_length, half_width in footprints:
         dx = np.maximum(np.abs(points[:, 0] - x) - (half_length - 0.45), 0)
         dy = np.maximum(np.abs(points[:, 1] - y) - (half_width - 0.45), 0)
-        distance = np.hypot(dx, dy) - 0.45  # to a rounded rectangle
-        distance = np.minimum(distance, 3.0)
+        distance = np.minimum(np.hypot(dx, dy) - 0.45, 3.0)  # to a rounded rectangle
         left *= 1 - 0.85 / (1 + np.exp((distance - 0.02) / 0.13))
     return left
 
@@ -213,8 +210,7 @@ def encode_display(radiance: np.ndarray) -> np.ndarray:
     return np.where(linear <= 0.0031308, low, high)
 
 
-# ------------------------------------------------------------------------------------------------
-# The sky: a gradient with a sun, cumulus clouds, and a hazy skyline below which land begins
+# ---- The sky: a gradient with a sun, cumulus clouds, and a hazy skyline below which land begins --
 
 FACE_SIZE = 512
 ZENITH_RGB = np.array([0.16, 0.34, 0.74])
@@ -281,10 +277,8 @@ def _with_skyline(sky: np.ndarray, directions: np.ndarray, seed: int) -> np.ndar
     circle = np.stack([np.cos(azimuth), np.sin(azimuth)], 1)
     elevation = d[:, 2]
     out = sky.copy()
-    ridges = (
-        (3.0, 0.030, 0.028, np.array([0.50, 0.60, 0.72])),
-        (9.0, 0.012, 0.014, HAZE_RGB * 0.62),
-    )
+    far, near = np.array([0.50, 0.60, 0.72]), HAZE_RGB * 0.62
+    ridges = ((3.0, 0.030, 0.028, far), (9.0, 0.012, 0.014, near))
     for scale, base, spread, rgb in ridges:
         crest = base + spread * fractal_noise(circle * scale, 4, seed * 7 + 300 + int(scale))
         inside = np.clip((crest - elevation) / 0.004 + 0.5, 0, 1)[:, None]

@@ -1,7 +1,9 @@
-"""Street lamps, traffic signs, litter bins and bollards."""
+"""What stands and moves on a street: people, trees, cars, lamps, signs, bins and bollards."""
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,8 +50,8 @@ def draw_person(seed: int) -> Shapes:
         ball((0.012, 0, 1.67), (0.105, 0.09, 0.105), hair),
         tube((0.01, 0, 1.46), (0.02, 0, 1.56), 0.055, skin),
     ]
-    for side, phase in ((1, 1), (-1, -1)):
-        y = side * 0.095
+    for side in (1, -1):  # the left leg steps forward
+        y, phase = side * 0.095, side
         knee = np.array([0.10 * phase + 0.06, y, 0.50])
         foot = np.array([0.27 * phase - (0.06 if phase < 0 else 0), y, 0.10 + 0.03 * (phase < 0)])
         shoulder = np.array([0.0, side * 0.19, 1.41])
@@ -76,8 +78,7 @@ def _tilted(centre: tuple, radii: tuple, angle_rad: float, look: Look) -> Shapes
     return ellipsoids(np.array([centre]), (turn * np.array(radii)[:, None])[None], look)
 
 
-# ------------------------------------------------------------------------------------------------
-# Trees: a trunk with a few boughs, and a crown of many small leafy blobs around a dense core
+# ---- Trees: a trunk with a few boughs, and a crown of many small leafy blobs around a dense core -
 
 BARK = Look((0.13, 0.10, 0.075), Class.VEGETATION, Material.BARK)
 LEAF = Look((0.12, 0.21, 0.04), Class.VEGETATION, Material.LEAF)
@@ -89,7 +90,7 @@ NEAR_LEAVES, MIDDLE_LEAVES, FAR_LEAVES, GARDEN_LEAVES = 2600, 1200, 300, 80
 def build_vegetation(layout: Layout) -> Shapes:
     """Street trees, garden trees behind the houses, and woods far out."""
     rng = np.random.default_rng([layout.parameters.seed, 30])
-    middle = layout.path_length_m / 2
+    middle = layout.parameters.path_length_m / 2
     parts = []
     for x, y in layout.trees:
         beyond = max(abs(x - middle) - middle, 0.0)  # along the street from the drive
@@ -220,12 +221,8 @@ class CarModel:
     roof_rear: float
 
     @property
-    def height(self) -> float:
-        return self.roof + 0.02
-
-    @property
     def size_m(self) -> tuple[float, float, float]:
-        return (self.length + 0.08, self.width + 0.08, self.height + 0.04)
+        return (self.length + 0.08, self.width + 0.08, self.roof + 0.02 + 0.04)
 
 
 MODELS = (
@@ -241,12 +238,8 @@ def draw_car(seed: int) -> tuple[CarModel, Shapes]:
     model = MODELS[rng.integers(len(MODELS))]
     rgb = PAINTS[rng.integers(len(PAINTS))]
     paint = Look(rgb, Class.VEHICLE, Material.PAINT, spacing=SPACING)
-    return model, build_car(model, paint)
-
-
-def build_car(model: CarModel, paint: Look) -> Shapes:
-    """All surfaces of a car."""
-    return join([_body(model, paint), _glasshouse(model, paint), *_wheels(model), *_details(model)])
+    parts = [_body(model, paint), _glasshouse(model, paint), *_wheels(model), *_details(model)]
+    return model, join(parts)
 
 
 def _body(model: CarModel, paint: Look) -> Shapes:
@@ -262,36 +255,19 @@ def _body(model: CarModel, paint: Look) -> Shapes:
     low = 0.20 + 0.12 * np.clip((end - 0.86) / 0.14, 0, 1)
     rise = top - low
     # (share of the half width, share of the height) around one side of a section, from the sill up.
-    profile = np.array(
-        [
-            (0.90, 0),
-            (0.97, 0.10),
-            (1.0, 0.42),
-            (0.985, 0.72),
-            (0.94, 0.91),
-            (0.86, 0.985),
-            (0.45, 1.03),
-        ]
-    )
-    side = np.stack(
-        [
-            np.broadcast_to(x[:, None], (len(x), len(profile))),
-            width[:, None] * profile[:, 0],
-            low[:, None] + rise[:, None] * profile[:, 1],
-        ],
-        -1,
-    )
-    ring = np.concatenate(
-        [side * [1, -1, 1], side[:, ::-1]], 1
-    )  # right sill, over, to the left sill
-    mesh = _loft(ring, paint)
+    lower = ((0.90, 0), (0.97, 0.10), (1.0, 0.42), (0.985, 0.72))
+    profile = np.array([*lower, (0.94, 0.91), (0.86, 0.985), (0.45, 1.03)])
+    y, z = width[:, None] * profile[:, 0], low[:, None] + rise[:, None] * profile[:, 1]
+    side = np.stack([*np.broadcast_arrays(x[:, None], y, z)], -1)
+    # From the right sill over to the left sill.
+    ring = np.concatenate([side * [1, -1, 1], side[:, ::-1]], 1)
     caps = []
     for index, outward in ((0, -1), (-1, 1)):
         count = len(profile)
         right, left = ring[index, :count], ring[index, ::-1][:count]
         corners = np.stack([right[:-1], left[:-1], left[1:], right[1:]], 1)
         caps.append(quads(corners if outward > 0 else corners[:, ::-1], paint))
-    return join([mesh, *caps])
+    return join([_loft(ring, paint), *caps])
 
 
 def _loft(rings: np.ndarray, look: Look) -> Shapes:
@@ -311,7 +287,6 @@ def _glasshouse(model: CarModel, paint: Look) -> Shapes:
     """Windscreen, side windows with pillars, rear window and roof."""
     base, top = model.width / 2 * 0.89, model.width / 2 * 0.70
     z0, z1 = model.belt - 0.02, model.roof
-    lean = 0.0
 
     def side_point(s: float, t: float, sign: int) -> np.ndarray:
         """s from rear to front, t from belt to roof."""
@@ -319,22 +294,22 @@ def _glasshouse(model: CarModel, paint: Look) -> Shapes:
         front = model.hood + (model.roof_front - model.hood) * t
         bulge = 0.05 * t * (1 - t) * 4
         y = sign * (base + (top - base) * t**1.3 + bulge)
-        return np.array([rear + (front - rear) * s, y + lean, z0 + (z1 - z0) * t])
+        return np.array([rear + (front - rear) * s, y, z0 + (z1 - z0) * t])
 
     parts = []
     levels = (0.0, 0.09, 0.50, 0.86, 1.0)
     cuts = (0.0, 0.06, 0.30, 0.36, 0.53, 0.58, 0.78, 0.93, 1.0)
     clear = {(i, j) for i in (1, 3, 5, 6) for j in (1, 2)}
-    for look, wanted in ((GLASS, True), (paint, False)):
+    panes = list(itertools.product(range(len(cuts) - 1), range(len(levels) - 1)))
+    for look, is_clear in ((GLASS, True), (paint, False)):
         corners = []
-        for i in range(len(cuts) - 1):
-            for j in range(len(levels) - 1):
-                if ((i, j) in clear) != wanted:
-                    continue
-                a, b, c, d = cuts[i], cuts[i + 1], levels[j], levels[j + 1]
-                for sign in (1, -1):
-                    loop = [side_point(*q, sign) for q in ((a, c), (b, c), (b, d), (a, d))]
-                    corners.append(loop[::-1] if sign > 0 else loop)
+        for i, j in panes:
+            if ((i, j) in clear) != is_clear:
+                continue
+            a, b, c, d = cuts[i], cuts[i + 1], levels[j], levels[j + 1]
+            for sign in (1, -1):
+                loop = [side_point(*q, sign) for q in ((a, c), (b, c), (b, d), (a, d))]
+                corners.append(loop[::-1] if sign > 0 else loop)
         parts.append(quads(np.array(corners), look))
     for s, steps, sign in ((1.0, levels, 1), (0.0, levels, -1)):  # windscreen, rear window
         for look, (u0, u1), chosen in (
@@ -345,18 +320,14 @@ def _glasshouse(model: CarModel, paint: Look) -> Shapes:
         ):
             corners = []
             for j in chosen:
-                loop = [
-                    _between(side_point(s, steps[j + k], -1), side_point(s, steps[j + k], 1), u)
-                    for u, k in ((u0, 0), (u1, 0), (u1, 1), (u0, 1))
-                ]
+                loop = []
+                for u, k in ((u0, 0), (u1, 0), (u1, 1), (u0, 1)):
+                    left, right = (side_point(s, steps[j + k], side) for side in (-1, 1))
+                    loop.append(left + (right - left) * u)
                 corners.append(loop if sign > 0 else loop[::-1])
             parts.append(quads(np.array(corners), look))
     parts.append(_roof(model, paint, top))
     return join(parts)
-
-
-def _between(a: np.ndarray, b: np.ndarray, share: float) -> np.ndarray:
-    return a + (b - a) * share
 
 
 def _roof(model: CarModel, paint: Look, half_width: float) -> Shapes:
@@ -364,15 +335,8 @@ def _roof(model: CarModel, paint: Look, half_width: float) -> Shapes:
     x = np.linspace(model.roof_rear, model.roof_front, 7)
     share = np.linspace(-1, 1, 7)
     dome = 0.03 * (1 - share[None, :] ** 2) * np.sin(np.linspace(0, np.pi, 7))[:, None] ** 0.5
-    grid = np.stack(
-        [
-            np.broadcast_to(x[:, None], (7, 7)),
-            np.broadcast_to(share[None, :] * half_width, (7, 7)),
-            model.roof + dome * 0.6,
-        ],
-        -1,
-    )
-    return _loft(grid, paint)
+    z = model.roof + dome * 0.6
+    return _loft(np.stack([*np.broadcast_arrays(x[:, None], share * half_width, z)], -1), paint)
 
 
 def _wheels(model: CarModel) -> list[Shapes]:
@@ -396,73 +360,84 @@ def _details(model: CarModel) -> list[Shapes]:
     front_z, rear_z = model.belt - 0.35, model.belt - 0.20
     parts = []
     for side in (1, -1):
-        y = sorted((side * width * 0.48, side * width * 0.80))
-        low, high = (half - 0.16, y[0], front_z - 0.06), (half + 0.012, y[1], front_z + 0.07)
+        y0, y1 = sorted((side * width * 0.48, side * width * 0.80))
+        low, high = (half - 0.16, y0, front_z - 0.06), (half + 0.012, y1, front_z + 0.07)
         parts.append(boxes(low, high, HEADLIGHT, faces=("+x", "+z", "+y", "-y", "-z")))
-        low, high = (-half - 0.012, y[0], rear_z - 0.10), (-half + 0.16, y[1], rear_z + 0.07)
+        low, high = (-half - 0.012, y0, rear_z - 0.10), (-half + 0.16, y1, rear_z + 0.07)
         parts.append(boxes(low, high, TAILLIGHT, faces=("-x", "+z", "+y", "-y", "-z")))
-        mirror = sorted((side * width * 0.93, side * (width + 0.035)))
-        low, high = (model.hood - 0.42, mirror[0], model.belt + 0.0), (0.0, mirror[1], 0.0)
-        high = (model.hood - 0.30, mirror[1], model.belt + 0.13)
+        y0, y1 = sorted((side * width * 0.93, side * (width + 0.035)))  # a mirror
+        low, high = (
+            (model.hood - 0.42, y0, model.belt + 0.0),
+            (model.hood - 0.30, y1, model.belt + 0.13),
+        )
         parts.append(boxes(low, high, TRIM, faces=("+x", "-x", "+y", "-y", "+z", "-z")))
-    grille = (half + 0.010, -width * 0.42, front_z - 0.07)
-    parts.append(parallelograms(grille, (0, width * 0.84, 0), (0, 0, 0.11), TRIM))
-    lower = (half + 0.010, -width * 0.6, 0.36)
-    parts.append(parallelograms(lower, (0, width * 1.2, 0), (0, 0, 0.12), TRIM))
-    parts.append(parallelograms((half + 0.016, -0.26, 0.40), (0, 0.52, 0), (0, 0, 0.11), PLATE))
-    rear = (-half - 0.016, -0.26, rear_z - 0.22)
-    parts.append(parallelograms(rear, (0, 0, 0.11), (0, 0.52, 0), PLATE))
-    bumper = (-half - 0.010, -width * 0.7, 0.34)
-    parts.append(parallelograms(bumper, (0, 0, 0.13), (0, width * 1.4, 0), TRIM))
-    return parts
+    front, back = half + 0.010, -half - 0.010
+    panels = (
+        (
+            (front, -width * 0.42, front_z - 0.07),
+            (0, width * 0.84, 0),
+            (0, 0, 0.11),
+            TRIM,
+        ),  # grille
+        ((front, -width * 0.6, 0.36), (0, width * 1.2, 0), (0, 0, 0.12), TRIM),
+        ((half + 0.016, -0.26, 0.40), (0, 0.52, 0), (0, 0, 0.11), PLATE),
+        ((-half - 0.016, -0.26, rear_z - 0.22), (0, 0, 0.11), (0, 0.52, 0), PLATE),
+        ((back, -width * 0.7, 0.34), (0, 0, 0.13), (0, width * 1.4, 0), TRIM),  # bumper
+    )
+    return parts + [parallelograms(*panel) for panel in panels]
 
 
-# ---- furniture -----------------------------------------------------------------------------------
+# ---- Lamps, signs, litter bins and bollards ------------------------------------------------------
 
 STEEL = Look((0.16, 0.17, 0.17), Class.POLE)
 LANTERN = Look((0.72, 0.71, 0.66), Class.POLE)
 GREY = Look((0.30, 0.31, 0.32), Class.SIGN, spacing=0.5)
 WHITE = Look((0.75, 0.75, 0.74), Class.SIGN, spacing=0.5)
 BLUE = Look((0.03, 0.11, 0.36), Class.SIGN, spacing=0.5)
+BLACK = Look((0.02, 0.02, 0.02), Class.SIGN, spacing=0.5)
 RED = Look((0.48, 0.03, 0.03), Class.SIGN, spacing=0.5)
-BIN = Look((0.05, 0.10, 0.07), Class.OTHER)
-BOLLARD = Look((0.10, 0.10, 0.105), Class.BARRIER)
+GREEN = Look((0.05, 0.10, 0.07), Class.OTHER)
+IRON = Look((0.10, 0.10, 0.105), Class.BARRIER)
 
 
 def build_furniture(layout: Layout) -> Shapes:
     """Everything man-made that stands on the pavements."""
     rng = np.random.default_rng([layout.parameters.seed, 40])
-    parts = []
-    for x, y in layout.lamps:
-        parts.append(_lamp().moved((x, y, float(pavement_z(y))), 0.0 if y < 0 else np.pi))
-    builders = (_crossing_sign, _crossing_sign, _limit_sign, _limit_sign, _parking_sign)
-    for number, (x, y) in enumerate(layout.signs):
-        # Signs face the traffic on their own side of the road.
-        yaw = np.pi if y < 0 else 0.0
-        parts.append(builders[number % 5]().moved((x, y, float(pavement_z(y))), yaw))
-    for x, y in layout.lamps[::2]:
-        place = (x + rng.uniform(1.2, 2.0), y, float(pavement_z(y)))
-        parts.append(_bin().moved(place))
-    for side in (1, -1):
-        y = side * (ROAD_HALF_M + 0.4)
-        for offset in (-3.4, 3.4, -4.6, 4.6):
-            place = (layout.zebra_x + offset, y, float(pavement_z(y)))
-            parts.append(_bollard().moved(place))
-    return join(parts)
+    lamp, bollard, litter_bin = _joined(LAMP), _joined(BOLLARD), _joined(LITTER_BIN)
+    places: list[tuple[Shapes, float, float, float]] = []  # what, x, y, yaw
+    places += [(lamp, x, y, 0.0 if y < 0 else np.pi) for x, y in layout.lamps]
+    signs = [_crossing_sign(), _crossing_sign(), _limit_sign(), _limit_sign(), _parking_sign()]
+    for number, (x, y) in enumerate(layout.signs):  # they face the traffic on their own side
+        places.append((signs[number % 5], x, y, np.pi if y < 0 else 0.0))
+    places += [(litter_bin, x + rng.uniform(1.2, 2.0), y, 0.0) for x, y in layout.lamps[::2]]
+    for y in (ROAD_HALF_M + 0.4, -ROAD_HALF_M - 0.4):
+        places += [(bollard, layout.zebra_x + dx, y, 0.0) for dx in (-3.4, 3.4, -4.6, 4.6)]
+    return join([form.moved((x, y, float(pavement_z(y))), yaw) for form, x, y, yaw in places])
 
 
-def _lamp() -> Shapes:
-    """A tapered mast with an arm over the road (towards +y)."""
-    return join(
-        [
-            tube((0, 0, -0.05), (0, 0, 0.9), 0.085, STEEL),
-            tube((0, 0, 0.9), (0, 0, 6.4), 0.055, STEEL),
-            tube((0, 0, 6.35), (0, 1.5, 6.75), 0.035, STEEL),
-            boxes((-0.14, 1.35, 6.68), (0.14, 2.05, 6.82), STEEL),
-            parallelograms((-0.11, 1.4, 6.675), (0, 0.6, 0), (0.22, 0, 0), LANTERN),
-            ball((0, 0, 6.38), (0.07, 0.07, 0.07), STEEL),
-        ]
-    )
+# Forms as (builder, its arguments). A tapered mast with an arm over the road (towards +y):
+LAMP = (
+    (tube, (0, 0, -0.05), (0, 0, 0.9), 0.085, STEEL),
+    (tube, (0, 0, 0.9), (0, 0, 6.4), 0.055, STEEL),
+    (tube, (0, 0, 6.35), (0, 1.5, 6.75), 0.035, STEEL),
+    (boxes, (-0.14, 1.35, 6.68), (0.14, 2.05, 6.82), STEEL),
+    (parallelograms, (-0.11, 1.4, 6.675), (0, 0.6, 0), (0.22, 0, 0), LANTERN),
+    (ball, (0, 0, 6.38), (0.07, 0.07, 0.07), STEEL),
+)
+LITTER_BIN = (
+    (tube, (0, 0, 0.0), (0, 0, 0.85), 0.22, GREEN),
+    (disc, (0, 0, 0.85), (0, 0, 1), 0.22, GREEN.tinted((0.02, 0.02, 0.02))),
+    (tube, (0, 0, 0.85), (0, 0, 0.92), 0.23, STEEL),
+)
+BOLLARD = (
+    (tube, (0, 0, 0.0), (0, 0, 0.85), 0.06, IRON),
+    (tube, (0, 0, 0.66), (0, 0, 0.76), 0.064, WHITE),
+    (ball, (0, 0, 0.85), (0.06, 0.06, 0.05), IRON),
+)
+
+
+def _joined(parts: Iterable[tuple]) -> Shapes:
+    return join([build(*arguments) for build, *arguments in parts])
 
 
 def _pole(height: float) -> Shapes:
@@ -482,53 +457,25 @@ def _rear(z: float, size: float) -> Shapes:
 
 def _crossing_sign() -> Shapes:
     figure = np.array([[0.022, -0.2, 2.3], [0.022, 0.2, 2.3], [0.022, 0.0, 2.66]])
-    dark = Look((0.02, 0.02, 0.02), Class.SIGN, spacing=0.5)
-    return join(
-        [
-            _pole(2.75),
-            _rear(2.45, 0.62),
-            _plate(2.45, 0.64, 0.64, BLUE),
-            triangle(figure, WHITE),
-            _plate(2.40, 0.09, 0.18, dark, 0.032),
-        ]
-    )
+    plates = (_plate(2.45, 0.64, 0.64, BLUE), triangle(figure, WHITE))
+    return join([_pole(2.75), _rear(2.45, 0.62), *plates, _plate(2.40, 0.09, 0.18, BLACK, 0.032)])
 
 
 def _limit_sign() -> Shapes:
-    plates = [(0.31, RED, 0.010), (0.235, WHITE, 0.018)]
-    digits = Look((0.02, 0.02, 0.02), Class.SIGN, spacing=0.5)
-    parts = [disc((x, 0, 2.5), (1, 0, 0), radius, look) for radius, look, x in plates]
-    parts.append(disc((0, 0, 2.5), (-1, 0, 0), 0.31, GREY))
+    discs = ((0.010, 1, 0.31, RED), (0.018, 1, 0.235, WHITE), (0, -1, 0.31, GREY))
+    parts = [disc((x, 0, 2.5), (facing, 0, 0), radius, look) for x, facing, radius, look in discs]
     for y in (-0.1, 0.1):
-        parts.append(_plate(2.5, 0.13, 0.24, digits, 0.024).moved((0, y, 0)))
+        parts.append(_plate(2.5, 0.13, 0.24, BLACK, 0.024).moved((0, y, 0)))
         parts.append(_plate(2.5, 0.045, 0.14, WHITE, 0.030).moved((0, y, 0)))
     return join([_pole(2.85), *parts])
 
 
 def _parking_sign() -> Shapes:
     parts = [_pole(2.7), _rear(2.4, 0.5), _plate(2.4, 0.52, 0.52, BLUE)]
-    for y, z, width, height in ((-0.09, 2.4, 0.07, 0.36), (0.02, 2.54, 0.18, 0.07)):
-        parts.append(_plate(z, width, height, WHITE, 0.02).moved((0, y, 0)))
-    for y, z, width, height in ((0.02, 2.4, 0.18, 0.07), (0.11, 2.47, 0.07, 0.2)):
+    strokes = (
+        *((-0.09, 2.4, 0.07, 0.36), (0.02, 2.54, 0.18, 0.07)),
+        *((0.02, 2.4, 0.18, 0.07), (0.11, 2.47, 0.07, 0.2)),
+    )
+    for y, z, width, height in strokes:
         parts.append(_plate(z, width, height, WHITE, 0.02).moved((0, y, 0)))
     return join(parts)
-
-
-def _bin() -> Shapes:
-    return join(
-        [
-            tube((0, 0, 0.0), (0, 0, 0.85), 0.22, BIN),
-            disc((0, 0, 0.85), (0, 0, 1), 0.22, BIN.tinted((0.02, 0.02, 0.02))),
-            tube((0, 0, 0.85), (0, 0, 0.92), 0.23, STEEL),
-        ]
-    )
-
-
-def _bollard() -> Shapes:
-    return join(
-        [
-            tube((0, 0, 0.0), (0, 0, 0.85), 0.06, BOLLARD),
-            tube((0, 0, 0.66), (0, 0, 0.76), 0.064, WHITE),
-            ball((0, 0, 0.85), (0.06, 0.06, 0.05), BOLLARD),
-        ]
-    )

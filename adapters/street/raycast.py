@@ -10,7 +10,7 @@ from numba import njit
 
 from adapters.street.forms import Kind, Shapes
 
-# ---- The compiled part of ray casting: walk a tree of boxes, meet the shapes in its leaves -------
+# ---- Kernels: walk a tree of boxes, meet the shapes in its leaves --------------------------------
 
 STACK = 512  # far deeper than the trees of any street
 BINS = 16
@@ -263,7 +263,7 @@ def _split(low, high, order, start, stop, scratch):
     return left
 
 
-# ---- raycast -------------------------------------------------------------------------------------
+# ---- The tree ------------------------------------------------------------------------------------
 
 LEAF_SHAPES = 4
 
@@ -271,8 +271,7 @@ LEAF_SHAPES = 4
 @dataclass(frozen=True, eq=False)
 class Hits:
     """What N rays met. distance [N]: in lengths of the ray's direction, infinite where nothing was
-    met. shape [N]: -1 there. local [N, 3]: coordinates on the shape.
-    """
+    met. shape [N]: -1 there. local [N, 3]: coordinates on the shape."""
 
     distance: np.ndarray
     shape: np.ndarray
@@ -306,22 +305,14 @@ class Tree:
     ) -> Hits:
         rays = len(directions)
         hits = Hits(np.empty(rays), np.empty(rays, np.int64), np.empty((rays, 3)))
-        trace(
-            np.ascontiguousarray(np.broadcast_to(origins, (rays, 3)), np.float64),
-            np.ascontiguousarray(directions, np.float64),
-            limits,
-            any_hit,
-            self.bounds,
-            self.first,
-            self.count,
-            self.order,
-            self.kind,
-            self.origin,
-            self.inverse,
-            hits.distance,
-            hits.shape,
-            hits.local,
+        starts = np.ascontiguousarray(np.broadcast_to(origins, (rays, 3)), np.float64)
+        ahead = np.ascontiguousarray(directions, np.float64)
+        nodes, shapes = (
+            (self.bounds, self.first, self.count),
+            (self.kind, self.origin, self.inverse),
         )
+        out = (hits.distance, hits.shape, hits.local)
+        trace(starts, ahead, limits, any_hit, *nodes, self.order, *shapes, *out)
         return hits
 
 

@@ -35,9 +35,9 @@ BACKED_BLEND_LEAD = 0.41
 
 @dataclass(frozen=True, eq=False)
 class Spacing:
-    """Per shape: along [P, 2] spacing in metres per unit of coarseness on both axes; sink [P] how
-    far below its surface splats lie, in spacings, so that their blend is seen on it; hidden [P]
-    whether no camera sees it, so that its splats may be few but must keep clear of rims.
+    """Per shape: spacing along [P, 2] both axes in metres per unit of coarseness; sink [P]: how far
+    below its surface splats lie, in spacings, so that their blend is seen on it; hidden [P]: no
+    camera sees it, so that its splats may be few but must keep clear of rims.
     """
 
     along: np.ndarray
@@ -54,9 +54,9 @@ def split_long(shapes: Shapes, eyes: np.ndarray) -> Shapes:
         limit = np.maximum(SPLIT_M[0], 0.45 * distance)
         built = shapes.semantic != SemanticClass.TERRAIN
         limit[built] = np.minimum(limit, SPLIT_M[1])[built]
-        wanted = (sides.max(1) > limit) & (shapes.kind == Kind.PARALLELOGRAM)
-        done.append(shapes.select(np.flatnonzero(~wanted)))
-        shapes = _halved(shapes.select(np.flatnonzero(wanted)), sides[wanted].argmax(1))
+        split = (sides.max(1) > limit) & (shapes.kind == Kind.PARALLELOGRAM)
+        done.append(shapes.select(np.flatnonzero(~split)))
+        shapes = _halved(shapes.select(np.flatnonzero(split)), sides[split].argmax(1))
     return join(done)
 
 
@@ -138,31 +138,25 @@ def _sightings(shapes: Shapes, eyes: np.ndarray) -> tuple[np.ndarray, np.ndarray
     return np.maximum(length, np.abs(nearest[..., 2]) / STEEPEST), view
 
 
-def _sink(
-    distance: np.ndarray,
-    slant: np.ndarray,
-    facing: np.ndarray,
-    cosine: np.ndarray,
-    along: np.ndarray,
-    backed: np.ndarray,
-) -> np.ndarray:
-    """Depth below the surface, per unit of spacing, that puts the blend on it in the mean.
+def _sink(distance, slant, facing, cosine, along, backed) -> np.ndarray:
+    """Depth below the surface [P], per unit of spacing, that puts the blend on it in the mean.
 
-    A splat that lies h below the surface is seen h / slant further along the ray; blending brings
-    it some part of a spacing nearer along the surface. No depth suits all eyes: the weighted median
+    distance, slant, facing [E, P] and cosine [E, P, 2]: of the eyes. along [P, 2], backed [P]. A
+    splat that lies h below the surface is seen h / slant further along the ray; blending brings it
+    some part of a spacing nearer along the surface. No depth suits all eyes: the weighted median
     makes the error least where most pixels are spent on the surface.
     """
     slant = np.clip(slant, 0.04, 1)
     level = np.sqrt(1 - slant**2)
     reach = np.sqrt((cosine**2 * along**2).sum(2)) / np.maximum(level, 1e-6)
     lead = np.where(backed, BACKED_BLEND_LEAD, BLEND_LEAD)
-    wanted = lead * reach / along.max(1) * level * slant
+    depth = lead * reach / along.max(1) * level * slant
     weight = facing / distance**2  # pixels go with slant, what an error costs with 1 / slant
-    order = np.argsort(wanted, axis=0)
-    heard = np.cumsum(np.take_along_axis(weight, order, 0), axis=0)
-    middle = (heard < heard[-1] / 2).sum(0)
+    order = np.argsort(depth, axis=0)
+    weights = np.cumsum(np.take_along_axis(weight, order, 0), axis=0)
+    middle = (weights < weights[-1] / 2).sum(0)
     rows = np.take_along_axis(order, np.minimum(middle, len(order) - 1)[None], 0)
-    return np.minimum(np.take_along_axis(wanted, rows, 0)[0], 0.5)
+    return np.minimum(np.take_along_axis(depth, rows, 0)[0], 0.5)
 
 
 # ---- Cells of surfaces: where splats stand and how large each is ---------------------------------
@@ -184,8 +178,7 @@ FINE_FROM = 7  # cells along a side from which its crisp edges get two more rows
 @dataclass(frozen=True, eq=False)
 class Cells:
     """shape [N]; local [N, 3]: the cell's middle; sides [N, 2, 3]: its sides in the shape's local
-    coordinates; edges [N, 2, 3]: the same in metres.
-    """
+    coordinates; edges [N, 2, 3]: the same in metres."""
 
     shape: np.ndarray
     local: np.ndarray
@@ -252,30 +245,18 @@ def make_cells(shapes: Shapes, counts: np.ndarray, hidden: np.ndarray) -> Cells:
         if len(index):
             parts.append(build(shapes, index, counts[index], hidden))
     if not parts:
-        return Cells(
-            np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 2, 3)), np.zeros((0, 2, 3))
-        )
+        none = np.zeros((0, 2, 3))
+        return Cells(np.zeros(0, np.int64), np.zeros((0, 3)), none, none)
     shape, local, sides = (np.concatenate(p) for p in zip(*parts, strict=True))
-    inset = hidden[shape] & (shapes.kind[shape] == Kind.PARALLELOGRAM)
-    _draw_in(shapes, counts, np.flatnonzero(inset), shape, local, sides)
-    return Cells(shape, local, sides, np.einsum("nak,nkj->naj", sides, shapes.axes[shape]))
-
-
-def _draw_in(
-    shapes: Shapes,
-    counts: np.ndarray,
-    index: np.ndarray,
-    shape: np.ndarray,
-    local: np.ndarray,
-    sides: np.ndarray,
-) -> None:
-    """Move the cells at index, in place, away from the crisp edges of their panels."""
+    # Splats of hidden panels keep away from their crisp edges.
+    index = np.flatnonzero(hidden[shape] & (shapes.kind[shape] == Kind.PARALLELOGRAM))
+    edges = shapes.edges[shape[index]]
     for axis, (low_bit, high_bit) in enumerate(((U0, U1), (V0, V1))):
         margin = np.minimum(INSET / counts[shape[index], axis], 0.25)
-        low = margin * ((shapes.edges[shape[index]] & low_bit) > 0)
-        high = margin * ((shapes.edges[shape[index]] & high_bit) > 0)
+        low, high = margin * ((edges & low_bit) > 0), margin * ((edges & high_bit) > 0)
         local[index, axis] = low + local[index, axis] * (1 - low - high)
         sides[index, axis] *= (1 - low - high)[:, None]
+    return Cells(shape, local, sides, np.einsum("nak,nkj->naj", sides, shapes.axes[shape]))
 
 
 def _graded(
@@ -445,7 +426,7 @@ def contact_shadow(mover: MovingBody) -> ContactShadow:
     return ContactShadow(cover.reshape(counts), origin, mover.ground_z)
 
 
-# ---- splats --------------------------------------------------------------------------------------
+# ---- Gaussians of cells --------------------------------------------------------------------------
 
 SH_C0 = 0.28209479177387814
 OPACITY = 0.99
@@ -481,8 +462,8 @@ class SplatPlan:
 
     def backing(self, counts: np.ndarray) -> np.ndarray:
         """Cells of the second layer, [P, 2]; none where there is no such layer."""
-        wanted = self.shapes.backed & ~self.spacing.hidden & (counts.min(1) >= BACKED_FROM)
-        return np.where(wanted[:, None], -(-counts // BACKING), 0)
+        is_backed = self.shapes.backed & ~self.spacing.hidden & (counts.min(1) >= BACKED_FROM)
+        return np.where(is_backed[:, None], -(-counts // BACKING), 0)
 
     def total(self, coarseness: float) -> int:
         counts = self.counts(coarseness)
@@ -577,7 +558,7 @@ def _gaussians(plan: SplatPlan, cells: Cells, share: np.ndarray, sink: np.ndarra
     frames[leaf] = (shapes.axes[shape[leaf]] / size).transpose(0, 2, 1)
     sigmas[leaf], means[leaf] = LEAF_SIGMA * size[..., 0], shapes.origin[shape[leaf]]
     opacities = np.full(len(means), OPACITY)
-    return make_gaussians(means, frames, sigmas, opacities, rgb, shapes.semantic[shape])
+    return _make_gaussians(means, frames, sigmas, opacities, rgb, shapes.semantic[shape])
 
 
 def _flat_covariance(edges: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -600,7 +581,7 @@ def _flat_covariance(edges: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray
 
 def shadow_gaussians(shadow: ContactShadow) -> Gaussians:
     """A mover's shadow as thin translucent layers, none heavy enough to hide the ground's class."""
-    size = np.array(shadow.values.shape) * 0.06
+    size = np.array(shadow.values.shape) * CELL_M
     x, y = (np.arange(SHADOW_SPACING_M / 2, s, SHADOW_SPACING_M) for s in size)
     grid = np.stack(np.meshgrid(x, y, indexing="ij"), -1).reshape(-1, 2) + shadow.origin
     points = np.concatenate([grid, np.full((len(grid), 1), shadow.ground_z)], 1)
@@ -614,17 +595,10 @@ def shadow_gaussians(shadow: ContactShadow) -> Gaussians:
     rgb = np.tile(SHADOW_RGB, (len(points), 1))
     semantic = np.full(len(points), SemanticClass.ROAD, np.int16)
     points[:, 2] += SHADOW_HEIGHT_M
-    return make_gaussians(points, frames, sigma, opacity, rgb, semantic)
+    return _make_gaussians(points, frames, sigma, opacity, rgb, semantic)
 
 
-def make_gaussians(
-    means: np.ndarray,
-    frames: np.ndarray,
-    scales: np.ndarray,
-    opacities: np.ndarray,
-    rgb: np.ndarray,
-    semantic: np.ndarray,
-) -> Gaussians:
+def _make_gaussians(means, frames, scales, opacities, rgb, semantic) -> Gaussians:
     """Gaussians of one colour each, from rotations [N, 3, 3] whose columns are the axes."""
     quats = quat_from_rotmat(torch.from_numpy(frames))
     return Gaussians(

@@ -51,8 +51,7 @@ from adapters.street.objects import SIZE_M, build_furniture, build_vegetation, d
 from adapters.street.raycast import Tree, build_tree
 from augment.semantics import SemanticClass as Class
 
-# ------------------------------------------------------------------------------------------------
-# Carriageway and markings, kerbs, pavements, the cross streets at both ends, the land around
+# ---- The ground: carriageway and markings, kerbs, pavements, cross streets, the land around ------
 
 ASPHALT = Look((0.105, 0.105, 0.11), Class.ROAD, Material.ASPHALT, spacing=1.3, backed=True)
 REPAIR = Look((0.075, 0.075, 0.08), Class.ROAD, Material.ASPHALT, spacing=1.3, backed=True)
@@ -74,7 +73,7 @@ def build_ground(layout: Layout) -> Shapes:
 
 
 def _sloped(
-    rectangles: np.ndarray, edges: np.ndarray, slope: float, z0: float, look: Look
+    rectangles: np.ndarray, slope: float, z0: float, look: Look, edges: np.ndarray | int = ALL_EDGES
 ) -> Shapes:
     """Panels over rectangles [R, 4] on the plane z = z0 + slope y, facing up."""
     x0, y0, x1, y1 = rectangles.T
@@ -146,13 +145,12 @@ def _carriageway(layout: Layout) -> list[Shapes]:
             here = [r for r in rectangles if low <= r[1] and r[3] <= high]
             holes += here
             if here:
-                edges = np.full(len(here), ALL_EDGES, np.uint8)
-                parts.append(_sloped(np.array(here), edges, slope, 0.0, look))
+                parts.append(_sloped(np.array(here), slope, 0.0, look))
         kerb = V1 if side > 0 else V0
         for start, stop in itertools.pairwise(bounds):
             near = [h for h in holes if h[0] < stop and h[2] > start]
             pieces, edges = cut((start, low, stop, high), near, rim=kerb)
-            parts.append(_sloped(pieces, edges, slope, 0.0, ASPHALT))
+            parts.append(_sloped(pieces, slope, 0.0, ASPHALT, edges))
     return parts
 
 
@@ -170,8 +168,7 @@ def _pavements(layout: Layout) -> list[Shapes]:
             low, high = sorted((side * near, side * far))
             z0 = kerb_high - PAVEMENT_SLOPE * ROAD_HALF_M
             rectangle = np.array([[x0, low, layout.x1, high]])
-            edges = np.array([ALL_EDGES], np.uint8)
-            parts.append(_sloped(rectangle, edges, side * PAVEMENT_SLOPE, z0, look))
+            parts.append(_sloped(rectangle, side * PAVEMENT_SLOPE, z0, look))
     return parts
 
 
@@ -182,15 +179,14 @@ def _cross_streets(layout: Layout) -> list[Shapes]:
     for x, direction in ((layout.x0, -1), (layout.x1, 1)):
         near, far = sorted((x, x + direction * CROSS_STREET_M))
         strip = np.array([[near, -70.0, far, 70.0]])
-        parts.append(_sloped(strip, np.array([ALL_EDGES], np.uint8), 0.0, z, ASPHALT))
+        parts.append(_sloped(strip, 0.0, z, ASPHALT))
         kerb = x + direction * CROSS_STREET_M
         u, up = np.array([0, 140.0, 0]), np.array([0, 0, KERB_RISE_M])
         sides = (up, u) if direction > 0 else (u, up)
         parts.append(parallelograms([kerb, -70.0, z], *sides, KERB))
         near, far = sorted((kerb, kerb + direction * 4.6))
         strip = np.array([[near, -70.0, far, 70.0]])
-        edges = np.array([ALL_EDGES], np.uint8)
-        parts.append(_sloped(strip, edges, 0.0, z + KERB_RISE_M, PAVING))
+        parts.append(_sloped(strip, 0.0, z + KERB_RISE_M, PAVING))
         for side in (1, -1):  # the near pavement's edge, left and right of our street
             u = np.array([0, 60.0, 0]) * side
             start = [x, side * ROAD_HALF_M, z]
@@ -212,10 +208,10 @@ def _land(layout: Layout) -> Shapes:
     pieces, edges = cut(outer, holes)
     # Only the rims that border something else need to be crisp.
     edges &= np.uint8(V0 | V1)
-    return _sloped(pieces, edges, 0.0, TERRAIN_Z_M, GRASS)
+    return _sloped(pieces, 0.0, TERRAIN_Z_M, GRASS, edges)
 
 
-# ---- world ---------------------------------------------------------------------------------------
+# ---- The whole -----------------------------------------------------------------------------------
 
 ROOF_Z_M = 11.5  # of a typical house, for sky light between the fronts
 SINK_M = 0.008  # tyres sit this far in the road, as on their contact patch
@@ -235,14 +231,10 @@ class Body:
         Albedo and the sun's shadows are averaged; other light is taken at the first place.
         """
         shapes = self.shapes
-        material, rgb, variation = (
-            shapes.material[shape],
-            shapes.rgb[shape],
-            shapes.variation[shape],
-        )
+        looks = shapes.material[shape], shapes.rgb[shape], shapes.variation[shape]
         base = np.zeros((len(shape), 3))
         for local in places:
-            base += albedo(material, rgb, variation, local, shapes.points(shape, local))
+            base += albedo(*looks, local, shapes.points(shape, local))
         sun = sun_share(shapes, self.tree, self.lighting, shape, places)
         return shade(shapes, self.lighting, shape, places[0], base / len(places), sun)
 
@@ -290,15 +282,8 @@ def build_street(parameters: StreetParameters) -> Street:
     ends = np.array([frame_time_ns(0), frame_time_ns(parameters.frames - 1)])
     eye_path = camera_path(parameters, ends)
     parked, cars = _park(layout)
-    shapes = join(
-        [
-            build_ground(layout),
-            build_buildings(layout),
-            build_vegetation(layout),
-            build_furniture(layout),
-            *cars,
-        ]
-    )
+    ground, houses = build_ground(layout), build_buildings(layout)
+    shapes = join([ground, houses, build_vegetation(layout), build_furniture(layout), *cars])
     footprints = [(c.centre[0], c.centre[1], c.size_m[0] / 2, c.size_m[1] / 2) for c in parked]
     lighting = Lighting(
         to_sun=to_sun,
@@ -348,20 +333,15 @@ def _moving_body(mover: Mover, layout: Layout, static: Body, ends: np.ndarray) -
     eyes = camera_path(layout.parameters, ends)
     centre = motion.centres[0]
     walls = sorted(turn * (side * FACADE_M - centre[1]) for side in (-1, 1))
+    directions = static.lighting.sun_directions()
+    origins = np.repeat(motion.centres, len(directions), axis=0)
+    shaded = static.tree.occluded(origins, np.tile(directions, (len(motion.centres), 1)))
     lighting = Lighting(
         to_sun=static.lighting.to_sun * flip,
         eye_path=(eyes - motion.at(ends)[0]) * flip,
         canyon=(walls[0], walls[1], ROOF_Z_M - centre[2]),
         ground_z=-size[2] / 2,
-        sunlit=_sunlit(static, motion.centres),
+        sunlit=1 - float(shaded.mean()),
     )
     body = Body(shapes, build_tree(shapes), lighting)
     return MovingBody(mover.name, label, size, body, motion, -size[2] / 2)
-
-
-def _sunlit(static: Body, centres: np.ndarray) -> float:
-    """Share of places [N, 3] that the static scene leaves in the sun."""
-    directions = static.lighting.sun_directions()
-    origins = np.repeat(centres, len(directions), axis=0)
-    rays = np.tile(directions, (len(centres), 1))
-    return 1 - float(static.tree.occluded(origins, rays).mean())
