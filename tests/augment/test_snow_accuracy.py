@@ -17,14 +17,21 @@ from adapters.procedural import open_truth
 from augment.effects.snow.placement import PlacementSettings, place_snow_support
 from augment.scene import Gaussians
 from augment.semantics import SemanticClass
-from tools.bench_snow_accuracy import AccuracyCase, bench_accuracy
-from tools.bench_snow_cells import bed_heights, cells_over
-from tools.bench_snow_masks import bench_masks
-from tools.bench_snow_truth import camera_from_above, pixel_places, still, true_points
+from tools.bench.snow import (
+    SHADINGS,
+    accuracy,
+    all_cameras,
+    bed_heights,
+    camera_from_above,
+    cells_over,
+    pixel_places,
+    snow_masks,
+    still,
+    true_points,
+)
 
 STREET = "procedural:street?seed=3&frames=2&gaussians=110000&parked=4&moving=1&pedestrians=1"
 CELL_M, REACH_M = 0.1, 10.0
-CASE = AccuracyCase(reach_m=REACH_M, pixel_m=0.1, every=2)
 
 
 @pytest.fixture(scope="module")
@@ -38,20 +45,21 @@ def truth():
 
 
 @pytest.fixture(scope="module")
-def accuracy(scene, truth):
-    return bench_accuracy(
+def found(scene, truth):
+    return accuracy(
         scene,
         truth,
         cell_m=CELL_M,
-        case=CASE,
+        reach_m=REACH_M,
+        pixel_m=0.1,
         depths_m=(0.02, 0.1),
         estimators=("mode", "expected"),
     )
 
 
 @pytest.fixture(scope="module")
-def mode(accuracy):
-    return accuracy["estimators"][0]
+def mode(found):
+    return found["estimators"][0]
 
 
 @pytest.fixture(scope="module")
@@ -59,10 +67,6 @@ def points(scene, truth):
     above = camera_from_above(all_cameras(scene), reach_m=REACH_M, pixel_m=0.3)
     xy = pixel_places(above).reshape(-1, 2)
     return true_points(still(truth), all_cameras(scene), xy, reach_m=REACH_M)
-
-
-def all_cameras(scene):
-    return [camera for frame in scene.frames for camera in frame.cameras.values()]
 
 
 def covered_by(scene, points, **settings):
@@ -84,15 +88,15 @@ def test_little_lies_where_the_sky_is_not_seen(mode):
     assert all(drawn["sheltered"] <= 0.01 for drawn in mode["depths"])
 
 
-def test_snow_is_as_high_as_its_depth(accuracy, mode):
+def test_snow_is_as_high_as_its_depth(found, mode):
     for drawn in mode["depths"]:
         assert drawn["error_on_scene_m"]["median"] <= 0.2 * drawn["depth_m"] + 0.01
-    assert abs(mode["bed_error_m"]["bias"] - accuracy["scene_bias_m"]) < 0.01
+    assert abs(mode["bed_error_m"]["bias"] - found["scene_bias_m"]) < 0.01
     assert mode["bed_error_m"]["p95"] < 0.06
 
 
-def test_mode_depth_beats_expected_depth(accuracy):
-    mode, expected = accuracy["estimators"]
+def test_mode_depth_beats_expected_depth(found):
+    mode, expected = found["estimators"]
     assert (mode["estimator"], expected["estimator"]) == ("mode", "expected")
     assert mode["covered"] > expected["covered"] + 0.03
     assert mode["covered_off_edges"] > expected["covered_off_edges"] + 0.02
@@ -148,10 +152,9 @@ def test_floaters_do_not_lift_the_snow(scene, points):
     assert off["expected"] > 0.12
 
 
-def test_neighbouring_views_agree_on_the_snow(scene):
-    figures = bench_masks(scene, (0,), scale=0.25, cell_m=CELL_M)
-    for kinds in figures.values():
-        for pairs in kinds.values():
-            assert pairs["points"] > 5000
-            assert pairs["agreeing"] >= 0.985
-            assert pairs["color_rms"] < 9
+@pytest.mark.parametrize("shading", SHADINGS)
+def test_neighbouring_views_agree_on_the_snow(scene, shading):
+    for _, points, agreeing, _, color_rms in snow_masks(scene, (0,), 0.25, shading, CELL_M):
+        assert points > 5000
+        assert agreeing >= 0.985
+        assert color_rms < 9

@@ -3,8 +3,17 @@
 import pytest
 
 from recipes.schema import TIERS
-from tools.trade_docs import DOCS, PAGE, SCENES, START, document, read_tables
-from tools.trade_tiers import INVISIBLE_FLIP, invisible_evidence, tiers_from
+from tools.bench.trade_rule import (
+    DOCS,
+    INVISIBLE_FLIP,
+    PAGE,
+    SCENES,
+    document,
+    draw_chart,
+    invisible_evidence,
+    read_tables,
+    tiers_from,
+)
 
 MAX_BYTES = 150_000
 
@@ -30,7 +39,7 @@ def test_the_document_agrees_with_the_tables(tables):
         assert (DOCS / "trade" / f"{name}.json").stat().st_size < MAX_BYTES
 
 
-def test_a_document_without_markers_is_refused(tables):
-    with pytest.raises(ValueError, match="end of machine"):
-        document("nothing", tables)
-    assert START.format(name="tiers") in PAGE.read_text()
+def test_published_figures_make_a_chart(tables, tmp_path):
+    pytest.importorskip("matplotlib")
+    draw_chart(tmp_path / "chart.png", tables[0])
+    assert (tmp_path / "chart.png").stat().st_size > 10_000

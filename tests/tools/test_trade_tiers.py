@@ -3,8 +3,8 @@
 import pytest
 
 from recipes.schema import BY_PATH
-from tools.trade_cases import WHOLE
-from tools.trade_tiers import Unmeasured, measure_tiers, settle, tier_from
+from tools.bench.trade import WHOLE
+from tools.bench.trade_rule import Unmeasured, measure_wholes, settle, tier_from
 
 STOP, CLIP, FRESNEL = "render.transmittance_stop", "render.radius_clip_px", "weather.flood.fresnel"
 
@@ -105,7 +105,7 @@ def test_settling_adds_what_the_rule_asks_for(monkeypatch):
         rows = [row(WHOLE, "reference", 1.0, 0.0, {}), row(WHOLE, name, 0.5, 0.005, given)]
         return type("Trade", (), {"figures": table(clean=rows)})
 
-    monkeypatch.setattr("tools.trade_tiers.bench_trade", measured)
+    monkeypatch.setattr("tools.bench.trade_rule.bench_trade", measured)
     tiers = settle([made_up], ["some:scene"], None)
     assert tiers["balanced"] == {STOP: 0.01, CLIP: 1.0}
     assert tiers["draft"] == {STOP: 0.05, CLIP: 2.0}
@@ -119,6 +119,6 @@ def test_rows_of_tiers_replace_those_of_earlier_ones(monkeypatch):
     made_up = table(clean=old)
     new = [row(WHOLE, "reference", 1.0, 0.0, {}), row(WHOLE, "draft", 0.5, 0.1, {CLIP: 2.0})]
     trade = type("Trade", (), {"figures": table(clean=new)})
-    monkeypatch.setattr("tools.trade_tiers.bench_trade", lambda *_, **__: trade)
-    assert measure_tiers(made_up, "some:scene", {"draft": {CLIP: 2.0}}, None) is trade
+    monkeypatch.setattr("tools.bench.trade_rule.bench_trade", lambda *_, **__: trade)
+    assert measure_wholes(made_up, "some:scene", {"draft": {CLIP: 2.0}}, None) is trade
     assert made_up["recipes"][0]["rows"] == [old[0], *SINGLE, new[1]]

@@ -1,8 +1,8 @@
 """Styles: what they cost, how exact maps in SH are, how well methods do on photographs, and whether
 views of a styled scene agree as those of the clean one do.
 
-Colours are clamped to >= 0 before they are blended. Mapped as evaluated colours, a splat's colour is
-clamped before the map and after it; mapped in its SH, after it alone. So pictures differ only in
+Colours are clamped to >= 0 before they are blended. Mapped as evaluated colours, a splat's colour
+is clamped before the map and after it; mapped in its SH, after it alone. So pictures differ only in
 "touched" pixels: where a splat with a colour below 0, as this camera sees it, is blended.
 """
 
@@ -68,6 +68,13 @@ from tools.bench.effects import (
 from tools.bench.harness import Action, Figures, Table, figures, machine_facts, median_ms, rounds
 from tools.bench.scenes import RasterCase, front_camera, random_scene, style_recipe
 
+WHOLE_STYLE = dataclasses.replace(
+    WHOLE, street="procedural:street?seed=0&frames=10", frames=(0, 1, 2)
+)
+QUICK_STYLE = dataclasses.replace(
+    QUICK, street="procedural:street?seed=0&frames=8&gaussians=120000"
+)
+PRESETS, QUICK_PRESETS = style_preset_names(), ("overcast", "golden-hour")
 KINDS = ("1 ahead", "7 ahead", NEXT_CAMERA)  # frames apart, as Lai et al. 2018 and successors
 VIEWS_PX, PHOTO_PX, HOLDOUT = 480, 256, 8
 VISIBLE = 1 / 255
@@ -84,11 +91,11 @@ def bench_style(
     repeats: int = 7,
     memory: bool = True,
 ) -> Figures:
-    """scene_uri: a scene whose cost, exactness and views are measured beside the street's. photos: a
-    folder of photographs, of which those are scored on that the network was not trained on.
+    """scene_uri: a scene whose cost, exactness and views are measured beside the street's. photos:
+    a folder of photographs; those that the network was not trained on are scored on.
     """
-    machine, case = machine_facts(), case or (QUICK if quick else WHOLE)
-    presets = ("overcast", "golden-hour") if quick else style_preset_names()
+    machine, case = machine_facts(), case or (QUICK_STYLE if quick else WHOLE_STYLE)
+    presets = QUICK_PRESETS if quick else PRESETS
     network = load_network(None)
     tables = [apply_table(RasterCase(200_000 if quick else 1_000_000, 640, 480), repeats)]
     costs = {
