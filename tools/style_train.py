@@ -69,15 +69,11 @@ RESERVE = 0.05  # of the time, for scores and checkpoints
 def train_style(
     options: StyleTrainOptions, *, progress: bool = True, checkpoint_s: float = CHECKPOINT_S
 ) -> Outcome:
-    """Trains, or goes on training, into `options.out`; with the ablations where they are asked for.
+    """Trains, or goes on training, into `options.out`.
 
     Raises:
         ClimateGSError: options, data or the output folder cannot be used as they are.
     """
-    if options.ablations:
-        from tools.style_ablations import train_ablations
-
-        return train_ablations(options, progress=progress)
     folder = checkpoint_folder(options.out)
     if options.out.exists() and not options.out.is_dir():
         raise OutputError(f"{options.out} is a file: choose another --out")

@@ -58,7 +58,6 @@ class StyleTrainOptions:
         half_precision: Write the network's numbers in 16 bits.
         through: Render mapped Gaussians for every step, or map pictures rendered once.
         device: Where torch trains: cpu, or cuda, where through renderer renders on the GPU, too.
-        ablations: Train without each loss, and 3x3 maps, too, and write a table.
         overwrite: Begin anew and replace what is there.
         json_file: Also write the report to this file.
     """
@@ -90,7 +89,6 @@ class StyleTrainOptions:
     half_precision: bool = False
     through: Literal["picture", "renderer"] = "picture"
     device: str = "cpu"
-    ablations: bool = False
     overwrite: bool = False
     json_file: JsonFile = None
 

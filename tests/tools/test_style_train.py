@@ -19,11 +19,9 @@ from augment.errors import ClimateGSError, OutputError, StyleError
 from augment.geometry import rigid
 from augment.scene import Gaussians, Scene
 from augment.sky import ConstantSky
-from tools import style_ablations, style_train
-from tools.style_ablations import VARIANTS, ablation_table
+from tools import style_train
 from tools.style_train import checkpoint_folder, train_style
 from tools.style_train_options import StyleTrainOptions, parse_pair_weights
-from tools.training import Outcome
 
 STREET = "procedural:street?seed=3"
 
@@ -221,46 +219,3 @@ def test_no_images_leave_no_training_behind(tmp_path):
 def test_pair_weights_keep_what_is_not_named():
     weights = parse_pair_weights("same=2,look=0")
     assert (weights.same, weights.look, weights.half) == (2.0, 0.0, parse_pair_weights("").half)
-
-
-# ---- ablations --------------------------------------------------------------------------------
-
-
-def test_ablations_differ_in_one_part_each(tmp_path, photos, monkeypatch, capsys):
-    asked = []
-
-    def pretend(options, **_):
-        asked.append(options)
-        return Outcome(
-            0, {"steps": 70, "scores": {"content_rmse": 0.1 * len(asked), "style_loss": 1.0}}
-        )
-
-    monkeypatch.setattr(style_ablations, "train_style", pretend)
-    options = options_of(tmp_path / "out", photos, steps=None, minutes=8.0, ablations=True)
-    report = run(options).report
-    full, no_consistency, no_cycle, square = asked
-    assert [o.out.name for o in asked] == list(VARIANTS)
-    assert (full.minutes, full.steps) == (2.0, None)
-    assert all((o.steps, o.minutes, o.seed, o.ablations) == (70, None, 0, False) for o in asked[1:])
-    same = {"out": full.out, "steps": None, "minutes": 2.0}
-    for other, fields in (
-        (no_consistency, {"consistency": 10.0, "pair_weights": ""}),
-        (no_cycle, {"cycle": 10.0, "pair_weights": ""}),
-        (square, {"matrix": "3x4"}),
-    ):
-        assert other != full and dataclasses.replace(other, **same, **fields) == full
-    assert no_consistency.consistency == 0 and no_cycle.cycle == 0 and square.matrix == "3x3"
-    assert parse_pair_weights(no_cycle.pair_weights).cycle == 0
-    table = (tmp_path / "out" / "ablations.txt").read_text()
-    assert "| without L_con | 0.200 | 1.000 |" in table and table in capsys.readouterr().out
-    assert json.loads((tmp_path / "out" / "ablations.json").read_bytes()) == report
-
-
-def test_a_table_leaves_out_what_no_training_knows():
-    table = ablation_table({"a": {"style_loss": 0.5, "same": 30.0}, "b": {"style_loss": 0.25}})
-    assert table.splitlines() == [
-        "| training | L_s | same, dB |",
-        "| --- | ---: | ---: |",
-        "| a | 0.500 | 30.00 |",
-        "| b | 0.250 | - |",
-    ]
