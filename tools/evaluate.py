@@ -7,36 +7,54 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections import OrderedDict
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
 from tqdm import tqdm
 
+from augment.cameras import Camera
+from augment.dataset.clips_pairs import clean_mask
+from augment.dataset.weather_dataset import Companions, RowReader, Rows, StoredFiles
 from augment.errors import OutputError
-from augment.jobs.store import open_store
-from augment.metrics.consistency import Warp, carry, consistency_of, find_warp
+from augment.geometry import invert_rigid
+from augment.jobs.files import depth_in_metres
+from augment.jobs.layout import folder_name
+from augment.jobs.manifest import OK, read_finished
+from augment.jobs.store import Store, open_store
+from augment.jobs.tables import read_boxes
+from augment.metrics.consistency import (
+    ActorPaths,
+    DepthView,
+    Warp,
+    carry,
+    consistency_of,
+    find_warp,
+)
 from augment.metrics.lpips import Lpips, load_lpips, picture_lpips
-from tools.evaluate_views import KINDS, Drive, Pair, View, Views, pairs_of
+from tools.drawing import GAP_PX, captioned, color_mapped, strip
+from tools.report_pictures import evenly
+from tools.sheet import write_rgb
 
+SHORT, LONG, CAMERAS = "short", "long", "cameras"
+KINDS = (SHORT, LONG, CAMERAS)
+MAX_ANGLE_DEG = 90.0  # between the optical axes of neighbouring cameras
+_BUFFERS = ("image", "depth", "water", "instance")
+_KEPT = 12  # decoded views; a pair of frames needs 2, the cameras of a frame mostly 6 or 7
 MIN_SHARE = 0.01  # of a picture's pixels; of fewer there is nothing to say
 ALL, DRY, WATER = "all", "dry", "water"
 _NUMBERS = ("rmse", "relative", "share")
-
-
-@dataclass(frozen=True, eq=False)
-class Compared:
-    """B warped into A. warped: float64 [H, W, 3]. warp: which pixels count. moved: bool [H, W],
-    carried along with a box. water: bool [H, W], where either shows water; None where no file says.
-    """
-
-    a: View
-    warped: np.ndarray
-    warp: Warp
-    moved: np.ndarray
-    water: np.ndarray | None
+PANEL_PX = 640  # wide
+ERROR_GAIN = 5.0  # of the error's picture: white is a fifth of the range
+# Of the mask: what does not count, counts, went along with a box, shows water.
+_COLORS = {"not": (0, 0, 0), "counts": (190, 190, 190), "moved": (240, 160, 30)}
+_WATER = (60, 120, 230)
+_PARTS = {ALL: "", DRY: "without water", WATER: "water only"}
 
 
 def evaluate_output(
@@ -52,7 +70,7 @@ def evaluate_output(
     pictures: Path | None = None,
     progress: bool = True,
 ) -> dict[str, Any]:
-    """The consistency of an output's images, as facts for `evaluate_text` and for JSON.
+    """The consistency of an output's images, as facts for `evaluation_text` and for JSON.
 
     short, long: how many frame numbers apart. pairs: at most so many of each kind from each variant
     of a scene. lpips, lpips_heads: weights (`augment.metrics.lpips.load_lpips`). pictures: a folder
@@ -84,9 +102,9 @@ def evaluate_output(
     records = [_record(views, drive, pair, network) for drive, pair in shown]
     worst = _worst(records)
     if pictures is not None:
-        from tools.evaluate_pictures import write_pictures
-
-        write_pictures(pictures, views, worst)
+        for record in worst:
+            name = f"{folder_name(record['recipe'])}-{record['kind']}.png"
+            write_rgb(pictures / name, pair_picture(views, record))
     return {
         "out": str(out),
         "frames_apart": {"short": short, "long": long},
@@ -98,6 +116,214 @@ def evaluate_output(
         "worst": [{k: v for k, v in each.items() if k != "rows"} for each in worst],
         "pairs": [{k: v for k, v in each.items() if k != "rows"} for each in records],
     }
+
+
+# ---- Views with depth, and which pairs of them are compared --------------------------------------
+
+
+class View(NamedTuple):
+    """An image with its depth. shows_water, shows_actor: bool [H, W], None where no file says."""
+
+    depth_view: DepthView
+    shows_water: np.ndarray | None
+    shows_actor: np.ndarray | None
+
+
+class Pair(NamedTuple):
+    """Rows of the manifest: b is warped into a."""
+
+    kind: str
+    a: int
+    b: int
+
+
+class Drive(NamedTuple):
+    """The images of one variant of one scene. rows: by (frame, camera)."""
+
+    scene: str
+    variant: str
+    recipe: str
+    effects: str
+    rows: dict[tuple[int, str], int]
+
+
+class Views:
+    """Reads the views of an output, the last ones kept.
+
+    scenes, recipes: which to keep; None for all.
+
+    Raises:
+        OutputError: nothing is finished there, or nothing of these scenes and recipes.
+    """
+
+    def __init__(
+        self,
+        store: Store,
+        scenes: Sequence[str] | None = None,
+        recipes: Sequence[str] | None = None,
+    ) -> None:
+        table = read_finished(store)
+        table = table.filter(pc.equal(table["status"], OK))
+        for column, names in (("scene", scenes), ("recipe", recipes)):
+            if names is None:
+                continue
+            there = set(pc.unique(table[column]).to_pylist())
+            if unknown := sorted(set(names) - there):
+                raise OutputError(
+                    f"{store.uri} has no {column} {unknown}; finished are: "
+                    f"{', '.join(sorted(there)) or 'none'}"
+                )
+            table = table.filter(pc.is_in(table[column], pa.array(names, pa.string())))
+        self.rows = Rows.of(table)
+        self._store = store
+        self._reader = RowReader(store, verify=False)
+        self._paths = Companions(StoredFiles(store), _read_paths)
+        self._kept: OrderedDict[int, View] = OrderedDict()
+
+    def drives(self) -> list[Drive]:
+        """In the manifest's order."""
+        found: dict[tuple[str, str], Drive] = {}
+        clean = clean_mask(self.rows)
+        for row in range(len(self.rows)):
+            scene, variant = self.rows["scene"][row], self.rows["variant"][row]
+            if (scene, variant) not in found:
+                effects = "clean" if clean[row] else _effects(self.rows, row)
+                recipe = self.rows["recipe"][row]
+                found[scene, variant] = Drive(scene, variant, recipe, effects, {})
+            item = self.rows["frame"][row], self.rows["camera"][row]
+            found[scene, variant].rows[item] = row
+        return list(found.values())
+
+    def camera(self, row: int) -> Camera:
+        """The row's camera in the dataset's world, which is that of the boxes."""
+        record, _ = self._reader.camera(self.rows, row)
+        try:
+            return Camera(
+                record.name,
+                record.width,
+                record.height,
+                float(record.K[0, 0]),
+                float(record.K[1, 1]),
+                float(record.K[0, 2]),
+                float(record.K[1, 2]),
+                invert_rigid(record.world_from_camera),
+                record.timestamp_ns,
+            )
+        except (RuntimeError, TypeError, ValueError) as error:
+            raise OutputError(
+                f"{self._store.uri}: {self.rows['calibration_path'][row]} is damaged (frame "
+                f"{self.rows['frame'][row]}, camera {record.name!r}: {error}); delete it and run "
+                f"the job again, which makes it anew"
+            ) from error
+
+    def view(self, row: int) -> View:
+        """What the row's files hold.
+
+        Raises:
+            OutputError: the row has no depth, or a file is missing or damaged.
+        """
+        if row not in self._kept:
+            self._kept[row] = self._read(row)
+            while len(self._kept) > _KEPT:
+                self._kept.popitem(last=False)
+        self._kept.move_to_end(row)
+        return self._kept[row]
+
+    def paths(self, row: int) -> ActorPaths:
+        """Where the boxes of the row's drive are; none where it has no labels."""
+        column: Any = self.rows["labels_path"]
+        parts = column.parts(row)
+        return ActorPaths({}) if parts is None else self._paths.get(*parts)[0]
+
+    def _read(self, row: int) -> View:
+        pixels = self._reader.pixels(self.rows, row, _BUFFERS)
+        if pixels.depth is None:
+            raise OutputError(
+                f"{self._store.uri}: variant {self.rows['variant'][row]!r} of scene "
+                f"{self.rows['scene'][row]!r} has no depth images, by which views are compared; "
+                f"render it with output: {{depth: median}}"
+            )
+        assert pixels.rgb is not None
+        depth_m = depth_in_metres(pixels.depth)
+        return View(
+            DepthView(
+                self.camera(row),
+                pixels.rgb.astype(np.float32) / np.float32(255),
+                depth_m,
+                (depth_m > 0).astype(np.float32),
+            ),
+            None if pixels.water is None else pixels.water > 0,
+            None if pixels.instance is None else pixels.instance > 0,
+        )
+
+
+def pairs_of(views: Views, drive: Drive, short: int, long: int, most: int | None) -> list[Pair]:
+    """The pairs of a drive: of one camera, `short` and `long` frame numbers apart (the later one is
+    warped into the earlier), and of neighbouring cameras of one frame (the second by name into the
+    first). most: of each kind at most so many, evenly chosen.
+    """
+    frames = sorted({frame for frame, _ in drive.rows})
+    cameras = sorted({camera for _, camera in drive.rows})
+    found: dict[str, list[Pair]] = {kind: [] for kind in KINDS}
+    for kind, apart in ((SHORT, short), (LONG, long)):
+        for camera in cameras:
+            for frame in frames:
+                a, b = (drive.rows.get((number, camera)) for number in (frame, frame + apart))
+                if a is not None and b is not None:
+                    found[kind].append(Pair(kind, a, b))
+    for frame in frames:
+        rows = [drive.rows[frame, name] for name in cameras if (frame, name) in drive.rows]
+        found[CAMERAS] += [Pair(CAMERAS, a, b) for a, b in _neighbours(views, rows)]
+    return [
+        pair
+        for each in found.values()
+        for pair in (each if most is None or not each else evenly(each, most))
+    ]
+
+
+def _neighbours(views: Views, rows: Sequence[int]) -> Iterator[tuple[int, int]]:
+    axes = {row: views.camera(row).world_from_camera[:3, 2].numpy() for row in rows}
+    least = math.cos(math.radians(MAX_ANGLE_DEG))
+    for place, a in enumerate(rows):
+        for b in rows[place + 1 :]:
+            if float(axes[a] @ axes[b]) >= least - 1e-9:
+                yield a, b
+
+
+def _effects(rows: Rows, row: int) -> str:
+    """Which effects the manifest's numbers name: `smog + snow`."""
+    present = {
+        "smog": _number(rows, row, "smog_extinction_per_m") > 0,
+        "flood": not math.isnan(_number(rows, row, "flood_level_m")),
+        "snow": _number(rows, row, "snow_depth_m") > 0,
+        "style": rows["style"][row] is not None,
+    }
+    return " + ".join(name for name, there in present.items() if there) or "other"
+
+
+def _number(rows: Rows, row: int, name: str) -> float:
+    """A weather number; NaN where there is none."""
+    value = rows[name][row] if name in rows.weather else None
+    return math.nan if value is None else value
+
+
+def _read_paths(path: Any) -> tuple[ActorPaths]:
+    return (ActorPaths(read_boxes(path)),)
+
+
+# ---- A pair by the protocol ------------------------------------------------------------------
+
+
+class Compared(NamedTuple):
+    """B warped into A. warped: float64 [H, W, 3]. warp: which pixels count. moved: bool [H, W],
+    carried along with a box. water: bool [H, W], where either shows water; None where no file says.
+    """
+
+    a: View
+    warped: np.ndarray
+    warp: Warp
+    moved: np.ndarray
+    water: np.ndarray | None
 
 
 def compare(views: Views, pair: Pair) -> Compared:
@@ -216,3 +442,120 @@ def _worst(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
         if rmse is not None and (key not in found or rmse > found[key][ALL]["rmse"]):
             found[key] = record
     return list(found.values())
+
+
+def pair_picture(views: Views, record: dict[str, Any]) -> np.ndarray:
+    """uint8 [H', W', 3]: its frame, the other one warped, their error and the mask."""
+    seen = compare(views, record["rows"])
+    own = seen.a.depth_view.picture
+    counts = seen.warp.counts
+    error = np.abs(seen.warped - own).mean(2) * counts
+    mask = np.full(own.shape, _COLORS["not"], np.uint8)
+    mask[counts] = _COLORS["counts"]
+    if seen.water is not None:
+        mask[counts & seen.water] = _WATER
+    mask[seen.moved] = _COLORS["moved"]
+    numbers = record["all"]
+    frames, cameras = record["frames"], record["cameras"]
+    panels = (
+        (
+            _bytes(own),
+            f"{cameras[0]}, frame {frames[0]}",
+            f"{record['scene']}, {record['variant']}",
+        ),
+        (
+            _bytes(np.where(counts[..., None], seen.warped, 0.0)),
+            f"{cameras[1]}, frame {frames[1]}, warped into it",
+            f"{record['meters_apart']:.2f} m and {record['seconds_apart']:.2f} s apart",
+        ),
+        (
+            color_mapped(ERROR_GAIN * error, cv2.COLORMAP_INFERNO),
+            f"error, x{ERROR_GAIN:g}",
+            f"RMSE {numbers['rmse']:.4f}",
+        ),
+        (
+            mask,
+            f"what counts: {100 * numbers['share']:.0f} % of the pixels",
+            "blue: water; orange: went along with a box",
+        ),
+    )
+    drawn = [captioned(_small(image), *texts) for image, *texts in panels]
+    between = np.full((GAP_PX, 2 * drawn[0].shape[1] + GAP_PX, 3), 255, np.uint8)
+    return np.concatenate([strip(drawn[:2]), between, strip(drawn[2:])])
+
+
+def _bytes(picture: np.ndarray) -> np.ndarray:
+    return (np.clip(picture, 0, 1) * 255).round().astype(np.uint8)
+
+
+def _small(image: np.ndarray) -> np.ndarray:
+    height = max(1, round(image.shape[0] * PANEL_PX / image.shape[1]))
+    larger = image.shape[1] < PANEL_PX
+    how = cv2.INTER_NEAREST if larger else cv2.INTER_AREA
+    return cv2.resize(image, (PANEL_PX, height), interpolation=how)
+
+
+def evaluation_text(facts: dict[str, Any]) -> str:
+    """All tables."""
+    apart = facts["frames_apart"]
+    names = {
+        "short": _frames(apart["short"]),
+        "long": _frames(apart["long"]),
+        "cameras": "neighbouring cameras",
+    }
+    with_lpips = facts["lpips"] is not None
+    lines = []
+    for kind, name in names.items():
+        lines += [f"{name[0].upper()}{name[1:]}", "", *_table(facts, kind, with_lpips), ""]
+    if with_lpips:
+        lines += [
+            f"LPIPS is of {facts['lpips']}, over the whole picture, in which pixels that do not "
+            f"count are taken to agree; `counted` is it divided by the share that counts.",
+            "",
+        ]
+    return "\n".join(lines).rstrip()
+
+
+def _table(facts: dict[str, Any], kind: str, with_lpips: bool) -> list[str]:
+    titles = ["recipe", "effects", "pairs", "left out", "apart", "pixels that count"]
+    titles += ["RMSE", "p90", "relative"] + ["LPIPS", "counted"] * with_lpips
+    lines = [f"| {' | '.join(titles)} |", "|---" * len(titles) + "|"]
+    for row in facts["recipes"]:
+        lines += [f"| {' | '.join(cells)} |" for cells in _rows(row, kind, with_lpips)]
+    return lines
+
+
+def _rows(row: dict[str, Any], kind: str, with_lpips: bool) -> Iterator[list[str]]:
+    """The cells of one recipe: all pixels, then those without and with water."""
+    found = row[kind]
+    if found is None or found["all"] is None:
+        left_out = "0" if found is None else str(found["left_out"])
+        yield [row["recipe"], row["effects"], "0", left_out, *["–"] * (5 + 2 * with_lpips)]
+        return
+    apart = f"{found['meters_apart']:.2f} m, {found['seconds_apart']:.2f} s"
+    for part, title in _PARTS.items():
+        each = found[part]
+        if each is None:
+            continue
+        share, rmse = each["share"]["mean"], each["rmse"]
+        relative = f"{each['relative']['mean']:.3f}" if "relative" in each else "–"
+        numbers = [f"{100 * share:.0f} %", f"{rmse['mean']:.4f} ± {rmse['std']:.4f}"]
+        numbers += [f"{rmse['p90']:.4f}", relative]
+        if with_lpips:
+            keys = ("lpips", "lpips_counted")
+            numbers += [f"{each[k]['mean']:.4f}" if k in each else "–" for k in keys]
+        if part == "all":
+            yield [
+                row["recipe"],
+                row["effects"],
+                str(each["pairs"]),
+                str(found["left_out"]),
+                apart,
+                *numbers,
+            ]
+        else:
+            yield [title, "", str(each["pairs"]), "", "", *numbers]
+
+
+def _frames(count: int) -> str:
+    return f"{count} frame{'s' * (count != 1)} apart"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 from adapters.base import open_scene
@@ -26,6 +25,7 @@ from augment.files.scene_file import (
     save_scene_file,
 )
 from augment.scene import Scene
+from tools.output import print_note
 
 _SUFFIXES: dict[ExportKind, str] = {"file": SCENE_SUFFIX, "ply": ".ply", "splat": ".splat"}
 _BAKED = ("ply", "splat")
@@ -59,7 +59,7 @@ def export_scene(
     _check_out(out, kind, overwrite)
     scene = open_scene(uri)
     for problem in scene.problems:
-        _print_result(f"note: {problem}")
+        print_note(f"note: {problem}")
     moment = _moment(scene, frame)
     written = _write(storable(scene), out, kind, moment, half)
     for path in written:
@@ -86,7 +86,7 @@ def _write(scene: Scene, out: Path, kind: ExportKind, moment: int, half: bool) -
     cameras = out.parent / CAMERAS
     if export_cameras(scene, out.parent):
         return [out, cameras] if cameras.exists() else [out]
-    _print_result(
+    print_note(
         f"note: {cameras} is there already and not this scene's; it is left as it is. Viewers that "
         f"look for cameras there find its cameras: export into a folder of its own"
     )
@@ -132,7 +132,3 @@ def _check_out(out: Path, kind: ExportKind, overwrite: bool) -> None:
         raise OutputError(f"{out} holds something else than a scene: choose another --out")
     if not overwrite:
         raise OutputError(f"{out} is there already: choose another --out, or add --overwrite")
-
-
-def _print_result(text: str) -> None:
-    print(text, file=sys.stderr)

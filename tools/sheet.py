@@ -205,11 +205,12 @@ def read_rgb(path: Path) -> np.ndarray:
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
-def write_rgb(path: Path, image: np.ndarray) -> None:
+def write_rgb(path: Path, image: np.ndarray, *, jpeg_quality: int = 95) -> None:
     """PNG or JPEG by the name's ending.
 
     Raises:
         OutputError: the file cannot be written.
     """
-    _, data = cv2.imencode(path.suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+    settings = [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality] if path.suffix == ".jpg" else []
+    _, data = cv2.imencode(path.suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR), settings)
     write_atomic(path, data.tobytes())

@@ -8,24 +8,23 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-import cv2
 import numpy as np
 import torch
 from pydantic import ValidationError
 
+from adapters.base import open_scene
+from adapters.scene_folder import storable
 from augment.cameras import Camera
 from augment.effects.style.color_maps import StyleMaps, sky_levels, style_gaussians, styled_scene
 from augment.effects.style.content import content_pictures, content_statistics, select_views
 from augment.effects.style.style import SceneStyle, style_maps
-from augment.errors import ClimateGSError, OutputError, StyleError
+from augment.errors import OutputError, StyleError
 from augment.files.scene_file import is_scene_folder, save_scene
-from augment.jobs.atomic import write_atomic
 from augment.render.composite import composite_sky, quantise
 from augment.render.rasterize import rasterize
 from augment.render.sh import SH_C0
@@ -33,6 +32,8 @@ from augment.scene import Gaussians, Scene
 from augment.semantics import SemanticClass
 from recipes.weather import Style, no_such_style, style_preset_names
 from tools.drawing import captioned, strip
+from tools.output import print_note
+from tools.sheet import write_rgb
 
 Method = Literal["mkl", "reinhard", "gscm"]
 VIEWS = 2  # that are drawn and measured
@@ -62,30 +63,36 @@ def apply_style(
     """
     out = Path(out)
     _check_out(out, overwrite)
-    wanted = _style(style, method, strength, per_region, mask, checkpoint)
-    _warm_up()
+    requested = _style(style, method, strength, per_region, mask, checkpoint)
+    # Compile the kernel where it is not yet, so that times are of the work.
+    eye = torch.eye(3, 4) / 2
+    style_gaussians(Gaussians.empty(), StyleMaps(eye[None], eye, eye))
     begun = time.perf_counter()
-    scene = _open(scene_uri)
-    opened_s = time.perf_counter() - begun
-
-    begun = time.perf_counter()
-    if wanted.changes and method == "gscm":
+    scene = open_scene(scene_uri)
+    for problem in scene.problems:
+        print_note(f"note: {problem}")
+    scene = storable(scene)
+    opened = time.perf_counter()
+    if requested.changes and method == "gscm":
         content_pictures(scene)
-    elif wanted.changes:
+    elif requested.changes:
         content_statistics(scene, per_region=per_region)
-    content_s = time.perf_counter() - begun
-    begun = time.perf_counter()
-    maps = style_maps(scene, wanted)
-    map_s = time.perf_counter() - begun
+    measured = time.perf_counter()
+    maps = style_maps(scene, requested)
+    mapped = time.perf_counter()
 
     styled = styled_scene(scene, maps)
     facts: dict[str, Any] = {
         "scene": scene.source,
         "out": str(out),
-        "style": _style_facts(wanted),
+        "style": _style_facts(requested),
         "maps": _map_facts(maps),
         "clamped": _clamp_facts(scene, styled, maps),
-        "seconds": {"open": opened_s, "content": content_s, "image to map": map_s},
+        "seconds": {
+            "open": opened - begun,
+            "content": measured - opened,
+            "image to map": mapped - measured,
+        },
         "apply": _apply_facts(scene, maps),
     }
     done = {**facts["style"], "scene": scene.source, "maps": facts["maps"]}
@@ -95,19 +102,9 @@ def apply_style(
     facts["seconds"]["write"] = time.perf_counter() - begun
     if (picture := _picture(scene, styled)) is not None:
         facts["picture"] = str(picture_path(out))
-        write_atomic(picture_path(out), picture)
+        write_rgb(picture_path(out), picture, jpeg_quality=88)
     print(style_text(facts))
     return facts
-
-
-def _open(uri: str) -> Scene:
-    from adapters.base import open_scene
-    from adapters.scene_folder import storable
-
-    scene = open_scene(uri)
-    for problem in scene.problems:
-        _print_result(f"note: {problem}")
-    return storable(scene)
 
 
 def picture_path(out: Path) -> Path:
@@ -179,12 +176,12 @@ def _style(
             checkpoint=None if checkpoint is None else str(checkpoint),
         )
     except ValidationError as error:
-        said = "; ".join(
+        message = "; ".join(
             f"{'.'.join(map(str, e['loc'])) + ': ' if e['loc'] else ''}"
             f"{e['msg'].removeprefix('Value error, ')}"
             for e in error.errors()
         )
-        raise StyleError(f"the style cannot be used: {said}") from None
+        raise StyleError(f"the style cannot be used: {message}") from None
 
 
 def _check_out(out: Path, overwrite: bool) -> None:
@@ -277,7 +274,7 @@ def _views(scene: Scene) -> list[Camera]:
 
 
 def _render(scene: Scene, camera: Camera, style_parts: SceneStyle | None = None) -> torch.Tensor:
-    """The picture with its sky, not clamped. worn: a style to render it under."""
+    """The picture with its sky, not clamped. style_parts: a style to render it under."""
     parts, sky = scene.parts_for(camera), scene.sky
     if style_parts is not None:
         parts, sky = style_parts.on(parts), style_parts.sky
@@ -290,28 +287,26 @@ def _apply_facts(scene: Scene, maps: StyleMaps) -> dict[str, Any]:
     """Time of the mapping alone, over all Gaussians, least of three."""
     parts = [dataclasses.replace(part, sh=part.sh.clone()) for part in scene.all_gaussians]
     traffic = 2 * sum(part.sh.numel() * part.sh.element_size() for part in parts)
-    in_place, fresh = [], []
-    for _ in range(3):
-        begun = time.perf_counter()
-        for part in parts:
-            style_gaussians(part, maps)
-        fresh.append(time.perf_counter() - begun)
-    for _ in range(3):
-        begun = time.perf_counter()
-        for part in parts:
-            style_gaussians(part, maps, out=part.sh)
-        in_place.append(time.perf_counter() - begun)
+    seconds = {}
+    for is_in_place in (False, True):
+        runs = []
+        for _ in range(3):
+            begun = time.perf_counter()
+            for part in parts:
+                style_gaussians(part, maps, out=part.sh if is_in_place else None)
+            runs.append(time.perf_counter() - begun)
+        seconds[is_in_place] = min(runs)
     return {
         "gaussians": sum(map(len, parts)),
         "bytes": traffic,
-        "in_place_s": min(in_place),
-        "in_place_gbps": traffic / max(min(in_place), 1e-9) / 1e9,
-        "new_memory_s": min(fresh),
+        "in_place_s": seconds[True],
+        "in_place_gbps": traffic / max(seconds[True], 1e-9) / 1e9,
+        "new_memory_s": seconds[False],
     }
 
 
-def _picture(scene: Scene, styled: Scene) -> bytes | None:
-    """JPEG: a view a row, before and after; None of a scene without cameras."""
+def _picture(scene: Scene, styled: Scene) -> np.ndarray | None:
+    """uint8 RGB: a view a row, before and after; None of a scene without cameras."""
     rows = []
     for camera in _views(scene):
         panels = [
@@ -323,18 +318,4 @@ def _picture(scene: Scene, styled: Scene) -> bytes | None:
         return None
     width = max(row.shape[1] for row in rows)
     rows = [np.pad(r, ((0, 0), (0, width - r.shape[1]), (0, 0)), constant_values=255) for r in rows]
-    image = np.concatenate(rows)
-    done, data = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 88])
-    if not done:
-        raise ClimateGSError(f"a picture of {image.shape[1]} x {image.shape[0]} pixels is no JPEG")
-    return data.tobytes()
-
-
-def _warm_up() -> None:
-    """Compile the kernel where it is not yet, so that times are of the work."""
-    color_map = torch.eye(3, 4) / 2
-    style_gaussians(Gaussians.empty(), StyleMaps(color_map[None], color_map, color_map))
-
-
-def _print_result(text: str) -> None:
-    print(text, file=sys.stderr)
+    return np.concatenate(rows)

@@ -19,8 +19,8 @@ from augment.jobs.manifest import rows_to_table, write_manifest
 from augment.jobs.tables import boxes_bytes
 from augment.metrics.lpips import ALEX, expected_shapes
 from recipes.schema import Output
-from tools.evaluate import evaluate_output
 from tools.cli import evaluate
+from tools.evaluate import evaluate_output
 from tools.output import write_json
 
 FRAMES = 8

@@ -10,9 +10,14 @@ from augment.scene import Scene
 from recipes.schema import Output, Recipe, Smog, Weather
 from recipes.weather import Snow, Style
 from tests.snow_scenes import box_car, drive, sheet
-from tools import pass_times
-from tools.explain import explain_recipe, explanation_text
-from tools.pass_times import measure_passes, sample_views, without_folded
+from tools import explain
+from tools.explain import (
+    explain_recipe,
+    explanation_text,
+    measure_passes,
+    sample_views,
+    without_folded,
+)
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +29,7 @@ def scene() -> Scene:
 def explained(monkeypatch, tmp_path, scene: Scene, recipe: str, **options):
     path = tmp_path / "recipe.yaml"
     path.write_text(recipe)
-    monkeypatch.setattr("adapters.base.open_scene", lambda uri: scene)
+    monkeypatch.setattr(explain, "open_scene", lambda uri: scene)
     facts = explain_recipe(str(path), "test:sheets", **options)
     return facts, explanation_text(facts)
 
@@ -65,7 +70,7 @@ def test_times_are_on_the_page_only_where_they_were_measured(scene, monkeypatch,
     assert "%" in lines["rasterise"] and "(" in lines["smog per Gaussian"]
     assert "%" not in lines["flood: bed"] and "2 views spread over" in page
     assert "actors can be in view in 2 of 2, 1.0 of 1 on average" in page
-    monkeypatch.setattr(pass_times, "measure_passes", None)  # not called
+    monkeypatch.setattr(explain, "measure_passes", None)  # not called
     facts, page = explained(monkeypatch, tmp_path, scene, recipe, times=False)
     assert facts["times"] is None and "%" not in page and "skips  flood: bed" in page
 
