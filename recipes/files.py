@@ -93,7 +93,7 @@ def file_below(folder: Path, written: str) -> Path:
         target = short(str(real), 200)
         raise ValueError(f"leads through a link to {target}, out of the recipe's folder; {aside}")
     try:
-        check_file(path)
+        _open_checked(path).close()
     except FileNotFoundError:
         near = _near(path)
         hint = f"did you mean {near}?" if near else "put the file beside the recipe or below it"
@@ -120,34 +120,34 @@ def open_file(path: str | Path) -> BufferedReader:
         raise
 
 
-def check_file(path: Path) -> None:
-    """Raise ValueError unless the file can be read and is not too large.
+def _open_checked(path: str | Path) -> BufferedReader:
+    """A file of no more than MAX_MIB, for reading.
 
     Raises:
         FileNotFoundError: there is none. ValueError: it cannot be read; says why.
     """
     try:
-        with open_file(path) as file:
-            size = os.fstat(file.fileno()).st_size
+        file = open_file(path)
     except (FileNotFoundError, NotADirectoryError):
         raise FileNotFoundError(str(path)) from None
     except IsADirectoryError:
         raise ValueError("is a folder, not a file") from None
     except OSError as error:
         raise ValueError(f"cannot be read: {error.strerror}") from None
-    if size > MAX_MIB * 2**20:
-        mib = size / 2**20
+    mib = os.fstat(file.fileno()).st_size / 2**20
+    if mib > MAX_MIB:
+        file.close()
         raise ValueError(f"holds {mib:.0f} MiB, more than the {MAX_MIB} MiB that are read")
+    return file
 
 
 def _open(name: str, path: str) -> BufferedReader:
     shown = f"style.{name} = {path!r}"
     try:
-        check_file(Path(path))
-        return open_file(path)
+        return _open_checked(path)
     except FileNotFoundError:
         raise ValueError(f"{shown}: there is no such file") from None
-    except (OSError, ValueError) as error:
+    except ValueError as error:
         raise ValueError(f"{shown}: {error}") from None
 
 

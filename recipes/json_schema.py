@@ -11,35 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from recipes.schema import VERSION
-from recipes.template import CHANNEL, RATE, ROOT, FieldSpec, Kind, SectionSpec, words
-
-# ---- The table of fields in the documentation, made from the schema ------------------------------
-
-_HEADER = "| Field | Allowed | Default | Meaning |\n| --- | --- | --- | --- |\n"
-
-
-def field_table() -> str:
-    """A Markdown table of every key of a recipe file, one row each, sections in their order."""
-    rows = []
-    for section in ROOT.walk():
-        if section.max_items is not None:
-            path = section.path.removesuffix("[]")
-            allowed = f"a list of up to {section.max_items} mappings, or null"
-            rows.append(f"| `{path}` | {allowed} | `null` | {section.list_description} |\n")
-        rows += [_row(spec) for spec in (*section.fields.values(), *section.extra.values())]
-    return _HEADER + "".join(rows)
-
-
-def _row(spec: FieldSpec) -> str:
-    default = "" if spec.default is None else f"`{words(spec.default)}`"
-    if spec.nullable:
-        default = "`null`"
-    if spec.required:
-        default = "required"
-    return f"| `{spec.path}` | {spec.allowed()} | {default} | {spec.description} |\n"
-
-
-# ---- json schema ---------------------------------------------------------------------------------
+from recipes.template import CHANNEL, RATE, ROOT, FieldSpec, Kind, SectionSpec
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
@@ -119,10 +91,9 @@ def _field(spec: FieldSpec, definitions: Schema) -> Schema:
 
 def _literal(spec: FieldSpec) -> Schema:
     null = ["null"] if spec.nullable else []
-    if spec.kind is Kind.WORD:
-        return {"enum": [*spec.words, *(None for _ in null)]}
-    if spec.kind is Kind.FLAG and spec.words:
-        return {"enum": [True, False, *spec.words, *(None for _ in null)]}
+    if spec.kind is Kind.WORD or (spec.kind is Kind.FLAG and spec.words):
+        flags = [True, False] if spec.kind is Kind.FLAG else []
+        return {"enum": [*flags, *spec.words, *(None for _ in null)]}
     if spec.channel is not None:
         return {
             "type": ["array", *null],
@@ -138,23 +109,19 @@ def _literal(spec: FieldSpec) -> Schema:
 
 
 def _with_ranges(spec: FieldSpec, definition: str) -> Schema:
-    literal = _literal(spec)
-    end = _literal(spec.without_null)
+    literal, end = _literal(spec), _literal(spec.without_null)
     ranges = [_choice(definition)]
     if spec.channel is not None:
         plain = {**end, "items": _literal(spec.channel)}
-        ranges.append(_range("uniform", _pair(plain)))
+        ranges.append(_closed({"uniform": _pair(plain)}))
     elif spec.kind in (Kind.NUMBER, Kind.WHOLE):
-        ranges.append(_range("uniform", _pair(end)))
-        ranges.append(_range("log_uniform", _pair({"allOf": [end, {"exclusiveMinimum": 0}]})))
-        ranges.append(_range("normal", _normal(end)))
+        above_0 = {"allOf": [end, {"exclusiveMinimum": 0}]}
+        spread = {"type": "number", "exclusiveMinimum": 0}
+        normal = {"mean": {"type": "number"}, "std": spread, "min": end, "max": end}
+        ranges.append(_closed({"uniform": _pair(end)}))
+        ranges.append(_closed({"log_uniform": _pair(above_0)}))
+        ranges.append(_closed({"normal": _closed(normal)}))
     return {"oneOf": [literal, *ranges]}
-
-
-def _normal(end: Schema) -> Schema:
-    number = {"type": "number"}
-    spread = {**number, "exclusiveMinimum": 0}
-    return _closed({"mean": number, "std": spread, "min": end, "max": end})
 
 
 def _choice(definition: str) -> Schema:
@@ -163,10 +130,6 @@ def _choice(definition: str) -> Schema:
     schema = _closed({"choice": options})
     schema["properties"]["weights"] = weights
     return schema
-
-
-def _range(kind: str, body: Schema) -> Schema:
-    return _closed({kind: body})
 
 
 def _pair(item: Schema) -> Schema:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import re
 from pathlib import Path
@@ -88,22 +89,13 @@ def _text_hint(text: str, spec: FieldSpec) -> str:
             return "; decimals take a point"
         if _NUMBER_WITH_UNIT.fullmatch(text):
             return "; write the number alone"
-        return "; write it without quotes" if _is_quoted_number(text) else ""
+        with contextlib.suppress(ValueError):
+            float(text)
+            return "; write it without quotes"
     return ""
 
 
-def _is_quoted_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
-
-
-# ------------------------------------------------------------------------------------------------
-# One field of a file: a literal or a range, checked against the field's limits where it stands
-# A range is a mapping: {uniform: [a, b]}, {log_uniform: [a, b]}, {normal: {mean, std, min, max}} or
-# {choice: [...], weights: [...]}. Both ends, the mean and every option must be allowed values.
+# ---- One field of a file: a literal or a range, checked against the field's limits where it stands
 
 NORMAL_KEYS = ("mean", "std", "min", "max")
 MAX_STD_PER_WIDTH = 1000  # a wider normal is uniform for all purposes, and loses digits
@@ -350,11 +342,10 @@ def _nearest(key: str, section: SectionSpec) -> str | None:
 
 def _base(name: str) -> str:
     """The name without its unit."""
-    stripped = _UNIT.sub("", name)
-    return stripped or name
+    return _UNIT.sub("", name) or name
 
 
-# ---- parse ---------------------------------------------------------------------------------------
+# ---- The whole file ------------------------------------------------------------------------------
 
 _LOG = logging.getLogger(__name__)
 
@@ -388,9 +379,8 @@ def _check_version(tree: MapNode, problems: Problems) -> None:
     line, node = tree.entries["version"]
     value = node.value if isinstance(node, ScalarNode) else None
     if type(value) is not int or value != VERSION:
-        raise problems.fail(
-            line, f"version = {show(node)}: this package reads version {VERSION} of the format"
-        )
+        text = f"version = {show(node)}: this package reads version {VERSION} of the format"
+        raise problems.fail(line, text)
 
 
 class _Compiler:
@@ -407,11 +397,8 @@ class _Compiler:
         name = self._take("name", file_name)
         if "name" not in tree.entries and not ROOT.fields["name"].accepts(name):
             allowed = ROOT.fields["name"].allowed()
-            self._problems.add(
-                1,
-                f"name: the file's name, {short(str(name))!r}, cannot serve as it; "
-                f"add 'name: ...', {allowed}",
-            )
+            text = f"the file's name, {short(str(name))!r}, cannot serve as it; add 'name: ...'"
+            self._problems.add(1, f"name: {text}, {allowed}")
         seed, first = int(self._take("seed")), int(self._take("variant"))
         variants = int(self._take("variants"))
         if not ROOT.fields["variant"].accepts(first + variants - 1):
@@ -420,11 +407,8 @@ class _Compiler:
         self._problems.raise_if_any()
         self._values.pop("version", None)
         if variants > 1 and not self._differs():
-            _LOG.warning(
-                "%s: variants = %d, but no field has a range: all have the same numbers",
-                source,
-                variants,
-            )
+            text = "%s: variants = %d, but no field has a range: all have the same numbers"
+            _LOG.warning(text, source, variants)
         return RecipeTemplate(
             name=str(name),
             source=source,
@@ -464,8 +448,7 @@ class _Compiler:
                 given[spec.shorthand] = self._values[join(path, spec.shorthand)] = value
             return given
         if not isinstance(node, MapNode):
-            known = ", ".join(spec.known)
-            text = f"{path} = {show(node)}: must be a mapping, with {known}"
+            text = f"{path} = {show(node)}: must be a mapping, with {', '.join(spec.known)}"
             self._problems.add(node.line, text)
             return given
         found_before = len(self._problems)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -161,11 +162,7 @@ def settings_of(recipe: BaseModel) -> dict[str, Value]:
 
 
 def with_settings(recipe: RecipeT, settings: Mapping[str, Value]) -> RecipeT:
-    """The recipe with some knobs set, which count as given from then on.
-
-    Raises:
-        ValueError: the schema refuses a value.
-    """
+    """The recipe with some knobs set, which then count as given; ValueError if one is refused."""
     return changed(recipe, settings)
 
 
@@ -242,22 +239,19 @@ def parse_frames(text: str) -> FramePattern:
         raise ValueError(f"{text!r} is not understood; {GRAMMAR}") from None
 
 
+_PIECE = re.compile(r"\s*(\d*)\s*(?::\s*(\d*)\s*(?::\s*(\d*)\s*)?)?")
+
+
 def _piece(text: str) -> int | slice:
-    if ":" not in text:
-        return _number(text)
-    values = [None if not part.strip() else _number(part) for part in text.split(":")]
-    if len(values) > 3 or (len(values) == 3 and values[2] == 0):
+    match = _PIECE.fullmatch(text)
+    if match is None:
         raise ValueError
-    start, stop, step = [*values, None][:3]
-    if start is not None and stop is not None and stop <= start:
+    start, stop, step = (int(number) if number else None for number in match.groups())
+    if ":" not in text:
+        return int(match[1])
+    if step == 0 or (start is not None and stop is not None and stop <= start):
         raise ValueError
     return slice(start, stop, step)
-
-
-def _number(text: str) -> int:
-    if not text.strip().isdecimal():
-        raise ValueError
-    return int(text)
 
 
 # ---- The recipe ---------------------------------------------------------------------------------
@@ -298,14 +292,10 @@ class Smog(Closed):
 
     @model_validator(mode="after")
     def _one_density(self) -> Smog:
-        if self.visibility_m is not None and self.extinction_per_m is not None:
-            raise ValueError(
-                "visibility_m and extinction_per_m both give the density: keep one of them"
-            )
-        if self.visibility_m is None and self.extinction_per_m is None:
-            raise ValueError(
-                "needs a density: give visibility_m (metres) or extinction_per_m (1/metre)"
-            )
+        both = "visibility_m and extinction_per_m both give the density: keep one of them"
+        neither = "needs a density: give visibility_m (metres) or extinction_per_m (1/metre)"
+        if (self.visibility_m is None) == (self.extinction_per_m is None):
+            raise ValueError(neither if self.visibility_m is None else both)
         if self.sigma_per_m > MAX_EXTINCTION_PER_M:
             raise ValueError(
                 f"visibility_m = {self.visibility_m:g} means an extinction of "
@@ -413,12 +403,8 @@ class Recipe(Closed):
         """One text per recipe: sorted keys, no spaces, floats that read back to the same bits.
 
         Fields younger than the first release are left out at their defaults, which mean what
-        recipes without them meant: their hashes stay, and with them the folders they resume.
-
-        Sweeps that auto passes through are those of `lidar: true`, and so is the text.
-
-        Where files lie is left out, too: what they hold is in their digest, which
-        `recipes.files.with_digest` fills in where a recipe lacks it.
+        recipes without them meant, so that hashes stay; sweeps that auto passes through are those
+        of `lidar: true`. Where files lie is left out: their digest says what they hold.
         """
         data = self.model_dump(mode="json")
         for section, name in _LATER_FIELDS:
@@ -477,12 +463,10 @@ class Recipe(Closed):
         return found
 
     def weather_numbers(self) -> dict[str, float]:
-        """Flat numbers for the manifest: NaN where absent.
+        """Flat numbers for the manifest: NaN where absent; no smog and no style are 0.
 
-        Without smog its extinction is 0, and without a style its strength.
-
-        flood_turbidity_ntu is the default's where the recipe gives none, and NaN where it gives an
-        absorption. flood_wave_height is a factor on a preset's waves, NaN where they are listed.
+        flood_turbidity_ntu is NaN where the recipe gives an absorption, flood_wave_height (a factor
+        on a preset's waves) where waves are listed.
         """
         smog, flood, snow = self.weather.smog, self.weather.flood, self.weather.snow
         height_m = None if smog is None else smog.scale_height_m
@@ -502,6 +486,4 @@ class Recipe(Closed):
     def style_words(self) -> dict[str, str | None]:
         """For the manifest: the name of the style's preset or image, and the method; or null."""
         style = self.style
-        if style is None:
-            return {"style": None, "style_method": None}
-        return {"style": style.name, "style_method": style.method}
+        return {"style": style and style.name, "style_method": style and style.method}

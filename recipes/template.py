@@ -293,7 +293,7 @@ class Kind(enum.Enum):
     WORD = "one of"
     COLOUR = "a colour"
     RATES = "three rates"
-    TEXT = "text"
+    TEXT = "up to 64 letters, digits, '.', '_' or '-', the first a letter or a digit"
     PATH = "a file in the recipe's folder or below it"
     DIGEST = "64 hexadecimal digits, small letters"
 
@@ -317,11 +317,9 @@ _KINDS = (
 class FieldSpec:
     """One field that holds a value.
 
-    path: as in a file, with [] for the items of a list. limits: pairs such as (">", 0.0). words:
-    what a WORD may be, or a FLAG besides true and false. rangeable: a range may stand here.
-    required: there is no default.
-    annotation: what pydantic checks a value against. channel: what each of a COLOUR's or RATES'
-    three numbers is; None for other kinds.
+    path: as in a file, with [] for the items of a list. annotation: what pydantic checks a value
+    against. limits: pairs such as (">", 0.0). words: what a WORD may be, or a FLAG besides true and
+    false. channel: what each of a COLOUR's or RATES' three numbers is; None for other kinds.
     """
 
     path: str
@@ -343,10 +341,7 @@ class FieldSpec:
     @property
     def unit(self) -> str | None:
         """The unit in words; None for a pure number."""
-        for suffix, unit in UNITS.items():
-            if self.name.endswith(suffix):
-                return unit
-        return None
+        return next((unit for end, unit in UNITS.items() if self.name.endswith(end)), None)
 
     @cached_property
     def _adapter(self) -> TypeAdapter[Any]:
@@ -370,12 +365,8 @@ class FieldSpec:
             text = f"{', '.join(('true', 'false', *self.words[:-1]))} or {self.words[-1]}"
         elif self.channel is not None:
             text = f"[red, green, blue], each {self.channel.allowed()}"
-        elif self.kind is Kind.TEXT:
-            text = "up to 64 letters, digits, '.', '_' or '-', the first a letter or a digit"
-        elif self.kind.is_text:
-            text = self.kind.value
         else:
-            text = self._allowed_number(value)
+            text = self.kind.value if self.kind.is_text else self._allowed_number(value)
         if self.unit and self.channel is None:
             text += f" ({self.unit})"
         return text + (", or null" if self.nullable and not is_number(value) else "")
@@ -542,11 +533,10 @@ _INDEX = re.compile(r"\[[0-9]+\]")
 class RecipeTemplate:
     """A loaded recipe file.
 
-    name: for folders and the manifest. source: where it was read from, for messages. variants: how
-    many recipes a run draws from it; first_variant: the number of the first. values: dotted path ->
-    how the field gets its value, for the fields that the file gives. effects: dotted path -> the
-    share of variants that have it, for the effects that the file names. lists: dotted path -> how
-    many items, for the lists that the file gives. folder: where the files lie that values name.
+    source: where it was read from, for messages. variants: how many recipes a run draws from it;
+    first_variant: the number of the first. values: how each field that the file gives gets its
+    value, by dotted path. effects: the share of variants that have it, of each effect that the file
+    names. lists: how many items, of each list. folder: where the files lie that values name.
     """
 
     name: str
@@ -563,9 +553,8 @@ class RecipeTemplate:
         """The recipe number `variant`, counted from 0.
 
         Its numbers depend on the seed, on first_variant + variant and on each field's own path
-        only: not on other fields, other variants, or what was resolved before. So there is no end
-        to the variants; `variants` says how many a run draws. Files that it names are found and
-        read: the recipe has their absolute paths, and a digest of what they hold.
+        only, so there is no end to the variants. Files that it names are found and read: the recipe
+        has their absolute paths, and a digest of what they hold.
 
         Raises:
             RecipeError: variant is negative or too large, what was drawn breaks a rule, or a file
@@ -576,23 +565,18 @@ class RecipeTemplate:
             allowed = ROOT.fields["variant"].allowed(number)
             raise RecipeError(f"{self.source}: variant = {variant}: must be {allowed}")
         draws = Draws(self.seed, number)
-        data: dict[str, Any] = {
-            "version": VERSION,
-            "name": self.name,
-            "seed": self.seed,
-            "variant": number,
-        }
-        off: list[str] = []
+        data: dict[str, Any] = {"version": VERSION, "name": self.name, "seed": self.seed}
+        data["variant"] = number
+        absent: tuple[str, ...] = ()
         for path, probability in self.effects:
             present = draws.unit(f"{path}.probability") < probability
             _put(data, path, {} if present else None)
-            if not present:
-                off.append(path + ".")
+            absent += () if present else (f"{path}.",)
         for path, count in self.lists:
-            if not path.startswith(tuple(off)):
+            if not path.startswith(absent):
                 _put(data, path, [{} for _ in range(count)])
         for path, value in self.values:
-            if not path.startswith(tuple(off)):
+            if not path.startswith(absent):
                 _put(data, path, value.draw(draws, path))
         where = f"{self.source}: variant {number}"
         self._find_files(data.get("style"), where)
@@ -618,9 +602,7 @@ class RecipeTemplate:
 
     def describe_ranges(self) -> dict[str, str]:
         """Dotted path -> its range in words, with the unit; only what differs between variants."""
-        units = {
-            spec.path: spec.unit for section in ROOT.walk() for spec in section.fields.values()
-        }
+        units = {spec.path: spec.unit for part in ROOT.walk() for spec in part.fields.values()}
         said = {
             path: f"present with probability {probability:g}"
             for path, probability in self.effects
@@ -711,8 +693,7 @@ def _drawn(name: str, value: Value | Items, end: Any) -> str:
 def _ends(value: Value | Items, is_free_text: bool) -> list[Any]:
     """What a rule between fields can depend on: the extreme numbers, null, and every word.
 
-    A handful, so that the product over a section's fields stays in the hundreds. No rule compares
-    colours, rates or names of files, so one stands for all.
+    A handful, for the product over a section's fields. No rule compares colours or names of files.
     """
     if isinstance(value, Items):
         return list(value.ends())
@@ -721,7 +702,7 @@ def _ends(value: Value | Items, is_free_text: bool) -> list[Any]:
     triples = [p for p in probes if isinstance(p, tuple)]
     others = [p for p in probes if p is None or isinstance(p, str | bool)]
     if is_free_text:
-        others = [p for p in others if p is None] + [p for p in others if p is not None][:1]
+        others = sorted(others, key=lambda p: p is not None)[: 1 + (None in others)]
     ends: list[Plain] = [min(numbers), max(numbers)] if numbers else []
     return list(dict.fromkeys([*ends, *triples[:1], *others]))
 

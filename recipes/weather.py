@@ -42,10 +42,12 @@ class Closed(BaseModel):
     )
 
 
+_PRESENT: JsonDict = {"not": {"type": "null"}}
+
+
 def one_of(*names: str) -> JsonDict:
     """In words of JSON Schema: exactly one of the fields is present and not null."""
-    present: JsonDict = {"not": {"type": "null"}}
-    return {"oneOf": [{"required": [name], "properties": {name: present}} for name in names]}
+    return {"oneOf": [{"required": [name], "properties": {name: _PRESENT}} for name in names]}
 
 
 # ---- What a recipe may say of snow that lies on the ground ---------------------------------------
@@ -230,25 +232,17 @@ class Style(Closed):
 # ---- flood ---------------------------------------------------------------------------------------
 
 MAX_WAVES = 64
-
 # Absorption of pure water at 650, 550 and 450 nm, 1/metre (Pope and Fry 1997).
 PURE_WATER_PER_M = (0.340, 0.0565, 0.00922)
-
-# Extinction that one nephelometric turbidity unit of particles adds, 1/metre. A black disc is seen
-# as far as 4.8 / extinction (Davies-Colley and Smith 2001), in rivers about 0.2 m at 50 NTU. The
-# ratio follows the grain size: clear rivers have up to twice as much, muddy ones down to half.
+# Extinction that one nephelometric turbidity unit of particles adds, 1/metre, to a factor of two. A
+# black disc is seen as far as 4.8 / extinction (Davies-Colley and Smith 2001).
 EXTINCTION_PER_M_PER_NTU = 0.5
-
 DEFAULT_TURBIDITY_NTU = 50.0  # moderately turbid, as a street's run-off is
 
+_CLARITIES = ("turbidity_ntu", "absorption_per_m")
 # In words of JSON Schema: the two are not both present and not null.
 _ONE_CLARITY: JsonDict = {
-    "not": {
-        "required": ["turbidity_ntu", "absorption_per_m"],
-        "properties": {
-            name: {"not": {"type": "null"}} for name in ("turbidity_ntu", "absorption_per_m")
-        },
-    }
+    "not": {"required": [*_CLARITIES], "properties": dict.fromkeys(_CLARITIES, _PRESENT)}
 }
 
 

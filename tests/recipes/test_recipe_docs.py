@@ -8,24 +8,32 @@ from pathlib import Path
 import pytest
 
 from recipes.errors import RecipeError
-from recipes.json_schema import field_table
 from recipes.load import preset_names
 from recipes.parse import parse_recipe
-from recipes.template import ROOT
+from recipes.template import ROOT, words
 from recipes.weather import style_preset_names
 
 PAGE = (Path(__file__).parents[2] / "docs" / "recipes.md").read_text(encoding="utf-8")
 
 
-def test_the_table_of_fields_is_the_schemas() -> None:
-    """To renew it, replace the end of the page by recipes.json_schema.field_table()."""
-    assert PAGE.endswith(field_table())
-
-
-def test_every_key_has_a_row() -> None:
+def field_table() -> str:
+    """A row for every key of a recipe file, sections in their order."""
+    rows = ["| Field | Allowed | Default | Meaning |\n| --- | --- | --- | --- |\n"]
     for section in ROOT.walk():
+        if section.max_items is not None:
+            path = section.path.removesuffix("[]")
+            allowed = f"a list of up to {section.max_items} mappings, or null"
+            rows.append(f"| `{path}` | {allowed} | `null` | {section.list_description} |\n")
         for spec in (*section.fields.values(), *section.extra.values()):
-            assert f"\n| `{spec.path}` |" in PAGE
+            known = "" if spec.default is None else f"`{words(spec.default)}`"
+            default = "required" if spec.required else "`null`" if spec.nullable else known
+            rows.append(f"| `{spec.path}` | {spec.allowed()} | {default} | {spec.description} |\n")
+    return "".join(rows)
+
+
+def test_the_table_of_fields_is_the_schemas() -> None:
+    """To renew it, replace the end of the page by field_table()."""
+    assert PAGE.endswith(field_table())
 
 
 def test_every_preset_is_described() -> None:

@@ -61,7 +61,7 @@ def test_files_that_are_no_recipes(tmp_path: Path, data: bytes, message: str) ->
 
 
 def test_paths_that_are_no_files(tmp_path: Path) -> None:
-    with pytest.raises(RecipeError, match="is a folder; a recipe is a YAML file"):
+    with pytest.raises(RecipeError, match="is a folder, not a YAML file"):
         load_recipe(tmp_path)
     with pytest.raises(RecipeError, match=r"missing.yaml: no such file, and no such preset; pres"):
         load_recipe(tmp_path / "missing.yaml")

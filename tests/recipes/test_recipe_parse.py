@@ -6,7 +6,7 @@ import pytest
 
 from recipes.errors import MAX_SHOWN, RecipeError
 from recipes.parse import parse_recipe
-from recipes.template import Channels, Choice, Fixed, LogUniform, Normal, TripleLine, Uniform
+from recipes.template import Channels, Choice, Fixed, Normal, TripleLine, Uniform
 
 
 def problems(text: str) -> tuple[str, ...]:
@@ -240,7 +240,7 @@ def test_values_are_shown_shortened() -> None:
         ("color: [0, 0.5, 1]", Fixed((0.0, 0.5, 1.0))),
         ("base_height_m: {uniform: [0, 2]}", Uniform(0.0, 2.0)),
         ("base_height_m: {uniform: [2, 2]}", Uniform(2.0, 2.0)),
-        ("base_height_m: {log_uniform: [1, 2]}", LogUniform(1.0, 2.0)),
+        ("base_height_m: {log_uniform: [1, 2]}", Uniform(1.0, 2.0, log=True)),
         ("base_height_m: {normal: {mean: 1, std: 2, min: 0, max: 3}}", Normal(1.0, 2.0, 0.0, 3.0)),
         ("scale_height_m: {choice: [null, 5]}", Choice((Fixed(None), Fixed(5.0)), (1.0, 1.0))),
         ("model: {choice: [deferred], weights: [2]}", Choice((Fixed("deferred"),), (2.0,))),

@@ -9,17 +9,7 @@ from statistics import NormalDist
 
 import pytest
 
-from recipes.template import (
-    Channels,
-    Choice,
-    Draws,
-    Fixed,
-    LogUniform,
-    Normal,
-    TripleLine,
-    Uniform,
-    Value,
-)
+from recipes.template import Channels, Choice, Draws, Fixed, Normal, TripleLine, Uniform, Value
 
 COUNT = 2000
 SEEDS = (0, 1, 12345)
@@ -46,7 +36,7 @@ def truncated(normal: NormalDist, low: float, high: float) -> Callable[[float], 
     ("value", "cdf"),
     [
         (Uniform(50.0, 120.0), lambda x: (x - 50) / 70),
-        (LogUniform(10.0, 1000.0), lambda x: math.log(x / 10) / math.log(100)),
+        (Uniform(10.0, 1000.0, log=True), lambda x: math.log(x / 10) / math.log(100)),
         (Normal(300.0, 100.0, 100.0, 600.0), truncated(NormalDist(300, 100), 100, 600)),
         (Normal(0.0, 50.0, 0.0, 1.0), truncated(NormalDist(0, 50), 0, 1)),
         (Normal(0.0, 1.0, -40.0, 40.0), truncated(NormalDist(0, 1), -40, 40)),
@@ -62,7 +52,10 @@ def test_draws_follow_their_distribution(value: Value, cdf, seed: int) -> None:
     ("value", "shares"),
     [
         (Uniform(1, 4, whole=True), {k: 0.25 for k in (1, 2, 3, 4)}),
-        (LogUniform(1, 3, whole=True), {k: math.log((k + 1) / k) / math.log(4) for k in (1, 2, 3)}),
+        (
+            Uniform(1, 3, whole=True, log=True),
+            {k: math.log((k + 1) / k) / math.log(4) for k in (1, 2, 3)},
+        ),
         (
             Normal(2.5, 1.0, 1, 4, whole=True),
             {
@@ -85,7 +78,7 @@ def test_discrete_draws_have_their_shares(value: Value, shares: dict) -> None:
 
 
 @pytest.mark.parametrize(
-    "value", [Uniform(1, 4, True), LogUniform(1, 4, True), Normal(2.2, 1.0, 1, 4, True)]
+    "value", [Uniform(1, 4, True), Uniform(1, 4, True, log=True), Normal(2.2, 1.0, 1, 4, True)]
 )
 def test_whole_draws_are_ints(value: Value) -> None:
     assert {type(x) for x in many(value, 0, 50)} == {int}
@@ -102,14 +95,14 @@ class Ends(Draws):
     "value",
     [
         Uniform(0.1, 0.3),
-        LogUniform(0.1, 0.3),
-        LogUniform(1e-300, 1e-200),
+        Uniform(0.1, 0.3, log=True),
+        Uniform(1e-300, 1e-200, log=True),
         Normal(0.2, 0.1, 0.1, 0.3),
         Normal(0.2, 1e-300, 0.1, 0.3),
         Normal(0.2, 200.0, 0.1, 0.3),
         Normal(0.1, 0.001, 0.1, 0.3),
         Uniform(1, 3, True),
-        LogUniform(1, 3, True),
+        Uniform(1, 3, True, log=True),
         Normal(2.0, 5.0, 1, 3, True),
         Uniform(0.5, 0.5),
         Uniform(1 / 3, math.nextafter(1 / 3, 1)),  # rounding to 10 digits would leave the range
@@ -174,7 +167,7 @@ def test_random_numbers_are_pinned() -> None:
     ("value", "drawn"),
     [
         (Uniform(50.0, 120.0), 99.47355614),
-        (LogUniform(50.0, 120.0), 92.83036027),
+        (Uniform(50.0, 120.0, log=True), 92.83036027),
         (Normal(80.0, 10.0, 50.0, 120.0), 85.45044491),
         (Uniform(1, 100, True), 71),
         (Choice((Fixed("a"), Fixed("b"), Fixed("c")), (1.0, 1.0, 1.0)), "c"),
@@ -187,7 +180,7 @@ def test_first_draws_are_pinned(value: Value, drawn: object) -> None:
 
 def test_descriptions() -> None:
     assert Uniform(50.0, 120.0).describe() == "uniform from 50 to 120"
-    assert LogUniform(0.001, 2.5).describe() == "log-uniform from 0.001 to 2.5"
+    assert Uniform(0.001, 2.5, log=True).describe() == "log-uniform from 0.001 to 2.5"
     assert (
         Normal(3.0, 1.0, 1.0, 6.0).describe() == "normal with mean 3 and deviation 1, from 1 to 6"
     )
