@@ -205,7 +205,7 @@ def _gradient(picture: Float[Tensor, "3 H W"]) -> np.ndarray:
 
 
 # --------------------------------------------------------------------------------------------------
-# What the style network's training is worth, by the losses' own measures: for curves, ablations.
+# What the style network's training is worth, by the losses' own measures: for curves.
 # They are defined on one fixed draw of contents and styles, so that networks can be compared.
 
 DEFINITIONS = {
