@@ -22,9 +22,9 @@ from augment.scene import Actor, Gaussians, PosedGaussians, Track
 from augment.semantics import SemanticClass
 from augment.views import render_view
 from tests.augment import pretend_gpu
+from tests.augment.kernel_frames import RECIPES, small_scene
 from tests.augment.pretend_gpu import AwayTensor, held_by, pretended_gpu
 from tests.snow_beds import scene_of
-from tools.kernel_frames import RECIPES, small_scene
 
 SUN = np.array([math.cos(0.6), 0.0, math.sin(0.6)])
 GRAIN = Grain(amount=0.5, contrast=0.4, seed=5)
