@@ -95,11 +95,8 @@ class Job(Closed):
     @model_validator(mode="after")
     def _names_known_recipes(self) -> Job:
         known = [entry.name or Path(entry.recipe).stem for entry in self.recipes]
-        repeated = sorted({name for name in known if known.count(name) > 1})
-        if repeated:
-            raise ValueError(
-                f"recipes are called the same: {', '.join(repeated)}; give one of them a name"
-            )
+        if repeated := _repeated(known):
+            raise ValueError(f"recipes are called the same: {repeated}; give one of them a name")
         for scene in self.scenes:
             for name in scene.recipes or ():
                 if name not in known:
@@ -109,6 +106,10 @@ class Job(Closed):
                         f"{guess}it has {', '.join(known)}"
                     )
         return self
+
+
+def _repeated(names: list[str]) -> str:
+    return ", ".join(sorted({name for name in names if names.count(name) > 1}))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -160,9 +161,8 @@ def parse_job(text: str, *, source: str, name: str = "job") -> Job:
     problems.raise_if_any()
     data: Any = plain(tree)
     if "name" not in data and not re.fullmatch(_NAME, name):
-        raise problems.fail(
-            1, f"the file's own name is no name for a job; give it a name: {_NAMES}"
-        )
+        text = f"the file's own name is no name for a job; give it a name: {_NAMES}"
+        raise problems.fail(1, text)
     try:
         return Job.model_validate({"name": name, **data})
     except ValidationError as error:
@@ -194,12 +194,10 @@ def load_job_recipes(job: Job, folder: Path) -> JobRecipes:
         if entry.variants is not None:
             template = dataclasses.replace(template, variants=entry.variants)
         templates[name] = template
-    names = [template.name for template in templates.values()]
-    repeated = sorted({name for name in names if names.count(name) > 1})
-    if repeated:
+    if repeated := _repeated([template.name for template in templates.values()]):
         raise RecipeError(
-            f"job {job.name}: recipes write to the same folders: {', '.join(repeated)}; give one "
-            f"of them a name in the job"
+            f"job {job.name}: recipes write to the same folders: {repeated}; give one of them a "
+            "name in the job"
         )
     return JobRecipes(job, templates)
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from statistics import NormalDist
-from typing import Annotated, Any, Literal, Protocol, TypeGuard, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, TypeGuard, Union, get_args, get_origin
 
 from annotated_types import Ge, Gt, Le, Lt, MaxLen
 from pydantic import BaseModel, Field, TypeAdapter, ValidationError
@@ -68,19 +68,9 @@ RANGE_KINDS = ("uniform", "log_uniform", "normal", "choice")
 Plain = bool | int | float | str | Triple | None
 
 
-class Value(Protocol):
-    """What a template holds for a field.
-
-    is_range: False where every variant gets the same. draw: the value of one variant, `path` naming
-    its random number. probes: the extreme values of the range and every option of a choice, all of
-    which must be allowed. describe: the range in words, without its unit.
-    """
-
-    @property
-    def is_range(self) -> bool: ...
-    def draw(self, draws: Draws, path: str) -> Plain: ...
-    def probes(self) -> tuple[Plain, ...]: ...
-    def describe(self) -> str: ...
+# What a template holds for a field has `is_range`, False where every variant gets the same; `draw`,
+# the value of one variant, the path naming its random number; `probes`, the extreme values and
+# every option, all of which must be allowed; and `describe`, the range in words, without its unit.
 
 
 @dataclass(frozen=True)
@@ -232,6 +222,9 @@ class Channels:
 
     def describe(self) -> str:
         return f"[{', '.join(channel.describe() for channel in self.channels)}]"
+
+
+Value = Fixed | Uniform | Normal | Choice | TripleLine | Channels
 
 
 def _rounded(drawn: float, low: float, high: float) -> float:
@@ -666,21 +659,20 @@ class Items:
 
 def broken_rules(spec: SectionSpec, given: Mapping[str, Value | Items]) -> Iterator[str]:
     """What the section's model says against any combination of the ranges' ends, each text once."""
-    said: set[str] = set()
-    free = {name for name, field in spec.fields.items() if field.kind.is_text}
-    corners = {name: _ends(value, name in free) for name, value in given.items()}
+    found: set[str] = set()
+    corners = {
+        k: _ends(v, k in spec.fields and spec.fields[k].kind.is_text) for k, v in given.items()
+    }
     for combination in itertools.product(*corners.values()):
         corner = dict(zip(corners, combination, strict=True))
         try:
             spec.model.model_validate(corner)
         except ValidationError as error:
-            ranged = [name for name, value in given.items() if value.is_range]
-            drawn = [_drawn(name, given[name], corner[name]) for name in ranged]
+            drawn = [_drawn(k, v, corner[k]) for k, v in given.items() if v.is_range]
             where = f" (in a draw with {', '.join(drawn)})" if drawn else ""
-            for text in readable(error):
-                if text not in said:
-                    said.add(text)
-                    yield f"{text}{where}"
+            texts = dict.fromkeys(readable(error))
+            yield from (f"{text}{where}" for text in texts if text not in found)
+            found.update(texts)
 
 
 def _drawn(name: str, value: Value | Items, end: Any) -> str:

@@ -334,10 +334,8 @@ class Flood(Closed):
     @model_validator(mode="after")
     def _one_clarity(self) -> Flood:
         if self.turbidity_ntu is not None and self.absorption_per_m is not None:
-            raise ValueError(
-                "turbidity_ntu and absorption_per_m both say how clear the water is: "
-                "keep one of them"
-            )
+            both = "turbidity_ntu and absorption_per_m both say how clear the water is"
+            raise ValueError(f"{both}: keep one of them")
         return self
 
     @property
@@ -349,10 +347,7 @@ class Flood(Closed):
 
     @property
     def extinction_per_m_rgb(self) -> tuple[float, float, float]:
-        """Extinction of red, green and blue along the way through the water, 1/metre.
-
-        From a turbidity: the absorption of pure water, and grey particles in proportion.
-        """
+        """Along the way through the water: given, or pure water and grey particles."""
         if self.absorption_per_m is not None:
             return self.absorption_per_m
         assert self.effective_turbidity_ntu is not None

@@ -1,8 +1,7 @@
 """YAML text -> a small tree that remembers lines; no object of YAML's choice is ever built.
 
-PyYAML scans and parses; the tree is built here from its events, without recursion, so that depth
-and size are bounded whatever the text. Scalars follow YAML 1.2's core schema (1e-3 is a number, yes
-is text); keys are always text. Duplicate keys, tags, merge keys and further documents are problems.
+The tree is built from PyYAML's events, without recursion, so that depth and size are bounded
+whatever the text. Scalars follow YAML 1.2's core schema; keys are always text.
 """
 
 from __future__ import annotations
@@ -154,9 +153,8 @@ class _Builder:
 
     def _start(self, line: int, event: yaml.ScalarEvent | yaml.CollectionStartEvent) -> None:
         if event.tag is not None:
-            raise self._problems.fail(
-                line, f"the tag {short(str(event.tag))!r}: tags are not allowed"
-            )
+            text = f"the tag {short(str(event.tag))!r}: tags are not allowed"
+            raise self._problems.fail(line, text)
         if isinstance(event, yaml.ScalarEvent):
             value = plain_value(event.value) if event.style is None else event.value
             node = ScalarNode(line, event.value, value)
@@ -202,9 +200,8 @@ class _Builder:
         if not isinstance(node, ScalarNode):
             raise self._problems.fail(line, "a key must be plain text, not a list or a mapping")
         if node.text == "<<":
-            raise self._problems.fail(
-                line, "merge keys (<<) are not read; write the fields out, or use *alias as a value"
-            )
+            text = "merge keys (<<) are not read; write the fields out, or use *alias as a value"
+            raise self._problems.fail(line, text)
         return node.text
 
     def _insert(self, parent: MapNode, line: int, key: str, node: Node) -> None:
