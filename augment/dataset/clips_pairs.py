@@ -26,13 +26,9 @@ _PRESENCE = {
 
 
 def clean_frames(dataset: WeatherDataset, variant: str | None = None) -> WeatherDataset:
-    """The images without weather and style, or those of one variant.
-
-    Without a variant's name: those whose manifest says no smog, flood, snow or style, and whose
-    other weather numbers are all zero or absent.
-
-    Raises:
-        ValueError: there is no such variant.
+    """The images without weather and style, or those of one variant. Without a variant's name:
+    those whose manifest says no smog, flood, snow or style, and whose other weather numbers are all
+    zero or absent. Raises ValueError: there is no such variant.
     """
     rows = dataset.rows
     if variant is None:

@@ -118,14 +118,10 @@ def moved_points(points_m: np.ndarray, world_from_frame: np.ndarray) -> np.ndarr
 
 
 def boxes_2d(sample: Mapping[str, Any]) -> Boxes2d:
-    """A sample's boxes as the image shows them: bounds of what lies inside the image, tight.
-
-    They enclose the projected box cut off at the image's borders, not the projected corners, whose
+    """A sample's boxes as the image shows them: bounds of what lies inside the image, tight. They
+    enclose the projected box cut off at the image's borders, not the projected corners, whose
     bounds are wider for a box that a border cuts. Weather and what hides a box change nothing. A
-    box whose numbers are not finite is out of view.
-
-    Raises:
-        ValueError: the sample has no boxes.
+    box whose numbers are not finite is out of view. Raises ValueError: the sample has no boxes.
     """
     boxes, camera = sample["boxes"], sample["camera"]
     if boxes is None:
@@ -278,11 +274,7 @@ class SampleOptions:
 
     @staticmethod
     def checked(image_type: str, load: Collection[str], box_frame: str) -> SampleOptions:
-        """The options of these values.
-
-        Raises:
-            ValueError: a value that there is not.
-        """
+        """The options of these values. Raises ValueError: a value that there is not."""
         if image_type not in ("float32", "uint8"):
             raise ValueError(f"image_type must be 'float32' or 'uint8'; got {image_type!r}")
         if box_frame not in BOX_FRAMES:
@@ -296,7 +288,6 @@ class SampleOptions:
 @dataclass(frozen=True, eq=False)
 class Pixels:
     """Decoded images of one view. rgb: uint8 [H, W, 3]. depth: uint16 [H, W], steps of 1/256 m.
-
     semantic: uint8 [H, W]. instance: uint16 [H, W]. water, snow: uint8 [H, W], 0 or 255.
     """
 

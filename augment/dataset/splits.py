@@ -81,11 +81,10 @@ class ShardedSampler(Sampler[int]):
         return -(-left // self.ranks) if self.uneven == "pad" else left // self.ranks
 
     def state_dict(self, given: int | None = None) -> dict[str, Any]:
-        """Where the epoch stands, in plain numbers that JSON holds.
-
-        given: samples of this rank that were trained on since the epoch began or the last state was
-        loaded: batches times their size. None: those that this sampler gave out, which is right
-        where no worker reads ahead. Every rank has given as many.
+        """Where the epoch stands, in plain numbers that JSON holds. given: samples of this rank
+        that were trained on since the epoch began or the last state was loaded: batches times their
+        size. None: those that this sampler gave out, which is right where no worker reads ahead.
+        Every rank has given as many.
         """
         ahead = (self._given if given is None else given) * self.ranks
         return {
@@ -97,10 +96,8 @@ class ShardedSampler(Sampler[int]):
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on where `state_dict` stood.
-
-        Raises:
-            ValueError: the state is of another seed, order or number of samples.
+        """Go on where `state_dict` stood. Raises ValueError: the state is of another seed, order or
+        number of samples.
         """
         own = {"seed": self.seed, "shuffle": self.shuffle, "count": self.count}
         if wrong := {k: (state.get(k), v) for k, v in own.items() if state.get(k) != v}:

@@ -103,14 +103,10 @@ def _check_measured(sample: Mapping[str, Any]) -> None:
 
 
 def box_masks(sample: Mapping[str, Any]) -> torch.Tensor:
-    """bool [B, H, W]: the pixels that show each of a sample's boxes.
-
-    A pixel does if the surface of the depth image there lies inside the box, its lowest centimetres
-    left out and the other sides 10 cm wider (`augment.boxes`); so what hides a box is not in
-    its mask. Where boxes overlap a pixel is in both.
-
-    Raises:
-        ValueError: the sample has no boxes or no depth.
+    """bool [B, H, W]: the pixels that show each of a sample's boxes. A pixel does if the surface of
+    the depth image there lies inside the box, its lowest centimetres left out and the other sides
+    10 cm wider (`augment.boxes`); so what hides a box is not in its mask. Where boxes overlap a
+    pixel is in both. Raises ValueError: the sample has no boxes or no depth.
     """
     boxes, depth, camera = sample["boxes"], sample["depth"], sample["camera"]
     if boxes is None or depth is None:

@@ -15,7 +15,7 @@ from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 import cv2
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
+import pyarrow.compute
 import pyarrow.dataset
 import torch
 from pyarrow.compute import Expression
@@ -42,23 +42,20 @@ from augment.jobs.tables import FrameBoxes, read_boxes, read_lidar
 from augment.labels import LidarSweep
 
 # ---- A manifest's rows in a fifth of its memory, with random access to single ones ---------------
-# A row of a manifest with short names takes 440 bytes in an Arrow table and 84 here: most of it are
-# paths and names that repeat. Here a column is its distinct values and one small number a row;
-# paths
-# are split into folder and file name, of which there are few. Rows are NumPy arrays, so
-# forked workers share them.
+# Most of a row in an Arrow table (440 bytes with short names, 84 here) are paths and names that
+# repeat. Here a column is its distinct values and one small number a row; paths are split into
+# folder and file name, of which there are few. Rows are NumPy arrays, so forked workers share them.
 
+pc: Any = pyarrow.compute  # type checkers do not see the functions that it makes on import
 _PATH = r"(?s)^(?P<folder>.*/)?(?P<name>[^/]*)$"  # the folder with its slash
 _MAX_CODES = 1 << 16  # numbers of more distinct values are kept as they are
-_DIGEST_LENGTH = 64  # hexadecimal digits of a SHA-256
-_HEX_DIGITS = np.frombuffer(b"0123456789abcdef", np.uint8)
+_DIGEST = "V32"  # a SHA-256
 
 
 @runtime_checkable
 class Column(Protocol):
     """One column: a value by its row, or as an Arrow array."""
 
-    def __len__(self) -> int: ...
     def __getitem__(self, row: int) -> Any: ...
     def take(self, rows: np.ndarray) -> Column: ...
     @property
@@ -92,15 +89,13 @@ class Coded:
 
 @dataclass(frozen=True, eq=False)
 class Numbers:
-    """A number a row."""
+    """A number a row, or a SHA-256 (of type _DIGEST), whose value is its hexadecimal digits."""
 
     numbers: np.ndarray
 
-    def __len__(self) -> int:
-        return len(self.numbers)
-
     def __getitem__(self, row: int) -> Any:
-        return self.numbers[row].item()
+        value = self.numbers[row]
+        return value.tobytes().hex() if self.numbers.dtype == _DIGEST else value.item()
 
     @property
     def nbytes(self) -> int:
@@ -110,7 +105,11 @@ class Numbers:
         return Numbers(self.numbers[rows])
 
     def arrow(self, kind: pa.DataType) -> pa.Array:
-        return pa.array(self.numbers, kind)
+        is_digest = self.numbers.dtype == _DIGEST
+        return pa.array(list(self) if is_digest else self.numbers, kind)
+
+    def __iter__(self) -> Iterator[Any]:
+        return (self[row] for row in range(len(self.numbers)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,9 +118,6 @@ class Paths:
 
     folders: Coded
     names: Coded
-
-    def __len__(self) -> int:
-        return len(self.names)
 
     def __getitem__(self, row: int) -> str | None:
         parts = self.parts(row)
@@ -140,43 +136,13 @@ class Paths:
         return Paths(self.folders.take(rows), self.names.take(rows))
 
     def arrow(self, kind: pa.DataType) -> pa.Array:
-        joined: Any = pc.binary_join_element_wise(  # pyright: ignore[reportAttributeAccessIssue]
-            self.folders.arrow(kind), self.names.arrow(kind), ""
-        )
-        return joined
-
-
-@dataclass(frozen=True, eq=False)
-class Digests:
-    """SHA-256 digests, which all differ. digests: uint8 [N, 32]."""
-
-    digests: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.digests)
-
-    def __getitem__(self, row: int) -> str:
-        return self.digests[row].tobytes().hex()
-
-    @property
-    def nbytes(self) -> int:
-        return self.digests.nbytes
-
-    def take(self, rows: np.ndarray) -> Digests:
-        return Digests(self.digests[rows])
-
-    def arrow(self, kind: pa.DataType) -> pa.Array:
-        digits = np.stack([self.digests >> 4, self.digests & 15], axis=-1)
-        text = _HEX_DIGITS[digits].tobytes()
-        ends = np.arange(len(self) + 1, dtype=np.int32) * _DIGEST_LENGTH
-        return pa.StringArray.from_buffers(len(self), pa.py_buffer(ends), pa.py_buffer(text))
+        return pc.binary_join_element_wise(self.folders.arrow(kind), self.names.arrow(kind), "")
 
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Columns of equal length by name. schema: the manifest's, in its order of columns.
-
-    weather: the names of the columns that hold weather numbers.
+    """Columns of equal length by name. schema: the manifest's, in its order of columns. weather:
+    the names of the columns that hold weather numbers.
     """
 
     columns: Mapping[str, Column]
@@ -190,7 +156,7 @@ class Rows:
         return Rows(dict(_packed_columns(table)), schema, weather)
 
     def __len__(self) -> int:
-        return len(next(iter(self.columns.values())))
+        return len(self.coded("status"))
 
     def __getitem__(self, name: str) -> Column:
         return self.columns[name]
@@ -206,10 +172,8 @@ class Rows:
         return Rows(columns, self.schema, self.weather)
 
     def coded(self, name: str) -> Coded:
-        """A column of names or of other values that repeat.
-
-        Raises:
-            TypeError: the column is none of those.
+        """A column of names or of other values that repeat. Raises TypeError: the column is none of
+        those.
         """
         column = self.columns[name]
         if isinstance(column, Numbers):  # numbers that hardly repeat
@@ -252,16 +216,14 @@ class Rows:
         return there[column.names.codes] if len(there) else np.zeros(len(self), bool)
 
     def numbers(self, name: str) -> np.ndarray:
-        """A numeric column, [N]; null is NaN.
-
-        Raises:
-            TypeError: the column holds no numbers.
-        """
+        """A numeric column, [N]; null is NaN. Raises TypeError: the column holds no numbers."""
         column = self.columns[name]
         if isinstance(column, Numbers):
             return column.numbers
         kind = self.schema.field(name).type
-        if not (isinstance(column, Coded) and (pa.types.is_integer(kind) or _is_float(kind))):
+        if not (
+            isinstance(column, Coded) and (pa.types.is_integer(kind) or pa.types.is_floating(kind))
+        ):
             raise TypeError(f"column {name!r} holds {kind}, not numbers")
         is_whole = pa.types.is_integer(kind) and None not in column.values
         values = np.array(column.values, np.int64 if is_whole else np.float64)
@@ -282,13 +244,13 @@ def _packed_columns(table: pa.Table) -> Iterator[tuple[str, Column]]:
 
 def _packed(name: str, column: pa.ChunkedArray) -> Column:
     if name.endswith("_path") and pa.types.is_string(column.type):
-        parts: Any = pc.extract_regex(column, _PATH)  # pyright: ignore[reportAttributeAccessIssue]
+        parts: Any = pc.extract_regex(column, _PATH)
         folders, names = parts.combine_chunks().flatten() if len(column) else (column, column)
         return Paths(_coded(pa.chunked_array([folders])), _coded(pa.chunked_array([names])))
     if name == "checksum" and (digests := _digests(column)) is not None:
-        return Digests(digests)
+        return Numbers(digests)
     coded = _coded(column)
-    is_number = pa.types.is_integer(column.type) or _is_float(column.type)
+    is_number = pa.types.is_integer(column.type) or pa.types.is_floating(column.type)
     if is_number and len(coded.values) > _MAX_CODES and column.null_count == 0:
         return Numbers(column.to_numpy())
     return coded
@@ -298,15 +260,8 @@ def _coded(column: pa.ChunkedArray) -> Coded:
     # Nulls have no code in Arrow: they get the one behind the last.
     encoded: Any = column.dictionary_encode().unify_dictionaries()
     values = encoded.chunk(0).dictionary.to_pylist() if encoded.num_chunks else []
-    codes = np.concatenate(
-        [
-            np.zeros(0, np.int32),
-            *(
-                c.indices.fill_null(len(values)).to_numpy(zero_copy_only=False)
-                for c in encoded.chunks
-            ),
-        ]
-    )
+    indices = [chunk.indices.fill_null(len(values)) for chunk in encoded.chunks]
+    codes = pa.chunked_array(indices, pa.int32()).to_numpy()
     if column.null_count:
         values = [*values, None]
     return Coded(_smallest(codes, len(values)), values)
@@ -318,38 +273,17 @@ def _smallest(codes: np.ndarray, count: int) -> np.ndarray:
 
 
 def _digests(column: pa.ChunkedArray) -> np.ndarray | None:
-    """uint8 [N, 32] of a column of SHA-256 in lower-case digits; None where it is not one."""
-    if column.null_count:
+    """[N] of a column of SHA-256 in lower-case digits; None where it is not one."""
+    if column.null_count or not pc.all(pc.match_substring_regex(column, "^[0-9a-f]{64}$")).as_py():
         return None
-    pieces: list[np.ndarray] = [np.zeros((0, _DIGEST_LENGTH // 2), np.uint8)]
-    value_of = np.full(256, 255, np.uint8)
-    value_of[_HEX_DIGITS] = np.arange(16)
-    for chunk in column.chunks:
-        lengths: Any = pc.binary_length(chunk)  # pyright: ignore[reportAttributeAccessIssue]
-        if (lengths.to_numpy(zero_copy_only=False) != _DIGEST_LENGTH).any():
-            return None
-        if not len(chunk):
-            continue
-        data = np.frombuffer(chunk.buffers()[2], np.uint8)
-        start = np.frombuffer(chunk.buffers()[1], np.int32)[chunk.offset]
-        digits = value_of[data[start : start + len(chunk) * _DIGEST_LENGTH]]
-        if (digits == 255).any():
-            return None
-        digits = digits.reshape(len(chunk), -1, 2)
-        pieces.append(digits[..., 0] << 4 | digits[..., 1])
-    return np.concatenate(pieces)
-
-
-def _is_float(kind: pa.DataType) -> bool:
-    return pa.types.is_floating(kind)
+    return np.frombuffer(bytes.fromhex("".join(column.to_pylist())), _DIGEST)
 
 
 # ---- The files that a manifest names, read from this machine or from an object store -------------
-# A manifest may come from anybody, so no path leaves the output folder, whether by `..` or
-# through a
-# link. Checking that takes longer than opening a file, so a folder's way is checked once, and a
-# file
+# A manifest may come from anybody, so no path leaves the output folder, by `..` or through a link.
+# Checking that takes longer than opening a file, so a folder's way is checked once, and a file
 # itself is opened such that it cannot be a link.
+
 
 Value = TypeVar("Value")
 SizedValue = TypeVar("SizedValue", bound=Sized)
@@ -422,10 +356,9 @@ class StoredFiles:
 
 
 class Companions(Generic[SizedValue]):
-    """Parsed files beside the images, the last used ones kept.
-
-    read: what makes something with entries of a file. At least one file is kept, and others as long
-    as they have no more than CACHED_ENTRIES together.
+    """Parsed files beside the images, the last used ones kept. read: what makes something with
+    entries of a file. At least one file is kept, and others as long as they have no more than
+    CACHED_ENTRIES together.
     """
 
     def __init__(self, files: StoredFiles, read: Callable[[Path], SizedValue]) -> None:
@@ -520,12 +453,10 @@ class RowReader:
             entry = self._calibration.get(*parts)[frame]
             ego = torch.tensor(entry["world_from_ego"], dtype=torch.float64)
             return read_camera(entry, camera), ego
-        except KeyError as error:
+        except (ArithmeticError, KeyError, RuntimeError, TypeError, ValueError) as error:
+            what = f"it lacks {error}" if isinstance(error, KeyError) else str(error)
             where = f"frame {frame}, camera {camera!r}"
-            raise damaged(self._files.name(*parts), f"it lacks {error} ({where})") from error
-        except (ArithmeticError, RuntimeError, TypeError, ValueError) as error:
-            where = f"frame {frame}, camera {camera!r}"
-            raise damaged(self._files.name(*parts), f"{error} ({where})") from error
+            raise damaged(self._files.name(*parts), f"{what} ({where})") from error
 
     def labels(self, rows: Rows, row: int, load: Collection[str]) -> Labels:
         """The boxes of the row's frame, what is measured of them in its image, and the sweep."""
@@ -607,7 +538,7 @@ def _read_one_sweep(path: Path) -> tuple[LidarSweep]:
     return (read_lidar(path),)
 
 
-# ---- files ---------------------------------------------------------------------------------------
+# ---- The dataset ---------------------------------------------------------------------------------
 
 _NAMES = ("scene", "variant", "frame", "recipe_hash", "surface")
 # What samples may lack beside others that have it: only such weather has these masks.
@@ -749,9 +680,8 @@ def _read_rows(
 
 
 def _check_all_have(rows: Rows, load: Collection[str], uris: list[str]) -> None:
-    """Raise ValueError where some variants have what is to be loaded, and others have none of it.
-
-    A single frame without labels or a sweep is no fault: a dataset may lack its file.
+    """Raise ValueError where some variants have what is to be loaded, and others have none of it. A
+    single frame without labels or a sweep is no fault: a dataset may lack its file.
     """
     groups, codes = rows.variants()
     lacking = {}

@@ -32,11 +32,9 @@ _LEGACY_PROTOCOL = 1001
 
 
 def load_checkpoint(path: Path) -> dict[str, Any]:
-    """The dictionary of a checkpoint, its tensors mapped, in the processor's memory.
-
-    Raises:
-        AdapterError: missing, damaged, holding code or objects other than tensors and plain values
-            (nothing of which is run), or no dictionary.
+    """The dictionary of a checkpoint, its tensors mapped, in the processor's memory. Raises
+    AdapterError: missing, damaged, holding code or objects other than tensors and plain values
+    (nothing of which is run), or no dictionary.
     """
     if not path.is_file():
         raise AdapterError(f"{path} does not exist; expected a checkpoint (.pth)")
@@ -56,11 +54,8 @@ def read_state_dict(
     path: Path, error: type[ClimateGSError], *, wrapped_in: Sequence[str] = ()
 ) -> dict[str, Tensor]:
     """Names and tensors of a network's weights, from a .safetensors file or one that torch saved.
-
-    wrapped_in: names under which training scripts keep the state dict of a checkpoint.
-
-    Raises:
-        error: there is no such file, it cannot be read, or it holds something else.
+    wrapped_in: names under which training scripts keep the state dict of a checkpoint. Raises
+    error: there is no such file, it cannot be read, or it holds something else.
     """
     if not path.is_file():
         raise error(f"{path}: there is no such file of weights")
@@ -89,10 +84,8 @@ def read_state_dict(
 
 def read_torch(path: Path) -> Any:
     """What `torch.save` wrote, in its format or that of before torch 1.6: tensors mapped from the
-    file, parameters as tensors, ordered dictionaries as dictionaries.
-
-    Raises:
-        PickleError: it holds something else than tensors and plain values, or is damaged.
+    file, parameters as tensors, ordered dictionaries as dictionaries. Raises PickleError: it holds
+    something else than tensors and plain values, or is damaged.
     """
     try:
         with open_file(path) as file:
@@ -257,10 +250,8 @@ _NAMES = _names()
 
 
 def section(content: Mapping[str, Any], name: str, where: str) -> Mapping[str, Any]:
-    """A dictionary inside a checkpoint.
-
-    Raises:
-        AdapterError: there is none of that name; lists what there is.
+    """A dictionary inside a checkpoint. Raises AdapterError: there is none of that name; lists what
+    there is.
     """
     found = content.get(name)
     if not isinstance(found, Mapping):
@@ -278,10 +269,8 @@ def tensor(
     dtype: torch.dtype | None = torch.float32,
 ) -> Tensor:
     """A tensor of a checkpoint, checked. shape: None stands for any length. dtype: None for any.
-
-    Raises:
-        AdapterError: missing, no tensor, of another shape or type, or without all its numbers: a
-            small file can announce a tensor of any size.
+    Raises AdapterError: missing, no tensor, of another shape or type, or without all its numbers: a
+    small file can announce a tensor of any size.
     """
     found = content.get(name)
     if not isinstance(found, Tensor):
@@ -308,9 +297,8 @@ def tensor(
 
 
 def taken(source: Tensor, out: Tensor | None = None) -> Tensor:
-    """A copy of a mapped tensor, whose pages are given back as it goes: memory is needed once.
-
-    out: where to copy to, of the source's shape (it may be a part of something larger).
+    """A copy of a mapped tensor, whose pages are given back as it goes: memory is needed once. out:
+    where to copy to, of the source's shape (it may be a part of something larger).
     """
     out = torch.empty(source.shape, dtype=source.dtype) if out is None else out
     if not source.is_contiguous() or source.dim() == 0:
@@ -324,7 +312,6 @@ def taken(source: Tensor, out: Tensor | None = None) -> Tensor:
 
 def release(source: Tensor) -> None:
     """Give back the pages of a mapped tensor that nobody has written to; reading brings them back.
-
     Call it only with tensors of `load_checkpoint`.
     """
     begin = source.data_ptr()

@@ -37,9 +37,8 @@ ExportKind = Literal["scene", "file", "ply", "ply-parts", "splat"]
 def export_losses(
     scene: Scene, kind: ExportKind, timestamp_ns: int | None = None, *, half: bool = False
 ) -> tuple[str, ...]:
-    """What is lost, or has to be known, of a scene in a file of that kind.
-
-    timestamp_ns: the moment at which ply and splat are baked.
+    """What is lost, or has to be known, of a scene in a file of that kind. timestamp_ns: the moment
+    at which ply and splat are baked.
     """
     if kind in ("scene", "file"):
         return tuple(_of_saved(scene, kind, half=half))
@@ -70,7 +69,9 @@ def _of_places(scene: Scene, kind: ExportKind, timestamp_ns: int | None) -> Iter
     elif scene.actors:
         assert timestamp_ns is not None
         there = sum(actor.track.pose_at(timestamp_ns) is not None for actor in scene.actors)
-        yield f"actors ({there}) stand still where they are {_moment(scene, timestamp_ns)}"
+        number = next((f.index for f in scene.frames if f.timestamp_ns == timestamp_ns), None)
+        moment = f"at {timestamp_ns} ns" if number is None else f"in frame {number}"
+        yield f"actors ({there}) stand still where they are {moment}"
         if there < len(scene.actors):
             yield f"actors ({len(scene.actors) - there}) that are not there then are left out"
         if off_ns := _greatest_delay_ns(scene, timestamp_ns):
@@ -132,11 +133,6 @@ def _of_facts(scene: Scene) -> Iterator[str]:
         yield "how the scene was made (made_by) is left out"
 
 
-def _moment(scene: Scene, timestamp_ns: int) -> str:
-    number = next((f.index for f in scene.frames if f.timestamp_ns == timestamp_ns), None)
-    return f"at {timestamp_ns} ns" if number is None else f"in frame {number}"
-
-
 def _greatest_delay_ns(scene: Scene, timestamp_ns: int) -> int:
     """How far from a frame's own time its cameras took their images; 0 of another time."""
     delays = [
@@ -160,7 +156,6 @@ def moved_gaussians(
     scale: float = 1.0,
 ) -> Gaussians:
     """The Gaussians at scale * rotation @ mean + shift: quaternions and SH are turned with them.
-
     rotation, shift: float64; places are computed in float64 and rounded once.
     """
     means = scale * (gaussians.means.double() @ rotation.T) + shift
@@ -178,9 +173,8 @@ def moved_gaussians(
 
 def baked(scene: Scene, timestamp_ns: int) -> Gaussians:
     """Background and the actors that are there at a moment as Gaussians of the scene's world, in
-    the colours they have then; in the order of `Scene.parts_at`.
-
-    Colours of a lower degree are filled up with zero bands, unknown classes with UNKNOWN.
+    the colours they have then; in the order of `Scene.parts_at`. Colours of a lower degree are
+    filled up with zero bands, unknown classes with UNKNOWN.
     """
     placed = []
     for part in scene.parts_at(timestamp_ns):
@@ -219,7 +213,7 @@ def _turned_sh(sh: Float[Tensor, "N K 3"], rotation: Float[Tensor, "3 3"]) -> Te
     return turned
 
 
-# ---- gaussian export -----------------------------------------------------------------------------
+# ---- Files ---------------------------------------------------------------------------------------
 
 BACKGROUND, CAMERAS, PARTS, ACTORS = "background.ply", "cameras.json", "parts.json", "actors"
 _FORMAT = "climategs-parts"
@@ -227,9 +221,8 @@ _MARK = re.compile(rb'\s*\{\s*"format"\s*:\s*"' + _FORMAT.encode() + rb'"')
 
 
 def export_ply(scene: Scene, path: str | Path, timestamp_ns: int) -> None:
-    """Write the scene as it is at a moment into an INRIA .ply.
-
-    Its comments say `up: +z` where gravity is known, `unit: metre` where the scale is.
+    """Write the scene as it is at a moment into an INRIA .ply. Its comments say `up: +z` where
+    gravity is known, `unit: metre` where the scale is.
     """
     write_ply(path, _something(scene, timestamp_ns), notes=_notes(scene))
 
@@ -241,9 +234,8 @@ def export_splat(scene: Scene, path: str | Path, timestamp_ns: int) -> None:
 
 
 def export_cameras(scene: Scene, folder: str | Path) -> bool:
-    """Write `cameras.json` beside splat files; a file that is there already stays as it is.
-
-    Returns whether the folder's cameras.json is now this scene's; without frames there is none.
+    """Write `cameras.json` beside splat files; a file that is there already stays as it is. Returns
+    whether the folder's cameras.json is now this scene's; without frames there is none.
     """
     path, text = Path(folder) / CAMERAS, inria_cameras(scene)
     if text is None:
@@ -259,7 +251,6 @@ def export_cameras(scene: Scene, folder: str | Path) -> bool:
 
 def inria_cameras(scene: Scene) -> bytes | None:
     """All images' cameras in the form of INRIA's cameras.json, named CAMERA/FRAME; None without.
-
     Principal points, which the form does not know, stand beside it as cx and cy.
     """
     views = [
@@ -277,9 +268,8 @@ def inria_cameras(scene: Scene) -> bytes | None:
 def export_ply_parts(scene: Scene, folder: str | Path) -> None:
     """Write background.ply, actors/NAME.ply in each actor's own frame, cameras.json, and parts.json
     with tracks, labels and sizes; as a whole or not at all. Colours that change over time are
-    written as their constant part. Parts without Gaussians have no file.
-
-    An earlier export in the folder is replaced.
+    written as their constant part. Parts without Gaussians have no file. An earlier export in the
+    folder is replaced.
     """
     folder = Path(folder).resolve()
     with refusals_of(folder):
@@ -366,12 +356,7 @@ def _view(camera: Camera, frame: int) -> dict[str, Any]:
     pose = camera.world_from_camera
     return {
         "img_name": f"{folder_name(camera.name)}/{frame:06d}",
-        "width": camera.width,
-        "height": camera.height,
-        "position": pose[:3, 3].tolist(),
-        "rotation": pose[:3, :3].tolist(),
-        "fx": camera.fx,
-        "fy": camera.fy,
-        "cx": camera.cx,
-        "cy": camera.cy,
+        **{"width": camera.width, "height": camera.height},
+        **{"position": pose[:3, 3].tolist(), "rotation": pose[:3, :3].tolist()},
+        **{name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy")},
     }

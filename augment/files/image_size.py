@@ -30,10 +30,8 @@ class ImageHeader:
 
 
 def read_image_header(path: str | Path) -> ImageHeader | None:
-    """Of a file by its first bytes; None as for `image_header`.
-
-    Raises:
-        OSError: the file cannot be read.
+    """Of a file by its first bytes; None as for `image_header`. Raises OSError: the file cannot be
+    read.
     """
     with open_file(path) as file:
         data = file.read(_FIRST_BYTES)
@@ -44,7 +42,7 @@ def image_header(data: bytes) -> ImageHeader | None:
     """Of a file's content; None where it is not one of FORMATS, or ends within its header."""
     for head, name, size in (
         (b"\xff\xd8", "JPEG", _jpeg),
-        (b"\x89PNG\r\n\x1a\n", "PNG", _png),
+        (b"\x89PNG\r\n\x1a\n", "PNG", lambda data: struct.unpack_from(">II", data, 16)),
         (b"RIFF", "WebP", _webp),
         (b"II*\0", "TIFF", _tiff),
         (b"MM\0*", "TIFF", _tiff),
@@ -58,10 +56,6 @@ def image_header(data: bytes) -> ImageHeader | None:
             is_grey = name == "PNG" and data[25:26] in _PNG_GREY
             return None if found is None or min(found) < 1 else ImageHeader(name, *found, is_grey)
     return None
-
-
-def _png(data: bytes) -> tuple[int, int]:
-    return struct.unpack_from(">II", data, 16)
 
 
 def _bmp(data: bytes) -> tuple[int, int]:
@@ -94,10 +88,8 @@ def _webp(data: bytes) -> tuple[int, int] | None:
         (bits,) = struct.unpack_from("<I", data, 21)
         return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
     if kind == b"VP8X":
-        return (
-            int.from_bytes(data[24:27], "little") + 1,
-            int.from_bytes(data[27:30], "little") + 1,
-        )
+        width, height = (int.from_bytes(data[at : at + 3], "little") for at in (24, 27))
+        return width + 1, height + 1
     return None
 
 
@@ -109,7 +101,6 @@ def _tiff(data: bytes) -> tuple[int, int] | None:
     for entry in range(at + 2, at + 2 + 12 * count, 12):
         tag, kind = struct.unpack_from(f"{order}HH", data, entry)
         if tag in (256, 257) and kind in (3, 4):  # ImageWidth, ImageLength as SHORT or LONG
-            size[tag] = struct.unpack_from(f"{order}{'H' if kind == 3 else 'I'}", data, entry + 8)[
-                0
-            ]
+            code = f"{order}{'H' if kind == 3 else 'I'}"
+            (size[tag],) = struct.unpack_from(code, data, entry + 8)
     return (size[256], size[257]) if len(size) == 2 else None

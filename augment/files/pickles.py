@@ -303,7 +303,6 @@ class DtypeRecord(Record):
 @dataclass(eq=False)
 class ArrayRecord(Record):
     """An array that a pickle makes. values: None until it is filled, and once it was taken.
-
     wrapped: instead of values, what is neither text nor number: `np.save` makes an array of one
     object of whatever is no array.
     """

@@ -6,10 +6,11 @@ before anything is allocated, so a damaged or hostile file costs a message and n
 
 from __future__ import annotations
 
+import itertools
 import logging
 import os
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
 from typing import BinaryIO
@@ -17,14 +18,13 @@ from typing import BinaryIO
 import numpy as np
 import torch
 from jaxtyping import Float
-from torch import Tensor
 
 from augment.errors import SceneError
 from augment.jobs.atomic import replaced_file
 from augment.render.sh import SH_C0
 from augment.scene import SH_COUNTS, Gaussians, check_gaussians
 
-# ---- ply io --------------------------------------------------------------------------------------
+# ---- The container -------------------------------------------------------------------------------
 
 ROWS_PER_CHUNK = 16384  # about 4 MB of degree-3 rows: columns are picked out while in the cache
 _MAX_HEADER_BYTES = 1 << 20
@@ -41,7 +41,6 @@ _TYPES = {
 @dataclass(frozen=True)
 class PlyElement:
     """One table of the file. columns: names and numpy type codes without byte order, in order.
-
     list_columns: names of properties whose length varies by row; such an element has no row size.
     """
 
@@ -97,7 +96,10 @@ def read_ply_header(path: str | Path) -> PlyHeader:
         elif words[0] == "format" and len(words) == 3 and words[1] in _BYTE_ORDERS:
             byte_order = _BYTE_ORDERS[words[1]]
         elif words[0] == "element":
-            elements.append(_parse_element(words, path, number))
+            digits = words[2] if len(words) == 3 else ""
+            if not (digits.isascii() and digits.isdigit() and len(digits) <= _MAX_COUNT_DIGITS):
+                raise _bad_line(path, number, " ".join(words))
+            elements.append(PlyElement(words[1], int(digits), ()))
         elif words[0] == "property" and elements:
             elements[-1] = _add_property(elements[-1], words, path, number)
         else:
@@ -119,9 +121,8 @@ def count_surplus_bytes(header: PlyHeader) -> int:
 
 
 def iterate_rows(header: PlyHeader, name: str) -> Iterator[np.ndarray]:
-    """Structured arrays of at most ROWS_PER_CHUNK rows of one element, in order.
-
-    Ascii values arrive as float64, binary ones in the file's own types.
+    """Structured arrays of at most ROWS_PER_CHUNK rows of one element, in order. Ascii values
+    arrive as float64, binary ones in the file's own types.
     """
     position = [e.name for e in header.elements].index(header.element(name).name)
     before, element = header.elements[:position], header.elements[position]
@@ -164,13 +165,6 @@ def _bad_line(path: Path, number: int, line: str) -> SceneError:
     )
 
 
-def _parse_element(words: list[str], path: Path, number: int) -> PlyElement:
-    digits = words[2] if len(words) == 3 else ""
-    if not (digits.isascii() and digits.isdigit() and len(digits) <= _MAX_COUNT_DIGITS):
-        raise _bad_line(path, number, " ".join(words))
-    return PlyElement(words[1], int(digits), ())
-
-
 def _add_property(element: PlyElement, words: list[str], path: Path, number: int) -> PlyElement:
     line = " ".join(words)
     name = words[-1]
@@ -180,11 +174,9 @@ def _add_property(element: PlyElement, words: list[str], path: Path, number: int
             f"{element.name!r}"
         )
     if len(words) == 3 and words[1] in _TYPES:
-        columns = (*element.columns, (name, _TYPES[words[1]]))
-        return PlyElement(element.name, element.count, columns, element.list_columns)
+        return replace(element, columns=(*element.columns, (name, _TYPES[words[1]])))
     if len(words) == 5 and words[1] == "list" and words[2] in _TYPES and words[3] in _TYPES:
-        lists = (*element.list_columns, name)
-        return PlyElement(element.name, element.count, element.columns, lists)
+        return replace(element, list_columns=(*element.list_columns, name))
     raise _bad_line(path, number, line)
 
 
@@ -254,9 +246,8 @@ def _parse_numbers(
 
 # ---- Columns of the INRIA splat .ply: which there must be, and how they map to Gaussians ---------
 # Scales are logs, opacities logits, quaternions of any length; f_rest is channel-major (all of
-# red's
-# coefficients, then green's, then blue's). Values here are as in the file: no activation is applied
-# on reading, and `rows_of_gaussians` inverts them for writing.
+# red's coefficients, then green's, then blue's). Values here are as in the file: `_activate` and
+# `rows_of_gaussians` change them on reading and writing.
 
 SEMANTIC = "semantic_class"
 _F_REST_COUNTS = tuple(3 * (k - 1) for k in SH_COUNTS)
@@ -275,21 +266,20 @@ def has_wide_means(header: PlyHeader, table: PlyElement) -> bool:
 
 
 def read_columns(header: PlyHeader, table: PlyElement) -> dict[str, np.ndarray]:
-    """The columns of Gaussians as they stand in the file, gathered into contiguous arrays.
-
-    means [N, 3] (float64 where the file is wider than float32), quats [N, 4], scales [N, 3] (log),
+    """The columns of Gaussians as they stand in the file, gathered into contiguous arrays. means
+    [N, 3] (float64 where the file is wider than float32), quats [N, 4], scales [N, 3] (log),
     opacities [N] (logit), sh [N, K, 3], and semantic_class [N] where the file has it.
     """
     sh_count = _check_columns(header, table)
     mean_type = np.float64 if has_wide_means(header, table) else np.float32
-    target: dict[str, np.ndarray] = {}
+    pieces = iterate_rows(header, table.name)
+    first = next(pieces, None)  # only now is the file known to be as long as its header says
+    target = _allocate(table, sh_count, mean_type)
     done = 0
-    for rows in iterate_rows(header, table.name):
-        if not target:  # only now is the file known to be as long as its header says
-            target = _allocate(table, sh_count, mean_type)
+    for rows in () if first is None else itertools.chain([first], pieces):
         _scatter_columns(rows, target, slice(done, done + len(rows)))
         done += len(rows)
-    return target or _allocate(table, sh_count, mean_type)
+    return target
 
 
 def column_types(gaussians: Gaussians) -> list[tuple[str, str]]:
@@ -307,11 +297,7 @@ def rows_of_gaussians(part: Gaussians, dtype: np.dtype) -> np.ndarray:
     logits = (opacities.log() - torch.log1p(-opacities)).clamp(_LOGIT_MIN, _LOGIT_MAX)
     log_scales = part.scales.double().log()
     rest = part.sh[:, 1:].transpose(1, 2).reshape(len(part), -1)  # channel-major
-    columns: dict[str, Tensor] = {
-        "x": part.means[:, 0],
-        "y": part.means[:, 1],
-        "z": part.means[:, 2],
-    }
+    columns = {axis: part.means[:, i] for i, axis in enumerate("xyz")}
     columns["opacity"] = logits
     columns |= {f"scale_{i}": log_scales[:, i] for i in range(3)}
     columns |= {f"rot_{i}": part.quats[:, i] for i in range(4)}
@@ -356,17 +342,11 @@ def _guess_content(header: PlyHeader, names: set[str]) -> str:
 
 
 def _allocate(table: PlyElement, sh_count: int, mean_type: type) -> dict[str, np.ndarray]:
-    count = table.count
-    target = {
-        "means": np.empty((count, 3), mean_type),
-        "quats": np.empty((count, 4), np.float32),
-        "scales": np.empty((count, 3), np.float32),
-        "opacities": np.empty(count, np.float32),
-        "sh": np.empty((count, sh_count, 3), np.float32),
-    }
+    shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh": (sh_count, 3)}
+    types = {"means": mean_type}
     if SEMANTIC in table.names:
-        target[SEMANTIC] = np.empty(count, np.int16)
-    return target
+        shapes[SEMANTIC], types[SEMANTIC] = (), np.int16
+    return {n: np.empty((table.count, *s), types.get(n, np.float32)) for n, s in shapes.items()}
 
 
 def _scatter_columns(rows: np.ndarray, target: dict[str, np.ndarray], where: slice) -> None:
@@ -394,8 +374,6 @@ def _scatter_columns(rows: np.ndarray, target: dict[str, np.ndarray], where: sli
 
 
 # ---- Gaussians in plain files: INRIA .ply (SH degree 0 to 3) and .splat (32-byte records) --------
-# Activations are applied on reading and inverted on writing: files hold log scales, opacity logits
-# and quaternions of any length, `Gaussians` holds metres, [0, 1] and unit quaternions.
 
 RECENTRE_BEYOND_M = 1000.0  # float32 keeps 0.06 mm at 1 km; 0.25 m at UTM's 4000 km
 _SPLAT_RECORD = np.dtype(
@@ -408,11 +386,9 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class SplatFile:
-    """What a splat file held.
-
-    gaussians: in the file's axes and unit. origin: float64 [3], what was subtracted from its
-    coordinates (not zero only for double-precision .ply far from the origin). notes: the `key:
-    value` comments of a .ply. problems: what was left out, a sentence each.
+    """What a splat file held. gaussians: in the file's axes and unit. origin: float64 [3], what was
+    subtracted from its coordinates (not zero only for double-precision .ply far from the origin).
+    notes: the `key: value` comments of a .ply. problems: what was left out, a sentence each.
     """
 
     gaussians: Gaussians
@@ -422,10 +398,8 @@ class SplatFile:
 
 
 def read_splats(path: str | Path) -> SplatFile:
-    """Read a .ply or .splat file, told apart by its first bytes.
-
-    Raises:
-        SceneError: no such file, an unknown format, or damaged content; says what was expected.
+    """Read a .ply or .splat file, told apart by its first bytes. Raises SceneError: no such file,
+    an unknown format, or damaged content; says what was expected.
     """
     path = Path(path)
     if not path.is_file():
@@ -443,13 +417,10 @@ def read_splats(path: str | Path) -> SplatFile:
 
 
 def read_ply(path: str | Path, element: str = "vertex") -> SplatFile:
-    """Read Gaussians from one element of a .ply, binary of either byte order or ascii.
-
-    Properties may stand in any order; unknown ones are ignored. `red green blue` (uint8) serve as
-    colour where f_dc is missing. Reads in pieces: peak memory is the Gaussians plus a few MB.
-
-    Raises:
-        SceneError: not a splat .ply (lists what is missing), truncated, empty, wrong f_rest count.
+    """Read Gaussians from one element of a .ply, binary of either byte order or ascii. Properties
+    may stand in any order; unknown ones are ignored. `red green blue` (uint8) serve as colour where
+    f_dc is missing. Reads in pieces: peak memory is the Gaussians plus a few MB. Raises SceneError:
+    not a splat .ply (lists what is missing), truncated, empty, wrong f_rest count.
     """
     header = read_ply_header(path)
     table = header.element(element)
@@ -502,10 +473,9 @@ def read_splat(path: str | Path) -> SplatFile:
 def write_ply(
     path: str | Path, gaussians: Gaussians, *, notes: Mapping[str, str] | None = None
 ) -> None:
-    """Write an INRIA .ply (binary little endian), atomically.
-
-    notes: written as `comment key: value` lines and given back by `read_ply`. A `semantic_class`
-    column is added where the Gaussians have classes; other readers ignore it.
+    """Write an INRIA .ply (binary little endian), atomically. notes: written as `comment key:
+    value` lines and given back by `read_ply`. A `semantic_class` column is added where the
+    Gaussians have classes; other readers ignore it.
     """
     columns = column_types(gaussians)
     lines = ["ply", "format binary_little_endian 1.0"]
@@ -524,9 +494,8 @@ def write_ply(
 
 
 def write_splat(path: str | Path, gaussians: Gaussians) -> None:
-    """Write a .splat file, atomically. The format keeps 8 bits of colour, opacity and rotation.
-
-    SH bands above degree 0 cannot be kept; that they are dropped is logged as a warning.
+    """Write a .splat file, atomically. The format keeps 8 bits of colour, opacity and rotation. SH
+    bands above degree 0 cannot be kept; that they are dropped is logged as a warning.
     """
     if gaussians.sh_degree > 0:
         _log.warning("%s: .splat holds no view dependence; SH bands above 0 are dropped", path)

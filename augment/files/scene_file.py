@@ -56,8 +56,7 @@ from augment.scene import Actor, ColorWaves, Scene, Track
 from augment.sky import Sky
 from recipes.files import open_file
 
-# ------------------------------------------------------------------------------------------------
-# scene.json: everything of a saved scene but its arrays, in numbers that read back to the bit
+# ---- scene.json: everything of a saved scene but its arrays, in numbers that read back to the bit
 
 _LISTS = ("actors", "frames", "problems", "image_color_maps")  # with a line an item
 _ROTATION_TOLERANCE = 1e-3  # cameras are held to 1e-4 by their own class
@@ -326,7 +325,7 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
         raise SceneError(f"{path} is damaged or no safetensors file: {error}") from error
 
 
-# ---- scene files ---------------------------------------------------------------------------------
+# ---- Folders and single files --------------------------------------------------------------------
 
 DOCUMENT, GAUSSIANS, SKY = "scene.json", "gaussians.safetensors", "sky.safetensors"
 FILES = (DOCUMENT, GAUSSIANS, SKY)
@@ -418,12 +417,9 @@ def load_scene_parts(path: str | Path) -> Scene:
 
 def read_saved_scene(path: str | Path) -> SavedScene:
     """Open a scene folder or a scene file. Its arrays are mapped: writes to them stay in memory.
-
-    Gaussians that no rasteriser can draw are left out with a sentence in `problems`.
-
-    Raises:
-        SceneError: a file is missing, damaged, of another version or format, or they do not belong
-            together.
+    Gaussians that no rasteriser can draw are left out with a sentence in `problems`. Raises
+    SceneError: a file is missing, damaged, of another version or format, or they do not belong
+    together.
     """
     path = Path(path)
     opened = _open_file(path) if path.is_file() else _open_folder(path)

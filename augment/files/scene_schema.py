@@ -29,8 +29,8 @@ from augment.scene import (
 from augment.sky import ConstantSky, CubemapSky, LatLongSky, Sky
 from recipes.files import open_file
 
-# ------------------------------------------------------------------------------------------------
-# The arrays of a saved scene: their names, their shapes, and that every number can be drawn
+# ---- The arrays of a saved scene: their names, their shapes, and that every number can be drawn --
+#
 #     background.means [n, 3], quats [n, 4], scales [n, 3], opacities [n], sh [n, K, 3]: float32
 #     background.semantic [n]: int16, where classes are known
 #     actors.0.means ...: the same of each actor; actors.0.waves [n, F - 1, 3] of its colour waves
@@ -98,7 +98,9 @@ def take_parts(
     for number, count in enumerate(counts):
         name = _part_name(number)
         part = _take_part(tensors, name, count, document.precision, has_waves[number], where)
-        if not _is_drawable(part):
+        waves = part.waves  # one look at each number tells whether every bit can stay as it is
+        has_finite_waves = waves is None or bool(np.isfinite(_range(waves)).all())
+        if not (has_finite_waves and is_drawable(part.gaussians)):
             part, found = _drawable(part, f"{where}, {name}")
             problems += found
         parts.append(part)
@@ -117,14 +119,13 @@ def take_sky(tensors: dict[str, Tensor], kind: str, precision: Precision, where:
         raise SceneError(f"{where}: a {kind} sky is one array {name!r}; got {sorted(tensors)[:5]}")
     values = tensors[name]
     shape = tuple(values.shape)
-    fits = {
-        "rgb": shape == (3,),
-        "image": len(shape) == 3 and shape[2] == 3,
-        "faces": len(shape) == 4 and shape[0] == 6 and shape[1] == shape[2] and shape[3] == 3,
+    fits, expected = {
+        "rgb": (shape == (3,), "[3]"),
+        "image": (len(shape) == 3 and shape[2] == 3, "[H, W, 3]"),
+        "faces": (len(shape) == 4 and shape == (6, shape[1], shape[1], 3), "[6, R, R, 3]"),
     }[name]
     is_type = values.dtype == (torch.float16 if precision == "float16" else torch.float32)
     if not fits or not is_type or values.numel() == 0:
-        expected = {"rgb": "[3]", "image": "[H, W, 3]", "faces": "[6, R, R, 3]"}[name]
         raise SceneError(
             f"{where}: {name} must be {precision} {expected}; got {values.dtype} {list(shape)}"
         )
@@ -214,13 +215,6 @@ def _check_semantic(semantic: Tensor, count: int, where: str) -> None:
         )
 
 
-def _is_drawable(part: SavedPart) -> bool:
-    """Whether `_drawable` would leave every bit as it is, told in one look at each number."""
-    waves = part.waves
-    has_finite_waves = waves is None or bool(np.isfinite(_range(waves)).all())
-    return is_drawable(part.gaussians) and has_finite_waves
-
-
 def _drawable(part: SavedPart, where: str) -> tuple[SavedPart, tuple[str, ...]]:
     """As check_gaussians; colour waves follow their Gaussians."""
     gaussians, waves = part.gaussians, part.waves
@@ -244,7 +238,7 @@ def _range(values: Tensor) -> tuple[float, float]:
         return float(array.min()), float(array.max())
 
 
-# ---- scene schema --------------------------------------------------------------------------------
+# ---- scene.json ----------------------------------------------------------------------------------
 
 FORMAT = "climategs-scene"
 VERSION = 2  # of what is written

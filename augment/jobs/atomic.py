@@ -58,13 +58,10 @@ def replaced_file(
     path: Path, *, clear: bool = True, flush: bool = True, ending: str = ""
 ) -> Iterator[BinaryIO]:
     """A file that takes its name only once it is whole and on the disk; makes missing folders.
-
     clear: delete what killed writers of this file left. A job that writes many files into one
     folder does that once, at its start. flush: make the name durable too. ending: of the temporary
-    name, for libraries that write to a name and go by it.
-
-    Raises:
-        OutputError: the system refused (disk full, no permission ...); `path` is then as it was.
+    name, for libraries that write to a name and go by it. Raises OutputError: the system refused
+    (disk full, no permission ...); `path` is then as it was.
     """
     with refusals_of(path):
         make_folder(path.parent)
@@ -142,7 +139,6 @@ def flush_folder(folder: Path) -> None:
 
 def remove_temporaries(folder: Path, *, name: str = "", recursive: bool = True) -> None:
     """Delete what killed processes left under temporary names; what a living one writes stays.
-
     name: of the file that they were to become; of any if empty.
     """
     for place, _, names in os.walk(folder):  # passes over folders that vanish meanwhile
@@ -222,12 +218,9 @@ _CANNOT_EXCHANGE = (errno.ENOSYS, errno.EINVAL, errno.EOPNOTSUPP, errno.ENOTTY, 
 @contextmanager
 def replaced_folder(target: Path, own: Collection[str]) -> Iterator[Path]:
     """A new, empty folder that takes the place of `target` when the block ends without an error.
-
     own: names of the files and folders that make up such a folder. Those of the old folder are
-    deleted; anything else in the old folder is kept.
-
-    Raises:
-        OutputError: the system refused (disk full, no permission ...); `target` is then as it was.
+    deleted; anything else in the old folder is kept. Raises OutputError: the system refused (disk
+    full, no permission ...); `target` is then as it was.
     """
     target = target.resolve()  # a link to a folder stays a link
     with refusals_of(target):

@@ -11,12 +11,9 @@ from augment.scene import Scene
 
 def choose_backend(backend: str, scene: Scene, *, gpu: bool = True) -> str:
     """The backend that will render the scene: `auto` resolved, any other name checked. `auto` takes
-    the GPU where there is one, unless `gpu` says that it must not.
-
-    Resolved once for the whole job, so that a resumed job cannot mix backends in one folder.
-
-    Raises:
-        ValueError: no such backend. BackendUnavailable: it cannot run on this machine.
+    the GPU where there is one, unless `gpu` says that it must not. Resolved once for the whole job,
+    so that a resumed job cannot mix backends in one folder. Raises ValueError: no such backend.
+    BackendUnavailable: it cannot run on this machine.
     """
     from augment.render.cuda.runtime import has_gpu
 

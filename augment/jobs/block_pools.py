@@ -54,10 +54,9 @@ Tick = Callable[[int, Outcome], None]  # the slot, and an image that its worker 
 
 @runtime_checkable
 class WorkerPool(Protocol):
-    """Workers are numbered 0 to slots - 1; every one has at most one task.
-
-    A pool tells of finished images through the `tick` that it was made with, called in the thread
-    that waits, or, where the work is done in this process, in several threads.
+    """Workers are numbered 0 to slots - 1; every one has at most one task. A pool tells of finished
+    images through the `tick` that it was made with, called in the thread that waits, or, where the
+    work is done in this process, in several threads.
     """
 
     @property
@@ -104,10 +103,8 @@ _READY = "ready"
 
 
 class ProcessPool:
-    """`slots` worker processes that share the cores.
-
-    Raises:
-        ClimateGSError: from wait: a process ended while starting, and none has ever started.
+    """`slots` worker processes that share the cores. Raises ClimateGSError: from wait: a process
+    ended while starting, and none has ever started.
     """
 
     def __init__(self, setup: WorkSetup, tick: Tick, slots: int) -> None:
@@ -503,9 +500,8 @@ class _ActorHandle:
 
 
 class _Actor:
-    """The worker's own side, in a process somewhere on the cluster.
-
-    Tasks are done in a thread of its own, which can be interrupted: Ray's main thread cannot.
+    """The worker's own side, in a process somewhere on the cluster. Tasks are done in a thread of
+    its own, which can be interrupted: Ray's main thread cannot.
     """
 
     def __init__(self, setup: WorkSetup, threads: int) -> None:

@@ -99,9 +99,8 @@ class Publisher:
 
 
 def staging_folder(store: Store, scratch: Path | None, block: Block) -> Path:
-    """Where a block is rendered: on the output's own disk, else in `scratch`.
-
-    There a killed job finds again what it had finished of the block.
+    """Where a block is rendered: on the output's own disk, else in `scratch`. There a killed job
+    finds again what it had finished of the block.
     """
     if store.local_dir is not None:
         return store.local_dir / STATE_FOLDER / "blocks" / block.claim
@@ -205,10 +204,9 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class WorkSetup:
-    """What all workers of a job share; picklable.
-
-    store_uri: the output. scratch: where blocks are rendered on their way to an output that is not
-    on this machine. open_scene, renderer: importable functions; None renders with the library's.
+    """What all workers of a job share; picklable. store_uri: the output. scratch: where blocks are
+    rendered on their way to an output that is not on this machine. open_scene, renderer: importable
+    functions; None renders with the library's.
     """
 
     store_uri: str
@@ -240,7 +238,6 @@ class BlockTask:
 @dataclass(frozen=True)
 class ResolveTask:
     """Let the qualities of recipes choose their settings in a scene, or find what they have chosen.
-
     name: as of an IndexTask. keep: whether a new choice is kept in the output.
     """
 
@@ -256,7 +253,6 @@ Task = IndexTask | ResolveTask | BlockTask
 @dataclass(frozen=True)
 class BlockDone:
     """What became of a block. skipped: images that were finished before, here or elsewhere.
-
     is_elsewhere: another process is at it; nothing was done. seconds: by kind of work, as of
     `worker.WorkTimes`.
     """
@@ -279,7 +275,6 @@ class SettledRecipes:
 @dataclass(frozen=True)
 class TaskFailed:
     """The task could not be done. is_output: nothing can be written, so that all others would fail.
-
     of_scene: the scene could not be opened, so that its other blocks would fail too. of_memory: it
     may succeed while no other worker takes any.
     """
@@ -305,10 +300,8 @@ class BlockWorker:
         self._entered: set[tuple[str, str]] = set()
 
     def do(self, task: Task) -> Result:
-        """The task's result; errors that concern the task alone are results too.
-
-        Raises:
-            GpuLost: this process can do no other task either.
+        """The task's result; errors that concern the task alone are results too. Raises GpuLost:
+        this process can do no other task either.
         """
         try:
             if isinstance(task, IndexTask):

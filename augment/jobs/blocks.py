@@ -11,7 +11,9 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import Field, TypeAdapter
 
 import augment
 from augment.cameras import scaled_size
@@ -42,7 +44,6 @@ class FrameRecord:
 @dataclass(frozen=True)
 class SceneRecord:
     """A scene's frames and cameras. uri: as the job names it. source: as the scene does itself.
-
     has_labels: whether boxes can pass through. has_lidar: whether a frame has a sweep. open_s: how
     long opening it took. gaussians_bytes: of its splats.
     """
@@ -105,12 +106,11 @@ class SceneRecord:
 
 @dataclass(frozen=True)
 class Block:
-    """Images that one worker renders in a row and that appear in the output at once.
-
-    key: `<scene>/<variant>-<first frame>-<digest>`; the digest is of all that decides the block's
-    images, so it stays the same whatever else is in the job. uri: what opens the scene. source:
-    the scene's own word for that. scene: its name in the output. frames, cameras: in order.
-    images: how many it has.
+    """Images that one worker renders in a row and that appear in the output at once. key:
+    `<scene>/<variant>-<first frame>-<digest>`; the digest is of all that decides the block's
+    images, so it stays the same whatever else is in the job. uri: what opens the scene. source: the
+    scene's own word for that. scene: its name in the output. frames, cameras: in order. images: how
+    many it has.
     """
 
     key: str
@@ -166,11 +166,10 @@ def cut_into_blocks(
     block_images: int = 64,
     backend: str = "auto",
 ) -> list[Block]:
-    """The scene's blocks, variant by variant, in the order of the frames.
-
-    frames: as `recipes.schema` reads them; ranges end with the scene. block_images: about how many
-    images one has. Blocks begin at fixed frames of the scene, whatever the selection, so that most
-    stay the same when it grows.
+    """The scene's blocks, variant by variant, in the order of the frames. frames: as
+    `recipes.schema` reads them; ranges end with the scene. block_images: about how many images one
+    has. Blocks begin at fixed frames of the scene, whatever the selection, so that most stay the
+    same when it grows.
     """
     known = {name for frame in record.frames for name in frame.cameras}
     if cameras is not None and (unknown := sorted(set(cameras) - known)):
@@ -263,11 +262,9 @@ def make_plan(
 ) -> Plan:
     """The plan of a job. scenes: without patterns. found: the scene of every URI and name, or why
     it cannot be opened. settled: by scene and variant, those recipes whose quality had to choose
-    its settings in the scene, or why it could not: no recipe of that scene is rendered then.
-
-    Raises:
-        ClimateGSError: two scenes would share a folder, or none of them can be used.
-        RecipeError: a draw breaks a rule.
+    its settings in the scene, or why it could not: no recipe of that scene is rendered then. Raises
+    ClimateGSError: two scenes would share a folder, or none of them can be used. RecipeError: a
+    draw breaks a rule.
     """
     blocks: list[Block] = []
     records: dict[str, SceneRecord] = {}
@@ -300,7 +297,8 @@ def make_plan(
     if not records:
         reasons = "".join(f"\n  {uri}: {why}" for uri, why in list(unusable.items())[:5])
         raise ClimateGSError(f"job {recipes.job.name}: none of its scenes can be used:{reasons}")
-    names = {record.name: entry.name for entry, record in _pairs(scenes, found)}
+    pairs = [(entry, found[entry.uri, entry.name]) for entry in scenes]
+    names = {record.name: e.name for e, record in pairs if isinstance(record, SceneRecord)}
     return Plan(recipes.job.name, backend, tuple(blocks), records, names, unusable)
 
 
@@ -325,7 +323,7 @@ class PlannedBlock:
     scene: str
     variant: str
     recipe: str
-    images: int
+    images: Annotated[int, Field(ge=1)]
 
     @property
     def claim(self) -> str:
@@ -340,7 +338,11 @@ class StoredPlan:
     job: str
     version: str
     blocks: tuple[PlannedBlock, ...]
-    unusable: Mapping[str, str]
+    unusable: dict[str, str]
+
+
+_STORED_PLAN = TypeAdapter(StoredPlan)
+_BLOCK_FIELDS = tuple(PlannedBlock.__dataclass_fields__)
 
 
 def store_plan(store: Store, plan: Plan) -> None:
@@ -355,13 +357,6 @@ def stored_plans(store: Store) -> list[StoredPlan]:
     """The plans of all jobs in the output, by name."""
     paths = [path for path in store.list(JOBS) if path.endswith(".json")]
     return [_from_json(store.read(path), f"{store.uri}/{path}") for path in sorted(paths)]
-
-
-def _pairs(
-    scenes: Sequence[JobScene], found: Mapping[tuple[str, str | None], SceneRecord | str]
-) -> list[tuple[JobScene, SceneRecord]]:
-    pairs = [(entry, found[entry.uri, entry.name]) for entry in scenes]
-    return [(entry, record) for entry, record in pairs if isinstance(record, SceneRecord)]
 
 
 def _check_folder(records: Mapping[str, SceneRecord], record: SceneRecord) -> None:
@@ -393,22 +388,10 @@ def _from_json(data: bytes, where: str) -> StoredPlan:
         facts = json.loads(data)
         if facts["format"] != _FORMAT:
             raise ValueError("it is of another version")
-        blocks = tuple(PlannedBlock(*block) for block in facts["blocks"])
-        plan = StoredPlan(facts["job"], facts["version"], blocks, facts["unusable"])
-        _check_types(plan)
-        return plan
+        blocks = [dict(zip(_BLOCK_FIELDS, block, strict=True)) for block in facts["blocks"]]
+        return _STORED_PLAN.validate_json(json.dumps({**facts, "blocks": blocks}), strict=True)
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
-        raise OutputError(f"{where} is damaged: {error}. Delete it and start the job again") from (
-            error
-        )
-
-
-def _check_types(plan: StoredPlan) -> None:
-    texts = [plan.job, plan.version, *plan.unusable.keys(), *plan.unusable.values()]
-    for block in plan.blocks:
-        texts += [block.key, block.scene, block.variant, block.recipe]
-        if type(block.images) is not int or block.images < 1:
-            raise ValueError(f"a block of {block.images!r} images")
-    for text in texts:
-        if not isinstance(text, str):
-            raise ValueError(f"{text!r} in place of a text")
+        problem = str(error).replace("\n", " ")
+        raise OutputError(
+            f"{where} is damaged: {problem}. Delete it and start the job again"
+        ) from error

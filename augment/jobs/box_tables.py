@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -76,10 +77,9 @@ BoxWeather = Mapping[str, BoxNumbers]
 
 @dataclass(frozen=True)
 class BoxTable:
-    """How the numbers of one kind are stored. kind: what the file says that it holds.
-
-    columns: the file's, with their types. derived: what follows from the others; those that are
-    columns are there for other readers. sampled: those that samples of the datasets have.
+    """How the numbers of one kind are stored. kind: what the file says that it holds. columns: the
+    file's, with their types. derived: what follows from the others; those that are columns are
+    there for other readers. sampled: those that samples of the datasets have.
     """
 
     kind: str
@@ -108,7 +108,6 @@ class BoxTable:
 
     def to_bytes(self, items: Mapping[Item, BoxNumbers]) -> bytes:
         """All images' boxes as one Parquet file, ordered by frame, camera and place in the labels.
-
         A note in the metadata lists every image, so that one without boxes differs from one that
         was not measured.
         """
@@ -163,9 +162,14 @@ def _visible_fraction(columns: Mapping[str, np.ndarray]) -> np.ndarray:
     return np.where(both == 0, np.nan, columns["pixels"] / np.maximum(both, 1))
 
 
-def _fraction(name: str) -> Callable[[Mapping[str, np.ndarray]], np.ndarray]:
+def _fraction(name: str, columns: Mapping[str, np.ndarray]) -> np.ndarray:
     """float64 [B]: that part of the box's pixels; 0 where they were not counted, NaN of none."""
-    return lambda columns: fraction_of(columns[name], columns["pixels"])
+    return fraction_of(columns[name], columns["pixels"])
+
+
+def _modal_xyxy(columns: Mapping[str, np.ndarray]) -> np.ndarray:
+    """float32 [B, 4]."""
+    return np.stack([columns[name] for name in _MODAL], axis=1).astype(np.float32)
 
 
 _SIDES = ("x0", "y0", "x1", "y1")
@@ -175,7 +179,7 @@ TABLES: Mapping[str, BoxTable] = {
     # the part inside the image, hidden or not; zeros out of view. modal_x0 ... modal_y1: bounds of
     # the pixels that show the box; NaN where none does. pixels, hidden_pixels: those, and those
     # inside its outline that show what stands before it. truncated_fraction: of the outline's area,
-    # outside the image. modal_xyxy: float32 [B, 4].
+    # outside the image.
     "box_2d": BoxTable(
         kind="boxes 2d",
         columns={
@@ -187,10 +191,7 @@ TABLES: Mapping[str, BoxTable] = {
             "truncated_fraction": np.float64,
         },
         sampled=("modal_xyxy", "visible_fraction", "truncated_fraction"),
-        derived={
-            "visible_fraction": _visible_fraction,
-            "modal_xyxy": lambda c: np.stack([c[n] for n in _MODAL], axis=1).astype(np.float32),
-        },
+        derived={"visible_fraction": _visible_fraction, "modal_xyxy": _modal_xyxy},
     ),
     # submerged_fraction: of the box's height. pixels: that show the box, or NOT_COUNTED in an image
     # without water in view. hidden_pixels: those behind water.
@@ -203,7 +204,7 @@ TABLES: Mapping[str, BoxTable] = {
             "hidden_fraction": np.float64,
         },
         sampled=("submerged_fraction", "hidden_fraction"),
-        derived={"hidden_fraction": _fraction("hidden_pixels")},
+        derived={"hidden_fraction": partial(_fraction, "hidden_pixels")},
     ),
     # pixels: that show the box or the snow on it, or NOT_COUNTED in an image without snow in view.
     # snow_pixels: those that show snow.
@@ -211,7 +212,7 @@ TABLES: Mapping[str, BoxTable] = {
         kind="box snow",
         columns={"pixels": np.int64, "snow_pixels": np.int64, "snow_fraction": np.float64},
         sampled=("snow_fraction",),
-        derived={"snow_fraction": _fraction("snow_pixels")},
+        derived={"snow_fraction": partial(_fraction, "snow_pixels")},
     ),
     # transmittance: 0 to 1, of the smog between camera and box; NaN of a box whose numbers are not
     # finite. pixels: those it is the mean of; it is an estimate of none, or where NOT_COUNTED.
@@ -285,11 +286,10 @@ def _measure_2d(
 
 def visibility(weather: BoxWeather, count: int) -> Float64[np.ndarray, " B"]:
     """What the weather leaves of each box: transmittance of the smog, times the part of its pixels
-    that no water hides, times the part that no snow covers; [count], 0 to 1.
-
-    An effect that there is not, or that says nothing of a box (NaN: no pixel shows it, or its own
-    numbers are not finite), takes nothing from it. So this is no answer to whether a box is in
-    view, or behind another: `pixels` of the tables is.
+    that no water hides, times the part that no snow covers; [count], 0 to 1. An effect that there
+    is not, or that says nothing of a box (NaN: no pixel shows it, or its own numbers are not
+    finite), takes nothing from it. So this is no answer to whether a box is in view, or behind
+    another: `pixels` of the tables is.
     """
     factors = [np.ones(count)]
     if "box_smog" in weather:

@@ -107,10 +107,9 @@ CLAIMS_FOLDER = f"{STATE_FOLDER}/claims"
 
 @dataclass(frozen=True)
 class ClaimTimes:
-    """How often a remote claim is renewed, when one counts as dead, and how contenders part.
-
-    The lifetime must exceed the renewal several times.
-    Contenders that see each other try again, `attempts` times in all, each after a random wait.
+    """How often a remote claim is renewed, when one counts as dead, and how contenders part. The
+    lifetime must exceed the renewal several times. Contenders that see each other try again,
+    `attempts` times in all, each after a random wait.
     """
 
     renewal_s: float = 20.0
@@ -140,12 +139,9 @@ class Claim(Protocol):
 
 
 def try_claim(store: Store, name: str, times: ClaimTimes | None = None) -> Claim | None:
-    """The claim of that name, or None: a live process, here or elsewhere, holds it.
-
-    The name is one component of a path: letters, digits, `.`, `_`, `-` (see layout.folder_name).
-
-    Raises:
-        OutputError: the store cannot be read or written. ValueError: another name.
+    """The claim of that name, or None: a live process, here or elsewhere, holds it. The name is one
+    component of a path: letters, digits, `.`, `_`, `-` (see layout.folder_name). Raises
+    OutputError: the store cannot be read or written. ValueError: another name.
     """
     if folder_name(name) != name:
         raise ValueError(

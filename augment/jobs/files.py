@@ -33,11 +33,10 @@ from recipes.schema import Output
 @dataclass(frozen=True, eq=False)
 class SceneIndex:
     """A scene without its Gaussians: small enough to keep while workers hold the whole of it.
-
     frames: those of the job, the scene's own or a camera path's. labelled: numbers of the frames
     whose boxes and LiDAR pass through: all of the scene's own; of a camera path, those that share
-    number and timestamp with a frame of the scene. instances: of the objects in all the scene's
-    own frames.
+    number and timestamp with a frame of the scene. instances: of the objects in all the scene's own
+    frames.
     """
 
     name: str
@@ -82,9 +81,8 @@ def check_frames(scene: Scene) -> None:
 def select_frames(
     index: SceneIndex, frames: Sequence[int] | None, cameras: Sequence[str] | None
 ) -> list[tuple[Frame, tuple[str, ...]]]:
-    """The wanted frames in order of number, each with its wanted cameras in order of name.
-
-    None wants all. A frame without any of the cameras is left out.
+    """The wanted frames in order of number, each with its wanted cameras in order of name. None
+    wants all. A frame without any of the cameras is left out.
     """
     known = index.frames_by_number
     if len(known) != len(index.frames):
@@ -188,14 +186,10 @@ def frame_entry(
     cameras = {}
     for name in sorted(names):
         record = camera_record(frame.cameras[name].scaled(scale), world_origin_m)
+        (fx, _, cx), (_, fy, cy), _ = record.K.tolist()
         cameras[name] = {
-            "timestamp_ns": record.timestamp_ns,
-            "width": record.width,
-            "height": record.height,
-            "fx": record.K[0, 0].item(),
-            "fy": record.K[1, 1].item(),
-            "cx": record.K[0, 2].item(),
-            "cy": record.K[1, 2].item(),
+            **{key: getattr(record, key) for key in ("timestamp_ns", "width", "height")},
+            **{"fx": fx, "fy": fy, "cx": cx, "cy": cy},
             "world_from_camera": record.world_from_camera.tolist(),
         }
     return {
@@ -233,11 +227,8 @@ def read_entries(path: Path) -> dict[int, dict[str, Any]]:
 
 
 def read_camera(entry: Mapping[str, Any], name: str) -> CameraRecord:
-    """One camera of a frame entry.
-
-    Raises:
-        KeyError: the entry lacks the camera or one of its numbers.
-        ValueError, TypeError, RuntimeError: a number is none.
+    """One camera of a frame entry. Raises KeyError: the entry lacks the camera or one of its
+    numbers. ValueError, TypeError, RuntimeError: a number is none.
     """
     camera = entry["cameras"][name]
     rows = [[camera["fx"], 0.0, camera["cx"]], [0.0, camera["fy"], camera["cy"]], [0.0, 0.0, 1.0]]
@@ -261,6 +252,7 @@ def _in_dataset(world_from_x: torch.Tensor, world_origin_m: np.ndarray) -> torch
 # The text carries a path to worker processes, and its hash is the path's identity in the manifest.
 
 RECORDED = "recorded"  # the identity of a scene's own frames
+_CAMERA_NUMBERS = ("name", "timestamp_ns", "width", "height", "fx", "fy", "cx", "cy")
 
 
 def frames_to_json(frames: Sequence[Frame]) -> str:
@@ -270,7 +262,13 @@ def frames_to_json(frames: Sequence[Frame]) -> str:
             "index": frame.index,
             "timestamp_ns": frame.timestamp_ns,
             "world_from_ego": frame.world_from_ego.tolist(),
-            "cameras": [_camera_record(camera) for camera in frame.cameras.values()],
+            "cameras": [
+                {
+                    **{name: getattr(camera, name) for name in _CAMERA_NUMBERS},
+                    "camera_from_world": camera.camera_from_world.tolist(),
+                }
+                for camera in frame.cameras.values()
+            ],
         }
         for frame in frames
     ]
@@ -279,9 +277,7 @@ def frames_to_json(frames: Sequence[Frame]) -> str:
 
 def frames_from_json(text: str) -> tuple[Frame, ...]:
     """The frames that `frames_to_json` wrote. Poses are camera_from_world in the scene's world.
-
-    Raises:
-        ValueError: the text is not such a path; says what is missing.
+    Raises ValueError: the text is not such a path; says what is missing.
     """
     try:
         return tuple(
@@ -304,31 +300,12 @@ def trajectory_id(camera_path: Sequence[Frame] | None) -> str:
     return "path-" + hashlib.sha256(frames_to_json(camera_path).encode()).hexdigest()[:16]
 
 
-def _camera_record(camera: Camera) -> dict[str, Any]:
-    numbers = {k: getattr(camera, k) for k in ("width", "height", "fx", "fy", "cx", "cy")}
-    return {
-        "name": camera.name,
-        "timestamp_ns": camera.timestamp_ns,
-        **numbers,
-        "camera_from_world": camera.camera_from_world.tolist(),
-    }
-
-
 def _camera(record: dict[str, Any]) -> Camera:
-    return Camera(
-        name=record["name"],
-        width=record["width"],
-        height=record["height"],
-        fx=record["fx"],
-        fy=record["fy"],
-        cx=record["cx"],
-        cy=record["cy"],
-        camera_from_world=torch.tensor(record["camera_from_world"], dtype=torch.float64),
-        timestamp_ns=record["timestamp_ns"],
-    )
+    pose = torch.tensor(record["camera_from_world"], dtype=torch.float64)
+    return Camera(**{name: record[name] for name in _CAMERA_NUMBERS}, camera_from_world=pose)
 
 
-# ---- encode --------------------------------------------------------------------------------------
+# ---- Arrays to image files and back --------------------------------------------------------------
 
 DEPTH_STEPS_PER_M = 256  # as KITTI's depth maps: uint16 = metres x 256, 0 = none
 _PNG_START, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
@@ -361,9 +338,8 @@ def decode_image(data: bytes) -> np.ndarray:
 
 
 def quantise_depth(depth_m: np.ndarray) -> np.ndarray:
-    """float [H, W] metres -> uint16 steps of 1/256 m; 0 where there is none.
-
-    None are: 0, negative, NaN, infinite, and more than 65535/256 = 255.996 m.
+    """float [H, W] metres -> uint16 steps of 1/256 m; 0 where there is none. None are: 0, negative,
+    NaN, infinite, and more than 65535/256 = 255.996 m.
     """
     steps = np.rint(np.asarray(depth_m, np.float64) * DEPTH_STEPS_PER_M)
     usable = (steps >= 1) & (steps <= 65535)  # false for NaN

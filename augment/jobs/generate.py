@@ -71,11 +71,16 @@ Choices = dict[tuple[str, str], Recipe | str]
 
 
 def resolve_recipes(
-    job: GenerateJob, store: Store, driver: Scheduler, found: Found, *, progress: bool, keep: bool
+    job: GenerateJob,
+    store: Store,
+    scheduler: Scheduler,
+    found: Found,
+    *,
+    progress: bool,
+    keep: bool,
 ) -> Choices:
-    """By scene and variant: the recipes that had to choose, settled, or why they could not.
-
-    found: the scene of every URI and name. keep: whether new choices are kept in the output.
+    """By scene and variant: the recipes that had to choose, settled, or why they could not. found:
+    the scene of every URI and name. keep: whether new choices are kept in the output.
     """
     wanted = _wanted(job, found)
     if not wanted:
@@ -97,7 +102,11 @@ def resolve_recipes(
 
     with bar:
         timed = any(r.quality.budget_ms is not None for task in tasks for r in task.recipes)
-        driver.resolve_quality(_turned(list(tasks), *job.shard), each, one_by_one=timed)
+        # Each shard begins elsewhere, so that those that start together do not wait for each other.
+        number, count = job.shard
+        start = (number - 1) * len(tasks) // count
+        turned = [*tasks][start:] + [*tasks][:start]
+        scheduler.do_first(turned, each, one_by_one=timed)
     return choices
 
 
@@ -140,12 +149,6 @@ def _recorded(store: Store, wanted: _Wanted, backend: str) -> tuple[Choices, _Wa
     return choices, left
 
 
-def _turned(tasks: Sequence[ResolveTask], number: int, count: int) -> list[ResolveTask]:
-    """Each shard begins elsewhere, so that those that start together do not wait for each other."""
-    start = (number - 1) * len(tasks) // count
-    return [*tasks[start:], *tasks[:start]]
-
-
 # ---- How long a job will take and how large its output gets, from a few pictures -----------------
 
 MAX_SAMPLED = 8  # recipes whose pictures are made; the others take their mean
@@ -175,13 +178,11 @@ class Estimate:
 def estimate(
     plan: Plan, open_scene: SceneLoader, *, each: Callable[[str], None] = lambda name: None
 ) -> Estimate:
-    """Render a frame under each recipe, and scale what it takes by the pixels of the job.
-
-    The pictures are the middle frame of the recipe's first scene in one camera, twice: what the
-    first takes beyond the second (where snow can lie, what a style maps, compiling) counts once a
-    scene. Scenes and weather differ, so this is right to within a factor of two or so.
-
-    each: told of every recipe before it is tried.
+    """Render a frame under each recipe, and scale what it takes by the pixels of the job. The
+    pictures are the middle frame of the recipe's first scene in one camera, twice: what the first
+    takes beyond the second (where snow can lie, what a style maps, compiling) counts once a scene.
+    Scenes and weather differ, so this is right to within a factor of two or so. each: told of every
+    recipe before it is tried.
     """
     firsts: dict[str, Block] = {}
     for block in plan.blocks:
@@ -248,7 +249,7 @@ def _sample(block: Block, loader: SceneLoader, plan: Plan) -> Sample:
     return Sample(took[1] / mpx, size / mpx, max(0.0, took[0] - took[1]))
 
 
-# ---- job -----------------------------------------------------------------------------------------
+# ---- The job -------------------------------------------------------------------------------------
 
 SCENES = f"{STATE_FOLDER}/scenes"
 EXECUTORS = ("serial", "processes", "ray")
@@ -287,10 +288,9 @@ class GenerateJob:
 @dataclass(frozen=True)
 class GenerateResult:
     """Images of this shard. skipped: finished before, here or elsewhere. unusable: scenes by URI.
-
-    timings: seconds by kind of work, summed over threads and workers, of which
-    `worker.shares_of` says what the job was bound by; and by the clock: `plan`, with the
-    scenes' opening, `scan` of what is finished, and `render_wall`, all else.
+    timings: seconds by kind of work, summed over threads and workers, of which `worker.shares_of`
+    says what the job was bound by; and by the clock: `plan`, with the scenes' opening, `scan` of
+    what is finished, and `render_wall`, all else.
     """
 
     written: int
@@ -330,9 +330,9 @@ def plan_job(job: GenerateJob, *, progress: bool = True) -> Plan:
     """The job's plan, for which its scenes are opened that have not been; writes nothing."""
     job = _with_backend(job)
     store = open_store(job.setup.store_uri)
-    driver = Scheduler(lambda tick: make_pool(job, tick))
-    with contextlib.closing(driver):
-        return _plan(job, store, driver, progress, keep=False)
+    scheduler = Scheduler(lambda tick: make_pool(job, tick))
+    with contextlib.closing(scheduler):
+        return _plan(job, store, scheduler, progress, keep=False)
 
 
 def make_pool(job: GenerateJob, tick: Tick) -> WorkerPool:
@@ -395,25 +395,25 @@ class _Generation:
 
     def go(self) -> GenerateResult:
         started = time.perf_counter()
-        self._driver = Scheduler(
+        self._scheduler = Scheduler(
             lambda tick: make_pool(self._job, tick), on_image=self._show, idle=self._merge_at_times
         )
-        with contextlib.closing(self._driver):
+        with contextlib.closing(self._scheduler):
             self._plan = plan = _plan(
-                self._job, self._store, self._driver, self._progress, keep=True
+                self._job, self._store, self._scheduler, self._progress, keep=True
             )
             self._timings["plan"] = time.perf_counter() - started
             blocks = shard_of(plan.blocks, *self._job.shard)
             pending = self._pending(blocks)
             self._timings["scan"] = time.perf_counter() - started - self._timings["plan"]
             done = sum(b.images for b in blocks) - sum(b.images for b in pending)
-            self._driver.tally.skipped = done
+            self._scheduler.tally.skipped = done
             begun = time.perf_counter()
             self._render(pending, total=sum(block.images for block in blocks))
             self._timings["render_wall"] = time.perf_counter() - begun
-            self._timings[WORKERS] = self._rendering_s * self._driver.slots
+            self._timings[WORKERS] = self._rendering_s * self._scheduler.slots
         self._merge(wait=True)
-        tally = self._driver.tally
+        tally = self._scheduler.tally
         return GenerateResult(
             tally.written,
             tally.skipped,
@@ -446,7 +446,7 @@ class _Generation:
             self._prepare(list({block.recipe.name: block.recipe for block in pending}.values()))
         self._bar = tqdm(
             total=total,
-            initial=self._driver.tally.skipped,
+            initial=self._scheduler.tally.skipped,
             unit="image",
             disable=not self._progress,
         )
@@ -454,10 +454,10 @@ class _Generation:
             try:
                 if pending:
                     started = time.perf_counter()
-                    self._driver.render(pending, dict(self._plan.names), self._fail)
+                    self._scheduler.render(pending, dict(self._plan.names), self._fail)
                     self._rendering_s = time.perf_counter() - started
             except KeyboardInterrupt:
-                self._driver.close()
+                self._scheduler.close()
                 self._merge(wait=True)
                 raise KeyboardInterrupt(
                     "stopped; start the same job again to go on from there"
@@ -513,7 +513,9 @@ class _Generation:
         self._merge_s = self._merged_at - started
 
 
-def _plan(job: GenerateJob, store: Store, driver: Scheduler, progress: bool, *, keep: bool) -> Plan:
+def _plan(
+    job: GenerateJob, store: Store, scheduler: Scheduler, progress: bool, *, keep: bool
+) -> Plan:
     found: dict[tuple[str, str | None], SceneRecord | str] = {}
     for entry in job.scenes:
         record = None if job.rescan else _known(store, entry)
@@ -530,8 +532,8 @@ def _plan(job: GenerateJob, store: Store, driver: Scheduler, progress: bool, *, 
                 store.write(_record_path(task.uri, task.name), record.to_json())
             bar.update()
 
-        driver.index(list(dict.fromkeys(tasks)), each)
-    settled = resolve_recipes(job, store, driver, found, progress=progress, keep=keep)
+        scheduler.do_first(list(dict.fromkeys(tasks)), each)
+    settled = resolve_recipes(job, store, scheduler, found, progress=progress, keep=keep)
     return make_plan(job.recipes, job.scenes, found, job.setup.backend, settled)
 
 

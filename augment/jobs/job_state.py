@@ -101,7 +101,9 @@ class ProgressLog:
         with self._lock:
             length = os.fstat(self._file).st_size
             try:
-                _write_all(self._file, _line(row))
+                data = _line(row)
+                while data:
+                    data = data[os.write(self._file, data) :]
                 os.fsync(self._file)
             except OSError as error:
                 os.ftruncate(self._file, length)  # a later line must not join half of this one
@@ -129,18 +131,11 @@ def logged_variants(out_dir: Path) -> list[str]:
     return sorted(str(p.relative_to(root).with_suffix("")) for p in root.glob("*/*.jsonl"))
 
 
-def _write_all(descriptor: int, data: bytes) -> None:
-    while data:
-        data = data[os.write(descriptor, data) :]
-
-
 def _line(value: dict[str, Any]) -> bytes:
     return json.dumps(value, separators=(",", ":")).encode() + b"\n"
 
 
-# ---- job state -----------------------------------------------------------------------------------
-
-# ---- ledger --------------------------------------------------------------------------------------
+# ---- What of a job is done already, what is left, and what the manifest will say of it -----------
 
 # What belongs to a whole variant is written when the job ends.
 _OF_VARIANT = ("labels", *TABLES, "calibration")
@@ -150,7 +145,6 @@ _log = logging.getLogger(__name__)
 @dataclass
 class VariantState:
     """One variant of the job. rows: what is known of its images, from this run and earlier ones.
-
     box_weather: what is measured of the boxes of those images, by kind (see TABLES).
     """
 
@@ -278,10 +272,9 @@ class JobState:
         return False
 
     def _give_up(self, variants: Sequence[VariantState]) -> None:
-        """Drop the variants' files and rows, in an order that a kill cannot confuse.
-
-        The folder goes first, in one step: until the rows have gone too, the next run finds the
-        old images missing, which the old job can render again and another is refused.
+        """Drop the variants' files and rows, in an order that a kill cannot confuse. The folder
+        goes first, in one step: until the rows have gone too, the next run finds the old images
+        missing, which the old job can render again and another is refused.
         """
         trash = self.out_dir / STATE_FOLDER / "trash"
         for number, variant in enumerate(variants):
@@ -387,9 +380,8 @@ class BoxCache:
 
 
 def finish(job_state: JobState, trajectory: str, boxes: BoxCache) -> None:
-    """Write labels, calibration and manifest of the job's variants that have rows.
-
-    Safe to repeat: a kill at any point leaves the journals, and the next run does it again.
+    """Write labels, calibration and manifest of the job's variants that have rows. Safe to repeat:
+    a kill at any point leaves the journals, and the next run does it again.
     """
     variants = [variant for variant in job_state.variants if variant.rows]
     for variant in variants:
@@ -407,13 +399,9 @@ def finish(job_state: JobState, trajectory: str, boxes: BoxCache) -> None:
 def needs_finish(job_state: JobState) -> bool:
     """Whether anything that `finish` writes is not there, or a journal is still open."""
     return not (job_state.out_dir / MANIFEST).is_file() or any(
-        variant.is_logged or not _is_whole(job_state, variant) for variant in job_state.variants
+        variant.is_logged or not all(p.is_file() for p in _companions(job_state, variant).values())
+        for variant in job_state.variants
     )
-
-
-def _is_whole(job_state: JobState, variant: VariantState) -> bool:
-    paths = _companions(job_state, variant)
-    return all(path.is_file() for path in paths.values())
 
 
 def _companions(job_state: JobState, variant: VariantState) -> dict[str, Path]:

@@ -28,11 +28,10 @@ _UNSAFE_CHARACTERS = re.compile(r"[^A-Za-z0-9._-]+")
 
 
 def folder_name(name: str) -> str:
-    """A name of a scene or camera as one safe path component.
-
-    Letters, digits, `.`, `_`, `-`, at most 100 of them and the first a letter or digit, stay as
-    they are. Any other name has the rest replaced by `_` and eight hex digits of its SHA-256
-    added, so that two names never share a folder and nothing leaves the output folder.
+    """A name of a scene or camera as one safe path component. Letters, digits, `.`, `_`, `-`, at
+    most 100 of them and the first a letter or digit, stay as they are. Any other name has the rest
+    replaced by `_` and eight hex digits of its SHA-256 added, so that two names never share a
+    folder and nothing leaves the output folder.
     """
     if _SAFE.fullmatch(name) and name != MANIFEST:
         return name

@@ -218,9 +218,8 @@ def merge_rows(
 
 
 def latest_rows(tables: Sequence[pa.Table]) -> pa.Table:
-    """One row an image out of several tables, sorted: that of the first table that has one.
-
-    Of an image's rows in one table, one that is finished comes before one that failed.
+    """One row an image out of several tables, sorted: that of the first table that has one. Of an
+    image's rows in one table, one that is finished comes before one that failed.
     """
     rank = [np.full(table.num_rows, number, np.int64) for number, table in enumerate(tables)]
     table = concat_rows(list(tables))
@@ -340,9 +339,8 @@ class Part:
 
 
 def list_parts(store: Store, scene_folder: str | None = None) -> dict[str, Part]:
-    """The part of every block that has one, by the block's key; no file is read.
-
-    scene_folder: of one scene only.
+    """The part of every block that has one, by the block's key; no file is read. scene_folder: of
+    one scene only.
     """
     found: dict[str, Part] = {}
     for part in _all_parts(store, scene_folder):
@@ -352,9 +350,8 @@ def list_parts(store: Store, scene_folder: str | None = None) -> dict[str, Part]
 
 
 def publish_part(store: Store, key: str, rows: pa.Table) -> Part:
-    """Make a block's rows visible: in one step, and in place of what the block had before.
-
-    A part without failures is never replaced by one with some. Returns the part that stands.
+    """Make a block's rows visible: in one step, and in place of what the block had before. A part
+    without failures is never replaced by one with some. Returns the part that stands.
     """
     data = manifest_bytes(rows)
     failed = FAILED in rows["status"].to_pylist()
@@ -370,10 +367,8 @@ def publish_part(store: Store, key: str, rows: pa.Table) -> Part:
 
 
 def read_finished(store: Store) -> pa.Table:
-    """The rows of all finished images and of those that failed, sorted by `manifest.KEY`.
-
-    Raises:
-        OutputError: nothing is finished yet, or a file is damaged.
+    """The rows of all finished images and of those that failed, sorted by `manifest.KEY`. Raises
+    OutputError: nothing is finished yet, or a file is damaged.
     """
     table = _merged(store)[0]
     if table is None:
@@ -385,9 +380,8 @@ def read_finished(store: Store) -> pa.Table:
 
 
 def compact(store: Store) -> pa.Table | None:
-    """Merge all parts into the manifest; returns its table, None where nothing is finished.
-
-    Whoever calls holds the claim on the manifest, so that the last to write has seen all parts.
+    """Merge all parts into the manifest; returns its table, None where nothing is finished. Whoever
+    calls holds the claim on the manifest, so that the last to write has seen all parts.
     """
     table, before, parts = _merged(store)
     if table is None:
@@ -408,16 +402,19 @@ def parts_to_merge(store: Store) -> int:
 
 
 def _merged(store: Store) -> tuple[pa.Table | None, bytes | None, list[Part]]:
-    """The rows of the manifest and of the parts, the manifest's bytes as they are, and the parts.
-
-    A part may be replaced between being listed and being read: then all is looked at again.
+    """The rows of the manifest and of the parts, the manifest's bytes as they are, and the parts. A
+    part may be replaced between being listed and being read: then all is looked at again.
     """
     for attempt in range(_MAX_RACES):
         parts = sorted(list_parts(store).values(), key=lambda part: part.name)
         table, data = _manifest(store)
         listed = _listed(table)
         try:
-            read = [_read_part(store, part) for part in parts if part.name not in listed]
+            read = [
+                parse_manifest(store.read(part.path), f"{store.uri}/{part.path}")
+                for part in parts
+                if part.name not in listed
+            ]
         except StoredFileMissing:
             if attempt == _MAX_RACES - 1:
                 raise
@@ -435,10 +432,6 @@ def _manifest(store: Store) -> tuple[pa.Table | None, bytes | None]:
     except StoredFileMissing:
         return None, None
     return parse_manifest(data, f"{store.uri}/{MANIFEST}"), data
-
-
-def _read_part(store: Store, part: Part) -> pa.Table:
-    return parse_manifest(store.read(part.path), f"{store.uri}/{part.path}")
 
 
 def _listed(table: pa.Table | None) -> Collection[str]:
@@ -550,10 +543,9 @@ def image_row(
 
 
 def shown_words(recipe: Recipe) -> dict[str, str | float | None]:
-    """What a recipe says of its images beside the weather's numbers, by columns.
-
-    settings: JSON of the values of the knobs that a quality may set (recipes.schema) and that have
-    an effect, by dotted path; None where the recipe has no quality.
+    """What a recipe says of its images beside the weather's numbers, by columns. settings: JSON of
+    the values of the knobs that a quality may set (recipes.schema) and that have an effect, by
+    dotted path; None where the recipe has no quality.
     """
     words, settings = recipe.quality.words, None
     if words is not None:

@@ -117,7 +117,6 @@ def _entries(content: Any, keys: tuple[str, ...]) -> dict[str, dict[str, str]]:
 @dataclass(frozen=True)
 class WeatheredSweep:
     """One of the dataset's files of a frame's returns, and the weathered sweep that is to be in it.
-
     scene: whose sweep it is. path: of our sweep. name: the same, relative to the output folder.
     content: makes the file's bytes; None where only another scene's labels could.
     """
@@ -189,10 +188,9 @@ class ImageForm:
 
 @dataclass(frozen=True)
 class Weathered:
-    """A finished image of ours and where the dataset has the recorded one.
-
-    scene: whose image it is. path: of our file. name: the same, relative to the output folder.
-    form: what our file is. checksum: its SHA-256. jpeg_quality: for writing it anew.
+    """A finished image of ours and where the dataset has the recorded one. scene: whose image it
+    is. path: of our file. name: the same, relative to the output folder. form: what our file is.
+    checksum: its SHA-256. jpeg_quality: for writing it anew.
     """
 
     scene: str
@@ -272,11 +270,6 @@ def weathered_images(
     return found, notes
 
 
-def fits(image: Weathered, recorded: ImageForm) -> bool:
-    """Whether our file can stand for the recorded one as it is."""
-    return image.form == recorded
-
-
 def fitted(image: Weathered, recorded: ImageForm) -> bytes:
     """Our image as a file of the recorded one's form: smaller by area, larger by cubic splines."""
     try:
@@ -293,19 +286,14 @@ def fitted(image: Weathered, recorded: ImageForm) -> bytes:
         method = cv2.INTER_AREA if is_smaller else cv2.INTER_CUBIC
         rgb = np.asarray(cv2.resize(rgb, size, interpolation=method), np.uint8)
     if recorded.is_grey:
-        return _encode_grey(rgb)
+        done, data = cv2.imencode(".png", cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY))
+        assert done
+        return data.tobytes()
     settings = {"image": recorded.format, "jpeg_quality": image.jpeg_quality}
     return encode_image(rgb, Output.model_validate(settings))
 
 
-def _encode_grey(rgb: np.ndarray) -> bytes:
-    """uint8 [H, W, 3] as a PNG of its luma."""
-    done, data = cv2.imencode(".png", cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY))
-    assert done
-    return data.tobytes()
-
-
-# ---- mirror --------------------------------------------------------------------------------------
+# ---- The copy ------------------------------------------------------------------------------------
 
 Links = Literal["hard", "copy"]
 
@@ -473,7 +461,7 @@ class _Mirroring:
             return False
         rendered = _facts_of(image.path)
         target = self._target(file.relative)
-        if not fits(image, recorded):
+        if image.form != recorded:
             self._fit(image, recorded, target, rendered.st_mtime_ns)
         elif self._place(str(image.path), rendered, target) == COPIED:
             self.done.new += 1
@@ -520,7 +508,7 @@ class _Mirroring:
     def _fit(self, image: Weathered, recorded: ImageForm, target: str, mtime_ns: int) -> None:
         """Encode anew, where the file there is not this image's: its time and form would be."""
         self.fitted.append(target)
-        if _is_fitted(target, recorded, mtime_ns):
+        if _is_written(target, mtime_ns, recorded):
             return
         self._begin()
         self.pump.submit(lambda: write_file(fitted(image, recorded), target, mtime_ns))
@@ -582,16 +570,10 @@ def _facts_of(path: Path) -> os.stat_result:
         ) from error
 
 
-def _is_written(target: str, mtime_ns: int) -> bool:
+def _is_written(target: str, mtime_ns: int, form: ImageForm | None = None) -> bool:
+    """Whether a file of ours stands there: of that time, and of that form, if it is an image."""
     try:
-        return os.lstat(target).st_mtime_ns == mtime_ns
-    except OSError:
-        return False
-
-
-def _is_fitted(target: str, recorded: ImageForm, mtime_ns: int) -> bool:
-    try:
-        facts = os.lstat(target)
-        return facts.st_mtime_ns == mtime_ns and image_form(target) == recorded
+        is_ours = os.lstat(target).st_mtime_ns == mtime_ns
+        return is_ours and (form is None or image_form(target) == form)
     except OSError:
         return False

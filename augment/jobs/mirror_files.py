@@ -32,11 +32,9 @@ from augment.jobs.atomic import (
 
 @dataclass(frozen=True)
 class SourceTree:
-    """A dataset in a folder. root: absolute; its name is the copy's name too.
-
-    uri: what it was opened by. images, sweeps: regular expressions that the paths of its camera
-    images and LiDAR sweeps, relative to root, match in full. entries: what in root belongs to it;
-    None for all.
+    """A dataset in a folder. root: absolute; its name is the copy's name too. uri: what it was
+    opened by. images, sweeps: regular expressions that the paths of its camera images and LiDAR
+    sweeps, relative to root, match in full. entries: what in root belongs to it; None for all.
     """
 
     uri: str
@@ -199,18 +197,12 @@ def _link_text(tree: SourceTree, within: str, path: str) -> str:
     return os.path.relpath(target or ".", os.path.dirname(within) or ".")
 
 
-# ---- mirror files --------------------------------------------------------------------------------
+# ---- Files and links put in place ----------------------------------------------------------------
 
 LINKED, COPIED = "linked", "copied"
-# Another disk, a file system without hard links, another user's file, too many links to it.
-_CANNOT_LINK = (
-    errno.EXDEV,
-    errno.EPERM,
-    errno.EMLINK,
-    errno.EOPNOTSUPP,
-    errno.ENOTSUP,
-    errno.ENOSYS,
-)
+# Another disk, another user's file, too many links to it, a file system without hard links.
+_CANNOT_LINK = {errno.EXDEV, errno.EPERM, errno.EMLINK}
+_CANNOT_LINK |= {errno.EOPNOTSUPP, errno.ENOTSUP, errno.ENOSYS}
 
 
 def found_as(target: str, original: os.stat_result) -> str | None:
@@ -291,14 +283,12 @@ def own_folder(folder: str) -> bool:
 
 def others_in(folder: str, expected: set[str]) -> list[str]:
     """Names in a folder of the copy that are not expected; what a killed run left is deleted."""
-    others = []
     with refusals_of(Path(folder)):
         found = set(os.listdir(folder)) - expected
         left = set(temporary_names(found))
         for name in left:
             os.unlink(os.path.join(folder, name))
-        others += sorted(found - left)
-    return others
+    return sorted(found - left)
 
 
 def _facts(path: str) -> os.stat_result | None:

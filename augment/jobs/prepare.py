@@ -75,7 +75,6 @@ def store_beds(
     progress: bool = False,
 ) -> tuple[StoredBed, ...]:
     """The beds of all snow in the recipes, in `folder` and remembered for this scene object.
-
     cameras: all that a camera path has, or None for the scene's: never a selection, so that no
     image depends on what else is rendered. backend: that renders the images, which places their
     snow, too. progress: a bar on stderr for each bed that is placed.
@@ -116,9 +115,8 @@ class StoredMaps:
     seen_sky: np.ndarray | None  # [3, 4]
 
     def take_over(self, scene: Scene) -> None:
-        """Make them the maps that pictures of the scene in this style use in this process.
-
-        A scene remembers the last few styles only, so this comes right before their pictures.
+        """Make them the maps that pictures of the scene in this style use in this process. A scene
+        remembers the last few styles only, so this comes right before their pictures.
         """
         from augment.effects.style.style import remember_maps
 
@@ -147,13 +145,9 @@ def style_to_apply(recipe: Recipe) -> Style | None:
 def store_maps(
     scene: Scene, recipes: Iterable[Recipe], *, cameras: Sequence[Camera] | None = None
 ) -> tuple[StoredMaps, ...]:
-    """The maps of all styles in the recipes.
-
-    cameras: all that a camera path has, or None for the scene's: never a selection, so that no
-    image depends on what else is rendered.
-
-    Raises:
-        StyleError: a style's files cannot be used, or it cannot be had in this scene.
+    """The maps of all styles in the recipes. cameras: all that a camera path has, or None for the
+    scene's: never a selection, so that no image depends on what else is rendered. Raises
+    StyleError: a style's files cannot be used, or it cannot be had in this scene.
     """
     from augment.effects.style.style import style_maps
 

@@ -276,9 +276,8 @@ class SharedScene:
     skeleton: bytes
 
     def open(self) -> Scene:
-        """The scene, its tensors mapped from the file; writes to them stay in this process.
-
-        The skeleton is a pickle that comes from the parent through the pipe, never from a file.
+        """The scene, its tensors mapped from the file; writes to them stay in this process. The
+        skeleton is a pickle that comes from the parent through the pipe, never from a file.
         """
         load = ForkingPickler.loads  # pyright: ignore[reportAttributeAccessIssue]
         return load(self.skeleton)
@@ -289,12 +288,9 @@ class SharedScene:
 
 
 def share_scene(scene: Scene, folder: Path) -> SharedScene:
-    """Lay the scene's tensors into a temporary file of `folder`, which a later job clears away
-    once it holds the folder.
-
-    Raises:
-        OutputError: the file cannot be written. ValueError: a part of the scene, such as its label
-            source, cannot be sent to another process.
+    """Lay the scene's tensors into a temporary file of `folder`, which a later job clears away once
+    it holds the folder. Raises OutputError: the file cannot be written. ValueError: a part of the
+    scene, such as its label source, cannot be sent to another process.
     """
     path = temporary_beside(folder / "scene")
     try:

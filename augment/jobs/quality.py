@@ -30,10 +30,7 @@ from augment.metrics.image import flip
 from augment.scene import Scene
 from recipes.schema import BY_PATH, Recipe, Value, free_knobs, with_settings
 
-# ---- quality -------------------------------------------------------------------------------------
-
-# ------------------------------------------------------------------------------------------------
-# One picture for the sake of its time and its errors, at the size of those it is compared with
+# ---- One picture for the sake of its time and its errors, at the size of its reference -----------
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,9 +79,8 @@ def render_trial(
 
 
 def upsampled(picture: np.ndarray, width: int, height: int) -> np.ndarray:
-    """The picture [H, W, 3] at another size, in its own type, as a viewer would show it.
-
-    Bilinear where it grows, means over areas where it shrinks, else the same array.
+    """The picture [H, W, 3] at another size, in its own type, as a viewer would show it. Bilinear
+    where it grows, means over areas where it shrinks, else the same array.
     """
     if picture.shape[:2] == (height, width):
         return picture
@@ -108,12 +104,9 @@ class View(NamedTuple):
 
 def calibration_views(frames: Sequence[Frame], count: int = COUNT) -> tuple[View, ...]:
     """Images spread over the frames and over each frame's cameras; at most `count`, at least one.
-
     frames: all that the scene or the camera path has, never a selection, so that what is rendered
-    beside an image does not change it.
-
-    Raises:
-        ValueError: no frame has a camera, or count is below 1.
+    beside an image does not change it. Raises ValueError: no frame has a camera, or count is below
+    1.
     """
     if count < 1:
         raise ValueError(f"count must be >= 1; got {count}")
@@ -137,14 +130,11 @@ DOUBT = 1.25  # how far beyond the bound an estimate must be to stand for the wh
 
 
 class Bench:
-    """Tries settings of a recipe on a scene.
-
-    recipe: its knobs at reference. scene, cameras: where snow can lie and what a style maps is
-    found for these cameras, the scene's own if None. clock: in seconds. each: is told before every
-    picture.
-
-    Errors of single knobs are estimated from windows of the picture where that is much larger:
-    FLIP takes longer than rendering. `flip` and, near the bound, `exceeds` look at all of it.
+    """Tries settings of a recipe on a scene. recipe: its knobs at reference. scene, cameras: where
+    snow can lie and what a style maps is found for these cameras, the scene's own if None. clock:
+    in seconds. each: is told before every picture. Errors of single knobs are estimated from
+    windows of the picture where that is much larger: FLIP takes longer than rendering. `flip` and,
+    near the bound, `exceeds` look at all of it.
     """
 
     def __init__(
@@ -157,7 +147,7 @@ class Bench:
         cameras: Sequence[Camera] | None = None,
         renderer: Renderer | None = None,
         clock: Callable[[], float] = time.perf_counter,
-        each: Callable[[], None] = lambda: None,
+        each: Callable[[], object] = lambda: None,
     ) -> None:
         self._recipe, self._views, self._backend = recipe, tuple(views), backend
         # An object of its own, which takes along what is found of settings that are not chosen.
@@ -289,8 +279,7 @@ def _starts(length: int) -> list[int]:
     return [min(max(0, int(c - WINDOW / 2)), length - WINDOW) for c in centres]
 
 
-# ------------------------------------------------------------------------------------------------
-# From what the values of each knob cost and save to a setting of all of them; renders nothing
+# ---- From what the values of each knob cost and save to a setting of all of them -----------------
 # `options` are the values that a choice is made from, by the knobs' paths: from the fastest to the
 # most accurate, which is the reference. What is not measured yet is asked for when it is needed.
 
@@ -354,13 +343,11 @@ def within_budget(
     costs: Mapping[str, Sequence[Cost]],
     ms_of: Callable[[Settings], float],
 ) -> Budgeted:
-    """Accurate settings whose frames together take no longer than the budget.
-
-    From reference on, the knob goes a step on that saves the most time for the error that it adds,
-    by what each costs alone, and the time of all together is measured again, until it is within
-    the budget or no step is left that saves anything.
-
-    costs: of every value of every knob, its reference included. ms_of: time of settings together.
+    """Accurate settings whose frames together take no longer than the budget. From reference on,
+    the knob goes a step on that saves the most time for the error that it adds, by what each costs
+    alone, and the time of all together is measured again, until it is within the budget or no step
+    is left that saves anything. costs: of every value of every knob, its reference included. ms_of:
+    time of settings together.
     """
     ladders = {path: useful(costs[path]) for path in options}
     places = dict.fromkeys(options, 0)
@@ -418,7 +405,6 @@ def useful(costs: Sequence[Cost]) -> list[Cost]:
 
 def _worth(ladder: Sequence[Cost]) -> tuple[float, float]:
     """Time saved for the error added, then time saved, of the best of the steps down a ladder.
-
     Where a step is poor and the one behind it good, it is the way there.
     """
     before, *after = ladder
@@ -426,7 +412,7 @@ def _worth(ladder: Sequence[Cost]) -> tuple[float, float]:
     return max((ms / error if error > 0 else math.inf, ms) for ms, error in saved)
 
 
-# ---- settle --------------------------------------------------------------------------------------
+# ---- The choice ----------------------------------------------------------------------------------
 
 _CELL = "weather.snow.cell_m"  # the one knob whose finest value a scene may be too large for
 _log = logging.getLogger(__name__)
@@ -448,11 +434,10 @@ class Measured:
 class Report:
     """settings: what was chosen, of the knobs that the recipe leaves free. is_met: whether they
     keep what the recipe asks for; an error can always be kept, a budget cannot. flip: mean FLIP
-    against reference in the worst of the views. views: frame numbers and cameras.
-
-    The same for the same scene, recipe and backend on every machine, where the recipe gives
-    max_flip. Not so the rest: ms, the settings' frame time; reference_ms; seconds, what choosing
-    took. Only a recipe with budget_ms has the first two.
+    against reference in the worst of the views. views: frame numbers and cameras. The same for the
+    same scene, recipe and backend on every machine, where the recipe gives max_flip. Not so the
+    rest: ms, the settings' frame time; reference_ms; seconds, what choosing took. Only a recipe
+    with budget_ms has the first two.
     """
 
     settings: Settings
@@ -503,9 +488,6 @@ def resolve_quality(
     bar = tqdm(unit="picture", desc=f"choosing settings of {recipe.name}", disable=not progress)
     with bar:
 
-        def each() -> None:
-            bar.update()
-
         def bench_of(reference: Recipe) -> Bench:
             return Bench(
                 reference,
@@ -515,7 +497,7 @@ def resolve_quality(
                 cameras=cameras,
                 renderer=renderer,
                 clock=clock,
-                each=each,
+                each=bar.update,
             )
 
         chosen = _chosen(recipe, bench_of)
@@ -543,10 +525,8 @@ def resolve_quality(
 
 
 def resolved_recipe(recipe: Recipe, settings: Settings) -> Recipe:
-    """The recipe with a choice made for it.
-
-    Raises:
-        ValueError: these are not settings for the recipe's free knobs.
+    """The recipe with a choice made for it. Raises ValueError: these are not settings for the
+    recipe's free knobs.
     """
     free = {knob.path for knob in free_knobs(recipe)}
     if settings.keys() != free:
@@ -559,7 +539,6 @@ def resolved_recipe(recipe: Recipe, settings: Settings) -> Recipe:
 
 def recipes_to_try(recipe: Recipe) -> list[Recipe]:
     """The recipe with each knob at each value that `settle` may try alone; to compile kernels for.
-
     The recipe itself where there is nothing to choose.
     """
     if not recipe.quality.is_open:
@@ -598,7 +577,7 @@ def _chosen(recipe: Recipe, bench_of: Callable[[Recipe], Bench]) -> _Chosen:
 def _started(
     recipe: Recipe, options: dict[str, tuple[Value, ...]], bench_of: Callable[[Recipe], Bench]
 ) -> Bench:
-    """A bench that has rendered the reference; leaves out of `options` what the scene cannot have."""
+    """A bench with the reference rendered; takes what the scene cannot have out of `options`."""
     while True:
         bench = bench_of(resolved_recipe(recipe, reference_settings(options)))
         try:
@@ -662,10 +641,9 @@ def _options(recipe: Recipe) -> dict[str, tuple[Value, ...]]:
 
 def _is_allowed(recipe: Recipe, path: str, value: Value) -> bool:
     try:
-        with_settings(recipe, {path: value})
+        return with_settings(recipe, {path: value}) is not None
     except ValueError:
         return False
-    return True
 
 
 # ---- A choice of settings, made once for an output and kept in it --------------------------------
@@ -780,11 +758,11 @@ def recorded(store: Store, question: Question) -> Recipe | None:
         _check_values(settings)
         return resolved_recipe(question.recipe, settings)
     except (ValueError, TypeError, KeyError, RecursionError) as error:
-        said = f"{error} is missing" if isinstance(error, KeyError) else str(error)
+        message = f"{error} is missing" if isinstance(error, KeyError) else str(error)
         raise OutputError(
             f"{store.uri}/{question.path}, the settings chosen for recipe {question.recipe.name} "
-            f"in scene {question.scene}, is damaged: {said}. Delete it, and they are chosen anew; "
-            f"images of other settings then have to be overwritten"
+            f"in scene {question.scene}, is damaged: {message}. Delete it, and they are chosen "
+            f"anew; images of other settings then have to be overwritten"
         ) from error
 
 
@@ -792,9 +770,8 @@ def resolve_quality_once(
     store: Store, question: Question, choose: Callable[[], Settled], *, anew: bool = False
 ) -> Recipe:
     """The recipe settled as the output has it; where it has nothing, `choose` chooses, and the
-    choice is kept before anyone sees it. Waits for another process that is choosing.
-
-    anew: choose whatever there is, and keep that in its place.
+    choice is kept before anyone sees it. Waits for another process that is choosing. anew: choose
+    whatever there is, and keep that in its place.
     """
     found = None if anew else recorded(store, question)
     if found is not None:

@@ -61,10 +61,8 @@ _SUFFIX = re.compile(r"\.[A-Za-z0-9]{1,16}")
 
 
 def stored_names(style: Style) -> dict[str, str]:
-    """The name of each of the style's files inside the variant's folder, by field.
-
-    The image keeps its name where that is safe; another file of the same name gets its field's
-    name before its own.
+    """The name of each of the style's files inside the variant's folder, by field. The image keeps
+    its name where that is safe; another file of the same name gets its field's name before its own.
     """
     names: dict[str, str] = {}
     for key, path in style.files.items():
@@ -84,7 +82,7 @@ def portable_recipe(recipe: Recipe) -> Recipe:
 
 
 def check_kept(recipe: Recipe, folders: Collection[Path]) -> None:
-    """Refuse to overwrite the files that the recipe is about to need. folders: to be overwritten."""
+    """Refuse to overwrite (`folders`) files that the recipe is about to need."""
     files = {} if recipe.style is None else recipe.style.files
     for key, path in files.items():
         real = Path(path).resolve()
@@ -97,11 +95,9 @@ def check_kept(recipe: Recipe, folders: Collection[Path]) -> None:
 
 
 def copy_style_files(recipe: Recipe, folder: Path) -> None:
-    """Put the style's files where `portable_recipe` names them. folder: the variant's.
-
-    Raises:
-        RecipeError: they cannot be read or are not those of the recipe's digest.
-        OutputError: they cannot be written.
+    """Put the style's files where `portable_recipe` names them. folder: the variant's. Raises
+    RecipeError: they cannot be read or are not those of the recipe's digest. OutputError: they
+    cannot be written.
     """
     if recipe.style is None or not recipe.style.files:
         return
@@ -167,10 +163,9 @@ class RenderJob:
 @dataclass(frozen=True)
 class JobResult:
     """Counts of images of this job. skipped: finished by earlier runs. failures: one line each.
-
-    manifest: its path. seconds: wall clock. timings: seconds by kind of work, summed over
-    threads and workers (the kinds of `times`), or of the job itself (open, settle, place, style,
-    labels, share, finish). `times.shares_of` says what the job was bound by.
+    manifest: its path. seconds: wall clock. timings: seconds by kind of work, summed over threads
+    and workers (the kinds of `times`), or of the job itself (open, settle, place, style, labels,
+    share, finish). `times.shares_of` says what the job was bound by.
     """
 
     written: int
@@ -360,9 +355,8 @@ class _Run:
             check_kept(recipe, folders)
 
     def _prepare(self, recipes: Collection[Recipe], progress: bool) -> None:
-        """Find what images of these recipes share, for all cameras of the scene or the path.
-
-        Where their snow can lie, and the colour maps of their styles.
+        """Find what images of these recipes share, for all cameras of the scene or the path. Where
+        their snow can lie, and the colour maps of their styles.
         """
         snowy = [recipe for recipe in recipes if snow_to_lay(recipe) is not None]
         styled = [recipe for recipe in recipes if style_to_apply(recipe) is not None]

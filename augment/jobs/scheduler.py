@@ -7,19 +7,11 @@ import time
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from augment.errors import OutputError
 from augment.jobs.block_pools import Event, Lost, WorkerPool
-from augment.jobs.block_worker import (
-    BlockDone,
-    BlockTask,
-    IndexTask,
-    ResolveTask,
-    Result,
-    SettledRecipes,
-    TaskFailed,
-)
+from augment.jobs.block_worker import BlockDone, BlockTask, IndexTask, ResolveTask, TaskFailed
 from augment.jobs.blocks import Block, SceneRecord
 from augment.jobs.manifest import FAILED
 from augment.jobs.worker import Outcome
@@ -28,9 +20,8 @@ from augment.jobs.worker import Outcome
 
 
 class BlockQueue:
-    """Blocks by scene, in order. A worker stays with a scene; a new scene goes to one worker.
-
-    Where no scene is left that nobody works on, a worker joins the one with most images left.
+    """Blocks by scene, in order. A worker stays with a scene; a new scene goes to one worker. Where
+    no scene is left that nobody works on, a worker joins the one with most images left.
     """
 
     def __init__(self, blocks: Iterable[Block]) -> None:
@@ -68,7 +59,7 @@ class BlockQueue:
         self._images[block.scene] = self._images.get(block.scene, 0) + block.images
 
 
-# ---- drive ---------------------------------------------------------------------------------------
+# ---- The scheduler -------------------------------------------------------------------------------
 
 WAIT_S = 1.0
 MAX_LOST = 3  # blocks of a scene whose workers die even alone, before the scene is given up
@@ -94,7 +85,6 @@ class Tally:
 
 class Scheduler:
     """Runs tasks in a pool. on_image: told how many images are done, and how many of them failed.
-
     idle: called now and then between events.
     """
 
@@ -119,42 +109,19 @@ class Scheduler:
     def close(self) -> None:
         self._pool.close()
 
-    def index(
-        self, tasks: Sequence[IndexTask], each: Callable[[IndexTask, SceneRecord | str], None]
-    ) -> None:
-        """Open scenes and tell `each` what is in them, or why that is not known.
-
-        A scene whose worker dies is tried once more, while no other worker is busy.
-        """
-
-        def take(task: IndexTask, result: Result | str) -> None:
-            assert isinstance(result, (SceneRecord, str))
-            each(task, result)
-
-        self._do_first(tasks, take, self._pool.slots)
-
-    def resolve_quality(
+    def do_first(
         self,
-        tasks: Sequence[ResolveTask],
-        each: Callable[[ResolveTask, SettledRecipes | str], None],
+        tasks: Sequence[_First],
+        each: Callable[[_First, Any], None],
         *,
-        one_by_one: bool,
+        one_by_one: bool = False,
     ) -> None:
-        """As `index`, for recipes that have still to choose their settings in a scene.
+        """What comes before the blocks; `each` gets a task's result, or a text that says why there
+        is none. A task whose worker dies is tried once more, while no other worker is busy.
 
         one_by_one: no two at a time, so that none is in the way of another's frame times.
         """
-
-        def take(task: ResolveTask, result: Result | str) -> None:
-            assert isinstance(result, (SettledRecipes, str))
-            each(task, result)
-
-        self._do_first(tasks, take, 1 if one_by_one else self._pool.slots)
-
-    def _do_first(
-        self, tasks: Sequence[_First], each: Callable[[_First, Result | str], None], slots: int
-    ) -> None:
-        """What comes before the blocks: results, or why there is none."""
+        slots = 1 if one_by_one else self._pool.slots
         waiting, alone = deque(tasks), deque[_First]()
         busy: dict[int, _First] = {}
         tried_alone: set[_First] = set()
@@ -185,10 +152,9 @@ class Scheduler:
     def render(
         self, blocks: Sequence[Block], names: dict[str, str | None], fail: FailBlock
     ) -> None:
-        """Render and publish the blocks. names: by scene, what it is called if not by itself.
-
-        fail: records all images of a block as failed. A block whose worker dies is tried once more
-        while no other worker is busy, each of its images in a process of its own.
+        """Render and publish the blocks. names: by scene, what it is called if not by itself. fail:
+        records all images of a block as failed. A block whose worker dies is tried once more while
+        no other worker is busy, each of its images in a process of its own.
         """
         run = _Rendering(self, BlockQueue(blocks), names, fail)
         while run.dispatch():
@@ -212,9 +178,9 @@ class _Rendering:
     """The blocks of one run, and who is at which."""
 
     def __init__(
-        self, driver: Scheduler, queue: BlockQueue, names: dict[str, str | None], fail: FailBlock
+        self, scheduler: Scheduler, queue: BlockQueue, names: dict[str, str | None], fail: FailBlock
     ) -> None:
-        self._driver, self._pool = driver, driver._pool
+        self._scheduler, self._pool = scheduler, scheduler._pool
         self._queue, self._names, self._fail = queue, names, fail
         self._busy: dict[int, BlockTask] = {}
         self._trials: list[Block] = []
@@ -235,7 +201,7 @@ class _Rendering:
         for slot in range(self._pool.slots):
             if slot in self._busy:
                 continue
-            open_scenes = self._driver._open
+            open_scenes = self._scheduler._open
             others = [open_scenes[s] for s in self._busy]
             block = self._queue.take(open_scenes[slot], [name for name in others if name])
             if block is not None:
@@ -247,15 +213,15 @@ class _Rendering:
     def _give(self, slot: int, block: Block, *, is_trial: bool = False) -> None:
         task = BlockTask(block, self._names.get(block.scene), is_trial)
         self._busy[slot] = task
-        self._driver._open[slot] = block.scene
+        self._scheduler._open[slot] = block.scene
         self._pool.give(slot, task)
 
     def collect(self, event: Event) -> None:
         task = self._busy.pop(event.slot)
-        self._driver._partial.pop(event.slot, None)
+        self._scheduler._partial.pop(event.slot, None)
         block = task.block
         if isinstance(event, Lost):
-            self._driver._open[event.slot] = None
+            self._scheduler._open[event.slot] = None
         if _wants_memory(event) and not task.is_trial:
             _log.warning("%s is tried once more, alone: %s", block.key, _why(event))
             self._trials.append(block)
@@ -267,17 +233,19 @@ class _Rendering:
                     self._give_up(other, _lost_twice(event))
         elif isinstance(event.result, TaskFailed):
             _raise_if_output(event.result)
-            self._failed(block, event.result)
+            others = self._queue.take_all(block.scene) if event.result.of_scene else []
+            for failed in (block, *others):
+                self._give_up(failed, event.result.text)
         else:
             assert isinstance(event.result, BlockDone)
             if event.result.is_elsewhere:
                 self._later.append((time.monotonic() + ELSEWHERE_S, block))
             else:
                 self._done(block, event.result)
-        self._driver.report()
+        self._scheduler.report()
 
     def _done(self, block: Block, done: BlockDone) -> None:
-        tally = self._driver.tally
+        tally = self._scheduler.tally
         tally.written += done.written
         tally.skipped += done.skipped
         tally.failed += done.failed
@@ -285,15 +253,9 @@ class _Rendering:
         for kind, seconds in (done.seconds or {}).items():
             tally.seconds[kind] += seconds
 
-    def _failed(self, block: Block, failed: TaskFailed) -> None:
-        self._give_up(block, failed.text)
-        if failed.of_scene:
-            for other in self._queue.take_all(block.scene):
-                self._give_up(other, failed.text)
-
     def _give_up(self, block: Block, message: str) -> None:
         self._fail(block, message)
-        tally = self._driver.tally
+        tally = self._scheduler.tally
         tally.failed += block.images
         tally.failures.append(f"{block.scene}/{block.variant}, {block.images} images: {message}")
 
@@ -319,5 +281,5 @@ def _lost_twice(event: Lost) -> str:
 
 
 def _raise_if_output(failed: TaskFailed) -> None:
-    if failed.is_output:
+    if failed.is_output:  # nothing can be written any more
         raise OutputError(failed.text)

@@ -29,9 +29,8 @@ class Progress:
 @dataclass(frozen=True)
 class JobStatus:
     """staged: images that are finished in blocks that are not published, on this machine.
-
-    images_per_s: of the last blocks together, None where too few tell. claims: blocks that
-    somebody works on.
+    images_per_s: of the last blocks together, None where too few tell. claims: blocks that somebody
+    works on.
     """
 
     job: str

@@ -177,7 +177,6 @@ class LocalStore:
 
     def put_files(self, files: Mapping[str, Path]) -> None:
         """As put_file, for files that are durable already; each folder is flushed once, at the end.
-
         files: the local file by its path here.
         """
         placed = {self._file(path): source for path, source in files.items()}
@@ -336,10 +335,8 @@ class RemoteUri:
         return text
 
     def open(self, timeout_s: float) -> FileSystem:
-        """A new file system whose root is the URI's folder; it does not try again by itself.
-
-        Raises:
-            OSError: there is no such bucket, no answer ...; others of pyarrow.
+        """A new file system whose root is the URI's folder; it does not try again by itself. Raises
+        OSError: there is no such bucket, no answer ...; others of pyarrow.
         """
         from pyarrow.fs import FileSystem, FileType, SubTreeFileSystem
 
@@ -475,10 +472,9 @@ _T = TypeVar("_T")
 
 @dataclass(frozen=True)
 class Patience:
-    """How failures that pass (timeouts, lost connections, 500, 503) are waited out.
-
-    Before attempt n + 1 it waits a random time up to first_wait_s * 2^(n - 1), at most
-    longest_wait_s. One request may stand still for timeout_s.
+    """How failures that pass (timeouts, lost connections, 500, 503) are waited out. Before attempt
+    n + 1 it waits a random time up to first_wait_s * 2^(n - 1), at most longest_wait_s. One request
+    may stand still for timeout_s.
     """
 
     attempts: int = 6

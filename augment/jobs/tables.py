@@ -51,12 +51,9 @@ def column_type(column: np.ndarray) -> str:
 
 def pack_column(pieces: Sequence[np.ndarray], *, where: str) -> PackedColumn:
     """Join columns of one meaning (one per frame, say) into one Arrow column, a chunk a piece.
-
     pieces: each [n] or [n, k]. where: names the column in errors. Pieces of different Arrow types
-    are all stored as JSON, one text an entry.
-
-    Raises:
-        ValueError: a value cannot be stored such that reading gives it back exactly.
+    are all stored as JSON, one text an entry. Raises ValueError: a value cannot be stored such that
+    reading gives it back exactly.
     """
     plain = [_to_arrow(piece) for piece in pieces]
     # Empty pieces have no say: a frame without boxes often has columns of another dtype.
@@ -77,22 +74,14 @@ def check_count(table: pa.Table, described: int) -> None:
 
 
 def whole(value: object) -> int:
-    """A number of JSON that int64 holds.
-
-    Raises:
-        ValueError: it is anything else.
-    """
+    """A number of JSON that int64 holds. Raises ValueError: it is anything else."""
     if type(value) is not int or not -(2**63) <= value < 2**63:
         raise ValueError(f"expected a whole number; got {value!r:.80}")
     return value
 
 
 def texts_of(data: pa.ChunkedArray) -> list[str]:
-    """The texts of a column without gaps.
-
-    Raises:
-        ValueError: it holds anything else.
-    """
+    """The texts of a column without gaps. Raises ValueError: it holds anything else."""
     if not pa.types.is_string(data.type) or data.null_count:
         raise ValueError(f"expected texts; got {data.type} with {data.null_count} nulls")
     return data.to_pylist()
@@ -139,7 +128,6 @@ def parquet_bytes(table: pa.Table, metadata: dict[str, object]) -> bytes:
 
 def read_table(source: Path | bytes, where: str, columns: Sequence[str] | None = None) -> pa.Table:
     """The table in a Parquet file from anybody: columns of Arrow's own types, valid throughout.
-
     where: the file, for errors. columns: only those of these that it has.
     """
     with _opened(source, where) as file:
@@ -212,12 +200,11 @@ def _opened(source: Path | bytes, where: str) -> Iterator[pq.ParquetFile]:
 
 
 def _has_extension_types(file: pa.NativeFile) -> bool:
-    """Whether the Arrow schema in a Parquet file's footer names an extension type.
-
-    As a file is opened, Arrow hands what it says of such a type to whatever this process has
-    registered under the type's name; some unpickle it, as pyarrow's own did up to 14.0.0. So the
-    footer is searched beforehand, unparsed, for the schema: it is base64, and bytes before it may
-    look as if they belonged to it.
+    """Whether the Arrow schema in a Parquet file's footer names an extension type. As a file is
+    opened, Arrow hands what it says of such a type to whatever this process has registered under
+    the type's name; some unpickle it, as pyarrow's own did up to 14.0.0. So the footer is searched
+    beforehand, unparsed, for the schema: it is base64, and bytes before it may look as if they
+    belonged to it.
     """
     size = file.size()
     file.seek(max(0, size - 8))
@@ -300,9 +287,8 @@ _VECTORS = {
 
 @dataclass(frozen=True, eq=False)
 class FrameBoxes:
-    """The boxes of one frame and the frame's reference time.
-
-    instances: uint16 [B], the objects' numbers (`augment.boxes`); None in older files.
+    """The boxes of one frame and the frame's reference time. instances: uint16 [B], the objects'
+    numbers (`augment.boxes`); None in older files.
     """
 
     timestamp_ns: int
@@ -311,9 +297,8 @@ class FrameBoxes:
 
 
 def lidar_bytes(sweep: LidarSweep, *, note: str | None = None) -> bytes:
-    """The sweep as a Parquet file: the source's columns, in its order.
-
-    note: kept beside them for `read_lidar_note`.
+    """The sweep as a Parquet file: the source's columns, in its order. note: kept beside them for
+    `read_lidar_note`.
     """
     columns, kinds = {}, {}
     for name, column in sweep.columns.items():
@@ -342,10 +327,9 @@ def read_lidar_note(path: Path) -> str | None:
 
 
 def boxes_bytes(frames: Mapping[int, FrameBoxes]) -> bytes:
-    """All boxes of the frames as one Parquet file, one row a box, ordered by frame.
-
-    The dataset's further columns are `attribute_<name>`, null in frames that lack them. A note in
-    the metadata lists every frame, so that one without boxes differs from one that was not asked.
+    """All boxes of the frames as one Parquet file, one row a box, ordered by frame. The dataset's
+    further columns are `attribute_<name>`, null in frames that lack them. A note in the metadata
+    lists every frame, so that one without boxes differs from one that was not asked.
     """
     order = sorted(frames)
     listed = [frames[index].boxes for index in order]

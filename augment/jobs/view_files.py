@@ -41,7 +41,6 @@ class Written:
 
 def check_view(view: View, camera: Camera, recipe: Recipe) -> None:
     """Raise ValueError unless the view has the camera's size and the buffers the recipe asks for.
-
     camera: at the written resolution.
     """
     output, weather = recipe.output, recipe.weather
@@ -80,11 +79,9 @@ def _check_fact(fact: str, is_given: bool, effect: str, is_wanted: bool) -> None
 
 
 def write_view(out_dir: Path, paths: ItemPaths, view: View, recipe: Recipe) -> Written:
-    """Encode and write all files of a view that `check_view` has passed.
-
-    Raises:
-        ValueError: a buffer has another type or shape than View says.
-        OutputError: the system refused; no partial file is left.
+    """Encode and write all files of a view that `check_view` has passed. Raises ValueError: a
+    buffer has another type or shape than View says. OutputError: the system refused; no partial
+    file is left.
     """
     started = time.perf_counter()
     files: dict[str, bytes] = {}
@@ -112,10 +109,9 @@ def write_view(out_dir: Path, paths: ItemPaths, view: View, recipe: Recipe) -> W
 
 
 class WritePump:
-    """Runs writes on threads beside the renderer, with few waiting: memory stays bounded.
-
-    OpenCV's encoders and file writes release the GIL, so they overlap with rendering. The first
-    exception of a task stops the pump: `submit` and `close` raise it.
+    """Runs writes on threads beside the renderer, with few waiting: memory stays bounded. OpenCV's
+    encoders and file writes release the GIL, so they overlap with rendering. The first exception of
+    a task stops the pump: `submit` and `close` raise it.
     """
 
     def __init__(self, threads: int = 2, waiting: int = 4) -> None:
@@ -127,11 +123,10 @@ class WritePump:
 
     @staticmethod
     def beside(backend: str, cores: int) -> WritePump:
-        """For pictures that `backend` draws in a process that has so many cores.
-
-        A CPU backend draws on the same cores, so two threads do. A GPU leaves all cores free, and
-        draws faster than one of them can encode. Two pictures more than threads wait, so that none
-        is idle while one is handed over.
+        """For pictures that `backend` draws in a process that has so many cores. A CPU backend
+        draws on the same cores, so two threads do. A GPU leaves all cores free, and draws faster
+        than one of them can encode. Two pictures more than threads wait, so that none is idle while
+        one is handed over.
         """
         return WritePump(cores, cores + 2) if renders_on_gpu(backend) else WritePump()
 
@@ -155,9 +150,8 @@ class WritePump:
         return future
 
     def after(self, future: Future, task: Callable[[], Any]) -> None:
-        """Run a short task as soon as `future` is done: now, or in the thread that is at it.
-
-        So no thread waits for another one's task.
+        """Run a short task as soon as `future` is done: now, or in the thread that is at it. So no
+        thread waits for another one's task.
         """
 
         def run(_: Future) -> None:
@@ -193,9 +187,8 @@ def label_view(
     recipe: Recipe,
 ) -> tuple[View, BoxWeather]:
     """One of a frame's images with the frame's boxes: in the instance image those that have no
-    actor, too; and what is measured of them, where labels are written.
-
-    camera: at the written resolution. view: one that `check_view` has passed.
+    actor, too; and what is measured of them, where labels are written. camera: at the written
+    resolution. view: one that `check_view` has passed.
     """
     measured: BoxWeather = {}
     if recipe.output.labels:

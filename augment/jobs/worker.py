@@ -103,10 +103,9 @@ class WorkTimes:
 
 @dataclass(frozen=True)
 class Shares:
-    """Parts of a job's time, 0 to 1.
-
-    Of the workers' time: rendering; awaiting, of that, views in flight; held, waiting for files;
-    beside, all else, and the greatest part of it. Of the writing threads' time: writing, by kind.
+    """Parts of a job's time, 0 to 1. Of the workers' time: rendering; awaiting, of that, views in
+    flight; held, waiting for files; beside, all else, and the greatest part of it. Of the writing
+    threads' time: writing, by kind.
     """
 
     rendering: float
@@ -136,9 +135,8 @@ class Shares:
 
 
 def shares_of(seconds: Mapping[str, float], held_up: int = 1) -> Shares | None:
-    """The shares of a job's seconds by kind of work; None where nothing was rendered.
-
-    held_up: how many workers there are while the job itself does other work than rendering.
+    """The shares of a job's seconds by kind of work; None where nothing was rendered. held_up: how
+    many workers there are while the job itself does other work than rendering.
     """
     whole, writers = seconds.get(WORKERS, 0.0), seconds.get(WRITERS, 0.0)
     if not (seconds.get(RENDER) and whole and writers):
@@ -187,11 +185,10 @@ class Pending(Protocol):
 
 @dataclass(frozen=True)
 class Setup:
-    """What rendering needs besides the scene; small, and picklable.
-
-    camera_path: JSON of `trajectory`, or None for the scene's frames. labelled: numbers of the
-    frames whose labels and LiDAR pass through. instances: of the scene's objects. beds: where the
-    recipes' snow can lie; the scene to render remembers them. maps: those of the recipes' styles.
+    """What rendering needs besides the scene; small, and picklable. camera_path: JSON of
+    `trajectory`, or None for the scene's frames. labelled: numbers of the frames whose labels and
+    LiDAR pass through. instances: of the scene's objects. beds: where the recipes' snow can lie;
+    the scene to render remembers them. maps: those of the recipes' styles.
     """
 
     out_dir: str
@@ -249,9 +246,8 @@ def default_renderer() -> Renderer:
 
 
 def job_renderer(backend: str) -> Renderer:
-    """The library's own for a job: on a GPU it begins views and does not wait for them.
-
-    On the CPU a begun view would be a finished one, whose files would come a view too late.
+    """The library's own for a job: on a GPU it begins views and does not wait for them. On the CPU
+    a begun view would be a finished one, whose files would come a view too late.
     """
     from augment.views import begin_view, render_view
 
@@ -269,11 +265,10 @@ class _Drawn:
 
 
 class FrameRunner:
-    """Renders chunks in this thread, writes on others, and tells `deliver` of each image.
-
-    Where the renderer returns pending views, the next is begun before the last is waited for, so
-    that a GPU has work while its pictures come back. deliver: called from the writing threads, once
-    the image's files are on the disk. An error of the scene or the renderer concerns one image; an
+    """Renders chunks in this thread, writes on others, and tells `deliver` of each image. Where the
+    renderer returns pending views, the next is begun before the last is waited for, so that a GPU
+    has work while its pictures come back. deliver: called from the writing threads, once the
+    image's files are on the disk. An error of the scene or the renderer concerns one image; an
     OutputError or GpuLost ends the run, since the next image would fail too.
     """
 

@@ -303,15 +303,3 @@ def test_files_changed_at_random_run_nothing_and_give_our_errors(tmp_path):
             path.write_bytes(mutated(data, rng))
             with nothing_runs(path), suppress(AdapterError, PickleError):
                 read(path)
-
-
-def test_the_real_tables_changed_at_random_run_nothing(tmp_path, shared_dir):
-    source = shared_dir / "data" / "pandaset_mini" / "002" / "annotations" / "cuboids" / "00.pkl.gz"
-    if not source.is_file():
-        pytest.skip(f"no PandaSet sequence at {source}")
-    rng, path = np.random.default_rng(12), tmp_path / "cuboids.pkl"
-    data = gzip.decompress(source.read_bytes())
-    for _ in range(MUTATIONS):
-        path.write_bytes(mutated(data, rng))
-        with nothing_runs(path), suppress(AdapterError):
-            read_frame(path)

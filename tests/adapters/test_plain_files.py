@@ -6,7 +6,6 @@ import os
 import re
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
@@ -15,14 +14,7 @@ from adapters.camera_files.camera_files import read_views
 from adapters.drivestudio.drive import read_config as drivestudio_config
 from adapters.lidar_scene.image_views import read_image
 from adapters.nuscenes.tables import read_rows
-from adapters.plain_files import (
-    decode_image,
-    inside,
-    read_image_size,
-    read_json,
-    read_numbers,
-    read_pose,
-)
+from adapters.plain_files import inside, read_image_size, read_json, read_numbers, read_pose
 from adapters.recording.labels import read_sweep
 from adapters.safe_pickle import read_array, read_frame
 from adapters.street_gaussians.model import read_config as street_gaussians_config
@@ -206,15 +198,3 @@ def test_pipes_inside_datasets_are_faults_of_theirs(tmp_path, ends_soon):
     picture = tmp_path / "pipe.png"
     assert read_image(picture, 1.0) is None
     assert read_image_size(picture) == "cannot be read (a pipe or device, not a regular file)"
-
-
-def test_pictures_are_decoded_as_opencv_does(tmp_path):
-    rng = np.random.default_rng(0)
-    for suffix, kind in (("jpg", np.uint8), ("png", np.uint16)):
-        path = tmp_path / f"picture.{suffix}"
-        cv2.imwrite(str(path), rng.integers(0, 255, (37, 53, 3)).astype(kind))
-        for flags in (cv2.IMREAD_COLOR, cv2.IMREAD_UNCHANGED, cv2.IMREAD_REDUCED_COLOR_4):
-            assert np.array_equal(decode_image(path, flags), cv2.imread(str(path), flags))
-    for text in (b"", b"no picture"):
-        path.write_bytes(text)
-        assert decode_image(path, cv2.IMREAD_COLOR) is None

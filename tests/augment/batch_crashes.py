@@ -24,12 +24,12 @@ from fork_server import keep_in_forks, start_fork_server
 
 from augment.effects.snow import support as beds
 from augment.jobs.atomic import TEMPORARY_SUFFIX
-from augment.jobs.layout import STATE_FOLDER
 from augment.jobs.job_state import ProgressLog
+from augment.jobs.layout import STATE_FOLDER
 from augment.jobs.render_job import RenderJob, run_job
 from recipes.weather import Flood, Snow
 
-STRIDE = 27  # odd, so that kills come before and after calls; 1 tries every point
+STRIDE = 71  # odd, so that kills come before and after calls; 1 tries every point
 SYNC_POINTS = ("fsync", "replace", "unlink", "rename", "rmdir")
 
 
@@ -146,7 +146,7 @@ def sweep_fresh(folder: Path) -> dict[str, int]:
     whole = tree_digest(folder / "whole")
     kills, last = 0, 2 * uninterrupted.points
     # The end, where journals become the manifest, is tried more closely.
-    for kill_at in [*range(1, last - 30, STRIDE), *range(last - 30, last, 5)]:
+    for kill_at in [*range(1, last - 30, STRIDE), *range(last - 30, last, 11)]:
         out = folder / "killed"
         ended = run_forked(render(job(out)), kill_at)
         # Threads meet the points in another order each time, so the last may not be reached.
@@ -165,7 +165,7 @@ def sweep_snow(folder: Path) -> dict[str, int]:
     whole = tree_digest(folder / "whole" / "street")
     kills = 0
     # Just before each of the first calls: after one, nothing differs until the next is at hand.
-    for kill_at in range(1, 25, 2):
+    for kill_at in range(1, 25, 6):
         out = folder / "killed"
         kills += run_forked(render(snowy_job(out)), kill_at).code == -signal.SIGKILL
         check_only_whole_files(out / "street", whole, f"killed at {kill_at}")
@@ -185,7 +185,7 @@ def sweep_overwrite(folder: Path) -> dict[str, int]:
     old, whole = tree_digest(folder / "old"), tree_digest(folder / "whole")
     kills = 0
     # All that an overwriting run does before it renders is within its first 30 changes.
-    for kill_at in [*range(1, 60, 7), *range(61, 140, STRIDE)]:
+    for kill_at in [*range(1, 60, 13), 100]:
         out = folder / "killed"
         shutil.copytree(folder / "old", out)
         ended = run_forked(render(job(out, frames=1, overwrite=True)), kill_at)
@@ -227,7 +227,7 @@ def kill_at_random(folder: Path) -> dict[str, int]:
 
 def stop_a_job_with_workers(folder: Path) -> dict[str, int]:
     """Press Ctrl-C on a job with two workers, run it again, kill its process alone, resume."""
-    run_forked(render(job(folder / "whole", frames=30)))
+    run_forked(render(job(folder / "whole", frames=16)))
     out, printed = folder / "stopped", folder / "stderr"
     child = start_with_workers(out, printed)
     wait_for_finished(out, 3)
@@ -244,7 +244,7 @@ def stop_a_job_with_workers(folder: Path) -> dict[str, int]:
     os.waitpid(child, 0)
     finished = count_finished(out)
     whole = tree_digest(folder / "whole")
-    resume_and_compare(job(out, frames=30), out, whole, finished, "parent killed")
+    resume_and_compare(job(out, frames=16), out, whole, finished, "parent killed")
     return {"finished": finished}
 
 
@@ -256,7 +256,7 @@ def start_with_workers(out: Path, printed: Path) -> int:
         with printed.open("w") as file:
             os.dup2(file.fileno(), 2)
         try:
-            render(job(out, frames=30, workers=2), slow_render)()
+            render(job(out, frames=16, workers=2), slow_render)()
         except KeyboardInterrupt as stopped:
             os.write(2, f"{stopped}\n".encode())
             os._exit(130)

@@ -53,7 +53,6 @@ from augment.jobs.tables import lidar_bytes
 CHANGES = ("fsync", "replace", "unlink", "rename", "rmdir", "link", "mkdir")
 DISK_FULL, INTERRUPTED = 28, 130
 SCENARIOS: list[Callable[[Path], dict]] = []
-_write = os.write
 
 
 def scenario(function: Callable[[Path], dict]) -> Callable[[Path], dict]:
@@ -216,7 +215,7 @@ def require(holds: bool, message: str) -> None:
 
 
 @scenario
-def kill_the_driver(folder: Path, kills: int = 50, seed: int = 3) -> dict:
+def kill_the_driver(folder: Path, kills: int = 12, seed: int = 3) -> dict:
     """Kill one serial driver after the other, around changes of the disk and at random times."""
     rng, met, rounds = random.Random(seed), 0, 0
     whole, seen = whole_of(folder, lambda out: make_job(out)), set()
@@ -249,7 +248,7 @@ def fill_the_disk(folder: Path) -> dict:
     """Let the disk be full after ever more writes; free it, and go on."""
     whole = whole_of(folder, lambda out: make_job(out))
     failures = 0
-    for calls in range(0, 1000, 20):
+    for calls in range(0, 1000, 60):
         out = folder / "full"
         code = end_of(fork(generating(make_job(out)), full_disk(calls)))
         require(code in (0, DISK_FULL), f"full after {calls} calls: exit code {code}")
@@ -290,7 +289,7 @@ def run_several_drivers(folder: Path) -> dict:
 
 
 @scenario
-def kill_workers(folder: Path, kills: int = 4, seed: int = 1) -> dict:
+def kill_workers(folder: Path, kills: int = 2, seed: int = 1) -> dict:
     """Kill workers and drivers of a job with processes, at random times, until it gets through."""
     rng, workers_killed, drivers_killed, runs = random.Random(seed), 0, 0, 0
     scenes = ("fake:a?frames=5", "fake:b?frames=4")

@@ -21,9 +21,9 @@ from augment.cameras import Camera
 from augment.errors import OutputError
 from augment.jobs.block_worker import WorkSetup
 from augment.jobs.generate import GenerateJob
+from augment.jobs.job_state import ProgressLog
 from augment.jobs.layout import STATE_FOLDER
 from augment.jobs.manifest import read_finished
-from augment.jobs.job_state import ProgressLog
 from augment.jobs.store import open_store
 from augment.scene import Scene
 from recipes.job import Job, JobRecipes, JobScene
@@ -31,7 +31,6 @@ from recipes.parse import parse_recipe
 from recipes.schema import Recipe
 
 NOTES = "CLIMATEGS_TEST_NOTES"
-CHAOS = "CLIMATEGS_TEST_CHAOS"  # how likely a worker dies at an image
 
 FOG = "weather: {smog: {visibility_m: {uniform: [20, 200]}}}\n"
 WET = "weather: {flood: {level_m: {uniform: [0.1, 0.5]}}}\noutput: {image: jpg, depth: none}\n"

@@ -11,9 +11,14 @@ from pathlib import Path
 
 import pytest
 
-from augment.jobs.atomic import replaced_folder
 from augment.jobs import atomic
-from augment.jobs.atomic import TEMPORARY_SUFFIX, remove_temporaries, replaced_file, write_atomic
+from augment.jobs.atomic import (
+    TEMPORARY_SUFFIX,
+    remove_temporaries,
+    replaced_file,
+    replaced_folder,
+    write_atomic,
+)
 from augment.jobs.mirror_files import copy_file
 from augment.jobs.store import LocalStore
 

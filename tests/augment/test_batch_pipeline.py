@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import sys
 import threading
 import time
 from dataclasses import dataclass, field
@@ -18,7 +17,6 @@ from pretend_gpu import pretended_gpu
 
 from augment.errors import GpuLost, OutputError
 from augment.jobs import worker as runner
-from augment.jobs.backends import gpu_is_lost
 from augment.jobs.manifest import read_manifest
 from augment.jobs.render_job import JobResult, RenderJob, run_job
 from augment.jobs.view_files import WritePump
@@ -91,16 +89,6 @@ def test_a_lost_gpu_ends_the_run_and_fails_no_image(tmp_path: Path, monkeypatch,
     result = run(job)
     assert (result.written, result.skipped, result.failed) == (5, 3, 0)
     assert tree_digest(tmp_path) == whole
-
-
-def test_a_gpu_that_nobody_has_used_is_not_lost(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail() -> None:
-        raise RuntimeError("CUDA error")
-
-    assert not gpu_is_lost("cuda") and not gpu_is_lost("cpu")
-    monkeypatch.setattr("torch.cuda.is_initialized", lambda: True)
-    monkeypatch.setattr("torch.cuda.synchronize", fail)
-    assert gpu_is_lost("cuda") and not gpu_is_lost("cpu")
 
 
 def test_an_interrupt_lands_what_is_in_flight(tmp_path: Path, whole) -> None:
@@ -203,28 +191,6 @@ def test_no_more_views_wait_than_memory_is_meant_for(tmp_path: Path, monkeypatch
     recipe = make_recipe(lidar=False)
     run(RenderJob("fake:street?frames=20", [recipe], tmp_path), counting)
     assert held[0] == 0 and most[0] <= 5  # four in the pump, and the one that is handed over
-
-
-def test_threads_that_write_beside_a_gpu() -> None:
-    pump = WritePump.beside("cuda", 16)
-    assert pump.threads == 16
-    pump.close()
-    assert WritePump.beside("cpu", 16).threads == 2 and WritePump.beside("auto", 1).threads == 2
-
-
-@pytest.mark.parametrize(("backend", "turn_s"), [("cuda", 0.0005), ("cpu", 0.005)])
-def test_threads_take_turns_quickly_beside_a_gpu(tmp_path, backend: str, turn_s: float) -> None:
-    turns = []
-
-    def render(*arguments, **options):
-        turns.append(sys.getswitchinterval())
-        return fake_render(*arguments, **options)
-
-    before = sys.getswitchinterval()
-    assert before == pytest.approx(0.005)
-    run(RenderJob("fake:s", [make_recipe()], tmp_path, frames=[0], backend=backend), render)
-    assert turns == pytest.approx([turn_s, turn_s])
-    assert sys.getswitchinterval() == before
 
 
 def test_what_fails_after_a_task_stops_the_pump() -> None:

@@ -28,9 +28,9 @@ def test_killed_jobs_resume_to_identical_files(quick_folder: Path) -> None:
     )
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
-    assert found["sweep_fresh"]["kills"] >= 8
-    assert found["sweep_snow"]["kills"] >= 10
-    assert found["sweep_overwrite"]["kills"] >= 8
+    assert found["sweep_fresh"]["kills"] >= 4
+    assert found["sweep_snow"]["kills"] >= 3
+    assert found["sweep_overwrite"]["kills"] >= 4
     assert found["kill_at_random"]["kills"] >= 1
     assert found["stop_a_job_with_workers"]["finished"] >= 3
 

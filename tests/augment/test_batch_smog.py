@@ -11,7 +11,6 @@ import pytest
 from batch_scenes import (
     ORIGIN_M,
     FakeLabels,
-    FakeView,
     fake_render,
     make_recipe,
     must_not_render,
@@ -76,7 +75,7 @@ def test_boxes_have_their_numbers_beside_the_labels(whole: Path) -> None:
         assert smoggy is not None
         got = box_transmittance(boxes, ORIGIN_M, camera, smoggy.medium, smoggy.surface_depth_m)
         assert row["track_id"] == boxes.track_ids[k]
-        assert (row["transmittance"], row["pixels"]) == (got["transmittance"][k], got["pixels"][k])
+        assert (row["transmittance"], row["pixels"]) == (got.transmittance[k], got.pixels[k])
         seen, estimated = seen + (row["pixels"] > 0), estimated + (row["pixels"] == 0)
     assert seen and estimated
     for row in read_manifest(whole).to_pylist():
@@ -91,42 +90,6 @@ def test_without_density_all_comes_through_and_without_smog_nothing_is_said(tmp_
     assert not (tmp_path / "street/clear-000/labels/smog.parquet").exists()
     paths = {row["variant"]: row["box_smog_path"] for row in read_manifest(tmp_path).to_pylist()}
     assert paths == {"fog-000": TABLE.as_posix(), "clear-000": None}
-
-
-@pytest.mark.parametrize(
-    ("uri", "output"), [("fake:street?unlabelled=1", {}), ("fake:street", {"labels": False})]
-)
-def test_without_labels_there_is_nothing(tmp_path: Path, uri: str, output: dict) -> None:
-    job = RenderJob(uri, [make_recipe(**output)], tmp_path)
-    assert run(job).failed == 0
-    assert not (tmp_path / FOLDER / "labels").exists()
-    assert set(read_manifest(tmp_path)["box_smog_path"].to_pylist()) == {None}
-    assert run(job, must_not_render).skipped == 8
-
-
-@pytest.mark.parametrize(("shown", "drawn"), [("fog", "clear"), ("clear", "fog")])
-def test_a_view_that_breaks_its_promise_is_recorded(tmp_path, shown: str, drawn: str) -> None:
-    def render(scene, camera, recipe, *, backend) -> FakeView:
-        return fake_render(scene, camera, make_recipe(drawn), backend=backend)
-
-    result = run(RenderJob("fake:s", [make_recipe(shown)], tmp_path, frames=[1]), render)
-    says = {"fog": "no smog density for a recipe with", "clear": "a smog density for a recipe w"}
-    assert result.failed == 2 and says[shown] in result.failures[0]
-
-
-def test_parts_in_any_order_give_the_files_of_one_run(whole: Path, tmp_path: Path) -> None:
-    run(in_fog(out=tmp_path, frames=[3, 1], cameras=["rear/left"]))
-    assert len(TABLES["box_smog"].read(tmp_path / TABLE)) == 2
-    assert run(in_fog(out=tmp_path)).skipped == 2
-    assert tree_digest(tmp_path) == tree_digest(whole)
-
-
-def test_a_lost_table_is_made_again(whole: Path, tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    shutil.copytree(whole, out)
-    (out / TABLE).unlink()
-    assert run(in_fog(out=out)).written == 8
-    assert tree_digest(out) == tree_digest(whole)
 
 
 def test_a_finished_folder_of_before_stays_as_it_is(older: Path) -> None:

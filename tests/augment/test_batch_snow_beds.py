@@ -25,7 +25,7 @@ from augment.dataset import SceneDataset
 from augment.effects.snow import support as beds
 from augment.effects.snow.placement import PlacementSettings
 from augment.errors import OutputError, SceneError
-from augment.jobs.prepare import snow_to_lay, store_beds
+from augment.jobs.prepare import store_beds
 from augment.jobs.render_job import JobResult, RenderJob, run_job
 from recipes.schema import Recipe
 from recipes.weather import Snow
@@ -84,42 +84,11 @@ def test_a_bed_is_found_for_all_cameras_before_any_file(placements, tmp_path: Pa
     assert len(placements) == 2
 
 
-def test_snow_of_one_kind_shares_a_bed(placements, tmp_path: Path) -> None:
-    recipes = [
-        snowy(0.1, 0), snowy(0.4, 1, coverage=0.5), snowy(0.1, 2, cell_m=0.1),
-        snowy(0.1, 3, max_slope_deg=30),
-    ]  # fmt: skip
-    run(RenderJob("fake:street", recipes, tmp_path, frames=[0]))
-    assert [(s.cell_m, s.max_slope_deg) for s, _ in placements] == [
-        (0.05, 50),
-        (0.1, 50),
-        (0.05, 30),
-    ]
-    assert len(list((tmp_path / ".climategs").glob("snow-*"))) == 3
-
-
 def test_another_depth_finds_the_bed_in_its_file(placements, tmp_path: Path) -> None:
     run(RenderJob("fake:street", [snowy(0.1)], tmp_path))
     placements.before = pytest.fail
     result = run(RenderJob("fake:street", [snowy(0.3, 1)], tmp_path), bed_render)
     assert (result.written, result.failures) == (8, ())
-
-
-@pytest.mark.parametrize("snow", [None, Snow(depth_m=0), Snow(depth_m=0.2, coverage=0)])
-def test_without_snow_there_is_no_search(placements, tmp_path: Path, snow) -> None:
-    placements.before = pytest.fail
-    result = run(RenderJob("fake:street", [make_recipe(snow=snow)], tmp_path))
-    assert result.written == 8 and "place" not in result.timings
-    assert snow_to_lay(make_recipe(snow=snow)) is None
-
-
-def test_a_finished_job_searches_for_nothing(placements, tmp_path: Path) -> None:
-    job = RenderJob("fake:street", [snowy()], tmp_path)
-    run(job)
-    (bed,) = (tmp_path / ".climategs").glob("snow-*")
-    bed.unlink()
-    placements.before = pytest.fail
-    assert run(job).skipped == 8
 
 
 def test_where_there_can_be_no_snow_nothing_is_written_or_replaced(

@@ -28,7 +28,7 @@ from augment.effects.style import style as scene_maps
 from augment.errors import OutputError, StyleError
 from augment.jobs.manifest import read_manifest
 from augment.jobs.prepare import store_maps, style_to_apply
-from augment.jobs.render_job import JobResult, RenderJob, portable_recipe, run_job, stored_names
+from augment.jobs.render_job import JobResult, RenderJob, run_job, stored_names
 from recipes.errors import RecipeError
 from recipes.files import with_digest
 from recipes.load import load_recipe
@@ -111,12 +111,6 @@ def test_a_style_that_changes_nothing_needs_no_maps(searches, tmp_path: Path, st
     result = run(RenderJob("fake:street", [make_recipe(style=style)], tmp_path))
     assert result.written == 8 and "style" not in result.timings
     assert style_to_apply(make_recipe(style=style)) is None
-
-
-def test_a_finished_job_works_nothing_out(searches, tmp_path: Path) -> None:
-    run(RenderJob("fake:street", [styled()], tmp_path))
-    searches.before = pytest.fail
-    assert run(RenderJob("fake:street", [styled()], tmp_path)).skipped == 8
 
 
 def test_a_camera_path_has_maps_of_its_own_however_many_styles(searches, tmp_path: Path) -> None:
@@ -254,11 +248,6 @@ def test_unsafe_names_become_safe_ones_and_then_stay(name: str) -> None:
     assert stored_names(Style(image=f"/out/{first}"))["image"] == first
     other = stored_names(Style(image=f"/photos/x{name}"))["image"]
     assert other != first
-
-
-def test_a_recipe_without_files_is_dumped_as_it_is() -> None:
-    for recipe in (make_recipe(), styled()):
-        assert portable_recipe(recipe) is recipe
 
 
 def test_a_picture_under_another_name_is_the_same_style(searches, tmp_path: Path) -> None:

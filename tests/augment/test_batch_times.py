@@ -6,12 +6,12 @@ import time
 from pathlib import Path
 
 import pytest
-from batch_scenes import fake_render, make_recipe, open_fake
+from batch_scenes import make_recipe, open_fake
 from pending_views import Gpu
 
 from augment.jobs.files import encode_image
 from augment.jobs.render_job import RenderJob, run_job
-from augment.jobs.worker import Shares, WorkTimes, shares_of
+from augment.jobs.worker import Shares, shares_of
 
 # 10 s of one worker with two writing threads.
 SECONDS = {"workers": 10.0, "renderers": 10.0, "writers": 20.0, "render": 9.0, "held": 0.5}
@@ -43,32 +43,6 @@ def test_shares_are_of_all_workers_from_begin_to_end() -> None:
     assert shares.rendering == 0.6 and shares.held == 0.1
     assert shares.beside == pytest.approx(0.3)
     assert shares.writing["encoding"] == 0.5  # of four threads' 10 s
-
-
-def test_the_sentence() -> None:
-    shares = bound(render=6.0, held=3.0, **{"await": 2.0}, encode=15.0, write=3.0, open=0.75)
-    assert shares.sentence == (
-        "bound by encoding: rendering 60 % of the time (20 % for views in flight), waiting for "
-        "files 30 %, other work 10 %, first of all opening scenes; writing threads 90 % busy "
-        "(encoding 75 %, writing to disk 15 %, boxes 0 %, LiDAR 0 %)"
-    )
-
-
-def test_nothing_is_said_where_nothing_was_rendered(tmp_path: Path) -> None:
-    assert shares_of({}) is None and shares_of({"workers": 3.0, "finish": 0.1}) is None
-    job = RenderJob("fake:street", [make_recipe()], tmp_path)
-    run_job(job, scene_loader=open_fake, renderer=fake_render, progress=False)
-    again = run_job(job, scene_loader=open_fake, renderer=fake_render, progress=False)
-    assert again.skipped == 8 and shares_of(again.timings) is None
-
-
-def test_time_that_ends_with_an_exception_counts() -> None:
-    times = WorkTimes()
-    with pytest.raises(ValueError, match="x"), times.spent("render", "await"):
-        time.sleep(0.01)
-        raise ValueError("x")
-    spent = times.so_far()
-    assert spent["render"] >= 0.01 and spent["await"] >= 0.01
 
 
 @pytest.mark.parametrize("slow", ["rendering", "encoding"])

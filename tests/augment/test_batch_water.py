@@ -126,18 +126,6 @@ def test_images_without_boxes_are_listed(whole: Path) -> None:
     assert len(water) == 8
 
 
-@pytest.mark.parametrize(
-    ("uri", "output"), [("fake:street?unlabelled=1", {}), ("fake:street", {"labels": False})]
-)
-def test_without_labels_there_is_only_the_mask(tmp_path: Path, uri: str, output: dict) -> None:
-    assert run(RenderJob(uri, [make_recipe(flood=FLOOD, **output)], tmp_path)).failed == 0
-    rows = read_manifest(tmp_path).to_pylist()
-    assert all(row["water_path"] and row["box_water_path"] is None for row in rows)
-    assert not (tmp_path / FOLDER / "labels").exists()
-    again = RenderJob(uri, [make_recipe(flood=FLOOD, **output)], tmp_path)
-    assert run(again, must_not_render).skipped == 8
-
-
 def test_a_camera_path_has_them_where_it_has_labels(tmp_path: Path, recipe: Recipe) -> None:
     recorded = make_frame(1)
     path = [
@@ -191,27 +179,6 @@ def test_a_view_of_water_under_a_recipe_without_is_recorded(tmp_path: Path) -> N
     job = RenderJob("fake:s", [make_recipe(semantic=False)], tmp_path, frames=[1])
     result = run(job, render)
     assert result.failed == 2 and "a water level for a recipe without a flood" in result.failures[0]
-
-
-def test_parts_in_any_order_give_the_files_of_one_run(whole: Path, recipe, tmp_path: Path) -> None:
-    run(RenderJob("fake:street", [recipe], tmp_path, frames=[3, 1], cameras=["rear/left"]))
-    assert len(TABLES["box_water"].read(tmp_path / FOLDER / "labels" / "water.parquet")) == 2
-    run(RenderJob("fake:street", [recipe], tmp_path, cameras=["front"]))
-    assert run(RenderJob("fake:street", [recipe], tmp_path)).skipped == 6
-    assert tree_digest(tmp_path) == tree_digest(whole)
-
-
-@pytest.mark.parametrize(
-    ("lost", "rendered"),
-    [("water/front/000001.png", 1), ("labels/water.parquet", 8), ("labels/boxes.parquet", 0)],
-)
-def test_what_is_lost_is_made_again(whole: Path, recipe, tmp_path: Path, lost, rendered) -> None:
-    """Only rendering tells the numbers of the boxes; the boxes themselves the scene still has."""
-    out = tmp_path / "out"
-    shutil.copytree(whole, out)
-    (out / FOLDER / lost).unlink()
-    assert run(RenderJob("fake:street", [recipe], out)).written == rendered
-    assert tree_digest(out) == tree_digest(whole)
 
 
 def test_a_damaged_table_counts_as_lost(whole: Path, recipe, tmp_path: Path, caplog) -> None:

@@ -178,7 +178,7 @@ def test_fractions_and_bounds_are_those_of_rays(hidden_to_y: float, instance: bo
 def test_a_box_across_the_border_is_truncated_by_its_share_of_the_outline() -> None:
     scene = street()
     whole = scene.frames[0].cameras["ahead"]
-    x0, x1 = (getattr(measure(scene, whole)[0], side)[0] for side in ("x0", "x1"))
+    x0, x1 = (measure(scene, whole)[0][side][0] for side in ("x0", "x1"))
     middle = round((x0 + x1) / 2)
     cut = whole.cropped(middle, 0, 480 - middle, 270)  # symmetric: the car stands straight ahead
     numbers, _ = measure(scene, cut)
@@ -268,7 +268,7 @@ def test_files_agree_over_frames_and_with_a_live_scene(whole: Path) -> None:
         shown = {ids[t] for t in ("parked", "car", *(["later"] if frame else []))}
         assert set(np.unique(image).tolist()) == {0, *shown}
         assert boxes[frame].instances.tolist() == [ids[t] for t in boxes[frame].boxes.track_ids]
-        np.testing.assert_array_equal(measured[frame, "ahead"].instance, boxes[frame].instances)
+        np.testing.assert_array_equal(measured[frame, "ahead"]["instance"], boxes[frame].instances)
     stored = WeatherDataset(whole)
     for sample, other in zip(stored, live, strict=True):
         assert torch.equal(sample["instance"], other["instance"])

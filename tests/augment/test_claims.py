@@ -5,7 +5,6 @@ import fcntl
 import os
 import subprocess
 import sys
-import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -19,8 +18,7 @@ from s3_server import s3_server
 from augment.errors import OutputError
 from augment.jobs import claims as remote_claims
 from augment.jobs.claims import CLAIMS_FOLDER, ClaimTimes, try_claim, try_lock
-from augment.jobs.store import Patience, RemoteStore
-from augment.jobs.store import open_store
+from augment.jobs.store import Patience, RemoteStore, open_store
 
 OFTEN = ClaimTimes(renewal_s=0.05, lifetime_s=60.0)
 
@@ -240,9 +238,3 @@ def test_forked_children_do_not_release(store):
         assert os.waitpid(child, 0)[1] == 0
         claim.check()
         assert try_claim(store, "a", PATIENT) is None
-
-
-def test_releasing_ends_the_thread(remote):
-    for _ in range(3):
-        try_claim(remote, "a", PATIENT).release()
-    assert not [thread for thread in threading.enumerate() if "renews" in thread.name]

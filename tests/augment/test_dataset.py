@@ -131,17 +131,6 @@ def test_a_flooded_sample_holds_what_it_says(written: Path) -> None:
     assert sample["paths"]["box_water"].endswith("labels/water.parquet")
 
 
-def test_batches_of_flooded_samples(written: Path) -> None:
-    flooded = WeatherDataset(written, variants=["clear-009"], frames=[2])
-    batch = collate_frames([flooded[0], flooded[1]])
-    assert batch["water"].shape == (2, 16, 24) and batch["water"].dtype == torch.bool
-    assert [boxes["hidden_fraction"].shape for boxes in batch["boxes"]] == [(2,), (2,)]
-    dry = WeatherDataset(written, variants=["fog-000"], frames=[2])
-    mixed = collate_frames([flooded[0], dry[0]])
-    assert mixed["water"][1] is None and mixed["surface"] == ["first", "solid"]
-    assert mixed["boxes"][1]["submerged_fraction"] is None
-
-
 def test_filters(written: Path) -> None:
     assert len(WeatherDataset(written, load=["image"])) == 32
     flooded = WeatherDataset(written, where=pc.field("water_path").is_valid())
@@ -291,25 +280,6 @@ def one_flooded_image(tmp_path: Path) -> Path:
     job = RenderJob("fake:street", [FLOODED], tmp_path, frames=[1], cameras=["front"])
     run_job(job, scene_loader=open_fake, renderer=fake_render, progress=False)
     return tmp_path
-
-
-@pytest.mark.parametrize(
-    ("name", "damage", "message"),
-    [
-        ("water/front/000001.png", None, "water/front/000001.png cannot be read"),
-        ("water/front/000001.png", 40, "water/front/000001.png is damaged: not a complete PNG"),
-        ("labels/water.parquet", None, "water.parquet is missing or not a readable"),
-        ("labels/water.parquet", 50, "water.parquet is missing or not a readable"),
-    ],
-)
-def test_damaged_files_of_a_flood_are_named(one_flooded_image, name, damage, message) -> None:
-    path = one_flooded_image / "street" / "clear-009" / name
-    data = path.read_bytes()
-    path.unlink()
-    if damage is not None:
-        path.write_bytes(data[:damage])
-    with pytest.raises(OutputError, match=message):
-        WeatherDataset(one_flooded_image)[0]
 
 
 @pytest.mark.parametrize(

@@ -160,9 +160,9 @@ TWO = boxes_at([[0, 0, 5], [0, 0, 9], [0, 0, -5]], [[1, 1, 1], [6, 1, 3], [1, 1,
 
 
 def smog_of(*transmittance: float) -> BoxWeather:
-    values = np.array(transmittance)
-    names = tuple(map(str, range(len(values))))
-    return {"box_smog": TABLES["box_smog"].from_json([names, values, [1] * len(values)])}
+    names = tuple(map(str, range(len(transmittance))))
+    stored = [names, transmittance, [1] * len(names)]
+    return {"box_smog": TABLES["box_smog"].from_json(stored)}
 
 
 def depth_of_two() -> torch.Tensor:

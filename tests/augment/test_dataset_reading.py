@@ -17,7 +17,6 @@ from torch.utils.data import DataLoader
 
 from augment.dataset import SceneDataset, WeatherDataset, collate_frames
 from augment.dataset import weather_dataset as rows
-from augment.dataset import weather_dataset as stored
 from augment.dataset.weather_dataset import Rows
 from augment.errors import OutputError
 from augment.geometry import invert_rigid, rotmat_from_quat, transform_points
@@ -200,16 +199,6 @@ def test_odd_paths_are_refused(remote: MemoryStore, tmp_path: Path, path: str) -
         WeatherDataset(tmp_path)[0]
 
 
-def test_companions_beyond_the_limit_are_read_again(written: Path, monkeypatch) -> None:
-    monkeypatch.setattr(stored, "CACHED_ENTRIES", 1)
-    dataset = WeatherDataset(written)
-    order = [0, 23, 9, 1, 22]
-    expected = WeatherDataset(written)
-    for index in order:
-        assert_same_sample(dataset[index], expected[index])
-        assert len(dataset._readers[0]._calibration._values) == 1
-
-
 def test_packed_rows_are_the_manifests(written: Path, monkeypatch) -> None:
     table = pq.read_table(written / MANIFEST)
     for most in (2, 1 << 16):  # numbers packed as such, or by their distinct values
@@ -242,13 +231,3 @@ def test_checksums_of_any_kind_are_kept(checksums) -> None:
     for name in ("checksum", "image_path"):
         assert again[name].to_pylist() == table[name].to_pylist()
     assert np.isnan(again["snow_depth_m"].to_numpy()).all()
-
-
-def test_a_manifest_of_digests_in_pieces() -> None:
-    digests = [f"{k:064x}" for k in range(7)]
-    chunks = [pa.array(digests[:3]), pa.array([], pa.string()), pa.array(["?", *digests[3:]])[1:]]
-    table = pa.table({"checksum": pa.chunked_array(chunks)})
-    packed = Rows.of(table)
-    assert packed.nbytes == 7 * 32
-    assert packed.to_arrow()["checksum"].to_pylist() == digests
-    assert [packed["checksum"][k] for k in range(7)] == digests

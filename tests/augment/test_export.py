@@ -17,7 +17,6 @@ from scenes import camera_ahead, random_gaussians, slight_pose
 
 from adapters.base import open_scene
 from augment.errors import OutputError, SceneError
-from augment.files import atomic_folder
 from augment.files.export import (
     baked,
     export_cameras,
@@ -31,6 +30,7 @@ from augment.files.export import (
 )
 from augment.files.ply import read_ply, read_splat
 from augment.geometry import rigid, rotmat_from_quat, transform_points
+from augment.jobs import atomic as atomic_folder
 from augment.render.rasterize import rasterize
 from augment.render.sh import evaluate_sh
 from augment.scene import Actor, ColorWaves, Gaussians, PosedGaussians, Scene, SemanticClass, Track

@@ -16,10 +16,10 @@ def test_killed_jobs_go_on_to_identical_files(quick_folder: Path) -> None:
     )
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
-    assert found["kill_the_driver"]["kills"] >= 50
-    assert found["kill_the_driver"]["seen"] >= 3  # readers met outputs of as many sizes
-    assert found["fill_the_disk"]["failures"] >= 4
-    assert sum(found["kill_workers"][who] for who in ("workers_killed", "drivers_killed")) >= 4
+    assert found["kill_the_driver"]["kills"] >= 12
+    assert found["kill_the_driver"]["seen"] >= 2  # readers met outputs of as many sizes
+    assert found["fill_the_disk"]["failures"] >= 2
+    assert sum(found["kill_workers"][who] for who in ("workers_killed", "drivers_killed")) >= 2
     assert len(found["stop_a_job_with_workers"]["finished"]) == 2
     assert found["die_at_one_image"]["rendered_again"] == 1
     assert {"run_several_drivers", "die_while_opening", "kill_an_idle_worker"} <= found.keys()

@@ -17,7 +17,6 @@ from generate_jobs import leftovers, make_job, outputs
 from augment.cameras import Camera
 from augment.errors import ClimateGSError
 from augment.jobs.generate import run_generate
-from augment.jobs.block_pools import _cpus_of_a_gpu
 from augment.scene import Scene
 from recipes.schema import Recipe
 
@@ -122,18 +121,6 @@ def test_an_actor_that_draws_on_a_gpu_has_it_and_its_cpus(tmp_path):
     job = replace(job, setup=replace(job.setup, backend="cuda"))
     assert run_generate(job, progress=False).failed == 0
     assert notes.read_text() == f"cuda 0 {CPUS}"
-
-
-def test_cpus_that_come_to_a_gpu():
-    machines = [
-        {"Alive": True, "Resources": {"CPU": 64.0, "GPU": 4.0}},
-        {"Alive": True, "Resources": {"CPU": 20.0, "GPU": 2.0}},
-        {"Alive": True, "Resources": {"CPU": 8.0}},
-        {"Alive": False, "Resources": {"CPU": 2.0, "GPU": 2.0}},
-    ]
-    assert _cpus_of_a_gpu(types.SimpleNamespace(nodes=lambda: machines)) == 10
-    with pytest.raises(ClimateGSError, match="no machine of the cluster has a GPU"):
-        _cpus_of_a_gpu(types.SimpleNamespace(nodes=lambda: machines[2:]))
 
 
 @pytest.mark.usefixtures("cluster")

@@ -137,15 +137,6 @@ def test_an_image_that_failed_stays_clear(source, tmp_path):
     assert (done.folder / "camera/front/00.png").samefile(source / "camera/front/00.png")
 
 
-def test_variants_stand_side_by_side(source, out):
-    trees.render(source, out, name="clear")
-    one, two = trees.mirror(source, out), trees.mirror(source, out, "clear-000")
-    assert one.folder != two.folder
-    assert trees.listing(one.folder) == trees.listing(two.folder) == trees.listing(source)
-    a, b = trees.contents(one.folder), trees.contents(two.folder)
-    assert {name for name in a if a[name] != b[name]} == places()
-
-
 def test_going_on_after_a_kill_at_any_point(tmp_path, monkeypatch):
     """Stopped before or after each change of the disk: no half file, and the rest is done later."""
     source, out = trees.write_dataset(tmp_path / "drive", frames=1), tmp_path / "out"

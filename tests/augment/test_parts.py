@@ -18,7 +18,7 @@ from augment.jobs.layout import PATH_KINDS
 from augment.jobs.manifest import (
     FAILED,
     OK,
-    Part,
+    Identity,
     Pictured,
     compact,
     image_row,
@@ -29,7 +29,6 @@ from augment.jobs.manifest import (
     read_finished,
     rows_to_table,
 )
-from augment.jobs.manifest import Identity
 from augment.jobs.store import Store, open_store
 
 RECIPE = make_recipe()
@@ -200,12 +199,3 @@ def test_a_damaged_note_in_the_manifest(tmp_path: Path, note: bytes) -> None:
     store.write("manifest.parquet", manifest_bytes(rows.replace_schema_metadata(
         {b"climategs.parts": note})))  # fmt: skip
     assert frames_of(store) == {0: (True, "")} and parts_to_merge(store) == 1
-
-
-def test_files_that_are_no_parts_are_passed_over(tmp_path: Path) -> None:
-    store = open_store(tmp_path)
-    part = publish_part(store, "a/fog-000-000000-0123", table({0: True}))
-    assert Part.parse(part.path) == part
-    for name in ("a/notes.txt", "a/.x.parquet.12-0.climategs-tmp", "nodash.parquet"):
-        store.write(f".climategs/parts/{name}", b"?")
-    assert list(list_parts(store)) == ["a/fog-000-000000-0123"]

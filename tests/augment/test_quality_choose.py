@@ -62,23 +62,12 @@ def test_the_first_knobs_have_first_call_on_the_error() -> None:
     ]
 
 
-def test_a_value_that_is_beyond_the_bound_alone_is_not_tried_with_others() -> None:
-    table = Table({("a", 1): 0.2, ("a", 2): 0.02, ("b", "fast"): 0.2, ("c", 0.5): 0.2})
-    assert flip_choice(table, 0.04) == {"a": 2, "b": "slow", "c": 1.0}
-    assert table.asked == [{"a": 2, "b": "slow", "c": 1.0}]
-
-
 def test_errors_that_only_appear_together_lead_to_reference() -> None:
     table = Table({("a", 1): 0.01, ("a", 2): 0.01, ("b", "fast"): 0.01}, synergy=100)
     assert flip_choice(table, 0.04) == {"a": 3, "b": "slow", "c": 0.5}  # c has none of its own
     table = Table(dict.fromkeys([("a", 1), ("a", 2), ("b", "fast"), ("c", 0.5)], 0.01), synergy=9)
     assert flip_choice(table, 0.04) == {"a": 3, "b": "slow", "c": 1.0}
     assert {"a": 3, "b": "slow", "c": 1.0} not in table.asked  # its error is 0 by definition
-
-
-def test_without_free_knobs_there_is_nothing_to_choose() -> None:
-    assert within_flip({}, 0.1, lambda path, value: 1.0, lambda settings: True) == {}
-    assert within_budget({}, 1.0, {}, lambda settings: 5.0).is_met is False
 
 
 FLIPS = st.fixed_dictionaries(

@@ -19,17 +19,19 @@ from augment.jobs import quality as record
 from augment.jobs.generate import plan_job, run_generate
 from augment.jobs.manifest import read_manifest
 from augment.jobs.quality import (
+    Question,
     Report,
     Settings,
     Settled,
     calibration_views,
     recipes_to_try,
+    recorded,
     render_trial,
     resolve_quality,
+    resolve_quality_once,
     resolved_recipe,
     upsampled,
 )
-from augment.jobs.quality import Question, recorded, resolve_quality_once
 from augment.jobs.render_job import RenderJob, run_job
 from augment.jobs.store import open_store
 from augment.metrics.image import flip

@@ -19,7 +19,6 @@ from safetensors.numpy import load_file, save_file
 from scenes import camera_ahead, random_gaussians
 
 from augment.errors import OutputError, SceneError
-from augment.files import atomic_folder
 from augment.files.scene_file import (
     FILES,
     is_scene_folder,
@@ -27,6 +26,7 @@ from augment.files.scene_file import (
     save_scene,
     save_scene_file,
 )
+from augment.jobs import atomic as atomic_folder
 from augment.render.rasterize import rasterize
 from augment.scene import Actor, ColorWaves, Gaussians, Track
 from augment.sky import ConstantSky, LatLongSky

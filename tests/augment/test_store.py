@@ -215,20 +215,3 @@ def test_writing_where_others_delete_the_folder(tmp_path):
         thread.join()
     assert not errors
     assert os.listdir(tmp_path) == []
-
-
-def test_many_files_are_put_at_once(tmp_path):
-    store, here = open_store(tmp_path / "out"), tmp_path / "here"
-    here.mkdir()
-    sources = {f"{folder}/{name}": here / f"{folder}-{name}" for folder in "ab" for name in "xy"}
-    for path, source in sources.items():
-        source.write_bytes(path.encode())
-    store.write("a/x", b"older")
-    store.put_files(sources)
-    assert list(store.list("")) == sorted(sources)
-    for path, source in sources.items():
-        assert store.read(path) == path.encode()
-        assert (tmp_path / "out" / path).stat().st_ino == source.stat().st_ino
-    with pytest.raises(OutputError, match=r"cannot write .*c/z"):
-        store.put_files({"c/z": here / "nothing"})
-    assert not store.exists("c/z")

@@ -10,8 +10,7 @@ import pytest
 from s3_server import s3_server
 
 from augment.errors import OutputError
-from augment.jobs.store import Patience, RemoteStore, advice, is_permanent
-from augment.jobs.store import StoredFileMissing, open_store
+from augment.jobs.store import Patience, RemoteStore, StoredFileMissing, open_store
 
 BIG = b"0123456789" * 1_100_000  # two parts of an upload
 QUICK = Patience(attempts=4, first_wait_s=0.001, longest_wait_s=0.002, timeout_s=5.0)
@@ -208,23 +207,6 @@ def test_interrupts_wait_for_the_upload(server, store):
     assert store.read("a") == b"22"
 
 
-def test_uploads_are_out_of_reach_of_signals(store):
-    """An exception between opening and writing would replace the file by an empty one."""
-    store.write("a", b"1")
-    system, threads = store._system(), []
-
-    class Spy:
-        get_file_info = staticmethod(system.get_file_info)
-
-        def open_output_stream(self, *arguments, **options):
-            threads.append(threading.current_thread())
-            return system.open_output_stream(*arguments, **options)
-
-    store._opened = Spy()
-    store.write("a", b"2")
-    assert len(threads) == 1 and threads[0] is not threading.main_thread()
-
-
 def _in_child(store, connection):
     store.write("from/child", b"2")
     connection.send(store.read("from/parent"))
@@ -253,12 +235,3 @@ def test_threads_share_a_store(server, store):
     assert list(store.list("t")) == names
     store.delete(names)
     assert store.list("t") == {}
-
-
-def test_what_failures_mean():
-    passing = ["AWS Error SLOW_DOWN during", "(HTTP status 503)", "(HTTP status 429)", "timed out"]
-    assert not any(is_permanent(OSError(text)) for text in passing)
-    lasting = ["AWS Error NO_SUCH_BUCKET during", "(HTTP status 301)", "Code: EntityTooLarge"]
-    assert all(is_permanent(OSError(text)) for text in lasting)
-    assert is_permanent(NotImplementedError()) and is_permanent(PermissionError())
-    assert "GOOGLE_APPLICATION_CREDENTIALS" in advice(OSError("PERMISSION_DENIED"), "gs")
