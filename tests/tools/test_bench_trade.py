@@ -9,11 +9,10 @@ import torch
 
 from augment.cameras import Camera
 from augment.jobs.quality import Trial
-from recipes.schema import knobs_of
+from recipes.schema import knobs_of, settings_of
 from tests.streets import SMALL_STREET, open_street
 from tools.bench import trade as bench
 from tools.bench.trade import (
-    CLEAN,
     DEFAULTS,
     DEPTH,
     JPEG,
@@ -32,7 +31,6 @@ from tools.bench.trade import (
     trade_recipe,
     true_depths,
 )
-from tools.bench.trade_rule import draw_trade, pareto
 
 TINY = TradeCase(width=64, repeats=1, depths=("none", "median"), memory=False)
 SOME = ("render.scale", "weather.flood.fresnel", DEPTH, JPEG)
@@ -97,39 +95,16 @@ def test_files_shrink_with_quality(rows):
     assert rows[JPEG, "png"]["flip"] == 0
 
 
-def test_pictures_of_chart_and_tiers(trade, tmp_path):
-    pytest.importorskip("matplotlib")
-    paths = draw_trade(tmp_path, trade.figures, trade.pictures)
-    assert [path.suffix for path in paths] == [".png", ".jpg"]
-    assert all(path.stat().st_size > 1000 for path in paths)
-
-
 def test_settings_differ_from_reference_in_one_knob():
     recipe = trade_recipe("all")
+    assert None not in (recipe.style, *dict(recipe.weather).values())
     best, *others = settings_of_trade(recipe, TINY)
     paths = [knob.path for knob in knobs_of(recipe) if not knob.path.startswith("output.")]
     assert {setting.knob for setting in others} == {*paths, WHOLE, DEPTH}
-    good = dict(flat(best.recipe.model_dump()))
-    for setting in others:
-        if setting.knob != WHOLE and setting.knob != DEPTH:
-            own = dict(flat(setting.recipe.model_dump()))
-            assert [path for path in paths if own[path] != good[path]] == [setting.knob]
-
-
-def flat(value, path=""):
-    if isinstance(value, dict):
-        for name, inner in value.items():
-            yield from flat(inner, f"{path}.{name}".lstrip("."))
-    else:
-        yield path, value
-
-
-def test_recipes_by_name():
-    assert trade_recipe(CLEAN).weather.flood is None
-    assert trade_recipe("flood").weather.flood is not None
-    assert trade_recipe("overcast").style.preset == "overcast"  # any preset
-    everything = trade_recipe("all")
-    assert None not in (everything.style, *dict(everything.weather).values())
+    good = settings_of(best.recipe)
+    for setting in (each for each in others if each.knob in paths):
+        own = settings_of(setting.recipe)
+        assert [path for path in paths if own[path] != good[path]] == [setting.knob]
 
 
 # Flicker: a wall 10 m ahead, seen twice by a camera that stands still, so that nothing moves.
@@ -178,8 +153,3 @@ def test_picture_figures_pool_views():
     both = picture_figures([same, other])
     assert both["psnr"] == pytest.approx(-10 * math.log10(0.04 / 2))
     assert both["worst_flip"] == other.flip == 2 * both["flip"]
-
-
-def test_pareto_front_is_what_nothing_beats():
-    points = [(3.0, 0.0), (1.0, 0.5), (2.0, 0.6), (2.0, 0.2), (4.0, 0.0)]
-    assert pareto(points) == [(1.0, 0.5), (2.0, 0.2), (3.0, 0.0)]

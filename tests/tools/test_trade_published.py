@@ -11,6 +11,7 @@ from tools.bench.trade_rule import (
     document,
     draw_chart,
     invisible_evidence,
+    pareto,
     read_tables,
     tiers_from,
 )
@@ -43,3 +44,5 @@ def test_published_figures_make_a_chart(tables, tmp_path):
     pytest.importorskip("matplotlib")
     draw_chart(tmp_path / "chart.png", tables[0])
     assert (tmp_path / "chart.png").stat().st_size > 10_000
+    points = [(3.0, 0.0), (1.0, 0.5), (2.0, 0.6), (2.0, 0.2), (4.0, 0.0)]
+    assert pareto(points) == [(1.0, 0.5), (2.0, 0.2), (3.0, 0.0)]

@@ -176,9 +176,9 @@ def exact_table(uri: str, scene: Scene, camera: Camera, presets: Sequence[str]) 
         touched = clamped_pixels(each, camera)
         for preset in presets:
             off = map_error(each, camera, preset)
-            rest = 255 * off[~touched].max(initial=0)
+            worst = [255 * float(each.max(initial=0)) for each in (off, off[~touched])]
             shares = 100 * float(touched.mean()), 100 * float((off > VISIBLE).mean())
-            rows.append([kind, preset, shares[0], 255 * off.max(), rest, shares[1]])
+            rows.append([kind, preset, shares[0], *worst, shares[1]])
     columns = ("colours", "preset", "touched %", "largest", "elsewhere", "off by > 1/255, %")
     return Table(f"Maps in SH against mapped colours, 1/255: {uri}", columns, rows)
 
