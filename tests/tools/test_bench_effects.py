@@ -36,7 +36,6 @@ def test_every_subject_has_its_tables(name, monkeypatch):
     monkeypatch.setattr(style, "PRESETS", ("overcast",))
     monkeypatch.setattr(smog, "SMOGS", dict(list(smog.SMOGS.items())[:1]))
     monkeypatch.setattr(flood, "WAVES", ("calm",))
-    monkeypatch.setattr(snow, "DEPTHS_M", (0.1,))
     found = BENCHES[name](case=TINY, repeats=1, memory=False)
     assert json.loads(json.dumps(found, allow_nan=False))["bench"] == name
     assert all(table["rows"] for table in found["tables"])
