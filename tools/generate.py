@@ -22,7 +22,7 @@ from augment.jobs.generate import (
     run_generate,
 )
 from augment.jobs.layout import STATE_FOLDER
-from augment.jobs.status import JobStatus, read_status
+from augment.jobs.blocks import JobStatus, read_status
 from augment.jobs.store import Store, open_store
 from augment.jobs.worker import shares_of
 from recipes.job import load_job, load_job_recipes

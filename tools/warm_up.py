@@ -16,7 +16,7 @@ from augment.effects.lidar.beam import weathered_sweep
 from augment.geometry import rigid
 from augment.ground_heights import Ground
 from augment.jobs.backends import renders_on_gpu
-from augment.jobs.view_files import uses_boxes
+from augment.jobs.files import uses_boxes
 from augment.labels import Boxes, LidarSweep
 from augment.render.buffers import CPU, CUDA
 from augment.render.cpu import driver as cpu

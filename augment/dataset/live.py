@@ -26,15 +26,17 @@ from augment.jobs.box_tables import View
 from augment.jobs.files import (
     SceneIndex,
     camera_record,
+    check_view,
     decode_image,
     encode_image,
+    label_view,
     quantise_depth,
     select_frames,
+    uses_boxes,
 )
 from augment.jobs.layout import PATH_KINDS, variant_name
 from augment.jobs.prepare import find_bed, remember, snow_to_lay, store_maps
 from augment.jobs.quality import resolve_quality
-from augment.jobs.view_files import check_view, label_view, uses_boxes
 from augment.jobs.worker import Renderer, default_renderer
 from augment.render.buffers import CUDA
 from augment.scene import Scene

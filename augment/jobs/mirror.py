@@ -26,7 +26,7 @@ from augment.effects.lidar.codes import drop_lost
 from augment.errors import AdapterError, OutputError
 from augment.files.image_size import read_image_header
 from augment.jobs.atomic import flush_folder, output_error, refusals_of, write_atomic
-from augment.jobs.files import decode_image, encode_image
+from augment.jobs.files import WritePump, decode_image, encode_image
 from augment.jobs.layout import folder_name, resolve_inside
 from augment.jobs.manifest import OK
 from augment.jobs.mirror_files import (
@@ -46,7 +46,6 @@ from augment.jobs.mirror_files import (
     write_file,
 )
 from augment.jobs.tables import read_lidar
-from augment.jobs.view_files import WritePump
 from augment.labels import LabelSource, StoresLidar
 from recipes.schema import Output
 

@@ -22,7 +22,7 @@ from augment.cameras import Frame
 from augment.errors import OutputError
 from augment.jobs.atomic import write_atomic
 from augment.jobs.backends import choose_backend
-from augment.jobs.files import SceneIndex, frames_to_json, select_frames, trajectory_id
+from augment.jobs.files import SceneIndex, frames_to_json, select_frames, trajectory_id, uses_boxes
 from augment.jobs.job_state import BoxCache, JobState, finish, needs_finish
 from augment.jobs.layout import MANIFEST, STATE_FOLDER, folder_name, variant_name
 from augment.jobs.manifest import FAILED, OK, Identity
@@ -36,7 +36,6 @@ from augment.jobs.prepare import (
 )
 from augment.jobs.processes import OutputLock, share_scene
 from augment.jobs.store import open_store
-from augment.jobs.view_files import uses_boxes
 from augment.jobs.worker import (
     WORKERS,
     Chunk,

@@ -30,7 +30,14 @@ from augment.errors import ClimateGSError, GpuLost, OutputError
 from augment.jobs.atomic import write_atomic
 from augment.jobs.backends import gpu_is_lost, renders_on_gpu
 from augment.jobs.box_tables import BoxWeather, View
-from augment.jobs.files import frames_from_json
+from augment.jobs.files import (
+    WritePump,
+    check_view,
+    frames_from_json,
+    label_view,
+    uses_boxes,
+    write_view,
+)
 from augment.jobs.layout import item_paths, variant_name
 from augment.jobs.manifest import FAILED, OK
 from augment.jobs.prepare import StoredBed, StoredMaps
@@ -46,7 +53,6 @@ from augment.jobs.processes import (
     sender,
 )
 from augment.jobs.tables import lidar_bytes, read_lidar_note
-from augment.jobs.view_files import WritePump, check_view, label_view, uses_boxes, write_view
 from augment.labels import Boxes, LidarSweep
 from augment.scene import Scene
 from recipes.schema import Recipe

@@ -19,7 +19,7 @@ from augment.errors import GpuLost, OutputError
 from augment.jobs import worker as runner
 from augment.jobs.manifest import read_manifest
 from augment.jobs.render_job import JobResult, RenderJob, run_job
-from augment.jobs.view_files import WritePump
+from augment.jobs.files import WritePump
 
 SOON_S = 10.0  # for what takes no time, on a machine that is busy
 

@@ -59,7 +59,7 @@ def test_a_job_measures_what_bounds_it(
         time.sleep(0.2 if slow == "encoding" else 0.0)
         return encode_image(*arguments)
 
-    monkeypatch.setattr("augment.jobs.view_files.encode_image", slow_encode)
+    monkeypatch.setattr("augment.jobs.files.encode_image", slow_encode)
     recipe = make_recipe("clear", depth="none", labels=False, lidar=False)
     job = RenderJob("fake:street", [recipe], tmp_path)
     result = run_job(job, scene_loader=open_fake, renderer=Slow(), progress=False)

@@ -12,7 +12,7 @@ from s3_server import s3_server
 
 from augment.jobs.claims import ClaimTimes
 from augment.jobs.generate import run_generate
-from augment.jobs.status import read_status
+from augment.jobs.blocks import read_status
 from augment.jobs.store import open_store
 
 

@@ -8,9 +8,9 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
+from augment.jobs.box_tables import TABLES, visibility
 from augment.jobs.manifest import rows_to_table
 from augment.jobs.store import LocalStore, StoredFile
-from augment.jobs.box_tables import TABLES, visibility
 from tests.tools.report_outputs import make_row, street_rows, write_output
 from tools import report, report_numbers, report_pictures
 from tools.report_numbers import (

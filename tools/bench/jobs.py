@@ -32,9 +32,9 @@ from augment.jobs.generate import GenerateJob, make_pool, run_generate
 from augment.jobs.layout import variant_name
 from augment.jobs.manifest import compact
 from augment.jobs.scheduler import Scheduler
-from augment.jobs.status import read_status
+from augment.jobs.blocks import read_status
 from augment.jobs.store import open_store
-from augment.jobs.view_files import WritePump
+from augment.jobs.files import WritePump
 from augment.scene import Gaussians, Scene
 from augment.sky import ConstantSky
 from augment.views import WeatheredView, render_view
