@@ -104,16 +104,13 @@ class DriveOptions:
                 raise AdapterError(f"{scheme}: {key} must be {kinds[key]}; got {text!r}") from None
         return DriveOptions(**fields)
 
-    def keeps(self, frame: int) -> bool:
-        return frame in self.frames
-
     def select(self, numbers: Sequence[int], *, where: str) -> DriveFrames:
         """Which of the dataset's frames, ascending, the scene has. where: for messages.
 
         Raises:
             AdapterError: no frame is left, or all are held out.
         """
-        kept = tuple(filter(self.keeps, numbers))
+        kept = tuple(number for number in numbers if number in self.frames)
         if not kept:
             stop = "" if self.frames.stop is None else self.frames.stop
             raise AdapterError(

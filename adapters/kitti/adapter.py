@@ -249,23 +249,18 @@ def _frame(
 ) -> Frame:
     pose = source.labels.world_from_velodyne[number].copy()
     pose[:3, 3] -= source.world_origin_m
-    world_from_ego = torch.from_numpy(pose)
+    ego_from_world = invert_rigid(torch.from_numpy(pose))
     time = source.labels.timestamps_ns[number]
     return Frame(
         index=number,
         timestamp_ns=time,
-        world_from_ego=world_from_ego,
+        world_from_ego=torch.from_numpy(pose),
         cameras={
             camera.name: Camera(
-                name=camera.name,
-                width=images[camera.name][1][0],
-                height=images[camera.name][1][1],
-                fx=camera.fx,
-                fy=camera.fy,
-                cx=camera.cx,
-                cy=camera.cy,
-                camera_from_world=torch.from_numpy(camera.camera_from_velodyne)
-                @ invert_rigid(world_from_ego),
+                camera.name,
+                *images[camera.name][1],
+                *camera.lens,
+                camera_from_world=torch.from_numpy(camera.camera_from_velodyne) @ ego_from_world,
                 timestamp_ns=source.image_times_ns[camera.name].get(number, time),
             )
             for camera in source.calibration.cameras

@@ -129,14 +129,11 @@ def some(numbers: Sequence[int]) -> str:
 
 @dataclass(frozen=True, eq=False)
 class RectifiedCamera:
-    """A rectified camera. camera_from_velodyne: float64 [4, 4]. size: width and height in pixels
-    where the calibration says so."""
+    """A rectified camera. lens: fx, fy, cx, cy, pixels. camera_from_velodyne: float64 [4, 4]. size:
+    width and height in pixels where the calibration says so."""
 
     name: str
-    fx: float
-    fy: float
-    cx: float
-    cy: float
+    lens: tuple[float, float, float, float]
     camera_from_velodyne: np.ndarray
     size: tuple[int, int] | None
 
@@ -240,15 +237,8 @@ def _camera(
         )
     camera_from_rectified = np.eye(4)
     camera_from_rectified[:3, 3] = np.linalg.solve(pinhole, projection[:, 3])
-    return RectifiedCamera(
-        name,
-        float(k[0, 0]),
-        float(k[1, 1]),
-        float(k[0, 2]),
-        float(k[1, 2]),
-        camera_from_rectified @ rectified_from_velodyne,
-        size,
-    )
+    lens = (float(k[0, 0]), float(k[1, 1]), float(k[0, 2]), float(k[1, 2]))
+    return RectifiedCamera(name, lens, camera_from_rectified @ rectified_from_velodyne, size)
 
 
 def _size(keyed: KeyedLines, key: str) -> tuple[int, int] | None:

@@ -1,5 +1,11 @@
-"""Ground where no LiDAR ring fell: between rings beside the path, under parked cars, under the
-sensor. Heights are interpolated, the extent is that of the ground seen around the hole.
+"""Points where no LiDAR ring fell.
+
+Walls: the upper channels of a spinning LiDAR lie degrees apart, metres on a building across the
+street. A wall is taken to go straight up from one ring to the next. Bridges: a splat stretched over
+the gap between two rings would smear one ring's colour across it; new points are put on the
+straight line between neighbours that lie in each other's tangent plane, but only as far as gaps of
+that class are likely to be surface. Ground: between rings beside the path, under parked cars, under
+the sensor; heights are interpolated, the extent is that of the ground seen around the hole.
 """
 
 from __future__ import annotations
@@ -12,17 +18,25 @@ from scipy.spatial import cKDTree
 
 from adapters.lidar_scene.split import PointSet, is_flat
 from adapters.lidar_scene.surfels import Surfels, edges_at
-from augment.semantics import SemanticClass
 from augment.semantics import SemanticClass as Class
 
-# ------------------------------------------------------------------------------------------------
-# Walls between LiDAR rings: the upper channels of a spinning LiDAR lie degrees apart, metres on a
-# building across the street. A wall is taken to go straight up from one ring to the next.
-
-WIDEST_M = 3.0  # gaps higher than this stay open
+MAX_WALL_GAP_M = 3.0  # gaps higher than this stay open
 _CELL_M, _CELL_EDGES = 0.2, 1.5  # size in plan of a column of wall
 _SPARSER = 1.6  # spacing of new points in edges: what is guessed needs no detail
 _UPRIGHT = 0.4  # largest upward part of an upright surface's unit normal
+_MAX_GAP_M = {
+    Class.BUILDING: 1.0,
+    Class.BARRIER: 0.6,
+    Class.SIGN: 0.6,
+    Class.VEHICLE: 0.4,
+    Class.UNKNOWN: 0.4,
+}
+_MAX_OTHER_GAP_M = 0.25
+CELL_M = 0.25
+CLOSE_M = 3.0  # holes up to twice this wide are filled
+REACH_M = 60.0  # from the path
+_RELAXATIONS = 2 * round(CLOSE_M / CELL_M) ** 2 // 3  # to settle across half the widest hole
+_STEEP = 0.35  # height over distance that ground can have from one cell to the next
 
 
 def fill_walls(points: PointSet, edge_m: np.ndarray, surfels: Surfels) -> PointSet:
@@ -37,7 +51,7 @@ def fill_walls(points: PointSet, edge_m: np.ndarray, surfels: Surfels) -> PointS
     column = _columns(some, edges)
     order = np.lexsort((some[:, 2], column))
     return PointSet(
-        *_fill(some[order], edges[order], classes[order], column[order], WIDEST_M, _SPARSER)
+        *_fill(some[order], edges[order], classes[order], column[order], MAX_WALL_GAP_M, _SPARSER)
     )
 
 
@@ -72,43 +86,19 @@ def _fill(points, edges, classes, column, widest, sparser):  # pragma: no cover 
     return out, out_class
 
 
-# ------------------------------------------------------------------------------------------------
-# Points between neighbouring LiDAR rings on one surface, so that each piece gets its own colour
-# A splat stretched over the gap between two rings would smear one ring's colour across it. New
-# points
-# are put on the straight line between neighbours that lie in each other's tangent plane, but only
-# as
-# far as gaps of that class are likely to be surface.
-
-_WIDEST_M = {
-    Class.BUILDING: 1.0,
-    Class.BARRIER: 0.6,
-    Class.SIGN: 0.6,
-    Class.VEHICLE: 0.4,
-    Class.UNKNOWN: 0.4,
-}
-_WIDEST_OTHERWISE_M = 0.25
-
-
 def bridge_gaps(points: PointSet, edge_m: np.ndarray, surfels: Surfels) -> PointSet:
     """The new points only.
 
     edge_m: float32 [N], distance that the points were thinned to. surfels: of the points."""
-    widest = np.full(64, _WIDEST_OTHERWISE_M, np.float32)
-    for semantic, width in _WIDEST_M.items():
+    widest = np.full(64, _MAX_OTHER_GAP_M, np.float32)
+    for semantic, width in _MAX_GAP_M.items():
         widest[semantic] = width
     a, b = _find_bridges(
-        points.points,
-        points.semantic,
-        surfels.normals,
-        surfels.major,
-        surfels.neighbours,
-        edge_m,
-        widest,
-    )
-    pieces = np.ceil(
-        np.linalg.norm(points.points[a] - points.points[b], axis=1) / edge_m[a]
-    ).astype(np.int64)
+        points.points, points.semantic, surfels.normals, surfels.major, surfels.neighbours,
+        edge_m, widest,
+    )  # fmt: skip
+    length = np.linalg.norm(points.points[a] - points.points[b], axis=1)
+    pieces = np.ceil(length / edge_m[a]).astype(np.int64)
     inner = np.maximum(pieces - 1, 0)
     pair = np.repeat(np.arange(len(a)), inner)
     step = np.arange(len(pair)) - np.repeat(np.cumsum(inner) - inner, inner) + 1
@@ -158,28 +148,19 @@ def _find_bridges(
     return first[:count], second[:count]
 
 
-# ---- ground fill ---------------------------------------------------------------------------------
-
-CELL_M = 0.25
-CLOSE_M = 3.0  # holes up to twice this wide are filled
-REACH_M = 60.0  # from the path
-_RELAXATIONS = 2 * round(CLOSE_M / CELL_M) ** 2 // 3  # to settle across half the widest hole
-_STEEP = 0.35  # height over distance that ground can have from one cell to the next
-
-
 def ground_points(points: PointSet) -> np.ndarray:
     """Which points are ground, bool [N]: by class where any has one, else the lowest of their
     square metre where its height agrees with the squares around it."""
     flat = is_flat(points.semantic)
-    if flat.any() or (points.semantic != SemanticClass.UNKNOWN).any():
+    if flat.any() or (points.semantic != Class.UNKNOWN).any():
         return flat
     return _low_points(points.points)
 
 
 def fill_ground(points: PointSet, path: np.ndarray, *, voxel_m: float) -> PointSet:
     """New ground points only, a little sparser than `thin_points`; class of the nearest point."""
-    ground = points.points[ground_points(points)]
-    classes = points.semantic[ground_points(points)]
+    is_ground = ground_points(points)
+    ground, classes = points.points[is_ground], points.semantic[is_ground]
     near = cKDTree(path[:, :2]).query(ground[:, :2])[0] < REACH_M
     ground, classes = ground[near], classes[near]
     if len(ground) < 16:
@@ -187,7 +168,10 @@ def fill_ground(points: PointSet, path: np.ndarray, *, voxel_m: float) -> PointS
     origin = ground[:, :2].min(axis=0) - 2 * CLOSE_M
     shape = np.ceil((ground[:, :2].max(axis=0) + 2 * CLOSE_M - origin) / CELL_M).astype(int) + 1
     heights, seen = _height_grid(ground, origin, shape)
-    inside = _closed(seen)
+    # Holes among cells with ground up to 2 CLOSE_M wide count; nothing beyond the outline does.
+    radius = round(CLOSE_M / CELL_M)
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+    inside = cv2.morphologyEx(seen.astype(np.uint8), cv2.MORPH_CLOSE, disc) > 0
     heights = _spread(heights, seen)
     voxel_m = voxel_m * _SPARSER
     new = _candidates(heights, inside, origin, path, voxel_m)
@@ -206,13 +190,6 @@ def _height_grid(
     total = np.bincount(flat, ground[:, 2].astype(np.float64), shape[0] * shape[1])
     heights = (total / np.maximum(count, 1)).reshape(shape)
     return heights, (count > 0).reshape(shape)
-
-
-def _closed(seen: np.ndarray) -> np.ndarray:
-    """Cells with ground, and holes among them up to 2 CLOSE_M wide; nothing beyond the outline."""
-    radius = round(CLOSE_M / CELL_M)
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
-    return cv2.morphologyEx(seen.astype(np.uint8), cv2.MORPH_CLOSE, disc) > 0
 
 
 def _spread(heights: np.ndarray, seen: np.ndarray) -> np.ndarray:
@@ -259,14 +236,11 @@ def _candidates(
 
 def _low_points(points: np.ndarray) -> np.ndarray:
     cell = np.floor(points[:, :2]).astype(np.int64)
-    cell -= cell.min(axis=0)
-    shape = cell.max(axis=0) + 1
-    flat = cell[:, 0] * shape[1] + cell[:, 1]
-    low = np.full(int(shape.prod()), np.inf)
-    np.minimum.at(low, flat, points[:, 2].astype(np.float64))
-    grid = low.reshape(shape)
+    i, j = (cell - cell.min(axis=0)).T
+    grid = np.full((i.max() + 1, j.max() + 1), np.inf)
+    np.minimum.at(grid, (i, j), points[:, 2].astype(np.float64))
     around = np.where(np.isinf(grid), 1e6, grid)
     around = cv2.erode(around.astype(np.float32), np.ones((9, 9), np.uint8)).astype(np.float64)
     # A roof or a car is more than this above the lowest square within four metres.
     is_ground = grid - around < 0.25 + _STEEP
-    return (points[:, 2] - low[flat] < 0.15) & is_ground.ravel()[flat]
+    return (points[:, 2] - grid[i, j] < 0.15) & is_ground[i, j]

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -17,8 +17,6 @@ from adapters.lidar_scene.split import ObjectTrack
 from adapters.lidar_scene.surfels import Surfels
 from adapters.plain_files import decode_image
 from augment.cameras import Camera
-
-logger = logging.getLogger(__name__)
 
 DEPTH_WIDTH = 480  # columns of the z-buffers
 DISC_PER_SPACING = 0.75  # radius of a disc in units of the spacing: neighbours overlap
@@ -53,12 +51,37 @@ class Body:
     track: ObjectTrack | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class Seen:
+class Seen(NamedTuple):
     """colours: float32 [N, 3] in [0, 1]. seen: bool [N], whether any image shows the surfel."""
 
     colours: np.ndarray
     seen: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """The best KEPT observations of N surfels or places. scores: float32 [N, KEPT], 0 where there
+    is none. colours: uint8 [N, KEPT, 3]. cameras: uint8 [N, KEPT], numbers of cameras."""
+
+    scores: np.ndarray
+    colours: np.ndarray
+    cameras: np.ndarray
+
+    @staticmethod
+    def empty(count: int) -> Observations:
+        return Observations(
+            np.zeros((count, kernels.KEPT), np.float32),
+            np.zeros((count, kernels.KEPT, 3), np.uint8),
+            np.zeros((count, kernels.KEPT), np.uint8),
+        )
+
+    def blended(self) -> Seen:
+        """A camera's observations by their median, cameras averaged; see kernels."""
+        return Seen(
+            *kernels.blended_colours(
+                self.scores, self.colours, self.cameras, _KEEP_SCORE, _CAMERA_POWER
+            )
+        )
 
 
 def observe_views(
@@ -71,28 +94,19 @@ def observe_views(
     their median; cameras are averaged with weights that fall towards an image's border, so that
     unlike exposures meet softly. What no surfel covers goes to the sky."""
     names = list(dict.fromkeys(view.camera.name for view in views))
-    stores = [_Store.empty(len(body.surfels)) for body in bodies]
+    stores = [Observations.empty(len(body.surfels)) for body in bodies]
     problems: list[str] = []
     for view in tqdm(views, desc="colours from images", unit="image", disable=None):
         image = read_image(view.path, image_scale)
+        where = f"camera {view.camera.name}, frame {view.frame}: image {view.path}"
         if image is None:
-            problems.append(
-                f"camera {view.camera.name}, frame {view.frame}: "
-                f"image {view.path} cannot be decoded"
-            )
-            continue
-        if abs(image.shape[1] - view.camera.width * image_scale) > 1:
-            problems.append(
-                f"camera {view.camera.name}, frame {view.frame}: image {view.path} is "
-                f"{round(image.shape[1] / image_scale)} px wide, not {view.camera.width}; left out"
-            )
-            continue
-        _observe_one(bodies, stores, view, names.index(view.camera.name), image, sky)
-    seen = [
-        kernels.blended_colours(s.scores, s.colours, s.cameras, _KEEP_SCORE, _CAMERA_POWER)
-        for s in stores
-    ]
-    return tuple(Seen(*result) for result in seen), tuple(problems)
+            problems.append(f"{where} cannot be decoded")
+        elif abs(image.shape[1] - view.camera.width * image_scale) > 1:
+            width = round(image.shape[1] / image_scale)
+            problems.append(f"{where} is {width} px wide, not {view.camera.width}; left out")
+        else:
+            _observe_one(bodies, stores, view, names.index(view.camera.name), image, sky)
+    return tuple(store.blended() for store in stores), tuple(problems)
 
 
 def read_image(path: Path, image_scale: float) -> np.ndarray | None:
@@ -101,24 +115,9 @@ def read_image(path: Path, image_scale: float) -> np.ndarray | None:
     return None if image is None else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
-@dataclass(frozen=True, eq=False)
-class _Store:
-    scores: np.ndarray
-    colours: np.ndarray
-    cameras: np.ndarray
-
-    @staticmethod
-    def empty(count: int) -> _Store:
-        return _Store(
-            np.zeros((count, kernels.KEPT), np.float32),
-            np.zeros((count, kernels.KEPT, 3), np.uint8),
-            np.zeros((count, kernels.KEPT), np.uint8),
-        )
-
-
 def _observe_one(
     bodies: Sequence[Body],
-    stores: Sequence[_Store],
+    stores: Sequence[Observations],
     view: View,
     camera_number: int,
     image: np.ndarray,

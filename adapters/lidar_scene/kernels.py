@@ -1,4 +1,11 @@
-"""Compiled loops over surfels and pixels: which surface a camera sees, and in what colour."""
+"""Compiled loops over surfels and pixels: which surface a camera sees, and in what colour; and the
+sky, a cube map from the pixels that no surface covers.
+
+Everything uncovered is taken as infinitely far: clouds and distant towers truly are; a wall above
+the LiDAR's field of view is not, and appears in the right direction but drifts against the scene
+as the camera moves. Where some image is sure to show sky in a direction, the others hardly count.
+Directions that no image shows are filled smoothly from the sky around them.
+"""
 
 from __future__ import annotations
 
@@ -12,17 +19,14 @@ import torch
 from augment.cameras import Camera
 from augment.sky import CubemapSky, directions_of_cubemap
 
-# ---- A sky cube map from the pixels of recorded images that no surface covers --------------------
-# Everything uncovered is taken as infinitely far: clouds and distant towers truly are; a wall above
-# the LiDAR's field of view is not, and appears in the right direction but drifts against the scene
-# as the camera moves. Where some image is sure to show sky in a direction, the others hardly count.
-# Directions that no image shows are filled smoothly from the sky around them.
-
 _FEATHER = 0.12  # images fade over this part of their width, so that exposures meet softly
 _UNSURE = 0.02  # weight of pixels that may be a wall above the LiDAR's view
 _TOP_MARGIN_RAD = math.radians(4.0)  # the camera is not where the LiDAR is
 _FILL_ROWS = 64  # of the lat-long image that unseen directions are filled from
 _DEFAULT_SKY = (0.7, 0.75, 0.8)  # where no image shows any sky
+KEPT = 12  # observations remembered of each surfel
+_NEAR_M = 0.3
+_SCORE_FEATHER = 0.1  # scores fall to zero over this part of the image towards its border
 
 
 class SkyGatherer:
@@ -156,13 +160,6 @@ def _gather(
             bottom = image[y1, x0, c] * (1 - wx) + image[y1, x1, c] * wx
             sums[i, c] += weight * (top * (1 - wy) + bottom * wy)
         weights[i] += weight
-
-
-# ---- kernels -------------------------------------------------------------------------------------
-
-KEPT = 12  # observations remembered of each surfel
-_NEAR_M = 0.3
-_SCORE_FEATHER = 0.1  # scores fall to zero over this part of the image towards its border
 
 
 @numba.njit(cache=True, nogil=True)

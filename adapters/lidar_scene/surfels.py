@@ -2,7 +2,8 @@
 
 LiDAR points lie dense along a ring and sparse across rings, so a round splat either leaves gaps or
 smears. Each point's extent is measured apart along its two tangent axes, from the nearest
-neighbours to either side.
+neighbours to either side. Before, accumulated points are thinned to one a voxel, finer near the
+path that was driven.
 """
 
 from __future__ import annotations
@@ -21,14 +22,20 @@ from augment.render.sh import SH_C0
 from augment.scene import Gaussians
 from augment.semantics import SemanticClass
 
-# ---- Accumulated LiDAR thinned to one point a voxel, finer near the path that was driven ---------
-
 NEAR_M = 6.0  # voxels have their given size up to this distance from the path
 # Edges grow with this power of the distance: slower than a LiDAR's spacing, because a narrow camera
 # still resolves what is far ahead.
 GROWTH = 0.7
 _STEP = 0.5  # octaves of distance that share a size, so that points near each other share a grid
 _MAX_LEVEL = 15
+NEIGHBOURS = 12  # nearest points, and as many again out of a coarser sample
+_COARSE = 4.0  # edges between points of that sample: it reaches across the gap between two rings
+_STRETCH, _STRETCH_FIRM = 2.0, 4.0  # widest gap in edges that a splat closes; on ground and walls
+_UPRIGHT = (SemanticClass.BUILDING, SemanticClass.BARRIER, SemanticClass.SIGN)
+_LINE = 0.02  # middle over largest variance below which neighbours lie on a line, not a plane
+_GROUND_SIGMA_PER_SPACING = 0.6  # wider than elsewhere: the ground must not leak
+_THICKNESS = 0.15  # standard deviation along the normal over the smaller tangent one
+_MIN_THICKNESS_M = 0.005
 
 
 def thin_points(
@@ -40,9 +47,7 @@ def thin_points(
     the path and grows with the power GROWTH of the distance beyond."""
     if len(points) == 0:
         return points, np.zeros(0, np.float32)
-    level = _levels(
-        points.points, np.ascontiguousarray(path, np.float32), NEAR_M, _STEP, _MAX_LEVEL
-    )
+    level = _levels(points.points, np.ascontiguousarray(path, np.float32))
     edges = _edges(voxel_m)
     keys = _keys(points.points, level, edges)
     order = np.argsort(keys, kind="stable")
@@ -54,13 +59,8 @@ def thin_points(
 
 def edges_at(points: np.ndarray, path: np.ndarray, *, voxel_m: float) -> np.ndarray:
     """The edge that `thin_points` uses at each position, metres, float32 [N]."""
-    level = _levels(
-        np.ascontiguousarray(points, np.float32),
-        np.ascontiguousarray(path, np.float32),
-        NEAR_M,
-        _STEP,
-        _MAX_LEVEL,
-    )
+    points, path = (np.ascontiguousarray(a, np.float32) for a in (points, path))
+    level = _levels(points, path)
     return _edges(voxel_m)[level].astype(np.float32)
 
 
@@ -77,7 +77,7 @@ def _edges(voxel_m: float) -> np.ndarray:
 
 
 @numba.njit(cache=True)
-def _levels(points, path, near_m, step, highest):  # pragma: no cover - compiled
+def _levels(points, path):  # pragma: no cover - compiled
     out = np.empty(len(points), np.uint8)
     for i in range(len(points)):
         best = np.inf
@@ -86,8 +86,8 @@ def _levels(points, path, near_m, step, highest):  # pragma: no cover - compiled
             dy = points[i, 1] - path[j, 1]
             dz = points[i, 2] - path[j, 2]
             best = min(best, dx * dx + dy * dy + dz * dz)
-        level = np.ceil(0.5 * np.log2(max(best, 1e-12) / (near_m * near_m)) / step)
-        out[i] = np.uint8(min(max(level, 0.0), highest))
+        level = np.ceil(0.5 * np.log2(max(best, 1e-12) / (NEAR_M * NEAR_M)) / _STEP)
+        out[i] = np.uint8(min(max(level, 0.0), _MAX_LEVEL))
     return out
 
 
@@ -138,15 +138,6 @@ def _reduce(points, semantic, keys, level):  # pragma: no cover - compiled
     return means, classes, levels
 
 
-# ---- surfels -------------------------------------------------------------------------------------
-
-NEIGHBOURS = 12  # nearest points, and as many again out of a coarser sample
-_COARSE = 4.0  # edges between points of that sample: it reaches across the gap between two rings
-_STRETCH, _STRETCH_FIRM = 2.0, 4.0  # widest gap in edges that a splat closes; on ground and walls
-_UPRIGHT = (SemanticClass.BUILDING, SemanticClass.BARRIER, SemanticClass.SIGN)
-_LINE = 0.02  # middle over largest variance below which neighbours lie on a line, not a plane
-
-
 @dataclass(frozen=True, eq=False)
 class Surfels:
     """N discs. centres, normals, major: float32 [N, 3]; normals and major are unit and orthogonal,
@@ -163,6 +154,16 @@ class Surfels:
 
     def __len__(self) -> int:
         return len(self.centres)
+
+    @staticmethod
+    def discs(
+        centres: np.ndarray, normals: np.ndarray, major: np.ndarray, spacing_m: np.ndarray
+    ) -> Surfels:
+        """Round surfels of any float type, spacing [N], without neighbours."""
+        spacing = np.repeat(spacing_m[:, None], 2, axis=1)
+        floats = [a.astype(np.float32) for a in (centres, normals, major, spacing)]
+        count = len(centres)
+        return Surfels(*floats, np.zeros(count, np.bool_), np.zeros((count, 0), np.int64))
 
     def select(self, index: np.ndarray) -> Surfels:
         """The surfels at the given indices; neighbours still count through all."""
@@ -294,13 +295,6 @@ def _spacing(points, index, major, normals, edge_m, widest, endless):  # pragma:
                 gap = edge_m[i]
             out[i, axis] = max(gap, 0.5 * edge_m[i])
     return out
-
-
-# ---- Coloured LiDAR surfels as Gaussians: the scene before any optimisation ----------------------
-
-_GROUND_SIGMA_PER_SPACING = 0.6  # wider than elsewhere: the ground must not leak
-_THICKNESS = 0.15  # standard deviation along the normal over the smaller tangent one
-_MIN_THICKNESS_M = 0.005
 
 
 @dataclass(frozen=True)

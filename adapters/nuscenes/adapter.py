@@ -194,17 +194,13 @@ def _frame(file: FrameFiles, origin: np.ndarray, usable: dict[str, Path]) -> Fra
 
 def _camera(image: SensorFile, origin: np.ndarray) -> Camera:
     assert image.intrinsic is not None
-    fx, fy, cx, cy = image.intrinsic
     world_from_camera = image.world_from_sensor
     world_from_camera[:3, 3] -= origin
     return Camera(
-        name=image.channel,
-        width=image.width,
-        height=image.height,
-        fx=fx,
-        fy=fy,
-        cx=cx,
-        cy=cy,
+        image.channel,
+        image.width,
+        image.height,
+        *image.intrinsic,
         camera_from_world=invert_rigid(torch.from_numpy(world_from_camera)),
         timestamp_ns=image.timestamp_ns,
     )

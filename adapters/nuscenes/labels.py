@@ -332,10 +332,14 @@ def boxes_of_sweep(tables: SceneTables, sweep: SensorFile) -> Boxes:
     span = sample.timestamp_ns - before.timestamp_ns
     fraction = (sweep.timestamp_ns - before.timestamp_ns) / span if span else 1.0
     fraction = min(max(fraction, 0.0), 1.0)
-    moved = [
-        _between(earlier[box.instance], box, fraction) if box.instance in earlier else box
-        for box in sample.annotations
-    ]
+    moved = []
+    for box in sample.annotations:
+        start = earlier.get(box.instance)
+        if start is not None:
+            center_m = start.center_m + fraction * (box.center_m - start.center_m)
+            quat = slerp(start.quat, box.quat, fraction)
+            box = dataclasses.replace(box, center_m=center_m, quat=quat)
+        moved.append(box)
     return _boxes(moved, interpolated=True)
 
 
@@ -351,14 +355,6 @@ def slerp(a: np.ndarray, b: np.ndarray, fraction: float) -> np.ndarray:
         angle = np.arccos(cosine)
         quat = np.sin((1 - fraction) * angle) * a + np.sin(fraction * angle) * b
     return quat / np.linalg.norm(quat)
-
-
-def _between(before: Annotation, after: Annotation, fraction: float) -> Annotation:
-    return dataclasses.replace(
-        after,
-        center_m=before.center_m + fraction * (after.center_m - before.center_m),
-        quat=slerp(before.quat, after.quat, fraction),
-    )
 
 
 def _boxes(annotations: Sequence[Annotation], *, interpolated: bool) -> Boxes:

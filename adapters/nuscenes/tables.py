@@ -275,11 +275,6 @@ class NuScenesOptions:
 
     @staticmethod
     def from_query(query: dict[str, str]) -> NuScenesOptions:
-        """The options of a URI's query.
-
-        Raises:
-            AdapterError: an unknown key, or a value of the wrong kind or out of range.
-        """
         sweeps = query.get("sweeps", "1")
         if sweeps not in ("0", "1"):
             raise AdapterError(f"nuscenes: sweeps must be {_OWN['sweeps']}; got {sweeps!r}")
@@ -386,7 +381,12 @@ def read_tables(root: Path, version: str | None, scene: str | None) -> SceneTabl
         images=images,
         semantic_files=_files_of_sweeps(root, folder / "lidarseg.json", lidar),
         panoptic_files=_files_of_sweeps(root, folder / "panoptic.json", lidar),
-        class_names=_class_names(categories),
+        # Tables without lidarseg do not number their categories.
+        class_names={
+            row.integer("index"): row.text("name")
+            for row in categories.values()
+            if "index" in row.fields
+        },
         turn=_read_turn(lidar, images),
     )
 
@@ -554,12 +554,6 @@ def _files_of_sweeps(root: Path, path: Path, lidar: Sequence[SensorFile]) -> dic
             inside(root, row.text("filename"), f"{row}: field 'filename'")
             files[sweep] = row.text("filename")
     return files
-
-
-def _class_names(categories: Mapping[str, Row]) -> dict[int, str]:
-    """Class numbers of lidarseg files; tables without lidarseg do not number their categories."""
-    numbered = [row for row in categories.values() if "index" in row.fields]
-    return {row.integer("index"): row.text("name") for row in numbered}
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,7 +21,6 @@ from tqdm import tqdm
 from adapters.lidar_scene.scene import build_lidar_scene, views_of
 from adapters.lidar_scene.split import indices_between, inside_box, join_tracks
 from adapters.pandaset.files import (
-    CameraTrack,
     Sequence,
     read_cuboids,
     read_lidar,
@@ -97,28 +96,22 @@ def open_pandaset(path: str, query: dict[str, str]) -> Scene:
 
 
 def _frame(sequence: Sequence, number: int) -> Frame:
-    cameras = {track.name: _camera(track, number) for track in sequence.cameras}
     paths = {track.name: track.images[number] for track in sequence.cameras}
     return Frame(
         index=number,
         timestamp_ns=int(sequence.timestamps_ns[number]),
         world_from_ego=torch.from_numpy(sequence.world_from_ego[number].copy()),
-        cameras=cameras,
+        cameras={
+            track.name: Camera(
+                track.name,
+                *track.size,
+                *track.lens,
+                camera_from_world=invert_rigid(torch.from_numpy(track.world_from_camera[number])),
+                timestamp_ns=int(track.timestamps_ns[number]),
+            )
+            for track in sequence.cameras
+        },
         image_paths={name: str(path) for name, path in paths.items() if path is not None},
-    )
-
-
-def _camera(track: CameraTrack, number: int) -> Camera:
-    return Camera(
-        name=track.name,
-        width=track.width,
-        height=track.height,
-        fx=track.fx,
-        fy=track.fy,
-        cx=track.cx,
-        cy=track.cy,
-        camera_from_world=invert_rigid(torch.from_numpy(track.world_from_camera[number])),
-        timestamp_ns=int(track.timestamps_ns[number]),
     )
 
 

@@ -30,7 +30,6 @@ from adapters.safe_pickle import read_frame
 from augment.errors import AdapterError
 from augment.geometry import rigid, rotmat_from_quat
 
-_INTRINSICS = ("fx", "fy", "cx", "cy")
 _LATEST_S = 9e9  # int64 nanoseconds reach 9.2e9 s
 LIDAR_COLUMNS = ("x", "y", "z", "i", "t", "d")
 # Columns: ego x (forward), y (left), z in the axes of the LiDAR pose (x right, y forward).
@@ -39,18 +38,14 @@ LIDAR_POSE_FROM_EGO = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0,
 
 @dataclass(frozen=True, eq=False)
 class CameraTrack:
-    """One camera over the sequence.
+    """One camera over the sequence. size: width and height, pixels. lens: fx, fy, cx, cy, pixels.
 
     world_from_camera: float64 [F, 4, 4]; timestamps_ns: int64 [F]; images: one path a frame, None
     where the image is missing or damaged."""
 
     name: str
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
+    size: tuple[int, int]
+    lens: tuple[float, float, float, float]
     world_from_camera: np.ndarray
     timestamps_ns: np.ndarray
     images: tuple[Path | None, ...]
@@ -163,7 +158,9 @@ def _read_table(path: Path, needed: tuple[str, ...]) -> pd.DataFrame:
 def _read_camera(folder: Path, frames: int, problems: list[str]) -> CameraTrack:
     path = folder / "intrinsics.json"
     lens = read_json(path)
-    fx, fy, cx, cy = (number_of(lens.get(k), f"{path}: {k} (pixels)") for k in _INTRINSICS)
+    fx, fy, cx, cy = (
+        number_of(lens.get(key), f"{path}: {key} (pixels)") for key in ("fx", "fy", "cx", "cy")
+    )
     if min(fx, fy) <= 0:
         raise AdapterError(f"{path}: fx and fy (pixels) must be above 0; got {fx} and {fy}")
     poses = _read_poses(folder / "poses.json")
@@ -173,7 +170,7 @@ def _read_camera(folder: Path, frames: int, problems: list[str]) -> CameraTrack:
         )
     times = _read_times(folder / "timestamps.json", expected=frames)
     images, (height, width) = _find_images(folder, frames, problems)
-    return CameraTrack(folder.name, width, height, fx, fy, cx, cy, poses, times, images)
+    return CameraTrack(folder.name, (width, height), (fx, fy, cx, cy), poses, times, images)
 
 
 def _find_images(

@@ -354,13 +354,6 @@ def _facing(
     up = np.where(np.abs(normals[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
     major = np.cross(up, normals)
     major /= np.linalg.norm(major, axis=1, keepdims=True)
-    surfels = Surfels(
-        points.astype(np.float32),
-        normals.astype(np.float32),
-        major.astype(np.float32),
-        np.repeat(spacing[:, None], 2, axis=1).astype(np.float32),
-        np.zeros(len(points), bool),
-        np.zeros((len(points), 0), np.int64),
-    )
+    surfels = Surfels.discs(points, normals, major, spacing)
     unknown = np.full(len(points), SemanticClass.UNKNOWN, np.int16)
     return gaussians_from_surfels(surfels, colours.astype(np.float32), unknown, _SHAPE)

@@ -21,13 +21,6 @@ class ByteCache(Generic[T]):
         self._held = 0
         self._items: OrderedDict[Hashable, tuple[T, int]] = OrderedDict()
 
-    @property
-    def held_bytes(self) -> int:
-        return self._held
-
-    def __len__(self) -> int:
-        return len(self._items)
-
     def has_room(self, nbytes: int) -> bool:
         """Whether so much more fits without forgetting anything."""
         return self._held + nbytes <= self._limit

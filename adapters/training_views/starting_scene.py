@@ -174,14 +174,7 @@ def _gaussians(
     major /= np.linalg.norm(major, axis=1, keepdims=True)
     low, high = turned.min(axis=0) - _MARGIN_M, turned.max(axis=0) + _MARGIN_M
     centre = (low + high) / 2
-    surfels = Surfels(
-        centres=(turned - centre).astype(np.float32),
-        normals=normals.astype(np.float32),
-        major=major.astype(np.float32),
-        spacing=np.repeat(spacing[:, None], 2, axis=1).astype(np.float32),
-        isolated=np.zeros(len(points), np.bool_),
-        neighbours=np.zeros((len(points), 0), np.int64),
-    )
+    surfels = Surfels.discs(turned - centre, normals, major, spacing)
     other = np.full(len(points), int(SemanticClass.OTHER), np.int16)
     length, width, height = (float(v) for v in high - low)
     return gaussians_from_surfels(surfels, colours, other, _SHAPE), centre, (length, width, height)

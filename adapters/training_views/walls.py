@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from adapters.lidar_scene import kernels
+from adapters.lidar_scene.image_views import Observations
 from adapters.lidar_scene.surfels import SplatShape, Surfels, edges_at, gaussians_from_surfels
 from augment.cameras import Camera
 from augment.geometry import rotmat_from_quat
@@ -50,7 +50,6 @@ _SKY_PART, _SEEN_PAST_PART = 0.3, 0.3  # of the views of a piece, that end the w
 _SPREAD_LEVELS = 28.0  # of 255: median deviation from the median colour of one surface
 _GAP_M = 0.8  # of pieces in a row that fail end a column; a window that mirrors the sky is lower
 _NEARER, _NEARER_M = 0.03, 0.3  # tolerance of depth comparisons, relative and in metres
-_KEEP_SCORE, _CAMERA_POWER = 0.5, 2.0  # as for the colours of LiDAR's surfaces
 _FEATHER = 0.1  # scores fall over this part of the image towards its border
 MAX_VIEWS = 300  # as many are looked at, evenly over the drive: what is coarse needs no more
 VOXEL_M = 0.08
@@ -198,11 +197,6 @@ def _normals(scene: Scene, splats: np.ndarray) -> np.ndarray:
     return axes[np.arange(len(splats)), :, thinnest].astype(np.float32)
 
 
-def elevation_rad(offsets: np.ndarray) -> np.ndarray:
-    """Elevation above the horizon of offsets [N, 3] from an eye, float64 [N]."""
-    return np.arctan2(offsets[:, 2], np.hypot(offsets[:, 0], offsets[:, 1]))
-
-
 @dataclass(frozen=True, eq=False)
 class Columns:
     """Places in plan where a surface goes on. xy: float64 [C, 2]. low_z_m, high_z_m: float64 [C],
@@ -250,9 +244,7 @@ def vote(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Which pieces are surface, bool [N], and their colours, float32 [N, 3]."""
     count = len(pieces.centres)
-    scores = np.zeros((count, kernels.KEPT), np.float32)
-    colours = np.zeros((count, kernels.KEPT, 3), np.uint8)
-    cameras = np.zeros((count, kernels.KEPT), np.uint8)
+    seen_colours = Observations.empty(count)
     shown, sky, seen_past = (np.zeros(count, np.int64) for _ in range(3))
     names = list(dict.fromkeys(view.camera.name for view in views))
     for view, sky_table in zip(views, sky_tables, strict=True):
@@ -261,17 +253,17 @@ def vote(
         seen_past[seen[empty]] += 1
         sky[seen[is_sky & ~empty]] += 1
         shown[seen[~is_sky & ~empty]] += 1
-        worst = scores[seen].argmin(axis=1)
-        better = ~empty & (score > scores[seen, worst])
+        worst = seen_colours.scores[seen].argmin(axis=1)
+        better = ~empty & (score > seen_colours.scores[seen, worst])
         index, worst = seen[better], worst[better]
-        scores[index, worst] = score[better]
-        colours[index, worst] = rgb[better]
-        cameras[index, worst] = names.index(view.camera.name)
-    blended, _ = kernels.blended_colours(scores, colours, cameras, _KEEP_SCORE, _CAMERA_POWER)
+        seen_colours.scores[index, worst] = score[better]
+        seen_colours.colours[index, worst] = rgb[better]
+        seen_colours.cameras[index, worst] = names.index(view.camera.name)
+    blended, _ = seen_colours.blended()
     total = shown + sky + seen_past
     good = shown >= min(MIN_VIEWS, len(views))
     good &= (sky <= _SKY_PART * total) & (seen_past <= _SEEN_PAST_PART * total)
-    good &= _spread(scores, colours, blended) <= _SPREAD_LEVELS
+    good &= _spread(seen_colours, blended) <= _SPREAD_LEVELS
     empty = (seen_past > _SEEN_PAST_PART * total) | (total == 0)
     return _without_holes(good, empty, pieces, columns), blended
 
@@ -298,8 +290,9 @@ def _observe(
     slack = _NEARER * z + _NEARER_M
     hidden = z > np.abs(depth) + slack
     offsets = centres[seen] - camera.centre.numpy()
-    scanned = elevation_rad(offsets) < lidar_top_rad - LIDAR_MARGIN_RAD
-    scanned &= np.hypot(offsets[:, 0], offsets[:, 1]) < LIDAR_REACH_M
+    level_m = np.hypot(offsets[:, 0], offsets[:, 1])
+    scanned = np.arctan2(offsets[:, 2], level_m) < lidar_top_rad - LIDAR_MARGIN_RAD
+    scanned &= level_m < LIDAR_REACH_M
     empty = np.where(depth > 0, np.isfinite(depth) & (z < depth - slack), False)
     empty |= scanned & np.isinf(depth)
     border = np.minimum(
@@ -316,11 +309,11 @@ def _observe(
     )
 
 
-def _spread(scores: np.ndarray, colours: np.ndarray, blended: np.ndarray) -> np.ndarray:
+def _spread(seen: Observations, blended: np.ndarray) -> np.ndarray:
     """Median over a piece's observations of their largest deviation from its colour, float [N]."""
-    off = np.abs(colours - 255 * blended[:, None]).max(axis=2)
-    off = np.where(scores > 0, off, np.nan)
-    off[~(scores > 0).any(axis=1)] = np.inf
+    off = np.abs(seen.colours - 255 * blended[:, None]).max(axis=2)
+    off = np.where(seen.scores > 0, off, np.nan)
+    off[~(seen.scores > 0).any(axis=1)] = np.inf
     return np.nanmedian(off, axis=1)
 
 
@@ -346,41 +339,31 @@ def wall_tops(scene: Scene, source: ViewSource, *, lidar_top_deg: float = 15.0) 
     scene: as initialised from LiDAR. source: recorded views whose `sky` masks tell what sky looks
     like and whose `weight` masks out the recording car. lidar_top_deg: highest elevation that the
     LiDAR looks at. Deterministic."""
-    views = _load_views(scene, source, lidar_top_deg)
+    every = max(1, math.ceil(len(source.train) / MAX_VIEWS))
+    by_camera: dict[str, list[ViewKey]] = defaultdict(list)
+    for key in source.train:
+        by_camera[key.camera].append(key)
+    chosen = [key for group in by_camera.values() for key in group[::every]]
+    lidar_top_rad = math.radians(lidar_top_deg)
+    views = [WallView.of(scene, source.load(k), lidar_top_rad - _RIM_MARGIN_RAD) for k in chosen]
     path = np.array([frame.world_from_ego[:3, 3].numpy() for frame in scene.frames])
     if not any(len(view.rims.points) for view in views) or len(path) == 0:
         return Gaussians.empty()
-    sky_tables = _sky_tables(views)
+    totals: dict[str, np.ndarray] = defaultdict(lambda: np.zeros(_SIDE**3, np.float32))
+    for view in views:
+        totals[view.camera.name] = totals[view.camera.name] + view.sky_counts
+    sky_tables = [sky_colours(view.sky_counts, totals[view.camera.name]) for view in views]
     voxel_m = VOXEL_M
     while True:
         columns = _columns(views, path, voxel_m)
         pieces = Pieces.of(columns)
-        keep, colours = vote(pieces, columns, views, sky_tables, math.radians(lidar_top_deg))
+        keep, colours = vote(pieces, columns, views, sky_tables, lidar_top_rad)
         kept = int(keep.sum())
         logger.info("%d of %d pieces of walls kept at %.3f m", kept, len(keep), voxel_m)
         if kept <= _MAX_GAUSSIANS:
             break
         voxel_m *= max(1.05, math.sqrt(kept / _MAX_GAUSSIANS))
     return _gaussians(pieces, columns, keep, colours)
-
-
-def _load_views(scene: Scene, source: ViewSource, lidar_top_deg: float) -> list[WallView]:
-    every = max(1, math.ceil(len(source.train) / MAX_VIEWS))
-    by_camera: dict[str, list[ViewKey]] = defaultdict(list)
-    for key in source.train:
-        by_camera[key.camera].append(key)
-    chosen = [key for group in by_camera.values() for key in group[::every]]
-    lowest = math.radians(lidar_top_deg) - _RIM_MARGIN_RAD
-    return [WallView.of(scene, source.load(key), lowest) for key in chosen]
-
-
-def _sky_tables(views: Sequence[WallView]) -> list[np.ndarray]:
-    """For each view, which coarse colours are sky."""
-    totals: dict[str, np.ndarray] = {}
-    for view in views:
-        name = view.camera.name
-        totals[name] = totals.get(name, 0) + view.sky_counts
-    return [sky_colours(view.sky_counts, totals[view.camera.name]) for view in views]
 
 
 def _columns(views: Sequence[WallView], path: np.ndarray, voxel_m: float) -> Columns:
@@ -436,13 +419,6 @@ def _gaussians(
     column = pieces.column[keep]
     normals = columns.normals[column].astype(np.float32)
     up = np.broadcast_to(np.array([0, 0, 1], np.float32), normals.shape)
-    edges = columns.edge_m[column].astype(np.float32)
-    surfels = Surfels(
-        centres=pieces.centres[keep].astype(np.float32),
-        normals=normals,
-        major=np.cross(up, normals),
-        spacing=np.repeat(edges[:, None], 2, axis=1),
-        isolated=np.zeros(len(column), np.bool_),
-        neighbours=np.zeros((len(column), 0), np.int64),
-    )
+    edges = columns.edge_m[column]
+    surfels = Surfels.discs(pieces.centres[keep], normals, np.cross(up, normals), edges)
     return gaussians_from_surfels(surfels, colours[keep], columns.semantic[column], _SHAPE)

@@ -299,9 +299,8 @@ def test_poses_go_by_number_unless_there_are_as_many_as_frames(drive, tmp_path):
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ("1 0 0 0 0 1 0 0 0 0 1", "line 2: expected 12 numbers, a pose; got 11"),
-        ("1 0 0 0 0 1 0 0 0 0 1 x", "line 2: expected 12 numbers"),
-        ("1 0 0 0 0 1 0 0 0 0 1 nan", "line 2 must be a rotation"),
+        ("1 0 0 0 0 1 0 0 0 0 1", "line 2 must hold 3 x 4 numbers; it holds 11"),
+        ("1 0 0 0 0 1 0 0 0 0 1 x", "line 2 must hold numbers only"),
         ("2 0 0 0 0 1 0 0 0 0 1 0", "line 2 must be a rotation"),
     ],
 )

@@ -8,7 +8,7 @@ import torch
 
 from adapters.lidar_scene.fill import (
     CLOSE_M,
-    WIDEST_M,
+    MAX_WALL_GAP_M,
     bridge_gaps,
     fill_ground,
     fill_walls,
@@ -208,7 +208,7 @@ def test_a_step_is_not_bridged():
 
 def test_walls_are_filled_between_rings_and_no_further():
     x = np.arange(0, 3, 0.1)
-    heights = (0.0, 1.0, 2.5, 2.5 + WIDEST_M + 0.5)
+    heights = (0.0, 1.0, 2.5, 2.5 + MAX_WALL_GAP_M + 0.5)
     rows = [np.stack([x, np.full_like(x, 10), np.full_like(x, z)], 1) for z in heights]
     points = np.concatenate(rows).astype(np.float32)
     some = point_set(points, Class.BUILDING)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import pickle
 import shutil
 from pathlib import Path
 
@@ -151,11 +150,6 @@ def test_held_out_frames_leave_no_trace_in_the_gaussians(scene, copy):
         open_pandaset(str(copy), QUERY | {"held_out": "0::"})
 
 
-def test_labels_survive_pickling(scene):
-    labels = pickle.loads(pickle.dumps(scene.labels))
-    assert len(labels.boxes(0)) == 2 and len(labels.lidar(1)) == len(scene.lidar(1))
-
-
 def test_a_world_far_from_its_origin_is_recentred(scene, tmp_path):
     offset = np.array([545_000.25, 4_183_000.5, 12.0])
     moved = open_pandaset(str(street.write_sequence(tmp_path / "utm", offset_m=offset)), QUERY)
@@ -208,27 +202,20 @@ def test_missing_files_of_single_frames_are_problems(copy):
     assert set(scene.frame(1).cameras) == {"front_camera", "left_camera"}
 
 
-def test_an_image_that_does_not_decode_is_a_problem(copy):
-    path = copy / "camera/left_camera/02.jpg"
-    path.write_bytes(b"\xff\xd8 nothing of a picture \xff\xd9")
+def test_images_that_do_not_decode_or_fit_are_problems(copy):
+    broken = copy / "camera/left_camera/02.jpg"
+    broken.write_bytes(b"\xff\xd8 nothing of a picture \xff\xd9")
+    cv2.imwrite(str(copy / "camera/left_camera/01.jpg"), np.zeros((48, 80, 3), np.uint8))
     scene = open_pandaset(str(copy), QUERY)
-    assert any("left_camera, frame 2" in p and "cannot be decoded" in p for p in scene.problems)
+    text = " ".join(scene.problems)
+    assert "02.jpg cannot be decoded" in text and "01.jpg is not of 160x96 pixels" in text
     assert set(scene.frame(2).image_paths) == {"front_camera"}
-
-
-def test_an_image_of_another_size_is_a_problem(copy):
-    cv2.imwrite(str(copy / "camera/left_camera/02.jpg"), np.zeros((48, 80, 3), np.uint8))
-    scene = open_pandaset(str(copy), QUERY)
-    assert any("02.jpg is not of 160x96 pixels" in p for p in scene.problems)
 
 
 @pytest.mark.parametrize(
     ("remove", "message"),
     [
         ("camera/front_camera/intrinsics.json", r"intrinsics\.json does not exist.*copy it"),
-        ("camera/front_camera/poses.json", r"poses\.json does not exist"),
-        ("camera/left_camera/timestamps.json", r"timestamps\.json does not exist"),
-        ("lidar/poses.json", r"lidar/poses\.json does not exist"),
         ("lidar/timestamps.json", r"lidar/timestamps\.json does not exist"),
     ],
 )
@@ -250,16 +237,6 @@ def test_no_lidar_at_all_is_an_error(copy):
         path.unlink()
     with pytest.raises(AdapterError, match="holds no returns for frames 0 to 2"):
         open_pandaset(str(copy), QUERY)
-
-
-def test_frames_beyond_the_sequence_are_an_error(folder):
-    with pytest.raises(AdapterError, match=r"frames=7:9 selects none of the 3 frames"):
-        open_pandaset(str(folder), {**QUERY, "frames": "7:9"})
-
-
-def test_a_folder_that_is_none_is_an_error(tmp_path):
-    with pytest.raises(AdapterError, match="is not a folder"):
-        open_pandaset(str(tmp_path / "003"), {})
 
 
 @pytest.fixture(scope="module")
@@ -291,16 +268,6 @@ def test_the_real_sequence_looks_like_its_images(real):
         values[name] = psnr(image, recorded[:rows, :, ::-1] / 255)
     # 22.0 on average when written, from two sweeps at voxels of 15 cm.
     assert np.mean(list(values.values())) > 20.5, values
-
-
-def test_every_real_object_and_return_passes_through(real):
-    boxes, sweep = real.boxes(10), real.lidar(10)
-    assert 90 < len(boxes) < 100  # of 119 cuboids
-    siblings = boxes.attributes["cuboids.sibling_id"]
-    assert sum(s != "-" for s in siblings) > 20
-    assert {actor.track_id for actor in real.actors} <= set(boxes.track_ids)
-    assert set(sweep.columns) == {"x", "y", "z", "i", "t", "d", "semantic"}
-    assert len(sweep) > 150_000 and sweep.columns["x"].dtype == np.float64
 
 
 def test_real_returns_fall_on_the_pixels_that_the_sources_own_matrices_say(real):

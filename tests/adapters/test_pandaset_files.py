@@ -32,11 +32,7 @@ def edit(path: Path, change) -> None:
 @pytest.mark.parametrize(
     ("name", "change", "message"),
     [
-        (
-            "camera/left_camera/intrinsics.json",
-            lambda v: {"fx": 1.0},
-            "fy .pixels. must be a number",
-        ),
+        ("camera/left_camera/intrinsics.json", lambda v: {"fx": 1.0}, "fy .pixels. must be a num"),
         ("camera/left_camera/intrinsics.json", lambda v: [1, 2], "must hold an object; got list"),
         ("camera/left_camera/poses.json", lambda v: v[:-1], "has 2 poses; lidar/poses.json has 3"),
         ("camera/left_camera/timestamps.json", lambda v: v[:-1], "has 2 entries; there are 3"),
@@ -59,18 +55,33 @@ def test_calibration_that_contradicts_itself_is_refused(folder, name, change, me
     assert Path(name).name in str(caught.value)
 
 
+def test_folders_that_are_no_sequence_are_refused(tmp_path):
+    root = street.write_sequence(tmp_path / "002")
+    left = root / "camera/left_camera"
+    (left / "03.jpg").write_bytes((left / "00.jpg").read_bytes())
+    with pytest.raises(AdapterError, match=r"image 03\.jpg, but timestamps\.json ends with frame"):
+        read_sequence(root)
+    for path in left.glob("*.jpg"):
+        path.unlink()
+    with pytest.raises(AdapterError, match="left_camera holds no images"):
+        read_sequence(root)
+    (root / "camera").rename(root / "cam")
+    with pytest.raises(AdapterError, match="camera does not exist"):
+        read_sequence(root)
+    with pytest.raises(AdapterError, match=r"poses\.json does not exist"):
+        read_sequence(tmp_path)
+    with pytest.raises(AdapterError, match="is not a folder"):
+        read_sequence(tmp_path / "003")
+
+
 # What JSON allows where a number is due: (as text, as in the error).
 NO_NUMBERS = {
     "NaN": "nan",
-    "-Infinity": "-inf",
     "1e999": "inf",
     "1e39": "1e\\+39",
-    "1" + "0" * 39: "10000",
     "1" + "0" * 400: "10000",
     '"1.5"': "'1.5'",
     "true": "True",
-    "null": "None",
-    "[1]": r"\[1\]",
 }
 
 
@@ -97,37 +108,6 @@ def test_no_number_is_refused_by_file_frame_and_field(folder):
             with pytest.raises(AdapterError, match=f"{where} must be a number .* got {shown}"):
                 read_sequence(folder)
             path.write_text(whole)
-
-
-def test_json_that_is_none_is_refused(folder):
-    (folder / "lidar" / "poses.json").write_text("{")
-    with pytest.raises(AdapterError, match=r"poses\.json is not readable JSON"):
-        read_sequence(folder)
-
-
-def test_a_camera_folder_without_images_is_refused(folder):
-    for path in (folder / "camera/left_camera").glob("*.jpg"):
-        path.unlink()
-    with pytest.raises(AdapterError, match="left_camera holds no images"):
-        read_sequence(folder)
-
-
-def test_more_images_than_timestamps_are_refused(folder):
-    left = folder / "camera/left_camera"
-    (left / "03.jpg").write_bytes((left / "00.jpg").read_bytes())
-    with pytest.raises(
-        AdapterError, match=r"image 03\.jpg, but timestamps\.json ends with frame 02"
-    ):
-        read_sequence(folder)
-
-
-def test_a_folder_without_cameras_is_refused(tmp_path):
-    with pytest.raises(AdapterError, match=r"poses\.json does not exist"):
-        read_sequence(tmp_path)
-    root = street.write_sequence(tmp_path / "002")
-    (root / "camera").rename(root / "cam")
-    with pytest.raises(AdapterError, match="camera does not exist"):
-        read_sequence(root)
 
 
 def test_tables_without_their_columns_are_refused(folder):
@@ -221,14 +201,10 @@ def test_options_are_typed():
 @pytest.mark.parametrize(
     ("query", "message"),
     [
-        (
-            {"voxels": "1"},
-            r"unknown option 'voxels'; did you mean 'voxel_m'. allowed are frames: .*; sky_size: ",
-        ),
+        ({"voxels": "1"}, "option 'voxels'; did you mean 'voxel_m'. allowed are frames: .*; sky_"),
         ({"frames": "3"}, "frames must be first:stop.*got '3'"),
         ({"frames": "5:5"}, "frames must be first:stop"),
         ({"frames": "-1:5"}, "frames must be first:stop"),
-        ({"frames": "a:b"}, "frames must be first:stop"),
         ({"voxel_m": "nan"}, "voxel_m must be a number of metres from 0.01 to 2; got 'nan'"),
         ({"voxel_m": "0"}, "voxel_m must be"),
         ({"max_gaussians": "1e6"}, "max_gaussians must be an integer from 1000"),
@@ -237,7 +213,6 @@ def test_options_are_typed():
         ({"held_out": "3"}, "held_out must be first:stop:step.*such as 1::2.*got '3'"),
         ({"held_out": "1::0"}, "held_out must be first:stop:step"),
         ({"held_out": "5:2:1"}, "held_out must be first:stop:step"),
-        ({"held_out": "-1::2"}, "held_out must be first:stop:step"),
         ({"held_out": "1:2:3:4"}, "held_out must be first:stop:step"),
     ],
 )
@@ -247,25 +222,18 @@ def test_wrong_options_say_what_is_allowed(query, message):
 
 
 @pytest.mark.parametrize(
-    ("text", "held"),
-    [("1::2", [3, 5, 7]), ("::", [2, 3, 4, 5, 6, 7, 8]), ("4:6", [4, 5]), ("0:7:3", [3, 6])],
+    ("text", "held"), [("1::2", [3, 5, 7]), ("4:6", [4, 5]), ("0:7:3", [3, 6]), ("30::", [])]
 )
 def test_held_out_counts_frame_numbers(text, held):
     options = DriveOptions.from_query("pandaset", {"frames": "2:9", "held_out": text})
-    everything = held == list(range(2, 9))
-    if everything:
-        with pytest.raises(
-            AdapterError, match=r"here: held_out=0::1 holds out all 7 frames \(2 to"
-        ):
-            options.select(range(20), where="here")
-        return
     chosen = options.select(range(20), where="here")
     assert sorted(chosen.held_out) == held and chosen.numbers == tuple(range(2, 9))
     assert set(chosen.used) == set(range(2, 9)) - set(held)
-    assert chosen.problems == ()
+    said = ("held_out=30::1 holds out none of frames 2 to 8",)
+    assert chosen.problems == (() if held else said)
 
 
-def test_holding_out_nothing_is_said():
-    options = DriveOptions(held_out=FrameRange(30))
-    problems = options.select(range(20), where="here").problems
-    assert problems == ("held_out=30::1 holds out none of frames 0 to 19",)
+def test_holding_out_everything_is_refused():
+    options = DriveOptions(held_out=FrameRange())
+    with pytest.raises(AdapterError, match=r"here: held_out=0::1 holds out all 7 frames \(2 to"):
+        options.select(range(2, 9), where="here")

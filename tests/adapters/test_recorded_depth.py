@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 from pathlib import Path
 
 import cv2
@@ -11,7 +10,6 @@ import numpy as np
 import pytest
 
 from adapters.lidar_scene.depth import SparseDepth, depth_seen, read_returns
-from adapters.safe_pickle import read_array_dict
 from adapters.training_views.depth_priors import (
     DepthPriors,
     PriorPixels,
@@ -238,24 +236,6 @@ def test_hostile_and_damaged_depth_files_are_refused_and_named(tmp_path):
         strict=True,
     ):
         assert text in sentence
-
-
-def test_a_dictionary_file_may_hold_arrays_only(tmp_path):
-    path = tmp_path / "a.npy"
-    for bad in ({"a": 1}, {"a": np.array([None])}, {1: np.ones(2)}, [np.ones(2)]):
-        np.save(path, np.array(bad, dtype=object) if isinstance(bad, list) else bad)
-        with pytest.raises(AdapterError):
-            read_array_dict(path)
-    np.save(path, np.ones(3))
-    with pytest.raises(AdapterError, match="one dictionary of arrays; it holds float64"):
-        read_array_dict(path)
-    path.write_bytes(pickle.dumps({"a": np.ones(2)}))
-    with pytest.raises(AdapterError, match=r"start as a \.npy file"):
-        read_array_dict(path)
-    np.save(path, {"a": np.arange(3)})
-    assert read_array_dict(path)["a"].tolist() == [0, 1, 2]
-    with pytest.raises(AdapterError, match="more than 8 bytes"):
-        read_array_dict(path, max_bytes=8)
 
 
 def test_relative_files_that_are_no_inverse_depth(tmp_path):

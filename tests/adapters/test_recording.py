@@ -74,6 +74,13 @@ def test_what_moves_is_an_actor_and_what_is_parked_is_not(scene):
     assert not (offset < street.CAR_SIZE_M / 2 - 0.1).all(axis=1).any()
 
 
+def test_further_files_of_a_job_change_nothing(scene, copy):
+    """Masks and numbers of a flood, as a job writes them."""
+    shutil.copytree(copy / "images", copy / "water")
+    shutil.copy(copy / "labels/boxes.parquet", copy / "labels/water.parquet")
+    assert_same_bits(scene, open_recording(str(copy), QUERY))
+
+
 def test_labels_pass_through(scene):
     boxes = scene.boxes(2)
     assert boxes.track_ids == ("car", "parked") and boxes.labels == ("Car", "Car")
