@@ -94,7 +94,7 @@ def test_files_that_are_no_jobs(tmp_path: Path) -> None:
         load_job(tmp_path)
     path = tmp_path / "winter.yaml"
     path.write_bytes(b"\xff\xfe")
-    with pytest.raises(RecipeError, match="not UTF-8 text at byte 0"):
+    with pytest.raises(RecipeError, match="not UTF-8 text"):
         load_job(path)
     path.write_bytes(b"#" * (MAX_BYTES + 1))
     with pytest.raises(RecipeError, match="larger than"):

@@ -55,19 +55,14 @@ def test_a_style_may_be_left_empty() -> None:
         ("preset: {uniform: [dusk, dusk]}", "uniform is for numbers; a range here is choice"),
         ("preset: 3", "preset = 3: must be one of "),
         ("method: mlk", "must be one of mkl, reinhard, gscm; did you mean mkl?"),
-        ("strength: 2.5", "strength = 2.5: must be >= 0 and <= 2"),
-        ("strength: 50 %", "must be a number >= 0 and <= 2; write the number alone"),
         ("strength: {uniform: [0, 3]}", "strength.uniform[1] = 3: must be >= 0 and <= 2"),
         ("per_region: yes", "must be true or false; write true"),
         ("applied_to: pictures", "one of scene, picture; did you mean picture?"),
         ("digest: 12ab", "digest = '12ab': must be 64 hexadecimal digits, small letters, or null"),
         ("digest: {choice: [null]}", "it cannot be a range"),
-        ("probability: 2", "probability = 2: must be >= 0 and <= 1"),
         ("photo: a.jpg", "photo: unknown field; did you mean image?"),
-        ("intensity: 1", "intensity: unknown field; did you mean strength?"),
         ("visibility_m: 1", "did you mean weather.smog.visibility_m?"),
         ("image: ''", "image = '': must be a file in the recipe's folder or below it, or null"),
-        ("image: [a.jpg]", "must be a file in the recipe's folder or below it"),
     ],
 )
 def test_a_wrong_field_is_named_with_its_line_and_what_is_allowed(field: str, message: str) -> None:
@@ -76,23 +71,6 @@ def test_a_wrong_field_is_named_with_its_line_and_what_is_allowed(field: str, me
         text = text.replace("strength: 1", "method: mkl")
     (problem, *_) = [line for line in problems(text) if "image and preset" not in line]
     assert problem.startswith("r.yaml:4: style.")
-    assert message in problem
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("stile: {preset: dusk}", "stile: unknown field; did you mean style?"),
-        ("mood: {preset: dusk}", "mood: unknown field; did you mean style?"),
-        ("weather: {style: {preset: dusk}}", "here; did you mean style at the top?"),
-        ("preset: dusk", "did you mean weather.flood.waves.preset or style.preset?"),
-        ("per_region: true", "per_region: unknown field here; did you mean style.per_region?"),
-        ("style: dusk", "style = 'dusk': must be a mapping, with image, preset, mask, method"),
-        ("style: {smog: 1}", "did you mean weather.smog?"),
-    ],
-)
-def test_what_was_meant_in_another_place(text: str, message: str) -> None:
-    (problem,) = problems(text)
     assert message in problem
 
 
@@ -122,26 +100,6 @@ def test_rules_are_tried_at_every_word_of_a_choice(folder: Path) -> None:
     assert "(in a draw with image = a.jpg, method = gscm)" in problem
     (problem,) = problems("style: {image: {choice: [a.jpg, null, b.jpg]}}", folder)
     assert "neither gives the style" in problem and "image = null" in problem
-
-
-@pytest.mark.parametrize(
-    "data",
-    [
-        {"preset": "dusk", "strength": "1"},
-        {"preset": "dusk", "strength": 2.01},
-        {"preset": "dusk", "per_region": 1},
-        {"preset": "dusk", "applied_to": "sky"},
-        {"preset": "dusk", "applied_to": "picture", "per_region": True},
-        {"preset": "dusk", "colour": 1},
-        {"preset": "dawn of nothing"},
-        {"image": 3},
-        {"image": "a.jpg", "digest": "F" * 64},
-        {"image": "a.jpg", "digest": "0" * 63},
-    ],
-)
-def test_the_model_is_strict_and_closed(data: dict[str, Any]) -> None:
-    with pytest.raises(ValidationError):
-        Style(**data)
 
 
 def test_an_unknown_preset_in_python_is_explained() -> None:

@@ -13,7 +13,7 @@ from recipes.errors import RecipeError
 from recipes.load import dump_recipe
 from recipes.parse import parse_recipe
 from recipes.schema import Output, Recipe, Render, Smog, Weather
-from recipes.template import Draws, Fixed, RecipeTemplate
+from recipes.template import Fixed, RecipeTemplate
 from recipes.weather import Flood, Snow, SnowLight, SnowWind, Wave, Waves
 
 TEXT = """
@@ -72,12 +72,6 @@ def test_another_field_or_more_variants_change_no_draw() -> None:
         assert smog_of(fewer.resolve(i)).color == here.color
 
 
-def test_the_seed_changes_every_draw() -> None:
-    other = template(TEXT.replace("seed: 7", "seed: 8"))
-    for i in range(5):
-        assert smog_of(other.resolve(i)).visibility_m != smog_of(template().resolve(i)).visibility_m
-
-
 def test_a_first_variant_continues_the_series() -> None:
     later = template(TEXT.replace("variants: 5", "variant: 3\nvariants: 2"))
     assert [later.resolve(i) for i in range(2)] == [template().resolve(i) for i in (3, 4)]
@@ -87,11 +81,6 @@ def test_variants_count_from_zero() -> None:
     for variant in (-1, 2**31):
         with pytest.raises(RecipeError, match=rf"^foggy.yaml: variant = {variant}: must be >= 0 a"):
             template().resolve(variant)
-
-
-def test_a_run_may_draw_more_variants_than_the_file_says() -> None:
-    many = template(TEXT.replace("variants: 5", "variants: 9"))
-    assert template().resolve(8) == many.resolve(8)
 
 
 @pytest.mark.parametrize("probability", [0, 0.25, 1])
@@ -104,18 +93,9 @@ weather: {{smog: {{visibility_m: {{uniform: [50, 90]}}, probability: {probabilit
     present = [recipe.weather.smog is not None for recipe in map(drawn.resolve, range(2000))]
     spread = 4 * math.sqrt(probability * (1 - probability) / 2000)  # four standard deviations
     assert abs(sum(present) / 2000 - probability) <= spread
-
-
-def test_who_has_the_effect_is_pinned() -> None:
-    text = "variants: 12\nweather: {smog: {visibility_m: 9, probability: 0.5}}"
-    present = [template(text).resolve(i).weather.smog is not None for i in range(12)]
-    assert "".join("01"[p] for p in present) == "000000010111"
-
-
-def test_probability_zero_is_never(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Draws, "unit", lambda self, path: 0.0)  # the least there is
-    never = template("weather: {smog: {visibility_m: 9, probability: 0}}")
-    assert never.resolve(0).weather.smog is None
+    half = template("variants: 12\nweather: {smog: {visibility_m: 9, probability: 0.5}}")
+    pinned = ["01"[half.resolve(i).weather.smog is not None] for i in range(12)]
+    assert "".join(pinned) == "000000010111"
 
 
 def test_probability_leaves_the_other_draws_alone() -> None:
@@ -166,13 +146,6 @@ def read_back(recipe: Recipe) -> Recipe:
     return again.resolve(0)
 
 
-def test_resolved_recipes_read_back_equal() -> None:
-    for i in range(5):
-        recipe = template().resolve(i)
-        assert read_back(recipe) == recipe
-        assert read_back(recipe).hash == recipe.hash
-
-
 def test_a_dump_says_everything() -> None:
     text = dump_recipe(template().resolve(2))
     assert text.startswith(
@@ -217,22 +190,6 @@ def test_the_numbers_of_a_list_are_drawn_each_by_itself_and_pinned() -> None:
         assert (green, blue) == pytest.approx((2 * red, 3 * red), rel=1e-9)
 
 
-def test_another_wave_changes_no_draw() -> None:
-    more = template(FLOODED + "        - {amplitude_m: {uniform: [0, 0.1]}, wavelength_m: 3}\n")
-    for i in range(3):
-        here = flood_of(template(FLOODED).resolve(i)).waves.components
-        there = flood_of(more.resolve(i)).waves.components
-        assert here is not None and there is not None and there[:2] == here and len(there) == 3
-
-
-def test_ranges_of_a_list_in_words() -> None:
-    said = template(FLOODED).describe_ranges()
-    waves = "weather.flood.waves.components"
-    assert said["weather.flood.absorption_per_m"] == "uniform from [1, 2, 3] to [3, 6, 9] (1/metre)"
-    assert said[f"{waves}[0].steepness"] == "one of 0.1, 0.2"
-    assert said[f"{waves}[1].amplitude_m"] == "uniform from 0.01 to 0.02 (metres)"
-
-
 def test_a_flood_that_is_absent_takes_its_waves_along() -> None:
     text = FLOODED.replace("  flood:\n", "  flood:\n    probability: 0.5\n")
     pairs = [(template(FLOODED).resolve(i), template(text).resolve(i)) for i in range(12)]
@@ -250,10 +207,7 @@ def test_an_empty_list_is_a_list() -> None:
         assert flood_of(none).waves.components is None
 
 
-def test_flooded_recipes_read_back_equal() -> None:
-    for i in range(5):
-        recipe = template(FLOODED).resolve(i)
-        assert read_back(recipe) == recipe and read_back(recipe).hash == recipe.hash
+def test_waves_and_rates_are_dumped_to_be_read() -> None:
     text = dump_recipe(template(FLOODED).resolve(0))
     assert "      - direction_deg: 0.0\n        amplitude_m: " in text, "a wave a paragraph"
     assert "    absorption_per_m: [" in text, "rates on one line"
