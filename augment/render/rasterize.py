@@ -7,6 +7,7 @@ import functools
 import logging
 import math
 from collections.abc import Collection, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -42,10 +43,6 @@ from augment.scene import Gaussians, PosedGaussians
 # transparent it would show the sky through every wall; instead, what the pixel has blended stands
 # for it: rgb and snow are divided by alpha, which becomes 1. At the default stop and below nothing
 # is done: 1e-4 is less than 8 bits show, and gsplat leaves it transparent, too.
-
-
-def needs_remainder(stop: float) -> bool:
-    return stop > TRANSMITTANCE_STOP
 
 
 def renormalise_alpha(output: RenderOutput, stop: float, *, backend: str = CPU) -> RenderOutput:
@@ -130,93 +127,66 @@ def rasterize(
             f"camera {camera.name!r} is orthographic: there is no eye from which to measure how "
             f"far the smog is looked through; render it without smog, or with a pinhole camera"
         )
+    size = (camera.height, camera.width)
     if pixel_mask is not None and (
-        pixel_mask.dtype != torch.bool or tuple(pixel_mask.shape) != (camera.height, camera.width)
+        pixel_mask.dtype != torch.bool or tuple(pixel_mask.shape) != size
     ):
         raise ValueError(
-            f"pixel_mask must be bool [{camera.height}, {camera.width}] (the camera's size); got "
+            f"pixel_mask must be bool {list(size)} (the camera's size); got "
             f"{pixel_mask.dtype} {list(pixel_mask.shape)}"
         )
-    names, stop = frozenset(buffers), settings.transmittance_stop
-    chosen = _choose(parts, camera, backend, names, smog, clip)
-    if not needs_remainder(stop):
-        return _rasterize(parts, camera, names, settings, smog, clip, pixel_mask, chosen)
-    drawn = _rasterize(parts, camera, names | {ALPHA}, settings, smog, clip, pixel_mask, chosen)
-    shared = renormalise_alpha(drawn, stop, backend=chosen)
-    return shared if ALPHA in names else dataclasses.replace(shared, alpha=None)
+    image = _Image(parts, camera, frozenset(buffers), settings, smog, clip, pixel_mask)
+    chosen = _choose(image, backend)
+    stop = settings.transmittance_stop
+    if stop <= TRANSMITTANCE_STOP:
+        return _draw(image, chosen)
+    drawn = _draw(image._replace(buffers=image.buffers | {ALPHA}), chosen)
+    opaque = renormalise_alpha(drawn, stop, backend=chosen)
+    return opaque if ALPHA in image.buffers else dataclasses.replace(opaque, alpha=None)
 
 
-def _rasterize(
-    parts: Sequence[PosedGaussians],
-    camera: Camera,
-    names: frozenset[str],
-    settings: RasterSettings,
-    smog: SmogMedium | None,
-    clip: HeightClip | None,
-    pixel_mask: torch.Tensor | None,
-    backend: str,
-) -> RenderOutput:
+class _Image(NamedTuple):
+    """What is to be drawn: the arguments of `rasterize`, checked."""
+
+    parts: Sequence[PosedGaussians]
+    camera: Camera
+    buffers: frozenset[str]
+    settings: RasterSettings
+    smog: SmogMedium | None
+    clip: HeightClip | None
+    pixel_mask: torch.Tensor | None
+
+
+def _draw(image: _Image, backend: str) -> RenderOutput:
     if backend == REFERENCE:
-        return rasterize_reference(parts, camera, names, settings, smog, clip)
+        return rasterize_reference(*image[:-1])
+    module = import_cuda() if backend == CUDA else import_cpu()
+    if _tracked(image.parts):
+        if backend == CUDA:
+            from augment.render.cuda.backward import rasterize_with_gradients
+        else:
+            from augment.render.cpu.backward import rasterize_with_gradients
+        return rasterize_with_gradients(*image[:4])
+    parts, mask = [_detached(p) for p in image.parts], image.pixel_mask
     if backend == CUDA:
-        return _rasterize_cuda(parts, camera, names, settings, smog, clip, pixel_mask)
-    cpu = import_cpu()
-    if _tracked(parts):
-        from augment.render.cpu.backward import rasterize_with_gradients
-
-        return rasterize_with_gradients(parts, camera, names, settings)
-    return cpu.rasterize_cpu(
-        [_detached(p) for p in parts],
-        camera,
-        names,
-        settings,
-        smog,
-        clip,
-        None if pixel_mask is None else pixel_mask.numpy(),
-    )
+        return module.rasterize_cuda(parts, *image[1:])
+    return module.rasterize_cpu(parts, *image[1:-1], None if mask is None else mask.numpy())
 
 
-def _rasterize_cuda(
-    parts: Sequence[PosedGaussians],
-    camera: Camera,
-    names: frozenset[str],
-    settings: RasterSettings,
-    smog: SmogMedium | None,
-    clip: HeightClip | None,
-    pixel_mask: torch.Tensor | None,
-) -> RenderOutput:
-    cuda = import_cuda()
-    if _tracked(parts):
-        from augment.render.cuda.backward import rasterize_with_gradients
-
-        return rasterize_with_gradients(parts, camera, names, settings)
-    return cuda.rasterize_cuda(
-        [_detached(p) for p in parts], camera, names, settings, smog, clip, pixel_mask
-    )
-
-
-def _choose(
-    parts: Sequence[PosedGaussians],
-    camera: Camera,
-    backend: str,
-    buffers: frozenset[str],
-    smog: SmogMedium | None,
-    clip: HeightClip | None,
-) -> str:
+def _choose(image: _Image, backend: str) -> str:
     """The backend to use; the first time a choice is made for a reason, it is logged."""
     if backend not in BACKENDS:
         raise ValueError(f"backend must be one of {', '.join(BACKENDS)}; got {backend!r}")
-    first = parts[0].gaussians.means
+    first = image.parts[0].gaussians.means
     if backend == AUTO and first.device.type != "cpu":
         backend = CUDA
     if backend == REFERENCE:
         return REFERENCE
-    dtype = first.dtype
     obstacle = None
-    if dtype != torch.float32:
-        obstacle = f"the Gaussians are {dtype}, it takes torch.float32"
-    elif _tracked(parts):
-        what = _beyond_its_gradients(parts, camera, buffers, smog, clip, backend)
+    if first.dtype != torch.float32:
+        obstacle = f"the Gaussians are {first.dtype}, it takes torch.float32"
+    elif _tracked(image.parts):
+        what = _gradients_it_lacks(image, backend)
         obstacle = what and f"gradients {what} are asked for, it has none"
     if backend in (CPU, CUDA):
         if obstacle:
@@ -238,28 +208,21 @@ def _choose(
     return CPU
 
 
-def _beyond_its_gradients(
-    parts: Sequence[PosedGaussians],
-    camera: Camera,
-    buffers: frozenset[str],
-    smog: SmogMedium | None,
-    clip: HeightClip | None,
-    backend: str,
-) -> str | None:
+def _gradients_it_lacks(image: _Image, backend: str) -> str | None:
     """What the backend would need gradients of and has none; None where it has all."""
-    if any(part.shading is not None for part in parts):
+    if any(part.shading is not None for part in image.parts):
         return "of light per pixel"
-    if any(part.color_maps is not None for part in parts):
+    if any(part.color_maps is not None for part in image.parts):
         return "through colour maps"
-    if smog is not None:
+    if image.smog is not None:
         return "through smog"
-    if clip is not None:
+    if image.clip is not None:
         return "of a clip"
-    if backend == CUDA and not tracked_geometry(parts):
+    if backend == CUDA and not tracked_geometry(image.parts):
         return None  # colours move no other buffer, and any camera has its own kernels' gradients
-    if camera.is_orthographic:
+    if image.camera.is_orthographic:
         return "of an orthographic camera"
-    others = buffers - DIFFERENTIABLE
+    others = image.buffers - DIFFERENTIABLE
     return f"of {', '.join(sorted(others))}" if others else None
 
 
@@ -378,33 +341,36 @@ def _check_pose(part: PosedGaussians, number: int, camera: Camera) -> None:
 
 
 def _check_settings(settings: RasterSettings) -> None:
-    if not (math.isfinite(settings.near_m) and settings.near_m > 0):
-        raise ValueError(f"settings.near_m must be finite and > 0 (metres); got {settings.near_m}")
-    if not 0 < settings.alpha_max < 1:
-        raise ValueError(
-            f"settings.alpha_max must lie between 0 and 1 (usual: 0.999 or 0.99), since a splat "
-            f"of alpha 1 would never be blended; got {settings.alpha_max}"
-        )
-    if not (math.isfinite(settings.mode_depth_floor_m) and settings.mode_depth_floor_m > 0):
-        raise ValueError(
-            f"settings.mode_depth_floor_m must be finite and > 0 (metres); "
-            f"got {settings.mode_depth_floor_m}"
-        )
-    if not 0 < settings.transmittance_stop <= MAX_TRANSMITTANCE_STOP:
-        raise ValueError(
-            f"settings.transmittance_stop must be > 0 and at most {MAX_TRANSMITTANCE_STOP}, "
-            f"since median depth is where less than half the light is left; "
-            f"got {settings.transmittance_stop}"
-        )
-    if not (math.isfinite(settings.radius_clip_px) and settings.radius_clip_px >= 0):
-        raise ValueError(
-            f"settings.radius_clip_px must be finite and >= 0 (pixels); "
-            f"got {settings.radius_clip_px}"
-        )
-    if settings.sh_degree is not None and not 0 <= settings.sh_degree <= MAX_DEGREE:
-        raise ValueError(
-            f"settings.sh_degree must be None or 0 to {MAX_DEGREE}; got {settings.sh_degree}"
-        )
+    s, degree = settings, settings.sh_degree
+    above_0 = "finite and > 0 (metres)"
+    for name, is_good, expected in (
+        ("near_m", math.isfinite(s.near_m) and s.near_m > 0, above_0),
+        (
+            "alpha_max",
+            0 < s.alpha_max < 1,
+            "between 0 and 1 (usual: 0.999 or 0.99), since a splat of alpha 1 would never be "
+            "blended",
+        ),
+        (
+            "mode_depth_floor_m",
+            math.isfinite(s.mode_depth_floor_m) and s.mode_depth_floor_m > 0,
+            above_0,
+        ),
+        (
+            "transmittance_stop",
+            0 < s.transmittance_stop <= MAX_TRANSMITTANCE_STOP,
+            f"> 0 and at most {MAX_TRANSMITTANCE_STOP}, since median depth is where less than half "
+            f"the light is left",
+        ),
+        (
+            "radius_clip_px",
+            math.isfinite(s.radius_clip_px) and s.radius_clip_px >= 0,
+            "finite and >= 0 (pixels)",
+        ),
+        ("sh_degree", degree is None or 0 <= degree <= MAX_DEGREE, f"None or 0 to {MAX_DEGREE}"),
+    ):
+        if not is_good:
+            raise ValueError(f"settings.{name} must be {expected}; got {getattr(s, name)}")
 
 
 def _tracked(parts: Sequence[PosedGaussians]) -> bool:

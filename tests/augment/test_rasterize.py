@@ -85,9 +85,8 @@ def test_what_a_raised_stop_leaves_is_shared(parts, backend):
     assert (
         float(output.alpha[~finished].max()) < 1 - stop < float(exact.alpha[finished].min()) + 1e-6
     )
-    drawn = module._rasterize(
-        parts, camera, frozenset(BUFFERS), settings, None, None, None, backend
-    )
+    image = module._Image(parts, camera, frozenset(BUFFERS), settings, None, None, None)
+    drawn = module._draw(image, backend)
     expected = drawn.rgb[finished] / drawn.alpha[finished][:, None]
     torch.testing.assert_close(output.rgb[finished], expected, rtol=1e-6, atol=0)
     every = rasterize(parts, camera, buffers=BUFFERS, settings=settings, backend=backend)
@@ -165,9 +164,9 @@ def test_naming_a_backend_that_is_missing_raises(parts, monkeypatch):
 def test_a_failing_import_names_the_reason_and_the_way_out(monkeypatch):
     import sys
 
-    import augment.render
+    import augment.render.cpu
 
-    monkeypatch.delattr(augment.render, "cpu", raising=False)
+    monkeypatch.delattr(augment.render.cpu, "driver", raising=False)
     monkeypatch.setitem(sys.modules, "augment.render.cpu.driver", None)
     with pytest.raises(BackendUnavailable, match=r"unavailable: .*numba, tbb.*'reference'"):
         backends.import_cpu()
@@ -184,7 +183,7 @@ def test_a_failing_import_names_the_reason_and_the_way_out(monkeypatch):
         ({"buffers": "rgb"}, TypeError, "collection of names; got the string 'rgb'"),
         ({"backend": "gpu"}, ValueError, "one of auto, reference, cpu, cuda; got 'gpu'"),
         ({"settings": RasterSettings(near_m=0.0)}, ValueError, "near_m must be finite and > 0"),
-        ({"settings": RasterSettings(alpha_max=1.0)}, ValueError, "alpha_max must lie between"),
+        ({"settings": RasterSettings(alpha_max=1.0)}, ValueError, "alpha_max must be between"),
         ({"settings": RasterSettings(sh_degree=4)}, ValueError, "None or 0 to 3; got 4"),
         (
             {"settings": RasterSettings(transmittance_stop=0.3)},

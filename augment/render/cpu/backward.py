@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -219,20 +219,13 @@ def rasterize_with_gradients(
     return RenderOutput(**{name: images[name] for name in buffers})
 
 
-class _Setting:
+class _Setting(NamedTuple):
     """What an operation is told besides its tensors."""
 
-    def __init__(
-        self,
-        parts: tuple[PosedGaussians, ...],
-        camera: Camera,
-        settings: RasterSettings,
-        with_depth: bool,
-    ) -> None:
-        self.parts = parts
-        self.camera = camera
-        self.settings = settings
-        self.with_depth = with_depth
+    parts: tuple[PosedGaussians, ...]
+    camera: Camera
+    settings: RasterSettings
+    with_depth: bool
 
 
 class _Rasterize(torch.autograd.Function):
