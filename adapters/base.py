@@ -1,10 +1,9 @@
 """Scenes by URI: `open_scene("scheme:path?key=value&…")`.
 
 Schemes and syntax are those of adapters.uri; a path without a scheme is recognised by what it
-holds. Two keys work with every scheme:
-`camera_path=FILE` replaces the scene's cameras (see adapters.camera_files.paths), and
-`ground_z=HEIGHT`
-says how high the road is (scene world, metres) where the scene does not know or is wrong.
+holds. Two keys work with every scheme: `camera_path=FILE` replaces the scene's cameras (see
+adapters.camera_files.paths), and `ground_z=HEIGHT` says how high the road is (scene world, metres)
+where the scene does not know or is wrong.
 """
 
 from __future__ import annotations
@@ -26,7 +25,6 @@ from adapters.uri import (
     CAMERA_PATH_KEY,
     GROUND_KEY,
     SCHEMES,
-    Scheme,
     add_to_uri,
     format_uri,
     known_schemes,
@@ -37,8 +35,6 @@ from augment.ground import Ground
 from augment.scene import Scene
 from recipes.errors import nearest_word
 from recipes.job import JobScene
-
-# ---- base ----------------------------------------------------------------------------------------
 
 
 def open_scene(uri: str) -> Scene:
@@ -58,12 +54,18 @@ def open_scene(uri: str) -> Scene:
         near = nearest_word(scheme, tuple(SCHEMES))
         guess = f"; did you mean {near}?" if near else ";"
         raise AdapterError(f"unknown scheme {scheme!r} in {uri!r}{guess} known: {known_schemes()}")
+    opener = getattr(importlib.import_module(entry.module), entry.function)
     if entry.builtin:
-        scene = _open_builtin(scheme, entry, path, query)
+        if path not in entry.builtin:
+            raise AdapterError(
+                f"{scheme}:{path}: {scheme} scenes are {', '.join(entry.builtin)}; got {path!r}. "
+                f"Example: {entry.example}"
+            )
+        scene = opener(query)
     else:
         _check_there(Path(path))
         try:
-            scene = _load(entry)(path, query)
+            scene = opener(path, query)
         except OSError as error:
             raise AdapterError(f"{uri!r}: cannot be read: {error}") from error
     if ground_z is not None:
@@ -101,19 +103,6 @@ def recognise(path: Path) -> str:
     return scheme
 
 
-def _open_builtin(scheme: str, entry: Scheme, path: str, query: dict[str, str]) -> Scene:
-    if path not in entry.builtin:
-        raise AdapterError(
-            f"{scheme}:{path}: {scheme} scenes are {', '.join(entry.builtin)}; got {path!r}. "
-            f"Example: {entry.example}"
-        )
-    return _load(entry)(query)
-
-
-def _load(entry: Scheme):
-    return getattr(importlib.import_module(entry.module), entry.function)
-
-
 def _check_there(path: Path) -> None:
     if path.is_dir() or path.is_file():
         return
@@ -125,10 +114,9 @@ def _check_there(path: Path) -> None:
     raise AdapterError(f"{path}: no such file or folder (looked at {absolute}{where})")
 
 
-# ------------------------------------------------------------------------------------------------
-# Scenes of a job as its file names them: patterns taken apart, relative paths made absolute
+# ---- Scenes of a job as its file names them: patterns expanded, relative paths made absolute -----
 
-MAX_LOOKED_AT = 200_000  # files and folders, for one pattern: a second or two
+MAX_ENTRIES = 200_000  # files and folders, for one pattern: a second or two
 
 
 def scenes_of(entries: Iterable[JobScene], folder: Path) -> list[JobScene]:
@@ -172,11 +160,9 @@ def _expanded(entry: JobScene, folder: Path) -> list[JobScene]:
     matches = [str(whole)]
     if glob.has_magic(path) and not whole.exists():
         # The job's own folder may be called [x] too.
-        top, parts = (
-            (Path("/"), Path(path).parts[1:])
-            if Path(path).is_absolute()
-            else (folder.absolute(), Path(path).parts)
-        )
+        top, parts = folder.absolute(), Path(path).parts
+        if Path(path).is_absolute():
+            top, parts = Path("/"), parts[1:]
         matches = _matches(top, parts, entry.uri)
     if not matches:
         raise AdapterError(f"{entry.uri!r}: nothing matches {whole}")
@@ -186,14 +172,14 @@ def _expanded(entry: JobScene, folder: Path) -> list[JobScene]:
 def _matches(top: Path, parts: tuple[str, ...], what: str) -> list[str]:
     """Paths that match, in order. parts: of the pattern below `top`. As glob.glob, but that `**`
     follows no links, which may lead round in circles, and that there is an end to it."""
-    looked_at = itertools.count()
+    entry_count = itertools.count()
 
     def names(folder: str) -> Iterator[os.DirEntry[str]]:
         with contextlib.suppress(OSError), os.scandir(folder) as entries:  # a file, another user's
             for entry in entries:
-                if next(looked_at) >= MAX_LOOKED_AT:
+                if next(entry_count) >= MAX_ENTRIES:
                     raise AdapterError(
-                        f"{what!r}: looked at {MAX_LOOKED_AT} files and folders and saw no end; "
+                        f"{what!r}: looked at {MAX_ENTRIES} files and folders and saw no end; "
                         f"name more of the path, or fewer levels (**)"
                     )
                 yield entry

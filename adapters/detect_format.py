@@ -1,6 +1,4 @@
-"""Which kind of scene a path holds, told by a few names in it; nothing is opened for it but the
-first bytes of a file.
-"""
+"""Which kind of scene a path holds, told by a few names in it and the first bytes of files."""
 
 from __future__ import annotations
 
@@ -20,8 +18,7 @@ from augment.jobs.mirror_files import SourceTree
 from augment.scene import Scene
 from recipes.files import open_file
 
-# ------------------------------------------------------------------------------------------------
-# Which folder and files make up the dataset behind a scene, for copies of it in other weather
+# ---- Which folder and files make up the dataset behind a scene, for copies in other weather ------
 
 _KITTI_SWEEP = r"velodyne_points/data/\d+\.bin"
 _KITTI_CAMERA = r"image_\d\d/data/\d+\.(?i:png|jpg)"
@@ -59,22 +56,16 @@ def source_tree(scene: Scene) -> SourceTree:
     return SourceTree(uri, found.root, found.images, entries, found.sweeps)
 
 
+_NONE = r"(?!)"  # matches nothing
+
+
 class _Found(NamedTuple):
     """As of SourceTree."""
 
     root: Path
     images: str
-    sweeps: str = r"(?!)"
+    sweeps: str = _NONE
     entries: Iterable[str] | None = None
-
-
-def _pandaset(folder: Path, _query: dict[str, str]) -> _Found:
-    return _Found(folder, r"camera/[^/]+/\d+\.jpg", r"lidar/\d+\.pkl\.gz")
-
-
-def _nuscenes(folder: Path, _query: dict[str, str]) -> _Found:
-    sweeps = r"(samples|sweeps)/LIDAR_TOP/[^/]+\.pcd\.bin"
-    return _Found(folder, r"(samples|sweeps)/CAM_[^/]+/[^/]+\.jpg", sweeps)
 
 
 def _kitti(folder: Path, _query: dict[str, str]) -> _Found:
@@ -93,10 +84,6 @@ def _kitti(folder: Path, _query: dict[str, str]) -> _Found:
     return _Found(calibrated, images, sweeps, (folder.name, *calibration))
 
 
-def _street_gaussians(folder: Path, _query: dict[str, str]) -> _Found:
-    return _Found(folder, r"images/[^/]+\.(png|jpg)")
-
-
 def _drivestudio(path: Path, query: dict[str, str]) -> _Found:
     """The processed data that a run was trained on."""
     from adapters.drivestudio.drive import RunOptions, find_run
@@ -105,21 +92,23 @@ def _drivestudio(path: Path, query: dict[str, str]) -> _Found:
     return _Found(Path(os.path.abspath(data)), r"images/\d+_\d+\.jpg", r"lidar/\d+\.bin")
 
 
-def _recording(folder: Path, _query: dict[str, str]) -> _Found:
-    return _Found(folder, r"images/[^/]+/\d+\.(?i:png|jpe?g)", r"lidar/\d+\.parquet")
+def _fixed(images: str, sweeps: str = _NONE) -> Callable[[Path, dict[str, str]], _Found]:
+    return lambda folder, _query: _Found(folder, images, sweeps)
 
 
 _TREES: dict[str, Callable[[Path, dict[str, str]], _Found]] = {
-    "pandaset": _pandaset,
-    "nuscenes": _nuscenes,
+    "pandaset": _fixed(r"camera/[^/]+/\d+\.jpg", r"lidar/\d+\.pkl\.gz"),
+    "nuscenes": _fixed(
+        r"(samples|sweeps)/CAM_[^/]+/[^/]+\.jpg", r"(samples|sweeps)/LIDAR_TOP/[^/]+\.pcd\.bin"
+    ),
     "kitti": _kitti,
-    "street_gaussians": _street_gaussians,
+    "street_gaussians": _fixed(r"images/[^/]+\.(png|jpg)"),
     "drivestudio": _drivestudio,
-    "recording": _recording,
+    "recording": _fixed(r"images/[^/]+/\d+\.(?i:png|jpe?g)", r"lidar/\d+\.parquet"),
 }
 
 
-# ---- signatures ----------------------------------------------------------------------------------
+# ---- Signatures ----------------------------------------------------------------------------------
 
 _MAX_ENTRIES = 1000  # of a folder that are looked at below the one given
 _MAX_LISTED = 1_000_000  # names of a folder: some tenths of a second
@@ -163,10 +152,6 @@ def _scenes_below(folder: Path) -> Iterator[Path]:
                     yield entry
 
 
-def _is_pandaset(folder: Path) -> bool:
-    return (folder / "camera").is_dir() and (folder / "lidar").is_dir()
-
-
 def _is_nuscenes(folder: Path) -> bool:
     versions = (name for name in _names(folder) if name.startswith("v1.0-"))
     return any((folder / name / "scene.json").is_file() for name in versions)
@@ -187,18 +172,6 @@ def _is_street_gaussians(folder: Path) -> bool:
     if is_data or any(folder.glob("trained_model/iteration_*.pth")):
         return True
     return any(map(_is_multi_part, folder.glob("point_cloud/iteration_*/point_cloud.ply")))
-
-
-def _is_drivestudio(folder: Path) -> bool:
-    return (folder / "config.yaml").is_file() and any(folder.glob("checkpoint_*.pth"))
-
-
-def _is_street_gaussians_file(path: Path) -> bool:
-    return _is_multi_part(path) or re.fullmatch(r"iteration_\d+\.pth", path.name) is not None
-
-
-def _is_drivestudio_file(path: Path) -> bool:
-    return re.fullmatch(r"checkpoint_\w+\.pth", path.name) is not None
 
 
 def _is_recording(folder: Path) -> bool:
@@ -236,7 +209,11 @@ def _names(folder: Path) -> list[str]:
 # In this order: a later one may fit where an earlier one does.
 FOLDERS = (
     Signature("scene", is_scene_folder, "a scene folder (scene.json)"),
-    Signature("pandaset", _is_pandaset, "a PandaSet sequence (camera/ and lidar/)"),
+    Signature(
+        "pandaset",
+        lambda folder: (folder / "camera").is_dir() and (folder / "lidar").is_dir(),
+        "a PandaSet sequence (camera/ and lidar/)",
+    ),
     Signature("nuscenes", _is_nuscenes, "a nuScenes dataset (v1.0-*/scene.json)"),
     Signature(
         "street_gaussians",
@@ -244,7 +221,11 @@ FOLDERS = (
         "a Street Gaussians model (trained_model/iteration_N.pth) or its dataset (ego_pose/, "
         "extrinsics/, track/)",
     ),
-    Signature("drivestudio", _is_drivestudio, "a drivestudio run (config.yaml, checkpoint_*.pth)"),
+    Signature(
+        "drivestudio",
+        lambda folder: (folder / "config.yaml").is_file() and any(folder.glob("checkpoint_*.pth")),
+        "a drivestudio run (config.yaml, checkpoint_*.pth)",
+    ),
     Signature(
         "kitti",
         _is_kitti,
@@ -261,7 +242,15 @@ FOLDERS = (
 )
 FILES = (
     Signature("scene", is_scene_file, "a scene file (.climategs)"),
-    Signature("street_gaussians", _is_street_gaussians_file, "iteration_N.pth of Street Gaussians"),
-    Signature("drivestudio", _is_drivestudio_file, "checkpoint_*.pth of drivestudio"),
+    Signature(
+        "street_gaussians",
+        lambda path: _is_multi_part(path) or bool(re.fullmatch(r"iteration_\d+\.pth", path.name)),
+        "iteration_N.pth of Street Gaussians",
+    ),
+    Signature(
+        "drivestudio",
+        lambda path: re.fullmatch(r"checkpoint_\w+\.pth", path.name) is not None,
+        "checkpoint_*.pth of drivestudio",
+    ),
     Signature("gaussians", _is_splat_file, "a .ply or .splat file"),
 )

@@ -3,12 +3,11 @@
     gaussians:PATH?up=-y&scale=1&cameras=FILE
 
 Cameras are looked for beside the file (cameras.json, transforms.json, a COLMAP model in sparse/0)
-and above it in a model's folder; `adapters.camera_files.paths` says how images become frames.
-Without
-any, `adapters.camera_files.paths` makes a path. Coordinates and cameras of the file are turned
-so that `up` points to +z, scaled to metres, and recentred where they lie beyond a kilometre from
-zero. What neither the URI nor the file says of up and scale, `adapters.gaussian_files` estimates; a
-file whose ground is not clear gets no path.
+and above it in a model's folder; `adapters.camera_files.paths` says how images become frames, and
+makes a path where there are none. Coordinates and cameras of the file are turned so that `up`
+points to +z, scaled to metres, and recentred where they lie beyond a kilometre from zero. What
+neither the URI nor the file says of up and scale is estimated; a file whose ground is not clear
+gets no path.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ from adapters.camera_files.paths import (
     road_heights,
     solid_points,
 )
-from adapters.uri import format_uri
+from adapters.uri import check_query, choice_of, format_uri, whole_number_of
 from adapters.world import WorldChange, nearest_axis, parse_up, rotation_to_z_up
 from augment.cameras import Frame
 from augment.errors import AdapterError
@@ -46,8 +45,7 @@ from augment.rng import rng_for
 from augment.scene import Gaussians, Scene
 from augment.sky import ConstantSky
 
-# ------------------------------------------------------------------------------------------------
-# What may be asked of a splat file in its URI: `gaussians:PATH?up=-y&scale=1&cameras=FILE`
+# ---- What may be asked of a splat file in its URI ------------------------------------------------
 
 QUERY_KEYS = {
     "up": "the file's axis that points up (+x … -z), a vector 0,-1,0.1, or 'cameras': their mean; "
@@ -75,30 +73,17 @@ class GaussianOptions:
 
     @staticmethod
     def from_query(query: dict[str, str]) -> GaussianOptions:
-        """The options of a URI's query.
-
-        Raises:
-            AdapterError: an unknown key, or a value of the wrong kind or out of range.
-        """
-        unknown = sorted(set(query) - set(QUERY_KEYS))
-        if unknown:
-            known = "; ".join(f"{key}: {meaning}" for key, meaning in QUERY_KEYS.items())
-            raise AdapterError(
-                f"gaussians: unknown key {', '.join(map(repr, unknown))}. Known: {known}"
-            )
+        """The options of a URI's query."""
+        check_query("gaussians", query, QUERY_KEYS)
         if query.get("up", "cameras") != "cameras":
             parse_up(query["up"])  # a mistake here must not wait for a large file to load
-        path = PATH_KINDS.get(query.get("path", "auto"))
-        if path is None:
-            raise AdapterError(
-                f"gaussians: path must be one of {', '.join(PATH_KINDS)}; got {query['path']!r}"
-            )
+        choice_of("gaussians", query, "path", PATH_KINDS)
         return GaussianOptions(
             up=query.get("up"),
             scale=_parse_scale(query["scale"]) if "scale" in query else None,
             cameras=query.get("cameras"),
-            path=path,
-            iteration=_whole_number(query["iteration"]) if "iteration" in query else None,
+            path=PATH_KINDS[query.get("path", "auto")],
+            iteration=whole_number_of("gaussians", query, "iteration"),
             sky=_parse_colour(query["sky"]) if "sky" in query else None,
         )
 
@@ -113,12 +98,6 @@ def _parse_scale(text: str) -> float:
             f"gaussians: scale must be metres per unit, a number from 1e-6 to 1e6; got {text!r}"
         )
     return value
-
-
-def _whole_number(text: str) -> int:
-    if not (text.isascii() and text.isdigit() and len(text) < 10):
-        raise AdapterError(f"gaussians: iteration must be a whole number; got {text!r}")
-    return int(text)
 
 
 def _parse_colour(text: str) -> tuple[float, float, float]:
@@ -139,10 +118,8 @@ def _parse_colour(text: str) -> tuple[float, float, float]:
 # its size there: a floor under a ceiling and the facades of a canyon look like each other, and are
 # refused. Surface is counted in voxels, so that it matters neither how densely splats lie nor how
 # large they are; distances are parts of the scene's own size, so that the unit does not matter. The
-# same file gives the same numbers every time.
-#
-# The unit is the height of cameras above the ground, where they were driven or carried; without
-# cameras there is only the question whether the scene can be a street in metres.
+# unit is the height of cameras above the ground, where they were driven or carried; without cameras
+# there is only the question whether the scene can be a street in metres.
 
 CAMERAS_ABOVE_GROUND_M = 1.6
 _METRIC_HEIGHTS_M = (1.0, 2.6)  # cameras this high are on a car or a head, and the unit is a metre
@@ -165,9 +142,9 @@ _MIN_POINTS = 100
 
 @dataclass(frozen=True, eq=False)
 class GroundFound:
-    """up: unit [3], in the file's world. share: of the scene's surface, that lies in the ground's
-    plane. below: of it, that lies under the plane. above: in the fullest parallel plane over it.
-    lead: how many times better than the best plane of another direction it is.
+    """up: unit [3], in the file's world. share, below, above: parts of the scene's surface in the
+    ground's plane, under it, and in the fullest parallel plane over it. lead: how many times better
+    than the best plane of another direction it is.
     """
 
     up: np.ndarray
@@ -182,9 +159,8 @@ class GroundFound:
 
     @property
     def sentence(self) -> str:
-        name = ",".join(f"{value:.4g}" for value in self.up)
-        if np.abs(self.up).max() == 1:
-            name = nearest_axis(self.up)
+        is_axis = np.abs(self.up).max() == 1
+        name = nearest_axis(self.up) if is_axis else ",".join(f"{value:.4g}" for value in self.up)
         return (
             f"{name}: {self.share:.0%} of the surface lies in one plane, {self.below:.1%} under it "
             f"and {self.above:.0%} in a parallel one above it; that is {min(self.lead, 99):.1f} "
@@ -254,8 +230,7 @@ def scale_from_cameras(points: np.ndarray, poses: np.ndarray) -> tuple[float, st
 
 def doubt_about_metres(points: np.ndarray, scales: Tensor) -> str | None:
     """Why these solid points [N, 3] (+z up) and the scales of all Gaussians cannot be of a street
-    in metres; None where they may be.
-    """
+    in metres; None where they may be."""
     points = points[in_bulk(points, BULK_REACH)]
     low, high = np.quantile(points, [0.05, 0.95], axis=0)
     measures = {
@@ -331,8 +306,7 @@ class _Surface:
 
 def _voxel_means(points: np.ndarray, size: float) -> np.ndarray:
     """Mean of the points in every voxel that has not far fewer of them than a point's usually has:
-    stray ones fill many voxels.
-    """
+    stray ones fill many voxels."""
     index = np.floor(points / size).astype(np.int64)
     index -= index.min(axis=0)
     _, y, z = index.max(axis=0) + 1
@@ -350,7 +324,7 @@ def _snapped(up: np.ndarray) -> np.ndarray:
     return axis if up @ axis > math.cos(math.radians(_SNAP_DEG)) else up
 
 
-# ---- gaussian files ------------------------------------------------------------------------------
+# ---- The scene -----------------------------------------------------------------------------------
 
 _UP_TOLERANCE_DEG = 30.0
 _LEVEL_TOLERANCE_DEG = 15.0  # cameras on a car lean less; this vouches for an axis, not for degrees
@@ -397,11 +371,7 @@ def open_gaussians(path: str | Path, query: dict[str, str]) -> Scene:
 
 
 def find_splat_file(path: Path, iteration: int | None = None) -> Path:
-    """The splat file itself, the newest (or given) iteration of a model, or a folder's only one.
-
-    Raises:
-        AdapterError: none, or several; lists what is there.
-    """
+    """The splat file itself, the newest (or given) iteration of a model, or a folder's only one."""
     if not path.is_dir():
         return path
     found = {}
@@ -424,8 +394,7 @@ def find_splat_file(path: Path, iteration: int | None = None) -> Path:
 
 def _stand_in_sky(path: Path) -> tuple[float, float, float]:
     """An overcast sky, whose light tints nothing; white where the model's cfg_args say that it was
-    trained in front of white. (What was trained in front of black would stand in a black night.)
-    """
+    trained in front of white. (What was trained in front of black would stand in a black night.)"""
     arguments = path / "cfg_args"
     if arguments.is_file() and "white_background=True" in arguments.read_text(errors="replace"):
         return COLOURS["white"]
@@ -457,8 +426,7 @@ def _find_views(file: Path, given: Path, options: GaussianOptions) -> ViewSet | 
 @dataclass(frozen=True, eq=False)
 class _World:
     """change: from the file's world to the scene's. problems: what is estimated or in doubt.
-    lacking: what of up and scale is not known; empty where both are.
-    """
+    lacking: what of up and scale is not known; empty where both are."""
 
     change: WorldChange
     knows_up: bool
@@ -501,7 +469,11 @@ def _find_up(
     splats: SplatFile, views: tuple[PosedView, ...], options: GaussianOptions
 ) -> tuple[np.ndarray, bool, str]:
     """Up in the file's world, whether it is known, and what there is to say about it."""
-    cameras_up = _mean_up(views)
+    cameras_up = None
+    if views:  # the mean direction of the images' top edges; cameras may point everywhere
+        mean = np.mean([-view.world_from_camera[:3, 1] for view in views], axis=0)
+        length = np.linalg.norm(mean)
+        cameras_up = mean / length if length > 0.1 else None
     if options.up == "cameras":
         if cameras_up is None:
             raise AdapterError(
@@ -536,8 +508,7 @@ def _find_scale(
     splats: SplatFile, views: tuple[PosedView, ...], options: GaussianOptions, turned: WorldChange
 ) -> tuple[float, bool, str]:
     """Metres per unit, whether that is known, and what there is to say about it. turned: to a world
-    whose +z is up.
-    """
+    whose +z is up."""
     if options.scale is not None:
         return options.scale, True, ""
     if splats.notes.get("unit") in ("metre", "metres", "m"):
@@ -553,17 +524,8 @@ def _find_scale(
     doubt = doubt_about_metres(scale * points, scale * splats.gaussians.scales)
     if doubt is not None:
         return 1.0, False, doubt
-    said = f"a unit is estimated to be {scale:.4g} m: {reason}"
-    return scale, True, f"{said}. Give scale=METRES_PER_UNIT if not"
-
-
-def _mean_up(views: tuple[PosedView, ...]) -> np.ndarray | None:
-    """Mean direction of the images' top edge in the file's world; None if there is none."""
-    if not views:
-        return None
-    mean = np.mean([-view.world_from_camera[:3, 1] for view in views], axis=0)
-    length = np.linalg.norm(mean)
-    return mean / length if length > 0.1 else None  # cameras that point everywhere say nothing
+    message = f"a unit is estimated to be {scale:.4g} m: {reason}"
+    return scale, True, f"{message}. Give scale=METRES_PER_UNIT if not"
 
 
 def _frames_and_ground(

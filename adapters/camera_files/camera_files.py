@@ -6,6 +6,7 @@ Read are INRIA's cameras.json, nerfstudio's transforms.json, this project's came
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import Counter
 from collections.abc import Sequence
@@ -17,10 +18,9 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from adapters.plain_files import LARGEST, read_json
+from adapters.world import invert_pose
 from augment.errors import AdapterError
 from augment.jobs.manifest import MAX_SIDE_PX
-
-# ---- Views: the images of a camera file, before they are grouped into frames ---------------------
 
 _ORTHONORMAL_TOLERANCE = 1e-4  # as in Camera: poses written with four decimals or fewer fail
 
@@ -58,11 +58,7 @@ class ViewSet:
 
 
 def check_pose(world_from_camera: np.ndarray, *, where: str) -> np.ndarray:
-    """The pose as float64 [4, 4] with an exact last row, once it is known to be rigid.
-
-    Raises:
-        AdapterError: the rotation is not orthonormal with determinant +1, or a value not finite.
-    """
+    """The pose as float64 [4, 4] with an exact last row, once it is known to be rigid."""
     pose = np.asarray(world_from_camera, dtype=np.float64)
     if not (np.abs(pose) <= LARGEST).all():  # NaN included
         raise AdapterError(
@@ -83,9 +79,7 @@ def check_pose(world_from_camera: np.ndarray, *, where: str) -> np.ndarray:
             f"{where}: the rotation must have determinant +1; got {determinant:.3g}, a mirrored "
             "camera"
         )
-    whole = np.eye(4)
-    whole[:3] = pose[:3]
-    return whole
+    return np.vstack([pose[:3], [0, 0, 0, 1]])
 
 
 def look_at_pose(
@@ -94,9 +88,6 @@ def look_at_pose(
     """world_from_camera of an upright camera at `position` that looks at `target` (world +z up).
 
     Straight up or down, where upright means nothing, the top of the image points to world +y.
-
-    Raises:
-        AdapterError: the two points coincide.
     """
     eye, forward = np.asarray(position, np.float64), np.subtract(target, position, dtype=np.float64)
     length = np.linalg.norm(forward)
@@ -114,8 +105,7 @@ def look_at_pose(
     return pose
 
 
-# ------------------------------------------------------------------------------------------------
-# Cameras that other tools wrote as JSON: INRIA's cameras.json and nerfstudio's transforms.json
+# ---- JSON of other tools: INRIA's cameras.json and nerfstudio's transforms.json ------------------
 
 Model = TypeVar("Model", bound=BaseModel)
 # No texts, true or false, which pydantic otherwise takes for numbers; and none beyond LARGEST.
@@ -180,11 +170,7 @@ class _NerfstudioFile(_Intrinsics):
 
 
 def validate(model: type[Model], content: object, path: Path, kind: str) -> Model:
-    """`content` as the model.
-
-    Raises:
-        AdapterError: names the first fields that do not fit, with their place and value.
-    """
+    """`content` as the model."""
     try:
         return model.model_validate(content)
     except ValidationError as error:
@@ -200,11 +186,7 @@ def validate(model: type[Model], content: object, path: Path, kind: str) -> Mode
 
 def inria_views(content: list[object], path: Path) -> ViewSet:
     """Views of INRIA's list. Its cameras have no principal point, which is the middle then; our own
-    exports add cx and cy.
-
-    Raises:
-        AdapterError: a field is missing or out of range; names it.
-    """
+    exports add cx and cy."""
     file = validate(_InriaFile, {"cameras": content}, path, "INRIA cameras.json")
     views = []
     for number, camera in enumerate(file.cameras):
@@ -226,11 +208,7 @@ def inria_views(content: list[object], path: Path) -> ViewSet:
 
 
 def nerfstudio_views(content: object, path: Path) -> ViewSet:
-    """Views of nerfstudio's frames: OpenGL axes turned to OpenCV's, lens distortion left out.
-
-    Raises:
-        AdapterError: a field is missing or out of range, or a lens with no pinhole near it.
-    """
+    """Views of nerfstudio's frames: OpenGL axes turned to OpenCV's, lens distortion left out."""
     file = validate(_NerfstudioFile, content, path, "nerfstudio transforms.json")
     views = []
     distorted: Counter[str] = Counter()
@@ -293,20 +271,15 @@ _MODEL_FOLDERS = (".", "sparse/0", "sparse", "colmap/sparse/0")
 
 def find_colmap_model(folder: Path) -> Path | None:
     """The folder of the sparse model in or below `folder`, or None."""
-    for name in _MODEL_FOLDERS:
+    for name, suffix in itertools.product(_MODEL_FOLDERS, (".bin", ".txt")):
         model = folder / name
-        for suffix in (".bin", ".txt"):
-            if all((model / f"{table}{suffix}").is_file() for table in ("cameras", "images")):
-                return model
+        if all((model / f"{table}{suffix}").is_file() for table in ("cameras", "images")):
+            return model
     return None
 
 
 def read_colmap_views(model: Path) -> ViewSet:
-    """Views of the registered images. Lens distortion is left out, and said so.
-
-    Raises:
-        AdapterError: the model is damaged or holds no posed image.
-    """
+    """Views of the registered images. Lens distortion is left out, and said so."""
     import pycolmap  # 0.2 s and a large native library: only those who have COLMAP models pay
 
     try:
@@ -316,7 +289,9 @@ def read_colmap_views(model: Path) -> ViewSet:
             f"{model}: pycolmap cannot read this COLMAP model: {error}. Expected cameras, images "
             "and points3D, all .bin or all .txt"
         ) from error
-    folder = next((f for f in _image_folders(model) if f.is_dir()), None)
+    # Images of a model in project/sparse/0, project/sparse or project.
+    folders = [parent / "images" for parent in (model, model.parent, model.parent.parent)]
+    folder = next((f for f in folders if f.is_dir()), None)
     views = []
     distorted: Counter[str] = Counter()
     for image in sorted(reconstruction.images.values(), key=lambda image: image.name):
@@ -325,6 +300,7 @@ def read_colmap_views(model: Path) -> ViewSet:
         camera = reconstruction.cameras[image.camera_id]
         if not camera.is_undistorted():
             distorted[camera.model_name] += 1
+        where = f"{model}: image {image.name}"
         camera_from_world = np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
         path = folder / image.name if folder else None
         views.append(
@@ -336,7 +312,7 @@ def read_colmap_views(model: Path) -> ViewSet:
                 fy=camera.focal_length_y,
                 cx=camera.principal_point_x,
                 cy=camera.principal_point_y,
-                world_from_camera=_inverse(camera_from_world, f"{model}: image {image.name}"),
+                world_from_camera=invert_pose(check_pose(camera_from_world, where=where)),
                 image_path=str(path) if path and path.is_file() else None,
             )
         )
@@ -344,19 +320,6 @@ def read_colmap_views(model: Path) -> ViewSet:
         raise AdapterError(f"{model}: this COLMAP model holds no image with a pose")
     problems = [distortion_problem(str(model), n, m) for m, n in distorted.items()]
     return ViewSet(tuple(views), tuple(problems))
-
-
-def _image_folders(model: Path) -> list[Path]:
-    """Where COLMAP projects keep the images of project/sparse/0, project/sparse or project."""
-    return [parent / "images" for parent in (model, model.parent, model.parent.parent)]
-
-
-def _inverse(camera_from_world: np.ndarray, where: str) -> np.ndarray:
-    pose = check_pose(camera_from_world, where=where)
-    inverse = np.eye(4)
-    inverse[:3, :3] = pose[:3, :3].T
-    inverse[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
-    return inverse
 
 
 # ---- The camera path: a small JSON format for poses made by hand or by a script ------------------
@@ -369,8 +332,7 @@ def _inverse(camera_from_world: np.ndarray, where: str) -> np.ndarray:
 # Lengths and axes are those of the world the path is used in; cameras are OpenCV (x right, y down,
 # z forward). `fy` defaults to `fx`, `cx, cy` to the middle, `camera` to "camera". `timestamp_s`
 # counts from the scene's first frame, and entries of one time are one frame. Without times, the
-# n-th
-# entry of every camera is frame n, 0.1 s apart.
+# n-th entry of every camera is frame n, 0.1 s apart.
 
 # int64 nanoseconds reach 9.2e9 s.
 Seconds = Annotated[float, Field(strict=True, ge=-9e9, le=9e9, allow_inf_nan=False)]
@@ -418,11 +380,7 @@ class _PathFile(BaseModel):
 
 
 def path_views(content: object, path: Path) -> ViewSet:
-    """Views of a camera path.
-
-    Raises:
-        AdapterError: a field is unknown, missing or out of range; names its place and value.
-    """
+    """Views of a camera path."""
     file = validate(_PathFile, content, path, "camera path")
     times = sorted({f.timestamp_s for f in file.frames if f.timestamp_s is not None})
     rank = {time: number for number, time in enumerate(times)}
@@ -454,7 +412,7 @@ def path_views(content: object, path: Path) -> ViewSet:
     return ViewSet(tuple(views))
 
 
-# ---- files ---------------------------------------------------------------------------------------
+# ---- Any of them ---------------------------------------------------------------------------------
 
 _JSON_NAMES = ("cameras.json", "transforms.json")
 
@@ -488,12 +446,7 @@ def find_camera_file(folder: Path) -> Path | None:
 
 
 def read_camera_json(path: Path) -> ViewSet:
-    """Read any of the three JSON formats, told apart by their keys.
-
-    Raises:
-        AdapterError: not JSON, none of the formats, or a field that is missing or out of range
-            (named with its place in the file).
-    """
+    """Read any of the three JSON formats, told apart by their keys."""
     content = read_json(path, object)
     if isinstance(content, list):
         return inria_views(content, path)
@@ -503,14 +456,11 @@ def read_camera_json(path: Path) -> ViewSet:
         return nerfstudio_views(content, path)
     if isinstance(content, dict) and "frames" in content:
         return path_views(content, path)
+    found = f"a {type(content).__name__}"
+    if isinstance(content, dict):
+        found = f"an object with keys {sorted(content)[:8]}"
     raise AdapterError(
         f"{path}: expected a list of cameras (INRIA cameras.json), 'frames' with "
         "'transform_matrix' (nerfstudio transforms.json), or 'frames' with 'position' and "
-        f"'look_at' or 'world_from_camera' (a camera path); got {_describe(content)}"
+        f"'look_at' or 'world_from_camera' (a camera path); got {found}"
     )
-
-
-def _describe(content: object) -> str:
-    if isinstance(content, dict):
-        return f"an object with keys {sorted(content)[:8]}"
-    return f"a {type(content).__name__}"

@@ -1,11 +1,10 @@
-"""Other cameras for a scene, from a path file.
+"""Frames for scenes that come without: from camera files, or a drive or orbit made for them.
 
-The path file is a camera path (`adapters.camera_files.camera_files`), an INRIA cameras.json, a
-nerfstudio
-transforms.json or a COLMAP model. Its poses are in the scene's world before recentring: metres, +z
-up, `Scene.world_origin_m` not yet subtracted. Its times count from the scene's first frame, so that
-moving actors are where they were then. (Cameras in a splat file's own axes and unit belong
-into that scene's URI: `gaussians:FILE?cameras=…`.)
+A path file is a camera path (`adapters.camera_files.camera_files`), an INRIA cameras.json, a
+nerfstudio transforms.json or a COLMAP model. Its poses are in the scene's world before recentring:
+metres, +z up, `Scene.world_origin_m` not yet subtracted. Its times count from the scene's first
+frame, so that moving actors are where they were then. (Cameras in a splat file's own axes and unit
+belong into that scene's URI: `gaussians:FILE?cameras=…`.)
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from torch import Tensor
 
 from adapters.camera_files.camera_files import PosedView, look_at_pose, read_views
 from adapters.uri import CAMERA_PATH_KEY, add_to_uri
-from adapters.world import WorldChange
+from adapters.world import WorldChange, invert_pose
 from augment.cameras import Camera, Frame
 from augment.errors import AdapterError
 from augment.scene import Gaussians, Scene
@@ -57,8 +56,7 @@ def solid_points(gaussians: Gaussians) -> np.ndarray:
 def solid_points_and_areas(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray]:
     """The same centres, and the area [N] each hides: opacity times 2 pi times its two larger
     scales, which is what it takes from a wide beam across its face. Thinned areas make up for
-    those left out.
-    """
+    those left out."""
     index = _solid(gaussians)
     count = int((gaussians.opacities > SOLID_OPACITY).sum())
     scales = gaussians.scales[index].sort(dim=1).values
@@ -76,8 +74,7 @@ def _solid(gaussians: Gaussians) -> Tensor:
 
 def in_bulk(points: np.ndarray, reach: float) -> np.ndarray:
     """Which points [N, 3] lie within `reach` times the median distance from their middle: without
-    what floats far around a scene, which would stretch every extent.
-    """
+    what floats far around a scene, which would stretch every extent."""
     inside = np.ones(len(points), bool)
     for _ in range(3):  # the middle moves once the far ones are gone
         distance = np.linalg.norm(points - np.median(points[inside], axis=0), axis=1)
@@ -215,10 +212,7 @@ _CAR_M = (0.5, 2.5)  # above the ground: what lies between is in the way
 _HALF_WIDTH_M = 1.25
 _DETAIL_REACH_M, _COARSER_THAN_USUAL = 2.0, 1.7
 _BLOCKED_COST = 4.0  # passing half a metre of wall must cost more than it gains
-_BEHIND_SHARE, _AHEAD_SHARE = (
-    0.05,
-    0.3,
-)  # parts of the line before the first and after the last image
+_BEHIND_SHARE, _AHEAD_SHARE = 0.05, 0.3  # of the line, before the first and after the last image
 _ORBIT_ELEVATION_DEG = 20.0
 
 
@@ -317,8 +311,7 @@ def _is_detailed(
     points: np.ndarray, areas: np.ndarray, corner: np.ndarray, cell: float, shape: np.ndarray
 ) -> np.ndarray:
     """Where Gaussians are not much larger than usual: scenes are sharp where their cameras drove,
-    and a path far from there would look into a blur.
-    """
+    and a path far from there would look into a blur."""
     size = np.log(np.maximum(areas, 1e-12))
     reach = round(_DETAIL_REACH_M / cell)
     total = _sum_around(_sum_in_cells(points, size, corner, cell, shape), reach)
@@ -358,10 +351,8 @@ def _drive(
     ]
     if beyond[1] > beyond[0]:  # drive towards the side where more lies ahead of the end
         start, end, forward = end, start, -forward
-    start, length = (
-        start + _BEHIND_SHARE * whole * forward,
-        min((1 - _BEHIND_SHARE - _AHEAD_SHARE) * whole, _MAX_DRIVE_M),
-    )
+    start = start + _BEHIND_SHARE * whole * forward
+    length = min((1 - _BEHIND_SHARE - _AHEAD_SHARE) * whole, _MAX_DRIVE_M)
     count = max(2, min(_MAX_FRAMES, round(length / _STEP_M) + 1))
     places = start + np.linspace(0, length, count)[:, None] * forward
     heights = road_heights(points, areas, places, grid.at(places))
@@ -475,30 +466,27 @@ def frames_from_views(
     change: from the views' world to the scene's. start_ns: what times in the views count from, and
     the time of the first frame where they have none. world_from_ego stands at the front camera,
     level, x along its optical axis.
-
-    Raises:
-        AdapterError: a camera's numbers cannot be used.
     """
     keys, problems = _keys_of_views(views)
     order = sorted(set(frame for _, frame in keys), key=_natural)
     numbers = _frame_numbers(order)
     frames = []
     for rank, key in enumerate(order):
-        members = [(k[0], v) for k, v in zip(keys, views, strict=True) if k[1] == key]
-        members.sort(key=lambda member: _natural(member[0]))
+        of_frame = [(k[0], v) for k, v in zip(keys, views, strict=True) if k[1] == key]
+        of_frame.sort(key=lambda named: _natural(named[0]))
         default_ns = start_ns + round(rank * FRAME_INTERVAL_S * 1e9)
         times = {
             name: default_ns if view.timestamp_ns is None else start_ns + view.timestamp_ns
-            for name, view in members
+            for name, view in of_frame
         }
-        cameras = {name: _camera(name, view, change, times[name]) for name, view in members}
+        cameras = {name: _camera(name, view, change, times[name]) for name, view in of_frame}
         frames.append(
             Frame(
                 index=numbers[rank],
                 timestamp_ns=min(camera.timestamp_ns for camera in cameras.values()),
                 world_from_ego=ego_from_front_camera(cameras),
                 cameras=cameras,
-                image_paths={name: v.image_path for name, v in members if v.image_path},
+                image_paths={name: v.image_path for name, v in of_frame if v.image_path},
             )
         )
     return tuple(frames), problems
@@ -506,8 +494,7 @@ def frames_from_views(
 
 def split_names(names: Sequence[str]) -> list[tuple[str, str]] | None:
     """Camera and frame of every image name by the module's rules; None where none of them fits
-    (then every image is a frame of a single camera).
-    """
+    (then every image is a frame of a single camera)."""
     parts = [_parts(name) for name in names]
     while len({p[0] for p in parts}) == 1 and min(map(len, parts)) > 1:
         parts = [p[1:] for p in parts]
@@ -589,10 +576,7 @@ def _frame_numbers(order: Sequence[str]) -> list[int]:
 
 
 def _camera(name: str, view: PosedView, change: WorldChange, timestamp_ns: int) -> Camera:
-    pose = change.pose(view.world_from_camera)
-    camera_from_world = np.eye(4)
-    camera_from_world[:3, :3] = pose[:3, :3].T
-    camera_from_world[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
+    camera_from_world = invert_pose(change.pose(view.world_from_camera))
     try:
         return Camera(
             name=name,
@@ -609,7 +593,7 @@ def _camera(name: str, view: PosedView, change: WorldChange, timestamp_ns: int) 
         raise AdapterError(f"image {view.name!r}: {error}") from error
 
 
-# ---- paths ---------------------------------------------------------------------------------------
+# ---- A scene with the frames of a path file ------------------------------------------------------
 
 
 def frames_from_path_file(path: str | Path, scene: Scene) -> tuple[Frame, ...]:
@@ -640,11 +624,9 @@ def with_camera_path(scene: Scene, path: str | Path) -> Scene:
 
 def _frames_and_problems(path: Path, scene: Scene) -> tuple[tuple[Frame, ...], tuple[str, ...]]:
     found = read_views(path)
-    frames, problems = frames_from_views(
-        found.views,
-        WorldChange(origin_m=scene.world_origin_m),
-        start_ns=scene.frames[0].timestamp_ns if scene.frames else 0,
-    )
+    start_ns = scene.frames[0].timestamp_ns if scene.frames else 0
+    change = WorldChange(origin_m=scene.world_origin_m)
+    frames, problems = frames_from_views(found.views, change, start_ns=start_ns)
     if scene.labels is not None:
         problems += (f"{path}: its frames are not the dataset's, so boxes and LiDAR are left out",)
     return frames, (*found.problems, *problems)

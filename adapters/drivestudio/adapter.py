@@ -287,8 +287,8 @@ def identify(
             if np.abs(size - poses.sizes_m[index]).max() > _SAME_SIZE_M:
                 continue
             places = instance.poses[inside, :3, 3] @ model_from_dataset[:3, :3].T
-            apart = places + model_from_dataset[:3, 3] - poses.positions[shown, index]
-            candidates.append((float(np.linalg.norm(apart, axis=1).mean()), instance))
+            offsets = places + model_from_dataset[:3, 3] - poses.positions[shown, index]
+            candidates.append((float(np.linalg.norm(offsets, axis=1).mean()), instance))
         candidates.sort(key=lambda candidate: candidate[0])
         is_clear = bool(candidates) and candidates[0][0] < _NEAR_M
         if is_clear and len(candidates) > 1:
@@ -382,9 +382,9 @@ def _turns_of_faces(source_from_target: np.ndarray) -> list[tuple[int, int]]:
             (source, quarters)
             for source in range(6)
             for quarters in range(4)
-            if torch.equal(torch.rot90(texels[source], quarters), wanted)
+            if torch.equal(torch.rot90(texels[source], quarters), texels_of_face)
         )
-        for wanted in shown
+        for texels_of_face in shown
     ]
 
 
@@ -460,6 +460,7 @@ def open_drivestudio(path: str, query: dict[str, str]) -> Scene:
     models = section(content, "models", where)
     corrections = read_corrections(models, run, where)
     frames, about_frames = read_drive(run, numbers, corrections)
+    color_maps, image_color_maps = corrections.maps_of(run, frames)
     sky, about_sky = read_sky(models, scene_from_model(run), where)
     background, about_background = read_gaussians(
         section(models, BACKGROUND, where),
@@ -483,8 +484,8 @@ def open_drivestudio(path: str, query: dict[str, str]) -> Scene:
         sky=sky,
         frames=frames,
         labels=DriveStudioLabels(run),
-        color_maps=corrections.camera_maps(run),
-        image_color_maps=corrections.image_maps(run, frames),
+        color_maps=color_maps,
+        image_color_maps=image_color_maps,
         problems=(
             *left_out(models, where),
             *about_background,

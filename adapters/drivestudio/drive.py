@@ -66,10 +66,6 @@ def needed(
     return value
 
 
-def _is_text(value: Any) -> bool:
-    return isinstance(value, str)
-
-
 def _is_integer(value: Any) -> bool:
     return type(value) is int
 
@@ -122,11 +118,9 @@ class RunOptions:
         return kept
 
 
-# ------------------------------------------------------------------------------------------------
-# What drivestudio's processed data of each dataset means: cameras, axes, worlds, LiDAR columns
+# ---- What the processed data of each dataset means: cameras, axes, worlds, LiDAR columns ---------
 # Facts of the project's loaders and of its table of image sizes, to which it resizes whatever
-# images
-# it finds. The model's world is the first frame's pose of `world`, undone.
+# images it finds. The model's world is the first frame's pose of `world`, undone.
 
 # Rows: x forward, y left, z up, in OpenCV's camera axes x right, y down, z forward.
 FLAT_FROM_OPENCV = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
@@ -178,27 +172,28 @@ def convention_of(dataset: str, where: str) -> Convention:
     return found
 
 
-def _cameras(width: int, height: int, *names: str) -> tuple[CameraKind, ...]:
-    return tuple(CameraKind(name, width, height) for name in names)
+def _cameras(width: int, height: int, names: str) -> tuple[CameraKind, ...]:
+    return tuple(CameraKind(name, width, height) for name in names.split())
 
 
+_WAYMO_COLUMNS = (
+    "origin_x origin_y origin_z x y z flow_x flow_y flow_z flow_class ground intensity elongation "
+    "laser_id"
+)
 _XYZI = ("x", "y", "z", "intensity")
 _CONVENTIONS = {
     "waymo": Convention(
         cameras=(
-            *_cameras(1920, 1280, "front_camera", "front_left_camera", "front_right_camera"),
-            *_cameras(1920, 866, "left_camera", "right_camera"),
+            *_cameras(1920, 1280, "front_camera front_left_camera front_right_camera"),
+            *_cameras(1920, 866, "left_camera right_camera"),
         ),
-        lidar_columns=(
-            *("origin_x", "origin_y", "origin_z", "x", "y", "z", "flow_x", "flow_y", "flow_z"),
-            *("flow_class", "ground", "intensity", "elongation", "laser_id"),
-        ),
+        lidar_columns=tuple(_WAYMO_COLUMNS.split()),
         camera_from_opencv=FLAT_FROM_OPENCV,
     ),
     "nuscenes": Convention(
-        cameras=_cameras(
-            *(1600, 900, "CAM_FRONT", "CAM_FRONT_LEFT", "CAM_FRONT_RIGHT"),
-            *("CAM_BACK_LEFT", "CAM_BACK_RIGHT", "CAM_BACK"),
+        cameras=(
+            *_cameras(1600, 900, "CAM_FRONT CAM_FRONT_LEFT CAM_FRONT_RIGHT CAM_BACK_LEFT"),
+            *_cameras(1600, 900, "CAM_BACK_RIGHT CAM_BACK"),
         ),
         lidar_columns=_XYZI,
         poses_per_frame=True,
@@ -207,9 +202,9 @@ _CONVENTIONS = {
         pose_from_ego=FLAT_FROM_OPENCV.T,
     ),
     "pandaset": Convention(
-        cameras=_cameras(
-            *(1920, 1080, "front_camera", "front_left_camera", "front_right_camera"),
-            *("left_camera", "right_camera", "back_camera"),
+        cameras=(
+            *_cameras(1920, 1080, "front_camera front_left_camera front_right_camera"),
+            *_cameras(1920, 1080, "left_camera right_camera back_camera"),
         ),
         lidar_columns=(*_XYZI, "laser_id"),
         poses_per_frame=True,
@@ -219,17 +214,14 @@ _CONVENTIONS = {
     "argoverse": Convention(
         cameras=(
             CameraKind("ring_front_center", 1550, 2048),
-            *_cameras(2048, 1550, "ring_front_left", "ring_front_right", "ring_side_left"),
-            *_cameras(2048, 1550, "ring_side_right", "ring_rear_left", "ring_rear_right"),
+            *_cameras(2048, 1550, "ring_front_left ring_front_right ring_side_left"),
+            *_cameras(2048, 1550, "ring_side_right ring_rear_left ring_rear_right"),
         ),
         lidar_columns=_XYZI,
     ),
-    "kitti": Convention(cameras=_cameras(1242, 375, "CAM_LEFT", "CAM_RIGHT"), lidar_columns=_XYZI),
+    "kitti": Convention(cameras=_cameras(1242, 375, "CAM_LEFT CAM_RIGHT"), lidar_columns=_XYZI),
     "nuplan": Convention(
-        cameras=_cameras(
-            *(1920, 1080, "CAM_F0", "CAM_L0", "CAM_R0", "CAM_L1"),
-            *("CAM_R1", "CAM_L2", "CAM_R2", "CAM_B0"),
-        ),
+        cameras=_cameras(1920, 1080, "CAM_F0 CAM_L0 CAM_R0 CAM_L1 CAM_R1 CAM_L2 CAM_R2 CAM_B0"),
         lidar_columns=(*_XYZI, "ring", "lidar_id"),
     ),
 }
@@ -249,8 +241,7 @@ class Run:
     """A trained run and the data it was trained on.
 
     frames: numbers of all its frames. cameras: numbers, in the model's order. downscale: of each
-    camera's images. test_stride: every how manyeth frame was held out; 0 for none. config: the
-    whole of it.
+    camera's images. test_stride: every how manyeth frame was held out; 0 for none.
     """
 
     folder: Path
@@ -292,7 +283,9 @@ def find_run(path: Path, options: RunOptions) -> Run:
     config_file = folder / "config.yaml"
     config = read_config(config_file)
     where = str(config_file)
-    convention = convention_of(needed(config, "data.dataset", where, "a text", _is_text), where)
+    convention = convention_of(
+        needed(config, "data.dataset", where, "a text", lambda name: isinstance(name, str)), where
+    )
     checkpoint = _find_checkpoint(path, folder, options)
     data = _find_data(config, folder, options, where)
     stride = 0
@@ -375,7 +368,7 @@ def _find_data(config: Mapping[str, Any], folder: Path, options: RunOptions, whe
             )
         return data
     root, scene = lookup(config, "data.data_root"), lookup(config, "data.scene_idx")
-    said = "its config.yaml does not say where the data is"
+    reason = "its config.yaml does not say where the data is"
     if isinstance(root, str) and isinstance(scene, int | str):
         name = f"{int(scene):03d}" if str(scene).isdecimal() else str(scene)
         # A relative root is one from where training was started, often a folder above the run.
@@ -383,9 +376,9 @@ def _find_data(config: Mapping[str, Any], folder: Path, options: RunOptions, whe
             data = start / root / name
             if data.is_dir():
                 return data
-        said = f"{Path(root) / name} of its config.yaml is not here"
+        reason = f"{Path(root) / name} of its config.yaml is not here"
     raise AdapterError(
-        f"{where}: the run needs the processed data it was trained on, and {said}; give the "
+        f"{where}: the run needs the processed data it was trained on, and {reason}; give the "
         f"scene's folder as data=DIR"
     )
 
@@ -429,32 +422,21 @@ class ImageCorrections:
     pose_changes: np.ndarray | None
     problems: tuple[str, ...] = ()
 
-    def camera_from_corrected(self, image: int) -> np.ndarray:
-        return np.eye(4) if self.pose_changes is None else self.pose_changes[image]
-
-    def camera_maps(self, run: Run) -> dict[str, torch.Tensor]:
-        """Of cameras whose images were not trained on, by name."""
-        if self.mean_color_map is None:
-            return {}
-        names = [run.convention.cameras[number].name for number in run.cameras]
-        return {name: torch.from_numpy(self.mean_color_map.copy()) for name in names}
-
-    def image_maps(
+    def maps_of(
         self, run: Run, frames: tuple[Frame, ...]
-    ) -> dict[tuple[str, int], torch.Tensor]:
-        """Of the images that were trained on, by camera name and time."""
-        if self.color_maps is None:
-            return {}
-        maps = {}
-        for frame in frames:
-            if run.is_held_out(frame.index):
-                continue
-            first = (frame.index - run.frames.start) * len(run.cameras)
-            for position, number in enumerate(run.cameras):
-                name = run.convention.cameras[number].name
-                color_map = torch.from_numpy(self.color_maps[first + position].copy())
-                maps[name, frame.cameras[name].timestamp_ns] = color_map
-        return maps
+    ) -> tuple[dict[str, torch.Tensor], dict[tuple[str, int], torch.Tensor]]:
+        """Colour maps by camera name, and of images that were trained on by name and time."""
+        names = [run.convention.cameras[number].name for number in run.cameras]
+        by_camera, by_image = {}, {}
+        if self.color_maps is not None and self.mean_color_map is not None:
+            by_camera = {name: torch.from_numpy(self.mean_color_map.copy()) for name in names}
+            for frame in frames:
+                first = (frame.index - run.frames.start) * len(run.cameras)
+                for image, name in enumerate(names, start=first):
+                    if not run.is_held_out(frame.index):
+                        color_map = torch.from_numpy(self.color_maps[image].copy())
+                        by_image[name, frame.cameras[name].timestamp_ns] = color_map
+        return by_camera, by_image
 
 
 def read_corrections(models: Mapping[str, Any], run: Run, where: str) -> ImageCorrections:
@@ -592,7 +574,9 @@ def read_drive(
                 missing.append(file.name)
             image = (number - run.frames.start) * len(cameras) + position
             world_from_camera = scene @ _dataset_from_camera(run, number, position, fixed)
-            pose = torch.from_numpy(world_from_camera @ corrections.camera_from_corrected(image))
+            if corrections.pose_changes is not None:
+                world_from_camera = world_from_camera @ corrections.pose_changes[image]
+            pose = torch.from_numpy(world_from_camera)
             shown[camera.name] = dataclasses.replace(
                 camera, camera_from_world=invert_rigid(pose), timestamp_ns=number * FRAME_NS
             )

@@ -305,14 +305,14 @@ class Tree:
     ) -> Hits:
         rays = len(directions)
         hits = Hits(np.empty(rays), np.empty(rays, np.int64), np.empty((rays, 3)))
-        starts = np.ascontiguousarray(np.broadcast_to(origins, (rays, 3)), np.float64)
+        origins = np.ascontiguousarray(np.broadcast_to(origins, (rays, 3)), np.float64)
         ahead = np.ascontiguousarray(directions, np.float64)
         nodes, shapes = (
             (self.bounds, self.first, self.count),
             (self.kind, self.origin, self.inverse),
         )
         out = (hits.distance, hits.shape, hits.local)
-        trace(starts, ahead, limits, any_hit, *nodes, self.order, *shapes, *out)
+        trace(origins, ahead, limits, any_hit, *nodes, self.order, *shapes, *out)
         return hits
 
 

@@ -514,10 +514,10 @@ def _sigma_per_side(plan: SplatPlan, counts: np.ndarray, backing: np.ndarray) ->
     share = np.where(kind == Kind.TRIANGLE, MESH_SIGMA_PER_SIDE, share)
     share = np.where(kind == Kind.ELLIPSOID, BLOB_SIGMA_PER_SIDE, share)
     share = np.where(hidden & (kind == Kind.PARALLELOGRAM), NARROW_SIGMA_PER_SIDE, share)
-    lone = [
+    single = [
         (counts[:, i] == 1) & ((plan.shapes.edges & bits) == bits) for i, bits in enumerate(_ENDS)
     ]
-    return np.where(np.stack(lone, 1), NARROW_SIGMA_PER_SIDE, share[:, None])
+    return np.where(np.stack(single, 1), NARROW_SIGMA_PER_SIDE, share[:, None])
 
 
 _ENDS = (U0 | U1, V0 | V1)

@@ -118,12 +118,12 @@ def _patches(layout: Layout, taken: list[Rectangle]) -> tuple[list[Rectangle], l
         half = (rng.uniform(0.8, 2.6), rng.uniform(0.3, 0.6)) if kind == 0 else (0.3, 0.3)
         middle = (x + rng.uniform(0, 4), side * rng.uniform(0.9, 2.4))
         spot = (middle[0] - half[0], middle[1] - half[1], middle[0] + half[0], middle[1] + half[1])
-        if all(_apart(spot, other) for other in [*taken, *found[0], *found[1]]):
+        if all(_are_disjoint(spot, other) for other in [*taken, *found[0], *found[1]]):
             found[kind].append(spot)
     return found[0], found[1]
 
 
-def _apart(a: Rectangle, b: Rectangle) -> bool:
+def _are_disjoint(a: Rectangle, b: Rectangle) -> bool:
     gap = 0.1
     return a[2] + gap < b[0] or b[2] + gap < a[0] or a[3] + gap < b[1] or b[3] + gap < a[1]
 

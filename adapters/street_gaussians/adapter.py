@@ -227,13 +227,12 @@ def make_actor(
     world_from_actor = world_from_moved @ world_from_ego @ ego_from_actor
     stamps = np.array([data.images[i].timestamp_ns for i in shown])
     knots, first, which = np.unique(stamps, return_index=True, return_inverse=True)
-    apart = np.linalg.norm(
-        world_from_actor[:, :3, 3] - world_from_actor[first[which], :3, 3], axis=1
-    ).max()
+    offsets = world_from_actor[:, :3, 3] - world_from_actor[first[which], :3, 3]
+    spread_m = np.linalg.norm(offsets, axis=1).max()
     problems = []
-    if apart > _SAME_MOMENT_M:
+    if spread_m > _SAME_MOMENT_M:
         problems.append(
-            f"{name} is at places up to {apart:.2f} m apart in images of one moment; the first "
+            f"{name} is at places up to {spread_m:.2f} m apart in images of one moment; the first "
             f"camera's is taken"
         )
     if part.terms is not None and tracked.start_frame == tracked.end_frame:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-import types
 from pathlib import Path
 
 import pytest
@@ -85,15 +83,6 @@ def test_unknown_schemes_list_the_known() -> None:
         AdapterError, match=r"unknown scheme 'argoverse'.*pandaset.*gaussians.*up=-y"
     ):
         open_scene("argoverse:/data")
-
-
-def test_procedural_scenes_have_names(monkeypatch: pytest.MonkeyPatch) -> None:
-    calls = []
-    fake = types.ModuleType("adapters.procedural")
-    fake.open_procedural = calls.append
-    monkeypatch.setitem(sys.modules, "adapters.procedural", fake)
-    open_scene("procedural:street?seed=3")
-    assert calls == [{"seed": "3"}]
     with pytest.raises(AdapterError, match="procedural scenes are street; got 'forest'"):
         open_scene("procedural:forest")
 

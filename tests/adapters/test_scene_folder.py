@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from fitted_scenes import assert_same, fitted_scene
 from pandaset_folder import write_sequence
 
@@ -19,7 +18,6 @@ from augment.errors import AdapterError, SceneError
 from augment.files.scene_file import save_scene, save_scene_file
 from augment.jobs.processes import share_scene
 from augment.scene import Scene
-from tools.scene_report import describe_scene, scene_text
 
 STREET = (
     "procedural:street?seed=5&frames=6&gaussians=60000&lidar_columns=16"
@@ -151,14 +149,3 @@ def test_workers_share_a_scene_folders_scene(tmp_path):
     shared.remove()
     assert_same(scene, again, but=("labels",))
     assert again.labels == scene.labels
-
-
-def test_inspect_says_what_it_was_made_from_and_by(tmp_path):
-    maps = {"ahead": torch.tensor([[1.1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, -0.1]])}
-    folder = save(tmp_path, recorded_source=STREET, color_maps=maps)
-    facts = describe_scene(open_scene(str(folder)))
-    assert facts["recorded_source"] == STREET and facts["made_by"]["steps"] == 30
-    text = scene_text(facts)
-    assert f"made from   {STREET}" in text
-    assert "made by     steps: 30" in text
-    assert "records mid grey x 1.10 1.00 0.80" in text

@@ -8,7 +8,6 @@ import pytest
 
 from adapters.base import recognise
 from adapters.detect_format import FILES, FOLDERS, looked_for, recognised
-from adapters.uri import SCHEMES
 from augment.errors import AdapterError
 
 MULTI_PART = b"ply\nformat binary_little_endian 1.0\nelement vertex_background 1\n"
@@ -84,7 +83,3 @@ def test_what_is_not_known_is_answered_with_what_was_looked_for(tmp_path):
     assert f"give one, such as {tmp_path}/set/seq. Or name the scheme" in str(caught.value)
     (tmp_path / "a.txt").write_text("hello")
     assert all(signature.what in looked_for(tmp_path / "a.txt") for signature in FILES)
-
-
-def test_every_signature_has_a_scheme():
-    assert {signature.scheme for signature in (*FOLDERS, *FILES)} <= set(SCHEMES)

@@ -174,16 +174,6 @@ def test_a_damaged_image_is_left_out_by_name(own_street):
     assert any(str(path) in said and "damaged" in said for said in data.problems)
 
 
-def test_sizes_are_read_without_decoding(own_street):
-    """Only the head of a file is looked at: there may be thousands, of several megabytes."""
-    for cam in (0, 1, 2):
-        for number in own_street.numbers:
-            path = own_street.image_path(number, cam)
-            path.write_bytes(path.read_bytes()[:24] + b"no picture")
-    data = read_data(own_street.root, FRONT)
-    assert data.problems == () and data.images[0].width == 96
-
-
 def test_a_principal_point_outside_the_images_is_an_error(own_street):
     for number in own_street.numbers:
         path = own_street.image_path(number, 0)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import builtins
 import io
-import os
 import pickle
 import threading
 import time
@@ -14,7 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from street_gaussians_files import npy_of_pickle, write_members, write_point_clouds
+from street_gaussians_files import write_members, write_point_clouds
 
 from adapters.safe_pickle import stream_arrays
 from adapters.street_gaussians.labels import iterate_point_clouds, read_point_cloud
@@ -166,34 +164,6 @@ class Calls:
 
 
 @pytest.mark.parametrize(
-    ("function", "arguments", "name"),
-    [
-        (os.system, ("touch {marker}",), r"\.system"),
-        (builtins.eval, ("open('{marker}', 'w')",), r"builtins\.eval"),
-        (builtins.getattr, (np.ndarray, "tofile"), r"builtins\.getattr"),
-        (np.load, ("{marker}",), r"numpy\.load"),
-    ],
-)
-@pytest.mark.parametrize("protocol", [3, 4])
-def test_what_a_hostile_file_asks_for_is_refused_by_name(
-    tmp_path, function, arguments, name, protocol
-):
-    marker = tmp_path / "marker"
-    arguments = tuple(a.format(marker=marker) if isinstance(a, str) else a for a in arguments)
-    for value in (
-        Calls(function, *arguments),
-        {0: Calls(function, *arguments)},
-        {0: np.ones((2, 3)), Calls(function, *arguments): np.ones((2, 3))},
-        {0: np.array([Calls(function, *arguments)], object)},
-    ):
-        pickled = npy_of_pickle(pickle.dumps(value, protocol=protocol))
-        write_members(tmp_path, {"pointcloud.npy": pickled})
-        with pytest.raises(AdapterError, match=rf"pointcloud\.npy was not read: it .*{name}"):
-            list(iterate_point_clouds(tmp_path))
-    assert not marker.exists()
-
-
-@pytest.mark.parametrize(
     ("data", "message"),
     [
         (b"", "cut short"),
@@ -210,7 +180,6 @@ def test_what_a_hostile_file_asks_for_is_refused_by_name(
         (b"\x80\x04B\xff\xff\xff\x7f", "states 2147483647 bytes"),
         (b"\x80\x04cnumpy" + b"x" * 5000, "name without end"),
         (b"\x80\x04)" + b"\x85" * 300_000 + b".", "more than 262144 steps"),
-        (b"\x80\x04)" + b"\x94" * 300_000 + b".", "more than 262144 steps"),
         (b"\x80\x04cnumpy\nd\\type\n.", "with escapes"),
         (b"\x80\x04\x97.", "NEXT_BUFFER"),
         (b"\x80\x04P1\n.", "PERSID"),

@@ -303,15 +303,6 @@ def test_weights_in_a_point_cloud_show_the_same_without_what_they_lack(
     assert by_file.name == "run" and by_file.made_by["iteration"] == 50000
 
 
-def test_the_older_release_can_be_had(tmp_path: Path, drive: Facts) -> None:
-    raw = raw_model(drive)
-    raw.opt_rots[1, 0] += 0.1
-    model = saved(tmp_path, drive, raw)
-    times = [scene_time(opened(model), 1), scene_time(opened(model, rotation_bug="1"), 1)]
-    assert not torch.equal(times[0], times[1])
-    torch.testing.assert_close(times[0][:3, 3], times[1][:3, 3], rtol=0, atol=1e-9)
-
-
 def scene_time(scene: Scene, frame: int) -> torch.Tensor:
     stamp = scene.frame(frame).cameras["FRONT_LEFT"].timestamp_ns
     return scene.actors[0].track.pose_at(stamp)
@@ -364,13 +355,6 @@ def test_parts_and_tracks_that_do_not_belong_together_are_said(
     assert [actor.track_id for actor in scene.actors] == ["1"]
     assert any("obj_004 of the tracks has no Gaussians" in p for p in scene.problems)
     assert any("obj_099 has no track" in p for p in scene.problems)
-
-
-def test_poses_that_belong_to_other_tracks_are_refused(tmp_path: Path, drive: Facts) -> None:
-    raw = raw_model(drive)
-    model = saved(tmp_path, drive, raw, **{"data.selected_frames": [0, 2]})
-    with pytest.raises(AdapterError, match=r"4 frames and 2 columns.*3 frames and 1 columns"):
-        opened(model)
 
 
 def test_of_several_iterations_the_newest_or_the_named(tmp_path: Path, drive: Facts) -> None:
@@ -434,10 +418,3 @@ def test_paths_that_are_no_model(tmp_path: Path, drive: Facts) -> None:
     model = saved(tmp_path, drive, raw_model(drive))
     with pytest.raises(AdapterError, match="is one file, so iteration= and weights="):
         opened(model / "trained_model" / "iteration_50000.pth", iteration="3")
-
-
-def test_a_dataset_alone_opens_as_a_raw_drive(drive: Facts, monkeypatch) -> None:
-    asked = []
-    monkeypatch.setattr("adapters.street_gaussians.adapter.open_raw", lambda *a: asked.append(a))
-    open_street_gaussians(str(drive.root), {"voxel_m": "0.3"})
-    assert asked == [(drive.root, {"voxel_m": "0.3"})]

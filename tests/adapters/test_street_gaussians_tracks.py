@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from street_gaussians_files import HEADER, OBJECTS, StreetObject, pose_about_z, write_dataset
+from street_gaussians_files import HEADER, StreetObject, pose_about_z, write_dataset
 
 from adapters.street_gaussians.data import (
     ModelConfig,
@@ -249,7 +249,3 @@ def test_columns_are_those_of_going_through_the_file_by_hand(tmp_path_factory, d
         assert tracklets_of(table, placed).ids.tolist() == slow_columns(rows, frames, poses)
     else:
         assert tracklets_of(table, placed).ids.tolist() == [[-1]] * 4
-
-
-def test_the_street_has_objects_of_all_kinds():
-    assert {o.label for o in OBJECTS} == {"vehicle", "sign", "pedestrian", "cyclist"}
