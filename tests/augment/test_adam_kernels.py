@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 
-from augment.geometry import rigid, rotmat_from_quat
 from augment.reconstruct import kernels
 from augment.reconstruct.config import FitConfig, LearningRates, LossWeights
 from augment.reconstruct.splats import Splats
@@ -461,12 +460,6 @@ def test_step_sizes_fall_over_the_run_and_no_further():
     assert first.dtype == np.float32 and len(first) == kernels.RATES
 
 
-@pytest.mark.parametrize("steps", [0, 1])
-def test_step_sizes_of_the_shortest_runs(steps):
-    config = dataclasses.replace(CONFIG, steps=steps)
-    assert np.isfinite(splat_rates(config, 0, camera_ahead(), EXTENT_M)).all()
-
-
 def test_a_rate_of_zero_freezes_the_means():
     rates = dataclasses.replace(FASTER, means=0.0)
     values = splat_rates(dataclasses.replace(CONFIG, rates=rates), 10, camera_ahead(), EXTENT_M)
@@ -535,12 +528,6 @@ def test_color_adam_counts_every_row_for_itself():
     assert adam.arrays()["count"][13] == 0
 
 
-def test_color_adam_takes_no_rows_at_all():
-    values = np.full((5, 3), 0.5, np.float32)
-    ColorAdam(values).update(np.zeros(0, np.int32), np.zeros((0, 3), np.float32), 0.1)
-    assert (values == 0.5).all()
-
-
 @pytest.mark.parametrize("kind", [DenseAdam, ColorAdam])
 def test_moments_that_were_saved_continue_to_the_same_bits(kind):
     rng = np.random.default_rng(3)
@@ -566,20 +553,3 @@ def test_moments_that_were_saved_continue_to_the_same_bits(kind):
 
 
 # ---- inputs ----------------------------------------------------------------------------------
-
-
-def test_kernels_read_the_arrays_themselves():
-    """Addresses of the parts that are present, in their order, without a copy."""
-    splats = some_splats()
-    pose = rigid(
-        rotmat_from_quat(torch.tensor([1.0, 0.1, 0, 0], dtype=torch.float64)),
-        torch.zeros(3, dtype=torch.float64),
-    )
-    alone, both = (part_poses(poses) for poses in ([pose], [None, pose]))
-    inputs = splat_inputs(splats, [1], alone, camera_ahead(), RasterSettings())
-    start = int(splats.starts[1])
-    assert inputs.addresses[0, 0] == splats.means[start:].ctypes.data
-    assert inputs.addresses[0, 4] == splats.sh[start:].ctypes.data
-    assert inputs.sizes.tolist() == [[COUNTS[1], 16]] and inputs.first_ids.tolist() == [start]
-    inputs = splat_inputs(splats, [0, 1], both, camera_ahead(), RasterSettings())
-    assert inputs.blocks.tolist() == [[0, 0, BLOCK], [0, BLOCK, COUNTS[0]], [1, 0, COUNTS[1]]]

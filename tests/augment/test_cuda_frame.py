@@ -25,7 +25,6 @@ from augment.render.rasterize import renormalise_alpha
 from augment.scene import Scene
 from augment.semantics import SemanticClass
 from augment.sky import ConstantSky, CubemapSky, LatLongSky, Sky
-from augment.timing import stopwatch, timed
 from augment.views import WeatheredView, begin_view, render_view
 from recipes.schema import Output, Recipe, Render, Smog, Weather
 from recipes.weather import Snow, Style
@@ -267,15 +266,3 @@ def test_two_views_under_way_do_not_mix(scene, away):
     for view, expected in zip(reversed(begun), reversed(alone), strict=True):
         check_same(view.result(), expected)
     assert not np.array_equal(alone[0].rgb, alone[1].rgb)
-
-
-def test_laps_wait_for_the_gpu_only_while_somebody_listens(monkeypatch):
-    waits = []
-    monkeypatch.setattr(torch.cuda, "is_initialized", lambda: True)
-    monkeypatch.setattr(torch.cuda, "synchronize", lambda: waits.append(None))
-    with timed("unheard"):
-        pass
-    assert not waits
-    with stopwatch(), timed("heard"):
-        pass
-    assert len(waits) == 2  # where it begins and where it ends

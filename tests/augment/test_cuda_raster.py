@@ -28,8 +28,8 @@ from augment.render.buffers import (
 from augment.render.constants import RasterSettings
 from augment.render.cuda import driver as cuda_blend
 from augment.render.cuda import runtime as gpu
-from augment.render.cuda.driver import blend, list_tiles, rasterize_cuda
-from augment.render.cuda.splats import HIDDEN, TILE, CudaSplats, CudaTiles, GpuStageTimer
+from augment.render.cuda.driver import blend, list_tiles
+from augment.render.cuda.splats import HIDDEN, TILE, CudaSplats, CudaTiles
 from augment.render.layout import UNCUT, HeightClip
 from augment.render.rasterize import rasterize
 from augment.render.reference import rasterize_reference
@@ -431,14 +431,6 @@ def test_everything_lies_on_the_gpu(monkeypatch):
         assert all(isinstance(getattr(output, name), AwayTensor) for name in ALL)
         held = on_cpu(output)
     assert_same_bits(held, on_cpu(expected))
-
-
-def test_a_clock_is_told_of_the_stages():
-    clock = GpuStageTimer()
-    parts = [PosedGaussians(stack(one_gaussian(), one_gaussian((-3.0, 0, 0))))]
-    rasterize_cuda(parts, camera_ahead(16, 16, 8.0), COLOR, DEFAULT, None, timer=clock)
-    assert clock.counts == {"visible": 1, "pairs": 1}
-    assert set(clock.milliseconds()) == {"project", "list", "blend"}
 
 
 # ---- on a real GPU -----------------------------------------------------------------------------

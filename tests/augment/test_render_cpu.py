@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from concurrent.futures import ThreadPoolExecutor
 
 import numba
@@ -18,7 +17,7 @@ from augment.render.buffers import ALPHA, BUFFERS, EXPECTED_DEPTH, MEDIAN_DEPTH,
 from augment.render.constants import RasterSettings
 from augment.render.cpu import driver as cpu
 from augment.render.cpu import driver as cpu_scratch
-from augment.render.cpu.driver import gather_inputs, rasterize_cpu, warm_up
+from augment.render.cpu.driver import gather_inputs, rasterize_cpu
 from augment.render.reference import project_parts, rasterize_reference
 from augment.scene import Gaussians, PosedGaussians
 from tests.assertions import assert_images_close, assert_labels_equal
@@ -348,21 +347,6 @@ def test_bits_do_not_depend_on_slices_and_lists(crowd, monkeypatch):
     assert_same_bits(render(*crowd), whole)
 
 
-def test_hidden_splats_are_not_projected(crowd, monkeypatch):
-    """A wall before almost everything closes all tiles in the first slices."""
-    parts, camera = crowd
-    monkeypatch.setattr(cpu, "_MIN_SLICE", 1)
-    monkeypatch.setattr(cpu, "_SLICE_COVER", 2.0)
-    wall = stack(*[one_gaussian(mean=(0.2, 0, 0), scale=5.0, opacity=0.99)] * 4)
-    open_view: dict[str, float] = {}
-    rasterize_cpu(parts, camera, COLOR, DEFAULT, None, stage_times=open_view)
-    assert open_view["visible"] > 2000
-    walled: dict[str, float] = {}
-    behind = [PosedGaussians(wall), *parts]
-    rasterize_cpu(behind, camera, COLOR, DEFAULT, None, stage_times=walled)
-    assert walled["visible"] < 100  # the wall, and what stands before it
-
-
 def test_pixels_beyond_the_image_keep_no_tile_open(monkeypatch):
     """The screen covers the image of 3x3 pixels and not its one tile; what is behind is hidden."""
     monkeypatch.setattr(cpu, "_MIN_SLICE", 1)
@@ -373,17 +357,6 @@ def test_pixels_beyond_the_image_keep_no_tile_open(monkeypatch):
     parts = [PosedGaussians(screen), PosedGaussians(behind)]
     rasterize_cpu(parts, camera_ahead(3, 3, 30.0), COLOR, DEFAULT, None, stage_times=times)
     assert times["visible"] == 20
-
-
-def test_stage_times_add_up(crowd):
-    times = {"project": 1000.0, "other": 1.0}
-    rasterize_cpu(*crowd, COLOR, DEFAULT, None, stage_times=times)
-    once = times["visible"], times["pairs"]
-    rasterize_cpu(*crowd, COLOR, DEFAULT, None, stage_times=times)
-    assert (times["visible"], times["pairs"]) == (2 * once[0], 2 * once[1])
-    assert times["pairs"] >= times["visible"] > 0
-    assert set(times) == {"project", "sort", "bin", "raster", "visible", "pairs", "other"}
-    assert times["project"] > 1000 and all(times[s] > 0 for s in ("sort", "bin", "raster"))
 
 
 def test_parts_equal_one_part():
@@ -450,28 +423,6 @@ def test_outputs_outlive_the_work_space():
     render(random_gaussians(200, seed=5), camera)
     for name, copy in copies.items():
         assert torch.equal(getattr(first, name), copy)
-
-
-def test_work_space_is_kept_and_given_back():
-    cpu_scratch.release_scratch()
-    scene, camera = random_gaussians(200), camera_ahead()
-    render(scene, camera)
-    with cpu_scratch.borrowed_scratch() as scratch:
-        kept = scratch.nbytes
-        assert kept > 0
-        aligned = scratch.array("records", (16,), np.float32)
-        assert aligned.ctypes.data % 64 == 0
-    render(scene, camera)
-    with cpu_scratch.borrowed_scratch() as scratch:
-        assert scratch.nbytes == kept
-    cpu_scratch.release_scratch()
-    with cpu_scratch.borrowed_scratch() as scratch:
-        assert scratch.nbytes == 0
-
-
-def test_warm_up_reports_its_seconds():
-    assert 0 <= warm_up() < math.inf
-    assert warm_up() < 1  # compiled by now
 
 
 def test_camera_is_not_assumed_central():

@@ -1,5 +1,4 @@
 import dataclasses
-import pickle
 
 import pytest
 import torch
@@ -147,16 +146,6 @@ def test_poses_are_those_of_the_geometry(turn_rad):
         assert got.dtype == torch.float64
         # Float64 rounding of positions below 10 km, and of rotations.
         torch.testing.assert_close(got, pose_by_tensors(moving, time), atol=1e-11, rtol=0)
-
-
-def test_a_track_sends_only_its_samples_to_other_processes():
-    t = track()
-    size = len(pickle.dumps(t))
-    t.pose_at(1_500)
-    assert len(pickle.dumps(t)) == size
-    again = pickle.loads(pickle.dumps(t))
-    assert torch.equal(again.pose_at(1_500), t.pose_at(1_500))
-    assert dataclasses.replace(t, hold_ns=7).hold_ns == 7
 
 
 def test_track_times_must_increase():

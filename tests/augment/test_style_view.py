@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from augment.dataset import SceneDataset
-from augment.effects.snow.snow import cover_of
+from augment.effects.snow.snow import snow_layers_of
 from augment.effects.style import style as scene_maps
 from augment.effects.style.color_maps import CLASSES, StyleMaps
 from augment.effects.style.style import SceneStyle, look_of, remember_maps, style_maps
@@ -142,7 +142,7 @@ def test_snow_keeps_its_colour_and_takes_the_styles_light(scene):
     recipe = recipe_of(snow=Snow(depth_m=0.1, cell_m=0.1, tracks="never"))
     plan = make_plan(recipe, scene)
     look = look_of(scene, STYLE)
-    styled, plain = cover_of(scene, plan.snow, look), cover_of(scene, plan.snow)
+    styled, plain = snow_layers_of(scene, plan.snow, look), snow_layers_of(scene, plan.snow)
     parts = look.on(styled.parts_for(scene, camera_of(scene)))
     assert any(part.is_snow for part in parts)
     assert all((part.color_maps is None) == part.is_snow for part in parts)
@@ -166,11 +166,11 @@ def test_covers_of_two_styles_are_kept_beside_each_other(scene):
     for style in (STYLE, other):
         known_maps(scene, style)
     placed = make_plan(recipe_of(snow=Snow(depth_m=0.1, cell_m=0.1)), scene).snow
-    first = cover_of(scene, placed, look_of(scene, STYLE))
-    second = cover_of(scene, placed, look_of(scene, other))
+    first = snow_layers_of(scene, placed, look_of(scene, STYLE))
+    second = snow_layers_of(scene, placed, look_of(scene, other))
     assert first is not second
-    assert cover_of(scene, placed, look_of(scene, STYLE)) is first
-    assert cover_of(scene, placed, look_of(scene, other)) is second
+    assert snow_layers_of(scene, placed, look_of(scene, STYLE)) is first
+    assert snow_layers_of(scene, placed, look_of(scene, other)) is second
 
 
 def test_water_mirrors_the_styled_sky(scene):
@@ -189,14 +189,6 @@ def test_water_mirrors_the_styled_sky(scene):
     assert far.sum() > 100
     redder = styled.rgb[far].astype(float).mean(0) - clean.rgb[far].astype(float).mean(0)
     assert redder[0] > 5 and redder[2] < -5
-
-
-def test_maps_are_made_once(scene):
-    assert style_maps(scene, STYLE) is style_maps(scene, STYLE)
-    assert look_of(scene, STYLE) is look_of(scene, STYLE)
-    other = StyleMaps(gentle(1)[None], gentle(2), gentle(3))
-    remember_maps(scene, STYLE, other)
-    assert look_of(scene, STYLE).maps is other
 
 
 def with_directions(scene: Scene, spread: float) -> Scene:

@@ -257,19 +257,6 @@ def test_a_fit_finds_the_truth(recorded):
     assert all(set(r.stage_s) == stages for r in records)
 
 
-def test_every_view_is_taken_once_an_epoch_in_an_order_of_the_seed(recorded):
-    count = len(recorded.train)
-    orders = []
-    for seed in (0, 0, 1):
-        config = dataclasses.replace(QUICK, seed=seed)
-        orders.append([r.key for r in run(Trainer(start(), recorded, config), 3 * count)])
-    for order in orders:
-        for epoch in range(3):
-            assert set(order[epoch * count : (epoch + 1) * count]) == set(recorded.train)
-    assert orders[0] == orders[1] != orders[2]
-    assert not set(orders[0]) & set(recorded.test)
-
-
 def test_cameras_learn_their_exposure(recorded):
     """The right camera records nine tenths; colours of the scene are shared by both."""
     config = dataclasses.replace(QUICK, steps=200, exposure_pull=1e-4)
@@ -437,11 +424,6 @@ def moved_m(scene: Scene, before: Scene) -> float:
 
 
 # ---- what may be missing -----------------------------------------------------------------------
-
-
-def test_no_training_views_are_refused(recorded):
-    with pytest.raises(ValueError, match="no training views"):
-        Trainer(start(), Recorded({}), QUICK)
 
 
 NOTHING = {

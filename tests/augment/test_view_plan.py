@@ -17,7 +17,6 @@ from augment.plan import Bounds, ViewPlan, bound, bound_chunks, make_plan, may_s
 from augment.render.constants import RasterSettings
 from augment.render.reference import half_extents, project_parts
 from augment.scene import Actor, Gaussians, PosedGaussians, Scene, Track
-from augment.timing import stopwatch, timed
 from augment.views import render_buffers, render_view
 from recipes.schema import Output, Recipe, Weather
 from recipes.weather import Flood, Snow, Waves
@@ -223,19 +222,3 @@ def test_an_actor_without_an_opaque_splat_is_never_drawn(scene):
     haunted = dataclasses.replace(scene, actors=(*scene.actors, actor))
     view = plan_view(make_plan(Recipe(), haunted), haunted, cameras_of(scene)[0])
     assert 5 not in view.actors and 1 in view.actors
-
-
-def test_a_stopwatch_gives_time_to_the_innermost_lap_and_to_nobody_else(monkeypatch):
-    now = iter(range(100))
-    monkeypatch.setattr("augment.timing.time.perf_counter", lambda: float(next(now)))
-    with timed("before"):
-        pass
-    with stopwatch() as seconds:  # 0
-        with timed("outer"):  # 1  # noqa: SIM117 - the inner one is nested
-            with timed("inner"):  # 2
-                pass  # 3
-        with pytest.raises(ZeroDivisionError), timed("fails"):  # 5
-            raise ZeroDivisionError  # 6
-    with timed("after"):
-        pass
-    assert seconds == {"outer": 2.0, "inner": 1.0, "fails": 1.0}
