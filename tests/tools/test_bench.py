@@ -1,5 +1,6 @@
 """The benches: how the harness measures, and one small run of each subject."""
 
+import importlib.util
 import json
 import math
 import os
@@ -9,10 +10,12 @@ import numpy as np
 import pytest
 import torch
 
+from augment.errors import ClimateGSError
 from augment.render.constants import RasterSettings
 from augment.render.reference import project_parts
 from augment.scene import PosedGaussians
 from tools.bench.dataset import DECODING, DatasetCase, bench_dataset
+from tools.bench.fit import FitCase, bench_fit, time_steps
 from tools.bench.harness import (
     Table,
     figures,
@@ -28,8 +31,10 @@ from tools.bench.harness import (
     spread_ms,
     spread_ratio,
 )
+from tools.bench.jobs import BARE, JobsCase, bench_jobs
 from tools.bench.raster import _frame_of, bench_raster
 from tools.bench.scenes import RasterCase, random_scene
+from tools.cli import main
 
 TINY = RasterCase(400, 48, 32)
 
@@ -138,6 +143,12 @@ def test_peak_memory_holds_the_images_and_little_more():
         peak_mib_in_subprocess(int, ("x",))
 
 
+def test_without_the_source_checkout_the_command_says_so(monkeypatch, capsys):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    assert main(["bench", "raster"]) == 2
+    assert "part of the source checkout" in capsys.readouterr().err
+
+
 # ---- scenes -------------------------------------------------------------------------------------
 
 
@@ -203,3 +214,35 @@ def test_dataset_measures_reading_rendering_and_a_large_manifest():
     assert all(rate > 0 for *_, rate, _ in (*reading, *live))
     # Some eighty bytes a row, where the Arrow table has 440.
     assert rows == 700 and 700 * 32 < held * 2**20 < 700 * 200
+
+
+def test_jobs_measures_machinery_a_long_job_and_opening():
+    scene = "procedural:street?seed=3&frames=2&gaussians=60000"
+    case = JobsCase(scene, 0.05, variants=2, images=8, gaussians=500)
+    result = bench_jobs(case, repeats=1, workers=(), memory=False, progress=False)
+    compared, long, opened = check_figures(result).values()
+    assert [name for name, *_ in compared] == [BARE, "generate, this process"]
+    assert all(ms > 0 for _, ms, *_ in (*compared, *opened)) and compared[0][-1] == 1
+    assert dict(long)["images"] == 8 and dict(long)["blocks"] == 1
+    assert len(opened) == 4 and all(mib > 0 for _, _, mib, _ in opened)
+
+
+def test_fit_measures_steps_and_held_out_views():
+    case = FitCase(
+        splats=20_000, steps=3, frames=4, gaussians=60_000, cameras=("front",),
+        render_scale=0.1, fit_steps=4, street_scale=1.0,
+    )  # fmt: skip
+    result = bench_fit(case, progress=False)
+    (steps, fits), facts = check_figures(result).values(), result["facts"]
+    stages = {name: ms for name, *ms in steps}
+    assert stages.keys() == {
+        "whole step", "load", "forward", "loss", "backward", "optimise", "densify"
+    }  # fmt: skip
+    # the stages lie within their step, so even their least times must fit into the slowest tenth
+    least = sum(low for name, (_, low, _) in stages.items() if name != "whole step")
+    assert least <= stages["whole step"][2]
+    assert facts["splats"] == 20_000 and facts["memory_mib"]["peak"] > 0
+    ((_, fitted, psnr, *_, true_depth_m, _, minutes),) = fits
+    assert fitted == 4 and 5 < psnr < 40 and 0 < true_depth_m < 50 and minutes > 0
+    with pytest.raises(ClimateGSError, match="no recorded images"):
+        time_steps("procedural:street?seed=3&frames=1&gaussians=60000", 1.0, case)

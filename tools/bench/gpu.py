@@ -34,7 +34,7 @@ from augment.plan import make_plan
 from augment.render.buffers import ALPHA, RGB, RenderOutput, available_backends
 from augment.render.constants import COV2D_BLUR, RasterSettings
 from augment.scene import Gaussians, PosedGaussians, Scene
-from augment.views import begin_view, render_buffers, render_view
+from augment.views import WeatheredBuffers, begin_view, render_buffers, render_view
 from recipes.schema import (
     TIERS,
     Flood,
@@ -133,16 +133,6 @@ class Timing:
         own = clock or self.clock
         return rounds(actions, self.repeats, warm_up=self.warm_up, clock=own, progress=False)
 
-    def until_done(self, action: Action) -> dict[str, float]:
-        """Milliseconds of the host's clock until the GPU is idle again."""
-
-        def finished() -> None:
-            action()
-            self.clock.wait()
-
-        self.clock.wait()
-        return spread_ms(self.rounds({"": finished}, WallClock())[""])
-
 
 def gpu_facts() -> dict[str, Any] | None:
     """Of the current GPU; None where torch sees none."""
@@ -207,46 +197,36 @@ def draw(
 
 
 def measure_raster(case: RasterCase, timing: Timing, ceilings: Ceilings) -> Figures:
-    """Milliseconds on the GPU, from the call's first work to the finished images there; host_ms
-    until the host has seen the end of it.
-    """
+    """Milliseconds on the GPU, from the call's first work to the finished images there."""
     from tools.bench.gpu_ceilings import floor_of
 
     gaussians, camera = random_scene(case)
     parts = [PosedGaussians(gaussians)]
     frames = {CLEAN: lambda: draw(parts, camera), SMOG: lambda: draw(parts, camera, MEDIUM)}
-    start = time.perf_counter()
-    for frame in frames.values():
-        frame()
-    timing.clock.wait()
-    first_frames_s = time.perf_counter() - start
+    stages = [_stages_ms(parts, camera) for _ in range(timing.warm_up + timing.repeats)]
     peak, extra = peak_gpu_mib(frames[CLEAN])  # before gsplat's copy of the scene lies there, too
     pairs = [[getattr(frames[CLEAN](), name).cpu() for name in sorted(BUFFERS)] for _ in "ab"]
     return {
         "case": case.name,
-        "first_frames_s": first_frames_s,
         "scene_mib": gaussians.nbytes / 2**20,
         "peak_mib": peak,
         "frame_mib": extra,
-        "stages_ms": _stage_times(parts, camera, timing),
-        "host_ms": timing.until_done(frames[CLEAN]),
+        "stages_ms": {
+            name: spread([each[name] for each in stages[timing.warm_up :]]) for name in STAGES
+        },
         "same_bits": all(map(torch.equal, *pairs)),
         "floor": floor_of(parts, camera, SETTINGS, frames[CLEAN](), ceilings),
         **_beside_gsplat(frames, gaussians, camera, timing),
     }
 
 
-def _stage_times(parts: list[PosedGaussians], camera: Camera, timing: Timing) -> Figures:
-    """Of the rasteriser's stages, in frames of their own."""
+def _stages_ms(parts: list[PosedGaussians], camera: Camera) -> dict[str, float]:
+    """Of the rasteriser's stages, in a frame of their own."""
     from augment.render.cuda.splats import GpuStageTimer
 
-    times: dict[str, list[float]] = defaultdict(list)
-    for turn in range(timing.warm_up + timing.repeats):
-        timer = GpuStageTimer()
-        draw(parts, camera, timer=timer)
-        for name, ms in timer.milliseconds().items() if turn >= timing.warm_up else ():
-            times[name].append(ms)
-    return {name: spread(values) for name, values in times.items()}
+    timer = GpuStageTimer()
+    draw(parts, camera, timer=timer)
+    return timer.milliseconds()
 
 
 def _beside_gsplat(
@@ -352,35 +332,29 @@ def balanced(recipe: Recipe, given: Mapping[str, Value] | None = None) -> Recipe
 def measure_frames(
     scene: Scene, camera: Camera, recipes: Mapping[str, Recipe], timing: Timing
 ) -> Figures:
-    """Every recipe's frame, in turns. ms: on the GPU, to finished floats there. first_s: of the
-    frame that compiles, copies the scene and places snow. delivered: 8 bits on the host.
+    """Every recipe's frame, in turns. ms: on the GPU, to finished floats there. delivered: 8 bits
+    on the host.
     """
-    rows, scenes, actions = {}, {}, {}
-    for name, recipe in recipes.items():  # one after the other: nobody else's snow counts as memory
-        own, plan = scene_of_recipe(scene, recipe, BACKEND), make_plan(recipe, scene)
+    rows: dict[str, Figures] = {}
+
+    def frame_of(name: str) -> functools.partial[WeatheredBuffers]:
+        own, plan = scene_of_recipe(scene, recipes[name], BACKEND), make_plan(recipes[name], scene)
         frame = functools.partial(render_buffers, own, camera, plan, backend=BACKEND)
-        start = time.perf_counter()
-        frame()
-        timing.clock.wait()
-        first_s = time.perf_counter() - start
+        frame()  # compiles, copies the scene and places what stays with it
+        return frame
+
+    for name in recipes:  # one after the other: nobody else's snow counts as memory
+        frame = frame_of(name)
         peak, extra = peak_gpu_mib(frame)
-        rows[name] = {
-            "first_s": first_s,
-            "peak_mib": peak,
-            "frame_mib": extra,
-            "same_bits": torch.equal(frame().rgb.cpu(), frame().rgb.cpu()),
-        }
-        del own, frame
-    for name, recipe in recipes.items():
-        own, plan = scene_of_recipe(scene, recipe, BACKEND), make_plan(recipe, scene)
-        scenes[name] = own
-        actions[name] = functools.partial(render_buffers, own, camera, plan, backend=BACKEND)
-        actions[name]()  # places what stays with its scene
+        same_bits = torch.equal(frame().rgb.cpu(), frame().rgb.cpu())
+        rows[name] = {"peak_mib": peak, "frame_mib": extra, "same_bits": same_bits}
+        del frame
+    actions = {name: frame_of(name) for name in recipes}
     seconds = timing.rounds(actions)
     for name, row in rows.items():
         row["ms"] = spread_ms(seconds[name])
         row["over_clean"] = spread_ratio(seconds[name], seconds[CLEAN])
-        row["delivered"] = _delivered(scenes[name], camera, recipes[name], timing)
+        row["delivered"] = _delivered(actions[name].args[0], camera, recipes[name], timing)
     return {
         "camera": f"{camera.name} {camera.width}x{camera.height}",
         "gaussians": sum(len(part.gaussians) for part in scene.parts_for(camera)),
@@ -392,7 +366,8 @@ def _delivered(scene: Scene, camera: Camera, recipe: Recipe, timing: Timing) -> 
     """Milliseconds of the host's clock to pictures in 8 bits that lie there: of a view alone, and
     of each of a row of them in which the next is begun before the last is waited for.
     """
-    alone = timing.until_done(lambda: render_view(scene, camera, recipe, backend=BACKEND))
+    view = functools.partial(render_view, scene, camera, recipe, backend=BACKEND)
+    alone = spread_ms(timing.rounds({"": view}, WallClock())[""])
     start = time.perf_counter()
     pending = begin_view(scene, camera, recipe, backend=BACKEND)
     for _ in range(timing.repeats):
@@ -693,7 +668,6 @@ def gpu_tables(found: Figures) -> list[Table]:
         whole = floor["ms"]["frame"], floor["bytes"]
         for name, ms in raster["ms"].items():
             rows.append(_stage_row(name, ms, *((None, None) if "gsplat" in name else whole)))
-        rows.append(_stage_row("clean, host waits", raster["host_ms"], None, None))
         columns = ("stage", "ms", "min", "p90", "floor ms", "% of it", "MB", "GB/s")
         tables.append(Table(f"Rasteriser, {raster['case']}", columns, rows, note))
     if "frames" in frames:

@@ -25,16 +25,14 @@ from augment.cameras import Camera, Frame
 from augment.effects.smog import SmogMedium
 from augment.files.export import export_ply
 from augment.files.scene_file import save_scene, save_scene_file
-from augment.jobs.block_worker import IndexTask, WorkSetup
-from augment.jobs.blocks import Block, SceneRecord, make_plan
-from augment.jobs.files import encode_depth, encode_image
-from augment.jobs.generate import GenerateJob, make_pool, run_generate
+from augment.jobs.block_worker import WorkSetup
+from augment.jobs.blocks import Block, read_status
+from augment.jobs.files import WritePump, encode_depth, encode_image
+from augment.jobs.generate import GenerateJob, make_pool, plan_job, run_generate
 from augment.jobs.layout import variant_name
 from augment.jobs.manifest import compact
 from augment.jobs.scheduler import Scheduler
-from augment.jobs.blocks import read_status
 from augment.jobs.store import open_store
-from augment.jobs.files import WritePump
 from augment.scene import Gaussians, Scene
 from augment.sky import ConstantSky
 from augment.views import WeatheredView, render_view
@@ -174,13 +172,9 @@ def _generate(job: GenerateJob, out: Path, executor: str, workers: int) -> float
     """Seconds an image of a job once all its workers have the scene and their kernels."""
     setup = dataclasses.replace(job.setup, store_uri=str(out))
     run = dataclasses.replace(job, setup=setup, executor=executor, workers=workers)
-    uri = job.scenes[0].uri
-    found: dict[tuple[str, str | None], SceneRecord | str] = {}
+    plan = plan_job(run, progress=False)
     scheduler = Scheduler(lambda tick: make_pool(run, tick))
     with contextlib.closing(scheduler):
-        tasks = [IndexTask(uri, None)] * workers
-        scheduler.index(tasks, lambda task, record: found.update({(task.uri, task.name): record}))
-        plan = make_plan(job.recipes, job.scenes, found, setup.backend)
         first, rest = plan.blocks[:workers], plan.blocks[workers:]
         scheduler.render(first, dict(plan.names), _refuse_failure)
         started = time.perf_counter()
