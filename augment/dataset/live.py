@@ -175,8 +175,8 @@ class SceneDataset(Dataset):
         camera: as written.
         """
         load, recipe, index = self.options.load, self.recipe, self._index
-        wanted = "boxes" in load or "instance" in load
-        if not (wanted and uses_boxes(recipe) and frame.index in index.labelled):
+        requested = "boxes" in load or "instance" in load
+        if not (requested and uses_boxes(recipe) and frame.index in index.labelled):
             return view, Labels()
         boxes = self.scene.boxes(frame.index)
         view, measured = label_view(

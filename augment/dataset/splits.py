@@ -101,10 +101,10 @@ class ShardedSampler(Sampler[int]):
         """
         own = {"seed": self.seed, "shuffle": self.shuffle, "count": self.count}
         if wrong := {k: (state.get(k), v) for k, v in own.items() if state.get(k) != v}:
-            told = ", ".join(
+            message = ", ".join(
                 f"{name} {was} there and {now} here" for name, (was, now) in wrong.items()
             )
-            raise ValueError(f"the state is of another sampler: {told}")
+            raise ValueError(f"the state is of another sampler: {message}")
         self.epoch, self._done, self._given = int(state["epoch"]), int(state["done"]), 0
 
     def _share(self) -> list[int]:

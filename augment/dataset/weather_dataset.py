@@ -333,8 +333,8 @@ class StoredFiles:
             try:
                 return read(copy)
             except OutputError as error:
-                told = str(error).replace(str(copy), self.name(folder, name))
-                raise OutputError(told) from error
+                message = str(error).replace(str(copy), self.name(folder, name))
+                raise OutputError(message) from error
 
     def _read_here(self, root: Path, folder: str, name: str) -> bytes:
         if not _CAN_REFUSE_LINKS or name in ("", ".", "..") or "\\" in name or "\0" in name:
@@ -512,8 +512,8 @@ class RowReader:
                 raise damaged(self._files.name(*parts), f"it lacks {where}")
             boxes = len(numbers.track_ids)
             if boxes != count:
-                told = f"{where}: it has {boxes} boxes, the labels have {count}"
-                raise damaged(self._files.name(*parts), told)
+                message = f"{where}: it has {boxes} boxes, the labels have {count}"
+                raise damaged(self._files.name(*parts), message)
             found[kind] = numbers
         return found
 
@@ -592,8 +592,8 @@ class WeatherDataset(Dataset):
             raise ValueError("root must be an output folder or a list of them; got an empty list")
         self.stores = [r if isinstance(r, Store) else open_store(r) for r in roots]
         self._readers = [RowReader(store, verify=verify) for store in self.stores]
-        wanted = {"scene": scenes, "variant": variants, "camera": cameras, "frame": frames}
-        self.rows = _read_rows(self.stores, where, wanted)
+        requested = {"scene": scenes, "variant": variants, "camera": cameras, "frame": frames}
+        self.rows = _read_rows(self.stores, where, requested)
         _check_all_have(self.rows, self.options.load, self.uris)
 
     def given(self) -> frozenset[str]:
@@ -650,7 +650,7 @@ class WeatherDataset(Dataset):
 
 
 def _read_rows(
-    stores: Sequence[Store], where: Expression | None, wanted: dict[str, Collection | None]
+    stores: Sequence[Store], where: Expression | None, requested: dict[str, Collection | None]
 ) -> Rows:
     """The finished rows of the stores that a filter keeps."""
     tables = [read_finished(store) for store in stores]
@@ -663,7 +663,7 @@ def _read_rows(
         rows = rows.with_outputs(uris, lengths)
     finished = _is_among(rows.coded("status"), {OK})
     keep = finished.copy()
-    for name, values in wanted.items():
+    for name, values in requested.items():
         if values is None:
             continue
         if isinstance(values, str):
@@ -671,8 +671,8 @@ def _read_rows(
         column = rows.coded(name)
         known = {column.values[code] for code in np.unique(column.codes[finished])}
         if unknown := sorted(set(values) - known):
-            told = ", ".join(map(str, sorted(known))) or "none"
-            raise ValueError(f"{', '.join(uris)}: no {name} {unknown}; finished are: {told}")
+            message = ", ".join(map(str, sorted(known))) or "none"
+            raise ValueError(f"{', '.join(uris)}: no {name} {unknown}; finished are: {message}")
         keep &= _is_among(column, set(values))
     if fits is not None:
         keep &= fits
@@ -691,12 +691,14 @@ def _check_all_have(rows: Rows, load: Collection[str], uris: list[str]) -> None:
             lacking[kind] = [group for group, there in zip(groups, given, strict=True) if not there]
     if not lacking:
         return
-    told = "; ".join(f"{kind}: none in {_listed(found, uris)}" for kind, found in lacking.items())
+    message = "; ".join(
+        f"{kind}: none in {_listed(found, uris)}" for kind, found in lacking.items()
+    )
     kept = tuple(kind for kind in LOADABLE if kind in load and kind not in lacking)
     raise ValueError(
         f"load asks for what only a part of the outputs has, so that batches would not stack. "
-        f"{told}. Leave it out (load={kept!r}), choose outputs, scenes or variants that are alike, "
-        f"or render those again with it under the recipe's `output`"
+        f"{message}. Leave it out (load={kept!r}), choose outputs, scenes or variants that are "
+        f"alike, or render those again with it under the recipe's `output`"
     )
 
 
@@ -717,5 +719,5 @@ def _fitting(table: pa.Table, where: Expression) -> np.ndarray:
 
 
 def _is_among(column: Coded, values: set[Any]) -> np.ndarray:
-    wanted = np.array([value in values for value in column.values], bool)
-    return wanted[column.codes] if len(wanted) else np.zeros(len(column), bool)
+    requested = np.array([value in values for value in column.values], bool)
+    return requested[column.codes] if len(requested) else np.zeros(len(column), bool)

@@ -193,9 +193,9 @@ def _binary_rows(header: PlyHeader, element: PlyElement, offset: int) -> Iterato
     with header.path.open("rb") as file:
         file.seek(offset)
         for start in range(0, element.count, ROWS_PER_CHUNK):
-            wanted = min(ROWS_PER_CHUNK, element.count - start)
-            rows = np.fromfile(file, dtype=dtype, count=wanted)
-            if len(rows) < wanted:
+            count = min(ROWS_PER_CHUNK, element.count - start)
+            rows = np.fromfile(file, dtype=dtype, count=count)
+            if len(rows) < count:
                 raise SceneError(f"{header.path}: the file became shorter while it was read")
             yield rows
 
@@ -215,15 +215,15 @@ def _ascii_rows(header: PlyHeader, element: PlyElement, skip: int) -> Iterator[n
         for _ in islice(file, skip):
             pass
         for start in range(0, element.count, ROWS_PER_CHUNK):
-            wanted = min(ROWS_PER_CHUNK, element.count - start)
-            words = [line.split() for line in islice(file, wanted)]
+            count = min(ROWS_PER_CHUNK, element.count - start)
+            words = [line.split() for line in islice(file, count)]
             for number, row in enumerate(words, start=start):
                 if len(row) != width:
                     raise SceneError(
                         f"{header.path}: row {number} of {element.name!r} must have {width} values "
                         f"(one per property); got {len(row)}"
                     )
-            if len(words) < wanted:
+            if len(words) < count:
                 raise SceneError(
                     f"{header.path}: the header announces {element.count} rows of "
                     f"{element.name!r}, but the file ends after {start + len(words)} of them"

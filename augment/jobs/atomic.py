@@ -27,8 +27,6 @@ from typing import BinaryIO
 
 from augment.errors import OutputError
 
-# ---- atomic --------------------------------------------------------------------------------------
-
 TEMPORARY_SUFFIX = ".climategs-tmp"
 _MAX_SHOWN = 200  # bytes of the final name in the temporary one, which may have 255
 _MAX_WRITING_S = 86400.0  # where the file system has no locks, older files count as left behind
@@ -206,8 +204,7 @@ def _remove_if_abandoned(path: Path) -> None:
         os.close(descriptor)
 
 
-# ------------------------------------------------------------------------------------------------
-# Folders that are replaced as a whole: readers find the old one or the new one, never a mixture
+# ---- Folders replaced as a whole: readers find the old one or the new one ------------------------
 # The new folder is written beside the old under a temporary name, flushed to the disk, and changes
 # places with it in one step. What else the old folder held moves over afterwards.
 

@@ -150,8 +150,7 @@ def enter_variant(store: Store, scene: str, variant: str, identity: Identity) ->
     identity.check(other, f"{store.uri}/{folder}")
 
 
-# ------------------------------------------------------------------------------------------------
-# Clears away what killed processes have left in an output: nobody reads it, but it takes room
+# ---- What killed processes have left in an output ------------------------------------------------
 # Temporary files of processes that have ended, the folders that published blocks were rendered in,
 # and the claims' files of the dead. What live processes hold stays; should one on another machine
 # lose a temporary file all the same, because locks do not reach there, its store writes it again.
@@ -197,7 +196,7 @@ def clear_files_of(store: Store, block: Block) -> None:
         remove_temporaries(store.local_dir / variant_folder(block.scene, block.variant))
 
 
-# ---- workshop ------------------------------------------------------------------------------------
+# ---- The worker ----------------------------------------------------------------------------------
 
 _log = logging.getLogger(__name__)
 
@@ -266,7 +265,7 @@ class BlockDone:
 
 
 @dataclass(frozen=True)
-class SettledRecipes:
+class ResolvedRecipes:
     """The recipes of a ResolveTask, in its order."""
 
     recipes: tuple[Recipe, ...]
@@ -285,15 +284,15 @@ class TaskFailed:
     of_memory: bool = False
 
 
-Result = SceneRecord | SettledRecipes | BlockDone | TaskFailed
-Tell = Callable[[Outcome], None]
+Result = SceneRecord | ResolvedRecipes | BlockDone | TaskFailed
+OnOutcome = Callable[[Outcome], None]
 
 
 class BlockWorker:
     """Does one task after the other. tell: hears of every image, from several threads."""
 
-    def __init__(self, setup: WorkSetup, tell: Tell) -> None:
-        self._setup, self._tell = setup, tell
+    def __init__(self, setup: WorkSetup, on_outcome: OnOutcome) -> None:
+        self._setup, self._on_outcome = setup, on_outcome
         self._store: Store = open_store(setup.store_uri)
         self._scene: Scene | None = None
         self._opened: tuple[str, str | None] | None = None
@@ -307,7 +306,9 @@ class BlockWorker:
             if isinstance(task, IndexTask):
                 return self._index(task)
             if isinstance(task, ResolveTask):
-                return SettledRecipes(tuple(self._settle(task, recipe) for recipe in task.recipes))
+                return ResolvedRecipes(
+                    tuple(self._resolve(task, recipe) for recipe in task.recipes)
+                )
             return self._render(task)
         except OutputError as error:
             return TaskFailed(str(error), is_output=True)
@@ -318,14 +319,14 @@ class BlockWorker:
             return TaskFailed(str(error), of_scene=True, of_memory=of_memory)
         except Exception as error:
             _log.debug("task failed", exc_info=True)
-            return TaskFailed(_said(error), of_memory=isinstance(error, MemoryError))
+            return TaskFailed(_message_of(error), of_memory=isinstance(error, MemoryError))
 
     def _index(self, task: IndexTask) -> SceneRecord:
         started = time.perf_counter()
         scene = self._scene_of(task.uri, task.name)
         return SceneRecord.of(scene, task.uri, time.perf_counter() - started)
 
-    def _settle(self, task: ResolveTask, recipe: Recipe) -> Recipe:
+    def _resolve(self, task: ResolveTask, recipe: Recipe) -> Recipe:
         from augment.jobs.quality import resolve_quality_for
 
         scene, setup = self._scene_of(task.uri, task.name), self._setup
@@ -353,7 +354,7 @@ class BlockWorker:
                 raise
             except Exception as error:
                 _log.debug("%s", uri, exc_info=True)
-                raise _SceneFailed(_said(error)) from error
+                raise _SceneFailed(_message_of(error)) from error
             self._scene = scene if name is None else replace(scene, name=name)
             self._opened = (uri, name)
         return self._scene
@@ -400,16 +401,16 @@ class BlockWorker:
         )
         with Publisher(self._store, folder, block) as publisher:
 
-            def tell(outcome: Outcome) -> None:
+            def on_outcome(outcome: Outcome) -> None:
                 publisher.image_done(outcome)
-                self._tell(outcome)
+                self._on_outcome(outcome)
 
             result = run_job(
                 job,
                 scene_loader=lambda uri: self._scene_of(uri, task.name),
                 renderer=self._setup.renderer,
                 progress=False,
-                tell=tell,
+                on_outcome=on_outcome,
             )
             with times.spent("publish"):
                 publisher.finish()
@@ -447,7 +448,7 @@ class _SceneFailed(ClimateGSError):
     """A scene could not be opened."""
 
 
-def _said(error: Exception) -> str:
+def _message_of(error: Exception) -> str:
     """Our own errors say what to do; of others the kind matters too."""
     if isinstance(error, MemoryError):
         return f"memory ran out ({error}); use fewer workers, or a machine with more"

@@ -145,11 +145,11 @@ class Block:
 
     def pictured(self, record: SceneRecord) -> list[Pictured]:
         """All images of the block, by frame and camera."""
-        wanted, cameras, scale = set(self.frames), set(self.cameras), self.recipe.render.scale
+        requested, cameras, scale = set(self.frames), set(self.cameras), self.recipe.render.scale
         return [
             Pictured(frame.number, name, time, *scaled_size(width, height, scale))
             for frame in record.frames
-            if frame.number in wanted
+            if frame.number in requested
             for name, (width, height, time) in frame.cameras.items()
             if name in cameras
         ]
@@ -183,8 +183,8 @@ def cut_into_blocks(
     wanted_cameras = known if cameras is None else set(cameras)
     numbers = [frame.number for frame in record.frames]
     chosen = parse_frames(frames).select(numbers, clip=True)
-    wanted = set(numbers if chosen is None else chosen)
-    if unknown_frames := sorted(wanted - set(numbers)):
+    requested = set(numbers if chosen is None else chosen)
+    if unknown_frames := sorted(requested - set(numbers)):
         raise SceneError(
             f"scene {record.name!r} has no frame {', '.join(map(str, unknown_frames))}; its frames "
             f"are {numbers[0]} to {numbers[-1]}"
@@ -193,7 +193,7 @@ def cut_into_blocks(
     blocks: list[Block] = []
     for recipe in recipes:
         for start in range(0, len(record.frames), span):
-            run = [f for f in record.frames[start : start + span] if f.number in wanted]
+            run = [f for f in record.frames[start : start + span] if f.number in requested]
             counts = [len(wanted_cameras & f.cameras.keys()) for f in run]
             held = tuple(f.number for f, count in zip(run, counts, strict=True) if count)
             if held:
@@ -261,10 +261,10 @@ def make_plan(
     scenes: Sequence[JobScene],
     found: Mapping[tuple[str, str | None], SceneRecord | str],
     backend: str,
-    settled: Mapping[tuple[str, str], Recipe | str] = MappingProxyType({}),
+    resolved: Mapping[tuple[str, str], Recipe | str] = MappingProxyType({}),
 ) -> Plan:
     """The plan of a job. scenes: without patterns. found: the scene of every URI and name, or why
-    it cannot be opened. settled: by scene and variant, those recipes whose quality had to choose
+    it cannot be opened. resolved: by scene and variant, those recipes whose quality had to choose
     its settings in the scene, or why it could not: no recipe of that scene is rendered then. Raises
     ClimateGSError: two scenes would share a folder, or none of them can be used. RecipeError: a
     draw breaks a rule.
@@ -279,7 +279,7 @@ def make_plan(
             continue
         _check_folder(records, record)
         drawn = recipes.of_scene(entry, record.name)
-        chosen = [settled.get((record.name, variant_name(recipe)), recipe) for recipe in drawn]
+        chosen = [resolved.get((record.name, variant_name(recipe)), recipe) for recipe in drawn]
         if failed := [why for why in chosen if isinstance(why, str)]:
             unusable[entry.uri] = failed[0]
             continue

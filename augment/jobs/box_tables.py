@@ -232,23 +232,21 @@ def measure_boxes(
     if view.surface is not None:
         measured["box_2d"] = _measure_2d(boxes, instances, world_origin_m, camera, view.surface)
     if (flood := view.flood) is not None:
-        depth_m, mask = flood.scene_depth_m, view.water
+        counted, depth_m = None, flood.scene_depth_m
+        if depth_m is not None:
+            assert view.water is not None
+            counted = hidden_pixels(boxes, world_origin_m, camera, depth_m, view.water)
         measured["box_water"] = {
             "submerged_fraction": submerged_fraction(boxes, world_origin_m, flood.level_z_m),
-            **_counted(
-                boxes,
-                "hidden_pixels",
-                depth_m is not None and hidden_pixels(boxes, world_origin_m, camera, depth_m, mask),
-            ),
+            **_counts(boxes, counted, "hidden_pixels"),
         }
     if (snow := view.snowy) is not None:
-        depth_m, mask = snow.surface_depth_m, view.snow
-        measured["box_snow"] = _counted(
-            boxes,
-            "snow_pixels",
-            depth_m is not None
-            and snow_pixels(boxes, world_origin_m, camera, depth_m, mask, snow.thickness_m),
-        )
+        counted, depth_m = None, snow.surface_depth_m
+        if depth_m is not None:
+            assert view.snow is not None
+            thickness_m = snow.thickness_m
+            counted = snow_pixels(boxes, world_origin_m, camera, depth_m, view.snow, thickness_m)
+        measured["box_snow"] = _counts(boxes, counted, "snow_pixels")
     if (smog := view.smoggy) is not None:
         found = box_transmittance(
             boxes, world_origin_m, camera, smog.medium, smog.surface_depth_m, smog.water_level_z_m
@@ -257,11 +255,11 @@ def measure_boxes(
     return {k: TABLES[k].numbers(boxes.track_ids, **columns) for k, columns in measured.items()}
 
 
-def _counted(boxes: Boxes, name: str, counted: Any) -> dict[str, np.ndarray]:
-    """The pixels of each box and those marked, under that name; counted: False, where not."""
-    if counted is False:
-        return {"pixels": np.full(len(boxes), NOT_COUNTED), name: np.zeros(len(boxes), np.int64)}
-    return {"pixels": counted.pixels, name: counted.marked}
+def _counts(boxes: Boxes, counted: Any, marked: str) -> dict[str, np.ndarray]:
+    """The pixels of each box, and those of them that are marked, by that name."""
+    if counted is None:
+        return {"pixels": np.full(len(boxes), NOT_COUNTED), marked: np.zeros(len(boxes), np.int64)}
+    return {"pixels": counted.pixels, marked: counted.marked}
 
 
 def _measure_2d(

@@ -21,25 +21,42 @@ import secrets
 import socket
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from random import SystemRandom
-from typing import Protocol, runtime_checkable
 
 from augment.errors import OutputError
 from augment.jobs.atomic import is_named, make_folder, output_error, refusals_of
 from augment.jobs.layout import STATE_FOLDER, folder_name
 from augment.jobs.store import Store
 
-# ------------------------------------------------------------------------------------------------
-# Claims among the processes of one machine: the kernel's lock of a file that comes and goes
+# ---- Among the processes of one machine: the kernel's lock of a file -----------------------------
 
 _MAX_RACES = 1000  # times that the file is deleted by its holder while it is being opened
 
 
-class FileClaim:
-    """A locked file; see Claim. The file is deleted by its holder, while it holds it."""
+class Claim(ABC):
+    """Held by this process until released; leaving its `with` block releases it."""
+
+    @abstractmethod
+    def check(self) -> None:
+        """Make sure that it is still held."""
+
+    @abstractmethod
+    def release(self) -> None:
+        """Give it up, for others to take; a second time, or in a forked child, does nothing."""
+
+    def __enter__(self) -> Claim:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.release()
+
+
+class FileClaim(Claim):
+    """A locked file, deleted by its holder while it holds it."""
 
     def __init__(self, path: Path, descriptor: int) -> None:
         self._path = path
@@ -70,12 +87,6 @@ class FileClaim:
             fcntl.flock(descriptor, fcntl.LOCK_UN)  # for forked children too
             os.close(descriptor)
 
-    def __enter__(self) -> FileClaim:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.release()
-
 
 def try_lock(path: Path) -> FileClaim | None:
     """Lock the file, which is made if missing; None where another process holds it."""
@@ -100,7 +111,7 @@ def try_lock(path: Path) -> FileClaim | None:
     return None
 
 
-# ---- claims --------------------------------------------------------------------------------------
+# ---- Claims --------------------------------------------------------------------------------------
 
 CLAIMS_FOLDER = f"{STATE_FOLDER}/claims"
 
@@ -119,23 +130,6 @@ class ClaimTimes:
 
 
 CLAIM_TIMES = ClaimTimes()
-
-
-@runtime_checkable
-class Claim(Protocol):
-    """Held by this process until released; leaving its `with` block releases it."""
-
-    def check(self) -> None:
-        """Make sure that it is still held."""
-        ...
-
-    def release(self) -> None:
-        """Give it up, for others to take; a second time, or in a forked child, does nothing."""
-        ...
-
-    def __enter__(self) -> Claim: ...
-
-    def __exit__(self, *_: object) -> None: ...
 
 
 def try_claim(store: Store, name: str, times: ClaimTimes | None = None) -> Claim | None:
@@ -169,8 +163,7 @@ def hold(store: Store, name: str, patience_s: float = 120.0) -> Iterator[None]:
         yield
 
 
-# ------------------------------------------------------------------------------------------------
-# Claims among machines that share nothing but a remote store; the protocol is told in claims.py
+# ---- Among machines that share nothing but a remote store ----------------------------------------
 # Whoever contends has an empty object, whoever holds the claim one that says who it is.
 
 _log = logging.getLogger(__name__)
@@ -178,8 +171,8 @@ _RESOLUTION_S = 1.0  # of the times that stores tell
 _random = SystemRandom()  # processes with one seed must part
 
 
-class ObjectClaim:
-    """An object that a thread renews; see Claim."""
+class ObjectClaim(Claim):
+    """An object that a thread renews."""
 
     def __init__(self, store: Store, path: str, times: ClaimTimes, renewed_s: float) -> None:
         self._store, self._path, self._times = store, path, times
@@ -214,12 +207,6 @@ class ObjectClaim:
         self._stop.set()
         self._thread.join()  # a renewal under way would bring the object back
         _withdraw(self._store, self._path, self._times)
-
-    def __enter__(self) -> ObjectClaim:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.release()
 
     def _keep_renewing(self) -> None:
         while not self._lost and not self._stop.wait(self._times.renewal_s):

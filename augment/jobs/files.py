@@ -82,8 +82,10 @@ class SceneIndex:
 def check_frames(scene: Scene) -> None:
     """Raises SceneError, with what its adapter said, where a scene has no frames to render."""
     if not scene.frames:
-        said = "; ".join(scene.problems) or "give camera_path=FILE in its URI"
-        raise SceneError(f"scene {scene.name!r} ({scene.source}) has no frames to render: {said}")
+        message = "; ".join(scene.problems) or "give camera_path=FILE in its URI"
+        raise SceneError(
+            f"scene {scene.name!r} ({scene.source}) has no frames to render: {message}"
+        )
 
 
 def select_frames(
@@ -104,9 +106,9 @@ def select_frames(
         raise SceneError(
             f"scene {index.name!r} has no camera {_listed(missing)}; it has {_listed(names)}"
         )
-    wanted = set(names if cameras is None else cameras)
+    requested = set(names if cameras is None else cameras)
     selected = [
-        (known[number], tuple(sorted(wanted & known[number].cameras.keys())))
+        (known[number], tuple(sorted(requested & known[number].cameras.keys())))
         for number in sorted(known if frames is None else set(frames))
     ]
     selected = [(frame, names) for frame, names in selected if names]
@@ -445,7 +447,7 @@ def check_view(view: View, camera: Camera, recipe: Recipe) -> None:
     _check_fact("water level", view.flood is not None, "a flood", has_flood)
     _check_fact("snow depth", view.snowy is not None, "snow", has_snow)
     _check_fact("smog density", view.smoggy is not None, "smog", weather.smog is not None)
-    wanted = {
+    requested = {
         "rgb": True,
         "depth_m": output.depth != "none",
         "semantic": output.semantic,
@@ -453,7 +455,7 @@ def check_view(view: View, camera: Camera, recipe: Recipe) -> None:
         "water": has_flood,
         "snow": has_snow,
     }
-    for name, needed in wanted.items():
+    for name, needed in requested.items():
         buffer = getattr(view, name)
         if (buffer is not None) != needed:
             raise ValueError(

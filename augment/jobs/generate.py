@@ -19,6 +19,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import pyarrow as pa
 from tqdm import tqdm
@@ -30,8 +31,8 @@ from augment.jobs.backends import renders_on_gpu
 from augment.jobs.block_pools import SerialPool, Tick, WorkerPool
 from augment.jobs.block_worker import (
     IndexTask,
+    ResolvedRecipes,
     ResolveTask,
-    SettledRecipes,
     WorkSetup,
     clear_leftovers,
 )
@@ -79,13 +80,13 @@ def resolve_recipes(
     progress: bool,
     keep: bool,
 ) -> Choices:
-    """By scene and variant: the recipes that had to choose, settled, or why they could not. found:
+    """By scene and variant: the recipes that had to choose, resolved, or why they could not. found:
     the scene of every URI and name. keep: whether new choices are kept in the output.
     """
-    wanted = _wanted(job, found)
-    if not wanted:
+    open_recipes = _open_recipes(job, found)
+    if not open_recipes:
         return {}
-    choices, left = _recorded(store, wanted, job.setup.backend)
+    choices, left = _recorded(store, open_recipes, job.setup.backend)
     tasks = {
         ResolveTask(record.uri, name, tuple(recipes), keep): record
         for record, name, recipes in left
@@ -94,9 +95,9 @@ def resolve_recipes(
         total=len(tasks), unit="scene", desc="choosing settings", disable=not progress or not tasks
     )
 
-    def each(task: ResolveTask, settled: SettledRecipes | str) -> None:
+    def each(task: ResolveTask, resolved: ResolvedRecipes | str) -> None:
         for number, recipe in enumerate(task.recipes):
-            outcome = settled if isinstance(settled, str) else settled.recipes[number]
+            outcome = resolved if isinstance(resolved, str) else resolved.recipes[number]
             choices[tasks[task].name, variant_name(recipe)] = outcome
         bar.update()
 
@@ -110,28 +111,30 @@ def resolve_recipes(
     return choices
 
 
-_Wanted = list[tuple[SceneRecord, str | None, list[Recipe]]]
+_OpenRecipes = list[tuple[SceneRecord, str | None, list[Recipe]]]
 
 
-def _wanted(job: GenerateJob, found: Found) -> _Wanted:
+def _open_recipes(job: GenerateJob, found: Found) -> _OpenRecipes:
     """Scenes with their names in the job and the recipes that have to choose there."""
-    wanted: _Wanted = []
+    open_recipes: _OpenRecipes = []
     for entry in job.scenes:
         record = found[entry.uri, entry.name]
         if isinstance(record, SceneRecord):
             drawn = job.recipes.of_scene(entry, record.name)
-            if unsettled := [recipe for recipe in drawn if recipe.quality.is_open]:
-                wanted.append((record, entry.name, unsettled))
-    return wanted
+            if unresolved := [recipe for recipe in drawn if recipe.quality.is_open]:
+                open_recipes.append((record, entry.name, unresolved))
+    return open_recipes
 
 
-def _recorded(store: Store, wanted: _Wanted, backend: str) -> tuple[Choices, _Wanted]:
+def _recorded(
+    store: Store, open_recipes: _OpenRecipes, backend: str
+) -> tuple[Choices, _OpenRecipes]:
     """What the output knows already, and what is left to choose."""
     from augment.jobs.quality import Question, recorded
 
     questions = [
         Question(recipe, record.name, record.source, RECORDED, backend)
-        for record, _, recipes in wanted
+        for record, _, recipes in open_recipes
         for recipe in recipes
     ]
     with ThreadPoolExecutor(_READS, thread_name_prefix="choices") as pool:
@@ -141,8 +144,8 @@ def _recorded(store: Store, wanted: _Wanted, backend: str) -> tuple[Choices, _Wa
         for question, answer in zip(questions, answers, strict=True)
         if answer is not None
     }
-    left: _Wanted = []
-    for record, name, recipes in wanted:
+    left: _OpenRecipes = []
+    for record, name, recipes in open_recipes:
         rest = [r for r in recipes if (record.name, variant_name(r)) not in choices]
         if rest:
             left.append((record, name, rest))
@@ -154,8 +157,7 @@ def _recorded(store: Store, wanted: _Wanted, backend: str) -> tuple[Choices, _Wa
 MAX_SAMPLED = 8  # recipes whose pictures are made; the others take their mean
 
 
-@dataclass(frozen=True)
-class Sample:
+class Sample(NamedTuple):
     """What a recipe's images cost. per megapixel: seconds of rendering and writing, and bytes."""
 
     seconds_per_mpx: float
@@ -196,12 +198,7 @@ def estimate(
             opened.clear()
             opened[block.uri] = open_scene(block.uri)
         samples[name] = _sample(block, opened.__getitem__, plan)
-    mean = Sample(
-        *(
-            sum(getattr(s, field) for s in samples.values()) / len(samples)
-            for field in Sample.__dataclass_fields__
-        )
-    )
+    mean = Sample(*(sum(each) / len(samples) for each in zip(*samples.values(), strict=True)))
     pixels, scenes = _megapixels(plan)
     costs = {name: samples.get(name, mean) for name in firsts}
     opening = sum(record.open_s for record in plan.records.values())
@@ -533,8 +530,8 @@ def _plan(
             bar.update()
 
         scheduler.do_first(list(dict.fromkeys(tasks)), each)
-    settled = resolve_recipes(job, store, scheduler, found, progress=progress, keep=keep)
-    return make_plan(job.recipes, job.scenes, found, job.setup.backend, settled)
+    resolved = resolve_recipes(job, store, scheduler, found, progress=progress, keep=keep)
+    return make_plan(job.recipes, job.scenes, found, job.setup.backend, resolved)
 
 
 def _known(store: Store, entry: JobScene) -> SceneRecord | None:

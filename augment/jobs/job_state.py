@@ -56,16 +56,15 @@ from augment.jobs.tables import FrameBoxes, boxes_bytes, read_boxes
 from augment.jobs.worker import Chunk, Outcome, describe
 from recipes.schema import Recipe
 
-# ------------------------------------------------------------------------------------------------
-# What a job has finished so far, on the disk: one journal per variant until the manifest has it
+# ---- What a variant has finished so far, on the disk, until the manifest has it ------------------
 # `.climategs/journal/<scene>/<variant>.jsonl` starts with the variant's identity and gains a line
 # for every image once all its files are in place. A line counts only with its line break, so a job
 # killed while writing one loses that line and nothing else. When a job ends, its lines have become
-# rows of the manifest and the journal goes.
+# rows of the manifest and the progress log goes.
 
 
 class ProgressLog:
-    """The journal of one variant. `append` may be called from several threads."""
+    """The progress log of one variant. `append` may be called from several threads."""
 
     def __init__(self, out_dir: Path, scene: str, variant: str) -> None:
         folder = out_dir / STATE_FOLDER / "journal" / folder_name(scene)
@@ -74,7 +73,7 @@ class ProgressLog:
         self._lock = threading.Lock()
 
     def load(self) -> tuple[Identity | None, list[dict[str, Any]]]:
-        """The identity and rows in the journal; (None, []) where there is none."""
+        """The identity and rows in it; (None, []) where there is none."""
         try:
             lines = self.path.read_bytes().split(b"\n")[:-1]  # the last part has no line break
         except FileNotFoundError:
@@ -115,7 +114,7 @@ class ProgressLog:
             self._file = None
 
     def remove(self) -> None:
-        """Delete the journal and the folders it leaves empty."""
+        """Delete the progress log and the folders it leaves empty."""
         self.close()
         with refusals_of(self.path):
             self.path.unlink(missing_ok=True)
@@ -346,8 +345,7 @@ def _remove_tree(folder: Path) -> None:
         shutil.rmtree(folder)
 
 
-# ------------------------------------------------------------------------------------------------
-# Ends a job: what belongs to a whole variant is written, then the manifest, then journals go
+# ---- The end of a job: what belongs to a whole variant, then the manifest; then the logs go ------
 
 
 @dataclass
@@ -360,11 +358,11 @@ class BoxCache:
 
     def get(self, frames: Iterable[int]) -> dict[int, FrameBoxes]:
         """The boxes of those frames that have labels and can be read."""
-        wanted = [f for f in frames if f in self.index.labelled]
-        for number in wanted:
+        requested = [f for f in frames if f in self.index.labelled]
+        for number in requested:
             if number not in self.read and number not in self.errors:
                 self._read(number)
-        return {number: self.read[number] for number in wanted if number in self.read}
+        return {number: self.read[number] for number in requested if number in self.read}
 
     def _read(self, number: int) -> None:
         assert self.index.labels is not None  # labelled frames exist only with a source
@@ -381,7 +379,7 @@ class BoxCache:
 
 def finish(job_state: JobState, trajectory: str, boxes: BoxCache) -> None:
     """Write labels, calibration and manifest of the job's variants that have rows. Safe to repeat:
-    a kill at any point leaves the journals, and the next run does it again.
+    a kill at any point leaves the progress logs, and the next run does it again.
     """
     variants = [variant for variant in job_state.variants if variant.rows]
     for variant in variants:
@@ -397,7 +395,7 @@ def finish(job_state: JobState, trajectory: str, boxes: BoxCache) -> None:
 
 
 def needs_finish(job_state: JobState) -> bool:
-    """Whether anything that `finish` writes is not there, or a journal is still open."""
+    """Whether anything that `finish` writes is not there, or a progress log is still open."""
     return not (job_state.out_dir / MANIFEST).is_file() or any(
         variant.is_logged or not all(p.is_file() for p in _companions(job_state, variant).values())
         for variant in job_state.variants

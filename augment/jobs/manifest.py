@@ -143,15 +143,15 @@ def parse_manifest(data: bytes, where: str) -> pa.Table:
 
 
 def _check_types(table: pa.Table, where: str) -> None:
-    wanted = {**LEADING, **dict.fromkeys(weather_columns(table), pa.float64()), **TRAILING}
+    requested = {**LEADING, **dict.fromkeys(weather_columns(table), pa.float64()), **TRAILING}
     advice = "It was written by another program or version: write to another output folder"
-    missing = sorted(wanted.keys() - set(table.column_names))
+    missing = sorted(requested.keys() - set(table.column_names))
     if missing:
         raise OutputError(f"{where} lacks the columns {missing}. {advice}")
     for field in table.schema:
-        if field.type != wanted[field.name]:
+        if field.type != requested[field.name]:
             raise OutputError(
-                f"{where}: column {field.name!r} must be of type {wanted[field.name]}; got "
+                f"{where}: column {field.name!r} must be of type {requested[field.name]}; got "
                 f"{field.type}. {advice}"
             )
 

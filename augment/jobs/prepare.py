@@ -21,9 +21,8 @@ from recipes.schema import Recipe
 from recipes.weather import Snow, Style
 
 # ---- Where snow can lie, found once for all images and processes of a job ------------------------
-# The beds lie beside the lock and the journals, named by their content: a later job of the same
-# scene, with snow of another depth, finds them there. What finds them is imported only where it is
-# needed, for it brings the rasteriser.
+# The beds lie beside the lock, named by their content: a later job of the same scene, with snow of
+# another depth, finds them there.
 
 
 @dataclass(frozen=True)
@@ -36,9 +35,9 @@ class StoredBed:
 
     def take_over(self, scene: Scene) -> None:
         """Read the bed into this process, for whoever renders the scene here."""
-        from augment.effects.snow.support import load_bed
+        from augment.effects.snow.support import load_support
 
-        remember(scene, self.snow, load_bed(Path(self.path), self.key))
+        remember(scene, self.snow, load_support(Path(self.path), self.key))
 
 
 def snow_to_lay(recipe: Recipe) -> Snow | None:
@@ -60,9 +59,9 @@ def find_bed(scene: Scene, snow: Snow, *, backend: str = "auto") -> SnowSupport:
     that renders the pictures.
     """
     from augment.effects.snow.snow import placement_settings
-    from augment.effects.snow.support import bed_of
+    from augment.effects.snow.support import support_of
 
-    return bed_of(scene, placement_settings(snow), backend=backend)
+    return support_of(scene, placement_settings(snow), backend=backend)
 
 
 def store_beds(
@@ -80,20 +79,20 @@ def store_beds(
     snow, too. progress: a bar on stderr for each bed that is placed.
     """
     from augment.effects.snow.snow import placement_settings
-    from augment.effects.snow.support import bed_key, bed_of, bed_path, save_bed
+    from augment.effects.snow.support import save_support, support_key, support_of, support_path
 
     if cameras is None:
         cameras = [camera for frame in scene.frames for camera in frame.cameras.values()]
-    wanted = {placement_settings(s): s for r in recipes if (s := snow_to_lay(r)) is not None}
+    requested = {placement_settings(s): s for r in recipes if (s := snow_to_lay(r)) is not None}
     stored = []
-    for settings, snow in wanted.items():
-        bed = bed_of(
+    for settings, snow in requested.items():
+        bed = support_of(
             scene, settings, cameras=cameras, folder=folder, backend=backend, progress=progress
         )
-        key = bed_key(scene, cameras, settings, backend=backend)
-        path = bed_path(folder, key)
+        key = support_key(scene, cameras, settings, backend=backend)
+        path = support_path(folder, key)
         if not path.is_file():  # this process knew the bed from a job in another folder
-            save_bed(path, bed, key)
+            save_support(path, bed, key)
         stored.append(StoredBed(snow, str(path), key))
     return tuple(stored)
 
@@ -151,9 +150,9 @@ def store_maps(
     """
     from augment.effects.style.style import style_maps
 
-    wanted = {s: None for r in recipes if (s := style_to_apply(r)) is not None}
+    requested = {s: None for r in recipes if (s := style_to_apply(r)) is not None}
     stored = []
-    for style in wanted:
+    for style in requested:
         maps = style_maps(scene, style, cameras=cameras)
         splats, sky, picture = (m.numpy() for m in (maps.splats, maps.sky, maps.picture))
         seen = None if maps.seen_sky is None else maps.seen_sky.numpy()

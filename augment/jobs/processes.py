@@ -129,12 +129,12 @@ def thread_limits(threads: int) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def quick_turns(wanted: bool) -> Iterator[None]:
+def quick_turns(requested: bool) -> Iterator[None]:
     """If wanted, a thread waits half a millisecond for its turn at Python and not five: one that
     launches kernels gives its turn away with each, and the GPU would wait for whoever encodes.
     """
     before = sys.getswitchinterval()
-    if wanted:
+    if requested:
         sys.setswitchinterval(min(before, _TURN_S))
     try:
         yield

@@ -64,7 +64,7 @@ def render_trial(
     and the colours of the other does.
 
     Raises:
-        SceneError: the scene cannot be rendered so. RecipeError: the recipe is not settled.
+        SceneError: the scene cannot be rendered so. RecipeError: the recipe is not resolved.
     """
     render = renderer or default_renderer()
     started = clock()
@@ -241,10 +241,10 @@ class Bench:
         snow, style = snow_to_lay(recipe), style_to_apply(recipe)
         if snow is not None:
             from augment.effects.snow.snow import placement_settings
-            from augment.effects.snow.support import bed_of
+            from augment.effects.snow.support import support_of
 
             settings = placement_settings(snow)
-            bed_of(self._scene, settings, cameras=self._cameras, backend=self._backend)
+            support_of(self._scene, settings, cameras=self._cameras, backend=self._backend)
         if style is not None:
             from augment.effects.style.style import remember_maps, style_maps
 
@@ -451,7 +451,7 @@ class Report:
 
 
 @dataclass(frozen=True)
-class Settled:
+class Resolved:
     """recipe: with its settings in numbers. report: None where nothing had to be chosen."""
 
     recipe: Recipe
@@ -468,7 +468,7 @@ def resolve_quality(
     renderer: Renderer | None = None,
     clock: Callable[[], float] = time.perf_counter,
     progress: bool = False,
-) -> Settled:
+) -> Resolved:
     """The recipe with the settings that its max_flip or budget_ms chooses in this scene.
 
     views: what is rendered to find out, `calibration_views` of the scene's frames if None. cameras:
@@ -482,7 +482,7 @@ def resolve_quality(
         SceneError: the scene cannot be rendered under the recipe.
     """
     if not recipe.quality.is_open:
-        return Settled(recipe)
+        return Resolved(recipe)
     started = time.perf_counter()
     views = calibration_views(scene.frames) if views is None else tuple(views)
     bar = tqdm(unit="picture", desc=f"choosing settings of {recipe.name}", disable=not progress)
@@ -521,7 +521,7 @@ def resolve_quality(
             chosen.ms,
             recipe.quality.budget_ms,
         )
-    return Settled(resolved_recipe(recipe, chosen.settings), report)
+    return Resolved(resolved_recipe(recipe, chosen.settings), report)
 
 
 def resolved_recipe(recipe: Recipe, settings: Settings) -> Recipe:
@@ -538,16 +538,16 @@ def resolved_recipe(recipe: Recipe, settings: Settings) -> Recipe:
 
 
 def recipes_to_try(recipe: Recipe) -> list[Recipe]:
-    """The recipe with each knob at each value that `settle` may try alone; to compile kernels for.
+    """The recipe with each knob at each value that may be tried alone; to compile kernels for.
     The recipe itself where there is nothing to choose.
     """
     if not recipe.quality.is_open:
         return [recipe]
     options = _options(recipe)
-    settled = resolved_recipe(recipe, reference_settings(options))
-    tried = [settled]
+    resolved = resolved_recipe(recipe, reference_settings(options))
+    tried = [resolved]
     for path, values in options.items():
-        tried += [with_settings(settled, {path: value}) for value in values[:-1]]
+        tried += [with_settings(resolved, {path: value}) for value in values[:-1]]
     return tried
 
 
@@ -660,7 +660,7 @@ _MAX_WAIT_S = 1.0  # between looks at what another process is choosing
 
 @dataclass(frozen=True)
 class Question:
-    """What a choice is made for. recipe: not settled. scene, source: its name and where it is from.
+    """What a choice is made for. recipe: not resolved. scene, source: its name and origin.
     trajectory: of the camera path, as in the manifest.
     """
 
@@ -709,7 +709,7 @@ def resolve_quality_for(
 
     camera_path: frames that are rendered in place of the scene's own. anew: as in
     `resolve_quality_once`.
-    keep: whether a new choice is kept in the output. The others: as in `settle`.
+    keep: whether a new choice is kept in the output. The others: as in `resolve_quality`.
 
     Raises:
         SceneError: the scene cannot be rendered under the recipe. OutputError: as
@@ -723,7 +723,7 @@ def resolve_quality_for(
         frames = camera_path
         cameras = [camera for frame in camera_path for camera in frame.cameras.values()]
 
-    def choose() -> Settled:
+    def choose() -> Resolved:
         return resolve_quality(
             recipe,
             scene,
@@ -741,7 +741,7 @@ def resolve_quality_for(
 
 
 def recorded(store: Store, question: Question) -> Recipe | None:
-    """The recipe settled as the output has it; None where nothing was chosen yet."""
+    """The recipe resolved as the output has it; None where nothing was chosen yet."""
     try:
         data = store.read(question.path)
     except StoredFileMissing:
@@ -767,9 +767,9 @@ def recorded(store: Store, question: Question) -> Recipe | None:
 
 
 def resolve_quality_once(
-    store: Store, question: Question, choose: Callable[[], Settled], *, anew: bool = False
+    store: Store, question: Question, choose: Callable[[], Resolved], *, anew: bool = False
 ) -> Recipe:
-    """The recipe settled as the output has it; where it has nothing, `choose` chooses, and the
+    """The recipe resolved as the output has it; where it has nothing, `choose` chooses, and the
     choice is kept before anyone sees it. Waits for another process that is choosing. anew: choose
     whatever there is, and keep that in its place.
     """
@@ -779,11 +779,11 @@ def resolve_quality_once(
     with _claimed(store, question) as claim:
         found = None if anew else recorded(store, question)  # another may have chosen meanwhile
         if found is None:
-            settled = choose()
-            assert settled.report is not None, "the recipe had nothing to choose"
-            found = settled.recipe
+            resolved = choose()
+            assert resolved.report is not None, "the recipe had nothing to choose"
+            found = resolved.recipe
             claim.check()
-            store.write(question.path, _to_json(question, settled.report))
+            store.write(question.path, _to_json(question, resolved.report))
     return found
 
 

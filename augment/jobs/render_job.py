@@ -51,8 +51,7 @@ from recipes.load import dump_recipe
 from recipes.schema import Recipe
 from recipes.weather import Style
 
-# ------------------------------------------------------------------------------------------------
-# The files of a style beside the images that it made: `<variant>/style/`, and what names them
+# ---- The files of a style beside the images that it made: `<variant>/style/` ---------------------
 # With them a variant's `recipe.yaml` renders it again wherever the folder is taken.
 
 STYLE_FOLDER = "style"
@@ -115,7 +114,7 @@ def _safe_name(path: str) -> str:
     return folder_name(name.name)
 
 
-# ---- job -----------------------------------------------------------------------------------------
+# ---- The job -------------------------------------------------------------------------------------
 
 SceneLoader = Callable[[str], Scene]
 
@@ -182,7 +181,7 @@ def run_job(
     scene_loader: SceneLoader,
     renderer: Renderer | None = None,
     progress: bool = True,
-    tell: Callable[[Outcome], None] | None = None,
+    on_outcome: Callable[[Outcome], None] | None = None,
 ) -> JobResult:
     """Render what is missing, then write labels, calibration and manifest.
 
@@ -201,7 +200,7 @@ def run_job(
         OutputError: the folder cannot be written, is in use, or holds something else.
     """
     started = time.perf_counter()
-    run = _Run(job, scene_loader(job.scene_uri), renderer, tell, progress)
+    run = _Run(job, scene_loader(job.scene_uri), renderer, on_outcome, progress)
     run.timings["open"] = time.perf_counter() - started - run.timings.get("settle", 0.0)
     run.go(progress)
     seconds = time.perf_counter() - started
@@ -225,10 +224,10 @@ class _Run:
         job: RenderJob,
         scene: Scene,
         renderer: Renderer | None,
-        tell: Callable[[Outcome], None] | None,
+        on_outcome: Callable[[Outcome], None] | None,
         progress: bool,
     ) -> None:
-        self.job, self.renderer, self.tell = job, renderer, tell
+        self.job, self.renderer, self.on_outcome = job, renderer, on_outcome
         self.scene: Scene | None = scene  # None once workers have it
         self.timings: defaultdict[str, float] = defaultdict(float)
         # A stand-in has its own idea of backends.
@@ -237,7 +236,7 @@ class _Run:
         self.selection = select_frames(self.index, job.frames, job.cameras)
         self.out_dir = Path(job.out_dir).absolute()
         self.trajectory = trajectory_id(job.camera_path)
-        self.recipes = tuple(self._settled(with_digest(r), progress) for r in job.recipes)
+        self.recipes = tuple(self._resolved(with_digest(r), progress) for r in job.recipes)
         self.job_state = JobState(self.out_dir, self.index, self.recipes, self._identities())
         self.boxes = BoxCache(self.index)
         self.beds: tuple[StoredBed, ...] = ()
@@ -315,7 +314,7 @@ class _Run:
             shared.remove()
         self.timings.update(spent)
 
-    def _settled(self, recipe: Recipe, progress: bool) -> Recipe:
+    def _resolved(self, recipe: Recipe, progress: bool) -> Recipe:
         """The recipe with the settings that its quality chooses here, or has chosen before."""
         if not recipe.quality.is_open:
             return recipe
@@ -415,8 +414,8 @@ class _Run:
                 self.failures.append(f"{folder}, {where}: {outcome.message}")
                 self.bar.set_postfix(failed=self.counts[FAILED], refresh=False)
             self.bar.update()
-            if self.tell is not None:
-                self.tell(outcome)
+            if self.on_outcome is not None:
+                self.on_outcome(outcome)
 
     def _finish(self) -> None:
         started = time.perf_counter()

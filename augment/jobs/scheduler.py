@@ -64,7 +64,7 @@ class BlockQueue:
 WAIT_S = 1.0
 MAX_LOST = 3  # blocks of a scene whose workers die even alone, before the scene is given up
 ELSEWHERE_S = 2.0  # how long to leave a block alone that another process is at
-_SETTLING = "choosing the settings of its recipes"
+_RESOLVING = "choosing the settings of its recipes"
 _log = logging.getLogger(__name__)
 
 MakePool = Callable[[Callable[[int, Outcome], None]], WorkerPool]
@@ -139,7 +139,7 @@ class Scheduler:
                 if _wants_memory(event) and task not in tried_alone:
                     alone.append(task)
                 elif isinstance(event, Lost):
-                    doing = "opening the scene" if isinstance(task, IndexTask) else _SETTLING
+                    doing = "opening the scene" if isinstance(task, IndexTask) else _RESOLVING
                     each(task, f"the worker {event.how} while {doing}, alone too")
                 elif isinstance(event.result, TaskFailed):
                     _raise_if_output(event.result)

@@ -13,7 +13,7 @@ import secrets
 import threading
 import time
 import urllib.parse
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -31,10 +31,6 @@ from augment.jobs.atomic import (
 from augment.jobs.layout import path_below, relative_parts
 from augment.jobs.mirror_files import copy_file, link_file
 from augment.jobs.processes import uninterrupted
-
-# ---- store ---------------------------------------------------------------------------------------
-
-# ---- store ---------------------------------------------------------------------------------------
 
 _UNSAFE = re.compile("[\x00-\x1f\x7f\ud800-\udfff]")  # control characters, bytes that are no text
 
@@ -151,11 +147,12 @@ class LocalStore:
     def read(self, path: str) -> bytes:
         file = self._file(path)
         try:
-            return file.read_bytes()
-        except (FileNotFoundError, NotADirectoryError):
-            raise StoredFileMissing(f"{file} is missing") from None
-        except OSError as error:
-            raise _read_error(file, error) from error
+            with _reading(file):
+                return file.read_bytes()
+        except OutputError as error:
+            if isinstance(error.__cause__, FileNotFoundError | NotADirectoryError):
+                raise StoredFileMissing(f"{file} is missing") from None
+            raise
 
     def write(self, path: str, data: bytes) -> None:
         file = self._file(path)
@@ -164,15 +161,13 @@ class LocalStore:
     def put_file(self, path: str, source: Path) -> None:
         """A hard link where the system can, else a copy; either way flushed to the disk."""
         file = self._file(path)
-        try:
+        with _reading(source):
             original = source.resolve(strict=True)
             descriptor = os.open(original, os.O_RDONLY)
             try:
                 os.fsync(descriptor)
             finally:
                 os.close(descriptor)
-        except OSError as error:
-            raise _read_error(source, error) from error
         _with_folder(lambda: _link_or_copy(original, file))
 
     def put_files(self, files: Mapping[str, Path]) -> None:
@@ -189,18 +184,14 @@ class LocalStore:
     def list(self, folder: str) -> dict[str, StoredFile]:
         top = self.root if folder == "" else self._file(folder)
         found: dict[str, StoredFile] = {}
-        try:
+        with _reading(top):
             _scan(top, "" if folder == "" else f"{stored_path(folder, self.uri)}/", found)
-        except OSError as error:
-            raise _read_error(top, error) from error
         return dict(sorted(found.items()))
 
     def exists(self, path: str) -> bool:
         file = self._file(path)
-        try:
+        with _reading(file):
             return file.is_file()
-        except OSError as error:
-            raise _read_error(file, error) from error
 
     def delete(self, paths: Iterable[str]) -> None:
         """Folders that become empty go too, up to the root, which stays."""
@@ -260,10 +251,14 @@ def _link_or_copy(original: Path, file: Path, *, flush: bool = True) -> None:
             flush_folder(file.parent)
 
 
-def _read_error(path: Path, error: OSError) -> OutputError:
-    return OutputError(
-        f"cannot read {path}: {error.strerror}; check that it is a file that this user may read"
-    )
+@contextlib.contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(
+            f"cannot read {path}: {error.strerror}; check that it is a file that this user may read"
+        ) from error
 
 
 # ---- An output folder in the cloud, through pyarrow's file systems -------------------------------

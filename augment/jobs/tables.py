@@ -305,8 +305,8 @@ def lidar_bytes(sweep: LidarSweep, *, note: str | None = None) -> bytes:
         packed = pack_column([column], where=f"LiDAR column {name!r}")
         columns[name] = packed.data
         kinds[name] = [column_type(column), packed.encoding]
-    said = {} if note is None else {"note": note}
-    return parquet_bytes(pa.table(columns), {"kind": "lidar", "columns": kinds, **said})
+    extra = {} if note is None else {"note": note}
+    return parquet_bytes(pa.table(columns), {"kind": "lidar", "columns": kinds, **extra})
 
 
 def read_lidar(path: Path) -> LidarSweep:

@@ -19,7 +19,7 @@ from augment.cameras import Camera, Frame
 from augment.effects.smog import SmogMedium
 from augment.effects.snow.cells import OPEN_EDGE, SnowCells, SnowSupport
 from augment.effects.snow.placement import PlacementSettings
-from augment.effects.snow.support import bed_of
+from augment.effects.snow.support import support_of
 from augment.effects.style.color_maps import StyleMaps
 from augment.errors import AdapterError
 from augment.labels import Boxes, LidarSweep
@@ -254,7 +254,7 @@ def bed_render(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str) ->
     """As `style_render`, with the number that `make_bed` was given in the first pixel's red."""
     snow = recipe.weather.snow
     assert snow is not None
-    bed = bed_of(scene, PlacementSettings(cell_m=snow.cell_m, max_slope_deg=snow.max_slope_deg))
+    bed = support_of(scene, PlacementSettings(cell_m=snow.cell_m, max_slope_deg=snow.max_slope_deg))
     view = style_render(scene, camera, recipe, backend=backend)
     view.rgb[0, 0, 0] = round(bed.ground.centers_m[0, 0].item() * 20)
     return view

@@ -448,6 +448,6 @@ def test_rows_that_are_merged_while_a_job_runs_stay(tmp_path: Path) -> None:
     run(RenderJob("fake:other", [make_recipe()], tmp_path / "other"))
     others, out = read_manifest(tmp_path / "other"), tmp_path / "out"
     street = RenderJob("fake:street", [make_recipe()], out)
-    run(street, tell=lambda _: write_manifest(out, others))
+    run(street, on_outcome=lambda _: write_manifest(out, others))
     scenes = read_manifest(out)["scene"].to_pylist()
     assert scenes.count("other") == scenes.count("street") == others.num_rows

@@ -17,9 +17,9 @@ from pretend_gpu import pretended_gpu
 
 from augment.errors import GpuLost, OutputError
 from augment.jobs import worker as runner
+from augment.jobs.files import WritePump
 from augment.jobs.manifest import read_manifest
 from augment.jobs.render_job import JobResult, RenderJob, run_job
-from augment.jobs.files import WritePump
 
 SOON_S = 10.0  # for what takes no time, on a machine that is busy
 
@@ -143,7 +143,7 @@ def test_pictures_do_not_wait_for_their_sweep(tmp_path: Path, whole) -> None:
     watcher = threading.Thread(target=let_come)
     watcher.start()
     job = RenderJob("fake:street", [make_recipe()], tmp_path, frames=[0])
-    result = run(job, scene_loader=lambda _uri: scene, tell=told.append)
+    result = run(job, scene_loader=lambda _uri: scene, on_outcome=told.append)
     watcher.join()
     assert written == [2] and result.written == len(told) == 2
     found = tree_digest(tmp_path / "street/fog-000/images")

@@ -129,7 +129,7 @@ def test_a_camera_path_has_a_bed_of_its_own(placements, tmp_path: Path) -> None:
     settings, found = PlacementSettings(), []
 
     def render(scene, camera, recipe, *, backend):
-        found.append(beds.bed_of(scene, settings))
+        found.append(beds.support_of(scene, settings))
         return fake_render(scene, camera, recipe, backend=backend)
 
     load = {"scene_loader": lambda _uri: scene}
@@ -140,7 +140,7 @@ def test_a_camera_path_has_a_bed_of_its_own(placements, tmp_path: Path) -> None:
     # A path's job after it neither takes the scene's bed nor leaves its own.
     run(RenderJob("fake:street", [snowy()], tmp_path / "path2", camera_path=path), render, **load)
     assert found[-1].ground.centers_m[0, 0].item() == pytest.approx(1.05)
-    assert beds.bed_of(scene, settings).ground.centers_m[0, 0].item() == pytest.approx(8.05)
+    assert beds.support_of(scene, settings).ground.centers_m[0, 0].item() == pytest.approx(8.05)
 
 
 def test_beds_that_are_remembered_get_their_file_too(placements, tmp_path: Path) -> None:
@@ -153,7 +153,7 @@ def test_beds_that_are_remembered_get_their_file_too(placements, tmp_path: Path)
     other = open_fake("fake:street")
     bed.take_over(other)
     placements.before = pytest.fail
-    same, again = beds.bed_of(scene, PlacementSettings()), beds.bed_of(other, PlacementSettings())
+    same, again = (beds.support_of(s, PlacementSettings()) for s in (scene, other))
     assert torch.equal(same.ground.centers_m, again.ground.centers_m)
 
 

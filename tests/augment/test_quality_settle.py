@@ -21,8 +21,8 @@ from augment.jobs.manifest import read_manifest
 from augment.jobs.quality import (
     Question,
     Report,
+    Resolved,
     Settings,
-    Settled,
     calibration_views,
     recipes_to_try,
     recorded,
@@ -254,11 +254,11 @@ def test_what_a_recipe_leaves_free_is_part_of_the_question() -> None:
 def _choose_slowly(folder: str, scale: float, answers) -> None:
     recipe = open_recipe("max_flip: 0.5")
 
-    def choose() -> Settled:
+    def choose() -> Resolved:
         time.sleep(0.2)
         settings: Settings = {knob.path: knob.reference for knob in free_knobs(recipe)}
         settings["render.scale"] = scale
-        return Settled(resolved_recipe(recipe, settings), Report(settings, True, 0.0, (), ()))
+        return Resolved(resolved_recipe(recipe, settings), Report(settings, True, 0.0, (), ()))
 
     question = Question(recipe, "a", "fake:a", "recorded", "cpu")
     answers.put(resolve_quality_once(open_store(folder), question, choose).render.scale)
