@@ -21,8 +21,8 @@ from augment.effects.flood.flood_view import COARSE, MAX_MARGIN, MAX_SHIFT
 from augment.effects.flood.water_plane import mirrored_camera, plane_window
 from augment.effects.flood.waves import make_waves
 from augment.effects.smog import SmogMedium
-from augment.effects.snow.near_camera import SIZE_M, Layer, SnowCover
-from augment.effects.snow.snow import PlacedSnow, cover_of
+from augment.effects.snow.near_camera import SIZE_M, Layer, SnowLayers
+from augment.effects.snow.snow import PlacedSnow, snow_layers_of
 from augment.effects.style.style import look_of
 from augment.errors import SceneError
 from augment.geometry import rotmat_from_quat
@@ -577,8 +577,8 @@ class ViewPlan:
 def plan_view(plan: Plan, scene: Scene, camera: Camera, *, backend: str = AUTO) -> ViewPlan:
     """The parts, passes and buffers of the plan that the camera's image can show.
 
-    The first call for a scene bounds its actors; under snow, it also lays the snow (cover_of), by
-    `backend`.
+    The first call for a scene bounds its actors; under snow, it also lays the snow
+    (snow_layers_of), by `backend`.
 
     Raises:
         SceneError: snow cannot be placed in this scene.
@@ -606,12 +606,12 @@ def plan_view(plan: Plan, scene: Scene, camera: Camera, *, backend: str = AUTO) 
     )
 
 
-def cover_for(plan: Plan, scene: Scene, *, backend: str = AUTO) -> SnowCover | None:
-    """The plan's snow as it lies in the scene; None without one. backend: see cover_of."""
+def cover_for(plan: Plan, scene: Scene, *, backend: str = AUTO) -> SnowLayers | None:
+    """The plan's snow as it lies in the scene; None without one. backend: see snow_layers_of."""
     if plan.snow is None:
         return None
     style_parts = None if plan.style is None or plan.styles_picture else look_of(scene, plan.style)
-    return cover_of(scene, plan.snow, style_parts, backend=backend)
+    return snow_layers_of(scene, plan.snow, style_parts, backend=backend)
 
 
 def _water(plan: Plan, camera: Camera) -> tuple[bool, str | None]:
@@ -690,7 +690,7 @@ def _actor_boxes(scene: Scene) -> _Owned:
 _of_actors: WeakKeyDictionary[Scene, _Owned] = WeakKeyDictionary()
 
 
-def _snow_boxes(scene: Scene, cover: SnowCover) -> tuple[Bounds, _Owned]:
+def _snow_boxes(scene: Scene, cover: SnowLayers) -> tuple[Bounds, _Owned]:
     """Around the ground's snow, and the actors'; worked out once per cover (of one scene)."""
     if cover not in _of_covers:
         on_ground = _bound_snow(cover.ground, scene.background)
@@ -700,7 +700,7 @@ def _snow_boxes(scene: Scene, cover: SnowCover) -> tuple[Bounds, _Owned]:
     return _of_covers[cover]
 
 
-_of_covers: WeakKeyDictionary[SnowCover, tuple[Bounds, _Owned]] = WeakKeyDictionary()
+_of_covers: WeakKeyDictionary[SnowLayers, tuple[Bounds, _Owned]] = WeakKeyDictionary()
 
 
 def _bound_snow(layer: Layer, own: Gaussians) -> Bounds:
@@ -732,7 +732,7 @@ def _steps(
     scene: Scene,
     poses: dict[int, np.ndarray],
     drawn: set[int],
-    cover: SnowCover | None,
+    cover: SnowLayers | None,
     snowy: set[int],
     no_water: str | None,
     buffers: frozenset[str],

@@ -26,8 +26,6 @@ from augment.cameras import Camera
 from augment.labels import Boxes
 from augment.render.buffers import AUTO, CUDA, RenderOutput, kernels_for
 
-# ---- smog ----------------------------------------------------------------------------------------
-
 MAX_EXPONENT = 80.0  # exp(80) is still finite in float32; smog that dense has t = 0 at any distance
 
 
@@ -108,8 +106,7 @@ def blend_airlight(
 ) -> Float[Tensor, "*B 3"]:
     """t rgb + (1 - t) airlight, with t = exp(-tau). tau = 0 returns rgb to the bit."""
     t = torch.exp(-tau)[..., None]
-    airlight = torch.tensor(medium.rgb, dtype=rgb.dtype, device=rgb.device)
-    return t * rgb + (1 - t) * airlight
+    return t * rgb + (1 - t) * torch.tensor(medium.rgb, dtype=rgb.dtype, device=rgb.device)
 
 
 def fog_buffers(
@@ -153,9 +150,8 @@ def fog_raster(
 
 
 # ---- How much of the light of labelled boxes comes through the smog before them ------------------
-# Boxes come in the dataset's world (`augment.labels`), smog and cameras in the scene's, which is
-# the
-# dataset's less `world_origin_m`. NumPy on one thread: the numbers depend on no thread count.
+# Boxes come in the dataset's world, which lies `world_origin_m` off the scene's. NumPy on one
+# thread: the numbers depend on no thread count.
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,25 +174,24 @@ def box_transmittance(
 ) -> BoxTransmittance:
     """exp(-tau) between the eye and each box, by the smog that the image shows.
 
-    medium: None where there is none, which lets everything through. surface_depth_m: z of what the
-    pixels show, 0 = none; it decides which of them show a box, and how far it is there. A box that
-    none shows (it is hidden, or out of view) has the mean over its corners and its centre, as has
-    any where the depth is not known. water_level_z_m: of the water in the image, scene world;
-    an eye in it looks at what else is in it through no smog, as `flood_view` draws it.
+    surface_depth_m: z of what the pixels show, 0 = none; it decides which of them show a box, and
+    how far it is there. A box that none shows, or any where depth is not known, has the mean over
+    its corners and its centre. water_level_z_m: scene world; an eye in the water looks at what
+    else is in it through no smog, as `flood_view` draws it.
     """
     placed = PlacedBoxes.of(boxes, world_origin_m)
     pixels = np.full(len(placed), NOT_COUNTED)
-    through = np.ones(len(placed))
+    transmittance = np.ones(len(placed))
     if medium is not None:
         smog = _SmogFromEye(medium, camera.centre.numpy(), water_level_z_m)
-        through = _estimate(placed, smog)
+        transmittance = _estimate(placed, smog)
         if surface_depth_m is not None:
             pixels[:] = 0
             for number, rows, columns in shown_pixels(placed, camera, surface_depth_m):
                 z = surface_depth_m[rows, columns].astype(np.float64)
                 pixels[number] = len(rows)
-                through[number] = _mean_over_pixels(rows, columns, z, camera, smog)
-    return BoxTransmittance(np.where(placed.is_finite, through, np.nan), pixels)
+                transmittance[number] = _mean_over_pixels(rows, columns, z, camera, smog)
+    return BoxTransmittance(np.where(placed.is_finite, transmittance, np.nan), pixels)
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,26 +202,29 @@ class _SmogFromEye:
 
     def transmittance(self, distance_m: np.ndarray, point_z_m: np.ndarray) -> np.ndarray:
         """Of the ways to points at a distance from the eye (float64, any shape)."""
-        through = np.exp(
-            -optical_depth_of_arrays(self.medium, distance_m, self.eye_m[2], point_z_m)
-        )
+        tau = optical_depth_of_arrays(self.medium, distance_m, self.eye_m[2], point_z_m)
         level = self.water_level_z_m
         if level is None or self.eye_m[2] > level:
-            return through
-        return np.where(point_z_m <= level, 1.0, through)
+            return np.exp(-tau)
+        return np.where(point_z_m <= level, 1.0, np.exp(-tau))
 
 
 def optical_depth_of_arrays(
-    medium: SmogMedium, distance_m: np.ndarray, eye_z_m: float, point_z_m: np.ndarray
+    medium: SmogMedium,
+    distance_m: np.ndarray,
+    eye_z_m: float | np.ndarray,
+    point_z_m: np.ndarray,
+    *,
+    series_below: float = 1e-8,  # there 1 - x/2 is exact to float64
 ) -> np.ndarray:
-    """`smog.optical_depth` of NumPy arrays."""
+    """`optical_depth` of NumPy arrays, from one eye or an eye for each point."""
     uniform = medium.sigma_per_m * distance_m
     if medium.scale_height_m is None:
         return uniform
     a = (eye_z_m - medium.base_z_m) / medium.scale_height_m
     b = (point_z_m - medium.base_z_m) / medium.scale_height_m
     difference = np.abs(b - a)
-    small = difference < 1e-8  # there 1 - x/2 is exact to float64
+    small = difference < series_below
     safe = np.where(small, 1.0, difference)
     mean = np.where(small, 1 - difference / 2, -np.expm1(-safe) / safe)
     return uniform * np.exp(np.minimum(-np.minimum(a, b), MAX_EXPONENT)) * mean

@@ -20,7 +20,7 @@ from pydantic import ValidationError
 
 from augment.cameras import Camera
 from augment.effects.snow.snow import placement_settings
-from augment.effects.snow.support import bed_of, remember_support
+from augment.effects.snow.support import remember_support, support_of
 from augment.geometry import rigid
 from augment.ground_heights import Ground
 from augment.plan import make_plan
@@ -173,7 +173,7 @@ class Place:
         )
         for slope in SLOPES_DEG:
             settings = placement_settings(snow_model(max_slope_deg=slope))
-            remember_support(scene, settings, bed_of(base, settings))
+            remember_support(scene, settings, support_of(base, settings))
         return scene
 
 

@@ -11,9 +11,8 @@ def few_programs(monkeypatch: pytest.MonkeyPatch, size: int = 64) -> None:
     """Lets the flood's kernels take squares of so many pixels a side where they are interpreted."""
     if not gpu.is_interpreted():
         return
-    from augment.effects.flood import cuda_pour, cuda_screen, cuda_water
+    from augment.effects.flood import cuda
 
-    for module in (cuda_screen, cuda_water):
-        monkeypatch.setattr(module, "WIDE", size)
-        monkeypatch.setattr(module, "HIGH", size)
-    monkeypatch.setattr(cuda_pour, "LANES", size * size)
+    for name in ("TRACE_TILE", "SHADE_TILE"):
+        monkeypatch.setattr(cuda, name, (size, size))
+    monkeypatch.setattr(cuda, "LANES", size * size)

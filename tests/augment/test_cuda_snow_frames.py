@@ -13,7 +13,7 @@ from augment.cameras import Camera
 from augment.effects.snow import cuda
 from augment.effects.snow.cuda import MAX_GLINTS, blocks_of, plan_split, pose_layers
 from augment.effects.snow.kernels import MAX_SPLITS
-from augment.effects.snow.near_camera import Crystals, Grain, Layer, SnowCover, split_near
+from augment.effects.snow.near_camera import Crystals, Grain, Layer, SnowLayers, split_near
 from augment.geometry import rigid
 from augment.render.cuda import runtime as gpu
 from augment.render.cuda.runtime import upload_together
@@ -70,8 +70,8 @@ def crystals(count: int, seed: int, *, spread_m=6.0) -> Crystals:
     return Crystals(torch.from_numpy(places), torch.from_numpy(mirrors), 0.9)
 
 
-def cover_of(ground: Layer, **actors: Layer) -> SnowCover:
-    return SnowCover(ground, actors, tuple(SUN.tolist()), WRAP, 0.1, GRAIN)
+def snow_layers_of(ground: Layer, **actors: Layer) -> SnowLayers:
+    return SnowLayers(ground, actors, tuple(SUN.tolist()), WRAP, 0.1, GRAIN)
 
 
 def layer(gaussians: Gaussians, own: int = 3, **options) -> Layer:
@@ -117,7 +117,7 @@ def test_near_discs_are_split_as_on_the_cpu(lit, monkeypatch):
     slopes = 0.4 * torch.rand(150, 3, generator=torch.Generator().manual_seed(9)) if lit else None
     kept = snow.opacities.clone()
     near = split_near(snow, slopes, view, torch.from_numpy(SUN), GRAIN)
-    cover = cover_of(layer(snow, slopes=slopes))
+    cover = snow_layers_of(layer(snow, slopes=slopes))
     whole, fine = posed_on_gpu(cover, [(cover.ground, PosedGaussians(snow))], view, monkeypatch)
     assert torch.equal(snow.opacities, kept)
     left = held_by(whole.gaussians.opacities)
@@ -140,7 +140,7 @@ def test_grain_keeps_its_place_far_from_the_origin(monkeypatch):
     shift = (4096.0, -2048.0, 64.0)  # where float32 tells half a millimetre
     snow, view = moved(discs(60, 2, far_m=4.0), shift), camera(shift)
     near = split_near(snow, None, view, torch.from_numpy(SUN), GRAIN)
-    cover = cover_of(layer(snow))
+    cover = snow_layers_of(layer(snow))
     _, fine = posed_on_gpu(cover, [(cover.ground, PosedGaussians(snow))], view, monkeypatch)
     found = np.sort(drawn_of(fine.gaussians)["sh"].reshape(-1))
     expected = np.sort(drawn_of(near.fine)["sh"].reshape(-1))
@@ -165,21 +165,6 @@ def test_no_block_near_the_eye_is_left_out_and_few_others_are_looked_at():
         assert split.total == reserved.sum() <= len(snow) * MAX_SPLITS**2
         ends = rows[:, 3] + rows[:, 1] * rows[:, 2] ** 2
         assert (rows[1:, 3] == ends[:-1]).all() and ends[-1] == split.total
-
-
-@pytest.mark.parametrize(
-    "snow, view",
-    [
-        (discs(0, 1), camera()),
-        (moved(discs(40, 1), (-20.0, 0.0, 0.0)), camera()),
-        (moved(discs(40, 1), (15.0, 0.0, 0.0)), camera()),
-        (discs(40, 1), camera(f=20.0)),
-    ],
-    ids=["none", "behind", "far", "coarse"],
-)
-def test_snow_that_nothing_splits_stays_as_it_is(snow, view):
-    assert split_near(snow, None, view, torch.from_numpy(SUN), GRAIN) is None
-    assert plan_split(snow, None, view, SUN, GRAIN) is None
 
 
 def yawed(angle: float, x: float, y: float) -> torch.Tensor:
@@ -214,7 +199,7 @@ def street(monkeypatch):
               (2.0, 2.0, 1.0))
         for name, pose in (("a", yawed(0.7, 3.0, 1.0)), ("b", yawed(-2.0, 5.0, -2.0)))
     )  # fmt: skip
-    return scene_of(own[3], actors), cover_of(ground, **cars)
+    return scene_of(own[3], actors), snow_layers_of(ground, **cars)
 
 
 def test_a_street_full_of_snow_is_the_cpus(street, monkeypatch):
@@ -296,7 +281,7 @@ def test_crystals_that_all_face_alike_leave_no_block_its_bounds(monkeypatch):
     facing = torch.nn.functional.normalize(towards + torch.from_numpy(SUN).float(), dim=1)
     bright = Crystals(many.places_m, facing, 1.0)
     snow = moved(discs(5, 1), (30.0, 0.0, 0.0))
-    cover = cover_of(layer(snow, crystals=bright))
+    cover = snow_layers_of(layer(snow, crystals=bright))
     found = posed_on_gpu(cover, [(cover.ground, PosedGaussians(snow))], camera(), monkeypatch)[-1]
     assert len(found.gaussians) == 2 * MAX_GLINTS
     opacities = held_by(found.gaussians.opacities)
@@ -307,7 +292,7 @@ def test_crystals_that_all_face_alike_leave_no_block_its_bounds(monkeypatch):
 @pytest.mark.gpu
 def test_much_snow_on_a_gpu_is_the_cpus_and_the_same_every_time():
     snow, bright = discs(200_000, 11, far_m=60.0), crystals(300_000, 12, spread_m=20.0)
-    cover = cover_of(layer(snow, slopes=snow.sh[:, 0].abs(), crystals=bright))
+    cover = snow_layers_of(layer(snow, slopes=snow.sh[:, 0].abs(), crystals=bright))
     scene = scene_of(discs(3, 4))
     expected = cover.parts_for(scene, camera())
     found, again = (cover.parts_for(scene, camera(), backend="cuda") for _ in range(2))

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from augment.cameras import Camera
 from augment.effects.snow.snow import placement_settings
-from augment.effects.snow.support import bed_of
+from augment.effects.snow.support import support_of
 from augment.errors import SceneError
 from augment.scene import Actor, Gaussians, Scene, Track, check_gaussians
 from augment.semantics import SemanticClass
@@ -158,7 +158,7 @@ def test_snow_is_placed_among_extreme_gaussians(place: Place):
     scene: Scene = dataclasses.replace(base, frames=frames)  # another object: nothing remembered
     snow = {"depth_m": 0.3, "cell_m": 0.5}
     try:
-        bed_of(scene, placement_settings(snow_model(cell_m=0.5)))
+        support_of(scene, placement_settings(snow_model(cell_m=0.5)))
     except SceneError as error:
         assert "cell" in str(error)
         return

@@ -24,7 +24,7 @@ from augment.effects.snow.cells import SnowCells
 from augment.effects.snow.layer import find_depths, surface_heights
 from augment.effects.snow.profile import profile_of
 from augment.effects.snow.snow import placement_settings
-from augment.effects.snow.support import bed_of
+from augment.effects.snow.support import support_of
 from augment.plan import make_plan
 from augment.rng import rng_for
 from augment.views import render_buffers, render_view
@@ -138,7 +138,7 @@ def test_deeper_snow_never_lowers_the_surface(
     relief_m: float | None, depths: list[float], coverage: float, drift: float, tracks: str, seed
 ):
     if relief_m is None:
-        cells = bed_of(street(), placement_settings(snow_model())).ground
+        cells = support_of(street(), placement_settings(snow_model())).ground
     else:
         cells = rough_cells(seed, relief_m)
     more = {"coverage": coverage, "wind": {"drift": drift}, "tracks": tracks}

@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from augment.effects.flood.flood import exact, reflectance, schlick
+from augment.effects.flood.flood import exact, schlick
 
 
 def cosines(*degrees: float) -> torch.Tensor:
@@ -60,12 +60,6 @@ def test_what_schlick_misses():
     assert float(miss[7500]) == pytest.approx(0.027, abs=5e-4)
     assert float(miss.max()) == pytest.approx(0.059, abs=5e-4)
     assert float(angles[miss.argmax()]) == pytest.approx(84, abs=0.5)
-
-
-def test_a_model_is_chosen_by_its_name():
-    c = cosines(0.0, 50.0, 80.0)
-    assert torch.equal(reflectance(c, 1.333, "exact"), exact(c, 1.333))
-    assert torch.equal(reflectance(c, 1.333, "schlick"), schlick(c, 1.333))
 
 
 def test_gradients_stay_finite_from_end_to_end():

@@ -12,18 +12,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
-from augment.effects import smog as image_smog
 from augment.effects.lidar import ATTENUATED, LOST, SCATTERED, UNCHANGED
 from augment.effects.lidar.beam import (
     LidarModel,
-    optical_depth,
     scatter_before,
     soft_echo,
     soft_response,
     wavelength_factor,
     weathered_sweep,
 )
-from augment.effects.smog import SmogMedium
+from augment.effects.smog import SmogMedium, optical_depth, optical_depth_of_arrays
 from recipes.schema import KOSCHMIEDER, Smog
 from tests.lidar_sweeps import (
     SENSOR_M,
@@ -59,10 +57,8 @@ def test_extinction_rises_with_the_smogs_density_at_905_nm_too() -> None:
 def test_optical_depth_is_the_images(scale_height_m: float | None) -> None:
     medium = SmogMedium(0.02, (1.0, 1.0, 1.0), scale_height_m, -1.0)
     distance, z = np.linspace(0, 80, 50), np.linspace(1.7, 30, 50)
-    ours = optical_depth(medium, distance, np.full(50, 1.7), z)
-    theirs = image_smog.optical_depth(
-        medium, torch.from_numpy(distance), 1.7, torch.from_numpy(z)
-    ).numpy()
+    ours = optical_depth_of_arrays(medium, distance, np.full(50, 1.7), z)
+    theirs = optical_depth(medium, torch.from_numpy(distance), 1.7, torch.from_numpy(z)).numpy()
     np.testing.assert_allclose(ours, theirs, rtol=1e-12)
 
 
@@ -175,7 +171,7 @@ def test_extremes(sigma: float, height: float | None, base: float, seed: int) ->
     rng = np.random.default_rng(seed)
     ends = np.array([0.0, 1e-3, 0.9, 0.91, 5.0, 200.0, 1e6])
     eyes = np.full(7, 1.8)
-    tau = optical_depth(medium, ends, eyes, eyes - 0.01 * ends)
+    tau = optical_depth_of_arrays(medium, ends, eyes, eyes - 0.01 * ends)
     assert (tau >= 0).all()
     found = scatter_before(medium, eyes, ends, MODEL, rng)
     assert np.isfinite(found.signal).all() and (found.signal >= 0).all()

@@ -15,7 +15,7 @@ from augment.effects.lidar import snow as lidar_snow
 from augment.effects.lidar.beam import weathered_sweep
 from augment.effects.lidar.snow import LidarSnow, layer_of, meet_snow, snow_in
 from augment.effects.snow.cells import SnowCells, SnowSupport
-from augment.effects.snow.snow import PlacedSnow, cover_of, placement_settings
+from augment.effects.snow.snow import PlacedSnow, placement_settings, snow_layers_of
 from augment.effects.snow.support import remember_support
 from recipes.weather import Snow
 from tests.lidar_sweeps import (
@@ -132,7 +132,7 @@ def test_the_march_is_what_a_search_in_small_steps_finds(seed: int, depth: float
 def test_the_layer_is_that_of_the_images(scene) -> None:
     placed = PlacedSnow(SNOW, seed=0)
     top = snow_in(scene, placed).ground.top
-    means = cover_of(scene, placed).ground.gaussians.means.numpy()
+    means = snow_layers_of(scene, placed).ground.gaussians.means.numpy()
     covered = np.isfinite(top)
     # A splat's middle lies a centimetre inside the layer whose surface it shows.
     assert np.median(top[covered]) == pytest.approx(np.median(means[:, 2]), abs=0.02)

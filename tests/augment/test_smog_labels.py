@@ -143,12 +143,6 @@ def test_boxes_behind_the_camera_around_it_and_of_no_number() -> None:
         assert (got.pixels <= 0).all()
 
 
-def test_there_may_be_no_boxes() -> None:
-    for medium in (THICK, None):
-        got = measure(Boxes.empty(), medium, wall(5))
-        assert got.transmittance.shape == got.pixels.shape == (0,)
-
-
 def test_denser_smog_lets_less_through_and_none_all() -> None:
     boxes, camera = boxes_at_random(np.random.default_rng(7)), make_camera(pitch=0.1)
     depth = np.random.default_rng(8).uniform(0, 20, SHAPE).astype(np.float32)

@@ -156,12 +156,3 @@ def test_the_same_bits_on_any_number_of_threads():
         limit_threads(None)
     for name in ("means", "quats", "scales", "opacities", "sh"):
         assert torch.equal(getattr(many, name), getattr(one, name))
-
-
-def test_no_snow_and_snow_behind_the_camera_stay_as_they_are():
-    view = camera()
-    assert split_near(sheet(2.0, 2.0), None, view, SUN, GRAIN) is None
-    assert split_near(sheet(-6.0, -2.0), None, view, SUN, GRAIN) is None
-    zenith = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-    near = split_near(sheet(), None, view, zenith, GRAIN)
-    assert torch.isfinite(near.fine.sh).all()

@@ -12,7 +12,7 @@ import torch
 from augment.effects.snow.cells import FLUSH, OPEN_EDGE
 from augment.effects.snow.layer import OPACITY, build_snow_layer, find_depths
 from augment.effects.snow.light import Illumination
-from augment.effects.snow.near_camera import SnowCover
+from augment.effects.snow.near_camera import SnowLayers
 from augment.effects.snow.profile import BARE_M, FILM_M, PRESSED, profile_of, share_covered
 from augment.geometry import rigid
 from augment.render.buffers import ALPHA, RGB
@@ -31,7 +31,7 @@ CALM = {"wind": {"drift": 0}, "grain": 0, "tracks": "never"}
 FAR_AWAY = scene_of(grid_surface(np.zeros((1, 1)), CELL_M, corner_m=(-90.0, -90.0)))
 
 
-def _lay(bed, scene=FAR_AWAY, *, seed=3, water=None, light=LIGHT, **options) -> SnowCover:
+def _lay(bed, scene=FAR_AWAY, *, seed=3, water=None, light=LIGHT, **options) -> SnowLayers:
     return build_snow_layer(bed, scene, Snow(**options), light, seed=seed, water_level_z_m=water)
 
 
@@ -54,8 +54,7 @@ def _colors(gaussians) -> torch.Tensor:
 # --- depth ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("depth_m", [0.05, 0.3, 2.0])
-@pytest.mark.parametrize("drift", [0.0, 0.3, 1.0])
+@pytest.mark.parametrize(("depth_m", "drift"), [(0.05, 0.0), (0.3, 0.3), (2.0, 1.0)])
 def test_median_depth_on_open_ground_is_the_recipes(depth_m, drift):
     """Over 60 m, some hundreds of the widest drifts: the median may be a few per cent off."""
     bed = level_bed(60.0, 0.2)
@@ -125,12 +124,6 @@ def test_patches_are_metres_wide_and_thin_out_at_their_rims():
     assert np.median(rims) < 0.03 < 0.08 < np.median(heights[heights > 0])
 
 
-def test_more_coverage_never_bares_what_was_covered():
-    ground = level_bed(20.0, 0.1).ground
-    some, more = (_depths(ground, depth_m=0.1, coverage=c, **CALM) for c in (0.3, 0.7))
-    assert (more >= some).all() and (more > some).any()
-
-
 # --- tracks and water -----------------------------------------------------------------------------
 
 
@@ -190,8 +183,7 @@ def test_no_snow_below_the_waters_edge():
 # --- closed surfaces ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("grain", [0.0, 1.0])
-@pytest.mark.parametrize("depth_m", [0.05, 0.4])
+@pytest.mark.parametrize(("depth_m", "grain"), [(0.05, 1.0), (0.4, 0.0)])
 def test_level_layer_lets_no_light_through(depth_m, grain):
     """At most 2 %, from above and from a car's height; half a metre of the bed's border is left."""
     cover = _lay(level_bed(6.0), depth_m=depth_m, grain=grain)
@@ -222,7 +214,7 @@ def test_edge_is_as_sharp_as_a_cell():
     assert abs(np.median(middles)) < 0.4 * CELL_M  # from the bed's border
 
 
-@pytest.mark.parametrize("depth_m", [0.2, 0.5, 2.0])
+@pytest.mark.parametrize("depth_m", [0.2, 2.0])
 def test_sides_of_a_deep_layer_are_closed(depth_m):
     cover = _lay(level_bed(3.0, border=OPEN_EDGE), depth_m=depth_m)
     height = 0.3 * depth_m
@@ -421,14 +413,12 @@ def test_sparkle_adds_a_few_glints_that_change_with_the_view():
 # --- extremes -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("shading", ["per_splat", "per_pixel"])
 @pytest.mark.parametrize(
     "options",
     [
-        {"depth_m": 1e-4},
-        {"depth_m": 10.0, "wind": {"drift": 1.0}, "sparkle": 1.0},
-        {"depth_m": 0.1, "coverage": 0.001},
         {"depth_m": 1e-12},
+        {"depth_m": 10.0, "wind": {"drift": 1.0}, "sparkle": 1.0},
+        {"depth_m": 0.1, "coverage": 0.001, "shading": "per_pixel"},
     ],
 )
 @pytest.mark.parametrize(
@@ -444,8 +434,8 @@ def test_sparkle_adds_a_few_glints_that_change_with_the_view():
     ],
     ids=["edges", "one open", "one", "10 m", "1 mm", "far", "none"],
 )
-def test_extremes_stay_finite(bed, options, shading):
-    cover = _lay(bed, shading=shading, **options)
+def test_extremes_stay_finite(bed, options):
+    cover = _lay(bed, **options)
     snow = cover.ground.gaussians
     for values in (snow.means, snow.quats, snow.scales, snow.opacities, snow.sh):
         assert torch.isfinite(values).all()

@@ -172,11 +172,6 @@ def test_a_clear_sky_makes_blue_shadows_half_as_bright_and_warm_light() -> None:
     assert light.wrap == pytest.approx(0.54)
 
 
-def test_a_low_sun_gives_less_of_the_light() -> None:
-    shares = [light_of(street(sky_with_sun(0, e, radius_deg=4))).sun_share for e in (8, 20, 40)]
-    assert shares == sorted(shares) and shares[0] < 0.7 < shares[2]
-
-
 def test_level_snow_gets_the_light_of_the_road() -> None:
     """Where nothing nears white: linear radiance is the road's times the ratio of the albedos."""
     for sky in (sky_with_sun(0, 30, radius_deg=4), ConstantSky(torch.tensor([0.2, 0.2, 0.2]))):

@@ -8,7 +8,7 @@ import time
 import pytest
 
 from augment.effects.snow import height_map as in_threads
-from augment.effects.snow.height_map import in_order, on_device, slices_of
+from augment.effects.snow.height_map import in_order, on_device
 
 
 @pytest.fixture(autouse=True, params=[1, 4])
@@ -63,9 +63,3 @@ def test_work_within_work_begins_no_more_threads() -> None:
         return [own]
 
     assert len(in_order(inner, range(4))) == 4
-
-
-@pytest.mark.parametrize("count", [0, 1, 8192, 8193, 20_000])
-def test_slices_are_the_whole_once(count: int) -> None:
-    rows = [row for part in slices_of(count) for row in range(count)[part]]
-    assert rows == list(range(count))

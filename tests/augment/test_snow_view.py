@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from augment.effects.snow.snow import cover_of
+from augment.effects.snow.snow import snow_layers_of
 from augment.errors import SceneError
 from augment.labels import Boxes
 from augment.plan import make_plan
@@ -217,12 +217,12 @@ def test_the_plan_names_what_runs_and_what_does_not(scene):
 
 def test_a_recipes_snow_is_laid_once_and_a_third_drives_out_the_first(scene):
     placed = [make_plan(recipe_of(snow(depth_m=d)), scene).snow for d in (0.05, 0.1, 0.2)]
-    first = cover_of(scene, placed[0])
-    assert cover_of(scene, placed[0]) is first
-    cover_of(scene, placed[1])
-    assert cover_of(scene, placed[0]) is first
-    cover_of(scene, placed[1]), cover_of(scene, placed[2])
-    assert cover_of(scene, placed[0]) is not first
+    first = snow_layers_of(scene, placed[0])
+    assert snow_layers_of(scene, placed[0]) is first
+    snow_layers_of(scene, placed[1])
+    assert snow_layers_of(scene, placed[0]) is first
+    snow_layers_of(scene, placed[1]), snow_layers_of(scene, placed[2])
+    assert snow_layers_of(scene, placed[0]) is not first
 
 
 def test_scenes_without_metres_or_gravity_are_refused_before_anything_is_rendered(scene):

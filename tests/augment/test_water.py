@@ -16,6 +16,7 @@ from augment.effects.flood.screen_space import ScreenReflection
 from augment.effects.flood.waves import WaveField, WaveSet
 from augment.effects.smog import SmogMedium, blend_airlight, optical_depth
 from augment.geometry import invert_rigid
+from augment.render.threads import limit_threads
 from augment.sky import ConstantSky, CubemapSky, LatLongSky
 from tests.augment.flood_programs import few_programs
 
@@ -124,8 +125,19 @@ def large_programs(monkeypatch):
     few_programs(monkeypatch)
 
 
-def shade_water(*args, **kwargs) -> torch.Tensor:
-    return water_module.shade_water(*args, **kwargs).cpu()
+def shade_water(
+    eye: Camera,
+    water: FloodMedium,
+    field: WaveField,
+    bed: Layer,
+    *,
+    cover=None,
+    sky=None,
+    **options,
+) -> torch.Tensor:
+    """The water's colours, where nothing covers it unless said."""
+    cover, sky = uncovered(eye) if cover is None else cover, noise_sky() if sky is None else sky
+    return water_module.shade_water(eye, cover, water, field, bed, sky=sky, **options).cpu()
 
 
 ALL = pytest.mark.parametrize("backend", ["reference", "cpu", "cuda"])
@@ -172,9 +184,8 @@ def test_the_kernel_matches_the_definition(backend, smog, tier, view):
         layers["screen"] = ScreenReflection(front, distance, weight)
         exact["screen"] = ScreenReflection(doubled(front), distance, weight)
     water = medium(fresnel=fresnel)
-    cover = uncovered(eye)
-    fast = shade_water(eye, cover, water, field, bed, sky=sky, smog=smog, backend=backend, **layers)
-    slow = shade_water(eye, cover, water, field, doubled(bed), sky=sky, smog=smog, **exact)
+    fast = shade_water(eye, water, field, bed, sky=sky, smog=smog, backend=backend, **layers)
+    slow = shade_water(eye, water, field, doubled(bed), sky=sky, smog=smog, **exact)
     assert slow.dtype == torch.float64 and bool((slow != 0).any())
     difference = (fast - slow).abs().amax(-1)
     # Float32 knows image coordinates to about 1e-5 pixels here, and colours change by up to 0.1 a
@@ -210,9 +221,7 @@ def test_a_world_of_one_colour_keeps_it(backend, tier, index, extinction):
     sky = ConstantSky(torch.tensor(GREY))
     smogs = [None, *[SmogMedium(0.05, GREY, height) for height in (None, 5.0)]]
     for smog in smogs[::2] if backend == "cuda" else smogs:
-        out = shade_water(
-            eye, uncovered(eye), water, field, bed, sky=sky, smog=smog, backend=backend, **layers
-        )
+        out = shade_water(eye, water, field, bed, sky=sky, smog=smog, backend=backend, **layers)
         met = eye.ray_directions(torch.float64)[..., 2] < 0
         # Mixtures of one colour by weights that sum to 1: some twenty float32 roundings.
         torch.testing.assert_close(
@@ -226,7 +235,7 @@ def test_without_refraction_and_absorption_the_bed_is_seen_as_it_is(backend):
     bed = plane_layer(margin(eye, 5), LEVEL - 0.5)
     water = medium(refraction_index=1.0, extinction_per_m=(0.0, 0.0, 0.0))
     field = wavy_field(eye)
-    out = shade_water(eye, uncovered(eye), water, field, bed, sky=noise_sky(), backend=backend)
+    out = shade_water(eye, water, field, bed, backend=backend)
     own = bed.rgb[5:-5, 5:-5]
     mud = torch.tensor(MUD)
     expected = torch.where(bed.alpha[5:-5, 5:-5, None] > 0, own, mud)
@@ -253,7 +262,7 @@ def test_refracted_rays_meet_the_bed_where_snell_says(backend, index):
     bed = plane_layer(margin(eye, 40), LEVEL - depth)
     water = medium(extinction_per_m=(0.0, 0.4, 1.5), refraction_index=index)
     black = ConstantSky(torch.zeros(3))
-    out = shade_water(eye, uncovered(eye), water, flat_field(eye), bed, sky=black, backend=backend)
+    out = shade_water(eye, water, flat_field(eye), bed, sky=black, backend=backend)
     ends, way = refract_exactly(eye, depth, index)
     a = torch.exp(-torch.tensor([0.0, 0.4, 1.5], dtype=torch.float64) * way[..., None])
     seen = a * pattern(ends) + (1 - a) * torch.tensor(MUD, dtype=torch.float64)
@@ -291,9 +300,7 @@ def test_the_mirrored_wall_is_where_the_mirrored_ray_meets_it(backend, slope):
     up = torch.tensor([*slope, 1.0], dtype=torch.float64)
     up = up / up.norm()
     field = WaveField(*(torch.full((43, 61), float(part)) for part in (up[0], up[1], 0.0)))
-    out = shade_water(
-        eye, uncovered(eye), water, field, bed, mirror=mirror, sky=noise_sky(), backend=backend
-    )
+    out = shade_water(eye, water, field, bed, mirror=mirror, backend=backend)
     d = torch.nn.functional.normalize(eye.ray_directions(torch.float64), dim=-1)
     surface = eye.centre + d * ((float(eye.centre[2]) - LEVEL) / -d[..., 2:])
     ray = d - 2 * (d @ up)[..., None] * up
@@ -314,7 +321,7 @@ def test_the_sky_tier_shows_the_sky_of_the_mirrored_direction(backend):
     bed = plane_layer(eye, LEVEL - 0.3)
     opaque = medium(rgb=(0.0, 0.0, 0.0), extinction_per_m=(math.inf,) * 3)
     sky = noise_sky(8)
-    out = shade_water(eye, uncovered(eye), opaque, flat_field(eye), bed, sky=sky, backend=backend)
+    out = shade_water(eye, opaque, flat_field(eye), bed, sky=sky, backend=backend)
     rays = eye.ray_directions(torch.float64)
     up = rays * torch.tensor([1.0, 1.0, -1.0])
     cosine = up[..., 2] / up.norm(dim=-1)
@@ -332,16 +339,7 @@ def test_smog_fogs_the_water_as_a_surface_of_its_colour(backend, smog):
     eye = camera(pitch_deg=-40)
     bed = constant_layer(margin(eye), MUD, 9.0, 1)
     water = medium(refraction_index=1.0, extinction_per_m=(math.inf,) * 3)
-    out = shade_water(
-        eye,
-        uncovered(eye),
-        water,
-        flat_field(eye),
-        bed,
-        sky=noise_sky(),
-        smog=smog,
-        backend=backend,
-    )
+    out = shade_water(eye, water, flat_field(eye), bed, smog=smog, backend=backend)
     rays = eye.ray_directions(torch.float64)
     height = float(eye.centre[2]) - LEVEL
     distance = height / -rays[..., 2] * rays.norm(dim=-1)
@@ -357,16 +355,7 @@ def test_uniform_smog_leaves_its_own_colour_of_the_sky(backend):
     bed = plane_layer(eye, LEVEL - 0.3)
     black = medium(rgb=(0.0, 0.0, 0.0), extinction_per_m=(math.inf,) * 3)
     thin = SmogMedium(1e-6, GREY)
-    out = shade_water(
-        eye,
-        uncovered(eye),
-        black,
-        flat_field(eye),
-        bed,
-        sky=noise_sky(),
-        smog=thin,
-        backend=backend,
-    )
+    out = shade_water(eye, black, flat_field(eye), bed, smog=thin, backend=backend)
     rays = torch.nn.functional.normalize(eye.ray_directions(torch.float64), dim=-1)
     share = reflectance(-rays[..., 2], 1.333, "exact")[..., None]
     # The smog before the water hides less than a 1e-4th of it.
@@ -390,9 +379,8 @@ def test_extreme_views_stay_finite(backend, above, pitch_deg):
         constant_layer(eye, GREY, 4.0, 3), torch.full((43, 61), 2.0), torch.ones(43, 61)
     )
     for extinction in (0.0, math.inf):
-        out = shade_water(
-            eye, uncovered(eye), medium(extinction_per_m=(extinction,) * 3), steep, bed,
-            mirror=mirror, screen=screen, sky=noise_sky(), smog=SMOGS["layered"], backend=backend,
+        out = shade_water(eye, medium(extinction_per_m=(extinction,) * 3), steep, bed,
+            mirror=mirror, screen=screen, smog=SMOGS["layered"], backend=backend
         )  # fmt: skip
         assert bool(torch.isfinite(out).all()) and float(out.min()) >= -1e-5
         assert float(out.max()) <= 1 + 1e-5  # no more light than the brightest colour
@@ -405,9 +393,7 @@ def test_a_dry_bed_is_not_dimmed_by_any_water(backend):
     water = medium(extinction_per_m=(math.inf,) * 3, refraction_index=1.0)
     # On the plane itself, or above it by the rounding of its depth: no water over it.
     bed = dataclasses.replace(bed, depth=bed.depth * (1 - 1e-6))
-    out = shade_water(
-        eye, uncovered(eye), water, flat_field(eye), bed, sky=noise_sky(), backend=backend
-    )
+    out = shade_water(eye, water, flat_field(eye), bed, backend=backend)
     assert torch.equal(out, bed.rgb)
 
 
@@ -419,7 +405,7 @@ def test_the_bed_is_not_looked_for_where_it_cannot_be_seen(backend):
     for per_m, seen in ((10.0, True), (40.0, False)):
         clear, opaque = medium(extinction_per_m=(per_m,) * 3), medium(extinction_per_m=(1e9,) * 3)
         out, water = (
-            shade_water(eye, uncovered(eye), each, field, bed, sky=black, backend=backend)
+            shade_water(eye, each, field, bed, sky=black, backend=backend)
             for each in (clear, opaque)
         )
         difference = float((out - water).abs().max())
@@ -443,17 +429,7 @@ def test_rough_pixels_take_the_mirror_and_smooth_ones_the_image(backend):
         field = WaveField(zero, zero, torch.full((43, 61), variance))
         assert bool(is_smooth(field, eye).all()) == (variance < limit)
         views = [
-            shade_water(
-                eye,
-                uncovered(eye),
-                water,
-                field,
-                bed,
-                mirror=grey,
-                screen=shown,
-                sky=sky,
-                backend=backend,
-            )
+            shade_water(eye, water, field, bed, mirror=grey, screen=shown, sky=sky, backend=backend)
             for shown in (None, screen)
         ]
         both.append(views)
@@ -472,12 +448,14 @@ def test_covered_pixels_are_one_colour(backend):
     cover[30:, :] = 0.96
     cover[40:, :] = 0.94
     bed, water, sky = plane_layer(eye, LEVEL - 0.3), medium(), noise_sky()
-    out = shade_water(eye, cover, water, flat_field(eye), bed, sky=sky, backend=backend)
-    bare = shade_water(eye, uncovered(eye), water, flat_field(eye), bed, sky=sky, backend=backend)
+    out = shade_water(eye, water, flat_field(eye), bed, cover=cover, sky=sky, backend=backend)
+    bare = shade_water(eye, water, flat_field(eye), bed, sky=sky, backend=backend)
     covered = torch.tensor(water.rgb).expand_as(out[30:40])
     assert torch.equal(out[30:40], covered) and torch.equal(out[40:], bare[40:])
     smog = SmogMedium(0.05, (0.5, 0.6, 0.7))
-    out = shade_water(eye, cover, water, flat_field(eye), bed, sky=sky, smog=smog, backend=backend)
+    out = shade_water(
+        eye, water, flat_field(eye), bed, cover=cover, sky=sky, smog=smog, backend=backend
+    )
     assert torch.equal(out[30:40], torch.tensor(smog.rgb).expand_as(out[30:40]))
 
 
@@ -493,9 +471,7 @@ def test_several_slopes_show_one_blurred_picture(backend):
     bed = plane_layer(eye, LEVEL - 0.3)
     zero = torch.zeros(43, 61)
     rough = WaveField(zero, zero, torch.full((43, 61), 0.004))
-    out = shade_water(
-        eye, uncovered(eye), water, rough, bed, mirror=mirror, sky=noise_sky(), backend=backend
-    )
+    out = shade_water(eye, water, rough, bed, mirror=mirror, backend=backend)
     column = out[:, 30, 0]
     top = int(column.argmax())
     rises = column[1:] - column[:-1]
@@ -511,15 +487,7 @@ def test_other_skies_go_through_a_cube_map(backend):
     image = torch.rand(4, 8, 3, generator=torch.Generator().manual_seed(2))
     bed = plane_layer(eye, LEVEL - 0.3)
     fast, slow = (
-        shade_water(
-            eye,
-            uncovered(eye),
-            medium(),
-            wavy_field(eye),
-            bed,
-            sky=LatLongSky(image),
-            backend=choice,
-        )
+        shade_water(eye, medium(), wavy_field(eye), bed, sky=LatLongSky(image), backend=choice)
         for choice in (backend, "reference")
     )
     # A texel of the cube map is 1/80 of the image's: a kink between its pixels is cut that much.
@@ -532,7 +500,7 @@ def test_a_sky_that_is_painted_over_is_seen_anew(backend):
     bed, field, sky = plane_layer(eye, LEVEL - 0.3), flat_field(eye), noise_sky()
 
     def shaded(seen: CubemapSky) -> torch.Tensor:
-        return shade_water(eye, uncovered(eye), medium(), field, bed, sky=seen, backend=backend)
+        return shade_water(eye, medium(), field, bed, sky=seen, backend=backend)
 
     before = shaded(sky)
     sky.faces.mul_(0.5)
@@ -544,39 +512,33 @@ def test_gradients_pass_through_the_definition():
     eye = camera(20, 14)
     layer = plane_layer(eye, LEVEL - 0.3)
     rgb = layer.rgb.clone().requires_grad_(True)
-    out = shade_water(
-        eye, uncovered(eye), medium(), wavy_field(eye),
-        dataclasses.replace(layer, rgb=rgb), sky=noise_sky(),
+    out = shade_water(eye, medium(), wavy_field(eye),
+        dataclasses.replace(layer, rgb=rgb), 
     )  # fmt: skip
     out.sum().backward()
     assert bool(torch.isfinite(rgb.grad).all()) and float(rgb.grad.sum()) > 1
 
 
 def test_results_do_not_depend_on_the_number_of_threads():
-    from augment.render.threads import limit_threads
-
     eye = camera()
     bed, mirror = plane_layer(eye, LEVEL - 0.3), plane_layer(mirrored(eye), LEVEL + 2)
     field = wavy_field(eye, variance=1e-3)
     images = []
     for count in (1, 2, None):
         limit_threads(count)
-        images.append(
-            shade_water(eye, uncovered(eye), medium(), field, bed, mirror=mirror, sky=noise_sky())
-        )
+        images.append(shade_water(eye, medium(), field, bed, mirror=mirror))
     assert torch.equal(images[0], images[1]) and torch.equal(images[0], images[2])
 
 
 def test_what_does_not_fit_is_refused():
     eye = camera()
     bed, field, cover = plane_layer(eye, LEVEL - 0.3), flat_field(eye), uncovered(eye)
-    sky = ConstantSky(torch.zeros(3))
-    with pytest.raises(ValueError, match="above the water"):
-        shade_water(eye, cover, medium(level_z_m=20.0), field, bed, sky=sky)
     turned = dataclasses.replace(bed, camera=camera(pitch_deg=-21))
-    with pytest.raises(ValueError, match="window of the image"):
-        shade_water(eye, cover, medium(), field, turned, sky=sky)
-    with pytest.raises(ValueError, match="mirrored eye"):
-        shade_water(eye, cover, medium(), field, bed, mirror=bed, sky=sky)
-    with pytest.raises(ValueError, match="cover must be"):
-        shade_water(eye, cover[1:], medium(), field, bed, sky=sky)
+    for message, water, seen, options in (
+        ("above the water", medium(level_z_m=20.0), bed, {}),
+        ("window of the image", medium(), turned, {}),
+        ("mirrored eye", medium(), bed, {"mirror": bed}),
+        ("cover must be", medium(), bed, {"cover": cover[1:]}),
+    ):
+        with pytest.raises(ValueError, match=message):
+            shade_water(eye, water, field, seen, **options)

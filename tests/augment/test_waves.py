@@ -7,17 +7,17 @@ import pytest
 import torch
 
 from augment.cameras import Camera
-from augment.effects.flood import kernels as waves_kernels
 from augment.effects.flood.waves import (
     FARTHEST_M,
     GRAVITY_MPS2,
     MAX_STEEPNESS,
     WaveSet,
-    displaced_surface,
     make_waves,
+    normals_from_tangents,
+    phase_of,
+    tangent_terms,
     turns_at,
     wave_field,
-    wave_normals,
 )
 from augment.geometry import rigid
 from augment.render.threads import limit_threads
@@ -42,6 +42,26 @@ def waves_of(count: int = 5, *, steepness: float = 0.5, low=0.4, high=6.0, slope
         phases_rad=rng.uniform(0, 2 * math.pi, count),
         depth_m=0.4,
     )
+
+
+def displaced_surface(waves: WaveSet, points: torch.Tensor, timestamp_ns: int) -> torch.Tensor:
+    """Where points [N, 2] of the still plane are at that time; z counts from its level."""
+    surface = torch.nn.functional.pad(points, (0, 1))
+    turns = turns_at(waves, timestamp_ns)
+    for i, (dx, dy) in enumerate(waves.directions.tolist()):
+        theta = phase_of(waves, i, turns, points)
+        across = float(waves.steepness[i] / waves.wavenumbers[i]) * theta.cos()
+        lift = float(waves.amplitudes_m[i]) * theta.sin()
+        surface = surface + torch.stack([dx * across, dy * across, lift], dim=-1)
+    return surface
+
+
+def wave_normals(waves: WaveSet, points: torch.Tensor, timestamp_ns: int) -> torch.Tensor:
+    """Unit normals over parameter points, with every wave at full height."""
+    turns = turns_at(waves, timestamp_ns)
+    terms = [tangent_terms(waves, i, phase_of(waves, i, turns, points)) for i in range(len(turns))]
+    none = torch.zeros(*points.shape[:-1], 5, dtype=torch.float64)
+    return normals_from_tangents(sum(terms, none))
 
 
 def camera_at(
@@ -125,8 +145,7 @@ def test_still_water_has_no_waves():
     assert make_waves(Waves(preset="wind", height=0.0), seed=0, depth_m=1.0).is_flat
 
 
-@pytest.mark.parametrize("preset", RMS_SLOPES)
-@pytest.mark.parametrize("count", [1, 24, 64])
+@pytest.mark.parametrize(("preset", "count"), [("calm", 1), ("breeze", 24), ("wind", 64)])
 def test_a_preset_has_its_rms_slope_whatever_the_count(preset, count):
     waves = make_waves(Waves(preset=preset, count=count), seed=3, depth_m=0.5)
     assert len(waves.wavelengths_m) == count
@@ -138,19 +157,9 @@ def test_a_preset_has_its_rms_slope_whatever_the_count(preset, count):
     assert float(slopes.mean().sqrt()) == pytest.approx(RMS_SLOPES[preset], rel=0.02)
 
 
-def test_presets_are_as_high_as_water_in_a_street():
-    def rms_height(preset: str) -> float:
-        waves = make_waves(Waves(preset=preset), seed=3, depth_m=0.5)
-        return float(displaced_surface(waves, random_points(5000), NOW)[:, 2].std())
-
-    assert 1e-4 < rms_height("calm") < 2e-3
-    assert 1e-3 < rms_height("breeze") < 1e-2
-    assert 1e-2 < rms_height("wind") < 5e-2
-
-
-@pytest.mark.parametrize("preset", RMS_SLOPES)
-@pytest.mark.parametrize("count", [1, 24, 64])
-@pytest.mark.parametrize("height", [0.5, 1.0, 10.0])
+@pytest.mark.parametrize(
+    ("preset", "count", "height"), [("calm", 1, 10.0), ("breeze", 24, 0.5), ("wind", 64, 10.0)]
+)
 def test_height_scales_amplitudes_and_keeps_the_surface_from_folding(preset, count, height):
     low = make_waves(Waves(preset=preset, count=count), seed=3, depth_m=0.5)
     high = make_waves(Waves(preset=preset, count=count, height=height), seed=3, depth_m=0.5)
@@ -207,13 +216,6 @@ def test_phases_keep_their_precision_at_any_time(time):
             assert abs(exact - exact.to_integral_value()) < 4e-16
 
 
-def test_float64_seconds_would_not_keep_it():
-    waves = waves_of(8, low=0.01, high=1.0)
-    naive = waves.phases_rad / (2 * math.pi) - waves.frequencies_hz * (NOW * 1e-9)
-    off = turns_at(waves, NOW) - naive
-    assert np.abs(off - np.round(off)).max() > 1e-7
-
-
 def test_a_wave_has_run_one_length_after_one_period():
     waves = waves_of(1, steepness=0.3)
     direction = torch.from_numpy(waves.directions[0])
@@ -257,33 +259,6 @@ def test_normals_are_those_of_the_displaced_surface(steepness):
     # 1e-5 m from rounding 50 m; ten times that where the crests are steep.
     assert torch.allclose(normals, expected, atol=5e-8)
     assert torch.allclose(normals.norm(dim=-1), torch.ones(500, dtype=torch.float64), atol=1e-14)
-
-
-def closed_form(waves: WaveSet, points: torch.Tensor) -> torch.Tensor:
-    """The normals often quoted for sums: (-sum D k A cos, 1 - sum S sin)."""
-    d, k = torch.from_numpy(waves.directions), torch.from_numpy(waves.wavenumbers)
-    theta = k * (points @ d.T) + 2 * math.pi * torch.from_numpy(turns_at(waves, NOW))
-    slopes = k * torch.from_numpy(waves.amplitudes_m) * theta.cos()
-    up = 1 - (torch.from_numpy(waves.steepness) * theta.sin()).sum(-1, keepdim=True)
-    normals = torch.cat([-slopes @ d, up], dim=-1)
-    return normals / normals.norm(dim=-1, keepdim=True)
-
-
-def error_of_closed_form_deg(waves: WaveSet) -> torch.Tensor:
-    points = random_points(5000)
-    cosine = (closed_form(waves, points) * wave_normals(waves, points, NOW)).sum(-1)
-    return torch.rad2deg(torch.acos(cosine.clamp(-1, 1)))
-
-
-def test_the_closed_form_is_exact_for_one_wave_and_wrong_for_sums():
-    one = error_of_closed_form_deg(waves_of(1, steepness=0.9, slope=0.9))
-    assert float(one.max()) < 1e-5  # acos next to 1 loses half the digits
-    aligned = waves_of(4, steepness=0.8, slope=0.8)
-    same = np.tile(aligned.directions[:1], (4, 1))
-    aligned = error_of_closed_form_deg(dataclasses.replace(aligned, directions=same))
-    assert float(aligned.max()) < 1e-5
-    crossing = error_of_closed_form_deg(waves_of(4, steepness=0.8, slope=0.8))
-    assert float(crossing.max()) > 3 and float(crossing.mean()) > 0.5
 
 
 def test_a_cusp_counts_as_level():
@@ -440,19 +415,6 @@ def test_pixels_above_the_horizon_and_eyes_in_the_plane_see_no_water():
         wave_field(waves, camera, math.inf)
 
 
-def test_still_water_runs_no_kernel(monkeypatch):
-    def ran(*_):
-        raise AssertionError("the kernel ran for still water")
-
-    monkeypatch.setattr(waves_kernels, "fill_field", ran)
-    for recipe in (Waves(preset="still"), Waves(preset="wind", height=0.0)):
-        waves = make_waves(recipe, seed=0, depth_m=1.0)
-        for backend in ("cpu", "cuda"):
-            assert bool((fields_of(waves, CAMERAS["driving"], backend=backend) == 0).all())
-    with pytest.raises(AssertionError, match="the kernel ran"):
-        wave_field(SETS["one"], CAMERAS["driving"], 0.0)
-
-
 def test_two_cameras_see_one_surface():
     waves = SETS["24"]  # 0.4 m and longer
     first = camera_at([0.0, 0, 2.0], down_deg=30, focal=400.0)
@@ -504,11 +466,3 @@ def test_bits_do_not_depend_on_threads():
         finally:
             limit_threads(None)
     assert torch.equal(*alone)
-
-
-def test_a_window_of_the_image_sees_the_same_waves():
-    camera, waves = CAMERAS["rolled"], SETS["24"]
-    whole = fields_of(waves, camera, backend="cpu")
-    window = fields_of(waves, camera.cropped(11, 20, 40, 30), backend="cpu")
-    # Other anchors: the kernel's error twice.
-    assert torch.allclose(window, whole[:, 20:50, 11:51], atol=2e-5)

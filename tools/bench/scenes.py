@@ -15,7 +15,7 @@ import torch
 from adapters.base import open_scene
 from augment.cameras import Camera
 from augment.effects.snow.snow import placement_settings
-from augment.effects.snow.support import bed_of, remember_support
+from augment.effects.snow.support import remember_support, support_of
 from augment.effects.style.style import remember_maps, style_maps
 from augment.geometry import rigid
 from augment.jobs.layout import folder_name, variant_name
@@ -190,7 +190,7 @@ def scene_of_recipe(scene: Scene, recipe: Recipe, backend: str = "auto") -> Scen
     snow, style = recipe.weather.snow, recipe.style
     if snow is not None:
         settings = placement_settings(snow)
-        remember_support(own, settings, bed_of(scene, settings, backend=backend))
+        remember_support(own, settings, support_of(scene, settings, backend=backend))
     if style is not None:
         usual = style.model_copy(update={"evaluated": "color"})
         remember_maps(own, style, style_maps(scene, usual))

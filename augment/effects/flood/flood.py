@@ -15,11 +15,8 @@ from augment.cameras import Camera
 from augment.effects.flood.waves import WaveSet
 from augment.labels import Boxes
 
-# ------------------------------------------------------------------------------------------------
-# What a flood does to labelled boxes: how deep each stands in the water, and what of it is hidden
-# Boxes come in the dataset's world (`augment.labels`), water and cameras in the scene's, which is
-# the
-# dataset's less `world_origin_m`.
+# ---- Labelled boxes: how deep each stands in the water, and what of it is hidden -----------------
+# Boxes come in the dataset's world, which lies `world_origin_m` off the scene's.
 
 
 def submerged_fraction(
@@ -56,7 +53,7 @@ def hidden_pixels(
     return count_pixels(PlacedBoxes.of(boxes, world_origin_m), camera, scene_depth_m, water)
 
 
-# ---- flood ---------------------------------------------------------------------------------------
+# ---- The water and its layers --------------------------------------------------------------------
 
 FresnelModel = Literal["exact", "schlick"]
 ReflectionTier = Literal["sky", "screen_space", "mirrored"]
@@ -93,11 +90,9 @@ class Layer:
     depth: Float[Tensor, "H W"]
 
 
-# ---- How much light a water surface reflects: Fresnel's equations and Schlick's approximation ----
-# `cosine` is that of the angle between the ray and the surface normal, in [0, 1]; `index` is the
-# refraction index behind the surface over the one before it: n from air into water, 1 / n from
-# water
-# into air. Light is unpolarised. An index of 1 reflects nothing, exactly.
+# ---- How much unpolarised light a water surface reflects -----------------------------------------
+# `cosine` is that of the angle between the ray and the surface normal, in [0, 1]; `index` the
+# refraction index behind the surface over the one before it. An index of 1 reflects nothing.
 
 
 def exact(cosine: Float[Tensor, "*B"], index: float) -> Float[Tensor, "*B"]:

@@ -25,7 +25,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from augment.cameras import Camera
-from augment.effects.flood import water_kernels as pour_kernels
+from augment.effects.flood import water_kernels
 from augment.effects.flood.flood import FloodMedium, Layer, exact
 from augment.effects.flood.refraction import is_smooth
 from augment.effects.flood.screen_space import ScreenReflection, trace_screen
@@ -34,6 +34,7 @@ from augment.effects.flood.water_plane import (
     Margins,
     Window,
     falling,
+    image_coordinates,
     mirrored_camera,
     mirrored_window,
     plane_depth,
@@ -63,8 +64,7 @@ from augment.scene import PosedGaussians
 from augment.sky import Sky, sample_at
 from augment.timing import timed
 
-# ------------------------------------------------------------------------------------------------
-# Putting the layers of a flooded view together: the torch definition, and the way to kernels
+# ---- Layers put together: the torch definition, and the way to kernels ---------------------------
 
 ROWS = 32  # image rows a thread takes at a time
 
@@ -78,15 +78,15 @@ def find_water(
     """
     kernels = kernels_for(backend, alpha)
     if kernels == CUDA:
-        from augment.effects.flood import cuda_pour
+        from augment.effects.flood import cuda
 
-        water, most = cuda_pour.find_water(alpha, camera)
+        water, most = cuda.find_water(alpha, camera)
         return water, float(most)  # waits for the GPU: what is drawn next depends on it
     if kernels == CPU:
         water = np.empty(tuple(alpha.shape), np.uint8)
         shown = np.empty(len(alpha), np.float32)
         with kernel_threads(ROWS):
-            pour_kernels.find_water(*_rays(camera), alpha.detach().numpy(), shown, water)
+            water_kernels.find_water(*_rays(camera), alpha.detach().numpy(), shown, water)
         return torch.from_numpy(water).view(torch.bool), float(shown.max())
     share = torch.where(falling(camera), 1 - alpha, torch.zeros_like(alpha))
     return share > 0.5, float(share.max())
@@ -117,14 +117,13 @@ def composite_water(
         window.paste(image, torch.where(meets, mixed, window.cut(image)))
         return image
     if kernels == CUDA:
-        from augment.effects.flood import cuda_pour
-        from augment.effects.flood.cuda_pour import dry_rows
+        from augment.effects.flood import cuda
 
-        part, dry = rgb, dry_rows(camera)
+        part, dry = rgb, cuda.dry_rows(camera)
         if dry:
             above = camera.cropped(0, 0, camera.width, dry)
             part = composite_sky(rgb[:dry], alpha[:dry], above, sky, smog=smog, backend=backend)
-        cuda_pour.composite_water(rgb, alpha, camera, window, color, part, dry)
+        cuda.composite_water(rgb, alpha, camera, window, color, part, dry)
         return rgb
     dry = _dry_rows(camera)
     if dry:
@@ -138,7 +137,7 @@ def composite_water(
             wet = falling(camera.cropped(0, window.top, camera.width, dry - window.top))
             rgb[window.top : dry][wet] = shared[wet]
     with kernel_threads(ROWS):
-        pour_kernels.composite_water(
+        water_kernels.composite_water(
             *_rays(window.of(camera)),
             window.top,
             window.left,
@@ -157,9 +156,8 @@ def _dry_rows(camera: Camera) -> int:
 
 
 def _rays(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    u = (np.arange(camera.width, dtype=np.float64) + 0.5 - camera.cx) / camera.fx
-    v = (np.arange(camera.height, dtype=np.float64) + 0.5 - camera.cy) / camera.fy
-    return u, v, np.ascontiguousarray(camera.world_from_camera[2, :3].numpy())
+    rise = np.ascontiguousarray(camera.world_from_camera[2, :3].numpy())
+    return *image_coordinates(camera), rise
 
 
 def merge_depths(
@@ -170,42 +168,42 @@ def merge_depths(
     *,
     backend: str = CPU,
 ) -> RenderOutput:
-    """Buffers of two layers as one scene's, colour excepted: what stands before the water, and, in
-    the window, what is seen through it.
+    """Buffers of two layers as one scene's, colour excepted; behind: what the window shows through
+    the water.
 
     Alpha and expected depth are what one render would give. Median depth and the heaviest splat
     are those of the layer that covers more of the pixel. backend: kernels work on float32 in place.
     """
     assert front.alpha is not None and behind.alpha is not None
-    wanted = buffers - {RGB, ALPHA}
-    if not wanted:
+    requested = buffers - {RGB, ALPHA}
+    if not requested:
         return RenderOutput()
-    values = {name: getattr(front, name) for name in (*wanted, ALPHA)}
+    values = {name: getattr(front, name) for name in (*requested, ALPHA)}
     kernels = kernels_for(backend, front.alpha)
     if kernels == CUDA:
-        from augment.effects.flood import cuda_pour
+        from augment.effects.flood import cuda
 
-        pairs = {name: (values[name], getattr(behind, name)) for name in sorted(wanted)}
+        pairs = {name: (values[name], getattr(behind, name)) for name in sorted(requested)}
         depths = pairs.pop(EXPECTED_DEPTH, None)
-        cuda_pour.join(front.alpha, behind.alpha, depths, list(pairs.values()), window)
+        cuda.merge_depths(front.alpha, behind.alpha, depths, list(pairs.values()), window)
         return RenderOutput(**values)
     if kernels == CPU:
         here, there = window.overlap(front.alpha)
         alphas = (front.alpha.numpy()[here], behind.alpha.numpy()[there])
         with kernel_threads(ROWS):
-            for name in sorted(wanted):
+            for name in sorted(requested):
                 pair = (values[name].numpy()[here], getattr(behind, name).numpy()[there])
                 if name == EXPECTED_DEPTH:
-                    pour_kernels.join_depth(*alphas, *pair, np.float32(DEPTH_EPS))
+                    water_kernels.join_depth(*alphas, *pair, np.float32(DEPTH_EPS))
                 else:
-                    pour_kernels.join_heavier(*alphas, *pair)
-            pour_kernels.join_alpha(*alphas)
+                    water_kernels.join_heavier(*alphas, *pair)
+            water_kernels.join_alpha(*alphas)
         return RenderOutput(**values)
     covered = torch.zeros_like(front.alpha)
     window.paste(covered, behind.alpha)
     share = (1 - front.alpha) * covered
     values[ALPHA] = front.alpha + share
-    for name in wanted:
+    for name in requested:
         nearer = values[name]
         other = torch.full_like(nearer, -1) if name == SPLAT_IDS else torch.zeros_like(nearer)
         window.paste(other, getattr(behind, name))
@@ -233,8 +231,8 @@ def view_from_below(
     rgb, device = front.rgb, front.rgb.device
     lengths = camera.ray_lengths(rgb.dtype, device)
     deep = torch.tensor(medium.rgb, dtype=rgb.dtype, device=device)
-    through = transmittance(medium, front.depth * lengths)
-    seen = through * rgb + front.alpha[..., None] * (1 - through) * deep
+    to_bed = transmittance(medium, front.depth * lengths)
+    seen = to_bed * rgb + front.alpha[..., None] * (1 - to_bed) * deep
 
     directions = camera.ray_directions(rgb.dtype, device)
     up = directions[..., 2] / lengths
@@ -271,7 +269,7 @@ def _into_air(directions: Float[Tensor, "*B 3"], index: float) -> Float[Tensor, 
     return torch.nn.functional.normalize(torch.cat([flat, rise[..., None]], -1), dim=-1)
 
 
-# ---- flood view ----------------------------------------------------------------------------------
+# ---- The layers that are drawn -------------------------------------------------------------------
 
 COARSE = 0.25  # resolution of the mirrored view that fills what the screen does not show
 REACH_SIGMAS = 3.0  # slopes of the waves that the margins allow for
@@ -303,9 +301,9 @@ class LayerRenderer:
         camera: Camera,
         clip: HeightClip,
         buffers: frozenset[str],
-        wanted: Bool[Tensor, "H W"] | None = None,
+        pixel_mask: Bool[Tensor, "H W"] | None = None,
     ) -> RenderOutput:
-        """The layer's buffers; its colours are seen through the smog. wanted: as for rasterize."""
+        """The layer's buffers; its colours are seen through the smog."""
         if self.smog_on_buffers is not None:
             buffers = buffers | {EXPECTED_DEPTH}
         raster = rasterize(
@@ -315,7 +313,7 @@ class LayerRenderer:
             settings=self.settings,
             smog=self.smog,
             clip=clip,
-            pixel_mask=wanted,
+            pixel_mask=pixel_mask,
             backend=self.backend,
         )
         if self.smog_on_buffers is None:
@@ -323,10 +321,10 @@ class LayerRenderer:
         return replace(raster, rgb=fog_raster(raster, camera, self.smog_on_buffers))
 
     def layer(
-        self, camera: Camera, clip: HeightClip, wanted: Bool[Tensor, "H W"] | None = None
+        self, camera: Camera, clip: HeightClip, pixel_mask: Bool[Tensor, "H W"] | None = None
     ) -> Layer:
         buffers = frozenset({RGB, ALPHA, EXPECTED_DEPTH})
-        return as_layer(camera, self.draw(camera, clip, buffers, wanted))
+        return as_layer(camera, self.draw(camera, clip, buffers, pixel_mask))
 
 
 @dataclass(frozen=True, eq=False)
@@ -350,7 +348,7 @@ def as_layer(camera: Camera, raster: RenderOutput) -> Layer:
 
 
 def render_flooded(
-    painter: LayerRenderer, camera: Camera, medium: FloodMedium, buffers: frozenset[str]
+    renderer: LayerRenderer, camera: Camera, medium: FloodMedium, buffers: frozenset[str]
 ) -> FloodedImage | None:
     """The picture of a camera whose image the water's plane may reach; None where it cannot.
 
@@ -358,28 +356,28 @@ def render_flooded(
     """
     window = plane_window(camera, medium.level_z_m)
     if float(camera.centre[2]) <= medium.level_z_m:
-        return _from_below(painter, camera, medium, buffers)
+        return _from_below(renderer, camera, medium, buffers)
     if window is None:
         return None
-    return _from_above(painter, camera, medium, buffers, window)
+    return _from_above(renderer, camera, medium, buffers, window)
 
 
 def _from_above(
-    painter: LayerRenderer,
+    renderer: LayerRenderer,
     camera: Camera,
     medium: FloodMedium,
     buffers: frozenset[str],
     window: Window,
 ) -> FloodedImage:
     above = HeightClip(medium.level_z_m, ABOVE)
-    wanted = buffers | {RGB, ALPHA}
+    requested = buffers | {RGB, ALPHA}
     if medium.reflection == "screen_space":
-        wanted = wanted | {EXPECTED_DEPTH}
+        requested = requested | {EXPECTED_DEPTH}
     with timed("rasterise"):
-        front = painter.draw(camera, above, wanted)
+        front = renderer.draw(camera, above, requested)
     assert front.rgb is not None and front.alpha is not None
-    sky, smog = painter.sky, painter.medium
-    backend = _follows(painter.backend, front.alpha)
+    sky, smog = renderer.sky, renderer.medium
+    backend = _follows(renderer.backend, front.alpha)
     with timed("flood: where it is seen"):
         water, most_shown = find_water(front.alpha, camera, backend=backend)
     if most_shown < 1 - HIDDEN_COVER:
@@ -396,9 +394,9 @@ def _from_above(
     bed_window = window.grown(margins)
     bed_camera = bed_window.of(camera)
     with timed("flood: bed"):
-        bed = _draw_bed(painter, bed_camera, medium, buffers - {RGB, ALPHA}, margins, seen)
+        bed = _draw_bed(renderer, bed_camera, medium, buffers - {RGB, ALPHA}, margins, seen)
     with timed("flood: mirrored view"):
-        mirror = _mirror_layer(painter, camera, medium, window, seen)
+        mirror = _mirror_layer(renderer, camera, medium, window, seen)
     with timed("flood: screen march"):
         screen = _screen_reflection(camera, medium, crop, field, front, backend)
     with timed("flood: colours of the water"):
@@ -427,7 +425,7 @@ def _follows(backend: str, image: Tensor) -> str:
 
 
 def _draw_bed(
-    painter: LayerRenderer,
+    renderer: LayerRenderer,
     camera: Camera,
     medium: FloodMedium,
     scene_buffers: frozenset[str],
@@ -439,8 +437,8 @@ def _draw_bed(
     """
     reach = math.inf if scene_buffers else visible_depth_m(medium)
     below = HeightClip(medium.level_z_m, BELOW, reach, overlaps=True)
-    wanted = scene_buffers | {RGB, ALPHA, EXPECTED_DEPTH}
-    return painter.draw(camera, below, wanted, margins.around(seen, margins))
+    requested = scene_buffers | {RGB, ALPHA, EXPECTED_DEPTH}
+    return renderer.draw(camera, below, requested, margins.around(seen, margins))
 
 
 def visible_depth_m(medium: FloodMedium) -> float:
@@ -450,7 +448,7 @@ def visible_depth_m(medium: FloodMedium) -> float:
 
 
 def _mirror_layer(
-    painter: LayerRenderer,
+    renderer: LayerRenderer,
     camera: Camera,
     medium: FloodMedium,
     window: Window,
@@ -462,12 +460,12 @@ def _mirror_layer(
     place = mirrored_window(window, camera).grown(margins)
     view = place.of(mirrored_camera(camera, medium.level_z_m))
     # Within the window tilted waves look as far down as up.
-    wanted = margins.around(seen.flip(0), replace(margins, bottom=margins.top))
+    pixel_mask = margins.around(seen.flip(0), replace(margins, bottom=margins.top))
     if medium.reflection == "screen_space":
         view = view.scaled(COARSE)
-        wanted = resized(wanted, view)
+        pixel_mask = resized(pixel_mask, view)
     above = HeightClip(medium.level_z_m, ABOVE, overlaps=True)
-    return painter.layer(view, above, wanted)
+    return renderer.layer(view, above, pixel_mask)
 
 
 def _screen_reflection(
@@ -517,20 +515,19 @@ def _bed_margins(camera: Camera, medium: FloodMedium) -> Margins:
 
 
 def _from_below(
-    painter: LayerRenderer, camera: Camera, medium: FloodMedium, buffers: frozenset[str]
+    renderer: LayerRenderer, camera: Camera, medium: FloodMedium, buffers: frozenset[str]
 ) -> FloodedImage:
     """From under the water, or exactly at its surface."""
-    wanted = buffers | {RGB, ALPHA, EXPECTED_DEPTH}
-    in_air = replace(painter, smog=None, smog_on_buffers=None)
+    requested = buffers | {RGB, ALPHA, EXPECTED_DEPTH}
+    in_air = replace(renderer, smog=None, smog_on_buffers=None)
     with timed("rasterise"):
-        front = in_air.draw(camera, HeightClip(medium.level_z_m, BELOW), wanted)
+        front = in_air.draw(camera, HeightClip(medium.level_z_m, BELOW), requested)
         above = HeightClip(medium.level_z_m, ABOVE, overlaps=True)
-        air = painter.draw(camera, above, wanted)
+        air = renderer.draw(camera, above, requested)
     image = view_from_below(
-        as_layer(camera, front), as_layer(camera, air), medium, painter.sky, painter.medium
+        as_layer(camera, front), as_layer(camera, air), medium, renderer.sky, renderer.medium
     )
-    size = (camera.height, camera.width)
-    water = torch.ones(size, dtype=torch.bool, device=image.device)
+    water = torch.ones((camera.height, camera.width), dtype=torch.bool, device=image.device)
     whole = Window(0, 0, camera.width, camera.height)
-    scene = merge_depths(front, air, whole, buffers, backend=painter.backend)
+    scene = merge_depths(front, air, whole, buffers, backend=renderer.backend)
     return FloodedImage(image, scene, water)

@@ -18,9 +18,8 @@ from augment.render.composite import sky_behind
 from augment.sky import Sky
 
 # ---- Where vectors lie in a layer's image, and what the layer shows there ------------------------
-# Image coordinates are (column, row) in pixels with the first pixel's centre at (0.5, 0.5), so that
-# the pixel nearest to a coordinate is its integer part. Vectors are in world axes and start at the
-# layer's optical centre; their length plays no part, which makes directions of points of them.
+# Image coordinates are (column, row) in pixels, the first pixel's centre at (0.5, 0.5). Vectors are
+# in world axes and start at the layer's optical centre; their length plays no part.
 
 SOLID_ALPHA = 0.5  # a pixel at least this opaque shows a surface at its depth
 MIN_DEPTH = 1e-20  # of what is projected: things behind a camera land far outside its image
@@ -101,8 +100,7 @@ def blurred(
 
 
 # ---- Where a camera's rays meet the water, and how the surface is tilted there -------------------
-# All vectors are in world axes and all points relative to the eye, which keeps float32 exact enough
-# kilometres away from the world's origin.
+# Vectors are in world axes, points relative to the eye: float32 stays exact far from the origin.
 
 FARTHEST = 1e12  # times the eye's distance from the image plane: rays along the water end here
 MIN_COSINE = 1e-3  # of rays against the surface, and of reflected ones against the horizon
@@ -219,7 +217,7 @@ def _at_least_upward(ray: Tensor) -> Tensor:
     return torch.nn.functional.normalize(torch.cat((ray[..., :2], upward), -1), dim=-1)
 
 
-# ---- refraction ----------------------------------------------------------------------------------
+# ---- The bed as seen through the surface ---------------------------------------------------------
 
 BED_STEPS = 2  # corrections of the bed's depth where a refracted ray meets it,
 SETTLED_M = 0.01  # unless the last one was smaller
@@ -258,11 +256,9 @@ def through_the_surface(
 ) -> Float[Tensor, "H W 3"]:
     """Colour of the light that comes up through the surface: T = a bed + (1 - a) water.
 
-    The bed's depth where the ray meets it is unknown; it starts as that of the bed straight behind
-    the pixel, and is corrected by the depth at the pixel found with it. Where that search leaves
-    the bed's image or meets a hole, the bed straight behind the pixel is taken, and the water's own
-    colour where there is none either, or it lies too deep to be seen. The bed's holes show the
-    water's own colour.
+    The search for the bed's depth along the ray starts from the bed straight behind the pixel.
+    Where it leaves the bed's image or meets a hole, that bed is taken, and the water's own colour
+    where there is none either, or it lies too deep to be seen.
     """
     water = water_color(surface, camera, medium, smog)
     own_column, own_row = _own_pixel(bed.camera, camera, normal.dtype)
@@ -347,11 +343,8 @@ def smog_before(
 
 
 # ---- What a water surface reflects: the sky, a view from below the water, the image itself -------
-# The sky is known in every direction. What stands above the water is seen in the mirrored layer
-# from
-# the mirrored eye, or in the front layer from the eye itself; a ray that leaves the surface a
-# little
-# off the flat mirror's direction is looked up there at the distance at which it meets something.
+# A ray that leaves the surface a little off the flat mirror's direction is looked up in the
+# mirrored layer, or in the front layer, at the distance at which it meets something.
 
 EDGE = 0.04  # share of the image's sides over which what the image shows fades out
 MATCH_M, MATCH_SHARE = 0.3, 0.05  # how far beside a surface a ray may end and still show it
@@ -384,8 +377,9 @@ def reflect_sky(
     near = smog_before(surface, camera, level_z_m, layered)
     above = vertical_optical_depth(layered, level_z_m)
     airlight = torch.tensor(layered.rgb, dtype=near.dtype)
-    through = [torch.exp(-(near + above / ray[..., 2]))[..., None] for ray in rays]
-    return [t * color + (1 - t) * airlight for t, color in zip(through, colors, strict=True)]
+    transmittances = [torch.exp(-(near + above / ray[..., 2]))[..., None] for ray in rays]
+    pairs = zip(transmittances, colors, strict=True)
+    return [t * color + (1 - t) * airlight for t, color in pairs]
 
 
 def reflect_mirror(

@@ -28,7 +28,7 @@ from torch import Tensor
 from augment.cameras import Camera
 from augment.effects.flood import kernels
 from augment.effects.flood.flood import Layer
-from augment.render.buffers import CPU, CUDA, REFERENCE, kernels_for
+from augment.render.buffers import CPU, CUDA, kernels_for
 from augment.render.threads import kernel_threads
 
 # The kernels' thresholds, as numbers that torch takes.
@@ -87,22 +87,28 @@ def trace_screen(
     if stride not in STRIDES:
         raise ValueError(f"stride must be one of {STRIDES}; got {stride}")
     left, top = _window_origin(front.camera, camera)
+    size, device = (camera.height, camera.width), front.alpha.device
     if float(camera.centre[2]) <= level_z_m:
-        size, device = (camera.height, camera.width), front.alpha.device
         distance = torch.full(size, math.inf, device=device)
         return ScreenReflection(front, distance, torch.zeros_like(distance))
     if needed is None:
-        size, device = (camera.height, camera.width), front.alpha.device
         needed = torch.ones(size, dtype=torch.bool, device=device)
-    elif tuple(needed.shape) != (camera.height, camera.width):
+    elif tuple(needed.shape) != size:
         raise ValueError(
             f"needed must be [{camera.height}, {camera.width}] as camera {camera.name!r} is; "
             f"got {list(needed.shape)}"
         )
-    chosen = kernels_for(backend, front.alpha.detach())
-    run = {REFERENCE: _trace, CPU: _trace_fast, CUDA: _trace_on_gpu}[chosen]
-    distance, weight = run(front, camera, level_z_m, left, top, stride, needed)
-    return ScreenReflection(front, distance, weight)
+    backend = kernels_for(backend, front.alpha.detach())
+    vertical = _vertical(front.camera, level_z_m)
+    if backend == CUDA:
+        from augment.effects.flood import cuda
+
+        found = cuda.trace(front, camera, left, top, needed, vertical)
+    elif backend == CPU:
+        found = _run_kernels(front, camera, vertical, left, top, stride, needed)
+    else:
+        found = _trace(front, camera, level_z_m, left, top, needed)
+    return ScreenReflection(front, *found)
 
 
 def _window_origin(whole: Camera, window: Camera) -> tuple[int, int]:
@@ -127,17 +133,16 @@ def _vertical(camera: Camera, level_z_m: float) -> tuple[list[float], list[float
     return up, image, float(camera.centre[2]) - level_z_m
 
 
-def _trace_fast(
+def _run_kernels(
     front: Layer,
     camera: Camera,
-    level_z_m: float,
+    vertical: tuple[list[float], list[float], float],
     left: int,
     top: int,
     stride: int,
     needed: Bool[Tensor, "h w"],
 ) -> tuple[Tensor, Tensor]:
-    whole = front.camera
-    up, image, eye_height_m = _vertical(whole, level_z_m)
+    whole, (up, image, eye_height_m) = front.camera, vertical
     alpha = front.alpha.detach().contiguous().numpy()
     asked = needed.contiguous().numpy()
     block = kernels.BLOCK
@@ -156,22 +161,6 @@ def _trace_fast(
             pyramid, view, alpha, asked, left, top, stride, ways, trust, distance, weight
         )
     return torch.from_numpy(distance), torch.from_numpy(weight)
-
-
-def _trace_on_gpu(
-    front: Layer,
-    camera: Camera,
-    level_z_m: float,
-    left: int,
-    top: int,
-    stride: int,
-    needed: Bool[Tensor, "h w"],
-) -> tuple[Tensor, Tensor]:
-    """`stride` is the affair of the CPU's kernel."""
-    from augment.effects.flood import cuda_screen
-
-    vertical = _vertical(front.camera, level_z_m)
-    return cuda_screen.trace(front, camera, left, top, needed, vertical)
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,15 +212,9 @@ def _mirrored_rays(camera: Camera, level_z_m: float, x: Tensor, y: Tensor) -> _R
 
 
 def _trace(
-    front: Layer,
-    camera: Camera,
-    level_z_m: float,
-    left: int,
-    top: int,
-    stride: int,
-    needed: Bool[Tensor, "h w"],
+    front: Layer, camera: Camera, level_z_m: float, left: int, top: int, needed: Bool[Tensor, "h w"]
 ) -> tuple[Tensor, Tensor]:
-    """The definition: every pixel, in small steps. `stride` is the kernel's affair."""
+    """The definition: every pixel, in small steps."""
     whole = front.camera
     row, column = torch.meshgrid(
         torch.arange(camera.height) + top, torch.arange(camera.width) + left, indexing="ij"

@@ -9,7 +9,7 @@ comes from the mirrored direction and T what comes up through the surface.
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import Any
+from typing import NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -19,11 +19,7 @@ from torch import Tensor
 
 from augment.cameras import Camera
 from augment.effects.flood import refraction
-from augment.effects.flood import refraction as layer_lookup
-from augment.effects.flood import refraction as reflection_lookup
-from augment.effects.flood import refraction as water_surface
 from augment.effects.flood import water_kernels as kernels
-from augment.effects.flood import water_kernels as mip_kernels
 from augment.effects.flood.flood import FloodMedium, Layer, reflectance
 from augment.effects.flood.refraction import (
     MIN_COSINE,
@@ -36,11 +32,13 @@ from augment.effects.flood.refraction import (
     reflect_mirror,
     reflect_screen,
     reflect_sky,
+    smooth_variance,
     through_the_surface,
     tilted_normals,
     window_offset,
 )
 from augment.effects.flood.screen_space import ScreenReflection
+from augment.effects.flood.water_plane import image_coordinates
 from augment.effects.flood.waves import WaveField
 from augment.effects.smog import SmogMedium, optical_depth, vertical_optical_depth
 from augment.render.buffers import CPU, REFERENCE, kernels_for
@@ -56,6 +54,21 @@ from augment.sky import (
     with_border,
 )
 
+
+class Water(NamedTuple):
+    """What `shade_water` is given; smog is None where it has no density."""
+
+    camera: Camera
+    cover: Float[Tensor, "h w"]
+    medium: FloodMedium
+    field: WaveField
+    bed: Layer
+    mirror: Layer | None
+    screen: ScreenReflection | None
+    sky: Sky
+    smog: SmogMedium | None
+
+
 # ---- Arrays for the kernels that shade water on the CPU, and their launch ------------------------
 
 ROWS = 8  # image rows a thread takes at a time: rows without water cost nothing
@@ -65,36 +78,22 @@ _known_faces: WeakKeyDictionary[Sky, tuple[int, Tensor]] = WeakKeyDictionary()
 LARGEST = 1e30  # stands for infinity: its products with 0 are 0
 
 
-def shade(
-    camera: Camera,
-    cover: Tensor,
-    hidden_cover: float,
-    medium: FloodMedium,
-    field: WaveField,
-    bed: Layer,
-    mirror: Layer | None,
-    screen: ScreenReflection | None,
-    sky: Sky,
-    smog: SmogMedium | None,
-) -> Tensor:
-    """As `water.shade_water`; smog is None where it has no density."""
-    faces, size, layered = flat_faces(sky, smog)
-    limit = water_surface.smooth_variance(camera)
+def _shade(water: Water, hidden_cover: float) -> Tensor:
+    camera, field, mirror, screen = water.camera, water.field, water.mirror, water.screen
+    faces, size, layered = flat_faces(water.sky, water.smog)
+    limit = smooth_variance(camera)
     rough = bool((field.slope_variance >= limit).any())
     out = np.empty((camera.height, camera.width, 3), np.float32)
-    front, distance, weight = None, cover, cover
+    front, distance, weight = None, water.cover, water.cover
     if screen is not None:
         front, distance, weight = screen.layer, screen.distance, screen.weight
     arguments = (
-        (np.arange(camera.width, dtype=np.float64) + 0.5 - camera.cx) / camera.fx,
-        (np.arange(camera.height, dtype=np.float64) + 0.5 - camera.cy) / camera.fy,
+        *image_coordinates(camera),
         np.ascontiguousarray(camera.world_from_camera[:3, :3].numpy()),
-        _array(cover),
-        _array(field.normal_x),
-        _array(field.normal_y),
-        _array(field.slope_variance),
-        *_layer(bed),
-        refraction.window_offset(bed.camera, camera),
+        _array(water.cover),
+        *(_array(part) for part in (field.normal_x, field.normal_y, field.slope_variance)),
+        *_layer(water.bed),
+        window_offset(water.bed.camera, camera),
         *_layer(mirror),
         *_averages(mirror, rough),
         mirror is not None,
@@ -104,7 +103,7 @@ def shade(
         _array(weight),
         faces.numpy(),
         np.uint64(size),
-        medium_numbers(camera, medium, smog, layered),
+        medium_numbers(water, layered),
         _limits(hidden_cover, limit),
         out,
     )
@@ -177,7 +176,7 @@ def _averages(layer: Layer | None, rough: bool) -> tuple[np.ndarray, np.ndarray]
     rgb, alpha = _array(layer.rgb), _array(layer.alpha)
     height, width = alpha.shape
     spare, shapes, first = width + 1, [(0, width, height)], height * width
-    while len(shapes) < layer_lookup.MIP_LEVELS and max(height, width) > 1:
+    while len(shapes) < refraction.MIP_LEVELS and max(height, width) > 1:
         height, width = (height + 1) // 2, (width + 1) // 2
         shapes.append((first, width, height))
         first += height * width
@@ -185,21 +184,20 @@ def _averages(layer: Layer | None, rough: bool) -> tuple[np.ndarray, np.ndarray]
     mips[first:] = 0
     images = [mips[start : start + w * h].reshape(h, w, 4) for start, w, h in shapes]
     with kernel_threads(MIP_ROWS):
-        mip_kernels.pack(rgb, alpha, images[0])
+        kernels.pack(rgb, alpha, images[0])
         for fine, coarse in pairwise(images):
-            mip_kernels.halve_mip(fine, coarse)
+            kernels.halve_mip(fine, coarse)
     return mips.reshape(-1), np.asarray(shapes, np.int64)
 
 
-def medium_numbers(
-    camera: Camera, medium: FloodMedium, smog: SmogMedium | None, layered: SmogMedium | None
-) -> np.ndarray:
-    """`kernels.Medium`."""
-    eye_z, level = float(camera.centre[2]), medium.level_z_m
+def medium_numbers(water: Water, layered: SmogMedium | None) -> np.ndarray:
+    """`kernels.Medium`. layered: the smog before the sky."""
+    medium, eye_z = water.medium, float(water.camera.centre[2])
+    level = medium.level_z_m
     per_m, above, airlight = 0.0, -1.0, (0.0, 0.0, 0.0)
-    if smog is not None:
+    if water.smog is not None:
         metre, height = torch.tensor([1.0, level], dtype=torch.float64)
-        per_m, airlight = float(optical_depth(smog, metre, eye_z, height)), smog.rgb
+        per_m, airlight = float(optical_depth(water.smog, metre, eye_z, height)), water.smog.rgb
     if layered is not None:
         above = vertical_optical_depth(layered, level)
     numbers = [eye_z - level, medium.refraction_index, medium.fresnel == "schlick"]
@@ -207,17 +205,15 @@ def medium_numbers(
     return np.minimum(numbers, LARGEST).astype(np.float32)
 
 
-def _limits(hidden_cover: float, smooth_variance: float) -> np.ndarray:
+def _limits(hidden_cover: float, smooth: float) -> np.ndarray:
     """`kernels.Limits`."""
-    surface, lookup, reflection = water_surface, layer_lookup, reflection_lookup
-    numbers = [hidden_cover, surface.FARTHEST, surface.MIN_COSINE, smooth_variance]
-    numbers += [surface.STEEPEST, lookup.MIN_DEPTH, lookup.SOLID_ALPHA, refraction.BED_STEPS]
-    numbers += [reflection.EDGE, reflection.MATCH_M, reflection.MATCH_SHARE, refraction.SETTLED_M]
-    numbers += [refraction.MAX_OPTICAL_DEPTH, reflection.FAINT]
-    return np.asarray(numbers, np.float32)
+    r = refraction
+    numbers = [hidden_cover, r.FARTHEST, r.MIN_COSINE, smooth, r.STEEPEST, r.MIN_DEPTH]
+    numbers += [r.SOLID_ALPHA, r.BED_STEPS, r.EDGE, r.MATCH_M, r.MATCH_SHARE, r.SETTLED_M]
+    return np.asarray([*numbers, r.MAX_OPTICAL_DEPTH, r.FAINT], np.float32)
 
 
-# ---- water ---------------------------------------------------------------------------------------
+# ---- The colour of the water ---------------------------------------------------------------------
 
 # Water that is covered more than this is one colour. Opaque surfaces let up to 4 % through (a splat
 # that would bring transmittance to 1e-4 is not blended, whatever is left before it), and what
@@ -251,19 +247,19 @@ def shade_water(
     Raises:
         ValueError: the eye is not above the water, or cameras, images and fields do not fit.
     """
-    _check(camera, cover, medium, field, bed, mirror, screen)
     if smog is not None and smog.sigma_per_m == 0:
         smog = None
-    layers = [
-        bed,
-        *([] if mirror is None else [mirror]),
-        *([] if screen is None else [screen.layer]),
-    ]
-    images = [cover, *(part for layer in layers for part in (layer.rgb, layer.alpha, layer.depth))]
-    kernels = kernels_for(backend, *images)
-    if kernels != REFERENCE:
-        run = shade if kernels == CPU else _shade_on_gpu
-        return run(camera, cover, HIDDEN_COVER, medium, field, bed, mirror, screen, sky, smog)
+    water = Water(camera, cover, medium, field, bed, mirror, screen, sky, smog)
+    _check(water)
+    layers = (bed, mirror, None if screen is None else screen.layer)
+    images = [(i.rgb, i.alpha, i.depth) for i in layers if i is not None]
+    backend = kernels_for(backend, cover, *(part for parts in images for part in parts))
+    if backend == CPU:
+        return _shade(water, HIDDEN_COVER)
+    if backend != REFERENCE:
+        from augment.effects.flood import cuda
+
+        return cuda.shade(water, HIDDEN_COVER)
     surface = meet_plane(camera, medium.level_z_m, bed.rgb.dtype)
     smooth = is_smooth(field, camera)
     taps = tilted_normals(surface, field, smooth)
@@ -285,12 +281,6 @@ def shade_water(
     return torch.where(surface.meets[..., None], out, 0)
 
 
-def _shade_on_gpu(*arguments: Any) -> Tensor:
-    from augment.effects.flood import cuda_water
-
-    return cuda_water.shade(*arguments)
-
-
 def reflected_share(
     surface: Surface, normal: Float[Tensor, "h w 3"], medium: FloodMedium
 ) -> Float[Tensor, "h w"]:
@@ -299,46 +289,30 @@ def reflected_share(
     return reflectance(cosine, medium.refraction_index, medium.fresnel)
 
 
-def _check(
-    camera: Camera,
-    cover: Tensor,
-    medium: FloodMedium,
-    field: WaveField,
-    bed: Layer,
-    mirror: Layer | None,
-    screen: ScreenReflection | None,
-) -> None:
+def _check(water: Water) -> None:
+    camera, level_z_m, mirror = water.camera, water.medium.level_z_m, water.mirror
     eye_z = float(camera.centre[2])
-    if not eye_z > medium.level_z_m:
+    if not eye_z > level_z_m:
         raise ValueError(
-            f"camera {camera.name!r} must be above the water at z = {medium.level_z_m} m; "
+            f"camera {camera.name!r} must be above the water at z = {level_z_m} m; "
             f"its eye is at z = {eye_z} m"
         )
-    window_offset(bed.camera, camera)
-    parts = {"cover": cover, "field": field.normal_x}
-    if screen is not None:
-        parts |= {"screen.distance": screen.distance}
-    for name, part in parts.items():
-        _fits(name, part, camera)
-    layers = {
-        "bed": bed,
-        "mirror": mirror,
-        "screen.layer": None if screen is None else screen.layer,
-    }
-    for name, layer in layers.items():
-        if layer is not None:
-            _fits(name, layer.alpha, layer.camera)
-    if mirror is not None and not mirrored_eye_is(mirror.camera, medium.level_z_m, camera.centre):
-        expected = [*camera.centre.tolist()[:2], 2 * medium.level_z_m - eye_z]
+    window_offset(water.bed.camera, camera)
+    parts = [("cover", water.cover, camera), ("field", water.field.normal_x, camera)]
+    layers = {"bed": water.bed, "mirror": mirror}
+    if water.screen is not None:
+        parts.append(("screen.distance", water.screen.distance, camera))
+        layers["screen.layer"] = water.screen.layer
+    parts += [(name, part.alpha, part.camera) for name, part in layers.items() if part is not None]
+    for name, part, own in parts:
+        if tuple(part.shape) != (own.height, own.width):
+            raise ValueError(
+                f"{name} must be [{own.height}, {own.width}] as its camera {own.name!r} is; "
+                f"got {list(part.shape)}"
+            )
+    if mirror is not None and not mirrored_eye_is(mirror.camera, level_z_m, camera.centre):
+        expected = [*camera.centre.tolist()[:2], 2 * level_z_m - eye_z]
         raise ValueError(
             f"the mirror's camera must stand at the mirrored eye {expected}; "
             f"it stands at {mirror.camera.centre.tolist()}"
-        )
-
-
-def _fits(name: str, part: Tensor, camera: Camera) -> None:
-    if tuple(part.shape) != (camera.height, camera.width):
-        raise ValueError(
-            f"{name} must be [{camera.height}, {camera.width}] as its camera {camera.name!r} is; "
-            f"got {list(part.shape)}"
         )

@@ -18,11 +18,9 @@ from augment.geometry import any_in_squares, rigid
 
 # ---- Which pixels of an image's rows see the water's plane, by float64 once a row ----------------
 # Whether a ray falls is the sign of a sum that float64 has to decide, and near the horizon the
-# small
-# fall is what distances are divided by. Along a row the fall is linear in the column, and so the
-# rays
-# that fall are an interval of columns. Kernels that know it and the fall at its end nearest to the
-# horizon need no float64: from there the fall only grows, and nothing cancels.
+# small fall is what distances are divided by. Along a row the fall is linear in the column: the
+# rays that fall are an interval. Kernels that know it and the fall at its end nearest to the
+# horizon need no float64: from there the fall only grows.
 
 BEGIN, END, ANCHOR, FALL = range(4)  # of a row's numbers
 ROW = 4
@@ -78,7 +76,7 @@ def column_intervals(
     return begin, end
 
 
-# ---- water plane ---------------------------------------------------------------------------------
+# ---- Windows of an image, and the plane in them --------------------------------------------------
 
 GRAIN = 16  # pixels a side of the squares that masks are grown in
 
@@ -110,12 +108,9 @@ class Margins:
         return torch.from_numpy(np.ascontiguousarray(fine)).view(torch.bool)
 
     def in_squares(self) -> tuple[int, int, int, int]:
-        return (
-            math.ceil(self.left / GRAIN),
-            math.ceil(self.top / GRAIN),
-            math.ceil(self.right / GRAIN),
-            math.ceil(self.bottom / GRAIN),
-        )
+        """Left, top, right and bottom in whole squares."""
+        left, top, right, bottom = (-(-side // GRAIN) for side in dataclasses.astuple(self))
+        return left, top, right, bottom
 
     def _around_by_torch(self, mask: Tensor, reach: Margins) -> Tensor:
         """`around` of a mask on a GPU: the same squares."""

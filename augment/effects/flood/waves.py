@@ -29,8 +29,6 @@ from augment.render.threads import kernel_threads
 from augment.rng import rng_for
 from recipes.weather import Wave, Waves
 
-# ---- waves ---------------------------------------------------------------------------------------
-
 GRAVITY_MPS2 = 9.80665
 UNIT_ERROR = 1e-6  # of a direction's length, which scales a wavelength no more than this
 CUSP = 1e-12  # area that is left of a unit of the plane where the surface counts as a point
@@ -92,6 +90,13 @@ class WaveSet:
         return 2 * math.pi / self.wavelengths_m
 
     @property
+    def tangent_factors(self) -> tuple[np.ndarray, ...]:
+        """S (Dx Dx, Dx Dy, Dy Dy), k A (Dx, Dy): [N] each, see `tangent_terms`."""
+        (dx, dy), bends = self.directions.T, self.steepness
+        slopes = self.wavenumbers * self.amplitudes_m
+        return bends * dx * dx, bends * dx * dy, bends * dy * dy, slopes * dx, slopes * dy
+
+    @property
     def frequencies_hz(self) -> np.ndarray:
         """omega / 2 pi [N] by the dispersion of gravity waves over a flat bed.
 
@@ -131,35 +136,6 @@ def _fraction_of_turns(frequency_hz: float, timestamp_ns: int) -> float:
     return (numerator * timestamp_ns % denominator) / denominator
 
 
-def displaced_surface(
-    waves: WaveSet, points_xy: Float64[Tensor, "*B 2"], timestamp_ns: int
-) -> Float64[Tensor, "*B 3"]:
-    """Where the parameter points of the plane are at that time; z counts from the still level."""
-    surface = torch.cat([points_xy, torch.zeros_like(points_xy[..., :1])], dim=-1)
-    turns = turns_at(waves, timestamp_ns)
-    for i, (dx, dy) in enumerate(waves.directions.tolist()):
-        theta = phase_of(waves, i, turns, points_xy)
-        reach = float(waves.steepness[i] / waves.wavenumbers[i])
-        lift = float(waves.amplitudes_m[i]) * theta.sin()
-        across = reach * theta.cos()
-        surface = surface + torch.stack([dx * across, dy * across, lift], dim=-1)
-    return surface
-
-
-def wave_normals(
-    waves: WaveSet, points_xy: Float64[Tensor, "*B 2"], timestamp_ns: int
-) -> Float64[Tensor, "*B 3"]:
-    """Unit normals, upward, of the surface over parameter points, with every wave at full height.
-
-    A cusp, which a total steepness of 1 can have, counts as level.
-    """
-    tangents = torch.zeros((*points_xy.shape[:-1], 5), dtype=torch.float64)
-    turns = turns_at(waves, timestamp_ns)
-    for i in range(len(turns)):
-        tangents += tangent_terms(waves, i, phase_of(waves, i, turns, points_xy))
-    return normals_from_tangents(tangents)
-
-
 def phase_of(
     waves: WaveSet, index: int, turns: np.ndarray, points_xy: Float64[Tensor, "*B 2"]
 ) -> Float64[Tensor, "*B"]:
@@ -195,15 +171,10 @@ def normals_from_tangents(tangents: Float64[Tensor, "*B 5"]) -> Float64[Tensor, 
 
 
 # ---- Waves drawn from what a recipe says of them -------------------------------------------------
-# A preset is a spectrum for a flooded street: a fetch of tens of metres between houses, so short
-# waves only, all running within some angle of the wind. Every wave has the same slope (the mean
-# square slope per octave of a wind sea is nearly constant: Phillips 1958), so amplitudes grow with
-# wavelength.
-#
-# Cox and Munk 1954 give the mean square slope of the open sea as 0.003 + 0.00512 U for a wind of U
-# m/s (0.008 + 0.00156 U without waves shorter than about 0.3 m): an rms slope of 0.09 at 1 m/s,
-# 0.17
-# at 5 m/s. Water between houses is sheltered and has no long fetch, so the presets lie below that.
+# A preset is a spectrum for a flooded street: a fetch of tens of metres, so short waves only,
+# within some angle of the wind, all of the same slope (the mean square slope per octave of a wind
+# sea is nearly constant: Phillips 1958). The open sea has an rms slope of 0.09 in a wind of 1 m/s,
+# 0.17 at 5 m/s (Cox and Munk 1954: mean square 0.003 + 0.00512 U); sheltered water lies below that.
 
 MAX_STEEPNESS = 0.8  # of all waves together, so that no crest of a preset comes near a cusp
 _WIDEST_RAD = math.radians(85)  # no wave runs against the wind that raised it
@@ -275,15 +246,12 @@ def _draw(spectrum: _Spectrum, recipe: Waves, rng: np.random.Generator, depth_m:
     )
 
 
-# ------------------------------------------------------------------------------------------------
-# What a camera sees of waves: normals per pixel, and roughness where waves are too fine for it
-# The footprint of a pixel on the plane is J = d(plane point)/d(pixel), metres per pixel, 2x2. A
-# wave
-# advances by k |J^T D| radians per pixel, so it is 2 pi / that pixels long there; shorter than two
-# pixels it cannot be drawn, and its normals would glitter. Its terms are faded out between four
-# pixels and two by a smoothstep w, and the slope it loses becomes slope variance along the view:
-# (k A)^2 (1 - w^2) (D.v)^2 / 2, v the ray's horizontal direction (Bruneton et al. 2010 split a sea
-# into normals and a variance in the same way).
+# ---- What a camera sees of waves: normals per pixel, and roughness where waves are too fine ------
+# The footprint of a pixel on the plane is J = d(plane point)/d(pixel), metres per pixel. A wave
+# advances by k |J^T D| radians per pixel; shorter than two pixels it would glitter. Its terms fade
+# out between four pixels and two by a smoothstep w, and the slope it loses becomes slope variance
+# along the view: (k A)^2 (1 - w^2) (D.v)^2 / 2, v the ray's horizontal direction (as Bruneton et
+# al. 2010 split a sea into normals and a variance).
 
 FADED_PX, FULL_PX = 2.0, 4.0  # lengths in pixels at which a wave is gone, and at full height
 FARTHEST_M = 1e7  # depth beyond which a ray counts as running beside the plane
@@ -313,10 +281,10 @@ def wave_field(
         still = torch.zeros(camera.height, camera.width, device=device)
         return WaveField(still, still, still)
     if kernels == CUDA:
-        from augment.effects.flood import cuda_screen as cuda_waves
+        from augment.effects.flood import cuda
 
         limits = (UPRIGHT, FADED_PX, FULL_PX)
-        return cuda_waves.fill_field(waves, camera, height, farthest=FARTHEST_M, limits=limits)
+        return cuda.fill_field(waves, camera, height, farthest=FARTHEST_M, limits=limits)
     return (_define if kernels == REFERENCE else _run_kernel)(waves, camera, height)
 
 
@@ -361,15 +329,8 @@ def _footprint(camera: Camera, rays: Tensor, away: Tensor, z: Tensor) -> tuple[T
 def _run_kernel(waves: WaveSet, camera: Camera, height: float) -> WaveField:
     # Zeros cost nothing until they are touched: rows above the horizon never are.
     fields = [np.zeros((camera.height, camera.width), np.float32) for _ in range(3)]
-    dx, dy = waves.directions.T
-    slopes = waves.wavenumbers * waves.amplitudes_m
-    bends = waves.steepness
-    terms = [bends * dx * dx, bends * dx * dy, bends * dy * dy, slopes * dx, slopes * dy]
-    phases = [
-        dx / waves.wavelengths_m,
-        dy / waves.wavelengths_m,
-        turns_at(waves, camera.timestamp_ns),
-    ]
+    dx, dy = waves.directions.T / waves.wavelengths_m
+    phases = [dx, dy, turns_at(waves, camera.timestamp_ns)]
     pose = camera.world_from_camera
     with kernel_threads(ROWS):
         waves_kernels.fill_field(
@@ -380,7 +341,7 @@ def _run_kernel(waves: WaveSet, camera: Camera, height: float) -> WaveField:
             FARTHEST_M,
             np.array([UPRIGHT, FADED_PX, FULL_PX], np.float32),
             np.stack(phases, axis=1),
-            np.stack(terms, axis=1).astype(np.float32),
+            np.stack(waves.tangent_factors, axis=1).astype(np.float32),
             *fields,
         )
     return WaveField(*(torch.from_numpy(field) for field in fields))

@@ -31,7 +31,7 @@ from augment.effects.lidar.codes import (
     UNCHANGED,
 )
 from augment.effects.lidar.snow import meet_snow, snow_in
-from augment.effects.smog import MAX_EXPONENT, SmogMedium
+from augment.effects.smog import MAX_EXPONENT, SmogMedium, optical_depth_of_arrays
 from augment.labels import KnowsLidarOrigins, LidarSweep
 from augment.plan import Plan, make_plan
 from augment.rng import rng_for
@@ -52,14 +52,13 @@ EGO_SENSOR_M = (0.0, 0.0, 1.8)  # forward, left, up of the ego origin, where not
 class LidarModel:
     """A spinning 905 nm LiDAR as its makers describe such; datasets do not publish their own.
 
-    reach_m: where a surface of 10 % reflectance is just seen in clear air; it stands for the
-    noise. pulse_fwhm_s: half-power width of the emitted pulse, which is as sin^2 and twice as long
-    at its foot. overlap_from_m, overlap_full_m: from where the receiver sees the beam, and from
-    where all of it (Hahner et al. 2021, section 3). near_gain: share of a signal from the first
-    metres, relative to one from far, that the receiver makes use of. Makers suppress it, and do not
-    say by how much: the default makes fog of 40 m visibility cost a surface of 50 % reflectance at
-    25 m, which is as far as Bijelic, Gruber and Ritter (2018, "A Benchmark for Lidar Sensors in
-    Fog") found LiDARs to see in it.
+    reach_m: where a surface of 10 % reflectance is just seen in clear air; it stands for the noise.
+    pulse_fwhm_s: half-power width of the emitted sin^2 pulse. overlap_from_m, overlap_full_m: from
+    where the receiver sees the beam, and all of it (Hahner et al. 2021, section 3). near_gain:
+    share of a signal from the first metres that the receiver makes use of. Makers suppress it and
+    do not say by how much: with the default, fog of 40 m visibility costs a surface of 50 %
+    reflectance at 25 m, as far as Bijelic, Gruber and Ritter (2018, "A Benchmark for Lidar Sensors
+    in Fog") found LiDARs to see in it.
     """
 
     wavelength_um: float = 0.905
@@ -148,15 +147,14 @@ def signal(reflectance: np.ndarray, ranges_m: np.ndarray) -> np.ndarray:
     return reflectance / (math.pi * ranges_m**2)
 
 
-# ------------------------------------------------------------------------------------------------
-# The strongest echo of every beam of a sweep, as the effects change it one after the other
+# ---- The strongest echo of every beam of a sweep, as one effect after another changes it ---------
 
 _MIN_M = 1e-3  # nearer returns have no direction
 
 
 @dataclass(eq=False)
 class Echoes:
-    """The echoes of a sweep of N returns; arrays are changed in place.
+    """The echoes of a sweep of N returns; arrays change in place.
 
     origins, directions [N, 3]: scene world; directions are unit. ranges_m [N]: as the sensor
     reports them, 0 where the source has no point: such rows are never touched. air_m [N]: how much
@@ -227,13 +225,13 @@ class Echoes:
         """Nothing comes back of the returns in rows, numbers or bool [N]."""
         self.codes[rows] = LOST
 
-    def lose_what_is_too_faint(self, model: LidarModel) -> None:
+    def lose_faint(self, model: LidarModel) -> None:
         """Lose what is below the sensor's noise."""
         faint = self.reflectance * self.gain < model.noise_reflectance(self.ranges_m)
         self.lose(faint & (self.ranges_m > 0))
 
     def sweep(self) -> LidarSweep:
-        """As `apply.weathered_sweep` returns it."""
+        """As `weathered_sweep` returns it."""
         columns = {name: np.asarray(column) for name, column in self.source.columns.items()}
         columns |= self._coordinates(columns)
         name = intensity_column(self.source)
@@ -263,10 +261,8 @@ class Echoes:
         if not len(rows):
             return column
         old = column[rows]
-        values = (
-            np.where(self.is_new[rows], white_level(column) * self.reflectance[rows], old)
-            * self.gain[rows]
-        )
+        own = white_level(column) * self.reflectance[rows]
+        values = np.where(self.is_new[rows], own, old) * self.gain[rows]
         values[self.codes[rows] == LOST] = 0
         if column.dtype.kind in "iu":
             limits = np.iinfo(column.dtype)
@@ -279,23 +275,17 @@ class Echoes:
         return out
 
 
-# ------------------------------------------------------------------------------------------------
-# Fog, haze and smog as a LiDAR meets them (Hahner et al. 2021, "Fog Simulation on Real LiDAR
-# Point
-# Clouds in Adverse Weather", ICCV), from the equations of the paper.
-#
-# The echo of a pulse P(t) = P0 sin^2(pi t / (2 tau)), 0 <= t <= 2 tau, whose half-power width is
-# tau:
+# ---- Fog, haze and smog: Hahner et al. 2021, "Fog Simulation on Real LiDAR Point Clouds in Adverse
+# Weather", ICCV -----------------------------------------------------------------------------------
+# The echo of a pulse P(t) = P0 sin^2(pi t / (2 tau)), 0 <= t <= 2 tau, of half-power width tau:
 #
 #     hard, from a surface at R0   (rho / pi) exp(-2 T(R0)) / R0^2
 #     soft, of droplets, at R      beta int_0^{2w} sin^2(pi x / (2w)) exp(-2 alpha r) xi(r) / r^2 dx
 #                                  r = R - x, w = c tau / 2
 #
-# T is the optical depth, alpha the extinction, beta = 0.046 / MOR the backscatter and MOR =
-# ln(20) /
+# T is the optical depth, alpha the extinction, beta = 0.046 / MOR the backscatter, MOR = ln(20) /
 # alpha the meteorological optical range; xi rises from 0 at overlap_from_m to 1 at overlap_full_m.
 # Ranges count from the pulse's middle, so that a surface at R0 is reported at R0 and not at R0 + w.
-#
 # The smog is that of the images, thinned to the LiDAR's wavelength (`wavelength_factor`).
 
 VISIBLE_UM = 0.55
@@ -315,10 +305,9 @@ _KIM = ((50.0, 0.0, 1.6), (6.0, 0.0, 1.3), (1.0, 0.16, 0.34), (0.5, 1.0, -0.5), 
 def wavelength_factor(extinction_per_m: float, wavelength_um: float = 0.905) -> float:
     """Extinction at the LiDAR's wavelength over that of visible light (0.55 um).
 
-    (wavelength / 0.55 um)^-q with q by the visibility: 0 below 500 m, as fog's droplets are larger
-    than either wavelength, up to 1.6 in clear air. At 905 nm: 1 in fog, 0.78 at 1 km, 0.52 at 6 km.
-    Kim et al. fitted it to models of fog and haze; single measurements differ by some 20 %, and
-    dry city smog of fine particles may have less in the infrared than fog of its visibility.
+    (wavelength / 0.55 um)^-q with q by the visibility, see _KIM. At 905 nm: 1 in fog, whose
+    droplets are larger than either wavelength, 0.78 at 1 km, 0.52 at 6 km. Single measurements
+    differ from this fit by some 20 %; dry smog of fine particles may have less in the infrared.
     """
     if extinction_per_m <= 0:
         return 1.0
@@ -333,24 +322,6 @@ def medium_for(medium: SmogMedium, model: LidarModel) -> SmogMedium:
     return dataclasses.replace(medium, sigma_per_m=factor * medium.sigma_per_m)
 
 
-def optical_depth(
-    medium: SmogMedium, ranges_m: np.ndarray, eyes_z_m: np.ndarray, points_z_m: np.ndarray
-) -> np.ndarray:
-    """tau [N] of beams from eyes to points, scene world: `augment.effects.smog.optical_depth`, with
-    an eye for each point.
-    """
-    uniform = medium.sigma_per_m * ranges_m
-    if medium.scale_height_m is None:
-        return uniform
-    a = (eyes_z_m - medium.base_z_m) / medium.scale_height_m
-    b = (points_z_m - medium.base_z_m) / medium.scale_height_m
-    difference = np.abs(b - a)
-    small = difference < 1e-4
-    safe = np.where(small, 1.0, difference)
-    mean = np.where(small, 1 - difference / 2, -np.expm1(-safe) / safe)
-    return uniform * np.exp(np.minimum(-np.minimum(a, b), MAX_EXPONENT)) * mean
-
-
 def extinction_at(medium: SmogMedium, z_m: np.ndarray) -> np.ndarray:
     """alpha [N] at heights, 1/metre."""
     if medium.scale_height_m is None:
@@ -362,7 +333,7 @@ def extinction_at(medium: SmogMedium, z_m: np.ndarray) -> np.ndarray:
 @dataclass(frozen=True, eq=False)
 class SoftEcho:
     """What droplets give back, by reported range. ranges_m [K]: rising. signal [K]: as
-    `sensors.signal`, near_gain included. strongest [K]: the greatest signal up to each range.
+    `signal`, near_gain included. strongest [K]: the greatest signal up to each range.
     share [K]: of the whole echo, that comes from up to each range.
     """
 
@@ -395,14 +366,13 @@ def soft_echo(alpha_per_m: float, model: LidarModel) -> SoftEcho:
     ranges = np.arange(model.overlap_from_m, _FAR_M, _STEP_M)
     response = model.near_gain * soft_response(alpha_per_m, ranges, model)
     total = np.cumsum(response)
-    return SoftEcho(
-        ranges, response, np.maximum.accumulate(response), total / max(total[-1], 1e-300)
-    )
+    share = total / max(total[-1], 1e-300)
+    return SoftEcho(ranges, response, np.maximum.accumulate(response), share)
 
 
 @dataclass(frozen=True, eq=False)
 class Scatter:
-    """The strongest echo of the droplets before each return. signal [N]: as `sensors.signal`, 0
+    """The strongest echo of the droplets before each return. signal [N]: as `signal` gives it, 0
     where none can be. ranges_m [N]: where it is reported."""
 
     signal: np.ndarray
@@ -434,21 +404,15 @@ def scatter_before(
         rows = np.flatnonzero(usable & (group == number)) if high > low else np.flatnonzero(usable)
         if not len(rows):
             continue
-        mean = medium.sigma_per_m if medium.scale_height_m is None else _alpha_of(number)
+        is_uniform = medium.scale_height_m is None
+        mean = medium.sigma_per_m if is_uniform else math.exp(number * _DENSITY_STEP)
         echo = soft_echo(float(mean), model)
-        last = np.clip(
-            ((ends_m[rows] - echo.ranges_m[0]) / _STEP_M).astype(np.int64),
-            0,
-            len(echo.ranges_m) - 1,
-        )
+        last = ((ends_m[rows] - echo.ranges_m[0]) / _STEP_M).astype(np.int64)
+        last = np.clip(last, 0, len(echo.ranges_m) - 1)
         out.signal[rows] = echo.strongest[last] * clump[rows]
         at = np.interp(where[rows] * echo.share[last], echo.share, echo.ranges_m)
         out.ranges_m[rows] = np.minimum(at, ends_m[rows])
     return out
-
-
-def _alpha_of(group: int) -> float:
-    return math.exp(group * _DENSITY_STEP)
 
 
 def apparent_reflectance(power: np.ndarray, ranges_m: np.ndarray) -> np.ndarray:
@@ -456,19 +420,16 @@ def apparent_reflectance(power: np.ndarray, ranges_m: np.ndarray) -> np.ndarray:
     return power / signal(np.ones_like(power), np.maximum(ranges_m, 1e-3))
 
 
-# ------------------------------------------------------------------------------------------------
-# Standing water as a LiDAR meets it: a flat mirror that swallows 905 nm within centimetres
+# ---- Standing water: a flat mirror that swallows 905 nm within centimetres -----------------------
 # A beam that meets the surface at a slant leaves it by reflection, away from the sensor, or enters.
 # What comes back is the stronger of
 #
 #     bed     rho (1 - F)^2 exp(-2 c l)     from the bed, l metres along the refracted way
 #     water   (1 - F)^2 R_w cos(theta)      from grains in muddy water, within a hand of its surface
 #
-# with Fresnel's F and theta the angle of incidence. The waves' slopes are left out: their mean
-# surface is this plane, and no facet of theirs faces a sensor on a car but right beside it. Objects
-# that a beam would meet by way of the mirror are left out, too: such returns, of mirror images
-# below
-# the street, are few and weak.
+# with Fresnel's F and theta the angle of incidence. Left out: the waves' slopes, as no facet of
+# theirs faces a sensor on a car but right beside it, and mirror images of objects, which are few
+# and weak.
 
 # Absorption of pure water at 905 nm. Kou, Labrie and Chylek (1993, "Refractive indices of water and
 # ice in the 0.65- to 2.5-um spectral region") have 6.8/m at 900 nm and 14/m at 925 nm; warm water
@@ -540,7 +501,7 @@ def meet_water(
     return WaterEcho(rows, surface, np.where(is_bed, ranges, surface), kept, is_bed, mud)
 
 
-# ---- apply ---------------------------------------------------------------------------------------
+# ---- The sweep -----------------------------------------------------------------------------------
 
 DEFAULT_MODEL = LidarModel()
 MIN_FACING = 0.02  # cosine
@@ -556,13 +517,10 @@ def weathered_sweep(
 ) -> LidarSweep:
     """The sweep of a frame as the recipe's weather would have let the sensor take it.
 
-    All columns of the source with their names, types and order, of which x, y, z and the intensity
-    change where the weather changed them, and two more: `source_index` int32, `weather_code` uint8
-    (see codes). Other columns say what they said: the class of a return that moved onto the snow is
-    still that of what lies beneath. Coordinates of whole numbers become float64, since lost returns
-    have none.
-
-    Depends on the recipe, the scene and the frame only. Safe to call from several threads.
+    All columns of the source, of which x, y, z and the intensity change where the weather changed
+    them, and `source_index` int32, `weather_code` uint8 (see codes). The class of a return that
+    moved onto the snow is still that of what lies beneath. Coordinates of whole numbers become
+    float64, since lost returns have none. Safe to call from several threads.
 
     Raises:
         SceneError: the weather cannot be placed in this scene. ValueError: the sweep has a column
@@ -585,7 +543,7 @@ def weathered_sweep(
     if plan.smog is not None:
         rng = rng_for(seed=recipe.seed, scene=scene.name, frame=frame_index, effect="lidar.smog")
         _meet_smog(echoes, medium_for(plan.smog, model), model, rng)
-    echoes.lose_what_is_too_faint(model)
+    echoes.lose_faint(model)
     return echoes.sweep()
 
 
@@ -615,7 +573,8 @@ def _meet_smog(
     echoes: Echoes, medium: SmogMedium, model: LidarModel, rng: np.random.Generator
 ) -> None:
     eyes_z, air = echoes.origins[:, 2], echoes.air_m
-    tau = optical_depth(medium, air, eyes_z, eyes_z + air * echoes.directions[:, 2])
+    ends_z = eyes_z + air * echoes.directions[:, 2]
+    tau = optical_depth_of_arrays(medium, air, eyes_z, ends_z, series_below=1e-4)
     echoes.gain *= np.exp(-2 * tau)
     scatter = scatter_before(medium, eyes_z, air, model, rng)
     echo = signal(echoes.reflectance * echoes.gain, np.maximum(echoes.ranges_m, 1e-3))

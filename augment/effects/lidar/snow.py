@@ -1,10 +1,8 @@
 """Lying snow as a LiDAR meets it: beams end on its surface, which is bright at 905 nm.
 
-The layer is that of the images: the same bed, profile and seed, so that drifts, patches and wheel
-tracks are where the pictures have them. It is less smooth by what the images' layer evens out of
-the ground beneath, and its grid has cells of GRID_M. Snow on moving things moves with them.
-
-Snow that is falling is not in a recipe, and not here.
+The layer is that of the images: the same support, profile and seed, so that drifts, patches and
+wheel tracks are where the pictures have them. It is less smooth by what the images' layer evens out
+of the ground beneath, and its grid has cells of GRID_M. Snow on moving things moves with them.
 """
 
 from __future__ import annotations
@@ -20,12 +18,10 @@ import numpy as np
 
 from augment.effects.lidar import snow_kernels
 from augment.effects.snow.cells import SnowCells, SnowSupport
-from augment.effects.snow.layer import find_depths
-from augment.effects.snow.profile import profile_of
+from augment.effects.snow.layer import find_depths, profile_on
 from augment.effects.snow.snow import PlacedSnow, placement_settings
-from augment.effects.snow.support import bed_of
+from augment.effects.snow.support import support_of
 from augment.labels import LidarSweep
-from augment.rng import rng_for
 from augment.scene import Scene
 
 # Fresh snow gives back 0.95 of visible light and 0.90 at 0.9 um; old, coarse snow 0.9 and 0.7
@@ -89,11 +85,11 @@ def snow_in(scene: Scene, placed: PlacedSnow) -> LidarSnow:
     """
     with _lock:
         layers = _layers.setdefault(scene, OrderedDict())
-        bed = bed_of(scene, placement_settings(placed.snow))
+        support = support_of(scene, placement_settings(placed.snow))
         laid_on, snow = layers.get(placed, (None, None))
-        if snow is None or laid_on is not bed:
-            snow = _lay(bed, scene, placed)
-            layers[placed] = (bed, snow)
+        if snow is None or laid_on is not support:
+            snow = _lay(support, scene, placed)
+            layers[placed] = (support, snow)
         layers.move_to_end(placed)
         while len(layers) > _MAX_LAYERS:
             layers.popitem(last=False)
@@ -159,35 +155,23 @@ def _meet(
     part_from_world[:3, :3] = world_from_part[:3, :3].T
     part_from_world[:3, 3] = -world_from_part[:3, :3].T @ world_from_part[:3, 3]
     snow_kernels.meet_layer(
-        origins,
-        directions,
-        hits,
-        part_from_world[:3].copy(),
+        *(origins, directions, hits, part_from_world[:3].copy()),
         np.array([world_from_part[0, 3], world_from_part[1, 3], radius_m]),
-        layer.corner,
-        layer.cell_m,
-        layer.base,
-        layer.top,
-        layer.highest,
-        slack_m,
+        *(layer.corner, layer.cell_m, layer.base, layer.top, layer.highest, slack_m),
     )
 
 
-def _lay(bed: SnowSupport, scene: Scene, placed: PlacedSnow) -> LidarSnow:
+def _lay(support: SnowSupport, scene: Scene, placed: PlacedSnow) -> LidarSnow:
     def layer(cells: SnowCells, track_id: str | None) -> Layer | None:
-        # As augment.effects.snow.layer draws them: another key would be another layer.
-        part = "ground" if track_id is None else f"actor {track_id}"
-        rng = rng_for(seed=placed.seed, scene=scene.name, effect=f"snow.layer of {part}")
-        profile = profile_of(
-            placed.snow, rng, on_ground=track_id is None, water_level_z_m=placed.water_level_z_m
-        )
+        given = (placed.snow, placed.seed, placed.water_level_z_m)
+        profile, rng = profile_on(track_id, scene, *given)
         seed = rng.integers(0, 2**64, dtype=np.uint64)
         grid_m = GRID_M if track_id is None else min(GRID_M, placed.snow.cell_m)
         return layer_of(cells, find_depths(cells, profile, seed).heights, grid_m=grid_m)
 
-    actors = {track_id: layer(cells, track_id) for track_id, cells in bed.actors.items()}
+    actors = {track_id: layer(cells, track_id) for track_id, cells in support.actors.items()}
     return LidarSnow(
-        ground=layer(bed.ground, None),
+        ground=layer(support.ground, None),
         actors={track_id: laid for track_id, laid in actors.items() if laid is not None},
         reflectance=ALBEDO_AT_905 * placed.snow.albedo,
     )

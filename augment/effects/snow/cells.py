@@ -1,6 +1,6 @@
 """Where snow can lie in a scene: cells of surfaces that are open to the sky, found once.
 
-A bed knows nothing of a recipe's depth: snow of any depth is laid on the same bed.
+A support knows nothing of a recipe's depth: snow of any depth is laid on the same support.
 """
 
 from __future__ import annotations

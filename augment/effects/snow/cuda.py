@@ -30,7 +30,7 @@ from augment.effects.snow.near_camera import (
     Crystals,
     Grain,
     Layer,
-    SnowCover,
+    SnowLayers,
     finest_split,
     noise_table,
     shift_m,
@@ -53,9 +53,9 @@ _MIN_ROWS = 1 << 14  # of a column that is the same for every splat
 
 
 def pose_layers(
-    cover: SnowCover, covered: Sequence[tuple[Layer, PosedGaussians]], camera: Camera
+    snow: SnowLayers, covered: Sequence[tuple[Layer, PosedGaussians]], camera: Camera
 ) -> list[PosedGaussians]:
-    """Layers that have splats where their parts stand, as `SnowCover.parts_for` lists them.
+    """Layers that have splats where their parts stand, as `SnowLayers.parts_for` lists them.
 
     What differs from frame to frame goes to the GPU in one upload; the rest stays there.
     """
@@ -63,15 +63,15 @@ def pose_layers(
         return []
     layers = [layer for layer, _ in covered]
     poses = part_poses([part.world_from_part for _, part in covered])
-    sun = np.array(cover.sun)
+    sun = np.array(snow.sun)
     suns = sun @ poses[:, :3, :3]
     eyes_m = ((camera.centre.numpy() - poses[:, :3, 3])[:, None] @ poses[:, :3, :3])[:, 0]
 
     by_normals = [number for number, layer in enumerate(layers) if layer.normals is not None]
-    light = plan_light([layers[number] for number in by_normals], suns[by_normals], cover.wrap)
-    ground, split = cover.ground, None
+    light = plan_light([layers[number] for number in by_normals], suns[by_normals], snow.wrap)
+    ground, split = snow.ground, None
     if ground in layers and ground.normals is None:
-        split = plan_split(ground.gaussians, ground.slopes, camera, sun, cover.grain)
+        split = plan_split(ground.gaussians, ground.slopes, camera, sun, snow.grain)
     glints = plan_glints([layer.crystals for layer in layers], suns, eyes_m)
 
     sent = _sent(*(() if plan is None else plan.arrays for plan in (light, split, glints)))
@@ -98,7 +98,7 @@ def pose_layers(
                 part.world_from_part,
                 part.instance_id,
                 is_snow=True,
-                shading=None if added is None else SplatShading(added, direction, cover.wrap),
+                shading=None if added is None else SplatShading(added, direction, snow.wrap),
             )
             for splats, added in drawn
         ]

@@ -34,8 +34,9 @@ _COARSER = tl.constexpr(cpu.COARSER)
 _CRUMB_SHARE, _CLOD_SHARE = tl.constexpr(cpu.CRUMB), tl.constexpr(cpu.CLOD)
 _TABLE = tl.constexpr(near_camera.TABLE)
 # Numbers of a view, after camera_from_part's rotation: the eye (3, and the 3 remainders that
-# float32 could not hold), lowest and highest x / z, then y / z; see `kernels.split`; the sun's level
-# direction times half a step, metres; where the eye lies in the noise, texels: of crumbs, of clods.
+# float32 could not hold), lowest and highest x / z, then y / z; see `kernels.split`; the sun's
+# level direction times half a step, metres; where the eye lies in the noise, texels: of crumbs, of
+# clods.
 _EYE, _LIMITS, _FINEST, _RELIEF, _MOTTLE, _SUN, _CRUMB, _CLOD = (
     tl.constexpr(k) for k in (9, 15, 19, 20, 21, 22, 24, 26)
 )
@@ -215,7 +216,7 @@ def light_splats(rows, numbers, lit, BLOCK: tl.constexpr):
     """SH of the splats of layer program_id(1), BLOCK of them a program.
 
     rows int64 [L, 5]: addresses of normals, slopes and SH; how many splats, and the place of the
-    first in lit [S, 3], written. numbers float32 [L, 4]: the sun (unit, in the layer's frame), wrap.
+    first in lit [S, 3], written. numbers float32 [L, 4]: the sun (unit, layer's frame), wrap.
     """
     layer, first = tl.program_id(1), tl.program_id(0) * BLOCK
     row, view = rows + layer * 5, numbers + layer * 4

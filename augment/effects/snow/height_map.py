@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from augment.cameras import Camera
-from augment.effects.snow import surface_kernels as visibility_kernels
+from augment.effects.snow import surface_kernels
 from augment.render.buffers import (
     ALPHA,
     AUTO,
@@ -37,8 +37,7 @@ from augment.render.threads import kernel_threads, thread_count
 from augment.scene import Gaussians, PosedGaussians
 from augment.semantics import SemanticClass
 
-# ------------------------------------------------------------------------------------------------
-# Work of placing snow on several threads, with the GPU left to the thread that waits for them
+# ---- Work on several threads, with the GPU left to the thread that waits for them ----------------
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -128,7 +127,7 @@ def _answer_until(one: Future[Result], calls: SimpleQueue[Callable[[], object]])
         calls.get()()
 
 
-# ---- height map ----------------------------------------------------------------------------------
+# ---- What lies highest ---------------------------------------------------------------------------
 
 Estimator = Literal["mode", "expected", "median"]
 
@@ -177,14 +176,10 @@ class HeightMap:
 
 def plain_gaussians(gaussians: Gaussians) -> Gaussians:
     """float32, with the colour that all directions share, without gradients."""
-    return Gaussians(
-        means=_plain(gaussians.means),
-        quats=_plain(gaussians.quats),
-        scales=_plain(gaussians.scales),
-        opacities=_plain(gaussians.opacities),
-        sh=_plain(gaussians.sh[:, :1]),
-        semantic=gaussians.semantic,
-    )
+    g = gaussians
+    columns = (g.means, g.quats, g.scales, g.opacities, g.sh[:, :1])
+    plain = (c.detach().to(torch.float32).contiguous() for c in columns)
+    return Gaussians(*plain, semantic=g.semantic)
 
 
 def classes_of(gaussians: Gaussians) -> np.ndarray:
@@ -238,13 +233,13 @@ def draw_from_above(
     cell_m: float,
     shape: tuple[int, int],
     estimator: Estimator,
-    wanted: np.ndarray | None = None,
+    pixel_mask: np.ndarray | None = None,
     with_thin: bool = True,
     top_m: float | None = None,
     backend: str = AUTO,
 ) -> HeightMap:
     """Draw parts of plain Gaussians from above. corner_m: least x and y. shape: rows and columns of
-    cells. wanted: bool of that shape; the others may be left empty. with_thin: what is thin is
+    cells. pixel_mask: bool of that shape; the others may be left empty. with_thin: what is thin is
     looked for. top_m: as `top_of` finds it, where that is known. backend: that draws.
 
     A pixel of the drawing is opaque for the share that is truly covered; a second drawing, in which
@@ -259,18 +254,11 @@ def draw_from_above(
     pose[1, 1] = pose[2, 2] = -1.0  # x to +x, rows towards -y, depth downwards
     eye = torch.tensor([*middle, top + _EYE_ABOVE_M], dtype=torch.float64)
     pose[:3, 3] = -pose[:3, :3] @ eye
-    camera = Camera(
-        "from above",
-        columns,
-        rows,
-        1 / cell_m,
-        1 / cell_m,
-        columns / 2,
-        rows / 2,
-        pose,
-        is_orthographic=True,
-    )
-    shown = None if wanted is None else torch.from_numpy(np.ascontiguousarray(wanted[::-1]))
+    lens = (1 / cell_m, 1 / cell_m, columns / 2, rows / 2)
+    camera = Camera("from above", columns, rows, *lens, pose, is_orthographic=True)
+    shown = None
+    if pixel_mask is not None:
+        shown = torch.from_numpy(np.ascontiguousarray(pixel_mask[::-1]))
     names = (ALPHA, DEPTH_ESTIMATORS[estimator], MEDIAN_DEPTH, RGB, SPLAT_IDS)
     alpha, depths, medians, rgb, ids = _draw(
         parts, camera, names, shown, antialiased=cell_m <= _TRUE_M, backend=backend
@@ -307,7 +295,7 @@ def _draw(
     parts: Sequence[PosedGaussians],
     camera: Camera,
     names: tuple[str, ...],
-    wanted: torch.Tensor | None,
+    pixel_mask: torch.Tensor | None,
     *,
     antialiased: bool,
     backend: str,
@@ -315,7 +303,7 @@ def _draw(
     """Buffers of a view from above, rows towards +y."""
     # Other depths than the mode's are for comparing them: rather slower with all buffers, which
     # takes a kernel of the CPU that there is, than at once after one has been compiled for each.
-    asked = names if MODE_DEPTH in names else BUFFERS
+    asked, mask = names if MODE_DEPTH in names else BUFFERS, pixel_mask
 
     def draw() -> list[np.ndarray]:
         out = rasterize(
@@ -324,7 +312,7 @@ def _draw(
             buffers=asked,
             settings=RasterSettings(sh_degree=0, antialiased=antialiased),
             clip=UNCUT,
-            pixel_mask=gpu.upload(wanted) if wanted is not None and backend == CUDA else wanted,
+            pixel_mask=gpu.upload(mask) if mask is not None and backend == CUDA else mask,
             backend=backend,
         )
         return [getattr(out, name).cpu().numpy() for name in names]
@@ -337,10 +325,6 @@ def _heights(alpha: np.ndarray, depths: np.ndarray, eye_z_m: float) -> tuple[np.
     covered = (alpha >= COVERED) & (depths > 0) & np.isfinite(depths)
     height = np.where(covered, eye_z_m - depths.astype(np.float64), 0.0)
     return covered, height.astype(np.float32)
-
-
-def _plain(tensor: torch.Tensor) -> torch.Tensor:
-    return tensor.detach().to(torch.float32).contiguous()
 
 
 def _top_m(part: PosedGaussians) -> float:
@@ -365,7 +349,7 @@ _VIEW_ROWS = 256  # points a thread takes at a time
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """Cameras with the depth that they see. See visibility_kernels.find_seen.
+    """Cameras with the depth that they see. See surface_kernels.find_seen.
 
     on_gpu: depths lie there, and that is where points are looked at.
     """
@@ -403,16 +387,11 @@ class Views:
             return on_device(lambda: cuda.find_seen(points, normals, is_sure, *given), CUDA)
         seen = np.empty(len(points), bool)
         with kernel_threads(_VIEW_ROWS):
-            visibility_kernels.find_seen(
+            surface_kernels.find_seen(
                 np.ascontiguousarray(points),
                 np.ascontiguousarray(normals),
                 np.ascontiguousarray(is_sure),
-                self.views,
-                self.sizes,
-                self.depths.numpy(),
-                lifts,
-                tolerances,
-                seen,
+                *(self.views, self.sizes, self.depths.numpy(), lifts, tolerances, seen),
             )
         return seen
 

@@ -149,16 +149,16 @@ def count_splats(neighbours, sizes, centers, heights, tops, counts):
 
 
 @inner()
-def _slope(i, axis, neighbours, size, bed_slope, centers, tops):
+def _slope(i, axis, neighbours, size, ground_slope, centers, tops):
     """Rise of the surface per metre along x (axis 0) or y (1)."""
     before, run_before = _beyond(i, 2 * axis, neighbours, size, centers, tops)
     after, run_after = _beyond(i, 2 * axis + 1, neighbours, size, centers, tops)
-    if run_before < size:  # the bed's own height where the layer ends, not its middle's
-        before -= run_before * bed_slope
+    if run_before < size:  # the support's own height where the layer ends, not its middle's
+        before -= run_before * ground_slope
     if run_after < size:
-        after += run_after * bed_slope
+        after += run_after * ground_slope
     if run_before == 0.0 and run_after == 0.0:
-        return bed_slope
+        return ground_slope
     if run_before == 0.0:
         return (after - tops[i]) / run_after
     if run_after == 0.0:
@@ -205,19 +205,19 @@ def _turn(nx, ny, nz, s, quats):
 
 
 @inner()
-def _shade(s, normal, tints, packed, seen, lights, look, sh, normals, slopes):
+def _shade(s, normal, tints, packed, seen, lights, colors, sh, normals, slopes):
     """Colour of Gaussian s: by its normal, or what the light's share is added to.
 
     tints: of red, green and blue. packed: 0 to 1, darker. seen: share of the sun.
     """
     share = normal[0] * lights[0, 0] + normal[1] * lights[0, 1] + normal[2] * lights[0, 2]
-    share = min(max((share + look.wrap) / (1.0 + look.wrap), 0.0), 1.0)
+    share = min(max((share + colors.wrap) / (1.0 + colors.wrap), 0.0), 1.0)
     # Packed snow gives back less of every colour alike: what is grey has the tint of the light.
     left = 1.0 - packed * (1.0 - PACKED_SHARE)
     for c in range(3):
         shadow = tints[c] * left * lights[2, c]
         rise = tints[c] * left * (lights[1, c] - lights[2, c]) * seen
-        baked = share if look.is_baked else 0.0
+        baked = share if colors.is_baked else 0.0
         sh[s, 0, c] = np.float32((shadow + rise * baked - 0.5) / SH_C0)
         if len(slopes) > 0:
             slopes[s, c] = np.float32(rise)
@@ -237,8 +237,8 @@ def _rough(normal, amount, draw, number):
 
 @kernel
 def fill(
-    centers, bed_normals, sizes, neighbours, tracks, light, heights, mottle, draws, tops, firsts,
-    lights, look, means, quats, scales, sh, normals, slopes,
+    centers, ground_normals, sizes, neighbours, tracks, light, heights, mottle, draws, tops, firsts,
+    lights, colors, means, quats, scales, sh, normals, slopes,
 ):  # fmt: skip
     """The Gaussians of every covered cell, from index firsts[i] on.
 
@@ -250,9 +250,9 @@ def fill(
             continue
         size, draw, h = np.float64(sizes[i]), draws[i], np.float64(heights[i])
         x, y = np.float64(centers[i, 0]), np.float64(centers[i, 1])
-        up = np.float64(bed_normals[i, 2])
-        gx = _slope(i, 0, neighbours, size, -bed_normals[i, 0] / up, centers, tops)
-        gy = _slope(i, 1, neighbours, size, -bed_normals[i, 1] / up, centers, tops)
+        up = np.float64(ground_normals[i, 2])
+        gx = _slope(i, 0, neighbours, size, -ground_normals[i, 0] / up, centers, tops)
+        gy = _slope(i, 1, neighbours, size, -ground_normals[i, 1] / up, centers, tops)
         steep = math.sqrt(gx * gx + gy * gy)
         if steep > LEAN:
             gx, gy, steep = gx * LEAN / steep, gy * LEAN / steep, LEAN
@@ -263,8 +263,8 @@ def fill(
         at_rim = in_x != 0 or in_y != 0
         spread = RIM_SPREAD if at_rim else SPREAD + (STEEP_SPREAD - SPREAD) * min(steep, 1.0)
         spread *= size
-        spread *= 1.0 + 0.2 * look.grain * abs(_uniform(draw, 0))
-        # On steep sides discs are long, and scattered ones would look like fur.
+        spread *= 1.0 + 0.2 * colors.grain * abs(_uniform(draw, 0))
+        # On steep sides discs are long, and scattered ones would colors like fur.
         shift = (0.5 if at_rim else max(1.0 - 1.2 * steep, 0.1)) * SHIFT * size
         dx, dy = shift * _uniform(draw, 1), shift * _uniform(draw, 2)
         dx += DRAWN_IN * size * in_x if in_x < 2 else 0.0
@@ -279,17 +279,17 @@ def fill(
         scales[s, 0], scales[s, 1], scales[s, 2] = spread * longer, spread, thick
 
         bend = min(max(_hollow(i, neighbours, size, tops), -MAX_BEND), MAX_BEND)
-        pale = 1.0 + (PALE + PALE_GRAIN * look.grain) * _uniform(draw, 3) + MOTTLED * mottle[i]
+        pale = 1.0 + (PALE + PALE_GRAIN * colors.grain) * _uniform(draw, 3) + MOTTLED * mottle[i]
         pale *= 1.0 - THIN_LOSS * math.exp(-h / THIN_M)
         loss = SHADED_HOLLOW * bend
         tints = (pale * (1.0 - loss), pale * (1.0 - 0.8 * loss), pale * (1.0 - 0.55 * loss))
         dirt = min(max(0.8 + 0.2 * mottle[i] + 0.15 * _uniform(draw, 4), 0.3), 1.0)
-        packed = look.packed * tracks[i] * tracks[i] * dirt
+        packed = colors.packed * tracks[i] * tracks[i] * dirt
         seen = min(max((light[i] - DARKEST) / (BRIGHTEST - DARKEST), 0.0), 1.0)
         seen = seen * seen * (3.0 - 2.0 * seen)
-        rough = (ROUGH + ROUGH_GRAIN * look.grain) / stretch
+        rough = (ROUGH + ROUGH_GRAIN * colors.grain) / stretch
         facing = _rough(normal, rough, draw, 5)
-        _shade(s, facing, tints, packed, seen, lights, look, sh, normals, slopes)
+        _shade(s, facing, tints, packed, seen, lights, colors, sh, normals, slopes)
 
         for side in range(4):
             count, drop = _walls(i, side, neighbours, sizes, centers, tops)
@@ -307,7 +307,7 @@ def fill(
                 scales[s, 2] = thick
                 normal = (0.8 * out_x, 0.8 * out_y, 0.6)  # of a rounded side, for its light
                 facing = _rough(normal, rough, draw, 8 + 12 * side + 3 * (k % 4))
-                _shade(s, facing, tints, packed, seen, lights, look, sh, normals, slopes)
+                _shade(s, facing, tints, packed, seen, lights, colors, sh, normals, slopes)
 
 
 @kernel

@@ -1,7 +1,6 @@
-"""Snow of a recipe's depth laid on a bed: Gaussians in the colours of its light.
+"""Snow of a recipe's depth laid on a scene's support: Gaussians in the colours of its light.
 
-Everything is a function of the bed, the recipe and the seed; a bed is laid anew in a fraction of a
-second when only the recipe changes.
+Everything is a function of the support, the recipe and the seed.
 """
 
 from __future__ import annotations
@@ -13,11 +12,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from augment.effects.snow import kernels as noise_kernels
-from augment.effects.snow import kernels as splat_kernels
+from augment.effects.snow import kernels
 from augment.effects.snow.cells import SnowCells, SnowSupport
 from augment.effects.snow.light import Illumination
-from augment.effects.snow.near_camera import Grain, Layer, SnowCover, crystals_of
+from augment.effects.snow.near_camera import Grain, Layer, SnowLayers, crystals_of
 from augment.effects.snow.profile import Octaves, Profile, profile_of
 from augment.render.threads import kernel_threads
 from augment.rng import rng_for
@@ -46,41 +44,48 @@ class LayerColors(NamedTuple):
 
 
 def build_snow_layer(
-    bed: SnowSupport,
+    support: SnowSupport,
     scene: Scene,
     snow: Snow,
     light: Illumination,
     *,
     seed: int,
     water_level_z_m: float | None = None,
-) -> SnowCover:
-    """The recipe's snow on a bed of the scene.
+) -> SnowLayers:
+    """The recipe's snow on a support of the scene.
 
     seed: of drifts, patches and grain. water_level_z_m: height of standing water, which melts what
     it reaches, in the scene's world; snow on actors is not asked.
 
-    What a tensor of the scene holds is never written to: `Layer.opacities` is the part's own tensor
-    where nothing is buried, and a copy else.
+    No tensor of the scene is written to: `Layer.opacities` is the part's own tensor where nothing
+    is buried, and a copy else.
     """
 
     def layer_of(cells: SnowCells, own: Gaussians, track_id: str | None) -> Layer:
-        part = "ground" if track_id is None else f"actor {track_id}"
-        rng = rng_for(seed=seed, scene=scene.name, effect=f"snow.layer of {part}")
-        profile = profile_of(snow, rng, on_ground=track_id is None, water_level_z_m=water_level_z_m)
+        profile, rng = profile_on(track_id, scene, snow, seed, water_level_z_m)
         return _lay(cells, own, snow, light, profile, rng, moves=track_id is not None)
 
     actors = {actor.track_id: actor.gaussians for actor in scene.actors}
-    return SnowCover(
-        ground=layer_of(bed.ground, scene.background, None),
+    return SnowLayers(
+        ground=layer_of(support.ground, scene.background, None),
         actors={
             track_id: layer_of(cells, actors[track_id], track_id)
-            for track_id, cells in bed.actors.items()
+            for track_id, cells in support.actors.items()
         },
         sun=light.sun,
         wrap=light.wrap,
         thickness_m=snow.depth_m,
         grain=_grain(snow, scene, light, seed),
     )
+
+
+def profile_on(
+    track_id: str | None, scene: Scene, snow: Snow, seed: int, water_level_z_m: float | None
+) -> tuple[Profile, np.random.Generator]:
+    """The profile of the snow on an actor or the ground (None), and its own random numbers."""
+    part = "ground" if track_id is None else f"actor {track_id}"
+    rng = rng_for(seed=seed, scene=scene.name, effect=f"snow.layer of {part}")
+    return profile_of(snow, rng, on_ground=track_id is None, water_level_z_m=water_level_z_m), rng
 
 
 def _grain(snow: Snow, scene: Scene, light: Illumination, seed: int) -> Grain:
@@ -102,7 +107,7 @@ def _lay(
 ) -> Layer:
     """The snow on one part. own: the part's Gaussians."""
     per_pixel = snow.shading == "per_pixel"
-    look = LayerColors(
+    colors = LayerColors(
         wrap=float(light.wrap),
         grain=float(snow.grain),
         packed=1.0 if profile.numbers.pressed > 0 else 0.0,
@@ -116,7 +121,7 @@ def _lay(
         depths,
         profile.numbers.depth_m,
         lights,
-        look,
+        colors,
         keep_normals=snow.sparkle > 0 or (moves and not per_pixel),
         keep_slopes=per_pixel or moves,
     )
@@ -150,16 +155,11 @@ def find_depths(cells: SnowCells, profile: Profile, seed: np.uint64) -> Depths:
     heights, mottle = np.empty((2, count), np.float32)
     draws = np.empty(count, np.uint64)
     with kernel_threads(CELLS):
-        noise_kernels.lay(
+        kernels.lay(
             *_arrays(cells.centers_m, cells.sizes_m, cells.edge_m, cells.tracks, cells.banks),
             profile.numbers,
-            _columns(profile.drifts),
-            _columns(profile.patches),
-            _columns(profile.mottle),
-            seed,
-            heights,
-            mottle,
-            draws,
+            *(_columns(octaves) for octaves in (profile.drifts, profile.patches, profile.mottle)),
+            *(seed, heights, mottle, draws),
         )
     return Depths(heights, mottle, draws)
 
@@ -169,20 +169,20 @@ def _splats(
     depths: Depths,
     depth_m: float,
     lights: np.ndarray,
-    look: LayerColors,
+    colors: LayerColors,
     *,
     keep_normals: bool,
     keep_slopes: bool,
 ) -> tuple[Gaussians, Tensor | None, Tensor | None]:
     """The Gaussians of the snow, with their normals and slopes where asked for."""
-    centers, bed_normals, sizes, neighbours, tracks = _arrays(
+    centers, ground_normals, sizes, neighbours, tracks = _arrays(
         cells.centers_m, cells.normals, cells.sizes_m, cells.neighbours, cells.tracks
     )
     heights = depths.heights
     light = _softened_light(cells, heights, depth_m)
     tops, counts = surface_heights(cells, heights), np.empty(len(cells), np.int64)
     with kernel_threads(CELLS):
-        splat_kernels.count_splats(neighbours, sizes, centers, heights, tops, counts)
+        kernels.count_splats(neighbours, sizes, centers, heights, tops, counts)
         lasts = np.cumsum(counts)
         total = int(lasts[-1]) if len(cells) else 0
         means, scales, quats, sh = (
@@ -191,20 +191,9 @@ def _splats(
         normals, slopes = (
             torch.empty(total if keep else 0, 3) for keep in (keep_normals, keep_slopes)
         )
-        splat_kernels.fill(
-            centers,
-            bed_normals,
-            sizes,
-            neighbours,
-            tracks,
-            light,
-            heights,
-            depths.mottle,
-            depths.draws,
-            tops,
-            lasts - counts,
-            lights,
-            look,
+        kernels.fill(
+            *(centers, ground_normals, sizes, neighbours, tracks, light),
+            *(heights, depths.mottle, depths.draws, tops, lasts - counts, lights, colors),
             *(t.numpy() for t in (means, quats, scales, sh, normals, slopes)),
         )
     gaussians = Gaussians(
@@ -227,9 +216,9 @@ def surface_heights(cells: SnowCells, heights: np.ndarray) -> np.ndarray:
     with kernel_threads(CELLS):
         for _ in range(MAX_STEPS):
             next_z = np.empty(len(z), np.float32)
-            splat_kernels.relax_heights(neighbours, z, next_z)
+            kernels.relax_heights(neighbours, z, next_z)
             z = next_z
-        splat_kernels.find_tops(centers, heights, z, tops)
+        kernels.find_tops(centers, heights, z, tops)
     return tops
 
 
@@ -243,7 +232,7 @@ def _softened_light(cells: SnowCells, heights: np.ndarray, depth_m: float) -> np
     with kernel_threads(CELLS):
         for _ in range(steps):
             next_light = np.empty(len(light), np.float32)
-            splat_kernels.soften(neighbours, heights, light, next_light)
+            kernels.soften(neighbours, heights, light, next_light)
             light = next_light
     return light
 
@@ -254,7 +243,7 @@ def _left_visible(cells: SnowCells, own: Gaussians, heights: np.ndarray) -> Tens
         return own.opacities
     opacities = own.opacities.detach().clone()
     with kernel_threads(CELLS):
-        splat_kernels.bury(*_arrays(cells.buried, cells.buried_by), heights, opacities.numpy())
+        kernels.bury(*_arrays(cells.buried, cells.buried_by), heights, opacities.numpy())
     return opacities
 
 

@@ -1,9 +1,8 @@
 """Snow close to the camera: discs that a pixel could tell apart are split, and show grain.
 
 A cell of 5 cm is 20 pixels wide a few metres before a car's camera. There every disc becomes a few
-that together cover what it covered, each a little brighter or darker: crumbs and clods of snow, lit
-on the side of the sun. The noise they follow belongs to the place, so that all cameras and frames
-see the same grain; it fades out with the distance before the discs grow whole again.
+that cover what it covered, each a little brighter or darker: crumbs and clods, lit on the side of
+the sun. The noise they follow belongs to the place, so that all cameras and frames see one grain.
 """
 
 from __future__ import annotations
@@ -29,8 +28,6 @@ from augment.render.sh import SH_C0
 from augment.render.threads import kernel_threads
 from augment.scene import Gaussians, PosedGaussians, Scene, SplatShading
 from augment.semantics import SemanticClass
-
-# ---- close ---------------------------------------------------------------------------------------
 
 # Splitting stops at a standard deviation of so many pixels, and of so much of the distance.
 FINEST_PX, FINEST = 5.0, 0.0038
@@ -93,16 +90,9 @@ def split_near(
     fine_slopes = torch.empty(0 if slopes is None else total, 3)
     with kernel_threads(ROWS):
         close_kernels.split(
-            chosen,
-            splits,
-            lasts - splits.astype(np.int64) ** 2,
-            camera.centre.numpy(),
-            sun_step(sun.numpy()),
-            shift_m(grain.seed),
-            noise_table(),
-            grain.amount * grain.contrast * RELIEF,
-            grain.amount * MOTTLE,
-            finest,
+            *(chosen, splits, lasts - splits.astype(np.int64) ** 2, camera.centre.numpy()),
+            *(sun_step(sun.numpy()), shift_m(grain.seed), noise_table()),
+            *(grain.amount * grain.contrast * RELIEF, grain.amount * MOTTLE, finest),
             *_arrays(gaussians, slopes),
             *_arrays(fine, fine_slopes),
         )
@@ -274,7 +264,7 @@ class Layer:
 
 
 @dataclass(frozen=True, eq=False)
-class SnowCover:
+class SnowLayers:
     """The snow in a scene. actors: layers by track_id. sun, wrap: of the light, for layers with
     slopes (world; see SplatShading). thickness_m: the layer's depth on level ground. grain: how the
     ground's snow looks from close by.

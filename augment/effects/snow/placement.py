@@ -1,13 +1,13 @@
 """Where snow can lie in a scene: cells of the surfaces that are open to the sky and seen.
 
 plan      square tiles about the cameras' path, finer near it             (tiles)
-views     what each of some cameras along the drive sees                  (visibility)
+views     what each of some cameras along the drive sees                  (height_map)
 then for squares of tiles, each with a margin of its surroundings:
-  above   heights, colours and classes from straight above                (height_map, holes)
+  above   heights, colours and classes from straight above                (height_map)
   surface where snow stays, and where its edges are                       (surface)
-  ground  light, wheel tracks, banks                                      (ground_light, ...)
-actors    the same in each vehicle's own frame                            (actor_cells)
-join      neighbours across squares, and what the cells bury              (cell_lists, buried)
+  ground  holes, light, wheel tracks, banks
+actors    the same in each vehicle's own frame                            (surface)
+join      neighbours across squares, and what the cells bury              (surface)
 """
 
 from __future__ import annotations
@@ -61,7 +61,6 @@ from augment.effects.snow.tiles import (
     plan_tiles,
     views_along,
 )
-from augment.errors import SceneError
 from augment.ground import check_metric_and_level
 from augment.labels import EGO_VEHICLE
 from augment.render.buffers import AUTO, CUDA
@@ -140,13 +139,9 @@ def _blur(values: np.ndarray, sigma: float) -> np.ndarray:
     return cv2.GaussianBlur(values, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
 
 
-# ------------------------------------------------------------------------------------------------
-# Ground that a recording does not hold, though it shows: closed where it is plain what is there
+# ---- Holes in the ground, closed where it is plain what is there ---------------------------------
 # A car's lidar does not see the ground beneath the car, and a fit of a drive that begins or ends
-# with
-# the car standing still has no Gaussians there. What lies around such a hole, and that the car
-# stood
-# on it, tell how high the ground in it is.
+# with the car standing still has no Gaussians there. What lies around such a hole tells its height.
 
 MIN_M2, MAX_M2 = 0.1, 7.0  # what is smaller is left to `surface`
 MAX_OVER_M2 = 0.6  # of that, under narrow things: lamps, not eaves
@@ -166,18 +161,18 @@ def fill_holes(
     classes: np.ndarray,
     lies: np.ndarray,
     narrow: np.ndarray,
-    wanted: np.ndarray,
+    pixel_mask: np.ndarray,
     path_xy: np.ndarray,
 ) -> tuple[HeightMap, np.ndarray]:
     """The map with the holes closed that one smooth surface surrounds, and where, bool [H, W].
 
     classes: int16 [H, W], which get those of what is around. lies: bool, where the map shows
     something that may carry snow. narrow: bool, what stands high and hides nothing below it.
-    wanted: bool, what was drawn. path_xy [P, 2]: places of the cameras.
+    pixel_mask: bool, what was drawn. path_xy [P, 2]: places of the cameras.
     """
     filled = np.zeros(lies.shape, bool)
     covered = height_map.covered
-    empty = wanted & (~covered | height_map.is_thin | narrow)
+    empty = pixel_mask & (~covered | height_map.is_thin | narrow)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(
         empty.astype(np.uint8), connectivity=4
     )
@@ -202,7 +197,7 @@ def fill_holes(
         inside = labels[window] == hole
         around = np.ones((2 * _RIM_CELLS + 1, 2 * _RIM_CELLS + 1), np.uint8)
         rim = (cv2.dilate(inside.astype(np.uint8), around) > 0) & ~inside
-        if not on_path[hole] and bool((rim & ~wanted[window]).any()):
+        if not on_path[hole] and bool((rim & ~pixel_mask[window]).any()):
             continue  # it goes on where nothing was drawn
         known = rim & covered[window] & ~height_map.is_thin[window] & ~narrow[window]
         plane, alike = _plane_around(
@@ -272,8 +267,7 @@ def _surrounds(inside: np.ndarray, alike: np.ndarray, fewest: int) -> bool:
     return len(np.unique(octants)) >= fewest
 
 
-# ------------------------------------------------------------------------------------------------
-# Wheel tracks: where the ego and the scene's vehicles drive, drawn on the cells of the ground
+# ---- Wheel tracks: where the ego and the scene's vehicles drive ----------------------------------
 
 EGO_WIDTH_M = 1.9
 WHEEL_SHARE = 0.42  # of a vehicle's width, from its middle to its wheels
@@ -414,7 +408,7 @@ def _pixels(line: np.ndarray, corner: np.ndarray, cell_m: float) -> np.ndarray:
     return np.round(pixels * 2**_SHIFT).astype(np.int32)[:, None]
 
 
-# ---- placement -----------------------------------------------------------------------------------
+# ---- The support of a scene ----------------------------------------------------------------------
 
 _SQUARE_CELLS = 1024  # on a side of what is drawn at once, about
 _MARGIN_M, _MARGIN_CELLS = EDGE_CAP_M + 0.2, 4  # drawn about it
@@ -424,7 +418,7 @@ _SURELY_BELOW_M = 0.5  # the cameras: there is ground behind what lies there, no
 
 @dataclass(frozen=True)
 class PlacementSettings:
-    """How a bed is found. cell_m: side of the cells near the path, metres; they double with the
+    """How a support is found. cell_m: side of the cells near the path, metres; they double with the
     distance from it. max_slope_deg: nothing steeper carries snow. estimator: the depth buffer that
     heights from above are taken from.
     """
@@ -455,7 +449,7 @@ def place_snow_support(
     """The cells of a scene that snow can lie on and that some of the cameras can see.
 
     Several threads work on squares of the ground, and any number gives the same bits.
-    Without cameras, or where nothing open is seen, the bed is empty. backend: "cuda" draws and
+    Without cameras, or where nothing open is seen, the support is empty. backend: "cuda" draws and
     looks on the GPU; any other on the CPU, since the torch definition would take hours. progress:
     shows a bar.
 
@@ -656,14 +650,14 @@ class _Ground:
                 chosen = None
         margin = _margin(cell)
         around = np.ones((2 * margin + 1, 2 * margin + 1), np.uint8)
-        wanted = cv2.dilate(square.inner.astype(np.uint8), around).astype(bool)
+        pixel_mask = cv2.dilate(square.inner.astype(np.uint8), around).astype(bool)
         view = draw_from_above(
             [PosedGaussians(near), *self._parked],
             corner_m=corner,
             cell_m=cell,
             shape=shape,
             estimator=self._settings.estimator,
-            wanted=wanted,
+            pixel_mask=pixel_mask,
             top_m=max(self._footprints.top_m(chosen), self._parked_top_m),
             backend=self._backend,
         )
@@ -673,7 +667,7 @@ class _Ground:
         classes[is_ground] = self._classes[ids if chosen is None else chosen[ids]]
         lies = is_ground & ~view.is_thin
         narrow = narrow_things(view, lies)
-        view, filled = fill_holes(view, classes, lies, narrow, wanted, self._path[:, :2])
+        view, filled = fill_holes(view, classes, lies, narrow, pixel_mask, self._path[:, :2])
         return view, classes, lies | filled, filled
 
     def _seen(self, surface: Surface, square: _Square, filled: np.ndarray) -> np.ndarray:
@@ -696,12 +690,8 @@ class _Ground:
 
 def _with_margin(plan: TilePlan, level: int, window: Window) -> _Square:
     margin = _margin(plan.size_m(level))
-    wide = Window(
-        window.left - margin,
-        window.bottom - margin,
-        window.width + 2 * margin,
-        window.height + 2 * margin,
-    )
+    left, bottom, twice = window.left - margin, window.bottom - margin, 2 * margin
+    wide = Window(left, bottom, window.width + twice, window.height + twice)
     own = plan.is_level(level, wide)
     inner = np.zeros_like(own)
     inner[margin:-margin, margin:-margin] = own[margin:-margin, margin:-margin]
@@ -740,20 +730,9 @@ def _parked(scene: Scene) -> list[PosedGaussians]:
 def _heights(scene: Scene) -> tuple[float, float]:
     """Lowest and highest z of anything in the background."""
     z = scene.background.means[:, 2]
-    if len(z) == 0:
-        return 0.0, 0.0
-    return float(z.min()), float(z.max())
+    return (float(z.min()), float(z.max())) if len(z) else (0.0, 0.0)
 
 
 def _no_cells() -> SnowCells:
-    return make_cells(
-        CellList.empty(),
-        np.zeros(0, np.float32),
-        CellNumbers(plan_tiles([], 1.0, (0.0, 0.0))),
-        _NOBODY,
-    )
-
-
-_NOBODY = Gaussians.empty()
-
-__all__ = ["PlacementSettings", "SceneError", "place_snow_support"]
+    numbers = CellNumbers(plan_tiles([], 1.0, (0.0, 0.0)))
+    return make_cells(CellList.empty(), np.zeros(0, np.float32), numbers, Gaussians.empty())

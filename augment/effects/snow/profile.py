@@ -23,12 +23,9 @@ from augment.effects.snow.cells import EDGE_CAP_M, SnowCells
 from recipes.weather import Snow
 
 # ---- Noise over the plane that snow's depth and patches follow: the numpy definition -------------
-# Gradient noise (Perlin 1985) with the fade curve of Perlin 2002: every point of a lattice has a
-# level gradient, drawn by a hash of its integer coordinates, and the planes of a square's four
-# corners are blended. It is a function of the place and the seed alone, takes coordinates of any
-# size up to the lattice's integers, and is as often above zero as below: its median is 0.
-#
-# A field is a sum of octaves, each with a lattice and a hash of its own.
+# Gradient noise (Perlin 1985) with the fade curve of Perlin 2002, its gradients drawn by a hash of
+# the lattice's integers: a function of the place and the seed alone, of median 0. A field is a sum
+# of octaves, each with a lattice and a hash of its own.
 
 # Standard deviation of the noise over the plane where the gradients' components are uniform in
 # [-1, 1]: the mean over a square of 4 w^2 (x^2 + y^2) / 3, w the blend of a corner at (0, 0).
@@ -145,7 +142,7 @@ def _ordered_values(lengths_m: tuple[float, ...], amplitudes: tuple[float, ...])
     return np.sort(field_of(octaves, x_m, y_m))
 
 
-# ---- profile -------------------------------------------------------------------------------------
+# ---- The depth -----------------------------------------------------------------------------------
 
 BARE_M = 0.002  # less snow than this is none
 COVERING_M = 0.004  # depth that covers all but 1/e of the surface
@@ -178,7 +175,7 @@ class Numbers(NamedTuple):
 
     depth_m: where snow lies. threshold: of the patches' noise, above which snow lies. rim: rise of
     that noise over a patch's rim. radius_m: of the shoulder. drift: of the wind, which blows
-    towards (wind_x, wind_y). pressed: share that wheels take. floor_z_m: lowest bed with snow.
+    towards (wind_x, wind_y). pressed: share that wheels take. floor_z_m: lowest support with snow.
     """
 
     depth_m: float
@@ -233,6 +230,9 @@ def profile_of(
     patches = octaves_of(_PATCHES, rng)
     threshold = threshold_of(patches, share_covered(snow))
     pressed = snow.tracks == "always" or (snow.tracks == "auto" and snow.depth_m <= AUTO_TRACKS_M)
+    floor_z_m = -1e30
+    if water_level_z_m is not None and on_ground:
+        floor_z_m = water_level_z_m + WATER_MARGIN_M
     numbers = Numbers(
         depth_m=depth_m,
         threshold=max(min(threshold, 1e9), -1e9),
@@ -242,20 +242,15 @@ def profile_of(
         wind_x=math.cos(along),
         wind_y=math.sin(along),
         pressed=PRESSED if pressed and on_ground else 0.0,
-        floor_z_m=-1e30
-        if water_level_z_m is None or not on_ground
-        else water_level_z_m + WATER_MARGIN_M,
+        floor_z_m=floor_z_m,
     )
     return Profile(numbers, drifts, patches, octaves_of(_MOTTLE, rng))
 
 
 def _joined(first: Octaves, second: Octaves) -> Octaves:
-    return Octaves(
-        *(
-            np.concatenate([getattr(first, name), getattr(second, name)])
-            for name in ("turns", "amplitudes", "lengths_m", "seeds")
-        )
-    )
+    names = ("turns", "amplitudes", "lengths_m", "seeds")
+    pairs = ([getattr(first, name), getattr(second, name)] for name in names)
+    return Octaves(*(np.concatenate(pair) for pair in pairs))
 
 
 def heights_of(cells: SnowCells, profile: Profile) -> np.ndarray:

@@ -15,16 +15,14 @@ from augment.cameras import Camera
 from augment.effects.snow.cells import SnowSupport
 from augment.effects.snow.layer import build_snow_layer
 from augment.effects.snow.light import illumination_of
-from augment.effects.snow.near_camera import SnowCover
+from augment.effects.snow.near_camera import SnowLayers
 from augment.effects.snow.placement import PlacementSettings
-from augment.effects.snow.support import bed_of
+from augment.effects.snow.support import support_of
 from augment.effects.style.style import SceneStyle
 from augment.labels import Boxes
 from augment.render.buffers import AUTO
 from augment.scene import Scene
 from recipes.weather import Snow
-
-# ---- A recipe's snow in a scene, before any of it is laid ----------------------------------------
 
 
 @dataclass(frozen=True)
@@ -38,10 +36,8 @@ class PlacedSnow:
     water_level_z_m: float | None = None
 
 
-# ---- What snow does to labelled boxes: how much of what an image shows of each is snow -----------
-# Boxes come in the dataset's world (`augment.labels`), depth and cameras in the scene's, which is
-# the
-# dataset's less `world_origin_m`.
+# ---- How much of what an image shows of labelled boxes is snow -----------------------------------
+# Boxes come in the dataset's world, which lies `world_origin_m` off the scene's.
 
 MARGIN_M = 0.05  # by which splats blur the layer's surface
 DRIFTED = 1.5  # how deep drifts make the layer, relative to its depth on level ground
@@ -79,9 +75,9 @@ def placed_in_snow(placed: PlacedBoxes, thickness_m: float) -> PlacedBoxes:
     return dataclasses.replace(placed, low_m=low, high_m=high)
 
 
-# ---- covers --------------------------------------------------------------------------------------
+# ---- Snow laid in a scene, kept for the next frame -----------------------------------------------
 
-_MAX_COVERS = 2  # of a scene, that are kept: a job goes through its variants frame by frame
+_MAX_KEPT = 2  # of a scene, that are kept: a job goes through its variants frame by frame
 
 
 def placement_settings(snow: Snow) -> PlacementSettings:
@@ -89,37 +85,30 @@ def placement_settings(snow: Snow) -> PlacementSettings:
     return PlacementSettings(cell_m=snow.cell_m, max_slope_deg=snow.max_slope_deg)
 
 
-def cover_of(
-    scene: Scene, placed: PlacedSnow, look: SceneStyle | None = None, *, backend: str = AUTO
-) -> SnowCover:
+def snow_layers_of(
+    scene: Scene, placed: PlacedSnow, style: SceneStyle | None = None, *, backend: str = AUTO
+) -> SnowLayers:
     """The snow in the scene; remembered for as long as the scene lives and no third is asked for.
 
-    look: the style that the scene wears; the snow lies in the light that it shows.
-
-    The first call finds where snow can lie, unless a bed is remembered
-    (augment.effects.snow.support), by `backend` (augment.effects.snow.placement).
+    style: the scene's style, in whose light the snow lies. backend: that finds where snow can lie,
+    unless that is known (augment.effects.snow.support).
 
     Raises:
         SceneError: snow cannot be placed in this scene, or not with cells this small.
     """
-    covers = _covers.setdefault(scene, OrderedDict())
-    bed = bed_of(scene, placement_settings(placed.snow), backend=backend)
-    laid_on, cover = covers.get((placed, look), (None, None))
-    if cover is None or laid_on is not bed:
-        cover = build_snow_layer(
-            bed,
-            scene,
-            placed.snow,
-            illumination_of(scene if look is None else look.lighting_scene, placed.snow),
-            seed=placed.seed,
-            water_level_z_m=placed.water_level_z_m,
-        )
-        covers[placed, look] = (bed, cover)
-    covers.move_to_end((placed, look))
-    while len(covers) > _MAX_COVERS:
-        covers.popitem(last=False)
-    return cover
+    laid = _laid.setdefault(scene, OrderedDict())
+    support = support_of(scene, placement_settings(placed.snow), backend=backend)
+    laid_on, layers = laid.get((placed, style), (None, None))
+    if layers is None or laid_on is not support:
+        light = illumination_of(scene if style is None else style.lighting_scene, placed.snow)
+        own = {"seed": placed.seed, "water_level_z_m": placed.water_level_z_m}
+        layers = build_snow_layer(support, scene, placed.snow, light, **own)
+        laid[placed, style] = (support, layers)
+    laid.move_to_end((placed, style))
+    while len(laid) > _MAX_KEPT:
+        laid.popitem(last=False)
+    return layers
 
 
-_Covers = OrderedDict[tuple[PlacedSnow, SceneStyle | None], tuple[SnowSupport, SnowCover]]
-_covers: WeakKeyDictionary[Scene, _Covers] = WeakKeyDictionary()
+_Laid = OrderedDict[tuple[PlacedSnow, SceneStyle | None], tuple[SnowSupport, SnowLayers]]
+_laid: WeakKeyDictionary[Scene, _Laid] = WeakKeyDictionary()

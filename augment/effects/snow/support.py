@@ -1,4 +1,4 @@
-"""Beds found once: remembered for as long as the scene lives, and kept in a folder."""
+"""Where snow can lie, found once: remembered while the scene lives, and kept in a folder."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from augment.jobs.atomic import write_atomic
 from augment.render.buffers import AUTO, CUDA
 from augment.scene import Gaussians, Scene
 
-# ---- Beds as files: what was found once is found again by the content it was found from ----------
+logger = logging.getLogger(__name__)
 
-# Raised whenever the same scene would give another bed, or a file hold it otherwise.
+# Raised whenever the same scene would give another support, or a file hold it otherwise.
 FORMAT = "climategs-snow-bed-5"
 _ABOUT = "snow_bed"
 _DTYPES = {
@@ -39,11 +39,11 @@ _DTYPES = {
 _COLUMNS = {"centers_m": 3, "normals": 3, "neighbours": 4, "banks": 2, "buried_by": 5}
 
 
-def bed_key(
+def support_key(
     scene: Scene, cameras: Sequence[Camera], settings: PlacementSettings, *, backend: str = AUTO
 ) -> str:
-    """Hex digest of all that a bed depends on: Gaussians, tracks, cameras, poses, settings, what
-    places it (the GPU rounds otherwise than the CPU), and the version of this code. Of colours,
+    """Hex digest of all that a support depends on: Gaussians, tracks, cameras, poses, settings,
+    what places it (the GPU rounds otherwise than the CPU), and the version of this code. Of colours,
     what all directions share. Order of the cameras counts.
     """
     digest = hashlib.blake2b(FORMAT.encode(), digest_size=20)
@@ -66,27 +66,25 @@ def bed_key(
     return digest.hexdigest()
 
 
-def save_bed(path: Path, bed: SnowSupport, key: str) -> None:
-    """Write a bed, as a whole or not at all; its bytes are those of its content. Seconds are not
-    kept.
+def save_support(path: Path, support: SnowSupport, key: str) -> None:
+    """Write a support, as a whole or not at all, without its seconds: equal ones are equal bytes.
 
     Raises:
         OutputError: the system refused (disk full, no permission ...); `path` is then as it was.
     """
-    tensors = _named("ground", bed.ground)
-    for number, cells in enumerate(bed.actors.values()):
+    tensors = _named("ground", support.ground)
+    for number, cells in enumerate(support.actors.values()):
         tensors |= _named(f"actors.{number}", cells)
-    about = {"format": FORMAT, "key": key, "track_ids": list(bed.actors)}
+    about = {"format": FORMAT, "key": key, "track_ids": list(support.actors)}
     # A single entry: several are written in any order.
     write_atomic(path, save(tensors, metadata={_ABOUT: json.dumps(about, sort_keys=True)}))
 
 
-def load_bed(path: Path, key: str) -> SnowSupport:
-    """The bed of a file.
+def load_support(path: Path, key: str) -> SnowSupport:
+    """The support of a file.
 
     Raises:
-        SceneError: there is no such file, it is damaged or no bed's, or it was made from something
-            else than `key` says.
+        SceneError: there is no such file, it is damaged or no snow bed, or not that of `key`.
     """
     try:
         with safe_open(path, framework="pt") as file:
@@ -109,8 +107,7 @@ def load_bed(path: Path, key: str) -> SnowSupport:
 
 
 def _check_about(path: Path, about: Any, key: str) -> None:
-    if not isinstance(about, dict):
-        about = {}
+    about = about if isinstance(about, dict) else {}
     if about.get("format") != FORMAT:
         raise SceneError(
             f"{path} is no snow bed of this version: its format is {about.get('format')!r}, "
@@ -167,14 +164,10 @@ def _add(digest: hashlib.blake2b, tensor: Tensor) -> None:
     digest.update(array.view(np.uint8).data if array.size else b"")
 
 
-# ---- beds ----------------------------------------------------------------------------------------
-
-logger = logging.getLogger(__name__)
-
 _remembered: WeakKeyDictionary[Scene, dict[PlacementSettings, SnowSupport]] = WeakKeyDictionary()
 
 
-def bed_of(
+def support_of(
     scene: Scene,
     settings: PlacementSettings,
     *,
@@ -183,13 +176,12 @@ def bed_of(
     backend: str = AUTO,
     progress: bool = False,
 ) -> SnowSupport:
-    """The bed of a scene: remembered, else read from the folder, else placed and written there.
+    """The support of a scene: remembered, else read from the folder, else placed and written there.
 
-    cameras: those that must see the snow; None for all of the scene's. Only the bed of all cameras
-    is remembered under the settings alone; `remember_support` gives that place to another.
-    folder: beds are kept there as snow-<key>.safetensors. A file that cannot be used is replaced,
-    with a warning. backend: that places what is not remembered yet, see place_snow_support; a
-    scene has one bed, so that its pictures, sweeps and labels agree.
+    cameras: those that must see the snow; None for all of the scene's. folder: supports
+    are kept there as snow-<key>.safetensors; a file that cannot be used is replaced, with a
+    warning. backend: that places what is not remembered yet, see place_snow_support. A scene and
+    its settings have one support, so that its pictures, sweeps and labels agree.
 
     Raises:
         SceneError: as place_snow_support.
@@ -198,21 +190,20 @@ def bed_of(
     found = _remembered.get(scene, {}).get(settings)
     if found is not None:
         return found
-    seeing = cameras
-    if seeing is None:
-        seeing = [camera for frame in scene.frames for camera in frame.cameras.values()]
-    bed = _kept(scene, seeing, settings, folder, backend, progress)
-    remember_support(scene, settings, bed)
-    return bed
+    if cameras is None:
+        cameras = [camera for frame in scene.frames for camera in frame.cameras.values()]
+    support = _kept(scene, cameras, settings, folder, backend, progress)
+    remember_support(scene, settings, support)
+    return support
 
 
-def remember_support(scene: Scene, settings: PlacementSettings, bed: SnowSupport) -> None:
-    """Make `bed_of` give this bed for the scene and the settings from now on."""
-    _remembered.setdefault(scene, {})[settings] = bed
+def remember_support(scene: Scene, settings: PlacementSettings, support: SnowSupport) -> None:
+    """Make `support_of` give this support for the scene and the settings from now on."""
+    _remembered.setdefault(scene, {})[settings] = support
 
 
-def bed_path(folder: Path, key: str) -> Path:
-    """Where the bed of a key is kept in a folder."""
+def support_path(folder: Path, key: str) -> Path:
+    """Where the support of a key is kept in a folder."""
     return folder / f"snow-{key}.safetensors"
 
 
@@ -226,13 +217,13 @@ def _kept(
 ) -> SnowSupport:
     if folder is None:
         return place_snow_support(scene, cameras, settings, backend=backend, progress=progress)
-    key = bed_key(scene, cameras, settings, backend=backend)
-    path = bed_path(folder, key)
+    key = support_key(scene, cameras, settings, backend=backend)
+    path = support_path(folder, key)
     if path.exists():
         try:
-            return load_bed(path, key)
+            return load_support(path, key)
         except SceneError as error:
             logger.warning("the snow of %s is placed anew: %s", scene.name, error)
-    bed = place_snow_support(scene, cameras, settings, backend=backend, progress=progress)
-    save_bed(path, bed, key)
-    return bed
+    support = place_snow_support(scene, cameras, settings, backend=backend, progress=progress)
+    save_support(path, support, key)
+    return support

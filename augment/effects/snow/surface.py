@@ -32,8 +32,6 @@ from augment.render.threads import kernel_threads
 from augment.scene import Actor, Gaussians, PosedGaussians
 from augment.semantics import SemanticClass, class_of_label
 
-# ---- surface -------------------------------------------------------------------------------------
-
 STEP_M = 0.25  # lower steps do not break a layer: kerbs
 _AROUND_M = 0.4  # of a cell: steps are told by the heights within
 _NARROW_M, _HIGH_M = 0.4, 1.5  # what is so narrow and so high carries nothing: wires, arms of lamps
@@ -89,17 +87,10 @@ def find_surface(
         surface_kernels.median_heights(
             height_map.height_m, covered, int(np.clip(round(_MEDIAN_M / cell), 1, 3)), smooth
         )
+        steepest = math.tan(min(limit + _STEEPER_RAD, _STEEPEST_RAD))
         surface_kernels.fit_planes(
-            smooth,
-            covered,
-            int(np.clip(round(_SMOOTH_M / cell), 1, 5)),
-            cell,
-            _SLACK_M,
-            math.tan(min(limit + _STEEPER_RAD, _STEEPEST_RAD)),
-            _SMOOTHED_BY_M,
-            fitted,
-            slopes,
-            good,
+            *(smooth, covered, int(np.clip(round(_SMOOTH_M / cell), 1, 5)), cell, _SLACK_M),
+            *(steepest, _SMOOTHED_BY_M, fitted, slopes, good),
         )
     floor = _floor(fitted, covered & may_carry, cell) if floor_m is None else np.float32(floor_m)
     lowest, rises = _rises(fitted, covered, floor, cell)
@@ -277,8 +268,8 @@ def _gradient(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 # ---- Which Gaussians are the surface that snow lies on: it hides them where it is deep enough ----
 
-BELOW_M, ABOVE_M = 0.5, 0.08  # of the bed; above, half a cell at least
-FACING_RAD = math.radians(40)  # between a flat Gaussian's normal and the bed's
+BELOW_M, ABOVE_M = 0.5, 0.08  # of the support; above, half a cell at least
+FACING_RAD = math.radians(40)  # between a flat Gaussian's normal and the support's
 _FLAT = 0.5  # shortest axis over the next, of a flat Gaussian
 _SMALL_M, _SMALL_BELOW_M = 0.06, 0.15  # what is small and just beneath goes whichever way it faces
 _INLAND_M = 0.15  # but not near an open edge, where it may be a wall's top
@@ -295,23 +286,13 @@ class NumbersCells(Protocol):
 
 
 def find_buried(
-    gaussians: Gaussians,
-    numbers: NumbersCells,
-    *,
-    centers_m: np.ndarray,
-    normals: np.ndarray,
-    sizes_m: np.ndarray,
-    edge_m: np.ndarray,
+    gaussians: Gaussians, numbers: NumbersCells, cells: CellList
 ) -> tuple[np.ndarray, np.ndarray]:
-    """buried int32 [B] and buried_by int32 [B, 5], see SnowCells; only such as can be hidden.
-
-    centers_m float64 [C, 3], normals [C, 3], sizes_m [C], edge_m [C]: of the cells.
-    """
+    """buried int32 [B] and buried_by int32 [B, 5], see SnowCells; only such as can be hidden."""
     found = []
-    if len(centers_m):
-        cells = (centers_m, normals, sizes_m, edge_m)
+    if len(cells):
         parts = slices_of(len(gaussians))
-        found = in_order(lambda part: _find_part(gaussians, numbers, part, *cells), parts)
+        found = in_order(lambda part: _find_part(gaussians, numbers, part, cells), parts)
     return (
         np.concatenate([np.zeros(0, np.int32), *(buried for buried, _ in found)]),
         np.concatenate([np.zeros((0, 5), np.int32), *(by for _, by in found)]),
@@ -319,22 +300,17 @@ def find_buried(
 
 
 def _find_part(
-    gaussians: Gaussians,
-    numbers: NumbersCells,
-    part: slice,
-    centers_m: np.ndarray,
-    normals: np.ndarray,
-    sizes_m: np.ndarray,
-    edge_m: np.ndarray,
+    gaussians: Gaussians, numbers: NumbersCells, part: slice, cells: CellList
 ) -> tuple[np.ndarray, np.ndarray]:
     """As find_buried, of part of the Gaussians: of so few that what is found lies in the caches."""
+    normals = cells.normals
     means = gaussians.means[part].numpy().astype(np.float64)
     under = numbers.at(means[:, :2])
     index = np.flatnonzero(under >= 0)
     cell = under[index]
-    offset = means[index] - centers_m[cell]
+    offset = means[index] - cells.centers_m[cell]
     rise = (offset * normals[cell]).sum(1) / normals[cell, 2]  # above the cell's plane, along z
-    near = (rise > -BELOW_M) & (rise < np.maximum(ABOVE_M, sizes_m[cell] / 2))
+    near = (rise > -BELOW_M) & (rise < np.maximum(ABOVE_M, cells.sizes_m[cell] / 2))
     index, cell, rise = index[near], cell[near], rise[near]
     rows = torch.from_numpy(index)
     axes = rotmat_from_quat(gaussians.quats[part][rows]).numpy()  # columns: the axes
@@ -344,7 +320,7 @@ def _find_part(
     scales = np.take_along_axis(scales, order, 1)
     facing = np.abs((axes[..., 0] * normals[cell]).sum(1)) >= math.cos(FACING_RAD)
     flat = scales[:, 0] <= _FLAT * scales[:, 1]
-    small = (scales[:, 2] < _SMALL_M) & (rise > -_SMALL_BELOW_M) & (edge_m[cell] >= _INLAND_M)
+    small = (scales[:, 2] < _SMALL_M) & (rise > -_SMALL_BELOW_M) & (cells.edge_m[cell] >= _INLAND_M)
     lies = (flat & facing) | small
     index, cell, axes, scales = index[lies], cell[lies], axes[lies], scales[lies]
     over = [cell]
@@ -357,7 +333,7 @@ def _find_part(
     return (part.start + index[whole]).astype(np.int32), buried_by[whole].astype(np.int32)
 
 
-# ---- Cells taken from grids, one list after another, and made into the record of a bed -----------
+# ---- Cells taken from grids, one list after another, and made into a record ----------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -384,27 +360,15 @@ class CellList:
     @staticmethod
     def joined(lists: Sequence[CellList]) -> CellList:
         """All of them, in order."""
-        return CellList(
-            **{
-                field.name: np.concatenate([getattr(one, field.name) for one in lists])
-                for field in fields(CellList)
-            }
-        )
+        names = [field.name for field in fields(CellList)]
+        return CellList(*(np.concatenate([getattr(one, n) for one in lists]) for n in names))
 
     @staticmethod
     def empty() -> CellList:
-        none = np.zeros(0, np.float32)
-        return CellList(
-            centers_m=np.zeros((0, 3)),
-            normals=np.zeros((0, 3), np.float32),
-            sizes_m=none,
-            edge_m=none,
-            sides=np.zeros((0, 4), np.int8),
-            luminance=none,
-            tracks=none,
-            banks=np.zeros((0, 2), np.float32),
-            semantic=np.zeros(0, np.int16),
-        )
+        none, pairs = np.zeros(0, np.float32), np.zeros((0, 2), np.float32)
+        normals, sides = np.zeros((0, 3), np.float32), np.zeros((0, 4), np.int8)
+        semantic = np.zeros(0, np.int16)
+        return CellList(np.zeros((0, 3)), normals, none, none, sides, none, none, pairs, semantic)
 
 
 def cells_at(
@@ -452,24 +416,13 @@ def make_cells(
     """The record: neighbours found by their places, and the Gaussians that the cells bury."""
     neighbours = cells.sides.astype(np.int32)
     in_order(lambda part: _link(cells, numbers, part, neighbours[part]), slices_of(len(cells)))
-    buried, buried_by = find_buried(
-        gaussians,
-        numbers,
-        centers_m=cells.centers_m,
-        normals=cells.normals,
-        sizes_m=cells.sizes_m,
-        edge_m=cells.edge_m,
-    )
+    buried, buried_by = find_buried(gaussians, numbers, cells)
+    kept = ("normals", "sizes_m", "edge_m", "tracks", "banks", "semantic")
     return SnowCells(
+        **{name: torch.from_numpy(getattr(cells, name)) for name in kept},
         centers_m=torch.from_numpy(cells.centers_m.astype(np.float32)),
-        normals=torch.from_numpy(cells.normals),
-        sizes_m=torch.from_numpy(cells.sizes_m),
-        edge_m=torch.from_numpy(cells.edge_m),
         neighbours=torch.from_numpy(neighbours),
         light=torch.from_numpy(light),
-        tracks=torch.from_numpy(cells.tracks),
-        banks=torch.from_numpy(cells.banks),
-        semantic=torch.from_numpy(cells.semantic),
         buried=torch.from_numpy(buried),
         buried_by=torch.from_numpy(buried_by),
     )
@@ -484,12 +437,7 @@ DRIVEN_MAX_SLOPE_DEG = 25.0  # drivers clear their windows, and what is steeper 
 _BOTTOM_M = 0.25  # of the box: there are wheels, and the shadow on the road
 _MARGIN_M = 0.3  # beyond the box: mirrors, and boxes that are too small
 _PATCH_M2 = 0.02
-_GROUND = (
-    SemanticClass.ROAD,
-    SemanticClass.LANE_MARKING,
-    SemanticClass.SIDEWALK,
-    SemanticClass.TERRAIN,
-)
+_GROUND = tuple(SemanticClass[n] for n in ("ROAD", "LANE_MARKING", "SIDEWALK", "TERRAIN"))
 
 
 def is_vehicle(actor: Actor) -> bool:
@@ -553,19 +501,8 @@ def find_actor_cells(
     rows, columns = np.nonzero(surface.can_carry)
     if len(rows) * cell**2 < MIN_ACTOR_AREA_M2:
         return None
-    return _record(surface, rows, columns, classes[chosen], body, chosen)
-
-
-def _record(
-    surface: Surface,
-    rows: np.ndarray,
-    columns: np.ndarray,
-    classes: np.ndarray,
-    body: Gaussians,
-    chosen: np.ndarray,
-) -> SnowCells:
-    grid = surface.map
-    seen = np.where(grid.ids >= 0, classes[np.maximum(grid.ids, 0)], SemanticClass.VEHICLE)
+    grid, own_classes = surface.map, classes[chosen]
+    seen = np.where(grid.ids >= 0, own_classes[np.maximum(grid.ids, 0)], SemanticClass.VEHICLE)
     numbers = GridNumbers(grid, rows, columns)
     sides = np.where(surface.sides == RISES, FLUSH, surface.sides)
     cells = cells_at(surface, rows, columns, sides=sides, classes=seen.astype(np.int16))
@@ -588,7 +525,6 @@ class GridNumbers:
         self._numbers[rows, columns] = np.arange(len(rows), dtype=np.int32)
 
     def at(self, xy: np.ndarray) -> np.ndarray:
-        """int32 [P]: numbers of the cells under points float64 [P, 2], -1 where there is none."""
         high, wide = self._numbers.shape[:2]
         place = np.floor((xy - self._corner) / self._cell_m)
         inside = ((place >= 0) & (place < (wide, high))).all(1)

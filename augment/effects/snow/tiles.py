@@ -1,4 +1,4 @@
-"""Which squares of the world a bed is made for, how fine each is, and where its cells are kept."""
+"""Which squares of the world a support covers, how fine each is, and where its cells are kept."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from augment.errors import SceneError
 # last there are none.
 RINGS_M = (8.0, 32.0, 48.0, 80.0, 120.0)
 COARSEST_M = 1.0  # cells double up to about this size; a coarser cell_m does not double at all
-BYTES_PER_CELL = 70  # of a bed
+BYTES_PER_CELL = 70  # of a support
 MAX_BYTES = 4 << 30
 _SIDE_M = 3.2  # of a tile, about
 _PATH_STEP_M = 1.0  # camera centres closer than this are one place of the path
@@ -59,12 +59,12 @@ class TilePlan:
 
     @property
     def cells(self) -> int:
-        """Cells of all tiles; a bed holds those of them that are open ground."""
+        """Cells of all tiles; a support holds those of them that are open ground."""
         counts = np.bincount(self.levels[self.levels >= 0].astype(np.int64))
         return sum(int(n) * self.cells_per_side(k) ** 2 for k, n in enumerate(counts))
 
     def check_size(self) -> None:
-        """Raises SceneError where a bed of these tiles would take more than MAX_BYTES."""
+        """Raises SceneError where a support of these tiles would take more than MAX_BYTES."""
         if self.cells * BYTES_PER_CELL <= MAX_BYTES:
             return
         fits = self.cell_m * math.sqrt(self.cells * BYTES_PER_CELL / MAX_BYTES)
@@ -109,8 +109,8 @@ class TilePlan:
 
 
 class CellNumbers:
-    """Where each cell of a plan stands in a bed: a number for every cell of every tile, -1 where
-    the bed has none.
+    """Where each cell of a plan stands in a support: a number for every cell of every tile, -1
+    where the support has none.
     """
 
     def __init__(self, plan: TilePlan) -> None:
