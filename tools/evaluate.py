@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -51,9 +51,8 @@ ALL, DRY, WATER = "all", "dry", "water"
 _NUMBERS = ("rmse", "relative", "share")
 PANEL_PX = 640  # wide
 ERROR_GAIN = 5.0  # of the error's picture: white is a fifth of the range
-# Of the mask: what does not count, counts, went along with a box, shows water.
-_COLORS = {"not": (0, 0, 0), "counts": (190, 190, 190), "moved": (240, 160, 30)}
-_WATER = (60, 120, 230)
+# Of the mask: what counts, went along with a box, shows water; what does not count is black.
+_COUNTS, _MOVED, _WATER = (190, 190, 190), (240, 160, 30), (60, 120, 230)
 _PARTS = {ALL: "", DRY: "without water", WATER: "water only"}
 
 
@@ -109,10 +108,8 @@ def evaluate_output(
         "out": str(out),
         "frames_apart": {"short": short, "long": long},
         "lpips": None if network is None else network.name,
-        "recipes": _summaries(records, lambda r: (r["recipe"],), ("recipe",)),
-        "variants": _summaries(
-            records, lambda r: (r["scene"], r["variant"]), ("scene", "variant", "recipe")
-        ),
+        "recipes": _summaries(records, ("recipe",)),
+        "variants": _summaries(records, ("scene", "variant", "recipe")),
         "worst": [{k: v for k, v in each.items() if k != "rows"} for each in worst],
         "pairs": [{k: v for k, v in each.items() if k != "rows"} for each in records],
     }
@@ -178,7 +175,7 @@ class Views:
         self._store = store
         self._reader = RowReader(store, verify=False)
         self._paths = Companions(StoredFiles(store), _read_paths)
-        self._kept: OrderedDict[int, View] = OrderedDict()
+        self._recent: OrderedDict[int, View] = OrderedDict()
 
     def drives(self) -> list[Drive]:
         """In the manifest's order."""
@@ -222,12 +219,12 @@ class Views:
         Raises:
             OutputError: the row has no depth, or a file is missing or damaged.
         """
-        if row not in self._kept:
-            self._kept[row] = self._read(row)
-            while len(self._kept) > _KEPT:
-                self._kept.popitem(last=False)
-        self._kept.move_to_end(row)
-        return self._kept[row]
+        if row not in self._recent:
+            self._recent[row] = self._read(row)
+            while len(self._recent) > _KEPT:
+                self._recent.popitem(last=False)
+        self._recent.move_to_end(row)
+        return self._recent[row]
 
     def paths(self, row: int) -> ActorPaths:
         """Where the boxes of the row's drive are; none where it has no labels."""
@@ -283,10 +280,10 @@ def pairs_of(views: Views, drive: Drive, short: int, long: int, most: int | None
 
 def _neighbours(views: Views, rows: Sequence[int]) -> Iterator[tuple[int, int]]:
     axes = {row: views.camera(row).world_from_camera[:3, 2].numpy() for row in rows}
-    least = math.cos(math.radians(MAX_ANGLE_DEG))
+    min_cosine = math.cos(math.radians(MAX_ANGLE_DEG))
     for place, a in enumerate(rows):
         for b in rows[place + 1 :]:
-            if float(axes[a] @ axes[b]) >= least - 1e-9:
+            if float(axes[a] @ axes[b]) >= min_cosine - 1e-9:
                 yield a, b
 
 
@@ -380,17 +377,14 @@ def _record(views: Views, drive: Drive, pair: Pair, network: Lpips | None) -> di
     return record
 
 
-def _summaries(
-    records: Iterable[dict[str, Any]], key: Callable[[dict[str, Any]], tuple], named: Sequence[str]
-) -> list[dict[str, Any]]:
-    """Means over pairs with equal keys. named: what of a record its summary repeats."""
+def _summaries(records: Iterable[dict[str, Any]], names: Sequence[str]) -> list[dict[str, Any]]:
+    """Means over the pairs that have these values in common."""
     grouped: dict[tuple, list[dict[str, Any]]] = {}
     for record in records:
-        grouped.setdefault(key(record), []).append(record)
+        grouped.setdefault(tuple(record[name] for name in names), []).append(record)
     return [
         {
-            **{name: each[0][name] for name in named},
-            "effects": each[0]["effects"],
+            **{name: each[0][name] for name in (*names, "effects")},
             **{kind: _of_kind([r for r in each if r["kind"] == kind]) for kind in KINDS},
         }
         for each in grouped.values()
@@ -405,9 +399,10 @@ def _of_kind(records: list[dict[str, Any]]) -> dict[str, Any] | None:
     return {
         "pairs": len(used),
         "left_out": len(records) - len(used),
-        "seconds_apart": _mean([r["seconds_apart"] for r in used]),
-        "meters_apart": _mean([r["meters_apart"] for r in used]),
-        "moved_share": _mean([r["moved_share"] for r in used]),
+        **{
+            name: float(np.mean([r[name] for r in used])) if used else None
+            for name in ("seconds_apart", "meters_apart", "moved_share")
+        },
         **{part: _of_part(used, part) for part in (ALL, DRY, WATER)},
     }
 
@@ -429,10 +424,6 @@ def _of_part(records: list[dict[str, Any]], part: str) -> dict[str, Any] | None:
     return found
 
 
-def _mean(values: list[float]) -> float | None:
-    return float(np.mean(values)) if values else None
-
-
 def _worst(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Of each recipe and kind the pair with the largest error."""
     found: dict[tuple[str, str], dict[str, Any]] = {}
@@ -450,34 +441,22 @@ def pair_picture(views: Views, record: dict[str, Any]) -> np.ndarray:
     own = seen.a.depth_view.picture
     counts = seen.warp.counts
     error = np.abs(seen.warped - own).mean(2) * counts
-    mask = np.full(own.shape, _COLORS["not"], np.uint8)
-    mask[counts] = _COLORS["counts"]
+    mask = np.zeros(own.shape, np.uint8)
+    mask[counts] = _COUNTS
     if seen.water is not None:
         mask[counts & seen.water] = _WATER
-    mask[seen.moved] = _COLORS["moved"]
-    numbers = record["all"]
-    frames, cameras = record["frames"], record["cameras"]
+    mask[seen.moved] = _MOVED
+    numbers = record[ALL]
+    a, b = (f"{c}, frame {f}" for c, f in zip(record["cameras"], record["frames"], strict=True))
+    apart = f"{record['meters_apart']:.2f} m and {record['seconds_apart']:.2f} s apart"
+    shares = f"what counts: {100 * numbers['share']:.0f} % of the pixels"
+    error_map = color_mapped(ERROR_GAIN * error, cv2.COLORMAP_INFERNO)
+    warped = _bytes(np.where(counts[..., None], seen.warped, 0.0))
     panels = (
-        (
-            _bytes(own),
-            f"{cameras[0]}, frame {frames[0]}",
-            f"{record['scene']}, {record['variant']}",
-        ),
-        (
-            _bytes(np.where(counts[..., None], seen.warped, 0.0)),
-            f"{cameras[1]}, frame {frames[1]}, warped into it",
-            f"{record['meters_apart']:.2f} m and {record['seconds_apart']:.2f} s apart",
-        ),
-        (
-            color_mapped(ERROR_GAIN * error, cv2.COLORMAP_INFERNO),
-            f"error, x{ERROR_GAIN:g}",
-            f"RMSE {numbers['rmse']:.4f}",
-        ),
-        (
-            mask,
-            f"what counts: {100 * numbers['share']:.0f} % of the pixels",
-            "blue: water; orange: went along with a box",
-        ),
+        (_bytes(own), a, f"{record['scene']}, {record['variant']}"),
+        (warped, f"{b}, warped into it", apart),
+        (error_map, f"error, x{ERROR_GAIN:g}", f"RMSE {numbers['rmse']:.4f}"),
+        (mask, shares, "blue: water; orange: went along with a box"),
     )
     drawn = [captioned(_small(image), *texts) for image, *texts in panels]
     between = np.full((GAP_PX, 2 * drawn[0].shape[1] + GAP_PX, 3), 255, np.uint8)
@@ -497,16 +476,11 @@ def _small(image: np.ndarray) -> np.ndarray:
 
 def evaluation_text(facts: dict[str, Any]) -> str:
     """All tables."""
-    apart = facts["frames_apart"]
-    names = {
-        "short": _frames(apart["short"]),
-        "long": _frames(apart["long"]),
-        "cameras": "neighbouring cameras",
-    }
+    apart = {k: f"{n} frame{'s' * (n != 1)} apart" for k, n in facts["frames_apart"].items()}
     with_lpips = facts["lpips"] is not None
     lines = []
-    for kind, name in names.items():
-        lines += [f"{name[0].upper()}{name[1:]}", "", *_table(facts, kind, with_lpips), ""]
+    for kind, title in (*apart.items(), (CAMERAS, "Neighbouring cameras")):
+        lines += [title, "", *_table(facts, kind, with_lpips), ""]
     if with_lpips:
         lines += [
             f"LPIPS is of {facts['lpips']}, over the whole picture, in which pixels that do not "
@@ -528,9 +502,10 @@ def _table(facts: dict[str, Any], kind: str, with_lpips: bool) -> list[str]:
 def _rows(row: dict[str, Any], kind: str, with_lpips: bool) -> Iterator[list[str]]:
     """The cells of one recipe: all pixels, then those without and with water."""
     found = row[kind]
-    if found is None or found["all"] is None:
+    names = [row["recipe"], row["effects"]]
+    if found is None or found[ALL] is None:
         left_out = "0" if found is None else str(found["left_out"])
-        yield [row["recipe"], row["effects"], "0", left_out, *["–"] * (5 + 2 * with_lpips)]
+        yield [*names, "0", left_out, *["–"] * (5 + 2 * with_lpips)]
         return
     apart = f"{found['meters_apart']:.2f} m, {found['seconds_apart']:.2f} s"
     for part, title in _PARTS.items():
@@ -544,18 +519,8 @@ def _rows(row: dict[str, Any], kind: str, with_lpips: bool) -> Iterator[list[str
         if with_lpips:
             keys = ("lpips", "lpips_counted")
             numbers += [f"{each[k]['mean']:.4f}" if k in each else "–" for k in keys]
-        if part == "all":
-            yield [
-                row["recipe"],
-                row["effects"],
-                str(each["pairs"]),
-                str(found["left_out"]),
-                apart,
-                *numbers,
-            ]
+        pairs = str(each["pairs"])
+        if part == ALL:
+            yield [*names, pairs, str(found["left_out"]), apart, *numbers]
         else:
-            yield [title, "", str(each["pairs"]), "", "", *numbers]
-
-
-def _frames(count: int) -> str:
-    return f"{count} frame{'s' * (count != 1)} apart"
+            yield [title, "", pairs, "", "", *numbers]

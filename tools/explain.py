@@ -21,7 +21,7 @@ from augment.views import render_view
 from recipes.load import load_recipe
 from recipes.schema import Recipe, free_knobs, settings_of
 
-DRAWING = ("rasterise", "flood: bed", "flood: mirrored view")  # laps that run the rasteriser
+DRAWING = ("rasterise", "flood: bed", "flood: mirrored view")  # stages that run the rasteriser
 FRAME = "frame"  # the whole view
 ROUNDS = 3  # of all views; the fastest of each counts
 VIEWS = 3
@@ -171,7 +171,7 @@ def _with_weather(recipe: Recipe, **changes: Any) -> Recipe:
 
 
 def _runs(scene: Scene, cameras: Sequence[Camera], recipe: Recipe) -> list[list[dict[str, float]]]:
-    """The laps of every run of each view. A recipe's runs stand side by side, since a scene keeps
+    """The stages of every run of each view. A recipe's runs stand side by side, since a scene keeps
     the snow of two recipes at most.
     """
     for camera in cameras:

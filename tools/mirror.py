@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from adapters.base import open_scene
 from adapters.detect_format import source_tree
 from adapters.uri import parse_uri
 from augment.errors import AdapterError, OutputError
@@ -56,7 +57,8 @@ def recipes_for_source(
         read_record(tree, mirror_folder(out, variant_name(recipe)))
         if not overwrite:
             _check_format(scene, out, recipe, written_as)
-        rendered.append(_with_format(recipe, written_as))
+        output = recipe.output.model_copy(update={"image": written_as})
+        rendered.append(recipe.model_copy(update={"output": output}))
     return rendered
 
 
@@ -73,7 +75,7 @@ def mirror_outputs(
 
     scene: the one the images were rendered from. variants: names, or None for all of the scene's
     that the manifest has. Images that a copy has from other scenes of the dataset stay in it.
-    Returns what to tell: for each variant where its copy is and what it is made of.
+    Returns sentences: for each variant where its copy is and what it is made of.
 
     Raises:
         AdapterError: the scene is of no dataset, or one that cannot be copied.
@@ -81,26 +83,27 @@ def mirror_outputs(
     """
     out = out.absolute()
     tree, extent = _dataset(scene)
-    said = []
+    lines = []
     with OutputLock(out):
         found = _rows(scene, out, variants)
         try:
             for name, rows in found.items():
-                said += _mirror_rows(scene, out, tree, extent, name, rows, links, progress)
+                lines += _mirror_rows(scene, out, tree, extent, name, rows, links, progress)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(
                 "stopped while the dataset was being copied; run the same command again to go on "
                 "from there"
             ) from None
-    return said
+    return lines
 
 
 def mirror_again(out: Path, scene_uri: str | None = None, *, links: Links = "hard") -> int:
     """`climategs mirror`: opens the scene, or all that the manifest has in turn, builds the copies,
     prints. Returns the exit code."""
-    from adapters.base import open_scene
-
-    named = _scene_names(out)
+    rows = read_manifest(out).select(["source", "scene"]).to_pylist()
+    named: dict[str, list[str]] = {}  # a job can give scenes other names
+    for source, name in sorted({(row["source"], row["scene"]) for row in rows}):
+        named.setdefault(source, []).append(name)
     sources = [scene_uri] if scene_uri else sorted(named)
     if not sources:
         raise OutputError(f"{out / MANIFEST} lists no images; render some first")
@@ -110,13 +113,6 @@ def mirror_again(out: Path, scene_uri: str | None = None, *, links: Links = "har
             for sentence in mirror_outputs(dataclasses.replace(scene, name=name), out, links=links):
                 print(sentence)
     return 0
-
-
-def _scene_names(out: Path) -> dict[str, list[str]]:
-    """What the scenes are called in the manifest, by source: a job can give them other names."""
-    rows = read_manifest(out).select(["source", "scene"]).to_pylist()
-    pairs = sorted({(row["source"], row["scene"]) for row in rows})
-    return {source: [name for s, name in pairs if s == source] for source, _ in pairs}
 
 
 def _dataset(scene: Scene) -> tuple[SourceTree, Survey]:
@@ -245,17 +241,12 @@ def _check_rows(scene: Scene, out: Path, name: str, rows: list[dict[str, Any]]) 
             f"{where} shows a camera path; a dataset's copy takes images of its own frames"
         )
     if source != scene.source and not (
-        _without_path(source) == _without_path(scene.source) and _has_all(scene, rows)
+        parse_uri(source)[::2] == parse_uri(scene.source)[::2] and _has_all(scene, rows)
     ):
         raise OutputError(
             f"{where} was rendered from {source}, not from {scene.source}; name that scene, or the "
             f"same one where it is now"
         )
-
-
-def _without_path(uri: str) -> tuple[str | None, dict[str, str]]:
-    scheme, _, query = parse_uri(uri)
-    return scheme, query
 
 
 def _has_all(scene: Scene, rows: list[dict[str, Any]]) -> bool:
@@ -282,41 +273,36 @@ def _check_format(scene: Scene, out: Path, recipe: Recipe, written_as: str) -> N
         )
 
 
-def _with_format(recipe: Recipe, written_as: str) -> Recipe:
-    output = recipe.output.model_copy(update={"image": written_as})
-    return recipe.model_copy(update={"output": output})
-
-
 def _sentences(done: Mirrored, tree: SourceTree, links: Links) -> list[str]:
     replaced = len(done.replaced)
     state = f"{done.changed} files put in place" if done.changed else "up to date"
-    said = [f"dataset: {done.folder} ({state})"]
+    lines = [f"dataset: {done.folder} ({state})"]
     clear = f"; {done.images - replaced} stay clear, as recorded" if done.images > replaced else ""
-    said.append(f"  {replaced} of {done.images} camera images are weathered{clear}")
+    lines.append(f"  {replaced} of {done.images} camera images are weathered{clear}")
     if done.sweeps:
         count = sum(tree.is_sweep(place) for place in done.weathered)
         clear = f"; {done.sweeps - count} stay clear, as recorded" if done.sweeps > count else ""
-        said.append(
+        lines.append(
             f"  {count} of {done.sweeps} LiDAR sweeps are weathered"
             + (", lost returns left out" if count else "")
             + clear
         )
     if done.resized:
         (rendered, recorded) = done.resized[0]
-        said.append(
+        lines.append(
             f"  {len(done.resized)} were rendered at another size and resized, such as "
             f"{rendered[0]}x{rendered[1]} to {recorded[0]}x{recorded[1]} pixels"
         )
     if done.linked:
-        said.append(
+        lines.append(
             f"  {done.linked} files are shared with {tree.root} ({_megabytes(done.linked_size)}): "
             f"changed in place, they change there too; --links copy shares nothing"
         )
     if done.copied:
         why = ", made by --links copy or where the system cannot link" if links == "hard" else ""
-        said.append(f"  {done.copied} files are copies ({_megabytes(done.copied_size)}){why}")
+        lines.append(f"  {done.copied} files are copies ({_megabytes(done.copied_size)}){why}")
     if done.new:
-        said.append(f"  weathered images there take {_megabytes(done.new_size)} of their own")
+        lines.append(f"  weathered images there take {_megabytes(done.new_size)} of their own")
     for names, what in (
         (done.unusable, "recorded images are neither PNG nor JPEG and stay as they are"),
         (done.missing, "recorded images are no longer in the source: nothing stands for them"),
@@ -328,8 +314,8 @@ def _sentences(done: Mirrored, tree: SourceTree, links: Links) -> list[str]:
         (done.others, "files in the copy are not the source's: they are left"),
     ):
         if names:
-            said.append(f"  {len(names)} {what}; the first is {names[0]}")
-    return said
+            lines.append(f"  {len(names)} {what}; the first is {names[0]}")
+    return lines
 
 
 def _megabytes(size: int) -> str:

@@ -236,8 +236,8 @@ def _open_data(options: StyleTrainOptions) -> _Data:
     pool = TrainingPool(tuple(views), photos.train).to(options.device)  # once, for all trainers
     # Networks are scored by held-out photos where there are any, and the scenes' views.
     held_out = photos.held_out.to(options.device)
-    apart = TrainingPool(pool.views, held_out) if len(held_out) else pool
-    scored = apart.draw(
+    scored_pool = TrainingPool(pool.views, held_out) if len(held_out) else pool
+    scored = scored_pool.draw(
         generator_for(0, 0, "scores"),  # whatever the seed: trainings are compared by them
         SCORED,
         scene_share=options.scene_share,

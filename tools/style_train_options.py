@@ -108,8 +108,8 @@ class StyleTrainOptions:
             if path is not None and not path.is_file():
                 raise ClimateGSError(f"--{name.replace('_', '-')}: there is no file {path}")
         check_choice(self, "matrix", ("3x4", "3x3"))
-        least = {"steps": 1, "size_px": 16, "views": 1, "holdout": 0, "seed": 0}
-        for name, low in least.items():
+        lowest = {"steps": 1, "size_px": 16, "views": 1, "holdout": 0, "seed": 0}
+        for name, low in lowest.items():
             check_range(self, name, f"at least {low}", low)
         if self.through == "renderer" and not self.scenes:
             raise ClimateGSError("--through renderer is for scenes: add --scene URI")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import subprocess
 import sys
 
 import cv2
@@ -123,12 +122,6 @@ def test_a_view_without_pixels_or_priors_has_no_figures():
     assert mean_scores(scores) == {"scored": 0.0, "depth_pixels": 0.0}
 
 
-def test_flip_can_be_left_out():
-    scene = small_scene()
-    (score,) = evaluate_views(scene, Views(scene), KEYS[:1], with_flip=False)
-    assert math.isnan(score.flip) and score.psnr == math.inf
-
-
 def test_missing_surfaces_are_a_share_and_not_an_error():
     def everywhere(view):
         count = view.camera.width * view.camera.height
@@ -142,6 +135,7 @@ def test_missing_surfaces_are_a_share_and_not_an_error():
     scene = small_scene()
     source = Views(scene, change=everywhere)
     (score,) = evaluate_views(scene, source, KEYS[:1], with_flip=False)
+    assert math.isnan(score.flip)  # as it was left out
     surface = render_recorded(scene, source.camera(KEYS[0])).has_surface
     assert 0 < score.no_surface < 1
     assert score.no_surface == pytest.approx(1 - surface.mean())
@@ -203,6 +197,8 @@ def test_report(tmp_path):
     facts |= {"problems": ["camera left, frame 2: no image"], "settings": {"scale": 0.25}}
     folder = tmp_path / "new" / "report"
     report = write_report(folder, scene, Views(scene, change=noisy), history(), facts)
+    write_report(tmp_path, scene, Views(scene, change=noisy), history(), facts)
+    assert all((tmp_path / p.name).read_bytes() == p.read_bytes() for p in folder.iterdir())
     assert {p.name for p in folder.iterdir()} == {"report.json", "report.md", CURVES, PICTURES}
     read = json.loads((folder / "report.json").read_text(), parse_constant=pytest.fail)
     assert read == report
@@ -223,14 +219,6 @@ def test_report(tmp_path):
 
     image = cv2.imread(str(folder / PICTURES))
     assert image.shape[1] > 4 * CELL_WIDTH and image.shape[0] > 4 * CELL_WIDTH * 21 / 33
-
-
-def test_report_is_the_same_again(tmp_path):
-    scene = small_scene()
-    for name in ("a", "b"):
-        write_report(tmp_path / name, scene, Views(scene, change=noisy), history())
-    for path in (tmp_path / "a").iterdir():
-        assert path.read_bytes() == (tmp_path / "b" / path.name).read_bytes()
 
 
 def test_without_held_out_views_training_views_are_scored_and_it_says_so(tmp_path):
@@ -268,14 +256,11 @@ def fake_scores(cameras: int, each: int) -> list[ViewScore]:
     return [dataclasses.replace(score, key=key) for key in keys]
 
 
-@pytest.mark.parametrize(
-    ("cameras", "each", "frames"),
-    [(1, 9, [1, 4, 7]), (6, 10, [2, 7]), (2, 2, [0, 1]), (40, 1, [0])],
-)
-def test_chosen_views_are_few_and_spread(cameras, each, frames):
-    chosen = choose_views(fake_scores(cameras, each))
-    assert len(chosen) == min(MAX_ROWS, cameras * len(frames))
-    assert [s.key.frame for s in chosen if s.key.camera == "camera 0"] == frames
+def test_chosen_views_are_few_and_spread():
+    for cameras, each, frames in ((1, 9, [1, 4, 7]), (6, 10, [2, 7]), (2, 2, [0, 1]), (40, 1, [0])):
+        chosen = choose_views(fake_scores(cameras, each))
+        assert len(chosen) == min(MAX_ROWS, cameras * len(frames))
+        assert [s.key.frame for s in chosen if s.key.camera == "camera 0"] == frames
 
 
 def test_pictures_of_views_show_what_is_left_out(tmp_path):
@@ -308,10 +293,10 @@ def test_curves_have_a_panel_for_each_known_quantity(tmp_path):
     assert style.shape == (one.shape[0], image.shape[1], 3)
 
 
-@pytest.mark.parametrize("loss", [0.0, -1.0, 1e-30, 1e30])
-def test_curves_take_any_number(loss, tmp_path):
-    rows = [{"step": s, "seconds": s, "loss": v, "splats": 0} for s, v in ((50, loss), (100, 0.1))]
-    assert drawn(tmp_path, rows) is not None
+def test_curves_take_any_number(tmp_path):
+    for loss in (0.0, -1.0, 1e-30, 1e30):
+        rows = [{"step": n, "seconds": n, "loss": v, "splats": 0} for n, v in ((5, loss), (9, 0.1))]
+        assert drawn(tmp_path, rows) is not None
 
 
 def test_without_matplotlib_the_report_lacks_its_curves_and_says_so(tmp_path, monkeypatch, capsys):
@@ -328,16 +313,5 @@ def test_ticks_are_round_and_inside():
     assert linear_ticks(3, 3) == [3]
     assert log_ticks(0.045, 0.3) == pytest.approx([0.05, 0.1, 0.2])
     assert log_ticks(1e-4, 1e3) == pytest.approx([10.0**e for e in range(-4, 4)])
-    rng = np.random.default_rng(0)
-    for low, span in zip(rng.normal(0, 50, 200), np.exp(rng.normal(0, 5, 200)), strict=True):
-        ticks = linear_ticks(low, low + span)
-        room = 1e-6 * (abs(low) + span)  # steps are multiplied, not added: rounding only
-        assert 2 <= len(ticks) <= 8
-        assert low - room <= ticks[0] and ticks[-1] <= low + span + room
     numbers = (5000, 1.5e6, 0.02, 0.0)
     assert [short_number(v) for v in numbers] == ["5k", "1.5M", "0.02", "0"]
-
-
-def test_importing_the_report_loads_no_error_metric():
-    code = "import sys, tools.fit_report; sys.exit('flip_evaluator' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code]).returncode == 0

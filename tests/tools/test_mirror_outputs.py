@@ -157,7 +157,7 @@ def with_sweeps(root: Path, name: str = "street", frames: tuple[int, ...] = (0, 
 @pytest.fixture
 def bin_sweeps(monkeypatch):
     """The little sequence's sweeps are no pickles."""
-    found = source_trees._pandaset
+    found = source_trees._TREES["pandaset"]
     monkeypatch.setitem(
         source_trees._TREES,
         "pandaset",
@@ -205,11 +205,8 @@ def test_weathered_sweeps_stand_in_the_copy(root, tmp_path, bin_sweeps):
 
 def test_scenes_of_one_dataset_keep_each_others_sweeps(root, tmp_path, bin_sweeps):
     one, two = with_sweeps(root, "one", (0, 1)), with_sweeps(root, "two", (2,))
-    out, copy, wet = (
-        tmp_path / "out",
-        tmp_path / "out/source/wet-000/002",
-        make_recipe("wet", **WET),
-    )
+    out, copy = tmp_path / "out", tmp_path / "out/source/wet-000/002"
+    wet = make_recipe("wet", **WET)
     for scene in (one, two):
         render(scene, out, wet)
         said = mirror_outputs(scene, out, progress=False)
@@ -328,7 +325,7 @@ def test_making_the_copy_again_by_itself(root, tmp_path, monkeypatch, capsys):
         opened.append(uri)
         return scene if uri == scene.source else other
 
-    monkeypatch.setattr("adapters.base.open_scene", opened_scene)
+    monkeypatch.setattr("tools.mirror.open_scene", opened_scene)
     assert mirror_again(out) == 0
     assert opened == [scene.source]
     assert str(out / "source/fog-000/002") in capsys.readouterr().out
@@ -344,7 +341,7 @@ def test_making_the_copy_again_by_itself(root, tmp_path, monkeypatch, capsys):
 def test_scenes_that_a_job_renamed_are_copied(root, tmp_path, monkeypatch):
     scene, out = scene_of(root), tmp_path / "out"
     render(dataclasses.replace(scene, name="drive-7"), out, frames=[0])
-    monkeypatch.setattr("adapters.base.open_scene", lambda uri: scene)
+    monkeypatch.setattr("tools.mirror.open_scene", lambda uri: scene)
     assert mirror_again(out) == 0
     assert changed(root, out / "source/fog-000/002")
     assert mirror_again(out, scene.source) == 0
@@ -364,25 +361,29 @@ def test_wrong_scenes_and_folders_are_refused(root, tmp_path):
         recipes_for_source(scene, root / "out", [recipe_of()])
     with pytest.raises(OutputError, match="is no finished output folder"):
         mirror_outputs(scene, tmp_path / "nothing", progress=False)
+    mirror_outputs(scene, out, progress=False)
+    namesake = scene_of(write_sequence(tmp_path / "more" / "002"), "other")
+    with pytest.raises(OutputError, match=r"is the copy of .*/002, not of .*/more/002: choose"):
+        recipes_for_source(namesake, out, [recipe_of()])
+    render(scene_of(root, "source"), tmp_path / "named", frames=[0])
+    with pytest.raises(OutputError, match="has images of a scene called 'source'"):
+        mirror_outputs(scene_of(root, "source"), tmp_path / "named", progress=False)
+    render(scene, tmp_path / "path", camera_path=scene.frames[:1])
+    assert read_manifest(tmp_path / "path")["trajectory"][0].as_py() != "recorded"
+    with pytest.raises(OutputError, match="shows a camera path"):
+        mirror_outputs(scene, tmp_path / "path", progress=False)
 
 
 def test_a_dataset_that_has_moved_is_taken(root, tmp_path):
     scene, out = scene_of(root), tmp_path / "out"
     render(scene, out, frames=[0])
     moved = scene_of(root.rename(tmp_path / "moved"))
-    late = dataclasses.replace(
-        moved,
-        frames=tuple(
-            dataclasses.replace(
-                frame,
-                cameras={
-                    name: dataclasses.replace(camera, timestamp_ns=camera.timestamp_ns + 1)
-                    for name, camera in frame.cameras.items()
-                },
-            )
-            for frame in moved.frames
-        ),
-    )
+    (first, *others) = moved.frames
+    cameras = {
+        name: dataclasses.replace(camera, timestamp_ns=camera.timestamp_ns + 1)
+        for name, camera in first.cameras.items()
+    }
+    late = dataclasses.replace(moved, frames=(dataclasses.replace(first, cameras=cameras), *others))
     with pytest.raises(OutputError, match=r"was rendered from .*/002.*, or the same one where"):
         mirror_outputs(late, out, progress=False)
     mirror_outputs(moved, out, progress=False)
@@ -392,24 +393,15 @@ def test_a_dataset_that_has_moved_is_taken(root, tmp_path):
     }
 
 
-def test_another_dataset_of_that_name_is_refused(root, tmp_path):
-    scene, out = scene_of(root), tmp_path / "out"
-    render(scene, out, frames=[0])
-    mirror_outputs(scene, out, progress=False)
-    other = scene_of(write_sequence(tmp_path / "more" / "002"), "other")
-    with pytest.raises(OutputError, match=r"is the copy of .*/002, not of .*/more/002: choose"):
-        recipes_for_source(other, out, [recipe_of()])
-
-
-@pytest.mark.parametrize("text", ["{", "[]", '{"scenes": {}, "replaced": {"a": {}}, "folder": ""}'])
-def test_a_damaged_record_is_said(root, tmp_path, text):
+def test_a_damaged_record_is_said(root, tmp_path):
     scene, out = scene_of(root), tmp_path / "out"
     render(scene, out, frames=[0])
     mirror_outputs(scene, out, progress=False)
     record = out / "source/fog-000/climategs-mirror-002.json"
-    record.write_text(text)
-    with pytest.raises(OutputError, match=r"climategs-mirror-002\.json is damaged"):
-        mirror_outputs(scene, out, progress=False)
+    for text in ("{", "[]", '{"scenes": {}, "replaced": {"a": {}}, "folder": ""}'):
+        record.write_text(text)
+        with pytest.raises(OutputError, match=r"climategs-mirror-002\.json is damaged"):
+            mirror_outputs(scene, out, progress=False)
     record.unlink()
     mirror_outputs(scene, out, progress=False)
 
@@ -426,21 +418,6 @@ def test_a_record_names_no_files_outside(root, tmp_path):
     path.write_text(json.dumps(record))
     mirror_outputs(scene, out, progress=False)
     assert len(changed(root, out / "source/fog-000/002")) == 2
-
-
-def test_a_scene_called_as_the_copies_folder_is_refused(root, tmp_path):
-    scene, out = scene_of(root, "source"), tmp_path / "out"
-    render(scene, out, frames=[0])
-    with pytest.raises(OutputError, match="has images of a scene called 'source'"):
-        mirror_outputs(scene, out, progress=False)
-
-
-def test_camera_paths_are_refused(root, tmp_path):
-    scene, out = scene_of(root), tmp_path / "out"
-    render(scene, out, camera_path=scene.frames[:1])
-    assert read_manifest(out)["trajectory"][0].as_py() != "recorded"
-    with pytest.raises(OutputError, match="shows a camera path"):
-        mirror_outputs(scene, out, progress=False)
 
 
 def test_render_takes_the_layout(root, tmp_path, monkeypatch, capsys):

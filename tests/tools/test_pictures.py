@@ -12,32 +12,26 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from augment.jobs.layout import MANIFEST, PATH_KINDS
+from augment.jobs.layout import MANIFEST
 from augment.jobs.manifest import LATER, rows_to_table, write_manifest
+from tests.tools.report_outputs import make_row
 from tools import sheet
 
 DRY, THIN, DEEP = ("clear-000", 0.0, math.nan), ("wet-000", 0.0, -0.05), ("wet-001", 0.0, 0.5)
 MURKY, WHITE = ("fog-000", 0.0978, 0.3), ("white-000", 0.0, math.nan, 0.125)
 
 
-def make_row(
+def row_of(
     variant: str, extinction_per_m: float, level_m: float, snow_m: float = math.nan
 ) -> dict[str, Any]:
-    paths: dict[str, Any] = {f"{kind}_path": None for kind in PATH_KINDS}
-    paths |= {"image_path": f"{variant}.png", "water_path": f"{variant}-water.png"}
-    row = {"scene": "street", "source": "s", "variant": variant, "frame": 4, "camera": "front"}
-    row |= {"timestamp_ns": 5, "width": 40, "height": 20, "surface": "scene", **paths}
-    row |= {"style": None, "style_method": None, "lidar": None, "lidar_note": None}
-    row |= {"quality": None, "render_scale": 1.0, "settings": None}
-    row |= {"smog_extinction_per_m": extinction_per_m, "flood_level_m": level_m}
-    row |= {"snow_depth_m": snow_m}
-    row |= {"seed": 0, "recipe": "r", "recipe_hash": "0", "trajectory": "recorded"}
-    return row | {"version": "1", "backend": "cpu", "checksum": "", "status": "ok", "message": ""}
+    weather = {"smog_extinction_per_m": extinction_per_m, "flood_level_m": level_m}
+    paths = {"image_path": f"{variant}.png", "water_path": f"{variant}-water.png"}
+    return make_row(frame=4, **weather, snow_depth_m=snow_m, **paths) | {"variant": variant}
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    rows = [make_row(*variant) for variant in (MURKY, DEEP, WHITE, DRY, THIN)]
+    rows = [row_of(*variant) for variant in (MURKY, DEEP, WHITE, DRY, THIN)]
     for row in rows:
         cv2.imwrite(str(tmp_path / row["image_path"]), np.full((20, 40, 3), 200, np.uint8))
     write_manifest(tmp_path, rows_to_table(rows))
@@ -70,18 +64,14 @@ def test_a_row_says_its_weather_and_the_driest_comes_first(folder, monkeypatch) 
 def test_a_folder_older_than_floods_is_drawn(folder, monkeypatch) -> None:
     table = pq.read_table(folder / MANIFEST)
     pq.write_table(table.drop_columns([*LATER, "flood_level_m", "snow_depth_m"]), folder / MANIFEST)
-    assert [title.rpartition(" (")[2] for title in titles(folder, monkeypatch)] == [
-        "no weather)",
-        "no weather)",
-        "no weather)",
-        "no weather)",
-        "visibility 40 m)",
-    ]
+    weather = [title.rpartition(" (")[2] for title in titles(folder, monkeypatch)]
+    assert weather == [*["no weather)"] * 4, "visibility 40 m)"]
 
 
 def test_a_row_says_its_style(folder, monkeypatch) -> None:
     table = pq.read_table(folder / MANIFEST)
-    table = table.drop_columns("style").append_column("style", pa.array(["dusk"] * len(table)))
+    table = table.drop_columns(["style", "style_strength"])
+    table = table.append_column("style", pa.array(["dusk"] * len(table)))
     table = table.append_column("style_strength", pa.array([0.75] * len(table)))
     pq.write_table(table, folder / MANIFEST)
     assert titles(folder, monkeypatch)[0] == "street, frame 4: clear-000 (dusk x 0.75)"
@@ -89,7 +79,7 @@ def test_a_row_says_its_style(folder, monkeypatch) -> None:
 
 def test_a_picture_of_many_variants_shows_some_from_end_to_end() -> None:
     few, many = (
-        [make_row(f"{i:03d}", 0.0, math.nan) for i in range(n)] for n in (sheet.MAX_SHOWN, 100)
+        [row_of(f"{i:03d}", 0.0, math.nan) for i in range(n)] for n in (sheet.MAX_SHOWN, 100)
     )
     assert [name for _, name in sheet.shown_groups(few)] == [row["variant"] for row in few]
     names = [name for _, name in sheet.shown_groups(many)]
