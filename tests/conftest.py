@@ -50,7 +50,7 @@ install_import_hook(_checked_modules(), "beartype.beartype")
 LONG = {
     f"test_{name}.py"
     for name in (
-        "batch_resume", "batch_workers", "bench_flood", "bench_open", "bench_snow", "fit",
+        "batch_resume", "batch_workers", "bench", "bench_effects", "bench_gpu", "fit",
         "flood_accuracy", "generate", "generate_crashes", "generate_ray", "packages", "procedural",
         "recording_flood", "render_backward", "smog_accuracy", "snow_accuracy", "trained_street",
     )
