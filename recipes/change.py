@@ -31,11 +31,7 @@ def is_given(model: BaseModel, path: str) -> bool:
 
 
 def replaced(model: Model, path: str, value: object) -> Model:
-    """A copy with one field set, and counted as given; nothing is checked.
-
-    Raises:
-        KeyError: a section on the way is absent.
-    """
+    """A copy with one field set, unchecked, and given; KeyError where a section is absent."""
     name, _, rest = path.partition(".")
     if rest:
         section = getattr(model, name)

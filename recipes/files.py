@@ -1,8 +1,6 @@
 """The files that a recipe's style names: where they may lie, and the digest of what they hold.
 
-A recipe file names them from its own folder, and none outside of it: a recipe from elsewhere reads
-no other files. A recipe in numbers holds their paths and, in `style.digest`, what stands for their
-contents; the paths are no part of its hash.
+A recipe file names them from its own folder and none outside: one from elsewhere reads no others.
 """
 
 from __future__ import annotations
@@ -27,8 +25,7 @@ def with_digest(recipe: Recipe) -> Recipe:
     """The recipe with the digest of its style's files; the same object where there is none.
 
     Raises:
-        RecipeError: a file is missing, unreadable or too large, or the recipe has a digest already
-            and the files have changed since.
+        RecipeError: a file is missing, unreadable or too large, or is not that of a given digest.
     """
     style = recipe.style
     if style is None or not style.files:
@@ -58,10 +55,7 @@ def read_files(style: Style) -> dict[str, bytes]:
 
 
 def digest_of(hashes: Mapping[str, str]) -> str:
-    """One digest for all files. hashes: the SHA-256 of each, in hexadecimal, by field.
-
-    The SHA-256 of a line `FIELD HASH` for each file, in the order image, mask, checkpoint.
-    """
+    """The SHA-256 of a line `FIELD HASH` for each file, in the order image, mask, checkpoint."""
     lines = [f"{name} {hashes[name]}\n" for name in FILES if name in hashes]
     return hashlib.sha256("".join(lines).encode()).hexdigest()
 
@@ -105,15 +99,13 @@ def open_file(path: str | Path) -> BufferedReader:
     """A file that somebody has named, for reading.
 
     Raises:
-        OSError: it cannot be opened, or is a folder, a pipe or a device: to open a pipe might wait
-            for ever, and a device need not end.
+        OSError: it cannot be opened, or is a folder, a pipe (might wait for ever) or a device.
     """
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
     try:
         kind = os.fstat(descriptor).st_mode
         if not (stat.S_ISREG(kind) or stat.S_ISDIR(kind)):
-            text = "a pipe or device, not a regular file"
-            raise OSError(errno.EINVAL, text, str(path))
+            raise OSError(errno.EINVAL, "a pipe or device, not a regular file", str(path))
         return os.fdopen(descriptor, "rb")  # which refuses folders
     except BaseException:
         os.close(descriptor)
@@ -121,11 +113,7 @@ def open_file(path: str | Path) -> BufferedReader:
 
 
 def _open_checked(path: str | Path) -> BufferedReader:
-    """A file of no more than MAX_MIB, for reading.
-
-    Raises:
-        FileNotFoundError: there is none. ValueError: it cannot be read; says why.
-    """
+    """A file of no more than MAX_MIB; FileNotFoundError, or a ValueError that says why not."""
     try:
         file = open_file(path)
     except (FileNotFoundError, NotADirectoryError):

@@ -1,13 +1,4 @@
-"""A job file: which scenes, under which recipes, how many variants of each.
-
-    name: winter
-    scenes:
-      - pandaset:data/002
-      - {uri: "drivestudio:runs/*", frames: "::5", cameras: [front]}
-    recipes:
-      - dense-fog
-      - {recipe: recipes/flood.yaml, variants: 4}
-    draws: per_scene
+"""A job file: which scenes, under which recipes, how many variants of each (docs/generate.md).
 
 Every scene is rendered under every recipe, or under those that it names itself.
 """
@@ -120,14 +111,9 @@ class JobRecipes:
     templates: dict[str, RecipeTemplate]
 
     def of_scene(self, entry: JobScene, scene_name: str) -> list[Recipe]:
-        """The recipes in numbers that a scene is rendered under.
-
-        Raises:
-            RecipeError: a draw breaks a rule of the schema.
-        """
-        wanted = self.templates if entry.recipes is None else dict.fromkeys(entry.recipes)
+        """The recipes in numbers that a scene is rendered under."""
         resolved = []
-        for name in wanted:
+        for name in self.templates if entry.recipes is None else dict.fromkeys(entry.recipes):
             template = self.templates[name]
             if self.job.draws == "per_scene":
                 seed = seed_for_scene(template.seed, scene_name)
@@ -209,21 +195,14 @@ def seed_for_scene(seed: int, scene_name: str) -> int:
 
 
 def scaled_recipe(recipe: Recipe, scale: float) -> Recipe:
-    """The recipe at another resolution, recorded as its render.scale.
-
-    Raises:
-        RecipeError: beyond the schema's limits.
-    """
+    """The recipe at another resolution, its render.scale; RecipeError beyond the limits."""
     if scale == 1:
         return recipe
     try:
         return changed(recipe, {"render.scale": recipe.render.scale * scale})
     except ValidationError as error:
-        limits = error.errors()[0]["msg"]
-        raise RecipeError(
-            f"a scale of {scale} times the recipe's render.scale {recipe.render.scale} is not "
-            f"possible: {limits}"
-        ) from None
+        both = f"a scale of {scale} times the recipe's render.scale {recipe.render.scale}"
+        raise RecipeError(f"{both} is not possible: {error.errors()[0]['msg']}") from None
 
 
 def _place(tree: Node, location: tuple[int | str, ...]) -> tuple[str, int]:

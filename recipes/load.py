@@ -34,10 +34,9 @@ _Dumper.add_representer(tuple, _sequence)
 def dump_recipe(recipe: Recipe) -> str:
     """YAML with every field written out, defaults included, and the hash in a comment.
 
-    `parse_recipe(dump_recipe(r), ...).resolve(0)` equals r: floats keep all their bits, and the
-    variant's number is kept. Paths of files are written as they are, and a recipe file names files
-    from its own folder only: give them such names first, as a job does. Settings that the recipe's
-    quality has still to choose, in view of a scene, are left out.
+    `parse_recipe(dump_recipe(r), ...).resolve(0)` equals r, to the bit. Paths of files are written
+    as they are: give them names from the recipe's folder first, as a job does. Settings that an
+    open quality has still to choose are left out.
     """
     data = recipe.model_dump()
     for knob in free_knobs(recipe) if recipe.quality.is_open else ():
@@ -56,9 +55,8 @@ MAX_BYTES = 65_536  # a recipe is a page of text; a bigger file is something els
 def load_recipe(path_or_preset_name: str | Path) -> RecipeTemplate:
     """The template in a file, or the preset of that name.
 
-    A text that names a preset is the preset, even where a file is called the same (write ./NAME for
-    the file); anything else, and every Path, is a file. A file's stem is the recipe's name unless
-    the file gives one. Files that it names lie in its folder or below it.
+    A text that names a preset is the preset (write ./NAME for a file of that name); anything else,
+    and every Path, is a file. A file's stem is the recipe's name unless the file gives one.
 
     Raises:
         RecipeError: there is no such file or preset, it holds no valid recipe, or it names a

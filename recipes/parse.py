@@ -101,14 +101,13 @@ NORMAL_KEYS = ("mean", "std", "min", "max")
 MAX_STD_PER_WIDTH = 1000  # a wider normal is uniform for all purposes, and loses digits
 
 
-class ValueParser:
-    """Turns the node of a field into its Value.
+class _FieldReader:
+    """Turns the node of a field into its Value; None where something is wrong, added to problems.
 
-    Every method returns None where something is wrong, which it has added to the problems. folder:
-    where the files that the recipe names lie; None for a text that comes from no file.
+    folder: where the files that the recipe names lie; None for a text that comes from no file.
     """
 
-    def __init__(self, problems: Problems, folder: Path | None = None) -> None:
+    def __init__(self, problems: Problems, folder: Path | None) -> None:
         self._problems, self._folder = problems, folder
 
     def parse(self, node: Node, spec: FieldSpec, path: str) -> Value | None:
@@ -154,11 +153,14 @@ class ValueParser:
         fixed = self.literal(node, spec.without_null, path)
         return None if fixed is None else as_number(fixed.value)
 
+    def _each(self, node: ListNode, spec: FieldSpec, path: str) -> list[Value | None]:
+        return [self.parse(item, spec, f"{path}[{i}]") for i, item in enumerate(node.items)]
+
+    def _numbers(self, node: ListNode, spec: FieldSpec, path: str) -> list[float | None]:
+        return [self._number(item, spec, f"{path}[{i}]") for i, item in enumerate(node.items)]
+
     def _triple(self, node: ListNode, spec: FieldSpec, path: str) -> Value | None:
-        channels = [
-            self.parse(item, spec, f"{path}[{index}]") for index, item in enumerate(node.items)
-        ]
-        red, green, blue = channels
+        red, green, blue = channels = self._each(node, spec, path)
         if red is None or green is None or blue is None:
             return None
         fixed = [channel.value for channel in channels if isinstance(channel, Fixed)]
@@ -189,17 +191,14 @@ class ValueParser:
     def _interval(self, body: Node, spec: FieldSpec, path: str, *, log: bool) -> Value | None:
         if not isinstance(body, ListNode) or len(body.items) != 2:
             return self._bad(body, path, "must be [low, high]")
-        low, high = (
-            self._number(item, spec, f"{path}[{index}]") for index, item in enumerate(body.items)
-        )
+        low, high = self._numbers(body, spec, path)
         if low is None or high is None:
             return None
         if low > high:
             return self._bad(body, path, "the low end comes first")
         if log and low <= 0:
             return self._bad(body.items[0], f"{path}[0]", "must be > 0: its logarithm is taken")
-        whole = spec.kind is Kind.WHOLE
-        return Uniform(low, high, whole, log)
+        return Uniform(low, high, spec.kind is Kind.WHOLE, log)
 
     def _normal(self, body: Node, spec: FieldSpec, path: str) -> Value | None:
         if not isinstance(body, MapNode) or set(body.entries) != set(NORMAL_KEYS):
@@ -227,8 +226,7 @@ class ValueParser:
         if not isinstance(body, ListNode) or not body.items:
             return self._bad(body, below, "must be a list of at least one option")
         count = len(body.items)
-        parsed = [self.parse(item, spec, f"{below}[{i}]") for i, item in enumerate(body.items)]
-        options = tuple(option for option in parsed if option is not None)
+        options = tuple(o for o in self._each(body, spec, below) if o is not None)
         weights: tuple[float, ...] | None = (1.0,) * count
         if "weights" in node.entries:
             weights = self._weights(node.entries["weights"][1], count, f"{path}.weights")
@@ -239,8 +237,7 @@ class ValueParser:
     def _weights(self, node: Node, count: int, path: str) -> tuple[float, ...] | None:
         if not isinstance(node, ListNode) or len(node.items) != count:
             return self._bad(node, path, f"must be {count} numbers, one for each option")
-        read = [self._number(item, ANY_NUMBER, f"{path}[{i}]") for i, item in enumerate(node.items)]
-        weights = tuple(weight for weight in read if weight is not None)
+        weights = tuple(w for w in self._numbers(node, ANY_NUMBER, path) if w is not None)
         if len(weights) < count:
             return None
         # bounds keep the sum finite and every share representable
@@ -252,9 +249,7 @@ class ValueParser:
         ends = "colours" if spec.kind is Kind.COLOUR else "triples of rates"
         if not isinstance(body, ListNode) or len(body.items) != 2:
             return self._bad(body, path, f"must be [from, to], two {ends}")
-        start, end = (
-            self.parse(item, spec, f"{path}[{index}]") for index, item in enumerate(body.items)
-        )
+        start, end = self._each(body, spec, path)
         if start is None or end is None:
             return None
         if not (isinstance(start, Fixed) and isinstance(end, Fixed)):
@@ -355,9 +350,8 @@ def parse_recipe(
 ) -> RecipeTemplate:
     """The template in YAML `text`.
 
-    source: stands before the line number in messages. name: the recipe's name where the text gives
-    none; the schema's default without it. folder: where the files that the text names lie; without
-    it, it can name none.
+    source: stands before the line number in messages. name: the recipe's, where the text gives
+    none. folder: where the files that the text names lie; without it, it can name none.
 
     Raises:
         RecipeError: anything is wrong with the text; one line for each problem.
@@ -386,7 +380,7 @@ def _check_version(tree: MapNode, problems: Problems) -> None:
 class _Compiler:
     def __init__(self, problems: Problems, folder: Path | None) -> None:
         self._problems, self._folder = problems, folder
-        self._parser = ValueParser(problems, folder)
+        self._fields = _FieldReader(problems, folder)
         self._values: dict[str, Value] = {}
         self._effects: dict[str, float] = {}
         self._lists: dict[str, int] = {}
@@ -443,7 +437,7 @@ class _Compiler:
         if isinstance(node, ScalarNode) and node.value is None and spec.max_items is None:
             return given  # 'weather:' with nothing below it: it is empty, an effect absent
         if isinstance(node, ScalarNode) and spec.shorthand is not None:
-            value = self._parser.literal(node, spec.fields[spec.shorthand].without_null, path)
+            value = self._fields.literal(node, spec.fields[spec.shorthand].without_null, path)
             if value is not None:
                 given[spec.shorthand] = self._values[join(path, spec.shorthand)] = value
             return given
@@ -477,9 +471,8 @@ class _Compiler:
             self._section(node, below, path, line)
         elif key in spec.fields:
             field = spec.fields[key]
-            read = self._parser.parse if field.rangeable else self._parser.literal
-            value = read(node, field, path)
-            if value is not None:
+            read = self._fields.parse if field.rangeable else self._fields.literal
+            if (value := read(node, field, path)) is not None:
                 self._values[path] = value
             return value
         elif key in spec.extra:
@@ -493,9 +486,8 @@ class _Compiler:
         if isinstance(node, ScalarNode) and node.value is None:
             return None
         if not isinstance(node, ListNode) or len(node.items) > most:
-            known = ", ".join(spec.known)
-            allowed = f"a list of up to {most} mappings, each with {known}; or null"
-            self._problems.add(node.line, f"{path} = {show(node)}: must be {allowed}")
+            allowed = f"up to {most} mappings, each with {', '.join(spec.known)}; or null"
+            self._problems.add(node.line, f"{path} = {show(node)}: must be a list of {allowed}")
             return None
         self._lists[path] = len(node.items)
         mappings = [
@@ -505,10 +497,8 @@ class _Compiler:
         return Items(tuple(mappings))
 
     def _extra(self, node: Node, spec: SectionSpec, key: str, path: str) -> None:
-        value = self._parser.literal(node, spec.extra[key], path)
-        if value is None:
-            return
-        if spec.effect and key == "probability":
+        value = self._fields.literal(node, spec.extra[key], path)
+        if value is not None and spec.effect and key == "probability":
             self._effects[spec.path] = as_number(value.value)
-        else:
+        elif value is not None:
             self._values[path] = value

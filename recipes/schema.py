@@ -1,7 +1,7 @@
 """What a recipe may say once its ranges are resolved to numbers.
 
 Every model is frozen and closed: an unknown key is an error, at every level. Units are in the
-names. Numbers are strict: text, and true or false, never pass for a number.
+names, and numbers are strict.
 """
 
 from __future__ import annotations
@@ -226,11 +226,7 @@ class FramePattern:
 
 
 def parse_frames(text: str) -> FramePattern:
-    """The pattern in a text.
-
-    Raises:
-        ValueError: the text is none; says what is.
-    """
+    """The pattern in a text; ValueError, which says what is one, where the text is none."""
     if text.strip() == "all":
         return FramePattern(text, None)
     try:

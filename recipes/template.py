@@ -328,13 +328,9 @@ class FieldSpec:
     channel: FieldSpec | None = None
 
     @property
-    def name(self) -> str:
-        return self.path.rpartition(".")[2]
-
-    @property
     def unit(self) -> str | None:
         """The unit in words; None for a pure number."""
-        return next((unit for end, unit in UNITS.items() if self.name.endswith(end)), None)
+        return next((unit for end, unit in UNITS.items() if self.path.endswith(end)), None)
 
     @cached_property
     def _adapter(self) -> TypeAdapter[Any]:
@@ -367,9 +363,8 @@ class FieldSpec:
     def _allowed_number(self, value: object) -> str:
         limits = " and ".join(f"{sign} {plain(bound)}" for sign, bound in self.limits)
         right_type = is_number(value) and (isinstance(value, int) or self.kind is Kind.NUMBER)
-        if limits and right_type and value == value:
-            return limits
-        return f"{self.kind.value} {limits}".strip()
+        is_close = limits and right_type and value == value
+        return limits if is_close else f"{self.kind.value} {limits}".strip()
 
     @property
     def without_null(self) -> FieldSpec:

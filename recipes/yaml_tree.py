@@ -80,10 +80,8 @@ class _Open:
 def read_tree(text: str, problems: Problems, *, empty: str = EMPTY) -> Node:
     """The tree of the one document in `text`; duplicate keys are added to `problems`.
 
-    empty: what to say where there is none.
-
     Raises:
-        RecipeError: not YAML, or YAML that a recipe may not use.
+        RecipeError: not YAML, YAML that a recipe may not use, or nothing (`empty` says so).
     """
     tree = _Builder(problems).build(_events(text, problems))
     if tree is None:
@@ -92,11 +90,7 @@ def read_tree(text: str, problems: Problems, *, empty: str = EMPTY) -> Node:
 
 
 def read_plain(text: str, *, source: str) -> PlainValue:
-    """What YAML says as mappings, lists and scalars. source: stands before the line in messages.
-
-    Raises:
-        RecipeError: as for read_tree, or a key is given twice.
-    """
+    """What YAML says as mappings, lists and scalars; RecipeError as for read_tree."""
     problems = Problems(source)
     tree = read_tree(text, problems, empty="the file is empty")
     problems.raise_if_any()
@@ -141,7 +135,14 @@ class _Builder:
                 if documents > 1:
                     raise self._problems.fail(line, "one document a file: remove the second '---'")
             elif isinstance(event, yaml.AliasEvent):
-                self._attach(line, self._look_up(line, event.anchor))
+                node = self._anchors.get(event.anchor)
+                if node is None:
+                    is_open = event.anchor in self._anchors
+                    wrong = "stands inside its own" if is_open else "refers to no"
+                    end = "" if is_open else " above it"
+                    text = f"*{short(event.anchor)} {wrong} anchor{end}"
+                    raise self._problems.fail(line, text)
+                self._attach(line, node)
             elif isinstance(event, yaml.CollectionEndEvent):
                 done = self._open.pop()
                 if done.anchor is not None:
@@ -168,14 +169,6 @@ class _Builder:
             raise self._problems.fail(line, f"nested more than {MAX_DEPTH} levels deep")
         kind = MapNode if isinstance(event, yaml.MappingStartEvent) else ListNode
         self._open.append(_Open(kind(line), event.anchor))
-
-    def _look_up(self, line: int, anchor: str) -> Node:
-        if anchor not in self._anchors:
-            raise self._problems.fail(line, f"*{short(anchor)} refers to no anchor above it")
-        node = self._anchors[anchor]
-        if node is None:
-            raise self._problems.fail(line, f"*{short(anchor)} stands inside its own anchor")
-        return node
 
     def _attach(self, line: int, node: Node) -> None:
         if not self._open:
