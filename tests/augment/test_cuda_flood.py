@@ -95,9 +95,9 @@ def medium(reflection: str, preset: str = "breeze", **changes) -> FloodMedium:
 def drawn_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
     """Layers come from the CPU's rasteriser: interpreted, the GPU's takes most of the time."""
 
-    def rasterize_here(parts, camera, *, wanted, backend, **settings):
+    def rasterize_here(parts, camera, *, pixel_mask, backend, **settings):
         assert backend == "cuda"
-        asked = None if wanted is None else wanted.cpu()
+        asked = None if pixel_mask is None else pixel_mask.cpu()
         drawn = rasterize(parts, camera, pixel_mask=asked, backend="cpu", **settings)
         images = {f.name: getattr(drawn, f.name) for f in dataclasses.fields(drawn)}
         device = gpu.gpu_device()

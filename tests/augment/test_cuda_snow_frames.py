@@ -21,7 +21,6 @@ from augment.render.sh import SH_C0
 from augment.scene import Actor, Gaussians, PosedGaussians, Track
 from augment.semantics import SemanticClass
 from augment.views import render_view
-from tests.augment import pretend_gpu
 from tests.augment.kernel_frames import RECIPES, small_scene
 from tests.augment.pretend_gpu import AwayTensor, held_by, pretended_gpu
 from tests.snow_beds import scene_of
@@ -246,31 +245,6 @@ def test_a_picture_of_close_and_glinting_snow_is_the_cpus(monkeypatch):
     assert {"split_discs", "find_glints", "light_splats"} <= set(launched)
     assert np.abs(found.rgb.astype(int) - expected.rgb).max() <= 1
     assert (found.snow == expected.snow).all() and expected.snow.any()
-
-
-def test_a_frame_sends_one_small_array_and_waits_for_nothing(street, monkeypatch):
-    scene, cover = street
-    with pretended_gpu(monkeypatch):
-        cover.parts_for(scene, camera(), backend="cuda")  # sends what stays
-        sent, asked = [], []
-        run, upload = pretend_gpu._run, gpu.upload
-
-        def watched(func, args, kwargs):
-            out = run(func, args, kwargs)
-            if (
-                args
-                and isinstance(args[0], AwayTensor)
-                and not isinstance(out, AwayTensor | tuple | list)
-            ):
-                asked.append(func)
-            return out
-
-        monkeypatch.setattr(pretend_gpu, "_run", watched)
-        monkeypatch.setattr(gpu, "upload", lambda a: sent.append(a.nbytes) or upload(a))
-        known = dict(gpu._copies)
-        cover.parts_for(scene, camera(shift=(0.1, 0.0, 0.0)), backend="cuda")
-        assert dict(gpu._copies).keys() == known.keys()
-    assert len(sent) == 1 and sent[0] < 4096 and not asked
 
 
 def test_crystals_that_all_face_alike_leave_no_block_its_bounds(monkeypatch):

@@ -17,7 +17,7 @@ from augment.plan import make_plan
 from augment.render.composite import quantise
 from augment.scene import Actor, Gaussians, Scene, Track
 from augment.semantics import SemanticClass
-from augment.sky import ConstantSky, CubemapSky, Sky
+from augment.sky import ConstantSky, Sky
 from augment.views import render_buffers, render_view
 from recipes.schema import Output, Recipe, Smog, Weather
 from recipes.weather import Flood, Wave, Waves
@@ -412,13 +412,6 @@ def test_a_scene_without_ground_shows_deep_water():
     view = view_of(bare, water, high)
     # Before the wall nothing is under the surface.
     assert np.abs(view.rgb[58, 40].astype(int) - np.array([51, 77, 26])).max() <= 1
-
-
-def test_cube_maps_and_constant_skies_reflect_alike(scene):
-    faces = torch.tensor(SKY).expand(6, 4, 4, 3).contiguous()
-    mapped = dataclasses.replace(scene, sky=CubemapSky(faces))
-    views = [view_of(s, flood(waves=Waves())).rgb.astype(int) for s in (scene, mapped)]
-    assert np.abs(views[0] - views[1]).max() <= 1
 
 
 def test_time_moves_the_waves_and_nothing_else_does(scene):

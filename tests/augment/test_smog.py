@@ -68,25 +68,13 @@ def test_scale_height_against_quadrature(eye, point, distance):
 def test_optical_depths_add_up_along_a_ray():
     medium = layered()
     eye, middle, far = 2.0, 12.0, 42.0  # equal slope: the middle lies at a quarter of the way
-    whole = optical_depth(
-        medium,
-        torch.tensor(100.0, dtype=torch.float64),
-        eye,
-        torch.tensor(far, dtype=torch.float64),
-    )
-    first = optical_depth(
-        medium,
-        torch.tensor(25.0, dtype=torch.float64),
-        eye,
-        torch.tensor(middle, dtype=torch.float64),
-    )
-    rest = optical_depth(
-        medium,
-        torch.tensor(75.0, dtype=torch.float64),
-        middle,
-        torch.tensor(far, dtype=torch.float64),
-    )
-    assert float(first + rest) == pytest.approx(float(whole), rel=1e-12)
+
+    def tau(way_m: float, eye_z_m: float, z_m: float) -> float:
+        way, z = torch.tensor([way_m, z_m], dtype=torch.float64)
+        return float(optical_depth(medium, way, eye_z_m, z))
+
+    parts = tau(25.0, eye, middle) + tau(75.0, middle, far)
+    assert parts == pytest.approx(tau(100.0, eye, far), rel=1e-12)
 
 
 def test_a_huge_scale_height_is_uniform_smog():

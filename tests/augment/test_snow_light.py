@@ -303,19 +303,3 @@ def test_any_scene_gives_colours(sky: float, road: float, classed: bool) -> None
     place = scene(ConstantSky(torch.full((3,), sky)), discs((road,) * 3, semantic, count=count))
     for said in (snow(), snow(albedo=1.0, sun=1.0), snow(brightness=0.0)):
         check(illumination_of(place, said))
-
-
-def test_the_same_scene_again_is_the_same_and_is_looked_at_once() -> None:
-    class Counting:
-        calls = 0
-
-        def sample(self, directions: torch.Tensor) -> torch.Tensor:
-            self.calls += 1
-            return sky_with_sun(50, 40).sample(directions)
-
-    sky = Counting()
-    place = street(sky)
-    first = illumination_of(place, snow())
-    assert illumination_of(place, snow()) == first and sky.calls == 1
-    assert illumination_of(street(sky_with_sun(50, 40)), snow()) == first
-    assert illumination_of(place, snow(sun=0.0)) != first and sky.calls == 1

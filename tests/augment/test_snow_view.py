@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from augment.effects.snow.snow import snow_layers_of
 from augment.errors import SceneError
 from augment.labels import Boxes
 from augment.plan import make_plan
@@ -155,14 +154,6 @@ def test_the_two_shadings_agree_on_how_bright_snow_is(scene):
     assert not np.array_equal(splat, pixel)
 
 
-def test_the_same_bits_every_time(scene):
-    once = view_of(scene, snow())
-    again = view_of(dataclasses.replace(scene), snow())
-    other = view_of(scene, snow(seed=7))
-    assert np.array_equal(once.rgb, again.rgb)
-    assert not np.array_equal(once.rgb, other.rgb)
-
-
 @pytest.mark.parametrize("model", ["per_gaussian", "deferred"])
 def test_fog_lies_over_the_snow(scene, model):
     fog = Smog(extinction_per_m=0.2, color=(0.5, 0.5, 0.5), model=model)
@@ -213,16 +204,6 @@ def test_the_plan_names_what_runs_and_what_does_not(scene):
     poor = recipe_of(snow(), depth="none")
     assert EXPECTED_DEPTH in make_plan(poor, scene).buffers  # what labels are measured from
     assert EXPECTED_DEPTH not in make_plan(poor, unlabelled).buffers
-
-
-def test_a_recipes_snow_is_laid_once_and_a_third_drives_out_the_first(scene):
-    placed = [make_plan(recipe_of(snow(depth_m=d)), scene).snow for d in (0.05, 0.1, 0.2)]
-    first = snow_layers_of(scene, placed[0])
-    assert snow_layers_of(scene, placed[0]) is first
-    snow_layers_of(scene, placed[1])
-    assert snow_layers_of(scene, placed[0]) is first
-    snow_layers_of(scene, placed[1]), snow_layers_of(scene, placed[2])
-    assert snow_layers_of(scene, placed[0]) is not first
 
 
 def test_scenes_without_metres_or_gravity_are_refused_before_anything_is_rendered(scene):

@@ -70,16 +70,14 @@ def trace_screen(
     """What the mirrored rays of the flat surface z = level_z_m meet, for the pixels of `camera`.
 
     front: what stands above the water, over the whole image. camera: a window of that image (same
-    eye, same pixels), which may reach beyond it. needed: the pixels to trace, best those that
-    `water_surface.is_smooth` names; None for all. The others, those that the front covers, and
-    those whose own ray does not meet the water have weight 0. So have rays that leave the image,
-    come back to the camera's plane, or are lost behind something that is thinner than the way
-    behind it. The weight falls to 0 over the outer 4 % of the image.
+    eye, same pixels), which may reach beyond it. needed: the pixels to trace, best the smooth ones;
+    None for all. Weight 0 have the others, those that the front covers or whose own ray does not
+    meet the water, and rays that leave the image, come back to the camera's plane, or are lost
+    behind something thin. The weight falls to 0 over the outer 4 % of the image.
 
-    backend: kernels are equal to this definition but for rays that pass a silhouette's
-    pixel by its corner. Those of the CPU trace every `stride`-th pixel of rows and columns (1, 2 or
-    4), interpolate where four agree and trace what is left; the definition and the GPU trace every
-    pixel.
+    backend: kernels equal this definition but for rays that pass a silhouette's pixel by its
+    corner. The CPU's trace every `stride`-th pixel of rows and columns, interpolate where four
+    agree and trace what is left.
 
     Raises:
         ValueError: another stride, or a camera that is no window of the front's.

@@ -236,13 +236,11 @@ def shade_water(
 ) -> Float[Tensor, "h w 3"]:
     """Colour of the water where the camera's rays meet it, not clamped; 0 where they do not.
 
-    camera: above the water. cover: alpha of what stands before the water; where it is more than
-    HIDDEN_COVER the result is the water's own colour, or the smog's. field: of this camera. bed:
-    from a window of the same image, best a larger one. mirror: from the eye mirrored in the plane.
-    screen: its layer is of the same eye; it serves the pixels that are smooth
-    (`water_surface.is_smooth`), in the others' blur a coarse mirror is as sharp. Layers are fogged
-    already; smog here dims the sky and the water's own colour. backend: with kernels, float32 goes
-    through them, equal to this definition within float rounding, unless gradients are recorded.
+    cover: alpha of what stands before the water; where it is more than HIDDEN_COVER the result is
+    the water's own colour, or the smog's. bed: from a window of the same image, best a larger one.
+    mirror: from the eye mirrored in the plane. screen: of the same eye; it serves the pixels that
+    are smooth. Layers are fogged already; smog here dims the sky and the water's own colour.
+    backend: kernels take float32 without gradients, equal within float rounding.
 
     Raises:
         ValueError: the eye is not above the water, or cameras, images and fields do not fit.

@@ -40,7 +40,7 @@ from augment.effects.snow.near_camera import (
 from augment.render.cuda import runtime as gpu
 from augment.render.part_views import part_poses
 from augment.render.sh import SH_C0
-from augment.scene import Gaussians, PosedGaussians, SplatShading
+from augment.scene import Gaussians, PosedGaussians
 from augment.semantics import SemanticClass
 
 DISCS, CRYSTALS, SPLATS, POINTS = 128, 1024, 256, 64  # lanes of a program of each kernel
@@ -91,17 +91,7 @@ def pose_layers(
         shown = bright[number]
         if shown is not None:
             drawn.append((shown, None))
-        direction = tuple(suns[number].tolist())
-        out += [
-            PosedGaussians(
-                splats,
-                part.world_from_part,
-                part.instance_id,
-                is_snow=True,
-                shading=None if added is None else SplatShading(added, direction, snow.wrap),
-            )
-            for splats, added in drawn
-        ]
+        out += snow.posed(drawn, part, tuple(suns[number].tolist()))
     return out
 
 

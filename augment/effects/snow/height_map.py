@@ -239,11 +239,9 @@ def draw_from_above(
     backend: str = AUTO,
 ) -> HeightMap:
     """Draw parts of plain Gaussians from above. corner_m: least x and y. shape: rows and columns of
-    cells. pixel_mask: bool of that shape; the others may be left empty. with_thin: what is thin is
-    looked for. top_m: as `top_of` finds it, where that is known. backend: that draws.
-
-    A pixel of the drawing is opaque for the share that is truly covered; a second drawing, in which
-    whatever is thin is blurred to a pixel's width, shows what is thin.
+    cells. pixel_mask: bool of that shape; other cells may be left empty. with_thin: whether what is
+    thin is looked for, by a second drawing in which it is blurred to a pixel's width. top_m: of
+    `top_of`, where that is known.
     """
     rows, columns = shape
     if top_m is None:

@@ -1,8 +1,8 @@
 """The light that snow in a scene would stand in: where the sun is, how bright it is, what colour.
 
-A recording rarely shows its sun, and its pictures hold no physical unit. The scene itself is the
-evidence: the sky for the direction and for how much of the light is the sun's, and the road, whose
-albedo is roughly known, for what a surface of a given albedo looks like at this exposure.
+A recording rarely shows its sun, and its pictures hold no physical unit. The sky tells the
+direction and how much of the light is the sun's, and the road, whose albedo is roughly known, what
+a surface of a given albedo looks like at this exposure.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from recipes.weather import Snow
 
 FRESH_ALBEDO = 0.85  # `light.brightness` is of this snow; fresh snow has 0.8 to 0.95 (Oke 1987)
 
-# Class, albedo, and whether it is grey, so that its tint is the light's; the best witness first.
+# Class, albedo, and whether it is grey, so that its tint is the light's; the best evidence first.
 # Oke 1987 lists asphalt 0.05 to 0.20, concrete 0.10 to 0.35, grass 0.16 to 0.26; with the road's a
 # little below the middle, snow comes out about as bright as white cars do. None: any class.
-_WITNESSES: tuple[tuple[SemanticClass | None, float, bool], ...] = (
+_GROUND_ALBEDOS: tuple[tuple[SemanticClass | None, float, bool], ...] = (
     (SemanticClass.ROAD, 0.10, True),
     (SemanticClass.SIDEWALK, 0.22, True),
     (SemanticClass.TERRAIN, 0.18, False),
@@ -83,9 +83,9 @@ class SceneLight:
 
     azimuth_deg, elevation_deg: of the sun, 0 degrees azimuth is world +x. sun_share: 0 to 1, of the
     light. contrast: of the sky's brightest region over its mean. sky_rgb_linear: mean of the upper
-    half by solid angle. ground_albedo: what the ground is taken to give back, None where no ground
-    was found. ground_rgb_linear: its median colour; the sky's mean without ground. ground_is_grey:
-    whether its tint is the light's.
+    half by solid angle. ground_albedo: as assumed, None where no ground was found.
+    ground_rgb_linear: its median; the sky's mean without ground. ground_is_grey: its tint is the
+    light's.
     """
 
     azimuth_deg: float
@@ -101,11 +101,10 @@ class SceneLight:
 def illumination_of(scene: Scene, snow: Snow) -> Illumination:
     """The light on a recipe's snow in a scene: what the recipe leaves open, the scene answers.
 
-    Level snow that sees the sun gets the light of the scene's ground: radiance = albedo x ground /
-    ground's albedo, in linear light. Snow that faces the sun is brighter by what the wrapped cosine
-    says, then bent below white by a soft shoulder; shadows keep their ratio to it. Wrapped lighting
-    (Green 2004, "Real-time approximations to subsurface scattering") stands for light that
-    travels inside the snow. Without ground, snow in shadow gets the mean light of the sky.
+    Level snow in the sun gets radiance = albedo x ground / ground's albedo, in linear light; snow
+    that faces the sun is brighter by the wrapped cosine (Green 2004, "Real-time approximations to
+    subsurface scattering"), bent below white by a soft shoulder; shadows keep their ratio to it.
+    Without ground, snow in shadow gets the mean light of the sky.
     """
     found = light_of(scene)
     light = snow.light
@@ -134,7 +133,7 @@ def illumination_of(scene: Scene, snow: Snow) -> Illumination:
 def light_of(scene: Scene) -> SceneLight:
     """What the scene shows of its light; worked out once per scene object."""
     if scene not in _LIGHTS:
-        _LIGHTS[scene] = _look(scene)
+        _LIGHTS[scene] = _find_light(scene)
     return _LIGHTS[scene]
 
 
@@ -169,7 +168,7 @@ def _shadow(lit: np.ndarray, tinted: np.ndarray, shade: float) -> np.ndarray:
     return np.minimum(shade * (lit + strength * (tinted - lit)), lit)
 
 
-def _look(scene: Scene) -> SceneLight:
+def _find_light(scene: Scene) -> SceneLight:
     sun_deg, contrast, sky_rgb = _look_at_sky(scene.sky)
     red, _, blue = _triple(sky_rgb)
     is_blue = _ramp(blue / red, _GREY_BLUENESS, _CLEAR_BLUENESS) if red > 1e-6 else 0.0
@@ -234,7 +233,7 @@ def _look_at_ground(scene: Scene) -> tuple[np.ndarray, float, bool] | None:
     """
     g = scene.background
     solid = (g.opacities > _SOLID_OPACITY).numpy()
-    for semantic, albedo, is_grey in _WITNESSES:
+    for semantic, albedo, is_grey in _GROUND_ALBEDOS:
         if semantic is None:
             chosen = solid & _is_low_and_level(g, scene)
         elif g.semantic is None:

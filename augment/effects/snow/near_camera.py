@@ -250,10 +250,9 @@ class Layer:
     """The snow on one part of a scene.
 
     gaussians [S]: the snow, in the part's frame, semantic SNOW. opacities [N]: of the part's own
-    Gaussians, 0 for those that the snow buries. slopes [S, 3]: what the light's share is
-    multiplied by, see SplatShading; None where the light is in the Gaussians' colours already.
-    normals [S, 3]: unit, where that share is one for a splat but changes as the part turns, as that
-    of a vehicle's snow; None where it is one for a pixel. crystals: what may glint, or None.
+    Gaussians, 0 for those that the snow buries. slopes [S, 3]: see SplatShading; None where the
+    light is in the Gaussians' colours already. normals [S, 3]: unit, where the light's share is one
+    for a splat but changes as the part turns; None where it is one for a pixel.
     """
 
     gaussians: Gaussians
@@ -287,21 +286,20 @@ class SnowLayers:
         self,
         scene: Scene,
         camera: Camera,
-        bare: Sequence[PosedGaussians] | None = None,
+        without_snow: Sequence[PosedGaussians] | None = None,
         snowy: Collection[int] | None = None,
         *,
         backend: str = AUTO,
     ) -> tuple[PosedGaussians, ...]:
         """The scene's parts and the snow on them at the moment the camera took its image.
 
-        The scene's own come first and in their order, so that what is neither buried nor covered
-        keeps its number. bare: those parts that are drawn, the background first. snowy: instance
-        ids of the parts whose snow is; None for all. backend: that draws them; what changes with
-        the view lies on the GPU where that is "cuda", and equals the CPU's within float rounding.
+        The scene's own come first, in their order. without_snow: those that are drawn, the
+        background first. snowy: instance ids of the parts whose snow is; None for all. backend:
+        with "cuda", what changes with the view lies on the GPU, equal within float rounding.
         """
-        bare = scene.parts_for(camera) if bare is None else bare
+        without_snow = scene.parts_for(camera) if without_snow is None else without_snow
         parts, covered = [], []
-        for part in bare:
+        for part in without_snow:
             layer = self.layer_on(scene, part.instance_id)
             if layer is None or (snowy is not None and part.instance_id not in snowy):
                 parts.append(part)
@@ -314,16 +312,13 @@ class SnowLayers:
             from augment.effects.snow.cuda import pose_layers
 
             return (*parts, *pose_layers(self, covered, camera))
-        eye_m = camera.centre
         for layer, part in covered:
-            parts.extend(self._posed(layer, part, camera, eye_m))
+            parts.extend(self._posed(layer, part, camera))
         return tuple(parts)
 
-    def _posed(
-        self, layer: Layer, part: PosedGaussians, camera: Camera, eye_m: Float[Tensor, "3"]
-    ) -> tuple[PosedGaussians, ...]:
+    def _posed(self, layer: Layer, part: PosedGaussians, camera: Camera) -> list[PosedGaussians]:
         """The layer where its part stands, the ground's finer where it is near, and its glints."""
-        pose, number = part.world_from_part, part.instance_id
+        pose, eye_m = part.world_from_part, camera.centre
         sun = torch.tensor(self.sun, dtype=torch.float64)
         if pose is not None:
             sun, eye_m = pose[:3, :3].T @ sun, pose[:3, :3].T @ (eye_m - pose[:3, 3])
@@ -341,17 +336,25 @@ class SnowLayers:
         glints = None if layer.crystals is None else layer.crystals.glints(sun, eye_m)
         if glints is not None:
             drawn.append((glints, None))
-        light = tuple(sun.tolist())
-        return tuple(
+        return self.posed(drawn, part, tuple(sun.tolist()))
+
+    def posed(
+        self,
+        drawn: Sequence[tuple[Gaussians, Tensor | None]],
+        part: PosedGaussians,
+        sun: tuple[float, float, float],
+    ) -> list[PosedGaussians]:
+        """Splats with their slopes where a part stands. sun: unit, in the part's frame."""
+        return [
             PosedGaussians(
                 splats,
-                pose,
-                number,
+                part.world_from_part,
+                part.instance_id,
                 is_snow=True,
-                shading=None if added is None else SplatShading(added, light, self.wrap),
+                shading=None if slopes is None else SplatShading(slopes, sun, self.wrap),
             )
-            for splats, added in drawn
-        )
+            for splats, slopes in drawn
+        ]
 
 
 _left: WeakKeyDictionary[Layer, tuple[Gaussians, Gaussians]] = WeakKeyDictionary()

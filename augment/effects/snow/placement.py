@@ -448,7 +448,7 @@ def place_snow_support(
 ) -> SnowSupport:
     """The cells of a scene that snow can lie on and that some of the cameras can see.
 
-    Several threads work on squares of the ground, and any number gives the same bits.
+    Any number of threads gives the same bits.
     Without cameras, or where nothing open is seen, the support is empty. backend: "cuda" draws and
     looks on the GPU; any other on the CPU, since the torch definition would take hours. progress:
     shows a bar.

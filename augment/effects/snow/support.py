@@ -43,7 +43,7 @@ def support_key(
     scene: Scene, cameras: Sequence[Camera], settings: PlacementSettings, *, backend: str = AUTO
 ) -> str:
     """Hex digest of all that a support depends on: Gaussians, tracks, cameras, poses, settings,
-    what places it (the GPU rounds otherwise than the CPU), and the version of this code. Of colours,
+    what places it (the GPU rounds otherwise than the CPU), and this code's version. Of colours,
     what all directions share. Order of the cameras counts.
     """
     digest = hashlib.blake2b(FORMAT.encode(), digest_size=20)
