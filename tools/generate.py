@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from adapters.base import open_scene, scenes_of
 from augment.errors import ClimateGSError
 from augment.jobs.block_worker import WorkSetup
-from augment.jobs.blocks import Plan, shard_of
+from augment.jobs.blocks import JobStatus, Plan, read_status, shard_of
 from augment.jobs.generate import (
     GenerateJob,
     GenerateResult,
@@ -22,11 +22,10 @@ from augment.jobs.generate import (
     run_generate,
 )
 from augment.jobs.layout import STATE_FOLDER
-from augment.jobs.blocks import JobStatus, read_status
 from augment.jobs.store import Store, open_store
 from augment.jobs.worker import shares_of
 from recipes.job import load_job, load_job_recipes
-from tools.output import print_note
+from tools.output import print_images, print_note
 
 if TYPE_CHECKING:
     from recipes.schema import Recipe
@@ -144,18 +143,9 @@ def _print_plan(plan: Plan, blocks: int, job: GenerateJob) -> None:
 
 
 def _report(result: GenerateResult, out: str) -> None:
-    rate = result.written / result.seconds if result.seconds else 0.0
-    print(
-        f"{result.written} images written, {result.skipped} already there, {result.failed} failed; "
-        f"{_duration(result.seconds)}, {rate:.1f} images/s"
-    )
+    print_images(result, _duration(result.seconds))
     if shares := shares_of(result.timings):
         print(shares.sentence)
-    for failure in result.failures[:_MAX_LINES]:
-        print_note(f"failed: {failure}")
-    if len(result.failures) > _MAX_LINES:
-        more = len(result.failures) - _MAX_LINES
-        print_note(f"... and {more} more; the manifest has them all")
     for uri, why in result.unusable.items():
         print_note(f"cannot be used: {uri}: {why}")
     print(f"output: {out}   (climategs report {shlex.quote(out)} shows it)")

@@ -10,12 +10,26 @@ from typing import Annotated, Any
 
 from tyro.conf import arg
 
+MAX_FAILURES = 20  # that are printed
 JsonFile = Annotated[Path | None, arg(name="json", metavar="FILE")]
 
 
 def print_note(text: str) -> None:
     """On stderr, beside the result on stdout."""
     print(text, file=sys.stderr)
+
+
+def print_images(result: Any, took: str) -> None:
+    """What became of a job's images: counts on stdout, the first failures as notes."""
+    rate = result.written / result.seconds if result.seconds else 0.0
+    print(
+        f"{result.written} images written, {result.skipped} already there, {result.failed} failed; "
+        f"{took}, {rate:.1f} images/s"
+    )
+    for failure in result.failures[:MAX_FAILURES]:
+        print_note(f"failed: {failure}")
+    if (more := len(result.failures) - MAX_FAILURES) > 0:
+        print_note(f"... and {more} more; the manifest has them all")
 
 
 def write_json(path: Path | None, facts: dict[str, Any], *, say: bool = True) -> None:

@@ -28,7 +28,7 @@ from recipes.job import scaled_recipe
 from recipes.load import load_recipe
 from recipes.schema import FramePattern, Recipe, free_knobs, parse_frames
 from tools.mirror import mirror_outputs, recipes_for_source
-from tools.output import print_note
+from tools.output import print_images, print_note
 from tools.sheet import draw_sheet, draw_video
 from tools.warm_up import warm_up, warming_up_beside
 
@@ -62,7 +62,7 @@ def render_recipe(options: RenderOptions) -> int:
         path = frames_from_path_file(options.camera_path, scene)
     recipes = [_with_quality(resolved, scene, options, path) for resolved in recipes]
     for resolved in recipes:
-        make_plan(resolved, scene)  # what the scene cannot give is said once, not for every image
+        make_plan(resolved, scene)  # refuse once, not for every image
     chosen = _pattern(options.frames).select([frame.index for frame in scene.frames])
     notes = lidar_notes(recipes)
     labelled = SceneIndex.of(scene, path).labelled
@@ -109,7 +109,7 @@ def resolve_variants(recipe: str, variants: int | None = None, scale: float = 1.
 def _with_quality(
     recipe: Recipe, scene: Scene, options: RenderOptions, path: Sequence[Frame] | None
 ) -> Recipe:
-    """The recipe with the settings of its quality, which are told where it had to choose them."""
+    """The recipe with the settings of its quality; a note says which it had to choose."""
     if not recipe.quality.is_open:
         return recipe
     resolved = resolve_quality_for(
@@ -144,21 +144,13 @@ def _check_no_path(camera_path: Path | None) -> None:
 
 
 def _report(result: JobResult, workers: int) -> None:
-    rate = result.written / result.seconds if result.seconds else 0.0
-    print(
-        f"{result.written} images written, {result.skipped} already there, {result.failed} failed; "
-        f"{result.seconds:.1f} s, {rate:.1f} images/s"
-    )
+    print_images(result, f"{result.seconds:.1f} s")
     if result.written:
         kinds = ("render", "encode", "write")
         each = [f"{1000 * result.timings.get(k, 0.0) / result.written:.0f} ms {k}" for k in kinds]
         print(f"per image: {', '.join(each)} (on threads that overlap)")
     if shares := shares_of(result.timings, held_up=workers):
         print(shares.sentence)
-    for failure in result.failures[:20]:
-        print_note(f"failed: {failure}")
-    if len(result.failures) > 20:
-        print_note(f"... and {len(result.failures) - 20} more; the manifest has them all")
     print(f"manifest: {result.manifest}")
 
 

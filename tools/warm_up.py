@@ -53,9 +53,9 @@ def warm_up_for_workers(recipes: Sequence[Recipe], backend: str) -> float:
     if not renders_on_gpu(backend):
         return warm_up(recipes)
     started = time.perf_counter()
-    apart = multiprocessing.get_context("spawn").Process(target=warm_up, args=(recipes, backend))
-    apart.start()
-    apart.join()
+    process = multiprocessing.get_context("spawn").Process(target=warm_up, args=(recipes, backend))
+    process.start()
+    process.join()
     return time.perf_counter() - started
 
 

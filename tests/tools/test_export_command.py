@@ -123,25 +123,21 @@ def test_what_is_refused(uri, tmp_path):
     assert {Path(name).parent.name for name in names(tmp_path)} == {"scene"}
 
 
-@pytest.mark.parametrize("kind", ["file", "ply", "splat"])
-def test_what_is_there_is_replaced_only_if_wanted(uri, tmp_path, kind):
-    suffix = "climategs" if kind == "file" else kind
-    path = tmp_path / f"a.{suffix}"
-    path.write_text("keep")
-    with pytest.raises(OutputError, match=r"is there already: .* --overwrite"):
-        export_scene(uri, tmp_path / "a", kind=kind)
-    assert path.read_text() == "keep"
-    export_scene(uri, tmp_path / "a", kind=kind, overwrite=True)
-    assert path.stat().st_size > 1000
-    (tmp_path / f"b.{suffix}").mkdir()
-    with pytest.raises(OutputError, match="is a folder"):
-        export_scene(uri, tmp_path / "b", kind=kind, overwrite=True)
-
-
-@pytest.mark.parametrize("kind", ["scene", "ply-parts"])
-def test_a_folder_of_other_things_is_never_replaced(uri, tmp_path, kind):
+def test_what_is_there_is_replaced_only_if_wanted(uri, tmp_path):
+    for kind, suffix in {"file": "climategs", "ply": "ply", "splat": "splat"}.items():
+        path = tmp_path / f"a.{suffix}"
+        path.write_text("keep")
+        with pytest.raises(OutputError, match=r"is there already: .* --overwrite"):
+            export_scene(uri, tmp_path / "a", kind=kind)
+        assert path.read_text() == "keep"
+        export_scene(uri, tmp_path / "a", kind=kind, overwrite=True)
+        assert path.stat().st_size > 1000
+        (tmp_path / f"b.{suffix}").mkdir()
+        with pytest.raises(OutputError, match="is a folder"):
+            export_scene(uri, tmp_path / "b", kind=kind, overwrite=True)
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos" / "holiday.jpg").touch()
-    with pytest.raises(OutputError, match="holds something else"):
-        export_scene(uri, tmp_path / "photos", kind=kind, overwrite=True)
+    for kind in ("scene", "ply-parts"):
+        with pytest.raises(OutputError, match="holds something else"):
+            export_scene(uri, tmp_path / "photos", kind=kind, overwrite=True)
     assert names(tmp_path / "photos") == ["holiday.jpg"]

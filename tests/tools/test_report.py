@@ -181,9 +181,9 @@ def test_without_a_clear_variant_pairs_are_shown(tmp_path) -> None:
     assert page.values("option", "data-name")[:3] == ["fog-000", "fog-001", "fog-002"]
 
 
-@pytest.mark.parametrize("images", [0, 1, 2, 5])
-def test_few_pictures_or_none(images, street) -> None:
-    assert page_of(street, images).tags["img"] <= images
+def test_few_pictures_or_none(street) -> None:
+    for images in (0, 1, 2, 5):
+        assert page_of(street, images).tags["img"] <= images
 
 
 def test_an_output_that_failed_altogether_has_a_page(tmp_path) -> None:
