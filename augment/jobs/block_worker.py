@@ -11,7 +11,7 @@ import logging
 import shutil
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
@@ -35,11 +35,11 @@ from recipes.schema import Recipe
 # ---- Takes a block from the folder it was rendered in to the output, where it appears at once ----
 # Its files go there first, to an object store those of an image as soon as it is finished; nobody
 # sees them before the block's rows follow in one step. What belongs to several images lies by
-# blocks,
-# for no two blocks ever write the same file: `labels/boxes/000016-3fc0a1b2d4e5.parquet`.
+# blocks, so that no two write one file: `labels/boxes/000016-3fc0a1b2d4e5.parquet`.
 
 _OF_BLOCK = ("labels", "box_2d", "box_smog", "box_water", "box_snow", "calibration")
 _OF_IMAGE = tuple(kind for kind in PATH_KINDS if kind not in _OF_BLOCK)
+_OF_VARIANT = ("*/*/recipe.yaml", "*/*/style/*")
 REMOTE_UPLOADS = 8  # at a time: most of the time of one is waiting
 
 
@@ -74,7 +74,9 @@ class Publisher:
         """Send what is left, then make the block visible."""
         rows = read_manifest(self._folder)
         new = _renamed(rows, self._block.file_stem)
-        left = {path: path for path in self._of_variant()}
+        # The recipe, and the files of its style: every block of a variant has the same.
+        of_variant = [p for glob in _OF_VARIANT for p in sorted(self._folder.glob(glob))]
+        left = {p: p for p in (p.relative_to(self._folder).as_posix() for p in of_variant)}
         for kind in PATH_KINDS:
             there, here = new[f"{kind}_path"].to_pylist(), rows[f"{kind}_path"].to_pylist()
             left |= {t: h for t, h in zip(there, here, strict=True) if h is not None}
@@ -90,13 +92,6 @@ class Publisher:
     def _send(self, source: str, target: str) -> None:
         self._sent[target] = self._pool.submit(self._store.put_file, target, self._folder / source)
 
-    def _of_variant(self) -> Iterator[str]:
-        """The recipe, and the files of its style: every block of a variant has the same."""
-        for path in sorted(self._folder.glob("*/*/recipe.yaml")):
-            yield path.relative_to(self._folder).as_posix()
-        for path in sorted(self._folder.glob("*/*/style/*")):
-            yield path.relative_to(self._folder).as_posix()
-
 
 def staging_folder(store: Store, scratch: Path | None, block: Block) -> Path:
     """Where a block is rendered: on the output's own disk, else in `scratch`. There a killed job
@@ -109,18 +104,13 @@ def staging_folder(store: Store, scratch: Path | None, block: Block) -> Path:
 
 
 def _renamed(rows: pa.Table, stem: str) -> pa.Table:
-    for kind in _OF_BLOCK:
-        name = f"{kind}_path"
-        paths = [None if p is None else _of_block(p, stem) for p in rows[name].to_pylist()]
+    """`labels/boxes.parquet` becomes `labels/boxes/<stem>.parquet`."""
+    for name in (f"{kind}_path" for kind in _OF_BLOCK):
+        files = [None if p is None else PurePosixPath(p) for p in rows[name].to_pylist()]
+        paths = [f and str(f.with_suffix("") / f"{stem}{f.suffix}") for f in files]
         place = rows.column_names.index(name)
         rows = rows.set_column(place, rows.schema.field(place), pa.array(paths, pa.string()))
     return rows.combine_chunks()
-
-
-def _of_block(path: str, stem: str) -> str:
-    """`labels/boxes.parquet` -> `labels/boxes/<stem>.parquet`."""
-    whole = PurePosixPath(path)
-    return str(whole.with_suffix("") / f"{stem}{whole.suffix}")
 
 
 # ---- What the images of a variant are made from, kept in the output before the first of them -----

@@ -333,8 +333,7 @@ class _ScenePickler(pickle.Pickler):
 
 
 def _map_tensor(path: str, offset: int, dtype: str, shape: tuple[int, ...]) -> torch.Tensor:
-    array = np.ndarray(shape, dtype, buffer=_mapping(path), offset=offset)
-    return torch.from_numpy(array)
+    return torch.from_numpy(np.ndarray(shape, dtype, buffer=_mapping(path), offset=offset))
 
 
 @functools.lru_cache(maxsize=1)

@@ -10,7 +10,8 @@ import math
 import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import cv2
@@ -441,10 +442,10 @@ class Report:
     """
 
     settings: Settings
-    is_met: bool
-    flip: float
-    views: tuple[tuple[int, str], ...]
-    measured: tuple[Measured, ...]
+    is_met: bool = True
+    flip: float = 0.0
+    views: tuple[tuple[int, str], ...] = ()
+    measured: tuple[Measured, ...] = ()
     ms: float | None = None
     reference_ms: float | None = None
     seconds: float = 0.0
@@ -487,31 +488,27 @@ def resolve_quality(
     views = calibration_views(scene.frames) if views is None else tuple(views)
     bar = tqdm(unit="picture", desc=f"choosing settings of {recipe.name}", disable=not progress)
     with bar:
-
-        def bench_of(reference: Recipe) -> Bench:
-            return Bench(
-                reference,
-                scene,
-                views,
-                backend=backend,
-                cameras=cameras,
-                renderer=renderer,
-                clock=clock,
-                each=bar.update,
-            )
-
-        chosen = _chosen(recipe, bench_of)
-    chosen.bench.hand_over(chosen.settings, scene)
-    report = Report(
-        settings=chosen.settings,
-        is_met=chosen.is_met,
-        flip=max(chosen.flips),
-        views=tuple((view.frame, view.name) for view in views),
-        measured=tuple(chosen.measured),
-        ms=chosen.ms,
-        reference_ms=chosen.reference_ms,
-        seconds=time.perf_counter() - started,
-    )
+        options = _options(recipe)
+        bench_of = partial(
+            Bench,
+            scene=scene,
+            views=views,
+            backend=backend,
+            cameras=cameras,
+            renderer=renderer,
+            clock=clock,
+            each=bar.update,
+        )
+        bench = _started(recipe, options, bench_of)
+        if recipe.quality.max_flip is not None:
+            chosen = _for_flip(bench, options, recipe.quality.max_flip)
+        else:
+            assert recipe.quality.budget_ms is not None
+            chosen = _for_budget(bench, options, recipe.quality.budget_ms)
+        flip = max(bench.flip(chosen.settings))
+    bench.hand_over(chosen.settings, scene)
+    shown = tuple((view.frame, view.name) for view in views)
+    seconds = time.perf_counter() - started
     if not chosen.is_met:
         _log.warning(
             "recipe %s, scene %s: its frames take %.0f ms with the fastest settings, more than "
@@ -521,6 +518,7 @@ def resolve_quality(
             chosen.ms,
             recipe.quality.budget_ms,
         )
+    report = replace(chosen, flip=flip, views=shown, seconds=seconds)
     return Resolved(resolved_recipe(recipe, chosen.settings), report)
 
 
@@ -551,29 +549,6 @@ def recipes_to_try(recipe: Recipe) -> list[Recipe]:
     return tried
 
 
-@dataclass
-class _Chosen:
-    bench: Bench
-    settings: Settings
-    is_met: bool = True
-    flips: tuple[float, ...] = ()
-    measured: list[Measured] = field(default_factory=list)
-    ms: float | None = None
-    reference_ms: float | None = None
-
-
-def _chosen(recipe: Recipe, bench_of: Callable[[Recipe], Bench]) -> _Chosen:
-    options = _options(recipe)
-    bench = _started(recipe, options, bench_of)
-    if recipe.quality.max_flip is not None:
-        chosen = _for_flip(bench, options, recipe.quality.max_flip)
-    else:
-        assert recipe.quality.budget_ms is not None
-        chosen = _for_budget(bench, options, recipe.quality.budget_ms)
-    chosen.flips = bench.flip(chosen.settings)
-    return chosen
-
-
 def _started(
     recipe: Recipe, options: dict[str, tuple[Value, ...]], bench_of: Callable[[Recipe], Bench]
 ) -> Bench:
@@ -589,7 +564,7 @@ def _started(
             options[_CELL] = options[_CELL][:-1]
 
 
-def _for_flip(bench: Bench, options: Options, bound: float) -> _Chosen:
+def _for_flip(bench: Bench, options: Options, bound: float) -> Report:
     measured: dict[tuple[str, Value], Measured] = {}
 
     def own_flip(path: str, value: Value) -> float:
@@ -598,10 +573,10 @@ def _for_flip(bench: Bench, options: Options, bound: float) -> _Chosen:
         return error
 
     settings = within_flip(options, bound, own_flip, lambda s: bench.exceeds(s, bound))
-    return _Chosen(bench, settings, measured=list(measured.values()))
+    return Report(settings, measured=tuple(measured.values()))
 
 
-def _for_budget(bench: Bench, options: Options, budget_ms: float) -> _Chosen:
+def _for_budget(bench: Bench, options: Options, budget_ms: float) -> Report:
     reference_ms = bench.ms({})
     costs: dict[str, list[Cost]] = {path: [] for path in options}
     measured = []
@@ -619,11 +594,10 @@ def _for_budget(bench: Bench, options: Options, budget_ms: float) -> _Chosen:
         return bench.ms({p: value for p, value in settings.items() if value != reference[p]})
 
     found = within_budget(options, budget_ms, costs, ms_of)
-    return _Chosen(
-        bench,
+    return Report(
         found.settings,
         found.is_met,
-        measured=measured,
+        measured=tuple(measured),
         ms=found.ms,
         reference_ms=reference_ms,
     )
@@ -647,11 +621,9 @@ def _is_allowed(recipe: Recipe, path: str, value: Value) -> bool:
 
 
 # ---- A choice of settings, made once for an output and kept in it --------------------------------
-# `.climategs/quality/<digest>.json` is found again by what was asked: the recipe with the knobs
-# that
-# it leaves free, the scene, the camera path, the package's version and the backend. Whoever goes on
-# with the output, on whatever machine, takes the settings from there: with a budget of time they
-# would else differ from one machine to the next, and the images with them.
+# `.climategs/quality/<digest>.json` is found again by what was asked. Whoever goes on with the
+# output, on whatever machine, takes the settings from there: with a budget of time they would else
+# differ from one machine to the next, and the images with them.
 
 FOLDER = f"{STATE_FOLDER}/quality"
 _FORMAT = 1
