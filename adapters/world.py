@@ -31,7 +31,7 @@ def with_class_of(label: str, gaussians: Gaussians) -> Gaussians:
     return dataclasses.replace(gaussians, semantic=classes)
 
 
-# ---- world ---------------------------------------------------------------------------------------
+# ---- World to world -----------------------------------------------------------------------------
 
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 

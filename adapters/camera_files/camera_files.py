@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, TypeVar
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -47,6 +47,17 @@ class PosedView:
     camera: str | None = None
     frame: int | None = None
     timestamp_ns: int | None = None
+
+
+Lens = tuple[int, int, float, float, float, float]  # width, height, fx, fy, cx, cy: pixels
+
+
+def lens_of(
+    width: int, height: int, fx: float, fy: float | None, cx: float | None, cy: float | None
+) -> Lens:
+    """A pinhole; fy is fx and the principal point the middle where they are not said."""
+    fy, cx = fx if fy is None else fy, width / 2 if cx is None else cx
+    return width, height, fx, fy, cx, height / 2 if cy is None else cy
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,18 +203,9 @@ def inria_views(content: list[object], path: Path) -> ViewSet:
     for number, camera in enumerate(file.cameras):
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = camera.rotation, camera.position
-        views.append(
-            PosedView(
-                name=camera.img_name,
-                width=camera.width,
-                height=camera.height,
-                fx=camera.fx,
-                fy=camera.fy,
-                cx=camera.width / 2 if camera.cx is None else camera.cx,
-                cy=camera.height / 2 if camera.cy is None else camera.cy,
-                world_from_camera=check_pose(pose, where=f"{path}: {number} ({camera.img_name})"),
-            )
-        )
+        pose = check_pose(pose, where=f"{path}: {number} ({camera.img_name})")
+        lens = lens_of(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+        views.append(PosedView(camera.img_name, *lens, pose))
     return ViewSet(tuple(views))
 
 
@@ -226,14 +228,8 @@ def nerfstudio_views(content: object, path: Path) -> ViewSet:
         pose = np.asarray(frame.transform_matrix, dtype=np.float64)
         pose = check_pose(np.vstack([pose[:3], [0, 0, 0, 1]]) @ opencv_from_opengl, where=where)
         image = path.parent / frame.file_path
-        views.append(
-            PosedView(
-                name=frame.file_path,
-                **_pinhole(lens, where),
-                world_from_camera=pose,
-                image_path=str(image) if image.is_file() else None,
-            )
-        )
+        image_path = str(image) if image.is_file() else None
+        views.append(PosedView(frame.file_path, *_pinhole(lens, where), pose, image_path))
     problems = [distortion_problem(str(path), n, m) for m, n in distorted.items()]
     return ViewSet(tuple(views), tuple(problems))
 
@@ -246,7 +242,7 @@ def distortion_problem(where: str, count: int, model: str) -> str:
     )
 
 
-def _pinhole(lens: _Intrinsics, where: str) -> dict[str, Any]:
+def _pinhole(lens: _Intrinsics, where: str) -> Lens:
     if lens.w is None or lens.h is None:
         raise AdapterError(f"{where}: w and h (image size, pixels) are missing; add them")
     fl_x = lens.fl_x
@@ -254,14 +250,7 @@ def _pinhole(lens: _Intrinsics, where: str) -> dict[str, Any]:
         fl_x = 0.5 * lens.w / math.tan(0.5 * lens.camera_angle_x)
     if fl_x is None:
         raise AdapterError(f"{where}: fl_x (pixels) or camera_angle_x (radians) is missing; add it")
-    return {
-        "width": lens.w,
-        "height": lens.h,
-        "fx": fl_x,
-        "fy": fl_x if lens.fl_y is None else lens.fl_y,
-        "cx": lens.w / 2 if lens.cx is None else lens.cx,
-        "cy": lens.h / 2 if lens.cy is None else lens.cy,
-    }
+    return lens_of(lens.w, lens.h, fl_x, lens.fl_y, lens.cx, lens.cy)
 
 
 # ---- Cameras of a COLMAP sparse model (cameras, images; .bin or .txt), read by pycolmap ----------
@@ -303,19 +292,11 @@ def read_colmap_views(model: Path) -> ViewSet:
         where = f"{model}: image {image.name}"
         camera_from_world = np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
         path = folder / image.name if folder else None
-        views.append(
-            PosedView(
-                name=image.name,
-                width=camera.width,
-                height=camera.height,
-                fx=camera.focal_length_x,
-                fy=camera.focal_length_y,
-                cx=camera.principal_point_x,
-                cy=camera.principal_point_y,
-                world_from_camera=invert_pose(check_pose(camera_from_world, where=where)),
-                image_path=str(path) if path and path.is_file() else None,
-            )
-        )
+        size, focal = (camera.width, camera.height), (camera.focal_length_x, camera.focal_length_y)
+        middle = (camera.principal_point_x, camera.principal_point_y)
+        pose = invert_pose(check_pose(camera_from_world, where=where))
+        image_path = str(path) if path and path.is_file() else None
+        views.append(PosedView(image.name, *size, *focal, *middle, pose, image_path))
     if not views:
         raise AdapterError(f"{model}: this COLMAP model holds no image with a pose")
     problems = [distortion_problem(str(model), n, m) for m, n in distorted.items()]
@@ -395,14 +376,9 @@ def path_views(content: object, path: Path) -> ViewSet:
         time = frame.timestamp_s
         views.append(
             PosedView(
-                name=f"frames.{number}",
-                width=file.width,
-                height=file.height,
-                fx=file.fx,
-                fy=file.fx if file.fy is None else file.fy,
-                cx=file.width / 2 if file.cx is None else file.cx,
-                cy=file.height / 2 if file.cy is None else file.cy,
-                world_from_camera=pose,
+                f"frames.{number}",
+                *lens_of(file.width, file.height, file.fx, file.fy, file.cx, file.cy),
+                pose,
                 camera=frame.camera,
                 frame=seen[frame.camera] if time is None else rank[time],
                 timestamp_ns=None if time is None else round(time * 1e9),

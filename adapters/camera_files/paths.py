@@ -23,7 +23,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from adapters.camera_files.camera_files import PosedView, look_at_pose, read_views
+from adapters.camera_files.camera_files import PosedView, lens_of, look_at_pose, read_views
 from adapters.uri import CAMERA_PATH_KEY, add_to_uri
 from adapters.world import WorldChange, invert_pose
 from augment.cameras import Camera, Frame
@@ -422,18 +422,8 @@ def _reach(distances: np.ndarray) -> float:
 
 def _view(camera: str, frame: int, pose: np.ndarray, kind: str) -> PosedView:
     focal = 0.5 * WIDTH / math.tan(math.radians(_FIELD_OF_VIEW_DEG[kind]) / 2)
-    return PosedView(
-        name=f"{camera}/{frame:04d}",
-        width=WIDTH,
-        height=HEIGHT,
-        fx=focal,
-        fy=focal,
-        cx=WIDTH / 2,
-        cy=HEIGHT / 2,
-        world_from_camera=pose,
-        camera=camera,
-        frame=frame,
-    )
+    lens = lens_of(WIDTH, HEIGHT, focal, None, None, None)
+    return PosedView(f"{camera}/{frame:04d}", *lens, pose, camera=camera, frame=frame)
 
 
 # ---- Views grouped into the frames of a drive ----------------------------------------------------

@@ -113,9 +113,9 @@ def left_out(models: Mapping[str, Any], where: str) -> tuple[str, ...]:
         if name in (BACKGROUND, RIGID, *OTHERS):
             continue
         means = section(models, name, where).get("_means")
-        what = (
-            f"{len(means)} Gaussians of {name} are" if isinstance(means, Tensor) else name + " is"
-        )
+        what = f"the model {name} is"
+        if isinstance(means, Tensor):
+            what = f"{len(means)} Gaussians of {name} are"
         reason = _REASONS.get(name, "models of this kind are not known here")
         sentences.append(f"{where}: {what} left out: {reason}")
     return tuple(sentences)
@@ -435,7 +435,7 @@ def _network(directions: Tensor, appearance: Tensor, layers: list[tuple[Tensor, 
     return (hidden @ last.T + last_bias).sigmoid()
 
 
-# ---- adapter -------------------------------------------------------------------------------------
+# ---- The scene -----------------------------------------------------------------------------------
 
 
 def open_drivestudio(path: str, query: dict[str, str]) -> Scene:

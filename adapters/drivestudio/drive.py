@@ -514,7 +514,7 @@ def _numbers(
     return values
 
 
-# ---- drive ---------------------------------------------------------------------------------------
+# ---- Where car and cameras were ------------------------------------------------------------------
 
 FRAME_NS = 100_000_000
 _LEVEL = 1e-4  # slope that is none: a centimetre in 100 m

@@ -58,12 +58,24 @@ class ModelConfig:
 
 
 @dataclass(frozen=True, eq=False)
+class Lens:
+    """camera_from_ego: float64 [4, 4], OpenCV axes. path: of the intrinsics, for messages."""
+
+    path: Path
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    camera_from_ego: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
 class StreetImage:
     """One image, or a camera without its image. cam: number in CAMERA_NAMES.
 
-    world_from_ego: float64 [4, 4], at the moment of the image. camera_from_ego: float64 [4, 4],
-    OpenCV axes. is_held_out: not trained on. number: its position among all images of the selected
-    frames and cameras, by frame, then camera, left out or not: the index of per-image corrections.
+    world_from_ego: float64 [4, 4], at the moment of the image. is_held_out: not trained on.
+    number: its position among all images of the selected frames and cameras, by frame, then camera,
+    left out or not: the index of per-image corrections.
     """
 
     frame: int
@@ -71,13 +83,9 @@ class StreetImage:
     path: Path | None
     timestamp_s: float
     world_from_ego: np.ndarray
-    camera_from_ego: np.ndarray
+    lens: Lens
     width: int
     height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
     is_held_out: bool
     number: int
 
@@ -145,18 +153,6 @@ TIMES = "timestamps.json"
 _NUMBER = re.compile(r"[0-9]{1,9}")
 _FRAME_POSE = re.compile(r"([0-9]{1,9})\.txt")
 _MAX_GAPS = 1000  # numbers between the first frame and the last that nothing is known of
-
-
-@dataclass(frozen=True, eq=False)
-class Lens:
-    """camera_from_ego: float64 [4, 4], OpenCV axes. path: of the intrinsics, for messages."""
-
-    path: Path
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    camera_from_ego: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -703,15 +699,15 @@ def frames_of(data: StreetData) -> tuple[Frame, ...]:
 
 def camera_of(image: StreetImage) -> Camera:
     """The camera at the moment of the image, of the recorded size."""
-    camera_from_world = image.camera_from_ego @ invert_pose(image.world_from_ego)
+    camera_from_world = image.lens.camera_from_ego @ invert_pose(image.world_from_ego)
     return Camera(
         name=image.name,
         width=image.width,
         height=image.height,
-        fx=image.fx,
-        fy=image.fy,
-        cx=image.cx,
-        cy=image.cy,
+        fx=image.lens.fx,
+        fy=image.lens.fy,
+        cx=image.lens.cx,
+        cy=image.lens.cy,
         camera_from_world=torch.from_numpy(camera_from_world),
         timestamp_ns=image.timestamp_ns,
     )
@@ -785,7 +781,7 @@ def _images(
     for number, (frame, cam) in enumerate((frame, cam) for frame in frames for cam in cams):
         if (frame, cam) not in moments:
             continue
-        (timestamp_s, world_from_ego), lens = moments[frame, cam], lenses[cam]
+        timestamp_s, world_from_ego = moments[frame, cam]
         width, height = sizes[cam]
         images.append(
             StreetImage(
@@ -794,13 +790,9 @@ def _images(
                 path=paths.get((frame, cam)),
                 timestamp_s=timestamp_s,
                 world_from_ego=_centred(world_from_ego, origin),
-                camera_from_ego=lens.camera_from_ego,
+                lens=lenses[cam],
                 width=width,
                 height=height,
-                fx=lens.fx,
-                fy=lens.fy,
-                cx=lens.cx,
-                cy=lens.cy,
                 is_held_out=frames.index(frame) in held_out,
                 number=number,
             )

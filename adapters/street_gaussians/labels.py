@@ -203,7 +203,7 @@ def _checked(
         yield frame, PointCloud(xyz.astype(np.float64), seen)
 
 
-# ---- labels --------------------------------------------------------------------------------------
+# ---- Labels --------------------------------------------------------------------------------------
 
 # Of Waymo's cars, from the ego origin: forward, left, up.
 ROOF_SENSOR_M = np.array([1.43, 0.0, 2.18])

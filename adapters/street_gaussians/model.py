@@ -90,10 +90,8 @@ _MODES = {"color_correction_mode": ("image", "sensor"), "pose_correction_mode": 
 
 def newest_config(model: Path) -> Path:
     """The configuration of a model's folder; of several the one of the latest iteration."""
-    found = {}
-    for path in (model / "configs").glob("config_*.yaml"):
-        if match := _NAME.fullmatch(path.name):
-            found[int(match[1])] = path
+    files = (model / "configs").glob("config_*.yaml")
+    found = {int(match[1]): path for path in files if (match := _NAME.fullmatch(path.name))}
     if not found:
         raise AdapterError(
             f"{model / 'configs'} holds no config_*.yaml; which column of the actors' poses "
@@ -224,14 +222,11 @@ def _weights(path: Path, options: ModelOptions) -> tuple[Path, Path, int | None]
 
 def _saved(folder: Path) -> dict[tuple[str, int], Path]:
     """Weights by kind and iteration."""
-    found = {}
-    for file in folder.glob("trained_model/iteration_*.pth"):
-        if match := _PTH.fullmatch(file.name):
-            found["pth", int(match[1])] = file
+    files = [("pth", file, file.name) for file in folder.glob("trained_model/iteration_*.pth")]
     for file in folder.glob("point_cloud/iteration_*/point_cloud.ply"):
-        if match := _PLY.fullmatch(file.parent.name):
-            found["ply", int(match[1])] = file
-    return found
+        files.append(("ply", file, file.parent.name))
+    pattern = {"pth": _PTH, "ply": _PLY}
+    return {(k, int(m[1])): file for k, file, name in files if (m := pattern[k].fullmatch(name))}
 
 
 # ---- Tables of a trained model beside its Gaussians: poses, sky, colour and pose correction ------
@@ -249,15 +244,18 @@ def actor_id(name: str) -> int | None:
 class Parameters:
     """Networks and tables of a checkpoint beside its Gaussians, with sentences about them."""
 
-    def __init__(self, content: Mapping[str, Any], path: Path, problems: list[str]) -> None:
-        self.path, self.problems = path, problems
+    def __init__(
+        self, content: Mapping[str, Any], path: Path, config: ModelConfig, problems: list[str]
+    ) -> None:
+        self.path, self.config, self.problems = path, config, problems
         self._content = content
         self.seen = {"background", "iter"}
 
-    def of(self, name: str, key: str, is_used: bool) -> Mapping[str, Any] | None:
-        """The table `params` of an entry. key: what in the configuration says that it is used."""
+    def of(self, name: str, switch: str) -> Mapping[str, Any] | None:
+        """The table `params` of an entry. switch: what of the configuration says if it is used."""
         self.seen.add(name)
-        if not is_used:
+        key = _CONFIG_KEYS[switch]
+        if not getattr(self.config, switch):
             if self._content.get(name):
                 self.problems.append(
                     f"{self.path}: {name} is left out, as the configuration has not {key}"
@@ -316,14 +314,12 @@ def rotations_of(quats: np.ndarray) -> np.ndarray:
     return np.moveaxis(np.array(rows), -1, 0)
 
 
-def read_pose_changes(
-    parameters: Parameters, config: ModelConfig, *, has_actors: bool
-) -> PoseChanges | None:
+def read_pose_changes(parameters: Parameters, *, has_actors: bool) -> PoseChanges | None:
     """What training added to the actors' poses; None where it left them."""
     if not has_actors:
         parameters.seen.add("actor_pose")
         return None
-    params = parameters.of("actor_pose", "model.nsg.opt_track", config.opt_track)
+    params = parameters.of("actor_pose", "opt_track")
     if params is None:
         return None
     positions = parameters.numbers(params, "actor_pose", "opt_trans", (None, None, 3))
@@ -332,13 +328,13 @@ def read_pose_changes(
     return PoseChanges(positions, half_turns[..., 0])
 
 
-def read_sky(parameters: Parameters, config: ModelConfig) -> Tensor | None:
+def read_sky(parameters: Parameters) -> Tensor | None:
     """Faces of the sky, float32 [6, R, R, 3] in [0, 1]; None where there is none that can be used.
 
     The project clamps what it looks up; clamped texels are the same but between texels of which
     only some are out of range.
     """
-    params = parameters.of("sky_cubemap", "model.nsg.include_sky", config.include_sky)
+    params = parameters.of("sky_cubemap", "include_sky")
     if params is None:
         return None
     where = f"{parameters.path}, sky_cubemap.params"
@@ -362,13 +358,15 @@ def read_sky(parameters: Parameters, config: ModelConfig) -> Tensor | None:
     return own.clamp_(0, 1)
 
 
-def read_color_maps(parameters: Parameters, config: ModelConfig) -> Tensor | None:
+def read_color_maps(parameters: Parameters) -> Tensor | None:
     """Colour maps float32 [n, 3, 4]; None where there are none that can be used."""
     name = "color_correction"
-    params = parameters.of(name, "model.use_color_correction", config.use_color_correction)
+    params = parameters.of(name, "use_color_correction")
     if params is None:
         return None
-    if config.color_correction_mlp or any(str(k).startswith("affine_trans.") for k in params):
+    if parameters.config.color_correction_mlp or any(
+        str(k).startswith("affine_trans.") for k in params
+    ):
         parameters.problems.append(
             f"{parameters.path}, {name}: colour correction by a network is not supported and left "
             f"out; images have the scene's own colours"
@@ -379,10 +377,10 @@ def read_color_maps(parameters: Parameters, config: ModelConfig) -> Tensor | Non
     )
 
 
-def read_camera_changes(parameters: Parameters, config: ModelConfig) -> np.ndarray | None:
+def read_camera_changes(parameters: Parameters) -> np.ndarray | None:
     """What the background is moved by before an image is taken, float64 [n, 4, 4]."""
     name = "pose_correction"
-    params = parameters.of(name, "model.use_pose_correction", config.use_pose_correction)
+    params = parameters.of(name, "use_pose_correction")
     if params is None:
         return None
     centres = parameters.numbers(params, name, "pose_correction_trans", (None, 3))
@@ -479,7 +477,7 @@ def _mark_bad_terms(means: Tensor, terms: Tensor) -> None:
             means[piece][torch.from_numpy(bad)] = torch.nan
 
 
-# ---- model ---------------------------------------------------------------------------------------
+# ---- A whole model -------------------------------------------------------------------------------
 
 _TENSORS = ("xyz", "feature_dc", "feature_rest", "scaling", "rotation", "opacity", "semantic")
 _TRAINING = (
@@ -530,15 +528,15 @@ def read_checkpoint(path: Path, config: ModelConfig) -> TrainedModel:
         if part is not None:
             actors[number] = part
     assert background is not None
-    parameters = Parameters(content, path, problems)
+    parameters = Parameters(content, path, config, problems)
     model = TrainedModel(
         file=path,
         background=background,
         actors=actors,
-        pose_changes=read_pose_changes(parameters, config, has_actors=bool(actors)),
-        sky=read_sky(parameters, config),
-        color_maps=read_color_maps(parameters, config),
-        camera_changes=read_camera_changes(parameters, config),
+        pose_changes=read_pose_changes(parameters, has_actors=bool(actors)),
+        sky=read_sky(parameters),
+        color_maps=read_color_maps(parameters),
+        camera_changes=read_camera_changes(parameters),
         problems=problems,
     )
     parameters.report_unknown()

@@ -22,6 +22,7 @@ from adapters.street_gaussians.adapter import (
     vehicle_poses,
 )
 from adapters.street_gaussians.data import (
+    Lens,
     ModelConfig,
     StreetData,
     StreetImage,
@@ -33,6 +34,7 @@ from augment.errors import AdapterError
 from augment.scene import Gaussians
 
 FRAMES = 6
+LENS = Lens(Path(), fx=50, fy=50, cx=32, cy=24, camera_from_ego=np.eye(4))
 CAMS = (0, 2)
 DELAYS_S = {0: 0.013, 2: 0.031}
 START_S = 1550083467.25
@@ -53,8 +55,8 @@ def image(step: int, number: int, cam: int, *, is_held_out: bool) -> StreetImage
     time_s = START_S + 0.1 * step + DELAYS_S[cam]
     return StreetImage(
         frame=10 + step, cam=cam, path=None, timestamp_s=time_s,
-        world_from_ego=ego(0.1 * step + DELAYS_S[cam]), camera_from_ego=np.eye(4), width=64,
-        height=48, fx=50, fy=50, cx=32, cy=24, is_held_out=is_held_out, number=number,
+        world_from_ego=ego(0.1 * step + DELAYS_S[cam]), lens=LENS, width=64,
+        height=48, is_held_out=is_held_out, number=number,
     )  # fmt: skip
 
 
