@@ -81,11 +81,7 @@ class DriveOptions:
         scheme: str, query: Mapping[str, str], own: Mapping[str, str] | None = None
     ) -> DriveOptions:
         """The options of a URI's query. own: keys that the scheme has besides and reads itself,
-        with what their values may be.
-
-        Raises:
-            AdapterError: an unknown key, or a value of the wrong kind or out of range.
-        """
+        with what their values may be."""
         kinds = {key: kind for key, (_, kind) in _KEYS.items()} | dict(own or {})
         unknown = sorted(set(query) - set(kinds))
         if unknown:
@@ -105,11 +101,7 @@ class DriveOptions:
         return DriveOptions(**fields)
 
     def select(self, numbers: Sequence[int], *, where: str) -> DriveFrames:
-        """Which of the dataset's frames, ascending, the scene has. where: for messages.
-
-        Raises:
-            AdapterError: no frame is left, or all are held out.
-        """
+        """Which of the dataset's frames, ascending, the scene has. where: for messages."""
         kept = tuple(number for number in numbers if number in self.frames)
         if not kept:
             stop = "" if self.frames.stop is None else self.frames.stop

@@ -137,7 +137,7 @@ def open_kitti(path: str, query: dict[str, str]) -> Scene:
         )
     boxes = {frame.index: TimedBoxes(source.labels.boxes(frame.index), None) for frame in frames}
     objects = read_objects(frames, boxes, source.world_origin_m)
-    scene = build_lidar_scene(
+    return build_lidar_scene(
         sweeps,
         join_tracks(objects.moving),
         views_of(used),
@@ -149,21 +149,13 @@ def open_kitti(path: str, query: dict[str, str]) -> Scene:
         labels=source.labels,
         world_origin_m=source.world_origin_m,
         problems=(*source.problems, *image_problems, *sweep_problems, *objects.problems),
+        if_empty=f"{source.labels.root}: none of the sweeps' points is in any image; check that "
+        f"calibration, sweeps and images are of one day",
     )
-    if len(scene.background) + len(scene.actors) == 0:
-        raise AdapterError(
-            f"{source.labels.root}: none of the sweeps' points is in any image; check that "
-            f"calibration, sweeps and images are of one day"
-        )
-    return scene
 
 
 def kitti_labels(path: str, query: dict[str, str]) -> KittiLabels:
-    """The labels alone, in the world that `open_kitti` with this query has before recentring.
-
-    Raises:
-        AdapterError: as for `open_kitti`, but for images.
-    """
+    """The labels alone, in the world that `open_kitti` with this query has before recentring."""
     return find_source(path, query)[0].labels
 
 
@@ -290,11 +282,7 @@ class Source:
 
 
 def find_source(path: str, query: dict[str, str]) -> tuple[Source, KittiOptions]:
-    """What the URI names, and its options.
-
-    Raises:
-        AdapterError: a wrong option, no KITTI folder, wrong calibration, times, poses or tracklets.
-    """
+    """What the URI names, and its options."""
     root, calibration = kitti_root(path)
     is_object = is_object_folder(root)
     options = KittiOptions.from_query(query, is_object=is_object)

@@ -385,14 +385,14 @@ def _mercator_pose(packet: np.ndarray, scale: float) -> np.ndarray:
     """world_from_imu, float64 [4, 4]."""
     latitude, longitude, altitude, roll, pitch, yaw = packet[:6]
     pose = np.eye(4)
-    pose[:3, :3] = _about(2, yaw) @ _about(1, pitch) @ _about(0, roll)
+    pose[:3, :3] = rotation_about(2, yaw) @ rotation_about(1, pitch) @ rotation_about(0, roll)
     pose[0, 3] = scale * EARTH_RADIUS_M * np.radians(longitude)
     pose[1, 3] = scale * EARTH_RADIUS_M * np.log(np.tan(np.pi * (90 + latitude) / 360))
     pose[2, 3] = altitude
     return pose
 
 
-def _about(axis: int, angle: float) -> np.ndarray:
+def rotation_about(axis: int, angle: float) -> np.ndarray:
     """Rotation about x, y or z (0, 1, 2), float64 [3, 3]."""
     cos, sin = np.cos(angle), np.sin(angle)
     matrix = np.eye(3)

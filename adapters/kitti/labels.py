@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from adapters.kitti.files import OBJECT_DIGITS, file_in, read_returns
+from adapters.kitti.files import OBJECT_DIGITS, file_in, read_returns, rotation_about
 from adapters.plain_files import parse_numbers, read_text
 from adapters.raw_drive import stored_records
 from augment.errors import AdapterError
@@ -159,13 +159,9 @@ def boxes_at(tracklets: tuple[Tracklet, ...], frame: int, world_from_velodyne: n
 def _pose(tracklet: Tracklet, row: int) -> np.ndarray:
     """velodyne_from_box of the box's middle, float64 [4, 4]."""
     values = tracklet.poses[row]
-    (cx, cy, cz), (sx, sy, sz) = np.cos(values[3:]), np.sin(values[3:])
+    rx, ry, rz = values[3:]
     pose = np.eye(4)
-    pose[:3, :3] = (
-        np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
-        @ np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
-        @ np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
-    )
+    pose[:3, :3] = rotation_about(2, rz) @ rotation_about(1, ry) @ rotation_about(0, rx)
     pose[:3, 3] = values[:3] + pose[:3, 2] * tracklet.size_m[2] / 2
     return pose
 

@@ -134,11 +134,7 @@ def read_returns(
     """The part of `lidar_depth` that all cameras of a frame share; None without a sweep.
 
     without_semantic: the dataset's class numbers of returns that are no surface, such as mirror
-    images.
-
-    Raises:
-        AdapterError: the sweep's column timestamp_ns holds no times.
-    """
+    images."""
     sweep = scene.lidar(frame_index)
     if sweep is None:
         return None

@@ -22,8 +22,10 @@ from adapters.lidar_scene.surfels import (
     thin_points,
 )
 from adapters.raw_drive import DriveOptions, Sweep
+from adapters.world import join_gaussians
 from augment.cameras import Frame
-from augment.ground import measure_from_classes
+from augment.errors import AdapterError
+from augment.ground import Ground, measure_from_classes
 from augment.labels import LabelSource
 from augment.scene import Actor, Gaussians, Scene
 
@@ -66,17 +68,26 @@ def build_lidar_scene(
     world_origin_m: np.ndarray,
     problems: tuple[str, ...],
     has_metric_scale: bool = True,
+    added: Gaussians | None = None,
+    ground: Ground | None = None,
+    if_empty: str = "",
 ) -> Scene:
     """Accumulate, thin, find surfaces, colour from images, and turn into Gaussians.
 
     Surfels that no image shows take the colour of a near seen one, or are left out; so are points
     without neighbours, and actors of which nothing is left. lidar_top_deg: highest elevation that
-    the LiDAR looks at. problems: of reading; those of building follow them. Without a known ground
-    the scene's ground_z_m is a low height."""
+    the LiDAR looks at. problems: of reading; those of building follow them. added: Gaussians of the
+    background from elsewhere. ground: measured unless given; where it is not found, ground_z_m is a
+    low height.
+
+    Raises:
+        AdapterError: no Gaussian is left, and if_empty says why.
+    """
     path = np.stack([frame.world_from_ego[:3, 3].numpy() for frame in frames])
     times_ns = np.array([frame.timestamp_ns for frame in frames], np.int64)
     background, actors = split_sweeps(sweeps, tracks)
-    ground = measure_from_classes(background.points, background.semantic, path)
+    if ground is None:
+        ground = measure_from_classes(background.points, background.semantic, path)
     paths = [path, *(_path_in(track, path, times_ns) for track in tracks)]
     sampled = _sample_all([background, *actors], paths, options)
     thinned = [(p, e, surfels_from_points(p.points, e, semantic=p.semantic)) for p, e in sampled]
@@ -84,6 +95,10 @@ def build_lidar_scene(
     gatherer = SkyGatherer(options.sky_size, math.radians(lidar_top_deg))
     seen, faults = observe_views(bodies, views, gatherer, image_scale=options.image_scale)
     gaussians = [_gaussians(*thing, colours) for thing, colours in zip(thinned, seen, strict=True)]
+    if added is not None:
+        gaussians[0] = join_gaussians([gaussians[0], added])
+    if if_empty and not any(map(len, gaussians)):
+        raise AdapterError(if_empty)
     return Scene(
         name=name,
         source=source,

@@ -111,14 +111,8 @@ def read_returns(tables: SceneTables, sweep: SensorFile) -> Returns:
         points = local @ pose[:3, :3].T + pose[:3, 3]
         before = tables.turn.before_ns(local @ sweep.ego_from_sensor[:3, :3].T)
     classes, problem = _read_classes(tables, sweep, len(records))
-    return Returns(
-        points_m=points,
-        timestamps_ns=sweep.timestamp_ns - before,
-        intensity=records[:, 3].copy(),
-        ring=records[:, 4].copy(),
-        classes=classes,
-        problem=problem,
-    )
+    times_ns = sweep.timestamp_ns - before
+    return Returns(points, times_ns, records[:, 3].copy(), records[:, 4].copy(), classes, problem)
 
 
 @dataclass(frozen=True, eq=False)
@@ -310,11 +304,7 @@ def _panoptic_of(file: Path, rows: np.ndarray) -> bytes:
 
 
 def nuscenes_labels(path: str, query: dict[str, str]) -> NuScenesLabels:
-    """The labels of a scene; whatever frames= says, they are those of all its frames.
-
-    Raises:
-        AdapterError: as open_nuscenes for the options and the tables.
-    """
+    """The labels of a scene; whatever frames= says, they are those of all its frames."""
     options = NuScenesOptions.from_query(query)
     tables = read_tables(Path(path), options.version, options.scene)
     return NuScenesLabels(tables, scene_frames(tables, sweeps=options.sweeps)[0])

@@ -15,6 +15,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -35,7 +36,6 @@ from adapters.recording.files import (
 )
 from adapters.recording.labels import RecordingLabels, all_boxes, read_lidar_drive
 from adapters.uri import format_uri
-from adapters.world import join_gaussians
 from augment.cameras import Camera, Frame
 from augment.errors import AdapterError
 from augment.ground import Ground
@@ -110,7 +110,11 @@ def open_recording(path: str, query: dict[str, str]) -> Scene:
     )
 
     def build(
-        sweeps: Sequence[Sweep], options: DriveOptions, top_deg: float, problems: Sequence[str]
+        sweeps: Sequence[Sweep],
+        options: DriveOptions,
+        top_deg: float,
+        problems: Sequence[str],
+        **guessed: Any,
     ) -> Scene:
         scene = build_lidar_scene(
             sweeps,
@@ -125,18 +129,15 @@ def open_recording(path: str, query: dict[str, str]) -> Scene:
             world_origin_m=calibration.world_origin_m,
             problems=(*found, *problems),
             has_metric_scale=calibration.has_metric_scale,
+            if_empty=f"{root}: none of the points that were measured is in any image; check in "
+            f"calibration.json that camera axes are x right, y down, z forward, and that LiDAR "
+            f"and poses are in one world with z up",
+            **guessed,
         )
         problems = scene.problems + without_points(tracks, scene)
         return dataclasses.replace(scene, problems=problems)
 
-    scene = _best_scene(root, calibration, options, frames, used, objects, build)
-    if len(scene.background) + len(scene.actors) == 0:
-        raise AdapterError(
-            f"{root}: none of the points that were measured is in any image; check in "
-            f"calibration.json that camera axes are x right, y down, z forward, and that LiDAR "
-            f"and poses are in one world with z up"
-        )
-    return scene
+    return _best_scene(root, calibration, options, frames, used, objects, build)
 
 
 def _best_scene(
@@ -146,7 +147,7 @@ def _best_scene(
     frames: Sequence[Frame],
     used: Sequence[Frame],
     objects: RecordedObjects,
-    build: Callable[[Sequence[Sweep], DriveOptions, float, Sequence[str]], Scene],
+    build: Callable[..., Scene],
 ) -> Scene:
     """The scene from LiDAR, else from depth images, else from guesses.
 
@@ -177,15 +178,9 @@ def _best_scene(
         options, voxel_m=max(_VOXEL_M, options.voxel_m), max_gaussians=budget - len(shells)
     )
     sweeps = guess_surfaces(road, objects.moving, objects.still)
-    scene = build(sweeps, coarse, _SKY_ABOVE_DEG, (*problems, start))
-    # Whatever was found in the guessed surfaces is the height they were given.
-    assumed = Ground(float(road[:, 2].min()), float(np.median(road[:, 2])), "ego path")
-    return dataclasses.replace(
-        scene,
-        background=join_gaussians([scene.background, shells]),
-        ground_z_m=assumed.lowest_z_m,
-        ground=assumed,
-    )
+    # Whatever is found in the guessed surfaces is the height they were given.
+    ground = Ground(float(road[:, 2].min()), float(np.median(road[:, 2])), "ego path")
+    return build(sweeps, coarse, _SKY_ABOVE_DEG, (*problems, start), added=shells, ground=ground)
 
 
 def depth_sweeps(root: Path, frames: Sequence[Frame]) -> tuple[tuple[Sweep, ...], tuple[str, ...]]:

@@ -200,11 +200,7 @@ def read_calibration(root: Path) -> Calibration:
 
 
 def read_lidar_classes(root: Path) -> Mapping[int, int] | None:
-    """The calibration's lidar_classes alone.
-
-    Raises:
-        AdapterError: the file is missing or damaged, or names no classes.
-    """
+    """The calibration's lidar_classes alone."""
     path, content = _content(root)
     return _lidar_classes(path, content.get("lidar_classes"))
 

@@ -179,8 +179,8 @@ class RecordedViews:
         self._problems: list[str] = []
         self._cameras = self._read_all(scene, names, scale)
         held_out = {f.index for f in scene.frames[step - 1 :: step]} if step else set()
-        self._train = tuple(key for key in self._cameras if key.frame not in held_out)
-        self._test = tuple(key for key in self._cameras if key.frame in held_out)
+        self.train = tuple(key for key in self._cameras if key.frame not in held_out)
+        self.test = tuple(key for key in self._cameras if key.frame in held_out)
         self._check_split(holdout)
         self._depth = DepthSource(
             scene, self._cameras, depth, cache_bytes=cache_bytes // 2, reference=reference_depth
@@ -191,14 +191,6 @@ class RecordedViews:
         self.ego_masks = self._find_ego(names, masks_dir)
         self._mask_ego = mask_ego
         self._lock = threading.Lock()
-
-    @property
-    def train(self) -> tuple[ViewKey, ...]:
-        return self._train
-
-    @property
-    def test(self) -> tuple[ViewKey, ...]:
-        return self._test
 
     @property
     def problems(self) -> tuple[str, ...]:
@@ -213,8 +205,8 @@ class RecordedViews:
         return {
             "images": dict(Counter(key.camera for key in self._cameras)),
             "sizes_px": sizes,
-            "train_images": len(self._train),
-            "test_images": len(self._test),
+            "train_images": len(self.train),
+            "test_images": len(self.test),
             "depth_priors": list(self._depth.kinds),
             "lidar_top_deg": None if top is None else float(np.degrees(top)),
             "ego_mask_parts": {n: float(mask.mean()) for n, mask in self.ego_masks.items()},
@@ -244,15 +236,8 @@ class RecordedViews:
             ego = self._ego(camera)
             if ego is not None:
                 prior = prior.select(~ego.reshape(-1)[prior.pixels])
-            return RecordedView(
-                camera=camera,
-                rgb=rgb,
-                weight=self._weight(camera),
-                sky=sky,
-                depth_pixels=prior.pixels,
-                depth_m=prior.depth_m,
-                depth_weight=prior.weight,
-            )
+            weight, depth = self._weight(camera), (prior.pixels, prior.depth_m, prior.weight)
+            return RecordedView(camera, rgb, weight, sky, *depth)
 
     def _ego(self, camera: Camera) -> np.ndarray | None:
         """Where the camera sees the recording car; None if it does not."""
@@ -285,14 +270,14 @@ class RecordedViews:
 
     def _read_all(self, scene: Scene, names: Sequence[str], scale: float) -> dict[ViewKey, Camera]:
         """The training camera of every view with a usable image, in order of frame and camera."""
-        wanted = [
+        expected = [
             (ViewKey(frame.index, name), frame.cameras[name], frame.image_paths.get(name))
             for frame in scene.frames
             for name in names
             if name in frame.cameras
         ]
         cameras: dict[ViewKey, Camera] = {}
-        for key, full, path in tqdm(wanted, desc="images", unit="image", disable=None):
+        for key, full, path in tqdm(expected, desc="images", unit="image", disable=None):
             if path is None:
                 continue  # the adapter that left it out has said so
             _check_camera(key, full)
@@ -306,16 +291,23 @@ class RecordedViews:
                 continue
             cameras[key] = scaled
         if not cameras:
-            raise AdapterError(_no_images(scene, names, len(wanted), self._problems))
+            first = f" First: {self._problems[0]}." if self._problems else ""
+            raise AdapterError(
+                f"scene {scene.name!r} ({scene.source}) has no usable recorded image for "
+                f"{len(scene.frames)} frames of {', '.join(names) or 'no camera'} "
+                f"({len(expected)} expected). A reconstruction needs recordings: open the raw "
+                f"drive, such as pandaset:PATH or recording:PATH, and see that its images are in "
+                f"place.{first}"
+            )
         return cameras
 
     def _check_split(self, holdout: str) -> None:
-        if not self._train:
+        if not self.train:
             raise AdapterError(
                 f"scene {self._scene.name!r}: holdout {holdout!r} leaves no image to learn from; "
                 f"choose a larger step or 'none'"
             )
-        if holdout != "none" and not self._test:
+        if holdout != "none" and not self.test:
             frames = len({key.frame for key in self._cameras})
             self._problems.append(
                 f"nothing is held out: {holdout} selects none of the {frames} "
@@ -328,10 +320,11 @@ class RecordedViews:
         found: dict[str, np.ndarray] = {}
         for name in names:
             views = [(k, c) for k, c in self._cameras.items() if k.camera == name]
-            # Should a camera's size change, masks are for the size it has at first.
-            views = [(k, c) for k, c in views if (c.width, c.height) == _size(views[0][1])]
             if not views:
                 continue
+            # Should a camera's size change, masks are for the size it has at first.
+            size = (views[0][1].width, views[0][1].height)
+            views = [(k, c) for k, c in views if (c.width, c.height) == size]
             if masks_dir is not None:
                 path = masks_dir / f"{name}.png"
                 if path.exists():
@@ -349,8 +342,8 @@ class RecordedViews:
 
     def _measure_lidar_top(self) -> float | None:
         frames = list(dict.fromkeys(key.frame for key in self._cameras))
-        spread = frames[:: max(1, -(-len(frames) // _TOP_FRAMES))]
-        top = lidar_top_rad(self._scene, spread)
+        some = frames[:: max(1, -(-len(frames) // _TOP_FRAMES))]
+        top = lidar_top_rad(self._scene, some)
         if top is None:
             self._problems.append(
                 "no sky masks: without LiDAR sweeps nothing tells sky from tall buildings"
@@ -374,10 +367,6 @@ def _check_camera(key: ViewKey, camera: Camera) -> None:
         )
 
 
-def _size(camera: Camera) -> tuple[int, int]:
-    return camera.width, camera.height
-
-
 def _camera_names(scene: Scene, cameras: Sequence[str] | None) -> tuple[str, ...]:
     known = scene.camera_names
     if cameras is None:
@@ -389,13 +378,3 @@ def _camera_names(scene: Scene, cameras: Sequence[str] | None) -> tuple[str, ...
             f"it has {', '.join(known) or 'none'}"
         )
     return tuple(name for name in known if name in cameras)
-
-
-def _no_images(scene: Scene, names: Sequence[str], wanted: int, problems: Sequence[str]) -> str:
-    first = f" First: {problems[0]}." if problems else ""
-    return (
-        f"scene {scene.name!r} ({scene.source}) has no usable recorded image for "
-        f"{len(scene.frames)} frames of {', '.join(names) or 'no camera'} ({wanted} expected). "
-        f"A reconstruction needs recordings: open the raw drive, such as pandaset:PATH or "
-        f"recording:PATH, and see that its images are in place.{first}"
-    )

@@ -160,12 +160,6 @@ def test_wrong_calibration(drive, file, pattern, text, message):
         find_source(str(drive), {})
 
 
-def test_more_keys_and_empty_lines_are_no_problem(drive):
-    path = drive.parent / "calib_cam_to_cam.txt"
-    path.write_text("\n\n" + path.read_text() + "\nK_77: not of numbers\n")
-    assert problems_of(drive) == ""
-
-
 def test_missing_calibration_files(drive):
     (drive.parent / "calib_imu_to_velo.txt").unlink()
     with pytest.raises(AdapterError, match=r"calib_imu_to_velo\.txt does not exist"):
@@ -208,7 +202,7 @@ def test_the_cameras_times_serve_where_the_velodyne_has_none(drive):
     assert source.problems == ()
 
 
-@pytest.mark.parametrize("line", ["today", "2011-13-26 13:02:25", "1", "9999-01-01 00:00:00"])
+@pytest.mark.parametrize("line", ["2011-13-26 13:02:25", "1", "9999-01-01 00:00:00"])
 def test_lines_that_are_no_time(drive, line):
     path = drive / "image_03/timestamps.txt"
     path.write_text(f"2011-09-26 13:02:25.9\n{line}\n")

@@ -14,7 +14,6 @@ from adapters.training_views.depth_priors import (
     DepthPriors,
     PriorPixels,
     align,
-    beside,
     find_maps,
     find_sparse,
     join_priors,
@@ -89,13 +88,6 @@ def test_the_first_prior_of_a_pixel_is_believed_and_the_nearest_of_one_prior():
     assert both.pixels.tolist() == [1, 3, 7] and both.depth_m.tolist() == [9, 2, 4]
     assert both.weight.tolist() == [0.5, 1, 1] and both.pixels.dtype == np.int32
     assert len(join_priors([])) == 0
-
-
-def test_dense_priors_leave_cells_with_better_ones_alone():
-    cam = drives.camera(size=(8, 8))
-    dense = PriorPixels.of(np.array([18, 22, 50, 54]), np.full(4, 5.0))  # middles of cells of 4
-    known = PriorPixels.of(np.array([0, 63]), np.full(2, 5.0))
-    assert beside(dense, known, cam, 4).pixels.tolist() == [22, 50]
 
 
 def test_alignment_survives_outliers():
