@@ -15,25 +15,14 @@ import torch
 from augment.cameras import Camera, Frame
 from augment.files.scene_schema import FORMAT
 from augment.reconstruct.config import FitConfig
+from augment.reconstruct.trainer import StepRecord
 from augment.reconstruct.view import RecordedView, ViewKey
-from augment.scene import Gaussians, Scene
+from augment.scene import Scene
 from augment.sky import ConstantSky
+from tests.scenes import one_gaussian
 from tools.fit import FitParts
 
 SIZE = (6, 8)
-
-
-@dataclass(frozen=True)
-class FakeRecord:
-    step: int
-    key: ViewKey
-    loss: float
-    l1: float
-    ssim: float
-    depth: float
-    sky: float
-    splats: int
-    stage_s: dict[str, float]
 
 
 class FakeTrainer:
@@ -47,7 +36,7 @@ class FakeTrainer:
         self._order: list[int] = []
         self.before_step: Callable[[int], None] = lambda step: None
 
-    def run_step(self) -> FakeRecord:
+    def run_step(self) -> StepRecord:
         self.before_step(self.step)
         if not self._order:
             self._order = self._rng.permutation(len(self._source.train)).tolist()
@@ -58,7 +47,7 @@ class FakeTrainer:
         self.step += 1
         loss = float(np.abs(target - self._colour).mean())
         times = {"load": 0.001, "forward": 0.002}
-        return FakeRecord(self.step, key, loss, loss, 0.5, 0.1, 0.0, 400, times)
+        return StepRecord(self.step, key, loss, loss, 0.5, 0.1, 0.0, 400, times)
 
     def scene(self) -> Scene:
         sh = torch.from_numpy(self._colour.copy()).expand(1, 1, 3).contiguous()
@@ -114,17 +103,10 @@ def fake_scene(source: str, numbers: Sequence[int] = range(6), recorded: bool = 
         paths = {name: f"{number}-{name}.png" for name in cameras} if recorded else {}
         return Frame(number, number, pose, cameras, paths)
 
-    one = Gaussians(
-        means=torch.zeros(1, 3),
-        quats=torch.tensor([[1.0, 0, 0, 0]]),
-        scales=torch.ones(1, 3),
-        opacities=torch.ones(1),
-        sh=torch.zeros(1, 1, 3),
-    )
     return Scene(
         name="street",
         source=source,
-        background=one,
+        background=one_gaussian(),
         actors=(),
         sky=ConstantSky(torch.zeros(3)),
         frames=tuple(frame(n) for n in numbers),

@@ -146,16 +146,13 @@ def test_what_stands_there_is_kept(scene_uri, photo, tmp_path):
     assert files_of(other) == {"notes.txt": b"mine"}
 
 
-@pytest.mark.parametrize(
-    ("style", "options", "said"),
-    [
+def test_styles_that_cannot_be_used(scene_uri, tmp_path):
+    for style, options, message in (
         ("dusc", {}, "no such style; did you mean dusk"),
         ("none.png", {}, r"none\.png"),
         ("dusk", {"method": "gscm"}, "give image instead of preset"),
         ("dusk", {"strength": 3}, "strength"),
-    ],
-)
-def test_styles_that_cannot_be_used(scene_uri, tmp_path, style, options, said):
-    with pytest.raises(StyleError, match=said):
-        apply_style(scene_uri, style, tmp_path / "out", **options)
-    assert not (tmp_path / "out").exists()
+    ):
+        with pytest.raises(StyleError, match=message):
+            apply_style(scene_uri, style, tmp_path / "out", **options)
+        assert not (tmp_path / "out").exists()
