@@ -33,7 +33,7 @@ WATCHED = (
     "socket.",
     "marshal.",
 )
-MUTATIONS = 120  # of each file
+MUTATIONS = 60  # of each file
 
 
 class _Watch:

@@ -81,6 +81,6 @@ def test_a_pattern_that_would_look_through_too_much_is_refused(tmp_path, monkeyp
     assert set(uris(tmp_path, "**")) == {str(tmp_path / n) for n in (
         "", "a", "a/deep", "a/one", "a/two", "b", "b/deep", "b/one", "b/two"
     )}  # fmt: skip
-    monkeypatch.setattr("adapters.base.MAX_LOOKED_AT", 5)
+    monkeypatch.setattr("adapters.base.MAX_ENTRIES", 5)
     with pytest.raises(AdapterError, match=r"'\*\*/no': looked at 5 files and folders and saw no"):
         uris(tmp_path, "**/no")
