@@ -156,7 +156,7 @@ def parse_job(text: str, *, source: str, name: str = "job") -> Job:
             if problem["type"] == "too_short" and problem["input"]:
                 continue  # it has items, each of them with a problem of its own
             where, line = _place(tree, problem["loc"])
-            problems.add(line, f"{where}{_said(problem)}")
+            problems.add(line, f"{where}{_message(problem)}")
     problems.raise_if_any()
     raise AssertionError("pydantic found a problem and named none")
 
@@ -207,23 +207,23 @@ def scaled_recipe(recipe: Recipe, scale: float) -> Recipe:
 
 def _place(tree: Node, location: tuple[int | str, ...]) -> tuple[str, int]:
     """`scenes[1].uri: ` and its line, or those of the nearest thing above that the file has."""
-    said, line, node = "", tree.line, tree
+    place, line, node = "", tree.line, tree
     for part in location:
         if isinstance(part, int):
             if not isinstance(node, ListNode) or part >= len(node.items):
                 break
-            node, said = node.items[part], f"{said}[{part}]"
+            node, place = node.items[part], f"{place}[{part}]"
             line = node.line
         elif isinstance(node, MapNode) and part in node.entries:
             line, node = node.entries[part]
-            said = f"{said}.{short(part)}" if said else short(part)
+            place = f"{place}.{short(part)}" if place else short(part)
         elif not isinstance(node, ScalarNode):
-            said = f"{said}.{short(part)}" if said else short(part)
+            place = f"{place}.{short(part)}" if place else short(part)
             break
-    return f"{said}: " if said else "", line
+    return f"{place}: " if place else "", line
 
 
-def _said(problem: Any) -> str:
+def _message(problem: Any) -> str:
     if problem["type"] == "extra_forbidden":
         known = {**JobScene.model_fields, **JobRecipe.model_fields, **Job.model_fields}
         near = nearest_word(str(problem["loc"][-1]), tuple(known))

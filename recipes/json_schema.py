@@ -47,18 +47,13 @@ def write_schema(path: str | Path) -> None:
 
 
 def _section(section: SectionSpec, definitions: Schema) -> Schema:
-    properties: Schema = {}
-    for name, spec in {**section.fields, **section.extra}.items():
-        properties[name] = _field(spec, definitions)
+    specs = {**section.fields, **section.extra}
+    properties: Schema = {name: _field(spec, definitions) for name, spec in specs.items()}
     for name, below in section.sections.items():
         schema = _section(below, definitions)
         if below.max_items is not None:
-            schema = {
-                "type": "array",
-                "items": schema,
-                "description": below.list_description,
-                "maxItems": below.max_items,
-            }
+            described = {"description": below.list_description, "maxItems": below.max_items}
+            schema = {"type": "array", "items": schema, **described}
         # 'weather:' with nothing after it is null
         ways = [schema, {"type": "null"}]
         if below.shorthand is not None:
@@ -79,14 +74,13 @@ def _section(section: SectionSpec, definitions: Schema) -> Schema:
 
 def _field(spec: FieldSpec, definitions: Schema) -> Schema:
     unit = f" [{spec.unit}]" if spec.unit else ""
-    said: Schema = {"description": spec.description + unit}
-    if spec.default is not None:
-        default = spec.default
-        said["default"] = list(default) if isinstance(default, tuple) else default
+    described: Schema = {"description": spec.description + unit}
+    if (default := spec.default) is not None:
+        described["default"] = list(default) if isinstance(default, tuple) else default
     if not spec.rangeable:
-        return {**_literal(spec), **said}
+        return {**_literal(spec), **described}
     definitions[spec.path] = _with_ranges(spec, spec.path)
-    return {"$ref": f"#/$defs/{spec.path}", **said}
+    return {"$ref": f"#/$defs/{spec.path}", **described}
 
 
 def _literal(spec: FieldSpec) -> Schema:
@@ -95,12 +89,8 @@ def _literal(spec: FieldSpec) -> Schema:
         flags = [True, False] if spec.kind is Kind.FLAG else []
         return {"enum": [*flags, *spec.words, *(None for _ in null)]}
     if spec.channel is not None:
-        return {
-            "type": ["array", *null],
-            "items": {"$ref": f"#/$defs/{spec.channel.path}"},
-            "minItems": 3,
-            "maxItems": 3,
-        }
+        items = {"$ref": f"#/$defs/{spec.channel.path}"}
+        return {"type": ["array", *null], "items": items, "minItems": 3, "maxItems": 3}
     if spec.kind.is_text:  # taken as it is written
         return {"type": ["string", "number", "boolean", *null], **_PATTERNS.get(spec.kind, {})}
     name = {Kind.NUMBER: "number", Kind.WHOLE: "integer", Kind.FLAG: "boolean"}[spec.kind]

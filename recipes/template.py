@@ -591,7 +591,7 @@ class RecipeTemplate:
     def describe_ranges(self) -> dict[str, str]:
         """Dotted path -> its range in words, with the unit; only what differs between variants."""
         units = {spec.path: spec.unit for part in ROOT.walk() for spec in part.fields.values()}
-        said = {
+        described = {
             path: f"present with probability {probability:g}"
             for path, probability in self.effects
             if probability < 1
@@ -599,8 +599,8 @@ class RecipeTemplate:
         for path, value in self.values:
             if value.is_range:
                 unit = units.get(_INDEX.sub("[]", path))
-                said[path] = value.describe() + (f" ({unit})" if unit else "")
-        return said
+                described[path] = value.describe() + (f" ({unit})" if unit else "")
+        return described
 
 
 def readable(error: ValidationError) -> list[str]:
