@@ -377,7 +377,9 @@ def _from_above(
         front = renderer.draw(camera, above, requested)
     assert front.rgb is not None and front.alpha is not None
     sky, smog = renderer.sky, renderer.medium
-    backend = _follows(renderer.backend, front.alpha)
+    backend = renderer.backend
+    if backend == AUTO and front.alpha.device.type != "cpu":
+        backend = CUDA  # also passes without an image of their own run where the layers lie
     with timed("flood: where it is seen"):
         water, most_shown = find_water(front.alpha, camera, backend=backend)
     if most_shown < 1 - HIDDEN_COVER:
@@ -416,12 +418,6 @@ def _from_above(
         image = composite_water(front, camera, window, color, sky, smog, backend=backend)
         scene = merge_depths(front, bed, bed_window, buffers, backend=backend)
     return FloodedImage(image, scene, water)
-
-
-def _follows(backend: str, image: Tensor) -> str:
-    """The backend of passes without an image of their own: where layers lie on a GPU, theirs."""
-    follows = backend == AUTO and image.device.type != "cpu"
-    return CUDA if follows else backend
 
 
 def _draw_bed(

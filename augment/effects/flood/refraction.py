@@ -424,7 +424,10 @@ def reflect_screen(
     camera = screen.layer.camera
     column, row, matches = _end_in_image(surface, ray, screen)
     matches = matches & is_inside(camera, column, row) & smooth
-    fade = _smoothstep(_to_border(camera, column, row) / EDGE)
+    across = torch.minimum(column, camera.width - column) / camera.width
+    down = torch.minimum(row, camera.height - row) / camera.height
+    x = (torch.minimum(across, down) / EDGE).clamp(0, 1)
+    fade = x * x * (3 - 2 * x)
     weight = torch.where(matches, screen.weight * fade, 0)[..., None]
     seen = bilinear(stacked(screen.layer), *clamp_to(camera, column, row))
     return weight * seen + (1 - weight) * rest
@@ -457,18 +460,6 @@ def _end_in_image(
     corrected = (point - surface.points).norm(dim=-1)
     column, row, solid, _, matches = look(torch.where(solid, corrected, distance))
     return column, row, torch.where(far, ~solid, solid & matches)
-
-
-def _to_border(camera: Camera, column: Tensor, row: Tensor) -> Tensor:
-    """Distance to the image's border over the length of the sides that stand on it."""
-    across = torch.minimum(column, camera.width - column) / camera.width
-    down = torch.minimum(row, camera.height - row) / camera.height
-    return torch.minimum(across, down)
-
-
-def _smoothstep(x: Tensor) -> Tensor:
-    x = x.clamp(0, 1)
-    return x * x * (3 - 2 * x)
 
 
 def _fetch(

@@ -137,11 +137,6 @@ def origins_of(scene: Scene, frame_index: int, sweep: LidarSweep) -> np.ndarray:
     return np.broadcast_to(origin + np.asarray(scene.world_origin_m), (len(sweep), 3))
 
 
-def lambertian(reflectance: float, cosine: np.ndarray) -> np.ndarray:
-    """What a diffuse surface gives back at an angle, relative to a white one met head on."""
-    return reflectance * np.clip(cosine, 0.0, 1.0)
-
-
 def signal(reflectance: np.ndarray, ranges_m: np.ndarray) -> np.ndarray:
     """Power of an echo, in the units of `smog.soft_response`: reflectance / (pi R^2), 1/m^2/sr."""
     return reflectance / (math.pi * ranges_m**2)
@@ -316,12 +311,6 @@ def wavelength_factor(extinction_per_m: float, wavelength_um: float = 0.905) -> 
     return (wavelength_um / VISIBLE_UM) ** -(slope * visibility_km + offset)
 
 
-def medium_for(medium: SmogMedium, model: LidarModel) -> SmogMedium:
-    """The images' smog as the LiDAR's light meets it."""
-    factor = wavelength_factor(medium.sigma_per_m, model.wavelength_um)
-    return dataclasses.replace(medium, sigma_per_m=factor * medium.sigma_per_m)
-
-
 def extinction_at(medium: SmogMedium, z_m: np.ndarray) -> np.ndarray:
     """alpha [N] at heights, 1/metre."""
     if medium.scale_height_m is None:
@@ -413,11 +402,6 @@ def scatter_before(
         at = np.interp(where[rows] * echo.share[last], echo.share, echo.ranges_m)
         out.ranges_m[rows] = np.minimum(at, ends_m[rows])
     return out
-
-
-def apparent_reflectance(power: np.ndarray, ranges_m: np.ndarray) -> np.ndarray:
-    """The reflectance of a surface whose echo from that range is as strong: inverse of `signal`."""
-    return power / signal(np.ones_like(power), np.maximum(ranges_m, 1e-3))
 
 
 # ---- Standing water: a flat mirror that swallows 905 nm within centimetres -----------------------
@@ -542,7 +526,7 @@ def weathered_sweep(
         _meet_water(echoes, plan.flood)
     if plan.smog is not None:
         rng = rng_for(seed=recipe.seed, scene=scene.name, frame=frame_index, effect="lidar.smog")
-        _meet_smog(echoes, medium_for(plan.smog, model), model, rng)
+        _meet_smog(echoes, plan.smog, model, rng)
     echoes.lose_faint(model)
     return echoes.sweep()
 
@@ -555,7 +539,7 @@ def _meet_snow(echoes: Echoes, scene: Scene, plan: Plan, sweep: LidarSweep, fram
     rows = np.flatnonzero(hits < ranges)
     # The layer counts as level, but its grains stand out: no beam slides over it unreflected.
     facing = np.maximum(np.abs(echoes.directions[rows, 2]), MIN_FACING)
-    echoes.replace(rows, hits[rows], lambertian(snow.reflectance, facing), MOVED)
+    echoes.replace(rows, hits[rows], snow.reflectance * np.clip(facing, 0.0, 1.0), MOVED)
 
 
 def _meet_water(echoes: Echoes, medium: FloodMedium) -> None:
@@ -572,6 +556,8 @@ def _meet_water(echoes: Echoes, medium: FloodMedium) -> None:
 def _meet_smog(
     echoes: Echoes, medium: SmogMedium, model: LidarModel, rng: np.random.Generator
 ) -> None:
+    factor = wavelength_factor(medium.sigma_per_m, model.wavelength_um)
+    medium = dataclasses.replace(medium, sigma_per_m=factor * medium.sigma_per_m)
     eyes_z, air = echoes.origins[:, 2], echoes.air_m
     ends_z = eyes_z + air * echoes.directions[:, 2]
     tau = optical_depth_of_arrays(medium, air, eyes_z, ends_z, series_below=1e-4)
@@ -581,5 +567,6 @@ def _meet_smog(
     wins = (scatter.signal > echo) & (echoes.ranges_m > 0) & (echoes.codes != LOST)
     rows = np.flatnonzero(wins)
     ranges = scatter.ranges_m[rows]
-    apparent = apparent_reflectance(scatter.signal[rows], ranges)
-    echoes.replace(rows, ranges, apparent, SCATTERED)
+    # As reflectance of a surface whose echo from that range is as strong.
+    white = signal(np.ones(len(rows)), np.maximum(ranges, 1e-3))
+    echoes.replace(rows, ranges, scatter.signal[rows] / white, SCATTERED)
