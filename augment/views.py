@@ -125,7 +125,7 @@ class WeatheredView:
 
     rgb: uint8 [H, W, 3]. depth_m: float32 [H, W], 0 = none. semantic: uint8 [H, W], SemanticClass.
     instance: uint16 [H, W], 0 = background or sky, else 1 + the actor's index in the scene; what is
-    written has boxes without an actor, too (`augment.jobs.view_files.label_view`).
+    written has boxes without an actor, too (`augment.jobs.files.label_view`).
     water: uint8 [H, W], 255 where a ray meets water first, else 0; None where the recipe has no
     flood. flood: None where the recipe has no flood. snow: uint8 [H, W], 255 where snow is what the
     pixel shows, else 0. snow, snowy: None where the recipe has no snow. smoggy: None where it has

@@ -17,10 +17,10 @@ from augment.cameras import Camera
 from augment.dataset import SceneDataset, WeatherDataset, boxes_2d, torchvision_sample
 from augment.errors import AdapterError
 from augment.jobs.box_tables import TABLES, BoxNumbers, measure_boxes
+from augment.jobs.files import label_view
 from augment.jobs.manifest import read_manifest
 from augment.jobs.render_job import JobResult, RenderJob, run_job
 from augment.jobs.tables import read_boxes
-from augment.jobs.files import label_view
 from augment.labels import Boxes
 from augment.scene import Gaussians, Scene
 from augment.semantics import SemanticClass

@@ -24,12 +24,11 @@ from generate_jobs import (
 
 from augment.errors import ClimateGSError, OutputError
 from augment.jobs.atomic import write_atomic
-from augment.jobs.blocks import stored_plans
+from augment.jobs.blocks import read_status, stored_plans
 from augment.jobs.generate import GenerateJob, GenerateResult, run_generate
 from augment.jobs.layout import folder_name
 from augment.jobs.manifest import list_parts, read_finished, read_manifest
 from augment.jobs.render_job import RenderJob, run_job
-from augment.jobs.blocks import read_status
 from augment.jobs.store import open_store
 from recipes.job import JobScene
 

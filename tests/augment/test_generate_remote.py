@@ -10,9 +10,9 @@ import pytest
 from generate_jobs import image_name, make_job, make_recipes, outputs
 from s3_server import s3_server
 
+from augment.jobs.blocks import read_status
 from augment.jobs.claims import ClaimTimes
 from augment.jobs.generate import run_generate
-from augment.jobs.blocks import read_status
 from augment.jobs.store import open_store
 
 

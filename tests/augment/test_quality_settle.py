@@ -84,7 +84,9 @@ def bench(monkeypatch: pytest.MonkeyPatch) -> Workbench:
     """
     bench = Workbench()
     monkeypatch.setattr("augment.jobs.quality.flip", _mean_error)
-    monkeypatch.setattr(record, "resolve_quality", functools.partial(resolve_quality, clock=bench.clock))
+    monkeypatch.setattr(
+        record, "resolve_quality", functools.partial(resolve_quality, clock=bench.clock)
+    )
     return bench
 
 
