@@ -23,17 +23,18 @@ def trace(
     directions,  # [N, 3] float64, any length: distances come out in their unit
     limits,  # [N] float64: how far to look
     any_hit,  # stop at the first shape met, whichever it is
-    node_bounds,  # [M, 6] float64: low, high
-    node_first,  # [M] int64: leaf: first entry of order; else: index of the second child
-    node_count,  # [M] int64: shapes in a leaf; 0 for an inner node, whose first child follows it
+    nodes,  # bounds [M, 6] float64: low, high; first [M] int64: leaf: first entry of order, else
+    # index of the second child; count [M] int64: shapes in a leaf, 0 for an inner node, whose first
+    # child follows it
     order,  # [P] int64: shapes as the leaves list them
-    kind,  # [P] int8
-    shape_origin,  # [P, 3] float64
-    inverse,  # [P, 3, 3] float64: q = inverse @ (point - origin)
-    hit_distance,  # [N] float64 out: infinite where nothing is met
-    hit_shape,  # [N] int64 out: -1 where nothing is met
-    hit_local,  # [N, 3] float64 out
+    shapes,  # kind [P] int8; origin [P, 3] float64; inverse [P, 3, 3] float64: q = inverse @ (point
+    # - origin)
+    hits,  # out: distance [N] float64, infinite, and shape [N] int64, -1, where nothing is met;
+    # local [N, 3] float64
 ):
+    node_bounds, node_first, node_count = nodes
+    kind, shape_origin, inverse = shapes
+    hit_distance, hit_shape, hit_local = hits
     stack = np.empty(STACK, np.int64)
     for ray in range(origins.shape[0]):
         ox, oy, oz = origins[ray, 0], origins[ray, 1], origins[ray, 2]
@@ -280,7 +281,7 @@ class Hits:
 
 @dataclass(frozen=True, eq=False)
 class Tree:
-    """A bounding volume hierarchy over shapes, flat and depth first (see `raycast_kernels`)."""
+    """A bounding volume hierarchy over shapes, flat and depth first (see `trace`)."""
 
     bounds: np.ndarray
     first: np.ndarray
@@ -312,7 +313,7 @@ class Tree:
             (self.kind, self.origin, self.inverse),
         )
         out = (hits.distance, hits.shape, hits.local)
-        trace(origins, ahead, limits, any_hit, *nodes, self.order, *shapes, *out)
+        trace(origins, ahead, limits, any_hit, nodes, self.order, shapes, out)
         return hits
 
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import os
 import shutil
+import subprocess
 from pathlib import Path
 
 import cv2
@@ -137,6 +139,44 @@ def test_a_nuscenes_dataset(tmp_path):
     assert snapshot(root) == before
     # Of two scenes with five images of each of two cameras, keyframes of one.
     assert "  6 of 20 camera images are weathered; 14 stay clear, as recorded" in said
+
+
+DEVKIT = """
+import json, sys
+from nuscenes.nuscenes import NuScenes
+found = []
+for root in sys.argv[1:]:
+    nusc = NuScenes(version="v1.0-mini", dataroot=root, verbose=False)
+    shown = {}
+    for sample in nusc.sample:
+        for channel, token in sample["data"].items():
+            path, boxes, intrinsic = nusc.get_sample_data(token)
+            key = path.replace(root, "")
+            shown[key] = [
+                open(path, "rb").read()[:8].hex(),
+                [[b.name, list(b.center), list(b.orientation.q)] for b in boxes],
+                None if intrinsic is None else [list(row) for row in intrinsic],
+            ]
+    found.append(shown)
+assert found[0].keys() == found[1].keys()
+for key in found[0]:
+    assert found[0][key][1:] == found[1][key][1:], key
+print(json.dumps(sorted(found[0])))
+"""
+
+
+def test_the_official_devkit_reads_the_copy(tmp_path):
+    python = os.environ.get("CLIMATEGS_NUSCENES_DEVKIT")
+    if python is None:
+        pytest.skip("CLIMATEGS_NUSCENES_DEVKIT names no Python with nuscenes-devkit")
+    root = nuscenes_files.write_dataset(tmp_path / "nuscenes", scenes=["scene-0001"])
+    scene = open_scene(format_uri("nuscenes", root, SMALL))
+    copy, _ = weather(scene, tmp_path / "out")
+    command = [python, "-c", DEVKIT, str(root), str(copy / "nuscenes")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    images = {name for name in json.loads(done.stdout) if "CAM_" in name}
+    assert len(images) == 2 * nuscenes_files.SAMPLES
 
 
 def write_kitti_drive(folder: Path, *, calibration: str) -> Path:

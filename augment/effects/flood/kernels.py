@@ -169,8 +169,13 @@ def _add_kept(kept, count, way):
 
 
 @inner()
-def _add_fading(fading, count, way, n, spacing, limits, vx, vy, lost, xx, xy, yy, gx, gy):
-    """As `_add_kept` with weights; what they leave out goes to the variance `lost`."""
+def _add_fading(fading, count, way, n, spacing, limits, towards, sums):
+    """As `_add_kept` with weights; what they leave out goes to the variance `lost`.
+
+    towards: vx, vy. sums: what is added to: lost, xx, xy, yy, gx, gy.
+    """
+    vx, vy = towards
+    lost, xx, xy, yy, gx, gy = sums
     gone, rise = limits[1], _ONE / (limits[2] - limits[1])
     for i in range(count):
         at = i * np.uint64(FADING)
@@ -217,7 +222,7 @@ def _shade_chunk(kept, many, fading, some, faded, ray, height, limits, begin, en
         way = away * n
         xx, xy, yy, gx, gy = _add_kept(kept, many, way)
         lost, xx, xy, yy, gx, gy = _add_fading(
-            fading, some, way, n, spacing, limits, vx, vy, lost, xx, xy, yy, gx, gy
+            fading, some, way, n, spacing, limits, (vx, vy), (lost, xx, xy, yy, gx, gy)
         )
         wide, deep = one - xx, one - yy
         nx = v8.negate(v8.fmuladd(xy, gy, deep * gx))
