@@ -395,7 +395,7 @@ def sections(draw: st.DrawFn, spec: SectionSpec, effects: frozenset[str]) -> dic
         if field.required or draw(st.integers(0, 2)) > 0:
             found[name] = draw(values_of(field))
     for name, below in spec.sections.items():
-        if below.items is not None:
+        if below.max_items is not None:
             if draw(st.integers(0, 3)) == 0:
                 found[name] = draw(st.lists(sections(below, effects), max_size=3).map(tuple))
         elif name not in _NOT_OF_FRAMES and (not below.effect or name in effects):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from augment.boxes import instances_of
 from augment.cameras import Camera, Frame
 from augment.jobs.box_tables import measure_boxes
 from augment.labels import Boxes
@@ -133,7 +134,9 @@ def test_boxes_are_measured_by_the_surfaces_in_the_smog(scene):
     labelled = dataclasses.replace(scene, labels=CarLabels())
     view, clean = view_of(labelled, smog, depth="none"), view_of(scene)
     assert view.depth_m is None and view.smoggy.water_level_z_m is None
-    measured = measure_boxes(CarLabels().boxes(0), np.zeros(3), camera(), view)["box_smog"]
+    instances = instances_of(labelled)
+    measured = measure_boxes(CarLabels().boxes(0), instances, np.zeros(3), camera(), view)
+    measured = measured["box_smog"]
     assert measured["pixels"][0] > 100 and measured["pixels"][1] == 0
     t = (view.rgb[CAR] - 255 * AIRLIGHT[0]) / (clean.rgb[CAR] - 255 * AIRLIGHT[0])
     assert measured["transmittance"][0] == pytest.approx(t.mean(), abs=0.01)  # of 8-bit colours

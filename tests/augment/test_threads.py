@@ -17,7 +17,7 @@ SECONDS = 120  # for a fresh process on a busy machine; a worker that hangs woul
 FORKED_WORKERS = """
 import torch
 from torch.utils.data import DataLoader, Dataset
-from augment.render.cpu import rasterize_cpu
+from augment.render.cpu.driver import rasterize_cpu
 from augment.render.constants import RasterSettings
 from augment.render.threads import limit_threads, thread_count
 from augment.scene import PosedGaussians
@@ -55,7 +55,7 @@ logging.basicConfig()
 import numba, torch
 from augment.render import threads
 threads._preload_tbb = lambda: False
-from augment.render.cpu import rasterize_cpu
+from augment.render.cpu.driver import rasterize_cpu
 from augment.render.constants import RasterSettings
 from augment.scene import PosedGaussians
 from tests.scenes import camera_ahead, random_gaussians
