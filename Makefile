@@ -10,11 +10,12 @@ TEST_WORKERS := $(shell expr $$(nproc 2>/dev/null || echo 1) + 1)
 COMPILE := $(if $(PYTHONDONTWRITEBYTECODE),,--no-compile)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint bench check-system clean
+.PHONY: help setup demo test test-all lint bench check-system clean
 
 help:
 	@echo "make demo   install, render the embedded street under five recipes, say where the pictures are"
-	@echo "make test   install, run the whole test suite"
+	@echo "make test   install, run the test suite"
+	@echo "make test-all  also what takes long: soaks, sweeps, hundreds of kills, clusters, benches"
 	@echo "make lint   formatting, style and types"
 	@echo "make bench  time the rasteriser on this machine"
 
@@ -59,8 +60,13 @@ export MISSING_LIBRARIES
 demo: setup
 	$(BIN)/climategs demo
 
+PYTEST := $(BIN)/python -m pytest -q --numprocesses $(TEST_WORKERS) --dist loadfile --no-loadscope-reorder
+
 test: setup
-	$(BIN)/python -m pytest -q --numprocesses $(TEST_WORKERS) --dist loadfile --no-loadscope-reorder
+	$(PYTEST) -m "not long"
+
+test-all: setup
+	$(PYTEST)
 
 lint: setup
 	$(BIN)/ruff check .
