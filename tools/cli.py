@@ -16,9 +16,8 @@ from typing import TYPE_CHECKING, Literal
 import tyro
 from tyro.conf import Positional
 
-from tools.fit_options import FitOptions
+from tools.options import FitOptions, StyleTrainOptions
 from tools.output import JsonFile, check_local, write_json
-from tools.style_train_options import StyleTrainOptions
 
 if TYPE_CHECKING:
     from augment.scene import Scene
@@ -119,7 +118,7 @@ class GenerateOptions:
             raise ClimateGSError("--out is missing: a folder, or s3://bucket/path")
         if self.job is None and not self.status:
             raise ClimateGSError("no job file is named: climategs generate JOB.yaml --out OUT")
-        from tools.generate import generate_dataset, show_status
+        from tools.render import generate_dataset, show_status
 
         return show_status(self.out) if self.status else generate_dataset(self)
 
@@ -134,7 +133,7 @@ def inspect(
         camera_path: A JSON file of camera poses to look at instead of the scene's own.
         json_file: Also write the facts to this file.
     """
-    from tools.scene_report import describe_scene, scene_text
+    from tools.explain import describe_scene, scene_text
 
     facts = describe_scene(open_with_path(uri, camera_path))
     print(scene_text(facts))
@@ -200,7 +199,7 @@ def sheet(
         video_camera: Also write an MP4 of this camera, all variants side by side.
         fps: Frames per second of the video.
     """
-    from tools.sheet import draw_sheet, draw_video
+    from tools.drawing import draw_sheet, draw_video
 
     check_local(out, "`climategs report` reads object stores; or copy the output here")
     print(draw_sheet(out, frame))
@@ -320,7 +319,7 @@ def mirror(out: Positional[Path], scene: str | None = None, links: Links = "hard
         scene: Only of this scene. By default of all that the manifest names.
         links: hard: unchanged files share the dataset's disk space. copy: nothing is shared.
     """
-    from tools.mirror import mirror_again
+    from tools.export import mirror_again
 
     check_local(out, "copy the output here")
     return mirror_again(out, scene, links=links)
@@ -353,7 +352,7 @@ def apply(
         overwrite: Replace the scene that is there.
         json_file: Also write the maps and figures to this file.
     """
-    from tools.style_apply import apply_style
+    from tools.style import apply_style
 
     facts = apply_style(
         scene,

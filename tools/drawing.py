@@ -1,13 +1,22 @@
-"""Text and colour bars on pictures, and what they need: round numbers on an axis."""
+"""Pictures: captions, colour bars and axes; contact sheets and videos of an output folder."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
+
+from augment.errors import OutputError
+from augment.jobs.atomic import replaced_file, write_atomic
+from augment.jobs.layout import folder_name, resolve_inside
+from augment.jobs.manifest import read_manifest
+from recipes.schema import KOSCHMIEDER
+
+# ---- drawing -------------------------------------------------------------------------------------
 
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 CAPTION_PX, GAP_PX = 42, 8
@@ -98,3 +107,204 @@ def short_number(value: float) -> str:
         if abs(value) >= limit:
             return f"{value / limit:g}{suffix}"
     return f"{value:.6g}"
+
+
+# ---- Pictures of an output folder: a contact sheet, and a video of variants side by side ---------
+
+VIDEO_WIDTH = 1440
+MAX_SHOWN = 12  # scenes and variants in one picture
+CELL_WIDTH = 400  # px of one image on a contact sheet
+MARGIN = 6
+CAPTION = 26
+_TITLE_SIZE = 0.6
+
+
+def draw_sheet(out: Path, frame: int | None = None) -> Path:
+    """Writes OUT/contact_sheet.png: a row per scene and variant, a column per camera.
+
+    Of more than MAX_SHOWN variants, as many are shown, evenly spread.
+
+    Raises:
+        OutputError: there is no manifest, no finished image, or none of the frame.
+    """
+    rows = read_rows(out)
+    frames = sorted({row["frame"] for row in rows})
+    frame = frames[len(frames) // 2] if frame is None else frame
+    cameras = list(dict.fromkeys(row["camera"] for row in rows))
+    lines = []
+    for scene, variant in shown_groups(rows):
+        group = {
+            row["camera"]: row
+            for row in rows
+            if (row["scene"], row["variant"], row["frame"]) == (scene, variant, frame)
+        }
+        if group:
+            title = f"{scene}, frame {frame}: {_weather(next(iter(group.values())))}"
+            images = [(name, _read(out, group[name])) for name in cameras if name in group]
+            lines.append((title, images))
+    if not lines:
+        raise OutputError(f"{out} holds no image of frame {frame}; it has frames {frames}")
+    path = out / "contact_sheet.png"
+    write_rgb(path, contact_sheet(lines))
+    return path
+
+
+def draw_video(out: Path, camera: str, frames_per_second: float = 10.0) -> Path:
+    """Writes OUT/video_<camera>.mp4: scenes and variants side by side, frame by frame."""
+    rows = [row for row in read_rows(out) if row["camera"] == camera]
+    by_key = {(row["scene"], row["variant"], row["frame"]): row for row in rows}
+    groups = shown_groups(rows)
+    frames = [
+        frame
+        for frame in sorted({row["frame"] for row in rows})
+        if all((*group, frame) in by_key for group in groups)
+    ]
+    pictures = (
+        side_by_side(
+            [(_weather(row), _read(out, row)) for g in groups for row in [by_key[(*g, frame)]]],
+            VIDEO_WIDTH,
+        )
+        for frame in frames
+    )
+    path = out / f"video_{folder_name(camera)}.mp4"
+    write_video(path, pictures, frames_per_second)
+    return path
+
+
+def read_rows(out: Path) -> list[dict[str, Any]]:
+    """The finished images of an output folder, as manifest rows.
+
+    Raises:
+        OutputError: there is no manifest, or it holds no finished image.
+    """
+    rows = [row for row in read_manifest(out).to_pylist() if row["status"] == "ok"]
+    if not rows:
+        raise OutputError(f"{out} holds no finished image; run `climategs render` first")
+    return rows
+
+
+def shown_groups(rows: list[dict[str, Any]]) -> list[tuple[str, str]]:
+    """Scene and variant of every row, each once and at most MAX_SHOWN of them: a scene's clearest,
+    driest and barest first.
+    """
+    weather = {(row["scene"], row["variant"]): _numbers(row) for row in rows}
+    groups = sorted(weather, key=lambda group: (group[0], *weather[group], group[1]))
+    return groups[:: -(-len(groups) // MAX_SHOWN)]
+
+
+def _numbers(row: dict[str, Any]) -> tuple[float, float, float]:
+    """The recipe's smog per metre (0 without), its water level in metres (-infinity without) and
+    its snow depth in metres (0 without). Old folders lack some of the columns.
+    """
+    absent = {"smog_extinction_per_m": 0.0, "flood_level_m": -math.inf, "snow_depth_m": 0.0}
+    found = {name: row.get(name, math.nan) for name in absent}
+    smog, water, snow = (absent[n] if math.isnan(v) else v for n, v in found.items())
+    return smog, water, snow
+
+
+def _weather(row: dict[str, Any]) -> str:
+    """The variant's name and what its weather means to a person."""
+    extinction_per_m, water_m, snow_m = _numbers(row)
+    texts = []
+    if style := row.get("style"):
+        texts.append(f"{style} x {row.get('style_strength', math.nan):.2g}")
+    if extinction_per_m > 0:
+        texts.append(f"visibility {KOSCHMIEDER / extinction_per_m:.0f} m")
+    if math.isfinite(water_m):
+        texts.append(f"water at {water_m:.2f} m")
+    if snow_m > 0:
+        texts.append(f"snow {100 * snow_m:.3g} cm")
+    return f"{row['variant']} ({', '.join(texts) or 'no weather'})"
+
+
+def _read(out: Path, row: dict[str, Any]) -> np.ndarray:
+    return read_rgb(resolve_inside(out, row["image_path"]))
+
+
+def contact_sheet(rows: Sequence[tuple[str, Sequence[tuple[str, np.ndarray]]]]) -> np.ndarray:
+    """One picture of many: a row per (title, images), a caption under each image.
+
+    Images are uint8 [H, W, 3] RGB of any size; all are scaled to one width. Returns RGB.
+    """
+    columns = max(len(images) for _, images in rows)
+    cell_height = max(
+        round(image.shape[0] * CELL_WIDTH / image.shape[1]) for _, r in rows for _, image in r
+    )
+    row_height = CAPTION + cell_height + CAPTION + MARGIN
+    longest = max(text_width(title, _TITLE_SIZE) for title, _ in rows)
+    width = MARGIN + max(columns * (CELL_WIDTH + MARGIN), 2 + longest + MARGIN)
+    sheet = np.full((row_height * len(rows) + MARGIN, width, 3), 24, np.uint8)
+    for r, (title, images) in enumerate(rows):
+        top = MARGIN + r * row_height
+        left, bottom = MARGIN + 2, top + CAPTION - 8
+        write(sheet, title, left, bottom, size=_TITLE_SIZE, color=(255, 255, 255))
+        for c, (caption, image) in enumerate(images):
+            left = MARGIN + c * (CELL_WIDTH + MARGIN)
+            height = round(image.shape[0] * CELL_WIDTH / image.shape[1])
+            small = cv2.resize(image, (CELL_WIDTH, height), interpolation=cv2.INTER_AREA)
+            sheet[top + CAPTION : top + CAPTION + height, left : left + CELL_WIDTH] = small
+            bottom = top + CAPTION + cell_height + CAPTION - 9
+            write(sheet, caption, left + 2, bottom, size=0.45, color=(190, 190, 190))
+    return sheet
+
+
+def side_by_side(images: Sequence[tuple[str, np.ndarray]], width: int) -> np.ndarray:
+    """Images of equal size in a row of up to three, else in a square grid, each named."""
+    columns = len(images) if len(images) <= 3 else math.ceil(math.sqrt(len(images)))
+    source_height, source_width = images[0][1].shape[:2]
+    cell_width = width // columns // 2 * 2  # codecs want even sides
+    cell_height = round(source_height * cell_width / source_width) // 2 * 2
+    lines = -(-len(images) // columns)
+    canvas = np.zeros((lines * cell_height, columns * cell_width, 3), np.uint8)
+    for number, (caption, image) in enumerate(images):
+        top, left = number // columns * cell_height, number % columns * cell_width
+        small = cv2.resize(image, (cell_width, cell_height), interpolation=cv2.INTER_AREA)
+        canvas[top : top + cell_height, left : left + cell_width] = small
+        write(canvas, caption, left + 9, top + 23, size=0.55, color=(0, 0, 0))
+        write(canvas, caption, left + 8, top + 22, size=0.55, color=(255, 255, 255))
+    return canvas
+
+
+def write_video(path: Path, frames: Iterable[np.ndarray], frames_per_second: float) -> None:
+    """An MP4 (MPEG-4 part 2, which OpenCV can always write) of RGB frames of equal size.
+
+    Frames are taken one at a time, so a long sequence need not fit in memory.
+
+    Raises:
+        OutputError: the file cannot be written, or there are no frames.
+    """
+    with replaced_file(path, ending=path.suffix) as file:
+        writer = None
+        for frame in frames:
+            if writer is None:
+                code, (height, width) = cv2.VideoWriter.fourcc(*"mp4v"), frame.shape[:2]
+                writer = cv2.VideoWriter(file.name, code, frames_per_second, (width, height))
+                if not writer.isOpened():
+                    raise OutputError(f"cannot write the video {path}: does its name end in .mp4?")
+            writer.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
+        if writer is None:
+            raise OutputError(f"no frames for the video {path}")
+        writer.release()
+
+
+def read_rgb(path: Path) -> np.ndarray:
+    """uint8 [H, W, 3] RGB.
+
+    Raises:
+        OutputError: the file is missing or no image.
+    """
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if image is None:
+        raise OutputError(f"cannot read the image {path}: it is missing or damaged")
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+def write_rgb(path: Path, image: np.ndarray, *, jpeg_quality: int = 95) -> None:
+    """PNG or JPEG by the name's ending.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    settings = [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality] if path.suffix == ".jpg" else []
+    _, data = cv2.imencode(path.suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR), settings)
+    write_atomic(path, data.tobytes())

@@ -37,9 +37,8 @@ from augment.metrics.consistency import (
     find_warp,
 )
 from augment.metrics.lpips import Lpips, load_lpips, picture_lpips
-from tools.drawing import GAP_PX, captioned, color_mapped, strip
+from tools.drawing import GAP_PX, captioned, color_mapped, strip, write_rgb
 from tools.report_pictures import evenly
-from tools.sheet import write_rgb
 
 SHORT, LONG, CAMERAS = "short", "long", "cameras"
 KINDS = (SHORT, LONG, CAMERAS)

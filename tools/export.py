@@ -1,12 +1,19 @@
-"""`climategs export`: a scene for other programs, or in one file to share."""
+"""`climategs export`: a scene for other programs, or in one file to share; `--layout source` and
+`climategs mirror`: a variant as a copy of the dataset it was made from.
+"""
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from adapters.base import open_scene
+from adapters.detect_format import source_tree
 from adapters.scene_folder import storable
-from augment.errors import ClimateGSError, OutputError
+from adapters.uri import parse_uri
+from augment.errors import AdapterError, ClimateGSError, OutputError
 from augment.files.export import (
     CAMERAS,
     PARTS,
@@ -24,8 +31,322 @@ from augment.files.scene_file import (
     save_scene,
     save_scene_file,
 )
+from augment.jobs.files import RECORDED
+from augment.jobs.layout import MANIFEST, folder_name, variant_folder, variant_name
+from augment.jobs.manifest import OK, read_manifest, rows_of
+from augment.jobs.mirror import (
+    MIRROR_FOLDER,
+    Links,
+    Mirrored,
+    Weathered,
+    WeatheredSweep,
+    check_disjoint,
+    dataset_format,
+    is_weathered,
+    mirror_dataset,
+    mirror_folder,
+    read_record,
+    weathered_images,
+    weathered_sweeps,
+)
+from augment.jobs.mirror_files import SourceTree, Survey, survey
+from augment.jobs.processes import OutputLock
 from augment.scene import Scene
+from recipes.load import load_recipe
+from recipes.schema import Recipe
 from tools.output import print_note
+
+# ------------------------------------------------------------------------------------------------
+# `--layout source` and `climategs mirror`: a variant as a copy of the dataset it was made from
+
+
+def recipes_for_source(
+    scene: Scene, out: Path, recipes: Sequence[Recipe], *, overwrite: bool = False
+) -> list[Recipe]:
+    """The recipes with images in the dataset's format, or PNG where they are of another size, after
+    a look at whether the dataset can be copied and images that are there go on or are overwritten.
+
+    Raises:
+        AdapterError: the scene is of no dataset, or one that cannot be copied.
+        OutputError: the output folder lies in it, or holds these images in another format.
+    """
+    tree, _ = _dataset(scene)
+    recorded_as = dataset_format(scene.frames)
+    rendered = []
+    for recipe in recipes:
+        # What is resized afterwards is compressed once, then.
+        written_as = recorded_as if recipe.render.scale == 1 else "png"
+        for folder in (variant_folder(scene.name, variant_name(recipe)), MIRROR_FOLDER):
+            check_disjoint(tree, out / folder)
+        read_record(tree, mirror_folder(out, variant_name(recipe)))
+        if not overwrite:
+            _check_format(scene, out, recipe, written_as)
+        output = recipe.output.model_copy(update={"image": written_as})
+        rendered.append(recipe.model_copy(update={"output": output}))
+    return rendered
+
+
+def mirror_outputs(
+    scene: Scene,
+    out: Path,
+    *,
+    variants: Sequence[str] | None = None,
+    links: Links = "hard",
+    progress: bool = True,
+) -> list[str]:
+    """Build the copies of the dataset in the weather of each variant, or bring them up to date:
+    `out/source/<variant>/<the dataset's folder>`.
+
+    scene: the one the images were rendered from. variants: names, or None for all of the scene's
+    that the manifest has. Images that a copy has from other scenes of the dataset stay in it.
+    Returns sentences: for each variant where its copy is and what it is made of.
+
+    Raises:
+        AdapterError: the scene is of no dataset, or one that cannot be copied.
+        OutputError: no such images, a folder that is in use or cannot be written.
+    """
+    out = out.absolute()
+    tree, extent = _dataset(scene)
+    lines = []
+    with OutputLock(out):
+        found = _rows(scene, out, variants)
+        try:
+            for name, rows in found.items():
+                lines += _mirror_rows(scene, out, tree, extent, name, rows, links, progress)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(
+                "stopped while the dataset was being copied; run the same command again to go on "
+                "from there"
+            ) from None
+    return lines
+
+
+def mirror_again(out: Path, scene_uri: str | None = None, *, links: Links = "hard") -> int:
+    """`climategs mirror`: opens the scene, or all that the manifest has in turn, builds the copies,
+    prints. Returns the exit code."""
+    rows = read_manifest(out).select(["source", "scene"]).to_pylist()
+    named: dict[str, list[str]] = {}  # a job can give scenes other names
+    for source, name in sorted({(row["source"], row["scene"]) for row in rows}):
+        named.setdefault(source, []).append(name)
+    sources = [scene_uri] if scene_uri else sorted(named)
+    if not sources:
+        raise OutputError(f"{out / MANIFEST} lists no images; render some first")
+    for source in sources:
+        scene = open_scene(source)
+        for name in named.get(scene.source, [scene.name]):
+            for sentence in mirror_outputs(dataclasses.replace(scene, name=name), out, links=links):
+                print(sentence)
+    return 0
+
+
+def _dataset(scene: Scene) -> tuple[SourceTree, Survey]:
+    tree = source_tree(scene)
+    extent = survey(tree)
+    if not extent.images:
+        raise AdapterError(
+            f"{tree.root}, which {tree.uri} names, holds no camera images ({tree.images}); there "
+            f"is nothing that weathered images could replace"
+        )
+    return tree, extent
+
+
+def _mirror_rows(
+    scene: Scene,
+    out: Path,
+    tree: SourceTree,
+    extent: Survey,
+    name: str,
+    rows: list[dict[str, Any]],
+    links: Links,
+    progress: bool,
+) -> list[str]:
+    folder = mirror_folder(out, name)
+    record = read_record(tree, folder)
+    quality = _jpeg_quality(out, scene.name, name)
+    images, notes = weathered_images(out, rows, scene.frames, tree, quality)
+    sweeps, unplaced = weathered_sweeps(out, rows, scene.labels, tree)
+    others, more = _of_other_scenes(scene, out, name, record.replaced)
+    other_sweeps = _sweeps_of_other_scenes(scene, out, name, record.sweeps)
+    facts = {key: rows[0][key] for key in ("source", "recipe_hash", "version", "backend")}
+    known = {each.scene for each in (*others.values(), *other_sweeps.values())}
+    scenes = {key: record.scenes[key] for key in sorted(known & record.scenes.keys())}
+    done = mirror_dataset(
+        tree,
+        folder,
+        {**others, **images},
+        {**scenes, scene.name: facts},
+        extent=extent,
+        sweeps={**other_sweeps, **sweeps},
+        links=links,
+        progress=progress,
+    )
+    return [*_sentences(done, tree, links), *(f"  {note}" for note in [*notes, *unplaced, *more])]
+
+
+def _of_other_scenes(
+    scene: Scene, out: Path, variant: str, recorded: Mapping[str, Mapping[str, Any]]
+) -> tuple[dict[str, Weathered], list[str]]:
+    """The images that the copy has from other scenes of the dataset, as far as they are there."""
+    images = {place: entry for place, entry in recorded.items() if entry["scene"] != scene.name}
+    if not images:
+        return {}, []
+    table = read_manifest(out)
+    pairs = {(entry["scene"], variant) for entry in images.values()}
+    rows = {row["image_path"]: row for row in rows_of(table, pairs) if row["status"] == OK}
+    names = {row["scene"] for row in rows.values()}
+    quality = {name: _jpeg_quality(out, name, variant) for name in names}
+    found = {}
+    for place, entry in images.items():
+        if (row := rows.get(entry["image"])) is not None:
+            found[place] = Weathered.of_row(out, row, quality[row["scene"]])
+    gone = sorted(images.keys() - found.keys())
+    if not gone:
+        return found, []
+    return found, [
+        f"{len(gone)} images of other scenes, such as {gone[0]}, are no longer in the manifest: "
+        f"the source's own stand there again"
+    ]
+
+
+def _sweeps_of_other_scenes(
+    scene: Scene, out: Path, variant: str, recorded: Mapping[str, Mapping[str, str]]
+) -> dict[str, WeatheredSweep]:
+    """The weathered sweeps that the copy has from other scenes, as far as they are there."""
+    entries = {place: entry for place, entry in recorded.items() if entry["scene"] != scene.name}
+    if not entries:
+        return {}
+    pairs = {(entry["scene"], variant) for entry in entries.values()}
+    rows = [row for row in rows_of(read_manifest(out), pairs) if row["status"] == OK]
+    known = {row["lidar_path"]: row for row in rows if is_weathered(row)}
+    return {
+        place: WeatheredSweep.of_row(out, known[entry["sweep"]])
+        for place, entry in entries.items()
+        if entry["sweep"] in known
+    }
+
+
+def _jpeg_quality(out: Path, scene: str, variant: str) -> int:
+    recipe = load_recipe(out / variant_folder(scene, variant) / "recipe.yaml")
+    return recipe.resolve(0).output.jpeg_quality
+
+
+def _rows(
+    scene: Scene, out: Path, variants: Sequence[str] | None
+) -> dict[str, list[dict[str, Any]]]:
+    """The manifest's rows of the scene's variants, by name."""
+    table = read_manifest(out)
+    pairs = {
+        (row["scene"], row["variant"]) for row in table.select(["scene", "variant"]).to_pylist()
+    }
+    if MIRROR_FOLDER in {folder_name(name) for name, _ in pairs}:
+        raise OutputError(
+            f"{out} has images of a scene called {MIRROR_FOLDER!r}, and copies of datasets lie in "
+            f"{out / MIRROR_FOLDER}: choose another output folder"
+        )
+    if variants is None:
+        variants = sorted({variant for name, variant in pairs if name == scene.name})
+    found = {name: rows_of(table, {(scene.name, name)}) for name in variants}
+    absent = sorted(name for name, rows in found.items() if not rows)
+    if absent or not found:
+        raise OutputError(
+            f"{out / MANIFEST} has no images of scene {scene.name!r}"
+            + (f" and {', '.join(absent)}" if absent else "")
+            + "; render them first, or name another scene"
+        )
+    for name, rows in found.items():
+        _check_rows(scene, out, name, rows)
+    return found
+
+
+def _check_rows(scene: Scene, out: Path, name: str, rows: list[dict[str, Any]]) -> None:
+    where, source = out / variant_folder(scene.name, name), rows[0]["source"]
+    if rows[0]["trajectory"] != RECORDED:
+        raise OutputError(
+            f"{where} shows a camera path; a dataset's copy takes images of its own frames"
+        )
+    if source != scene.source and not (
+        parse_uri(source)[::2] == parse_uri(scene.source)[::2] and _has_all(scene, rows)
+    ):
+        raise OutputError(
+            f"{where} was rendered from {source}, not from {scene.source}; name that scene, or the "
+            f"same one where it is now"
+        )
+
+
+def _has_all(scene: Scene, rows: list[dict[str, Any]]) -> bool:
+    """Whether every image of the rows is one of the scene's, by its time."""
+    times = {
+        (frame.index, name): camera.timestamp_ns
+        for frame in scene.frames
+        for name, camera in frame.cameras.items()
+    }
+    return all(times.get((row["frame"], row["camera"])) == row["timestamp_ns"] for row in rows)
+
+
+def _check_format(scene: Scene, out: Path, recipe: Recipe, written_as: str) -> None:
+    """Images of the same recipe in another format are not rendered twice beside each other."""
+    if not (out / MANIFEST).is_file() or recipe.output.image == written_as:
+        return
+    rows = rows_of(read_manifest(out), {(scene.name, variant_name(recipe))})
+    if rows and rows[0]["recipe_hash"] == recipe.hash:
+        folder = out / variant_folder(scene.name, variant_name(recipe))
+        raise OutputError(
+            f"{folder} holds these images as {recipe.output.image}, and they would be rendered as "
+            f"{written_as} for the dataset's copy: `climategs mirror {out} --scene URI` makes it "
+            f"from the images there; or choose another output folder, or add --overwrite"
+        )
+
+
+def _sentences(done: Mirrored, tree: SourceTree, links: Links) -> list[str]:
+    replaced = len(done.replaced)
+    state = f"{done.changed} files put in place" if done.changed else "up to date"
+    lines = [f"dataset: {done.folder} ({state})"]
+    clear = f"; {done.images - replaced} stay clear, as recorded" if done.images > replaced else ""
+    lines.append(f"  {replaced} of {done.images} camera images are weathered{clear}")
+    if done.sweeps:
+        count = sum(tree.is_sweep(place) for place in done.weathered)
+        clear = f"; {done.sweeps - count} stay clear, as recorded" if done.sweeps > count else ""
+        lines.append(
+            f"  {count} of {done.sweeps} LiDAR sweeps are weathered"
+            + (", lost returns left out" if count else "")
+            + clear
+        )
+    if done.resized:
+        (rendered, recorded) = done.resized[0]
+        lines.append(
+            f"  {len(done.resized)} were rendered at another size and resized, such as "
+            f"{rendered[0]}x{rendered[1]} to {recorded[0]}x{recorded[1]} pixels"
+        )
+    if done.linked:
+        lines.append(
+            f"  {done.linked} files are shared with {tree.root} ({_megabytes(done.linked_size)}): "
+            f"changed in place, they change there too; --links copy shares nothing"
+        )
+    if done.copied:
+        why = ", made by --links copy or where the system cannot link" if links == "hard" else ""
+        lines.append(f"  {done.copied} files are copies ({_megabytes(done.copied_size)}){why}")
+    if done.new:
+        lines.append(f"  weathered images there take {_megabytes(done.new_size)} of their own")
+    for names, what in (
+        (done.unusable, "recorded images are neither PNG nor JPEG and stay as they are"),
+        (done.missing, "recorded images are no longer in the source: nothing stands for them"),
+        (
+            done.outdated,
+            "files of LiDAR of other scenes are out of date: the source's own stand "
+            "there until their scenes are mirrored",
+        ),
+        (done.others, "files in the copy are not the source's: they are left"),
+    ):
+        if names:
+            lines.append(f"  {len(names)} {what}; the first is {names[0]}")
+    return lines
+
+
+def _megabytes(size: int) -> str:
+    return f"{size / 1e6:.1f} MB"
+
+
+# ---- export --------------------------------------------------------------------------------------
 
 _SUFFIXES: dict[ExportKind, str] = {"file": SCENE_SUFFIX, "ply": ".ply", "splat": ".splat"}
 _BAKED = ("ply", "splat")

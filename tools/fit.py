@@ -27,7 +27,7 @@ from augment.jobs.processes import OutputLock
 from augment.reconstruct.config import FitConfig
 from augment.reconstruct.view import RecordedView, ViewKey, ViewSource
 from augment.scene import Scene
-from tools.fit_options import FitOptions, budget_s, length_of, parse_depth, resolved_uri
+from tools.options import FitOptions, budget_s, length_of, parse_depth, resolved_uri
 from tools.output import print_note
 from tools.training import (
     CHECKPOINT_S,

@@ -33,9 +33,8 @@ from augment.semantics import SemanticClass
 from augment.views import SURFACE_ALPHA, render_buffers
 from recipes.load import load_recipe
 from recipes.schema import Recipe
-from tools.drawing import color_bar, color_mapped, log_ticks, short_number, write
-from tools.plots import FIT_PANELS, write_curves
-from tools.sheet import write_rgb
+from tools.drawing import color_bar, color_mapped, log_ticks, short_number, write, write_rgb
+from tools.training import FIT_PANELS, write_curves
 
 if TYPE_CHECKING:
     from adapters.procedural import StreetTruth

@@ -1,36 +1,392 @@
-"""`climategs render`: a recipe and a scene's URI become a job; `climategs demo` is one of them."""
+"""`climategs render`, `demo` and `generate`: recipes and scenes become jobs, and jobs images."""
 
 from __future__ import annotations
 
+import contextlib
+import math
+import multiprocessing
+import shlex
+import signal
 import time
-from collections.abc import Sequence
+import uuid
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from adapters.base import open_scene
+import numpy as np
+import torch
+
+from adapters.base import open_scene, scenes_of
 from adapters.camera_files.paths import frames_from_path_file
-from augment.cameras import Frame
+from augment.boxes import PlacedBoxes, find_occlusion
+from augment.cameras import Camera, Frame
+from augment.effects.lidar.beam import weathered_sweep
 from augment.errors import ClimateGSError
+from augment.geometry import rigid
 from augment.ground import ground_of
-from augment.jobs.backends import choose_backend
-from augment.jobs.files import SceneIndex, check_frames, has_lidar
-from augment.jobs.layout import variant_name
+from augment.ground_heights import Ground
+from augment.jobs.backends import choose_backend, renders_on_gpu
+from augment.jobs.block_worker import WorkSetup
+from augment.jobs.blocks import JobStatus, Plan, read_status, shard_of
+from augment.jobs.files import SceneIndex, check_frames, has_lidar, uses_boxes
+from augment.jobs.generate import (
+    GenerateJob,
+    GenerateResult,
+    default_scratch,
+    plan_job,
+    run_generate,
+)
+from augment.jobs.layout import STATE_FOLDER, variant_name
 from augment.jobs.manifest import lidar_notes
 from augment.jobs.quality import recipes_to_try, resolve_quality_for
 from augment.jobs.render_job import JobResult, RenderJob, run_job
-from augment.jobs.store import open_store
+from augment.jobs.store import Store, open_store
 from augment.jobs.worker import shares_of
+from augment.labels import Boxes, LidarSweep
 from augment.plan import make_plan
-from augment.scene import Scene
+from augment.render.buffers import CPU, CUDA
+from augment.render.cpu import driver as cpu
+from augment.render.cuda.runtime import is_interpreted
+from augment.render.threads import thread_count
+from augment.scene import Gaussians, Scene
+from augment.sky import CubemapSky
+from augment.views import render_view
 from recipes.change import found
-from recipes.job import scaled_recipe
+from recipes.job import load_job, load_job_recipes, scaled_recipe
 from recipes.load import load_recipe
 from recipes.schema import FramePattern, Recipe, free_knobs, parse_frames
-from tools.mirror import mirror_outputs, recipes_for_source
+from tools.drawing import draw_sheet, draw_video
+from tools.export import mirror_outputs, recipes_for_source
 from tools.output import print_images, print_note
-from tools.sheet import draw_sheet, draw_video
-from tools.warm_up import warm_up, warming_up_beside
+
+# ---- Compiling what a job's recipes need before it starts, so that no image waits for it ---------
+
+SIZE = 32  # pixels a side
+ACROSS, SPACING_M = 10, 0.1  # splats of the road to each side, and between them
+
+
+def warm_up(recipes: Sequence[Recipe], backend: str = CPU) -> float:
+    """Compile the kernels that the recipes take, or load them; seconds it took."""
+    if not renders_on_gpu(backend):
+        seconds = cpu.warm_up()
+        started = time.perf_counter()
+        _warm_recipes(recipes)
+        return seconds + time.perf_counter() - started
+    if is_interpreted():  # there is nothing to compile, and drawing takes long
+        return 0.0
+    started = time.perf_counter()
+    _warm_recipes(recipes, CUDA)
+    return time.perf_counter() - started
+
+
+def warm_up_for_workers(recipes: Sequence[Recipe], backend: str) -> float:
+    """As `warm_up`, for other processes, which find what was compiled in the caches on the disk.
+
+    A GPU is used in a process of its own: this one would hold a part of its memory until it ends.
+    """
+    if not renders_on_gpu(backend):
+        return warm_up(recipes)
+    started = time.perf_counter()
+    process = multiprocessing.get_context("spawn").Process(target=warm_up, args=(recipes, backend))
+    process.start()
+    process.join()
+    return time.perf_counter() - started
+
+
+@contextmanager
+def warming_up_beside(recipes: Sequence[Recipe]) -> Iterator[None]:
+    """Meanwhile a second process compiles for the last recipes first, where there is a core for it.
+
+    numba compiles one kernel at a time in a process, and finds in its cache what another process
+    has compiled: `warm_up` in this one goes on from the first recipe until they meet.
+    """
+    if thread_count() < 2:
+        yield
+        return
+    spawn = multiprocessing.get_context("spawn")
+    beside = spawn.Process(target=_warm_recipes, args=(recipes[::-1],), daemon=True)
+    beside.start()
+    try:
+        yield
+        beside.join()
+    finally:
+        beside.kill()
+
+
+def _warm_recipes(recipes: Sequence[Recipe], backend: str = CPU) -> None:
+    seen = set()
+    if any(uses_boxes(recipe) for recipe in recipes):
+        nothing = PlacedBoxes.of(Boxes.empty(), np.zeros(3))
+        find_occlusion(nothing, _camera(1.0), np.zeros((SIZE, SIZE), np.float32))
+    for recipe in recipes:
+        flood, snow, output = recipe.weather.flood, recipe.weather.snow, recipe.output
+        style = recipe.style if recipe.style and recipe.style.changes else None
+        is_clear = flood is None and snow is None and style is None
+        for_boxes = uses_boxes(recipe) and output.depth == "none"
+        if is_clear and not for_boxes and backend == CPU:  # `cpu.warm_up` has drawn one
+            continue
+        ids = output.semantic or output.instance
+        water, light = flood and flood.reflection, snow and snow.shading
+        style_parts = style and (style.applied_to, style.method)
+        shown = (output.depth, ids, output.surface, for_boxes)
+        kernels = (water, light, *shown, style_parts, recipe.lidar)
+        if kernels not in seen:
+            seen.add(kernels)
+            level_z_m = 0.0 if flood is None else flood.level_m
+            scene = _warm_up_scene(level_z_m, with_labels=output.labels)
+            render_view(scene, scene.frames[0].cameras["warm-up"], recipe, backend=backend)
+            if recipe.lidar == "weather":
+                weathered_sweep(scene, recipe, 0, _one_return(level_z_m))
+
+
+def _warm_up_scene(level_z_m: float, *, with_labels: bool) -> Scene:
+    """A level road above a flood's surface, and a splat below it; the level counts from z = 0."""
+    across = torch.arange(-ACROSS, ACROSS + 1) * SPACING_M
+    x, y = torch.meshgrid(across + 4, across, indexing="ij")
+    road = torch.stack([x.flatten(), y.flatten(), torch.full((x.numel(),), level_z_m + 0.1)], 1)
+    means = torch.cat([road, torch.tensor([[4.0, 0.0, level_z_m - 0.1]])])
+    gaussians = Gaussians(
+        means=means,
+        quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(len(means), 1),
+        scales=torch.tensor([[SPACING_M, SPACING_M, 0.02]]).repeat(len(means), 1),
+        opacities=torch.full((len(means),), 0.9),
+        sh=torch.zeros(len(means), 1, 3),
+    )
+    sky = CubemapSky(torch.zeros(6, 2, 2, 3))
+    camera = _camera(level_z_m + 1.0)
+    frame = Frame(0, 0, torch.eye(4, dtype=torch.float64), {camera.name: camera})
+    return Scene(
+        "warm-up",
+        "warm-up",
+        gaussians,
+        (),
+        sky,
+        (frame,),
+        labels=_NoLabels() if with_labels else None,
+        ground_z_m=0.0,  # smog that thins with height asks for it
+        ground=Ground(0.0, 0.0, "stated"),
+    )
+
+
+class _NoLabels:
+    """Labels of which there are none: what is drawn for labels' sake is drawn."""
+
+    def boxes(self, frame_index: int) -> Boxes:
+        return Boxes.empty()
+
+    def lidar(self, frame_index: int) -> LidarSweep | None:
+        return None
+
+
+def _one_return(z_m: float) -> LidarSweep:
+    """Of the road, ahead."""
+    return LidarSweep({"x": np.array([4.0]), "y": np.array([0.0]), "z": np.array([z_m])})
+
+
+def _camera(z_m: float) -> Camera:
+    """Level, ahead along +x."""
+    rotation = torch.tensor([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]], dtype=torch.float64)
+    centre = torch.tensor([0.0, 0.0, z_m], dtype=torch.float64)
+    pose = rigid(rotation, -rotation @ centre)
+    return Camera("warm-up", SIZE, SIZE, 20.0, 20.0, SIZE / 2, SIZE / 2, pose)
+
+
+# ---- `climategs generate`: a job file becomes a plan, and the plan a dataset ---------------------
+
+if TYPE_CHECKING:
+    from recipes.schema import Recipe
+    from tools.cli import GenerateOptions
+
+_MAX_LINES = 20
+
+
+def generate_dataset(options: GenerateOptions) -> int:
+    """Runs the job and prints what became of it. Returns the exit code: 1 where images failed."""
+    job, out, backend = options.job, options.out, options.backend
+    assert job is not None
+    if options.workers is not None and options.workers < 1:
+        raise ClimateGSError(f"--workers must be 1 or more; got {options.workers}")
+    requested = load_job(job)
+    recipes = load_job_recipes(requested, job.parent)
+    store = open_store(out)
+    setup = WorkSetup(
+        store_uri=out if store.local_dir is None else store.uri,
+        scratch=options.scratch or default_scratch(out),
+        backend=backend,
+        open_scene=open_scene,
+    )
+    task = GenerateJob(
+        recipes,
+        scenes_of(requested.scenes, job.parent),
+        setup,
+        executor=options.executor,
+        workers=options.workers,
+        shard=parse_shard(options.shard),
+        rescan=options.rescan,
+    )
+    if options.dry_run:
+        return _dry_run(task)
+    _check_writable(store)
+    with ended_by_sigterm():
+        result = run_generate(task, prepare=lambda recipes: _warm_up(recipes, backend))
+    _report(result, out)
+    return 1 if result.failed or result.unusable else 0
+
+
+def show_status(out: str) -> int:
+    """Prints how far the jobs of an output have come. Returns the exit code: 1 for unfinished ones.
+
+    Raises:
+        ClimateGSError: no job was ever started there.
+    """
+    found = read_status(open_store(out))
+    if not found:
+        raise ClimateGSError(f"{out}: no job has been started there (no .climategs/jobs)")
+    for status in found:
+        _print_status(status)
+    return 0 if all(_is_done(status) for status in found) else 1
+
+
+def parse_shard(text: str) -> tuple[int, int]:
+    """`2/8`, the second of eight.
+
+    Raises:
+        ClimateGSError: the text is something else.
+    """
+    number, slash, count = text.partition("/")
+    are_numbers = slash and number.isdecimal() and count.isdecimal() and len(text) < 20
+    if not are_numbers or not 1 <= int(number) <= int(count):
+        raise ClimateGSError(f"--shard {text!r}: write i/n with i from 1 to n, as in 2/8")
+    return int(number), int(count)
+
+
+def _check_writable(store: Store) -> None:
+    """Learn that an output cannot be written before scenes are opened, which may take hours."""
+    name = f"{STATE_FOLDER}/probe-{uuid.uuid4().hex}"
+    store.write(name, b"")
+    store.delete([name])
+
+
+def _dry_run(job: GenerateJob) -> int:
+    from augment.jobs.generate import estimate
+
+    plan = plan_job(job)
+    blocks = shard_of(plan.blocks, *job.shard)
+    _print_plan(plan, len(blocks), job)
+    guess = estimate(plan, open_scene, each=lambda name: print_note(f"trying {name}"))
+    for name, sample in guess.samples.items():
+        print(
+            f"  {name}: {sample.seconds_per_mpx:.2f} s and {_size(sample.bytes_per_mpx)} a "
+            f"megapixel, {sample.prepare_s:.1f} s to prepare"
+        )
+    if guess.unsampled:
+        print(f"  taken as their mean: {', '.join(guess.unsampled)}")
+    print(
+        f"about {_duration(guess.seconds)} of one worker, {_size(guess.bytes)} "
+        f"(from one picture a recipe; right to a factor of two or so)"
+    )
+    return 1 if plan.unusable else 0
+
+
+def _print_plan(plan: Plan, blocks: int, job: GenerateJob) -> None:
+    recipes = dict.fromkeys(block.recipe.name for block in plan.blocks)
+    variants = len({(block.scene, block.variant) for block in plan.blocks})
+    print(
+        f"{plan.job}: {len(plan.records)} scenes, {len(recipes)} recipes, {variants} variants, "
+        f"{plan.images} images in {len(plan.blocks)} blocks"
+    )
+    number, count = job.shard
+    if count > 1:
+        images = sum(block.images for block in shard_of(plan.blocks, number, count))
+        print(f"shard {number}/{count}: {images} images in {blocks} blocks")
+    for name, record in list(plan.records.items())[:_MAX_LINES]:
+        images = sum(block.images for block in plan.blocks if block.scene == name)
+        print(f"  {name}: {images} images, opened in {record.open_s:.1f} s")
+    if len(plan.records) > _MAX_LINES:
+        print(f"  ... and {len(plan.records) - _MAX_LINES} more")
+    for uri, why in plan.unusable.items():
+        print(f"  cannot be used: {uri}: {why}")
+
+
+def _report(result: GenerateResult, out: str) -> None:
+    print_images(result, _duration(result.seconds))
+    if shares := shares_of(result.timings):
+        print(shares.sentence)
+    for uri, why in result.unusable.items():
+        print_note(f"cannot be used: {uri}: {why}")
+    print(f"output: {out}   (climategs report {shlex.quote(out)} shows it)")
+
+
+def _print_status(status: JobStatus) -> None:
+    total = status.total
+    share = 100 * total.published / max(total.planned, 1)
+    print(
+        f"{status.job}: {total.published} of {total.planned} images published ({share:.1f} %), "
+        f"{status.blocks_published} of {status.blocks} blocks"
+    )
+    if status.staged:
+        print(f"  {status.staged} more are finished in blocks that are not")
+    if status.claims:
+        print(f"  {status.claims} blocks are being worked on")
+    if status.left_s and not _is_done(status):
+        print(f"  {status.images_per_s:.1f} images/s; about {_duration(status.left_s)} left")
+    for kind, groups in (("scene", status.by_scene), ("recipe", status.by_recipe)):
+        open_ones = {n: g for n, g in groups.items() if g.published < g.planned}
+        for name, group in list(open_ones.items())[:_MAX_LINES]:
+            print(f"  {kind} {name}: {group.published} of {group.planned}")
+        if len(open_ones) > _MAX_LINES:
+            print(f"  ... and {len(open_ones) - _MAX_LINES} more {kind}s")
+    if total.in_failed_blocks:
+        print(
+            f"  with failures: blocks of {total.in_failed_blocks} images; start it again to retry"
+        )
+    for uri, why in status.unusable.items():
+        print(f"  cannot be used: {uri}: {why}")
+
+
+def _is_done(status: JobStatus) -> bool:
+    total = status.total
+    return total.published == total.planned and not total.in_failed_blocks and not status.unusable
+
+
+def _warm_up(recipes: list[Recipe], backend: str) -> None:
+
+    seconds = warm_up_for_workers(recipes, backend)
+    if seconds > 1:
+        print_note(f"compiled the kernels in {seconds:.1f} s (kept for the next run)")
+
+
+@contextlib.contextmanager
+def ended_by_sigterm() -> Iterator[None]:
+    """Let a scheduler's SIGTERM end the job as Ctrl-C does."""
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 90:
+        return f"{seconds:.1f} s"
+    if seconds < 5400:
+        return f"{seconds / 60:.0f} min"
+    return f"{seconds / 3600:.1f} h"
+
+
+def _size(count: float) -> str:
+    steps = ("B", "kB", "MB", "GB", "TB")
+    step = min(int(math.log(max(count, 1), 1000)), len(steps) - 1)
+    return f"{count / 1000**step:.1f} {steps[step]}"
+
+
+# ---- render --------------------------------------------------------------------------------------
 
 if TYPE_CHECKING:
     from tools.cli import RenderOptions
@@ -82,7 +438,7 @@ def render_recipe(options: RenderOptions) -> int:
         overwrite=options.overwrite,
     )
     result = run_job(job, scene_loader=lambda _uri: scene)
-    _report(result, options.workers)
+    _render_report(result, options.workers)
     if options.layout == "source":
         names = [variant_name(resolved) for resolved in recipes]
         for sentence in mirror_outputs(scene, out, variants=names, links=options.links):
@@ -143,7 +499,7 @@ def _check_no_path(camera_path: Path | None) -> None:
         )
 
 
-def _report(result: JobResult, workers: int) -> None:
+def _render_report(result: JobResult, workers: int) -> None:
     print_images(result, f"{result.seconds:.1f} s")
     if result.written:
         kinds = ("render", "encode", "write")

@@ -24,7 +24,7 @@ from augment.ground import Ground, ground_of, load_open3d
 from augment.labels import ClassifiesLidar, LidarSweep
 from augment.scene import Scene
 from augment.semantics import SemanticClass
-from tools.scene_report import describe_scene, scene_text
+from tools.explain import describe_scene, scene_text
 
 SMALL = "voxel_m=0.15&image_scale=0.25&sky_size=16"
 

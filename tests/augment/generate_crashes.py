@@ -375,7 +375,7 @@ def kill_an_idle_worker(folder: Path) -> dict:
 @scenario
 def stop_a_job_with_workers(folder: Path) -> dict:
     """Ctrl-C and SIGTERM let workers finish their images, and a second run goes on."""
-    from tools.generate import ended_by_sigterm
+    from tools.render import ended_by_sigterm
 
     whole = whole_of(folder, lambda out: make_job(out))
     out, stops = folder / "stopped", []

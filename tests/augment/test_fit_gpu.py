@@ -18,7 +18,7 @@ from augment.render.layout import BLOCK
 from tests.augment import gsplat_stand_in
 from tests.augment.pretend_gpu import AwayTensor, pretended_gpu
 from tests.augment.test_trainer import QUICK, assert_same_state, record, run, start, truth
-from tools.fit_options import FitOptions
+from tools.options import FitOptions
 
 if not gpu.is_interpreted():
     pytest.skip("the stand-in computes on the CPU", allow_module_level=True)

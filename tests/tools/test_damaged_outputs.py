@@ -21,9 +21,9 @@ from augment.jobs.render_job import RenderJob, run_job
 from augment.jobs.tables import METADATA_KEY
 from recipes.weather import Flood
 from tests.augment.batch_scenes import fake_render, make_recipe, open_fake
+from tools.drawing import draw_sheet
 from tools.evaluate import evaluate_output
 from tools.report import write_report
-from tools.sheet import draw_sheet
 
 TYPES = [pa.int32(), pa.float64(), pa.string(), pa.binary(), pa.bool_(), pa.null(),
          pa.list_(pa.int64()), pa.struct([("a", pa.int64())]), pa.timestamp("ns"),

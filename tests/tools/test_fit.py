@@ -34,7 +34,7 @@ from tools.fit import (
     sample_keys,
     state_folder,
 )
-from tools.fit_options import FitOptions, parse_depth
+from tools.options import FitOptions, parse_depth
 from tools.training import Checkpoint, evaluation_steps, load_checkpoint, save_checkpoint
 
 

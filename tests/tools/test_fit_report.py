@@ -34,7 +34,7 @@ from tools.fit_report import (
     render_recorded,
     write_report,
 )
-from tools.plots import FIT_PANELS, STYLE_PANELS, write_curves
+from tools.training import FIT_PANELS, STYLE_PANELS, write_curves
 
 KEYS = tuple(ViewKey(frame, name) for frame in range(4) for name in ("left", "right"))
 FIGURES = ("psnr", "ssim", "flip")

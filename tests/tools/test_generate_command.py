@@ -10,7 +10,7 @@ import pytest
 from augment.errors import ClimateGSError
 from augment.jobs.atomic import write_atomic
 from tools.cli import GenerateOptions, main
-from tools.generate import ended_by_sigterm, generate_dataset, parse_shard
+from tools.render import ended_by_sigterm, generate_dataset, parse_shard
 
 
 def test_shards() -> None:

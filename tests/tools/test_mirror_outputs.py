@@ -23,7 +23,7 @@ from tests.augment.batch_scenes import SIZE, FakeLabels, fake_render, make_recip
 from tests.augment.mirror_trees import contents
 from tools import render as render_tools
 from tools.cli import RenderOptions
-from tools.mirror import mirror_again, mirror_outputs, recipes_for_source
+from tools.export import mirror_again, mirror_outputs, recipes_for_source
 
 CAMERAS = {"front": "front", "rear/left": "left"}
 FRAMES = 4
@@ -325,7 +325,7 @@ def test_making_the_copy_again_by_itself(root, tmp_path, monkeypatch, capsys):
         opened.append(uri)
         return scene if uri == scene.source else other
 
-    monkeypatch.setattr("tools.mirror.open_scene", opened_scene)
+    monkeypatch.setattr("tools.export.open_scene", opened_scene)
     assert mirror_again(out) == 0
     assert opened == [scene.source]
     assert str(out / "source/fog-000/002") in capsys.readouterr().out
@@ -341,7 +341,7 @@ def test_making_the_copy_again_by_itself(root, tmp_path, monkeypatch, capsys):
 def test_scenes_that_a_job_renamed_are_copied(root, tmp_path, monkeypatch):
     scene, out = scene_of(root), tmp_path / "out"
     render(dataclasses.replace(scene, name="drive-7"), out, frames=[0])
-    monkeypatch.setattr("tools.mirror.open_scene", lambda uri: scene)
+    monkeypatch.setattr("tools.export.open_scene", lambda uri: scene)
     assert mirror_again(out) == 0
     assert changed(root, out / "source/fog-000/002")
     assert mirror_again(out, scene.source) == 0

@@ -15,7 +15,7 @@ import pytest
 from augment.jobs.layout import MANIFEST
 from augment.jobs.manifest import LATER, rows_to_table, write_manifest
 from tests.tools.report_outputs import make_row
-from tools import sheet
+from tools import drawing as sheet
 
 DRY, THIN, DEEP = ("clear-000", 0.0, math.nan), ("wet-000", 0.0, -0.05), ("wet-001", 0.0, 0.5)
 MURKY, WHITE = ("fog-000", 0.0978, 0.3), ("white-000", 0.0, math.nan, 0.125)

@@ -7,7 +7,7 @@ import pytest
 from augment.effects.style.train import StyleTrainConfig
 from recipes.weather import style_preset_names
 from tools import cli
-from tools.style_train_options import StyleTrainOptions
+from tools.options import StyleTrainOptions
 
 
 def test_the_training_s_defaults_are_the_library_s():

@@ -14,7 +14,7 @@ from augment.errors import OutputError, StyleError
 from augment.files.scene_file import load_scene_parts, save_scene
 from recipes.weather import Style
 from tests.fitted_scenes import fitted_scene
-from tools.style_apply import apply_style, picture_path, style_text
+from tools.style import apply_style, picture_path, style_text
 
 
 @pytest.fixture

@@ -19,9 +19,9 @@ from augment.errors import ClimateGSError, OutputError, StyleError
 from augment.geometry import rigid
 from augment.scene import Gaussians, Scene
 from augment.sky import ConstantSky
-from tools import style_train
-from tools.style_train import checkpoint_folder, train_style
-from tools.style_train_options import StyleTrainOptions, parse_pair_weights
+from tools import style as style_train
+from tools.options import StyleTrainOptions, parse_pair_weights
+from tools.style import checkpoint_folder, train_style
 
 STREET = "procedural:street?seed=3"
 

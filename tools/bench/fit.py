@@ -38,7 +38,7 @@ from tools.bench.harness import (
 )
 from tools.bench.scenes import record_street
 from tools.fit import fit_scene
-from tools.fit_options import FitOptions
+from tools.options import FitOptions
 
 UNTIMED = 6  # first steps: compiling, and every view of a short recording decoded once
 NO_GROWTH = DensifyConfig(start=1.0, stop=0.0)  # its part of the run ends before it starts

@@ -67,7 +67,7 @@ from tools.bench.harness import (
     spread_ms,
 )
 from tools.bench.scenes import scene_of_recipe
-from tools.warm_up import warm_up
+from tools.render import warm_up
 
 WHOLE = "whole"  # stands for a knob where several are set
 DEPTH, JPEG = "output.depth", "output.jpeg_quality"
