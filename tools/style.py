@@ -1,0 +1,676 @@
+"""`climategs style apply`: a scene in the colours of a photograph or a preset, as a scene folder;
+`style train`: photographs and scenes become a network that maps colours.
+
+Bytes depend on the data, the settings and the number of steps alone; times are only printed.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import math
+import time
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import torch
+from pydantic import ValidationError
+
+from adapters.base import open_scene
+from adapters.scene_folder import storable
+from augment.cameras import Camera
+from augment.effects.style.color_maps import StyleMaps, sky_levels, style_gaussians, styled_scene
+from augment.effects.style.content import content_pictures, content_statistics, select_views
+from augment.effects.style.losses import FeatureExtractor, open_features
+from augment.effects.style.network import B0Encoder, load_imagenet_weights, save_network
+from augment.effects.style.pairs import recolor
+from augment.effects.style.scores import DEFINITIONS, score_photos, score_training
+from augment.effects.style.style import SceneStyle, style_maps
+from augment.effects.style.train import (
+    Content,
+    Draw,
+    StepRecord,
+    StyleTrainer,
+    TrainingPool,
+    fixed_threads,
+    generator_for,
+    new_network,
+    pair_loss_of,
+    read_photos,
+    scene_contents,
+)
+from augment.errors import ClimateGSError, OutputError, StyleError
+from augment.files.scene_file import is_scene_folder, save_scene
+from augment.jobs.atomic import write_atomic
+from augment.jobs.processes import OutputLock
+from augment.render.composite import composite_sky, quantise
+from augment.render.rasterize import rasterize
+from augment.render.sh import SH_C0
+from augment.scene import Gaussians, Scene
+from augment.semantics import SemanticClass
+from recipes.weather import Style, no_such_style, style_preset_names
+from tools.drawing import captioned, strip, write_rgb
+from tools.options import StyleTrainOptions, budget_s, length_of, uri_text
+from tools.output import print_note
+from tools.training import (
+    CHECKPOINT_S,
+    STYLE_PANELS,
+    Checkpoint,
+    Outcome,
+    StopRequest,
+    check_same,
+    differences,
+    load_checkpoint,
+    mark_finished,
+    note_stop,
+    remove_unused,
+    rounded_steps,
+    run_steps,
+    save_checkpoint,
+    write_curves,
+)
+
+# ---- `climategs style train`: photographs and scenes become a network that maps colours ----------
+# OUT holds the network, the report and its curves; OUT/checkpoint what an unfinished training
+# goes on
+# from. The network's bytes depend on the data, the settings and the number of steps alone.
+
+NETWORK_FILE, REPORT_FILE, CURVES_FILE = "network.safetensors", "report.json", "curves.png"
+ROWS, ROW_STEPS = 40, 50  # of the history; steps averaged into one, at most
+SCORED = 16  # contents with a style each, by which a network is scored
+TIMED, UNTIMED = 8, 2  # steps from which the number of them is estimated
+RESERVE = 0.05  # of the time, for scores and checkpoints
+
+
+def train_style(
+    options: StyleTrainOptions, *, progress: bool = True, checkpoint_s: float = CHECKPOINT_S
+) -> Outcome:
+    """Trains, or goes on training, into `options.out`.
+
+    Raises:
+        ClimateGSError: options, data or the output folder cannot be used as they are.
+    """
+    folder = checkpoint_folder(options.out)
+    if options.out.exists() and not options.out.is_dir():
+        raise OutputError(f"{options.out} is a file: choose another --out")
+    with OutputLock(options.out):
+        before = None if options.overwrite else load_checkpoint(folder, arrays=False)
+        if before is None and not options.overwrite and (options.out / NETWORK_FILE).exists():
+            raise OutputError(
+                f"{options.out} holds a network, and no checkpoint to go on from: choose another "
+                f"--out, or replace it with --overwrite"
+            )
+        if before is not None:
+            check_same(options.out, options.settings(), length_of(options), before)
+            if before.finished and (done := _finished(options, before)) is not None:
+                return done
+        try:
+            run = _prepare(options, folder, before)
+        except BaseException:
+            if not folder.exists():
+                remove_unused(options.out)
+            raise
+        return _train(run, progress, checkpoint_s)
+
+
+def checkpoint_folder(out: Path) -> Path:
+    """What a training in this folder goes on from."""
+    return out / "checkpoint"
+
+
+class _Data(NamedTuple):
+    """scored: what networks are scored by. held_out: photos."""
+
+    pool: TrainingPool
+    scored: Draw
+    held_out: torch.Tensor
+    facts: dict[str, Any]
+    problems: tuple[str, ...]
+
+
+@dataclass(eq=False)
+class _Run:
+    """All that a training needs, opened and at the step to go on from."""
+
+    options: StyleTrainOptions
+    folder: Path
+    trainer: StyleTrainer
+    features: FeatureExtractor
+    plan: Checkpoint
+    data: _Data
+    rows: list[dict[str, Any]]
+    sums: dict[str, float]
+    begun: float = field(default_factory=time.perf_counter)
+
+    def seconds(self) -> float:
+        return self.plan.seconds + time.perf_counter() - self.begun
+
+    def score(self) -> None:
+        """One more row of the history, with what the network is worth now."""
+        scores = score_training(self.trainer.net, self.data.scored, self.features)
+        self.rows.append({"step": self.trainer.step, "seconds": self.seconds(), **scores})
+
+    def add(self, record: StepRecord) -> None:
+        """One more step; a row of the history where it completes one."""
+        for name, value in {"steps": 1.0, "loss": record.loss}.items():
+            self.sums[name] = self.sums.get(name, 0.0) + value
+        for name, value in record.terms.items():  # of a part of the steps, where the warm-up ends
+            self.sums[f"sum.{name}"] = self.sums.get(f"sum.{name}", 0.0) + value
+            self.sums[f"count.{name}"] = self.sums.get(f"count.{name}", 0.0) + 1
+        length = min(max(self.plan.steps // ROWS, 1), ROW_STEPS)
+        if record.step % length and record.step != self.plan.steps:
+            return
+        sums, self.sums = self.sums, {}
+        names = [name.removeprefix("sum.") for name in sums if name.startswith("sum.")]
+        self.rows.append({
+            "step": record.step,
+            "seconds": self.seconds(),
+            "loss": sums["loss"] / sums["steps"],
+            **{name: sums[f"sum.{name}"] / sums[f"count.{name}"] for name in names},
+        })  # fmt: skip
+
+    def save(self) -> None:
+        arrays, facts = self.trainer.state()
+        checkpoint = dataclasses.replace(
+            self.plan,
+            step=self.trainer.step,
+            seconds=self.seconds(),
+            history=self.rows,
+            sums=self.sums,
+            facts=facts,
+            arrays=arrays,
+        )
+        save_checkpoint(self.folder, checkpoint)
+
+
+def _prepare(options: StyleTrainOptions, folder: Path, before: Checkpoint | None) -> _Run:
+    _take_device(options.device)
+    data = _open_data(options)
+    for problem in data.problems:
+        print_note(f"note: {problem}")
+    views, photos = len(data.pool.views), len(data.pool.photos)
+    print_note(f"{photos} photos and {views} views of {len(options.scenes)} scenes to learn from")
+    features = open_features(options.vgg)
+    if before is None:
+        plan = Checkpoint(options.settings(), length_of(options), options.steps or 0, data.facts)
+        if (budget := budget_s(options)) is not None:
+            steps, step_s = _estimate(options, budget, data.pool, features)
+            plan = dataclasses.replace(plan, steps=steps)
+            print_note(
+                f"{1e3 * step_s:.0f} ms a step: {steps} steps make about {budget / 60:g} minutes. "
+                f"--steps {steps} gives the same network again"
+            )
+        save_checkpoint(folder, plan)
+    else:
+        plan = load_checkpoint(folder)
+        assert plan is not None
+        if changed := differences(plan.data, data.facts):
+            raise OutputError(
+                f"the photos or scenes are not those {options.out} was trained on so far: "
+                f"{'; '.join(changed)}. Begin anew with --overwrite, or train into another --out"
+            )
+    trainer = _trainer(options, plan.steps, data.pool, features)
+    if plan.arrays:
+        trainer.load_state(plan.arrays, plan.facts)
+        print_note(f"going on after step {plan.step} of {plan.steps}")
+    rows, sums = list(plan.history), dict(plan.sums)
+    plan = dataclasses.replace(plan, arrays={}, facts={})
+    return _Run(options, folder, trainer, features, plan, data, rows, sums)
+
+
+def _take_device(device: str) -> None:
+    """Make it the current one, on which the renderer's kernels run, too."""
+    try:
+        torch.zeros(1, device=device)
+    except (RuntimeError, AssertionError) as error:  # of torch without CUDA
+        reason = str(error).splitlines()[0]
+        raise ClimateGSError(f"--device {device}: {reason}; train on cpu, or cuda") from error
+    place = torch.device(device)
+    if place.type == "cuda" and place.index is not None:
+        torch.cuda.set_device(place)
+
+
+def _open_data(options: StyleTrainOptions) -> _Data:
+    size = options.picture_px
+    views: list[Content] = []
+    problems: list[str] = []
+    for uri in options.scenes:
+        scene = open_scene(uri)
+        views += scene_contents(
+            scene, options.views, size, with_parts=options.through == "renderer", seed=options.seed
+        )
+        problems += scene.problems
+    photos = read_photos(options.photos, size, holdout=options.holdout)
+    facts = {
+        "views": len(views),
+        "views_sha256": _digest(view.picture for view in views),
+        "photos": len(photos.train),
+        "photos_sha256": _digest([photos.train]),
+        "held_out_photos": len(photos.held_out),
+        "held_out_sha256": _digest([photos.held_out]),
+    }
+    pool = TrainingPool(tuple(views), photos.train).to(options.device)  # once, for all trainers
+    # Networks are scored by held-out photos where there are any, and the scenes' views.
+    held_out = photos.held_out.to(options.device)
+    scored_pool = TrainingPool(pool.views, held_out) if len(held_out) else pool
+    scored = scored_pool.draw(
+        generator_for(0, 0, "scores"),  # whatever the seed: trainings are compared by them
+        SCORED,
+        scene_share=options.scene_share,
+        perturbed=0.5,
+        colors=1,
+        recolor=recolor,
+    )
+    return _Data(pool, scored, photos.held_out, facts, (*problems, *photos.problems))
+
+
+def _digest(pictures: Iterable[torch.Tensor]) -> str:
+    found = hashlib.sha256()
+    for picture in pictures:
+        found.update(picture.contiguous().numpy().tobytes())
+    return found.hexdigest()
+
+
+def _trainer(
+    options: StyleTrainOptions, steps: int, pool: TrainingPool, features: FeatureExtractor
+) -> StyleTrainer:
+    net = new_network(options.encoder, offset=options.matrix == "3x4", seed=options.seed)
+    if options.encoder_weights is not None:
+        assert isinstance(net.encoder, B0Encoder)
+        load_imagenet_weights(net.encoder, options.encoder_weights)
+    config = options.config(steps)
+    return StyleTrainer(
+        net,
+        pool,
+        config,
+        features,
+        recolor=recolor,
+        pairs=pair_loss_of(pool, config.pair_weights) if options.pairs > 0 else None,
+        frozen_norm=options.encoder_weights is not None,
+        device=options.device,
+    )
+
+
+def _estimate(
+    options: StyleTrainOptions, budget_s: float, pool: TrainingPool, features: FeatureExtractor
+) -> tuple[int, float]:
+    """Steps that fill the time, and seconds of one with all losses, by a trainer thrown away."""
+    trainer = _trainer(dataclasses.replace(options, warm_up=0.0), 1000, pool, features)
+    seconds: list[float] = []
+    for _ in range(UNTIMED + TIMED):
+        begun = time.perf_counter()
+        trainer.run_step()
+        seconds.append(time.perf_counter() - begun)
+    step_s = sorted(seconds[UNTIMED:])[TIMED // 2]
+    return rounded_steps(int(budget_s * (1 - RESERVE) / step_s)), step_s
+
+
+def _train(run: _Run, progress: bool, checkpoint_s: float) -> Outcome:
+    def after_step(record: StepRecord, is_evaluated: bool) -> dict[str, str]:
+        run.add(record)
+        if is_evaluated:
+            run.score()
+        return {"loss": f"{run.sums['loss'] / run.sums['steps']:.4f}"} if run.sums else {}
+
+    with StopRequest() as stop, fixed_threads():
+        if run.trainer.step == 0 and not run.rows:
+            run.score()
+        complete = run_steps(
+            run.trainer,
+            run.plan.steps,
+            after_step=after_step,
+            save=run.save,
+            stop=stop,
+            name="train",
+            checkpoint_s=checkpoint_s,
+            progress=progress,
+        )
+        report = _write(run, complete)
+    if complete:
+        mark_finished(run.folder)
+        _show_end(run.options.out, report)
+        return Outcome(0, report)
+    note_stop(run.trainer.step, run.plan.steps, overwrite=run.options.overwrite)
+    return Outcome(130, report)
+
+
+def _write(run: _Run, complete: bool) -> dict[str, Any]:
+    options, net = run.options, run.trainer.net
+    about = {
+        "command": "style train",
+        "step": run.trainer.step,
+        "steps": run.plan.steps,
+        "features": run.features.name,
+        "settings": run.plan.settings,
+        "data": run.plan.data,
+    }
+    save_network(options.out / NETWORK_FILE, net, about, half_precision=options.half_precision)
+    scores = score_training(net, run.data.scored, run.features)
+    report = {
+        **about,
+        "complete": complete,
+        "network": NETWORK_FILE,
+        "parameters": sum(parameter.numel() for parameter in net.parameters()),
+        "seconds": run.seconds(),
+        "scenes": [uri_text(uri) for uri in options.scenes],
+        "problems": list(run.data.problems),
+        "definitions": DEFINITIONS,
+        "scores": scores | score_photos(net, run.data.held_out),
+        "history": run.rows,
+    }
+    write_atomic(options.out / REPORT_FILE, (json.dumps(report, indent=1) + "\n").encode())
+    write_curves(options.out / CURVES_FILE, run.rows, STYLE_PANELS)
+    return report
+
+
+def _finished(options: StyleTrainOptions, before: Checkpoint) -> Outcome | None:
+    """The outcome where network and report stand; None where one of them was lost since."""
+    try:
+        report = json.loads((options.out / REPORT_FILE).read_bytes())
+    except (OSError, ValueError):
+        return None
+    if not (options.out / NETWORK_FILE).is_file():
+        return None
+    print(f"{options.out} is finished already ({before.steps} steps); nothing was done")
+    _show_end(options.out, report)
+    return Outcome(0, report)
+
+
+def _show_end(out: Path, report: dict[str, Any]) -> None:
+    known = {n: v for n, v in report["scores"].items() if isinstance(v, int | float)}
+    print(", ".join(f"{name} {v:.4g}" for name, v in known.items() if math.isfinite(v)))
+    if (out / CURVES_FILE).is_file():
+        print(f"curves: {out / CURVES_FILE}")
+    print(f"network: {out / NETWORK_FILE}")
+
+
+# ---- style apply ---------------------------------------------------------------------------------
+
+Method = Literal["mkl", "reinhard", "gscm"]
+VIEWS = 2  # that are drawn and measured
+VIEW_WIDTH = 640  # px
+VISIBLE = 1 / 255  # a difference of colour
+
+
+def apply_style(
+    scene_uri: str,
+    style: str,
+    out: Path,
+    *,
+    method: Method = "mkl",
+    strength: float = 1.0,
+    per_region: bool = False,
+    mask: Path | None = None,
+    checkpoint: Path | None = None,
+    overwrite: bool = False,
+) -> dict[str, Any]:
+    """Writes the styled scene and its picture, prints what was done, and returns it as facts.
+
+    style: an image file, or the name of a style preset (a file of the same name is ./NAME).
+
+    Raises:
+        StyleError: the style cannot be used. SceneError: the scene cannot. OutputError: OUT holds
+            something, or cannot be written.
+    """
+    out = Path(out)
+    _check_out(out, overwrite)
+    requested = _style(style, method, strength, per_region, mask, checkpoint)
+    # Compile the kernel where it is not yet, so that times are of the work.
+    eye = torch.eye(3, 4) / 2
+    style_gaussians(Gaussians.empty(), StyleMaps(eye[None], eye, eye))
+    begun = time.perf_counter()
+    scene = open_scene(scene_uri)
+    for problem in scene.problems:
+        print_note(f"note: {problem}")
+    scene = storable(scene)
+    opened = time.perf_counter()
+    if requested.changes and method == "gscm":
+        content_pictures(scene)
+    elif requested.changes:
+        content_statistics(scene, per_region=per_region)
+    measured = time.perf_counter()
+    maps = style_maps(scene, requested)
+    mapped = time.perf_counter()
+
+    styled = styled_scene(scene, maps)
+    facts: dict[str, Any] = {
+        "scene": scene.source,
+        "out": str(out),
+        "style": _style_facts(requested),
+        "maps": _map_facts(maps),
+        "clamped": _clamp_facts(scene, styled, maps),
+        "seconds": {
+            "open": opened - begun,
+            "content": measured - opened,
+            "image to map": mapped - measured,
+        },
+        "apply": _apply_facts(scene, maps),
+    }
+    done = {**facts["style"], "scene": scene.source, "maps": facts["maps"]}
+    made_by = {**scene.made_by, "styles": [*scene.made_by.get("styles", ()), done]}
+    begun = time.perf_counter()
+    save_scene(dataclasses.replace(styled, made_by=made_by), out.absolute())
+    facts["seconds"]["write"] = time.perf_counter() - begun
+    if (picture := _picture(scene, styled)) is not None:
+        facts["picture"] = str(picture_path(out))
+        write_rgb(picture_path(out), picture, jpeg_quality=88)
+    print(style_text(facts))
+    return facts
+
+
+def picture_path(out: Path) -> Path:
+    """Where the picture of a styled scene lies: beside its folder."""
+    folder = Path(out).resolve()
+    return folder.with_name(f"{folder.name}.style.jpg")
+
+
+def style_text(facts: Mapping[str, Any]) -> str:
+    """The facts for people."""
+    lines = []
+    for name, one in facts["maps"].items():
+        rows = "   ".join(" ".join(f"{value:7.3f}" for value in row) for row in one["map"])
+        gains = ", ".join(f"{value:.2f}" for value in one["gains"])
+        lines.append(f"{name:8}  {rows}")
+        lines.append(f"          gains {gains}; condition {one['condition']:.1f}")
+    clamped = facts["clamped"]
+    for what in ("Gaussians", "pixels"):
+        if what in clamped:
+            below, above = clamped[what]["below 0"], clamped[what]["above 1"]
+            lines.append(
+                f"{what:9} with a colour below 0: {_percent(below)}; above 1: {_percent(above)}"
+            )
+    if (off := clamped.get("pixels off a render under the style")) is not None:
+        lines.append(
+            f"pixels where that makes more than 1/255 of difference to rendering the scene under "
+            f"the style: {100 * off:.2f} %"
+        )
+    seconds, applied = facts["seconds"], facts["apply"]
+    lines.append(
+        f"scene colours {1e3 * seconds['content']:.0f} ms, image to map "
+        f"{1e3 * seconds['image to map']:.0f} ms; {applied['gaussians']} Gaussians mapped in "
+        f"{1e3 * applied['in_place_s']:.1f} ms ({applied['in_place_gbps']:.1f} GB/s) in place, "
+        f"{1e3 * applied['new_memory_s']:.1f} ms into new memory; written in "
+        f"{seconds['write']:.1f} s"
+    )
+    if "picture" in facts:
+        lines.append(f"picture: {facts['picture']}")
+    lines.append(f"scene: {facts['out']}")
+    lines.append(
+        f"render it: climategs render clear --scene 'scene:{facts['out']}' --out out/styled"
+    )
+    return "\n".join(lines)
+
+
+def _percent(change: list[float]) -> str:
+    return f"{100 * change[0]:.2f} % before, {100 * change[1]:.2f} % after"
+
+
+def _style(
+    style: str,
+    method: Method,
+    strength: float,
+    per_region: bool,
+    mask: Path | None,
+    checkpoint: Path | None,
+) -> Style:
+    is_preset = style in style_preset_names()
+    if not is_preset and not Path(style).exists() and not Path(style).suffix:
+        raise StyleError(f"{style} is no image file, and {no_such_style(style)}")
+    try:
+        return Style(
+            image=None if is_preset else style,
+            preset=style if is_preset else None,
+            method=method,
+            strength=float(strength),
+            per_region=per_region,
+            mask=None if mask is None else str(mask),
+            checkpoint=None if checkpoint is None else str(checkpoint),
+        )
+    except ValidationError as error:
+        message = "; ".join(
+            f"{'.'.join(map(str, e['loc'])) + ': ' if e['loc'] else ''}"
+            f"{e['msg'].removeprefix('Value error, ')}"
+            for e in error.errors()
+        )
+        raise StyleError(f"the style cannot be used: {message}") from None
+
+
+def _check_out(out: Path, overwrite: bool) -> None:
+    """What is at OUT is nothing, or a scene that may be replaced; known before anything is done."""
+    if not out.resolve().name:
+        raise OutputError(f"--out {out} is the file system's root: name a folder below it")
+    if not out.exists() or (out.is_dir() and not any(out.iterdir())):
+        return
+    if not is_scene_folder(out):
+        raise OutputError(f"{out} holds something else than a scene: choose another --out")
+    if not overwrite:
+        raise OutputError(
+            f"{out} holds a scene: choose another --out, or replace it with --overwrite"
+        )
+
+
+def _style_facts(style: Style) -> dict[str, Any]:
+    """What is kept with the scene: names and contents of files, not where they lay."""
+    facts = {
+        name: value
+        for name, value in style.model_dump(exclude={"applied_to", "evaluated", "digest"}).items()
+        if value is not None
+    }
+    for name in ("image", "mask", "checkpoint"):
+        if name in facts:
+            path = Path(facts[name])
+            content = path.read_bytes() if style.changes else b""
+            facts[name] = {"name": path.name, "sha256": hashlib.sha256(content).hexdigest()}
+    return facts
+
+
+def _map_facts(maps: StyleMaps) -> dict[str, Any]:
+    """Every map that is one of its own, by what it is for."""
+    named = {"splats": maps.splats[0]}
+    if len(maps.splats) > 1:
+        named = {SemanticClass(n).name.lower(): one for n, one in enumerate(maps.splats)}
+    named["sky"] = maps.sky
+    facts, seen = {}, []
+    for name, one in named.items():
+        if name != "sky" and any(torch.equal(one, other) for other in seen):
+            continue
+        seen.append(one)
+        gains = torch.linalg.svdvals(one[:, :3].double())
+        facts[name] = {
+            "map": [[float(value) for value in row] for row in one],
+            "gains": [float(gain) for gain in gains],
+            "condition": float(gains[0] / gains[-1].clamp_min(1e-12)),
+        }
+    return facts
+
+
+def _clamp_facts(scene: Scene, styled: Scene, maps: StyleMaps) -> dict[str, Any]:
+    """Shares of what leaves [0, 1], before and after: below 0 renderers clamp each Gaussian, which
+    a map does not commute with; above 1 the finished picture is clipped.
+    """
+    facts: dict[str, Any] = {"Gaussians": _outside([_constant_colors(s) for s in (scene, styled)])}
+    pictures = [_render(s, camera) for s in (scene, styled) for camera in _views(scene)]
+    if not pictures:
+        return facts
+    half = len(pictures) // 2
+    before, after = pictures[:half], pictures[half:]
+    facts["pixels"] = _outside(
+        [torch.cat([p.reshape(-1, 3) for p in group]) for group in (before, after)]
+    )
+    style_parts = SceneStyle(maps, styled.sky, scene, sky_levels(scene, maps))
+    errors = [
+        (_render(scene, camera, style_parts) - new).abs().amax(-1).flatten()
+        for camera, new in zip(_views(scene), after, strict=True)
+    ]
+    off = torch.cat(errors) > VISIBLE
+    facts["pixels off a render under the style"] = float(off.float().mean())
+    return facts
+
+
+def _outside(pair: list[torch.Tensor]) -> dict[str, list[float]]:
+    slack = 1e-5  # rounding of a black or a white one
+    return {
+        "below 0": [float((rgb.amin(-1) < -slack).float().mean()) for rgb in pair],
+        "above 1": [float((rgb.amax(-1) > 1 + slack).float().mean()) for rgb in pair],
+    }
+
+
+def _constant_colors(scene: Scene) -> torch.Tensor:
+    return torch.cat([0.5 + SH_C0 * part.sh[:, 0] for part in scene.all_gaussians])
+
+
+def _views(scene: Scene) -> list[Camera]:
+    cameras = select_views(scene, None, VIEWS)
+    return [camera.scaled(min(1.0, VIEW_WIDTH / camera.width)) for camera in cameras]
+
+
+def _render(scene: Scene, camera: Camera, style_parts: SceneStyle | None = None) -> torch.Tensor:
+    """The picture with its sky, not clamped. style_parts: a style to render it under."""
+    parts, sky = scene.parts_for(camera), scene.sky
+    if style_parts is not None:
+        parts, sky = style_parts.on(parts), style_parts.sky
+    seen = rasterize(parts, camera)
+    assert seen.rgb is not None and seen.alpha is not None
+    return composite_sky(seen.rgb, seen.alpha, camera, sky)
+
+
+def _apply_facts(scene: Scene, maps: StyleMaps) -> dict[str, Any]:
+    """Time of the mapping alone, over all Gaussians, least of three."""
+    parts = [dataclasses.replace(part, sh=part.sh.clone()) for part in scene.all_gaussians]
+    traffic = 2 * sum(part.sh.numel() * part.sh.element_size() for part in parts)
+    seconds = {}
+    for is_in_place in (False, True):
+        runs = []
+        for _ in range(3):
+            begun = time.perf_counter()
+            for part in parts:
+                style_gaussians(part, maps, out=part.sh if is_in_place else None)
+            runs.append(time.perf_counter() - begun)
+        seconds[is_in_place] = min(runs)
+    return {
+        "gaussians": sum(map(len, parts)),
+        "bytes": traffic,
+        "in_place_s": seconds[True],
+        "in_place_gbps": traffic / max(seconds[True], 1e-9) / 1e9,
+        "new_memory_s": seconds[False],
+    }
+
+
+def _picture(scene: Scene, styled: Scene) -> np.ndarray | None:
+    """uint8 RGB: a view a row, before and after; None of a scene without cameras."""
+    rows = []
+    for camera in _views(scene):
+        panels = [
+            captioned(quantise(_render(shown, camera)), title, camera.name)
+            for shown, title in ((scene, "before"), (styled, "after"))
+        ]
+        rows.append(strip(panels))
+    if not rows:
+        return None
+    width = max(row.shape[1] for row in rows)
+    rows = [np.pad(r, ((0, 0), (0, width - r.shape[1]), (0, 0)), constant_values=255) for r in rows]
+    return np.concatenate(rows)
