@@ -46,12 +46,13 @@ def weather(depth: str = "expected", **effects) -> Recipe:
     return Recipe.model_validate({"weather": effects, "style": style, "output": output})
 
 
-@drawing(24)
+@drawing(6)
 @given(places(), cameras(levels_m=(0.2,)), recipes())
 def test_any_scene_from_anywhere_in_any_weather(place: Place, camera: Camera, recipe: Recipe):
     rendered(place.scene(), camera, recipe)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("pair", PAIRS, ids=lambda pair: "-".join(sorted(pair)))
 @drawing(4)
 @given(data=st.data())
@@ -60,7 +61,7 @@ def test_every_pair_of_effects(pair: frozenset[str], data: st.DataObject):
     rendered(place.scene(), camera, data.draw(recipes(pair)))
 
 
-@drawing(8)
+@drawing(4)
 @given(cameras(levels_m=(0.2,)), recipes(frozenset({"flood"})))
 def test_the_eye_at_below_and_above_the_water(camera: Camera, recipe: Recipe):
     """The eye at the recipe's level, the next number beside it, or a little away from it."""
@@ -74,6 +75,7 @@ def test_the_eye_at_below_and_above_the_water(camera: Camera, recipe: Recipe):
         assert (view.water == 255).all()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("size", [(8192, 1), (1, 8192)])
 @pytest.mark.parametrize("effects", [("smog", "snow"), ("flood",)])
 def test_images_of_one_row_or_column(size: tuple[int, int], effects: tuple[str, ...]):
@@ -98,6 +100,7 @@ def test_one_gaussian(opacity: float):
     assert np.unique(view.rgb).size == (1 if opacity == 0 else np.unique(view.rgb).size)
 
 
+@pytest.mark.long
 def test_two_million_gaussians():
     """In every effect at once; most of them far smaller than a pixel."""
     count = 2_000_000
@@ -149,6 +152,7 @@ def test_degenerate_quaternions(quat: tuple[float, ...]):
     rendered(Place(kept, 0, on_street=False).scene(), camera_at((0.0, 0.0, 0.0)), weather())
 
 
+@pytest.mark.long
 @drawing(3)
 @given(places())
 def test_snow_is_placed_among_extreme_gaussians(place: Place):

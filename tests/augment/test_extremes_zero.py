@@ -75,7 +75,7 @@ def assert_same_bits(view: WeatheredView, clean: WeatheredView) -> None:
         assert one is None or np.array_equal(one, other), f"{name} differs"
 
 
-@drawing(15)
+@drawing(5)
 @given(places(), cameras(), recipes(frozenset()), st.data())
 def test_effects_without_strength_change_no_bit(
     place: Place, camera: Camera, recipe: Recipe, data: st.DataObject
@@ -88,6 +88,7 @@ def test_effects_without_strength_change_no_bit(
     assert view.snow is None or not view.snow.any()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("effect", EFFECTS)
 @drawing(6)
 @given(data=st.data())
@@ -101,7 +102,7 @@ def test_effects_without_strength_change_no_bit_of_another_effect(effect: str, d
     assert_same_bits(render_view(scene, camera, zero), render_view(scene, camera, recipe))
 
 
-@drawing(8)
+@drawing(3)
 @given(cameras(), recipes(frozenset({"smog"})), st.sampled_from(("sky", "mirrored")))
 def test_water_below_everything_changes_no_bit(camera: Camera, recipe: Recipe, tier: str):
     scene = Place(nothing(), sky=3, on_street=True).scene()
@@ -111,7 +112,7 @@ def test_water_below_everything_changes_no_bit(camera: Camera, recipe: Recipe, t
     assert flooded.water is not None and not flooded.water.any()
 
 
-@drawing(8)
+@drawing(3)
 @given(places(), recipes(frozenset()), st.sampled_from((0.05, 1.0)))
 def test_water_behind_the_camera_changes_no_bit(place: Place, recipe: Recipe, level_m: float):
     """Above the water and looking up, no ray meets it."""
