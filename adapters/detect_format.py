@@ -14,7 +14,7 @@ from typing import NamedTuple
 from adapters.uri import CAMERA_PATH_KEY, GROUND_KEY, parse_uri
 from augment.errors import AdapterError
 from augment.files.scene_file import is_scene_file, is_scene_folder
-from augment.jobs.mirror_files import SourceTree
+from augment.jobs.mirror import SourceTree
 from augment.scene import Scene
 from recipes.files import open_file
 

@@ -15,7 +15,7 @@ from augment.effects.flood.flood_view import LayerRenderer, render_flooded
 from augment.effects.flood.water_plane import plane_depth
 from augment.effects.smog import SmogMedium, fog_raster
 from augment.effects.style.style import look_of
-from augment.jobs.backends import choose_backend
+from augment.jobs.processes import choose_backend
 from augment.plan import Plan, ViewPlan, cover_for, make_plan, plan_view
 from augment.render.buffers import AUTO, CUDA, EXPECTED_DEPTH, RenderOutput, kernels_for
 from augment.render.composite import composite_sky, map_colors, quantise

@@ -38,6 +38,8 @@ from augment.jobs.mirror import (
     MIRROR_FOLDER,
     Links,
     Mirrored,
+    SourceTree,
+    Survey,
     Weathered,
     WeatheredSweep,
     check_disjoint,
@@ -46,10 +48,10 @@ from augment.jobs.mirror import (
     mirror_dataset,
     mirror_folder,
     read_record,
+    survey,
     weathered_images,
     weathered_sweeps,
 )
-from augment.jobs.mirror_files import SourceTree, Survey, survey
 from augment.jobs.processes import OutputLock
 from augment.scene import Scene
 from recipes.load import load_recipe

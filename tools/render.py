@@ -27,7 +27,6 @@ from augment.errors import ClimateGSError
 from augment.geometry import rigid
 from augment.ground import ground_of
 from augment.ground_heights import Ground
-from augment.jobs.backends import choose_backend, renders_on_gpu
 from augment.jobs.block_worker import WorkSetup
 from augment.jobs.blocks import JobStatus, Plan, read_status, shard_of
 from augment.jobs.files import SceneIndex, check_frames, has_lidar, uses_boxes
@@ -40,6 +39,7 @@ from augment.jobs.generate import (
 )
 from augment.jobs.layout import STATE_FOLDER, variant_name
 from augment.jobs.manifest import lidar_notes
+from augment.jobs.processes import choose_backend, renders_on_gpu
 from augment.jobs.quality import recipes_to_try, resolve_quality_for
 from augment.jobs.render_job import JobResult, RenderJob, run_job
 from augment.jobs.store import Store, open_store

@@ -404,7 +404,7 @@ def share_visible(table: pa.Table, recipes: list[str], files: ReportFiles) -> Ba
     """How much the weather leaves of each box that an image shows, in VISIBILITY_STEPS.
 
     Transmittance of smog, times what water does not hide, times what snow does not cover, as
-    `augment.jobs.box_tables.visibility` has it.
+    `augment.jobs.files.visibility` has it.
     """
     columns = [f"{kind}_path" for kind in _LEFT if f"{kind}_path" in table.column_names]
     rows, read, there = [], 0, 0

@@ -308,3 +308,48 @@ def _clear(old: Path, target: Path, own: Collection[str]) -> None:
                 os.rename(entry, target / entry.name)
         if not any(old.iterdir()):
             old.rmdir()
+
+
+# ---- A file of the disk under another name -----------------------------------------------------
+
+# Another disk, another user's file, too many links to it, a file system without hard links.
+_CANNOT_LINK = {errno.EXDEV, errno.EPERM, errno.EMLINK}
+_CANNOT_LINK |= {errno.EOPNOTSUPP, errno.ENOTSUP, errno.ENOSYS}
+
+
+def link_file(original: str, target: str) -> bool:
+    """Give the original a second name; False where the system cannot, and nothing has changed."""
+    try:
+        try:
+            os.link(original, target, follow_symlinks=False)
+        except FileExistsError:
+            temporary = temporary_beside(Path(target))
+            os.link(original, temporary, follow_symlinks=False)
+            move_temporary(temporary, target)
+    except OSError as error:
+        if error.errno in _CANNOT_LINK:
+            return False
+        raise output_error(Path(target), error) from error
+    return True
+
+
+def copy_file(original: str, target: str) -> None:
+    """Copy bytes and time of change."""
+    with replaced_file(Path(target), clear=False, flush=False) as file:
+        source = os.open(original, os.O_RDONLY)
+        try:
+            at = 0
+            while sent := os.sendfile(file.fileno(), source, at, 1 << 26):
+                at += sent
+            facts = os.fstat(source)
+            os.utime(file.fileno(), ns=(facts.st_mtime_ns, facts.st_mtime_ns))
+        finally:
+            os.close(source)
+
+
+def move_temporary(temporary: Path, target: str) -> None:
+    try:
+        os.replace(temporary, target)
+    finally:
+        # Renaming does nothing where both names are links of one file already.
+        temporary.unlink(missing_ok=True)

@@ -23,13 +23,14 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar, runtime_checkable
 from augment.errors import OutputError
 from augment.jobs.atomic import (
     TEMPORARY_SUFFIX,
+    copy_file,
     flush_folder,
+    link_file,
     make_folder,
     refusals_of,
     write_atomic,
 )
 from augment.jobs.layout import path_below, relative_parts
-from augment.jobs.mirror_files import copy_file, link_file
 from augment.jobs.processes import uninterrupted
 
 _UNSAFE = re.compile("[\x00-\x1f\x7f\ud800-\udfff]")  # control characters, bytes that are no text

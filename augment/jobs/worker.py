@@ -28,9 +28,9 @@ from augment.boxes import Instances
 from augment.cameras import Camera
 from augment.errors import ClimateGSError, GpuLost, OutputError
 from augment.jobs.atomic import write_atomic
-from augment.jobs.backends import gpu_is_lost, renders_on_gpu
-from augment.jobs.box_tables import BoxWeather, View
 from augment.jobs.files import (
+    BoxWeather,
+    View,
     WritePump,
     check_view,
     frames_from_json,
@@ -48,8 +48,10 @@ from augment.jobs.processes import (
     SharedScene,
     available_cores,
     failed_start,
+    gpu_is_lost,
     limit_threads,
     quick_turns,
+    renders_on_gpu,
     sender,
 )
 from augment.jobs.tables import lidar_bytes, read_lidar_note

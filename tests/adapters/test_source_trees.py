@@ -24,7 +24,7 @@ from adapters.detect_format import source_tree
 from adapters.uri import format_uri
 from augment.errors import AdapterError
 from augment.files.scene_file import save_scene
-from augment.jobs.mirror_files import survey
+from augment.jobs.mirror import survey
 from augment.jobs.render_job import RenderJob, run_job
 from augment.scene import Scene
 from recipes.schema import Recipe

@@ -41,7 +41,7 @@ from generate_jobs import (
 )
 from tqdm import tqdm
 
-import augment.jobs.scheduler as drive
+import augment.jobs.generate as drive
 from augment.errors import OutputError
 from augment.jobs.block_pools import Finished, ProcessPool
 from augment.jobs.block_worker import IndexTask

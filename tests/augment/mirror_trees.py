@@ -11,8 +11,14 @@ import cv2
 import numpy as np
 
 from augment.jobs.manifest import read_manifest
-from augment.jobs.mirror import Mirrored, mirror_dataset, mirror_folder, weathered_images
-from augment.jobs.mirror_files import SourceTree, survey
+from augment.jobs.mirror import (
+    Mirrored,
+    SourceTree,
+    mirror_dataset,
+    mirror_folder,
+    survey,
+    weathered_images,
+)
 from augment.jobs.render_job import RenderJob, run_job
 from augment.scene import Scene
 from tests.augment.batch_scenes import SIZE, FakeLabels, fake_render, make_recipe, open_fake

@@ -8,7 +8,7 @@ import torch
 
 from augment.boxes import instances_of
 from augment.cameras import Camera, Frame
-from augment.jobs.box_tables import measure_boxes
+from augment.jobs.files import measure_boxes
 from augment.labels import Boxes
 from augment.plan import make_plan
 from augment.scene import Actor, Gaussians, Scene, Track

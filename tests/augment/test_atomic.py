@@ -14,12 +14,12 @@ import pytest
 from augment.jobs import atomic
 from augment.jobs.atomic import (
     TEMPORARY_SUFFIX,
+    copy_file,
     remove_temporaries,
     replaced_file,
     replaced_folder,
     write_atomic,
 )
-from augment.jobs.mirror_files import copy_file
 from augment.jobs.store import LocalStore
 
 DATA = b"whole" * 1000

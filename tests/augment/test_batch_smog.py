@@ -20,7 +20,7 @@ from batch_scenes import (
 
 from augment.dataset import SceneDataset, WeatherDataset
 from augment.effects.smog import box_transmittance
-from augment.jobs.box_tables import TABLES, visibility
+from augment.jobs.files import TABLES, visibility
 from augment.jobs.layout import box_weather_files
 from augment.jobs.manifest import read_manifest
 from augment.jobs.render_job import JobResult, RenderJob, run_job

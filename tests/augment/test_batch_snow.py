@@ -24,7 +24,7 @@ from batch_scenes import (
 
 from augment.dataset import SceneDataset, WeatherDataset, collate_frames
 from augment.effects.snow.snow import snow_pixels
-from augment.jobs.box_tables import TABLES
+from augment.jobs.files import TABLES
 from augment.jobs.manifest import read_manifest
 from augment.jobs.render_job import JobResult, RenderJob, run_job
 from recipes.schema import Recipe

@@ -29,7 +29,7 @@ from batch_scenes import (
 from augment.cameras import Frame
 from augment.dataset import WeatherDataset
 from augment.effects.flood.flood import hidden_pixels, submerged_fraction
-from augment.jobs.box_tables import TABLES
+from augment.jobs.files import TABLES
 from augment.jobs.manifest import LATER, read_manifest
 from augment.jobs.render_job import JobResult, RenderJob, run_job
 from recipes.schema import Recipe

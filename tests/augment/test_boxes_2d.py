@@ -16,8 +16,7 @@ from augment.boxes import MAX_INSTANCE, Instances, instances_of
 from augment.cameras import Camera
 from augment.dataset import SceneDataset, WeatherDataset, boxes_2d, torchvision_sample
 from augment.errors import AdapterError
-from augment.jobs.box_tables import TABLES, BoxNumbers, measure_boxes
-from augment.jobs.files import label_view
+from augment.jobs.files import TABLES, BoxNumbers, label_view, measure_boxes
 from augment.jobs.manifest import read_manifest
 from augment.jobs.render_job import JobResult, RenderJob, run_job
 from augment.jobs.tables import read_boxes

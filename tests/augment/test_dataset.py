@@ -36,7 +36,7 @@ from augment.dataset import (
 )
 from augment.effects.flood.flood import hidden_pixels, submerged_fraction
 from augment.errors import BackendUnavailable, OutputError, SceneError
-from augment.jobs.box_tables import TABLES
+from augment.jobs.files import TABLES
 from augment.jobs.render_job import RenderJob, run_job
 from recipes.schema import Recipe
 from recipes.weather import Flood

@@ -12,7 +12,7 @@ import torch
 from augment.dataset import box_masks, boxes_2d, torchvision_sample
 from augment.dataset.samples import BOX_FRAMES, box_tensors
 from augment.geometry import multiply_quats, quat_from_rotmat, rigid, rotmat_from_quat
-from augment.jobs.box_tables import TABLES, BoxWeather
+from augment.jobs.files import TABLES, BoxWeather
 from augment.labels import Boxes
 from augment.semantics import SemanticClass
 

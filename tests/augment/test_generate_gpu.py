@@ -9,9 +9,8 @@ import pytest
 from generate_jobs import make_job, make_recipes, outputs, raising_render
 
 from augment.errors import GpuLost, OutputError
-from augment.jobs.backends import renders_on_gpu
 from augment.jobs.generate import GenerateJob, make_pool, plan_job, run_generate
-from augment.jobs.processes import available_cores
+from augment.jobs.processes import available_cores, renders_on_gpu
 from augment.jobs.worker import shares_of
 
 SCENES = ["fake:a?frames=2"]

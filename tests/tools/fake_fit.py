@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from augment.cameras import Camera, Frame
-from augment.files.scene_schema import FORMAT
+from augment.files.scene_file import FORMAT
 from augment.reconstruct.config import FitConfig
 from augment.reconstruct.trainer import StepRecord
 from augment.reconstruct.view import RecordedView, ViewKey

@@ -16,7 +16,7 @@ from safetensors import SafetensorError
 from adapters.base import open_scene
 from adapters.training_views.depth_priors import DepthPriors
 from augment.errors import ClimateGSError, OutputError
-from augment.files.scene_schema import FORMAT
+from augment.files.scene_file import FORMAT
 from augment.jobs.processes import OutputLock
 from augment.reconstruct.config import FitConfig
 from augment.reconstruct.densify import densify_due

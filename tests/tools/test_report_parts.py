@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from augment.jobs.box_tables import TABLES, visibility
+from augment.jobs.files import TABLES, visibility
 from augment.jobs.manifest import rows_to_table
 from augment.jobs.store import LocalStore, StoredFile
 from tests.tools.report_outputs import make_row, street_rows, write_output

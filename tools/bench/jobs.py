@@ -28,10 +28,9 @@ from augment.files.scene_file import save_scene, save_scene_file
 from augment.jobs.block_worker import WorkSetup
 from augment.jobs.blocks import Block, read_status
 from augment.jobs.files import WritePump, encode_depth, encode_image
-from augment.jobs.generate import GenerateJob, make_pool, plan_job, run_generate
+from augment.jobs.generate import GenerateJob, Scheduler, make_pool, plan_job, run_generate
 from augment.jobs.layout import variant_name
 from augment.jobs.manifest import compact
-from augment.jobs.scheduler import Scheduler
 from augment.jobs.store import open_store
 from augment.scene import Gaussians, Scene
 from augment.sky import ConstantSky
