@@ -451,7 +451,7 @@ def open_drivestudio(path: str, query: dict[str, str]) -> Scene:
     """
     options = RunOptions.from_query(query)
     run = find_run(Path(path), options)
-    numbers = options.select(run.frames, f"drivestudio:{path}")
+    numbers = options.frames.select(run.frames, where=f"drivestudio:{path}").numbers
     content = load_checkpoint(run.checkpoint)
     where = str(run.checkpoint)
     step = content.get("step")
@@ -494,7 +494,7 @@ def open_drivestudio(path: str, query: dict[str, str]) -> Scene:
             *about_sky,
             *corrections.problems,
             *about_frames,
-            *(about_renderer if run.antialiased else ()),
+            *(about_renderer if run.is_set("trainer.render.antialiased") else ()),
         ),
         made_by={
             "method": "drivestudio",

@@ -1,9 +1,9 @@
 """The drive that a run was trained on, from its processed data: where car and cameras were.
 
 The scene's world is the model's, whose origin and axes are the first frame's car (nuScenes: front
-camera), turned until z is up as it is in the dataset's world: a car stands on a slope, and its
-brakes tip it. Frame t is at t tenths of a second: the data hold no times, and all cameras of a
-frame were trained as one moment.
+camera), turned until z is up as in the dataset's world: a car stands on a slope, and its brakes
+tip it. Frame t is at t tenths of a second: the data hold no times, and all cameras of a frame were
+trained as one moment.
 """
 
 from __future__ import annotations
@@ -12,16 +12,26 @@ import dataclasses
 import functools
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    RootModel,
+    field_validator,
+    model_validator,
+)
 
+from adapters.camera_files.camera_files import Number, validate
 from adapters.plain_files import array_of, inside, read_json, read_numbers, read_pose, read_yaml
-from adapters.raw_drive import stored_records
+from adapters.raw_drive import DriveOptions, stored_records
 from adapters.uri import check_query
 from adapters.world import rotation_to_z_up
 from augment.cameras import Camera, Frame
@@ -31,13 +41,13 @@ from augment.files.image_size import read_image_header
 from augment.geometry import invert_rigid, quat_from_rotmat
 from augment.labels import Boxes, LidarSweep
 
-# ---- A run's config.yaml, and values of it by dotted keys such as `data.scene_idx` ---------------
+# ---- A run's config.yaml, read by dotted keys such as `data.scene_idx` ---------------------------
 
 
 def read_config(path: Path) -> Mapping[str, Any]:
-    """The whole of it."""
-    what = "a drivestudio run is a folder with config.yaml and checkpoint_*.pth"
-    return read_yaml(path, if_missing=what)
+    return read_yaml(
+        path, if_missing="a drivestudio run is a folder with config.yaml and checkpoint_*.pth"
+    )
 
 
 def lookup(config: Mapping[str, Any], key: str) -> Any:
@@ -54,20 +64,44 @@ def lookup(config: Mapping[str, Any], key: str) -> Any:
     return value
 
 
-def needed(
-    config: Mapping[str, Any], key: str, where: str, expected: str, fits: Callable[[Any], bool]
-) -> Any:
-    """The value of a dotted key that must be there and fit; expected: what, for the message."""
-    value = lookup(config, key)
-    if value is None:
-        raise AdapterError(f"{where} lacks {key}; expected the config that drivestudio saved")
-    if not fits(value):
-        raise AdapterError(f"{where}: {key} must be {expected}; got {value!r}")
-    return value
+class RunConfig(BaseModel):
+    """What of config.yaml must be there and fit. end_timestep: included; -1 for the data's last.
+    test_image_stride: every how manyeth frame was held out; 0 for none."""
 
+    model_config = ConfigDict(frozen=True, strict=True)
 
-def _is_integer(value: Any) -> bool:
-    return type(value) is int
+    dataset: str = Field(alias="data.dataset")
+    start_timestep: int = Field(alias="data.start_timestep")
+    end_timestep: int = Field(alias="data.end_timestep")
+    cameras: Annotated[list[int], Field(min_length=1)] = Field(alias="data.pixel_source.cameras")
+    downscale: list[Annotated[Number, Field(gt=0)]] = Field(
+        alias="data.pixel_source.downscale_when_loading"
+    )
+    test_image_stride: int = Field(0, ge=0, alias="data.pixel_source.test_image_stride")
+
+    @field_validator("dataset")
+    @classmethod
+    def _is_known(cls, name: str) -> str:
+        if name.lower() not in CONVENTIONS:
+            raise ValueError(
+                f"the axes of {name!r} are not known here; known are {', '.join(CONVENTIONS)}"
+            )
+        return name.lower()
+
+    @model_validator(mode="after")
+    def _fits(self) -> RunConfig:
+        known = range(len(CONVENTIONS[self.dataset].cameras))
+        if len(set(self.cameras)) != len(self.cameras) or not set(self.cameras) <= set(known):
+            raise ValueError(
+                f"data.pixel_source.cameras must be camera numbers, 0 to {known[-1]}, each once; "
+                f"got {self.cameras}"
+            )
+        if len(self.downscale) < len(self.cameras):
+            raise ValueError(
+                f"data.pixel_source.downscale_when_loading must hold a factor > 0 for each of the "
+                f"{len(self.cameras)} cameras; got {self.downscale}"
+            )
+        return self
 
 
 # ---- What a drivestudio URI may ask for, as in `drivestudio:<run>?data=DIR&frames=0:50` ----------
@@ -77,17 +111,15 @@ _KEYS = {
     "checkpoint": "the name of a checkpoint in the run, such as checkpoint_15000.pth",
     "frames": "first:stop, numbers of the data's frames, either of them left out at will",
 }
-_FRAMES = re.compile(r"(\d*):(\d*)", re.ASCII)
 
 
 @dataclass(frozen=True)
 class RunOptions:
-    """Options of one opening; None where the run decides. stop_frame is excluded."""
+    """Options of one opening; None where the run decides."""
 
     data: str | None = None
     checkpoint: str | None = None
-    first_frame: int = 0
-    stop_frame: int | None = None
+    frames: DriveOptions = field(default_factory=DriveOptions)
 
     @staticmethod
     def from_query(query: dict[str, str]) -> RunOptions:
@@ -95,27 +127,12 @@ class RunOptions:
         for key in ("data", "checkpoint"):
             if query.get(key) == "":
                 raise AdapterError(f"drivestudio: {key} must be {_KEYS[key]}; got ''")
-        first, stop = 0, None
-        if "frames" in query:
-            match = _FRAMES.fullmatch(query["frames"])
-            first, stop = (int(t) if t else None for t in match.groups()) if match else (0, 0)
-            first = first or 0
-            if stop is not None and stop <= first:
-                raise AdapterError(
-                    f"drivestudio: frames must be {_KEYS['frames']}; got {query['frames']!r}"
-                )
-        return RunOptions(query.get("data"), query.get("checkpoint"), first, stop)
-
-    def select(self, numbers: range, where: str) -> tuple[int, ...]:
-        """Those of the run's frames that the scene has."""
-        stop = numbers.stop if self.stop_frame is None else self.stop_frame
-        kept = tuple(number for number in numbers if self.first_frame <= number < stop)
-        if not kept:
-            raise AdapterError(
-                f"{where}: frames={self.first_frame}:{stop} selects none of the run's frames "
-                f"{numbers[0]} to {numbers[-1]}"
-            )
-        return kept
+        frames = {"frames": query["frames"]} if "frames" in query else {}
+        return RunOptions(
+            query.get("data"),
+            query.get("checkpoint"),
+            DriveOptions.from_query("drivestudio", frames),
+        )
 
 
 # ---- What the processed data of each dataset means: cameras, axes, worlds, LiDAR columns ---------
@@ -144,11 +161,10 @@ class Convention:
     cameras: by number. lidar_columns: of lidar/{frame}.bin, float32. poses_per_frame:
     extrinsics/{frame}_{camera}.txt is world_from_camera; else extrinsics/{camera}.txt is
     ego_from_camera. world_of_front_camera: the model's world is camera 0's first frame, else the
-    first ego_pose. camera_from_opencv: [3, 3], the axes of the extrinsics. scene_from_model:
-    [3, 3], a permutation of axes that turns the model's world z up, as far as the car stands level.
-    pose_from_ego: [3, 3], ego axes (x forward, y left, z up) in those of ego_pose, or of camera 0
-    where that is the world's. object_from_actor: [3, 3], x forward, y left, z up in the axes of its
-    boxes.
+    first ego_pose. The rest are axes, [3, 3]. camera_from_opencv: of the extrinsics.
+    scene_from_model: a permutation that turns the model's world z up, as far as the car stands
+    level. pose_from_ego: ego axes (x forward, y left, z up) in those of ego_pose, or of camera 0
+    where that is the world's. object_from_actor: x forward, y left, z up in those of its boxes.
     """
 
     cameras: tuple[CameraKind, ...]
@@ -161,17 +177,6 @@ class Convention:
     object_from_actor: np.ndarray = field(default_factory=lambda: np.eye(3))
 
 
-def convention_of(dataset: str, where: str) -> Convention:
-    """The convention of `data.dataset`; where: the file that says so, for messages."""
-    found = _CONVENTIONS.get(dataset.lower())
-    if found is None:
-        raise AdapterError(
-            f"{where}: data.dataset is {dataset!r}; its axes are not known here. Known datasets: "
-            f"{', '.join(_CONVENTIONS)}"
-        )
-    return found
-
-
 def _cameras(width: int, height: int, names: str) -> tuple[CameraKind, ...]:
     return tuple(CameraKind(name, width, height) for name in names.split())
 
@@ -181,7 +186,7 @@ _WAYMO_COLUMNS = (
     "laser_id"
 )
 _XYZI = ("x", "y", "z", "intensity")
-_CONVENTIONS = {
+CONVENTIONS = {
     "waymo": Convention(
         cameras=(
             *_cameras(1920, 1280, "front_camera front_left_camera front_right_camera"),
@@ -232,27 +237,19 @@ _CONVENTIONS = {
 _CHECKPOINT = re.compile(r"checkpoint_(\d+)\.pth", re.ASCII)
 _FINAL = "checkpoint_final.pth"
 _POSE = re.compile(r"\d{3,}\.txt", re.ASCII)
-_STRIDE = "data.pixel_source.test_image_stride"
 _SH_INTERVAL = 1000  # steps after which the project adds a degree, unless a config says otherwise
 
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A trained run and the data it was trained on.
-
-    frames: numbers of all its frames. cameras: numbers, in the model's order. downscale: of each
-    camera's images. test_stride: every how manyeth frame was held out; 0 for none.
-    """
+    """A trained run and the data it was trained on. frames: numbers of all its frames. config: the
+    whole file, of which `known` is what is checked."""
 
     folder: Path
     checkpoint: Path
     data: Path
-    convention: Convention
     frames: range
-    cameras: tuple[int, ...]
-    downscale: tuple[float, ...]
-    undistort: bool
-    test_stride: int
+    known: RunConfig
     config: Mapping[str, Any]
 
     @property
@@ -260,8 +257,16 @@ class Run:
         return self.folder / "config.yaml"
 
     @property
-    def antialiased(self) -> bool:
-        return lookup(self.config, "trainer.render.antialiased") is True
+    def convention(self) -> Convention:
+        return CONVENTIONS[self.known.dataset]
+
+    @property
+    def cameras(self) -> list[int]:
+        """Numbers, in the model's order."""
+        return self.known.cameras
+
+    def is_set(self, key: str) -> bool:
+        return lookup(self.config, key) is True
 
     def sh_interval(self, node: str) -> int:
         """Steps of training for each degree of a node's spherical harmonics."""
@@ -273,8 +278,8 @@ class Run:
 
     def is_held_out(self, frame: int) -> bool:
         """Whether a frame was not trained on: every stride-th from the stride-th of the run on."""
-        position = frame - self.frames.start
-        return self.test_stride > 0 and position > 0 and position % self.test_stride == 0
+        position, stride = frame - self.frames.start, self.known.test_image_stride
+        return stride > 0 and position > 0 and position % stride == 0
 
 
 def find_run(path: Path, options: RunOptions) -> Run:
@@ -282,52 +287,12 @@ def find_run(path: Path, options: RunOptions) -> Run:
     folder = path if path.is_dir() else path.parent
     config_file = folder / "config.yaml"
     config = read_config(config_file)
-    where = str(config_file)
-    convention = convention_of(
-        needed(config, "data.dataset", where, "a text", lambda name: isinstance(name, str)), where
-    )
+    keys = [str(entry.alias) for entry in RunConfig.model_fields.values()]
+    given = {key: value for key in keys if (value := lookup(config, key)) is not None}
+    known = validate(RunConfig, given, config_file, "config that drivestudio saved")
     checkpoint = _find_checkpoint(path, folder, options)
-    data = _find_data(config, folder, options, where)
-    stride = 0
-    if lookup(config, _STRIDE) is not None:
-        stride = needed(
-            config, _STRIDE, where, "a whole number >= 0", lambda n: _is_integer(n) and n >= 0
-        )
-    known = range(len(convention.cameras))
-    cameras = needed(
-        config,
-        "data.pixel_source.cameras",
-        where,
-        f"a list of camera numbers, 0 to {known[-1]}, each once",
-        lambda numbers: (
-            isinstance(numbers, list)
-            and all(_is_integer(n) and n in known for n in numbers)
-            and 0 < len(numbers) == len(set(numbers))
-        ),
-    )
-    factors = needed(
-        config,
-        "data.pixel_source.downscale_when_loading",
-        where,
-        f"a list of a factor > 0 for each of the {len(cameras)} cameras",
-        lambda factors: (
-            isinstance(factors, list)
-            and len(factors) >= len(cameras)
-            and all(type(f) in (int, float) and math.isfinite(f) and f > 0 for f in factors)
-        ),
-    )
-    return Run(
-        folder=folder,
-        checkpoint=checkpoint,
-        data=data,
-        convention=convention,
-        frames=_frames(config, data, where),
-        cameras=tuple(cameras),
-        downscale=tuple(float(factor) for factor in factors[: len(cameras)]),
-        undistort=lookup(config, "data.pixel_source.undistort") is True,
-        test_stride=stride,
-        config=config,
-    )
+    data = _find_data(config, folder, options)
+    return Run(folder, checkpoint, data, _frames(known, data, config_file), known, config)
 
 
 def _find_checkpoint(path: Path, folder: Path, options: RunOptions) -> Path:
@@ -346,11 +311,8 @@ def _find_checkpoint(path: Path, folder: Path, options: RunOptions) -> Path:
         return found
     if (folder / _FINAL).is_file():
         return folder / _FINAL
-    steps = {
-        int(match[1]): file
-        for file in folder.glob("checkpoint_*.pth")
-        if (match := _CHECKPOINT.fullmatch(file.name))
-    }
+    files = folder.glob("checkpoint_*.pth")
+    steps = {int(match[1]): file for file in files if (match := _CHECKPOINT.fullmatch(file.name))}
     if not steps:
         raise AdapterError(
             f"{folder} holds no {_FINAL} and no checkpoint_NNNNN.pth; give a run that was saved"
@@ -358,14 +320,11 @@ def _find_checkpoint(path: Path, folder: Path, options: RunOptions) -> Path:
     return steps[max(steps)]
 
 
-def _find_data(config: Mapping[str, Any], folder: Path, options: RunOptions, where: str) -> Path:
+def _find_data(config: Mapping[str, Any], folder: Path, options: RunOptions) -> Path:
     if options.data is not None:
         data = Path(options.data).expanduser()
         if not data.is_dir():
-            raise AdapterError(
-                f"data={options.data}: no such folder; give the processed scene's, such as "
-                f"data/waymo/processed/training/023"
-            )
+            raise AdapterError(f"data={options.data}: no such folder; give {_KEYS['data']}")
         return data
     root, scene = lookup(config, "data.data_root"), lookup(config, "data.scene_idx")
     reason = "its config.yaml does not say where the data is"
@@ -378,17 +337,13 @@ def _find_data(config: Mapping[str, Any], folder: Path, options: RunOptions, whe
                 return data
         reason = f"{Path(root) / name} of its config.yaml is not here"
     raise AdapterError(
-        f"{where}: the run needs the processed data it was trained on, and {reason}; give the "
-        f"scene's folder as data=DIR"
+        f"{folder / 'config.yaml'}: the run needs the processed data it was trained on, and "
+        f"{reason}; give the scene's folder as data=DIR"
     )
 
 
-def _frames(config: Mapping[str, Any], data: Path, where: str) -> range:
-    """start_timestep to end_timestep, both included; -1 stands for the data's last."""
-    start, end = (
-        needed(config, f"data.{name}_timestep", where, "a whole number", _is_integer)
-        for name in ("start", "end")
-    )
+def _frames(config: RunConfig, data: Path, config_file: Path) -> range:
+    start, end = config.start_timestep, config.end_timestep
     if end == -1:
         folders = [data / name for name in ("ego_pose", "lidar_pose") if (data / name).is_dir()]
         if not folders:
@@ -399,8 +354,8 @@ def _frames(config: Mapping[str, Any], data: Path, where: str) -> range:
         end = sum(1 for p in folders[0].iterdir() if _POSE.fullmatch(p.name)) - 1
     if not 0 <= start <= end:
         raise AdapterError(
-            f"{where}: frames data.start_timestep {start} to data.end_timestep {end} of {data} are "
-            f"none; is it the scene that the run was trained on?"
+            f"{config_file}: frames data.start_timestep {start} to data.end_timestep {end} of "
+            f"{data} are none; is it the scene that the run was trained on?"
         )
     return range(start, end + 1)
 
@@ -417,57 +372,52 @@ class ImageCorrections:
     trained on; both None without any. pose_changes: float64 [n, 4, 4], what world_from_camera is
     multiplied by on its right; None for no change."""
 
-    color_maps: np.ndarray | None
-    mean_color_map: np.ndarray | None
-    pose_changes: np.ndarray | None
+    color_maps: np.ndarray | None = None
+    mean_color_map: np.ndarray | None = None
+    pose_changes: np.ndarray | None = None
     problems: tuple[str, ...] = ()
 
     def maps_of(
         self, run: Run, frames: tuple[Frame, ...]
     ) -> tuple[dict[str, torch.Tensor], dict[tuple[str, int], torch.Tensor]]:
         """Colour maps by camera name, and of images that were trained on by name and time."""
+        if self.color_maps is None or self.mean_color_map is None:
+            return {}, {}
         names = [run.convention.cameras[number].name for number in run.cameras]
-        by_camera, by_image = {}, {}
-        if self.color_maps is not None and self.mean_color_map is not None:
-            by_camera = {name: torch.from_numpy(self.mean_color_map.copy()) for name in names}
-            for frame in frames:
-                first = (frame.index - run.frames.start) * len(run.cameras)
-                for image, name in enumerate(names, start=first):
-                    if not run.is_held_out(frame.index):
-                        color_map = torch.from_numpy(self.color_maps[image].copy())
-                        by_image[name, frame.cameras[name].timestamp_ns] = color_map
+        by_camera = {name: torch.from_numpy(self.mean_color_map.copy()) for name in names}
+        by_image = {
+            (name, frame.cameras[name].timestamp_ns): torch.from_numpy(self.color_maps[i].copy())
+            for frame in frames
+            if not run.is_held_out(frame.index)
+            for i, name in enumerate(names, (frame.index - run.frames.start) * len(run.cameras))
+        }
         return by_camera, by_image
 
 
 def read_corrections(models: Mapping[str, Any], run: Run, where: str) -> ImageCorrections:
     """The corrections of a checkpoint's models."""
     count = len(run.frames) * len(run.cameras)
-    maps, mean, problems = None, None, ()
+    found = ImageCorrections()
     if "Affine" in models:
-        maps, mean, problems = _affine(section(models, "Affine", where), count, f"{where} Affine")
+        found = _read_color_maps(section(models, "Affine", where), count, f"{where} Affine")
     changes = None
     for name in _POSES:
         if name in models:
-            found = _pose_changes(section(models, name, where), count, f"{where} {name}")
-            changes = found if changes is None else changes @ found
-    return ImageCorrections(maps, mean, changes, problems)
+            change = _pose_changes(section(models, name, where), count, f"{where} {name}")
+            changes = change if changes is None else changes @ change
+    return dataclasses.replace(found, pose_changes=changes)
 
 
-def _affine(
-    content: Mapping[str, Any], count: int, where: str
-) -> tuple[np.ndarray | None, np.ndarray | None, tuple[str, ...]]:
+def _read_color_maps(content: Mapping[str, Any], count: int, where: str) -> ImageCorrections:
     embedding = _numbers(content, "embedding.weight", (count, None), where)
     hidden = _numbers(content, "decoder.0.weight", (None, None), where)
     width, inputs = hidden.shape
     if inputs == embedding.shape[1] + 2:
-        return (
-            None,
-            None,
-            (
-                f"{where}: the colour corrections differ over the image (pixel_affine); they are "
-                f"left out, so images have the model's own colours",
-            ),
+        problem = (
+            f"{where}: the colour corrections differ over the image (pixel_affine); they are "
+            f"left out, so images have the model's own colours"
         )
+        return ImageCorrections(problems=(problem,))
     if inputs != embedding.shape[1]:
         raise AdapterError(
             f"{where}: decoder.0.weight must take the {embedding.shape[1]} numbers of "
@@ -481,7 +431,7 @@ def _affine(
         values = np.maximum(embedding @ hidden.T + hidden_bias, 0) @ output.T + output_bias
         return (values.reshape(-1, 3, 4) + np.eye(3, 4)).astype(np.float32)
 
-    return decoded(embedding), decoded(embedding.mean(0, keepdims=True))[0], ()
+    return ImageCorrections(decoded(embedding), decoded(embedding.mean(0, keepdims=True))[0])
 
 
 def _pose_changes(content: Mapping[str, Any], count: int, where: str) -> np.ndarray:
@@ -530,19 +480,16 @@ def scene_from_model(run: Run) -> np.ndarray:
     """The rotation from the model's world to the scene's, float64 [3, 3]: a permutation of axes
     where that leaves z as good as up, or where the dataset's z cannot be what is up."""
     axes, up = run.convention.scene_from_model, _up(run)
-    if _is_steep(run) or np.hypot(up[0], up[1]) < _LEVEL:
+    if up[2] < _STEEPEST_UP or np.hypot(up[0], up[1]) < _LEVEL:
         return axes
-    return rotation_to_z_up(up / np.linalg.norm(up)) @ axes
+    return rotation_to_z_up(up) @ axes
 
 
 def _up(run: Run) -> np.ndarray:
-    """The dataset's z axis as the first frame's car has it, x forward, y left, z up."""
-    return run.convention.scene_from_model @ model_from_dataset(run)[:3, 2]
-
-
-def _is_steep(run: Run) -> bool:
-    up = _up(run)
-    return up[2] < _STEEPEST_UP * np.linalg.norm(up)
+    """The dataset's z axis, of length 1, as the first frame's car has it (x forward, y left, z
+    up)."""
+    up = run.convention.scene_from_model @ model_from_dataset(run)[:3, 2]
+    return up / np.linalg.norm(up)
 
 
 def scene_from_dataset(run: Run) -> np.ndarray:
@@ -557,24 +504,24 @@ def read_drive(
     each kind of thing gone on without."""
     scene = scene_from_dataset(run)
     problems: list[str] = []
-    if _is_steep(run):
+    if _up(run)[2] < _STEEPEST_UP:
         problems.append(
             f"{run.data}: z of its world is not what is up for the first frame's car, which is "
             f"therefore taken to stand level"
         )
-    cameras = [_calibrated(run, position, problems) for position in range(len(run.cameras))]
+    cameras = [_read_camera(run, position, problems) for position in range(len(run.cameras))]
     frames, missing = [], []
     for number in numbers:
         shown, paths = {}, {}
-        for position, (camera, fixed) in enumerate(cameras):
+        for position, camera in enumerate(cameras):
             file = run.data / "images" / f"{number:03d}_{run.cameras[position]}.jpg"
             if file.is_file():
                 paths[camera.name] = str(file)
             else:
                 missing.append(file.name)
-            image = (number - run.frames.start) * len(cameras) + position
-            world_from_camera = scene @ _dataset_from_camera(run, number, position, fixed)
+            world_from_camera = scene @ _dataset_from_camera(run, number, position)
             if corrections.pose_changes is not None:
+                image = (number - run.frames.start) * len(cameras) + position
                 world_from_camera = world_from_camera @ corrections.pose_changes[image]
             pose = torch.from_numpy(world_from_camera)
             shown[camera.name] = dataclasses.replace(
@@ -603,19 +550,17 @@ def _world_pose(run: Run, number: int) -> np.ndarray:
     return read_pose(run.data / "ego_pose" / f"{number:03d}.txt")
 
 
-def _dataset_from_camera(
-    run: Run, number: int, position: int, ego_from_camera: np.ndarray | None
-) -> np.ndarray:
+def _dataset_from_camera(run: Run, number: int, position: int) -> np.ndarray:
+    folder, camera = run.data / "extrinsics", run.cameras[position]
     axes = _rigid(run.convention.camera_from_opencv)
-    if ego_from_camera is None:
-        name = f"{number:03d}_{run.cameras[position]}.txt"
-        return read_pose(run.data / "extrinsics" / name) @ axes
-    return _world_pose(run, number) @ ego_from_camera @ axes
+    if run.convention.poses_per_frame:
+        return read_pose(folder / f"{number:03d}_{camera}.txt") @ axes
+    return _world_pose(run, number) @ read_pose(folder / f"{camera}.txt") @ axes
 
 
-def _calibrated(run: Run, position: int, problems: list[str]) -> tuple[Camera, np.ndarray | None]:
-    """A camera at no place yet, and its extrinsics where they are the same in all frames."""
-    number = run.cameras[position]
+def _read_camera(run: Run, position: int, problems: list[str]) -> Camera:
+    """A camera at no place yet."""
+    number, downscale = run.cameras[position], run.known.downscale[position]
     kind = run.convention.cameras[number]
     file = run.data / "intrinsics" / f"{number}.txt"
     values = read_numbers(file)
@@ -624,42 +569,28 @@ def _calibrated(run: Run, position: int, problems: list[str]) -> tuple[Camera, n
             f"{file} must hold fx fy cx cy k1 k2 p1 p2 k3 with fx, fy > 0; got {values.tolist()}"
         )
     if values[4:].any():
+        how = "as if it had none (undistort is off)"
+        if run.is_set("data.pixel_source.undistort"):
+            how = "on images without it; the recorded images still have it"
         problems.append(
-            f"camera {kind.name}: its lens distortion is left out, as the model was trained "
-            + (
-                "on images without it; the recorded images still have it"
-                if run.undistort
-                else "as if it had none (undistort is off)"
-            )
+            f"camera {kind.name}: its lens distortion is left out, as the model was trained {how}"
         )
-    problems += _about_size(run.data / "images", number, kind)
-    fx, fy, cx, cy = values[:4].tolist()
-    nowhere = torch.eye(4, dtype=torch.float64)
-    camera = Camera(kind.name, kind.width, kind.height, fx, fy, cx, cy, nowhere)
-    width, height = (int(side / run.downscale[position]) for side in (kind.width, kind.height))
+    first = min((run.data / "images").glob(f"*_{number}.jpg"), default=None)
+    header = None if first is None else read_image_header(first)
+    if header is not None and (header.width, header.height) != (kind.width, kind.height):
+        problems.append(
+            f"{first} is of {header.width}x{header.height} pixels; drivestudio takes the "
+            f"intrinsics of {kind.name} to be for {kind.width}x{kind.height}, and so does the scene"
+        )
+    width, height = (int(side / downscale) for side in (kind.width, kind.height))
     if min(width, height) < 1:
         raise AdapterError(
             f"{run.config_file}: data.pixel_source.downscale_when_loading of {kind.name} is "
-            f"{run.downscale[position]:g}, which leaves no pixel of {kind.width}x{kind.height}"
+            f"{downscale:g}, which leaves no pixel of {kind.width}x{kind.height}"
         )
-    fixed = None
-    if not run.convention.poses_per_frame:
-        fixed = read_pose(run.data / "extrinsics" / f"{number}.txt")
-    return camera.resized(width, height), fixed
-
-
-def _about_size(folder: Path, number: int, kind: CameraKind) -> list[str]:
-    """A sentence where the first image is of another size than training took it to be."""
-    first = min(folder.glob(f"*_{number}.jpg"), default=None)
-    if first is None:
-        return []
-    header = read_image_header(first)
-    if header is None or (header.width, header.height) == (kind.width, kind.height):
-        return []
-    return [
-        f"{first} is of {header.width}x{header.height} pixels; drivestudio takes the intrinsics of "
-        f"{kind.name} to be for {kind.width}x{kind.height}, and so does the scene"
-    ]
+    nowhere = torch.eye(4, dtype=torch.float64)
+    camera = Camera(kind.name, kind.width, kind.height, *values[:4].tolist(), nowhere)
+    return camera.resized(width, height)
 
 
 def _rigid(rotation: np.ndarray) -> np.ndarray:
@@ -671,6 +602,56 @@ def _rigid(rotation: np.ndarray) -> np.ndarray:
 # ---- Labelled objects of the processed data: instances/instances_info.json -----------------------
 # {"0": {"id": ..., "class_name": ..., "frame_annotations":
 #     {"frame_idx": [...], "obj_to_world": [4 x 4, ...], "box_size": [[x, y, z], ...]}}, ...}
+
+
+def _rows(*shape: int) -> BeforeValidator:
+    """JSON's numbers as float64 [T, *shape]; rows may be flat."""
+
+    def parse(value: object) -> np.ndarray:
+        values = array_of(value)
+        length = len(values) if values is not None and values.ndim else -1
+        size = length * math.prod(shape)
+        if values is None or values.size != size or not np.isfinite(values).all():
+            raise ValueError(f"must hold {' x '.join(('T', *map(str, shape)))} numbers")
+        return values.reshape(length, *shape)
+
+    return BeforeValidator(parse)
+
+
+class _Annotations(BaseModel):
+    model_config = ConfigDict(arbitrary_types_allowed=True)
+
+    frame_idx: Annotated[np.ndarray, _rows()]
+    obj_to_world: Annotated[np.ndarray, _rows(4, 4)]
+    box_size: Annotated[np.ndarray, _rows(3)]
+
+    @model_validator(mode="after")
+    def _fits(self) -> _Annotations:
+        counts = len(self.frame_idx), len(self.obj_to_world), len(self.box_size)
+        if len(set(counts)) != 1:
+            raise ValueError(
+                f"frame_idx, obj_to_world and box_size must be of equal length; got {counts}"
+            )
+        numbers = self.frame_idx.astype(np.int64)
+        if (numbers != self.frame_idx).any() or (np.diff(np.sort(numbers), prepend=-1) < 1).any():
+            raise ValueError("frame_idx must list frame numbers, each once")
+        rotations = self.obj_to_world[:, :3, :3]
+        error = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(initial=0)
+        if error > 1e-3 or (np.linalg.det(rotations) < 0).any() or (self.box_size <= 0).any():
+            raise ValueError(
+                "obj_to_world must be rotations and translations, and box_size > 0 (metres)"
+            )
+        return self
+
+
+class _Object(BaseModel):
+    id: Any
+    class_name: Any = None
+    frame_annotations: _Annotations
+
+
+class _Objects(RootModel[dict[Annotated[str, Field(pattern="^[0-9]{1,9}$")], _Object]]):
+    pass
 
 
 @dataclass(frozen=True, eq=False)
@@ -692,64 +673,28 @@ class Instance:
 def read_instances(data: Path) -> tuple[Instance, ...] | None:
     """All objects, by their numbers; None without the file."""
     path = data / "instances" / "instances_info.json"
-    if not path.is_file():
-        return None
-    return _read(path, path.stat().st_mtime_ns)
+    return _read_instances(path, path.stat().st_mtime_ns) if path.is_file() else None
 
 
 @functools.lru_cache(maxsize=2)  # labels ask for one frame after the other
-def _read(path: Path, _written_ns: int) -> tuple[Instance, ...]:
-    content = read_json(path)
-    objects = [_instance(key, entry, f"{path}: object {key!r}") for key, entry in content.items()]
-    ids = [found.track_id for found in objects]
-    if len(set(ids)) != len(ids):
+def _read_instances(path: Path, _written_ns: int) -> tuple[Instance, ...]:
+    instances = []
+    for key, entry in validate(_Objects, read_json(path), path, "table of objects").root.items():
+        notes, label = entry.frame_annotations, entry.class_name
+        order = np.argsort(notes.frame_idx, kind="stable")
+        instances.append(
+            Instance(
+                number=int(key),
+                track_id=str(entry.id),
+                label=label if isinstance(label, str) and label else "unknown",
+                frames=notes.frame_idx[order].astype(np.int64),
+                poses=notes.obj_to_world[order],
+                sizes_m=notes.box_size[order],
+            )
+        )
+    if len({found.track_id for found in instances}) != len(instances):
         raise AdapterError(f"{path}: ids of objects repeat; process the data again")
-    return tuple(sorted(objects, key=lambda found: found.number))
-
-
-def _instance(key: str, entry: Any, where: str) -> Instance:
-    notes = entry.get("frame_annotations") if isinstance(entry, Mapping) else None
-    if not re.fullmatch("[0-9]{1,9}", key) or not isinstance(notes, Mapping) or "id" not in entry:
-        raise AdapterError(
-            f"{where} must have a number as its key, and id, class_name and frame_annotations"
-        )
-    frames = _array(notes, "frame_idx", (), where)
-    poses = _array(notes, "obj_to_world", (4, 4), where)
-    sizes = _array(notes, "box_size", (3,), where)
-    if not len(frames) == len(poses) == len(sizes):
-        raise AdapterError(
-            f"{where}: frame_idx, obj_to_world and box_size must be of equal length; got "
-            f"{len(frames)}, {len(poses)} and {len(sizes)}"
-        )
-    numbers = frames.astype(np.int64)
-    order = np.argsort(numbers, kind="stable")
-    if (numbers != frames).any() or (np.diff(numbers[order]) < 1).any() or (numbers < 0).any():
-        raise AdapterError(f"{where}: frame_idx must list frame numbers, each once")
-    rotations = poses[:, :3, :3]
-    error = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(initial=0)
-    if error > 1e-3 or (np.linalg.det(rotations) < 0).any() or (sizes <= 0).any():
-        raise AdapterError(
-            f"{where}: obj_to_world must be rotations and translations, and box_size > 0 (metres)"
-        )
-    label = entry.get("class_name")
-    return Instance(
-        number=int(key),
-        track_id=str(entry["id"]),
-        label=label if isinstance(label, str) and label else "unknown",
-        frames=numbers[order],
-        poses=poses[order],
-        sizes_m=sizes[order],
-    )
-
-
-def _array(notes: Mapping[str, Any], name: str, shape: tuple[int, ...], where: str) -> np.ndarray:
-    """float64 [T, *shape]; rows may be flat."""
-    values = array_of(notes.get(name))
-    length = len(values) if values is not None and values.ndim else -1
-    if values is None or values.size != length * math.prod(shape) or not np.isfinite(values).all():
-        expected = " x ".join(("T", *map(str, shape)))
-        raise AdapterError(f"{where}: {name} must hold {expected} numbers")
-    return values.reshape(length, *shape)
+    return tuple(sorted(instances, key=lambda found: found.number))
 
 
 # ---- Boxes and LiDAR of the processed data a run was trained on, in the scene's world ------------
@@ -762,11 +707,10 @@ _TURNED = ("flow_x", "flow_y", "flow_z")
 class DriveStudioLabels:
     """Labels of a run's data, read when asked.
 
-    The scene's world is the model's (see adapters.drivestudio.drive), not the dataset's, from which
-    it is turned: so are these labels. Boxes: x forward; track_ids are the data's ids; `instance` is
-    their number in instances_info.json. Sweeps: the columns of Convention.lidar_columns, of which
-    points, and Waymo's origins and flows, are moved from the frame of the car (nuScenes: of the
-    sensor, lidar_pose) at that moment; they are taken to be in it, as the project's loaders do.
+    Boxes: x forward; track_ids are the data's ids; `instance` is their number in
+    instances_info.json. Sweeps: Convention.lidar_columns; points, and Waymo's origins and flows,
+    are taken to be in the frame of the car (nuScenes: lidar_pose) at that moment, as the project
+    does.
     """
 
     run: Run

@@ -15,7 +15,7 @@ import torch
 from adapters.base import open_scene
 from adapters.detect_format import recognised
 from adapters.drivestudio.adapter import drivestudio_labels, open_drivestudio
-from adapters.drivestudio.drive import convention_of
+from adapters.drivestudio.drive import CONVENTIONS
 from augment.errors import AdapterError
 from augment.sky import ConstantSky
 
@@ -45,29 +45,28 @@ def refused(numbers, message: str, **query) -> str:
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
-        ("data.dataset", "mars", "data.dataset is 'mars'.*waymo, nuscenes, pandaset, argoverse"),
-        ("data.dataset", None, "lacks data.dataset"),
-        ("data.dataset", 3, "data.dataset must be a text; got 3"),
-        ("data.start_timestep", "${start}", r"data.start_timestep is '\$\{start\}', which refers"),
+        ("data.dataset", "mars", "axes of 'mars' are not known.*waymo, nuscenes, pandaset, argov"),
+        ("data.dataset", None, "data.dataset: Field required"),
+        ("data.dataset", 3, "data.dataset: Input should be a valid string .got 3"),
         ("data.data_root", "${root}/x", r"data.data_root is '\$\{root\}/x', which refers"),
         ("data.pixel_source.cameras", ["${cam}"], r"data.pixel_source.cameras is '\$\{cam\}'"),
-        ("data.start_timestep", 1.5, "data.start_timestep must be a whole number; got 1.5"),
+        ("data.start_timestep", 1.5, "data.start_timestep: Input should be a valid integer"),
         ("data.start_timestep", 6, "frames data.start_timestep 6 to data.end_timestep 5 .* none"),
-        ("data.pixel_source.cameras", [0, 5], r"list of camera numbers, 0 to 4, .*; got \[0, 5\]"),
+        ("data.pixel_source.cameras", [0, 5], r"camera numbers, 0 to 4, each once; got \[0, 5\]"),
         ("data.pixel_source.cameras", [0, 0, 1], "each once"),
-        ("data.pixel_source.cameras", [], "must be a list of camera numbers"),
-        ("data.pixel_source.cameras", [True, 2, 3], "must be a list of camera numbers"),
+        ("data.pixel_source.cameras", [], "data.pixel_source.cameras: List should have at least 1"),
+        ("data.pixel_source.cameras", [True, 2], "cameras.0: Input should be a valid integer"),
         ("data.pixel_source.downscale_when_loading", [2, 2], "factor > 0 for each of the 3"),
-        ("data.pixel_source.downscale_when_loading", [2, 0, 2], "factor > 0"),
+        ("data.pixel_source.downscale_when_loading", [2, 0, 2], "loading.1: .*greater than 0"),
         ("data.pixel_source.downscale_when_loading", [2000, 2, 2], "leaves no pixel of 1920x1280"),
-        ("data.pixel_source.test_image_stride", -1, "must be a whole number >= 0; got -1"),
+        ("data.pixel_source.test_image_stride", -1, "greater than or equal to 0 .got -1"),
         ("data.data_root", "/nowhere", r"/nowhere/007 of its config.yaml is not here.*data=DIR"),
         ("data.scene_idx", None, "does not say where the data is.*data=DIR"),
     ],
 )
 def test_a_config_that_cannot_be_used_is_refused(numbers, key, value, message):
     files.write_config(numbers.folder, numbers.data.parent, "waymo", {key: value})
-    refused(numbers, message)
+    assert "config.yaml" in refused(numbers, message)
 
 
 def test_a_config_that_is_none_is_refused(numbers):
@@ -88,7 +87,7 @@ def test_options_that_cannot_be_used_are_refused(numbers):
     )
     refused(numbers, "frames must be first:stop", frames="3")
     refused(numbers, "frames must be first:stop", frames="4:2")
-    refused(numbers, "frames=7:6 selects none of the run's frames 1 to 5", frames="7:")
+    refused(numbers, "frames=7: selects none of the 5 frames .1 to 5", frames="7:")
     refused(numbers, "no such folder; give the processed scene's", data="/nowhere")
     refused(numbers, "data must be the processed scene's folder", data="")
     refused(numbers, "does not exist; the run has checkpoint_final.pth", checkpoint="b.pth")
@@ -215,23 +214,17 @@ def test_data_of_another_scene_is_refused(numbers):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda v: {"a": v["0"]}, "must have a number as its key"),
-        (lambda v: {"0": {"id": 1}}, "must have a number as its key, and id"),
+        (lambda v: {"a": v["0"]}, "a.*: String should match pattern"),
+        (lambda v: {"0": {"id": 1}}, "0.frame_annotations: Field required"),
         (lambda v: {"0": v["0"], "1": v["0"]}, "ids of objects repeat"),
-        (lambda v: {"0": notes(v["0"], frame_idx=[0])}, "must be of equal length; got 1, 6 and 6"),
+        (lambda v: {"0": notes(v["0"], frame_idx=[0])}, r"of equal length; got \(1, 6, 6\)"),
         (lambda v: {"0": notes(v["0"], frame_idx=[0] * 6)}, "frame numbers, each once"),
-        (lambda v: {"0": notes(v["0"], frame_idx=["x"] * 6)}, "frame_idx must hold T numbers"),
-        (lambda v: {"0": notes(v["0"], frame_idx=[10**400] * 6)}, "frame_idx must hold T numbers"),
-        (lambda v: {"0": notes(v["0"], box_size=[["1"] * 3] * 6)}, "box_size must hold T x 3 numb"),
-        (lambda v: {"9" * 5000: v["0"]}, "must have a number as its key"),
-        (lambda v: {"0": notes(v["0"], box_size=[[1, 2]] * 6)}, "box_size must hold T x 3 numbers"),
+        (lambda v: {"0": notes(v["0"], frame_idx=[10**400] * 6)}, "frame_idx: .*must hold T numb"),
+        (lambda v: {"0": notes(v["0"], box_size=[["1"] * 3] * 6)}, "must hold T x 3 numbers"),
+        (lambda v: {"9" * 5000: v["0"]}, "String should match pattern"),
+        (lambda v: {"0": notes(v["0"], box_size=[[1, 2]] * 6)}, "box_size: .*must hold T x 3 numb"),
         (lambda v: {"0": notes(v["0"], box_size=[[1, 2, 0]] * 6)}, "box_size > 0"),
-        (
-            lambda v: {
-                "0": notes(v["0"], obj_to_world=(2 * np.eye(4)[None].repeat(6, 0)).tolist())
-            },
-            "must be rotations and translations",
-        ),
+        (lambda v: {"0": notes(v["0"], obj_to_world=[[2.0] * 16] * 6)}, "must be rotations"),
     ],
 )
 def test_objects_that_are_none_are_refused(numbers, change, message):
@@ -382,15 +375,9 @@ def test_labels_need_no_readable_checkpoint(numbers):
     assert labels.boxes(1).track_ids == ("walker", "car-b", "car-a")
 
 
-@pytest.mark.parametrize("name", ["waymo", "nuscenes", "pandaset", "argoverse", "kitti", "nuplan"])
-def test_axes_of_datasets_are_rotations(name):
-    convention = convention_of(name, "here")
-    for axes in (
-        convention.camera_from_opencv,
-        convention.scene_from_model,
-        convention.pose_from_ego,
-        convention.object_from_actor,
-    ):
-        assert np.array_equal(axes @ axes.T, np.eye(3)) and np.linalg.det(axes) > 0
-    assert {"x", "y", "z"} <= set(convention.lidar_columns)
-    assert len({camera.name for camera in convention.cameras}) == len(convention.cameras)
+def test_axes_of_datasets_are_rotations():
+    for c in CONVENTIONS.values():
+        for axes in (
+            c.camera_from_opencv, c.scene_from_model, c.pose_from_ego, c.object_from_actor,
+        ):  # fmt: skip
+            assert np.array_equal(axes @ axes.T, np.eye(3)) and np.linalg.det(axes) > 0
