@@ -36,6 +36,7 @@ FOG = "weather: {smog: {visibility_m: {uniform: [20, 200]}}}\n"
 WET = "weather: {flood: {level_m: {uniform: [0.1, 0.5]}}}\noutput: {image: jpg, depth: none}\n"
 DRY = "output: {depth: none, labels: false, lidar: false}\n"
 TEXTS = {"fog": FOG, "wet": WET, "dry": DRY}
+SCENES = ("fake:a?frames=4", "fake:b?frames=3")
 
 
 def make_recipes(
@@ -59,7 +60,7 @@ def make_recipes(
 
 def make_job(
     out: Path | str,
-    scenes: Sequence[str | JobScene] = ("fake:a?frames=4", "fake:b?frames=3"),
+    scenes: Sequence[str | JobScene] = SCENES,
     recipes: JobRecipes | None = None,
     *,
     renderer: Callable = fake_render,

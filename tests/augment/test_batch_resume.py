@@ -21,6 +21,7 @@ def run(job: RenderJob, renderer=fake_render) -> JobResult:
     return run_job(job, scene_loader=open_fake, renderer=renderer, progress=False)
 
 
+@pytest.mark.long
 def test_killed_jobs_resume_to_identical_files(quick_folder: Path) -> None:
     script = Path(__file__).with_name("batch_crashes.py")
     done = subprocess.run(

@@ -7,15 +7,26 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 
-def test_killed_jobs_go_on_to_identical_files(quick_folder: Path) -> None:
+
+def found_by(folder: Path, *scenarios: str) -> dict[str, dict]:
     """What has to hold is in the script, which ends with a message where it does not."""
     script = Path(__file__).with_name("generate_crashes.py")
     done = subprocess.run(
-        [sys.executable, script, quick_folder], capture_output=True, text=True, timeout=600
+        [sys.executable, script, folder, *scenarios], capture_output=True, text=True, timeout=600
     )
     assert done.returncode == 0, done.stderr
-    found = json.loads(done.stdout)
+    return json.loads(done.stdout)
+
+
+def test_a_driver_killed_twice_goes_on_to_identical_files(quick_folder: Path) -> None:
+    assert found_by(quick_folder, "kill_the_driver_twice")["kill_the_driver_twice"]["kills"] >= 2
+
+
+@pytest.mark.long
+def test_killed_jobs_go_on_to_identical_files(quick_folder: Path) -> None:
+    found = found_by(quick_folder)
     assert found["kill_the_driver"]["kills"] >= 12
     assert found["kill_the_driver"]["seen"] >= 2  # readers met outputs of as many sizes
     assert found["fill_the_disk"]["failures"] >= 2

@@ -45,12 +45,17 @@ def cluster():
         ray.shutdown()
 
 
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory) -> dict[str, str]:
+def serial(out: Path, *scenes: list[str]) -> dict[str, str]:
     """Digests of what one process renders."""
-    out = tmp_path_factory.mktemp("serial") / "out"
-    run_generate(make_job(out), progress=False)
+    run_generate(make_job(out, *scenes), progress=False)
     return outputs(out)
+
+
+@pytest.mark.usefixtures("cluster")
+def test_an_actor_gives_the_serial_bytes(tmp_path):
+    scenes = ["fake:a?frames=1"]
+    run_generate(make_job(tmp_path / "out", scenes, executor="ray", workers=1), progress=False)
+    assert outputs(tmp_path / "out") == serial(tmp_path / "serial", scenes)
 
 
 def dying_once(
@@ -67,8 +72,9 @@ def dying_once(
     return fake_render(scene, camera, recipe, backend=backend)
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("cluster")
-def test_job_gives_the_serial_bytes_with_too_few_cpus_and_an_actor_killed(whole, tmp_path):
+def test_job_gives_the_serial_bytes_with_too_few_cpus_and_an_actor_killed(tmp_path):
     """Two promises in one test, for every start of an actor imports torch anew."""
     marker, seen = tmp_path / "killed", []
     job = make_job(
@@ -80,13 +86,14 @@ def test_job_gives_the_serial_bytes_with_too_few_cpus_and_an_actor_killed(whole,
     result = run_generate(job, progress=False, on_image=lambda done, failed: seen.append(done))
     assert marker.exists()
     assert result.failed == 0, result.failures
-    assert outputs(tmp_path / "out") == whole
+    assert outputs(tmp_path / "out") == serial(tmp_path / "serial")
     assert not leftovers(tmp_path / "out")
     assert len(set(seen)) > 8, f"images are told of one by one, not in blocks: {seen}"
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("cluster")
-def test_interrupt_lets_actors_finish_their_images(whole, tmp_path):
+def test_interrupt_lets_actors_finish_their_images(tmp_path):
     def interrupt(done: int, failed: int) -> None:
         if done:
             raise KeyboardInterrupt
@@ -98,7 +105,7 @@ def test_interrupt_lets_actors_finish_their_images(whole, tmp_path):
     assert not held, "a killed actor would have left its claim"
     result = run_generate(make_job(tmp_path / "out"), progress=False)
     assert result.written < 28, "what was finished is not rendered again"
-    assert outputs(tmp_path / "out") == whole
+    assert outputs(tmp_path / "out") == serial(tmp_path / "serial")
 
 
 def noting_gpus(
@@ -109,6 +116,7 @@ def noting_gpus(
     return fake_render(scene, camera, recipe, backend=backend)
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("cluster")
 def test_an_actor_that_draws_on_a_gpu_has_it_and_its_cpus(tmp_path):
     notes = tmp_path / "notes"
@@ -123,6 +131,7 @@ def test_an_actor_that_draws_on_a_gpu_has_it_and_its_cpus(tmp_path):
     assert notes.read_text() == f"cuda 0 {CPUS}"
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("cluster")
 def test_scenes_that_actors_cannot_import_end_the_job(tmp_path, monkeypatch):
     module = types.ModuleType("only_on_this_machine")
