@@ -13,14 +13,18 @@ import numpy as np
 from augment.errors import OutputError
 from augment.jobs.atomic import replaced_file, write_atomic
 from augment.jobs.layout import folder_name, resolve_inside
-from augment.jobs.manifest import read_manifest
+from augment.jobs.manifest import OK, read_manifest
 from recipes.schema import KOSCHMIEDER
-
-# ---- drawing -------------------------------------------------------------------------------------
 
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 CAPTION_PX, GAP_PX = 42, 8
 Color = tuple[int, int, int]
+VIDEO_WIDTH = 1440
+MAX_SHOWN = 12  # scenes and variants in one picture
+CELL_WIDTH = 400  # px of one image on a contact sheet
+MARGIN = 6
+CAPTION = 26
+_TITLE_SIZE = 0.6
 
 
 def write(
@@ -31,13 +35,13 @@ def write(
     *,
     size: float = 0.5,
     color: Color = (40, 40, 40),
-    align: str = "left",
+    centred: bool = False,
     thickness: int = 1,
 ) -> None:
-    """Text with its baseline at y and its left end, centre or right end at x."""
-    shift = {"left": 0.0, "centre": 0.5, "right": 1.0}[align] * text_width(text, size, thickness)
-    at = (round(x - shift), round(y))
-    cv2.putText(image, text, at, FONT, size, color, thickness, cv2.LINE_AA)
+    """Text with its baseline at y and its left end, or its centre, at x."""
+    if centred:
+        x -= 0.5 * text_width(text, size, thickness)
+    cv2.putText(image, text, (round(x), round(y)), FONT, size, color, thickness, cv2.LINE_AA)
 
 
 def captioned(image: np.ndarray, title: str, text: str) -> np.ndarray:
@@ -54,9 +58,10 @@ def strip(panels: Sequence[np.ndarray]) -> np.ndarray:
     return np.concatenate([part for panel in panels for part in (gap, panel)][1:], 1)
 
 
-def write_jpeg(path: Path, image: np.ndarray) -> None:
-    """uint8 [H, W, 3] RGB, at a quality for documents."""
-    cv2.imwrite(str(path), image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 88])
+def resized(image: np.ndarray, width: int, how: int) -> np.ndarray:
+    """At another width, by one of OpenCV's interpolations."""
+    height = max(1, round(image.shape[0] * width / image.shape[1]))
+    return cv2.resize(image, (width, height), interpolation=how)
 
 
 def text_width(text: str, size: float, thickness: int = 1) -> int:
@@ -109,16 +114,6 @@ def short_number(value: float) -> str:
     return f"{value:.6g}"
 
 
-# ---- Pictures of an output folder: a contact sheet, and a video of variants side by side ---------
-
-VIDEO_WIDTH = 1440
-MAX_SHOWN = 12  # scenes and variants in one picture
-CELL_WIDTH = 400  # px of one image on a contact sheet
-MARGIN = 6
-CAPTION = 26
-_TITLE_SIZE = 0.6
-
-
 def draw_sheet(out: Path, frame: int | None = None) -> Path:
     """Writes OUT/contact_sheet.png: a row per scene and variant, a column per camera.
 
@@ -127,7 +122,7 @@ def draw_sheet(out: Path, frame: int | None = None) -> Path:
     Raises:
         OutputError: there is no manifest, no finished image, or none of the frame.
     """
-    rows = read_rows(out)
+    rows = _read_rows(out)
     frames = sorted({row["frame"] for row in rows})
     frame = frames[len(frames) // 2] if frame is None else frame
     cameras = list(dict.fromkeys(row["camera"] for row in rows))
@@ -151,7 +146,7 @@ def draw_sheet(out: Path, frame: int | None = None) -> Path:
 
 def draw_video(out: Path, camera: str, frames_per_second: float = 10.0) -> Path:
     """Writes OUT/video_<camera>.mp4: scenes and variants side by side, frame by frame."""
-    rows = [row for row in read_rows(out) if row["camera"] == camera]
+    rows = [row for row in _read_rows(out) if row["camera"] == camera]
     by_key = {(row["scene"], row["variant"], row["frame"]): row for row in rows}
     groups = shown_groups(rows)
     frames = [
@@ -171,13 +166,9 @@ def draw_video(out: Path, camera: str, frames_per_second: float = 10.0) -> Path:
     return path
 
 
-def read_rows(out: Path) -> list[dict[str, Any]]:
-    """The finished images of an output folder, as manifest rows.
-
-    Raises:
-        OutputError: there is no manifest, or it holds no finished image.
-    """
-    rows = [row for row in read_manifest(out).to_pylist() if row["status"] == "ok"]
+def _read_rows(out: Path) -> list[dict[str, Any]]:
+    """The finished images of an output folder, as manifest rows."""
+    rows = [row for row in read_manifest(out).to_pylist() if row["status"] == OK]
     if not rows:
         raise OutputError(f"{out} holds no finished image; run `climategs render` first")
     return rows
@@ -193,12 +184,12 @@ def shown_groups(rows: list[dict[str, Any]]) -> list[tuple[str, str]]:
 
 
 def _numbers(row: dict[str, Any]) -> tuple[float, float, float]:
-    """The recipe's smog per metre (0 without), its water level in metres (-infinity without) and
-    its snow depth in metres (0 without). Old folders lack some of the columns.
+    """Smog per metre (0 without), water level (m, -infinity without) and snow depth (m, 0 without).
+    Old folders lack some of the columns.
     """
     absent = {"smog_extinction_per_m": 0.0, "flood_level_m": -math.inf, "snow_depth_m": 0.0}
-    found = {name: row.get(name, math.nan) for name in absent}
-    smog, water, snow = (absent[n] if math.isnan(v) else v for n, v in found.items())
+    found = ((row.get(name, math.nan), none) for name, none in absent.items())
+    smog, water, snow = (none if math.isnan(value) else value for value, none in found)
     return smog, water, snow
 
 
@@ -218,7 +209,12 @@ def _weather(row: dict[str, Any]) -> str:
 
 
 def _read(out: Path, row: dict[str, Any]) -> np.ndarray:
-    return read_rgb(resolve_inside(out, row["image_path"]))
+    """uint8 [H, W, 3] RGB of a row's image."""
+    path = resolve_inside(out, row["image_path"])
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if image is None:
+        raise OutputError(f"cannot read the image {path}: it is missing or damaged")
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
 def contact_sheet(rows: Sequence[tuple[str, Sequence[tuple[str, np.ndarray]]]]) -> np.ndarray:
@@ -240,8 +236,8 @@ def contact_sheet(rows: Sequence[tuple[str, Sequence[tuple[str, np.ndarray]]]]) 
         write(sheet, title, left, bottom, size=_TITLE_SIZE, color=(255, 255, 255))
         for c, (caption, image) in enumerate(images):
             left = MARGIN + c * (CELL_WIDTH + MARGIN)
-            height = round(image.shape[0] * CELL_WIDTH / image.shape[1])
-            small = cv2.resize(image, (CELL_WIDTH, height), interpolation=cv2.INTER_AREA)
+            small = resized(image, CELL_WIDTH, cv2.INTER_AREA)
+            height = len(small)
             sheet[top + CAPTION : top + CAPTION + height, left : left + CELL_WIDTH] = small
             bottom = top + CAPTION + cell_height + CAPTION - 9
             write(sheet, caption, left + 2, bottom, size=0.45, color=(190, 190, 190))
@@ -266,12 +262,8 @@ def side_by_side(images: Sequence[tuple[str, np.ndarray]], width: int) -> np.nda
 
 
 def write_video(path: Path, frames: Iterable[np.ndarray], frames_per_second: float) -> None:
-    """An MP4 (MPEG-4 part 2, which OpenCV can always write) of RGB frames of equal size.
-
-    Frames are taken one at a time, so a long sequence need not fit in memory.
-
-    Raises:
-        OutputError: the file cannot be written, or there are no frames.
+    """An MP4 (MPEG-4 part 2, which OpenCV can always write) of RGB frames of equal size, which are
+    taken one at a time.
     """
     with replaced_file(path, ending=path.suffix) as file:
         writer = None
@@ -279,24 +271,10 @@ def write_video(path: Path, frames: Iterable[np.ndarray], frames_per_second: flo
             if writer is None:
                 code, (height, width) = cv2.VideoWriter.fourcc(*"mp4v"), frame.shape[:2]
                 writer = cv2.VideoWriter(file.name, code, frames_per_second, (width, height))
-                if not writer.isOpened():
-                    raise OutputError(f"cannot write the video {path}: does its name end in .mp4?")
             writer.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
-        if writer is None:
-            raise OutputError(f"no frames for the video {path}")
+        if writer is None or not writer.isOpened():
+            raise OutputError(f"cannot write the video {path}: there are no frames, or no encoder")
         writer.release()
-
-
-def read_rgb(path: Path) -> np.ndarray:
-    """uint8 [H, W, 3] RGB.
-
-    Raises:
-        OutputError: the file is missing or no image.
-    """
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if image is None:
-        raise OutputError(f"cannot read the image {path}: it is missing or damaged")
-    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
 def write_rgb(path: Path, image: np.ndarray, *, jpeg_quality: int = 95) -> None:

@@ -6,8 +6,9 @@ The protocol is in docs/evaluation.md; warping is `augment.metrics.consistency`'
 from __future__ import annotations
 
 import dataclasses
+import functools
+import itertools
 import math
-from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -37,7 +38,7 @@ from augment.metrics.consistency import (
     find_warp,
 )
 from augment.metrics.lpips import Lpips, load_lpips, picture_lpips
-from tools.drawing import GAP_PX, captioned, color_mapped, strip, write_rgb
+from tools.drawing import GAP_PX, captioned, color_mapped, resized, strip, write_rgb
 from tools.report_pictures import evenly
 
 SHORT, LONG, CAMERAS = "short", "long", "cameras"
@@ -86,9 +87,10 @@ def evaluate_output(
         )
     network = None if lpips is None else load_lpips(lpips, lpips_heads)
     views = Views(open_store(out), scenes, recipes)
-    drives = views.drives()
     found = [
-        (drive, pair) for drive in drives for pair in pairs_of(views, drive, short, long, pairs)
+        (drive, pair)
+        for drive in views.drives()
+        for pair in pairs_of(views, drive, short, long, pairs)
     ]
     if not found:
         raise OutputError(
@@ -103,18 +105,17 @@ def evaluate_output(
         for record in worst:
             name = f"{folder_name(record['recipe'])}-{record['kind']}.png"
             write_rgb(pictures / name, pair_picture(views, record))
+    for record in records:
+        del record["rows"]
     return {
         "out": str(out),
         "frames_apart": {"short": short, "long": long},
         "lpips": None if network is None else network.name,
         "recipes": _summaries(records, ("recipe",)),
         "variants": _summaries(records, ("scene", "variant", "recipe")),
-        "worst": [{k: v for k, v in each.items() if k != "rows"} for each in worst],
-        "pairs": [{k: v for k, v in each.items() if k != "rows"} for each in records],
+        "worst": worst,
+        "pairs": records,
     }
-
-
-# ---- Views with depth, and which pairs of them are compared --------------------------------------
 
 
 class View(NamedTuple):
@@ -144,9 +145,7 @@ class Drive(NamedTuple):
 
 
 class Views:
-    """Reads the views of an output, the last ones kept.
-
-    scenes, recipes: which to keep; None for all.
+    """Reads the views of an output, the last ones kept. scenes, recipes: which; None for all.
 
     Raises:
         OutputError: nothing is finished there, or nothing of these scenes and recipes.
@@ -173,8 +172,8 @@ class Views:
         self.rows = Rows.of(table)
         self._store = store
         self._reader = RowReader(store, verify=False)
-        self._paths = Companions(StoredFiles(store), _read_paths)
-        self._recent: OrderedDict[int, View] = OrderedDict()
+        self._paths = Companions(StoredFiles(store), lambda path: (ActorPaths(read_boxes(path)),))
+        self.view = functools.lru_cache(_KEPT)(self._read)
 
     def drives(self) -> list[Drive]:
         """In the manifest's order."""
@@ -212,19 +211,6 @@ class Views:
                 f"the job again, which makes it anew"
             ) from error
 
-    def view(self, row: int) -> View:
-        """What the row's files hold.
-
-        Raises:
-            OutputError: the row has no depth, or a file is missing or damaged.
-        """
-        if row not in self._recent:
-            self._recent[row] = self._read(row)
-            while len(self._recent) > _KEPT:
-                self._recent.popitem(last=False)
-        self._recent.move_to_end(row)
-        return self._recent[row]
-
     def paths(self, row: int) -> ActorPaths:
         """Where the boxes of the row's drive are; none where it has no labels."""
         column: Any = self.rows["labels_path"]
@@ -232,6 +218,11 @@ class Views:
         return ActorPaths({}) if parts is None else self._paths.get(*parts)[0]
 
     def _read(self, row: int) -> View:
+        """What the row's files hold.
+
+        Raises:
+            OutputError: the row has no depth, or a file is missing or damaged.
+        """
         pixels = self._reader.pixels(self.rows, row, _BUFFERS)
         if pixels.depth is None:
             raise OutputError(
@@ -258,56 +249,43 @@ def pairs_of(views: Views, drive: Drive, short: int, long: int, most: int | None
     warped into the earlier), and of neighbouring cameras of one frame (the second by name into the
     first). most: of each kind at most so many, evenly chosen.
     """
-    frames = sorted({frame for frame, _ in drive.rows})
-    cameras = sorted({camera for _, camera in drive.rows})
-    found: dict[str, list[Pair]] = {kind: [] for kind in KINDS}
+    rows, found = drive.rows, dict[str, list[Pair]]()
+    frames = sorted({frame for frame, _ in rows})
+    cameras = sorted({camera for _, camera in rows})
     for kind, apart in ((SHORT, short), (LONG, long)):
-        for camera in cameras:
-            for frame in frames:
-                a, b = (drive.rows.get((number, camera)) for number in (frame, frame + apart))
-                if a is not None and b is not None:
-                    found[kind].append(Pair(kind, a, b))
-    for frame in frames:
-        rows = [drive.rows[frame, name] for name in cameras if (frame, name) in drive.rows]
-        found[CAMERAS] += [Pair(CAMERAS, a, b) for a, b in _neighbours(views, rows)]
-    return [
-        pair
-        for each in found.values()
-        for pair in (each if most is None or not each else evenly(each, most))
+        items = [((n, camera), (n + apart, camera)) for camera in cameras for n in frames]
+        found[kind] = [Pair(kind, rows[a], rows[b]) for a, b in items if a in rows and b in rows]
+    found[CAMERAS] = [
+        Pair(CAMERAS, a, b)
+        for frame in frames
+        for a, b in _neighbours(views, [rows[frame, c] for c in cameras if (frame, c) in rows])
     ]
+    limit = most or len(rows) ** 2
+    return [pair for each in found.values() for pair in evenly(each, limit)]
 
 
-def _neighbours(views: Views, rows: Sequence[int]) -> Iterator[tuple[int, int]]:
+def _neighbours(views: Views, rows: Sequence[int]) -> list[tuple[int, int]]:
     axes = {row: views.camera(row).world_from_camera[:3, 2].numpy() for row in rows}
-    min_cosine = math.cos(math.radians(MAX_ANGLE_DEG))
-    for place, a in enumerate(rows):
-        for b in rows[place + 1 :]:
-            if float(axes[a] @ axes[b]) >= min_cosine - 1e-9:
-                yield a, b
+    min_cosine = math.cos(math.radians(MAX_ANGLE_DEG)) - 1e-9
+    return [
+        (a, b) for a, b in itertools.combinations(rows, 2) if float(axes[a] @ axes[b]) >= min_cosine
+    ]
 
 
 def _effects(rows: Rows, row: int) -> str:
     """Which effects the manifest's numbers name: `smog + snow`."""
+
+    def number(name: str) -> float:
+        value = rows[name][row] if name in rows.weather else None
+        return math.nan if value is None else value
+
     present = {
-        "smog": _number(rows, row, "smog_extinction_per_m") > 0,
-        "flood": not math.isnan(_number(rows, row, "flood_level_m")),
-        "snow": _number(rows, row, "snow_depth_m") > 0,
+        "smog": number("smog_extinction_per_m") > 0,
+        "flood": not math.isnan(number("flood_level_m")),
+        "snow": number("snow_depth_m") > 0,
         "style": rows["style"][row] is not None,
     }
     return " + ".join(name for name, there in present.items() if there) or "other"
-
-
-def _number(rows: Rows, row: int, name: str) -> float:
-    """A weather number; NaN where there is none."""
-    value = rows[name][row] if name in rows.weather else None
-    return math.nan if value is None else value
-
-
-def _read_paths(path: Any) -> tuple[ActorPaths]:
-    return (ActorPaths(read_boxes(path)),)
-
-
-# ---- A pair by the protocol ------------------------------------------------------------------
 
 
 class Compared(NamedTuple):
@@ -457,20 +435,14 @@ def pair_picture(views: Views, record: dict[str, Any]) -> np.ndarray:
         (error_map, f"error, x{ERROR_GAIN:g}", f"RMSE {numbers['rmse']:.4f}"),
         (mask, shares, "blue: water; orange: went along with a box"),
     )
-    drawn = [captioned(_small(image), *texts) for image, *texts in panels]
+    how = cv2.INTER_NEAREST if own.shape[1] < PANEL_PX else cv2.INTER_AREA
+    drawn = [captioned(resized(image, PANEL_PX, how), *texts) for image, *texts in panels]
     between = np.full((GAP_PX, 2 * drawn[0].shape[1] + GAP_PX, 3), 255, np.uint8)
     return np.concatenate([strip(drawn[:2]), between, strip(drawn[2:])])
 
 
 def _bytes(picture: np.ndarray) -> np.ndarray:
     return (np.clip(picture, 0, 1) * 255).round().astype(np.uint8)
-
-
-def _small(image: np.ndarray) -> np.ndarray:
-    height = max(1, round(image.shape[0] * PANEL_PX / image.shape[1]))
-    larger = image.shape[1] < PANEL_PX
-    how = cv2.INTER_NEAREST if larger else cv2.INTER_AREA
-    return cv2.resize(image, (PANEL_PX, height), interpolation=how)
 
 
 def evaluation_text(facts: dict[str, Any]) -> str:

@@ -528,7 +528,7 @@ def _draw_scale(
     for text, part in ticks.items():
         at = x + part * width
         cv2.line(sheet, (round(at), y + height), (round(at), y + height + 4), _SOFT, 1)
-        write(sheet, text, at, y + height + 20, size=0.45, color=_INK, align="centre")
+        write(sheet, text, at, y + height + 20, size=0.45, color=_INK, centred=True)
     left = x - 106
     sheet[y : y + height, left : left + height] = _NOTHING
     write(sheet, nothing, left + height + 5, y + height, size=0.45, color=_INK)

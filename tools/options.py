@@ -208,11 +208,6 @@ def length_of(options: Any) -> dict[str, float]:
     return {"minutes": value_or(options.minutes, DEFAULT_MINUTES)}
 
 
-def budget_s(options: Any) -> float | None:
-    """Seconds to train for; None where the number of steps is given."""
-    return None if options.steps is not None else 60 * length_of(options)["minutes"]
-
-
 def parse_depth(text: str) -> DepthPriors:
     """`lidar`, `none`, or kinds separated by commas: lidar, sparse:DIR, metric:DIR, relative:DIR; a
     DIR alone is metric. What they are: `adapters.training_views.depth_priors.DepthPriors`.

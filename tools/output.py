@@ -65,3 +65,36 @@ def check_local(out: Path, instead: str) -> None:
         raise OutputError(
             f"{out} is not on this machine, and this command needs a folder that is; {instead}"
         )
+
+
+def check_scene_out(out: Path, *, may_replace: bool, why: str = "") -> None:
+    """What is at OUT is nothing, or a scene that may be replaced; known before hours are spent.
+
+    Raises:
+        OutputError: it is something else, or a scene that may not; why: for that message.
+    """
+    from augment.errors import OutputError
+    from augment.files.scene_file import is_scene_folder
+
+    if not out.exists() or (out.is_dir() and not any(out.iterdir())):
+        return
+    if not is_scene_folder(out):
+        raise OutputError(f"{out} holds something else than a scene: choose another --out")
+    if not may_replace:
+        raise OutputError(
+            f"{out} holds a scene{why}: choose another --out, or replace it with --overwrite"
+        )
+
+
+def path_beside(out: Path, ending: str) -> Path:
+    """OUT with an ending behind its name.
+
+    Raises:
+        OutputError: OUT has no name.
+    """
+    from augment.errors import OutputError
+
+    out = out.resolve()
+    if not out.name:
+        raise OutputError(f"--out {out} is the file system's root: name a folder below it")
+    return out.with_name(out.name + ending)

@@ -12,7 +12,6 @@ import json
 import math
 import time
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -27,7 +26,6 @@ from augment.effects.style.color_maps import StyleMaps, sky_levels, style_gaussi
 from augment.effects.style.content import content_pictures, content_statistics, select_views
 from augment.effects.style.losses import FeatureExtractor, open_features
 from augment.effects.style.network import B0Encoder, load_imagenet_weights, save_network
-from augment.effects.style.pairs import recolor
 from augment.effects.style.scores import DEFINITIONS, score_photos, score_training
 from augment.effects.style.style import SceneStyle, style_maps
 from augment.effects.style.train import (
@@ -39,14 +37,12 @@ from augment.effects.style.train import (
     fixed_threads,
     generator_for,
     new_network,
-    pair_loss_of,
     read_photos,
     scene_contents,
 )
 from augment.errors import ClimateGSError, OutputError, StyleError
-from augment.files.scene_file import is_scene_folder, save_scene
+from augment.files.scene_file import save_scene
 from augment.jobs.atomic import write_atomic
-from augment.jobs.processes import OutputLock
 from augment.render.composite import composite_sky, quantise
 from augment.render.rasterize import rasterize
 from augment.render.sh import SH_C0
@@ -54,36 +50,30 @@ from augment.scene import Gaussians, Scene
 from augment.semantics import SemanticClass
 from recipes.weather import Style, no_such_style, style_preset_names
 from tools.drawing import captioned, strip, write_rgb
-from tools.options import StyleTrainOptions, budget_s, length_of, uri_text
-from tools.output import print_note
+from tools.options import StyleTrainOptions, uri_text
+from tools.output import check_scene_out, path_beside, print_note
 from tools.training import (
     CHECKPOINT_S,
+    PLAN_FILE,
+    REPORT_FILE,
+    RESERVE,
     STYLE_PANELS,
     Checkpoint,
     Outcome,
-    StopRequest,
-    check_same,
-    differences,
-    load_checkpoint,
-    mark_finished,
-    note_stop,
-    remove_unused,
+    Training,
+    open_training,
     rounded_steps,
-    run_steps,
-    save_checkpoint,
+    run_training,
+    train,
     write_curves,
 )
 
-# ---- `climategs style train`: photographs and scenes become a network that maps colours ----------
-# OUT holds the network, the report and its curves; OUT/checkpoint what an unfinished training
-# goes on
-# from. The network's bytes depend on the data, the settings and the number of steps alone.
-
-NETWORK_FILE, REPORT_FILE, CURVES_FILE = "network.safetensors", "report.json", "curves.png"
+# OUT of a training holds the network, the report and its curves; OUT/checkpoint what an unfinished
+# one goes on from.
+NETWORK_FILE, CURVES_FILE = "network.safetensors", "curves.png"
 ROWS, ROW_STEPS = 40, 50  # of the history; steps averaged into one, at most
 SCORED = 16  # contents with a style each, by which a network is scored
 TIMED, UNTIMED = 8, 2  # steps from which the number of them is estimated
-RESERVE = 0.05  # of the time, for scores and checkpoints
 
 
 def train_style(
@@ -94,27 +84,25 @@ def train_style(
     Raises:
         ClimateGSError: options, data or the output folder cannot be used as they are.
     """
-    folder = checkpoint_folder(options.out)
-    if options.out.exists() and not options.out.is_dir():
-        raise OutputError(f"{options.out} is a file: choose another --out")
-    with OutputLock(options.out):
-        before = None if options.overwrite else load_checkpoint(folder, arrays=False)
-        if before is None and not options.overwrite and (options.out / NETWORK_FILE).exists():
-            raise OutputError(
-                f"{options.out} holds a network, and no checkpoint to go on from: choose another "
-                f"--out, or replace it with --overwrite"
-            )
-        if before is not None:
-            check_same(options.out, options.settings(), length_of(options), before)
-            if before.finished and (done := _finished(options, before)) is not None:
-                return done
-        try:
-            run = _prepare(options, folder, before)
-        except BaseException:
-            if not folder.exists():
-                remove_unused(options.out)
-            raise
-        return _train(run, progress, checkpoint_s)
+    out, folder = options.out, checkpoint_folder(options.out)
+    if out.exists() and not out.is_dir():
+        raise OutputError(f"{out} is a file: choose another --out")
+    network = out / NETWORK_FILE
+    if not (options.overwrite or (folder / PLAN_FILE).is_file()) and network.exists():
+        raise OutputError(
+            f"{out} holds a network, and no checkpoint to go on from: choose another --out, or "
+            f"replace it with --overwrite"
+        )
+    return train(
+        options,
+        folder,
+        out,
+        report=out / REPORT_FILE,
+        stands=network.is_file,
+        show=lambda report: _show_end(out, report),
+        prepare=lambda before: _prepare(options, folder, before),
+        run=lambda run: _train(run, progress, checkpoint_s),
+    )
 
 
 def checkpoint_folder(out: Path) -> Path:
@@ -132,59 +120,12 @@ class _Data(NamedTuple):
     problems: tuple[str, ...]
 
 
-@dataclass(eq=False)
-class _Run:
+class _Run(NamedTuple):
     """All that a training needs, opened and at the step to go on from."""
 
-    options: StyleTrainOptions
-    folder: Path
-    trainer: StyleTrainer
+    training: Training
     features: FeatureExtractor
-    plan: Checkpoint
     data: _Data
-    rows: list[dict[str, Any]]
-    sums: dict[str, float]
-    begun: float = field(default_factory=time.perf_counter)
-
-    def seconds(self) -> float:
-        return self.plan.seconds + time.perf_counter() - self.begun
-
-    def score(self) -> None:
-        """One more row of the history, with what the network is worth now."""
-        scores = score_training(self.trainer.net, self.data.scored, self.features)
-        self.rows.append({"step": self.trainer.step, "seconds": self.seconds(), **scores})
-
-    def add(self, record: StepRecord) -> None:
-        """One more step; a row of the history where it completes one."""
-        for name, value in {"steps": 1.0, "loss": record.loss}.items():
-            self.sums[name] = self.sums.get(name, 0.0) + value
-        for name, value in record.terms.items():  # of a part of the steps, where the warm-up ends
-            self.sums[f"sum.{name}"] = self.sums.get(f"sum.{name}", 0.0) + value
-            self.sums[f"count.{name}"] = self.sums.get(f"count.{name}", 0.0) + 1
-        length = min(max(self.plan.steps // ROWS, 1), ROW_STEPS)
-        if record.step % length and record.step != self.plan.steps:
-            return
-        sums, self.sums = self.sums, {}
-        names = [name.removeprefix("sum.") for name in sums if name.startswith("sum.")]
-        self.rows.append({
-            "step": record.step,
-            "seconds": self.seconds(),
-            "loss": sums["loss"] / sums["steps"],
-            **{name: sums[f"sum.{name}"] / sums[f"count.{name}"] for name in names},
-        })  # fmt: skip
-
-    def save(self) -> None:
-        arrays, facts = self.trainer.state()
-        checkpoint = dataclasses.replace(
-            self.plan,
-            step=self.trainer.step,
-            seconds=self.seconds(),
-            history=self.rows,
-            sums=self.sums,
-            facts=facts,
-            arrays=arrays,
-        )
-        save_checkpoint(self.folder, checkpoint)
 
 
 def _prepare(options: StyleTrainOptions, folder: Path, before: Checkpoint | None) -> _Run:
@@ -195,31 +136,17 @@ def _prepare(options: StyleTrainOptions, folder: Path, before: Checkpoint | None
     views, photos = len(data.pool.views), len(data.pool.photos)
     print_note(f"{photos} photos and {views} views of {len(options.scenes)} scenes to learn from")
     features = open_features(options.vgg)
-    if before is None:
-        plan = Checkpoint(options.settings(), length_of(options), options.steps or 0, data.facts)
-        if (budget := budget_s(options)) is not None:
-            steps, step_s = _estimate(options, budget, data.pool, features)
-            plan = dataclasses.replace(plan, steps=steps)
-            print_note(
-                f"{1e3 * step_s:.0f} ms a step: {steps} steps make about {budget / 60:g} minutes. "
-                f"--steps {steps} gives the same network again"
-            )
-        save_checkpoint(folder, plan)
-    else:
-        plan = load_checkpoint(folder)
-        assert plan is not None
-        if changed := differences(plan.data, data.facts):
-            raise OutputError(
-                f"the photos or scenes are not those {options.out} was trained on so far: "
-                f"{'; '.join(changed)}. Begin anew with --overwrite, or train into another --out"
-            )
-    trainer = _trainer(options, plan.steps, data.pool, features)
-    if plan.arrays:
-        trainer.load_state(plan.arrays, plan.facts)
-        print_note(f"going on after step {plan.step} of {plan.steps}")
-    rows, sums = list(plan.history), dict(plan.sums)
-    plan = dataclasses.replace(plan, arrays={}, facts={})
-    return _Run(options, folder, trainer, features, plan, data, rows, sums)
+    training = open_training(
+        options,
+        folder,
+        before,
+        data.facts,
+        trainer=lambda steps: _trainer(options, steps, data.pool, features),
+        estimate=lambda budget_s: _estimate(options, budget_s, data.pool, features),
+        result="network",
+        changed=f"the photos or scenes are not those {options.out} was trained on so far",
+    )
+    return _Run(training, features, data)
 
 
 def _take_device(device: str) -> None:
@@ -263,7 +190,6 @@ def _open_data(options: StyleTrainOptions) -> _Data:
         scene_share=options.scene_share,
         perturbed=0.5,
         colors=1,
-        recolor=recolor,
     )
     return _Data(pool, scored, photos.held_out, facts, (*problems, *photos.problems))
 
@@ -288,8 +214,6 @@ def _trainer(
         pool,
         config,
         features,
-        recolor=recolor,
-        pairs=pair_loss_of(pool, config.pair_weights) if options.pairs > 0 else None,
         frozen_norm=options.encoder_weights is not None,
         device=options.device,
     )
@@ -310,74 +234,71 @@ def _estimate(
 
 
 def _train(run: _Run, progress: bool, checkpoint_s: float) -> Outcome:
-    def after_step(record: StepRecord, is_evaluated: bool) -> dict[str, str]:
-        run.add(record)
-        if is_evaluated:
-            run.score()
-        return {"loss": f"{run.sums['loss'] / run.sums['steps']:.4f}"} if run.sums else {}
+    training = run.training
+    steps = training.plan.steps
+    row_steps = min(max(steps // ROWS, 1), ROW_STEPS)
 
-    with StopRequest() as stop, fixed_threads():
-        if run.trainer.step == 0 and not run.rows:
-            run.score()
-        complete = run_steps(
-            run.trainer,
-            run.plan.steps,
-            after_step=after_step,
-            save=run.save,
-            stop=stop,
-            name="train",
+    def add(record: StepRecord) -> None:
+        training.add({"steps": 1.0, "loss": record.loss})
+        for name, value in record.terms.items():  # of a part of the steps, where the warm-up ends
+            training.add({f"sum.{name}": value, f"count.{name}": 1})
+        if record.step % row_steps == 0 or record.step == steps:
+            sums, training.sums = training.sums, {}
+            names = [name.removeprefix("sum.") for name in sums if name.startswith("sum.")]
+            terms = {name: sums[f"sum.{name}"] / sums[f"count.{name}"] for name in names}
+            training.add_row(loss=sums["loss"] / sums["steps"], **terms)
+
+    def shown(_: StepRecord) -> dict[str, str]:
+        sums = training.sums
+        return {"loss": f"{sums['loss'] / sums['steps']:.4f}"} if sums else {}
+
+    with fixed_threads():
+        return run_training(
+            training,
+            "train",
+            add=add,
+            score=lambda: training.add_row(**_scores(run)),
+            shown=shown,
+            write=lambda complete: _write(run, complete),
             checkpoint_s=checkpoint_s,
             progress=progress,
         )
-        report = _write(run, complete)
-    if complete:
-        mark_finished(run.folder)
-        _show_end(run.options.out, report)
-        return Outcome(0, report)
-    note_stop(run.trainer.step, run.plan.steps, overwrite=run.options.overwrite)
-    return Outcome(130, report)
+
+
+def _scores(run: _Run) -> dict[str, Any]:
+    """What the network is worth now."""
+    return score_training(run.training.trainer.net, run.data.scored, run.features)
 
 
 def _write(run: _Run, complete: bool) -> dict[str, Any]:
-    options, net = run.options, run.trainer.net
+    training = run.training
+    options, plan, net = training.options, training.plan, training.trainer.net
     about = {
         "command": "style train",
-        "step": run.trainer.step,
-        "steps": run.plan.steps,
+        "step": training.trainer.step,
+        "steps": plan.steps,
         "features": run.features.name,
-        "settings": run.plan.settings,
-        "data": run.plan.data,
+        "settings": plan.settings,
+        "data": plan.data,
     }
     save_network(options.out / NETWORK_FILE, net, about, half_precision=options.half_precision)
-    scores = score_training(net, run.data.scored, run.features)
     report = {
         **about,
         "complete": complete,
         "network": NETWORK_FILE,
         "parameters": sum(parameter.numel() for parameter in net.parameters()),
-        "seconds": run.seconds(),
+        "seconds": training.seconds(),
         "scenes": [uri_text(uri) for uri in options.scenes],
         "problems": list(run.data.problems),
         "definitions": DEFINITIONS,
-        "scores": scores | score_photos(net, run.data.held_out),
-        "history": run.rows,
+        "scores": _scores(run) | score_photos(net, run.data.held_out),
+        "history": training.rows,
     }
     write_atomic(options.out / REPORT_FILE, (json.dumps(report, indent=1) + "\n").encode())
-    write_curves(options.out / CURVES_FILE, run.rows, STYLE_PANELS)
+    write_curves(options.out / CURVES_FILE, training.rows, STYLE_PANELS)
+    if complete:
+        _show_end(options.out, report)
     return report
-
-
-def _finished(options: StyleTrainOptions, before: Checkpoint) -> Outcome | None:
-    """The outcome where network and report stand; None where one of them was lost since."""
-    try:
-        report = json.loads((options.out / REPORT_FILE).read_bytes())
-    except (OSError, ValueError):
-        return None
-    if not (options.out / NETWORK_FILE).is_file():
-        return None
-    print(f"{options.out} is finished already ({before.steps} steps); nothing was done")
-    _show_end(options.out, report)
-    return Outcome(0, report)
 
 
 def _show_end(out: Path, report: dict[str, Any]) -> None:
@@ -387,8 +308,6 @@ def _show_end(out: Path, report: dict[str, Any]) -> None:
         print(f"curves: {out / CURVES_FILE}")
     print(f"network: {out / NETWORK_FILE}")
 
-
-# ---- style apply ---------------------------------------------------------------------------------
 
 Method = Literal["mkl", "reinhard", "gscm"]
 VIEWS = 2  # that are drawn and measured
@@ -416,8 +335,8 @@ def apply_style(
         StyleError: the style cannot be used. SceneError: the scene cannot. OutputError: OUT holds
             something, or cannot be written.
     """
-    out = Path(out)
-    _check_out(out, overwrite)
+    check_scene_out(out, may_replace=overwrite)
+    picture_file = picture_path(out)
     requested = _style(style, method, strength, per_region, mask, checkpoint)
     # Compile the kernel where it is not yet, so that times are of the work.
     eye = torch.eye(3, 4) / 2
@@ -456,16 +375,15 @@ def apply_style(
     save_scene(dataclasses.replace(styled, made_by=made_by), out.absolute())
     facts["seconds"]["write"] = time.perf_counter() - begun
     if (picture := _picture(scene, styled)) is not None:
-        facts["picture"] = str(picture_path(out))
-        write_rgb(picture_path(out), picture, jpeg_quality=88)
+        facts["picture"] = str(picture_file)
+        write_rgb(picture_file, picture, jpeg_quality=88)
     print(style_text(facts))
     return facts
 
 
 def picture_path(out: Path) -> Path:
     """Where the picture of a styled scene lies: beside its folder."""
-    folder = Path(out).resolve()
-    return folder.with_name(f"{folder.name}.style.jpg")
+    return path_beside(out, ".style.jpg")
 
 
 def style_text(facts: Mapping[str, Any]) -> str:
@@ -537,20 +455,6 @@ def _style(
             for e in error.errors()
         )
         raise StyleError(f"the style cannot be used: {message}") from None
-
-
-def _check_out(out: Path, overwrite: bool) -> None:
-    """What is at OUT is nothing, or a scene that may be replaced; known before anything is done."""
-    if not out.resolve().name:
-        raise OutputError(f"--out {out} is the file system's root: name a folder below it")
-    if not out.exists() or (out.is_dir() and not any(out.iterdir())):
-        return
-    if not is_scene_folder(out):
-        raise OutputError(f"{out} holds something else than a scene: choose another --out")
-    if not overwrite:
-        raise OutputError(
-            f"{out} holds a scene: choose another --out, or replace it with --overwrite"
-        )
 
 
 def _style_facts(style: Style) -> dict[str, Any]:

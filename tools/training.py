@@ -9,6 +9,7 @@ one or the one before.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import hashlib
 import io
 import json
@@ -39,10 +40,390 @@ from augment.jobs.atomic import (
     write_atomic,
 )
 from augment.jobs.layout import STATE_FOLDER
+from augment.jobs.processes import OutputLock
+from tools.options import length_of
 from tools.output import print_note
 
-# ------------------------------------------------------------------------------------------------
-# Histories of trainings as pictures: curves over the steps, drawn by matplotlib (an extra)
+EVALUATIONS = 10
+CHECKPOINT_S = 120.0
+RESERVE = 0.05  # of the time, for evaluations and checkpoints
+VERSION = 1
+PLAN_FILE, REPORT_FILE = "fit.json", "report.json"
+_STATES = "state-*.safetensors"
+_STOPPING = b"\nstopping after this step; interrupt again to stop at once\n"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """code: the command's exit code, 130 where it was interrupted. report: as in report.json."""
+
+    code: int
+    report: dict[str, Any]
+
+
+def train(
+    options: Any,
+    folder: Path,
+    locked: Path,
+    *,
+    report: Path,
+    stands: Callable[[], bool],
+    show: Callable[[dict[str, Any]], None],
+    prepare: Callable[[Checkpoint | None], Any],
+    run: Callable[[Any], Outcome],
+) -> Outcome:
+    """Begin a training, or go on from the checkpoint in `folder`, while no other process does.
+
+    locked: the folder that holds the lock. report, stands(), show(report): of a finished training,
+    where its report lies, whether its result is there, and what is printed. prepare(before): what
+    `run` takes; None of a new training.
+
+    Raises:
+        OutputError: it was begun with other settings, or is being run.
+    """
+    with OutputLock(locked):
+        before = None if options.overwrite else load_checkpoint(folder, arrays=False)
+        if before is not None:
+            _check_same(options, before)
+            if before.finished and stands():
+                with contextlib.suppress(OSError, ValueError):  # lost since: it is written again
+                    facts = json.loads(report.read_bytes())
+                    steps = f"{before.steps} steps"
+                    print(f"{options.out} is finished already ({steps}); nothing was done")
+                    show(facts)
+                    return Outcome(0, facts)
+        try:
+            prepared = prepare(before)
+        except BaseException:
+            if not (folder / PLAN_FILE).exists():  # leave no trace of a run that never began
+                shutil.rmtree(locked / STATE_FOLDER, ignore_errors=True)
+                with contextlib.suppress(OSError):  # not empty
+                    locked.rmdir()
+            raise
+        return run(prepared)
+
+
+@dataclass(eq=False)
+class Training:
+    """A trainer at the step to go on from, and its history: rows, and sums since the last row."""
+
+    options: Any
+    folder: Path
+    trainer: Any
+    plan: Checkpoint
+    rows: list[dict[str, Any]]
+    sums: dict[str, float]
+    begun: float = field(default_factory=time.perf_counter)
+
+    def seconds(self) -> float:
+        """Spent so far, in earlier runs too."""
+        return self.plan.seconds + time.perf_counter() - self.begun
+
+    def add(self, values: Mapping[str, float]) -> None:
+        """To the sums."""
+        for name, value in values.items():
+            self.sums[name] = self.sums.get(name, 0.0) + value
+
+    def add_row(self, **values: Any) -> None:
+        """One more row of the history, at the trainer's step."""
+        self.rows.append({"step": int(self.trainer.step), "seconds": self.seconds(), **values})
+
+    def save(self) -> None:
+        """A checkpoint, which does not change what is learnt."""
+        arrays, facts = self.trainer.state()
+        step, seconds = self.trainer.step, self.seconds()
+        now = {"step": step, "seconds": seconds, "history": self.rows, "sums": self.sums}
+        checkpoint = dataclasses.replace(self.plan, **now, facts=facts, arrays=arrays)
+        save_checkpoint(self.folder, checkpoint)
+
+
+def open_training(
+    options: Any,
+    folder: Path,
+    before: Checkpoint | None,
+    data: dict[str, Any],
+    *,
+    trainer: Callable[[int], Any],
+    estimate: Callable[[float], tuple[int, float]],
+    result: str,
+    changed: str,
+) -> Training:
+    """A new training, or the one that `folder` has a checkpoint of.
+
+    trainer: makes one for a number of steps: learning rates that decay need it before the first
+    one. estimate(budget_s): the number of steps that fill the time, and seconds of one. result,
+    changed: what is made, and what data is not the same, for messages.
+
+    Raises:
+        OutputError: the data is not what the checkpoint was made from.
+    """
+    if before is None:
+        steps = options.steps
+        if steps is None:
+            minutes = length_of(options)["minutes"]
+            steps, step_s = estimate(60 * minutes)
+            print_note(
+                f"{1e3 * step_s:.0f} ms a step at the start: {steps} steps make about {minutes:g} "
+                f"minutes. --steps {steps} gives the same {result} again"
+            )
+        plan = Checkpoint(options.settings(), length_of(options), steps, data)
+        save_checkpoint(folder, plan)  # in place of what --overwrite gives up
+    else:
+        plan = load_checkpoint(folder)
+        assert plan is not None
+        if differing := _differences(plan.data, data):
+            raise OutputError(
+                f"{changed}: {'; '.join(differing)}. Begin anew with --overwrite, or choose "
+                f"another --out"
+            )
+    made = trainer(plan.steps)
+    if plan.arrays:
+        made.load_state(plan.arrays, plan.facts)
+        print_note(f"going on after step {plan.step} of {plan.steps}")
+    rows, sums = list(plan.history), dict(plan.sums)
+    plan = dataclasses.replace(plan, arrays={}, facts={})  # the trainer has them: free the memory
+    return Training(options, folder, made, plan, rows, sums)
+
+
+def run_training(
+    training: Training,
+    name: str,
+    *,
+    add: Callable[[Any], None],
+    score: Callable[[], None],
+    shown: Callable[[Any], Mapping[str, str]],
+    write: Callable[[bool], dict[str, Any]],
+    checkpoint_s: float = CHECKPOINT_S,
+    progress: bool = True,
+) -> Outcome:
+    """Steps from the trainer's to the plan's last, or until asked to stop.
+
+    add(record): of every step. score(): adds rows to the history, about EVALUATIONS times.
+    shown(record): for the progress bar. write(complete): the result; returns the report.
+    """
+    trainer, steps = training.trainer, training.plan.steps
+    evaluated, saved = evaluation_steps(steps), time.monotonic()
+    with StopRequest() as stop:
+        if trainer.step == 0 and not training.rows:
+            score()
+        with tqdm(
+            total=steps, initial=trainer.step, desc=name, unit="step", disable=not progress
+        ) as bar:
+            while trainer.step < steps and not stop.requested:
+                record = trainer.run_step()
+                add(record)
+                if record.step in evaluated:
+                    score()
+                bar.set_postfix(shown(record), refresh=False)
+                bar.update(record.step - bar.n)
+                if time.monotonic() - saved > checkpoint_s and record.step < steps:
+                    training.save()
+                    saved = time.monotonic()
+        training.save()
+        complete = trainer.step >= steps
+        report = write(complete)
+    if complete:
+        _write_plan(training.folder, {**_read_plan(training.folder), "finished": True})
+        return Outcome(0, report)
+    overwrite = training.options.overwrite
+    again = "the same command without --overwrite" if overwrite else "the same command"
+    print_note(f"stopped after step {trainer.step} of {steps}; {again} goes on from there")
+    return Outcome(130, report)
+
+
+def evaluation_steps(steps: int) -> frozenset[int]:
+    """About EVALUATIONS even points of a run, the last step among them."""
+    return frozenset(max(1, round(steps * i / EVALUATIONS)) for i in range(1, EVALUATIONS + 1))
+
+
+def rounded_steps(steps: int) -> int:
+    """At least 1; of hundreds, whole fifties."""
+    return max(1, steps if steps < 100 else steps // 50 * 50)
+
+
+class StopRequest:
+    """While entered, the first Ctrl-C or SIGTERM only sets `requested`; the second interrupts.
+
+    Signals are Python's main thread's; elsewhere nothing is caught.
+    """
+
+    def __init__(self) -> None:
+        self.requested = False
+        self._before: dict[signal.Signals, Any] = {}
+
+    def __enter__(self) -> StopRequest:
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM):
+                if signal.getsignal(number) != signal.SIG_IGN:  # `nohup`, or a script's background
+                    self._before[number] = signal.signal(number, self._catch)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _catch(self, _number: int, _frame: FrameType | None) -> None:
+        if self.requested:
+            raise KeyboardInterrupt("stopped at once; what the last checkpoint holds is kept")
+        self.requested = True
+        os.write(2, _STOPPING)  # print could meet a half-written line of its own
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A training after `step` of `steps` steps.
+
+    settings, length: what was asked for. data: what was found in the recorded data. history: rows
+    so far; sums: of the steps since the last row; seconds: spent so far. facts, arrays: the
+    trainer's state; no arrays before the first step. finished: the result and its report stand.
+    """
+
+    settings: dict[str, Any]
+    length: dict[str, float]
+    steps: int
+    data: dict[str, Any]
+    step: int = 0
+    finished: bool = False
+    seconds: float = 0.0
+    history: list[dict[str, Any]] = field(default_factory=list)
+    sums: dict[str, float] = field(default_factory=dict)
+    facts: dict[str, Any] = field(default_factory=dict)
+    arrays: dict[str, np.ndarray] = field(default_factory=dict)
+
+
+def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
+    """Replace the folder's checkpoint.
+
+    Raises:
+        OutputError: the system refused; the checkpoint before is then as it was.
+    """
+    names = [field.name for field in fields(Checkpoint) if field.name != "arrays"]
+    plan = {**{n: getattr(checkpoint, n) for n in names}, "version": VERSION, "state": None}
+    name = None
+    if checkpoint.arrays:
+        name = f"state-{checkpoint.step:07d}.safetensors"
+        plan["state"] = {"file": name, "sha256": _write_state(folder / name, checkpoint.arrays)}
+    _write_plan(folder, plan)
+    remove_temporaries(folder, recursive=False)
+    # What killed runs left half-written, too; safetensors has temporary names of its own.
+    for path in (*folder.glob(_STATES), *folder.glob(".tmp*")):
+        if path.name != name:
+            try:
+                path.unlink(missing_ok=True)
+            except OSError as error:
+                raise output_error(path, error) from error
+
+
+def _check_same(options: Any, before: Checkpoint) -> None:
+    """Refuse to go on with what was begun with other settings or another length; name them all."""
+    settings, length = options.settings(), length_of(options)
+    changed = _differences(before.settings, settings)
+    if length != before.length and length.get("steps") != before.steps:
+        was, now = (" ".join(f"--{n} {v:g}" for n, v in a.items()) for a in (before.length, length))
+        changed.append(f"its length was {was} ({before.steps} steps), now {now}")
+    if changed:
+        raise OutputError(
+            f"{options.out} was begun with other settings: {'; '.join(changed)}. Choose another "
+            f"--out, or begin anew with --overwrite"
+        )
+
+
+def _differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+    """Every setting that is not the same: `scale was 0.25, now 0.5`."""
+    return [
+        f"{name} was {before.get(name)}, now {now.get(name)}"
+        for name in dict.fromkeys([*before, *now])
+        if before.get(name) != now.get(name)
+    ]
+
+
+def load_checkpoint(folder: Path, *, arrays: bool = True) -> Checkpoint | None:
+    """The folder's checkpoint; None where there is none. arrays: False leaves them on disk.
+
+    Raises:
+        OutputError: a file of it is missing, damaged, or of another version.
+    """
+    if not (folder / PLAN_FILE).is_file():
+        return None
+    plan = _read_plan(folder)
+    state = plan.pop("state")
+    del plan["version"]
+    return Checkpoint(**plan, arrays=_read_state(folder, state) if state and arrays else {})
+
+
+def _write_plan(folder: Path, plan: Mapping[str, Any]) -> None:
+    write_atomic(folder / PLAN_FILE, (json.dumps(plan, indent=1) + "\n").encode())
+
+
+def _read_plan(folder: Path) -> dict[str, Any]:
+    path = folder / PLAN_FILE
+    try:
+        plan = json.loads(path.read_bytes())
+    except OSError as error:
+        raise OutputError(f"{path} cannot be read: {error.strerror}") from error
+    except ValueError as error:
+        raise _damaged(path, str(error)) from error
+    version = plan.get("version") if isinstance(plan, dict) else None
+    if version != VERSION:
+        raise OutputError(
+            f"{path} is of version {version}, this program writes {VERSION}: fit to another --out, "
+            f"or begin anew with --overwrite"
+        )
+    names = {field.name for field in fields(Checkpoint)} - {"arrays"} | {"version", "state"}
+    if wrong := names ^ plan.keys():
+        raise _damaged(path, f"it lacks, or should not have, {', '.join(sorted(wrong))}")
+    step, steps = plan["step"], plan["steps"]
+    if not (isinstance(step, int) and isinstance(steps, int) and 0 <= step <= steps):
+        raise _damaged(path, f"it is at step {step!r} of {steps!r}")
+    return plan
+
+
+def _read_state(folder: Path, state: dict[str, str]) -> dict[str, np.ndarray]:
+    try:
+        path = folder / Path(state["file"]).name  # a name: nothing outside the folder is read
+        checksum = state["sha256"]
+    except (KeyError, TypeError) as error:
+        raise _damaged(folder / PLAN_FILE, "it does not name its state's file") from error
+    try:
+        with path.open("rb") as file:
+            if hashlib.file_digest(file, "sha256").hexdigest() != checksum:
+                raise _damaged(path, f"its SHA-256 is not the one in {PLAN_FILE}")
+        return {name: np.array(array) for name, array in load_file(path).items()}  # ours to change
+    except OSError as error:
+        raise _damaged(path, f"it cannot be read ({error.strerror})") from error
+    except SafetensorError as error:
+        raise _damaged(path, str(error)) from error
+
+
+def _write_state(path: Path, arrays: dict[str, np.ndarray]) -> str:
+    """Write arrays under their final name in one step, without a copy in memory. Returns SHA-256.
+
+    Raises:
+        OutputError: the system refused.
+    """
+    temporary = temporary_beside(path)
+    try:
+        make_folder(path.parent)
+        save_file({name: np.asarray(a, order="C") for name, a in arrays.items()}, temporary)
+        with temporary.open("rb") as file:
+            checksum = hashlib.file_digest(file, "sha256").hexdigest()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+        flush_folder(path.parent)
+    except OSError as error:
+        raise output_error(path, error) from error
+    except SafetensorError as error:  # how it reports a full disk
+        raise OutputError(f"cannot write {path}: {error}; see whether the disk is full") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+    return checksum
+
+
+def _damaged(path: Path, what: str) -> OutputError:
+    return OutputError(f"{path} is damaged: {what}. Begin anew with --overwrite")
+
+
+# ---- Curves over the steps, drawn by matplotlib (an extra) ----
 
 _BLUE, _ORANGE, _GREEN = "#0072b2", "#d55e00", "#009e73"
 Row = Mapping[str, Any]
@@ -190,267 +571,3 @@ def _draw_clock(axes: Any, clock: Sequence[tuple[float, float]]) -> None:
     above = axes.secondary_xaxis("top")
     steps = np.interp([t * unit for t in ticks], np.maximum.accumulate(seconds), at)
     above.set_xticks(steps, [f"{t:g} {name}" for t in ticks], fontsize="small")
-
-
-# ---- training ------------------------------------------------------------------------------------
-
-EVALUATIONS = 10
-CHECKPOINT_S = 120.0
-VERSION = 1
-PLAN_FILE = "fit.json"
-_STATES = "state-*.safetensors"
-_STOPPING = b"\nstopping after this step; interrupt again to stop at once\n"
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """code: the command's exit code, 130 where it was interrupted. report: as in report.json."""
-
-    code: int
-    report: dict[str, Any]
-
-
-class StopRequest:
-    """While entered, the first Ctrl-C or SIGTERM only sets `requested`; the second interrupts.
-
-    Signals are Python's main thread's; elsewhere nothing is caught.
-    """
-
-    def __init__(self) -> None:
-        self.requested = False
-        self._before: dict[signal.Signals, Any] = {}
-
-    def __enter__(self) -> StopRequest:
-        if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM):
-                if signal.getsignal(number) != signal.SIG_IGN:  # `nohup`, or a script's background
-                    self._before[number] = signal.signal(number, self._catch)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
-
-    def _catch(self, _number: int, _frame: FrameType | None) -> None:
-        if self.requested:
-            raise KeyboardInterrupt("stopped at once; what the last checkpoint holds is kept")
-        self.requested = True
-        os.write(2, _STOPPING)  # print could meet a half-written line of its own
-
-
-def run_steps(
-    trainer: Any,
-    steps: int,
-    *,
-    after_step: Callable[[Any, bool], Mapping[str, str]],
-    save: Callable[[], None],
-    stop: StopRequest,
-    name: str,
-    checkpoint_s: float = CHECKPOINT_S,
-    progress: bool = True,
-) -> bool:
-    """From the trainer's step to `steps` (True), or until asked to stop (False); saves at the end.
-
-    after_step(record, is_evaluated): what the progress bar shows. save(): a checkpoint, every
-    checkpoint_s seconds; it does not change what is learnt.
-    """
-    evaluated, saved = evaluation_steps(steps), time.monotonic()
-    with tqdm(
-        total=steps, initial=trainer.step, desc=name, unit="step", disable=not progress
-    ) as bar:
-        while trainer.step < steps and not stop.requested:
-            record = trainer.run_step()
-            bar.set_postfix(after_step(record, record.step in evaluated), refresh=False)
-            bar.update(record.step - bar.n)
-            if time.monotonic() - saved > checkpoint_s and record.step < steps:
-                save()
-                saved = time.monotonic()
-    save()
-    return trainer.step >= steps
-
-
-def evaluation_steps(steps: int) -> frozenset[int]:
-    """About EVALUATIONS even points of a run, the last step among them."""
-    return frozenset(max(1, round(steps * i / EVALUATIONS)) for i in range(1, EVALUATIONS + 1))
-
-
-def rounded_steps(steps: int) -> int:
-    """At least 1; of hundreds, whole fifties."""
-    return max(1, steps if steps < 100 else steps // 50 * 50)
-
-
-def note_stop(step: int, steps: int, *, overwrite: bool) -> None:
-    """Say how to go on."""
-    again = "the same command without --overwrite" if overwrite else "the same command"
-    print_note(f"stopped after step {step} of {steps}; {again} goes on from there")
-
-
-def remove_unused(folder: Path) -> None:
-    """Leave no trace of a run that never began: its lock, and the folder if that was all."""
-    shutil.rmtree(folder / STATE_FOLDER, ignore_errors=True)
-    with contextlib.suppress(OSError):  # not empty
-        folder.rmdir()
-
-
-@dataclass(frozen=True)
-class Checkpoint:
-    """A training after `step` of `steps` steps.
-
-    settings, length: what was asked for. data: what was found in the recorded data. history: rows
-    so far; sums: of the steps since the last row; seconds: spent so far. facts, arrays: the
-    trainer's state; no arrays before the first step. finished: the result and its report stand.
-    """
-
-    settings: dict[str, Any]
-    length: dict[str, float]
-    steps: int
-    data: dict[str, Any]
-    step: int = 0
-    finished: bool = False
-    seconds: float = 0.0
-    history: list[dict[str, Any]] = field(default_factory=list)
-    sums: dict[str, float] = field(default_factory=dict)
-    facts: dict[str, Any] = field(default_factory=dict)
-    arrays: dict[str, np.ndarray] = field(default_factory=dict)
-
-
-def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
-    """Replace the folder's checkpoint.
-
-    Raises:
-        OutputError: the system refused; the checkpoint before is then as it was.
-    """
-    names = [field.name for field in fields(Checkpoint) if field.name != "arrays"]
-    plan = {**{n: getattr(checkpoint, n) for n in names}, "version": VERSION, "state": None}
-    name = None
-    if checkpoint.arrays:
-        name = f"state-{checkpoint.step:07d}.safetensors"
-        plan["state"] = {"file": name, "sha256": _write_state(folder / name, checkpoint.arrays)}
-    _write_plan(folder, plan)
-    remove_temporaries(folder, recursive=False)
-    # What killed runs left half-written, too; safetensors has temporary names of its own.
-    for path in (*folder.glob(_STATES), *folder.glob(".tmp*")):
-        if path.name != name:
-            try:
-                path.unlink(missing_ok=True)
-            except OSError as error:
-                raise output_error(path, error) from error
-
-
-def mark_finished(folder: Path) -> None:
-    """Note that the result and the report of the folder's checkpoint are written."""
-    _write_plan(folder, {**_read_plan(folder), "finished": True})
-
-
-def check_same(
-    out: Path, settings: Mapping[str, Any], length: Mapping[str, float], before: Checkpoint
-) -> None:
-    """Refuse to go on with what was begun with other settings or another length.
-
-    Raises:
-        OutputError: it was; every difference is named.
-    """
-    changed = differences(before.settings, settings)
-    if length != before.length and length.get("steps") != before.steps:
-        was, now = (" ".join(f"--{n} {v:g}" for n, v in a.items()) for a in (before.length, length))
-        changed.append(f"its length was {was} ({before.steps} steps), now {now}")
-    if changed:
-        raise OutputError(
-            f"{out} was begun with other settings: {'; '.join(changed)}. Choose another --out, or "
-            f"begin anew with --overwrite"
-        )
-
-
-def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    """Every setting that is not the same: `scale was 0.25, now 0.5`."""
-    return [
-        f"{name} was {before.get(name)}, now {now.get(name)}"
-        for name in dict.fromkeys([*before, *now])
-        if before.get(name) != now.get(name)
-    ]
-
-
-def load_checkpoint(folder: Path, *, arrays: bool = True) -> Checkpoint | None:
-    """The folder's checkpoint; None where there is none. arrays: False leaves them on disk.
-
-    Raises:
-        OutputError: a file of it is missing, damaged, or of another version.
-    """
-    if not (folder / PLAN_FILE).is_file():
-        return None
-    plan = _read_plan(folder)
-    state = plan.pop("state")
-    del plan["version"]
-    return Checkpoint(**plan, arrays=_read_state(folder, state) if state and arrays else {})
-
-
-def _write_plan(folder: Path, plan: Mapping[str, Any]) -> None:
-    write_atomic(folder / PLAN_FILE, (json.dumps(plan, indent=1) + "\n").encode())
-
-
-def _read_plan(folder: Path) -> dict[str, Any]:
-    path = folder / PLAN_FILE
-    try:
-        plan = json.loads(path.read_bytes())
-    except OSError as error:
-        raise OutputError(f"{path} cannot be read: {error.strerror}") from error
-    except ValueError as error:
-        raise _damaged(path, str(error)) from error
-    version = plan.get("version") if isinstance(plan, dict) else None
-    if version != VERSION:
-        raise OutputError(
-            f"{path} is of version {version}, this program writes {VERSION}: fit to another --out, "
-            f"or begin anew with --overwrite"
-        )
-    names = {field.name for field in fields(Checkpoint)} - {"arrays"} | {"version", "state"}
-    if wrong := names ^ plan.keys():
-        raise _damaged(path, f"it lacks, or should not have, {', '.join(sorted(wrong))}")
-    step, steps = plan["step"], plan["steps"]
-    if not (isinstance(step, int) and isinstance(steps, int) and 0 <= step <= steps):
-        raise _damaged(path, f"it is at step {step!r} of {steps!r}")
-    return plan
-
-
-def _read_state(folder: Path, state: dict[str, str]) -> dict[str, np.ndarray]:
-    try:
-        path = folder / Path(state["file"]).name  # a name: nothing outside the folder is read
-        checksum = state["sha256"]
-    except (KeyError, TypeError) as error:
-        raise _damaged(folder / PLAN_FILE, "it does not name its state's file") from error
-    try:
-        with path.open("rb") as file:
-            if hashlib.file_digest(file, "sha256").hexdigest() != checksum:
-                raise _damaged(path, f"its SHA-256 is not the one in {PLAN_FILE}")
-        return {name: np.array(array) for name, array in load_file(path).items()}  # ours to change
-    except OSError as error:
-        raise _damaged(path, f"it cannot be read ({error.strerror})") from error
-    except SafetensorError as error:
-        raise _damaged(path, str(error)) from error
-
-
-def _write_state(path: Path, arrays: dict[str, np.ndarray]) -> str:
-    """Write arrays under their final name in one step, without a copy in memory. Returns SHA-256.
-
-    Raises:
-        OutputError: the system refused.
-    """
-    temporary = temporary_beside(path)
-    try:
-        make_folder(path.parent)
-        save_file({name: np.asarray(a, order="C") for name, a in arrays.items()}, temporary)
-        with temporary.open("rb") as file:
-            checksum = hashlib.file_digest(file, "sha256").hexdigest()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-        flush_folder(path.parent)
-    except OSError as error:
-        raise output_error(path, error) from error
-    except SafetensorError as error:  # how it reports a full disk
-        raise OutputError(f"cannot write {path}: {error}; see whether the disk is full") from error
-    finally:
-        temporary.unlink(missing_ok=True)
-    return checksum
-
-
-def _damaged(path: Path, what: str) -> OutputError:
-    return OutputError(f"{path} is damaged: {what}. Begin anew with --overwrite")

@@ -7,9 +7,11 @@ import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pytest
 import torch
 
 from augment.cameras import Camera, Frame
@@ -20,7 +22,7 @@ from augment.reconstruct.view import RecordedView, ViewKey
 from augment.scene import Scene
 from augment.sky import ConstantSky
 from tests.scenes import one_gaussian
-from tools.fit import FitParts
+from tools import fit
 
 SIZE = (6, 8)
 
@@ -116,50 +118,58 @@ def fake_scene(source: str, numbers: Sequence[int] = range(6), recorded: bool = 
 
 @dataclass
 class Fakes:
-    """FitParts over one fake drive, and what was asked of them."""
+    """Stand-ins in `tools.fit` over one fake drive, and what was asked of them."""
 
     numbers: Sequence[int] = range(6)
     recorded: bool = True
     before_step: Callable[[int], None] = lambda step: None
     opened: list[str] = field(default_factory=list)
     trainers: list[FakeTrainer] = field(default_factory=list)
-    reports: list[dict[str, Any]] = field(default_factory=list)
+    reported: list[FakeViews] = field(default_factory=list)
 
-    def parts(self) -> FitParts:
-        return FitParts(
-            open_scene=self._open,
-            views=lambda scene, options: FakeViews(scene, options.holdout),
-            start=lambda scene, source: scene,
-            trainer=self._trainer,
-            score=self._score,
-            save=_save,
-            report=self._report,
-        )
+    def install(self, patch: pytest.MonkeyPatch) -> None:
+        stand_ins = {
+            "open_scene": self._open,
+            "RecordedViews": lambda scene, **options: FakeViews(scene, options["holdout"]),
+            "check_views": lambda *_: SimpleNamespace(time_offset_s=None, problems=(), facts={}),
+            "starting_scene": lambda scene, source: scene,
+            "Trainer": self._trainer,
+            "evaluate_views": lambda *asked, with_flip: asked,
+            "mean_scores": _mean_scores,
+            "save_scene": _save,
+            "write_report": self._report,
+        }
+        for name, stand_in in stand_ins.items():
+            patch.setattr(fit, name, stand_in)
 
     def _open(self, uri: str) -> Scene:
         self.opened.append(uri)
         return fake_scene(uri, self.numbers, self.recorded)
 
-    def _trainer(self, scene: Scene, source: FakeViews, config: FitConfig) -> FakeTrainer:
+    def _trainer(
+        self, scene: Scene, source: FakeViews, config: FitConfig, device: str
+    ) -> FakeTrainer:
         trainer = FakeTrainer(scene, source, config)
         trainer.before_step = self.before_step
         self.trainers.append(trainer)
         return trainer
 
-    def _score(self, scene: Scene, source: FakeViews, keys: Sequence[ViewKey]) -> dict[str, float]:
-        shades = [source.load(key).rgb.mean() / 255 for key in keys]
-        error = np.mean((np.array(shades) - float(scene.background.sh.mean())) ** 2)
-        return {"psnr": float(-10 * np.log10(error + 1e-12)), "ssim": 0.5, "depth_median_m": 0.1}
-
     def _report(
         self, folder: Path, scene: Scene, source: FakeViews, history: list, facts: dict
     ) -> dict[str, Any]:
         report = {"history": [dict(row) for row in history], **facts}
-        self.reports.append(report)
+        self.reported.append(source)
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "report.json").write_text(json.dumps(report))
         (folder / "report.md").write_text("# Report\n\n| views | PSNR |\n|---|---|\n| 6 | 20.0 |\n")
         return report
+
+
+def _mean_scores(asked: tuple[Scene, FakeViews, Sequence[ViewKey]]) -> dict[str, float]:
+    scene, source, keys = asked
+    shades = [source.load(key).rgb.mean() / 255 for key in keys]
+    error = np.mean((np.array(shades) - float(scene.background.sh.mean())) ** 2)
+    return {"psnr": float(-10 * np.log10(error + 1e-12)), "ssim": 0.5, "depth_median_m": 0.1}
 
 
 def _save(scene: Scene, folder: Path) -> None:

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from augment.jobs.files import TABLES
-from augment.jobs.files import encode_depth, encode_ids, encode_image
+from augment.jobs.files import TABLES, encode_depth, encode_ids, encode_image
 from augment.jobs.layout import PATH_KINDS
 from augment.jobs.manifest import rows_to_table, write_manifest
 from augment.jobs.tables import FrameBoxes, boxes_bytes, parquet_bytes

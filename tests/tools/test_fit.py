@@ -19,23 +19,21 @@ from augment.errors import ClimateGSError, OutputError
 from augment.files.scene_file import FORMAT
 from augment.jobs.processes import OutputLock
 from augment.reconstruct.config import FitConfig
-from augment.reconstruct.densify import densify_due
+from augment.reconstruct.splats import densify_due
 from augment.reconstruct.view import ViewKey
 from tools import fit, training
 from tools.cli import main
 from tools.fit import (
     GROWTH,
-    RESERVE,
     estimate_steps,
     fit_scene,
     held_out_range,
     open_to_fit,
-    real_parts,
     sample_keys,
     state_folder,
 )
 from tools.options import FitOptions, parse_depth
-from tools.training import Checkpoint, evaluation_steps, load_checkpoint, save_checkpoint
+from tools.training import RESERVE, Checkpoint, evaluation_steps, load_checkpoint, save_checkpoint
 
 
 @pytest.fixture
@@ -51,7 +49,16 @@ def options(drive, tmp_path) -> FitOptions:
 
 
 def run(options, fakes, **more):
-    return fit_scene(options, parts=fakes.parts(), progress=False, **more)
+    with pytest.MonkeyPatch.context() as patch:
+        fakes.install(patch)
+        return fit_scene(options, progress=False, **more)
+
+
+def opened_by(options, fakes):
+    """The scene and the warnings of `open_to_fit`."""
+    with pytest.MonkeyPatch.context() as patch:
+        fakes.install(patch)
+        return open_to_fit(options)
 
 
 def written(out) -> dict[str, bytes]:
@@ -178,18 +185,12 @@ def test_an_ignored_signal_stays_ignored(options):
 
 
 def test_a_stopped_run_evaluates_some_views_only(options, monkeypatch):
-    seen = []
     monkeypatch.setattr(fit, "EVALUATED_WHEN_STOPPED", 2)
     fakes = Fakes(before_step=interrupter(3, signal.SIGINT))
-    parts, report = fakes.parts(), fakes.parts().report
-
-    def noting(folder, scene, source, history, facts):
-        seen.append((source.test, source.load(source.test[0]).camera.name, len(source.train)))
-        return report(folder, scene, source, history, facts)
-
-    outcome = fit_scene(options, parts=dataclasses.replace(parts, report=noting), progress=False)
-    ((keys, camera, training),) = seen
-    assert len(keys) == 2 and camera == keys[0].camera and training == 6
+    outcome = run(options, fakes)
+    (source,) = fakes.reported
+    assert len(source.test) == 2 and len(source.train) == 6
+    assert source.load(source.test[0]).camera.name == source.test[0].camera
     assert "figures are of 2 of the 6 held-out views" in outcome.report["problems"][-1]
 
 
@@ -360,7 +361,7 @@ def test_scenes_are_opened_without_the_held_out_frames(drive, tmp_path):
     ):
         fakes = Fakes(numbers=list(numbers))
         options = FitOptions(scene=drive + query, out=tmp_path / "scene", steps=1)
-        _, warnings = open_to_fit(options, fakes.parts().open_scene)
+        _, warnings = opened_by(options, fakes)
         assert fakes.opened[-1].endswith(last) and warnings == ()
         assert len(fakes.opened) == (2 if last == "held_out=2::4" else 1)
 
@@ -369,7 +370,7 @@ def test_a_scheme_that_cannot_hold_out_is_a_problem(tmp_path):
     (tmp_path / "a.ply").touch()
     options = FitOptions(scene=f"gaussians:{tmp_path / 'a.ply'}", out=tmp_path / "o", steps=1)
     fakes = Fakes()
-    _, warnings = open_to_fit(options, fakes.parts().open_scene)
+    _, warnings = opened_by(options, fakes)
     assert "held_out=" not in fakes.opened[0] and "may be too good" in warnings[0]
 
 
@@ -558,23 +559,17 @@ def recording(tmp_path, monkeypatch) -> str:
     return f"recording:{folder}?voxel_m=0.1&image_scale=1&sky_size=32"
 
 
-def real_fit(recording, out, before_step=None):
-    parts = real_parts()
+def real_fit(recording, out, before_step=lambda step: None):
+    run_step = fit.Trainer.run_step
 
-    def trainer(scene, source, config):
-        made = parts.trainer(scene, source, config)
-        step = made.run_step
-
-        def run_step():
-            before_step(made.step)
-            return step()
-
-        if before_step is not None:
-            made.run_step = run_step
-        return made
+    def noting(trainer):
+        before_step(trainer.step)
+        return run_step(trainer)
 
     options = FitOptions(scene=recording, out=out, steps=12, scale=1.0, max_splats=20_000)
-    return fit_scene(options, parts=dataclasses.replace(parts, trainer=trainer), progress=False)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fit.Trainer, "run_step", noting)
+        return fit_scene(options, progress=False)
 
 
 def test_a_recording_is_fitted_and_interruptions_change_no_bit(recording, tmp_path):

@@ -19,7 +19,7 @@ from augment.errors import ClimateGSError, OutputError, StyleError
 from augment.geometry import rigid
 from augment.scene import Gaussians, Scene
 from augment.sky import ConstantSky
-from tools import style as style_train
+from tools import style
 from tools.options import StyleTrainOptions, parse_pair_weights
 from tools.style import checkpoint_folder, train_style
 
@@ -29,7 +29,7 @@ STREET = "procedural:street?seed=3"
 @pytest.fixture(autouse=True)
 def light(monkeypatch):
     """Few pictures to score by; torch in one thread, as trainings are."""
-    monkeypatch.setattr(style_train, "SCORED", 2)
+    monkeypatch.setattr(style, "SCORED", 2)
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -65,8 +65,8 @@ def street(monkeypatch) -> str:
     frame = Frame(0, 0, torch.eye(4, dtype=torch.float64), {"ahead": camera})
     sky = ConstantSky(torch.tensor([0.5, 0.7, 0.9]))
     scene = Scene("tiny", STREET, gaussians, (), sky, (frame,), problems=("it is tiny",))
-    monkeypatch.setattr(style_train, "open_scene", lambda uri: scene)
-    assert open_scene is not style_train.open_scene
+    monkeypatch.setattr(style, "open_scene", lambda uri: scene)
+    assert open_scene is not style.open_scene
     return STREET
 
 
