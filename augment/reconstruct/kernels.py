@@ -10,7 +10,6 @@ import numba
 import numpy as np
 from numba import prange
 
-from augment.reconstruct.splats import GEOMETRY
 from augment.render.cpu import simd as v8
 from augment.render.cpu.backward_kernels import (
     G_ABS,
@@ -326,27 +325,6 @@ def _mapped(planes, at, plane, color_map, channel):
 
 
 @kernel
-def finish_picture(rgb, alpha, sky, color_map, size, out):
-    """The picture as the camera shows it: the sky behind, then the camera's colours.
-
-    rgb, out: flat [H, W, 3]. alpha: flat [H, W]. sky: flat planes [3, H, stride]. color_map: flat
-    [3, 4]. size: height, width, stride.
-    """
-    width, stride = U(size[1]), U(size[2])
-    for band in prange((size[0] + BAND - 1) // BAND):
-        rows = np.zeros(7 * size[2], np.float32)
-        for i in range(band * BAND, min((band + 1) * BAND, size[0])):
-            _composite_row(rgb, alpha, sky, U(i), size, rows, rows, U(4) * stride, stride)
-            for j in range(U(0), stride, U(LANES)):
-                for c in range(U(0), U(3)):
-                    value = _mapped(rows, U(4) * stride + j, stride, color_map, c)
-                    v8.store(rows, c * stride + j, value)
-            for j in range(U(0), width):
-                for c in range(U(0), U(3)):
-                    out[(U(i) * width + j) * U(3) + c] = rows[c * stride + j]
-
-
-@kernel
 def compare(
     rgb,
     alpha,
@@ -605,6 +583,9 @@ def _three(array, at):
 # of an opacity divides its odds, quaternions are turned along the sphere and normalised. Kingma &
 # Ba 2015, with the bias correction counted per splat, since a view touches a few of them only.
 
+# Columns of the geometry's moments, two registers: means 3, quats 4, one unused, logarithms of
+# scales 3, logit of opacity 1, four unused.
+GEOMETRY = 16
 # Numbers of an update, float32: step sizes of a row's first 16 columns as GRAD lists them (negative
 # for opacity, whose odds are divided), of the SH, and the rest.
 R_ROW, R_SH_DC, R_SH_REST, R_BETA1, R_BETA2 = 0, 16, 17, 18, 19

@@ -4,7 +4,8 @@
     total = (1 - d_ssim) L1 + d_ssim (1 - SSIM) / 2 + depth |1/ED - 1/z| + surface (1 - alpha)
             + sky alpha
 
-each a weighted mean as `LossWeights` says. `loss_reference` is the torch definition of the same.
+each a weighted mean as `LossWeights` says. A test holds it to its torch
+definition.
 SSIM is that of 3D Gaussian splatting (Kerbl et al. 2023): windows of 11 x 11 pixels, a Gaussian of
 sigma 1.5, zeros beyond the image, per channel, of pictures in [0, 1] that are not clamped.
 
@@ -23,13 +24,17 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+import torch
 
 from augment.cameras import Camera
 from augment.reconstruct import kernels
 from augment.reconstruct.config import LossWeights
-from augment.reconstruct.loss_reference import MIN_ALPHA, MIN_SKY
 from augment.reconstruct.view import RecordedView
 from augment.render.threads import kernel_threads
+from augment.sky import CubemapSky, Sky, directions_of_cubemap
+
+MIN_SKY = 1e-3  # less of the sky shows at most a quarter of an 8-bit step
+MIN_ALPHA = 0.05
 
 # ---- Buffers of the image loss that calls share, and the sums of the sky's gradient --------------
 
@@ -146,34 +151,6 @@ class ViewLoss:
     d_color_map: np.ndarray
     d_sky: SkyGradient | None
     surface: float = 0.0
-
-
-def picture(
-    rgb: np.ndarray,
-    alpha: np.ndarray,
-    camera: Camera,
-    sky_faces: np.ndarray,
-    color_map: np.ndarray = IDENTITY_MAP,
-) -> np.ndarray:
-    """float32 [H, W, 3], not clamped: the sky [6, R, R, 3] behind, then the colour map [3, 4].
-
-    rgb [H, W, 3] without background and alpha [H, W] as rasterised, float32. Every pixel's sky is
-    looked up.
-    """
-    rgb, alpha, sky_faces, color_map = _checked(rgb, alpha, camera, sky_faces, color_map)
-    buffers = ImageBuffers(camera.height, camera.width)
-    out = np.empty_like(rgb)
-    with kernel_threads():
-        _sample_sky(alpha, camera, sky_faces, np.float32(0), buffers)
-        kernels.finish_picture(
-            rgb.reshape(-1),
-            alpha.reshape(-1),
-            buffers.sky_colors.reshape(-1),
-            color_map.reshape(-1),
-            buffers.size,
-            out.reshape(-1),
-        )
-    return out
 
 
 def view_loss(
@@ -383,3 +360,32 @@ def _writeable(value: np.ndarray) -> np.ndarray:
     """The array, or a copy where it is read-only, which numba would compile everything anew for."""
     value = np.ascontiguousarray(value)
     return value if value.flags.writeable else value.copy()
+
+
+# ---- The sky that a fit starts from, as a cube map, and what of it is sky at all -----------------
+
+_SIZE = 512  # texels along a cube edge where the starting sky is no cube map
+# Sines of elevations: what lies lower is no sky, also where the road falls; the horizon's colour.
+_BELOW, _HAZE = -0.05, 0.15
+
+
+def starting_sky(sky: Sky) -> np.ndarray:
+    """float32 [6, R, R, 3]: a copy of a cube map, or any other sky sampled into one."""
+    if isinstance(sky, CubemapSky):
+        return sky.faces.float().numpy().copy()
+    directions = directions_of_cubemap(_SIZE).float()
+    return np.ascontiguousarray(sky.sample(directions).float().numpy())
+
+
+def paint_below_horizon(faces: np.ndarray) -> np.ndarray:
+    """Which texels are sky, bool [6 R R]; the others, below the horizon, get its mean colour.
+
+    They are not learnt: a hole in the road must look wrong, not like road infinitely far away,
+    which weather would uncover.
+    """
+    flat = faces.reshape(-1, 3)
+    z = directions_of_cubemap(faces.shape[1]).reshape(-1, 3)
+    z = torch.nn.functional.normalize(z, dim=1)[:, 2].numpy()
+    horizon = (z >= 0) & (z < _HAZE)
+    flat[z < _BELOW] = flat[horizon if horizon.any() else z >= 0].mean(0, dtype=np.float64)
+    return z >= _BELOW

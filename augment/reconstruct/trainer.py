@@ -11,135 +11,267 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from augment.cameras import Camera, Frame
-from augment.reconstruct import kernels
+from augment.labels import EGO_VEHICLE
 from augment.reconstruct.config import FitConfig
-from augment.reconstruct.densify import add_noise, densify, densify_due
-from augment.reconstruct.kernels import update_rows, update_splats
-from augment.reconstruct.loss import LossScratch, ViewLoss, view_loss
-from augment.reconstruct.loss_reference import paint_below_horizon, starting_sky
-from augment.reconstruct.poses import ActorPoses, CameraPoses, part_forces
-from augment.reconstruct.renderers import ViewTape, fit_renderer
-from augment.reconstruct.splats import Splats
-from augment.reconstruct.view import RecordedView, ViewKey, ViewSource
+from augment.reconstruct.kernels import MOMENTS, sum_forces, update_splats
+from augment.reconstruct.loss import (
+    IDENTITY_MAP,
+    LossScratch,
+    ViewLoss,
+    paint_below_horizon,
+    starting_sky,
+    view_loss,
+)
+from augment.reconstruct.splats import (
+    CORRECTIONS,
+    ColorAdam,
+    DenseAdam,
+    Splats,
+    add_noise,
+    decayed,
+    densify,
+    densify_due,
+    splat_rates,
+)
+from augment.reconstruct.view import ViewKey, ViewSource
 from augment.render import layout
 from augment.render.constants import RasterSettings
-from augment.render.cpu.backward import SplatGradients
-from augment.render.cpu.backward_kernels import G_MEAN, G_OPACITY, G_QUAT, G_SCALE
-from augment.render.cpu.driver import Inputs
+from augment.render.cpu import backward_kernels
+from augment.render.cpu.backward import SplatGradients, Tape, record
+from augment.render.cpu.driver import Inputs, Scratch
+from augment.render.cuda import runtime
+from augment.render.gsplat_backend import GsplatImages, draw_with_gsplat, import_gsplat
 from augment.render.layout import BLOCK, M_FUNCTIONS
 from augment.render.part_views import part_poses, part_views, raster_modes
 from augment.render.threads import kernel_threads
 from augment.rng import rng_for
-from augment.scene import Scene
+from augment.scene import Actor, Gaussians, PosedGaussians, Scene, Track
 from augment.sky import CubemapSky
 
-# --------------------------------------------------------------------------------------------------
-# Adam for what is not a splat: colour maps (every number, every step) and the sky (few texels)
+# ---- Small corrections of where actors and cameras are, learnt with the scene -------------------
+# Labelled boxes are centimetres off, and recorded poses some tenths of a pixel. Corrections are
+# given at knots and linear in time between them, so that what is not learnt from, held-out frames
+# above all, shares what its neighbours found.
 
-# ---- Step sizes of one update, as the kernel takes them ------------------------------------------
-
-BETA1, BETA2 = 0.9, 0.999
-CORRECTIONS = kernels.bias_corrections(BETA1, BETA2)
-_MIN_M = 1e-3  # no splat gets thinner along any axis
+# Forces are some 1e-4 a metre: what is smaller than this is rounding, and must not be a direction.
+_BETA1, _BETA2, _EPS = 0.9, 0.999, 1e-10
 
 
-def splat_rates(config: FitConfig, step: int, camera: Camera, extent_m: float) -> np.ndarray:
-    """float32 [RATES] for the update after `step` updates.
+class Knots:
+    """D numbers at the knots of several things, float64, all zero to begin with.
 
-    Means decay exponentially over the run; the others fall to rates.late of their value likewise.
+    Before the first and after the last knot the nearest one holds. A thing without knots is never
+    corrected.
     """
-    rates = config.rates
-    done = min(1.0, step / max(config.steps, 1))
-    late = rates.late**done
-    values = np.zeros(kernels.RATES, np.float32)
-    values[G_MEAN : G_MEAN + 3] = decayed(rates.means, rates.means_end, done)
-    values[G_QUAT : G_QUAT + 4] = rates.quats * late
-    values[G_SCALE : G_SCALE + 3] = rates.scales * late
-    values[G_OPACITY] = -rates.opacities * late
-    values[kernels.R_SH_DC] = rates.sh_dc * late
-    values[kernels.R_SH_REST] = rates.sh_rest * late
-    values[kernels.R_BETA1], values[kernels.R_BETA2] = BETA1, BETA2
-    values[kernels.R_OPACITY_DECAY] = config.loss.opacity_decay
-    values[kernels.R_SCALE_DECAY] = config.loss.scale_decay
-    values[kernels.R_SMALLEST], values[kernels.R_LARGEST] = _MIN_M, extent_m
-    side = max(camera.width, camera.height)
-    values[kernels.R_ABS_UNIT], values[kernels.R_RADIUS_UNIT] = 0.5 * side, 1 / side
-    return values
 
+    def __init__(self, times_ns: Sequence[np.ndarray], width: int) -> None:
+        """times_ns: int64 [K] a thing, increasing."""
+        self._times = list(times_ns)
+        self._firsts = np.cumsum([0, *(len(times) for times in times_ns)])
+        shape = (int(self._firsts[-1]), width)
+        self.values = np.zeros(shape)
+        self._m, self._v = np.zeros(shape), np.zeros(shape)
+        self._count = np.zeros(shape[0], np.int64)
 
-def decayed(start: float, end: float, done: float) -> float:
-    """From start to end exponentially, done being the part of the run; 0 where either is 0."""
-    return start ** (1 - done) * end**done if start and end else 0.0
+    def at(self, number: int, timestamp_ns: int) -> np.ndarray | None:
+        """The thing's correction, float64 [D], at a time; None where it has no knots."""
+        place = self._place(number, timestamp_ns)
+        return None if place is None else place[1] @ self.values[place[0]]
 
-
-_EPS = 1e-15
-
-
-class DenseAdam:
-    """Adam on one small float32 array, which is updated in place; moments in float64."""
-
-    def __init__(self, values: np.ndarray) -> None:
-        self._values = values
-        self._m = np.zeros(values.shape)
-        self._v = np.zeros(values.shape)
-        self._count = np.zeros(1, np.int64)
-
-    def update(self, gradient: np.ndarray, rate: float) -> None:
-        self._count += 1
-        self._m += (1 - BETA1) * (gradient - self._m)
-        self._v += (1 - BETA2) * (gradient * gradient - self._v)
-        n = int(self._count[0])
-        first = self._m / (1 - BETA1**n)
-        second = self._v / (1 - BETA2**n)
-        self._values -= (rate * first / (np.sqrt(second) + _EPS)).astype(np.float32)
+    def update(
+        self, number: int, timestamp_ns: int, gradient: np.ndarray, rates: np.ndarray, pull: float
+    ) -> None:
+        """A step of Adam for the knots around a time. gradient, rates: [D]. pull: towards 0."""
+        place = self._place(number, timestamp_ns)
+        if place is None:
+            return
+        for row, weight in zip(*place, strict=True):
+            if weight > 0:
+                self._step(row, weight * gradient + pull * self.values[row], rates)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        return {"m": self._m, "v": self._v, "count": self._count}
+        return {"values": self.values, "m": self._m, "v": self._v, "count": self._count}
 
-    def load(self, arrays: dict[str, np.ndarray]) -> None:
-        for name, array in self.arrays().items():
-            array[:] = arrays[name]
+    def _place(self, number: int, timestamp_ns: int) -> tuple[list[int], np.ndarray] | None:
+        """Rows of `values` around a time, and their weights."""
+        times = self._times[number]
+        if len(times) == 0:
+            return None
+        first = int(self._firsts[number])
+        after = int(np.searchsorted(times, timestamp_ns, side="right"))
+        if after == 0 or after == len(times):
+            return [first + min(after, len(times) - 1)], np.ones(1)
+        span = int(times[after]) - int(times[after - 1])
+        part = (timestamp_ns - int(times[after - 1])) / span
+        return [first + after - 1, first + after], np.array([1 - part, part])
+
+    def _step(self, row: int, gradient: np.ndarray, rates: np.ndarray) -> None:
+        self._count[row] += 1
+        n = int(self._count[row])
+        self._m[row] += (1 - _BETA1) * (gradient - self._m[row])
+        self._v[row] += (1 - _BETA2) * (gradient * gradient - self._v[row])
+        first, second = self._m[row] / (1 - _BETA1**n), self._v[row] / (1 - _BETA2**n)
+        self.values[row] -= rates * first / (np.sqrt(second) + _EPS)
 
 
-class ColorAdam:
-    """Adam on rows of a float32 array [N, 3] of colours in place, counting each row's updates."""
+@dataclass(frozen=True, eq=False)
+class Forces:
+    """Of P parts, in each part's own axes, float64. seen: bool [P], whether the view shows it.
 
-    def __init__(self, values: np.ndarray) -> None:
-        self._values = values
-        self._m = np.zeros_like(values)
-        self._v = np.zeros_like(values)
-        self._count = np.zeros(len(values), np.int32)
+    shift [P, 3]: dL by a shift of the part. turn [P, 3]: dL by a turn about its origin (rad), of
+    means and ellipsoids; that view-dependent colours turn along is left out.
+    """
 
-    def update(self, rows: np.ndarray, gradient: np.ndarray, rate: float) -> None:
-        """rows: int32 [T], each once. gradient: float32 [T, 3]. Colours stay within [0, 1]."""
-        with kernel_threads():
-            update_rows(
-                self._values.reshape(-1),
-                self._m.reshape(-1),
-                self._v.reshape(-1),
-                self._count,
-                rows,
-                gradient,
-                np.float32(rate),
-                np.array([BETA1, BETA2], np.float32),
-                CORRECTIONS.reshape(-1),
-            )
+    seen: np.ndarray
+    shift: np.ndarray
+    turn: np.ndarray
 
-    def arrays(self) -> dict[str, np.ndarray]:
-        return {"m": self._m, "v": self._v, "count": self._count}
+    def on_camera(self, camera_from_parts: np.ndarray) -> np.ndarray:
+        """dL [6] by a turn, then a shift, of everything as the camera sees it, in camera axes.
 
-    def load(self, arrays: dict[str, np.ndarray]) -> None:
-        for name, array in self.arrays().items():
-            array[:] = arrays[name]
+        camera_from_parts: float64 [P, 4, 4].
+        """
+        rotations, offsets = camera_from_parts[:, :3, :3], camera_from_parts[:, :3, 3]
+        shift = (rotations @ self.shift[..., None])[..., 0]
+        turn = (rotations @ self.turn[..., None])[..., 0] + np.cross(offsets, shift)
+        return np.concatenate([turn.sum(0), shift.sum(0)])
+
+
+def part_forces(inputs: Inputs, grads: SplatGradients) -> Forces:
+    """The forces of one view's gradients, the same for any number of threads."""
+    moments = np.empty((len(inputs.blocks), MOMENTS))
+    with kernel_threads():
+        sum_forces(
+            inputs.addresses,
+            inputs.sizes,
+            inputs.blocks,
+            grads.rows.reshape(-1),
+            grads.ids,
+            grads.counts,
+            moments,
+        )
+    parts = len(inputs.sizes)
+    # Blocks of a part stand together; an empty part has none.
+    totals = np.zeros((parts, MOMENTS))
+    np.add.at(totals, inputs.blocks[:, 0], moments)
+    seen = np.bincount(inputs.blocks[:, 0], grads.counts, minlength=parts) > 0
+    return Forces(seen, totals[:, :3], totals[:, 3:])
+
+
+KNOT_EVERY = 4  # track samples between an actor's knots
+_REACH_M = 2.0  # a turn moves an actor's points about this far from its origin as a shift does
+_DEPTH_M = 10.0  # and a camera's turn what it sees this far away
+
+
+class ActorPoses:
+    """A shift in the world (3, metres) and a turn about the vertical (its arc at 2 m)."""
+
+    def __init__(self, actors: Sequence[Actor]) -> None:
+        self.knots = Knots([_actor_knots(actor) for actor in actors], 4)
+
+    def corrected(self, number: int, pose: np.ndarray, timestamp_ns: int) -> np.ndarray:
+        """world_from_actor, float64 [4, 4], of the actor with this index, moved and turned."""
+        shift = self.knots.at(number, timestamp_ns)
+        if shift is None:
+            return pose
+        out = pose.copy()
+        out[:3, :3] = _turn([0.0, 0.0, shift[3] / _REACH_M]) @ pose[:3, :3]
+        out[:3, 3] += shift[:3]
+        return out
+
+    def update(
+        self,
+        parts: Sequence[int],
+        poses: np.ndarray,
+        forces: Forces,
+        timestamp_ns: int,
+        *,
+        rate_m: float,
+        pull: float,
+    ) -> None:
+        """One step for every actor that a view shows. parts, poses: those of its inputs."""
+        rates = np.full(4, rate_m)
+        for place in np.flatnonzero(forces.seen).tolist():
+            if parts[place] == 0:
+                continue
+            rotation = poses[place, :3, :3]
+            turn = (rotation @ forces.turn[place])[2] / _REACH_M
+            gradient = np.append(rotation @ forces.shift[place], turn)
+            self.knots.update(parts[place] - 1, timestamp_ns, gradient, rates, pull)
+
+    def track(self, number: int, track: Track) -> Track:
+        """The actor's track with its corrections."""
+        times = track.timestamps_ns.tolist()
+        poses = [
+            self.corrected(number, pose.numpy(), time)
+            for pose, time in zip(track.world_from_actor, times, strict=True)
+        ]
+        return dataclasses.replace(track, world_from_actor=torch.from_numpy(np.stack(poses)))
+
+
+class CameraPoses:
+    """A turn (3, arcs at 10 m) and a shift (3, metres) in camera axes of what a camera sees."""
+
+    def __init__(self, source: ViewSource) -> None:
+        times: dict[str, list[int]] = {}
+        for key in source.train:
+            times.setdefault(key.camera, []).append(source.camera(key).timestamp_ns)
+        self._names: Mapping[str, int] = {name: i for i, name in enumerate(times)}
+        self.knots = Knots([np.unique(np.array(t, np.int64)) for t in times.values()], 6)
+
+    def corrected(self, camera: Camera) -> Camera:
+        """The camera where it was found to be; itself where nothing is known of it."""
+        number = self._names.get(camera.name)
+        change = None if number is None else self.knots.at(number, camera.timestamp_ns)
+        if change is None or not change.any():
+            return camera
+        moved = np.eye(4)
+        moved[:3, :3], moved[:3, 3] = _turn(change[:3] / _DEPTH_M), change[3:]
+        pose = torch.from_numpy(moved @ camera.camera_from_world.numpy())
+        return dataclasses.replace(camera, camera_from_world=pose)
+
+    def update(
+        self, camera: Camera, poses: np.ndarray, forces: Forces, *, rate_px: float, pull: float
+    ) -> None:
+        """One step for a view's camera, as corrected. poses: world_from_part of its inputs."""
+        number = self._names.get(camera.name)
+        if number is None:
+            return
+        gradient = forces.on_camera(camera.camera_from_world.numpy() @ poses)
+        gradient[:3] /= _DEPTH_M
+        rates = np.full(6, rate_px * _DEPTH_M / camera.fx)
+        self.knots.update(number, camera.timestamp_ns, gradient, rates, pull)
+
+
+def _actor_knots(actor: Actor) -> np.ndarray:
+    """int64 [K] times; none for the recording car's own body, whose track is exact."""
+    times = actor.track.timestamps_ns.numpy()
+    if actor.label == EGO_VEHICLE:
+        return times[:0]
+    knots = times[::KNOT_EVERY]
+    return knots if knots[-1] == times[-1] else np.append(knots, times[-1])
+
+
+def _turn(vector_rad: Sequence[float] | np.ndarray) -> np.ndarray:
+    """Rotation matrix of a rotation vector (Rodrigues)."""
+    x, y, z = (float(v) for v in vector_rad)
+    angle = (x * x + y * y + z * z) ** 0.5
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    if angle < 1e-12:
+        return np.eye(3) + cross
+    return (
+        np.eye(3) + np.sin(angle) / angle * cross + (1 - np.cos(angle)) / angle**2 * (cross @ cross)
+    )
 
 
 # ---- The splats of a view as the CPU kernels take them: addresses into the arrays being fitted ---
@@ -191,7 +323,209 @@ def _blocks(counts: np.ndarray) -> np.ndarray:
     return np.stack([part, first, last], 1).astype(np.int64)
 
 
-_IDENTITY = np.eye(3, 4, dtype=np.float32)
+# ---- What renders the views: the CPU's kernels, or gsplat on a GPU; all else is the same
+
+DEVICES = ("cpu", "cuda")
+
+
+class CpuRenderer:
+    """Renders the splats that are fitted by the kernels of augment.render.cpu.backward; the same
+    bits for any number of threads.
+
+    A tape holds until the next render. Splats may be changed in place between two renders, but only
+    those whose gradients the last tape told.
+    """
+
+    def __init__(self) -> None:
+        self._scratch = Scratch()
+
+    def record(
+        self,
+        splats: Splats,
+        inputs: Inputs,
+        poses: np.ndarray,
+        camera: Camera,
+        settings: RasterSettings,
+        *,
+        with_depth: bool,
+    ) -> Tape:
+        """inputs: of these splats; poses: world_from_part of their parts, float64 [P, 4, 4]."""
+        return record(inputs, camera, settings, self._scratch, with_depth=with_depth)
+
+
+# The GPU holds a copy of all splats; what a step changed on the CPU, it is sent: the rows of the
+# splats that the view showed. Back come the image and those splats' gradients. gsplat adds shares
+# up in no fixed order, so a fit's bits do not repeat.
+
+_MIN_DET = 1e-30  # of a conic, px^-4
+
+
+class GsplatRenderer:
+    """As `CpuRenderer`, by gsplat.
+
+    Raises:
+        BackendUnavailable: there is no GPU, or no gsplat.
+    """
+
+    def __init__(self) -> None:
+        runtime.check_can_run()
+        import_gsplat()
+        self._splats: Splats | None = None
+        self._copies: dict[str, Tensor] = {}
+        self._changed = np.zeros(0, np.int64)  # rows of the last tape's gradients
+        self._scratch = Scratch()
+
+    def record(
+        self,
+        splats: Splats,
+        inputs: Inputs,
+        poses: np.ndarray,
+        camera: Camera,
+        settings: RasterSettings,
+        *,
+        with_depth: bool,
+    ) -> GsplatTape:
+        self._refresh(splats)
+        # SH need no gradients of their own: they follow from the colours'.
+        leaves = {name: copy.detach() for name, copy in self._copies.items()}
+        for name in _FIELDS[:4]:
+            leaves[name].requires_grad_()
+        parts = []
+        for first, (count, _), pose in zip(inputs.first_ids, inputs.sizes, poses, strict=True):
+            own = {name: leaf[int(first) : int(first + count)] for name, leaf in leaves.items()}
+            is_world = np.array_equal(pose, np.eye(4))
+            placed = None if is_world else torch.from_numpy(np.ascontiguousarray(pose))
+            parts.append(PosedGaussians(Gaussians(**own), placed))
+        images = draw_with_gsplat(
+            parts,
+            camera,
+            settings,
+            with_depth=with_depth,
+            functions=int(inputs.modes[M_FUNCTIONS]),
+            keep_color_slopes=True,
+        )
+        depth = None if images.expected_depth is None else _array(images.expected_depth)
+        return GsplatTape(
+            inputs, _array(images.rgb), _array(images.alpha), depth, images, leaves, self
+        )
+
+    def _refresh(self, splats: Splats) -> None:
+        """The copy on the GPU as the splats are now."""
+        if splats is not self._splats:
+            self._copies = {
+                name: runtime.upload(torch.from_numpy(getattr(splats, name))) for name in _FIELDS
+            }
+            if runtime.gpu_device().type == "cpu":  # interpreted: a copy of its own all the same
+                self._copies = {name: copy.clone() for name, copy in self._copies.items()}
+        elif len(rows := self._changed):
+            flat = [getattr(splats, name)[rows].reshape(len(rows), -1) for name in _FIELDS]
+            sent = runtime.upload(np.concatenate(flat, 1))
+            index = runtime.upload(rows)
+            widths = [part.shape[1] for part in flat]
+            for name, part in zip(_FIELDS, sent.split(widths, 1), strict=True):
+                copy = self._copies[name]
+                copy.index_copy_(0, index, part.reshape(-1, *copy.shape[1:]))
+        self._splats, self._changed = splats, np.zeros(0, np.int64)
+
+    def rows_of(self, inputs: Inputs, seen: np.ndarray, rows: np.ndarray) -> SplatGradients:
+        """Gradients block by block. seen: int64 [T], increasing positions in all parts one after
+        another; rows: float32 [T, GRAD].
+        """
+        counts = inputs.sizes[:, 0]
+        ends = np.cumsum(counts)
+        part = np.searchsorted(ends, seen, side="right")
+        ids = seen - (ends - counts)[part]
+        self._changed = inputs.first_ids[part] + ids
+        blocks = -(-counts // BLOCK)
+        block = (np.cumsum(blocks) - blocks)[part] + ids // BLOCK
+        total = len(inputs.blocks)
+        found = np.bincount(block, minlength=total)
+        at = block * BLOCK + np.arange(len(seen)) - (np.cumsum(found) - found)[block]
+        all_rows = self._scratch.array("rows", (total * BLOCK, backward_kernels.GRAD), np.float32)
+        all_ids = self._scratch.array("ids", (total * BLOCK,), np.int32)
+        all_rows[at], all_ids[at] = rows, ids
+        return SplatGradients(all_rows, all_ids, found.astype(np.int64), inputs.blocks)
+
+
+@dataclass(frozen=True, eq=False)
+class GsplatTape:
+    """As cpu.backward.Tape. leaves: what gsplat was given, by name."""
+
+    inputs: Inputs
+    rgb: np.ndarray
+    alpha: np.ndarray
+    expected_depth: np.ndarray | None
+    images: GsplatImages
+    leaves: dict[str, Tensor]
+    renderer: GsplatRenderer
+
+    def backward(
+        self, d_rgb: np.ndarray, d_alpha: np.ndarray, d_expected_depth: np.ndarray | None = None
+    ) -> SplatGradients:
+        """Of the splats that a pixel shows; each once, in order."""
+        images = [self.images.rgb, self.images.alpha]
+        slopes = [runtime.upload(d_rgb), runtime.upload(d_alpha)]
+        if self.images.expected_depth is not None and d_expected_depth is not None:
+            images.append(self.images.expected_depth)
+            slopes.append(runtime.upload(d_expected_depth))
+        ids = self.images.ids
+        if len(ids) == 0:
+            none = np.zeros(0, np.int64)
+            return self.renderer.rows_of(self.inputs, none, np.zeros((0, 16), np.float32))
+        torch.autograd.backward(images, slopes)
+        with torch.no_grad():
+            ids, order = torch.sort(ids.long())
+            rows = self._rows(ids, order)
+            shown = torch.nonzero((rows[:, : backward_kernels.G_RADIUS] != 0).any(1))[:, 0]  # waits
+            return self.renderer.rows_of(self.inputs, _array(ids[shown]), _array(rows[shown]))
+
+    def _rows(self, ids: Tensor, order: Tensor) -> Tensor:
+        """Rows as augment.render.cpu.backward_kernels lists them, [M, GRAD], of splats drawn."""
+        counts = self.inputs.sizes[:, 0]
+        ends = np.cumsum(counts)
+        shifts = runtime.upload(self.inputs.first_ids - (ends - counts))
+        part = torch.searchsorted(runtime.upload(ends), ids, right=True)
+        own = ids + shifts[part]  # in the arrays of all splats
+        slopes = {name: _slope(leaf)[own] for name, leaf in self.leaves.items() if name != "sh"}
+        values = {name: self.leaves[name].detach()[own] for name in slopes}
+        quats = values["quats"]
+        radial = (slopes["quats"] * quats).sum(1, keepdim=True)
+        absolute = self.images.means2d.absgrad[order]
+        a, b, c = self.images.conics.detach()[order].unbind(1)
+        widest = torch.maximum(a, c) / (a * c - b * b).clamp_min(_MIN_DET)
+        rows = {
+            backward_kernels.G_MEAN: slopes["means"],
+            backward_kernels.G_QUAT: slopes["quats"] - radial * quats,
+            backward_kernels.G_ABS: absolute.norm(dim=1, keepdim=True),
+            backward_kernels.G_SCALE: slopes["scales"] * values["scales"],
+            backward_kernels.G_OPACITY: (slopes["opacities"] * values["opacities"])[:, None],
+            backward_kernels.G_COLOR: _slope(self.images.colors)[ids],
+            backward_kernels.G_RADIUS: torch.sqrt(widest)[:, None],
+        }
+        return torch.cat([rows[column] for column in sorted(rows)], 1)
+
+
+def _slope(tensor: Tensor) -> Tensor:
+    return torch.zeros_like(tensor) if tensor.grad is None else tensor.grad
+
+
+def _array(tensor: Tensor) -> np.ndarray:
+    return np.ascontiguousarray(tensor.detach().cpu().numpy())
+
+
+def fit_renderer(device: str) -> CpuRenderer | GsplatRenderer:
+    """device: one of DEVICES.
+
+    Raises:
+        BackendUnavailable: there is no such device, or gsplat is not installed.
+        ValueError: another name.
+    """
+    if device not in DEVICES:
+        raise ValueError(f"device must be one of {', '.join(DEVICES)}; got {device!r}")
+    return CpuRenderer() if device == "cpu" else GsplatRenderer()
+
+
+# ---- The optimisation ----------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -228,7 +562,7 @@ class Trainer:
         self._is_sky = paint_below_horizon(self.sky_faces)
         self._sky_adam = ColorAdam(self.sky_faces.reshape(-1, 3))
         names = sorted({key.camera for key in (*source.train, *source.test)})
-        self.color_maps = {name: _IDENTITY.copy() for name in names}
+        self.color_maps = {name: IDENTITY_MAP.copy() for name in names}
         self._map_adams = {name: DenseAdam(m) for name, m in self.color_maps.items()}
         self._scene = scene
         self._source = source
@@ -251,7 +585,16 @@ class Trainer:
             parts = self._posed(view.camera)
             tape = self._render(parts, view.camera)
         with _timed(stages, "loss"):
-            loss = self._loss(tape, view, key)
+            loss = view_loss(
+                tape.rgb,
+                tape.alpha,
+                tape.expected_depth,
+                view,
+                self.sky_faces,
+                self.color_maps[key.camera],
+                self.config.loss,
+                scratch=self._loss_scratch,
+            )
         with _timed(stages, "backward"):
             with_depth = tape.expected_depth is not None
             grads = tape.backward(
@@ -303,32 +646,27 @@ class Trainer:
         cameras = {n: self.camera_poses.corrected(c) for n, c in frame.cameras.items()}
         return dataclasses.replace(frame, cameras=cameras)
 
+    def _learnt_arrays(self) -> dict[str, np.ndarray]:
+        """All that is learnt in place besides the splats, by the names of a state."""
+        parts = {"sky_adam": self._sky_adam}
+        parts |= {f"color_map_adam.{name}": adam for name, adam in self._map_adams.items()}
+        parts |= {"actors": self.actor_poses.knots, "cameras": self.camera_poses.knots}
+        own = {f"{part}.{k}": a for part, adam in parts.items() for k, a in adam.arrays().items()}
+        maps = {f"color_map.{name}": color_map for name, color_map in self.color_maps.items()}
+        return {"sky": self.sky_faces, **maps, **own}
+
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """All that continuing to the same bits needs: arrays, and facts for JSON."""
         arrays = {f"splats.{name}": array for name, array in self.splats.arrays().items()}
-        arrays["sky"] = self.sky_faces
-        arrays |= {f"sky_adam.{name}": a for name, a in self._sky_adam.arrays().items()}
-        for name, adam in self._map_adams.items():
-            arrays[f"color_map.{name}"] = self.color_maps[name]
-            arrays |= {f"color_map_adam.{name}.{k}": a for k, a in adam.arrays().items()}
-        arrays |= {f"actors.{name}": a for name, a in self.actor_poses.knots.arrays().items()}
-        arrays |= {f"cameras.{name}": a for name, a in self.camera_poses.knots.arrays().items()}
+        arrays |= self._learnt_arrays()
         return {name: array.copy() for name, array in arrays.items()}, {"step": self.step}
 
     def load_state(self, arrays: dict[str, np.ndarray], facts: dict[str, Any]) -> None:
         """Continue from a state of a trainer with the same scene, views and config."""
         names = Splats.__dataclass_fields__
         self.splats = Splats(**{name: arrays[f"splats.{name}"].copy() for name in names})
-        self.sky_faces[:] = arrays["sky"]
-        self._sky_adam.load({k: arrays[f"sky_adam.{k}"] for k in self._sky_adam.arrays()})
-        for name, adam in self._map_adams.items():
-            self.color_maps[name][:] = arrays[f"color_map.{name}"]
-            adam.load({k: arrays[f"color_map_adam.{name}.{k}"] for k in adam.arrays()})
-        for prefix, knots in (
-            ("actors", self.actor_poses.knots),
-            ("cameras", self.camera_poses.knots),
-        ):
-            knots.load({k: arrays[f"{prefix}.{k}"] for k in knots.arrays()})
+        for name, array in self._learnt_arrays().items():
+            array[:] = arrays[name]
         self.step = int(facts["step"])
 
     def _next_key(self) -> ViewKey:
@@ -361,7 +699,7 @@ class Trainer:
                     )
         return _PosedParts(numbers, poses)
 
-    def _render(self, parts: _PosedParts, camera: Camera) -> ViewTape:
+    def _render(self, parts: _PosedParts, camera: Camera) -> Tape | GsplatTape:
         inputs = splat_inputs(self.splats, parts.numbers, parts.poses, camera, self._settings)
         inputs.modes[M_FUNCTIONS] = self._functions
         return self._renderer.record(
@@ -383,18 +721,6 @@ class Trainer:
         """SH functions that are learnt by now."""
         degree = min(self.config.sh_degree, self.step // max(self.config.sh_every, 1))
         return (degree + 1) ** 2
-
-    def _loss(self, tape: ViewTape, view: RecordedView, key: ViewKey) -> ViewLoss:
-        return view_loss(
-            tape.rgb,
-            tape.alpha,
-            tape.expected_depth,
-            view,
-            self.sky_faces,
-            self.color_maps[key.camera],
-            self.config.loss,
-            scratch=self._loss_scratch,
-        )
 
     def _update(
         self,
@@ -433,7 +759,7 @@ class Trainer:
             self._sky_adam.update(loss.d_sky.texels[above], loss.d_sky.grads[above], rate)
         if self.config.exposure:
             color_map = self.color_maps[camera.name]
-            pull = self.config.exposure_pull * (color_map - _IDENTITY)
+            pull = self.config.exposure_pull * (color_map - IDENTITY_MAP)
             self._map_adams[camera.name].update(
                 loss.d_color_map + pull, rates.color_map * rates.late**done
             )

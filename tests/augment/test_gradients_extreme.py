@@ -25,11 +25,9 @@ from augment.effects.style.statistics import WHOLE, ColorStatistics, closed_maps
 from augment.geometry import rigid
 from augment.reconstruct import kernels as adam
 from augment.reconstruct.config import FitConfig, LossWeights
-from augment.reconstruct.loss import IDENTITY_MAP, ViewLoss, view_loss
-from augment.reconstruct.loss_reference import MIN_ALPHA, MIN_SKY, reference_loss
-from augment.reconstruct.poses import Knots, part_forces
-from augment.reconstruct.splats import Splats
-from augment.reconstruct.trainer import CORRECTIONS, ColorAdam, DenseAdam, splat_inputs, splat_rates
+from augment.reconstruct.loss import IDENTITY_MAP, MIN_ALPHA, MIN_SKY, ViewLoss, view_loss
+from augment.reconstruct.splats import CORRECTIONS, ColorAdam, DenseAdam, Splats, splat_rates
+from augment.reconstruct.trainer import Knots, part_forces, splat_inputs
 from augment.reconstruct.view import RecordedView
 from augment.render.buffers import ALPHA, EXPECTED_DEPTH, RGB
 from augment.render.constants import RasterSettings
@@ -48,6 +46,7 @@ from tests.augment.hard_scenes import (
     in_float64,
     wide_camera,
 )
+from tests.augment.loss_definition import reference_loss
 
 FIELDS = ("means", "quats", "scales", "opacities", "sh")
 kinds, seeds = st.sampled_from(KINDS), st.integers(0, 2**31)

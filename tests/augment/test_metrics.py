@@ -14,7 +14,7 @@ from augment.metrics.image import (
     psnr,
     ssim,
 )
-from augment.reconstruct.loss_reference import ssim_map
+from tests.augment.loss_definition import ssim_map
 
 
 def pictures(height=23, width=31, *, noise=0.1, seed=0):

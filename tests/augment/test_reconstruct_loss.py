@@ -8,12 +8,10 @@ from augment.cameras import Camera
 from augment.geometry import rigid, rotmat_from_quat
 from augment.reconstruct import kernels as sky_kernels
 from augment.reconstruct.config import LossWeights
-from augment.reconstruct.loss import IDENTITY_MAP, LossScratch, ViewLoss, picture, view_loss
-from augment.reconstruct.loss_reference import MIN_SKY, reference_loss, reference_picture, ssim_map
+from augment.reconstruct.loss import IDENTITY_MAP, LossScratch, ViewLoss, view_loss
 from augment.reconstruct.view import RecordedView
-from augment.render.composite import composite_sky
 from augment.render.threads import limit_threads
-from augment.sky import CubemapSky, cubemap_coordinates
+from tests.augment.loss_definition import reference_loss, ssim_map
 
 WEIGHTS = LossWeights(d_ssim=0.3, depth=0.7, sky=0.2)
 
@@ -106,12 +104,9 @@ def assert_matches_reference(arguments: dict, tolerance: float = 1e-4) -> ViewLo
     return loss
 
 
-@pytest.mark.parametrize(
-    "size", [(37, 61), (32, 48), (7, 4), (4, 30), (11, 11), (1, 9), (1, 1)], ids=str
-)
-@pytest.mark.parametrize("seed", [1, 2])
-def test_values_and_gradients_match_the_reference(size, seed):
-    loss = assert_matches_reference(case(*size, seed=seed))
+@pytest.mark.parametrize("size", [(37, 61), (7, 4), (4, 30), (11, 11), (1, 1)], ids=str)
+def test_values_and_gradients_match_the_reference(size):
+    loss = assert_matches_reference(case(*size, seed=1))
     assert loss.d_rgb.dtype == loss.d_alpha.dtype == loss.d_expected_depth.dtype == np.float32
     assert loss.d_color_map.dtype == np.float64
     assert type(loss.total) is type(loss.sky) is float
@@ -404,26 +399,3 @@ def test_depth_pixels_outside_or_out_of_order_are_refused(pixels):
     )
     with pytest.raises(ValueError, match=r"'front'.* increasing indices from 0 to 220"):
         view_loss(**bad)
-
-
-def test_the_picture_is_that_of_the_renderer_and_of_the_reference():
-    arguments = case(37, 61, seed=1)
-    camera, alpha = arguments["view"].camera, arguments["alpha"]
-    alpha[0] = 1 - MIN_SKY / 2  # looked up all the same
-    faces = torch.from_numpy(arguments["sky_faces"])
-    rgb, color_map = torch.from_numpy(arguments["rgb"]), torch.from_numpy(arguments["color_map"])
-    plain = picture(arguments["rgb"], alpha, camera, arguments["sky_faces"])
-    # The renderer looks across the edges of the sky's faces, within half a texel of them.
-    directions = camera.ray_directions()
-    _, s, t = cubemap_coordinates(directions)
-    inner = (torch.maximum(s.abs(), t.abs()) < 1 - 1.01 / faces.shape[1]).numpy()
-    assert inner.mean() > 0.5
-    expected = composite_sky(rgb, torch.from_numpy(alpha), camera, CubemapSky(faces))
-    # One product is fused here: a rounding or two of values around 1.
-    np.testing.assert_allclose(plain[inner], expected.numpy()[inner], atol=1e-6)
-    got = picture(arguments["rgb"], alpha, camera, arguments["sky_faces"], arguments["color_map"])
-    expected = reference_picture(
-        rgb.double(), torch.from_numpy(alpha).double(), camera, faces.double(), color_map.double()
-    )
-    # float32 rounding of directions times 8 texels of noise.
-    np.testing.assert_allclose(got, expected.numpy(), atol=1e-4)

@@ -14,9 +14,7 @@ from augment.cameras import Camera, Frame
 from augment.geometry import rigid, rotmat_from_quat
 from augment.plan import make_plan
 from augment.reconstruct.config import DensifyConfig, FitConfig, LearningRates, LossWeights
-from augment.reconstruct.loss import picture
-from augment.reconstruct.poses import part_forces
-from augment.reconstruct.trainer import Trainer
+from augment.reconstruct.trainer import Trainer, part_forces
 from augment.reconstruct.view import RecordedView, ViewKey, ViewSource
 from augment.render.composite import quantise
 from augment.render.cpu.backward import Tape
@@ -26,6 +24,7 @@ from augment.scene import Actor, Gaussians, Scene, Track
 from augment.sky import ConstantSky, CubemapSky, cubemap_coordinates
 from augment.views import render_buffers
 from recipes.schema import Output, Recipe
+from tests.augment.loss_definition import reference_picture
 from tests.scenes import camera_ahead, random_gaussians
 
 WIDTH, HEIGHT = 41, 29
@@ -403,7 +402,10 @@ def test_the_fitted_scene_shows_what_the_trainer_sees(recorded):
         camera = camera_of(scene, key)
         tape = rendered(trainer, camera)
         color_map = trainer.color_maps[key.camera]
-        own = picture(tape.rgb, tape.alpha, camera, trainer.sky_faces, color_map)
+        images = (tape.rgb, tape.alpha, camera, trainer.sky_faces, color_map)
+        own = reference_picture(
+            *(torch.from_numpy(i) if isinstance(i, np.ndarray) else i for i in images)
+        ).numpy()
         # The right camera fires between samples of the track, where a fitted pose is interpolated
         # and a trained one is the interpolated label corrected: micrometres, 1e-4 of a pixel.
         tolerance = 1e-6 if key.camera == "left" else 2e-3
