@@ -8,7 +8,6 @@ import torch
 pytest.importorskip("triton")
 
 from augment.effects.style.losses import FilterBank
-from augment.effects.style.pairs import recolor
 from augment.effects.style.scene_views import folded_pictures, rendered_pictures
 from augment.effects.style.train import (
     StyleTrainConfig,
@@ -16,7 +15,6 @@ from augment.effects.style.train import (
     TrainingPool,
     generator_for,
     new_network,
-    pair_loss_of,
     scene_contents,
 )
 from augment.render.cuda import runtime as gpu
@@ -34,22 +32,14 @@ def trained(pool: TrainingPool, device: str, steps: int) -> tuple[StyleTrainer, 
         steps=20, batch=1, pair_batch=1, warm_up=0.0, scene_share=1.0, through="renderer"
     )
     net = new_network("small", offset=True, seed=0)
-    trainer = StyleTrainer(
-        net,
-        pool,
-        config,
-        FilterBank(),
-        recolor=recolor,
-        pairs=pair_loss_of(pool.to(device), config.pair_weights),
-        device=device,
-    )
+    trainer = StyleTrainer(net, pool, config, FilterBank(), device=device)
     return trainer, [trainer.run_step() for _ in range(steps)]
 
 
 def test_a_draw_is_the_same_on_every_device(monkeypatch):
     def draw(pool):
         generator = generator_for(0, 3, "pictures")
-        return pool.draw(generator, 3, scene_share=0.5, perturbed=0.7, colors=5, recolor=recolor)
+        return pool.draw(generator, 3, scene_share=0.5, perturbed=0.7, colors=5)
 
     own = pool()
     expected = draw(own)
@@ -79,6 +69,7 @@ def test_mapped_gaussians_are_rendered_where_they_lie(monkeypatch):
     assert error < 1e-4  # no colour is clamped; alpha is 1 - T, weights are sums
 
 
+@pytest.mark.long
 def test_a_training_goes_on_between_devices(monkeypatch):
     own = pool()
     here, expected = trained(own, "cpu", 2)

@@ -38,32 +38,16 @@ def trained(encoder: str = "small", **options) -> Gscm:
 
 
 @pytest.mark.parametrize("offset", [True, False])
-@pytest.mark.parametrize("moments", [True, False])
-def test_folded_is_factor_by_factor(offset, moments):
-    net = trained(offset=offset, moments=moments)
+def test_folded_is_factor_by_factor(offset):
+    net = trained(offset=offset)
     f_c, f_s = net.encode(pictures(2))
     colors = torch.rand(2, 40, 3, generator=torch.Generator().manual_seed(2))
     folded = apply_map(compose(net.style_map(f_s), net.content_map(f_c)), colors)
     # 1e-5: the sums of float32 products of values near 1, in two orders.
     torch.testing.assert_close(folded, net.apply_factors(f_c, f_s, colors), atol=1e-5, rtol=1e-5)
-
-
-def test_without_offset_every_map_is_3x3():
-    net = trained(offset=False)
-    f_c, f_s = net.encode(pictures(2))
-    for maps in (net.content_map(f_c), net.style_map(f_s)):
-        assert maps.shape == (2, 3, 4)
-        assert (maps[..., 3] == 0).all()
-    assert net.content_p.shape == (3, 16) and net.content_q.shape == (16, 3)
-    assert Gscm(offset=True).content_p.shape == (4, 16)
-
-
-@pytest.mark.parametrize("offset", [True, False])
-@pytest.mark.parametrize("moments", [True, False])
-def test_untrained_leaves_a_picture_in_its_own_style(offset, moments):
-    image = pictures(1)
-    found = gscm_map(Gscm(offset=offset, moments=moments), image, image)
-    torch.testing.assert_close(found, torch.eye(3, 4), atol=1e-4, rtol=0)
+    assert bool((net.content_map(f_c)[..., 3] != 0).any()) == offset
+    untrained = gscm_map(Gscm(offset=offset), pictures(1), pictures(1))
+    torch.testing.assert_close(untrained, torch.eye(3, 4), atol=1e-4, rtol=0)
 
 
 def test_untrained_carries_moments_from_content_to_style():
@@ -75,22 +59,14 @@ def test_untrained_carries_moments_from_content_to_style():
     torch.testing.assert_close(torch.cov(got), torch.cov(wanted), atol=4 * FLOOR_STD**2, rtol=0.03)
 
 
-@pytest.mark.parametrize(
-    "image",
-    [
-        torch.zeros(1, 3, 256, 256),
-        torch.ones(1, 3, 256, 256),
-        torch.tensor([1.0, 0.0, 0.0])[None, :, None, None].expand(1, 3, 256, 256),
-        pictures(1)[:, :1].expand(1, 3, 256, 256),
-    ],
-    ids=["black", "white", "red", "grey"],
-)
-def test_plain_pictures_give_finite_maps_of_bounded_gain(image):
-    net = trained()
-    for content, style in ((image, pictures(1)), (pictures(1), image), (image, image)):
-        found = gscm_map(net, content, style)
-        assert torch.isfinite(found).all()
-        assert torch.linalg.matrix_norm(found[:, :3], 2) < 0.6 / FLOOR_STD
+def test_plain_pictures_give_finite_maps_of_bounded_gain():
+    net, usual = trained(), pictures(1)
+    black, red = torch.zeros_like(usual), torch.tensor([1.0, 0.0, 0.0]).reshape(1, 3, 1, 1)
+    for image in (black, black + 1, black + red, usual[:, :1].expand_as(usual)):
+        for content, style in ((image, usual), (usual, image), (image, image)):
+            found = gscm_map(net, content, style)
+            assert torch.isfinite(found).all()
+            assert torch.linalg.matrix_norm(found[:, :3], 2) < 0.6 / FLOOR_STD
 
 
 def test_a_map_of_maps():
@@ -138,18 +114,11 @@ def test_moments_maps_are_inverses_and_symmetric():
         torch.testing.assert_close(matrix, matrix.transpose(1, 2), atol=1e-4, rtol=1e-4)
 
 
-def test_small_encoder_is_small():
-    assert sum(value.numel() for value in Gscm().parameters()) < 400_000
-
-
-def test_bad_arguments():
+def test_bad_arguments(monkeypatch):
     with pytest.raises(ValueError, match="k must be at least 4"):
         Gscm(k=3)
     with pytest.raises(ValueError, match="small, b0; got 'vgg'"):
         Gscm("vgg")
-
-
-def test_without_monai_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "monai.networks.nets.efficientnet", None)
     with pytest.raises(StyleError, match=r"climategs\[efficientnet\]"):
         Gscm("b0")
@@ -194,14 +163,12 @@ def torchvision_names(state):
     return names | {"classifier.1.weight": torch.zeros(1000, 1280)}
 
 
-@pytest.mark.parametrize("scheme", ["torchvision", "lukemelas", "safetensors"])
+@pytest.mark.parametrize("scheme", ["lukemelas", "torchvision"])
 def test_imagenet_weights_by_path(b0, scheme, tmp_path):
     own = b0.net.state_dict()
     given = {n: v + 0.5 if v.is_floating_point() else torch.tensor(7) for n, v in own.items()}
     path = tmp_path / "weights.pth"
-    if scheme == "torchvision":
-        torch.save(torchvision_names(given), path)
-    elif scheme == "lukemelas":
+    if scheme == "lukemelas":
         parts = {n: n.split(".") for n in given}
         luke = {
             ".".join([p[0], *p[2:]] if p[0] == "_blocks" else p): given[n] for n, p in parts.items()
@@ -234,6 +201,5 @@ def test_weights_of_another_network(b0, tmp_path):
 
 
 def test_b0_maps(b0):
-    image = pictures(1)
-    net = Gscm("b0")
+    image, net = pictures(1), Gscm("b0")
     torch.testing.assert_close(gscm_map(net, image, image), torch.eye(3, 4), atol=1e-4, rtol=0)

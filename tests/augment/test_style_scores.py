@@ -8,12 +8,12 @@ import torch
 from augment.effects.style.network import Gscm
 from augment.effects.style.scores import (
     closed_method,
-    identity_method,
-    least_squares_limit,
     network_method,
-    score_harm,
+    oversaturated_share,
     score_pairs,
 )
+
+IDENTITY = closed_method("mkl", 0.0)
 
 
 @pytest.fixture(scope="module")
@@ -25,17 +25,12 @@ def photos() -> torch.Tensor:
 
 
 def test_order_of_methods(photos):
-    identity = score_pairs(identity_method, photos, repeats=1)
-    half = score_pairs(closed_method("mkl", 0.5), photos, repeats=1)
-    full = score_pairs(closed_method("mkl"), photos, repeats=1)
-    assert identity.same < half.same < full.same
-    assert identity.same == pytest.approx(identity.look)  # the style does not matter to it
+    none, half, full = (
+        score_pairs(closed_method("mkl", strength), photos, repeats=1) for strength in (0.0, 0.5, 1.0)
+    )
+    assert none.same < half.same < full.same
+    assert none.same == pytest.approx(none.look)  # the style does not matter to it
     assert full.same > full.half and full.same > full.below and full.same > full.look
-    # No linear map beats the best one; without an offset there are fewer.
-    best = least_squares_limit(photos, offset=True, repeats=1)
-    assert full.same <= best + 0.1  # the best before clamping
-    assert least_squares_limit(photos, offset=False, repeats=1) < best
-    assert score_pairs(closed_method("reinhard"), photos, repeats=1).same <= best + 0.1
 
 
 def test_same_seed_same_scores(photos):
@@ -50,23 +45,9 @@ def test_untrained_network_is_near_the_closed_form(photos):
     assert abs(network.same - closed.same) < 4
 
 
-def test_no_change_does_no_harm(photos):
-    found = score_harm(identity_method, photos)
-    assert found.gradient_ssim == pytest.approx(1)
-    assert found.oversaturated == 0
-    assert found.conditioning == pytest.approx(1)
-
-
 def test_harm_is_seen(photos):
     def bright(content, style):
         return 3 * torch.eye(3, 4)
 
-    def thin(content, style):
-        return torch.diag(torch.tensor([1.0, 0.5, 0.1]))[:, [0, 1, 2, 2]] * torch.tensor(
-            [1, 1, 1, 0]
-        )
-
-    found = score_harm(bright, photos)
-    assert found.oversaturated > 0.9
-    assert found.gradient_ssim < 0.95
-    assert score_harm(thin, photos).conditioning == pytest.approx(10)
+    assert oversaturated_share(IDENTITY, photos) == 0
+    assert oversaturated_share(bright, photos) > 0.9

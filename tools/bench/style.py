@@ -36,10 +36,8 @@ from augment.effects.style.network import (
 from augment.effects.style.scores import (
     Method,
     closed_method,
-    identity_method,
-    least_squares_limit,
     network_method,
-    score_harm,
+    oversaturated_share,
     score_pairs,
 )
 from augment.effects.style.statistics import closed_maps
@@ -270,7 +268,7 @@ def score_table(net: Gscm, photos: Path, *, pairs: int) -> Table:
     )
     pictures = squares.float() / 255
     methods: dict[str, Method] = {
-        "none": identity_method,
+        "none": closed_method("mkl", 0.0),
         "reinhard": closed_method("reinhard"),
         "mkl": closed_method("mkl"),
         "mkl, half": closed_method("mkl", 0.5),
@@ -278,17 +276,13 @@ def score_table(net: Gscm, photos: Path, *, pairs: int) -> Table:
     }
     rows = []
     for name, method in methods.items():
-        good, harm = (
-            score_pairs(method, pictures, repeats=1),
-            score_harm(method, pictures, pairs=pairs),
-        )
-        rows.append([name, *dataclasses.astuple(good), *dataclasses.astuple(harm)])
-    best = [least_squares_limit(pictures, offset=o, repeats=1) for o in (False, True)]
+        good = score_pairs(method, pictures, repeats=1)
+        harm = oversaturated_share(method, pictures, pairs=pairs)
+        rows.append([name, *dataclasses.astuple(good), harm])
     return Table(
         f"Methods on {len(pictures)} photos that are held out, PSNR in dB",
-        ("method", "same", "half", "below", "look", "gradients", "oversaturated", "condition"),
+        ("method", "same", "half", "below", "look", "oversaturated"),
         rows,
-        f"best linear map of each case, same: 3x3 {best[0]:.2f}, 3x4 {best[1]:.2f}",
     )
 
 

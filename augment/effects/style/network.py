@@ -5,10 +5,9 @@ P and Q trained and T = E(picture), k x k. The content stage (nGSCM, T = f_c of 
 colours to a common space, the style stage (sGSCM, T = f_s of the style) from there to the style's.
 Nothing in between is nonlinear, so each stage folds to a 3x4 map and both to one.
 
-Two departures, both to switch off. offset: c carries a homogeneous 1, so that maps move the mean
-(False: the paper's 3x3). moments: T starts at the transport between the picture's colour moments
-and a mean photo's, and the encoder predicts what to multiply it with (False: T starts at the
-identity).
+Two departures. offset: c carries a homogeneous 1, so that maps move the mean (False: the paper's
+3x3). And T starts at the transport between the picture's colour moments and a mean photo's; the
+encoder predicts what to multiply it with.
 """
 
 from __future__ import annotations
@@ -32,29 +31,14 @@ from augment.files.checkpoints import read_state_dict
 from augment.jobs.atomic import write_atomic
 from recipes.files import open_file
 
-# ---- Encoders: a picture to a vector of features, from which GSCM's matrices T are predicted -----
-# Every encoder takes display-encoded pictures [B, 3, S, S] and small copies of them [B, 3, R, R]
-# whose colour moments were carried to a mean photo's, and returns [B, .width].
+# ---- Encoders: pictures [B, 3, S, S], display-encoded, and small copies [B, 3, R, R] whose -------
+# colour moments were carried to a mean photo's, become features [B, .width].
 
 ENCODERS = ("small", "b0")
 LOOKED_AT_PX = 32  # by the small encoder: the arrangement of colours, not the detail
 SMALL_CHANNELS = (16, 32, 64, 96, 96)
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 B0_WIDTH = 1280
-
-
-def build_encoder(name: str) -> SmallEncoder | B0Encoder:
-    """By name.
-
-    Raises:
-        ValueError: there is no such encoder.
-        StyleError: its library is not installed.
-    """
-    if name == "small":
-        return SmallEncoder()
-    if name == "b0":
-        return B0Encoder()
-    raise ValueError(f"encoder must be one of {', '.join(ENCODERS)}; got {name!r}")
 
 
 class SmallEncoder(nn.Module):
@@ -109,9 +93,8 @@ class B0Encoder(nn.Module):
 def load_imagenet_weights(encoder: B0Encoder, path: Path) -> None:
     """Fill EfficientNet-B0 with weights trained on ImageNet, from a file the user has.
 
-    path: .safetensors, or a state dict that torch saved. Names are
-    torchvision's (`efficientnet_b0`), lukemelas' (`efficientnet-b0`) or MONAI's; what belongs to
-    the classifier is left out.
+    path: .safetensors, or a state dict that torch saved, with torchvision's names
+    (`efficientnet_b0`), lukemelas' (`efficientnet-b0`) or MONAI's; its classifier is left out.
 
     Raises:
         StyleError: the file cannot be read, or is not of this network.
@@ -191,11 +174,9 @@ _TORCHVISION_FIRST = {  # the first stack expands nothing
 
 
 # ---- A picture's colour moments, and the linear maps between them and a mean photo's -------------
-# What a global linear map can do depends mostly on the mean and the covariance of the colours,
-# which no stack of convolutions gives exactly. So the encoders get them computed, and the maps that
-# they predict start at the transport of the picture's moments to a mean photo's (content stage) and
-# back (style stage). Both are symmetric and depend on one picture only, as the two stages of GSCM
-# do.
+# What a global linear map can do depends mostly on the colours' mean and covariance, which no stack
+# of convolutions gives exactly, so encoders get them computed. The maps are symmetric and depend on
+# one picture only, as the two stages of GSCM do.
 
 # Of 87 photos (kodak and open, 128 x 128): mean over photos of their colours' mean and covariance.
 REFERENCE_MEAN = (0.43, 0.43, 0.42)
@@ -322,18 +303,21 @@ HEAD_SCALE = 0.1  # of T, so that a step of the optimiser is a small step of the
 
 
 class Gscm(nn.Module):
-    """The network. encoder: "small" or "b0". k: width of T. offset, moments: see above."""
+    """The network. encoder: of ENCODERS. k: width of T. offset: see above.
 
-    def __init__(
-        self, encoder: str = "small", k: int = LATENT, offset: bool = True, moments: bool = True
-    ) -> None:
+    Raises:
+        ValueError: no such encoder, or k is too small. StyleError: its library is not installed.
+    """
+
+    def __init__(self, encoder: str = "small", k: int = LATENT, offset: bool = True) -> None:
         super().__init__()
         rows = 4 if offset else 3
         if k < rows:
             raise ValueError(f"k must be at least {rows}, the width of a colour; got {k}")
-        self.encoder_name, self.k, self.offset, self.moments = encoder, k, offset, moments
-        self.size = SIZE_PX
-        self.encoder = build_encoder(encoder)
+        if encoder not in ENCODERS:
+            raise ValueError(f"encoder must be one of {', '.join(ENCODERS)}; got {encoder!r}")
+        self.encoder_name, self.k, self.offset, self.size = encoder, k, offset, SIZE_PX
+        self.encoder = SmallEncoder() if encoder == "small" else B0Encoder()
         self.hidden = nn.Linear(self.encoder.width + MOMENT_FEATURES, HIDDEN)
         self.head = nn.Linear(HIDDEN, 2 * k * k)
         self.direct = nn.Linear(MOMENT_FEATURES, 2 * k * k, bias=False)
@@ -355,8 +339,6 @@ class Gscm(nn.Module):
         predicted = HEAD_SCALE * (predicted + self.direct(found.features))
         content, style = predicted.unflatten(1, (2, self.k, self.k)).unbind(1)
         eye = torch.eye(self.k, device=images.device)
-        if not self.moments:
-            return eye + content, eye + style
         normalise, restore = self._lifted(found)
         # Rows: the moments act first on the content and last on the style.
         return normalise @ (eye + content), (eye + style) @ restore
@@ -457,11 +439,9 @@ def _basis(rows: int, k: int) -> Float[Tensor, "rows k"]:
     return (basis / basis.norm(dim=1, keepdim=True)).float()
 
 
-# --------------------------------------------------------------------------------------------------
-# Style networks in files: safetensors, with what the network is and where it comes from as JSON.
-# The file's metadata hold one entry, `climategs.gscm`, a JSON object: format (1), encoder, k,
-# offset, moments, size (px of the pictures) and about (training facts, free). Tensors may be stored
-# in half precision; they are float32 in memory.
+# ---- Networks in files: safetensors, whose one metadata entry is a header in JSON ----------------
+# Its fields: those of _FIELDS and about (training facts, free). Tensors may be stored in half
+# precision; they are float32 in memory.
 
 FORMAT = 1
 METADATA_KEY = "climategs.gscm"
@@ -484,7 +464,7 @@ def save_network(
         "encoder": net.encoder_name,
         "k": net.k,
         "offset": net.offset,
-        "moments": net.moments,
+        "moments": True,
         "size": net.size,
         "about": dict(about),
     }
@@ -506,8 +486,8 @@ def load_network(path: Path | None = None) -> Gscm:
         StyleError: there is no such file, or it is no network of this format.
     """
     path = SHIPPED if path is None else path
-    header, tensors = _read(path)
-    net = Gscm(header["encoder"], header["k"], header["offset"], header["moments"])
+    header, tensors = _read(path, with_tensors=True)
+    net = Gscm(header["encoder"], header["k"], header["offset"])
     own = net.state_dict()
     missing, extra = sorted(own.keys() - tensors.keys()), sorted(tensors.keys() - own.keys())
     if missing or extra:
@@ -534,27 +514,19 @@ def network_facts(path: Path | None = None) -> dict[str, Any]:
     Raises:
         StyleError: as load_network, but for the tensors, which are not looked at.
     """
-    path = SHIPPED if path is None else path
+    return _read(SHIPPED if path is None else path, with_tensors=False)[0]
+
+
+def _read(path: Path, *, with_tensors: bool) -> tuple[dict[str, Any], dict[str, Tensor]]:
     try:
         open_file(path).close()  # to open a pipe would wait for ever
         with safe_open(path, framework="pt") as file:
-            return _header(path, file.metadata())
+            names = file.keys() if with_tensors else ()
+            return _header(path, file.metadata()), {name: file.get_tensor(name) for name in names}
     except (OSError, SafetensorError) as error:
-        raise _unreadable(path, error) from error
-
-
-def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    try:
-        open_file(path).close()  # to open a pipe would wait for ever
-        with safe_open(path, framework="pt") as file:
-            header = _header(path, file.metadata())
-            return header, {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (OSError, SafetensorError) as error:
-        raise _unreadable(path, error) from error
-
-
-def _unreadable(path: Path, error: Exception) -> StyleError:
-    return StyleError(f"{path}: the style network cannot be read: {error}; {_WHAT_TO_DO}")
+        raise StyleError(
+            f"{path}: the style network cannot be read: {error}; {_WHAT_TO_DO}"
+        ) from error
 
 
 def _header(path: Path, metadata: Mapping[str, str] | None) -> dict[str, Any]:
@@ -579,9 +551,9 @@ def _header(path: Path, metadata: Mapping[str, str] | None) -> dict[str, Any]:
             )
     if header["encoder"] not in ENCODERS:
         raise StyleError(f"{path}: encoder must be one of {ENCODERS}; got {header['encoder']!r}")
-    if not 4 <= header["k"] <= MAX_K or header["size"] != SIZE_PX:
+    if not (4 <= header["k"] <= MAX_K and header["size"] == SIZE_PX and header["moments"]):
         raise StyleError(
-            f"{path}: k must be 4 to {MAX_K} and size {SIZE_PX}; got {header['k']} and "
-            f"{header['size']}"
+            f"{path}: k must be 4 to {MAX_K}, size {SIZE_PX} and moments true; got {header['k']}, "
+            f"{header['size']} and {header['moments']}"
         )
     return header

@@ -1,9 +1,19 @@
-"""Pairs to train a style network on, made of photographs: a photo and a recoloured copy of it.
+"""Pairs of a photo and a recoloured copy, and what a style network learns from them.
 
 A recolouring is a change of colours that a camera, a light or a weather makes: exposure, white
 balance, contrast, saturation, hue, tint, gamma, a curve, an arbitrary linear part; some reach grey
 and night. Put on a photo it gives a style whose perfect result is known; put on two photos, a look
 that both share.
+
+Errors of colours are logarithms of mean squares, as their figures are (dB): a pair that is nearly
+right goes on counting. With N and S the folded stages of GSCM, x a photo, p its recolouring:
+
+    same         S(p x) N(x) x = p x, and back
+    half         the same, with the style from one half of the picture, the colours of the other
+    look         S(p y) N(x) x = p x with y another photo, and back
+    consistency  N(x) x = N(p x) p x: the paper's L_con
+    cycle        S(x) N(x) x = x: the paper's L_cyc
+    range        colours of photo x in the style of photo y that are not displayable
 """
 
 from __future__ import annotations
@@ -25,12 +35,12 @@ VARIED = 0.3  # of a recolouring's settings: by how much photos are recoloured b
 
 @dataclass(frozen=True)
 class RecolorSettings:
-    """How far recolourings go: standard deviations, but for the shares.
+    """How far recolourings go: standard deviations, and shares of those that take nearly all
+    colour, or light, away.
 
-    exposure, balance: log2 of the gains of all channels, of each. contrast, gamma: log. lift: of
-    each channel. saturation: log. hue_rad: about the grey axis. mix: of the entries of a matrix.
-    curve: of a tone curve's strength. grey_share, night_share: of the recolourings that take nearly
-    all colour, or light, away.
+    exposure, balance: log2 of the gains of all channels, of each. contrast, gamma, saturation: log.
+    lift: of each channel. hue_rad: about the grey axis. mix: of the entries of a matrix. curve: of
+    a tone curve's strength.
     """
 
     exposure: float = 0.22
@@ -79,10 +89,9 @@ class PairBatch:
 
 
 def sample_recolorings(
-    count: int, generator: torch.Generator, settings: RecolorSettings | None = None
+    count: int, generator: torch.Generator, s: RecolorSettings = RecolorSettings()
 ) -> Recoloring:
     """The same for the same state of the generator."""
-    s = RecolorSettings() if settings is None else settings
 
     def normal(*shape: int) -> Tensor:
         return torch.randn((count, *shape), generator=generator).clamp(-2.5, 2.5)
@@ -127,10 +136,10 @@ def sample_pairs(
     batch: int,
     *,
     size_px: int = 128,
-    settings: RecolorSettings | None = None,
+    settings: RecolorSettings = RecolorSettings(),
 ) -> PairBatch:
-    """A batch from photos in [0, 1], on the device where they lie; the same for the same state of
-    the generator, which is the CPU's.
+    """A batch from photos in [0, 1], on their device; the same for the same state of the CPU's
+    generator.
 
     Photos are cut (half to all of each side), mirrored at random, and squeezed to size_px squares;
     every second one shares its square with another, and each is recoloured a little before all
@@ -152,7 +161,7 @@ def sample_pairs(
 
 
 def _varied(
-    photos: Float[Tensor, "B 3 S S"], generator: torch.Generator, settings: RecolorSettings | None
+    photos: Float[Tensor, "B 3 S S"], generator: torch.Generator, settings: RecolorSettings
 ) -> Float[Tensor, "B 3 S S"]:
     """Half of the photos take a part, on the right or below, from the one before in the batch;
     then each is recoloured a little."""
@@ -164,9 +173,8 @@ def _varied(
     foreign = torch.where(below, beyond.transpose(1, 2), beyond)
     foreign = foreign & (torch.rand((count, 1, 1), generator=generator) < MIXED_SHARE)
     mixed = torch.where(foreign[:, None].to(photos.device), photos.roll(1, 0), photos)
-    own = settings or RecolorSettings()
-    little = RecolorSettings(*(0.0 if "share" in n else VARIED * v for n, v in vars(own).items()))
-    return sample_recolorings(count, generator, little)(mixed)
+    little = {n: 0.0 if "share" in n else VARIED * v for n, v in vars(settings).items()}
+    return sample_recolorings(count, generator, RecolorSettings(**little))(mixed)
 
 
 def _about_grey(
@@ -196,18 +204,7 @@ def _cut(
     return functional.grid_sample(photos, grid, padding_mode="border", align_corners=False)
 
 
-# ---- What a style network learns from photographs alone (see augment.effects.style.pairs)
-# ----------------
-# Errors of colours are logarithms of mean squares, as their figures are (dB): a pair that is nearly
-# right goes on counting. With N and S the folded stages of GSCM, x a photo, p its recolouring:
-#
-#     same         S(p x) N(x) x = p x, and back
-#     half         the same, with the style from one half of the picture and the colours of the
-# other
-#     look         S(p y) N(x) x = p x with y another photo, and back
-#     consistency  N(x) x = N(p x) p x: the paper's L_con
-#     cycle        S(x) N(x) x = x: the paper's L_cyc
-#     range        colours of photo x in the style of photo y that are not displayable
+# ---- Losses of pairs -----------------------------------------------------------------------------
 
 _ERROR_FLOOR = 1e-4  # mean square: nothing is gained beyond 40 dB
 _STRIDE_PX = 2  # of the pixels whose colours are compared
@@ -228,12 +225,8 @@ class PairWeights:
 def pair_losses(net: Gscm, batch: PairBatch) -> dict[str, Float[Tensor, ""]]:
     """Each loss, by name, unweighted."""
     count, _, _, size = batch.photos.shape
-    pictures = {
-        "x": batch.photos,
-        "px": batch.recolored,
-        "y": batch.others,
-        "py": batch.others_recolored,
-    }
+    parts = (batch.photos, batch.recolored, batch.others, batch.others_recolored)
+    pictures = dict(zip(("x", "px", "y", "py"), parts, strict=True))
     # The left half's style on the right half's colours.
     halves = {
         f"{side}{name}": functional.interpolate(part, (size, size), mode="bilinear")
@@ -276,7 +269,7 @@ def _colors(pictures: Float[Tensor, "B 3 S S"]) -> Float[Tensor, "B N 3"]:
     return pictures[:, :, ::_STRIDE_PX, ::_STRIDE_PX].flatten(2).transpose(1, 2)
 
 
-def _log_error(got: Float[Tensor, "B N 3"], wanted: Float[Tensor, "B N 3"]) -> Float[Tensor, ""]:
+def _log_error(got: Float[Tensor, "B N 3"], target: Float[Tensor, "B N 3"]) -> Float[Tensor, ""]:
     """Mean log of the mean square, of what a display would show."""
-    square = (got.clamp(0, 1) - wanted).square().mean((1, 2))
+    square = (got.clamp(0, 1) - target).square().mean((1, 2))
     return (square + _ERROR_FLOOR).log().mean()

@@ -10,13 +10,12 @@ that two on two busy cores took four times as long.
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import hashlib
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -36,7 +35,7 @@ from augment.effects.style.losses import (
     weighted_sum,
 )
 from augment.effects.style.network import Gscm, compose
-from augment.effects.style.pairs import PairWeights, pair_losses, sample_pairs, weighted
+from augment.effects.style.pairs import PairWeights, pair_losses, recolor, sample_pairs, weighted
 from augment.effects.style.scene_views import (
     SceneView,
     colors_of,
@@ -47,8 +46,6 @@ from augment.effects.style.scene_views import (
 from augment.errors import StyleError
 from augment.scene import Scene
 
-# ---- How the style network is trained: lengths, weights and schedule, the paper's where it says --
-
 Through = Literal["picture", "renderer"]
 LEARNING_RATES = {"small": 1e-3, "b0": 1e-4}  # the paper's is B0's, which starts from ImageNet
 
@@ -57,14 +54,13 @@ LEARNING_RATES = {"small": 1e-3, "b0": 1e-4}  # the paper's is B0's, which start
 class StyleTrainConfig:
     """One training.
 
-    steps: of the optimiser (Adam); the paper takes 300,000. learning_rate is multiplied by `decay`
-    after each third of them. warm_up: the part of the steps in which the cycle loss is alone.
-    style, consistency, cycle: weights of L_s, L_con and L_cyc; pairs: of the losses of pairs, which
-    pair_weights weigh among themselves. batch: contents with a style each, a step; pair_batch:
-    pairs. scene_share: of the contents, where there are both scenes and photos. perturbed: share of
-    the style pictures that are recoloured first. colors: Gaussians, or pixels, whose colours are
-    compared, an item. through: see augment.effects.style.scene_views. gradient_limit: norm that a
-    step's gradient is shortened to, where it is longer.
+    steps: of Adam; the paper takes 300,000. learning_rate is multiplied by `decay` after each third
+    of them. warm_up: share of the steps in which the cycle loss is alone. style, consistency,
+    cycle: weights of L_s, L_con and L_cyc; pairs: of the sum that pair_weights make. batch:
+    contents with a style each, a step; pair_batch: pairs. scene_share: of the contents, where there
+    are both scenes and photos. perturbed: share of the styles that are recoloured first. colors:
+    Gaussians, or pixels, whose colours are compared, an item. through: see
+    augment.effects.style.scene_views. gradient_limit: a step's greatest gradient norm.
 
     Raises:
         ValueError: a value outside its range.
@@ -89,24 +85,21 @@ class StyleTrainConfig:
     gradient_limit: float = 10.0
 
     def __post_init__(self) -> None:
-        for name in ("steps", "batch", "pair_batch", "colors"):
-            self._check(name, getattr(self, name) >= 1, "at least 1")
-        for name in ("warm_up", "scene_share", "perturbed"):
-            self._check(name, 0 <= getattr(self, name) <= 1, "between 0 and 1")
-        for name in ("style", "consistency", "cycle", "pairs"):
-            value = getattr(self, name)
-            self._check(name, math.isfinite(value) and value >= 0, "finite and at least 0")
-        for name, value in dataclasses.asdict(self.pair_weights).items():
-            if not (math.isfinite(value) and value >= 0):
-                raise ValueError(
-                    f"pair_weights.{name} must be finite and at least 0; got {value!r}"
-                )
-        for name in ("learning_rate", "gradient_limit"):
-            value = getattr(self, name)
-            self._check(name, math.isfinite(value) and value > 0, "finite and above 0")
-        self._check("decay", 0 < self.decay <= 1, "above 0 and at most 1")
-        self._check("through", self.through in ("picture", "renderer"), "picture or renderer")
-        if not self.style + self.consistency + self.cycle + self.pairs > 0:
+        weights = {f"pair_weights.{name}": v for name, v in vars(self.pair_weights).items()}
+        values = vars(self) | weights
+        losses = ("style", "consistency", "cycle", "pairs")
+        for expected, is_good, names in (
+            ("at least 1", lambda v: v >= 1, ("steps", "batch", "pair_batch", "colors")),
+            ("between 0 and 1", lambda v: 0 <= v <= 1, ("warm_up", "scene_share", "perturbed")),
+            ("finite and at least 0", lambda v: 0 <= v < math.inf, (*losses, *weights)),
+            ("finite and above 0", lambda v: 0 < v < math.inf, ("learning_rate", "gradient_limit")),
+            ("above 0 and at most 1", lambda v: 0 < v <= 1, ("decay",)),
+            ("picture or renderer", lambda v: v in ("picture", "renderer"), ("through",)),
+        ):
+            for name in names:
+                if not is_good(values[name]):
+                    raise ValueError(f"{name} must be {expected}; got {values[name]!r}")
+        if not any(values[name] for name in losses):
             raise ValueError("all losses weigh 0: nothing would be learnt")
 
     def learning_rate_at(self, step: int) -> float:
@@ -117,21 +110,14 @@ class StyleTrainConfig:
         """Whether the cycle loss is alone in this step; never, where it weighs nothing."""
         return self.cycle > 0 and step < self.warm_up * self.steps
 
-    def _check(self, name: str, is_good: bool, wanted: str) -> None:
-        if not is_good:
-            raise ValueError(f"{name} must be {wanted}; got {getattr(self, name)!r}")
 
-
-# ---- What the style network is trained on: views of scenes and photographs, drawn step by step ---
-# A photograph is taken for a scene of one Gaussian a pixel, so that the same losses hold for it.
-
-Recolor = Callable[[Tensor, torch.Generator], Tensor]  # [B, 3, H, W] in [0, 1] to the same
+# ---- Views of scenes, and photographs as scenes of one Gaussian a pixel, drawn step by step ------
 
 
 @dataclass(frozen=True, eq=False)
 class Content:
-    """A picture that styles are put on. picture: float32 [3, S, S]. colors: [1, N, ...], of its
-    Gaussians or pixels. view: None of a photograph.
+    """A picture that styles are put on. colors: [1, N, ...], of its Gaussians or pixels. view: None
+    of a photograph.
     """
 
     picture: Float[Tensor, "3 S S"]
@@ -141,9 +127,7 @@ class Content:
 
 @dataclass(frozen=True, eq=False)
 class Draw:
-    """One step's contents and, item by item, their styles, float32 [B, 3, S, S] in about [0, 1];
-    all on the pool's device.
-    """
+    """One step's contents and their styles, in about [0, 1], on the pool's device."""
 
     contents: tuple[Content, ...]
     pictures: Float[Tensor, "B 3 S S"]
@@ -171,9 +155,7 @@ class TrainingPool:
         return self.views[0].picture.shape[1] if self.views else self.photos.shape[2]
 
     def to(self, device: str | torch.device) -> TrainingPool:
-        """The same on the device, Gaussians too, so that a step copies nothing but the few numbers
-        that it draws: those come from the CPU's generators wherever pictures lie.
-        """
+        """The same on the device; what is drawn from it comes from the CPU's generators."""
         moved: dict[int, GaussianColors] = {}  # views of a scene share its colours
 
         def there(content: Content) -> Content:
@@ -198,7 +180,6 @@ class TrainingPool:
         scene_share: float,
         perturbed: float,
         colors: int,
-        recolor: Recolor,
     ) -> Draw:
         """Contents and styles of one step; the same for the same state of the generator.
 
@@ -245,7 +226,7 @@ class TrainingPool:
 def scene_contents(
     scene: Scene, count: int, size_px: int, *, with_parts: bool, seed: int
 ) -> tuple[Content, ...]:
-    """At most `count` views of a scene, which share its colours."""
+    """At most `count` views of a scene, which share its colours. with_parts: see `views_of`."""
     colors = colors_of(scene, seed=seed)
     views = views_of(scene, count, size_px, with_parts=with_parts)
     return tuple(Content(view.picture, colors, view) for view in views)
@@ -277,14 +258,6 @@ def _integer(below: int, generator: torch.Generator) -> int:
 
 
 THREADS = 1
-CYCLE, CONSISTENCY, STYLE, PAIRS = "cycle", "consistency", "style", "pairs"
-
-
-@runtime_checkable
-class PairLoss(Protocol):
-    """The loss of a batch of self-supervised pairs of pictures, drawn with the generator."""
-
-    def __call__(self, net: Gscm, generator: torch.Generator, batch: int) -> Tensor: ...
 
 
 @dataclass(frozen=True)
@@ -304,12 +277,11 @@ def new_network(encoder: str, *, offset: bool, seed: int) -> Gscm:
 
 
 class StyleTrainer:
-    """Trains `net` in place.
+    """Trains `net` in place; with pairs of the pool's pictures, where it holds at least two.
 
-    pairs: None where there are no photos. frozen_norm: keep the statistics of batch normalisation,
-    of an encoder that came with some. device: torch's name of where to compute and to keep the
-    pool; on a GPU it must be the current one, whose kernels render. What a step draws is the same
-    everywhere; bits are promised on "cpu" alone.
+    frozen_norm: keep the statistics of batch normalisation, of an encoder that came with some.
+    device: torch's name of where to compute and to keep the pool; a GPU must be the current one,
+    whose kernels render. What a step draws is the same everywhere; bits are promised on "cpu".
     """
 
     def __init__(
@@ -319,8 +291,6 @@ class StyleTrainer:
         config: StyleTrainConfig,
         features: FeatureExtractor,
         *,
-        recolor: Recolor,
-        pairs: PairLoss | None = None,
         frozen_norm: bool = False,
         device: str = "cpu",
     ) -> None:
@@ -329,13 +299,12 @@ class StyleTrainer:
         self.config = config
         self.step = 0
         self._features = features.to(device)
-        self._recolor = recolor
-        self._pairs = pairs if config.pairs > 0 else None
+        has_pairs = config.pairs > 0 and len(pool.views) + len(pool.photos) > 1
+        self._paired = self.pool.pictures() if has_pairs else None
         self._frozen_norm = frozen_norm
         self._device = device
-        self._names = [name for name, p in net.named_parameters() if p.requires_grad]
-        self._parameters = [p for p in net.parameters() if p.requires_grad]
-        self._adam = torch.optim.Adam(self._parameters, lr=config.learning_rate)
+        self._parameters = {n: p for n, p in net.named_parameters() if p.requires_grad}
+        self._adam = torch.optim.Adam(self._parameters.values(), lr=config.learning_rate)
 
     def run_step(self) -> StepRecord:
         """One step.
@@ -353,30 +322,28 @@ class StyleTrainer:
                     f"the pictures are no longer numbers in step {step + 1} ({error}): train with "
                     f"a smaller learning rate"
                 ) from error
-            loss = weighted_sum(terms, self._weights(step))
+            loss = weighted_sum(terms, {name: getattr(config, name) for name in terms})
             value = float(loss.detach())
+            facts = {name: float(term.detach()) for name, term in terms.items()}
             if not math.isfinite(value):
+                parts = ", ".join(f"{name} {fact:.4g}" for name, fact in facts.items())
                 raise StyleError(
-                    f"the loss became {value} in step {step + 1} ("
-                    + ", ".join(
-                        f"{name} {float(term.detach()):.4g}" for name, term in terms.items()
-                    )
-                    + "): train with a smaller learning rate"
+                    f"the loss became {value} in step {step + 1} ({parts}): train with a smaller "
+                    f"learning rate"
                 )
             self._adam.zero_grad(set_to_none=True)
             loss.backward()
-            nn.utils.clip_grad_norm_(self._parameters, config.gradient_limit)
+            nn.utils.clip_grad_norm_(self._parameters.values(), config.gradient_limit)
             for group in self._adam.param_groups:
                 group["lr"] = config.learning_rate_at(step)
             self._adam.step()
         self.step += 1
-        facts = {name: float(term.detach()) for name, term in terms.items()}
         return StepRecord(self.step, value, facts)
 
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Copies of all arrays, and facts, from which `load_state` goes on to the same bits."""
         arrays = {f"net.{n}": _array(t) for n, t in self.net.state_dict().items()}
-        for name, parameter in zip(self._names, self._parameters, strict=True):
+        for name, parameter in self._parameters.items():
             for part, value in self._adam.state.get(parameter, {}).items():
                 arrays[f"adam.{name}:{part}"] = _array(value)
         return arrays, {"step": self.step}
@@ -394,7 +361,7 @@ class StyleTrainer:
         }:
             raise StyleError("the state to go on from is of another network")
         self.net.load_state_dict({n: torch.from_numpy(a.copy()) for n, a in found.items()})
-        for name, parameter in zip(self._names, self._parameters, strict=True):
+        for name, parameter in self._parameters.items():
             start = f"adam.{name}:"
             parts = {n.removeprefix(start): a for n, a in arrays.items() if n.startswith(start)}
             if parts:
@@ -412,27 +379,17 @@ class StyleTrainer:
             scene_share=config.scene_share,
             perturbed=config.perturbed,
             colors=config.colors,
-            recolor=self._recolor,
         )
         warming_up = config.is_warming_up(step)
         terms = paper_terms(
             self.net, draw, self._features, only_cycle=warming_up, through=config.through
         )
-        if self._pairs is not None and not warming_up:
+        if self._paired is not None and not warming_up:
             generator = generator_for(config.seed, step, "pairs")
-            terms[PAIRS] = self._pairs(self.net, generator, config.pair_batch)
+            size_px = self.pool.size_px
+            pairs = sample_pairs(self._paired, generator, config.pair_batch, size_px=size_px)
+            terms["pairs"] = weighted(pair_losses(self.net, pairs), config.pair_weights)
         return terms
-
-    def _weights(self, step: int) -> dict[str, float]:
-        config = self.config
-        if config.is_warming_up(step):
-            return {CYCLE: config.cycle}
-        return {
-            CYCLE: config.cycle,
-            CONSISTENCY: config.consistency,
-            STYLE: config.style,
-            PAIRS: config.pairs,
-        }
 
     def _train_mode(self) -> None:
         self.net.train()
@@ -449,23 +406,16 @@ def transfer_maps(
     asked."""
     f_c, f_s = net.encode(torch.cat([draw.pictures, draw.styles.clamp(0, 1)]))
     count = len(draw.pictures)
-    content, own, other = (
-        net.content_map(f_c[:count]),
-        net.style_map(f_s[:count]),
-        net.style_map(f_s[count:]),
-    )
-    cycled = compose(own, content)
+    content = net.content_map(f_c[:count])
+    cycled = compose(net.style_map(f_s[:count]), content)
     if only_cycle:
         return Transfer(content, content, content, cycled), None
-    styled = compose(other, content)
+    styled = compose(net.style_map(f_s[count:]), content)
     rendered = _pictures(draw, styled, through)
-    seen, transferred = rendered.clamp(0, 1), styled  # an encoder's pictures end at 0 and 1
-    if net.moments:
-        # No gradient passes a picture's moments, so a map that Z_s follows would not be seen to do
-        # so, and L_con would bend Y_s instead (by 2 dB of `same`): it teaches the way back alone.
-        seen, transferred = seen.detach(), styled.detach()
-    back, _ = net.encode(seen)
-    returned = compose(net.content_map(back), transferred)
+    # No gradient passes a picture's moments, so a map that Z_s follows would not be seen to do
+    # so, and L_con would bend Y_s instead (by 2 dB of `same`): it teaches the way back alone.
+    back, _ = net.encode(rendered.detach().clamp(0, 1))  # an encoder's pictures end at 0 and 1
+    returned = compose(net.content_map(back), styled.detach())
     return Transfer(content, styled, returned, cycled), rendered
 
 
@@ -481,15 +431,15 @@ def paper_terms(
     maps, rendered = transfer_maps(net, draw, through=through, only_cycle=only_cycle)
     cycled = _pictures(draw, maps.cycled, through)
     terms = {
-        CYCLE: color_distance(draw.colors.mapped(maps.cycled), draw.colors)
+        "cycle": color_distance(draw.colors.mapped(maps.cycled), draw.colors)
         + picture_distance(cycled, draw.pictures)
     }
     if rendered is None:
         return terms
     colors = draw.colors.mapped(maps.content), draw.colors.mapped(maps.returned)
     pictures = _pictures(draw, maps.content, through), _pictures(draw, maps.returned, through)
-    terms[CONSISTENCY] = color_distance(*colors) + picture_distance(*pictures)
-    terms[STYLE] = style_loss(features(rendered), features(draw.styles))
+    terms["consistency"] = color_distance(*colors) + picture_distance(*pictures)
+    terms["style"] = style_loss(features(rendered), features(draw.styles))
     return terms
 
 
@@ -529,25 +479,7 @@ def _own_generator(seed: int, step: int, device: str) -> Iterator[None]:
         yield
 
 
-# ---- The losses of photo pairs, as the trainer takes them ----------------------------------------
-
-
-def pair_loss_of(pool: TrainingPool, weights: PairWeights) -> PairLoss | None:
-    """The pairs' losses in sum, over the pool's photos and views, on the device where they lie;
-    None where it holds only one.
-    """
-    pictures = pool.pictures()
-    if len(pictures) < 2:
-        return None
-
-    def loss(net: Gscm, generator: torch.Generator, batch: int) -> Tensor:
-        pairs = sample_pairs(pictures, generator, batch, size_px=pool.size_px)
-        return weighted(pair_losses(net, pairs), weights)
-
-    return loss
-
-
-# ---- Photographs to train the style network on, and to score it with -----------------------------
+# ---- Photographs to train on, and to score with --------------------------------------------------
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
 MIN_TO_HOLD_OUT = 5  # of fewer photos none is spared
