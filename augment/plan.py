@@ -1,19 +1,19 @@
 """Recipe + scene -> exactly the passes and buffers that the picture requires, before rendering.
 
-A plan is made of plain facts, so it can be printed, compared and tested. `view_plan` leaves out of
-it what one camera cannot see, and `apply` carries that out.
+A plan is made of plain facts, so it can be printed, compared and tested. `plan_view` leaves out
+what one camera cannot see, without changing a bit of what is written; `views` carries it out.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int64
 
 from augment.cameras import Camera
 from augment.effects.flood.flood import FloodMedium
@@ -42,7 +42,7 @@ from recipes.errors import RecipeError
 from recipes.schema import Recipe
 from recipes.weather import Style
 
-# ---- A recipe's weather put into a scene: heights and reasons become numbers that kernels take ---
+# ---- A recipe's weather placed in a scene --------------------------------------------------------
 
 MIN_DEPTH_M = 0.05  # waves run in at least this much water
 
@@ -140,15 +140,15 @@ def place_snow(
     return PlacedSnow(snow, seed, water_level_z_m), reason
 
 
-def lowest_z_m(scene: Scene) -> float:
-    """Height below which no splat of the scene reaches at any time; worked out once per scene."""
-    if scene not in _LOWEST:
+def _lowest_z_m(scene: Scene) -> float:
+    """Height below which no splat of the scene reaches at any time; found once per scene."""
+    if scene not in _lowest_known:
         lows = [_lowest(scene.background), *(_lowest_of_actor(a) for a in scene.actors)]
-        _LOWEST[scene] = min(lows)
-    return _LOWEST[scene]
+        _lowest_known[scene] = min(lows)
+    return _lowest_known[scene]
 
 
-_LOWEST: WeakKeyDictionary[Scene, float] = WeakKeyDictionary()
+_lowest_known: WeakKeyDictionary[Scene, float] = WeakKeyDictionary()
 
 
 def _lowest(gaussians: Gaussians) -> float:
@@ -168,9 +168,10 @@ def _lowest_of_actor(actor: Actor) -> float:
     return float(actor.track.world_from_actor[:, 2, 3].min()) - radius
 
 
-def gaussians_below(scene: Scene, level_z_m: float) -> bool:
-    """Whether any splat of the scene reaches below a height: else no water stands anywhere."""
-    return lowest_z_m(scene) < level_z_m
+# ---- The plan of a recipe for a scene ------------------------------------------------------------
+
+WATER_PASSES = ("flood: waves", "flood: bed", "flood: mirrored view", "flood: screen march")
+SNOW_PASSES = ("snow: placement and layer", "snow: light per pixel", "snow: bare surface")
 
 
 @dataclass(frozen=True)
@@ -186,19 +187,14 @@ class Step:
 class Plan:
     """What rendering one view under a recipe takes.
 
-    buffers: what the rasteriser is asked for. smog_in_splats: smog blended per Gaussian inside the
-    rasteriser; smog_on_buffers: smog applied to finished buffers; at most one of them is set.
-    recorded_exposure: whether cameras' colour maps apply to the finished picture.
-    depth_buffer: which buffer is written as depth, or None. steps: every pass considered, in order.
-    flood: the water, None where there is none. shows_water: whether depth, semantic and instance
-    images show the water's surface or the scene's under it. snow: None where there is none.
-    finds_boxes: whether labels or instance images need the depth of the solid surfaces, snow
-    included, for what is seen of the boxes.
-    snowless_buffers: what takes the place of buffers in views that no snow is in. bare_buffers:
-    what depth, semantic and instance images take from a render of the scene without its snow;
-    empty where they show the snow.
-    style: what the colours of the scene are turned into; None leaves them. styles_picture: whether
-    it is put on the finished picture, weather and all, and not on the scene in it.
+    buffers: asked of the rasteriser. smog_in_splats: blended per Gaussian by the rasteriser;
+    smog_on_buffers: applied to finished buffers; at most one is set. depth_buffer: written as
+    depth. steps: every pass considered, in order. recorded_exposure: cameras' colour maps apply to
+    the finished picture. shows_water: depth, semantic and instance images show the water's surface,
+    not the scene under it. finds_boxes: labels or instance images need the depth of the solid
+    surfaces, snow included. snowless_buffers: replace buffers in views without snow. bare_buffers:
+    what depth, semantic and instance images take from a render of the scene without its snow; empty
+    where they show it. styles_picture: the style maps the finished picture, not the scene in it.
     """
 
     settings: RasterSettings
@@ -230,7 +226,7 @@ class Plan:
         return {
             "buffers": sorted(self.buffers),
             "bare_buffers": sorted(self.bare_buffers),
-            "steps": [{"name": s.name, "runs": s.runs, "why": s.why} for s in self.steps],
+            "steps": [asdict(step) for step in self.steps],
         }
 
 
@@ -247,25 +243,26 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
             f"still to choose its settings in view of a scene, as jobs do; settle the recipe first "
             f"(augment.jobs.quality)"
         )
+    output = recipe.output
     flood, flood_reason = place_flood(recipe, scene)
     level_z_m = None if flood is None else flood.level_z_m
-    if flood is not None and not gaussians_below(scene, flood.level_z_m):
+    if flood is not None and _lowest_z_m(scene) >= flood.level_z_m:
         flood, flood_reason = None, f"no splat reaches below the level, z = {flood.level_z_m:.2f} m"
     snow, snow_reason = place_snow(recipe, scene, level_z_m)
     smog, smog_reason = place_smog(recipe, scene)
     style, style_reason = place_style(recipe)
     styles_picture = style is not None and style.applied_to == "picture"
     per_gaussian = recipe.weather.smog is not None and recipe.weather.smog.model == "per_gaussian"
-    depth_buffer = DEPTH_ESTIMATORS.get(recipe.output.depth)
-    wants_boxes = recipe.output.labels or recipe.output.instance
+    depth_buffer = DEPTH_ESTIMATORS.get(output.depth)
+    wants_boxes = output.labels or output.instance
     finds_boxes = wants_boxes and scene.labels is not None
     for_images = {ALPHA, depth_buffer} if depth_buffer else set[str]()
-    if recipe.output.semantic or recipe.output.instance:
+    if output.semantic or output.instance:
         for_images |= {ALPHA, SPLAT_IDS}
-    if recipe.output.instance and finds_boxes and not depth_buffer:
+    if output.instance and finds_boxes and not depth_buffer:
         for_images.add(EXPECTED_DEPTH)
     without_snow, bare_buffers = {RGB, ALPHA} | for_images, set[str]()
-    if snow is not None and recipe.output.surface == "scene":
+    if snow is not None and output.surface == "scene":
         without_snow, bare_buffers = {RGB, ALPHA}, for_images
     if (smog and not per_gaussian) or (finds_boxes and depth_buffer not in without_snow):
         without_snow.add(EXPECTED_DEPTH)
@@ -287,12 +284,12 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
         smog_in_splats=smog if per_gaussian else None,
         smog_on_buffers=None if per_gaussian else smog,
         depth_buffer=depth_buffer,
-        semantic=recipe.output.semantic,
-        instance=recipe.output.instance,
+        semantic=output.semantic,
+        instance=output.instance,
         recorded_exposure=exposure.runs,
         flood=flood,
         flood_level_z_m=level_z_m,
-        shows_water=flood is not None and recipe.output.surface == "first",
+        shows_water=flood is not None and output.surface == "first",
         snow=snow,
         finds_boxes=finds_boxes,
         bare_buffers=frozenset(bare_buffers),
@@ -308,19 +305,14 @@ def make_plan(recipe: Recipe, scene: Scene) -> Plan:
             *_flood_steps(flood, flood_reason),
             _style_step("on the picture", style, styles_picture, style_reason),
             exposure,
-            Step(
-                "depth image", depth_buffer is not None, f"output.depth is {recipe.output.depth!r}"
-            ),
-            Step("semantic image", recipe.output.semantic, _asked("semantic", recipe)),
-            Step("instance image", recipe.output.instance, _asked("instance", recipe)),
+            Step("depth image", depth_buffer is not None, f"output.depth is {output.depth!r}"),
+            Step("semantic image", output.semantic, _asked("semantic", recipe)),
+            Step("instance image", output.instance, _asked("instance", recipe)),
         ),
     )
 
 
 def _style_step(how: str, style: Style | None, chosen: bool, reason: str) -> Step:
-    """On the scene it takes no pass of its own: splats are mapped as they are projected, or were
-    once for all views.
-    """
     if style is not None and not chosen:
         reason = f"style.applied_to is {style.applied_to!r}"
     elif style is not None and how == "on the scene":
@@ -348,40 +340,36 @@ def _sky_step(smog: SmogMedium | None) -> Step:
 
 
 def _flood_steps(flood: FloodMedium | None, reason: str) -> tuple[Step, ...]:
-    """What runs does so in views that the water's plane reaches; the others are drawn as ever."""
     if flood is None:
-        names = ("flood: waves", "flood: bed", "flood: mirrored view", "flood: screen march")
-        return tuple(Step(name, False, reason) for name in names)
+        return tuple(Step(name, False, reason) for name in WATER_PASSES)
     waves, tier = len(flood.waves.amplitudes_m), flood.reflection
     mirrored = {
         "sky": "reflection 'sky' shows no scene",
         "screen_space": "at a quarter of the resolution, for what the screen does not show",
         "mirrored": "at full resolution",
     }
-    return (
-        Step("flood: waves", waves > 0, reason if waves else "the surface is still"),
-        Step("flood: bed", True, f"{reason}; splats are cut at the surface"),
-        Step("flood: mirrored view", tier != "sky", mirrored[tier]),
-        Step("flood: screen march", tier == "screen_space", f"reflection is {tier!r}"),
+    steps = (
+        (waves > 0, reason if waves else "the surface is still"),
+        (True, f"{reason}; splats are cut at the surface"),
+        (tier != "sky", mirrored[tier]),
+        (tier == "screen_space", f"reflection is {tier!r}"),
     )
+    return tuple(Step(name, *step) for name, step in zip(WATER_PASSES, steps, strict=True))
 
 
 def _snow_steps(snow: PlacedSnow | None, reason: str, bare_buffers: set[str]) -> tuple[Step, ...]:
-    """Placement runs once for all views of a scene, and the layer is laid once for each recipe."""
     if snow is None:
-        names = ("snow: placement and layer", "snow: light per pixel", "snow: bare surface")
-        return tuple(Step(name, False, reason) for name in names)
-    per_pixel = snow.snow.shading == "per_pixel"
-    bare = f"output.surface is 'scene': {', '.join(sorted(bare_buffers))} of the bare scene"
-    return (
-        Step("snow: placement and layer", True, reason),
-        Step("snow: light per pixel", per_pixel, f"shading is {snow.snow.shading!r}"),
-        Step(
-            "snow: bare surface",
-            bool(bare_buffers),
-            bare if bare_buffers else "no image shows the surface under the snow",
-        ),
+        return tuple(Step(name, False, reason) for name in SNOW_PASSES)
+    bare = "no image shows the surface under the snow"
+    if bare_buffers:
+        bare = f"output.surface is 'scene': {', '.join(sorted(bare_buffers))} of the bare scene"
+    shading = snow.snow.shading
+    steps = (
+        (True, reason),
+        (shading == "per_pixel", f"shading is {shading!r}"),
+        (bool(bare_buffers), bare),
     )
+    return tuple(Step(name, *step) for name, step in zip(SNOW_PASSES, steps, strict=True))
 
 
 def _exposure_step(recipe: Recipe, scene: Scene) -> Step:
@@ -399,19 +387,17 @@ def _asked(name: str, recipe: Recipe) -> str:
     return f"output.{name} is {str(getattr(recipe.output, name)).lower()}"
 
 
-# ---- Boxes around Gaussians, and whether any of them can touch a camera's image ------------------
+# ---- Whether Gaussians in a box can touch a camera's image ---------------------------------------
 # A rasteriser draws a Gaussian if its mean lies at `near_m` or beyond and its splat's box touches
-# the
-# image. With g = MAX_EXTENT_SIGMAS sqrt(1 + w^2), w the largest tangent that the projection's
+# the image. With g = MAX_EXTENT_SIGMAS sqrt(1 + w^2), w the largest tangent that the projection's
 # Jacobian is clamped to, the splat of a Gaussian at depth z whose longest axis is s reaches at most
 # fx g s / z + 2 px from its mean's place (the 2 px: its blur). So it lies left of the image where
 #
 #     fx x / z + cx + fx g s / z + 2 < 0,    that is    fx x + (cx + 2) z + fx g s < 0 :
 #
 # a half-space of the mean, and so are the other sides. A box of means that lies wholly in one of
-# these, or before the near plane, shows nothing. Rays of an orthographic camera are parallel: z
-# drops
-# out of the sides, and w is 0.
+# these, or before the near plane, shows nothing. For an orthographic camera, z drops out of the
+# sides, and w is 0.
 
 _BLUR_PX = 3.0  # 1.9 of it is the blur, the rest float32's rounding of pixels
 _ROUNDING = 1e-5  # of all terms of a sum: a hundred times float32's
@@ -419,74 +405,67 @@ _ROUNDING = 1e-5  # of all terms of a sum: a hundred times float32's
 
 @dataclass(frozen=True, eq=False)
 class Bounds:
-    """B boxes along the axes of a part's frame that hold means. centres, halves [B, 3]: metres.
+    """B boxes along the axes of a part's frame that hold means. centres, halves: metres.
 
-    longest [B]: the largest standard deviation of a Gaussian in the box, metres.
+    longest: the largest standard deviation of a Gaussian in the box, metres. owners: instance ids
+    of the parts, 0 for the background.
     """
 
     centres: Float[np.ndarray, "B 3"]
     halves: Float[np.ndarray, "B 3"]
     longest: Float[np.ndarray, "B"]
+    owners: Int64[np.ndarray, "B"]
 
     def __len__(self) -> int:
         return len(self.longest)
 
-    def grown(self, metres: Float[np.ndarray, "B"]) -> Bounds:
-        """The boxes with room on every side."""
-        return Bounds(self.centres, self.halves + metres[:, None], self.longest)
+    def select(self, rows: np.ndarray) -> Bounds:
+        return Bounds(*(getattr(self, f.name)[rows] for f in fields(self)))
 
     @staticmethod
-    def join(bounds: list[Bounds]) -> Bounds:
-        """All boxes of a list, in their order."""
-        return Bounds(
-            np.concatenate([np.zeros((0, 3)), *(b.centres for b in bounds)]),
-            np.concatenate([np.zeros((0, 3)), *(b.halves for b in bounds)]),
-            np.concatenate([np.zeros(0), *(b.longest for b in bounds)]),
-        )
+    def join(bounds: Iterable[Bounds]) -> Bounds:
+        """All boxes, in their order."""
+        nothing = Bounds(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int64))
+        each, names = [nothing, *bounds], [f.name for f in fields(Bounds)]
+        return Bounds(*(np.concatenate([getattr(b, name) for b in each]) for name in names))
 
 
-def bound(gaussians: Gaussians) -> Bounds:
+def bound(gaussians: Gaussians, owner: int = 0) -> Bounds:
     """One box around all that are opaque enough to be drawn; none where there are none."""
-    shown = gaussians.opacities.detach().numpy() >= ALPHA_MIN
-    means, longest = _numbers(gaussians, shown)
-    return _boxes(means, longest, np.zeros(len(means), np.int64))
+    return bound_chunks(gaussians, gaussians.opacities.detach().numpy() >= ALPHA_MIN, owner=owner)
 
 
-def bound_chunks(gaussians: Gaussians, chosen: np.ndarray, side_m: float) -> Bounds:
-    """Boxes around the chosen (bool [N]), one for each square of x and y that has any."""
-    means, longest = _numbers(gaussians, chosen)
-    return bound_points(means, longest, side_m)
-
-
-def bound_points(
-    means: Float[np.ndarray, "N 3"], longest: Float[np.ndarray, "N"], side_m: float
+def bound_chunks(
+    gaussians: Gaussians, chosen: np.ndarray, side_m: float = math.inf, owner: int = 0
 ) -> Bounds:
-    """As bound_chunks, of means and the largest standard deviation of each."""
-    squares = np.floor(means[:, :2] / side_m).astype(np.int64)
-    return _boxes(means, longest, np.unique(squares, axis=0, return_inverse=True)[1].reshape(-1))
-
-
-def _numbers(gaussians: Gaussians, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Boxes around the chosen (bool [N]), one for each square of x and y that has any."""
     means = gaussians.means.detach().numpy()[chosen].astype(np.float64)
-    return means, gaussians.scales.detach().numpy()[chosen].max(1, initial=0).astype(np.float64)
+    longest = gaussians.scales.detach().numpy()[chosen].max(1, initial=0).astype(np.float64)
+    return _bound_points(means, longest, side_m, owner)
 
 
-def _boxes(means: np.ndarray, longest: np.ndarray, numbers: np.ndarray) -> Bounds:
-    """Of the points that share a number, counted from 0 without gaps."""
+def _bound_points(
+    means: Float[np.ndarray, "N 3"], longest: Float[np.ndarray, "N"], side_m: float, owner: int
+) -> Bounds:
     if len(means) == 0:
         return Bounds.join([])
+    numbers = np.zeros(len(means), np.int64)
+    if side_m < math.inf:
+        squares = np.floor(means[:, :2] / side_m).astype(np.int64)
+        numbers = np.unique(squares, axis=0, return_inverse=True)[1].reshape(-1)
     order = np.argsort(numbers, kind="stable")
     starts = np.flatnonzero(np.diff(numbers[order], prepend=-1))
     lows = np.minimum.reduceat(means[order], starts, axis=0)
     highs = np.maximum.reduceat(means[order], starts, axis=0)
     widest = np.maximum.reduceat(longest[order], starts)
-    return Bounds((lows + highs) / 2, (highs - lows) / 2, widest)
+    owners = np.full(len(starts), owner, np.int64)
+    return Bounds((lows + highs) / 2, (highs - lows) / 2, widest, owners)
 
 
 def may_show(
     bounds: Bounds, world_from_part: np.ndarray | None, camera: Camera, near_m: float
-) -> np.ndarray:
-    """Whether a Gaussian of each box can touch the image, bool [B]; True where it is not known.
+) -> Bool[np.ndarray, "B"]:
+    """Whether a Gaussian of each box can touch the image; True where it is not known.
 
     world_from_part: float64, [4, 4] of all boxes or [B, 4, 4]; None for the identity.
     """
@@ -526,12 +505,8 @@ def _half_spaces(camera: Camera, near_m: float) -> tuple[np.ndarray, np.ndarray,
     return sides, offsets, np.array([0.0, *reach, *reach])
 
 
-# ---- What one camera needs of a plan: parts, passes and buffers that can show in its image -------
-# A plan is made once for a recipe and a scene. A camera that looks away from the water, the snow or
-# an actor needs less, which is found from boxes around them before anything is drawn. What is left
-# out changes no bit of what is written.
+# ---- The plan of one view ------------------------------------------------------------------------
 
-WATER_PASSES = ("flood: waves", "flood: bed", "flood: mirrored view", "flood: screen march")
 _CHUNK_M = 8.0  # side of the squares that snow is bounded in
 _SPARE_PX = 8.0  # of the margins in flood_view, and of the splats' blur at a coarse resolution
 
@@ -557,21 +532,10 @@ class ViewPlan:
         """Whether any snow can be in view."""
         return bool(self.snowy)
 
-    def as_dict(self) -> dict[str, object]:
-        """For machines: buffers sorted, one entry a step."""
-        return {
-            "actors": list(self.actors),
-            "snowy": list(self.snowy),
-            "water": self.water,
-            "buffers": sorted(self.buffers),
-            "bare_buffers": sorted(self.bare_buffers),
-            "steps": [{"name": s.name, "runs": s.runs, "why": s.why} for s in self.steps],
-        }
-
     def with_hidden_water(self) -> ViewPlan:
         """The same view once its front layer has shown that nothing of the water is to be seen."""
         why = "what stands before the water hides all of it"
-        return replace(self, steps=tuple(_replaced(self.steps, dict.fromkeys(WATER_PASSES, why))))
+        return replace(self, steps=_skip(self.steps, {name: why for name in WATER_PASSES}))
 
 
 def plan_view(plan: Plan, scene: Scene, camera: Camera, *, backend: str = AUTO) -> ViewPlan:
@@ -583,26 +547,43 @@ def plan_view(plan: Plan, scene: Scene, camera: Camera, *, backend: str = AUTO) 
     Raises:
         SceneError: snow cannot be placed in this scene.
     """
-    water, water_why = _water(plan, camera)
-    cameras = _lookers(plan, camera) if water else (camera,)
+    water, skipped = plan.flood is not None, dict[str, str]()
+    if plan.flood is not None and float(camera.centre[2]) <= plan.flood.level_z_m:
+        why = "the camera is under water: it sees what lies below and what lies above"
+        skipped |= {name: why for name in WATER_PASSES}
+    elif plan.flood is not None and plane_window(camera, plan.flood.level_z_m) is None:
+        water = False
+        skipped |= {name: "no ray of this camera meets the water's plane" for name in WATER_PASSES}
+    cameras = _layer_cameras(plan, camera) if water else (camera,)
     poses = _poses(scene, camera)
-    near_m = plan.settings.near_m
-    drawn = _owners_seen(_actor_boxes(scene), poses, cameras, near_m)
-    cover, snowy = cover_for(plan, scene, backend=backend), set[int]()
-    if cover is not None:
-        on_ground, on_actors = _snow_boxes(scene, cover)
-        if any(may_show(on_ground, None, view, near_m).any() for view in cameras):
-            snowy.add(0)
-        snowy |= _owners_seen(on_actors, poses, cameras, near_m)
+    drawn = _owners_seen(_actor_boxes(scene), poses, cameras, plan.settings.near_m)
+    layers, snowy = cover_for(plan, scene, backend=backend), set[int]()
+    if layers is not None:
+        with_ground = {0: np.eye(4), **poses}
+        snowy = _owners_seen(_snow_boxes(scene, layers), with_ground, cameras, plan.settings.near_m)
         drawn |= snowy - {0}
-    buffers, bare_buffers = _buffers(plan, bool(snowy), water)
+    buffers, bare_buffers = plan.buffers, plan.bare_buffers
+    if layers is not None and not snowy:
+        buffers = plan.snowless_buffers
+        if not water:  # the scene is the bare one already
+            buffers, bare_buffers = buffers | bare_buffers, frozenset[str]()
+        why = "neither snow nor what it buries can be in view"
+        skipped |= {name: why for name in SNOW_PASSES[: 2 if bare_buffers else 3]}
+    elif layers is not None and not any(_lit_per_pixel(layers.layer_on(scene, n)) for n in snowy):
+        skipped["snow: light per pixel"] = "no snow that is lit per pixel can be in view"
+    actors = (
+        f"background and {len(drawn)} of {len(scene.actors)} actors "
+        f"({len(scene.actors) - len(poses)} absent at this time, "
+        f"{len(poses) - len(drawn)} out of view); buffers {', '.join(sorted(buffers))}"
+    )
+    steps = _skip(plan.steps, skipped)
     return ViewPlan(
         actors=tuple(sorted(drawn)),
         snowy=tuple(sorted(snowy)),
         water=water,
         buffers=buffers,
         bare_buffers=bare_buffers,
-        steps=_steps(plan, scene, poses, drawn, cover, snowy, water_why, buffers, bare_buffers),
+        steps=tuple(replace(s, why=actors) if s.name == "rasterise" else s for s in steps),
     )
 
 
@@ -614,18 +595,7 @@ def cover_for(plan: Plan, scene: Scene, *, backend: str = AUTO) -> SnowLayers | 
     return snow_layers_of(scene, plan.snow, style_parts, backend=backend)
 
 
-def _water(plan: Plan, camera: Camera) -> tuple[bool, str | None]:
-    """Whether the water's plane can be in view; why its passes are skipped, if they are."""
-    if plan.flood is None:
-        return False, None
-    if float(camera.centre[2]) <= plan.flood.level_z_m:
-        return True, "the camera is under water: it sees what lies below and what lies above"
-    if plane_window(camera, plan.flood.level_z_m) is None:
-        return False, "no ray of this camera meets the water's plane"
-    return True, None
-
-
-def _lookers(plan: Plan, camera: Camera) -> tuple[Camera, ...]:
+def _layer_cameras(plan: Plan, camera: Camera) -> tuple[Camera, ...]:
     """Cameras that see, between them, what the layers of a view with water can show."""
     assert plan.flood is not None
     wide = _grown(camera, MAX_SHIFT * camera.height + _SPARE_PX)
@@ -646,125 +616,66 @@ def _poses(scene: Scene, camera: Camera) -> dict[int, np.ndarray]:
     return {number: pose.numpy() for number, pose in found if pose is not None}
 
 
-@dataclass(frozen=True, eq=False)
-class _Owned:
-    """Boxes in the frames of their owners. owners [B]: instance ids."""
-
-    bounds: Bounds
-    owners: np.ndarray
-
-
-def _owned(each: Iterable[tuple[int, Bounds]]) -> _Owned:
-    each = list(each)
-    counts = [len(bounds) for _, bounds in each]
-    return _Owned(
-        Bounds.join([bounds for _, bounds in each]),
-        np.repeat(np.array([number for number, _ in each], np.int64), counts),
-    )
-
-
 def _owners_seen(
-    boxes: _Owned, poses: dict[int, np.ndarray], cameras: Iterable[Camera], near_m: float
+    bounds: Bounds, poses: Mapping[int, np.ndarray], cameras: Iterable[Camera], near_m: float
 ) -> set[int]:
-    """Instance ids of which a box may be seen."""
-    rows = [row for row, owner in enumerate(boxes.owners.tolist()) if owner in poses]
-    if not rows:
+    """Instance ids of which a box may be seen. poses: world_from_part of those that exist."""
+    bounds = bounds.select(np.isin(bounds.owners, list(poses)))
+    if not len(bounds):
         return set()
-    b, owners = boxes.bounds, boxes.owners[rows]
-    bounds = Bounds(b.centres[rows], b.halves[rows], b.longest[rows])
-    placed = np.stack([poses[owner] for owner in owners.tolist()])
-    seen = np.zeros(len(rows), bool)
-    for camera in cameras:
-        seen |= may_show(bounds, placed, camera, near_m)
-    return set(owners[seen].tolist())
+    placed = np.stack([poses[owner] for owner in bounds.owners.tolist()])
+    seen = np.any([may_show(bounds, placed, camera, near_m) for camera in cameras], axis=0)
+    return set(bounds.owners[seen].tolist())
 
 
-def _actor_boxes(scene: Scene) -> _Owned:
-    """One box around each actor; worked out once per scene."""
-    if scene not in _of_actors:
+def _actor_boxes(scene: Scene) -> Bounds:
+    """One box around each actor; found once per scene."""
+    if scene not in _boxes_of_actors:
         numbered = enumerate(scene.actors, start=1)
-        _of_actors[scene] = _owned((number, bound(a.gaussians)) for number, a in numbered)
-    return _of_actors[scene]
+        _boxes_of_actors[scene] = Bounds.join(bound(a.gaussians, n) for n, a in numbered)
+    return _boxes_of_actors[scene]
 
 
-_of_actors: WeakKeyDictionary[Scene, _Owned] = WeakKeyDictionary()
+_boxes_of_actors: WeakKeyDictionary[Scene, Bounds] = WeakKeyDictionary()
 
 
-def _snow_boxes(scene: Scene, cover: SnowLayers) -> tuple[Bounds, _Owned]:
-    """Around the ground's snow, and the actors'; worked out once per cover (of one scene)."""
-    if cover not in _of_covers:
-        on_ground = _bound_snow(cover.ground, scene.background)
-        layers = ((n, a, cover.layer_on(scene, n)) for n, a in enumerate(scene.actors, start=1))
-        on_actors = _owned((n, _bound_snow(own, a.gaussians)) for n, a, own in layers if own)
-        _of_covers[cover] = (on_ground, on_actors)
-    return _of_covers[cover]
+def _snow_boxes(scene: Scene, layers: SnowLayers) -> Bounds:
+    """Around the snow of the ground and the actors; found once per layers (of one scene)."""
+    if layers not in _boxes_of_snow:
+        parts = [(0, layers.ground, scene.background)]
+        parts += [(n, layers.layer_on(scene, n), a.gaussians)
+            for n, a in enumerate(scene.actors, start=1)]  # fmt: skip
+        _boxes_of_snow[layers] = Bounds.join(
+            _bound_snow(layer, own, n) for n, layer, own in parts if layer
+        )
+    return _boxes_of_snow[layers]
 
 
-_of_covers: WeakKeyDictionary[SnowLayers, tuple[Bounds, _Owned]] = WeakKeyDictionary()
+_boxes_of_snow: WeakKeyDictionary[SnowLayers, Bounds] = WeakKeyDictionary()
 
 
-def _bound_snow(layer: Layer, own: Gaussians) -> Bounds:
+def _bound_snow(layer: Layer, own: Gaussians, owner: int) -> Bounds:
     """Around a part's snow, its glints, and what of the part it buries: where none of these is in
     view, the part looks as it does without snow.
     """
     buried = (layer.opacities.numpy() == 0) & (own.opacities.numpy() > 0)
     everywhere = np.ones(len(layer.gaussians), bool)
-    snow = bound_chunks(layer.gaussians, everywhere, _CHUNK_M)
+    snow = bound_chunks(layer.gaussians, everywhere, _CHUNK_M, owner)
     # Close to a camera discs are split: their parts lie within one standard deviation.
-    bounds = [snow.grown(snow.longest), bound_chunks(own, buried, _CHUNK_M)]
+    snow = replace(snow, halves=snow.halves + snow.longest[:, None])
+    bounds = [snow, bound_chunks(own, buried, _CHUNK_M, owner)]
     if layer.crystals is not None:
         places = layer.crystals.places_m.numpy().astype(np.float64)
-        bounds.append(bound_points(places, np.full(len(places), SIZE_M), _CHUNK_M))
+        bounds.append(_bound_points(places, np.full(len(places), SIZE_M), _CHUNK_M, owner))
     return Bounds.join(bounds)
-
-
-def _buffers(plan: Plan, snow: bool, water: bool) -> tuple[frozenset[str], frozenset[str]]:
-    """Without snow in view the scene is the bare one already, but for its water."""
-    if plan.snow is None or snow:
-        return plan.buffers, plan.bare_buffers
-    if water:
-        return plan.snowless_buffers, plan.bare_buffers
-    return plan.snowless_buffers | plan.bare_buffers, frozenset()
-
-
-def _steps(
-    plan: Plan,
-    scene: Scene,
-    poses: dict[int, np.ndarray],
-    drawn: set[int],
-    cover: SnowLayers | None,
-    snowy: set[int],
-    no_water: str | None,
-    buffers: frozenset[str],
-    bare_buffers: frozenset[str],
-) -> tuple[Step, ...]:
-    """The plan's steps with what this camera leaves out."""
-    skipped = dict[str, str]()
-    if no_water is not None:
-        skipped |= dict.fromkeys(WATER_PASSES, no_water)
-    if cover is not None:
-        if not snowy:
-            names = ("snow: placement and layer", "snow: light per pixel", "snow: bare surface")
-            skipped |= dict.fromkeys(names, "neither snow nor what it buries can be in view")
-        elif not any(_lit_per_pixel(cover.layer_on(scene, number)) for number in snowy):
-            skipped["snow: light per pixel"] = "no snow that is lit per pixel can be in view"
-        if bare_buffers:
-            skipped.pop("snow: bare surface", None)
-    steps = _replaced(plan.steps, skipped)
-    beyond, absent = len(poses) - len(drawn), len(scene.actors) - len(poses)
-    actors = (
-        f"background and {len(drawn)} of {len(scene.actors)} actors ({absent} absent at this time, "
-        f"{beyond} out of view); buffers {', '.join(sorted(buffers))}"
-    )
-    return tuple(Step(s.name, s.runs, actors) if s.name == "rasterise" else s for s in steps)
 
 
 def _lit_per_pixel(layer: Layer | None) -> bool:
     return layer is not None and layer.slopes is not None and layer.normals is None
 
 
-def _replaced(steps: Iterable[Step], skipped: dict[str, str]) -> list[Step]:
-    """The steps, those that would run but are skipped with the reason."""
-    return [
+def _skip(steps: Iterable[Step], skipped: Mapping[str, str]) -> tuple[Step, ...]:
+    """The steps; those that would run but are skipped have that reason."""
+    return tuple(
         Step(s.name, False, skipped[s.name]) if s.runs and s.name in skipped else s for s in steps
-    ]
+    )

@@ -31,7 +31,7 @@ SURFACE_ALPHA = 0.5  # a pixel less covered than this shows more sky than surfac
 
 @dataclass(frozen=True, eq=False)
 class SnowFreeBuffers:
-    """What images show of a scene without its snow: see the same fields of WeatheredBuffers."""
+    """The scene without its snow: see the same fields of WeatheredBuffers."""
 
     raster: RenderOutput
     depth_m: Float[Tensor, "H W"] | None
@@ -40,14 +40,13 @@ class SnowFreeBuffers:
 
 @dataclass(frozen=True, eq=False)
 class WeatheredBuffers:
-    """One finished view in floats. rgb [H, W, 3]: display-encoded, not clamped, sky included.
+    """One finished view in floats. rgb: display-encoded, not clamped, sky included.
 
-    raster: the buffers of the scene's surfaces; with water in view, of those under it too, without
-    colours. depth_m [H, W]: z along the optical axis of the scene's surface, 0 where there is none;
-    None unless planned. water [H, W]: where a ray meets water first; None where no water is in
-    view. snow [H, W]: where snow is what the pixel shows; None where none can be in view; it is a
-    surface of the scene for raster, depth_m and parts. bare: the scene without it, if planned.
-    parts: those drawn, by which splat_ids count. view: what of the plan was carried out.
+    raster: buffers of the scene's surfaces, snow included, with water in view also those under it,
+    without colours. depth_m: z of the scene's surface, 0 where there is none; None unless planned.
+    water: where a ray meets water first; None where none is in view. snow: where snow is what the
+    pixel shows; None where none can be in view. bare: the scene without snow, if planned. parts:
+    those drawn, by which splat_ids count. view: what of the plan was carried out.
     """
 
     camera: Camera
@@ -61,13 +60,13 @@ class WeatheredBuffers:
     bare: SnowFreeBuffers | None = None
 
 
+# ---- What labels are measured from: depths are float32 [H, W], z in metres, 0 = none -------------
+
+
 @dataclass(frozen=True, eq=False)
 class FloodedView:
-    """What a view's labels under water are measured from.
-
-    level_z_m: the water's surface, scene world. scene_depth_m: float32 [H, W], z of the scene's own
-    surface, seen through the water where there is some; 0 = none. None where no water is in
-    view, or no label needs it.
+    """level_z_m: the water's surface, scene world. scene_depth_m: of the scene's own surface, seen
+    through the water; None where no water is in view, or no label needs it.
     """
 
     level_z_m: float
@@ -76,10 +75,8 @@ class FloodedView:
 
 @dataclass(frozen=True, eq=False)
 class SnowyView:
-    """What a view's labels in the snow are measured from.
-
-    surface_depth_m: float32 [H, W], z of the first solid surface, snow included; 0 = none. None
-    where no snow is in view, or no label needs it. thickness_m: the layer's depth.
+    """surface_depth_m: of the first solid surface, snow included; None where no snow is in view, or
+    no label needs it. thickness_m: the layer's depth.
     """
 
     surface_depth_m: np.ndarray | None
@@ -88,11 +85,9 @@ class SnowyView:
 
 @dataclass(frozen=True, eq=False)
 class SmoggyView:
-    """What the labels in a view's smog are measured from.
-
-    medium: None where the recipe's smog has no density. surface_depth_m: float32 [H, W], z of the
-    surface that is seen through the smog, snow included and water not; 0 = none. None where no
-    label needs it. water_level_z_m: of the flood, scene world; None where none is drawn.
+    """medium: None where the recipe's smog has no density. surface_depth_m: of the surface that is
+    seen through the smog, snow included and water not; None where no label needs it.
+    water_level_z_m: of the flood, scene world; None where none is drawn.
     """
 
     medium: SmogMedium | None
@@ -102,13 +97,10 @@ class SmoggyView:
 
 @dataclass(frozen=True, eq=False)
 class SurfaceView:
-    """What the labelled boxes in a view are found by.
-
-    depth_m: float32 [H, W], z of the first solid surface, snow included and water not; 0 = none.
-    snow_m: the snow's depth, 0 where none is in view. actors: uint16 [H, W], the instance image of
-    those surfaces, which knows of actors only; None where there is none. shown_depth_m,
-    shown_classes, shown_snow_m: likewise of the surfaces that the view's instance image shows; None
-    without one.
+    """depth_m: of the first solid surface, snow included and water not. snow_m: the snow's depth, 0
+    where none is in view. actors: uint16 [H, W], the instance image of those surfaces, which knows
+    of actors only; None where there is none. shown_depth_m, shown_classes, shown_snow_m: likewise
+    of the surfaces that the view's instance image shows; None without one.
     """
 
     depth_m: np.ndarray
@@ -124,12 +116,10 @@ class WeatheredView:
     """One finished view as it is written to files.
 
     rgb: uint8 [H, W, 3]. depth_m: float32 [H, W], 0 = none. semantic: uint8 [H, W], SemanticClass.
-    instance: uint16 [H, W], 0 = background or sky, else 1 + the actor's index in the scene; what is
-    written has boxes without an actor, too (`augment.jobs.files.label_view`).
-    water: uint8 [H, W], 255 where a ray meets water first, else 0; None where the recipe has no
-    flood. flood: None where the recipe has no flood. snow: uint8 [H, W], 255 where snow is what the
-    pixel shows, else 0. snow, snowy: None where the recipe has no snow. smoggy: None where it has
-    no smog. surface: None where nobody asks for boxes.
+    instance: uint16 [H, W], 0 = background or sky, else 1 + the actor's index in the scene
+    (`augment.jobs.files.label_view` adds boxes without an actor). water, snow: uint8 [H, W], 255
+    where a ray meets water first, and where snow is what the pixel shows. What belongs to an effect
+    is None where the recipe lacks it. surface: None where nobody asks for boxes.
     """
 
     camera: Camera
@@ -146,9 +136,7 @@ class WeatheredView:
 
 
 class PendingView:
-    """A view that is under way. On a GPU it has been begun and nobody has waited for it yet; other
-    backends have finished it.
-    """
+    """A view that was begun: on a GPU it may still be computed, other backends have finished it."""
 
     def __init__(self, finish: Callable[[], WeatheredView]) -> None:
         self._finish: Callable[[], WeatheredView] | None = finish
@@ -162,17 +150,14 @@ class PendingView:
         return self._view
 
 
-# --------------------------------------------------------------------------------------------------
-# The images of a finished view as files hold them: 8 bits, depth, classes, instances and masks. On
-# the CPU they are made here, image by image. On a GPU one kernel makes all of them, and one copy
-# brings them back (augment.render.cuda.images).
+# ---- Buffers into images as files hold them ------------------------------------------------------
+# On a GPU one kernel makes all of them, and one copy brings them back (augment.render.cuda.images).
 
 
 @dataclass(frozen=True, eq=False)
 class ViewImages:
-    """rgb, depth_m, semantic, instance: as those of WeatheredView. water, snow: uint8 [H, W], 255
-    where the buffers of these names are true, None where there are none. scene_depth_m: float32
-    [H, W], the buffers' depth, where labels need it.
+    """As the fields of WeatheredView; water, snow: None where the buffers have none. scene_depth_m:
+    float32 [H, W], the buffers' depth, where labels need it.
     """
 
     rgb: np.ndarray
@@ -188,10 +173,9 @@ class ViewImages:
 class RequestedImages:
     """What of a view's buffers becomes images.
 
-    shown: the surfaces that depth, semantic and instance images show, and the parts that its
-    splat_ids count through. first: pixels in which these images show the water instead.
-    plane_z_m: the water's surface, scene world, if an eye in the air sees it there; None leaves the
-    depth of such pixels 0. semantic, instance, depth_m, scene_depth_m: whether, or of what.
+    shown: the surfaces that depth, semantic and instance images show; parts: those its splat_ids
+    count through. first: pixels in which these images show the water instead. plane_z_m: the
+    water's surface, scene world, if an eye in the air sees it there; None leaves their depth 0.
     """
 
     rgb: Float[Tensor, "H W 3"]
@@ -208,26 +192,12 @@ class RequestedImages:
 
 
 def begin_images(view: WeatheredBuffers, plan: Plan, *, backend: str) -> Callable[[], ViewImages]:
-    """The images that the plan asks for, of buffers that lie where the backend leaves them. What is
-    returned waits for them, where there is something to wait for.
-    """
-    wanted = _wanted(view, plan)
-    if kernels_for(backend, wanted.rgb.detach()) == CUDA:
-        from augment.render.cuda.images import begin_cuda_images
-
-        with timed("images"):
-            return begin_cuda_images(wanted, view.camera)
-    images = _images(wanted, view)
-    return lambda: images
-
-
-def _wanted(view: WeatheredBuffers, plan: Plan) -> RequestedImages:
-    shown = view.bare or view  # the scene's surfaces that the other images show
-    first = view.water if plan.shows_water else None
+    """The images that the plan asks for; what is returned waits for those on a GPU."""
+    shown = view.bare or view
     in_air = plan.flood is not None and float(view.camera.centre[2]) > plan.flood.level_z_m
     paints_boxes = plan.instance and plan.finds_boxes  # by depth and class of what is shown
     shows_depth = plan.depth_buffer is not None or (paints_boxes and view.bare is not None)
-    return RequestedImages(
+    requested = RequestedImages(
         rgb=view.rgb,
         shown=shown.raster,
         parts=shown.parts,
@@ -235,46 +205,53 @@ def _wanted(view: WeatheredBuffers, plan: Plan) -> RequestedImages:
         instance=plan.instance,
         depth_m=shown.depth_m if shows_depth else None,
         scene_depth_m=view.depth_m if plan.finds_boxes else None,
-        first=first,
+        first=view.water if plan.shows_water else None,
         plane_z_m=plan.flood.level_z_m if plan.flood is not None and in_air else None,
         water=view.water,
         snow=view.snow,
     )
+    if kernels_for(backend, view.rgb.detach()) == CUDA:
+        from augment.render.cuda.images import begin_cuda_images
+
+        with timed("images"):
+            return begin_cuda_images(requested, view.camera)
+    images = _make_images(requested, view.camera)
+    return lambda: images
 
 
-def _images(wanted: RequestedImages, view: WeatheredBuffers) -> ViewImages:
+def _make_images(requested: RequestedImages, camera: Camera) -> ViewImages:
     """The definition, on the CPU."""
-    semantic = instance = depth = None
-    first, parts = wanted.first, wanted.parts
-    if wanted.semantic:
+    semantic = instance = None
+    shown, parts, depth = requested.shown, requested.parts, requested.depth_m
+    first = None if requested.first is None else requested.first.numpy()
+    if requested.semantic:
         with timed("semantic image"):
-            table = semantic_table(parts)
-            semantic = _look_up(wanted.shown, table, int(SemanticClass.SKY), np.uint8)
+            semantic = _look_up(shown, _semantic_table(parts), int(SemanticClass.SKY), np.uint8)
             if first is not None:
-                semantic[first.numpy()] = int(SemanticClass.WATER)
-    if wanted.instance:
+                semantic[first] = int(SemanticClass.WATER)
+    if requested.instance:
         with timed("instance image"):
-            instance = _look_up(wanted.shown, instance_table(parts), 0, np.uint16)
+            counts = [len(part.gaussians) for part in parts]
+            table = np.repeat(np.array([part.instance_id for part in parts], np.uint16), counts)
+            instance = _look_up(shown, table, 0, np.uint16)
             if first is not None:
-                instance[first.numpy()] = 0
-    if wanted.depth_m is not None:
-        depth = wanted.depth_m
-        if first is not None:
-            with timed("depth image"):
-                surface = torch.zeros_like(depth)
-                if wanted.plane_z_m is not None:
-                    surface = plane_depth(view.camera, wanted.plane_z_m).to(depth.dtype)
-                depth = torch.where(first, surface, depth)
+                instance[first] = 0
+    if depth is not None and requested.first is not None:
+        with timed("depth image"):
+            surface = torch.zeros_like(depth)
+            if requested.plane_z_m is not None:
+                surface = plane_depth(camera, requested.plane_z_m).to(depth.dtype)
+            depth = torch.where(requested.first, surface, depth)
     with timed("8 bits"):
-        rgb = quantise(wanted.rgb)
+        rgb = quantise(requested.rgb)
     return ViewImages(
         rgb=rgb,
         depth_m=_floats(depth),
         semantic=semantic,
         instance=instance,
-        water=_mask(wanted.water),
-        snow=_mask(wanted.snow),
-        scene_depth_m=_floats(wanted.scene_depth_m),
+        water=_mask(requested.water),
+        snow=_mask(requested.snow),
+        scene_depth_m=_floats(requested.scene_depth_m),
     )
 
 
@@ -287,7 +264,7 @@ def _mask(shown: Tensor | None) -> np.ndarray | None:
     return None if shown is None else shown.numpy().astype(np.uint8) * np.uint8(255)
 
 
-def semantic_table(parts: tuple[PosedGaussians, ...]) -> np.ndarray:
+def _semantic_table(parts: tuple[PosedGaussians, ...]) -> np.ndarray:
     """int16 [total splats]: the class of every splat, in the order splat_ids counts them."""
     return np.concatenate([
         np.zeros(len(p.gaussians), np.int16)
@@ -295,12 +272,6 @@ def semantic_table(parts: tuple[PosedGaussians, ...]) -> np.ndarray:
         else p.gaussians.semantic.numpy()
         for p in parts
     ])  # fmt: skip
-
-
-def instance_table(parts: tuple[PosedGaussians, ...]) -> np.ndarray:
-    """uint16 [total splats]: the instance of every splat, in the order splat_ids counts them."""
-    counts = [len(p.gaussians) for p in parts]
-    return np.repeat(np.array([p.instance_id for p in parts], np.uint16), counts)
 
 
 def _look_up(raster: RenderOutput, table: np.ndarray, none: int, dtype: type) -> np.ndarray:
@@ -312,7 +283,7 @@ def _look_up(raster: RenderOutput, table: np.ndarray, none: int, dtype: type) ->
     return np.where(seen, table[np.maximum(index, 0)], none).astype(dtype)
 
 
-# ---- Carries out a plan: the order of the effects in plain sight ---------------------------------
+# ---- A plan carried out: the order of the effects in plain sight ---------------------------------
 
 
 def render_view(
@@ -326,21 +297,19 @@ def render_view(
 
 
 def begin_view(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str = AUTO) -> PendingView:
-    """The view of `render_view`, begun: its `result` waits for what the GPU has still to do. In the
-    meantime another view can be begun.
-    """
+    """The view of `render_view`, begun: its `result` waits for the GPU; another can be begun."""
     if backend == AUTO:
         backend = choose_backend(backend, scene)
     with timed("plan"):
         plan = make_plan(recipe, scene)
     buffers = render_buffers(scene, camera.scaled(recipe.render.scale), plan, backend=backend)
     images = begin_images(buffers, plan, backend=backend)
-    view_camera = buffers.camera  # and not the buffers, which the images may long outlive
-    return PendingView(lambda: _weathered(images(), view_camera, plan, recipe))
+    camera = buffers.camera  # and not the buffers, which the images may long outlive
+    return PendingView(lambda: _weathered(images(), camera, plan, recipe))
 
 
 def render_buffers(
-    scene: Scene, camera: Camera, plan: Plan, *, backend: str = "auto"
+    scene: Scene, camera: Camera, plan: Plan, *, backend: str = AUTO
 ) -> WeatheredBuffers:
     """The view of `camera` at its own resolution, as floats."""
     with timed("view plan"):
@@ -349,25 +318,24 @@ def render_buffers(
         look = None if plan.style is None else look_of(scene, plan.style)
         style_parts = None if plan.styles_picture else look
         parts = bare_parts = scene.parts_for(camera, view.actors)
-    cover = cover_for(plan, scene, backend=backend) if view.snow else None
-    if cover is not None:
+    layers = cover_for(plan, scene, backend=backend) if view.snow else None
+    if layers is not None:
         with timed("snow: placement and layer"):
-            parts = cover.parts_for(scene, camera, parts, view.snowy, backend=backend)
+            parts = layers.parts_for(scene, camera, parts, view.snowy, backend=backend)
     sky = scene.sky
     if style_parts is not None:
         parts, sky = style_parts.on(parts, backend=backend), style_parts.sky
     flooded = None
     if plan.flood is not None and view.water:
-        painter = LayerRenderer(
+        renderer = LayerRenderer(
             parts, sky, plan.settings, plan.smog_in_splats, plan.smog_on_buffers, backend
         )
-        flooded = render_flooded(painter, camera, plan.flood, view.buffers)
-    if flooded is not None:
-        rgb, raster = flooded.rgb, flooded.scene
-        if flooded.is_hidden:
-            view = view.with_hidden_water()
-    else:
+        flooded = render_flooded(renderer, camera, plan.flood, view.buffers)
+    if flooded is None:
         rgb, raster = _without_water(sky, parts, camera, plan, view.buffers, backend)
+    else:
+        rgb, raster = flooded.rgb, flooded.scene
+        view = view.with_hidden_water() if flooded.is_hidden else view
     if look is not None and plan.styles_picture:
         with timed("style on the picture"):
             rgb = map_colors(rgb, look.maps.picture, backend=backend)
@@ -378,23 +346,13 @@ def render_buffers(
     water = None if flooded is None else flooded.water
     with timed("depth of surfaces"):
         depth_m = _surface_depth(raster, plan, plan.buffers)
-    return WeatheredBuffers(
-        camera,
-        rgb,
-        raster,
-        depth_m,
-        parts,
-        view,
-        water=water,
-        snow=_snow_mask(raster, water),
-        bare=_bare(raster, bare_parts, camera, plan, view, backend),
-    )
+    bare = _bare(raster, bare_parts, camera, plan, view, backend)
+    snow = _snow_mask(raster, water)
+    return WeatheredBuffers(camera, rgb, raster, depth_m, parts, view, water, snow, bare)
 
 
 def _surface_depth(raster: RenderOutput, plan: Plan, buffers: frozenset[str]) -> Tensor | None:
-    """z of the surfaces by the planned estimator if it is among the buffers, else by the one that
-    labels need.
-    """
+    """z of the surfaces by the planned estimator if among the buffers, else by the labels'."""
     by = plan.depth_buffer if plan.depth_buffer in buffers else None
     z = getattr(raster, by or EXPECTED_DEPTH)
     if z is None or raster.alpha is None:
@@ -403,11 +361,11 @@ def _surface_depth(raster: RenderOutput, plan: Plan, buffers: frozenset[str]) ->
 
 
 def _snow_mask(raster: RenderOutput, water: Tensor | None) -> Tensor | None:
-    """Where snow makes up half of the pixel or more; what a ray meets behind water is none."""
+    """Where snow makes up half of the pixel or more, and not behind water."""
     if raster.snow is None:
         return None
-    shows = raster.snow >= SURFACE_ALPHA
-    return shows if water is None else shows & ~water
+    is_shown = raster.snow >= SURFACE_ALPHA
+    return is_shown if water is None else is_shown & ~water
 
 
 def _bare(
@@ -418,9 +376,7 @@ def _bare(
     view: ViewPlan,
     backend: str,
 ) -> SnowFreeBuffers | None:
-    """What images show of the scene without its snow. raster: of the picture, which is that scene
-    where the view has no pass for it.
-    """
+    """raster: of the picture, which is the bare scene where the view has no pass for it."""
     if not plan.bare_buffers:
         return None
     if view.bare_buffers:
@@ -474,12 +430,11 @@ def _weathered(images: ViewImages, camera: Camera, plan: Plan, recipe: Recipe) -
     if weather.smog is not None:
         level_z_m = None if plan.flood is None else plan.flood.level_z_m
         smoggy = SmoggyView(plan.smog, None if plan.smog is None else depth, level_z_m)
-    size = (camera.height, camera.width)
     water, snow = images.water, images.snow
     if weather.flood is not None and water is None:
-        water = np.zeros(size, np.uint8)
+        water = np.zeros((camera.height, camera.width), np.uint8)
     if weather.snow is not None and snow is None:
-        snow = np.zeros(size, np.uint8)
+        snow = np.zeros((camera.height, camera.width), np.uint8)
     return WeatheredView(
         camera=camera,
         rgb=images.rgb,
@@ -497,15 +452,13 @@ def _weathered(images: ViewImages, camera: Camera, plan: Plan, recipe: Recipe) -
 
 def _surface_view(images: ViewImages, plan: Plan, snow_m: float) -> SurfaceView | None:
     """snow_m: of the snow in view."""
-    depth = images.scene_depth_m
+    depth, is_bare = images.scene_depth_m, bool(plan.bare_buffers)
     if depth is None:
         return None
-    is_bare = bool(plan.bare_buffers)
-    is_solid = not is_bare and not plan.shows_water
     return SurfaceView(
         depth_m=depth,
         snow_m=snow_m,
-        actors=images.instance if is_solid else None,
+        actors=None if is_bare or plan.shows_water else images.instance,
         shown_depth_m=images.depth_m if is_bare else depth,
         shown_classes=images.semantic,
         shown_snow_m=0.0 if is_bare else snow_m,

@@ -10,10 +10,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from augment.effects.lidar import MOVED, UNCHANGED
-from augment.effects.lidar import snow as lidar_snow
-from augment.effects.lidar.beam import weathered_sweep
-from augment.effects.lidar.snow import LidarSnow, layer_of, meet_snow, snow_in
+from augment.effects.lidar import MOVED, UNCHANGED, beam
+from augment.effects.lidar.beam import LidarSnow, layer_of, meet_layers, snow_in, weathered_sweep
 from augment.effects.snow.cells import SnowCells, SnowSupport
 from augment.effects.snow.snow import PlacedSnow, placement_settings, snow_layers_of
 from augment.effects.snow.support import remember_support
@@ -57,7 +55,7 @@ def meets(cells: SnowCells, depths: np.ndarray | float, points: np.ndarray) -> n
     layer = layer_of(cells, np.broadcast_to(np.float32(depths), len(cells)).copy())
     snow = LidarSnow(layer, {}, 0.8)
     origins, directions, ends = beams(points)
-    hits = meet_snow(snow, street(), sweep_of(points), 0, origins, directions, ends)
+    hits = meet_layers(snow, street(), sweep_of(points), 0, origins, directions, ends)
     assert (hits <= ends).all()
     return origins + hits[:, None] * directions
 
@@ -106,7 +104,7 @@ def test_the_march_is_what_a_search_in_small_steps_finds(seed: int, depth: float
     if layer is None:
         return
     origins, directions, ends = beams(points)
-    shallow = meet_snow(
+    shallow = meet_layers(
         LidarSnow(layer, {}, 1.0), street(), sweep_of(points), 0, origins, directions, ends
     )
     steps = np.arange(0.3, 20, 5e-3)
@@ -115,7 +113,7 @@ def test_the_march_is_what_a_search_in_small_steps_finds(seed: int, depth: float
     rows, columns = layer.base.shape
     inside = ((index >= 0) & (index < [columns, rows])).all(-1)
     row, column = np.clip(index[..., 1], 0, rows - 1), np.clip(index[..., 0], 0, columns - 1)
-    low, high = layer.base[row, column] - lidar_snow._GROUND_SLACK_M, layer.top[row, column]
+    low, high = layer.base[row, column] - beam._GROUND_SLACK_M, layer.top[row, column]
     within = inside & (at[..., 2] >= low) & (at[..., 2] <= high) & (steps < ends[:, None])
     first = np.where(within.any(1), steps[within.argmax(1)], ends)
     entered = directions[:, 2] < 0  # a step from below may be taken for one from a side
@@ -123,7 +121,7 @@ def test_the_march_is_what_a_search_in_small_steps_finds(seed: int, depth: float
     assert (shallow[entered] <= first[entered] + 1e-6).all()
     assert (np.abs(shallow - first)[entered] < 1e-2).mean() > 0.8
     deep = layer_of(cells, deeper * depths, grid_m=0.5)
-    hits = meet_snow(
+    hits = meet_layers(
         LidarSnow(deep, {}, 1.0), street(), sweep_of(points), 0, origins, directions, ends
     )
     assert (hits <= shallow + 1e-6).all()

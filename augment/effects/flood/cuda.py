@@ -14,6 +14,7 @@ from augment.effects.flood import cuda_kernels as kernels
 from augment.effects.flood.flood import Layer
 from augment.effects.flood.refraction import MIP_LEVELS, smooth_variance, window_offset
 from augment.effects.flood.water import Water, flat_faces, medium_numbers, view_numbers
+from augment.effects.flood.water_kernels import HIDDEN_COVER
 from augment.effects.flood.water_plane import (
     BEGIN,
     END,
@@ -268,7 +269,7 @@ def trace(
 # ---- The water's colours -------------------------------------------------------------------------
 
 
-def shade(water: Water, hidden_cover: float) -> Float[Tensor, "h w 3"]:
+def shade(water: Water) -> Float[Tensor, "h w 3"]:
     """As `water.shade_water`."""
     camera, medium, field, screen = water.camera, water.medium, water.field, water.screen
     faces, size, layered = flat_faces(water.sky, water.smog)
@@ -284,7 +285,7 @@ def shade(water: Water, hidden_cover: float) -> Float[Tensor, "h w 3"]:
     launch(
         kernels.shade,
         (across * -(-camera.height // high),),
-        *(upload(_numbers(water, hidden_cover, layered)), _rows_of(camera)[0]),
+        *(upload(_numbers(water, layered)), _rows_of(camera)[0]),
         *(resident(faces), size, cover),
         *(_on_gpu(part) for part in (field.normal_x, field.normal_y, field.slope_variance)),
         *(*_images(water.bed), *window_offset(water.bed.camera, camera)),
@@ -320,16 +321,13 @@ def _averages(
     return mips, levels
 
 
-def _numbers(
-    water: Water, hidden_cover: float, layered: SmogMedium | None
-) -> Float32[np.ndarray, " n"]:
+def _numbers(water: Water, layered: SmogMedium | None) -> Float32[np.ndarray, " n"]:
     """What `kernels.shade` reads beside images."""
     camera, bed = water.camera, water.bed
     axes = camera.world_from_camera[:3, :3].numpy()
     lens = [1 / camera.fx, 1 / camera.fy, 0.5 - camera.cx, 0.5 - camera.cy]
     front = None if water.screen is None else water.screen.layer
     views = [view_numbers((layer or bed).camera) for layer in (bed, water.mirror, front)]
-    limits = [hidden_cover, smooth_variance(camera)]
     numbers = [axes.reshape(-1), [*lens, axes[2, 0] / camera.fx], *views]
-    numbers += [medium_numbers(water, layered), limits]
+    numbers += [medium_numbers(water, layered), [HIDDEN_COVER, smooth_variance(camera)]]
     return np.concatenate(numbers).astype(np.float32)

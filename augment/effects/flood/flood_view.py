@@ -29,7 +29,7 @@ from augment.effects.flood import water_kernels
 from augment.effects.flood.flood import FloodMedium, Layer, exact
 from augment.effects.flood.refraction import is_smooth
 from augment.effects.flood.screen_space import ScreenReflection, trace_screen
-from augment.effects.flood.water import HIDDEN_COVER, shade_water
+from augment.effects.flood.water import shade_water
 from augment.effects.flood.water_plane import (
     Margins,
     Window,
@@ -382,14 +382,14 @@ def _from_above(
         backend = CUDA  # also passes without an image of their own run where the layers lie
     with timed("flood: where it is seen"):
         water, most_shown = find_water(front.alpha, camera, backend=backend)
-    if most_shown < 1 - HIDDEN_COVER:
+    if most_shown < 1 - water_kernels.HIDDEN_COVER:
         with timed("sky"):
             image = composite_sky(front.rgb, front.alpha, camera, sky, smog=smog, backend=backend)
         return FloodedImage(image, front, water, is_hidden=True)
 
     crop = window.of(camera)
     cover = window.cut(front.alpha)
-    seen = cover <= HIDDEN_COVER
+    seen = cover <= water_kernels.HIDDEN_COVER
     with timed("flood: waves"):
         field = wave_field(medium.waves, crop, medium.level_z_m, backend=backend)
     margins = _bed_margins(camera, medium)

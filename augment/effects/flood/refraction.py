@@ -1,8 +1,9 @@
-"""What is seen through the water's surface: the bed, through the water over it."""
+"""The torch definition of what a pixel of water shows: the bed through the surface, and what the
+surface reflects.
+"""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch
@@ -12,17 +13,29 @@ from torch import Tensor
 from augment.cameras import Camera
 from augment.effects.flood.flood import FloodMedium, Layer
 from augment.effects.flood.screen_space import ScreenReflection
+from augment.effects.flood.water_kernels import (
+    BED_STEPS,
+    EDGE,
+    FAINT,
+    FARTHEST,
+    MATCH_M,
+    MATCH_SHARE,
+    MAX_OPTICAL_DEPTH,
+    MIN_COSINE,
+    MIN_DEPTH,
+    SETTLED_M,
+    SOLID_ALPHA,
+    STEEPEST,
+)
 from augment.effects.flood.waves import WaveField
 from augment.effects.smog import SmogMedium, optical_depth, vertical_optical_depth
 from augment.render.composite import sky_behind
 from augment.sky import Sky
 
-# ---- Where vectors lie in a layer's image, and what the layer shows there ------------------------
-# Image coordinates are (column, row) in pixels, the first pixel's centre at (0.5, 0.5). Vectors are
-# in world axes and start at the layer's optical centre; their length plays no part.
+# ---- What a layer's image shows in a direction ---------------------------------------------------
+# Image coordinates are (column, row) in pixels. Vectors are in world axes and start at the layer's
+# optical centre.
 
-SOLID_ALPHA = 0.5  # a pixel at least this opaque shows a surface at its depth
-MIN_DEPTH = 1e-20  # of what is projected: things behind a camera land far outside its image
 MIP_LEVELS = 7  # blurs up to 64 pixels: three taps are seldom farther apart
 
 
@@ -100,12 +113,9 @@ def blurred(
 
 
 # ---- Where a camera's rays meet the water, and how the surface is tilted there -------------------
-# Vectors are in world axes, points relative to the eye: float32 stays exact far from the origin.
+# Points are relative to the eye: float32 stays exact far from the world's origin.
 
-FARTHEST = 1e12  # times the eye's distance from the image plane: rays along the water end here
-MIN_COSINE = 1e-3  # of rays against the surface, and of reflected ones against the horizon
 SMOOTH_PX = 2.0  # reflections that a pixel's slopes spread over less are as good as sharp
-STEEPEST = 1e-6  # least square of a normal's z
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,13 +228,6 @@ def _at_least_upward(ray: Tensor) -> Tensor:
 
 
 # ---- The bed as seen through the surface ---------------------------------------------------------
-
-BED_STEPS = 2  # corrections of the bed's depth where a refracted ray meets it,
-SETTLED_M = 0.01  # unless the last one was smaller
-# Where less of any colour comes up from the depth of the bed straight behind a pixel, no bed is
-# looked for: a quarter of an 8-bit step at most, but for beds that rise before the pixel's own.
-MIN_TRANSMITTANCE = 1 / 1024
-MAX_OPTICAL_DEPTH = -math.log(MIN_TRANSMITTANCE)
 
 
 def window_offset(outer: Camera, inner: Camera) -> tuple[int, int]:
@@ -342,14 +345,7 @@ def smog_before(
     return optical_depth(smog, surface.distance, float(camera.centre[2]), level)
 
 
-# ---- What a water surface reflects: the sky, a view from below the water, the image itself -------
-# A ray that leaves the surface a little off the flat mirror's direction is looked up in the
-# mirrored layer, or in the front layer, at the distance at which it meets something.
-
-EDGE = 0.04  # share of the image's sides over which what the image shows fades out
-MATCH_M, MATCH_SHARE = 0.3, 0.05  # how far beside a surface a ray may end and still show it
-
-FAINT = 1 / 256  # a share of the sky that does not change what it shows through
+# ---- What the surface reflects: the sky, the mirrored layer, the image itself --------------------
 
 Colours = list[Tensor]  # one [H, W, 3], or 4 with alpha, for each of a pixel's normals
 

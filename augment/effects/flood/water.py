@@ -1,9 +1,9 @@
 """A water surface's picture: what it reflects, and what is seen through it. The torch definition.
 
-water = sum_i w_i F_i R_i + (1 - sum_i w_i F_i) T
+    water = sum_i w_i F_i R_i + (1 - sum_i w_i F_i) T
 
-i runs over the slopes of the surface inside a pixel, F is the reflected share of the light, R what
-comes from the mirrored direction and T what comes up through the surface.
+i runs over the slopes inside a pixel; F: reflected share of the light, R: what comes from the
+mirrored direction, T: what comes up through the surface.
 """
 
 from __future__ import annotations
@@ -18,11 +18,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from augment.cameras import Camera
-from augment.effects.flood import refraction
 from augment.effects.flood import water_kernels as kernels
 from augment.effects.flood.flood import FloodMedium, Layer, reflectance
 from augment.effects.flood.refraction import (
-    MIN_COSINE,
+    MIP_LEVELS,
     Surface,
     before_sky,
     is_smooth,
@@ -38,6 +37,7 @@ from augment.effects.flood.refraction import (
     window_offset,
 )
 from augment.effects.flood.screen_space import ScreenReflection
+from augment.effects.flood.water_kernels import HIDDEN_COVER, MIN_COSINE
 from augment.effects.flood.water_plane import image_coordinates
 from augment.effects.flood.waves import WaveField
 from augment.effects.smog import SmogMedium, optical_depth, vertical_optical_depth
@@ -47,7 +47,6 @@ from augment.render.threads import kernel_threads
 from augment.sky import (
     ConstantSky,
     CubemapSky,
-    LatLongSky,
     Sky,
     bordered_faces,
     directions_of_cubemap,
@@ -69,7 +68,7 @@ class Water(NamedTuple):
     smog: SmogMedium | None
 
 
-# ---- Arrays for the kernels that shade water on the CPU, and their launch ------------------------
+# ---- The kernels' arrays -------------------------------------------------------------------------
 
 ROWS = 8  # image rows a thread takes at a time: rows without water cost nothing
 MIP_ROWS = 32
@@ -78,7 +77,7 @@ _known_faces: WeakKeyDictionary[Sky, tuple[int, Tensor]] = WeakKeyDictionary()
 LARGEST = 1e30  # stands for infinity: its products with 0 are 0
 
 
-def _shade(water: Water, hidden_cover: float) -> Tensor:
+def _shade(water: Water) -> Tensor:
     camera, field, mirror, screen = water.camera, water.field, water.mirror, water.screen
     faces, size, layered = flat_faces(water.sky, water.smog)
     limit = smooth_variance(camera)
@@ -104,7 +103,7 @@ def _shade(water: Water, hidden_cover: float) -> Tensor:
         faces.numpy(),
         np.uint64(size),
         medium_numbers(water, layered),
-        _limits(hidden_cover, limit),
+        np.float32(limit),
         out,
     )
     with kernel_threads(ROWS):
@@ -117,27 +116,25 @@ def _array(part: Tensor) -> np.ndarray:
 
 
 def flat_faces(sky: Sky, smog: SmogMedium | None) -> tuple[Tensor, int, SmogMedium | None]:
-    """A flat cube map for the kernels, the size of its faces with border, the smog before them.
+    """(flat cube map, size of its faces with border, the smog before them).
 
-    The map of a sky that is an image is the same tensor until the image changes.
+    The map of an image is the same tensor until the image changes.
     """
     seen, layered = sky_behind(sky, smog)
     if isinstance(seen, ConstantSky):
         return _padded(seen.rgb.expand(6, 3, 3, 3)), 3, layered
-    if not isinstance(seen, CubemapSky | LatLongSky):
-        return _padded(with_border(_sampled(seen))), SKY_SIZE + 2, layered
-    image = seen.faces if isinstance(seen, CubemapSky) else seen.image
-    known = _known_faces.get(seen)
+    image = seen.faces if isinstance(seen, CubemapSky) else getattr(seen, "image", None)
+    known = None if image is None else _known_faces.get(seen)
     if known is None or known[0] != image._version:
-        is_cube = isinstance(seen, CubemapSky)
-        faces = bordered_faces(seen) if is_cube else with_border(_sampled(seen))
-        known = _known_faces[seen] = (image._version, _padded(faces))
+        if isinstance(seen, CubemapSky):
+            faces = bordered_faces(seen)
+        else:
+            faces = with_border(seen.sample(directions_of_cubemap(SKY_SIZE)))
+        known = (0 if image is None else image._version), _padded(faces)
+        if image is not None:
+            _known_faces[seen] = known
     size = seen.faces.shape[1] if isinstance(seen, CubemapSky) else SKY_SIZE
     return known[1], size + 2, layered
-
-
-def _sampled(sky: Sky) -> Tensor:
-    return sky.sample(directions_of_cubemap(SKY_SIZE))
 
 
 def _padded(faces: Tensor) -> Tensor:
@@ -176,7 +173,7 @@ def _averages(layer: Layer | None, rough: bool) -> tuple[np.ndarray, np.ndarray]
     rgb, alpha = _array(layer.rgb), _array(layer.alpha)
     height, width = alpha.shape
     spare, shapes, first = width + 1, [(0, width, height)], height * width
-    while len(shapes) < refraction.MIP_LEVELS and max(height, width) > 1:
+    while len(shapes) < MIP_LEVELS and max(height, width) > 1:
         height, width = (height + 1) // 2, (width + 1) // 2
         shapes.append((first, width, height))
         first += height * width
@@ -205,20 +202,7 @@ def medium_numbers(water: Water, layered: SmogMedium | None) -> np.ndarray:
     return np.minimum(numbers, LARGEST).astype(np.float32)
 
 
-def _limits(hidden_cover: float, smooth: float) -> np.ndarray:
-    """`kernels.Limits`."""
-    r = refraction
-    numbers = [hidden_cover, r.FARTHEST, r.MIN_COSINE, smooth, r.STEEPEST, r.MIN_DEPTH]
-    numbers += [r.SOLID_ALPHA, r.BED_STEPS, r.EDGE, r.MATCH_M, r.MATCH_SHARE, r.SETTLED_M]
-    return np.asarray([*numbers, r.MAX_OPTICAL_DEPTH, r.FAINT], np.float32)
-
-
 # ---- The colour of the water ---------------------------------------------------------------------
-
-# Water that is covered more than this is one colour. Opaque surfaces let up to 4 % through (a splat
-# that would bring transmittance to 1e-4 is not blended, whatever is left before it), and what
-# shines through them is worth no reflections.
-HIDDEN_COVER = 0.95
 
 
 def shade_water(
@@ -236,11 +220,10 @@ def shade_water(
 ) -> Float[Tensor, "h w 3"]:
     """Colour of the water where the camera's rays meet it, not clamped; 0 where they do not.
 
-    cover: alpha of what stands before the water; where it is more than HIDDEN_COVER the result is
-    the water's own colour, or the smog's. bed: from a window of the same image, best a larger one.
-    mirror: from the eye mirrored in the plane. screen: of the same eye; it serves the pixels that
-    are smooth. Layers are fogged already; smog here dims the sky and the water's own colour.
-    backend: kernels take float32 without gradients, equal within float rounding.
+    cover: alpha of what stands before the water; above HIDDEN_COVER the result is the water's own
+    colour, or the smog's. bed: from a window of the same image. mirror: from the mirrored eye.
+    screen: serves the smooth pixels. Layers are fogged already; smog here dims the sky and the
+    water's own colour. backend: kernels equal the definition within float rounding.
 
     Raises:
         ValueError: the eye is not above the water, or cameras, images and fields do not fit.
@@ -253,11 +236,11 @@ def shade_water(
     images = [(i.rgb, i.alpha, i.depth) for i in layers if i is not None]
     backend = kernels_for(backend, cover, *(part for parts in images for part in parts))
     if backend == CPU:
-        return _shade(water, HIDDEN_COVER)
+        return _shade(water)
     if backend != REFERENCE:
         from augment.effects.flood import cuda
 
-        return cuda.shade(water, HIDDEN_COVER)
+        return cuda.shade(water)
     surface = meet_plane(camera, medium.level_z_m, bed.rgb.dtype)
     smooth = is_smooth(field, camera)
     taps = tilted_normals(surface, field, smooth)

@@ -1,19 +1,17 @@
-"""Numba kernels for a water surface: what `water.shade_water` defines.
+"""Numba kernels that shade a water surface and composite a flooded view's layers.
 
-The pixels of a row that show water are collected in two lists, smooth and rough ones, and worked on
-eight at a time: what a list's pixels need differs (rough ones: three slopes and averages over
-squares of pixels; smooth ones: the image itself), and what none of the eight needs is left out.
-Coordinates and colours are vectors of eight; looking pixels up is done one by one, through scratch
-memory, which holds lines of eight numbers. All is float32 but the rays' directions, whose sign
-decides where there is water and whose small downward part the distance to it is divided by.
-Indices are unsigned, so that nothing wraps.
+`shade` implements `water.shade_water`. It sorts a row's water pixels into a smooth and a rough list
+and works on eight pixels at a time: rough ones need three slopes and mip levels, smooth ones the
+image itself. Coordinates and colours are vectors of eight; pixels are fetched one by one through
+scratch memory. All is float32 but the rays' directions, whose sign decides where there is water and
+whose small downward part the distance to it is divided by. Indices are unsigned, so nothing wraps.
 """
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from llvmlite import ir
 from numba import prange
@@ -25,13 +23,36 @@ from augment.render.cpu.jit import inner, kernel
 from augment.render.cpu.simd import LOG2_E, exp2_fine, log2
 from augment.render.layout import U
 
-# ---- Numba kernels for averages over ever larger squares of pixels: images are halved ------------
+# pyright: reportCallIssue=false, reportGeneralTypeIssues=false, reportAttributeAccessIssue=false
+# (of numba's intrinsics it sees the compiler's first argument as well, and no result)
+
+# Constants of the definition (`refraction`, `water`), which the kernels round to float32.
+# Water that is covered more than HIDDEN_COVER is one colour. Opaque surfaces let up to 4 % through
+# (a splat that would bring transmittance to 1e-4 is not blended, whatever is left before it), and
+# what shines through them is worth no reflections.
+HIDDEN_COVER = 0.95
+SOLID_ALPHA = 0.5  # a pixel at least this opaque shows a surface at its depth
+MIN_DEPTH = 1e-20  # of what is projected: things behind a camera land far outside its image
+FARTHEST = 1e12  # times the eye's distance from the image plane: rays along the water end here
+MIN_COSINE = 1e-3  # of rays against the surface, and of reflected ones against the horizon
+STEEPEST = 1e-6  # least square of a normal's z
+BED_STEPS = 2  # corrections of the bed's depth where a refracted ray meets it,
+SETTLED_M = 0.01  # unless the last one was smaller
+# Where less of any colour comes up from the bed straight behind a pixel, no bed is looked for: a
+# quarter of an 8-bit step at most, but for beds that rise before the pixel's own.
+MIN_TRANSMITTANCE = 1 / 1024
+MAX_OPTICAL_DEPTH = -math.log(MIN_TRANSMITTANCE)
+EDGE = 0.04  # share of the image's sides over which what the image shows fades out
+MATCH_M, MATCH_SHARE = 0.3, 0.05  # how far beside a surface a ray may end and still show it
+FAINT = 1 / 256  # a share of the sky that does not change what it shows through
+
+# ---- Mip levels ----------------------------------------------------------------------------------
 
 
 @kernel
 def pack(rgb, alpha, out):
     """rgb [H, W, 3] and alpha [H, W] side by side in out [H, W, 4]."""
-    for i in numba.prange(out.shape[0]):
+    for i in prange(out.shape[0]):
         for j in range(np.uint64(out.shape[1])):
             for c in range(np.uint64(3)):
                 out[i, j, c] = rgb[i, j, c]
@@ -43,7 +64,7 @@ def halve_mip(image, out):
     """Averages over 2 x 2 pixels of image [H, W, 4] into out [h, w, 4]."""
     height, width, _ = image.shape
     quarter = np.float32(0.25)
-    for i in numba.prange(out.shape[0]):
+    for i in prange(out.shape[0]):
         top, bottom = np.uint64(2 * i), np.uint64(min(2 * i + 1, height - 1))
         for j in range(np.uint64(out.shape[1])):
             c0 = np.uint64(2) * j
@@ -55,7 +76,7 @@ def halve_mip(image, out):
                 out[i, j, c] = quarter * total
 
 
-# ---- Numba kernels that put the layers of a flooded view together --------------------------------
+# ---- Layers of a flooded view --------------------------------------------------------------------
 
 
 @inner()
@@ -92,9 +113,9 @@ def composite_water(u, v, rise, top, left, alpha, color, rgb):
         for j in range(color.shape[1]):
             if _falls(u[j], v[i], rise) < 0.0:
                 column = U(left + j)
-                through = np.float32(1) - alpha[row, column]
+                transmittance = np.float32(1) - alpha[row, column]
                 for c in range(U(3)):
-                    rgb[row, column, c] += through * color[U(i), U(j), c]
+                    rgb[row, column, c] += transmittance * color[U(i), U(j), c]
 
 
 @kernel
@@ -127,14 +148,10 @@ def join_alpha(alpha, behind_alpha):
             alpha[i, j] = a + (np.float32(1) - a) * behind_alpha[i, j]
 
 
-# ---- water kernels -------------------------------------------------------------------------------
-
-# pyright: reportCallIssue=false, reportGeneralTypeIssues=false, reportAttributeAccessIssue=false
-# (of numba's intrinsics it sees the compiler's first argument as well, and no result)
-
+# ---- The water's colour --------------------------------------------------------------------------
 
 F = np.float32
-ZERO, HALF, ONE = F(0), F(0.5), F(1)
+ZERO, HALF, ONE, SOLID = F(0), F(0.5), F(1), F(SOLID_ALPHA)
 TINY = F(1e-7)
 STRIP = 64  # pixels of a list that are worked on at a time
 LANES = U(8)
@@ -147,8 +164,8 @@ DX, DY, DZ, ALONG, NX, NY, ROUGH, OWN_DEPTH, DISTANCE, TRUST = (U(STRIP * k) for
 LIST = U(STRIP * 10)
 
 # Lines of the scratch memory. Look-ups: pixel, way from it, colour; was the bed found and how deep;
-# two levels of averages; for each of three slopes the mirrored ray, its share of the light
-# and its place in the mirror.
+# two mip levels; for each of three slopes the mirrored ray, its share of the light and its place in
+# the mirror.
 C0, R0, FC, FR, R, G, B, A, FOUND, DEPTH, SHARE_ABOVE = (U(8 * k) for k in range(11))
 LOW, WIDE, HIGH, SCALE = (U(88 + 16 * k) for k in range(4))
 RX, RY, RZ, SHARE, MIRROR_C, MIRROR_R = (U(152 + 24 * k) for k in range(6))
@@ -156,12 +173,12 @@ SCRATCH = 152 + 24 * 6
 
 
 class View(NamedTuple):
-    """A layer's camera. Tuples hold numbers alone: counting references to arrays would take longer
-    than the arithmetic.
+    """A layer's camera, unpacked from an array by `_view`: counting references to arrays would take
+    longer than the arithmetic.
 
     project: focal length times the camera's right, down (fx, fy) and forward axes. rays:
     coefficients of column, row and 1 in the x, y, z of a pixel's ray. columns, rows: the image's
-    sides as real numbers. Kernels take it as one array and build it with `_view`.
+    sides as real numbers.
     """
 
     project: tuple[np.float32, ...]
@@ -175,7 +192,7 @@ class View(NamedTuple):
 
 
 class Medium(NamedTuple):
-    """The water, and the smog over it, as the kernel needs them.
+    """The water and the smog over it.
 
     height: of the eye over the water. smog_per_m: optical depth between eye and water per metre of
     the ray, 0 without smog. smog_above: from the water straight up, < 0 where the sky is seen
@@ -193,25 +210,6 @@ class Medium(NamedTuple):
     least_extinction: np.float32
 
 
-class Limits(NamedTuple):
-    """The definition's constants."""
-
-    cover: np.float32
-    farthest: np.float32
-    least_cosine: np.float32
-    smooth_variance: np.float32
-    steepest: np.float32
-    least_depth: np.float32
-    solid_alpha: np.float32
-    bed_steps: int
-    edge: np.float32
-    match_m: np.float32
-    match_share: np.float32
-    settled_m: np.float32
-    opaque: np.float32
-    faint: np.float32
-
-
 @inner()
 def _view(n):
     project = (n[0], n[1], n[2], n[3], n[4], n[5], n[6], n[7], n[8])
@@ -225,14 +223,6 @@ def _medium(n):
     extinction, rgb, airlight = (n[3], n[4], n[5]), (n[6], n[7], n[8]), (n[11], n[12], n[13])
     least = min(n[3], min(n[4], n[5]))
     return Medium(n[0], n[1], n[2] > ZERO, extinction, rgb, n[9], n[10], airlight, least)
-
-
-@inner()
-def _limits(n):
-    return Limits(
-        n[0], n[1], n[2], n[3], n[4], n[5], n[6], np.int64(n[7]), n[8], n[9], n[10], n[11], n[12],
-        n[13],
-    )  # fmt: skip
 
 
 @intrinsic
@@ -333,17 +323,61 @@ def _clamp(x, low, high):
 
 
 @inner()
-def _dot(m, first, x, y, z):
-    return v8.splat(m[first]) * x + v8.splat(m[first + 1]) * y + v8.splat(m[first + 2]) * z
+def _splat3(c):
+    return v8.splat(c[0]), v8.splat(c[1]), v8.splat(c[2])
 
 
 @inner()
-def _project(view, x, y, z, limits):
+def _blend3(t, a, b):
+    """t a + (1 - t) b of two colours."""
+    rest = v8.splat(ONE) - t
+    return t * a[0] + rest * b[0], t * a[1] + rest * b[1], t * a[2] + rest * b[2]
+
+
+@inner()
+def _blend4(t, a, b):
+    red, green, blue = _blend3(t, (a[0], a[1], a[2]), (b[0], b[1], b[2]))
+    return red, green, blue, t * a[3] + (v8.splat(ONE) - t) * b[3]
+
+
+@inner()
+def _select3(mask, a, b):
+    return v8.select(mask, a[0], b[0]), v8.select(mask, a[1], b[1]), v8.select(mask, a[2], b[2])
+
+
+@inner()
+def _load3(s, x, y, z):
+    return v8.load(s, x), v8.load(s, y), v8.load(s, z)
+
+
+@inner()
+def _norm(x, y, z):
+    return v8.sqrt(x * x + y * y + z * z)
+
+
+@inner()
+def _any(mask):
+    return v8.any_not_negative(v8.select(mask, v8.splat(ONE), v8.splat(-ONE)))
+
+
+@inner()
+def _exponential(x):
+    """exp(-x) for x >= 0."""
+    return exp2_fine(v8.maximum(x * v8.splat(-LOG2_E), v8.splat(F(-126))))
+
+
+@inner()
+def _dot(m, first, p):
+    return v8.splat(m[first]) * p[0] + v8.splat(m[first + 1]) * p[1] + v8.splat(m[first + 2]) * p[2]
+
+
+@inner()
+def _project(view, p):
     m = view.project
-    depth = v8.maximum(_dot(m, 6, x, y, z), v8.splat(limits.least_depth))
+    depth = v8.maximum(_dot(m, 6, p), v8.splat(F(MIN_DEPTH)))
     inverse = v8.splat(ONE) / depth
-    column = _dot(m, 0, x, y, z) * inverse + v8.splat(view.cx)
-    return column, _dot(m, 3, x, y, z) * inverse + v8.splat(view.cy)
+    column = _dot(m, 0, p) * inverse + v8.splat(view.cx)
+    return column, _dot(m, 3, p) * inverse + v8.splat(view.cy)
 
 
 @inner()
@@ -377,31 +411,20 @@ def _ray_part(view, first, column, row):
 
 
 @inner()
-def _way(view, z, column, row, x0, y0, z0):
+def _way(view, z, column, row, p):
     """How far the points that pixels show (relative to the layer's eye) are from others."""
-    x = z * _ray_part(view, 0, column, row) - x0
-    y = z * _ray_part(view, 3, column, row) - y0
-    z = z * _ray_part(view, 6, column, row) - z0
-    return v8.sqrt(x * x + y * y + z * z)
+    x = z * _ray_part(view, 0, column, row) - p[0]
+    y = z * _ray_part(view, 3, column, row) - p[1]
+    z = z * _ray_part(view, 6, column, row) - p[2]
+    return _norm(x, y, z)
 
 
 @inner()
-def _end(px, py, pz, distance, rx, ry, rz):
+def _end(p, distance, ray):
     """Where rays end, and their directions where that is nowhere (a distance < 0)."""
     met = v8.at_least(distance, v8.splat(ZERO))
-    x, y = v8.select(met, px + distance * rx, rx), v8.select(met, py + distance * ry, ry)
-    return x, y, v8.select(met, pz + distance * rz, rz)
-
-
-@inner()
-def _any(mask):
-    return v8.any_not_negative(v8.select(mask, v8.splat(ONE), v8.splat(-ONE)))
-
-
-@inner()
-def _exponential(x):
-    """exp(-x) for x >= 0."""
-    return exp2_fine(v8.maximum(x * v8.splat(-LOG2_E), v8.splat(F(-126))))
+    ends = p[0] + distance * ray[0], p[1] + distance * ray[1], p[2] + distance * ray[2]
+    return _select3(met, ends, ray)
 
 
 @inner()
@@ -445,10 +468,15 @@ def _bilinear(s, k, rgb, alpha, width, right, below):
 
 
 @inner()
+def _neighbours(view):
+    """Steps to the pixels right and below; 0 in images of one column or row."""
+    return min(view.width - U(1), U(1)), min(view.height - U(1), U(1)) * view.width
+
+
+@inner()
 def _fetch(s, column, row, rgb, alpha, view):
     _place(s, column, row, v8.splat(view.columns), v8.splat(view.rows))
-    right = min(view.width - U(1), U(1))
-    below = min(view.height - U(1), U(1)) * view.width
+    right, below = _neighbours(view)
     for k in range(LANES):
         r, g, b, a = _bilinear(s, k, rgb, alpha, view.width, right, below)
         s[R + k], s[G + k], s[B + k], s[A + k] = r, g, b, a
@@ -457,7 +485,7 @@ def _fetch(s, column, row, rgb, alpha, view):
 
 @inner()
 def _choose_levels(s, starts, level, sizes):
-    """The two levels of averages round real ones: first pixels, sizes, scales of coordinates."""
+    """The two mip levels round real ones: first pixels, sizes, scales of coordinates."""
     low, top = v8.floor(level), v8.splat(F(np.int32(sizes.shape[0] - 1)))
     v8.store(s, SHARE_ABOVE, level - low)
     v8.store(s, LOW, low)
@@ -471,7 +499,7 @@ def _choose_levels(s, starts, level, sizes):
 
 @inner()
 def _fetch_level(s, starts, second, column, row, mips):
-    """Colours and alphas from one of the levels chosen; second: LANES for the upper one."""
+    """Colours and alphas from one of the chosen levels; second: LANES for the upper one."""
     scale = v8.load(s, SCALE + second)
     wide, high = v8.load(s, WIDE + second), v8.load(s, HIGH + second)
     _place(s, column * scale, row * scale, wide, high)
@@ -484,19 +512,8 @@ def _fetch_level(s, starts, second, column, row, mips):
 
 
 @inner()
-def _fetch_blurred(s, starts, column, row, mips):
-    """Colours and alphas between the two levels chosen."""
-    r, g, b, a = _fetch_level(s, starts, U(0), column, row, mips)
-    r1, g1, b1, a1 = _fetch_level(s, starts, LANES, column, row, mips)
-    share = v8.load(s, SHARE_ABOVE)
-    keep = v8.splat(ONE) - share
-    r, g, b = keep * r + share * r1, keep * g + share * g1, keep * b + share * b1
-    return r, g, b, keep * a + share * a1
-
-
-@inner()
 def _sky(s, faces, size, x, y, z, near, medium):
-    """Colours of a cube map with a border, flat, in directions that climb, behind smog."""
+    """Colours of a flat, bordered cube map in directions that climb, behind smog."""
     zero = v8.splat(ZERO)
     ax, ay = v8.absolute(x), v8.absolute(y)
     by_x = v8.both(v8.at_least(ax, ay), v8.at_least(ax, z))
@@ -517,14 +534,11 @@ def _sky(s, faces, size, x, y, z, near, medium):
         at = _pixel(s[R0 + k]) * size + _pixel(s[C0 + k])
         r, g, b, _ = _between(faces, at, at + size, s[FC + k], s[FR + k])
         s[R + k], s[G + k], s[B + k] = r, g, b
-    r, g, b = v8.load(s, R), v8.load(s, G), v8.load(s, B)
+    seen = _load3(s, R, G, B)
     if medium.smog_above >= ZERO:
         t = _exponential(near + v8.splat(medium.smog_above) / z)
-        rest, fog = v8.splat(ONE) - t, medium.airlight
-        r = t * r + rest * v8.splat(fog[0])
-        g = t * g + rest * v8.splat(fog[1])
-        b = t * b + rest * v8.splat(fog[2])
-    return r, g, b
+        seen = _blend3(t, seen, _splat3(medium.airlight))
+    return seen
 
 
 @inner()
@@ -544,9 +558,12 @@ def _reflectance(c, inside, medium):
 
 
 @inner()
-def _facet(sx, sy, vx, vy, vz, medium, limits):
-    """Of facets with these slopes: normals, cosines in air and water, reflected share, rays."""
-    one, least = v8.splat(ONE), v8.splat(limits.least_cosine)
+def _facet(sx, sy, view, medium):
+    """Facets with these slopes, seen from unit `view`: (normals, cosines in air and water,
+    reflected share, mirrored rays).
+    """
+    one, least = v8.splat(ONE), v8.splat(F(MIN_COSINE))
+    vx, vy, vz = view
     nz = one / v8.sqrt(sx * sx + sy * sy + one)
     nx, ny = sx * nz, sy * nz
     cosine = nx * vx + ny * vy + nz * vz
@@ -556,66 +573,64 @@ def _facet(sx, sy, vx, vy, vz, medium, limits):
     twice = cosine + cosine
     x, y = twice * nx - vx, twice * ny - vy
     z = v8.maximum(twice * nz - vz, least)
-    unit = one / v8.sqrt(x * x + y * y + z * z)
+    unit = one / _norm(x, y, z)
     share = _reflectance(c, inside, medium)
-    return nx, ny, nz, c, inside, share, x * unit, y * unit, z * unit
+    return (nx, ny, nz), c, inside, share, (x * unit, y * unit, z * unit)
 
 
 @inner()
-def _refract(nx, ny, nz, c, inside, vx, vy, vz, medium, limits):
+def _refract(normal, c, inside, view, medium):
     """Refracted rays per metre of depth, and their length per metre."""
     one, ratio = v8.splat(ONE), v8.splat(ONE / medium.index)
     bend = c * ratio - inside
-    x, y = bend * nx - vx * ratio, bend * ny - vy * ratio
-    z = v8.maximum(vz * ratio - bend * nz, v8.splat(limits.least_cosine))
+    x, y = bend * normal[0] - view[0] * ratio, bend * normal[1] - view[1] * ratio
+    z = v8.maximum(view[2] * ratio - bend * normal[2], v8.splat(F(MIN_COSINE)))
     steep = one / z
-    return x * steep, y * steep, v8.sqrt(x * x + y * y + z * z) * steep
+    return x * steep, y * steep, _norm(x, y, z) * steep
 
 
 @inner()
-def _place_on_bed(px, py, tx, ty, depth, bed, medium, limits):
-    x, y = px + depth * tx, py + depth * ty
-    column, row = _project(bed, x, y, v8.splat(-medium.height) - depth, limits)
+def _place_on_bed(px, py, tx, ty, depth, bed, medium):
+    below = px + depth * tx, py + depth * ty, v8.splat(-medium.height) - depth
+    column, row = _project(bed, below)
     return column, row, _is_inside(bed, column, row)
 
 
 @inner()
-def _search_bed(s, found, depth, px, py, tx, ty, alpha, depths, bed, medium, limits):
+def _search_bed(s, found, depth, px, py, tx, ty, alpha, depths, bed, medium):
     """The bed's depth along the refracted rays; C0 to FR, FOUND (1 or 0): where they meet it."""
     zero, one = v8.splat(ZERO), v8.splat(ONE)
-    solid = v8.splat(limits.solid_alpha)
     going = found
-    for _ in range(limits.bed_steps):
+    for _ in range(BED_STEPS):
         goes = v8.greater(going, zero)
         if not _any(goes):
             break
-        column, row, inside = _place_on_bed(px, py, tx, ty, depth, bed, medium, limits)
+        column, row, inside = _place_on_bed(px, py, tx, ty, depth, bed, medium)
         a, z, column, row = _look(alpha, depths, bed, column, row)
-        met = v8.select(v8.both(inside, v8.at_least(a, solid)), one, zero)
+        met = v8.select(v8.both(inside, v8.at_least(a, v8.splat(SOLID))), one, zero)
         found = v8.select(goes, v8.minimum(found, met), found)
         going = v8.minimum(going, met)
         better = v8.splat(-medium.height) - z * _ray_part(bed, 6, column, row)
         better = v8.select(v8.greater(going, zero), v8.maximum(better, zero), depth)
-        moved = v8.greater(v8.absolute(better - depth), v8.splat(limits.settled_m))
+        moved = v8.greater(v8.absolute(better - depth), v8.splat(F(SETTLED_M)))
         going = v8.select(moved, going, zero)
         depth = better
-    column, row, inside = _place_on_bed(px, py, tx, ty, depth, bed, medium, limits)
+    column, row, inside = _place_on_bed(px, py, tx, ty, depth, bed, medium)
     _place(s, column, row, v8.splat(bed.columns), v8.splat(bed.rows))
     v8.store(s, FOUND, v8.select(inside, found, zero))
     return depth
 
 
 @inner()
-def _fetch_bed(s, q, own, place, at, depth, rgb, alpha, bed, limits):
+def _fetch_bed(s, q, own, place, at, depth, rgb, alpha, bed):
     """The bed's colour where it was found, straight behind the pixel elsewhere; its depth."""
     v8.store(s, DEPTH, depth)
-    right = min(bed.width - U(1), U(1))
-    below = min(bed.height - U(1), U(1)) * bed.width
+    right, below = _neighbours(bed)
     for k in range(LANES):
         r = g = b = a = ZERO
         if s[FOUND + k] > ZERO:
             r, g, b, a = _bilinear(s, k, rgb, alpha, bed.width, right, below)
-        if a < limits.solid_alpha:
+        if a < SOLID:
             pixel = U(own[place + k])
             r, g, b = (rgb[U(3) * pixel], rgb[U(3) * pixel + U(1)], rgb[U(3) * pixel + U(2)])
             a, s[DEPTH + k] = alpha[pixel], q[OWN_DEPTH + at + k]
@@ -631,30 +646,26 @@ def _absorb(seen, alpha, water, length, extinction):
 
 
 @inner()
-def _mirror_distance(alpha, depth, mirror, column, row, px, py, medium, limits):
+def _mirror_distance(alpha, depth, mirror, column, row, p):
     """From the surface to what the mirrored layer shows, -1 where that is nothing."""
     a, z, column, row = _look(alpha, depth, mirror, column, row)
-    way = _way(mirror, z, column, row, px, py, v8.splat(medium.height))
-    return v8.select(v8.at_least(a, v8.splat(limits.solid_alpha)), way, v8.splat(-ONE))
+    way = _way(mirror, z, column, row, p)
+    return v8.select(v8.at_least(a, v8.splat(SOLID)), way, v8.splat(-ONE))
 
 
 @inner()
-def _find_in_mirror(s, count, dx, dy, dz, px, py, alpha, depth, mirror, medium, limits):
+def _find_in_mirror(s, count, dx, dy, dz, px, py, alpha, depth, mirror, medium):
     """MIRROR_C, MIRROR_R: where the reflected rays end in the mirrored layer."""
-    pz = v8.splat(medium.height)
-    column, row = _project(mirror, dx, dy, v8.negate(dz), limits)
+    p = px, py, v8.splat(medium.height)
+    column, row = _project(mirror, (dx, dy, v8.negate(dz)))
     column, row = _clamp_to(mirror, column, row)
-    d = _mirror_distance(alpha, depth, mirror, column, row, px, py, medium, limits)
-    rx, ry, rz = v8.load(s, RX), v8.load(s, RY), v8.load(s, RZ)
-    x, y, z = _end(px, py, pz, d, rx, ry, rz)
-    column, row = _project(mirror, x, y, z, limits)
+    d = _mirror_distance(alpha, depth, mirror, column, row, p)
+    column, row = _project(mirror, _end(p, d, _load3(s, RX, RY, RZ)))
     column, row = _clamp_to(mirror, column, row)
-    d = _mirror_distance(alpha, depth, mirror, column, row, px, py, medium, limits)
+    d = _mirror_distance(alpha, depth, mirror, column, row, p)
     for tap in range(count):
         t = tap * LANES
-        rx, ry, rz = v8.load(s, RX + t), v8.load(s, RY + t), v8.load(s, RZ + t)
-        x, y, z = _end(px, py, pz, d, rx, ry, rz)
-        column, row = _project(mirror, x, y, z, limits)
+        column, row = _project(mirror, _end(p, d, _load3(s, RX + t, RY + t, RZ + t)))
         column, row = _clamp_to(mirror, column, row)
         v8.store(s, MIRROR_C + t, column)
         v8.store(s, MIRROR_R + t, row)
@@ -662,7 +673,7 @@ def _find_in_mirror(s, count, dx, dy, dz, px, py, alpha, depth, mirror, medium, 
 
 @inner()
 def _level(s, sizes):
-    """Level of averages whose pixels are as wide as a pixel's three places lie apart."""
+    """Mip level whose pixels are as wide as a pixel's three places lie apart."""
     c, r = v8.load(s, MIRROR_C), v8.load(s, MIRROR_R)
     x1, y1 = (v8.load(s, MIRROR_C + U(8)) - c, v8.load(s, MIRROR_R + U(8)) - r)
     x2, y2 = (v8.load(s, MIRROR_C + U(16)) - c, v8.load(s, MIRROR_R + U(16)) - r)
@@ -673,38 +684,39 @@ def _level(s, sizes):
 
 
 @inner()
-def _match_in_image(px, py, pz, d, rx, ry, rz, alpha, depth, front, limits):
-    """(column, row, alpha, depth, distance along the optical axis of the ray's end)."""
-    x, y, z = _end(px, py, pz, d, rx, ry, rz)
-    column, row = _project(front, x, y, z, limits)
-    a, z_seen, c, r = _look(alpha, depth, front, column, row)
-    return column, row, a, z_seen, c, r, _dot(front.project, 6, x, y, z)
-
-
-@inner()
-def _find_in_image(s, d, trust, px, py, alpha, depth, front, medium, limits):
+def _find_in_image(s, d, trust, px, py, alpha, depth, front, medium):
     """(column, row, weight) of the image's pixels in which the first ray ends."""
-    zero, one = v8.splat(ZERO), v8.splat(ONE)
-    pz, solid = v8.splat(-medium.height), v8.splat(limits.solid_alpha)
-    rx, ry, rz = v8.load(s, RX), v8.load(s, RY), v8.load(s, RZ)
-    _, _, a, z, c, r, _ = _match_in_image(px, py, pz, d, rx, ry, rz, alpha, depth, front, limits)
-    better = v8.select(v8.at_least(a, solid), _way(front, z, c, r, px, py, pz), d)
+    zero, one, solid = v8.splat(ZERO), v8.splat(ONE), v8.splat(SOLID)
+    p, ray = (px, py, v8.splat(-medium.height)), _load3(s, RX, RY, RZ)
+    column, row = _project(front, _end(p, d, ray))
+    a, z, c, r = _look(alpha, depth, front, column, row)
+    better = v8.select(v8.at_least(a, solid), _way(front, z, c, r, p), d)
     finite = v8.at_least(d, zero)
-    d = v8.select(finite, better, d)
-    column, row, a, z, _, _, ahead = _match_in_image(
-        px, py, pz, d, rx, ry, rz, alpha, depth, front, limits
-    )
-    allowed = v8.maximum(v8.splat(limits.match_share) * ahead, v8.splat(limits.match_m))
+    end = _end(p, v8.select(finite, better, d), ray)
+    column, row = _project(front, end)
+    a, z, _, _ = _look(alpha, depth, front, column, row)
+    ahead = _dot(front.project, 6, end)
+    allowed = v8.maximum(v8.splat(F(MATCH_SHARE)) * ahead, v8.splat(F(MATCH_M)))
     near = v8.both(v8.at_least(a, solid), v8.greater(allowed, v8.absolute(z - ahead)))
     on_sky = v8.select(v8.at_least(a, solid), zero, one)
     seen = v8.select(finite, v8.select(near, one, zero), on_sky)
     columns, rows = v8.splat(front.columns), v8.splat(front.rows)
     across = v8.minimum(column, columns - column) / columns
     border = v8.minimum(across, v8.minimum(row, rows - row) / rows)
-    fade = _clamp(border / v8.splat(limits.edge), ZERO, ONE)
+    fade = _clamp(border / v8.splat(F(EDGE)), ZERO, ONE)
     weight = trust * (fade * fade * (v8.splat(F(3)) - (fade + fade)))
     column, row = _clamp_to(front, column, row)
     return column, row, seen * weight
+
+
+@inner()
+def _store_tap(s, tap, share, ray):
+    """The mirrored ray of one of a pixel's slopes, and its share of the light."""
+    t = tap * LANES
+    v8.store(s, RX + t, ray[0])
+    v8.store(s, RY + t, ray[1])
+    v8.store(s, RZ + t, ray[2])
+    v8.store(s, SHARE + t, share)
 
 
 @kernel
@@ -712,22 +724,22 @@ def shade(
     u, v, axes, cover, normal_x, normal_y, variance, bed_view, bed_rgb, bed_alpha, bed_depth,
     offset, mirror_view, mirror_rgb, mirror_alpha, mirror_depth, mirror_mips, mirror_sizes,
     has_mirror, front_view, front_rgb, front_alpha, front_depth, has_front, front_distance,
-    front_weight, faces, size, medium_numbers, limit_numbers, out,
+    front_weight, faces, size, medium_numbers, smooth_variance, out,
 ):  # fmt: skip
     """Water of the pixels of a camera into out [H, W, 3].
 
     u [W], v [H]: image coordinates at unit depth. axes [3, 3]: world_from_camera, float64. offset:
     (left, top) of the camera's window in the bed's. front: the layer of the screen-space reflection
     whose rays run front_distance. faces: flat cube map with its border, `size` squared texels a
-    face, each four numbers. mirror_mips: the mirrored layer and its averages, four numbers a pixel.
-    mirror_sizes [levels, 3]: their first pixels, widths, heights. Both arrays go on a row and a
-    pixel beyond.
+    face, four numbers each. mirror_mips: the mirrored layer's mip levels, four numbers a pixel.
+    mirror_sizes [levels, 3]: their first pixels, widths, heights. faces and mirror_mips go on a row
+    and a pixel beyond. smooth_variance: slope variance from which a pixel is rough.
     """
     height, width = cover.shape
     left, top = offset
-    for i in numba.prange(height):
+    for i in prange(height):
         bed, mirror, front = _view(bed_view), _view(mirror_view), _view(front_view)
-        medium, limits = _medium(medium_numbers), _limits(limit_numbers)
+        medium = _medium(medium_numbers)
         q, s = np.zeros(2 * STRIP * 10, np.float32), np.zeros(SCRATCH, np.float32)
         pixels, own = np.zeros(2 * STRIP, np.int64), np.zeros(2 * STRIP, np.int64)
         starts = np.zeros(16, np.int64)
@@ -735,12 +747,12 @@ def shade(
         bx, by, bz = v[i] * axes[0, 1], v[i] * axes[1, 1], v[i] * axes[2, 1]
         own_row = i + top
         row_inside = own_row >= 0 and own_row < np.int64(bed.height)
-        far = np.float64(limits.farthest)
+        far = np.float64(F(FARTHEST))
         while True:
             while j < width and smooth_count < U(STRIP) and rough_count < U(STRIP):
                 # The order of these sums is that of Camera.ray_directions: the sign has to agree.
                 fall = (u[j] * axes[2, 0] + bz) + axes[2, 2]
-                if not (fall < 0.0 and cover[i, j] <= limits.cover):
+                if not (fall < 0.0 and cover[i, j] <= F(HIDDEN_COVER)):
                     plain = medium.airlight if medium.smog_per_m > ZERO else medium.rgb
                     met = ONE if fall < 0.0 else ZERO
                     for c in range(3):
@@ -748,7 +760,7 @@ def shade(
                     j += 1
                     continue
                 spread = variance[i, j]
-                if spread >= limits.smooth_variance:
+                if spread >= smooth_variance:
                     n, p = LIST + rough_count, U(STRIP) + rough_count
                     rough_count += U(1)
                 else:
@@ -764,7 +776,7 @@ def shade(
                 column = j + left
                 if row_inside and column >= 0 and column < np.int64(bed.width):
                     pixel = U(own_row) * bed.width + U(column)
-                    if bed_alpha[pixel] >= limits.solid_alpha:
+                    if bed_alpha[pixel] >= SOLID:
                         own[p] = np.int64(pixel)
                         q[OWN_DEPTH + n] = max(-bed_depth[pixel] * F(fall) - medium.height, ZERO)
                 if has_front:
@@ -795,39 +807,29 @@ def shade(
                 dx, dy, dz = v8.load(q, DX + at), v8.load(q, DY + at), v8.load(q, DZ + at)
                 along = v8.load(q, ALONG + at)
                 px, py = along * dx, along * dy
-                length = v8.sqrt(dx * dx + dy * dy + dz * dz)
+                length = _norm(dx, dy, dz)
                 inverse = one / length
-                vx, vy, vz = (
-                    v8.negate(dx) * inverse,
-                    v8.negate(dy) * inverse,
-                    v8.negate(dz) * inverse,
-                )
+                vx, vy = v8.negate(dx) * inverse, v8.negate(dy) * inverse
+                view = vx, vy, v8.negate(dz) * inverse
                 near = v8.splat(medium.smog_per_m) * along * length
                 nx, ny = v8.load(q, NX + at), v8.load(q, NY + at)
-                upright = v8.maximum(one - nx * nx - ny * ny, v8.splat(limits.steepest))
+                upright = v8.maximum(one - nx * nx - ny * ny, v8.splat(F(STEEPEST)))
                 upright = one / v8.sqrt(upright)
                 sx, sy = nx * upright, ny * upright
-                nx, ny, nz, c, inside, share, rx, ry, rz = _facet(
-                    sx, sy, vx, vy, vz, medium, limits
-                )
+                normal, c, inside, share, ray = _facet(sx, sy, view, medium)
                 # Through the surface.
-                wr, wg, wb = (
-                    v8.splat(medium.rgb[0]), v8.splat(medium.rgb[1]), v8.splat(medium.rgb[2])
-                )  # fmt: skip
+                water = _splat3(medium.rgb)
                 if medium.smog_per_m > ZERO:
-                    t = _exponential(near)
-                    rest, fog = one - t, medium.airlight
-                    wr, wg = t * wr + rest * v8.splat(fog[0]), t * wg + rest * v8.splat(fog[1])
-                    wb = t * wb + rest * v8.splat(fog[2])
-                below_r, below_g, below_b = wr, wg, wb
+                    water = _blend3(_exponential(near), water, _splat3(medium.airlight))
+                below = water
                 own_depth = v8.load(q, OWN_DEPTH + at)
                 bends = medium.index != ONE
-                tx, ty, steep = zero, zero, one / vz
+                tx, ty, steep = zero, zero, one / view[2]
                 if bends:
-                    tx, ty, steep = _refract(nx, ny, nz, c, inside, vx, vy, vz, medium, limits)
+                    tx, ty, steep = _refract(normal, c, inside, view, medium)
                 thick = own_depth * steep * v8.splat(medium.least_extinction)
                 clear = v8.both(
-                    v8.at_least(own_depth, zero), v8.greater(v8.splat(limits.opaque), thick)
+                    v8.at_least(own_depth, zero), v8.greater(v8.splat(F(MAX_OPTICAL_DEPTH)), thick)
                 )
                 if _any(clear):
                     found = v8.select(clear, one, zero)
@@ -835,95 +837,82 @@ def shade(
                     depth = own_depth
                     if bends:
                         depth = _search_bed(
-                            s, found, own_depth, px, py, tx, ty, bed_alpha, bed_depth, bed, medium,
-                            limits,
-                        )  # fmt: skip
-                    depth = _fetch_bed(
-                        s, q, own, start + first, at, depth, bed_rgb, bed_alpha, bed, limits
-                    )  # fmt: skip
+                            s, found, own_depth, px, py, tx, ty, bed_alpha, bed_depth, bed, medium
+                        )
+                    depth = _fetch_bed(s, q, own, start + first, at, depth, bed_rgb, bed_alpha, bed)
                     r, g, b, a = _fetched(s)
                     way = depth * steep
-                    r = _absorb(r, a, wr, way, medium.extinction[0])
-                    g = _absorb(g, a, wg, way, medium.extinction[1])
-                    b = _absorb(b, a, wb, way, medium.extinction[2])
-                    below_r = v8.select(clear, r, wr)
-                    below_g = v8.select(clear, g, wg)
-                    below_b = v8.select(clear, b, wb)
-                sum_r, sum_g, sum_b = below_r, below_g, below_b
+                    absorbed = (
+                        _absorb(r, a, water[0], way, medium.extinction[0]),
+                        _absorb(g, a, water[1], way, medium.extinction[1]),
+                        _absorb(b, a, water[2], way, medium.extinction[2]),
+                    )
+                    below = _select3(clear, absorbed, water)
+                sum_r, sum_g, sum_b = below
                 if bends:
                     # Mirrored rays and shares of the slopes.
                     if rough:
                         share = v8.splat(F(2 / 3)) * share
-                    v8.store(s, RX, rx)
-                    v8.store(s, RY, ry)
-                    v8.store(s, RZ, rz)
-                    v8.store(s, SHARE, share)
+                    _store_tap(s, U(0), share, ray)
                     if rough:
                         flat = v8.maximum(v8.sqrt(vx * vx + vy * vy), v8.splat(F(1e-12)))
                         spread8 = v8.sqrt(v8.splat(F(3)) * v8.load(q, ROUGH + at)) / flat
                         for tap in range(U(1), U(3)):
-                            t8 = tap * LANES
                             sign = ONE if tap == U(1) else -ONE
                             offset8 = v8.splat(sign) * spread8
-                            _, _, _, _, _, share, rx, ry, rz = _facet(
-                                sx + offset8 * vx, sy + offset8 * vy, vx, vy, vz, medium, limits
+                            _, _, _, share, ray = _facet(
+                                sx + offset8 * vx, sy + offset8 * vy, view, medium
                             )
-                            v8.store(s, RX + t8, rx)
-                            v8.store(s, RY + t8, ry)
-                            v8.store(s, RZ + t8, rz)
-                            v8.store(s, SHARE + t8, v8.splat(F(1 / 6)) * share)
+                            _store_tap(s, tap, v8.splat(F(1 / 6)) * share, ray)
                     # What stands above the water, where the image shows it.
-                    image_r, image_g, image_b, image_a, weight = zero, zero, zero, zero, zero
+                    image, weight = (zero, zero, zero, zero), zero
                     needs_mirror = has_mirror
                     if has_front and not rough:
                         column, row, weight = _find_in_image(
                             s, v8.load(q, DISTANCE + at), v8.load(q, TRUST + at), px, py,
-                            front_alpha, front_depth, front, medium, limits,
+                            front_alpha, front_depth, front, medium,
                         )  # fmt: skip
                         if _any(v8.greater(weight, zero)):
-                            image_r, image_g, image_b, image_a = _fetch(
-                                s, column, row, front_rgb, front_alpha, front
-                            )
+                            image = _fetch(s, column, row, front_rgb, front_alpha, front)
                         rest = _any(v8.greater(one - weight, v8.splat(TINY)))
                         needs_mirror = has_mirror and rest
                     if needs_mirror:
                         _find_in_mirror(
-                            s, taps, dx, dy, dz, px, py, mirror_alpha, mirror_depth, mirror,
-                            medium, limits,
-                        )  # fmt: skip
+                            s, taps, dx, dy, dz, px, py, mirror_alpha, mirror_depth, mirror, medium
+                        )
                     if needs_mirror and rough:
                         _choose_levels(s, starts, _level(s, mirror_sizes), mirror_sizes)
                     for tap in range(taps):
                         t8 = tap * LANES
-                        r, g, b, a = zero, zero, zero, zero
+                        seen = zero, zero, zero, zero
                         if needs_mirror:
                             column, row = v8.load(s, MIRROR_C + t8), v8.load(s, MIRROR_R + t8)
                             if rough:
-                                r, g, b, a = _fetch_blurred(s, starts, column, row, mirror_mips)
+                                lower = _fetch_level(s, starts, U(0), column, row, mirror_mips)
+                                upper = _fetch_level(s, starts, LANES, column, row, mirror_mips)
+                                seen = _blend4(v8.load(s, SHARE_ABOVE), upper, lower)
                             else:
-                                r, g, b, a = _fetch(
-                                    s, column, row, mirror_rgb, mirror_alpha, mirror
-                                )
+                                seen = _fetch(s, column, row, mirror_rgb, mirror_alpha, mirror)
                         if has_front:
-                            rest = one - weight
-                            r, g = weight * image_r + rest * r, weight * image_g + rest * g
-                            b, a = weight * image_b + rest * b, weight * image_a + rest * a
-                        through = one - a
-                        shines = v8.greater(through, v8.splat(limits.faint))
+                            seen = _blend4(weight, image, seen)
+                        r, g, b, a = seen
+                        transmittance = one - a
+                        shines = v8.greater(transmittance, v8.splat(F(FAINT)))
                         whole = one / v8.maximum(a, v8.splat(HALF))
-                        own_r, own_g, own_b = r * whole, g * whole, b * whole
+                        color = r * whole, g * whole, b * whole
                         if _any(shines):
-                            rx, ry, rz = (
-                                v8.load(s, RX + t8), v8.load(s, RY + t8), v8.load(s, RZ + t8)
-                            )  # fmt: skip
-                            sky_r, sky_g, sky_b = _sky(s, faces, size, rx, ry, rz, near, medium)
-                            own_r = v8.select(shines, r + through * sky_r, own_r)
-                            own_g = v8.select(shines, g + through * sky_g, own_g)
-                            own_b = v8.select(shines, b + through * sky_b, own_b)
+                            rx, ry, rz = _load3(s, RX + t8, RY + t8, RZ + t8)
+                            sky = _sky(s, faces, size, rx, ry, rz, near, medium)
+                            before = (
+                                r + transmittance * sky[0],
+                                g + transmittance * sky[1],
+                                b + transmittance * sky[2],
+                            )
+                            color = _select3(shines, before, color)
                         share = v8.load(s, SHARE + t8)
-                        sum_r = sum_r + share * (own_r - below_r)
-                        sum_g = sum_g + share * (own_g - below_g)
-                        sum_b = sum_b + share * (own_b - below_b)
+                        sum_r = sum_r + share * (color[0] - below[0])
+                        sum_g = sum_g + share * (color[1] - below[1])
+                        sum_b = sum_b + share * (color[2] - below[2])
                 v8.store(s, R, sum_r)
                 v8.store(s, G, sum_g)
                 v8.store(s, B, sum_b)

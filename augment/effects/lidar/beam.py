@@ -1,6 +1,4 @@
-"""A recipe's weather on a LiDAR sweep: the order of effects in plain sight.
-
-A beam meets the weather in this order, and so is it worked out, once for all returns:
+"""A recipe's weather on a LiDAR sweep, in the order in which a beam meets it.
 
 1. Snow ends it where it comes to the layer first: the echo is the snow's.
 2. Water bends it, swallows it, or sends it away; snow under water has melted.
@@ -15,12 +13,17 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
+import threading
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
 
 from augment.effects.flood.flood import FloodMedium, reflectance
+from augment.effects.lidar import snow_kernels
 from augment.effects.lidar.codes import (
     ATTENUATED,
     CODE_COLUMN,
@@ -30,8 +33,11 @@ from augment.effects.lidar.codes import (
     SCATTERED,
     UNCHANGED,
 )
-from augment.effects.lidar.snow import meet_snow, snow_in
 from augment.effects.smog import MAX_EXPONENT, SmogMedium, optical_depth_of_arrays
+from augment.effects.snow.cells import SnowCells, SnowSupport
+from augment.effects.snow.layer import find_depths, profile_on
+from augment.effects.snow.snow import PlacedSnow, placement_settings
+from augment.effects.snow.support import support_of
 from augment.labels import KnowsLidarOrigins, LidarSweep
 from augment.plan import Plan, make_plan
 from augment.rng import rng_for
@@ -39,7 +45,7 @@ from augment.scene import Scene
 from recipes.schema import KOSCHMIEDER, Recipe
 from recipes.weather import PURE_WATER_PER_M
 
-# ---- What is known of a LiDAR: its optics as assumed, its intensities, where its beams start -----
+# ---- The sensor: its optics as assumed, its intensities, where its beams start -------------------
 
 LIGHT_MPS = 299_792_458.0
 INTENSITY_COLUMNS = ("intensity", "i", "reflectance", "reflectivity")
@@ -50,15 +56,14 @@ EGO_SENSOR_M = (0.0, 0.0, 1.8)  # forward, left, up of the ego origin, where not
 
 @dataclass(frozen=True)
 class LidarModel:
-    """A spinning 905 nm LiDAR as its makers describe such; datasets do not publish their own.
+    """A spinning 905 nm LiDAR; datasets do not publish their own.
 
     reach_m: where a surface of 10 % reflectance is just seen in clear air; it stands for the noise.
     pulse_fwhm_s: half-power width of the emitted sin^2 pulse. overlap_from_m, overlap_full_m: from
     where the receiver sees the beam, and all of it (Hahner et al. 2021, section 3). near_gain:
-    share of a signal from the first metres that the receiver makes use of. Makers suppress it and
-    do not say by how much: with the default, fog of 40 m visibility costs a surface of 50 %
-    reflectance at 25 m, as far as Bijelic, Gruber and Ritter (2018, "A Benchmark for Lidar Sensors
-    in Fog") found LiDARs to see in it.
+    share of a signal from the first metres that is not suppressed, unpublished: the default makes
+    fog of 40 m visibility cost a surface of 50 % reflectance at 25 m, as far as LiDARs see in it
+    (Bijelic, Gruber and Ritter 2018, "A Benchmark for Lidar Sensors in Fog").
     """
 
     wavelength_um: float = 0.905
@@ -102,8 +107,8 @@ def white_level(intensity: np.ndarray) -> float:
 
 
 def reflectances(sweep: LidarSweep) -> np.ndarray:
-    """What share of the light each return's surface gave back, float64 [N], FAINTEST at least;
-    incidence included, as sensors do not take it out.
+    """Reflectance of each return's surface, float64 [N], FAINTEST at least; incidence included, as
+    sensors do not take it out.
     """
     name = intensity_column(sweep)
     if name is None:
@@ -142,7 +147,7 @@ def signal(reflectance: np.ndarray, ranges_m: np.ndarray) -> np.ndarray:
     return reflectance / (math.pi * ranges_m**2)
 
 
-# ---- The strongest echo of every beam of a sweep, as one effect after another changes it ---------
+# ---- The strongest echo of every beam, which one effect after another changes --------------------
 
 _MIN_M = 1e-3  # nearer returns have no direction
 
@@ -151,12 +156,11 @@ _MIN_M = 1e-3  # nearer returns have no direction
 class Echoes:
     """The echoes of a sweep of N returns; arrays change in place.
 
-    origins, directions [N, 3]: scene world; directions are unit. ranges_m [N]: as the sensor
-    reports them, 0 where the source has no point: such rows are never touched. air_m [N]: how much
-    of the way leads through the air. reflectance [N]: of what gives the echo, incidence included,
-    relative to a white surface met head on. gain [N]: what the weather leaves of the echo. codes
-    [N]: see `codes`. is_new [N]: the echo is not the source's, so its intensity follows from
-    reflectance.
+    origins, directions [N, 3]: scene world; directions are unit. ranges_m [N]: as reported, 0 where
+    the source has no point: such rows are never touched. air_m [N]: of the way, through the air.
+    reflectance [N]: of what gives the echo, incidence included, relative to a white surface met
+    head on. gain [N]: what the weather leaves of the echo. is_new [N]: the echo is not the
+    source's, so its intensity follows from reflectance.
     """
 
     source: LidarSweep
@@ -216,14 +220,10 @@ class Echoes:
         self.air_m[rows] = air_m
         self.gain[rows] *= kept
 
-    def lose(self, rows: np.ndarray) -> None:
-        """Nothing comes back of the returns in rows, numbers or bool [N]."""
-        self.codes[rows] = LOST
-
     def lose_faint(self, model: LidarModel) -> None:
         """Lose what is below the sensor's noise."""
         faint = self.reflectance * self.gain < model.noise_reflectance(self.ranges_m)
-        self.lose(faint & (self.ranges_m > 0))
+        self.codes[faint & (self.ranges_m > 0)] = LOST
 
     def sweep(self) -> LidarSweep:
         """As `weathered_sweep` returns it."""
@@ -270,9 +270,9 @@ class Echoes:
         return out
 
 
-# ---- Fog, haze and smog: Hahner et al. 2021, "Fog Simulation on Real LiDAR Point Clouds in Adverse
-# Weather", ICCV -----------------------------------------------------------------------------------
-# The echo of a pulse P(t) = P0 sin^2(pi t / (2 tau)), 0 <= t <= 2 tau, of half-power width tau:
+# ---- Fog, haze and smog --------------------------------------------------------------------------
+# Hahner et al. 2021, "Fog Simulation on Real LiDAR Point Clouds in Adverse Weather", ICCV. The echo
+# of a pulse P(t) = P0 sin^2(pi t / (2 tau)), 0 <= t <= 2 tau, of half-power width tau:
 #
 #     hard, from a surface at R0   (rho / pi) exp(-2 T(R0)) / R0^2
 #     soft, of droplets, at R      beta int_0^{2w} sin^2(pi x / (2w)) exp(-2 alpha r) xi(r) / r^2 dx
@@ -300,9 +300,8 @@ _KIM = ((50.0, 0.0, 1.6), (6.0, 0.0, 1.3), (1.0, 0.16, 0.34), (0.5, 1.0, -0.5), 
 def wavelength_factor(extinction_per_m: float, wavelength_um: float = 0.905) -> float:
     """Extinction at the LiDAR's wavelength over that of visible light (0.55 um).
 
-    (wavelength / 0.55 um)^-q with q by the visibility, see _KIM. At 905 nm: 1 in fog, whose
-    droplets are larger than either wavelength, 0.78 at 1 km, 0.52 at 6 km. Single measurements
-    differ from this fit by some 20 %; dry smog of fine particles may have less in the infrared.
+    (wavelength / 0.55 um)^-q with q by the visibility, see _KIM; measurements scatter by some 20 %.
+    At 905 nm: 1 in fog, whose droplets are larger than either wavelength, 0.78 at 1 km, 0.52 at 6.
     """
     if extinction_per_m <= 0:
         return 1.0
@@ -359,10 +358,10 @@ def soft_echo(alpha_per_m: float, model: LidarModel) -> SoftEcho:
     return SoftEcho(ranges, response, np.maximum.accumulate(response), share)
 
 
-@dataclass(frozen=True, eq=False)
-class Scatter:
+class Scatter(NamedTuple):
     """The strongest echo of the droplets before each return. signal [N]: as `signal` gives it, 0
-    where none can be. ranges_m [N]: where it is reported."""
+    where none can be. ranges_m [N]: where it is reported.
+    """
 
     signal: np.ndarray
     ranges_m: np.ndarray
@@ -377,9 +376,9 @@ def scatter_before(
 ) -> Scatter:
     """What comes back from the smog before surfaces at ends_m [N].
 
-    Its strength varies with the clumps that a beam meets (CLUMPS), and where along the echo the
-    strongest of them is, is drawn from the echo's own shape. N numbers of each are drawn whatever
-    the density, so that denser smog differs by nothing else.
+    Its strength varies with the clumps that a beam meets (CLUMPS); the range of the strongest is
+    drawn from the echo's shape. N numbers of each are drawn whatever the density, so that denser
+    smog differs by nothing else.
     """
     count = len(ends_m)
     clump = rng.standard_gamma(CLUMPS, count) / CLUMPS
@@ -406,23 +405,20 @@ def scatter_before(
 
 # ---- Standing water: a flat mirror that swallows 905 nm within centimetres -----------------------
 # A beam that meets the surface at a slant leaves it by reflection, away from the sensor, or enters.
-# What comes back is the stronger of
+# The stronger echo counts:
 #
 #     bed     rho (1 - F)^2 exp(-2 c l)     from the bed, l metres along the refracted way
 #     water   (1 - F)^2 R_w cos(theta)      from grains in muddy water, within a hand of its surface
 #
-# with Fresnel's F and theta the angle of incidence. Left out: the waves' slopes, as no facet of
-# theirs faces a sensor on a car but right beside it, and mirror images of objects, which are few
-# and weak.
+# with Fresnel's F and theta the angle of incidence. Left out: the waves' slopes, none of whose
+# facets faces a sensor on a car but right beside it, and the few, weak mirror images of objects.
 
 # Absorption of pure water at 905 nm. Kou, Labrie and Chylek (1993, "Refractive indices of water and
 # ice in the 0.65- to 2.5-um spectral region") have 6.8/m at 900 nm and 14/m at 925 nm; warm water
 # has a tenth more. Visible light's 0.06 to 0.3/m does not count against it.
 ABSORPTION_905_PER_M = 7.5
-# Of the light that grains deflect, what goes backwards (Petzold 1972, harbour: 0.019).
-BACKWARD = 0.019
-# Diffuse reflectance of water over b_b / (a + b_b) (Morel and Prieur 1977: 0.33).
-MOREL = 0.33
+BACKWARD = 0.019  # of the light that grains deflect (Petzold 1972, harbour)
+MOREL = 0.33  # diffuse reflectance of water over b_b / (a + b_b) (Morel and Prieur 1977)
 
 
 @dataclass(frozen=True, eq=False)
@@ -485,10 +481,186 @@ def meet_water(
     return WaterEcho(rows, surface, np.where(is_bed, ranges, surface), kept, is_bed, mud)
 
 
+# ---- Lying snow: beams end on its surface, which is bright at 905 nm -----------------------------
+# The layer has the support, profile and seed of the images', so that drifts, patches and wheel
+# tracks are where the pictures have them, on a grid of GRID_M cells, without the images' levelling.
+
+# Fresh snow gives back 0.95 of visible light and 0.90 at 0.9 um; old, coarse snow 0.9 and 0.7
+# (Wiscombe and Warren 1980, figure 8): the recipe's albedo times this.
+ALBEDO_AT_905 = 0.93
+GRID_M = 0.1
+MIN_FACING = 0.02  # cosine
+_MAX_CELLS = 8_000_000  # of a grid; larger scenes get coarser ones
+_GROUND_SLACK_M, _ACTOR_SLACK_M = 0.15, 0.05
+_MAX_LAYERS = 2  # of a scene, that are kept
+_REACH_M = 200.0  # actors farther away are not asked
+_ABOUT_M, _EVERY = 3.0, 8  # returns that tell when the sensor looked at an actor
+_SAME_DRIVE_NS = 10**9  # a sweep's times are within this of its frame's
+
+
+@dataclass(frozen=True, eq=False)
+class SnowGrid:
+    """Snow on one part, in the part's frame: see snow_kernels.meet_layer. radius_m: of the circle
+    about the part's origin that holds it, seen from above.
+    """
+
+    corner: np.ndarray
+    cell_m: float
+    base: np.ndarray
+    top: np.ndarray
+    highest: np.ndarray
+    radius_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class LidarSnow:
+    """The snow in a scene. actors: by track_id. reflectance: of it, met head on."""
+
+    ground: SnowGrid | None
+    actors: Mapping[str, SnowGrid]
+    reflectance: float
+
+
+def layer_of(cells: SnowCells, depths_m: np.ndarray, *, grid_m: float = GRID_M) -> SnowGrid | None:
+    """Snow of depths [C] on cells; None where there is none."""
+    centers, sizes = cells.centers_m.numpy(), cells.sizes_m.numpy()
+    covered = depths_m > 0
+    if not covered.any():
+        return None
+    half = sizes[covered, None] / 2
+    low = (centers[covered, :2] - half).min(0).astype(np.float64)
+    extent = (centers[covered, :2] + half).max(0) - low
+    cell = float(max(grid_m, math.sqrt(float(extent.prod()) / _MAX_CELLS)))
+    columns, rows = (int(n) for n in np.ceil(extent / cell) + 1)
+    base, top = np.full((2, rows, columns), -np.inf, np.float32)
+    depths = np.ascontiguousarray(depths_m, np.float32)
+    snow_kernels.fill_layer(centers, sizes, depths, low, cell, base, top)
+    radius = float(np.hypot(*(centers[covered, :2] + np.sign(centers[covered, :2]) * half).T).max())
+    # The greatest of every block of the grid, for the march to skip.
+    block = snow_kernels.BLOCK
+    blocks = [-(-n // block) for n in top.shape]
+    padded = np.full([n * block for n in blocks], -np.inf, np.float32)
+    padded[:rows, :columns] = top
+    highest = padded.reshape(blocks[0], block, blocks[1], block).max((1, 3))
+    return SnowGrid(low, cell, base, top, highest, radius)
+
+
+def snow_in(scene: Scene, placed: PlacedSnow) -> LidarSnow:
+    """The snow of a recipe in a scene; the last _MAX_LAYERS of a scene are kept. Thread-safe.
+
+    Raises:
+        SceneError: snow cannot be placed in this scene.
+    """
+    with _lock:
+        layers = _layers.setdefault(scene, {})
+        support = support_of(scene, placement_settings(placed.snow))
+        laid_on, snow = layers.pop(placed, (None, None))
+        if snow is None or laid_on is not support:
+            snow = _lay(support, scene, placed)
+        layers[placed] = (support, snow)
+        while len(layers) > _MAX_LAYERS:
+            del layers[next(iter(layers))]
+        return snow
+
+
+_lock = threading.Lock()
+_layers: WeakKeyDictionary[Scene, dict[PlacedSnow, tuple[SnowSupport, LidarSnow]]]
+_layers = WeakKeyDictionary()
+
+
+def meet_layers(
+    snow: LidarSnow,
+    scene: Scene,
+    sweep: LidarSweep,
+    frame_ns: int,
+    origins: np.ndarray,
+    directions: np.ndarray,
+    ends_m: np.ndarray,
+) -> np.ndarray:
+    """Where beams [N] end, ends_m at most, float64 [N]. origins, directions: [N, 3], scene world.
+
+    An actor stands where it was when the sensor looked at it, by the times of the returns about it,
+    as far as the sweep has them; else where it is at the frame's time.
+    """
+    hits = ends_m.copy()
+    if snow.ground is not None:
+        _meet(snow.ground, np.eye(4), math.inf, origins, directions, hits, _GROUND_SLACK_M)
+    every = np.flatnonzero(ends_m > 0)[::_EVERY]
+    if not snow.actors or not len(every):
+        return hits
+    ends = origins[every] + ends_m[every, None] * directions[every]
+    times = _times(sweep, frame_ns)
+    eye = np.median(origins[every], axis=0)
+    for actor in scene.actors:
+        layer = snow.actors.get(actor.track_id)
+        pose = actor.track.pose_at(frame_ns)
+        if layer is None or pose is None:
+            continue
+        place = pose[:2, 3].numpy()
+        if np.hypot(*(place - eye[:2])) > _REACH_M:
+            continue
+        if times is not None:
+            about = np.hypot(*(ends[:, :2] - place).T) < layer.radius_m + _ABOUT_M
+            if about.any():
+                pose = actor.track.pose_at(int(np.sort(times[every][about])[about.sum() // 2]))
+        if pose is not None:
+            world = pose.double().numpy()
+            _meet(layer, world, layer.radius_m, origins, directions, hits, _ACTOR_SLACK_M)
+    return hits
+
+
+def _meet(
+    layer: SnowGrid,
+    world_from_part: np.ndarray,
+    radius_m: float,
+    origins: np.ndarray,
+    directions: np.ndarray,
+    hits: np.ndarray,
+    slack_m: float,
+) -> None:
+    part_from_world = np.eye(4)
+    part_from_world[:3, :3] = world_from_part[:3, :3].T
+    part_from_world[:3, 3] = -world_from_part[:3, :3].T @ world_from_part[:3, 3]
+    snow_kernels.meet_layer(
+        *(origins, directions, hits, part_from_world[:3].copy()),
+        np.array([world_from_part[0, 3], world_from_part[1, 3], radius_m]),
+        *(layer.corner, layer.cell_m, layer.base, layer.top, layer.highest, slack_m),
+    )
+
+
+def _lay(support: SnowSupport, scene: Scene, placed: PlacedSnow) -> LidarSnow:
+    def layer(cells: SnowCells, track_id: str | None) -> SnowGrid | None:
+        given = (placed.snow, placed.seed, placed.water_level_z_m)
+        profile, rng = profile_on(track_id, scene, *given)
+        seed = rng.integers(0, 2**64, dtype=np.uint64)
+        grid_m = GRID_M if track_id is None else min(GRID_M, placed.snow.cell_m)
+        return layer_of(cells, find_depths(cells, profile, seed).heights, grid_m=grid_m)
+
+    actors = {track_id: layer(cells, track_id) for track_id, cells in support.actors.items()}
+    return LidarSnow(
+        ground=layer(support.ground, None),
+        actors={track_id: laid for track_id, laid in actors.items() if laid is not None},
+        reflectance=ALBEDO_AT_905 * placed.snow.albedo,
+    )
+
+
+def _times(sweep: LidarSweep, frame_ns: int) -> np.ndarray | None:
+    """int64 [N] of timestamp_ns, or t in seconds, where they are on the frames' clock."""
+    column = sweep.columns.get("timestamp_ns")
+    if column is not None and np.asarray(column).dtype.kind in "iu":
+        times = np.asarray(column).astype(np.int64)
+    else:
+        column = sweep.columns.get("t")
+        if column is None or np.asarray(column).dtype.kind != "f" or not np.isfinite(column).all():
+            return None
+        times = np.round(np.clip(column, -9e9, 9e9) * 1e9).astype(np.int64)
+    near = len(times) > 0 and abs(int(np.median(times)) - frame_ns) <= _SAME_DRIVE_NS
+    return times if near else None
+
+
 # ---- The sweep -----------------------------------------------------------------------------------
 
 DEFAULT_MODEL = LidarModel()
-MIN_FACING = 0.02  # cosine
 
 
 def weathered_sweep(
@@ -503,8 +675,8 @@ def weathered_sweep(
 
     All columns of the source, of which x, y, z and the intensity change where the weather changed
     them, and `source_index` int32, `weather_code` uint8 (see codes). The class of a return that
-    moved onto the snow is still that of what lies beneath. Coordinates of whole numbers become
-    float64, since lost returns have none. Safe to call from several threads.
+    moved onto the snow is still that of what lies beneath. Whole coordinates become float64, since
+    lost returns have none. Thread-safe.
 
     Raises:
         SceneError: the weather cannot be placed in this scene. ValueError: the sweep has a column
@@ -535,7 +707,7 @@ def _meet_snow(echoes: Echoes, scene: Scene, plan: Plan, sweep: LidarSweep, fram
     assert plan.snow is not None
     snow = snow_in(scene, plan.snow)
     ranges = echoes.ranges_m
-    hits = meet_snow(snow, scene, sweep, frame_ns, echoes.origins, echoes.directions, ranges)
+    hits = meet_layers(snow, scene, sweep, frame_ns, echoes.origins, echoes.directions, ranges)
     rows = np.flatnonzero(hits < ranges)
     # The layer counts as level, but its grains stand out: no beam slides over it unreflected.
     facing = np.maximum(np.abs(echoes.directions[rows, 2]), MIN_FACING)
@@ -545,7 +717,7 @@ def _meet_snow(echoes: Echoes, scene: Scene, plan: Plan, sweep: LidarSweep, fram
 def _meet_water(echoes: Echoes, medium: FloodMedium) -> None:
     """A sensor under water sees nothing: its light ends within centimetres."""
     drowned = echoes.origins[:, 2] <= medium.level_z_m
-    echoes.lose(drowned & (echoes.ranges_m > 0))
+    echoes.codes[drowned & (echoes.ranges_m > 0)] = LOST
     ends = np.where(drowned, 0.0, echoes.ranges_m)
     water = meet_water(medium, echoes.origins, echoes.directions, ends, echoes.reflectance)
     bed, mud = water.is_bed, ~water.is_bed
